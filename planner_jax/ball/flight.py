@@ -1,0 +1,153 @@
+"""Ball flight: quadratic drag (paper 002, eq. 2), and the closed forms for no drag and linear drag.
+
+World frame, z up, SI units. Everything here is written for one ball; `jax.vmap` makes many.
+"""
+
+import chex
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import Array
+
+
+@struct.dataclass
+class BallState:
+    """A ball at one instant, world frame, z up."""
+
+    pos: Array  # (3,) [m]
+    vel: Array  # (3,) [m/s]
+
+
+def gravity_vector(gravity: Array) -> Array:
+    """The acceleration (0, 0, -gravity) [m/s^2] of a free fall, shape (3,)."""
+    gravity = jnp.asarray(gravity)
+    return jnp.stack([jnp.zeros_like(gravity), jnp.zeros_like(gravity), -gravity])
+
+
+def ball_acceleration(vel: Array, drag: Array, gravity: Array) -> Array:
+    """Acceleration  g - K_D |v| v  of a ball in flight (paper 002, eq. 2).
+
+    Args:
+        vel: (3,) [m/s].
+        drag: () K_D [1/m], >= 0.
+        gravity: () [m/s^2], magnitude.
+
+    Returns:
+        (3,) [m/s^2]. The gradient is finite at rest.
+    """
+    speed_squared = jnp.sum(vel**2)
+    moving = speed_squared > 0.0
+    # The inner where keeps the gradient of sqrt finite for a ball at rest.
+    speed = jnp.where(moving, jnp.sqrt(jnp.where(moving, speed_squared, 1.0)), 0.0)
+    return gravity_vector(gravity) - drag * speed * vel
+
+
+def rk4_step(ball: BallState, duration: Array, drag: Array, gravity: Array) -> BallState:
+    """The ball after one Runge-Kutta step of order 4; a negative duration [s] steps back."""
+
+    def rate(state: BallState) -> BallState:
+        return BallState(pos=state.vel, vel=ball_acceleration(state.vel, drag, gravity))
+
+    def ahead(slope: BallState, step: Array) -> BallState:
+        return jax.tree.map(lambda x, dx: x + step * dx, ball, slope)
+
+    k1 = rate(ball)
+    k2 = rate(ahead(k1, 0.5 * duration))
+    k3 = rate(ahead(k2, 0.5 * duration))
+    k4 = rate(ahead(k3, duration))
+    return jax.tree.map(
+        lambda x, a, b, c, d: x + duration / 6.0 * (a + 2.0 * b + 2.0 * c + d), ball, k1, k2, k3, k4
+    )
+
+
+def fly(
+    ball: BallState, duration: Array, drag: Array, gravity: Array, *, num_steps: int
+) -> tuple[BallState, BallState]:
+    """The ball after `duration` seconds of flight with quadratic drag.
+
+    Args:
+        ball: one ball.
+        duration: () [s], of either sign.
+        drag: () K_D [1/m].
+        gravity: () [m/s^2], magnitude.
+        num_steps: how many equal Runge-Kutta steps.
+
+    Returns:
+        final: the ball at the end.
+        path: the ball after each step, leaves (num_steps, 3).
+    """
+    chex.assert_shape([ball.pos, ball.vel], (3,))
+    step = jnp.asarray(duration, ball.pos.dtype) / num_steps
+
+    def advance(state: BallState, _: None) -> tuple[BallState, BallState]:
+        after = rk4_step(state, step, drag, gravity)
+        return after, after
+
+    return jax.lax.scan(advance, ball, None, length=num_steps, unroll=4)
+
+
+def drag_free_flight(ball: BallState, duration: Array, gravity: Array) -> BallState:
+    """The ball after `duration` [s] under gravity alone (closed form)."""
+    g = gravity_vector(gravity)
+    return BallState(
+        pos=ball.pos + ball.vel * duration + 0.5 * g * duration**2,
+        vel=ball.vel + g * duration,
+    )
+
+
+def linear_drag_flight(ball: BallState, duration: Array, drag: Array, gravity: Array) -> BallState:
+    """The ball after `duration` [s] with drag  -K_i v_i  on each axis (closed form).
+
+    Paper 002, eq. 4a with the constant that the print lacks:
+    s(t) = s_0 + (v_0 - g/K)(1 - exp(-K t))/K + g t/K  on each axis, g signed.
+
+    Args:
+        ball: one ball.
+        duration: () [s].
+        drag: (3,) K_i [1/s], >= 0. Small K goes over into the drag-free form.
+        gravity: () [m/s^2], magnitude.
+    """
+    x = drag * duration
+    small = jnp.abs(x) < 1e-3
+    safe = jnp.where(small, 1.0, x)
+    # phi_1(x) = (1 - exp(-x))/x and phi_2(x) = (1 - phi_1(x))/x, by series near zero.
+    phi_1 = jnp.where(small, 1.0 - x / 2.0 + x**2 / 6.0, -jnp.expm1(-safe) / safe)
+    phi_2 = jnp.where(
+        small, 0.5 - x / 6.0 + x**2 / 24.0, (1.0 + jnp.expm1(-safe) / safe) / safe
+    )
+    g = gravity_vector(gravity)
+    return BallState(
+        pos=ball.pos + ball.vel * duration * phi_1 + g * duration**2 * phi_2,
+        vel=ball.vel * jnp.exp(-x) + g * duration * phi_1,
+    )
+
+
+def drag_free_apex(ball: BallState, gravity: Array) -> Array:
+    """Greatest height [m] that a drag-free ball reaches from now on.
+
+    v_z^2 / (2 g) + z  for a rising ball (paper 002, eq. 22, with the z component that the
+    print lacks), z itself for a falling one.
+    """
+    return ball.pos[2] + jnp.maximum(ball.vel[2], 0.0) ** 2 / (2.0 * gravity)
+
+
+def drag_free_fall_time(ball: BallState, height: Array, gravity: Array) -> tuple[Array, Array]:
+    """Time at which a drag-free ball falls through a horizontal plane.
+
+    The later root t of  z + v_z t - g t^2 / 2 = height.
+
+    Args:
+        ball: one ball.
+        height: () [m], of the plane.
+        gravity: () [m/s^2], magnitude, > 0.
+
+    Returns:
+        time: () [s] from now; 0 where the plane is never reached.
+        reached: () bool.
+    """
+    discriminant = ball.vel[2] ** 2 + 2.0 * gravity * (ball.pos[2] - height)
+    real = discriminant > 0.0
+    # The inner where keeps sqrt's gradient finite in lanes that the outer one drops.
+    time = (ball.vel[2] + jnp.sqrt(jnp.where(real, discriminant, 1.0))) / gravity
+    reached = real & (time > 0.0)
+    return jnp.where(reached, time, 0.0), reached

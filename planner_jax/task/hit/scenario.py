@@ -1,0 +1,110 @@
+"""One volley to plan: the incoming ball, the hovering quadrotor, the target and the limits."""
+
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+from planner_jax.ball.flight import BallState
+from planner_jax.robot.quadrotor import QuadrotorLimits
+
+
+@struct.dataclass
+class HitLimits:
+    """What the stroke itself may not exceed (paper 002, eqs 18f and 18g)."""
+
+    hitting_speed: Array  # (3,) [m/s], per world axis, of the quadrotor at impact
+    min_apex: Array  # () [m], of the ball after the impact
+    max_apex: Array  # () [m]
+
+
+@struct.dataclass
+class HitScenario:
+    """One case. Every field is a leaf: batch it, randomise it, differentiate by it.
+
+    Times count from the moment at which planning begins.
+    """
+
+    ball: BallState  # at time 0
+    head_state: Array  # (4, 3) position, velocity, acceleration, jerk of the quadrotor at time 0
+    target: Array  # (3,) [m], where the returned ball must land
+    drag: Array  # () K_D [1/m]
+    gravity: Array  # () [m/s^2], magnitude
+    restitution: Array  # () beta of the racket
+    racket_height: Array  # () [m], racket centre above the propeller plane
+    limits: QuadrotorLimits
+    hit_limits: HitLimits
+
+
+def hit_scenario(
+    serve_pos,
+    serve_vel,
+    target,
+    *,
+    start=(-3.0, 0.0, 1.5),
+    drag=0.0616,
+    gravity=9.8,
+    restitution=0.7,
+    racket_height=0.06,
+    speed=5.0,
+    acceleration=15.0,
+    body_rate=5.0,
+    min_height=0.25,
+    hitting_speed=(4.0, 3.0, 4.0),
+    min_apex=2.2,
+    max_apex=6.2,
+    dtype=jnp.float32,
+) -> HitScenario:
+    """A scenario, or a batch of them, with the setting of paper 002, Section VI-A.
+
+    K_D and g are the fit to the published landing positions; the hover start is an
+    assumption (the paper draws it at the near/far boundary of the hitting half).
+
+    Args:
+        serve_pos: (..., 3) [m], ball when planning begins.
+        serve_vel: (..., 3) [m/s].
+        target: (..., 3) [m].
+        start: (3,) or (..., 3) [m], hover position of the quadrotor.
+        drag: K_D [1/m]. This and all that follow may be one value or one a case.
+        gravity: [m/s^2].
+        restitution: beta of the racket.
+        racket_height: [m].
+        speed: [m/s].
+        acceleration: [m/s^2].
+        body_rate: [rad/s].
+        min_height: [m].
+        hitting_speed: (3,) [m/s], per axis.
+        min_apex: [m].
+        max_apex: [m].
+        dtype: of every leaf.
+
+    Returns:
+        A `HitScenario` whose leaves carry the batch shape of `serve_pos`.
+    """
+    batch = np.shape(serve_pos)[:-1]
+
+    def leaf(value, *shape: int) -> Array:
+        return jnp.asarray(np.broadcast_to(np.asarray(value), batch + shape), dtype)
+
+    head = np.zeros(batch + (4, 3))
+    head[..., 0, :] = start
+    return HitScenario(
+        ball=BallState(pos=leaf(serve_pos, 3), vel=leaf(serve_vel, 3)),
+        head_state=jnp.asarray(head, dtype),
+        target=leaf(target, 3),
+        drag=leaf(drag),
+        gravity=leaf(gravity),
+        restitution=leaf(restitution),
+        racket_height=leaf(racket_height),
+        limits=QuadrotorLimits(
+            speed=leaf(speed),
+            acceleration=leaf(acceleration),
+            body_rate=leaf(body_rate),
+            min_height=leaf(min_height),
+        ),
+        hit_limits=HitLimits(
+            hitting_speed=leaf(hitting_speed, 3),
+            min_apex=leaf(min_apex),
+            max_apex=leaf(max_apex),
+        ),
+    )

@@ -1,0 +1,66 @@
+"""Piecewise polynomials in time: the one form in which every planner returns a trajectory."""
+
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array, lax
+
+
+@struct.dataclass
+class PiecewisePolynomial:
+    """p(t) = sum_k coeffs[i, k] (t - t_i)^k  on piece i, which starts at t_i."""
+
+    coeffs: Array  # (M, D + 1, 3), ascending powers of the time [s] since the piece began
+    durations: Array  # (M,) [s], > 0
+
+
+def derivative_factors(degree: int, order: int) -> np.ndarray:
+    """Factors k!/(k - order)! of the `order`-th derivative of t^k, shape (degree + 1,)."""
+    powers = np.arange(degree + 1)
+    factors = np.ones(degree + 1)
+    for i in range(order):
+        factors = factors * np.maximum(powers - i, 0)
+    return factors
+
+
+def evaluate(trajectory: PiecewisePolynomial, time: Array, order: int = 0) -> Array:
+    """Position or a derivative of it at one time.
+
+    Args:
+        trajectory: M pieces.
+        time: () [s] since the start. Before the start and past the end the nearest piece
+            is continued.
+        order: 0 position, 1 velocity, 2 acceleration, 3 jerk, 4 snap.
+
+    Returns:
+        (3,) [m/s^order].
+    """
+    coeffs, durations = trajectory.coeffs, trajectory.durations
+    starts = jnp.concatenate([jnp.zeros_like(durations[:1]), jnp.cumsum(durations)[:-1]])
+    piece = jnp.clip(jnp.sum(time >= starts) - 1, 0, durations.shape[0] - 1)
+    local = time - starts[piece]
+    degree = coeffs.shape[1] - 1
+    factors = jnp.asarray(derivative_factors(degree, order), coeffs.dtype)[:, None]
+    scaled = coeffs[piece] * factors
+    value = jnp.zeros_like(scaled[0])
+    for k in range(degree, order - 1, -1):
+        value = value * local + scaled[k]
+    return value
+
+
+def total_duration(trajectory: PiecewisePolynomial) -> Array:
+    """Duration [s] of all pieces together."""
+    return jnp.sum(trajectory.durations, axis=-1)
+
+
+def snap_energy(trajectory: PiecewisePolynomial, order: int = 4) -> Array:
+    """Integral of the squared `order`-th derivative over the whole trajectory, exactly."""
+    coeffs, durations = trajectory.coeffs, trajectory.durations
+    degree = coeffs.shape[1] - 1
+    factors = derivative_factors(degree, order)
+    powers = np.arange(degree + 1)
+    exponents = powers[:, None] + powers[None, :] - 2 * order + 1
+    valid = (powers[:, None] >= order) & (powers[None, :] >= order)
+    weights = np.where(valid, np.outer(factors, factors) / np.maximum(exponents, 1), 0.0)
+    gram = jnp.asarray(weights, coeffs.dtype) * durations[:, None, None] ** np.maximum(exponents, 0)
+    return jnp.einsum("mki,mkl,mli->", coeffs, gram, coeffs, precision=lax.Precision.HIGHEST)
