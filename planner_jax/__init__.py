@@ -1,0 +1,1 @@
+"""Batched, differentiable planning for robots that meet flying objects."""

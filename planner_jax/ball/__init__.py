@@ -1,0 +1,1 @@
+"""The ball: flight, impact, prediction and estimation."""

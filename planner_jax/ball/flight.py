@@ -3,6 +3,8 @@
 World frame, z up, SI units. Everything here is written for one ball; `jax.vmap` makes many.
 """
 
+import math
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -108,18 +110,26 @@ def linear_drag_flight(ball: BallState, duration: Array, drag: Array, gravity: A
         gravity: () [m/s^2], magnitude.
     """
     x = drag * duration
-    small = jnp.abs(x) < 1e-3
-    safe = jnp.where(small, 1.0, x)
-    # phi_1(x) = (1 - exp(-x))/x and phi_2(x) = (1 - phi_1(x))/x, by series near zero.
-    phi_1 = jnp.where(small, 1.0 - x / 2.0 + x**2 / 6.0, -jnp.expm1(-safe) / safe)
-    phi_2 = jnp.where(
-        small, 0.5 - x / 6.0 + x**2 / 24.0, (1.0 + jnp.expm1(-safe) / safe) / safe
-    )
+    phi_1, phi_2 = _phi(x)
     g = gravity_vector(gravity)
     return BallState(
         pos=ball.pos + ball.vel * duration * phi_1 + g * duration**2 * phi_2,
         vel=ball.vel * jnp.exp(-x) + g * duration * phi_1,
     )
+
+
+def _phi(x: Array) -> tuple[Array, Array]:
+    """phi_1 = (1 - exp(-x))/x and phi_2 = (1 - phi_1)/x, exact to rounding for any x.
+
+    The direct form of phi_2 cancels far above zero, so a series of thirteen terms serves up
+    to |x| = 1/2. Each branch sees an input on which its gradient is finite.
+    """
+    small = jnp.abs(x) < 0.5
+    near = jnp.where(small, x, 0.0)
+    series = sum((-near) ** k / math.factorial(k + 2) for k in range(13))
+    far = jnp.where(small, 1.0, x)
+    phi_2 = jnp.where(small, series, (1.0 + jnp.expm1(-far) / far) / far)
+    return 1.0 - x * phi_2, phi_2
 
 
 def drag_free_apex(ball: BallState, gravity: Array) -> Array:

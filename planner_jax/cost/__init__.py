@@ -1,0 +1,1 @@
+"""Penalty shapes, limits and contact: short pure functions."""

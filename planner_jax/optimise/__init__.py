@@ -1,0 +1,1 @@
+"""The batched optimiser, its status codes, scaling and gradients through an optimum."""

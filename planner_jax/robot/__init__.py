@@ -1,0 +1,1 @@
+"""What a robot can do: flatness, kinematics and limits."""

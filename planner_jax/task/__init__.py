@@ -1,0 +1,1 @@
+"""One room a task, and the one call that plans them all."""

@@ -1,0 +1,1 @@
+"""Piecewise polynomials and the maps that make them."""

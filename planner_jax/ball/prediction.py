@@ -1,0 +1,101 @@
+"""Where the ball will be: an integrated state table, smoothed by cubic convolution.
+
+Paper 002, Section III-C (eqs 8-10): the flight is integrated once into a table of states,
+and Keys' kernel (a = -1/2) reads it at any time with a continuous gradient.
+"""
+
+import chex
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import Array
+
+from planner_jax.ball.flight import BallState, rk4_step
+
+
+@struct.dataclass
+class PathTable:
+    """States of a target at equal time steps. Node k is at time (k - 1) * resolution."""
+
+    pos: Array  # (N, 3) [m]
+    vel: Array  # (N, 3) [m/s]
+    resolution: Array  # () [s], > 0
+
+
+def predict_path(
+    ball: BallState, horizon: Array, drag: Array, gravity: Array, *, num_nodes: int
+) -> PathTable:
+    """The table of a ball in flight with quadratic drag, one Runge-Kutta step a node.
+
+    Args:
+        ball: the ball at time 0.
+        horizon: () [s], the table answers times from 0 to here.
+        drag: () K_D [1/m].
+        gravity: () [m/s^2], magnitude.
+        num_nodes: N >= 5. One node lies before time 0 and one past the horizon, because the
+            kernel reads two nodes on each side.
+    """
+    if num_nodes < 5:
+        raise ValueError(f"num_nodes must be >= 5, got {num_nodes}")
+    resolution = horizon / (num_nodes - 3)
+    before = rk4_step(ball, -resolution, drag, gravity)
+
+    def advance(state: BallState, _: None) -> tuple[BallState, BallState]:
+        after = rk4_step(state, resolution, drag, gravity)
+        return after, after
+
+    _, later = jax.lax.scan(advance, ball, None, length=num_nodes - 2, unroll=4)
+    nodes = jax.tree.map(
+        lambda a, b, c: jnp.concatenate([a[None], b[None], c]), before, ball, later
+    )
+    return PathTable(pos=nodes.pos, vel=nodes.vel, resolution=resolution)
+
+
+def horizon_of(table: PathTable) -> Array:
+    """Last time [s] that the table answers; the first is 0."""
+    return table.resolution * (table.pos.shape[0] - 3)
+
+
+def convolution_weights(u: Array) -> Array:
+    """Keys' weights of the four nodes around a point (paper 002, eqs 8 and 10b).
+
+    Args:
+        u: () fraction of the way from the second to the third node, 0 to 1.
+
+    Returns:
+        (4,), which sum to one.
+    """
+    far = lambda x: ((-0.5 * x + 2.5) * x - 4.0) * x + 2.0  # noqa: E731
+    near = lambda x: (1.5 * x - 2.5) * x * x + 1.0  # noqa: E731
+    return jnp.stack([far(1.0 + u), near(u), near(1.0 - u), far(2.0 - u)])
+
+
+def target_at(table: PathTable, time: Array) -> BallState:
+    """State of the target at one time, with a gradient in time that is continuous.
+
+    Inside the table both position and velocity are cubic convolutions (paper 002, eq. 9).
+    Outside [0, horizon] the target goes on from the end of the table at the velocity it has
+    there: defined, differentiable, and easy to notice with `covers`.
+
+    Args:
+        table: N nodes.
+        time: () [s].
+    """
+    chex.assert_rank(time, 0)
+    inside = jnp.clip(time, 0.0, horizon_of(table))
+    position = inside / table.resolution
+    index = jnp.clip(jnp.floor(position), 0, table.pos.shape[0] - 4)
+    weights = convolution_weights(position - index)
+    first = index.astype(jnp.int32)
+
+    def read(nodes: Array) -> Array:
+        window = jax.lax.dynamic_slice_in_dim(nodes, first, 4)
+        return jnp.sum(weights[:, None] * window, axis=0)
+
+    vel = read(table.vel)
+    return BallState(pos=read(table.pos) + vel * (time - inside), vel=vel)
+
+
+def covers(table: PathTable, time: Array) -> Array:
+    """Whether the table answers a time, () bool."""
+    return (time >= 0.0) & (time <= horizon_of(table))

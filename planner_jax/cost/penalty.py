@@ -1,0 +1,50 @@
+"""Smooth penalty shapes and the quadrature that sums them along a trajectory."""
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+
+def smoothed_hinge(x: Array, width: float) -> Array:
+    """L_mu: zero below 0, linear above mu, a quartic blend between (paper 000, eq. 27b).
+
+    Twice continuously differentiable. x - mu/2 above the blend.
+
+    Args:
+        x: (...) violation, in the unit of the constraint.
+        width: mu > 0.
+    """
+    inside = jnp.clip(x, 0.0, width)
+    blend = (width - 0.5 * inside) * (inside / width) ** 3
+    return blend + jnp.maximum(x - width, 0.0)
+
+
+def steep_hinge(x: Array, width: float) -> Array:
+    """L_eps: cubic up to eps, then a far steeper cubic (paper 000, eq. 23).
+
+    eps^3 + (x - eps)^2 x / eps^4 above eps, as printed: the value is continuous there, but
+    the slope drops from 3 eps^2 to 0 and grows again. See `c1_steep_hinge`.
+
+    Args:
+        x: (...) violation.
+        width: eps > 0.
+    """
+    inside = jnp.clip(x, 0.0, width)
+    beyond = jnp.maximum(x - width, 0.0)
+    return inside**3 + beyond**2 * (beyond + width) / width**4 * (x > width)
+
+
+def c1_steep_hinge(x: Array, width: float) -> Array:
+    """L_eps with its slope kept: adds 3 eps^2 (x - eps) beyond eps, so that it is C1."""
+    return steep_hinge(x, width) + 3.0 * width**2 * jnp.maximum(x - width, 0.0)
+
+
+def trapezoid_weights(num_intervals: int) -> np.ndarray:
+    """Weights (1/2, 1, ..., 1, 1/2) / n of the trapezoid rule on [0, 1] (paper 000, eq. 26a).
+
+    Returns:
+        (num_intervals + 1,) float64, which sum to one.
+    """
+    weights = np.ones(num_intervals + 1)
+    weights[[0, -1]] = 0.5
+    return weights / num_intervals

@@ -1,0 +1,164 @@
+"""The published trial files of paper 002: what was served, and whether it was planned for."""
+
+import math
+import os
+import re
+from pathlib import Path
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+
+from planner_jax.task.hit import court
+from planner_jax.task.hit.validate import DRAG, GRAVITY, ServeError, landing
+
+_FILE_NAME = re.compile(r"([1-4])_([1-4])_([1-4])_([plb])\.csv")
+_FILE_PLANNER = {"p": "bat", "l": "bat-lite", "b": "juggle"}
+_SERVE_COLUMNS = ("serve position", "serve velocity", "landing position", "target")
+_HIT_COLUMNS = (("hitting position", 3), ("hitting velocity", 3), ("hitting attitude", 4))
+_LISTED = 5  # how many bad rows a message spells out
+
+# Numbers and outcome of each line of a file; None where the line does not parse.
+_Table: TypeAlias = dict[int, tuple[list[float], bool] | None]
+
+
+class Trial(NamedTuple):
+    """One serve of a trial file."""
+
+    line: int  # from 1
+    scenario: int  # place in court.SCENARIOS
+    file: str
+    numbers: list[float]  # 12: serve position, serve velocity, landing position, target
+    solved: tuple[float, ...]  # per court.PLANNERS: 1 planned, 0 failed, NaN not published
+
+
+def read_trials(folder: str | os.PathLike) -> list[Trial]:
+    """Every serve of a folder of trial files  S_L_T_M.csv, line by line of all scenarios.
+
+    Raises:
+        ServeError: as `planner_jax.task.hit.serves.read_serves` says.
+    """
+    problems: list[str] = []
+    trials: list[Trial] = []
+    for scenario, paths in _trial_files(folder).items():
+        tables = {letter: _read_file(path, problems) for letter, path in paths.items()}
+        full = {letter: table for letter, table in tables.items() if table}
+        trials += _merge(scenario, paths, full, problems)
+    trials.sort(key=lambda trial: (trial.line, trial.scenario))
+    problems += _out_of_play(trials)
+    if problems:
+        listed = "; ".join(problems[:_LISTED])
+        rest = f"; and {len(problems) - _LISTED} more" if len(problems) > _LISTED else ""
+        raise ServeError(f"serves in {str(folder)!r} must be sound: {listed}{rest}", problems)
+    return trials
+
+
+def _trial_files(folder) -> dict[int, dict[str, Path]]:
+    """Paths of the trial files of a folder, by place of the scenario and letter of the planner."""
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise ServeError(f"serves must be an existing folder, got {str(folder)!r}")
+    files: dict[int, dict[str, Path]] = {}
+    for path in sorted(folder.iterdir()):
+        if match := _FILE_NAME.fullmatch(path.name):
+            name = "".join(court.REGIONS[int(code) - 1] for code in match.groups()[:3])
+            if name not in court.SCENARIOS:
+                raise ServeError(
+                    f"serves must name one of the court's {len(court.SCENARIOS)} scenarios, "
+                    f"got {path.name} ({name}, the mirror image of another)"
+                )
+            files.setdefault(court.SCENARIOS.index(name), {})[match[4]] = path
+    if not files:
+        raise ServeError(
+            f"serves must be a folder of S_L_T_M.csv files, got none in {str(folder)!r}"
+        )
+    return files
+
+
+def _read_file(path: Path, problems: list[str]) -> _Table:
+    """The table of one file, and a problem for each line that does not parse."""
+    try:
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError as error:
+        problems.append(f"{path.name}: file must be readable, got {error.strerror}")
+        return {}
+    rows: _Table = {}
+    for number, line in enumerate(lines, start=1):
+        if number == 1 and line.startswith("number,") or not line.strip():
+            continue
+        try:
+            rows[number] = _parse(line)
+        except ValueError as error:
+            rows[number] = None
+            problems.append(f"{path.name}:{number}: {error}")
+    if not rows:
+        problems.append(f"{path.name}: file must have a row of numbers, got {len(lines)} lines")
+    return rows
+
+
+def _parse(line: str) -> tuple[list[float], bool]:
+    """Twelve numbers of the serve, and whether the planner solved it, from one line."""
+    cells = [cell.strip() for cell in line.split(",")]
+    if len(cells) != 8:
+        raise ValueError(f"row must have 8 columns between commas, got {len(cells)}")
+    numbers = []
+    for name, cell in zip(_SERVE_COLUMNS, cells[1:5], strict=True):
+        numbers += _vector(name, cell, 3)
+    solved = cells[5:] != ["failed"] * 3
+    if solved:
+        for (name, size), cell in zip(_HIT_COLUMNS, cells[5:], strict=True):
+            _vector(name, cell, size)
+    return numbers, solved
+
+
+def _vector(name: str, cell: str, size: int) -> list[float]:
+    """The finite numbers of one blank-separated cell."""
+    try:
+        vector = [float(number) for number in cell.split()]
+    except ValueError:
+        vector = []
+    if len(vector) != size or not all(map(math.isfinite, vector)):
+        raise ValueError(f"{name} must be {size} finite numbers, got {cell!r}")
+    return vector
+
+
+def _merge(
+    scenario: int, paths: dict[str, Path], tables: dict[str, _Table], problems: list[str]
+) -> list[Trial]:
+    """Serves of one scenario from the files of its planners; problems where these disagree."""
+    trials = []
+    for line in sorted(set().union(*tables.values())):
+        there = [letter for letter, table in tables.items() if line in table]
+        rule = f"serve must be the one in {paths[there[0]].name}"
+        problems += [
+            f"{paths[letter].name}:{line}: {rule}, got no such line"
+            for letter in tables.keys() - there
+        ]
+        rows = {letter: row for letter in there if (row := tables[letter][line]) is not None}
+        if len(rows) < len(tables):
+            continue
+        numbers, _ = rows[there[0]]
+        problems += [
+            f"{paths[letter].name}:{line}: {rule}, {numbers}, got {again}"
+            for letter, (again, _) in rows.items()
+            if again != numbers
+        ]
+        outcome = {_FILE_PLANNER[letter]: float(solved) for letter, (_, solved) in rows.items()}
+        solved = tuple(outcome.get(planner, math.nan) for planner in court.PLANNERS)
+        trials.append(Trial(line, scenario, paths[there[0]].name, numbers, solved))
+    return trials
+
+
+def _out_of_play(trials: list[Trial]) -> list[str]:
+    """Problems of the serves that start in the ground or do not come down in the hitting half."""
+    numbers = np.array([trial.numbers for trial in trials]).reshape(-1, 12)
+    height = numbers[:, 2]
+    position = np.column_stack([numbers[:, :2], np.where(height > 0.0, height, 1.0)])
+    _, point = landing(position, numbers[:, 3:6], DRAG, GRAVITY)
+    problems = []
+    for trial, z, x in zip(trials, height, point[:, 0], strict=True):
+        where = f"{trial.file}:{trial.line}"
+        if z <= 0.0:
+            problems.append(f"{where}: serve height must be > 0, got {z:g}")
+        elif not x < 0.0:
+            problems.append(f"{where}: serve must land in the hitting half, x < 0, got x = {x:.3g}")
+    return problems

@@ -1,0 +1,133 @@
+"""MINCO with equal durations: constant matrices in normalised time.
+
+When all M pieces last h seconds, the map from boundary rows and waypoints to coefficients,
+and to samples of position, velocity, acceleration and jerk, is one constant matrix in the
+unit time of a piece. Boundary rows are (p, v h, a h^2, j h^3) at both ends.
+
+The waypoints are expressed as whitened offsets y from the minimum-energy interpolation of
+the boundary, q = -E_qq^-1 E_qb b + W y with W = R^-T / |R^-T| and E_qq = R R^T, so y = 0 is
+the smoothest guess for any boundary, and the energy is a boundary part plus a multiple of
+|y|^2.
+"""
+
+import dataclasses
+import functools
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from planner_jax.trajectory.minco import hermite_energy, hermite_map
+from planner_jax.trajectory.polynomial import PiecewisePolynomial, derivative_factors
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class UniformMinco:
+    """Constant float64 maps for M equal pieces of energy order s."""
+
+    order: int
+    num_pieces: int
+    coefficients: np.ndarray  # (M, 2s, 2s + M - 1), unit-time coefficients from [b; y]
+    waypoints: np.ndarray  # (M - 1, 2s + M - 1), waypoints from [b; y]
+    offsets: np.ndarray  # (M - 1, 2s + M - 1), y from [b; waypoints]
+    boundary_energy: np.ndarray  # (2s, 2s), least energy for given boundary rows
+    offset_energy: float  # energy a unit of |y|^2
+
+    def sample_matrix(self, nodes: int, derivative: int) -> np.ndarray:
+        """Samples at `nodes` + 1 points a piece, ends shared: (M nodes + 1, 2s + M - 1).
+
+        Multiply by [b; y] and divide by h^derivative.
+        """
+        degree = 2 * self.order - 1
+        factors = derivative_factors(degree, derivative)
+        powers = np.maximum(np.arange(degree + 1) - derivative, 0)
+        times = np.arange(nodes + 1) / nodes
+        basis = factors * times[:, None] ** powers  # (nodes + 1, 2s)
+        samples = basis @ self.coefficients  # (M, nodes + 1, columns)
+        inner = samples[:, :-1].reshape(-1, samples.shape[-1])
+        return np.concatenate([inner, samples[-1:, -1]])
+
+
+@functools.cache
+def uniform_minco(order: int, num_pieces: int) -> UniformMinco:
+    """Build the constant maps (cached).
+
+    Args:
+        order: s, the derivative whose square is integrated: 2, 3 or 4.
+        num_pieces: M >= 1.
+    """
+    if num_pieces < 1:
+        raise ValueError(f"num_pieces must be >= 1, got {num_pieces}")
+    s, m = order, num_pieces
+    piece_energy = hermite_energy(s)
+    total = np.zeros(((m + 1) * s, (m + 1) * s))
+    for i in range(m):
+        span = slice(i * s, (i + 2) * s)
+        total[span, span] += piece_energy
+    head, tail = np.arange(s), np.arange(m * s, (m + 1) * s)
+    positions = np.arange(1, m) * s
+    given = np.concatenate([head, tail, positions])
+    free = np.setdiff1d(np.arange((m + 1) * s), given)
+    nodal = np.zeros(((m + 1) * s, given.size))
+    nodal[given] = np.eye(given.size)
+    nodal[free] = -np.linalg.solve(total[np.ix_(free, free)], total[np.ix_(free, given)])
+    energy = nodal.T @ total @ nodal
+
+    b, q = np.s_[: 2 * s], np.s_[2 * s :]
+    smooth = -np.linalg.solve(energy[q, q], energy[q, b])
+    whitening = np.linalg.inv(np.linalg.cholesky(energy[q, q])).T if m > 1 else np.zeros((0, 0))
+    norm = np.linalg.norm(whitening, 2) if m > 1 else 1.0
+    whitening = whitening / norm
+    from_offsets = np.eye(given.size)
+    from_offsets[q, b] = smooth
+    from_offsets[q, q] = whitening
+    to_offsets = np.linalg.inv(from_offsets)
+    nodes = nodal @ from_offsets
+    hermite = hermite_map(s)
+    return UniformMinco(
+        order=s,
+        num_pieces=m,
+        coefficients=np.stack([hermite @ nodes[i * s : (i + 2) * s] for i in range(m)]),
+        waypoints=from_offsets[q],
+        offsets=to_offsets[q],
+        boundary_energy=energy[b, b] + energy[b, q] @ smooth,
+        offset_energy=norm**-2,
+    )
+
+
+def boundary_rows(head_state: Array, tail_state: Array, piece_duration: Array) -> Array:
+    """Boundary in the unit time of a piece, (2s, 3): derivative d times h^d."""
+    scale = piece_duration ** jnp.arange(head_state.shape[0])[:, None]
+    return jnp.concatenate([head_state * scale, tail_state * scale])
+
+
+def trajectory_energy(maps: UniformMinco, rows: Array, offsets: Array, piece_duration: Array):
+    """Integral of |p^(s)|^2 over the trajectory, ().
+
+    Args:
+        maps: constant maps of M pieces.
+        rows: (2s, 3) boundary rows.
+        offsets: (M - 1, 3) whitened offsets y.
+        piece_duration: () h [s].
+    """
+    gram = jnp.asarray(maps.boundary_energy, rows.dtype)
+    boundary = jnp.sum(rows * jnp.matmul(gram, rows, precision=lax.Precision.HIGHEST))
+    total = boundary + maps.offset_energy * jnp.sum(offsets**2)
+    return total / piece_duration ** (2 * maps.order - 1)
+
+
+def uniform_trajectory(
+    maps: UniformMinco, rows: Array, offsets: Array, piece_duration: Array
+) -> PiecewisePolynomial:
+    """The trajectory in real time; arguments as in `trajectory_energy`."""
+    unit = jnp.einsum(
+        "mkc,ci->mki",
+        jnp.asarray(maps.coefficients, rows.dtype),
+        jnp.concatenate([rows, offsets]),
+        precision=lax.Precision.HIGHEST,
+    )
+    powers = piece_duration ** jnp.arange(2 * maps.order)
+    return PiecewisePolynomial(
+        coeffs=unit / powers[None, :, None],
+        durations=jnp.full((maps.num_pieces,), piece_duration),
+    )

@@ -1,0 +1,1 @@
+"""Learned policies over the planner: Brax environments, Flax networks and their training."""

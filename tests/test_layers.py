@@ -1,0 +1,107 @@
+"""Imports go downwards: no room of the library knows a room that is built on it."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+OUTSIDE = {"sims", "policies", "benchmarks"}
+BASE = {"ball", "robot", "trajectory"}
+# What each room may import of planner_jax, besides itself.
+ALLOWED = {
+    "ball": BASE,
+    "robot": BASE,
+    "trajectory": BASE,
+    "cost": BASE,
+    "optimise": set(),
+    "task": BASE | {"cost", "optimise"},
+    "referee": set(),
+    "sweep": BASE | {"cost", "optimise", "task", "referee"},
+}
+ALLOWED["cli"] = ALLOWED["__init__"] = ALLOWED.keys() - {"cli", "__init__"}
+MODULES = sorted((ROOT / "planner_jax").rglob("*.py"))
+
+
+def room_of(path):
+    """The folder or module under planner_jax that a file belongs to."""
+    return path.relative_to(ROOT / "planner_jax").parts[0].removesuffix(".py")
+
+
+def dotted_names(statement, package):
+    """Full names that one import statement asks for; relative ones start from `package`."""
+    if isinstance(statement, ast.Import):
+        return [alias.name for alias in statement.names]
+    if isinstance(statement, ast.ImportFrom):
+        base = package[: len(package) - statement.level + 1] if statement.level else ()
+        prefix = ".".join((*base, *filter(None, [statement.module])))
+        return [f"{prefix}.{alias.name}" for alias in statement.names]
+    return []
+
+
+def imports(tree, package=()):
+    """(dotted name, whether it stands inside a function) of every import in a syntax tree."""
+    functions = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)
+    found = []
+
+    def visit(node, lazy):
+        found.extend((name, lazy) for name in dotted_names(node, package))
+        for child in ast.iter_child_nodes(node):
+            visit(child, lazy or isinstance(node, functions))
+
+    visit(tree, False)
+    return found
+
+
+def imports_of(path):
+    return imports(ast.parse(path.read_text()), path.relative_to(ROOT).parent.parts)
+
+
+def name_of(path):
+    return path.relative_to(ROOT).as_posix()
+
+
+def test_imports_are_found_wherever_and_however_they_are_written():
+    source = """
+import jax.numpy as jnp
+from planner_jax import ball
+from planner_jax.task.hit.plan import HitPlan
+def f():
+    from sims.scene import load
+    if True:
+        import policies.env
+from . import lbfgs
+from ..cost import limits
+"""
+    assert imports(ast.parse(source), ("planner_jax", "optimise")) == [
+        ("jax.numpy", False),
+        ("planner_jax.ball", False),
+        ("planner_jax.task.hit.plan.HitPlan", False),
+        ("sims.scene.load", True),
+        ("policies.env", True),
+        ("planner_jax.optimise.lbfgs", False),
+        ("planner_jax.cost.limits", False),
+    ]
+
+
+@pytest.mark.parametrize("path", MODULES, ids=name_of)
+def test_a_module_imports_only_the_rooms_below_its_own(path):
+    room = room_of(path)
+    assert room in ALLOWED, f"{room} is a new room: give it its place in ALLOWED"
+    for name, _ in imports_of(path):
+        package, *inside = name.split(".")
+        if package == "planner_jax":
+            assert inside[:1] and inside[0] in ALLOWED[room] | {room}, f"imports {name}"
+
+
+@pytest.mark.parametrize("path", MODULES, ids=name_of)
+def test_only_the_command_line_reaches_outside_the_library_and_only_when_called(path):
+    for name, lazy in imports_of(path):
+        if name.split(".")[0] in OUTSIDE:
+            assert room_of(path) == "cli" and lazy, f"imports {name}"
+
+
+@pytest.mark.parametrize("path", [m for m in MODULES if room_of(m) == "referee"], ids=name_of)
+def test_the_referee_shares_no_arithmetic_with_the_planners(path):
+    for name, _ in imports_of(path):
+        assert name.split(".")[0] not in {"jax", "jaxlib", "flax", "optax", "chex"}

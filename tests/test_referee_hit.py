@@ -1,0 +1,571 @@
+"""The referee of hit plans, on plans worked out by hand: no planner has a part in this."""
+
+import ast
+import math
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from planner_jax.ball.flight import BallState
+from planner_jax.referee import hit
+from planner_jax.referee.hit import LIMITS, HitVerdict, referee_hits
+from planner_jax.robot.quadrotor import QuadrotorLimits
+from planner_jax.task.hit.plan import HitPlan, Stroke
+from planner_jax.task.hit.scenario import HitLimits, HitScenario
+from planner_jax.trajectory.polynomial import PiecewisePolynomial
+
+GRAVITY, DRAG, RESTITUTION, RACKET_HEIGHT = 9.8, 0.0616, 0.7, 0.06
+IMPACT_TIME, NUM_PIECES = 1.2, 3
+CONTACT = np.array([-2.0, 0.3, 1.8])
+BALL_VEL = np.array([-5.0, -0.4, -5.5])
+
+
+def fall(_, state, drag=DRAG):
+    vel = state[3:]
+    return np.concatenate([vel, -drag * np.linalg.norm(vel) * vel - [0.0, 0.0, GRAVITY]])
+
+
+def flight(pos, vel, span, **options):
+    return solve_ivp(
+        fall,
+        (0.0, span),
+        np.concatenate([pos, vel]),
+        method="DOP853",
+        rtol=1e-12,
+        atol=1e-12,
+        **options,
+    )
+
+
+def derivative_row(time, order, degree):
+    return [
+        math.perm(k, order) * time ** (k - order) if k >= order else 0.0 for k in range(degree + 1)
+    ]
+
+
+def join_states(head, tail, duration):
+    """Coefficients (8, 3) of the polynomial between two states (4, 3)."""
+    rows = [derivative_row(time, n, 7) for time in (0.0, duration) for n in range(4)]
+    return np.linalg.solve(np.array(rows), np.concatenate([head, tail]))
+
+
+def cut(coeffs, durations):
+    """The same polynomial in pieces (M, D + 1, 3), each in its own time."""
+    starts = np.cumsum(durations) - durations
+    degree = len(coeffs) - 1
+    shifts = [
+        [np.array(derivative_row(t, n, degree)) / math.factorial(n) for n in range(degree + 1)]
+        for t in starts
+    ]
+    return np.array(shifts) @ coeffs
+
+
+def volley(*, target=(3.0, 0.0, 0.0), flight_time=1.5, ball_vel=BALL_VEL, pieces=NUM_PIECES):
+    """Leaves, with leading axis 1, of a volley solved backwards from its impact."""
+    target = np.array(target)
+    after = (target - CONTACT) / flight_time + [0.0, 0.0, 0.5 * GRAVITY * flight_time]
+    change = after - BALL_VEL
+    normal = change / np.linalg.norm(change)
+    normal_speed = (RESTITUTION * BALL_VEL + after) @ normal / (1.0 + RESTITUTION)
+    head = np.zeros((4, 3))
+    head[0] = [-3.0, 0.0, 1.5]
+    tail = np.zeros((4, 3))
+    tail[0] = CONTACT - RACKET_HEIGHT * normal
+    tail[1] = normal_speed * normal
+    tail[2] = 1.1 * GRAVITY * normal - [0.0, 0.0, GRAVITY]
+    back = flight(CONTACT, np.asarray(ball_vel), -IMPACT_TIME).y[:, -1]
+    durations = IMPACT_TIME * np.arange(2, pieces + 2) / np.arange(2, pieces + 2).sum()
+    leaves = {
+        "coeffs": cut(join_states(head, tail, IMPACT_TIME), durations),
+        "durations": durations,
+        "stroke.time": IMPACT_TIME,
+        "ball.pos": back[:3],
+        "ball.vel": back[3:],
+        "head_state": head,
+        "target": target,
+        "drag": DRAG,
+        "gravity": GRAVITY,
+        "restitution": RESTITUTION,
+        "racket_height": RACKET_HEIGHT,
+        "limits.speed": 5.0,
+        "limits.acceleration": 15.0,
+        "limits.body_rate": 8.0,
+        "limits.min_height": 0.25,
+        "hit_limits.hitting_speed": [4.0, 3.0, 4.0],
+        "hit_limits.min_apex": 2.2,
+        "hit_limits.max_apex": 6.2,
+    }
+    return {name: np.asarray(leaf, float)[None] for name, leaf in leaves.items()}
+
+
+def objects(leaves):
+    """A scenario and a plan of the referee's own fields alone."""
+
+    def part(room):
+        inside = {name.split(".")[1]: v for name, v in leaves.items() if name.startswith(room)}
+        return SimpleNamespace(**inside)
+
+    scenario = SimpleNamespace(
+        ball=part("ball."),
+        limits=part("limits."),
+        hit_limits=part("hit_limits."),
+        **{name: leaf for name, leaf in leaves.items() if "." not in name},
+    )
+    trajectory = SimpleNamespace(coeffs=leaves["coeffs"], durations=leaves["durations"])
+    return scenario, SimpleNamespace(trajectory=trajectory, stroke=part("stroke."))
+
+
+def judge(leaves, **options) -> HitVerdict:
+    return referee_hits(*objects(leaves), **options)
+
+
+def stack(*cases):
+    return {name: np.concatenate([case[name] for case in cases]) for name in cases[0]}
+
+
+def dense(leaves, order, num=20001):
+    """Times (num,) and a derivative (num, 3) of the first lane, by plain powers."""
+    ends = np.cumsum(leaves["durations"][0])
+    times = np.linspace(0.0, ends[-1], num)
+    piece = np.minimum(np.searchsorted(ends, times, side="right"), len(ends) - 1)
+    local = times - (ends - leaves["durations"][0])[piece]
+    values = np.zeros((num, 3))
+    for k in range(order, leaves["coeffs"].shape[2]):
+        power = math.perm(k, order) * local ** (k - order)
+        values += power[:, None] * leaves["coeffs"][0, piece, k]
+    return times, values
+
+
+def hopf_rotations(acc):
+    """Rotation matrices (n, 3, 3) of the Hopf fibration at zero heading."""
+    thrust = acc + [0.0, 0.0, GRAVITY]
+    z = thrust / np.linalg.norm(thrust, axis=1, keepdims=True)
+    a, b, c = z.T
+    first = np.stack([1.0 - a * a / (1.0 + c), -a * b / (1.0 + c), -a], axis=1)
+    second = np.stack([-a * b / (1.0 + c), 1.0 - b * b / (1.0 + c), -b], axis=1)
+    return np.stack([first, second, z], axis=2)
+
+
+def body_rates(leaves):
+    """Times and body rates [rad/s] by central differences of the attitude."""
+    times, acc = dense(leaves, 2)
+    attitude = hopf_rotations(acc)
+    change = (attitude[2:] - attitude[:-2]) / (times[2:] - times[:-2])[:, None, None]
+    skew = np.swapaxes(attitude[1:-1], 1, 2) @ change
+    rates = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=1)
+    return times[1:-1], np.linalg.norm(rates, axis=1)
+
+
+def test_a_volley_solved_backwards_succeeds():
+    verdict = judge(volley())
+    assert verdict.success[0], verdict.sentence(0)
+    assert verdict.failed_limit[0] == "" and np.isnan(verdict.failed_time[0])
+    assert verdict.head_error[0] < 1e-12 and verdict.continuity_error[0] < 1e-12
+    assert verdict.contact_error[0] < 1e-7
+    assert verdict.landing_error[0] < 1e-6
+    assert verdict.sentence(0).startswith("success: the ball lands")
+
+
+def test_measured_quantities_agree_with_dense_sampling():
+    leaves = volley()
+    verdict = judge(leaves)
+    size = [np.linalg.norm(dense(leaves, order)[1], axis=1) for order in range(4)]
+    thrust = np.linalg.norm(dense(leaves, 2)[1] + [0.0, 0.0, GRAVITY], axis=1)
+    assert verdict.max_speed[0] == pytest.approx(size[1].max(), rel=1e-7)
+    assert verdict.max_acceleration[0] == pytest.approx(size[2].max(), rel=1e-7)
+    assert verdict.min_height[0] == pytest.approx(dense(leaves, 0)[1][:, 2].min(), rel=1e-7)
+    assert verdict.min_thrust[0] == pytest.approx(thrust.min(), rel=1e-7)
+    assert verdict.max_thrust[0] == pytest.approx(thrust.max(), rel=1e-7)
+    np.testing.assert_allclose(verdict.hitting_velocity[0], dense(leaves, 1)[1][-1], rtol=1e-12)
+    np.testing.assert_allclose(verdict.landing_point[0], leaves["target"][0], atol=1e-7)
+
+
+def test_body_rate_agrees_with_finite_differences_of_the_hopf_attitude():
+    leaves = volley()
+    times, rates = body_rates(leaves)
+    verdict = judge(leaves | {"limits.body_rate": np.array([0.5])})
+    assert verdict.max_body_rate[0] == pytest.approx(rates.max(), rel=1e-5)
+    assert verdict.failed_limit[0] == "body rate"
+    assert verdict.failed_time[0] == pytest.approx(times[rates.argmax()], abs=1e-3)
+
+
+def test_pieces_of_one_polynomial_are_judged_alike():
+    one, many = judge(volley(pieces=1)), judge(volley(pieces=9))
+    assert one.success[0] and many.success[0]
+    for name in ("max_speed", "max_acceleration", "max_body_rate", "min_height", "apex"):
+        assert getattr(one, name)[0] == pytest.approx(getattr(many, name)[0], rel=1e-6)
+
+
+@pytest.mark.parametrize("name", ["speed", "acceleration", "body rate"])
+def test_a_lowered_limit_fails_by_name_time_and_excess(name):
+    leaves = volley()
+    times, values = {
+        "speed": lambda: dense(leaves, 1),
+        "acceleration": lambda: dense(leaves, 2),
+        "body rate": lambda: body_rates(leaves),
+    }[name]()
+    sizes = values if values.ndim == 1 else np.linalg.norm(values, axis=1)
+    leaves["limits." + name.replace(" ", "_")] = sizes.max(keepdims=True) / 1.25
+    verdict = judge(leaves)
+    assert not verdict.success[0] and verdict.failed_limit[0] == name
+    assert verdict.failed_excess[0] == pytest.approx(0.25, rel=1e-4)
+    assert verdict.failed_time[0] == pytest.approx(times[sizes.argmax()], abs=1e-3)
+    assert verdict.sentence(0).startswith(f"{name}: 25.00% above its limit at ")
+
+
+def test_ground_fails_where_the_trajectory_is_lowest():
+    leaves = volley()
+    times, pos = dense(leaves, 0)
+    leaves["limits.min_height"] = np.array([pos[:, 2].min() * 1.25])
+    verdict = judge(leaves)
+    assert verdict.failed_limit[0] == "ground"
+    assert verdict.failed_excess[0] == pytest.approx(0.2, rel=1e-6)
+    assert verdict.failed_time[0] == pytest.approx(times[pos[:, 2].argmin()], abs=1e-3)
+    assert "20.00% below the least height" in verdict.sentence(0)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_hitting_speed_fails_on_its_own_axis_at_the_impact(axis):
+    leaves = volley()
+    speed = np.abs(dense(leaves, 1)[1][-1, axis])
+    leaves["hit_limits.hitting_speed"][0, axis] = speed / 1.1
+    verdict = judge(leaves)
+    assert verdict.failed_limit[0] == "hitting speed " + "xyz"[axis]
+    assert verdict.failed_excess[0] == pytest.approx(0.1, rel=1e-6)
+    assert verdict.failed_time[0] == pytest.approx(IMPACT_TIME)
+
+
+@pytest.mark.parametrize("bound, factor", [("min", 1.1), ("max", 0.9)])
+def test_apex_fails_when_the_ball_is_highest(bound, factor):
+    leaves = volley(flight_time=1.5)
+    rise = (-CONTACT[2]) / 1.5 + 0.5 * GRAVITY * 1.5  # vertical speed after the impact
+    apex = CONTACT[2] + rise**2 / (2.0 * GRAVITY)
+    leaves[f"hit_limits.{bound}_apex"] = np.array([apex * factor])
+    verdict = judge(leaves)
+    assert verdict.apex[0] == pytest.approx(apex, rel=1e-7)
+    assert verdict.failed_limit[0] == ("apex low" if bound == "min" else "apex high")
+    assert verdict.failed_excess[0] == pytest.approx(abs(1.0 - factor) / factor, rel=1e-5)
+    assert verdict.failed_time[0] == pytest.approx(IMPACT_TIME + rise / GRAVITY, rel=1e-6)
+
+
+@pytest.mark.parametrize("order", [0, 1, 2, 3])
+def test_a_shifted_head_state_is_seen_in_every_derivative(order):
+    leaves = volley()
+    leaves["head_state"][0, order, 1] += 0.1
+    verdict = judge(leaves)
+    period = IMPACT_TIME / NUM_PIECES
+    assert verdict.failed_limit[0] == "head state" and verdict.failed_time[0] == 0.0
+    assert verdict.failed_excess[0] == pytest.approx(
+        0.1 * period**order / math.factorial(order), rel=1e-6
+    )
+
+
+@pytest.mark.parametrize("order", [0, 1, 2, 3])
+def test_a_jump_between_pieces_is_seen_in_every_derivative(order):
+    leaves = volley()
+    leaves["coeffs"][0, 1:, order, 2] += 0.1 / math.factorial(order)  # from piece 1 on
+    verdict = judge(leaves)
+    period = IMPACT_TIME / NUM_PIECES
+    assert verdict.failed_limit[0] == "continuity"
+    assert verdict.failed_excess[0] >= 0.1 * period**order / math.factorial(order) * (1 - 1e-6)
+    first_joint = leaves["durations"][0, 0]
+    if order == 0:
+        assert verdict.failed_time[0] == pytest.approx(first_joint)
+    assert "jumps by" in verdict.sentence(0)
+
+
+def test_a_target_moved_by_two_centimetres_is_missed_by_them():
+    leaves = volley()
+    leaves["target"][0, :2] += [0.012, -0.016]
+    verdict = judge(leaves)
+    assert verdict.failed_limit[0] == "landing"
+    assert verdict.failed_excess[0] == pytest.approx(0.02, rel=1e-5)
+    assert verdict.failed_time[0] == pytest.approx(IMPACT_TIME + 1.5, rel=1e-6)
+    assert verdict.sentence(0) == "landing: the ball lands 0.02 m from the target at 2.700 s"
+    assert judge(leaves, landing_tolerance=0.021).success[0]
+
+
+def test_a_ball_beside_the_racket_is_no_contact():
+    leaves = volley()
+    leaves["ball.pos"][0, 1] += 0.006
+    verdict = judge(leaves)
+    assert verdict.failed_limit[0] == "contact"
+    assert verdict.failed_excess[0] == pytest.approx(0.006, rel=1e-5)
+    assert judge(leaves, contact_tolerance=0.007).success[0]
+
+
+def test_a_ball_that_runs_away_from_the_racket_is_on_the_wrong_face():
+    verdict = judge(volley(ball_vel=(12.0, 0.0, -5.0)))
+    assert verdict.contact_error[0] < 1e-3
+    assert verdict.failed_limit[0] == "wrong face" and verdict.failed_excess[0] > 0.0
+
+
+@pytest.mark.parametrize("late", [-0.02, 0.02])
+def test_an_impact_claimed_at_another_time_is_a_wrong_contact_time(late):
+    leaves = volley()
+    leaves["stroke.time"] += late
+    verdict = judge(leaves)
+    assert verdict.failed_limit[0] == "contact time"
+    assert verdict.failed_excess[0] == pytest.approx(0.02)
+    assert verdict.failed_time[0] == pytest.approx(IMPACT_TIME)
+
+
+def test_a_trajectory_that_ends_late_misses_the_ball():
+    leaves = volley()
+    leaves["durations"][0, -1] += 0.01
+    leaves["stroke.time"] += 0.01
+    assert judge(leaves).failed_limit[0] == "contact"
+
+
+@pytest.mark.parametrize("duration", [0.0, -0.3])
+def test_a_piece_without_positive_duration_is_a_wrong_contact_time(duration):
+    leaves = volley()
+    leaves["durations"][0, 1] = duration
+    leaves["stroke.time"] = leaves["durations"].sum(axis=1)
+    assert judge(leaves).failed_limit[0] == "contact time"
+
+
+def test_a_ball_that_has_landed_is_a_wrong_contact_time():
+    leaves = volley()
+    leaves["ball.pos"][0, 2] -= CONTACT[2] + 0.01
+    verdict = judge(leaves)
+    assert verdict.failed_limit[0] == "contact time"
+    assert verdict.failed_excess[0] == pytest.approx(0.01 / -BALL_VEL[2], rel=1e-5)
+
+
+def test_limits_are_met_to_a_relative_thousandth():
+    leaves = volley()
+    fastest = judge(leaves).max_speed
+    assert judge(leaves | {"limits.speed": fastest / 1.0009}).success[0]
+    assert not judge(leaves | {"limits.speed": fastest / 1.0011}).success[0]
+    assert not judge(leaves | {"limits.speed": fastest / 1.0009}, tolerance=0.0).success[0]
+
+
+def test_a_peak_between_samples_is_found_on_the_polynomial():
+    lowest = 20.0 * 100.5 / 200.0  # half-way between two of the 201 samples of 20 s
+    coeffs = np.zeros((1, 1, 3, 3))
+    coeffs[0, 0, :, 2] = [0.25 + lowest**2, -2.0 * lowest, 1.0]  # 0.25 + (t - lowest)^2
+    leaves = volley() | {
+        "coeffs": coeffs,
+        "durations": np.array([[20.0]]),
+        "limits.min_height": np.array([0.252]),
+    }
+    sampled = 0.25 + (np.linspace(0.0, 20.0, 201) - lowest) ** 2
+    assert sampled.min() > 0.252
+    assert judge(leaves, samples=200).min_height[0] == pytest.approx(0.25, abs=1e-5)
+
+
+@pytest.mark.parametrize("centre", [0.30321, 0.6004, 0.8999])
+def test_a_narrow_peak_of_the_body_rate_is_found_where_the_thrust_nearly_vanishes(centre):
+    # tau = (5 t, 0.3, 40 (t - centre)^2 + 0.5): the attitude turns fast near the centre.
+    leaves = volley()
+    coeffs = np.zeros((1, 1, 5, 3))
+    coeffs[0, 0, 0, 2] = 1.5
+    coeffs[0, 0, 2, 1] = 0.5 * 0.3
+    coeffs[0, 0, 3, 0] = 5.0 / 6.0
+    coeffs[0, 0, 2, 2] = 0.5 * (40.0 * centre**2 + 0.5 - GRAVITY)
+    coeffs[0, 0, 3:, 2] = [-80.0 * centre / 6.0, 40.0 / 12.0]
+    leaves |= {"coeffs": coeffs, "durations": np.array([[IMPACT_TIME]])}
+    _, rates = body_rates(leaves)
+    assert judge(leaves).max_body_rate[0] == pytest.approx(rates.max(), rel=1e-4)
+
+
+def test_a_thrust_that_changes_sign_between_samples_turns_the_quadrotor_over():
+    # tau_z = 1 - 4 t with next to nothing across: no sample sees a body rate.
+    leaves = volley()
+    coeffs = np.zeros((1, 1, 4, 3))
+    coeffs[0, 0, 0, 2], coeffs[0, 0, 2, 0] = 3.0, 1e-9
+    coeffs[0, 0, 2:, 2] = [0.5 * (1.0 - GRAVITY), -4.0 / 6.0]
+    leaves |= {"coeffs": coeffs, "durations": np.array([[0.33]])}
+    verdict = judge(leaves)
+    assert verdict.min_thrust[0] < 1e-3
+    assert verdict.max_body_rate[0] > 100.0
+
+
+def returned_ball(leaves):
+    """State of the ball just after the impact, from the volley's construction."""
+    after = (leaves["target"][0] - CONTACT) / 1.5 + [0.0, 0.0, 0.5 * GRAVITY * 1.5]
+    return CONTACT, after
+
+
+def test_drag_after_the_impact_shortens_the_return_as_integrated():
+    leaves = volley()
+
+    def landed(_, state):
+        return state[2]
+
+    landed.terminal, landed.direction = True, -1.0
+    path = flight(*returned_ball(leaves), 5.0, events=landed, dense_output=True)
+    verdict = judge(leaves, drag_after_impact=True)
+    assert verdict.failed_limit[0] == "landing"
+    assert verdict.failed_time[0] == pytest.approx(IMPACT_TIME + path.t[-1], abs=1e-7)
+    np.testing.assert_allclose(verdict.landing_point[0], path.y[:3, -1], atol=1e-6)
+    assert verdict.landing_point[0, 0] < leaves["target"][0, 0] - 0.3
+    heights = path.sol(np.linspace(0.0, path.t[-1], 100001))[2]
+    assert verdict.apex[0] == pytest.approx(heights.max(), abs=1e-7)
+    aimed = leaves | {"target": path.y[None, :3, -1]}
+    assert judge(aimed, drag_after_impact=True).success[0]
+    assert not judge(aimed).success[0]
+
+
+def test_without_drag_both_returns_agree():
+    leaves = volley()
+    # The ball comes in on another path then, so that only the return is compared.
+    leaves["drag"] = np.zeros(1)
+    vacuum, air = judge(leaves), judge(leaves, drag_after_impact=True)
+    np.testing.assert_allclose(air.landing_point, vacuum.landing_point, atol=1e-9)
+    np.testing.assert_allclose(air.apex, vacuum.apex, rtol=1e-12)
+
+
+@pytest.mark.parametrize("drag_after_impact", [False, True])
+def test_a_ball_that_never_reaches_the_target_height_does_not_land(drag_after_impact):
+    leaves = volley()
+    leaves["target"][0, 2] = 9.0
+    verdict = judge(leaves, drag_after_impact=drag_after_impact)
+    assert verdict.failed_limit[0] == "landing" and np.isinf(verdict.landing_error[0])
+    assert np.isnan(verdict.landing_point[0]).all()
+    assert "never comes down to the target's height" in verdict.sentence(0)
+
+
+def test_free_fall_has_no_attitude():
+    coeffs = np.zeros((1, 1, 3, 3))
+    coeffs[0, 0, :, 2] = [3.0, 0.0, -0.5 * GRAVITY]
+    head = np.zeros((1, 4, 3))
+    head[0, 0, 2], head[0, 2, 2] = 3.0, -GRAVITY
+    verdict = judge(
+        volley()
+        | {
+            "coeffs": coeffs,
+            "durations": np.array([[0.3]]),
+            "stroke.time": np.array([0.3]),
+            "head_state": head,
+        }
+    )
+    assert verdict.failed_limit[0] == "body rate" and np.isinf(verdict.max_body_rate[0])
+    assert "without attitude" in verdict.sentence(0)
+
+
+def unequal_lanes():
+    fast, shifted, missed = volley(), volley(flight_time=1.4), volley(target=(3.0, -1.0, 0.0))
+    fast["limits.speed"] /= 4.0
+    shifted["head_state"][0, 0] += 0.2
+    missed["target"][0, 0] += 0.5
+    return [volley(), fast, volley(flight_time=1.6), shifted, missed, volley(target=(3.5, 1, 0))]
+
+
+def assert_same(a: HitVerdict, b: HitVerdict, lanes=slice(None)):
+    for name, left in vars(a).items():
+        right = getattr(b, name)
+        if left.dtype.kind == "f":
+            np.testing.assert_allclose(left[lanes], right[lanes], rtol=1e-12, atol=1e-12)
+        else:
+            np.testing.assert_array_equal(left[lanes], right[lanes], err_msg=name)
+
+
+@pytest.mark.parametrize("drag_after_impact", [False, True])
+@pytest.mark.parametrize("chunk", [1, 4, 512])
+def test_batch_equals_loop(chunk, drag_after_impact):
+    lanes = unequal_lanes()
+    batch = judge(stack(*lanes), chunk=chunk, drag_after_impact=drag_after_impact)
+    for i, lane in enumerate(lanes):
+        alone = judge(lane, drag_after_impact=drag_after_impact)
+        assert_same(alone, HitVerdict(**{k: v[i : i + 1] for k, v in vars(batch).items()}))
+    assert len(set(batch.failed_limit)) >= (2 if drag_after_impact else 4)
+
+
+@pytest.mark.parametrize("drag_after_impact", [False, True])
+@pytest.mark.parametrize("name", sorted(volley()))
+def test_a_nan_fails_its_own_lane_and_no_other(name, drag_after_impact):
+    leaves = stack(*unequal_lanes())
+    clean = judge(leaves, drag_after_impact=drag_after_impact)
+    leaves[name][(2,) + (-1,) * (leaves[name].ndim - 1)] = np.nan
+    verdict = judge(leaves, drag_after_impact=drag_after_impact)
+    assert not verdict.success[2] and verdict.failed_limit[2] == "not finite"
+    assert verdict.sentence(2) == "not finite: the plan or its scenario is not finite"
+    assert_same(clean, verdict, lanes=[0, 1, 3, 4, 5])
+
+
+@pytest.mark.parametrize("name", ["coeffs", "durations", "ball.vel", "drag", "head_state"])
+@pytest.mark.parametrize("value", [1e300, -1e30, np.inf])
+def test_absurd_numbers_fail_without_a_warning(name, value):
+    leaves = volley()
+    leaves[name] = np.full_like(leaves[name], value)
+    for drag_after_impact in (False, True):
+        assert not judge(leaves, drag_after_impact=drag_after_impact).success[0]
+
+
+def test_an_infinite_limit_is_no_limit():
+    leaves = volley()
+    for name in ("limits.speed", "limits.acceleration", "limits.body_rate", "hit_limits.max_apex"):
+        leaves[name] = np.array([np.inf])
+    leaves["limits.min_height"] = np.array([-np.inf])
+    leaves["hit_limits.hitting_speed"] = np.full((1, 3), np.inf)
+    assert judge(leaves).success[0]
+
+
+def test_float32_structs_of_the_planner_are_taken_as_they_are():
+    leaves = {name: jnp.float32(leaf) for name, leaf in stack(volley(), volley()).items()}
+    plain, _ = objects(leaves)
+    scenario = HitScenario(
+        ball=BallState(**vars(plain.ball)),
+        limits=QuadrotorLimits(**vars(plain.limits)),
+        hit_limits=HitLimits(**vars(plain.hit_limits)),
+        **{
+            name: leaves[name]
+            for name in ("head_state", "target", "drag", "gravity", "restitution", "racket_height")
+        },
+    )
+    blank = np.full(2, np.nan)  # what the plan claims beside its impact time is not read
+    plan = HitPlan(
+        trajectory=PiecewisePolynomial(coeffs=leaves["coeffs"], durations=leaves["durations"]),
+        stroke=Stroke(leaves["stroke.time"], blank, blank, blank, blank, blank),
+        cost=blank,
+        violation=blank,
+        iterations=blank,
+        status=blank,
+    )
+    verdict = referee_hits(scenario, plan)
+    assert verdict.success.all(), verdict.sentence(0)
+    assert verdict.max_speed.dtype == np.float64
+
+
+def test_an_empty_batch_has_an_empty_verdict():
+    verdict = judge({name: leaf[:0] for name, leaf in volley().items()})
+    assert verdict.success.shape == (0,) and verdict.hitting_velocity.shape == (0, 3)
+
+
+def test_wrong_arguments_are_named():
+    leaves = volley()
+    with pytest.raises(ValueError, match=r"samples must be >= 200, got 50"):
+        judge(leaves, samples=50)
+    with pytest.raises(ValueError, match=r"chunk must be >= 1, got 0"):
+        judge(leaves, chunk=0)
+    with pytest.raises(ValueError, match=r"target must be \(1, 3\), got \(3,\)"):
+        judge(leaves | {"target": np.zeros(3)})
+    with pytest.raises(ValueError, match=r"coeffs must be \(B, M, D \+ 1, 3\), got \(3, 8, 3\)"):
+        judge(leaves | {"coeffs": leaves["coeffs"][0]})
+
+
+def test_the_referee_imports_numpy_and_the_standard_library_alone():
+    tree = ast.parse(Path(hit.__file__).read_text())
+    roots = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            roots |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0
+            roots.add(node.module.split(".")[0])
+    assert roots <= {"numpy"} | set(sys.stdlib_module_names)
+
+
+def test_every_limit_has_its_sentence():
+    lanes = len(LIMITS)
+    blank = {name: np.zeros(lanes) for name in HitVerdict.__dataclass_fields__}
+    verdict = HitVerdict(**blank | {"failed_limit": np.array(LIMITS)})
+    for lane, name in enumerate(LIMITS):
+        assert verdict.sentence(lane).startswith(f"{name}: ")

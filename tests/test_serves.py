@@ -1,0 +1,461 @@
+"""Court, published trial files, generated serves and the checks before planning."""
+
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from planner_jax.ball import flight
+from planner_jax.task.hit import court
+from planner_jax.task.hit.scenario import hit_scenario
+from planner_jax.task.hit.serves import (
+    DEPTH,
+    MAX_FLIGHT_TIME,
+    MIN_APPROACH_SPEED,
+    RISE_SPEED,
+    SERVE_HEIGHT,
+    advance,
+    generate_serves,
+    read_serves,
+    to_scenarios,
+)
+from planner_jax.task.hit.validate import (
+    DRAG,
+    GRAVITY,
+    ScenarioError,
+    ServeError,
+    check_scenarios,
+    fly,
+    landing,
+)
+
+PUBLISHED = Path(__file__).resolve().parents[2] / "shared" / "data" / "serves"
+needs_published = pytest.mark.skipif(
+    not PUBLISHED.is_dir(), reason="the published trial files are not beside the repository"
+)
+
+HEADER = (
+    "number,serve position,serve velocity,landing position,target,"
+    "drone hitting positon,drone hitting velocity,drone hitting attitude"
+)
+HIT = " -2.1 -0.3   1.5,  1.8 -0.2 1.1,-0.01  0.2  -0.002  0.97"
+MISS = "failed,failed,failed"
+
+
+def row(number=1, position=" 2.5 -0.3       2", velocity=" -4.3 0.02  7.3", hit=HIT):
+    return f"{number},{position},{velocity},-2.9 -0.3        0,1.75    0    0,{hit}"
+
+
+def write(folder, name, *rows, header=HEADER):
+    (folder / name).write_text("\n".join([header, *rows]) + "\n")
+
+
+def floor_points(position, velocity, step=1e-3):
+    """Landing points by the midpoint rule, the last step cut by a straight line."""
+    position, velocity = position.copy(), velocity.copy()
+    point = np.full_like(position, np.nan)
+
+    def acceleration(v):
+        return [0.0, 0.0, -GRAVITY] - DRAG * np.linalg.norm(v, axis=1, keepdims=True) * v
+
+    for _ in range(2000):
+        middle = velocity + 0.5 * step * acceleration(velocity)
+        after = position + step * middle
+        crossed = (position[:, 2] > 0.0) & (after[:, 2] <= 0.0)
+        share = position[:, 2:] / np.where(crossed, position[:, 2] - after[:, 2], 1.0)[:, None]
+        point = np.where(crossed[:, None], position + share * (after - position), point)
+        position, velocity = after, velocity + step * acceleration(middle)
+    return point
+
+
+# The court.
+
+
+def test_the_court_has_36_scenarios_without_mirror_images():
+    assert len(court.SCENARIOS) == len(set(court.SCENARIOS)) == 36
+    mirror = str.maketrans("LR", "RL")
+    assert not [
+        n for n in court.SCENARIOS if (m := n.translate(mirror)) != n and m in court.SCENARIOS
+    ]
+    assert court.SCENARIOS[:4] == ("NNN", "NNF", "NNL", "NFN") and court.SCENARIOS[-1] == "LRR"
+
+
+def test_published_rates_have_the_known_means():
+    rates = court.published_rates()
+    np.testing.assert_allclose(rates.paper.mean(axis=0), [12.66, 47.86, 77.91], atol=5e-3)
+    np.testing.assert_allclose(rates.trials.mean(axis=0), [9.42, 46.57, 85.38], atol=5e-3)
+    np.testing.assert_allclose(rates.paper[court.SCENARIOS.index("FLR")], [0.3, 60.6, 85.4])
+
+
+@pytest.mark.parametrize("half", [1.0, -1.0])
+def test_a_point_lies_in_the_same_region_of_either_half(half):
+    x = np.array([1.0, 4.0, 2.0, 4.9, 0.4, 5.1, 2.0, np.nan])
+    y = np.array([0.8, -0.8, 0.9, -2.4, 0.0, 0.0, 2.6, 0.0])
+    np.testing.assert_array_equal(court.region_of(half * x, y), [1, 2, 3, 4, 0, 0, 0, 0])
+
+
+def test_each_target_lies_in_the_region_that_its_scenario_names():
+    target = court.target_of(np.arange(36))
+    named = [1 + court.REGIONS.index(name[2]) for name in court.SCENARIOS]
+    np.testing.assert_array_equal(court.region_of(target[:, 0], target[:, 1]), named)
+
+
+# The published files.
+
+
+def test_trial_files_are_read_with_the_outcome_of_each_planner(tmp_path):
+    write(tmp_path, "1_1_2_p.csv", row(1), row(2, position="1.5 0.2 2"))
+    write(tmp_path, "1_1_2_l.csv", row(1, hit=MISS), row(2, position="  1.5  0.2       2"))
+    write(tmp_path, "1_1_2_b.csv", row(1, hit=MISS), row(2, position="1.5 0.2 2", hit=MISS))
+    (tmp_path / "README.md").write_text("not a trial file")
+    serves = read_serves(tmp_path)
+    np.testing.assert_array_equal(serves.position, [[2.5, -0.3, 2.0], [1.5, 0.2, 2.0]])
+    np.testing.assert_array_equal(serves.velocity[0], [-4.3, 0.02, 7.3])
+    np.testing.assert_array_equal(serves.target[0], [1.75, 0.0, 0.0])
+    np.testing.assert_array_equal(serves.published, [[0, 0, 1], [0, 1, 1]])
+    assert [court.SCENARIOS[s] for s in serves.scenario] == ["NNF", "NNF"]
+    assert list(serves.file) == ["1_1_2_b.csv"] * 2 and list(serves.line) == [2, 3]
+
+
+def test_a_missing_planner_is_nan_and_scenarios_take_turns(tmp_path):
+    write(tmp_path, "3_4_4_l.csv", row(1), row(2, hit=MISS))
+    write(tmp_path, "1_1_1_p.csv", row(1), row(2), row(3))
+    serves = read_serves(tmp_path)
+    names = [court.SCENARIOS[s] for s in serves.scenario]
+    assert names == ["NNN", "LRR", "NNN", "LRR", "NNN"]
+    np.testing.assert_array_equal(serves.published[1], [np.nan, 1, np.nan])
+    np.testing.assert_array_equal(serves[names.index("LRR") :: 2].line, [2, 3])
+
+
+def test_an_absent_or_unsuitable_folder_is_named(tmp_path):
+    with pytest.raises(ServeError, match="existing folder, got .*nowhere"):
+        read_serves(tmp_path / "nowhere")
+    with pytest.raises(ServeError, match="S_L_T_M.csv files, got none"):
+        read_serves(tmp_path)
+    write(tmp_path, "1_1_4_p.csv", row())
+    with pytest.raises(ServeError, match=r"36 scenarios, got 1_1_4_p.csv \(NNR"):
+        read_serves(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "bad, says",
+    [
+        ("1,2", "row must have 8 columns between commas, got 2"),
+        (row(position="2.5 nan 2"), "serve position must be 3 finite numbers, got '2.5 nan 2'"),
+        (row(velocity="-4 inf 7"), "serve velocity must be 3 finite numbers, got '-4 inf 7'"),
+        (row(velocity="-4 7"), "serve velocity must be 3 finite numbers, got '-4 7'"),
+        (row(hit="failed,1 2 3,failed"), "hitting position must be 3 finite numbers, got 'failed'"),
+        (row(velocity="-1 0 3"), "serve must land in the hitting half, x < 0, got x = 1."),
+        (row(velocity="4.3 0 7"), "serve must land in the hitting half, x < 0, got x = 7."),
+        (row(velocity="-4e200 0 7e200"), "serve must land in the hitting half, x < 0, got x = nan"),
+        (row(position="2.5 0 -2"), "serve height must be > 0, got -2"),
+    ],
+)
+def test_a_bad_row_is_named_by_file_line_rule_and_value(tmp_path, bad, says):
+    write(tmp_path, "1_1_1_p.csv", row(), bad)
+    with pytest.raises(ServeError) as caught:
+        read_serves(tmp_path)
+    assert f"1_1_1_p.csv:3: {says}" in str(caught.value)
+    assert "\n" not in str(caught.value) and len(caught.value.problems) == 1
+
+
+def test_all_bad_rows_are_collected_and_the_first_few_spelled_out(tmp_path):
+    write(tmp_path, "1_1_1_p.csv", *["broken"] * 4, row())
+    write(tmp_path, "1_1_2_p.csv", *["broken"] * 3)
+    with pytest.raises(ServeError, match="1_1_2_p.csv:2: .*; and 2 more$") as caught:
+        read_serves(tmp_path)
+    assert len(caught.value.problems) == 7
+
+
+@pytest.mark.parametrize("text", ["", HEADER + "\n"])
+def test_an_empty_file_is_named_once(tmp_path, text):
+    write(tmp_path, "1_1_1_p.csv", row())
+    (tmp_path / "1_1_1_l.csv").write_text(text)
+    with pytest.raises(ServeError, match="1_1_1_l.csv: file must have a row") as caught:
+        read_serves(tmp_path)
+    assert len(caught.value.problems) == 1
+
+
+def test_files_of_one_scenario_must_hold_the_same_serves(tmp_path):
+    write(tmp_path, "1_1_1_b.csv", row(), row(2), row(3))
+    write(tmp_path, "1_1_1_p.csv", row(), row(2, position="2.6 0 2"))
+    with pytest.raises(ServeError) as caught:
+        read_serves(tmp_path)
+    changed, missing = caught.value.problems
+    assert changed.startswith(
+        "1_1_1_p.csv:3: serve must be the one in 1_1_1_b.csv, [2.5, -0.3, 2.0"
+    )
+    assert missing == "1_1_1_p.csv:4: serve must be the one in 1_1_1_b.csv, got no such line"
+
+
+@needs_published
+def test_the_published_serves_are_read_with_their_rates():
+    serves = read_serves(PUBLISHED)
+    assert len(serves) == 9000
+    np.testing.assert_array_equal(np.bincount(serves.scenario), np.full(36, 250))
+    np.testing.assert_allclose(serves.target, court.target_of(serves.scenario))
+    # 250 of the 1,000 trials of each scenario: the means are near, not equal.
+    rates = 100.0 * serves.published.mean(axis=0)
+    np.testing.assert_allclose(rates, court.published_rates().trials.mean(axis=0), atol=1.0)
+
+
+# Flight on the host.
+
+
+def test_the_host_flies_a_ball_as_the_library_does(float64):
+    position, velocity = np.array([2.0, 0.3, 2.0]), np.array([-5.0, 1.0, 7.0])
+    ball = flight.BallState(pos=jnp.asarray(position), vel=jnp.asarray(velocity))
+    there, _ = flight.fly(ball, 1.3, DRAG, GRAVITY, num_steps=16)
+    pos, vel = fly(position, velocity, 1.3, DRAG, GRAVITY)
+    np.testing.assert_allclose(pos, there.pos, rtol=1e-12)
+    np.testing.assert_allclose(vel, there.vel, rtol=1e-12)
+
+
+def test_without_drag_the_landing_is_the_closed_form():
+    position = np.array([[1.0, 0.0, 2.0], [0.0, 0.0, 0.1], [2.0, 1.0, 5.0]])
+    velocity = np.array([[-3.0, 0.5, 7.0], [1.0, 0.0, 0.0], [-4.0, 0.0, -20.0]])
+    time, point = landing(position, velocity, 0.0, GRAVITY)
+    rise, height = velocity[:, 2], position[:, 2]
+    expected = (rise + np.sqrt(rise**2 + 2.0 * GRAVITY * height)) / GRAVITY
+    np.testing.assert_allclose(time, expected, rtol=1e-12)
+    np.testing.assert_allclose(point[:, :2], (position + expected[:, None] * velocity)[:, :2])
+    np.testing.assert_allclose(point[:, 2], 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("drag", [0.0616, 1.0])
+def test_the_landing_point_agrees_with_a_fine_integration(drag):
+    position, velocity = np.array([0.0, 0.0, 2.0]), np.array([20.0, -3.0, 15.0])
+    time, point = landing(position, velocity, drag, GRAVITY)
+    fine, _ = fly(position, velocity, time, drag, GRAVITY, num_steps=4000)
+    np.testing.assert_allclose(point, fine, atol=1e-3)
+
+
+# Generated serves.
+
+
+def same(first, second):
+    return all(
+        np.array_equal(getattr(first, name), getattr(second, name))
+        for name in ("position", "velocity", "target", "scenario", "index")
+    )
+
+
+def test_fewer_serves_are_the_first_of_more_and_chunks_join():
+    whole = generate_serves(4700, 7)  # over the seam of two blocks
+    assert same(generate_serves(40, 7), whole[:40])
+    assert same(generate_serves(200, 7, start=4500), whole[4500:])
+    assert not np.allclose(generate_serves(40, 8).velocity, whole.velocity[:40])
+
+
+def test_every_run_of_36_serves_covers_the_court_in_shuffled_order():
+    runs = generate_serves(360, 0).scenario.reshape(10, 36)
+    np.testing.assert_array_equal(np.sort(runs, axis=1), np.tile(np.arange(36), (10, 1)))
+    assert len(np.unique(runs, axis=0)) == 10
+    some = generate_serves(20, 0, ["LRR", "FFN"]).scenario
+    assert (
+        {court.SCENARIOS[s] for s in some[:2]}
+        == {"LRR", "FFN"}
+        == {court.SCENARIOS[s] for s in some}
+    )
+
+
+def test_serves_start_and_land_in_their_regions():
+    serves = generate_serves(36 * 20, 3)
+    regions = court.scenario_regions(serves.scenario)
+    x, y, z = serves.position.T
+    assert (x > 0.0).all() and (z == SERVE_HEIGHT).all()
+    np.testing.assert_array_equal(court.region_of(x, y), regions[:, 0])
+    point = floor_points(serves.position, serves.velocity)
+    # A landing point within the error of the two integrations of a line may fall beyond it.
+    inward = [
+        court.region_of(point[:, 0] + dx, point[:, 1] + dy)
+        for dx, dy in [(0, 0), (1e-3, 0), (-1e-3, 0), (0, 1e-3), (0, -1e-3)]
+    ]
+    assert (np.stack(inward) == regions[:, 1]).any(axis=0).all()
+    assert (point[:, 0] < 0.0).all() and (np.abs(point[:, 0]) < DEPTH + 1e-3).all()
+    np.testing.assert_allclose(serves.target, court.target_of(serves.scenario))
+
+
+def test_serves_keep_the_declared_law():
+    serves = generate_serves(3600, 1)
+    time, _ = landing(serves.position, serves.velocity, DRAG, GRAVITY)
+    assert time.max() < MAX_FLIGHT_TIME + 1e-5 and time.min() > 1.49
+    assert serves.velocity[:, 0].max() <= -MIN_APPROACH_SPEED
+    rise = serves.velocity[:, 2]
+    assert rise.min() >= RISE_SPEED[0] and rise.max() <= RISE_SPEED[1]
+
+
+def test_the_shortcut_of_the_generator_draws_uniform_serves():
+    """Against the plain way: uniform serves, those kept that land in the region."""
+    random = np.random.default_rng(0)
+    low, high = [0.5, 0.84, 2.0, -8.5, -5.5, 6.5], [4.5, 2.5, 2.0, -2.0, -0.5, 8.73]
+    plain = random.uniform(low, high, (40000, 6))
+    time, point = landing(plain[:, :3], plain[:, 3:], DRAG, GRAVITY)
+    kept = (court.region_of(point[:, 0], point[:, 1]) == 4) & (time < MAX_FLIGHT_TIME)
+    plain = plain[kept & (point[:, 0] < 0.0) & (point[:, 0] > -DEPTH)]
+    serves = generate_serves(8000, 0, ["LRN"])
+    shortcut = np.hstack([serves.position, serves.velocity])
+    deciles = np.linspace(0.1, 0.9, 9)
+    spread = np.maximum(plain.std(axis=0), 1e-9)
+    gap = (np.quantile(shortcut, deciles, axis=0) - np.quantile(plain, deciles, axis=0)) / spread
+    assert len(plain) > 3000 and np.abs(gap).max() < 0.1
+
+
+@needs_published
+def test_generated_serves_are_distributed_as_the_published_ones():
+    published, generated = read_serves(PUBLISHED), generate_serves(36000, 0)
+    pair = np.array([name[:2] for name in court.SCENARIOS])
+
+    def features(serves):
+        time, point = landing(serves.position, serves.velocity, DRAG, GRAVITY)
+        return np.column_stack([serves.position[:, :2], point[:, :2], serves.velocity, time])
+
+    ours, theirs = features(generated), features(published)
+    levels = [0.05, 0.25, 0.5, 0.75, 0.95]
+    for name in np.unique(pair):
+        a, b = ours[pair[generated.scenario] == name], theirs[pair[published.scenario] == name]
+        # The serves of one pair of regions stand in three or four files: 250 different ones.
+        share = np.stack([(b <= q).mean(axis=0) for q in np.quantile(a, levels, axis=0)])
+        assert np.abs(share - np.array(levels)[:, None]).max() < 0.1, name
+    np.testing.assert_allclose(ours.mean(axis=0), theirs.mean(axis=0), atol=0.035)
+
+
+@pytest.mark.parametrize(
+    "arguments, says",
+    [
+        ({"num": 0}, "num must be >= 1, got 0"),
+        ({"seed": -1}, "seed must be >= 0, got -1"),
+        ({"start": -5}, "start must be >= 0, got -5"),
+        ({"scenarios": ["NNN", "NNR"]}, "scenarios must be names out of .*, got NNR"),
+        ({"scenarios": []}, "scenarios must be names out of .*, got none"),
+    ],
+)
+def test_arguments_of_the_generator_out_of_range_are_named(arguments, says):
+    with pytest.raises(ServeError, match=says):
+        generate_serves(**{"num": 1, "seed": 0, **arguments})
+
+
+# From serves to scenarios.
+
+
+def test_two_delays_in_a_row_are_their_sum():
+    serves = generate_serves(36, 0)
+    late = advance(serves, 0.8)
+    twice = advance(advance(serves, 0.5), 0.3)
+    np.testing.assert_allclose(late.position, twice.position, atol=1e-5)
+    np.testing.assert_allclose(late.velocity, twice.velocity, atol=1e-5)
+    time, point = landing(serves.position, serves.velocity, DRAG, GRAVITY)
+    later_time, later_point = landing(late.position, late.velocity, DRAG, GRAVITY)
+    np.testing.assert_allclose(later_time, time - 0.8, atol=1e-4)
+    np.testing.assert_allclose(later_point, point, atol=1e-3)
+
+
+@pytest.mark.parametrize("delay", [-0.1, float("nan"), float("inf")])
+def test_a_delay_must_be_finite_and_not_negative(delay):
+    with pytest.raises(ServeError, match=f"delay must be finite and >= 0, got {delay:g}"):
+        advance(generate_serves(2, 0), delay)
+
+
+def test_a_delay_beyond_the_flight_names_the_serve():
+    serves = generate_serves(50, 0)
+    time, _ = landing(serves.position, serves.velocity, DRAG, GRAVITY)
+    first = np.argmax(time <= 1.6)
+    with pytest.raises(ServeError, match=f"{time[first]:.3f} s for serve {first}, got 1.6"):
+        to_scenarios(serves, delay=1.6)
+
+
+def test_scenarios_carry_the_serves_and_the_setting_of_the_paper():
+    serves = generate_serves(5, 0)
+    scenarios = to_scenarios(serves, limit_scale=0.5)
+    np.testing.assert_allclose(scenarios.ball.pos, serves.position, rtol=1e-6)
+    np.testing.assert_allclose(scenarios.target, serves.target, rtol=1e-6)
+    np.testing.assert_allclose(scenarios.head_state[:, 0], np.tile([-3.0, 0.0, 1.5], (5, 1)))
+    np.testing.assert_array_equal(scenarios.limits.speed, np.full(5, 2.5))
+    np.testing.assert_array_equal(scenarios.hit_limits.hitting_speed[0], [4.0, 3.0, 4.0])
+    assert scenarios.drag.dtype == jnp.float32
+    plain = hit_scenario(serves.position, serves.velocity, serves.target)
+    np.testing.assert_array_equal(scenarios.drag, plain.drag)
+    np.testing.assert_array_equal(scenarios.gravity, plain.gravity)
+
+
+def test_uniform_starts_fill_the_half_court_and_belong_to_their_serve():
+    serves = generate_serves(3000, 0)
+    start = np.asarray(to_scenarios(serves, start="uniform", seed=1).head_state[:, 0])
+    assert (start[:, 2] == 1.5).all()
+    np.testing.assert_allclose(start[:, :2].min(axis=0), [-5.0, -2.5], atol=0.01)
+    np.testing.assert_allclose(start[:, :2].max(axis=0), [-0.5, 2.5], atol=0.01)
+    np.testing.assert_allclose(start[:, :2].mean(axis=0), [-2.75, 0.0], atol=0.1)
+    part = to_scenarios(serves[1000:1100], start="uniform", seed=1).head_state[:, 0]
+    np.testing.assert_array_equal(part, start[1000:1100])
+    other = to_scenarios(serves[:10], start="uniform", seed=2).head_state[:, 0]
+    assert not np.allclose(other, start[:10])
+
+
+@pytest.mark.parametrize(
+    "arguments, says",
+    [
+        ({"limit_scale": 0.0}, "limit_scale must be finite and > 0, got 0"),
+        ({"limit_scale": float("nan")}, "limit_scale must be finite and > 0, got nan"),
+        ({"start": "random"}, "start must be three numbers or 'uniform', got 'random'"),
+        (
+            {"start": (1.0, 2.0)},
+            r"start must be three finite numbers or 'uniform', got \(1.0, 2.0\)",
+        ),
+        ({"start": "uniform", "seed": -1}, "seed must be >= 0, got -1"),
+    ],
+)
+def test_arguments_of_scenarios_out_of_range_are_named(arguments, says):
+    with pytest.raises(ServeError, match=says):
+        to_scenarios(generate_serves(1, 0), **arguments)
+
+
+# The check before planning.
+
+
+def test_generated_scenarios_pass_the_check_early_and_late_and_one_by_one():
+    serves = generate_serves(72, 0)
+    check_scenarios(to_scenarios(serves))
+    check_scenarios(to_scenarios(serves, delay=0.8, start="uniform", limit_scale=0.35))
+    check_scenarios(hit_scenario(serves.position[0], serves.velocity[0], serves.target[0]))
+
+
+SERVE = ([2.0, 0.0, 2.0], [-4.0, 0.0, 7.0], [4.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    "setting, says",
+    [
+        ({"speed": -5.0}, "limits.speed must be > 0, got -5"),
+        ({"acceleration": 0.0}, "limits.acceleration must be > 0, got 0"),
+        ({"body_rate": float("nan")}, "limits.body_rate must be finite, got nan"),
+        ({"min_height": -0.1}, "limits.min_height must be >= 0, got -0.1"),
+        ({"hitting_speed": (4.0, -3.0, 4.0)}, "hit_limits.hitting_speed must be > 0, got -3"),
+        ({"gravity": 0.0}, "gravity must be > 0, got 0"),
+        ({"drag": -0.1}, "drag must be >= 0, got -0.1"),
+        ({"restitution": 1.2}, "restitution must be in [0, 1], got 1.2"),
+        ({"min_apex": 7.0}, "hit_limits.min_apex must be < hit_limits.max_apex, got 7"),
+    ],
+)
+def test_a_setting_out_of_range_is_named(setting, says):
+    with pytest.raises(ScenarioError) as caught:
+        check_scenarios(hit_scenario(*SERVE, **setting))
+    assert str(caught.value) == says
+
+
+def test_the_first_bad_lane_is_named_and_the_others_counted():
+    batch = [np.tile(part, (6, 1)) for part in SERVE]
+    with pytest.raises(
+        ScenarioError, match=r"^drag must be >= 0, got -1 in lane 2 \(1 more such lane\)$"
+    ):
+        check_scenarios(hit_scenario(*batch, drag=[0.1, 0.1, -1.0, 0.1, -2.0, 0.1]))
+    batch[1][4] = [2.0, 0.0, 7.0]
+    message = r"^landing point of ball must be in the hitting half, x < 0, got 4\.\d+ in lane 4$"
+    with pytest.raises(ScenarioError, match=message):
+        check_scenarios(hit_scenario(*batch))
+    batch[0][1, 1] = np.nan
+    with pytest.raises(ScenarioError, match="^ball.pos must be finite, got nan in lane 1$"):
+        check_scenarios(hit_scenario(*batch))
+    batch[0][1] = [2.0, 0.0, -1.0]
+    with pytest.raises(ScenarioError, match="^height of ball.pos must be > 0, got -1 in lane 1$"):
+        check_scenarios(hit_scenario(*batch))
