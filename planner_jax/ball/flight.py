@@ -126,7 +126,7 @@ def _phi(x: Array) -> tuple[Array, Array]:
     """
     small = jnp.abs(x) < 0.5
     near = jnp.where(small, x, 0.0)
-    series = sum((-near) ** k / math.factorial(k + 2) for k in range(13))
+    series = sum((-near) ** k / float(math.factorial(k + 2)) for k in range(13))
     far = jnp.where(small, 1.0, x)
     phi_2 = jnp.where(small, series, (1.0 + jnp.expm1(-far) / far) / far)
     return 1.0 - x * phi_2, phi_2

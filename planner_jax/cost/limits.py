@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from planner_jax.robot.quadrotor import QuadrotorLimits, body_rate_squared
+from planner_jax.trajectory.polynomial import Motion
 
 
 def speed_excess(vel: Array, limits: QuadrotorLimits) -> Array:
@@ -34,6 +35,18 @@ def ground_excess(height: Array, limits: QuadrotorLimits) -> Array:
     return limits.min_height - height
 
 
+def motion_excess(motion: Motion, gravity: Array, limits: QuadrotorLimits) -> Array:
+    """All four limits along samples of a motion, (4, N): speed, acceleration, rate, ground."""
+    return jnp.stack(
+        [
+            speed_excess(motion.vel, limits),
+            acceleration_excess(motion.acc, limits),
+            body_rate_excess(motion.acc, motion.jerk, gravity, limits),
+            ground_excess(motion.height, limits),
+        ]
+    )
+
+
 def relative(squared_excess: Array) -> Array:
-    """q / limit - 1 from q^2 / limit^2 - 1."""
+    """Ratio of a quantity to its limit, less one, from the same of the squares."""
     return jnp.sqrt(jnp.maximum(squared_excess + 1.0, 1e-12)) - 1.0

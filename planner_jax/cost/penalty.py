@@ -48,3 +48,14 @@ def trapezoid_weights(num_intervals: int) -> np.ndarray:
     weights = np.ones(num_intervals + 1)
     weights[[0, -1]] = 0.5
     return weights / num_intervals
+
+
+def joined_trapezoid_weights(num_intervals: int, num_pieces: int) -> np.ndarray:
+    """Trapezoid weights of pieces of one duration whose shared ends are sampled once.
+
+    Returns:
+        (num_pieces * num_intervals + 1,) float64; multiply by the duration of a piece.
+    """
+    weights = np.ones(num_pieces * num_intervals + 1)
+    weights[[0, -1]] = 0.5
+    return weights / num_intervals

@@ -16,8 +16,6 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from planner_jax.optimise.status import Status
-
 
 @struct.dataclass
 class Evaluation:
@@ -98,7 +96,11 @@ def init(objective: Objective, point: Array, config: LbfgsConfig) -> LbfgsState:
 
 
 def search_direction(state: LbfgsState, config: LbfgsConfig) -> Array:
-    """Quasi-Newton direction -H g, no longer than the step cap, (n,)."""
+    """Quasi-Newton direction -H g, no longer than the step cap, (n,).
+
+    Without a pair in memory it is the steepest descent of unit length: in scaled variables
+    one is the size of a sensible step, whatever the size of the gradient.
+    """
     q = state.grad
     alphas = []
     for k in reversed(range(config.memory)):
@@ -107,7 +109,8 @@ def search_direction(state: LbfgsState, config: LbfgsConfig) -> Array:
         alphas.append(alpha)
     newest = state.inverse_curvature[-1]
     size = jnp.sum(state.changes[-1] ** 2) * newest
-    gamma = jnp.where(newest > 0.0, 1.0 / jnp.where(newest > 0.0, size, 1.0), 1.0)
+    slope = jnp.sqrt(jnp.maximum(jnp.sum(state.grad**2), 1e-30))
+    gamma = jnp.where(newest > 0.0, 1.0 / jnp.where(newest > 0.0, size, 1.0), 1.0 / slope)
     q = gamma * q
     for k, alpha in zip(range(config.memory), reversed(alphas), strict=True):
         beta = state.inverse_curvature[k] * jnp.sum(state.changes[k] * q)

@@ -14,6 +14,16 @@ class PiecewisePolynomial:
     durations: Array  # (M,) [s], > 0
 
 
+@struct.dataclass
+class Motion:
+    """Samples of a trajectory at N times: what the limits look at."""
+
+    height: Array  # (N,) [m]
+    vel: Array  # (N, 3) [m/s]
+    acc: Array  # (N, 3) [m/s^2]
+    jerk: Array  # (N, 3) [m/s^3]
+
+
 def derivative_factors(degree: int, order: int) -> np.ndarray:
     """Factors k!/(k - order)! of the `order`-th derivative of t^k, shape (degree + 1,)."""
     powers = np.arange(degree + 1)

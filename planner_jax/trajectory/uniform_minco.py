@@ -18,7 +18,7 @@ import numpy as np
 from jax import Array, lax
 
 from planner_jax.trajectory.minco import hermite_energy, hermite_map
-from planner_jax.trajectory.polynomial import PiecewisePolynomial, derivative_factors
+from planner_jax.trajectory.polynomial import Motion, PiecewisePolynomial, derivative_factors
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -91,7 +91,7 @@ def uniform_minco(order: int, num_pieces: int) -> UniformMinco:
         waypoints=from_offsets[q],
         offsets=to_offsets[q],
         boundary_energy=energy[b, b] + energy[b, q] @ smooth,
-        offset_energy=norm**-2,
+        offset_energy=float(norm) ** -2,
     )
 
 
@@ -99,6 +99,32 @@ def boundary_rows(head_state: Array, tail_state: Array, piece_duration: Array) -
     """Boundary in the unit time of a piece, (2s, 3): derivative d times h^d."""
     scale = piece_duration ** jnp.arange(head_state.shape[0])[:, None]
     return jnp.concatenate([head_state * scale, tail_state * scale])
+
+
+def sample_motion(
+    maps: UniformMinco, nodes: int, rows: Array, offsets: Array, piece_duration: Array
+) -> Motion:
+    """Height, velocity, acceleration and jerk at `nodes` intervals a piece.
+
+    Args:
+        maps: constant maps of M pieces.
+        nodes: intervals a piece; N = M nodes + 1 samples, ends shared.
+        rows: (2s, 3) boundary rows.
+        offsets: (M - 1, 3) whitened offsets y.
+        piece_duration: () h [s].
+    """
+    columns = jnp.concatenate([rows, offsets])
+    height = jnp.matmul(
+        jnp.asarray(maps.sample_matrix(nodes, 0), rows.dtype),
+        columns[:, 2],
+        precision=lax.Precision.HIGHEST,
+    )
+    rates = np.concatenate([maps.sample_matrix(nodes, d) for d in (1, 2, 3)])
+    vel, acc, jerk = jnp.split(
+        jnp.matmul(jnp.asarray(rates, rows.dtype), columns, precision=lax.Precision.HIGHEST), 3
+    )
+    h = piece_duration
+    return Motion(height=height, vel=vel / h, acc=acc / h**2, jerk=jerk / h**3)
 
 
 def trajectory_energy(maps: UniformMinco, rows: Array, offsets: Array, piece_duration: Array):

@@ -1,0 +1,49 @@
+"""The seam between a task and the optimiser: what a planner offers for ONE scenario."""
+
+import dataclasses
+from typing import Any, Protocol
+
+from jax import Array
+
+from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
+
+
+@dataclasses.dataclass(frozen=True)
+class Round:
+    """One attempt at the lanes that earlier rounds left unsolved."""
+
+    starts: int
+    solver: LbfgsConfig
+
+    def __post_init__(self) -> None:
+        if self.starts < 1:
+            raise ValueError(f"starts must be >= 1, got {self.starts}")
+
+
+class Planner(Protocol):
+    """A small frozen dataclass of sizes and switches, static under jit.
+
+    All functions are pure and written for one scenario, and work in scaled decision
+    variables in which the objective has curvature of order one.
+    """
+
+    @property
+    def rounds(self) -> tuple[Round, ...]:
+        """What to try, in order."""
+        ...
+
+    def prepare(self, scenario: Any) -> Any:
+        """What every evaluation needs and none changes, such as the ball's path table."""
+        ...
+
+    def guesses(self, context: Any, num: int) -> Array:
+        """The first `num` starting points, (num, n), best first."""
+        ...
+
+    def objective(self, point: Array, context: Any) -> Evaluation:
+        """Cost and largest violation at a point (n,)."""
+        ...
+
+    def decode(self, point: Array, context: Any) -> Any:
+        """The plan at a point (n,), with its violation looked at more closely."""
+        ...

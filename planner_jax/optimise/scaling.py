@@ -1,0 +1,81 @@
+"""Measuring the diagonal scale of a planner's decision variables.
+
+Quasi-Newton steps are only as good as the coordinates. The scale of variable i is
+c_i = gain / sqrt(floor + median H_ii), where H = J^T J is the Gauss-Newton curvature of the planner's
+residuals in natural units, and the median runs over scenarios, each taken at its first guess
+and at a solution. A new task offers `residuals` and gets its scale from here.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from planner_jax.optimise.lbfgs import LbfgsConfig
+from planner_jax.optimise.multistart import minimise
+from planner_jax.optimise.problem import Planner
+
+
+class ScaledPlanner(Planner, Protocol):
+    """A planner whose scale can be measured."""
+
+    @property
+    def scale(self) -> tuple[float, ...]:
+        """Natural unit of each scaled variable, (n,)."""
+        ...
+
+    def residuals(self, point: Array, context: Any) -> Array:
+        """Residuals whose squares sum to about twice the objective near its minimum, (R,)."""
+        ...
+
+
+def curvature_diagonal(residuals: Callable[[Array], Array], point: Array) -> Array:
+    """Diagonal of J^T J of a residual function at a point (n,), shape (n,)."""
+    jacobian = jax.jacfwd(residuals)(point)
+    return jnp.sum(jacobian**2, axis=0)
+
+
+def measure_scale(
+    planner: ScaledPlanner, scenarios: Any, *, gain: float = 1.0, floor: float = 1e-4, num_rounds: int = 3
+) -> np.ndarray:
+    """Scale of every decision variable, measured on a batch of scenarios.
+
+    Solutions depend on the scale they were found with, so measuring is repeated with its own
+    result; two or three rounds settle it.
+
+    Args:
+        planner: a frozen dataclass with a `scale` field, the first value of which only has
+            to be sensible.
+        scenarios: a batch; a few hundred, hard ones among them, so that limits are active.
+        gain: multiplies the result; below one for smaller first steps.
+        floor: curvature that is taken as none, so that a variable which hardly matters keeps
+            a finite scale.
+        num_rounds: repetitions.
+
+    Returns:
+        (n,) float64.
+    """
+    config = LbfgsConfig(max_steps=30)
+    for _ in range(num_rounds):
+
+        def diagonals(scenario: Any, planner: ScaledPlanner = planner) -> Array:
+            context = planner.prepare(scenario)
+            scale = jnp.asarray(planner.scale)
+            start = planner.guesses(context, 1)[0]
+            optimum = minimise(lambda x: planner.objective(x, context), start, config)
+
+            def at(point: Array) -> Array:
+                return curvature_diagonal(
+                    lambda natural: planner.residuals(natural / scale, context), point * scale
+                )
+
+            return at(start) + at(optimum.point)
+
+        curvature = np.asarray(jax.jit(jax.vmap(diagonals))(scenarios), np.float64)
+        scale = gain / np.sqrt(floor + np.nanmedian(curvature, axis=0))
+        planner = dataclasses.replace(planner, scale=tuple(scale.tolist()))
+    return np.asarray(planner.scale)

@@ -1,0 +1,286 @@
+"""The `exact` hit planner: contact, impact and landing are built into the decision variables.
+
+No plan it returns can miss; only inequalities are left to penalties. The idea of solving the
+impact for the racket's normal and normal speed is paper 002's (eqs 11-12); what is new is the
+choice of variables, which needs none of the singular divisions of its eqs 13-14.
+"""
+
+import dataclasses
+import functools
+import importlib.resources
+import json
+
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array, lax
+
+from planner_jax.ball.aim import aim_drag_free, aim_with_drag, apex_with_drag
+from planner_jax.ball.flight import (
+    BallState,
+    drag_free_apex,
+    drag_free_fall_time,
+    gravity_vector,
+)
+from planner_jax.ball.impact import required_impact
+from planner_jax.ball.prediction import PathTable, predict_path, target_at
+from planner_jax.cost.contact import apex_excess, hitting_speed_excess
+from planner_jax.cost.limits import motion_excess
+from planner_jax.cost.penalty import joined_trapezoid_weights, smoothed_hinge
+from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
+from planner_jax.optimise.problem import Round
+from planner_jax.robot.quadrotor import tangent_basis
+from planner_jax.task.hit.plan import HitPlan, Stroke
+from planner_jax.task.hit.scenario import HitScenario
+from planner_jax.trajectory.uniform_minco import (
+    boundary_rows,
+    sample_motion,
+    trajectory_energy,
+    uniform_minco,
+    uniform_trajectory,
+)
+
+_ORDER = 4  # minimum snap
+
+
+@struct.dataclass
+class HitContext:
+    """One scenario with what every evaluation reuses."""
+
+    scenario: HitScenario
+    path: PathTable  # of the incoming ball
+    landing_time: Array  # () [s], when the ball would land if nobody hit it
+
+
+def prepare_hit(scenario: HitScenario, num_nodes: int) -> HitContext:
+    """Integrate the incoming ball once; shared by all hit planners.
+
+    The table's horizon follows the drag-free fall, which drag changes by a few per cent.
+    """
+    fall, _ = drag_free_fall_time(scenario.ball, jnp.zeros_like(scenario.drag), scenario.gravity)
+    horizon = lax.stop_gradient(1.1 * fall)
+    path = predict_path(
+        scenario.ball, horizon, scenario.drag, scenario.gravity, num_nodes=num_nodes
+    )
+    node = jnp.maximum(jnp.sum(path.pos[1:, 2] > 0.0), 1)
+    # From the last node above the ground, down at that node's speed.
+    sinking = jnp.maximum(-path.vel[node, 2], 0.1)
+    landing = (node - 1) * path.resolution + path.pos[node, 2] / sinking
+    return HitContext(scenario=scenario, path=path, landing_time=lax.stop_gradient(landing))
+
+
+@struct.dataclass
+class Impact:
+    """A stroke with the quadrotor states at both ends of its trajectory."""
+
+    stroke: Stroke
+    tail_state: Array  # (4, 3) of the quadrotor at the impact
+    apex: Array  # () [m], of the returned ball
+
+
+# Starting points, best first: impact time over landing time, flight time afterwards [s],
+# thrust over g. The first serves every easy case; the others hit earlier or flatter.
+_GUESSES = np.array(
+    [
+        (0.92, 1.7, 1.2),
+        (0.75, 1.7, 1.2),
+        (0.75, 1.3, 0.9),
+        (0.85, 1.3, 1.2),
+        (0.85, 2.1, 0.9),
+        (0.65, 1.7, 1.2),
+        (0.95, 1.3, 0.9),
+        (0.65, 2.1, 1.4),
+    ]
+)
+
+
+@functools.cache
+def shipped_scale(name: str) -> tuple[float, ...]:
+    """Measured scale of a planner's variables, from `measured_scales.json`.
+
+    `python -m benchmarks.measure_scales` makes the file again.
+    """
+    text = (importlib.resources.files(__package__) / "measured_scales.json").read_text("utf-8")
+    return tuple(json.loads(text)[name])
+
+
+@dataclasses.dataclass(frozen=True)
+class ExactHit:
+    """Minimum-snap hits with the impact eliminated exactly.
+
+    Decision variables, n = 3 (M - 1) + 8, each in units of `scale`: whitened waypoint offsets
+    y, log impact time, log flight time after it, log thrust, two racket velocities across the
+    normal, jerk at the impact. From the two times follow the ball's velocities before and
+    after (target reached exactly), from these normal and normal speed of the racket (paper
+    002, eqs 11-12), and so position, velocity and acceleration at the impact.
+
+    Cost: energy_weight * integral |snap|^2 + integral of the smoothed hinges of the limits
+    (paper 002, eq. 18a) + hinges of apex (eq. 21) and hitting speed (eq. 24).
+    """
+
+    num_pieces: int = 6
+    nodes: int = 8  # penalty intervals a piece
+    num_table_nodes: int = 48
+    drag_after_impact: bool = False
+    energy_weight: float = 1e-8
+    margin: float = 0.03  # penalties begin this far inside a limit, relative
+    hinge_width: float = 0.1
+    impact_weight: float = 0.3  # [s], of apex and hitting-speed hinges beside the integrals
+    rounds: tuple[Round, ...] = (
+        Round(starts=1, solver=LbfgsConfig(max_steps=12)),
+        Round(starts=1, solver=LbfgsConfig(max_steps=60)),
+        Round(starts=8, solver=LbfgsConfig(max_steps=80)),
+    )
+    scale: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.num_pieces < 2:
+            raise ValueError(f"num_pieces must be >= 2, got {self.num_pieces}")
+        if not self.scale:
+            object.__setattr__(self, "scale", shipped_scale(f"exact-{self.num_pieces}"))
+
+    @property
+    def num_offsets(self) -> int:
+        """Number of waypoint variables."""
+        return 3 * (self.num_pieces - 1)
+
+    def prepare(self, scenario: HitScenario) -> HitContext:
+        """The incoming ball's table; see `prepare_hit`."""
+        return prepare_hit(scenario, self.num_table_nodes)
+
+    def guesses(self, context: HitContext, num: int) -> Array:
+        """Smooth trajectories to a few impact times, flight times and thrusts, (num, n)."""
+        if num > len(_GUESSES):
+            raise ValueError(f"starts must be <= {len(_GUESSES)}, got {num}")
+        fraction, flight_time, thrust = jnp.asarray(_GUESSES[:num], context.landing_time.dtype).T
+        times = jnp.stack(
+            [
+                jnp.log(fraction * jnp.maximum(context.landing_time, 0.1)),
+                jnp.log(flight_time),
+                jnp.log(thrust * context.scenario.gravity),
+            ],
+            axis=1,
+        )
+        natural = jnp.pad(times, ((0, 0), (self.num_offsets, 5)))
+        return natural / jnp.asarray(self.scale, natural.dtype)
+
+    def impact(self, natural: Array, context: HitContext) -> Impact:
+        """The impact that the variables after the waypoint offsets describe.
+
+        Args:
+            natural: (8,) log T, log t_post, log thrust, two tangential speeds [m/s], jerk
+                [m/s^3].
+            context: of the scenario.
+        """
+        scenario = context.scenario
+        time, flight_time, thrust = jnp.exp(natural[0]), jnp.exp(natural[1]), jnp.exp(natural[2])
+        ball = target_at(context.path, time)
+        if self.drag_after_impact:
+            after = aim_with_drag(
+                ball.pos, scenario.target, flight_time, scenario.drag, scenario.gravity
+            )
+            apex = apex_with_drag(
+                BallState(ball.pos, after), flight_time, scenario.drag, scenario.gravity
+            )
+        else:
+            after = aim_drag_free(ball.pos, scenario.target, flight_time, scenario.gravity)
+            apex = drag_free_apex(BallState(ball.pos, after), scenario.gravity)
+        normal, normal_speed = required_impact(ball.vel, after, scenario.restitution)
+        across_x, across_y = tangent_basis(normal)
+        tail_state = jnp.stack(
+            [
+                ball.pos - scenario.racket_height * normal,
+                normal_speed * normal + natural[3] * across_x + natural[4] * across_y,
+                thrust * normal + gravity_vector(scenario.gravity),
+                natural[5:],
+            ]
+        )
+        stroke = Stroke(
+            time=time,
+            ball_pos=ball.pos,
+            ball_vel=ball.vel,
+            ball_vel_after=after,
+            normal=normal,
+            flight_time=flight_time,
+        )
+        return Impact(stroke=stroke, tail_state=tail_state, apex=apex)
+
+    def _unpack(self, point: Array, context: HitContext) -> tuple[Array, Array, Array, Impact]:
+        """Whitened offsets, boundary rows, piece duration and impact at a point."""
+        natural = point * jnp.asarray(self.scale, point.dtype)
+        offsets = natural[: self.num_offsets].reshape(-1, 3)
+        impact = self.impact(natural[self.num_offsets :], context)
+        duration = impact.stroke.time / self.num_pieces
+        rows = boundary_rows(context.scenario.head_state, impact.tail_state, duration)
+        return offsets, rows, duration, impact
+
+    def _excess(
+        self, offsets: Array, rows: Array, duration: Array, impact: Impact, context, nodes: int
+    ) -> tuple[Array, Array]:
+        """Excess over the limits along the way, (4, N), and at the impact, (5,)."""
+        scenario = context.scenario
+        maps = uniform_minco(_ORDER, self.num_pieces)
+        motion = sample_motion(maps, nodes, rows, offsets, duration)
+        along = motion_excess(motion, scenario.gravity, scenario.limits)
+        limits = scenario.hit_limits
+        at_impact = jnp.concatenate(
+            [
+                apex_excess(impact.apex, limits.min_apex, limits.max_apex),
+                hitting_speed_excess(impact.tail_state[1], limits.hitting_speed),
+            ]
+        )
+        return along, at_impact
+
+    def _margins(self) -> np.ndarray:
+        """Margins of the four limits along the way: squares carry twice the relative one."""
+        return self.margin * np.array([2.0, 2.0, 2.0, 1.0])[:, None]
+
+    def objective(self, point: Array, context: HitContext) -> Evaluation:
+        """Cost, and the largest excess at the penalty nodes (squares over squares)."""
+        offsets, rows, duration, impact = self._unpack(point, context)
+        along, at_impact = self._excess(offsets, rows, duration, impact, context, self.nodes)
+        weights = joined_trapezoid_weights(self.nodes, self.num_pieces)
+        hinges = smoothed_hinge(along + jnp.asarray(self._margins(), point.dtype), self.hinge_width)
+        penalty = duration * jnp.sum(hinges * jnp.asarray(weights, point.dtype))
+        penalty += self.impact_weight * jnp.sum(
+            smoothed_hinge(at_impact + self.margin, self.hinge_width)
+        )
+        maps = uniform_minco(_ORDER, self.num_pieces)
+        energy = trajectory_energy(maps, rows, offsets, duration)
+        # Peaks between nodes are a little higher than the nodes show.
+        violation = jnp.maximum(jnp.max(along), jnp.max(at_impact)) + 0.004
+        return Evaluation(cost=penalty + self.energy_weight * energy, violation=violation)
+
+    def residuals(self, point: Array, context: HitContext) -> Array:
+        """Squared hinges and energy as residuals, for `measure_scale`.
+
+        The smoothed hinge bends at most with 3 / (2 hinge_width); the residuals bend alike.
+        """
+        offsets, rows, duration, impact = self._unpack(point, context)
+        along, at_impact = self._excess(offsets, rows, duration, impact, context, self.nodes)
+        bend = jnp.sqrt(1.5 / self.hinge_width)
+        inside = jnp.maximum(along + jnp.asarray(self._margins(), point.dtype), 0.0)
+        weights = joined_trapezoid_weights(self.nodes, self.num_pieces)
+        inside = inside * jnp.sqrt(duration * jnp.asarray(weights, point.dtype))
+        impact_part = jnp.sqrt(self.impact_weight) * jnp.maximum(at_impact + self.margin, 0.0)
+        maps = uniform_minco(_ORDER, self.num_pieces)
+        energy_unit = jnp.sqrt(self.energy_weight / duration ** (2 * _ORDER - 1))
+        smooth = energy_unit * np.sqrt(maps.offset_energy) * offsets
+        return jnp.concatenate([bend * inside.ravel(), bend * impact_part, smooth.ravel()])
+
+    def decode(self, point: Array, context: HitContext) -> HitPlan:
+        """The plan at a point, its violation looked for at 24 nodes a piece."""
+        offsets, rows, duration, impact = self._unpack(point, context)
+        along, at_impact = self._excess(offsets, rows, duration, impact, context, 24)
+        squared = jnp.concatenate([jnp.max(along[:3], axis=1), at_impact[2:]])
+        plain = jnp.concatenate([jnp.max(along[3:], axis=1), at_impact[:2]])
+        violation = jnp.maximum(jnp.max(jnp.sqrt(squared + 1.0) - 1.0), jnp.max(plain))
+        maps = uniform_minco(_ORDER, self.num_pieces)
+        return HitPlan(
+            trajectory=uniform_trajectory(maps, rows, offsets, duration),
+            stroke=impact.stroke,
+            cost=self.objective(point, context).cost,
+            violation=violation,
+            iterations=jnp.zeros((), jnp.int32),
+            status=jnp.zeros((), jnp.int32),
+        )
