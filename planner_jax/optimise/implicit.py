@@ -1,0 +1,144 @@
+"""Gradients of an optimal plan by the implicit function theorem.
+
+At an optimum u*(theta) the gradient of the objective vanishes, so
+du*/dtheta = -J_uu^-1 J_utheta: one linear solve with the Hessian, whatever the number of
+iterations that led there, and nothing is unrolled.
+"""
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import Array, lax
+
+from planner_jax.optimise.lbfgs import LbfgsConfig, Objective
+from planner_jax.optimise.multistart import minimise, status_of
+from planner_jax.optimise.problem import Planner
+
+
+@struct.dataclass
+class _Newton:
+    """One lane of the refinement: where it is, and where it will look next."""
+
+    point: Array  # (n,)
+    slope: Array  # () norm of the gradient at `point`
+    gradient: Array  # (n,)
+    hessian: Array  # (n, n)
+    damping: Array  # ()
+    trial: Array  # (n,)
+    iteration: Array  # () int32
+
+
+def newton_refine(
+    objective: Objective, point: Array, *, max_steps: int, stationarity: Array | float
+) -> tuple[Array, Array]:
+    """Bring a nearly stationary point to the optimum of its basin.
+
+    Damped Newton steps, the eigenvalues of the Hessian made positive; a step that does not
+    lower the gradient is not taken, and the next is damped more.
+
+    Args:
+        objective: of one problem.
+        point: (n,).
+        max_steps: Hessians at most.
+        stationarity: stops where the gradient's norm is below this.
+
+    Returns:
+        point: (n,).
+        slope: () norm of the gradient there.
+    """
+    gradient = jax.grad(lambda x: objective(x).cost)
+
+    def slope_and_curvature(x: Array) -> tuple[Array, Array]:
+        hessian, slope = jax.jacfwd(lambda y: (gradient(y),) * 2, has_aux=True)(x)
+        return slope, hessian
+
+    def step(state: _Newton) -> _Newton:
+        slope_vector, hessian = slope_and_curvature(state.trial)
+        slope = jnp.linalg.norm(slope_vector)
+        better = slope < state.slope
+        point, slope, slope_vector, hessian = jax.tree.map(
+            lambda new, old: jnp.where(better, new, old),
+            (state.trial, slope, slope_vector, hessian),
+            (state.point, state.slope, state.gradient, state.hessian),
+        )
+        damping = jnp.where(better, state.damping / 4.0, state.damping * 8.0)
+        values, vectors = jnp.linalg.eigh(hessian)
+        floor = jnp.max(jnp.abs(values)) * jnp.finfo(point.dtype).eps
+        product = functools.partial(jnp.matmul, precision=lax.Precision.HIGHEST)
+        along = product(slope_vector, vectors)
+        newton = product(vectors, along / (jnp.maximum(jnp.abs(values), floor) + damping * slope))
+        return _Newton(
+            point, slope, slope_vector, hessian, damping, point - newton, state.iteration + 1
+        )
+
+    def unfinished(state: _Newton) -> Array:
+        return (state.iteration < max_steps) & (state.slope > stationarity)
+
+    n = point.shape[0]
+    state = _Newton(
+        point=point,
+        slope=jnp.full((), jnp.inf, point.dtype),
+        gradient=jnp.zeros_like(point),
+        hessian=jnp.zeros((n, n), point.dtype),
+        damping=jnp.full((), 1e-3, point.dtype),
+        trial=point,
+        iteration=jnp.zeros((), jnp.int32),
+    )
+    state = lax.while_loop(unfinished, step, state)
+    return state.point, state.slope
+
+
+def optimal_plan(
+    planner: Planner,
+    scenario: Any,
+    *,
+    solver: LbfgsConfig | None = None,
+    newton_steps: int = 100,
+) -> Any:
+    """The plan at the optimum of the first guess's basin, differentiable by the scenario.
+
+    `jax.grad` and `jax.jacobian` of any number in the plan, by any leaf of the scenario, go
+    through the implicit function theorem. Use float64 (`jax.enable_x64`) where gradients
+    matter to more than two digits.
+
+    Args:
+        planner: sizes and switches, static.
+        scenario: one case; the leaves to differentiate by.
+        solver: of the search before the refinement; 200 iterations by default.
+        newton_steps: of the refinement, at most.
+
+    Returns:
+        The planner's plan. Where its status is not CONVERGED the point is not stationary or
+        breaks a limit, and its gradients mean nothing.
+    """
+    solver = solver or LbfgsConfig(max_steps=200, tolerance=1e-7, patience=6)
+    context = planner.prepare(scenario)
+    start = lax.stop_gradient(planner.guesses(context, 1)[0])
+    # A gradient that rounding alone can make: relative to the size of the cost at the start.
+    stationarity = 1e2 * float(jnp.finfo(start.dtype).eps)
+
+    def cost(point: Array) -> Array:
+        return planner.objective(point, context).cost
+
+    def solve(_: Any, start: Array) -> tuple[Array, Array]:
+        def objective(point: Array):
+            return planner.objective(point, context)
+
+        found = minimise(objective, start, solver)
+        tolerance = stationarity * jnp.abs(found.evaluation.cost)
+        point, slope = newton_refine(
+            objective, found.point, max_steps=newton_steps, stationarity=tolerance
+        )
+        return point, slope / tolerance
+
+    def tangent_solve(hessian_product: Any, rhs: Array) -> Array:
+        return jnp.linalg.solve(jax.jacobian(hessian_product)(rhs), rhs)
+
+    point, excess = lax.custom_root(
+        jax.grad(cost), start, solve, tangent_solve, has_aux=True
+    )
+    plan = planner.decode(point, context)
+    return plan.replace(status=status_of(plan.cost, plan.violation, excess <= 1e3))
