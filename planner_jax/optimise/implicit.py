@@ -23,6 +23,7 @@ class _Newton:
     """One lane of the refinement: where it is, and where it will look next."""
 
     point: Array  # (n,)
+    cost: Array  # ()
     slope: Array  # () norm of the gradient at `point`
     gradient: Array  # (n,)
     hessian: Array  # (n, n)
@@ -36,8 +37,9 @@ def newton_refine(
 ) -> tuple[Array, Array]:
     """Bring a nearly stationary point to the optimum of its basin.
 
-    Damped Newton steps, the eigenvalues of the Hessian made positive; a step that does not
-    lower the gradient is not taken, and the next is damped more.
+    Damped Newton steps, the eigenvalues of the Hessian made positive. A step is taken where it
+    lowers the cost, or the gradient at a cost that is the same to rounding; otherwise the
+    next is damped more.
 
     Args:
         objective: of one problem.
@@ -49,20 +51,20 @@ def newton_refine(
         point: (n,).
         slope: () norm of the gradient there.
     """
-    gradient = jax.grad(lambda x: objective(x).cost)
 
-    def slope_and_curvature(x: Array) -> tuple[Array, Array]:
-        hessian, slope = jax.jacfwd(lambda y: (gradient(y),) * 2, has_aux=True)(x)
-        return slope, hessian
+    def gradient(x: Array) -> tuple[Array, tuple[Array, Array]]:
+        cost, slope = jax.value_and_grad(lambda y: objective(y).cost)(x)
+        return slope, (cost, slope)
 
     def step(state: _Newton) -> _Newton:
-        slope_vector, hessian = slope_and_curvature(state.trial)
+        hessian, (cost, slope_vector) = jax.jacfwd(gradient, has_aux=True)(state.trial)
         slope = jnp.linalg.norm(slope_vector)
-        better = slope < state.slope
-        point, slope, slope_vector, hessian = jax.tree.map(
+        rounding = 10.0 * jnp.finfo(cost.dtype).eps * jnp.abs(cost)
+        better = (cost < state.cost) | ((cost <= state.cost + rounding) & (slope < state.slope))
+        point, cost, slope, slope_vector, hessian = jax.tree.map(
             lambda new, old: jnp.where(better, new, old),
-            (state.trial, slope, slope_vector, hessian),
-            (state.point, state.slope, state.gradient, state.hessian),
+            (state.trial, cost, slope, slope_vector, hessian),
+            (state.point, state.cost, state.slope, state.gradient, state.hessian),
         )
         damping = jnp.where(better, state.damping / 4.0, state.damping * 8.0)
         values, vectors = jnp.linalg.eigh(hessian)
@@ -71,7 +73,7 @@ def newton_refine(
         along = product(slope_vector, vectors)
         newton = product(vectors, along / (jnp.maximum(jnp.abs(values), floor) + damping * slope))
         return _Newton(
-            point, slope, slope_vector, hessian, damping, point - newton, state.iteration + 1
+            point, cost, slope, slope_vector, hessian, damping, point - newton, state.iteration + 1
         )
 
     def unfinished(state: _Newton) -> Array:
@@ -80,6 +82,7 @@ def newton_refine(
     n = point.shape[0]
     state = _Newton(
         point=point,
+        cost=jnp.full((), jnp.inf, point.dtype),
         slope=jnp.full((), jnp.inf, point.dtype),
         gradient=jnp.zeros_like(point),
         hessian=jnp.zeros((n, n), point.dtype),
@@ -137,8 +140,6 @@ def optimal_plan(
     def tangent_solve(hessian_product: Any, rhs: Array) -> Array:
         return jnp.linalg.solve(jax.jacobian(hessian_product)(rhs), rhs)
 
-    point, excess = lax.custom_root(
-        jax.grad(cost), start, solve, tangent_solve, has_aux=True
-    )
-    plan = planner.decode(point, context)
+    point, excess = lax.custom_root(jax.grad(cost), start, solve, tangent_solve, has_aux=True)
+    plan = planner.decode(point, context).replace(cost=cost(point))
     return plan.replace(status=status_of(plan.cost, plan.violation, excess <= 1e3))

@@ -32,9 +32,9 @@ Objective = Callable[[Array], Evaluation]
 class LbfgsConfig:
     """Sizes and switches of the solver: hashable, so static under jit."""
 
-    max_steps: int = 12
+    max_steps: int = 10
     memory: int = 6
-    trial_steps: tuple[float, ...] = (2.0, 0.7071, 0.25, 0.0884)
+    trial_steps: tuple[float, ...] = (1.0, 2.5, 0.3)
     step_cap: float = 2.0  # largest Euclidean length of a unit step
     tolerance: float = 1e-4  # relative decrease of the cost that counts as none
     patience: int = 2  # iterations without a decrease before a lane is stationary
@@ -58,6 +58,7 @@ class LbfgsState:
     inverse_curvature: Array  # (m,), 1 / s.y; 0 where the slot is empty
     best_point: Array  # (n,)
     best: Evaluation
+    reach: Array  # (), multiplies the trial steps: shrinks while none lowers the cost
     iteration: Array  # () int32
     stalled: Array  # () int32, iterations in a row without a decrease
 
@@ -90,6 +91,7 @@ def init(objective: Objective, point: Array, config: LbfgsConfig) -> LbfgsState:
         inverse_curvature=empty[:, 0],
         best_point=point,
         best=Evaluation(cost, violation),
+        reach=jnp.ones((), point.dtype),
         iteration=jnp.zeros((), jnp.int32),
         stalled=jnp.zeros((), jnp.int32),
     )
@@ -122,13 +124,13 @@ def search_direction(state: LbfgsState, config: LbfgsConfig) -> Array:
 def step(objective: Objective, state: LbfgsState, config: LbfgsConfig) -> LbfgsState:
     """One iteration: direction, all trial steps at once, the lowest kept, memory updated."""
     direction = search_direction(state, config)
-    trials = jnp.asarray(config.trial_steps, state.point.dtype)
+    trials = state.reach * jnp.asarray(config.trial_steps, state.point.dtype)
     costs = jax.vmap(lambda a: objective(state.point + a * direction).cost)(trials)
     costs = jnp.where(jnp.isfinite(costs), costs, jnp.inf)
     chosen = jnp.argmin(costs)
     decreased = costs[chosen] < state.cost
     # Without a decrease the lane stands still and forgets its curvature: the next direction
-    # is steepest descent.
+    # is steepest descent, and looks nearer.
     taken = jnp.where(decreased, trials[chosen], 0.0)
     point = state.point + taken * direction
     (cost, violation), grad = jax.value_and_grad(lambda x: _value(objective, x), has_aux=True)(
@@ -156,6 +158,7 @@ def step(objective: Objective, state: LbfgsState, config: LbfgsConfig) -> LbfgsS
         inverse_curvature=push(state.inverse_curvature, inverse),
         best_point=jnp.where(better, point, state.best_point),
         best=jax.tree.map(lambda a, b: jnp.where(better, a, b), here, state.best),
+        reach=jnp.where(decreased, 1.0, 0.05 * state.reach),
         iteration=state.iteration + 1,
         stalled=jnp.where(progress, 0, state.stalled + 1),
     )

@@ -62,7 +62,8 @@ def solve_round(planner: Planner, attempt: Round, scenario: Any) -> Any:
     def from_start(start: Array) -> tuple[Any, Array]:
         optimum = minimise(lambda x: planner.objective(x, context), start, attempt.solver)
         plan = planner.decode(optimum.point, context)
-        return plan.replace(iterations=optimum.iterations), optimum.stationary
+        plan = plan.replace(cost=optimum.evaluation.cost, iterations=optimum.iterations)
+        return plan, optimum.stationary
 
     if attempt.starts == 1:
         plan, stationary = from_start(starts[0])
@@ -70,10 +71,9 @@ def solve_round(planner: Planner, attempt: Round, scenario: Any) -> Any:
         plans, all_stationary = jax.vmap(from_start)(starts)
         feasible = plans.violation <= FEASIBILITY_TOLERANCE
         finite = jnp.isfinite(plans.cost) & jnp.isfinite(plans.violation)
-        rank = jnp.where(feasible, 0.0, 1.0) * 1e12 + jnp.where(
-            feasible, plans.cost, plans.violation
-        )
-        best = jnp.argmin(jnp.where(finite, rank, jnp.inf))
+        by_cost = jnp.where(feasible, plans.cost, jnp.inf)
+        score = jnp.where(jnp.any(feasible & finite), by_cost, plans.violation)
+        best = jnp.argmin(jnp.where(finite, score, jnp.inf))
         plan, stationary = jax.tree.map(lambda leaf: leaf[best], (plans, all_stationary))
     return plan.replace(status=status_of(plan.cost, plan.violation, stationary))
 

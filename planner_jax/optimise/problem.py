@@ -20,6 +20,15 @@ class Round:
             raise ValueError(f"starts must be >= 1, got {self.starts}")
 
 
+class Scenario(Protocol):
+    """A pytree of arrays for one case, or for a batch with a leading axis on every leaf."""
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """() for one case, (B,) for a batch."""
+        ...
+
+
 class Planner(Protocol):
     """A small frozen dataclass of sizes and switches, static under jit.
 
@@ -45,5 +54,8 @@ class Planner(Protocol):
         ...
 
     def decode(self, point: Array, context: Any) -> Any:
-        """The plan at a point (n,), with its violation looked at more closely."""
+        """The plan at a point (n,), its violation looked at more closely.
+
+        The solver fills in `cost`, `iterations` and `status`.
+        """
         ...

@@ -8,7 +8,7 @@ and at a solution. A new task offers `residuals` and gets its scale from here.
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,9 @@ from planner_jax.optimise.problem import Planner
 
 
 class ScaledPlanner(Planner, Protocol):
-    """A planner whose scale can be measured."""
+    """A planner, a frozen dataclass, whose scale can be measured."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
 
     @property
     def scale(self) -> tuple[float, ...]:
@@ -40,7 +42,12 @@ def curvature_diagonal(residuals: Callable[[Array], Array], point: Array) -> Arr
 
 
 def measure_scale(
-    planner: ScaledPlanner, scenarios: Any, *, gain: float = 1.0, floor: float = 1e-4, num_rounds: int = 3
+    planner: ScaledPlanner,
+    scenarios: Any,
+    *,
+    gain: float = 1.0,
+    floor: float = 1e-4,
+    num_rounds: int = 3,
 ) -> np.ndarray:
     """Scale of every decision variable, measured on a batch of scenarios.
 

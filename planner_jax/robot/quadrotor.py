@@ -5,6 +5,8 @@ held at zero, the Hopf fibration gives the body rates from tau and the jerk alon
 (Watterson and Kumar, "Control of quadrotors using the Hopf fibration on SO(3)").
 """
 
+import dataclasses
+
 import jax.numpy as jnp
 from flax import struct
 from jax import Array
@@ -21,7 +23,8 @@ class QuadrotorLimits:
 
     def scaled(self, factor: float) -> "QuadrotorLimits":
         """Speed, acceleration and body-rate limits times `factor`; the ground stays."""
-        return self.replace(
+        return dataclasses.replace(
+            self,
             speed=self.speed * factor,
             acceleration=self.acceleration * factor,
             body_rate=self.body_rate * factor,

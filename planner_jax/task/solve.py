@@ -11,17 +11,16 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from planner_jax.optimise.multistart import solve_round
-from planner_jax.optimise.problem import Planner, Round
+from planner_jax.optimise.problem import Planner, Round, Scenario
 from planner_jax.optimise.status import Status
 
 BUCKETS = (16, 128, 1024, 8192, 65536)
 
 
-def plan(planner: Planner, scenarios: Any, *, chunk: int | None = None) -> Any:
+def plan(planner: Planner, scenarios: Scenario, *, chunk: int | None = None) -> Any:
     """Plan one scenario, or a batch of them with a leading axis on every leaf.
 
     Args:
@@ -34,16 +33,16 @@ def plan(planner: Planner, scenarios: Any, *, chunk: int | None = None) -> Any:
         The planner's plans with the batch shape of the scenarios, leaves NumPy arrays. Look
         at `status`: a lane that could not be solved says so and holds the best that was found.
     """
-    ranks = {np.ndim(leaf) for leaf in jax.tree.leaves(scenarios.drag)}
-    if ranks == {0}:
+    batch = scenarios.batch_shape
+    if batch == ():
         return _plan_single(planner, scenarios)
-    if ranks != {1}:
-        raise ValueError(f"scenarios must have no batch axis or one, got drag of rank {ranks}")
-    num = scenarios.drag.shape[0]
+    if len(batch) != 1 or batch[0] == 0:
+        raise ValueError(f"scenarios must be one case or a batch of some, got batch shape {batch}")
+    num = batch[0]
     host = jax.tree.map(np.asarray, scenarios)
     for name, leaf in zip(_paths(host), jax.tree.leaves(host), strict=True):
-        if leaf.shape[0] != num:
-            raise ValueError(f"scenarios{name} must have {num} lanes, got {leaf.shape[0]}")
+        if leaf.shape[:1] != batch:
+            raise ValueError(f"scenarios{name} must have {num} lanes, got shape {leaf.shape}")
     plans: Any = None
     lanes = np.arange(num)
     for attempt in planner.rounds:
@@ -69,19 +68,15 @@ def _paths(tree: Any) -> list[str]:
     return [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(tree)]
 
 
-def _plan_single(planner: Planner, scenario: Any) -> Any:
-    plans = None
+def _plan_single(planner: Planner, scenario: Scenario) -> Any:
+    best = None
     for attempt in planner.rounds:
-        found = jax.device_get(_solve_one(planner, attempt, scenario))
-        if plans is None or _rank(found) < _rank(plans):
-            plans = found
-        if not _unsolved(plans.status):
+        found = jax.tree.map(np.asarray, _solve_one(planner, attempt, scenario))
+        if best is None or is_solved(found.status) or found.violation < best.violation:
+            best = found
+        if not _unsolved(best.status):
             break
-    return plans
-
-
-def _rank(plan: Any) -> tuple[bool, float]:
-    return (not is_solved(plan.status), float(plan.violation))
+    return best
 
 
 def _merge(plans: Any, later: Any, lanes: np.ndarray) -> Any:

@@ -105,7 +105,7 @@ def _inner_derivatives(
 
     before = jnp.concatenate([head_state[None, 0], waypoints[:-1]])
     after = jnp.concatenate([waypoints[1:], tail_state[None, 0]])
-    times = functools.partial(jnp.einsum, "mk,mi->mki")
+    times = functools.partial(jnp.einsum, "mk,mi->mki", precision=_HIGHEST)
     rhs = -(
         times(left[:, s + 1 :, 0], before)
         + times(left[:, s + 1 :, s] + right[:, 1:s, 0], waypoints)

@@ -35,6 +35,11 @@ class HitScenario:
     limits: QuadrotorLimits
     hit_limits: HitLimits
 
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """() for one case, (B,) for a batch."""
+        return np.shape(self.drag)
+
 
 def hit_scenario(
     serve_pos,

@@ -1,0 +1,311 @@
+"""Ball flight: eq. 2 against its closed forms and SciPy, linear drag, apex and fall."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from convergence import observed_order
+from derivatives import assert_gradient_matches_differences
+from scipy.integrate import solve_ivp
+
+from planner_jax.ball.flight import (
+    BallState,
+    ball_acceleration,
+    drag_free_apex,
+    drag_free_fall_time,
+    drag_free_flight,
+    fly,
+    linear_drag_flight,
+    rk4_step,
+)
+
+GRAVITY, DRAG = 9.8, 0.0616
+WEIGHT = np.array([0.0, 0.0, -GRAVITY])
+LINEAR_DRAG = np.array([0.4, 0.3, 0.2])  # [1/s]
+SERVE_POS, SERVE_VEL = (4.0, 0.5, 2.0), (-6.5, 0.7, 5.5)
+
+float64 = pytest.mark.usefixtures("float64")
+
+# Compiled once for all tests of equal shapes and dtype.
+step_once = jax.jit(rk4_step)
+fly_eight_steps = jax.jit(functools.partial(fly, num_steps=8))
+drag_free = jax.jit(drag_free_flight)
+linear_drag = jax.jit(linear_drag_flight)
+apex_and_slope = jax.jit(jax.value_and_grad(drag_free_apex))
+fall_and_slope = jax.jit(jax.value_and_grad(drag_free_fall_time, argnums=(0, 1, 2), has_aux=True))
+
+
+@jax.jit
+def linear_drag_and_rates(ball, duration, drag):
+    """The state, and its rates of change in time and in drag on all axes."""
+    flight = functools.partial(linear_drag_flight, gravity=GRAVITY)
+    state, in_time = jax.jvp(lambda t: flight(ball, t, drag), (duration,), (jnp.ones(()),))
+    _, in_drag = jax.jvp(lambda k: flight(ball, duration, k), (drag,), (jnp.ones(3),))
+    return state, in_time, in_drag
+
+
+def ball(pos=SERVE_POS, vel=SERVE_VEL, dtype=np.float64):
+    return BallState(pos=np.array(pos, dtype), vel=np.array(vel, dtype))
+
+
+def flown(start, duration, drag=DRAG, gravity=GRAVITY, *, num=32):
+    for _ in range(num):
+        start = step_once(start, duration / num, drag, gravity)
+    return start
+
+
+def integrate(acceleration, duration):
+    """The serve after `duration`, by SciPy and to rounding."""
+    flight = solve_ivp(
+        lambda _, state: np.concatenate([state[3:], acceleration(state[3:])]),
+        (0.0, duration),
+        np.array(SERVE_POS + SERVE_VEL),
+        method="DOP853",
+        rtol=1e-13,
+        atol=1e-13,
+    )
+    return BallState(pos=flight.y[:3, -1], vel=flight.y[3:, -1])
+
+
+def with_quadratic_drag(vel):
+    return WEIGHT - DRAG * np.linalg.norm(vel) * vel
+
+
+def assert_close(a, b, **tolerance):
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, **tolerance), a, b)
+
+
+# Quadratic drag
+
+
+def test_a_ball_feels_its_weight_and_a_drag_against_its_velocity():
+    """|(3, 4, 12)| = 13. At rest there is no drag, and the gradient is finite."""
+
+    def accelerate(vel):
+        acceleration = ball_acceleration(vel, 0.1, GRAVITY)
+        return acceleration, acceleration
+
+    moving, rest = np.array([3.0, 4.0, 12.0], np.float32), np.zeros(3, np.float32)
+    jacobian, acceleration = jax.jit(jax.vmap(jax.jacfwd(accelerate, has_aux=True)))(
+        np.stack([moving, rest])
+    )
+    np.testing.assert_allclose(acceleration, [WEIGHT - 1.3 * moving, WEIGHT], rtol=1e-6)
+    np.testing.assert_array_equal(jacobian[1], np.zeros((3, 3)))
+
+
+@float64
+def test_one_runge_kutta_step_without_drag_is_the_closed_form():
+    after = step_once(ball(), 1.3, 0.0, GRAVITY)
+    assert_close(after, drag_free(ball(), 1.3, GRAVITY), rtol=1e-14)
+
+
+@float64
+def test_a_fall_from_rest_follows_its_closed_form():
+    """v = -c tanh(g t / c) and z = -(c^2 / g) log cosh(g t / c), c the terminal speed."""
+    final = flown(ball((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), 2.0)
+    terminal = np.sqrt(GRAVITY / DRAG)
+    x = GRAVITY * 2.0 / terminal
+    fallen = terminal**2 / GRAVITY * np.log(np.cosh(x))
+    np.testing.assert_allclose(final.pos, [0.0, 0.0, -fallen], atol=1e-6)
+    np.testing.assert_allclose(final.vel, [0.0, 0.0, -terminal * np.tanh(x)], atol=1e-6)
+
+
+@float64
+def test_a_ball_without_weight_follows_its_closed_form():
+    """Speed v / (1 + K v t) after a way of log(1 + K v t) / K, straight on. |(2, -3, 6)| = 7."""
+    start = ball((1.0, 2.0, 3.0), (2.0, -3.0, 6.0))
+    x = DRAG * 7.0 * 2.0
+    expected = BallState(start.pos + start.vel * np.log1p(x) / (7.0 * DRAG), start.vel / (1.0 + x))
+    assert_close(flown(start, 2.0, gravity=0.0), expected, atol=1e-7)
+
+
+@float64
+def test_a_long_fall_ends_at_the_terminal_speed():
+    final = flown(ball(), 10.0, 0.3)
+    np.testing.assert_allclose(final.vel, [0.0, 0.0, -np.sqrt(GRAVITY / 0.3)], atol=1e-6)
+
+
+@float64
+def test_runge_kutta_converges_with_order_four_to_the_flight_that_scipy_finds():
+    exact = integrate(with_quadratic_drag, 1.8)
+    nums = [4, 8, 16, 32]
+    errors = [np.linalg.norm(flown(ball(), 1.8, num=n).pos - exact.pos) for n in nums]
+    assert float(observed_order(1.8 / np.array(nums), errors)) == pytest.approx(4.0, abs=0.2)
+    assert errors[-1] < 1e-6
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_flight_is_its_steps_and_its_path_holds_the_ball_after_each(float64, dtype):
+    final, path = fly_eight_steps(ball(dtype=dtype), 1.6, DRAG, GRAVITY)
+    assert path.pos.dtype == path.vel.dtype == dtype
+    tolerance = 8.0 * np.finfo(dtype).eps
+    final, path = jax.tree.map(np.asarray, (final, path))
+    state = ball(dtype=dtype)
+    for k in range(8):
+        state = step_once(state, 0.2, DRAG, GRAVITY)
+        assert_close(jax.tree.map(lambda x, k=k: x[k], path), state, rtol=tolerance, atol=tolerance)
+    assert_close(jax.tree.map(lambda x: x[7], path), final, rtol=0.0)
+
+
+def test_a_flight_in_float32_is_right_to_some_micrometres():
+    exact = integrate(with_quadratic_drag, 1.8)
+    np.testing.assert_allclose(flown(ball(dtype=np.float32), 1.8).pos, exact.pos, atol=5e-6)
+
+
+@float64
+def test_a_negative_duration_flies_back():
+    there, _ = fly_eight_steps(ball(), 0.8, DRAG, GRAVITY)
+    back, _ = fly_eight_steps(there, -0.8, DRAG, GRAVITY)
+    assert_close(back, ball(), atol=1e-5)
+
+
+@float64
+def test_energy_decays_with_drag_and_is_kept_without():
+    for drag, kept in ((0.0, True), (DRAG, False)):
+        _, path = fly_eight_steps(ball(), 1.6, drag, GRAVITY)
+        vel, height = np.asarray(path.vel), np.asarray(path.pos)[:, 2]
+        energy = 0.5 * np.sum(vel**2, axis=1) + GRAVITY * height
+        assert np.ptp(energy) < 1e-12 * energy[0] if kept else np.all(np.diff(energy) < 0.0)
+
+
+@float64
+def test_flight_gradient_matches_finite_differences():
+    """With respect to the ball, the duration, the drag and gravity."""
+
+    def landing(args):
+        final, _ = fly(*args, num_steps=2)
+        return jnp.sum(final.pos * jnp.arange(1.0, 4.0)) + jnp.sum(final.vel**2)
+
+    assert_gradient_matches_differences(landing, (ball(), 1.1, DRAG, GRAVITY))
+
+
+# Linear drag
+
+
+@float64
+def test_linear_drag_is_the_flight_that_scipy_finds():
+    exact = integrate(lambda vel: WEIGHT - LINEAR_DRAG * vel, 1.6)
+    assert_close(linear_drag(ball(), 1.6, LINEAR_DRAG, GRAVITY), exact, atol=1e-11)
+
+
+@float64
+def test_linear_drag_obeys_its_own_equation_of_motion():
+    state, rate, _ = linear_drag_and_rates(ball(), 1.6, LINEAR_DRAG)
+    np.testing.assert_allclose(rate.pos, state.vel, rtol=1e-12)
+    np.testing.assert_allclose(rate.vel, WEIGHT - LINEAR_DRAG * state.vel, rtol=1e-12)
+
+
+@float64
+def test_linear_drag_goes_over_into_the_drag_free_flight():
+    free = drag_free(ball(), 1.6, GRAVITY)
+    assert_close(linear_drag(ball(), 1.6, np.zeros(3), GRAVITY), free, rtol=1e-15)
+    drags = np.array([1e-2, 1e-4, 1e-6])
+    errors = [
+        np.linalg.norm(linear_drag(ball(), 1.6, np.full(3, k), GRAVITY).pos - free.pos)
+        for k in drags
+    ]
+    assert float(observed_order(drags, errors)) == pytest.approx(1.0, abs=0.01)
+
+
+@float64
+def test_the_slope_in_linear_drag_at_no_drag_is_the_first_term_of_its_series():
+    """s = s_0 + v t + g t^2 / 2 - K (v t^2 / 2 + g t^3 / 6) + ..."""
+    t = 1.6
+    _, _, slope = linear_drag_and_rates(ball(), t, np.zeros(3))
+    expected = -(ball().vel * t**2 / 2.0 + WEIGHT * t**3 / 6.0)
+    np.testing.assert_allclose(slope.pos, expected, rtol=1e-14)
+
+
+@float64
+@pytest.mark.parametrize("product", [0.5, -0.5])  # K t where the series hands over
+def test_linear_drag_and_its_slopes_have_no_jump_where_the_formula_changes(product):
+    below, above = (
+        linear_drag_and_rates(ball(), 1.0, np.full(3, product * (1.0 + e))) for e in (-1e-13, 1e-13)
+    )
+    assert_close(below, above, rtol=1e-11)
+
+
+def test_linear_drag_is_exact_to_rounding_in_float32_however_small_it_is():
+    for drag in (1e-6, 1e-3, 0.3, 0.32, 3.0):
+        exact = integrate(lambda vel, drag=drag: WEIGHT - drag * vel, 1.6)
+        state = linear_drag(ball(dtype=np.float32), 1.6, np.full(3, drag, np.float32), GRAVITY)
+        assert state.pos.dtype == np.float32
+        assert_close(state, exact, atol=5e-6)
+
+
+@float64
+def test_strong_linear_drag_leaves_the_terminal_velocity():
+    final = linear_drag(ball(), 10.0, np.full(3, 20.0), GRAVITY)
+    np.testing.assert_allclose(final.vel, WEIGHT / 20.0, atol=1e-12)
+
+
+# Apex and fall of a drag-free ball
+
+
+@float64
+def test_the_apex_is_the_highest_point_of_the_path():
+    times = np.linspace(0.0, 2.0, 20001)
+    heights = SERVE_POS[2] + SERVE_VEL[2] * times - 0.5 * GRAVITY * times**2
+    apex, slope = apex_and_slope(ball(), GRAVITY)
+    assert float(apex) == pytest.approx(heights.max(), abs=1e-7)
+    np.testing.assert_allclose(slope.vel, [0.0, 0.0, SERVE_VEL[2] / GRAVITY], rtol=1e-14)
+
+
+@float64
+@pytest.mark.parametrize("vz", [-3.0, 0.0, 1e-9])
+def test_a_falling_ball_is_highest_now_and_the_apex_has_no_kink(vz):
+    apex, slope = apex_and_slope(ball(vel=(1.0, 0.0, vz)), GRAVITY)
+    assert apex == SERVE_POS[2]
+    np.testing.assert_allclose(slope.vel, 0.0, atol=1e-9)
+
+
+@float64
+@pytest.mark.parametrize("height", [0.0, 2.0, 3.5])
+def test_a_ball_falls_through_the_plane_at_the_fall_time(height):
+    """A plane that is higher by dh is met earlier by dh / |v_z|."""
+    (time, reached), slopes = fall_and_slope(ball(), height, GRAVITY)
+    there = drag_free(ball(), float(time), GRAVITY)
+    assert reached and there.vel[2] < 0.0
+    np.testing.assert_allclose(there.pos[2], height, atol=1e-12)
+    np.testing.assert_allclose(slopes[1], 1.0 / there.vel[2], rtol=1e-12)
+
+
+# Too slow to rise so far; grazing it; below and falling; in the plane and falling.
+@pytest.mark.parametrize(("height", "vz"), [(2.25, 1.0), (2.25, 2.0), (2.25, -6.0), (2.0, -6.0)])
+def test_a_plane_that_is_not_fallen_through_is_flagged_with_a_finite_gradient(height, vz):
+    start = ball(vel=(0.0, 0.0, vz), dtype=np.float32)
+    (time, reached), slopes = fall_and_slope(start, height, 8.0)
+    assert not reached and time == 0.0
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(slopes))
+
+
+# One ball or many
+
+
+@float64
+def test_batch_equals_loop():
+    balls = BallState(
+        pos=np.array([SERVE_POS, (0.0, 0.0, 0.0), (-1.0, 2.0, 0.3)]),
+        vel=np.array([SERVE_VEL, (0.0, 0.0, 0.0), (0.0, -20.0, 1.0)]),
+    )
+    durations, drags = np.array([1.8, 0.5, -0.2]), np.array([DRAG, 0.0, 0.3])
+    linear_drags = drags[:, None] * LINEAR_DRAG
+    axes = (0, 0, 0, None)
+    many = jax.jit(jax.vmap(functools.partial(fly, num_steps=8), axes))
+    many_linear = jax.jit(jax.vmap(linear_drag_flight, axes))
+    together = jax.tree.map(
+        np.asarray,
+        (
+            many(balls, durations, drags, GRAVITY),
+            many_linear(balls, durations, linear_drags, GRAVITY),
+        ),
+    )
+    for k in range(3):
+        pick = functools.partial(jax.tree.map, lambda x, k=k: x[k])
+        alone = (
+            fly_eight_steps(pick(balls), float(durations[k]), float(drags[k]), GRAVITY),
+            linear_drag(pick(balls), float(durations[k]), linear_drags[k], GRAVITY),
+        )
+        assert_close(pick(together), alone, rtol=1e-13)

@@ -1,0 +1,120 @@
+"""The racket impact: what the bounce keeps, what it loses, and its inverse."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from derivatives import assert_gradient_matches_differences
+
+from planner_jax.ball.impact import racket_impact, required_impact
+
+RESTITUTION = 0.7
+BALL_VEL = np.array([-5.0, -0.4, -5.5])
+RACKET_VEL = np.array([1.0, -2.0, 0.5])
+NORMAL = np.array([2.0, 1.0, 2.0]) / 3.0
+STILL = np.zeros(3)
+
+float64 = pytest.mark.usefixtures("float64")
+
+bounce = jax.jit(racket_impact)
+required = jax.jit(required_impact)
+
+
+def split(vel):
+    """Speed along the normal, and velocity across it."""
+    along = vel @ NORMAL
+    return along, vel - along * NORMAL
+
+
+@float64
+def test_a_still_racket_sends_a_ball_back_at_the_restitution_times_its_normal_speed():
+    """A ball that falls on a level racket at 2 m/s leaves it at 1.4 m/s."""
+    after = bounce(np.array([3.0, 0.0, -2.0]), STILL, np.array([0.0, 0.0, 1.0]), RESTITUTION)
+    np.testing.assert_allclose(after, [3.0, 0.0, 1.4], rtol=1e-15)
+    before, after = split(BALL_VEL), split(bounce(BALL_VEL, STILL, NORMAL, RESTITUTION))
+    np.testing.assert_allclose(after[0], -RESTITUTION * before[0], rtol=1e-14)
+    np.testing.assert_allclose(after[1], before[1], atol=1e-14)
+
+
+@float64
+def test_a_bounce_looks_the_same_from_a_moving_frame():
+    after = bounce(BALL_VEL, STILL, NORMAL, RESTITUTION) + RACKET_VEL
+    moving = bounce(BALL_VEL + RACKET_VEL, RACKET_VEL, NORMAL, RESTITUTION)
+    np.testing.assert_allclose(moving, after, atol=1e-14)
+
+
+@float64
+def test_only_the_normal_speed_of_the_racket_counts_and_not_which_side_is_the_front():
+    after = bounce(BALL_VEL, RACKET_VEL, NORMAL, RESTITUTION)
+    across = np.cross(NORMAL, [0.3, -4.0, 1.0])
+    sliding = bounce(BALL_VEL, RACKET_VEL + across, NORMAL, RESTITUTION)
+    np.testing.assert_allclose(sliding, after, atol=1e-14)
+    np.testing.assert_array_equal(bounce(BALL_VEL, RACKET_VEL, -NORMAL, RESTITUTION), after)
+
+
+@float64
+def test_an_elastic_bounce_keeps_the_energy_and_a_plastic_one_leaves_ball_and_racket_together():
+    elastic = bounce(BALL_VEL, STILL, NORMAL, 1.0)
+    np.testing.assert_allclose(np.linalg.norm(elastic), np.linalg.norm(BALL_VEL), rtol=1e-14)
+    plastic = bounce(BALL_VEL, RACKET_VEL, NORMAL, 0.0)
+    np.testing.assert_allclose(split(plastic)[0], split(RACKET_VEL)[0], rtol=1e-14)
+
+
+@float64
+@pytest.mark.parametrize("restitution", [0.0, 0.47, 0.7, 1.0])
+def test_the_required_impact_inverts_the_bounce(restitution):
+    wanted = np.array([4.0, 1.5, 6.0])
+    normal, normal_speed = required(BALL_VEL, wanted, restitution)
+    np.testing.assert_allclose(np.linalg.norm(normal), 1.0, rtol=1e-15)
+    assert normal @ (wanted - BALL_VEL) > 0.0
+    across = np.cross(normal, [0.3, -4.0, 1.0])
+    after = bounce(BALL_VEL, normal_speed * normal + across, normal, restitution)
+    np.testing.assert_allclose(after, wanted, atol=1e-13)
+
+
+@float64
+def test_the_bounce_determines_normal_and_normal_speed():
+    after = bounce(BALL_VEL, RACKET_VEL, NORMAL, RESTITUTION)
+    normal, normal_speed = required(BALL_VEL, after, RESTITUTION)
+    np.testing.assert_allclose(normal, NORMAL, atol=1e-14)
+    np.testing.assert_allclose(normal_speed, RACKET_VEL @ NORMAL, rtol=1e-13)
+
+
+@float64
+def test_impact_gradients_match_finite_differences():
+    """With respect to both velocities, the normal and the restitution, both ways."""
+
+    def everything(args):
+        ball_vel, racket_vel, normal, restitution = args
+        after = racket_impact(ball_vel, racket_vel, normal, restitution)
+        back, normal_speed = required_impact(after, racket_vel, restitution)
+        return jnp.sum(after**3) + back @ jnp.arange(3.0) + normal_speed
+
+    assert_gradient_matches_differences(everything, (BALL_VEL, RACKET_VEL, NORMAL, RESTITUTION))
+
+
+def test_no_change_of_velocity_needs_no_normal_and_has_a_finite_gradient():
+    vel = BALL_VEL.astype(np.float32)
+
+    def require(after):
+        impact = required_impact(vel, after, RESTITUTION)
+        return impact, impact
+
+    jacobian, (normal, normal_speed) = jax.jit(jax.jacfwd(require, has_aux=True))(vel)
+    assert not np.any(normal) and normal_speed == 0.0
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(jacobian))
+
+
+def test_batch_equals_loop_in_float32():
+    balls = np.array([BALL_VEL, [0.0, 0.0, -2.0], [-9.0, 3.0, 1.0]], np.float32)
+    wanted = np.array([[4.0, 1.5, 6.0], [0.0, 0.0, 1.4], [3.0, -3.0, 7.0]], np.float32)
+    restitutions = np.array([0.7, 0.5, 0.9], np.float32)
+    many = jax.jit(jax.vmap(required_impact))(balls, wanted, restitutions)
+    normals, speeds = map(np.asarray, many)
+    assert normals.dtype == speeds.dtype == np.float32
+    for k in range(3):
+        normal, speed = required(balls[k], wanted[k], restitutions[k])
+        np.testing.assert_allclose(normals[k], normal, atol=1e-6)
+        np.testing.assert_allclose(speeds[k], speed, rtol=1e-6)
+        after = bounce(balls[k], speed * normal, normal, restitutions[k])
+        np.testing.assert_allclose(after, wanted[k], atol=5e-6)

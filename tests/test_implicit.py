@@ -1,0 +1,93 @@
+"""Gradients of optimal plans against finite differences of plans solved anew."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from planner_jax.optimise.implicit import newton_refine, optimal_plan
+from planner_jax.optimise.lbfgs import Evaluation
+from planner_jax.optimise.status import Status
+from planner_jax.task.hit.exact import ExactHit
+from planner_jax.task.hit.serves import generate_serves, to_scenarios
+
+PLANNER = ExactHit()
+
+# How to move one number of a scenario, for each leaf that is differentiated by.
+MOVES = {
+    "drag": lambda s, d: s.replace(drag=s.drag + d),
+    "racket_height": lambda s, d: s.replace(racket_height=s.racket_height + d),
+    "target": lambda s, d: s.replace(target=s.target.at[0].add(d)),
+    "restitution": lambda s, d: s.replace(restitution=s.restitution + d),
+    "speed limit": lambda s, d: s.replace(limits=s.limits.replace(speed=s.limits.speed + d)),
+    "rate limit": lambda s, d: s.replace(limits=s.limits.replace(body_rate=s.limits.body_rate + d)),
+    "start": lambda s, d: s.replace(head_state=s.head_state.at[0, 1].add(d)),
+}
+
+
+def numbers(scenario):
+    """Cost, contact time and hitting point of the optimum, and its status."""
+    plan = optimal_plan(PLANNER, scenario)
+    return jnp.stack([plan.cost, plan.stroke.time, *plan.stroke.ball_pos]), plan.status
+
+
+@pytest.fixture(scope="module")
+def study():
+    """Two late serves under weak limits, one of which presses on them, with their Jacobians."""
+    with jax.enable_x64(True):
+        batch = to_scenarios(generate_serves(8, 3), delay=0.4, limit_scale=0.7, dtype=jnp.float64)
+
+        def moved(scenario, move, distance):
+            return numbers(jax.tree.map(lambda a, b: a + distance * b, scenario, move))
+
+        along = jax.jit(lambda s, move: jax.jvp(lambda d: moved(s, move, d), (0.0,), (1.0,)))
+        return [jax.tree.map(lambda leaf, k=k: leaf[k], batch) for k in (1, 3)], along
+
+
+@pytest.mark.parametrize("name", MOVES)
+def test_gradients_are_those_of_plans_solved_anew(study, name):
+    lanes, along = study
+    with jax.enable_x64(True):
+        for scenario in lanes:
+            unit = jax.tree.map(lambda a, b: a - b, MOVES[name](scenario, 1.0), scenario)
+            (value, status), (slope, _) = along(scenario, unit)
+            assert status == Status.CONVERGED
+            # Large enough for the rounding of a solve, which a flat direction amplifies.
+            step = 1e-4 if name == "drag" else 1e-3
+            ahead = along(MOVES[name](scenario, step), unit)[0][0]
+            behind = along(MOVES[name](scenario, -step), unit)[0][0]
+            numeric = (ahead - behind) / (2 * step)
+            scale = np.maximum(np.abs(value), [1e-12, 1.0, 1.0, 1.0, 1.0])
+            np.testing.assert_allclose(slope / scale, numeric / scale, rtol=2e-3, atol=2e-4)
+
+
+def test_a_limit_that_presses_has_a_price_and_a_slack_one_has_none(study):
+    lanes, along = study
+    with jax.enable_x64(True):
+        slopes = []
+        for scenario in lanes:
+            move = MOVES["speed limit"](scenario, 1.0)
+            unit = jax.tree.map(lambda a, b: a - b, move, scenario)
+            slopes.append(float(along(scenario, unit)[1][0][0]))
+    pressed, slack = slopes
+    assert pressed < 0.0
+    assert slack == 0.0
+
+
+def test_newton_finds_the_minimum_of_a_curved_valley(float64):
+    def rosenbrock(x):
+        cost = 100.0 * (x[1] - x[0] ** 2) ** 2 + (1.0 - x[0]) ** 2
+        return Evaluation(cost=cost, violation=-jnp.ones(()))
+
+    point, slope = newton_refine(
+        rosenbrock, jnp.array([0.7, 0.5]), max_steps=60, stationarity=1e-12
+    )
+    np.testing.assert_allclose(point, 1.0, rtol=1e-9)
+    assert slope <= 1e-12
+
+
+def test_newton_stands_still_at_a_minimum(float64):
+    bowl = lambda x: Evaluation(jnp.sum(x**4), -jnp.ones(()))  # noqa: E731
+    point, slope = newton_refine(bowl, jnp.zeros(3), max_steps=5, stationarity=1e-12)
+    assert jnp.all(point == 0.0)
+    assert slope == 0.0

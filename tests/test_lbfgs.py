@@ -1,0 +1,160 @@
+"""The solver: textbook directions, known minima, and every way of ending by name."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.optimize
+
+from planner_jax.optimise import lbfgs
+from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
+from planner_jax.optimise.multistart import minimise, status_of
+from planner_jax.optimise.status import Status
+
+
+def unlimited(cost):
+    return lambda x: Evaluation(cost=cost(x), violation=jnp.full((), -1.0, x.dtype))
+
+
+def rosenbrock(x):
+    return jnp.sum(100.0 * (x[1:] - x[:-1] ** 2) ** 2 + (1.0 - x[:-1]) ** 2)
+
+
+def stretched(x):
+    return 0.5 * jnp.sum(jnp.logspace(0, 3, x.shape[0]) * (x - 1.0) ** 2)
+
+
+LONG = LbfgsConfig(max_steps=300, tolerance=1e-12, patience=8)
+
+
+@pytest.mark.parametrize("cost", [rosenbrock, stretched])
+def test_known_minimum_is_found(float64, cost):
+    found = jax.jit(lambda x: minimise(unlimited(cost), x, LONG))(jnp.full(6, -0.5))
+    np.testing.assert_allclose(found.point, 1.0, atol=1e-4)
+    assert found.stationary
+
+
+def test_final_cost_is_as_low_as_scipys(float64):
+    start = np.full(6, -0.5)
+    ours = minimise(unlimited(rosenbrock), jnp.asarray(start), LONG)
+    theirs = scipy.optimize.minimize(
+        jax.value_and_grad(rosenbrock), start, jac=True, method="L-BFGS-B", options={"maxcor": 6}
+    )
+    assert ours.evaluation.cost <= theirs.fun + 1e-8
+
+
+def two_loop_by_the_book(steps, changes, grad):
+    """Nocedal and Wright, algorithm 7.4, written out for lists of pairs, oldest first."""
+    q, alphas = grad.copy(), []
+    for s, y in zip(reversed(steps), reversed(changes), strict=True):
+        alphas.append(s @ q / (y @ s))
+        q -= alphas[-1] * y
+    r = (steps[-1] @ changes[-1]) / (changes[-1] @ changes[-1]) * q
+    for s, y, a in zip(steps, changes, reversed(alphas), strict=True):
+        r += s * (a - y @ r / (y @ s))
+    return -r
+
+
+def test_direction_is_that_of_the_two_loop_recursion(float64):
+    config = LbfgsConfig(memory=4, step_cap=1e9)
+    objective = unlimited(stretched)
+    state = lbfgs.init(objective, jnp.linspace(-1.0, 2.0, 5), config)
+    steps, changes = [], []
+    for _ in range(7):
+        after = lbfgs.step(objective, state, config)
+        steps.append(np.asarray(after.point - state.point))
+        changes.append(np.asarray(after.grad - state.grad))
+        state = after
+    expected = two_loop_by_the_book(steps[-4:], changes[-4:], np.asarray(state.grad))
+    np.testing.assert_allclose(lbfgs.search_direction(state, config), expected, rtol=1e-9)
+
+
+def test_first_direction_has_unit_length_whatever_the_gradient():
+    for size in (1e-6, 1e6):
+        state = lbfgs.init(unlimited(lambda x, s=size: s * jnp.sum(x)), jnp.ones(4), LbfgsConfig())
+        assert jnp.linalg.norm(lbfgs.search_direction(state, LbfgsConfig())) == pytest.approx(1.0)
+
+
+def test_no_step_is_longer_than_the_cap():
+    config = LbfgsConfig(step_cap=0.1)
+    state = lbfgs.init(unlimited(stretched), jnp.full(5, 50.0), config)
+    for _ in range(5):
+        after = lbfgs.step(unlimited(stretched), state, config)
+        assert jnp.linalg.norm(after.point - state.point) <= 0.1 * max(config.trial_steps) * 1.001
+        state = after
+
+
+def test_cost_never_rises():
+    state = lbfgs.init(unlimited(rosenbrock), jnp.full(4, -1.0), LbfgsConfig())
+    for _ in range(20):
+        after = lbfgs.step(unlimited(rosenbrock), state, LbfgsConfig())
+        assert after.cost <= state.cost
+        state = after
+
+
+def test_best_feasible_iterate_is_kept_when_the_minimum_is_infeasible():
+    """Minimum at 0, feasible only beyond 1: the answer lies at or beyond 1."""
+
+    def objective(x):
+        return Evaluation(cost=jnp.sum(x**2), violation=1.0 - jnp.min(x))
+
+    config = LbfgsConfig(max_steps=80, trial_steps=(0.3,), step_cap=0.2)
+    found = minimise(objective, jnp.full(2, 3.0), config)
+    assert found.evaluation.violation <= 0.0
+    assert jnp.all(found.point >= 1.0)
+    assert jnp.all(found.point < 1.5)
+
+
+def end_of(objective, start, **options):
+    found = minimise(objective, start, LbfgsConfig(**options))
+    return Status(
+        int(status_of(found.evaluation.cost, found.evaluation.violation, found.stationary))
+    )
+
+
+def test_each_ending_has_its_status():
+    start = jnp.full(4, -0.5)
+    infeasible = lambda x: Evaluation(stretched(x), jnp.full((), 0.2, x.dtype))  # noqa: E731
+    assert end_of(unlimited(stretched), start, max_steps=200) is Status.CONVERGED
+    assert end_of(unlimited(rosenbrock), start, max_steps=2) is Status.FEASIBLE
+    assert end_of(infeasible, start, max_steps=200) is Status.INFEASIBLE
+    assert end_of(infeasible, start, max_steps=1) is Status.MAX_STEPS
+    nan = lambda x: jnp.sum(x) * jnp.nan  # noqa: E731
+    assert end_of(unlimited(nan), start, max_steps=5) is Status.NON_FINITE
+
+
+def test_flat_objective_ends_stationary_and_finite():
+    found = minimise(unlimited(lambda x: 0.0 * jnp.sum(x) + 1.0), jnp.ones(3), LbfgsConfig())
+    assert found.stationary
+    assert jnp.all(jnp.isfinite(found.point))
+
+
+def test_steps_into_the_undefined_are_not_taken():
+    found = minimise(unlimited(lambda x: jnp.sum(x - jnp.log(x))), jnp.full(3, 0.2), LONG)
+    np.testing.assert_allclose(found.point, 1.0, atol=1e-2)
+
+
+def test_batch_equals_loop_with_unequal_lanes_and_a_broken_one():
+    def solve(start, scale):
+        return minimise(unlimited(lambda x: scale * rosenbrock(x)), start, LbfgsConfig(30))
+
+    starts = jnp.array([[-0.5, 0.3], [2.0, -1.0], [1.0, 1.0], [0.1, 0.0]])
+    scales = jnp.array([1.0, 1e-4, 30.0, jnp.nan])
+    batch = jax.jit(jax.vmap(solve))(starts, scales)
+    healthy = jax.jit(jax.vmap(solve))(starts, scales.at[3].set(1.0))
+    for lane in range(3):
+        alone = solve(starts[lane], scales[lane])
+        np.testing.assert_allclose(batch.point[lane], alone.point, rtol=2e-3, atol=1e-4)
+        np.testing.assert_array_equal(batch.point[lane], healthy.point[lane])
+    assert not jnp.isfinite(batch.evaluation.cost[3])
+
+
+@pytest.mark.parametrize("options", [{"max_steps": -1}, {"memory": 0}])
+def test_impossible_sizes_are_refused(options):
+    name = next(iter(options))
+    with pytest.raises(ValueError, match=f"{name} must be >= "):
+        LbfgsConfig(**options)
+
+
+def test_every_status_has_a_sentence():
+    assert len({status.message for status in Status}) == len(Status)

@@ -1,0 +1,133 @@
+"""The minimum-jerk primitive: its ends, its cost, and that nothing does better."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from derivatives import assert_gradient_matches_differences
+
+from planner_jax.trajectory.minco import minco
+from planner_jax.trajectory.minimum_jerk import mean_squared_jerk, minimum_jerk
+
+DURATION = 0.9
+HEAD = np.array([[1.0, -2.0, 1.5], [0.5, 2.0, -1.0], [3.0, -4.0, 2.0]])
+TAIL = np.array([[0.2, 1.0, 2.5], [-1.5, 0.0, 3.0], [-2.0, 5.0, 1.0]])
+
+float64 = pytest.mark.usefixtures("float64")
+
+
+@jax.jit
+def solve(head_state, tail_state, duration):
+    primitive = minimum_jerk(head_state, tail_state, duration)
+    return primitive, mean_squared_jerk(primitive)
+
+
+def axes_of(coeffs):
+    """One NumPy polynomial an axis, of coefficients (D + 1, 3)."""
+    return [np.polynomial.Polynomial(c) for c in np.asarray(coeffs, np.float64).T]
+
+
+def jerk_cost(axes):
+    """(1/T) integral |jerk|^2 dt by Gauss's quadrature, exact up to degree 31."""
+    nodes, weights = np.polynomial.legendre.leggauss(16)
+    times = 0.5 * DURATION * (1.0 + nodes)
+    return sum(0.5 * weights @ axis.deriv(3)(times) ** 2 for axis in axes)
+
+
+def states(axes):
+    """Position, velocity and acceleration at both ends, (2, 3, 3)."""
+    return np.array(
+        [
+            [[axis.deriv(d)(time) if d else axis(time) for axis in axes] for d in range(3)]
+            for time in (0.0, DURATION)
+        ]
+    )
+
+
+@float64
+def test_the_primitive_meets_both_states():
+    primitive, _ = solve(HEAD, TAIL, DURATION)
+    assert primitive.coeffs.shape == (1, 6, 3)
+    np.testing.assert_array_equal(primitive.durations, [DURATION])
+    head, tail = states(axes_of(primitive.coeffs[0]))
+    np.testing.assert_allclose(head, HEAD, atol=1e-14)
+    np.testing.assert_allclose(tail, TAIL, atol=1e-11)
+
+
+@float64
+def test_from_hover_to_hover_it_is_the_classical_quintic():
+    """p = (10 x^3 - 15 x^4 + 6 x^5) d with x = t / T, whose cost is 720 |d|^2 / T^6."""
+    way = np.array([2.0, -1.0, 0.5])
+    rest = np.zeros((3, 3))
+    primitive, cost = solve(rest, np.concatenate([way[None], rest[1:]]), DURATION)
+    shape = np.array([0.0, 0.0, 0.0, 10.0, -15.0, 6.0]) / DURATION ** np.arange(6)
+    np.testing.assert_allclose(primitive.coeffs[0], np.outer(shape, way), atol=1e-12)
+    np.testing.assert_allclose(cost, 720.0 * way @ way / DURATION**6, rtol=1e-12)
+
+
+@float64
+def test_coasting_costs_nothing():
+    powers = np.array([1.0, DURATION, DURATION**2 / 2.0])
+    tail = np.array([powers @ HEAD, powers[:2] @ HEAD[1:], HEAD[2]])
+    primitive, cost = solve(HEAD, tail, DURATION)
+    np.testing.assert_allclose(primitive.coeffs[0, 3:], 0.0, atol=1e-11)
+    assert cost < 1e-20
+
+
+@float64
+def test_it_is_one_piece_of_minco_of_order_three():
+    primitive, _ = solve(HEAD, TAIL, DURATION)
+    other = jax.jit(minco)(HEAD, TAIL, np.zeros((0, 3)), np.array([DURATION]))
+    np.testing.assert_allclose(primitive.coeffs, other.coeffs, rtol=1e-10)
+
+
+@float64
+def test_the_cost_is_the_mean_of_the_squared_jerk():
+    primitive, cost = solve(HEAD, TAIL, DURATION)
+    np.testing.assert_allclose(cost, jerk_cost(axes_of(primitive.coeffs[0])), rtol=1e-12)
+
+
+@float64
+def test_every_change_that_keeps_both_states_raises_the_cost_by_its_own():
+    """The sixth derivative vanishes (Pontryagin), so the first variation of the cost does."""
+    primitive, cost = solve(HEAD, TAIL, DURATION)
+    axes = axes_of(primitive.coeffs[0])
+    assert all(axis.degree() == 5 and not axis.deriv(6).coef.any() for axis in axes)
+    # t^3 (T - t)^3 and what is times it have no position, velocity or acceleration at the ends.
+    bump = (
+        np.polynomial.Polynomial([0.0, 1.0]) ** 3 * np.polynomial.Polynomial([DURATION, -1.0]) ** 3
+    )
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        changes = [bump * np.polynomial.Polynomial(c) for c in rng.normal(scale=9.0, size=(3, 4))]
+        np.testing.assert_allclose(states(changes), 0.0, atol=1e-12)
+        changed = [axis + change for axis, change in zip(axes, changes, strict=True)]
+        np.testing.assert_allclose(jerk_cost(changed) - cost, jerk_cost(changes), rtol=1e-9)
+        assert jerk_cost(changed) > cost
+
+
+def cost_and_coefficients(point):
+    primitive = minimum_jerk(*point)
+    return mean_squared_jerk(primitive) + jnp.sum(primitive.coeffs**2)
+
+
+@float64
+def test_the_gradient_in_states_and_duration_matches_finite_differences():
+    assert_gradient_matches_differences(cost_and_coefficients, (HEAD, TAIL, DURATION))
+
+
+def test_batch_equals_loop_in_float32():
+    heads, tails = (np.stack([x, -2.0 * x, x[::-1]]).astype(np.float32) for x in (HEAD, TAIL))
+    durations = np.array([0.9, 0.4, 1.7], np.float32)
+    primitives, costs = jax.tree.map(np.asarray, jax.jit(jax.vmap(solve))(heads, tails, durations))
+    assert primitives.coeffs.dtype == costs.dtype == np.float32
+    for k in range(3):
+        primitive, cost = solve(heads[k], tails[k], durations[k])
+        np.testing.assert_allclose(primitives.coeffs[k], primitive.coeffs, rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(costs[k], cost, rtol=1e-4)
+
+
+def test_in_float32_the_end_is_met_to_ten_micrometres():
+    primitive, _ = solve(*(np.asarray(x, np.float32) for x in (HEAD, TAIL, DURATION)))
+    _, tail = states(axes_of(primitive.coeffs[0]))
+    np.testing.assert_allclose(tail[0], TAIL[0], atol=1e-5)

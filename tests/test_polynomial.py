@@ -1,0 +1,133 @@
+"""Piecewise polynomials: evaluation, continuation past the ends, and energy."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from derivatives import assert_gradient_matches_differences
+
+from planner_jax.trajectory.polynomial import (
+    PiecewisePolynomial,
+    derivative_factors,
+    evaluate,
+    snap_energy,
+    total_duration,
+)
+
+DURATIONS = (0.4, 1.1, 0.7)
+DEGREE = 5
+
+float64 = pytest.mark.usefixtures("float64")
+
+
+# Of all orders at once, compiled once for all tests of equal dtype.
+
+
+@jax.jit
+def values_at(trajectory, time):
+    return tuple(evaluate(trajectory, time, order) for order in range(DEGREE + 2))
+
+
+@jax.jit
+def energies_of(trajectory):
+    return tuple(snap_energy(trajectory, order) for order in range(DEGREE + 2))
+
+
+def trajectory(dtype=np.float64, seed=0):
+    """Three pieces that do not join."""
+    coeffs = np.random.default_rng(seed).normal(size=(3, DEGREE + 1, 3))
+    return PiecewisePolynomial(coeffs=coeffs.astype(dtype), durations=np.array(DURATIONS, dtype))
+
+
+def exact(piece, local, order=0):
+    polynomials = map(np.polynomial.Polynomial, trajectory().coeffs[piece].T)
+    return [p.deriv(order)(local) if order else p(local) for p in polynomials]
+
+
+def test_derivative_factors_are_falling_factorials():
+    for order in range(7):
+        expected = [math.perm(k, order) for k in range(6)]
+        np.testing.assert_array_equal(derivative_factors(5, order), expected)
+
+
+@float64
+@pytest.mark.parametrize("order", range(5))
+def test_every_piece_is_evaluated_in_its_own_time(order):
+    for time, piece, local in ((0.3, 0, 0.3), (0.9, 1, 0.5), (2.0, 2, 0.5)):
+        expected = exact(piece, local, order)
+        np.testing.assert_allclose(values_at(trajectory(), time)[order], expected, rtol=1e-12)
+
+
+@float64
+def test_a_piece_begins_where_the_one_before_it_ends():
+    for time, piece in ((0.0, 0), (0.4, 1), (1.5, 2)):
+        np.testing.assert_array_equal(
+            values_at(trajectory(), time)[0], trajectory().coeffs[piece, 0]
+        )
+
+
+@float64
+def test_before_the_start_and_past_the_end_the_nearest_piece_goes_on():
+    np.testing.assert_allclose(values_at(trajectory(), -0.5)[0], exact(0, -0.5), rtol=1e-12)
+    np.testing.assert_allclose(values_at(trajectory(), 3.0)[0], exact(2, 1.5), rtol=1e-12)
+
+
+@float64
+def test_more_derivatives_than_the_degree_leave_nothing():
+    assert not np.any(values_at(trajectory(), 0.3)[DEGREE + 1])
+    assert energies_of(trajectory())[DEGREE + 1] == 0.0
+
+
+@float64
+def test_the_slope_in_time_is_the_next_derivative():
+    rate_of = jax.jit(jax.jacfwd(lambda time, path: evaluate(path, time, 1)))
+    for time in (-0.1, 0.2, 1.2, 2.5):
+        np.testing.assert_allclose(
+            rate_of(time, trajectory()), values_at(trajectory(), time)[2], rtol=1e-12
+        )
+
+
+@float64
+def test_the_durations_add_up_in_one_trajectory_and_in_many():
+    assert float(total_duration(trajectory())) == pytest.approx(2.2, rel=1e-15)
+    many = jax.tree.map(lambda x: np.stack([x, 2.0 * x]), trajectory())
+    np.testing.assert_allclose(total_duration(many), [2.2, 4.4], rtol=1e-15)
+
+
+@float64
+@pytest.mark.parametrize("order", range(5))
+def test_the_energy_is_the_quadrature_of_the_squared_derivative(order):
+    """Six nodes integrate the squares, of degree ten, exactly."""
+    nodes, weights = np.polynomial.legendre.leggauss(6)
+    energy = 0.0
+    for piece, duration in enumerate(DURATIONS):
+        samples = exact(piece, 0.5 * duration * (1.0 + nodes), order)
+        energy += 0.5 * duration * np.sum(weights * np.square(samples))
+    np.testing.assert_allclose(energies_of(trajectory())[order], energy, rtol=1e-13)
+
+
+@float64
+def test_the_gradients_match_finite_differences():
+    """Of the energy and of a value, with respect to coefficients and durations."""
+
+    def everything(trajectory):
+        value = evaluate(trajectory, 1.8, 1)
+        return snap_energy(trajectory, 3) + jnp.sum(value * jnp.arange(1.0, 4.0))
+
+    assert_gradient_matches_differences(everything, trajectory())
+
+
+def test_batch_equals_loop_in_float32():
+    many = jax.tree.map(
+        lambda a, b: np.stack([a, 1.5 * b]), *(trajectory(np.float32, k) for k in (0, 1))
+    )
+    times = np.array([1.3, 0.2], np.float32)
+    both = jax.vmap(lambda path, time: (evaluate(path, time), snap_energy(path)))
+    values, energies = map(np.asarray, jax.jit(both)(many, times))
+    assert values.dtype == energies.dtype == np.float32
+    for k in range(2):
+        one = jax.tree.map(lambda x, k=k: x[k], many)
+        np.testing.assert_allclose(values[k], values_at(one, times[k])[0], rtol=1e-5)
+        np.testing.assert_allclose(energies[k], energies_of(one)[4], rtol=1e-5)

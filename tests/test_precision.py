@@ -1,0 +1,92 @@
+"""Matrix products ask for full float32 precision, which a GPU does not give unasked."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+from jaxpr import assert_full_precision
+
+from planner_jax.trajectory.minco import minco
+from planner_jax.trajectory.polynomial import snap_energy
+from planner_jax.trajectory.uniform_minco import (
+    sample_motion,
+    trajectory_energy,
+    uniform_minco,
+    uniform_trajectory,
+)
+
+MATRIX, ROWS = np.eye(3, dtype=np.float32), np.ones((8, 3), np.float32)
+
+
+def full(a, b):
+    return jnp.matmul(a, b, precision=lax.Precision.HIGHEST)
+
+
+def custom_derivative(product):
+    function = jax.custom_jvp(lambda a, b: product(a, b))
+    function.defjvp(lambda primals, tangents: (product(*primals), product(*tangents)))
+    return function
+
+
+def general_energy(head, tail, waypoints, durations):
+    return snap_energy(minco(head, tail, waypoints, durations))
+
+
+def uniform_values(rows, offsets, duration):
+    """One number of everything that the equal-duration maps give."""
+    args = uniform_minco(4, 4), rows, offsets, duration
+    parts = (
+        uniform_trajectory(*args),
+        sample_motion(args[0], 5, *args[1:]),
+        trajectory_energy(*args),
+    )
+    return sum(jnp.sum(leaf) for leaf in jax.tree.leaves(parts))
+
+
+# The check itself
+
+
+NESTED = {
+    "plain": lambda product: product,
+    "jit": jax.jit,
+    "vmap": lambda product: lambda a, b: jax.vmap(product, in_axes=(None, 0))(a, b[None]),
+    "loop": lambda product: lambda a, b: lax.scan(lambda c, _: (product(a, c), None), b, None, 2),
+    "branch": lambda product: lambda a, b: lax.cond(a[0, 0] > 0, product, lambda a, b: b, a, b),
+    "checkpoint": jax.checkpoint,
+    "custom derivative": custom_derivative,
+    "linear solve": lambda product: (
+        lambda a, b: lax.custom_linear_solve(
+            lambda x: product(a, x), b, lambda _, x: x, symmetric=True
+        )
+    ),
+}
+
+
+@pytest.mark.parametrize("nest", NESTED.values(), ids=NESTED)
+def test_a_product_of_less_precision_is_found_wherever_it_hides(nest):
+    assert assert_full_precision(nest(full), MATRIX, MATRIX) > 0
+    for precision in (None, lax.Precision.DEFAULT, lax.Precision.HIGH):
+        less = lambda a, b, p=precision: jnp.matmul(a, b, precision=p)  # noqa: E731
+        with pytest.raises(AssertionError, match="dot_general of .* asks for precision"):
+            assert_full_precision(nest(less), MATRIX, MATRIX)
+
+
+# The library
+
+
+@pytest.mark.parametrize("order", [2, 3, 4])
+def test_the_general_map_and_its_gradient_ask_for_full_precision(order):
+    ends = ROWS[:order]
+    given = ends, -ends, 0.5 * ROWS[:3], np.full(4, 0.4, np.float32)
+    assert assert_full_precision(general_energy, *given) > 0
+    gradient = jax.grad(general_energy, argnums=(0, 1, 2, 3))
+    assert assert_full_precision(gradient, *given) > 0
+    many = (np.stack([x, 2.0 * x]) for x in given)
+    assert assert_full_precision(jax.vmap(gradient), *many) > 0
+
+
+def test_the_equal_duration_maps_and_their_gradients_ask_for_full_precision():
+    given = ROWS, ROWS[:3], np.float32(0.4)
+    assert assert_full_precision(uniform_values, *given) > 0
+    assert assert_full_precision(jax.grad(uniform_values, argnums=(0, 1, 2)), *given) > 0

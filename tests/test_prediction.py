@@ -1,0 +1,229 @@
+"""The predicted path: cubic convolution of a state table, and its derivatives."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from convergence import observed_order
+from derivatives import assert_gradient_matches_differences
+
+from planner_jax.ball.flight import BallState, drag_free_flight, rk4_step
+from planner_jax.ball.prediction import (
+    PathTable,
+    convolution_weights,
+    covers,
+    horizon_of,
+    predict_path,
+    target_at,
+)
+
+GRAVITY, DRAG = 9.8, 0.0616
+SERVE_POS, SERVE_VEL = (4.0, 0.5, 2.0), (-6.5, 0.7, 5.5)
+HORIZON, NUM_NODES = 1.5, 13  # ten intervals of 0.15 s between time 0 and the horizon
+RESOLUTION = 0.15
+
+float64 = pytest.mark.usefixtures("float64")
+
+# Compiled once for all tests of equal shapes and dtype; "many" have a row of times.
+predict = jax.jit(functools.partial(predict_path, num_nodes=NUM_NODES))
+many_targets = jax.jit(jax.vmap(target_at, in_axes=(None, 0)))
+step_once = jax.jit(rk4_step)
+drag_free = jax.jit(jax.vmap(drag_free_flight, in_axes=(None, 0, None)))
+
+
+@jax.jit
+def target_and_rate(table, time):
+    return jax.jvp(lambda t: target_at(table, t), (time,), (jnp.ones_like(time),))
+
+
+def serve(dtype=np.float64):
+    return BallState(pos=np.array(SERVE_POS, dtype), vel=np.array(SERVE_VEL, dtype))
+
+
+def path(drag=DRAG, dtype=np.float64):
+    return predict(serve(dtype), dtype(HORIZON), dtype(drag), dtype(GRAVITY))
+
+
+def table_of(function, resolution, num_nodes=NUM_NODES):
+    """The table of a position (3,) and its velocity, given as `function(time)`."""
+    times = resolution * (np.arange(num_nodes) - 1.0)
+    nodes = [function(t) for t in times]
+    pos, vel = (np.array(rows) for rows in zip(*nodes, strict=True))
+    return PathTable(pos=pos, vel=vel, resolution=np.asarray(resolution))
+
+
+def swing(t):
+    t = t + 1.0
+    pos = np.array([np.sin(t), np.cos(2.0 * t), np.exp(-t)])
+    return pos, np.array([np.cos(t), -2.0 * np.sin(2.0 * t), -np.exp(-t)])
+
+
+def assert_close(a, b, **tolerance):
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, **tolerance), a, b)
+
+
+# The table
+
+
+@float64
+def test_nodes_are_runge_kutta_steps_from_one_before_the_start_to_one_past_the_horizon():
+    table = jax.tree.map(np.asarray, path())
+    assert table.pos.shape == table.vel.shape == (NUM_NODES, 3)
+    np.testing.assert_allclose(horizon_of(table), HORIZON, rtol=1e-15)
+    state = step_once(serve(), -RESOLUTION, DRAG, GRAVITY)
+    assert_close((table.pos[0], table.vel[0]), (state.pos, state.vel), rtol=1e-14)
+    state = serve()
+    for k in range(1, NUM_NODES):
+        assert_close((table.pos[k], table.vel[k]), (state.pos, state.vel), rtol=1e-13)
+        state = step_once(state, RESOLUTION, DRAG, GRAVITY)
+
+
+def test_a_table_of_too_few_nodes_is_refused():
+    with pytest.raises(ValueError, match=r"^num_nodes must be >= 5, got 4$"):
+        predict_path(serve(), HORIZON, DRAG, GRAVITY, num_nodes=4)
+
+
+# Between the nodes
+
+
+@float64
+def test_the_kernel_reproduces_quadratics_and_reads_nodes_exactly():
+    u = np.linspace(0.0, 1.0, 11)
+    weights = np.asarray(jax.jit(jax.vmap(convolution_weights))(u))
+    nodes = np.arange(-1.0, 3.0)
+    for power in range(3):
+        np.testing.assert_allclose(weights @ nodes**power, u**power, atol=1e-15)
+    np.testing.assert_allclose(weights[[0, -1]], [[0, 1, 0, 0], [0, 0, 1, 0]], atol=1e-15)
+
+
+@float64
+def test_a_drag_free_path_is_exact_at_any_time():
+    times = np.linspace(0.0, HORIZON, 41)
+    state = many_targets(path(drag=0.0), times)
+    assert_close(state, drag_free(serve(), times, GRAVITY), atol=1e-13)
+
+
+@float64
+def test_interpolation_converges_with_order_three():
+    """Of position and of velocity, as Keys has it for his kernel."""
+    resolutions = np.array([0.08, 0.04, 0.02])
+    errors = []
+    for resolution in resolutions:
+        times = np.linspace(2.0, 7.0, 41) * resolution
+        exact = [np.array(x) for x in zip(*map(swing, times), strict=True)]
+        state = many_targets(table_of(swing, resolution), times)
+        errors.append([np.abs(state.pos - exact[0]).max(), np.abs(state.vel - exact[1]).max()])
+    for error in np.transpose(errors):
+        assert float(observed_order(resolutions, error)) == pytest.approx(3.0, abs=0.3)
+
+
+def test_a_path_in_float32_is_right_to_some_micrometres(float64):
+    times = np.linspace(-0.2, HORIZON + 0.2, 41)
+    single = many_targets(path(dtype=np.float32), times.astype(np.float32))
+    assert single.pos.dtype == single.vel.dtype == np.float32
+    assert_close(single, many_targets(path(), times), atol=1e-5)
+
+
+# Derivatives in time
+
+
+@float64
+@pytest.mark.parametrize("node", range(1, 10))
+def test_value_and_slope_are_continuous_across_every_node(node):
+    table = table_of(swing, RESOLUTION)
+    before, at, after = (target_and_rate(table, node * RESOLUTION + e) for e in (-1e-9, 0.0, 1e-9))
+    assert_close(before, at, atol=1e-7)
+    assert_close(after, at, atol=1e-7)
+    pos, vel = swing(node * RESOLUTION)
+    assert_close(at[0], BallState(pos=pos, vel=vel), atol=1e-14)
+
+
+@float64
+@pytest.mark.parametrize("position", [-1.0, 0.3, 1.0, 4.3, 5.0, 9.0, 9.9, 11.0])
+def test_the_slope_is_the_finite_difference_to_either_side(position):
+    table, step = path(), 1e-6
+    time = position * RESOLUTION
+    state, rate = target_and_rate(table, time)
+    for side in (-step, step):
+        ahead, _ = target_and_rate(table, time + side)
+        difference = jax.tree.map(lambda a, b, side=side: (a - b) / side, ahead, state)
+        assert_close(rate, difference, atol=1e-4)
+
+
+@float64
+@pytest.mark.parametrize(("end", "outwards"), [(0.0, -1.0), (HORIZON, 1.0)])
+def test_at_both_ends_the_value_is_continuous_and_the_target_keeps_its_velocity(end, outwards):
+    """The slope of the position is continuous but for the interpolation, of order two there."""
+    table = path()
+    inside, at, outside = (target_and_rate(table, end + outwards * e) for e in (-1e-9, 0.0, 1e-9))
+    assert_close(inside[0], at[0], atol=1e-7)
+    assert_close(outside[0], at[0], atol=1e-7)
+    for rate in (inside[1], at[1]):
+        np.testing.assert_allclose(rate.pos, outside[1].pos, atol=0.05)
+    np.testing.assert_array_equal(outside[1].pos, outside[0].vel)
+    np.testing.assert_array_equal(outside[1].vel, 0.0)
+
+
+@float64
+def test_the_jump_of_slope_at_the_ends_falls_with_order_two():
+    resolutions = np.array([0.02, 0.01, 0.005])
+    for node, outwards in ((0.0, -1.0), (10.0, 1.0)):
+        jumps = []
+        for resolution in resolutions:
+            end = node * resolution
+            table = table_of(lambda t, end=end: swing(t - end), resolution)
+            inside, outside = (target_and_rate(table, end + outwards * e)[1] for e in (-1e-9, 1e-9))
+            jumps.append(np.linalg.norm(inside.pos - outside.pos))
+        assert float(observed_order(resolutions, jumps)) == pytest.approx(2.0, abs=0.1)
+
+
+@float64
+@pytest.mark.parametrize(("time", "end"), [(-0.4, 0.0), (HORIZON + 2.0, HORIZON)])
+def test_a_time_outside_the_table_continues_at_constant_velocity_and_is_not_covered(time, end):
+    table = path()
+    state, last = (target_and_rate(table, t)[0] for t in (time, end))
+    np.testing.assert_allclose(state.vel, last.vel, rtol=1e-14)
+    np.testing.assert_allclose(state.pos, last.pos + last.vel * (time - end), rtol=1e-14)
+    assert not covers(table, time) and covers(table, end)
+
+
+# Derivatives in everything else
+
+
+def somewhere_on_the_path(point):
+    ball, drag, gravity, time = point
+    table = predict_path(ball, HORIZON, drag, gravity, num_nodes=5)
+    state = target_at(table, time)
+    return jnp.sum(state.pos * jnp.arange(1.0, 4.0)) + jnp.sum(state.vel**2)
+
+
+@float64
+@pytest.mark.parametrize("position", [0.4, 1.0, 1.99, 2.5])  # in nodes; the last is outside
+def test_the_gradient_in_ball_drag_gravity_and_time_matches_finite_differences(position):
+    point = (serve(), DRAG, GRAVITY, position * HORIZON / 2.0)
+    assert_gradient_matches_differences(somewhere_on_the_path, point, step=1e-6, rtol=1e-6)
+
+
+# One ball or many
+
+
+@float64
+def test_batch_equals_loop():
+    balls = BallState(
+        pos=np.array([SERVE_POS, (0.0, 0.0, 0.0), (-1.0, 2.0, 0.3)]),
+        vel=np.array([SERVE_VEL, (0.0, 0.0, 0.0), (0.0, -20.0, 1.0)]),
+    )
+    horizons, drags = np.array([HORIZON, 0.3, 2.0]), np.array([DRAG, 0.0, 0.3])
+    gravity, times = np.float64(GRAVITY), np.array([1.5, 0.4, -0.1])
+    tables = jax.jit(
+        jax.vmap(functools.partial(predict_path, num_nodes=NUM_NODES), in_axes=(0, 0, 0, None))
+    )(balls, horizons, drags, gravity)
+    targets = jax.jit(jax.vmap(target_at))(tables, times)
+    tables, targets = jax.tree.map(np.asarray, (tables, targets))
+    for k in range(3):
+        pick = functools.partial(jax.tree.map, lambda x, k=k: x[k])
+        table = predict(pick(balls), horizons[k], drags[k], gravity)
+        assert_close(pick(tables), table, rtol=1e-13)
+        assert_close(pick(targets), target_and_rate(table, float(times[k]))[0], rtol=1e-13)

@@ -1,0 +1,133 @@
+"""`plan` on a toy planner: rounds, packing, padding and status, without any physics."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import struct
+from jax import Array
+
+from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
+from planner_jax.optimise.problem import Round
+from planner_jax.optimise.status import Status
+from planner_jax.task.solve import is_solved, plan
+
+
+@struct.dataclass
+class Well:
+    """Reach `goal`, which lies behind a ridge unless the start is on its side."""
+
+    goal: Array  # ()
+
+    @property
+    def batch_shape(self):
+        return np.shape(self.goal)
+
+
+@struct.dataclass
+class Reached:
+    point: Array
+    cost: Array
+    violation: Array
+    iterations: Array
+    status: Array
+
+
+TRACES = []
+
+
+@dataclasses.dataclass(frozen=True)
+class WellPlanner:
+    """Guesses at 0 and 4; goals above 2 are only found from the second."""
+
+    rounds: tuple[Round, ...] = (
+        Round(1, LbfgsConfig(max_steps=20)),
+        Round(2, LbfgsConfig(max_steps=20)),
+    )
+
+    def prepare(self, scenario):
+        TRACES.append(scenario.goal)
+        return scenario
+
+    def guesses(self, context, num):
+        return jnp.array([[0.0], [4.0]])[:num]
+
+    def objective(self, point, context):
+        away = jnp.sum((point - context.goal) ** 2)
+        ridge = 50.0 * jnp.exp(-20.0 * jnp.sum((point - 2.0) ** 2))
+        return Evaluation(cost=away + ridge, violation=jnp.sqrt(away) - 0.05)
+
+    def decode(self, point, context):
+        zero = jnp.zeros((), jnp.int32)
+        violation = self.objective(point, context).violation
+        return Reached(point, jnp.zeros_like(violation), violation, zero, zero)
+
+
+GOALS = np.array([0.5, 3.5, -1.0, 4.5, 1.0], np.float32)
+
+
+def test_lanes_unsolved_in_one_round_are_solved_in_the_next():
+    first = plan(WellPlanner(rounds=WellPlanner().rounds[:1]), Well(GOALS))
+    both = plan(WellPlanner(), Well(GOALS))
+    assert list(is_solved(first.status)) == [True, False, True, False, True]
+    assert is_solved(both.status).all()
+    np.testing.assert_allclose(both.point[:, 0], GOALS, atol=0.05)
+    np.testing.assert_array_equal(both.point[[0, 2, 4]], first.point[[0, 2, 4]])
+
+
+def test_a_single_case_equals_its_lane_in_a_batch():
+    batch = plan(WellPlanner(), Well(GOALS))
+    for lane, goal in enumerate(GOALS):
+        alone = plan(WellPlanner(), Well(goal))
+        np.testing.assert_allclose(alone.point, batch.point[lane], rtol=1e-5, atol=1e-5)
+        assert alone.status == batch.status[lane]
+
+
+def test_chunks_and_padding_change_nothing():
+    goals = np.linspace(-1.0, 5.0, 41).astype(np.float32)
+    whole = plan(WellPlanner(), Well(goals))
+    chunked = plan(WellPlanner(), Well(goals), chunk=16)
+    np.testing.assert_array_equal(whole.status, chunked.status)
+    np.testing.assert_allclose(whole.point, chunked.point, rtol=1e-5, atol=1e-5)
+
+
+def test_new_batch_sizes_of_one_bucket_are_not_traced_again():
+    plan(WellPlanner(), Well(GOALS[:3]))
+    TRACES.clear()
+    plan(WellPlanner(), Well(GOALS[:2]))
+    plan(WellPlanner(), Well(GOALS[1:]))
+    assert TRACES == []
+
+
+def test_a_lane_that_is_not_finite_says_so_and_spoils_no_neighbour():
+    broken = GOALS.copy()
+    broken[2] = np.nan
+    clean, spoiled = plan(WellPlanner(), Well(GOALS)), plan(WellPlanner(), Well(broken))
+    assert spoiled.status[2] == Status.NON_FINITE
+    others = [0, 1, 3, 4]
+    np.testing.assert_array_equal(clean.point[others], spoiled.point[others])
+
+
+def test_unsolvable_lanes_keep_the_least_violation_found():
+    @dataclasses.dataclass(frozen=True)
+    class Hopeless(WellPlanner):
+        def objective(self, point, context):
+            found = super().objective(point, context)
+            return Evaluation(found.cost, found.violation + 1.0)
+
+    found = plan(Hopeless(), Well(GOALS))
+    assert not is_solved(found.status).any()
+    np.testing.assert_allclose(found.violation, 0.95, atol=0.02)
+
+
+def test_wrong_batches_are_refused():
+    with pytest.raises(ValueError, match="batch shape"):
+        plan(WellPlanner(), Well(np.zeros((2, 3), np.float32)))
+    with pytest.raises(ValueError, match="batch shape"):
+        plan(WellPlanner(), Well(np.zeros(0, np.float32)))
+
+
+def test_a_round_needs_a_start():
+    with pytest.raises(ValueError, match="starts must be >= 1, got 0"):
+        Round(0, LbfgsConfig())
