@@ -1,1 +1,50 @@
-"""Batched, differentiable planning for robots that meet flying objects."""
+"""Batched, differentiable planning for robots that meet flying objects.
+
+The public names, in the order of the data flow:
+
+* where the ball goes: `BallState`, `fly`, `predict_path`, `target_at`
+* what to plan: `HitScenario`, `hit_scenario`, `generate_serves`, `read_serves`, `to_scenarios`
+* the planners: `planner` (by name), `ExactHit`, and `plan`, one call for one case or many
+* gradients through an optimum: `optimal_plan`
+* the judge: `referee_hits`
+* reading a plan: `PiecewisePolynomial`, `evaluate`, `Status`
+
+They are imported on first use, so that `import planner_jax` itself is quick.
+"""
+
+import pkgutil
+
+_PUBLIC = {
+    "BallState": "planner_jax.ball.flight",
+    "fly": "planner_jax.ball.flight",
+    "predict_path": "planner_jax.ball.prediction",
+    "target_at": "planner_jax.ball.prediction",
+    "HitScenario": "planner_jax.task.hit.scenario",
+    "hit_scenario": "planner_jax.task.hit.scenario",
+    "generate_serves": "planner_jax.task.hit.serves",
+    "read_serves": "planner_jax.task.hit.serves",
+    "to_scenarios": "planner_jax.task.hit.serves",
+    "planner": "planner_jax.task.hit.planners",
+    "ExactHit": "planner_jax.task.hit.exact",
+    "plan": "planner_jax.task.solve",
+    "optimal_plan": "planner_jax.optimise.implicit",
+    "referee_hits": "planner_jax.referee.hit",
+    "PiecewisePolynomial": "planner_jax.trajectory.polynomial",
+    "evaluate": "planner_jax.trajectory.polynomial",
+    "Status": "planner_jax.optimise.status",
+}
+
+__all__ = [*_PUBLIC]
+
+
+def __getattr__(name: str):
+    """Import a public name on first use."""
+    if name not in _PUBLIC:
+        raise AttributeError(f"module 'planner_jax' has no attribute {name!r}")
+    value = pkgutil.resolve_name(f"{_PUBLIC[name]}:{name}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_PUBLIC])

@@ -1,9 +1,9 @@
 """Measuring the diagonal scale of a planner's decision variables.
 
 Quasi-Newton steps are only as good as the coordinates. The scale of variable i is
-c_i = gain / sqrt(floor + median H_ii), where H = J^T J is the Gauss-Newton curvature of the planner's
-residuals in natural units, and the median runs over scenarios, each taken at its first guess
-and at a solution. A new task offers `residuals` and gets its scale from here.
+c_i = gain / sqrt(floor + median H_ii), where H = J^T J is the Gauss-Newton curvature of the
+planner's residuals in natural units, and the median runs over scenarios, each taken at its
+first guess and at a solution. A new task offers `residuals` and gets its scale from here.
 """
 
 import dataclasses
