@@ -85,7 +85,7 @@ def fly(
         after = rk4_step(state, step, drag, gravity)
         return after, after
 
-    return jax.lax.scan(advance, ball, None, length=num_steps, unroll=4)
+    return jax.lax.scan(advance, ball, None, length=num_steps)
 
 
 def drag_free_flight(ball: BallState, duration: Array, gravity: Array) -> BallState:

@@ -1,0 +1,135 @@
+"""The batched L-BFGS beside optax.lbfgs and SciPy's L-BFGS-B on the same hit objective.
+
+    python -m benchmarks.optimiser [--num 200] [--row late-0.5]
+
+All three get the same float32 objective in the same scaled variables from the same start.
+Time is per plan, warm: the batched solvers in one call over all serves, SciPy serve by serve
+with a compiled value and gradient. Success is the referee's.
+"""
+
+import argparse
+import time
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import scipy.optimize
+
+from benchmarks.hit_rows import ROWS
+from planner_jax.optimise.lbfgs import LbfgsConfig
+from planner_jax.optimise.multistart import minimise
+from planner_jax.referee.hit import referee_hits
+from planner_jax.task.hit.exact import ExactHit
+from planner_jax.task.hit.serves import generate_serves, to_scenarios
+
+PLANNER = ExactHit()
+
+
+def ours(iterations: int) -> Callable:
+    """This library's solver, one problem."""
+
+    def solve(scenario):
+        context = PLANNER.prepare(scenario)
+        start = PLANNER.guesses(context, 1)[0]
+        found = minimise(
+            lambda x: PLANNER.objective(x, context), start, LbfgsConfig(max_steps=iterations)
+        )
+        return found.point, found.iterations
+
+    return solve
+
+
+def with_optax(iterations: int) -> Callable:
+    """optax.lbfgs with its zoom line search, one problem."""
+
+    def solve(scenario):
+        context = PLANNER.prepare(scenario)
+        solver = optax.lbfgs(memory_size=6)
+
+        def cost(x):
+            return PLANNER.objective(x, context).cost
+
+        def step(_, carry):
+            point, state = carry
+            value, grad = optax.value_and_grad_from_state(cost)(point, state=state)
+            updates, state = solver.update(
+                grad, state, point, value=value, grad=grad, value_fn=cost
+            )
+            return optax.apply_updates(point, updates), state
+
+        start = PLANNER.guesses(context, 1)[0]
+        point, _ = jax.lax.fori_loop(0, iterations, step, (start, solver.init(start)))
+        return point, jnp.asarray(iterations)
+
+    return solve
+
+
+def batched(solve: Callable, scenarios) -> tuple[np.ndarray, float, float]:
+    """Points, mean iterations and warm seconds of a batched solver."""
+    compiled = jax.jit(jax.vmap(solve))
+    jax.block_until_ready(compiled(scenarios))
+    began = time.perf_counter()
+    points, iterations = jax.block_until_ready(compiled(scenarios))
+    return np.asarray(points), float(iterations.mean()), time.perf_counter() - began
+
+
+def with_scipy(scenarios, iterations: int) -> tuple[np.ndarray, float, float]:
+    """Points, mean iterations and seconds of SciPy's L-BFGS-B, serve by serve."""
+    contexts = jax.jit(jax.vmap(PLANNER.prepare))(scenarios)
+    starts = np.asarray(jax.jit(jax.vmap(lambda c: PLANNER.guesses(c, 1)[0]))(contexts), float)
+    value_and_grad = jax.jit(jax.value_and_grad(lambda x, c: PLANNER.objective(x, c).cost))
+    lanes = [jax.tree.map(lambda x, k=k: x[k], contexts) for k in range(len(starts))]
+    value_and_grad(starts[0], lanes[0])
+    points, counts = [], []
+    began = time.perf_counter()
+    for start, context in zip(starts, lanes, strict=True):
+
+        def function(x, context=context):
+            value, grad = value_and_grad(np.float32(x), context)
+            return float(value), np.asarray(grad, float)
+
+        found = scipy.optimize.minimize(
+            function,
+            start,
+            jac=True,
+            method="L-BFGS-B",
+            options={"maxcor": 6, "maxiter": iterations, "ftol": 1e-9, "gtol": 1e-12},
+        )
+        points.append(found.x)
+        counts.append(found.nit)
+    return np.asarray(points, np.float32), float(np.mean(counts)), time.perf_counter() - began
+
+
+def main() -> None:
+    """Print one line a solver and iteration budget."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--num", type=int, default=200)
+    parser.add_argument("--row", default="late-0.5", choices=[*ROWS][:-1])
+    args = parser.parse_args()
+    scenarios = to_scenarios(generate_serves(args.num, 2), **ROWS[args.row])
+    final = jax.jit(jax.vmap(lambda s, x: PLANNER.objective(x, PLANNER.prepare(s)).cost))
+    decode = jax.jit(jax.vmap(lambda s, x: PLANNER.decode(x, PLANNER.prepare(s))))
+    print(f"{args.num} generated serves, row {args.row}, {jax.devices()[0].platform}")
+    print("| solver | iterations | ms a plan | median cost | mean cost | success |")
+    print("|---|---|---|---|---|---|")
+    for budget in (10, 60, 200):
+        for name, run in (
+            ("planner_jax", lambda n=budget: batched(ours(n), scenarios)),
+            ("optax.lbfgs", lambda n=budget: batched(with_optax(n), scenarios)),
+            ("SciPy L-BFGS-B", lambda n=budget: with_scipy(scenarios, n)),
+        ):
+            points, iterations, seconds = run()
+            cost = np.asarray(final(scenarios, points))
+            verdict = referee_hits(scenarios, decode(scenarios, points))
+            print(
+                f"| {name} | {iterations:.0f} of {budget} | {1e3 * seconds / args.num:.3f} | "
+                f"{np.median(cost):.3g} | {cost.mean():.3g} | "
+                f"{100 * verdict.success.mean():.1f} % |",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,186 @@
+"""The command line: `planner-jax sweep hit` and `planner-jax report`."""
+
+import argparse
+import datetime
+import os
+import shlex
+import signal
+import sys
+import threading
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from planner_jax.sweep.environment import installed_version
+from planner_jax.sweep.settings import CPU_BATCH, DEFAULT_NUM, GPU_BATCH, HitSweep, SettingError
+from planner_jax.task.hit.planners import PLANNERS
+
+_FAILED, _BAD_ARGUMENT, _INTERRUPTED = 1, 2, 130
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command.
+
+    Args:
+        arguments: of the command line; by default those of the process.
+
+    Returns:
+        The exit code: 0, 1 where the file system fails, 2 for a bad argument, 130 after Ctrl-C.
+    """
+    options = vars(_parser().parse_args(arguments))
+    command = options.pop("command")
+    try:
+        command(options)
+    except KeyboardInterrupt as stop:
+        print(f"planner-jax: {str(stop) or 'interrupted'}", file=sys.stderr)
+        return _INTERRUPTED
+    except SettingError as error:
+        return _fail(str(error))
+    except OSError as error:
+        _fail(str(error))
+        return _FAILED
+    return 0
+
+
+def _fail(message: str) -> int:
+    """Print one line, in which an argument's name is written as on the command line."""
+    name, _, rest = message.partition(" ")
+    if name in HitSweep.__dataclass_fields__ or name == "out":
+        message = f"--{name.replace('_', '-')} {rest}"
+    print(f"planner-jax: error: {' '.join(message.split())}", file=sys.stderr)
+    return _BAD_ARGUMENT
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong with an argument in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        sys.exit(_fail(message.removeprefix("argument ")))
+
+
+class _Help(argparse.RawDescriptionHelpFormatter):
+    def __init__(self, prog: str):
+        super().__init__(prog, max_help_position=28, width=100)
+
+
+def _parser() -> argparse.ArgumentParser:
+    look: dict[str, Any] = {"formatter_class": _Help, "allow_abbrev": False}
+    parser = _Parser(
+        prog="planner-jax",
+        description="Plan for robots that meet flying objects, thousands of cases at once.",
+        epilog="example:\n  planner-jax sweep hit --num 9000 --out runs/first",
+        **look,
+    )
+    version = f"planner-jax {installed_version('planner-jax') or 'of a source tree'}"
+    parser.add_argument("--version", action="version", version=version)
+    commands = parser.add_subparsers(title="commands", required=True, metavar="command")
+    sweep = commands.add_parser("sweep", help="plan and referee many cases of a task", **look)
+    tasks = sweep.add_subparsers(title="tasks", required=True, metavar="task")
+    _add_hit(tasks, look)
+    report = commands.add_parser(
+        "report", help="write table, figures and page of a run anew", **look
+    )
+    report.add_argument("run", metavar="RUN", help="folder of a finished run")
+    report.set_defaults(command=_report)
+    return parser
+
+
+def _add_hit(tasks: Any, look: dict[str, Any]) -> None:
+    """The arguments of `sweep hit`. One that is not given is absent from the namespace."""
+    parser = tasks.add_parser(
+        "hit",
+        help="a quadrotor hits served balls to a target with a racket",
+        description="Plan a quadrotor's volley for thousands of serves and let a referee judge "
+        "every plan.\nWrites a run folder: index.html, table.md, figures, plans.parquet, "
+        "manifest.json.",
+        argument_default=argparse.SUPPRESS,
+        **look,
+    )
+    default = HitSweep()
+    start = " ".join(f"{x:g}" for x in default.start)
+    add = parser.add_argument
+    # fmt: off
+    add("--planner", metavar="NAME", help=f"{', '.join(PLANNERS)} (default: {default.planner})")
+    add("--serves", metavar="DIR", help="read published trial files (default: draw serves)")
+    add("--num", type=int, metavar="N",
+        help=f"cases (default: {DEFAULT_NUM} drawn ones, or all of the folder)")
+    add("--start", nargs="+", metavar="X",
+        help=f"hover start X Y Z in m, or 'uniform' over the half court (default: {start})")
+    add("--delay", type=float, metavar="S",
+        help=f"seconds from the serve to the start of planning (default: {default.delay:g})")
+    add("--limit-scale", type=float, metavar="F",
+        help="factor on the speed, acceleration and body-rate limits "
+        f"(default: {default.limit_scale:g})")
+    add("--drag-after-impact", action="store_true",
+        help="plan and judge the returned ball with drag too (exact only)")
+    add("--batch", type=int, metavar="B",
+        help="cases planned, judged and written at once; bounds the memory "
+        f"(default: {CPU_BATCH} on a CPU, {GPU_BATCH} on a GPU)")
+    add("--seed", type=int, metavar="K",
+        help=f"of drawn serves and of uniform starts (default: {default.seed})")
+    add("--out", metavar="DIR", help="run folder (default: runs/hit-PLANNER-DATE-TIME)")
+    add("--resume", action="store_true", help="finish the interrupted run in --out")
+    # fmt: on
+    parser.set_defaults(command=_sweep_hit)
+
+
+def _sweep_hit(given: dict[str, Any]) -> None:
+    out, resume = given.pop("out", None), given.pop("resume", False)
+    if given.get("start") == ["uniform"]:
+        given["start"] = "uniform"
+    settings = HitSweep(**given)
+    if resume and out is None:
+        raise SettingError("out must name the folder to resume, got nothing")
+    if out is None:
+        now = datetime.datetime.now()
+        out = os.path.join("runs", f"hit-{settings.planner}-{now:%Y%m%d-%H%M%S}")
+    # A shell starts background jobs deaf to SIGINT; this one can be stopped and resumed there too.
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    _keep_compiled_programs()
+    from planner_jax.sweep.hit import SweepInterrupted, resume_hit_sweep, start_hit_sweep
+
+    try:
+        manifest = resume_hit_sweep(out, **given) if resume else start_hit_sweep(settings, out)
+    except SweepInterrupted:
+        again = f"planner-jax sweep hit --resume --out {shlex.quote(str(out))}"
+        raise SweepInterrupted(f"interrupted; finish with: {again}") from None
+    _print_result(manifest, Path(out))
+
+
+def _print_result(manifest: dict[str, Any], out: Path) -> None:
+    from planner_jax.sweep.table import headline
+
+    print("\n".join(headline(manifest)))
+    print(f"Look at {out / 'index.html'}")
+
+
+def _report(options: dict[str, Any]) -> None:
+    from planner_jax.sweep.report import write_report
+    from planner_jax.sweep.run_folder import RunFolder
+
+    folder = RunFolder(options["run"], name="RUN")
+    write_report(folder)
+    _print_result(folder.read_manifest(), folder.path)
+
+
+def _keep_compiled_programs() -> None:
+    """Let JAX keep what it compiles from run to run, where there is a folder for it."""
+    import jax
+
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.join("~", ".cache")
+    default = os.path.join(os.path.expanduser(home), "planner-jax", "jax")
+    folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or default
+    # An entry that cannot be read or written costs a compilation, not the run.
+    warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache")
+    try:
+        os.makedirs(folder, exist_ok=True)
+    except OSError:
+        return
+    jax.config.update("jax_compilation_cache_dir", folder)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,80 @@
+"""Where a run took place: versions, commit, device."""
+
+import os
+import platform
+import subprocess
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from planner_jax.sweep.settings import SettingError
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+
+
+def installed_version(name: str) -> str | None:
+    """Version of a package; None where it is used without being installed."""
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def environment() -> dict[str, Any]:
+    """Versions, git commit and device, for the manifest."""
+    import jax
+
+    device = jax.devices()[0]
+    packages = ("planner-jax", "jax", "jaxlib", "numpy", "scipy", "pyarrow")
+    return {
+        "versions": {
+            "python": platform.python_version(),
+            **{name: installed_version(name) for name in packages},
+        },
+        "git_commit": _git_commit(),
+        "device": {
+            "platform": device.platform,
+            "kind": device.device_kind,
+            "count": jax.device_count(),
+            "cpu_count": os.cpu_count(),
+            "machine": platform.machine(),
+            "system": platform.system(),
+        },
+    }
+
+
+def require_backend() -> str:
+    """The platform that JAX computes on.
+
+    Raises:
+        SettingError: JAX has none that works.
+    """
+    import jax
+
+    try:
+        return jax.default_backend()
+    except RuntimeError as error:
+        reason = str(error).splitlines()[0]
+        asked = os.environ.get("JAX_PLATFORMS", "")
+        raise SettingError(
+            f"JAX_PLATFORMS must name a platform that works here, got {asked!r} ({reason})"
+        ) from None
+
+
+def _git_commit() -> str | None:
+    """Commit of the checkout that holds this package, "+" behind it where files differ.
+
+    None outside a checkout, and where git is missing.
+    """
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(_PACKAGE), *arguments]
+        found = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
+        return found.stdout.strip()
+
+    try:
+        git("ls-files", "--error-unmatch", "__init__.py")
+        changed = git("status", "--porcelain", "--untracked-files=no", "--", ".")
+        return git("rev-parse", "HEAD") + ("+" if changed else "")
+    except (OSError, subprocess.SubprocessError):
+        return None

@@ -1,0 +1,54 @@
+"""Seconds of a sweep: those in which JAX compiled apart from those of warm planning."""
+
+import time
+from typing import Any
+
+import jax.monitoring
+
+# Tracing, lowering and the backend's compilation, which includes reading the compile cache.
+# Inner functions are traced inside outer ones: spans are joined, not added.
+_COMPILING = "/jax/core/compile/"
+
+
+class CompileClock:
+    """Seconds within its block in which JAX traced, lowered or compiled, in any thread."""
+
+    def __init__(self) -> None:
+        self._spans: list[tuple[float, float]] = []
+
+    def __enter__(self) -> "CompileClock":
+        jax.monitoring.register_event_time_span_listener(self._listen)
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        jax.monitoring.unregister_event_time_span_listener(self._listen)
+
+    def _listen(self, event: str, start_time: float, end_time: float, **kwargs: Any) -> None:
+        if event.startswith(_COMPILING):
+            self._spans.append((start_time, end_time))
+
+    @property
+    def seconds(self) -> float:
+        """Length of the union of all spans so far [s]."""
+        total, reached = 0.0, 0.0
+        for start, end in sorted(self._spans):
+            total += max(end - max(start, reached), 0.0)
+            reached = max(reached, end)
+        return total
+
+    @property
+    def compiled(self) -> bool:
+        """Whether anything was compiled."""
+        return bool(self._spans)
+
+
+class Stopwatch:
+    """Seconds since the last lap."""
+
+    def __init__(self) -> None:
+        self._last = time.perf_counter()
+
+    def lap(self) -> float:
+        """Seconds since the last call, or since the start."""
+        last, self._last = self._last, time.perf_counter()
+        return self._last - last

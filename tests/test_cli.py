@@ -1,0 +1,170 @@
+"""The command line: what it prints, its exit codes, and one line for every bad argument."""
+
+import subprocess
+import sys
+
+import pytest
+
+from planner_jax.cli import main
+from planner_jax.sweep import chunks, hit
+
+HEADER = "number,serve position,serve velocity,landing position,target,hit,velocity,attitude"
+GOOD, GONE = "2.5 -0.3 2,-4.3 0.02 7.3", "2.5 -0.3 2,4.3 0.02 7.3"
+
+
+def trial_file(folder, serve, name="1_1_1_p.csv"):
+    """A folder with one trial file of one serve."""
+    folder.mkdir(exist_ok=True)
+    row = f"1,{serve},-2.9 -0.3 0,1.75 0 0,failed,failed,failed"
+    (folder / name).write_text(f"{HEADER}\n{row}\n")
+    return str(folder)
+
+
+def run(capsys, *arguments):
+    """Exit code and what went to the two streams."""
+    try:
+        code = main(arguments)
+    except SystemExit as stop:
+        code = stop.code
+    streams = capsys.readouterr()
+    return code, streams.out, streams.err
+
+
+def expect_one_line(capsys, arguments, *parts):
+    code, out, err = run(capsys, *arguments)
+    assert code == 2 and out == ""
+    assert err.startswith("planner-jax: error: ") and err.count("\n") == 1
+    for part in parts:
+        assert part in err
+
+
+@pytest.fixture
+def elsewhere(tmp_path, monkeypatch):
+    """An empty working folder."""
+    folder = tmp_path / "elsewhere"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        (["--num", "0"], ["--num must be >= 1", "got 0"]),
+        (["--num", "-4"], ["--num must be >= 1", "got -4"]),
+        (["--num", "ten"], ["--num", "ten"]),
+        (["--batch", "0"], ["--batch must be >= 1", "got 0"]),
+        (["--limit-scale", "0"], ["--limit-scale must be finite and > 0", "got 0"]),
+        (["--limit-scale", "-1"], ["--limit-scale must be finite and > 0", "got -1"]),
+        (["--delay", "-0.5"], ["--delay must be finite and >= 0", "got -0.5"]),
+        (["--delay", "3"], ["--delay must be shorter than each serve's flight", "got 3"]),
+        (["--planner", "nobody"], ["--planner must be one of", "exact", "got 'nobody'"]),
+        (["--start", "1", "2"], ["--start must be three finite numbers", "got 1 2"]),
+        (["--start", "0", "nan", "1"], ["--start must be three finite numbers", "got 0 nan 1"]),
+        (["--serves", "nowhere"], ["--serves must be an existing folder", "nowhere"]),
+        (["--resume"], ["--out must name the folder to resume"]),
+        (["--resume", "--out", "nowhere"], ["--out must be the folder of a run", "nowhere"]),
+        (["--speed", "3"], ["unrecognized arguments", "--speed"]),
+    ],
+)
+def test_a_bad_argument_gets_one_line_and_leaves_nothing(capsys, elsewhere, arguments, parts):
+    expect_one_line(capsys, ["sweep", "hit", *arguments], *parts)
+    assert not list(elsewhere.iterdir())
+
+
+def test_bad_serves_are_named_by_file_and_line(capsys, elsewhere, tmp_path):
+    nan = trial_file(tmp_path / "nan", "nan -0.3 2,-4.3 0.02 7.3")
+    gone = trial_file(tmp_path / "gone", GONE)
+    empty = trial_file(tmp_path / "empty", "")
+    (tmp_path / "empty" / "1_1_1_p.csv").write_text("")
+    for folder, part in [
+        (nan, "1_1_1_p.csv:2: serve position must be 3 finite numbers, got 'nan -0.3 2'"),
+        (gone, "1_1_1_p.csv:2: serve must land in the hitting half"),
+        (empty, "1_1_1_p.csv: file must have a row of numbers"),
+    ]:
+        expect_one_line(capsys, ["sweep", "hit", "--serves", folder], "--serves in", part)
+    assert not list(elsewhere.iterdir())
+
+
+def test_more_serves_than_the_folder_holds_are_refused(capsys, elsewhere, tmp_path):
+    folder = trial_file(tmp_path / "one", GOOD)
+    arguments = ["sweep", "hit", "--serves", folder, "--num", "2"]
+    expect_one_line(capsys, arguments, "--num must be <= 1", "got 2")
+    assert not list(elsewhere.iterdir())
+
+
+def test_a_folder_in_use_or_out_of_reach_is_refused(capsys, elsewhere):
+    (elsewhere / "used").mkdir()
+    (elsewhere / "used" / "file").touch()
+    before = sorted(elsewhere.rglob("*"))
+    for out, part in [
+        ("used", "--out must be a new or empty folder"),
+        ("used/file", "--out must be a folder that can be written"),
+        ("used/file/below", "--out must be a folder that can be written"),
+        ("/proc/nowhere", "--out must be a folder that can be written"),
+    ]:
+        expect_one_line(capsys, ["sweep", "hit", "--num", "1", "--out", out], part, repr(out))
+    assert sorted(elsewhere.rglob("*")) == before
+
+
+def test_a_report_needs_a_finished_run(capsys, elsewhere):
+    expect_one_line(capsys, ["report", "nowhere"], "RUN must be the folder of a run", "nowhere")
+
+
+def test_ctrl_c_says_how_to_resume(capsys, elsewhere, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(chunks, "plan", interrupted)
+    code, out, err = run(capsys, "sweep", "hit", "--num", "3", "--out", "a run")
+    assert code == 130 and out == ""
+    expected = "planner-jax: interrupted; finish with: planner-jax sweep hit --resume --out 'a run'"
+    assert err.splitlines()[-1] == expected
+
+
+def test_a_sweep_prints_rate_and_speed_together(capsys, elsewhere, monkeypatch):
+    asked = {}
+
+    def sweep(settings, out):
+        asked.update(settings=settings, out=out)
+        return {
+            "parameters": {"planner": "exact"},
+            "device": {"kind": "cpu", "cpu_count": 2},
+            "times": {"compile_seconds": 8.0, "referee_seconds": 1.0, "wall_seconds": 12.0},
+            "summary": {
+                "num": 10,
+                "successes": 9,
+                "success_rate": 0.9,
+                "wilson_95": [0.6, 0.98],
+                "plans_per_second_warm": 4000.0,
+                "failed_limits": {"speed": 1},
+            },
+        }
+
+    monkeypatch.setattr(hit, "start_hit_sweep", sweep)
+    arguments = ["--start", "uniform", "--delay", "0.3", "--drag-after-impact", "--seed", "5"]
+    code, out, err = run(capsys, "sweep", "hit", "--num", "10", *arguments)
+    assert code == 0 and err == ""
+    assert "90.00 % success, 9 of 10" in out and "4,000 plans/s warm" in out
+    assert asked["out"].startswith("runs/hit-exact-") and asked["out"] in out
+    settings = asked["settings"]
+    assert (settings.start, settings.delay, settings.seed) == ("uniform", 0.3, 5)
+    assert settings.drag_after_impact
+
+
+def test_help_names_the_defaults_and_loads_no_jax():
+    script = (
+        "import sys; from planner_jax.cli import main\n"
+        "try: main(['sweep', 'hit', '--help'])\n"
+        "except SystemExit: pass\n"
+        "sys.exit('jax' in sys.modules or 'numpy' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    for part in ("--planner NAME", "default: exact", "default: -3 0 1.5", "runs/hit-PLANNER"):
+        assert part in done.stdout
+
+
+def test_the_version_is_printed(capsys):
+    code, out, _ = run(capsys, "--version")
+    assert code == 0 and out.startswith("planner-jax ")

@@ -1,0 +1,425 @@
+"""Sweeps: run folder, resuming, tables, figures, clocks and rates."""
+
+import json
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from scipy.stats import binomtest
+
+from planner_jax.referee.hit import referee_hits
+from planner_jax.robot import quadrotor
+from planner_jax.sweep import baselines, chunks, hit
+from planner_jax.sweep.figures.motion import body_rate, net_thrust, sample_motion
+from planner_jax.sweep.hit import SweepInterrupted, resume_hit_sweep, start_hit_sweep
+from planner_jax.sweep.report import write_report
+from planner_jax.sweep.run_folder import RunFolder, pick_rows
+from planner_jax.sweep.settings import HitSweep, SettingError
+from planner_jax.sweep.source import open_source
+from planner_jax.sweep.summary import percent, wilson_interval
+from planner_jax.sweep.table import rate_table
+from planner_jax.sweep.timing import CompileClock
+from planner_jax.task.hit import court
+from planner_jax.task.hit.exact import ExactHit
+from planner_jax.task.hit.planners import planner
+from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
+
+NUM, BATCH = 84, 24
+# Half of these fail: late, and with one short round.
+SETTINGS = HitSweep(num=NUM, batch=BATCH, delay=0.8, seed=3)
+FAILED = "failed,failed,failed"
+FIGURES = ("court.png", "motion.png", "rates.png")
+
+
+def one_round(name, **options):
+    """The planner with its first round alone, so that one program is compiled."""
+    return ExactHit(rounds=ExactHit().rounds[:1], **options)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def quick_planners():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(hit, "planner", one_round)
+        patch.setattr(baselines, "planner", one_round)
+        patch.setattr(baselines, "PLANNERS", {"exact": "", "bat": ""})
+        yield
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """The folder and manifest of a sweep that nothing disturbed."""
+    out = tmp_path_factory.mktemp("runs") / "finished"
+    return out, start_hit_sweep(SETTINGS, out, progress=False)
+
+
+@pytest.fixture
+def no_report(monkeypatch):
+    """Leave the drawing out."""
+    monkeypatch.setattr(hit, "write_report", lambda folder: None)
+    monkeypatch.setattr(hit, "plan_baselines", lambda source, index: None)
+
+
+def stop_after(monkeypatch, num_chunks):
+    """Ctrl-C in the chunk after so many."""
+    calls = iter(range(num_chunks))
+
+    def plan(*arguments):
+        if next(calls, None) is None:
+            raise KeyboardInterrupt
+        return real(*arguments)
+
+    real = chunks.plan
+    monkeypatch.setattr(chunks, "plan", plan)
+
+
+def columns(out):
+    """The rows of a run as NumPy arrays, lists stacked."""
+    table = pq.read_table(out / "plans.parquet")
+    return {name: np.array(table[name].to_pylist()) for name in table.column_names}
+
+
+# The folder.
+
+
+def test_a_finished_run_holds_manifest_rows_table_figures_and_page(finished):
+    out, manifest = finished
+    assert manifest == json.loads((out / "manifest.json").read_text())
+    assert manifest["state"] == "complete"
+    for name in ("plans.parquet", "baselines.parquet", "table.md", "index.html"):
+        assert (out / name).stat().st_size > 0
+    page = (out / "index.html").read_text()
+    for name in FIGURES:
+        assert (out / "figures" / name).read_bytes().startswith(b"\x89PNG")
+        assert f'src="figures/{name}"' in page
+    assert not (out / "parts").exists() and not list(out.rglob(".*"))
+
+
+def test_the_manifest_says_what_was_run_where_and_how_long(finished):
+    _, manifest = finished
+    assert HitSweep(**manifest["parameters"]) == SETTINGS
+    assert manifest["seed"] == 3
+    assert {"python", "jax", "numpy", "planner-jax"} <= manifest["versions"].keys()
+    assert manifest["device"]["platform"] == jax.default_backend()
+    assert manifest["device"]["cpu_count"] >= 1
+    assert manifest["setting"]["speed"] == 5.0
+    times, summary = manifest["times"], manifest["summary"]
+    for name in ("compile_seconds", "first_seconds", "warm_seconds", "referee_seconds"):
+        assert 0.0 < times[name] and name in times["measured"]
+    assert times["compile_seconds"] < times["wall_seconds"]
+    assert summary["compile_seconds"] == times["compile_seconds"]
+    assert summary["plans_per_second_warm"] > 0.0
+
+
+def test_the_summary_counts_the_rows(finished):
+    out, manifest = finished
+    rows, summary = columns(out), manifest["summary"]
+    successes = int(rows["success"].sum())
+    assert 0 < successes < NUM == summary["num"] == len(rows["index"])
+    assert summary["successes"] == successes
+    assert summary["success_rate"] == pytest.approx(successes / NUM)
+    assert summary["wilson_95"] == list(wilson_interval(successes, NUM))
+    for name, count in summary["per_scenario"].items():
+        own = rows["success"][rows["scenario"] == name]
+        assert (count["num"], count["success_rate"]) == (len(own), pytest.approx(own.mean()))
+    assert sum(summary["status_counts"].values()) == NUM
+    assert sum(summary["failed_limits"].values()) == NUM - successes
+
+
+def test_every_column_has_its_unit_and_meaning(finished):
+    out, _ = finished
+    for field in pq.read_schema(out / "plans.parquet"):
+        assert field.metadata.keys() == {b"unit", b"meaning"} and field.metadata[b"meaning"]
+
+
+def test_the_rows_alone_lead_the_referee_to_the_same_verdict(finished):
+    out, manifest = finished
+    rows, setting = columns(out), manifest["setting"]
+    head = np.zeros((NUM, 4, 3))
+    head[:, 0] = rows["start"]
+
+    def same(*names):
+        return SimpleNamespace(**{n: np.tile(setting[n], (NUM, 1)).squeeze() for n in names})
+
+    physics = vars(same("drag", "gravity", "restitution", "racket_height"))
+    scenarios = SimpleNamespace(
+        ball=SimpleNamespace(pos=rows["ball_pos"], vel=rows["ball_vel"]),
+        head_state=head,
+        target=rows["target"],
+        limits=same("speed", "acceleration", "body_rate", "min_height"),
+        hit_limits=same("hitting_speed", "min_apex", "max_apex"),
+        **physics,
+    )
+    pieces = rows["durations"].shape[1]
+    trajectory = SimpleNamespace(
+        durations=rows["durations"], coeffs=rows["coeffs"].reshape(NUM, pieces, -1, 3)
+    )
+    plans = SimpleNamespace(
+        trajectory=trajectory, stroke=SimpleNamespace(time=rows["contact_time"])
+    )
+    verdict = referee_hits(scenarios, plans)
+    np.testing.assert_array_equal(verdict.success, rows["success"])
+    np.testing.assert_array_equal(verdict.failed_limit, rows["failed_limit"])
+    np.testing.assert_allclose(verdict.max_speed, rows["max_speed"], rtol=1e-5)
+
+
+def test_rows_are_picked_across_row_groups(finished):
+    out, _ = finished
+    picked = pick_rows(out / "plans.parquet", [BATCH, 0, NUM - 1, BATCH], ["index"])
+    assert [row["index"] for row in picked] == [0, BATCH, NUM - 1]
+
+
+def test_a_report_is_drawn_again_from_the_folder_alone(finished, tmp_path):
+    out, manifest = finished
+    for name in ("manifest.json", "plans.parquet"):
+        (tmp_path / name).write_bytes((out / name).read_bytes())
+    write_report(RunFolder(tmp_path))
+    assert (tmp_path / "table.md").read_text() == (out / "table.md").read_text()
+    assert {path.name for path in (tmp_path / "figures").iterdir()} == set(FIGURES)
+
+
+# Resuming.
+
+
+@pytest.mark.parametrize("num_chunks", [0, 2])
+def test_an_interrupted_sweep_is_resumed_to_the_same_rows(
+    finished, tmp_path, monkeypatch, no_report, num_chunks
+):
+    out = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        stop_after(patch, num_chunks)
+        with pytest.raises(SweepInterrupted):
+            start_hit_sweep(SETTINGS, out, progress=False)
+    assert RunFolder(out).read_manifest()["state"] == "interrupted"
+    manifest = resume_hit_sweep(out, progress=False, num=NUM, delay=0.8)
+    assert manifest["state"] == "complete" and len(manifest["sessions"]) == 2
+    assert (out / "plans.parquet").read_bytes() == (finished[0] / "plans.parquet").read_bytes()
+    assert manifest["summary"]["successes"] == finished[1]["summary"]["successes"]
+    assert resume_hit_sweep(out, progress=False) == manifest
+
+
+def test_a_sweep_killed_while_writing_is_resumed_to_the_same_rows(
+    finished, tmp_path, monkeypatch, no_report
+):
+    out = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        stop_after(patch, 2)
+        with pytest.raises(SweepInterrupted):
+            start_hit_sweep(SETTINGS, out, progress=False)
+    folder = RunFolder(out)
+    folder.write_manifest({**folder.read_manifest(), "state": "running"})
+    (out / "parts" / ".part-000002.parquet.tmp").write_bytes(b"half a part")
+    (out / ".plans.parquet.tmp").write_bytes(b"half a table")
+    resume_hit_sweep(out, progress=False)
+    assert (out / "plans.parquet").read_bytes() == (finished[0] / "plans.parquet").read_bytes()
+    assert not list(out.rglob(".*"))
+
+
+def test_resuming_with_another_setting_names_it(finished):
+    with pytest.raises(SettingError, match=r"delay must be 0.8 as in the run .*, got 0.5"):
+        resume_hit_sweep(finished[0], delay=0.5)
+
+
+def test_resuming_what_is_no_run_is_refused(tmp_path):
+    with pytest.raises(SettingError, match="out must be the folder of a run"):
+        resume_hit_sweep(tmp_path)
+
+
+def test_a_serve_drawn_late_that_breaks_a_rule_leaves_nothing_behind(tmp_path):
+    # The first chunk holds no ball that is down by then; a later one does.
+    settings = HitSweep(num=40, batch=4, delay=1.56, seed=0)
+    source = open_source(settings, batch=4)
+    source.scenarios(source.chunk(0))
+    out = tmp_path / "runs" / "run"
+    with pytest.raises(SettingError, match="delay must be shorter than each serve's flight"):
+        start_hit_sweep(settings, out, progress=False)
+    assert not list(tmp_path.iterdir())
+
+
+# Serves from a folder.
+
+
+def trial_files(folder, num_rows=3):
+    """A folder with files of bat (odd rows planned) and juggle (none) for scenario NNN."""
+    folder.mkdir(exist_ok=True)
+    serve = "2.5 -0.3 2,-4.3 0.02 7.{},-2.9 -0.3 0,1.75 0 0"
+    for letter in "pb":
+        rows = [
+            f"{n},{serve.format(n)},"
+            + ("1 0 1,0 0 1,0 0 0 1" if letter == "p" and n % 2 else FAILED)
+            for n in range(1, num_rows + 1)
+        ]
+        (folder / f"1_1_1_{letter}.csv").write_text("\n".join(rows) + "\n")
+    return str(folder)
+
+
+def test_published_outcomes_stand_beside_the_plans_of_the_same_serves(tmp_path, no_report):
+    serves, out = trial_files(tmp_path / "serves"), tmp_path / "run"
+    manifest = start_hit_sweep(HitSweep(serves=serves), out, progress=False)
+    rows = columns(out)
+    assert rows["published_bat"].tolist() == [True, False, True]
+    assert rows["published_juggle"].tolist() == [False] * 3
+    assert rows["published_bat_lite"].tolist() == [None] * 3
+    assert rows["file"].tolist() == ["1_1_1_b.csv"] * 3 and rows["line"].tolist() == [1, 2, 3]
+    published = manifest["summary"]["per_scenario"]["NNN"]["published_on_these_serves"]
+    assert published == pytest.approx({"bat": 2 / 3, "juggle": 0.0})
+    table = rate_table(manifest)
+    assert table.header[-1] == "bat, same serves %"
+    assert table.rows[0][-1] == "66.7" and table.rows[1][-1] == "" and table.rows[-1][-1] == "66.67"
+
+
+def test_a_single_chunk_is_timed_warm_too(tmp_path, no_report):
+    jax.clear_caches()
+    serves = trial_files(tmp_path / "serves")
+    manifest = start_hit_sweep(HitSweep(serves=serves), tmp_path / "run", progress=False)
+    times = manifest["times"]
+    assert times["warm_plans"] == 3 and times["warm_seconds"] < times["first_seconds"]
+
+
+def test_resuming_needs_the_serves_that_the_run_began_with(tmp_path, monkeypatch):
+    serves, out = trial_files(tmp_path / "serves"), tmp_path / "run"
+    stop_after(monkeypatch, 0)
+    with pytest.raises(SweepInterrupted):
+        start_hit_sweep(HitSweep(serves=serves, num=2), out, progress=False)
+    trial_files(tmp_path / "serves", num_rows=2)
+    with pytest.raises(SweepInterrupted):
+        resume_hit_sweep(out, progress=False)
+    for path in (tmp_path / "serves").iterdir():
+        path.write_text(path.read_text().replace("7.2", "7.0"))
+    with pytest.raises(SettingError, match="serves must be as they were when the run began"):
+        resume_hit_sweep(out, progress=False)
+
+
+# Tables.
+
+
+def test_the_table_has_all_scenarios_beside_both_published_rates(finished):
+    _, manifest = finished
+    table, rates = rate_table(manifest), court.published_rates()
+    assert [row[0] for row in table.rows] == [*court.SCENARIOS, "all"]
+    assert table.header[-2:] == ["bat, paper %", "bat, trial files %"]
+    column = court.PLANNERS.index("bat")
+    for row, paper, trials in zip(table.rows, rates.paper, rates.trials, strict=False):
+        assert row[-2:] == [f"{paper[column]:.1f}", f"{trials[column]:.1f}"]
+    summary = manifest["summary"]
+    assert table.rows[-1][2] == percent(summary["successes"], summary["num"])
+
+
+def test_a_published_planner_stands_beside_its_own_rates(finished):
+    _, manifest = finished
+    manifest = {**manifest, "parameters": {**manifest["parameters"], "planner": "juggle"}}
+    assert rate_table(manifest).header[-2:] == ["juggle, paper %", "juggle, trial files %"]
+
+
+def test_the_table_says_which_rates_are_compared_and_how_many_serves_are_distinct(finished):
+    text = (finished[0] / "table.md").read_text()
+    assert "Table I of the paper" in text and "trial files" in text
+    assert f"{NUM} distinct balls" in text
+
+
+def test_a_percentage_is_100_or_0_only_where_it_is_exact():
+    assert percent(10**6, 10**6) == "100.00" and percent(0, 10**6) == "0.00"
+    assert percent(10**6 - 1, 10**6) == "99.99" and percent(1, 10**6) == "0.01"
+    assert percent(1, 3) == "33.33"
+
+
+@pytest.mark.parametrize(("successes", "num"), [(0, 9), (9, 9), (7, 9), (8999, 9000)])
+def test_the_interval_is_wilsons(successes, num):
+    expected = binomtest(successes, num).proportion_ci(method="wilson")
+    assert wilson_interval(successes, num) == pytest.approx((expected.low, expected.high), abs=1e-7)
+
+
+def test_the_interval_without_trials_says_nothing():
+    assert wilson_interval(0, 0) == (0.0, 1.0)
+
+
+# Clocks and curves.
+
+
+def test_overlapping_compilations_are_counted_once():
+    with CompileClock() as clock:
+        for event, start, end in [
+            ("/jax/core/compile/jaxpr_trace_duration", 10.0, 14.0),
+            ("/jax/core/compile/jaxpr_trace_duration", 11.0, 12.0),
+            ("/jax/core/compile/backend_compile_duration", 13.0, 16.0),
+            ("/jax/core/compile/backend_compile_duration", 20.0, 21.0),
+            ("/jax/elsewhere", 0.0, 100.0),
+        ]:
+            jax.monitoring.record_event_time_span(event, start, end)
+    jax.monitoring.record_event_time_span("/jax/core/compile/later", 30.0, 40.0)
+    assert clock.seconds == pytest.approx(7.0) and clock.compiled
+
+
+def test_the_clock_sees_a_compilation_but_no_second_call():
+    program = jax.jit(lambda x: jnp.sin(x) + 3.25)
+    with CompileClock() as first:
+        program(1.0)
+    with CompileClock() as second:
+        program(2.0)
+    assert first.compiled and first.seconds > 0.0
+    assert not second.compiled and second.seconds == 0.0
+
+
+def test_sampled_motion_agrees_with_the_trajectory(float64):
+    random = np.random.default_rng(0)
+    coeffs, durations = random.normal(size=(3, 8, 3)), np.array([0.5, 0.2, 0.9])
+    motion = sample_motion(coeffs.ravel(), durations, 23)
+    trajectory = PiecewisePolynomial(jnp.asarray(coeffs), jnp.asarray(durations))
+    for order, samples in enumerate((motion.pos, motion.vel, motion.acc, motion.jerk)):
+        expected = jax.vmap(lambda t, order=order: evaluate(trajectory, t, order))(motion.time)
+        np.testing.assert_allclose(samples[:-1], expected[:-1], rtol=1e-9)
+    acc, jerk = jnp.asarray(motion.acc), jnp.asarray(motion.jerk)
+    squared = quadrotor.body_rate_squared(acc, jerk, jnp.asarray(9.8))
+    np.testing.assert_allclose(body_rate(motion, 9.8) ** 2, squared, rtol=1e-8)
+    np.testing.assert_allclose(net_thrust(motion, 9.8), quadrotor.net_thrust(acc, 9.8))
+
+
+# Settings.
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"planner": "nobody"}, "planner must be one of .*exact.*, got 'nobody'"),
+        ({"num": 0}, "num must be >= 1, got 0"),
+        ({"batch": -2}, "batch must be >= 1, got -2"),
+        ({"seed": -1}, "seed must be >= 0, got -1"),
+        ({"delay": -0.1}, "delay must be finite and >= 0, got -0.1"),
+        ({"limit_scale": 0.0}, "limit_scale must be finite and > 0, got 0.0"),
+        ({"limit_scale": float("nan")}, "limit_scale must be finite and > 0, got nan"),
+        ({"start": (0.0, 1.0)}, "start must be three finite numbers .*, got 0 1"),
+        ({"start": "nowhere"}, "start must be three finite numbers .*, got 'nowhere'"),
+    ],
+)
+def test_a_setting_out_of_its_range_is_named(given, message):
+    with pytest.raises(SettingError, match=message):
+        HitSweep(**given)
+
+
+def test_the_truer_model_is_for_the_exact_planner_alone(monkeypatch):
+    monkeypatch.setattr("planner_jax.task.hit.planners.PLANNERS", {"exact": "", "bat": ""})
+    assert HitSweep(drag_after_impact=True).planner_options() == {"drag_after_impact": True}
+    with pytest.raises(SettingError, match="drag_after_impact must be left out"):
+        HitSweep(planner="bat", drag_after_impact=True)
+
+
+def test_settings_survive_the_manifest():
+    settings = HitSweep(num=7, start=(-1, 0, 2), serves="somewhere")
+    assert HitSweep(**json.loads(json.dumps(settings.parameters()))) == settings
+
+
+def test_planners_are_found_by_name():
+    assert planner("exact", num_pieces=6) == ExactHit(num_pieces=6)
+    with pytest.raises(ValueError, match="planner must be one of exact"):
+        planner("nobody")
+
+
+def test_chunks_join_to_the_whole_without_a_seam():
+    whole = open_source(HitSweep(num=50, batch=50), batch=1).chunk(0)
+    source = open_source(HitSweep(num=50, batch=20), batch=1)
+    assert source.num_chunks == 3
+    parts = [source.chunk(number) for number in range(3)]
+    np.testing.assert_array_equal(np.concatenate([p.velocity for p in parts]), whole.velocity)
+    np.testing.assert_array_equal(np.concatenate([p.index for p in parts]), np.arange(50))
