@@ -44,7 +44,7 @@ def predict_path(
         after = rk4_step(state, resolution, drag, gravity)
         return after, after
 
-    _, later = jax.lax.scan(advance, ball, None, length=num_nodes - 2, unroll=4)
+    _, later = jax.lax.scan(advance, ball, None, length=num_nodes - 2)
     nodes = jax.tree.map(
         lambda a, b, c: jnp.concatenate([a[None], b[None], c]), before, ball, later
     )
