@@ -42,8 +42,8 @@ class WellPlanner:
     """Guesses at 0 and 4; goals above 2 are only found from the second."""
 
     rounds: tuple[Round, ...] = (
-        Round(1, LbfgsConfig(max_steps=20)),
-        Round(2, LbfgsConfig(max_steps=20)),
+        Round(1, LbfgsConfig(max_steps=40, step_cap=0.2)),
+        Round(2, LbfgsConfig(max_steps=40, step_cap=0.2)),
     )
 
     def prepare(self, scenario):
