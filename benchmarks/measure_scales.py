@@ -1,9 +1,9 @@
-"""Measure the scales of the hit planners' decision variables and write the shipped file.
+"""Measure the scales of the hit planners' decision variables beside the shipped ones.
 
-    python -m benchmarks.measure_scales [--check]
+    python -m benchmarks.measure_scales [--write]
 
 Scenarios are drawn by the serve generator (seed 7), 100 of each hard kind, so that limits are
-active. With --check nothing is written and the largest ratio to the shipped scale is printed.
+active. Prints the largest ratio to the shipped scale; --write makes the shipped file anew.
 """
 
 import argparse
@@ -51,7 +51,7 @@ def measure_exact(num_pieces: int, scenarios: HitScenario) -> np.ndarray:
 def main() -> None:
     """Measure, and write or compare."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--check", action="store_true", help="compare, write nothing")
+    parser.add_argument("--write", action="store_true", help="replace the shipped file")
     parser.add_argument("--num", type=int, default=100, help="serves of each kind")
     parser.add_argument("--seed", type=int, default=7)
     args = parser.parse_args()
@@ -65,7 +65,7 @@ def main() -> None:
             ratio = np.exp(np.abs(np.log(scale / np.asarray(shipped[name]))).max())
             print(f"  largest ratio to the shipped scale: {ratio:.2f}")
         shipped[name] = [float(f"{value:.3g}") for value in scale]
-    if not args.check:
+    if args.write:
         SHIPPED.write_text(json.dumps(shipped, indent=1) + "\n", "utf-8")
         print(f"wrote {SHIPPED.name}")
 

@@ -98,7 +98,7 @@ _GUESSES = np.array(
 def shipped_scale(name: str) -> tuple[float, ...]:
     """Measured scale of a planner's variables, from `measured_scales.json`.
 
-    `python -m benchmarks.measure_scales` makes the file again.
+    `python -m benchmarks.measure_scales --write` makes the file again.
     """
     text = (importlib.resources.files("planner_jax.task.hit") / "measured_scales.json").read_text(
         "utf-8"
@@ -134,7 +134,7 @@ class ExactHit:
     hinge_width: float = 0.1
     impact_weight: float = 0.3  # [s], of apex and hitting-speed hinges beside the integrals
     rounds: tuple[Round, ...] = (
-        Round(starts=1, solver=LbfgsConfig(max_steps=10)),
+        Round(starts=1, solver=LbfgsConfig(max_steps=7)),
         Round(starts=1, solver=LbfgsConfig(max_steps=60)),
         Round(starts=8, solver=LbfgsConfig(max_steps=80)),
     )

@@ -3,9 +3,12 @@
 import pkgutil
 from typing import Any
 
-# Name -> frozen dataclass, as "module:attribute", so that a list of names imports no planner.
+# Name -> what makes the planner, as "module:attribute", so that a list of names imports none.
 PLANNERS = {
     "exact": "planner_jax.task.hit.exact:ExactHit",
+    "bat": "planner_jax.task.hit.bat:BatHit",
+    "bat-lite": "planner_jax.task.hit.bat:bat_lite",
+    "juggle": "planner_jax.task.hit.juggle:JuggleHit",
 }
 
 

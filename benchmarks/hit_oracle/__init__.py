@@ -1,0 +1,1 @@
+"""Direct transcription of a hit, to tell infeasible cases from missed ones."""

@@ -1,0 +1,182 @@
+"""From many starts to a verdict: coarse pieces, halved pieces, tightening, referee."""
+
+import dataclasses
+import functools
+import math
+import multiprocessing
+import time
+
+import jax
+import numpy as np
+from tqdm import tqdm
+
+from benchmarks.hit_oracle.program import Program, case_parameters, later
+from planner_jax.referee.hit import referee_hits
+from planner_jax.task.hit.plan import HitPlan, Stroke
+from planner_jax.task.hit.scenario import HitScenario
+from planner_jax.trajectory.polynomial import PiecewisePolynomial
+
+TOLERANCE = 1e-3  # of the referee, relative
+COARSE_PIECES, COARSE_SAMPLES = 20, 3  # samples of a piece, its end included
+FINE_SAMPLES = 4
+COARSE_FLOOR, FINE_FLOOR = -0.01, -0.003  # excesses at which the solver may rest
+REFINED_BELOW = 0.06  # coarse excesses above it are left: halving takes off 0.03 at most
+NEW_BELOW = 0.003  # by how much a coarse excess must be lower than one refined in vain
+MOST_TIGHTENINGS = 5
+INFEASIBLE_ABOVE = 0.01  # a case whose least excess is larger is called infeasible
+
+# Impact over landing time, flight time after the impact [s], thrust at the impact [g]. The
+# fifth is a smash from above the least apex.
+STARTS = (
+    (0.93, 1.6, 1.2),
+    (0.80, 1.3, 1.0),
+    (0.70, 1.8, 1.5),
+    (0.95, 1.2, 2.2),
+    (0.55, 0.7, 1.2),
+    (0.87, 2.1, 1.5),
+    (0.65, 1.1, 0.8),
+    (0.97, 1.0, 1.4),
+)
+START_RANGES = ((0.5, 0.98), (0.6, 2.3), (0.8, 2.3))  # of starts beyond these
+
+
+def worst_ratios(motion: list[np.ndarray], durations: np.ndarray, case: dict) -> np.ndarray:
+    """Largest of speed, acceleration and body rate over their limits on every piece, (M,)."""
+    times = durations[:, None, None] * np.linspace(0.0, 1.0, 41)[:, None]
+    _, vel, acc, jerk, _ = later([part[:, None] for part in motion], times)
+    thrust = acc + case["gravity"] * np.array([0.0, 0.0, 1.0])
+    size, cross = np.linalg.norm(thrust, axis=-1), np.cross(thrust, jerk)
+    rate = np.hypot(np.linalg.norm(cross, axis=-1) / size, cross[..., 2] / (size + thrust[..., 2]))
+    ratios = {
+        "speed": np.linalg.norm(vel, axis=-1),
+        "acceleration": np.linalg.norm(acc, axis=-1),
+        "body_rate": rate / size,
+    }
+    return np.max([value / case[name] for name, value in ratios.items()], axis=(0, 2))
+
+
+@dataclasses.dataclass
+class Finding:
+    """What the oracle found about one case."""
+
+    feasible: bool = False  # the referee passed a hit
+    least_excess: float = math.inf  # of the programs that converged
+    starts: int = 0  # how many were used
+    seconds: float = 0.0
+    impact_time: float = math.nan  # [s], of the hit, or of the least excess
+    flight_time: float = math.nan  # [s]
+    thrust: float = math.nan  # [g], at the impact
+    coeffs: np.ndarray | None = None  # (M, 5, 3) of a hit
+    durations: np.ndarray | None = None  # (M,) [s]
+
+    def note(self, unknowns: np.ndarray, durations: np.ndarray) -> None:
+        """Keep the result of a program that converged if it is the best so far."""
+        if unknowns[-1] < self.least_excess:
+            self.impact_time = float(durations.sum())
+            self.flight_time, self.thrust, self.least_excess = unknowns[-3:].tolist()
+
+    @property
+    def verdict(self) -> str:
+        """feasible, infeasible (as far as the programs can tell), or undecided."""
+        if self.feasible:
+            return "feasible"
+        clear = INFEASIBLE_ABOVE < self.least_excess < math.inf
+        return "infeasible" if clear else "undecided"
+
+
+class Oracle:
+    """Coarse and fine program."""
+
+    def __init__(self):
+        self.coarse = Program(COARSE_PIECES, COARSE_SAMPLES, COARSE_FLOOR)
+        self.fine = Program(2 * COARSE_PIECES, FINE_SAMPLES, FINE_FLOOR)
+
+    def find(self, scenario: HitScenario, starts) -> Finding:
+        """Look for a hit in one scenario (NumPy leaves, no batch axis) from several starts."""
+        began, finding, in_vain = time.perf_counter(), Finding(), math.inf
+        case = case_parameters(scenario)
+        for start in starts:
+            finding.starts += 1
+            unknowns, converged = self.coarse.solve(case, self.coarse.guess(case, start))
+            if unknowns[-1] < min(REFINED_BELOW, in_vain - NEW_BELOW):
+                guess = self.coarse.halved(case, unknowns)
+                if self._refine(scenario, case, guess, finding) > TOLERANCE:
+                    in_vain = unknowns[-1]
+                if finding.feasible:
+                    break
+            elif converged:
+                finding.note(unknowns, unknowns[: self.coarse.pieces])
+        finding.seconds = time.perf_counter() - began
+        return finding
+
+    def _refine(self, scenario, case: dict, guess: np.ndarray, finding: Finding) -> float:
+        """Solve the fine program, tightening what peaks between samples; its last excess."""
+        margins = None
+        for _ in range(1 + MOST_TIGHTENINGS):
+            guess, converged = self.fine.solve(case, guess, margins)
+            motion, durations = self.fine.motion(case, guess)
+            coeffs = np.stack([m / math.factorial(k) for k, m in enumerate(motion)], axis=1)
+            finding.feasible = passes_referee(scenario, coeffs, durations)
+            if converged or finding.feasible:
+                finding.note(guess, durations)
+            if finding.feasible:
+                finding.coeffs, finding.durations = coeffs, durations
+                break
+            peaks = worst_ratios(motion, durations, case) - 1.0 - max(guess[-1], 0.5 * TOLERANCE)
+            if guess[-1] > TOLERANCE or peaks.max() <= 0.0:
+                break
+            margins = np.maximum(peaks, 0.0) + (0.0 if margins is None else margins)
+        return guess[-1]
+
+
+def passes_referee(scenario: HitScenario, coeffs: np.ndarray, durations: np.ndarray) -> bool:
+    """Whether the library's referee passes one trajectory."""
+    none = np.zeros(1)
+    stroke = Stroke(
+        time=durations.sum(keepdims=True),
+        ball_pos=none,
+        ball_vel=none,
+        ball_vel_after=none,
+        normal=none,
+        flight_time=none,
+    )
+    plan = HitPlan(
+        trajectory=PiecewisePolynomial(coeffs=coeffs[None], durations=durations[None]),
+        stroke=stroke,
+        cost=none,
+        violation=none,
+        iterations=none,
+        status=none,
+    )
+    batch = jax.tree.map(lambda leaf: leaf[None], scenario)
+    return bool(referee_hits(batch, plan, tolerance=TOLERANCE).success[0])
+
+
+def starting_points(num: int, seed: int) -> list[tuple[float, ...]]:
+    """`STARTS`, then random ones."""
+    low, high = np.transpose(START_RANGES)
+    draws = np.random.default_rng(seed).uniform(low, high, (max(num - len(STARTS), 0), 3))
+    return [*STARTS, *map(tuple, draws)][:num]
+
+
+@functools.cache
+def oracle() -> Oracle:
+    """The one oracle of a process; building it takes a second."""
+    return Oracle()
+
+
+def find_hit(scenario: HitScenario, starts) -> Finding:
+    """What the process's oracle finds about one scenario."""
+    return oracle().find(scenario, starts)
+
+
+def find_hits(scenarios: HitScenario, starts, workers: int = 1) -> list[Finding]:
+    """Findings for a batch of scenarios, in order, with a progress bar."""
+    scenarios = jax.tree.map(np.asarray, scenarios)
+    num = len(scenarios.drag)
+    lanes = [jax.tree.map(lambda leaf, i=i: leaf[i], scenarios) for i in range(num)]
+    look = functools.partial(find_hit, starts=starts)
+    if workers == 1:
+        return list(tqdm(map(look, lanes), total=num, unit="case"))
+    with multiprocessing.get_context("spawn").Pool(workers) as pool:
+        return list(tqdm(pool.imap(look, lanes), total=num, unit="case"))
