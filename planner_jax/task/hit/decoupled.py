@@ -1,0 +1,109 @@
+"""The impact with uncoupled components of paper 002, Section IV-B (eqs 11-14).
+
+Two components of the racket's velocity and two of its thrust are given; the others follow
+from the ball and the target.
+"""
+
+import jax.numpy as jnp
+from flax import struct
+from jax import Array
+
+from planner_jax.ball.aim import aim_drag_free
+from planner_jax.ball.flight import BallState
+
+_LEAST_THRUST_X = 1e-2  # [m/s^2]
+_LEAST_ROOT = 1e-2  # [m/s], of the discriminant of eq. 13c
+_LEAST_FLIGHT = 1e-2  # [s]
+_LEAST_PUSH = 1e-3  # [s], change of the ball's velocity over the thrust
+
+
+@struct.dataclass
+class DecoupledHit:
+    """What eqs 13 and 14 make of the four given components."""
+
+    ball_vel_after: Array  # (3,) [m/s]
+    flight_time: Array  # () [s], of the ball to the target
+    racket_vel: Array  # (3,) [m/s], x by eq. 14a
+    thrust: Array  # (3,) [m/s^2], y by eq. 14b
+    defect: Array  # () >= 0; where it is not 0, no hit with these components reaches the target
+
+
+def decoupled_hit(
+    ball: BallState,
+    target: Array,
+    racket_vel_yz: Array,
+    thrust_xz: Array,
+    restitution: Array,
+    gravity: Array,
+) -> DecoupledHit:
+    """Solve eqs 13 and 14 for the rest of a hit that sends the ball to the target.
+
+    With delta = tau_z / tau_x, xi = target - ball and c = v-_z - delta v-_x the flight time is
+    the later root of  g t^2 / 2 - c t - (delta xi_x - xi_z) = 0 . Eq. 13c is xi_x over that
+    root, written with divisions by xi_x and delta xi_x - xi_z that the root does without.
+    Eq. 14b is the change of the ball's v_y over that of v_x, times tau_x. What can still be
+    singular is guarded, and `defect` tells where: tau_x = 0, a negative discriminant, a ball
+    that flies or is pushed backwards. Values and gradients are finite everywhere.
+
+    Eq. 13d counts xi from the quadrotor; from the ball, 6 cm away, the target is hit exactly.
+
+    Args:
+        ball: just before the impact.
+        target: (3,) [m].
+        racket_vel_yz: (2,) [m/s].
+        thrust_xz: (2,) [m/s^2], per unit mass.
+        restitution: ().
+        gravity: () [m/s^2], magnitude.
+    """
+    size_x = jnp.abs(thrust_xz[0])
+    tau_x = jnp.where(thrust_xz[0] < 0.0, -1.0, 1.0) * jnp.maximum(size_x, _LEAST_THRUST_X)
+    tau_z = thrust_xz[1]
+    delta = tau_z / tau_x
+    xi = target - ball.pos
+    c = ball.vel[2] - delta * ball.vel[0]
+    discriminant = c**2 + 2.0 * gravity * (delta * xi[0] - xi[2])
+    root = jnp.sqrt(jnp.maximum(discriminant, _LEAST_ROOT**2))
+    flight_time = (c + root) / gravity
+    flight = jnp.maximum(flight_time, _LEAST_FLIGHT)
+    after = aim_drag_free(ball.pos, target, flight, gravity)
+    push = (after[0] - ball.vel[0]) / tau_x
+    tau_y = (after[1] - ball.vel[1]) / jnp.maximum(push, _LEAST_PUSH)
+    thrust = jnp.stack([tau_x, tau_y, tau_z])
+    along = jnp.sum((restitution * ball.vel + after) * thrust) / (1.0 + restitution)
+    vel_x = (along - racket_vel_yz[0] * tau_y - racket_vel_yz[1] * tau_z) / tau_x
+    shortfalls = jnp.stack(
+        [
+            _LEAST_THRUST_X - size_x,
+            (_LEAST_ROOT**2 - discriminant) / gravity,
+            _LEAST_FLIGHT - flight_time,
+            _LEAST_PUSH - push,
+        ]
+    )
+    return DecoupledHit(
+        ball_vel_after=after,
+        flight_time=flight,
+        racket_vel=jnp.concatenate([vel_x[None], racket_vel_yz]),
+        thrust=thrust,
+        defect=jnp.sum(jnp.maximum(shortfalls, 0.0)),
+    )
+
+
+def aim_at_angle(pos: Array, target: Array, angle: float, gravity: Array) -> Array:
+    """Velocity with which a drag-free ball leaves at an angle and reaches the target.
+
+    Args:
+        pos: (3,) [m].
+        target: (3,) [m]. One above the line of that angle is taken to be 0.1 m below it.
+        angle: [rad], above the horizontal, less than pi / 2.
+        gravity: () [m/s^2], magnitude.
+
+    Returns:
+        (3,) [m/s].
+    """
+    way = target - pos
+    distance = jnp.sqrt(jnp.maximum(jnp.sum(way[:2] ** 2), 1e-4))
+    slope = jnp.tan(angle)
+    below = jnp.maximum(distance * slope - way[2], 0.1)
+    # Over the flight time t = sqrt(2 below / g) the ball falls that far from the line.
+    flight_time = jnp.sqrt(2.0 * below / gravity)
+    return jnp.concatenate([way[:2], (distance * slope)[None]]) / flight_time
