@@ -152,7 +152,8 @@ class JuggleHit:
     @property
     def rounds(self) -> tuple[Round, ...]:
         """One evaluation: without a decision to take, every lane is stationary at once."""
-        return (Round(starts=1, solver=LbfgsConfig(max_steps=0, patience=0)),)
+        solver = LbfgsConfig(max_steps=0, memory=1, trial_steps=(1.0,), patience=0)
+        return (Round(starts=1, solver=solver),)
 
     def prepare(self, scenario: HitScenario) -> HitContext:
         """The incoming ball's table; see `prepare_hit`."""

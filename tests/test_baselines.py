@@ -1,0 +1,352 @@
+"""The published baselines: what they take from the paper holds, and they fail with a status."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from derivatives import assert_gradient_matches_differences
+
+from planner_jax.ball.flight import BallState, drag_free_flight, fly
+from planner_jax.ball.impact import racket_impact
+from planner_jax.optimise.lbfgs import LbfgsConfig
+from planner_jax.optimise.problem import Round
+from planner_jax.optimise.status import Status
+from planner_jax.referee.hit import referee_hits
+from planner_jax.task.hit import court
+from planner_jax.task.hit.bat import BatHit, serve_origin, transition_point
+from planner_jax.task.hit.decoupled import aim_at_angle, decoupled_hit
+from planner_jax.task.hit.juggle import JuggleHit, eased_minimum_jerk
+from planner_jax.task.hit.planners import PLANNERS, planner
+from planner_jax.task.hit.scenario import hit_scenario
+from planner_jax.task.hit.serves import generate_serves, to_scenarios
+from planner_jax.task.solve import is_solved, plan
+from planner_jax.trajectory.minimum_jerk import minimum_jerk
+from planner_jax.trajectory.polynomial import evaluate
+
+NUM = 16
+GRAVITY = 9.8
+RESTITUTION = 0.7
+BAT = BatHit()
+JUGGLE = JuggleHit()
+
+float64 = pytest.mark.usefixtures("float64")
+
+
+@pytest.fixture(scope="module")
+def scenarios():
+    return to_scenarios(generate_serves(NUM, 5))
+
+
+@pytest.fixture(scope="module")
+def bat_plans(scenarios):
+    return plan(BAT, scenarios)
+
+
+@pytest.fixture(scope="module")
+def juggle_plans(scenarios):
+    return plan(JUGGLE, scenarios)
+
+
+def lane_of(tree, lane):
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf[lane]), tree)
+
+
+def serves_gone_wrong():
+    """Cases in which an equation of the paper divides by zero or has no root, one good one last.
+
+    Target straight above and straight below the falling ball, so that xi_x = xi_y = 0; a ball
+    that falls straight down; one that is already below the height of `juggle`; one that
+    lands at once; one at rest.
+    """
+    pos = [[-2.0, 0.0, 2.0]] * 3 + [[-2.0, 0.0, 1.0], [-2.0, 0.0, 0.01], [-2.0, 0.0, 3.0]]
+    vel = [[0.0, 0.0, 7.0]] * 3 + [[0.0, 0.0, -4.0], [-3.0, 0.0, -8.0], [0.0, 0.0, 0.0]]
+    target = [[-2.0, 0.0, 5.0], [-2.0, 0.0, 0.0], [-2.0, 3.0, 0.0]] + [[3.0, 0.0, 0.0]] * 3
+    return hit_scenario(
+        np.array([*pos, [3.5, 0.3, 2.0]]),
+        np.array([*vel, [-4.0, -0.2, 7.4]]),
+        np.array([*target, [3.0, 1.67, 0.0]]),
+    )
+
+
+# eqs 11-14
+
+
+def generic_hits():
+    """Balls, targets and the four components, 32 of them, away from every singularity."""
+    rng = np.random.default_rng(1)
+    ball = BallState(
+        pos=rng.uniform([-4.0, -2.0, 0.5], [-1.0, 2.0, 2.5], (32, 3)),
+        vel=rng.uniform([-4.0, -1.5, -7.5], [-1.5, 1.5, -4.0], (32, 3)),
+    )
+    target = rng.uniform([1.5, -2.0, 0.0], [4.0, 2.0, 0.0], (32, 3))
+    return (
+        ball,
+        target,
+        rng.uniform(-2.0, 2.0, (32, 2)),
+        rng.uniform([3.0, 8.0], [8.0, 14.0], (32, 2)),
+    )
+
+
+def solve(ball, target, racket_vel_yz, thrust_xz):
+    return decoupled_hit(ball, target, racket_vel_yz, thrust_xz, RESTITUTION, GRAVITY)
+
+
+@float64
+def test_a_generic_hit_sends_the_ball_to_the_target():
+    ball, target, racket_vel, thrust = generic_hits()
+    hit = jax.jit(jax.vmap(solve))(ball, target, racket_vel, thrust)
+    assert (hit.defect == 0.0).all()
+    np.testing.assert_array_equal(hit.racket_vel[:, 1:], racket_vel)
+    np.testing.assert_array_equal(hit.thrust[:, ::2], thrust)
+    normal = hit.thrust / jnp.linalg.norm(hit.thrust, axis=1, keepdims=True)
+    bounce = jax.vmap(racket_impact, in_axes=(0, 0, 0, None))
+    after = bounce(ball.vel, hit.racket_vel, normal, RESTITUTION)
+    np.testing.assert_allclose(after, hit.ball_vel_after, atol=1e-11)
+    fall = jax.vmap(drag_free_flight, in_axes=(0, 0, None))
+    landing = fall(BallState(ball.pos, after), hit.flight_time, GRAVITY).pos
+    np.testing.assert_allclose(landing, target, atol=1e-11)
+
+
+@float64
+def test_the_flight_time_is_the_one_of_the_printed_equations():
+    ball, target, racket_vel, thrust = generic_hits()
+    hit = jax.jit(jax.vmap(solve))(ball, target, racket_vel, thrust)
+    xi, delta = target - ball.pos, thrust[:, 1] / thrust[:, 0]
+    vx, vy, vz = ball.vel.T
+    lead = delta * vx - vz
+    below = delta * xi[:, 0] - xi[:, 2]
+    after_x = (np.sqrt(lead**2 + 2.0 * GRAVITY * below) + lead) * xi[:, 0] / (2.0 * below)
+    tau_y = (vy - xi[:, 1] / xi[:, 0] * after_x) / (vx - after_x) * thrust[:, 0]
+    cross = xi[:, 0] * tau_y - xi[:, 1] * thrust[:, 0]
+    after_y = xi[:, 1] * (tau_y * vx - thrust[:, 0] * vy) / cross
+    after_z = -thrust[:, 1] / tau_y * (vy - after_y) + vz
+    np.testing.assert_allclose(hit.thrust[:, 1], tau_y, rtol=1e-9)
+    np.testing.assert_allclose(
+        hit.ball_vel_after, np.stack([after_x, after_y, after_z], axis=1), rtol=1e-8
+    )
+
+
+@float64
+def test_gradients_of_the_hit_match_differences():
+    ball, target, racket_vel, thrust = jax.tree.map(lambda x: x[3], generic_hits())
+
+    def some_number(given):
+        hit = solve(ball, target, *given)
+        return jnp.sum(hit.racket_vel**2) + jnp.sum(hit.thrust) + hit.flight_time
+
+    assert_gradient_matches_differences(some_number, (racket_vel, thrust))
+
+
+@pytest.mark.parametrize(
+    ("xi", "ball_vel", "thrust"),
+    [
+        ((0.0, 0.0, 3.0), (0.0, 0.0, -5.0), (4.0, 10.0)),  # straight above
+        ((0.0, 0.0, -1.0), (0.0, 0.0, -5.0), (0.0, 10.0)),  # straight below, no tau_x
+        ((3.0, 1.0, -1.0), (0.0, 0.0, -5.0), (0.0, 10.0)),
+        ((3.0, 1.0, -1.0), (-3.0, 0.0, -5.0), (-4.0, 10.0)),  # the racket faces away
+        ((5.0, 1.0, 0.0), (5.0, 0.0, 0.0), (1e-3, 0.0)),
+    ],
+)
+def test_a_hit_that_cannot_be_is_finite_and_says_so(xi, ball_vel, thrust):
+    ball = BallState(pos=jnp.zeros(3), vel=jnp.array(ball_vel))
+
+    def total(thrust_xz):
+        hit = solve(ball, jnp.array(xi), jnp.array([0.0, 1.0]), thrust_xz)
+        return sum(jnp.sum(leaf) for leaf in jax.tree.leaves(hit)), hit
+
+    (_, hit), gradient = jax.value_and_grad(total, has_aux=True)(jnp.array(thrust))
+    assert hit.defect > 0.0
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((hit, gradient)))
+
+
+@float64
+def test_a_ball_aimed_at_an_angle_leaves_at_it_and_arrives():
+    pos, target = jnp.array([-2.0, 0.5, 1.4]), jnp.array([3.0, -1.0, 0.0])
+    vel = aim_at_angle(pos, target, np.radians(60.0), GRAVITY)
+    np.testing.assert_allclose(vel[2] / jnp.hypot(vel[0], vel[1]), np.sqrt(3.0), rtol=1e-12)
+    time = (target[0] - pos[0]) / vel[0]
+    landing = drag_free_flight(BallState(pos, vel), time, GRAVITY).pos
+    np.testing.assert_allclose(landing, target, atol=1e-12)
+
+
+# the transition
+
+
+def test_transition_point_of_an_example_by_hand():
+    """s_mid = (2,0,0); the ray to p_h runs along -x; p_alpha = (-3,1.5,0), its foot (-3,0,0)."""
+    point = transition_point(
+        start=jnp.array([-4.0, 3.0, 0.0]),
+        hit=jnp.array([-2.0, 0.0, 0.0]),
+        origin=jnp.array([4.0, 0.0, 0.0]),
+        target=jnp.array([0.0, 0.0, 0.0]),
+    )
+    np.testing.assert_allclose(point, [-3.0, 1.0, 0.0], atol=1e-6)
+
+
+@float64
+def test_the_serve_comes_from_where_its_flight_began(scenarios):
+    origin = np.array([3.0, -1.0, 0.0])
+    launched = BallState(jnp.array(origin), jnp.array([-4.0, 0.5, 9.5]))
+    drag, gravity = jnp.asarray(0.0616), jnp.asarray(GRAVITY)
+    ball, _ = fly(launched, jnp.asarray(0.25), drag, gravity, num_steps=100)
+    lane = hit_scenario(ball.pos, ball.vel, np.zeros(3), dtype=jnp.float64)
+    np.testing.assert_allclose(serve_origin(lane), origin, atol=1e-3)
+    falling = dataclasses.replace(lane, ball=BallState(ball.pos, jnp.array([-9.0, 0.0, -30.0])))
+    assert np.isfinite(serve_origin(falling)).all()
+
+
+@pytest.mark.parametrize("transition", [True, False])
+def test_first_waypoints_lie_on_the_primitives(scenarios, transition):
+    bat, scenario = BatHit(transition=transition), lane_of(scenarios, 2)
+    context = bat.prepare(scenario)
+    natural = bat.guesses(context, 1)[0] * jnp.asarray(bat.scale)
+    waypoints = np.asarray(natural[: bat.num_offsets]).reshape(-1, 3)
+    impact, defect = bat.impact(natural[bat.num_offsets :], context)
+    head, tail, end = scenario.head_state[:3], impact.tail_state[:3], impact.stroke.time
+    assert defect == 0.0
+    np.testing.assert_allclose(end, 1.2 if transition else 0.7, rtol=1e-5)
+    rise = impact.stroke.ball_vel_after
+    np.testing.assert_allclose(rise[2] / np.hypot(rise[0], rise[1]), np.sqrt(3.0), rtol=1e-3)
+    if not transition:
+        straight = minimum_jerk(head, tail, end)
+        np.testing.assert_allclose(waypoints[1], evaluate(straight, 0.5 * end), atol=1e-4)
+        return
+    state = bat.transition_state(impact, scenario)
+    np.testing.assert_allclose(state[1], tail[1] * np.array([0.5, 0.5, 1.0 / 3.0]), atol=1e-5)
+    np.testing.assert_allclose(state[2, 2], 2.0 / 3.0 * tail[2, 2], atol=1e-5)
+    first = minimum_jerk(head, state, 0.7 / 1.2 * end)
+    second = minimum_jerk(state, tail, 0.5 / 1.2 * end)
+    np.testing.assert_allclose(waypoints[1], evaluate(first, 0.5 * end), atol=1e-4)
+    np.testing.assert_allclose(waypoints[2], evaluate(second, (0.75 - 0.7 / 1.2) * end), atol=1e-4)
+
+
+# the plans
+
+
+def test_juggle_is_at_rest_first_and_in_its_fixed_stroke_last(scenarios, juggle_plans):
+    verdict = referee_hits(scenarios, juggle_plans)
+    assert verdict.head_error.max() < 1e-6
+    assert verdict.continuity_error.max() < 1e-4
+    assert verdict.contact_error.max() < 1e-3
+    assert verdict.landing_error.max() < 1e-3
+    np.testing.assert_allclose(juggle_plans.stroke.ball_pos[:, 2], JUGGLE.height, atol=1e-3)
+    np.testing.assert_allclose(verdict.apex, JUGGLE.apex, atol=2e-3)
+    np.testing.assert_allclose(verdict.hitting_velocity[:, :2], 0.0, atol=1e-3)
+    for lane in range(NUM):
+        one = lane_of(juggle_plans, lane)
+        acc = evaluate(one.trajectory, one.stroke.time, 2)
+        thrust = 0.1 * GRAVITY  # less g
+        np.testing.assert_allclose(acc[2], thrust, atol=2e-3)
+
+
+@float64
+def test_a_short_ease_leaves_the_minimum_jerk_primitive():
+    rng = np.random.default_rng(3)
+    head, tail = rng.normal(size=(4, 3)), rng.normal(size=(3, 3))
+    plain = minimum_jerk(jnp.asarray(head[:3]), jnp.asarray(tail), jnp.asarray(1.3))
+    for ease, tolerance in ((1e-2, 0.1), (1e-4, 1e-3)):
+        eased = eased_minimum_jerk(jnp.asarray(head), jnp.asarray(tail), jnp.asarray(1.3), ease)
+        np.testing.assert_allclose(eased.durations, [ease, 1.3 - ease], rtol=1e-12)
+        for order in range(4):
+            begin = evaluate(eased, jnp.asarray(0.0), order)
+            np.testing.assert_allclose(begin, head[order], atol=1e-9)
+        for order in range(3):
+            end = evaluate(eased, jnp.asarray(1.3), order)
+            np.testing.assert_allclose(end, tail[order], atol=1e-9)
+        middle = evaluate(eased, jnp.asarray(0.6))
+        np.testing.assert_allclose(middle, evaluate(plain, jnp.asarray(0.6)), atol=tolerance)
+        before = [eased.coeffs[0] @ np.eye(3), eased.coeffs[1]]
+        joint = [sum(before[0][k] * ease**k for k in range(6)), before[1][0]]
+        np.testing.assert_allclose(joint[0], joint[1], atol=1e-9)
+
+
+def test_bat_meets_the_ball_and_reaches_the_target_on_every_lane(scenarios, bat_plans):
+    verdict = referee_hits(scenarios, bat_plans)
+    assert verdict.contact_error.max() < 1e-3
+    assert verdict.landing_error.max() < 1e-2
+    assert verdict.head_error.max() < 1e-4
+    solved = is_solved(bat_plans.status)
+    assert solved.sum() >= NUM // 2
+    assert verdict.success[solved].all()
+
+
+@pytest.mark.parametrize("name", ["bat_plans", "juggle_plans"])
+def test_a_lane_that_breaks_a_limit_carries_a_status_that_says_so(scenarios, name, request):
+    plans = request.getfixturevalue(name)
+    verdict = referee_hits(scenarios, plans)
+    refused = np.isin(verdict.failed_limit, ["speed", "acceleration", "body rate", "apex low"])
+    assert set(plans.status[refused]) <= {Status.INFEASIBLE, Status.MAX_STEPS}
+    assert (plans.violation[refused] > 0.0).all()
+
+
+def test_juggle_decides_nothing_and_so_never_asks_for_more_iterations(juggle_plans):
+    assert (juggle_plans.iterations == 0).all()
+    assert set(juggle_plans.status) <= {Status.CONVERGED, Status.INFEASIBLE}
+
+
+@pytest.mark.parametrize("make", [BatHit, JuggleHit])
+def test_no_equation_leaks_a_nan_and_its_neighbours_do_not_notice(make, scenarios):
+    broken = jax.tree.map(lambda a, b: jnp.concatenate([a, b[:9]]), serves_gone_wrong(), scenarios)
+    found = plan(make(), broken)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
+    assert not is_solved(found.status[0]), "the target is above every path"
+    verdict = referee_hits(broken, found)
+    assert verdict.success[is_solved(found.status)].all()
+    alone = plan(make(), scenarios)
+    for old, new in zip(jax.tree.leaves(alone), jax.tree.leaves(found), strict=True):
+        np.testing.assert_array_equal(old[:9], new[7:])
+
+
+def test_a_nan_serve_is_a_row_with_a_status(scenarios):
+    pos = scenarios.ball.pos.at[2, 0].set(jnp.nan)
+    broken = dataclasses.replace(scenarios, ball=BallState(pos, scenarios.ball.vel))
+    for make in (BAT, JUGGLE):
+        found = plan(make, broken)
+        assert found.status[2] == Status.NON_FINITE
+        assert (np.delete(found.status, 2) != Status.NON_FINITE).all()
+
+
+@pytest.mark.parametrize("make", [JUGGLE, BAT])
+def test_batch_equals_loop(make, scenarios):
+    """One evaluation each: iterations may part ways by rounding."""
+
+    def evaluate_guess(scenario):
+        context = make.prepare(scenario)
+        point = make.guesses(context, 1)[0]
+        return make.objective(point, context), make.decode(point, context)
+
+    some = jax.tree.map(lambda leaf: leaf[:3], scenarios)
+    batch = jax.jit(jax.vmap(evaluate_guess))(some)
+    single = jax.jit(evaluate_guess)
+    for lane in range(3):
+        alone, among = single(lane_of(some, lane)), lane_of(batch, lane)
+        for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(among), strict=True):
+            np.testing.assert_allclose(a, b, rtol=2e-4, atol=2e-4)
+
+
+# names and options
+
+
+def test_every_published_planner_has_its_name():
+    assert {"exact", *court.PLANNERS} == set(PLANNERS)
+    assert planner("juggle") == JUGGLE
+    assert planner("bat") == BAT
+    assert planner("bat-lite", nodes=8) == BatHit(transition=False, nodes=8)
+    with pytest.raises(
+        ValueError, match="planner must be one of exact, bat, bat-lite, juggle, got"
+    ):
+        planner("bat lite")
+
+
+@pytest.mark.parametrize("make", [BAT, JUGGLE])
+def test_the_published_planners_have_a_single_start(make, scenarios):
+    context = make.prepare(lane_of(scenarios, 0))
+    with pytest.raises(ValueError, match="starts must be 1, got 2"):
+        make.guesses(context, 2)
+
+
+def test_one_piece_has_no_waypoint_to_decide_on():
+    with pytest.raises(ValueError, match="num_pieces must be >= 2, got 1"):
+        BatHit(num_pieces=1)
