@@ -10,8 +10,6 @@ from derivatives import assert_gradient_matches_differences
 
 from planner_jax.ball.flight import BallState, drag_free_flight, fly
 from planner_jax.ball.impact import racket_impact
-from planner_jax.optimise.lbfgs import LbfgsConfig
-from planner_jax.optimise.problem import Round
 from planner_jax.optimise.status import Status
 from planner_jax.referee.hit import referee_hits
 from planner_jax.task.hit import court
@@ -197,29 +195,40 @@ def test_the_serve_comes_from_where_its_flight_began(scenarios):
     assert np.isfinite(serve_origin(falling)).all()
 
 
-@pytest.mark.parametrize("transition", [True, False])
-def test_first_waypoints_lie_on_the_primitives(scenarios, transition):
-    bat, scenario = BatHit(transition=transition), lane_of(scenarios, 2)
+def first_guess(transition, scenario):
+    """What the first guess decides: waypoints, impact, its defect, and the transition state."""
+    bat = BatHit(transition=transition)
     context = bat.prepare(scenario)
     natural = bat.guesses(context, 1)[0] * jnp.asarray(bat.scale)
-    waypoints = np.asarray(natural[: bat.num_offsets]).reshape(-1, 3)
     impact, defect = bat.impact(natural[bat.num_offsets :], context)
+    waypoints = natural[: bat.num_offsets].reshape(-1, 3)
+    return waypoints, impact, defect, bat.transition_state(impact, scenario)
+
+
+position = jax.jit(lambda head, tail, end, t: evaluate(minimum_jerk(head, tail, end), t))
+
+
+@pytest.mark.parametrize("transition", [True, False])
+def test_first_waypoints_lie_on_the_primitives(scenarios, transition):
+    scenario = lane_of(scenarios, 2)
+    waypoints, impact, defect, state = jax.jit(first_guess, static_argnums=0)(transition, scenario)
     head, tail, end = scenario.head_state[:3], impact.tail_state[:3], impact.stroke.time
     assert defect == 0.0
     np.testing.assert_allclose(end, 1.2 if transition else 0.7, rtol=1e-5)
     rise = impact.stroke.ball_vel_after
     np.testing.assert_allclose(rise[2] / np.hypot(rise[0], rise[1]), np.sqrt(3.0), rtol=1e-3)
-    if not transition:
-        straight = minimum_jerk(head, tail, end)
-        np.testing.assert_allclose(waypoints[1], evaluate(straight, 0.5 * end), atol=1e-4)
-        return
-    state = bat.transition_state(impact, scenario)
-    np.testing.assert_allclose(state[1], tail[1] * np.array([0.5, 0.5, 1.0 / 3.0]), atol=1e-5)
-    np.testing.assert_allclose(state[2, 2], 2.0 / 3.0 * tail[2, 2], atol=1e-5)
-    first = minimum_jerk(head, state, 0.7 / 1.2 * end)
-    second = minimum_jerk(state, tail, 0.5 / 1.2 * end)
-    np.testing.assert_allclose(waypoints[1], evaluate(first, 0.5 * end), atol=1e-4)
-    np.testing.assert_allclose(waypoints[2], evaluate(second, (0.75 - 0.7 / 1.2) * end), atol=1e-4)
+    if transition:
+        np.testing.assert_allclose(state[1], tail[1] * np.array([0.5, 0.5, 1.0 / 3.0]), atol=1e-5)
+        np.testing.assert_allclose(state[2, 2], 2.0 / 3.0 * tail[2, 2], atol=1e-5)
+        switch = 0.7 / 1.2 * end
+        expected = [
+            position(head, state, switch, 0.25 * end),
+            position(head, state, switch, 0.5 * end),
+            position(state, tail, end - switch, 0.75 * end - switch),
+        ]
+    else:
+        expected = [position(head, tail, end, share * end) for share in (0.25, 0.5, 0.75)]
+    np.testing.assert_allclose(waypoints, np.stack(expected), atol=1e-4)
 
 
 # the plans
@@ -242,24 +251,28 @@ def test_juggle_is_at_rest_first_and_in_its_fixed_stroke_last(scenarios, juggle_
 
 
 @float64
-def test_a_short_ease_leaves_the_minimum_jerk_primitive():
+def test_a_short_ease_leaves_the_minimum_jerk_primitive_and_joins_it_up_to_the_jerk():
     rng = np.random.default_rng(3)
-    head, tail = rng.normal(size=(4, 3)), rng.normal(size=(3, 3))
-    plain = minimum_jerk(jnp.asarray(head[:3]), jnp.asarray(tail), jnp.asarray(1.3))
-    for ease, tolerance in ((1e-2, 0.1), (1e-4, 1e-3)):
-        eased = eased_minimum_jerk(jnp.asarray(head), jnp.asarray(tail), jnp.asarray(1.3), ease)
-        np.testing.assert_allclose(eased.durations, [ease, 1.3 - ease], rtol=1e-12)
-        for order in range(4):
-            begin = evaluate(eased, jnp.asarray(0.0), order)
-            np.testing.assert_allclose(begin, head[order], atol=1e-9)
-        for order in range(3):
-            end = evaluate(eased, jnp.asarray(1.3), order)
-            np.testing.assert_allclose(end, tail[order], atol=1e-9)
-        middle = evaluate(eased, jnp.asarray(0.6))
-        np.testing.assert_allclose(middle, evaluate(plain, jnp.asarray(0.6)), atol=tolerance)
-        before = [eased.coeffs[0] @ np.eye(3), eased.coeffs[1]]
-        joint = [sum(before[0][k] * ease**k for k in range(6)), before[1][0]]
-        np.testing.assert_allclose(joint[0], joint[1], atol=1e-9)
+    head, tail, end = rng.normal(size=(4, 3)), rng.normal(size=(3, 3)), 1.3
+    eased_primitive = jax.jit(eased_minimum_jerk, static_argnums=3)
+
+    def derivatives(coeffs, t, num):
+        """Derivatives 0 to num - 1 of one piece at t, (num, 3)."""
+        value = [np.polynomial.polynomial.polyder(coeffs, n) for n in range(num)]
+        return np.stack([np.polynomial.polynomial.polyval(t, c) for c in value])
+
+    plain = minimum_jerk(jnp.asarray(head[:3]), jnp.asarray(tail), jnp.asarray(end))
+    for ease, away in ((1e-2, 2e-2), (1e-4, 2e-4)):
+        eased = eased_primitive(head, tail, jnp.asarray(end), ease)
+        ramp, primitive = np.asarray(eased.coeffs)
+        np.testing.assert_allclose(eased.durations, [ease, end - ease], rtol=1e-12)
+        np.testing.assert_allclose(derivatives(ramp, 0.0, 4), head, atol=1e-12)
+        joint = derivatives(ramp, ease, 4), derivatives(primitive, 0.0, 4)
+        np.testing.assert_allclose(*joint, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(derivatives(primitive, end - ease, 3), tail, atol=1e-9)
+        np.testing.assert_allclose(
+            derivatives(primitive, 0.6 - ease, 1), derivatives(plain.coeffs[0], 0.6, 1), atol=away
+        )
 
 
 def test_bat_meets_the_ball_and_reaches_the_target_on_every_lane(scenarios, bat_plans):
@@ -310,16 +323,15 @@ def test_a_nan_serve_is_a_row_with_a_status(scenarios):
 
 @pytest.mark.parametrize("make", [JUGGLE, BAT])
 def test_batch_equals_loop(make, scenarios):
-    """One evaluation each: iterations may part ways by rounding."""
+    """Of the first guesses: iterations may part ways by rounding."""
 
-    def evaluate_guess(scenario):
+    def first_plan(scenario):
         context = make.prepare(scenario)
-        point = make.guesses(context, 1)[0]
-        return make.objective(point, context), make.decode(point, context)
+        return make.decode(make.guesses(context, 1)[0], context)
 
     some = jax.tree.map(lambda leaf: leaf[:3], scenarios)
-    batch = jax.jit(jax.vmap(evaluate_guess))(some)
-    single = jax.jit(evaluate_guess)
+    batch = jax.jit(jax.vmap(first_plan))(some)
+    single = jax.jit(first_plan)
     for lane in range(3):
         alone, among = single(lane_of(some, lane)), lane_of(batch, lane)
         for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(among), strict=True):
