@@ -72,12 +72,14 @@ def largest_violation(along: Array, impact: Impact, scenario: HitScenario) -> Ar
     return jnp.maximum(jnp.max(relative(squared)), jnp.max(plain))
 
 
-def undecided_plan(trajectory: PiecewisePolynomial, impact: Impact, violation: Array) -> HitPlan:
-    """A plan whose cost, iterations and status the solver is still to fill in."""
+def undecided_plan(
+    trajectory: PiecewisePolynomial, impact: Impact, cost: Array, violation: Array
+) -> HitPlan:
+    """A plan whose iterations and status the solver is still to fill in, and its cost anew."""
     return HitPlan(
         trajectory=trajectory,
         stroke=impact.stroke,
-        cost=jnp.zeros_like(violation),
+        cost=cost,
         violation=violation,
         iterations=jnp.zeros((), jnp.int32),
         status=jnp.zeros((), jnp.int32),

@@ -4,6 +4,7 @@ import dataclasses
 import math
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -219,16 +220,14 @@ class BatHit:
         head, tail, end = scenario.head_state[:3], impact.tail_state[:3], impact.stroke.time
         shares = np.arange(1, self.num_pieces) / self.num_pieces
         times = end * jnp.asarray(shares, end.dtype)
+        position = jax.vmap(evaluate, in_axes=(None, 0))
         if not self.transition:
-            primitive = minimum_jerk(head, tail, end)
-            return jnp.stack([evaluate(primitive, t) for t in times])
+            return position(minimum_jerk(head, tail, end), times)
         switch = self.stage_times[0] / sum(self.stage_times) * end
         middle = self.transition_state(impact, scenario)
-        first = minimum_jerk(head, middle, switch)
-        second = minimum_jerk(middle, tail, end - switch)
-        return jnp.stack(
-            [jnp.where(t < switch, evaluate(first, t), evaluate(second, t - switch)) for t in times]
-        )
+        first = position(minimum_jerk(head, middle, switch), times)
+        second = position(minimum_jerk(middle, tail, end - switch), times - switch)
+        return jnp.where((times < switch)[:, None], first, second)
 
     def transition_state(self, impact: Impact, scenario: HitScenario) -> Array:
         """Position, velocity and acceleration at the transition, (3, 3).
@@ -299,7 +298,7 @@ class BatHit:
         along = motion_excess(motion, scenario.gravity, scenario.limits)
         violation = jnp.maximum(largest_violation(along, impact, scenario), defect)
         trajectory = uniform_trajectory(maps, rows, offsets, duration)
-        return undecided_plan(trajectory, impact, violation)
+        return undecided_plan(trajectory, impact, jnp.zeros_like(violation), violation)
 
 
 def bat_lite(**options: Any) -> BatHit:
