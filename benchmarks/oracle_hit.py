@@ -51,12 +51,12 @@ def summarise(findings: list[Finding]) -> dict:
         summary[name] = {"count": count, "share": count / num, "wilson_95": interval}
     excess = [f.least_excess for f in findings if f.verdict == "infeasible"]
     quartiles = np.quantile(excess, (0.0, 0.25, 0.5, 0.75, 1.0)).tolist() if excess else None
-    seconds = np.array([finding.seconds for finding in findings])
+    seconds = np.array([finding.cpu_seconds for finding in findings])
     return summary | {
         "least_excess_quartiles_of_infeasible": quartiles,
-        "seconds_per_case_median": float(np.median(seconds)),
-        "seconds_per_case_p90": float(np.quantile(seconds, 0.9)),
-        "seconds": float(seconds.sum()),
+        "cpu_seconds_median": float(np.median(seconds)),
+        "cpu_seconds_p90": float(np.quantile(seconds, 0.9)),
+        "cpu_seconds": float(seconds.sum()),
     }
 
 
@@ -73,8 +73,8 @@ def table_of(summary: dict) -> str:
         lines += ["", f"Least excess of the infeasible, quartiles: {listed} % of every limit."]
     lines += [
         "",
-        f"{summary['seconds_per_case_median']:.2f} s a case (median), "
-        f"{summary['seconds_per_case_p90']:.2f} s (90 %), {summary['seconds']:.0f} s in all.",
+        f"{summary['cpu_seconds_median']:.2f} s of processor time a case (median), "
+        f"{summary['cpu_seconds_p90']:.2f} s (90 %), {summary['cpu_seconds']:.0f} s in all.",
     ]
     return "\n".join(lines)
 

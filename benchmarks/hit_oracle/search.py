@@ -21,7 +21,9 @@ COARSE_PIECES, COARSE_SAMPLES = 20, 3  # samples of a piece, its end included
 FINE_SAMPLES = 4
 COARSE_FLOOR, FINE_FLOOR = -0.01, -0.003  # excesses at which the solver may rest
 REFINED_BELOW = 0.06  # coarse excesses above it are left: halving takes off 0.03 at most
-NEW_BELOW = 0.003  # by how much a coarse excess must be lower than one refined in vain
+NEW_BELOW = 0.001  # by how much a coarse excess must be lower than one refined in vain
+# A case is given up early if so many starts agree on no less than this excess.
+HOPELESS_ABOVE, HOPELESS_STARTS = 0.1, 4
 MOST_TIGHTENINGS = 5
 INFEASIBLE_ABOVE = 0.01  # a case whose least excess is larger is called infeasible
 
@@ -62,7 +64,7 @@ class Finding:
     feasible: bool = False  # the referee passed a hit
     least_excess: float = math.inf  # of the programs that converged
     starts: int = 0  # how many were used
-    seconds: float = 0.0
+    cpu_seconds: float = 0.0
     impact_time: float = math.nan  # [s], of the hit, or of the least excess
     flight_time: float = math.nan  # [s]
     thrust: float = math.nan  # [g], at the impact
@@ -93,40 +95,51 @@ class Oracle:
 
     def find(self, scenario: HitScenario, starts) -> Finding:
         """Look for a hit in one scenario (NumPy leaves, no batch axis) from several starts."""
-        began, finding, in_vain = time.perf_counter(), Finding(), math.inf
+        began, finding, in_vain = time.process_time(), Finding(), math.inf
         case = case_parameters(scenario)
         for start in starts:
             finding.starts += 1
             unknowns, converged = self.coarse.solve(case, self.coarse.guess(case, start))
-            if unknowns[-1] < min(REFINED_BELOW, in_vain - NEW_BELOW):
-                guess = self.coarse.halved(case, unknowns)
-                if self._refine(scenario, case, guess, finding) > TOLERANCE:
-                    in_vain = unknowns[-1]
+            excess = unknowns[-1]
+            if excess < min(REFINED_BELOW, in_vain - NEW_BELOW):
+                refined = self._refine(scenario, case, unknowns, finding)
                 if finding.feasible:
                     break
+                if TOLERANCE < refined < math.inf:
+                    in_vain = excess
             elif converged:
                 finding.note(unknowns, unknowns[: self.coarse.pieces])
-        finding.seconds = time.perf_counter() - began
+            if (
+                finding.starts >= HOPELESS_STARTS
+                and HOPELESS_ABOVE < finding.least_excess < math.inf
+            ):
+                break
+        finding.cpu_seconds = time.process_time() - began
         return finding
 
-    def _refine(self, scenario, case: dict, guess: np.ndarray, finding: Finding) -> float:
-        """Solve the fine program, tightening what peaks between samples; its last excess."""
-        margins = None
+    def _refine(self, scenario, case: dict, coarse: np.ndarray, finding: Finding) -> float:
+        """Halve the pieces and tighten what peaks between samples; the excess, if it converged."""
+        guess, margins = self.coarse.halved(case, coarse), np.zeros(self.fine.pieces)
+        unknowns, converged = self.fine.solve(case, guess)
+        if not converged:
+            unknowns, converged = self.fine.solve(case, guess, margins)
+        if not converged:
+            return math.inf
         for _ in range(1 + MOST_TIGHTENINGS):
-            guess, converged = self.fine.solve(case, guess, margins)
-            motion, durations = self.fine.motion(case, guess)
+            motion, durations = self.fine.motion(case, unknowns)
+            finding.note(unknowns, durations)
             coeffs = np.stack([m / math.factorial(k) for k, m in enumerate(motion)], axis=1)
             finding.feasible = passes_referee(scenario, coeffs, durations)
-            if converged or finding.feasible:
-                finding.note(guess, durations)
             if finding.feasible:
                 finding.coeffs, finding.durations = coeffs, durations
                 break
-            peaks = worst_ratios(motion, durations, case) - 1.0 - max(guess[-1], 0.5 * TOLERANCE)
-            if guess[-1] > TOLERANCE or peaks.max() <= 0.0:
+            excess = max(unknowns[-1], 0.5 * TOLERANCE)
+            peaks = np.maximum(worst_ratios(motion, durations, case) - 1.0 - excess, 0.0)
+            if unknowns[-1] > TOLERANCE or not peaks.any():
                 break
-            margins = np.maximum(peaks, 0.0) + (0.0 if margins is None else margins)
-        return guess[-1]
+            margins = margins + peaks
+            unknowns, _ = self.fine.solve(case, unknowns, margins)
+        return unknowns[-1]
 
 
 def passes_referee(scenario: HitScenario, coeffs: np.ndarray, durations: np.ndarray) -> bool:
