@@ -22,6 +22,8 @@ from planner_jax.task.hit.serves import generate_serves, to_scenarios
 
 SHIPPED = Path(planner_jax.task.hit.__file__).with_name("measured_scales.json")
 
+PROPORTIONS = tuple((0.2, 0.5) + (1.0,) * (num - 2) for num in (6, 12))
+
 # Sensible sizes to begin with: metres, log seconds, log m/s^2, m/s, m/s^3.
 _FIRST = (0.05, 0.1, 0.2, 0.6, 0.8, 30.0, 30.0, 30.0)
 
@@ -42,10 +44,10 @@ def hard_scenarios(num: int, seed: int) -> HitScenario:
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *batches)
 
 
-def measure_exact(num_pieces: int, scenarios: HitScenario) -> np.ndarray:
-    """Scale of `ExactHit` with the given number of pieces, (n,)."""
-    first = (0.2,) * (3 * (num_pieces - 1)) + _FIRST
-    return measure_scale(ExactHit(num_pieces=num_pieces, scale=first), scenarios)
+def measure_exact(proportions: tuple[float, ...], scenarios: HitScenario) -> np.ndarray:
+    """Scale of `ExactHit` with pieces of the given relative durations, (n,)."""
+    first = (0.2,) * (3 * (len(proportions) - 1)) + _FIRST
+    return measure_scale(ExactHit(proportions=proportions, scale=first), scenarios)
 
 
 def main() -> None:
@@ -57,9 +59,9 @@ def main() -> None:
     args = parser.parse_args()
     scenarios = hard_scenarios(args.num, args.seed)
     shipped = json.loads(SHIPPED.read_text("utf-8"))
-    for pieces in (4, 6, 8):
-        name = f"exact-{pieces}"
-        scale = measure_exact(pieces, scenarios)
+    for proportions in PROPORTIONS:
+        name = f"exact-{len(proportions)}"
+        scale = measure_exact(proportions, scenarios)
         print(name, np.array2string(scale, precision=3, max_line_width=100))
         if name in shipped:
             ratio = np.exp(np.abs(np.log(scale / np.asarray(shipped[name]))).max())

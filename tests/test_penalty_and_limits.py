@@ -142,10 +142,10 @@ def test_the_trapezoid_rule_is_of_order_two():
 
 
 def test_joined_weights_are_those_of_the_pieces_with_shared_ends_added():
-    separate = np.zeros(13)
+    separate, shares = np.zeros(13), (0.5, 1.0, 1.5)
     for piece in range(3):
-        separate[4 * piece : 4 * piece + 5] += trapezoid_weights(4)
-    np.testing.assert_allclose(joined_trapezoid_weights(4, 3), separate, rtol=1e-15)
+        separate[4 * piece : 4 * piece + 5] += shares[piece] * trapezoid_weights(4)
+    np.testing.assert_allclose(joined_trapezoid_weights(4, shares), separate, rtol=1e-15)
 
 
 # Limits

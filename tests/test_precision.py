@@ -9,11 +9,12 @@ from jaxpr import assert_full_precision
 
 from planner_jax.trajectory.minco import minco
 from planner_jax.trajectory.polynomial import snap_energy
-from planner_jax.trajectory.uniform_minco import (
+from planner_jax.trajectory.proportional_minco import (
+    equal_pieces,
+    proportional_minco,
+    proportional_trajectory,
     sample_motion,
     trajectory_energy,
-    uniform_minco,
-    uniform_trajectory,
 )
 
 MATRIX, ROWS = np.eye(3, dtype=np.float32), np.ones((8, 3), np.float32)
@@ -33,11 +34,11 @@ def general_energy(head, tail, waypoints, durations):
     return snap_energy(minco(head, tail, waypoints, durations))
 
 
-def uniform_values(rows, offsets, duration):
-    """One number of everything that the equal-duration maps give."""
-    args = uniform_minco(4, 4), rows, offsets, duration
+def proportional_values(rows, offsets, duration):
+    """One number of everything that the maps of fixed proportions give."""
+    args = proportional_minco(4, equal_pieces(4)), rows, offsets, duration
     parts = (
-        uniform_trajectory(*args),
+        proportional_trajectory(*args),
         sample_motion(args[0], 5, *args[1:]),
         trajectory_energy(*args),
     )
@@ -88,5 +89,5 @@ def test_the_general_map_and_its_gradient_ask_for_full_precision(order):
 
 def test_the_equal_duration_maps_and_their_gradients_ask_for_full_precision():
     given = ROWS, ROWS[:3], np.float32(0.4)
-    assert assert_full_precision(uniform_values, *given) > 0
-    assert assert_full_precision(jax.grad(uniform_values, argnums=(0, 1, 2)), *given) > 0
+    assert assert_full_precision(proportional_values, *given) > 0
+    assert assert_full_precision(jax.grad(proportional_values, argnums=(0, 1, 2)), *given) > 0

@@ -411,7 +411,7 @@ def test_settings_survive_the_manifest():
 
 
 def test_planners_are_found_by_name():
-    assert planner("exact", num_pieces=6) == ExactHit(num_pieces=6)
+    assert planner("exact", nodes=6) == ExactHit(nodes=6)
     with pytest.raises(ValueError, match="planner must be one of exact"):
         planner("nobody")
 

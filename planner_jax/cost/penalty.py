@@ -50,12 +50,18 @@ def trapezoid_weights(num_intervals: int) -> np.ndarray:
     return weights / num_intervals
 
 
-def joined_trapezoid_weights(num_intervals: int, num_pieces: int) -> np.ndarray:
-    """Trapezoid weights of pieces of one duration whose shared ends are sampled once.
+def joined_trapezoid_weights(num_intervals: int, proportions: np.ndarray) -> np.ndarray:
+    """Trapezoid weights of pieces whose shared ends are sampled once.
+
+    Args:
+        num_intervals: of every piece.
+        proportions: (M,) durations of the pieces in some unit.
 
     Returns:
-        (num_pieces * num_intervals + 1,) float64; multiply by the duration of a piece.
+        (M * num_intervals + 1,) float64; multiply by that unit [s].
     """
-    weights = np.ones(num_pieces * num_intervals + 1)
-    weights[[0, -1]] = 0.5
-    return weights / num_intervals
+    weights = np.zeros(len(proportions) * num_intervals + 1)
+    for i, share in enumerate(proportions):
+        span = slice(i * num_intervals, (i + 1) * num_intervals + 1)
+        weights[span] += share * trapezoid_weights(num_intervals)
+    return weights

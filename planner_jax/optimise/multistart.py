@@ -1,5 +1,6 @@
 """The loop around the solver, for one scenario and several starts."""
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -56,6 +57,7 @@ def solve_round(planner: Planner, attempt: Round, scenario: Any) -> Any:
     Returns:
         The planner's plan of the best start, its `status` and `iterations` set.
     """
+    planner = dataclasses.replace(planner, **dict(attempt.settings))
     context = planner.prepare(scenario)
     starts = planner.guesses(context, attempt.starts)
 

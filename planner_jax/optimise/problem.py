@@ -14,6 +14,7 @@ class Round:
 
     starts: int
     solver: LbfgsConfig
+    settings: tuple[tuple[str, Any], ...] = ()  # of the planner, that differ in this round
 
     def __post_init__(self) -> None:
         if self.starts < 1:

@@ -23,12 +23,14 @@ from planner_jax.task.hit.plan import HitPlan
 from planner_jax.task.hit.scenario import HitScenario
 from planner_jax.trajectory.minimum_jerk import minimum_jerk
 from planner_jax.trajectory.polynomial import Motion, evaluate
-from planner_jax.trajectory.uniform_minco import (
+from planner_jax.trajectory.proportional_minco import (
+    ProportionalMinco,
     boundary_rows,
+    equal_pieces,
+    proportional_minco,
+    proportional_trajectory,
     sample_motion,
     trajectory_energy,
-    uniform_minco,
-    uniform_trajectory,
 )
 
 _ORDER = 4  # minimum snap
@@ -161,6 +163,11 @@ class BatHit:
             object.__setattr__(self, "scale", (place,) * self.num_offsets + terminal)
 
     @property
+    def maps(self) -> ProportionalMinco:
+        """Constant maps from boundary and offsets to the trajectory."""
+        return proportional_minco(_ORDER, equal_pieces(self.num_pieces))
+
+    @property
     def num_offsets(self) -> int:
         """Number of waypoint variables."""
         return 3 * (self.num_pieces - 1)
@@ -249,7 +256,7 @@ class BatHit:
         impact, defect = self.impact(natural[self.num_offsets :], context)
         duration = impact.stroke.time / self.num_pieces
         rows = boundary_rows(context.scenario.head_state, impact.tail_state, duration)
-        to_offsets = jnp.asarray(uniform_minco(_ORDER, self.num_pieces).offsets, point.dtype)
+        to_offsets = jnp.asarray(self.maps.offsets, point.dtype)
         offsets = jnp.matmul(
             to_offsets, jnp.concatenate([rows, waypoints]), precision=lax.Precision.HIGHEST
         )
@@ -273,16 +280,16 @@ class BatHit:
         one = jnp.ones_like(limits.speed)
         unit = jnp.stack([limits.speed**2, limits.acceleration**2, limits.body_rate**2, one])
         hinges = smoothed_hinge(along * unit[:, None], self.hinge_width)
-        weights = jnp.asarray(joined_trapezoid_weights(self.nodes, self.num_pieces), along.dtype)
+        weights = joined_trapezoid_weights(self.nodes, self.maps.proportions)
+        weights = jnp.asarray(weights, along.dtype)
         return self.limit_weight * duration * jnp.sum(hinges * weights)
 
     def objective(self, point: Array, context: HitContext) -> Evaluation:
         """The cost of eq. 20. It names no violation, so that the last iterate is the plan."""
         offsets, rows, duration, impact, defect = self._unpack(point, context)
-        maps = uniform_minco(_ORDER, self.num_pieces)
-        motion = sample_motion(maps, self.nodes, rows, offsets, duration)
+        motion = sample_motion(self.maps, self.nodes, rows, offsets, duration)
         cost = (
-            trajectory_energy(maps, rows, offsets, duration)
+            trajectory_energy(self.maps, rows, offsets, duration)
             + self.time_weight * impact.stroke.time
             + self._penalty(motion, duration, context.scenario)
             + self._terminal_penalty(impact, defect, context.scenario)
@@ -293,11 +300,10 @@ class BatHit:
         """The plan at a point, its violation looked for at 24 nodes a piece."""
         scenario = context.scenario
         offsets, rows, duration, impact, defect = self._unpack(point, context)
-        maps = uniform_minco(_ORDER, self.num_pieces)
-        motion = sample_motion(maps, _DECODE_NODES, rows, offsets, duration)
+        motion = sample_motion(self.maps, _DECODE_NODES, rows, offsets, duration)
         along = motion_excess(motion, scenario.gravity, scenario.limits)
         violation = jnp.maximum(largest_violation(along, impact, scenario), defect)
-        trajectory = uniform_trajectory(maps, rows, offsets, duration)
+        trajectory = proportional_trajectory(self.maps, rows, offsets, duration)
         return undecided_plan(trajectory, impact, jnp.zeros_like(violation), violation)
 
 

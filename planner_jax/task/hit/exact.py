@@ -32,12 +32,13 @@ from planner_jax.optimise.problem import Round
 from planner_jax.robot.quadrotor import tangent_basis
 from planner_jax.task.hit.plan import HitPlan, Stroke
 from planner_jax.task.hit.scenario import HitScenario
-from planner_jax.trajectory.uniform_minco import (
+from planner_jax.trajectory.proportional_minco import (
+    ProportionalMinco,
     boundary_rows,
+    proportional_minco,
+    proportional_trajectory,
     sample_motion,
     trajectory_energy,
-    uniform_minco,
-    uniform_trajectory,
 )
 
 _ORDER = 4  # minimum snap
@@ -79,7 +80,7 @@ class Impact:
 
 
 # Starting points, best first: impact time over landing time, flight time afterwards [s],
-# thrust over g. The first serves every easy case; the others hit earlier or flatter.
+# thrust over g. The first serves every easy case; the others hit earlier, flatter or harder.
 _GUESSES = np.array(
     [
         (0.92, 1.7, 1.2),
@@ -90,6 +91,10 @@ _GUESSES = np.array(
         (0.65, 1.7, 1.2),
         (0.95, 1.3, 0.9),
         (0.65, 2.1, 1.4),
+        (0.95, 1.3, 2.3),
+        (0.70, 1.4, 2.2),
+        (0.85, 1.2, 2.2),
+        (0.65, 1.7, 2.2),
     ]
 )
 
@@ -125,26 +130,49 @@ class ExactHit:
     (paper 002, eq. 18a) + hinges of apex (eq. 21) and hitting speed (eq. 24).
     """
 
-    num_pieces: int = 6
-    nodes: int = 8  # penalty intervals a piece
+    # Relative durations of the pieces. The first are short, because a hovering quadrotor has
+    # to begin to turn at once and its jerk is continuous.
+    proportions: tuple[float, ...] = (0.2, 0.5) + (1.0,) * 10
+    nodes: int = 4  # penalty intervals a piece
     num_table_nodes: int = 36
     drag_after_impact: bool = False
     energy_weight: float = 1e-8
     margin: float = 0.03  # penalties begin this far inside a limit, relative
     hinge_width: float = 0.1
     impact_weight: float = 0.3  # [s], of apex and hitting-speed hinges beside the integrals
+    # The first two solve what is easy. Where limits bind all along the way, energy is worth
+    # nothing any more and the margin has to give: the others look for any feasible plan.
     rounds: tuple[Round, ...] = (
         Round(starts=1, solver=LbfgsConfig(max_steps=7)),
         Round(starts=1, solver=LbfgsConfig(max_steps=60)),
-        Round(starts=8, solver=LbfgsConfig(max_steps=80)),
+        Round(
+            starts=8,
+            solver=LbfgsConfig(max_steps=80),
+            settings=(("energy_weight", 1e-10), ("margin", 0.015)),
+        ),
+        Round(
+            starts=12,
+            solver=LbfgsConfig(max_steps=400, memory=12, tolerance=1e-6, patience=5),
+            settings=(("energy_weight", 1e-11), ("margin", 0.01), ("nodes", 6)),
+        ),
     )
     scale: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.num_pieces < 2:
-            raise ValueError(f"num_pieces must be >= 2, got {self.num_pieces}")
+        if len(self.proportions) < 2:
+            raise ValueError(f"proportions must be of >= 2 pieces, got {self.proportions}")
         if not self.scale:
             object.__setattr__(self, "scale", shipped_scale(f"exact-{self.num_pieces}"))
+
+    @property
+    def num_pieces(self) -> int:
+        """M."""
+        return len(self.proportions)
+
+    @property
+    def maps(self) -> ProportionalMinco:
+        """Constant maps from boundary and offsets to the trajectory."""
+        return proportional_minco(_ORDER, self.proportions)
 
     @property
     def num_offsets(self) -> int:
@@ -226,8 +254,7 @@ class ExactHit:
     ) -> tuple[Array, Array]:
         """Excess over the limits along the way, (4, N), and at the impact, (5,)."""
         scenario = context.scenario
-        maps = uniform_minco(_ORDER, self.num_pieces)
-        motion = sample_motion(maps, nodes, rows, offsets, duration)
+        motion = sample_motion(self.maps, nodes, rows, offsets, duration)
         along = motion_excess(motion, scenario.gravity, scenario.limits)
         limits = scenario.hit_limits
         at_impact = jnp.concatenate(
@@ -246,14 +273,13 @@ class ExactHit:
         """Cost, and the largest excess at the penalty nodes (squares over squares)."""
         offsets, rows, duration, impact = self._unpack(point, context)
         along, at_impact = self._excess(offsets, rows, duration, impact, context, self.nodes)
-        weights = joined_trapezoid_weights(self.nodes, self.num_pieces)
+        weights = joined_trapezoid_weights(self.nodes, self.maps.proportions)
         hinges = smoothed_hinge(along + jnp.asarray(self._margins(), point.dtype), self.hinge_width)
         penalty = duration * jnp.sum(hinges * jnp.asarray(weights, point.dtype))
         penalty += self.impact_weight * jnp.sum(
             smoothed_hinge(at_impact + self.margin, self.hinge_width)
         )
-        maps = uniform_minco(_ORDER, self.num_pieces)
-        energy = trajectory_energy(maps, rows, offsets, duration)
+        energy = trajectory_energy(self.maps, rows, offsets, duration)
         # Peaks between nodes are a little higher than the nodes show.
         violation = jnp.maximum(jnp.max(along), jnp.max(at_impact)) + 0.004
         return Evaluation(cost=penalty + self.energy_weight * energy, violation=violation)
@@ -267,12 +293,11 @@ class ExactHit:
         along, at_impact = self._excess(offsets, rows, duration, impact, context, self.nodes)
         bend = jnp.sqrt(1.5 / self.hinge_width)
         inside = jnp.maximum(along + jnp.asarray(self._margins(), point.dtype), 0.0)
-        weights = joined_trapezoid_weights(self.nodes, self.num_pieces)
+        weights = joined_trapezoid_weights(self.nodes, self.maps.proportions)
         inside = inside * jnp.sqrt(duration * jnp.asarray(weights, point.dtype))
         impact_part = jnp.sqrt(self.impact_weight) * jnp.maximum(at_impact + self.margin, 0.0)
-        maps = uniform_minco(_ORDER, self.num_pieces)
         energy_unit = jnp.sqrt(self.energy_weight / duration ** (2 * _ORDER - 1))
-        smooth = energy_unit * np.sqrt(maps.offset_energy) * offsets
+        smooth = energy_unit * np.sqrt(self.maps.offset_energy) * offsets
         return jnp.concatenate([bend * inside.ravel(), bend * impact_part, smooth.ravel()])
 
     def decode(self, point: Array, context: HitContext) -> HitPlan:
@@ -282,9 +307,8 @@ class ExactHit:
         squared = jnp.concatenate([jnp.max(along[:3], axis=1), at_impact[2:]])
         plain = jnp.concatenate([jnp.max(along[3:], axis=1), at_impact[:2]])
         violation = jnp.maximum(jnp.max(jnp.sqrt(squared + 1.0) - 1.0), jnp.max(plain))
-        maps = uniform_minco(_ORDER, self.num_pieces)
         return HitPlan(
-            trajectory=uniform_trajectory(maps, rows, offsets, duration),
+            trajectory=proportional_trajectory(self.maps, rows, offsets, duration),
             stroke=impact.stroke,
             cost=jnp.zeros_like(violation),
             violation=violation,

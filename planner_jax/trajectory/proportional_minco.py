@@ -1,8 +1,9 @@
-"""MINCO with equal durations: constant matrices in normalised time.
+"""MINCO with durations in fixed proportion: constant matrices in normalised time.
 
-When all M pieces last h seconds, the map from boundary rows and waypoints to coefficients,
-and to samples of position, velocity, acceleration and jerk, is one constant matrix in the
-unit time of a piece. Boundary rows are (p, v h, a h^2, j h^3) at both ends.
+When the M pieces last r_i h seconds with constant r_i of mean one, so that h = T / M, the map
+from boundary rows and waypoints to coefficients, and to samples of position, velocity,
+acceleration and jerk, is one constant matrix in time over h. Boundary rows are
+(p, v h, a h^2, j h^3) at both ends.
 
 The waypoints are expressed as whitened offsets y from the minimum-energy interpolation of
 the boundary, q = -E_qq^-1 E_qb b + W y with W = R^-T / |R^-T| and E_qq = R R^T, so y = 0 is
@@ -22,16 +23,21 @@ from planner_jax.trajectory.polynomial import Motion, PiecewisePolynomial, deriv
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class UniformMinco:
-    """Constant float64 maps for M equal pieces of energy order s."""
+class ProportionalMinco:
+    """Constant float64 maps for M pieces of energy order s."""
 
     order: int
-    num_pieces: int
-    coefficients: np.ndarray  # (M, 2s, 2s + M - 1), unit-time coefficients from [b; y]
+    proportions: np.ndarray  # (M,) durations over h, mean one
+    coefficients: np.ndarray  # (M, 2s, 2s + M - 1), of powers of time over h, from [b; y]
     waypoints: np.ndarray  # (M - 1, 2s + M - 1), waypoints from [b; y]
     offsets: np.ndarray  # (M - 1, 2s + M - 1), y from [b; waypoints]
     boundary_energy: np.ndarray  # (2s, 2s), least energy for given boundary rows
     offset_energy: float  # energy a unit of |y|^2
+
+    @property
+    def num_pieces(self) -> int:
+        """M."""
+        return len(self.proportions)
 
     def sample_matrix(self, nodes: int, derivative: int) -> np.ndarray:
         """Samples at `nodes` + 1 points a piece, ends shared: (M nodes + 1, 2s + M - 1).
@@ -41,29 +47,38 @@ class UniformMinco:
         degree = 2 * self.order - 1
         factors = derivative_factors(degree, derivative)
         powers = np.maximum(np.arange(degree + 1) - derivative, 0)
-        times = np.arange(nodes + 1) / nodes
-        basis = factors * times[:, None] ** powers  # (nodes + 1, 2s)
+        times = self.proportions[:, None] * np.arange(nodes + 1) / nodes
+        basis = factors * times[..., None] ** powers  # (M, nodes + 1, 2s)
         samples = basis @ self.coefficients  # (M, nodes + 1, columns)
         inner = samples[:, :-1].reshape(-1, samples.shape[-1])
         return np.concatenate([inner, samples[-1:, -1]])
 
 
+def equal_pieces(num_pieces: int) -> tuple[float, ...]:
+    """Proportions of pieces that all last equally long."""
+    return (1.0,) * num_pieces
+
+
 @functools.cache
-def uniform_minco(order: int, num_pieces: int) -> UniformMinco:
+def proportional_minco(order: int, proportions: tuple[float, ...]) -> ProportionalMinco:
     """Build the constant maps (cached).
 
     Args:
         order: s, the derivative whose square is integrated: 2, 3 or 4.
-        num_pieces: M >= 1.
+        proportions: durations of the M >= 1 pieces relative to each other, all > 0.
     """
-    if num_pieces < 1:
-        raise ValueError(f"num_pieces must be >= 1, got {num_pieces}")
-    s, m = order, num_pieces
+    if not proportions or min(proportions) <= 0.0:
+        raise ValueError(f"proportions must be some numbers > 0, got {proportions}")
+    s, m = order, len(proportions)
+    shares = np.array(proportions) * m / np.sum(proportions)
+    # Derivative d of a node in the unit time of piece i is r_i^d of that in time over h.
+    units = np.tile(shares[:, None] ** np.arange(s), 2)
     piece_energy = hermite_energy(s)
     total = np.zeros(((m + 1) * s, (m + 1) * s))
     for i in range(m):
         span = slice(i * s, (i + 2) * s)
-        total[span, span] += piece_energy
+        scaled = piece_energy * units[i][:, None] * units[i]
+        total[span, span] += scaled / shares[i] ** (2 * s - 1)
     head, tail = np.arange(s), np.arange(m * s, (m + 1) * s)
     positions = np.arange(1, m) * s
     given = np.concatenate([head, tail, positions])
@@ -83,11 +98,12 @@ def uniform_minco(order: int, num_pieces: int) -> UniformMinco:
     from_offsets[q, q] = whitening
     to_offsets = np.linalg.inv(from_offsets)
     nodes = nodal @ from_offsets
-    hermite = hermite_map(s)
-    return UniformMinco(
+    pieces = np.stack([nodes[i * s : (i + 2) * s] for i in range(m)])
+    powers = shares[:, None] ** np.arange(2 * s)
+    return ProportionalMinco(
         order=s,
-        num_pieces=m,
-        coefficients=np.stack([hermite @ nodes[i * s : (i + 2) * s] for i in range(m)]),
+        proportions=shares,
+        coefficients=hermite_map(s) @ (units[:, :, None] * pieces) / powers[:, :, None],
         waypoints=from_offsets[q],
         offsets=to_offsets[q],
         boundary_energy=energy[b, b] + energy[b, q] @ smooth,
@@ -96,13 +112,13 @@ def uniform_minco(order: int, num_pieces: int) -> UniformMinco:
 
 
 def boundary_rows(head_state: Array, tail_state: Array, piece_duration: Array) -> Array:
-    """Boundary in the unit time of a piece, (2s, 3): derivative d times h^d."""
+    """Boundary in time over h, (2s, 3): derivative d times h^d."""
     scale = piece_duration ** jnp.arange(head_state.shape[0])[:, None]
     return jnp.concatenate([head_state * scale, tail_state * scale])
 
 
 def sample_motion(
-    maps: UniformMinco, nodes: int, rows: Array, offsets: Array, piece_duration: Array
+    maps: ProportionalMinco, nodes: int, rows: Array, offsets: Array, piece_duration: Array
 ) -> Motion:
     """Height, velocity, acceleration and jerk at `nodes` intervals a piece.
 
@@ -111,7 +127,7 @@ def sample_motion(
         nodes: intervals a piece; N = M nodes + 1 samples, ends shared.
         rows: (2s, 3) boundary rows.
         offsets: (M - 1, 3) whitened offsets y.
-        piece_duration: () h [s].
+        piece_duration: () h = T / M [s].
     """
     columns = jnp.concatenate([rows, offsets])
     height = jnp.matmul(
@@ -127,14 +143,14 @@ def sample_motion(
     return Motion(height=height, vel=vel / h, acc=acc / h**2, jerk=jerk / h**3)
 
 
-def trajectory_energy(maps: UniformMinco, rows: Array, offsets: Array, piece_duration: Array):
+def trajectory_energy(maps: ProportionalMinco, rows: Array, offsets: Array, piece_duration: Array):
     """Integral of |p^(s)|^2 over the trajectory, ().
 
     Args:
         maps: constant maps of M pieces.
         rows: (2s, 3) boundary rows.
         offsets: (M - 1, 3) whitened offsets y.
-        piece_duration: () h [s].
+        piece_duration: () h = T / M [s].
     """
     gram = jnp.asarray(maps.boundary_energy, rows.dtype)
     boundary = jnp.sum(rows * jnp.matmul(gram, rows, precision=lax.Precision.HIGHEST))
@@ -142,8 +158,8 @@ def trajectory_energy(maps: UniformMinco, rows: Array, offsets: Array, piece_dur
     return total / piece_duration ** (2 * maps.order - 1)
 
 
-def uniform_trajectory(
-    maps: UniformMinco, rows: Array, offsets: Array, piece_duration: Array
+def proportional_trajectory(
+    maps: ProportionalMinco, rows: Array, offsets: Array, piece_duration: Array
 ) -> PiecewisePolynomial:
     """The trajectory in real time; arguments as in `trajectory_energy`."""
     unit = jnp.einsum(
@@ -155,5 +171,5 @@ def uniform_trajectory(
     powers = piece_duration ** jnp.arange(2 * maps.order)
     return PiecewisePolynomial(
         coeffs=unit / powers[None, :, None],
-        durations=jnp.full((maps.num_pieces,), piece_duration),
+        durations=piece_duration * jnp.asarray(maps.proportions, rows.dtype),
     )
