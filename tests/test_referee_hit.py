@@ -551,16 +551,18 @@ def test_wrong_arguments_are_named():
         judge(leaves | {"coeffs": leaves["coeffs"][0]})
 
 
-def test_the_referee_imports_numpy_and_the_standard_library_alone():
-    tree = ast.parse(Path(hit.__file__).read_text())
-    roots = set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            roots |= {alias.name.split(".")[0] for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0
-            roots.add(node.module.split(".")[0])
-    assert roots <= {"numpy"} | set(sys.stdlib_module_names)
+def test_the_referees_import_numpy_the_standard_library_and_each_other_alone():
+    for path in Path(hit.__file__).parent.glob("*.py"):
+        names = set()
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                names |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                assert node.level == 0
+                names.add(node.module)
+        outside = {name for name in names if not name.startswith("planner_jax.referee.")}
+        roots = {name.split(".")[0] for name in outside}
+        assert roots <= {"numpy"} | set(sys.stdlib_module_names), path
 
 
 def test_every_limit_has_its_sentence():

@@ -8,7 +8,7 @@ the quantity to its limit, less one.
 import jax.numpy as jnp
 from jax import Array
 
-from planner_jax.robot.quadrotor import QuadrotorLimits, body_rate_squared
+from planner_jax.robot.quadrotor import QuadrotorLimits, body_rate_squared, net_thrust
 from planner_jax.trajectory.polynomial import Motion
 
 
@@ -50,3 +50,16 @@ def motion_excess(motion: Motion, gravity: Array, limits: QuadrotorLimits) -> Ar
 def relative(squared_excess: Array) -> Array:
     """Ratio of a quantity to its limit, less one, from the same of the squares."""
     return jnp.sqrt(jnp.maximum(squared_excess + 1.0, 1e-12)) - 1.0
+
+
+def thrust_excess(acc: Array, gravity: Array, least: Array, most: Array) -> Array:
+    """How far the squared thrust leaves its bounds, (2, ...): 1 - f^2/least^2, f^2/most^2 - 1.
+
+    Args:
+        acc: (..., 3) [m/s^2].
+        gravity: () [m/s^2].
+        least: () [m/s^2], per unit mass.
+        most: () [m/s^2], per unit mass.
+    """
+    squared = jnp.sum(net_thrust(acc, gravity) ** 2, axis=-1)
+    return jnp.stack([1.0 - squared / least**2, squared / most**2 - 1.0])

@@ -1,18 +1,33 @@
 """Float64 NumPy referee of hit plans: the physics alone decides whether a plan succeeds.
 
-It shares no code with the planner: it samples the returned polynomial, recomputes attitude
-and body rate from flatness, integrates the ball, applies the impact and follows the ball to
-the ground. A plan's own claims (status, cost, stroke) are not trusted; only the impact time
-that it claims is compared. World frame, z up, ground at z = 0, SI units.
+It shares no code with the planner: `referee.motion` samples the returned polynomial and
+recomputes attitude and body rate from flatness; here the ball is integrated, the impact applied
+and the ball followed to the ground. A plan's own claims (status, cost, stroke) are not trusted;
+only the impact time that it claims is compared. World frame, z up, ground at z = 0, SI units.
 
 Paper 002 is "Bat Planner": eq. 2 drag, eq. 3 impact (with 1 + beta), eq. 18 limits. Body
 rates are those of the Hopf fibration at zero heading (Watterson and Kumar).
 """
 
 import dataclasses
-import math
+import functools
 
 import numpy as np
+
+from planner_jax.referee.motion import (
+    CONTACT_TIME_TOLERANCE,
+    above,
+    check_sampling,
+    checked_coeffs,
+    checked_leaf,
+    finite_lanes,
+    first_failures,
+    intervals_of,
+    judge_in_chunks,
+    judge_motion,
+    motion_at,
+    pieces_of,
+)
 
 # Limit -> what is said when it fails. In the order in which they are tested: a failed plan is
 # named after its first failure.
@@ -41,18 +56,10 @@ _UNBOUNDED = {
 }
 LIMITS = tuple(_SENTENCES)
 
-# Largest difference [s] between the claimed impact time and the end of the trajectory.
-CONTACT_TIME_TOLERANCE = 1e-4
-# Limits smaller than this (in their own unit) are compared as if relative to it.
-SMALLEST_LIMIT = 1e-3
-# Jumps of derivatives count as displacement over one piece, or over this time [s] if longer.
-SHORTEST_PIECE = 0.1
 # Runge-Kutta: steps up to the impact; step and longest flight [s] after it.
 _INCOMING_STEPS = 60
 _OUTGOING_STEP = 0.01
 _LONGEST_FLIGHT = 20.0
-# Fewest intervals between the samples of one piece.
-_FEWEST_INTERVALS = 16
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,40 +139,30 @@ def referee_hits(
     Raises:
         ValueError: a leaf has the wrong shape, `samples` < 200 or `chunk` < 1.
     """
-    if samples < 200:
-        raise ValueError(f"samples must be >= 200, got {samples}")
-    if chunk < 1:
-        raise ValueError(f"chunk must be >= 1, got {chunk}")
+    check_sampling(samples, chunk)
     leaves = _leaves(scenarios, plans)
-    num_lanes, num_pieces = leaves["durations"].shape
-    intervals = max(math.ceil(samples / num_pieces), _FEWEST_INTERVALS)
     tolerances = {
         "relative": tolerance,
         "landing": landing_tolerance,
         "contact": contact_tolerance,
         "continuity": continuity_tolerance,
     }
-    parts = []
-    # A broken or absurd lane may overflow; its verdict says so, not a warning.
-    with np.errstate(all="ignore"):
-        for start in range(0, max(num_lanes, 1), chunk):
-            case = {
-                name: leaf[start : start + chunk].astype(np.float64)
-                for name, leaf in leaves.items()
-            }
-            parts.append(_judge(case, intervals, drag_after_impact, tolerances))
-    return HitVerdict(**{name: np.concatenate([p[name] for p in parts]) for name in parts[0]})
+    judge = functools.partial(
+        _judge,
+        intervals=intervals_of(samples, leaves["durations"].shape[1]),
+        drag_after_impact=drag_after_impact,
+        tolerances=tolerances,
+    )
+    return HitVerdict(**judge_in_chunks(judge, leaves, chunk))
 
 
 def _leaves(scenarios, plans) -> dict[str, np.ndarray]:
     """Every array that the referee reads, by name, its shape checked."""
     limits, stroke_limits = scenarios.limits, scenarios.hit_limits
     path = plans.trajectory
-    coeffs, durations = np.asarray(path.coeffs), np.asarray(path.durations)
-    if coeffs.ndim != 4 or coeffs.shape[-1] != 3 or 0 in coeffs.shape[1:]:
-        raise ValueError(f"coeffs must be (B, M, D + 1, 3), got {coeffs.shape}")
+    coeffs = checked_coeffs(path.coeffs)
     trailing = {
-        "durations": (durations, coeffs.shape[1:2]),
+        "durations": (path.durations, coeffs.shape[1:2]),
         "stroke.time": (plans.stroke.time, ()),
         "ball.pos": (scenarios.ball.pos, (3,)),
         "ball.vel": (scenarios.ball.vel, (3,)),
@@ -185,217 +182,18 @@ def _leaves(scenarios, plans) -> dict[str, np.ndarray]:
     }
     leaves = {"coeffs": coeffs}
     for name, (value, shape) in trailing.items():
-        leaf = np.asarray(value)
-        if leaf.shape != coeffs.shape[:1] + shape:
-            raise ValueError(f"{name} must be {coeffs.shape[:1] + shape}, got {leaf.shape}")
-        leaves[name] = leaf
+        leaves[name] = checked_leaf(name, value, coeffs.shape[:1] + shape)
     return leaves
-
-
-def _finite(case: dict) -> np.ndarray:
-    """Lanes (B,) whose inputs are finite; limits may be infinite, but not NaN."""
-    finite = np.ones(len(case["coeffs"]), bool)
-    for name, leaf in case.items():
-        good = ~np.isnan(leaf) if "limits." in name else np.isfinite(leaf)
-        finite &= _flat(good).all(axis=1)
-    return finite
 
 
 def _judge(case: dict, intervals: int, drag_after_impact: bool, tolerances: dict) -> dict:
     """The fields of `HitVerdict` for one chunk of lanes."""
-    measured, tests = _judge_motion(case, intervals, tolerances)
+    pieces = pieces_of(case["coeffs"], case["durations"])
+    measured, tests = judge_motion(
+        pieces, case, intervals, tolerances["relative"], tolerances["continuity"]
+    )
     at_impact, impact_tests = _judge_impact(case, drag_after_impact, tolerances)
-    measured.update(at_impact)
-    tests.update(impact_tests)
-    failed = np.stack([tests[name][0] for name in LIMITS[1:]], axis=1)
-    excess = np.stack([tests[name][1] for name in LIMITS[1:]], axis=1)
-    time = np.stack([tests[name][2] for name in LIMITS[1:]], axis=1)
-    finite = _finite(case) & ~np.isnan(excess).any(axis=1)
-    success = finite & ~failed.any(axis=1)
-    first = failed.argmax(axis=1)
-    lanes = np.arange(len(first))
-    names = np.where(success, "", np.where(finite, np.array(LIMITS)[1 + first], LIMITS[0]))
-    broken = finite & ~success
-    return {
-        "success": success,
-        "failed_limit": names,
-        "failed_time": np.where(broken, time[lanes, first], np.nan),
-        "failed_excess": np.where(broken, excess[lanes, first], np.nan),
-    } | measured
-
-
-def _above(value, limit, tolerance: float, time) -> tuple:
-    """Test of value <= limit: failed, relative excess, time."""
-    scale = np.where(np.isinf(limit), 1.0, np.maximum(np.abs(limit), SMALLEST_LIMIT))
-    excess = (value - limit) / scale
-    return excess > tolerance, excess, time
-
-
-def _motion(coeffs: np.ndarray, durations: np.ndarray, u: np.ndarray, orders) -> list:
-    """Derivatives of polynomial pieces at the fractions u of their durations.
-
-    coeffs (3, ..., D + 1), durations (...), u (S,) or (..., S): one (3, ..., S) an order.
-    """
-    out = []
-    for order in orders:
-        powers = np.arange(coeffs.shape[-1] - order)
-        factors = np.array([math.perm(int(k) + order, order) for k in powers], float)
-        scaled = coeffs[..., order:] * factors * durations[..., None] ** powers
-        # Not a matrix product: threads of a BLAS on a busy machine cost more than they save.
-        out.append(np.einsum("...k,...ks->...s", scaled, u[..., None, :] ** powers[:, None]))
-    return out
-
-
-def _squared(vector: np.ndarray) -> np.ndarray:
-    """Squared length of vectors (3, ...)."""
-    return vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2
-
-
-def _thrust_squared(gravity, acc: np.ndarray) -> np.ndarray:
-    """|a + g e_3|^2 of accelerations (3, ...)."""
-    return acc[0] ** 2 + acc[1] ** 2 + (acc[2] + gravity) ** 2
-
-
-def _body_rate_squared(gravity, acc: np.ndarray, jerk: np.ndarray) -> np.ndarray:
-    """|omega|^2 of the Hopf fibration at zero heading, from c = tau x jerk.
-
-    z' = (c / |tau|^2) x z, so |z'| = |c| / |tau|^2, and the yaw rate
-    (z_y z_x' - z_x z_y') / (1 + z_z) is -c_z / (|tau| (|tau| + tau_z)).
-    Infinite without thrust and upside down, where there is no attitude.
-    """
-    tau_x, tau_y, tau_z = acc[0], acc[1], acc[2] + gravity
-    c_x = tau_y * jerk[2] - tau_z * jerk[1]
-    c_y = tau_z * jerk[0] - tau_x * jerk[2]
-    c_z = tau_x * jerk[1] - tau_y * jerk[0]
-    size_squared = tau_x**2 + tau_y**2 + tau_z**2
-    upright = np.sqrt(size_squared) + tau_z
-    rate = ((c_x**2 + c_y**2 + c_z**2) / size_squared + (c_z / upright) ** 2) / size_squared
-    return np.where(upright > 0.0, rate, np.inf)
-
-
-# Name -> orders of the derivatives it needs, and the measure whose maximum is sought.
-_MEASURES = {
-    "speed": ((1,), lambda gravity, vel: _squared(vel)),
-    "acceleration": ((2,), lambda gravity, acc: _squared(acc)),
-    "body rate": ((2, 3), _body_rate_squared),
-    "depth": ((0,), lambda gravity, pos: -pos[2]),
-    "thrust": ((2,), _thrust_squared),
-    "weakness": ((2,), lambda gravity, acc: -_thrust_squared(gravity, acc)),
-}
-
-
-def _likeliest_peak(values: np.ndarray) -> np.ndarray:
-    """Index (B,) next to the greatest parabola through three samples (B, M, S) of a piece."""
-    left, middle, right = values[..., :-2], values[..., 1:-1], values[..., 2:]
-    crest = (middle >= left) & (middle > right)
-    gain = (right - left) ** 2 / (8.0 * (2.0 * middle - left - right))
-    vertex = values.copy()
-    vertex[..., 1:-1] += np.where(crest, gain, 0.0)
-    return _flat(vertex).argmax(axis=1)
-
-
-def _flat(values: np.ndarray) -> np.ndarray:
-    """(B, ...) as (B, N); the empty batch too."""
-    return values.reshape(len(values), math.prod(values.shape[1:]))
-
-
-def _peaks(case: dict, intervals: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Greatest value (B,) of every measure along the trajectory, and its time (B,) [s]."""
-    durations, gravity = case["durations"], case["gravity"]
-    coeffs = np.ascontiguousarray(np.moveaxis(case["coeffs"], -1, 0))
-    u = np.linspace(0.0, 1.0, intervals + 1)
-    motion = _motion(coeffs, durations, u, range(4))
-    starts, lanes = np.cumsum(durations, axis=1) - durations, np.arange(len(durations))
-    times = starts[:, :, None] + durations[:, :, None] * u
-    peaks = {}
-    for name, (orders, measure) in _MEASURES.items():
-        values = measure(gravity[:, None, None], *[motion[order] for order in orders])
-        piece, sample = np.divmod(_likeliest_peak(values), intervals + 1)
-        around, span = coeffs[:, lanes, piece], durations[lanes, piece]
-        centre, half = u[sample], 1.0 / intervals
-        for _ in range(3):
-            near = np.clip(centre[:, None] + half * np.linspace(-1.0, 1.0, 9), 0.0, 1.0)
-            found = measure(gravity[:, None], *_motion(around, span, near, orders))
-            best = found.argmax(axis=1)
-            centre, half = near[lanes, best], half / 4.0
-        top = _flat(values).argmax(axis=1)
-        peaks[name] = _greater(
-            (found[lanes, best], starts[lanes, piece] + centre * span),
-            (_flat(values)[lanes, top], _flat(times)[lanes, top]),
-        )
-    turn = _fastest_turn(motion[2], gravity, times)
-    peaks["body rate"] = _greater(peaks["body rate"], turn)
-    return peaks
-
-
-def _greater(first: tuple, second: tuple) -> tuple[np.ndarray, np.ndarray]:
-    """The greater of two values, lane by lane, with its time."""
-    better = second[0] > first[0]
-    return np.where(better, second[0], first[0]), np.where(better, second[1], first[1])
-
-
-def _fastest_turn(acc, gravity, times) -> tuple[np.ndarray, np.ndarray]:
-    """Squared body rate (B,) that turns the thrust from one sample to the next; its time.
-
-    The mean over a step, so never above the true maximum. It is what betrays a thrust that
-    passes through zero between two samples and turns the quadrotor over at once.
-    """
-    tau_x, tau_y, tau_z = acc[0], acc[1], acc[2] + gravity[:, None, None]
-    size = np.sqrt(tau_x**2 + tau_y**2 + tau_z**2)
-    along = tau_x[..., 1:] * tau_x[..., :-1] + tau_y[..., 1:] * tau_y[..., :-1]
-    cosine = (along + tau_z[..., 1:] * tau_z[..., :-1]) / (size[..., 1:] * size[..., :-1])
-    sharpest = np.where(np.isnan(cosine), 1.0, cosine).min(axis=2)
-    step = np.maximum(times[..., 1] - times[..., 0], np.finfo(float).tiny)
-    rate = np.arccos(np.clip(sharpest, -1.0, 1.0)) / step
-    piece, lanes = rate.argmax(axis=1), np.arange(len(rate))
-    sample = cosine[lanes, piece].argmin(axis=1)
-    return rate[lanes, piece] ** 2, times[lanes, piece, sample]
-
-
-def _joint_errors(case: dict) -> tuple:
-    """Errors of head state and joints as displacement [m], time of the worst joint, scale [m]."""
-    coeffs, durations = np.moveaxis(case["coeffs"], -1, 0), case["durations"]
-    ends = np.stack(_motion(coeffs, durations, np.array([0.0, 1.0]), range(4)))
-    period = np.maximum(durations.mean(axis=1), SHORTEST_PIECE)
-    weights = np.stack([period**n / math.factorial(n) for n in range(4)])
-    head = np.moveaxis(case["head_state"], 0, -1)
-    head_error = np.linalg.norm(ends[..., 0, 0] - head, axis=1) * weights
-    jumps = np.linalg.norm(ends[..., 1:, 0] - ends[..., :-1, 1], axis=1)
-    jump = np.zeros_like(durations)
-    jump[:, 1:] = (jumps * weights[:, :, None]).max(axis=0)
-    worst = jump.argmax(axis=1)
-    starts = np.cumsum(durations, axis=1) - durations
-    scale = np.maximum(np.abs(ends[0]).max(axis=(0, 2, 3)), 1.0)
-    return head_error.max(axis=0), jump.max(axis=1), starts[np.arange(len(worst)), worst], scale
-
-
-def _judge_motion(case: dict, intervals: int, tolerances: dict) -> tuple[dict, dict]:
-    """What the trajectory does, and the tests of it: name -> failed, excess, time."""
-    peaks = _peaks(case, intervals)
-    head, jump, jump_time, scale = _joint_errors(case)
-    measured = {
-        "max_speed": np.sqrt(peaks["speed"][0]),
-        "max_acceleration": np.sqrt(peaks["acceleration"][0]),
-        "max_body_rate": np.sqrt(peaks["body rate"][0]),
-        "min_height": -peaks["depth"][0],
-        "min_thrust": np.sqrt(-peaks["weakness"][0]),
-        "max_thrust": np.sqrt(peaks["thrust"][0]),
-        "continuity_error": jump,
-        "head_error": head,
-    }
-    relative, allowed = tolerances["relative"], tolerances["continuity"] * scale
-    tests = {
-        "head state": (head > allowed, head, np.zeros_like(head)),
-        "continuity": (jump > allowed, jump, jump_time),
-        "ground": _above(
-            -measured["min_height"], -case["limits.min_height"], relative, peaks["depth"][1]
-        ),
-    }
-    for name in ("speed", "acceleration", "body rate"):
-        field = name.replace(" ", "_")
-        value, limit = measured[f"max_{field}"], case[f"limits.{field}"]
-        tests[name] = _above(value, limit, relative, peaks[name][1])
-    return measured, tests
+    return first_failures(tests | impact_tests, LIMITS, finite_lanes(case)) | measured | at_impact
 
 
 def _ball_rate(state: np.ndarray, drag: np.ndarray, gravity: np.ndarray) -> np.ndarray:
@@ -481,7 +279,7 @@ def _judge_impact(case: dict, drag_after_impact: bool, tolerances: dict) -> tupl
     tail = np.moveaxis(case["coeffs"][:, -1:], -1, 0)
     pos, vel, acc = (
         derivative[:, :, 0, 0].T
-        for derivative in _motion(tail, durations[:, -1:], np.ones(1), range(3))
+        for derivative in motion_at(tail, durations[:, -1:], np.ones(1), range(3))
     )
     normal = acc.copy()
     normal[:, 2] += gravity
@@ -521,13 +319,13 @@ def _impact_tests(case, measured, tolerances, end, apex_at, landing_at) -> dict:
     tests = {
         "contact": (~(contact <= tolerances["contact"]), contact, end),
         "landing": (~(landing <= tolerances["landing"]), landing, landing_at),
-        "apex low": _above(-measured["apex"], -lowest, relative, apex_at),
-        "apex high": _above(measured["apex"], highest, relative, apex_at),
+        "apex low": above(-measured["apex"], -lowest, relative, apex_at),
+        "apex high": above(measured["apex"], highest, relative, apex_at),
     }
     for axis, name in enumerate("xyz"):
         speed = np.abs(measured["hitting_velocity"][:, axis])
         limit = case["hit_limits.hitting_speed"][:, axis]
-        tests[f"hitting speed {name}"] = _above(speed, limit, relative, end)
+        tests[f"hitting speed {name}"] = above(speed, limit, relative, end)
     return tests
 
 

@@ -1,0 +1,57 @@
+"""Paths of targets: anything that says where it is, and how fast, at a time.
+
+A target path is a pytree with a method `at(time) -> BallState`, differentiable in time and in
+every leaf. The ones here cover the papers' targets; a user's own class serves as well.
+"""
+
+from typing import Protocol
+
+import jax.numpy as jnp
+from flax import struct
+from jax import Array
+
+from planner_jax.ball.flight import BallState, linear_drag_flight
+
+
+class TargetPath(Protocol):
+    """What a planner needs to know about a target."""
+
+    def at(self, time: Array) -> BallState:
+        """Position [m] and velocity [m/s] at one time () [s]."""
+        ...
+
+
+@struct.dataclass
+class BallPath:
+    """A ball with linear drag on each axis (paper 000, eq. 9, with its constant).
+
+    Without drag it is a parabola, without drag and gravity a straight line: the targets of
+    paper 000, Section VII-B a, c and d.
+    """
+
+    ball: BallState  # at time 0
+    drag: Array  # (3,) K_i [1/s]
+    gravity: Array  # () [m/s^2], magnitude
+
+    def at(self, time: Array) -> BallState:
+        """Position [m] and velocity [m/s] at one time () [s]."""
+        return linear_drag_flight(self.ball, time, self.drag, self.gravity)
+
+
+@struct.dataclass
+class HarmonicPath:
+    """A target that drifts and swings: p_0 + v t + A sin(w t + phi) (paper 000, VII-B b)."""
+
+    pos: Array  # (3,) [m]
+    vel: Array  # (3,) [m/s], of the drift
+    amplitude: Array  # (3,) [m]
+    rate: Array  # () w [rad/s]
+    phase: Array  # () phi [rad]
+
+    def at(self, time: Array) -> BallState:
+        """Position [m] and velocity [m/s] at one time () [s]."""
+        angle = self.rate * time + self.phase
+        return BallState(
+            pos=self.pos + self.vel * time + self.amplitude * jnp.sin(angle),
+            vel=self.vel + self.amplitude * self.rate * jnp.cos(angle),
+        )

@@ -1,0 +1,447 @@
+"""Float64 NumPy referee of catch plans: the physics alone decides whether a plan succeeds.
+
+It shares no code with the planner: `referee.motion` samples the returned polynomial and
+recomputes attitude and body rate from flatness; here the targets are followed along their
+paths and the net is held against them. A plan's own claims (status, cost) are not trusted; its
+order is checked, and the times of the catches that it claims are compared with those at which
+its pieces end. World frame, z up, SI units.
+
+Paper 000 is "Catch Planner": eq. 9 ball with linear drag (with its constant), eq. 22 net centre
+p + l z_d, eq. 25 angle between z_d and minus the ball's velocity; z_d is the thrust direction.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Literal
+
+import numpy as np
+
+from planner_jax.referee.motion import (
+    CONTACT_TIME_TOLERANCE,
+    above,
+    check_sampling,
+    checked_coeffs,
+    checked_leaf,
+    finite_lanes,
+    first_failures,
+    intervals_of,
+    judge_in_chunks,
+    judge_motion,
+    motion_at,
+    pieces_of,
+)
+
+# Limit -> what is said when it fails. In the order in which they are tested: a failed plan is
+# named after its first failure.
+_SENTENCES = {
+    "not finite": "the plan or its scenario is not finite",
+    "order": "{excess:.0f} wrong, the first at {time:.3f} s; every present target must have one "
+    "place, before the absent ones",
+    "catch time": "off by {excess:.3g} s at {time:.3f} s; catches must be at rising positive "
+    "times, where their pieces end, and not after the target's horizon",
+    "head state": "the trajectory starts {excess:.3g} m off the head state",
+    "continuity": "the trajectory jumps by {excess:.3g} m at {time:.3f} s",
+    "speed": "{excess:.2%} above its limit at {time:.3f} s",
+    "thrust low": "{excess:.2%} below the least thrust at {time:.3f} s",
+    "thrust high": "{excess:.2%} above the greatest thrust at {time:.3f} s",
+    "body rate": "{excess:.2%} above its limit at {time:.3f} s",
+    "ground": "{excess:.2%} below the least height at {time:.3f} s",
+    "net": "the target is {excess:.2%} outside the hoop's radius at {time:.3f} s",
+    "net plane": "the target is {excess:.3g} m off the hoop's plane at {time:.3f} s",
+    "angle": "{excess:.2%} above its limit between the net's axis and the target's way back at "
+    "{time:.3f} s",
+}
+_UNBOUNDED = {"body rate": "no thrust or upside down, so without attitude, at {time:.3f} s"}
+LIMITS = tuple(_SENTENCES)
+
+# A target slower than this [m/s] is at rest: what is left of its velocity is rounding.
+SLOWEST_TARGET = 1e-6
+
+
+@dataclasses.dataclass(frozen=True)
+class CatchVerdict:
+    """What the referee found, one entry a lane. What is measured may be NaN if inputs are.
+
+    Entries (B, N) are in the order of catching, as `order` and `times` of the plan, and NaN
+    at a place where no target is left to be caught or a wrong one is named.
+    """
+
+    success: np.ndarray  # (B,) bool, all present targets caught and no limit exceeded
+    failed_limit: np.ndarray  # (B,) str, the first of `LIMITS` that fails; "" for a success
+    failed_time: np.ndarray  # (B,) [s], where that limit is worst; NaN for a success
+    # (B,) relative to the limit for speed, thrust, body rate, ground, net and angle; [m] for
+    # head state, continuity and net plane; [s] for catch time; the number of wrong places for
+    # order; NaN for a success. It is the whole error, the tolerance not taken off.
+    failed_excess: np.ndarray
+    max_speed: np.ndarray  # (B,) [m/s]
+    max_body_rate: np.ndarray  # (B,) [rad/s], infinite where the attitude is not defined
+    min_thrust: np.ndarray  # (B,) [m/s^2], per unit mass
+    max_thrust: np.ndarray  # (B,) [m/s^2], per unit mass
+    min_height: np.ndarray  # (B,) [m]
+    net_distance: np.ndarray  # (B, N) [m], from the net's centre to the target at the catch
+    net_offset: np.ndarray  # (B, N) [m], its part along z_d: the target above the hoop's plane
+    angle: np.ndarray  # (B, N) [rad], net's axis to target's way back; NaN for one at rest too
+    catch_times: np.ndarray  # (B, N) [s], where the pieces up to each catch end
+    caught: np.ndarray  # (B, N) bool: order, catch time, net and angle hold for that target
+    num_caught: np.ndarray  # (B,) int
+    continuity_error: np.ndarray  # (B,) [m], worst jump between pieces, as displacement
+    head_error: np.ndarray  # (B,) [m], error at time 0, likewise
+
+    def sentence(self, lane: int) -> str:
+        """One line for a human: which limit failed, when, and by how much."""
+        name = str(self.failed_limit[lane])
+        if not name:
+            number = int(self.num_caught[lane])
+            if not number:
+                return "success: there is no target to catch"
+            farthest = np.nanmax(self.net_distance[lane])
+            return f"success: {number} caught, at most {farthest:.2g} m from the net's centre"
+        time, excess = self.failed_time[lane], self.failed_excess[lane]
+        text = _UNBOUNDED.get(name) if np.isinf(excess) else None
+        return f"{name}: " + (text or _SENTENCES[name]).format(time=time, excess=excess)
+
+
+def referee_catches(
+    scenarios,
+    plans,
+    *,
+    target_states: Callable | None = None,
+    net_test: Literal["plane", "ball"] = "plane",
+    tolerance: float = 1e-3,
+    contact_tolerance: float = 5e-3,
+    continuity_tolerance: float = 1e-4,
+    samples: int = 400,
+    chunk: int = 512,
+) -> CatchVerdict:
+    """The verdict on every plan of a batch.
+
+    Catch i (i = 0, 1, ... in the plan's order) is the end of piece (i + 1) M - 1. Pieces after
+    the last present target that have no duration are not looked at, and neither is anything
+    that belongs to an absent target; with a duration they are flown, and judged like the rest.
+    Speed, thrust, body rate and height are sampled at both ends and inside of every piece and
+    their peaks searched on the polynomial itself. Errors at time 0 and between pieces count as
+    displacement (`referee.motion.joint_errors`). A lane without targets has nothing to fail.
+
+    The target's place is worked out here, in float64, for a path with the fields of `BallPath`
+    (known by `ball`), of `HarmonicPath` (`amplitude`) or of `PathTable` (`resolution`; between
+    the nodes a cubic convolution, beyond the table on at its last velocity).
+
+    The shared protocol of paper 000 is `tolerance=0.05, net_test="ball"`.
+
+    Args:
+        scenarios: object with the fields of `CatchScenario`, leaves with leading axis B; those
+            of `targets` with (B, N). Its order and times are not read.
+        plans: object with the fields of `CatchPlan`, leaves with leading axis B; coefficients
+            (B, N * M, D + 1, 3), durations (B, N * M).
+        target_states: for targets of any other class:
+            `(targets, order (B, N) int, times (B, N) [s]) -> pos (B, N, 3), vel (B, N, 3)`,
+            [m] and [m/s], of target `order[b, i]` of case b at `times[b, i]`. It is asked for
+            the absent targets too; what it says of them is not read. If given, it answers for
+            the known classes as well.
+        net_test: "plane": the target is in the hoop's plane to `contact_tolerance`, and there
+            within the net's radius of its centre. "ball": it is within that radius of the
+            centre in any direction.
+        tolerance: relative, of every limit of the scenario, the net's radius and angle included.
+        contact_tolerance: [m], distance of the target from the hoop's plane at the catch.
+        continuity_tolerance: times the largest coordinate [m] at the piece ends (at least
+            1 m), allowed displacement of head state and joints.
+        samples: fewest samples between one catch and the next, >= 200.
+        chunk: lanes judged at once; it bounds the memory.
+
+    Returns:
+        A `CatchVerdict` of float64 arrays. A lane that is not finite fails as "not finite" and
+        leaves the others alone. A limit, the net's radius and angle and a horizon may be
+        infinite.
+
+    Raises:
+        ValueError: a leaf has the wrong shape, the class of the targets is not known,
+            `net_test` is another word, `samples` < 200 or `chunk` < 1.
+    """
+    check_sampling(samples, chunk)
+    if net_test not in ("plane", "ball"):
+        raise ValueError(f'net_test must be "plane" or "ball", got {net_test!r}')
+    leaves = _leaves(scenarios, plans)
+    shape = leaves["present"].shape
+    # A broken lane is told by its verdict, not by a warning.
+    with np.errstate(all="ignore"):
+        order = np.nan_to_num(leaves["order"].astype(np.float64))
+        order = np.clip(np.rint(order), 0, shape[1] - 1).astype(np.int64)
+        times = _ends(leaves["durations"].astype(np.float64), shape[1])
+        if target_states is None:
+            pos, vel = _known_states(scenarios.targets, order, times)
+        else:
+            pos, vel = target_states(scenarios.targets, order, times)
+    leaves["target pos"] = checked_leaf("target_states' pos", pos, (*shape, 3))
+    leaves["target vel"] = checked_leaf("target_states' vel", vel, (*shape, 3))
+    judge = functools.partial(
+        _judge,
+        intervals=intervals_of(samples, leaves["durations"].shape[1] // shape[1]),
+        net_test=net_test,
+        tolerances={
+            "relative": tolerance,
+            "contact": contact_tolerance,
+            "continuity": continuity_tolerance,
+        },
+    )
+    return CatchVerdict(**judge_in_chunks(judge, leaves, chunk))
+
+
+def _leaves(scenarios, plans) -> dict[str, np.ndarray]:
+    """Every array that the referee reads but those of the targets, by name, its shape checked."""
+    limits, net, path = scenarios.limits, scenarios.net, plans.trajectory
+    coeffs, present = checked_coeffs(path.coeffs), np.asarray(scenarios.present)
+    batch, pieces = coeffs.shape[:1], coeffs.shape[1]
+    if present.ndim != 2 or present.shape[:1] != batch or 0 in present.shape[1:]:
+        raise ValueError(f"present must be ({batch[0]}, N), got {present.shape}")
+    num = present.shape[1]
+    if pieces % num:
+        raise ValueError(f"coeffs must have N * M pieces for N = {num} targets, got {pieces}")
+    trailing = {
+        "durations": (path.durations, (pieces,)),
+        "order": (plans.order, (num,)),
+        "times": (plans.times, (num,)),
+        "horizon": (scenarios.horizon, (num,)),
+        "head_state": (scenarios.head_state, (4, 3)),
+        "gravity": (scenarios.gravity, ()),
+        "net.height": (net.height, ()),
+        "net.radius": (net.radius, ()),
+        "net.max_angle": (net.max_angle, ()),
+        "limits.speed": (limits.speed, ()),
+        "limits.min_thrust": (limits.min_thrust, ()),
+        "limits.max_thrust": (limits.max_thrust, ()),
+        "limits.body_rate": (limits.body_rate, ()),
+        "limits.min_height": (limits.min_height, ()),
+    }
+    leaves = {"coeffs": coeffs, "present": present}
+    for name, (value, shape) in trailing.items():
+        leaves[name] = checked_leaf(name, value, batch + shape)
+    return leaves
+
+
+def _ends(durations: np.ndarray, num: int) -> np.ndarray:
+    """Times (B, N) [s] at which the pieces (B, N * M) up to each catch end."""
+    each = durations.shape[1] // num
+    return np.cumsum(durations, axis=1)[:, each - 1 :: each]
+
+
+def _known_states(targets, order: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Position and velocity (B, N, 3) of the targets `order` at `times`, both (B, N)."""
+    lanes, finite = np.arange(len(order))[:, None], np.ones(order.shape, bool)
+
+    def leaf(name: str, value, *trailing: int) -> np.ndarray:
+        """One leaf (B, N, ...) of the targets, in the order of catching."""
+        value = checked_leaf(f"targets.{name}", value, order.shape + trailing)
+        value = value[lanes, order].astype(np.float64)
+        finite[...] &= np.isfinite(value).all(axis=tuple(range(2, value.ndim)))
+        return value
+
+    if hasattr(targets, "ball"):
+        states = _ball_states(
+            leaf("ball.pos", targets.ball.pos, 3),
+            leaf("ball.vel", targets.ball.vel, 3),
+            leaf("drag", targets.drag, 3),
+            leaf("gravity", targets.gravity),
+            times,
+        )
+    elif hasattr(targets, "amplitude"):
+        vel, amplitude = leaf("vel", targets.vel, 3), leaf("amplitude", targets.amplitude, 3)
+        rate = leaf("rate", targets.rate)[..., None]
+        angle = rate * times[..., None] + leaf("phase", targets.phase)[..., None]
+        start = leaf("pos", targets.pos, 3)
+        pos = start + vel * times[..., None] + amplitude * np.sin(angle)
+        states = pos, vel + amplitude * rate * np.cos(angle)
+    elif hasattr(targets, "resolution"):
+        nodes = np.shape(targets.pos)[2] if np.ndim(targets.pos) == 4 else 0
+        if nodes < 4:
+            raise ValueError(f"targets.pos must be (B, N, T >= 4, 3), got {np.shape(targets.pos)}")
+        states = _table_states(
+            leaf("pos", targets.pos, nodes, 3),
+            leaf("vel", targets.vel, nodes, 3),
+            leaf("resolution", targets.resolution),
+            times,
+        )
+    else:
+        raise ValueError(f"targets of class {type(targets).__name__} need target_states")
+    pos, vel = (np.where(finite[..., None], state, np.nan) for state in states)
+    return pos, vel
+
+
+def _ball_states(start, vel, drag, gravity, times) -> tuple[np.ndarray, np.ndarray]:
+    """Position and velocity (B, N, 3) of balls with linear drag on each axis.
+
+    Paper 000, eq. 9 with its constant: s_0 + (v_0 - g / K) (1 - e^-x) / K + g t / K, x = K t,
+    which is s_0 + v_0 t f(x) + g t^2 h(x) with f = (1 - e^-x) / x and h = (1 - f) / x. Both are
+    smooth at x = 0, where they are 1 and 1/2: the parabola. For small x, h is summed as
+    1/2! - x/3! + x^2/4! - ..., to rounding.
+
+    Args:
+        start: (B, N, 3) [m].
+        vel: (B, N, 3) [m/s] at time 0.
+        drag: (B, N, 3) K [1/s].
+        gravity: (B, N) [m/s^2], magnitude, downwards.
+        times: (B, N) [s].
+    """
+    times = times[..., None]
+    x = drag * times
+    series, term = np.zeros_like(x), np.full_like(x, 0.5)
+    for k in range(3, 18):
+        series += term
+        term *= -x / k
+    small = np.abs(x) < 0.5
+    divisor = np.where(small, 1.0, x)
+    f = np.where(small, 1.0 - x * series, -np.expm1(-divisor) / divisor)
+    h = np.where(small, series, (divisor + np.expm1(-divisor)) / divisor**2)
+    pull = gravity[..., None] * [0.0, 0.0, -1.0]
+    return start + times * (vel * f + pull * times * h), vel * np.exp(-x) + pull * times * f
+
+
+def _table_states(pos, vel, resolution, times) -> tuple[np.ndarray, np.ndarray]:
+    """Position and velocity (B, N, 3) read from tables whose node k is at (k - 1) resolution.
+
+    Keys' cubic convolution with a = -1/2 is the cubic between two nodes whose slopes there are
+    the central differences. Beyond the table the target goes on at its last velocity.
+
+    Args:
+        pos: (B, N, T, 3) [m].
+        vel: (B, N, T, 3) [m/s].
+        resolution: (B, N) [s].
+        times: (B, N) [s].
+    """
+    last = pos.shape[2] - 3
+    inside = np.minimum(np.maximum(times, 0.0), last * resolution)
+    place = np.nan_to_num(inside / resolution)
+    first = np.clip(np.floor(place), 0, last - 1)
+    u = (place - first)[..., None]
+
+    def read(nodes: np.ndarray) -> np.ndarray:
+        window = first.astype(np.int64)[..., None, None] + np.arange(4)[:, None]
+        before, left, right, after = np.moveaxis(np.take_along_axis(nodes, window, 2), 2, 0)
+        rise, slope, end_slope = right - left, 0.5 * (right - before), 0.5 * (after - left)
+        bend, twist = 3.0 * rise - 2.0 * slope - end_slope, slope + end_slope - 2.0 * rise
+        return left + u * (slope + u * (bend + u * twist))
+
+    at = read(vel)
+    return read(pos) + (times - inside)[..., None] * at, at
+
+
+def _judge(case: dict, intervals: int, net_test: str, tolerances: dict) -> dict:
+    """The fields of `CatchVerdict` for one chunk of lanes."""
+    durations, present = case["durations"], case["present"] != 0.0
+    num = present.shape[1]
+    ends = _ends(durations, num)
+    due = np.arange(num) < present.sum(axis=1, keepdims=True)
+    flown = np.repeat(due, durations.shape[1] // num, axis=1) | (durations != 0.0)
+    pieces = pieces_of(case["coeffs"], durations, flown)
+    right, target = _places(case["order"], present, due)
+    lanes = np.arange(len(due))
+    wrong = (~right).sum(axis=1).astype(np.float64)
+    order_test = (wrong > 0.0, wrong, ends[lanes, right.argmin(axis=1)])
+    held = due & right
+    # In the order of catching; what belongs to no catch may hold anything.
+    case = case | {
+        "coeffs": np.moveaxis(pieces.coeffs, 0, -1),
+        "order": np.where(due, case["order"], 0.0),
+        "times": np.where(due, case["times"], 0.0),
+        "horizon": np.where(held, case["horizon"][lanes[:, None], target], np.inf),
+        "target pos": np.where(held[..., None], case["target pos"], 0.0),
+        "target vel": np.where(held[..., None], case["target vel"], 0.0),
+    }
+    motion, tests = judge_motion(
+        pieces, case, intervals, tolerances["relative"], tolerances["continuity"]
+    )
+    del motion["max_acceleration"]  # it has no limit: the thrust has
+    flying = flown.any(axis=1)
+    tests = {
+        name: (failed & flying, np.where(flying, excess, 0.0), time)
+        for name, (failed, excess, time) in tests.items()
+    }
+    measured, catch_tests = _judge_catches(case, pieces, held, ends, net_test, tolerances)
+    tests |= {name: _worst(test, held) for name, test in catch_tests.items()}
+    tests["order"] = order_test
+    finite = finite_lanes(case, ("horizon", "net.radius", "net.max_angle"))
+    verdict = first_failures(tests, LIMITS, finite)
+    caught = held & (verdict["failed_limit"] != LIMITS[0])[:, None]
+    for failed, _, _ in catch_tests.values():
+        caught &= ~failed
+    return verdict | motion | measured | {"caught": caught, "num_caught": caught.sum(axis=1)}
+
+
+def _places(order: np.ndarray, present: np.ndarray, due: np.ndarray) -> tuple:
+    """Places (B, N) of the order that are right, and the target that each one names.
+
+    The first places, those that are due, name present targets, the others absent ones, and
+    none names a target that has been named before.
+    """
+    num = due.shape[1]
+    order = np.nan_to_num(order, nan=-1.0)
+    named = (order == np.rint(order)) & (order >= 0.0) & (order < num)
+    target = np.where(named, order, 0.0).astype(np.int64)
+    same = (target[:, :, None] == target[:, None, :]) & named[:, None, :]
+    repeated = np.tril(same, -1).any(axis=2)
+    kind = present[np.arange(len(due))[:, None], target]
+    return named & (kind == due) & ~repeated, target
+
+
+def _judge_catches(case, pieces, held, ends, net_test: str, tolerances: dict) -> tuple[dict, dict]:
+    """What happens at the catches, and the tests of it: name -> failed, excess, time (B, N)."""
+    num = held.shape[1]
+    each = pieces.durations.shape[1] // num
+    tail = pieces.coeffs[:, :, each - 1 :: each], pieces.durations[:, each - 1 :: each]
+    pos, _, acc = (
+        np.moveaxis(derivative[..., 0], 0, -1)
+        for derivative in motion_at(*tail, np.ones(1), range(3))
+    )
+    thrust = acc + case["gravity"][:, None, None] * [0.0, 0.0, 1.0]
+    size = np.linalg.norm(thrust, axis=-1, keepdims=True)
+    # Without thrust there is no axis: z_d stays zero, and the angle is the worst there is.
+    axis = thrust / np.maximum(size, np.finfo(float).tiny)
+    centre = pos + case["net.height"][:, None, None] * axis
+    miss, vel = case["target pos"] - centre, case["target vel"]
+    offset = (miss * axis).sum(axis=-1)
+    distance = np.linalg.norm(miss, axis=-1)
+    across = np.linalg.norm(miss - offset[..., None] * axis, axis=-1)
+    sine, cosine = np.linalg.norm(np.cross(axis, vel), axis=-1), -(axis * vel).sum(axis=-1)
+    angle = np.where(size[..., 0] > 0.0, np.arctan2(sine, cosine), np.pi)
+    at_rest = np.linalg.norm(vel, axis=-1) <= SLOWEST_TARGET
+    radius, widest = case["net.radius"], case["net.max_angle"]
+    relative = tolerances["relative"]
+    from_axis = distance if net_test == "ball" else across
+    from_plane = np.zeros_like(offset) if net_test == "ball" else np.abs(offset)
+    tests = {
+        "catch time": _catch_time(case, held, ends),
+        "net": above(from_axis, radius[:, None], relative, ends),
+        "net plane": (from_plane > tolerances["contact"], from_plane, ends),
+        "angle": above(np.where(at_rest, 0.0, angle), widest[:, None], relative, ends),
+    }
+    measured = {
+        "net_distance": np.where(held, distance, np.nan),
+        "net_offset": np.where(held, offset, np.nan),
+        "angle": np.where(held & ~at_rest, angle, np.nan),
+        "catch_times": np.where(held, ends, np.nan),
+    }
+    return measured, tests
+
+
+def _catch_time(case: dict, held: np.ndarray, ends: np.ndarray) -> tuple:
+    """Test of the catch times: positive and rising, as claimed, not after the horizon.
+
+    Every piece up to a catch has a positive duration, and none after the last a negative one.
+    """
+    each = case["durations"].shape[1] // held.shape[1]
+    shortest = case["durations"].reshape(*held.shape, each).min(axis=2)
+    after = np.where(held, 0.0, shortest).min(axis=1, keepdims=True)
+    shortest = np.where(after < 0.0, np.minimum(shortest, after), shortest)
+    off = np.maximum(np.abs(case["times"] - ends), ends - case["horizon"])
+    failed = (off > CONTACT_TIME_TOLERANCE) | (shortest <= 0.0)
+    return failed, np.maximum(off, -shortest), ends
+
+
+def _worst(test: tuple, held: np.ndarray) -> tuple:
+    """The worst catch of every lane: a test (B, N) of the catches that are held as one (B,)."""
+    failed, excess, time = test
+    failed = failed & held
+    counts = failed | (held & np.isnan(excess))
+    value = np.where(counts, excess, -np.inf)
+    pick, lanes = value.argmax(axis=1), np.arange(len(value))
+    return failed.any(axis=1), value[lanes, pick], time[lanes, pick]

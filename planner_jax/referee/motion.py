@@ -1,0 +1,348 @@
+"""What every referee asks of a trajectory: motion, peaks, head state and joints, in float64.
+
+It shares no code with the planners: polynomial pieces are sampled, attitude and body rate come
+from flatness (the Hopf fibration at zero heading; Watterson and Kumar). World frame, z up, SI
+units.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+# Largest difference [s] between the claimed time of a contact and the one that is flown.
+CONTACT_TIME_TOLERANCE = 1e-4
+# Limits smaller than this (in their own unit) are compared as if relative to it.
+SMALLEST_LIMIT = 1e-3
+# Jumps of derivatives count as displacement over one piece, or over this time [s] if longer.
+SHORTEST_PIECE = 0.1
+# Fewest intervals between the samples of one piece.
+_FEWEST_INTERVALS = 16
+
+
+@dataclasses.dataclass(frozen=True)
+class Pieces:
+    """Polynomial pieces in float64; one that is not flown repeats the last one that is.
+
+    A repeated piece changes no greatest and no least value.
+    """
+
+    coeffs: np.ndarray  # (3, B, M, D + 1)
+    durations: np.ndarray  # (B, M) [s]
+    starts: np.ndarray  # (B, M) [s]
+    flown: np.ndarray  # (B, M) bool
+
+
+def pieces_of(coeffs: np.ndarray, durations: np.ndarray, flown: np.ndarray | None = None) -> Pieces:
+    """The pieces of a batch of trajectories.
+
+    Args:
+        coeffs: (B, M, D + 1, 3), rising powers of the time [s] since the piece's start.
+        durations: (B, M) [s].
+        flown: (B, M) bool, which pieces are part of the trajectory; all of them if not given.
+            The others must have no duration.
+    """
+    coeffs = np.moveaxis(coeffs, -1, 0)
+    starts = np.cumsum(durations, axis=1) - durations
+    if flown is None:
+        flown = np.ones(durations.shape, bool)
+    else:
+        number = np.arange(durations.shape[1])
+        last = np.maximum.accumulate(np.where(flown, number, 0), axis=1)
+        lanes = np.arange(len(durations))[:, None]
+        coeffs = coeffs[:, lanes, last]
+        durations, starts = durations[lanes, last], starts[lanes, last]
+    return Pieces(np.ascontiguousarray(coeffs), durations, starts, flown)
+
+
+def check_sampling(samples: int, chunk: int) -> None:
+    """Raise ValueError for sizes that a referee does not take."""
+    if samples < 200:
+        raise ValueError(f"samples must be >= 200, got {samples}")
+    if chunk < 1:
+        raise ValueError(f"chunk must be >= 1, got {chunk}")
+
+
+def intervals_of(samples: int, num_pieces: int) -> int:
+    """Intervals between the samples of one of the pieces that `samples` are shared among."""
+    return max(math.ceil(samples / num_pieces), _FEWEST_INTERVALS)
+
+
+def checked_leaf(name: str, value, shape: tuple[int, ...]) -> np.ndarray:
+    """A leaf as an array; ValueError if it does not have this shape."""
+    leaf = np.asarray(value)
+    if leaf.shape != shape:
+        raise ValueError(f"{name} must be {shape}, got {leaf.shape}")
+    return leaf
+
+
+def checked_coeffs(value) -> np.ndarray:
+    """Coefficients as an array; ValueError if they are not (B, M, D + 1, 3)."""
+    coeffs = np.asarray(value)
+    if coeffs.ndim != 4 or coeffs.shape[-1] != 3 or 0 in coeffs.shape[1:]:
+        raise ValueError(f"coeffs must be (B, M, D + 1, 3), got {coeffs.shape}")
+    return coeffs
+
+
+def judge_in_chunks(
+    judge: Callable[[dict], dict], leaves: dict[str, np.ndarray], chunk: int
+) -> dict[str, np.ndarray]:
+    """The fields of a verdict from leaves with leading axis B, `chunk` lanes at once."""
+    num_lanes = len(leaves["durations"])
+    parts = []
+    # A broken or absurd lane may overflow; its verdict says so, not a warning.
+    with np.errstate(all="ignore"):
+        for start in range(0, max(num_lanes, 1), chunk):
+            parts.append(
+                judge(
+                    {
+                        name: leaf[start : start + chunk].astype(np.float64)
+                        for name, leaf in leaves.items()
+                    }
+                )
+            )
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def finite_lanes(case: dict, unbounded: tuple[str, ...] = ()) -> np.ndarray:
+    """Lanes (B,) whose inputs are finite; limits and `unbounded` may be infinite, but not NaN."""
+    finite = np.ones(len(case["coeffs"]), bool)
+    for name, leaf in case.items():
+        limit = "limits." in name or name in unbounded
+        good = ~np.isnan(leaf) if limit else np.isfinite(leaf)
+        finite &= flat(good).all(axis=1)
+    return finite
+
+
+def first_failures(tests: dict, limits: tuple[str, ...], finite: np.ndarray) -> dict:
+    """Success, failed limit, its time and excess of every lane.
+
+    Args:
+        tests: name -> failed, excess, time, each (B,).
+        limits: the names in the order in which they are tested, after "not finite".
+        finite: (B,) bool, lanes whose inputs are.
+    """
+    failed = np.stack([tests[name][0] for name in limits[1:]], axis=1)
+    excess = np.stack([tests[name][1] for name in limits[1:]], axis=1)
+    time = np.stack([tests[name][2] for name in limits[1:]], axis=1)
+    finite = finite & ~np.isnan(excess).any(axis=1)
+    success = finite & ~failed.any(axis=1)
+    first = failed.argmax(axis=1)
+    lanes = np.arange(len(first))
+    names = np.where(success, "", np.where(finite, np.array(limits)[1 + first], limits[0]))
+    broken = finite & ~success
+    return {
+        "success": success,
+        "failed_limit": names,
+        "failed_time": np.where(broken, time[lanes, first], np.nan),
+        "failed_excess": np.where(broken, excess[lanes, first], np.nan),
+    }
+
+
+def above(value, limit, tolerance: float, time) -> tuple:
+    """Test of value <= limit: failed, relative excess, time."""
+    scale = np.where(np.isinf(limit), 1.0, np.maximum(np.abs(limit), SMALLEST_LIMIT))
+    excess = (value - limit) / scale
+    return excess > tolerance, excess, time
+
+
+def motion_at(coeffs: np.ndarray, durations: np.ndarray, u: np.ndarray, orders) -> list:
+    """Derivatives of polynomial pieces at the fractions u of their durations.
+
+    coeffs (3, ..., D + 1), durations (...), u (S,) or (..., S): one (3, ..., S) an order.
+    """
+    out = []
+    for order in orders:
+        powers = np.arange(coeffs.shape[-1] - order)
+        factors = np.array([math.perm(int(k) + order, order) for k in powers], float)
+        scaled = coeffs[..., order:] * factors * durations[..., None] ** powers
+        # Not a matrix product: threads of a BLAS on a busy machine cost more than they save.
+        out.append(np.einsum("...k,...ks->...s", scaled, u[..., None, :] ** powers[:, None]))
+    return out
+
+
+def _squared(vector: np.ndarray) -> np.ndarray:
+    """Squared length of vectors (3, ...)."""
+    return vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2
+
+
+def _thrust_squared(gravity, acc: np.ndarray) -> np.ndarray:
+    """|a + g e_3|^2 of accelerations (3, ...)."""
+    return acc[0] ** 2 + acc[1] ** 2 + (acc[2] + gravity) ** 2
+
+
+def _body_rate_squared(gravity, acc: np.ndarray, jerk: np.ndarray) -> np.ndarray:
+    """|omega|^2 of the Hopf fibration at zero heading, from c = tau x jerk.
+
+    z' = (c / |tau|^2) x z, so |z'| = |c| / |tau|^2, and the yaw rate
+    (z_y z_x' - z_x z_y') / (1 + z_z) is -c_z / (|tau| (|tau| + tau_z)).
+    Infinite without thrust and upside down, where there is no attitude.
+    """
+    tau_x, tau_y, tau_z = acc[0], acc[1], acc[2] + gravity
+    c_x = tau_y * jerk[2] - tau_z * jerk[1]
+    c_y = tau_z * jerk[0] - tau_x * jerk[2]
+    c_z = tau_x * jerk[1] - tau_y * jerk[0]
+    size_squared = tau_x**2 + tau_y**2 + tau_z**2
+    upright = np.sqrt(size_squared) + tau_z
+    rate = ((c_x**2 + c_y**2 + c_z**2) / size_squared + (c_z / upright) ** 2) / size_squared
+    return np.where(upright > 0.0, rate, np.inf)
+
+
+# Name -> orders of the derivatives it needs, and the measure whose maximum is sought.
+_MEASURES = {
+    "speed": ((1,), lambda gravity, vel: _squared(vel)),
+    "acceleration": ((2,), lambda gravity, acc: _squared(acc)),
+    "body rate": ((2, 3), _body_rate_squared),
+    "depth": ((0,), lambda gravity, pos: -pos[2]),
+    "thrust": ((2,), _thrust_squared),
+    "weakness": ((2,), lambda gravity, acc: -_thrust_squared(gravity, acc)),
+}
+
+
+def _likeliest_peak(values: np.ndarray) -> np.ndarray:
+    """Index (B,) next to the greatest parabola through three samples (B, M, S) of a piece."""
+    left, middle, right = values[..., :-2], values[..., 1:-1], values[..., 2:]
+    crest = (middle >= left) & (middle > right)
+    gain = (right - left) ** 2 / (8.0 * (2.0 * middle - left - right))
+    vertex = values.copy()
+    vertex[..., 1:-1] += np.where(crest, gain, 0.0)
+    return flat(vertex).argmax(axis=1)
+
+
+def flat(values: np.ndarray) -> np.ndarray:
+    """(B, ...) as (B, N); the empty batch too."""
+    return values.reshape(len(values), math.prod(values.shape[1:]))
+
+
+def peaks(
+    pieces: Pieces, gravity: np.ndarray, intervals: int
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Greatest value (B,) of every measure along the trajectory, and its time (B,) [s].
+
+    Every piece is sampled at both ends and inside; the likeliest peak by parabolas through
+    three samples is then searched on the polynomial itself, so that what is found is reached.
+    """
+    coeffs, durations, starts = pieces.coeffs, pieces.durations, pieces.starts
+    u = np.linspace(0.0, 1.0, intervals + 1)
+    motion = motion_at(coeffs, durations, u, range(4))
+    lanes = np.arange(len(durations))
+    times = starts[:, :, None] + durations[:, :, None] * u
+    peaks = {}
+    for name, (orders, measure) in _MEASURES.items():
+        values = measure(gravity[:, None, None], *[motion[order] for order in orders])
+        piece, sample = np.divmod(_likeliest_peak(values), intervals + 1)
+        around, span = coeffs[:, lanes, piece], durations[lanes, piece]
+        centre, half = u[sample], 1.0 / intervals
+        for _ in range(3):
+            near = np.clip(centre[:, None] + half * np.linspace(-1.0, 1.0, 9), 0.0, 1.0)
+            found = measure(gravity[:, None], *motion_at(around, span, near, orders))
+            best = found.argmax(axis=1)
+            centre, half = near[lanes, best], half / 4.0
+        top = flat(values).argmax(axis=1)
+        peaks[name] = _greater(
+            (found[lanes, best], starts[lanes, piece] + centre * span),
+            (flat(values)[lanes, top], flat(times)[lanes, top]),
+        )
+    turn = _fastest_turn(motion[2], gravity, times, pieces.flown)
+    peaks["body rate"] = _greater(peaks["body rate"], turn)
+    return peaks
+
+
+def _greater(first: tuple, second: tuple) -> tuple[np.ndarray, np.ndarray]:
+    """The greater of two values, lane by lane, with its time."""
+    better = second[0] > first[0]
+    return np.where(better, second[0], first[0]), np.where(better, second[1], first[1])
+
+
+def _fastest_turn(acc, gravity, times, flown) -> tuple[np.ndarray, np.ndarray]:
+    """Squared body rate (B,) that turns the thrust from one sample to the next; its time.
+
+    The mean over a step, so never above the true maximum. It is what betrays a thrust that
+    passes through zero between two samples and turns the quadrotor over at once.
+    """
+    tau_x, tau_y, tau_z = acc[0], acc[1], acc[2] + gravity[:, None, None]
+    size = np.sqrt(tau_x**2 + tau_y**2 + tau_z**2)
+    along = tau_x[..., 1:] * tau_x[..., :-1] + tau_y[..., 1:] * tau_y[..., :-1]
+    cosine = (along + tau_z[..., 1:] * tau_z[..., :-1]) / (size[..., 1:] * size[..., :-1])
+    sharpest = np.where(np.isnan(cosine), 1.0, cosine).min(axis=2)
+    step = np.maximum(times[..., 1] - times[..., 0], np.finfo(float).tiny)
+    rate = np.where(flown, np.arccos(np.clip(sharpest, -1.0, 1.0)) / step, 0.0)
+    piece, lanes = rate.argmax(axis=1), np.arange(len(rate))
+    sample = cosine[lanes, piece].argmin(axis=1)
+    return rate[lanes, piece] ** 2, times[lanes, piece, sample]
+
+
+def joint_errors(pieces: Pieces, head_state: np.ndarray) -> tuple:
+    """Errors of head state and joints as displacement [m], time of the worst joint, scale [m].
+
+    An error e_n of the n-th derivative (n = 0..3) counts as the displacement |e_n| h^n / n!
+    that it makes over one mean piece h, at least `SHORTEST_PIECE`. The scale is the largest
+    coordinate at the pieces' ends, at least 1 m.
+
+    Args:
+        pieces: of B lanes.
+        head_state: (B, 4, 3) position to jerk at time 0.
+    """
+    durations, flown = pieces.durations, pieces.flown
+    ends = np.stack(motion_at(pieces.coeffs, durations, np.array([0.0, 1.0]), range(4)))
+    total = np.where(flown, durations, 0.0).sum(axis=1)
+    period = np.maximum(total / np.maximum(flown.sum(axis=1), 1), SHORTEST_PIECE)
+    weights = np.stack([period**n / math.factorial(n) for n in range(4)])
+    head = np.moveaxis(head_state, 0, -1)
+    head_error = np.linalg.norm(ends[..., 0, 0] - head, axis=1) * weights
+    jumps = np.linalg.norm(ends[..., 1:, 0] - ends[..., :-1, 1], axis=1)
+    jump = np.zeros_like(durations)
+    jump[:, 1:] = np.where(flown[:, 1:], (jumps * weights[:, :, None]).max(axis=0), 0.0)
+    worst = jump.argmax(axis=1)
+    scale = np.maximum(np.abs(ends[0]).max(axis=(0, 2, 3)), 1.0)
+    lanes = np.arange(len(worst))
+    return head_error.max(axis=0), jump.max(axis=1), pieces.starts[lanes, worst], scale
+
+
+def judge_motion(
+    pieces: Pieces, case: dict, intervals: int, relative: float, continuity: float
+) -> tuple[dict, dict]:
+    """What a trajectory does, and the tests of it: name -> failed, excess, time.
+
+    Args:
+        pieces: of B lanes.
+        case: leaves with leading axis B: "head_state", "gravity" and "limits.<name>"; of
+            speed, acceleration, body rate, least and greatest thrust those are tested that
+            have a limit, and the least height.
+        intervals: between the samples of one piece.
+        relative: tolerance of every limit.
+        continuity: tolerance of head state and joints, times the scale of the coordinates.
+    """
+    found = peaks(pieces, case["gravity"], intervals)
+    head, jump, jump_time, scale = joint_errors(pieces, case["head_state"])
+    measured = {
+        "max_speed": np.sqrt(found["speed"][0]),
+        "max_acceleration": np.sqrt(found["acceleration"][0]),
+        "max_body_rate": np.sqrt(found["body rate"][0]),
+        "min_height": -found["depth"][0],
+        "min_thrust": np.sqrt(-found["weakness"][0]),
+        "max_thrust": np.sqrt(found["thrust"][0]),
+        "continuity_error": jump,
+        "head_error": head,
+    }
+    allowed = continuity * scale
+    tests = {
+        "head state": (head > allowed, head, np.zeros_like(head)),
+        "continuity": (jump > allowed, jump, jump_time),
+    }
+    # Test -> peak, what is measured there, the limit's field, sign of an upper or lower limit.
+    bounds = {
+        "speed": ("speed", "max_speed", "speed", 1.0),
+        "acceleration": ("acceleration", "max_acceleration", "acceleration", 1.0),
+        "body rate": ("body rate", "max_body_rate", "body_rate", 1.0),
+        "thrust low": ("weakness", "min_thrust", "min_thrust", -1.0),
+        "thrust high": ("thrust", "max_thrust", "max_thrust", 1.0),
+        "ground": ("depth", "min_height", "min_height", -1.0),
+    }
+    for name, (peak, field, bound, sign) in bounds.items():
+        limit = case.get(f"limits.{bound}")
+        if limit is not None:
+            value = sign * measured[field]
+            tests[name] = above(value, sign * limit, relative, found[peak][1])
+    return measured, tests

@@ -1,0 +1,96 @@
+"""Trajectories through several catches: one minimum-snap segment of M pieces to each catch.
+
+The state at a catch, position to jerk, ends one segment and begins the next. Segments of
+targets that are not there are computed like the others, so that one compiled shape serves any
+number of targets, and count nothing.
+"""
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import Array
+
+from planner_jax.ball.flight import BallState
+from planner_jax.task.catch.scenario import CatchScenario
+from planner_jax.trajectory.polynomial import Motion, PiecewisePolynomial
+from planner_jax.trajectory.proportional_minco import (
+    ProportionalMinco,
+    boundary_rows,
+    proportional_trajectory,
+    sample_motion,
+    trajectory_energy,
+)
+
+
+@struct.dataclass
+class CatchContext:
+    """One scenario with its targets in the order of catching."""
+
+    scenario: CatchScenario
+    targets: object  # the path pytree, leaves (N, ...)
+    active: Array  # (N,) bool, False for the places of absent targets
+    horizon: Array  # (N,) [s]
+    times: Array  # (N,) [s], first guess
+
+
+def ordered_context(scenario: CatchScenario) -> CatchContext:
+    """Targets, presence and horizons in the order of catching."""
+    return CatchContext(
+        scenario=scenario,
+        targets=jax.tree.map(lambda leaf: leaf[scenario.order], scenario.targets),
+        active=scenario.present[scenario.order],
+        horizon=scenario.horizon[scenario.order],
+        times=scenario.times,
+    )
+
+
+def targets_at(targets, times: Array) -> BallState:
+    """Where each of N targets is at its own time (N,), leaves (N, 3)."""
+    return jax.vmap(lambda target, time: target.at(time))(targets, times)
+
+
+@struct.dataclass
+class Chain:
+    """Boundary rows, offsets and mean piece durations of N segments."""
+
+    rows: Array  # (N, 2s, 3)
+    offsets: Array  # (N, M - 1, 3) whitened
+    piece_durations: Array  # (N,) [s]
+
+
+def chain_rows(head_state: Array, tail_states: Array, piece_durations: Array) -> Array:
+    """Boundary rows of every segment, (N, 2s, 3).
+
+    Args:
+        head_state: (4, 3) of the whole trajectory.
+        tail_states: (N, 4, 3), at the catches.
+        piece_durations: (N,) [s], mean of the pieces of a segment.
+    """
+    heads = jnp.concatenate([head_state[None], tail_states[:-1]])
+    return jax.vmap(boundary_rows)(heads, tail_states, piece_durations)
+
+
+def chain_motion(maps: ProportionalMinco, nodes: int, chain: Chain) -> Motion:
+    """Samples of every segment, leaves with a leading axis N."""
+    sample = lambda *segment: sample_motion(maps, nodes, *segment)  # noqa: E731
+    return jax.vmap(sample)(chain.rows, chain.offsets, chain.piece_durations)
+
+
+def chain_energy(maps: ProportionalMinco, chain: Chain) -> Array:
+    """Integral of |snap|^2 over every segment, (N,)."""
+    energy = lambda *segment: trajectory_energy(maps, *segment)  # noqa: E731
+    return jax.vmap(energy)(chain.rows, chain.offsets, chain.piece_durations)
+
+
+def chain_trajectory(maps: ProportionalMinco, chain: Chain, active: Array) -> PiecewisePolynomial:
+    """The trajectory in N * M pieces; those of absent targets stand still for no time."""
+    build = lambda *segment: proportional_trajectory(maps, *segment)  # noqa: E731
+    pieces = jax.vmap(build)(chain.rows, chain.offsets, chain.piece_durations)
+    ends = chain.rows[:, maps.order, :]  # positions at the catches
+    last = ends[jnp.maximum(jnp.sum(active) - 1, 0)]
+    still = jnp.zeros_like(pieces.coeffs).at[:, :, 0].set(last)
+    coeffs = jnp.where(active[:, None, None, None], pieces.coeffs, still)
+    durations = jnp.where(active[:, None], pieces.durations, 0.0)
+    return PiecewisePolynomial(
+        coeffs=coeffs.reshape(-1, *coeffs.shape[2:]), durations=durations.ravel()
+    )

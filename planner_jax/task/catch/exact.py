@@ -1,0 +1,257 @@
+"""The `exact` catch planner: every catch is built into the decision variables.
+
+Paper 000 brings the net to the ball by a penalty (eqs 22-24), and its plans miss by what the
+penalty lets through. Here the net's centre is the ball's position less an offset inside the
+hoop, so that no plan misses; attitude and limits stay inequalities.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+from planner_jax.cost.limits import body_rate_excess, ground_excess, speed_excess, thrust_excess
+from planner_jax.cost.penalty import joined_trapezoid_weights, smoothed_hinge
+from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
+from planner_jax.optimise.problem import Round
+from planner_jax.robot.quadrotor import body_z, tangent_basis
+from planner_jax.task.catch.chain import (
+    CatchContext,
+    Chain,
+    chain_energy,
+    chain_motion,
+    chain_rows,
+    chain_trajectory,
+    ordered_context,
+    targets_at,
+)
+from planner_jax.task.catch.plan import CatchPlan
+from planner_jax.task.catch.scenario import CatchScenario
+from planner_jax.trajectory.proportional_minco import ProportionalMinco, proportional_minco
+
+_ORDER = 4  # minimum snap
+_CATCH_VARIABLES = 12  # log duration, offset in the net (2), velocity, acceleration, jerk
+_FIRST_SCALE = (0.03, 0.5, 0.5, 0.6, 0.6, 0.6, 2.0, 2.0, 2.0, 40.0, 40.0, 30.0)
+# Squares carry twice the relative margin.
+_MARGINS = np.array([2.0, 2.0, 2.0, 2.0, 1.0])[:, None, None]
+_RIM = 0.9  # share of the net's radius that a planned catch may use
+
+
+# Starting points, best first: factor on the guessed times, share of the mean velocity of the
+# way to a catch that is kept there.
+_GUESSES = np.array([(1.0, 0.5), (1.0, 1.0), (1.15, 0.3), (1.3, 0.0), (0.9, 1.0), (1.5, 0.2)])
+
+
+@struct.dataclass
+class Catch:
+    """The N catches that a point describes."""
+
+    times: Array  # (N,) [s]
+    durations: Array  # (N,) [s], of the segments
+    tail_states: Array  # (N, 4, 3) of the quadrotor
+    angle_excess: Array  # (N,) cosine of theta_safe less that of the angle; <= 0 is good
+
+
+@dataclasses.dataclass(frozen=True)
+class ExactCatch:
+    """Minimum-snap catches with the ball in the net by construction.
+
+    Decision variables, N segments with 3 (M - 1) + 12 each, in units of `scale`: whitened
+    waypoint offsets, log duration of the segment, place in the net, velocity, acceleration and
+    jerk at the catch. The acceleration gives the net's axis z_d; the ball's position at the
+    catch less the net's height along z_d and a place inside the hoop is the quadrotor's.
+
+    Cost: time_weight * total time + energy_weight * integral |snap|^2 + integral of the
+    smoothed hinges of the limits (paper 000, eqs 26-28) + hinges of the angle (eq. 25) and of
+    the horizon.
+    """
+
+    proportions: tuple[float, ...] = (0.3,) + (1.0,) * 5  # relative durations of the pieces
+    nodes: int = 8  # penalty intervals a piece
+    time_weight: float = 0.005
+    energy_weight: float = 3e-8
+    margin: float = 0.03  # penalties begin this far inside a limit, relative
+    hinge_width: float = 0.1
+    catch_weight: float = 0.3  # [s], of the hinges at a catch beside the integrals
+    rounds: tuple[Round, ...] = (
+        Round(starts=1, solver=LbfgsConfig(max_steps=10)),
+        Round(starts=1, solver=LbfgsConfig(max_steps=80)),
+        Round(starts=4, solver=LbfgsConfig(max_steps=150)),
+    )
+    scale: tuple[float, ...] = ()  # of one segment
+
+    def __post_init__(self) -> None:
+        if len(self.proportions) < 2:
+            raise ValueError(f"proportions must be of >= 2 pieces, got {self.proportions}")
+        if not self.scale:
+            object.__setattr__(self, "scale", (0.3,) * self.num_offsets + _FIRST_SCALE)
+
+    @property
+    def num_offsets(self) -> int:
+        """Number of waypoint variables of a segment."""
+        return 3 * (self.num_pieces - 1)
+
+    @property
+    def num_pieces(self) -> int:
+        """M, of one segment."""
+        return len(self.proportions)
+
+    @property
+    def maps(self) -> ProportionalMinco:
+        """Constant maps from boundary and offsets to one segment."""
+        return proportional_minco(_ORDER, self.proportions)
+
+    def prepare(self, scenario: CatchScenario) -> CatchContext:
+        """The targets in the order of catching."""
+        return ordered_context(scenario)
+
+    def guesses(self, context: CatchContext, num: int) -> Array:
+        """Smooth trajectories that face the balls, at and after the guessed times, (num, n)."""
+        if num > len(_GUESSES):
+            raise ValueError(f"starts must be <= {len(_GUESSES)}, got {num}")
+        return jax.vmap(lambda guess: self._guess(context, guess))(
+            jnp.asarray(_GUESSES[:num], context.times.dtype)
+        )
+
+    def _guess(self, context: CatchContext, guess: Array) -> Array:
+        """The point (n,) of later times and a share of the way's velocity at the catches."""
+        scenario = context.scenario
+        begin = jnp.zeros_like(context.times[:1])
+        times = context.times * guess[0]
+        durations = jnp.maximum(jnp.diff(times, prepend=begin), 0.05)
+        ball = targets_at(context.targets, times)
+        speed = jnp.sqrt(jnp.maximum(jnp.sum(ball.vel**2, axis=1, keepdims=True), 1e-6))
+        # Straight against the ball, but at most 60 degrees from upright.
+        facing = -ball.vel / speed + 0.3 * jnp.array([0.0, 0.0, 1.0])
+        upright = jnp.maximum(facing[:, 2:], 0.5)
+        acc = scenario.gravity * facing / upright * jnp.array([1.0, 1.0, 0.0])
+        before = jnp.concatenate([scenario.head_state[None, 0], ball.pos[:-1]])
+        vel = guess[1] * (ball.pos - before) / durations[:, None]
+        natural = jnp.concatenate(
+            [
+                jnp.zeros((times.size, self.num_offsets)),
+                jnp.log(durations)[:, None],
+                jnp.zeros((times.size, 2)),
+                vel,
+                acc,
+                jnp.zeros((times.size, 3)),
+            ],
+            axis=1,
+        )
+        return (natural / jnp.asarray(self.scale, times.dtype)).ravel()
+
+    def catches(self, natural: Array, context: CatchContext) -> Catch:
+        """The catches that the variables (N, 12) after the waypoint offsets describe."""
+        scenario, net = context.scenario, context.scenario.net
+        durations = jnp.exp(natural[:, 0])
+        times = jnp.cumsum(jnp.where(context.active, durations, 0.0))
+        ball = targets_at(context.targets, times)
+        acc = natural[:, 6:9]
+        axis = body_z(acc, scenario.gravity)
+        across_x, across_y = jax.vmap(tangent_basis)(axis)
+        place = natural[:, 1:3]
+        inside = _RIM * net.radius / jnp.sqrt(1.0 + jnp.sum(place**2, axis=1, keepdims=True))
+        place = place * inside
+        pos = ball.pos - net.height * axis - place[:, :1] * across_x - place[:, 1:] * across_y
+        speed_squared = jnp.sum(ball.vel**2, axis=1)
+        moving = speed_squared > 1e-12
+        speed = jnp.sqrt(jnp.where(moving, speed_squared, 1.0))
+        facing = -jnp.sum(axis * ball.vel, axis=1) / speed
+        excess = jnp.where(moving, jnp.cos(net.max_angle) - facing, -1.0)
+        tail_states = jnp.stack([pos, natural[:, 3:6], acc, natural[:, 9:12]], axis=1)
+        return Catch(times=times, durations=durations, tail_states=tail_states, angle_excess=excess)
+
+    def _unpack(self, point: Array, context: CatchContext) -> tuple[Chain, Catch]:
+        """Segments and catches at a point."""
+        scale = jnp.asarray(self.scale, point.dtype)
+        natural = point.reshape(-1, scale.size) * scale
+        num = natural.shape[0]
+        catch = self.catches(natural[:, self.num_offsets :], context)
+        piece_durations = catch.durations / self.num_pieces
+        rows = chain_rows(context.scenario.head_state, catch.tail_states, piece_durations)
+        offsets = natural[:, : self.num_offsets].reshape(num, -1, 3)
+        return Chain(rows=rows, offsets=offsets, piece_durations=piece_durations), catch
+
+    def _excess(
+        self, chain: Chain, catch: Catch, context: CatchContext, nodes: int
+    ) -> tuple[Array, Array]:
+        """Excess over the limits along the way, (5, N, K), and at the catches, (2, N)."""
+        scenario, limits = context.scenario, context.scenario.limits
+        motion = chain_motion(self.maps, nodes, chain)
+        along = jnp.concatenate(
+            [
+                speed_excess(motion.vel, limits)[None],
+                body_rate_excess(motion.acc, motion.jerk, scenario.gravity, limits)[None],
+                thrust_excess(motion.acc, scenario.gravity, limits.min_thrust, limits.max_thrust),
+                ground_excess(motion.height, limits)[None],
+            ]
+        )
+        late = catch.times / context.horizon - 1.0
+        at_catch = jnp.stack([catch.angle_excess, late])
+        idle = -jnp.ones((), along.dtype)
+        return (
+            jnp.where(context.active[:, None], along, idle),
+            jnp.where(context.active, at_catch, idle),
+        )
+
+    def objective(self, point: Array, context: CatchContext) -> Evaluation:
+        """Cost, and the largest excess at the penalty nodes (squares over squares)."""
+        chain, catch = self._unpack(point, context)
+        along, at_catch = self._excess(chain, catch, context, self.nodes)
+        weights = jnp.asarray(
+            joined_trapezoid_weights(self.nodes, self.maps.proportions), point.dtype
+        )
+        margins = jnp.asarray(self.margin * _MARGINS, point.dtype)
+        hinges = smoothed_hinge(along + margins, self.hinge_width)
+        penalty = jnp.sum(chain.piece_durations[:, None] * hinges * weights)
+        penalty += self.catch_weight * jnp.sum(
+            smoothed_hinge(at_catch + self.margin, self.hinge_width)
+        )
+        energy = jnp.sum(jnp.where(context.active, chain_energy(self.maps, chain), 0.0))
+        cost = penalty + self.energy_weight * energy + self.time_weight * catch.times[-1]
+        # Peaks between nodes are a little higher than the nodes show.
+        violation = jnp.maximum(jnp.max(along), jnp.max(at_catch)) + 0.004
+        return Evaluation(cost=cost, violation=violation)
+
+    def residuals(self, point: Array, context: CatchContext) -> Array:
+        """Squared hinges, energy and time as residuals, for `measure_scale`.
+
+        The smoothed hinge bends at most with 3 / (2 hinge_width); the residuals bend alike.
+        """
+        chain, catch = self._unpack(point, context)
+        along, at_catch = self._excess(chain, catch, context, self.nodes)
+        bend = jnp.sqrt(1.5 / self.hinge_width)
+        weights = jnp.asarray(
+            joined_trapezoid_weights(self.nodes, self.maps.proportions), point.dtype
+        )
+        margins = jnp.asarray(self.margin * _MARGINS, point.dtype)
+        inside = jnp.maximum(along + margins, 0.0)
+        inside = inside * jnp.sqrt(chain.piece_durations[:, None] * weights)
+        at_catch = jnp.sqrt(self.catch_weight) * jnp.maximum(at_catch + self.margin, 0.0)
+        energy = chain_energy(self.maps, chain)[:, None] * jnp.ones((1, 1))
+        smooth = jnp.sqrt(2.0 * self.energy_weight * jnp.maximum(energy, 1e-6))
+        late = jnp.sqrt(2.0 * self.time_weight * catch.durations)
+        parts = (bend * inside, bend * at_catch, smooth, late)
+        return jnp.concatenate([part.ravel() for part in parts])
+
+    def decode(self, point: Array, context: CatchContext) -> CatchPlan:
+        """The plan at a point, its violation looked for at 16 nodes a piece."""
+        chain, catch = self._unpack(point, context)
+        along, at_catch = self._excess(chain, catch, context, 16)
+        squared = jnp.max(along[jnp.array([0, 1, 3])])
+        plain = jnp.maximum(jnp.max(along[4]), jnp.max(at_catch))
+        weak = 1.0 - jnp.sqrt(jnp.maximum(1.0 - jnp.max(along[2]), 0.0))
+        ratio = jnp.sqrt(jnp.maximum(squared + 1.0, 0.0)) - 1.0
+        violation = jnp.maximum(jnp.maximum(ratio, weak), plain)
+        return CatchPlan(
+            trajectory=chain_trajectory(self.maps, chain, context.active),
+            order=context.scenario.order,
+            times=catch.times,
+            cost=jnp.zeros_like(violation),
+            violation=violation,
+            iterations=jnp.zeros((), jnp.int32),
+            status=jnp.zeros((), jnp.int32),
+        )

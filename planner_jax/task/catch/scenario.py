@@ -1,0 +1,126 @@
+"""One catching task: up to N targets, the quadrotor, its net and its limits."""
+
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+from planner_jax.ball.target import TargetPath
+
+
+@struct.dataclass
+class CatchLimits:
+    """What the quadrotor may not exceed (paper 000, eq. 3d-e)."""
+
+    speed: Array  # () [m/s]
+    min_thrust: Array  # () [m/s^2], per unit mass
+    max_thrust: Array  # () [m/s^2], per unit mass
+    body_rate: Array  # () [rad/s], with the yaw part of the Hopf fibration
+    min_height: Array  # () [m], of the propeller plane
+
+
+@struct.dataclass
+class Net:
+    """A hoop above the propellers, across the thrust direction (paper 000, eqs 22 and 25)."""
+
+    height: Array  # () l [m], of the hoop's centre above the propeller plane
+    radius: Array  # () [m]
+    max_angle: Array  # () theta_safe [rad], between the net's axis and the ball's way back
+
+
+@struct.dataclass
+class CatchScenario:
+    """One case. Every field is a leaf: batch it, randomise it, differentiate by it.
+
+    Times count from the moment at which planning begins. The N targets are caught in the
+    order `order`; `decide` fills it and `times`.
+    """
+
+    targets: TargetPath  # leaves with a leading axis N
+    present: Array  # (N,) bool, in the same order as `targets`; which of the N there are
+    horizon: Array  # (N,) [s], until when each target may be caught
+    order: Array  # (N,) int32, a permutation: which target is caught first, second, ...
+    times: Array  # (N,) [s], when, as a first guess; in the order of catching, rising
+    head_state: Array  # (4, 3) position, velocity, acceleration, jerk of the quadrotor at time 0
+    gravity: Array  # () [m/s^2], magnitude
+    net: Net
+    limits: CatchLimits
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """() for one case, (B,) for a batch."""
+        return np.shape(self.gravity)
+
+    @property
+    def num_targets(self) -> int:
+        """N, the number of targets that the shape holds."""
+        return np.shape(self.present)[-1]
+
+
+def catch_scenario(
+    targets: TargetPath,
+    horizon,
+    *,
+    present=True,
+    start=(0.0, 0.0, 1.0),
+    gravity=9.81,
+    net_height=0.2,
+    net_radius=0.125,
+    max_angle=np.pi / 6.0,
+    speed=5.0,
+    min_thrust=None,
+    max_thrust=None,
+    body_rate=5.0,
+    min_height=0.25,
+    dtype=jnp.float32,
+) -> CatchScenario:
+    """A scenario, or a batch of them, with the setting of paper 000.
+
+    Net and flight are paper 000's; it does not give limits, which are those of the shared
+    protocol: |v| <= 5 m/s, |omega| <= 5 rad/s, thrust 0.3 g to 2.5 g, height >= 0.25 m,
+    theta_safe = 30 degrees. Order and times are placeholders until `decide` sets them: the
+    targets as they come, at equal shares of the first horizon.
+
+    Args:
+        targets: a path pytree whose leaves have leading axes (..., N).
+        horizon: (..., N) [s], until when each target may be caught.
+        present: (..., N) bool.
+        start: (3,) or (..., 3) [m], hover position of the quadrotor.
+        gravity: [m/s^2]. This and all that follow may be one value or one a case.
+        net_height: l [m].
+        net_radius: [m].
+        max_angle: theta_safe [rad].
+        speed: [m/s].
+        min_thrust: [m/s^2]; 0.3 g if not given.
+        max_thrust: [m/s^2]; 2.5 g if not given.
+        body_rate: [rad/s].
+        min_height: [m].
+        dtype: of every floating leaf.
+    """
+    shape = np.shape(horizon)
+    batch, num = shape[:-1], shape[-1]
+
+    def leaf(value, *trailing: int) -> Array:
+        return jnp.asarray(np.broadcast_to(np.asarray(value), batch + trailing), dtype)
+
+    gravity = np.asarray(gravity)
+    head = np.zeros(batch + (4, 3))
+    head[..., 0, :] = start
+    shares = np.arange(1, num + 1) / (num + 1.0)
+    return CatchScenario(
+        targets=targets,
+        present=jnp.asarray(np.broadcast_to(present, shape), bool),
+        horizon=leaf(horizon, num),
+        order=jnp.asarray(np.broadcast_to(np.arange(num), shape), jnp.int32),
+        times=leaf(shares * np.asarray(horizon)[..., :1], num),
+        head_state=jnp.asarray(head, dtype),
+        gravity=leaf(gravity),
+        net=Net(height=leaf(net_height), radius=leaf(net_radius), max_angle=leaf(max_angle)),
+        limits=CatchLimits(
+            speed=leaf(speed),
+            min_thrust=leaf(0.3 * gravity if min_thrust is None else min_thrust),
+            max_thrust=leaf(2.5 * gravity if max_thrust is None else max_thrust),
+            body_rate=leaf(body_rate),
+            min_height=leaf(min_height),
+        ),
+    )

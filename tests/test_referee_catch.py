@@ -1,0 +1,596 @@
+"""The referee of catch plans, on plans worked out by hand: no planner has a part in this."""
+
+import math
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.polynomial import Polynomial
+from scipy.integrate import solve_ivp
+
+from planner_jax.ball.flight import BallState
+from planner_jax.ball.target import BallPath
+from planner_jax.referee.catch import LIMITS, CatchVerdict, referee_catches
+from planner_jax.task.catch.plan import CatchPlan
+from planner_jax.task.catch.scenario import CatchLimits, CatchScenario, Net
+from planner_jax.trajectory.polynomial import PiecewisePolynomial
+
+GRAVITY, DRAG, NET_HEIGHT, NET_RADIUS = 9.81, 0.5, 0.2, 0.125
+START, FIRST, SECOND = (0.0, 0.0, 1.2), (0.6, -0.3, 1.4), (-0.4, 0.2, 1.1)
+TIMES = (1.1, 2.4)  # of the two catches
+DURATIONS = (0.4, 0.7, 0.8, 0.5, 0.0, 0.0)  # two pieces up to each catch, the third not made
+STEP = Polynomial([0, 0, 0, 0, 35, -84, 70, -20])  # from 0 to 1, at rest up to jerk at both
+STEEPEST = 35.0 / 16.0  # slope of STEP, at 1/2
+
+
+def cut(path, durations, degree=7):
+    """A polynomial path, three of them, in pieces (M, degree + 1, 3), each in its own time."""
+    coeffs = np.zeros((len(durations), degree + 1, 3))
+    for piece, start in enumerate(np.cumsum(durations) - durations):
+        for axis, line in enumerate(path):
+            powers = line(Polynomial([start, 1.0])).coef
+            coeffs[piece, : len(powers), axis] = powers
+    return coeffs
+
+
+def rest_to_rest(start, end, durations):
+    """Pieces from one hover to the next."""
+    step = STEP(Polynomial([0.0, 1.0 / sum(durations)]))
+    return cut([a + (b - a) * step for a, b in zip(start, end, strict=True)], durations)
+
+
+def hover(place, pieces):
+    coeffs = np.zeros((pieces, 8, 3))
+    coeffs[:, 0] = place
+    return coeffs
+
+
+def drop(time):
+    """How far a ball with linear drag falls from rest: paper 000, eq. 9, with its constant."""
+    return GRAVITY * time / DRAG - GRAVITY * (1.0 - math.exp(-DRAG * time)) / DRAG**2
+
+
+def above_net(place, time):
+    """Where a ball must be dropped to fall into the net of a hovering quadrotor."""
+    return np.array(place) + [0.0, 0.0, NET_HEIGHT + drop(time)]
+
+
+def good():
+    """Leaves, with leading axis 1: of three targets the last and the first are caught."""
+    nowhere = np.full(3, np.nan)
+    leaves = {
+        "coeffs": np.concatenate(
+            [
+                rest_to_rest(START, FIRST, DURATIONS[:2]),
+                rest_to_rest(FIRST, SECOND, DURATIONS[2:4]),
+                hover(SECOND, 2),
+            ]
+        ),
+        "durations": DURATIONS,
+        "order": [2, 0, 1],
+        "times": [*TIMES, TIMES[1]],
+        "present": [True, False, True],
+        "horizon": [3.0, np.nan, 1.5],
+        "head_state": [START, *np.zeros((3, 3))],
+        "gravity": GRAVITY,
+        "targets.ball.pos": [above_net(SECOND, TIMES[1]), nowhere, above_net(FIRST, TIMES[0])],
+        "targets.ball.vel": [np.zeros(3), nowhere, np.zeros(3)],
+        "targets.drag": [np.full(3, DRAG), nowhere, np.full(3, DRAG)],
+        "targets.gravity": [GRAVITY, np.nan, GRAVITY],
+        "net.height": NET_HEIGHT,
+        "net.radius": NET_RADIUS,
+        "net.max_angle": math.pi / 6.0,
+        "limits.speed": 5.0,
+        "limits.min_thrust": 0.3 * GRAVITY,
+        "limits.max_thrust": 2.5 * GRAVITY,
+        "limits.body_rate": 5.0,
+        "limits.min_height": 0.25,
+    }
+    exact = {"order": int, "present": bool}
+    return {k: np.asarray(leaf, exact.get(k, float))[None] for k, leaf in leaves.items()}
+
+
+def tree(leaves, root):
+    """The object whose fields are the leaves named `root.<field>`, and so on inwards."""
+    inside = {k.removeprefix(f"{root}."): v for k, v in leaves.items() if k.startswith(f"{root}.")}
+    parts = {k.split(".")[0] for k in inside if "." in k}
+    plain = {k: v for k, v in inside.items() if "." not in k}
+    return SimpleNamespace(**plain, **{part: tree(inside, part) for part in parts})
+
+
+def objects(leaves):
+    """A scenario and a plan of the referee's own fields alone."""
+    scenario = SimpleNamespace(
+        targets=tree(leaves, "targets"),
+        net=tree(leaves, "net"),
+        limits=tree(leaves, "limits"),
+        **{name: leaves[name] for name in ("present", "horizon", "head_state", "gravity")},
+    )
+    trajectory = SimpleNamespace(coeffs=leaves["coeffs"], durations=leaves["durations"])
+    plan = SimpleNamespace(trajectory=trajectory, order=leaves["order"], times=leaves["times"])
+    return scenario, plan
+
+
+def judge(leaves, **options) -> CatchVerdict:
+    return referee_catches(*objects(leaves), **options)
+
+
+def stack(*cases):
+    return {name: np.concatenate([case[name] for case in cases]) for name in cases[0]}
+
+
+def one_target(place=START, *, pos=None, vel=(0.0, 0.0, -3.0), time=1.1, drag=0.0, gravity=0.0):
+    """Leaves of a hover in which one target comes to `pos` at `time`; it flies straight on."""
+    pos = np.array(place) + [0.0, 0.0, NET_HEIGHT] if pos is None else np.asarray(pos)
+    leaves = good()
+    return leaves | {
+        "coeffs": hover(place, 2)[None],
+        "durations": np.array([[0.4, time - 0.4]]),
+        "order": np.array([[0]]),
+        "times": np.array([[time]]),
+        "present": np.array([[True]]),
+        "horizon": np.array([[3.0]]),
+        "head_state": np.array([[place, *np.zeros((3, 3))]]),
+        "targets.ball.pos": (pos - np.array(vel) * time)[None, None],
+        "targets.ball.vel": np.array([[vel]], float),
+        "targets.drag": np.full((1, 1, 3), drag),
+        "targets.gravity": np.array([[gravity]]),
+    }
+
+
+def assert_fails(leaves, name, *, excess=None, time=None, rel=1e-6, **options):
+    verdict = judge(leaves, **options)
+    assert not verdict.success[0] and verdict.failed_limit[0] == name, verdict.sentence(0)
+    assert verdict.sentence(0).startswith(f"{name}: ")
+    if excess is not None:
+        assert verdict.failed_excess[0] == pytest.approx(excess, rel=rel)
+    if time is not None:
+        assert verdict.failed_time[0] == pytest.approx(time)
+    return verdict
+
+
+def test_a_hover_under_a_falling_ball_catches_it():
+    leaves = one_target(drag=DRAG, gravity=GRAVITY)
+    leaves["targets.ball.pos"][0, 0] = above_net(START, 1.1)
+    leaves["targets.ball.vel"][:] = 0.0
+    verdict = judge(leaves)
+    assert verdict.success[0], verdict.sentence(0)
+    assert verdict.failed_limit[0] == "" and np.isnan(verdict.failed_time[0])
+    assert verdict.caught.all() and verdict.num_caught[0] == 1
+    assert verdict.net_distance[0, 0] < 1e-12 and verdict.angle[0, 0] < 1e-12
+    assert verdict.min_thrust[0] == verdict.max_thrust[0] == pytest.approx(GRAVITY)
+    assert verdict.max_speed[0] == 0.0 and verdict.max_body_rate[0] == pytest.approx(0.0)
+    assert verdict.sentence(0).startswith("success: 1 caught, at most ")
+
+
+def test_two_targets_are_caught_in_sequence_and_an_absent_one_is_not_looked_at():
+    verdict = judge(good())
+    assert verdict.success[0], verdict.sentence(0)
+    np.testing.assert_array_equal(verdict.caught, [[True, True, False]])
+    np.testing.assert_allclose(verdict.catch_times, [[*TIMES, np.nan]])
+    np.testing.assert_allclose(verdict.net_distance, [[0.0, 0.0, np.nan]], atol=1e-12)
+    np.testing.assert_allclose(verdict.angle, [[0.0, 0.0, np.nan]], atol=1e-12)
+    assert verdict.num_caught[0] == 2
+    assert verdict.head_error[0] < 1e-12 and verdict.continuity_error[0] < 1e-12
+
+
+def test_pieces_that_are_not_flown_may_hold_anything():
+    leaves = good()
+    leaves["coeffs"][0, 4:] = np.nan
+    leaves["times"][0, 2] = np.nan
+    assert_same(judge(good()), judge(leaves))
+
+
+def test_a_piece_with_a_duration_after_the_last_catch_is_judged_too():
+    leaves = good()
+    leaves["durations"][0, 4] = 0.2
+    assert judge(leaves).success[0]
+    leaves["coeffs"][0, 4, 1, 0] = 3.0  # it starts at 3 m/s, from rest
+    assert_fails(leaves, "continuity", time=TIMES[1])
+
+
+def test_without_a_target_there_is_nothing_to_catch():
+    leaves = good()
+    leaves["present"][:], leaves["durations"][:] = False, 0.0
+    leaves["order"][:] = [0, 1, 2]
+    leaves["coeffs"][0, 0, 2] = [0.3, 0.2, 0.1]  # the cosine of no turn is rounded to below 1
+    verdict = judge(leaves)
+    assert verdict.max_body_rate[0] == 0.0
+    assert verdict.success[0] and verdict.num_caught[0] == 0
+    assert verdict.sentence(0) == "success: there is no target to catch"
+
+
+def test_peaks_agree_with_the_closed_form():
+    verdict = judge(good())
+    paths = np.diff([START, FIRST, SECOND], axis=0)
+    periods = np.diff([0.0, *TIMES])
+    speeds = STEEPEST * np.linalg.norm(paths, axis=1) / periods
+    assert verdict.max_speed[0] == pytest.approx(speeds.max(), rel=1e-7)
+    assert verdict.min_height[0] == pytest.approx(SECOND[2], rel=1e-7)
+    u = np.linspace(0.0, 1.0, 20001)
+    thrust = np.concatenate(
+        [
+            np.linalg.norm(
+                np.outer(STEP.deriv(2)(u), path / period**2) + [0.0, 0.0, GRAVITY], axis=1
+            )
+            for path, period in zip(paths, periods, strict=True)
+        ]
+    )
+    assert verdict.min_thrust[0] == pytest.approx(thrust.min(), rel=1e-7)
+    assert verdict.max_thrust[0] == pytest.approx(thrust.max(), rel=1e-7)
+
+
+@pytest.mark.parametrize(
+    "order, wrong",
+    [([2, 2, 1], 1), ([2, 1, 0], 2), ([2, 0, 3], 1), ([2, 0, 0], 1), ([2, -1, 1], 1)],
+)
+def test_an_order_that_misses_a_present_target_fails(order, wrong):
+    leaves = good()
+    leaves["order"][0] = order
+    verdict = assert_fails(leaves, "order", excess=wrong, time=TIMES[1])
+    assert verdict.caught[0, 0] and not verdict.caught[0, 2]
+    assert verdict.num_caught[0] == (2 if order[1] == 0 else 1)
+
+
+def test_targets_named_in_another_order_are_missed():
+    leaves = good()
+    leaves["order"][0], leaves["horizon"][0] = [0, 2, 1], 3.0
+    verdict = assert_fails(leaves, "net")
+    assert verdict.num_caught[0] == 0
+
+
+@pytest.mark.parametrize("late", [-0.02, 0.02])
+@pytest.mark.parametrize("place", [0, 1])
+def test_a_catch_claimed_at_another_time_fails(place, late):
+    leaves = good()
+    leaves["times"][0, place] += late
+    verdict = assert_fails(leaves, "catch time", excess=0.02, time=TIMES[place])
+    np.testing.assert_array_equal(verdict.caught[0], [place == 1, place == 0, False])
+
+
+def test_a_catch_after_the_targets_own_horizon_fails():
+    leaves = good()
+    leaves["horizon"][0] = [TIMES[1] + 0.01, 0.0, TIMES[0] - 0.01]
+    verdict = assert_fails(leaves, "catch time", excess=0.01, time=TIMES[0])
+    np.testing.assert_array_equal(verdict.caught, [[False, True, False]])
+    leaves["horizon"][:] = np.inf
+    assert judge(leaves).success[0]
+
+
+@pytest.mark.parametrize("piece, duration", [(1, 0.0), (2, 0.0), (3, -0.3), (4, -0.3)])
+def test_a_piece_that_does_not_go_on_in_time_fails(piece, duration):
+    leaves = good()
+    leaves["durations"][0, piece] = duration
+    leaves["times"] = np.cumsum(leaves["durations"], axis=1)[:, 1::2]
+    assert_fails(leaves, "catch time", excess=-duration)
+
+
+@pytest.mark.parametrize("order", [0, 1, 2, 3])
+def test_a_shifted_head_state_is_seen_in_every_derivative(order):
+    leaves = good()
+    leaves["head_state"][0, order, 1] += 0.1
+    period = TIMES[1] / 4  # the two pieces that are not flown do not count
+    assert_fails(leaves, "head state", excess=0.1 * period**order / math.factorial(order), time=0.0)
+
+
+def test_a_jump_between_pieces_is_seen():
+    leaves = good()
+    leaves["coeffs"][0, 2:, 0, 1] += 0.01
+    assert_fails(leaves, "continuity", excess=0.01, time=TIMES[0])
+
+
+@pytest.mark.parametrize(
+    "limit, name, field, sign",
+    [
+        ("speed", "speed", "max_speed", 1),
+        ("max_thrust", "thrust high", "max_thrust", 1),
+        ("body_rate", "body rate", "max_body_rate", 1),
+        ("min_thrust", "thrust low", "min_thrust", -1),
+        ("min_height", "ground", "min_height", -1),
+    ],
+)
+def test_a_limit_moved_below_what_is_flown_fails_by_name_and_excess(limit, name, field, sign):
+    leaves = good()
+    value = getattr(judge(leaves), field)
+    leaves[f"limits.{limit}"] = value / (1.0 + 0.25 * sign)
+    verdict = assert_fails(leaves, name, excess=0.25)
+    assert ("25.00% above" if sign > 0 else "25.00% below") in verdict.sentence(0)
+    assert verdict.num_caught[0] == 2
+    leaves[f"limits.{limit}"] = value / (1.0 + 0.0009 * sign)
+    assert judge(leaves).success[0]
+    assert judge(leaves | {f"limits.{limit}": np.array([sign * np.inf])}).success[0]
+
+
+def test_a_target_beside_the_hoop_is_missed():
+    leaves = good()
+    leaves["targets.ball.pos"][0, 2, :2] += [0.12, -0.16]
+    verdict = assert_fails(leaves, "net", excess=0.2 / NET_RADIUS - 1.0, time=TIMES[0])
+    assert verdict.net_distance[0, 0] == pytest.approx(0.2)
+    np.testing.assert_array_equal(verdict.caught, [[False, True, False]])
+    assert_fails(leaves, "net", net_test="ball", tolerance=0.05)
+
+
+@pytest.mark.parametrize("above", [-0.02, 0.02])
+def test_a_target_above_or_below_the_hoop_is_not_in_its_plane(above):
+    leaves = good()
+    leaves["targets.ball.pos"][0, 0, 2] += above
+    verdict = assert_fails(leaves, "net plane", excess=0.02, time=TIMES[1])
+    assert verdict.net_offset[0, 1] == pytest.approx(above)
+    np.testing.assert_array_equal(verdict.caught, [[True, False, False]])
+    assert judge(leaves, contact_tolerance=0.021).success[0]
+    assert judge(leaves, net_test="ball").success[0]
+
+
+def test_radius_and_plane_are_tested_each_on_its_own():
+    hoop = np.array(START) + [0.0, 0.0, NET_HEIGHT]
+    leaves = one_target(pos=hoop + [0.0, 0.999 * NET_RADIUS, 0.02])
+    assert judge(leaves, contact_tolerance=0.021).success[0]
+    assert_fails(leaves, "net", net_test="ball")
+
+
+@pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (0.0, 0.6, 0.8), (0.0, 0.0, 1.0)])
+def test_the_ball_test_takes_the_distance_in_any_direction(direction):
+    hoop = np.array(START) + [0.0, 0.0, NET_HEIGHT]
+    protocol = {"net_test": "ball", "tolerance": 0.05}
+    inside = one_target(pos=hoop + 1.049 * NET_RADIUS * np.array(direction))
+    outside = one_target(pos=hoop + 1.051 * NET_RADIUS * np.array(direction))
+    assert judge(inside, **protocol).success[0]
+    assert_fails(outside, "net", excess=0.051, **protocol)
+    assert not judge(inside, net_test="ball").success[0]
+
+
+@pytest.mark.parametrize("degrees", [29.0, 45.0, 180.0])
+def test_the_angle_is_that_between_the_nets_axis_and_the_targets_way_back(degrees):
+    angle = math.radians(degrees)
+    leaves = one_target(vel=(2.0 * math.sin(angle), 0.0, -2.0 * math.cos(angle)))
+    assert judge(leaves).angle[0, 0] == pytest.approx(angle)
+    if degrees < 30.0:
+        assert judge(leaves).success[0]
+    else:
+        verdict = assert_fails(leaves, "angle", excess=degrees / 30.0 - 1.0, time=1.1)
+        assert verdict.net_distance[0, 0] < 1e-12 and not verdict.caught.any()
+
+
+def test_a_target_at_rest_has_no_angle_to_fail():
+    verdict = judge(one_target(vel=(0.0, 0.0, 0.0)))
+    assert verdict.success[0] and np.isnan(verdict.angle[0, 0])
+
+
+def test_a_tilted_thrust_tilts_the_net():
+    tilt = math.radians(20.0)
+    axis = np.array([math.sin(tilt), 0.0, math.cos(tilt)])
+    push = GRAVITY * math.tan(tilt)  # constant, along x: thrust along `axis`
+    durations, time = np.array([0.3, 0.6]), 0.9
+    end = np.array([0.5 * push * time**2, 0.0, 1.2])
+    path = [Polynomial([0.0, 0.0, 0.5 * push]), Polynomial([0.0]), Polynomial([1.2])]
+    across = np.array([-axis[2], 0.0, axis[0]])
+    leaves = one_target(
+        pos=end + NET_HEIGHT * axis + 0.1 * across - 0.003 * axis, vel=-4.0 * axis, time=time
+    ) | {"coeffs": cut(path, durations)[None], "durations": durations[None]}
+    leaves["head_state"][0, 2, 0] = push
+    verdict = judge(leaves)
+    assert verdict.success[0], verdict.sentence(0)
+    assert verdict.angle[0, 0] == pytest.approx(0.0, abs=1e-12)
+    assert verdict.net_offset[0, 0] == pytest.approx(-0.003)
+    assert verdict.net_distance[0, 0] == pytest.approx(math.hypot(0.1, 0.003))
+
+
+def test_free_fall_has_no_attitude():
+    leaves = one_target()
+    leaves["coeffs"] = cut(
+        [Polynomial([0.0]), Polynomial([0.0]), Polynomial([9.0, 0.0, -0.5 * GRAVITY])], (0.4, 0.7)
+    )[None]
+    leaves["head_state"][0, 0, 2], leaves["head_state"][0, 2, 2] = 9.0, -GRAVITY
+    for name in ("speed", "min_thrust"):
+        leaves[f"limits.{name}"] = np.array([np.inf if name == "speed" else 0.0])
+    verdict = assert_fails(leaves, "body rate")
+    assert np.isinf(verdict.max_body_rate[0]) and not verdict.caught.any()
+    assert "without attitude" in verdict.sentence(0)
+
+
+@pytest.mark.parametrize("drag", [0.0, 1e-9, 1e-3, 0.3, (0.1, 0.6, 4.0), -0.2])
+def test_a_ball_with_linear_drag_is_where_integration_puts_it(drag):
+    drag, time = np.broadcast_to(drag, 3).astype(float), 1.7
+    pos, vel = np.array([1.0, -2.0, 3.0]), np.array([-4.0, 1.0, 6.0])
+
+    def fall(_, state):
+        return np.concatenate([state[3:], -drag * state[3:] - [0.0, 0.0, GRAVITY]])
+
+    end = solve_ivp(
+        fall, (0.0, time), np.concatenate([pos, vel]), method="DOP853", rtol=1e-12, atol=1e-12
+    ).y[:, -1]
+    leaves = one_target(end[:3] - [0.0, 0.0, NET_HEIGHT], time=time, gravity=GRAVITY)
+    leaves["targets.ball.pos"][0, 0], leaves["targets.ball.vel"][0, 0] = pos, vel
+    leaves["targets.drag"][0, 0] = drag
+    verdict = judge(leaves)
+    assert verdict.net_distance[0, 0] < 1e-9
+    angle = math.acos(-end[5] / np.linalg.norm(end[3:]))
+    assert verdict.angle[0, 0] == pytest.approx(angle, abs=1e-8)
+
+
+def with_targets(leaves, targets):
+    """The leaves with targets of another class, their leaves of one target without axes."""
+    kept = {name: leaf for name, leaf in leaves.items() if not name.startswith("targets.")}
+    return kept | {f"targets.{k}": np.asarray(v, float)[None, None] for k, v in targets.items()}
+
+
+def test_a_harmonic_target_is_caught_where_it_swings():
+    leaves = one_target()
+    vel, amplitude = np.array([0.2, 0.0, -1.0]), np.array([0.0, 0.1, 0.4])
+    rate, phase = 3.0, 0.7
+    swing = rate * 1.1 + phase
+    start = np.array(START) + [0.0, 0.0, NET_HEIGHT] - 1.1 * vel - amplitude * math.sin(swing)
+    path = {"pos": start, "vel": vel, "amplitude": amplitude, "rate": rate, "phase": phase}
+    verdict = judge(with_targets(leaves, path))
+    way = vel + amplitude * rate * math.cos(swing)
+    assert verdict.net_distance[0, 0] < 1e-12
+    assert verdict.angle[0, 0] == pytest.approx(math.acos(-way[2] / np.linalg.norm(way)))
+
+
+@pytest.mark.parametrize("time", [0.45, 0.999, 1.1, 1.3])
+def test_a_table_is_read_by_cubic_convolution(time):
+    # The kernel reproduces quadratics: the nodes of a parabola give the parabola.
+    pos, vel = np.array([1.0, 0.3, 2.0]), np.array([-2.0, 0.1, 3.0])
+    nodes = (np.arange(30) - 1.0)[:, None] * 0.05
+    pull = [0.0, 0.0, -GRAVITY]
+    table = {"pos": pos + nodes * vel + 0.5 * nodes**2 * pull, "vel": vel + nodes * pull}
+    end = pos + time * vel + 0.5 * time**2 * np.array(pull)
+    leaves = one_target(end - [0.0, 0.0, NET_HEIGHT], time=time)
+    verdict = judge(with_targets(leaves, table | {"resolution": 0.05}))
+    assert verdict.net_distance[0, 0] < 1e-12
+    way = vel + time * np.array(pull)
+    assert verdict.angle[0, 0] == pytest.approx(math.acos(-way[2] / np.linalg.norm(way)))
+
+
+def test_beyond_its_table_a_target_goes_straight_on():
+    nodes = (np.arange(8) - 1.0)[:, None] * 0.1  # to 0.5 s
+    way = np.array([0.1, 0.0, -2.0])
+    table = {"pos": [3.0, 0.0, 4.0] + nodes * way, "vel": np.tile(way, (8, 1)), "resolution": 0.1}
+    leaves = one_target(np.array([3.0, 0.0, 4.0 - NET_HEIGHT]) + 1.1 * way)
+    assert judge(with_targets(leaves, table)).success[0]
+
+
+def test_a_class_of_the_users_own_answers_through_a_function():
+    leaves = good()
+    known = judge(leaves)
+    scenario, plan = objects(leaves)
+    path = scenario.targets
+    scenario.targets = "falling"
+
+    def states(targets, order, times):
+        assert targets == "falling" and order.dtype.kind == "i"
+        pos = path.ball.pos[np.arange(len(order))[:, None], order].copy()
+        for lane, place in np.ndindex(*order.shape):
+            pos[lane, place, 2] -= drop(times[lane, place])
+        return pos, np.full(pos.shape, [0.0, 0.0, -1.0])
+
+    verdict = referee_catches(scenario, plan, target_states=states)
+    assert verdict.success[0], verdict.sentence(0)
+    np.testing.assert_array_equal(verdict.caught, known.caught)
+    with pytest.raises(ValueError, match="targets of class str need target_states"):
+        referee_catches(scenario, plan)
+    with pytest.raises(ValueError, match=r"target_states' pos must be \(1, 3, 3\), got \(3,\)"):
+        referee_catches(scenario, plan, target_states=lambda *_: (np.zeros(3), np.zeros(3)))
+
+
+def unequal_lanes():
+    fast, shifted, missed, swapped = good(), good(), good(), good()
+    fast["limits.speed"] /= 4.0
+    shifted["head_state"][0, 0] += 0.2
+    missed["targets.ball.pos"][0, 2, 0] += 0.5
+    swapped["order"][0] = [0, 2, 1]
+    swapped["horizon"][:] = 3.0
+    single = good()
+    single["present"][0], single["order"][0] = [False, False, True], [2, 1, 0]
+    single["durations"][0, 2:] = 0.0
+    return [good(), fast, single, shifted, missed, swapped]
+
+
+def assert_same(a: CatchVerdict, b: CatchVerdict, lanes=slice(None)):
+    for name, left in vars(a).items():
+        right = getattr(b, name)
+        if left.dtype.kind == "f":
+            np.testing.assert_allclose(left[lanes], right[lanes], rtol=1e-12, atol=1e-12)
+        else:
+            np.testing.assert_array_equal(left[lanes], right[lanes], err_msg=name)
+
+
+@pytest.mark.parametrize("chunk", [1, 4, 512])
+def test_batch_equals_loop(chunk):
+    lanes = unequal_lanes()
+    batch = judge(stack(*lanes), chunk=chunk)
+    for i, lane in enumerate(lanes):
+        assert_same(judge(lane), CatchVerdict(**{k: v[i : i + 1] for k, v in vars(batch).items()}))
+    np.testing.assert_array_equal(batch.failed_limit, ["", "speed", "", "head state", "net", "net"])
+    np.testing.assert_array_equal(batch.num_caught, [2, 2, 1, 2, 1, 0])
+
+
+@pytest.mark.parametrize("name", sorted(good().keys() - {"order", "present"}))
+def test_a_nan_fails_its_own_lane_and_no_other(name):
+    leaves = stack(*unequal_lanes())
+    clean = judge(leaves)
+    leaves[name][(0,) + (0,) * (leaves[name].ndim - 1)] = np.nan  # the good one's
+    verdict = judge(leaves)
+    assert not verdict.success[0] and verdict.failed_limit[0] == "not finite"
+    assert verdict.sentence(0) == "not finite: the plan or its scenario is not finite"
+    assert not verdict.caught[0].any()
+    assert_same(clean, verdict, lanes=slice(1, None))
+
+
+@pytest.mark.parametrize("name", ["coeffs", "durations", "times", "targets.drag", "net.height"])
+@pytest.mark.parametrize("value", [1e300, -1e30, np.inf])
+def test_absurd_numbers_fail_without_a_warning(name, value):
+    leaves = good()
+    leaves[name] = np.full_like(leaves[name], value)
+    assert not judge(leaves).success[0]
+
+
+def test_float32_structs_of_the_planner_are_taken_as_they_are():
+    kinds = {"f": jnp.float32, "i": jnp.int32, "b": bool}
+    leaves = {
+        name: jnp.asarray(leaf, kinds[leaf.dtype.kind])
+        for name, leaf in stack(good(), good()).items()
+    }
+    plain, _ = objects(leaves)
+    blank = np.full(2, np.nan)  # what the plan claims beside order and times is not read
+    scenario = CatchScenario(
+        targets=BallPath(
+            ball=BallState(**vars(plain.targets.ball)),
+            drag=plain.targets.drag,
+            gravity=plain.targets.gravity,
+        ),
+        present=plain.present,
+        horizon=plain.horizon,
+        order=blank,
+        times=blank,
+        head_state=plain.head_state,
+        gravity=plain.gravity,
+        net=Net(**vars(plain.net)),
+        limits=CatchLimits(**vars(plain.limits)),
+    )
+    plan = CatchPlan(
+        trajectory=PiecewisePolynomial(coeffs=leaves["coeffs"], durations=leaves["durations"]),
+        order=leaves["order"],
+        times=leaves["times"],
+        cost=blank,
+        violation=blank,
+        iterations=blank,
+        status=blank,
+    )
+    verdict = referee_catches(scenario, plan)
+    assert verdict.success.all(), verdict.sentence(0)
+    assert verdict.max_speed.dtype == np.float64
+
+
+def test_an_empty_batch_has_an_empty_verdict():
+    verdict = judge({name: leaf[:0] for name, leaf in good().items()})
+    assert verdict.success.shape == (0,) and verdict.caught.shape == (0, 3)
+
+
+def test_wrong_arguments_are_named():
+    leaves = good()
+    with pytest.raises(ValueError, match=r"samples must be >= 200, got 50"):
+        judge(leaves, samples=50)
+    with pytest.raises(ValueError, match=r"chunk must be >= 1, got 0"):
+        judge(leaves, chunk=0)
+    with pytest.raises(ValueError, match=r'net_test must be "plane" or "ball", got \'hoop\''):
+        judge(leaves, net_test="hoop")
+    with pytest.raises(ValueError, match=r"net.radius must be \(1,\), got \(\)"):
+        judge(leaves | {"net.radius": np.array(0.1)})
+    with pytest.raises(ValueError, match=r"present must be \(1, N\), got \(3,\)"):
+        judge(leaves | {"present": leaves["present"][0]})
+    with pytest.raises(ValueError, match=r"order must be \(1, 3\), got \(1, 2\)"):
+        judge(leaves | {"order": leaves["order"][:, :2]})
+    with pytest.raises(ValueError, match=r"N \* M pieces for N = 3 targets, got 5"):
+        judge(leaves | {"coeffs": leaves["coeffs"][:, :5]})
+    with pytest.raises(ValueError, match=r"targets.drag must be \(1, 3, 3\), got \(1, 3\)"):
+        judge(leaves | {"targets.drag": leaves["targets.drag"][..., 0]})
+
+
+def test_every_limit_has_its_sentence():
+    lanes = len(LIMITS)
+    blank = {name: np.zeros(lanes) for name in CatchVerdict.__dataclass_fields__}
+    verdict = CatchVerdict(**blank | {"failed_limit": np.array(LIMITS)})
+    for lane, name in enumerate(LIMITS):
+        assert verdict.sentence(lane).startswith(f"{name}: ")
