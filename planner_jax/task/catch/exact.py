@@ -29,12 +29,12 @@ from planner_jax.task.catch.chain import (
     targets_at,
 )
 from planner_jax.task.catch.plan import CatchPlan
+from planner_jax.task.catch.scales import shipped_scale
 from planner_jax.task.catch.scenario import CatchScenario
 from planner_jax.trajectory.proportional_minco import ProportionalMinco, proportional_minco
 
 _ORDER = 4  # minimum snap
 _CATCH_VARIABLES = 12  # log duration, offset in the net (2), velocity, acceleration, jerk
-_FIRST_SCALE = (0.03, 0.5, 0.5, 0.6, 0.6, 0.6, 2.0, 2.0, 2.0, 40.0, 40.0, 30.0)
 # Squares carry twice the relative margin.
 _MARGINS = np.array([2.0, 2.0, 2.0, 2.0, 1.0])[:, None, None]
 _RIM = 0.9  # share of the net's radius that a planned catch may use
@@ -87,7 +87,7 @@ class ExactCatch:
         if len(self.proportions) < 2:
             raise ValueError(f"proportions must be of >= 2 pieces, got {self.proportions}")
         if not self.scale:
-            object.__setattr__(self, "scale", (0.3,) * self.num_offsets + _FIRST_SCALE)
+            object.__setattr__(self, "scale", shipped_scale(f"exact-{self.num_pieces}"))
 
     @property
     def num_offsets(self) -> int:

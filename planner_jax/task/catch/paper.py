@@ -1,0 +1,245 @@
+"""The `catch` planner of paper 000: contact and attitude by penalties (its eqs 18-28)."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+from planner_jax.cost.limits import ground_excess, speed_excess
+from planner_jax.cost.penalty import joined_trapezoid_weights, smoothed_hinge, steep_hinge
+from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
+from planner_jax.optimise.problem import Round
+from planner_jax.robot.quadrotor import body_rate_squared, body_z, net_thrust
+from planner_jax.task.catch.chain import (
+    CatchContext,
+    Chain,
+    chain_energy,
+    chain_motion,
+    chain_rows,
+    chain_trajectory,
+    ordered_context,
+    targets_at,
+)
+from planner_jax.task.catch.plan import CatchPlan
+from planner_jax.task.catch.scenario import CatchScenario
+from planner_jax.task.catch.scales import shipped_scale
+from planner_jax.trajectory.minimum_jerk import minimum_jerk
+from planner_jax.trajectory.polynomial import evaluate
+from planner_jax.trajectory.proportional_minco import (
+    ProportionalMinco,
+    equal_pieces,
+    proportional_minco,
+)
+
+_ORDER = 4  # minimum snap
+_COST_UNIT = 1e3  # the solver wants curvatures of moderate size
+
+
+@struct.dataclass
+class Catch:
+    """The N catches that a point describes."""
+
+    times: Array  # (N,) [s]
+    durations: Array  # (N,) [s], of the segments
+    tail_states: Array  # (N, 4, 3) of the quadrotor
+    miss: Array  # (N,) [m], from the net's centre to the ball
+    angle_excess: Array  # (N,) cos(theta_safe) + z_d . v / |v|; <= 0 is good
+
+
+@dataclasses.dataclass(frozen=True)
+class PaperCatch:
+    """The joint optimisation of catching time and state of paper 000.
+
+    Cost (eqs 18-28): integral |snap|^2 + rho T + the smoothed penalties of speed, body rate,
+    thrust and ground by the trapezoid rule + the penalties of the net's distance (eqs 22-24)
+    and angle (eq. 25). The paper gives neither weights nor thresholds: they are those of the
+    published C++ protocol, squares in their own units. Pieces of a segment are equally long
+    and the jerk at the last catch is zero.
+
+    The variables are the paper's in other coordinates, so the optima are the same: waypoints
+    as whitened offsets, the position at the catch as the net's distance from the ball.
+    Decision variables, N segments with 3 (M - 1) + 13 each: offsets, log duration, miss,
+    velocity, acceleration and jerk (unused at the last catch).
+    """
+
+    num_pieces: int = 4  # M, of one segment
+    nodes: int = 16  # penalty intervals a piece
+    time_weight: float = 1000.0  # rho
+    limit_weight: float = 1e5
+    ground_weight: float = 1e7
+    miss_weight: float = 1e4
+    angle_weight: float = 1e2
+    hinge_width: float = 0.01  # mu, and eps of the angle
+    rounds: tuple[Round, ...] = (
+        Round(starts=1, solver=LbfgsConfig(max_steps=300, tolerance=1e-7, patience=8)),
+    )
+    scale: tuple[float, ...] = ()  # of one segment
+
+    def __post_init__(self) -> None:
+        if self.num_pieces < 2:
+            raise ValueError(f"num_pieces must be >= 2, got {self.num_pieces}")
+        if not self.scale:
+            object.__setattr__(self, "scale", shipped_scale(f"catch-{self.num_pieces}"))
+
+    @property
+    def maps(self) -> ProportionalMinco:
+        """Constant maps from boundary and offsets to one segment."""
+        return proportional_minco(_ORDER, equal_pieces(self.num_pieces))
+
+    @property
+    def num_offsets(self) -> int:
+        """Number of waypoint variables of a segment."""
+        return 3 * (self.num_pieces - 1)
+
+    def prepare(self, scenario: CatchScenario) -> CatchContext:
+        """The targets in the order of catching."""
+        return ordered_context(scenario)
+
+    def guesses(self, context: CatchContext, num: int) -> Array:
+        """From rest to rest below every ball, on minimum-jerk primitives, (1, n)."""
+        if num != 1:
+            raise ValueError(f"starts must be 1, got {num}")
+        scenario, dtype = context.scenario, context.times.dtype
+        durations = jnp.maximum(jnp.diff(context.times, prepend=jnp.zeros((1,), dtype)), 0.05)
+        ball = targets_at(context.targets, context.times)
+        below = ball.pos - scenario.net.height * jnp.array([0.0, 0.0, 1.0], dtype)
+        still = jnp.zeros((2, 3), dtype)
+        begins = jnp.concatenate([scenario.head_state[None, 0], below[:-1]])
+
+        def waypoints(begin: Array, end: Array, duration: Array) -> Array:
+            states = [jnp.concatenate([pos[None], still]) for pos in (begin, end)]
+            primitive = minimum_jerk(*states, duration)
+            shares = jnp.asarray(np.arange(1, self.num_pieces) / self.num_pieces, dtype)
+            return jax.vmap(lambda share: evaluate(primitive, share * duration))(shares)
+
+        tails = jnp.zeros((durations.size, 4, 3), dtype).at[:, 0].set(below)
+        rows = chain_rows(scenario.head_state, tails, durations / self.num_pieces)
+        columns = jnp.concatenate([rows, jax.vmap(waypoints)(begins, below, durations)], axis=1)
+        offsets = jnp.einsum(
+            "oc,nci->noi",
+            jnp.asarray(self.maps.offsets, dtype),
+            columns,
+            precision=jax.lax.Precision.HIGHEST,
+        )
+        natural = jnp.concatenate(
+            [
+                offsets.reshape(durations.size, -1),
+                jnp.log(durations)[:, None],
+                jnp.zeros((durations.size, 12), dtype),
+            ],
+            axis=1,
+        )
+        return (natural / jnp.asarray(self.scale, dtype)).reshape(1, -1)
+
+    def catches(self, natural: Array, context: CatchContext) -> Catch:
+        """The catches that the variables (N, 13) after the waypoint offsets describe."""
+        scenario, net = context.scenario, context.scenario.net
+        durations = jnp.exp(natural[:, 0])
+        times = jnp.cumsum(jnp.where(context.active, durations, 0.0))
+        ball = targets_at(context.targets, times)
+        miss, acc = natural[:, 1:4], natural[:, 7:10]
+        axis = body_z(acc, scenario.gravity)
+        pos = ball.pos - net.height * axis + miss
+        last = jnp.sum(context.active) - 1
+        flying = jnp.arange(times.size) != last
+        jerk = jnp.where(flying[:, None], natural[:, 10:13], 0.0)
+        speed_squared = jnp.sum(ball.vel**2, axis=1)
+        moving = speed_squared > 1e-12
+        speed = jnp.sqrt(jnp.where(moving, speed_squared, 1.0))
+        facing = -jnp.sum(axis * ball.vel, axis=1) / speed
+        miss_squared = jnp.sum(miss**2, axis=1)
+        missing = miss_squared > 0.0
+        return Catch(
+            times=times,
+            durations=durations,
+            tail_states=jnp.stack([pos, natural[:, 4:7], acc, jerk], axis=1),
+            miss=jnp.where(missing, jnp.sqrt(jnp.where(missing, miss_squared, 1.0)), 0.0),
+            angle_excess=jnp.where(moving, jnp.cos(net.max_angle) - facing, -1.0),
+        )
+
+    def _unpack(self, point: Array, context: CatchContext) -> tuple[Chain, Catch]:
+        """Segments and catches at a point."""
+        scale = jnp.asarray(self.scale, point.dtype)
+        natural = point.reshape(-1, scale.size) * scale
+        catch = self.catches(natural[:, self.num_offsets :], context)
+        piece_durations = catch.durations / self.num_pieces
+        rows = chain_rows(context.scenario.head_state, catch.tail_states, piece_durations)
+        offsets = natural[:, : self.num_offsets].reshape(natural.shape[0], -1, 3)
+        return Chain(rows=rows, offsets=offsets, piece_durations=piece_durations), catch
+
+    def _terms(self, point: Array, context: CatchContext) -> tuple[Array, Array, Chain, Catch]:
+        """Violations along the way, (4, N, K), in their own units, and the rest of the cost."""
+        chain, catch = self._unpack(point, context)
+        scenario, limits = context.scenario, context.scenario.limits
+        motion = chain_motion(self.maps, self.nodes, chain)
+        thrust = jnp.sqrt(
+            jnp.maximum(jnp.sum(net_thrust(motion.acc, scenario.gravity) ** 2, axis=-1), 1e-6)
+        )
+        middle = 0.5 * (limits.max_thrust + limits.min_thrust)
+        half = 0.5 * (limits.max_thrust - limits.min_thrust)
+        rate = body_rate_squared(motion.acc, motion.jerk, scenario.gravity)
+        along = jnp.stack(
+            [
+                speed_excess(motion.vel, limits) * limits.speed**2,
+                rate - limits.body_rate**2,
+                (thrust - middle) ** 2 - half**2,
+                ground_excess(motion.height, limits),
+            ]
+        )
+        at_catch = self.miss_weight * steep_hinge(catch.miss, scenario.net.radius)
+        at_catch += self.angle_weight * steep_hinge(catch.angle_excess, self.hinge_width)
+        energy = chain_energy(self.maps, chain)
+        rest = jnp.sum(jnp.where(context.active, at_catch + energy, 0.0))
+        return along, rest + self.time_weight * catch.times[-1], chain, catch
+
+    def objective(self, point: Array, context: CatchContext) -> Evaluation:
+        """The paper's cost over 1000. It names no violation, so the last iterate is the plan."""
+        along, rest, chain, _ = self._terms(point, context)
+        hinges = jnp.asarray(self._weights(), point.dtype) * smoothed_hinge(along, self.hinge_width)
+        weights = joined_trapezoid_weights(self.nodes, self.maps.proportions)
+        spans = chain.piece_durations[:, None] * jnp.asarray(weights, point.dtype)
+        penalty = jnp.sum(jnp.where(context.active[:, None], spans * jnp.sum(hinges, axis=0), 0.0))
+        cost = penalty + rest
+        return Evaluation(cost=cost / _COST_UNIT, violation=jnp.zeros_like(cost))
+
+    def _weights(self) -> np.ndarray:
+        """Weights of the four limits along the way."""
+        return np.array([self.limit_weight] * 3 + [self.ground_weight])[:, None, None]
+
+    def residuals(self, point: Array, context: CatchContext) -> Array:
+        """The cost's parts as residuals of like curvature, for `measure_scale`."""
+        along, _, chain, catch = self._terms(point, context)
+        weights = joined_trapezoid_weights(self.nodes, self.maps.proportions)
+        spans = chain.piece_durations[:, None] * jnp.asarray(weights, point.dtype)
+        unit = jnp.asarray(self._weights(), point.dtype) / _COST_UNIT
+        # As stiff as a hinge that bends over a tenth of the squared limit.
+        inside = jnp.maximum(along, 0.0) * jnp.sqrt(unit * spans / 2.5)
+        miss = jnp.sqrt(6.0 * self.miss_weight * context.scenario.net.radius / _COST_UNIT)
+        energy = jnp.sqrt(2.0 * jnp.maximum(chain_energy(self.maps, chain), 1e-6) / _COST_UNIT)
+        late = jnp.sqrt(2.0 * self.time_weight * catch.durations / _COST_UNIT)
+        parts = (inside, miss * catch.miss, energy, late)
+        return jnp.concatenate([part.ravel() for part in parts])
+
+    def decode(self, point: Array, context: CatchContext) -> CatchPlan:
+        """The plan at a point, its violation that of the protocol's samples."""
+        along, _, chain, catch = self._terms(point, context)
+        limits, net = context.scenario.limits, context.scenario.net
+        half = 0.5 * (limits.max_thrust - limits.min_thrust)
+        units = jnp.stack([limits.speed**2, limits.body_rate**2, half**2, limits.min_height])
+        relative = jnp.max(along / units[:, None, None], axis=2)  # (4, N)
+        relative = jnp.concatenate(
+            [relative, (catch.miss / net.radius - 1.0)[None], catch.angle_excess[None]]
+        )
+        violation = jnp.max(jnp.where(context.active, relative, -1.0))
+        return CatchPlan(
+            trajectory=chain_trajectory(self.maps, chain, context.active),
+            order=context.scenario.order,
+            times=catch.times,
+            cost=jnp.zeros_like(violation),
+            violation=violation,
+            iterations=jnp.zeros((), jnp.int32),
+            status=jnp.zeros((), jnp.int32),
+        )
