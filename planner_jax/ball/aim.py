@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from planner_jax.arithmetic import reciprocal
 from planner_jax.ball.flight import BallState, fly, gravity_vector
 
 _NEWTON_STEPS = 3
@@ -22,7 +23,7 @@ def aim_drag_free(pos: Array, target: Array, flight_time: Array, gravity: Array)
     Returns:
         (3,) [m/s].
     """
-    return (target - pos) / flight_time - 0.5 * gravity_vector(gravity) * flight_time
+    return (target - pos) * reciprocal(flight_time) - 0.5 * gravity_vector(gravity) * flight_time
 
 
 def aim_with_drag(

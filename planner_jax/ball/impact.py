@@ -3,6 +3,8 @@
 import jax.numpy as jnp
 from jax import Array
 
+from planner_jax.arithmetic import inverse_sqrt, reciprocal
+
 
 def racket_impact(ball_vel: Array, racket_vel: Array, normal: Array, restitution: Array) -> Array:
     """Ball velocity after the bounce.
@@ -41,6 +43,7 @@ def required_impact(
     change = ball_vel_after - ball_vel
     size_squared = jnp.sum(change**2)
     distinct = size_squared > 0.0
-    normal = change / jnp.sqrt(jnp.where(distinct, size_squared, 1.0))
-    normal_speed = jnp.sum((restitution * ball_vel + ball_vel_after) * normal) / (1.0 + restitution)
+    normal = change * inverse_sqrt(jnp.where(distinct, size_squared, 1.0))
+    mean = (restitution * ball_vel + ball_vel_after) * reciprocal(1.0 + restitution)
+    normal_speed = jnp.sum(mean * normal)
     return normal, normal_speed

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
+from planner_jax.arithmetic import reciprocal
 from planner_jax.ball.flight import BallState, rk4_step
 
 
@@ -82,8 +83,8 @@ def target_at(table: PathTable, time: Array) -> BallState:
         time: () [s].
     """
     chex.assert_rank(time, 0)
-    inside = jnp.clip(time, 0.0, horizon_of(table))
-    position = inside / table.resolution
+    inside = jax.lax.clamp(jnp.zeros_like(time), time, horizon_of(table))
+    position = inside * reciprocal(table.resolution)
     index = jnp.clip(jnp.floor(position), 0, table.pos.shape[0] - 4)
     weights = convolution_weights(position - index)
     first = index.astype(jnp.int32)

@@ -14,9 +14,11 @@ def smoothed_hinge(x: Array, width: float) -> Array:
         x: (...) violation, in the unit of the constraint.
         width: mu > 0.
     """
-    inside = jnp.clip(x, 0.0, width)
-    blend = (width - 0.5 * inside) * (inside / width) ** 3
-    return blend + jnp.maximum(x - width, 0.0)
+    # The slopes of `clip` and `maximum` divide; those of `where` do not, which is quicker.
+    below = x < width
+    inside = jnp.where(below, jnp.where(x > 0.0, x, 0.0), width)
+    blend = (width - 0.5 * inside) * (inside * (1.0 / width)) ** 3
+    return blend + jnp.where(below, 0.0, x - width)
 
 
 def steep_hinge(x: Array, width: float) -> Array:

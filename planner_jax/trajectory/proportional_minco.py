@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from planner_jax.arithmetic import components, reciprocal
 from planner_jax.trajectory.minco import hermite_energy, hermite_map
 from planner_jax.trajectory.polynomial import Motion, PiecewisePolynomial, derivative_factors
 
@@ -113,7 +114,7 @@ def proportional_minco(order: int, proportions: tuple[float, ...]) -> Proportion
 
 def boundary_rows(head_state: Array, tail_state: Array, piece_duration: Array) -> Array:
     """Boundary in time over h, (2s, 3): derivative d times h^d."""
-    scale = piece_duration ** jnp.arange(head_state.shape[0])[:, None]
+    scale = jnp.stack([piece_duration**k for k in range(head_state.shape[0])])[:, None]
     return jnp.concatenate([head_state * scale, tail_state * scale])
 
 
@@ -129,18 +130,18 @@ def sample_motion(
         offsets: (M - 1, 3) whitened offsets y.
         piece_duration: () h = T / M [s].
     """
-    columns = jnp.concatenate([rows, offsets])
-    height = jnp.matmul(
-        jnp.asarray(maps.sample_matrix(nodes, 0), rows.dtype),
-        columns[:, 2],
+    # One product for everything, samples along the rows: on a CPU each product, division and
+    # sum of its own costs more than its arithmetic.
+    matrices = np.stack([maps.sample_matrix(nodes, d) for d in range(4)])
+    unit = jnp.matmul(
+        jnp.concatenate([rows, offsets]).T,
+        jnp.asarray(matrices.reshape(-1, matrices.shape[-1]).T, rows.dtype),
         precision=lax.Precision.HIGHEST,
-    )
-    rates = np.concatenate([maps.sample_matrix(nodes, d) for d in (1, 2, 3)])
-    vel, acc, jerk = jnp.split(
-        jnp.matmul(jnp.asarray(rates, rows.dtype), columns, precision=lax.Precision.HIGHEST), 3
-    )
-    h = piece_duration
-    return Motion(height=height, vel=vel / h, acc=acc / h**2, jerk=jerk / h**3)
+    ).reshape(3, 4, -1)
+    rate = reciprocal(piece_duration)
+    rates = jnp.stack([jnp.ones_like(rate), rate, rate * rate, rate * rate * rate])
+    pos, vel, acc, jerk = components(jnp.moveaxis(unit * rates[:, None], (0, 1), (1, 2)))
+    return Motion(height=pos[:, 2], vel=vel, acc=acc, jerk=jerk)
 
 
 def trajectory_energy(maps: ProportionalMinco, rows: Array, offsets: Array, piece_duration: Array):
@@ -153,9 +154,10 @@ def trajectory_energy(maps: ProportionalMinco, rows: Array, offsets: Array, piec
         piece_duration: () h = T / M [s].
     """
     gram = jnp.asarray(maps.boundary_energy, rows.dtype)
-    boundary = jnp.sum(rows * jnp.matmul(gram, rows, precision=lax.Precision.HIGHEST))
+    # Sums, because a product this small costs more to call than to compute.
+    boundary = jnp.sum(rows * jnp.sum(gram[..., None] * rows, axis=1))
     total = boundary + maps.offset_energy * jnp.sum(offsets**2)
-    return total / piece_duration ** (2 * maps.order - 1)
+    return total * reciprocal(piece_duration) ** (2 * maps.order - 1)
 
 
 def proportional_trajectory(

@@ -1,0 +1,49 @@
+"""Arithmetic in the forms that compile to few loops on a CPU.
+
+XLA compiles a division, a root or a sum into a loop of its own, and one small problem waits
+for the number of loops, not for what they compute.
+"""
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+
+@jax.custom_jvp
+def reciprocal(x: Array) -> Array:
+    """1 / x for x (...) other than zero."""
+    return 1.0 / x
+
+
+@reciprocal.defjvp
+def _reciprocal_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    y = reciprocal(*primals)
+    return y, -y * y * tangents[0]
+
+
+@jax.custom_jvp
+def inverse_sqrt(x: Array) -> Array:
+    """1 / sqrt(x) for x (...) > 0."""
+    return lax.rsqrt(jnp.asarray(x))
+
+
+@inverse_sqrt.defjvp
+def _inverse_sqrt_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    y = inverse_sqrt(*primals)
+    return y, -0.5 * y * y * y * tangents[0]
+
+
+def at_least(x: Array, floor: float) -> Array:
+    """The larger of x (...) and a constant; at a tie the slope is one.
+
+    The slope of `jnp.maximum` divides by the number of arguments that tie.
+    """
+    return jnp.where(x < floor, floor, x)
+
+
+def components(x: Array) -> list[Array]:
+    """The n components of vectors (..., n), each (...).
+
+    As one split, whose derivative is one concatenation and not n paddings to be added.
+    """
+    return [jnp.squeeze(part, -1) for part in jnp.split(x, x.shape[-1], axis=-1)]
