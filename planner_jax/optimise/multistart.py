@@ -10,7 +10,7 @@ from jax import Array
 
 from planner_jax.optimise import lbfgs
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig, Objective
-from planner_jax.optimise.problem import Planner, Round
+from planner_jax.optimise.problem import Planner, Round, Settings
 from planner_jax.optimise.status import Status
 
 # Plans are refereed to 1e-3 of a limit; half of that is left for peaks between samples.
@@ -46,6 +46,11 @@ def minimise(objective: Objective, start: Array, config: LbfgsConfig) -> Optimum
     )
 
 
+def changed(planner: Planner, settings: Settings) -> Planner:
+    """The planner with some of its fields set anew; its plans keep their shape."""
+    return dataclasses.replace(planner, **dict(settings))  # type: ignore[type-var]
+
+
 def solve_round(planner: Planner, attempt: Round, scenario: Any) -> Any:
     """Plan one scenario with one round's starts and iterations; pure, so jit and vmap it.
 
@@ -57,14 +62,20 @@ def solve_round(planner: Planner, attempt: Round, scenario: Any) -> Any:
     Returns:
         The planner's plan of the best start, its `status` and `iterations` set.
     """
-    planner = dataclasses.replace(planner, **dict(attempt.settings))
+    stages = [changed(planner, stage.settings) for stage in attempt.stages]
+    planner = changed(planner, attempt.settings)
     context = planner.prepare(scenario)
     starts = planner.guesses(context, attempt.starts)
 
     def from_start(start: Array) -> tuple[Any, Array]:
+        iterations = jnp.zeros((), jnp.int32)
+        for easier, stage in zip(stages, attempt.stages, strict=True):
+            reached = minimise(lambda x: easier.objective(x, context), start, stage.solver)  # noqa: B023
+            start, iterations = reached.point, iterations + reached.iterations
         optimum = minimise(lambda x: planner.objective(x, context), start, attempt.solver)
         plan = planner.decode(optimum.point, context)
-        plan = plan.replace(cost=optimum.evaluation.cost, iterations=optimum.iterations)
+        iterations += optimum.iterations
+        plan = plan.replace(cost=optimum.evaluation.cost, iterations=iterations)
         return plan, optimum.stationary
 
     if attempt.starts == 1:

@@ -7,6 +7,16 @@ from jax import Array
 
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
 
+Settings = tuple[tuple[str, Any], ...]  # fields of a planner, and the values they take
+
+
+@dataclasses.dataclass(frozen=True)
+class Stage:
+    """An easier problem, the end of which is where the next one begins."""
+
+    solver: LbfgsConfig
+    settings: Settings = ()
+
 
 @dataclasses.dataclass(frozen=True)
 class Round:
@@ -14,7 +24,8 @@ class Round:
 
     starts: int
     solver: LbfgsConfig
-    settings: tuple[tuple[str, Any], ...] = ()  # of the planner, that differ in this round
+    settings: Settings = ()  # of the planner, that differ in this round
+    stages: tuple[Stage, ...] = ()  # before it, from easy to hard
 
     def __post_init__(self) -> None:
         if self.starts < 1:

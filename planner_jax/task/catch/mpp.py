@@ -1,7 +1,6 @@
 """The `mpp` baseline: sampled state-to-state primitives to catches at a height fixed beforehand."""
 
 import dataclasses
-from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -96,6 +95,11 @@ class MppCatch:
       the scenario's order, each where it first falls through the height, and each segment
       kept by its own cost.
 
+    With the limits of `catch_scenario` it succeeds on four of five `throws` and two of five
+    `hard` ones, more on lower catches (0.8 m: 99 % and 51 %) and fewer on higher ones (1.9 m:
+    68 % and 27 %), body rate being what it breaks. The paper has it plan 14 % of its throws,
+    within limits and at a height that it does not give.
+
     A target that does not fall through the height before its horizon, or before the one that
     is due earlier does, leaves the lane unsolved: this planner has no other time to offer.
     """
@@ -123,8 +127,15 @@ class MppCatch:
         """The plan itself: no variable is left to decide on."""
         context = ordered_context(scenario)
         times, missed = self.times(context)
-        segments = [_cheapest(tried) for tried in self.segments(context, times)]
-        joined = jax.tree.map(lambda *leaves: jnp.stack(leaves), *segments)  # (N, 2, ...)
+        balls = targets_at(context.targets, times)
+        durations = jnp.maximum(jnp.diff(times, prepend=jnp.zeros_like(times[:1])), _SHORTEST)
+
+        def fly(head: Array, catch: tuple[BallState, Array]) -> tuple[Array, PiecewisePolynomial]:
+            best = _cheapest(self.candidates(head, *catch, scenario))
+            return _end_state(best), best
+
+        # Leaves (N, 2, ...): two pieces to each catch.
+        _, joined = lax.scan(fly, scenario.head_state, (balls, durations))
         flown = jnp.where(context.active[:, None], joined.durations, 0.0)
         last = jnp.maximum(jnp.sum(context.active) - 1, 0)
         end = _end_state(_lane(joined, last))[0]
@@ -176,21 +187,23 @@ class MppCatch:
         late = jnp.maximum(_SHORTEST - (fall - before), jnp.where(found, -1.0, 1.0))
         return times, late
 
-    def segments(self, context: CatchContext, times: Array) -> Iterator[Candidates]:
-        """What is tried for each of the N segments, from the end of the best one before."""
-        scenario = context.scenario
-        balls = targets_at(context.targets, times)
-        durations = jnp.maximum(jnp.diff(times, prepend=jnp.zeros_like(times[:1])), _SHORTEST)
-        head = scenario.head_state
-        for i in range(times.shape[0]):
-            ends = self.end_states(_lane(balls, i), scenario)
-            tried = jax.vmap(eased_minimum_jerk, in_axes=(None, 0, None, None))(
-                head, ends, durations[i], self.ease
-            )
-            cost = jax.vmap(lambda one: snap_energy(one, 3))(tried) / durations[i]
-            candidates = Candidates(trajectory=tried, cost=cost)
-            yield candidates
-            head = _end_state(_cheapest(candidates))
+    def candidates(
+        self, head_state: Array, ball: BallState, duration: Array, scenario: CatchScenario
+    ) -> Candidates:
+        """What is tried for one segment.
+
+        Args:
+            head_state: (4, 3), where the segment begins, position to jerk.
+            ball: the target at the catch.
+            duration: () [s], until then.
+            scenario: for gravity and the net.
+        """
+        ends = self.end_states(ball, scenario)
+        tried = jax.vmap(eased_minimum_jerk, in_axes=(None, 0, None, None))(
+            head_state, ends, duration, self.ease
+        )
+        cost = jax.vmap(lambda one: snap_energy(one, 3))(tried) / duration
+        return Candidates(trajectory=tried, cost=cost)
 
     def end_states(self, ball: BallState, scenario: CatchScenario) -> Array:
         """The sampled states (K, 3, 3), position to acceleration, at a catch.

@@ -1,6 +1,7 @@
 """The `catch` planner of paper 000: contact and attitude by penalties (its eqs 18-28)."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ from jax import Array
 from planner_jax.cost.limits import ground_excess, speed_excess
 from planner_jax.cost.penalty import joined_trapezoid_weights, smoothed_hinge, steep_hinge
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
-from planner_jax.optimise.problem import Round
+from planner_jax.optimise.problem import Round, Stage
 from planner_jax.robot.quadrotor import body_rate_squared, body_z, net_thrust
 from planner_jax.task.catch.chain import (
     CatchContext,
@@ -24,8 +25,8 @@ from planner_jax.task.catch.chain import (
     targets_at,
 )
 from planner_jax.task.catch.plan import CatchPlan
-from planner_jax.task.catch.scenario import CatchScenario
 from planner_jax.task.catch.scales import shipped_scale
+from planner_jax.task.catch.scenario import CatchScenario
 from planner_jax.trajectory.minimum_jerk import minimum_jerk
 from planner_jax.trajectory.polynomial import evaluate
 from planner_jax.trajectory.proportional_minco import (
@@ -35,6 +36,12 @@ from planner_jax.trajectory.proportional_minco import (
 )
 
 _ORDER = 4  # minimum snap
+_PATIENT: dict[str, Any] = {
+    "memory": 16,
+    "trial_steps": (1.0, 2.5, 0.3, 0.05),
+    "tolerance": 1e-8,
+    "patience": 10,
+}
 _COST_UNIT = 1e3  # the solver wants curvatures of moderate size
 
 
@@ -73,8 +80,22 @@ class PaperCatch:
     miss_weight: float = 1e4
     angle_weight: float = 1e2
     hinge_width: float = 0.01  # mu, and eps of the angle
+    # The hinges are so stiff that they are brought on in stages.
     rounds: tuple[Round, ...] = (
-        Round(starts=1, solver=LbfgsConfig(max_steps=300, tolerance=1e-7, patience=8)),
+        Round(
+            starts=1,
+            solver=LbfgsConfig(max_steps=150, **_PATIENT),
+            stages=(
+                Stage(
+                    LbfgsConfig(max_steps=15),
+                    (("limit_weight", 1e3), ("ground_weight", 1e4), ("hinge_width", 1.0)),
+                ),
+                Stage(
+                    LbfgsConfig(max_steps=20, **_PATIENT),
+                    (("limit_weight", 1e4), ("ground_weight", 1e6), ("hinge_width", 0.1)),
+                ),
+            ),
+        ),
     )
     scale: tuple[float, ...] = ()  # of one segment
 

@@ -20,9 +20,9 @@ Its velocity follows from landing point and flight time. It may be caught until 
 
 With drag, 1.78 s is the flight whose apex is at the hall's 4.2 m, less than the 1.9 s that the
 paper allows; the shortest flight has an apex of 2.7 m, just under the 2.8 m above which the
-paper first outputs a ball. At most 1.48 s are left before the ball is down, the paper's 1.6 s;
-that its catches took less than 1.3 s is an outcome and not a bound here. Without drag the paper
-allows any height and t < 2. The second ball of `parabola2` leaves when planning begins.
+paper first outputs a ball. At most 1.48 s are left before the ball is down, where the paper has
+1.6 s; that its catches took less than 1.3 s is an outcome and not a bound here. Without drag
+the paper allows any height and t < 2. The second ball of `parabola2` leaves when planning begins.
 
 Others. Every target comes near the vertical axis through the origin, the quadrotor's, at a
 height of 1 to 3.5 m, and no farther away than `reach` while it may be caught.
@@ -42,9 +42,9 @@ height of 1 to 3.5 m, and no farther away than `reach` while it may be caught.
 - hexagon6: six targets 1 to 1.5 m from the centre of a level hexagon, all at one velocity; the
   centre is up to 0.5 m from the axis on either of e1, e2 after 4 to 6 s.
 
-The targets of the last two fly level: the paper's angle of 120 degrees between three velocities
-asks for one plane, and any other plane than a level one has targets sink into an upright net.
-So the net must lean over by 60 degrees at least, 90 less theta_safe, at each of their catches.
+The targets of the last two fly level. Three velocities 120 degrees apart, as the paper has
+them, lie in one plane, and in the level one no target sinks, which would ease its catch: the
+net must lean over by 60 degrees at least, 90 less theta_safe, at every catch.
 """
 
 import dataclasses

@@ -1,0 +1,193 @@
+"""When and in what order to catch: by estimated arrival, or the best of all orders.
+
+The estimate sees a point that accelerates evenly to its greatest speed, and a target that may
+be caught while it is high enough and does not come from below. It serves to rank orders and to
+guess times; the planner then optimises the times together with the trajectory.
+"""
+
+import dataclasses
+import functools
+import itertools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+from planner_jax.optimise.problem import Planner
+from planner_jax.task.catch.plan import CatchPlan
+from planner_jax.task.catch.scenario import CatchScenario
+from planner_jax.task.solve import is_solved, plan
+
+DECISIONS = ("best", "greedy", "given")
+
+_GRID = 64  # times at which every target is looked at
+_ACCELERATION = 7.0  # [m/s^2], sustained, of the estimate
+_TURNING = 0.2  # [s] to begin to move
+_STEEPEST = -0.2  # least upward part of the way back along the target's path
+_FINALISTS = 6  # orders that `best` plans
+
+
+@struct.dataclass
+class Decision:
+    """An order with its estimated times."""
+
+    order: Array  # (N,) int32, present targets first
+    times: Array  # (N,) [s], rising, in that order
+    shortfall: Array  # () [m], by how much the targets stay out of the estimate's reach
+
+
+@struct.dataclass
+class _Timetable:
+    """Where every target is, when, and whether it may be caught there."""
+
+    times: Array  # (N, K) [s]
+    places: Array  # (N, K, 3) [m], of the quadrotor
+    penalty: Array  # (N, K) [m], above zero where a catch is hardly possible
+
+
+def _timetable(scenario: CatchScenario) -> _Timetable:
+    net, limits = scenario.net, scenario.limits
+    shares = jnp.asarray(np.arange(1, _GRID + 1) / _GRID, scenario.gravity.dtype)
+    times = scenario.horizon[:, None] * shares
+    states = jax.vmap(lambda target, at: jax.vmap(target.at)(at))(scenario.targets, times)
+    up = jnp.array([0.0, 0.0, 1.0], times.dtype)
+    speed = jnp.sqrt(jnp.maximum(jnp.sum(states.vel**2, axis=-1), 1e-6))
+    from_below = jnp.maximum(states.vel[..., 2] / speed + _STEEPEST, 0.0)
+    places = states.pos - net.height * up
+    low = jnp.maximum(limits.min_height + 0.1 - places[..., 2], 0.0)
+    return _Timetable(times=times, places=places, penalty=10.0 * from_below + 10.0 * low)
+
+
+def _arrival(
+    table: _Timetable, target: Array, begin: Array, place: Array, speed: Array
+) -> tuple[Array, Array, Array]:
+    """Earliest time (), place (3,) and shortfall () of the next catch."""
+    times, places, penalty = table.times[target], table.places[target], table.penalty[target]
+    distance = jnp.sqrt(jnp.maximum(jnp.sum((places - place) ** 2, axis=-1), 1e-12))
+    span = jnp.maximum(times - begin - _TURNING, 0.0)
+    rise = speed / _ACCELERATION
+    reach = jnp.where(span < rise, 0.5 * _ACCELERATION * span**2, speed * span - 0.5 * speed * rise)
+    late = jnp.where(times > begin, 0.0, 100.0)
+    shortfall = jnp.maximum(distance - reach, 0.0) + penalty + late
+    possible = shortfall <= 0.0
+    first = jnp.where(jnp.any(possible), jnp.argmax(possible), jnp.argmin(shortfall))
+    return times[first], places[first], shortfall[first]
+
+
+def _follow(scenario: CatchScenario, table: _Timetable, order: Array) -> Decision:
+    """Estimated times of one order (N,), present targets moved to the front."""
+    order = order[jnp.argsort(~scenario.present[order], stable=True)]
+    speed = 0.9 * scenario.limits.speed
+
+    def advance(state: tuple, target: Array) -> tuple[tuple, tuple[Array, Array]]:
+        begin, place = state
+        time, there, shortfall = _arrival(table, target, begin, place, speed)
+        here = scenario.present[target]
+        time = jnp.where(here, jnp.maximum(time, begin + 0.05), begin + 0.05)
+        there = jnp.where(here, there, place)
+        return (time, there), (time, jnp.where(here, shortfall, 0.0))
+
+    start = (jnp.zeros_like(scenario.gravity), scenario.head_state[0])
+    _, (times, shortfalls) = jax.lax.scan(advance, start, order)
+    return Decision(order=order, times=times, shortfall=jnp.sum(shortfalls))
+
+
+def greedy(scenario: CatchScenario) -> Decision:
+    """Catch next whatever can be caught earliest. One scenario; pure."""
+    table = _timetable(scenario)
+    num, speed = scenario.num_targets, 0.9 * scenario.limits.speed
+    begin, place = jnp.zeros_like(scenario.gravity), scenario.head_state[0]
+    left, order = scenario.present, []
+    for _ in range(num):
+        arrive = lambda target, t=begin, p=place: _arrival(table, target, t, p, speed)  # noqa: E731
+        times, places, shortfalls = jax.vmap(arrive)(jnp.arange(num))
+        rank = jnp.where(left, times + 10.0 * shortfalls, jnp.inf)
+        # Absent targets come last, in any order.
+        taken = jnp.stack([jnp.arange(num) == k for k in order]).any(0) if order else ~left & left
+        rank = jnp.where(taken, jnp.nan, jnp.where(jnp.isinf(rank), 1e9, rank))
+        target = jnp.nanargmin(rank)
+        here = left[target]
+        begin = jnp.where(here, jnp.maximum(times[target], begin + 0.05), begin)
+        place = jnp.where(here, places[target], place)
+        left = left & (jnp.arange(num) != target)
+        order.append(target)
+    return _follow(scenario, table, jnp.stack(order).astype(jnp.int32))
+
+
+def best_orders(scenario: CatchScenario, finalists: int) -> Decision:
+    """The orders with the least shortfall, then the earliest last catch; leaves (F, ...).
+
+    All N! orders are looked at. One scenario; pure.
+    """
+    orders = jnp.asarray(list(itertools.permutations(range(scenario.num_targets))), jnp.int32)
+    table = _timetable(scenario)
+    decisions = jax.vmap(functools.partial(_follow, scenario, table))(orders)
+    rank = decisions.times[:, -1] + 10.0 * decisions.shortfall
+    chosen = jnp.argsort(rank)[: min(finalists, len(orders))]
+    return jax.tree.map(lambda leaf: leaf[chosen], decisions)
+
+
+_greedy = jax.jit(jax.vmap(greedy))
+_best_orders = jax.jit(jax.vmap(best_orders, in_axes=(0, None)), static_argnums=1)
+
+
+def decided(scenarios: CatchScenario, decision: Decision) -> CatchScenario:
+    """The scenarios with the order and times of a decision."""
+    return dataclasses.replace(scenarios, order=decision.order, times=decision.times)
+
+
+def plan_catches(
+    planner: Planner, scenarios: CatchScenario, decide: str = "best"
+) -> tuple[CatchScenario, CatchPlan]:
+    """Decide on orders and times, and plan.
+
+    Args:
+        planner: of this task, such as `ExactCatch()`.
+        scenarios: a batch.
+        decide: "best" plans the most promising of all orders and keeps the earliest last
+            catch, "greedy" catches next what it can reach first, "given" takes the order and
+            the times of the scenarios.
+
+    Returns:
+        scenarios: with the order and times that were decided; times before optimisation.
+        plans: of them.
+
+    Raises:
+        ValueError: no such decision, or a given order that is not a permutation.
+    """
+    if decide not in DECISIONS:
+        raise ValueError(f"decide must be one of {', '.join(DECISIONS)}, got {decide!r}")
+    if decide == "given":
+        _require_orders(scenarios)
+        return scenarios, plan(planner, scenarios)
+    if decide == "greedy" or scenarios.num_targets == 1:
+        scenarios = decided(scenarios, _greedy(scenarios))
+        return scenarios, plan(planner, scenarios)
+    decisions = _best_orders(scenarios, _FINALISTS)
+    finalists = decisions.order.shape[1]
+    tried = [
+        decided(scenarios, jax.tree.map(lambda leaf, k=k: leaf[:, k], decisions))
+        for k in range(finalists)
+    ]
+    together = jax.tree.map(lambda *leaves: np.concatenate(leaves), *tried)
+    plans = plan(planner, together)
+    shaped = lambda leaf: np.asarray(leaf).reshape(finalists, -1, *np.shape(leaf)[1:])  # noqa: E731
+    plans, together = jax.tree.map(shaped, plans), jax.tree.map(shaped, together)
+    solved = np.asarray(is_solved(plans.status))
+    rank = np.where(solved, plans.times[..., -1], 1e6 + np.nan_to_num(plans.violation, nan=1e9))
+    chosen, lanes = rank.argmin(axis=0), np.arange(rank.shape[1])
+    pick = lambda leaf: leaf[chosen, lanes]  # noqa: E731
+    return jax.tree.map(pick, together), jax.tree.map(pick, plans)
+
+
+def _require_orders(scenarios: Any) -> None:
+    order = np.asarray(scenarios.order)
+    wrong = np.flatnonzero((np.sort(order, axis=-1) != np.arange(order.shape[-1])).any(axis=-1))
+    if wrong.size:
+        raise ValueError(
+            f"order must be a permutation of 0..{order.shape[-1] - 1}, "
+            f"got {order[wrong[0]].tolist()} in scenario {wrong[0]}"
+        )
