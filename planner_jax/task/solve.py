@@ -131,8 +131,9 @@ def _solve_single(planner: Planner, attempt: Round, scenario: Scenario) -> Any:
     """
     leaves, treedef = jax.tree.flatten(scenario)
     arrays = [np.asarray(leaf) for leaf in leaves]
-    layout = tuple(array.shape for array in arrays)
-    solve, plan_tree, fields = _packed_solver(planner, attempt, treedef, layout, arrays[0].dtype)
+    layout = tuple((array.shape, array.dtype) for array in arrays)
+    dtype = np.result_type(*(kind for _, kind in layout if np.issubdtype(kind, np.floating)))
+    solve, plan_tree, fields = _packed_solver(planner, attempt, treedef, layout, dtype)
     packed = np.asarray(solve(np.concatenate([array.ravel() for array in arrays])))
     return jax.tree.unflatten(
         plan_tree,
@@ -142,14 +143,21 @@ def _solve_single(planner: Planner, attempt: Round, scenario: Scenario) -> Any:
 
 @functools.cache
 def _packed_solver(
-    planner: Planner, attempt: Round, treedef: Any, layout: tuple[tuple[int, ...], ...], dtype: Any
+    planner: Planner,
+    attempt: Round,
+    treedef: Any,
+    layout: tuple[tuple[tuple[int, ...], Any], ...],
+    dtype: Any,
 ) -> tuple[Callable, Any, list[tuple[slice, tuple[int, ...], Any]]]:
     """Compiled solver from vector to vector, and the plan's tree and where its leaves lie."""
-    ends = np.cumsum([int(np.prod(shape)) for shape in layout])
+    ends = np.cumsum([int(np.prod(shape)) for shape, _ in layout])
 
     def unpacked(vector: jax.Array) -> Any:
         pieces = jnp.split(vector, ends[:-1])
-        shaped = [piece.reshape(shape) for piece, shape in zip(pieces, layout, strict=True)]
+        shaped = [
+            piece.reshape(shape).astype(kind)
+            for piece, (shape, kind) in zip(pieces, layout, strict=True)
+        ]
         return solve_round(planner, attempt, jax.tree.unflatten(treedef, shaped))
 
     def packed(vector: jax.Array) -> jax.Array:

@@ -93,7 +93,9 @@ def eased_minimum_jerk(
         return 6.0 * primitive(jerk).coeffs[0, 3]
 
     constant = first_jerk(jnp.zeros_like(j0))
-    slope = first_jerk(jnp.ones_like(j0)) - constant  # negative
+    # By differences this would be lost in rounding: the two are a thousand times as large.
+    share = t / (duration - t)
+    slope = -share * (4.5 + share * (6.0 + 2.5 * share))
     jerk = constant / (1.0 - slope)
     ramp = jnp.stack([p0, v0, a0 / 2.0, j0 / 6.0, (jerk - j0) / (24.0 * t), jnp.zeros_like(p0)])
     after = primitive(jerk)

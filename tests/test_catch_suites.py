@@ -1,0 +1,204 @@
+"""The named suites of catch scenarios: what their module says of them holds for every draw."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from planner_jax.ball.target import BallPath
+from planner_jax.task.catch.suites import CATCH_HEIGHT, LAUNCH, SUITES, make_suite
+
+NUM = 64
+THROWS = ("throws", "hard", "parabola1", "parabola2")
+LINES = ("triangle3", "hexagon6")
+# Half sides of the landing rectangle, flight times [s], seconds from launch to planning.
+RANGES = {
+    "throws": [((1.0, 0.4), (1.4, 1.78), 0.3)],
+    "hard": [((2.0, 1.5), (1.4, 1.78), 0.5)],
+    "parabola1": [((1.0, 0.4), (1.4, 2.0), 0.3)],
+    "parabola2": [((1.0, 0.4), (1.4, 1.6), 0.3), ((1.0, 0.4), (1.7, 2.0), 0.0)],
+}
+# Farthest from the vertical axis through the origin, and heights [m].
+VOLUMES = {
+    "harmonic2": (9.0, (1.0, 3.5)),
+    "triangle3": (7.3, (1.5, 2.5)),
+    "hexagon6": (11.3, (1.5, 2.5)),
+}
+
+float64 = pytest.mark.usefixtures("float64")
+
+
+@jax.jit
+def states(targets, times):
+    """States of the targets (B, N) at the times (B, N, T), leaves (B, N, T, 3)."""
+    return jax.vmap(jax.vmap(lambda path, t: jax.vmap(path.at)(t)))(targets, times)
+
+
+def leaves(tree):
+    return [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
+
+
+def until_horizon(scenarios, num=60):
+    return scenarios.horizon[..., None] * jnp.linspace(0.0, 1.0, num)
+
+
+def drawn(name, num=NUM, seed=3):
+    return make_suite(name, num, seed, dtype=jnp.float64)
+
+
+def away(pos):
+    """Distance from the vertical axis through the origin."""
+    return np.linalg.norm(np.asarray(pos)[..., :2], axis=-1)
+
+
+@pytest.mark.parametrize("name", SUITES)
+def test_a_seed_always_gives_the_same_scenarios_and_fewer_of_them_are_the_first(name):
+    once, again, fewer = make_suite(name, 9, 5), make_suite(name, 9, 5), make_suite(name, 4, 5)
+    for a, b, c in zip(leaves(once), leaves(again), leaves(fewer), strict=True):
+        np.testing.assert_array_equal(a, b)
+        np.testing.assert_array_equal(a[:4], c)
+    other = leaves(make_suite(name, 9, 6).targets)
+    assert any((a != b).any() for a, b in zip(leaves(once.targets), other, strict=True))
+
+
+def test_a_suite_is_a_matter_of_its_name_and_the_seed_alone():
+    """One number of two suites: a change here is a change of published scenarios."""
+    np.testing.assert_allclose(
+        make_suite("throws", 1).targets.ball.vel[0, 0, 1], -0.10602945, rtol=1e-5
+    )
+    np.testing.assert_allclose(
+        make_suite("hexagon6", 1).targets.ball.pos[0, 0, 2], 2.3829162, rtol=1e-5
+    )
+    assert (
+        make_suite("throws", 1).targets.ball.vel != make_suite("hard", 1).targets.ball.vel
+    ).all()
+
+
+@pytest.mark.parametrize("name", SUITES)
+def test_shapes_and_setting(name):
+    scenarios, suite = make_suite(name, 3), SUITES[name]
+    assert suite.name == name and suite.description.endswith(".")
+    assert scenarios.batch_shape == (3,) and scenarios.num_targets == suite.num_targets
+    for leaf in leaves(scenarios):
+        assert leaf.shape[:1] == (3,) and leaf.dtype in (np.float32, np.int32, bool)
+    assert scenarios.present.all()
+    np.testing.assert_array_equal(scenarios.head_state[:, 0], np.tile([0.0, 0.0, 1.0], (3, 1)))
+    assert not scenarios.head_state[:, 1:].any()
+    many = np.asarray(make_suite(name, NUM).horizon)
+    assert 0.9 * suite.horizon < many.max() <= suite.horizon * (1.0 + 1e-6)
+
+
+@float64
+@pytest.mark.parametrize("name", THROWS)
+def test_a_throw_leaves_the_machine_lands_in_its_rectangle_and_flies_as_long_as_it_says(name):
+    scenarios = drawn(name)
+    for i, (land, (shortest, longest), delay) in enumerate(RANGES[name]):
+        ball = jax.tree.map(lambda leaf, i=i: leaf[:, i : i + 1], scenarios.targets)
+        flown = np.arange(0.0, longest, 2e-3)
+        pos = np.asarray(states(ball, jnp.asarray(np.tile(flown - delay, (NUM, 1, 1)))).pos)[:, 0]
+        np.testing.assert_allclose(pos[:, 0], np.tile(LAUNCH, (NUM, 1)), atol=1e-9)
+        down = np.where((pos[..., 2] <= 0.0).any(axis=1), (pos[..., 2] <= 0.0).argmax(axis=1), -1)
+        flight = flown[down]
+        assert flight.min() >= shortest and flight.max() <= longest
+        assert flight.max() - flight.min() > 0.8 * (longest - shortest)
+        where = np.abs(pos[np.arange(NUM), down, :2])
+        assert (where <= np.array(land) + 0.02).all(), "2 ms of flight are up to 1 cm"
+        assert (where.max(axis=0) > 0.8 * np.array(land)).all()
+        high = pos[..., 2].max()
+        assert high < (4.2 if name in ("throws", "hard") else 5.4)
+        assert pos[..., 2].max(axis=1).min() > 2.7
+
+
+@float64
+@pytest.mark.parametrize("name", THROWS)
+def test_a_thrown_ball_may_be_caught_until_it_falls_through_the_least_height(name):
+    scenarios = drawn(name)
+    ball = states(scenarios.targets, until_horizon(scenarios))
+    np.testing.assert_allclose(ball.pos[..., -1, 2], CATCH_HEIGHT, atol=1e-9)
+    assert (ball.vel[..., -1, 2] < 0.0).all()
+    assert (ball.pos[..., :-1, 2] > CATCH_HEIGHT).all()
+    drag = 0.5 if name in ("throws", "hard") else 0.0
+    assert (scenarios.targets.drag == drag).all() and (scenarios.targets.gravity == 9.81).all()
+
+
+@float64
+@pytest.mark.parametrize("name", VOLUMES)
+def test_every_target_stays_in_its_volume_and_comes_near_the_quadrotor(name):
+    scenarios, (reach, (low, high)) = drawn(name), VOLUMES[name]
+    assert (scenarios.horizon == SUITES[name].horizon).all()
+    ball = states(scenarios.targets, until_horizon(scenarios))
+    distance, height = away(ball.pos), np.asarray(ball.pos)[..., 2]
+    assert distance.max() <= reach
+    assert low <= height.min() and height.max() <= high
+    assert height.max() - height.min() > 0.8 * (high - low)
+    assert distance.min(axis=-1).max() < 2.8
+    level = away(ball.vel)
+    assert level.min() >= 1.0 - 1e-9 and level.max() <= 1.5 + 1e-9
+    sinking = -np.asarray(ball.vel)[..., 2].min()
+    assert 2.0 < sinking <= 2.5 if name == "harmonic2" else sinking == 0.0
+
+
+@float64
+def test_swings_are_near_in_time():
+    scenarios = drawn("harmonic2")
+    ball = states(scenarios.targets, until_horizon(scenarios, 141))
+    near = away(ball.pos)[..., 40:101]  # from 2 to 5 s
+    assert near.min(axis=-1).max() < 1.5 + 0.04
+    assert not scenarios.targets.amplitude[..., :2].any()
+
+
+@float64
+def test_lines_are_a_triangle_at_angles_of_120_degrees_and_a_hexagon_in_parallel():
+    for name in LINES:
+        scenarios = drawn(name)
+        assert isinstance(scenarios.targets, BallPath)
+        assert not (scenarios.targets.drag.any() or scenarios.targets.gravity.any())
+        num = SUITES[name].num_targets
+        ball = states(scenarios.targets, until_horizon(scenarios, 61))
+        pos, vel = np.asarray(ball.pos), np.asarray(ball.vel)[:, :, 0]
+        centre = pos.mean(axis=1, keepdims=True)
+        side = np.linalg.norm(pos - np.roll(pos, 1, axis=1), axis=-1)  # (B, N, T)
+        np.testing.assert_allclose(side, np.broadcast_to(side[:, :1], side.shape), rtol=1e-9)
+        radius = np.linalg.norm(pos - centre, axis=-1)
+        np.testing.assert_allclose(side, radius * 2.0 * np.sin(np.pi / num), rtol=1e-9)
+        cosine = (vel * np.roll(vel, 1, axis=1)).sum(-1) / (vel**2).sum(-1)
+        np.testing.assert_allclose(cosine, -0.5 if name == "triangle3" else 1.0, atol=1e-9)
+        if name == "triangle3":
+            assert 3.0 <= radius[:, 0, 0].min() and radius[:, 0, 0].max() <= 4.0
+            closest = np.broadcast_to(radius.argmin(axis=-1) * 0.1, vel.shape[:2])
+            assert 1.6 <= closest.min() and closest.max() <= 3.6
+            assert (np.abs(centre[..., :2]) <= 0.5 + 1e-9).all()
+        else:
+            assert 1.0 <= radius.min() and radius.max() <= 1.5
+            middle = np.abs(centre[:, 0, 24:37, :2])  # around 4 to 6 s
+            assert (middle.max(axis=-1).min(axis=-1) <= 0.5 + 0.08).all()
+
+
+@pytest.mark.parametrize("name", ["hard", "harmonic2", "hexagon6"])
+def test_padding_leaves_the_present_targets_alone(name):
+    plain, padded = make_suite(name, 5, 2), make_suite(name, 5, 2, num_targets=8)
+    own = SUITES[name].num_targets
+    assert padded.num_targets == 8
+    np.testing.assert_array_equal(padded.present, np.tile(np.arange(8) < own, (5, 1)))
+    for a, b in zip(
+        leaves((plain.targets, plain.horizon)),
+        leaves((padded.targets, padded.horizon)),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(a, b[:, :own])
+        np.testing.assert_array_equal(b[:, own:], np.repeat(a[:, :1], 8 - own, axis=1))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "options", "says"),
+    [
+        (("throw", 3), {}, "suite must be one of throws, hard, .*, hexagon6, got 'throw'"),
+        (("throws", 0), {}, "num must be >= 1, got 0"),
+        (("throws", 3, -1), {}, "seed must be >= 0, got -1"),
+        (("triangle3", 3), {"num_targets": 2}, "num_targets must be >= 3 .*'triangle3', got 2"),
+    ],
+)
+def test_bad_arguments_are_named_in_one_line(arguments, options, says):
+    with pytest.raises(ValueError, match=says) as caught:
+        make_suite(*arguments, **options)
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,185 @@
+"""The `mpp` baseline: every catch is made, at the fixed height, by the cheapest that was tried."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from planner_jax.ball.flight import BallState
+from planner_jax.optimise.multistart import solve_round
+from planner_jax.optimise.status import Status
+from planner_jax.referee.catch import referee_catches
+from planner_jax.task.catch.chain import ordered_context, targets_at
+from planner_jax.task.catch.mpp import MppCatch, falling_time
+from planner_jax.task.catch.suites import make_suite
+from planner_jax.task.solve import is_solved, plan
+
+NUM = 16
+MPP = MppCatch()
+
+
+@pytest.fixture(scope="module")
+def throws():
+    """As many of the paper's throws as of the hard ones, two more targets being absent."""
+    suites = [make_suite(name, NUM // 2, 4, num_targets=3) for name in ("throws", "hard")]
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *suites)
+
+
+@pytest.fixture(scope="module")
+def pairs():
+    """Two throws and one absent target; of the first two lanes the order is the wrong way round."""
+    scenarios = make_suite("parabola2", NUM, 4, num_targets=3)
+    order = np.tile([0, 1, 2], (NUM, 1))
+    order[:2] = [1, 0, 2]
+    return dataclasses.replace(scenarios, order=jnp.asarray(order, jnp.int32))
+
+
+@pytest.fixture(scope="module")
+def throw_plans(throws):
+    return plan(MPP, throws)
+
+
+@pytest.fixture(scope="module")
+def pair_plans(pairs):
+    return plan(MPP, pairs)
+
+
+def lane_of(tree, lane):
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf[lane]), tree)
+
+
+def heights(scenarios, plans):
+    """Heights [m] of the targets at the catches, in their order."""
+    ordered = jax.vmap(ordered_context)(scenarios).targets
+    return np.asarray(jax.jit(jax.vmap(targets_at))(ordered, plans.times).pos)[..., 2]
+
+
+def test_the_net_is_on_the_ball_and_faces_it_at_the_fixed_height(throws, throw_plans):
+    verdict = referee_catches(throws, throw_plans)
+    assert verdict.net_distance[:, 0].max() < 1e-4
+    assert verdict.angle[:, 0].max() < 1e-3
+    assert verdict.head_error.max() < 1e-5
+    assert verdict.continuity_error.max() < 1e-4
+    np.testing.assert_allclose(heights(throws, throw_plans)[:, 0], MPP.height, atol=1e-4)
+    assert MPP.height < 2.0
+    np.testing.assert_allclose(verdict.catch_times[:, 0], throw_plans.times[:, 0], atol=1e-6)
+
+
+def test_a_plan_that_passes_the_check_afterwards_passes_the_referee(throws, throw_plans):
+    verdict, solved = referee_catches(throws, throw_plans), is_solved(throw_plans.status)
+    assert verdict.success[solved].all()
+    assert set(verdict.failed_limit[~solved]) <= {"speed", "body rate", "thrust low", "thrust high"}
+    assert (throw_plans.violation[~solved] > 0.0).all()
+    assert 0 < solved.sum() < NUM, "limits are not planned for"
+    assert (throw_plans.iterations == 0).all()
+
+
+def test_the_kept_candidate_is_the_cheapest(throws, throw_plans):
+    @jax.jit
+    def tried(scenario):
+        context = ordered_context(scenario)
+        times, _ = MPP.times(context)
+        ball = jax.tree.map(lambda leaf: leaf[0], targets_at(context.targets, times))
+        return MPP.candidates(scenario.head_state, ball, times[0], scenario)
+
+    for lane in (0, 7):
+        candidates = tried(lane_of(throws, lane))
+        assert candidates.cost.shape == (81,)
+        costs, kept = np.asarray(candidates.cost), throw_plans.trajectory.coeffs[lane, :2]
+        np.testing.assert_allclose(throw_plans.cost[lane], costs.min(), rtol=1e-4)
+        np.testing.assert_allclose(
+            kept, candidates.trajectory.coeffs[costs.argmin()], rtol=1e-3, atol=1e-2
+        )
+        every = np.asarray(mean_squared_jerk(candidates.trajectory))
+        np.testing.assert_allclose(costs, every, rtol=1e-3)
+
+
+def mean_squared_jerk(trajectory):
+    """(K,), by Gauss-Legendre quadrature of order 5, exact for squares of quadratic jerks."""
+    nodes, weights = np.polynomial.legendre.leggauss(5)
+    coeffs = np.asarray(trajectory.coeffs, np.float64)
+    durations = np.asarray(trajectory.durations, np.float64)
+    t = 0.5 * durations[..., None] * (1.0 + nodes)  # (K, 2, 5)
+    powers = np.stack([6.0 * t**0, 24.0 * t, 60.0 * t**2], axis=-1)
+    jerk = np.einsum("kpni,kpix->kpnx", powers, coeffs[:, :, 3:])
+    integral = 0.5 * ((jerk**2).sum(-1) * weights).sum(-1) * durations
+    return integral.sum(axis=1) / durations.sum(axis=1)
+
+
+def test_one_equals_its_lane_in_the_batch(pairs, pair_plans):
+    solve = jax.jit(functools.partial(solve_round, MPP, MPP.rounds[0]))
+    for lane in (3, 5, 9):
+        alone = solve(lane_of(pairs, lane))
+        for one, among in zip(
+            jax.tree.leaves(alone), jax.tree.leaves(lane_of(pair_plans, lane)), strict=True
+        ):
+            np.testing.assert_allclose(one, among, rtol=2e-3, atol=2e-3)
+
+
+def test_targets_are_caught_one_after_the_other_and_an_absent_one_is_not(pairs, pair_plans):
+    verdict = referee_catches(pairs, pair_plans)
+    right = np.arange(2, NUM)
+    assert pair_plans.trajectory.coeffs.shape == (NUM, 6, 6, 3)
+    assert verdict.net_distance[right, :2].max() < 1e-3
+    assert verdict.angle[right, :2].max() < 1e-3
+    np.testing.assert_allclose(heights(pairs, pair_plans)[right, :2], MPP.height, atol=1e-4)
+    assert (np.diff(pair_plans.times[right, :2], axis=1) > 0.0).all()
+    np.testing.assert_array_equal(pair_plans.times[:, 2], pair_plans.times[:, 1])
+    assert not pair_plans.trajectory.durations[:, 4:].any()
+    solved = is_solved(pair_plans.status)
+    assert verdict.success[solved].all()
+
+
+def test_times_that_do_not_rise_leave_the_lane_unsolved(pair_plans):
+    assert set(pair_plans.status[:2]) == {Status.INFEASIBLE}
+    assert (pair_plans.violation[:2] > 0.0).all()
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(pair_plans))
+
+
+def test_a_target_that_never_falls_through_the_height_is_not_solved(throws):
+    """One too low, one that rises, one at rest, one that is not a number; one good one last."""
+    pos, vel = np.array(throws.targets.ball.pos), np.array(throws.targets.ball.vel)
+    pos[0, 0, 2], vel[0, 0, 2] = 0.8, -1.0
+    vel[1, 0, 2] = 30.0
+    pos[3] = np.nan
+    gravity, drag = np.array(throws.targets.gravity), np.array(throws.targets.drag)
+    vel[2], gravity[2], drag[2] = 0.0, 0.0, 0.0
+    targets = dataclasses.replace(
+        throws.targets, ball=BallState(pos, vel), gravity=gravity, drag=drag
+    )
+    found = plan(MPP, dataclasses.replace(throws, targets=targets))
+    assert set(found.status[:3]) == {Status.INFEASIBLE}
+    assert found.status[3] == Status.NON_FINITE
+    assert all(np.isfinite(leaf[:3]).all() for leaf in jax.tree.leaves(found))
+    for old, new in zip(jax.tree.leaves(plan(MPP, throws)), jax.tree.leaves(found), strict=True):
+        np.testing.assert_array_equal(old[4:], new[4:])
+
+
+def test_the_first_fall_of_a_swing_is_found():
+    targets = lane_of(make_suite("harmonic2", 8, 1).targets, slice(None))
+    middle = targets.pos[..., 2]
+
+    @jax.jit
+    @jax.vmap
+    @jax.vmap
+    def first(path, height):
+        return falling_time(path, height, jnp.asarray(7.0), 128)
+
+    time, found = first(targets, middle)
+    assert found.all()
+    turn = np.mod(np.pi - np.asarray(targets.phase), 2.0 * np.pi)  # a sine falls through 0 at pi
+    np.testing.assert_allclose(time, turn / np.asarray(targets.rate), atol=1e-4)
+
+
+def test_bad_settings_are_named_in_one_line():
+    for options, says in (
+        ({"height": 2.0}, "height must be > 0 and < 2, got 2.0"),
+        ({"thrusts": ()}, "speeds and thrusts must have an entry, got none"),
+    ):
+        with pytest.raises(ValueError, match=says):
+            MppCatch(**options)
+    with pytest.raises(ValueError, match="starts must be 1, got 2"):
+        MPP.guesses(None, 2)
