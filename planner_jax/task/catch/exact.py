@@ -38,6 +38,7 @@ _CATCH_VARIABLES = 12  # log duration, offset in the net (2), velocity, accelera
 # Squares carry twice the relative margin.
 _MARGINS = np.array([2.0, 2.0, 2.0, 2.0, 1.0])[:, None, None]
 _RIM = 0.9  # share of the net's radius that a planned catch may use
+_ENCODED_RIM = 0.99  # share of that which a point made by `encode` may use
 
 
 # Starting points, best first: factor on the guessed times, share of the mean velocity of the
@@ -77,9 +78,10 @@ class ExactCatch:
     hinge_width: float = 0.1
     catch_weight: float = 0.3  # [s], of the hinges at a catch beside the integrals
     rounds: tuple[Round, ...] = (
-        Round(starts=1, solver=LbfgsConfig(max_steps=10)),
+        Round(starts=1, solver=LbfgsConfig(max_steps=8)),
+        Round(starts=1, solver=LbfgsConfig(max_steps=25)),
         Round(starts=1, solver=LbfgsConfig(max_steps=80)),
-        Round(starts=4, solver=LbfgsConfig(max_steps=150)),
+        Round(starts=6, solver=LbfgsConfig(max_steps=200)),
     )
     scale: tuple[float, ...] = ()  # of one segment
 
@@ -163,6 +165,42 @@ class ExactCatch:
         excess = jnp.where(moving, jnp.cos(net.max_angle) - facing, -1.0)
         tail_states = jnp.stack([pos, natural[:, 3:6], acc, natural[:, 9:12]], axis=1)
         return Catch(times=times, durations=durations, tail_states=tail_states, angle_excess=excess)
+
+    def encode(
+        self, context: CatchContext, durations: Array, tail_states: Array, offsets: Array
+    ) -> Array:
+        """The point (n,) that describes given catches: the inverse of `decode`.
+
+        A place in the net cannot hold what is outside of the hoop or off its plane; the catch
+        is then the nearest across the net's axis.
+
+        Args:
+            context: the targets.
+            durations: (N,) [s], of the segments.
+            tail_states: (N, 4, 3) of the quadrotor at the catches.
+            offsets: (N, M - 1, 3) whitened waypoint offsets.
+        """
+        scenario, net = context.scenario, context.scenario.net
+        times = jnp.cumsum(jnp.where(context.active, durations, 0.0))
+        pos, acc = tail_states[:, 0], tail_states[:, 2]
+        axis = body_z(acc, scenario.gravity)
+        miss = targets_at(context.targets, times).pos - net.height * axis - pos
+        across = jnp.stack(jax.vmap(tangent_basis)(axis), axis=1)  # (N, 2, 3)
+        share = jnp.sum(across * miss[:, None], axis=2) / (_RIM * net.radius)
+        squared = jnp.sum(share**2, axis=1, keepdims=True)
+        # Nearer to the rim than this the place hardly moves with its variables.
+        share *= jnp.minimum(1.0, _ENCODED_RIM / jnp.sqrt(jnp.maximum(squared, 1e-12)))
+        place = share / jnp.sqrt(1.0 - jnp.sum(share**2, axis=1, keepdims=True))
+        natural = jnp.concatenate(
+            [
+                offsets.reshape(times.size, -1),
+                jnp.log(durations)[:, None],
+                place,
+                tail_states[:, 1:].reshape(times.size, -1),
+            ],
+            axis=1,
+        )
+        return (natural / jnp.asarray(self.scale, natural.dtype)).ravel()
 
     def _unpack(self, point: Array, context: CatchContext) -> tuple[Chain, Catch]:
         """Segments and catches at a point."""

@@ -42,7 +42,7 @@ _PATIENT: dict[str, Any] = {
     "tolerance": 1e-8,
     "patience": 10,
 }
-_COST_UNIT = 1e3  # the solver wants curvatures of moderate size
+COST_UNIT = 1e3  # the solver wants curvatures of moderate size
 
 
 @struct.dataclass
@@ -224,7 +224,7 @@ class PaperCatch:
         spans = chain.piece_durations[:, None] * jnp.asarray(weights, point.dtype)
         penalty = jnp.sum(jnp.where(context.active[:, None], spans * jnp.sum(hinges, axis=0), 0.0))
         cost = penalty + rest
-        return Evaluation(cost=cost / _COST_UNIT, violation=jnp.zeros_like(cost))
+        return Evaluation(cost=cost / COST_UNIT, violation=jnp.zeros_like(cost))
 
     def _weights(self) -> np.ndarray:
         """Weights of the four limits along the way."""
@@ -235,12 +235,12 @@ class PaperCatch:
         along, _, chain, catch = self._terms(point, context)
         weights = joined_trapezoid_weights(self.nodes, self.maps.proportions)
         spans = chain.piece_durations[:, None] * jnp.asarray(weights, point.dtype)
-        unit = jnp.asarray(self._weights(), point.dtype) / _COST_UNIT
+        unit = jnp.asarray(self._weights(), point.dtype) / COST_UNIT
         # As stiff as a hinge that bends over a tenth of the squared limit.
         inside = jnp.maximum(along, 0.0) * jnp.sqrt(unit * spans / 2.5)
-        miss = jnp.sqrt(6.0 * self.miss_weight * context.scenario.net.radius / _COST_UNIT)
-        energy = jnp.sqrt(2.0 * jnp.maximum(chain_energy(self.maps, chain), 1e-6) / _COST_UNIT)
-        late = jnp.sqrt(2.0 * self.time_weight * catch.durations / _COST_UNIT)
+        miss = jnp.sqrt(6.0 * self.miss_weight * context.scenario.net.radius / COST_UNIT)
+        energy = jnp.sqrt(2.0 * jnp.maximum(chain_energy(self.maps, chain), 1e-6) / COST_UNIT)
+        late = jnp.sqrt(2.0 * self.time_weight * catch.durations / COST_UNIT)
         parts = (inside, miss * catch.miss, energy, late)
         return jnp.concatenate([part.ravel() for part in parts])
 

@@ -1,0 +1,41 @@
+"""The oracle of the late and weak rows: what it finds is a hit, and it knows a hopeless case."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from planner_jax.task.hit.serves import generate_serves, to_scenarios
+
+pytest.importorskip("casadi")
+from benchmarks.hit_oracle.search import STARTS, find_hit, passes_referee, starting_points
+
+
+def scenario(limit_scale):
+    with jax.enable_x64(True):
+        batch = to_scenarios(generate_serves(1, 5), limit_scale=limit_scale, dtype=jnp.float64)
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[0], batch)
+
+
+def test_an_easy_serve_is_proven_feasible_by_a_trajectory_that_the_referee_passes():
+    easy = scenario(1.0)
+    finding = find_hit(easy, starting_points(2, 0))
+    assert finding.verdict == "feasible"
+    assert passes_referee(easy, finding.coeffs, finding.durations)
+    assert finding.durations.sum() == pytest.approx(finding.impact_time)
+
+
+def test_a_hopeless_serve_is_called_infeasible():
+    """At a fifth of the limits nobody arrives in time."""
+    finding = find_hit(scenario(0.2), starting_points(4, 0))
+    assert finding.verdict == "infeasible"
+    assert finding.least_excess > 0.1
+    assert finding.coeffs is None
+
+
+def test_starts_are_the_listed_ones_and_then_drawn_by_the_seed():
+    assert starting_points(3, 0) == list(STARTS[:3])
+    more = starting_points(len(STARTS) + 2, 1)
+    assert more[: len(STARTS)] == list(STARTS)
+    assert more == starting_points(len(STARTS) + 2, 1)
+    assert more[-2:] != starting_points(len(STARTS) + 2, 2)[-2:]
