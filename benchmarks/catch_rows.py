@@ -19,7 +19,7 @@ import numpy as np
 from planner_jax.referee.catch import referee_catches
 from planner_jax.sweep.summary import wilson_interval
 from planner_jax.task.catch.decide import DECISIONS, plan_catches
-from planner_jax.task.catch.planners import PLANNERS, planner
+from planner_jax.task.catch.planners import PLANNERS, catch_planner
 from planner_jax.task.catch.suites import SUITES, make_suite
 
 # Planning success [%] of paper 000, Tables I and III.
@@ -35,7 +35,7 @@ PUBLISHED = {
 
 def run_row(suite: str, name: str, decide: str, num: int, seed: int) -> dict:
     """One suite's figures with one planner."""
-    chosen, scenarios = planner(name), make_suite(suite, num, seed)
+    chosen, scenarios = catch_planner(name), make_suite(suite, num, seed)
     began = time.perf_counter()
     plan_catches(chosen, scenarios, decide)
     first = time.perf_counter() - began

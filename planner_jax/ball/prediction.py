@@ -22,6 +22,10 @@ class PathTable:
     vel: Array  # (N, 3) [m/s]
     resolution: Array  # () [s], > 0
 
+    def at(self, time: Array) -> BallState:
+        """State of the target at one time () [s], as `target_at`: a `TargetPath`."""
+        return target_at(self, time)
+
 
 def predict_path(
     ball: BallState, horizon: Array, drag: Array, gravity: Array, *, num_nodes: int

@@ -11,7 +11,7 @@ PLANNERS = {
 }
 
 
-def planner(name: str, **options: Any) -> Any:
+def catch_planner(name: str, **options: Any) -> Any:
     """The planner of a name, as `planner_jax.task.solve.plan` takes it.
 
     Args:

@@ -1,4 +1,4 @@
-"""Measured scales of the catch planners' variables, of one segment each.
+"""Measured scales of `ExactCatch`'s variables, of one segment.
 
 `python -m benchmarks.measure_scales --write` makes the file again.
 """
