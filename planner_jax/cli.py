@@ -1,4 +1,4 @@
-"""The command line: `planner-jax sweep hit` and `planner-jax report`."""
+"""The command line: `planner-jax sweep hit`, `sweep catch` and `planner-jax report`."""
 
 import argparse
 import datetime
@@ -12,10 +12,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
+from planner_jax.sweep.catch.settings import DECISIONS, NET_TESTS, SUITES, CatchSweep
 from planner_jax.sweep.environment import installed_version
-from planner_jax.sweep.settings import CPU_BATCH, DEFAULT_NUM, GPU_BATCH, HitSweep, SettingError
-from planner_jax.task.hit.planners import PLANNERS
+from planner_jax.sweep.hit.settings import HitSweep
+from planner_jax.sweep.settings import SettingError, SweepSettings
+from planner_jax.task.catch.planners import PLANNERS as CATCH_PLANNERS
+from planner_jax.task.hit.planners import PLANNERS as HIT_PLANNERS
 
+_OPTIONS = {*HitSweep.__dataclass_fields__, *CatchSweep.__dataclass_fields__, "out"}
 _FAILED, _BAD_ARGUMENT, _INTERRUPTED = 1, 2, 130
 
 
@@ -46,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _fail(message: str) -> int:
     """Print one line, in which an argument's name is written as on the command line."""
     name, _, rest = message.partition(" ")
-    if name in HitSweep.__dataclass_fields__ or name == "out":
+    if name in _OPTIONS:
         message = f"--{name.replace('_', '-')} {rest}"
     print(f"planner-jax: error: {' '.join(message.split())}", file=sys.stderr)
     return _BAD_ARGUMENT
@@ -69,7 +73,8 @@ def _parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="planner-jax",
         description="Plan for robots that meet flying objects, thousands of cases at once.",
-        epilog="example:\n  planner-jax sweep hit --num 9000 --out runs/first",
+        epilog="examples:\n  planner-jax sweep hit --num 9000 --out runs/first\n"
+        "  planner-jax sweep catch --suite triangle3 --num 1000",
         **look,
     )
     version = f"planner-jax {installed_version('planner-jax') or 'of a source tree'}"
@@ -78,6 +83,7 @@ def _parser() -> argparse.ArgumentParser:
     sweep = commands.add_parser("sweep", help="plan and referee many cases of a task", **look)
     tasks = sweep.add_subparsers(title="tasks", required=True, metavar="task")
     _add_hit(tasks, look)
+    _add_catch(tasks, look)
     report = commands.add_parser(
         "report", help="write table, figures and page of a run anew", **look
     )
@@ -86,73 +92,148 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _add_hit(tasks: Any, look: dict[str, Any]) -> None:
-    """The arguments of `sweep hit`. One that is not given is absent from the namespace."""
+def _add_task(
+    tasks: Any,
+    look: dict[str, Any],
+    kind: type[SweepSettings],
+    planners: Sequence[str],
+    words: tuple[str, str],
+    cases: tuple[str, str, str],
+) -> argparse.ArgumentParser:
+    """The arguments that all sweeps have. One that is not given is absent from the namespace.
+
+    Args:
+        tasks: the parsers of all tasks.
+        look: of this parser.
+        kind: settings of the task.
+        planners: its names.
+        words: what the task is, short and long.
+        cases: what follows the default number of cases, which limits are scaled, what the seed
+            is of.
+    """
     parser = tasks.add_parser(
-        "hit",
-        help="a quadrotor hits served balls to a target with a racket",
-        description="Plan a quadrotor's volley for thousands of serves and let a referee judge "
-        "every plan.\nWrites a run folder: index.html, table.md, figures, plans.parquet, "
-        "manifest.json.",
+        kind.TASK,
+        help=words[0],
+        description=f"{words[1]}\n"
+        "Writes a run folder: index.html, table.md, figures, plans.parquet, manifest.json.",
         argument_default=argparse.SUPPRESS,
         **look,
+    )
+    default = kind()
+    more, limits, drawn = cases
+    add = parser.add_argument
+    # fmt: off
+    add("--planner", metavar="NAME", help=f"{', '.join(planners)} (default: {default.planner})")
+    add("--num", type=int, metavar="N", help=f"cases (default: {kind.DEFAULT_NUM}{more})")
+    add("--limit-scale", type=float, metavar="F",
+        help=f"factor on {limits} (default: {default.limit_scale:g})")
+    add("--batch", type=int, metavar="B",
+        help="cases planned, judged and written at once; bounds the memory "
+        f"(default: {kind.CPU_BATCH} on a CPU, {kind.GPU_BATCH} on a GPU)")
+    add("--seed", type=int, metavar="K", help=f"of {drawn} (default: {default.seed})")
+    add("--out", metavar="DIR", help=f"run folder (default: runs/{kind.TASK}-PLANNER-DATE-TIME)")
+    add("--resume", action="store_true", help="finish the interrupted run in --out")
+    # fmt: on
+    parser.set_defaults(command=lambda given: _sweep(kind, given))
+    return parser
+
+
+def _add_hit(tasks: Any, look: dict[str, Any]) -> None:
+    """The arguments of `sweep hit`."""
+    parser = _add_task(
+        tasks,
+        look,
+        HitSweep,
+        list(HIT_PLANNERS),
+        (
+            "a quadrotor hits served balls to a target with a racket",
+            "Plan a quadrotor's volley for thousands of serves and let a referee judge every plan.",
+        ),
+        (
+            " drawn ones, or all of the folder",
+            "the speed, acceleration and body-rate limits",
+            "drawn serves and of uniform starts",
+        ),
     )
     default = HitSweep()
     start = " ".join(f"{x:g}" for x in default.start)
     add = parser.add_argument
     # fmt: off
-    add("--planner", metavar="NAME", help=f"{', '.join(PLANNERS)} (default: {default.planner})")
     add("--serves", metavar="DIR", help="read published trial files (default: draw serves)")
-    add("--num", type=int, metavar="N",
-        help=f"cases (default: {DEFAULT_NUM} drawn ones, or all of the folder)")
     add("--start", nargs="+", metavar="X",
         help=f"hover start X Y Z in m, or 'uniform' over the half court (default: {start})")
     add("--delay", type=float, metavar="S",
         help=f"seconds from the serve to the start of planning (default: {default.delay:g})")
-    add("--limit-scale", type=float, metavar="F",
-        help="factor on the speed, acceleration and body-rate limits "
-        f"(default: {default.limit_scale:g})")
     add("--drag-after-impact", action="store_true",
         help="plan and judge the returned ball with drag too (exact only)")
-    add("--batch", type=int, metavar="B",
-        help="cases planned, judged and written at once; bounds the memory "
-        f"(default: {CPU_BATCH} on a CPU, {GPU_BATCH} on a GPU)")
-    add("--seed", type=int, metavar="K",
-        help=f"of drawn serves and of uniform starts (default: {default.seed})")
-    add("--out", metavar="DIR", help="run folder (default: runs/hit-PLANNER-DATE-TIME)")
-    add("--resume", action="store_true", help="finish the interrupted run in --out")
     # fmt: on
-    parser.set_defaults(command=_sweep_hit)
 
 
-def _sweep_hit(given: dict[str, Any]) -> None:
+def _add_catch(tasks: Any, look: dict[str, Any]) -> None:
+    """The arguments of `sweep catch`."""
+    parser = _add_task(
+        tasks,
+        look,
+        CatchSweep,
+        list(CATCH_PLANNERS),
+        (
+            "a quadrotor catches flying targets with a net",
+            "Decide when and in what order a quadrotor catches flying targets, plan it for "
+            "thousands of\nscenarios of a suite, and let a referee judge every plan.",
+        ),
+        (
+            "",
+            "the speed and body-rate limits and on the thrust's distance from hover",
+            "the suite's scenarios",
+        ),
+    )
+    default = CatchSweep()
+    add = parser.add_argument
+    # fmt: off
+    add("--suite", metavar="NAME", help=f"{', '.join(SUITES)} (default: {default.suite})")
+    add("--decide", metavar="NAME",
+        help=f"order and first times: {', '.join(DECISIONS)} (default: {default.decide})")
+    add("--tolerance", type=float, metavar="R",
+        help=f"relative, of the referee (default: {default.tolerance:g}; the published protocol "
+        "has 0.05 with --net-test ball)")
+    add("--net-test", metavar="NAME",
+        help=f"where the net's radius counts, {' or '.join(NET_TESTS)}: across the net in its "
+        f"plane, or all around its centre (default: {default.net_test})")
+    # fmt: on
+
+
+def _sweep(kind: type[SweepSettings], given: dict[str, Any]) -> None:
     out, resume = given.pop("out", None), given.pop("resume", False)
     if given.get("start") == ["uniform"]:
         given["start"] = "uniform"
-    settings = HitSweep(**given)
+    settings = kind(**given)
     if resume and out is None:
         raise SettingError("out must name the folder to resume, got nothing")
     if out is None:
         now = datetime.datetime.now()
-        out = os.path.join("runs", f"hit-{settings.planner}-{now:%Y%m%d-%H%M%S}")
+        out = os.path.join("runs", f"{kind.TASK}-{settings.planner}-{now:%Y%m%d-%H%M%S}")
     # A shell starts background jobs deaf to SIGINT; this one can be stopped and resumed there too.
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.default_int_handler)
     _keep_compiled_programs()
-    from planner_jax.sweep.hit import SweepInterrupted, resume_hit_sweep, start_hit_sweep
+    from planner_jax.sweep import run
 
     try:
-        manifest = resume_hit_sweep(out, **given) if resume else start_hit_sweep(settings, out)
-    except SweepInterrupted:
-        again = f"planner-jax sweep hit --resume --out {shlex.quote(str(out))}"
-        raise SweepInterrupted(f"interrupted; finish with: {again}") from None
+        if resume:
+            manifest = run.resume_sweep(kind.TASK, out, **given)
+        else:
+            manifest = run.start_sweep(settings, out)
+    except run.SweepInterrupted:
+        again = f"planner-jax sweep {kind.TASK} --resume --out {shlex.quote(str(out))}"
+        raise run.SweepInterrupted(f"interrupted; finish with: {again}") from None
     _print_result(manifest, Path(out))
 
 
 def _print_result(manifest: dict[str, Any], out: Path) -> None:
     from planner_jax.sweep.table import headline
+    from planner_jax.sweep.task import task_of
 
-    print("\n".join(headline(manifest)))
+    print("\n".join(headline(manifest, task_of(manifest).findings(manifest))))
     print(f"Look at {out / 'index.html'}")
 
 

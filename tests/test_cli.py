@@ -6,7 +6,8 @@ import sys
 import pytest
 
 from planner_jax.cli import main
-from planner_jax.sweep import chunks, hit
+from planner_jax.sweep import run as sweep_run
+from planner_jax.sweep.hit import task as hit_task
 
 HEADER = "number,serve position,serve velocity,landing position,target,hit,velocity,attitude"
 GOOD, GONE = "2.5 -0.3 2,-4.3 0.02 7.3", "2.5 -0.3 2,4.3 0.02 7.3"
@@ -72,6 +73,29 @@ def test_a_bad_argument_gets_one_line_and_leaves_nothing(capsys, elsewhere, argu
     assert not list(elsewhere.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        (["--suite", "nowhere"], ["--suite must be one of throws, hard", "got 'nowhere'"]),
+        (["--planner", "bat"], ["--planner must be one of exact, catch, mpp", "got 'bat'"]),
+        (["--decide", "later"], ["--decide must be one of best, greedy, given", "got 'later'"]),
+        (["--net-test", "box"], ["--net-test must be one of plane, ball", "got 'box'"]),
+        (["--tolerance", "-1"], ["--tolerance must be finite and >= 0", "got -1"]),
+        (["--num", "0"], ["--num must be >= 1", "got 0"]),
+        (["--limit-scale", "0"], ["--limit-scale must be finite and > 0", "got 0"]),
+        (["--num", "1", "--out", "/proc/nowhere"], ["--out must be a folder that can be"]),
+        (["--resume"], ["--out must name the folder to resume"]),
+        (["--resume", "--out", "nowhere"], ["--out must be the folder of a run", "nowhere"]),
+        (["--delay", "1"], ["unrecognized arguments", "--delay"]),
+    ],
+)
+def test_a_bad_argument_of_a_catch_gets_one_line_and_leaves_nothing(
+    capsys, elsewhere, arguments, parts
+):
+    expect_one_line(capsys, ["sweep", "catch", *arguments], *parts)
+    assert not list(elsewhere.iterdir())
+
+
 def test_bad_serves_are_named_by_file_and_line(capsys, elsewhere, tmp_path):
     nan = trial_file(tmp_path / "nan", "nan -0.3 2,-4.3 0.02 7.3")
     gone = trial_file(tmp_path / "gone", GONE)
@@ -115,7 +139,7 @@ def test_ctrl_c_says_how_to_resume(capsys, elsewhere, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(chunks, "plan", interrupted)
+    monkeypatch.setattr(hit_task, "plan", interrupted)
     code, out, err = run(capsys, "sweep", "hit", "--num", "3", "--out", "a run")
     assert code == 130 and out == ""
     expected = "planner-jax: interrupted; finish with: planner-jax sweep hit --resume --out 'a run'"
@@ -128,6 +152,7 @@ def test_a_sweep_prints_rate_and_speed_together(capsys, elsewhere, monkeypatch):
     def sweep(settings, out):
         asked.update(settings=settings, out=out)
         return {
+            "kind": "sweep hit",
             "parameters": {"planner": "exact"},
             "device": {"kind": "cpu", "cpu_count": 2},
             "times": {"compile_seconds": 8.0, "referee_seconds": 1.0, "wall_seconds": 12.0},
@@ -141,7 +166,7 @@ def test_a_sweep_prints_rate_and_speed_together(capsys, elsewhere, monkeypatch):
             },
         }
 
-    monkeypatch.setattr(hit, "start_hit_sweep", sweep)
+    monkeypatch.setattr(sweep_run, "start_sweep", sweep)
     arguments = ["--start", "uniform", "--delay", "0.3", "--drag-after-impact", "--seed", "5"]
     code, out, err = run(capsys, "sweep", "hit", "--num", "10", *arguments)
     assert code == 0 and err == ""
@@ -152,16 +177,23 @@ def test_a_sweep_prints_rate_and_speed_together(capsys, elsewhere, monkeypatch):
     assert settings.drag_after_impact
 
 
-def test_help_names_the_defaults_and_loads_no_jax():
+@pytest.mark.parametrize(
+    ("task", "parts"),
+    [
+        ("hit", ("--planner NAME", "default: exact", "default: -3 0 1.5", "runs/hit-PLANNER")),
+        ("catch", ("--suite NAME", "triangle3, hexagon6", "default: best", "runs/catch-PLANNER")),
+    ],
+)
+def test_help_names_the_defaults_and_loads_no_jax(task, parts):
     script = (
         "import sys; from planner_jax.cli import main\n"
-        "try: main(['sweep', 'hit', '--help'])\n"
+        f"try: main(['sweep', '{task}', '--help'])\n"
         "except SystemExit: pass\n"
         "sys.exit('jax' in sys.modules or 'numpy' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    for part in ("--planner NAME", "default: exact", "default: -3 0 1.5", "runs/hit-PLANNER"):
+    for part in parts:
         assert part in done.stdout
 
 

@@ -1,4 +1,4 @@
-"""Sweeps: run folder, resuming, tables, figures, clocks and rates."""
+"""Sweeps: run folder, resuming, tables, figures, clocks and rates, on the hit task."""
 
 import json
 from types import SimpleNamespace
@@ -12,15 +12,17 @@ from scipy.stats import binomtest
 
 from planner_jax.referee.hit import referee_hits
 from planner_jax.robot import quadrotor
-from planner_jax.sweep import baselines, chunks, hit
+from planner_jax.sweep import run
 from planner_jax.sweep.figures.motion import body_rate, net_thrust, sample_motion
-from planner_jax.sweep.hit import SweepInterrupted, resume_hit_sweep, start_hit_sweep
+from planner_jax.sweep.hit import task
+from planner_jax.sweep.hit.settings import HitSweep
+from planner_jax.sweep.hit.source import open_source
+from planner_jax.sweep.hit.table import rate_table
 from planner_jax.sweep.report import write_report
+from planner_jax.sweep.run import SweepInterrupted, resume_sweep, start_sweep
 from planner_jax.sweep.run_folder import RunFolder, pick_rows
-from planner_jax.sweep.settings import HitSweep, SettingError
-from planner_jax.sweep.source import open_source
+from planner_jax.sweep.settings import SettingError
 from planner_jax.sweep.summary import percent, wilson_interval
-from planner_jax.sweep.table import rate_table
 from planner_jax.sweep.timing import CompileClock
 from planner_jax.task.hit import court
 from planner_jax.task.hit.exact import ExactHit
@@ -42,9 +44,8 @@ def one_round(name, **options):
 @pytest.fixture(autouse=True, scope="module")
 def quick_planners():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(hit, "planner", one_round)
-        patch.setattr(baselines, "planner", one_round)
-        patch.setattr(baselines, "PLANNERS", {"exact": "", "bat": ""})
+        patch.setattr(task, "planner", one_round)
+        patch.setattr(task, "PLANNERS", {"exact": "", "bat": ""})
         yield
 
 
@@ -52,14 +53,14 @@ def quick_planners():
 def finished(tmp_path_factory):
     """The folder and manifest of a sweep that nothing disturbed."""
     out = tmp_path_factory.mktemp("runs") / "finished"
-    return out, start_hit_sweep(SETTINGS, out, progress=False)
+    return out, start_sweep(SETTINGS, out, progress=False)
 
 
 @pytest.fixture
 def no_report(monkeypatch):
     """Leave the drawing out."""
-    monkeypatch.setattr(hit, "write_report", lambda folder: None)
-    monkeypatch.setattr(hit, "plan_baselines", lambda source, index: None)
+    monkeypatch.setattr(run, "write_report", lambda folder: None)
+    monkeypatch.setattr(run, "plan_baselines", lambda task, source, index: None)
 
 
 def stop_after(monkeypatch, num_chunks):
@@ -71,8 +72,8 @@ def stop_after(monkeypatch, num_chunks):
             raise KeyboardInterrupt
         return real(*arguments)
 
-    real = chunks.plan
-    monkeypatch.setattr(chunks, "plan", plan)
+    real = task.plan
+    monkeypatch.setattr(task, "plan", plan)
 
 
 def columns(out):
@@ -191,13 +192,13 @@ def test_an_interrupted_sweep_is_resumed_to_the_same_rows(
     with monkeypatch.context() as patch:
         stop_after(patch, num_chunks)
         with pytest.raises(SweepInterrupted):
-            start_hit_sweep(SETTINGS, out, progress=False)
+            start_sweep(SETTINGS, out, progress=False)
     assert RunFolder(out).read_manifest()["state"] == "interrupted"
-    manifest = resume_hit_sweep(out, progress=False, num=NUM, delay=0.8)
+    manifest = resume_sweep("hit", out, progress=False, num=NUM, delay=0.8)
     assert manifest["state"] == "complete" and len(manifest["sessions"]) == 2
     assert (out / "plans.parquet").read_bytes() == (finished[0] / "plans.parquet").read_bytes()
     assert manifest["summary"]["successes"] == finished[1]["summary"]["successes"]
-    assert resume_hit_sweep(out, progress=False) == manifest
+    assert resume_sweep("hit", out, progress=False) == manifest
 
 
 def test_a_sweep_killed_while_writing_is_resumed_to_the_same_rows(
@@ -207,34 +208,34 @@ def test_a_sweep_killed_while_writing_is_resumed_to_the_same_rows(
     with monkeypatch.context() as patch:
         stop_after(patch, 2)
         with pytest.raises(SweepInterrupted):
-            start_hit_sweep(SETTINGS, out, progress=False)
+            start_sweep(SETTINGS, out, progress=False)
     folder = RunFolder(out)
     folder.write_manifest({**folder.read_manifest(), "state": "running"})
     (out / "parts" / ".part-000002.parquet.tmp").write_bytes(b"half a part")
     (out / ".plans.parquet.tmp").write_bytes(b"half a table")
-    resume_hit_sweep(out, progress=False)
+    resume_sweep("hit", out, progress=False)
     assert (out / "plans.parquet").read_bytes() == (finished[0] / "plans.parquet").read_bytes()
     assert not list(out.rglob(".*"))
 
 
 def test_resuming_with_another_setting_names_it(finished):
     with pytest.raises(SettingError, match=r"delay must be 0.8 as in the run .*, got 0.5"):
-        resume_hit_sweep(finished[0], delay=0.5)
+        resume_sweep("hit", finished[0], delay=0.5)
 
 
 def test_resuming_what_is_no_run_is_refused(tmp_path):
     with pytest.raises(SettingError, match="out must be the folder of a run"):
-        resume_hit_sweep(tmp_path)
+        resume_sweep("hit", tmp_path)
 
 
 def test_a_serve_drawn_late_that_breaks_a_rule_leaves_nothing_behind(tmp_path):
     # The first chunk holds no ball that is down by then; a later one does.
     settings = HitSweep(num=40, batch=4, delay=1.56, seed=0)
     source = open_source(settings, batch=4)
-    source.scenarios(source.chunk(0))
+    source.check()
     out = tmp_path / "runs" / "run"
     with pytest.raises(SettingError, match="delay must be shorter than each serve's flight"):
-        start_hit_sweep(settings, out, progress=False)
+        start_sweep(settings, out, progress=False)
     assert not list(tmp_path.iterdir())
 
 
@@ -257,7 +258,7 @@ def trial_files(folder, num_rows=3):
 
 def test_published_outcomes_stand_beside_the_plans_of_the_same_serves(tmp_path, no_report):
     serves, out = trial_files(tmp_path / "serves"), tmp_path / "run"
-    manifest = start_hit_sweep(HitSweep(serves=serves), out, progress=False)
+    manifest = start_sweep(HitSweep(serves=serves), out, progress=False)
     rows = columns(out)
     assert rows["published_bat"].tolist() == [True, False, True]
     assert rows["published_juggle"].tolist() == [False] * 3
@@ -273,7 +274,7 @@ def test_published_outcomes_stand_beside_the_plans_of_the_same_serves(tmp_path, 
 def test_a_single_chunk_is_timed_warm_too(tmp_path, no_report):
     jax.clear_caches()
     serves = trial_files(tmp_path / "serves")
-    manifest = start_hit_sweep(HitSweep(serves=serves), tmp_path / "run", progress=False)
+    manifest = start_sweep(HitSweep(serves=serves), tmp_path / "run", progress=False)
     times = manifest["times"]
     assert times["warm_plans"] == 3 and times["warm_seconds"] < times["first_seconds"]
 
@@ -282,14 +283,14 @@ def test_resuming_needs_the_serves_that_the_run_began_with(tmp_path, monkeypatch
     serves, out = trial_files(tmp_path / "serves"), tmp_path / "run"
     stop_after(monkeypatch, 0)
     with pytest.raises(SweepInterrupted):
-        start_hit_sweep(HitSweep(serves=serves, num=2), out, progress=False)
+        start_sweep(HitSweep(serves=serves, num=2), out, progress=False)
     trial_files(tmp_path / "serves", num_rows=2)
     with pytest.raises(SweepInterrupted):
-        resume_hit_sweep(out, progress=False)
+        resume_sweep("hit", out, progress=False)
     for path in (tmp_path / "serves").iterdir():
         path.write_text(path.read_text().replace("7.2", "7.0"))
-    with pytest.raises(SettingError, match="serves must be as they were when the run began"):
-        resume_hit_sweep(out, progress=False)
+    with pytest.raises(SettingError, match="serves must be the same as when the run began"):
+        resume_sweep("hit", out, progress=False)
 
 
 # Tables.
@@ -421,5 +422,6 @@ def test_chunks_join_to_the_whole_without_a_seam():
     source = open_source(HitSweep(num=50, batch=20), batch=1)
     assert source.num_chunks == 3
     parts = [source.chunk(number) for number in range(3)]
-    np.testing.assert_array_equal(np.concatenate([p.velocity for p in parts]), whole.velocity)
+    velocity = np.concatenate([part.origin.velocity for part in parts])
+    np.testing.assert_array_equal(velocity, whole.origin.velocity)
     np.testing.assert_array_equal(np.concatenate([p.index for p in parts]), np.arange(50))

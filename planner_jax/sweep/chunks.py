@@ -1,4 +1,4 @@
-"""The chunks of a hit sweep: drawn or read, planned, refereed, written and counted."""
+"""The chunks of a sweep: drawn or read, planned, refereed, written and counted."""
 
 import dataclasses
 import sys
@@ -8,22 +8,20 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from planner_jax.referee.hit import referee_hits
 from planner_jax.sweep.columns import RefereedBatch, rows_of
 from planner_jax.sweep.run_folder import RunFolder
-from planner_jax.sweep.source import ServeSource
-from planner_jax.sweep.summary import Tally, percent
+from planner_jax.sweep.source import Source
+from planner_jax.sweep.summary import percent
+from planner_jax.sweep.task import SweepTask
 from planner_jax.sweep.timing import CompileClock, Stopwatch
-from planner_jax.task.hit.scenario import HitScenario
-from planner_jax.task.solve import plan
 
 _MEASURED = {
     "compile_seconds": "JAX tracing, lowering, compiling or reading its cache, while chunks were "
     "made; overlapping spans counted once",
-    "first_seconds": "the first chunk's plan() call with the compilation in it",
-    "warm_seconds": "plan() calls in which nothing was compiled, from scenarios to plans on the "
-    "host: ball tables, guesses and all rounds. Where these were less than half a batch, the "
-    "first chunk planned again",
+    "first_seconds": "planning the first chunk, with the compilation in it",
+    "warm_seconds": "planning of chunks in which nothing was compiled, scenarios to plans on the "
+    "host: decisions, ball tables, guesses and all rounds. Where these were less than half a "
+    "batch, the first chunk planned again",
     "referee_seconds": "judging, without planning",
     "wall_seconds": "all chunks of all sessions with drawing, checking and writing; without "
     "imports, merging and report",
@@ -31,15 +29,16 @@ _MEASURED = {
 
 
 @dataclasses.dataclass(frozen=True)
-class HitRun:
-    """A hit sweep under way."""
+class SweepRun:
+    """A sweep under way."""
 
-    source: ServeSource
+    task: SweepTask
+    source: Source
     planner: Any
     folder: RunFolder
 
 
-def plan_chunks(run: HitRun, *, progress: bool) -> None:
+def plan_chunks(run: SweepRun, *, progress: bool) -> None:
     """Plan, referee and write every chunk that has no part yet.
 
     Args:
@@ -60,7 +59,8 @@ def plan_chunks(run: HitRun, *, progress: bool) -> None:
             batch, record = _plan_chunk(run, chunk)
             record["successes"] = int(np.sum(batch.verdict.success))
             record["wall_seconds"] = watch.lap()
-            folder.write_part(chunk, rows_of(batch), record)
+            rows = rows_of(run.task.columns, batch, run.task.frame)
+            folder.write_part(chunk, rows, record)
             done, successes = done + record["num"], successes + record["successes"]
             bar.set_postfix_str(f"success {percent(successes, done)} %", refresh=False)
             bar.update(record["num"])
@@ -74,36 +74,34 @@ def _progress(records: Iterable[dict[str, Any]]) -> tuple[int, int]:
     return done, successes
 
 
-def _plan_chunk(run: HitRun, chunk: int) -> tuple[RefereedBatch, dict[str, Any]]:
+def _plan_chunk(run: SweepRun, chunk: int) -> tuple[RefereedBatch, dict[str, Any]]:
     """One chunk, and how long it took."""
     source = run.source
     with CompileClock() as clock:
-        serves = source.chunk(chunk)
-        scenarios = source.scenarios(serves)
-        plans, seconds, warm = _timed_plan(run, scenarios)
+        cases = source.chunk(chunk)
+        (scenarios, plans), seconds, warm = _timed_plan(run, cases.scenarios)
         watch = Stopwatch()
-        drag = source.settings.drag_after_impact
-        verdict = referee_hits(scenarios, plans, drag_after_impact=drag)
+        verdict = run.task.judge(scenarios, plans, source.settings)
         referee_seconds = watch.lap()
     record = {
-        "num": len(serves),
+        "num": len(cases),
         "plan_seconds": seconds,
         "warm": warm,
         "compile_seconds": clock.seconds,
         "referee_seconds": referee_seconds,
     }
-    return RefereedBatch(serves, scenarios, plans, verdict), record
+    return RefereedBatch(cases, scenarios, plans, verdict), record
 
 
-def _timed_plan(run: HitRun, scenarios: HitScenario) -> tuple[Any, float, bool]:
-    """The plans, the seconds they took, and whether nothing was compiled meanwhile."""
+def _timed_plan(run: SweepRun, scenarios: Any) -> tuple[Any, float, bool]:
+    """Scenarios and plans, the seconds they took, and whether nothing was compiled meanwhile."""
     watch = Stopwatch()
     with CompileClock() as clock:
-        plans = plan(run.planner, scenarios)
-    return plans, watch.lap(), not clock.compiled
+        planned = run.task.plan(run.planner, scenarios, run.source.settings)
+    return planned, watch.lap(), not clock.compiled
 
 
-def merge_chunks(run: HitRun) -> dict[str, Any]:
+def merge_chunks(run: SweepRun) -> dict[str, Any]:
     """Join the parts to `plans.parquet`.
 
     Args:
@@ -113,7 +111,7 @@ def merge_chunks(run: HitRun) -> dict[str, Any]:
         Entries for the manifest: `summary`, `times`, and `example`, a case worth a figure.
     """
     times = _times(run)
-    tally = Tally()
+    tally = run.task.tally(run.source.settings)
     run.folder.merge_parts(run.source.num_chunks, tally.add)
     summary = tally.summary()
     summary["plans_per_second_warm"] = round(times["warm_plans"] / times["warm_seconds"], 1)
@@ -121,7 +119,7 @@ def merge_chunks(run: HitRun) -> dict[str, Any]:
     return {"summary": summary, "times": times, "example": tally.example}
 
 
-def _times(run: HitRun) -> dict[str, Any]:
+def _times(run: SweepRun) -> dict[str, Any]:
     """The times of the manifest, from the records of the parts."""
     seconds = dict.fromkeys(_MEASURED, 0.0)
     warm_plans = 0
@@ -141,11 +139,10 @@ def _times(run: HitRun) -> dict[str, Any]:
     return {**rounded, "warm_plans": warm_plans, "measured": _MEASURED}
 
 
-def _warm_first_chunk(run: HitRun) -> tuple[int, float]:
+def _warm_first_chunk(run: SweepRun) -> tuple[int, float]:
     """Number of plans and seconds of the first chunk, planned until nothing is compiled."""
-    serves = run.source.chunk(0)
-    scenarios = run.source.scenarios(serves)
+    cases = run.source.chunk(0)
     seconds, warm = 0.0, False
     while not warm:
-        _, seconds, warm = _timed_plan(run, scenarios)
-    return len(serves), seconds
+        _, seconds, warm = _timed_plan(run, cases.scenarios)
+    return len(cases), seconds

@@ -1,169 +1,127 @@
-"""The columns of `plans.parquet`: a row a case, SI units, world frame (z up, net at x = 0)."""
+"""The columns of `plans.parquet`: a row a case, SI units, world frame (z up)."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 
 from planner_jax.optimise.status import Status
-from planner_jax.referee.hit import HitVerdict
-from planner_jax.task.hit import court
-from planner_jax.task.hit.plan import HitPlan
-from planner_jax.task.hit.scenario import HitScenario
-from planner_jax.task.hit.serves import Serves
+from planner_jax.sweep.source import Cases
 
 
 @dataclasses.dataclass(frozen=True)
 class RefereedBatch:
-    """N cases with everything that is known about them; leaves are NumPy or JAX arrays."""
+    """B cases with everything that is known about them; leaves are NumPy or JAX arrays."""
 
-    serves: Serves
-    scenarios: HitScenario
-    plans: HitPlan
-    verdict: HitVerdict
+    cases: Cases
+    scenarios: Any  # as they were planned, with what was decided about them
+    plans: Any
+    verdict: Any
 
 
-class _Column(NamedTuple):
+class Column(NamedTuple):
+    """One column of a task's rows."""
+
     name: str
     unit: str  # "" for names and counts, "1" for ratios
     meaning: str
     type: pa.DataType
-    values: Callable[[RefereedBatch], Any]
+    values: Callable[[RefereedBatch], Any]  # (B,) or (B, ...), lists flat; None: all null
 
 
-_NUMBER, _VECTOR = pa.float32(), pa.list_(pa.float32(), 3)
-_LIST = pa.list_(pa.float32())
+BOOL, TEXT, COUNT, NUMBER = pa.bool_(), pa.string(), pa.int32(), pa.float32()
+VECTOR, LIST = pa.list_(pa.float32(), 3), pa.list_(pa.float32())
+
+INDEX = Column("index", "", "place in the whole", pa.int64(), lambda b: b.cases.index)
 
 
-def _case_columns() -> list[_Column]:
-    """What was to be done."""
-    vector = pa.list_(pa.float64(), 3)
+def leaves_of(part: str, rows: Sequence[tuple[str, str, str, pa.DataType, str]]) -> list[Column]:
+    """Columns that are leaves of one part of a batch.
+
+    Args:
+        part: field of `RefereedBatch`.
+        rows: name, unit, meaning and type of a column, and the dotted path of the leaf; the
+            path "" is the name itself.
+    """
     return [
-        _Column("index", "", "place in the whole", pa.int64(), lambda b: b.serves.index),
-        _Column(
-            "scenario",
-            "",
-            "serve, landing and target region",
-            pa.string(),
-            lambda b: np.array(court.SCENARIOS)[b.serves.scenario],
-        ),
-        _Column("file", "", "trial file of the serve", pa.string(), lambda b: b.serves.file),
-        _Column("line", "", "line of that file, from 1", pa.int32(), lambda b: b.serves.line),
-        _Column("serve_pos", "m", "ball when served", vector, lambda b: b.serves.position),
-        _Column("serve_vel", "m/s", "ball when served", vector, lambda b: b.serves.velocity),
-        _Column("target", "m", "wanted landing point", vector, lambda b: b.serves.target),
-        _Column(
-            "ball_pos", "m", "ball when planning begins", _VECTOR, lambda b: b.scenarios.ball.pos
-        ),
-        _Column(
-            "ball_vel", "m/s", "ball when planning begins", _VECTOR, lambda b: b.scenarios.ball.vel
-        ),
-        _Column(
-            "start",
-            "m",
-            "hover position of the quadrotor",
-            _VECTOR,
-            lambda b: np.asarray(b.scenarios.head_state)[:, 0],
-        ),
-    ]
-
-
-def _plan_columns() -> list[_Column]:
-    """What the planner says; times from the moment at which planning begins."""
-    rows = [
-        ("contact_time", "s", "of the impact", _NUMBER, "stroke.time"),
-        ("contact_pos", "m", "ball at the impact", _VECTOR, "stroke.ball_pos"),
-        ("ball_vel_before", "m/s", "ball just before the impact", _VECTOR, "stroke.ball_vel"),
-        ("ball_vel_after", "m/s", "ball just after the impact", _VECTOR, "stroke.ball_vel_after"),
-        ("normal", "1", "unit normal of the racket at the impact", _VECTOR, "stroke.normal"),
-        ("flight_time", "s", "from the impact to the landing", _NUMBER, "stroke.flight_time"),
-        ("cost", "1", "the planner's own objective", _NUMBER, "cost"),
-        ("violation", "1", "largest relative excess the planner saw", _NUMBER, "violation"),
-        ("iterations", "", "of the round that gave the plan", pa.int32(), "iterations"),
-    ]
-    columns = [
-        _Column(name, unit, meaning, kind, lambda b, path=path: _leaf(b.plans, path))
+        Column(name, unit, meaning, kind, lambda b, at=path or name: _leaf(getattr(b, part), at))
         for name, unit, meaning, kind, path in rows
     ]
-    status = _Column("status", "", "of the solver", pa.string(), lambda b: _status(b.plans.status))
-    return [*columns, status]
 
 
-def _verdict_columns() -> list[_Column]:
-    """What the referee found."""
-    rows = [
-        ("success", "", "the referee's word", pa.bool_()),
-        ("failed_limit", "", "first limit that fails, or empty", pa.string()),
-        ("failed_time", "s", "where that limit is worst", _NUMBER),
-        ("failed_excess", "as in `sentence`", "by how much, tolerance not taken off", _NUMBER),
-        ("max_speed", "m/s", "of the quadrotor", _NUMBER),
-        ("max_acceleration", "m/s^2", "of the quadrotor", _NUMBER),
-        ("max_body_rate", "rad/s", "of the quadrotor", _NUMBER),
-        ("min_height", "m", "of the propeller plane", _NUMBER),
-        ("min_thrust", "m/s^2", "per unit mass", _NUMBER),
-        ("max_thrust", "m/s^2", "per unit mass", _NUMBER),
-        ("hitting_velocity", "m/s", "quadrotor and racket at the impact", _VECTOR),
-        ("apex", "m", "of the returned ball", _NUMBER),
-        ("landing_point", "m", "of the returned ball", _VECTOR),
-        ("landing_error", "m", "horizontal, to the target", _NUMBER),
-        ("contact_error", "m", "racket centre to ball at the impact", _NUMBER),
-        ("continuity_error", "m", "worst jump between pieces", _NUMBER),
-        ("head_error", "m", "of the state at time 0", _NUMBER),
-    ]
-    columns = [
-        _Column(name, unit, meaning, kind, lambda b, name=name: getattr(b.verdict, name))
-        for name, unit, meaning, kind in rows
-    ]
-    sentence = _Column("sentence", "", "what failed, in words", pa.string(), _sentences)
-    return [*columns, sentence]
+SOLVER = [
+    *leaves_of(
+        "plans",
+        [
+            ("cost", "1", "the planner's own objective", NUMBER, ""),
+            ("violation", "1", "largest relative excess the planner saw", NUMBER, ""),
+            ("iterations", "", "of the round that gave the plan", COUNT, ""),
+        ],
+    ),
+    Column("status", "", "of the solver", TEXT, lambda b: _status(b.plans.status)),
+]
+
+OUTCOME = leaves_of(
+    "verdict",
+    [
+        ("success", "", "the referee's word", BOOL, ""),
+        ("failed_limit", "", "first limit that fails, or empty", TEXT, ""),
+        ("failed_time", "s", "where that limit is worst", NUMBER, ""),
+        ("failed_excess", "as in `sentence`", "by how much, tolerance not taken off", NUMBER, ""),
+        ("max_speed", "m/s", "of the quadrotor", NUMBER, ""),
+        ("max_body_rate", "rad/s", "of the quadrotor", NUMBER, ""),
+        ("min_height", "m", "of the propeller plane", NUMBER, ""),
+        ("min_thrust", "m/s^2", "per unit mass", NUMBER, ""),
+        ("max_thrust", "m/s^2", "per unit mass", NUMBER, ""),
+    ],
+)
+
+ERRORS = [
+    *leaves_of(
+        "verdict",
+        [
+            ("continuity_error", "m", "worst jump between pieces", NUMBER, ""),
+            ("head_error", "m", "of the state at time 0", NUMBER, ""),
+        ],
+    ),
+    Column("sentence", "", "what failed, in words", TEXT, lambda b: _sentences(b.verdict)),
+]
+
+TRAJECTORY = leaves_of(
+    "plans",
+    [
+        ("durations", "s", "of the pieces", LIST, "trajectory.durations"),
+        (
+            "coeffs",
+            "m/s^k",
+            "pieces x powers k = 0..D x 3 axes, flat",
+            LIST,
+            "trajectory.coeffs",
+        ),
+    ],
+)
 
 
-def _trajectory_columns() -> list[_Column]:
-    """The trajectory, and the published outcome of the same serve."""
-    durations = _Column(
-        "durations", "s", "of the M pieces", _LIST, lambda b: b.plans.trajectory.durations
-    )
-    coeffs = _Column(
-        "coeffs",
-        "m/s^k",
-        "M pieces x powers k = 0..D x 3 axes, flat",
-        _LIST,
-        lambda b: _flat(b.plans.trajectory.coeffs),
-    )
-    published = [
-        _Column(
-            published_column(planner),
-            "",
-            "published outcome, null where there is none",
-            pa.bool_(),
-            lambda b, place=place: _published(b.serves, place),
-        )
-        for place, planner in enumerate(court.PLANNERS)
-    ]
-    return [durations, coeffs, *published]
+def rows_of(columns: Sequence[Column], batch: RefereedBatch, frame: str) -> pa.Table:
+    """The rows of a batch.
 
-
-def published_column(planner: str) -> str:
-    """Name of the column with the published outcomes of a planner."""
-    return f"published_{planner.replace('-', '_')}"
-
-
-def rows_of(batch: RefereedBatch) -> pa.Table:
-    """The rows of a batch."""
-    columns = _case_columns() + _plan_columns() + _verdict_columns() + _trajectory_columns()
-    num = len(batch.serves)
+    Args:
+        columns: of the task.
+        batch: the cases.
+        frame: axes and times of the columns, in words, for the metadata.
+    """
+    num = len(batch.cases)
     fields = [
         pa.field(c.name, c.type, metadata={"unit": c.unit, "meaning": c.meaning}) for c in columns
     ]
     arrays = [_array(column.values(batch), column.type, num) for column in columns]
-    metadata = {"frame": "world, z up, net at x = 0; times from the start of planning"}
-    return pa.Table.from_arrays(arrays, schema=pa.schema(fields, metadata=metadata))
+    return pa.Table.from_arrays(arrays, schema=pa.schema(fields, metadata={"frame": frame}))
 
 
 def _array(values: Any, kind: pa.DataType, num: int) -> pa.Array:
-    """An Arrow array of `num` entries from (num,) or (num, length) values."""
+    """An Arrow array of `num` entries from (num,) or (num, ...) values."""
     if values is None:
         return pa.nulls(num, kind)
     if isinstance(values, pa.Array):
@@ -178,29 +136,17 @@ def _array(values: Any, kind: pa.DataType, num: int) -> pa.Array:
     return pa.ListArray.from_arrays(pa.array(offsets), flat, type=kind)
 
 
-def _leaf(tree: Any, path: str) -> np.ndarray:
+def _leaf(tree: Any, path: str) -> Any:
     for name in path.split("."):
         tree = getattr(tree, name)
-    return np.asarray(tree)
-
-
-def _flat(coeffs: Any) -> np.ndarray:
-    return np.asarray(coeffs).reshape(len(coeffs), -1)
+    return tree
 
 
 def _status(status: Any) -> np.ndarray:
     return np.array([Status(code).name for code in np.asarray(status)])
 
 
-def _sentences(batch: RefereedBatch) -> np.ndarray:
-    verdict = batch.verdict
+def _sentences(verdict: Any) -> np.ndarray:
     return np.array(
         ["" if good else verdict.sentence(lane) for lane, good in enumerate(verdict.success)]
     )
-
-
-def _published(serves: Serves, place: int) -> pa.Array | None:
-    if serves.published is None:
-        return None
-    outcome = serves.published[:, place]
-    return pa.array(outcome == 1.0, pa.bool_(), mask=np.isnan(outcome))

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from planner_jax.sweep import table
+from planner_jax.sweep.task import SweepTask
 
 _STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; color: #24292f; max-width: 68rem; margin: 2rem auto;
@@ -19,34 +20,28 @@ th, td { padding: 0.2rem 0.8rem; text-align: right; white-space: nowrap; }
 th:first-child, td:first-child { text-align: left; }
 .words td { text-align: left; white-space: normal; }
 tr { border-bottom: 1px solid #e6e8eb; } th { border-bottom: 2px solid #8a8f98; }
-.rates tr:last-child { font-weight: bold; border-top: 2px solid #8a8f98; }
+.rates tr.strong { font-weight: bold; background: #f0f4f8; }
 .lead { font-size: 1.05rem; } pre { font-size: 0.8rem; overflow-x: auto; background: #f6f8fa;
         padding: 1rem; }
 """.strip()
 
-FIGURES = {
-    "court.png": "Serves, planned trajectories and returned balls, from above and from the side. "
-    "Cases are taken evenly from the run, failures added where these hold fewer than twelve.",
-    "motion.png": "One plan along its time against the limits, beside the other planners' plans "
-    "for the same serve.",
-    "rates.png": "Success per scenario with 95 % Wilson intervals, beside the published rates.",
-}
 
-
-def to_page(manifest: dict[str, Any], failures: Sequence[dict[str, Any]]) -> str:
+def to_page(task: SweepTask, manifest: dict[str, Any], failures: Sequence[dict[str, Any]]) -> str:
     """The page of a run.
 
     Args:
+        task: of the run.
         manifest: of the run.
         failures: some rows of `plans.parquet` that failed.
     """
-    title = f"Hit sweep, planner {manifest['parameters']['planner']}"
-    lead = "".join(f"<p class=lead>{html.escape(line)}</p>\n" for line in table.headline(manifest))
-    notes = "".join(f"<li>{html.escape(line)}</li>\n" for line in table.remarks(manifest))
+    title, rates = html.escape(task.title(manifest)), task.table(manifest)
+    lines = table.headline(manifest, task.findings(manifest))
+    lead = "".join(f"<p class=lead>{html.escape(line)}</p>\n" for line in lines)
+    notes = "".join(f"<li>{html.escape(line)}</li>\n" for line in task.remarks(manifest))
     figures = "".join(
-        f'<figure><a href="figures/{name}"><img src="figures/{name}" alt="{caption}"></a>\n'
-        f"<figcaption>{caption}</figcaption></figure>\n"
-        for name, caption in FIGURES.items()
+        f'<figure><a href="figures/{figure.name}"><img src="figures/{figure.name}" '
+        f'alt="{figure.caption}"></a>\n<figcaption>{figure.caption}</figcaption></figure>\n'
+        for figure in task.figures
     )
     record = html.escape(json.dumps(manifest, indent=2))
     return f"""<!doctype html>
@@ -58,12 +53,12 @@ def to_page(manifest: dict[str, Any], failures: Sequence[dict[str, Any]]) -> str
 </style></head>
 <body>
 <h1>{title}</h1>
-{lead}{figures}<h2>Success per scenario</h2>
+{lead}{figures}<h2>{rates.title}</h2>
 <div class="scroll rates">
-{table.to_html(table.rate_table(manifest))}</div>
+{table.to_html(rates)}</div>
 <ul>
 {notes}</ul>
-{_failures(manifest, failures)}<h2>The run</h2>
+{_failures(task, manifest, failures)}<h2>The run</h2>
 <p>All rows: <a href="plans.parquet">plans.parquet</a> (units in the column metadata); this table:
 <a href="table.md">table.md</a>; everything about the run:
 <a href="manifest.json">manifest.json</a>.</p>
@@ -72,17 +67,13 @@ def to_page(manifest: dict[str, Any], failures: Sequence[dict[str, Any]]) -> str
 """
 
 
-def _failures(manifest: dict[str, Any], failures: Sequence[dict[str, Any]]) -> str:
+def _failures(task: SweepTask, manifest: dict[str, Any], failures: Sequence[dict[str, Any]]) -> str:
     """The first failures in the referee's words."""
     if not failures:
         return ""
     summary = manifest["summary"]
-    rows = [
-        [str(row["index"]), row["scenario"], row["status"], row["sentence"]] for row in failures
-    ]
-    words = table.RateTable(["case", "scenario", "solver's status", "referee"], rows)
+    words = task.failure_words
+    rows = [[str(row[column]) for column in words.values()] for row in failures]
     total = summary["num"] - summary["successes"]
-    return (
-        f"<h2>Failures, the first {len(failures)} of {total:,}</h2>\n"
-        f'<div class="scroll words">\n{table.to_html(words)}</div>\n'
-    )
+    listed = table.RateTable(f"Failures, the first {len(failures)} of {total:,}", list(words), rows)
+    return f'<h2>{listed.title}</h2>\n<div class="scroll words">\n{table.to_html(listed)}</div>\n'

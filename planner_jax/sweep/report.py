@@ -1,21 +1,52 @@
 """Table, figures and page of a run, from nothing but its folder."""
 
+import dataclasses
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 
-from planner_jax.sweep.figures.court import court_figure
-from planner_jax.sweep.figures.motion import motion_figure
-from planner_jax.sweep.figures.rates import rates_figure
 from planner_jax.sweep.figures.style import draw
 from planner_jax.sweep.page import to_page
 from planner_jax.sweep.run_folder import RunFolder, pick_rows
 from planner_jax.sweep.settings import SettingError
-from planner_jax.sweep.table import to_markdown
+from planner_jax.sweep.table import headline, to_markdown
+from planner_jax.sweep.task import task_of
 
 _CASES_SHOWN = 60
 _FAILURES_SHOWN = 12
+
+
+@dataclasses.dataclass(frozen=True)
+class RunRows:
+    """What the figures of a run are drawn from."""
+
+    folder: RunFolder
+    manifest: dict[str, Any]
+    failures: list[dict[str, Any]]  # the first few rows that failed
+
+    def sample(self) -> list[dict[str, Any]]:
+        """Rows taken evenly from the run; where nearly all succeed, failures are added."""
+        last = self.manifest["summary"]["num"] - 1
+        spread = np.linspace(0, last, _CASES_SHOWN).astype(int).tolist()
+        shown = pick_rows(self.folder.plans, spread)
+        missing = _FAILURES_SHOWN - sum(not row["success"] for row in shown)
+        others = [row for row in self.failures if row["index"] not in spread]
+        return shown + others[: max(missing, 0)]
+
+    def same_case(self) -> list[tuple[str, dict[str, Any]]]:
+        """Planner and row of the run's example, and of the other planners for the same case."""
+        own = pick_rows(self.folder.plans, [self.manifest["example"]])[0]
+        plans = [(self.manifest["parameters"]["planner"], own)]
+        if self.folder.baselines.exists():
+            others = pq.read_table(self.folder.baselines).to_pylist()
+            plans += [(row["planner"], row) for row in others]
+        return plans
+
+    def columns(self, *names: str) -> pa.Table:
+        """Some columns of all rows."""
+        return pq.read_table(self.folder.plans, columns=list(names))
 
 
 def write_report(folder: RunFolder) -> None:
@@ -25,27 +56,23 @@ def write_report(folder: RunFolder) -> None:
         folder: with `manifest.json` and `plans.parquet`; `baselines.parquet` may be there.
 
     Raises:
-        SettingError: the folder is not that of a run, or the run is not finished.
+        SettingError: the folder is not that of a sweep, or the run is not finished.
     """
     manifest = folder.read_manifest()
+    task = task_of(manifest, folder.name)
     if "summary" not in manifest or not folder.plans.exists():
         raise SettingError(
             f"{folder.name} must be finished, got {str(folder.path)!r}; resume it first"
         )
     folder.figures.mkdir(exist_ok=True)
     failed = pick_rows(folder.plans, _first_failures(folder))
-    spread = np.linspace(0, manifest["summary"]["num"] - 1, _CASES_SHOWN).astype(int).tolist()
-    shown = pick_rows(folder.plans, spread)
-    # Where nearly all succeed, an even sample would show no failure.
-    missing = _FAILURES_SHOWN - sum(not row["success"] for row in shown)
-    shown += [row for row in failed if row["index"] not in spread][: max(missing, 0)]
-    setting = manifest["setting"]
-    drag_after = manifest["parameters"]["drag_after_impact"]
-    draw(folder.figures / "court.png", court_figure, (9.0, 10.6), shown, setting, drag_after)
-    draw(folder.figures / "motion.png", motion_figure, (13.0, 6.8), _same_serve(folder), setting)
-    draw(folder.figures / "rates.png", rates_figure, (13.0, 6.6), manifest)
-    folder.write_text("table.md", to_markdown(manifest))
-    folder.write_text("index.html", to_page(manifest, failed))
+    rows = RunRows(folder, manifest, failed)
+    for figure in task.figures:
+        draw(folder.figures / figure.name, figure.draw, figure.size, rows)
+    lines = headline(manifest, task.findings(manifest))
+    text = to_markdown(task.title(manifest), lines, task.table(manifest), task.remarks(manifest))
+    folder.write_text("table.md", text)
+    folder.write_text("index.html", to_page(task, manifest, failed))
 
 
 def _first_failures(folder: RunFolder) -> list[int]:
@@ -59,14 +86,3 @@ def _first_failures(folder: RunFolder) -> list[int]:
             if len(failed) >= _FAILURES_SHOWN:
                 break
     return failed[:_FAILURES_SHOWN]
-
-
-def _same_serve(folder: RunFolder) -> list[tuple[str, dict[str, Any]]]:
-    """Planner and row of the run's example, and of the other planners for the same serve."""
-    manifest = folder.read_manifest()
-    own = pick_rows(folder.plans, [manifest["example"]])[0]
-    plans = [(manifest["parameters"]["planner"], own)]
-    if folder.baselines.exists():
-        others = pq.read_table(folder.baselines).to_pylist()
-        plans += [(row["planner"], row) for row in others]
-    return plans

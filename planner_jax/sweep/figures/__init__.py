@@ -1,1 +1,1 @@
-"""Figures of a run, drawn from its folder alone."""
+"""What the figures of all tasks share; every figure is drawn from a run's folder alone."""

@@ -13,7 +13,14 @@ BLUE, ORANGE, GREEN, RED = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 PURPLE, SKY, GREY, INK = "#CC79A7", "#56B4E9", "#8A8F98", "#24292F"
 PALE = "#C9CDD2"
 
-PLANNER_COLOURS = {"exact": BLUE, "bat": ORANGE, "bat-lite": GREEN, "juggle": PURPLE}
+PLANNER_COLOURS = {
+    "exact": BLUE,
+    "bat": ORANGE,
+    "bat-lite": GREEN,
+    "juggle": PURPLE,
+    "catch": ORANGE,
+    "mpp": PURPLE,
+}
 
 _LOOK: dict[Any, Any] = {
     "font.size": 10.0,

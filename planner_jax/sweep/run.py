@@ -1,4 +1,4 @@
-"""The hit sweep: serves in, refereed plans and a report out, in one run folder."""
+"""A sweep: cases in, refereed plans and a report out, in one run folder."""
 
 import dataclasses
 import datetime
@@ -6,33 +6,21 @@ import os
 import sys
 from typing import Any
 
-import numpy as np
-
 from planner_jax.sweep.baselines import plan_baselines
-from planner_jax.sweep.chunks import HitRun, merge_chunks, plan_chunks
+from planner_jax.sweep.chunks import SweepRun, merge_chunks, plan_chunks
 from planner_jax.sweep.environment import environment, require_backend
 from planner_jax.sweep.report import write_report
 from planner_jax.sweep.run_folder import RunFolder
-from planner_jax.sweep.settings import (
-    CPU_BATCH,
-    GPU_BATCH,
-    HitSweep,
-    SettingError,
-    settings_to_resume,
-)
-from planner_jax.sweep.source import open_source
-from planner_jax.task.hit.planners import PLANNERS, planner
-from planner_jax.task.hit.scenario import HitScenario
-
-KIND = "sweep hit"
+from planner_jax.sweep.settings import SettingError, SweepSettings, settings_to_resume
+from planner_jax.sweep.task import SweepTask, task_named
 
 
 class SweepInterrupted(KeyboardInterrupt):
     """A sweep was stopped by hand; its folder, the message, can be resumed."""
 
 
-def start_hit_sweep(
-    settings: HitSweep, out: str | os.PathLike, *, progress: bool = True
+def start_sweep(
+    settings: SweepSettings, out: str | os.PathLike, *, progress: bool = True
 ) -> dict[str, Any]:
     """Plan and referee a sweep into a new folder.
 
@@ -45,26 +33,23 @@ def start_hit_sweep(
         The manifest of the finished run.
 
     Raises:
-        SettingError: an argument or a serve breaks a rule; nothing is left behind.
+        SettingError: an argument or a case breaks a rule; nothing is left behind.
         SweepInterrupted: on Ctrl-C; the folder can be resumed.
     """
     folder = RunFolder(out)
     folder.require_new()
-    run = _open(settings, folder)
-    source = run.source
-    # Of a folder every serve is looked at before anything is written; drawn ones obey their law.
-    for chunk in range(source.num_chunks if source.folder is not None else 1):
-        scenarios = source.scenarios(source.chunk(chunk))
-    folder.create(_first_manifest(run, scenarios))
+    run = _open(task_named(settings.TASK), settings, folder)
+    folder.create(_first_manifest(run, run.source.check()))
     return _finish(run, progress)
 
 
-def resume_hit_sweep(
-    out: str | os.PathLike, *, progress: bool = True, **given: Any
+def resume_sweep(
+    name: str, out: str | os.PathLike, *, progress: bool = True, **given: Any
 ) -> dict[str, Any]:
     """Finish a sweep that was interrupted or killed; a finished one is left as it is.
 
     Args:
+        name: of its task.
         out: its folder.
         progress: show a bar on the standard error stream.
         **given: settings named again; they must be those of the run.
@@ -73,32 +58,36 @@ def resume_hit_sweep(
         The manifest of the finished run, whose rows are those of an uninterrupted one.
 
     Raises:
-        SettingError: the folder is not that of a hit sweep, a given setting is not the run's, or
-            the folder of serves is not what it was.
+        SettingError: the folder is not that of such a sweep, a given setting is not the
+            run's, or the cases are not what they were.
         SweepInterrupted: on Ctrl-C; the folder can be resumed.
     """
     folder = RunFolder(out)
     manifest = folder.read_manifest()
-    if manifest["kind"] != KIND:
-        raise SettingError(f"out must be the folder of a {KIND}, got one of a {manifest['kind']}")
-    settings = settings_to_resume(manifest["parameters"], given)
+    task = task_named(name)
+    if manifest["kind"] != task.kind:
+        raise SettingError(
+            f"out must be the folder of a {task.kind}, got one of a {manifest['kind']}"
+        )
+    settings = settings_to_resume(task.settings, manifest["parameters"], given)
     if manifest["state"] == "complete":
         return manifest
-    run = _open(settings, folder)
-    if run.source.description() != manifest["serves"]:
-        raise SettingError(f"serves must be as they were when the run began, in {settings.serves}")
+    run = _open(task, settings, folder)
+    for entry, known in run.source.description().items():
+        if known != manifest.get(entry):
+            raise SettingError(f"{entry} must be the same as when the run began")
     sessions = [*manifest["sessions"], _session()]
     folder.write_manifest({**manifest, "state": "running", "sessions": sessions})
     return _finish(run, progress)
 
 
-def _open(settings: HitSweep, folder: RunFolder) -> HitRun:
-    batch = CPU_BATCH if require_backend() == "cpu" else GPU_BATCH
-    chosen = planner(settings.planner, **settings.planner_options())
-    return HitRun(source=open_source(settings, batch), planner=chosen, folder=folder)
+def _open(task: SweepTask, settings: SweepSettings, folder: RunFolder) -> SweepRun:
+    batch = settings.CPU_BATCH if require_backend() == "cpu" else settings.GPU_BATCH
+    planner = task.planner(settings.planner, settings.planner_options())
+    return SweepRun(task, task.open_source(settings, batch), planner, folder)
 
 
-def _finish(run: HitRun, progress: bool) -> dict[str, Any]:
+def _finish(run: SweepRun, progress: bool) -> dict[str, Any]:
     """Everything that is missing, from the first chunk to the report."""
     folder = run.folder
     try:
@@ -115,24 +104,24 @@ def _finish(run: HitRun, progress: bool) -> dict[str, Any]:
     return manifest
 
 
-def _plan(run: HitRun, progress: bool) -> None:
+def _plan(run: SweepRun, progress: bool) -> None:
     """All chunks, merged and counted in the manifest."""
     try:
         plan_chunks(run, progress=progress)
     except SettingError:
-        # A serve that was drawn late breaks a rule, so that this run can never be finished.
+        # A case that was drawn late breaks a rule, so that this run can never be finished.
         run.folder.discard()
         raise
     found = merge_chunks(run)
     run.folder.write_manifest({**run.folder.read_manifest(), **found})
 
 
-def _add_baselines(run: HitRun, progress: bool) -> None:
+def _add_baselines(run: SweepRun, progress: bool) -> None:
     """Plan one case with the other planners too, and show them beside the run's plan."""
-    if progress and len(PLANNERS) > 1:
+    if progress and len(run.task.planners) > 1:
         page = run.folder.path / "index.html"
-        print(f"First figures: {page}. Now one serve with the other planners.", file=sys.stderr)
-    rows = plan_baselines(run.source, run.folder.read_manifest()["example"])
+        print(f"First figures: {page}. Now one case with the other planners.", file=sys.stderr)
+    rows = plan_baselines(run.task, run.source, run.folder.read_manifest()["example"])
     if rows is not None:
         run.folder.write_rows(run.folder.baselines, rows)
         write_report(run.folder)
@@ -144,30 +133,16 @@ def _session() -> dict[str, Any]:
     return {"started": now, **environment()}
 
 
-def _first_manifest(run: HitRun, scenarios: HitScenario) -> dict[str, Any]:
+def _first_manifest(run: SweepRun, scenarios: Any) -> dict[str, Any]:
     settings, session = run.source.settings, _session()
     return {
-        "kind": KIND,
+        "kind": run.task.kind,
         "state": "running",
         **session,
         "seed": settings.seed,
         "parameters": settings.parameters(),
-        "serves": run.source.description(),
-        "setting": _setting(scenarios),
+        **run.source.description(),
+        "setting": run.task.setting(scenarios),
         "planner": {"name": settings.planner, **dataclasses.asdict(run.planner)},
         "sessions": [session],
     }
-
-
-def _setting(scenarios: HitScenario) -> dict[str, Any]:
-    """What all scenarios have in common: physics and limits, from the first one."""
-
-    def first(tree: Any, names: list[str]) -> dict[str, Any]:
-        # Six digits, so that float32 does not show.
-        leaves = {name: np.asarray(getattr(tree, name), float)[0] for name in names}
-        return {name: leaf.round(6).tolist() for name, leaf in leaves.items()}
-
-    setting = first(scenarios, ["drag", "gravity", "restitution", "racket_height"])
-    for group in (scenarios.limits, scenarios.hit_limits):
-        setting |= first(group, [field.name for field in dataclasses.fields(group)])
-    return setting

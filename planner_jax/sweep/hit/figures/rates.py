@@ -8,19 +8,21 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from planner_jax.sweep.figures import style
+from planner_jax.sweep.report import RunRows
 from planner_jax.sweep.summary import wilson_interval
 from planner_jax.task.hit import court
 
 _WIDTH = 0.26
 
 
-def rates_figure(figure: Figure, manifest: dict[str, Any]) -> None:
+def rates_figure(figure: Figure, run: RunRows) -> None:
     """A bar a scenario with its Wilson interval, and both published rates of `compared_with`.
 
     Args:
         figure: empty.
-        manifest: of the run.
+        run: whose manifest is shown.
     """
+    manifest = run.manifest
     summary, name = manifest["summary"], manifest["parameters"]["planner"]
     other = compared_with(name)
     published = court.published_rates()

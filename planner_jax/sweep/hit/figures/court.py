@@ -1,6 +1,5 @@
 """The court from above and from the side, with serves, plans, returned balls and failures."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -12,23 +11,22 @@ from matplotlib.patches import Rectangle
 
 from planner_jax.sweep.figures import style
 from planner_jax.sweep.figures.motion import sample_motion
+from planner_jax.sweep.report import RunRows
 from planner_jax.task.hit import court
 from planner_jax.task.hit.validate import fly, landing
 
 _SAMPLES = 48
 
 
-def court_figure(
-    figure: Figure, rows: Sequence[dict[str, Any]], setting: dict[str, Any], drag_after: bool
-) -> None:
+def court_figure(figure: Figure, run: RunRows) -> None:
     """Sampled cases in both views.
 
     Args:
         figure: empty.
-        rows: of `plans.parquet`.
-        setting: physics, as in the manifest.
-        drag_after: whether the returned ball has drag too.
+        run: a sample of its cases is shown.
     """
+    rows, setting = run.sample(), run.manifest["setting"]
+    drag_after = run.manifest["parameters"]["drag_after_impact"]
     aside, top = court.HALF_WIDTH + 0.3, 6.4
     above, side = figure.subplots(2, 1, sharex=True, height_ratios=[2.0 * aside, top + 0.25])
     above.set_ylim(-aside, aside)

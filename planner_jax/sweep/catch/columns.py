@@ -1,0 +1,112 @@
+"""The columns of a catch run: targets, decision, catches and verdict.
+
+N targets, so that lists of a row have N entries, or N points one behind the other. Those of
+the decision, the plan and the verdict are in the order of catching.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from planner_jax.sweep.columns import (
+    COUNT,
+    ERRORS,
+    INDEX,
+    LIST,
+    NUMBER,
+    OUTCOME,
+    SOLVER,
+    TRAJECTORY,
+    VECTOR,
+    Column,
+    RefereedBatch,
+    leaves_of,
+)
+
+_WHICH, _FLAGS = pa.list_(pa.int32()), pa.list_(pa.bool_())
+
+
+def time_ratio(batch: RefereedBatch) -> np.ndarray:
+    """Optimal time ratio (B,) of every case, mean of |T_o - T_p| / T_o (paper 000, eq. 29)."""
+    decided, optimised = np.asarray(batch.scenarios.times), np.asarray(batch.plans.times)
+    present = np.take_along_axis(
+        np.asarray(batch.scenarios.present), np.asarray(batch.scenarios.order), axis=1
+    )
+    with np.errstate(all="ignore"):
+        ratio = np.where(present, np.abs(optimised - decided) / optimised, 0.0)
+        return ratio.sum(axis=1) / present.sum(axis=1)
+
+
+def _of_targets(*names: str) -> Any:
+    """Leaf of the targets at a path; null for targets of a class without it."""
+
+    def values(batch: RefereedBatch) -> Any:
+        leaf = batch.scenarios.targets
+        for name in names:
+            leaf = getattr(leaf, name, None)
+        return leaf
+
+    return values
+
+
+def _targets(rows: Sequence[tuple[str, str, str, str]]) -> list[Column]:
+    """Columns of the leaves of target paths: name, unit, meaning, dotted path."""
+    return [
+        Column(name, unit, meaning, LIST, _of_targets(*path.split(".")))
+        for name, unit, meaning, path in rows
+    ]
+
+
+_CASE = [
+    INDEX,
+    *_targets(
+        [
+            ("ball_pos", "m", "targets at time 0, N x 3", "ball.pos"),
+            ("ball_vel", "m/s", "targets at time 0, N x 3", "ball.vel"),
+            ("drag", "1/s", "linear, on each axis, N x 3", "drag"),
+            ("ball_gravity", "m/s^2", "of the targets", "gravity"),
+            ("swing_pos", "m", "middle of a swinging target at time 0, N x 3", "pos"),
+            ("swing_vel", "m/s", "drift of a swinging target, N x 3", "vel"),
+            ("swing_amplitude", "m", "of a swinging target, N x 3", "amplitude"),
+            ("swing_rate", "rad/s", "of a swinging target", "rate"),
+            ("swing_phase", "rad", "of a swinging target at time 0", "phase"),
+        ]
+    ),
+    *leaves_of(
+        "scenarios",
+        [
+            ("present", "", "which of the targets there are", _FLAGS, ""),
+            ("horizon", "s", "until when each target may be caught", LIST, ""),
+        ],
+    ),
+    Column(
+        "start",
+        "m",
+        "hover position of the quadrotor",
+        VECTOR,
+        lambda b: np.asarray(b.scenarios.head_state)[:, 0],
+    ),
+]
+
+_CATCHES = [
+    *leaves_of("plans", [("order", "", "targets in the order of catching", _WHICH, "")]),
+    *leaves_of("scenarios", [("decided_times", "s", "T_p, as decided", LIST, "times")]),
+    *leaves_of("plans", [("catch_times", "s", "T_o, as planned", LIST, "times")]),
+    Column("time_ratio", "1", "mean of |T_o - T_p| / T_o", NUMBER, time_ratio),
+]
+
+_JUDGED = leaves_of(
+    "verdict",
+    [
+        ("caught", "", "whether each catch holds, the way there aside", _FLAGS, ""),
+        ("num_caught", "", "of the targets", COUNT, ""),
+        ("net_distance", "m", "net's centre to target at each catch", LIST, ""),
+        ("net_offset", "m", "its part along the net's axis", LIST, ""),
+        ("angle", "rad", "net's axis to the target's way back at each catch", LIST, ""),
+    ],
+)
+
+FRAME = "world, z up; times from the start of planning"
+COLUMNS = [*_CASE, *_CATCHES, *SOLVER, *OUTCOME, *_JUDGED, *ERRORS, *TRAJECTORY]

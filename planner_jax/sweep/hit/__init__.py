@@ -1,0 +1,1 @@
+"""The hit sweep: serves, columns, table and figures of quadrotor volleys."""

@@ -1,0 +1,95 @@
+"""Serves of a hit sweep, drawn or read."""
+
+import dataclasses
+import hashlib
+from typing import Any
+
+import numpy as np
+
+from planner_jax.sweep.hit.settings import HitSweep
+from planner_jax.sweep.settings import SettingError
+from planner_jax.sweep.source import Cases, Source, filled_in
+from planner_jax.task.hit.scenario import HitScenario
+from planner_jax.task.hit.serves import Serves, generate_serves, read_serves, to_scenarios
+from planner_jax.task.hit.validate import ScenarioError, ServeError, check_scenarios
+
+
+@dataclasses.dataclass(frozen=True)
+class ServeSource(Source):
+    """Where the serves of a sweep come from; they are the origin of its cases."""
+
+    settings: HitSweep
+    folder: Serves | None  # the serves of the published files, if these were asked for
+
+    def cases(self, first: int, last: int) -> Cases:
+        """The cases from place `first` up to `last`, that one left out, checked.
+
+        Raises:
+            SettingError: a ball is down before planning begins, or a value of a scenario breaks
+                a rule.
+        """
+        if self.folder is not None:
+            serves = self.folder[first:last]
+        else:
+            serves = generate_serves(last - first, self.settings.seed, start=first)
+        return Cases(index=serves.index, scenarios=self._scenarios(serves), origin=serves)
+
+    def check(self) -> HitScenario:
+        """Look at every serve of a folder; drawn ones obey their law."""
+        scenarios = super().check()
+        for chunk in range(1, 1 if self.folder is None else self.num_chunks):
+            self.chunk(chunk)
+        return scenarios
+
+    def _scenarios(self, serves: Serves) -> HitScenario:
+        try:
+            scenarios = to_scenarios(
+                serves,
+                start=self.settings.start,
+                seed=self.settings.seed,
+                delay=self.settings.delay,
+                limit_scale=self.settings.limit_scale,
+            )
+            check_scenarios(scenarios)
+        except ServeError as error:
+            raise SettingError(str(error)) from error
+        except ScenarioError as error:
+            raise SettingError(f"serves must make sound scenarios: {error}") from error
+        return scenarios
+
+    def description(self) -> dict[str, Any]:
+        """Source, number of distinct serves and digest of their numbers."""
+        if self.folder is None:
+            return {"serves": {"source": "generated", "distinct": self.num, "sha256": None}}
+        used = self.folder[: self.num]
+        balls = np.column_stack([used.position, used.velocity])
+        digest = hashlib.sha256(np.column_stack([balls, used.target]).tobytes())
+        known = {
+            "source": self.settings.serves,
+            "distinct": len(np.unique(balls, axis=0)),
+            "sha256": digest.hexdigest(),
+        }
+        return {"serves": known}
+
+
+def open_source(settings: HitSweep, batch: int) -> ServeSource:
+    """The source of a sweep's serves; a folder is read and checked whole.
+
+    Args:
+        settings: of the sweep.
+        batch: cases a chunk, where the settings name none.
+
+    Raises:
+        SettingError: the folder is missing, a row of it is not sound, or more serves are asked
+            for than it holds.
+    """
+    try:
+        folder = None if settings.serves is None else read_serves(settings.serves)
+    except ServeError as error:
+        raise SettingError(str(error)) from error
+    fields = filled_in(settings, settings.DEFAULT_NUM if folder is None else len(folder), batch)
+    if folder is not None and fields["num"] > len(folder):
+        raise SettingError(
+            f"num must be <= {len(folder)}, the serves that the folder holds, got {fields['num']}"
+        )
+    return ServeSource(**fields, folder=folder)

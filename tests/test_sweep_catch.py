@@ -1,0 +1,280 @@
+"""The catch sweep: rows, table and figures of a suite, resuming, and what it refuses."""
+
+import json
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from planner_jax.referee.catch import referee_catches
+from planner_jax.sweep.catch import task
+from planner_jax.sweep.catch.columns import COLUMNS, FRAME
+from planner_jax.sweep.catch.published import PUBLISHED
+from planner_jax.sweep.catch.settings import DECISIONS, SUITES, CatchSweep
+from planner_jax.sweep.catch.source import open_source
+from planner_jax.sweep.catch.summary import CatchTally
+from planner_jax.sweep.catch.table import rate_table
+from planner_jax.sweep.catch.targets import target_positions
+from planner_jax.sweep.columns import RefereedBatch, rows_of
+from planner_jax.sweep.report import write_report
+from planner_jax.sweep.run import SweepInterrupted, resume_sweep, start_sweep
+from planner_jax.sweep.run_folder import RunFolder
+from planner_jax.sweep.settings import SettingError
+from planner_jax.task.catch import decide, suites
+from planner_jax.task.catch.exact import ExactCatch
+
+NUM, BATCH = 8, 4
+# Some of these fail, with one short round.
+SETTINGS = CatchSweep(suite="parabola2", decide="greedy", num=NUM, batch=BATCH, seed=2)
+FIGURES = ("flight.png", "motion.png", "outcomes.png")
+
+
+def one_round(name, **options):
+    """The planner with its first round alone, so that one program is compiled."""
+    return ExactCatch(rounds=ExactCatch().rounds[:1], **options)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def quick_planners():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(task, "catch_planner", one_round)
+        patch.setattr(task, "PLANNERS", {"exact": "", "mpp": ""})
+        yield
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """The folder and manifest of a sweep that nothing disturbed."""
+    out = tmp_path_factory.mktemp("runs") / "finished"
+    return out, start_sweep(SETTINGS, out, progress=False)
+
+
+def columns(out):
+    """The rows of a run as NumPy arrays, lists stacked."""
+    table = pq.read_table(out / "plans.parquet")
+    return {name: np.array(table[name].to_pylist()) for name in table.column_names}
+
+
+def test_a_finished_run_holds_manifest_rows_table_figures_and_page(finished):
+    out, manifest = finished
+    assert manifest == json.loads((out / "manifest.json").read_text())
+    assert manifest["state"] == "complete" and manifest["kind"] == "sweep catch"
+    assert CatchSweep(**manifest["parameters"]) == SETTINGS
+    page = (out / "index.html").read_text()
+    for name in FIGURES:
+        assert (out / "figures" / name).read_bytes().startswith(b"\x89PNG")
+        assert f'src="figures/{name}"' in page
+    assert pq.read_table(out / "baselines.parquet")["planner"].to_pylist() == ["mpp"]
+    assert not (out / "parts").exists() and not list(out.rglob(".*"))
+
+
+def test_the_summary_counts_the_rows(finished):
+    out, manifest = finished
+    rows, summary = columns(out), manifest["summary"]
+    successes = int(rows["success"].sum())
+    assert len(rows["index"]) == summary["num"] == NUM and 0 < successes < NUM
+    assert summary["success_rate"] == pytest.approx(successes / NUM)
+    assert sum(summary["failed_limits"].values()) == NUM - successes
+    assert summary["caught"] == pytest.approx(rows["num_caught"].mean() / 2)
+    times, decided, caught = rows["catch_times"], rows["decided_times"], rows["caught"]
+    assert summary["mean_catch_time"] == pytest.approx(times[caught].mean())
+    solved = np.isin(rows["status"], ["CONVERGED", "FEASIBLE"])
+    ratio = np.mean(np.abs(times - decided) / times, axis=1)
+    assert summary["optimal_time_ratio"] == pytest.approx(ratio[solved].mean(), rel=1e-5)
+    assert summary["plans_per_second_warm"] > 0.0
+    assert summary["compile_seconds"] == manifest["times"]["compile_seconds"]
+
+
+def test_a_planner_that_decides_itself_has_no_optimal_time_ratio(finished):
+    tally = CatchTally(decides=False)
+    tally.add(pq.read_table(finished[0] / "plans.parquet"))
+    assert tally.summary()["optimal_time_ratio"] is None
+    assert task.CatchTask().tally(CatchSweep(planner="mpp"))._decides is False
+
+
+def test_every_column_has_its_unit_and_meaning(finished):
+    for field in pq.read_schema(finished[0] / "plans.parquet"):
+        assert field.metadata.keys() == {b"unit", b"meaning"} and field.metadata[b"meaning"]
+
+
+def test_the_rows_alone_lead_the_referee_to_the_same_verdict(finished):
+    out, manifest = finished
+    rows, setting = columns(out), manifest["setting"]
+
+    def same(*names, prefix=""):
+        values = {name: np.full(NUM, setting[prefix + name]) for name in names}
+        return SimpleNamespace(**values)
+
+    head = np.zeros((NUM, 4, 3))
+    head[:, 0] = rows["start"]
+    by_target = {name: rows[name].reshape(NUM, 2, 3) for name in ("ball_pos", "ball_vel", "drag")}
+    ball = SimpleNamespace(pos=by_target["ball_pos"], vel=by_target["ball_vel"])
+    scenarios = SimpleNamespace(
+        targets=SimpleNamespace(ball=ball, drag=by_target["drag"], gravity=rows["ball_gravity"]),
+        present=rows["present"],
+        horizon=rows["horizon"],
+        head_state=head,
+        gravity=np.full(NUM, setting["gravity"]),
+        net=SimpleNamespace(
+            **vars(same("height", "radius", prefix="net_")),
+            max_angle=np.full(NUM, setting["net_max_angle"]),
+        ),
+        limits=same("speed", "min_thrust", "max_thrust", "body_rate", "min_height"),
+    )
+    coeffs = rows["coeffs"].reshape(NUM, rows["durations"].shape[1], -1, 3)
+    plans = SimpleNamespace(
+        trajectory=SimpleNamespace(coeffs=coeffs, durations=rows["durations"]),
+        order=rows["order"],
+        times=rows["catch_times"],
+    )
+    verdict = referee_catches(scenarios, plans)
+    np.testing.assert_array_equal(verdict.success, rows["success"])
+    np.testing.assert_array_equal(verdict.failed_limit, rows["failed_limit"])
+    np.testing.assert_allclose(verdict.net_distance, rows["net_distance"], atol=1e-5)
+
+
+def test_a_report_is_drawn_again_from_the_folder_alone(finished, tmp_path):
+    out, _ = finished
+    for name in ("manifest.json", "plans.parquet"):
+        (tmp_path / name).write_bytes((out / name).read_bytes())
+    write_report(RunFolder(tmp_path))
+    assert (tmp_path / "table.md").read_text() == (out / "table.md").read_text()
+    assert {path.name for path in (tmp_path / "figures").iterdir()} == set(FIGURES)
+
+
+def test_a_plan_that_is_not_finite_is_reported_too(finished, tmp_path):
+    out, manifest = finished
+    (tmp_path / "manifest.json").write_bytes((out / "manifest.json").read_bytes())
+    table = pq.read_table(out / "plans.parquet").slice(manifest["example"], 1)
+    row = table.to_pylist()[0]
+    row |= {"index": 0, "success": False, "sentence": "not finite", "caught": [False, False]}
+    for name in ("coeffs", "durations", "catch_times", "net_distance"):
+        row[name] = [float("nan")] * len(row[name])
+    folder = RunFolder(tmp_path)
+    folder.write_manifest({**manifest, "example": 0})
+    folder.write_rows(folder.plans, pa.Table.from_pylist([row], schema=table.schema))
+    write_report(folder)
+    assert "not finite" in (tmp_path / "index.html").read_text()
+
+
+def test_an_interrupted_sweep_is_resumed_to_the_same_rows(finished, tmp_path, monkeypatch):
+    out, calls, real = tmp_path / "run", [], task.plan_catches
+
+    def stopped(*arguments):
+        calls.append(arguments)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return real(*arguments)
+
+    monkeypatch.setattr("planner_jax.sweep.run.write_report", lambda folder: None)
+    monkeypatch.setattr("planner_jax.sweep.run.plan_baselines", lambda *_: None)
+    with monkeypatch.context() as patch:
+        patch.setattr(task, "plan_catches", stopped)
+        with pytest.raises(SweepInterrupted):
+            start_sweep(SETTINGS, out, progress=False)
+    assert RunFolder(out).read_manifest()["state"] == "interrupted"
+    manifest = resume_sweep("catch", out, progress=False, suite="parabola2")
+    assert manifest["state"] == "complete" and len(manifest["sessions"]) == 2
+    assert (out / "plans.parquet").read_bytes() == (finished[0] / "plans.parquet").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "message"),
+    [
+        ("catch", {"suite": "hard"}, "suite must be parabola2 as in the run .*, got hard"),
+        ("hit", {}, "out must be the folder of a sweep hit, got one of a sweep catch"),
+    ],
+)
+def test_a_run_is_resumed_as_what_it_is(finished, name, given, message):
+    with pytest.raises(SettingError, match=message):
+        resume_sweep(name, finished[0], **given)
+
+
+def test_scenarios_that_are_drawn_otherwise_are_not_mixed_into_a_run(
+    finished, tmp_path, monkeypatch
+):
+    out = tmp_path / "run"
+    out.mkdir()
+    manifest = {**finished[1], "state": "interrupted"}
+    (out / "manifest.json").write_text(json.dumps(manifest))
+    real = suites.make_suite
+    monkeypatch.setattr(
+        "planner_jax.sweep.catch.source.make_suite",
+        lambda name, num, seed: real(name, num, seed + 1),
+    )
+    with pytest.raises(SettingError, match="suite must be the same as when the run began"):
+        resume_sweep("catch", out)
+
+
+def test_the_table_has_the_papers_rates_beside_its_own_suite(finished):
+    table = rate_table(finished[1])
+    assert [row[0] for row in table.rows] == list(PUBLISHED)
+    rows = {row[0]: row for row in table.rows}
+    assert rows["throws"] == ["throws", "", "", "", "", "96.0", "0.092", "14.0"]
+    assert rows["hexagon6"][-3:] == ["76.3", "0.458", ""]
+    assert rows["parabola2"][1] == str(NUM) and rows["parabola2"][-3:] == ["98.2", "0.119", ""]
+    assert table.rows[table.strong][0] == "parabola2"
+
+
+def test_names_that_are_checked_without_jax_are_those_of_the_library():
+    assert SUITES == tuple(suites.SUITES) and DECISIONS == decide.DECISIONS
+
+
+@pytest.mark.parametrize("suite", ["parabola2", "harmonic2"])
+def test_the_columns_of_the_targets_bring_their_paths_back(suite):
+    source = open_source(CatchSweep(suite=suite, num=3), batch=2)
+    cases = source.chunk(1)
+    case_columns = [c for c in COLUMNS if c.name.startswith(("index", "ball", "drag", "swing"))]
+    batch = RefereedBatch(cases, cases.scenarios, None, None)
+    row = rows_of(case_columns, batch, FRAME).to_pylist()[0]
+    assert row["index"] == 2
+    times = np.array([0.0, 0.7, 1.3], np.float32)
+    targets = jax.tree.map(lambda leaf: leaf[0], cases.scenarios.targets)
+    expected = jax.vmap(lambda path: jax.vmap(path.at)(times))(targets).pos
+    np.testing.assert_allclose(target_positions(row, times), expected, atol=1e-5)
+
+
+def test_chunks_join_to_the_whole_and_a_seed_is_a_set_of_scenarios():
+    whole = open_source(CatchSweep(num=5, batch=5), batch=1)
+    parts = open_source(CatchSweep(num=5), batch=2)
+    joined = [parts.chunk(number).scenarios.targets.ball.vel for number in range(3)]
+    np.testing.assert_array_equal(np.concatenate(joined), whole.scenarios.targets.ball.vel)
+    assert parts.description() == whole.description()
+    assert parts.description() != open_source(CatchSweep(num=5, seed=1), batch=2).description()
+
+
+def test_limits_are_scaled_and_thrust_about_hover():
+    full = open_source(CatchSweep(num=2), batch=1).scenarios
+    half = open_source(CatchSweep(num=2, limit_scale=0.5), batch=1).scenarios
+    wide = open_source(CatchSweep(num=2, limit_scale=2.0), batch=1).scenarios
+    np.testing.assert_allclose(half.limits.speed, 0.5 * full.limits.speed)
+    np.testing.assert_allclose(half.limits.body_rate, 0.5 * full.limits.body_rate)
+    np.testing.assert_allclose(half.limits.min_height, full.limits.min_height)
+    np.testing.assert_allclose(half.limits.min_thrust, 0.65 * 9.81, rtol=1e-6)
+    np.testing.assert_allclose(half.limits.max_thrust, 1.75 * 9.81, rtol=1e-6)
+    np.testing.assert_allclose(wide.limits.min_thrust, 0.0)
+    assert {leaf.dtype for leaf in jax.tree.leaves(half.limits)} == {np.dtype("float32")}
+
+
+def test_the_published_protocol_can_be_asked_for():
+    settings = CatchSweep(planner="catch", tolerance=0.05, net_test="ball")
+    assert settings.judgement() == {"tolerance": 0.05, "net_test": "ball"}
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"suite": "nowhere"}, "suite must be one of throws, .*, got 'nowhere'"),
+        ({"planner": "juggle"}, "planner must be one of exact, .*, got 'juggle'"),
+        ({"decide": "late"}, "decide must be one of best, greedy, given, got 'late'"),
+        ({"tolerance": float("nan")}, "tolerance must be finite and >= 0, got nan"),
+        ({"limit_scale": -1.0}, "limit_scale must be finite and > 0, got -1.0"),
+        ({"num": 0}, "num must be >= 1, got 0"),
+    ],
+)
+def test_a_setting_out_of_its_range_is_named(given, message):
+    with pytest.raises(SettingError, match=message):
+        CatchSweep(**given)
