@@ -16,6 +16,7 @@ from jax import Array
 from planner_jax.cost.limits import body_rate_excess, ground_excess, speed_excess, thrust_excess
 from planner_jax.cost.penalty import joined_trapezoid_weights, smoothed_hinge
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
+from planner_jax.optimise.multistart import FEASIBILITY_TOLERANCE
 from planner_jax.optimise.problem import Round
 from planner_jax.robot.quadrotor import body_z, tangent_basis
 from planner_jax.task.catch.chain import (
@@ -53,7 +54,7 @@ class Catch:
     times: Array  # (N,) [s]
     durations: Array  # (N,) [s], of the segments
     tail_states: Array  # (N, 4, 3) of the quadrotor
-    angle_excess: Array  # (N,) cosine of theta_safe less that of the angle; <= 0 is good
+    angle_excess: Array  # (N,) of the net's angle over theta_safe, relative; <= 0 is good
 
 
 @dataclasses.dataclass(frozen=True)
@@ -162,7 +163,10 @@ class ExactCatch:
         moving = speed_squared > 1e-12
         speed = jnp.sqrt(jnp.where(moving, speed_squared, 1.0))
         facing = -jnp.sum(axis * ball.vel, axis=1) / speed
-        excess = jnp.where(moving, jnp.cos(net.max_angle) - facing, -1.0)
+        # To first order the relative excess of the angle, without an arc cosine.
+        angle = jnp.maximum(net.max_angle, 1e-3)
+        excess = (jnp.cos(angle) - facing) / (angle * jnp.sin(angle))
+        excess = jnp.where(moving, excess, -1.0)
         tail_states = jnp.stack([pos, natural[:, 3:6], acc, natural[:, 9:12]], axis=1)
         return Catch(times=times, durations=durations, tail_states=tail_states, angle_excess=excess)
 
@@ -227,7 +231,8 @@ class ExactCatch:
                 ground_excess(motion.height, limits)[None],
             ]
         )
-        late = catch.times / context.horizon - 1.0
+        # The horizon is a hard end: the tolerance of a feasible plan is taken off.
+        late = catch.times / context.horizon - 1.0 + FEASIBILITY_TOLERANCE
         at_catch = jnp.stack([catch.angle_excess, late])
         idle = -jnp.ones((), along.dtype)
         return (
