@@ -5,6 +5,8 @@ is exceeded, without a square root to differentiate. `relative` turns that into 
 the quantity to its limit, less one.
 """
 
+from typing import Protocol
+
 import jax.numpy as jnp
 from jax import Array
 
@@ -13,13 +15,32 @@ from planner_jax.robot.quadrotor import QuadrotorLimits, body_rate_squared, net_
 from planner_jax.trajectory.polynomial import Motion
 
 
+class FlightLimits(Protocol):
+    """Limits that every quadrotor task has."""
+
+    @property
+    def speed(self) -> Array:
+        """() [m/s]."""
+        ...
+
+    @property
+    def body_rate(self) -> Array:
+        """() [rad/s]."""
+        ...
+
+    @property
+    def min_height(self) -> Array:
+        """() [m]."""
+        ...
+
+
 def _size_squared(vector: Array) -> Array:
     """|v|^2 of (..., 3), written out: a CPU compiles a sum over an axis into its own loop."""
     x, y, z = components(vector)
     return x * x + y * y + z * z
 
 
-def speed_excess(vel: Array, limits: QuadrotorLimits) -> Array:
+def speed_excess(vel: Array, limits: FlightLimits) -> Array:
     """|v|^2 / v_max^2 - 1 for velocities (..., 3) [m/s] (paper 002, eq. 18a)."""
     return _size_squared(vel) * reciprocal(limits.speed) ** 2 - 1.0
 
@@ -29,13 +50,13 @@ def acceleration_excess(acc: Array, limits: QuadrotorLimits) -> Array:
     return _size_squared(acc) * reciprocal(limits.acceleration) ** 2 - 1.0
 
 
-def body_rate_excess(acc: Array, jerk: Array, gravity: Array, limits: QuadrotorLimits) -> Array:
+def body_rate_excess(acc: Array, jerk: Array, gravity: Array, limits: FlightLimits) -> Array:
     """|omega|^2 / omega_max^2 - 1 by flatness (paper 002, eq. 18a)."""
     rate_squared = body_rate_squared(acc, jerk, gravity)
     return rate_squared * reciprocal(limits.body_rate) ** 2 - 1.0
 
 
-def ground_excess(height: Array, limits: QuadrotorLimits) -> Array:
+def ground_excess(height: Array, limits: FlightLimits) -> Array:
     """z_min - z [m] for heights (...) [m] (paper 000, eq. 28, without its squares).
 
     The squares of the print change sign below ground.

@@ -21,7 +21,7 @@ def smoothed_hinge(x: Array, width: float) -> Array:
     return blend + jnp.where(below, 0.0, x - width)
 
 
-def steep_hinge(x: Array, width: float) -> Array:
+def steep_hinge(x: Array, width: float | Array) -> Array:
     """L_eps: cubic up to eps, then a far steeper cubic (paper 000, eq. 23).
 
     eps^3 + (x - eps)^2 x / eps^4 above eps, as printed: the value is continuous there, but
@@ -36,7 +36,7 @@ def steep_hinge(x: Array, width: float) -> Array:
     return inside**3 + beyond**2 * (beyond + width) / width**4 * (x > width)
 
 
-def c1_steep_hinge(x: Array, width: float) -> Array:
+def c1_steep_hinge(x: Array, width: float | Array) -> Array:
     """L_eps with its slope kept: adds 3 eps^2 (x - eps) beyond eps, so that it is C1."""
     return steep_hinge(x, width) + 3.0 * width**2 * jnp.maximum(x - width, 0.0)
 

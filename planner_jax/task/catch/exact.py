@@ -35,7 +35,7 @@ from planner_jax.task.catch.scenario import CatchScenario
 from planner_jax.trajectory.proportional_minco import ProportionalMinco, proportional_minco
 
 _ORDER = 4  # minimum snap
-_CATCH_VARIABLES = 12  # log duration, offset in the net (2), velocity, acceleration, jerk
+_DECODE_NODES = 40  # body rates peak sharply where the thrust is small
 # Squares carry twice the relative margin.
 _MARGINS = np.array([2.0, 2.0, 2.0, 2.0, 1.0])[:, None, None]
 _RIM = 0.9  # share of the net's radius that a planned catch may use
@@ -274,16 +274,17 @@ class ExactCatch:
         inside = jnp.maximum(along + margins, 0.0)
         inside = inside * jnp.sqrt(chain.piece_durations[:, None] * weights)
         at_catch = jnp.sqrt(self.catch_weight) * jnp.maximum(at_catch + self.margin, 0.0)
-        energy = chain_energy(self.maps, chain)[:, None] * jnp.ones((1, 1))
+        energy = jnp.where(context.active, chain_energy(self.maps, chain), 0.0)
         smooth = jnp.sqrt(2.0 * self.energy_weight * jnp.maximum(energy, 1e-6))
-        late = jnp.sqrt(2.0 * self.time_weight * catch.durations)
+        spent = jnp.where(context.active, catch.durations, 1e-6)
+        late = jnp.sqrt(2.0 * self.time_weight * spent)
         parts = (bend * inside, bend * at_catch, smooth, late)
         return jnp.concatenate([part.ravel() for part in parts])
 
     def decode(self, point: Array, context: CatchContext) -> CatchPlan:
-        """The plan at a point, its violation looked for at 16 nodes a piece."""
+        """The plan at a point, its violation looked for at 40 nodes a piece."""
         chain, catch = self._unpack(point, context)
-        along, at_catch = self._excess(chain, catch, context, 16)
+        along, at_catch = self._excess(chain, catch, context, _DECODE_NODES)
         squared = jnp.max(along[jnp.array([0, 1, 3])])
         plain = jnp.maximum(jnp.max(along[4]), jnp.max(at_catch))
         weak = 1.0 - jnp.sqrt(jnp.maximum(1.0 - jnp.max(along[2]), 0.0))

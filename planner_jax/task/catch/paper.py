@@ -133,8 +133,8 @@ class PaperCatch:
         begins = jnp.concatenate([scenario.head_state[None, 0], below[:-1]])
 
         def waypoints(begin: Array, end: Array, duration: Array) -> Array:
-            states = [jnp.concatenate([pos[None], still]) for pos in (begin, end)]
-            primitive = minimum_jerk(*states, duration)
+            first, last = (jnp.concatenate([pos[None], still]) for pos in (begin, end))
+            primitive = minimum_jerk(first, last, duration)
             shares = jnp.asarray(np.arange(1, self.num_pieces) / self.num_pieces, dtype)
             return jax.vmap(lambda share: evaluate(primitive, share * duration))(shares)
 

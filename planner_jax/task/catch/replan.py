@@ -278,7 +278,8 @@ def _rest(scenario: ReplanScenario, context: CatchContext) -> CatchPlan:
     trajectory = PiecewisePolynomial(
         coeffs=coeffs.reshape(-1, size, 3), durations=durations.ravel()
     )
-    return previous.replace(
+    return dataclasses.replace(
+        previous,
         trajectory=trajectory,
         order=scenario.scenario.order,
         times=jnp.maximum(times, 0.0),

@@ -1,5 +1,7 @@
 """One catching task: up to N targets, the quadrotor, its net and its limits."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -61,9 +63,9 @@ def catch_scenario(
     targets: TargetPath,
     horizon,
     *,
-    present=True,
+    present: Any = True,
     start=(0.0, 0.0, 1.0),
-    gravity=9.81,
+    gravity: Any = 9.81,
     net_height=0.2,
     net_radius=0.125,
     max_angle=np.pi / 6.0,

@@ -50,6 +50,7 @@ net must lean over by 60 degrees at least, 90 less theta_safe, at every catch.
 import dataclasses
 import zlib
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -179,7 +180,12 @@ def _throws(uniform: np.ndarray, throws: tuple[_Throw, ...]) -> tuple[BallPath, 
     drawn = [_throw(u, t) for u, t in zip(np.split(uniform, len(throws), 1), throws, strict=True)]
     pos, vel, horizon = (np.stack(column, axis=1) for column in zip(*drawn, strict=True))
     drag = np.broadcast_to([[t.drag] * 3 for t in throws], pos.shape)
-    return BallPath(BallState(pos, vel), drag, np.full(horizon.shape, GRAVITY)), horizon
+    return _balls(pos, vel, drag, np.full(horizon.shape, GRAVITY)), horizon
+
+
+def _balls(pos: Any, vel: Any, drag: Any, gravity: Any) -> BallPath:
+    """Paths with NumPy leaves."""
+    return BallPath(ball=BallState(pos=pos, vel=vel), drag=drag, gravity=gravity)
 
 
 def _throw(uniform: np.ndarray, throw: _Throw) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -219,10 +225,10 @@ def _fly(pos, vel, time, drag: float, gravity: float = GRAVITY) -> tuple[np.ndar
 
 def _lines(pos: np.ndarray, vel: np.ndarray) -> BallPath:
     """Targets that fly straight on from `pos` (B, N, 3) at `vel`."""
-    return BallPath(BallState(pos, vel), np.zeros(pos.shape), np.zeros(pos.shape[:2]))
+    return _balls(pos, vel, np.zeros(pos.shape), np.zeros(pos.shape[:2]))
 
 
-def _harmonic(uniform: np.ndarray) -> HarmonicPath:
+def _harmonic(uniform: Any) -> HarmonicPath:
     """Two swings from nine numbers each."""
     u = uniform.reshape(len(uniform), 2, 9)
     drift = _between(u[..., :1], 1.0, 1.5) * _unit(2.0 * np.pi * u[..., 1])
@@ -232,7 +238,8 @@ def _harmonic(uniform: np.ndarray) -> HarmonicPath:
     swing[..., 2] = _between(u[..., 5], 0.6, 1.0)
     rate, phase = _between(u[..., 6], 1.5, 2.5), 2.0 * np.pi * u[..., 7]
     when = _between(u[..., 8:9], 2.0, 5.0)
-    return HarmonicPath(near - drift * when, drift, swing, rate, phase)
+    leaves: tuple[Any, ...] = (near - drift * when, drift, swing, rate, phase)
+    return HarmonicPath(*leaves)
 
 
 def _triangle(uniform: np.ndarray) -> BallPath:
