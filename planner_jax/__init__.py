@@ -5,7 +5,7 @@ The public names, in the order of the data flow:
 * where the ball goes: `BallState`, `fly`, `predict_path`, `target_at`, `BallPath`, `HarmonicPath`
 * what to hit: `HitScenario`, `hit_scenario`, `generate_serves`, `read_serves`, `to_scenarios`
 * what to catch: `CatchScenario`, `catch_scenario`, `make_suite`
-* when and in what order to catch: `plan_catches`
+* when and in what order to catch: `plan_catches`, `closest_approach`
 * the planners: `planner` and `catch_planner` (by name), `ExactHit`, `ExactCatch`, and `plan`, one
   call for one case or many
 * gradients through an optimum: `optimal_plan`
@@ -33,6 +33,7 @@ _PUBLIC = {
     "catch_scenario": "planner_jax.task.catch.scenario",
     "make_suite": "planner_jax.task.catch.suites",
     "plan_catches": "planner_jax.task.catch.decide",
+    "closest_approach": "planner_jax.task.catch.decide",
     "planner": "planner_jax.task.hit.planners",
     "catch_planner": "planner_jax.task.catch.planners",
     "ExactHit": "planner_jax.task.hit.exact",

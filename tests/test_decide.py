@@ -11,8 +11,15 @@ from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
+from planner_jax.optimise.status import Status
 from planner_jax.referee.catch import referee_catches
-from planner_jax.task.catch.decide import best_orders, decided, greedy, plan_catches
+from planner_jax.task.catch.decide import (
+    best_orders,
+    closest_approach,
+    decided,
+    greedy,
+    plan_catches,
+)
 from planner_jax.task.catch.exact import ExactCatch
 from planner_jax.task.catch.scenario import catch_scenario
 from planner_jax.task.catch.suites import make_suite
@@ -177,3 +184,19 @@ def test_a_given_order_that_is_no_permutation_is_refused(pairs, order):
     line = rf"order must be a permutation of 0\.\.1, got \[{order[0]}, {order[1]}\] in scenario 1"
     with pytest.raises(ValueError, match=line):
         plan_catches(PLANNER, wrong, decide="given")
+
+
+def test_closest_approach_is_what_the_greatest_speed_leaves(pairs):
+    """100 m away, 4 s at 5 m/s, the net's size, and what a 64th of the time may hide."""
+    gap = np.array(jax.jit(jax.vmap(closest_approach))(pairs))
+    left = np.hypot(100.0, 0.2) - 5.0 * 4.0 - (0.2 + 0.125) - 5.0 * 4.0 / 64.0
+    assert gap[2, 0] == pytest.approx(left, rel=1e-4)
+    gap[2, 0] = 0.0
+    assert not gap.any()
+
+
+def test_a_target_out_of_reach_is_named_and_its_neighbours_are_not(pairs):
+    _, plans = plan_catches(PLANNER, pairs, decide="greedy")
+    assert plans.status[2] == Status.OUT_OF_REACH
+    assert Status(plans.status[2]).message.startswith("a target never comes within reach")
+    assert (np.delete(plans.status, 2) != Status.OUT_OF_REACH).all()

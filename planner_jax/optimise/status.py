@@ -11,6 +11,7 @@ class Status(enum.IntEnum):
     INFEASIBLE = 2
     MAX_STEPS = 3
     NON_FINITE = 4
+    OUT_OF_REACH = 5
 
     @property
     def message(self) -> str:
@@ -26,4 +27,5 @@ _MESSAGES = {
     Status.INFEASIBLE: "stationary with a limit exceeded; try more starts, or relax the limit",
     Status.MAX_STEPS: "out of iterations with a limit exceeded; allow more iterations or starts",
     Status.NON_FINITE: "the scenario or its cost is not finite; check the scenario for NaN",
+    Status.OUT_OF_REACH: "a target never comes within reach; `closest_approach` says by how much",
 }

@@ -17,6 +17,7 @@ from flax import struct
 from jax import Array
 
 from planner_jax.optimise.problem import Planner
+from planner_jax.optimise.status import Status
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.task.catch.scenario import CatchScenario
 from planner_jax.task.solve import is_solved, plan
@@ -134,6 +135,41 @@ _greedy = jax.jit(jax.vmap(greedy))
 _best_orders = jax.jit(jax.vmap(best_orders, in_axes=(0, None)), static_argnums=1)
 
 
+def closest_approach(scenario: CatchScenario) -> Array:
+    """How near each target comes to where the net could be, (N,) [m]; zero is within reach.
+
+    A bound that no plan can beat, at 64 times up to the horizon: the quadrotor leaves with its
+    velocity and flies at its greatest speed in any direction, above the least height. One
+    scenario; pure.
+    """
+    net, limits = scenario.net, scenario.limits
+    shares = jnp.asarray(np.arange(1, _GRID + 1) / _GRID, scenario.gravity.dtype)
+    times = scenario.horizon[:, None] * shares
+    states = jax.vmap(lambda target, at: jax.vmap(target.at)(at))(scenario.targets, times)
+    offset = states.pos - scenario.head_state[0]
+    distance = jnp.sqrt(jnp.maximum(jnp.sum(offset**2, axis=-1), 1e-12))
+    # The target moves on between two of the times.
+    speed = jnp.sqrt(jnp.maximum(jnp.sum(states.vel**2, axis=-1), 1e-12))
+    slack = net.height + net.radius + (speed + limits.speed) * scenario.horizon[:, None] / _GRID
+    far = distance - limits.speed * times - slack
+    low = limits.min_height - states.pos[..., 2] - slack
+    gap = jnp.min(jnp.maximum(jnp.maximum(far, low), 0.0), axis=1)
+    return jnp.where(scenario.present, gap, 0.0)
+
+
+_closest_approach = jax.jit(jax.vmap(closest_approach))
+
+
+def _name_out_of_reach(scenarios: CatchScenario, plans: CatchPlan) -> CatchPlan:
+    """The plans, with a status of its own where a target proves to be out of reach."""
+    unsolved = ~np.asarray(is_solved(plans.status)) & (plans.status != Status.NON_FINITE)
+    if not unsolved.any():
+        return plans
+    away = np.asarray(_closest_approach(scenarios)).max(axis=1) > 0.0
+    status = np.where(unsolved & away, np.int32(Status.OUT_OF_REACH), plans.status)
+    return dataclasses.replace(plans, status=status)
+
+
 def decided(scenarios: CatchScenario, decision: Decision) -> CatchScenario:
     """The scenarios with the order and times of a decision."""
     return dataclasses.replace(scenarios, order=decision.order, times=decision.times)
@@ -153,7 +189,8 @@ def plan_catches(
 
     Returns:
         scenarios: with the order and times that were decided; times before optimisation.
-        plans: of them.
+        plans: of them. An unsolved lane with a target that `closest_approach` puts out of
+            reach has the status OUT_OF_REACH.
 
     Raises:
         ValueError: no such decision, or a given order that is not a permutation.
@@ -162,10 +199,10 @@ def plan_catches(
         raise ValueError(f"decide must be one of {', '.join(DECISIONS)}, got {decide!r}")
     if decide == "given":
         _require_orders(scenarios)
-        return scenarios, plan(planner, scenarios)
+        return scenarios, _name_out_of_reach(scenarios, plan(planner, scenarios))
     if decide == "greedy" or scenarios.num_targets == 1:
         scenarios = decided(scenarios, _greedy(scenarios))
-        return scenarios, plan(planner, scenarios)
+        return scenarios, _name_out_of_reach(scenarios, plan(planner, scenarios))
     decisions = _best_orders(scenarios, _FINALISTS)
     finalists = decisions.order.shape[1]
     tried = [
@@ -180,7 +217,8 @@ def plan_catches(
     rank = np.where(solved, plans.times[..., -1], 1e6 + np.nan_to_num(plans.violation, nan=1e9))
     chosen, lanes = rank.argmin(axis=0), np.arange(rank.shape[1])
     pick = lambda leaf: leaf[chosen, lanes]  # noqa: E731
-    return jax.tree.map(pick, together), jax.tree.map(pick, plans)
+    together, plans = jax.tree.map(pick, together), jax.tree.map(pick, plans)
+    return together, _name_out_of_reach(together, plans)
 
 
 def _require_orders(scenarios: Any) -> None:
