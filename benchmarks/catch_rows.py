@@ -14,23 +14,13 @@ import time
 from pathlib import Path
 
 import jax
-import numpy as np
 
 from planner_jax.referee.catch import referee_catches
+from planner_jax.sweep.catch.published import PUBLISHED
 from planner_jax.sweep.summary import wilson_interval
-from planner_jax.task.catch.decide import DECISIONS, plan_catches
+from planner_jax.task.catch.decide import DECISIONS, optimal_time_ratio, plan_catches
 from planner_jax.task.catch.planners import PLANNERS, catch_planner
 from planner_jax.task.catch.suites import SUITES, make_suite
-
-# Planning success [%] of paper 000, Tables I and III.
-PUBLISHED = {
-    "throws": 96.0,
-    "parabola1": 99.3,
-    "parabola2": 98.2,
-    "harmonic2": 84.7,
-    "triangle3": 99.7,
-    "hexagon6": 76.3,
-}
 
 
 def run_row(suite: str, name: str, decide: str, num: int, seed: int) -> dict:
@@ -45,7 +35,7 @@ def run_row(suite: str, name: str, decide: str, num: int, seed: int) -> dict:
     verdict = referee_catches(ordered, plans)
     loose = referee_catches(ordered, plans, tolerance=0.05, net_test="ball")
     solved = verdict.success
-    ratio = np.abs(plans.times - ordered.times) / np.maximum(plans.times, 1e-6)
+    ratio = optimal_time_ratio(ordered, plans)
     return {
         "suite": suite,
         "planner": name,
@@ -102,7 +92,7 @@ def main() -> None:
             print(
                 f"| {suite} | {name} | {100 * row['success']:.2f} % | "
                 f"{100 * low:.2f}..{100 * high:.2f} | {100 * row['success_protocol']:.2f} % | "
-                f"{PUBLISHED.get(suite, '-')} | {ratio} | {last} s | "
+                f"{PUBLISHED[suite].success or '-'} | {ratio} | {last} s | "
                 f"{row['warm_seconds']:.2f} s |",
                 flush=True,
             )

@@ -13,11 +13,11 @@ from jax import Array
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
 from planner_jax.optimise.multistart import solve_round
 from planner_jax.optimise.problem import Round, Stage
+from planner_jax.optimise.scaling import shipped_scale
 from planner_jax.optimise.status import Status
 from planner_jax.referee.catch import referee_catches
 from planner_jax.task.catch.decide import decided, greedy
 from planner_jax.task.catch.exact import ExactCatch
-from planner_jax.task.catch.scales import shipped_scale
 from planner_jax.task.catch.suites import make_suite
 from planner_jax.task.solve import is_solved, plan
 from planner_jax.trajectory.polynomial import evaluate
@@ -199,7 +199,7 @@ def test_sizes_that_make_no_sense_are_refused(scenarios):
 
 
 def test_shipped_scale_fits_a_segment():
-    assert len(shipped_scale("exact-6")) == 3 * (6 - 1) + 12
+    assert len(shipped_scale("planner_jax.task.catch", "exact-6")) == 3 * (6 - 1) + 12
 
 
 # Stages, on a planner without any physics.

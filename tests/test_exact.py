@@ -10,9 +10,10 @@ import pytest
 from planner_jax.ball.aim import aim_with_drag, apex_with_drag
 from planner_jax.ball.flight import BallState, fly
 from planner_jax.ball.impact import racket_impact
+from planner_jax.optimise.scaling import shipped_scale
 from planner_jax.optimise.status import Status
 from planner_jax.referee.hit import referee_hits
-from planner_jax.task.hit.exact import ExactHit, shipped_scale
+from planner_jax.task.hit.exact import ExactHit
 from planner_jax.task.hit.serves import generate_serves, to_scenarios
 from planner_jax.task.solve import is_solved, plan
 from planner_jax.trajectory.polynomial import evaluate, total_duration
@@ -160,5 +161,5 @@ def test_sizes_that_make_no_sense_are_refused(scenarios):
 
 def test_shipped_scales_fit_their_planners():
     for pieces in (6, 12):
-        assert len(shipped_scale(f"exact-{pieces}")) == 3 * (pieces - 1) + 8
-    assert json.dumps(shipped_scale("exact-6"))
+        assert len(shipped_scale("planner_jax.task.hit", f"exact-{pieces}")) == 3 * (pieces - 1) + 8
+    assert json.dumps(shipped_scale("planner_jax.task.hit", "exact-6"))

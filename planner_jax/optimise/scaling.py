@@ -7,6 +7,9 @@ first guess and at a solution. A new task offers `residuals` and gets its scale 
 """
 
 import dataclasses
+import functools
+import importlib.resources
+import json
 from collections.abc import Callable
 from typing import Any, ClassVar, Protocol
 
@@ -33,6 +36,24 @@ class ScaledPlanner(Planner, Protocol):
     def residuals(self, point: Array, context: Any) -> Array:
         """Residuals whose squares sum to about twice the objective near its minimum, (R,)."""
         ...
+
+
+@functools.cache
+def shipped_scale(package: str, name: str) -> tuple[float, ...]:
+    """A measured scale, from the `measured_scales.json` of a task's package.
+
+    `python -m benchmarks.measure_scales --write` makes those files again.
+
+    Raises:
+        ValueError: there is none of that name.
+    """
+    path = importlib.resources.files(package) / "measured_scales.json"
+    scales = json.loads(path.read_text("utf-8"))
+    if name not in scales:
+        raise ValueError(
+            f"no measured scale for {name!r}: give `scale`, or one of {', '.join(scales)}"
+        )
+    return tuple(scales[name])
 
 
 def curvature_diagonal(residuals: Callable[[Array], Array], point: Array) -> Array:

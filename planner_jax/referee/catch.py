@@ -23,6 +23,7 @@ from planner_jax.referee.motion import (
     check_sampling,
     checked_coeffs,
     checked_leaf,
+    failure_sentence,
     finite_lanes,
     first_failures,
     intervals_of,
@@ -98,8 +99,7 @@ class CatchVerdict:
             farthest = np.nanmax(self.net_distance[lane])
             return f"success: {number} caught, at most {farthest:.2g} m from the net's centre"
         time, excess = self.failed_time[lane], self.failed_excess[lane]
-        text = _UNBOUNDED.get(name) if np.isinf(excess) else None
-        return f"{name}: " + (text or _SENTENCES[name]).format(time=time, excess=excess)
+        return failure_sentence(name, time, excess, _SENTENCES, _UNBOUNDED)
 
 
 def referee_catches(

@@ -20,6 +20,7 @@ from planner_jax.referee.motion import (
     check_sampling,
     checked_coeffs,
     checked_leaf,
+    failure_sentence,
     finite_lanes,
     first_failures,
     intervals_of,
@@ -93,8 +94,7 @@ class HitVerdict:
         if not name:
             return f"success: the ball lands {self.landing_error[lane]:.2g} m from the target"
         time, excess = self.failed_time[lane], self.failed_excess[lane]
-        text = _UNBOUNDED.get(name) if np.isinf(excess) else None
-        return f"{name}: " + (text or _SENTENCES[name]).format(time=time, excess=excess)
+        return failure_sentence(name, time, excess, _SENTENCES, _UNBOUNDED)
 
 
 def referee_hits(

@@ -35,6 +35,13 @@ BOOL, TEXT, COUNT, NUMBER = pa.bool_(), pa.string(), pa.int32(), pa.float32()
 VECTOR, LIST = pa.list_(pa.float32(), 3), pa.list_(pa.float32())
 
 INDEX = Column("index", "", "place in the whole", pa.int64(), lambda b: b.cases.index)
+START = Column(
+    "start",
+    "m",
+    "hover position of the quadrotor",
+    VECTOR,
+    lambda b: np.asarray(b.scenarios.head_state)[:, 0],
+)
 
 
 def leaves_of(part: str, rows: Sequence[tuple[str, str, str, pa.DataType, str]]) -> list[Column]:

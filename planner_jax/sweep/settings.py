@@ -2,8 +2,10 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any, ClassVar, TypeVar
+
+from planner_jax.task.by_name import require_planner
 
 AnySettings = TypeVar("AnySettings", bound="SweepSettings")
 
@@ -32,11 +34,11 @@ class SweepSettings:
     DEFAULT_NUM: ClassVar[int]
     CPU_BATCH: ClassVar[int]
     GPU_BATCH: ClassVar[int]
-    require_planner: ClassVar[Callable[[str], None]]  # raises ValueError unless there is such
+    PLANNERS: ClassVar[Mapping[str, str]]  # of the task, by name
 
     def __post_init__(self) -> None:
         try:
-            type(self).require_planner(self.planner)
+            require_planner(self.PLANNERS, self.planner)
         except ValueError as error:
             raise SettingError(str(error)) from None
         for name, least in (("num", 1), ("batch", 1), ("seed", 0)):

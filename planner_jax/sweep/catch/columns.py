@@ -7,7 +7,6 @@ the decision, the plan and the verdict are in the order of catching.
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 
 from planner_jax.sweep.columns import (
@@ -18,25 +17,15 @@ from planner_jax.sweep.columns import (
     NUMBER,
     OUTCOME,
     SOLVER,
+    START,
     TRAJECTORY,
-    VECTOR,
     Column,
     RefereedBatch,
     leaves_of,
 )
+from planner_jax.task.catch.decide import optimal_time_ratio
 
 _WHICH, _FLAGS = pa.list_(pa.int32()), pa.list_(pa.bool_())
-
-
-def time_ratio(batch: RefereedBatch) -> np.ndarray:
-    """Optimal time ratio (B,) of every case, mean of |T_o - T_p| / T_o (paper 000, eq. 29)."""
-    decided, optimised = np.asarray(batch.scenarios.times), np.asarray(batch.plans.times)
-    present = np.take_along_axis(
-        np.asarray(batch.scenarios.present), np.asarray(batch.scenarios.order), axis=1
-    )
-    with np.errstate(all="ignore"):
-        ratio = np.where(present, np.abs(optimised - decided) / optimised, 0.0)
-        return ratio.sum(axis=1) / present.sum(axis=1)
 
 
 def _of_targets(*names: str) -> Any:
@@ -81,20 +70,20 @@ _CASE = [
             ("horizon", "s", "until when each target may be caught", LIST, ""),
         ],
     ),
-    Column(
-        "start",
-        "m",
-        "hover position of the quadrotor",
-        VECTOR,
-        lambda b: np.asarray(b.scenarios.head_state)[:, 0],
-    ),
+    START,
 ]
 
 _CATCHES = [
     *leaves_of("plans", [("order", "", "targets in the order of catching", _WHICH, "")]),
     *leaves_of("scenarios", [("decided_times", "s", "T_p, as decided", LIST, "times")]),
     *leaves_of("plans", [("catch_times", "s", "T_o, as planned", LIST, "times")]),
-    Column("time_ratio", "1", "mean of |T_o - T_p| / T_o", NUMBER, time_ratio),
+    Column(
+        "time_ratio",
+        "1",
+        "mean of |T_o - T_p| / T_o",
+        NUMBER,
+        lambda b: optimal_time_ratio(b.scenarios, b.plans),
+    ),
 ]
 
 _JUDGED = leaves_of(

@@ -2,11 +2,12 @@
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 from planner_jax.sweep.catch.published import PUBLISHED
 from planner_jax.sweep.settings import SweepSettings, require, require_one_of
-from planner_jax.task.catch.planners import require_planner
+from planner_jax.task.catch.planners import PLANNERS
 
 # As in `planner_jax.task.catch`, `planner_jax.referee.catch`; importing those would load JAX.
 SUITES = tuple(PUBLISHED)
@@ -35,7 +36,7 @@ class CatchSweep(SweepSettings):
     # All orders of six targets are looked at at once: 1 MB a case.
     CPU_BATCH: ClassVar[int] = 1024
     GPU_BATCH: ClassVar[int] = 8192
-    require_planner = staticmethod(require_planner)
+    PLANNERS: ClassVar[Mapping[str, str]] = PLANNERS
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -11,6 +11,7 @@ from planner_jax.sweep.columns import (
     NUMBER,
     OUTCOME,
     SOLVER,
+    START,
     TEXT,
     TRAJECTORY,
     VECTOR,
@@ -43,13 +44,7 @@ _CASE = [
             ("ball_vel", "m/s", "ball when planning begins", VECTOR, "scenarios.ball.vel"),
         ],
     ),
-    Column(
-        "start",
-        "m",
-        "hover position of the quadrotor",
-        VECTOR,
-        lambda b: np.asarray(b.scenarios.head_state)[:, 0],
-    ),
+    START,
 ]
 
 # Times count from the moment at which planning begins.

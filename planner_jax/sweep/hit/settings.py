@@ -3,10 +3,11 @@
 import dataclasses
 import math
 import os
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 from planner_jax.sweep.settings import SettingError, SweepSettings, require
-from planner_jax.task.hit.planners import require_planner
+from planner_jax.task.hit.planners import PLANNERS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,7 +31,7 @@ class HitSweep(SweepSettings):
     # One block of the serve generator, or what fills a GPU.
     CPU_BATCH: ClassVar[int] = 4608
     GPU_BATCH: ClassVar[int] = 65536
-    require_planner = staticmethod(require_planner)
+    PLANNERS: ClassVar[Mapping[str, str]] = PLANNERS
 
     def __post_init__(self) -> None:
         super().__post_init__()

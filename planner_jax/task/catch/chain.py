@@ -49,6 +49,19 @@ def targets_at(targets, times: Array) -> BallState:
     return jax.vmap(lambda target, time: target.at(time))(targets, times)
 
 
+def facing_cosine(axis: Array, vel: Array) -> tuple[Array, Array]:
+    """Cosine (N,) between net axes (N, 3) and the targets' way back, and which have a way.
+
+    Args:
+        axis: (N, 3) unit vectors.
+        vel: (N, 3) [m/s], of the targets.
+    """
+    speed_squared = jnp.sum(vel**2, axis=1)
+    moving = speed_squared > 1e-12
+    speed = jnp.sqrt(jnp.where(moving, speed_squared, 1.0))
+    return -jnp.sum(axis * vel, axis=1) / speed, moving
+
+
 @struct.dataclass
 class Chain:
     """Boundary rows, offsets and mean piece durations of N segments."""

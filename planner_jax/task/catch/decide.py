@@ -16,6 +16,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
+from planner_jax.ball.flight import BallState
 from planner_jax.optimise.problem import Planner
 from planner_jax.optimise.status import Status
 from planner_jax.task.catch.plan import CatchPlan
@@ -49,13 +50,19 @@ class _Timetable:
     penalty: Array  # (N, K) [m], above zero where a catch is hardly possible
 
 
-def _timetable(scenario: CatchScenario) -> _Timetable:
-    net, limits = scenario.net, scenario.limits
+def _sampled(scenario: CatchScenario) -> tuple[Array, BallState, Array]:
+    """Times (N, K) up to the horizon, the targets' states and their speeds (N, K) then."""
     shares = jnp.asarray(np.arange(1, _GRID + 1) / _GRID, scenario.gravity.dtype)
     times = scenario.horizon[:, None] * shares
     states = jax.vmap(lambda target, at: jax.vmap(target.at)(at))(scenario.targets, times)
-    up = jnp.array([0.0, 0.0, 1.0], times.dtype)
     speed = jnp.sqrt(jnp.maximum(jnp.sum(states.vel**2, axis=-1), 1e-6))
+    return times, states, speed
+
+
+def _timetable(scenario: CatchScenario) -> _Timetable:
+    net, limits = scenario.net, scenario.limits
+    times, states, speed = _sampled(scenario)
+    up = jnp.array([0.0, 0.0, 1.0], times.dtype)
     from_below = jnp.maximum(states.vel[..., 2] / speed + _STEEPEST, 0.0)
     places = states.pos - net.height * up
     low = jnp.maximum(limits.min_height + 0.1 - places[..., 2], 0.0)
@@ -101,16 +108,14 @@ def greedy(scenario: CatchScenario) -> Decision:
     table = _timetable(scenario)
     num, speed = scenario.num_targets, 0.9 * scenario.limits.speed
     begin, place = jnp.zeros_like(scenario.gravity), scenario.head_state[0]
-    left, order = scenario.present, []
+    left, order = jnp.ones(num, bool), []
     for _ in range(num):
         arrive = lambda target, t=begin, p=place: _arrival(table, target, t, p, speed)  # noqa: E731
         times, places, shortfalls = jax.vmap(arrive)(jnp.arange(num))
-        rank = jnp.where(left, times + 10.0 * shortfalls, jnp.inf)
         # Absent targets come last, in any order.
-        taken = jnp.stack([jnp.arange(num) == k for k in order]).any(0) if order else ~left & left
-        rank = jnp.where(taken, jnp.nan, jnp.where(jnp.isinf(rank), 1e9, rank))
-        target = jnp.nanargmin(rank)
-        here = left[target]
+        rank = jnp.where(scenario.present, times + 10.0 * shortfalls, 1e9)
+        target = jnp.argmin(jnp.where(left, rank, jnp.inf))
+        here = scenario.present[target]
         begin = jnp.where(here, jnp.maximum(times[target], begin + 0.05), begin)
         place = jnp.where(here, places[target], place)
         left = left & (jnp.arange(num) != target)
@@ -143,13 +148,10 @@ def closest_approach(scenario: CatchScenario) -> Array:
     scenario; pure.
     """
     net, limits = scenario.net, scenario.limits
-    shares = jnp.asarray(np.arange(1, _GRID + 1) / _GRID, scenario.gravity.dtype)
-    times = scenario.horizon[:, None] * shares
-    states = jax.vmap(lambda target, at: jax.vmap(target.at)(at))(scenario.targets, times)
+    times, states, speed = _sampled(scenario)
     offset = states.pos - scenario.head_state[0]
     distance = jnp.sqrt(jnp.maximum(jnp.sum(offset**2, axis=-1), 1e-12))
     # The target moves on between two of the times.
-    speed = jnp.sqrt(jnp.maximum(jnp.sum(states.vel**2, axis=-1), 1e-12))
     slack = net.height + net.radius + (speed + limits.speed) * scenario.horizon[:, None] / _GRID
     far = distance - limits.speed * times - slack
     low = limits.min_height - states.pos[..., 2] - slack
@@ -199,10 +201,15 @@ def plan_catches(
         raise ValueError(f"decide must be one of {', '.join(DECISIONS)}, got {decide!r}")
     if decide == "given":
         _require_orders(scenarios)
-        return scenarios, _name_out_of_reach(scenarios, plan(planner, scenarios))
-    if decide == "greedy" or scenarios.num_targets == 1:
+    elif decide == "greedy" or scenarios.num_targets == 1:
         scenarios = decided(scenarios, _greedy(scenarios))
-        return scenarios, _name_out_of_reach(scenarios, plan(planner, scenarios))
+    else:
+        return _plan_finalists(planner, scenarios)
+    return scenarios, _name_out_of_reach(scenarios, plan(planner, scenarios))
+
+
+def _plan_finalists(planner: Planner, scenarios: CatchScenario) -> tuple[CatchScenario, CatchPlan]:
+    """The best of the most promising orders, planned together."""
     decisions = _best_orders(scenarios, _FINALISTS)
     finalists = decisions.order.shape[1]
     tried = [
@@ -219,6 +226,20 @@ def plan_catches(
     pick = lambda leaf: leaf[chosen, lanes]  # noqa: E731
     together, plans = jax.tree.map(pick, together), jax.tree.map(pick, plans)
     return together, _name_out_of_reach(together, plans)
+
+
+def optimal_time_ratio(scenarios: CatchScenario, plans: CatchPlan) -> np.ndarray:
+    """Mean of |T_o - T_p| / T_o over the targets of every case, (B,) (paper 000, eq. 29).
+
+    Args:
+        scenarios: with the times T_p that were decided, a batch.
+        plans: of them, with the optimised times T_o.
+    """
+    decided_times, optimised = np.asarray(scenarios.times), np.asarray(plans.times)
+    present = np.take_along_axis(np.asarray(scenarios.present), np.asarray(scenarios.order), axis=1)
+    with np.errstate(all="ignore"):
+        ratio = np.where(present, np.abs(optimised - decided_times) / optimised, 0.0)
+        return ratio.sum(axis=1) / present.sum(axis=1)
 
 
 def _require_orders(scenarios: Any) -> None:

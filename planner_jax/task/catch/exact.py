@@ -18,6 +18,7 @@ from planner_jax.cost.penalty import joined_trapezoid_weights, smoothed_hinge
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
 from planner_jax.optimise.multistart import FEASIBILITY_TOLERANCE
 from planner_jax.optimise.problem import Round
+from planner_jax.optimise.scaling import shipped_scale
 from planner_jax.robot.quadrotor import body_z, tangent_basis
 from planner_jax.task.catch.chain import (
     CatchContext,
@@ -26,11 +27,11 @@ from planner_jax.task.catch.chain import (
     chain_motion,
     chain_rows,
     chain_trajectory,
+    facing_cosine,
     ordered_context,
     targets_at,
 )
 from planner_jax.task.catch.plan import CatchPlan
-from planner_jax.task.catch.scales import shipped_scale
 from planner_jax.task.catch.scenario import CatchScenario
 from planner_jax.trajectory.proportional_minco import ProportionalMinco, proportional_minco
 
@@ -90,7 +91,9 @@ class ExactCatch:
         if len(self.proportions) < 2:
             raise ValueError(f"proportions must be of >= 2 pieces, got {self.proportions}")
         if not self.scale:
-            object.__setattr__(self, "scale", shipped_scale(f"exact-{self.num_pieces}"))
+            object.__setattr__(
+                self, "scale", shipped_scale(__package__, f"exact-{self.num_pieces}")
+            )
 
     @property
     def num_offsets(self) -> int:
@@ -159,10 +162,7 @@ class ExactCatch:
         inside = _RIM * net.radius / jnp.sqrt(1.0 + jnp.sum(place**2, axis=1, keepdims=True))
         place = place * inside
         pos = ball.pos - net.height * axis - place[:, :1] * across_x - place[:, 1:] * across_y
-        speed_squared = jnp.sum(ball.vel**2, axis=1)
-        moving = speed_squared > 1e-12
-        speed = jnp.sqrt(jnp.where(moving, speed_squared, 1.0))
-        facing = -jnp.sum(axis * ball.vel, axis=1) / speed
+        facing, moving = facing_cosine(axis, ball.vel)
         # To first order the relative excess of the angle, without an arc cosine.
         angle = jnp.maximum(net.max_angle, 1e-3)
         excess = (jnp.cos(angle) - facing) / (angle * jnp.sin(angle))

@@ -21,6 +21,7 @@ from planner_jax.task.catch.chain import (
     chain_motion,
     chain_rows,
     chain_trajectory,
+    facing_cosine,
     ordered_context,
     targets_at,
 )
@@ -169,10 +170,7 @@ class PaperCatch:
         last = jnp.sum(context.active) - 1
         flying = jnp.arange(times.size) != last
         jerk = jnp.where(flying[:, None], natural[:, 10:13], 0.0)
-        speed_squared = jnp.sum(ball.vel**2, axis=1)
-        moving = speed_squared > 1e-12
-        speed = jnp.sqrt(jnp.where(moving, speed_squared, 1.0))
-        facing = -jnp.sum(axis * ball.vel, axis=1) / speed
+        facing, moving = facing_cosine(axis, ball.vel)
         miss_squared = jnp.sum(miss**2, axis=1)
         missing = miss_squared > 0.0
         return Catch(

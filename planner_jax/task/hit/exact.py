@@ -6,9 +6,6 @@ choice of variables, which needs none of the singular divisions of its eqs 13-14
 """
 
 import dataclasses
-import functools
-import importlib.resources
-import json
 
 import jax.numpy as jnp
 import numpy as np
@@ -29,6 +26,7 @@ from planner_jax.cost.limits import motion_excess
 from planner_jax.cost.penalty import joined_trapezoid_weights, smoothed_hinge
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
 from planner_jax.optimise.problem import Round
+from planner_jax.optimise.scaling import shipped_scale
 from planner_jax.robot.quadrotor import tangent_basis
 from planner_jax.task.hit.plan import HitPlan, Stroke
 from planner_jax.task.hit.scenario import HitScenario
@@ -99,23 +97,6 @@ _GUESSES = np.array(
 )
 
 
-@functools.cache
-def shipped_scale(name: str) -> tuple[float, ...]:
-    """Measured scale of a planner's variables, from `measured_scales.json`.
-
-    `python -m benchmarks.measure_scales --write` makes the file again.
-    """
-    text = (importlib.resources.files("planner_jax.task.hit") / "measured_scales.json").read_text(
-        "utf-8"
-    )
-    scales = json.loads(text)
-    if name not in scales:
-        raise ValueError(
-            f"no measured scale for {name!r}: give `scale`, or one of {', '.join(scales)}"
-        )
-    return tuple(scales[name])
-
-
 @dataclasses.dataclass(frozen=True)
 class ExactHit:
     """Minimum-snap hits with the impact eliminated exactly.
@@ -162,7 +143,9 @@ class ExactHit:
         if len(self.proportions) < 2:
             raise ValueError(f"proportions must be of >= 2 pieces, got {self.proportions}")
         if not self.scale:
-            object.__setattr__(self, "scale", shipped_scale(f"exact-{self.num_pieces}"))
+            object.__setattr__(
+                self, "scale", shipped_scale(__package__, f"exact-{self.num_pieces}")
+            )
 
     @property
     def num_pieces(self) -> int:
