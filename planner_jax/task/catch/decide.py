@@ -18,10 +18,10 @@ from jax import Array
 
 from planner_jax.ball.flight import BallState
 from planner_jax.optimise.problem import Planner
-from planner_jax.optimise.status import Status
+from planner_jax.optimise.status import Status, is_solved
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.task.catch.scenario import CatchScenario
-from planner_jax.task.solve import is_solved, plan
+from planner_jax.task.solve import plan
 
 DECISIONS = ("best", "greedy", "given")
 
