@@ -19,6 +19,8 @@ ALLOWED = {
     "task": BASE | {"cost", "optimise"},
     "referee": set(),
     "sweep": BASE | {"cost", "optimise", "task", "referee"},
+    "compile_cache": set(),
+    "doctor": {"compile_cache", "task", "referee", "sweep"},
 }
 ALLOWED["cli"] = ALLOWED["__init__"] = ALLOWED.keys() - {"cli", "__init__"}
 MODULES = sorted((ROOT / "planner_jax").rglob("*.py"))
