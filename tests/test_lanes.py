@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from planner_jax.optimise.lanes import over_lanes
+from planner_jax.lanes import over_lanes
 
 MATRIX = np.random.default_rng(0).standard_normal((5, 4))
 LANES = 7

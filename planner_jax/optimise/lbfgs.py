@@ -9,12 +9,16 @@ Direction: Liu and Nocedal 1989, two-loop recursion, with gamma = s.y / y.y of t
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array
+
+from planner_jax.lanes import with_kernel
+from planner_jax.optimise.lbfgs_kernel import turn_kernel
 
 
 @struct.dataclass
@@ -118,7 +122,7 @@ def remember(memory: Memory, step: Array, change: Array) -> Memory:
     )
 
 
-def search_direction(memory: Memory, grad: Array, config: LbfgsConfig) -> Array:
+def search_direction(memory: Memory, grad: Array, step_cap: float) -> Array:
     """Quasi-Newton direction -H g, no longer than the step cap, (n,).
 
     Without a pair in memory it is the steepest descent of unit length: in scaled variables
@@ -126,7 +130,8 @@ def search_direction(memory: Memory, grad: Array, config: LbfgsConfig) -> Array:
     """
     q = grad
     alphas = []
-    for k in reversed(range(config.memory)):
+    pairs = range(memory.steps.shape[0])
+    for k in reversed(pairs):
         alpha = memory.inverse_curvature[k] * jnp.sum(memory.steps[k] * q)
         q = q - alpha * memory.changes[k]
         alphas.append(alpha)
@@ -135,11 +140,22 @@ def search_direction(memory: Memory, grad: Array, config: LbfgsConfig) -> Array:
     slope = jnp.sqrt(jnp.maximum(jnp.sum(grad**2), 1e-30))
     gamma = jnp.where(newest > 0.0, 1.0 / jnp.where(newest > 0.0, size, 1.0), 1.0 / slope)
     q = gamma * q
-    for k, alpha in zip(range(config.memory), reversed(alphas), strict=True):
+    for k, alpha in zip(pairs, reversed(alphas), strict=True):
         beta = memory.inverse_curvature[k] * jnp.sum(memory.changes[k] * q)
         q = q + memory.steps[k] * (alpha - beta)
     length = jnp.sqrt(jnp.maximum(jnp.sum(q**2), 1e-30))
-    return -q * jnp.minimum(1.0, config.step_cap / length)
+    return -q * jnp.minimum(1.0, step_cap / length)
+
+
+@functools.cache
+def _turn(num_pairs: int, step_cap: float) -> Callable:
+    """Memory and direction after one more pair, with a kernel for many lanes."""
+
+    def turn(memory: Memory, step: Array, change: Array, grad: Array) -> tuple[Memory, Array]:
+        memory = remember(memory, step, change)
+        return memory, search_direction(memory, grad, step_cap)
+
+    return with_kernel(turn, turn_kernel(num_pairs, step_cap))
 
 
 def step(objective: Objective, state: LbfgsState, config: LbfgsConfig) -> LbfgsState:
@@ -154,8 +170,9 @@ def step(objective: Objective, state: LbfgsState, config: LbfgsConfig) -> LbfgsS
 
     (cost, violation), grad = jax.value_and_grad(value, has_aux=True)(state.point)
     here = Evaluation(cost, violation)
-    memory = remember(state.memory, state.step, grad - state.grad)
-    direction = search_direction(memory, grad, config)
+    memory, direction = _turn(config.memory, config.step_cap)(
+        state.memory, state.step, grad - state.grad, grad
+    )
     lengths = state.reach * jnp.asarray(config.trial_steps, grad.dtype)
     trials = jax.vmap(lambda length: objective(state.point + length * direction))(lengths)
     costs = jnp.where(jnp.isfinite(trials.cost), trials.cost, jnp.inf)

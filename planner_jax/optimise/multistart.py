@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array, lax
 
+from planner_jax.lanes import over_lanes
 from planner_jax.optimise import lbfgs
-from planner_jax.optimise.lanes import over_lanes
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig, LbfgsState, Objective
 from planner_jax.optimise.problem import Planner, Round, Settings
 from planner_jax.optimise.status import Status

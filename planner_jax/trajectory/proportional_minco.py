@@ -119,23 +119,22 @@ def boundary_rows(head_state: Array, tail_state: Array, piece_duration: Array) -
 
 
 def sample_motion(
-    maps: ProportionalMinco, nodes: int, rows: Array, offsets: Array, piece_duration: Array
+    maps: ProportionalMinco, nodes: int, columns: Array, piece_duration: Array
 ) -> Motion:
     """Height, velocity, acceleration and jerk at `nodes` intervals a piece.
 
     Args:
         maps: constant maps of M pieces.
         nodes: intervals a piece; N = M nodes + 1 samples, ends shared.
-        rows: (2s, 3) boundary rows.
-        offsets: (M - 1, 3) whitened offsets y.
+        columns: (2s + M - 1, 3) boundary rows and whitened offsets y.
         piece_duration: () h = T / M [s].
     """
     # One product for everything: on a CPU each product, division and sum of its own costs more
     # than its arithmetic. The matrix comes first, so that a batch adds columns.
     matrices = np.stack([maps.sample_matrix(nodes, d) for d in range(4)])
     unit = jnp.matmul(
-        jnp.asarray(matrices.reshape(-1, matrices.shape[-1]), rows.dtype),
-        jnp.concatenate([rows, offsets]),
+        jnp.asarray(matrices.reshape(-1, matrices.shape[-1]), columns.dtype),
+        columns,
         precision=lax.Precision.HIGHEST,
     ).reshape(4, -1, 3)
     rate = reciprocal(piece_duration)

@@ -7,7 +7,7 @@ and the product with a constant matrix is one large product. Same numbers, anoth
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -63,6 +63,30 @@ def over_lanes(function: Callable) -> Callable:
     return mapped
 
 
+# A kernel takes the tree of a function's arguments and their leaves, with the lanes last; it gives
+# the leaves of the results, or None where it is not made for such shapes.
+Kernel = Callable[[Any, Sequence[Array]], list[Array] | None]
+_KERNELS: dict[str, tuple[Any, Kernel]] = {}
+
+
+def with_kernel(function: Callable, kernel: Kernel) -> Callable:
+    """The function, for which `over_lanes` calls a kernel where the program is for CUDA.
+
+    Args:
+        function: of pytrees of arrays of ONE lane, to a pytree of arrays.
+        kernel: the same on lanes. `jax.vmap` within a lane adds axes in front of some leaves.
+    """
+    name = f"kernel_{len(_KERNELS)}"
+
+    def named(*args: Any) -> Any:
+        _KERNELS[name] = (jax.tree.structure(args), kernel)
+        return function(*args)
+
+    named.__name__ = named.__qualname__ = name
+    _KERNELS[name] = (None, kernel)
+    return jax.jit(named)
+
+
 class _Lanes:
     """An array with lanes on its last axis; anything else is the same for all lanes."""
 
@@ -102,7 +126,10 @@ def _outputs(eqn: JaxprEqn, inputs: list[Any], lanes: int) -> list[Any]:
     if name in _CALLS:
         inner = eqn.params["jaxpr"] if "jaxpr" in eqn.params else eqn.params["call_jaxpr"]
         closed = inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
-        return _evaluate(closed.jaxpr, closed.consts, inputs, lanes)
+        plain = functools.partial(_evaluate, closed.jaxpr, closed.consts)
+        if eqn.params.get("name") in _KERNELS and jax.default_backend() == "gpu":
+            return _by_kernel(eqn, inputs, lanes, plain)
+        return plain(inputs, lanes)
     if not any(isinstance(value, _Lanes) for value in inputs):
         return _bound(eqn, inputs)
     shapes = [_shape(atom) for atom in eqn.invars]
@@ -120,6 +147,25 @@ def _outputs(eqn: JaxprEqn, inputs: list[Any], lanes: int) -> list[Any]:
     if found is None:
         return _mapped(eqn, inputs)
     return [_Lanes(array) for array in found]
+
+
+def _by_kernel(eqn: JaxprEqn, inputs: list[Any], lanes: int, plain: Callable) -> list[Any]:
+    """A function that has a kernel: that for CUDA, and what the function says elsewhere."""
+    treedef, kernel = _KERNELS[eqn.params["name"]]
+    arrays = [_widened(v, _shape(atom), lanes) for v, atom in zip(inputs, eqn.invars, strict=True)]
+
+    def in_kernel(*leaves: Array) -> list[Array]:
+        found = kernel(treedef, leaves)
+        return in_steps(*leaves) if found is None else [*found]
+
+    def in_steps(*leaves: Array) -> list[Array]:
+        found = plain([_Lanes(leaf) for leaf in leaves], lanes)
+        shapes = [_shape(atom) for atom in eqn.outvars]
+        return [_widened(v, shape, lanes) for v, shape in zip(found, shapes, strict=True)]
+
+    return [
+        _Lanes(leaf) for leaf in lax.platform_dependent(*arrays, cuda=in_kernel, default=in_steps)
+    ]
 
 
 def _bound(eqn: JaxprEqn, inputs: list[Any], **changes: Any) -> list[Any]:
