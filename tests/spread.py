@@ -1,7 +1,7 @@
 """Run by `test_devices.py` in processes of its own: plans on several devices or processes.
 
-    python spread.py devices             needs --xla_force_host_platform_device_count=4
-    python spread.py process INDEX PORT  of two
+python spread.py devices             needs --xla_force_host_platform_device_count=4
+python spread.py process INDEX PORT  of two
 """
 
 import sys

@@ -2,7 +2,8 @@
 
 A thread carries a lane. It reads the columns once, makes the samples one after another, each
 from a row of the constant matrices, and adds up penalties and, by the transposed product,
-slopes. Memory sees the columns, the results and nothing in between.
+slopes. Memory sees the columns, the results and nothing in between. Where there are few lanes,
+several threads share the samples of one.
 """
 
 import functools
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from planner_jax.cost.along import Along
 
 _THREADS = 128  # lanes of a block
+_ENOUGH = 512  # blocks that keep a large GPU busy
 _FEWEST = 16  # lanes that are worth a block
 
 
@@ -45,6 +47,8 @@ def along_kernel(along: "Along", *, slopes: bool, interpret: bool = False) -> Ca
         call = _call(along, slopes, interpret, treedef, math.prod(lead), num_columns, lanes)
         columns = columns.reshape(-1, num_columns, 3, lanes)
         found = call(columns, durations.reshape(-1, lanes), *parameters)
+        combine = [jnp.sum, jnp.max, jnp.sum, jnp.sum]
+        found = [together(leaf, axis=0) for together, leaf in zip(combine, found, strict=False)]
         return [leaf.reshape(*lead, *leaf.shape[1:]) for leaf in found]
 
     return kernel
@@ -67,6 +71,9 @@ def _call(
     threads = math.gcd(lanes, _THREADS)
     matrices, weights = along.matrices(), along.weights()
     num_samples = len(weights)
+    blocks = lead * lanes // threads
+    shares = min(max(_ENOUGH // blocks, 1), 8)
+    share = -(-num_samples // shares)
 
     def body(columns_ref, durations_ref, *refs):
         num_parameters = len(refs) - 2 - (4 if slopes else 2)
@@ -124,7 +131,9 @@ def _call(
         zero = jnp.zeros_like(duration)
         none = [[zero] * 3 for _ in range(num_columns)] if slopes else []
         begin = (zero, jnp.full_like(duration, -jnp.inf), none, zero)
-        total, worst, of_columns, of_rate = jax.lax.fori_loop(0, num_samples, sample, begin)
+        first = pl.program_id(2) * share
+        last = jnp.minimum(first + share, num_samples)
+        total, worst, of_columns, of_rate = jax.lax.fori_loop(first, last, sample, begin)
         out[0][...] = duration * total
         out[1][...] = worst
         for c, axes in enumerate(of_columns):
@@ -136,17 +145,20 @@ def _call(
     def whole(*shape: int) -> pl.BlockSpec:
         return pl.BlockSpec(shape, lambda *_: (0,) * len(shape))
 
-    one = pl.BlockSpec((None, threads), lambda t, i: (t, i))
-    many = pl.BlockSpec((None, num_columns, 3, threads), lambda t, i: (t, 0, 0, i))
-    shared = pl.BlockSpec((threads,), lambda t, i: (i,))
-    number = jax.ShapeDtypeStruct((lead, lanes), jnp.float32)
-    vector = jax.ShapeDtypeStruct((lead, num_columns, 3, lanes), jnp.float32)
+    one = pl.BlockSpec((None, threads), lambda t, i, s: (t, i))
+    many = pl.BlockSpec((None, num_columns, 3, threads), lambda t, i, s: (t, 0, 0, i))
+    shared = pl.BlockSpec((threads,), lambda t, i, s: (i,))
+    # Results have the shares of the samples in front.
+    one_out = pl.BlockSpec((None, None, threads), lambda t, i, s: (s, t, i))
+    many_out = pl.BlockSpec((None, None, num_columns, 3, threads), lambda t, i, s: (s, t, 0, 0, i))
+    number = jax.ShapeDtypeStruct((shares, lead, lanes), jnp.float32)
+    vector = jax.ShapeDtypeStruct((shares, lead, num_columns, 3, lanes), jnp.float32)
 
     def call(columns: Array, durations: Array, *parameters: Array) -> list[Array]:
         return pl.pallas_call(
             body,
             out_shape=[number, number, *((vector, number) if slopes else ())],
-            grid=(lead, lanes // threads),
+            grid=(lead, lanes // threads, shares),
             in_specs=[
                 many,
                 one,
@@ -154,7 +166,7 @@ def _call(
                 whole(num_samples, 4 * num_columns),
                 whole(num_samples),
             ],
-            out_specs=[one, one, *((many, one) if slopes else ())],
+            out_specs=[one_out, one_out, *((many_out, one_out) if slopes else ())],
             compiler_params=triton.CompilerParams(num_warps=max(threads // 32, 1), num_stages=1),
             interpret=interpret,
             name="integrate_along",

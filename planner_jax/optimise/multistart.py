@@ -64,7 +64,9 @@ def minimise_lanes(
     def step(state: LbfgsState, context: Any) -> LbfgsState:
         after = lbfgs.step(lambda x: objective(x, context), state, config)
         going = _unfinished(state, config)
-        return jax.tree.map(lambda new, old: jnp.where(going, new, old), after, state)
+        kept = jax.tree.map(lambda new, old: jnp.where(going, new, old), after, state)
+        # The largest part, which a lane at rest does not look at any more.
+        return dataclasses.replace(kept, memory=after.memory, grad=after.grad)
 
     state = lax.while_loop(
         lambda s: jnp.any(_unfinished(s, config)),
