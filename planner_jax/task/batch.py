@@ -79,18 +79,18 @@ def _solved(
     planner: Planner, attempt: Round, scenarios: Any, calls: list[np.ndarray], mesh: Mesh
 ) -> list[Any]:
     """One round on the lanes of every call; on one CPU device a thread for each core."""
-    first = jax.tree.leaves(scenarios)[0]
-    resident = isinstance(first, jax.Array)
+    leaf = jax.tree.leaves(scenarios)[0]
+    resident = isinstance(leaf, jax.Array)
     placed = NamedSharding(mesh, _LANES)
 
     def solve(lanes: np.ndarray) -> Any:
         if not resident:
             part = jax.tree.map(lambda leaf: leaf[lanes], scenarios)
-        elif lanes.size == first.shape[0] and (np.diff(lanes) == 1).all():
+        elif lanes.size == leaf.shape[0] and (np.diff(lanes) == 1).all():
             part = scenarios  # all of them, as they are
         else:
             part = _taken(scenarios, lanes)
-        if not resident or first.sharding != placed:
+        if not resident or leaf.sharding != placed:
             part = jax.device_put(part, placed)
         found = _solve(planner, attempt, mesh, part)
         return jax.block_until_ready(found) if threads > 1 else found
