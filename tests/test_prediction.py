@@ -18,6 +18,7 @@ from planner_jax.ball.prediction import (
     predict_path,
     target_at,
 )
+from planner_jax.ball.prediction_kernel import table_kernel
 
 GRAVITY, DRAG = 9.8, 0.0616
 SERVE_POS, SERVE_VEL = (4.0, 0.5, 2.0), (-6.5, 0.7, 5.5)
@@ -227,3 +228,23 @@ def test_batch_equals_loop():
         table = predict(pick(balls), horizons[k], drags[k], gravity)
         assert_close(pick(tables), table, rtol=1e-13)
         assert_close(pick(targets), target_and_rate(table, float(times[k]))[0], rtol=1e-13)
+
+
+def test_the_kernel_gives_the_same_table():
+    random = np.random.default_rng(5)
+    lanes, nodes = 32, 12
+    pos, vel = random.uniform(-3.0, 3.0, (2, 3, lanes)).astype(np.float32)
+    vel[:, 3] = 0.0  # a ball at rest
+    numbers = [random.uniform(*ends, lanes).astype(np.float32) for ends in ((0.01, 0.1), (0, 0.3))]
+    gravity = np.full(lanes, 9.8, np.float32)
+    args = [jnp.asarray(x) for x in (pos, vel, *numbers, gravity)]
+    found = table_kernel(nodes, interpret=True)(None, args)
+    table = jax.vmap(
+        lambda p, v, step, drag, g: predict_path(
+            BallState(p, v), step * (nodes - 3), drag, g, num_nodes=nodes
+        ),
+        in_axes=-1,
+        out_axes=-1,
+    )(*args)
+    np.testing.assert_allclose(found[0], table.pos, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(found[1], table.vel, rtol=1e-5, atol=1e-5)

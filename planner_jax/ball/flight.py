@@ -4,12 +4,15 @@ World frame, z up, SI units. Everything here is written for one ball; `jax.vmap`
 """
 
 import math
+from typing import Any
 
 import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array
+
+from planner_jax.arithmetic import Components, components
 
 
 @struct.dataclass
@@ -26,29 +29,36 @@ def gravity_vector(gravity: Array) -> Array:
     return jnp.stack([jnp.zeros_like(gravity), jnp.zeros_like(gravity), -gravity])
 
 
-def ball_acceleration(vel: Array, drag: Array, gravity: Array) -> Array:
+def ball_acceleration(vel: Components, drag: Array, gravity: Array) -> Components:
     """Acceleration  g - K_D |v| v  of a ball in flight (paper 002, eq. 2).
 
     Args:
-        vel: (3,) [m/s].
+        vel: (3,) [m/s], or a tuple of its components.
         drag: () K_D [1/m], >= 0.
         gravity: () [m/s^2], magnitude.
 
     Returns:
-        (3,) [m/s^2]. The gradient is finite at rest.
+        (3,) [m/s^2], or a tuple like the velocity. The gradient is finite at rest.
     """
-    speed_squared = jnp.sum(vel**2)
+    x, y, z = components(vel)
+    speed_squared = x * x + y * y + z * z
     moving = speed_squared > 0.0
     # The inner where keeps the gradient of sqrt finite for a ball at rest.
     speed = jnp.where(moving, jnp.sqrt(jnp.where(moving, speed_squared, 1.0)), 0.0)
-    return gravity_vector(gravity) - drag * speed * vel
+    braking = -drag * speed
+    acc = (braking * x, braking * y, braking * z - gravity)
+    return acc if isinstance(vel, tuple) else jnp.stack(acc)
 
 
 def rk4_step(ball: BallState, duration: Array, drag: Array, gravity: Array) -> BallState:
-    """The ball after one Runge-Kutta step of order 4; a negative duration [s] steps back."""
+    """The ball after one Runge-Kutta step of order 4; a negative duration [s] steps back.
+
+    A ball whose vectors are tuples of their components gives such a ball.
+    """
 
     def rate(state: BallState) -> BallState:
-        return BallState(pos=state.vel, vel=ball_acceleration(state.vel, drag, gravity))
+        slopes: Any = ball_acceleration(state.vel, drag, gravity)
+        return BallState(pos=state.vel, vel=slopes)
 
     def ahead(slope: BallState, step: Array) -> BallState:
         return jax.tree.map(lambda x, dx: x + step * dx, ball, slope)

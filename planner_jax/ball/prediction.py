@@ -4,6 +4,9 @@ Paper 002, Section III-C (eqs 8-10): the flight is integrated once into a table 
 and Keys' kernel (a = -1/2) reads it at any time with a continuous gradient.
 """
 
+import functools
+from collections.abc import Callable
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -12,6 +15,8 @@ from jax import Array
 
 from planner_jax.arithmetic import reciprocal
 from planner_jax.ball.flight import BallState, rk4_step
+from planner_jax.ball.prediction_kernel import table_kernel
+from planner_jax.lanes import with_kernel
 
 
 @struct.dataclass
@@ -43,17 +48,31 @@ def predict_path(
     if num_nodes < 5:
         raise ValueError(f"num_nodes must be >= 5, got {num_nodes}")
     resolution = horizon / (num_nodes - 3)
-    before = rk4_step(ball, -resolution, drag, gravity)
+    pos, vel = _integrated(num_nodes)(ball.pos, ball.vel, resolution, drag, gravity)
+    return PathTable(pos=pos, vel=vel, resolution=resolution)
 
-    def advance(state: BallState, _: None) -> tuple[BallState, BallState]:
-        after = rk4_step(state, resolution, drag, gravity)
-        return after, after
 
-    _, later = jax.lax.scan(advance, ball, None, length=num_nodes - 2)
-    nodes = jax.tree.map(
-        lambda a, b, c: jnp.concatenate([a[None], b[None], c]), before, ball, later
-    )
-    return PathTable(pos=nodes.pos, vel=nodes.vel, resolution=resolution)
+@functools.cache
+def _integrated(num_nodes: int) -> Callable:
+    """Positions and velocities (N, 3) at the nodes, with a kernel for many lanes."""
+
+    def integrated(
+        pos: Array, vel: Array, resolution: Array, drag: Array, gravity: Array
+    ) -> tuple[Array, Array]:
+        ball = BallState(pos, vel)
+        before = rk4_step(ball, -resolution, drag, gravity)
+
+        def advance(state: BallState, _: None) -> tuple[BallState, BallState]:
+            after = rk4_step(state, resolution, drag, gravity)
+            return after, after
+
+        _, later = jax.lax.scan(advance, ball, None, length=num_nodes - 2)
+        nodes = jax.tree.map(
+            lambda a, b, c: jnp.concatenate([a[None], b[None], c]), before, ball, later
+        )
+        return nodes.pos, nodes.vel
+
+    return with_kernel(integrated, table_kernel(num_nodes))
 
 
 def horizon_of(table: PathTable) -> Array:

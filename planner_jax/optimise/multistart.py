@@ -139,13 +139,13 @@ def solve_batch(planner: Planner, attempt: Round, scenarios: Any) -> Any:
         Their plans, a leading axis on every leaf.
     """
     planners, configs = _stages(planner, attempt)
-    contexts = jax.vmap(planners[-1].prepare)(scenarios)
-    starts = jax.vmap(lambda context: planners[-1].guesses(context, attempt.starts))(contexts)
-    num = starts.shape[0]
-    points = starts.reshape(num * attempt.starts, -1).T
+    lanes = jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), scenarios)
+    contexts = over_lanes(planners[-1].prepare)(lanes)
+    starts = over_lanes(lambda context: planners[-1].guesses(context, attempt.starts))(contexts)
+    # A lane of the solver is one start of one case; the starts of a case are neighbours.
+    points = jnp.moveaxis(starts, 0, -1).reshape(starts.shape[1], -1)
     if attempt.starts > 1:
-        contexts = jax.tree.map(lambda x: jnp.repeat(x, attempt.starts, axis=0), contexts)
-    contexts = jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), contexts)
+        contexts = jax.tree.map(lambda x: jnp.repeat(x, attempt.starts, axis=-1), contexts)
     iterations = jnp.zeros(points.shape[1:], jnp.int32)
     for stage, config in zip(planners, configs, strict=True):
         optimum = minimise_lanes(stage.objective, points, contexts, config)
@@ -155,7 +155,7 @@ def solve_batch(planner: Planner, attempt: Round, scenarios: Any) -> Any:
     plans = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), plans)
     if attempt.starts == 1:
         return plans
-    split = lambda x: x.reshape(num, attempt.starts, *x.shape[1:])  # noqa: E731
+    split = lambda x: x.reshape(-1, attempt.starts, *x.shape[1:])  # noqa: E731
     return jax.vmap(_best)(jax.tree.map(split, plans))
 
 
