@@ -7,7 +7,9 @@ units.
 
 import dataclasses
 import math
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
@@ -19,6 +21,8 @@ SMALLEST_LIMIT = 1e-3
 SHORTEST_PIECE = 0.1
 # Fewest intervals between the samples of one piece.
 _FEWEST_INTERVALS = 16
+# Samples taken at once: a dozen arrays of so many float64 stay in the cache of a core.
+_TILE = 12_000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,6 +36,11 @@ class Pieces:
     durations: np.ndarray  # (B, M) [s]
     starts: np.ndarray  # (B, M) [s]
     flown: np.ndarray  # (B, M) bool
+
+    def of(self, lanes: slice) -> "Pieces":
+        """The pieces of some lanes."""
+        rest = (part[lanes] for part in (self.durations, self.starts, self.flown))
+        return Pieces(self.coeffs[:, lanes], *rest)
 
 
 def pieces_of(coeffs: np.ndarray, durations: np.ndarray, flown: np.ndarray | None = None) -> Pieces:
@@ -88,20 +97,21 @@ def checked_coeffs(value) -> np.ndarray:
 def judge_in_chunks(
     judge: Callable[[dict], dict], leaves: dict[str, np.ndarray], chunk: int
 ) -> dict[str, np.ndarray]:
-    """The fields of a verdict from leaves with leading axis B, `chunk` lanes at once."""
-    num_lanes = len(leaves["durations"])
-    parts = []
-    # A broken or absurd lane may overflow; its verdict says so, not a warning.
-    with np.errstate(all="ignore"):
-        for start in range(0, max(num_lanes, 1), chunk):
-            parts.append(
-                judge(
-                    {
-                        name: leaf[start : start + chunk].astype(np.float64)
-                        for name, leaf in leaves.items()
-                    }
-                )
-            )
+    """The fields of a verdict from leaves with leading axis B, `chunk` lanes a thread at once."""
+
+    def judged(start: int) -> dict[str, np.ndarray]:
+        lanes = slice(start, start + chunk)
+        # A broken or absurd lane may overflow; its verdict says so, not a warning.
+        with np.errstate(all="ignore"):
+            return judge({name: leaf[lanes].astype(np.float64) for name, leaf in leaves.items()})
+
+    starts = range(0, max(len(leaves["durations"]), 1), chunk)
+    threads = min(len(starts), os.cpu_count() or 1)
+    if threads == 1:
+        parts = [judged(start) for start in starts]
+    else:
+        with ThreadPoolExecutor(threads) as pool:
+            parts = list(pool.map(judged, starts))
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
@@ -164,21 +174,33 @@ def above(value, limit, tolerance: float, time) -> tuple:
 
 
 def motion_at(coeffs: np.ndarray, durations: np.ndarray, u: np.ndarray, orders) -> list:
-    """Derivatives of polynomial pieces at the fractions u of their durations.
+    """Derivatives of polynomial pieces at the same fractions u of their durations.
 
-    coeffs (3, ..., D + 1), durations (...), u (S,) or (..., S): one (3, ..., S) an order.
+    coeffs (3, B, M, D + 1), durations (B, M), u (S,): one (3, B, M, S) an order.
     """
+    num = coeffs.shape[-1]
+    spans = np.vander(durations.ravel(), num, increasing=True)
+    powers = np.vander(u, num, increasing=True).T
+    coeffs = coeffs.reshape(3, len(spans), num)
     out = []
     for order in orders:
-        powers = np.arange(coeffs.shape[-1] - order)
-        factors = np.array([math.perm(int(k) + order, order) for k in powers], float)
-        scaled = coeffs[..., order:] * factors * durations[..., None] ** powers
-        # Not a matrix product: threads of a BLAS on a busy machine cost more than they save.
-        out.append(np.einsum("...k,...ks->...s", scaled, u[..., None, :] ** powers[:, None]))
+        factors = np.array([math.perm(k, order) for k in range(order, num)], float)
+        left = max(num - order, 0)
+        values = (coeffs[..., order:] * (factors * spans[:, :left])) @ powers[:left]
+        out.append(values.reshape(3, *durations.shape, len(u)))
     return out
 
 
-def _squared(vector: np.ndarray) -> np.ndarray:
+def _derivative(coeffs: np.ndarray, times: np.ndarray, order: int) -> np.ndarray:
+    """A derivative (3, S, B) of one piece a lane, at times (S, B); coeffs (D + 1, 3, 1, B)."""
+    value = np.zeros((3, *times.shape))
+    for k in range(len(coeffs) - 1, order - 1, -1):
+        value *= times
+        value += math.perm(k, order) * coeffs[k]
+    return value
+
+
+def squared(vector: np.ndarray) -> np.ndarray:
     """Squared length of vectors (3, ...)."""
     return vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2
 
@@ -207,8 +229,8 @@ def _body_rate_squared(gravity, acc: np.ndarray, jerk: np.ndarray) -> np.ndarray
 
 # Name -> orders of the derivatives it needs, and the measure whose maximum is sought.
 _MEASURES = {
-    "speed": ((1,), lambda gravity, vel: _squared(vel)),
-    "acceleration": ((2,), lambda gravity, acc: _squared(acc)),
+    "speed": ((1,), lambda gravity, vel: squared(vel)),
+    "acceleration": ((2,), lambda gravity, acc: squared(acc)),
     "body rate": ((2, 3), _body_rate_squared),
     "depth": ((0,), lambda gravity, pos: -pos[2]),
     "thrust": ((2,), _thrust_squared),
@@ -218,12 +240,15 @@ _MEASURES = {
 
 def _likeliest_peak(values: np.ndarray) -> np.ndarray:
     """Index (B,) next to the greatest parabola through three samples (B, M, S) of a piece."""
-    left, middle, right = values[..., :-2], values[..., 1:-1], values[..., 2:]
-    crest = (middle >= left) & (middle > right)
-    gain = (right - left) ** 2 / (8.0 * (2.0 * middle - left - right))
-    vertex = values.copy()
-    vertex[..., 1:-1] += np.where(crest, gain, 0.0)
-    return flat(vertex).argmax(axis=1)
+    line = values.ravel()
+    crest = np.zeros(values.shape, bool)
+    crest.ravel()[1:-1] = (line[1:-1] >= line[:-2]) & (line[1:-1] > line[2:])
+    crest[..., 0] = crest[..., -1] = False  # their neighbour belongs to another piece
+    peak = np.flatnonzero(crest)
+    left, middle, right = line[peak - 1], line[peak], line[peak + 1]
+    vertex = line.copy()
+    vertex[peak] += (right - left) ** 2 / (8.0 * (2.0 * middle - left - right))
+    return flat(vertex.reshape(values.shape)).argmax(axis=1)
 
 
 def flat(values: np.ndarray) -> np.ndarray:
@@ -239,54 +264,87 @@ def peaks(
     Every piece is sampled at both ends and inside; the likeliest peak by parabolas through
     three samples is then searched on the polynomial itself, so that what is found is reached.
     """
-    coeffs, durations, starts = pieces.coeffs, pieces.durations, pieces.starts
     u = np.linspace(0.0, 1.0, intervals + 1)
-    motion = motion_at(coeffs, durations, u, range(4))
-    lanes = np.arange(len(durations))
-    times = starts[:, :, None] + durations[:, :, None] * u
+    num_lanes, num_pieces = pieces.durations.shape
+    size = max(_TILE // (num_pieces * len(u)), 1)
+    tiles = [slice(start, start + size) for start in range(0, max(num_lanes, 1), size)]
+    sampled = [_sampled(pieces.of(tile), gravity[tile], u) for tile in tiles]
     peaks = {}
-    for name, (orders, measure) in _MEASURES.items():
-        values = measure(gravity[:, None, None], *[motion[order] for order in orders])
-        piece, sample = np.divmod(_likeliest_peak(values), intervals + 1)
-        around, span = coeffs[:, lanes, piece], durations[lanes, piece]
-        centre, half = u[sample], 1.0 / intervals
-        for _ in range(3):
-            near = np.clip(centre[:, None] + half * np.linspace(-1.0, 1.0, 9), 0.0, 1.0)
-            found = measure(gravity[:, None], *motion_at(around, span, near, orders))
-            best = found.argmax(axis=1)
-            centre, half = near[lanes, best], half / 4.0
-        top = flat(values).argmax(axis=1)
-        peaks[name] = _greater(
-            (found[lanes, best], starts[lanes, piece] + centre * span),
-            (flat(values)[lanes, top], flat(times)[lanes, top]),
-        )
-    turn = _fastest_turn(motion[2], gravity, times, pieces.flown)
-    peaks["body rate"] = _greater(peaks["body rate"], turn)
+    for name in sampled[0]:
+        likeliest, *seen = map(np.concatenate, zip(*(tile[name] for tile in sampled), strict=True))
+        searched = _searched(name, pieces, gravity, likeliest, u)
+        peaks[name] = _greater(searched, seen)
     return peaks
 
 
-def _greater(first: tuple, second: tuple) -> tuple[np.ndarray, np.ndarray]:
+def _sampled(pieces: Pieces, gravity: np.ndarray, u: np.ndarray) -> dict[str, tuple]:
+    """What the samples show of every measure.
+
+    Index (B,) of the sample next to the likeliest peak; the greatest value (B,) of a sample,
+    for the body rate that of `_fastest_turn` too, and its time (B,) [s].
+    """
+    motion = motion_at(pieces.coeffs, pieces.durations, u, range(4))
+    gravity = gravity[:, None, None]
+    lanes = np.arange(len(gravity))
+    sampled = {}
+    for name, (orders, measure) in _MEASURES.items():
+        values = measure(gravity, *[motion[order] for order in orders])
+        top = flat(values).argmax(axis=1)
+        seen = flat(values)[lanes, top], _time(pieces, top, u)
+        if name == "body rate":
+            seen = _greater(seen, _fastest_turn(motion[2], gravity, pieces, u))
+        sampled[name] = _likeliest_peak(values), *seen
+    return sampled
+
+
+def _time(pieces: Pieces, index: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Time (B,) [s] of one sample a lane, counted through all of its pieces."""
+    piece, sample = np.divmod(index, len(u))
+    lanes = np.arange(len(index))
+    return pieces.starts[lanes, piece] + pieces.durations[lanes, piece] * u[sample]
+
+
+def _searched(name: str, pieces: Pieces, gravity, likeliest, u: np.ndarray) -> tuple:
+    """Greatest value (B,) of a measure up to one sample away from a sample a lane; its time."""
+    orders, measure = _MEASURES[name]
+    piece, sample = np.divmod(likeliest, len(u))
+    lanes = np.arange(len(piece))
+    coeffs = np.ascontiguousarray(pieces.coeffs[:, lanes, piece].transpose(2, 0, 1))[:, :, None]
+    span = pieces.durations[lanes, piece]
+    centre, half = u[sample], u[1]
+    for _ in range(3):
+        near = np.clip(centre + half * np.linspace(-1.0, 1.0, 9)[:, None], 0.0, 1.0)
+        found = measure(gravity, *[_derivative(coeffs, near * span, order) for order in orders])
+        best = found.argmax(axis=0)
+        centre, half = near[best, lanes], half / 4.0
+    return found[best, lanes], pieces.starts[lanes, piece] + centre * span
+
+
+def _greater(first, second) -> tuple[np.ndarray, np.ndarray]:
     """The greater of two values, lane by lane, with its time."""
     better = second[0] > first[0]
     return np.where(better, second[0], first[0]), np.where(better, second[1], first[1])
 
 
-def _fastest_turn(acc, gravity, times, flown) -> tuple[np.ndarray, np.ndarray]:
+def _fastest_turn(acc, gravity, pieces: Pieces, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Squared body rate (B,) that turns the thrust from one sample to the next; its time.
 
     The mean over a step, so never above the true maximum. It is what betrays a thrust that
     passes through zero between two samples and turns the quadrotor over at once.
     """
-    tau_x, tau_y, tau_z = acc[0], acc[1], acc[2] + gravity[:, None, None]
-    size = np.sqrt(tau_x**2 + tau_y**2 + tau_z**2)
-    along = tau_x[..., 1:] * tau_x[..., :-1] + tau_y[..., 1:] * tau_y[..., :-1]
-    cosine = (along + tau_z[..., 1:] * tau_z[..., :-1]) / (size[..., 1:] * size[..., :-1])
-    sharpest = np.where(np.isnan(cosine), 1.0, cosine).min(axis=2)
-    step = np.maximum(times[..., 1] - times[..., 0], np.finfo(float).tiny)
-    rate = np.where(flown, np.arccos(np.clip(sharpest, -1.0, 1.0)) / step, 0.0)
+    tau = acc.reshape(3, -1).copy()
+    tau[2] += np.broadcast_to(gravity, acc.shape[1:]).ravel()
+    size = np.sqrt(squared(tau))
+    along = tau[:, 1:] * tau[:, :-1]
+    cosine = np.ones(acc.shape[1:])
+    cosine.ravel()[:-1] = (along[0] + along[1] + along[2]) / (size[1:] * size[:-1])
+    cosine[..., -1] = 1.0  # the next sample belongs to another piece
+    sharpest = np.fmin.reduce(cosine, axis=2)
+    step = np.maximum(pieces.durations * (u[1] - u[0]), np.finfo(float).tiny)
+    rate = np.where(pieces.flown, np.arccos(np.clip(sharpest, -1.0, 1.0)) / step, 0.0)
     piece, lanes = rate.argmax(axis=1), np.arange(len(rate))
     sample = cosine[lanes, piece].argmin(axis=1)
-    return rate[lanes, piece] ** 2, times[lanes, piece, sample]
+    return rate[lanes, piece] ** 2, _time(pieces, piece * len(u) + sample, u)
 
 
 def joint_errors(pieces: Pieces, head_state: np.ndarray) -> tuple:
