@@ -21,8 +21,12 @@ SMALLEST_LIMIT = 1e-3
 SHORTEST_PIECE = 0.1
 # Fewest intervals between the samples of one piece.
 _FEWEST_INTERVALS = 16
-# Samples taken at once: a dozen arrays of so many float64 stay in the cache of a core.
-_TILE = 12_000
+# Multiplications of one matrix product that samples lanes, and lanes whose peaks are searched at
+# once: many to a call of NumPy, and few enough for the cache. Up to 2^18 of them OpenBLAS starts
+# no threads of its own, which would get in the way of those here.
+_PRODUCT, _SEARCHED = 250_000, 1024
+# Fewest lanes that are worth a thread.
+_FEWEST_LANES = 256
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,24 +98,33 @@ def checked_coeffs(value) -> np.ndarray:
     return coeffs
 
 
+def _cut(num_lanes: int, size: int) -> list[slice]:
+    """Runs of so many lanes; one of no lanes if there are none."""
+    return [slice(start, start + size) for start in range(0, max(num_lanes, 1), size)]
+
+
 def judge_in_chunks(
     judge: Callable[[dict], dict], leaves: dict[str, np.ndarray], chunk: int
 ) -> dict[str, np.ndarray]:
-    """The fields of a verdict from leaves with leading axis B, `chunk` lanes a thread at once."""
+    """The fields of a verdict from leaves with leading axis B, up to `chunk` lanes at once.
 
-    def judged(start: int) -> dict[str, np.ndarray]:
-        lanes = slice(start, start + chunk)
+    The lanes are shared among threads, one for each core: NumPy lets go of the interpreter
+    inside its loops.
+    """
+    num_lanes, cores = len(leaves["durations"]), os.cpu_count() or 1
+    size = min(chunk, max(math.ceil(num_lanes / cores), _FEWEST_LANES))
+
+    def judged(lanes: slice) -> dict[str, np.ndarray]:
         # A broken or absurd lane may overflow; its verdict says so, not a warning.
         with np.errstate(all="ignore"):
             return judge({name: leaf[lanes].astype(np.float64) for name, leaf in leaves.items()})
 
-    starts = range(0, max(len(leaves["durations"]), 1), chunk)
-    threads = min(len(starts), os.cpu_count() or 1)
-    if threads == 1:
-        parts = [judged(start) for start in starts]
+    chunks = _cut(num_lanes, size)
+    if min(len(chunks), cores) == 1:
+        parts = [judged(lanes) for lanes in chunks]
     else:
-        with ThreadPoolExecutor(threads) as pool:
-            parts = list(pool.map(judged, starts))
+        with ThreadPoolExecutor(cores) as pool:
+            parts = list(pool.map(judged, chunks))
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
@@ -173,17 +186,23 @@ def above(value, limit, tolerance: float, time) -> tuple:
     return excess > tolerance, excess, time
 
 
-def motion_at(coeffs: np.ndarray, durations: np.ndarray, u: np.ndarray, orders) -> list:
-    """Derivatives of polynomial pieces at the same fractions u of their durations.
+def derivative(coeffs: np.ndarray, times: np.ndarray, order: int) -> np.ndarray:
+    """A derivative (3, ...) of polynomials (D + 1, 3, ...) at times (...) since they began."""
+    value = np.zeros(np.broadcast_shapes(coeffs.shape[1:], times.shape))
+    for k in range(len(coeffs) - 1, order - 1, -1):
+        value *= times
+        value += math.perm(k, order) * coeffs[k]
+    return value
 
-    coeffs (3, B, M, D + 1), durations (B, M), u (S,): one (3, B, M, S) an order.
-    """
-    num = coeffs.shape[-1]
+
+def _motion(pieces: Pieces, u: np.ndarray) -> list:
+    """Derivatives (3, B, M, S) of order 0 to 3 at the same fractions u (S,) of all pieces."""
+    durations, num = pieces.durations, pieces.coeffs.shape[-1]
     spans = np.vander(durations.ravel(), num, increasing=True)
     powers = np.vander(u, num, increasing=True).T
-    coeffs = coeffs.reshape(3, len(spans), num)
+    coeffs = pieces.coeffs.reshape(3, len(spans), num)
     out = []
-    for order in orders:
+    for order in range(4):
         factors = np.array([math.perm(k, order) for k in range(order, num)], float)
         left = max(num - order, 0)
         values = (coeffs[..., order:] * (factors * spans[:, :left])) @ powers[:left]
@@ -191,16 +210,7 @@ def motion_at(coeffs: np.ndarray, durations: np.ndarray, u: np.ndarray, orders) 
     return out
 
 
-def _derivative(coeffs: np.ndarray, times: np.ndarray, order: int) -> np.ndarray:
-    """A derivative (3, S, B) of one piece a lane, at times (S, B); coeffs (D + 1, 3, 1, B)."""
-    value = np.zeros((3, *times.shape))
-    for k in range(len(coeffs) - 1, order - 1, -1):
-        value *= times
-        value += math.perm(k, order) * coeffs[k]
-    return value
-
-
-def squared(vector: np.ndarray) -> np.ndarray:
+def _squared(vector: np.ndarray) -> np.ndarray:
     """Squared length of vectors (3, ...)."""
     return vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2
 
@@ -229,8 +239,8 @@ def _body_rate_squared(gravity, acc: np.ndarray, jerk: np.ndarray) -> np.ndarray
 
 # Name -> orders of the derivatives it needs, and the measure whose maximum is sought.
 _MEASURES = {
-    "speed": ((1,), lambda gravity, vel: squared(vel)),
-    "acceleration": ((2,), lambda gravity, acc: squared(acc)),
+    "speed": ((1,), lambda gravity, vel: _squared(vel)),
+    "acceleration": ((2,), lambda gravity, acc: _squared(acc)),
     "body rate": ((2, 3), _body_rate_squared),
     "depth": ((0,), lambda gravity, pos: -pos[2]),
     "thrust": ((2,), _thrust_squared),
@@ -238,17 +248,22 @@ _MEASURES = {
 }
 
 
-def _likeliest_peak(values: np.ndarray) -> np.ndarray:
-    """Index (B,) next to the greatest parabola through three samples (B, M, S) of a piece."""
-    line = values.ravel()
+def _tops(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What samples (N, M, S) of M pieces show; they are overwritten.
+
+    Index (N,) of the greatest one among the M S, its value, and the index next to the greatest
+    parabola through three samples of a piece.
+    """
+    line, rows = values.ravel(), flat(values)
+    top = rows.argmax(axis=1)
+    greatest = rows[np.arange(len(rows)), top]
     crest = np.zeros(values.shape, bool)
     crest.ravel()[1:-1] = (line[1:-1] >= line[:-2]) & (line[1:-1] > line[2:])
     crest[..., 0] = crest[..., -1] = False  # their neighbour belongs to another piece
     peak = np.flatnonzero(crest)
     left, middle, right = line[peak - 1], line[peak], line[peak + 1]
-    vertex = line.copy()
-    vertex[peak] += (right - left) ** 2 / (8.0 * (2.0 * middle - left - right))
-    return flat(vertex.reshape(values.shape)).argmax(axis=1)
+    line[peak] += (right - left) ** 2 / (8.0 * (2.0 * middle - left - right))
+    return top, greatest, rows.argmax(axis=1)
 
 
 def flat(values: np.ndarray) -> np.ndarray:
@@ -265,36 +280,43 @@ def peaks(
     three samples is then searched on the polynomial itself, so that what is found is reached.
     """
     u = np.linspace(0.0, 1.0, intervals + 1)
+    parts = [_peaks(pieces.of(lanes), gravity[lanes], u) for lanes in _cut(len(gravity), _SEARCHED)]
+    return {
+        name: tuple(np.concatenate(found) for found in zip(*(p[name] for p in parts), strict=True))
+        for name in _MEASURES
+    }
+
+
+def _peaks(pieces: Pieces, gravity: np.ndarray, u: np.ndarray) -> dict[str, tuple]:
+    """`peaks` of as many lanes as are searched at once; the samples are at fractions u (S,)."""
     num_lanes, num_pieces = pieces.durations.shape
-    size = max(_TILE // (num_pieces * len(u)), 1)
-    tiles = [slice(start, start + size) for start in range(0, max(num_lanes, 1), size)]
+    products = num_pieces * pieces.coeffs.shape[-1] * len(u)
+    tiles = _cut(num_lanes, max(_PRODUCT // products, 1))
     sampled = [_sampled(pieces.of(tile), gravity[tile], u) for tile in tiles]
-    peaks = {}
-    for name in sampled[0]:
-        likeliest, *seen = map(np.concatenate, zip(*(tile[name] for tile in sampled), strict=True))
-        searched = _searched(name, pieces, gravity, likeliest, u)
-        peaks[name] = _greater(searched, seen)
+    top, greatest, likeliest, sharpest, turn = (
+        np.concatenate(parts, axis=-1) for parts in zip(*sampled, strict=True)
+    )
+    peaks = {
+        name: _greater(
+            _searched(name, pieces, gravity, likeliest[i], u),
+            (greatest[i], _time(pieces, top[i], u)),
+        )
+        for i, name in enumerate(_MEASURES)
+    }
+    peaks["body rate"] = _greater(peaks["body rate"], (turn, _time(pieces, sharpest, u)))
     return peaks
 
 
-def _sampled(pieces: Pieces, gravity: np.ndarray, u: np.ndarray) -> dict[str, tuple]:
-    """What the samples show of every measure.
-
-    Index (B,) of the sample next to the likeliest peak; the greatest value (B,) of a sample,
-    for the body rate that of `_fastest_turn` too, and its time (B,) [s].
-    """
-    motion = motion_at(pieces.coeffs, pieces.durations, u, range(4))
+def _sampled(pieces: Pieces, gravity: np.ndarray, u: np.ndarray) -> tuple:
+    """What the samples show: `_tops` of every measure, (6, B), and `_fastest_turn`, (B,)."""
+    motion = _motion(pieces, u)
     gravity = gravity[:, None, None]
-    lanes = np.arange(len(gravity))
-    sampled = {}
-    for name, (orders, measure) in _MEASURES.items():
-        values = measure(gravity, *[motion[order] for order in orders])
-        top = flat(values).argmax(axis=1)
-        seen = flat(values)[lanes, top], _time(pieces, top, u)
-        if name == "body rate":
-            seen = _greater(seen, _fastest_turn(motion[2], gravity, pieces, u))
-        sampled[name] = _likeliest_peak(values), *seen
-    return sampled
+    values = np.empty((len(_MEASURES), *motion[0].shape[1:]))
+    for i, (orders, measure) in enumerate(_MEASURES.values()):
+        values[i] = measure(gravity, *[motion[order] for order in orders])
+    tops = _tops(values.reshape(-1, *values.shape[2:]))
+    turn = _fastest_turn(motion[2], gravity, pieces, u)
+    return *(found.reshape(values.shape[:2]) for found in tops), *turn
 
 
 def _time(pieces: Pieces, index: np.ndarray, u: np.ndarray) -> np.ndarray:
@@ -314,27 +336,28 @@ def _searched(name: str, pieces: Pieces, gravity, likeliest, u: np.ndarray) -> t
     centre, half = u[sample], u[1]
     for _ in range(3):
         near = np.clip(centre + half * np.linspace(-1.0, 1.0, 9)[:, None], 0.0, 1.0)
-        found = measure(gravity, *[_derivative(coeffs, near * span, order) for order in orders])
+        found = measure(gravity, *[derivative(coeffs, near * span, order) for order in orders])
         best = found.argmax(axis=0)
         centre, half = near[best, lanes], half / 4.0
     return found[best, lanes], pieces.starts[lanes, piece] + centre * span
 
 
-def _greater(first, second) -> tuple[np.ndarray, np.ndarray]:
+def _greater(first: tuple, second: tuple) -> tuple[np.ndarray, np.ndarray]:
     """The greater of two values, lane by lane, with its time."""
     better = second[0] > first[0]
     return np.where(better, second[0], first[0]), np.where(better, second[1], first[1])
 
 
 def _fastest_turn(acc, gravity, pieces: Pieces, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Squared body rate (B,) that turns the thrust from one sample to the next; its time.
+    """Sample (B,) before the fastest turn of the thrust to the next sample; squared body rate.
 
     The mean over a step, so never above the true maximum. It is what betrays a thrust that
     passes through zero between two samples and turns the quadrotor over at once.
     """
-    tau = acc.reshape(3, -1).copy()
-    tau[2] += np.broadcast_to(gravity, acc.shape[1:]).ravel()
-    size = np.sqrt(squared(tau))
+    tau = acc.copy()
+    tau[2] += gravity
+    tau = tau.reshape(3, -1)
+    size = np.sqrt(_squared(tau))
     along = tau[:, 1:] * tau[:, :-1]
     cosine = np.ones(acc.shape[1:])
     cosine.ravel()[:-1] = (along[0] + along[1] + along[2]) / (size[1:] * size[:-1])
@@ -344,7 +367,7 @@ def _fastest_turn(acc, gravity, pieces: Pieces, u: np.ndarray) -> tuple[np.ndarr
     rate = np.where(pieces.flown, np.arccos(np.clip(sharpest, -1.0, 1.0)) / step, 0.0)
     piece, lanes = rate.argmax(axis=1), np.arange(len(rate))
     sample = cosine[lanes, piece].argmin(axis=1)
-    return rate[lanes, piece] ** 2, _time(pieces, piece * len(u) + sample, u)
+    return piece * len(u) + sample, rate[lanes, piece] ** 2
 
 
 def joint_errors(pieces: Pieces, head_state: np.ndarray) -> tuple:
@@ -359,17 +382,21 @@ def joint_errors(pieces: Pieces, head_state: np.ndarray) -> tuple:
         head_state: (B, 4, 3) position to jerk at time 0.
     """
     durations, flown = pieces.durations, pieces.flown
-    ends = np.stack(motion_at(pieces.coeffs, durations, np.array([0.0, 1.0]), range(4)))
+    coeffs = np.moveaxis(pieces.coeffs, -1, 0)
+    starts, ends = (
+        np.stack([derivative(coeffs, times, order) for order in range(4)])
+        for times in (np.zeros_like(durations), durations)
+    )
     total = np.where(flown, durations, 0.0).sum(axis=1)
     period = np.maximum(total / np.maximum(flown.sum(axis=1), 1), SHORTEST_PIECE)
     weights = np.stack([period**n / math.factorial(n) for n in range(4)])
     head = np.moveaxis(head_state, 0, -1)
-    head_error = np.linalg.norm(ends[..., 0, 0] - head, axis=1) * weights
-    jumps = np.linalg.norm(ends[..., 1:, 0] - ends[..., :-1, 1], axis=1)
+    head_error = np.linalg.norm(starts[..., 0] - head, axis=1) * weights
+    jumps = np.linalg.norm(starts[..., 1:] - ends[..., :-1], axis=1)
     jump = np.zeros_like(durations)
     jump[:, 1:] = np.where(flown[:, 1:], (jumps * weights[:, :, None]).max(axis=0), 0.0)
     worst = jump.argmax(axis=1)
-    scale = np.maximum(np.abs(ends[0]).max(axis=(0, 2, 3)), 1.0)
+    scale = np.maximum(np.abs([starts[0], ends[0]]).max(axis=(0, 1, 3)), 1.0)
     lanes = np.arange(len(worst))
     return head_error.max(axis=0), jump.max(axis=1), pieces.starts[lanes, worst], scale
 
