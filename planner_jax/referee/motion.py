@@ -271,9 +271,7 @@ def flat(values: np.ndarray) -> np.ndarray:
     return values.reshape(len(values), math.prod(values.shape[1:]))
 
 
-def peaks(
-    pieces: Pieces, gravity: np.ndarray, intervals: int
-) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def peaks(pieces: Pieces, gravity: np.ndarray, intervals: int) -> dict[str, tuple]:
     """Greatest value (B,) of every measure along the trajectory, and its time (B,) [s].
 
     Every piece is sampled at both ends and inside; the likeliest peak by parabolas through
@@ -282,7 +280,9 @@ def peaks(
     u = np.linspace(0.0, 1.0, intervals + 1)
     parts = [_peaks(pieces.of(lanes), gravity[lanes], u) for lanes in _cut(len(gravity), _SEARCHED)]
     return {
-        name: tuple(np.concatenate(found) for found in zip(*(p[name] for p in parts), strict=True))
+        name: tuple(
+            np.concatenate(found) for found in zip(*(part[name] for part in parts), strict=True)
+        )
         for name in _MEASURES
     }
 
