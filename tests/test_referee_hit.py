@@ -478,6 +478,16 @@ def test_batch_equals_loop(chunk, drag_after_impact):
     assert len(set(batch.failed_limit)) >= (2 if drag_after_impact else 4)
 
 
+def test_many_lanes_on_several_threads_are_judged_as_a_few():
+    broken = volley()
+    broken["coeffs"] = np.full_like(broken["coeffs"], 1e300)
+    few = stack(*unequal_lanes(), broken)
+    many = {name: np.concatenate([leaf] * 400) for name, leaf in few.items()}
+    verdict = judge(few)
+    repeated = {name: np.concatenate([leaf] * 400) for name, leaf in vars(verdict).items()}
+    assert_same(HitVerdict(**repeated), judge(many))
+
+
 @pytest.mark.parametrize("drag_after_impact", [False, True])
 @pytest.mark.parametrize("name", sorted(volley()))
 def test_a_nan_fails_its_own_lane_and_no_other(name, drag_after_impact):

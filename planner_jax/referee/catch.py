@@ -23,13 +23,13 @@ from planner_jax.referee.motion import (
     check_sampling,
     checked_coeffs,
     checked_leaf,
+    derivative,
     failure_sentence,
     finite_lanes,
     first_failures,
     intervals_of,
     judge_in_chunks,
     judge_motion,
-    motion_at,
     pieces_of,
 )
 
@@ -112,7 +112,7 @@ def referee_catches(
     contact_tolerance: float = 5e-3,
     continuity_tolerance: float = 1e-4,
     samples: int = 400,
-    chunk: int = 512,
+    chunk: int = 2048,
 ) -> CatchVerdict:
     """The verdict on every plan of a batch.
 
@@ -147,7 +147,7 @@ def referee_catches(
         continuity_tolerance: times the largest coordinate [m] at the piece ends (at least
             1 m), allowed displacement of head state and joints.
         samples: fewest samples between one catch and the next, >= 200.
-        chunk: lanes judged at once; it bounds the memory.
+        chunk: most lanes that a thread judges at once; it bounds the memory.
 
     Returns:
         A `CatchVerdict` of float64 arrays. A lane that is not finite fails as "not finite" and
@@ -387,11 +387,9 @@ def _judge_catches(case, pieces, held, ends, net_test: str, tolerances: dict) ->
     """What happens at the catches, and the tests of it: name -> failed, excess, time (B, N)."""
     num = held.shape[1]
     each = pieces.durations.shape[1] // num
-    tail = pieces.coeffs[:, :, each - 1 :: each], pieces.durations[:, each - 1 :: each]
-    pos, _, acc = (
-        np.moveaxis(derivative[..., 0], 0, -1)
-        for derivative in motion_at(*tail, np.ones(1), range(3))
-    )
+    tail = np.moveaxis(pieces.coeffs[:, :, each - 1 :: each], -1, 0)
+    spans = pieces.durations[:, each - 1 :: each]
+    pos, acc = (np.moveaxis(derivative(tail, spans, order), 0, -1) for order in (0, 2))
     thrust = acc + case["gravity"][:, None, None] * [0.0, 0.0, 1.0]
     size = np.linalg.norm(thrust, axis=-1, keepdims=True)
     # Without thrust there is no axis: z_d stays zero, and the angle is the worst there is.

@@ -7,7 +7,9 @@ units.
 
 import dataclasses
 import math
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
@@ -19,6 +21,12 @@ SMALLEST_LIMIT = 1e-3
 SHORTEST_PIECE = 0.1
 # Fewest intervals between the samples of one piece.
 _FEWEST_INTERVALS = 16
+# Multiplications of one matrix product that samples lanes, and lanes whose peaks are searched at
+# once: many to a call of NumPy, and few enough for the cache. Up to 2^18 of them OpenBLAS starts
+# no threads of its own, which would get in the way of those here.
+_PRODUCT, _SEARCHED = 250_000, 1024
+# Fewest lanes that are worth a thread.
+_FEWEST_LANES = 256
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,6 +40,11 @@ class Pieces:
     durations: np.ndarray  # (B, M) [s]
     starts: np.ndarray  # (B, M) [s]
     flown: np.ndarray  # (B, M) bool
+
+    def of(self, lanes: slice) -> "Pieces":
+        """The pieces of some lanes."""
+        rest = (part[lanes] for part in (self.durations, self.starts, self.flown))
+        return Pieces(self.coeffs[:, lanes], *rest)
 
 
 def pieces_of(coeffs: np.ndarray, durations: np.ndarray, flown: np.ndarray | None = None) -> Pieces:
@@ -85,23 +98,33 @@ def checked_coeffs(value) -> np.ndarray:
     return coeffs
 
 
+def _cut(num_lanes: int, size: int) -> list[slice]:
+    """Runs of so many lanes; one of no lanes if there are none."""
+    return [slice(start, start + size) for start in range(0, max(num_lanes, 1), size)]
+
+
 def judge_in_chunks(
     judge: Callable[[dict], dict], leaves: dict[str, np.ndarray], chunk: int
 ) -> dict[str, np.ndarray]:
-    """The fields of a verdict from leaves with leading axis B, `chunk` lanes at once."""
-    num_lanes = len(leaves["durations"])
-    parts = []
-    # A broken or absurd lane may overflow; its verdict says so, not a warning.
-    with np.errstate(all="ignore"):
-        for start in range(0, max(num_lanes, 1), chunk):
-            parts.append(
-                judge(
-                    {
-                        name: leaf[start : start + chunk].astype(np.float64)
-                        for name, leaf in leaves.items()
-                    }
-                )
-            )
+    """The fields of a verdict from leaves with leading axis B, up to `chunk` lanes at once.
+
+    The lanes are shared among threads, one for each core: NumPy lets go of the interpreter
+    inside its loops.
+    """
+    num_lanes, cores = len(leaves["durations"]), os.cpu_count() or 1
+    size = min(chunk, max(math.ceil(num_lanes / cores), _FEWEST_LANES))
+
+    def judged(lanes: slice) -> dict[str, np.ndarray]:
+        # A broken or absurd lane may overflow; its verdict says so, not a warning.
+        with np.errstate(all="ignore"):
+            return judge({name: leaf[lanes].astype(np.float64) for name, leaf in leaves.items()})
+
+    chunks = _cut(num_lanes, size)
+    if min(len(chunks), cores) == 1:
+        parts = [judged(lanes) for lanes in chunks]
+    else:
+        with ThreadPoolExecutor(cores) as pool:
+            parts = list(pool.map(judged, chunks))
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
@@ -163,18 +186,27 @@ def above(value, limit, tolerance: float, time) -> tuple:
     return excess > tolerance, excess, time
 
 
-def motion_at(coeffs: np.ndarray, durations: np.ndarray, u: np.ndarray, orders) -> list:
-    """Derivatives of polynomial pieces at the fractions u of their durations.
+def derivative(coeffs: np.ndarray, times: np.ndarray, order: int) -> np.ndarray:
+    """A derivative (3, ...) of polynomials (D + 1, 3, ...) at times (...) since they began."""
+    value = np.zeros(np.broadcast_shapes(coeffs.shape[1:], times.shape))
+    for k in range(len(coeffs) - 1, order - 1, -1):
+        value *= times
+        value += math.perm(k, order) * coeffs[k]
+    return value
 
-    coeffs (3, ..., D + 1), durations (...), u (S,) or (..., S): one (3, ..., S) an order.
-    """
+
+def _motion(pieces: Pieces, u: np.ndarray) -> list:
+    """Derivatives (3, B, M, S) of order 0 to 3 at the same fractions u (S,) of all pieces."""
+    durations, num = pieces.durations, pieces.coeffs.shape[-1]
+    spans = np.vander(durations.ravel(), num, increasing=True)
+    powers = np.vander(u, num, increasing=True).T
+    coeffs = pieces.coeffs.reshape(3, len(spans), num)
     out = []
-    for order in orders:
-        powers = np.arange(coeffs.shape[-1] - order)
-        factors = np.array([math.perm(int(k) + order, order) for k in powers], float)
-        scaled = coeffs[..., order:] * factors * durations[..., None] ** powers
-        # Not a matrix product: threads of a BLAS on a busy machine cost more than they save.
-        out.append(np.einsum("...k,...ks->...s", scaled, u[..., None, :] ** powers[:, None]))
+    for order in range(4):
+        factors = np.array([math.perm(k, order) for k in range(order, num)], float)
+        left = max(num - order, 0)
+        values = (coeffs[..., order:] * (factors * spans[:, :left])) @ powers[:left]
+        out.append(values.reshape(3, *durations.shape, len(u)))
     return out
 
 
@@ -216,14 +248,22 @@ _MEASURES = {
 }
 
 
-def _likeliest_peak(values: np.ndarray) -> np.ndarray:
-    """Index (B,) next to the greatest parabola through three samples (B, M, S) of a piece."""
-    left, middle, right = values[..., :-2], values[..., 1:-1], values[..., 2:]
-    crest = (middle >= left) & (middle > right)
-    gain = (right - left) ** 2 / (8.0 * (2.0 * middle - left - right))
-    vertex = values.copy()
-    vertex[..., 1:-1] += np.where(crest, gain, 0.0)
-    return flat(vertex).argmax(axis=1)
+def _tops(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What samples (N, M, S) of M pieces show; they are overwritten.
+
+    Index (N,) of the greatest one among the M S, its value, and the index next to the greatest
+    parabola through three samples of a piece.
+    """
+    line, rows = values.ravel(), flat(values)
+    top = rows.argmax(axis=1)
+    greatest = rows[np.arange(len(rows)), top]
+    crest = np.zeros(values.shape, bool)
+    crest.ravel()[1:-1] = (line[1:-1] >= line[:-2]) & (line[1:-1] > line[2:])
+    crest[..., 0] = crest[..., -1] = False  # their neighbour belongs to another piece
+    peak = np.flatnonzero(crest)
+    left, middle, right = line[peak - 1], line[peak], line[peak + 1]
+    line[peak] += (right - left) ** 2 / (8.0 * (2.0 * middle - left - right))
+    return top, greatest, rows.argmax(axis=1)
 
 
 def flat(values: np.ndarray) -> np.ndarray:
@@ -231,38 +271,75 @@ def flat(values: np.ndarray) -> np.ndarray:
     return values.reshape(len(values), math.prod(values.shape[1:]))
 
 
-def peaks(
-    pieces: Pieces, gravity: np.ndarray, intervals: int
-) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def peaks(pieces: Pieces, gravity: np.ndarray, intervals: int) -> dict[str, tuple]:
     """Greatest value (B,) of every measure along the trajectory, and its time (B,) [s].
 
     Every piece is sampled at both ends and inside; the likeliest peak by parabolas through
     three samples is then searched on the polynomial itself, so that what is found is reached.
     """
-    coeffs, durations, starts = pieces.coeffs, pieces.durations, pieces.starts
     u = np.linspace(0.0, 1.0, intervals + 1)
-    motion = motion_at(coeffs, durations, u, range(4))
-    lanes = np.arange(len(durations))
-    times = starts[:, :, None] + durations[:, :, None] * u
-    peaks = {}
-    for name, (orders, measure) in _MEASURES.items():
-        values = measure(gravity[:, None, None], *[motion[order] for order in orders])
-        piece, sample = np.divmod(_likeliest_peak(values), intervals + 1)
-        around, span = coeffs[:, lanes, piece], durations[lanes, piece]
-        centre, half = u[sample], 1.0 / intervals
-        for _ in range(3):
-            near = np.clip(centre[:, None] + half * np.linspace(-1.0, 1.0, 9), 0.0, 1.0)
-            found = measure(gravity[:, None], *motion_at(around, span, near, orders))
-            best = found.argmax(axis=1)
-            centre, half = near[lanes, best], half / 4.0
-        top = flat(values).argmax(axis=1)
-        peaks[name] = _greater(
-            (found[lanes, best], starts[lanes, piece] + centre * span),
-            (flat(values)[lanes, top], flat(times)[lanes, top]),
+    parts = [_peaks(pieces.of(lanes), gravity[lanes], u) for lanes in _cut(len(gravity), _SEARCHED)]
+    return {
+        name: tuple(
+            np.concatenate(found) for found in zip(*(part[name] for part in parts), strict=True)
         )
-    turn = _fastest_turn(motion[2], gravity, times, pieces.flown)
-    peaks["body rate"] = _greater(peaks["body rate"], turn)
+        for name in _MEASURES
+    }
+
+
+def _peaks(pieces: Pieces, gravity: np.ndarray, u: np.ndarray) -> dict[str, tuple]:
+    """`peaks` of as many lanes as are searched at once; the samples are at fractions u (S,)."""
+    num_lanes, num_pieces = pieces.durations.shape
+    products = num_pieces * pieces.coeffs.shape[-1] * len(u)
+    tiles = _cut(num_lanes, max(_PRODUCT // products, 1))
+    sampled = [_sampled(pieces.of(tile), gravity[tile], u) for tile in tiles]
+    top, greatest, likeliest, sharpest, turn = (
+        np.concatenate(parts, axis=-1) for parts in zip(*sampled, strict=True)
+    )
+    peaks = {
+        name: _greater(
+            _searched(name, pieces, gravity, likeliest[i], u),
+            (greatest[i], _time(pieces, top[i], u)),
+        )
+        for i, name in enumerate(_MEASURES)
+    }
+    peaks["body rate"] = _greater(peaks["body rate"], (turn, _time(pieces, sharpest, u)))
     return peaks
+
+
+def _sampled(pieces: Pieces, gravity: np.ndarray, u: np.ndarray) -> tuple:
+    """What the samples show: `_tops` of every measure, (6, B), and `_fastest_turn`, (B,)."""
+    motion = _motion(pieces, u)
+    gravity = gravity[:, None, None]
+    values = np.empty((len(_MEASURES), *motion[0].shape[1:]))
+    for i, (orders, measure) in enumerate(_MEASURES.values()):
+        values[i] = measure(gravity, *[motion[order] for order in orders])
+    tops = _tops(values.reshape(-1, *values.shape[2:]))
+    turn = _fastest_turn(motion[2], gravity, pieces, u)
+    return *(found.reshape(values.shape[:2]) for found in tops), *turn
+
+
+def _time(pieces: Pieces, index: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Time (B,) [s] of one sample a lane, counted through all of its pieces."""
+    piece, sample = np.divmod(index, len(u))
+    lanes = np.arange(len(index))
+    return pieces.starts[lanes, piece] + pieces.durations[lanes, piece] * u[sample]
+
+
+def _searched(name: str, pieces: Pieces, gravity, likeliest, u: np.ndarray) -> tuple:
+    """Greatest value (B,) of a measure up to one sample away from a sample a lane; its time."""
+    orders, measure = _MEASURES[name]
+    piece, sample = np.divmod(likeliest, len(u))
+    lanes = np.arange(len(piece))
+    coeffs = np.ascontiguousarray(pieces.coeffs[:, lanes, piece].transpose(2, 0, 1))[:, :, None]
+    span = pieces.durations[lanes, piece]
+    centre, half = u[sample], u[1]
+    for _ in range(3):
+        near = np.clip(centre + half * np.linspace(-1.0, 1.0, 9)[:, None], 0.0, 1.0)
+        found = measure(gravity, *[derivative(coeffs, near * span, order) for order in orders])
+        best = found.argmax(axis=0)
+        centre, half = near[best, lanes], half / 4.0
+    return found[best, lanes], pieces.starts[lanes, piece] + centre * span
 
 
 def _greater(first: tuple, second: tuple) -> tuple[np.ndarray, np.ndarray]:
@@ -271,22 +348,26 @@ def _greater(first: tuple, second: tuple) -> tuple[np.ndarray, np.ndarray]:
     return np.where(better, second[0], first[0]), np.where(better, second[1], first[1])
 
 
-def _fastest_turn(acc, gravity, times, flown) -> tuple[np.ndarray, np.ndarray]:
-    """Squared body rate (B,) that turns the thrust from one sample to the next; its time.
+def _fastest_turn(acc, gravity, pieces: Pieces, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Sample (B,) before the fastest turn of the thrust to the next sample; squared body rate.
 
     The mean over a step, so never above the true maximum. It is what betrays a thrust that
     passes through zero between two samples and turns the quadrotor over at once.
     """
-    tau_x, tau_y, tau_z = acc[0], acc[1], acc[2] + gravity[:, None, None]
-    size = np.sqrt(tau_x**2 + tau_y**2 + tau_z**2)
-    along = tau_x[..., 1:] * tau_x[..., :-1] + tau_y[..., 1:] * tau_y[..., :-1]
-    cosine = (along + tau_z[..., 1:] * tau_z[..., :-1]) / (size[..., 1:] * size[..., :-1])
-    sharpest = np.where(np.isnan(cosine), 1.0, cosine).min(axis=2)
-    step = np.maximum(times[..., 1] - times[..., 0], np.finfo(float).tiny)
-    rate = np.where(flown, np.arccos(np.clip(sharpest, -1.0, 1.0)) / step, 0.0)
+    tau = acc.copy()
+    tau[2] += gravity
+    tau = tau.reshape(3, -1)
+    size = np.sqrt(_squared(tau))
+    along = tau[:, 1:] * tau[:, :-1]
+    cosine = np.ones(acc.shape[1:])
+    cosine.ravel()[:-1] = (along[0] + along[1] + along[2]) / (size[1:] * size[:-1])
+    cosine[..., -1] = 1.0  # the next sample belongs to another piece
+    sharpest = np.fmin.reduce(cosine, axis=2)
+    step = np.maximum(pieces.durations * (u[1] - u[0]), np.finfo(float).tiny)
+    rate = np.where(pieces.flown, np.arccos(np.clip(sharpest, -1.0, 1.0)) / step, 0.0)
     piece, lanes = rate.argmax(axis=1), np.arange(len(rate))
     sample = cosine[lanes, piece].argmin(axis=1)
-    return rate[lanes, piece] ** 2, times[lanes, piece, sample]
+    return piece * len(u) + sample, rate[lanes, piece] ** 2
 
 
 def joint_errors(pieces: Pieces, head_state: np.ndarray) -> tuple:
@@ -301,17 +382,21 @@ def joint_errors(pieces: Pieces, head_state: np.ndarray) -> tuple:
         head_state: (B, 4, 3) position to jerk at time 0.
     """
     durations, flown = pieces.durations, pieces.flown
-    ends = np.stack(motion_at(pieces.coeffs, durations, np.array([0.0, 1.0]), range(4)))
+    coeffs = np.moveaxis(pieces.coeffs, -1, 0)
+    starts, ends = (
+        np.stack([derivative(coeffs, times, order) for order in range(4)])
+        for times in (np.zeros_like(durations), durations)
+    )
     total = np.where(flown, durations, 0.0).sum(axis=1)
     period = np.maximum(total / np.maximum(flown.sum(axis=1), 1), SHORTEST_PIECE)
     weights = np.stack([period**n / math.factorial(n) for n in range(4)])
     head = np.moveaxis(head_state, 0, -1)
-    head_error = np.linalg.norm(ends[..., 0, 0] - head, axis=1) * weights
-    jumps = np.linalg.norm(ends[..., 1:, 0] - ends[..., :-1, 1], axis=1)
+    head_error = np.linalg.norm(starts[..., 0] - head, axis=1) * weights
+    jumps = np.linalg.norm(starts[..., 1:] - ends[..., :-1], axis=1)
     jump = np.zeros_like(durations)
     jump[:, 1:] = np.where(flown[:, 1:], (jumps * weights[:, :, None]).max(axis=0), 0.0)
     worst = jump.argmax(axis=1)
-    scale = np.maximum(np.abs(ends[0]).max(axis=(0, 2, 3)), 1.0)
+    scale = np.maximum(np.abs([starts[0], ends[0]]).max(axis=(0, 1, 3)), 1.0)
     lanes = np.arange(len(worst))
     return head_error.max(axis=0), jump.max(axis=1), pieces.starts[lanes, worst], scale
 
