@@ -72,6 +72,8 @@ _KERNELS: dict[str, tuple[Any, Kernel]] = {}
 def with_kernel(function: Callable, kernel: Kernel) -> Callable:
     """The function, for which `over_lanes` calls a kernel where the program is for CUDA.
 
+    Derivatives are those of the function.
+
     Args:
         function: of pytrees of arrays of ONE lane, to a pytree of arrays.
         kernel: the same on lanes. `jax.vmap` within a lane adds axes in front of some leaves.
@@ -84,7 +86,12 @@ def with_kernel(function: Callable, kernel: Kernel) -> Callable:
 
     named.__name__ = named.__qualname__ = name
     _KERNELS[name] = (None, kernel)
-    return jax.jit(named)
+    compiled = jax.jit(named)
+
+    # A derivative of the named function would bear its name, and be taken for it.
+    guarded = jax.custom_jvp(lambda *args: compiled(*args))
+    guarded.defjvp(lambda primals, tangents: jax.jvp(function, primals, tangents))
+    return guarded
 
 
 class _Lanes:

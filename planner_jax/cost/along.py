@@ -76,7 +76,7 @@ def _integral(along: Along) -> Callable:
     values_in_lanes = with_kernel(values, along_kernel(along, slopes=False))
 
     def slopes(columns: Array, durations: Array, parameters: Any) -> tuple[Array, ...]:
-        value: Any = lambda *of: values(*of, parameters)  # noqa: E731
+        value: Any = lambda c, h: values(c, h, parameters)  # noqa: E731
         penalties, pull_back, worst = jax.vjp(value, columns, durations, has_aux=True)
         return penalties, worst, *pull_back(jnp.ones_like(penalties))
 

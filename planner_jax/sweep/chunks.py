@@ -2,7 +2,8 @@
 
 import dataclasses
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ _MEASURED = {
     "warm_seconds": "planning of chunks in which nothing was compiled, scenarios to plans on the "
     "host: decisions, ball tables, guesses and all rounds. Where these were less than half a "
     "batch, the first chunk planned again",
-    "referee_seconds": "judging, without planning",
+    "referee_seconds": "judging, while the next chunk is planned",
     "wall_seconds": "all chunks of all sessions with drawing, checking and writing; without "
     "imports, merging and report",
 }
@@ -52,18 +53,25 @@ def plan_chunks(run: SweepRun, *, progress: bool) -> None:
     if progress:
         print(f"Writing {folder.path}; the first chunk compiles.", file=sys.stderr)
     look: dict[str, Any] = {"unit": " plans", "desc": source.settings.planner}
+    missing = [k for k in range(source.num_chunks) if not folder.part_record(k)]
     with tqdm(total=source.num, initial=done, disable=not progress, **look) as bar:
-        for chunk in range(source.num_chunks):
-            if folder.part_record(chunk):
-                continue
-            batch, record = _plan_chunk(run, chunk)
-            record["successes"] = int(np.sum(batch.verdict.success))
-            record["wall_seconds"] = watch.lap()
-            rows = rows_of(run.task.columns, batch, run.task.frame)
-            folder.write_part(chunk, rows, record)
+        for record in _in_pipeline(run, missing, watch):
             done, successes = done + record["num"], successes + record["successes"]
             bar.set_postfix_str(f"success {percent(successes, done)} %", refresh=False)
             bar.update(record["num"])
+
+
+def _in_pipeline(run: SweepRun, chunks: list[int], watch: Stopwatch) -> Iterator[dict[str, Any]]:
+    """The record of every chunk, one being judged and written while the next is planned."""
+    with ThreadPoolExecutor(1) as behind:
+        judged: Future | None = None
+        for chunk in chunks:
+            planned = _plan_chunk(run, chunk)
+            if judged is not None:
+                yield judged.result()
+            judged = behind.submit(_judge_chunk, run, chunk, planned, watch)
+        if judged is not None:
+            yield judged.result()
 
 
 def _progress(records: Iterable[dict[str, Any]]) -> tuple[int, int]:
@@ -74,23 +82,44 @@ def _progress(records: Iterable[dict[str, Any]]) -> tuple[int, int]:
     return done, successes
 
 
-def _plan_chunk(run: SweepRun, chunk: int) -> tuple[RefereedBatch, dict[str, Any]]:
-    """One chunk, and how long it took."""
+@dataclasses.dataclass(frozen=True)
+class _Planned:
+    """One chunk, not judged yet."""
+
+    cases: Any
+    scenarios: Any
+    plans: Any
+    record: dict[str, Any]  # how long it took
+
+
+def _plan_chunk(run: SweepRun, chunk: int) -> _Planned:
+    """The cases of one chunk and their plans."""
     source = run.source
     with CompileClock() as clock:
         cases = source.chunk(chunk)
         (scenarios, plans), seconds, warm = _timed_plan(run, cases.scenarios)
-        watch = Stopwatch()
-        verdict = run.task.judge(scenarios, plans, source.settings)
-        referee_seconds = watch.lap()
     record = {
         "num": len(cases),
         "plan_seconds": seconds,
         "warm": warm,
         "compile_seconds": clock.seconds,
-        "referee_seconds": referee_seconds,
     }
-    return RefereedBatch(cases, scenarios, plans, verdict), record
+    return _Planned(cases, scenarios, plans, record)
+
+
+def _judge_chunk(run: SweepRun, chunk: int, planned: _Planned, watch: Stopwatch) -> dict[str, Any]:
+    """Judge and write one chunk; its record, with the seconds since the one before."""
+    own = Stopwatch()
+    verdict = run.task.judge(planned.scenarios, planned.plans, run.source.settings)
+    record = {
+        **planned.record,
+        "referee_seconds": own.lap(),
+        "successes": int(np.sum(verdict.success)),
+        "wall_seconds": watch.lap(),
+    }
+    batch = RefereedBatch(planned.cases, planned.scenarios, planned.plans, verdict)
+    run.folder.write_part(chunk, rows_of(run.task.columns, batch, run.task.frame), record)
+    return record
 
 
 def _timed_plan(run: SweepRun, scenarios: Any) -> tuple[Any, float, bool]:
