@@ -231,14 +231,16 @@ class ExactCatch:
                 ground_excess(motion.height, limits)[None],
             ]
         )
+        idle = -jnp.ones((), along.dtype)
+        along = jnp.where(context.active[:, None], along, idle)
+        return along, self._excess_at_catches(catch, context)
+
+    def _excess_at_catches(self, catch: Catch, context: CatchContext) -> Array:
+        """Excess of angle and time over their limits, (2, N)."""
         # The horizon is a hard end: the tolerance of a feasible plan is taken off.
         late = catch.times / context.horizon - 1.0 + FEASIBILITY_TOLERANCE
         at_catch = jnp.stack([catch.angle_excess, late])
-        idle = -jnp.ones((), along.dtype)
-        return (
-            jnp.where(context.active[:, None], along, idle),
-            jnp.where(context.active, at_catch, idle),
-        )
+        return jnp.where(context.active, at_catch, -jnp.ones((), at_catch.dtype))
 
     def objective(self, point: Array, context: CatchContext) -> Evaluation:
         """Cost, and the largest excess at the penalty nodes (squares over squares)."""
@@ -250,14 +252,27 @@ class ExactCatch:
         margins = jnp.asarray(self.margin * _MARGINS, point.dtype)
         hinges = smoothed_hinge(along + margins, self.hinge_width)
         penalty = jnp.sum(chain.piece_durations[:, None] * hinges * weights)
-        penalty += self.catch_weight * jnp.sum(
-            smoothed_hinge(at_catch + self.margin, self.hinge_width)
-        )
-        energy = jnp.sum(jnp.where(context.active, chain_energy(self.maps, chain), 0.0))
-        cost = penalty + self.energy_weight * energy + self.time_weight * catch.times[-1]
+        cost = penalty + self._core(chain, catch, at_catch, context)
         # Peaks between nodes are a little higher than the nodes show.
         violation = jnp.maximum(jnp.max(along), jnp.max(at_catch)) + 0.004
         return Evaluation(cost=cost, violation=violation)
+
+    def _core(self, chain: Chain, catch: Catch, at_catch: Array, context: CatchContext) -> Array:
+        """The part of the cost that needs no samples: energy, time, hinges at the catches."""
+        hinges = smoothed_hinge(at_catch + self.margin, self.hinge_width)
+        energy = jnp.sum(jnp.where(context.active, chain_energy(self.maps, chain), 0.0))
+        weighed = self.energy_weight * energy + self.time_weight * catch.times[-1]
+        return self.catch_weight * jnp.sum(hinges) + weighed
+
+    def core(self, point: Array, context: CatchContext) -> Array:
+        """The part of the cost that needs no samples, for `optimise.sensitivity`."""
+        chain, catch = self._unpack(point, context)
+        return self._core(chain, catch, self._excess_at_catches(catch, context), context)
+
+    def core_blocks(self, size: int) -> np.ndarray:
+        """The variables after the waypoint offsets of every segment, (N, 12)."""
+        one = np.arange(self.num_offsets, len(self.scale))
+        return np.arange(0, size, len(self.scale))[:, None] + one
 
     def residuals(self, point: Array, context: CatchContext) -> Array:
         """Squared hinges, energy and time as residuals, for `measure_scale`.

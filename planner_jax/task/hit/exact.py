@@ -239,14 +239,17 @@ class ExactHit:
         scenario = context.scenario
         motion = sample_motion(self.maps, nodes, rows, offsets, duration)
         along = motion_excess(motion, scenario.gravity, scenario.limits)
-        limits = scenario.hit_limits
-        at_impact = jnp.concatenate(
+        return along, self._excess_at_impact(impact, context)
+
+    def _excess_at_impact(self, impact: Impact, context: HitContext) -> Array:
+        """Excess of apex and hitting speed over their limits, (5,)."""
+        limits = context.scenario.hit_limits
+        return jnp.concatenate(
             [
                 apex_excess(impact.apex, limits.min_apex, limits.max_apex),
                 hitting_speed_excess(impact.tail_state[1], limits.hitting_speed),
             ]
         )
-        return along, at_impact
 
     def _margins(self) -> np.ndarray:
         """Margins of the four limits along the way: squares carry twice the relative one."""
@@ -259,13 +262,25 @@ class ExactHit:
         weights = joined_trapezoid_weights(self.nodes, self.maps.proportions)
         hinges = smoothed_hinge(along + jnp.asarray(self._margins(), point.dtype), self.hinge_width)
         penalty = duration * jnp.sum(hinges * jnp.asarray(weights, point.dtype))
-        penalty += self.impact_weight * jnp.sum(
-            smoothed_hinge(at_impact + self.margin, self.hinge_width)
-        )
-        energy = trajectory_energy(self.maps, rows, offsets, duration)
+        core = self._core(offsets, rows, duration, at_impact)
         # Peaks between nodes are a little higher than the nodes show.
         violation = jnp.maximum(jnp.max(along), jnp.max(at_impact)) + 0.004
-        return Evaluation(cost=penalty + self.energy_weight * energy, violation=violation)
+        return Evaluation(cost=penalty + core, violation=violation)
+
+    def _core(self, offsets: Array, rows: Array, duration: Array, at_impact: Array) -> Array:
+        """The part of the cost that needs no samples: energy, and hinges at the impact."""
+        hinges = smoothed_hinge(at_impact + self.margin, self.hinge_width)
+        energy = trajectory_energy(self.maps, rows, offsets, duration)
+        return self.impact_weight * jnp.sum(hinges) + self.energy_weight * energy
+
+    def core(self, point: Array, context: HitContext) -> Array:
+        """The part of the cost that needs no samples, for `optimise.sensitivity`."""
+        offsets, rows, duration, impact = self._unpack(point, context)
+        return self._core(offsets, rows, duration, self._excess_at_impact(impact, context))
+
+    def core_blocks(self, size: int) -> np.ndarray:
+        """The variables after the waypoint offsets, (1, 8)."""
+        return np.arange(self.num_offsets, size)[None]
 
     def residuals(self, point: Array, context: HitContext) -> Array:
         """Squared hinges and energy as residuals, for `measure_scale`.
