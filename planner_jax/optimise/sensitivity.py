@@ -25,6 +25,7 @@ from jax import Array
 from planner_jax.optimise.problem import Planner, Round
 
 Quantity = str | Callable[[Any], Array]
+_CURVATURES = ("core", "whole")
 
 
 @runtime_checkable
@@ -87,10 +88,14 @@ class Differentiated:
     quantity: Quantity  # place in the plan such as "stroke.time", or a function of the plan
     wrt: tuple[str, ...]  # places in the scenario such as "net.radius"
     steps: int = 1  # of the conjugate gradients
+    curvature: str = "core"  # or "whole", of the preconditioner
 
     def __post_init__(self) -> None:
-        if self.steps < 1:
-            raise ValueError(f"steps must be >= 1, got {self.steps}")
+        if self.curvature not in _CURVATURES:
+            known = ", ".join(_CURVATURES)
+            raise ValueError(f"curvature must be one of {known}, got {self.curvature!r}")
+        if self.steps < 0:
+            raise ValueError(f"steps must be >= 0, got {self.steps}")
         if not self.wrt:
             raise ValueError("wrt must name something in the scenario, got nothing")
 
@@ -131,7 +136,13 @@ class Differentiated:
         return DifferentiatedPlan(
             plan=plan,
             gradient=gradient_at(
-                self.planner, context.scenario, point, self.quantity, self.wrt, steps=self.steps
+                self.planner,
+                context.scenario,
+                point,
+                self.quantity,
+                self.wrt,
+                steps=self.steps,
+                curvature=self.curvature,
             ),
             cost=plan.cost,
             violation=plan.violation,
@@ -148,6 +159,7 @@ def gradient_at(
     wrt: tuple[str, ...],
     *,
     steps: int = 1,
+    curvature: str = "core",
 ) -> Gradient:
     """Gradient of a number of the plan at a point by parts of the scenario. One lane; pure.
 
@@ -159,7 +171,10 @@ def gradient_at(
         quantity: place of a number in the plan, names joined by dots, or a function of the plan.
         wrt: places in the scenario.
         steps: of the conjugate gradients; each takes a product with the Hessian. A lane stops
-            early where the Hessian is not positive.
+            early where the Hessian is not positive. 0 leaves the adjoint out, which is right
+            for "cost": its gradient at an optimum is that at a fixed point (envelope theorem).
+        curvature: of the preconditioner: "core" is that of the planner's core, "whole" the
+            Hessian itself, which takes n products more.
 
     Raises:
         ValueError: a place does not exist, or holds something else than floating numbers.
@@ -196,7 +211,16 @@ def gradient_at(
         """(p^T cost_uu, p^T cost_uc) as the gradient of the slope along p."""
         return jax.jvp(lambda y: cost(y, smooth), (x,), (direction,))[1]
 
-    solve = _preconditioner(planner, point, context)
+    if steps == 0:
+        solve = lambda rhs: rhs  # noqa: E731
+    elif curvature == "whole":
+        hessian = jax.vmap(lambda unit: products(point, smooth, unit)[0])(
+            jnp.eye(point.shape[0], dtype=point.dtype)
+        )
+        inverse = _positive_inverse(hessian)
+        solve = lambda rhs: jnp.sum(inverse * rhs, axis=1)  # noqa: E731
+    else:
+        solve = _core_inverse(planner, point, context)
     by_context, residual = _adjoint(
         lambda p: products(point, smooth, p), solve, along_point, by_context, steps
     )
@@ -237,7 +261,7 @@ def _adjoint(
     return total, jnp.sqrt(jnp.maximum(ratio, 0.0))
 
 
-def _preconditioner(planner: Any, point: Array, context: Any) -> Callable[[Array], Array]:
+def _core_inverse(planner: Any, point: Array, context: Any) -> Callable[[Array], Array]:
     """An approximate inverse of the Hessian, positive definite: that of the core.
 
     Without a core it is one, because scaled variables have curvature of one size.

@@ -17,6 +17,7 @@ def plan_with_gradients(
     wrt: Sequence[str],
     *,
     steps: int = 1,
+    curvature: str = "core",
     solver: LbfgsConfig | None = None,
     chunk: int | None = None,
     devices: Sequence[Any] | None = None,
@@ -36,7 +37,10 @@ def plan_with_gradients(
             "violation", or a function of one plan. A function is compiled for anew with every
             new function object.
         wrt: places in the scenario, such as "racket_height", "limits" or "net.radius".
-        steps: of the conjugate gradients for the adjoint; more where limits bind.
+        steps: of the conjugate gradients for the adjoint. One is exact where no limit binds;
+            0 is exact for "cost", by the envelope theorem.
+        curvature: "core" is quick; "whole" takes the Hessian itself, exact where limits bind
+            too, at the cost of some n solver iterations.
         solver: one search with this in the place of the planner's rounds.
         chunk: as for `plan`.
         devices: as for `plan`.
@@ -46,7 +50,8 @@ def plan_with_gradients(
         gradient: with the batch shape of the scenarios.
 
     Raises:
-        ValueError: a name is not of the plan or the scenario, or `steps` < 1.
+        ValueError: a name is not of the plan or the scenario, `steps` < 0, or
+            `curvature` is unknown.
     """
     for name in wrt:
         part_of(scenarios, name)
@@ -54,7 +59,7 @@ def plan_with_gradients(
         rounds = (Round(starts=1, solver=solver),)
         planner = dataclasses.replace(planner, rounds=rounds)  # type: ignore[type-var]
     found = plan(
-        Differentiated(planner, quantity, tuple(wrt), steps),
+        Differentiated(planner, quantity, tuple(wrt), steps, curvature),
         scenarios,
         chunk=chunk,
         devices=devices,
