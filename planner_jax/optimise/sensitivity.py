@@ -230,6 +230,8 @@ def gradient_at(
         next(taken) if flag else np.zeros(leaf.shape, jax.dtypes.float0) for leaf, flag in both
     ]
     (by_parts,) = pull(jax.tree.unflatten(treedef, cotangent))
+    finite = jnp.isfinite(value) & jnp.isfinite(residual)
+    by_parts = jax.tree.map(lambda leaf: jnp.where(finite, leaf, jnp.nan), by_parts)
     return Gradient(value=value, by=by_parts, residual=residual)
 
 
