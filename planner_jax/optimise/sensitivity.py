@@ -200,11 +200,12 @@ def gradient_at(
 
     def value_of(x: Array, smooth: list) -> Array:
         plan = planner.decode(x, context_of(smooth))
-        return number(plan.replace(cost=cost(x, smooth)))
+        value = number(plan.replace(cost=cost(x, smooth)))
+        if value.shape:
+            raise ValueError(f"quantity must be one number, got shape {value.shape}")
+        return value
 
     value, (along_point, by_context) = jax.value_and_grad(value_of, argnums=(0, 1))(point, smooth)
-    if value.shape:
-        raise ValueError(f"quantity must be one number, got shape {value.shape}")
 
     @functools.partial(jax.grad, argnums=(0, 1))
     def products(x: Array, smooth: list, direction: Array) -> Array:
