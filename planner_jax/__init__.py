@@ -9,7 +9,7 @@ The public names, in the order of the data flow:
 * the planners: `planner` and `catch_planner` (by name), `ExactHit`, `ExactCatch`, and `plan`, one
   call for one case or many, on all devices; `plan_across_processes`, `keep_compiled_programs`
 * plans again while a ball flies: `ReplanCatch`, `replanned`
-* gradients through an optimum: `optimal_plan`
+* gradients through an optimum: `plan_with_gradients` of batches, `optimal_plan` of any numbers
 * the judges: `referee_hits`, `referee_catches`
 * reading a plan: `PiecewisePolynomial`, `evaluate`, `Status`
 
@@ -44,6 +44,7 @@ _PUBLIC = {
     "keep_compiled_programs": "planner_jax.compile_cache",
     "ReplanCatch": "planner_jax.task.catch.replan",
     "replanned": "planner_jax.task.catch.replan",
+    "plan_with_gradients": "planner_jax.task.gradients",
     "optimal_plan": "planner_jax.optimise.implicit",
     "referee_hits": "planner_jax.referee.hit",
     "referee_catches": "planner_jax.referee.catch",

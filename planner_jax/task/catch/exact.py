@@ -254,14 +254,28 @@ class ExactCatch:
             self._along(), chain.columns, chain.piece_durations, (scenario.gravity, scenario.limits)
         )
         at_catch = self._at_catch(catch, context)
-        energies = chain_energy(self.maps, chain)
-        flown = jnp.where(context.active, penalties + self.energy_weight * energies, 0.0)
-        hinges = smoothed_hinge(at_catch + self.margin, self.hinge_width)
-        cost = jnp.sum(flown) + self.catch_weight * jnp.sum(hinges)
-        cost += self.time_weight * catch.times[-1]
+        penalty = jnp.sum(jnp.where(context.active, penalties, 0.0))
+        cost = penalty + self._core(chain, catch, at_catch, context)
         # Peaks between nodes are a little higher than the nodes show.
         worst = jnp.max(jnp.where(context.active, worst, -1.0))
         return Evaluation(cost=cost, violation=jnp.maximum(worst, jnp.max(at_catch)) + 0.004)
+
+    def _core(self, chain: Chain, catch: Catch, at_catch: Array, context: CatchContext) -> Array:
+        """The part of the cost that needs no samples: energy, time, hinges at the catches."""
+        hinges = smoothed_hinge(at_catch + self.margin, self.hinge_width)
+        energy = jnp.sum(jnp.where(context.active, chain_energy(self.maps, chain), 0.0))
+        weighed = self.energy_weight * energy + self.time_weight * catch.times[-1]
+        return self.catch_weight * jnp.sum(hinges) + weighed
+
+    def core(self, point: Array, context: CatchContext) -> Array:
+        """The part of the cost that needs no samples, for `optimise.sensitivity`."""
+        chain, catch = self._unpack(point, context)
+        return self._core(chain, catch, self._at_catch(catch, context), context)
+
+    def core_blocks(self, size: int) -> np.ndarray:
+        """The variables after the waypoint offsets of every segment, (N, 12)."""
+        one = np.arange(self.num_offsets, len(self.scale))
+        return np.arange(0, size, len(self.scale))[:, None] + one
 
     def residuals(self, point: Array, context: CatchContext) -> Array:
         """Squared hinges, energy and time as residuals, for `measure_scale`.

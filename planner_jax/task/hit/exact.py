@@ -266,13 +266,25 @@ class ExactHit:
             (context.scenario.gravity, context.scenario.limits),
         )
         at_impact = self._at_impact(impact, context)
-        penalty = penalties[0] + self.impact_weight * jnp.sum(
-            smoothed_hinge(at_impact + self.margin, self.hinge_width)
-        )
-        energy = trajectory_energy(self.maps, rows, offsets, duration)
+        core = self._core(offsets, rows, duration, at_impact)
         # Peaks between nodes are a little higher than the nodes show.
         violation = jnp.maximum(worst[0], jnp.max(at_impact)) + 0.004
-        return Evaluation(cost=penalty + self.energy_weight * energy, violation=violation)
+        return Evaluation(cost=penalties[0] + core, violation=violation)
+
+    def _core(self, offsets: Array, rows: Array, duration: Array, at_impact: Array) -> Array:
+        """The part of the cost that needs no samples: energy, and hinges at the impact."""
+        hinges = smoothed_hinge(at_impact + self.margin, self.hinge_width)
+        energy = trajectory_energy(self.maps, rows, offsets, duration)
+        return self.impact_weight * jnp.sum(hinges) + self.energy_weight * energy
+
+    def core(self, point: Array, context: HitContext) -> Array:
+        """The part of the cost that needs no samples, for `optimise.sensitivity`."""
+        offsets, rows, duration, impact = self._unpack(point, context)
+        return self._core(offsets, rows, duration, self._at_impact(impact, context))
+
+    def core_blocks(self, size: int) -> np.ndarray:
+        """The variables after the waypoint offsets, (1, 8)."""
+        return np.arange(self.num_offsets, size)[None]
 
     def residuals(self, point: Array, context: HitContext) -> Array:
         """Squared hinges and energy as residuals, for `measure_scale`.

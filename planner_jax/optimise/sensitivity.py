@@ -1,0 +1,365 @@
+"""Gradients of many plans at once: one adjoint solve a lane, without a Hessian.
+
+For a number q(u, theta) of a plan, where u minimises cost(u, theta),
+
+    dq/dtheta = q_theta - lambda^T cost_utheta,   cost_uu lambda = q_u,
+
+the adjoint form of the implicit function theorem. lambda comes from a few steps of conjugate
+gradients (Hestenes and Stiefel 1952). One reverse pass through the slope of the cost along a
+direction p yields both p^T cost_uu and p^T cost_utheta, so that the gradient is summed up along
+with lambda. A planner whose cost has a cheap part (`Planner.core`, see `CorePlanner`) is
+preconditioned with that part's curvature.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, Protocol, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+from planner_jax.optimise.problem import Planner, Round
+
+Quantity = str | Callable[[Any], Array]
+_CURVATURES = ("core", "whole")
+
+
+@runtime_checkable
+class CorePlanner(Protocol):
+    """A planner that says which part of its cost can be looked at cheaply."""
+
+    def core(self, point: Array, context: Any) -> Array:
+        """The cost without what has to be sampled along the trajectory, ()."""
+        ...
+
+    def core_blocks(self, size: int) -> np.ndarray:
+        """Places (K, k) in a point (size,) of the variables that the core couples.
+
+        In the others it is a sum of squares, with a factor each.
+        """
+        ...
+
+
+@struct.dataclass
+class Gradient:
+    """A number of a plan, and its gradient by some of the scenario."""
+
+    value: Array  # ()
+    by: dict[str, Any]  # name -> what the scenario has there, of d value / d leaf
+    # () what is left of q_u, relative, in the preconditioner's norm: 0 if lambda is exact. It
+    # says nothing about how far the point is from the optimum.
+    residual: Array
+
+
+@struct.dataclass
+class DifferentiatedPlan:
+    """A planner's plan with a gradient."""
+
+    plan: Any
+    gradient: Gradient
+    cost: Array  # ()
+    violation: Array  # ()
+    iterations: Array  # () int32
+    status: Array  # () int32
+
+    def whole_plan(self) -> Any:
+        """The plan with what the solver filled in."""
+        return self.plan.replace(cost=self.cost, iterations=self.iterations, status=self.status)
+
+
+@struct.dataclass
+class _Context:
+    scenario: Any
+    inner: Any
+
+
+@dataclasses.dataclass(frozen=True)
+class Differentiated:
+    """A planner whose plans carry the gradient of one of their numbers.
+
+    It is solved like the planner itself; the gradient is taken where the solver ends.
+    """
+
+    planner: Any
+    quantity: Quantity  # place in the plan such as "stroke.time", or a function of the plan
+    wrt: tuple[str, ...]  # places in the scenario such as "net.radius"
+    steps: int = 1  # of the conjugate gradients
+    curvature: str = "core"  # or "whole", of the preconditioner
+
+    def __post_init__(self) -> None:
+        if self.curvature not in _CURVATURES:
+            known = ", ".join(_CURVATURES)
+            raise ValueError(f"curvature must be one of {known}, got {self.curvature!r}")
+        if self.steps < 0:
+            raise ValueError(f"steps must be >= 0, got {self.steps}")
+        if not self.wrt:
+            raise ValueError("wrt must name something in the scenario, got nothing")
+
+    @property
+    def rounds(self) -> tuple[Round, ...]:
+        """Those of the planner, their settings made to the planner inside."""
+
+        def inner(settings: tuple) -> tuple:
+            return (("planner", dataclasses.replace(self.planner, **dict(settings))),)
+
+        return tuple(
+            dataclasses.replace(
+                attempt,
+                settings=inner(attempt.settings),
+                stages=tuple(
+                    dataclasses.replace(stage, settings=inner(stage.settings))
+                    for stage in attempt.stages
+                ),
+            )
+            for attempt in self.planner.rounds
+        )
+
+    def prepare(self, scenario: Any) -> _Context:
+        """As the planner does."""
+        return _Context(scenario=scenario, inner=self.planner.prepare(scenario))
+
+    def guesses(self, context: _Context, num: int) -> Array:
+        """Those of the planner."""
+        return self.planner.guesses(context.inner, num)
+
+    def objective(self, point: Array, context: _Context) -> Any:
+        """That of the planner."""
+        return self.planner.objective(point, context.inner)
+
+    def decode(self, point: Array, context: _Context) -> DifferentiatedPlan:
+        """The planner's plan, and the gradient there."""
+        plan = self.planner.decode(point, context.inner)
+        return DifferentiatedPlan(
+            plan=plan,
+            gradient=gradient_at(
+                self.planner,
+                context.scenario,
+                point,
+                self.quantity,
+                self.wrt,
+                steps=self.steps,
+                curvature=self.curvature,
+            ),
+            cost=plan.cost,
+            violation=plan.violation,
+            iterations=plan.iterations,
+            status=plan.status,
+        )
+
+
+def gradient_at(
+    planner: Planner,
+    scenario: Any,
+    point: Array,
+    quantity: Quantity,
+    wrt: tuple[str, ...],
+    *,
+    steps: int = 1,
+    curvature: str = "core",
+) -> Gradient:
+    """Gradient of a number of the plan at a point by parts of the scenario. One lane; pure.
+
+    Args:
+        planner: sizes and switches, static.
+        scenario: one case.
+        point: (n,) minimiser of the planner's objective. At another point the result is the
+            derivative of the points of equal cost gradient, not of the optimum.
+        quantity: place of a number in the plan, names joined by dots, or a function of the plan.
+        wrt: places in the scenario.
+        steps: of the conjugate gradients; each takes a product with the Hessian. A lane stops
+            early where the Hessian is not positive. 0 leaves the adjoint out, which is right
+            for "cost": its gradient at an optimum is that at a fixed point (envelope theorem).
+        curvature: of the preconditioner: "core" is that of the planner's core, "whole" the
+            Hessian itself, which takes n products more.
+
+    Raises:
+        ValueError: a place does not exist, or holds something else than floating numbers.
+    """
+    number = _quantity(quantity)
+    parts = {name: part_of(scenario, name) for name in wrt}
+
+    def moved(parts: dict) -> Any:
+        return functools.reduce(lambda s, name: _with_part(s, name, parts[name]), parts, scenario)
+
+    context, pull = jax.vjp(lambda parts: planner.prepare(moved(parts)), parts)
+    leaves, treedef = jax.tree.flatten(context)
+    is_smooth = [jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves]
+    smooth = [leaf for leaf, flag in zip(leaves, is_smooth, strict=True) if flag]
+
+    def context_of(smooth: list) -> Any:
+        taken = iter(smooth)
+        both = zip(leaves, is_smooth, strict=True)
+        return jax.tree.unflatten(treedef, [next(taken) if flag else leaf for leaf, flag in both])
+
+    def cost(x: Array, smooth: list) -> Array:
+        return planner.objective(x, context_of(smooth)).cost
+
+    def value_of(x: Array, smooth: list) -> Array:
+        plan = planner.decode(x, context_of(smooth))
+        value = number(plan.replace(cost=cost(x, smooth)))
+        if value.shape:
+            raise ValueError(f"quantity must be one number, got shape {value.shape}")
+        return value
+
+    value, (along_point, by_context) = jax.value_and_grad(value_of, argnums=(0, 1))(point, smooth)
+
+    @functools.partial(jax.grad, argnums=(0, 1))
+    def products(x: Array, smooth: list, direction: Array) -> Array:
+        """(p^T cost_uu, p^T cost_uc) as the gradient of the slope along p."""
+        return jax.jvp(lambda y: cost(y, smooth), (x,), (direction,))[1]
+
+    if steps == 0:
+        solve = lambda rhs: rhs  # noqa: E731
+    elif curvature == "whole":
+        hessian = jax.vmap(lambda unit: products(point, smooth, unit)[0])(
+            jnp.eye(point.shape[0], dtype=point.dtype)
+        )
+        inverse = _positive_inverse(hessian)
+        solve = lambda rhs: jnp.sum(inverse * rhs, axis=1)  # noqa: E731
+    else:
+        solve = _core_inverse(planner, point, context)
+    by_context, residual = _adjoint(
+        lambda p: products(point, smooth, p), solve, along_point, by_context, steps
+    )
+    taken = iter(by_context)
+    both = zip(leaves, is_smooth, strict=True)
+    cotangent = [
+        next(taken) if flag else np.zeros(leaf.shape, jax.dtypes.float0) for leaf, flag in both
+    ]
+    (by_parts,) = pull(jax.tree.unflatten(treedef, cotangent))
+    finite = jnp.isfinite(value) & jnp.isfinite(residual)
+    by_parts = jax.tree.map(lambda leaf: jnp.where(finite, leaf, jnp.nan), by_parts)
+    return Gradient(value=value, by=by_parts, residual=residual)
+
+
+def _adjoint(
+    products: Callable, solve: Callable, rhs: Array, total: list, steps: int
+) -> tuple[list, Array]:
+    """`total` - lambda^T cost_uc with cost_uu lambda = rhs, and the relative residual."""
+    left = rhs
+    corrected = solve(left)
+    size = first = jnp.sum(left * corrected)
+    direction = corrected
+    going = jnp.ones((), bool)
+    for k in range(steps):
+        curved, mixed = products(direction)
+        curvature = jnp.sum(direction * curved)
+        going = going & (curvature > 0.0) & (size > 0.0)
+        length = jnp.where(going, size / jnp.where(going, curvature, 1.0), 0.0)
+        total = [
+            t - jnp.where(length > 0.0, length * m, 0.0) for t, m in zip(total, mixed, strict=True)
+        ]
+        left = left - length * curved
+        corrected = solve(left)
+        after = jnp.sum(left * corrected)
+        if k + 1 < steps:
+            ratio = after / jnp.where(size > 0.0, size, 1.0)
+            direction = corrected + ratio * direction
+        size = jnp.where(going, after, size)
+    ratio = size / jnp.where(first > 0.0, first, 1.0)
+    return total, jnp.sqrt(jnp.maximum(ratio, 0.0))
+
+
+def _core_inverse(planner: Any, point: Array, context: Any) -> Callable[[Array], Array]:
+    """An approximate inverse of the Hessian, positive definite: that of the core.
+
+    Without a core it is one, because scaled variables have curvature of one size.
+    """
+    if not isinstance(planner, CorePlanner):
+        return lambda rhs: rhs
+    blocks = planner.core_blocks(point.shape[0])
+    inside = np.zeros(point.shape[0], bool)
+    inside[blocks.ravel()] = True
+    coupled = blocks.ravel()
+
+    def slope(x: Array) -> Array:
+        return jax.grad(lambda y: planner.core(y, context))(x)
+
+    # As constants, so that the lanes share them: unit vectors, and ones for the others.
+    units = np.concatenate([np.eye(point.shape[0])[coupled], ~inside[None]])
+    tangent = lambda unit: jax.jvp(slope, (point,), (unit,))[1]  # noqa: E731
+    *rows, row_of_others = jax.vmap(tangent)(jnp.asarray(units, point.dtype))
+    # What the core couples is not looked at here.
+    largest = jnp.max(jnp.where(inside, 0.0, jnp.abs(row_of_others)))
+    size_of_others = jnp.maximum(jnp.abs(row_of_others), 1e-6 * largest + 1e-20)
+    within = jnp.stack(rows).reshape(*blocks.shape, -1)  # (K, k, n)
+    inverses = [
+        _positive_inverse(jnp.stack([matrix[:, j] for j in block], axis=1))
+        for block, matrix in zip(blocks, within, strict=True)
+    ]
+
+    def solve(rhs: Array) -> Array:
+        entries, found = tuple(rhs), list(rhs / size_of_others)
+        for block, inverse in zip(blocks, inverses, strict=True):
+            solved = jnp.sum(inverse * jnp.stack([entries[j] for j in block]), axis=1)
+            for place, value in zip(block, tuple(solved), strict=True):
+                found[place] = value
+        return jnp.stack(found)
+
+    return solve
+
+
+def _positive_inverse(matrix: Array) -> Array:
+    """Inverse of a symmetric matrix (k, k), its pivots made positive.
+
+    Gauss-Jordan in k steps, in place; pivots are not exchanged. Where all of them are positive
+    without help, so is the matrix, and this is its inverse.
+    """
+    size = matrix.shape[0]
+    least = 1e-6 * jnp.abs(jnp.diagonal(matrix)) + 1e-20
+
+    def eliminate(j: Array, m: Array) -> Array:
+        here = jnp.arange(size) == j
+        row = jnp.sum(jnp.where(here[:, None], m, 0.0), axis=0)
+        column = jnp.sum(jnp.where(here, m, 0.0), axis=1)
+        pivot = jnp.maximum(
+            jnp.abs(jnp.sum(jnp.where(here, row, 0.0))), jnp.sum(jnp.where(here, least, 0.0))
+        )
+        scaled = jnp.where(here, 1.0, row) / pivot
+        rest = jnp.where(here, 0.0, m)
+        return jnp.where(here[:, None], scaled, rest - column[:, None] * scaled)
+
+    return jax.lax.fori_loop(0, size, eliminate, matrix)
+
+
+def part_of(tree: Any, name: str) -> Any:
+    """What stands at a place, names joined by dots, in a scenario.
+
+    Raises:
+        ValueError: there is no such place, or it holds something else than floating numbers.
+    """
+    part = _found(tree, name, "wrt")
+    for leaf in jax.tree.leaves(part):
+        if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
+            raise ValueError(f"wrt must name floating numbers, got {name!r}")
+    return jax.tree.map(jnp.asarray, part)
+
+
+def _found(tree: Any, name: str, argument: str) -> Any:
+    part = tree
+    for field in name.split("."):
+        known = getattr(part, "__dataclass_fields__", {})
+        if field not in known:
+            raise ValueError(
+                f"{argument} must name a place in {type(tree).__name__}, got {name!r}: "
+                f"{type(part).__name__} has {', '.join(known) or 'no fields'}"
+            )
+        part = getattr(part, field)
+    return part
+
+
+def _with_part(tree: Any, name: str, part: Any) -> Any:
+    """The tree with something else at a place."""
+    first, _, rest = name.partition(".")
+    inner = _with_part(getattr(tree, first), rest, part) if rest else part
+    return dataclasses.replace(tree, **{first: inner})
+
+
+def _quantity(quantity: Quantity) -> Callable[[Any], Array]:
+    if callable(quantity):
+        return quantity
+    return lambda plan: _found(plan, quantity, "quantity")

@@ -1,0 +1,204 @@
+"""Adjoint gradients of plans: closed form, finite differences, and lanes apart."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import struct
+
+from planner_jax.optimise.implicit import newton_refine
+from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
+from planner_jax.optimise.multistart import minimise
+from planner_jax.optimise.problem import Round
+from planner_jax.optimise.sensitivity import _positive_inverse, _with_part, gradient_at, part_of
+from planner_jax.task.catch.decide import decided, greedy
+from planner_jax.task.catch.exact import ExactCatch
+from planner_jax.task.catch.suites import make_suite
+from planner_jax.task.gradients import plan_with_gradients
+from planner_jax.task.hit.exact import ExactHit
+from planner_jax.task.hit.serves import generate_serves, to_scenarios
+
+CURVED = np.array([[3.0, 1.0, 0.2], [1.0, 2.0, 0.0], [0.2, 0.0, 1.0]])
+
+
+@struct.dataclass
+class Bowl:
+    """cost = u^T A u / 2 - u^T b - k u_0, least at u = A^-1 (b + k e_0)."""
+
+    b: jax.Array  # (3,)
+    k: jax.Array  # ()
+    kind: jax.Array  # () int32
+
+    @property
+    def batch_shape(self):
+        return np.shape(self.k)
+
+
+@struct.dataclass
+class BowlPlan:
+    point: jax.Array
+    cost: jax.Array
+    violation: jax.Array
+    iterations: jax.Array
+    status: jax.Array
+
+
+@dataclasses.dataclass(frozen=True)
+class BowlPlanner:
+    weight: float = 1.0
+    rounds: tuple = (
+        Round(starts=2, solver=LbfgsConfig(max_steps=40, tolerance=1e-14), settings=()),
+        Round(starts=1, solver=LbfgsConfig(max_steps=5), settings=(("weight", 2.0),)),
+    )
+
+    def prepare(self, scenario):
+        return {"force": self.weight * (scenario.b + scenario.k * jnp.eye(3)[0])}
+
+    def guesses(self, context, num):
+        return jnp.arange(num)[:, None] + 0.0 * context["force"]
+
+    def objective(self, point, context):
+        curved = 0.5 * self.weight * jnp.sum(point * (CURVED @ point))
+        return Evaluation(curved - jnp.sum(point * context["force"]), -jnp.ones(()))
+
+    def decode(self, point, context):
+        zero = jnp.zeros((), jnp.int32)
+        return BowlPlan(point, jnp.zeros(()), -jnp.ones(()), zero, zero)
+
+
+def squared(plan):
+    return jnp.sum(plan.point**2)
+
+
+@pytest.fixture
+def bowls(float64):
+    random = np.random.default_rng(0)
+    return Bowl(random.standard_normal((5, 3)), random.standard_normal(5), np.zeros(5, np.int32))
+
+
+@pytest.mark.parametrize("options", [{"steps": 3}, {"steps": 1, "curvature": "whole"}])
+def test_gradient_of_a_quadratic_is_the_closed_form(bowls, options):
+    plans, gradient = plan_with_gradients(BowlPlanner(), bowls, squared, ("b", "k"), **options)
+    inverse = np.linalg.inv(CURVED)
+    best = (bowls.b + bowls.k[:, None] * np.eye(3)[0]) @ inverse
+    np.testing.assert_allclose(plans.point, best, atol=1e-6)
+    np.testing.assert_allclose(gradient.value, np.sum(best**2, axis=1), atol=1e-6)
+    np.testing.assert_allclose(gradient.by["b"], 2.0 * best @ inverse, atol=1e-5)
+    np.testing.assert_allclose(gradient.by["k"], gradient.by["b"][:, 0], atol=1e-12)
+    assert np.all(gradient.residual < 1e-6)
+
+
+def test_gradient_of_the_cost_needs_no_adjoint(bowls):
+    plans, gradient = plan_with_gradients(BowlPlanner(), bowls, "cost", ("b",), steps=0)
+    np.testing.assert_allclose(gradient.by["b"], -plans.point, atol=1e-12)
+    np.testing.assert_allclose(gradient.value, plans.cost, atol=1e-12)
+
+
+def test_a_batch_is_its_lanes_and_a_broken_lane_spoils_no_other(bowls):
+    b = bowls.b.copy()
+    b[2] = np.nan
+    plans, found = plan_with_gradients(BowlPlanner(), bowls.replace(b=b), squared, ("b",), steps=2)
+    assert np.isnan(found.by["b"][2]).all() and plans.point.shape == (5, 3)
+    for lane in (0, 1, 3, 4):
+        one = jax.tree.map(lambda leaf, k=lane: leaf[k], bowls)
+        _, alone = plan_with_gradients(BowlPlanner(), one, squared, ("b",), steps=2)
+        np.testing.assert_allclose(found.by["b"][lane], alone.by["b"], rtol=1e-9)
+
+
+def test_a_matrix_that_is_not_positive_has_a_finite_inverse(float64):
+    np.testing.assert_allclose(
+        _positive_inverse(jnp.asarray(CURVED)) @ CURVED, np.eye(3), atol=1e-12
+    )
+    broken = _positive_inverse(jnp.asarray(CURVED - 1.5 * np.eye(3)))
+    assert np.isfinite(broken).all()
+
+
+@pytest.mark.parametrize(
+    "options, line",
+    [
+        ({"wrt": ("b.x",)}, "wrt must name a place in Bowl, got 'b.x'"),
+        ({"wrt": ("kind",)}, "wrt must name floating numbers, got 'kind'"),
+        ({"wrt": ()}, "wrt must name something"),
+        ({"quantity": "speed"}, "quantity must name a place in BowlPlan, got 'speed'"),
+        ({"quantity": "point"}, r"quantity must be one number, got shape \(3,\)"),
+        ({"steps": -1}, "steps must be >= 0, got -1"),
+        ({"curvature": "none"}, "curvature must be one of core, whole, got 'none'"),
+    ],
+)
+def test_what_is_wrong_is_named(bowls, options, line):
+    asked = {"quantity": "cost", "wrt": ("b",), **options}
+    with pytest.raises(ValueError, match=line):
+        plan_with_gradients(BowlPlanner(), bowls, **asked)
+
+
+def first(lanes):
+    """The first lane, in float64."""
+
+    def leaf(x):
+        x = jnp.asarray(x)[0]
+        return x.astype(jnp.float64) if jnp.issubdtype(x.dtype, jnp.floating) else x
+
+    return jax.tree.map(leaf, lanes)
+
+
+def hit_case():
+    """A serve planned late under weak limits, which press."""
+    serves = generate_serves(8, 3)[1:2]
+    return to_scenarios(serves, delay=0.4, limit_scale=0.7, dtype=jnp.float64)
+
+
+def catch_case():
+    """A throw whose first guess is made by the decision."""
+    throws = make_suite("throws", 1, seed=3)
+    return decided(throws, jax.vmap(greedy)(throws))
+
+
+PIECES = (0.2, 0.5, 1.0, 1.0, 1.0, 1.0)
+CASES = {
+    "hit": (
+        ExactHit(proportions=PIECES),
+        hit_case,
+        "stroke.time",
+        {"racket_height": 1e-3, "drag": 1e-4, "limits.body_rate": 1e-3},
+    ),
+    "catch": (
+        ExactCatch(),
+        catch_case,
+        lambda plan: plan.times[-1],
+        {"net.height": 1e-3, "gravity": 1e-3, "limits.speed": 1e-3},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_gradient_at_an_optimum_is_that_of_plans_solved_anew(name, float64):
+    planner, case, quantity, steps = CASES[name]
+    scenario = first(case())
+    search = LbfgsConfig(max_steps=200, tolerance=1e-7, patience=6)
+
+    @jax.jit
+    def solved(scenario, start):
+        context = planner.prepare(scenario)
+        objective = lambda x: planner.objective(x, context)  # noqa: E731
+        found = minimise(objective, start, search).point
+        point, _ = newton_refine(objective, found, max_steps=40, stationarity=1e-14)
+        plan = planner.decode(point, context)
+        return point, quantity(plan) if callable(quantity) else plan.stroke.time
+
+    start = planner.guesses(planner.prepare(scenario), 1)[0]
+    point, value = solved(scenario, start)
+    for options in ({"steps": 4}, {"steps": 1, "curvature": "whole"}):
+        take = functools.partial(gradient_at, planner, quantity=quantity, wrt=tuple(steps))
+        gradient = jax.jit(lambda s, x, t=take, o=options: t(s, x, **o))(scenario, point)
+        np.testing.assert_allclose(gradient.value, value, rtol=1e-12)
+        for place, step in steps.items():
+            here = part_of(scenario, place)
+            ahead, behind = (
+                solved(_with_part(scenario, place, here + sign * step), point)[1]
+                for sign in (1.0, -1.0)
+            )
+            numeric = (ahead - behind) / (2.0 * step)
+            np.testing.assert_allclose(gradient.by[place], numeric, rtol=5e-3, atol=2e-5)
