@@ -35,6 +35,7 @@ from planner_jax.task.hit.serves import generate_serves, to_scenarios
 from planner_jax.task.solve import plan
 
 _LONG = (Round(starts=1, solver=LbfgsConfig(max_steps=300, tolerance=1e-7, patience=6)),)
+_JUDGED = 300_000  # lanes of a batch that the referee sees, at most
 _COMPARED = 1024  # lanes whose cost is held against a long search's, and with the CPU's
 
 
@@ -136,8 +137,9 @@ def _row(kind: Any, planner: Any, num: int, seed: int, devices: list, repeat: in
             began = time.perf_counter()
             decided, plans = jax.block_until_ready(kind.plan(planner, scenarios, devices))
             seconds.append(time.perf_counter() - began)
-    decided, plans = jax.device_get((decided, plans))
-    accepted = kind.accepted(decided, plans)
+    plans = jax.device_get(plans)
+    judged = jax.tree.map(lambda leaf: np.asarray(leaf)[:_JUDGED], (decided, plans))
+    accepted = kind.accepted(*judged)
     first = jax.tree.map(lambda leaf: leaf[:_COMPARED], (host, plans))
     _, best = kind.plan(dataclasses.replace(planner, rounds=_LONG), first[0], devices)
     both = is_solved(first[1].status) & is_solved(best.status)
@@ -146,7 +148,7 @@ def _row(kind: Any, planner: Any, num: int, seed: int, devices: list, repeat: in
     return (
         f"| {num:,} | {seconds[0]:.1f} | {clock.seconds:.1f} | {1e3 * fastest:.2f} | "
         f"{1e3 * median:.2f} | {num / fastest:,.0f} | {100.0 * accepted.mean():.3f} % "
-        f"({(~accepted).sum()} fail) | {np.median(gap):.1f} %, {np.quantile(gap, 0.9):.1f} % | "
+        f"({(~accepted).sum()} of {accepted.size:,} fail) | {np.median(gap):.1f} %, {np.quantile(gap, 0.9):.1f} % | "
         f"{_memory(devices):.1f} |"
     )
 

@@ -12,7 +12,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from planner_jax.ball.flight import BallState
-from planner_jax.referee import hit
+from planner_jax.referee import hit, motion
 from planner_jax.referee.hit import LIMITS, HitVerdict, referee_hits
 from planner_jax.robot.quadrotor import QuadrotorLimits
 from planner_jax.task.hit.plan import HitPlan, Stroke
@@ -581,3 +581,24 @@ def test_every_limit_has_its_sentence():
     verdict = HitVerdict(**blank | {"failed_limit": np.array(LIMITS)})
     for lane, name in enumerate(LIMITS):
         assert verdict.sentence(lane).startswith(f"{name}: ")
+
+
+def test_processes_judge_as_threads_do(monkeypatch):
+    lanes = np.arange(600)
+    case = {"durations": lanes[:, None].astype(np.float32), "value": lanes.astype(np.float32)}
+    in_threads = motion.judge_in_chunks(_halved, case, 256)
+    monkeypatch.setattr(motion, "_MANY_CORES", 1)
+    monkeypatch.setattr(motion, "_MANY_LANES", 1)
+    in_processes = motion.judge_in_chunks(_halved, case, 256)
+    assert motion.workers.cache_info().currsize == 1
+    np.testing.assert_array_equal(in_processes["half"], in_threads["half"])
+    with pytest.raises(ValueError, match="refused"):
+        motion.workers().map(_refuse, [1, 2])
+
+
+def _halved(case):
+    return {"half": 0.5 * case["value"]}
+
+
+def _refuse(_):
+    raise ValueError("refused")

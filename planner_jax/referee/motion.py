@@ -6,12 +6,16 @@ units.
 """
 
 import dataclasses
+import functools
 import math
 import os
+import pickle
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
+
+from planner_jax.referee.workers import workers
 
 # Largest difference [s] between the claimed time of a contact and the one that is flown.
 CONTACT_TIME_TOLERANCE = 1e-4
@@ -27,6 +31,8 @@ _FEWEST_INTERVALS = 16
 _PRODUCT, _SEARCHED = 250_000, 1024
 # Fewest lanes that are worth a thread.
 _FEWEST_LANES = 256
+# From these on processes judge instead of threads.
+_MANY_LANES, _MANY_CORES = 16384, 4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,23 +115,36 @@ def judge_in_chunks(
     """The fields of a verdict from leaves with leading axis B, up to `chunk` lanes at once.
 
     The lanes are shared among threads, one for each core: NumPy lets go of the interpreter
-    inside its loops.
+    inside its loops. Many lanes and many cores are worth processes, if `judge` can be sent.
     """
     num_lanes, cores = len(leaves["durations"]), os.cpu_count() or 1
     size = min(chunk, max(math.ceil(num_lanes / cores), _FEWEST_LANES))
-
-    def judged(lanes: slice) -> dict[str, np.ndarray]:
-        # A broken or absurd lane may overflow; its verdict says so, not a warning.
-        with np.errstate(all="ignore"):
-            return judge({name: leaf[lanes].astype(np.float64) for name, leaf in leaves.items()})
-
-    chunks = _cut(num_lanes, size)
-    if min(len(chunks), cores) == 1:
-        parts = [judged(lanes) for lanes in chunks]
+    judged = functools.partial(_judged, judge)
+    cases = [
+        {name: leaf[lanes] for name, leaf in leaves.items()} for lanes in _cut(num_lanes, size)
+    ]
+    if min(len(cases), cores) == 1:
+        parts = [judged(case) for case in cases]
+    elif cores >= _MANY_CORES and num_lanes >= _MANY_LANES and _can_be_sent(judge):
+        parts = workers().map(judged, cases)
     else:
         with ThreadPoolExecutor(cores) as pool:
-            parts = list(pool.map(judged, chunks))
+            parts = list(pool.map(judged, cases))
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def _judged(judge: Callable[[dict], dict], case: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    # A broken or absurd lane may overflow; its verdict says so, not a warning.
+    with np.errstate(all="ignore"):
+        return judge({name: leaf.astype(np.float64) for name, leaf in case.items()})
+
+
+def _can_be_sent(judge: Callable) -> bool:
+    try:
+        pickle.dumps(judge)
+    except (pickle.PicklingError, AttributeError, TypeError):
+        return False
+    return True
 
 
 def finite_lanes(case: dict, unbounded: tuple[str, ...] = ()) -> np.ndarray:

@@ -8,6 +8,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -120,7 +121,7 @@ class RunFolder:
         return json.loads(metadata[_PART_RECORD])
 
     def merge_parts(self, num_parts: int, visit: Callable[[pa.Table], None]) -> None:
-        """Join the parts to `plans.parquet`, a row group each, one in memory at a time.
+        """Join the parts to `plans.parquet`, a row group each, two in memory at a time.
 
         Args:
             num_parts: how many there are.
@@ -128,12 +129,13 @@ class RunFolder:
         """
         schema = pq.read_schema(self._part(0))
         schema = schema.with_metadata(_without_record(schema.metadata))
-        with _replacing(self.plans) as scratch:
+        with _replacing(self.plans) as scratch, ThreadPoolExecutor(1) as ahead:
+            following = ahead.submit(pq.read_table, self._part(0))
             with pq.ParquetWriter(scratch, schema, **_encoding(schema)) as writer:
                 for number in range(num_parts):
-                    rows = pq.read_table(self._part(number)).replace_schema_metadata(
-                        schema.metadata
-                    )
+                    rows = following.result().replace_schema_metadata(schema.metadata)
+                    if number + 1 < num_parts:
+                        following = ahead.submit(pq.read_table, self._part(number + 1))
                     visit(rows)
                     writer.write_table(rows, row_group_size=max(rows.num_rows, 1))
 
@@ -168,9 +170,9 @@ class _replacing:
 
 
 def _encoding(schema: pa.Schema) -> dict[str, Any]:
-    """Numbers hardly repeat: only text is worth a dictionary."""
+    """Numbers hardly repeat: only text is worth a dictionary, and little is worth squeezing."""
     text = [field.name for field in schema if pa.types.is_string(field.type)]
-    return {"compression": "zstd", "use_dictionary": text}
+    return {"compression": "snappy", "use_dictionary": text}
 
 
 def _without_record(metadata: dict[bytes, bytes]) -> dict[bytes, bytes]:
