@@ -1,6 +1,7 @@
 """Plans a second of batches that stay on the devices: `planner-jax bench throughput`.
 
     planner-jax bench throughput --task hit --batch 1024 65536 288000 [--devices N]
+    python -m benchmarks.throughput          both tasks, small
 
 One row a batch size: the first call, with what it compiles, then the fastest and the median of
 some more; the share that the referee accepts; and by how much the cost is above that of a
@@ -148,8 +149,8 @@ def _row(kind: Any, planner: Any, num: int, seed: int, devices: list, repeat: in
     return (
         f"| {num:,} | {seconds[0]:.1f} | {clock.seconds:.1f} | {1e3 * fastest:.2f} | "
         f"{1e3 * median:.2f} | {num / fastest:,.0f} | {100.0 * accepted.mean():.3f} % "
-        f"({(~accepted).sum()} of {accepted.size:,} fail) | {np.median(gap):.1f} %, {np.quantile(gap, 0.9):.1f} % | "
-        f"{_memory(devices):.1f} |"
+        f"({(~accepted).sum()} of {accepted.size:,} fail) | {np.median(gap):.1f} %, "
+        f"{np.quantile(gap, 0.9):.1f} % | {_memory(devices):.1f} |"
     )
 
 
@@ -176,3 +177,16 @@ def _agreement(kind: Any, planner: Any, seed: int, devices: list) -> str:
         f"time differs by {1e3 * np.quantile(later, 0.99):.3f} ms on 99 % and "
         f"{1e3 * later.max():.3f} at most; cost by {100.0 * np.quantile(cost, 0.99):.2g} % on 99 %"
     )
+
+
+if __name__ == "__main__":
+    for name in _TASKS:
+        report(
+            task=name,
+            batch=(1024, 8192),
+            devices=None,
+            iterations=None,
+            repeat=5,
+            seed=0,
+            agree=True,
+        )

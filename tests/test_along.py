@@ -12,7 +12,7 @@ from planner_jax.cost.penalty import smoothed_hinge
 from planner_jax.robot.quadrotor import QuadrotorLimits
 from planner_jax.trajectory.proportional_minco import proportional_minco, sample_motion
 
-PROPORTIONS, LANES, SEGMENTS = (0.4, 1.0, 1.0), 32, 2
+PROPORTIONS, LANES, SEGMENTS = (0.4, 1.0), 32, 2
 
 
 def limits_along(motion, given):
@@ -20,7 +20,7 @@ def limits_along(motion, given):
 
 
 ALONG = Along(
-    proportional_minco(4, PROPORTIONS),
+    proportional_minco(2, PROPORTIONS),
     5,
     limits_along,
     margins=(0.1, 0.1, 0.1, 0.05),
@@ -31,7 +31,7 @@ ALONG = Along(
 def cases(num=LANES, dtype=np.float32):
     """Trajectories that break every limit somewhere: columns, durations, gravity and limits."""
     random = np.random.default_rng(0)
-    columns = random.standard_normal((num, SEGMENTS, 10, 3)) * 0.7
+    columns = random.standard_normal((num, SEGMENTS, 5, 3)) * 0.7
     durations = random.uniform(0.2, 0.5, (num, SEGMENTS))
     limit = lambda low, high: random.uniform(low, high, num).astype(dtype)  # noqa: E731
     limits = QuadrotorLimits(limit(2, 9), limit(5, 15), limit(3, 8), limit(-1, 1))
