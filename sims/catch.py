@@ -31,7 +31,7 @@ from sims.closed_loop import (
     whole,
     with_rest,
 )
-from sims.launch import launched, ready, require_hovering, require_world
+from sims.launch import flight_keys, launched, ready, require_hovering, require_world
 from sims.model import NET
 
 HOME = (0.0, 0.0, 1.0)  # [m], where the quadrotor hovers
@@ -47,7 +47,8 @@ _AFTER = 0.05  # [s] flown after the last ball has come down to where it may be 
 class CatchPilot:
     """Plans catches anew from the plan that is flown."""
 
-    planner: ReplanCatch = ReplanCatch()
+    # Later than 0.2 s before a catch a new plan shakes more than the news of the ball is worth.
+    planner: ReplanCatch = ReplanCatch(shortest=0.2)
     excess: float = 0.1  # relative, over a limit, with which a new plan is still flown
 
     def times(self, plan: CatchPlan) -> Array:
@@ -92,9 +93,15 @@ class Throws:
     horizon: np.ndarray  # (B, N) [s], until when each may be caught, its own time
     drag: np.ndarray  # (B, N) K_D [1/m], the true one
     believed: np.ndarray  # (B, N) K_D [1/m]
+    index: np.ndarray  # (B,) place in the whole, which decides the noise
 
     def __len__(self) -> int:
         return self.horizon.shape[0]
+
+    def __getitem__(self, rows: Any) -> "Throws":
+        """Some of them, picked as NumPy does."""
+        columns = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        return Throws(**jax.tree.map(lambda leaf: leaf[rows], columns))
 
 
 def throws(
@@ -122,6 +129,7 @@ def throws(
         horizon=shaped(suite.horizon),
         drag=true,
         believed=(true * (1.0 + drag_error * sign)).astype(np.float32),
+        index=np.arange(num),
     )
 
 
@@ -139,7 +147,7 @@ class CatchFlights:
 
 
 @functools.partial(jax.jit, static_argnames="loop")
-def _scenarios(loop: Loop, flights: Flight, horizon: Array) -> CatchScenario:
+def scenarios(loop: Loop, flights: Flight, horizon: Array) -> CatchScenario:
     """What is to be caught from now on, as it is believed; horizons (B, N) [s] from now."""
     unknown: Any = None
     empty = catch_scenario(
@@ -196,13 +204,13 @@ def fly_catches(
     planner, pilot = planner or ExactCatch(), pilot or CatchPilot()
     drag = jnp.asarray(cases.drag)
     balls, believed = jax.tree.map(jnp.asarray, (cases.balls, cases.believed))
-    keys = jax.random.split(jax.random.key(seed), len(cases))
+    keys = flight_keys(seed, cases.index)
     flight = ready(loop, jnp.tile(jnp.array(HOME), (len(cases), 1)), keys)
     plans, records = [], []
     for ball in range(num_balls):
         flight = launched(loop, flight, balls, drag, believed, ball=ball, seen=SEEN)
         begins = INTERVAL * (np.arange(num_balls) - ball)  # of the balls' own times, from now
-        scenario = _scenarios(loop, flight, jnp.asarray(cases.horizon + begins, jnp.float32))
+        scenario = scenarios(loop, flight, jnp.asarray(cases.horizon + begins, jnp.float32))
         if plan is None or ball > 0:
             plans.append(plan_catches(planner, jax.tree.map(np.asarray, scenario))[1])
         else:

@@ -66,7 +66,8 @@ class Loop:
     sensing: Sensing = Sensing()
     replan: float = 0.0  # [Hz]; 0 flies the first plan
     gains: Gains = Gains()
-    estimate_drag: bool = True
+    kalman: bool = True  # filter of what is seen of the balls
+    estimate_drag: bool = True  # from the energy that a ball loses
     record: bool = False  # path and prediction errors, look by look
 
     def __post_init__(self) -> None:
@@ -245,7 +246,8 @@ def _looked(loop: Loop, estimates: Estimate, seen: Array) -> Estimate:
     gravity = jnp.asarray(loop.world.gravity, seen.dtype)
 
     def one(estimate: Estimate, at: Array) -> Estimate:
-        estimate = sight.look(estimate, at, loop.sensing, gravity)
+        looked = sight.look if loop.kalman else sight.look_unfiltered
+        estimate = looked(estimate, at, loop.sensing, gravity)
         return sight.with_drag(estimate, gravity) if loop.estimate_drag else estimate
 
     return jax.vmap(one)(estimates, seen)

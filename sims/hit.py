@@ -20,7 +20,7 @@ from planner_jax.task.hit.scenario import HitScenario
 from planner_jax.task.hit.serves import advance, generate_serves, to_scenarios
 from planner_jax.task.solve import plan as plan_all
 from sims.closed_loop import Flight, Flown, Loop, Outlook, expected, flown, fly_leg
-from sims.launch import launched, ready, require_hovering, require_world
+from sims.launch import flight_keys, launched, ready, require_hovering, require_world
 from sims.model import RACKET
 from sims.scoring import Contact, landing_point, returned
 
@@ -80,9 +80,15 @@ class Volleys:
 
     scenarios: HitScenario  # leaves (B, ...), with the true ball and drag
     believed: np.ndarray  # (B,) K_D [1/m]
+    index: np.ndarray  # (B,) place in the whole, which decides the noise
 
     def __len__(self) -> int:
         return self.believed.size
+
+    def __getitem__(self, rows: Any) -> "Volleys":
+        """Some of them, picked as NumPy does."""
+        columns = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        return Volleys(**jax.tree.map(lambda leaf: leaf[rows], columns))
 
 
 def volleys(
@@ -102,7 +108,8 @@ def volleys(
     scenarios = to_scenarios(serves)
     sign = np.random.default_rng([seed, 1]).choice([-1.0, 1.0], num)
     true = np.asarray(scenarios.drag)
-    return Volleys(scenarios, (true * (1.0 + drag_error * sign)).astype(np.float32))
+    believed = (true * (1.0 + drag_error * sign)).astype(np.float32)
+    return Volleys(jax.tree.map(np.asarray, scenarios), believed, np.arange(num))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,7 +173,7 @@ def fly_hits(
     require_world(loop, RACKET, 1)
     planner, pilot = planner or ExactHit(drag_after_impact=True), pilot or HitPilot()
     truth = jax.tree.map(jnp.asarray, cases.scenarios)
-    keys = jax.random.split(jax.random.key(seed), len(cases))
+    keys = flight_keys(seed, cases.index)
     drag = truth.drag[:, None]
     flight = ready(loop, truth.head_state[:, 0], keys)
     balls = jax.tree.map(lambda leaf: leaf[:, None], truth.ball)

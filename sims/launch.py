@@ -22,6 +22,11 @@ from sims.scoring import no_contact
 from sims.sensing import Estimate
 
 
+def flight_keys(seed: int, index: np.ndarray) -> Array:
+    """Keys (B,) of the flights at some places of the whole, whichever batch they are flown in."""
+    return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(jax.random.key(seed), jnp.asarray(index))
+
+
 @functools.partial(jax.jit, static_argnames="loop")
 def ready(loop: Loop, starts: Array, keys: Array) -> Flight:
     """Flights with the quadrotors in hover and no ball launched.
@@ -127,8 +132,10 @@ def watched(
     keys = jax.random.split(key, looks.shape[0])
     seen = jax.vmap(lambda k, at: sight.observed(k, at[None], sensing)[0])(keys, looks)
 
+    look = sight.look if loop.kalman else sight.look_unfiltered
+
     def advance(estimate: Estimate, at: Array) -> tuple[Estimate, Estimate]:
-        after = sight.look(estimate, at, sensing, gravity)
+        after = look(estimate, at, sensing, gravity)
         return after, after
 
     first = sight.first_estimate(looks[0], believed)

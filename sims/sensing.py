@@ -163,6 +163,19 @@ def look(estimate: Estimate, seen: Array, sensing: Sensing, gravity: Array) -> E
     return dataclasses.replace(estimate, belief=belief, lever=estimate.lever + speed**3 * period)
 
 
+def look_unfiltered(estimate: Estimate, seen: Array, sensing: Sensing, gravity: Array) -> Estimate:
+    """The estimate one look later without a filter: the place seen, and the velocity to there."""
+    period = 1.0 / sensing.rate
+    before = estimate.belief.ball
+    flown = rk4_step(before, jnp.full_like(estimate.drag, period), estimate.drag, gravity)
+    # The mean velocity on the way, and half of what it changes on the way.
+    vel = (seen - before.pos) / period + 0.5 * (flown.vel - before.vel)
+    taken = jnp.concatenate([seen, vel])
+    blind = jnp.concatenate([flown.pos, flown.vel])
+    mean = jnp.where(jnp.all(jnp.isfinite(seen)), taken, blind)
+    return dataclasses.replace(estimate, belief=dataclasses.replace(estimate.belief, mean=mean))
+
+
 def anchored(estimate: Estimate, gravity: Array) -> Estimate:
     """The estimate with its energy as it is now, from which losses count."""
     energy, variance = _energy(estimate.belief, gravity)

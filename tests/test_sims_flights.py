@@ -1,13 +1,11 @@
 """Whole flights in closed loop: what is planned is flown, and noise is borne."""
 
-import dataclasses
-
 import jax
 import numpy as np
 import pytest
 
 from planner_jax.trajectory.polynomial import evaluate
-from sims.catch import Throws, fly_catches, throws
+from sims.catch import fly_catches, throws
 from sims.closed_loop import Loop
 from sims.hit import SCENARIOS, fly_hits, volleys
 from sims.model import NET, RACKET, World
@@ -78,21 +76,12 @@ def test_cases_out_of_range_are_refused(build, message):
     assert str(error.value) == message
 
 
-def rows(cases: Throws, lanes):
-    """Some of the throws."""
-    picked = {
-        field.name: jax.tree.map(lambda leaf: leaf[lanes], getattr(cases, field.name))
-        for field in dataclasses.fields(cases)
-    }
-    return Throws(**picked)
-
-
 @pytest.mark.slow
 def test_a_batch_is_flown_like_its_flights_one_by_one():
     cases = throws(3, seed=2)
     together = fly_catches(Loop(CATCH), cases)
     for lane in range(3):
-        alone = fly_catches(Loop(CATCH), rows(cases, [lane]))
+        alone = fly_catches(Loop(CATCH), cases[[lane]])
         time = together.flown.contact.time[lane]
         np.testing.assert_allclose(alone.flown.contact.time[0], time, atol=1e-4)
 
