@@ -183,8 +183,8 @@ def fly_catches(
 ) -> CatchFlights:
     """Plan and fly a batch of throws.
 
-    Whenever a ball comes into sight, all catches still to be made are planned from scratch;
-    in between they are re-planned inside the loop.
+    Whenever a ball comes into sight, all catches still to be made are planned from scratch, next
+    whatever can be caught first; in between they are re-planned inside the loop.
 
     Args:
         loop: world, sensing, rates and gains.
@@ -212,7 +212,7 @@ def fly_catches(
         begins = INTERVAL * (np.arange(num_balls) - ball)  # of the balls' own times, from now
         scenario = scenarios(loop, flight, jnp.asarray(cases.horizon + begins, jnp.float32))
         if plan is None or ball > 0:
-            plans.append(plan_catches(planner, jax.tree.map(np.asarray, scenario))[1])
+            plans.append(plan_catches(planner, jax.tree.map(np.asarray, scenario), "greedy")[1])
         else:
             require_catch_plan(plan, scenario)
             plans.append(plan)

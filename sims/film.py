@@ -91,7 +91,8 @@ class Scene:
         points = np.concatenate(every)
         low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
         low[2] = 0.0
-        low, high = low - 0.2, high + 0.3
+        thin = np.maximum(2.0 - (high - low), 0.0)  # [m], so that flat flights keep their depth
+        low, high = low - 0.2 - 0.5 * thin, high + 0.3 + 0.5 * thin
         self.axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(0.0, high[2]))
         self.axes.set_box_aspect(high - low)
         self.axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", title=title)
