@@ -159,10 +159,12 @@ def with_rest(trajectory: PiecewisePolynomial) -> PiecewisePolynomial:
     coeffs = trajectory.coeffs
     missing = 8 - coeffs.shape[1]
     coeffs = jnp.pad(coeffs, ((0, 0), (0, missing), (0, 0)))
-    end = total_duration(trajectory)
+    # Pieces of balls that are not there come last and last no time.
+    last = jnp.max(jnp.where(trajectory.durations > 0.0, jnp.arange(coeffs.shape[0]), 0))
+    piece = PiecewisePolynomial(coeffs[last][None], trajectory.durations[last][None])
     unit = jnp.asarray([_BRAKING**k for k in range(8)], coeffs.dtype)[:, None]
     factorials = jnp.asarray([1.0, 1.0, 2.0, 6.0], coeffs.dtype)[:, None]
-    state = jnp.stack([evaluate(trajectory, end, k) for k in range(4)])
+    state = jnp.stack([evaluate(piece, piece.durations[0], k) for k in range(4)])
     low = state * unit[:4] / factorials
     rest = state[0] + 0.5 * _BRAKING * state[1]
     rest = rest.at[2].max(jnp.minimum(_LOWEST_REST, state[0, 2] + 1.0))
@@ -176,9 +178,9 @@ def with_rest(trajectory: PiecewisePolynomial) -> PiecewisePolynomial:
     )
     inverse = jnp.asarray(np.linalg.inv(rows[:, 4:]), coeffs.dtype)
     high = jnp.matmul(inverse, wanted, precision=lax.Precision.HIGHEST)
-    piece = jnp.concatenate([low, high]) / unit
+    braking = jnp.concatenate([low, high]) / unit
     return PiecewisePolynomial(
-        coeffs=jnp.concatenate([coeffs, piece[None]]),
+        coeffs=jnp.concatenate([coeffs, braking[None]]),
         durations=jnp.append(trajectory.durations, jnp.asarray(_BRAKING, coeffs.dtype)),
     )
 

@@ -78,6 +78,11 @@ def test_a_trajectory_comes_to_rest_smoothly_after_its_end():
     for order in range(4):
         before, after = evaluate(wiggle(), end, order), evaluate(path, end + 1e-5, order)
         np.testing.assert_allclose(after, before, rtol=2e-3, atol=1e-3)
+    absent = PiecewisePolynomial(
+        jnp.concatenate([wiggle().coeffs, jnp.zeros((2, 8, 3))]), jnp.array([1.0, 0.0, 0.0])
+    )
+    braking = with_rest(absent).coeffs[-1]
+    np.testing.assert_allclose(braking, path.coeffs[-1], atol=1e-5)
     for order in (1, 2, 3):
         np.testing.assert_allclose(evaluate(path, rest, order), 0.0, atol=2e-2)
 
