@@ -19,6 +19,7 @@ Run it on an idle machine; the load average is printed.
 
 import argparse
 import dataclasses
+import gc
 import os
 import time
 from typing import Any
@@ -31,6 +32,7 @@ from jax.flatten_util import ravel_pytree
 from planner_jax.ball.estimation import EkfModel, ekf_init, ekf_predict, ekf_update
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath
+from planner_jax.optimise.status import is_solved
 from planner_jax.referee.catch import referee_catches
 from planner_jax.task.catch.decide import decided, greedy
 from planner_jax.task.catch.exact import ExactCatch
@@ -38,7 +40,7 @@ from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.task.catch.replan import ReplanCatch, replanned
 from planner_jax.task.catch.scenario import CatchScenario
 from planner_jax.task.catch.suites import make_suite
-from planner_jax.task.solve import is_solved, plan
+from planner_jax.task.solve import plan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 SEEN = 0.1  # [s], how long the ball has been in sight when planning begins
@@ -287,6 +289,8 @@ def main() -> None:
     for lane, seen in zip(lanes[:WARM_UP], looks, strict=False):
         fly(lane, seen, estimator, period, Times())
     times = Times()
+    gc.collect()
+    gc.disable()  # what a loop with deadlines does: a collection takes milliseconds
     flights = [
         fly(lane, seen, estimator, period, times) for lane, seen in zip(lanes, looks, strict=True)
     ]

@@ -14,11 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
+from planner_jax.optimise.status import is_solved
 from planner_jax.referee.hit import referee_hits
 from planner_jax.sweep.summary import wilson_interval
 from planner_jax.task.hit.exact import ExactHit
 from planner_jax.task.hit.serves import Serves, generate_serves, read_serves, to_scenarios
-from planner_jax.task.solve import is_solved, plan
+from planner_jax.task.solve import plan
 
 ROWS: dict[str, dict] = {
     "base": {},

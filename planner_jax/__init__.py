@@ -7,7 +7,8 @@ The public names, in the order of the data flow:
 * what to catch: `CatchScenario`, `catch_scenario`, `make_suite`
 * when and in what order to catch: `plan_catches`, `closest_approach`
 * the planners: `planner` and `catch_planner` (by name), `ExactHit`, `ExactCatch`, and `plan`, one
-  call for one case or many
+  call for one case or many, on all devices; `plan_across_processes`, `keep_compiled_programs`
+* plans again while a ball flies: `ReplanCatch`, `replanned`
 * gradients through an optimum: `optimal_plan`
 * the judges: `referee_hits`, `referee_catches`
 * reading a plan: `PiecewisePolynomial`, `evaluate`, `Status`
@@ -39,6 +40,10 @@ _PUBLIC = {
     "ExactHit": "planner_jax.task.hit.exact",
     "ExactCatch": "planner_jax.task.catch.exact",
     "plan": "planner_jax.task.solve",
+    "plan_across_processes": "planner_jax.task.solve",
+    "keep_compiled_programs": "planner_jax.compile_cache",
+    "ReplanCatch": "planner_jax.task.catch.replan",
+    "replanned": "planner_jax.task.catch.replan",
     "optimal_plan": "planner_jax.optimise.implicit",
     "referee_hits": "planner_jax.referee.hit",
     "referee_catches": "planner_jax.referee.catch",

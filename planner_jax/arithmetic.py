@@ -41,9 +41,14 @@ def at_least(x: Array, floor: float) -> Array:
     return jnp.where(x < floor, floor, x)
 
 
-def components(x: Array) -> list[Array]:
-    """The n components of vectors (..., n), each (...).
+Components = Array | tuple[Array, Array, Array]  # (..., 3), or its three components, each (...)
+
+
+def components(x: Components) -> list[Array]:
+    """The n components of vectors (..., n), each (...); a tuple of them is what it is.
 
     As one split, whose derivative is one concatenation and not n paddings to be added.
     """
+    if isinstance(x, tuple):
+        return [*x]
     return [jnp.squeeze(part, -1) for part in jnp.split(x, x.shape[-1], axis=-1)]

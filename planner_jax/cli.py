@@ -1,4 +1,4 @@
-"""The command line: `planner-jax sweep`, `planner-jax fly` and `planner-jax report`."""
+"""The command line: `planner-jax sweep|fly hit|catch`, `report`, `bench throughput`, `doctor`."""
 
 import argparse
 import datetime
@@ -7,20 +7,24 @@ import shlex
 import signal
 import sys
 import threading
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
+from planner_jax.compile_cache import keep_compiled_programs
 from planner_jax.sweep.catch.settings import DECISIONS, NET_TESTS, SUITES, CatchSweep
 from planner_jax.sweep.environment import installed_version
 from planner_jax.sweep.hit.settings import HitSweep
-from planner_jax.sweep.settings import SettingError, SweepSettings
+from planner_jax.sweep.settings import SettingError, SweepSettings, require
 from planner_jax.task.catch.planners import PLANNERS as CATCH_PLANNERS
 from planner_jax.task.hit.planners import PLANNERS as HIT_PLANNERS
 
-_OPTIONS = {*HitSweep.__dataclass_fields__, *CatchSweep.__dataclass_fields__, "out"}
-_OPTIONS |= {"noise", "replan", "balls", "scenario", "drag_error", "video"}
+_OPTIONS = {
+    *HitSweep.__dataclass_fields__,
+    *CatchSweep.__dataclass_fields__,
+    *("out", "devices", "iterations", "repeat"),
+    *("noise", "replan", "balls", "scenario", "drag_error", "video"),
+}
 _FAILED, _BAD_ARGUMENT, _INTERRUPTED = 1, 2, 130
 
 
@@ -36,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = vars(_parser().parse_args(arguments))
     command = options.pop("command")
     try:
-        command(options)
+        return command(options) or 0
     except KeyboardInterrupt as stop:
         print(f"planner-jax: {str(stop) or 'interrupted'}", file=sys.stderr)
         return _INTERRUPTED
@@ -45,7 +49,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except OSError as error:
         _fail(str(error))
         return _FAILED
-    return 0
 
 
 def _fail(message: str) -> int:
@@ -94,6 +97,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     report.add_argument("run", metavar="RUN", help="folder of a finished run")
     report.set_defaults(command=_report)
+    _add_bench(commands, look)
+    doctor = commands.add_parser(
+        "doctor", help="versions, devices, precision, cache and a timed plan", **look
+    )
+    doctor.set_defaults(command=_doctor)
     return parser
 
 
@@ -242,7 +250,7 @@ def _add_fly(tasks: Any, look: dict[str, Any], task: str, words: str) -> None:
 
 
 def _fly(task: str, given: dict[str, Any]) -> None:
-    _keep_compiled_programs()
+    keep_compiled_programs()
     from sims.run import FlySettings, headline, start_flights
 
     out, video = given.pop("out", None), given.pop("video", None)
@@ -250,6 +258,50 @@ def _fly(task: str, given: dict[str, Any]) -> None:
     manifest = start_flights(FlySettings(task, **given), out, video)
     print("\n".join(headline(manifest)))
     print(f"Look at {Path(out) / 'index.html'}")
+
+
+def _add_bench(commands: Any, look: dict[str, Any]) -> None:
+    """The arguments of `bench throughput`."""
+    bench = commands.add_parser("bench", help="measure this machine", **look)
+    kinds = bench.add_subparsers(title="benchmarks", required=True, metavar="benchmark")
+    parser = kinds.add_parser(
+        "throughput",
+        help="plans a second, with success and cost",
+        description="Plans a second of batches that stay on the devices, with what the referee "
+        "says of them,\nthe cost beside a long search's, compile time and memory.",
+        **look,
+    )
+    add = parser.add_argument
+    # fmt: off
+    add("--task", choices=("hit", "catch"), default="hit", help="(default: hit)")
+    add("--batch", type=int, nargs="+", default=[1024, 8192], metavar="B",
+        help="plans in one call, one or more sizes (default: 1024 8192)")
+    add("--devices", type=int, metavar="N", help="how many share a batch (default: all)")
+    add("--iterations", type=int, metavar="K",
+        help="of the first round (default: the planner's own)")
+    add("--repeat", type=int, default=5, metavar="R", help="timed calls (default: 5)")
+    add("--seed", type=int, default=0, metavar="K", help="of the drawn scenarios (default: 0)")
+    add("--agree", action="store_true", help="compare the lanes with those of a CPU, too")
+    # fmt: on
+    parser.set_defaults(command=_throughput)
+
+
+def _throughput(options: dict[str, Any]) -> None:
+    for name in ("devices", "iterations", "repeat"):
+        value = options[name]
+        require(value is None or value >= 1, name, ">= 1", value)
+    require(min(options["batch"]) >= 1, "batch", ">= 1", min(options["batch"]))
+    require(options["seed"] >= 0, "seed", ">= 0", options["seed"])
+    keep_compiled_programs()
+    from benchmarks.throughput import report
+
+    report(**options)
+
+
+def _doctor(options: dict[str, Any]) -> int:
+    from planner_jax.doctor import report
+
+    return 0 if report() else _FAILED
 
 
 def _sweep(kind: type[SweepSettings], given: dict[str, Any]) -> None:
@@ -265,7 +317,7 @@ def _sweep(kind: type[SweepSettings], given: dict[str, Any]) -> None:
     # A shell starts background jobs deaf to SIGINT; this one can be stopped and resumed there too.
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.default_int_handler)
-    _keep_compiled_programs()
+    keep_compiled_programs()
     from planner_jax.sweep import run
 
     try:
@@ -294,23 +346,6 @@ def _report(options: dict[str, Any]) -> None:
     folder = RunFolder(options["run"], name="RUN")
     write_report(folder)
     _print_result(folder.read_manifest(), folder.path)
-
-
-def _keep_compiled_programs() -> None:
-    """Let JAX keep what it compiles from run to run, where there is a folder for it."""
-    import jax
-
-    home = os.environ.get("XDG_CACHE_HOME") or os.path.join("~", ".cache")
-    default = os.path.join(os.path.expanduser(home), "planner-jax", "jax")
-    folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or default
-    # An entry that cannot be read or written costs a compilation, not the run.
-    warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache")
-    try:
-        os.makedirs(folder, exist_ok=True)
-    except OSError:
-        return
-    jax.config.update("jax_compilation_cache_dir", folder)
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from derivatives import assert_gradient_matches_differences
 
 from planner_jax.ball.flight import BallState, drag_free_flight, fly
 from planner_jax.ball.impact import racket_impact
-from planner_jax.optimise.status import Status
+from planner_jax.optimise.status import Status, is_solved
 from planner_jax.referee.hit import referee_hits
 from planner_jax.task.hit import court
 from planner_jax.task.hit.bat import BatHit, serve_origin, transition_point
@@ -20,7 +20,7 @@ from planner_jax.task.hit.juggle import JuggleHit, eased_minimum_jerk
 from planner_jax.task.hit.planners import PLANNERS, planner
 from planner_jax.task.hit.scenario import hit_scenario
 from planner_jax.task.hit.serves import generate_serves, to_scenarios
-from planner_jax.task.solve import is_solved, plan
+from planner_jax.task.solve import plan
 from planner_jax.trajectory.minimum_jerk import minimum_jerk
 from planner_jax.trajectory.polynomial import evaluate
 

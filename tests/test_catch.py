@@ -14,12 +14,12 @@ from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
 from planner_jax.optimise.multistart import solve_round
 from planner_jax.optimise.problem import Round, Stage
 from planner_jax.optimise.scaling import shipped_scale
-from planner_jax.optimise.status import Status
+from planner_jax.optimise.status import Status, is_solved
 from planner_jax.referee.catch import referee_catches
 from planner_jax.task.catch.decide import decided, greedy
 from planner_jax.task.catch.exact import ExactCatch
 from planner_jax.task.catch.suites import make_suite
-from planner_jax.task.solve import is_solved, plan
+from planner_jax.task.solve import plan
 from planner_jax.trajectory.polynomial import evaluate
 from tests.jaxpr import assert_full_precision
 

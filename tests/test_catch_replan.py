@@ -9,12 +9,12 @@ import pytest
 from planner_jax.ball.flight import BallState
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
-from planner_jax.optimise.status import Status
+from planner_jax.optimise.status import Status, is_solved
 from planner_jax.referee.catch import referee_catches
 from planner_jax.task.catch.exact import ExactCatch
 from planner_jax.task.catch.replan import ReplanCatch, replanned
 from planner_jax.task.catch.suites import make_suite
-from planner_jax.task.solve import is_solved, plan
+from planner_jax.task.solve import plan
 
 SCRATCH = ExactCatch(rounds=(Round(starts=1, solver=LbfgsConfig(max_steps=40)),))
 AGAIN = ReplanCatch(

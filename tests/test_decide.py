@@ -11,7 +11,7 @@ from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
-from planner_jax.optimise.status import Status
+from planner_jax.optimise.status import Status, is_solved
 from planner_jax.referee.catch import referee_catches
 from planner_jax.task.catch.decide import (
     best_orders,
@@ -23,7 +23,6 @@ from planner_jax.task.catch.decide import (
 from planner_jax.task.catch.exact import ExactCatch
 from planner_jax.task.catch.scenario import catch_scenario
 from planner_jax.task.catch.suites import make_suite
-from planner_jax.task.solve import is_solved
 
 PLANNER = ExactCatch(rounds=(Round(1, LbfgsConfig(max_steps=20)),))
 GREEDY = jax.jit(jax.vmap(greedy))

@@ -8,6 +8,7 @@ import scipy.optimize
 
 from planner_jax.optimise import lbfgs
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
+from planner_jax.optimise.lbfgs_kernel import turn_kernel
 from planner_jax.optimise.multistart import minimise, status_of
 from planner_jax.optimise.status import Status
 
@@ -58,26 +59,34 @@ def two_loop_by_the_book(steps, changes, grad):
 def test_direction_is_that_of_the_two_loop_recursion(float64):
     config = LbfgsConfig(memory=4, step_cap=1e9)
     objective = unlimited(stretched)
-    state = lbfgs.init(objective, jnp.linspace(-1.0, 2.0, 5), config)
-    steps, changes = [], []
-    for _ in range(7):
-        after = lbfgs.step(objective, state, config)
-        steps.append(np.asarray(after.point - state.point))
-        changes.append(np.asarray(after.grad - state.grad))
-        state = after
-    expected = two_loop_by_the_book(steps[-4:], changes[-4:], np.asarray(state.grad))
-    np.testing.assert_allclose(lbfgs.search_direction(state, config), expected, rtol=1e-9)
+    state = lbfgs.init(jnp.linspace(-1.0, 2.0, 5), config)
+    points = [state.point]
+    for _ in range(8):
+        state = lbfgs.step(objective, state, config)
+        points.append(state.point)
+    points = np.asarray(points)
+    grads = np.asarray(jax.vmap(jax.grad(stretched))(points))
+    steps, changes = np.diff(points[:-1], axis=0)[-4:], np.diff(grads[:-1], axis=0)[-4:]
+    expected = two_loop_by_the_book(list(steps), list(changes), grads[-2])
+    np.testing.assert_allclose(
+        lbfgs.search_direction(state.memory, state.grad, config.step_cap), expected, rtol=1e-9
+    )
+    taken = points[-1] - points[-2]
+    lengths = taken / expected
+    np.testing.assert_allclose(lengths, lengths[0], rtol=1e-6)
+    assert min(abs(lengths[0] - length) for length in config.trial_steps) < 1e-6
 
 
 def test_first_direction_has_unit_length_whatever_the_gradient():
+    memory = lbfgs.init(jnp.ones(4), LbfgsConfig()).memory
     for size in (1e-6, 1e6):
-        state = lbfgs.init(unlimited(lambda x, s=size: s * jnp.sum(x)), jnp.ones(4), LbfgsConfig())
-        assert jnp.linalg.norm(lbfgs.search_direction(state, LbfgsConfig())) == pytest.approx(1.0)
+        direction = lbfgs.search_direction(memory, jnp.full(4, size), 2.0)
+        assert jnp.linalg.norm(direction) == pytest.approx(1.0)
 
 
 def test_no_step_is_longer_than_the_cap():
     config = LbfgsConfig(step_cap=0.1)
-    state = lbfgs.init(unlimited(stretched), jnp.full(5, 50.0), config)
+    state = lbfgs.init(jnp.full(5, 50.0), config)
     for _ in range(5):
         after = lbfgs.step(unlimited(stretched), state, config)
         assert jnp.linalg.norm(after.point - state.point) <= 0.1 * max(config.trial_steps) * 1.001
@@ -85,11 +94,51 @@ def test_no_step_is_longer_than_the_cap():
 
 
 def test_cost_never_rises():
-    state = lbfgs.init(unlimited(rosenbrock), jnp.full(4, -1.0), LbfgsConfig())
+    state = lbfgs.init(jnp.full(4, -1.0), LbfgsConfig())
     for _ in range(20):
         after = lbfgs.step(unlimited(rosenbrock), state, LbfgsConfig())
-        assert after.cost <= state.cost
+        assert rosenbrock(after.point) <= rosenbrock(state.point)
         state = after
+
+
+def test_an_iteration_without_descent_forgets_and_looks_nearer():
+    config = LbfgsConfig(trial_steps=(1.0,))
+    state = lbfgs.init(jnp.full(3, 1e-3), config)  # a unit step overshoots
+    state = lbfgs.step(unlimited(lambda x: jnp.sum(x**2)), state, config)
+    np.testing.assert_array_equal(state.step, 0.0)
+    assert state.reach < 1.0
+    memory = lbfgs.remember(
+        lbfgs.Memory(jnp.ones((6, 3)), jnp.ones((6, 3)), jnp.ones(6)), state.step, jnp.zeros(3)
+    )
+    np.testing.assert_array_equal(memory.inverse_curvature, 0.0)
+
+
+def test_the_kernel_turns_as_the_plain_path_does():
+    """With room for more pairs than there are, bad pairs, and lanes that did not move."""
+    pairs, n, lanes = 3, 5, 32
+    random = np.random.default_rng(3)
+    curvature = np.logspace(0, 2, n)[:, None]
+    steps = random.standard_normal((pairs, n, lanes)).astype(np.float32)
+    changes = (curvature * steps).astype(np.float32)
+    inverse = 1.0 / (steps * changes).sum(axis=1)
+    inverse[0, :8] = 0.0  # not all slots are filled
+    step = random.standard_normal((n, lanes)).astype(np.float32)
+    change = (curvature * step).astype(np.float32)
+    change[:, 8:16] *= -1.0  # curvature that is not positive
+    step[:, 16:24] = 0.0
+    grad = random.standard_normal((n, lanes)).astype(np.float32)
+    memory = lbfgs.Memory(steps, changes, inverse.astype(np.float32))
+    args = memory, step, change, grad
+
+    def plain(memory, step, change, grad):
+        memory = lbfgs.remember(memory, step, change)
+        return memory, lbfgs.search_direction(memory, grad, 2.0)
+
+    expected = jax.vmap(plain, in_axes=-1, out_axes=-1)(*args)
+    kernel = turn_kernel(pairs, 2.0, interpret=True)
+    found = kernel(jax.tree.structure(args), [jnp.asarray(x) for x in jax.tree.leaves(args)])
+    for ours, theirs in zip(found, jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-6)
 
 
 def test_best_feasible_iterate_is_kept_when_the_minimum_is_infeasible():

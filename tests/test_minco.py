@@ -52,7 +52,7 @@ def proportional_one(order, pieces, rows, offsets, duration):
     args = maps_of(order, pieces), rows, offsets, duration
     return (
         proportional_trajectory(*args),
-        sample_motion(args[0], NODES, *args[1:]),
+        sample_motion(args[0], NODES, jnp.concatenate(args[1:3]), args[3]),
         trajectory_energy(*args),
     )
 

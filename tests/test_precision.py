@@ -39,7 +39,7 @@ def proportional_values(rows, offsets, duration):
     args = proportional_minco(4, equal_pieces(4)), rows, offsets, duration
     parts = (
         proportional_trajectory(*args),
-        sample_motion(args[0], 5, *args[1:]),
+        sample_motion(args[0], 5, jnp.concatenate(args[1:3]), args[3]),
         trajectory_energy(*args),
     )
     return sum(jnp.sum(leaf) for leaf in jax.tree.leaves(parts))

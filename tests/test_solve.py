@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -10,8 +11,8 @@ from jax import Array
 
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
 from planner_jax.optimise.problem import Round
-from planner_jax.optimise.status import Status
-from planner_jax.task.solve import is_solved, plan
+from planner_jax.optimise.status import Status, is_solved
+from planner_jax.task.solve import plan, plan_across_processes
 
 
 @struct.dataclass
@@ -131,3 +132,28 @@ def test_wrong_batches_are_refused():
 def test_a_round_needs_a_start():
     with pytest.raises(ValueError, match="starts must be >= 1, got 0"):
         Round(0, LbfgsConfig())
+
+
+def test_arrays_on_a_device_stay_there_and_give_the_same_plans():
+    goals = np.linspace(-1.0, 5.0, 41).astype(np.float32)
+    host = plan(WellPlanner(), Well(goals), chunk=16)
+    resident = plan(WellPlanner(), Well(jnp.asarray(goals)), chunk=16)
+    for ours, theirs in zip(jax.tree.leaves(resident), jax.tree.leaves(host), strict=True):
+        assert isinstance(ours, jax.Array)
+        assert isinstance(theirs, np.ndarray)
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_one_process_plans_the_whole_batch_alone():
+    shared = plan_across_processes(WellPlanner(), Well(GOALS))
+    alone = plan(WellPlanner(), Well(GOALS))
+    jax.tree.map(np.testing.assert_array_equal, shared, alone)
+
+
+def test_lanes_of_unequal_length_are_refused():
+    @struct.dataclass
+    class Pair(Well):
+        other: Array
+
+    with pytest.raises(ValueError, match=r"scenarios.other must have 5 lanes, got shape \(3,\)"):
+        plan(WellPlanner(), Pair(GOALS, np.zeros(3, np.float32)))

@@ -12,10 +12,11 @@ from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath, HarmonicPath
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
+from planner_jax.optimise.status import is_solved
 from planner_jax.referee.catch import referee_catches
 from planner_jax.task.catch.exact import ExactCatch
 from planner_jax.task.catch.scenario import catch_scenario
-from planner_jax.task.solve import is_solved, plan
+from planner_jax.task.solve import plan
 
 GRAVITY = 9.81
 POS, VEL = np.array([3.0, -0.2, 2.5]), np.array([-2.5, 0.3, 4.0])

@@ -9,12 +9,16 @@ Direction: Liu and Nocedal 1989, two-loop recursion, with gamma = s.y / y.y of t
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array
+
+from planner_jax.lanes import with_kernel
+from planner_jax.optimise.lbfgs_kernel import turn_kernel
 
 
 @struct.dataclass
@@ -32,7 +36,7 @@ Objective = Callable[[Array], Evaluation]
 class LbfgsConfig:
     """Sizes and switches of the solver: hashable, so static under jit."""
 
-    max_steps: int = 10
+    max_steps: int = 10  # 0 for the start itself
     memory: int = 6
     trial_steps: tuple[float, ...] = (1.0, 2.5, 0.3)
     step_cap: float = 2.0  # largest Euclidean length of a unit step
@@ -47,25 +51,27 @@ class LbfgsConfig:
 
 
 @struct.dataclass
+class Memory:
+    """The newest m pairs of steps and changes of the gradient, newest last."""
+
+    steps: Array  # (m, n), s_k of Liu and Nocedal
+    changes: Array  # (m, n), y_k
+    inverse_curvature: Array  # (m,), 1 / s.y; 0 where the slot is empty
+
+
+@struct.dataclass
 class LbfgsState:
     """What one lane carries from iteration to iteration."""
 
     point: Array  # (n,)
-    cost: Array  # ()
-    grad: Array  # (n,)
-    steps: Array  # (m, n), newest last: s_k of Liu and Nocedal
-    changes: Array  # (m, n), y_k
-    inverse_curvature: Array  # (m,), 1 / s.y; 0 where the slot is empty
+    step: Array  # (n,), that led to the point; 0 if it did not move
+    grad: Array  # (n,), where that step began
+    memory: Memory
     best_point: Array  # (n,)
-    best: Evaluation
+    best: Evaluation  # not finite before the first iteration
     reach: Array  # (), multiplies the trial steps: shrinks while none lowers the cost
     iteration: Array  # () int32
     stalled: Array  # () int32, iterations in a row without a decrease
-
-
-def _value(objective: Objective, point: Array) -> tuple[Array, Array]:
-    evaluation = objective(point)
-    return evaluation.cost, evaluation.violation
 
 
 def _better(a: Evaluation, b: Evaluation) -> Array:
@@ -76,88 +82,120 @@ def _better(a: Evaluation, b: Evaluation) -> Array:
     return jnp.where(both, by_cost, by_violation) | ~jnp.isfinite(b.cost)
 
 
-def init(objective: Objective, point: Array, config: LbfgsConfig) -> LbfgsState:
-    """State before the first iteration."""
-    (cost, violation), grad = jax.value_and_grad(lambda x: _value(objective, x), has_aux=True)(
-        point
-    )
+def init(point: Array, config: LbfgsConfig) -> LbfgsState:
+    """State before the first iteration; nothing is evaluated."""
+    zero = jnp.zeros_like(point)
     empty = jnp.zeros((config.memory, point.shape[0]), point.dtype)
+    unknown = jnp.full((), jnp.inf, point.dtype)
     return LbfgsState(
         point=point,
-        cost=cost,
-        grad=grad,
-        steps=empty,
-        changes=empty,
-        inverse_curvature=empty[:, 0],
+        step=zero,
+        grad=zero,
+        memory=Memory(steps=empty, changes=empty, inverse_curvature=empty[:, 0]),
         best_point=point,
-        best=Evaluation(cost, violation),
+        best=Evaluation(unknown, unknown),
         reach=jnp.ones((), point.dtype),
         iteration=jnp.zeros((), jnp.int32),
         stalled=jnp.zeros((), jnp.int32),
     )
 
 
-def search_direction(state: LbfgsState, config: LbfgsConfig) -> Array:
+def remember(memory: Memory, step: Array, change: Array) -> Memory:
+    """The memory with one pair (n,), (n,) more.
+
+    A pair without positive curvature is left out. After no step at all the memory is emptied:
+    the next direction is steepest descent.
+    """
+    curvature = jnp.sum(step * change)
+    keep = curvature > 1e-8 * jnp.sum(change**2)
+    moved = jnp.any(step != 0.0)
+    inverse = jnp.where(keep, 1.0 / jnp.where(keep, curvature, 1.0), 0.0)
+
+    def push(old: Array, new: Array) -> Array:
+        pushed = jnp.concatenate([old[1:], new[None]])
+        return jnp.where(keep, pushed, jnp.where(moved, old, 0.0))
+
+    return Memory(
+        steps=push(memory.steps, step),
+        changes=push(memory.changes, change),
+        inverse_curvature=push(memory.inverse_curvature, inverse),
+    )
+
+
+def search_direction(memory: Memory, grad: Array, step_cap: float) -> Array:
     """Quasi-Newton direction -H g, no longer than the step cap, (n,).
 
     Without a pair in memory it is the steepest descent of unit length: in scaled variables
     one is the size of a sensible step, whatever the size of the gradient.
     """
-    q = state.grad
+    q = grad
     alphas = []
-    for k in reversed(range(config.memory)):
-        alpha = state.inverse_curvature[k] * jnp.sum(state.steps[k] * q)
-        q = q - alpha * state.changes[k]
+    pairs = range(memory.steps.shape[0])
+    for k in reversed(pairs):
+        alpha = memory.inverse_curvature[k] * jnp.sum(memory.steps[k] * q)
+        q = q - alpha * memory.changes[k]
         alphas.append(alpha)
-    newest = state.inverse_curvature[-1]
-    size = jnp.sum(state.changes[-1] ** 2) * newest
-    slope = jnp.sqrt(jnp.maximum(jnp.sum(state.grad**2), 1e-30))
+    newest = memory.inverse_curvature[-1]
+    size = jnp.sum(memory.changes[-1] ** 2) * newest
+    slope = jnp.sqrt(jnp.maximum(jnp.sum(grad**2), 1e-30))
     gamma = jnp.where(newest > 0.0, 1.0 / jnp.where(newest > 0.0, size, 1.0), 1.0 / slope)
     q = gamma * q
-    for k, alpha in zip(range(config.memory), reversed(alphas), strict=True):
-        beta = state.inverse_curvature[k] * jnp.sum(state.changes[k] * q)
-        q = q + state.steps[k] * (alpha - beta)
+    for k, alpha in zip(pairs, reversed(alphas), strict=True):
+        beta = memory.inverse_curvature[k] * jnp.sum(memory.changes[k] * q)
+        q = q + memory.steps[k] * (alpha - beta)
     length = jnp.sqrt(jnp.maximum(jnp.sum(q**2), 1e-30))
-    return -q * jnp.minimum(1.0, config.step_cap / length)
+    return -q * jnp.minimum(1.0, step_cap / length)
+
+
+@functools.cache
+def _turn(num_pairs: int, step_cap: float) -> Callable:
+    """Memory and direction after one more pair, with a kernel for many lanes."""
+
+    def turn(memory: Memory, step: Array, change: Array, grad: Array) -> tuple[Memory, Array]:
+        memory = remember(memory, step, change)
+        return memory, search_direction(memory, grad, step_cap)
+
+    return with_kernel(turn, turn_kernel(num_pairs, step_cap))
 
 
 def step(objective: Objective, state: LbfgsState, config: LbfgsConfig) -> LbfgsState:
-    """One iteration: direction, all trial steps at once, the lowest kept, memory updated."""
-    direction = search_direction(state, config)
-    trials = state.reach * jnp.asarray(config.trial_steps, state.point.dtype)
-    costs = jax.vmap(lambda a: objective(state.point + a * direction).cost)(trials)
-    costs = jnp.where(jnp.isfinite(costs), costs, jnp.inf)
-    chosen = jnp.argmin(costs)
-    decreased = costs[chosen] < state.cost
-    # Without a decrease the lane stands still and forgets its curvature: the next direction
-    # is steepest descent, and looks nearer.
-    taken = jnp.where(decreased, trials[chosen], 0.0)
-    point = state.point + taken * direction
-    (cost, violation), grad = jax.value_and_grad(lambda x: _value(objective, x), has_aux=True)(
-        point
-    )
-    s = point - state.point
-    y = grad - state.grad
-    curvature = jnp.sum(s * y)
-    keep = curvature > 1e-8 * jnp.sum(y**2)
-    inverse = jnp.where(keep, 1.0 / jnp.where(keep, curvature, 1.0), 0.0)
+    """One iteration: gradient, memory, direction, all trial steps at once, the lowest kept.
 
-    def push(old: Array, new: Array) -> Array:
-        pushed = jnp.concatenate([old[1:], new[None]])
-        return jnp.where(keep, pushed, jnp.where(decreased, old, 0.0))
+    The gradient comes first, so that k iterations take k gradients and no more.
+    """
 
+    def value(point: Array) -> tuple[Array, Array]:
+        evaluation = objective(point)
+        return evaluation.cost, evaluation.violation
+
+    (cost, violation), grad = jax.value_and_grad(value, has_aux=True)(state.point)
     here = Evaluation(cost, violation)
-    better = _better(here, state.best)
-    progress = state.cost - cost > config.tolerance * jnp.abs(state.cost)
+    memory, direction = _turn(config.memory, config.step_cap)(
+        state.memory, state.step, grad - state.grad, grad
+    )
+    lengths = state.reach * jnp.asarray(config.trial_steps, grad.dtype)
+    trials = jax.vmap(lambda length: objective(state.point + length * direction))(lengths)
+    costs = jnp.where(jnp.isfinite(trials.cost), trials.cost, jnp.inf)
+    is_chosen = jnp.arange(costs.size) == jnp.argmin(costs)
+
+    def of_chosen(values: Array) -> Array:  # without a gather, which would need a loop of its own
+        return jnp.sum(jnp.where(is_chosen, values, 0.0))
+
+    decreased = of_chosen(costs) < cost
+    # Without a decrease the lane stands still and next looks nearer.
+    step = jnp.where(decreased, of_chosen(lengths), 0.0) * direction
+    point = state.point + step
+    there = jax.tree.map(lambda new, old: jnp.where(decreased, of_chosen(new), old), trials, here)
+    best = jax.tree.map(lambda a, b: jnp.where(state.iteration == 0, a, b), here, state.best)
+    better = _better(there, best)
+    progress = cost - there.cost > config.tolerance * jnp.abs(cost)
     return LbfgsState(
         point=point,
-        cost=cost,
+        step=step,
         grad=grad,
-        steps=push(state.steps, s),
-        changes=push(state.changes, y),
-        inverse_curvature=push(state.inverse_curvature, inverse),
+        memory=memory,
         best_point=jnp.where(better, point, state.best_point),
-        best=jax.tree.map(lambda a, b: jnp.where(better, a, b), here, state.best),
+        best=jax.tree.map(lambda a, b: jnp.where(better, a, b), there, best),
         reach=jnp.where(decreased, 1.0, 0.05 * state.reach),
         iteration=state.iteration + 1,
         stalled=jnp.where(progress, 0, state.stalled + 1),

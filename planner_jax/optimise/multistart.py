@@ -1,15 +1,18 @@
 """The loop around the solver, for one scenario and several starts."""
 
 import dataclasses
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jax import Array
+from jax import Array, lax
 
+from planner_jax.lanes import over_lanes
 from planner_jax.optimise import lbfgs
-from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig, Objective
+from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig, LbfgsState, Objective
 from planner_jax.optimise.problem import Planner, Round, Settings
 from planner_jax.optimise.status import Status
 
@@ -29,21 +32,67 @@ class Optimum:
 
 def minimise(objective: Objective, start: Array, config: LbfgsConfig) -> Optimum:
     """Minimise from one start until stationary or out of iterations."""
-
-    def unfinished(state: lbfgs.LbfgsState) -> Array:
-        return (state.iteration < config.max_steps) & (state.stalled < config.patience)
-
-    state = jax.lax.while_loop(
-        unfinished,
+    if config.max_steps == 0:
+        return _optimum_at(start, objective(start), config)
+    state = lax.while_loop(
+        lambda s: _unfinished(s, config),
         lambda s: lbfgs.step(objective, s, config),
-        lbfgs.init(objective, start, config),
+        lbfgs.init(start, config),
     )
+    return _optimum_of(state, config)
+
+
+def minimise_lanes(
+    objective: Callable[[Array, Any], Evaluation], starts: Array, contexts: Any, config: LbfgsConfig
+) -> Optimum:
+    """`minimise` on many lanes, each with its own start and context.
+
+    Args:
+        objective: of one point (n,) and one context.
+        starts: (n, B).
+        contexts: a pytree, the lanes last on every leaf.
+        config: sizes and switches, static.
+
+    Returns:
+        The optima, with the lanes last on every leaf.
+    """
+    if config.max_steps == 0:
+        evaluate = lambda x, context: _optimum_at(x, objective(x, context), config)  # noqa: E731
+        return over_lanes(evaluate)(starts, contexts)
+
+    @over_lanes
+    def step(state: LbfgsState, context: Any) -> LbfgsState:
+        after = lbfgs.step(lambda x: objective(x, context), state, config)
+        going = _unfinished(state, config)
+        kept = jax.tree.map(lambda new, old: jnp.where(going, new, old), after, state)
+        # The largest part, which a lane at rest does not look at any more.
+        return dataclasses.replace(kept, memory=after.memory, grad=after.grad)
+
+    state = lax.while_loop(
+        lambda s: jnp.any(_unfinished(s, config)),
+        lambda s: step(s, contexts),
+        over_lanes(lambda start: lbfgs.init(start, config))(starts),
+    )
+    return _optimum_of(state, config)
+
+
+def _unfinished(state: LbfgsState, config: LbfgsConfig) -> Array:
+    return (state.iteration < config.max_steps) & (state.stalled < config.patience)
+
+
+def _optimum_of(state: LbfgsState, config: LbfgsConfig) -> Optimum:
     return Optimum(
         point=state.best_point,
         evaluation=state.best,
         iterations=state.iteration,
         stationary=state.stalled >= config.patience,
     )
+
+
+def _optimum_at(point: Array, evaluation: Evaluation, config: LbfgsConfig) -> Optimum:
+    """The start itself."""
+    stationary = jnp.full((), config.patience == 0)
+    return Optimum(point, evaluation, jnp.zeros((), jnp.int32), stationary)
 
 
 def changed(planner: Planner, settings: Settings) -> Planner:
@@ -54,6 +103,8 @@ def changed(planner: Planner, settings: Settings) -> Planner:
 def solve_round(planner: Planner, attempt: Round, scenario: Any) -> Any:
     """Plan one scenario with one round's starts and iterations; pure, so jit and vmap it.
 
+    For a batch `solve_batch` is quicker.
+
     Args:
         planner: sizes and switches, static.
         attempt: how many starts and iterations.
@@ -62,33 +113,75 @@ def solve_round(planner: Planner, attempt: Round, scenario: Any) -> Any:
     Returns:
         The planner's plan of the best start, its `status` and `iterations` set.
     """
-    stages = [changed(planner, stage.settings) for stage in attempt.stages]
-    planner = changed(planner, attempt.settings)
-    context = planner.prepare(scenario)
-    starts = planner.guesses(context, attempt.starts)
+    planners, configs = _stages(planner, attempt)
+    context = planners[-1].prepare(scenario)
 
-    def from_start(start: Array) -> tuple[Any, Array]:
+    def from_start(start: Array) -> Any:
         iterations = jnp.zeros((), jnp.int32)
-        for easier, stage in zip(stages, attempt.stages, strict=True):
-            reached = minimise(lambda x: easier.objective(x, context), start, stage.solver)  # noqa: B023
-            start, iterations = reached.point, iterations + reached.iterations
-        optimum = minimise(lambda x: planner.objective(x, context), start, attempt.solver)
-        plan = planner.decode(optimum.point, context)
-        iterations += optimum.iterations
-        plan = plan.replace(cost=optimum.evaluation.cost, iterations=iterations)
-        return plan, optimum.stationary
+        for stage, config in zip(planners, configs, strict=True):
+            optimum = minimise(lambda x: stage.objective(x, context), start, config)  # noqa: B023
+            start, iterations = optimum.point, iterations + optimum.iterations
+        return _plan_at(planners[-1], dataclasses.replace(optimum, iterations=iterations), context)
 
+    starts = planners[-1].guesses(context, attempt.starts)
+    return from_start(starts[0]) if attempt.starts == 1 else _best(jax.vmap(from_start)(starts))
+
+
+def solve_batch(planner: Planner, attempt: Round, scenarios: Any) -> Any:
+    """`solve_round` on a batch, the lanes of which end at their own times.
+
+    Args:
+        planner: sizes and switches, static.
+        attempt: how many starts and iterations.
+        scenarios: B cases, a leading axis on every leaf.
+
+    Returns:
+        Their plans, a leading axis on every leaf.
+    """
+    planners, configs = _stages(planner, attempt)
+    contexts = jax.vmap(planners[-1].prepare)(scenarios)
+    starts = jax.vmap(lambda context: planners[-1].guesses(context, attempt.starts))(contexts)
+    num = starts.shape[0]
+    points = starts.reshape(num * attempt.starts, -1).T
+    if attempt.starts > 1:
+        contexts = jax.tree.map(lambda x: jnp.repeat(x, attempt.starts, axis=0), contexts)
+    contexts = jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), contexts)
+    iterations = jnp.zeros(points.shape[1:], jnp.int32)
+    for stage, config in zip(planners, configs, strict=True):
+        optimum = minimise_lanes(stage.objective, points, contexts, config)
+        points, iterations = optimum.point, iterations + optimum.iterations
+    optimum = dataclasses.replace(optimum, iterations=iterations)
+    plans = over_lanes(functools.partial(_plan_at, planners[-1]))(optimum, contexts)
+    plans = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), plans)
     if attempt.starts == 1:
-        plan, stationary = from_start(starts[0])
-    else:
-        plans, all_stationary = jax.vmap(from_start)(starts)
-        feasible = plans.violation <= FEASIBILITY_TOLERANCE
-        finite = jnp.isfinite(plans.cost) & jnp.isfinite(plans.violation)
-        by_cost = jnp.where(feasible, plans.cost, jnp.inf)
-        score = jnp.where(jnp.any(feasible & finite), by_cost, plans.violation)
-        best = jnp.argmin(jnp.where(finite, score, jnp.inf))
-        plan, stationary = jax.tree.map(lambda leaf: leaf[best], (plans, all_stationary))
-    return plan.replace(status=status_of(plan.cost, plan.violation, stationary))
+        return plans
+    split = lambda x: x.reshape(num, attempt.starts, *x.shape[1:])  # noqa: E731
+    return jax.vmap(_best)(jax.tree.map(split, plans))
+
+
+def _stages(planner: Planner, attempt: Round) -> tuple[list[Planner], list[LbfgsConfig]]:
+    """The problems to be solved one after another; the last is the one that counts."""
+    planners = [changed(planner, stage.settings) for stage in attempt.stages]
+    configs = [stage.solver for stage in attempt.stages]
+    return [*planners, changed(planner, attempt.settings)], [*configs, attempt.solver]
+
+
+def _plan_at(planner: Planner, optimum: Optimum, context: Any) -> Any:
+    """The plan of one optimum."""
+    plan = planner.decode(optimum.point, context)
+    cost = optimum.evaluation.cost
+    status = status_of(cost, plan.violation, optimum.stationary)
+    return plan.replace(cost=cost, iterations=optimum.iterations, status=status)
+
+
+def _best(plans: Any) -> Any:
+    """The plan of least cost among the feasible ones of several starts, or of least violation."""
+    feasible = plans.violation <= FEASIBILITY_TOLERANCE
+    finite = jnp.isfinite(plans.cost) & jnp.isfinite(plans.violation)
+    by_cost = jnp.where(feasible, plans.cost, jnp.inf)
+    score = jnp.where(jnp.any(feasible & finite), by_cost, plans.violation)
+    best = jnp.argmin(jnp.where(finite, score, jnp.inf))
+    return jax.tree.map(lambda leaf: leaf[best], plans)
 
 
 def status_of(cost: Array, violation: Array, stationary: Array) -> Array:

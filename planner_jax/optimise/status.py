@@ -1,6 +1,7 @@
 """What became of one lane of a batched solve."""
 
 import enum
+from typing import Any
 
 
 class Status(enum.IntEnum):
@@ -19,8 +20,6 @@ class Status(enum.IntEnum):
         return _MESSAGES[self]
 
 
-SOLVED = (Status.CONVERGED, Status.FEASIBLE)
-
 _MESSAGES = {
     Status.CONVERGED: "stationary, and every limit holds",
     Status.FEASIBLE: "every limit holds; more iterations may lower the cost",
@@ -29,3 +28,13 @@ _MESSAGES = {
     Status.NON_FINITE: "the scenario or its cost is not finite; check the scenario for NaN",
     Status.OUT_OF_REACH: "a target never comes within reach; `closest_approach` says by how much",
 }
+
+
+def is_solved(status: Any) -> Any:
+    """Which statuses are those of a plan that meets every limit the planner looked at."""
+    return (status == Status.CONVERGED) | (status == Status.FEASIBLE)
+
+
+def is_unsolved(status: Any) -> Any:
+    """Which lanes are worth another round: not solved, and not broken either."""
+    return (status >= Status.INFEASIBLE) & (status != Status.NON_FINITE)

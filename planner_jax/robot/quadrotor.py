@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from planner_jax.arithmetic import at_least, components, inverse_sqrt, reciprocal
+from planner_jax.arithmetic import Components, at_least, components, inverse_sqrt, reciprocal
 
 
 @struct.dataclass
@@ -46,7 +46,7 @@ def body_z(acc: Array, gravity: Array) -> Array:
     return jnp.where(pushing, thrust / jnp.sqrt(jnp.where(pushing, size_squared, 1.0)), 0.0)
 
 
-def body_rate_squared(acc: Array, jerk: Array, gravity: Array) -> Array:
+def body_rate_squared(acc: Components, jerk: Components, gravity: Array) -> Array:
     """Squared body rate  |omega|^2  of the Hopf fibration at zero heading [rad^2/s^2].
 
     |z'|^2 + ((z_y z_x' - z_x z_y') / (1 + z_z))^2 , where z' is the jerk across the thrust

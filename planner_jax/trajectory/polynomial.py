@@ -16,7 +16,10 @@ class PiecewisePolynomial:
 
 @struct.dataclass
 class Motion:
-    """Samples of a trajectory at N times: what the limits look at."""
+    """Samples of a trajectory at N times: what the limits look at.
+
+    In a kernel each vector is a tuple of its three components.
+    """
 
     height: Array  # (N,) [m]
     vel: Array  # (N, 3) [m/s]

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from planner_jax.arithmetic import components, reciprocal
+from planner_jax.arithmetic import reciprocal
 from planner_jax.trajectory.minco import hermite_energy, hermite_map
 from planner_jax.trajectory.polynomial import Motion, PiecewisePolynomial, derivative_factors
 
@@ -119,28 +119,27 @@ def boundary_rows(head_state: Array, tail_state: Array, piece_duration: Array) -
 
 
 def sample_motion(
-    maps: ProportionalMinco, nodes: int, rows: Array, offsets: Array, piece_duration: Array
+    maps: ProportionalMinco, nodes: int, columns: Array, piece_duration: Array
 ) -> Motion:
     """Height, velocity, acceleration and jerk at `nodes` intervals a piece.
 
     Args:
         maps: constant maps of M pieces.
         nodes: intervals a piece; N = M nodes + 1 samples, ends shared.
-        rows: (2s, 3) boundary rows.
-        offsets: (M - 1, 3) whitened offsets y.
+        columns: (2s + M - 1, 3) boundary rows and whitened offsets y.
         piece_duration: () h = T / M [s].
     """
-    # One product for everything, samples along the rows: on a CPU each product, division and
-    # sum of its own costs more than its arithmetic.
+    # One product for everything: on a CPU each product, division and sum of its own costs more
+    # than its arithmetic. The matrix comes first, so that a batch adds columns.
     matrices = np.stack([maps.sample_matrix(nodes, d) for d in range(4)])
     unit = jnp.matmul(
-        jnp.concatenate([rows, offsets]).T,
-        jnp.asarray(matrices.reshape(-1, matrices.shape[-1]).T, rows.dtype),
+        jnp.asarray(matrices.reshape(-1, matrices.shape[-1]), columns.dtype),
+        columns,
         precision=lax.Precision.HIGHEST,
-    ).reshape(3, 4, -1)
+    ).reshape(4, -1, 3)
     rate = reciprocal(piece_duration)
     rates = jnp.stack([jnp.ones_like(rate), rate, rate * rate, rate * rate * rate])
-    pos, vel, acc, jerk = components(jnp.moveaxis(unit * rates[:, None], (0, 1), (1, 2)))
+    pos, vel, acc, jerk = unit * rates[:, None, None]
     return Motion(height=pos[:, 2], vel=vel, acc=acc, jerk=jerk)
 
 

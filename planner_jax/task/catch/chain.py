@@ -70,6 +70,11 @@ class Chain:
     offsets: Array  # (N, M - 1, 3) whitened
     piece_durations: Array  # (N,) [s]
 
+    @property
+    def columns(self) -> Array:
+        """Rows and offsets together, (N, 2s + M - 1, 3)."""
+        return jnp.concatenate([self.rows, self.offsets], axis=1)
+
 
 def chain_rows(head_state: Array, tail_states: Array, piece_durations: Array) -> Array:
     """Boundary rows of every segment, (N, 2s, 3).
@@ -86,7 +91,7 @@ def chain_rows(head_state: Array, tail_states: Array, piece_durations: Array) ->
 def chain_motion(maps: ProportionalMinco, nodes: int, chain: Chain) -> Motion:
     """Samples of every segment, leaves with a leading axis N."""
     sample = lambda *segment: sample_motion(maps, nodes, *segment)  # noqa: E731
-    return jax.vmap(sample)(chain.rows, chain.offsets, chain.piece_durations)
+    return jax.vmap(sample)(chain.columns, chain.piece_durations)
 
 
 def chain_energy(maps: ProportionalMinco, chain: Chain) -> Array:

@@ -8,6 +8,7 @@ guess times; the planner then optimises the times together with the trajectory.
 import dataclasses
 import functools
 import itertools
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -18,10 +19,10 @@ from jax import Array
 
 from planner_jax.ball.flight import BallState
 from planner_jax.optimise.problem import Planner
-from planner_jax.optimise.status import Status
+from planner_jax.optimise.status import Status, is_solved, is_unsolved
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.task.catch.scenario import CatchScenario
-from planner_jax.task.solve import is_solved, plan
+from planner_jax.task.solve import plan
 
 DECISIONS = ("best", "greedy", "given")
 
@@ -164,12 +165,13 @@ _closest_approach = jax.jit(jax.vmap(closest_approach))
 
 def _name_out_of_reach(scenarios: CatchScenario, plans: CatchPlan) -> CatchPlan:
     """The plans, with a status of its own where a target proves to be out of reach."""
-    unsolved = ~np.asarray(is_solved(plans.status)) & (plans.status != Status.NON_FINITE)
+    unsolved = is_unsolved(np.asarray(plans.status))
     if not unsolved.any():
         return plans
     away = np.asarray(_closest_approach(scenarios)).max(axis=1) > 0.0
     status = np.where(unsolved & away, np.int32(Status.OUT_OF_REACH), plans.status)
-    return dataclasses.replace(plans, status=status)
+    resident = isinstance(plans.status, jax.Array)
+    return dataclasses.replace(plans, status=jnp.asarray(status) if resident else status)
 
 
 def decided(scenarios: CatchScenario, decision: Decision) -> CatchScenario:
@@ -178,7 +180,11 @@ def decided(scenarios: CatchScenario, decision: Decision) -> CatchScenario:
 
 
 def plan_catches(
-    planner: Planner, scenarios: CatchScenario, decide: str = "best"
+    planner: Planner,
+    scenarios: CatchScenario,
+    decide: str = "best",
+    *,
+    devices: Sequence[Any] | None = None,
 ) -> tuple[CatchScenario, CatchPlan]:
     """Decide on orders and times, and plan.
 
@@ -188,6 +194,7 @@ def plan_catches(
         decide: "best" plans the most promising of all orders and keeps the earliest last
             catch, "greedy" catches next what it can reach first, "given" takes the order and
             the times of the scenarios.
+        devices: that share the batch, as for `plan`.
 
     Returns:
         scenarios: with the order and times that were decided; times before optimisation.
@@ -204,11 +211,13 @@ def plan_catches(
     elif decide == "greedy" or scenarios.num_targets == 1:
         scenarios = decided(scenarios, _greedy(scenarios))
     else:
-        return _plan_finalists(planner, scenarios)
-    return scenarios, _name_out_of_reach(scenarios, plan(planner, scenarios))
+        return _plan_finalists(planner, scenarios, devices)
+    return scenarios, _name_out_of_reach(scenarios, plan(planner, scenarios, devices=devices))
 
 
-def _plan_finalists(planner: Planner, scenarios: CatchScenario) -> tuple[CatchScenario, CatchPlan]:
+def _plan_finalists(
+    planner: Planner, scenarios: CatchScenario, devices: Sequence[Any] | None
+) -> tuple[CatchScenario, CatchPlan]:
     """The best of the most promising orders, planned together."""
     decisions = _best_orders(scenarios, _FINALISTS)
     finalists = decisions.order.shape[1]
@@ -217,7 +226,7 @@ def _plan_finalists(planner: Planner, scenarios: CatchScenario) -> tuple[CatchSc
         for k in range(finalists)
     ]
     together = jax.tree.map(lambda *leaves: np.concatenate(leaves), *tried)
-    plans = plan(planner, together)
+    plans = plan(planner, together, devices=devices)
     shaped = lambda leaf: np.asarray(leaf).reshape(finalists, -1, *np.shape(leaf)[1:])  # noqa: E731
     plans, together = jax.tree.map(shaped, plans), jax.tree.map(shaped, together)
     solved = np.asarray(is_solved(plans.status))

@@ -13,8 +13,9 @@ import numpy as np
 from flax import struct
 from jax import Array
 
+from planner_jax.cost.along import Along, integrate_along
 from planner_jax.cost.limits import body_rate_excess, ground_excess, speed_excess, thrust_excess
-from planner_jax.cost.penalty import joined_trapezoid_weights, smoothed_hinge
+from planner_jax.cost.penalty import smoothed_hinge
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
 from planner_jax.optimise.multistart import FEASIBILITY_TOLERANCE
 from planner_jax.optimise.problem import Round
@@ -32,13 +33,12 @@ from planner_jax.task.catch.chain import (
     targets_at,
 )
 from planner_jax.task.catch.plan import CatchPlan
-from planner_jax.task.catch.scenario import CatchScenario
+from planner_jax.task.catch.scenario import CatchLimits, CatchScenario
+from planner_jax.trajectory.polynomial import Motion
 from planner_jax.trajectory.proportional_minco import ProportionalMinco, proportional_minco
 
 _ORDER = 4  # minimum snap
 _DECODE_NODES = 40  # body rates peak sharply where the thrust is small
-# Squares carry twice the relative margin.
-_MARGINS = np.array([2.0, 2.0, 2.0, 2.0, 1.0])[:, None, None]
 _RIM = 0.9  # share of the net's radius that a planned catch may use
 _ENCODED_RIM = 0.99  # share of that which a point made by `encode` may use
 
@@ -46,6 +46,17 @@ _ENCODED_RIM = 0.99  # share of that which a point made by `encode` may use
 # Starting points, best first: factor on the guessed times, share of the mean velocity of the
 # way to a catch that is kept there.
 _GUESSES = np.array([(1.0, 0.5), (1.0, 1.0), (1.15, 0.3), (1.3, 0.0), (0.9, 1.0), (1.5, 0.2)])
+
+
+def _limits_along(motion: Motion, given: tuple[Array, CatchLimits]) -> tuple[Array, ...]:
+    """Speed, body rate, weak and strong thrust, ground."""
+    gravity, limits = given
+    return (
+        speed_excess(motion.vel, limits),
+        body_rate_excess(motion.acc, motion.jerk, gravity, limits),
+        *thrust_excess(motion.acc, gravity, limits.min_thrust, limits.max_thrust),
+        ground_excess(motion.height, limits),
+    )
 
 
 @struct.dataclass
@@ -217,47 +228,40 @@ class ExactCatch:
         offsets = natural[:, : self.num_offsets].reshape(num, -1, 3)
         return Chain(rows=rows, offsets=offsets, piece_durations=piece_durations), catch
 
-    def _excess(
-        self, chain: Chain, catch: Catch, context: CatchContext, nodes: int
-    ) -> tuple[Array, Array]:
-        """Excess over the limits along the way, (5, N, K), and at the catches, (2, N)."""
-        scenario, limits = context.scenario, context.scenario.limits
+    def _excess(self, chain: Chain, context: CatchContext, nodes: int) -> Array:
+        """Excess over the limits along the way, (5, N, K)."""
         motion = chain_motion(self.maps, nodes, chain)
-        along = jnp.concatenate(
-            [
-                speed_excess(motion.vel, limits)[None],
-                body_rate_excess(motion.acc, motion.jerk, scenario.gravity, limits)[None],
-                thrust_excess(motion.acc, scenario.gravity, limits.min_thrust, limits.max_thrust),
-                ground_excess(motion.height, limits)[None],
-            ]
-        )
+        scenario = context.scenario
+        along = jnp.stack(_limits_along(motion, (scenario.gravity, scenario.limits)))
+        return jnp.where(context.active[:, None], along, -1.0)
+
+    def _at_catch(self, catch: Catch, context: CatchContext) -> Array:
+        """Excess at the catches, (2, N): of the angle, and over the horizon."""
         # The horizon is a hard end: the tolerance of a feasible plan is taken off.
         late = catch.times / context.horizon - 1.0 + FEASIBILITY_TOLERANCE
-        at_catch = jnp.stack([catch.angle_excess, late])
-        idle = -jnp.ones((), along.dtype)
-        return (
-            jnp.where(context.active[:, None], along, idle),
-            jnp.where(context.active, at_catch, idle),
-        )
+        return jnp.where(context.active, jnp.stack([catch.angle_excess, late]), -1.0)
+
+    def _along(self) -> Along:
+        """Penalties along the way: squares carry twice the relative margin."""
+        margins = tuple(self.margin * factor for factor in (2.0, 2.0, 2.0, 2.0, 1.0))
+        return Along(self.maps, self.nodes, _limits_along, margins, self.hinge_width)
 
     def objective(self, point: Array, context: CatchContext) -> Evaluation:
         """Cost, and the largest excess at the penalty nodes (squares over squares)."""
         chain, catch = self._unpack(point, context)
-        along, at_catch = self._excess(chain, catch, context, self.nodes)
-        weights = jnp.asarray(
-            joined_trapezoid_weights(self.nodes, self.maps.proportions), point.dtype
+        scenario = context.scenario
+        penalties, worst = integrate_along(
+            self._along(), chain.columns, chain.piece_durations, (scenario.gravity, scenario.limits)
         )
-        margins = jnp.asarray(self.margin * _MARGINS, point.dtype)
-        hinges = smoothed_hinge(along + margins, self.hinge_width)
-        penalty = jnp.sum(chain.piece_durations[:, None] * hinges * weights)
-        penalty += self.catch_weight * jnp.sum(
-            smoothed_hinge(at_catch + self.margin, self.hinge_width)
-        )
-        energy = jnp.sum(jnp.where(context.active, chain_energy(self.maps, chain), 0.0))
-        cost = penalty + self.energy_weight * energy + self.time_weight * catch.times[-1]
+        at_catch = self._at_catch(catch, context)
+        energies = chain_energy(self.maps, chain)
+        flown = jnp.where(context.active, penalties + self.energy_weight * energies, 0.0)
+        hinges = smoothed_hinge(at_catch + self.margin, self.hinge_width)
+        cost = jnp.sum(flown) + self.catch_weight * jnp.sum(hinges)
+        cost += self.time_weight * catch.times[-1]
         # Peaks between nodes are a little higher than the nodes show.
-        violation = jnp.maximum(jnp.max(along), jnp.max(at_catch)) + 0.004
-        return Evaluation(cost=cost, violation=violation)
+        worst = jnp.max(jnp.where(context.active, worst, -1.0))
+        return Evaluation(cost=cost, violation=jnp.maximum(worst, jnp.max(at_catch)) + 0.004)
 
     def residuals(self, point: Array, context: CatchContext) -> Array:
         """Squared hinges, energy and time as residuals, for `measure_scale`.
@@ -265,15 +269,14 @@ class ExactCatch:
         The smoothed hinge bends at most with 3 / (2 hinge_width); the residuals bend alike.
         """
         chain, catch = self._unpack(point, context)
-        along, at_catch = self._excess(chain, catch, context, self.nodes)
+        along = self._along()
         bend = jnp.sqrt(1.5 / self.hinge_width)
-        weights = jnp.asarray(
-            joined_trapezoid_weights(self.nodes, self.maps.proportions), point.dtype
-        )
-        margins = jnp.asarray(self.margin * _MARGINS, point.dtype)
-        inside = jnp.maximum(along + margins, 0.0)
+        margins = jnp.asarray(along.margins, point.dtype)[:, None, None]
+        inside = jnp.maximum(self._excess(chain, context, self.nodes) + margins, 0.0)
+        weights = jnp.asarray(along.weights(), point.dtype)
         inside = inside * jnp.sqrt(chain.piece_durations[:, None] * weights)
-        at_catch = jnp.sqrt(self.catch_weight) * jnp.maximum(at_catch + self.margin, 0.0)
+        at_catch = self._at_catch(catch, context) + self.margin
+        at_catch = jnp.sqrt(self.catch_weight) * jnp.maximum(at_catch, 0.0)
         energy = jnp.where(context.active, chain_energy(self.maps, chain), 0.0)
         smooth = jnp.sqrt(2.0 * self.energy_weight * jnp.maximum(energy, 1e-6))
         spent = jnp.where(context.active, catch.durations, 1e-6)
@@ -284,7 +287,8 @@ class ExactCatch:
     def decode(self, point: Array, context: CatchContext) -> CatchPlan:
         """The plan at a point, its violation looked for at 40 nodes a piece."""
         chain, catch = self._unpack(point, context)
-        along, at_catch = self._excess(chain, catch, context, _DECODE_NODES)
+        along = self._excess(chain, context, _DECODE_NODES)
+        at_catch = self._at_catch(catch, context)
         squared = jnp.max(along[jnp.array([0, 1, 3])])
         plain = jnp.maximum(jnp.max(along[4]), jnp.max(at_catch))
         weak = 1.0 - jnp.sqrt(jnp.maximum(1.0 - jnp.max(along[2]), 0.0))

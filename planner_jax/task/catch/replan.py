@@ -77,11 +77,14 @@ class ReplanCatch:
     With less than `shortest` left until the next catch nothing is planned: what is left of the
     previous plan comes back, cut into as many pieces, with its violation. The same holds after
     the last catch, when the plan is an empty one that stays where that catch was made.
+
+    The first round makes one iteration, and the next re-plan goes on from there: the real-time
+    iteration of Diehl et al. 2005. At most of the looks it leaves no limit broken.
     """
 
     planner: ExactCatch = ExactCatch()
     rounds: tuple[Round, ...] = (
-        Round(starts=1, solver=LbfgsConfig(max_steps=2, memory=2, trial_steps=_TRIALS)),
+        Round(starts=1, solver=LbfgsConfig(max_steps=1, memory=1, trial_steps=_TRIALS)),
         Round(starts=1, solver=LbfgsConfig(max_steps=40, trial_steps=_TRIALS)),
         Round(starts=3, solver=LbfgsConfig(max_steps=80)),
     )

@@ -276,7 +276,7 @@ class BatHit:
     def _penalty(self, motion: Motion, duration: Array, scenario: HitScenario) -> Array:
         """The limits along the way (eq. 18a), the squares of their own units."""
         limits = scenario.limits
-        along = motion_excess(motion, scenario.gravity, limits)
+        along = jnp.stack(motion_excess(motion, scenario.gravity, limits))
         one = jnp.ones_like(limits.speed)
         unit = jnp.stack([limits.speed**2, limits.acceleration**2, limits.body_rate**2, one])
         hinges = smoothed_hinge(along * unit[:, None], self.hinge_width)
@@ -287,7 +287,8 @@ class BatHit:
     def objective(self, point: Array, context: HitContext) -> Evaluation:
         """The cost of eq. 20. It names no violation, so that the last iterate is the plan."""
         offsets, rows, duration, impact, defect = self._unpack(point, context)
-        motion = sample_motion(self.maps, self.nodes, rows, offsets, duration)
+        columns = jnp.concatenate([rows, offsets])
+        motion = sample_motion(self.maps, self.nodes, columns, duration)
         cost = (
             trajectory_energy(self.maps, rows, offsets, duration)
             + self.time_weight * impact.stroke.time
@@ -300,8 +301,9 @@ class BatHit:
         """The plan at a point, its violation looked for at 24 nodes a piece."""
         scenario = context.scenario
         offsets, rows, duration, impact, defect = self._unpack(point, context)
-        motion = sample_motion(self.maps, _DECODE_NODES, rows, offsets, duration)
-        along = motion_excess(motion, scenario.gravity, scenario.limits)
+        columns = jnp.concatenate([rows, offsets])
+        motion = sample_motion(self.maps, _DECODE_NODES, columns, duration)
+        along = jnp.stack(motion_excess(motion, scenario.gravity, scenario.limits))
         violation = jnp.maximum(largest_violation(along, impact, scenario), defect)
         trajectory = proportional_trajectory(self.maps, rows, offsets, duration)
         return undecided_plan(trajectory, impact, jnp.zeros_like(violation), violation)

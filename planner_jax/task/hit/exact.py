@@ -21,15 +21,17 @@ from planner_jax.ball.flight import (
 )
 from planner_jax.ball.impact import required_impact
 from planner_jax.ball.prediction import PathTable, predict_path, target_at
+from planner_jax.cost.along import Along, integrate_along
 from planner_jax.cost.contact import apex_excess, hitting_speed_excess
 from planner_jax.cost.limits import motion_excess
-from planner_jax.cost.penalty import joined_trapezoid_weights, smoothed_hinge
+from planner_jax.cost.penalty import smoothed_hinge
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
 from planner_jax.optimise.problem import Round
 from planner_jax.optimise.scaling import shipped_scale
-from planner_jax.robot.quadrotor import tangent_basis
+from planner_jax.robot.quadrotor import QuadrotorLimits, tangent_basis
 from planner_jax.task.hit.plan import HitPlan, Stroke
 from planner_jax.task.hit.scenario import HitScenario
+from planner_jax.trajectory.polynomial import Motion
 from planner_jax.trajectory.proportional_minco import (
     ProportionalMinco,
     boundary_rows,
@@ -66,6 +68,13 @@ def prepare_hit(scenario: HitScenario, num_nodes: int) -> HitContext:
     sinking = jnp.maximum(-path.vel[node, 2], 0.1)
     landing = (node - 1) * path.resolution + path.pos[node, 2] / sinking
     return HitContext(scenario=scenario, path=path, landing_time=lax.stop_gradient(landing))
+
+
+def _limits_along(
+    motion: Motion, given: tuple[Array, QuadrotorLimits]
+) -> tuple[Array, Array, Array, Array]:
+    gravity, limits = given
+    return motion_excess(motion, gravity, limits)
 
 
 @struct.dataclass
@@ -232,39 +241,37 @@ class ExactHit:
         rows = boundary_rows(context.scenario.head_state, impact.tail_state, duration)
         return offsets, rows, duration, impact
 
-    def _excess(
-        self, offsets: Array, rows: Array, duration: Array, impact: Impact, context, nodes: int
-    ) -> tuple[Array, Array]:
-        """Excess over the limits along the way, (4, N), and at the impact, (5,)."""
-        scenario = context.scenario
-        motion = sample_motion(self.maps, nodes, rows, offsets, duration)
-        along = motion_excess(motion, scenario.gravity, scenario.limits)
-        limits = scenario.hit_limits
-        at_impact = jnp.concatenate(
+    def _at_impact(self, impact: Impact, context: HitContext) -> Array:
+        """Excess at the impact, (5,): apex, and squares of the hitting speed."""
+        limits = context.scenario.hit_limits
+        return jnp.concatenate(
             [
                 apex_excess(impact.apex, limits.min_apex, limits.max_apex),
                 hitting_speed_excess(impact.tail_state[1], limits.hitting_speed),
             ]
         )
-        return along, at_impact
 
-    def _margins(self) -> np.ndarray:
-        """Margins of the four limits along the way: squares carry twice the relative one."""
-        return self.margin * np.array([2.0, 2.0, 2.0, 1.0])[:, None]
+    def _along(self) -> Along:
+        """Penalties along the way: squares carry twice the relative margin."""
+        margins = tuple(self.margin * factor for factor in (2.0, 2.0, 2.0, 1.0))
+        return Along(self.maps, self.nodes, _limits_along, margins, self.hinge_width)
 
     def objective(self, point: Array, context: HitContext) -> Evaluation:
         """Cost, and the largest excess at the penalty nodes (squares over squares)."""
         offsets, rows, duration, impact = self._unpack(point, context)
-        along, at_impact = self._excess(offsets, rows, duration, impact, context, self.nodes)
-        weights = joined_trapezoid_weights(self.nodes, self.maps.proportions)
-        hinges = smoothed_hinge(along + jnp.asarray(self._margins(), point.dtype), self.hinge_width)
-        penalty = duration * jnp.sum(hinges * jnp.asarray(weights, point.dtype))
-        penalty += self.impact_weight * jnp.sum(
+        penalties, worst = integrate_along(
+            self._along(),
+            jnp.concatenate([rows, offsets])[None],
+            duration[None],
+            (context.scenario.gravity, context.scenario.limits),
+        )
+        at_impact = self._at_impact(impact, context)
+        penalty = penalties[0] + self.impact_weight * jnp.sum(
             smoothed_hinge(at_impact + self.margin, self.hinge_width)
         )
         energy = trajectory_energy(self.maps, rows, offsets, duration)
         # Peaks between nodes are a little higher than the nodes show.
-        violation = jnp.maximum(jnp.max(along), jnp.max(at_impact)) + 0.004
+        violation = jnp.maximum(worst[0], jnp.max(at_impact)) + 0.004
         return Evaluation(cost=penalty + self.energy_weight * energy, violation=violation)
 
     def residuals(self, point: Array, context: HitContext) -> Array:
@@ -273,20 +280,29 @@ class ExactHit:
         The smoothed hinge bends at most with 3 / (2 hinge_width); the residuals bend alike.
         """
         offsets, rows, duration, impact = self._unpack(point, context)
-        along, at_impact = self._excess(offsets, rows, duration, impact, context, self.nodes)
+        along = self._along()
+        excess = self._excess(rows, offsets, duration, context, self.nodes)
+        at_impact = self._at_impact(impact, context)
         bend = jnp.sqrt(1.5 / self.hinge_width)
-        inside = jnp.maximum(along + jnp.asarray(self._margins(), point.dtype), 0.0)
-        weights = joined_trapezoid_weights(self.nodes, self.maps.proportions)
-        inside = inside * jnp.sqrt(duration * jnp.asarray(weights, point.dtype))
+        inside = jnp.maximum(excess + jnp.asarray(along.margins, point.dtype)[:, None], 0.0)
+        inside = inside * jnp.sqrt(duration * jnp.asarray(along.weights(), point.dtype))
         impact_part = jnp.sqrt(self.impact_weight) * jnp.maximum(at_impact + self.margin, 0.0)
         energy_unit = jnp.sqrt(self.energy_weight / duration ** (2 * _ORDER - 1))
         smooth = energy_unit * np.sqrt(self.maps.offset_energy) * offsets
         return jnp.concatenate([bend * inside.ravel(), bend * impact_part, smooth.ravel()])
 
+    def _excess(
+        self, rows: Array, offsets: Array, duration: Array, context: HitContext, nodes: int
+    ) -> Array:
+        """Excess over the limits along the way, (4, N)."""
+        motion = sample_motion(self.maps, nodes, jnp.concatenate([rows, offsets]), duration)
+        return jnp.stack(_limits_along(motion, (context.scenario.gravity, context.scenario.limits)))
+
     def decode(self, point: Array, context: HitContext) -> HitPlan:
         """The plan at a point, its violation looked for at 16 nodes a piece."""
         offsets, rows, duration, impact = self._unpack(point, context)
-        along, at_impact = self._excess(offsets, rows, duration, impact, context, 16)
+        along = self._excess(rows, offsets, duration, context, 16)
+        at_impact = self._at_impact(impact, context)
         squared = jnp.concatenate([jnp.max(along[:3], axis=1), at_impact[2:]])
         plain = jnp.concatenate([jnp.max(along[3:], axis=1), at_impact[:2]])
         violation = jnp.maximum(jnp.max(jnp.sqrt(squared + 1.0) - 1.0), jnp.max(plain))

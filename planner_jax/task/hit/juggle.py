@@ -166,7 +166,7 @@ class JuggleHit:
             scenario.head_state, impact.tail_state[:3], impact.stroke.time, self.ease
         )
         motion = sample_pieces(trajectory, self.nodes)
-        along = motion_excess(motion, scenario.gravity, scenario.limits)
+        along = jnp.stack(motion_excess(motion, scenario.gravity, scenario.limits))
         # A height or an apex that cannot be, or a racket on edge, is a broken limit too.
         meeting = jnp.abs(impact.stroke.ball_pos[2] - self.height)
         too_low = jnp.maximum(impact.stroke.ball_pos[2], scenario.target[2]) - self.apex

@@ -1,0 +1,176 @@
+"""Plans a second of batches that stay on the devices: `planner-jax bench throughput`.
+
+    planner-jax bench throughput --task hit --batch 1024 65536 288000 [--devices N]
+
+One row a batch size: the first call, with what it compiles, then the fastest and the median of
+some more; the share that the referee accepts; and by how much the cost is above that of a
+long search from the same guess. What is timed is the whole of `plan` (for catches
+`plan_catches` with the decision "greedy"): ball tables, guesses, all rounds, and the check of
+the limits, from arrays on the devices to arrays on the devices. The referee is not part of it.
+"""
+
+import dataclasses
+import os
+import resource
+import statistics
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from planner_jax.optimise.lbfgs import LbfgsConfig
+from planner_jax.optimise.problem import Round
+from planner_jax.optimise.status import is_solved
+from planner_jax.referee.catch import referee_catches
+from planner_jax.referee.hit import referee_hits
+from planner_jax.sweep.settings import require
+from planner_jax.sweep.timing import CompileClock
+from planner_jax.task.catch.decide import plan_catches
+from planner_jax.task.catch.exact import ExactCatch
+from planner_jax.task.catch.suites import make_suite
+from planner_jax.task.hit.exact import ExactHit
+from planner_jax.task.hit.serves import generate_serves, to_scenarios
+from planner_jax.task.solve import plan
+
+_LONG = (Round(starts=1, solver=LbfgsConfig(max_steps=300, tolerance=1e-7, patience=6)),)
+_COMPARED = 1024  # lanes whose cost is held against a long search's, and with the CPU's
+
+
+class _Hits:
+    """Generated serves and `ExactHit`."""
+
+    planner = ExactHit()
+
+    def scenarios(self, num: int, seed: int) -> Any:
+        return to_scenarios(generate_serves(num, seed))
+
+    def plan(self, planner: Any, scenarios: Any, devices: Any) -> tuple[Any, Any]:
+        return scenarios, plan(planner, scenarios, devices=devices)
+
+    def accepted(self, scenarios: Any, plans: Any) -> np.ndarray:
+        return referee_hits(scenarios, plans).success
+
+    def contact(self, plans: Any) -> Any:
+        return plans.stroke.time
+
+
+class _Catches:
+    """The suite `throws` and `ExactCatch`."""
+
+    planner = ExactCatch()
+
+    def scenarios(self, num: int, seed: int) -> Any:
+        return make_suite("throws", num=num, seed=seed)
+
+    def plan(self, planner: Any, scenarios: Any, devices: Any) -> tuple[Any, Any]:
+        return plan_catches(planner, scenarios, "greedy", devices=devices)
+
+    def accepted(self, scenarios: Any, plans: Any) -> np.ndarray:
+        return referee_catches(scenarios, plans).success
+
+    def contact(self, plans: Any) -> Any:
+        return plans.times[..., 0]
+
+
+_TASKS: dict[str, Any] = {"hit": _Hits, "catch": _Catches}
+
+
+def report(
+    *,
+    task: str,
+    batch: Sequence[int],
+    devices: int | None,
+    iterations: int | None,
+    repeat: int,
+    seed: int,
+    agree: bool,
+) -> None:
+    """Measure and print one row a batch size.
+
+    Args:
+        task: "hit" or "catch".
+        batch: sizes.
+        devices: how many share a batch; None for all.
+        iterations: of the planner's first round; None for its own.
+        repeat: timed calls.
+        seed: of the scenarios.
+        agree: whether the first lanes are compared with a CPU's.
+
+    Raises:
+        SettingError: there are fewer devices.
+    """
+    kind = _TASKS[task]()
+    local = jax.local_devices()
+    require(devices is None or devices <= len(local), "devices", f"<= {len(local)}", devices)
+    used = local[: devices or len(local)]
+    planner = kind.planner
+    if iterations is not None:
+        first, *rest = planner.rounds
+        solver = dataclasses.replace(first.solver, max_steps=iterations)
+        rounds = (dataclasses.replace(first, solver=solver), *rest)
+        planner = dataclasses.replace(planner, rounds=rounds)
+    print(
+        f"{task}, {len(used)} x {used[0].device_kind}, jax {jax.__version__}, load average "
+        f"{os.getloadavg()[0]:.1f}; first round: {planner.rounds[0].solver.max_steps} iterations"
+    )
+    print(
+        "| plans | first call [s] | of it compiling [s] | fastest [ms] | median [ms] | plans/s |",
+        end="",
+    )
+    print(" refereed | cost above a long search's (median, p90) | memory [GiB] |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    for num in batch:
+        print(_row(kind, planner, num, seed, used, repeat), flush=True)
+    if agree:
+        print(_agreement(kind, planner, seed, used))
+
+
+def _row(kind: Any, planner: Any, num: int, seed: int, devices: list, repeat: int) -> str:
+    host = jax.tree.map(np.asarray, kind.scenarios(num, seed))
+    scenarios = jax.block_until_ready(jax.device_put(host, devices[0]))
+    seconds = []
+    with CompileClock() as clock:
+        for _ in range(1 + repeat):
+            began = time.perf_counter()
+            decided, plans = jax.block_until_ready(kind.plan(planner, scenarios, devices))
+            seconds.append(time.perf_counter() - began)
+    decided, plans = jax.device_get((decided, plans))
+    accepted = kind.accepted(decided, plans)
+    first = jax.tree.map(lambda leaf: leaf[:_COMPARED], (host, plans))
+    _, best = kind.plan(dataclasses.replace(planner, rounds=_LONG), first[0], devices)
+    both = is_solved(first[1].status) & is_solved(best.status)
+    gap = 100.0 * (first[1].cost / best.cost - 1.0)[both]
+    fastest, median = min(seconds[1:]), statistics.median(seconds[1:])
+    return (
+        f"| {num:,} | {seconds[0]:.1f} | {clock.seconds:.1f} | {1e3 * fastest:.2f} | "
+        f"{1e3 * median:.2f} | {num / fastest:,.0f} | {100.0 * accepted.mean():.3f} % "
+        f"({(~accepted).sum()} fail) | {np.median(gap):.1f} %, {np.quantile(gap, 0.9):.1f} % | "
+        f"{_memory(devices):.1f} |"
+    )
+
+
+def _memory(devices: list) -> float:
+    """Peak of a device, or of the process on a CPU [GiB]."""
+    stats = devices[0].memory_stats() or {}
+    peak = stats.get("peak_bytes_in_use")
+    if peak is None:
+        peak = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 2**30
+
+
+def _agreement(kind: Any, planner: Any, seed: int, devices: list) -> str:
+    """How far plans of the devices differ from those of a CPU, lane by lane."""
+    scenarios = jax.tree.map(np.asarray, kind.scenarios(_COMPARED, seed))
+    _, ours = kind.plan(planner, scenarios, devices)
+    with jax.default_device(jax.devices("cpu")[0]):
+        _, theirs = kind.plan(planner, scenarios, jax.devices("cpu")[:1])
+    same = np.asarray(ours.status) == np.asarray(theirs.status)
+    later = np.abs(np.asarray(kind.contact(ours)) - np.asarray(kind.contact(theirs)))
+    cost = np.abs(ours.cost / theirs.cost - 1.0)
+    return (
+        f"beside a CPU, {_COMPARED} lanes: status equal on {100.0 * same.mean():.2f} %; contact "
+        f"time differs by {1e3 * np.quantile(later, 0.99):.3f} ms on 99 % and "
+        f"{1e3 * later.max():.3f} at most; cost by {100.0 * np.quantile(cost, 0.99):.2g} % on 99 %"
+    )

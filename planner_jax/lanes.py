@@ -1,0 +1,266 @@
+"""`over_lanes`: `jax.vmap` that keeps the lanes on the last axis of every array.
+
+`vmap` puts the lanes first, so that the few numbers of one lane lie next to each other. In a
+loop that is bound by memory the neighbours should be the same number of other lanes: every
+read is then one whole line of memory, a sum over samples needs no exchange between threads,
+and the product with a constant matrix is one large product. Same numbers, another layout.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
+
+_ELEMENTWISE = frozenset(
+    "abs acos add add_any and asin atan atan2 cbrt ceil clamp convert_element_type copy copy_p "
+    "cos cosh div eq erf exp exp2 expm1 floor ge gt integer_pow is_finite le log log1p logistic "
+    "lt max min mul ne neg not or pow reduce_precision rem round rsqrt select_n sign sin sinh "
+    "sqrt square stop_gradient sub tan tanh xor".split()
+)
+# Their parameters name axes by number from the front, which the lanes do not move.
+_BY_AXIS = frozenset(
+    "argmax argmin cumlogsumexp cummax cummin cumprod cumsum reduce_and reduce_max reduce_min "
+    "reduce_or reduce_prod reduce_sum rev sort split squeeze unstack".split()
+)
+_JOINING = frozenset({"concatenate", "stack"})
+_CALLS = frozenset(
+    "checkpoint closed_call core_call custom_jvp_call custom_vjp_call jit pjit".split()
+)
+
+
+def over_lanes(function: Callable) -> Callable:
+    """The function on many lanes at once.
+
+    Args:
+        function: of pytrees of arrays of ONE lane, to a pytree of arrays.
+
+    Returns:
+        A function of the same pytrees with one more, last, axis on every leaf: the lanes.
+        Its results too have the lanes last. To rounding it is `jax.vmap` with all axes -1; it
+        is meant for the inside of a compiled function, and cannot be differentiated where
+        `function` has derivatives of its own making (differentiate within `function`).
+    """
+
+    @functools.wraps(function)
+    def mapped(*args: Any) -> Any:
+        leaves, treedef = jax.tree.flatten(args)
+        lanes = leaves[0].shape[-1]
+        single = [jax.ShapeDtypeStruct(leaf.shape[:-1], leaf.dtype) for leaf in leaves]
+        closed, shape = jax.make_jaxpr(function, return_shape=True)(
+            *jax.tree.unflatten(treedef, single)
+        )
+        found = _evaluate(closed.jaxpr, closed.consts, [_Lanes(leaf) for leaf in leaves], lanes)
+        full = [
+            _widened(value, _shape(out), lanes)
+            for value, out in zip(found, closed.jaxpr.outvars, strict=True)
+        ]
+        return jax.tree.unflatten(jax.tree.structure(shape), full)
+
+    return mapped
+
+
+# A kernel takes the tree of a function's arguments and their leaves, with the lanes last; it gives
+# the leaves of the results, or None where it is not made for such shapes.
+Kernel = Callable[[Any, Sequence[Array]], list[Array] | None]
+_KERNELS: dict[str, tuple[Any, Kernel]] = {}
+
+
+def with_kernel(function: Callable, kernel: Kernel) -> Callable:
+    """The function, for which `over_lanes` calls a kernel where the program is for CUDA.
+
+    Args:
+        function: of pytrees of arrays of ONE lane, to a pytree of arrays.
+        kernel: the same on lanes. `jax.vmap` within a lane adds axes in front of some leaves.
+    """
+    name = f"kernel_{len(_KERNELS)}"
+
+    def named(*args: Any) -> Any:
+        _KERNELS[name] = (jax.tree.structure(args), kernel)
+        return function(*args)
+
+    named.__name__ = named.__qualname__ = name
+    _KERNELS[name] = (None, kernel)
+    return jax.jit(named)
+
+
+class _Lanes:
+    """An array with lanes on its last axis; anything else is the same for all lanes."""
+
+    def __init__(self, array: Array) -> None:
+        self.array = array
+
+
+def _shape(atom: Any) -> tuple[int, ...]:
+    """Shape of a variable of a jaxpr."""
+    return atom.aval.shape
+
+
+def _widened(value: Any, shape: tuple[int, ...], lanes: int) -> Array:
+    """The array of a value, of (*shape, lanes)."""
+    if isinstance(value, _Lanes):
+        return value.array
+    return jnp.broadcast_to(jnp.asarray(value)[..., None], (*shape, lanes))
+
+
+def _evaluate(jaxpr: Jaxpr, consts: Any, args: list[Any], lanes: int) -> list[Any]:
+    """Values of the outputs, `_Lanes` or not, of a jaxpr of one lane."""
+    values: dict[Any, Any] = dict(zip(jaxpr.constvars, consts, strict=True))
+    values.update(zip(jaxpr.invars, args, strict=True))
+
+    def read(atom: Any) -> Any:
+        return atom.val if isinstance(atom, Literal) else values[atom]
+
+    for eqn in jaxpr.eqns:
+        inputs = [read(atom) for atom in eqn.invars]
+        values.update(zip(eqn.outvars, _outputs(eqn, inputs, lanes), strict=True))
+    return [read(atom) for atom in jaxpr.outvars]
+
+
+def _outputs(eqn: JaxprEqn, inputs: list[Any], lanes: int) -> list[Any]:
+    """What one operation makes of its inputs."""
+    name = eqn.primitive.name
+    if name in _CALLS:
+        inner = eqn.params["jaxpr"] if "jaxpr" in eqn.params else eqn.params["call_jaxpr"]
+        closed = inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
+        plain = functools.partial(_evaluate, closed.jaxpr, closed.consts)
+        if eqn.params.get("name") in _KERNELS and jax.default_backend() == "gpu":
+            return _by_kernel(eqn, inputs, lanes, plain)
+        return plain(inputs, lanes)
+    if not any(isinstance(value, _Lanes) for value in inputs):
+        return _bound(eqn, inputs)
+    shapes = [_shape(atom) for atom in eqn.invars]
+    out_shape = _shape(eqn.outvars[0])
+    found = None
+    if name in _ELEMENTWISE:
+        found = _bound(eqn, [_spread(value, out_shape, lanes) for value in inputs])
+    elif name in _BY_AXIS:
+        found = _bound(eqn, [_widened(v, s, lanes) for v, s in zip(inputs, shapes, strict=True)])
+    elif name in _JOINING:
+        wide = [_widened(v, s, lanes) for v, s in zip(inputs, shapes, strict=True)]
+        found = _bound(eqn, wide)
+    elif name in _RULES:
+        found = _RULES[name](eqn, inputs, lanes)
+    if found is None:
+        return _mapped(eqn, inputs)
+    return [_Lanes(array) for array in found]
+
+
+def _by_kernel(eqn: JaxprEqn, inputs: list[Any], lanes: int, plain: Callable) -> list[Any]:
+    """A function that has a kernel: that for CUDA, and what the function says elsewhere."""
+    treedef, kernel = _KERNELS[eqn.params["name"]]
+    arrays = [_widened(v, _shape(atom), lanes) for v, atom in zip(inputs, eqn.invars, strict=True)]
+
+    def in_kernel(*leaves: Array) -> list[Array]:
+        found = kernel(treedef, leaves)
+        return in_steps(*leaves) if found is None else [*found]
+
+    def in_steps(*leaves: Array) -> list[Array]:
+        found = plain([_Lanes(leaf) for leaf in leaves], lanes)
+        shapes = [_shape(atom) for atom in eqn.outvars]
+        return [_widened(v, shape, lanes) for v, shape in zip(found, shapes, strict=True)]
+
+    return [
+        _Lanes(leaf) for leaf in lax.platform_dependent(*arrays, cuda=in_kernel, default=in_steps)
+    ]
+
+
+def _bound(eqn: JaxprEqn, inputs: list[Any], **changes: Any) -> list[Any]:
+    """The operation itself, some of its parameters changed."""
+    found = eqn.primitive.bind(*inputs, **{**eqn.params, **changes})
+    return list(found) if eqn.primitive.multiple_results else [found]
+
+
+def _spread(value: Any, shape: tuple[int, ...], lanes: int) -> Array:
+    """An operand of an elementwise operation, of (*shape, lanes)."""
+    array = value.array if isinstance(value, _Lanes) else jnp.asarray(value)[..., None]
+    if array.ndim == 1 and shape:  # one number a lane, such as the bound of a clamp
+        array = array.reshape((1,) * len(shape) + array.shape)
+    return jnp.broadcast_to(array, (*shape, lanes))
+
+
+def _mapped(eqn: JaxprEqn, inputs: list[Any]) -> list[Any]:
+    """Any operation, by way of `jax.vmap` with the lanes first."""
+    arrays = [jnp.moveaxis(v.array, -1, 0) if isinstance(v, _Lanes) else v for v in inputs]
+    axes = tuple(0 if isinstance(value, _Lanes) else None for value in inputs)
+    found = jax.vmap(lambda *operands: _bound(eqn, list(operands)), in_axes=axes)(*arrays)
+    return [_Lanes(jnp.moveaxis(array, 0, -1)) for array in found]
+
+
+def _broadcast(eqn: JaxprEqn, inputs: list[Any], lanes: int) -> list[Any]:
+    shape, dims = eqn.params["shape"], eqn.params["broadcast_dimensions"]
+    return [lax.broadcast_in_dim(inputs[0].array, (*shape, lanes), (*dims, len(shape)))]
+
+
+def _reshape(eqn: JaxprEqn, inputs: list[Any], lanes: int) -> list[Any]:
+    return [inputs[0].array.reshape(*eqn.params["new_sizes"], lanes)]
+
+
+def _transpose(eqn: JaxprEqn, inputs: list[Any], lanes: int) -> list[Any]:
+    order = eqn.params["permutation"]
+    return [lax.transpose(inputs[0].array, (*order, len(order)))]
+
+
+def _slice(eqn: JaxprEqn, inputs: list[Any], lanes: int) -> list[Any]:
+    strides = eqn.params["strides"]
+    return [
+        lax.slice(
+            inputs[0].array,
+            (*eqn.params["start_indices"], 0),
+            (*eqn.params["limit_indices"], lanes),
+            None if strides is None else (*strides, 1),
+        )
+    ]
+
+
+def _pad(eqn: JaxprEqn, inputs: list[Any], lanes: int) -> list[Any] | None:
+    operand, filling = inputs
+    if isinstance(filling, _Lanes):
+        return None
+    return [lax.pad(operand.array, filling, (*eqn.params["padding_config"], (0, 0, 0)))]
+
+
+def _dot_general(eqn: JaxprEqn, inputs: list[Any], lanes: int) -> list[Any] | None:
+    """A product with a matrix that all lanes share: one product, the lanes among its columns."""
+    (left, right), ((left_dims, right_dims), batch) = inputs, eqn.params["dimension_numbers"]
+    both = isinstance(left, _Lanes) and isinstance(right, _Lanes)
+    if both or batch != ((), ()):
+        return None
+    if isinstance(right, _Lanes):
+        return _bound(eqn, [left, right.array])
+    swapped = ((right_dims, left_dims), batch)
+    found = _bound(eqn, [right, left.array], dimension_numbers=swapped)[0]
+    ahead = right.ndim - len(right_dims)
+    places = (*range(ahead, found.ndim - 1), *range(ahead), found.ndim - 1)
+    return [lax.transpose(found, places)]
+
+
+def _dynamic_slice(eqn: JaxprEqn, inputs: list[Any], lanes: int) -> list[Any] | None:
+    """A window that each lane begins elsewhere."""
+    operand, *starts = inputs
+    shape = _shape(eqn.invars[0])
+    window = _widened(operand, shape, lanes)
+    for axis, (start, size) in enumerate(zip(starts, eqn.params["slice_sizes"], strict=True)):
+        if not isinstance(start, _Lanes):
+            window = lax.dynamic_slice_in_dim(window, start, size, axis)
+            continue
+        first = jnp.clip(start.array, 0, shape[axis] - size)
+        places = [1] * len(shape)
+        places[axis] = size
+        places = jnp.arange(size, dtype=first.dtype).reshape(*places, 1) + first
+        window = jnp.take_along_axis(window, places, axis)
+    return [window]
+
+
+_RULES: dict[str, Callable[[JaxprEqn, list[Any], int], list[Any] | None]] = {
+    "broadcast_in_dim": _broadcast,
+    "dot_general": _dot_general,
+    "dynamic_slice": _dynamic_slice,
+    "pad": _pad,
+    "reshape": _reshape,
+    "slice": _slice,
+    "transpose": _transpose,
+}

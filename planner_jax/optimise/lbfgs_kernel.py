@@ -1,0 +1,118 @@
+"""The next direction of L-BFGS on many lanes as one kernel for CUDA, in Pallas' Triton.
+
+In single operations it is a chain of some thirty sums that each wait for the last. Here a block
+of threads keeps its lanes' gradient in registers and reads every pair twice.
+"""
+
+import functools
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+_LANES = 32  # of a block
+_FEWEST = 16  # lanes that are worth a block
+
+
+def turn_kernel(num_pairs: int, step_cap: float, *, interpret: bool = False) -> Callable:
+    """What `lanes.with_kernel` takes for `lbfgs.remember` and `lbfgs.search_direction`.
+
+    Args:
+        num_pairs: m.
+        step_cap: largest length of the direction.
+        interpret: run it without a GPU, for tests.
+    """
+
+    def kernel(treedef: Any, leaves: Sequence[Array]) -> list[Array] | None:
+        grad = leaves[-1]
+        if grad.ndim != 2 or grad.dtype != jnp.float32 or math.gcd(grad.shape[1], _LANES) < _FEWEST:
+            return None
+        return _call(num_pairs, step_cap, *grad.shape, interpret)(*leaves)
+
+    return kernel
+
+
+@functools.cache
+def _call(num_pairs: int, step_cap: float, n: int, lanes: int, interpret: bool) -> Callable:
+    """The kernel for vectors of n on `lanes` lanes."""
+    from jax.experimental import pallas as pl
+    from jax.experimental.pallas import triton
+
+    width = math.gcd(lanes, _LANES)
+    height = 1 << (n - 1).bit_length()  # a block's rows are a power of two
+
+    def body(steps, changes, inverses, step, change, grad, *out):
+        new_steps, new_changes, new_inverses, direction = out
+        rows = jax.lax.broadcasted_iota(jnp.int32, (height, width), 0)
+        columns = jax.lax.broadcasted_iota(jnp.int32, (height, width), 1)
+        there = rows < n
+
+        def load(ref: Any, *pair: int) -> Array:
+            return triton.load(ref.at[(*pair, rows, columns)], mask=there, other=0.0)
+
+        def store(ref: Any, value: Array, *pair: int) -> None:
+            triton.store(ref.at[(*pair, rows, columns)], value, mask=there)
+
+        def dot(a: Array, b: Array) -> Array:
+            return jnp.sum(a * b, axis=0)
+
+        step, change, grad = load(step), load(change), load(grad)
+        curvature = dot(step, change)
+        keep = curvature > 1e-8 * dot(change, change)
+        moved = dot(step, step) > 0.0
+        inverse = jnp.where(keep, 1.0 / jnp.where(keep, curvature, 1.0), 0.0)
+        none = jnp.zeros_like(inverse)
+
+        # Newest first. A slot's pair is the one behind it if there is a new one.
+        alphas, kept, q = [], [], grad
+        for k in reversed(range(num_pairs)):
+            last = k == num_pairs - 1
+            old = [load(steps, k), load(changes, k)]
+            behind = [step, change] if last else [load(steps, k + 1), load(changes, k + 1)]
+            own = [
+                jnp.where(keep, new, jnp.where(moved, was, 0.0))
+                for new, was in zip(behind, old, strict=True)
+            ]
+            later = inverse if last else inverses[k + 1]
+            weight = jnp.where(keep, later, jnp.where(moved, inverses[k], none))
+            store(new_steps, own[0], k)
+            store(new_changes, own[1], k)
+            new_inverses[k] = weight
+            alpha = weight * dot(own[0], q)
+            q = q - alpha * own[1]
+            alphas.append(alpha)
+            kept.append((own, weight))
+        (_, newest_change), newest = kept[0]
+        size = dot(newest_change, newest_change) * newest
+        slope = jnp.sqrt(jnp.maximum(dot(grad, grad), 1e-30))
+        gamma = jnp.where(newest > 0.0, 1.0 / jnp.where(newest > 0.0, size, 1.0), 1.0 / slope)
+        q = gamma * q
+        for ((own_step, own_change), weight), alpha in zip(
+            reversed(kept), reversed(alphas), strict=True
+        ):
+            beta = weight * dot(own_change, q)
+            q = q + own_step * (alpha - beta)
+        length = jnp.sqrt(jnp.maximum(dot(q, q), 1e-30))
+        store(direction, -q * jnp.minimum(1.0, step_cap / length))
+
+    matrix = pl.BlockSpec((num_pairs, n, width), lambda i: (0, 0, i))
+    vector = pl.BlockSpec((n, width), lambda i: (0, i))
+    numbers = pl.BlockSpec((num_pairs, width), lambda i: (0, i))
+    return pl.pallas_call(
+        body,
+        out_shape=[
+            jax.ShapeDtypeStruct((num_pairs, n, lanes), jnp.float32),
+            jax.ShapeDtypeStruct((num_pairs, n, lanes), jnp.float32),
+            jax.ShapeDtypeStruct((num_pairs, lanes), jnp.float32),
+            jax.ShapeDtypeStruct((n, lanes), jnp.float32),
+        ],
+        grid=(lanes // width,),
+        in_specs=[matrix, matrix, numbers, vector, vector, vector],
+        out_specs=[matrix, matrix, numbers, vector],
+        compiler_params=triton.CompilerParams(num_warps=4, num_stages=1),
+        interpret=interpret,
+        name="lbfgs_turn",
+    )

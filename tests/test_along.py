@@ -1,0 +1,112 @@
+"""Penalties along a trajectory: what they integrate, their slopes, and the kernel for both."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from planner_jax.cost.along import Along, integrate_along
+from planner_jax.cost.along_kernel import along_kernel
+from planner_jax.cost.limits import motion_excess
+from planner_jax.cost.penalty import smoothed_hinge
+from planner_jax.robot.quadrotor import QuadrotorLimits
+from planner_jax.trajectory.proportional_minco import proportional_minco, sample_motion
+
+PROPORTIONS, LANES, SEGMENTS = (0.4, 1.0, 1.0), 32, 2
+
+
+def limits_along(motion, given):
+    return motion_excess(motion, *given)
+
+
+ALONG = Along(
+    proportional_minco(4, PROPORTIONS),
+    5,
+    limits_along,
+    margins=(0.1, 0.1, 0.1, 0.05),
+    hinge_width=0.2,
+)
+
+
+def cases(num=LANES, dtype=np.float32):
+    """Trajectories that break every limit somewhere: columns, durations, gravity and limits."""
+    random = np.random.default_rng(0)
+    columns = random.standard_normal((num, SEGMENTS, 10, 3)) * 0.7
+    durations = random.uniform(0.2, 0.5, (num, SEGMENTS))
+    limit = lambda low, high: random.uniform(low, high, num).astype(dtype)  # noqa: E731
+    limits = QuadrotorLimits(limit(2, 9), limit(5, 15), limit(3, 8), limit(-1, 1))
+    return columns.astype(dtype), durations.astype(dtype), (limit(9, 10), limits)
+
+
+def test_it_is_the_trapezoid_sum_of_the_hinges(float64):
+    columns, durations, given = jax.tree.map(lambda x: x[0], cases(dtype=np.float64))
+    penalties, worst = integrate_along(ALONG, columns, durations, given)
+    for n in range(SEGMENTS):
+        motion = sample_motion(ALONG.maps, ALONG.nodes, columns[n], durations[n])
+        excess = np.stack(motion_excess(motion, *given))
+        hinges = smoothed_hinge(excess + np.array(ALONG.margins)[:, None], 0.2).sum(axis=0)
+        times = np.concatenate([[0.0], np.cumsum(np.repeat(ALONG.maps.proportions, 5) / 5)])
+        expected = durations[n] * np.trapezoid(hinges, times)
+        np.testing.assert_allclose(penalties[n], expected, rtol=1e-12)
+        np.testing.assert_allclose(worst[n], excess.max(), rtol=1e-12)
+
+
+def test_slopes_and_curvature_are_those_of_finite_differences(float64):
+    columns, durations, given = jax.tree.map(lambda x: jnp.asarray(x[1]), cases(dtype=np.float64))
+
+    def value(x):
+        c, h, g = x
+        penalties, _ = integrate_along(ALONG, c, h, g)
+        return jnp.sum(penalties)
+
+    x = (columns, durations, given)
+    for moving in ((True, False), (False, True), (True, True)):  # the unknowns, the parameters
+        direction = (
+            jax.tree.map(
+                lambda leaf, m=moving[0]: m * jnp.cos(jnp.arange(leaf.size)).reshape(leaf.shape),
+                x[:2],
+            ),
+            jax.tree.map(lambda leaf, m=moving[1]: m * jnp.ones_like(leaf), given),
+        )
+        direction = (*direction[0], direction[1])
+        along = lambda t, d=direction: value(jax.tree.map(lambda a, b: a + t * b, x, d))  # noqa: E731
+        for function, tolerance in ((along, 1e-7), (jax.grad(along), 1e-6)):
+            step = 1e-5
+            expected = (function(step) - function(-step)) / (2.0 * step)
+            found = jax.grad(function)(0.0) if function is along else jax.jacfwd(function)(0.0)
+            np.testing.assert_allclose(found, expected, rtol=tolerance, atol=1e-6)
+
+
+def test_worst_has_no_derivative():
+    columns, durations, given = jax.tree.map(lambda x: jnp.asarray(x[1]), cases())
+    slope = jax.grad(lambda c: jnp.sum(integrate_along(ALONG, c, durations, given)[1]))(columns)
+    np.testing.assert_array_equal(slope, 0.0)
+
+
+@pytest.mark.parametrize("slopes", [False, True])
+def test_the_kernel_gives_the_same_numbers(slopes):
+    args = cases()
+    lanes = jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), args)
+
+    def plain(c, h, given):
+        value = lambda *x: integrate_along(ALONG, *x, given)  # noqa: E731
+        if not slopes:
+            return value(c, h)
+        penalties, pull_back, worst = jax.vjp(value, c, h, has_aux=True)
+        return penalties, worst, *pull_back(jnp.ones_like(penalties))
+
+    expected = jax.vmap(plain, out_axes=-1)(*args)
+    kernel = along_kernel(ALONG, slopes=slopes, interpret=True)
+    found = kernel(jax.tree.structure(args), jax.tree.leaves(lanes))
+    assert len(found) == len(expected)
+    for ours, theirs in zip(found, expected, strict=True):
+        scale = np.abs(theirs).max()
+        np.testing.assert_allclose(ours, theirs, rtol=2e-4, atol=2e-5 * scale)
+
+
+def test_the_kernel_leaves_alone_what_it_is_not_made_for():
+    kernel = along_kernel(ALONG, slopes=False)
+    for num, dtype in ((LANES, np.float16), (7, np.float32)):
+        args = cases(num, dtype)
+        lanes = jax.tree.leaves(jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), args))
+        assert kernel(jax.tree.structure(args), lanes) is None

@@ -1,0 +1,84 @@
+"""`over_lanes` is `jax.vmap` with the lanes last, whatever the function does."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from planner_jax.lanes import over_lanes
+
+MATRIX = np.random.default_rng(0).standard_normal((5, 4))
+LANES = 7
+
+
+@jax.custom_jvp
+def cube(x):
+    return x**3
+
+
+cube.defjvp(lambda primals, tangents: (cube(*primals), 7.0 * tangents[0]))  # not its slope
+
+
+def halved_until_small(x):
+    return jax.lax.while_loop(lambda y: jnp.sum(y**2) > 0.1, lambda y: 0.5 * y, x)
+
+
+FUNCTIONS = {
+    "matrix from the left": lambda x, k: MATRIX @ x,
+    "matrix from the right": lambda x, k: x.T @ MATRIX.T,
+    "matrix of three axes": lambda x, k: jnp.einsum("abc,bd->dac", MATRIX.reshape(5, 2, 2), x[:2]),
+    "product of two lanes": lambda x, k: x.T @ x,
+    "sum over axes": lambda x, k: (jnp.sum(x), jnp.sum(x, axis=-1), jnp.max(x, axis=0)),
+    "shape": lambda x, k: x.reshape(2, 6)[::-1, 1::2].T,
+    "joining": lambda x, k: jnp.concatenate([x, jnp.stack([x[0], jnp.ones(3)])], axis=0),
+    "padding": lambda x, k: jnp.pad(x, ((1, 0), (0, 2)), constant_values=2.0),
+    "splitting": lambda x, k: jnp.split(x, 3, axis=-1),
+    "window": lambda x, k: jax.lax.dynamic_slice_in_dim(x, k, 2),
+    "window across": lambda x, k: jax.lax.dynamic_slice(x, (0, k), (4, 2)),
+    "window of a constant": lambda x, k: jax.lax.dynamic_slice_in_dim(MATRIX, k, 3) * x[0, 0],
+    "gather": lambda x, k: x[k],
+    "bounds": lambda x, k: jnp.clip(x, -0.5, x[0, 0]),
+    "choice": lambda x, k: jnp.where(k > 1, x, 0.0),
+    "loop": lambda x, k: halved_until_small(x),
+    "branches": lambda x, k: jax.lax.cond(k > 1, jnp.sin, jnp.cos, x),
+    "own derivative": lambda x, k: (cube(x), jax.grad(lambda y: jnp.sum(cube(y)))(x)),
+    "gradient": lambda x, k: jax.grad(lambda y: jnp.sum(jnp.sin(MATRIX @ y) ** 2) / y[0, 0])(x),
+    "inner map": lambda x, k: jax.vmap(lambda a: jnp.sum(a * x))(jnp.arange(3.0)),
+    "no lanes": lambda x, k: jnp.arange(3.0) + MATRIX[0, 0],
+    "untouched": lambda x, k: {"k": k, "x": x},
+    "compiled": lambda x, k: jax.jit(jnp.cumsum)(x),
+    "order": lambda x, k: (jnp.argmin(x, axis=1), jnp.sort(x, axis=0)),
+}
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_is_vmap_with_the_lanes_last(name, float64):
+    random = np.random.default_rng(1)
+    x = jnp.asarray(random.standard_normal((4, 3, LANES)))
+    k = jnp.asarray(random.integers(-1, 5, LANES))
+    function = FUNCTIONS[name]
+    expected = jax.vmap(function, in_axes=-1, out_axes=-1)(x, k)
+    found = over_lanes(function)(x, k)
+    assert jax.tree.structure(found) == jax.tree.structure(expected)
+    for ours, theirs in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        assert ours.dtype == theirs.dtype
+        np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-14)
+
+
+def test_a_shared_matrix_makes_one_product_and_no_gather():
+    """What the layout is for: the lanes stay columns of one large product."""
+    jaxpr = jax.make_jaxpr(over_lanes(lambda x: jnp.sum((MATRIX @ x) ** 2)))(
+        jnp.ones((4, 3, LANES))
+    )
+    (product,) = [eqn for eqn in jaxpr.eqns if eqn.primitive.name == "dot_general"]
+    assert product.outvars[0].aval.shape == (5, 3, LANES)
+    assert not [eqn for eqn in jaxpr.eqns if eqn.primitive.name in ("transpose", "gather")]
+
+
+def test_lanes_do_not_mix():
+    x = np.random.default_rng(2).standard_normal((4, 3, LANES))
+    clean = over_lanes(lambda y: jnp.tanh(MATRIX @ y))(jnp.asarray(x))
+    x[:, :, 2] = np.nan
+    broken = np.asarray(over_lanes(lambda y: jnp.tanh(MATRIX @ y))(jnp.asarray(x)))
+    assert np.isnan(broken[..., 2]).all()
+    np.testing.assert_array_equal(np.delete(broken, 2, -1), np.delete(np.asarray(clean), 2, -1))
