@@ -21,7 +21,7 @@ import numpy as np
 
 from planner_jax.task.catch.decide import plan_catches
 from planner_jax.task.catch.exact import ExactCatch
-from sims.catch import HOME, SEEN, CatchPilot, scenarios, throws
+from sims.catch import HOME, SEEN, CatchPilot, scenarios, throws, with_catch
 from sims.closed_loop import Loop, fly_leg
 from sims.launch import launched, ready
 from sims.model import NET, World, hovering, step
@@ -73,10 +73,10 @@ def closed_loop(world: World, worlds: int, seconds: float) -> None:
     flight = ready(loop, starts, jax.random.split(jax.random.key(0), few))
     balls = jax.tree.map(jnp.asarray, cases.balls)
     flight = launched(loop, flight, balls, drag, believed, ball=0, seen=SEEN)
-    scenario = scenarios(loop, flight, jnp.asarray(cases.horizon))
+    scenario = scenarios(loop, flight, jnp.array([True]), jnp.asarray(cases.horizon))
     _, plan = plan_catches(ExactCatch(), jax.tree.map(np.asarray, scenario))
     begun = jax.tree.map(jnp.asarray, plan)
-    flight = dataclasses.replace(flight, plan=begun, began=flight.time, key=None)
+    flight = with_catch(flight, begun, jnp.array([True])).replace(key=None)
     many = lambda leaf: jnp.resize(leaf, (worlds, *leaf.shape[1:]))  # noqa: E731
     keys = jax.random.split(jax.random.key(1), worlds)
     flight = dataclasses.replace(jax.tree.map(many, flight), key=keys)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import time
 from typing import Any
 
 import jax
@@ -139,6 +140,7 @@ class CatchFlights:
 
     first_plan: CatchPlan
     flown: Flown  # times from the first plan
+    planning_seconds: float  # of the host's clock, spent on plans from scratch
 
     @property
     def caught(self) -> np.ndarray:
@@ -147,29 +149,96 @@ class CatchFlights:
 
 
 @functools.partial(jax.jit, static_argnames="loop")
-def scenarios(loop: Loop, flights: Flight, horizon: Array) -> CatchScenario:
-    """What is to be caught from now on, as it is believed; horizons (B, N) [s] from now."""
+def scenarios(loop: Loop, flights: Flight, new: Array, horizon: Array) -> CatchScenario:
+    """The catch of a ball that has come into sight, as it is believed.
+
+    It is to be planned from where the last catch that is planned already will have been made,
+    or from now where none is left; times count from then.
+
+    Args:
+        loop: of the flights.
+        flights: leaves (B, ...).
+        new: (N,) bool, which ball it is.
+        horizon: (B, N) [s] from now, until when each may be caught.
+    """
     unknown: Any = None
     empty = catch_scenario(
         unknown, np.zeros(horizon.shape), gravity=loop.world.gravity, net_radius=_AIM_RADIUS
     )
 
     def one(scenario: CatchScenario, flight: Flight, horizon: Array) -> CatchScenario:
-        head = scenario.head_state
+        head, after = scenario.head_state, jnp.zeros_like(flight.time)
         if flight.plan is None:
             head = head.at[0].set(flight.physics.qpos[:3])
         else:
-            head = state_at(with_rest(flight.plan.trajectory), flight.time - flight.began)
-        balls = expected(loop, flight.earlier, loop.period)
+            after = until_last_catch(flight)
+            path = with_rest(flight.plan.trajectory)
+            head = state_at(path, flight.time - flight.began + after)
+        balls = expected(loop, flight.earlier, loop.period + after)
+        horizon = horizon - after
         return dataclasses.replace(
             scenario,
             targets=tables(balls, flight.earlier.drag, horizon, scenario.gravity),
-            present=flight.present,
+            present=new,
             horizon=horizon,
             head_state=head,
         )
 
     return jax.vmap(one)(empty, flights, horizon)
+
+
+def until_last_catch(flight: Flight) -> Array:
+    """Time () [s] from now to the last catch that is planned; 0 where none is left."""
+    planned = CatchPilot().times(flight.plan) - (flight.time - flight.began)
+    return jnp.maximum(jnp.max(jnp.where(flight.present, planned, 0.0)), 0.0)
+
+
+@jax.jit
+def with_catch(flights: Flight, found: CatchPlan, new: Array) -> Flight:
+    """Flights (B, ...) with one more catch behind those that are planned already.
+
+    Args:
+        flights: as `scenarios` saw them.
+        found: plans (B, ...) of its scenarios.
+        new: (N,) bool, which ball that is.
+    """
+
+    def one(flight: Flight, found: CatchPlan) -> Flight:
+        present = flight.present | new
+        alone = dataclasses.replace(flight, plan=found, began=flight.time, present=present)
+        if flight.plan is None:
+            return alone
+        old, number = flight.plan, new.size
+        each = found.trajectory.durations.size // number
+        lasts = jnp.sum(old.trajectory.durations.reshape(number, each), axis=1) > 0.0
+        segments = jnp.sum(lasts)  # of the old plan, catches that are made included
+        place = jnp.arange(number)
+        before = place < segments
+
+        def behind(old: Array, found: Array) -> Array:
+            rows = jnp.where(before, 0, place - segments)
+            shape = (number, *(1,) * (old.ndim - 1))
+            return jnp.where(before.reshape(shape), old, found[rows])
+
+        split = lambda leaf: leaf.reshape(number, each, *leaf.shape[1:])  # noqa: E731
+        flat = lambda leaf: leaf.reshape(-1, *leaf.shape[2:])  # noqa: E731
+        trajectory = jax.tree.map(
+            lambda a, b: flat(behind(split(a), split(b))), old.trajectory, found.trajectory
+        )
+        end = old.times[segments - 1]
+        rank = jnp.zeros_like(place).at[old.order].set(jnp.where(before, place, 2 * number))
+        order = jnp.argsort(jnp.where(new, number, rank), stable=True)
+        joined = dataclasses.replace(
+            found,
+            trajectory=trajectory,
+            order=order.astype(old.order.dtype),
+            times=behind(old.times, end + found.times),
+        )
+        joined = dataclasses.replace(flight, plan=joined, present=present)
+        going = until_last_catch(flight) > 0.0
+        return jax.tree.map(lambda a, b: jnp.where(going, a, b), joined, alone)
+
+    return jax.vmap(one)(flights, found)
 
 
 def fly_catches(
@@ -183,8 +252,8 @@ def fly_catches(
 ) -> CatchFlights:
     """Plan and fly a batch of throws.
 
-    Whenever a ball comes into sight, all catches still to be made are planned from scratch, next
-    whatever can be caught first; in between they are re-planned inside the loop.
+    Whenever a ball comes into sight, its catch is planned from scratch, from where the last one
+    that is planned will have been made; all that are left are then re-planned inside the loop.
 
     Args:
         loop: world, sensing, rates and gains.
@@ -206,30 +275,35 @@ def fly_catches(
     balls, believed = jax.tree.map(jnp.asarray, (cases.balls, cases.believed))
     keys = flight_keys(seed, cases.index)
     flight = ready(loop, jnp.tile(jnp.array(HOME), (len(cases), 1)), keys)
-    plans, records = [], []
+    first: Any = plan
+    records, planning = [], 0.0
     for ball in range(num_balls):
         flight = launched(loop, flight, balls, drag, believed, ball=ball, seen=SEEN)
         begins = INTERVAL * (np.arange(num_balls) - ball)  # of the balls' own times, from now
-        scenario = scenarios(loop, flight, jnp.asarray(cases.horizon + begins, jnp.float32))
+        horizon = jnp.asarray(cases.horizon + begins, jnp.float32)
+        new = jnp.arange(num_balls) == ball
+        scenario = scenarios(loop, flight, new, horizon)
         if plan is None or ball > 0:
-            plans.append(plan_catches(planner, jax.tree.map(np.asarray, scenario), "greedy")[1])
+            known = jax.tree.map(np.asarray, scenario)
+            began = time.perf_counter()
+            found = plan_catches(planner, known, "greedy")[1]
+            planning += time.perf_counter() - began
         else:
             require_catch_plan(plan, scenario)
-            plans.append(plan)
-        begun = jax.tree.map(jnp.asarray, plans[-1])
-        flight = dataclasses.replace(flight, plan=begun, began=flight.time)
+            found = plan
+        first = found if first is None else first
+        flight = with_catch(flight, jax.tree.map(jnp.asarray, found), new)
         last = ball == num_balls - 1
-        duration = float(cases.horizon.max()) + _AFTER if last else INTERVAL
         flight, record = fly_leg(
             loop,
             pilot,
             flight,
-            dataclasses.replace(scenario, horizon=scenario.horizon + INTERVAL * ball),
+            dataclasses.replace(scenario, horizon=horizon + flight.time[:, None]),
             drag,
-            num_periods=loop.num_periods(duration),
+            num_periods=loop.num_periods(float(cases.horizon.max()) + _AFTER if last else INTERVAL),
         )
         records.append(record)
-    return CatchFlights(first_plan=plans[0], flown=flown(flight, records))
+    return CatchFlights(first, flown(flight, records), planning)
 
 
 def require_catch_plan(plan: Any, scenario: CatchScenario) -> None:

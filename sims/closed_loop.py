@@ -128,7 +128,7 @@ class Flight:
     estimates: Estimate  # leaves (N, ...)
     earlier: Estimate  # those of one planning period ago
     launched: Array  # (N,) bool
-    present: Array  # (N,) bool, in flight and not yet met by plan
+    present: Array  # (N,) bool, planned for and not yet met by plan
     plan: Any
     began: Array  # () [s], when the plan began
     contact: Contact  # leaves (N, ...)
@@ -255,7 +255,7 @@ def _looked(loop: Loop, estimates: Estimate, seen: Array) -> Estimate:
     return jax.vmap(one)(estimates, seen)
 
 
-def expected(loop: Loop, estimates: Estimate, ahead: float) -> BallState:
+def expected(loop: Loop, estimates: Estimate, ahead: Any) -> BallState:
     """The balls `ahead` [s] from now, as they are believed, leaves (N, 3)."""
     dtype = estimates.drag.dtype
     gravity = jnp.asarray(loop.world.gravity, dtype)

@@ -30,6 +30,7 @@ class Gains:
     attitude: float = 16.0  # [1/s]
     heading: float = 4.0  # [1/s], of the attitude's error about body z
     rate: float = 25.0  # [1/s]
+    share: float = 0.5  # of the plan's thrust, largest correction of it
     correction: float = 6.0  # [rad/s], largest body rate against an attitude's error
 
 
@@ -113,7 +114,9 @@ def reference_at(trajectory: PiecewisePolynomial, time: Array, world: World) -> 
     order = lambda k, at: evaluate(trajectory, at, k)  # noqa: E731
     pos, vel, acc, jerk = (order(k, time) for k in range(4))
     lag, step = world.vehicle.rotor_lag, 2.0 * world.timestep
-    ahead = time + 1.5 * world.timestep  # a command waits for the next step, then is held for one
+    # What is asked for now is taken up by the next step, and its force counts around that step's
+    # beginning: MuJoCo's Euler is a leapfrog. In between it rises by itself, on average half way.
+    ahead = time + 0.5 * world.timestep
 
     def flat(at: Array) -> tuple[Array, Array]:
         acc_then = order(2, at)
@@ -143,7 +146,12 @@ def control(state: RobotState, reference: Reference, gains: Gains, world: World)
     R = rotation(state.quat_wxyz)
     half = 0.5 * world.timestep  # the velocities of MuJoCo's Euler are that much older
     ahead, faster = reference.pos - state.pos, reference.vel - half * reference.acc - state.vel
-    acc = reference.acc + gains.position * ahead + gains.velocity * faster
+    pull = net_thrust(reference.acc, jnp.asarray(gravity, ahead.dtype))
+    back = gains.position * ahead + gains.velocity * faster
+    # Unbounded, an error would turn a weak thrust any way, and the plan's with it.
+    most = gains.share * jnp.sqrt(jnp.sum(pull**2))
+    back *= jnp.minimum(most / jnp.sqrt(jnp.maximum(jnp.sum(back**2), 1e-6)), 1.0)
+    acc = reference.acc + back
     jerk = reference.jerk + gains.position * faster
     R_wanted, rate_wanted = flat_attitude(acc, jerk, gravity)
     pull = net_thrust(acc, jnp.asarray(gravity, acc.dtype))

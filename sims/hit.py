@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import time
 from collections.abc import Mapping
 from typing import Any
 
@@ -120,6 +121,7 @@ class HitFlights:
     flown: Flown  # times from the first plan; N = 1
     landing: np.ndarray  # (B, 3) [m], of the returned ball; NaN where it was missed
     miss: np.ndarray  # (B,) [m], from the target; inf where the ball was missed
+    planning_seconds: float  # of the host's clock, spent on plans from scratch
 
 
 @functools.partial(jax.jit, static_argnames="loop")
@@ -180,14 +182,17 @@ def fly_hits(
     guess = jnp.asarray(cases.believed)[:, None]
     flight = launched(loop, flight, balls, drag, guess, ball=0, seen=SEEN)
     scenario = _scenarios(loop, flight, truth)
-    first = plan_all(planner, scenario) if plan is None else plan
+    jax.block_until_ready(scenario)
+    clock = time.perf_counter()
+    first = jax.block_until_ready(plan_all(planner, scenario)) if plan is None else plan
+    planning = time.perf_counter() - clock
     require_hit_plan(first, scenario)
     begun = jax.tree.map(jnp.asarray, first)
-    flight = dataclasses.replace(flight, plan=begun, began=flight.time)
+    flight = dataclasses.replace(flight, plan=begun, began=flight.time, present=flight.launched)
     periods = loop.num_periods(_LONGEST - SEEN + _AFTER)
     flight, record = fly_leg(loop, pilot, flight, scenario, drag, num_periods=periods)
     landing, miss = jax.device_get(_landings(flight.contact, truth))
-    return HitFlights(first, flown(flight, [record]), landing, miss)
+    return HitFlights(first, flown(flight, [record]), landing, miss, planning)
 
 
 def require_hit_plan(plan: Any, scenario: HitScenario) -> None:

@@ -98,7 +98,6 @@ def launched(
             estimates=jax.tree.map(put, flight.estimates, now),
             earlier=jax.tree.map(put, flight.earlier, earlier),
             launched=flight.launched | which,
-            present=flight.present | which,
             key=key,
         )
 

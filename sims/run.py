@@ -38,6 +38,7 @@ from sims.scoring import returned
 from sims.sensing import NOISES
 
 TASKS = ("catch", "hit")
+_RECORDED = 256  # flights of a batch that are recorded whole
 _FRAME = "world, z up; times from the first plan"
 _NEAR, _FAR = 0.5, 1.0  # [m] from the target: the two rates of paper 002
 _RATES = {"catch": 100.0, "hit": 50.0}  # [Hz]
@@ -119,14 +120,14 @@ def _contact(name: str) -> Any:
     return lambda b: np.asarray(getattr(b.verdict.flown.contact, name)).reshape(len(b.cases), -1)
 
 
-def _success(flights: Any) -> np.ndarray:
+def success(flights: Any) -> np.ndarray:
     """(B,) bool: all balls caught, or the ball within half a metre of the target."""
     return flights.caught.all(axis=1) if hasattr(flights, "caught") else flights.miss <= _NEAR
 
 
 _COMMON = [
     Column("index", "", "place in the whole", pa.int64(), lambda b: b.cases.index),
-    Column("success", "", "caught, or landed within 0.5 m", BOOL, lambda b: _success(b.verdict)),
+    Column("success", "", "caught, or landed within 0.5 m", BOOL, lambda b: success(b.verdict)),
     Column(
         "status",
         "",
@@ -194,28 +195,34 @@ def start_flights(
             "loop": dataclasses.asdict(settings.loop(record=False)),
         }
     )
-    rows, times = _fly_all(settings, cases)
+    shown = min(film if video else 1, settings.num)
+    rows, times, flights = _fly_all(settings, cases, shown)
     folder.write_rows(folder.plans, rows)
     manifest = {**folder.read_manifest(), "summary": _summary(settings, rows), "times": times}
     folder.write_manifest(manifest)
-    _show(folder, settings, cases, video, film)
+    _show(folder, settings, cases[np.arange(shown)], flights, video)
     _report(folder, manifest, settings, video)
     manifest["state"] = "complete"
     folder.write_manifest(manifest)
     return manifest
 
 
-def _fly_all(settings: FlySettings, cases: Any) -> tuple[pa.Table, dict[str, Any]]:
-    """Rows of all flights, batch by batch, and seconds."""
+def _fly_all(settings: FlySettings, cases: Any, shown: int) -> tuple[pa.Table, dict[str, Any], Any]:
+    """Rows of all flights, batch by batch, seconds, and the first flights with their record.
+
+    A run of few flights records them all, which saves compiling another program.
+    """
     size = min(settings.batch or 4096, settings.num)
-    parts, compiling, warm, warm_flights = [], 0.0, 0.0, 0
+    record = shown <= size <= _RECORDED
+    parts, compiling, warm, warm_flights, recorded = [], 0.0, 0.0, 0, None
     watch = Stopwatch()
     for first in range(0, settings.num, size):
         lanes = np.arange(first, first + size) % settings.num  # the last batch is filled up
         with CompileClock() as clock:
             lap = Stopwatch()
-            flights = settings.fly(cases[lanes], record=False)
+            flights = settings.fly(cases[lanes], record)
             seconds = lap.lap()
+        recorded = flights if record and first == 0 else recorded
         compiling += clock.seconds
         if not clock.compiled:
             warm, warm_flights = warm + seconds, warm_flights + size
@@ -228,7 +235,9 @@ def _fly_all(settings: FlySettings, cases: Any) -> tuple[pa.Table, dict[str, Any
         "warm_flights": warm_flights,
         "wall_seconds": round(watch.lap(), 3),
     }
-    return pa.concat_tables(parts), times
+    if recorded is None:
+        recorded = settings.fly(cases[np.arange(shown)], record=True)
+    return pa.concat_tables(parts), times, recorded
 
 
 def _summary(settings: FlySettings, rows: pa.Table) -> dict[str, Any]:
@@ -261,23 +270,51 @@ def _after(settings: FlySettings, cases: Any, flights: Any, lane: int) -> list[n
     return [path[path[:, 2] > 0.0]]
 
 
-def _show(
-    folder: RunFolder, settings: FlySettings, cases: Any, video: str | None, film: int
+def _met(flights: Any) -> np.ndarray:
+    """When each ball was met (B, N) [s], NaN for never."""
+    return np.where(flights.flown.contact.met, flights.flown.contact.time, np.nan)
+
+
+def draw_one(
+    path: Path, settings: FlySettings, cases: Any, flights: Any, lane: int, **look: Any
 ) -> None:
-    """A picture of the first flight, and the film."""
-    lanes = range(min(film if video else 1, settings.num))
-    few = cases[np.array(lanes)]
-    flights = settings.fly(few, record=True)
-    world = settings.loop(record=True).world
-    records = [flight_of(flights.flown.record, lane) for lane in lanes]
-    after = [_after(settings, few, flights, lane) for lane in lanes]
-    words = np.where(_success(flights), "success", "failure")
-    titles = [f"{settings.task} {lane}, {word}" for lane, word in zip(lanes, words, strict=True)]
-    until = float(np.max(flights.flown.contact.time[0]))
+    """Write the picture of one of some flights that were recorded.
+
+    Args:
+        path: ends in .png.
+        settings: of the run.
+        cases: that were flown.
+        flights: what came of them.
+        lane: which one.
+        look: `title` and `view` for `film.draw_flight`.
+    """
+    record = flight_of(flights.flown.record, lane)
+    world, after = settings.loop(record=True).world, _after(settings, cases, flights, lane)
+    target = cases.scenarios.target[lane] if settings.task == "hit" else None
+    look = {"title": _title(settings, flights, lane), **look}
+    draw_flight(path, world, record, _met(flights)[lane], after=after, target=target, **look)
+
+
+def _title(settings: FlySettings, flights: Any, lane: int) -> str:
+    return f"{settings.task} {lane}, {'success' if success(flights)[lane] else 'failure'}"
+
+
+def _show(
+    folder: RunFolder, settings: FlySettings, cases: Any, flights: Any, video: str | None
+) -> None:
+    """A picture of the first flight, and a film of all `cases`."""
     folder.figures.mkdir(exist_ok=True)
-    draw_flight(folder.figures / "flight.png", world, records[0], until, titles[0], after[0])
+    draw_one(folder.figures / "flight.png", settings, cases, flights, 0)
     if video is not None:
-        film_flights(folder.path / video, world, records, titles, after)
+        lanes = range(len(cases))
+        film_flights(
+            folder.path / video,
+            settings.loop(record=True).world,
+            [flight_of(flights.flown.record, lane) for lane in lanes],
+            _met(flights)[: len(cases)],
+            [_title(settings, flights, lane) for lane in lanes],
+            [_after(settings, cases, flights, lane) for lane in lanes],
+        )
 
 
 def headline(manifest: dict[str, Any]) -> list[str]:

@@ -27,6 +27,7 @@ class Vehicle:
     max_rotor_thrust: float = 11.8  # [N]
     torque_ratio: float = 0.016  # [m], rotor's drag torque over its thrust
     rotor_lag: float = 0.02  # [s], time constant of a rotor's thrust
+    spare_thrust: float = 1.0  # [N], by which a rotor's may be raised to make room for a torque
 
     def __post_init__(self) -> None:
         for name in ("mass", "diagonal", "max_rotor_thrust", "torque_ratio", "rotor_lag"):
@@ -55,7 +56,8 @@ def rotor_thrusts(vehicle: Vehicle, thrust: Array, torque: Array) -> Array:
     """Rotor thrusts (4,) [N] that make a wrench, each within what a rotor can do.
 
     Where they cannot make all of it, roll and pitch go before the thrust, without which it
-    would point elsewhere, and the thrust before yaw, which a round tool does not feel.
+    would point elsewhere, and the thrust before yaw, which a round tool does not feel. Roll and
+    pitch are cut where they would raise the thrust by more than is spared for them.
 
     Args:
         vehicle: whose rotors.
@@ -64,8 +66,10 @@ def rotor_thrusts(vehicle: Vehicle, thrust: Array, torque: Array) -> Array:
     """
     inverse = jnp.asarray(np.linalg.inv(allocation(vehicle)), torque.dtype)
     most = vehicle.max_rotor_thrust
-    wrench = jnp.concatenate([thrust[None], torque[:2]])
-    wanted = jnp.matmul(inverse[:, :3], wrench, precision=lax.Precision.HIGHEST)
+    turning = jnp.matmul(inverse[:, 1:3], torque[:2], precision=lax.Precision.HIGHEST)
+    lift = 0.25 * thrust
+    turning *= jnp.minimum((lift + vehicle.spare_thrust) / jnp.maximum(-jnp.min(turning), 1e-6), 1)
+    wanted = lift + turning
     below, above = jnp.maximum(-jnp.min(wanted), 0.0), jnp.maximum(jnp.max(wanted) - most, 0.0)
     level = jnp.clip(wanted + below - above, 0.0, most)
     yaw = inverse[:, 3] * torque[2]

@@ -63,7 +63,7 @@ def record():
 
 def test_a_film_is_written_without_a_display(tmp_path):
     path = tmp_path / "flights.gif"
-    film_flights(path, World(NET), [record()], ["one"], [[]])
+    film_flights(path, World(NET), [record()], [[np.nan]], ["one"], [[]])
     assert path.read_bytes()[:4] == b"GIF8"
     assert list(tmp_path.iterdir()) == [path]
 
@@ -71,7 +71,7 @@ def test_a_film_is_written_without_a_display(tmp_path):
 def test_a_film_that_fails_leaves_nothing_behind(tmp_path, monkeypatch):
     monkeypatch.setattr(Figure, "clear", lambda self: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        film_flights(tmp_path / "flights.gif", World(NET), [record()], ["one"], [[]])
+        film_flights(tmp_path / "flights.gif", World(NET), [record()], [[np.nan]], ["one"], [[]])
     assert not list(tmp_path.iterdir())
 
 
