@@ -41,6 +41,8 @@ SEEN = 0.3  # [s], a throw's flight before it is planned for: 2 m and more (pape
 DRAG = 0.0616  # [1/m], K_D of the published serves; paper 000 gives none
 _TABLE_NODES = 36
 _AIM_RADIUS = 0.05  # [m], of the net that plans are made for; the rest is left for errors
+# Of plans; what a weak thrust or a fast turn leaves to control is too little.
+_LEAST_THRUST, _BODY_RATE = 0.45, 4.0  # [g], [rad/s]
 _AFTER = 0.05  # [s] flown after the last ball has come down to where it may be caught
 
 
@@ -163,7 +165,12 @@ def scenarios(loop: Loop, flights: Flight, new: Array, horizon: Array) -> CatchS
     """
     unknown: Any = None
     empty = catch_scenario(
-        unknown, np.zeros(horizon.shape), gravity=loop.world.gravity, net_radius=_AIM_RADIUS
+        unknown,
+        np.zeros(horizon.shape),
+        gravity=loop.world.gravity,
+        net_radius=_AIM_RADIUS,
+        min_thrust=_LEAST_THRUST * loop.world.gravity,
+        body_rate=_BODY_RATE,
     )
 
     def one(scenario: CatchScenario, flight: Flight, horizon: Array) -> CatchScenario:

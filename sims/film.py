@@ -22,7 +22,7 @@ from sims.vehicle import rotor_positions
 BALL_COLOURS = (ORANGE, PURPLE, GREEN)
 FORMATS = (".gif", ".mp4")
 _FRAME = 2  # looks a frame
-_GHOSTS, _APART = 8, 0.35  # at most; [m] of way from one to the next
+_GHOSTS, _APART = 7, 0.45  # at most; [m] of way from one to the next
 _ROTOR = 0.06  # [m], radius
 _FAR = 20.0  # [m], where balls wait that are not in flight
 _TURN = np.linspace(0.0, 2.0 * np.pi, 25)
@@ -115,16 +115,16 @@ class Scene:
         low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
         thin = np.maximum(1.6 - (high - low), 0.0)  # [m], so that flat flights keep their depth
         low, high = low - 0.2 - 0.5 * thin, high + 0.2 + 0.5 * thin
-        low[2] = 0.0
-        self.axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(0.0, high[2]))
-        self.axes.set_box_aspect(high - low, zoom=1.1)
+        low[2] = max(low[2] - 0.3, 0.0)
+        self.axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+        self.axes.set_box_aspect(high - low, zoom=1.0)
         self.axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", title=title)
         for axis in (self.axes.xaxis, self.axes.yaxis, self.axes.zaxis):
             axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10], prune="both"))
             axis.pane.set_facecolor("white")
             axis.labelpad = 6.0
         for path in (wanted, *np.moveaxis(self.balls, 1, 0), *map(np.asarray, after)):
-            self.axes.plot(path[:, 0], path[:, 1], 0.0, color=PALE, lw=1.0, zorder=0)
+            self.axes.plot(path[:, 0], path[:, 1], low[2], color=PALE, lw=1.0, zorder=0)
         self.axes.view_init(*view)
         self.axes.legend(loc="upper left", fontsize=9, frameon=False)
 
@@ -197,9 +197,10 @@ def draw_flight(
         view: elevation and azimuth of the eye [degree].
         target: (3,) [m], where a returned ball is to land.
     """
-    figure = Figure(figsize=(8.0, 5.6), layout="constrained")
+    figure = Figure(figsize=(7.6, 6.0))
     FigureCanvasAgg(figure)
     scene = Scene(figure, world, record, met, after, title, view)
+    figure.subplots_adjust(left=0.0, right=0.96, bottom=0.04, top=0.95)
     times, end = np.asarray(record.time), np.nanmax(np.append(met, 0.0))
     last = int(np.searchsorted(times, end)) if end > 0.0 else len(times) - 1
     last = min(last, len(times) - 1)
