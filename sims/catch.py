@@ -41,8 +41,9 @@ SEEN = 0.3  # [s], a throw's flight before it is planned for: 2 m and more (pape
 DRAG = 0.0616  # [1/m], K_D of the published serves; paper 000 gives none
 _TABLE_NODES = 36
 _AIM_RADIUS = 0.05  # [m], of the net that plans are made for; the rest is left for errors
-# Of plans; what a weak thrust or a fast turn leaves to control is too little.
-_LEAST_THRUST, _BODY_RATE = 0.45, 4.0  # [g], [rad/s]
+# Least thrust [g] and greatest body rate [rad/s] of plans. A weak thrust and a fast turn leave
+# control little; the first catch stays away from them, so that the next can begin within bounds.
+_FIRST, _BEHIND = (0.5, 3.0), (0.4, 4.5)
 _AFTER = 0.05  # [s] flown after the last ball has come down to where it may be caught
 
 
@@ -164,13 +165,14 @@ def scenarios(loop: Loop, flights: Flight, new: Array, horizon: Array) -> CatchS
         horizon: (B, N) [s] from now, until when each may be caught.
     """
     unknown: Any = None
+    least_thrust, body_rate = _FIRST if flights.plan is None else _BEHIND
     empty = catch_scenario(
         unknown,
         np.zeros(horizon.shape),
         gravity=loop.world.gravity,
         net_radius=_AIM_RADIUS,
-        min_thrust=_LEAST_THRUST * loop.world.gravity,
-        body_rate=_BODY_RATE,
+        min_thrust=least_thrust * loop.world.gravity,
+        body_rate=body_rate,
     )
 
     def one(scenario: CatchScenario, flight: Flight, horizon: Array) -> CatchScenario:

@@ -55,6 +55,13 @@ def test_saturated_rotors_keep_roll_and_pitch_and_let_yaw_go_first():
     np.testing.assert_allclose((allocation(Vehicle()) @ weak)[1:], [0.4, 0.0, 0.0], atol=1e-5)
 
 
+def test_a_torque_raises_a_weak_thrust_no_further_than_is_spared_for_it():
+    rotors = rotor_thrusts(Vehicle(), jnp.float32(1.0), jnp.array([2.0, 0.0, 0.0]))
+    thrust, roll = (allocation(Vehicle()) @ rotors)[:2]
+    assert 0.0 < roll < 2.0
+    np.testing.assert_allclose(thrust, 1.0 + 4.0 * Vehicle().spare_thrust, rtol=1e-5)
+
+
 def test_the_flat_body_rate_is_that_of_the_flat_attitude():
     times = jnp.array([0.3, 0.3 + 1e-3])
     acc = lambda t: jnp.array([4.0 * jnp.sin(3.0 * t), 3.0 * t, 2.0 * t**2])  # noqa: E731

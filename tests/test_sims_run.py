@@ -96,3 +96,6 @@ def test_a_run_of_flights_is_written_whole(tmp_path, capsys):
         "figures",
         "flights.gif",
     }
+    assert main(["report", str(out)]) == 2
+    said = capsys.readouterr().err.splitlines()
+    assert said == ["planner-jax: error: RUN must be the folder of a sweep, got a fly catch"]
