@@ -1,4 +1,4 @@
-"""The command line: `planner-jax sweep hit|catch`, `report`, `bench throughput`, `doctor`."""
+"""The command line: `planner-jax sweep|fly hit|catch`, `report`, `bench throughput`, `doctor`."""
 
 import argparse
 import datetime
@@ -23,6 +23,7 @@ _OPTIONS = {
     *HitSweep.__dataclass_fields__,
     *CatchSweep.__dataclass_fields__,
     *("out", "devices", "iterations", "repeat"),
+    *("noise", "replan", "balls", "scenario", "drag_error", "video"),
 }
 _FAILED, _BAD_ARGUMENT, _INTERRUPTED = 1, 2, 130
 
@@ -87,6 +88,10 @@ def _parser() -> argparse.ArgumentParser:
     tasks = sweep.add_subparsers(title="tasks", required=True, metavar="task")
     _add_hit(tasks, look)
     _add_catch(tasks, look)
+    fly = commands.add_parser("fly", help="fly many cases of a task in closed loop", **look)
+    tasks = fly.add_subparsers(title="tasks", required=True, metavar="task")
+    _add_fly(tasks, look, "catch", "a quadrotor catches thrown balls with a net")
+    _add_fly(tasks, look, "hit", "a quadrotor hits served balls to a target with a racket")
     report = commands.add_parser(
         "report", help="write table, figures and page of a run anew", **look
     )
@@ -208,6 +213,51 @@ def _add_catch(tasks: Any, look: dict[str, Any]) -> None:
         help=f"where the net's radius counts, {' or '.join(NET_TESTS)}: across the net in its "
         f"plane, or all around its centre (default: {default.net_test})")
     # fmt: on
+
+
+def _add_fly(tasks: Any, look: dict[str, Any], task: str, words: str) -> None:
+    """The arguments of `fly catch` or `fly hit`; what is not given is absent."""
+    parser = tasks.add_parser(
+        task,
+        help=words,
+        description=f"Plan and fly in MuJoCo MJX: {words}, with noise, latency and wrong drag.\n"
+        "Writes a run folder: index.html, table.md, a figure, plans.parquet, manifest.json.",
+        argument_default=argparse.SUPPRESS,
+        **look,
+    )
+    planners = CATCH_PLANNERS if task == "catch" else HIT_PLANNERS
+    add = parser.add_argument
+    # fmt: off
+    add("--num", type=int, metavar="N", help="flights (default: 64)")
+    add("--noise", metavar="NAME", help="of sensing: none, lab, harsh (default: lab)")
+    add("--replan", type=float, metavar="HZ", help="plans a second, 0 for the first one only "
+        f"(default: {100 if task == 'catch' else 50} with exact, 0 with other planners)")
+    add("--planner", metavar="NAME", help=f"{', '.join(planners)} (default: exact)")
+    if task == "catch":
+        add("--balls", type=int, metavar="N", help="thrown 0.8 s apart (default: 1)")
+    else:
+        add("--scenario", metavar="NAME", help="S.1 to S.6 of the paper (default: S.1)")
+    add("--drag-error", type=float, metavar="F", help="relative, of what is believed of the "
+        "balls' drag, either way (default: 0.15)")
+    add("--seed", type=int, metavar="K", help="of balls and noise (default: 0)")
+    add("--batch", type=int, metavar="B", help="flights at once (default: all up to 4096)")
+    add("--video", nargs="?", const="flights.gif", metavar="FILE",
+        help="film the first three flights into the run folder, .gif, or .mp4 where ffmpeg is "
+        "installed (default name: flights.gif)")
+    add("--out", metavar="DIR", help=f"run folder (default: runs/fly-{task}-DATE-TIME)")
+    # fmt: on
+    parser.set_defaults(command=lambda given: _fly(task, given))
+
+
+def _fly(task: str, given: dict[str, Any]) -> None:
+    keep_compiled_programs()
+    from sims.run import FlySettings, headline, start_flights
+
+    out, video = given.pop("out", None), given.pop("video", None)
+    out = out or os.path.join("runs", f"fly-{task}-{datetime.datetime.now():%Y%m%d-%H%M%S}")
+    manifest = start_flights(FlySettings(task, **given), out, video)
+    print("\n".join(headline(manifest)))
+    print(f"Look at {Path(out) / 'index.html'}")
 
 
 def _add_bench(commands: Any, look: dict[str, Any]) -> None:

@@ -1,0 +1,125 @@
+"""How fast MJX flies: steps a second of one quadrotor and one ball, batches of worlds.
+
+    python -m benchmarks.fly_steps [--worlds 4096,65536] [--seconds 0.4]
+
+Open loop steps the physics with constant rotor thrusts. Closed loop is a whole flight without
+re-planning: looks, Kalman filter, reference, control, physics, contact. A step is a physics and
+a control step of 2 ms. Where the package crazyflow is installed, its first-principles quadrotor
+steps beside ours, without a ball. Compilation is apart.
+"""
+
+import argparse
+import dataclasses
+import os
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from planner_jax.task.catch.decide import plan_catches
+from planner_jax.task.catch.exact import ExactCatch
+from sims.catch import HOME, SEEN, CatchPilot, scenarios, throws, with_catch
+from sims.closed_loop import Loop, fly_leg
+from sims.launch import launched, ready
+from sims.model import NET, World, hovering, step
+from sims.sensing import NOISES
+
+RUNS = 3
+
+
+def timed(name: str, steps: int, run: Callable[[], Any]) -> None:
+    """One line: compilation, and steps a second of the best of a few runs."""
+    began = time.perf_counter()
+    jax.block_until_ready(run())
+    first = time.perf_counter() - began
+    seconds = []
+    for _ in range(RUNS):
+        began = time.perf_counter()
+        jax.block_until_ready(run())
+        seconds.append(time.perf_counter() - began)
+    print(
+        f"{name}: {steps / min(seconds):.3g} steps/s ({min(seconds):.3f} s, "
+        f"slowest of {RUNS} {max(seconds):.3f} s; first, with compilation, {first:.1f} s)",
+        flush=True,
+    )
+
+
+def open_loop(world: World, worlds: int, steps: int) -> None:
+    """Physics alone."""
+    start = hovering(world, jnp.array(HOME))
+    start = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (worlds, *leaf.shape)), start)
+    drag = jnp.zeros(1)
+
+    @jax.jit
+    @jax.vmap
+    def run(physics: Any) -> Any:
+        rotors = physics.act
+        advance = lambda state, _: (step(world, state, rotors, drag), None)  # noqa: E731
+        return jax.lax.scan(advance, physics, None, length=steps)[0]
+
+    timed(f"open loop, {worlds} worlds", worlds * steps, lambda: run(start))
+
+
+def closed_loop(world: World, worlds: int, seconds: float) -> None:
+    """Flights without re-planning; their plans, from scratch, are not in the time."""
+    loop = Loop(world, NOISES["lab"])
+    few = min(worlds, 256)  # different throws, repeated to fill the batch
+    cases = throws(few)
+    drag, believed = jnp.asarray(cases.drag), jnp.asarray(cases.believed)
+    starts = jnp.tile(jnp.array(HOME), (few, 1))
+    flight = ready(loop, starts, jax.random.split(jax.random.key(0), few))
+    balls = jax.tree.map(jnp.asarray, cases.balls)
+    flight = launched(loop, flight, balls, drag, believed, ball=0, seen=SEEN)
+    scenario = scenarios(loop, flight, jnp.array([True]), jnp.asarray(cases.horizon))
+    _, plan = plan_catches(ExactCatch(), jax.tree.map(np.asarray, scenario))
+    begun = jax.tree.map(jnp.asarray, plan)
+    flight = with_catch(flight, begun, jnp.array([True])).replace(key=None)
+    many = lambda leaf: jnp.resize(leaf, (worlds, *leaf.shape[1:]))  # noqa: E731
+    keys = jax.random.split(jax.random.key(1), worlds)
+    flight = dataclasses.replace(jax.tree.map(many, flight), key=keys)
+    scenario, drag = jax.tree.map(many, (scenario, drag))
+    periods = loop.num_periods(seconds)
+    steps = worlds * periods * loop.looks_per_plan * loop.steps_per_look
+    run = lambda: fly_leg(loop, CatchPilot(), flight, scenario, drag, num_periods=periods)  # noqa: E731
+    timed(f"closed loop, {worlds} worlds", steps, lambda: run()[0].physics)
+
+
+def crazyflow(worlds: int, steps: int) -> None:
+    """The peer's steps, where it is installed."""
+    os.environ.setdefault("SCIPY_ARRAY_API", "1")
+    try:
+        from crazyflow.sim import Sim
+    except ImportError as error:
+        print(f"crazyflow: not measured ({error})")
+        return
+    sim = Sim(n_worlds=worlds, n_drones=1, freq=500, device=jax.default_backend())
+    sim.reset()
+
+    def run() -> Any:
+        sim.step(steps)
+        return sim.data.states.pos
+
+    timed(f"crazyflow, {worlds} worlds, no ball", worlds * steps, run)
+
+
+def main() -> None:
+    """Print all lines."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    default = "256" if jax.default_backend() == "cpu" else "4096,65536"
+    parser.add_argument("--worlds", default=default)
+    parser.add_argument("--seconds", type=float, default=0.4, help="of each flight")
+    args = parser.parse_args()
+    world = World(NET)
+    steps = round(args.seconds / world.timestep)
+    print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}, {steps} steps of 2 ms a world")
+    for worlds in [int(number) for number in args.worlds.split(",")]:
+        open_loop(world, worlds, steps)
+        closed_loop(world, worlds, args.seconds)
+        crazyflow(worlds, steps)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,172 @@
+"""The start of a flight: a hovering quadrotor, balls that are launched, and what is seen of them.
+
+A ball is in flight for a while before it is planned for: the papers use what they see of it
+only after 2 m (000, Section VII-A). That part is flown by the library, backwards from the
+ball's state at the planning.
+"""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from planner_jax.ball.flight import BallState, fly
+from sims import sensing as sight
+from sims.closed_loop import Flight, Loop
+from sims.model import Tool, hovering, placed
+from sims.scoring import no_contact
+from sims.sensing import Estimate
+
+
+def flight_keys(seed: int, index: np.ndarray) -> Array:
+    """Keys (B,) of the flights at some places of the whole, whichever batch they are flown in."""
+    return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(jax.random.key(seed), jnp.asarray(index))
+
+
+@functools.partial(jax.jit, static_argnames="loop")
+def ready(loop: Loop, starts: Array, keys: Array) -> Flight:
+    """Flights with the quadrotors in hover and no ball launched.
+
+    Args:
+        loop: with the world.
+        starts: (B, 3) [m].
+        keys: (B,) of the noise.
+    """
+    number = loop.world.num_balls
+
+    def one(start: Array, key: Array) -> Flight:
+        zero, nothing = jnp.zeros(()), jnp.zeros(number, bool)
+        unknown = jnp.zeros((number, 3)), jnp.full(number, 0.1)
+        estimates = jax.vmap(sight.first_estimate)(*unknown)
+        return Flight(
+            physics=hovering(loop.world, start),
+            shown=jnp.zeros((loop.late_looks, number, 3)),
+            estimates=estimates,
+            earlier=estimates,
+            launched=nothing,
+            present=nothing,
+            plan=None,
+            began=zero,
+            contact=no_contact(number),
+            worst_tracking=zero,
+            squared_tracking=zero,
+            tracked=zero,
+            time=zero,
+            key=key,
+        )
+
+    return jax.vmap(one)(starts, keys)
+
+
+@functools.partial(jax.jit, static_argnames=("loop", "ball", "seen"))
+def launched(
+    loop: Loop,
+    flights: Flight,
+    balls: BallState,
+    drag: Array,
+    believed: Array,
+    *,
+    ball: int,
+    seen: float,
+) -> Flight:
+    """The flights with one more ball in the air.
+
+    Args:
+        loop: of the flights.
+        flights: leaves (B, ...).
+        balls: leaves (B, N, 3), each when it is planned for.
+        drag: (B, N) K_D [1/m], the true one.
+        believed: (B, N) K_D [1/m].
+        ball: which of the N (static).
+        seen: [s] that it has been in flight already (static).
+    """
+
+    def one(flight: Flight, balls: BallState, drag: Array, believed: Array) -> Flight:
+        key, look_key = jax.random.split(flight.key)
+        own = jax.tree.map(lambda leaf: leaf[ball], balls)
+        shown, earlier, now = watched(loop, own, drag[ball], believed[ball], look_key, seen)
+        which = jnp.arange(drag.size) == ball
+        put = lambda all_balls, one_ball: all_balls.at[ball].set(one_ball)  # noqa: E731
+        return dataclasses.replace(
+            flight,
+            physics=placed(loop.world, flight.physics, balls, drag, which),
+            shown=flight.shown.at[:, ball].set(shown),
+            estimates=jax.tree.map(put, flight.estimates, now),
+            earlier=jax.tree.map(put, flight.earlier, earlier),
+            launched=flight.launched | which,
+            key=key,
+        )
+
+    return jax.vmap(one)(flights, balls, drag, believed)
+
+
+def watched(
+    loop: Loop, ball: BallState, drag: Array, believed: Array, key: Array, duration: float
+) -> tuple[Array, Estimate, Estimate]:
+    """What was seen of one ball before it is planned for.
+
+    Args:
+        loop: with sensing and planning period.
+        ball: true state when the plan begins.
+        drag: () K_D [1/m], the true one.
+        believed: () K_D [1/m].
+        key: of the looks.
+        duration: [s] that the ball has been in flight by then (static).
+
+    Returns:
+        Positions (L, 3) [m] that looks are still to show, and the estimates of one planning
+        period ago and of now.
+    """
+    sensing, dtype = loop.sensing, drag.dtype
+    gravity = jnp.asarray(loop.world.gravity, dtype)
+    num = int(round(duration * sensing.rate)) + 1
+    ages = (num - 1 - np.arange(num)) / sensing.rate
+    place = lambda age: fly(ball, -age, drag, gravity, num_steps=16)[0].pos  # noqa: E731
+    path = jax.vmap(place)(jnp.asarray(ages, dtype))
+    looks, shown = path[: num - loop.late_looks], path[num - loop.late_looks :]
+    keys = jax.random.split(key, looks.shape[0])
+    seen = jax.vmap(lambda k, at: sight.observed(k, at[None], sensing)[0])(keys, looks)
+
+    look = sight.look if loop.kalman else sight.look_unfiltered
+
+    def advance(estimate: Estimate, at: Array) -> tuple[Estimate, Estimate]:
+        after = look(estimate, at, sensing, gravity)
+        return after, after
+
+    first = sight.first_estimate(looks[0], believed)
+    now, history = lax.scan(advance, first, seen)
+    earlier = jax.tree.map(lambda leaf: leaf[-1 - loop.looks_per_plan], history)
+    return shown, earlier, sight.anchored(now, gravity)
+
+
+def require_world(loop: Loop, tool: Tool, num_balls: int) -> None:
+    """Raise `ValueError` unless a world has the task's tool and as many balls."""
+    world = loop.world
+    if world.tool != tool:
+        raise ValueError(f"world must carry {tool}, got {world.tool}")
+    if world.num_balls != num_balls:
+        raise ValueError(f"world must have {num_balls} balls, got {world.num_balls}")
+
+
+def require_hovering(head_state: Any, plan: Any) -> None:
+    """Raise `ValueError` unless a plan begins where the quadrotor hovers.
+
+    Args:
+        head_state: (B, 4, 3) of the quadrotor.
+        plan: with a trajectory, leaves (B, ...).
+    """
+    begin = np.asarray(plan.trajectory.coeffs)[:, 0, 0]
+    place = np.asarray(head_state)[:, 0]
+    if begin.shape != place.shape:
+        raise ValueError(f"plan must be of {len(place)} flights, got {len(begin)}")
+    away = np.linalg.norm(begin - place, axis=1)
+    if away.size and not np.nanmax(away) < 0.01:
+        lane = int(np.nanargmax(away))
+        raise ValueError(
+            f"plan must begin where its quadrotor is, got {away[lane]:.2f} m from there "
+            f"in flight {lane}"
+        )

@@ -1,0 +1,208 @@
+"""What the quadrotor sees: motion capture of the balls and of itself, and what it makes of it.
+
+A look at a ball shows where it was a latency ago, with noise, or nothing at all. The library's
+Kalman filter turns looks into position and velocity; the energy that the ball has lost since it
+was first seen well says what its drag is (paper 002, eqs 6 and 7). World frame, SI units.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import Array
+
+from planner_jax.ball.estimation import (
+    EkfModel,
+    EkfState,
+    RlsState,
+    ekf_init,
+    ekf_predict,
+    ekf_update,
+    rls_update,
+    specific_energy,
+)
+from planner_jax.ball.flight import BallState, fly, rk4_step
+from sims.control import RobotState
+
+_LEAST_STD = 1e-3  # [m], that the filter believes of a sensor without noise
+_ACCELERATION_DENSITY = 0.01  # [m^2/s^3], of what the filter's flight leaves out
+_FLIGHT_STEPS = 4  # of a prediction over latency and planning
+_DRAG_SPREAD = 0.2  # relative standard deviation of the drag believed at first
+
+
+@dataclasses.dataclass(frozen=True)
+class Sensing:
+    """Motion capture and state estimation; static under jit."""
+
+    rate: float = 100.0  # [Hz], of the looks at the balls
+    position_std: float = 0.0  # [m], of a ball's coordinate
+    dropout: float = 0.0  # probability that a look shows nothing
+    latency: float = 0.0  # [s], age of what a look shows
+    robot_position_std: float = 0.0  # [m], a coordinate; redrawn every look
+    robot_velocity_std: float = 0.0  # [m/s]
+    robot_attitude_std: float = 0.0  # [rad]
+    robot_rate_std: float = 0.0  # [rad/s]
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if not value >= 0.0:
+                raise ValueError(f"{field.name} must be >= 0, got {value}")
+        if not self.rate > 0.0:
+            raise ValueError(f"rate must be > 0, got {self.rate}")
+        if not self.dropout < 1.0:
+            raise ValueError(f"dropout must be < 1, got {self.dropout}")
+
+    @property
+    def robot_stds(self) -> tuple[float, ...]:
+        """Standard deviations of the quadrotor's own state, in the order of `RobotState`."""
+        return (
+            self.robot_position_std,
+            self.robot_velocity_std,
+            self.robot_attitude_std,
+            self.robot_rate_std,
+        )
+
+
+NOISES = {
+    "none": Sensing(),
+    # Both papers see with Vicon and run every module within 20 ms (002, Section VI-C), which is
+    # the latency; neither gives noise, rate or dropout. 5 mm a coordinate on a 40 mm ball at
+    # 7 m/s, 100 looks a second and 2 % of them lost are assumptions, as are the errors of the
+    # quadrotor's own state, an EKF of pose and IMU in both papers.
+    "lab": Sensing(
+        position_std=0.005,
+        dropout=0.02,
+        latency=0.02,
+        robot_position_std=0.002,
+        robot_velocity_std=0.02,
+        robot_attitude_std=0.005,
+        robot_rate_std=0.02,
+    ),
+    # Worse than the papers' halls: three times the noise, twice the latency, one look in ten
+    # lost; an assumption throughout.
+    "harsh": Sensing(
+        position_std=0.015,
+        dropout=0.1,
+        latency=0.04,
+        robot_position_std=0.006,
+        robot_velocity_std=0.06,
+        robot_attitude_std=0.015,
+        robot_rate_std=0.06,
+    ),
+}
+
+
+@struct.dataclass
+class Estimate:
+    """What is believed of one ball; the belief is as old as the looks' latency."""
+
+    belief: EkfState
+    energy: Array  # () [m^2/s^2], specific, when the ball was first seen well
+    energy_variance: Array  # () [m^4/s^4], of that
+    lever: Array  # () [m^3/s^2], integral of |v|^3 since then
+    prior: RlsState  # of K_D [1/m]
+    drag: Array  # () K_D [1/m]
+
+
+def observed(key: Array, pos: Array, sensing: Sensing) -> Array:
+    """What a look shows of balls at (N, 3) [m]; a row of NaN where it shows nothing."""
+    noise_key, drop_key = jax.random.split(key)
+    seen = pos + sensing.position_std * jax.random.normal(noise_key, pos.shape, pos.dtype)
+    lost = jax.random.uniform(drop_key, pos.shape[:1], pos.dtype) < sensing.dropout
+    return jnp.where(lost[:, None], jnp.nan, seen)
+
+
+def sensed_robot(state: RobotState, noise: Array, sensing: Sensing) -> RobotState:
+    """The quadrotor's state as it is estimated.
+
+    Args:
+        state: the true one.
+        noise: (4, 3) standard normal.
+        sensing: its standard deviations.
+    """
+    pos, vel, attitude, rate = (std * noise[k] for k, std in enumerate(sensing.robot_stds))
+    w, v = state.quat_wxyz[0], state.quat_wxyz[1:]
+    half = 0.5 * attitude  # a small rotation in the body frame
+    turned = jnp.concatenate([(w - jnp.sum(v * half))[None], v + w * half + jnp.cross(v, half)])
+    return RobotState(
+        pos=state.pos + pos,
+        vel=state.vel + vel,
+        quat_wxyz=turned / jnp.sqrt(jnp.sum(turned**2)),
+        rate=state.rate + rate,
+    )
+
+
+def _model(sensing: Sensing, drag: Array, gravity: Array) -> EkfModel:
+    return EkfModel(
+        drag=drag,
+        gravity=gravity,
+        acceleration_density=jnp.full_like(drag, _ACCELERATION_DENSITY),
+        observation_std=jnp.full_like(drag, max(sensing.position_std, _LEAST_STD)),
+    )
+
+
+def first_estimate(pos: Array, drag: Array) -> Estimate:
+    """Of a ball that leaves a machine at (3,) [m] at an unknown velocity, believed drag ()."""
+    zero = jnp.zeros_like(drag)
+    wide = ekf_init(pos, jnp.zeros_like(pos), pos_std=zero + 0.1, vel_std=zero + 10.0)
+    prior = RlsState(estimate=drag, variance=(_DRAG_SPREAD * drag) ** 2 + 1e-8)
+    return Estimate(
+        belief=wide, energy=zero, energy_variance=zero, lever=zero, prior=prior, drag=drag
+    )
+
+
+def look(estimate: Estimate, seen: Array, sensing: Sensing, gravity: Array) -> Estimate:
+    """The estimate of one ball one look (3,) later."""
+    model = _model(sensing, estimate.drag, gravity)
+    period = jnp.full_like(estimate.drag, 1.0 / sensing.rate)
+    ahead = ekf_predict(estimate.belief, period, model, flight=rk4_step)
+    belief, _ = ekf_update(ahead, seen, model)
+    speed = jnp.sqrt(jnp.sum(belief.ball.vel**2))
+    return dataclasses.replace(estimate, belief=belief, lever=estimate.lever + speed**3 * period)
+
+
+def look_unfiltered(estimate: Estimate, seen: Array, sensing: Sensing, gravity: Array) -> Estimate:
+    """The estimate one look later without a filter: the place seen, and the velocity to there."""
+    period = 1.0 / sensing.rate
+    before = estimate.belief.ball
+    flown = rk4_step(before, jnp.full_like(estimate.drag, period), estimate.drag, gravity)
+    # The mean velocity on the way, and half of what it changes on the way.
+    vel = (seen - before.pos) / period + 0.5 * (flown.vel - before.vel)
+    taken = jnp.concatenate([seen, vel])
+    blind = jnp.concatenate([flown.pos, flown.vel])
+    mean = jnp.where(jnp.all(jnp.isfinite(seen)), taken, blind)
+    return dataclasses.replace(estimate, belief=dataclasses.replace(estimate.belief, mean=mean))
+
+
+def anchored(estimate: Estimate, gravity: Array) -> Estimate:
+    """The estimate with its energy as it is now, from which losses count."""
+    energy, variance = _energy(estimate.belief, gravity)
+    return dataclasses.replace(
+        estimate, energy=energy, energy_variance=variance, lever=jnp.zeros_like(estimate.lever)
+    )
+
+
+def _energy(belief: EkfState, gravity: Array) -> tuple[Array, Array]:
+    """Specific energy and its variance, to first order."""
+    slope = jnp.concatenate([jnp.stack([0.0 * gravity, 0.0 * gravity, gravity]), belief.ball.vel])
+    variance = jnp.sum(slope[:, None] * belief.covariance * slope)
+    return specific_energy(belief.ball, gravity), variance
+
+
+def with_drag(estimate: Estimate, gravity: Array) -> Estimate:
+    """The estimate with K_D from the energy lost since the anchor (paper 002, eq. 7).
+
+    The one loss over all that time is weighed against what was believed at first; the paper's
+    running mean of losses between looks would count the same noise again and again.
+    """
+    energy, variance = _energy(estimate.belief, gravity)
+    std = jnp.sqrt(jnp.maximum(variance + estimate.energy_variance, 1e-12))
+    found = rls_update(estimate.prior, estimate.lever / std, (estimate.energy - energy) / std, 1.0)
+    return dataclasses.replace(estimate, drag=found.estimate)
+
+
+def predicted(estimate: Estimate, ahead: Array, gravity: Array) -> BallState:
+    """The ball `ahead` [s] after the time of the belief."""
+    return fly(estimate.belief.ball, ahead, estimate.drag, gravity, num_steps=_FLIGHT_STEPS)[0]

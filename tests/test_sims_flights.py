@@ -1,0 +1,107 @@
+"""Whole flights in closed loop: what is planned is flown, and noise is borne."""
+
+import jax
+import numpy as np
+import pytest
+
+from planner_jax.trajectory.polynomial import evaluate
+from sims.catch import fly_catches, throws
+from sims.closed_loop import Loop
+from sims.hit import SCENARIOS, fly_hits, volleys
+from sims.model import NET, RACKET, World
+from sims.sensing import NOISES
+
+CATCH, HIT = World(NET), World(RACKET, gravity=9.8)
+
+
+def planned_places(flown):
+    """Where the last plans are at the times of the first ball's contact, (B, 3) [m]."""
+    times = flown.contact.planned_time[:, 0] - flown.began
+    return np.asarray(jax.vmap(evaluate)(flown.plan.trajectory, times))
+
+
+def contact_errors(flown):
+    """Distance [m] and time [s] between planned and flown contacts of the first ball."""
+    places = flown.contact.robot_pos[:, 0] - planned_places(flown)
+    times = flown.contact.time - flown.contact.planned_time
+    return np.linalg.norm(places, axis=1), np.abs(times[:, 0])
+
+
+@pytest.fixture(scope="module")
+def catches():
+    return fly_catches(Loop(CATCH), throws(3, seed=1))
+
+
+@pytest.fixture(scope="module")
+def hits():
+    return fly_hits(Loop(HIT), volleys(3, SCENARIOS["S.1"], seed=1))
+
+
+def test_without_noise_every_ball_is_caught_where_and_when_it_was_planned(catches):
+    assert catches.caught.all()
+    places, times = contact_errors(catches.flown)
+    assert places.max() < 0.02 and times.max() < 0.002
+    assert catches.flown.tracking[:, 1].max() < 0.02
+
+
+def test_without_noise_every_ball_is_hit_where_and_when_it_was_planned(hits):
+    places, times = contact_errors(hits.flown)
+    assert places.max() < 0.02 and times.max() < 0.002
+    assert hits.miss.max() < 0.05  # from the target, after a second and a half of flight
+
+
+def test_a_plan_of_the_other_task_is_refused(catches, hits):
+    with pytest.raises(ValueError, match="^plan must be a CatchPlan, got a HitPlan$"):
+        fly_catches(Loop(CATCH), throws(3, seed=1), plan=hits.first_plan)
+    with pytest.raises(ValueError, match="^plan must be a HitPlan, got a CatchPlan$"):
+        fly_hits(Loop(HIT), volleys(3, SCENARIOS["S.1"], seed=1), plan=catches.first_plan)
+
+
+def test_a_plan_that_is_given_is_the_one_that_is_flown(catches):
+    again = fly_catches(Loop(CATCH), throws(3, seed=1), plan=catches.first_plan)
+    np.testing.assert_allclose(again.flown.contact.time, catches.flown.contact.time, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: throws(1, 0), "num_balls must be >= 1, got 0"),
+        (lambda: throws(1, drag_error=-0.1), "drag_error must be >= 0 and < 1, got -0.1"),
+        (lambda: volleys(1, drag_error=1.5), "drag_error must be >= 0 and < 1, got 1.5"),
+    ],
+)
+def test_cases_out_of_range_are_refused(build, message):
+    with pytest.raises(ValueError) as error:
+        build()
+    assert str(error.value) == message
+
+
+@pytest.mark.slow
+def test_a_batch_is_flown_like_its_flights_one_by_one():
+    cases = throws(3, seed=2)
+    together = fly_catches(Loop(CATCH), cases)
+    for lane in range(3):
+        alone = fly_catches(Loop(CATCH), cases[[lane]])
+        time = together.flown.contact.time[lane]
+        np.testing.assert_allclose(alone.flown.contact.time[0], time, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_with_noise_latency_and_wrong_drag_balls_are_caught_by_planning_anew():
+    flights = fly_catches(Loop(CATCH, NOISES["lab"], replan=100.0), throws(8, drag_error=0.15))
+    assert flights.caught.all()
+
+
+@pytest.mark.slow
+def test_a_second_ball_is_caught_after_the_first():
+    world = World(NET, num_balls=2)
+    flights = fly_catches(Loop(world, NOISES["lab"], replan=100.0), throws(4, 2, drag_error=0.15))
+    assert flights.caught.sum() >= 7
+
+
+@pytest.mark.slow
+def test_a_hit_that_is_planned_anew_lands_on_the_target():
+    exact = fly_hits(Loop(HIT, replan=50.0), volleys(4, SCENARIOS["S.4"]))
+    assert exact.miss.max() < 0.05
+    noisy = fly_hits(Loop(HIT, NOISES["lab"], replan=50.0), volleys(4, SCENARIOS["S.4"]))
+    assert noisy.miss.max() < 0.5

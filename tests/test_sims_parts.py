@@ -1,0 +1,293 @@
+"""The simulated world's parts: allocation, control, sensing, scoring, and MJX beside MuJoCo."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from planner_jax.ball.flight import BallState, drag_free_flight, fly
+from planner_jax.ball.impact import racket_impact
+from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, total_duration
+from sims.closed_loop import Loop, with_rest
+from sims.control import Gains, RobotState, control, flat_attitude, reference_at, rotation_error
+from sims.launch import require_hovering, require_world
+from sims.model import (
+    NET,
+    RACKET,
+    World,
+    ball_states,
+    hovering,
+    mujoco_data,
+    placed,
+    step,
+    step_mujoco,
+)
+from sims.scoring import Moment, landing_point, nearest, no_contact, passage
+from sims.sensing import (
+    NOISES,
+    Sensing,
+    anchored,
+    first_estimate,
+    look,
+    observed,
+    predicted,
+    with_drag,
+)
+from sims.vehicle import Vehicle, allocation, rotor_thrusts
+
+WORLD = World(NET)
+GRAVITY = jnp.float32(9.81)
+
+
+def test_rotor_thrusts_are_the_inverse_of_the_allocation():
+    thrust, torque = jnp.float32(12.0), jnp.array([0.2, -0.1, 0.02])
+    rotors = rotor_thrusts(Vehicle(), thrust, torque)
+    np.testing.assert_allclose(allocation(Vehicle()) @ rotors, [12.0, 0.2, -0.1, 0.02], atol=1e-5)
+
+
+def test_saturated_rotors_keep_roll_and_pitch_and_let_yaw_go_first():
+    rotors = rotor_thrusts(Vehicle(), jnp.float32(12.0), jnp.array([0.2, -0.1, 5.0]))
+    assert rotors.min() >= 0.0 and rotors.max() <= Vehicle().max_rotor_thrust
+    np.testing.assert_allclose((allocation(Vehicle()) @ rotors)[:3], [12.0, 0.2, -0.1], atol=1e-5)
+    weak = rotor_thrusts(Vehicle(), jnp.float32(0.5), jnp.array([0.4, 0.0, 0.0]))
+    np.testing.assert_allclose((allocation(Vehicle()) @ weak)[1:], [0.4, 0.0, 0.0], atol=1e-5)
+
+
+def test_a_torque_raises_a_weak_thrust_no_further_than_is_spared_for_it():
+    rotors = rotor_thrusts(Vehicle(), jnp.float32(1.0), jnp.array([2.0, 0.0, 0.0]))
+    thrust, roll = (allocation(Vehicle()) @ rotors)[:2]
+    assert 0.0 < roll < 2.0
+    np.testing.assert_allclose(thrust, 1.0 + 4.0 * Vehicle().spare_thrust, rtol=1e-5)
+
+
+def test_the_flat_body_rate_is_that_of_the_flat_attitude():
+    times = jnp.array([0.3, 0.3 + 1e-3])
+    acc = lambda t: jnp.array([4.0 * jnp.sin(3.0 * t), 3.0 * t, 2.0 * t**2])  # noqa: E731
+    with jax.enable_x64(True):
+        now, then = (flat_attitude(acc(t), jax.jacfwd(acc)(t), 9.81) for t in times.astype(float))
+        turned = rotation_error(now[0], then[0]) / (times[1] - times[0]).astype(float)
+        np.testing.assert_allclose(turned, 0.5 * (now[1] + then[1]), atol=1e-3)
+
+
+def wiggle():
+    """A trajectory of one piece that accelerates to and fro."""
+    coeffs = np.zeros((1, 8, 3), np.float32)
+    coeffs[0, :, 0] = [0.0, 0.0, 0.0, 0.0, 3.0, -2.0, 0.0, 0.0]
+    coeffs[0, :, 2] = [1.0, 0.0, 0.0, 0.0, 1.0, -0.7, 0.0, 0.0]
+    return PiecewisePolynomial(jnp.asarray(coeffs), jnp.array([1.0], jnp.float32))
+
+
+def test_a_trajectory_comes_to_rest_smoothly_after_its_end():
+    path = with_rest(wiggle())
+    end, rest = total_duration(wiggle()), total_duration(path)
+    for order in range(4):
+        before, after = evaluate(wiggle(), end, order), evaluate(path, end + 1e-5, order)
+        np.testing.assert_allclose(after, before, rtol=2e-3, atol=1e-3)
+    absent = PiecewisePolynomial(
+        jnp.concatenate([wiggle().coeffs, jnp.zeros((2, 8, 3))]), jnp.array([1.0, 0.0, 0.0])
+    )
+    braking = with_rest(absent).coeffs[-1]
+    np.testing.assert_allclose(braking, path.coeffs[-1], atol=1e-5)
+    for order in (1, 2, 3):
+        np.testing.assert_allclose(evaluate(path, rest, order), 0.0, atol=2e-2)
+
+
+@pytest.fixture(scope="module")
+def tracked():
+    """A few quadrotors tracking the same trajectory from different attitudes, 0.8 s."""
+    world, path = WORLD, with_rest(wiggle())
+
+    def one(tilt):
+        start = hovering(world, jnp.array([0.0, 0.0, 1.0]))
+        quat = jnp.stack([jnp.cos(tilt / 2), jnp.sin(tilt / 2), 0.0 * tilt, 0.0 * tilt])
+        start = start.replace(qpos=start.qpos.at[3:7].set(quat))
+
+        def advance(physics, time):
+            state = RobotState(
+                pos=physics.qpos[:3],
+                vel=physics.qvel[:3],
+                quat_wxyz=physics.qpos[3:7],
+                rate=physics.qvel[3:6],
+            )
+            rotors = control(state, reference_at(path, time, world), Gains(), world)
+            away = jnp.linalg.norm(physics.qpos[:3] - evaluate(path, time))
+            return step(world, physics, rotors, jnp.zeros(1)), (away, rotors)
+
+        return jax.lax.scan(advance, start, world.timestep * jnp.arange(400))[1]
+
+    return jax.device_get(jax.jit(jax.vmap(one))(jnp.array([0.0, 1.0])))
+
+
+def test_a_planned_trajectory_is_tracked_within_two_centimetres(tracked):
+    assert tracked[0][0].max() < 0.02
+
+
+def test_a_tilt_of_one_radian_is_recovered_from(tracked):
+    assert tracked[0][1].max() < 1.0 and tracked[0][1][-1] < 0.1
+
+
+def test_hover_is_an_equilibrium_and_mjx_flies_as_mujoco_does():
+    world = World(NET, contacts=False)
+    balls = BallState(jnp.array([[0.5, 0.0, 2.0]]), jnp.array([[1.0, -2.0, 3.0]]))
+    drag = jnp.array([0.06])
+    start = placed(
+        world, hovering(world, jnp.array([0.0, 0.0, 1.0])), balls, drag, jnp.array([True])
+    )
+    late = np.arange(400)[:, None] > 200
+    pulses = 0.1 * late * np.sin(0.05 * np.arange(400)[:, None] * np.arange(1, 5))
+    rotors = jnp.asarray(np.asarray(start.act) + pulses, jnp.float32)
+
+    def advance(physics, command):
+        physics = step(world, physics, command, drag)
+        return physics, physics.qpos
+
+    path = jax.jit(lambda physics: jax.lax.scan(advance, physics, rotors)[1])(start)
+    np.testing.assert_allclose(path[200, :7], [0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0], atol=1e-4)
+    data, reference = mujoco_data(world, start), []
+    for command in np.asarray(rotors):
+        step_mujoco(world, data, command, np.asarray(drag))
+        reference.append(data.qpos.copy())
+    assert np.ptp(np.array(reference)[:, 3:7], axis=0).max() > 0.01  # it did turn
+    np.testing.assert_allclose(path, reference, atol=1e-4)
+    truth = fly(jax.tree.map(lambda x: x[0], balls), 0.8, drag[0], GRAVITY, num_steps=100)[0]
+    np.testing.assert_allclose(path[-1, 7:], truth.pos, atol=1e-3)
+
+
+def test_a_ball_that_falls_on_the_plate_of_a_net_is_held_by_mujocos_own_contact():
+    world = World(NET, contacts=True)
+    balls = BallState(jnp.array([[0.02, 0.0, 1.5]]), jnp.array([[0.0, 0.0, -1.0]]))
+    start = placed(
+        world, hovering(world, jnp.array([0.0, 0.0, 1.0])), balls, jnp.zeros(1), jnp.array([True])
+    )
+    data = mujoco_data(world, start)
+    heights = []
+    for _ in range(150):
+        step_mujoco(world, data, np.asarray(start.act), np.zeros(1))
+        heights.append(data.qpos[9] - data.qpos[2])
+    assert min(heights) > NET.height - 0.08  # it did not fall through
+
+
+def test_mujocos_own_contact_bounces_a_ball_off_the_racket_like_the_librarys_map():
+    world = World(RACKET, timestep=0.0005, contacts=True)
+    vel = jnp.array([[0.5, 0.0, -7.0]])
+    balls = BallState(jnp.array([[0.0, 0.0, 1.1]]), vel)
+    calm = hovering(world, jnp.array([0.0, 0.0, 1.0]))
+    start = placed(world, calm, balls, jnp.zeros(1), jnp.array([True]))
+    data = mujoco_data(world, start)
+    for _ in range(40):
+        step_mujoco(world, data, np.asarray(start.act), np.zeros(1))
+    expected = racket_impact(vel[0], jnp.zeros(3), jnp.array([0.0, 0.0, 1.0]), 0.7)
+    np.testing.assert_allclose(data.qvel[6:], expected, atol=0.5)
+
+
+def moments(gap_before, gap_after, aside):
+    """A level tool at rest at the origin, and one ball over it before and after a step."""
+    at = lambda gap: Moment(  # noqa: E731
+        robot_pos=jnp.zeros(3),
+        robot_vel=jnp.zeros(3),
+        rate=jnp.zeros(3),
+        normal=jnp.array([0.0, 0.0, 1.0]),
+        ball_pos=jnp.array([[aside, 0.0, NET.height + gap]]),
+        ball_vel=jnp.array([[0.0, 0.0, -5.0]]),
+    )
+    return at(gap_before), at(gap_after)
+
+
+@pytest.mark.parametrize(
+    ("gaps", "aside", "met"),
+    [((0.003, -0.007), 0.1, True), ((0.003, -0.007), 0.13, False), ((-0.007, 0.003), 0.1, False)],
+)
+def test_a_ball_is_caught_from_above_inside_the_radius_at_the_interpolated_time(gaps, aside, met):
+    before, after = moments(*gaps, aside)
+    passes, later = passage(WORLD, before, after, 1.0, jnp.zeros(1), jnp.zeros(3))
+    contact = nearest(no_contact(1), passes, later)
+    assert bool(contact.met[0]) == met
+    if gaps[0] > 0.0:
+        np.testing.assert_allclose(contact.time, 1.0 + 0.3 * WORLD.timestep, rtol=1e-6)
+        np.testing.assert_allclose(contact.offset, aside, rtol=1e-5)
+
+
+def test_the_landing_point_is_that_of_the_closed_form_without_drag():
+    ball = BallState(jnp.array([0.0, 1.0, 2.0]), jnp.array([3.0, -1.0, 4.0]))
+    point, time = landing_point(ball, jnp.float32(0.0), GRAVITY)
+    np.testing.assert_allclose(
+        drag_free_flight(ball, time, GRAVITY).pos, [*point[:2], 0.0], atol=2e-3
+    )
+    away, _ = landing_point(
+        ball.replace(vel=jnp.array([0.0, 0.0, 40.0])), jnp.float32(0.0), GRAVITY
+    )
+    assert np.isnan(away).all()
+
+
+def test_the_drag_is_found_from_the_energy_that_is_lost():
+    sensing, true = Sensing(position_std=0.002), jnp.float32(0.0616)
+    ball = BallState(jnp.array([4.0, 0.0, 0.8]), jnp.array([-4.0, 0.5, 7.0]))
+    path = fly(ball, 1.2, true, GRAVITY, num_steps=120)[1].pos
+    seen = observed(jax.random.key(0), path, sensing)
+
+    def advance(estimate, now):
+        number, at = now
+        estimate = look(estimate, at, sensing, GRAVITY)
+        fresh = anchored(estimate, GRAVITY)
+        later = with_drag(estimate, GRAVITY)
+        return jax.tree.map(lambda a, b: jnp.where(number < 30, a, b), fresh, later), None
+
+    first = first_estimate(path[0], 1.15 * true)
+    found, _ = jax.jit(lambda e: jax.lax.scan(advance, e, (jnp.arange(120), seen)))(first)
+    assert abs(found.drag / true - 1.0) < 0.06
+    ahead = fly(ball, 1.3, true, GRAVITY, num_steps=130)[0].pos
+    np.testing.assert_allclose(predicted(found, 0.1, GRAVITY).pos, ahead, atol=0.02)
+
+
+def test_a_lost_look_shows_nothing():
+    seen = observed(jax.random.key(1), jnp.zeros((2000, 3)), Sensing(dropout=0.25))
+    assert abs(np.isnan(seen[:, 0]).mean() - 0.25) < 0.04
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: Sensing(position_std=-0.1), "position_std must be >= 0, got -0.1"),
+        (lambda: Sensing(dropout=1.0), "dropout must be < 1, got 1.0"),
+        (lambda: Loop(WORLD, replan=-1.0), "replan must be >= 0, got -1.0"),
+        (lambda: Loop(WORLD, replan=30.0), "replan must be a divisor of the looks' 100 Hz, got 30"),
+        (lambda: Loop(WORLD, Sensing(rate=300.0)), "rate must be a divisor of 500 Hz, got 300"),
+        (
+            lambda: Loop(WORLD, Sensing(latency=0.015)),
+            "latency must be a multiple of the looks' 0.01 s, got 0.015",
+        ),
+        (lambda: World(NET, num_balls=0), "num_balls must be >= 1, got 0"),
+        (lambda: World(NET, timestep=0.0), "timestep must be > 0, got 0.0"),
+    ],
+)
+def test_what_cannot_be_flown_is_refused_in_one_line(build, message):
+    with pytest.raises(ValueError) as error:
+        build()
+    assert str(error.value) == message
+
+
+def test_a_plan_or_world_of_another_robot_is_refused():
+    with pytest.raises(ValueError, match="^world must carry Tool.*net.*, got Tool.*racket"):
+        require_world(Loop(World(RACKET)), NET, 1)
+    with pytest.raises(ValueError, match="^world must have 2 balls, got 1$"):
+        require_world(Loop(WORLD), NET, 2)
+
+    @dataclasses.dataclass
+    class Plan:
+        trajectory: PiecewisePolynomial
+
+    plan = Plan(jax.tree.map(lambda leaf: np.asarray(leaf)[None], wiggle()))
+    heads = np.zeros((1, 4, 3))
+    with pytest.raises(ValueError, match="^plan must begin where its quadrotor is, got 1.00 m"):
+        require_hovering(heads, plan)
+    with pytest.raises(ValueError, match="^plan must be of 2 flights, got 1$"):
+        require_hovering(np.zeros((2, 4, 3)), plan)
+
+
+def test_the_presets_are_in_rising_order_of_noise():
+    assert list(NOISES) == ["none", "lab", "harsh"]
+    stds = [noise.position_std for noise in NOISES.values()]
+    assert stds == sorted(stds)
+    assert ball_states(WORLD, hovering(WORLD, jnp.zeros(3)))[0].shape == (1, 3)
