@@ -4,7 +4,7 @@ World frame, z up, SI units. Everything here is written for one ball; `jax.vmap`
 """
 
 import math
-from typing import Any
+from typing import Any, TypeVar
 
 import chex
 import jax
@@ -12,7 +12,9 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from planner_jax.arithmetic import Components, components
+from planner_jax.arithmetic import components
+
+Vector = TypeVar("Vector", Array, tuple[Array, Array, Array])
 
 
 @struct.dataclass
@@ -29,7 +31,7 @@ def gravity_vector(gravity: Array) -> Array:
     return jnp.stack([jnp.zeros_like(gravity), jnp.zeros_like(gravity), -gravity])
 
 
-def ball_acceleration(vel: Components, drag: Array, gravity: Array) -> Components:
+def ball_acceleration(vel: Vector, drag: Array, gravity: Array) -> Vector:
     """Acceleration  g - K_D |v| v  of a ball in flight (paper 002, eq. 2).
 
     Args:
@@ -46,8 +48,10 @@ def ball_acceleration(vel: Components, drag: Array, gravity: Array) -> Component
     # The inner where keeps the gradient of sqrt finite for a ball at rest.
     speed = jnp.where(moving, jnp.sqrt(jnp.where(moving, speed_squared, 1.0)), 0.0)
     braking = -drag * speed
-    acc = (braking * x, braking * y, braking * z - gravity)
-    return acc if isinstance(vel, tuple) else jnp.stack(acc)
+    acc: Any = (braking * x, braking * y, braking * z - gravity)
+    if not isinstance(vel, tuple):
+        acc = jnp.stack(acc)
+    return acc
 
 
 def rk4_step(ball: BallState, duration: Array, drag: Array, gravity: Array) -> BallState:
