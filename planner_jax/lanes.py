@@ -24,9 +24,8 @@ _ELEMENTWISE = frozenset(
 # Their parameters name axes by number from the front, which the lanes do not move.
 _BY_AXIS = frozenset(
     "argmax argmin cumlogsumexp cummax cummin cumprod cumsum reduce_and reduce_max reduce_min "
-    "reduce_or reduce_prod reduce_sum rev sort split squeeze unstack".split()
+    "reduce_or reduce_prod reduce_sum rev sort split squeeze unstack concatenate stack".split()
 )
-_JOINING = frozenset({"concatenate", "stack"})
 _CALLS = frozenset(
     "checkpoint closed_call core_call custom_jvp_call custom_vjp_call jit pjit".split()
 )
@@ -140,15 +139,12 @@ def _outputs(eqn: JaxprEqn, inputs: list[Any], lanes: int) -> list[Any]:
     if not any(isinstance(value, _Lanes) for value in inputs):
         return _bound(eqn, inputs)
     shapes = [_shape(atom) for atom in eqn.invars]
-    out_shape = _shape(eqn.outvars[0])
     found = None
     if name in _ELEMENTWISE:
+        out_shape = _shape(eqn.outvars[0])
         found = _bound(eqn, [_spread(value, out_shape, lanes) for value in inputs])
     elif name in _BY_AXIS:
         found = _bound(eqn, [_widened(v, s, lanes) for v, s in zip(inputs, shapes, strict=True)])
-    elif name in _JOINING:
-        wide = [_widened(v, s, lanes) for v, s in zip(inputs, shapes, strict=True)]
-        found = _bound(eqn, wide)
     elif name in _RULES:
         found = _RULES[name](eqn, inputs, lanes)
     if found is None:
