@@ -21,7 +21,7 @@ from planner_jax.optimise.problem import Planner, Round
 from planner_jax.optimise.status import is_solved, is_unsolved
 
 BUCKETS = (16, 64, 256, 1024, 4096, 16384, 32768, 65536)  # lanes of a device in one call
-_CPU_CHUNK, _GPU_CHUNK = 1024, 65536  # what fits the cache of a core, and what fills a GPU
+_CPU_CHUNK, _GPU_CHUNK = 256, 65536  # what fits the cache of a core, and what fills a GPU
 _LANES = PartitionSpec("lanes")
 
 
