@@ -23,7 +23,7 @@ _OPTIONS = {
     *HitSweep.__dataclass_fields__,
     *CatchSweep.__dataclass_fields__,
     *("out", "devices", "iterations", "repeat"),
-    *("noise", "replan", "balls", "scenario", "drag_error", "video"),
+    *("noise", "replan", "balls", "scenario", "drag_error", "video", "record"),
 }
 _FAILED, _BAD_ARGUMENT, _INTERRUPTED = 1, 2, 130
 
@@ -221,7 +221,8 @@ def _add_fly(tasks: Any, look: dict[str, Any], task: str, words: str) -> None:
         task,
         help=words,
         description=f"Plan and fly in MuJoCo MJX: {words}, with noise, latency and wrong drag.\n"
-        "Writes a run folder: index.html, table.md, a figure, plans.parquet, manifest.json.",
+        "Writes a run folder: index.html, table.md, a figure, plans.parquet, flights.parquet,\n"
+        "manifest.json.",
         argument_default=argparse.SUPPRESS,
         **look,
     )
@@ -241,8 +242,10 @@ def _add_fly(tasks: Any, look: dict[str, Any], task: str, words: str) -> None:
         "balls' drag, either way (default: 0.15)")
     add("--seed", type=int, metavar="K", help="of balls and noise (default: 0)")
     add("--batch", type=int, metavar="B", help="flights at once (default: all up to 4096)")
+    add("--record", type=int, metavar="K",
+        help="flights kept look by look, the first ones (default: 16)")
     add("--video", nargs="?", const="flights.gif", metavar="FILE",
-        help="film the first three flights into the run folder, .gif, or .mp4 where ffmpeg is "
+        help="film the first three of these into the run folder, .gif, or .mp4 where ffmpeg is "
         "installed (default name: flights.gif)")
     add("--out", metavar="DIR", help=f"run folder (default: runs/fly-{task}-DATE-TIME)")
     # fmt: on
@@ -251,13 +254,20 @@ def _add_fly(tasks: Any, look: dict[str, Any], task: str, words: str) -> None:
 
 def _fly(task: str, given: dict[str, Any]) -> None:
     keep_compiled_programs()
-    from sims.run import FlySettings, headline, start_flights
+    from sims.run import FlySettings, start_flights
 
     out, video = given.pop("out", None), given.pop("video", None)
     out = out or os.path.join("runs", f"fly-{task}-{datetime.datetime.now():%Y%m%d-%H%M%S}")
-    manifest = start_flights(FlySettings(task, **given), out, video)
+    keep = {"record": given.pop("record")} if "record" in given else {}
+    manifest = start_flights(FlySettings(task, **given), out, video, **keep)
+    _print_flights(manifest, Path(out))
+
+
+def _print_flights(manifest: dict[str, Any], out: Path) -> None:
+    from sims.run import headline
+
     print("\n".join(headline(manifest)))
-    print(f"Look at {Path(out) / 'index.html'}")
+    print(f"Look at {out / 'index.html'}")
 
 
 def _add_bench(commands: Any, look: dict[str, Any]) -> None:
@@ -344,8 +354,15 @@ def _report(options: dict[str, Any]) -> None:
     from planner_jax.sweep.run_folder import RunFolder
 
     folder = RunFolder(options["run"], name="RUN")
-    write_report(folder)
-    _print_result(folder.read_manifest(), folder.path)
+    manifest = folder.read_manifest()
+    if str(manifest["kind"]).startswith("fly "):
+        from sims.run import write_flight_report
+
+        write_flight_report(folder)
+        _print_flights(manifest, folder.path)
+    else:
+        write_report(folder)
+        _print_result(manifest, folder.path)
 
 
 if __name__ == "__main__":
