@@ -29,7 +29,7 @@ from jax import Array
 from mujoco import mjx
 
 from planner_jax.ball.flight import BallState, ball_acceleration
-from sims.scenery import MOUTHS, TOWARDS_NET, Part, court_parts, machine_parts
+from sims.scenery import GROUND_COLOUR, MOUTHS, TOWARDS_NET, Part, court_parts, machine_parts
 from sims.vehicle import Vehicle, rotor_positions, rotor_torques
 
 BALL_RADIUS, BALL_MASS = 0.02, 0.0027  # [m], [kg]: a table tennis ball
@@ -116,11 +116,15 @@ def _scenery_xml(world: World) -> str:
 def _part_xml(part: Part) -> str:
     length, width, height = (0.5 * size for size in part.size)
     half = (length, width, height) if part.kind == "box" else (length, height)
-    colour = [int(part.colour[k : k + 2], 16) / 255.0 for k in (1, 3, 5)]
     return (
         f'<geom type="{part.kind}" size="{_text(*half)}" pos="{_text(*part.centre)}" '
-        f'quat="{_text(*part.quat_wxyz)}" rgba="{_text(*colour, 1.0)}" {_LOOK}/>'
+        f'quat="{_text(*part.quat_wxyz)}" rgba="{_rgba(part.colour)}" {_LOOK}/>'
     )
+
+
+def _rgba(colour: str) -> str:
+    """Of #RRGGBB."""
+    return _text(*(int(colour[k : k + 2], 16) / 255.0 for k in (1, 3, 5)), 1.0)
 
 
 def _contact_xml(world: World) -> str:
@@ -179,7 +183,7 @@ def mjcf(world: World) -> str:
   </visual>
   <worldbody>
     <light directional="true" dir="0 .3 -1" diffuse=".5 .5 .5" castshadow="false"/>
-    <geom name="ground" type="plane" size="10 10 .1" rgba=".8 .85 .8 1" {_LOOK}/>
+    <geom name="ground" type="plane" size="10 10 .1" rgba="{_rgba(GROUND_COLOUR)}" {_LOOK}/>
     {_scenery_xml(world)}
     <body name="quadrotor"><freejoint/>
       <inertial pos="0 0 0" mass="{vehicle.mass}" diaginertia="{_text(*vehicle.inertia)}"/>

@@ -210,7 +210,7 @@ def start_flights(
     recording = record_of(settings, cases, flights, np.arange(kept))
     folder.write_rows(folder.path / FILE, to_rows(recording))
     if video is not None:
-        titles = [_title(settings, recording, lane) for lane in range(min(film, kept))]
+        titles = [title_of(settings, recording, lane) for lane in range(min(film, kept))]
         film_flights(folder.path / video, settings.loop(record=False).world, recording, titles)
     done = {"state": "complete", "summary": _summary(settings, rows), "times": times}
     manifest = {**folder.read_manifest(), **done}
@@ -234,7 +234,11 @@ def read_flights(folder: RunFolder) -> tuple[dict[str, Any], FlySettings, Record
             f"{folder.name} must be finished, with its {FILE}, got {str(folder.path)!r}; "
             "fly it again"
         )
-    return manifest, FlySettings(**manifest["parameters"]), read_recording(path)
+    try:
+        recording = read_recording(path)
+    except (pa.ArrowException, KeyError) as error:
+        raise SettingError(f"{folder.name} must have a whole {FILE}: {error}") from None
+    return manifest, FlySettings(**manifest["parameters"]), recording
 
 
 def _fly_all(settings: FlySettings, cases: Any, shown: int) -> tuple[pa.Table, dict[str, Any], Any]:
@@ -337,10 +341,11 @@ def draw_one(
     """
     recording = record_of(settings, cases, flights, np.array([lane]))
     world = settings.loop(record=True).world
-    draw_flight(path, world, recording, 0, **{"title": _title(settings, recording, 0), **look})
+    draw_flight(path, world, recording, 0, **{"title": title_of(settings, recording, 0), **look})
 
 
-def _title(settings: FlySettings, recording: Recording, flight: int) -> str:
+def title_of(settings: FlySettings, recording: Recording, flight: int) -> str:
+    """Task, place in the run and outcome of a flight."""
     outcome = "success" if recording.success[flight] else "failure"
     return f"{settings.task} {recording.index[flight]}, {outcome}"
 
@@ -384,7 +389,7 @@ def write_flight_report(folder: RunFolder) -> None:
     manifest, settings, recording = read_flights(folder)
     folder.figures.mkdir(exist_ok=True)
     world = settings.loop(record=False).world
-    title = _title(settings, recording, 0)
+    title = title_of(settings, recording, 0)
     draw_flight(folder.figures / "flight.png", world, recording, 0, title)
     summary, video = manifest["summary"], manifest["video"]
     name = f"{settings.balls} ball(s)" if settings.task == "catch" else settings.scenario
@@ -412,7 +417,7 @@ def write_flight_report(folder: RunFolder) -> None:
         f'{lead}{shown}<p><img src="figures/flight.png" alt="one flight"></p>\n'
         f'{to_html(table)}<p>All rows: <a href="plans.parquet">plans.parquet</a>. The first '
         f"{len(recording)} flights look by look: "
-        f'<a href="{FILE}">{FILE}</a>.</p>\n'
+        f'<a href="{FILE}">{FILE}</a>; play them with <code>planner-jax view</code>.</p>\n'
         f"<details><summary>manifest.json</summary><pre>{record}</pre></details>\n"
         "</body></html>\n",
     )

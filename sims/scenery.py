@@ -15,6 +15,7 @@ MOUTHS = {
     "racket": (0.5 * (court.NEAR_LINE + serves.DEPTH), 0.0, serves.SERVE_HEIGHT),
 }
 TOWARDS_NET = np.pi  # [rad], heading of a machine that throws along -x
+GROUND_COLOUR = "#A9C4A9"
 LINE_COLOUR, MIDDLE_COLOUR, DEAD_COLOUR = "#FFFFFF", "#24292F", "#D98880"
 _STEEL, _RUBBER = "#5B6B73", "#2E8B57"
 _LINE = 0.03  # [m], width of the court's lines
