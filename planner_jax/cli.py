@@ -1,4 +1,4 @@
-"""The command line: `planner-jax sweep|fly hit|catch`, `report`, `bench throughput`, `doctor`."""
+"""The command line: `planner-jax sweep|fly hit|catch`, `view`, `report`, `bench`, `doctor`."""
 
 import argparse
 import datetime
@@ -23,7 +23,7 @@ _OPTIONS = {
     *HitSweep.__dataclass_fields__,
     *CatchSweep.__dataclass_fields__,
     *("out", "devices", "iterations", "repeat"),
-    *("noise", "replan", "balls", "scenario", "drag_error", "video"),
+    *("noise", "replan", "balls", "scenario", "drag_error", "video", "record", "host", "port"),
 }
 _FAILED, _BAD_ARGUMENT, _INTERRUPTED = 1, 2, 130
 
@@ -92,6 +92,13 @@ def _parser() -> argparse.ArgumentParser:
     tasks = fly.add_subparsers(title="tasks", required=True, metavar="task")
     _add_fly(tasks, look, "catch", "a quadrotor catches thrown balls with a net")
     _add_fly(tasks, look, "hit", "a quadrotor hits served balls to a target with a racket")
+    view = commands.add_parser("view", help="play a run's flights in a browser", **look)
+    view.add_argument("run", metavar="RUN", help="folder of a run of flights")
+    view.add_argument("--host", default="localhost", help="where to serve (default: localhost)")
+    view.add_argument(
+        "--port", type=int, default=8080, metavar="N", help="0 takes a free one (default: 8080)"
+    )
+    view.set_defaults(command=_view)
     report = commands.add_parser(
         "report", help="write table, figures and page of a run anew", **look
     )
@@ -221,7 +228,8 @@ def _add_fly(tasks: Any, look: dict[str, Any], task: str, words: str) -> None:
         task,
         help=words,
         description=f"Plan and fly in MuJoCo MJX: {words}, with noise, latency and wrong drag.\n"
-        "Writes a run folder: index.html, table.md, a figure, plans.parquet, manifest.json.",
+        "Writes a run folder: index.html, table.md, a figure, plans.parquet, flights.parquet,\n"
+        "manifest.json.",
         argument_default=argparse.SUPPRESS,
         **look,
     )
@@ -241,8 +249,10 @@ def _add_fly(tasks: Any, look: dict[str, Any], task: str, words: str) -> None:
         "balls' drag, either way (default: 0.15)")
     add("--seed", type=int, metavar="K", help="of balls and noise (default: 0)")
     add("--batch", type=int, metavar="B", help="flights at once (default: all up to 4096)")
+    add("--record", type=int, metavar="K",
+        help="flights kept look by look for `planner-jax view`, the first ones (default: 16)")
     add("--video", nargs="?", const="flights.gif", metavar="FILE",
-        help="film the first three flights into the run folder, .gif, or .mp4 where ffmpeg is "
+        help="film the first three of these into the run folder, .gif, or .mp4 where ffmpeg is "
         "installed (default name: flights.gif)")
     add("--out", metavar="DIR", help=f"run folder (default: runs/fly-{task}-DATE-TIME)")
     # fmt: on
@@ -251,13 +261,40 @@ def _add_fly(tasks: Any, look: dict[str, Any], task: str, words: str) -> None:
 
 def _fly(task: str, given: dict[str, Any]) -> None:
     keep_compiled_programs()
-    from sims.run import FlySettings, headline, start_flights
+    from sims.run import FlySettings, start_flights
 
     out, video = given.pop("out", None), given.pop("video", None)
     out = out or os.path.join("runs", f"fly-{task}-{datetime.datetime.now():%Y%m%d-%H%M%S}")
-    manifest = start_flights(FlySettings(task, **given), out, video)
+    keep = {"record": given.pop("record")} if "record" in given else {}
+    manifest = start_flights(FlySettings(task, **given), out, video, **keep)
+    _print_flights(manifest, Path(out))
+
+
+def _print_flights(manifest: dict[str, Any], out: Path) -> None:
+    from sims.run import headline
+
     print("\n".join(headline(manifest)))
-    print(f"Look at {Path(out) / 'index.html'}")
+    print(f"Look at {out / 'index.html'}, or play it: planner-jax view {shlex.quote(str(out))}")
+
+
+def _view(options: dict[str, Any]) -> None:
+    from planner_jax.sweep.run_folder import RunFolder
+    from sims.run import read_flights, title_of
+    from sims.view import Viewer
+
+    _, settings, recording = read_flights(RunFolder(options["run"], name="RUN"))
+    titles = [title_of(settings, recording, flight) for flight in range(len(recording))]
+    world = settings.loop(record=False).world
+    viewer = Viewer(world, recording, titles, options["host"], options["port"])
+    _let_ctrl_c_stop()
+    print(f"Playing {len(titles)} flights at {viewer.url}; Ctrl-C stops.", flush=True)
+    viewer.run()
+
+
+def _let_ctrl_c_stop() -> None:
+    """A shell starts background jobs deaf to SIGINT; here it is heard there too."""
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def _add_bench(commands: Any, look: dict[str, Any]) -> None:
@@ -314,9 +351,7 @@ def _sweep(kind: type[SweepSettings], given: dict[str, Any]) -> None:
     if out is None:
         now = datetime.datetime.now()
         out = os.path.join("runs", f"{kind.TASK}-{settings.planner}-{now:%Y%m%d-%H%M%S}")
-    # A shell starts background jobs deaf to SIGINT; this one can be stopped and resumed there too.
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+    _let_ctrl_c_stop()
     keep_compiled_programs()
     from planner_jax.sweep import run
 
@@ -344,8 +379,15 @@ def _report(options: dict[str, Any]) -> None:
     from planner_jax.sweep.run_folder import RunFolder
 
     folder = RunFolder(options["run"], name="RUN")
-    write_report(folder)
-    _print_result(folder.read_manifest(), folder.path)
+    manifest = folder.read_manifest()
+    if str(manifest["kind"]).startswith("fly "):
+        from sims.run import write_flight_report
+
+        write_flight_report(folder)
+        _print_flights(manifest, folder.path)
+    else:
+        write_report(folder)
+        _print_result(manifest, folder.path)
 
 
 if __name__ == "__main__":

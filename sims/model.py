@@ -9,7 +9,8 @@ Rotors are MuJoCo actuators with a first-order lag; ball drag is a force in `qfr
 
 In flight nothing touches: the racket's impact is the library's map and a caught ball has
 crossed the hoop's disc (`scoring`), so the batch model has no contacts. The model with contacts
-is for comparison with MuJoCo's own.
+is for comparison with MuJoCo's own. Court and pitching machine are there to be looked at: they
+touch nothing and cost no step anything.
 
 MuJoCo's Euler is semi-implicit: the velocity it keeps lies half a step before the position. For
 a ball that is taken care of at both ends, by `placed` and `ball_velocity`, which makes its
@@ -28,9 +29,11 @@ from jax import Array
 from mujoco import mjx
 
 from planner_jax.ball.flight import BallState, ball_acceleration
+from sims.scenery import GROUND_COLOUR, MOUTHS, TOWARDS_NET, Part, court_parts, machine_parts
 from sims.vehicle import Vehicle, rotor_positions, rotor_torques
 
 BALL_RADIUS, BALL_MASS = 0.02, 0.0027  # [m], [kg]: a table tennis ball
+_LOOK = 'mass="0" contype="0" conaffinity="0"'  # of what is there to be looked at
 _SEGMENTS = 12  # capsules of the hoop
 
 
@@ -84,23 +87,44 @@ def _text(*values: float) -> str:
 
 def _tool_xml(world: World) -> str:
     """The hoop as a ring of capsules over a plate, or the racket as a plate."""
-    tool, look = world.tool, 'mass="0" contype="0" conaffinity="0"'
+    tool = world.tool
     side = 0.5 * np.sqrt(np.pi) * tool.radius  # of the square of the disc's area, halved
     drop = 0.0 if tool.kind == "racket" else 2.0 * BALL_RADIUS
     plate = (
         f'<geom name="plate" type="box" size="{_text(side, side, 0.002)}" '
-        f'pos="0 0 {_text(tool.height - drop - 0.002 - BALL_RADIUS)}" rgba=".3 .5 .9 .5" {look}/>'
+        f'pos="0 0 {_text(tool.height - drop - 0.002 - BALL_RADIUS)}" rgba=".3 .5 .9 .5" {_LOOK}/>'
     )
     if tool.kind == "racket":
         return plate
     turn = 2.0 * np.pi * np.arange(_SEGMENTS + 1) / _SEGMENTS
     rim = np.stack([np.cos(turn), np.sin(turn)], axis=1) * tool.radius
     ring = "".join(
-        f'<geom type="capsule" size=".004" rgba=".2 .2 .2 1" {look} '
+        f'<geom type="capsule" size=".004" rgba=".2 .2 .2 1" {_LOOK} '
         f'fromto="{_text(*a, tool.height, *b, tool.height)}"/>'
         for a, b in zip(rim[:-1], rim[1:], strict=True)
     )
     return plate + ring
+
+
+def _scenery_xml(world: World) -> str:
+    """The pitching machine, and for hits the court."""
+    kind = world.tool.kind
+    parts = machine_parts(MOUTHS[kind], TOWARDS_NET) + (court_parts() if kind == "racket" else [])
+    return "".join(map(_part_xml, parts))
+
+
+def _part_xml(part: Part) -> str:
+    length, width, height = (0.5 * size for size in part.size)
+    half = (length, width, height) if part.kind == "box" else (length, height)
+    return (
+        f'<geom type="{part.kind}" size="{_text(*half)}" pos="{_text(*part.centre)}" '
+        f'quat="{_text(*part.quat_wxyz)}" rgba="{_rgba(part.colour)}" {_LOOK}/>'
+    )
+
+
+def _rgba(colour: str) -> str:
+    """Of #RRGGBB."""
+    return _text(*(int(colour[k : k + 2], 16) / 255.0 for k in (1, 3, 5)), 1.0)
 
 
 def _contact_xml(world: World) -> str:
@@ -121,12 +145,11 @@ def mjcf(world: World) -> str:
     its centre passes the disc (for the net, one ball's diameter later).
     """
     vehicle = world.vehicle
-    look = 'mass="0" contype="0" conaffinity="0"'
     places = rotor_positions(vehicle)
     rotors = "".join(
         f'<site name="rotor{i}" pos="{_text(*place)}"/>'
-        f'<geom type="cylinder" size=".06 .003" pos="{_text(*place)}" rgba=".2 .2 .2 .6" {look}/>'
-        f'<geom type="capsule" size=".008" fromto="0 0 0 {_text(*place)}" {look}/>'
+        f'<geom type="cylinder" size=".06 .003" pos="{_text(*place)}" rgba=".2 .2 .2 .6" {_LOOK}/>'
+        f'<geom type="capsule" size=".008" fromto="0 0 0 {_text(*place)}" {_LOOK}/>'
         for i, place in enumerate(places)
     )
     motors = "".join(
@@ -140,7 +163,7 @@ def mjcf(world: World) -> str:
     balls = "".join(
         f'<body name="ball{k}">{slides}'
         f'<inertial pos="0 0 0" mass="{BALL_MASS}" diaginertia="{_text(*[inertia] * 3)}"/>'
-        f'<geom name="ball{k}" type="sphere" size="{BALL_RADIUS}" rgba="1 .5 0 1" {look}/></body>'
+        f'<geom name="ball{k}" type="sphere" size="{BALL_RADIUS}" rgba="1 .5 0 1" {_LOOK}/></body>'
         for k in range(world.num_balls)
     )
     pairs = "".join(
@@ -155,10 +178,13 @@ def mjcf(world: World) -> str:
           iterations="1" ls_iterations="4">
     <flag eulerdamp="disable"{switch}/>
   </option>
-  <visual><quality shadowsize="1024"/></visual>
+  <visual>
+    <quality shadowsize="1024"/><headlight ambient=".4 .4 .4" diffuse=".3 .3 .3"/>
+  </visual>
   <worldbody>
-    <light pos="0 0 8" castshadow="false"/>
-    <geom name="ground" type="plane" size="10 10 .1" rgba=".8 .85 .8 1" {look}/>
+    <light directional="true" dir="0 .3 -1" diffuse=".5 .5 .5" castshadow="false"/>
+    <geom name="ground" type="plane" size="10 10 .1" rgba="{_rgba(GROUND_COLOUR)}" {_LOOK}/>
+    {_scenery_xml(world)}
     <body name="quadrotor"><freejoint/>
       <inertial pos="0 0 0" mass="{vehicle.mass}" diaginertia="{_text(*vehicle.inertia)}"/>
       {rotors}{_tool_xml(world)}

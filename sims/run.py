@@ -10,11 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pyarrow as pa
 
-from planner_jax.ball.flight import fly
 from planner_jax.optimise.status import Status
 from planner_jax.sweep.columns import BOOL, COUNT, LIST, NUMBER, TEXT, VECTOR, Column, rows_of
 from planner_jax.sweep.columns import RefereedBatch as FlownBatch
@@ -29,11 +27,14 @@ from planner_jax.task.catch.planners import PLANNERS as CATCH_PLANNERS
 from planner_jax.task.catch.planners import catch_planner
 from planner_jax.task.hit.planners import PLANNERS as HIT_PLANNERS
 from planner_jax.task.hit.planners import planner as hit_planner
-from sims.catch import fly_catches, throws
+from sims.catch import INTERVAL, fly_catches, throws
+from sims.catch import SEEN as CATCH_SEEN
 from sims.closed_loop import Loop
-from sims.film import FilmError, draw_flight, film_flights, flight_of, require_film
+from sims.film import FilmError, draw_flight, film_flights, require_film
 from sims.hit import SCENARIOS, fly_hits, volleys
+from sims.hit import SEEN as HIT_SEEN
 from sims.model import NET, RACKET, World
+from sims.recording import FILE, Recording, read_recording, recorded, to_rows
 from sims.scoring import returned
 from sims.sensing import NOISES
 
@@ -158,7 +159,12 @@ _OWN: Mapping[str, Sequence[Column]] = {
 
 
 def start_flights(
-    settings: FlySettings, out: str | os.PathLike, video: str | None = None, film: int = 3
+    settings: FlySettings,
+    out: str | os.PathLike,
+    video: str | None = None,
+    *,
+    record: int = 16,
+    film: int = 3,
 ) -> dict[str, Any]:
     """Fly into a new folder.
 
@@ -166,7 +172,8 @@ def start_flights(
         settings: of the run.
         out: folder, new or empty.
         video: name of a film in the folder, .gif or .mp4; None makes none.
-        film: how many flights it shows, the first ones.
+        record: how many flights are kept look by look, the first ones.
+        film: how many of these the film shows, the first ones.
 
     Returns:
         The manifest.
@@ -175,6 +182,7 @@ def start_flights(
         SettingError: an argument breaks a rule; nothing is left behind.
     """
     folder = RunFolder(out)
+    require(1 <= record <= _RECORDED, "record", f">= 1 and <= {_RECORDED}", record)
     if video is not None:
         require(os.path.basename(video) == video, "video", "a file name", repr(video))
         try:
@@ -193,18 +201,44 @@ def start_flights(
             "seed": settings.seed,
             "parameters": dataclasses.asdict(settings),
             "loop": dataclasses.asdict(settings.loop(record=False)),
+            "video": video,
         }
     )
-    shown = min(film if video else 1, settings.num)
-    rows, times, flights = _fly_all(settings, cases, shown)
+    kept = min(record, settings.num)
+    rows, times, flights = _fly_all(settings, cases, kept)
     folder.write_rows(folder.plans, rows)
-    manifest = {**folder.read_manifest(), "summary": _summary(settings, rows), "times": times}
+    recording = record_of(settings, cases, flights, np.arange(kept))
+    folder.write_rows(folder.path / FILE, to_rows(recording))
+    if video is not None:
+        titles = [title_of(settings, recording, lane) for lane in range(min(film, kept))]
+        film_flights(folder.path / video, settings.loop(record=False).world, recording, titles)
+    done = {"state": "complete", "summary": _summary(settings, rows), "times": times}
+    manifest = {**folder.read_manifest(), **done}
     folder.write_manifest(manifest)
-    _show(folder, settings, cases[np.arange(shown)], flights, video)
-    _report(folder, manifest, settings, video)
-    manifest["state"] = "complete"
-    folder.write_manifest(manifest)
+    write_flight_report(folder)
     return manifest
+
+
+def read_flights(folder: RunFolder) -> tuple[dict[str, Any], FlySettings, Recording]:
+    """Manifest, settings and recording of a finished run of flights.
+
+    Raises:
+        SettingError: the folder is not that of such a run.
+    """
+    manifest = folder.read_manifest()
+    path = folder.path / FILE
+    if not str(manifest["kind"]).startswith("fly "):
+        raise SettingError(f"{folder.name} must be a run of flights, got a {manifest['kind']}")
+    if manifest["state"] != "complete" or not path.exists():
+        raise SettingError(
+            f"{folder.name} must be finished, with its {FILE}, got {str(folder.path)!r}; "
+            "fly it again"
+        )
+    try:
+        recording = read_recording(path)
+    except (pa.ArrowException, KeyError) as error:
+        raise SettingError(f"{folder.name} must have a whole {FILE}: {error}") from None
+    return manifest, FlySettings(**manifest["parameters"]), recording
 
 
 def _fly_all(settings: FlySettings, cases: Any, shown: int) -> tuple[pa.Table, dict[str, Any], Any]:
@@ -258,21 +292,38 @@ def _summary(settings: FlySettings, rows: pa.Table) -> dict[str, Any]:
     return summary
 
 
-def _after(settings: FlySettings, cases: Any, flights: Any, lane: int) -> list[np.ndarray]:
-    """The returned ball's path, for a hit that met it."""
-    if settings.task == "catch" or not flights.flown.contact.met[lane, 0]:
-        return []
-    contact = jax.tree.map(lambda leaf: leaf[lane, 0], flights.flown.contact)
-    scenario = jax.tree.map(lambda leaf: leaf[lane], cases.scenarios)
-    ball = returned(contact, scenario.restitution)
-    path = fly(ball, jnp.float32(3.0), scenario.drag, scenario.gravity, num_steps=150)[1].pos
-    path = np.asarray(path)
-    return [path[path[:, 2] > 0.0]]
+def record_of(settings: FlySettings, cases: Any, flights: Any, lanes: np.ndarray) -> Recording:
+    """The recording of some of the flights that were recorded.
 
-
-def _met(flights: Any) -> np.ndarray:
-    """When each ball was met (B, N) [s], NaN for never."""
-    return np.where(flights.flown.contact.met, flights.flown.contact.time, np.nan)
+    Args:
+        settings: of the run.
+        cases: that were flown.
+        flights: what came of them.
+        lanes: (F,) which of them.
+    """
+    pick = lambda leaf: np.asarray(leaf)[lanes]  # noqa: E731
+    flown = flights.flown
+    flown = dataclasses.replace(
+        flown,
+        contact=jax.tree.map(pick, flown.contact),
+        record=jax.tree.map(pick, flown.record),
+    )
+    world, some = settings.loop(record=True).world, cases[lanes]
+    common: dict[str, Any] = {
+        "index": some.index,
+        "success": pick(success(flights)),
+        "gravity": world.gravity,
+    }
+    if settings.task == "catch":
+        begins = INTERVAL * np.arange(world.num_balls)
+        common |= {"drag": some.drag, "begins": begins, "seen": CATCH_SEEN}
+        return recorded(flown, some.balls, **common)
+    scenarios = some.scenarios
+    contact = jax.tree.map(lambda leaf: leaf[:, 0], flown.contact)
+    back = jax.device_get(jax.vmap(returned)(contact, scenarios.restitution))
+    common |= {"drag": scenarios.drag[:, None], "begins": np.zeros(1), "seen": HIT_SEEN}
+    balls = jax.tree.map(lambda leaf: leaf[:, None], scenarios.ball)
+    return recorded(flown, balls, returned=back, target=scenarios.target, **common)
 
 
 def draw_one(
@@ -288,33 +339,15 @@ def draw_one(
         lane: which one.
         look: `title` and `view` for `film.draw_flight`.
     """
-    record = flight_of(flights.flown.record, lane)
-    world, after = settings.loop(record=True).world, _after(settings, cases, flights, lane)
-    target = cases.scenarios.target[lane] if settings.task == "hit" else None
-    look = {"title": _title(settings, flights, lane), **look}
-    draw_flight(path, world, record, _met(flights)[lane], after=after, target=target, **look)
+    recording = record_of(settings, cases, flights, np.array([lane]))
+    world = settings.loop(record=True).world
+    draw_flight(path, world, recording, 0, **{"title": title_of(settings, recording, 0), **look})
 
 
-def _title(settings: FlySettings, flights: Any, lane: int) -> str:
-    return f"{settings.task} {lane}, {'success' if success(flights)[lane] else 'failure'}"
-
-
-def _show(
-    folder: RunFolder, settings: FlySettings, cases: Any, flights: Any, video: str | None
-) -> None:
-    """A picture of the first flight, and a film of all `cases`."""
-    folder.figures.mkdir(exist_ok=True)
-    draw_one(folder.figures / "flight.png", settings, cases, flights, 0)
-    if video is not None:
-        lanes = range(len(cases))
-        film_flights(
-            folder.path / video,
-            settings.loop(record=True).world,
-            [flight_of(flights.flown.record, lane) for lane in lanes],
-            _met(flights)[: len(cases)],
-            [_title(settings, flights, lane) for lane in lanes],
-            [_after(settings, cases, flights, lane) for lane in lanes],
-        )
+def title_of(settings: FlySettings, recording: Recording, flight: int) -> str:
+    """Task, place in the run and outcome of a flight."""
+    outcome = "success" if recording.success[flight] else "failure"
+    return f"{settings.task} {recording.index[flight]}, {outcome}"
 
 
 def headline(manifest: dict[str, Any]) -> list[str]:
@@ -344,11 +377,21 @@ def headline(manifest: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _report(
-    folder: RunFolder, manifest: dict[str, Any], settings: FlySettings, video: str | None
-) -> None:
-    """`table.md` and `index.html`."""
-    summary = manifest["summary"]
+def write_flight_report(folder: RunFolder) -> None:
+    """Write `table.md`, `figures/` and `index.html` of a run of flights anew.
+
+    Args:
+        folder: with `manifest.json` and `flights.parquet`; a film may be there.
+
+    Raises:
+        SettingError: the folder is not that of a finished run of flights.
+    """
+    manifest, settings, recording = read_flights(folder)
+    folder.figures.mkdir(exist_ok=True)
+    world = settings.loop(record=False).world
+    title = title_of(settings, recording, 0)
+    draw_flight(folder.figures / "flight.png", world, recording, 0, title)
+    summary, video = manifest["summary"], manifest["video"]
     name = f"{settings.balls} ball(s)" if settings.task == "catch" else settings.scenario
     cells = own_cells(summary["successes"], summary["num"])
     table = RateTable(
@@ -372,7 +415,9 @@ def _report(
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         f"<title>{html.escape(title)}</title></head>\n<body>\n<h1>{html.escape(title)}</h1>\n"
         f'{lead}{shown}<p><img src="figures/flight.png" alt="one flight"></p>\n'
-        f'{to_html(table)}<p>All rows: <a href="plans.parquet">plans.parquet</a>.</p>\n'
+        f'{to_html(table)}<p>All rows: <a href="plans.parquet">plans.parquet</a>. The first '
+        f"{len(recording)} flights look by look: "
+        f'<a href="{FILE}">{FILE}</a>; play them with <code>planner-jax view</code>.</p>\n'
         f"<details><summary>manifest.json</summary><pre>{record}</pre></details>\n"
         "</body></html>\n",
     )

@@ -20,10 +20,12 @@ from sims.model import (
     ball_states,
     hovering,
     mujoco_data,
+    mujoco_model,
     placed,
     step,
     step_mujoco,
 )
+from sims.scenery import court_parts, machine_parts, outlines
 from sims.scoring import Moment, landing_point, nearest, no_contact, passage
 from sims.sensing import (
     NOISES,
@@ -153,6 +155,23 @@ def test_hover_is_an_equilibrium_and_mjx_flies_as_mujoco_does():
     np.testing.assert_allclose(path, reference, atol=1e-4)
     truth = fly(jax.tree.map(lambda x: x[0], balls), 0.8, drag[0], GRAVITY, num_steps=100)[0]
     np.testing.assert_allclose(path[-1, 7:], truth.pos, atol=1e-3)
+
+
+@pytest.mark.parametrize("tool", [NET, RACKET])
+def test_court_and_machine_stand_there_and_touch_nothing(tool):
+    model = mujoco_model(World(tool, contacts=True))
+    standing = np.flatnonzero(model.geom_bodyid == 0)
+    assert len(standing) >= 6
+    assert not model.geom_contype.any() and not model.geom_conaffinity.any()
+    assert model.npair == 2  # the ball with ground and plate
+    ground = model.geom("ground").id
+    pairs = {*model.pair_geom1.tolist(), *model.pair_geom2.tolist()}
+    assert pairs & set(standing.tolist()) == {ground}
+    assert np.ptp(model.geom_pos[standing], axis=0)[0] > 3.0  # as far as the machine
+    for part in machine_parts((1.0, 2.0, 0.8), 0.5) + court_parts():
+        lines = np.concatenate(outlines(part))
+        np.testing.assert_allclose(0.5 * (lines.min(0) + lines.max(0)), part.centre, atol=1e-9)
+        assert lines[:, 2].min() > -1e-9
 
 
 def test_a_ball_that_falls_on_the_plate_of_a_net_is_held_by_mujocos_own_contact():

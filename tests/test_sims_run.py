@@ -1,15 +1,14 @@
 """Run folders of flights, films, and the command `planner-jax fly`."""
 
-import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
 from planner_jax.cli import main
 from planner_jax.sweep.settings import SettingError
-from sims.closed_loop import Record
-from sims.film import FilmError, film_flights, require_film
-from sims.model import NET, World, hovering
+from sims.film import FilmError, draw_flight, film_flights, require_film
+from sims.model import NET, RACKET, World
 from sims.run import FlySettings
+from tests.recordings import recording
 
 
 @pytest.mark.parametrize(
@@ -40,30 +39,18 @@ def test_the_command_says_what_is_wrong_and_writes_nothing(tmp_path, capsys):
     out = tmp_path / "run"
     assert main(["fly", "catch", "--noise", "loud", "--out", str(out)]) == 2
     assert main(["fly", "hit", "--video", "film.avi", "--out", str(out)]) == 2
+    assert main(["fly", "hit", "--record", "0", "--out", str(out)]) == 2
     lines = capsys.readouterr().err.splitlines()
     said = [line for line in lines if line.startswith("planner-jax: error:")]
     assert "--noise must be one of none, lab, harsh" in said[0]
     assert "--video must end in .gif or .mp4" in said[1]
+    assert "--record must be >= 1 and <= 256, got 0" in said[2]
     assert not out.exists()
-
-
-def record():
-    """Four looks at a hovering quadrotor, and a ball that falls."""
-    qpos = np.tile(np.asarray(hovering(World(NET), np.array([0.0, 0.0, 1.0])).qpos), (4, 1))
-    qpos[:, 7:] = [[0.5, 0.0, 2.0 - 0.1 * k] for k in range(4)]
-    physics = hovering(World(NET), np.zeros(3)).replace(qpos=qpos)
-    return Record(
-        time=0.01 * np.arange(4.0),
-        physics=physics,
-        wanted=qpos[:, :3],
-        horizon=np.ones((4, 1)),
-        error=np.zeros((4, 1, 3)),
-    )
 
 
 def test_a_film_is_written_without_a_display(tmp_path):
     path = tmp_path / "flights.gif"
-    film_flights(path, World(NET), [record()], [[np.nan]], ["one"], [[]])
+    film_flights(path, World(NET), recording(), ["one"])
     assert path.read_bytes()[:4] == b"GIF8"
     assert list(tmp_path.iterdir()) == [path]
 
@@ -71,8 +58,14 @@ def test_a_film_is_written_without_a_display(tmp_path):
 def test_a_film_that_fails_leaves_nothing_behind(tmp_path, monkeypatch):
     monkeypatch.setattr(Figure, "clear", lambda self: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        film_flights(tmp_path / "flights.gif", World(NET), [record()], [[np.nan]], ["one"], [[]])
+        film_flights(tmp_path / "flights.gif", World(NET), recording(), ["one"])
     assert not list(tmp_path.iterdir())
+
+
+def test_a_picture_of_a_hit_shows_court_machine_and_target(tmp_path):
+    path = tmp_path / "flight.png"
+    draw_flight(path, World(RACKET), recording(target=(1.75, 0.0, 0.0)), 0, "one")
+    assert path.read_bytes()[1:4] == b"PNG"
 
 
 def test_mp4_without_ffmpeg_is_refused(tmp_path, monkeypatch):
@@ -91,11 +84,19 @@ def test_a_run_of_flights_is_written_whole(tmp_path, capsys):
     assert names == {
         "manifest.json",
         "plans.parquet",
+        "flights.parquet",
         "table.md",
         "index.html",
         "figures",
         "flights.gif",
     }
+    page = (out / "index.html").read_text()
+    for name in ("index.html", "table.md", "figures/flight.png"):
+        (out / name).unlink()
+    assert main(["report", str(out)]) == 0
+    assert "100.00 % of 3 flights caught all balls" in capsys.readouterr().out
+    assert (out / "figures" / "flight.png").exists() and (out / "table.md").exists()
+    assert (out / "index.html").read_text() == page
+    (out / "flights.parquet").unlink()
     assert main(["report", str(out)]) == 2
-    said = capsys.readouterr().err.splitlines()
-    assert said == ["planner-jax: error: RUN must be the folder of a sweep, got a fly catch"]
+    assert "RUN must be finished, with its flights.parquet" in capsys.readouterr().err

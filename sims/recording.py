@@ -1,0 +1,247 @@
+"""What is kept of a run's first flights, so that they can be drawn, filmed and played again.
+
+The file is `flights.parquet` in the run folder: a row a flight, lists flat, SI units, meanings
+in the column metadata. Looks are at equal steps. They begin when the first ball leaves its
+machine, before there is a plan, and end when the last returned ball is down.
+"""
+
+import dataclasses
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from planner_jax.ball.flight import BallState
+from planner_jax.sweep.columns import BOOL, LIST, VECTOR, Column, RefereedBatch, rows_of
+from planner_jax.sweep.source import Cases
+from planner_jax.task.hit.validate import fly, landing
+from sims.closed_loop import Flown
+from sims.model import BALL_RADIUS, Tool
+
+FILE = "flights.parquet"
+_FAR = 20.0  # [m], where balls wait that are not in flight
+_LONGEST = 3.0  # [s], that a returned ball is followed
+
+
+@dataclasses.dataclass(frozen=True)
+class Recording:
+    """F flights of N balls at K looks each; NumPy leaves, world frame, z up.
+
+    Times count from the first plan. NaN stands for a ball that is not in flight, a quadrotor
+    that is no longer simulated, a ball that is never met and a flight without target.
+    """
+
+    index: np.ndarray  # (F,) place in the run
+    success: np.ndarray  # (F,) bool
+    time: np.ndarray  # (F, K) [s]
+    robot_pos: np.ndarray  # (F, K, 3) [m], of the propeller plane's centre
+    robot_quat: np.ndarray  # (F, K, 4), w x y z
+    wanted: np.ndarray  # (F, K, 3) [m], where the plan that is flown has the quadrotor
+    balls: np.ndarray  # (F, K, N, 3) [m]
+    met: np.ndarray  # (F, N) [s]
+    contact: np.ndarray  # (F, N, 3) [m], of the ball's centre when it is met
+    target: np.ndarray  # (F, 3) [m]
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    @property
+    def num_balls(self) -> int:
+        """N."""
+        return self.balls.shape[2]
+
+    def num_looks(self, flight: int) -> int:
+        """How many looks of a flight show anything that moves."""
+        there = np.isfinite(self.robot_pos[flight]).all(axis=1)
+        there |= np.isfinite(self.balls[flight]).all(axis=2).any(axis=1)
+        return int(np.flatnonzero(there)[-1]) + 1
+
+    def launch(self, flight: int, ball: int = 0) -> tuple[np.ndarray, float] | None:
+        """Where a ball leaves its machine (3,) [m], and in which heading [rad]; None if never."""
+        path = self.balls[flight, :, ball]
+        path = path[np.isfinite(path).all(axis=1)]
+        if len(path) < 2:
+            return None
+        away = path[1] - path[0]
+        return path[0], float(np.arctan2(away[1], away[0]))
+
+
+class Frame(NamedTuple):
+    """Where everything is at one look."""
+
+    time: float  # [s]
+    robot_pos: np.ndarray  # (3,) [m]
+    robot_quat: np.ndarray  # (4,), w x y z
+    wanted: np.ndarray  # (3,) [m]
+    balls: np.ndarray  # (N, 3) [m], NaN for those not to be seen
+
+
+def rotation(quat_wxyz: np.ndarray) -> np.ndarray:
+    """The rotation matrix (3, 3) of a unit quaternion."""
+    w, x, y, z = quat_wxyz
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def frame(recording: Recording, tool: Tool, flight: int, look: int) -> Frame:
+    """Where everything is at a look of a flight.
+
+    The quadrotor stays where it was last simulated, and a caught ball lies in the net.
+
+    Args:
+        recording: of the run.
+        tool: that the quadrotor carries.
+        flight: row of the recording.
+        look: of the flight.
+
+    Raises:
+        ValueError: there is no such flight or look.
+    """
+    for name, value, number in (
+        ("flight", flight, len(recording)),
+        ("look", look, recording.time.shape[1]),
+    ):
+        if not 0 <= value < number:
+            raise ValueError(f"{name} must be >= 0 and < {number}, got {value}")
+    flown = np.isfinite(recording.robot_pos[flight]).all(axis=1)
+    at = min(look, int(np.flatnonzero(flown)[-1]))
+    pos, quat = recording.robot_pos[flight, at], recording.robot_quat[flight, at]
+    balls, time = recording.balls[flight, look].copy(), recording.time[flight, look]
+    if tool.kind == "net":
+        caught = time > _or_never(recording.met[flight])
+        balls[caught] = pos + (tool.height - BALL_RADIUS) * rotation(quat)[:, 2]
+    return Frame(float(time), pos, quat, recording.wanted[flight, at], balls)
+
+
+def recorded(
+    flown: Flown,
+    balls: BallState,
+    *,
+    index: np.ndarray,
+    success: np.ndarray,
+    drag: np.ndarray,
+    gravity: float,
+    begins: np.ndarray,
+    seen: float,
+    returned: BallState | None = None,
+    target: np.ndarray | None = None,
+) -> Recording:
+    """The recording of some flights: what was simulated, the balls before, and what came back.
+
+    Args:
+        flown: F flights with their record.
+        balls: leaves (F, N, 3), each when it is planned for.
+        index: (F,) places in the run.
+        success: (F,) bool.
+        drag: (F, N) K_D [1/m], the true one.
+        gravity: [m/s^2], magnitude.
+        begins: (N,) [s], when each ball is planned for.
+        seen: [s] that it has been in flight by then.
+        returned: leaves (F, 3), just after the impact with the first ball; None for catches.
+        target: (F, 3) [m], or None.
+    """
+    record: Any = flown.record
+    steps, begins = np.asarray(record.time, float), np.asarray(begins, float)
+    apart = float(np.median(np.diff(steps[0])))
+    number, looks = steps.shape
+    met = np.where(flown.contact.met, flown.contact.time, np.nan)
+    down = np.full((number, 1), np.nan)  # when the returned balls are on the ground
+    if returned is not None:
+        away = landing(returned.pos, returned.vel, drag[:, 0], np.full(number, gravity))[0]
+        down = met[:, :1] + np.minimum(np.nan_to_num(away, nan=_LONGEST), _LONGEST)[:, None]
+    before = round((seen + steps[0, 0]) / apart)
+    after = int(np.ceil((np.nanmax(np.append(down, steps[0, -1])) - steps[0, -1]) / apart - 1e-6))
+    grid = steps[0, 0] + apart * np.arange(-before, looks + after)
+    time = np.broadcast_to(grid, (number, grid.size))
+
+    def stretched(leaf: np.ndarray) -> np.ndarray:
+        """The first value before the record, and NaN after it."""
+        whole = np.full((number, grid.size, *leaf.shape[2:]), np.nan)
+        whole[:, before : before + looks], whole[:, :before] = leaf, leaf[:, :1]
+        return whole
+
+    def flight_of(ball: BallState, span: np.ndarray, drag: np.ndarray) -> np.ndarray:
+        """Places (F, K, ..., 3) of balls (F, ..., 3) after spans (F, K, ...) [s]."""
+        pos, vel = (np.asarray(leaf, float)[:, None] for leaf in (ball.pos, ball.vel))
+        return fly(pos, vel, span, drag[:, None], np.full(span.shape, gravity))[0]
+
+    qpos = np.asarray(record.physics.qpos, float)
+    paths = stretched(qpos[:, :, 7:].reshape(number, looks, -1, 3))
+    own = time[:, :, None] - begins  # (F, K, N) [s], since each ball was planned for
+    early = flight_of(balls, np.clip(own, -seen, 0.0), drag)
+    paths = np.where((own < 0.5 * apart)[..., None], early, paths)
+    gone = (own < -seen - 0.5 * apart) | (time[:, :, None] > _or_never(met)[:, None])
+    with np.errstate(invalid="ignore"):
+        paths[gone | (np.abs(paths).max(axis=3) > _FAR) | (paths[..., 2] < 0.0)] = np.nan
+    if returned is not None:
+        back = time > _or_never(met[:, :1])
+        span = np.where(back, np.clip(time, None, down) - met[:, :1], 0.0)
+        path = flight_of(returned, span, drag[:, 0])
+        paths[:, :, 0] = np.where(back[..., None], path, paths[:, :, 0])
+    contact = np.where(np.isfinite(met)[..., None], flown.contact.ball_pos, np.nan)
+    return Recording(
+        index=np.asarray(index),
+        success=np.asarray(success),
+        time=time,
+        robot_pos=stretched(qpos[:, :, :3]),
+        robot_quat=stretched(qpos[:, :, 3:7]),
+        wanted=stretched(np.asarray(record.wanted, float)),
+        balls=paths,
+        met=met,
+        contact=contact,
+        target=np.full((number, 3), np.nan) if target is None else np.asarray(target),
+    )
+
+
+def _or_never(time: np.ndarray) -> np.ndarray:
+    """Infinity in the place of NaN."""
+    return np.nan_to_num(time, nan=np.inf)
+
+
+def _leaf(name: str) -> Any:
+    return lambda batch: getattr(batch.verdict, name)
+
+
+_COLUMNS = [
+    Column(name, unit, meaning, kind, _leaf(name))
+    for name, unit, meaning, kind in [
+        ("index", "", "place in the run", pa.int64()),
+        ("success", "", "caught, or landed within 0.5 m", BOOL),
+        ("time", "s", "of each look", LIST),
+        ("robot_pos", "m", "looks x 3, flat; centre of the propeller plane", LIST),
+        ("robot_quat", "", "looks x 4, flat; attitude, w x y z", LIST),
+        ("wanted", "m", "looks x 3, flat; where the plan has the quadrotor", LIST),
+        ("balls", "m", "looks x balls x 3, flat; NaN where not in flight", LIST),
+        ("met", "s", "when each ball is met, NaN for never", LIST),
+        ("contact", "m", "balls x 3, flat; where each ball is met", LIST),
+        ("target", "m", "of a returned ball, NaN for catches", VECTOR),
+    ]
+]
+
+
+def to_rows(recording: Recording) -> pa.Table:
+    """A row a flight."""
+    batch = RefereedBatch(Cases(recording.index, None), None, None, recording)
+    return rows_of(_COLUMNS, batch, "world, z up; times from the first plan")
+
+
+def read_recording(path: Path) -> Recording:
+    """The recording in a file that was made from `to_rows`."""
+    table = pq.read_table(path)
+    columns = {
+        name: np.array(table[name].to_pylist(), None if name in ("index", "success") else float)
+        for name in table.column_names
+    }
+    number, looks = columns["time"].shape
+    for name, width in (("robot_pos", 3), ("robot_quat", 4), ("wanted", 3)):
+        columns[name] = columns[name].reshape(number, looks, width)
+    columns["balls"] = columns["balls"].reshape(number, looks, -1, 3)
+    columns["contact"] = columns["contact"].reshape(number, -1, 3)
+    return Recording(**columns)

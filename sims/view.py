@@ -1,0 +1,267 @@
+"""A browser viewer of recorded flights: play, scrub, speed, and a choice of flights.
+
+Needs the extra `view`. What is to be seen at a look says `recording.frame`; here it is only
+shown. The server plays whether or not a browser looks on.
+"""
+
+import errno
+import importlib
+import socket
+import threading
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from planner_jax.sweep.figures.style import BLUE, GREEN, GREY, INK, RED, SKY
+from planner_jax.sweep.settings import SettingError, require
+from sims.film import BALL_COLOURS, robot_lines
+from sims.model import BALL_RADIUS, World
+from sims.recording import Recording, frame
+from sims.scenery import GROUND_COLOUR, Part, court_parts, machine_parts
+from sims.vehicle import rotor_positions
+
+_RATE = 30.0  # [Hz], of playing
+_STEP = 0.01  # [s], of the slider
+_IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+def _rgb(colour: str) -> tuple[int, int, int]:
+    """Of #RRGGBB."""
+    red, green, blue = (int(colour[k : k + 2], 16) for k in (1, 3, 5))
+    return red, green, blue
+
+
+def segments(path: np.ndarray) -> np.ndarray:
+    """The pieces (S, 2, 3) of a path (M, 3) between points that are both there (not NaN)."""
+    pairs = np.stack([path[:-1], path[1:]], axis=1)
+    return pairs[np.isfinite(pairs).all(axis=(1, 2))]
+
+
+def free_address(host: str, port: int) -> str:
+    """The numeric address of a host of this machine whose port is free; 0 stands for any.
+
+    Raises:
+        SettingError: there is none; one line that begins with `host` or `port`.
+    """
+    require(0 <= port <= 65535, "port", ">= 0 and <= 65535", port)
+    own = SettingError(f"host must be an address of this machine, got {host!r}")
+    try:
+        found = sorted(socket.getaddrinfo(host, port, type=socket.SOCK_STREAM))[0]
+    except (socket.gaierror, UnicodeError):
+        raise own from None
+    with socket.socket(found[0]) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(found[4])
+        except OSError as error:
+            if error.errno == errno.EADDRNOTAVAIL:
+                raise own from None
+            raise SettingError(f"port must be free, got {port} ({error.strerror})") from None
+    return str(found[4][0])
+
+
+def _viser() -> Any:
+    """The package.
+
+    Raises:
+        SettingError: it is not installed.
+    """
+    try:
+        return importlib.import_module("viser")
+    except ModuleNotFoundError:
+        raise SettingError(
+            "the viewer needs the package viser: pip install 'planner-jax[view]'"
+        ) from None
+
+
+class Viewer:
+    """A server that shows one flight of a recording at one time.
+
+    Attributes:
+        url: of the page.
+        flight: choice of the flight; its `value` is one of the titles.
+        time: slider; its `value` [s] is the time that is shown.
+        playing: check box.
+        speed: slider; 1 is real time.
+        robot: the quadrotor's place in the scene.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        recording: Recording,
+        titles: Sequence[str],
+        host: str = "localhost",
+        port: int = 8080,
+    ):
+        """Start to serve and to show the first flight.
+
+        Args:
+            world: of the flights.
+            recording: F of them.
+            titles: F different ones.
+            host: name or address of this machine, under which the page is served.
+            port: 0 takes any that is free.
+
+        Raises:
+            SettingError: viser is missing, or the page cannot be served there.
+        """
+        viser = _viser()
+        address = free_address(host, port)
+        self.world, self.recording, self._titles = world, recording, list(titles)
+        self._server = viser.ViserServer(address, port, label="planner-jax", verbose=False)
+        bound = self._server.get_port()
+        if port and bound != port:  # someone was faster
+            self._server.stop()
+            raise SettingError(f"port must be free, got {port}")
+        self.url = f"http://{f'[{host}]' if ':' in host else host}:{bound}"
+        self._lock = threading.RLock()
+        self._drawn: list[Any] = []
+        self._scene, gui = self._server.scene, self._server.gui
+        times = recording.time[0]
+        self.flight = gui.add_dropdown("Flight", self._titles)
+        self.playing = gui.add_checkbox("Play", True)
+        first, last = round(float(times[0]), 3), round(float(times[-1]), 3)
+        self.time = gui.add_slider("Time [s]", first, last, _STEP, first)
+        self.speed = gui.add_slider("Speed", 0.1, 2.0, 0.1, 0.5)
+        self._note = gui.add_markdown("")
+        self._stand()
+        self._draw_flight()
+        self.flight.on_update(lambda _: self._draw_flight())
+        self.time.on_update(lambda _: self._show())
+
+    @property
+    def look(self) -> int:
+        """The look that is shown."""
+        times = self.recording.time[self._row]
+        nearest = int(np.argmin(np.abs(times - self.time.value)))
+        return min(nearest, self.recording.num_looks(self._row) - 1)
+
+    @property
+    def _row(self) -> int:
+        return self._titles.index(self.flight.value)
+
+    def advance(self, seconds: float) -> None:
+        """Play for a while [s] of the clock; from the start again once the end is passed."""
+        if self.playing.value:
+            later = self.time.value + seconds * self.speed.value
+            self.time.value = later if later <= self.time.max else self.time.min
+
+    def run(self) -> None:
+        """Play until Ctrl-C, then stop serving."""
+        try:
+            before = time.monotonic()
+            while True:
+                time.sleep(1.0 / _RATE)
+                now = time.monotonic()
+                self.advance(now - before)
+                before = now
+        except KeyboardInterrupt:
+            pass
+        finally:
+            self.close()
+
+    def close(self) -> None:
+        """Stop serving."""
+        self._server.stop()
+
+    def _stand(self) -> None:
+        """What is the same for all flights: ground, court, quadrotor, balls and their trails."""
+        add = self._scene
+        add.set_up_direction("+z")
+        on_court = self.world.tool.kind == "racket"
+        add.add_grid(
+            "/ground",
+            width=14.0,
+            height=10.0,
+            plane_color=_rgb(GROUND_COLOUR),
+            plane_opacity=1.0,
+            cell_thickness=0.0,
+            section_thickness=0.0 if on_court else 1.0,
+            position=(0.0, 0.0, -0.01),
+        )
+        if on_court:
+            self._add_parts("/court", court_parts())
+        self.robot = add.add_frame("/quadrotor", show_axes=False)
+        *body, rim = robot_lines(self.world, np.zeros(3), _IDENTITY)
+        self._add_line("/quadrotor/body", np.concatenate(list(map(segments, body))), BLUE, 0.012)
+        self._add_line("/quadrotor/rim", segments(rim), INK, 0.008)
+        tool, flat = self.world.tool, {"height": 0.004, "color": _rgb(SKY), "opacity": 0.5}
+        discs = [(place, 0.06) for place in rotor_positions(self.world.vehicle)]
+        for number, (place, radius) in enumerate([*discs, ((0.0, 0.0, tool.height), tool.radius)]):
+            add.add_cylinder(f"/quadrotor/disc{number}", radius, position=place, **flat)
+        nothing = np.zeros((1, 2, 3))
+        self._balls, self._trails = [], []
+        for k in range(self.recording.num_balls):
+            colour = BALL_COLOURS[k % len(BALL_COLOURS)]
+            ball = add.add_icosphere(f"/ball{k}", BALL_RADIUS, _rgb(colour))
+            self._balls.append(ball)
+            self._trails.append(self._add_line(f"/trail{k}", nothing, colour, 0.012))
+        camera = self._server.initial_camera
+        camera.position, camera.look_at = (1.5, -8.0, 3.0), (1.9, 0.0, 1.2)
+
+    def _add_line(self, name: str, pieces: np.ndarray, colour: str, thickness: float) -> Any:
+        return self._scene.add_line_segments(name, pieces, _rgb(colour), thickness=thickness)
+
+    def _add_parts(self, name: str, parts: Sequence[Part]) -> list[Any]:
+        drawn = []
+        for number, part in enumerate(parts):
+            look = {"color": _rgb(part.colour), "wxyz": part.quat_wxyz, "position": part.centre}
+            own = f"{name}/{number}"
+            if part.kind == "box":
+                drawn.append(self._scene.add_box(own, dimensions=part.size, **look))
+            else:
+                radius, height = 0.5 * part.size[0], part.size[2]
+                drawn.append(self._scene.add_cylinder(own, radius, height, **look))
+        return drawn
+
+    def _draw_flight(self) -> None:
+        """What does not move in the flight that is chosen; then its first look."""
+        with self._lock, self._server.atomic():
+            recording, row = self.recording, self._row
+            for part in self._drawn:
+                part.remove()
+            launch = recording.launch(row)
+            drawn = self._add_parts("/machine", machine_parts(*launch) if launch else [])
+            paths = [
+                ("/flown", recording.robot_pos[row], BLUE, 0.012),
+                ("/plan", recording.wanted[row], INK, 0.006),
+            ]
+            paths += [
+                (f"/path{k}", recording.balls[row, :, k], GREY, 0.004)
+                for k in range(recording.num_balls)
+            ]
+            for name, path, colour, thickness in paths:
+                drawn.append(self._add_line(name, segments(path), colour, thickness))
+            points = [("/contact", place, RED) for place in recording.contact[row]]
+            points.append(("/target", recording.target[row], GREEN))
+            for number, (name, place, colour) in enumerate(points):
+                if np.isfinite(place).all():
+                    name, radius = f"{name}{number}", 1.5 * BALL_RADIUS
+                    dot = self._scene.add_icosphere(name, radius, _rgb(colour), position=place)
+                    drawn.append(dot)
+            self._drawn = drawn
+            met = [f"{at:.2f} s" for at in recording.met[row] if np.isfinite(at)]
+            word = "Caught" if self.world.tool.kind == "net" else "Hit"
+            self._note.content = f"{word} at {', '.join(met)}." if met else "No ball was met."
+            self.time.value = self.time.min
+            last = recording.num_looks(row) - 1
+            self.time.max = round(float(recording.time[row, last]), 3)
+            self._show()
+
+    def _show(self) -> None:
+        """The moving parts at the time of the slider."""
+        with self._lock, self._server.atomic():
+            row, look = self._row, self.look
+            now = frame(self.recording, self.world.tool, row, look)
+            self.robot.position, self.robot.wxyz = now.robot_pos, now.robot_quat
+            for k, (ball, trail) in enumerate(zip(self._balls, self._trails, strict=True)):
+                ball.visible = bool(np.isfinite(now.balls[k]).all())
+                if ball.visible:
+                    ball.position = now.balls[k]
+                behind = segments(self.recording.balls[row, : look + 1, k])
+                trail.visible = len(behind) > 0
+                if trail.visible:
+                    trail.points = behind.astype(np.float32)

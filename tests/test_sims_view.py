@@ -1,0 +1,247 @@
+"""Recordings of flights, and the viewer that plays them."""
+
+import dataclasses
+import importlib.util
+import socket
+import sys
+import time
+import urllib.request
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from planner_jax.ball.flight import BallState
+from planner_jax.cli import main
+from planner_jax.sweep.run_folder import RunFolder
+from planner_jax.sweep.settings import SettingError
+from sims import view
+from sims.closed_loop import Flown, Record
+from sims.model import BALL_RADIUS, NET, RACKET, Physics, World
+from sims.recording import FILE, Recording, frame, read_recording, recorded, to_rows
+from sims.run import FlySettings
+from sims.scoring import no_contact
+from sims.view import Viewer, free_address, segments
+from tests.recordings import recording
+
+GRAVITY = 9.81
+needs_viser = pytest.mark.skipif(
+    importlib.util.find_spec("viser") is None,
+    reason="viser is not installed; it comes with the extra view",
+)
+
+
+def drag_free(pos, vel, times):
+    """Places (K, 3) of a ball without drag."""
+    return pos + np.outer(times, vel) - np.outer(0.5 * GRAVITY * times**2, [0.0, 0.0, 1.0])
+
+
+def flight_with_return():
+    """A quadrotor at rest for 0.5 s, and a ball that is met after 0.2 s and goes straight up."""
+    times = 0.01 * np.arange(1, 51)
+    pos, vel = np.array([2.0, 0.0, 2.0]), np.array([-3.0, 0.0, 4.0])
+    balls = drag_free(pos, vel, times)
+    qpos = np.concatenate([np.tile([0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0], (50, 1)), balls], axis=1)
+    still = np.zeros((1, 50, 9)), np.zeros((1, 50, 4))
+    record = Record(times[None], Physics(qpos[None], *still), qpos[None, :, :3], None, None)
+    contact = no_contact(1)
+    contact = contact.replace(
+        met=np.array([[True]]),
+        time=np.array([[0.2]]),
+        ball_pos=drag_free(pos, vel, np.array([0.2]))[None],
+    )
+    back = BallState(contact.ball_pos[:, 0], np.array([[0.0, 0.0, 5.0]]))
+    flown = Flown(contact, None, np.zeros(1), np.zeros((1, 2)), record)
+    launched = BallState(pos[None, None], vel[None, None])
+    return flown, launched, back
+
+
+def kept(flown, balls, begins, **more):
+    """The recording of one flight without drag."""
+    return recorded(
+        flown,
+        balls,
+        index=np.array([0]),
+        success=np.array([True]),
+        drag=np.zeros((1, len(begins))),
+        gravity=GRAVITY,
+        begins=np.array(begins),
+        seen=0.3,
+        **more,
+    )
+
+
+def test_a_recording_holds_the_ball_from_the_machine_to_the_ground():
+    flown, launched, back = flight_with_return()
+    whole = kept(flown, launched, [0.0], returned=back, target=np.zeros((1, 3)))
+    path, times = whole.balls[0, :, 0], whole.time[0]
+    np.testing.assert_allclose(times[0], -0.3, atol=1e-9)
+    before = times < 0.205
+    expected = drag_free(launched.pos[0, 0], launched.vel[0, 0], times[before])
+    np.testing.assert_allclose(path[before], expected, atol=1e-6)
+    place, heading = whole.launch(0)
+    np.testing.assert_allclose(place, expected[0], atol=1e-6)
+    assert abs(abs(heading) - np.pi) < 1e-6  # along -x
+    down = 0.2 + (5.0 + np.sqrt(25.0 + 2.0 * GRAVITY * back.pos[0, 2])) / GRAVITY
+    assert down <= times[-1] < down + 0.02
+    np.testing.assert_allclose(path[-1], [*back.pos[0, :2], 0.0], atol=1e-4)
+    assert np.isfinite(path).all()
+    assert np.isnan(whole.robot_pos[0, times > 0.505]).all()  # it was simulated no further
+    assert whole.num_looks(0) == len(times)
+
+
+def test_a_second_ball_is_there_from_its_own_launch():
+    flown, launched, _ = flight_with_return()
+    physics, begin = flown.record.physics, 0.4
+    waiting = np.full((1, 50, 3), 100.0)
+    flown = dataclasses.replace(
+        flown,
+        contact=no_contact(2).replace(
+            met=np.zeros((1, 2), bool), time=np.zeros((1, 2)), ball_pos=np.zeros((1, 2, 3))
+        ),
+        record=flown.record.replace(
+            physics=physics.replace(qpos=np.concatenate([physics.qpos, waiting], axis=2))
+        ),
+    )
+    balls = jax.tree.map(lambda leaf: np.repeat(leaf, 2, axis=1), launched)
+    whole = kept(flown, balls, [0.0, begin])
+    times, second = whole.time[0], whole.balls[0, :, 1]
+    assert np.isnan(second[times < begin - 0.305]).all()
+    early = (times > begin - 0.305) & (times < begin + 0.005)
+    expected = drag_free(launched.pos[0, 0], launched.vel[0, 0], times[early] - begin)
+    np.testing.assert_allclose(second[early], expected, atol=1e-6)
+    assert np.isnan(second[times > begin + 0.005]).all()  # it is far away in this record
+    assert np.isnan(whole.met).all() and np.isnan(whole.contact).all()
+    assert whole.num_looks(0) == len(times) == 81
+
+
+def test_a_recording_is_read_as_it_was_written(tmp_path):
+    written = recording()
+    pq.write_table(to_rows(written), tmp_path / FILE)
+    read = read_recording(tmp_path / FILE)
+    for field in dataclasses.fields(written):
+        before, after = getattr(written, field.name), getattr(read, field.name)
+        assert before.shape == after.shape
+        np.testing.assert_allclose(after, before, atol=1e-6)
+
+
+def test_a_frame_shows_where_everything_is_at_a_look():
+    now = frame(recording(), NET, 0, 2)
+    assert now.time == 0.02
+    np.testing.assert_allclose(now.robot_pos, [0.0, 0.0, 1.02])
+    np.testing.assert_allclose(now.wanted, [0.01, 0.01, 1.03])
+    np.testing.assert_allclose(now.balls, [[0.3, 0.0, 1.98]])
+
+
+def test_after_its_end_a_flight_stands_still_and_a_caught_ball_lies_in_the_net():
+    last = frame(recording(), NET, 0, 5)
+    np.testing.assert_allclose(last.robot_pos, [0.0, 0.0, 1.04])
+    inside = [[0.0, 0.0, 1.04 + NET.height - BALL_RADIUS]]
+    np.testing.assert_allclose(last.balls, inside)
+    assert np.isnan(frame(recording(), RACKET, 0, 5).balls).all()  # a racket holds none
+
+
+@pytest.mark.parametrize(
+    ("flight", "look", "message"),
+    [
+        (1, 0, "flight must be >= 0 and < 1, got 1"),
+        (0, 6, "look must be >= 0 and < 6, got 6"),
+        (0, -1, "look must be >= 0 and < 6, got -1"),
+    ],
+)
+def test_a_frame_that_is_not_there_is_refused(flight, look, message):
+    with pytest.raises(ValueError) as error:
+        frame(recording(), NET, flight, look)
+    assert str(error.value) == message
+
+
+def test_a_path_is_drawn_between_points_that_are_there():
+    path = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [np.nan] * 3, [3.0, 0.0, 0.0]])
+    np.testing.assert_allclose(segments(path), [[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]])
+
+
+def test_what_cannot_be_served_is_said_in_one_line():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(SettingError, match=f"^port must be free, got {port}"):
+            free_address("localhost", port)
+    with pytest.raises(SettingError, match="^port must be >= 0 and <= 65535, got 70000$"):
+        free_address("localhost", 70000)
+    for host in ("192.0.2.1", "no such host"):
+        with pytest.raises(SettingError, match="^host must be an address of this machine, got '"):
+            free_address(host, 0)
+
+
+@pytest.fixture
+def run_folder(tmp_path):
+    """A folder like that of a run of flights."""
+    folder = RunFolder(tmp_path / "run")
+    settings = dataclasses.asdict(FlySettings("catch"))
+    folder.create({"kind": "fly catch", "state": "complete", "parameters": settings})
+    folder.write_rows(folder.path / FILE, to_rows(recording()))
+    return folder
+
+
+def said(capsys, *arguments):
+    """What the command says when it refuses something."""
+    assert main(["view", *map(str, arguments)]) == 2
+    return capsys.readouterr().err.removeprefix("planner-jax: error: ")
+
+
+def test_a_folder_without_flights_is_refused_in_one_line(run_folder, tmp_path, capsys):
+    assert said(capsys, tmp_path / "no").startswith("RUN must be the folder of a run, with its m")
+    manifest = run_folder.read_manifest()
+    run_folder.write_manifest({**manifest, "kind": "sweep hit"})
+    assert said(capsys, run_folder.path) == "RUN must be a run of flights, got a sweep hit\n"
+    run_folder.write_manifest({**manifest, "state": "running"})
+    assert said(capsys, run_folder.path).startswith("RUN must be finished, with its flights.parq")
+    run_folder.write_manifest(manifest)
+    (run_folder.path / FILE).write_bytes(b"half of it")
+    assert said(capsys, run_folder.path).startswith("RUN must have a whole flights.parquet: ")
+
+
+def test_a_missing_viser_is_named_with_its_remedy(run_folder, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    expected = "the viewer needs the package viser: pip install 'planner-jax[view]'\n"
+    assert said(capsys, run_folder.path) == expected
+
+
+@needs_viser
+def test_a_flight_is_served_scrubbed_and_played():
+    two = jax.tree.map(lambda leaf: np.repeat(leaf, 2, axis=0), vars(recording()))
+    two["time"] = two["time"].astype(np.float32)
+    viewer = Viewer(World(NET), Recording(**two), ["one", "two"], port=0)
+    try:
+        with urllib.request.urlopen(viewer.url, timeout=10) as page:
+            assert page.status == 200 and b"<html" in page.read()
+        viewer.time.value = 0.02
+        assert viewer.look == 2
+        np.testing.assert_allclose(viewer.robot.position, [0.0, 0.0, 1.02])
+        viewer.flight.value = "two"
+        assert viewer.look == 0
+        viewer.speed.value = 1.0
+        viewer.advance(0.03)
+        assert viewer.look == 3
+        viewer.playing.value = False
+        viewer.advance(0.01)
+        assert viewer.look == 3
+        viewer.playing.value = True
+        viewer.advance(0.03)
+        assert viewer.look == 0  # again from the start
+    finally:
+        viewer.close()
+
+
+@needs_viser
+def test_the_command_plays_until_ctrl_c(run_folder, capsys, monkeypatch):
+    naps = iter([None, None])
+
+    def sleep(_):
+        if next(naps, "done") == "done":
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(view, "time", SimpleNamespace(sleep=sleep, monotonic=time.monotonic))
+    assert main(["view", str(run_folder.path), "--port", "0"]) == 0
+    assert "Playing 1 flights at http://localhost:" in capsys.readouterr().out
