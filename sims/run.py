@@ -14,7 +14,17 @@ import numpy as np
 import pyarrow as pa
 
 from planner_jax.optimise.status import Status
-from planner_jax.sweep.columns import BOOL, COUNT, LIST, NUMBER, TEXT, VECTOR, Column, rows_of
+from planner_jax.sweep.columns import (
+    BOOL,
+    COUNT,
+    LIST,
+    NUMBER,
+    TEXT,
+    VECTOR,
+    Column,
+    list_of,
+    rows_of,
+)
 from planner_jax.sweep.columns import RefereedBatch as FlownBatch
 from planner_jax.sweep.environment import environment, require_backend
 from planner_jax.sweep.run_folder import RunFolder
@@ -148,7 +158,7 @@ _COMMON = [
 ]
 _OWN: Mapping[str, Sequence[Column]] = {
     "catch": [
-        Column("caught", "", "each ball", pa.list_(BOOL), lambda b: b.verdict.caught),
+        Column("caught", "", "each ball", list_of(BOOL), lambda b: b.verdict.caught),
     ],
     "hit": [
         Column("met", "", "by the racket", BOOL, lambda b: b.verdict.flown.contact.met[:, 0]),

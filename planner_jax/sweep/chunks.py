@@ -2,11 +2,13 @@
 
 import dataclasses
 import sys
+from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 from tqdm import tqdm
 
 from planner_jax.sweep.columns import RefereedBatch, rows_of
@@ -16,6 +18,7 @@ from planner_jax.sweep.summary import percent
 from planner_jax.sweep.task import SweepTask
 from planner_jax.sweep.timing import CompileClock, Stopwatch
 
+_UNDER_WAY = 2  # chunks that are judged or written while the next is planned
 _MEASURED = {
     "compile_seconds": "JAX tracing, lowering, compiling or reading its cache, while chunks were "
     "made; overlapping spans counted once",
@@ -25,7 +28,7 @@ _MEASURED = {
     "batch, the first chunk planned again",
     "referee_seconds": "judging, while the next chunk is planned",
     "wall_seconds": "all chunks of all sessions with drawing, checking and writing; without "
-    "imports, merging and report",
+    "imports and report",
 }
 
 
@@ -39,39 +42,71 @@ class SweepRun:
     folder: RunFolder
 
 
-def plan_chunks(run: SweepRun, *, progress: bool) -> None:
-    """Plan, referee and write every chunk that has no part yet.
+def plan_chunks(run: SweepRun, *, progress: bool) -> dict[str, Any]:
+    """Plan, referee and write every chunk that has no part yet, and join all to `plans.parquet`.
 
     Args:
         run: the sweep.
         progress: show a bar on the standard error stream.
+
+    Returns:
+        Entries for the manifest: `summary`, `times`, and `example`, a case worth a figure.
     """
     source, folder = run.source, run.folder
     records = (folder.part_record(chunk) for chunk in range(source.num_chunks))
     done, successes = _progress(record for record in records if record)
-    watch = Stopwatch()
     if progress:
         print(f"Writing {folder.path}; the first chunk compiles.", file=sys.stderr)
     look: dict[str, Any] = {"unit": " plans", "desc": source.settings.planner}
-    missing = [k for k in range(source.num_chunks) if not folder.part_record(k)]
+    tally = run.task.tally(source.settings)
     with tqdm(total=source.num, initial=done, disable=not progress, **look) as bar:
-        for record in _in_pipeline(run, missing, watch):
+        for rows, record in _in_pipeline(run):
+            tally.add(rows)
+            if record is None:  # there already
+                continue
             done, successes = done + record["num"], successes + record["successes"]
             bar.set_postfix_str(f"success {percent(successes, done)} %", refresh=False)
             bar.update(record["num"])
+    times = _times(run)
+    summary = tally.summary()
+    summary["plans_per_second_warm"] = round(times["warm_plans"] / times["warm_seconds"], 1)
+    summary["compile_seconds"] = times["compile_seconds"]
+    return {"summary": summary, "times": times, "example": tally.example}
 
 
-def _in_pipeline(run: SweepRun, chunks: list[int], watch: Stopwatch) -> Iterator[dict[str, Any]]:
-    """The record of every chunk, one being judged and written while the next is planned."""
-    with ThreadPoolExecutor(1) as behind:
-        judged: Future | None = None
-        for chunk in chunks:
-            planned = _plan_chunk(run, chunk)
-            if judged is not None:
-                yield judged.result()
-            judged = behind.submit(_judge_chunk, run, chunk, planned, watch)
-        if judged is not None:
-            yield judged.result()
+def _in_pipeline(run: SweepRun) -> Iterator[tuple[pa.Table, dict[str, Any] | None]]:
+    """Rows of every chunk in order, and the record of those that had no part.
+
+    While one chunk is planned, the one before is judged, and the one before that is written.
+    """
+    folder, watch = run.folder, Stopwatch()
+    pending: deque[Future] = deque()
+    with (
+        folder.joining_parts() as join,
+        ThreadPoolExecutor(1) as judge,
+        ThreadPoolExecutor(1) as writer,
+        ThreadPoolExecutor(1) as joiner,
+    ):
+
+        def write(judged: Future) -> tuple[pa.Table, dict[str, Any] | None]:
+            chunk, rows, record = judged.result()
+            joined = joiner.submit(join, rows)
+            if record is not None:
+                folder.write_part(chunk, rows, record)
+            joined.result()
+            return rows, record
+
+        for chunk in range(run.source.num_chunks):
+            if folder.part_record(chunk):
+                judged = judge.submit(lambda k=chunk: (k, folder.read_part(k), None))
+            else:
+                planned = _plan_chunk(run, chunk)
+                judged = judge.submit(_judge_chunk, run, chunk, planned, watch)
+            pending.append(writer.submit(write, judged))
+            if len(pending) > _UNDER_WAY:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
 
 
 def _progress(records: Iterable[dict[str, Any]]) -> tuple[int, int]:
@@ -107,8 +142,10 @@ def _plan_chunk(run: SweepRun, chunk: int) -> _Planned:
     return _Planned(cases, scenarios, plans, record)
 
 
-def _judge_chunk(run: SweepRun, chunk: int, planned: _Planned, watch: Stopwatch) -> dict[str, Any]:
-    """Judge and write one chunk; its record, with the seconds since the one before."""
+def _judge_chunk(
+    run: SweepRun, chunk: int, planned: _Planned, watch: Stopwatch
+) -> tuple[int, pa.Table, dict[str, Any]]:
+    """The chunk, its rows and its record, with the seconds since the one before."""
     own = Stopwatch()
     verdict = run.task.judge(planned.scenarios, planned.plans, run.source.settings)
     record = {
@@ -118,8 +155,7 @@ def _judge_chunk(run: SweepRun, chunk: int, planned: _Planned, watch: Stopwatch)
         "wall_seconds": watch.lap(),
     }
     batch = RefereedBatch(planned.cases, planned.scenarios, planned.plans, verdict)
-    run.folder.write_part(chunk, rows_of(run.task.columns, batch, run.task.frame), record)
-    return record
+    return chunk, rows_of(run.task.columns, batch, run.task.frame), record
 
 
 def _timed_plan(run: SweepRun, scenarios: Any) -> tuple[Any, float, bool]:
@@ -128,24 +164,6 @@ def _timed_plan(run: SweepRun, scenarios: Any) -> tuple[Any, float, bool]:
     with CompileClock() as clock:
         planned = run.task.plan(run.planner, scenarios, run.source.settings)
     return planned, watch.lap(), not clock.compiled
-
-
-def merge_chunks(run: SweepRun) -> dict[str, Any]:
-    """Join the parts to `plans.parquet`.
-
-    Args:
-        run: the sweep, every chunk of it planned.
-
-    Returns:
-        Entries for the manifest: `summary`, `times`, and `example`, a case worth a figure.
-    """
-    times = _times(run)
-    tally = run.task.tally(run.source.settings)
-    run.folder.merge_parts(run.source.num_chunks, tally.add)
-    summary = tally.summary()
-    summary["plans_per_second_warm"] = round(times["warm_plans"] / times["warm_seconds"], 1)
-    summary["compile_seconds"] = times["compile_seconds"]
-    return {"summary": summary, "times": times, "example": tally.example}
 
 
 def _times(run: SweepRun) -> dict[str, Any]:

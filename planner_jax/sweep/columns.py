@@ -32,7 +32,14 @@ class Column(NamedTuple):
 
 
 BOOL, TEXT, COUNT, NUMBER = pa.bool_(), pa.string(), pa.int32(), pa.float32()
-VECTOR, LIST = pa.list_(pa.float32(), 3), pa.list_(pa.float32())
+
+
+def list_of(kind: pa.DataType, length: int = -1) -> pa.DataType:
+    """The type of a list column, under the name that Parquet gives its entries back."""
+    return pa.list_(pa.field("element", kind), length)
+
+
+VECTOR, LIST = list_of(pa.float32(), 3), list_of(pa.float32())
 
 INDEX = Column("index", "", "place in the whole", pa.int64(), lambda b: b.cases.index)
 START = Column(

@@ -7,7 +7,7 @@ import sys
 from typing import Any
 
 from planner_jax.sweep.baselines import plan_baselines
-from planner_jax.sweep.chunks import SweepRun, merge_chunks, plan_chunks
+from planner_jax.sweep.chunks import SweepRun, plan_chunks
 from planner_jax.sweep.environment import environment, require_backend
 from planner_jax.sweep.report import write_report
 from planner_jax.sweep.run_folder import RunFolder
@@ -105,14 +105,13 @@ def _finish(run: SweepRun, progress: bool) -> dict[str, Any]:
 
 
 def _plan(run: SweepRun, progress: bool) -> None:
-    """All chunks, merged and counted in the manifest."""
+    """All chunks, joined and counted in the manifest."""
     try:
-        plan_chunks(run, progress=progress)
+        found = plan_chunks(run, progress=progress)
     except SettingError:
         # A case that was drawn late breaks a rule, so that this run can never be finished.
         run.folder.discard()
         raise
-    found = merge_chunks(run)
     run.folder.write_manifest({**run.folder.read_manifest(), **found})
 
 

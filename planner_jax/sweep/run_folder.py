@@ -4,11 +4,11 @@ Everything appears whole: files are written beside their place and renamed into 
 run which was killed at any moment can be resumed.
 """
 
+import contextlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -120,27 +120,34 @@ class RunFolder:
             return None
         return json.loads(metadata[_PART_RECORD])
 
-    def merge_parts(self, num_parts: int, visit: Callable[[pa.Table], None]) -> None:
-        """Join the parts to `plans.parquet`, a row group each, two in memory at a time.
+    def read_part(self, number: int) -> pa.Table:
+        """The rows of a part that is there."""
+        rows = pq.read_table(self._part(number))
+        return rows.replace_schema_metadata(_without_record(rows.schema.metadata))
 
-        Args:
-            num_parts: how many there are.
-            visit: called with the rows of every part in turn.
+    @contextlib.contextmanager
+    def joining_parts(self) -> Iterator[Callable[[pa.Table], None]]:
+        """A function that adds the rows of a part, a row group, to `plans.parquet`.
+
+        The file is there once the block has ended well, and the parts are then needed no more.
         """
-        schema = pq.read_schema(self._part(0))
-        schema = schema.with_metadata(_without_record(schema.metadata))
-        with _replacing(self.plans) as scratch, ThreadPoolExecutor(1) as ahead:
-            following = ahead.submit(pq.read_table, self._part(0))
-            with pq.ParquetWriter(scratch, schema, **_encoding(schema)) as writer:
-                for number in range(num_parts):
-                    rows = following.result().replace_schema_metadata(schema.metadata)
-                    if number + 1 < num_parts:
-                        following = ahead.submit(pq.read_table, self._part(number + 1))
-                    visit(rows)
-                    writer.write_table(rows, row_group_size=max(rows.num_rows, 1))
+        writer: pq.ParquetWriter | None = None
+
+        def join(rows: pa.Table) -> None:
+            nonlocal writer
+            if writer is None:
+                writer = pq.ParquetWriter(scratch, rows.schema, **_encoding(rows.schema))
+            writer.write_table(rows, row_group_size=max(rows.num_rows, 1))
+
+        with _replacing(self.plans) as scratch:
+            try:
+                yield join
+            finally:
+                if writer is not None:
+                    writer.close()
 
     def remove_parts(self) -> None:
-        """Drop what `merge_parts` has joined."""
+        """Drop what `joining_parts` has joined."""
         shutil.rmtree(self._parts, ignore_errors=True)
 
     def write_rows(self, path: Path, rows: pa.Table) -> None:

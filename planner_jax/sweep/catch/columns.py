@@ -22,10 +22,11 @@ from planner_jax.sweep.columns import (
     Column,
     RefereedBatch,
     leaves_of,
+    list_of,
 )
 from planner_jax.task.catch.decide import optimal_time_ratio
 
-_WHICH, _FLAGS = pa.list_(pa.int32()), pa.list_(pa.bool_())
+_WHICH, _FLAGS = list_of(pa.int32()), list_of(pa.bool_())
 
 
 def _of_targets(*names: str) -> Any:

@@ -17,11 +17,12 @@ from planner_jax.sweep.columns import (
     VECTOR,
     Column,
     leaves_of,
+    list_of,
 )
 from planner_jax.task.hit import court
 from planner_jax.task.hit.serves import Serves
 
-_POINT = pa.list_(pa.float64(), 3)
+_POINT = list_of(pa.float64(), 3)
 
 _CASE = [
     INDEX,
