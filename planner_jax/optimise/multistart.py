@@ -18,6 +18,8 @@ from planner_jax.optimise.status import Status
 
 # Plans are refereed to 1e-3 of a limit; half of that is left for peaks between samples.
 FEASIBILITY_TOLERANCE = 5e-4
+# So few iterations are counted, so that a GPU need not tell the host whether to go on.
+_COUNTED = 16
 
 
 @struct.dataclass
@@ -68,11 +70,13 @@ def minimise_lanes(
         # The largest part, which a lane at rest does not look at any more.
         return dataclasses.replace(kept, memory=after.memory, grad=after.grad)
 
-    state = lax.while_loop(
-        lambda s: jnp.any(_unfinished(s, config)),
-        lambda s: step(s, contexts),
-        over_lanes(lambda start: lbfgs.init(start, config))(starts),
-    )
+    state = over_lanes(lambda start: lbfgs.init(start, config))(starts)
+    if config.max_steps <= _COUNTED:
+        state = lax.fori_loop(0, config.max_steps, lambda _, s: step(s, contexts), state)
+    else:
+        state = lax.while_loop(
+            lambda s: jnp.any(_unfinished(s, config)), lambda s: step(s, contexts), state
+        )
     return _optimum_of(state, config)
 
 

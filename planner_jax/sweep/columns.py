@@ -156,8 +156,11 @@ def _leaf(tree: Any, path: str) -> Any:
     return tree
 
 
+_STATUS_NAMES = np.array([Status(code).name for code in range(len(Status))])
+
+
 def _status(status: Any) -> np.ndarray:
-    return np.array([Status(code).name for code in np.asarray(status)])
+    return _STATUS_NAMES[np.asarray(status)]
 
 
 def _sentences(verdict: Any) -> np.ndarray:

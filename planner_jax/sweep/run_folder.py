@@ -18,6 +18,7 @@ import pyarrow.parquet as pq
 from planner_jax.sweep.settings import SettingError
 
 _PART_RECORD = b"part"
+_ROW_GROUP = 2048  # rows, some 3 MB: little has to be read for one of them
 _MANIFEST_KEYS = {"kind", "state", "parameters"}
 
 
@@ -127,7 +128,7 @@ class RunFolder:
 
     @contextlib.contextmanager
     def joining_parts(self) -> Iterator[Callable[[pa.Table], None]]:
-        """A function that adds the rows of a part, a row group, to `plans.parquet`.
+        """A function that adds the rows of a part to `plans.parquet`.
 
         The file is there once the block has ended well, and the parts are then needed no more.
         """
@@ -137,7 +138,7 @@ class RunFolder:
             nonlocal writer
             if writer is None:
                 writer = pq.ParquetWriter(scratch, rows.schema, **_encoding(rows.schema))
-            writer.write_table(rows, row_group_size=max(rows.num_rows, 1))
+            writer.write_table(rows, row_group_size=_ROW_GROUP)
 
         with _replacing(self.plans) as scratch:
             try:
@@ -153,7 +154,7 @@ class RunFolder:
     def write_rows(self, path: Path, rows: pa.Table) -> None:
         """Write a Parquet file whole."""
         with _replacing(path) as scratch:
-            pq.write_table(rows, scratch, **_encoding(rows.schema))
+            pq.write_table(rows, scratch, row_group_size=_ROW_GROUP, **_encoding(rows.schema))
 
     def _part(self, number: int) -> Path:
         return self._parts / f"part-{number:06d}.parquet"
@@ -177,9 +178,16 @@ class _replacing:
 
 
 def _encoding(schema: pa.Schema) -> dict[str, Any]:
-    """Numbers hardly repeat: only text is worth a dictionary, and little is worth squeezing."""
+    """Numbers hardly repeat: only text is worth a dictionary, and lists are not worth squeezing."""
     text = [field.name for field in schema if pa.types.is_string(field.type)]
-    return {"compression": "snappy", "use_dictionary": text}
+    lists = {field.name for field in schema if pa.types.is_list(field.type)}
+    others = [field.name for field in schema if field.name not in lists]
+    return {
+        # Columns of lists have longer names in the file; what is not named is not squeezed.
+        "compression": dict.fromkeys(others, "snappy"),
+        "use_dictionary": text,
+        "write_statistics": others,
+    }
 
 
 def _without_record(metadata: dict[bytes, bytes]) -> dict[bytes, bytes]:

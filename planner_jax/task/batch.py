@@ -20,7 +20,8 @@ from planner_jax.optimise.multistart import solve_batch
 from planner_jax.optimise.problem import Planner, Round
 from planner_jax.optimise.status import is_solved, is_unsolved
 
-BUCKETS = (16, 64, 256, 1024, 4096, 16384, 32768, 65536)  # lanes of a device in one call
+# Lanes of a device in one call. Few, because every one is a program of its own to compile.
+BUCKETS = (16, 128, 1024, 8192, 65536)
 _CPU_CHUNK, _GPU_CHUNK = 256, 65536  # what fits the cache of a core, and what fills a GPU
 _LANES = PartitionSpec("lanes")
 
@@ -42,25 +43,68 @@ def plan_batch(
     """
     mesh = Mesh(np.array(jax.local_devices() if devices is None else devices), ("lanes",))
     resident = all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(scenarios))
-    if not resident:
-        scenarios = jax.tree.map(np.asarray, scenarios)
-    lanes = np.arange(jax.tree.leaves(scenarios)[0].shape[0])
+    return (_plan_resident if resident else _plan_from_host)(planner, scenarios, chunk, mesh)
+
+
+def _plan_from_host(planner: Planner, scenarios: Any, chunk: int | None, mesh: Mesh) -> Any:
+    """The plans of scenarios in NumPy arrays."""
+    scenarios = jax.tree.map(np.asarray, scenarios)
+    lanes = np.arange(_length(scenarios))
     plans: Any = None
     for attempt in planner.rounds:
-        size = mesh.size * (chunk or _default_chunk(attempt, mesh))
-        parts = [lanes[i : i + size] for i in range(0, lanes.size, size)]
-        calls = [_padded(part, size, mesh.size) for part in parts]
-        found = _solved(planner, attempt, scenarios, calls, mesh)
+        calls = _calls(lanes, chunk or _default_chunk(attempt, mesh), mesh)
+        found = _solved_from_host(planner, attempt, scenarios, [call for call, _ in calls], mesh)
         if plans is None:
-            plans = _joined(found, parts, resident)
+            trimmed = [
+                jax.tree.map(lambda leaf, n=num: np.asarray(leaf)[:n], part)
+                for part, (_, num) in zip(found, calls, strict=True)
+            ]
+            plans = jax.tree.map(lambda *leaves: np.concatenate(leaves), *trimmed)
         else:
-            merge = _merged_on_device if resident else _merged_on_host
-            for part, call, later in zip(parts, calls, found, strict=True):
-                plans = merge(plans, later, call if resident else part)
-        lanes = np.flatnonzero(is_unsolved(np.asarray(plans.status)))
+            for (call, num), later in zip(calls, found, strict=True):
+                plans = _merged_on_host(plans, later, call[:num])
+        lanes = np.flatnonzero(is_unsolved(plans.status))
         if lanes.size == 0:
             break
     return plans
+
+
+def _plan_resident(planner: Planner, scenarios: Any, chunk: int | None, mesh: Mesh) -> Any:
+    """The plans of scenarios in jax arrays; only statuses come to the host.
+
+    Every device begins with its own share, without asking the others for a lane.
+    """
+    num = _length(scenarios)
+    if num % mesh.size:  # the last lanes of the last device are the first lane again
+        lanes = np.arange(-(-num // mesh.size) * mesh.size)
+        scenarios = _taken(scenarios, np.where(lanes < num, lanes, 0))
+    scenarios = _placed(scenarios, mesh)
+    first, *others = planner.rounds
+    plans = _first_plans(planner, first, scenarios, chunk or _default_chunk(first, mesh), mesh)
+    for attempt in others:
+        lanes = np.flatnonzero(is_unsolved(np.asarray(plans.status)))
+        if lanes.size == 0:
+            break
+        for call, _ in _calls(lanes, chunk or _default_chunk(attempt, mesh), mesh):
+            later = _solve(planner, attempt, mesh, _placed(_taken(scenarios, call), mesh))
+            plans = _merged_on_device(plans, later, call)
+    return plans if num % mesh.size == 0 else jax.tree.map(lambda leaf: leaf[:num], plans)
+
+
+def _first_plans(planner: Planner, attempt: Round, scenarios: Any, chunk: int, mesh: Mesh) -> Any:
+    """One round on all lanes of every device, chunk by chunk."""
+    share = _length(scenarios) // mesh.size
+    if share == _bucket(share, chunk):
+        return _solve(planner, attempt, mesh, scenarios)
+    found = []
+    for begin in range(0, share, chunk):
+        lanes = np.minimum(begin + np.arange(_bucket(share - begin, chunk)), share - 1)
+        found.append(_solve(planner, attempt, mesh, _taken_locally(mesh, scenarios, lanes)))
+    return _joined_locally(mesh, found, share)
+
+
+def _length(tree: Any) -> int:
+    return jax.tree.leaves(tree)[0].shape[0]
 
 
 def _default_chunk(attempt: Round, mesh: Mesh) -> int:
@@ -68,35 +112,43 @@ def _default_chunk(attempt: Round, mesh: Mesh) -> int:
     return max(128, (_CPU_CHUNK if on_cpu else _GPU_CHUNK) // attempt.starts)
 
 
-def _padded(part: np.ndarray, size: int, num_devices: int) -> np.ndarray:
-    """The lanes of one call: up to the next bucket of every device the first one again."""
-    buckets = (bucket * num_devices for bucket in BUCKETS)
-    length = next((b for b in buckets if part.size <= b <= size), size)
-    return np.concatenate([part, np.full(length - part.size, part[0])])
+def _bucket(num: int, chunk: int) -> int:
+    """Lanes of the call that takes the next of `num` lanes of a device."""
+    return next((bucket for bucket in BUCKETS if num <= bucket <= chunk), chunk)
 
 
-def _solved(
+def _calls(lanes: np.ndarray, chunk: int, mesh: Mesh) -> list[tuple[np.ndarray, int]]:
+    """The lanes of every call, filled up with its first one, and how many of them count."""
+    calls = []
+    for begin in range(0, lanes.size, chunk * mesh.size):
+        part = lanes[begin : begin + chunk * mesh.size]
+        length = _bucket(-(-part.size // mesh.size), chunk) * mesh.size
+        calls.append((np.append(part, np.full(length - part.size, part[0])), part.size))
+    return calls
+
+
+def _placed(tree: Any, mesh: Mesh) -> Any:
+    """The tree with equal shares of its lanes on every device."""
+    placed = NamedSharding(mesh, _LANES)
+    leaves = jax.tree.leaves(tree)
+    if all(leaf.sharding.is_equivalent_to(placed, leaf.ndim) for leaf in leaves):
+        return tree
+    return jax.device_put(tree, placed)
+
+
+def _solved_from_host(
     planner: Planner, attempt: Round, scenarios: Any, calls: list[np.ndarray], mesh: Mesh
 ) -> list[Any]:
     """One round on the lanes of every call; on one CPU device a thread for each core."""
-    leaf = jax.tree.leaves(scenarios)[0]
-    resident = isinstance(leaf, jax.Array)
+    one_cpu = mesh.size == 1 and mesh.devices[0].platform == "cpu"
+    threads = min(len(calls), os.cpu_count() or 1) if one_cpu else 1
     placed = NamedSharding(mesh, _LANES)
 
     def solve(lanes: np.ndarray) -> Any:
-        if not resident:
-            part = jax.tree.map(lambda leaf: leaf[lanes], scenarios)
-        elif lanes.size == leaf.shape[0] and (np.diff(lanes) == 1).all():
-            part = scenarios  # all of them, as they are
-        else:
-            part = _taken(scenarios, lanes)
-        if not resident or leaf.sharding != placed:
-            part = jax.device_put(part, placed)
+        part = jax.device_put(jax.tree.map(lambda leaf: leaf[lanes], scenarios), placed)
         found = _solve(planner, attempt, mesh, part)
         return jax.block_until_ready(found) if threads > 1 else found
 
-    one_cpu = mesh.size == 1 and mesh.devices[0].platform == "cpu"
-    threads = min(len(calls), os.cpu_count() or 1) if one_cpu else 1
     if threads == 1:  # calls return before they are done, so that the next is under way
         return [solve(lanes) for lanes in calls]
     # The first call compiles; the others then find the program in the cache.
@@ -115,22 +167,25 @@ def _solve(planner: Planner, attempt: Round, mesh: Mesh, scenarios: Any) -> Any:
 
 
 @jax.jit
-def _taken(tree: Any, lanes: jax.Array) -> Any:
+def _taken(tree: Any, lanes: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf[lanes], tree)
 
 
-def _joined(found: list[Any], parts: list[np.ndarray], resident: bool) -> Any:
-    """The plans of all calls, without those of the padding."""
+@functools.partial(jax.jit, static_argnames="mesh")
+def _taken_locally(mesh: Mesh, tree: Any, lanes: Any) -> Any:
+    """The same lanes of every device's share."""
+    specs = (_LANES, PartitionSpec())
+    return jax.shard_map(_taken, mesh=mesh, in_specs=specs, out_specs=_LANES)(tree, lanes)
 
-    def join(*leaves: Any) -> Any:
-        if resident and len(parts) == 1 and leaves[0].shape[0] == parts[0].size:
-            return leaves[0]
-        if not resident:
-            leaves = tuple(np.asarray(leaf) for leaf in leaves)
-        trimmed = [leaf[: part.size] for leaf, part in zip(leaves, parts, strict=True)]
-        return (jnp if resident else np).concatenate(trimmed)
 
-    return jax.tree.map(join, *found)
+@functools.partial(jax.jit, static_argnames=("mesh", "share"))
+def _joined_locally(mesh: Mesh, parts: list[Any], share: int) -> Any:
+    """One after another the parts of every device, which makes its share."""
+
+    def join(*parts: Any) -> Any:
+        return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:share], *parts)
+
+    return jax.shard_map(join, mesh=mesh, in_specs=_LANES, out_specs=_LANES)(*parts)
 
 
 def _better(later: Any, plans: Any) -> Any:
