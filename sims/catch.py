@@ -61,8 +61,10 @@ class CatchPilot:
 
     # Later than 0.2 s before a catch a new plan shakes more than the news of the ball is worth.
     planner: ReplanCatch = ReplanCatch(shortest=0.2)
-    # Relative, over a limit, with which a new plan is still flown, unless the old one has more.
-    excess: float = 0.1
+    # Relative, over a limit, with which a new plan is still flown, unless the old one has more:
+    # of the last catch, and of more, where the excess is mostly on the way to those that are
+    # planned from scratch later, and an old plan would miss the ball that comes first.
+    excess: tuple[float, float] = (0.1, 1.0)
 
     def times(self, plan: CatchPlan) -> Array:
         """When each ball is to be caught (N,) [s], in the balls' order."""
@@ -88,7 +90,8 @@ class CatchPilot:
         task = ReplanScenario(scenario=left, previous=plan, elapsed=outlook.elapsed)
         found = solve_round(self.planner, self.planner.rounds[0], task)
         good = outlook.present[order[0]] & (times[0] >= self.planner.shortest)
-        return found, good & (found.violation <= jnp.maximum(self.excess, plan.violation))
+        excess = jnp.where(jnp.sum(outlook.present) > 1, self.excess[1], self.excess[0])
+        return found, good & (found.violation <= jnp.maximum(excess, plan.violation))
 
 
 def tables(balls: BallState, drag: Array, horizon: Array, gravity: Array) -> PathTable:
