@@ -76,7 +76,7 @@ def closed_loop(world: World, worlds: int, seconds: float) -> None:
     scenario = scenarios(loop, flight, jnp.array([True]), jnp.asarray(cases.horizon))
     _, plan = plan_catches(ExactCatch(), jax.tree.map(np.asarray, scenario))
     begun = jax.tree.map(jnp.asarray, plan)
-    flight = with_catch(flight, begun, jnp.array([True])).replace(key=None)
+    flight = with_catch(flight, begun, jnp.ones((few, 1), bool)).replace(key=None)
     many = lambda leaf: jnp.resize(leaf, (worlds, *leaf.shape[1:]))  # noqa: E731
     keys = jax.random.split(jax.random.key(1), worlds)
     flight = dataclasses.replace(jax.tree.map(many, flight), key=keys)

@@ -1,4 +1,10 @@
-"""Catches in flight: one to three balls, thrown a service interval apart (paper 000)."""
+"""Catches in flight: one to three balls, thrown a service interval apart (paper 000).
+
+When a ball comes into sight the one before it is about to be caught, and the state in which that
+leaves the quadrotor decides whether the next catch is possible. So every plan has one more catch
+than there are balls: the next one is awaited as the shortest throw that the machine makes, which
+leaves the least time, and is planned anew once it is seen.
+"""
 
 import dataclasses
 import functools
@@ -14,12 +20,13 @@ from planner_jax.ball.flight import BallState
 from planner_jax.ball.prediction import PathTable, predict_path
 from planner_jax.optimise.multistart import solve_round
 from planner_jax.optimise.problem import Planner
+from planner_jax.optimise.status import is_unsolved
 from planner_jax.task.catch.decide import plan_catches
 from planner_jax.task.catch.exact import ExactCatch
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.task.catch.replan import ReplanCatch, ReplanScenario
 from planner_jax.task.catch.scenario import CatchScenario, catch_scenario
-from planner_jax.task.catch.suites import make_suite
+from planner_jax.task.catch.suites import earliest_throw, make_suite
 from sims.closed_loop import (
     Flight,
     Flown,
@@ -32,7 +39,7 @@ from sims.closed_loop import (
     whole,
     with_rest,
 )
-from sims.launch import flight_keys, launched, ready, require_hovering, require_world
+from sims.launch import awaited, flight_keys, launched, ready, require_hovering, require_world
 from sims.model import NET
 
 HOME = (0.0, 0.0, 1.0)  # [m], where the quadrotor hovers
@@ -43,7 +50,8 @@ _TABLE_NODES = 36
 _AIM_RADIUS = 0.05  # [m], of the net that plans are made for; the rest is left for errors
 # Least thrust [g] and greatest body rate [rad/s] of plans. A weak thrust and a fast turn leave
 # control little; the first catch stays away from them, so that the next can begin within bounds.
-_FIRST, _BEHIND = (0.5, 3.0), (0.4, 4.5)
+# Where nothing else is left, plans go as far as the shared protocol admits.
+_FIRST, _BEHIND, _WIDEST = (0.5, 3.0), (0.4, 4.5), (0.3, 5.0)
 _AFTER = 0.05  # [s] flown after the last ball has come down to where it may be caught
 
 
@@ -53,7 +61,10 @@ class CatchPilot:
 
     # Later than 0.2 s before a catch a new plan shakes more than the news of the ball is worth.
     planner: ReplanCatch = ReplanCatch(shortest=0.2)
-    excess: float = 0.1  # relative, over a limit, with which a new plan is still flown
+    # Relative, over a limit, with which a new plan is still flown, unless the old one has more:
+    # of the last catch, and of more, where the excess is mostly on the way to those that are
+    # planned from scratch later, and an old plan would miss the ball that comes first.
+    excess: tuple[float, float] = (0.1, 1.0)
 
     def times(self, plan: CatchPlan) -> Array:
         """When each ball is to be caught (N,) [s], in the balls' order."""
@@ -79,7 +90,8 @@ class CatchPilot:
         task = ReplanScenario(scenario=left, previous=plan, elapsed=outlook.elapsed)
         found = solve_round(self.planner, self.planner.rounds[0], task)
         good = outlook.present[order[0]] & (times[0] >= self.planner.shortest)
-        return found, good & (found.violation <= self.excess)
+        excess = jnp.where(jnp.sum(outlook.present) > 1, self.excess[1], self.excess[0])
+        return found, good & (found.violation <= jnp.maximum(excess, plan.violation))
 
 
 def tables(balls: BallState, drag: Array, horizon: Array, gravity: Array) -> PathTable:
@@ -153,15 +165,15 @@ class CatchFlights:
 
 @functools.partial(jax.jit, static_argnames="loop")
 def scenarios(loop: Loop, flights: Flight, new: Array, horizon: Array) -> CatchScenario:
-    """The catch of a ball that has come into sight, as it is believed.
+    """The catches of a ball that has come into sight and of the next, as they are believed.
 
-    It is to be planned from where the last catch that is planned already will have been made,
+    They are to be planned from where the last catch of a ball seen before will have been made,
     or from now where none is left; times count from then.
 
     Args:
         loop: of the flights.
         flights: leaves (B, ...).
-        new: (N,) bool, which ball it is.
+        new: (N,) bool, which balls these are.
         horizon: (B, N) [s] from now, until when each may be caught.
     """
     unknown: Any = None
@@ -180,7 +192,7 @@ def scenarios(loop: Loop, flights: Flight, new: Array, horizon: Array) -> CatchS
         if flight.plan is None:
             head = head.at[0].set(flight.physics.qpos[:3])
         else:
-            after = until_last_catch(flight)
+            after = until_last_catch(flight, new)
             path = with_rest(flight.plan.trajectory)
             head = state_at(path, flight.time - flight.began + after)
         balls = expected(loop, flight.earlier, loop.period + after)
@@ -196,23 +208,23 @@ def scenarios(loop: Loop, flights: Flight, new: Array, horizon: Array) -> CatchS
     return jax.vmap(one)(empty, flights, horizon)
 
 
-def until_last_catch(flight: Flight) -> Array:
-    """Time () [s] from now to the last catch that is planned; 0 where none is left."""
+def until_last_catch(flight: Flight, new: Array) -> Array:
+    """Time () [s] to the last catch that is planned of balls not `new` (N,); 0 if none is left."""
     planned = CatchPilot().times(flight.plan) - (flight.time - flight.began)
-    return jnp.maximum(jnp.max(jnp.where(flight.present, planned, 0.0)), 0.0)
+    return jnp.maximum(jnp.max(jnp.where(flight.present & ~new, planned, 0.0)), 0.0)
 
 
 @jax.jit
 def with_catch(flights: Flight, found: CatchPlan, new: Array) -> Flight:
-    """Flights (B, ...) with one more catch behind those that are planned already.
+    """Flights (B, ...) with new catches behind those of the balls that were seen before.
 
     Args:
         flights: as `scenarios` saw them.
         found: plans (B, ...) of its scenarios.
-        new: (N,) bool, which ball that is.
+        new: (B, N) bool, of which balls.
     """
 
-    def one(flight: Flight, found: CatchPlan) -> Flight:
+    def one(flight: Flight, found: CatchPlan, new: Array) -> Flight:
         present = flight.present | new
         alone = dataclasses.replace(flight, plan=found, began=flight.time, present=present)
         if flight.plan is None:
@@ -220,7 +232,8 @@ def with_catch(flights: Flight, found: CatchPlan, new: Array) -> Flight:
         old, number = flight.plan, new.size
         each = found.trajectory.durations.size // number
         lasts = jnp.sum(old.trajectory.durations.reshape(number, each), axis=1) > 0.0
-        segments = jnp.sum(lasts)  # of the old plan, catches that are made included
+        # Of the old plan, catches that are made included; what was awaited comes last in it.
+        segments = jnp.sum(lasts & ~new[old.order])
         place = jnp.arange(number)
         before = place < segments
 
@@ -236,7 +249,8 @@ def with_catch(flights: Flight, found: CatchPlan, new: Array) -> Flight:
         )
         end = old.times[segments - 1]
         rank = jnp.zeros_like(place).at[old.order].set(jnp.where(before, place, 2 * number))
-        order = jnp.argsort(jnp.where(new, number, rank), stable=True)
+        behind_rank = jnp.zeros_like(place).at[found.order].set(number + place)
+        order = jnp.argsort(jnp.where(new, behind_rank, rank), stable=True)
         joined = dataclasses.replace(
             found,
             trajectory=trajectory,
@@ -244,10 +258,10 @@ def with_catch(flights: Flight, found: CatchPlan, new: Array) -> Flight:
             times=behind(old.times, end + found.times),
         )
         joined = dataclasses.replace(flight, plan=joined, present=present)
-        going = until_last_catch(flight) > 0.0
+        going = until_last_catch(flight, new) > 0.0
         return jax.tree.map(lambda a, b: jnp.where(going, a, b), joined, alone)
 
-    return jax.vmap(one)(flights, found)
+    return jax.vmap(one)(flights, found, new)
 
 
 def fly_catches(
@@ -261,8 +275,9 @@ def fly_catches(
 ) -> CatchFlights:
     """Plan and fly a batch of throws.
 
-    Whenever a ball comes into sight, its catch is planned from scratch, from where the last one
-    that is planned will have been made; all that are left are then re-planned inside the loop.
+    Whenever a ball comes into sight, its catch and that of the one awaited next are planned from
+    scratch (`planned_ahead`), from where the last of those seen before will have been made; all
+    that are left are then re-planned inside the loop.
 
     Args:
         loop: world, sensing, rates and gains.
@@ -270,7 +285,7 @@ def fly_catches(
         seed: of the noise, >= 0.
         planner: of the plans from scratch, by default `ExactCatch`.
         pilot: of the plans in between.
-        plan: first plan of each flight, instead of one made here.
+        plan: first plan of each flight, of the first ball, instead of one made here.
 
     Raises:
         ValueError: a world, plan or number does not fit.
@@ -286,23 +301,29 @@ def fly_catches(
     flight = ready(loop, jnp.tile(jnp.array(HOME), (len(cases), 1)), keys)
     first: Any = plan
     records, planning = [], 0.0
+    shortest, window = earliest_throw("throws")
     for ball in range(num_balls):
         flight = launched(loop, flight, balls, drag, believed, ball=ball, seen=SEEN)
-        begins = INTERVAL * (np.arange(num_balls) - ball)  # of the balls' own times, from now
-        horizon = jnp.asarray(cases.horizon + begins, jnp.float32)
-        new = jnp.arange(num_balls) == ball
-        scenario = scenarios(loop, flight, new, horizon)
-        if plan is None or ball > 0:
-            known = jax.tree.map(np.asarray, scenario)
-            began = time.perf_counter()
-            found = plan_catches(planner, known, "greedy")[1]
-            planning += time.perf_counter() - began
-        else:
+        until = cases.horizon + INTERVAL * (np.arange(num_balls) - ball)
+        given, last = plan is not None and ball == 0, ball == num_balls - 1
+        if not last:
+            coming = jax.tree.map(jnp.asarray, shortest)
+            flight = awaited(loop, flight, coming, believed, ball=ball + 1, ahead=INTERVAL)
+            until[:, ball + 1] = INTERVAL + window
+        horizon = jnp.asarray(until, jnp.float32)
+        new = np.isin(np.arange(num_balls), [ball] if given else [ball, ball + 1])
+        scenario = scenarios(loop, flight, jnp.asarray(new), horizon)
+        if given:
             require_catch_plan(plan, scenario)
             found = plan
+        else:
+            known = jax.tree.map(np.asarray, scenario)
+            began = time.perf_counter()
+            scenario, found = planned_ahead(planner, known, ball)
+            planning += time.perf_counter() - began
         first = found if first is None else first
-        flight = with_catch(flight, jax.tree.map(jnp.asarray, found), new)
-        last = ball == num_balls - 1
+        begun = jax.tree.map(jnp.asarray, found)
+        flight = with_catch(flight, begun, jnp.asarray(scenario.present))
         flight, record = fly_leg(
             loop,
             pilot,
@@ -313,6 +334,57 @@ def fly_catches(
         )
         records.append(record)
     return CatchFlights(first, flown(flight, records), planning)
+
+
+def planned_ahead(
+    planner: Planner, known: CatchScenario, ball: int
+) -> tuple[CatchScenario, CatchPlan]:
+    """Plans from scratch of a ball's catch and, where that is possible too, of the next one's.
+
+    Where no plan of both is found the ball is planned for alone, and where that fails as well,
+    within the widest limits. If nothing is solved, the plan that breaks its limits least is left.
+
+    Args:
+        planner: of catches.
+        known: of both balls, or of the last one, a batch with NumPy leaves.
+        ball: its place among the targets.
+
+    Returns:
+        The scenarios and their plans; `present` says which catches each has.
+    """
+    alone = np.arange(known.num_targets) == ball
+    scenarios, plans = plan_catches(planner, known, "greedy")
+    last = ball == known.num_targets - 1
+    for limits in (_WIDEST,) if last else (None, _WIDEST):
+        lanes = np.flatnonzero(is_unsolved(np.asarray(plans.status)))
+        if not lanes.size:
+            break
+        part = jax.tree.map(lambda leaf, lanes=lanes: np.asarray(leaf)[lanes], scenarios)
+        before = np.where((part.present == alone).all(axis=1), plans.violation[lanes], np.inf)
+        part = within(dataclasses.replace(part, present=part.present & alone), limits)
+        tried, found = plan_catches(planner, part, "greedy")
+        better = ~is_unsolved(np.asarray(found.status)) | (found.violation < before)
+        to, chosen = lanes[better], np.flatnonzero(better)
+
+        def merged(old: Any, new: Any, to: np.ndarray = to, chosen: np.ndarray = chosen) -> Any:
+            old = np.array(old)
+            old[to] = np.asarray(new)[chosen]
+            return old
+
+        scenarios, plans = jax.tree.map(merged, (scenarios, plans), (tried, found))
+    return scenarios, plans
+
+
+def within(scenarios: CatchScenario, limits: tuple[float, float] | None) -> CatchScenario:
+    """Scenarios with NumPy leaves with another least thrust [g] and greatest body rate [rad/s]."""
+    if limits is None:
+        return scenarios
+    thrust, rate = limits
+    gravity, old = scenarios.gravity, scenarios.limits
+    new = dataclasses.replace(
+        old, min_thrust=thrust * gravity, body_rate=np.full_like(old.body_rate, rate)
+    )
+    return dataclasses.replace(scenarios, limits=new)
 
 
 def require_catch_plan(plan: Any, scenario: CatchScenario) -> None:

@@ -229,11 +229,13 @@ def _fly_look(loop: Loop, pilot: Pilot, flight: Flight, drag: Array) -> Flight:
     )
     physics, _, contact, worst, squared, tracked = carry
     shown = jnp.concatenate([flight.shown, ball_states(world, physics)[0][None]])
+    seen = sight.observed(look_key, shown[0], loop.sensing)
+    seen = jnp.where(flight.launched[:, None], seen, jnp.nan)
     return dataclasses.replace(
         flight,
         physics=physics,
         shown=shown[1:],
-        estimates=_looked(loop, flight.estimates, sight.observed(look_key, shown[0], loop.sensing)),
+        estimates=_looked(loop, flight.estimates, seen),
         contact=contact,
         worst_tracking=jnp.sqrt(worst),
         squared_tracking=squared,

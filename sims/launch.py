@@ -104,6 +104,43 @@ def launched(
     return jax.vmap(one)(flights, balls, drag, believed)
 
 
+@functools.partial(jax.jit, static_argnames=("loop", "ball", "ahead"))
+def awaited(
+    loop: Loop, flights: Flight, coming: BallState, believed: Array, *, ball: int, ahead: float
+) -> Flight:
+    """The flights with a guess of one more ball, of which nothing is seen yet.
+
+    What is believed of it is the guessed flight, backwards from when it will be planned for.
+
+    Args:
+        loop: of the flights.
+        flights: leaves (B, ...).
+        coming: leaves (3,), as it is guessed to be when it is planned for.
+        believed: (B, N) K_D [1/m].
+        ball: which of the N (static).
+        ahead: [s] until it is planned for (static).
+    """
+    gravity = jnp.asarray(loop.world.gravity, believed.dtype)
+
+    def guess(before: float, drag: Array) -> Estimate:
+        ago = jnp.asarray(-ahead - loop.sensing.latency - before, drag.dtype)
+        there = fly(coming, ago, drag, gravity, num_steps=16)[0]
+        estimate = sight.first_estimate(there.pos, drag)
+        belief = dataclasses.replace(estimate.belief, mean=jnp.concatenate([there.pos, there.vel]))
+        return sight.anchored(dataclasses.replace(estimate, belief=belief), gravity)
+
+    def one(flight: Flight, believed: Array) -> Flight:
+        put = lambda all_balls, one_ball: all_balls.at[ball].set(one_ball)  # noqa: E731
+        now, earlier = (guess(before, believed[ball]) for before in (0.0, loop.period))
+        return dataclasses.replace(
+            flight,
+            estimates=jax.tree.map(put, flight.estimates, now),
+            earlier=jax.tree.map(put, flight.earlier, earlier),
+        )
+
+    return jax.vmap(one)(flights, believed)
+
+
 def watched(
     loop: Loop, ball: BallState, drag: Array, believed: Array, key: Array, duration: float
 ) -> tuple[Array, Estimate, Estimate]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from planner_jax.ball.target import BallPath
-from planner_jax.task.catch.suites import CATCH_HEIGHT, LAUNCH, SUITES, make_suite
+from planner_jax.task.catch.suites import CATCH_HEIGHT, LAUNCH, SUITES, earliest_throw, make_suite
 
 NUM = 64
 THROWS = ("throws", "hard", "parabola1", "parabola2")
@@ -202,3 +202,13 @@ def test_bad_arguments_are_named_in_one_line(arguments, options, says):
     with pytest.raises(ValueError, match=says) as caught:
         make_suite(*arguments, **options)
     assert "\n" not in str(caught.value)
+
+
+def test_the_earliest_throw_leaves_less_time_than_any_other_of_its_suite():
+    ball, horizon = earliest_throw("throws")
+    many = make_suite("throws", 200, 3)
+    assert horizon <= np.min(many.horizon) + 1e-3
+    assert ball.vel[2] <= np.min(many.targets.ball.vel[..., 2]) + 1e-3
+    assert abs(ball.pos[1]) < 1e-6  # to the middle
+    with pytest.raises(ValueError, match="^suite must be one of single throws, got 'hexagon6'$"):
+        earliest_throw("hexagon6")

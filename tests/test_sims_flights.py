@@ -1,11 +1,16 @@
 """Whole flights in closed loop: what is planned is flown, and noise is borne."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
 
+from planner_jax.optimise.status import is_unsolved
+from planner_jax.task.catch.exact import ExactCatch
+from planner_jax.task.catch.suites import make_suite
 from planner_jax.trajectory.polynomial import evaluate
-from sims.catch import fly_catches, throws
+from sims.catch import fly_catches, planned_ahead, throws
 from sims.closed_loop import Loop
 from sims.hit import SCENARIOS, fly_hits, volleys
 from sims.model import NET, RACKET, World
@@ -74,6 +79,17 @@ def test_cases_out_of_range_are_refused(build, message):
     with pytest.raises(ValueError) as error:
         build()
     assert str(error.value) == message
+
+
+@pytest.mark.slow
+def test_a_ball_is_planned_for_alone_where_no_plan_of_the_next_one_is_possible():
+    suite = jax.tree.map(np.asarray, make_suite("throws", 2, seed=4, num_targets=2))
+    both = dataclasses.replace(suite, present=np.ones((2, 2), bool))
+    # The second lane's next ball is to be caught at once.
+    both = dataclasses.replace(both, horizon=both.horizon * np.array([[1.0, 2.0], [1.0, 0.02]]))
+    known, plans = planned_ahead(ExactCatch(), both, 0)
+    assert not known.present[1, 1] and known.present[1, 0]
+    assert not is_unsolved(plans.status).any()
 
 
 @pytest.mark.slow

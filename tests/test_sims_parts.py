@@ -10,9 +10,9 @@ import pytest
 from planner_jax.ball.flight import BallState, drag_free_flight, fly
 from planner_jax.ball.impact import racket_impact
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, total_duration
-from sims.closed_loop import Loop, with_rest
+from sims.closed_loop import Loop, expected, with_rest
 from sims.control import Gains, RobotState, control, flat_attitude, reference_at, rotation_error
-from sims.launch import require_hovering, require_world
+from sims.launch import awaited, ready, require_hovering, require_world
 from sims.model import (
     NET,
     RACKET,
@@ -258,6 +258,19 @@ def test_the_drag_is_found_from_the_energy_that_is_lost():
     assert abs(found.drag / true - 1.0) < 0.06
     ahead = fly(ball, 1.3, true, GRAVITY, num_steps=130)[0].pos
     np.testing.assert_allclose(predicted(found, 0.1, GRAVITY).pos, ahead, atol=0.02)
+
+
+def test_an_awaited_ball_is_believed_to_come_as_it_is_guessed():
+    loop = Loop(World(NET, num_balls=2), NOISES["lab"], replan=100.0)
+    coming = BallState(jnp.array([2.9, 0.1, 2.4]), jnp.array([-3.0, 0.5, 4.0]))
+    flights = ready(loop, jnp.zeros((3, 3)), jax.random.split(jax.random.key(0), 3))
+    believed = jnp.full((3, 2), 0.06)
+    flights = awaited(loop, flights, coming, believed, ball=1, ahead=0.8)
+    for estimates, ahead in ((flights.estimates, 0.8), (flights.earlier, 0.8 + loop.period)):
+        then = jax.vmap(lambda known, ahead=ahead: expected(loop, known, ahead))(estimates)
+        np.testing.assert_allclose(then.pos[:, 1], jnp.tile(coming.pos, (3, 1)), atol=2e-3)
+        np.testing.assert_allclose(then.vel[:, 1], jnp.tile(coming.vel, (3, 1)), atol=5e-3)
+    np.testing.assert_allclose(flights.estimates.drag[:, 1], 0.06)
 
 
 def test_a_lost_look_shows_nothing():

@@ -209,6 +209,23 @@ def _throw(uniform: np.ndarray, throw: _Throw) -> tuple[np.ndarray, np.ndarray, 
     return pos, vel, early
 
 
+def earliest_throw(name: str) -> tuple[BallState, float]:
+    """The shortest throw of a suite of single throws, to the middle of where it throws.
+
+    Returns:
+        The ball when planning begins, NumPy leaves (3,) in float32, and its horizon [s].
+
+    Raises:
+        ValueError: no such suite.
+    """
+    if name not in _THROWS or len(_THROWS[name]) > 1:
+        raise ValueError(f"suite must be one of single throws, got {name!r}")
+    middle_and_shortest = np.array([[0.5, 0.5, 0.0]])
+    pos, vel, horizon = _throw(middle_and_shortest, _THROWS[name][0])
+    pos, vel = (leaf[0].astype(np.float32) for leaf in (pos, vel))
+    return BallState(pos=pos, vel=vel), float(horizon[0])
+
+
 def _fly(pos, vel, time, drag: float, gravity: float = GRAVITY) -> tuple[np.ndarray, np.ndarray]:
     """Balls (B, 3) after `time` (B,) [s] with linear drag [1/s] (paper 000, eq. 9)."""
     t = time[:, None]
