@@ -5,6 +5,7 @@ import sys
 from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -77,12 +78,16 @@ def plan_chunks(run: SweepRun, *, progress: bool) -> dict[str, Any]:
 def _in_pipeline(run: SweepRun) -> Iterator[tuple[pa.Table, dict[str, Any] | None]]:
     """Rows of every chunk in order, and the record of those that had no part.
 
-    While one chunk is planned, the one before is judged, and the one before that is written.
+    While one chunk is planned the next is drawn, the one before is judged, and the one before
+    that is written.
     """
-    folder, watch = run.folder, Stopwatch()
+    folder, source, watch = run.folder, run.source, Stopwatch()
+    there = [folder.part_record(chunk) is not None for chunk in range(source.num_chunks)]
     pending: deque[Future] = deque()
     with (
         folder.joining_parts() as join,
+        CompileClock() as clock,
+        ThreadPoolExecutor(1) as drawer,
         ThreadPoolExecutor(1) as judge,
         ThreadPoolExecutor(1) as writer,
         ThreadPoolExecutor(1) as joiner,
@@ -96,11 +101,16 @@ def _in_pipeline(run: SweepRun) -> Iterator[tuple[pa.Table, dict[str, Any] | Non
             joined.result()
             return rows, record
 
-        for chunk in range(run.source.num_chunks):
-            if folder.part_record(chunk):
+        missing = iter([chunk for chunk, is_there in enumerate(there) if not is_there])
+        draw_next = lambda: [drawer.submit(source.chunk, chunk) for chunk in islice(missing, 1)]  # noqa: E731
+        drawn = draw_next()
+        for chunk, is_there in enumerate(there):
+            if is_there:
                 judged = judge.submit(lambda k=chunk: (k, folder.read_part(k), None))
             else:
-                planned = _plan_chunk(run, chunk)
+                cases = drawn[0].result()
+                drawn = draw_next()
+                planned = _plan_chunk(run, cases, clock)
                 judged = judge.submit(_judge_chunk, run, chunk, planned, watch)
             pending.append(writer.submit(write, judged))
             if len(pending) > _UNDER_WAY:
@@ -127,17 +137,14 @@ class _Planned:
     record: dict[str, Any]  # how long it took
 
 
-def _plan_chunk(run: SweepRun, chunk: int) -> _Planned:
-    """The cases of one chunk and their plans."""
-    source = run.source
-    with CompileClock() as clock:
-        cases = source.chunk(chunk)
-        (scenarios, plans), seconds, warm = _timed_plan(run, cases.scenarios)
+def _plan_chunk(run: SweepRun, cases: Any, clock: CompileClock) -> _Planned:
+    """One chunk's plans. What the clock has counted since the chunk before is its compilation."""
+    (scenarios, plans), seconds, warm = _timed_plan(run, cases.scenarios)
     record = {
         "num": len(cases),
         "plan_seconds": seconds,
         "warm": warm,
-        "compile_seconds": clock.seconds,
+        "compile_seconds": clock.lap(),
     }
     return _Planned(cases, scenarios, plans, record)
 

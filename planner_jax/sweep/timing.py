@@ -15,6 +15,7 @@ class CompileClock:
 
     def __init__(self) -> None:
         self._spans: list[tuple[float, float]] = []
+        self._last = 0.0
 
     def __enter__(self) -> "CompileClock":
         jax.monitoring.register_event_time_span_listener(self._listen)
@@ -35,6 +36,11 @@ class CompileClock:
             total += max(end - max(start, reached), 0.0)
             reached = max(reached, end)
         return total
+
+    def lap(self) -> float:
+        """What `seconds` have grown by since the last call, or since the start."""
+        last, self._last = self._last, self.seconds
+        return self._last - last
 
     @property
     def compiled(self) -> bool:

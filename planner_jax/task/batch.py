@@ -7,14 +7,14 @@ a loop of its own and waits for no other.
 
 import functools
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec, Sharding, SingleDeviceSharding
 
 from planner_jax.optimise.multistart import solve_batch
 from planner_jax.optimise.problem import Planner, Round
@@ -127,11 +127,30 @@ def _calls(lanes: np.ndarray, chunk: int, mesh: Mesh) -> list[tuple[np.ndarray, 
     return calls
 
 
+def _sharding(mesh: Mesh) -> Sharding:
+    """Equal shares of the lanes on every device; for one device what JAX handles quickest."""
+    return NamedSharding(mesh, _LANES) if mesh.size > 1 else SingleDeviceSharding(mesh.devices[0])
+
+
+def _apart(mesh: Mesh, function: Callable, *specs: PartitionSpec) -> Callable:
+    """The function of every device's own lanes; arguments are split unless `specs` say else."""
+    if mesh.size == 1:
+        return function
+    # Without the check of replication: the lanes of a device share nothing with another's.
+    return jax.shard_map(
+        function, mesh=mesh, in_specs=specs or _LANES, out_specs=_LANES, check_vma=False
+    )
+
+
 def _placed(tree: Any, mesh: Mesh) -> Any:
     """The tree with equal shares of its lanes on every device."""
-    placed = NamedSharding(mesh, _LANES)
-    leaves = jax.tree.leaves(tree)
-    if all(leaf.sharding.is_equivalent_to(placed, leaf.ndim) for leaf in leaves):
+    placed = _sharding(mesh)
+
+    def is_there(leaf: jax.Array) -> bool:
+        own = leaf.sharding  # equality is quicker to find out
+        return own == placed or own.is_equivalent_to(placed, leaf.ndim)
+
+    if all(map(is_there, jax.tree.leaves(tree))):
         return tree
     return jax.device_put(tree, placed)
 
@@ -142,7 +161,7 @@ def _solved_from_host(
     """One round on the lanes of every call; on one CPU device a thread for each core."""
     one_cpu = mesh.size == 1 and mesh.devices[0].platform == "cpu"
     threads = min(len(calls), os.cpu_count() or 1) if one_cpu else 1
-    placed = NamedSharding(mesh, _LANES)
+    placed = _sharding(mesh)
 
     def solve(lanes: np.ndarray) -> Any:
         part = jax.device_put(jax.tree.map(lambda leaf: leaf[lanes], scenarios), placed)
@@ -159,11 +178,7 @@ def _solved_from_host(
 
 @functools.partial(jax.jit, static_argnames=("planner", "attempt", "mesh"))
 def _solve(planner: Planner, attempt: Round, mesh: Mesh, scenarios: Any) -> Any:
-    solve = functools.partial(solve_batch, planner, attempt)
-    # Without the check of replication: the lanes of a device share nothing with another's.
-    return jax.shard_map(solve, mesh=mesh, in_specs=_LANES, out_specs=_LANES, check_vma=False)(
-        scenarios
-    )
+    return _apart(mesh, functools.partial(solve_batch, planner, attempt))(scenarios)
 
 
 @jax.jit
@@ -174,8 +189,7 @@ def _taken(tree: Any, lanes: Any) -> Any:
 @functools.partial(jax.jit, static_argnames="mesh")
 def _taken_locally(mesh: Mesh, tree: Any, lanes: Any) -> Any:
     """The same lanes of every device's share."""
-    specs = (_LANES, PartitionSpec())
-    return jax.shard_map(_taken, mesh=mesh, in_specs=specs, out_specs=_LANES)(tree, lanes)
+    return _apart(mesh, _taken, _LANES, PartitionSpec())(tree, lanes)
 
 
 @functools.partial(jax.jit, static_argnames=("mesh", "share"))
@@ -185,7 +199,7 @@ def _joined_locally(mesh: Mesh, parts: list[Any], share: int) -> Any:
     def join(*parts: Any) -> Any:
         return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:share], *parts)
 
-    return jax.shard_map(join, mesh=mesh, in_specs=_LANES, out_specs=_LANES)(*parts)
+    return _apart(mesh, join)(*parts)
 
 
 def _better(later: Any, plans: Any) -> Any:
