@@ -122,8 +122,7 @@ class FlySettings:
         if self.task == "catch":
             planner: Any = catch_planner(self.planner)
             return fly_catches(self.loop(record), cases, self.seed, planner=planner)
-        options = {"drag_after_impact": True} if self.planner == "exact" else {}
-        planner = hit_planner(self.planner, **options)
+        planner = None if self.planner == "exact" else hit_planner(self.planner)
         return fly_hits(self.loop(record), cases, self.seed, planner=planner)
 
 
