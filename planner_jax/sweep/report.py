@@ -1,6 +1,7 @@
 """Table, figures and page of a run, from nothing but its folder."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from planner_jax.sweep.page import to_page
 from planner_jax.sweep.run_folder import RunFolder, pick_rows
 from planner_jax.sweep.settings import SettingError
 from planner_jax.sweep.table import headline, to_markdown
-from planner_jax.sweep.task import task_of
+from planner_jax.sweep.task import RunFigure, task_of
 
 _CASES_SHOWN = 60
 _FAILURES_SHOWN = 12
@@ -67,12 +68,23 @@ def write_report(folder: RunFolder) -> None:
     folder.figures.mkdir(exist_ok=True)
     failed = pick_rows(folder.plans, _first_failures(folder))
     rows = RunRows(folder, manifest, failed)
-    for figure in task.figures:
-        draw(folder.figures / figure.name, figure.draw, figure.size, rows)
+    _draw(rows, task.figures)
     lines = headline(manifest, task.findings(manifest))
     text = to_markdown(task.title(manifest), lines, task.table(manifest), task.remarks(manifest))
     folder.write_text("table.md", text)
     folder.write_text("index.html", to_page(task, manifest, failed))
+
+
+def draw_comparisons(folder: RunFolder) -> None:
+    """Draw anew the figures that show other planners too, now that they have planned."""
+    manifest = folder.read_manifest()
+    figures = [figure for figure in task_of(manifest, folder.name).figures if figure.compares]
+    _draw(RunRows(folder, manifest, failures=[]), figures)
+
+
+def _draw(rows: RunRows, figures: Sequence[RunFigure]) -> None:
+    for figure in figures:
+        draw(rows.folder.figures / figure.name, figure.draw, figure.size, rows)
 
 
 def _first_failures(folder: RunFolder) -> list[int]:

@@ -9,7 +9,7 @@ from typing import Any
 from planner_jax.sweep.baselines import plan_baselines
 from planner_jax.sweep.chunks import SweepRun, plan_chunks
 from planner_jax.sweep.environment import environment, require_backend
-from planner_jax.sweep.report import write_report
+from planner_jax.sweep.report import draw_comparisons, write_report
 from planner_jax.sweep.run_folder import RunFolder
 from planner_jax.sweep.settings import SettingError, SweepSettings, settings_to_resume
 from planner_jax.sweep.task import SweepTask, task_named
@@ -123,7 +123,7 @@ def _add_baselines(run: SweepRun, progress: bool) -> None:
     rows = plan_baselines(run.task, run.source, run.folder.read_manifest()["example"])
     if rows is not None:
         run.folder.write_rows(run.folder.baselines, rows)
-        write_report(run.folder)
+        draw_comparisons(run.folder)
 
 
 def _session() -> dict[str, Any]:

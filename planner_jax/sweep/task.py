@@ -30,6 +30,7 @@ class RunFigure:
     caption: str
     size: tuple[float, float]  # width and height [inch]
     draw: Callable[[Figure, Any], None]  # takes an empty figure and a `report.RunRows`
+    compares: bool = False  # shows plans of the other planners too
 
 
 class SweepTask(abc.ABC):

@@ -42,6 +42,7 @@ class CatchTask(SweepTask):
             "for the same case.",
             (13.0, 6.8),
             motion_figure,
+            compares=True,
         ),
         RunFigure(
             "outcomes.png",

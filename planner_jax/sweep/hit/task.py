@@ -43,6 +43,7 @@ class HitTask(SweepTask):
             "the same serve.",
             (13.0, 6.8),
             motion_figure,
+            compares=True,
         ),
         RunFigure(
             "rates.png",
