@@ -17,8 +17,10 @@ a ball that is taken care of at both ends, by `placed` and `ball_velocity`, whic
 flight second order.
 """
 
+import contextlib
 import dataclasses
 import functools
+import io
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +28,9 @@ import mujoco
 import numpy as np
 from flax import struct
 from jax import Array
-from mujoco import mjx
+
+with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp, not needed here, is missing
+    from mujoco import mjx
 
 from planner_jax.ball.flight import BallState, ball_acceleration
 from sims.scenery import GROUND_COLOUR, MOUTHS, TOWARDS_NET, Part, court_parts, machine_parts
