@@ -28,9 +28,10 @@ def on_devices():
     for some in (None, devices[:3], devices[2:3]):
         for chunk in (None, 16):
             equal(plan(WellPlanner(), Well(GOALS), devices=some, chunk=chunk), alone)
-    resident = plan(WellPlanner(), Well(jax.numpy.asarray(GOALS)))
-    equal(resident, alone)
-    assert isinstance(resident.point, jax.Array)
+            resident = Well(jax.numpy.asarray(GOALS))
+            resident = plan(WellPlanner(), resident, devices=some, chunk=chunk)
+            equal(resident, alone)
+            assert isinstance(resident.point, jax.Array)
     broken = GOALS.copy()
     broken[::100] = np.nan
     spoiled = plan(WellPlanner(), Well(broken))
