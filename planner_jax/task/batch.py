@@ -81,6 +81,7 @@ def _plan_resident(planner: Planner, scenarios: Any, chunk: int | None, mesh: Me
     scenarios = _placed(scenarios, mesh)
     first, *others = planner.rounds
     plans = _first_plans(planner, first, scenarios, chunk or _default_chunk(first, mesh), mesh)
+    plans.status.copy_to_host_async()  # on its way as soon as it is known
     for attempt in others:
         lanes = np.flatnonzero(is_unsolved(np.asarray(plans.status)))
         if lanes.size == 0:
