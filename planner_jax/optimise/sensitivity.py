@@ -5,8 +5,8 @@ For a number q(u, theta) of a plan, where u minimises cost(u, theta),
     dq/dtheta = q_theta - lambda^T cost_utheta,   cost_uu lambda = q_u,
 
 the adjoint form of the implicit function theorem. lambda comes from a few steps of conjugate
-gradients (Hestenes and Stiefel 1952). One reverse pass through the slope of the cost along a
-direction p yields both p^T cost_uu and p^T cost_utheta, so that the gradient is summed up along
+gradients (Hestenes and Stiefel 1952). The derivative of all slopes of the cost along a direction
+p of the point holds both p^T cost_uu and p^T cost_utheta, so that the gradient is summed up along
 with lambda. A planner whose cost has a cheap part (`Planner.core`, see `CorePlanner`) is
 preconditioned with that part's curvature.
 """
@@ -207,24 +207,22 @@ def gradient_at(
 
     value, (along_point, by_context) = jax.value_and_grad(value_of, argnums=(0, 1))(point, smooth)
 
-    @functools.partial(jax.grad, argnums=(0, 1))
-    def products(x: Array, smooth: list, direction: Array) -> Array:
-        """(p^T cost_uu, p^T cost_uc) as the gradient of the slope along p."""
-        return jax.jvp(lambda y: cost(y, smooth), (x,), (direction,))[1]
+    def products(direction: Array) -> tuple[Array, list]:
+        """(p^T cost_uu, p^T cost_uc) as the derivative of the slopes along p."""
+        slopes = lambda x: jax.grad(cost, argnums=(0, 1))(x, smooth)  # noqa: E731
+        return jax.jvp(slopes, (point,), (direction,))[1]
 
     if steps == 0:
         solve = lambda rhs: rhs  # noqa: E731
     elif curvature == "whole":
-        hessian = jax.vmap(lambda unit: products(point, smooth, unit)[0])(
+        hessian = jax.vmap(lambda unit: products(unit)[0])(
             jnp.eye(point.shape[0], dtype=point.dtype)
         )
         inverse = _positive_inverse(hessian)
         solve = lambda rhs: jnp.sum(inverse * rhs, axis=1)  # noqa: E731
     else:
         solve = _core_inverse(planner, point, context)
-    by_context, residual = _adjoint(
-        lambda p: products(point, smooth, p), solve, along_point, by_context, steps
-    )
+    by_context, residual = _adjoint(products, solve, along_point, by_context, steps)
     taken = iter(by_context)
     both = zip(leaves, is_smooth, strict=True)
     cotangent = [
