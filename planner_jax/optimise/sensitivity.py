@@ -30,16 +30,20 @@ _CURVATURES = ("core", "whole")
 
 @runtime_checkable
 class CorePlanner(Protocol):
-    """A planner that says which part of its cost can be looked at cheaply."""
-
-    def core(self, point: Array, context: Any) -> Array:
-        """The cost without what has to be sampled along the trajectory, ()."""
-        ...
+    """A planner that says how the part of its cost bends which can be looked at cheaply."""
 
     def core_blocks(self, size: int) -> np.ndarray:
         """Places (K, k) in a point (size,) of the variables that the core couples.
 
         In the others it is a sum of squares, with a factor each.
+        """
+        ...
+
+    def core_curvature(self, point: Array, context: Any) -> tuple[Array, Array]:
+        """The core's second derivatives: in the blocks (K, k, k), and by the others, (n,).
+
+        The core is the cost without what has to be sampled along the trajectory. What is
+        said of the others in the places of the blocks does not matter.
         """
         ...
 
@@ -272,23 +276,10 @@ def _core_inverse(planner: Any, point: Array, context: Any) -> Callable[[Array],
     blocks = planner.core_blocks(point.shape[0])
     inside = np.zeros(point.shape[0], bool)
     inside[blocks.ravel()] = True
-    coupled = blocks.ravel()
-
-    def slope(x: Array) -> Array:
-        return jax.grad(lambda y: planner.core(y, context))(x)
-
-    # As constants, so that the lanes share them: unit vectors, and ones for the others.
-    units = np.concatenate([np.eye(point.shape[0])[coupled], ~inside[None]])
-    tangent = lambda unit: jax.jvp(slope, (point,), (unit,))[1]  # noqa: E731
-    *rows, row_of_others = jax.vmap(tangent)(jnp.asarray(units, point.dtype))
-    # What the core couples is not looked at here.
+    within, row_of_others = planner.core_curvature(point, context)
     largest = jnp.max(jnp.where(inside, 0.0, jnp.abs(row_of_others)))
     size_of_others = jnp.maximum(jnp.abs(row_of_others), 1e-6 * largest + 1e-20)
-    within = jnp.stack(rows).reshape(*blocks.shape, -1)  # (K, k, n)
-    inverses = [
-        _positive_inverse(jnp.stack([matrix[:, j] for j in block], axis=1))
-        for block, matrix in zip(blocks, within, strict=True)
-    ]
+    inverses = [_positive_inverse(block) for block in within]
 
     def solve(rhs: Array) -> Array:
         entries, found = tuple(rhs), list(rhs / size_of_others)
@@ -299,6 +290,30 @@ def _core_inverse(planner: Any, point: Array, context: Any) -> Callable[[Array],
         return jnp.stack(found)
 
     return solve
+
+
+def curvature_by_tangents(
+    core: Callable[[Array], Array], blocks: np.ndarray, point: Array
+) -> tuple[Array, Array]:
+    """`CorePlanner.core_curvature` of a core, a tangent of its slope for each coupled variable.
+
+    Args:
+        core: of a point, ().
+        blocks: (K, k), that of the planner.
+        point: (n,).
+    """
+    inside = np.zeros(point.shape[0], bool)
+    inside[blocks.ravel()] = True
+    # As constants, so that the lanes share them: unit vectors, and ones for the others.
+    units = np.concatenate([np.eye(point.shape[0])[blocks.ravel()], ~inside[None]])
+    tangent = lambda unit: jax.jvp(jax.grad(core), (point,), (unit,))[1]  # noqa: E731
+    *rows, row_of_others = jax.vmap(tangent)(jnp.asarray(units, point.dtype))
+    within = jnp.stack(rows).reshape(*blocks.shape, -1)  # (K, k, n)
+    found = [
+        jnp.stack([matrix[:, j] for j in block], axis=1)
+        for block, matrix in zip(blocks, within, strict=True)
+    ]
+    return jnp.stack(found), row_of_others
 
 
 def _positive_inverse(matrix: Array) -> Array:
