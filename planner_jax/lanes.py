@@ -6,6 +6,7 @@ read is then one whole line of memory, a sum over samples needs no exchange betw
 and the product with a constant matrix is one large product. Same numbers, another layout.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -65,32 +66,69 @@ def over_lanes(function: Callable) -> Callable:
 # A kernel takes the tree of a function's arguments and their leaves, with the lanes last; it gives
 # the leaves of the results, or None where it is not made for such shapes.
 Kernel = Callable[[Any, Sequence[Array]], list[Array] | None]
-_KERNELS: dict[str, tuple[Any, Kernel]] = {}
 
 
-def with_kernel(function: Callable, kernel: Kernel) -> Callable:
+@dataclasses.dataclass
+class _Named:
+    """What a name of a compiled function stands for: a kernel for arguments of one structure."""
+
+    treedef: Any  # of the arguments
+    kernel: Kernel
+    shapes: list[tuple[int, ...]]  # of their leaves, then of the results'
+
+
+_KERNELS: dict[str, _Named] = {}
+
+
+def with_kernel(function: Callable, kernel: Kernel, jvp: Callable | None = None) -> Callable:
     """The function, for which `over_lanes` calls a kernel where the program is for CUDA.
-
-    Derivatives are those of the function.
 
     Args:
         function: of pytrees of arrays of ONE lane, to a pytree of arrays.
         kernel: the same on lanes. `jax.vmap` within a lane adds axes in front of some leaves.
+        jvp: its derivative as `jax.custom_jvp` takes it, zeros as `SymbolicZero`; without it,
+            the function's own.
     """
-    name = f"kernel_{len(_KERNELS)}"
 
-    def named(*args: Any) -> Any:
-        _KERNELS[name] = (jax.tree.structure(args), kernel)
-        return function(*args)
+    @functools.cache
+    def compiled(treedef: Any, shapes: tuple) -> Callable:
+        name = f"kernel_{len(_KERNELS)}"
+        here = _KERNELS[name] = _Named(treedef, kernel, [])
 
-    named.__name__ = named.__qualname__ = name
-    _KERNELS[name] = (None, kernel)
-    compiled = jax.jit(named)
+        def named(*leaves: Array) -> Any:
+            found = function(*jax.tree.unflatten(treedef, leaves))
+            here.shapes = [*shapes, *(leaf.shape for leaf in jax.tree.leaves(found))]
+            return found
+
+        named.__name__ = named.__qualname__ = name
+        return jax.jit(named)
 
     # A derivative of the named function would bear its name, and be taken for it.
-    guarded = jax.custom_jvp(lambda *args: compiled(*args))
-    guarded.defjvp(lambda primals, tangents: jax.jvp(function, primals, tangents))
+    @jax.custom_jvp
+    def guarded(*args: Any) -> Any:
+        leaves, treedef = jax.tree.flatten(args)
+        shapes: Any = tuple(jnp.shape(leaf) for leaf in leaves)
+        return compiled(treedef, shapes)(*leaves)
+
+    if jvp is None:
+        guarded.defjvp(lambda primals, tangents: jax.jvp(function, primals, tangents))
+    else:
+        guarded.defjvp(jvp, symbolic_zeros=True)
     return guarded
+
+
+def _has_kernel(eqn: JaxprEqn) -> bool:
+    """Whether a call is of a function that has a kernel, and not of a half of that.
+
+    Reverse mode splits compiled functions in two that keep the name.
+    """
+    named = _KERNELS.get(eqn.params.get("name", ""))
+    if named is None:
+        return False
+    shapes = [_shape(atom) for atom in (*eqn.invars, *eqn.outvars)]
+    return len(shapes) == len(named.shapes) and all(
+        full[len(full) - len(own) :] == own for full, own in zip(shapes, named.shapes, strict=True)
+    )
 
 
 class _Lanes:
@@ -133,7 +171,7 @@ def _outputs(eqn: JaxprEqn, inputs: list[Any], lanes: int) -> list[Any]:
         inner = eqn.params["jaxpr"] if "jaxpr" in eqn.params else eqn.params["call_jaxpr"]
         closed = inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
         plain = functools.partial(_evaluate, closed.jaxpr, closed.consts)
-        if eqn.params.get("name") in _KERNELS and jax.default_backend() == "gpu":
+        if jax.default_backend() == "gpu" and _has_kernel(eqn):
             return _by_kernel(eqn, inputs, lanes, plain)
         return plain(inputs, lanes)
     if not any(isinstance(value, _Lanes) for value in inputs):
@@ -154,17 +192,23 @@ def _outputs(eqn: JaxprEqn, inputs: list[Any], lanes: int) -> list[Any]:
 
 def _by_kernel(eqn: JaxprEqn, inputs: list[Any], lanes: int, plain: Callable) -> list[Any]:
     """A function that has a kernel: that for CUDA, and what the function says elsewhere."""
-    treedef, kernel = _KERNELS[eqn.params["name"]]
+    named = _KERNELS[eqn.params["name"]]
     arrays = [_widened(v, _shape(atom), lanes) for v, atom in zip(inputs, eqn.invars, strict=True)]
 
+    shapes = [(*_shape(atom), lanes) for atom in eqn.outvars]
+
     def in_kernel(*leaves: Array) -> list[Array]:
-        found = kernel(treedef, leaves)
-        return in_steps(*leaves) if found is None else [*found]
+        found = named.kernel(named.treedef, leaves)
+        if found is None:
+            return in_steps(*leaves)
+        # What does not vary along an axis of `vmap` does not have it.
+        found = [leaf[(0,) * (leaf.ndim - len(s))] for leaf, s in zip(found, shapes, strict=True)]
+        same = all(leaf.shape == s for leaf, s in zip(found, shapes, strict=True))
+        return found if same else in_steps(*leaves)
 
     def in_steps(*leaves: Array) -> list[Array]:
         found = plain([_Lanes(leaf) for leaf in leaves], lanes)
-        shapes = [_shape(atom) for atom in eqn.outvars]
-        return [_widened(v, shape, lanes) for v, shape in zip(found, shapes, strict=True)]
+        return [_widened(v, s[:-1], lanes) for v, s in zip(found, shapes, strict=True)]
 
     return [
         _Lanes(leaf) for leaf in lax.platform_dependent(*arrays, cuda=in_kernel, default=in_steps)

@@ -1,14 +1,17 @@
 """Penalties along a trajectory: what they integrate, their slopes, and the kernel for both."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from planner_jax.cost.along import Along, integrate_along
-from planner_jax.cost.along_kernel import along_kernel
+from planner_jax.cost.along_kernel import MODES, along_kernel
 from planner_jax.cost.limits import motion_excess
 from planner_jax.cost.penalty import smoothed_hinge
+from planner_jax.lanes import over_lanes
 from planner_jax.robot.quadrotor import QuadrotorLimits
 from planner_jax.trajectory.proportional_minco import proportional_minco, sample_motion
 
@@ -83,20 +86,45 @@ def test_worst_has_no_derivative():
     np.testing.assert_array_equal(slope, 0.0)
 
 
-@pytest.mark.parametrize("slopes", [False, True])
-def test_the_kernel_gives_the_same_numbers(slopes):
+def asked(mode):
+    """What a kernel computes, of one lane, by `integrate_along` alone."""
+
+    def value(*x):
+        penalties, worst = integrate_along(ALONG, *x)
+        return jnp.sum(penalties), (penalties, worst)
+
+    def slopes(*x):
+        """Every segment has its own parameters, to have its own slopes."""
+        num = range(3 if mode != "slopes" else 2)
+
+        def segment(c, h, given):
+            (_, aux), by = jax.value_and_grad(value, argnums=num, has_aux=True)(
+                c[None], h[None], given
+            )
+            return jax.tree.map(lambda leaf: leaf[0], (*aux, by[0], by[1])), by[2:]
+
+        return jax.vmap(segment, in_axes=(0, 0, None))(*x)
+
+    def curvature(point, direction):
+        return jax.jvp(slopes, point, direction)[1]
+
+    return {
+        "values": lambda *x: value(*x)[1],
+        "slopes": slopes,
+        "slopes by all": slopes,
+        "curvature": curvature,
+    }[mode]
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_the_kernel_gives_the_same_numbers(mode):
     args = cases()
+    if mode == "curvature":
+        random = np.random.default_rng(1)
+        args = (args, jax.tree.map(lambda x: random.standard_normal(x.shape).astype(x.dtype), args))
+    expected = jax.tree.leaves(jax.vmap(asked(mode), out_axes=-1)(*args))
     lanes = jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), args)
-
-    def plain(c, h, given):
-        value = lambda *x: integrate_along(ALONG, *x, given)  # noqa: E731
-        if not slopes:
-            return value(c, h)
-        penalties, pull_back, worst = jax.vjp(value, c, h, has_aux=True)
-        return penalties, worst, *pull_back(jnp.ones_like(penalties))
-
-    expected = jax.vmap(plain, out_axes=-1)(*args)
-    kernel = along_kernel(ALONG, slopes=slopes, interpret=True)
+    kernel = along_kernel(ALONG, mode, interpret=True)
     found = kernel(jax.tree.structure(args), jax.tree.leaves(lanes))
     assert len(found) == len(expected)
     for ours, theirs in zip(found, expected, strict=True):
@@ -104,8 +132,60 @@ def test_the_kernel_gives_the_same_numbers(slopes):
         np.testing.assert_allclose(ours, theirs, rtol=2e-4, atol=2e-5 * scale)
 
 
+def test_derivatives_in_lanes_are_those_without_a_kernel(monkeypatch):
+    """Slopes and curvature by kernels, `vmap` of them, and what reverse mode makes of them."""
+    used = []
+
+    def in_lanes(along, mode):
+        kernel = along_kernel(along, mode, interpret=True)
+
+        def counted(*args):
+            used.append(mode)
+            return kernel(*args)
+
+        return counted
+
+    monkeypatch.setattr("planner_jax.cost.along.along_kernel", in_lanes)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *x, cuda, default: cuda(*x))
+    along = dataclasses.replace(ALONG, hinge_width=0.25)  # another, to be built with these
+    args = cases()
+    lanes = jax.tree.map(lambda x: jnp.moveaxis(jnp.asarray(x), 0, -1), args)
+
+    def value(c, h, given):
+        return jnp.sum(integrate_along(along, c, h, given)[0])
+
+    def by_all(c, h, given):
+        return jax.grad(value, argnums=(0, 1, 2))(c, h, given)
+
+    def curved(c, h, given):
+        return jax.jvp(lambda c: by_all(c, h, given), (c,), (jnp.cos(c),))[1]
+
+    def curvature(c, h, given):
+        return jax.jacfwd(lambda h: by_all(c, h, given))(h)
+
+    def reversed(c, h, given):
+        total = lambda *x: sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(by_all(*x)))  # noqa: E731
+        return jax.grad(total, argnums=(0, 1, 2))(c, h, given)
+
+    by_kernels = {"slopes by all", "curvature"}
+    for function, kernels in (
+        (by_all, {"slopes by all"}),
+        (curved, by_kernels),
+        (curvature, by_kernels),
+        (reversed, {"slopes by all"}),
+    ):
+        used.clear()
+        expected = jax.vmap(function, out_axes=-1)(*args)
+        found = over_lanes(function)(*lanes)
+        assert set(used) == kernels
+        for ours, theirs in zip(*map(jax.tree.leaves, (found, expected)), strict=True):
+            scale = np.abs(theirs).max()
+            np.testing.assert_allclose(ours, theirs, rtol=2e-4, atol=5e-5 * scale)
+
+
 def test_the_kernel_leaves_alone_what_it_is_not_made_for():
-    kernel = along_kernel(ALONG, slopes=False)
+    kernel = along_kernel(ALONG, "values")
     for num, dtype in ((LANES, np.float16), (7, np.float32)):
         args = cases(num, dtype)
         lanes = jax.tree.leaves(jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), args))

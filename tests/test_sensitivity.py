@@ -13,7 +13,13 @@ from planner_jax.optimise.implicit import newton_refine
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
 from planner_jax.optimise.multistart import minimise
 from planner_jax.optimise.problem import Round
-from planner_jax.optimise.sensitivity import _positive_inverse, _with_part, gradient_at, part_of
+from planner_jax.optimise.sensitivity import (
+    _positive_inverse,
+    _with_part,
+    curvature_by_tangents,
+    gradient_at,
+    part_of,
+)
 from planner_jax.task.catch.decide import decided, greedy
 from planner_jax.task.catch.exact import ExactCatch
 from planner_jax.task.catch.suites import make_suite
@@ -185,6 +191,25 @@ CASES = {
         {"curvature": "whole"},
     ),
 }
+
+
+@pytest.mark.parametrize("options", [{"margin": 0.4}, {"drag_after_impact": True}])
+def test_curvature_of_the_core_in_closed_form_is_that_of_tangents(options, float64):
+    planner, scenario = ExactHit(proportions=PIECES, **options), first(easy_hit_case())
+
+    @jax.jit
+    def both(scenario):
+        context = planner.prepare(scenario)
+        point = planner.guesses(context, 1)[0]
+        point = point + 0.3 * jnp.cos(jnp.arange(point.size))
+        core = lambda x: planner.core(x, context)  # noqa: E731
+        blocks = planner.core_blocks(point.size)
+        return planner.core_curvature(point, context), curvature_by_tangents(core, blocks, point)
+
+    (block, factors), (expected, others) = both(scenario)
+    np.testing.assert_allclose(block, expected, rtol=1e-8, atol=1e-8 * np.abs(expected).max())
+    num = planner.num_offsets
+    np.testing.assert_allclose(factors[:num], others[:num], rtol=1e-10)
 
 
 @pytest.mark.slow

@@ -1,8 +1,8 @@
 """Penalties integrated along a trajectory of pieces in fixed proportion (paper 000, eq. 26).
 
 The innermost part of every solve. On a GPU it is one kernel (`along_kernel`), in which the
-samples of a trajectory never leave the registers; elsewhere, and for all derivatives that the
-solver does not take, it is what is written here.
+samples of a trajectory never leave the registers, and so are its slopes and their derivatives
+along a direction; elsewhere, and for all other derivatives, it is what is written here.
 """
 
 import dataclasses
@@ -71,33 +71,68 @@ def integrate_along(
 
 @functools.cache
 def _integral(along: Along) -> Callable:
-    """`integrate_along`, with a kernel for its values and one for its slopes."""
+    """`integrate_along`, with kernels for its values, slopes and curvature."""
     values = functools.partial(_values, along)
-    values_in_lanes = with_kernel(values, along_kernel(along, slopes=False))
+    values_in_lanes = with_kernel(values, along_kernel(along, "values"))
 
     def slopes(columns: Array, durations: Array, parameters: Any) -> tuple[Array, ...]:
         value: Any = lambda c, h: values(c, h, parameters)  # noqa: E731
         penalties, pull_back, worst = jax.vjp(value, columns, durations, has_aux=True)
         return penalties, worst, *pull_back(jnp.ones_like(penalties))
 
-    slopes_in_lanes = with_kernel(slopes, along_kernel(along, slopes=True))
+    slopes_in_lanes = with_kernel(slopes, along_kernel(along, "slopes"))
+
+    def segment_slopes(columns: Array, duration: Array, parameters: Any) -> tuple:
+        value: Any = functools.partial(_of_segment, along)
+        penalty, pull_back, worst = jax.vjp(value, columns, duration, parameters, has_aux=True)
+        return penalty, jax.lax.stop_gradient(worst), *pull_back(jnp.ones_like(penalty))
+
+    slopes_by_all: Any = jax.vmap(segment_slopes, in_axes=(0, 0, None))
+
+    def curved(primals: tuple, tangents: tuple) -> tuple:
+        """Tangents of `slopes_by_all`; None for those of parameters that do not move."""
+        *free, given = primals
+        if tangents[2] is None:
+            return jax.jvp(lambda *x: slopes_by_all(*x, given), tuple(free), tangents[:2])[1]
+        return jax.jvp(slopes_by_all, primals, tangents)[1]
+
+    curved_in_lanes = with_kernel(curved, along_kernel(along, "curvature"))
+
+    def curve(primals: tuple, tangents: tuple) -> tuple:
+        given = None if _is_still(tangents[2]) else jax.tree.map(_dense, tangents[2])
+        moving = (*map(_dense, tangents[:2]), given)
+        return slopes_by_all_in_lanes(*primals), curved_in_lanes(primals, moving)
+
+    slopes_by_all_in_lanes = with_kernel(
+        slopes_by_all, along_kernel(along, "slopes by all"), jvp=curve
+    )
 
     @jax.custom_jvp
     def integral(columns: Array, durations: Array, parameters: Any) -> tuple[Array, Array]:
         return values_in_lanes(columns, durations, parameters)
 
-    def jvp(primals: tuple, tangents: tuple) -> tuple:
-        constant = all(isinstance(x, SymbolicZero) for x in jax.tree.leaves(tangents[2]))
+    def slope(primals: tuple, tangents: tuple) -> tuple:
+        still = _is_still(tangents[2])
         tangents = jax.tree.map(_dense, tangents)
-        if constant:  # the parameters do not move, which is what the solver asks for
-            penalties, worst, by_columns, by_duration = slopes_in_lanes(*primals)
-            moved = jnp.sum(by_columns * tangents[0], axis=(1, 2)) + by_duration * tangents[1]
+        if still:  # which is what the solver asks for
+            penalties, worst, *by = slopes_in_lanes(*primals)
+            tangents = tangents[:2]
         else:
-            penalties, moved, worst = jax.jvp(values, primals, tangents, has_aux=True)
-        return (penalties, worst), (moved, jnp.zeros_like(worst))
+            penalties, worst, *by = slopes_by_all_in_lanes(*primals)
+        moved = jax.tree.leaves(jax.tree.map(_contracted, (*by,), tangents))
+        return (penalties, worst), (sum(moved[1:], moved[0]), jnp.zeros_like(worst))
 
-    integral.defjvp(jvp, symbolic_zeros=True)
+    integral.defjvp(slope, symbolic_zeros=True)
     return integral
+
+
+def _contracted(slope: Array, tangent: Array) -> Array:
+    """What a tangent moves each segment's penalty by, (N,)."""
+    return jnp.sum(slope * tangent, axis=tuple(range(1, slope.ndim)))
+
+
+def _is_still(tangent: Any) -> bool:
+    return all(isinstance(leaf, SymbolicZero) for leaf in jax.tree.leaves(tangent))
 
 
 def _dense(tangent: Any) -> Any:
@@ -110,13 +145,16 @@ def _dense(tangent: Any) -> Any:
 def _values(
     along: Along, columns: Array, piece_durations: Array, parameters: Any
 ) -> tuple[Array, Array]:
+    segments = jax.vmap(functools.partial(_of_segment, along), in_axes=(0, 0, None))
+    return segments(columns, piece_durations, parameters)
+
+
+def _of_segment(
+    along: Along, columns: Array, duration: Array, parameters: Any
+) -> tuple[Array, Array]:
     weights = jnp.asarray(along.weights(), columns.dtype)
     margins = jnp.asarray(np.array(along.margins)[:, None], columns.dtype)
-
-    def segment(own: Array, duration: Array) -> tuple[Array, Array]:
-        motion = sample_motion(along.maps, along.nodes, own, duration)
-        excess = jnp.stack(along.excess(motion, parameters))
-        hinges = smoothed_hinge(excess + margins, along.hinge_width)
-        return duration * jnp.sum(hinges * weights), jnp.max(excess)
-
-    return jax.vmap(segment)(columns, piece_durations)
+    motion = sample_motion(along.maps, along.nodes, columns, duration)
+    excess = jnp.stack(along.excess(motion, parameters))
+    hinges = smoothed_hinge(excess + margins, along.hinge_width)
+    return duration * jnp.sum(hinges * weights), jnp.max(excess)

@@ -8,13 +8,15 @@ several threads share the samples of one.
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+import operator
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
+from planner_jax.arithmetic import reciprocal
 from planner_jax.cost.penalty import smoothed_hinge
 from planner_jax.trajectory.polynomial import Motion
 
@@ -24,40 +26,67 @@ if TYPE_CHECKING:
 _THREADS = 128  # lanes of a block
 _ENOUGH = 512  # blocks that keep a large GPU busy
 _FEWEST = 16  # lanes that are worth a block
+_AXES = ((2,), (0, 1, 2), (0, 1, 2), (0, 1, 2))  # that a motion has of position to jerk
 
 
-def along_kernel(along: "Along", *, slopes: bool, interpret: bool = False) -> Callable:
+# What is summed up over the samples: penalties alone; also slopes by columns and durations; also
+# those by the parameters; or the derivative of all of these along a direction.
+MODES = ("values", "slopes", "slopes by all", "curvature")
+
+
+def along_kernel(along: "Along", mode: str, *, interpret: bool = False) -> Callable:
     """What `lanes.with_kernel` takes: the lanes' arrays to the lanes' results, or None.
 
     Args:
         along: constants.
-        slopes: whether slopes by columns and durations are results too.
+        mode: one of `MODES`. "curvature" takes a point and a direction, of which the parameters'
+            part may be None.
         interpret: run it without a GPU, for tests.
     """
 
     def kernel(treedef: Any, leaves: Sequence[Array]) -> list[Array] | None:
-        columns, durations, *parameters = leaves
-        *lead, num_columns, _, lanes = columns.shape
+        args = jax.tree.unflatten(treedef, leaves)
+        points = args if mode == "curvature" else (args,)
+        parameters = jax.tree.leaves([given for *_, given in points])
+        shape: Any = leaves[0].shape
+        *_, num_columns, _, lanes = shape
         threads = math.gcd(lanes, _THREADS)
-        flat = all(leaf.ndim == 1 for leaf in parameters)
-        if columns.dtype != jnp.float32 or durations.ndim != len(lead) + 1:
+        if any(leaf.dtype != jnp.float32 for leaf in leaves) or threads < _FEWEST:
             return None
-        if not flat or threads < _FEWEST:
+        if any(leaf.ndim != 1 for leaf in parameters):
             return None
-        call = _call(along, slopes, interpret, treedef, math.prod(lead), num_columns, lanes)
-        columns = columns.reshape(-1, num_columns, 3, lanes)
-        found = call(columns, durations.reshape(-1, lanes), *parameters)
-        combine = [jnp.sum, jnp.max, jnp.sum, jnp.sum]
-        found = [together(leaf, axis=0) for together, leaf in zip(combine, found, strict=False)]
+        # `vmap` may have put axes in front of a point, or of a direction alone.
+        lead: Any = jnp.broadcast_shapes(
+            *(columns.shape[:-3] for columns, *_ in points),
+            *(durations.shape[:-1] for _, durations, _ in points),
+        )
+
+        def flat(leaf: Array, *own: int) -> Array:
+            return jnp.broadcast_to(leaf, (*lead, *own, lanes)).reshape(-1, *own, lanes)
+
+        args = [(flat(c, num_columns, 3), flat(h), given) for c, h, given in points]
+        args = tuple(args) if mode == "curvature" else args[0]
+        call = _call(along, mode, interpret, treedef, math.prod(lead), num_columns, lanes)
+        found = call(*jax.tree.leaves(args))
+        found = [
+            jnp.max(x, axis=0) if k == _WORST else jnp.sum(x, axis=0) for k, x in enumerate(found)
+        ]
         return [leaf.reshape(*lead, *leaf.shape[1:]) for leaf in found]
 
     return kernel
 
 
+def _total(terms: Iterable) -> Any:
+    return functools.reduce(operator.add, terms)
+
+
+_WORST = 1  # place of the greatest excess among the results
+
+
 @functools.cache
 def _call(
     along: "Along",
-    slopes: bool,
+    mode: str,
     interpret: bool,
     treedef: Any,
     lead: int,
@@ -74,73 +103,100 @@ def _call(
     blocks = lead * lanes // threads
     shares = min(max(_ENOUGH // blocks, 1), 8)
     share = -(-num_samples // shares)
+    num_leaves = treedef.num_leaves
+    places = jax.tree.unflatten(treedef, range(num_leaves))
+    point = places[0] if mode == "curvature" else places
+    num_parameters = len(jax.tree.leaves(point[2]))
 
-    def body(columns_ref, durations_ref, *refs):
-        num_parameters = len(refs) - 2 - (4 if slopes else 2)
-        parameters = [ref[...] for ref in refs[:num_parameters]]
-        matrices_ref, weights_ref, *out = refs[num_parameters:]
-        # The tree is that of (columns, durations, parameters).
-        _, _, given = jax.tree.unflatten(treedef, [None, None, *parameters])
-        columns = [[columns_ref[c, axis] for axis in range(3)] for c in range(num_columns)]
-        duration = durations_ref[...]
-        rate = 1.0 / duration
-        rates = [jnp.ones_like(rate), rate, rate * rate, rate * rate * rate]
+    def body(*refs):
+        loaded = [
+            [[ref[c, axis] for axis in range(3)] for c in range(num_columns)]
+            if len(ref.shape) == 3
+            else ref[...]
+            for ref in refs[:num_leaves]
+        ]
+        matrices_ref, weights_ref, *out = refs[num_leaves:]
+        args = jax.tree.unflatten(treedef, loaded)
+        (columns, duration, given), direction = args if mode == "curvature" else (args, args)
 
-        def penalty(motion: Motion) -> tuple[Array, Array]:
-            excess = along.excess(motion, given)
+        def penalty(unit: list, duration: Array, given: Any) -> tuple[Array, Array]:
+            rate = reciprocal(duration)
+            rates = [None, rate, rate * rate, rate * rate * rate]
+            vel, acc, jerk = (tuple(value * rates[d] for value in unit[d]) for d in range(1, 4))
+            parts: Any = {"height": unit[0][0], "vel": vel, "acc": acc, "jerk": jerk}
+            excess = along.excess(Motion(**parts), given)
             hinges = [
                 smoothed_hinge(value + margin, along.hinge_width)
                 for value, margin in zip(excess, along.margins, strict=True)
             ]
-            return sum(hinges[1:], hinges[0]), functools.reduce(jnp.maximum, excess)
+            return duration * _total(hinges), functools.reduce(jnp.maximum, excess)
 
         def sample(k: Array, carry: tuple) -> tuple:
-            total, worst, of_columns, of_rate = carry
+            worst, sums = carry
             row = [
                 [matrices_ref[k, d * num_columns + c] for c in range(num_columns)] for d in range(4)
             ]
-            unit = [
-                [sum(row[d][c] * columns[c][axis] for c in range(num_columns)) for axis in axes]
-                for d, axes in enumerate(((2,), (0, 1, 2), (0, 1, 2), (0, 1, 2)))
-            ]
-            pos, vel, acc, jerk = (tuple(value * rates[d] for value in unit[d]) for d in range(4))
-            parts: Any = {"height": pos[0], "vel": vel, "acc": acc, "jerk": jerk}
-            motion = Motion(**parts)
             weight = weights_ref[k]
-            if not slopes:
-                value, greatest = penalty(motion)
-                return total + weight * value, jnp.maximum(worst, greatest), of_columns, of_rate
-            value, pull_back, greatest = jax.vjp(penalty, motion, has_aux=True)
-            (slope,) = pull_back(jnp.ones_like(duration) * weight)
-            by_order = ((slope.height,), slope.vel, slope.acc, slope.jerk)
-            for d in range(1, 4):
-                moved = sum(u * s for u, s in zip(unit[d], by_order[d], strict=True))
-                of_rate = of_rate + float(d) * rates[d - 1] * moved
-            scaled = [[value * rates[d] for value in by_order[d]] for d in range(4)]
-            of_columns = [
-                [
-                    of_columns[c][axis]
-                    + sum(row[d][c] * scaled[d][axis] for d in range(1, 4))
-                    + (row[0][c] * scaled[0][0] if axis == 2 else 0.0)
-                    for axis in range(3)
+
+            def unit_of(columns: list) -> list:
+                return [
+                    [
+                        _total(row[d][c] * columns[c][axis] for c in range(num_columns))
+                        for axis in axes
+                    ]
+                    for d, axes in enumerate(_AXES)
                 ]
-                for c in range(num_columns)
-            ]
-            return total + weight * value, jnp.maximum(worst, greatest), of_columns, of_rate
+
+            def slopes(*free: Any, fixed: tuple = ()) -> tuple:
+                moving: Any = lambda *free: penalty(*free, *fixed)  # noqa: E731
+                value, pull_back, greatest = jax.vjp(moving, *free, has_aux=True)
+                return greatest, weight * value, *pull_back(jnp.ones_like(value) * weight)
+
+            free = (unit_of(columns), duration)
+            if mode == "values":
+                value, greatest = penalty(*free, given)
+                found = (weight * value,)
+            elif mode == "slopes":
+                greatest, *found = slopes(*free, fixed=(given,))
+            elif mode == "slopes by all":
+                greatest, *found = slopes(*free, given)
+            else:
+                along_columns, along_duration, along_given = direction
+                tangents = (unit_of(along_columns), along_duration)
+                if along_given is None:
+                    moving: Any = lambda *free: slopes(*free, given)  # noqa: E731
+                else:
+                    moving, free, tangents = slopes, (*free, given), (*tangents, along_given)
+                _, (_, *found) = jax.jvp(moving, free, tangents)
+                greatest = worst
+            if len(found) > 1:
+                found[1] = [
+                    [
+                        _total(
+                            row[d][c] * found[1][d][axes.index(axis)]
+                            for d, axes in enumerate(_AXES)
+                            if axis in axes
+                        )
+                        for axis in range(3)
+                    ]
+                    for c in range(num_columns)
+                ]
+            return jnp.maximum(worst, greatest), list(map(jnp.add, sums, jax.tree.leaves(found)))
 
         zero = jnp.zeros_like(duration)
-        none = [[zero] * 3 for _ in range(num_columns)] if slopes else []
-        begin = (zero, jnp.full_like(duration, -jnp.inf), none, zero)
+        worst = zero if mode == "curvature" else jnp.full_like(duration, -jnp.inf)
         first = pl.program_id(2) * share
         last = jnp.minimum(first + share, num_samples)
-        total, worst, of_columns, of_rate = jax.lax.fori_loop(first, last, sample, begin)
-        out[0][...] = duration * total
-        out[1][...] = worst
-        for c, axes in enumerate(of_columns):
-            for axis, value in enumerate(axes):
-                out[2][c, axis] = duration * value
-        if slopes:
-            out[3][...] = total - duration * rate * rate * of_rate
+        num_sums = 1 + (mode != "values") * (3 * num_columns + 1) + len(out[4:])
+        worst, sums = jax.lax.fori_loop(first, last, sample, (worst, [zero] * num_sums))
+        found = iter([sums[0], worst, *sums[1:]])
+        for ref in out:
+            if len(ref.shape) == 3:
+                for c in range(num_columns):
+                    for axis in range(3):
+                        ref[c, axis] = next(found)
+            else:
+                ref[...] = next(found)
 
     def whole(*shape: int) -> pl.BlockSpec:
         return pl.BlockSpec(shape, lambda *_: (0,) * len(shape))
@@ -153,27 +209,34 @@ def _call(
     many_out = pl.BlockSpec((None, None, num_columns, 3, threads), lambda t, i, s: (s, t, 0, 0, i))
     number = jax.ShapeDtypeStruct((shares, lead, lanes), jnp.float32)
     vector = jax.ShapeDtypeStruct((shares, lead, num_columns, 3, lanes), jnp.float32)
+    by_parameters = num_parameters * (mode in ("slopes by all", "curvature"))
+    by_columns = mode != "values"
 
-    def call(columns: Array, durations: Array, *parameters: Array) -> list[Array]:
+    def call(*leaves: Array) -> list[Array]:
+        specs = {1: shared, 2: one, 4: many}
         return pl.pallas_call(
             body,
-            out_shape=[number, number, *((vector, number) if slopes else ())],
+            out_shape=[
+                *(number, number),
+                *((vector, number) if by_columns else ()),
+                *((number,) * by_parameters),
+            ],
             grid=(lead, lanes // threads, shares),
             in_specs=[
-                many,
-                one,
-                *(shared for _ in parameters),
+                *(specs[leaf.ndim] for leaf in leaves),
                 whole(num_samples, 4 * num_columns),
                 whole(num_samples),
             ],
-            out_specs=[one_out, one_out, *((many_out, one_out) if slopes else ())],
+            out_specs=[
+                *(one_out, one_out),
+                *((many_out, one_out) if by_columns else ()),
+                *((one_out,) * by_parameters),
+            ],
             compiler_params=triton.CompilerParams(num_warps=max(threads // 32, 1), num_stages=1),
             interpret=interpret,
             name="integrate_along",
         )(
-            columns,
-            durations,
-            *parameters,
+            *leaves,
             jnp.asarray(matrices.reshape(num_samples, -1), jnp.float32),
             jnp.asarray(weights, jnp.float32),
         )

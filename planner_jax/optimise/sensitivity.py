@@ -5,8 +5,8 @@ For a number q(u, theta) of a plan, where u minimises cost(u, theta),
     dq/dtheta = q_theta - lambda^T cost_utheta,   cost_uu lambda = q_u,
 
 the adjoint form of the implicit function theorem. lambda comes from a few steps of conjugate
-gradients (Hestenes and Stiefel 1952). One reverse pass through the slope of the cost along a
-direction p yields both p^T cost_uu and p^T cost_utheta, so that the gradient is summed up along
+gradients (Hestenes and Stiefel 1952). The derivative of all slopes of the cost along a direction
+p of the point holds both p^T cost_uu and p^T cost_utheta, so that the gradient is summed up along
 with lambda. A planner whose cost has a cheap part (`Planner.core`, see `CorePlanner`) is
 preconditioned with that part's curvature.
 """
@@ -30,16 +30,20 @@ _CURVATURES = ("core", "whole")
 
 @runtime_checkable
 class CorePlanner(Protocol):
-    """A planner that says which part of its cost can be looked at cheaply."""
-
-    def core(self, point: Array, context: Any) -> Array:
-        """The cost without what has to be sampled along the trajectory, ()."""
-        ...
+    """A planner that says how the part of its cost bends which can be looked at cheaply."""
 
     def core_blocks(self, size: int) -> np.ndarray:
         """Places (K, k) in a point (size,) of the variables that the core couples.
 
         In the others it is a sum of squares, with a factor each.
+        """
+        ...
+
+    def core_curvature(self, point: Array, context: Any) -> tuple[Array, Array]:
+        """The core's second derivatives: in the blocks (K, k, k), and by the others, (n,).
+
+        The core is the cost without what has to be sampled along the trajectory. What is
+        said of the others in the places of the blocks does not matter.
         """
         ...
 
@@ -207,24 +211,22 @@ def gradient_at(
 
     value, (along_point, by_context) = jax.value_and_grad(value_of, argnums=(0, 1))(point, smooth)
 
-    @functools.partial(jax.grad, argnums=(0, 1))
-    def products(x: Array, smooth: list, direction: Array) -> Array:
-        """(p^T cost_uu, p^T cost_uc) as the gradient of the slope along p."""
-        return jax.jvp(lambda y: cost(y, smooth), (x,), (direction,))[1]
+    def products(direction: Array) -> tuple[Array, list]:
+        """(p^T cost_uu, p^T cost_uc) as the derivative of the slopes along p."""
+        slopes = lambda x: jax.grad(cost, argnums=(0, 1))(x, smooth)  # noqa: E731
+        return jax.jvp(slopes, (point,), (direction,))[1]
 
     if steps == 0:
         solve = lambda rhs: rhs  # noqa: E731
     elif curvature == "whole":
-        hessian = jax.vmap(lambda unit: products(point, smooth, unit)[0])(
+        hessian = jax.vmap(lambda unit: products(unit)[0])(
             jnp.eye(point.shape[0], dtype=point.dtype)
         )
         inverse = _positive_inverse(hessian)
         solve = lambda rhs: jnp.sum(inverse * rhs, axis=1)  # noqa: E731
     else:
         solve = _core_inverse(planner, point, context)
-    by_context, residual = _adjoint(
-        lambda p: products(point, smooth, p), solve, along_point, by_context, steps
-    )
+    by_context, residual = _adjoint(products, solve, along_point, by_context, steps)
     taken = iter(by_context)
     both = zip(leaves, is_smooth, strict=True)
     cotangent = [
@@ -274,23 +276,10 @@ def _core_inverse(planner: Any, point: Array, context: Any) -> Callable[[Array],
     blocks = planner.core_blocks(point.shape[0])
     inside = np.zeros(point.shape[0], bool)
     inside[blocks.ravel()] = True
-    coupled = blocks.ravel()
-
-    def slope(x: Array) -> Array:
-        return jax.grad(lambda y: planner.core(y, context))(x)
-
-    # As constants, so that the lanes share them: unit vectors, and ones for the others.
-    units = np.concatenate([np.eye(point.shape[0])[coupled], ~inside[None]])
-    tangent = lambda unit: jax.jvp(slope, (point,), (unit,))[1]  # noqa: E731
-    *rows, row_of_others = jax.vmap(tangent)(jnp.asarray(units, point.dtype))
-    # What the core couples is not looked at here.
+    within, row_of_others = planner.core_curvature(point, context)
     largest = jnp.max(jnp.where(inside, 0.0, jnp.abs(row_of_others)))
     size_of_others = jnp.maximum(jnp.abs(row_of_others), 1e-6 * largest + 1e-20)
-    within = jnp.stack(rows).reshape(*blocks.shape, -1)  # (K, k, n)
-    inverses = [
-        _positive_inverse(jnp.stack([matrix[:, j] for j in block], axis=1))
-        for block, matrix in zip(blocks, within, strict=True)
-    ]
+    inverses = [_positive_inverse(block) for block in within]
 
     def solve(rhs: Array) -> Array:
         entries, found = tuple(rhs), list(rhs / size_of_others)
@@ -301,6 +290,30 @@ def _core_inverse(planner: Any, point: Array, context: Any) -> Callable[[Array],
         return jnp.stack(found)
 
     return solve
+
+
+def curvature_by_tangents(
+    core: Callable[[Array], Array], blocks: np.ndarray, point: Array
+) -> tuple[Array, Array]:
+    """`CorePlanner.core_curvature` of a core, a tangent of its slope for each coupled variable.
+
+    Args:
+        core: of a point, ().
+        blocks: (K, k), that of the planner.
+        point: (n,).
+    """
+    inside = np.zeros(point.shape[0], bool)
+    inside[blocks.ravel()] = True
+    # As constants, so that the lanes share them: unit vectors, and ones for the others.
+    units = np.concatenate([np.eye(point.shape[0])[blocks.ravel()], ~inside[None]])
+    tangent = lambda unit: jax.jvp(jax.grad(core), (point,), (unit,))[1]  # noqa: E731
+    *rows, row_of_others = jax.vmap(tangent)(jnp.asarray(units, point.dtype))
+    within = jnp.stack(rows).reshape(*blocks.shape, -1)  # (K, k, n)
+    found = [
+        jnp.stack([matrix[:, j] for j in block], axis=1)
+        for block, matrix in zip(blocks, within, strict=True)
+    ]
+    return jnp.stack(found), row_of_others
 
 
 def _positive_inverse(matrix: Array) -> Array:

@@ -20,6 +20,7 @@ from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
 from planner_jax.optimise.multistart import FEASIBILITY_TOLERANCE
 from planner_jax.optimise.problem import Round
 from planner_jax.optimise.scaling import shipped_scale
+from planner_jax.optimise.sensitivity import curvature_by_tangents
 from planner_jax.robot.quadrotor import body_z, tangent_basis
 from planner_jax.task.catch.chain import (
     CatchContext,
@@ -276,6 +277,12 @@ class ExactCatch:
         """The variables after the waypoint offsets of every segment, (N, 12)."""
         one = np.arange(self.num_offsets, len(self.scale))
         return np.arange(0, size, len(self.scale))[:, None] + one
+
+    def core_curvature(self, point: Array, context: CatchContext) -> tuple[Array, Array]:
+        """Hessian of the core in its blocks, (N, 12, 12), and of the offsets, (n,)."""
+        return curvature_by_tangents(
+            lambda x: self.core(x, context), self.core_blocks(point.size), point
+        )
 
     def residuals(self, point: Array, context: CatchContext) -> Array:
         """Squared hinges, energy and time as residuals, for `measure_scale`.
