@@ -8,6 +8,7 @@ and the product with a constant matrix is one large product. Same numbers, anoth
 
 import dataclasses
 import functools
+import zlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -92,7 +93,11 @@ def with_kernel(function: Callable, kernel: Kernel, jvp: Callable | None = None)
 
     @functools.cache
     def compiled(treedef: Any, shapes: tuple) -> Callable:
-        name = f"kernel_{len(_KERNELS)}"
+        # The same in every process, or kept programs would not be found again.
+        own = getattr(function, "__qualname__", type(function).__name__)
+        name = f"kernel_{zlib.crc32(repr((own, treedef, shapes)).encode()):08x}"
+        while name in _KERNELS:
+            name += "_"
         here = _KERNELS[name] = _Named(treedef, kernel, [])
 
         def named(*leaves: Array) -> Any:
