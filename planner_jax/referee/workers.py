@@ -29,8 +29,7 @@ class _Worker:
             env={
                 **os.environ,
                 "PYTHONPATH": os.pathsep.join(sys.path),
-                "OPENBLAS_NUM_THREADS": "1",
-                "OMP_NUM_THREADS": "1",
+                **_ENVIRONMENT,
             },
         )
 
@@ -51,9 +50,10 @@ class _Worker:
 
     def stop(self) -> None:
         """Let the process end: it does when there is no more to read."""
-        assert self._process.stdin is not None
+        assert self._process.stdin is not None and self._process.stdout is not None
         self._process.stdin.close()
         self._process.wait()
+        self._process.stdout.close()
 
 
 class Workers:

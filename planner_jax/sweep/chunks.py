@@ -19,7 +19,6 @@ from planner_jax.sweep.summary import percent
 from planner_jax.sweep.task import SweepTask
 from planner_jax.sweep.timing import CompileClock, Stopwatch
 
-_DRAWN = 2  # chunks that are drawn while one is planned
 _UNDER_WAY = 2  # chunks that are judged or written while the next is planned
 _MEASURED = {
     "compile_seconds": "JAX tracing, lowering, compiling or reading its cache, while chunks were "
@@ -79,7 +78,7 @@ def plan_chunks(run: SweepRun, *, progress: bool) -> dict[str, Any]:
 def _in_pipeline(run: SweepRun) -> Iterator[tuple[pa.Table, dict[str, Any] | None]]:
     """Rows of every chunk in order, and the record of those that had no part.
 
-    While one chunk is planned the next two are drawn, the one before is judged, and the one before
+    While one chunk is planned the next is drawn, the one before is judged, and the one before
     that is written.
     """
     folder, source, watch = run.folder, run.source, Stopwatch()
@@ -88,10 +87,11 @@ def _in_pipeline(run: SweepRun) -> Iterator[tuple[pa.Table, dict[str, Any] | Non
     with (
         folder.joining_parts() as join,
         CompileClock() as clock,
-        ThreadPoolExecutor(_DRAWN) as drawers,
-        ThreadPoolExecutor(1) as judge,
-        ThreadPoolExecutor(1) as writer,
+        # Left in the opposite order: what has been planned is still judged, written and joined.
         ThreadPoolExecutor(1) as joiner,
+        ThreadPoolExecutor(1) as writer,
+        ThreadPoolExecutor(1) as judge,
+        ThreadPoolExecutor(1) as drawer,
     ):
 
         def write(judged: Future) -> tuple[pa.Table, dict[str, Any] | None]:
@@ -103,13 +103,13 @@ def _in_pipeline(run: SweepRun) -> Iterator[tuple[pa.Table, dict[str, Any] | Non
             return rows, record
 
         missing = iter([chunk for chunk, is_there in enumerate(there) if not is_there])
-        drawn = deque(drawers.submit(source.chunk, chunk) for chunk in islice(missing, _DRAWN))
+        drawn = deque(drawer.submit(source.chunk, chunk) for chunk in islice(missing, 1))
         for chunk, is_there in enumerate(there):
             if is_there:
                 judged = judge.submit(lambda k=chunk: (k, folder.read_part(k), None))
             else:
                 cases = drawn.popleft().result()
-                drawn.extend(drawers.submit(source.chunk, k) for k in islice(missing, 1))
+                drawn.extend(drawer.submit(source.chunk, k) for k in islice(missing, 1))
                 planned = _plan_chunk(run, cases, clock)
                 judged = judge.submit(_judge_chunk, run, chunk, planned, watch)
             pending.append(writer.submit(write, judged))
