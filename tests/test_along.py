@@ -132,6 +132,7 @@ def test_the_kernel_gives_the_same_numbers(mode):
         np.testing.assert_allclose(ours, theirs, rtol=2e-4, atol=2e-5 * scale)
 
 
+@pytest.mark.slow
 def test_derivatives_in_lanes_are_those_without_a_kernel(monkeypatch):
     """Slopes and curvature by kernels, `vmap` of them, and what reverse mode makes of them."""
     used = []

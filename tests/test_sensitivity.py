@@ -193,7 +193,10 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("options", [{"margin": 0.4}, {"drag_after_impact": True}])
+@pytest.mark.parametrize(
+    "options",
+    [{"margin": 0.4}, pytest.param({"drag_after_impact": True}, marks=pytest.mark.slow)],
+)
 def test_curvature_of_the_core_in_closed_form_is_that_of_tangents(options, float64):
     planner, scenario = ExactHit(proportions=PIECES, **options), first(easy_hit_case())
 
