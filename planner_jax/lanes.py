@@ -8,6 +8,7 @@ and the product with a constant matrix is one large product. Same numbers, anoth
 
 import dataclasses
 import functools
+import math
 import zlib
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -79,6 +80,7 @@ class _Named:
 
 
 _KERNELS: dict[str, _Named] = {}
+_FEWEST = 16  # lanes that are worth a block of a kernel
 
 
 def with_kernel(function: Callable, kernel: Kernel, jvp: Callable | None = None) -> Callable:
@@ -134,6 +136,15 @@ def _has_kernel(eqn: JaxprEqn) -> bool:
     return len(shapes) == len(named.shapes) and all(
         full[len(full) - len(own) :] == own for full, own in zip(shapes, named.shapes, strict=True)
     )
+
+
+def block_width(lanes: int, most: int) -> int | None:
+    """Lanes of a kernel's block: `most`, a power of two, or as many as divide all evenly.
+
+    None where that would be too few to be worth a block.
+    """
+    width = math.gcd(lanes, most)
+    return width if width >= _FEWEST else None
 
 
 class _Lanes:

@@ -5,7 +5,6 @@ hundred launches, which a small batch waits for; here a thread flies a ball to t
 """
 
 import functools
-import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -14,9 +13,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from planner_jax.ball.flight import BallState, rk4_step
+from planner_jax.lanes import block_width
 
 _THREADS = 32  # lanes of a block
-_FEWEST = 16  # lanes that are worth a block
 
 
 def table_kernel(num_nodes: int, *, interpret: bool = False) -> Callable:
@@ -31,19 +30,19 @@ def table_kernel(num_nodes: int, *, interpret: bool = False) -> Callable:
         pos, _, *numbers = leaves
         if pos.ndim != 2 or pos.dtype != jnp.float32 or any(x.ndim != 1 for x in numbers):
             return None
-        if math.gcd(pos.shape[1], _THREADS) < _FEWEST:
+        lanes = pos.shape[1]
+        threads = block_width(lanes, _THREADS)
+        if threads is None:
             return None
-        return _call(num_nodes, pos.shape[1], interpret)(*leaves)
+        return _call(num_nodes, lanes, threads, interpret)(*leaves)
 
     return kernel
 
 
 @functools.cache
-def _call(num_nodes: int, lanes: int, interpret: bool) -> Callable:
+def _call(num_nodes: int, lanes: int, threads: int, interpret: bool) -> Callable:
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
-
-    threads = math.gcd(lanes, _THREADS)
 
     def body(pos, vel, resolution, drag, gravity, pos_out, vel_out):
         step, drag, gravity = resolution[...], drag[...], gravity[...]

@@ -18,6 +18,7 @@ from jax import Array
 
 from planner_jax.arithmetic import reciprocal
 from planner_jax.cost.penalty import smoothed_hinge
+from planner_jax.lanes import block_width
 from planner_jax.trajectory.polynomial import Motion
 
 if TYPE_CHECKING:
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
 
 _THREADS = 128  # lanes of a block
 _ENOUGH = 512  # blocks that keep a large GPU busy
-_FEWEST = 16  # lanes that are worth a block
 _AXES = ((2,), (0, 1, 2), (0, 1, 2), (0, 1, 2))  # that a motion has of position to jerk
 
 
@@ -50,8 +50,8 @@ def along_kernel(along: "Along", mode: str, *, interpret: bool = False) -> Calla
         parameters = jax.tree.leaves([given for *_, given in points])
         shape: Any = leaves[0].shape
         *_, num_columns, _, lanes = shape
-        threads = math.gcd(lanes, _THREADS)
-        if any(leaf.dtype != jnp.float32 for leaf in leaves) or threads < _FEWEST:
+        threads = block_width(lanes, _THREADS)
+        if any(leaf.dtype != jnp.float32 for leaf in leaves) or threads is None:
             return None
         if any(leaf.ndim != 1 for leaf in parameters):
             return None
@@ -66,7 +66,8 @@ def along_kernel(along: "Along", mode: str, *, interpret: bool = False) -> Calla
 
         args = [(flat(c, num_columns, 3), flat(h), given) for c, h, given in points]
         args = tuple(args) if mode == "curvature" else args[0]
-        call = _call(along, mode, interpret, treedef, math.prod(lead), num_columns, lanes)
+        sizes = math.prod(lead), num_columns, lanes, threads
+        call = _call(along, mode, interpret, treedef, *sizes)
         found = call(*jax.tree.leaves(args))
         found = [
             jnp.max(x, axis=0) if k == _WORST else jnp.sum(x, axis=0) for k, x in enumerate(found)
@@ -92,12 +93,12 @@ def _call(
     lead: int,
     num_columns: int,
     lanes: int,
+    threads: int,
 ) -> Callable:
     """The kernel for `lead` trajectories of each of `lanes` lanes."""
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
 
-    threads = math.gcd(lanes, _THREADS)
     matrices, weights = along.matrices(), along.weights()
     num_samples = len(weights)
     blocks = lead * lanes // threads

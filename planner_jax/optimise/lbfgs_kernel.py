@@ -5,7 +5,6 @@ of threads keeps its lanes' gradient in registers and reads every pair twice.
 """
 
 import functools
-import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -13,8 +12,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from planner_jax.lanes import block_width
+
 _LANES = 32  # of a block
-_FEWEST = 16  # lanes that are worth a block
 
 
 def turn_kernel(num_pairs: int, step_cap: float, *, interpret: bool = False) -> Callable:
@@ -28,20 +28,22 @@ def turn_kernel(num_pairs: int, step_cap: float, *, interpret: bool = False) -> 
 
     def kernel(treedef: Any, leaves: Sequence[Array]) -> list[Array] | None:
         grad = leaves[-1]
-        if grad.ndim != 2 or grad.dtype != jnp.float32 or math.gcd(grad.shape[1], _LANES) < _FEWEST:
+        width = block_width(grad.shape[-1], _LANES)
+        if grad.ndim != 2 or grad.dtype != jnp.float32 or width is None:
             return None
-        return _call(num_pairs, step_cap, *grad.shape, interpret)(*leaves)
+        return _call(num_pairs, step_cap, *grad.shape, width, interpret)(*leaves)
 
     return kernel
 
 
 @functools.cache
-def _call(num_pairs: int, step_cap: float, n: int, lanes: int, interpret: bool) -> Callable:
+def _call(
+    num_pairs: int, step_cap: float, n: int, lanes: int, width: int, interpret: bool
+) -> Callable:
     """The kernel for vectors of n on `lanes` lanes."""
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
 
-    width = math.gcd(lanes, _LANES)
     height = 1 << (n - 1).bit_length()  # a block's rows are a power of two
 
     def body(steps, changes, inverses, step, change, grad, *out):

@@ -5,7 +5,6 @@ import sys
 from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -102,15 +101,16 @@ def _in_pipeline(run: SweepRun) -> Iterator[tuple[pa.Table, dict[str, Any] | Non
             joined.result()
             return rows, record
 
-        missing = iter([chunk for chunk, is_there in enumerate(there) if not is_there])
-        drawn = deque(drawer.submit(source.chunk, chunk) for chunk in islice(missing, 1))
+        missing = [chunk for chunk, is_there in enumerate(there) if not is_there]
+        draws = (drawer.submit(source.chunk, chunk) for chunk in missing)
+        following = next(draws, None)
         for chunk, is_there in enumerate(there):
             if is_there:
                 judged = judge.submit(lambda k=chunk: (k, folder.read_part(k), None))
             else:
-                cases = drawn.popleft().result()
-                drawn.extend(drawer.submit(source.chunk, k) for k in islice(missing, 1))
-                planned = _plan_chunk(run, cases, clock)
+                drawn, following = following, next(draws, None)
+                assert drawn is not None
+                planned = _plan_chunk(run, drawn.result(), clock)
                 judged = judge.submit(_judge_chunk, run, chunk, planned, watch)
             pending.append(writer.submit(write, judged))
             if len(pending) > _UNDER_WAY:
