@@ -12,6 +12,7 @@ from jax import Array
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
 from planner_jax.optimise.problem import Round
 from planner_jax.optimise.status import Status, is_solved
+from planner_jax.task import batch
 from planner_jax.task.solve import plan, plan_across_processes
 
 
@@ -134,7 +135,10 @@ def test_a_round_needs_a_start():
         Round(0, LbfgsConfig())
 
 
-def test_arrays_on_a_device_stay_there_and_give_the_same_plans():
+@pytest.mark.parametrize("apart", [False, True], ids=["in host memory", "as on a GPU"])
+def test_arrays_on_a_device_stay_there_and_give_the_same_plans(apart, monkeypatch):
+    if apart:
+        monkeypatch.setattr(batch, "_is_one_cpu", lambda mesh: False)
     goals = np.linspace(-1.0, 5.0, 41).astype(np.float32)
     host = plan(WellPlanner(), Well(goals), chunk=16)
     resident = plan(WellPlanner(), Well(jnp.asarray(goals)), chunk=16)

@@ -43,7 +43,10 @@ def plan_batch(
     """
     mesh = Mesh(np.array(jax.local_devices() if devices is None else devices), ("lanes",))
     resident = all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(scenarios))
-    return (_plan_resident if resident else _plan_from_host)(planner, scenarios, chunk, mesh)
+    if resident and not _is_one_cpu(mesh):
+        return _plan_resident(planner, scenarios, chunk, mesh)
+    plans = _plan_from_host(planner, scenarios, chunk, mesh)
+    return jax.device_put(plans, _sharding(mesh)) if resident else plans
 
 
 def _plan_from_host(planner: Planner, scenarios: Any, chunk: int | None, mesh: Mesh) -> Any:
@@ -104,6 +107,11 @@ def _first_plans(planner: Planner, attempt: Round, scenarios: Any, chunk: int, m
     return _joined_locally(mesh, found, share)
 
 
+def _is_one_cpu(mesh: Mesh) -> bool:
+    """Whether the only device is the host itself, whose memory needs no transfer."""
+    return mesh.size == 1 and mesh.devices[0].platform == "cpu"
+
+
 def _length(tree: Any) -> int:
     return jax.tree.leaves(tree)[0].shape[0]
 
@@ -159,9 +167,11 @@ def _placed(tree: Any, mesh: Mesh) -> Any:
 def _solved_from_host(
     planner: Planner, attempt: Round, scenarios: Any, calls: list[np.ndarray], mesh: Mesh
 ) -> list[Any]:
-    """One round on the lanes of every call; on one CPU device a thread for each core."""
-    one_cpu = mesh.size == 1 and mesh.devices[0].platform == "cpu"
-    threads = min(len(calls), os.cpu_count() or 1) if one_cpu else 1
+    """One round on the lanes of every call; on one CPU device with a thread for each core.
+
+    One thread more hands over the next call while the others compute.
+    """
+    threads = min(len(calls), (os.cpu_count() or 1) + 1) if _is_one_cpu(mesh) else 1
     placed = _sharding(mesh)
 
     def solve(lanes: np.ndarray) -> Any:
