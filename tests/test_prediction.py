@@ -248,3 +248,21 @@ def test_the_kernel_gives_the_same_table():
     )(*args)
     np.testing.assert_allclose(found[0], table.pos, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(found[1], table.vel, rtol=1e-5, atol=1e-5)
+
+
+def test_the_kernel_gives_the_same_derivatives_of_the_table():
+    """By velocity, resolution and drag, in that order."""
+    random = np.random.default_rng(6)
+    lanes, nodes, moving = 32, 9, (1, 2, 3)
+    pos, vel = random.uniform(-3.0, 3.0, (2, 3, lanes)).astype(np.float32)
+    step, drag = (random.uniform(*ends, lanes).astype(np.float32) for ends in ((0.01, 0.1), (0, 0.3)))
+    args = [jnp.asarray(x) for x in (pos, vel, step, drag, np.full(lanes, 9.8, np.float32))]
+    found = table_kernel(nodes, moving, interpret=True)(None, args)
+
+    def table(p, v, step, drag, g):
+        path = predict_path(BallState(p, v), step * (nodes - 3), drag, g, num_nodes=nodes)
+        return path.pos, path.vel
+
+    slopes = jax.vmap(jax.jacrev(table, argnums=moving), in_axes=-1, out_axes=-1)(*args)
+    for ours, expected in zip(found, jax.tree.leaves(slopes), strict=True):
+        np.testing.assert_allclose(ours, expected, rtol=1e-4, atol=1e-5)

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array
+from jax.custom_derivatives import SymbolicZero
 
 from planner_jax.arithmetic import reciprocal
 from planner_jax.ball.flight import BallState, rk4_step
@@ -54,7 +55,11 @@ def predict_path(
 
 @functools.cache
 def _integrated(num_nodes: int) -> Callable:
-    """Positions and velocities (N, 3) at the nodes, with a kernel for many lanes."""
+    """Positions and velocities (N, 3) at the nodes, with a kernel for many lanes.
+
+    They are differentiated forward, along with the flight, whatever JAX asks for: there are few
+    numbers to differentiate by, and nothing has to be kept for a way back.
+    """
 
     def integrated(
         pos: Array, vel: Array, resolution: Array, drag: Array, gravity: Array
@@ -72,7 +77,29 @@ def _integrated(num_nodes: int) -> Callable:
         )
         return nodes.pos, nodes.vel
 
-    return with_kernel(integrated, table_kernel(num_nodes))
+    @functools.cache
+    def slopes(moving: tuple[int, ...]) -> Callable:
+        """Derivatives of positions, then of velocities, by some arguments."""
+        return with_kernel(
+            jax.jacfwd(integrated, argnums=moving), table_kernel(num_nodes, moving)
+        )
+
+    def moved(primals: tuple, tangents: tuple) -> tuple:
+        nodes = integrated_in_lanes(*primals)
+        moving = tuple(k for k, t in enumerate(tangents) if not isinstance(t, SymbolicZero))
+        further = tuple(k for k in moving if k > 0)
+        found = [jnp.zeros_like(leaf) for leaf in nodes]
+        if 0 in moving:  # the whole path moves with its first point
+            found[0] = found[0] + tangents[0]
+        if further:
+            for k, by in enumerate(slopes(further)(*primals)):
+                for place, slope in zip(further, by, strict=True):
+                    along = slope * tangents[place]
+                    found[k] = found[k] + (along if place > 1 else jnp.sum(along, axis=-1))
+        return nodes, tuple(found)
+
+    integrated_in_lanes = with_kernel(integrated, table_kernel(num_nodes), jvp=moved)
+    return integrated_in_lanes
 
 
 def horizon_of(table: PathTable) -> Array:

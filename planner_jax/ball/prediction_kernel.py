@@ -1,11 +1,13 @@
 """The table of a ball in flight on many lanes as one kernel for CUDA, in Pallas' Triton.
 
 A step needs the one before it. As operations of their own the steps of a table are some three
-hundred launches, which a small batch waits for; here a thread flies a ball to the end.
+hundred launches, which a small batch waits for; here a thread flies a ball to the end, and where
+derivatives are asked for, these along with it.
 """
 
+import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import jax
@@ -16,13 +18,19 @@ from planner_jax.ball.flight import BallState, rk4_step
 from planner_jax.lanes import block_width
 
 _THREADS = 32  # lanes of a block
+_VEL = 1  # place of the velocity among the arguments; numbers follow it
 
 
-def table_kernel(num_nodes: int, *, interpret: bool = False) -> Callable:
+def table_kernel(
+    num_nodes: int, moving: tuple[int, ...] = (), *, interpret: bool = False
+) -> Callable:
     """What `lanes.with_kernel` takes for the states at the nodes of a `PathTable`.
 
     Args:
         num_nodes: N.
+        moving: places among the arguments, all but the position's. With some, the kernel gives
+            derivatives by them instead of the states: those of all positions, then of all
+            velocities, each (N, 3), and by the velocity (N, 3, 3).
         interpret: run it without a GPU, for tests.
     """
 
@@ -34,45 +42,82 @@ def table_kernel(num_nodes: int, *, interpret: bool = False) -> Callable:
         threads = block_width(lanes, _THREADS)
         if threads is None:
             return None
-        return _call(num_nodes, lanes, threads, interpret)(*leaves)
+        return _call(num_nodes, moving, lanes, threads, interpret)(*leaves)
 
     return kernel
 
 
+@dataclasses.dataclass(frozen=True)
+class _Direction:
+    """One number by which the states are differentiated."""
+
+    result: int  # which result holds the positions' derivatives; those of velocities follow
+    index: tuple[int, ...]  # its place there, behind node and axis
+    vel: tuple[float, ...]  # (3,) what the velocity at time 0 moves by
+    numbers: tuple[float, ...]  # (3,) what resolution, drag and gravity move by
+
+
+def _directions(moving: tuple[int, ...]) -> list[_Direction]:
+    still = (0.0, 0.0, 0.0)
+    units = [tuple(float(j == k) for j in range(3)) for k in range(3)]
+    found = []
+    for result, place in enumerate(moving):
+        if place == _VEL:
+            found += [_Direction(result, (k,), unit, still) for k, unit in enumerate(units)]
+        else:
+            found.append(_Direction(result, (), still, units[place - _VEL - 1]))
+    return found
+
+
 @functools.cache
-def _call(num_nodes: int, lanes: int, threads: int, interpret: bool) -> Callable:
+def _call(
+    num_nodes: int, moving: tuple[int, ...], lanes: int, threads: int, interpret: bool
+) -> Callable:
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
 
-    def body(pos, vel, resolution, drag, gravity, pos_out, vel_out):
-        step, drag, gravity = resolution[...], drag[...], gravity[...]
-        vectors: Any = {
-            "pos": tuple(pos[k] for k in range(3)),
-            "vel": tuple(vel[k] for k in range(3)),
-        }
-        ball = BallState(**vectors)
+    directions = _directions(moving)
+    shapes = [(num_nodes, 3, 3) if place == _VEL else (num_nodes, 3) for place in moving]
+    shapes = 2 * (shapes or [(num_nodes, 3)])  # of positions, of velocities
 
-        def write(node: Any, state: Any) -> None:
-            for k in range(3):
-                pos_out[node, k], vel_out[node, k] = state.pos[k], state.vel[k]
+    def body(pos, vel, resolution, drag, gravity, *out):
+        numbers = resolution[...], drag[...], gravity[...]
+        zero = jnp.zeros_like(numbers[0])
 
-        def advance(node: Array, state: BallState) -> BallState:
-            write(node, state)
-            return rk4_step(state, step, drag, gravity)
+        def full(values: Iterable) -> Any:
+            return tuple(zero + value for value in values)
 
-        write(0, rk4_step(ball, -step, drag, gravity))
-        write(num_nodes - 1, jax.lax.fori_loop(1, num_nodes - 1, advance, ball))
+        def flown(ball: BallState, moved: list[BallState], sign: float = 1.0) -> tuple:
+            step: Any = lambda ball, h, *others: rk4_step(ball, sign * h, *others)  # noqa: E731
+            after, push = jax.linearize(step, ball, *numbers)
+            pairs = zip(moved, directions, strict=True)
+            return after, [push(state, *full(way.numbers)) for state, way in pairs]
 
-    vector = pl.BlockSpec((3, threads), lambda i: (0, i))
-    number = pl.BlockSpec((threads,), lambda i: (i,))
-    nodes = pl.BlockSpec((num_nodes, 3, threads), lambda i: (0, 0, i))
-    shape = jax.ShapeDtypeStruct((num_nodes, 3, lanes), jnp.float32)
+        def write(node: Any, ball: BallState, moved: list[BallState]) -> None:
+            ways = [(way.result, way.index) for way in directions] or [(0, ())]
+            for (result, index), state in zip(ways, moved or [ball], strict=True):
+                for k in range(3):
+                    out[result][node, k, *index] = state.pos[k]
+                    out[result + len(out) // 2][node, k, *index] = state.vel[k]
+
+        def advance(node: Array, carry: tuple) -> tuple:
+            write(node, *carry)
+            return flown(*carry)
+
+        ball = BallState(full(pos[k] for k in range(3)), full(vel[k] for k in range(3)))
+        moved = [BallState(full((0.0, 0.0, 0.0)), full(way.vel)) for way in directions]
+        write(0, *flown(ball, moved, -1.0))
+        write(num_nodes - 1, *jax.lax.fori_loop(1, num_nodes - 1, advance, (ball, moved)))
+
+    def by_lanes(*shape: int) -> pl.BlockSpec:
+        return pl.BlockSpec((*shape, threads), lambda i: (*(0 for _ in shape), i))
+
     return pl.pallas_call(
         body,
-        out_shape=[shape, shape],
+        out_shape=[jax.ShapeDtypeStruct((*shape, lanes), jnp.float32) for shape in shapes],
         grid=(lanes // threads,),
-        in_specs=[vector, vector, number, number, number],
-        out_specs=[nodes, nodes],
+        in_specs=[by_lanes(3), by_lanes(3), by_lanes(), by_lanes(), by_lanes()],
+        out_specs=[by_lanes(*shape) for shape in shapes],
         compiler_params=triton.CompilerParams(num_warps=1, num_stages=1),
         interpret=interpret,
         name="flight_table",
