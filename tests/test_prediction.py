@@ -255,7 +255,9 @@ def test_the_kernel_gives_the_same_derivatives_of_the_table():
     random = np.random.default_rng(6)
     lanes, nodes, moving = 32, 9, (1, 2, 3)
     pos, vel = random.uniform(-3.0, 3.0, (2, 3, lanes)).astype(np.float32)
-    step, drag = (random.uniform(*ends, lanes).astype(np.float32) for ends in ((0.01, 0.1), (0, 0.3)))
+    step, drag = (
+        random.uniform(*ends, lanes).astype(np.float32) for ends in ((0.01, 0.1), (0, 0.3))
+    )
     args = [jnp.asarray(x) for x in (pos, vel, step, drag, np.full(lanes, 9.8, np.float32))]
     found = table_kernel(nodes, moving, interpret=True)(None, args)
 

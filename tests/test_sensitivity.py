@@ -10,15 +10,16 @@ import pytest
 from flax import struct
 
 from planner_jax.optimise.implicit import newton_refine
+from planner_jax.optimise.inverse_kernel import inverse_kernel
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
 from planner_jax.optimise.multistart import minimise
 from planner_jax.optimise.problem import Round
 from planner_jax.optimise.sensitivity import (
-    _positive_inverse,
     _with_part,
     curvature_by_tangents,
     gradient_at,
     part_of,
+    positive_inverse,
 )
 from planner_jax.task.catch.decide import decided, greedy
 from planner_jax.task.catch.exact import ExactCatch
@@ -116,10 +117,21 @@ def test_a_batch_is_its_lanes_and_a_broken_lane_spoils_no_other(bowls):
 
 def test_a_matrix_that_is_not_positive_has_a_finite_inverse(float64):
     np.testing.assert_allclose(
-        _positive_inverse(jnp.asarray(CURVED)) @ CURVED, np.eye(3), atol=1e-12
+        positive_inverse(jnp.asarray(CURVED)) @ CURVED, np.eye(3), atol=1e-12
     )
-    broken = _positive_inverse(jnp.asarray(CURVED - 1.5 * np.eye(3)))
+    broken = positive_inverse(jnp.asarray(CURVED - 1.5 * np.eye(3)))
     assert np.isfinite(broken).all()
+
+
+def test_the_kernel_gives_the_same_inverses():
+    random = np.random.default_rng(3)
+    roots = random.normal(size=(16, 5, 5))
+    matrices = roots @ roots.transpose(0, 2, 1) + 0.1 * np.eye(5)
+    matrices[3] -= 2.0 * np.eye(5)  # not positive
+    lanes = jnp.asarray(np.moveaxis(matrices, 0, -1), jnp.float32)
+    (found,) = inverse_kernel(interpret=True)(None, [lanes])
+    expected = jax.vmap(positive_inverse, in_axes=-1, out_axes=-1)(lanes)
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4)
 
 
 @pytest.mark.parametrize(

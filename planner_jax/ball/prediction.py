@@ -80,9 +80,7 @@ def _integrated(num_nodes: int) -> Callable:
     @functools.cache
     def slopes(moving: tuple[int, ...]) -> Callable:
         """Derivatives of positions, then of velocities, by some arguments."""
-        return with_kernel(
-            jax.jacfwd(integrated, argnums=moving), table_kernel(num_nodes, moving)
-        )
+        return with_kernel(jax.jacfwd(integrated, argnums=moving), table_kernel(num_nodes, moving))
 
     def moved(primals: tuple, tangents: tuple) -> tuple:
         nodes = integrated_in_lanes(*primals)

@@ -22,6 +22,8 @@ import numpy as np
 from flax import struct
 from jax import Array
 
+from planner_jax.lanes import with_kernel
+from planner_jax.optimise.inverse_kernel import inverse_kernel
 from planner_jax.optimise.problem import Planner, Round
 
 Quantity = str | Callable[[Any], Array]
@@ -222,7 +224,7 @@ def gradient_at(
         hessian = jax.vmap(lambda unit: products(unit)[0])(
             jnp.eye(point.shape[0], dtype=point.dtype)
         )
-        inverse = _positive_inverse(hessian)
+        inverse = positive_inverse(hessian)
         solve = lambda rhs: jnp.sum(inverse * rhs, axis=1)  # noqa: E731
     else:
         solve = _core_inverse(planner, point, context)
@@ -279,7 +281,7 @@ def _core_inverse(planner: Any, point: Array, context: Any) -> Callable[[Array],
     within, row_of_others = planner.core_curvature(point, context)
     largest = jnp.max(jnp.where(inside, 0.0, jnp.abs(row_of_others)))
     size_of_others = jnp.maximum(jnp.abs(row_of_others), 1e-6 * largest + 1e-20)
-    inverses = [_positive_inverse(block) for block in within]
+    inverses = [positive_inverse(block) for block in within]
 
     def solve(rhs: Array) -> Array:
         entries, found = tuple(rhs), list(rhs / size_of_others)
@@ -316,7 +318,7 @@ def curvature_by_tangents(
     return jnp.stack(found), row_of_others
 
 
-def _positive_inverse(matrix: Array) -> Array:
+def _gauss_jordan(matrix: Array) -> Array:
     """Inverse of a symmetric matrix (k, k), its pivots made positive.
 
     Gauss-Jordan in k steps, in place; pivots are not exchanged. Where all of them are positive
@@ -337,6 +339,9 @@ def _positive_inverse(matrix: Array) -> Array:
         return jnp.where(here[:, None], scaled, rest - column[:, None] * scaled)
 
     return jax.lax.fori_loop(0, size, eliminate, matrix)
+
+
+positive_inverse = with_kernel(_gauss_jordan, inverse_kernel())
 
 
 def part_of(tree: Any, name: str) -> Any:

@@ -1,0 +1,72 @@
+"""The inverse of a small matrix on many lanes as one kernel for CUDA, in Pallas' Triton.
+
+A thread keeps its lane's matrix in registers. In single operations every pivot waits for the last
+one, and all entries cross the memory at each.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from planner_jax.lanes import block_width
+
+_THREADS = 32  # lanes of a block
+_LARGEST = 12  # rows, all of whose entries a thread can keep
+
+
+def inverse_kernel(*, interpret: bool = False) -> Callable:
+    """What `lanes.with_kernel` takes for `sensitivity.positive_inverse`.
+
+    Args:
+        interpret: run it without a GPU, for tests.
+    """
+
+    def kernel(treedef: Any, leaves: Sequence[Array]) -> list[Array] | None:
+        (matrix,) = leaves
+        width = block_width(matrix.shape[-1], _THREADS)
+        if matrix.ndim != 3 or matrix.dtype != jnp.float32 or width is None:
+            return None
+        if matrix.shape[0] > _LARGEST:
+            return None
+        return [_call(matrix.shape[0], matrix.shape[-1], width, interpret)(matrix)]
+
+    return kernel
+
+
+@functools.cache
+def _call(size: int, lanes: int, width: int, interpret: bool) -> Callable:
+    """The kernel for matrices of `size` rows on `lanes` lanes."""
+    from jax.experimental import pallas as pl
+    from jax.experimental.pallas import triton
+
+    def body(matrix, out):
+        entries = [[matrix[i, j] for j in range(size)] for i in range(size)]
+        least = [1e-6 * jnp.abs(entries[j][j]) + 1e-20 for j in range(size)]
+        for j in range(size):
+            rate = 1.0 / jnp.maximum(jnp.abs(entries[j][j]), least[j])
+            row = [rate if k == j else entries[j][k] * rate for k in range(size)]
+            for i in range(size):
+                factor = entries[i][j]
+                entries[i] = [
+                    row[k] if i == j else (0.0 if k == j else entries[i][k]) - factor * row[k]
+                    for k in range(size)
+                ]
+        for i in range(size):
+            for j in range(size):
+                out[i, j] = entries[i][j]
+
+    block = pl.BlockSpec((size, size, width), lambda i: (0, 0, i))
+    return pl.pallas_call(
+        body,
+        out_shape=jax.ShapeDtypeStruct((size, size, lanes), jnp.float32),
+        grid=(lanes // width,),
+        in_specs=[block],
+        out_specs=block,
+        compiler_params=triton.CompilerParams(num_warps=1, num_stages=1),
+        interpret=interpret,
+        name="positive_inverse",
+    )
