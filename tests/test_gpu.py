@@ -1,0 +1,93 @@
+"""On a GPU, where kernels take the place of single operations: the same as on a CPU."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from planner_jax.lanes import over_lanes
+from planner_jax.optimise.sensitivity import gradient_at
+from planner_jax.optimise.status import is_solved
+from planner_jax.task.catch.decide import plan_catches
+from planner_jax.task.catch.exact import ExactCatch
+from planner_jax.task.catch.suites import make_suite
+from planner_jax.task.hit.exact import ExactHit
+from planner_jax.task.hit.serves import generate_serves, to_scenarios
+from planner_jax.task.solve import plan
+
+pytestmark = pytest.mark.gpu
+
+LANES = 256
+
+
+@pytest.fixture(scope="module")
+def devices():
+    """The first GPU, and the CPU beside it."""
+    assert jax.default_backend() == "gpu"
+    return jax.devices()[0], jax.devices("cpu")[0]
+
+
+@pytest.fixture(scope="module")
+def serves():
+    return jax.tree.map(np.asarray, to_scenarios(generate_serves(LANES, 0)))
+
+
+def run(device, function, *args):
+    """The function's results, its arguments and the constants within on a device."""
+    with jax.default_device(device):
+        return jax.tree.map(np.asarray, function(*jax.device_put(args, device)))
+
+
+def test_hits_are_those_of_a_cpu(devices, serves):
+    ours, theirs = (
+        run(device, lambda s, d=device: plan(ExactHit(), s, devices=[d]), serves)
+        for device in devices
+    )
+    np.testing.assert_array_equal(ours.status, theirs.status)
+    assert is_solved(ours.status).all()
+    np.testing.assert_allclose(ours.stroke.time, theirs.stroke.time, atol=1e-3)
+
+
+def test_catches_are_those_of_a_cpu(devices):
+    throws = make_suite("throws", num=LANES, seed=0)
+    ours, theirs = (
+        run(
+            device,
+            lambda s, d=device: plan_catches(ExactCatch(), s, "greedy", devices=[d])[1],
+            throws,
+        )
+        for device in devices
+    )
+    np.testing.assert_array_equal(ours.status, theirs.status)
+    np.testing.assert_allclose(ours.times, theirs.times, atol=2e-2)
+    assert np.quantile(np.abs(ours.times - theirs.times), 0.95) < 1e-4
+
+
+def test_gradients_at_the_same_points_are_those_of_a_cpu(devices, serves):
+    planner = ExactHit()
+    lanes = jax.tree.map(lambda leaf: np.moveaxis(leaf, 0, -1), serves)
+
+    @jax.jit
+    @over_lanes
+    def gradients(scenario):
+        point = planner.guesses(planner.prepare(scenario), 1)[0]
+        wrt = ("drag", "ball", "limits", "target")
+        return gradient_at(planner, scenario, point, "stroke.time", wrt, steps=2).by
+
+    ours, theirs = (run(device, gradients, lanes) for device in devices)
+    for found, expected in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
+        size = np.median(np.abs(expected)) + 1e-12
+        assert np.quantile(np.abs(found - expected), 0.95) < 1e-2 * size
+
+
+def test_lanes_that_are_not_finite_change_no_bit_of_the_others(devices):
+    serves = to_scenarios(generate_serves(8192, 1))
+    broken = np.arange(8192) % 100 == 7
+    spoiled = serves.replace(drag=jnp.where(broken, jnp.nan, serves.drag))
+    hits = functools.partial(plan, ExactHit(), devices=[devices[0]])
+    clean, others = (run(devices[0], hits, each) for each in (serves, spoiled))
+    for ours, theirs in zip(jax.tree.leaves(clean), jax.tree.leaves(others), strict=True):
+        np.testing.assert_array_equal(ours[~broken], theirs[~broken])
+    assert not is_solved(others.status[broken]).any()
