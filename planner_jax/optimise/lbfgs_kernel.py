@@ -1,7 +1,8 @@
 """The next direction of L-BFGS on many lanes as one kernel for CUDA, in Pallas' Triton.
 
 In single operations it is a chain of some thirty sums that each wait for the last. Here a block
-of threads keeps its lanes' gradient in registers and reads every pair twice.
+of threads keeps its lanes' gradient and pairs in registers; it reads every pair once and writes
+it where the memory has been, so that nothing is copied between iterations.
 """
 
 import functools
@@ -69,17 +70,15 @@ def _call(
         none = jnp.zeros_like(inverse)
 
         # Newest first. A slot's pair is the one behind it if there is a new one.
-        alphas, kept, q = [], [], grad
+        alphas, kept, q, behind, later = [], [], grad, [step, change], inverse
         for k in reversed(range(num_pairs)):
-            last = k == num_pairs - 1
-            old = [load(steps, k), load(changes, k)]
-            behind = [step, change] if last else [load(steps, k + 1), load(changes, k + 1)]
+            old, earlier = [load(steps, k), load(changes, k)], inverses[k]
             own = [
                 jnp.where(keep, new, jnp.where(moved, was, 0.0))
                 for new, was in zip(behind, old, strict=True)
             ]
-            later = inverse if last else inverses[k + 1]
-            weight = jnp.where(keep, later, jnp.where(moved, inverses[k], none))
+            weight = jnp.where(keep, later, jnp.where(moved, earlier, none))
+            behind, later = old, earlier
             store(new_steps, own[0], k)
             store(new_changes, own[1], k)
             new_inverses[k] = weight
@@ -114,6 +113,7 @@ def _call(
         grid=(lanes // width,),
         in_specs=[matrix, matrix, numbers, vector, vector, vector],
         out_specs=[matrix, matrix, numbers, vector],
+        input_output_aliases={0: 0, 1: 1, 2: 2},
         compiler_params=triton.CompilerParams(num_warps=4, num_stages=1),
         interpret=interpret,
         name="lbfgs_turn",
