@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from planner_jax.cost.along import Along, integrate_along
+from planner_jax.cost.along import Along, greatest_along, integrate_along
 from planner_jax.cost.along_kernel import MODES, along_kernel
 from planner_jax.cost.limits import motion_excess
 from planner_jax.cost.penalty import smoothed_hinge
@@ -80,6 +80,17 @@ def test_slopes_and_curvature_are_those_of_finite_differences(float64):
             np.testing.assert_allclose(found, expected, rtol=tolerance, atol=1e-6)
 
 
+def test_the_greatest_of_every_limit_is_among_the_samples(float64):
+    columns, durations, given = jax.tree.map(lambda x: x[0], cases(dtype=np.float64))
+    greatest = greatest_along(ALONG, columns, durations, given)
+    for n in range(SEGMENTS):
+        motion = sample_motion(ALONG.maps, ALONG.nodes, columns[n], durations[n])
+        expected = np.stack(motion_excess(motion, *given)).max(axis=1)
+        np.testing.assert_allclose(np.stack(greatest)[:, n], expected, rtol=1e-12)
+    slope = jax.grad(lambda h: greatest_along(ALONG, columns, h, given)[0][0])(durations)
+    assert slope[0] < 0.0 and slope[1] == 0.0  # slower is less
+
+
 def test_worst_has_no_derivative():
     columns, durations, given = jax.tree.map(lambda x: jnp.asarray(x[1]), cases())
     slope = jax.grad(lambda c: jnp.sum(integrate_along(ALONG, c, durations, given)[1]))(columns)
@@ -109,6 +120,7 @@ def asked(mode):
         return jax.jvp(slopes, point, direction)[1]
 
     return {
+        "greatest": lambda *x: greatest_along(ALONG, *x),
         "values": lambda *x: value(*x)[1],
         "slopes": slopes,
         "slopes by all": slopes,

@@ -69,6 +69,29 @@ def integrate_along(
     return integral(columns, piece_durations, parameters)
 
 
+def greatest_along(
+    along: Along, columns: Array, piece_durations: Array, parameters: Any
+) -> tuple[Array, ...]:
+    """Greatest excess over every limit along N segments; the arguments of `integrate_along`.
+
+    Returns:
+        E arrays (N,), differentiable.
+    """
+    return _greatest(along)(columns, piece_durations, parameters)
+
+
+@functools.cache
+def _greatest(along: Along) -> Callable:
+    """`greatest_along`, with a kernel."""
+
+    def of_segment(columns: Array, duration: Array, parameters: Any) -> tuple[Array, ...]:
+        motion = sample_motion(along.maps, along.nodes, columns, duration)
+        return tuple(jnp.max(excess) for excess in along.excess(motion, parameters))
+
+    segments = jax.vmap(of_segment, in_axes=(0, 0, None))
+    return with_kernel(segments, along_kernel(along, "greatest"))
+
+
 @functools.cache
 def _integral(along: Along) -> Callable:
     """`integrate_along`, with kernels for its values, slopes and curvature."""

@@ -1,4 +1,4 @@
-"""`integrate_along` on many lanes as one kernel for CUDA, in Pallas' Triton.
+"""`integrate_along` and `greatest_along` on many lanes as one kernel for CUDA, in Pallas' Triton.
 
 A thread carries a lane. It reads the columns once, makes the samples one after another, each
 from a row of the constant matrices, and adds up penalties and, by the transposed product,
@@ -29,9 +29,10 @@ _ENOUGH = 512  # blocks that keep a large GPU busy
 _AXES = ((2,), (0, 1, 2), (0, 1, 2), (0, 1, 2))  # that a motion has of position to jerk
 
 
-# What is summed up over the samples: penalties alone; also slopes by columns and durations; also
-# those by the parameters; or the derivative of all of these along a direction.
-MODES = ("values", "slopes", "slopes by all", "curvature")
+# What is made of the samples: each limit's greatest excess; the sum of penalties, and the greatest
+# excess of all; also slopes by columns and durations; also those by the parameters; or the
+# derivative of all of these along a direction.
+MODES = ("greatest", "values", "slopes", "slopes by all", "curvature")
 
 
 def along_kernel(along: "Along", mode: str, *, interpret: bool = False) -> Callable:
@@ -70,7 +71,8 @@ def along_kernel(along: "Along", mode: str, *, interpret: bool = False) -> Calla
         call = _call(along, mode, interpret, treedef, *sizes)
         found = call(*jax.tree.leaves(args))
         found = [
-            jnp.max(x, axis=0) if k == _WORST else jnp.sum(x, axis=0) for k, x in enumerate(found)
+            jnp.max(x, axis=0) if mode == "greatest" or k == _WORST else jnp.sum(x, axis=0)
+            for k, x in enumerate(found)
         ]
         return [leaf.reshape(*lead, *leaf.shape[1:]) for leaf in found]
 
@@ -107,7 +109,10 @@ def _call(
     num_leaves = treedef.num_leaves
     places = jax.tree.unflatten(treedef, range(num_leaves))
     point = places[0] if mode == "curvature" else places
-    num_parameters = len(jax.tree.leaves(point[2]))
+    by_parameters = len(jax.tree.leaves(point[2])) * (mode in ("slopes by all", "curvature"))
+    by_columns = mode not in ("greatest", "values")
+    sums_up = mode != "greatest"
+    num_greatest = 1 if sums_up else len(along.margins)
 
     def body(*refs):
         loaded = [
@@ -120,12 +125,15 @@ def _call(
         args = jax.tree.unflatten(treedef, loaded)
         (columns, duration, given), direction = args if mode == "curvature" else (args, args)
 
-        def penalty(unit: list, duration: Array, given: Any) -> tuple[Array, Array]:
+        def excess_at(unit: list, duration: Array, given: Any) -> tuple[Array, ...]:
             rate = reciprocal(duration)
             rates = [None, rate, rate * rate, rate * rate * rate]
             vel, acc, jerk = (tuple(value * rates[d] for value in unit[d]) for d in range(1, 4))
             parts: Any = {"height": unit[0][0], "vel": vel, "acc": acc, "jerk": jerk}
-            excess = along.excess(Motion(**parts), given)
+            return along.excess(Motion(**parts), given)
+
+        def penalty(unit: list, duration: Array, given: Any) -> tuple[Array, Array]:
+            excess = excess_at(unit, duration, given)
             hinges = [
                 smoothed_hinge(value + margin, along.hinge_width)
                 for value, margin in zip(excess, along.margins, strict=True)
@@ -133,7 +141,7 @@ def _call(
             return duration * _total(hinges), functools.reduce(jnp.maximum, excess)
 
         def sample(k: Array, carry: tuple) -> tuple:
-            worst, sums = carry
+            most, sums = carry
             row = [
                 [matrices_ref[k, d * num_columns + c] for c in range(num_columns)] for d in range(4)
             ]
@@ -154,13 +162,18 @@ def _call(
                 return greatest, weight * value, *pull_back(jnp.ones_like(value) * weight)
 
             free = (unit_of(columns), duration)
-            if mode == "values":
-                value, greatest = penalty(*free, given)
-                found = (weight * value,)
+            greatest, found = most, ()
+            if mode == "greatest":
+                greatest = list(map(jnp.maximum, most, excess_at(*free, given)))
+            elif mode == "values":
+                value, worst = penalty(*free, given)
+                greatest, found = [jnp.maximum(most[0], worst)], (weight * value,)
             elif mode == "slopes":
-                greatest, *found = slopes(*free, fixed=(given,))
+                worst, *found = slopes(*free, fixed=(given,))
+                greatest = [jnp.maximum(most[0], worst)]
             elif mode == "slopes by all":
-                greatest, *found = slopes(*free, given)
+                worst, *found = slopes(*free, given)
+                greatest = [jnp.maximum(most[0], worst)]
             else:
                 along_columns, along_duration, along_given = direction
                 tangents = (unit_of(along_columns), along_duration)
@@ -169,7 +182,6 @@ def _call(
                 else:
                     moving, free, tangents = slopes, (*free, given), (*tangents, along_given)
                 _, (_, *found) = jax.jvp(moving, free, tangents)
-                greatest = worst
             if len(found) > 1:
                 found[1] = [
                     [
@@ -182,15 +194,16 @@ def _call(
                     ]
                     for c in range(num_columns)
                 ]
-            return jnp.maximum(worst, greatest), list(map(jnp.add, sums, jax.tree.leaves(found)))
+            return greatest, list(map(jnp.add, sums, jax.tree.leaves(found)))
 
         zero = jnp.zeros_like(duration)
         worst = zero if mode == "curvature" else jnp.full_like(duration, -jnp.inf)
         first = pl.program_id(2) * share
         last = jnp.minimum(first + share, num_samples)
-        num_sums = 1 + (mode != "values") * (3 * num_columns + 1) + len(out[4:])
-        worst, sums = jax.lax.fori_loop(first, last, sample, (worst, [zero] * num_sums))
-        found = iter([sums[0], worst, *sums[1:]])
+        num_sums = 1 + by_columns * (3 * num_columns + 1) + by_parameters if sums_up else 0
+        start = [worst] * num_greatest, [zero] * num_sums
+        most, sums = jax.lax.fori_loop(first, last, sample, start)
+        found = iter([*sums[:_WORST], *most, *sums[_WORST:]])
         for ref in out:
             if len(ref.shape) == 3:
                 for c in range(num_columns):
@@ -210,15 +223,13 @@ def _call(
     many_out = pl.BlockSpec((None, None, num_columns, 3, threads), lambda t, i, s: (s, t, 0, 0, i))
     number = jax.ShapeDtypeStruct((shares, lead, lanes), jnp.float32)
     vector = jax.ShapeDtypeStruct((shares, lead, num_columns, 3, lanes), jnp.float32)
-    by_parameters = num_parameters * (mode in ("slopes by all", "curvature"))
-    by_columns = mode != "values"
 
     def call(*leaves: Array) -> list[Array]:
         specs = {1: shared, 2: one, 4: many}
         return pl.pallas_call(
             body,
             out_shape=[
-                *(number, number),
+                *((number,) * (sums_up + num_greatest)),
                 *((vector, number) if by_columns else ()),
                 *((number,) * by_parameters),
             ],
@@ -229,7 +240,7 @@ def _call(
                 whole(num_samples),
             ],
             out_specs=[
-                *(one_out, one_out),
+                *((one_out,) * (sums_up + num_greatest)),
                 *((many_out, one_out) if by_columns else ()),
                 *((one_out,) * by_parameters),
             ],

@@ -13,7 +13,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.cost.along import Along, integrate_along
+from planner_jax.cost.along import Along, greatest_along, integrate_along
 from planner_jax.cost.limits import body_rate_excess, ground_excess, speed_excess, thrust_excess
 from planner_jax.cost.penalty import smoothed_hinge
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
@@ -229,30 +229,26 @@ class ExactCatch:
         offsets = natural[:, : self.num_offsets].reshape(num, -1, 3)
         return Chain(rows=rows, offsets=offsets, piece_durations=piece_durations), catch
 
-    def _excess(self, chain: Chain, context: CatchContext, nodes: int) -> Array:
-        """Excess over the limits along the way, (5, N, K)."""
-        motion = chain_motion(self.maps, nodes, chain)
-        scenario = context.scenario
-        along = jnp.stack(_limits_along(motion, (scenario.gravity, scenario.limits)))
-        return jnp.where(context.active[:, None], along, -1.0)
-
     def _at_catch(self, catch: Catch, context: CatchContext) -> Array:
         """Excess at the catches, (2, N): of the angle, and over the horizon."""
         # The horizon is a hard end: the tolerance of a feasible plan is taken off.
         late = catch.times / context.horizon - 1.0 + FEASIBILITY_TOLERANCE
         return jnp.where(context.active, jnp.stack([catch.angle_excess, late]), -1.0)
 
-    def _along(self) -> Along:
+    def _along(self, nodes: int) -> Along:
         """Penalties along the way: squares carry twice the relative margin."""
         margins = tuple(self.margin * factor for factor in (2.0, 2.0, 2.0, 2.0, 1.0))
-        return Along(self.maps, self.nodes, _limits_along, margins, self.hinge_width)
+        return Along(self.maps, nodes, _limits_along, margins, self.hinge_width)
 
     def objective(self, point: Array, context: CatchContext) -> Evaluation:
         """Cost, and the largest excess at the penalty nodes (squares over squares)."""
         chain, catch = self._unpack(point, context)
         scenario = context.scenario
         penalties, worst = integrate_along(
-            self._along(), chain.columns, chain.piece_durations, (scenario.gravity, scenario.limits)
+            self._along(self.nodes),
+            chain.columns,
+            chain.piece_durations,
+            (scenario.gravity, scenario.limits),
         )
         at_catch = self._at_catch(catch, context)
         penalty = jnp.sum(jnp.where(context.active, penalties, 0.0))
@@ -290,10 +286,13 @@ class ExactCatch:
         The smoothed hinge bends at most with 3 / (2 hinge_width); the residuals bend alike.
         """
         chain, catch = self._unpack(point, context)
-        along = self._along()
+        along = self._along(self.nodes)
         bend = jnp.sqrt(1.5 / self.hinge_width)
         margins = jnp.asarray(along.margins, point.dtype)[:, None, None]
-        inside = jnp.maximum(self._excess(chain, context, self.nodes) + margins, 0.0)
+        motion, scenario = chain_motion(self.maps, self.nodes, chain), context.scenario
+        excess = jnp.stack(_limits_along(motion, (scenario.gravity, scenario.limits)))
+        excess = jnp.where(context.active[:, None], excess, -1.0)
+        inside = jnp.maximum(excess + margins, 0.0)
         weights = jnp.asarray(along.weights(), point.dtype)
         inside = inside * jnp.sqrt(chain.piece_durations[:, None] * weights)
         at_catch = self._at_catch(catch, context) + self.margin
@@ -308,11 +307,19 @@ class ExactCatch:
     def decode(self, point: Array, context: CatchContext) -> CatchPlan:
         """The plan at a point, its violation looked for at 40 nodes a piece."""
         chain, catch = self._unpack(point, context)
-        along = self._excess(chain, context, _DECODE_NODES)
+        greatest = greatest_along(
+            self._along(_DECODE_NODES),
+            chain.columns,
+            chain.piece_durations,
+            (context.scenario.gravity, context.scenario.limits),
+        )
+        speed, rate, weak, strong, ground = (
+            jnp.max(jnp.where(context.active, excess, -1.0)) for excess in greatest
+        )
         at_catch = self._at_catch(catch, context)
-        squared = jnp.max(along[jnp.array([0, 1, 3])])
-        plain = jnp.maximum(jnp.max(along[4]), jnp.max(at_catch))
-        weak = 1.0 - jnp.sqrt(jnp.maximum(1.0 - jnp.max(along[2]), 0.0))
+        squared = jnp.maximum(jnp.maximum(speed, rate), strong)
+        plain = jnp.maximum(ground, jnp.max(at_catch))
+        weak = 1.0 - jnp.sqrt(jnp.maximum(1.0 - weak, 0.0))
         ratio = jnp.sqrt(jnp.maximum(squared + 1.0, 0.0)) - 1.0
         violation = jnp.maximum(jnp.maximum(ratio, weak), plain)
         return CatchPlan(

@@ -25,7 +25,7 @@ from planner_jax.ball.flight import (
 )
 from planner_jax.ball.impact import required_impact
 from planner_jax.ball.prediction import PathTable, predict_path, target_at
-from planner_jax.cost.along import Along, integrate_along
+from planner_jax.cost.along import Along, greatest_along, integrate_along
 from planner_jax.cost.contact import apex_excess, hitting_speed_excess
 from planner_jax.cost.limits import motion_excess
 from planner_jax.cost.penalty import smoothed_hinge
@@ -47,6 +47,7 @@ from planner_jax.trajectory.proportional_minco import (
 )
 
 _ORDER = 4  # minimum snap
+_DECODE_NODES = 16  # intervals a piece at which a finished plan is looked at
 
 
 @struct.dataclass
@@ -256,16 +257,16 @@ class ExactHit:
             ]
         )
 
-    def _along(self) -> Along:
+    def _along(self, nodes: int) -> Along:
         """Penalties along the way: squares carry twice the relative margin."""
         margins = tuple(self.margin * factor for factor in (2.0, 2.0, 2.0, 1.0))
-        return Along(self.maps, self.nodes, _limits_along, margins, self.hinge_width)
+        return Along(self.maps, nodes, _limits_along, margins, self.hinge_width)
 
     def objective(self, point: Array, context: HitContext) -> Evaluation:
         """Cost, and the largest excess at the penalty nodes (squares over squares)."""
         offsets, rows, duration, impact = self._unpack(point, context)
         penalties, worst = integrate_along(
-            self._along(),
+            self._along(self.nodes),
             jnp.concatenate([rows, offsets])[None],
             duration[None],
             (context.scenario.gravity, context.scenario.limits),
@@ -351,8 +352,10 @@ class ExactHit:
         The smoothed hinge bends at most with 3 / (2 hinge_width); the residuals bend alike.
         """
         offsets, rows, duration, impact = self._unpack(point, context)
-        along = self._along()
-        excess = self._excess(rows, offsets, duration, context, self.nodes)
+        along = self._along(self.nodes)
+        motion = sample_motion(self.maps, self.nodes, jnp.concatenate([rows, offsets]), duration)
+        given = (context.scenario.gravity, context.scenario.limits)
+        excess = jnp.stack(_limits_along(motion, given))
         at_impact = self._at_impact(impact, context)
         bend = jnp.sqrt(1.5 / self.hinge_width)
         inside = jnp.maximum(excess + jnp.asarray(along.margins, point.dtype)[:, None], 0.0)
@@ -362,20 +365,18 @@ class ExactHit:
         smooth = energy_unit * np.sqrt(self.maps.offset_energy) * offsets
         return jnp.concatenate([bend * inside.ravel(), bend * impact_part, smooth.ravel()])
 
-    def _excess(
-        self, rows: Array, offsets: Array, duration: Array, context: HitContext, nodes: int
-    ) -> Array:
-        """Excess over the limits along the way, (4, N)."""
-        motion = sample_motion(self.maps, nodes, jnp.concatenate([rows, offsets]), duration)
-        return jnp.stack(_limits_along(motion, (context.scenario.gravity, context.scenario.limits)))
-
     def decode(self, point: Array, context: HitContext) -> HitPlan:
         """The plan at a point, its violation looked for at 16 nodes a piece."""
         offsets, rows, duration, impact = self._unpack(point, context)
-        along = self._excess(rows, offsets, duration, context, 16)
+        *squares, ground = greatest_along(
+            self._along(_DECODE_NODES),
+            jnp.concatenate([rows, offsets])[None],
+            duration[None],
+            (context.scenario.gravity, context.scenario.limits),
+        )
         at_impact = self._at_impact(impact, context)
-        squared = jnp.concatenate([jnp.max(along[:3], axis=1), at_impact[2:]])
-        plain = jnp.concatenate([jnp.max(along[3:], axis=1), at_impact[:2]])
+        squared = jnp.concatenate([*squares, at_impact[2:]])
+        plain = jnp.concatenate([ground, at_impact[:2]])
         violation = jnp.maximum(jnp.max(jnp.sqrt(squared + 1.0) - 1.0), jnp.max(plain))
         return HitPlan(
             trajectory=proportional_trajectory(self.maps, rows, offsets, duration),
