@@ -78,8 +78,9 @@ def test_gradients_at_the_same_points_are_those_of_a_cpu(devices, serves):
 
     ours, theirs = (run(device, gradients, lanes) for device in devices)
     for found, expected in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
-        size = np.median(np.abs(expected)) + 1e-12
-        assert np.quantile(np.abs(found - expected), 0.95) < 1e-2 * size
+        # Where no limit binds the gradient is zero: the size is that of the others.
+        off = np.quantile(np.abs(found - expected), 0.95)
+        assert off <= 1e-4 * np.abs(expected).max()
 
 
 def test_lanes_that_are_not_finite_change_no_bit_of_the_others(devices):
