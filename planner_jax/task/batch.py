@@ -43,7 +43,9 @@ def plan_batch(
     """
     mesh = Mesh(np.array(jax.local_devices() if devices is None else devices), ("lanes",))
     resident = all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(scenarios))
-    if resident and not _is_one_cpu(mesh):
+    several = _length(scenarios) > (chunk or _default_chunk(planner.rounds[0], mesh))
+    # One CPU's memory is the host's, and there a thread for each core plans chunks.
+    if resident and not (several and _is_one_cpu(mesh)):
         return _plan_resident(planner, scenarios, chunk, mesh)
     plans = _plan_from_host(planner, scenarios, chunk, mesh)
     return jax.device_put(plans, _sharding(mesh)) if resident else plans
@@ -108,7 +110,7 @@ def _first_plans(planner: Planner, attempt: Round, scenarios: Any, chunk: int, m
 
 
 def _is_one_cpu(mesh: Mesh) -> bool:
-    """Whether the only device is the host itself, whose memory needs no transfer."""
+    """Whether the only device is the host itself."""
     return mesh.size == 1 and mesh.devices[0].platform == "cpu"
 
 
