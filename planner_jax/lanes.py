@@ -83,21 +83,24 @@ _KERNELS: dict[str, _Named] = {}
 _FEWEST = 16  # lanes that are worth a block of a kernel
 
 
-def with_kernel(function: Callable, kernel: Kernel, jvp: Callable | None = None) -> Callable:
+def with_kernel(
+    function: Callable, kernel: Kernel, key: Any = None, jvp: Callable | None = None
+) -> Callable:
     """The function, for which `over_lanes` calls a kernel where the program is for CUDA.
 
     Args:
         function: of pytrees of arrays of ONE lane, to a pytree of arrays.
         kernel: the same on lanes. `jax.vmap` within a lane adds axes in front of some leaves.
+        key: constants that tell the function from others of its code, by their `repr`.
         jvp: its derivative as `jax.custom_jvp` takes it, zeros as `SymbolicZero`; without it,
             the function's own.
     """
 
     @functools.cache
     def compiled(treedef: Any, shapes: tuple) -> Callable:
-        # The same in every process, or kept programs would not be found again.
+        # The same in every process, whatever it did before: kept programs are found by it.
         own = getattr(function, "__qualname__", type(function).__name__)
-        name = f"kernel_{zlib.crc32(repr((own, treedef, shapes)).encode()):08x}"
+        name = f"kernel_{zlib.crc32(repr((own, key, treedef, shapes)).encode()):08x}"
         while name in _KERNELS:
             name += "_"
         here = _KERNELS[name] = _Named(treedef, kernel, [])

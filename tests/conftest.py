@@ -23,3 +23,13 @@ def float64():
     """Double precision for the length of one test: the reference arithmetic of the suite."""
     with jax.enable_x64(True):
         yield
+
+
+# Modules that take longest. Workers get whole modules in this order, so that none is left with a
+# long one in the end.
+LONGEST = ("test_sims_flights", "test_notebooks", "test_along", "test_catch_replan", "test_sweep")
+
+
+def pytest_collection_modifyitems(items):
+    """The longest modules first."""
+    items.sort(key=lambda item: item.path.stem not in LONGEST)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from planner_jax.cost.along import Along, greatest_along, integrate_along
+from planner_jax.cost.along import Along, _greatest, greatest_along, integrate_along
 from planner_jax.cost.along_kernel import MODES, along_kernel
 from planner_jax.cost.limits import motion_excess
 from planner_jax.cost.penalty import smoothed_hinge
@@ -203,3 +203,19 @@ def test_the_kernel_leaves_alone_what_it_is_not_made_for():
         args = cases(num, dtype)
         lanes = jax.tree.leaves(jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), args))
         assert kernel(jax.tree.structure(args), lanes) is None
+
+
+def test_a_kernel_has_the_same_name_whatever_was_compiled_before(monkeypatch):
+    """Or kept programs would not be found again in another process."""
+    lane = jax.tree.map(lambda leaf: leaf[0], cases())
+    others = [dataclasses.replace(ALONG, margins=(0.1, 0.1, 0.1, margin)) for margin in (0.2, 0.3)]
+
+    def names(alongs):
+        known = {}
+        monkeypatch.setattr("planner_jax.lanes._KERNELS", known)
+        for along in alongs:
+            jax.make_jaxpr(_greatest.__wrapped__(along))(*lane)
+        return list(known)
+
+    assert names(others) == names(others[::-1])[::-1]
+    assert len(set(names(others))) == 2

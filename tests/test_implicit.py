@@ -44,6 +44,7 @@ def study():
         return [jax.tree.map(lambda leaf, k=k: leaf[k], batch) for k in (1, 3)], along
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MOVES)
 def test_gradients_are_those_of_plans_solved_anew(study, name):
     lanes, along = study
@@ -61,6 +62,7 @@ def test_gradients_are_those_of_plans_solved_anew(study, name):
             np.testing.assert_allclose(slope / scale, numeric / scale, rtol=2e-3, atol=2e-4)
 
 
+@pytest.mark.slow
 def test_a_limit_that_presses_has_a_price_and_a_slack_one_has_none(study):
     lanes, along = study
     with jax.enable_x64(True):

@@ -7,7 +7,8 @@ import nbformat
 import pytest
 
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
-LONG = {"03_design_by_gradient", "04_fly"}  # minutes each with an empty compile cache
+# With an empty compile cache these take from twenty seconds to minutes; the first is in every run.
+LONG = {"02_catch_and_sequence", "03_design_by_gradient", "04_fly"}
 
 
 def marked(path):

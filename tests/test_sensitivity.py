@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from flax import struct
 
-from planner_jax.optimise.implicit import newton_refine
+from planner_jax.optimise.implicit import newton_refine, optimal_plan
 from planner_jax.optimise.inverse_kernel import inverse_kernel
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
 from planner_jax.optimise.multistart import minimise
@@ -102,6 +102,17 @@ def test_gradient_of_the_cost_needs_no_adjoint(bowls):
     plans, gradient = plan_with_gradients(BowlPlanner(), bowls, "cost", ("b",), steps=0)
     np.testing.assert_allclose(gradient.by["b"], -plans.point, atol=1e-12)
     np.testing.assert_allclose(gradient.value, plans.cost, atol=1e-12)
+
+
+def test_an_optimal_plan_has_the_same_gradient_forward_and_backward(bowls):
+    """u = A^-1 (b + k e_0): the slopes of u by b are A^-1, those by k its first column."""
+    bowl = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), bowls)
+    inverse = np.linalg.inv(CURVED)
+    for jacobian in (jax.jacfwd, jax.jacrev):
+        by_b = jacobian(lambda b: optimal_plan(BowlPlanner(), bowl.replace(b=b)).point)(bowl.b)
+        by_k = jacobian(lambda k: optimal_plan(BowlPlanner(), bowl.replace(k=k)).point)(bowl.k)
+        np.testing.assert_allclose(by_b, inverse, atol=1e-9)
+        np.testing.assert_allclose(by_k, inverse[:, 0], atol=1e-9)
 
 
 def test_a_batch_is_its_lanes_and_a_broken_lane_spoils_no_other(bowls):

@@ -80,7 +80,8 @@ def _integrated(num_nodes: int) -> Callable:
     @functools.cache
     def slopes(moving: tuple[int, ...]) -> Callable:
         """Derivatives of positions, then of velocities, by some arguments."""
-        return with_kernel(jax.jacfwd(integrated, argnums=moving), table_kernel(num_nodes, moving))
+        derivatives = jax.jacfwd(integrated, argnums=moving)
+        return with_kernel(derivatives, table_kernel(num_nodes, moving), (num_nodes, moving))
 
     def moved(primals: tuple, tangents: tuple) -> tuple:
         nodes = integrated_in_lanes(*primals)
@@ -96,7 +97,7 @@ def _integrated(num_nodes: int) -> Callable:
                     found[k] = found[k] + (along if place > 1 else jnp.sum(along, axis=-1))
         return nodes, tuple(found)
 
-    integrated_in_lanes = with_kernel(integrated, table_kernel(num_nodes), jvp=moved)
+    integrated_in_lanes = with_kernel(integrated, table_kernel(num_nodes), num_nodes, moved)
     return integrated_in_lanes
 
 

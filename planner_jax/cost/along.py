@@ -41,6 +41,12 @@ class Along:
     margins: tuple[float, ...]  # (E,), in the unit of each excess
     hinge_width: float
 
+    def key(self) -> tuple:
+        """All of it in numbers and names."""
+        code = self.excess.__module__, getattr(self.excess, "__qualname__", "")
+        shape = self.maps.order, tuple(self.maps.proportions.tolist()), self.nodes
+        return *shape, *code, self.margins, self.hinge_width
+
     def matrices(self) -> np.ndarray:
         """Position to jerk at the samples, in time over h, from the columns: (K, 4, C)."""
         return np.stack([self.maps.sample_matrix(self.nodes, d) for d in range(4)], axis=1)
@@ -89,21 +95,21 @@ def _greatest(along: Along) -> Callable:
         return tuple(jnp.max(excess) for excess in along.excess(motion, parameters))
 
     segments = jax.vmap(of_segment, in_axes=(0, 0, None))
-    return with_kernel(segments, along_kernel(along, "greatest"))
+    return with_kernel(segments, along_kernel(along, "greatest"), along.key())
 
 
 @functools.cache
 def _integral(along: Along) -> Callable:
     """`integrate_along`, with kernels for its values, slopes and curvature."""
     values = functools.partial(_values, along)
-    values_in_lanes = with_kernel(values, along_kernel(along, "values"))
+    values_in_lanes = with_kernel(values, along_kernel(along, "values"), along.key())
 
     def slopes(columns: Array, durations: Array, parameters: Any) -> tuple[Array, ...]:
         value: Any = lambda c, h: values(c, h, parameters)  # noqa: E731
         penalties, pull_back, worst = jax.vjp(value, columns, durations, has_aux=True)
         return penalties, worst, *pull_back(jnp.ones_like(penalties))
 
-    slopes_in_lanes = with_kernel(slopes, along_kernel(along, "slopes"))
+    slopes_in_lanes = with_kernel(slopes, along_kernel(along, "slopes"), along.key())
 
     def segment_slopes(columns: Array, duration: Array, parameters: Any) -> tuple:
         value: Any = functools.partial(_of_segment, along)
@@ -119,7 +125,7 @@ def _integral(along: Along) -> Callable:
             return jax.jvp(lambda *x: slopes_by_all(*x, given), tuple(free), tangents[:2])[1]
         return jax.jvp(slopes_by_all, primals, tangents)[1]
 
-    curved_in_lanes = with_kernel(curved, along_kernel(along, "curvature"))
+    curved_in_lanes = with_kernel(curved, along_kernel(along, "curvature"), along.key())
 
     def curve(primals: tuple, tangents: tuple) -> tuple:
         given = None if _is_still(tangents[2]) else jax.tree.map(_dense, tangents[2])
@@ -127,7 +133,7 @@ def _integral(along: Along) -> Callable:
         return slopes_by_all_in_lanes(*primals), curved_in_lanes(primals, moving)
 
     slopes_by_all_in_lanes = with_kernel(
-        slopes_by_all, along_kernel(along, "slopes by all"), jvp=curve
+        slopes_by_all, along_kernel(along, "slopes by all"), along.key(), curve
     )
 
     @jax.custom_jvp

@@ -155,7 +155,7 @@ def _turn(num_pairs: int, step_cap: float) -> Callable:
         memory = remember(memory, step, change)
         return memory, search_direction(memory, grad, step_cap)
 
-    return with_kernel(turn, turn_kernel(num_pairs, step_cap))
+    return with_kernel(turn, turn_kernel(num_pairs, step_cap), step_cap)
 
 
 def step(objective: Objective, state: LbfgsState, config: LbfgsConfig) -> LbfgsState:
