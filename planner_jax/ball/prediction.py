@@ -94,7 +94,8 @@ def _integrated(num_nodes: int) -> Callable:
             for k, by in enumerate(slopes(further)(*primals)):
                 for place, slope in zip(further, by, strict=True):
                     along = slope * tangents[place]
-                    found[k] = found[k] + (along if place > 1 else jnp.sum(along, axis=-1))
+                    of_vector = tangents[place].ndim > 0
+                    found[k] = found[k] + (jnp.sum(along, axis=-1) if of_vector else along)
         return nodes, tuple(found)
 
     integrated_in_lanes = with_kernel(integrated, table_kernel(num_nodes), num_nodes, moved)
