@@ -25,12 +25,13 @@ def on_devices():
     devices = jax.local_devices()
     assert len(devices) == 4
     alone = plan(WellPlanner(), Well(GOALS), devices=devices[:1])
-    for some, chunk in ((None, 16), (devices[:3], None), (devices[:3], 16), (devices[2:3], 16)):
-        equal(plan(WellPlanner(), Well(GOALS), devices=some, chunk=chunk), alone)
-        resident = Well(jax.numpy.asarray(GOALS))
-        resident = plan(WellPlanner(), resident, devices=some, chunk=chunk)
-        equal(resident, alone)
-        assert isinstance(resident.point, jax.Array)
+    for some in (None, devices[:3], devices[2:3]):
+        for chunk in (None, 16):
+            equal(plan(WellPlanner(), Well(GOALS), devices=some, chunk=chunk), alone)
+            resident = Well(jax.numpy.asarray(GOALS))
+            resident = plan(WellPlanner(), resident, devices=some, chunk=chunk)
+            equal(resident, alone)
+            assert isinstance(resident.point, jax.Array)
     broken = GOALS.copy()
     broken[::100] = np.nan
     spoiled = plan(WellPlanner(), Well(broken))
