@@ -8,7 +8,7 @@ that bring up the device's clock, the fastest and the median of some more; the s
 referee accepts; and by how much the cost is above that of a long search from the same guess. What
 is timed is the whole of `plan` (for catches `plan_catches` with the decision "greedy"): ball
 tables, guesses, all rounds, and the check of the limits, from arrays on the devices to arrays on
-the devices. The referee is not part of it.
+the devices, where each holds its share. The referee is not part of it.
 """
 
 import dataclasses
@@ -21,6 +21,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
@@ -133,7 +134,9 @@ def report(
 
 def _row(kind: Any, planner: Any, num: int, seed: int, devices: list, repeat: int) -> str:
     host = jax.tree.map(np.asarray, kind.scenarios(num, seed))
-    scenarios = jax.block_until_ready(jax.device_put(host, devices[0]))
+    shares = NamedSharding(Mesh(np.array(devices), "lanes"), PartitionSpec("lanes"))
+    there = shares if num % len(devices) == 0 else devices[0]
+    scenarios = jax.block_until_ready(jax.device_put(host, there))
 
     def timed() -> tuple[float, Any]:
         began = time.perf_counter()

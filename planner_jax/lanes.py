@@ -8,15 +8,23 @@ and the product with a constant matrix is one large product. Same numbers, anoth
 
 import dataclasses
 import functools
+import importlib.util
 import math
+import sys
+import types
 import zlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
+from jax.core import Tracer
+from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
+
+from planner_jax.lanes_kernel import Unsupported, lanes_kernel
 
 _ELEMENTWISE = frozenset(
     "abs acos add add_any and asin atan atan2 cbrt ceil clamp convert_element_type copy copy_p "
@@ -30,7 +38,7 @@ _BY_AXIS = frozenset(
     "reduce_or reduce_prod reduce_sum rev sort split squeeze unstack concatenate stack".split()
 )
 _CALLS = frozenset(
-    "checkpoint closed_call core_call custom_jvp_call custom_vjp_call jit pjit".split()
+    "checkpoint closed_call core_call custom_jvp_call custom_vjp_call jit pjit remat2".split()
 )
 
 
@@ -72,15 +80,16 @@ Kernel = Callable[[Any, Sequence[Array]], list[Array] | None]
 
 @dataclasses.dataclass
 class _Named:
-    """What a name of a compiled function stands for: a kernel for arguments of one structure."""
+    """What a name of a compiled function stands for."""
 
-    treedef: Any  # of the arguments
-    kernel: Kernel
-    shapes: list[tuple[int, ...]]  # of their leaves, then of the results'
+    kernel: Callable[[Sequence[Array]], list[Array] | None]
+    shapes: list[tuple[int, ...]]  # of the arguments' leaves, then of the results'
 
 
 _KERNELS: dict[str, _Named] = {}
+_HALVED = "halved_"  # begins the names of functions whose halves are made kernels
 _FEWEST = 16  # lanes that are worth a block of a kernel
+_BLOCK = 32  # lanes of a block
 
 
 def with_kernel(
@@ -90,20 +99,28 @@ def with_kernel(
 
     Args:
         function: of pytrees of arrays of ONE lane, to a pytree of arrays.
-        kernel: the same on lanes. `jax.vmap` within a lane adds axes in front of some leaves.
+        kernel: the same on lanes. `jax.vmap` within a lane adds axes in front of some leaves;
+            where it has put one elsewhere, as after a matrix product, no kernel is called.
         key: constants that tell the function from others of its code, by their `repr`.
         jvp: its derivative as `jax.custom_jvp` takes it, zeros as `SymbolicZero`; without it,
             the function's own.
     """
+    return _with_kernels(function, lambda treedef, _: functools.partial(kernel, treedef), key, jvp)
+
+
+def _with_kernels(
+    function: Callable, kernel: Callable[[Any, tuple], Any], key: Any, jvp: Callable | None
+) -> Callable:
+    """`with_kernel` that makes a kernel for each tree and shapes of arguments."""
 
     @functools.cache
     def compiled(treedef: Any, shapes: tuple) -> Callable:
         # The same in every process, whatever it did before: kept programs are found by it.
-        own = getattr(function, "__qualname__", type(function).__name__)
-        name = f"kernel_{zlib.crc32(repr((own, key, treedef, shapes)).encode()):08x}"
+        text = repr((_name_of(function), key, treedef, shapes))
+        name = f"kernel_{zlib.crc32(text.encode()):08x}"
         while name in _KERNELS:
             name += "_"
-        here = _KERNELS[name] = _Named(treedef, kernel, [])
+        here = _KERNELS[name] = _Named(kernel(treedef, shapes), [])
 
         def named(*leaves: Array) -> Any:
             found = function(*jax.tree.unflatten(treedef, leaves))
@@ -127,18 +144,96 @@ def with_kernel(
     return guarded
 
 
-def _has_kernel(eqn: JaxprEqn) -> bool:
-    """Whether a call is of a function that has a kernel, and not of a half of that.
+def _name_of(function: Callable) -> str:
+    return getattr(function, "__qualname__", type(function).__name__)
 
-    Reverse mode splits compiled functions in two that keep the name.
+
+def in_one_kernel(function: Callable, key: Any = None) -> Callable:
+    """The function, which `over_lanes` makes one kernel of where the program is for CUDA.
+
+    Each half that reverse mode splits it into is a kernel as well. It is for arithmetic on
+    arrays of a few numbers: a function that `lanes_kernel` cannot take stays as it is.
+
+    Args:
+        function: of pytrees of arrays of ONE lane, to a pytree of arrays.
+        key: as for `with_kernel`.
     """
-    named = _KERNELS.get(eqn.params.get("name", ""))
+
+    # The way back computes anew what it needs: that is quicker than reading it.
+    @functools.partial(jax.checkpoint, prevent_cse=False)
+    def again(*args: Any) -> Any:
+        return function(*args)
+
+    def named(*args: Any) -> Any:
+        return again(*args)
+
+    named.__name__ = named.__qualname__ = _HALVED + _name_of(function)
+    halved = jax.jit(named)
+
+    def kernel(treedef: Any, shapes: tuple) -> Callable:
+        def flat(*leaves: Array) -> list[Array]:
+            return jax.tree.leaves(function(*jax.tree.unflatten(treedef, leaves)))
+
+        def in_lanes(leaves: Sequence[Array]) -> list[Array] | None:
+            pairs = zip(shapes, leaves, strict=True)
+            one = [jax.ShapeDtypeStruct(shape, leaf.dtype) for shape, leaf in pairs]
+            return _small_kernel(jax.make_jaxpr(flat)(*one), leaves)
+
+        return in_lanes
+
+    def slope(primals: tuple, tangents: tuple) -> tuple:
+        leaves, treedef = jax.tree.flatten(primals)
+        along = jax.tree.leaves(tangents)
+        moving = [k for k, t in enumerate(along) if not isinstance(t, SymbolicZero)]
+
+        def of_moving(*moved: Array) -> Any:
+            every = list(leaves)
+            for k, leaf in zip(moving, moved, strict=True):
+                every[k] = leaf
+            return halved(*jax.tree.unflatten(treedef, every))
+
+        return jax.jvp(of_moving, tuple(leaves[k] for k in moving), tuple(along[k] for k in moving))
+
+    return _with_kernels(function, kernel, key, slope)
+
+
+def _small_kernel(closed: ClosedJaxpr, args: Sequence[Any]) -> list[Array] | None:
+    """What a kernel makes of a jaxpr of one lane, or None where there is none."""
+    lanes = next((x.shape[-1] for x in args if not isinstance(x, np.ndarray)), 0)
+    threads = block_width(lanes, _BLOCK) if lanes else None
+    try:
+        return None if threads is None else lanes_kernel(closed, args, threads)
+    except Unsupported:
+        return None
+
+
+def _half_kernel(closed: ClosedJaxpr, inputs: list[Any]) -> Callable:
+    """The kernel of a half; constants that the half is handed are constants in it."""
+    fixed = [isinstance(x, np.ndarray | Array) and not isinstance(x, Tracer) for x in inputs]
+
+    def kernel(leaves: Sequence[Array]) -> list[Array] | None:
+        pairs = zip(inputs, leaves, fixed, strict=True)
+        return _small_kernel(
+            closed, [np.asarray(x) if is_fixed else leaf for x, leaf, is_fixed in pairs]
+        )
+
+    return kernel
+
+
+def _kernel_of(eqn: JaxprEqn, closed: ClosedJaxpr, inputs: list[Any]) -> Callable | None:
+    """The kernel of the lanes' arrays for a call, if it is of a function that has one."""
+    name = eqn.params.get("name", "")
+    if name.startswith(_HALVED):
+        return _half_kernel(closed, inputs)
+    named = _KERNELS.get(name)
     if named is None:
-        return False
+        return None
+    # Reverse mode splits compiled functions in two that keep the name: a half is something else.
     shapes = [_shape(atom) for atom in (*eqn.invars, *eqn.outvars)]
-    return len(shapes) == len(named.shapes) and all(
+    is_whole = len(shapes) == len(named.shapes) and all(
         full[len(full) - len(own) :] == own for full, own in zip(shapes, named.shapes, strict=True)
     )
+    return named.kernel if is_whole else None
 
 
 def block_width(lanes: int, most: int) -> int | None:
@@ -190,9 +285,8 @@ def _outputs(eqn: JaxprEqn, inputs: list[Any], lanes: int) -> list[Any]:
         inner = eqn.params["jaxpr"] if "jaxpr" in eqn.params else eqn.params["call_jaxpr"]
         closed = inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
         plain = functools.partial(_evaluate, closed.jaxpr, closed.consts)
-        if jax.default_backend() == "gpu" and _has_kernel(eqn):
-            return _by_kernel(eqn, inputs, lanes, plain)
-        return plain(inputs, lanes)
+        kernel = _kernel_of(eqn, closed, inputs) if jax.default_backend() == "gpu" else None
+        return _by_kernel(eqn, kernel, inputs, lanes, plain) if kernel else plain(inputs, lanes)
     if not any(isinstance(value, _Lanes) for value in inputs):
         return _bound(eqn, inputs)
     shapes = [_shape(atom) for atom in eqn.invars]
@@ -209,15 +303,17 @@ def _outputs(eqn: JaxprEqn, inputs: list[Any], lanes: int) -> list[Any]:
     return [_Lanes(array) for array in found]
 
 
-def _by_kernel(eqn: JaxprEqn, inputs: list[Any], lanes: int, plain: Callable) -> list[Any]:
+def _by_kernel(
+    eqn: JaxprEqn, kernel: Callable, inputs: list[Any], lanes: int, plain: Callable
+) -> list[Any]:
     """A function that has a kernel: that for CUDA, and what the function says elsewhere."""
-    named = _KERNELS[eqn.params["name"]]
+    _spare_searches()
     arrays = [_widened(v, _shape(atom), lanes) for v, atom in zip(inputs, eqn.invars, strict=True)]
 
     shapes = [(*_shape(atom), lanes) for atom in eqn.outvars]
 
     def in_kernel(*leaves: Array) -> list[Array]:
-        found = named.kernel(named.treedef, leaves)
+        found = kernel(leaves)
         if found is None:
             return in_steps(*leaves)
         # What does not vary along an axis of `vmap` does not have it.
@@ -232,6 +328,18 @@ def _by_kernel(eqn: JaxprEqn, inputs: list[Any], lanes: int, plain: Callable) ->
     return [
         _Lanes(leaf) for leaf in lax.platform_dependent(*arrays, cuda=in_kernel, default=in_steps)
     ]
+
+
+@functools.cache
+def _spare_searches() -> None:
+    """Have a kernel lowered in two thirds of the time.
+
+    For every value that it hands to Python, MLIR imports a module of Triton's dialect, which
+    jaxlib does not ship: thousands of searches of the path, unless an empty one is found.
+    """
+    name = "jaxlib.mlir.dialects.tt"
+    if importlib.util.find_spec(name) is None:
+        sys.modules.setdefault(name, types.ModuleType(name))
 
 
 def _bound(eqn: JaxprEqn, inputs: list[Any], **changes: Any) -> list[Any]:

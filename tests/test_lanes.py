@@ -1,11 +1,15 @@
 """`over_lanes` is `jax.vmap` with the lanes last, whatever the function does."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from planner_jax.lanes import over_lanes
+from planner_jax import lanes as lanes_module
+from planner_jax.lanes import in_one_kernel, over_lanes
+from planner_jax.lanes_kernel import Unsupported, lanes_kernel
 
 MATRIX = np.random.default_rng(0).standard_normal((5, 4))
 LANES = 7
@@ -82,3 +86,101 @@ def test_lanes_do_not_mix():
     broken = np.asarray(over_lanes(lambda y: jnp.tanh(MATRIX @ y))(jnp.asarray(x)))
     assert np.isnan(broken[..., 2]).all()
     np.testing.assert_array_equal(np.delete(broken, 2, -1), np.delete(np.asarray(clean), 2, -1))
+
+
+# What a kernel of single operations does not do: loops, branches, sorting, and reading at a
+# place of each lane's own from anything but an argument.
+NOT_IN_A_KERNEL = {"loop", "branches", "order", "window of a constant"}
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_a_kernel_of_single_operations_gives_the_same(name, float64):
+    random = np.random.default_rng(1)
+    x = jnp.asarray(random.standard_normal((4, 3, 32)))
+    k = jnp.asarray(random.integers(-1, 5, 32))
+    function = FUNCTIONS[name]
+    closed = jax.make_jaxpr(lambda *args: jax.tree.leaves(function(*args)))(x[..., 0], k[0])
+    if name in NOT_IN_A_KERNEL:
+        with pytest.raises(Unsupported):
+            lanes_kernel(closed, [x, k], 16, interpret=True)
+        return
+    expected = jax.vmap(function, in_axes=-1, out_axes=-1)(x, k)
+    found = lanes_kernel(closed, [x, k], 16, interpret=True)
+    for ours, theirs in zip(found, jax.tree.leaves(expected), strict=True):
+        assert ours.dtype == theirs.dtype
+        np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-14)
+
+
+def test_a_kernel_does_nothing_twice_and_nothing_in_vain():
+    def function(x):
+        unused = jnp.cos(x)
+        return jnp.sin(x[0]) * jnp.sin(x[0]) + 0.0 * unused.size
+
+    kernel = functools.partial(lanes_kernel, threads=16, interpret=True)
+    lanes = jnp.ones((2, 16), jnp.float32)
+    closed = jax.make_jaxpr(function)(lanes[:, 0])
+    jaxpr = str(jax.make_jaxpr(lambda lanes: kernel(closed, [lanes]))(lanes))
+    assert jaxpr.count("= sin ") == 1
+    assert jaxpr.count("= cos ") == 0
+
+
+def test_axes_in_front_of_some_arguments_are_in_front_of_all_results():
+    closed = jax.make_jaxpr(lambda x, k: (jnp.sum(x) * k, k + 1.0))(jnp.ones(3), jnp.ones(()))
+    x = jnp.arange(2.0 * 3 * 16).reshape(2, 3, 16)
+    k = jnp.arange(16.0)
+    product, later = lanes_kernel(closed, [x, k], 16, interpret=True)
+    np.testing.assert_allclose(product, x.sum(axis=1) * k)
+    np.testing.assert_allclose(later, [k + 1.0, k + 1.0])
+
+
+def test_arguments_that_all_lanes_share_are_constants():
+    closed = jax.make_jaxpr(lambda x, c: c @ x)(jnp.ones(3), jnp.ones((2, 3)))
+    x, shared = jnp.arange(3.0 * 16).reshape(3, 16), np.arange(6.0, dtype=np.float32).reshape(2, 3)
+    np.testing.assert_allclose(
+        lanes_kernel(closed, [x, shared], 16, interpret=True)[0], shared @ x, rtol=1e-6
+    )
+
+
+def test_halves_of_a_function_in_one_kernel_are_kernels(monkeypatch, float64):
+    """Values, `vmap` within a lane, slopes in both modes and the slope of a slope."""
+    used = []
+
+    def interpreted(closed, args, threads):
+        used.append(len(args))
+        return lanes_kernel(closed, args, threads, interpret=True)
+
+    monkeypatch.setattr(lanes_module, "lanes_kernel", interpreted)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *x, cuda, default: cuda(*x))
+
+    def plain(x, given):
+        return {"y": jnp.sin(x) * given["k"], "z": jnp.sum(MATRIX @ x**3)}
+
+    one = in_one_kernel(plain)
+
+    def total(function, x, given):
+        found = function(x, given)
+        return jnp.sum(found["y"] ** 2) + found["z"]
+
+    x = jnp.asarray(np.random.default_rng(3).standard_normal((4, 16)))
+    given = {"k": jnp.linspace(0.5, 1.0, 16)}
+    for number, asked in (
+        (1, lambda f: lambda x, g: f(x, g)),
+        (1, lambda f: lambda x, g: jax.vmap(lambda a: f(a * x, g))(jnp.arange(3.0))),
+        (2, lambda f: jax.grad(lambda x, g: total(f, x, g))),
+        (2, lambda f: jax.value_and_grad(lambda x, g: total(f, x, g), argnums=(0, 1))),
+        (1, lambda f: lambda x, g: jax.jvp(lambda y: total(f, y, g), (x,), (jnp.ones(4),))[1]),
+        (2, lambda f: jax.grad(lambda x, g: jnp.sum(jax.grad(lambda y: total(f, y, g))(x) ** 2))),
+    ):
+        used.clear()
+        expected = jax.vmap(asked(plain), in_axes=-1, out_axes=-1)(x, given)
+        found = over_lanes(asked(one))(x, given)
+        assert len(used) >= number
+        for ours, theirs in zip(*map(jax.tree.leaves, (found, expected)), strict=True):
+            np.testing.assert_allclose(ours, theirs, rtol=1e-10, atol=1e-12)
+
+
+def test_without_a_gpu_a_function_in_one_kernel_is_what_it_was(float64):
+    function = FUNCTIONS["gradient"]
+    x, k = jnp.ones((4, 3)), jnp.ones((), int)
+    np.testing.assert_allclose(in_one_kernel(function)(x, k), function(x, k), rtol=1e-13)

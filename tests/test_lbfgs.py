@@ -106,7 +106,7 @@ def test_an_iteration_without_descent_forgets_and_looks_nearer():
     state = lbfgs.init(jnp.full(3, 1e-3), config)  # a unit step overshoots
     state = lbfgs.step(unlimited(lambda x: jnp.sum(x**2)), state, config)
     np.testing.assert_array_equal(state.step, 0.0)
-    assert state.reach < 1.0
+    assert state.numbers.reach < 1.0
     memory = lbfgs.remember(
         lbfgs.Memory(jnp.ones((6, 3)), jnp.ones((6, 3)), jnp.ones(6)), state.step, jnp.zeros(3)
     )

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from planner_jax.lanes import with_kernel
+from planner_jax.lanes import in_one_kernel, with_kernel
 from planner_jax.optimise.lbfgs_kernel import turn_kernel
 
 
@@ -60,6 +60,16 @@ class Memory:
 
 
 @struct.dataclass
+class LbfgsNumbers:
+    """What one lane carries from iteration to iteration beside its points."""
+
+    best: Evaluation  # at the best point; not finite before the first iteration
+    reach: Array  # (), multiplies the trial steps: shrinks while none lowers the cost
+    iteration: Array  # () int32
+    stalled: Array  # () int32, iterations in a row without a decrease
+
+
+@struct.dataclass
 class LbfgsState:
     """What one lane carries from iteration to iteration."""
 
@@ -68,10 +78,7 @@ class LbfgsState:
     grad: Array  # (n,), where that step began
     memory: Memory
     best_point: Array  # (n,)
-    best: Evaluation  # not finite before the first iteration
-    reach: Array  # (), multiplies the trial steps: shrinks while none lowers the cost
-    iteration: Array  # () int32
-    stalled: Array  # () int32, iterations in a row without a decrease
+    numbers: LbfgsNumbers
 
 
 def _better(a: Evaluation, b: Evaluation) -> Array:
@@ -93,10 +100,12 @@ def init(point: Array, config: LbfgsConfig) -> LbfgsState:
         grad=zero,
         memory=Memory(steps=empty, changes=empty, inverse_curvature=empty[:, 0]),
         best_point=point,
-        best=Evaluation(unknown, unknown),
-        reach=jnp.ones((), point.dtype),
-        iteration=jnp.zeros((), jnp.int32),
-        stalled=jnp.zeros((), jnp.int32),
+        numbers=LbfgsNumbers(
+            best=Evaluation(unknown, unknown),
+            reach=jnp.ones((), point.dtype),
+            iteration=jnp.zeros((), jnp.int32),
+            stalled=jnp.zeros((), jnp.int32),
+        ),
     )
 
 
@@ -161,7 +170,8 @@ def _turn(num_pairs: int, step_cap: float) -> Callable:
 def step(objective: Objective, state: LbfgsState, config: LbfgsConfig) -> LbfgsState:
     """One iteration: gradient, memory, direction, all trial steps at once, the lowest kept.
 
-    The gradient comes first, so that k iterations take k gradients and no more.
+    The gradient comes first, so that k iterations take k gradients and no more. A finished lane
+    stands still: of its state only memory and gradient change, which it has no use for any more.
     """
 
     def value(point: Array) -> tuple[Array, Array]:
@@ -169,34 +179,72 @@ def step(objective: Objective, state: LbfgsState, config: LbfgsConfig) -> LbfgsS
         return evaluation.cost, evaluation.violation
 
     (cost, violation), grad = jax.value_and_grad(value, has_aux=True)(state.point)
-    here = Evaluation(cost, violation)
     memory, direction = _turn(config.memory, config.step_cap)(
         state.memory, state.step, grad - state.grad, grad
     )
-    lengths = state.reach * jnp.asarray(config.trial_steps, grad.dtype)
+    lengths = state.numbers.reach * jnp.asarray(config.trial_steps, grad.dtype)
     trials = jax.vmap(lambda length: objective(state.point + length * direction))(lengths)
+    here = Evaluation(cost, violation)
+    choice = _chooser(config)(state.numbers, here, lengths, trials)
+    step = jnp.where(choice.going, choice.length * direction, state.step)
+    point = jnp.where(choice.going, state.point + step, state.point)
+    return LbfgsState(
+        point=point,
+        step=step,
+        grad=grad,
+        memory=memory,
+        best_point=jnp.where(choice.better, point, state.best_point),
+        numbers=choice.numbers,
+    )
+
+
+def is_unfinished(numbers: LbfgsNumbers, config: LbfgsConfig) -> Array:
+    """Whether a lane has iterations left and is not stationary, () bool."""
+    return (numbers.iteration < config.max_steps) & (numbers.stalled < config.patience)
+
+
+@struct.dataclass
+class _Choice:
+    """What an iteration comes to."""
+
+    numbers: LbfgsNumbers  # afterwards
+    length: Array  # () of the step, times the direction; 0 without a decrease
+    better: Array  # () bool, whether the new point is the best one
+    going: Array  # () bool, False for a finished lane, which stands still
+
+
+@functools.cache
+def _chooser(config: LbfgsConfig) -> Callable:
+    """The choice of the step, one kernel for many lanes."""
+    return in_one_kernel(functools.partial(_chosen, config), config)
+
+
+def _chosen(
+    config: LbfgsConfig, numbers: LbfgsNumbers, here: Evaluation, lengths: Array, trials: Evaluation
+) -> _Choice:
+    """The lowest of the trials (k,), if it is lower than where the iteration began."""
     costs = jnp.where(jnp.isfinite(trials.cost), trials.cost, jnp.inf)
     is_chosen = jnp.arange(costs.size) == jnp.argmin(costs)
 
     def of_chosen(values: Array) -> Array:  # without a gather, which would need a loop of its own
         return jnp.sum(jnp.where(is_chosen, values, 0.0))
 
-    decreased = of_chosen(costs) < cost
-    # Without a decrease the lane stands still and next looks nearer.
-    step = jnp.where(decreased, of_chosen(lengths), 0.0) * direction
-    point = state.point + step
+    decreased = of_chosen(costs) < here.cost
     there = jax.tree.map(lambda new, old: jnp.where(decreased, of_chosen(new), old), trials, here)
-    best = jax.tree.map(lambda a, b: jnp.where(state.iteration == 0, a, b), here, state.best)
+    best = jax.tree.map(lambda a, b: jnp.where(numbers.iteration == 0, a, b), here, numbers.best)
     better = _better(there, best)
-    progress = cost - there.cost > config.tolerance * jnp.abs(cost)
-    return LbfgsState(
-        point=point,
-        step=step,
-        grad=grad,
-        memory=memory,
-        best_point=jnp.where(better, point, state.best_point),
+    progress = here.cost - there.cost > config.tolerance * jnp.abs(here.cost)
+    after = LbfgsNumbers(
         best=jax.tree.map(lambda a, b: jnp.where(better, a, b), there, best),
-        reach=jnp.where(decreased, 1.0, 0.05 * state.reach),
-        iteration=state.iteration + 1,
-        stalled=jnp.where(progress, 0, state.stalled + 1),
+        # Without a decrease the lane next looks nearer.
+        reach=jnp.where(decreased, 1.0, 0.05 * numbers.reach),
+        iteration=numbers.iteration + 1,
+        stalled=jnp.where(progress, 0, numbers.stalled + 1),
+    )
+    going = is_unfinished(numbers, config)
+    return _Choice(
+        numbers=jax.tree.map(lambda new, old: jnp.where(going, new, old), after, numbers),
+        length=jnp.where(decreased, of_chosen(lengths), 0.0),
+        better=better & going,
+        going=going,
     )

@@ -37,7 +37,7 @@ def minimise(objective: Objective, start: Array, config: LbfgsConfig) -> Optimum
     if config.max_steps == 0:
         return _optimum_at(start, objective(start), config)
     state = lax.while_loop(
-        lambda s: _unfinished(s, config),
+        lambda s: lbfgs.is_unfinished(s.numbers, config),
         lambda s: lbfgs.step(objective, s, config),
         lbfgs.init(start, config),
     )
@@ -64,32 +64,26 @@ def minimise_lanes(
 
     @over_lanes
     def step(state: LbfgsState, context: Any) -> LbfgsState:
-        after = lbfgs.step(lambda x: objective(x, context), state, config)
-        going = _unfinished(state, config)
-        kept = jax.tree.map(lambda new, old: jnp.where(going, new, old), after, state)
-        # The largest part, which a lane at rest does not look at any more.
-        return dataclasses.replace(kept, memory=after.memory, grad=after.grad)
+        return lbfgs.step(lambda x: objective(x, context), state, config)
 
     state = over_lanes(lambda start: lbfgs.init(start, config))(starts)
     if config.max_steps <= _COUNTED:
         state = lax.fori_loop(0, config.max_steps, lambda _, s: step(s, contexts), state)
     else:
         state = lax.while_loop(
-            lambda s: jnp.any(_unfinished(s, config)), lambda s: step(s, contexts), state
+            lambda s: jnp.any(lbfgs.is_unfinished(s.numbers, config)),
+            lambda s: step(s, contexts),
+            state,
         )
     return _optimum_of(state, config)
-
-
-def _unfinished(state: LbfgsState, config: LbfgsConfig) -> Array:
-    return (state.iteration < config.max_steps) & (state.stalled < config.patience)
 
 
 def _optimum_of(state: LbfgsState, config: LbfgsConfig) -> Optimum:
     return Optimum(
         point=state.best_point,
-        evaluation=state.best,
-        iterations=state.iteration,
-        stationary=state.stalled >= config.patience,
+        evaluation=state.numbers.best,
+        iterations=state.numbers.iteration,
+        stationary=state.numbers.stalled >= config.patience,
     )
 
 

@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from jax.sharding import Mesh, NamedSharding, PartitionSpec, Sharding, SingleDeviceSharding
 
 from planner_jax.optimise.multistart import solve_batch
@@ -75,7 +76,7 @@ def _plan_from_host(planner: Planner, scenarios: Any, chunk: int | None, mesh: M
 
 
 def _plan_resident(planner: Planner, scenarios: Any, chunk: int | None, mesh: Mesh) -> Any:
-    """The plans of scenarios in jax arrays; only statuses come to the host.
+    """The plans of scenarios in jax arrays; only what is unsolved comes to the host.
 
     Every device begins with its own share, without asking the others for a lane.
     """
@@ -85,20 +86,25 @@ def _plan_resident(planner: Planner, scenarios: Any, chunk: int | None, mesh: Me
         scenarios = _taken(scenarios, np.where(lanes < num, lanes, 0))
     scenarios = _placed(scenarios, mesh)
     first, *others = planner.rounds
-    plans = _first_plans(planner, first, scenarios, chunk or _default_chunk(first, mesh), mesh)
-    plans.status.copy_to_host_async()  # on its way as soon as it is known
+    size = chunk or _default_chunk(first, mesh)
+    plans, unsolved = _first_plans(planner, first, scenarios, size, mesh)
+    unsolved.copy_to_host_async()  # on its way as soon as it is known
+    if not np.asarray(unsolved).any():  # so that not all statuses have to come
+        others = []
     for attempt in others:
         lanes = np.flatnonzero(is_unsolved(np.asarray(plans.status)))
         if lanes.size == 0:
             break
         for call, _ in _calls(lanes, chunk or _default_chunk(attempt, mesh), mesh):
-            later = _solve(planner, attempt, mesh, _placed(_taken(scenarios, call), mesh))
+            later, _ = _solve(planner, attempt, mesh, _placed(_taken(scenarios, call), mesh))
             plans = _merged_on_device(plans, later, call)
     return plans if num % mesh.size == 0 else jax.tree.map(lambda leaf: leaf[:num], plans)
 
 
-def _first_plans(planner: Planner, attempt: Round, scenarios: Any, chunk: int, mesh: Mesh) -> Any:
-    """One round on all lanes of every device, chunk by chunk."""
+def _first_plans(
+    planner: Planner, attempt: Round, scenarios: Any, chunk: int, mesh: Mesh
+) -> tuple[Any, Array]:
+    """One round on all lanes of every device, chunk by chunk; as `_solve`."""
     share = _length(scenarios) // mesh.size
     if share == _bucket(share, chunk):
         return _solve(planner, attempt, mesh, scenarios)
@@ -157,7 +163,7 @@ def _placed(tree: Any, mesh: Mesh) -> Any:
     """The tree with equal shares of its lanes on every device."""
     placed = _sharding(mesh)
 
-    def is_there(leaf: jax.Array) -> bool:
+    def is_there(leaf: Array) -> bool:
         own = leaf.sharding  # equality is quicker to find out
         return own == placed or own.is_equivalent_to(placed, leaf.ndim)
 
@@ -178,7 +184,7 @@ def _solved_from_host(
 
     def solve(lanes: np.ndarray) -> Any:
         part = jax.device_put(jax.tree.map(lambda leaf: leaf[lanes], scenarios), placed)
-        found = _solve(planner, attempt, mesh, part)
+        found, _ = _solve(planner, attempt, mesh, part)
         return jax.block_until_ready(found) if threads > 1 else found
 
     if threads == 1:  # calls return before they are done, so that the next is under way
@@ -190,8 +196,14 @@ def _solved_from_host(
 
 
 @functools.partial(jax.jit, static_argnames=("planner", "attempt", "mesh"))
-def _solve(planner: Planner, attempt: Round, mesh: Mesh, scenarios: Any) -> Any:
-    return _apart(mesh, functools.partial(solve_batch, planner, attempt))(scenarios)
+def _solve(planner: Planner, attempt: Round, mesh: Mesh, scenarios: Any) -> tuple[Any, Array]:
+    """One round on the lanes of every device, and how many each leaves unsolved, (devices,)."""
+
+    def solve(scenarios: Any) -> tuple[Any, Array]:
+        plans = solve_batch(planner, attempt, scenarios)
+        return plans, jnp.sum(is_unsolved(plans.status), keepdims=True)
+
+    return _apart(mesh, solve)(scenarios)
 
 
 @jax.jit
@@ -233,12 +245,12 @@ def _merged_on_host(plans: Any, later: Any, lanes: np.ndarray) -> Any:
 
 
 @jax.jit
-def _merged_on_device(plans: Any, later: Any, lanes: jax.Array) -> Any:
+def _merged_on_device(plans: Any, later: Any, lanes: Array) -> Any:
     """As on the host; a lane that pads the call is there more than once, each time the same."""
     before = jax.tree.map(lambda leaf: leaf[lanes], plans)
     better = _better(later, before)
 
-    def replace(old: jax.Array, new: jax.Array, kept: jax.Array) -> jax.Array:
+    def replace(old: Array, new: Array, kept: Array) -> Array:
         chosen = better.reshape(-1, *(1,) * (new.ndim - 1))
         return old.at[lanes].set(jnp.where(chosen, new, kept))
 

@@ -6,6 +6,8 @@ hoop, so that no plan misses; attitude and limits stay inequalities.
 """
 
 import dataclasses
+import functools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +18,7 @@ from jax import Array
 from planner_jax.cost.along import Along, greatest_along, integrate_along
 from planner_jax.cost.limits import body_rate_excess, ground_excess, speed_excess, thrust_excess
 from planner_jax.cost.penalty import smoothed_hinge
+from planner_jax.lanes import in_one_kernel
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
 from planner_jax.optimise.multistart import FEASIBILITY_TOLERANCE
 from planner_jax.optimise.problem import Round
@@ -36,7 +39,12 @@ from planner_jax.task.catch.chain import (
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.task.catch.scenario import CatchLimits, CatchScenario
 from planner_jax.trajectory.polynomial import Motion
-from planner_jax.trajectory.proportional_minco import ProportionalMinco, proportional_minco
+from planner_jax.trajectory.proportional_minco import (
+    ProportionalMinco,
+    boundary_energy,
+    offset_energy,
+    proportional_minco,
+)
 
 _ORDER = 4  # minimum snap
 _DECODE_NODES = 40  # body rates peak sharply where the thrust is small
@@ -68,6 +76,12 @@ class Catch:
     durations: Array  # (N,) [s], of the segments
     tail_states: Array  # (N, 4, 3) of the quadrotor
     angle_excess: Array  # (N,) of the net's angle over theta_safe, relative; <= 0 is good
+
+
+@functools.cache
+def _ends(planner: "ExactCatch") -> Callable:
+    """`planner.ends`, one kernel for many lanes."""
+    return in_one_kernel(planner.ends, planner)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -242,25 +256,49 @@ class ExactCatch:
 
     def objective(self, point: Array, context: CatchContext) -> Evaluation:
         """Cost, and the largest excess at the penalty nodes (squares over squares)."""
-        chain, catch = self._unpack(point, context)
-        scenario = context.scenario
+        natural = point.reshape(-1, len(self.scale)) * jnp.asarray(self.scale, point.dtype)
+        offsets = natural[:, : self.num_offsets].reshape(natural.shape[0], -1, 3)
+        rows, durations, core, at_catches = _ends(self)(natural[:, self.num_offsets :], context)
         penalties, worst = integrate_along(
             self._along(self.nodes),
-            chain.columns,
-            chain.piece_durations,
-            (scenario.gravity, scenario.limits),
+            jnp.concatenate([rows, offsets], axis=1),
+            durations,
+            (context.scenario.gravity, context.scenario.limits),
         )
-        at_catch = self._at_catch(catch, context)
-        penalty = jnp.sum(jnp.where(context.active, penalties, 0.0))
-        cost = penalty + self._core(chain, catch, at_catch, context)
+        energies = jax.vmap(functools.partial(offset_energy, self.maps))(offsets, durations)
+        along = penalties + self.energy_weight * energies
+        cost = core + jnp.sum(jnp.where(context.active, along, 0.0))
         # Peaks between nodes are a little higher than the nodes show.
         worst = jnp.max(jnp.where(context.active, worst, -1.0))
-        return Evaluation(cost=cost, violation=jnp.maximum(worst, jnp.max(at_catch)) + 0.004)
+        return Evaluation(cost=cost, violation=jnp.maximum(worst, at_catches) + 0.004)
+
+    def ends(self, natural: Array, context: CatchContext) -> tuple[Array, Array, Array, Array]:
+        """What the variables after the waypoint offsets make of the objective.
+
+        Args:
+            natural: (N, 12) as for `catches`.
+            context: of the scenario.
+
+        Returns:
+            Boundary rows (N, 8, 3) and mean durations of a piece (N,) [s] of the segments, the
+            cost of time and of the ends, and the greatest excess at the catches.
+        """
+        catch = self.catches(natural, context)
+        durations = catch.durations / self.num_pieces
+        rows = chain_rows(context.scenario.head_state, catch.tail_states, durations)
+        at_catch = self._at_catch(catch, context)
+        energies = jax.vmap(functools.partial(boundary_energy, self.maps))(rows, durations)
+        energy = jnp.sum(jnp.where(context.active, energies, 0.0))
+        return rows, durations, self._weighed(catch, at_catch, energy), jnp.max(at_catch)
 
     def _core(self, chain: Chain, catch: Catch, at_catch: Array, context: CatchContext) -> Array:
         """The part of the cost that needs no samples: energy, time, hinges at the catches."""
-        hinges = smoothed_hinge(at_catch + self.margin, self.hinge_width)
         energy = jnp.sum(jnp.where(context.active, chain_energy(self.maps, chain), 0.0))
+        return self._weighed(catch, at_catch, energy)
+
+    def _weighed(self, catch: Catch, at_catch: Array, energy: Array) -> Array:
+        """Cost of the hinges at the catches, of an energy and of the time."""
+        hinges = smoothed_hinge(at_catch + self.margin, self.hinge_width)
         weighed = self.energy_weight * energy + self.time_weight * catch.times[-1]
         return self.catch_weight * jnp.sum(hinges) + weighed
 

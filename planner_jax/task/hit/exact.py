@@ -29,6 +29,7 @@ from planner_jax.cost.along import Along, greatest_along, integrate_along
 from planner_jax.cost.contact import apex_excess, hitting_speed_excess
 from planner_jax.cost.limits import motion_excess
 from planner_jax.cost.penalty import smoothed_hinge
+from planner_jax.lanes import in_one_kernel
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
 from planner_jax.optimise.problem import Round
 from planner_jax.optimise.scaling import shipped_scale
@@ -38,8 +39,10 @@ from planner_jax.task.hit.scenario import HitScenario
 from planner_jax.trajectory.polynomial import Motion
 from planner_jax.trajectory.proportional_minco import (
     ProportionalMinco,
+    boundary_energy,
     boundary_rows,
     energy_curvature,
+    offset_energy,
     proportional_minco,
     proportional_trajectory,
     sample_motion,
@@ -110,6 +113,12 @@ _GUESSES = np.array(
         (0.65, 1.7, 2.2),
     ]
 )
+
+
+@functools.cache
+def _ends(planner: "ExactHit") -> Callable:
+    """`planner.ends`, one kernel for many lanes."""
+    return in_one_kernel(planner.ends, planner)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -264,18 +273,37 @@ class ExactHit:
 
     def objective(self, point: Array, context: HitContext) -> Evaluation:
         """Cost, and the largest excess at the penalty nodes (squares over squares)."""
-        offsets, rows, duration, impact = self._unpack(point, context)
+        natural = point * jnp.asarray(self.scale, point.dtype)
+        offsets = natural[: self.num_offsets].reshape(-1, 3)
+        rows, duration, core, at_impact = _ends(self)(natural[self.num_offsets :], context)
         penalties, worst = integrate_along(
             self._along(self.nodes),
             jnp.concatenate([rows, offsets])[None],
             duration[None],
             (context.scenario.gravity, context.scenario.limits),
         )
-        at_impact = self._at_impact(impact, context)
-        core = self._core(offsets, rows, duration, at_impact)
+        energy = self.energy_weight * offset_energy(self.maps, offsets, duration)
         # Peaks between nodes are a little higher than the nodes show.
-        violation = jnp.maximum(worst[0], jnp.max(at_impact)) + 0.004
-        return Evaluation(cost=penalties[0] + core, violation=violation)
+        violation = jnp.maximum(worst[0], at_impact) + 0.004
+        return Evaluation(cost=penalties[0] + core + energy, violation=violation)
+
+    def ends(self, natural: Array, context: HitContext) -> tuple[Array, Array, Array, Array]:
+        """What the variables after the waypoint offsets make of the objective.
+
+        Args:
+            natural: (8,) as for `impact`.
+            context: of the scenario.
+
+        Returns:
+            Boundary rows (8, 3), mean duration of a piece [s], the cost of the ends, and the
+            greatest excess at the impact.
+        """
+        impact = self.impact(natural, context)
+        duration = impact.stroke.time / self.num_pieces
+        rows = boundary_rows(context.scenario.head_state, impact.tail_state, duration)
+        at_impact = self._at_impact(impact, context)
+        energy = self.energy_weight * boundary_energy(self.maps, rows, duration)
+        return rows, duration, self._hinges(at_impact) + energy, jnp.max(at_impact)
 
     def _core(self, offsets: Array, rows: Array, duration: Array, at_impact: Array) -> Array:
         """The part of the cost that needs no samples: energy, and hinges at the impact."""
