@@ -151,8 +151,8 @@ def _name_of(function: Callable) -> str:
 def in_one_kernel(function: Callable, key: Any = None) -> Callable:
     """The function, which `over_lanes` makes one kernel of where the program is for CUDA.
 
-    Each half that reverse mode splits it into is a kernel as well. It is for arithmetic on
-    arrays of a few numbers: a function that `lanes_kernel` cannot take stays as it is.
+    So is each half that reverse mode splits it into, if only the first argument moves. It is for
+    arithmetic on arrays of a few numbers: what `lanes_kernel` cannot take stays as it is.
 
     Args:
         function: of pytrees of arrays of ONE lane, to a pytree of arrays.
@@ -185,12 +185,14 @@ def in_one_kernel(function: Callable, key: Any = None) -> Callable:
         leaves, treedef = jax.tree.flatten(primals)
         along = jax.tree.leaves(tangents)
         moving = [k for k, t in enumerate(along) if not isinstance(t, SymbolicZero)]
+        of_first = len(jax.tree.leaves(primals[0]))
+        derived = halved if all(k < of_first for k in moving) else function
 
         def of_moving(*moved: Array) -> Any:
             every = list(leaves)
             for k, leaf in zip(moving, moved, strict=True):
                 every[k] = leaf
-            return halved(*jax.tree.unflatten(treedef, every))
+            return derived(*jax.tree.unflatten(treedef, every))
 
         return jax.jvp(of_moving, tuple(leaves[k] for k in moving), tuple(along[k] for k in moving))
 
