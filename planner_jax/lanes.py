@@ -186,7 +186,8 @@ def in_one_kernel(function: Callable, key: Any = None) -> Callable:
         along = jax.tree.leaves(tangents)
         moving = [k for k, t in enumerate(along) if not isinstance(t, SymbolicZero)]
         of_first = len(jax.tree.leaves(primals[0]))
-        derived = halved if all(k < of_first for k in moving) else function
+        by_first = all(k < of_first for k in moving)
+        derived = halved if by_first and _has_kernels() else function
 
         def of_moving(*moved: Array) -> Any:
             every = list(leaves)
@@ -197,6 +198,11 @@ def in_one_kernel(function: Callable, key: Any = None) -> Callable:
         return jax.jvp(of_moving, tuple(leaves[k] for k in moving), tuple(along[k] for k in moving))
 
     return _with_kernels(function, kernel, key, slope)
+
+
+def _has_kernels() -> bool:
+    """Whether programs are for a device that kernels are made for."""
+    return jax.default_backend() == "gpu"
 
 
 def _small_kernel(closed: ClosedJaxpr, args: Sequence[Any]) -> list[Array] | None:
@@ -287,7 +293,7 @@ def _outputs(eqn: JaxprEqn, inputs: list[Any], lanes: int) -> list[Any]:
         inner = eqn.params["jaxpr"] if "jaxpr" in eqn.params else eqn.params["call_jaxpr"]
         closed = inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
         plain = functools.partial(_evaluate, closed.jaxpr, closed.consts)
-        kernel = _kernel_of(eqn, closed, inputs) if jax.default_backend() == "gpu" else None
+        kernel = _kernel_of(eqn, closed, inputs) if _has_kernels() else None
         return _by_kernel(eqn, kernel, inputs, lanes, plain) if kernel else plain(inputs, lanes)
     if not any(isinstance(value, _Lanes) for value in inputs):
         return _bound(eqn, inputs)
