@@ -3,7 +3,8 @@
 A thread carries a lane and keeps every number of every array in a register of its own. The
 function is taken apart into operations on single numbers, each done once and only if a result
 needs it. So shapes cost nothing: what would be a launch for each concatenation and each sum over
-an axis is one launch altogether.
+an axis is one launch altogether. Vectors that only pass through should not: the compiler's time
+grows with the numbers that cross between a kernel and the memory.
 """
 
 import dataclasses
@@ -19,7 +20,9 @@ import numpy as np
 from jax import Array, lax
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Primitive
 
-_MOST = 4000  # operations of a kernel, all of which are written out
+# The compiler looks from each access to memory at all operations, and from each of these again.
+# This much, accesses times squared numbers, took it 5 s; larger functions are refused.
+_MOST = 3e8
 
 _ELEMENTWISE = frozenset(
     "abs add add_any and atan2 ceil clamp convert_element_type cos div eq exp expm1 floor ge gt "
@@ -81,8 +84,11 @@ def lanes_kernel(
     found = _evaluate(numbers, closed.jaxpr, closed.consts, values)
     results = [_entries(value, shape) for value, (shape, _) in zip(found, out, strict=True)]
     needed = numbers.needed_by(results)
-    if len(needed) > _MOST or any(0 in shape for shape in (*own, *(shape for shape, _ in out))):
-        raise Unsupported
+    accesses = sum(number.is_read for number in needed) + sum(entries.size for entries in results)
+    if accesses * len(needed) ** 2 > _MOST:
+        raise Unsupported("too large a function")
+    if any(0 in shape for shape in (*own, *(shape for shape, _ in out))):
+        raise Unsupported("an array without numbers")
 
     def body(*refs):
         arrays: dict[int, Array] = {}
@@ -131,6 +137,7 @@ class _Number:
     index: int
     operands: tuple[Any, ...]  # numbers, or what is the same for all lanes
     make: Callable[[Sequence[Any], Callable], Array]
+    is_read: bool = False  # from memory
 
 
 class _Numbers:
@@ -209,7 +216,9 @@ class _Argument:
             return triton.load(ref.at[(*places, lanes)])
 
         fixed = tuple(None if isinstance(k, _Number) else k for k in index)
-        return self.numbers.number(own, make, "argument", self.place, fixed)
+        number = self.numbers.number(own, make, "argument", self.place, fixed)
+        number.is_read = True
+        return number
 
 
 def _shape(atom: Any) -> tuple[int, ...]:

@@ -141,6 +141,12 @@ def test_arguments_that_all_lanes_share_are_constants():
     )
 
 
+def test_a_function_that_would_take_long_to_compile_is_refused():
+    closed = jax.make_jaxpr(lambda x: jnp.cumsum(jnp.sin(x)))(jnp.ones(500))
+    with pytest.raises(Unsupported, match="too large"):
+        lanes_kernel(closed, [jnp.ones((500, 16))], 16)
+
+
 def test_halves_of_a_function_in_one_kernel_are_kernels(monkeypatch, float64):
     """Values, `vmap` within a lane, slopes in both modes and the slope of a slope."""
     used = []
