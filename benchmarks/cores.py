@@ -10,17 +10,36 @@ core of the same turn. Linux, because processes are bound to cores.
 """
 
 import argparse
+import multiprocessing
 import os
 import statistics
-import subprocess
-import sys
 import time
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 
 
-def _serve(num: int, cores: Sequence[int]) -> None:
-    """The child: plans once for every line it is given and says how long it took."""
-    os.sched_setaffinity(0, cores)  # before JAX starts its threads
+def _on(cores: Sequence[int]) -> ProcessPoolExecutor:
+    """A process on some cores, to which it is bound before JAX starts its threads."""
+    spawn = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(1, spawn, initializer=os.sched_setaffinity, initargs=(0, cores))
+
+
+def _planned(num: int) -> tuple[float, str]:
+    """Seconds that planning hits took, warm, and how good the plans of the first call were."""
+    if num not in _CASES:
+        _CASES[num] = _first(num)
+    planner, scenarios, quality = _CASES[num]
+    from planner_jax.task.solve import plan
+
+    began = time.perf_counter()
+    plan(planner, scenarios)
+    return time.perf_counter() - began, quality
+
+
+_CASES: dict = {}  # of a process, by the number of hits
+
+
+def _first(num: int) -> tuple:
     import numpy as np
 
     from planner_jax.referee.hit import referee_hits
@@ -31,45 +50,8 @@ def _serve(num: int, cores: Sequence[int]) -> None:
     planner, scenarios = ExactHit(), to_scenarios(generate_serves(num, 0))
     plans = plan(planner, scenarios)
     success = referee_hits(scenarios, plans).success.mean()
-    print(f"{100 * success:.2f} % refereed, median cost {np.median(plans.cost):.3g}", flush=True)
-    for _ in sys.stdin:
-        began = time.perf_counter()
-        plan(planner, scenarios)
-        print(time.perf_counter() - began, flush=True)
-
-
-class _Child:
-    """A process that plans `num` hits on some cores when told to."""
-
-    def __init__(self, num: int, cores: Sequence[int]) -> None:
-        self.num = num
-        names = ",".join(map(str, cores))
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "benchmarks.cores", "--num", str(num), "--serve", names],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        self.quality = self._line()
-
-    def begin(self) -> None:
-        assert self.process.stdin
-        self.process.stdin.write("\n")
-        self.process.stdin.flush()
-
-    def rate(self) -> float:
-        """Plans a second of what was begun."""
-        return self.num / float(self._line())
-
-    def end(self) -> None:
-        self.process.communicate()
-
-    def _line(self) -> str:
-        assert self.process.stdout
-        line = self.process.stdout.readline()
-        if not line:
-            raise SystemExit("a planning process ended early")
-        return line.strip()
+    quality = f"{100 * success:.2f} % refereed, median cost {np.median(plans.cost):.3g}"
+    return planner, scenarios, quality
 
 
 def main() -> None:
@@ -77,23 +59,22 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--num", type=int, default=36000, help="hits a process plans at a time")
     parser.add_argument("--turns", type=int, default=8)
-    parser.add_argument("--serve", help=argparse.SUPPRESS)
     args = parser.parse_args()
-    if args.serve:
-        _serve(args.num, [int(core) for core in args.serve.split(",")])
-        return
     cores = sorted(os.sched_getaffinity(0))
     groups = {
-        "one core": [_Child(args.num, cores[-1:])],
-        f"all {len(cores)} cores": [_Child(args.num, cores)],
-        "a process for each core": [_Child(args.num, [core]) for core in cores],
+        "one core": [_on(cores[-1:])],
+        f"all {len(cores)} cores": [_on(cores)],
+        "a process for each core": [_on([core]) for core in cores],
+    }
+    quality = {
+        name: [child.submit(_planned, args.num).result()[1] for child in children][0]
+        for name, children in groups.items()
     }
     rates: dict[str, list[float]] = {name: [] for name in groups}
     for _ in range(args.turns):
         for name, children in groups.items():
-            for child in children:
-                child.begin()
-            rates[name].append(sum(child.rate() for child in children))
+            begun = [child.submit(_planned, args.num) for child in children]
+            rates[name].append(sum(args.num / one.result()[0] for one in begun))
     print(f"load average {os.getloadavg()[0]:.1f}; {args.turns} turns")
     print("| process | plans/s, median | lowest | highest | times one core | success |")
     print("|---|---|---|---|---|---|")
@@ -102,11 +83,11 @@ def main() -> None:
         times = statistics.median(f / a for f, a in zip(found, alone, strict=True))
         print(
             f"| {name} | {statistics.median(found):.0f} | {min(found):.0f} | {max(found):.0f} "
-            f"| {times:.2f} | {groups[name][0].quality} |"
+            f"| {times:.2f} | {quality[name]} |"
         )
     for children in groups.values():
         for child in children:
-            child.end()
+            child.shutdown()
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from jax import Array, lax
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Primitive
 
 # The compiler looks from each access to memory at all operations, and from each of these again.
-# This much, accesses times squared numbers, took it 5 s; larger functions are refused.
+# Accesses times squared numbers: so many take it some 5 s. Larger functions are refused.
 _MOST = 3e8
 
 _ELEMENTWISE = frozenset(
