@@ -5,7 +5,8 @@
 
 One row a batch size: the first call, with what it compiles; then, after half a second of calls
 that bring up the device's clock, the fastest and the median of some more; the share that the
-referee accepts; and by how much the cost is above that of a long search from the same guess. What
+referee accepts; and by how much the cost is above that of a long search from the same guess. For
+several devices also the efficiency beside one, and what each takes for its share alone. What
 is timed is the whole of `plan` (for catches `plan_catches` with the decision "greedy"): ball
 tables, guesses, all rounds, and the check of the limits, from arrays on the devices to arrays on
 the devices, where each holds its share. The referee is not part of it.
@@ -126,45 +127,90 @@ def report(
     )
     print(" refereed | cost above a long search's (median, p90) | memory [GiB] |")
     print("|---|---|---|---|---|---|---|---|---|")
+    beside = []
     for num in batch:
-        print(_row(kind, planner, num, seed, used, repeat), flush=True)
+        host = jax.tree.map(np.asarray, kind.scenarios(num, seed))
+        timed = _timed(kind, planner, host, used, repeat)
+        print(_row(kind, planner, host, used, timed), flush=True)
+        if len(used) > 1:
+            beside.append(_efficiency(kind, planner, host, used, repeat, timed))
+    print("\n".join(beside), end="\n" if beside else "")
     if agree:
         print(_agreement(kind, planner, seed, used))
 
 
-def _row(kind: Any, planner: Any, num: int, seed: int, devices: list, repeat: int) -> str:
-    host = jax.tree.map(np.asarray, kind.scenarios(num, seed))
+@dataclasses.dataclass(frozen=True)
+class _Timed:
+    """Calls on one batch."""
+
+    first: float  # [s]
+    compiling: float  # [s], of the first
+    seconds: list[float]  # of the others
+    decided: Any  # the scenarios, with what was decided on before they were planned
+    plans: Any
+
+    @property
+    def fastest(self) -> float:
+        return min(self.seconds)
+
+
+def _timed(kind: Any, planner: Any, host: Any, devices: list, repeat: int) -> _Timed:
+    """Plan a batch that the devices hold in equal shares, once and then `repeat` times, warm."""
+    num = jax.tree.leaves(host)[0].shape[0]
     shares = NamedSharding(Mesh(np.array(devices), "lanes"), PartitionSpec("lanes"))
-    there = shares if num % len(devices) == 0 else devices[0]
+    there = shares if len(devices) > 1 and num % len(devices) == 0 else devices[0]
     scenarios = jax.block_until_ready(jax.device_put(host, there))
 
-    def timed() -> tuple[float, Any]:
+    def call() -> tuple[float, Any]:
         began = time.perf_counter()
         found = jax.block_until_ready(kind.plan(planner, scenarios, devices))
         return time.perf_counter() - began, found
 
     with CompileClock() as clock:
-        first_call, _ = timed()
+        first, _ = call()
     began = time.perf_counter()
     while time.perf_counter() - began < _WARM_UP:
-        timed()
+        call()
     seconds = []
     for _ in range(repeat):
-        took, (decided, plans) = timed()
+        took, (decided, plans) = call()
         seconds.append(took)
-    plans = jax.device_get(plans)
-    judged = jax.tree.map(lambda leaf: np.asarray(leaf)[:_JUDGED], (decided, plans))
+    return _Timed(first, clock.seconds, seconds, decided, plans)
+
+
+def _row(kind: Any, planner: Any, host: Any, devices: list, timed: _Timed) -> str:
+    plans = jax.device_get(timed.plans)
+    judged = jax.tree.map(lambda leaf: np.asarray(leaf)[:_JUDGED], (timed.decided, plans))
     accepted = kind.accepted(*judged)
     first = jax.tree.map(lambda leaf: leaf[:_COMPARED], (host, plans))
     _, best = kind.plan(dataclasses.replace(planner, rounds=_LONG), first[0], devices)
     both = is_solved(first[1].status) & is_solved(best.status)
     gap = 100.0 * (first[1].cost / best.cost - 1.0)[both]
-    fastest, median = min(seconds), statistics.median(seconds)
+    num, median = plans.status.size, statistics.median(timed.seconds)
     return (
-        f"| {num:,} | {first_call:.1f} | {clock.seconds:.1f} | {1e3 * fastest:.2f} | "
-        f"{1e3 * median:.2f} | {num / fastest:,.0f} | {100.0 * accepted.mean():.3f} % "
+        f"| {num:,} | {timed.first:.1f} | {timed.compiling:.1f} | {1e3 * timed.fastest:.2f} | "
+        f"{1e3 * median:.2f} | {num / timed.fastest:,.0f} | {100.0 * accepted.mean():.3f} % "
         f"({(~accepted).sum()} of {accepted.size:,} fail) | {np.median(gap):.1f} %, "
         f"{np.quantile(gap, 0.9):.1f} % | {_memory(devices):.1f} |"
+    )
+
+
+def _efficiency(
+    kind: Any, planner: Any, host: Any, devices: list, repeat: int, timed: _Timed
+) -> str:
+    """What several devices make of a batch beside one, and beside each of them alone."""
+    num = timed.plans.status.size
+    whole = _timed(kind, planner, host, devices[:1], repeat).fastest
+    ends = np.linspace(0, num, len(devices) + 1).astype(int)
+    alone = []
+    for device, begin, end in zip(devices, ends[:-1], ends[1:], strict=True):
+        share = jax.tree.map(lambda leaf: leaf[begin:end], host)  # noqa: B023
+        alone.append(_timed(kind, planner, share, [device], repeat).fastest)
+    shares = ", ".join(f"{1e3 * seconds:.2f}" for seconds in alone)
+    return (
+        f"{num:,} plans: one device takes {1e3 * whole:.2f} ms, so that {len(devices)} have an "
+        f"efficiency of {whole / timed.fastest / len(devices):.3f}; each alone takes {shares} ms "
+        f"for its share"
     )
 
 
