@@ -134,7 +134,8 @@ def report(
         print(_row(kind, planner, host, used, timed), flush=True)
         if len(used) > 1:
             beside.append(_efficiency(kind, planner, host, used, repeat, timed))
-    print("\n".join(beside), end="\n" if beside else "")
+    for line in beside:
+        print(line)
     if agree:
         print(_agreement(kind, planner, seed, used))
 

@@ -22,8 +22,9 @@ import numpy as np
 from jax import Array, lax
 from jax.core import Tracer
 from jax.custom_derivatives import SymbolicZero
-from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
+from jax.extend.core import ClosedJaxpr, JaxprEqn
 
+from planner_jax.jaxprs import called, evaluate, shape_of
 from planner_jax.lanes_kernel import Unsupported, lanes_kernel
 
 _ELEMENTWISE = frozenset(
@@ -36,9 +37,6 @@ _ELEMENTWISE = frozenset(
 _BY_AXIS = frozenset(
     "argmax argmin cumlogsumexp cummax cummin cumprod cumsum reduce_and reduce_max reduce_min "
     "reduce_or reduce_prod reduce_sum rev sort split squeeze unstack concatenate stack".split()
-)
-_CALLS = frozenset(
-    "checkpoint closed_call core_call custom_jvp_call custom_vjp_call jit pjit remat2".split()
 )
 
 
@@ -63,9 +61,9 @@ def over_lanes(function: Callable) -> Callable:
         closed, shape = jax.make_jaxpr(function, return_shape=True)(
             *jax.tree.unflatten(treedef, single)
         )
-        found = _evaluate(closed.jaxpr, closed.consts, [_Lanes(leaf) for leaf in leaves], lanes)
+        found = _evaluate(closed, [_Lanes(leaf) for leaf in leaves], lanes)
         full = [
-            _widened(value, _shape(out), lanes)
+            _widened(value, shape_of(out), lanes)
             for value, out in zip(found, closed.jaxpr.outvars, strict=True)
         ]
         return jax.tree.unflatten(jax.tree.structure(shape), full)
@@ -148,26 +146,27 @@ def _name_of(function: Callable) -> str:
     return getattr(function, "__qualname__", type(function).__name__)
 
 
-def in_one_kernel(function: Callable, key: Any = None) -> Callable:
-    """The function, which `over_lanes` makes one kernel of where the program is for CUDA.
+@functools.cache
+def in_one_kernel(static: Callable, *constants: Any) -> Callable:
+    """A function of its constants and more, of which `over_lanes` makes one kernel for CUDA.
 
-    So is each half that reverse mode splits it into, if only the first argument moves. It is for
-    arithmetic on arrays of a few numbers: what `lanes_kernel` cannot take stays as it is.
+    So it does of each half that reverse mode splits it into, if only the first argument moves. It
+    is for arithmetic on arrays of a few numbers: what `lanes_kernel` cannot take stays as it is.
 
     Args:
-        function: of pytrees of arrays of ONE lane, to a pytree of arrays.
-        key: as for `with_kernel`.
+        static: of the constants, then of pytrees of arrays of ONE lane, to a pytree of arrays.
+        constants: hashable. For the same ones there is one kernel: give what does not vary, such
+            as a planner, in this way and not by a new function object.
     """
+    function = functools.partial(static, *constants)
 
     # The way back computes anew what it needs: that is quicker than reading it.
-    @functools.partial(jax.checkpoint, prevent_cse=False)
-    def again(*args: Any) -> Any:
-        return function(*args)
+    again = jax.checkpoint(function, prevent_cse=False)
 
     def named(*args: Any) -> Any:
         return again(*args)
 
-    named.__name__ = named.__qualname__ = _HALVED + _name_of(function)
+    named.__name__ = named.__qualname__ = _HALVED + _name_of(static)
     halved = jax.jit(named)
 
     def kernel(treedef: Any, shapes: tuple) -> Callable:
@@ -197,7 +196,7 @@ def in_one_kernel(function: Callable, key: Any = None) -> Callable:
 
         return jax.jvp(of_moving, tuple(leaves[k] for k in moving), tuple(along[k] for k in moving))
 
-    return _with_kernels(function, kernel, key, slope)
+    return _with_kernels(function, kernel, (_name_of(static), constants), slope)
 
 
 def _has_kernels() -> bool:
@@ -237,7 +236,7 @@ def _kernel_of(eqn: JaxprEqn, closed: ClosedJaxpr, inputs: list[Any]) -> Callabl
     if named is None:
         return None
     # Reverse mode splits compiled functions in two that keep the name: a half is something else.
-    shapes = [_shape(atom) for atom in (*eqn.invars, *eqn.outvars)]
+    shapes = [shape_of(atom) for atom in (*eqn.invars, *eqn.outvars)]
     is_whole = len(shapes) == len(named.shapes) and all(
         full[len(full) - len(own) :] == own for full, own in zip(shapes, named.shapes, strict=True)
     )
@@ -260,11 +259,6 @@ class _Lanes:
         self.array = array
 
 
-def _shape(atom: Any) -> tuple[int, ...]:
-    """Shape of a variable of a jaxpr."""
-    return atom.aval.shape
-
-
 def _widened(value: Any, shape: tuple[int, ...], lanes: int) -> Array:
     """The array of a value, of (*shape, lanes)."""
     if isinstance(value, _Lanes):
@@ -272,35 +266,26 @@ def _widened(value: Any, shape: tuple[int, ...], lanes: int) -> Array:
     return jnp.broadcast_to(jnp.asarray(value)[..., None], (*shape, lanes))
 
 
-def _evaluate(jaxpr: Jaxpr, consts: Any, args: list[Any], lanes: int) -> list[Any]:
-    """Values of the outputs, `_Lanes` or not, of a jaxpr of one lane."""
-    values: dict[Any, Any] = dict(zip(jaxpr.constvars, consts, strict=True))
-    values.update(zip(jaxpr.invars, args, strict=True))
-
-    def read(atom: Any) -> Any:
-        return atom.val if isinstance(atom, Literal) else values[atom]
-
-    for eqn in jaxpr.eqns:
-        inputs = [read(atom) for atom in eqn.invars]
-        values.update(zip(eqn.outvars, _outputs(eqn, inputs, lanes), strict=True))
-    return [read(atom) for atom in jaxpr.outvars]
+def _evaluate(closed: ClosedJaxpr, args: list[Any], lanes: int) -> list[Any]:
+    """Values of the outputs, `_Lanes` or not, of a function of one lane."""
+    outputs = functools.partial(_outputs, lanes=lanes)
+    return evaluate(closed.jaxpr, closed.consts, args, outputs)
 
 
 def _outputs(eqn: JaxprEqn, inputs: list[Any], lanes: int) -> list[Any]:
     """What one operation makes of its inputs."""
-    name = eqn.primitive.name
-    if name in _CALLS:
-        inner = eqn.params["jaxpr"] if "jaxpr" in eqn.params else eqn.params["call_jaxpr"]
-        closed = inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
-        plain = functools.partial(_evaluate, closed.jaxpr, closed.consts)
+    name, closed = eqn.primitive.name, called(eqn)
+    if closed is not None:
         kernel = _kernel_of(eqn, closed, inputs) if _has_kernels() else None
-        return _by_kernel(eqn, kernel, inputs, lanes, plain) if kernel else plain(inputs, lanes)
+        if kernel is None:
+            return _evaluate(closed, inputs, lanes)
+        return _by_kernel(eqn, closed, kernel, inputs, lanes)
     if not any(isinstance(value, _Lanes) for value in inputs):
         return _bound(eqn, inputs)
-    shapes = [_shape(atom) for atom in eqn.invars]
+    shapes = [shape_of(atom) for atom in eqn.invars]
     found = None
     if name in _ELEMENTWISE:
-        out_shape = _shape(eqn.outvars[0])
+        out_shape = shape_of(eqn.outvars[0])
         found = _bound(eqn, [_spread(value, out_shape, lanes) for value in inputs])
     elif name in _BY_AXIS:
         found = _bound(eqn, [_widened(v, s, lanes) for v, s in zip(inputs, shapes, strict=True)])
@@ -312,13 +297,15 @@ def _outputs(eqn: JaxprEqn, inputs: list[Any], lanes: int) -> list[Any]:
 
 
 def _by_kernel(
-    eqn: JaxprEqn, kernel: Callable, inputs: list[Any], lanes: int, plain: Callable
+    eqn: JaxprEqn, closed: ClosedJaxpr, kernel: Callable, inputs: list[Any], lanes: int
 ) -> list[Any]:
     """A function that has a kernel: that for CUDA, and what the function says elsewhere."""
     _spare_searches()
-    arrays = [_widened(v, _shape(atom), lanes) for v, atom in zip(inputs, eqn.invars, strict=True)]
+    arrays = [
+        _widened(v, shape_of(atom), lanes) for v, atom in zip(inputs, eqn.invars, strict=True)
+    ]
 
-    shapes = [(*_shape(atom), lanes) for atom in eqn.outvars]
+    shapes = [(*shape_of(atom), lanes) for atom in eqn.outvars]
 
     def in_kernel(*leaves: Array) -> list[Array]:
         found = kernel(leaves)
@@ -330,7 +317,7 @@ def _by_kernel(
         return found if same else in_steps(*leaves)
 
     def in_steps(*leaves: Array) -> list[Array]:
-        found = plain([_Lanes(leaf) for leaf in leaves], lanes)
+        found = _evaluate(closed, [_Lanes(leaf) for leaf in leaves], lanes)
         return [_widened(v, s[:-1], lanes) for v, s in zip(found, shapes, strict=True)]
 
     return [
@@ -423,7 +410,7 @@ def _dot_general(eqn: JaxprEqn, inputs: list[Any], lanes: int) -> list[Any] | No
 def _dynamic_slice(eqn: JaxprEqn, inputs: list[Any], lanes: int) -> list[Any] | None:
     """A window that each lane begins elsewhere."""
     operand, *starts = inputs
-    shape = _shape(eqn.invars[0])
+    shape = shape_of(eqn.invars[0])
     window = _widened(operand, shape, lanes)
     for axis, (start, size) in enumerate(zip(starts, eqn.params["slice_sizes"], strict=True)):
         if not isinstance(start, _Lanes):

@@ -18,7 +18,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
-from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Primitive
+from jax.extend.core import ClosedJaxpr, JaxprEqn, Primitive
+
+from planner_jax.jaxprs import called, evaluate, shape_of
 
 # The compiler looks from each access to memory at all operations, and from each of these again.
 # Accesses times squared numbers: so many take it some 5 s. Larger functions are refused.
@@ -30,7 +32,6 @@ _ELEMENTWISE = frozenset(
     "sqrt square sub tan tanh xor".split()
 )
 _UNCHANGED = frozenset("copy copy_p stop_gradient".split())
-_CALLS = frozenset("checkpoint closed_call custom_jvp_call jit pjit remat2".split())
 _FOLDS: dict[str, Primitive] = {
     "reduce_and": lax.and_p,
     "reduce_max": lax.max_p,
@@ -81,7 +82,7 @@ def lanes_kernel(
         leaves.append(arg)
         own.append(aval.shape)
     out: Any = [(aval.shape, aval.dtype) for aval in closed.out_avals]
-    found = _evaluate(numbers, closed.jaxpr, closed.consts, values)
+    found = _evaluate(numbers, closed, values)
     results = [_entries(value, shape) for value, (shape, _) in zip(found, out, strict=True)]
     needed = numbers.needed_by(results)
     accesses = sum(number.is_read for number in needed) + sum(entries.size for entries in results)
@@ -221,10 +222,6 @@ class _Argument:
         return number
 
 
-def _shape(atom: Any) -> tuple[int, ...]:
-    return atom.aval.shape
-
-
 def _dtype(atom: Any) -> Any:
     return atom.aval.dtype
 
@@ -249,35 +246,24 @@ def _filled(shape: tuple[int, ...], entry: Callable) -> np.ndarray:
     return found
 
 
-def _evaluate(numbers: _Numbers, jaxpr: Jaxpr, consts: Any, args: list[Any]) -> list[Any]:
-    """Values of the outputs of a jaxpr."""
-    values: dict[Any, Any] = dict(zip(jaxpr.constvars, consts, strict=True))
-    values.update(zip(jaxpr.invars, args, strict=True))
-
-    def read(atom: Any) -> Any:
-        return atom.val if isinstance(atom, Literal) else values[atom]
-
-    for eqn in jaxpr.eqns:
-        inputs = [read(atom) for atom in eqn.invars]
-        if eqn.primitive.name in _CALLS:
-            inner = eqn.params["jaxpr"] if "jaxpr" in eqn.params else eqn.params["call_jaxpr"]
-            closed = inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
-            found = _evaluate(numbers, closed.jaxpr, closed.consts, inputs)
-        else:
-            found = _outputs(numbers, eqn, inputs)
-        values.update(zip(eqn.outvars, found, strict=True))
-    return [read(atom) for atom in jaxpr.outvars]
+def _evaluate(numbers: _Numbers, closed: ClosedJaxpr, args: list[Any]) -> list[Any]:
+    """Values of the outputs of a function."""
+    outputs = functools.partial(_outputs, numbers)
+    return evaluate(closed.jaxpr, closed.consts, args, outputs)
 
 
 def _outputs(numbers: _Numbers, eqn: JaxprEqn, inputs: list[Any]) -> list[Any]:
     """What one operation makes of its inputs."""
-    name, shape = eqn.primitive.name, _shape(eqn.outvars[0])
+    inner = called(eqn)
+    if inner is not None:
+        return _evaluate(numbers, inner, inputs)
+    name, shape = eqn.primitive.name, shape_of(eqn.outvars[0])
     dtypes = [_dtype(atom) for atom in eqn.invars]
     if name == "dynamic_slice":
         return [_window(numbers, eqn, inputs)]
     if name == "gather":
         return [_gathered(numbers, eqn, inputs)]
-    operands = [_entries(v, _shape(a)) for v, a in zip(inputs, eqn.invars, strict=True)]
+    operands = [_entries(v, shape_of(a)) for v, a in zip(inputs, eqn.invars, strict=True)]
     if name in _UNCHANGED:
         return operands
     if name in _ELEMENTWISE:
@@ -361,7 +347,7 @@ def _product(
         return functools.reduce(add, terms)
 
     found = _filled((*left.shape[:-1], right.shape[-2]), entry)
-    return found.reshape(_shape(eqn.outvars[0]))
+    return found.reshape(shape_of(eqn.outvars[0]))
 
 
 def _place(
@@ -390,7 +376,7 @@ def _read(operand: Any, places: list[Any], shape: tuple[int, ...]) -> Any:
 
 def _window(numbers: _Numbers, eqn: JaxprEqn, inputs: list[Any]) -> np.ndarray:
     operand, *starts = inputs
-    shape, sizes = _shape(eqn.invars[0]), eqn.params["slice_sizes"]
+    shape, sizes = shape_of(eqn.invars[0]), eqn.params["slice_sizes"]
     starts = [_entries(start, ())[()] for start in starts]
     dtypes = [_dtype(atom) for atom in eqn.invars[1:]]
 
@@ -408,8 +394,8 @@ def _gathered(numbers: _Numbers, eqn: JaxprEqn, inputs: list[Any]) -> np.ndarray
         lax.GatherScatterMode.PROMISE_IN_BOUNDS,
     ):
         raise Unsupported("gather with filling")
-    operand, shape, out_shape = inputs[0], _shape(eqn.invars[0]), _shape(eqn.outvars[0])
-    starts = _entries(inputs[1], _shape(eqn.invars[1]))
+    operand, shape, out_shape = inputs[0], shape_of(eqn.invars[0]), shape_of(eqn.outvars[0])
+    starts = _entries(inputs[1], shape_of(eqn.invars[1]))
     dtype = _dtype(eqn.invars[1])
     dropped = (*axes.collapsed_slice_dims, *axes.operand_batching_dims)
     inside = [axis for axis in range(len(shape)) if axis not in dropped]

@@ -11,8 +11,9 @@ BASE = {"arithmetic", "ball", "lanes", "robot", "trajectory"}
 # What each room may import of planner_jax, besides itself.
 ALLOWED = {
     "arithmetic": set(),
-    "lanes": {"lanes_kernel"},
-    "lanes_kernel": set(),
+    "jaxprs": set(),
+    "lanes": {"jaxprs", "lanes_kernel"},
+    "lanes_kernel": {"jaxprs"},
     "ball": BASE,
     "robot": BASE,
     "trajectory": BASE,

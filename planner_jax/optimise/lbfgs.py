@@ -185,7 +185,7 @@ def step(objective: Objective, state: LbfgsState, config: LbfgsConfig) -> LbfgsS
     lengths = state.numbers.reach * jnp.asarray(config.trial_steps, grad.dtype)
     trials = jax.vmap(lambda length: objective(state.point + length * direction))(lengths)
     here = Evaluation(cost, violation)
-    choice = _chooser(config)(state.numbers, here, lengths, trials)
+    choice = in_one_kernel(_chosen, config)(state.numbers, here, lengths, trials)
     step = jnp.where(choice.going, choice.length * direction, state.step)
     point = jnp.where(choice.going, state.point + step, state.point)
     return LbfgsState(
@@ -211,12 +211,6 @@ class _Choice:
     length: Array  # () of the step, times the direction; 0 without a decrease
     better: Array  # () bool, whether the new point is the best one
     going: Array  # () bool, False for a finished lane, which stands still
-
-
-@functools.cache
-def _chooser(config: LbfgsConfig) -> Callable:
-    """The choice of the step, one kernel for many lanes."""
-    return in_one_kernel(functools.partial(_chosen, config), config)
 
 
 def _chosen(

@@ -7,7 +7,6 @@ hoop, so that no plan misses; attitude and limits stay inequalities.
 
 import dataclasses
 import functools
-from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -76,12 +75,6 @@ class Catch:
     durations: Array  # (N,) [s], of the segments
     tail_states: Array  # (N, 4, 3) of the quadrotor
     angle_excess: Array  # (N,) of the net's angle over theta_safe, relative; <= 0 is good
-
-
-@functools.cache
-def _ends(planner: "ExactCatch") -> Callable:
-    """`planner.ends`, one kernel for many lanes."""
-    return in_one_kernel(planner.ends, planner)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -232,15 +225,19 @@ class ExactCatch:
         )
         return (natural / jnp.asarray(self.scale, natural.dtype)).ravel()
 
-    def _unpack(self, point: Array, context: CatchContext) -> tuple[Chain, Catch]:
-        """Segments and catches at a point."""
+    def _split(self, point: Array) -> tuple[Array, Array]:
+        """Whitened offsets (N, M - 1, 3) and the variables after them, (N, 12), at a point."""
         scale = jnp.asarray(self.scale, point.dtype)
         natural = point.reshape(-1, scale.size) * scale
-        num = natural.shape[0]
-        catch = self.catches(natural[:, self.num_offsets :], context)
+        offsets = natural[:, : self.num_offsets].reshape(natural.shape[0], -1, 3)
+        return offsets, natural[:, self.num_offsets :]
+
+    def _unpack(self, point: Array, context: CatchContext) -> tuple[Chain, Catch]:
+        """Segments and catches at a point."""
+        offsets, natural = self._split(point)
+        catch = self.catches(natural, context)
         piece_durations = catch.durations / self.num_pieces
         rows = chain_rows(context.scenario.head_state, catch.tail_states, piece_durations)
-        offsets = natural[:, : self.num_offsets].reshape(num, -1, 3)
         return Chain(rows=rows, offsets=offsets, piece_durations=piece_durations), catch
 
     def _at_catch(self, catch: Catch, context: CatchContext) -> Array:
@@ -256,17 +253,16 @@ class ExactCatch:
 
     def objective(self, point: Array, context: CatchContext) -> Evaluation:
         """Cost, and the largest excess at the penalty nodes (squares over squares)."""
-        natural = point.reshape(-1, len(self.scale)) * jnp.asarray(self.scale, point.dtype)
-        offsets = natural[:, : self.num_offsets].reshape(natural.shape[0], -1, 3)
-        rows, durations, core, at_catches = _ends(self)(natural[:, self.num_offsets :], context)
+        offsets, natural = self._split(point)
+        ends = in_one_kernel(ExactCatch.ends, self)
+        rows, durations, core, at_catches = ends(natural, context)
         penalties, worst = integrate_along(
             self._along(self.nodes),
             jnp.concatenate([rows, offsets], axis=1),
             durations,
             (context.scenario.gravity, context.scenario.limits),
         )
-        energies = jax.vmap(functools.partial(offset_energy, self.maps))(offsets, durations)
-        along = penalties + self.energy_weight * energies
+        along = penalties + self._offset_costs(offsets, durations)
         cost = core + jnp.sum(jnp.where(context.active, along, 0.0))
         # Peaks between nodes are a little higher than the nodes show.
         worst = jnp.max(jnp.where(context.active, worst, -1.0))
@@ -289,23 +285,22 @@ class ExactCatch:
         at_catch = self._at_catch(catch, context)
         energies = jax.vmap(functools.partial(boundary_energy, self.maps))(rows, durations)
         energy = jnp.sum(jnp.where(context.active, energies, 0.0))
-        return rows, durations, self._weighed(catch, at_catch, energy), jnp.max(at_catch)
-
-    def _core(self, chain: Chain, catch: Catch, at_catch: Array, context: CatchContext) -> Array:
-        """The part of the cost that needs no samples: energy, time, hinges at the catches."""
-        energy = jnp.sum(jnp.where(context.active, chain_energy(self.maps, chain), 0.0))
-        return self._weighed(catch, at_catch, energy)
-
-    def _weighed(self, catch: Catch, at_catch: Array, energy: Array) -> Array:
-        """Cost of the hinges at the catches, of an energy and of the time."""
         hinges = smoothed_hinge(at_catch + self.margin, self.hinge_width)
         weighed = self.energy_weight * energy + self.time_weight * catch.times[-1]
-        return self.catch_weight * jnp.sum(hinges) + weighed
+        core = self.catch_weight * jnp.sum(hinges) + weighed
+        return rows, durations, core, jnp.max(at_catch)
+
+    def _offset_costs(self, offsets: Array, durations: Array) -> Array:
+        """Cost of the energy that the offsets make, (N,)."""
+        energies = jax.vmap(functools.partial(offset_energy, self.maps))(offsets, durations)
+        return self.energy_weight * energies
 
     def core(self, point: Array, context: CatchContext) -> Array:
         """The part of the cost that needs no samples, for `optimise.sensitivity`."""
-        chain, catch = self._unpack(point, context)
-        return self._core(chain, catch, self._at_catch(catch, context), context)
+        offsets, natural = self._split(point)
+        _, durations, core, _ = self.ends(natural, context)
+        costs = self._offset_costs(offsets, durations)
+        return core + jnp.sum(jnp.where(context.active, costs, 0.0))
 
     def core_blocks(self, size: int) -> np.ndarray:
         """The variables after the waypoint offsets of every segment, (N, 12)."""

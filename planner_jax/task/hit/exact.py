@@ -46,7 +46,6 @@ from planner_jax.trajectory.proportional_minco import (
     proportional_minco,
     proportional_trajectory,
     sample_motion,
-    trajectory_energy,
 )
 
 _ORDER = 4  # minimum snap
@@ -113,12 +112,6 @@ _GUESSES = np.array(
         (0.65, 1.7, 2.2),
     ]
 )
-
-
-@functools.cache
-def _ends(planner: "ExactHit") -> Callable:
-    """`planner.ends`, one kernel for many lanes."""
-    return in_one_kernel(planner.ends, planner)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -247,11 +240,15 @@ class ExactHit:
         )
         return Impact(stroke=stroke, tail_state=tail_state, apex=apex)
 
+    def _split(self, point: Array) -> tuple[Array, Array]:
+        """Whitened offsets (M - 1, 3) and the variables after them, (8,), at a point."""
+        natural = point * jnp.asarray(self.scale, point.dtype)
+        return natural[: self.num_offsets].reshape(-1, 3), natural[self.num_offsets :]
+
     def _unpack(self, point: Array, context: HitContext) -> tuple[Array, Array, Array, Impact]:
         """Whitened offsets, boundary rows, piece duration and impact at a point."""
-        natural = point * jnp.asarray(self.scale, point.dtype)
-        offsets = natural[: self.num_offsets].reshape(-1, 3)
-        impact = self.impact(natural[self.num_offsets :], context)
+        offsets, natural = self._split(point)
+        impact = self.impact(natural, context)
         duration = impact.stroke.time / self.num_pieces
         rows = boundary_rows(context.scenario.head_state, impact.tail_state, duration)
         return offsets, rows, duration, impact
@@ -273,9 +270,8 @@ class ExactHit:
 
     def objective(self, point: Array, context: HitContext) -> Evaluation:
         """Cost, and the largest excess at the penalty nodes (squares over squares)."""
-        natural = point * jnp.asarray(self.scale, point.dtype)
-        offsets = natural[: self.num_offsets].reshape(-1, 3)
-        rows, duration, core, at_impact = _ends(self)(natural[self.num_offsets :], context)
+        offsets, natural = self._split(point)
+        rows, duration, core, at_impact = in_one_kernel(ExactHit.ends, self)(natural, context)
         penalties, worst = integrate_along(
             self._along(self.nodes),
             jnp.concatenate([rows, offsets])[None],
@@ -305,19 +301,15 @@ class ExactHit:
         energy = self.energy_weight * boundary_energy(self.maps, rows, duration)
         return rows, duration, self._hinges(at_impact) + energy, jnp.max(at_impact)
 
-    def _core(self, offsets: Array, rows: Array, duration: Array, at_impact: Array) -> Array:
-        """The part of the cost that needs no samples: energy, and hinges at the impact."""
-        energy = trajectory_energy(self.maps, rows, offsets, duration)
-        return self._hinges(at_impact) + self.energy_weight * energy
-
     def _hinges(self, at_impact: Array) -> Array:
         hinges = smoothed_hinge(at_impact + self.margin, self.hinge_width)
         return self.impact_weight * jnp.sum(hinges)
 
     def core(self, point: Array, context: HitContext) -> Array:
         """The part of the cost that needs no samples, for `optimise.sensitivity`."""
-        offsets, rows, duration, impact = self._unpack(point, context)
-        return self._core(offsets, rows, duration, self._at_impact(impact, context))
+        offsets, natural = self._split(point)
+        _, duration, core, _ = self.ends(natural, context)
+        return core + self.energy_weight * offset_energy(self.maps, offsets, duration)
 
     def core_blocks(self, size: int) -> np.ndarray:
         """The variables after the waypoint offsets, (1, 8)."""

@@ -1,0 +1,46 @@
+"""Jaxprs carried out with other values than arrays: what `lanes` and `lanes_kernel` share."""
+
+from collections.abc import Callable
+from typing import Any
+
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
+
+_CALLS = frozenset(
+    "checkpoint closed_call core_call custom_jvp_call custom_vjp_call jit pjit remat2".split()
+)
+
+
+def evaluate(
+    jaxpr: Jaxpr, consts: Any, args: list[Any], outputs: Callable[[JaxprEqn, list[Any]], list[Any]]
+) -> list[Any]:
+    """Values of the outputs of a jaxpr.
+
+    Args:
+        jaxpr: to be carried out.
+        consts: values of its constants.
+        args: values of its arguments, of any kind that `outputs` takes.
+        outputs: values that one operation makes of those of its inputs.
+    """
+    values: dict[Any, Any] = dict(zip(jaxpr.constvars, consts, strict=True))
+    values.update(zip(jaxpr.invars, args, strict=True))
+
+    def read(atom: Any) -> Any:
+        return atom.val if isinstance(atom, Literal) else values[atom]
+
+    for eqn in jaxpr.eqns:
+        inputs = [read(atom) for atom in eqn.invars]
+        values.update(zip(eqn.outvars, outputs(eqn, inputs), strict=True))
+    return [read(atom) for atom in jaxpr.outvars]
+
+
+def called(eqn: JaxprEqn) -> ClosedJaxpr | None:
+    """The function that an operation calls, if it does nothing else."""
+    if eqn.primitive.name not in _CALLS:
+        return None
+    inner = eqn.params["jaxpr"] if "jaxpr" in eqn.params else eqn.params["call_jaxpr"]
+    return inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
+
+
+def shape_of(atom: Any) -> tuple[int, ...]:
+    """Shape of a variable or literal."""
+    return atom.aval.shape
