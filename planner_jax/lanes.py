@@ -28,10 +28,10 @@ from planner_jax.jaxprs import called, evaluate, shape_of
 from planner_jax.lanes_kernel import Unsupported, lanes_kernel
 
 _ELEMENTWISE = frozenset(
-    "abs acos add add_any and asin atan atan2 cbrt ceil clamp convert_element_type copy copy_p "
+    "abs acos add add_any and asin atan atan2 cbrt ceil clamp convert_element_type "
     "cos cosh div eq erf exp exp2 expm1 floor ge gt integer_pow is_finite le log log1p logistic "
     "lt max min mul ne neg not or pow reduce_precision rem round rsqrt select_n sign sin sinh "
-    "sqrt square stop_gradient sub tan tanh xor".split()
+    "sqrt square sub tan tanh xor".split()
 )
 # Their parameters name axes by number from the front, which the lanes do not move.
 _BY_AXIS = frozenset(

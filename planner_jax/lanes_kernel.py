@@ -31,7 +31,6 @@ _ELEMENTWISE = frozenset(
     "integer_pow is_finite le log log1p lt max min mul ne neg not or pow rsqrt select_n sign sin "
     "sqrt square sub tan tanh xor".split()
 )
-_UNCHANGED = frozenset("copy copy_p stop_gradient".split())
 _FOLDS: dict[str, Primitive] = {
     "reduce_and": lax.and_p,
     "reduce_max": lax.max_p,
@@ -264,8 +263,6 @@ def _outputs(numbers: _Numbers, eqn: JaxprEqn, inputs: list[Any]) -> list[Any]:
     if name == "gather":
         return [_gathered(numbers, eqn, inputs)]
     operands = [_entries(v, shape_of(a)) for v, a in zip(inputs, eqn.invars, strict=True)]
-    if name in _UNCHANGED:
-        return operands
     if name in _ELEMENTWISE:
         wide = [np.broadcast_to(operand, shape) for operand in operands]
 

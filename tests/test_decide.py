@@ -194,8 +194,10 @@ def test_closest_approach_is_what_the_greatest_speed_leaves(pairs):
     assert not gap.any()
 
 
-def test_a_target_out_of_reach_is_named_and_its_neighbours_are_not(pairs):
-    _, plans = plan_catches(PLANNER, pairs, decide="greedy")
+@pytest.mark.parametrize(("array", "kind"), [(np.asarray, np.ndarray), (jnp.asarray, jax.Array)])
+def test_a_target_out_of_reach_is_named_and_its_neighbours_are_not(array, kind, pairs):
+    _, plans = plan_catches(PLANNER, jax.tree.map(array, pairs), decide="greedy")
+    assert isinstance(plans.status, kind)
     assert plans.status[2] == Status.OUT_OF_REACH
     assert Status(plans.status[2]).message.startswith("a target never comes within reach")
     assert (np.delete(plans.status, 2) != Status.OUT_OF_REACH).all()

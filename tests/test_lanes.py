@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import Mesh, PartitionSpec
 
 from planner_jax import lanes as lanes_module
 from planner_jax.lanes import in_one_kernel, over_lanes
@@ -147,17 +148,39 @@ def test_a_function_that_would_take_long_to_compile_is_refused():
         lanes_kernel(closed, [jnp.ones((500, 16))], 16)
 
 
-def test_halves_of_a_function_in_one_kernel_are_kernels(monkeypatch, float64):
-    """Values, `vmap` within a lane, slopes in both modes and the slope of a slope."""
-    used = []
+@pytest.fixture
+def used(monkeypatch):
+    """What kernels were made, as if there were a GPU: for each how many arguments it has."""
+    made = []
 
     def interpreted(closed, args, threads):
-        used.append(len(args))
-        return lanes_kernel(closed, args, threads, interpret=True)
+        found = lanes_kernel(closed, args, threads, interpret=True)
+        made.append(len(args))
+        return found
 
     monkeypatch.setattr(lanes_module, "lanes_kernel", interpreted)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(jax.lax, "platform_dependent", lambda *x, cuda, default: cuda(*x))
+    return made
+
+
+def test_a_program_for_several_devices_has_the_kernels_of_one(used):
+    """There `jnp.where` also says that a device's arrays are its own."""
+
+    def chosen(x, y):
+        return jnp.sum(jnp.where(jnp.isfinite(x), x, jnp.inf)) + y
+
+    x, y = jnp.arange(3.0 * 16).reshape(3, 16), jnp.arange(16.0)
+    mapped = over_lanes(lambda x, y: in_one_kernel(chosen)(x, jnp.where(y > 2.0, y, 0.0)))
+    spec = PartitionSpec(None, "lanes"), PartitionSpec("lanes")
+    mesh = Mesh(np.array(jax.devices()[:1]), ("lanes",))
+    spread = jax.shard_map(mapped, mesh=mesh, in_specs=spec, out_specs=spec[1], check_vma=False)
+    np.testing.assert_array_equal(spread(x, y), mapped(x, y))
+    assert len(used) == 2
+
+
+def test_halves_of_a_function_in_one_kernel_are_kernels(used, float64):
+    """Values, `vmap` within a lane, slopes in both modes and the slope of a slope."""
 
     def plain(x, given):
         return {"y": jnp.sin(x) * given["k"], "z": jnp.sum(MATRIX @ x**3)}

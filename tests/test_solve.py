@@ -148,6 +148,22 @@ def test_arrays_on_a_device_stay_there_and_give_the_same_plans(apart, monkeypatc
         np.testing.assert_array_equal(ours, theirs)
 
 
+def test_a_later_round_takes_only_what_is_unsolved(monkeypatch):
+    """On a device that is not the host: also where the last lane fills up the last chunk."""
+    monkeypatch.setattr(batch, "_is_one_cpu", lambda mesh: False)
+    sizes, real = [], batch._solve
+
+    def noted(planner, attempt, mesh, scenarios):
+        sizes.append(scenarios.goal.size)
+        return real(planner, attempt, mesh, scenarios)
+
+    monkeypatch.setattr(batch, "_solve", noted)
+    goals = np.full(300, 0.5, np.float32)
+    goals[[7, -1]] = 3.5
+    assert is_solved(plan(WellPlanner(), Well(jnp.asarray(goals))).status).all()
+    assert sizes == [256, 128, 16]
+
+
 def test_one_process_plans_the_whole_batch_alone():
     shared = plan_across_processes(WellPlanner(), Well(GOALS))
     alone = plan(WellPlanner(), Well(GOALS))

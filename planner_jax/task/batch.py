@@ -76,9 +76,9 @@ def _plan_from_host(planner: Planner, scenarios: Any, chunk: int | None, mesh: M
 
 
 def _plan_resident(planner: Planner, scenarios: Any, chunk: int | None, mesh: Mesh) -> Any:
-    """The plans of scenarios in jax arrays; only what is unsolved comes to the host.
+    """The plans of scenarios in jax arrays; only how many are unsolved comes to the host.
 
-    Every device begins with its own share, without asking the others for a lane.
+    Every device plans its own share, without asking the others for a lane.
     """
     num = _length(scenarios)
     if num % mesh.size:  # the last lanes of the last device are the first lane again
@@ -86,18 +86,19 @@ def _plan_resident(planner: Planner, scenarios: Any, chunk: int | None, mesh: Me
         scenarios = _taken(scenarios, np.where(lanes < num, lanes, 0))
     scenarios = _placed(scenarios, mesh)
     first, *others = planner.rounds
-    size = chunk or _default_chunk(first, mesh)
-    plans, unsolved = _first_plans(planner, first, scenarios, size, mesh)
-    unsolved.copy_to_host_async()  # on its way as soon as it is known
-    if not np.asarray(unsolved).any():  # so that not all statuses have to come
-        others = []
+    plans, unsolved = _first_plans(
+        planner, first, scenarios, chunk or _default_chunk(first, mesh), mesh
+    )
     for attempt in others:
-        lanes = np.flatnonzero(is_unsolved(np.asarray(plans.status)))
-        if lanes.size == 0:
+        most = np.asarray(unsolved).max()  # of the devices
+        if most == 0:
             break
-        for call, _ in _calls(lanes, chunk or _default_chunk(attempt, mesh), mesh):
-            later, _ = _solve(planner, attempt, mesh, _placed(_taken(scenarios, call), mesh))
-            plans = _merged_on_device(plans, later, call)
+        size, before = chunk or _default_chunk(attempt, mesh), plans.status
+        for begin in range(0, most, size):
+            bucket = _bucket(most - begin, size)
+            part, lanes = _cut_unsolved(mesh, bucket, scenarios, before, np.int32(begin))
+            later, _ = _solve(planner, attempt, mesh, part)
+            plans, unsolved = _merged_locally(mesh, plans, later, lanes)
     return plans if num % mesh.size == 0 else jax.tree.map(lambda leaf: leaf[:num], plans)
 
 
@@ -110,8 +111,8 @@ def _first_plans(
         return _solve(planner, attempt, mesh, scenarios)
     found = []
     for begin in range(0, share, chunk):
-        lanes = np.minimum(begin + np.arange(_bucket(share - begin, chunk)), share - 1)
-        found.append(_solve(planner, attempt, mesh, _taken_locally(mesh, scenarios, lanes)))
+        part = _cut(mesh, _bucket(share - begin, chunk), scenarios, np.int32(begin))
+        found.append(_solve(planner, attempt, mesh, part)[0])
     return _joined_locally(mesh, found, share)
 
 
@@ -200,8 +201,7 @@ def _solve(planner: Planner, attempt: Round, mesh: Mesh, scenarios: Any) -> tupl
     """One round on the lanes of every device, and how many each leaves unsolved, (devices,)."""
 
     def solve(scenarios: Any) -> tuple[Any, Array]:
-        plans = solve_batch(planner, attempt, scenarios)
-        return plans, jnp.sum(is_unsolved(plans.status), keepdims=True)
+        return _counted(solve_batch(planner, attempt, scenarios))
 
     return _apart(mesh, solve)(scenarios)
 
@@ -211,20 +211,50 @@ def _taken(tree: Any, lanes: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf[lanes], tree)
 
 
-@functools.partial(jax.jit, static_argnames="mesh")
-def _taken_locally(mesh: Mesh, tree: Any, lanes: Any) -> Any:
-    """The same lanes of every device's share."""
-    return _apart(mesh, _taken, _LANES, PartitionSpec())(tree, lanes)
+@functools.partial(jax.jit, static_argnames=("mesh", "size"))
+def _cut(mesh: Mesh, size: int, tree: Any, begin: Any) -> Any:
+    """The next lanes of every device's share, filled up with its last one."""
+
+    def cut(tree: Any, begin: Array) -> Any:
+        return _kept(tree, begin + jnp.arange(size))
+
+    return _apart(mesh, cut, _LANES, PartitionSpec())(tree, begin)
+
+
+@functools.partial(jax.jit, static_argnames=("mesh", "size"))
+def _cut_unsolved(mesh: Mesh, size: int, tree: Any, status: Array, begin: Any) -> tuple[Any, Array]:
+    """The next unsolved lanes of every device's share, and where they are.
+
+    Filled up with the last lane, said to be behind the share.
+    """
+
+    def cut(tree: Any, status: Array, begin: Array) -> tuple[Any, Array]:
+        (num,) = status.shape
+        (unsolved,) = jnp.nonzero(is_unsolved(status), size=num, fill_value=num)
+        lanes = _kept(unsolved, begin + jnp.arange(size))
+        return _kept(tree, lanes), lanes
+
+    return _apart(mesh, cut, _LANES, _LANES, PartitionSpec())(tree, status, begin)
+
+
+def _kept(tree: Any, lanes: Array) -> Any:
+    """Some lanes; the last one for those behind it."""
+    return jax.tree.map(lambda leaf: leaf[jnp.minimum(lanes, leaf.shape[0] - 1)], tree)
 
 
 @functools.partial(jax.jit, static_argnames=("mesh", "share"))
-def _joined_locally(mesh: Mesh, parts: list[Any], share: int) -> Any:
-    """One after another the parts of every device, which makes its share."""
+def _joined_locally(mesh: Mesh, parts: list[Any], share: int) -> tuple[Any, Array]:
+    """One after another the parts of every device, which makes its share; as `_solve`."""
 
-    def join(*parts: Any) -> Any:
-        return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:share], *parts)
+    def join(*parts: Any) -> tuple[Any, Array]:
+        return _counted(jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:share], *parts))
 
     return _apart(mesh, join)(*parts)
+
+
+def _counted(plans: Any) -> tuple[Any, Array]:
+    """The plans, and how many are unsolved, (1,)."""
+    return plans, jnp.sum(is_unsolved(plans.status), keepdims=True)
 
 
 def _better(later: Any, plans: Any) -> Any:
@@ -244,14 +274,18 @@ def _merged_on_host(plans: Any, later: Any, lanes: np.ndarray) -> Any:
     return jax.tree.map(replace, plans, later)
 
 
-@jax.jit
-def _merged_on_device(plans: Any, later: Any, lanes: Array) -> Any:
-    """As on the host; a lane that pads the call is there more than once, each time the same."""
-    before = jax.tree.map(lambda leaf: leaf[lanes], plans)
-    better = _better(later, before)
+@functools.partial(jax.jit, static_argnames="mesh")
+def _merged_locally(mesh: Mesh, plans: Any, later: Any, lanes: Array) -> tuple[Any, Array]:
+    """As on the host, of every device's share, and how many it then has unsolved."""
 
-    def replace(old: Array, new: Array, kept: Array) -> Array:
-        chosen = better.reshape(-1, *(1,) * (new.ndim - 1))
-        return old.at[lanes].set(jnp.where(chosen, new, kept))
+    def merge(plans: Any, later: Any, lanes: Array) -> tuple[Any, Array]:
+        before = _kept(plans, lanes)
+        better = _better(later, before)
 
-    return jax.tree.map(replace, plans, later, before)
+        def replace(old: Array, new: Array, kept: Array) -> Array:
+            chosen = better.reshape(-1, *(1,) * (new.ndim - 1))
+            return old.at[lanes].set(jnp.where(chosen, new, kept), mode="drop")
+
+        return _counted(jax.tree.map(replace, plans, later, before))
+
+    return _apart(mesh, merge)(plans, later, lanes)

@@ -160,18 +160,30 @@ def closest_approach(scenario: CatchScenario) -> Array:
     return jnp.where(scenario.present, gap, 0.0)
 
 
-_closest_approach = jax.jit(jax.vmap(closest_approach))
+@jax.jit
+@jax.vmap
+def _named(scenario: CatchScenario, status: Array) -> Array:
+    """The status, another one where a target proves to be out of reach."""
+    away = jnp.max(closest_approach(scenario)) > 0.0
+    return jnp.where(is_unsolved(status) & away, jnp.int32(Status.OUT_OF_REACH), status)
 
 
 def _name_out_of_reach(scenarios: CatchScenario, plans: CatchPlan) -> CatchPlan:
     """The plans, with a status of its own where a target proves to be out of reach."""
-    unsolved = is_unsolved(np.asarray(plans.status))
-    if not unsolved.any():
-        return plans
-    away = np.asarray(_closest_approach(scenarios)).max(axis=1) > 0.0
-    status = np.where(unsolved & away, np.int32(Status.OUT_OF_REACH), plans.status)
     resident = isinstance(plans.status, jax.Array)
-    return dataclasses.replace(plans, status=jnp.asarray(status) if resident else status)
+    # Each device looks for itself: mostly there is none, and then the statuses stay there.
+    parts = (
+        [shard.data for shard in plans.status.addressable_shards] if resident else [plans.status]
+    )
+    if not any([_any_unsolved(part) for part in parts]):
+        return plans
+    status = _named(scenarios, plans.status)
+    return dataclasses.replace(plans, status=status if resident else np.asarray(status))
+
+
+@jax.jit
+def _any_unsolved(status: Array) -> Array:
+    return jnp.any(is_unsolved(status))
 
 
 def decided(scenarios: CatchScenario, decision: Decision) -> CatchScenario:
