@@ -29,7 +29,7 @@ _LANES = PartitionSpec("lanes")
 
 def plan_batch(
     planner: Planner, scenarios: Any, chunk: int | None, devices: Sequence[Any] | None
-) -> Any:
+) -> tuple[Any, Any]:
     """The planner's rounds on B cases, each round on the lanes that are still unsolved.
 
     Args:
@@ -39,8 +39,9 @@ def plan_batch(
         devices: that share the work; None for all local ones.
 
     Returns:
-        Plans with NumPy leaves, or where all leaves of the scenarios are jax arrays, with
-        those, so that nothing leaves the devices.
+        plans: with NumPy leaves, or where all leaves of the scenarios are jax arrays, with
+            those, so that nothing leaves the devices.
+        unsolved: how many lanes are, of each device or of all.
     """
     mesh = Mesh(np.array(jax.local_devices() if devices is None else devices), ("lanes",))
     resident = all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(scenarios))
@@ -48,12 +49,14 @@ def plan_batch(
     # One CPU's memory is the host's, and there a thread for each core plans chunks.
     if resident and not (several and _is_one_cpu(mesh)):
         return _plan_resident(planner, scenarios, chunk, mesh)
-    plans = _plan_from_host(planner, scenarios, chunk, mesh)
-    return jax.device_put(plans, _sharding(mesh)) if resident else plans
+    plans, unsolved = _plan_from_host(planner, scenarios, chunk, mesh)
+    return (jax.device_put(plans, _sharding(mesh)) if resident else plans), unsolved
 
 
-def _plan_from_host(planner: Planner, scenarios: Any, chunk: int | None, mesh: Mesh) -> Any:
-    """The plans of scenarios in NumPy arrays."""
+def _plan_from_host(
+    planner: Planner, scenarios: Any, chunk: int | None, mesh: Mesh
+) -> tuple[Any, int]:
+    """As `plan_batch`, of scenarios in NumPy arrays."""
     scenarios = jax.tree.map(np.asarray, scenarios)
     lanes = np.arange(_length(scenarios))
     plans: Any = None
@@ -72,11 +75,13 @@ def _plan_from_host(planner: Planner, scenarios: Any, chunk: int | None, mesh: M
         lanes = np.flatnonzero(is_unsolved(plans.status))
         if lanes.size == 0:
             break
-    return plans
+    return plans, lanes.size
 
 
-def _plan_resident(planner: Planner, scenarios: Any, chunk: int | None, mesh: Mesh) -> Any:
-    """The plans of scenarios in jax arrays; only how many are unsolved comes to the host.
+def _plan_resident(
+    planner: Planner, scenarios: Any, chunk: int | None, mesh: Mesh
+) -> tuple[Any, Array]:
+    """As `plan_batch`, of scenarios in jax arrays; only how many are unsolved comes to the host.
 
     Every device plans its own share, without asking the others for a lane.
     """
@@ -90,16 +95,19 @@ def _plan_resident(planner: Planner, scenarios: Any, chunk: int | None, mesh: Me
         planner, first, scenarios, chunk or _default_chunk(first, mesh), mesh
     )
     for attempt in others:
+        unsolved.copy_to_host_async()  # on its way as soon as it is known
         most = np.asarray(unsolved).max()  # of the devices
         if most == 0:
             break
         size, before = chunk or _default_chunk(attempt, mesh), plans.status
         for begin in range(0, most, size):
             bucket = _bucket(most - begin, size)
-            part, lanes = _cut_unsolved(mesh, bucket, scenarios, before, np.int32(begin))
+            part, lanes = _cut_unsolved(mesh, bucket, scenarios, before, _number(mesh, begin))
             later, _ = _solve(planner, attempt, mesh, part)
             plans, unsolved = _merged_locally(mesh, plans, later, lanes)
-    return plans if num % mesh.size == 0 else jax.tree.map(lambda leaf: leaf[:num], plans)
+    if num % mesh.size:
+        plans = jax.tree.map(lambda leaf: leaf[:num], plans)
+    return plans, unsolved
 
 
 def _first_plans(
@@ -111,7 +119,7 @@ def _first_plans(
         return _solve(planner, attempt, mesh, scenarios)
     found = []
     for begin in range(0, share, chunk):
-        part = _cut(mesh, _bucket(share - begin, chunk), scenarios, np.int32(begin))
+        part = _cut(mesh, _bucket(share - begin, chunk), scenarios, _number(mesh, begin))
         found.append(_solve(planner, attempt, mesh, part)[0])
     return _joined_locally(mesh, found, share)
 
@@ -148,6 +156,14 @@ def _calls(lanes: np.ndarray, chunk: int, mesh: Mesh) -> list[tuple[np.ndarray, 
 def _sharding(mesh: Mesh) -> Sharding:
     """Equal shares of the lanes on every device; for one device what JAX handles quickest."""
     return NamedSharding(mesh, _LANES) if mesh.size > 1 else SingleDeviceSharding(mesh.devices[0])
+
+
+@functools.lru_cache(maxsize=4096)
+def _number(mesh: Mesh, value: int) -> Array:
+    """A number that every device has; sent but once, since the way there takes time."""
+    whole = PartitionSpec()
+    placed = NamedSharding(mesh, whole) if mesh.size > 1 else _sharding(mesh)
+    return jax.device_put(np.int32(value), placed)
 
 
 def _apart(mesh: Mesh, function: Callable, *specs: PartitionSpec) -> Callable:

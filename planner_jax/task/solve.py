@@ -31,15 +31,31 @@ def plan(
     Returns:
         The planner's plans with the batch shape of the scenarios. The leaves are NumPy arrays;
         of a batch in jax arrays they are jax arrays too, and nothing leaves the devices but
-        the statuses. Look at `status`: a lane that could not be solved says so and holds the
+        how many lanes are unsolved. Look at `status`: a lane that could not be solved says so and holds the
         best that was found.
 
     Raises:
         ValueError: the leaves have not one batch axis or none, or of different lengths.
     """
-    batch = scenarios.batch_shape
-    if batch == ():
+    if scenarios.batch_shape == ():
         return plan_single(planner, scenarios)
+    plans, _ = plan_and_count(planner, scenarios, chunk=chunk, devices=devices)
+    return plans
+
+
+def plan_and_count(
+    planner: Planner,
+    scenarios: Scenario,
+    *,
+    chunk: int | None = None,
+    devices: Sequence[Any] | None = None,
+) -> tuple[Any, Any]:
+    """`plan` of a batch, and how many lanes are unsolved: numbers whose sum it is.
+
+    Raises:
+        ValueError: as for `plan`.
+    """
+    batch = scenarios.batch_shape
     if len(batch) != 1 or batch[0] == 0:
         raise ValueError(f"scenarios must be one case or a batch of some, got batch shape {batch}")
     for path, leaf in jax.tree_util.tree_leaves_with_path(scenarios):

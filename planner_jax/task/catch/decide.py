@@ -22,7 +22,7 @@ from planner_jax.optimise.problem import Planner
 from planner_jax.optimise.status import Status, is_solved, is_unsolved
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.task.catch.scenario import CatchScenario
-from planner_jax.task.solve import plan
+from planner_jax.task.solve import plan, plan_and_count
 
 DECISIONS = ("best", "greedy", "given")
 
@@ -170,20 +170,9 @@ def _named(scenario: CatchScenario, status: Array) -> Array:
 
 def _name_out_of_reach(scenarios: CatchScenario, plans: CatchPlan) -> CatchPlan:
     """The plans, with a status of its own where a target proves to be out of reach."""
-    resident = isinstance(plans.status, jax.Array)
-    # Each device looks for itself: mostly there is none, and then the statuses stay there.
-    parts = (
-        [shard.data for shard in plans.status.addressable_shards] if resident else [plans.status]
-    )
-    if not any([_any_unsolved(part) for part in parts]):
-        return plans
     status = _named(scenarios, plans.status)
+    resident = isinstance(plans.status, jax.Array)
     return dataclasses.replace(plans, status=status if resident else np.asarray(status))
-
-
-@jax.jit
-def _any_unsolved(status: Array) -> Array:
-    return jnp.any(is_unsolved(status))
 
 
 def decided(scenarios: CatchScenario, decision: Decision) -> CatchScenario:
@@ -224,7 +213,8 @@ def plan_catches(
         scenarios = decided(scenarios, _greedy(scenarios))
     else:
         return _plan_finalists(planner, scenarios, devices)
-    return scenarios, _name_out_of_reach(scenarios, plan(planner, scenarios, devices=devices))
+    plans, unsolved = plan_and_count(planner, scenarios, devices=devices)
+    return scenarios, _name_out_of_reach(scenarios, plans) if np.any(unsolved) else plans
 
 
 def _plan_finalists(
@@ -246,7 +236,7 @@ def _plan_finalists(
     chosen, lanes = rank.argmin(axis=0), np.arange(rank.shape[1])
     pick = lambda leaf: leaf[chosen, lanes]  # noqa: E731
     together, plans = jax.tree.map(pick, together), jax.tree.map(pick, plans)
-    return together, _name_out_of_reach(together, plans)
+    return together, plans if solved.any(axis=0).all() else _name_out_of_reach(together, plans)
 
 
 def optimal_time_ratio(scenarios: CatchScenario, plans: CatchPlan) -> np.ndarray:
