@@ -31,8 +31,8 @@ def plan(
     Returns:
         The planner's plans with the batch shape of the scenarios. The leaves are NumPy arrays;
         of a batch in jax arrays they are jax arrays too, and nothing leaves the devices but
-        how many lanes are unsolved. Look at `status`: a lane that could not be solved says so and holds the
-        best that was found.
+        how many lanes are unsolved. Look at `status`: a lane that could not be solved says so
+        and holds the best that was found.
 
     Raises:
         ValueError: the leaves have not one batch axis or none, or of different lengths.
