@@ -1,5 +1,6 @@
 """On a GPU, where kernels take the place of single operations: the same as on a CPU."""
 
+import dataclasses
 import functools
 
 import jax
@@ -8,6 +9,8 @@ import numpy as np
 import pytest
 
 from planner_jax.lanes import over_lanes
+from planner_jax.optimise.lbfgs import LbfgsConfig
+from planner_jax.optimise.problem import Round
 from planner_jax.optimise.sensitivity import gradient_at
 from planner_jax.optimise.status import is_solved
 from planner_jax.task.catch.decide import plan_catches
@@ -81,6 +84,23 @@ def test_gradients_at_the_same_points_are_those_of_a_cpu(devices, serves):
         # Where no limit binds the gradient is zero: the size is that of the others.
         off = np.quantile(np.abs(found - expected), 0.95)
         assert off <= 1e-4 * np.abs(expected).max()
+
+
+def test_several_gpus_give_the_plans_of_one(devices, serves):
+    """Also where the lanes are not as many for each, and where a later round has to solve them."""
+    gpus = jax.devices("gpu")
+    if len(gpus) == 1:
+        pytest.skip("there is one GPU")
+    planner = ExactHit()
+    first = Round(1, LbfgsConfig(max_steps=0))  # the guess itself
+    planner = dataclasses.replace(planner, rounds=(first, *planner.rounds))
+    some = jax.tree.map(lambda leaf: jax.device_put(leaf[:-3], gpus[0]), serves)
+    begun = plan(dataclasses.replace(planner, rounds=(first,)), some, devices=gpus[:1])
+    assert not is_solved(begun.status).all()
+    one, all_of_them = (plan(planner, some, devices=used) for used in (gpus[:1], gpus))
+    assert is_solved(one.status).all()
+    np.testing.assert_array_equal(all_of_them.status, one.status)
+    np.testing.assert_allclose(all_of_them.stroke.time, one.stroke.time, atol=1e-4)
 
 
 def test_lanes_that_are_not_finite_change_no_bit_of_the_others(devices):
