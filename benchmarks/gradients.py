@@ -88,11 +88,16 @@ def _double(tree: Any) -> Any:
 
 def _errors(found: np.ndarray, best: np.ndarray, lanes: np.ndarray) -> str:
     """Median and p90 of the relative difference, every column in units of its median size."""
+    has_none = ~np.isfinite(found[lanes]).all(axis=1)
+    none, lanes = has_none.mean(), lanes[~has_none]
     unit = np.median(np.abs(best[lanes]), axis=0)
     weight = np.where(unit > 1e-9 * unit.max(), 1.0 / np.maximum(unit, 1e-12), 0.0)
     size = np.linalg.norm(best[lanes] * weight, axis=1)
     error = np.linalg.norm((found[lanes] - best[lanes]) * weight, axis=1) / size
-    return f"{100 * np.median(error):.1f} %, {100 * np.quantile(error, 0.9):.1f} %"
+    return (
+        f"{100 * np.median(error):.1f} %, {100 * np.quantile(error, 0.9):.1f} %, "
+        f"beside {100 * none:.0f} % of the lanes without one"
+    )
 
 
 def main() -> None:
@@ -143,7 +148,7 @@ def main() -> None:
         lanes = np.flatnonzero(is_solved(np.asarray(plans.status)))
         num = args.accuracy
         gradient = [_flat(each, num) for each in (found, whole, best)]
-        residual = np.quantile(np.asarray(found.residual)[lanes], (0.5, 0.9))
+        residual = np.nanquantile(np.asarray(found.residual)[lanes], (0.5, 0.9))
         print(f"{lanes.size} of {num} lanes compared; difference (median, p90)")
         print(f"- from the optimum's: {_errors(gradient[0], gradient[2], lanes)}")
         print(

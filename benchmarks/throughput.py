@@ -132,7 +132,7 @@ def report(
         host = jax.tree.map(np.asarray, kind.scenarios(num, seed))
         timed = _timed(kind, planner, host, used, repeat)
         print(_row(kind, planner, host, used, timed), flush=True)
-        if len(used) > 1:
+        if num >= len(used) > 1:
             beside.append(_efficiency(kind, planner, host, used, repeat, timed))
     for line in beside:
         print(line)

@@ -13,7 +13,7 @@ from typing import Any, NoReturn
 
 from planner_jax.compile_cache import keep_compiled_programs
 from planner_jax.sweep.catch.settings import DECISIONS, NET_TESTS, SUITES, CatchSweep
-from planner_jax.sweep.environment import installed_version
+from planner_jax.sweep.environment import installed_version, require_backend
 from planner_jax.sweep.hit.settings import HitSweep
 from planner_jax.sweep.settings import SettingError, SweepSettings, require
 from planner_jax.task.catch.planners import PLANNERS as CATCH_PLANNERS
@@ -329,6 +329,7 @@ def _throughput(options: dict[str, Any]) -> None:
         require(value is None or value >= 1, name, ">= 1", value)
     require(min(options["batch"]) >= 1, "batch", ">= 1", min(options["batch"]))
     require(options["seed"] >= 0, "seed", ">= 0", options["seed"])
+    require_backend()
     keep_compiled_programs()
     from benchmarks.throughput import report
 

@@ -32,6 +32,9 @@ def on_devices():
             resident = plan(WellPlanner(), resident, devices=some, chunk=chunk)
             equal(resident, alone)
             assert isinstance(resident.point, jax.Array)
+            assert resident.point.sharding.device_set == {(some or devices)[0]}
+    even = plan(WellPlanner(), Well(jax.numpy.asarray(GOALS[:200])))
+    assert len(even.point.sharding.device_set) == 4
     broken = GOALS.copy()
     broken[::100] = np.nan
     spoiled = plan(WellPlanner(), Well(broken))

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 
+import jax
 import pytest
 
 from planner_jax.cli import main
@@ -129,6 +130,26 @@ def test_a_folder_in_use_or_out_of_reach_is_refused(capsys, elsewhere):
     ]:
         expect_one_line(capsys, ["sweep", "hit", "--num", "1", "--out", out], part, repr(out))
     assert sorted(elsewhere.rglob("*")) == before
+
+
+@pytest.mark.parametrize("command", [["sweep", "hit"], ["sweep", "catch"], ["bench", "throughput"]])
+@pytest.mark.parametrize(
+    ("error", "part"),
+    [
+        (AssertionError(), "got 'cuda' (JAX finds no device of it)"),
+        (RuntimeError("no such\nplatform"), "got 'cuda' (no such)"),
+    ],
+)
+def test_a_platform_that_does_not_work_gets_one_line_and_leaves_nothing(
+    capsys, elsewhere, monkeypatch, command, error, part
+):
+    def default_backend():
+        raise error
+
+    monkeypatch.setattr(jax, "default_backend", default_backend)
+    monkeypatch.setenv("JAX_PLATFORMS", "cuda")
+    expect_one_line(capsys, command, "JAX_PLATFORMS must name a platform that works here", part)
+    assert not list(elsewhere.iterdir())
 
 
 def test_a_report_needs_a_finished_run(capsys, elsewhere):

@@ -13,6 +13,7 @@ from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
 from planner_jax.optimise.status import Status, is_solved
 from planner_jax.referee.catch import referee_catches
+from planner_jax.task.catch import decide as decide_module
 from planner_jax.task.catch.decide import (
     best_orders,
     closest_approach,
@@ -151,6 +152,34 @@ def test_plans_follow_the_decision_and_best_catches_both_in_time(pairs):
     given, same = plan_catches(PLANNER, chosen, decide="given")
     assert given is chosen
     np.testing.assert_allclose(same.times[:2], plans.times[:2], rtol=1e-5)
+
+
+@pytest.mark.parametrize("decide", ["best", "greedy"])
+@pytest.mark.parametrize(("array", "kind"), [(np.asarray, np.ndarray), (jnp.asarray, jax.Array)])
+def test_what_comes_back_is_of_the_kind_that_was_given(decide, array, kind, pairs):
+    found = plan_catches(PLANNER, jax.tree.map(array, pairs), decide)
+    assert all(isinstance(leaf, kind) for leaf in jax.tree.leaves(found))
+
+
+def test_one_case_is_told_to_be_no_batch(pairs):
+    with pytest.raises(ValueError, match="must be a batch"):
+        plan_catches(PLANNER, jax.tree.map(lambda leaf: leaf[0], pairs), "greedy")
+
+
+def test_the_last_round_is_for_cases_without_any_solved_order(pairs, monkeypatch):
+    """Case 0 is solved in one order at once; the other one is not tried any longer for it."""
+    planned, real = [], decide_module.plan
+
+    def noted(planner, scenarios, **options):
+        planned.append((len(planner.rounds), scenarios.order.shape[0]))
+        return real(planner, scenarios, **options)
+
+    monkeypatch.setattr(decide_module, "plan", noted)
+    twice = dataclasses.replace(PLANNER, rounds=2 * PLANNER.rounds[:1])
+    _, plans = plan_catches(twice, pairs, "best")
+    unsolved = int((~is_solved(plans.status)).sum())
+    assert 0 < unsolved < 5
+    assert planned == [(1, 10), (1, 2 * unsolved)]
 
 
 def test_greedy_plans_have_the_order_of_the_estimate(pairs):

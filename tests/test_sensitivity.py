@@ -98,6 +98,17 @@ def test_gradient_of_a_quadratic_is_the_closed_form(bowls, options):
     assert np.all(gradient.residual < 1e-6)
 
 
+def test_where_the_cost_curves_downward_there_is_no_gradient(bowls):
+    """At a saddle the theorem has no minimum to follow; the direct part would be a false zero."""
+    upside_down = dataclasses.replace(BowlPlanner(), weight=-1.0)
+    first = (Round(1, LbfgsConfig(max_steps=0)),)
+    _, gradient = plan_with_gradients(
+        dataclasses.replace(upside_down, rounds=first), bowls, lambda plan: plan.point[0], ("b",)
+    )
+    assert np.isnan(gradient.by["b"]).all()
+    assert np.isnan(gradient.residual).all()
+
+
 def test_gradient_of_the_cost_needs_no_adjoint(bowls):
     plans, gradient = plan_with_gradients(BowlPlanner(), bowls, "cost", ("b",), steps=0)
     np.testing.assert_allclose(gradient.by["b"], -plans.point, atol=1e-12)

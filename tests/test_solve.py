@@ -128,6 +128,16 @@ def test_wrong_batches_are_refused():
         plan(WellPlanner(), Well(np.zeros((2, 3), np.float32)))
     with pytest.raises(ValueError, match="batch shape"):
         plan(WellPlanner(), Well(np.zeros(0, np.float32)))
+    with pytest.raises(ValueError, match="chunk must be >= 1, got 0"):
+        plan(WellPlanner(), Well(GOALS), chunk=0)
+    with pytest.raises(ValueError, match="devices must be at least one"):
+        plan(WellPlanner(), Well(GOALS), devices=[])
+
+
+@pytest.mark.parametrize("goals", [GOALS, GOALS[0]], ids=["batch", "one case"])
+def test_a_plan_that_jax_would_transform_says_what_to_use(goals):
+    with pytest.raises(TypeError, match="plan_with_gradients and optimal_plan"):
+        jax.grad(lambda goal: jnp.sum(plan(WellPlanner(), Well(goal)).point))(jnp.asarray(goals))
 
 
 def test_a_round_needs_a_start():

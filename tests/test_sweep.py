@@ -1,5 +1,6 @@
 """Sweeps: run folder, resuming, tables, figures, clocks and rates, on the hit task."""
 
+import html
 import json
 from types import SimpleNamespace
 
@@ -8,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from matplotlib.figure import Figure
 from scipy.stats import binomtest
 
 from planner_jax.referee.hit import referee_hits
@@ -15,10 +17,11 @@ from planner_jax.robot import quadrotor
 from planner_jax.sweep import run
 from planner_jax.sweep.figures.motion import body_rate, net_thrust, sample_motion
 from planner_jax.sweep.hit import task
+from planner_jax.sweep.hit.figures.motion import motion_figure
 from planner_jax.sweep.hit.settings import HitSweep
 from planner_jax.sweep.hit.source import open_source
-from planner_jax.sweep.hit.table import rate_table
-from planner_jax.sweep.report import write_report
+from planner_jax.sweep.hit.table import rate_table, remarks
+from planner_jax.sweep.report import RunRows, write_report
 from planner_jax.sweep.run import SweepInterrupted, resume_sweep, start_sweep
 from planner_jax.sweep.run_folder import RunFolder, pick_rows
 from planner_jax.sweep.settings import SettingError
@@ -82,6 +85,12 @@ def columns(out):
     return {name: np.array(table[name].to_pylist()) for name in table.column_names}
 
 
+def manifest_on_page(out):
+    """What the page of a run shows of its manifest."""
+    _, _, rest = (out / "index.html").read_text().partition("manifest.json</summary><pre>")
+    return json.loads(html.unescape(rest.partition("</pre>")[0]))
+
+
 # The folder.
 
 
@@ -95,6 +104,7 @@ def test_a_finished_run_holds_manifest_rows_table_figures_and_page(finished):
     for name in FIGURES:
         assert (out / "figures" / name).read_bytes().startswith(b"\x89PNG")
         assert f'src="figures/{name}"' in page
+    assert manifest_on_page(out) == manifest
     assert not (out / "parts").exists() and not list(out.rglob(".*"))
 
 
@@ -177,7 +187,8 @@ def test_a_report_is_drawn_again_from_the_folder_alone(finished, tmp_path):
     for name in ("manifest.json", "plans.parquet"):
         (tmp_path / name).write_bytes((out / name).read_bytes())
     write_report(RunFolder(tmp_path))
-    assert (tmp_path / "table.md").read_text() == (out / "table.md").read_text()
+    for name in ("table.md", "index.html"):
+        assert (tmp_path / name).read_text() == (out / name).read_text()
     assert {path.name for path in (tmp_path / "figures").iterdir()} == set(FIGURES)
 
 
@@ -216,6 +227,41 @@ def test_a_sweep_killed_while_writing_is_resumed_to_the_same_rows(
     resume_sweep("hit", out, progress=False)
     assert (out / "plans.parquet").read_bytes() == (finished[0] / "plans.parquet").read_bytes()
     assert not list(out.rglob(".*"))
+
+
+def test_the_page_of_an_interrupted_sweep_says_so_until_it_is_resumed(tmp_path, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    out = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        patch.setattr(run, "plan_baselines", interrupted)
+        with pytest.raises(SweepInterrupted):
+            start_sweep(SETTINGS, out, progress=False)
+    assert manifest_on_page(out)["state"] == "interrupted"
+    assert manifest_on_page(out) == RunFolder(out).read_manifest()
+    monkeypatch.setattr(run, "plan_baselines", lambda *_: None)
+    manifest = resume_sweep("hit", out, progress=False)
+    assert manifest["state"] == "complete" and manifest_on_page(out) == manifest
+
+
+def test_a_sweep_killed_before_its_last_manifest_is_resumed(tmp_path, monkeypatch):
+    class Killed(BaseException):
+        pass
+
+    def killed(folder, manifest):
+        real(folder, manifest)
+        raise Killed
+
+    out, real = tmp_path / "run", run.rewrite_page
+    monkeypatch.setattr(run, "plan_baselines", lambda *_: None)
+    with monkeypatch.context() as patch:
+        patch.setattr(run, "rewrite_page", killed)
+        with pytest.raises(Killed):
+            start_sweep(SETTINGS, out, progress=False)
+    assert RunFolder(out).read_manifest()["state"] == "running"
+    manifest = resume_sweep("hit", out, progress=False)
+    assert manifest["state"] == "complete" and manifest_on_page(out) == manifest
 
 
 def test_resuming_with_another_setting_names_it(finished):
@@ -268,6 +314,7 @@ def test_published_outcomes_stand_beside_the_plans_of_the_same_serves(tmp_path, 
     assert published == pytest.approx({"bat": 2 / 3, "juggle": 0.0})
     table = rate_table(manifest)
     assert table.header[-1] == "bat, same serves %"
+    assert any('"Same serves"' in line for line in remarks(manifest))
     assert table.rows[0][-1] == "66.7" and table.rows[1][-1] == "" and table.rows[-1][-1] == "66.67"
 
 
@@ -318,6 +365,7 @@ def test_the_table_says_which_rates_are_compared_and_how_many_serves_are_distinc
     text = (finished[0] / "table.md").read_text()
     assert "Table I of the paper" in text and "trial files" in text
     assert f"{NUM} distinct balls" in text
+    assert "ame serves" not in text  # known of no drawn serve: neither a column nor its note
 
 
 def test_a_percentage_is_100_or_0_only_where_it_is_exact():
@@ -375,6 +423,15 @@ def test_sampled_motion_agrees_with_the_trajectory(float64):
     squared = quadrotor.body_rate_squared(acc, jerk, jnp.asarray(9.8))
     np.testing.assert_allclose(body_rate(motion, 9.8) ** 2, squared, rtol=1e-8)
     np.testing.assert_allclose(net_thrust(motion, 9.8), quadrotor.net_thrust(acc, 9.8))
+
+
+def test_hover_is_named_where_no_curve_runs(finished):
+    out, manifest = finished
+    figure = Figure()
+    motion_figure(figure, RunRows(RunFolder(out), manifest, []))
+    thrust = next(axes for axes in figure.axes if axes.get_title().startswith("Thrust"))
+    assert "dotted: hover" in thrust.get_title()
+    assert all("hover" not in text.get_text() for text in thrust.texts)
 
 
 # Settings.

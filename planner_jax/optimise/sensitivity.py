@@ -57,7 +57,8 @@ class Gradient:
     value: Array  # ()
     by: dict[str, Any]  # name -> what the scenario has there, of d value / d leaf
     # () what is left of q_u, relative, in the preconditioner's norm: 0 if lambda is exact. It
-    # says nothing about how far the point is from the optimum.
+    # says nothing about how far the point is from the optimum. NaN, and so is `by`, where the
+    # cost does not curve upward in the first direction: there is no minimum to follow.
     residual: Array
 
 
@@ -243,15 +244,20 @@ def gradient_at(
 def _adjoint(
     products: Callable, solve: Callable, rhs: Array, total: list, steps: int
 ) -> tuple[list, Array]:
-    """`total` - lambda^T cost_uc with cost_uu lambda = rhs, and the relative residual."""
+    """`total` - lambda^T cost_uc with cost_uu lambda = rhs, and the relative residual.
+
+    The residual is not finite where the cost does not curve upward to begin with.
+    """
     left = rhs
     corrected = solve(left)
     size = first = jnp.sum(left * corrected)
     direction = corrected
-    going = jnp.ones((), bool)
+    going = defined = jnp.ones((), bool)
     for k in range(steps):
         curved, mixed = products(direction)
         curvature = jnp.sum(direction * curved)
+        if k == 0:
+            defined = (curvature > 0.0) | (size == 0.0)
         going = going & (curvature > 0.0) & (size > 0.0)
         length = jnp.where(going, size / jnp.where(going, curvature, 1.0), 0.0)
         total = [
@@ -265,7 +271,7 @@ def _adjoint(
             direction = corrected + ratio * direction
         size = jnp.where(going, after, size)
     ratio = size / jnp.where(first > 0.0, first, 1.0)
-    return total, jnp.sqrt(jnp.maximum(ratio, 0.0))
+    return total, jnp.where(defined, jnp.sqrt(jnp.maximum(ratio, 0.0)), jnp.nan)
 
 
 def _core_inverse(planner: Any, point: Array, context: Any) -> Callable[[Array], Array]:

@@ -53,8 +53,9 @@ def require_backend() -> str:
 
     try:
         return jax.default_backend()
-    except RuntimeError as error:
-        reason = str(error).splitlines()[0]
+    except (RuntimeError, AssertionError) as error:
+        # JAX 0.10 only asserts, without a word, where it knows a platform but has no device of it.
+        reason = (str(error) or "JAX finds no device of it").splitlines()[0]
         asked = os.environ.get("JAX_PLATFORMS", "")
         raise SettingError(
             f"JAX_PLATFORMS must name a platform that works here, got {asked!r} ({reason})"

@@ -15,6 +15,7 @@ from planner_jax.sweep.settings import SettingError
 from planner_jax.sweep.table import headline, to_markdown
 from planner_jax.sweep.task import RunFigure, task_of
 
+PAGE = "index.html"
 _CASES_SHOWN = 60
 _FAILURES_SHOWN = 12
 
@@ -66,13 +67,19 @@ def write_report(folder: RunFolder) -> None:
             f"{folder.name} must be finished, got {str(folder.path)!r}; resume it first"
         )
     folder.figures.mkdir(exist_ok=True)
-    failed = pick_rows(folder.plans, _first_failures(folder))
-    rows = RunRows(folder, manifest, failed)
-    _draw(rows, task.figures)
+    failed = _failed_rows(folder)
+    _draw(RunRows(folder, manifest, failed), task.figures)
     lines = headline(manifest, task.findings(manifest))
     text = to_markdown(task.title(manifest), lines, task.table(manifest), task.remarks(manifest))
     folder.write_text("table.md", text)
-    folder.write_text("index.html", to_page(task, manifest, failed))
+    folder.write_text(PAGE, to_page(task, manifest, failed))
+
+
+def rewrite_page(folder: RunFolder, manifest: dict[str, Any]) -> None:
+    """Write `index.html` anew with a manifest, where it has been written before."""
+    if (folder.path / PAGE).exists():
+        page = to_page(task_of(manifest, folder.name), manifest, _failed_rows(folder))
+        folder.write_text(PAGE, page)
 
 
 def draw_comparisons(folder: RunFolder) -> None:
@@ -87,8 +94,8 @@ def _draw(rows: RunRows, figures: Sequence[RunFigure]) -> None:
         draw(rows.folder.figures / figure.name, figure.draw, figure.size, rows)
 
 
-def _first_failures(folder: RunFolder) -> list[int]:
-    """Rows of the first failures, a few."""
+def _failed_rows(folder: RunFolder) -> list[dict[str, Any]]:
+    """The first failures, a few."""
     failed, first = [], 0
     with pq.ParquetFile(folder.plans) as file:
         for group in range(file.num_row_groups):
@@ -97,4 +104,4 @@ def _first_failures(folder: RunFolder) -> list[int]:
             first += len(success)
             if len(failed) >= _FAILURES_SHOWN:
                 break
-    return failed[:_FAILURES_SHOWN]
+    return pick_rows(folder.plans, failed[:_FAILURES_SHOWN])

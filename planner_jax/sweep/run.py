@@ -9,7 +9,7 @@ from typing import Any
 from planner_jax.sweep.baselines import plan_baselines
 from planner_jax.sweep.chunks import SweepRun, plan_chunks
 from planner_jax.sweep.environment import environment, require_backend
-from planner_jax.sweep.report import draw_comparisons, write_report
+from planner_jax.sweep.report import PAGE, draw_comparisons, rewrite_page, write_report
 from planner_jax.sweep.run_folder import RunFolder
 from planner_jax.sweep.settings import SettingError, SweepSettings, settings_to_resume
 from planner_jax.sweep.task import SweepTask, task_named
@@ -96,11 +96,20 @@ def _finish(run: SweepRun, progress: bool) -> dict[str, Any]:
         folder.remove_parts()
         write_report(folder)
         _add_baselines(run, progress)
-        manifest = {**folder.read_manifest(), "state": "complete"}
-        folder.write_manifest(manifest)
+        return _end(folder, "complete")
     except KeyboardInterrupt:
-        folder.write_manifest({**folder.read_manifest(), "state": "interrupted"})
+        _end(folder, "interrupted")
         raise SweepInterrupted(str(folder.path)) from None
+
+
+def _end(folder: RunFolder, state: str) -> dict[str, Any]:
+    """Tell on the page, if there is one yet, and in the manifest how a session ended.
+
+    The manifest comes last: a run that is killed in between is resumed, and its page made anew.
+    """
+    manifest = {**folder.read_manifest(), "state": state}
+    rewrite_page(folder, manifest)
+    folder.write_manifest(manifest)
     return manifest
 
 
@@ -118,7 +127,7 @@ def _plan(run: SweepRun, progress: bool) -> None:
 def _add_baselines(run: SweepRun, progress: bool) -> None:
     """Plan one case with the other planners too, and show them beside the run's plan."""
     if progress and len(run.task.planners) > 1:
-        page = run.folder.path / "index.html"
+        page = run.folder.path / PAGE
         print(f"First figures: {page}. Now one case with the other planners.", file=sys.stderr)
     rows = plan_baselines(run.task, run.source, run.folder.read_manifest()["example"])
     if rows is not None:

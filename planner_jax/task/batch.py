@@ -1,8 +1,8 @@
 """Batches of plans: chunks of a few fixed sizes, spread over the devices, round after round.
 
-Padding to fixed sizes keeps a new batch size from compiling anew. After each round the lanes
-that are still unsolved are packed together for the next one. Every device solves its lanes in
-a loop of its own and waits for no other.
+Padding to fixed sizes keeps a new batch size from compiling the solver anew. After each round the
+lanes that are still unsolved are packed together for the next one. Every device solves its lanes
+in a loop of its own and waits for no other.
 """
 
 import functools
@@ -41,13 +41,15 @@ def plan_batch(
     Returns:
         plans: with NumPy leaves, or where all leaves of the scenarios are jax arrays, with
             those, so that nothing leaves the devices.
-        unsolved: how many lanes are, of each device or of all.
+        unsolved: numbers that are all zero if no lane is unsolved.
     """
     mesh = Mesh(np.array(jax.local_devices() if devices is None else devices), ("lanes",))
     resident = all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(scenarios))
-    several = _length(scenarios) > (chunk or _default_chunk(planner.rounds[0], mesh))
-    # One CPU's memory is the host's, and there a thread for each core plans chunks.
-    if resident and not (several and _is_one_cpu(mesh)):
+    num = _length(scenarios)
+    in_one_call = num == _bucket(num, chunk or _default_chunk(planner.rounds[0], mesh))
+    # One CPU's memory is the host's: there a thread for each core plans chunks, and they are cut
+    # and joined without programs, which would be compiled for every new size.
+    if resident and (in_one_call or not _is_one_cpu(mesh)):
         return _plan_resident(planner, scenarios, chunk, mesh)
     plans, unsolved = _plan_from_host(planner, scenarios, chunk, mesh)
     return (jax.device_put(plans, _sharding(mesh)) if resident else plans), unsolved
@@ -71,7 +73,7 @@ def _plan_from_host(
             plans = jax.tree.map(lambda *leaves: np.concatenate(leaves), *trimmed)
         else:
             for (call, num), later in zip(calls, found, strict=True):
-                plans = _merged_on_host(plans, later, call[:num])
+                plans = merged(plans, later, call[:num])
         lanes = np.flatnonzero(is_unsolved(plans.status))
         if lanes.size == 0:
             break
@@ -105,8 +107,8 @@ def _plan_resident(
             part, lanes = _cut_unsolved(mesh, bucket, scenarios, before, _number(mesh, begin))
             later, _ = _solve(planner, attempt, mesh, part)
             plans, unsolved = _merged_locally(mesh, plans, later, lanes)
-    if num % mesh.size:
-        plans = jax.tree.map(lambda leaf: leaf[:num], plans)
+    if num % mesh.size:  # arrays have equal shares or none
+        plans = _first(jax.device_put(plans, mesh.devices[0]), num)
     return plans, unsolved
 
 
@@ -227,6 +229,11 @@ def _taken(tree: Any, lanes: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf[lanes], tree)
 
 
+@functools.partial(jax.jit, static_argnames="num")
+def _first(tree: Any, num: int) -> Any:
+    return jax.tree.map(lambda leaf: leaf[:num], tree)
+
+
 @functools.partial(jax.jit, static_argnames=("mesh", "size"))
 def _cut(mesh: Mesh, size: int, tree: Any, begin: Any) -> Any:
     """The next lanes of every device's share, filled up with its last one."""
@@ -278,7 +285,7 @@ def _better(later: Any, plans: Any) -> Any:
     return is_solved(later.status) | (later.violation < plans.violation)
 
 
-def _merged_on_host(plans: Any, later: Any, lanes: np.ndarray) -> Any:
+def merged(plans: Any, later: Any, lanes: np.ndarray) -> Any:
     """The plans, in place, with those of some lanes replaced by later ones that are better."""
     later = jax.tree.map(lambda leaf: np.asarray(leaf)[: lanes.size], later)
     better = _better(later, jax.tree.map(lambda leaf: leaf[lanes], plans))

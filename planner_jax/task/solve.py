@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.core import Tracer
 from jax.experimental import multihost_utils
 
 from planner_jax.optimise.problem import Planner, Scenario
@@ -31,12 +32,22 @@ def plan(
     Returns:
         The planner's plans with the batch shape of the scenarios. The leaves are NumPy arrays;
         of a batch in jax arrays they are jax arrays too, and nothing leaves the devices but
-        how many lanes are unsolved. Look at `status`: a lane that could not be solved says so
-        and holds the best that was found.
+        how many lanes are unsolved: each device holds its share, or the first one all if the
+        batch cannot be shared evenly. Look at `status`: a lane that could not be solved says so
+        and holds the best that was found. The same call gives the same bits. In other company,
+        chunks or devices a lane's arithmetic is rounded differently, and where few iterations
+        end short of the optimum it may end elsewhere, rarely with another status.
 
     Raises:
-        ValueError: the leaves have not one batch axis or none, or of different lengths.
+        ValueError: the leaves have not one batch axis or none, or of different lengths, the
+            batch is empty, `chunk` < 1, or there are no `devices`.
+        TypeError: within a transformation of JAX such as `jax.grad`.
     """
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(scenarios)):
+        raise TypeError(
+            "plan cannot be transformed by JAX: for gradients there are plan_with_gradients and "
+            "optimal_plan, and batches need no vmap"
+        )
     if scenarios.batch_shape == ():
         return plan_single(planner, scenarios)
     plans, _ = plan_and_count(planner, scenarios, chunk=chunk, devices=devices)
@@ -50,21 +61,31 @@ def plan_and_count(
     chunk: int | None = None,
     devices: Sequence[Any] | None = None,
 ) -> tuple[Any, Any]:
-    """`plan` of a batch, and how many lanes are unsolved: numbers whose sum it is.
+    """`plan` of a batch, and numbers that are all zero if no lane is unsolved.
 
     Raises:
         ValueError: as for `plan`.
     """
+    require_batch(scenarios)
+    if chunk is not None and chunk < 1:
+        raise ValueError(f"chunk must be >= 1, got {chunk}")
+    if devices is not None and not len(devices):
+        raise ValueError("devices must be at least one, got none")
+    return plan_batch(planner, scenarios, chunk, devices)
+
+
+def require_batch(scenarios: Scenario) -> int:
+    """The length of a batch; raises `ValueError` unless all leaves have it."""
     batch = scenarios.batch_shape
     if len(batch) != 1 or batch[0] == 0:
-        raise ValueError(f"scenarios must be one case or a batch of some, got batch shape {batch}")
+        raise ValueError(f"scenarios must be a batch of at least one, got batch shape {batch}")
     for path, leaf in jax.tree_util.tree_leaves_with_path(scenarios):
         if np.shape(leaf)[:1] != batch:
             name = jax.tree_util.keystr(path)
             raise ValueError(
                 f"scenarios{name} must have {batch[0]} lanes, got shape {np.shape(leaf)}"
             )
-    return plan_batch(planner, scenarios, chunk, devices)
+    return batch[0]
 
 
 def plan_across_processes(
@@ -81,9 +102,9 @@ def plan_across_processes(
         The whole batch's plans, leaves NumPy arrays, in every process.
 
     Raises:
-        ValueError: the batch has fewer lanes than there are processes.
+        ValueError: as for `plan`, or the batch has fewer lanes than there are processes.
     """
-    (num,) = scenarios.batch_shape
+    num = require_batch(scenarios)
     processes, mine = jax.process_count(), jax.process_index()
     if num < processes:
         raise ValueError(f"scenarios must have a lane for each of {processes} processes, got {num}")

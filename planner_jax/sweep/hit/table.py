@@ -14,7 +14,7 @@ def rate_table(manifest: dict[str, Any]) -> RateTable:
     published, column = court.published_rates(), court.PLANNERS.index(other)
     header = ["scenario", "cases", f"{planner} %", "95 % interval"]
     header += [f"{other}, paper %", f"{other}, trial files %"]
-    same = any(other in c["published_on_these_serves"] for c in summary["per_scenario"].values())
+    same = _knows_same_serves(summary, other)
     header += [f"{other}, same serves %"] if same else []
     rows: list[list[str]] = []
     known, solved = 0, 0.0
@@ -38,6 +38,11 @@ def rate_table(manifest: dict[str, Any]) -> RateTable:
     return RateTable("Success per scenario", header, [*rows, total], strong=len(rows))
 
 
+def _knows_same_serves(summary: dict[str, Any], other: str) -> bool:
+    """Whether published outcomes of the run's own cases are known."""
+    return any(other in c["published_on_these_serves"] for c in summary["per_scenario"].values())
+
+
 def remarks(manifest: dict[str, Any]) -> list[str]:
     """Where the numbers come from."""
     summary, settings, serves = manifest["summary"], manifest["parameters"], manifest["serves"]
@@ -49,6 +54,11 @@ def remarks(manifest: dict[str, Any]) -> list[str]:
     start = settings["start"]
     start = "uniform over the half court, 1.5 m high" if start == "uniform" else f"{tuple(start)} m"
     truth = "with" if settings["drag_after_impact"] else "without"
+    same = ""
+    if _knows_same_serves(summary, other):
+        same = (
+            '"Same serves" are the published outcomes of the very cases of this run, where known. '
+        )
     return [
         f"{origin}; {serves['distinct']:,} distinct balls (cases may share a ball and differ in "
         "the target).",
@@ -58,7 +68,6 @@ def remarks(manifest: dict[str, Any]) -> list[str]:
         "A success is the referee's: every limit within 1e-3 relative, landing within 1 cm.",
         f'"{other}, paper" is Table I of the paper, "{other}, trial files" what its published '
         "trial files count over 1,000 rows a scenario. The two differ by up to 20 points; their "
-        "totals are means over the scenarios. "
-        '"Same serves" are the published outcomes of the very cases of this run, where known. '
+        f"totals are means over the scenarios. {same}"
         "All of these stand for the paper's own setting: full limits, planning from the serve.",
     ]

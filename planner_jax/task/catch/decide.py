@@ -18,11 +18,12 @@ from flax import struct
 from jax import Array
 
 from planner_jax.ball.flight import BallState
-from planner_jax.optimise.problem import Planner
+from planner_jax.optimise.problem import Planner, Round
 from planner_jax.optimise.status import Status, is_solved, is_unsolved
+from planner_jax.task.batch import merged
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.task.catch.scenario import CatchScenario
-from planner_jax.task.solve import plan, plan_and_count
+from planner_jax.task.solve import plan, plan_and_count, require_batch
 
 DECISIONS = ("best", "greedy", "given")
 
@@ -201,18 +202,23 @@ def plan_catches(
         scenarios: with the order and times that were decided; times before optimisation.
         plans: of them. An unsolved lane with a target that `closest_approach` puts out of
             reach has the status OUT_OF_REACH.
+        The leaves of both are NumPy arrays, or jax arrays if those of the scenarios are.
 
     Raises:
-        ValueError: no such decision, or a given order that is not a permutation.
+        ValueError: no such decision, a given order that is not a permutation, or as for `plan`.
     """
     if decide not in DECISIONS:
         raise ValueError(f"decide must be one of {', '.join(DECISIONS)}, got {decide!r}")
+    require_batch(scenarios)
+    resident = all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(scenarios))
     if decide == "given":
         _require_orders(scenarios)
     elif decide == "greedy" or scenarios.num_targets == 1:
-        scenarios = decided(scenarios, _greedy(scenarios))
+        decision = _greedy(scenarios)
+        scenarios = decided(scenarios, decision if resident else jax.device_get(decision))
     else:
-        return _plan_finalists(planner, scenarios, devices)
+        found = _plan_finalists(planner, scenarios, devices)
+        return jax.tree.map(jnp.asarray, found) if resident else found
     plans, unsolved = plan_and_count(planner, scenarios, devices=devices)
     return scenarios, _name_out_of_reach(scenarios, plans) if np.any(unsolved) else plans
 
@@ -220,7 +226,10 @@ def plan_catches(
 def _plan_finalists(
     planner: Planner, scenarios: CatchScenario, devices: Sequence[Any] | None
 ) -> tuple[CatchScenario, CatchPlan]:
-    """The best of the most promising orders, planned together."""
+    """The best of the most promising orders, planned together; NumPy arrays.
+
+    The planner's last round, its longest, is for cases of which no order is solved by then.
+    """
     decisions = _best_orders(scenarios, _FINALISTS)
     finalists = decisions.order.shape[1]
     tried = [
@@ -228,7 +237,17 @@ def _plan_finalists(
         for k in range(finalists)
     ]
     together = jax.tree.map(lambda *leaves: np.concatenate(leaves), *tried)
-    plans = plan(planner, together, devices=devices)
+    *rounds, last = planner.rounds
+    if not rounds:
+        plans = plan(planner, together, devices=devices)
+    else:
+        plans = plan(_with_rounds(planner, rounds), together, devices=devices)
+        cases = is_solved(plans.status).reshape(finalists, -1).any(axis=0)
+        lanes = np.flatnonzero(is_unsolved(plans.status) & ~np.tile(cases, finalists))
+        if lanes.size:
+            left = jax.tree.map(lambda leaf: leaf[lanes], together)
+            later = plan(_with_rounds(planner, [last]), left, devices=devices)
+            plans = merged(plans, later, lanes)
     shaped = lambda leaf: np.asarray(leaf).reshape(finalists, -1, *np.shape(leaf)[1:])  # noqa: E731
     plans, together = jax.tree.map(shaped, plans), jax.tree.map(shaped, together)
     solved = np.asarray(is_solved(plans.status))
@@ -237,6 +256,10 @@ def _plan_finalists(
     pick = lambda leaf: leaf[chosen, lanes]  # noqa: E731
     together, plans = jax.tree.map(pick, together), jax.tree.map(pick, plans)
     return together, plans if solved.any(axis=0).all() else _name_out_of_reach(together, plans)
+
+
+def _with_rounds(planner: Planner, rounds: list[Round]) -> Planner:
+    return dataclasses.replace(planner, rounds=tuple(rounds))  # type: ignore[type-var]
 
 
 def optimal_time_ratio(scenarios: CatchScenario, plans: CatchPlan) -> np.ndarray:

@@ -12,5 +12,21 @@ PLANNERS = {
 
 
 def catch_planner(name: str, **options: Any) -> Any:
-    """The planner of a name with some fields set; see `make_planner`."""
+    """The catch planner of a name, with some of its fields set.
+
+    * `exact`: the ball is in the net by construction; the one to use.
+    * `catch`: the published planner of paper 000, which meets the ball by penalties.
+    * `mpp`: the motion primitives that paper 000 compares with; nothing is optimised.
+
+    Args:
+        name: one of these.
+        **options: fields of that planner's dataclass, for example `rounds`.
+
+    Returns:
+        `ExactCatch`, `PaperCatch` or `MppCatch`, for `plan` and `plan_catches`.
+
+    Raises:
+        ValueError: there is no planner of that name.
+        TypeError: the planner has no such field.
+    """
     return make_planner(PLANNERS, name, options)

@@ -48,7 +48,9 @@ def motion_figure(figure: Figure, run: RunRows) -> None:
     style.label(acceleration, "time since planning began [s]", "|a| [m/s²]", "Acceleration")
     acceleration.tick_params(labelbottom=True)
     style.label(rate, "time since planning began [s]", "|ω| [rad/s]", "Body rate")
-    style.label(thrust, "time since planning began [s]", "‖τ‖ [m/s²]", "Thrust per mass")
+    style.label(
+        thrust, "time since planning began [s]", "‖τ‖ [m/s²]", "Thrust per mass (dotted: hover)"
+    )
     case = f"Case {plans[0][1]['index']}, scenario {plans[0][1]['scenario']}"
     verdicts = [(name, row["success"], _word(row)) for name, row in plans]
     write_verdicts(words, case, verdicts)
@@ -92,7 +94,11 @@ def _draw_limits(panels: Any, setting: dict[str, Any]) -> None:
     thrust.set_ylim(0.0, min(max(thrust.get_ylim()[1], 1.1 * (gravity + most)), 3.0 * most))
     thrust.axhline(gravity, color=style.GREY, linewidth=1.0, linestyle=":")
     thrust.axhline(gravity + most, **follows)
-    for level, text in ((gravity, "hover"), (gravity + most, "g + acceleration limit")):
-        thrust.annotate(
-            text, (0.0, level), (4, 3), textcoords="offset points", color=style.GREY, fontsize=8.5
-        )
+    thrust.annotate(
+        "g + acceleration limit",
+        (0.0, gravity + most),
+        (4, 3),
+        textcoords="offset points",
+        color=style.GREY,
+        fontsize=8.5,
+    )
