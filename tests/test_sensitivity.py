@@ -115,6 +115,18 @@ def test_gradient_of_the_cost_needs_no_adjoint(bowls):
     np.testing.assert_allclose(gradient.value, plans.cost, atol=1e-12)
 
 
+def test_one_name_need_not_be_in_a_list(bowls):
+    one, listed = (
+        plan_with_gradients(BowlPlanner(), bowls, "cost", wrt, steps=0)[1] for wrt in ("b", ["b"])
+    )
+    np.testing.assert_array_equal(one.by["b"], listed.by["b"])
+
+
+def test_an_optimal_plan_is_of_one_case(bowls):
+    with pytest.raises(ValueError, match=r"must be one case, got batch shape \(5,\)"):
+        optimal_plan(BowlPlanner(), bowls)
+
+
 def test_an_optimal_plan_has_the_same_gradient_forward_and_backward(bowls):
     """u = A^-1 (b + k e_0): the slopes of u by b are A^-1, those by k its first column."""
     bowl = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), bowls)

@@ -116,7 +116,15 @@ def optimal_plan(
     Returns:
         The planner's plan. Where its status is not CONVERGED the point is not stationary or
         breaks a limit, and its gradients mean nothing.
+
+    Raises:
+        ValueError: the scenario is a batch.
     """
+    if scenario.batch_shape != ():
+        raise ValueError(
+            f"scenario must be one case, got batch shape {scenario.batch_shape}; for batches "
+            "there is plan_with_gradients, or jax.vmap of this"
+        )
     solver = solver or LbfgsConfig(max_steps=200, tolerance=1e-7, patience=6)
     context = planner.prepare(scenario)
     start = lax.stop_gradient(planner.guesses(context, 1)[0])

@@ -14,7 +14,7 @@ def plan_with_gradients(
     planner: Planner,
     scenarios: Scenario,
     quantity: Quantity,
-    wrt: Sequence[str],
+    wrt: str | Sequence[str],
     *,
     steps: int = 1,
     curvature: str = "core",
@@ -40,7 +40,7 @@ def plan_with_gradients(
         quantity: the number: names joined by dots, such as "stroke.time", "cost" or
             "violation", or a function of one plan. A function is compiled for anew with every
             new function object.
-        wrt: places in the scenario, such as "racket_height", "limits" or "net.radius".
+        wrt: a place in the scenario, or some, such as "racket_height", "limits", "net.radius".
         steps: of the conjugate gradients for the adjoint. One is exact where no limit binds;
             0 is exact for "cost", by the envelope theorem.
         curvature: "core" is quick; "whole" takes the Hessian itself, exact where limits bind
@@ -57,13 +57,14 @@ def plan_with_gradients(
         ValueError: a name is not of the plan or the scenario, `steps` < 0, or
             `curvature` is unknown.
     """
+    wrt = (wrt,) if isinstance(wrt, str) else tuple(wrt)
     for name in wrt:
         part_of(scenarios, name)
     if solver is not None:
         rounds = (Round(starts=1, solver=solver),)
         planner = dataclasses.replace(planner, rounds=rounds)  # type: ignore[type-var]
     found = plan(
-        Differentiated(planner, quantity, tuple(wrt), steps, curvature),
+        Differentiated(planner, quantity, wrt, steps, curvature),
         scenarios,
         chunk=chunk,
         devices=devices,
