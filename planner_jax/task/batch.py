@@ -88,9 +88,8 @@ def _plan_resident(
     Every device plans its own share, without asking the others for a lane.
     """
     num = _length(scenarios)
-    if num % mesh.size:  # the last lanes of the last device are the first lane again
-        lanes = np.arange(-(-num // mesh.size) * mesh.size)
-        scenarios = _taken(scenarios, np.where(lanes < num, lanes, 0))
+    if num % mesh.size:  # the last lane is there again until all shares are equal
+        scenarios = _taken(scenarios, np.arange(-(-num // mesh.size) * mesh.size))
     scenarios = _placed(scenarios, mesh)
     first, *others = planner.rounds
     plans, unsolved = _first_plans(
@@ -108,7 +107,7 @@ def _plan_resident(
             later, _ = _solve(planner, attempt, mesh, part)
             plans, unsolved = _merged_locally(mesh, plans, later, lanes)
     if num % mesh.size:  # arrays have equal shares or none
-        plans = _first(jax.device_put(plans, mesh.devices[0]), num)
+        plans = _taken(jax.device_put(plans, mesh.devices[0]), np.arange(num))
     return plans, unsolved
 
 
@@ -226,12 +225,8 @@ def _solve(planner: Planner, attempt: Round, mesh: Mesh, scenarios: Any) -> tupl
 
 @jax.jit
 def _taken(tree: Any, lanes: Any) -> Any:
-    return jax.tree.map(lambda leaf: leaf[lanes], tree)
-
-
-@functools.partial(jax.jit, static_argnames="num")
-def _first(tree: Any, num: int) -> Any:
-    return jax.tree.map(lambda leaf: leaf[:num], tree)
+    """Some lanes; the last one for those behind it."""
+    return jax.tree.map(lambda leaf: leaf[jnp.minimum(lanes, leaf.shape[0] - 1)], tree)
 
 
 @functools.partial(jax.jit, static_argnames=("mesh", "size"))
@@ -239,7 +234,7 @@ def _cut(mesh: Mesh, size: int, tree: Any, begin: Any) -> Any:
     """The next lanes of every device's share, filled up with its last one."""
 
     def cut(tree: Any, begin: Array) -> Any:
-        return _kept(tree, begin + jnp.arange(size))
+        return _taken(tree, begin + jnp.arange(size))
 
     return _apart(mesh, cut, _LANES, PartitionSpec())(tree, begin)
 
@@ -254,15 +249,10 @@ def _cut_unsolved(mesh: Mesh, size: int, tree: Any, status: Array, begin: Any) -
     def cut(tree: Any, status: Array, begin: Array) -> tuple[Any, Array]:
         (num,) = status.shape
         (unsolved,) = jnp.nonzero(is_unsolved(status), size=num, fill_value=num)
-        lanes = _kept(unsolved, begin + jnp.arange(size))
-        return _kept(tree, lanes), lanes
+        lanes = _taken(unsolved, begin + jnp.arange(size))
+        return _taken(tree, lanes), lanes
 
     return _apart(mesh, cut, _LANES, _LANES, PartitionSpec())(tree, status, begin)
-
-
-def _kept(tree: Any, lanes: Array) -> Any:
-    """Some lanes; the last one for those behind it."""
-    return jax.tree.map(lambda leaf: leaf[jnp.minimum(lanes, leaf.shape[0] - 1)], tree)
 
 
 @functools.partial(jax.jit, static_argnames=("mesh", "share"))
@@ -302,7 +292,7 @@ def _merged_locally(mesh: Mesh, plans: Any, later: Any, lanes: Array) -> tuple[A
     """As on the host, of every device's share, and how many it then has unsolved."""
 
     def merge(plans: Any, later: Any, lanes: Array) -> tuple[Any, Array]:
-        before = _kept(plans, lanes)
+        before = _taken(plans, lanes)
         better = _better(later, before)
 
         def replace(old: Array, new: Array, kept: Array) -> Array:

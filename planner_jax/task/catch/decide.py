@@ -218,7 +218,7 @@ def plan_catches(
         scenarios = decided(scenarios, decision if resident else jax.device_get(decision))
     else:
         found = _plan_finalists(planner, scenarios, devices)
-        return jax.tree.map(jnp.asarray, found) if resident else found
+        return jax.device_put(found, devices[0] if devices else None) if resident else found
     plans, unsolved = plan_and_count(planner, scenarios, devices=devices)
     return scenarios, _name_out_of_reach(scenarios, plans) if np.any(unsolved) else plans
 
