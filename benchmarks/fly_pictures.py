@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sims.run import FlySettings, draw_one, success
+from planner_jax.sims.run import FlySettings, draw_one, success
 
 PICTURES = {
     "fly_catch.png": (

@@ -21,15 +21,15 @@ from typing import Any
 import jax
 import numpy as np
 
+from planner_jax.sims.catch import CatchFlights, fly_catches, throws
+from planner_jax.sims.closed_loop import Flown, Loop
+from planner_jax.sims.hit import SCENARIOS, HitFlights, fly_hits, volleys
+from planner_jax.sims.model import NET, RACKET, World
+from planner_jax.sims.sensing import NOISES
 from planner_jax.sweep.summary import percent, wilson_interval
 from planner_jax.task.catch.planners import catch_planner
 from planner_jax.task.hit.planners import planner as hit_planner
 from planner_jax.trajectory.polynomial import evaluate
-from sims.catch import CatchFlights, fly_catches, throws
-from sims.closed_loop import Flown, Loop
-from sims.hit import SCENARIOS, HitFlights, fly_hits, volleys
-from sims.model import NET, RACKET, World
-from sims.sensing import NOISES
 
 DRAG_ERROR = 0.15
 CATCH_RATE, HIT_RATE = 100.0, 50.0  # [Hz], of planning anew

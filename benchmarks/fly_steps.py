@@ -19,13 +19,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from planner_jax.sims.catch import HOME, SEEN, CatchPilot, scenarios, throws, with_catch
+from planner_jax.sims.closed_loop import Loop, fly_leg
+from planner_jax.sims.launch import launched, ready
+from planner_jax.sims.model import NET, World, hovering, step
+from planner_jax.sims.sensing import NOISES
 from planner_jax.task.catch.decide import plan_catches
 from planner_jax.task.catch.exact import ExactCatch
-from sims.catch import HOME, SEEN, CatchPilot, scenarios, throws, with_catch
-from sims.closed_loop import Loop, fly_leg
-from sims.launch import launched, ready
-from sims.model import NET, World, hovering, step
-from sims.sensing import NOISES
 
 RUNS = 3
 

@@ -17,7 +17,7 @@ import numpy as np
 import optax
 import scipy.optimize
 
-from benchmarks.hit_rows import ROWS
+from planner_jax.benchmarks.hit_rows import ROWS
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.multistart import minimise
 from planner_jax.referee.hit import referee_hits

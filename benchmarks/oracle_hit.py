@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 import pyarrow.parquet as pq
 
-from benchmarks.hit_oracle.search import STARTS, Finding, find_hits, starting_points
+from planner_jax.benchmarks.hit_oracle.search import STARTS, Finding, find_hits, starting_points
 from planner_jax.sweep.summary import wilson_interval
 from planner_jax.task.hit.serves import generate_serves, read_serves, to_scenarios
 from planner_jax.task.hit.validate import ServeError

@@ -261,7 +261,7 @@ def _add_fly(tasks: Any, look: dict[str, Any], task: str, words: str) -> None:
 
 def _fly(task: str, given: dict[str, Any]) -> None:
     keep_compiled_programs()
-    from sims.run import FlySettings, start_flights
+    from planner_jax.sims.run import FlySettings, start_flights
 
     out, video = given.pop("out", None), given.pop("video", None)
     out = out or os.path.join("runs", f"fly-{task}-{datetime.datetime.now():%Y%m%d-%H%M%S}")
@@ -271,16 +271,16 @@ def _fly(task: str, given: dict[str, Any]) -> None:
 
 
 def _print_flights(manifest: dict[str, Any], out: Path) -> None:
-    from sims.run import headline
+    from planner_jax.sims.run import headline
 
     print("\n".join(headline(manifest)))
     print(f"Look at {out / 'index.html'}, or play it: planner-jax view {shlex.quote(str(out))}")
 
 
 def _view(options: dict[str, Any]) -> None:
+    from planner_jax.sims.run import read_flights, title_of
+    from planner_jax.sims.view import Viewer
     from planner_jax.sweep.run_folder import RunFolder
-    from sims.run import read_flights, title_of
-    from sims.view import Viewer
 
     _, settings, recording = read_flights(RunFolder(options["run"], name="RUN"))
     titles = [title_of(settings, recording, flight) for flight in range(len(recording))]
@@ -331,7 +331,7 @@ def _throughput(options: dict[str, Any]) -> None:
     require(options["seed"] >= 0, "seed", ">= 0", options["seed"])
     require_backend()
     keep_compiled_programs()
-    from benchmarks.throughput import report
+    from planner_jax.benchmarks.throughput import report
 
     report(**options)
 
@@ -382,7 +382,7 @@ def _report(options: dict[str, Any]) -> None:
     folder = RunFolder(options["run"], name="RUN")
     manifest = folder.read_manifest()
     if str(manifest["kind"]).startswith("fly "):
-        from sims.run import write_flight_report
+        from planner_jax.sims.run import write_flight_report
 
         write_flight_report(folder)
         _print_flights(manifest, folder.path)

@@ -21,13 +21,7 @@ from planner_jax.ball.prediction import PathTable, predict_path
 from planner_jax.optimise.multistart import solve_round
 from planner_jax.optimise.problem import Planner
 from planner_jax.optimise.status import is_unsolved
-from planner_jax.task.catch.decide import plan_catches
-from planner_jax.task.catch.exact import ExactCatch
-from planner_jax.task.catch.plan import CatchPlan
-from planner_jax.task.catch.replan import ReplanCatch, ReplanScenario
-from planner_jax.task.catch.scenario import CatchScenario, catch_scenario
-from planner_jax.task.catch.suites import earliest_throw, make_suite
-from sims.closed_loop import (
+from planner_jax.sims.closed_loop import (
     Flight,
     Flown,
     Loop,
@@ -39,8 +33,21 @@ from sims.closed_loop import (
     whole,
     with_rest,
 )
-from sims.launch import awaited, flight_keys, launched, ready, require_hovering, require_world
-from sims.model import NET
+from planner_jax.sims.launch import (
+    awaited,
+    flight_keys,
+    launched,
+    ready,
+    require_hovering,
+    require_world,
+)
+from planner_jax.sims.model import NET
+from planner_jax.task.catch.decide import plan_catches
+from planner_jax.task.catch.exact import ExactCatch
+from planner_jax.task.catch.plan import CatchPlan
+from planner_jax.task.catch.replan import ReplanCatch, ReplanScenario
+from planner_jax.task.catch.scenario import CatchScenario, catch_scenario
+from planner_jax.task.catch.suites import earliest_throw, make_suite
 
 HOME = (0.0, 0.0, 1.0)  # [m], where the quadrotor hovers
 INTERVAL = 0.8  # [s], from throw to throw (paper 000, Fig. 1)

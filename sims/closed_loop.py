@@ -19,12 +19,12 @@ from flax import struct
 from jax import Array, lax
 
 from planner_jax.ball.flight import BallState
+from planner_jax.sims import sensing as sight
+from planner_jax.sims.control import Gains, control, reference_at, robot_state
+from planner_jax.sims.model import Physics, World, ball_states, ball_velocity, step
+from planner_jax.sims.scoring import Contact, moment, nearest, passage
+from planner_jax.sims.sensing import Estimate, Sensing, sensed_robot
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, total_duration
-from sims import sensing as sight
-from sims.control import Gains, control, reference_at, robot_state
-from sims.model import Physics, World, ball_states, ball_velocity, step
-from sims.scoring import Contact, moment, nearest, passage
-from sims.sensing import Estimate, Sensing, sensed_robot
 
 _BRAKING = 0.8  # [s] from the end of a plan to rest
 _LOWEST_REST = 0.5  # [m]

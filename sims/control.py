@@ -16,9 +16,9 @@ from flax import struct
 from jax import Array, lax
 
 from planner_jax.robot.quadrotor import body_z, net_thrust, tangent_basis
+from planner_jax.sims.model import Physics, World
+from planner_jax.sims.vehicle import rotor_thrusts
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
-from sims.model import Physics, World
-from sims.vehicle import rotor_thrusts
 
 
 @dataclasses.dataclass(frozen=True)

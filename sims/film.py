@@ -13,12 +13,12 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
+from planner_jax.sims.model import World
+from planner_jax.sims.recording import Recording, frame, rotation
+from planner_jax.sims.scenery import court_lines, machine_parts, outlines
+from planner_jax.sims.vehicle import rotor_positions
 from planner_jax.sweep.figures.style import BLUE, GREEN, GREY, INK, ORANGE, PALE, PURPLE, RED, SKY
 from planner_jax.task.hit.court import DEAD_ZONE, HALF_WIDTH
-from sims.model import World
-from sims.recording import Recording, frame, rotation
-from sims.scenery import court_lines, machine_parts, outlines
-from sims.vehicle import rotor_positions
 
 BALL_COLOURS = (ORANGE, PURPLE, GREEN)
 FORMATS = (".gif", ".mp4")

@@ -15,16 +15,16 @@ from planner_jax.ball.flight import BallState
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.multistart import solve_round
 from planner_jax.optimise.problem import Planner, Round
+from planner_jax.sims.closed_loop import Flight, Flown, Loop, Outlook, expected, flown, fly_leg
+from planner_jax.sims.launch import flight_keys, launched, ready, require_hovering, require_world
+from planner_jax.sims.model import RACKET
+from planner_jax.sims.scoring import Contact, landing_point, returned
 from planner_jax.task.hit.exact import ExactHit
 from planner_jax.task.hit.plan import HitPlan
 from planner_jax.task.hit.replan import ReplanHit, ReplanHitScenario
 from planner_jax.task.hit.scenario import HitScenario
 from planner_jax.task.hit.serves import advance, generate_serves, to_scenarios
 from planner_jax.task.solve import plan as plan_all
-from sims.closed_loop import Flight, Flown, Loop, Outlook, expected, flown, fly_leg
-from sims.launch import flight_keys, launched, ready, require_hovering, require_world
-from sims.model import RACKET
-from sims.scoring import Contact, landing_point, returned
 
 SEEN = 0.25  # [s], a serve's flight before it is planned for: 2 m and more (paper 000, VII-A)
 _AFTER = 0.1  # [s] flown after the last impact planned

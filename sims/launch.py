@@ -15,11 +15,11 @@ import numpy as np
 from jax import Array, lax
 
 from planner_jax.ball.flight import BallState, fly
-from sims import sensing as sight
-from sims.closed_loop import Flight, Loop
-from sims.model import Tool, hovering, placed
-from sims.scoring import no_contact
-from sims.sensing import Estimate
+from planner_jax.sims import sensing as sight
+from planner_jax.sims.closed_loop import Flight, Loop
+from planner_jax.sims.model import Tool, hovering, placed
+from planner_jax.sims.scoring import no_contact
+from planner_jax.sims.sensing import Estimate
 
 
 def flight_keys(seed: int, index: np.ndarray) -> Array:

@@ -33,8 +33,15 @@ with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp, not need
     from mujoco import mjx
 
 from planner_jax.ball.flight import BallState, ball_acceleration
-from sims.scenery import GROUND_COLOUR, MOUTHS, TOWARDS_NET, Part, court_parts, machine_parts
-from sims.vehicle import Vehicle, rotor_positions, rotor_torques
+from planner_jax.sims.scenery import (
+    GROUND_COLOUR,
+    MOUTHS,
+    TOWARDS_NET,
+    Part,
+    court_parts,
+    machine_parts,
+)
+from planner_jax.sims.vehicle import Vehicle, rotor_positions, rotor_torques
 
 BALL_RADIUS, BALL_MASS = 0.02, 0.0027  # [m], [kg]: a table tennis ball
 _LOOK = 'mass="0" contype="0" conaffinity="0"'  # of what is there to be looked at

@@ -14,11 +14,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from planner_jax.ball.flight import BallState
+from planner_jax.sims.closed_loop import Flown
+from planner_jax.sims.model import BALL_RADIUS, Tool
 from planner_jax.sweep.columns import BOOL, LIST, VECTOR, Column, RefereedBatch, rows_of
 from planner_jax.sweep.source import Cases
 from planner_jax.task.hit.validate import fly, landing
-from sims.closed_loop import Flown
-from sims.model import BALL_RADIUS, Tool
 
 FILE = "flights.parquet"
 _FAR = 20.0  # [m], where balls wait that are not in flight

@@ -14,6 +14,16 @@ import numpy as np
 import pyarrow as pa
 
 from planner_jax.optimise.status import Status
+from planner_jax.sims.catch import INTERVAL, fly_catches, throws
+from planner_jax.sims.catch import SEEN as CATCH_SEEN
+from planner_jax.sims.closed_loop import Loop
+from planner_jax.sims.film import FilmError, draw_flight, film_flights, require_film
+from planner_jax.sims.hit import SCENARIOS, fly_hits, volleys
+from planner_jax.sims.hit import SEEN as HIT_SEEN
+from planner_jax.sims.model import NET, RACKET, World
+from planner_jax.sims.recording import FILE, Recording, read_recording, recorded, to_rows
+from planner_jax.sims.scoring import returned
+from planner_jax.sims.sensing import NOISES
 from planner_jax.sweep.columns import (
     BOOL,
     COUNT,
@@ -37,16 +47,6 @@ from planner_jax.task.catch.planners import PLANNERS as CATCH_PLANNERS
 from planner_jax.task.catch.planners import catch_planner
 from planner_jax.task.hit.planners import PLANNERS as HIT_PLANNERS
 from planner_jax.task.hit.planners import planner as hit_planner
-from sims.catch import INTERVAL, fly_catches, throws
-from sims.catch import SEEN as CATCH_SEEN
-from sims.closed_loop import Loop
-from sims.film import FilmError, draw_flight, film_flights, require_film
-from sims.hit import SCENARIOS, fly_hits, volleys
-from sims.hit import SEEN as HIT_SEEN
-from sims.model import NET, RACKET, World
-from sims.recording import FILE, Recording, read_recording, recorded, to_rows
-from sims.scoring import returned
-from sims.sensing import NOISES
 
 TASKS = ("catch", "hit")
 _RECORDED = 256  # flights of a batch that are recorded whole

@@ -12,8 +12,8 @@ from jax import Array
 
 from planner_jax.ball.flight import BallState, rk4_step
 from planner_jax.ball.impact import racket_impact
-from sims.control import robot_state, rotation
-from sims.model import Physics, World, ball_states
+from planner_jax.sims.control import robot_state, rotation
+from planner_jax.sims.model import Physics, World, ball_states
 
 _LANDING_STEPS, _LANDING_STEP = 150, 0.02  # [s], three seconds of flight
 

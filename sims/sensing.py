@@ -23,7 +23,7 @@ from planner_jax.ball.estimation import (
     specific_energy,
 )
 from planner_jax.ball.flight import BallState, fly, rk4_step
-from sims.control import RobotState
+from planner_jax.sims.control import RobotState
 
 _LEAST_STD = 1e-3  # [m], that the filter believes of a sensor without noise
 _ACCELERATION_DENSITY = 0.01  # [m^2/s^3], of what the filter's flight leaves out

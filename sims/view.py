@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
+from planner_jax.sims.film import BALL_COLOURS, robot_lines
+from planner_jax.sims.model import BALL_RADIUS, World
+from planner_jax.sims.recording import Recording, frame
+from planner_jax.sims.scenery import GROUND_COLOUR, Part, court_parts, machine_parts
+from planner_jax.sims.vehicle import rotor_positions
 from planner_jax.sweep.figures.style import BLUE, GREEN, GREY, INK, RED, SKY
 from planner_jax.sweep.settings import SettingError, require
-from sims.film import BALL_COLOURS, robot_lines
-from sims.model import BALL_RADIUS, World
-from sims.recording import Recording, frame
-from sims.scenery import GROUND_COLOUR, Part, court_parts, machine_parts
-from sims.vehicle import rotor_positions
 
 _RATE = 30.0  # [Hz], of playing
 _STEP = 0.01  # [s], of the slider

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sims.recording import Recording
+from planner_jax.sims.recording import Recording
 
 
 def recording(looks=6, met=0.04, target=(np.nan,) * 3):

@@ -8,7 +8,12 @@ import pytest
 from planner_jax.task.hit.serves import generate_serves, to_scenarios
 
 pytest.importorskip("casadi")
-from benchmarks.hit_oracle.search import STARTS, find_hit, passes_referee, starting_points
+from planner_jax.benchmarks.hit_oracle.search import (
+    STARTS,
+    find_hit,
+    passes_referee,
+    starting_points,
+)
 
 
 def scenario(limit_scale):

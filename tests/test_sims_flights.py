@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from planner_jax.optimise.status import is_unsolved
+from planner_jax.sims.catch import fly_catches, planned_ahead, throws
+from planner_jax.sims.closed_loop import Loop
+from planner_jax.sims.hit import SCENARIOS, fly_hits, volleys
+from planner_jax.sims.model import NET, RACKET, World
+from planner_jax.sims.sensing import NOISES
 from planner_jax.task.catch.exact import ExactCatch
 from planner_jax.task.catch.suites import make_suite
 from planner_jax.trajectory.polynomial import evaluate
-from sims.catch import fly_catches, planned_ahead, throws
-from sims.closed_loop import Loop
-from sims.hit import SCENARIOS, fly_hits, volleys
-from sims.model import NET, RACKET, World
-from sims.sensing import NOISES
 
 CATCH, HIT = World(NET), World(RACKET, gravity=9.8)
 

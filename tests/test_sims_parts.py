@@ -9,11 +9,17 @@ import pytest
 
 from planner_jax.ball.flight import BallState, drag_free_flight, fly
 from planner_jax.ball.impact import racket_impact
-from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, total_duration
-from sims.closed_loop import Loop, expected, with_rest
-from sims.control import Gains, RobotState, control, flat_attitude, reference_at, rotation_error
-from sims.launch import awaited, ready, require_hovering, require_world
-from sims.model import (
+from planner_jax.sims.closed_loop import Loop, expected, with_rest
+from planner_jax.sims.control import (
+    Gains,
+    RobotState,
+    control,
+    flat_attitude,
+    reference_at,
+    rotation_error,
+)
+from planner_jax.sims.launch import awaited, ready, require_hovering, require_world
+from planner_jax.sims.model import (
     NET,
     RACKET,
     World,
@@ -25,9 +31,9 @@ from sims.model import (
     step,
     step_mujoco,
 )
-from sims.scenery import court_parts, machine_parts, outlines
-from sims.scoring import Moment, landing_point, nearest, no_contact, passage
-from sims.sensing import (
+from planner_jax.sims.scenery import court_parts, machine_parts, outlines
+from planner_jax.sims.scoring import Moment, landing_point, nearest, no_contact, passage
+from planner_jax.sims.sensing import (
     NOISES,
     Sensing,
     anchored,
@@ -37,7 +43,8 @@ from sims.sensing import (
     predicted,
     with_drag,
 )
-from sims.vehicle import Vehicle, allocation, rotor_thrusts
+from planner_jax.sims.vehicle import Vehicle, allocation, rotor_thrusts
+from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, total_duration
 
 WORLD = World(NET)
 GRAVITY = jnp.float32(9.81)

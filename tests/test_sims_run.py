@@ -4,10 +4,10 @@ import pytest
 from matplotlib.figure import Figure
 
 from planner_jax.cli import main
+from planner_jax.sims.film import FilmError, draw_flight, film_flights, require_film
+from planner_jax.sims.model import NET, RACKET, World
+from planner_jax.sims.run import FlySettings
 from planner_jax.sweep.settings import SettingError
-from sims.film import FilmError, draw_flight, film_flights, require_film
-from sims.model import NET, RACKET, World
-from sims.run import FlySettings
 from tests.recordings import recording
 
 

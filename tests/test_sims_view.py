@@ -15,15 +15,15 @@ import pytest
 
 from planner_jax.ball.flight import BallState
 from planner_jax.cli import main
+from planner_jax.sims import view
+from planner_jax.sims.closed_loop import Flown, Record
+from planner_jax.sims.model import BALL_RADIUS, NET, RACKET, Physics, World
+from planner_jax.sims.recording import FILE, Recording, frame, read_recording, recorded, to_rows
+from planner_jax.sims.run import FlySettings
+from planner_jax.sims.scoring import no_contact
+from planner_jax.sims.view import Viewer, free_address, segments
 from planner_jax.sweep.run_folder import RunFolder
 from planner_jax.sweep.settings import SettingError
-from sims import view
-from sims.closed_loop import Flown, Record
-from sims.model import BALL_RADIUS, NET, RACKET, Physics, World
-from sims.recording import FILE, Recording, frame, read_recording, recorded, to_rows
-from sims.run import FlySettings
-from sims.scoring import no_contact
-from sims.view import Viewer, free_address, segments
 from tests.recordings import recording
 
 GRAVITY = 9.81

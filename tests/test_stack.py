@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from policies import brax_compat
+from planner_jax.policies import brax_compat
 
 SPHERE = """
 <mujoco>

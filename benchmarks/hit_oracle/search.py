@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks.hit_oracle.program import Program, case_parameters, later
+from planner_jax.benchmarks.hit_oracle.program import Program, case_parameters, later
 from planner_jax.referee.hit import referee_hits
 from planner_jax.task.hit.plan import HitPlan, Stroke
 from planner_jax.task.hit.scenario import HitScenario
