@@ -25,7 +25,7 @@ import numpy as np
 
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
-from planner_jax.optimise.status import is_solved
+from planner_jax.protocol import is_solved
 from planner_jax.task.catch.decide import plan_catches
 from planner_jax.task.catch.exact import ExactCatch
 from planner_jax.task.catch.suites import make_suite

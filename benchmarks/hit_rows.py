@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from planner_jax.optimise.status import is_solved
+from planner_jax.protocol import is_solved
 from planner_jax.referee.hit import referee_hits
 from planner_jax.sweep.summary import wilson_interval
 from planner_jax.task.hit.exact import ExactHit

@@ -26,7 +26,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
-from planner_jax.optimise.status import is_solved
+from planner_jax.protocol import is_solved
 from planner_jax.referee.catch import referee_catches
 from planner_jax.referee.hit import referee_hits
 from planner_jax.sweep.settings import require

@@ -11,7 +11,7 @@ from derivatives import assert_gradient_matches_differences
 
 from planner_jax.ball.flight import BallState, drag_free_flight, fly
 from planner_jax.ball.impact import racket_impact
-from planner_jax.optimise.status import Status, is_solved
+from planner_jax.protocol import Status, is_solved
 from planner_jax.referee.hit import referee_hits
 from planner_jax.task.hit import court
 from planner_jax.task.hit.bat import BatHit, serve_origin, transition_point

@@ -14,7 +14,7 @@ from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
 from planner_jax.optimise.multistart import solve_round
 from planner_jax.optimise.problem import Round, Stage
 from planner_jax.optimise.scaling import shipped_scale
-from planner_jax.optimise.status import Status, is_solved
+from planner_jax.protocol import Status, is_solved
 from planner_jax.referee.catch import referee_catches
 from planner_jax.task.catch.decide import decided, greedy
 from planner_jax.task.catch.exact import ExactCatch

@@ -9,7 +9,7 @@ import pytest
 from planner_jax.ball.flight import BallState
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
-from planner_jax.optimise.status import Status, is_solved
+from planner_jax.protocol import Status, is_solved
 from planner_jax.referee.catch import referee_catches
 from planner_jax.task.catch.exact import ExactCatch
 from planner_jax.task.catch.replan import ReplanCatch, replanned

@@ -11,7 +11,7 @@ from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
-from planner_jax.optimise.status import Status, is_solved
+from planner_jax.protocol import Status, is_solved
 from planner_jax.referee.catch import referee_catches
 from planner_jax.task.catch import decide as decide_module
 from planner_jax.task.catch.decide import (

@@ -13,7 +13,7 @@ from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.multistart import minimise_lanes
 from planner_jax.optimise.problem import Round
 from planner_jax.optimise.sensitivity import gradient_at
-from planner_jax.optimise.status import is_solved
+from planner_jax.protocol import is_solved
 from planner_jax.task.catch.decide import plan_catches
 from planner_jax.task.catch.exact import ExactCatch
 from planner_jax.task.catch.suites import make_suite

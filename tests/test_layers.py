@@ -88,7 +88,7 @@ from ..cost import limits
         ("planner_jax.sims.scene.load", True),
         ("planner_jax.policies.env", True),
         ("planner_jax.optimise.lbfgs", False),
-        ("planner_jax.cost.limits", False),
+        ("planner_jax.cost.quadrotor", False),
     ]
 
 

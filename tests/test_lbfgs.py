@@ -10,7 +10,7 @@ from planner_jax.optimise import lbfgs
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
 from planner_jax.optimise.lbfgs_kernel import turn_kernel
 from planner_jax.optimise.multistart import minimise, status_of
-from planner_jax.optimise.status import Status
+from planner_jax.protocol import Status
 
 
 def unlimited(cost):

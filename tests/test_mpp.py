@@ -10,7 +10,7 @@ import pytest
 
 from planner_jax.ball.flight import BallState
 from planner_jax.optimise.multistart import solve_round
-from planner_jax.optimise.status import Status, is_solved
+from planner_jax.protocol import Status, is_solved
 from planner_jax.referee.catch import referee_catches
 from planner_jax.task.catch.chain import ordered_context, targets_at
 from planner_jax.task.catch.mpp import MppCatch, falling_time

@@ -7,7 +7,7 @@ import pytest
 from derivatives import assert_gradient_matches_differences
 
 from planner_jax.cost.contact import apex_excess, hitting_speed_excess
-from planner_jax.cost.limits import (
+from planner_jax.cost.quadrotor import (
     acceleration_excess,
     body_rate_excess,
     ground_excess,

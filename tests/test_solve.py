@@ -11,7 +11,7 @@ from jax import Array
 
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
 from planner_jax.optimise.problem import Round
-from planner_jax.optimise.status import Status, is_solved
+from planner_jax.protocol import Status, is_solved
 from planner_jax.task import batch
 from planner_jax.task.solve import plan, plan_across_processes
 

@@ -12,7 +12,7 @@ from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath, HarmonicPath
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
-from planner_jax.optimise.status import is_solved
+from planner_jax.protocol import is_solved
 from planner_jax.referee.catch import referee_catches
 from planner_jax.task.catch.exact import ExactCatch
 from planner_jax.task.catch.scenario import catch_scenario

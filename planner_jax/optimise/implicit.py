@@ -14,8 +14,8 @@ from flax import struct
 from jax import Array, lax
 
 from planner_jax.optimise.lbfgs import LbfgsConfig, Objective
-from planner_jax.optimise.multistart import minimise, status_of
-from planner_jax.optimise.problem import Planner
+from planner_jax.optimise.multistart import minimise
+from planner_jax.protocol import status_of
 
 
 @struct.dataclass
@@ -95,21 +95,22 @@ def newton_refine(
 
 
 def optimal_plan(
-    planner: Planner,
-    scenario: Any,
+    planner: Any,
+    case: Any,
     *,
     solver: LbfgsConfig | None = None,
     newton_steps: int = 100,
 ) -> Any:
-    """The plan at the optimum of the first guess's basin, differentiable by the scenario.
+    """The plan at the optimum of the first guess's basin, differentiable by the case.
 
-    `jax.grad` and `jax.jacobian` of any number in the plan, by any leaf of the scenario, go
+    `jax.grad` and `jax.jacobian` of any number in the plan, by any leaf of the case, go
     through the implicit function theorem. Use float64 (`jax.enable_x64`) where gradients
     matter to more than two digits.
 
     Args:
-        planner: sizes and switches, static.
-        scenario: one case; the leaves to differentiate by.
+        planner: one that minimises. Of one that decides first it is the first choice that is
+            planned, and it is constant to derivatives.
+        case: one case; the leaves to differentiate by.
         solver: of the search before the refinement; 200 iterations by default.
         newton_steps: of the refinement, at most.
 
@@ -118,15 +119,17 @@ def optimal_plan(
         breaks a limit, and its gradients mean nothing.
 
     Raises:
-        ValueError: the scenario is a batch.
+        ValueError: the case is a batch.
     """
-    if scenario.batch_shape != ():
+    if case.batch_shape != ():
         raise ValueError(
-            f"scenario must be one case, got batch shape {scenario.batch_shape}; for batches "
-            "there is plan_with_gradients, or jax.vmap of this"
+            f"case must be one case, got batch shape {case.batch_shape}; for batches "
+            "there is pj.gradient, or jax.vmap of this"
         )
+    if hasattr(planner, "settled"):
+        planner, case = planner.settled(case)
     solver = solver or LbfgsConfig(max_steps=200, tolerance=1e-7, patience=6)
-    context = planner.prepare(scenario)
+    context = planner.prepare(case)
     start = lax.stop_gradient(planner.guesses(context, 1)[0])
     # A gradient that rounding alone can make: relative to the size of the cost at the start.
     stationarity = 1e2 * float(jnp.finfo(start.dtype).eps)

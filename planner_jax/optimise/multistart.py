@@ -1,4 +1,4 @@
-"""The loop around the solver, for one scenario and several starts."""
+"""The loop around the solver, for one case and several starts."""
 
 import dataclasses
 import functools
@@ -13,11 +13,9 @@ from jax import Array, lax
 from planner_jax.lanes import over_lanes
 from planner_jax.optimise import lbfgs
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig, LbfgsState, Objective
-from planner_jax.optimise.problem import Planner, Round, Settings
-from planner_jax.optimise.status import Status
+from planner_jax.optimise.problem import Problem, Round
+from planner_jax.protocol import FEASIBILITY_TOLERANCE, status_of
 
-# Plans are refereed to 1e-3 of a limit; half of that is left for peaks between samples.
-FEASIBILITY_TOLERANCE = 5e-4
 # So few iterations are counted, so that a GPU need not tell the host whether to go on.
 _COUNTED = 16
 
@@ -93,26 +91,21 @@ def _optimum_at(point: Array, evaluation: Evaluation, config: LbfgsConfig) -> Op
     return Optimum(point, evaluation, jnp.zeros((), jnp.int32), stationary)
 
 
-def changed(planner: Planner, settings: Settings) -> Planner:
-    """The planner with some of its fields set anew; its plans keep their shape."""
-    return dataclasses.replace(planner, **dict(settings))  # type: ignore[type-var]
-
-
-def solve_round(planner: Planner, attempt: Round, scenario: Any) -> Any:
-    """Plan one scenario with one round's starts and iterations; pure, so jit and vmap it.
+def solve_round(planner: Problem, attempt: Round, case: Any) -> Any:
+    """Plan one case with one round's starts and iterations; pure, so jit and vmap it.
 
     For a batch `solve_batch` is quicker.
 
     Args:
-        planner: sizes and switches, static.
+        planner: the problem; what it has of arrays is shared by all lanes.
         attempt: how many starts and iterations.
-        scenario: one case.
+        case: one case.
 
     Returns:
         The planner's plan of the best start, its `status` and `iterations` set.
     """
     planners, configs = _stages(planner, attempt)
-    context = planners[-1].prepare(scenario)
+    context = planners[-1].prepare(case)
 
     def from_start(start: Array) -> Any:
         iterations = jnp.zeros((), jnp.int32)
@@ -125,19 +118,19 @@ def solve_round(planner: Planner, attempt: Round, scenario: Any) -> Any:
     return from_start(starts[0]) if attempt.starts == 1 else _best(jax.vmap(from_start)(starts))
 
 
-def solve_batch(planner: Planner, attempt: Round, scenarios: Any) -> Any:
+def solve_batch(planner: Problem, attempt: Round, cases: Any) -> Any:
     """`solve_round` on a batch, the lanes of which end at their own times.
 
     Args:
-        planner: sizes and switches, static.
+        planner: the problem; what it has of arrays is shared by all lanes.
         attempt: how many starts and iterations.
-        scenarios: B cases, a leading axis on every leaf.
+        cases: B of them, a leading axis on every leaf.
 
     Returns:
         Their plans, a leading axis on every leaf.
     """
     planners, configs = _stages(planner, attempt)
-    lanes = jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), scenarios)
+    lanes = jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), cases)
     contexts = over_lanes(planners[-1].prepare)(lanes)
     starts = over_lanes(lambda context: planners[-1].guesses(context, attempt.starts))(contexts)
     # A lane of the solver is one start of one case; the starts of a case are neighbours.
@@ -157,14 +150,14 @@ def solve_batch(planner: Planner, attempt: Round, scenarios: Any) -> Any:
     return jax.vmap(_best)(jax.tree.map(split, plans))
 
 
-def _stages(planner: Planner, attempt: Round) -> tuple[list[Planner], list[LbfgsConfig]]:
+def _stages(planner: Problem, attempt: Round) -> tuple[list[Problem], list[LbfgsConfig]]:
     """The problems to be solved one after another; the last is the one that counts."""
-    planners = [changed(planner, stage.settings) for stage in attempt.stages]
+    planners = [planner.changed(stage.settings) for stage in attempt.stages]
     configs = [stage.solver for stage in attempt.stages]
-    return [*planners, changed(planner, attempt.settings)], [*configs, attempt.solver]
+    return [*planners, planner.changed(attempt.settings)], [*configs, attempt.solver]
 
 
-def _plan_at(planner: Planner, optimum: Optimum, context: Any) -> Any:
+def _plan_at(planner: Problem, optimum: Optimum, context: Any) -> Any:
     """The plan of one optimum."""
     plan = planner.decode(optimum.point, context)
     cost = optimum.evaluation.cost
@@ -180,15 +173,3 @@ def _best(plans: Any) -> Any:
     score = jnp.where(jnp.any(feasible & finite), by_cost, plans.violation)
     best = jnp.argmin(jnp.where(finite, score, jnp.inf))
     return jax.tree.map(lambda leaf: leaf[best], plans)
-
-
-def status_of(cost: Array, violation: Array, stationary: Array) -> Array:
-    """The `Status` of a finished lane, () int32."""
-    feasible = violation <= FEASIBILITY_TOLERANCE
-    status = jnp.where(
-        feasible,
-        jnp.where(stationary, Status.CONVERGED, Status.FEASIBLE),
-        jnp.where(stationary, Status.INFEASIBLE, Status.MAX_STEPS),
-    )
-    finite = jnp.isfinite(cost) & jnp.isfinite(violation)
-    return jnp.where(finite, status, Status.NON_FINITE).astype(jnp.int32)

@@ -1,4 +1,4 @@
-"""The seam between a task and the optimiser: what a planner offers for ONE scenario."""
+"""What the solver asks of a planner that minimises: a problem for ONE case, and attempts at it."""
 
 import dataclasses
 from typing import Any, Protocol
@@ -6,6 +6,7 @@ from typing import Any, Protocol
 from jax import Array
 
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
+from planner_jax.protocol import Attempt
 
 Settings = tuple[tuple[str, Any], ...]  # fields of a planner, and the values they take
 
@@ -19,41 +20,21 @@ class Stage:
 
 
 @dataclasses.dataclass(frozen=True)
-class Round:
-    """One attempt at the lanes that earlier rounds left unsolved."""
+class Round(Attempt):
+    """An attempt of a planner that minimises: so many starts and iterations."""
 
-    starts: int
-    solver: LbfgsConfig
+    solver: LbfgsConfig = LbfgsConfig()
     settings: Settings = ()  # of the planner, that differ in this round
     stages: tuple[Stage, ...] = ()  # before it, from easy to hard
 
-    def __post_init__(self) -> None:
-        if self.starts < 1:
-            raise ValueError(f"starts must be >= 1, got {self.starts}")
 
+class Problem(Protocol):
+    """A problem in scaled variables, in which the objective has curvature of order one.
 
-class Scenario(Protocol):
-    """A pytree of arrays for one case, or for a batch with a leading axis on every leaf."""
-
-    @property
-    def batch_shape(self) -> tuple[int, ...]:
-        """() for one case, (B,) for a batch."""
-        ...
-
-
-class Planner(Protocol):
-    """A small frozen dataclass of sizes and switches, static under jit.
-
-    All functions are pure and written for one scenario, and work in scaled decision
-    variables in which the objective has curvature of order one.
+    All functions are pure and written for one case.
     """
 
-    @property
-    def rounds(self) -> tuple[Round, ...]:
-        """What to try, in order."""
-        ...
-
-    def prepare(self, scenario: Any) -> Any:
+    def prepare(self, case: Any) -> Any:
         """What every evaluation needs and none changes, such as the ball's path table."""
         ...
 
@@ -70,4 +51,8 @@ class Planner(Protocol):
 
         The solver fills in `cost`, `iterations` and `status`.
         """
+        ...
+
+    def changed(self, settings: Settings) -> "Problem":
+        """The problem with some of the planner's fields set anew; plans keep their shape."""
         ...

@@ -2,7 +2,7 @@
 
 Quasi-Newton steps are only as good as the coordinates. The scale of variable i is
 c_i = gain / sqrt(floor + median H_ii), where H = J^T J is the Gauss-Newton curvature of the
-planner's residuals in natural units, and the median runs over scenarios, each taken at its
+planner's residuals in natural units, and the median runs over cases, each taken at its
 first guess and at a solution. A new task offers `residuals` and gets its scale from here.
 """
 
@@ -20,10 +20,10 @@ from jax import Array
 
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.multistart import minimise
-from planner_jax.optimise.problem import Planner
+from planner_jax.optimise.problem import Problem
 
 
-class ScaledPlanner(Planner, Protocol):
+class ScaledPlanner(Problem, Protocol):
     """A planner, a frozen dataclass, whose scale can be measured."""
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
@@ -64,13 +64,13 @@ def curvature_diagonal(residuals: Callable[[Array], Array], point: Array) -> Arr
 
 def measure_scale(
     planner: ScaledPlanner,
-    scenarios: Any,
+    cases: Any,
     *,
     gain: float = 1.0,
     floor: float = 1e-4,
     num_rounds: int = 3,
 ) -> np.ndarray:
-    """Scale of every decision variable, measured on a batch of scenarios.
+    """Scale of every decision variable, measured on a batch of cases.
 
     Solutions depend on the scale they were found with, so measuring is repeated with its own
     result; two or three rounds settle it.
@@ -78,7 +78,7 @@ def measure_scale(
     Args:
         planner: a frozen dataclass with a `scale` field, the first value of which only has
             to be sensible.
-        scenarios: a batch; a few hundred, hard ones among them, so that limits are active.
+        cases: a batch; a few hundred, hard ones among them, so that limits are active.
         gain: multiplies the result; below one for smaller first steps.
         floor: curvature that is taken as none, so that a variable which hardly matters keeps
             a finite scale.
@@ -90,8 +90,8 @@ def measure_scale(
     config = LbfgsConfig(max_steps=30)
     for _ in range(num_rounds):
 
-        def diagonals(scenario: Any, planner: ScaledPlanner = planner) -> Array:
-            context = planner.prepare(scenario)
+        def diagonals(case: Any, planner: ScaledPlanner = planner) -> Array:
+            context = planner.prepare(case)
             scale = jnp.asarray(planner.scale)
             start = planner.guesses(context, 1)[0]
             optimum = minimise(lambda x: planner.objective(x, context), start, config)
@@ -103,7 +103,7 @@ def measure_scale(
 
             return at(start) + at(optimum.point)
 
-        curvature = np.asarray(jax.jit(jax.vmap(diagonals))(scenarios), np.float64)
+        curvature = np.asarray(jax.jit(jax.vmap(diagonals))(cases), np.float64)
         scale = gain / np.sqrt(floor + np.nanmedian(curvature, axis=0))
         planner = dataclasses.replace(planner, scale=tuple(scale.tolist()))
     return np.asarray(planner.scale)

@@ -24,7 +24,9 @@ from jax import Array
 
 from planner_jax.lanes import with_kernel
 from planner_jax.optimise.inverse_kernel import inverse_kernel
-from planner_jax.optimise.problem import Planner, Round
+from planner_jax.optimise.planner import OptimisedPlanner, pending
+from planner_jax.optimise.problem import Problem, Round, Settings
+from planner_jax.protocol import Plan
 
 Quantity = str | Callable[[Any], Array]
 _CURVATURES = ("core", "whole")
@@ -32,7 +34,10 @@ _CURVATURES = ("core", "whole")
 
 @runtime_checkable
 class CorePlanner(Protocol):
-    """A planner that says how the part of its cost bends which can be looked at cheaply."""
+    """A planner that knows the second derivatives of a part of its cost, the core, in closed form.
+
+    They make a cheap preconditioner of the whole Hessian.
+    """
 
     def core_blocks(self, size: int) -> np.ndarray:
         """Places (K, k) in a point (size,) of the variables that the core couples.
@@ -52,10 +57,10 @@ class CorePlanner(Protocol):
 
 @struct.dataclass
 class Gradient:
-    """A number of a plan, and its gradient by some of the scenario."""
+    """A number of a plan, and its gradient by some of the case."""
 
     value: Array  # ()
-    by: dict[str, Any]  # name -> what the scenario has there, of d value / d leaf
+    by: dict[str, Any]  # name -> what the case has there, of d value / d leaf
     # () what is left of q_u, relative, in the preconditioner's norm: 0 if lambda is exact. It
     # says nothing about how far the point is from the optimum. NaN, and so is `by`, where the
     # cost does not curve upward in the first direction: there is no minimum to follow.
@@ -63,15 +68,11 @@ class Gradient:
 
 
 @struct.dataclass
-class DifferentiatedPlan:
+class DifferentiatedPlan(Plan):
     """A planner's plan with a gradient."""
 
     plan: Any
     gradient: Gradient
-    cost: Array  # ()
-    violation: Array  # ()
-    iterations: Array  # () int32
-    status: Array  # () int32
 
     def whole_plan(self) -> Any:
         """The plan with what the solver filled in."""
@@ -80,22 +81,24 @@ class DifferentiatedPlan:
 
 @struct.dataclass
 class _Context:
-    scenario: Any
+    case: Any
     inner: Any
 
 
-@dataclasses.dataclass(frozen=True)
-class Differentiated:
+@struct.dataclass
+class Differentiated(OptimisedPlanner):
     """A planner whose plans carry the gradient of one of their numbers.
 
     It is solved like the planner itself; the gradient is taken where the solver ends.
     """
 
     planner: Any
-    quantity: Quantity  # place in the plan such as "stroke.time", or a function of the plan
-    wrt: tuple[str, ...]  # places in the scenario such as "net.radius"
-    steps: int = 1  # of the conjugate gradients
-    curvature: str = "core"  # or "whole", of the preconditioner
+    # Place in the plan such as "stroke.time", or a function of the plan.
+    quantity: Quantity = struct.field(pytree_node=False)
+    by: tuple[str, ...] = struct.field(pytree_node=False)  # places in the case such as "net.radius"
+    steps: int = struct.field(pytree_node=False, default=1)  # of the conjugate gradients
+    # "core" or "whole", of the preconditioner.
+    curvature: str = struct.field(pytree_node=False, default="core")
 
     def __post_init__(self) -> None:
         if self.curvature not in _CURVATURES:
@@ -103,31 +106,21 @@ class Differentiated:
             raise ValueError(f"curvature must be one of {known}, got {self.curvature!r}")
         if self.steps < 0:
             raise ValueError(f"steps must be >= 0, got {self.steps}")
-        if not self.wrt:
-            raise ValueError("wrt must name something in the scenario, got nothing")
+        if not self.by:
+            raise ValueError("by must name something in the case, got nothing")
 
     @property
     def rounds(self) -> tuple[Round, ...]:
-        """Those of the planner, their settings made to the planner inside."""
+        """Those of the planner."""
+        return self.planner.rounds
 
-        def inner(settings: tuple) -> tuple:
-            return (("planner", dataclasses.replace(self.planner, **dict(settings))),)
+    def changed(self, settings: Settings) -> "Differentiated":
+        """With settings of the planner inside."""
+        return dataclasses.replace(self, planner=self.planner.changed(settings))
 
-        return tuple(
-            dataclasses.replace(
-                attempt,
-                settings=inner(attempt.settings),
-                stages=tuple(
-                    dataclasses.replace(stage, settings=inner(stage.settings))
-                    for stage in attempt.stages
-                ),
-            )
-            for attempt in self.planner.rounds
-        )
-
-    def prepare(self, scenario: Any) -> _Context:
+    def prepare(self, case: Any) -> _Context:
         """As the planner does."""
-        return _Context(scenario=scenario, inner=self.planner.prepare(scenario))
+        return _Context(case=case, inner=self.planner.prepare(case))
 
     def guesses(self, context: _Context, num: int) -> Array:
         """Those of the planner."""
@@ -144,39 +137,36 @@ class Differentiated:
             plan=plan,
             gradient=gradient_at(
                 self.planner,
-                context.scenario,
+                context.case,
                 point,
                 self.quantity,
-                self.wrt,
+                self.by,
                 steps=self.steps,
                 curvature=self.curvature,
             ),
-            cost=plan.cost,
-            violation=plan.violation,
-            iterations=plan.iterations,
-            status=plan.status,
+            **pending(plan.violation),
         )
 
 
 def gradient_at(
-    planner: Planner,
-    scenario: Any,
+    planner: Problem,
+    case: Any,
     point: Array,
     quantity: Quantity,
-    wrt: tuple[str, ...],
+    by: tuple[str, ...],
     *,
     steps: int = 1,
     curvature: str = "core",
 ) -> Gradient:
-    """Gradient of a number of the plan at a point by parts of the scenario. One lane; pure.
+    """Gradient of a number of the plan at a point by parts of the case. One lane; pure.
 
     Args:
         planner: sizes and switches, static.
-        scenario: one case.
+        case: one case.
         point: (n,) minimiser of the planner's objective. At another point the result is the
             derivative of the points of equal cost gradient, not of the optimum.
         quantity: place of a number in the plan, names joined by dots, or a function of the plan.
-        wrt: places in the scenario.
+        by: places in the case.
         steps: of the conjugate gradients; each takes a product with the Hessian. A lane stops
             early where the Hessian is not positive. 0 leaves the adjoint out, which is right
             for "cost": its gradient at an optimum is that at a fixed point (envelope theorem).
@@ -187,10 +177,10 @@ def gradient_at(
         ValueError: a place does not exist, or holds something else than floating numbers.
     """
     number = _quantity(quantity)
-    parts = {name: part_of(scenario, name) for name in wrt}
+    parts = {name: part_of(case, name) for name in by}
 
     def moved(parts: dict) -> Any:
-        return functools.reduce(lambda s, name: _with_part(s, name, parts[name]), parts, scenario)
+        return functools.reduce(lambda s, name: _with_part(s, name, parts[name]), parts, case)
 
     context, pull = jax.vjp(lambda parts: planner.prepare(moved(parts)), parts)
     leaves, treedef = jax.tree.flatten(context)
@@ -209,7 +199,7 @@ def gradient_at(
         plan = planner.decode(x, context_of(smooth))
         value = number(plan.replace(cost=cost(x, smooth)))
         if value.shape:
-            raise ValueError(f"quantity must be one number, got shape {value.shape}")
+            raise ValueError(f"of must be one number, got shape {value.shape}")
         return value
 
     value, (along_point, by_context) = jax.value_and_grad(value_of, argnums=(0, 1))(point, smooth)
@@ -351,15 +341,15 @@ positive_inverse = with_kernel(_gauss_jordan, inverse_kernel())
 
 
 def part_of(tree: Any, name: str) -> Any:
-    """What stands at a place, names joined by dots, in a scenario.
+    """What stands at a place, names joined by dots, in a case.
 
     Raises:
         ValueError: there is no such place, or it holds something else than floating numbers.
     """
-    part = _found(tree, name, "wrt")
+    part = _found(tree, name, "by")
     for leaf in jax.tree.leaves(part):
         if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
-            raise ValueError(f"wrt must name floating numbers, got {name!r}")
+            raise ValueError(f"by must name floating numbers, got {name!r}")
     return jax.tree.map(jnp.asarray, part)
 
 
@@ -386,4 +376,4 @@ def _with_part(tree: Any, name: str, part: Any) -> Any:
 def _quantity(quantity: Quantity) -> Callable[[Any], Array]:
     if callable(quantity):
         return quantity
-    return lambda plan: _found(plan, quantity, "quantity")
+    return lambda plan: _found(plan, quantity, "of")

@@ -1,6 +1,6 @@
 """Float64 NumPy referee of catch plans: the physics alone decides whether a plan succeeds.
 
-It shares no code with the planner: `referee.motion` samples the returned polynomial and
+It shares no code with the planner: `referee.quadrotor` samples the returned polynomial and
 recomputes attitude and body rate from flatness; here the targets are followed along their
 paths and the net is held against them. A plan's own claims (status, cost) are not trusted; its
 order is checked, and the times of the catches that it claims are compared with those at which
@@ -17,14 +17,13 @@ from typing import Literal
 
 import numpy as np
 
-from planner_jax.referee.motion import (
+from planner_jax.referee.quadrotor import (
     CONTACT_TIME_TOLERANCE,
     above,
     check_sampling,
     checked_coeffs,
     checked_leaf,
     derivative,
-    failure_sentence,
     finite_lanes,
     first_failures,
     intervals_of,
@@ -32,11 +31,12 @@ from planner_jax.referee.motion import (
     judge_motion,
     pieces_of,
 )
+from planner_jax.referee.verdict import Verdict
 
 # Limit -> what is said when it fails. In the order in which they are tested: a failed plan is
 # named after its first failure.
 _SENTENCES = {
-    "not finite": "the plan or its scenario is not finite",
+    "not finite": "the plan or its case is not finite",
     "order": "{excess:.0f} wrong, the first at {time:.3f} s; every present target must have one "
     "place, before the absent ones",
     "catch time": "off by {excess:.3g} s at {time:.3f} s; catches must be at rising positive "
@@ -61,20 +61,16 @@ SLOWEST_TARGET = 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
-class CatchVerdict:
+class CatchVerdict(Verdict):
     """What the referee found, one entry a lane. What is measured may be NaN if inputs are.
 
     Entries (B, N) are in the order of catching, as `order` and `times` of the plan, and NaN
     at a place where no target is left to be caught or a wrong one is named.
     """
 
-    success: np.ndarray  # (B,) bool, all present targets caught and no limit exceeded
-    failed_limit: np.ndarray  # (B,) str, the first of `LIMITS` that fails; "" for a success
-    failed_time: np.ndarray  # (B,) [s], where that limit is worst; NaN for a success
-    # (B,) relative to the limit for speed, thrust, body rate, ground, net and angle; [m] for
-    # head state, continuity and net plane; [s] for catch time; the number of wrong places for
-    # order; NaN for a success. It is the whole error, the tolerance not taken off.
-    failed_excess: np.ndarray
+    SENTENCES = _SENTENCES
+    UNBOUNDED = _UNBOUNDED
+
     max_speed: np.ndarray  # (B,) [m/s]
     max_body_rate: np.ndarray  # (B,) [rad/s], infinite where the attitude is not defined
     min_thrust: np.ndarray  # (B,) [m/s^2], per unit mass
@@ -89,21 +85,16 @@ class CatchVerdict:
     continuity_error: np.ndarray  # (B,) [m], worst jump between pieces, as displacement
     head_error: np.ndarray  # (B,) [m], error at time 0, likewise
 
-    def sentence(self, lane: int) -> str:
-        """One line for a human: which limit failed, when, and by how much."""
-        name = str(self.failed_limit[lane])
-        if not name:
-            number = int(self.num_caught[lane])
-            if not number:
-                return "success: there is no target to catch"
-            farthest = np.nanmax(self.net_distance[lane])
-            return f"success: {number} caught, at most {farthest:.2g} m from the net's centre"
-        time, excess = self.failed_time[lane], self.failed_excess[lane]
-        return failure_sentence(name, time, excess, _SENTENCES, _UNBOUNDED)
+    def praise(self, k: int | tuple) -> str:
+        """What is said of a success."""
+        if not (number := int(np.asarray(self.num_caught)[k])):
+            return "there is no target to catch"
+        farthest = np.nanmax(self.net_distance[k])
+        return f"{number} caught, at most {farthest:.2g} m from the net's centre"
 
 
 def referee_catches(
-    scenarios,
+    cases,
     plans,
     *,
     target_states: Callable | None = None,
@@ -121,7 +112,7 @@ def referee_catches(
     that belongs to an absent target; with a duration they are flown, and judged like the rest.
     Speed, thrust, body rate and height are sampled at both ends and inside of every piece and
     their peaks searched on the polynomial itself. Errors at time 0 and between pieces count as
-    displacement (`referee.motion.joint_errors`). A lane without targets has nothing to fail.
+    displacement (`referee.quadrotor.joint_errors`). A lane without targets has nothing to fail.
 
     The target's place is worked out here, in float64, for a path with the fields of `BallPath`
     (known by `ball`), of `HarmonicPath` (`amplitude`) or of `PathTable` (`resolution`; between
@@ -130,7 +121,7 @@ def referee_catches(
     The shared protocol of paper 000 is `tolerance=0.05, net_test="ball"`.
 
     Args:
-        scenarios: object with the fields of `CatchScenario`, leaves with leading axis B; those
+        cases: object with the fields of `CatchCase`, leaves with leading axis B; those
             of `targets` with (B, N). Its order and times are not read.
         plans: object with the fields of `CatchPlan`, leaves with leading axis B; coefficients
             (B, N * M, D + 1, 3), durations (B, N * M).
@@ -142,7 +133,7 @@ def referee_catches(
         net_test: "plane": the target is in the hoop's plane to `contact_tolerance`, and there
             within the net's radius of its centre. "ball": it is within that radius of the
             centre in any direction.
-        tolerance: relative, of every limit of the scenario, the net's radius and angle included.
+        tolerance: relative, of every limit of the case, the net's radius and angle included.
         contact_tolerance: [m], distance of the target from the hoop's plane at the catch.
         continuity_tolerance: times the largest coordinate [m] at the piece ends (at least
             1 m), allowed displacement of head state and joints.
@@ -161,7 +152,7 @@ def referee_catches(
     check_sampling(samples, chunk)
     if net_test not in ("plane", "ball"):
         raise ValueError(f'net_test must be "plane" or "ball", got {net_test!r}')
-    leaves = _leaves(scenarios, plans)
+    leaves = _leaves(cases, plans)
     shape = leaves["present"].shape
     # A broken lane is told by its verdict, not by a warning.
     with np.errstate(all="ignore"):
@@ -169,9 +160,9 @@ def referee_catches(
         order = np.clip(np.rint(order), 0, shape[1] - 1).astype(np.int64)
         times = _ends(leaves["durations"].astype(np.float64), shape[1])
         if target_states is None:
-            pos, vel = _known_states(scenarios.targets, order, times)
+            pos, vel = _known_states(cases.targets, order, times)
         else:
-            pos, vel = target_states(scenarios.targets, order, times)
+            pos, vel = target_states(cases.targets, order, times)
     leaves["target pos"] = checked_leaf("target_states' pos", pos, (*shape, 3))
     leaves["target vel"] = checked_leaf("target_states' vel", vel, (*shape, 3))
     judge = functools.partial(
@@ -187,10 +178,10 @@ def referee_catches(
     return CatchVerdict(**judge_in_chunks(judge, leaves, chunk))
 
 
-def _leaves(scenarios, plans) -> dict[str, np.ndarray]:
+def _leaves(cases, plans) -> dict[str, np.ndarray]:
     """Every array that the referee reads but those of the targets, by name, its shape checked."""
-    limits, net, path = scenarios.limits, scenarios.net, plans.trajectory
-    coeffs, present = checked_coeffs(path.coeffs), np.asarray(scenarios.present)
+    limits, net, path = cases.limits, cases.net, plans.trajectory
+    coeffs, present = checked_coeffs(path.coeffs), np.asarray(cases.present)
     batch, pieces = coeffs.shape[:1], coeffs.shape[1]
     if present.ndim != 2 or present.shape[:1] != batch or 0 in present.shape[1:]:
         raise ValueError(f"present must be ({batch[0]}, N), got {present.shape}")
@@ -201,9 +192,9 @@ def _leaves(scenarios, plans) -> dict[str, np.ndarray]:
         "durations": (path.durations, (pieces,)),
         "order": (plans.order, (num,)),
         "times": (plans.times, (num,)),
-        "horizon": (scenarios.horizon, (num,)),
-        "head_state": (scenarios.head_state, (4, 3)),
-        "gravity": (scenarios.gravity, ()),
+        "horizon": (cases.horizon, (num,)),
+        "head_state": (cases.head_state, (4, 3)),
+        "gravity": (cases.gravity, ()),
         "net.height": (net.height, ()),
         "net.radius": (net.radius, ()),
         "net.max_angle": (net.max_angle, ()),

@@ -1,6 +1,6 @@
 """Float64 NumPy referee of hit plans: the physics alone decides whether a plan succeeds.
 
-It shares no code with the planner: `referee.motion` samples the returned polynomial and
+It shares no code with the planner: `referee.quadrotor` samples the returned polynomial and
 recomputes attitude and body rate from flatness; here the ball is integrated, the impact applied
 and the ball followed to the ground. A plan's own claims (status, cost, stroke) are not trusted;
 only the impact time that it claims is compared. World frame, z up, ground at z = 0, SI units.
@@ -14,14 +14,13 @@ import functools
 
 import numpy as np
 
-from planner_jax.referee.motion import (
+from planner_jax.referee.quadrotor import (
     CONTACT_TIME_TOLERANCE,
     above,
     check_sampling,
     checked_coeffs,
     checked_leaf,
     derivative,
-    failure_sentence,
     finite_lanes,
     first_failures,
     intervals_of,
@@ -29,11 +28,12 @@ from planner_jax.referee.motion import (
     judge_motion,
     pieces_of,
 )
+from planner_jax.referee.verdict import Verdict
 
 # Limit -> what is said when it fails. In the order in which they are tested: a failed plan is
 # named after its first failure.
 _SENTENCES = {
-    "not finite": "the plan or its scenario is not finite",
+    "not finite": "the plan or its case is not finite",
     "contact time": "off by {excess:.3g} s; it must be positive, the end of the trajectory "
     "({time:.3f} s), and before the ball lands",
     "head state": "the trajectory starts {excess:.3g} m off the head state",
@@ -64,16 +64,12 @@ _LONGEST_FLIGHT = 20.0
 
 
 @dataclasses.dataclass(frozen=True)
-class HitVerdict:
+class HitVerdict(Verdict):
     """What the referee found, one entry a lane. What is measured may be NaN if inputs are."""
 
-    success: np.ndarray  # (B,) bool
-    failed_limit: np.ndarray  # (B,) str, the first of `LIMITS` that fails; "" for a success
-    failed_time: np.ndarray  # (B,) [s], where that limit is worst; NaN for a success
-    # (B,) relative to the limit for speed, acceleration, body rate, ground, hitting speed and
-    # apex; [m] for head state, continuity, contact, landing; [m/s] for wrong face; [s] for
-    # contact time; NaN for a success. It is the whole error, the tolerance not taken off.
-    failed_excess: np.ndarray
+    SENTENCES = _SENTENCES
+    UNBOUNDED = _UNBOUNDED
+
     max_speed: np.ndarray  # (B,) [m/s]
     max_acceleration: np.ndarray  # (B,) [m/s^2]
     max_body_rate: np.ndarray  # (B,) [rad/s], infinite where the attitude is not defined
@@ -88,17 +84,13 @@ class HitVerdict:
     continuity_error: np.ndarray  # (B,) [m], worst jump between pieces, as displacement
     head_error: np.ndarray  # (B,) [m], error at time 0, likewise
 
-    def sentence(self, lane: int) -> str:
-        """One line for a human: which limit failed, when, and by how much."""
-        name = str(self.failed_limit[lane])
-        if not name:
-            return f"success: the ball lands {self.landing_error[lane]:.2g} m from the target"
-        time, excess = self.failed_time[lane], self.failed_excess[lane]
-        return failure_sentence(name, time, excess, _SENTENCES, _UNBOUNDED)
+    def praise(self, k: int | tuple) -> str:
+        """What is said of a success."""
+        return f"the ball lands {np.asarray(self.landing_error)[k]:.2g} m from the target"
 
 
 def referee_hits(
-    scenarios,
+    cases,
     plans,
     *,
     drag_after_impact: bool = False,
@@ -120,11 +112,11 @@ def referee_hits(
     4.5 m have at most 1.3e-4 m of it, under a third of the default tolerance.
 
     Args:
-        scenarios: object with the fields of `HitScenario`, leaves with leading axis B.
+        cases: object with the fields of `HitCase`, leaves with leading axis B.
         plans: object with the fields of `HitPlan`, leaves with leading axis B; coefficients
             (B, M, D + 1, 3), durations (B, M).
         drag_after_impact: let the drag act on the returned ball too.
-        tolerance: relative, of every limit of the scenario.
+        tolerance: relative, of every limit of the case.
         landing_tolerance: [m], horizontal distance of the landing from the target.
         contact_tolerance: [m], distance of the racket centre from the ball at the impact.
         continuity_tolerance: times the largest coordinate [m] at the piece ends (at least
@@ -140,7 +132,7 @@ def referee_hits(
         ValueError: a leaf has the wrong shape, `samples` < 200 or `chunk` < 1.
     """
     check_sampling(samples, chunk)
-    leaves = _leaves(scenarios, plans)
+    leaves = _leaves(cases, plans)
     tolerances = {
         "relative": tolerance,
         "landing": landing_tolerance,
@@ -156,22 +148,22 @@ def referee_hits(
     return HitVerdict(**judge_in_chunks(judge, leaves, chunk))
 
 
-def _leaves(scenarios, plans) -> dict[str, np.ndarray]:
+def _leaves(cases, plans) -> dict[str, np.ndarray]:
     """Every array that the referee reads, by name, its shape checked."""
-    limits, stroke_limits = scenarios.limits, scenarios.hit_limits
+    limits, stroke_limits = cases.limits, cases.hit_limits
     path = plans.trajectory
     coeffs = checked_coeffs(path.coeffs)
     trailing = {
         "durations": (path.durations, coeffs.shape[1:2]),
         "stroke.time": (plans.stroke.time, ()),
-        "ball.pos": (scenarios.ball.pos, (3,)),
-        "ball.vel": (scenarios.ball.vel, (3,)),
-        "head_state": (scenarios.head_state, (4, 3)),
-        "target": (scenarios.target, (3,)),
-        "drag": (scenarios.drag, ()),
-        "gravity": (scenarios.gravity, ()),
-        "restitution": (scenarios.restitution, ()),
-        "racket_height": (scenarios.racket_height, ()),
+        "ball.pos": (cases.ball.pos, (3,)),
+        "ball.vel": (cases.ball.vel, (3,)),
+        "head_state": (cases.head_state, (4, 3)),
+        "target": (cases.target, (3,)),
+        "drag": (cases.drag, ()),
+        "gravity": (cases.gravity, ()),
+        "restitution": (cases.restitution, ()),
+        "racket_height": (cases.racket_height, ()),
         "limits.speed": (limits.speed, ()),
         "limits.acceleration": (limits.acceleration, ()),
         "limits.body_rate": (limits.body_rate, ()),

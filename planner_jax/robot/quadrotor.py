@@ -93,3 +93,33 @@ def tangent_basis(normal: Array) -> tuple[Array, Array]:
         jnp.stack([1.0 - k * x * x, -k * x * y, -x]),
         jnp.stack([-k * x * y, 1.0 - k * y * y, -y]),
     )
+
+
+def flat_attitude(acc: Array, jerk: Array, gravity: Array) -> tuple[Array, Array]:
+    """Attitude and body rate of a motion, at zero heading of the Hopf fibration.
+
+    Args:
+        acc: (3,) [m/s^2].
+        jerk: (3,) [m/s^3].
+        gravity: () [m/s^2], magnitude.
+
+    Returns:
+        (3, 3) rotation, body to world, and (3,) [rad/s] in the body frame.
+    """
+    z = body_z(acc, gravity)
+    size = jnp.sqrt(jnp.maximum(jnp.sum(net_thrust(acc, gravity) ** 2), 1e-2))
+    z_dot = (jerk - jnp.sum(jerk * z) * z) / size
+    x, y = tangent_basis(z)
+    twist = (z[1] * z_dot[0] - z[0] * z_dot[1]) / jnp.maximum(1.0 + z[2], 1e-2)
+    rate = jnp.stack([-jnp.sum(y * z_dot), jnp.sum(x * z_dot), twist])
+    return jnp.stack([x, y, z], axis=1), rate
+
+
+def tilt_quaternion(normal: Array) -> Array:
+    """The attitude at zero heading of the Hopf fibration, of the body z axis, (4,) w x y z.
+
+    The shortest turn from upright: (1 + z, -y, x, 0) / sqrt(2 (1 + z)).
+    """
+    x, y, z = components(normal)
+    w = jnp.sqrt(0.5 * at_least(1.0 + z, 1e-6))
+    return jnp.stack([w, -0.5 * y / w, 0.5 * x / w, jnp.zeros_like(w)])

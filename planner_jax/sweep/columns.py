@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from planner_jax.optimise.status import Status
+from planner_jax.protocol import Status
 from planner_jax.sweep.source import Cases
 
 

@@ -1,1 +1,5 @@
-"""One room a task, and the one call that plans them all."""
+"""One room a task."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -50,3 +50,51 @@ def mean_squared_jerk(primitive: PiecewisePolynomial) -> Array:
         + alpha * beta * t**3 / 4.0
         + alpha**2 * t**4 / 20.0
     )
+
+
+def eased_minimum_jerk(
+    head_state: Array, tail_state: Array, duration: Array, ease: float
+) -> PiecewisePolynomial:
+    """The minimum-jerk primitive, its first jerk reached by a ramp and not at once.
+
+    The primitive begins with a jerk that a hovering quadrotor does not have: its body rate
+    would jump. Here the jerk first runs in a straight line from its value at the head to the
+    one that the primitive begins with, which starts from where the ramp has led. That jerk J
+    is the root of J = first jerk of the primitive after a ramp to J, affine in J.
+
+    Args:
+        head_state: (4, 3), jerk included.
+        tail_state: (3, 3) position, velocity, acceleration.
+        duration: () [s] > 0, of ramp and primitive together.
+        ease: [s] > 0, of the ramp, but at most half of `duration`.
+
+    Returns:
+        Two pieces of degree 5 that join up to the jerk.
+    """
+    t = jnp.minimum(ease, 0.5 * duration)
+    p0, v0, a0, j0 = head_state
+
+    def primitive(jerk: Array) -> PiecewisePolynomial:
+        ramp_end = jnp.stack(
+            [
+                p0 + v0 * t + a0 * t**2 / 2.0 + (3.0 * j0 + jerk) * t**3 / 24.0,
+                v0 + a0 * t + (2.0 * j0 + jerk) * t**2 / 6.0,
+                a0 + (j0 + jerk) * t / 2.0,
+            ]
+        )
+        return minimum_jerk(ramp_end, tail_state, duration - t)
+
+    def first_jerk(jerk: Array) -> Array:
+        return 6.0 * primitive(jerk).coeffs[0, 3]
+
+    constant = first_jerk(jnp.zeros_like(j0))
+    # By differences this would be lost in rounding: the two are a thousand times as large.
+    share = t / (duration - t)
+    slope = -share * (4.5 + share * (6.0 + 2.5 * share))
+    jerk = constant / (1.0 - slope)
+    ramp = jnp.stack([p0, v0, a0 / 2.0, j0 / 6.0, (jerk - j0) / (24.0 * t), jnp.zeros_like(p0)])
+    after = primitive(jerk)
+    return PiecewisePolynomial(
+        coeffs=jnp.concatenate([ramp[None], after.coeffs]),
+        durations=jnp.concatenate([t[None], after.durations]),
+    )

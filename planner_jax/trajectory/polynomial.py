@@ -1,5 +1,7 @@
 """Piecewise polynomials in time: the one form in which every planner returns a trajectory."""
 
+import functools
+
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -77,3 +79,48 @@ def snap_energy(trajectory: PiecewisePolynomial, order: int = 4) -> Array:
     weights = np.where(valid, np.outer(factors, factors) / np.maximum(exponents, 1), 0.0)
     gram = jnp.asarray(weights, coeffs.dtype) * durations[:, None, None] ** np.maximum(exponents, 0)
     return jnp.einsum("mki,mkl,mli->", coeffs, gram, coeffs, precision=lax.Precision.HIGHEST)
+
+
+def sample_pieces(trajectory: PiecewisePolynomial, nodes: int) -> Motion:
+    """Motion at both ends and inside of every piece, `nodes` intervals each, pieces in a row."""
+    coeffs, degree = trajectory.coeffs, trajectory.coeffs.shape[1] - 1
+    fractions = jnp.asarray(np.arange(nodes + 1) / nodes, coeffs.dtype)
+    times = trajectory.durations[:, None] * fractions
+
+    def sample(order: int) -> Array:
+        factors = derivative_factors(degree, order)
+        value = jnp.zeros(times.shape + (3,), coeffs.dtype)
+        for k in range(degree, order - 1, -1):
+            value = value * times[..., None] + factors[k] * coeffs[:, None, k]
+        return value.reshape(-1, 3)
+
+    return Motion(height=sample(0)[:, 2], vel=sample(1), acc=sample(2), jerk=sample(3))
+
+
+def states_at(trajectory: PiecewisePolynomial, times: np.ndarray) -> np.ndarray:
+    """Position to jerk of one trajectory, or of a batch, each at its own time; on the host.
+
+    Args:
+        trajectory: leaves with a leading axis B, or without.
+        times: (B,) or () [s] since the start.
+
+    Returns:
+        (B, 4, 3) or (4, 3).
+    """
+    coeffs, durations = np.asarray(trajectory.coeffs), np.asarray(trajectory.durations)
+    ends = durations.cumsum(axis=-1)
+    piece = (times[..., None] >= ends[..., :-1]).sum(axis=-1)
+    if times.ndim:
+        lanes = np.arange(times.size)
+        coeffs, starts = coeffs[lanes, piece], (ends - durations)[lanes, piece]
+    else:
+        coeffs, starts = coeffs[piece], ends[piece] - durations[piece]
+    factors, powers = state_basis(coeffs.shape[-2])
+    return (factors * (times - starts)[..., None, None] ** powers) @ coeffs
+
+
+@functools.cache
+def state_basis(size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Factors and powers (4, size) of t in position to jerk of a polynomial's coefficients."""
+    factors = np.stack([derivative_factors(size - 1, order) for order in range(4)])
+    return factors, np.maximum(np.arange(size) - np.arange(4)[:, None], 0)

@@ -1,1 +1,5 @@
-"""A quadrotor catches flying targets in a net, one or several in sequence (paper 000)."""
+"""Catches: a quadrotor catches one or more flying targets in a net (paper 000)."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

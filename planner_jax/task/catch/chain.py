@@ -11,7 +11,7 @@ from flax import struct
 from jax import Array
 
 from planner_jax.ball.flight import BallState
-from planner_jax.task.catch.scenario import CatchScenario
+from planner_jax.task.catch.case import CatchCase
 from planner_jax.trajectory.polynomial import Motion, PiecewisePolynomial
 from planner_jax.trajectory.proportional_minco import (
     ProportionalMinco,
@@ -24,23 +24,23 @@ from planner_jax.trajectory.proportional_minco import (
 
 @struct.dataclass
 class CatchContext:
-    """One scenario with its targets in the order of catching."""
+    """One case with its targets in the order of catching."""
 
-    scenario: CatchScenario
+    case: CatchCase
     targets: object  # the path pytree, leaves (N, ...)
     active: Array  # (N,) bool, False for the places of absent targets
     horizon: Array  # (N,) [s]
     times: Array  # (N,) [s], first guess
 
 
-def ordered_context(scenario: CatchScenario) -> CatchContext:
+def ordered_context(case: CatchCase) -> CatchContext:
     """Targets, presence and horizons in the order of catching."""
     return CatchContext(
-        scenario=scenario,
-        targets=jax.tree.map(lambda leaf: leaf[scenario.order], scenario.targets),
-        active=scenario.present[scenario.order],
-        horizon=scenario.horizon[scenario.order],
-        times=scenario.times,
+        case=case,
+        targets=jax.tree.map(lambda leaf: leaf[case.order], case.targets),
+        active=case.present[case.order],
+        horizon=case.horizon[case.order],
+        times=case.times,
     )
 
 

@@ -7,6 +7,7 @@ hoop, so that no plan misses; attitude and limits stay inequalities.
 
 import dataclasses
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,15 +16,17 @@ from flax import struct
 from jax import Array
 
 from planner_jax.cost.along import Along, greatest_along, integrate_along
-from planner_jax.cost.limits import body_rate_excess, ground_excess, speed_excess, thrust_excess
 from planner_jax.cost.penalty import smoothed_hinge
+from planner_jax.cost.quadrotor import body_rate_excess, ground_excess, speed_excess, thrust_excess
 from planner_jax.lanes import in_one_kernel
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
-from planner_jax.optimise.multistart import FEASIBILITY_TOLERANCE
+from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.problem import Round
 from planner_jax.optimise.scaling import shipped_scale
 from planner_jax.optimise.sensitivity import curvature_by_tangents
+from planner_jax.protocol import FEASIBILITY_TOLERANCE
 from planner_jax.robot.quadrotor import body_z, tangent_basis
+from planner_jax.task.catch.case import CatchCase, CatchLimits
 from planner_jax.task.catch.chain import (
     CatchContext,
     Chain,
@@ -36,7 +39,6 @@ from planner_jax.task.catch.chain import (
     targets_at,
 )
 from planner_jax.task.catch.plan import CatchPlan
-from planner_jax.task.catch.scenario import CatchLimits, CatchScenario
 from planner_jax.trajectory.polynomial import Motion
 from planner_jax.trajectory.proportional_minco import (
     ProportionalMinco,
@@ -77,8 +79,9 @@ class Catch:
     angle_excess: Array  # (N,) of the net's angle over theta_safe, relative; <= 0 is good
 
 
+@jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class ExactCatch:
+class ExactCatch(OptimisedPlanner):
     """Minimum-snap catches with the ball in the net by construction.
 
     Decision variables, N segments with 3 (M - 1) + 12 each, in units of `scale`: whitened
@@ -91,6 +94,7 @@ class ExactCatch:
     the horizon.
     """
 
+    case_type = CatchCase
     proportions: tuple[float, ...] = (0.3,) + (1.0,) * 5  # relative durations of the pieces
     nodes: int = 8  # penalty intervals a piece
     time_weight: float = 0.005
@@ -129,9 +133,9 @@ class ExactCatch:
         """Constant maps from boundary and offsets to one segment."""
         return proportional_minco(_ORDER, self.proportions)
 
-    def prepare(self, scenario: CatchScenario) -> CatchContext:
+    def prepare(self, case: CatchCase) -> CatchContext:
         """The targets in the order of catching."""
-        return ordered_context(scenario)
+        return ordered_context(case)
 
     def guesses(self, context: CatchContext, num: int) -> Array:
         """Smooth trajectories that face the balls, at and after the guessed times, (num, n)."""
@@ -143,7 +147,7 @@ class ExactCatch:
 
     def _guess(self, context: CatchContext, guess: Array) -> Array:
         """The point (n,) of later times and a share of the way's velocity at the catches."""
-        scenario = context.scenario
+        case = context.case
         begin = jnp.zeros_like(context.times[:1])
         times = context.times * guess[0]
         durations = jnp.maximum(jnp.diff(times, prepend=begin), 0.05)
@@ -152,8 +156,8 @@ class ExactCatch:
         # Straight against the ball, but at most 60 degrees from upright.
         facing = -ball.vel / speed + 0.3 * jnp.array([0.0, 0.0, 1.0])
         upright = jnp.maximum(facing[:, 2:], 0.5)
-        acc = scenario.gravity * facing / upright * jnp.array([1.0, 1.0, 0.0])
-        before = jnp.concatenate([scenario.head_state[None, 0], ball.pos[:-1]])
+        acc = case.gravity * facing / upright * jnp.array([1.0, 1.0, 0.0])
+        before = jnp.concatenate([case.head_state[None, 0], ball.pos[:-1]])
         vel = guess[1] * (ball.pos - before) / durations[:, None]
         natural = jnp.concatenate(
             [
@@ -170,12 +174,12 @@ class ExactCatch:
 
     def catches(self, natural: Array, context: CatchContext) -> Catch:
         """The catches that the variables (N, 12) after the waypoint offsets describe."""
-        scenario, net = context.scenario, context.scenario.net
+        case, net = context.case, context.case.net
         durations = jnp.exp(natural[:, 0])
         times = jnp.cumsum(jnp.where(context.active, durations, 0.0))
         ball = targets_at(context.targets, times)
         acc = natural[:, 6:9]
-        axis = body_z(acc, scenario.gravity)
+        axis = body_z(acc, case.gravity)
         across_x, across_y = jax.vmap(tangent_basis)(axis)
         place = natural[:, 1:3]
         inside = _RIM * net.radius / jnp.sqrt(1.0 + jnp.sum(place**2, axis=1, keepdims=True))
@@ -203,10 +207,10 @@ class ExactCatch:
             tail_states: (N, 4, 3) of the quadrotor at the catches.
             offsets: (N, M - 1, 3) whitened waypoint offsets.
         """
-        scenario, net = context.scenario, context.scenario.net
+        case, net = context.case, context.case.net
         times = jnp.cumsum(jnp.where(context.active, durations, 0.0))
         pos, acc = tail_states[:, 0], tail_states[:, 2]
-        axis = body_z(acc, scenario.gravity)
+        axis = body_z(acc, case.gravity)
         miss = targets_at(context.targets, times).pos - net.height * axis - pos
         across = jnp.stack(jax.vmap(tangent_basis)(axis), axis=1)  # (N, 2, 3)
         share = jnp.sum(across * miss[:, None], axis=2) / (_RIM * net.radius)
@@ -237,7 +241,7 @@ class ExactCatch:
         offsets, natural = self._split(point)
         catch = self.catches(natural, context)
         piece_durations = catch.durations / self.num_pieces
-        rows = chain_rows(context.scenario.head_state, catch.tail_states, piece_durations)
+        rows = chain_rows(context.case.head_state, catch.tail_states, piece_durations)
         return Chain(rows=rows, offsets=offsets, piece_durations=piece_durations), catch
 
     def _at_catch(self, catch: Catch, context: CatchContext) -> Array:
@@ -260,7 +264,7 @@ class ExactCatch:
             self._along(self.nodes),
             jnp.concatenate([rows, offsets], axis=1),
             durations,
-            (context.scenario.gravity, context.scenario.limits),
+            (context.case.gravity, context.case.limits),
         )
         along = penalties + self._offset_costs(offsets, durations)
         cost = core + jnp.sum(jnp.where(context.active, along, 0.0))
@@ -273,7 +277,7 @@ class ExactCatch:
 
         Args:
             natural: (N, 12) as for `catches`.
-            context: of the scenario.
+            context: of the case.
 
         Returns:
             Boundary rows (N, 8, 3) and mean durations of a piece (N,) [s] of the segments, the
@@ -281,7 +285,7 @@ class ExactCatch:
         """
         catch = self.catches(natural, context)
         durations = catch.durations / self.num_pieces
-        rows = chain_rows(context.scenario.head_state, catch.tail_states, durations)
+        rows = chain_rows(context.case.head_state, catch.tail_states, durations)
         at_catch = self._at_catch(catch, context)
         energies = jax.vmap(functools.partial(boundary_energy, self.maps))(rows, durations)
         energy = jnp.sum(jnp.where(context.active, energies, 0.0))
@@ -322,8 +326,8 @@ class ExactCatch:
         along = self._along(self.nodes)
         bend = jnp.sqrt(1.5 / self.hinge_width)
         margins = jnp.asarray(along.margins, point.dtype)[:, None, None]
-        motion, scenario = chain_motion(self.maps, self.nodes, chain), context.scenario
-        excess = jnp.stack(_limits_along(motion, (scenario.gravity, scenario.limits)))
+        motion, case = chain_motion(self.maps, self.nodes, chain), context.case
+        excess = jnp.stack(_limits_along(motion, (case.gravity, case.limits)))
         excess = jnp.where(context.active[:, None], excess, -1.0)
         inside = jnp.maximum(excess + margins, 0.0)
         weights = jnp.asarray(along.weights(), point.dtype)
@@ -344,7 +348,7 @@ class ExactCatch:
             self._along(_DECODE_NODES),
             chain.columns,
             chain.piece_durations,
-            (context.scenario.gravity, context.scenario.limits),
+            (context.case.gravity, context.case.limits),
         )
         speed, rate, weak, strong, ground = (
             jnp.max(jnp.where(context.active, excess, -1.0)) for excess in greatest
@@ -357,10 +361,15 @@ class ExactCatch:
         violation = jnp.maximum(jnp.maximum(ratio, weak), plain)
         return CatchPlan(
             trajectory=chain_trajectory(self.maps, chain, context.active),
-            order=context.scenario.order,
+            gravity=context.case.gravity,
+            order=context.case.order,
+            decided_times=context.times,
             times=catch.times,
-            cost=jnp.zeros_like(violation),
-            violation=violation,
-            iterations=jnp.zeros((), jnp.int32),
-            status=jnp.zeros((), jnp.int32),
+            **pending(violation),
         )
+
+    def replanner(self) -> Any:
+        """The `ReplanCatch` that goes on from this planner's plans; see `pj.replan`."""
+        from planner_jax.task.catch.replan import ReplanCatch
+
+        return ReplanCatch(self)

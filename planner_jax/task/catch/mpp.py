@@ -1,7 +1,7 @@
 """The `mpp` baseline: sampled state-to-state primitives to catches at a height fixed beforehand."""
 
 import dataclasses
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -10,22 +10,22 @@ from flax import struct
 from jax import Array, lax
 
 from planner_jax.ball.flight import BallState, gravity_vector
-from planner_jax.cost.limits import (
+from planner_jax.cost.quadrotor import (
     body_rate_excess,
     ground_excess,
     relative,
     speed_excess,
     thrust_excess,
 )
-from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
-from planner_jax.optimise.problem import Round
+from planner_jax.protocol import Attempt, outcome
+from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.chain import CatchContext, ordered_context, targets_at
 from planner_jax.task.catch.plan import CatchPlan
-from planner_jax.task.catch.scenario import CatchScenario
-from planner_jax.task.hit.juggle import eased_minimum_jerk, sample_pieces
+from planner_jax.trajectory.minimum_jerk import eased_minimum_jerk
 from planner_jax.trajectory.polynomial import (
     PiecewisePolynomial,
     evaluate,
+    sample_pieces,
     snap_energy,
     total_duration,
 )
@@ -77,6 +77,7 @@ def falling_time(target, height: Array, horizon: Array, nodes: int) -> tuple[Arr
     return jnp.where(found, 0.5 * (early + late), horizon), found
 
 
+@jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class MppCatch:
     """The motion primitive planner that paper 000 compares with; nothing is optimised.
@@ -92,10 +93,10 @@ class MppCatch:
     - Assumed, as the paper gives none of it: the height, 1.2 m, about that of the net in
       hover at the start; the grids; the ramp of `eased_minimum_jerk`, without which the body
       rate would jump at time 0 and after every catch; several targets one after the other, in
-      the scenario's order, each where it first falls through the height, and each segment
+      the case's order, each where it first falls through the height, and each segment
       kept by its own cost.
 
-    With the limits of `catch_scenario` it succeeds on four of five `throws` and two of five
+    With the limits of `pj.catch.case` it succeeds on four of five `throws` and two of five
     `hard` ones, more on lower catches (0.8 m: 99 % and 51 %) and fewer on higher ones (1.9 m:
     68 % and 27 %), body rate being what it breaks. The paper has it plan 14 % of its throws,
     within limits and at a height that it does not give.
@@ -104,6 +105,8 @@ class MppCatch:
     is due earlier does, leaves the lane unsolved: this planner has no other time to offer.
     """
 
+    attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)
+    case_type: ClassVar[type] = CatchCase
     height: float = 1.2  # [m], of the targets at the catches
     speeds: tuple[float, ...] = (-1.0, 0.0, 1.0)  # [m/s], sampled on each axis at a catch
     thrusts: tuple[float, ...] = (0.5, 1.0, 1.5)  # sampled at a catch, over gravity
@@ -117,25 +120,22 @@ class MppCatch:
         if not self.speeds or not self.thrusts:
             raise ValueError("speeds and thrusts must have an entry, got none")
 
-    @property
-    def rounds(self) -> tuple[Round, ...]:
-        """One evaluation: without a decision to take, every lane is stationary at once."""
-        solver = LbfgsConfig(max_steps=0, memory=1, trial_steps=(1.0,), patience=0)
-        return (Round(starts=1, solver=solver),)
+    def solve(self, case: CatchCase, attempt: Attempt) -> CatchPlan:
+        """The cheapest primitives one after another; no variable is left to decide on.
 
-    def prepare(self, scenario: CatchScenario) -> CatchPlan:
-        """The plan itself: no variable is left to decide on."""
-        context = ordered_context(scenario)
+        Their cost is the mean squared jerk of the whole way.
+        """
+        context = ordered_context(case)
         times, missed = self.times(context)
         balls = targets_at(context.targets, times)
         durations = jnp.maximum(jnp.diff(times, prepend=jnp.zeros_like(times[:1])), _SHORTEST)
 
         def fly(head: Array, catch: tuple[BallState, Array]) -> tuple[Array, PiecewisePolynomial]:
-            best = _cheapest(self.candidates(head, *catch, scenario))
+            best = _cheapest(self.candidates(head, *catch, case))
             return _end_state(best), best
 
         # Leaves (N, 2, ...): two pieces to each catch.
-        _, joined = lax.scan(fly, scenario.head_state, (balls, durations))
+        _, joined = lax.scan(fly, case.head_state, (balls, durations))
         flown = jnp.where(context.active[:, None], joined.durations, 0.0)
         last = jnp.maximum(jnp.sum(context.active) - 1, 0)
         end = _end_state(_lane(joined, last))[0]
@@ -144,33 +144,18 @@ class MppCatch:
         trajectory = PiecewisePolynomial(
             coeffs=coeffs.reshape(-1, *coeffs.shape[2:]), durations=flown.ravel()
         )
-        excess = jax.vmap(lambda segment: self._excess(segment, scenario))(joined)
+        excess = jax.vmap(lambda segment: self._excess(segment, case))(joined)
         violation = jnp.max(jnp.where(context.active, jnp.maximum(excess, missed), -1.0))
         energy = jax.vmap(lambda segment: snap_energy(segment, 3))(joined)
         energy = jnp.sum(jnp.where(context.active, energy, 0.0))
         return CatchPlan(
             trajectory=trajectory,
-            order=scenario.order,
+            gravity=case.gravity,
+            order=case.order,
+            decided_times=case.times,
             times=times,
-            cost=energy / jnp.maximum(jnp.sum(flown), _SHORTEST),
-            violation=violation,
-            iterations=jnp.zeros((), jnp.int32),
-            status=jnp.zeros((), jnp.int32),
+            **outcome(energy / jnp.maximum(jnp.sum(flown), _SHORTEST), violation),
         )
-
-    def guesses(self, context: CatchPlan, num: int) -> Array:
-        """One point of one number that means nothing, (1, 1)."""
-        if num != 1:
-            raise ValueError(f"starts must be 1, got {num}")
-        return jnp.zeros((1, 1), context.cost.dtype)
-
-    def objective(self, point: Array, context: CatchPlan) -> Evaluation:
-        """Mean squared jerk of the whole way and largest violation, whatever the point."""
-        return Evaluation(cost=context.cost, violation=context.violation)
-
-    def decode(self, point: Array, context: CatchPlan) -> CatchPlan:
-        """The plan, whatever the point."""
-        return context
 
     def times(self, context: CatchContext) -> tuple[Array, Array]:
         """Times (N,) [s] of the catches, rising, and what is wrong with them, (N,) <= 0 if right.
@@ -188,7 +173,7 @@ class MppCatch:
         return times, late
 
     def candidates(
-        self, head_state: Array, ball: BallState, duration: Array, scenario: CatchScenario
+        self, head_state: Array, ball: BallState, duration: Array, case: CatchCase
     ) -> Candidates:
         """What is tried for one segment.
 
@@ -196,16 +181,16 @@ class MppCatch:
             head_state: (4, 3), where the segment begins, position to jerk.
             ball: the target at the catch.
             duration: () [s], until then.
-            scenario: for gravity and the net.
+            case: for gravity and the net.
         """
-        ends = self.end_states(ball, scenario)
+        ends = self.end_states(ball, case)
         tried = jax.vmap(eased_minimum_jerk, in_axes=(None, 0, None, None))(
             head_state, ends, duration, self.ease
         )
         cost = jax.vmap(lambda one: snap_energy(one, 3))(tried) / duration
         return Candidates(trajectory=tried, cost=cost)
 
-    def end_states(self, ball: BallState, scenario: CatchScenario) -> Array:
+    def end_states(self, ball: BallState, case: CatchCase) -> Array:
         """The sampled states (K, 3, 3), position to acceleration, at a catch.
 
         The thrust is straight against the target, or upright for one at rest; the net's centre
@@ -218,20 +203,18 @@ class MppCatch:
         axis = jnp.where(moving, against, jnp.array([0.0, 0.0, 1.0], dtype))
         grid = np.meshgrid(*[self.speeds] * 3, self.thrusts, indexing="ij")
         vx, vy, vz, thrust = (jnp.asarray(g.ravel(), dtype) for g in grid)
-        acc = scenario.gravity * thrust[:, None] * axis + gravity_vector(scenario.gravity)
-        pos = jnp.broadcast_to(ball.pos - scenario.net.height * axis, acc.shape)
+        acc = case.gravity * thrust[:, None] * axis + gravity_vector(case.gravity)
+        pos = jnp.broadcast_to(ball.pos - case.net.height * axis, acc.shape)
         return jnp.stack([pos, jnp.stack([vx, vy, vz], axis=1), acc], axis=1)
 
-    def _excess(self, segment: PiecewisePolynomial, scenario: CatchScenario) -> Array:
+    def _excess(self, segment: PiecewisePolynomial, case: CatchCase) -> Array:
         """Largest excess of one segment, relative, that of the ground in metres, ()."""
-        limits = scenario.limits
+        limits = case.limits
         motion = sample_pieces(segment, self.nodes)
-        weak, strong = thrust_excess(
-            motion.acc, scenario.gravity, limits.min_thrust, limits.max_thrust
-        )
+        weak, strong = thrust_excess(motion.acc, case.gravity, limits.min_thrust, limits.max_thrust)
         squared = [
             speed_excess(motion.vel, limits),
-            body_rate_excess(motion.acc, motion.jerk, scenario.gravity, limits),
+            body_rate_excess(motion.acc, motion.jerk, case.gravity, limits),
             strong,
         ]
         parts = [relative(jnp.max(jnp.stack(squared))), -relative(-jnp.max(weak))]

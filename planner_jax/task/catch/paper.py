@@ -9,11 +9,13 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.cost.limits import ground_excess, speed_excess
 from planner_jax.cost.penalty import joined_trapezoid_weights, smoothed_hinge, steep_hinge
+from planner_jax.cost.quadrotor import ground_excess, speed_excess
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
+from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.problem import Round, Stage
 from planner_jax.robot.quadrotor import body_rate_squared, body_z, net_thrust
+from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.chain import (
     CatchContext,
     Chain,
@@ -26,7 +28,6 @@ from planner_jax.task.catch.chain import (
     targets_at,
 )
 from planner_jax.task.catch.plan import CatchPlan
-from planner_jax.task.catch.scenario import CatchScenario
 from planner_jax.trajectory.minimum_jerk import minimum_jerk
 from planner_jax.trajectory.polynomial import evaluate
 from planner_jax.trajectory.proportional_minco import (
@@ -59,8 +60,9 @@ class Catch:
     angle_excess: Array  # (N,) cos(theta_safe) + z_d . v / |v|; <= 0 is good
 
 
+@jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class PaperCatch:
+class PaperCatch(OptimisedPlanner):
     """The joint optimisation of catching time and state of paper 000.
 
     Cost (eqs 18-28): integral |snap|^2 + rho T + the smoothed penalties of speed, body rate,
@@ -75,6 +77,7 @@ class PaperCatch:
     velocity, acceleration and jerk (unused at the last catch).
     """
 
+    case_type = CatchCase
     num_pieces: int = 4  # M, of one segment
     nodes: int = 16  # penalty intervals a piece
     time_weight: float = 1000.0  # rho
@@ -118,20 +121,20 @@ class PaperCatch:
         """Number of waypoint variables of a segment."""
         return 3 * (self.num_pieces - 1)
 
-    def prepare(self, scenario: CatchScenario) -> CatchContext:
+    def prepare(self, case: CatchCase) -> CatchContext:
         """The targets in the order of catching."""
-        return ordered_context(scenario)
+        return ordered_context(case)
 
     def guesses(self, context: CatchContext, num: int) -> Array:
         """From rest to rest below every ball, on minimum-jerk primitives, (1, n)."""
         if num != 1:
             raise ValueError(f"starts must be 1, got {num}")
-        scenario, dtype = context.scenario, context.times.dtype
+        case, dtype = context.case, context.times.dtype
         durations = jnp.maximum(jnp.diff(context.times, prepend=jnp.zeros((1,), dtype)), 0.05)
         ball = targets_at(context.targets, context.times)
-        below = ball.pos - scenario.net.height * jnp.array([0.0, 0.0, 1.0], dtype)
+        below = ball.pos - case.net.height * jnp.array([0.0, 0.0, 1.0], dtype)
         still = jnp.zeros((2, 3), dtype)
-        begins = jnp.concatenate([scenario.head_state[None, 0], below[:-1]])
+        begins = jnp.concatenate([case.head_state[None, 0], below[:-1]])
 
         def waypoints(begin: Array, end: Array, duration: Array) -> Array:
             first, last = (jnp.concatenate([pos[None], still]) for pos in (begin, end))
@@ -140,7 +143,7 @@ class PaperCatch:
             return jax.vmap(lambda share: evaluate(primitive, share * duration))(shares)
 
         tails = jnp.zeros((durations.size, 4, 3), dtype).at[:, 0].set(below)
-        rows = chain_rows(scenario.head_state, tails, durations / self.num_pieces)
+        rows = chain_rows(case.head_state, tails, durations / self.num_pieces)
         columns = jnp.concatenate([rows, jax.vmap(waypoints)(begins, below, durations)], axis=1)
         offsets = jnp.einsum(
             "oc,nci->noi",
@@ -160,12 +163,12 @@ class PaperCatch:
 
     def catches(self, natural: Array, context: CatchContext) -> Catch:
         """The catches that the variables (N, 13) after the waypoint offsets describe."""
-        scenario, net = context.scenario, context.scenario.net
+        case, net = context.case, context.case.net
         durations = jnp.exp(natural[:, 0])
         times = jnp.cumsum(jnp.where(context.active, durations, 0.0))
         ball = targets_at(context.targets, times)
         miss, acc = natural[:, 1:4], natural[:, 7:10]
-        axis = body_z(acc, scenario.gravity)
+        axis = body_z(acc, case.gravity)
         pos = ball.pos - net.height * axis + miss
         last = jnp.sum(context.active) - 1
         flying = jnp.arange(times.size) != last
@@ -187,21 +190,21 @@ class PaperCatch:
         natural = point.reshape(-1, scale.size) * scale
         catch = self.catches(natural[:, self.num_offsets :], context)
         piece_durations = catch.durations / self.num_pieces
-        rows = chain_rows(context.scenario.head_state, catch.tail_states, piece_durations)
+        rows = chain_rows(context.case.head_state, catch.tail_states, piece_durations)
         offsets = natural[:, : self.num_offsets].reshape(natural.shape[0], -1, 3)
         return Chain(rows=rows, offsets=offsets, piece_durations=piece_durations), catch
 
     def _terms(self, point: Array, context: CatchContext) -> tuple[Array, Array, Chain, Catch]:
         """Violations along the way, (4, N, K), in their own units, and the rest of the cost."""
         chain, catch = self._unpack(point, context)
-        scenario, limits = context.scenario, context.scenario.limits
+        case, limits = context.case, context.case.limits
         motion = chain_motion(self.maps, self.nodes, chain)
         thrust = jnp.sqrt(
-            jnp.maximum(jnp.sum(net_thrust(motion.acc, scenario.gravity) ** 2, axis=-1), 1e-6)
+            jnp.maximum(jnp.sum(net_thrust(motion.acc, case.gravity) ** 2, axis=-1), 1e-6)
         )
         middle = 0.5 * (limits.max_thrust + limits.min_thrust)
         half = 0.5 * (limits.max_thrust - limits.min_thrust)
-        rate = body_rate_squared(motion.acc, motion.jerk, scenario.gravity)
+        rate = body_rate_squared(motion.acc, motion.jerk, case.gravity)
         along = jnp.stack(
             [
                 speed_excess(motion.vel, limits) * limits.speed**2,
@@ -210,7 +213,7 @@ class PaperCatch:
                 ground_excess(motion.height, limits),
             ]
         )
-        at_catch = self.miss_weight * steep_hinge(catch.miss, scenario.net.radius)
+        at_catch = self.miss_weight * steep_hinge(catch.miss, case.net.radius)
         at_catch += self.angle_weight * steep_hinge(catch.angle_excess, self.hinge_width)
         energy = chain_energy(self.maps, chain)
         rest = jnp.sum(jnp.where(context.active, at_catch + energy, 0.0))
@@ -233,7 +236,7 @@ class PaperCatch:
     def decode(self, point: Array, context: CatchContext) -> CatchPlan:
         """The plan at a point, its violation that of the protocol's samples."""
         along, _, chain, catch = self._terms(point, context)
-        limits, net = context.scenario.limits, context.scenario.net
+        limits, net = context.case.limits, context.case.net
         half = 0.5 * (limits.max_thrust - limits.min_thrust)
         units = jnp.stack([limits.speed**2, limits.body_rate**2, half**2, limits.min_height])
         relative = jnp.max(along / units[:, None, None], axis=2)  # (4, N)
@@ -243,10 +246,9 @@ class PaperCatch:
         violation = jnp.max(jnp.where(context.active, relative, -1.0))
         return CatchPlan(
             trajectory=chain_trajectory(self.maps, chain, context.active),
-            order=context.scenario.order,
+            gravity=context.case.gravity,
+            order=context.case.order,
+            decided_times=context.times,
             times=catch.times,
-            cost=jnp.zeros_like(violation),
-            violation=violation,
-            iterations=jnp.zeros((), jnp.int32),
-            status=jnp.zeros((), jnp.int32),
+            **pending(violation),
         )

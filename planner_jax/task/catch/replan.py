@@ -6,7 +6,6 @@ from scratch stays for the first look and for surprises.
 """
 
 import dataclasses
-import functools
 import math
 from typing import Any
 
@@ -17,13 +16,19 @@ from flax import struct
 from jax import Array
 
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
+from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.problem import Round
+from planner_jax.planning.replan import Replanning
 from planner_jax.robot.quadrotor import body_z
+from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.chain import CatchContext, targets_at
 from planner_jax.task.catch.exact import ExactCatch
 from planner_jax.task.catch.plan import CatchPlan
-from planner_jax.task.catch.scenario import CatchScenario
-from planner_jax.trajectory.polynomial import PiecewisePolynomial, derivative_factors
+from planner_jax.trajectory.polynomial import (
+    PiecewisePolynomial,
+    state_basis,
+    states_at,
+)
 from planner_jax.trajectory.proportional_minco import boundary_rows
 
 _ORDERS = 4  # position to jerk
@@ -38,35 +43,19 @@ _TRIALS = (1.0, 0.2, 0.04)  # step lengths: the first direction, without curvatu
 
 
 @struct.dataclass
-class ReplanScenario:
-    """One case, or a batch of them. Times of `scenario` count from now.
-
-    `replanned` makes it: from the scenario of the previous plan, that plan and the time since.
-    """
-
-    scenario: CatchScenario  # targets as estimated now, head_state where the quadrotor is now
-    previous: CatchPlan  # by an `ExactCatch` of as many pieces; its times began `elapsed` ago
-    elapsed: Array  # () [s], since the previous plan began
-
-    @property
-    def batch_shape(self) -> tuple[int, ...]:
-        """() for one case, (B,) for a batch."""
-        return self.scenario.batch_shape
-
-
-@struct.dataclass
 class ReplanContext:
     """What every evaluation needs: the catches, the plan so far, and where the search begins."""
 
     catch: CatchContext
-    scenario: ReplanScenario
+    task: Replanning
     start: Array  # (n,), the previous plan for the new targets
     keep: Array  # () bool, too little time is left
 
 
+@jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class ReplanCatch:
-    """Catches re-planned from the previous plan, for `plan(ReplanCatch(), replanned(...))`.
+class ReplanCatch(OptimisedPlanner):
+    """Catches re-planned from the previous plan, as `pj.replan` asks for them.
 
     The search begins on what is left of the previous trajectory: its catches, at the times at
     which the targets are now expected to pass the net's plane there, and its way, read at the
@@ -82,6 +71,7 @@ class ReplanCatch:
     iteration of Diehl et al. 2005. At most of the looks it leaves no limit broken.
     """
 
+    case_type = Replanning
     planner: ExactCatch = ExactCatch()
     rounds: tuple[Round, ...] = (
         Round(starts=1, solver=LbfgsConfig(max_steps=1, memory=1, trial_steps=_TRIALS)),
@@ -90,27 +80,80 @@ class ReplanCatch:
     )
     shortest: float = 0.05  # [s], least time to the next catch that is planned anew
 
-    def prepare(self, scenario: ReplanScenario) -> ReplanContext:
+    def begin(
+        self,
+        cases: CatchCase,
+        previous: CatchPlan,
+        elapsed: Any,
+        *,
+        targets: Any,
+        head_state: Any = None,
+    ) -> Replanning:
+        """What is left of a case, or of a batch, some time into its plan; see `pj.replan`.
+
+        Catches that have been made are no longer present; the others keep their order.
+
+        Args:
+            cases: what `previous` was planned for.
+            previous: the plan that is being flown; see that it is solved.
+            elapsed: () or (B,) [s], since it began, >= 0.
+            targets: as estimated now, with times that count from now; shapes as in `cases`.
+            head_state: (4, 3) or (B, 4, 3), where the quadrotor is. The plan's own state if not
+                given: it flies what was planned.
+
+        Raises:
+            ValueError: a negative time.
+        """
+        dtype = np.asarray(cases.gravity).dtype
+        elapsed = np.asarray(elapsed, dtype)
+        if not (elapsed >= 0.0).all():
+            raise ValueError(f"elapsed must be >= 0, got {np.min(elapsed)}")
+        if head_state is None:
+            head_state = states_at(previous.trajectory, elapsed)
+        since = elapsed[..., None]
+        order, times = np.asarray(previous.order), np.asarray(previous.times)
+        present, horizon = np.asarray(cases.present), np.asarray(cases.horizon)
+        made = times <= since
+        if times.shape[-1] == 1:  # nothing to reorder
+            present = present & ~made
+        elif made.any():
+            gone = np.empty_like(made)
+            np.put_along_axis(gone, order, made, axis=-1)
+            present = present & ~gone
+            first = np.argsort(made, axis=-1, kind="stable")
+            order, times = (np.take_along_axis(x, first, axis=-1) for x in (order, times))
+        left = dataclasses.replace(
+            cases,
+            targets=targets,
+            present=present,
+            horizon=horizon - since,
+            order=order,
+            times=np.maximum(times - since, _SHORTEST),
+            head_state=np.asarray(head_state, dtype),
+        )
+        return Replanning(case=left, previous=previous, elapsed=elapsed)
+
+    def prepare(self, task: Replanning) -> ReplanContext:
         """The targets in the order of catching, and the previous plan as a point."""
-        context = self.planner.prepare(scenario.scenario)
-        left = _segments(scenario)[1][0]
+        context = self.planner.prepare(task.case)
+        left = _segments(task)[1][0]
         return ReplanContext(
             catch=context,
-            scenario=scenario,
-            start=self._start(scenario, context),
+            task=task,
+            start=self._start(task, context),
             keep=(left < self.shortest) | ~context.active[0],
         )
 
-    def _start(self, scenario: ReplanScenario, context: CatchContext) -> Array:
+    def _start(self, task: Replanning, context: CatchContext) -> Array:
         """What is left of the previous plan, for the new targets, as a point (n,)."""
-        planner, net = self.planner, scenario.scenario.net
-        trajectory = scenario.previous.trajectory
-        segments, times = _segments(scenario)
+        planner, net = self.planner, task.case.net
+        trajectory = task.previous.trajectory
+        segments, times = _segments(task)
         last = (segments + 1) * planner.num_pieces - 1
         coeffs, ends = trajectory.coeffs[last], trajectory.durations[last]
         tails = _states(coeffs, ends)
         # Where the targets pass the net's plane, to first order.
-        axis = body_z(tails[:, 2], scenario.scenario.gravity)
+        axis = body_z(tails[:, 2], task.case.gravity)
         ball = targets_at(context.targets, times)
         above = jnp.sum((ball.pos - tails[:, 0]) * axis, axis=1) - net.height
         closing = jnp.sum((tails[:, 1] - ball.vel) * axis, axis=1)
@@ -125,7 +168,7 @@ class ReplanCatch:
         proportions = planner.maps.proportions
         shares = np.cumsum(proportions) / np.sum(proportions) - proportions / np.sum(proportions)
         knots = begins[:, None] + durations[:, None] * jnp.asarray(shares, times.dtype)
-        way = _flown(trajectory, scenario.elapsed + knots.ravel())  # heads and waypoints
+        way = _flown(trajectory, task.elapsed + knots.ravel())  # heads and waypoints
         way = way.reshape(*knots.shape, _ORDERS, 3)
         heads = jnp.concatenate([way[:1, 0], tails[:-1]])
         rows = jax.vmap(boundary_rows)(heads, tails, durations / planner.num_pieces)
@@ -148,83 +191,13 @@ class ReplanCatch:
     def decode(self, point: Array, context: ReplanContext) -> CatchPlan:
         """The plan at a point, or what is left of the previous one."""
         plan = self.planner.decode(point, context.catch)
-        rest = lambda: _rest(context.scenario, context.catch)  # noqa: E731
+        rest = lambda: _rest(context.task, context.catch)  # noqa: E731
         return jax.lax.cond(context.keep, rest, lambda: plan)
-
-
-def replanned(
-    scenario: CatchScenario, previous: CatchPlan, elapsed: Any, targets: Any, head_state: Any = None
-) -> ReplanScenario:
-    """The task that is left of a scenario some time into its plan.
-
-    Catches that have been made are no longer present; the others keep their order.
-
-    Args:
-        scenario: what `previous` was planned for, or a batch; its times count from where the
-            plan began.
-        previous: the plan that is being flown; see that it is solved.
-        elapsed: () or (B,) [s], since it began, >= 0.
-        targets: as estimated now, with times that count from now; shapes as in `scenario`.
-        head_state: (4, 3) or (B, 4, 3), where the quadrotor is. The plan's own state if not
-            given: it flies what was planned.
-
-    Raises:
-        ValueError: a negative time.
-    """
-    dtype = np.asarray(scenario.gravity).dtype
-    elapsed = np.asarray(elapsed, dtype)
-    if not (elapsed >= 0.0).all():
-        raise ValueError(f"elapsed must be >= 0, got {np.min(elapsed)}")
-    if head_state is None:
-        head_state = _head_state(previous.trajectory, elapsed)
-    since = elapsed[..., None]
-    order, times = np.asarray(previous.order), np.asarray(previous.times)
-    present, horizon = np.asarray(scenario.present), np.asarray(scenario.horizon)
-    made = times <= since
-    if times.shape[-1] == 1:  # nothing to reorder
-        present = present & ~made
-    elif made.any():
-        gone = np.empty_like(made)
-        np.put_along_axis(gone, order, made, axis=-1)
-        present = present & ~gone
-        first = np.argsort(made, axis=-1, kind="stable")
-        order, times = (np.take_along_axis(x, first, axis=-1) for x in (order, times))
-    left = dataclasses.replace(
-        scenario,
-        targets=targets,
-        present=present,
-        horizon=horizon - since,
-        order=order,
-        times=np.maximum(times - since, _SHORTEST),
-        head_state=np.asarray(head_state, dtype),
-    )
-    return ReplanScenario(scenario=left, previous=previous, elapsed=elapsed)
-
-
-@functools.cache
-def _derivatives(size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Factors and powers (4, size) of t in position to jerk of a polynomial's coefficients."""
-    factors = np.stack([derivative_factors(size - 1, order) for order in range(_ORDERS)])
-    return factors, np.maximum(np.arange(size) - np.arange(_ORDERS)[:, None], 0)
-
-
-def _head_state(trajectory: PiecewisePolynomial, elapsed: np.ndarray) -> np.ndarray:
-    """State (..., 4, 3) some time (...) into a trajectory with NumPy leaves."""
-    coeffs, durations = np.asarray(trajectory.coeffs), np.asarray(trajectory.durations)
-    ends = durations.cumsum(axis=-1)
-    piece = (elapsed[..., None] >= ends[..., :-1]).sum(axis=-1)
-    if elapsed.ndim:
-        lanes = np.arange(elapsed.size)
-        coeffs, starts = coeffs[lanes, piece], (ends - durations)[lanes, piece]
-    else:
-        coeffs, starts = coeffs[piece], ends[piece] - durations[piece]
-    factors, powers = _derivatives(coeffs.shape[-2])
-    return (factors * (elapsed - starts)[..., None, None] ** powers) @ coeffs
 
 
 def _states(coeffs: Array, time: Array) -> Array:
     """States (K, 4, 3) on K pieces (K, D + 1, 3), each at its own time (K,) since it began."""
-    factors, powers = _derivatives(coeffs.shape[1])
+    factors, powers = state_basis(coeffs.shape[1])
     basis = time[:, None, None] ** jnp.asarray(powers, time.dtype)
     basis *= jnp.asarray(factors, time.dtype)
     return jnp.sum(basis[..., None] * coeffs[:, None], axis=2)
@@ -237,26 +210,26 @@ def _flown(trajectory: PiecewisePolynomial, times: Array) -> Array:
     return _states(trajectory.coeffs[piece], times - (ends - trajectory.durations)[piece])
 
 
-def _segments(scenario: ReplanScenario) -> tuple[Array, Array]:
+def _segments(task: Replanning) -> tuple[Array, Array]:
     """Which segment (N,) of the previous plan leads to each catch now, and when (N,) [s]."""
-    times = scenario.previous.times
-    made = jnp.sum(times <= scenario.elapsed)
+    times = task.previous.times
+    made = jnp.sum(times <= task.elapsed)
     segments = jnp.minimum(made + np.arange(times.size), times.size - 1)
-    return segments, times[segments] - scenario.elapsed
+    return segments, times[segments] - task.elapsed
 
 
-def _rest(scenario: ReplanScenario, context: CatchContext) -> CatchPlan:
+def _rest(task: Replanning, context: CatchContext) -> CatchPlan:
     """What is left of the previous plan, in as many pieces.
 
     What has been flown of a segment is cut off, and what is left of the piece that is being
     flown takes the place of those before it, in equal parts.
     """
-    previous, num = scenario.previous, context.times.size
-    segments, times = _segments(scenario)
+    previous, num = task.previous, context.times.size
+    segments, times = _segments(task)
     path = previous.trajectory
     size = path.coeffs.shape[1]
     ends = jnp.cumsum(path.durations)
-    knots = jnp.concatenate([jnp.zeros_like(ends[:1]), ends]) - scenario.elapsed
+    knots = jnp.concatenate([jnp.zeros_like(ends[:1]), ends]) - task.elapsed
     each = path.durations.size // num
     knots = knots[segments[:, None] * each + np.arange(each + 1)]  # (N, M + 1)
     coeffs = path.coeffs.reshape(num, each, size, 3)[segments]
@@ -284,7 +257,7 @@ def _rest(scenario: ReplanScenario, context: CatchContext) -> CatchPlan:
     return dataclasses.replace(
         previous,
         trajectory=trajectory,
-        order=scenario.scenario.order,
+        order=task.case.order,
         times=jnp.maximum(times, 0.0),
         iterations=jnp.zeros_like(previous.iterations),
     )

@@ -1,11 +1,11 @@
-"""Named, seeded suites of catch scenarios: the throws and the simulations of paper 000.
+"""Named, seeded suites of catch cases: the throws and the simulations of paper 000.
 
-The paper names its scenarios (Sections VII-A and VII-B, Table III) and gives none of the ranges
+The paper names its cases (Sections VII-A and VII-B, Table III) and gives none of the ranges
 from which it draws them. Those below are this library's, chosen to be no easier than what the
 paper says of its own, and part of each suite's name: a change of a range is another suite.
 
 All draws are uniform. World frame, z up, SI units; planning begins at time 0 with the quadrotor
-in hover at (0, 0, 1), within the limits of `catch_scenario`.
+in hover at (0, 0, 1), within the limits of `case`.
 
 Throws. The ball leaves a machine at (4, 0, 0.8) and lands in a rectangle around the origin.
 Its velocity follows from landing point and flight time. It may be caught until it falls through
@@ -58,22 +58,13 @@ import numpy as np
 
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath, HarmonicPath
-from planner_jax.task.catch.scenario import CatchScenario, catch_scenario
+from planner_jax.task.catch.card import SUITES, TASK
+from planner_jax.task.catch.case import CatchCase, case
 
 GRAVITY = 9.81  # [m/s^2]
 LAUNCH = (4.0, 0.0, 0.8)  # [m], of every throw
 CATCH_HEIGHT = 0.45  # [m], least height of a thrown ball at its catch
 _BISECTIONS = 60
-
-
-@dataclasses.dataclass(frozen=True)
-class Suite:
-    """One kind of catching task."""
-
-    name: str
-    num_targets: int
-    horizon: float  # [s], until when a target may be caught at the latest
-    description: str
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,70 +87,70 @@ _THROWS = {
     ),
 }
 
-SUITES = {
-    suite.name: suite
-    for suite in (
-        Suite("throws", 1, 1.42, "The paper's throws: with drag, to within 2 m x 0.8 m."),
-        Suite("hard", 1, 1.22, "Throws to within 4 m x 3 m that are seen 0.2 s later."),
-        Suite("parabola1", 1, 1.66, "A throw without drag, as high as its flight time asks."),
-        Suite("parabola2", 2, 1.96, "Two throws without drag, in the air together."),
-        Suite("harmonic2", 2, 7.0, "Two targets that swing in height and drift across."),
-        Suite("triangle3", 3, 6.0, "Three targets along the sides of a triangle."),
-        Suite("hexagon6", 6, 10.0, "Six targets in parallel, on a hexagon."),
-    )
-}
 
+def draw(
+    num: int,
+    suite: str | None = None,
+    seed: int = 0,
+    *,
+    first: int = 0,
+    limit_scale: float = 1.0,
+    num_targets: int | None = None,
+    dtype: Any = jnp.float32,
+) -> CatchCase:
+    """A batch of cases of a suite, drawn in float64 and then cast.
 
-def make_suite(
-    name: str, num: int, seed: int = 0, *, dtype=jnp.float32, num_targets: int | None = None
-) -> CatchScenario:
-    """A batch of scenarios of a suite, drawn in float64 and then cast.
-
-    The scenarios of a seed are always the same ones, and the first n of more are the n of
-    fewer. Order and times are placeholders until `decide` sets them.
+    Order and times are placeholders until a decision sets them.
 
     Args:
-        name: a key of `SUITES`.
         num: B, how many, >= 1.
-        seed: >= 0.
-        dtype: of every floating leaf.
+        suite: a key of `SUITES`, "throws" by default, or one that another package offers.
+        seed: >= 0. Case k of a suite and seed is always the same one.
+        first: place of the first one, >= 0.
+        limit_scale: factor on the limits of speed and body rate, and on how far the thrust may
+            be from that of hover.
         num_targets: N, how many targets the shape holds, at least the suite's own; those
             beyond these are absent, and copies of the first.
+        dtype: of every floating leaf.
 
     Raises:
         ValueError: an argument is out of its range.
     """
-    if name not in SUITES:
-        raise ValueError(f"suite must be one of {', '.join(SUITES)}, got {name!r}")
-    if num < 1:
-        raise ValueError(f"num must be >= 1, got {num}")
-    if seed < 0:
-        raise ValueError(f"seed must be >= 0, got {seed}")
-    own = SUITES[name].num_targets
+    suite = suite or "throws"
+    for name, value, least in (("num", num, 1), ("seed", seed, 0), ("first", first, 0)):
+        if value < least:
+            raise ValueError(f"{name} must be >= {least}, got {value}")
+    if suite not in SUITES:
+        return TASK.other_suite(suite)(num, seed, first)
+    own = SUITES[suite].num_targets
     size = own if num_targets is None else num_targets
     if size < own:
-        raise ValueError(f"num_targets must be >= {own} for suite {name!r}, got {size}")
-    random = np.random.default_rng([seed, zlib.crc32(name.encode())])
-    # One row a scenario, so that the first rows do not depend on how many there are.
-    targets, horizon = _draw(name, random, num)
+        raise ValueError(f"num_targets must be >= {own} for suite {suite!r}, got {size}")
+    random = np.random.default_rng([seed, zlib.crc32(suite.encode())])
+    targets, horizon = _targets(suite, random, num, first)
     # Which of the suite's targets has each place.
     place = np.where(np.arange(size) < own, np.arange(size), 0)
-    return catch_scenario(
+    cases = case(
         jax.tree.map(lambda leaf: jnp.asarray(leaf[:, place], dtype), targets),
         horizon[:, place],
         present=np.arange(size) < own,
         gravity=np.full(num, GRAVITY),
         dtype=dtype,
     )
+    return dataclasses.replace(cases, limits=cases.limits.scaled(limit_scale, cases.gravity))
 
 
-def _draw(name: str, random: np.random.Generator, num: int):
+def _targets(suite: str, random: np.random.Generator, num: int, first: int) -> tuple[Any, Any]:
     """Targets with NumPy leaves (num, N, ...) and their horizons (num, N) [s]."""
-    if name in _THROWS:
-        return _throws(random.random((num, 3 * len(_THROWS[name]))), _THROWS[name])
-    columns, draw = _PATHS[name]
-    targets = draw(random.random((num, columns)))
-    return targets, np.full((num, SUITES[name].num_targets), SUITES[name].horizon)
+    throws = _THROWS.get(suite)
+    columns = 3 * len(throws) if throws else _PATHS[suite][0]
+    # One row a case: what stands in front is passed over.
+    random.bit_generator.advance(first * columns)  # type: ignore[attr-defined]
+    uniform = random.random((num, columns))
+    if throws:
+        return _throws(uniform, throws)
+    targets = _PATHS[suite][1](uniform)
+    return targets, np.full((num, SUITES[suite].num_targets), SUITES[suite].horizon)
 
 
 def _between(uniform: np.ndarray, low: float, high: float) -> np.ndarray:
@@ -281,7 +272,7 @@ def _hexagon(uniform: np.ndarray) -> BallPath:
     return _lines(pos, np.broadcast_to(vel, pos.shape))
 
 
-# Suite -> how many numbers a scenario takes, and what makes targets of them.
+# Suite -> how many numbers a case takes, and what makes targets of them.
 _PATHS: dict[str, tuple[int, Callable]] = {
     "harmonic2": (18, _harmonic),
     "triangle3": (7, _triangle),

@@ -1,1 +1,5 @@
-"""A quadrotor hits a ball to a target with a racket (paper 002)."""
+"""Hits: a quadrotor volleys a flying ball to a target with a racket (paper 002)."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

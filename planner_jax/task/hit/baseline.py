@@ -5,11 +5,10 @@ from jax import Array
 
 from planner_jax.ball.flight import BallState, drag_free_apex, gravity_vector
 from planner_jax.cost.contact import apex_excess, hitting_speed_excess
-from planner_jax.cost.limits import relative
-from planner_jax.task.hit.exact import Impact
-from planner_jax.task.hit.plan import HitPlan, Stroke
-from planner_jax.task.hit.scenario import HitScenario
-from planner_jax.trajectory.polynomial import PiecewisePolynomial
+from planner_jax.cost.quadrotor import relative
+from planner_jax.task.hit.case import HitCase
+from planner_jax.task.hit.context import Impact
+from planner_jax.task.hit.plan import Stroke
 
 
 def make_impact(
@@ -19,7 +18,7 @@ def make_impact(
     after: Array,
     racket_vel: Array,
     thrust: Array,
-    scenario: HitScenario,
+    case: HitCase,
 ) -> Impact:
     """The impact of a ball on a quadrotor whose racket faces along its thrust.
 
@@ -30,7 +29,7 @@ def make_impact(
         after: (3,) [m/s], velocity of the ball just after it.
         racket_vel: (3,) [m/s], of the quadrotor.
         thrust: (3,) [m/s^2], per unit mass; not zero.
-        scenario: for racket height and gravity.
+        case: for racket height and gravity.
 
     Returns:
         The impact, the racket's centre at the ball and the quadrotor without jerk.
@@ -38,9 +37,9 @@ def make_impact(
     normal = thrust / jnp.sqrt(jnp.maximum(jnp.sum(thrust**2), 1e-6))
     tail_state = jnp.stack(
         [
-            ball.pos - scenario.racket_height * normal,
+            ball.pos - case.racket_height * normal,
             racket_vel,
-            thrust + gravity_vector(scenario.gravity),
+            thrust + gravity_vector(case.gravity),
             jnp.zeros_like(thrust),
         ]
     )
@@ -52,35 +51,21 @@ def make_impact(
         normal=normal,
         flight_time=flight_time,
     )
-    apex = drag_free_apex(BallState(ball.pos, after), scenario.gravity)
+    apex = drag_free_apex(BallState(ball.pos, after), case.gravity)
     return Impact(stroke=stroke, tail_state=tail_state, apex=apex)
 
 
-def largest_violation(along: Array, impact: Impact, scenario: HitScenario) -> Array:
+def largest_violation(along: Array, impact: Impact, case: HitCase) -> Array:
     """Largest excess over any limit, that of the ground in metres and all others relative, ().
 
     Args:
-        along: (4, N) from `planner_jax.cost.limits.motion_excess`.
+        along: (4, N) from `planner_jax.cost.quadrotor.motion_excess`.
         impact: with the apex and the hitting speeds.
-        scenario: for the limits.
+        case: for the limits.
     """
-    limits = scenario.hit_limits
+    limits = case.hit_limits
     apex = apex_excess(impact.apex, limits.min_apex, limits.max_apex)
     speed = hitting_speed_excess(impact.tail_state[1], limits.hitting_speed)
     squared = jnp.concatenate([jnp.max(along[:3], axis=1), speed])
     plain = jnp.concatenate([jnp.max(along[3:], axis=1), apex])
     return jnp.maximum(jnp.max(relative(squared)), jnp.max(plain))
-
-
-def undecided_plan(
-    trajectory: PiecewisePolynomial, impact: Impact, cost: Array, violation: Array
-) -> HitPlan:
-    """A plan whose iterations and status the solver is still to fill in, and its cost anew."""
-    return HitPlan(
-        trajectory=trajectory,
-        stroke=impact.stroke,
-        cost=cost,
-        violation=violation,
-        iterations=jnp.zeros((), jnp.int32),
-        status=jnp.zeros((), jnp.int32),
-    )

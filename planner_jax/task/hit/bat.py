@@ -12,15 +12,16 @@ from jax import Array, lax
 from planner_jax.ball.flight import BallState, drag_free_fall_time, fly
 from planner_jax.ball.impact import required_impact
 from planner_jax.ball.prediction import target_at
-from planner_jax.cost.limits import motion_excess
 from planner_jax.cost.penalty import joined_trapezoid_weights, smoothed_hinge
+from planner_jax.cost.quadrotor import motion_excess
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
+from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.problem import Round
-from planner_jax.task.hit.baseline import largest_violation, make_impact, undecided_plan
+from planner_jax.task.hit.baseline import largest_violation, make_impact
+from planner_jax.task.hit.case import HitCase
+from planner_jax.task.hit.context import HitContext, Impact, prepare_hit
 from planner_jax.task.hit.decoupled import aim_at_angle, decoupled_hit
-from planner_jax.task.hit.exact import HitContext, Impact, prepare_hit
 from planner_jax.task.hit.plan import HitPlan
-from planner_jax.task.hit.scenario import HitScenario
 from planner_jax.trajectory.minimum_jerk import minimum_jerk
 from planner_jax.trajectory.polynomial import Motion, evaluate
 from planner_jax.trajectory.proportional_minco import (
@@ -47,17 +48,17 @@ _TURNED = 2.0 / 3.0  # share of the hit's acceleration at the transition
 _LEAST_RISE = 0.1
 
 
-def serve_origin(scenario: HitScenario) -> Array:
+def serve_origin(case: HitCase) -> Array:
     """Where the ball's flight, followed backwards, comes out of the ground: s_0, (3,) [m].
 
     The mirrored ball flies forward against a drag of the other sign, for as long as it takes
     without drag; the rest is a straight line. A ball that the drag of the other sign would
     blow up is followed without drag.
     """
-    mirrored = BallState(pos=scenario.ball.pos, vel=-scenario.ball.vel)
-    floor = jnp.zeros_like(scenario.gravity)
-    time, _ = drag_free_fall_time(mirrored, floor, scenario.gravity)
-    ahead, _ = fly(mirrored, time, -scenario.drag, scenario.gravity, num_steps=10)
+    mirrored = BallState(pos=case.ball.pos, vel=-case.ball.vel)
+    floor = jnp.zeros_like(case.gravity)
+    time, _ = drag_free_fall_time(mirrored, floor, case.gravity)
+    ahead, _ = fly(mirrored, time, -case.drag, case.gravity, num_steps=10)
     rest = ahead.pos[2] / jnp.maximum(-ahead.vel[2], _LEAST_RISE)
     origin = ahead.pos + ahead.vel * rest
     sound = jnp.all(jnp.isfinite(origin)) & (jnp.abs(rest) < 0.5)
@@ -95,8 +96,9 @@ def transition_point(start: Array, hit: Array, origin: Array, target: Array) -> 
 _UNITS = (0.1, 0.05, 0.3, 0.5)
 
 
+@jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class BatHit:
+class BatHit(OptimisedPlanner):
     """The planner of paper 002; with `transition=False` its "Bat-Lite".
 
     Decision variables, n = 3 (M - 1) + 5, each in units of `scale`: the waypoints' positions
@@ -132,6 +134,7 @@ class BatHit:
     one, and a solver that is left to converge needs it less than the published one did.
     """
 
+    case_type = HitCase
     transition: bool = True
     num_pieces: int = 4  # M
     nodes: int = 16  # kappa, penalty intervals a piece
@@ -172,26 +175,26 @@ class BatHit:
         """Number of waypoint variables."""
         return 3 * (self.num_pieces - 1)
 
-    def prepare(self, scenario: HitScenario) -> HitContext:
+    def prepare(self, case: HitCase) -> HitContext:
         """The incoming ball's table; see `prepare_hit`."""
-        return prepare_hit(scenario, self.num_table_nodes)
+        return prepare_hit(case, self.num_table_nodes)
 
     def impact(self, natural: Array, context: HitContext) -> tuple[Impact, Array]:
         """The impact of the variables behind the waypoints, and the defect of eqs 13-14.
 
         Args:
             natural: (5,) log T; p_y_dot, p_z_dot [m/s]; tau_x, tau_z [m/s^2].
-            context: of the scenario.
+            context: of the case.
         """
-        scenario, time = context.scenario, jnp.exp(natural[0])
+        case, time = context.case, jnp.exp(natural[0])
         ball = target_at(context.path, time)
         hit = decoupled_hit(
             ball,
-            scenario.target,
+            case.target,
             natural[1:3],
             natural[3:5],
-            scenario.restitution,
-            scenario.gravity,
+            case.restitution,
+            case.gravity,
         )
         impact = make_impact(
             time,
@@ -200,7 +203,7 @@ class BatHit:
             hit.ball_vel_after,
             hit.racket_vel,
             hit.thrust,
-            scenario,
+            case,
         )
         return impact, hit.defect
 
@@ -208,35 +211,35 @@ class BatHit:
         """The initial values of Section VI-A with the waypoints of the primitives, (1, n)."""
         if num != 1:
             raise ValueError(f"starts must be 1, got {num}")
-        scenario, dtype = context.scenario, context.landing_time.dtype
+        case, dtype = context.case, context.landing_time.dtype
         stages = self.stage_times if self.transition else self.stage_times[:1]
         # A ball that lands sooner, because planning began late, is met before it lands.
         time = jnp.minimum(sum(stages), 0.9 * jnp.maximum(context.landing_time, 0.1))
         ball = target_at(context.path, time)
-        after = aim_at_angle(ball.pos, scenario.target, self.first_angle, scenario.gravity)
-        normal, _ = required_impact(ball.vel, after, scenario.restitution)
-        thrust = self.first_thrust_z * scenario.gravity / jnp.maximum(normal[2], 0.2) * normal
+        after = aim_at_angle(ball.pos, case.target, self.first_angle, case.gravity)
+        normal, _ = required_impact(ball.vel, after, case.restitution)
+        thrust = self.first_thrust_z * case.gravity / jnp.maximum(normal[2], 0.2) * normal
         speeds = jnp.asarray(self.first_racket_vel_yz, dtype)
         terminal = jnp.concatenate([jnp.log(time)[None], speeds, thrust[::2]])
         impact, _ = self.impact(terminal, context)
-        natural = jnp.concatenate([self.primitive_waypoints(impact, scenario).ravel(), terminal])
+        natural = jnp.concatenate([self.primitive_waypoints(impact, case).ravel(), terminal])
         return (natural / jnp.asarray(self.scale, dtype))[None]
 
-    def primitive_waypoints(self, impact: Impact, scenario: HitScenario) -> Array:
+    def primitive_waypoints(self, impact: Impact, case: HitCase) -> Array:
         """Positions of the minimum-jerk primitives at equal times, (M - 1, 3) [m]."""
-        head, tail, end = scenario.head_state[:3], impact.tail_state[:3], impact.stroke.time
+        head, tail, end = case.head_state[:3], impact.tail_state[:3], impact.stroke.time
         shares = np.arange(1, self.num_pieces) / self.num_pieces
         times = end * jnp.asarray(shares, end.dtype)
         position = jax.vmap(evaluate, in_axes=(None, 0))
         if not self.transition:
             return position(minimum_jerk(head, tail, end), times)
         switch = self.stage_times[0] / sum(self.stage_times) * end
-        middle = self.transition_state(impact, scenario)
+        middle = self.transition_state(impact, case)
         first = position(minimum_jerk(head, middle, switch), times)
         second = position(minimum_jerk(middle, tail, end - switch), times - switch)
         return jnp.where((times < switch)[:, None], first, second)
 
-    def transition_state(self, impact: Impact, scenario: HitScenario) -> Array:
+    def transition_state(self, impact: Impact, case: HitCase) -> Array:
         """Position, velocity and acceleration at the transition, (3, 3).
 
         The acceleration is 2/3 of that at the hit: the thrust then has the paper's vertical
@@ -244,9 +247,7 @@ class BatHit:
         direction that goes with it, on the way from upright to the hit's.
         """
         hit = impact.tail_state
-        pos = transition_point(
-            scenario.head_state[0], hit[0], serve_origin(scenario), scenario.target
-        )
+        pos = transition_point(case.head_state[0], hit[0], serve_origin(case), case.target)
         return jnp.stack([pos, jnp.asarray(_SLOWING, pos.dtype) * hit[1], _TURNED * hit[2]])
 
     def _unpack(self, point: Array, context: HitContext):
@@ -255,16 +256,16 @@ class BatHit:
         waypoints = natural[: self.num_offsets].reshape(-1, 3)
         impact, defect = self.impact(natural[self.num_offsets :], context)
         duration = impact.stroke.time / self.num_pieces
-        rows = boundary_rows(context.scenario.head_state, impact.tail_state, duration)
+        rows = boundary_rows(context.case.head_state, impact.tail_state, duration)
         to_offsets = jnp.asarray(self.maps.offsets, point.dtype)
         offsets = jnp.matmul(
             to_offsets, jnp.concatenate([rows, waypoints]), precision=lax.Precision.HIGHEST
         )
         return offsets, rows, duration, impact, defect
 
-    def _terminal_penalty(self, impact: Impact, defect: Array, scenario: HitScenario) -> Array:
+    def _terminal_penalty(self, impact: Impact, defect: Array, case: HitCase) -> Array:
         """Apex (eq. 21), hitting speed (eq. 24a) and the defect of eqs 13-14."""
-        limits = scenario.hit_limits
+        limits = case.hit_limits
         excess = jnp.concatenate(
             [
                 jnp.stack([limits.min_apex - impact.apex, impact.apex - limits.max_apex]),
@@ -273,10 +274,10 @@ class BatHit:
         )
         return self.terminal_weight * (jnp.sum(smoothed_hinge(excess, self.hinge_width)) + defect)
 
-    def _penalty(self, motion: Motion, duration: Array, scenario: HitScenario) -> Array:
+    def _penalty(self, motion: Motion, duration: Array, case: HitCase) -> Array:
         """The limits along the way (eq. 18a), the squares of their own units."""
-        limits = scenario.limits
-        along = jnp.stack(motion_excess(motion, scenario.gravity, limits))
+        limits = case.limits
+        along = jnp.stack(motion_excess(motion, case.gravity, limits))
         one = jnp.ones_like(limits.speed)
         unit = jnp.stack([limits.speed**2, limits.acceleration**2, limits.body_rate**2, one])
         hinges = smoothed_hinge(along * unit[:, None], self.hinge_width)
@@ -292,21 +293,23 @@ class BatHit:
         cost = (
             trajectory_energy(self.maps, rows, offsets, duration)
             + self.time_weight * impact.stroke.time
-            + self._penalty(motion, duration, context.scenario)
-            + self._terminal_penalty(impact, defect, context.scenario)
+            + self._penalty(motion, duration, context.case)
+            + self._terminal_penalty(impact, defect, context.case)
         )
         return Evaluation(cost=cost / _COST_UNIT, violation=jnp.zeros_like(cost))
 
     def decode(self, point: Array, context: HitContext) -> HitPlan:
         """The plan at a point, its violation looked for at 24 nodes a piece."""
-        scenario = context.scenario
+        case = context.case
         offsets, rows, duration, impact, defect = self._unpack(point, context)
         columns = jnp.concatenate([rows, offsets])
         motion = sample_motion(self.maps, _DECODE_NODES, columns, duration)
-        along = jnp.stack(motion_excess(motion, scenario.gravity, scenario.limits))
-        violation = jnp.maximum(largest_violation(along, impact, scenario), defect)
+        along = jnp.stack(motion_excess(motion, case.gravity, case.limits))
+        violation = jnp.maximum(largest_violation(along, impact, case), defect)
         trajectory = proportional_trajectory(self.maps, rows, offsets, duration)
-        return undecided_plan(trajectory, impact, jnp.zeros_like(violation), violation)
+        return HitPlan(
+            trajectory=trajectory, gravity=case.gravity, stroke=impact.stroke, **pending(violation)
+        )
 
 
 def bat_lite(**options: Any) -> BatHit:

@@ -13,29 +13,29 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
-from jax import Array, lax
+from jax import Array
 
 from planner_jax.ball.aim import aim_drag_free, aim_with_drag, apex_with_drag
 from planner_jax.ball.flight import (
     BallState,
     drag_free_apex,
-    drag_free_fall_time,
     gravity_vector,
 )
 from planner_jax.ball.impact import required_impact
-from planner_jax.ball.prediction import PathTable, predict_path, target_at
+from planner_jax.ball.prediction import target_at
 from planner_jax.cost.along import Along, greatest_along, integrate_along
 from planner_jax.cost.contact import apex_excess, hitting_speed_excess
-from planner_jax.cost.limits import motion_excess
 from planner_jax.cost.penalty import smoothed_hinge
+from planner_jax.cost.quadrotor import motion_excess
 from planner_jax.lanes import in_one_kernel
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
+from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.problem import Round
 from planner_jax.optimise.scaling import shipped_scale
 from planner_jax.robot.quadrotor import QuadrotorLimits, tangent_basis
+from planner_jax.task.hit.case import HitCase
+from planner_jax.task.hit.context import HitContext, Impact, prepare_hit
 from planner_jax.task.hit.plan import HitPlan, Stroke
-from planner_jax.task.hit.scenario import HitScenario
 from planner_jax.trajectory.polynomial import Motion
 from planner_jax.trajectory.proportional_minco import (
     ProportionalMinco,
@@ -52,46 +52,11 @@ _ORDER = 4  # minimum snap
 _DECODE_NODES = 16  # intervals a piece at which a finished plan is looked at
 
 
-@struct.dataclass
-class HitContext:
-    """One scenario with what every evaluation reuses."""
-
-    scenario: HitScenario
-    path: PathTable  # of the incoming ball
-    landing_time: Array  # () [s], when the ball would land if nobody hit it
-
-
-def prepare_hit(scenario: HitScenario, num_nodes: int) -> HitContext:
-    """Integrate the incoming ball once; shared by all hit planners.
-
-    The table's horizon follows the drag-free fall, which drag changes by a few per cent.
-    """
-    fall, _ = drag_free_fall_time(scenario.ball, jnp.zeros_like(scenario.drag), scenario.gravity)
-    horizon = lax.stop_gradient(1.1 * fall)
-    path = predict_path(
-        scenario.ball, horizon, scenario.drag, scenario.gravity, num_nodes=num_nodes
-    )
-    node = jnp.maximum(jnp.sum(path.pos[1:, 2] > 0.0), 1)
-    # From the last node above the ground, down at that node's speed.
-    sinking = jnp.maximum(-path.vel[node, 2], 0.1)
-    landing = (node - 1) * path.resolution + path.pos[node, 2] / sinking
-    return HitContext(scenario=scenario, path=path, landing_time=lax.stop_gradient(landing))
-
-
 def _limits_along(
     motion: Motion, given: tuple[Array, QuadrotorLimits]
 ) -> tuple[Array, Array, Array, Array]:
     gravity, limits = given
     return motion_excess(motion, gravity, limits)
-
-
-@struct.dataclass
-class Impact:
-    """A stroke with the quadrotor states at both ends of its trajectory."""
-
-    stroke: Stroke
-    tail_state: Array  # (4, 3) of the quadrotor at the impact
-    apex: Array  # () [m], of the returned ball
 
 
 # Starting points, best first: impact time over landing time, flight time afterwards [s],
@@ -114,8 +79,9 @@ _GUESSES = np.array(
 )
 
 
+@jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class ExactHit:
+class ExactHit(OptimisedPlanner):
     """Minimum-snap hits with the impact eliminated exactly.
 
     Decision variables, n = 3 (M - 1) + 8, each in units of `scale`: whitened waypoint offsets
@@ -128,6 +94,7 @@ class ExactHit:
     (paper 002, eq. 18a) + hinges of apex (eq. 21) and hitting speed (eq. 24).
     """
 
+    case_type = HitCase
     # Relative durations of the pieces. The first are short, because a hovering quadrotor has
     # to begin to turn at once and its jerk is continuous.
     proportions: tuple[float, ...] = (0.2, 0.5) + (1.0,) * 10
@@ -179,9 +146,9 @@ class ExactHit:
         """Number of waypoint variables."""
         return 3 * (self.num_pieces - 1)
 
-    def prepare(self, scenario: HitScenario) -> HitContext:
+    def prepare(self, case: HitCase) -> HitContext:
         """The incoming ball's table; see `prepare_hit`."""
-        return prepare_hit(scenario, self.num_table_nodes)
+        return prepare_hit(case, self.num_table_nodes)
 
     def guesses(self, context: HitContext, num: int) -> Array:
         """Smooth trajectories to a few impact times, flight times and thrusts, (num, n)."""
@@ -192,7 +159,7 @@ class ExactHit:
             [
                 jnp.log(fraction * jnp.maximum(context.landing_time, 0.1)),
                 jnp.log(flight_time),
-                jnp.log(thrust * context.scenario.gravity),
+                jnp.log(thrust * context.case.gravity),
             ],
             axis=1,
         )
@@ -205,28 +172,24 @@ class ExactHit:
         Args:
             natural: (8,) log T, log t_post, log thrust, two tangential speeds [m/s], jerk
                 [m/s^3].
-            context: of the scenario.
+            context: of the case.
         """
-        scenario = context.scenario
+        case = context.case
         time, flight_time, thrust = jnp.exp(natural[0]), jnp.exp(natural[1]), jnp.exp(natural[2])
         ball = target_at(context.path, time)
         if self.drag_after_impact:
-            after = aim_with_drag(
-                ball.pos, scenario.target, flight_time, scenario.drag, scenario.gravity
-            )
-            apex = apex_with_drag(
-                BallState(ball.pos, after), flight_time, scenario.drag, scenario.gravity
-            )
+            after = aim_with_drag(ball.pos, case.target, flight_time, case.drag, case.gravity)
+            apex = apex_with_drag(BallState(ball.pos, after), flight_time, case.drag, case.gravity)
         else:
-            after = aim_drag_free(ball.pos, scenario.target, flight_time, scenario.gravity)
-            apex = drag_free_apex(BallState(ball.pos, after), scenario.gravity)
-        normal, normal_speed = required_impact(ball.vel, after, scenario.restitution)
+            after = aim_drag_free(ball.pos, case.target, flight_time, case.gravity)
+            apex = drag_free_apex(BallState(ball.pos, after), case.gravity)
+        normal, normal_speed = required_impact(ball.vel, after, case.restitution)
         across_x, across_y = tangent_basis(normal)
         tail_state = jnp.stack(
             [
-                ball.pos - scenario.racket_height * normal,
+                ball.pos - case.racket_height * normal,
                 normal_speed * normal + natural[3] * across_x + natural[4] * across_y,
-                thrust * normal + gravity_vector(scenario.gravity),
+                thrust * normal + gravity_vector(case.gravity),
                 natural[5:],
             ]
         )
@@ -250,12 +213,12 @@ class ExactHit:
         offsets, natural = self._split(point)
         impact = self.impact(natural, context)
         duration = impact.stroke.time / self.num_pieces
-        rows = boundary_rows(context.scenario.head_state, impact.tail_state, duration)
+        rows = boundary_rows(context.case.head_state, impact.tail_state, duration)
         return offsets, rows, duration, impact
 
     def _at_impact(self, impact: Impact, context: HitContext) -> Array:
         """Excess at the impact, (5,): apex, and squares of the hitting speed."""
-        limits = context.scenario.hit_limits
+        limits = context.case.hit_limits
         return jnp.concatenate(
             [
                 apex_excess(impact.apex, limits.min_apex, limits.max_apex),
@@ -276,7 +239,7 @@ class ExactHit:
             self._along(self.nodes),
             jnp.concatenate([rows, offsets])[None],
             duration[None],
-            (context.scenario.gravity, context.scenario.limits),
+            (context.case.gravity, context.case.limits),
         )
         energy = self.energy_weight * offset_energy(self.maps, offsets, duration)
         # Peaks between nodes are a little higher than the nodes show.
@@ -288,7 +251,7 @@ class ExactHit:
 
         Args:
             natural: (8,) as for `impact`.
-            context: of the scenario.
+            context: of the case.
 
         Returns:
             Boundary rows (8, 3), mean duration of a piece [s], the cost of the ends, and the
@@ -296,7 +259,7 @@ class ExactHit:
         """
         impact = self.impact(natural, context)
         duration = impact.stroke.time / self.num_pieces
-        rows = boundary_rows(context.scenario.head_state, impact.tail_state, duration)
+        rows = boundary_rows(context.case.head_state, impact.tail_state, duration)
         at_impact = self._at_impact(impact, context)
         energy = self.energy_weight * boundary_energy(self.maps, rows, duration)
         return rows, duration, self._hinges(at_impact) + energy, jnp.max(at_impact)
@@ -374,7 +337,7 @@ class ExactHit:
         offsets, rows, duration, impact = self._unpack(point, context)
         along = self._along(self.nodes)
         motion = sample_motion(self.maps, self.nodes, jnp.concatenate([rows, offsets]), duration)
-        given = (context.scenario.gravity, context.scenario.limits)
+        given = (context.case.gravity, context.case.limits)
         excess = jnp.stack(_limits_along(motion, given))
         at_impact = self._at_impact(impact, context)
         bend = jnp.sqrt(1.5 / self.hinge_width)
@@ -392,7 +355,7 @@ class ExactHit:
             self._along(_DECODE_NODES),
             jnp.concatenate([rows, offsets])[None],
             duration[None],
-            (context.scenario.gravity, context.scenario.limits),
+            (context.case.gravity, context.case.limits),
         )
         at_impact = self._at_impact(impact, context)
         squared = jnp.concatenate([*squares, at_impact[2:]])
@@ -400,9 +363,13 @@ class ExactHit:
         violation = jnp.maximum(jnp.max(jnp.sqrt(squared + 1.0) - 1.0), jnp.max(plain))
         return HitPlan(
             trajectory=proportional_trajectory(self.maps, rows, offsets, duration),
+            gravity=context.case.gravity,
             stroke=impact.stroke,
-            cost=jnp.zeros_like(violation),
-            violation=violation,
-            iterations=jnp.zeros((), jnp.int32),
-            status=jnp.zeros((), jnp.int32),
+            **pending(violation),
         )
+
+    def replanner(self) -> Any:
+        """The `ReplanHit` that goes on from this planner's plans; see `pj.replan`."""
+        from planner_jax.task.hit.replan import ReplanHit
+
+        return ReplanHit(self)

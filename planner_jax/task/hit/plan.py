@@ -3,7 +3,7 @@
 from flax import struct
 from jax import Array
 
-from planner_jax.trajectory.polynomial import PiecewisePolynomial
+from planner_jax.robot.quadrotor_plan import QuadrotorPlan
 
 
 @struct.dataclass
@@ -19,12 +19,7 @@ class Stroke:
 
 
 @struct.dataclass
-class HitPlan:
-    """One plan, or a batch of them with a leading axis on every leaf."""
+class HitPlan(QuadrotorPlan):
+    """One plan, or a batch of them with a leading axis on every leaf; ends at the impact."""
 
-    trajectory: PiecewisePolynomial  # of the quadrotor's propeller plane, ends at the impact
     stroke: Stroke
-    cost: Array  # (), the planner's own objective
-    violation: Array  # (), largest relative excess over a limit that the planner saw; <= 0 is good
-    iterations: Array  # () int32
-    status: Array  # () int32, a `planner_jax.optimise.status.Status`

@@ -7,35 +7,28 @@ plans once, because "even minor updates in the terminal state could lead to dras
 """
 
 import dataclasses
+from typing import Any
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jax import Array
 
+from planner_jax.ball.flight import BallState
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
+from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.problem import Round
+from planner_jax.planning.replan import Replanning
 from planner_jax.robot.quadrotor import net_thrust, tangent_basis
-from planner_jax.task.hit.exact import ExactHit, HitContext
+from planner_jax.task.hit.case import HitCase
+from planner_jax.task.hit.context import HitContext
+from planner_jax.task.hit.exact import ExactHit
 from planner_jax.task.hit.plan import HitPlan
-from planner_jax.task.hit.scenario import HitScenario
-from planner_jax.trajectory.polynomial import evaluate, total_duration
+from planner_jax.trajectory.polynomial import evaluate, states_at, total_duration
 
 _SHORTEST = 0.01  # [s], least time to the impact that is guessed
 _TRIALS = (1.0, 0.2, 0.04)  # step lengths: the first direction, without curvature, is too long
-
-
-@struct.dataclass
-class ReplanHitScenario:
-    """One case, or a batch of them. Times of `scenario` count from now."""
-
-    scenario: HitScenario  # ball as estimated now, head_state where the quadrotor is now
-    previous: HitPlan  # its times began `elapsed` ago
-    elapsed: Array  # () [s]
-
-    @property
-    def batch_shape(self) -> tuple[int, ...]:
-        """() for one case, (B,) for a batch."""
-        return self.scenario.batch_shape
 
 
 @struct.dataclass
@@ -46,33 +39,66 @@ class ReplanHitContext:
     start: Array  # (n,)
 
 
+@jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class ReplanHit:
-    """Hits re-planned from the previous plan, for `plan` or `solve_round`.
+class ReplanHit(OptimisedPlanner):
+    """Hits re-planned from the previous plan, as `pj.replan` asks for them.
 
     The previous plan may be any planner's; what comes back is `planner`'s.
     """
 
+    case_type = Replanning
     planner: ExactHit = ExactHit()
     rounds: tuple[Round, ...] = (
         Round(starts=1, solver=LbfgsConfig(max_steps=4, trial_steps=_TRIALS)),
         Round(starts=1, solver=LbfgsConfig(max_steps=40, trial_steps=_TRIALS)),
     )
 
-    def prepare(self, scenario: ReplanHitScenario) -> ReplanHitContext:
-        """The incoming ball's table, and the previous stroke as a point."""
-        return ReplanHitContext(
-            hit=self.planner.prepare(scenario.scenario), start=self._start(scenario)
-        )
+    def begin(
+        self,
+        cases: HitCase,
+        previous: HitPlan,
+        elapsed: Any,
+        *,
+        ball: BallState,
+        drag: Any = None,
+        head_state: Any = None,
+    ) -> Replanning:
+        """What is left of a case, or of a batch, some time into its plan; see `pj.replan`.
 
-    def _start(self, scenario: ReplanHitScenario) -> Array:
+        Args:
+            cases: what `previous` was planned for.
+            previous: the plan that is being flown; see that it is solved.
+            elapsed: () or (B,) [s], since it began, >= 0.
+            ball: as estimated now, leaves (3,) or (B, 3).
+            drag: () or (B,) K_D [1/m], as believed now; by default as before.
+            head_state: (4, 3) or (B, 4, 3), where the quadrotor is. The plan's own state if not
+                given: it flies what was planned.
+
+        Raises:
+            ValueError: a negative time.
+        """
+        elapsed = np.asarray(elapsed, np.asarray(cases.gravity).dtype)
+        if not (elapsed >= 0.0).all():
+            raise ValueError(f"elapsed must be >= 0, got {np.min(elapsed)}")
+        if head_state is None:
+            head_state = states_at(previous.trajectory, elapsed)
+        drag = cases.drag if drag is None else drag
+        now = dataclasses.replace(cases, ball=ball, drag=drag, head_state=head_state)
+        return Replanning(case=now, previous=previous, elapsed=elapsed)
+
+    def prepare(self, task: Replanning) -> ReplanHitContext:
+        """The incoming ball's table, and the previous stroke as a point."""
+        return ReplanHitContext(hit=self.planner.prepare(task.case), start=self._start(task))
+
+    def _start(self, task: Replanning) -> Array:
         """The previous stroke, and no offset from the smoothest way to it, (n,)."""
-        planner, stroke = self.planner, scenario.previous.stroke
-        path = scenario.previous.trajectory
+        planner, stroke = self.planner, task.previous.stroke
+        path = task.previous.trajectory
         vel, acc, jerk = (evaluate(path, total_duration(path), order) for order in (1, 2, 3))
-        pull = net_thrust(acc, scenario.scenario.gravity)
+        pull = net_thrust(acc, task.case.gravity)
         across_x, across_y = tangent_basis(stroke.normal)
-        times = jnp.stack([stroke.time - scenario.elapsed, stroke.flight_time])
+        times = jnp.stack([stroke.time - task.elapsed, stroke.flight_time])
         sizes = jnp.append(times, jnp.sqrt(jnp.sum(pull**2)))
         natural = jnp.concatenate(
             [

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.interpolate import RectBivariateSpline
 
 from planner_jax.task.hit import court
-from planner_jax.task.hit.scenario import HitScenario, hit_scenario
+from planner_jax.task.hit.case import HitCase, case
 from planner_jax.task.hit.trial_files import read_trials
 from planner_jax.task.hit.validate import DRAG, GRAVITY, ServeError, fly, landing
 
@@ -91,7 +91,7 @@ def read_serves(folder: str | os.PathLike) -> Serves:
 
 
 def generate_serves(
-    num: int, seed: int, scenarios: Sequence[str] | None = None, *, start: int = 0
+    num: int, seed: int, scenarios: Sequence[str] | None = None, *, first: int = 0
 ) -> Serves:
     """Serves drawn from the law of the published ones, the scenarios in equal shares.
 
@@ -108,13 +108,13 @@ def generate_serves(
         num: how many, >= 1.
         seed: >= 0.
         scenarios: names out of court.SCENARIOS; all of them by default.
-        start: place of the first one in the sequence, >= 0.
+        first: place of the first one in the sequence, >= 0.
 
     Raises:
         ServeError: an argument is out of its range.
     """
     names = court.SCENARIOS if scenarios is None else tuple(scenarios)
-    for name, value, least in (("num", num, 1), ("seed", seed, 0), ("start", start, 0)):
+    for name, value, least in (("num", num, 1), ("seed", seed, 0), ("first", first, 0)):
         if value < least:
             raise ServeError(f"{name} must be >= {least}, got {value}")
     unknown = [name for name in names if name not in court.SCENARIOS]
@@ -123,16 +123,16 @@ def generate_serves(
         raise ServeError(f"scenarios must be {rule}, got {unknown[0] if unknown else 'none'}")
     places = np.array([court.SCENARIOS.index(name) for name in names])
     size = _ROUNDS * len(places)
-    first = start // size
-    blocks = [_draw_block(places, seed, b) for b in range(first, (start + num - 1) // size + 1)]
+    begin = first // size
+    blocks = [_draw_block(places, seed, b) for b in range(begin, (first + num - 1) // size + 1)]
     scenario, position, velocity = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
     return Serves(
         position=position,
         velocity=velocity,
         target=court.target_of(scenario),
         scenario=scenario,
-        index=first * size + np.arange(len(scenario)),
-    )[start - first * size :][:num]
+        index=begin * size + np.arange(len(scenario)),
+    )[first - begin * size :][:num]
 
 
 def _random(seed: int, stream: int, block: int) -> np.random.Generator:
@@ -265,7 +265,7 @@ def uniform_starts(index: np.ndarray, seed: int) -> np.ndarray:
     return starts
 
 
-def to_scenarios(
+def to_cases(
     serves: Serves,
     *,
     start: Sequence[float] | str = (-3.0, 0.0, 1.5),
@@ -273,8 +273,8 @@ def to_scenarios(
     delay: float = 0.0,
     limit_scale: float = 1.0,
     dtype=jnp.float32,
-) -> HitScenario:
-    """One batch of scenarios, with the setting of paper 002, from serves.
+) -> HitCase:
+    """One batch of cases, with the setting of paper 002, from serves.
 
     Args:
         serves: N of them.
@@ -301,7 +301,7 @@ def to_scenarios(
         if head.shape != (3,) or not np.isfinite(head).all():
             raise ServeError(f"start must be three finite numbers or 'uniform', got {start}")
     late = advance(serves, delay) if delay != 0.0 else serves
-    scenarios = hit_scenario(
+    cases = case(
         late.position,
         late.velocity,
         late.target,
@@ -310,4 +310,4 @@ def to_scenarios(
         gravity=GRAVITY,
         dtype=dtype,
     )
-    return dataclasses.replace(scenarios, limits=scenarios.limits.scaled(limit_scale))
+    return dataclasses.replace(cases, limits=cases.limits.scaled(limit_scale))

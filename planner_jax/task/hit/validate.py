@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from planner_jax.task.hit.scenario import HitScenario
+from planner_jax.task.hit.case import HitCase
 
 # Fit to the published landing points; the residual is 1 cm.
 DRAG = 0.0616  # K_D [1/m]
@@ -32,8 +32,8 @@ class ServeError(ValueError):
         self.problems = tuple(problems)
 
 
-class ScenarioError(ValueError):
-    """A value of a scenario breaks a rule; the message names the value, the rule and the lane."""
+class CaseError(ValueError):
+    """A value of a case breaks a rule; the message names the value, the rule and the lane."""
 
 
 # Inside, the axis of the components comes first: NumPy is quick along the last one.
@@ -134,18 +134,18 @@ def landing(position, velocity, drag, gravity):
     return np.where(down, time, np.nan), np.moveaxis(np.where(down, point, np.nan), 0, -1)
 
 
-def check_scenarios(scenarios: HitScenario) -> None:
-    """Raise `ScenarioError` for the first rule that some lane of a batch breaks.
+def check_cases(cases: HitCase) -> None:
+    """Raise `CaseError` for the first rule that some lane of a batch breaks.
 
     Every leaf is finite; limits, gravity and the ball's height are positive; drag and the lowest
     height are not negative; the restitution lies in [0, 1]; the lowest apex is below the highest;
     and the ball comes down in the hitting half, x < 0.
 
     Args:
-        scenarios: one scenario, or a batch with leading axes. Its leaves must be concrete.
+        cases: one case, or a batch with leading axes. Its leaves must be concrete.
     """
-    batch = np.shape(scenarios.drag)
-    paths, _ = jax.tree_util.tree_flatten_with_path(scenarios)
+    batch = np.shape(cases.drag)
+    paths, _ = jax.tree_util.tree_flatten_with_path(cases)
     leaves = {".".join(key.name for key in path): np.asarray(leaf, float) for path, leaf in paths}
     for name, leaf in leaves.items():
         _require(name, leaf, np.isfinite(leaf), "finite", batch)
@@ -182,4 +182,4 @@ def _require(name: str, leaf: np.ndarray, holds: np.ndarray, rule: str, batch: t
         where = f" in lane {lane[0] if len(lane) == 1 else lane}"
         if (others := int(lanes.sum()) - 1) > 0:
             where += f" ({others} more such lane{'s' if others > 1 else ''})"
-    raise ScenarioError(f"{name} must be {rule}, got {value:g}{where}")
+    raise CaseError(f"{name} must be {rule}, got {value:g}{where}")

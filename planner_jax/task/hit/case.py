@@ -19,7 +19,7 @@ class HitLimits:
 
 
 @struct.dataclass
-class HitScenario:
+class HitCase:
     """One case. Every field is a leaf: batch it, randomise it, differentiate by it.
 
     Times count from the moment at which planning begins.
@@ -41,7 +41,7 @@ class HitScenario:
         return np.shape(self.drag)
 
 
-def hit_scenario(
+def case(
     serve_pos,
     serve_vel,
     target,
@@ -59,8 +59,8 @@ def hit_scenario(
     min_apex=2.2,
     max_apex=6.2,
     dtype=jnp.float32,
-) -> HitScenario:
-    """A scenario, or a batch of them, with the setting of paper 002, Section VI-A.
+) -> HitCase:
+    """A hit, or a batch of them, with the setting of paper 002, Section VI-A.
 
     K_D and g are the fit to the published landing positions; the hover start is an
     assumption (the paper draws it at the near/far boundary of the hitting half).
@@ -84,7 +84,7 @@ def hit_scenario(
         dtype: of every leaf.
 
     Returns:
-        A `HitScenario` whose leaves carry the batch shape of `serve_pos`.
+        A `HitCase` whose leaves carry the batch shape of `serve_pos`.
     """
     batch = np.shape(serve_pos)[:-1]
 
@@ -93,7 +93,7 @@ def hit_scenario(
 
     head = np.zeros(batch + (4, 3))
     head[..., 0, :] = start
-    return HitScenario(
+    return HitCase(
         ball=BallState(pos=leaf(serve_pos, 3), vel=leaf(serve_vel, 3)),
         head_state=jnp.asarray(head, dtype),
         target=leaf(target, 3),

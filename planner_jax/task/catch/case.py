@@ -1,5 +1,6 @@
 """One catching task: up to N targets, the quadrotor, its net and its limits."""
 
+import dataclasses
 from typing import Any
 
 import jax.numpy as jnp
@@ -20,6 +21,16 @@ class CatchLimits:
     body_rate: Array  # () [rad/s], with the yaw part of the Hopf fibration
     min_height: Array  # () [m], of the propeller plane
 
+    def scaled(self, factor: float, gravity: Array) -> "CatchLimits":
+        """Speed, body rate and the thrust's distance from hover times `factor`."""
+        return dataclasses.replace(
+            self,
+            speed=factor * self.speed,
+            body_rate=factor * self.body_rate,
+            min_thrust=jnp.maximum(gravity + factor * (self.min_thrust - gravity), 0.0),
+            max_thrust=gravity + factor * (self.max_thrust - gravity),
+        )
+
 
 @struct.dataclass
 class Net:
@@ -31,11 +42,19 @@ class Net:
 
 
 @struct.dataclass
-class CatchScenario:
+class CatchChoice:
+    """What a decision settles of a catch."""
+
+    order: Array  # (N,) int32, a permutation, present targets first
+    times: Array  # (N,) [s], rising, when to catch in that order, before any optimisation
+
+
+@struct.dataclass
+class CatchCase:
     """One case. Every field is a leaf: batch it, randomise it, differentiate by it.
 
     Times count from the moment at which planning begins. The N targets are caught in the
-    order `order`; `decide` fills it and `times`.
+    order `order`, which a decision fills in together with `times`.
     """
 
     targets: TargetPath  # leaves with a leading axis N
@@ -58,8 +77,12 @@ class CatchScenario:
         """N, the number of targets that the shape holds."""
         return np.shape(self.present)[-1]
 
+    def decided(self, choice: CatchChoice) -> "CatchCase":
+        """The case, or the batch, with an order and times."""
+        return dataclasses.replace(self, order=choice.order, times=choice.times)
 
-def catch_scenario(
+
+def case(
     targets: TargetPath,
     horizon,
     *,
@@ -75,8 +98,8 @@ def catch_scenario(
     body_rate=5.0,
     min_height=0.25,
     dtype=jnp.float32,
-) -> CatchScenario:
-    """A scenario, or a batch of them, with the setting of paper 000.
+) -> CatchCase:
+    """A catch, or a batch of them, with the setting of paper 000.
 
     Net and flight are paper 000's; it does not give limits, which are those of the shared
     protocol: |v| <= 5 m/s, |omega| <= 5 rad/s, thrust 0.3 g to 2.5 g, height >= 0.25 m,
@@ -109,7 +132,7 @@ def catch_scenario(
     head = np.zeros(batch + (4, 3))
     head[..., 0, :] = start
     shares = np.arange(1, num + 1) / (num + 1.0)
-    return CatchScenario(
+    return CatchCase(
         targets=targets,
         present=jnp.asarray(np.broadcast_to(present, shape), bool),
         horizon=leaf(horizon, num),

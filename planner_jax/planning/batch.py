@@ -17,9 +17,8 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh, NamedSharding, PartitionSpec, Sharding, SingleDeviceSharding
 
-from planner_jax.optimise.multistart import solve_batch
-from planner_jax.optimise.problem import Planner, Round
-from planner_jax.optimise.status import is_solved, is_unsolved
+from planner_jax.planning.solved import solve_cases
+from planner_jax.protocol import Attempt, HostPlanner, is_solved, is_unsolved
 
 # Lanes of a device in one call. Few, because every one is a program of its own to compile.
 BUCKETS = (16, 128, 1024, 8192, 65536)
@@ -28,43 +27,63 @@ _LANES = PartitionSpec("lanes")
 
 
 def plan_batch(
-    planner: Planner, scenarios: Any, chunk: int | None, devices: Sequence[Any] | None
+    planner: Any,
+    attempts: Sequence[Attempt],
+    cases: Any,
+    chunk: int | None,
+    devices: Sequence[Any] | None,
 ) -> tuple[Any, Any]:
-    """The planner's rounds on B cases, each round on the lanes that are still unsolved.
+    """Attempts at B cases, each at the lanes that are still unsolved.
 
     Args:
-        planner: sizes and switches.
-        scenarios: a leading axis of B on every leaf.
+        planner: that makes them.
+        attempts: in order, one or more.
+        cases: a leading axis of B on every leaf.
         chunk: lanes a device solves in one call; None for what suits it.
         devices: that share the work; None for all local ones.
 
     Returns:
-        plans: with NumPy leaves, or where all leaves of the scenarios are jax arrays, with
+        plans: with NumPy leaves, or where all leaves of the cases are jax arrays, with
             those, so that nothing leaves the devices.
         unsolved: numbers that are all zero if no lane is unsolved.
     """
     mesh = Mesh(np.array(jax.local_devices() if devices is None else devices), ("lanes",))
-    resident = all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(scenarios))
-    num = _length(scenarios)
-    in_one_call = num == _bucket(num, chunk or _default_chunk(planner.rounds[0], mesh))
+    if jax.tree.leaves(planner):
+        planner = jax.device_put(planner, _whole(mesh))
+    resident = all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(cases))
+    num = _length(cases)
+    in_one_call = num == _bucket(num, chunk or _default_chunk(attempts[0], mesh))
     # One CPU's memory is the host's: there a thread for each core plans chunks, and they are cut
     # and joined without programs, which would be compiled for every new size.
     if resident and (in_one_call or not _is_one_cpu(mesh)):
-        return _plan_resident(planner, scenarios, chunk, mesh)
-    plans, unsolved = _plan_from_host(planner, scenarios, chunk, mesh)
+        return _plan_resident(planner, attempts, cases, chunk, mesh)
+    plans, unsolved = _plan_from_host(planner, attempts, cases, chunk, mesh)
     return (jax.device_put(plans, _sharding(mesh)) if resident else plans), unsolved
 
 
+def plan_on_host(planner: HostPlanner, attempts: Sequence[Attempt], cases: Any) -> tuple[Any, int]:
+    """As `plan_batch`, by a planner that works on the host; NumPy leaves."""
+    cases = jax.tree.map(np.asarray, cases)
+    plans, lanes = None, np.arange(_length(cases))
+    for attempt in attempts:
+        later = planner.solve_on_host(jax.tree.map(lambda leaf: leaf[lanes], cases), attempt)  # noqa: B023
+        plans = jax.tree.map(np.array, later) if plans is None else merged(plans, later, lanes)
+        lanes = np.flatnonzero(is_unsolved(plans.status))
+        if lanes.size == 0:
+            break
+    return plans, lanes.size
+
+
 def _plan_from_host(
-    planner: Planner, scenarios: Any, chunk: int | None, mesh: Mesh
+    planner: Any, attempts: Sequence[Attempt], cases: Any, chunk: int | None, mesh: Mesh
 ) -> tuple[Any, int]:
-    """As `plan_batch`, of scenarios in NumPy arrays."""
-    scenarios = jax.tree.map(np.asarray, scenarios)
-    lanes = np.arange(_length(scenarios))
+    """As `plan_batch`, of cases in NumPy arrays."""
+    cases = jax.tree.map(np.asarray, cases)
+    lanes = np.arange(_length(cases))
     plans: Any = None
-    for attempt in planner.rounds:
+    for attempt in attempts:
         calls = _calls(lanes, chunk or _default_chunk(attempt, mesh), mesh)
-        found = _solved_from_host(planner, attempt, scenarios, [call for call, _ in calls], mesh)
+        found = _solved_from_host(planner, attempt, cases, [call for call, _ in calls], mesh)
         if plans is None:
             trimmed = [
                 jax.tree.map(lambda leaf, n=num: np.asarray(leaf)[:n], part)
@@ -81,19 +100,19 @@ def _plan_from_host(
 
 
 def _plan_resident(
-    planner: Planner, scenarios: Any, chunk: int | None, mesh: Mesh
+    planner: Any, attempts: Sequence[Attempt], cases: Any, chunk: int | None, mesh: Mesh
 ) -> tuple[Any, Array]:
-    """As `plan_batch`, of scenarios in jax arrays; only how many are unsolved comes to the host.
+    """As `plan_batch`, of cases in jax arrays; only how many are unsolved comes to the host.
 
     Every device plans its own share, without asking the others for a lane.
     """
-    num = _length(scenarios)
+    num = _length(cases)
     if num % mesh.size:  # the last lane is there again until all shares are equal
-        scenarios = _taken(scenarios, np.arange(-(-num // mesh.size) * mesh.size))
-    scenarios = _placed(scenarios, mesh)
-    first, *others = planner.rounds
+        cases = _taken(cases, np.arange(-(-num // mesh.size) * mesh.size))
+    cases = _placed(cases, mesh)
+    first, *others = attempts
     plans, unsolved = _first_plans(
-        planner, first, scenarios, chunk or _default_chunk(first, mesh), mesh
+        planner, first, cases, chunk or _default_chunk(first, mesh), mesh
     )
     for attempt in others:
         unsolved.copy_to_host_async()  # on its way as soon as it is known
@@ -103,7 +122,7 @@ def _plan_resident(
         size, before = chunk or _default_chunk(attempt, mesh), plans.status
         for begin in range(0, most, size):
             bucket = _bucket(most - begin, size)
-            part, lanes = _cut_unsolved(mesh, bucket, scenarios, before, _number(mesh, begin))
+            part, lanes = _cut_unsolved(mesh, bucket, cases, before, _number(mesh, begin))
             later, _ = _solve(planner, attempt, mesh, part)
             plans, unsolved = _merged_locally(mesh, plans, later, lanes)
     if num % mesh.size:  # arrays have equal shares or none
@@ -112,15 +131,15 @@ def _plan_resident(
 
 
 def _first_plans(
-    planner: Planner, attempt: Round, scenarios: Any, chunk: int, mesh: Mesh
+    planner: Any, attempt: Attempt, cases: Any, chunk: int, mesh: Mesh
 ) -> tuple[Any, Array]:
-    """One round on all lanes of every device, chunk by chunk; as `_solve`."""
-    share = _length(scenarios) // mesh.size
+    """One attempt at all lanes of every device, chunk by chunk; as `_solve`."""
+    share = _length(cases) // mesh.size
     if share == _bucket(share, chunk):
-        return _solve(planner, attempt, mesh, scenarios)
+        return _solve(planner, attempt, mesh, cases)
     found = []
     for begin in range(0, share, chunk):
-        part = _cut(mesh, _bucket(share - begin, chunk), scenarios, _number(mesh, begin))
+        part = _cut(mesh, _bucket(share - begin, chunk), cases, _number(mesh, begin))
         found.append(_solve(planner, attempt, mesh, part)[0])
     return _joined_locally(mesh, found, share)
 
@@ -134,7 +153,7 @@ def _length(tree: Any) -> int:
     return jax.tree.leaves(tree)[0].shape[0]
 
 
-def _default_chunk(attempt: Round, mesh: Mesh) -> int:
+def _default_chunk(attempt: Attempt, mesh: Mesh) -> int:
     on_cpu = mesh.devices[0].platform == "cpu"
     return max(128, (_CPU_CHUNK if on_cpu else _GPU_CHUNK) // attempt.starts)
 
@@ -159,16 +178,25 @@ def _sharding(mesh: Mesh) -> Sharding:
     return NamedSharding(mesh, _LANES) if mesh.size > 1 else SingleDeviceSharding(mesh.devices[0])
 
 
+def _whole(mesh: Mesh) -> Sharding:
+    """The same on every device."""
+    return NamedSharding(mesh, PartitionSpec()) if mesh.size > 1 else _sharding(mesh)
+
+
 @functools.lru_cache(maxsize=4096)
 def _number(mesh: Mesh, value: int) -> Array:
     """A number that every device has; sent but once, since the way there takes time."""
-    whole = PartitionSpec()
-    placed = NamedSharding(mesh, whole) if mesh.size > 1 else _sharding(mesh)
-    return jax.device_put(np.int32(value), placed)
+    return jax.device_put(np.int32(value), _whole(mesh))
 
 
 def _apart(mesh: Mesh, function: Callable, *specs: PartitionSpec) -> Callable:
-    """The function of every device's own lanes; arguments are split unless `specs` say else."""
+    """A function that every device carries out on its own share of the lanes.
+
+    Args:
+        mesh: the devices.
+        function: of arrays with the lanes first.
+        specs: how its arguments are split, one each; by default all by their lanes.
+    """
     if mesh.size == 1:
         return function
     # Without the check of replication: the lanes of a device share nothing with another's.
@@ -191,9 +219,9 @@ def _placed(tree: Any, mesh: Mesh) -> Any:
 
 
 def _solved_from_host(
-    planner: Planner, attempt: Round, scenarios: Any, calls: list[np.ndarray], mesh: Mesh
+    planner: Any, attempt: Attempt, cases: Any, calls: list[np.ndarray], mesh: Mesh
 ) -> list[Any]:
-    """One round on the lanes of every call; on one CPU device with a thread for each core.
+    """One attempt at the lanes of every call; on one CPU device with a thread for each core.
 
     One thread more hands over the next call while the others compute.
     """
@@ -201,7 +229,7 @@ def _solved_from_host(
     placed = _sharding(mesh)
 
     def solve(lanes: np.ndarray) -> Any:
-        part = jax.device_put(jax.tree.map(lambda leaf: leaf[lanes], scenarios), placed)
+        part = jax.device_put(jax.tree.map(lambda leaf: leaf[lanes], cases), placed)
         found, _ = _solve(planner, attempt, mesh, part)
         return jax.block_until_ready(found) if threads > 1 else found
 
@@ -213,14 +241,14 @@ def _solved_from_host(
         return [first, *pool.map(solve, calls[1:])]
 
 
-@functools.partial(jax.jit, static_argnames=("planner", "attempt", "mesh"))
-def _solve(planner: Planner, attempt: Round, mesh: Mesh, scenarios: Any) -> tuple[Any, Array]:
-    """One round on the lanes of every device, and how many each leaves unsolved, (devices,)."""
+@functools.partial(jax.jit, static_argnames=("attempt", "mesh"))
+def _solve(planner: Any, attempt: Attempt, mesh: Mesh, cases: Any) -> tuple[Any, Array]:
+    """One attempt at the lanes of every device, and how many each leaves unsolved, (devices,)."""
 
-    def solve(scenarios: Any) -> tuple[Any, Array]:
-        return _counted(solve_batch(planner, attempt, scenarios))
+    def solve(planner: Any, cases: Any) -> tuple[Any, Array]:
+        return _counted(solve_cases(planner, cases, attempt))
 
-    return _apart(mesh, solve)(scenarios)
+    return _apart(mesh, solve, PartitionSpec(), _LANES)(planner, cases)
 
 
 @jax.jit
@@ -271,8 +299,18 @@ def _counted(plans: Any) -> tuple[Any, Array]:
 
 
 def _better(later: Any, plans: Any) -> Any:
-    """Where a later round did better."""
+    """Where a later attempt did better."""
     return is_solved(later.status) | (later.violation < plans.violation)
+
+
+def better_of(plans: Any, later: Any, where: Array) -> Any:
+    """The plans, with later ones where these do better among the cases that `where` tells."""
+    chosen = where & _better(later, plans)
+
+    def pick(old: Array, new: Array) -> Array:
+        return jnp.where(chosen.reshape(chosen.shape + (1,) * (new.ndim - chosen.ndim)), new, old)
+
+    return jax.tree.map(pick, plans, later)
 
 
 def merged(plans: Any, later: Any, lanes: np.ndarray) -> Any:
@@ -292,13 +330,11 @@ def _merged_locally(mesh: Mesh, plans: Any, later: Any, lanes: Array) -> tuple[A
     """As on the host, of every device's share, and how many it then has unsolved."""
 
     def merge(plans: Any, later: Any, lanes: Array) -> tuple[Any, Array]:
-        before = _taken(plans, lanes)
-        better = _better(later, before)
+        kept = better_of(_taken(plans, lanes), later, jnp.ones(lanes.shape, bool))
 
-        def replace(old: Array, new: Array, kept: Array) -> Array:
-            chosen = better.reshape(-1, *(1,) * (new.ndim - 1))
-            return old.at[lanes].set(jnp.where(chosen, new, kept), mode="drop")
+        def replace(old: Array, new: Array) -> Array:
+            return old.at[lanes].set(new, mode="drop")
 
-        return _counted(jax.tree.map(replace, plans, later, before))
+        return _counted(jax.tree.map(replace, plans, kept))
 
     return _apart(mesh, merge)(plans, later, lanes)

@@ -157,22 +157,6 @@ def finite_lanes(case: dict, unbounded: tuple[str, ...] = ()) -> np.ndarray:
     return finite
 
 
-def failure_sentence(
-    name: str, time: float, excess: float, sentences: dict[str, str], unbounded: dict[str, str]
-) -> str:
-    """One line for a human: which limit failed, when, and by how much.
-
-    Args:
-        name: of the limit.
-        time: [s], where it is worst.
-        excess: by how much; infinite for what has a line in `unbounded`.
-        sentences: limit -> template with `time` and `excess`.
-        unbounded: limit -> template with `time`.
-    """
-    text = unbounded.get(name) if np.isinf(excess) else None
-    return f"{name}: " + (text or sentences[name]).format(time=time, excess=excess)
-
-
 def first_failures(tests: dict, limits: tuple[str, ...], finite: np.ndarray) -> dict:
     """Success, failed limit, its time and excess of every lane.
 

@@ -1,0 +1,77 @@
+"""The planner that minimises: what it is to write, and what it gets for that."""
+
+import abc
+import dataclasses
+from typing import Any, ClassVar, Self
+
+import jax.numpy as jnp
+from jax import Array
+
+from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
+from planner_jax.optimise.multistart import solve_batch, solve_round
+from planner_jax.optimise.problem import Round, Settings
+
+_LONG = LbfgsConfig(max_steps=300, tolerance=1e-7, patience=6)
+
+
+def pending(violation: Array) -> dict[str, Array]:
+    """The fields that every `Plan` has, before the solver fills in all but the violation."""
+    zero = jnp.zeros((), jnp.int32)
+    return {
+        "cost": jnp.zeros_like(violation),
+        "violation": violation,
+        "iterations": zero,
+        "status": zero,
+    }
+
+
+class OptimisedPlanner(abc.ABC):
+    """A `LanesPlanner` by batched L-BFGS: a problem of one case and rounds of attempts at it.
+
+    A subclass is a frozen dataclass and a pytree (`jax.tree_util.register_static` where it holds
+    no arrays) with a field `rounds`. The four functions are pure and written for one case, in
+    scaled decision variables in which the objective has curvature of order one.
+    """
+
+    rounds: tuple[Round, ...]  # what to try, in order
+    case_type: ClassVar[type | None] = None
+
+    @abc.abstractmethod
+    def prepare(self, case: Any) -> Any:
+        """What every evaluation needs and none changes, such as the ball's path table."""
+
+    @abc.abstractmethod
+    def guesses(self, context: Any, num: int) -> Array:
+        """The first `num` starting points, (num, n), best first."""
+
+    @abc.abstractmethod
+    def objective(self, point: Array, context: Any) -> Evaluation:
+        """Cost and largest violation at a point (n,)."""
+
+    @abc.abstractmethod
+    def decode(self, point: Array, context: Any) -> Any:
+        """The plan at a point (n,), its violation looked at more closely.
+
+        The solver fills in `cost`, `iterations` and `status`; until then they are `pending`.
+        """
+
+    @property
+    def attempts(self) -> tuple[Round, ...]:
+        """The rounds."""
+        return self.rounds
+
+    def solve(self, case: Any, attempt: Round) -> Any:
+        """The plan of one case by one round."""
+        return solve_round(self, attempt, case)
+
+    def solve_lanes(self, cases: Any, attempt: Round) -> Any:
+        """The plans of a batch by one round."""
+        return solve_batch(self, attempt, cases)
+
+    def changed(self, settings: Settings) -> Self:
+        """The planner with some of its fields set anew; its plans keep their shape."""
+        return dataclasses.replace(self, **dict(settings))  # type: ignore[type-var]
+
+    def with_solver(self, solver: LbfgsConfig = _LONG) -> Self:
+        """The planner with one search from the first guess instead of its rounds, a long one."""
+        return self.changed((("rounds", (Round(solver=solver),)),))

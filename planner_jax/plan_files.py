@@ -1,0 +1,88 @@
+"""Dataclasses of arrays as NumPy's .npz files: names of the fields, a version, and no pickle."""
+
+import dataclasses
+import json
+import os
+import typing
+import zipfile
+from typing import Any, TypeVar
+
+import numpy as np
+
+VERSION = 1
+_HEADER = "header"
+Kind = TypeVar("Kind")
+
+
+class PlanFileError(ValueError):
+    """A file cannot be read as plans; one line that names the file."""
+
+
+def save_arrays(path: str | os.PathLike, tree: Any) -> None:
+    """Write a dataclass, the leaves of which are arrays or such dataclasses, whole or not at all.
+
+    Args:
+        path: of the file; its name is taken as it is.
+        tree: the dataclass.
+    """
+    header = json.dumps({"version": VERSION, "class": type(tree).__name__})
+    arrays = {name: np.asarray(leaf) for name, leaf in _leaves(tree)}
+    scratch = f"{os.fspath(path)}.tmp"
+    with open(scratch, "wb") as file:
+        np.savez(file, **{_HEADER: np.array(header)}, **arrays)
+    os.replace(scratch, path)
+
+
+def load_arrays(path: str | os.PathLike, kind: type[Kind]) -> Kind:
+    """The dataclass that `save_arrays` wrote, NumPy leaves.
+
+    Raises:
+        PlanFileError: the file is something else, of another class or of another version.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = dict(file)
+        header = json.loads(str(arrays.pop(_HEADER)))
+        version, name = header["version"], header["class"]
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        if isinstance(error, FileNotFoundError):
+            raise PlanFileError(f"path must be a file of plans, got {str(path)!r}") from None
+        raise PlanFileError(
+            f"path must be a whole file of plans, got {str(path)!r} ({type(error).__name__})"
+        ) from None
+    if version != VERSION or name != kind.__name__:
+        raise PlanFileError(
+            f"path must be a file of {kind.__name__} of version {VERSION}, got {name} of version "
+            f"{version} in {str(path)!r}"
+        )
+    try:
+        tree = _tree(kind, "", arrays)
+    except KeyError as error:
+        raise PlanFileError(f"path must hold {error.args[0]}, got {str(path)!r}") from None
+    if arrays:
+        raise PlanFileError(f"path must not hold {', '.join(arrays)}, got {str(path)!r}")
+    return tree
+
+
+def _leaves(tree: Any, prefix: str = "") -> list[tuple[str, Any]]:
+    """Names, joined by dots, and arrays of a dataclass."""
+    named = []
+    for field in dataclasses.fields(tree):
+        value = getattr(tree, field.name)
+        inner = dataclasses.is_dataclass(value)
+        place = prefix + field.name
+        named += _leaves(value, f"{place}.") if inner else [(place, value)]
+    return named
+
+
+def _tree(kind: type, prefix: str, arrays: dict[str, np.ndarray]) -> Any:
+    """A dataclass of the arrays of its names, which are taken out."""
+    types = typing.get_type_hints(kind)
+    values = {}
+    for field in dataclasses.fields(kind):
+        inner, place = types[field.name], prefix + field.name
+        if dataclasses.is_dataclass(inner):
+            values[field.name] = _tree(inner, f"{place}.", arrays)
+        else:
+            values[field.name] = arrays.pop(place)
+    return kind(**values)

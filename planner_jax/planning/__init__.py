@@ -1,0 +1,1 @@
+"""The calls of a user: plan, solve, replan and gradient, for planners of any kind."""

@@ -1,0 +1,119 @@
+"""A planner that first has a decision taken: in what order, when, which of several."""
+
+from typing import Any, Generic, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array, lax
+
+from planner_jax.planning.batch import better_of, merged
+from planner_jax.protocol import Attempt, Case, Decision, Drive, Plan, is_solved, is_unsolved
+
+CaseT = TypeVar("CaseT", bound=Case)
+PlanT = TypeVar("PlanT", bound=Plan)
+
+
+@struct.dataclass
+class DecidedPlanner(Generic[CaseT, PlanT]):
+    """A `CompositePlanner`: a decision proposes choices, a planner plans every one of them.
+
+    Of several choices the solved one of least `decision.rank` is kept, or the one of least
+    violation where none is solved. The planner's last attempt, its longest, is for cases of
+    which no choice is solved by then.
+    """
+
+    planner: Any
+    decision: Any  # a `Decision`
+
+    @property
+    def case_type(self) -> type | None:
+        """That of the planner."""
+        return getattr(self.planner, "case_type", None)
+
+    def replanner(self) -> Any:
+        """That of the planner: the order of the plan that is carried out is kept."""
+        return self.planner.replanner()
+
+    def settled(self, case: CaseT) -> tuple[Any, CaseT]:
+        """The planner inside, and the case with the decision's first choice; see `optimal_plan`."""
+        return self.planner, first_choice(self.decision, case)
+
+    def plan_by(self, drive: Drive, cases: Any) -> Any:
+        """The plans of a batch, with what was decided in them."""
+        is_resident = all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(cases))
+        if not drive.is_pure:
+            self.decision.check(cases)
+        choices = _proposals(self.decision, cases)
+        num = jax.tree.leaves(choices)[0].shape[1]
+        if num == 1:
+            choice = jax.tree.map(lambda leaf: leaf[:, 0], choices)
+            decided = cases.decided(choice if is_resident else jax.device_get(choice))
+            plans, unsolved = drive(self.planner, decided)
+        else:
+            decided, plans = self._best_choice(drive, cases, choices, num)
+            unsolved = is_unsolved(plans.status)
+        if not drive.is_pure and not np.any(unsolved):
+            return plans
+        status = _explained(self.decision, decided, plans.status)
+        return plans.replace(status=status if is_resident else np.asarray(status))
+
+    def _best_choice(self, drive: Drive, cases: Any, choices: Any, num: int) -> tuple[Any, Any]:
+        """The cases as decided and their plans, after all choices have been planned together."""
+        xp: Any = jnp if drive.is_pure else np
+        if not drive.is_pure:
+            cases, choices = jax.tree.map(np.asarray, (cases, choices))
+        tried = [cases.decided(jax.tree.map(lambda leaf: leaf[:, k], choices)) for k in range(num)]  # noqa: B023
+        together = jax.tree.map(lambda *leaves: xp.concatenate(leaves), *tried)
+        *others, last = self.planner.attempts
+        plans, _ = drive(self.planner, together, others or [last])
+        of_case = lambda leaf: leaf.reshape(num, -1, *leaf.shape[1:])  # noqa: E731
+        if others:
+            has_plan = of_case(is_solved(plans.status)).any(axis=0)
+            left = is_unsolved(plans.status) & ~xp.tile(has_plan, num)
+            plans = self._with_attempt(drive, last, together, plans, left)
+        plans, together = jax.tree.map(lambda x: of_case(xp.asarray(x)), (plans, together))
+        worse = 1e6 + xp.nan_to_num(plans.violation, nan=1e9)
+        rank = xp.where(is_solved(plans.status), self.decision.rank(plans), worse)
+        chosen, lanes = rank.argmin(axis=0), np.arange(rank.shape[1])
+        return jax.tree.map(lambda leaf: leaf[chosen, lanes], (together, plans))
+
+    def _with_attempt(
+        self, drive: Drive, attempt: Attempt, cases: Any, plans: Any, left: Any
+    ) -> Any:
+        """The plans after one more attempt at the cases that are left, (B,) bool."""
+        if drive.is_pure:
+            again = lambda plans: better_of(  # noqa: E731
+                plans, drive(self.planner, cases, [attempt])[0], left
+            )
+            return lax.cond(jnp.any(left), again, lambda plans: plans, plans)
+        lanes = np.flatnonzero(left)
+        if not lanes.size:
+            return plans
+        some = jax.tree.map(lambda leaf: leaf[lanes], cases)
+        return merged(plans, drive(self.planner, some, [attempt])[0], lanes)
+
+
+@jax.jit
+def _proposals(decision: Any, cases: Any) -> Any:
+    """The choices of every case, leaves (B, F, ...)."""
+    return jax.vmap(decision.propose)(cases)
+
+
+@jax.jit
+def _explained(decision: Any, cases: Any, status: Array) -> Array:
+    """The statuses (B,), those of unsolved cases with what the decision knows of them."""
+    return jax.vmap(decision.explain)(cases, status)
+
+
+def first_choice(decision: Decision, cases: Any) -> Any:
+    """The cases with a decision's first choice, without planning; one case or a batch.
+
+    It is pure, and constant to derivatives.
+    """
+    if cases.batch_shape == ():
+        choices = decision.propose(lax.stop_gradient(cases))
+        return cases.decided(jax.tree.map(lambda leaf: leaf[0], choices))
+    choices = _proposals(decision, lax.stop_gradient(cases))
+    return cases.decided(jax.tree.map(lambda leaf: leaf[:, 0], choices))

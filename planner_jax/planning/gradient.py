@@ -1,0 +1,92 @@
+"""`gradient`: plans, and how one of their numbers changes with the case."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, Generic, TypeVar
+
+from flax import struct
+from jax import Array
+
+from planner_jax.optimise.lbfgs import LbfgsConfig
+from planner_jax.optimise.sensitivity import Differentiated, Quantity, part_of
+from planner_jax.planning.decided import DecidedPlanner
+from planner_jax.planning.plan import plan
+from planner_jax.protocol import Plan
+
+PlanT = TypeVar("PlanT", bound=Plan)
+
+
+@struct.dataclass
+class PlanGradient(Generic[PlanT]):
+    """Plans, a number of each, and its gradient; leaves with the batch shape of the cases."""
+
+    plans: PlanT
+    value: Array  # ()
+    by: dict[str, Any]  # name -> what the case has there, of d value / d leaf
+    # () how exact the adjoint is, 0 if it is; NaN, and so is `by`, where the cost of the plan does
+    # not curve upward, so that there is no minimum to follow.
+    residual: Array
+
+
+def gradient(
+    planner: Any,
+    cases: Any,
+    *,
+    of: Quantity,
+    by: str | Sequence[str],
+    steps: int = 1,
+    curvature: str = "core",
+    solver: LbfgsConfig | None = None,
+    chunk: int | None = None,
+    devices: Sequence[Any] | None = None,
+) -> PlanGradient:
+    """`plan`, and the gradient of one number of every plan by parts of its case.
+
+    The gradient is that of an optimum, by the implicit function theorem. A plan that the solver
+    left before its optimum has none: what comes back there is the theorem's formula at the
+    plan's point, which need not even have the right sign, or NaN where the cost does not curve
+    upward (41 % of hits after 7 iterations, 1.6 % after 60, 1 % after 150). Where gradients
+    matter give a `solver` with iterations enough; `optimal_plan` is the exact and slow way. For
+    contact times of 48 easy serves in float32 the relative error to the optimum's gradient is
+    (median, p90) 1, 2.8 with the default 7 iterations, NaN taken for 0; 0.04, 2.0 with 60;
+    0.016, 1.0 with 150; 0.011, 0.07 with 400.
+
+    Args:
+        planner: one that minimises, such as `pj.hit.planner("exact")`. What it decides on first,
+            such as an order, is kept fixed.
+        cases: one case or a batch.
+        of: the number: names joined by dots, such as "stroke.time", "cost" or "violation", or a
+            function of one plan. A function is compiled for anew with every new function object.
+        by: a place in the case, or some, such as "racket_height", "limits", "net.radius".
+        steps: of the conjugate gradients for the adjoint. One is exact where no limit binds;
+            0 is exact for "cost", by the envelope theorem.
+        curvature: "core" is quick; "whole" takes the Hessian itself, exact where limits bind
+            too, at the cost of some n solver iterations.
+        solver: one search with this in the place of the planner's rounds.
+        chunk: as for `plan`.
+        devices: as for `plan`.
+
+    Raises:
+        TypeError: the planner does not minimise.
+        ValueError: a name is not of the plan or the case, `steps` < 0, or `curvature` is unknown.
+    """
+    by = (by,) if isinstance(by, str) else tuple(by)
+    for name in by:
+        part_of(cases, name)
+    if isinstance(planner, DecidedPlanner):
+        cases = cases.decided(plan(planner, cases, chunk=chunk, devices=devices).choice)
+        planner = planner.planner
+    if not hasattr(planner, "objective"):
+        raise TypeError(
+            f"{type(planner).__name__} minimises nothing, so that its plans have no gradient: use "
+            "the planner exact"
+        )
+    if solver is not None:
+        planner = planner.with_solver(solver)
+    differentiated = Differentiated(planner, of, by, steps, curvature)
+    plans = plan(differentiated, cases, chunk=chunk, devices=devices)
+    return PlanGradient(plans=plans.whole_plan(), **_fields(plans.gradient))
+
+
+def _fields(tree: Any) -> dict[str, Any]:
+    return {field.name: getattr(tree, field.name) for field in dataclasses.fields(tree)}

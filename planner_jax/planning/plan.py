@@ -1,0 +1,236 @@
+"""`plan`: one call for one case or a million, on one device or all of them; and `solve`, pure."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.core import Tracer
+from jax.experimental import multihost_utils
+
+from planner_jax.planning.batch import better_of, plan_batch, plan_on_host
+from planner_jax.planning.single import plan_single
+from planner_jax.planning.solved import solve_cases
+from planner_jax.protocol import (
+    AnyPlanner,
+    Attempt,
+    Case,
+    CompositePlanner,
+    HostPlanner,
+    Plan,
+    is_unsolved,
+)
+
+CaseT = TypeVar("CaseT", bound=Case)
+PlanT = TypeVar("PlanT", bound=Plan)
+
+
+def plan(
+    planner: AnyPlanner[CaseT, PlanT],
+    cases: CaseT,
+    *,
+    chunk: int | None = None,
+    devices: Sequence[Any] | None = None,
+) -> PlanT:
+    """Plan one case, or a batch of them with a leading axis on every leaf.
+
+    Args:
+        planner: such as `pj.hit.planner("exact")`; its attempts are made in order, each at the
+            cases that are still unsolved.
+        cases: a pytree; a batch has one more axis than a single case.
+        chunk: cases that a device solves in one compiled call. The default suits the device.
+        devices: that share a batch. By default all local ones, `jax.local_devices()`.
+
+    Returns:
+        The planner's plans with the batch shape of the cases. The leaves are NumPy arrays;
+        of a batch in jax arrays they are jax arrays too, and nothing leaves the devices but
+        how many cases are unsolved: each device holds its share, or the first one all if the
+        batch cannot be shared evenly. Look at `status`: a case that could not be solved says so
+        and holds the best that was found. The same call gives the same bits. In other company,
+        chunks or devices a case's arithmetic is rounded differently, and where few iterations
+        end short of the optimum it may end elsewhere, rarely with another status.
+        Inside a compiled function of the caller's own it is `solve`.
+
+    Raises:
+        ValueError: the leaves have not one batch axis or none, or of different lengths, the
+            batch is empty, `chunk` < 1, or there are no `devices`.
+        TypeError: the cases are of another task than the planner; or within a transformation of
+            JAX that the planner does not allow, see `solve`.
+    """
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((planner, cases))):
+        return solve(planner, cases)
+    _require_fit(planner, cases)
+    alone = cases.batch_shape == ()
+    if alone and not isinstance(planner, HostPlanner | CompositePlanner):
+        return plan_single(planner, planner.attempts, cases)
+    if alone:
+        cases = jax.tree.map(lambda leaf: np.asarray(leaf)[None], cases)
+    require_batch(cases)
+    if chunk is not None and chunk < 1:
+        raise ValueError(f"chunk must be >= 1, got {chunk}")
+    if devices is not None and not len(devices):
+        raise ValueError("devices must be at least one, got none")
+    plans, _ = _Drive(chunk, devices)(planner, cases)
+    return jax.tree.map(lambda leaf: leaf[0], plans) if alone else plans
+
+
+@dataclasses.dataclass(frozen=True)
+class _Drive:
+    """Carries out planners on batches, from the host."""
+
+    chunk: int | None
+    devices: Sequence[Any] | None
+    is_pure = False
+
+    def __call__(
+        self, planner: Any, cases: Any, attempts: Sequence[Attempt] | None = None
+    ) -> tuple[Any, Any]:
+        """Plans, and numbers that are all zero if no case is unsolved."""
+        if isinstance(planner, CompositePlanner):
+            plans = planner.plan_by(self, cases)
+            leaves = jax.tree.leaves(cases)
+            if all(isinstance(leaf, jax.Array) for leaf in leaves) and not isinstance(
+                plans.status, jax.Array
+            ):
+                plans = jax.device_put(plans, self.devices[0] if self.devices else None)
+            return plans, is_unsolved(plans.status)
+        tried: Sequence[Attempt] = planner.attempts if attempts is None else attempts
+        if isinstance(planner, HostPlanner):
+            return plan_on_host(planner, tried, cases)
+        return plan_batch(planner, tried, cases, self.chunk, self.devices)
+
+
+def solve(planner: AnyPlanner[CaseT, PlanT], cases: CaseT) -> PlanT:
+    """`plan` as a pure function, for the inside of a compiled function, `vmap` or `scan`.
+
+    Every attempt after the first is made only if some case is unsolved by then, but then at all
+    cases of the batch; `plan`, which takes out the solved ones, is quicker where few are left.
+
+    Args:
+        planner: as for `plan`.
+        cases: one case or a batch, as for `plan`.
+
+    Returns:
+        The plans, jax arrays.
+
+    Raises:
+        TypeError: the planner works on the host, or the result is differentiated: the way of a
+            solver is no derivative of the optimum.
+    """
+    _require_fit(planner, cases)
+    _require_pure(planner)
+    if cases.batch_shape == () and isinstance(planner, CompositePlanner):
+        plans = solve(planner, jax.tree.map(lambda leaf: leaf[None], cases))
+        return jax.tree.map(lambda leaf: leaf[0], plans)
+    return _solve(planner, cases)
+
+
+@jax.custom_jvp
+def _solve(planner: Any, cases: Any) -> Any:
+    return _drive_purely(planner, cases)[0]
+
+
+@_solve.defjvp
+def _refuse(primals: tuple, tangents: tuple) -> tuple:
+    raise TypeError(
+        "plan and solve cannot be differentiated: for gradients of plans there are pj.gradient, "
+        "and pj.optimal_plan inside a loss"
+    )
+
+
+class _DrivePurely:
+    """Carries out planners inside a compiled function."""
+
+    is_pure = True
+
+    def __call__(
+        self, planner: Any, cases: Any, attempts: Sequence[Attempt] | None = None
+    ) -> tuple[Any, Any]:
+        """Plans, and which cases are unsolved."""
+        if isinstance(planner, CompositePlanner):
+            plans = planner.plan_by(self, cases)
+            return plans, is_unsolved(plans.status)
+        _require_pure(planner)
+        first, *others = planner.attempts if attempts is None else attempts
+        plans = solve_cases(planner, cases, first)
+        for attempt in others:
+            unsolved = is_unsolved(plans.status)
+            again = lambda plans, attempt=attempt, unsolved=unsolved: better_of(  # noqa: E731
+                plans, solve_cases(planner, cases, attempt), unsolved
+            )
+            plans = lax.cond(jnp.any(unsolved), again, lambda plans: plans, plans)
+        return plans, is_unsolved(plans.status)
+
+
+_drive_purely = _DrivePurely()
+
+
+def _require_pure(planner: Any) -> None:
+    """Raise `TypeError` for a planner that works on the host."""
+    if isinstance(planner, HostPlanner):
+        raise TypeError(
+            f"{type(planner).__name__} works on the host: call pj.plan outside of what is compiled"
+        )
+
+
+def _require_fit(planner: Any, cases: Any) -> None:
+    """Raise `TypeError` unless the planner is a pytree and the cases are of its class."""
+    if not isinstance(planner, HostPlanner) and jax.tree.leaves(planner) == [planner]:
+        raise TypeError(
+            f"{type(planner).__name__} must be a pytree: put @jax.tree_util.register_static over "
+            "its frozen dataclass, or make it a flax.struct.dataclass if it holds arrays"
+        )
+    kind = getattr(planner, "case_type", None)
+    if kind is not None and not isinstance(cases, kind):
+        raise TypeError(
+            f"{type(planner).__name__} plans cases of the class {kind.__name__}, got "
+            f"{type(cases).__name__}"
+        )
+
+
+def require_batch(cases: Case) -> int:
+    """The length of a batch; raises `ValueError` unless all leaves have it."""
+    batch = cases.batch_shape
+    if len(batch) != 1 or batch[0] == 0:
+        raise ValueError(f"cases must be a batch of at least one, got batch shape {batch}")
+    for path, leaf in jax.tree_util.tree_leaves_with_path(cases):
+        if np.shape(leaf)[:1] != batch:
+            name = jax.tree_util.keystr(path)
+            raise ValueError(f"cases{name} must have {batch[0]} lanes, got shape {np.shape(leaf)}")
+    return batch[0]
+
+
+def plan_across_processes(
+    planner: AnyPlanner[CaseT, PlanT], cases: CaseT, *, chunk: int | None = None
+) -> PlanT:
+    """`plan` where each process of `jax.distributed` plans its share of one batch.
+
+    Args:
+        planner: as for `plan`, the same in every process.
+        cases: the whole batch, the same in every process.
+        chunk: as for `plan`.
+
+    Returns:
+        The whole batch's plans, leaves NumPy arrays, in every process.
+
+    Raises:
+        ValueError: as for `plan`, or the batch has fewer cases than there are processes.
+    """
+    num = require_batch(cases)
+    processes, mine = jax.process_count(), jax.process_index()
+    if num < processes:
+        raise ValueError(f"cases must have a lane for each of {processes} processes, got {num}")
+    shares = np.array_split(np.arange(num), processes)
+    longest = shares[0].size  # every process hands in as many
+    lanes = np.resize(shares[mine], longest)
+    plans = plan(planner, jax.tree.map(lambda leaf: np.asarray(leaf)[lanes], cases), chunk=chunk)
+    gathered = multihost_utils.process_allgather(plans)
+    kept = np.concatenate([np.arange(share.size) + k * longest for k, share in enumerate(shares)])
+
+    def whole(leaf: np.ndarray) -> np.ndarray:
+        return np.asarray(leaf).reshape(-1, *leaf.shape[2:])[kept]
+
+    return jax.tree.map(whole, gathered)

@@ -1,0 +1,275 @@
+"""What `plan` asks of a planner and of a decision, and what comes back for every case.
+
+A planner is a pytree: sizes and switches are static, arrays such as a library of motions or the
+weights of a network are leaves, so that other arrays of the same shapes compile nothing anew. A
+frozen dataclass of sizes and switches alone is made one by `jax.tree_util.register_static`.
+
+There are four kinds, and `plan` takes them all. A `Planner` solves one case at a time in a pure
+function. A `LanesPlanner` also solves a batch in a layout of its own. A `HostPlanner` works on
+NumPy arrays on the host, with whatever library it likes. A `CompositePlanner` has other planners
+do the work. Planners that minimise an objective inherit all of it from
+`planner_jax.optimise.planner.OptimisedPlanner`.
+"""
+
+import dataclasses
+import enum
+import os
+from collections.abc import Sequence
+from typing import Any, Protocol, Self, TypeVar, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+from planner_jax.plan_files import load_arrays, save_arrays
+
+
+class Status(enum.IntEnum):
+    """What became of one case; `message` says what it means and what to do about it."""
+
+    CONVERGED = 0
+    FEASIBLE = 1
+    INFEASIBLE = 2
+    MAX_STEPS = 3
+    NON_FINITE = 4
+    OUT_OF_REACH = 5
+
+    @property
+    def message(self) -> str:
+        """A sentence for the user, with the remedy."""
+        return _MESSAGES[self]
+
+
+_MESSAGES = {
+    Status.CONVERGED: "stationary, and every limit holds",
+    Status.FEASIBLE: "every limit holds; more iterations may lower the cost",
+    Status.INFEASIBLE: "stationary with a limit exceeded; try more starts, or relax the limit",
+    Status.MAX_STEPS: "out of iterations with a limit exceeded; allow more iterations or starts",
+    Status.NON_FINITE: "the case or its cost is not finite; check the case for NaN",
+    Status.OUT_OF_REACH: "a target never comes within reach; `closest_approach` says by how much",
+}
+
+
+def is_solved(status: Any) -> Any:
+    """Which statuses are those of a plan that meets every limit the planner looked at."""
+    return (status == Status.CONVERGED) | (status == Status.FEASIBLE)
+
+
+def is_unsolved(status: Any) -> Any:
+    """Which statuses are worth another attempt: not solved, and not broken either."""
+    return (status >= Status.INFEASIBLE) & (status != Status.NON_FINITE)
+
+
+# Plans are refereed to 1e-3 of a limit; half of that is left for peaks between samples.
+FEASIBILITY_TOLERANCE = 5e-4
+
+
+def status_of(cost: Array, violation: Array, stationary: Array | bool) -> Array:
+    """The `Status` of a finished case, () int32."""
+    feasible = violation <= FEASIBILITY_TOLERANCE
+    status = jnp.where(
+        feasible,
+        jnp.where(stationary, Status.CONVERGED, Status.FEASIBLE),
+        jnp.where(stationary, Status.INFEASIBLE, Status.MAX_STEPS),
+    )
+    finite = jnp.isfinite(cost) & jnp.isfinite(violation)
+    return jnp.where(finite, status, Status.NON_FINITE).astype(jnp.int32)
+
+
+def outcome(cost: Array, violation: Array, *, stationary: Array | bool = True) -> dict[str, Array]:
+    """The fields that every `Plan` has, of a planner that does not iterate.
+
+    Args:
+        cost: (), the planner's own objective.
+        violation: (), largest relative excess over a limit that the planner saw.
+        stationary: () bool, whether another attempt could not change the plan.
+    """
+    return {
+        "cost": cost,
+        "violation": violation,
+        "iterations": jnp.zeros_like(cost, jnp.int32),
+        "status": status_of(cost, violation, stationary),
+    }
+
+
+@struct.dataclass
+class Plan:
+    """What every planner gives back: the outcome; a task's own plan adds the motion.
+
+    One plan, or a batch of them with a leading axis on every leaf.
+    """
+
+    cost: Array  # (), the planner's own objective
+    violation: Array  # (), largest relative excess over a limit that the planner saw; <= 0 is good
+    iterations: Array  # () int32
+    status: Array  # () int32, a `Status`
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Write the plan, or the batch, as NumPy's .npz; `load` of the same class reads it."""
+        save_arrays(path, self)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike) -> Self:
+        """The plan or batch that `save` wrote, NumPy leaves.
+
+        Raises:
+            PlanFileError: the file is not one of plans, or of another class or version; one line.
+        """
+        return load_arrays(path, cls)
+
+
+class Case(Protocol):
+    """A pytree of arrays for one case, or for a batch with a leading axis on every leaf."""
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """() for one case, (B,) for a batch."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Attempt:
+    """One try at the cases that earlier tries left unsolved; static under jit."""
+
+    starts: int = 1  # places that one case takes in a batch
+
+    def __post_init__(self) -> None:
+        if self.starts < 1:
+            raise ValueError(f"starts must be >= 1, got {self.starts}")
+
+
+CaseT = TypeVar("CaseT", contravariant=True)
+PlanT = TypeVar("PlanT", bound=Plan, covariant=True)
+
+
+class Planner(Protocol[CaseT, PlanT]):
+    """Solves one case; pure, so that `plan` may compile, batch and spread it over devices.
+
+    A planner may have a `case_type`, the class of its cases; `plan` then refuses others.
+    """
+
+    @property
+    def attempts(self) -> Sequence[Attempt]:
+        """What to try, in order."""
+        ...
+
+    def solve(self, case: CaseT, attempt: Any, /) -> PlanT:
+        """The plan that one attempt makes of one case."""
+        ...
+
+
+@runtime_checkable
+class LanesPlanner(Protocol[CaseT, PlanT]):
+    """A `Planner` that solves a batch in a layout of its own."""
+
+    @property
+    def attempts(self) -> Sequence[Attempt]:
+        """What to try, in order."""
+        ...
+
+    def solve(self, case: CaseT, attempt: Any, /) -> PlanT:
+        """The plan that one attempt makes of one case."""
+        ...
+
+    def solve_lanes(self, cases: CaseT, attempt: Any, /) -> PlanT:
+        """The plans that one attempt makes of a batch; a leading axis on every leaf; pure."""
+        ...
+
+
+@runtime_checkable
+class HostPlanner(Protocol[CaseT, PlanT]):
+    """Solves a batch on the host, outside of compiled programs."""
+
+    @property
+    def attempts(self) -> Sequence[Attempt]:
+        """What to try, in order."""
+        ...
+
+    def solve_on_host(self, cases: CaseT, attempt: Any, /) -> PlanT:
+        """The plans that one attempt makes of a batch with NumPy leaves; NumPy leaves."""
+        ...
+
+
+class Drive(Protocol):
+    """What a `CompositePlanner` has its other planners carried out by."""
+
+    @property
+    def is_pure(self) -> bool:
+        """Whether this happens inside a compiled program, where nothing is a number yet."""
+        ...
+
+    def __call__(
+        self, planner: Any, cases: Any, attempts: Sequence[Attempt] | None = None
+    ) -> tuple[Any, Any]:
+        """Plans of a batch by some of a planner's attempts, by default all of them.
+
+        Returns:
+            The plans, and numbers that are all zero if no case is unsolved.
+        """
+        ...
+
+
+@runtime_checkable
+class CompositePlanner(Protocol[CaseT, PlanT]):
+    """Has other planners plan a batch, once or several times."""
+
+    def plan_by(self, drive: Drive, cases: CaseT, /) -> PlanT:
+        """The plans of a batch."""
+        ...
+
+
+AnyPlanner = (
+    Planner[CaseT, PlanT]
+    | LanesPlanner[CaseT, PlanT]
+    | HostPlanner[CaseT, PlanT]
+    | CompositePlanner[CaseT, PlanT]
+)
+
+
+class Decision(Protocol):
+    """Settles what a case leaves open, such as an order; a pytree, as planners are.
+
+    Best of all orders, a network's answer and what was given are all of this kind.
+    """
+
+    def check(self, cases: Any, /) -> None:
+        """Raise `ValueError` for a batch about which this cannot decide; on the host."""
+        ...
+
+    def propose(self, case: Any, /) -> Any:
+        """Choices for one case, best first, that `case.decided` takes; leaves (F, ...); pure."""
+        ...
+
+    def rank(self, plans: Any, /) -> Array:
+        """What is least for the choice whose plan is to be kept, one number a plan; pure.
+
+        It takes plans of any batch shape, in NumPy or jax arrays.
+        """
+        ...
+
+    def explain(self, case: Any, status: Array, /) -> Array:
+        """The status () of an unsolved case, or one that says more; pure."""
+        ...
+
+
+Tree = TypeVar("Tree")
+
+
+def lane(tree: Tree, k: Any) -> Tree:
+    """One case, plan or verdict of a batch, or some of them: entry `k` of every leaf.
+
+    Args:
+        tree: a pytree, or a dataclass of arrays such as a verdict, with a leading axis.
+        k: a place, a slice, or an array of places.
+    """
+    if dataclasses.is_dataclass(tree) and jax.tree_util.all_leaves([tree]):
+        fields = {f.name: getattr(tree, f.name)[k] for f in dataclasses.fields(tree)}
+        return dataclasses.replace(tree, **fields)  # type: ignore[type-var]
+    return jax.tree.map(lambda leaf: leaf[k], tree)
+
+
+def solved(plans: Plan) -> np.ndarray:
+    """Whether each plan meets every limit that its planner looked at, bool; see `Status`."""
+    return np.asarray(is_solved(plans.status))

@@ -1,0 +1,80 @@
+"""Plans that a quadrotor flies, and what a controller wants to know of them."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+from planner_jax.protocol import Plan
+from planner_jax.robot.quadrotor import body_z, flat_attitude, net_thrust, tilt_quaternion
+from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
+
+
+@dataclasses.dataclass(frozen=True)
+class QuadrotorSetpoints:
+    """A plan at K equally spaced times; world frame, z up; body x forward, z along the thrust.
+
+    Of a batch every array but `time` has a leading axis B, and is NaN past the end of each plan.
+    """
+
+    time: np.ndarray  # (K,) [s] since the plan began
+    pos: np.ndarray  # (K, 3) [m], of the propeller plane's centre
+    vel: np.ndarray  # (K, 3) [m/s]
+    acc: np.ndarray  # (K, 3) [m/s^2]
+    quat_wxyz: np.ndarray  # (K, 4), body to world, at zero heading of the Hopf fibration
+    body_rate: np.ndarray  # (K, 3) [rad/s], body frame
+    thrust: np.ndarray  # (K,) [m/s^2], per unit mass
+
+
+@struct.dataclass
+class QuadrotorPlan(Plan):
+    """A plan with the trajectory of a quadrotor's propeller plane."""
+
+    trajectory: PiecewisePolynomial
+    gravity: Array  # () [m/s^2], magnitude, for which it was planned
+
+    def sample(self, rate: float) -> QuadrotorSetpoints:
+        """The plan, or the batch, at a rate [Hz], from its beginning up to its end.
+
+        Raises:
+            ValueError: the rate is not positive.
+        """
+        if not rate > 0.0:
+            raise ValueError(f"rate must be > 0, got {rate}")
+        is_one = np.ndim(self.gravity) == 0
+        path, gravity = jax.tree.map(
+            lambda leaf: np.asarray(leaf)[None] if is_one else np.asarray(leaf),
+            (self.trajectory, self.gravity),
+        )
+        ends = path.durations.sum(axis=-1)
+        last = np.nanmax(ends, initial=0.0)
+        time = np.arange(int(last * rate * (1.0 + 1e-6)) + 1) / rate
+        sampled = jax.tree.map(np.array, _sampled(path, gravity, time.astype(path.coeffs.dtype)))
+        past = ~(time <= ends[:, None] * (1.0 + 1e-6))
+        for leaf in sampled.values():
+            leaf[past] = np.nan
+        return QuadrotorSetpoints(
+            time=time, **{name: leaf[0] if is_one else leaf for name, leaf in sampled.items()}
+        )
+
+
+@jax.jit
+def _sampled(path: PiecewisePolynomial, gravity: Array, time: Array) -> dict[str, Array]:
+    """The setpoints of plans with leaves (B, ...) at times (K,)."""
+
+    def at(path: PiecewisePolynomial, gravity: Array, time: Array) -> dict[str, Array]:
+        pos, vel, acc, jerk = (evaluate(path, time, order) for order in range(4))
+        return {
+            "pos": pos,
+            "vel": vel,
+            "acc": acc,
+            "quat_wxyz": tilt_quaternion(body_z(acc, gravity)),
+            "body_rate": flat_attitude(acc, jerk, gravity)[1],
+            "thrust": jnp.sqrt(jnp.sum(net_thrust(acc, gravity) ** 2)),
+        }
+
+    of_plan = jax.vmap(at, in_axes=(None, None, 0))
+    return jax.vmap(of_plan, in_axes=(0, 0, None))(path, gravity, time)

@@ -1,0 +1,2 @@
+from . import catch as catch
+from . import hit as hit

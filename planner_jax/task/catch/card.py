@@ -1,0 +1,46 @@
+"""What the registry knows of catches; imports no JAX."""
+
+import dataclasses
+
+from planner_jax.registry import Task
+
+
+@dataclasses.dataclass(frozen=True)
+class Suite:
+    """One kind of catching task."""
+
+    num_targets: int
+    horizon: float  # [s], until when a target may be caught at the latest
+    description: str
+
+
+# The ranges are those of `planner_jax.task.catch.suites`.
+SUITES = {
+    "throws": Suite(1, 1.42, "The paper's throws: with drag, to within 2 m x 0.8 m."),
+    "hard": Suite(1, 1.22, "Throws to within 4 m x 3 m that are seen 0.2 s later."),
+    "parabola1": Suite(1, 1.66, "A throw without drag, as high as its flight time asks."),
+    "parabola2": Suite(2, 1.96, "Two throws without drag, in the air together."),
+    "harmonic2": Suite(2, 7.0, "Two targets that swing in height and drift across."),
+    "triangle3": Suite(3, 6.0, "Three targets along the sides of a triangle."),
+    "hexagon6": Suite(6, 10.0, "Six targets in parallel, on a hexagon."),
+}
+
+DECISIONS = {
+    "best": "planner_jax.task.catch.decide:Best",
+    "greedy": "planner_jax.task.catch.decide:Greedy",
+    "given": "planner_jax.task.catch.decide:Given",
+}
+
+TASK = Task(
+    name="catch",
+    summary="a quadrotor catches flying targets with a net",
+    home="planner_jax.task.catch",
+    planners={
+        "exact": "planner_jax.task.catch.exact:ExactCatch",
+        "catch": "planner_jax.task.catch.paper:PaperCatch",
+        "mpp": "planner_jax.task.catch.mpp:MppCatch",
+    },
+    suites={name: suite.description for name, suite in SUITES.items()},
+    sweep="planner_jax.sweep.catch.sweep:CatchSweep",
+    flight="planner_jax.sims.tasks.catch:CatchFlight",
+)

@@ -1,0 +1,71 @@
+"""The words of the task: `pj.catch.planner` and `judge`; `case` and `draw` stand beside."""
+
+import pkgutil
+from typing import Any
+
+from planner_jax.planning.decided import DecidedPlanner
+from planner_jax.protocol import Decision
+from planner_jax.referee.catch import CatchVerdict, referee_catches
+from planner_jax.registry import require_name
+from planner_jax.task.catch.card import DECISIONS, TASK
+from planner_jax.task.catch.case import CatchCase
+from planner_jax.task.catch.plan import CatchPlan
+from planner_jax.task.judged import judged
+
+
+def planner(
+    name: str = "exact", *, decide: str | Decision = "best", **options: Any
+) -> DecidedPlanner[CatchCase, CatchPlan]:
+    """The catch planner of a name, behind a decision about order and times.
+
+    * `exact`: the ball is in the net by construction; the one to use.
+    * `catch`: the published planner of paper 000, which meets the ball by penalties.
+    * `mpp`: the motion primitives that paper 000 compares with; nothing is optimised.
+
+    Args:
+        name: one of these, or one that another package offers.
+        decide: "best" plans the most promising of all orders and keeps the earliest last catch,
+            "greedy" catches next what it can reach first, "given" takes order and times of the
+            cases; or a decision with settings, such as `Best(finalists=3)`.
+        **options: fields of that planner's dataclass, for example `rounds`.
+
+    Returns:
+        A planner for `pj.plan`; its `planner` is an `ExactCatch`, `PaperCatch` or `MppCatch`.
+        The plans hold the order and the times that were decided.
+
+    Raises:
+        ValueError: there is no planner or decision of that name.
+        TypeError: the planner has no such field.
+    """
+    return DecidedPlanner(TASK.make_planner(name, options), decision(decide))
+
+
+def decision(decide: str | Decision) -> Decision:
+    """The decision of a name, or the decision itself.
+
+    Raises:
+        ValueError: there is no decision of that name.
+    """
+    if not isinstance(decide, str):
+        return decide
+    require_name(DECISIONS, "decide", decide)
+    return pkgutil.resolve_name(DECISIONS[decide])()
+
+
+def judge(cases: CatchCase, plans: CatchPlan, **settings: Any) -> CatchVerdict:
+    """What the referee says of one plan or of a batch: the physics alone decides.
+
+    Args:
+        cases: one case, or a batch.
+        plans: of them.
+        **settings: such as `tolerance` and `net_test`; see `referee_catches`.
+
+    Returns:
+        A verdict with the batch shape of the cases: `success`, `sentence(k)`, and what was
+        measured.
+
+    Raises:
+        TypeError: the cases or plans are not catches.
+        ValueError: shapes that do not fit, or a setting out of its range.
+    """
+    return judged(referee_catches, cases, plans, (CatchCase, CatchPlan), settings)

@@ -1,0 +1,12 @@
+from .case import HitCase as HitCase
+from .case import HitLimits as HitLimits
+from .case import case as case
+from .exact import ExactHit as ExactHit
+from .plan import HitPlan as HitPlan
+from .plan import Stroke as Stroke
+from .serves import generate_serves as generate_serves
+from .serves import read_serves as read_serves
+from .serves import to_cases as to_cases
+from .words import draw as draw
+from .words import judge as judge
+from .words import planner as planner
