@@ -11,35 +11,77 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from planner_jax.ball.flight import BallState
+from planner_jax.ball.flight import BallState, rk4_step
+from planner_jax.ball.impact import racket_impact
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.multistart import solve_round
 from planner_jax.optimise.problem import Planner, Round
-from planner_jax.sims.closed_loop import Flight, Flown, Loop, Outlook, expected, flown, fly_leg
-from planner_jax.sims.launch import flight_keys, launched, ready, require_hovering, require_world
-from planner_jax.sims.model import RACKET
-from planner_jax.sims.scoring import Contact, landing_point, returned
+from planner_jax.sims.launch import flight_keys, launched, ready, require_start, require_world
+from planner_jax.sims.loop import FlightState, Flown, Loop, Outlook, expected, flown, fly_leg
+from planner_jax.sims.model import World
+from planner_jax.sims.recording import Launches
+from planner_jax.sims.robot import Tool
+from planner_jax.sims.robots.quadrotor.robot import Quadrotor
+from planner_jax.sims.scenery import Part
+from planner_jax.sims.scoring import Contact, passage
+from planner_jax.sims.settings import HIT_SUITES, HitFly
+from planner_jax.sims.task import FlightCases, Flights, FlightTask
+from planner_jax.sweep.columns import BOOL, NUMBER, VECTOR, Column
+from planner_jax.sweep.summary import percent
+from planner_jax.task.hit import court
 from planner_jax.task.hit.exact import ExactHit
 from planner_jax.task.hit.plan import HitPlan
+from planner_jax.task.hit.planners import planner as hit_planner
 from planner_jax.task.hit.replan import ReplanHit, ReplanHitScenario
-from planner_jax.task.hit.scenario import HitScenario
-from planner_jax.task.hit.serves import advance, generate_serves, to_scenarios
+from planner_jax.task.hit.scenario import GRAVITY, RACKET_HEIGHT, HitScenario
+from planner_jax.task.hit.serves import (
+    DEPTH,
+    SERVE_HEIGHT,
+    advance,
+    generate_serves,
+    to_scenarios,
+)
 from planner_jax.task.solve import plan as plan_all
 
 SEEN = 0.25  # [s], a serve's flight before it is planned for: 2 m and more (paper 000, VII-A)
 _AFTER = 0.1  # [s] flown after the last impact planned
 _LONGEST = 1.9  # [s], the longest flight
+_LANDING_STEPS, _LANDING_STEP = 150, 0.02  # [s], three seconds of flight
+_NEAR, _FAR = 0.5, 1.0  # [m] from the target: the two rates of paper 002
 
-# Serve, landing and target region of the simulated court (`court.SCENARIOS`) for the six real
-# scenarios of paper 002, Section VI-C, which it names in words alone: an assumption.
-SCENARIOS: Mapping[str, tuple[str, ...]] = {
-    "S.1": ("FNN", "FFN"),  # from different distances
-    "S.2": ("FFF", "LFF"),  # serves from different directions
-    "S.3": ("FFN", "FLN"),  # hit from different directions
-    "S.4": ("FFL", "FNL"),  # hit straight, shoot sideways
-    "S.5": ("FLL", "LLL"),  # hit and shoot sideways to the same side
-    "S.6": ("FLR", "LLR"),  # hit and shoot sideways to different sides
-}
+_LINE_COLOUR, _MIDDLE_COLOUR, _DEAD_COLOUR = "#FFFFFF", "#24292F", "#D98880"
+_LINE, _THIN = 0.03, 0.002  # [m], width and height of the court's lines
+
+
+def court_parts() -> list[Part]:
+    """The court of paper 002 as flat boxes: the dead zone, and the lines of both ends over it."""
+    length, width = court.HALF_LENGTH, court.HALF_WIDTH
+    lines = [((0.0, -width), (0.0, width))]  # first that at the net
+    for side in (-1.0, 1.0):
+        lines.append(((-length, side * width), (length, side * width)))
+        lines.append(((side * length, -width), (side * length, width)))
+        near, dead = side * court.NEAR_LINE, side * court.DEAD_ZONE
+        lines.append(((near, -court.LANE_LINE), (near, court.LANE_LINE)))
+        lines += [
+            ((dead, lane), (side * length, lane)) for lane in (-court.LANE_LINE, court.LANE_LINE)
+        ]
+    zone = (2.0 * court.DEAD_ZONE, 2.0 * width, _THIN)
+    parts = [Part("box", zone, (0.0, 0.0, 0.5 * _THIN), _DEAD_COLOUR)]
+    for number, (a, b) in enumerate(np.array(lines)):
+        length, width = np.abs(b - a) + _LINE
+        x, y = 0.5 * (a + b)
+        colour = _LINE_COLOUR if number else _MIDDLE_COLOUR
+        parts.append(Part("box", (length, width, 2.0 * _THIN), (x, y, _THIN), colour))
+    return parts
+
+
+HIT_WORLD = World(
+    Quadrotor(Tool("racket", RACKET_HEIGHT, radius=0.11)),  # paper 002, Fig. 2
+    GRAVITY,
+    scenery=tuple(court_parts()),
+    # Serves come from anywhere in a region: the middle of the far one.
+    mouth=(0.5 * (court.NEAR_LINE + DEPTH), 0.0, SERVE_HEIGHT),
+)
 
 
 def smooth_planner() -> ExactHit:
@@ -59,10 +101,11 @@ class HitPilot:
     """Plans a hit anew from the plan that is flown."""
 
     planner: ReplanHit = ReplanHit(ExactHit(drag_after_impact=True))
-    shortest: float = (
-        0.3  # [s], least time to the impact that is planned anew: the racket must settle
-    )
-    excess: float = 0.1  # relative, over a limit, with which a new plan is still flown
+    # Least time [s] to an impact that is planned anew: the racket must settle.
+    shortest: float = 0.3
+    # A new plan may break a limit by this share of the limit and is still flown.
+    excess: float = 0.1
+    passage = staticmethod(passage)
 
     def times(self, plan: HitPlan) -> Array:
         """When the ball is to be hit (1,) [s]."""
@@ -89,20 +132,11 @@ def believed(scenario: HitScenario, balls: BallState, drag: Array, head: Array) 
 
 
 @dataclasses.dataclass(frozen=True)
-class Volleys:
+class Volleys(FlightCases):
     """B serves, as they are when they are planned for."""
 
     scenarios: HitScenario  # leaves (B, ...), with the true ball and drag
     believed: np.ndarray  # (B,) K_D [1/m]
-    index: np.ndarray  # (B,) place in the whole, which decides the noise
-
-    def __len__(self) -> int:
-        return self.believed.size
-
-    def __getitem__(self, rows: Any) -> "Volleys":
-        """Some of them, picked as NumPy does."""
-        columns = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        return Volleys(**jax.tree.map(lambda leaf: leaf[rows], columns))
 
 
 def volleys(
@@ -123,25 +157,53 @@ def volleys(
     sign = np.random.default_rng([seed, 1]).choice([-1.0, 1.0], num)
     true = np.asarray(scenarios.drag)
     believed = (true * (1.0 + drag_error * sign)).astype(np.float32)
-    return Volleys(jax.tree.map(np.asarray, scenarios), believed, np.arange(num))
+    return Volleys(np.arange(num), jax.tree.map(np.asarray, scenarios), believed)
 
 
 @dataclasses.dataclass(frozen=True)
-class HitFlights:
-    """What came of a batch of serves; leaves with a leading axis B."""
+class HitFlights(Flights):
+    """What came of a batch of serves; leaves with a leading axis B, one ball (N = 1)."""
 
-    first_plan: HitPlan
-    flown: Flown  # times from the first plan; N = 1
     landing: np.ndarray  # (B, 3) [m], of the returned ball; NaN where it was missed
     miss: np.ndarray  # (B,) [m], from the target; inf where the ball was missed
-    planning_seconds: float  # of the host's clock, spent on plans from scratch
+
+    @property
+    def success(self) -> np.ndarray:
+        """Which balls landed near the target, (B,) bool."""
+        return self.miss <= _NEAR
+
+
+def returned(contact: Contact, restitution: Array) -> BallState:
+    """One ball just after the racket's impact, by the library's map (paper 002, eq. 3)."""
+    vel = racket_impact(contact.ball_vel, contact.tool_vel, contact.normal, restitution)
+    return BallState(pos=contact.ball_pos, vel=vel)
+
+
+def landing_point(ball: BallState, drag: Array, gravity: Array) -> tuple[Array, Array]:
+    """Where (3,) [m] one ball comes down to the ground, and when () [s] from now.
+
+    The library's flight with quadratic drag, three seconds at most; NaN for one still in the
+    air then.
+    """
+    step = jnp.full_like(drag, _LANDING_STEP)
+
+    def advance(state: BallState, _: None) -> tuple[BallState, Array]:
+        return rk4_step(state, step, drag, gravity), state.pos
+
+    _, path = jax.lax.scan(advance, ball, None, length=_LANDING_STEPS + 1)
+    falls = (path[:-1, 2] > 0.0) & (path[1:, 2] <= 0.0)
+    first = jnp.argmax(falls)
+    a, b = path[first], path[first + 1]
+    share = a[2] / jnp.where(falls[first], a[2] - b[2], 1.0)
+    point = jnp.where(falls[first], a + share * (b - a), jnp.nan)
+    return point, jnp.where(falls[first], (first + share) * step, jnp.nan)
 
 
 @functools.partial(jax.jit, static_argnames="loop")
-def _scenarios(loop: Loop, flights: Flight, truth: HitScenario) -> HitScenario:
+def _scenarios(loop: Loop, flights: FlightState, truth: HitScenario) -> HitScenario:
     """What is to be hit, as it is believed."""
 
-    def one(flight: Flight, scenario: HitScenario) -> HitScenario:
+    def one(flight: FlightState, scenario: HitScenario) -> HitScenario:
         balls = expected(loop, flight.earlier, loop.period)
         return believed(scenario, balls, flight.earlier.drag, scenario.head_state)
 
@@ -185,9 +247,10 @@ def fly_hits(
     Raises:
         ValueError: a world or plan does not fit.
     """
-    require_world(loop, RACKET, 1)
     planner, pilot = planner or smooth_planner(), pilot or HitPilot()
-    truth = jax.tree.map(jnp.asarray, cases.scenarios)
+    truth = cases.scenarios
+    require_world(loop, "racket", 1, gravity=truth.gravity, racket_height=truth.racket_height)
+    truth = jax.tree.map(jnp.asarray, truth)
     keys = flight_keys(seed, cases.index)
     drag = truth.drag[:, None]
     flight = ready(loop, truth.head_state[:, 0], keys)
@@ -205,11 +268,67 @@ def fly_hits(
     periods = loop.num_periods(_LONGEST - SEEN + _AFTER)
     flight, record = fly_leg(loop, pilot, flight, scenario, drag, num_periods=periods)
     landing, miss = jax.device_get(_landings(flight.contact, truth))
-    return HitFlights(first, flown(flight, [record]), landing, miss, planning)
+    return HitFlights(first, flown(flight, [record]), planning, landing, miss)
 
 
 def require_hit_plan(plan: Any, scenario: HitScenario) -> None:
     """Raise `ValueError` unless a plan is one of these hits."""
     if not isinstance(plan, HitPlan):
         raise ValueError(f"plan must be a HitPlan, got a {type(plan).__name__}")
-    require_hovering(scenario.head_state, plan)
+    require_start(scenario.head_state, plan)
+
+
+class HitFlight(FlightTask):
+    """Hits as a run of flights knows them; the settings are `HitFly`."""
+
+    settings: HitFly
+
+    CONTACT = "hit"
+    SUCCESS = f"landed within {_NEAR:g} m of the target"
+    # Paper 002 shows its rates as a figure.
+    PUBLISHED = "Bat, 600 real serves: within 0.5 m and 1 m, in a figure without numbers"
+    COLUMNS = (
+        Column("met", "", "by the racket", BOOL, lambda b: b.verdict.flown.contact.met[:, 0]),
+        Column("landing", "m", "of the returned ball", VECTOR, lambda b: b.verdict.landing),
+        Column("miss", "m", "from the target", NUMBER, lambda b: b.verdict.miss),
+    )
+
+    def world(self) -> World:
+        """The simulated world with the court."""
+        return HIT_WORLD
+
+    def cases(self) -> Volleys:
+        """All serves of the run."""
+        settings = self.settings
+        regions = HIT_SUITES[settings.suite]
+        return volleys(settings.num, regions, settings.seed, drag_error=settings.drag_error)
+
+    def fly(self, cases: Volleys, record: bool) -> HitFlights:
+        """Flights of some serves."""
+        name = self.settings.planner
+        planner = None if name == "exact" else hit_planner(name)
+        return fly_hits(self.loop(record), cases, self.settings.seed, planner=planner)
+
+    def launches(self, cases: Volleys, flown: Flown) -> Launches:
+        """The serves, and the balls that come back from the racket."""
+        scenarios = cases.scenarios
+        contact = jax.tree.map(lambda leaf: leaf[:, 0], flown.contact)
+        back = jax.device_get(jax.vmap(returned)(contact, scenarios.restitution))
+        balls = jax.tree.map(lambda leaf: leaf[:, None], scenarios.ball)
+        drag = scenarios.drag[:, None]
+        return Launches(balls, drag, np.zeros(1), SEEN, returned=back, target=scenarios.target)
+
+    @property
+    def suite(self) -> str:
+        """The suite of serves."""
+        return self.settings.suite
+
+    def counts(self, rows: Any) -> dict[str, int]:
+        """Balls that the racket met, and those that landed within the wider circle."""
+        miss, met = np.asarray(rows["miss"]), np.asarray(rows["met"])
+        return {"within_1_m": int((miss <= _FAR).sum()), "met": int(met.sum())}
+
+    def findings(self, summary: Mapping[str, Any]) -> list[str]:
+        """The wider circle, and the racket's part."""
+        within, met = (percent(summary[name], summary["num"]) for name in ("within_1_m", "met"))
+        return [f"{within} % within 1 m; the racket met the ball in {met} %."]
