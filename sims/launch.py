@@ -207,13 +207,16 @@ def require_world(loop: Loop, kind: str, num_balls: int, **planned: Any) -> None
             )
 
 
-def require_start(head_state: Any, plan: Any) -> None:
-    """Raise `ValueError` unless a plan begins where the robot rests.
+def require_plan(plan: Any, kind: type, head_state: Any) -> None:
+    """Raise `ValueError` unless a plan is one of the task and begins where the robot rests.
 
     Args:
-        head_state: (B, 4, 3) of the robot.
         plan: with a trajectory, leaves (B, ...).
+        kind: class of the task's plans.
+        head_state: (B, 4, 3) of the robot.
     """
+    if not isinstance(plan, kind):
+        raise ValueError(f"plan must be a {kind.__name__}, got a {type(plan).__name__}")
     begin = np.asarray(plan.trajectory.coeffs)[:, 0, 0]
     place = np.asarray(head_state)[:, 0]
     if begin.shape != place.shape:

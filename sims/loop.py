@@ -12,6 +12,7 @@ batch of it. Times count from the first plan.
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import jax
@@ -25,7 +26,7 @@ from planner_jax.sims import sensing as sight
 from planner_jax.sims.model import World, ball_states, ball_velocity, step
 from planner_jax.sims.noise import Sensing, require_whole
 from planner_jax.sims.robot import Physics
-from planner_jax.sims.scoring import Contact, Moment, moment, nearest
+from planner_jax.sims.scoring import Contact, moment, nearest
 from planner_jax.sims.sensing import Estimate
 
 
@@ -52,16 +53,9 @@ class Pilot(Protocol):
         """When each ball is to be met (N,) [s] since the plan began, in the balls' order."""
         ...
 
-    def passage(
-        self,
-        world: World,
-        before: Moment,
-        after: Moment,
-        time: Array,
-        planned: Array,
-        reference: Array,
-    ) -> tuple[Array, Contact]:
-        """Which balls (N,) bool are met or missed within a step, and how; as `scoring.passage`."""
+    @property
+    def passage(self) -> Callable[..., tuple[Array, Contact]]:
+        """What says which balls are met or missed within a step, like `scoring.passage`."""
         ...
 
 
@@ -149,9 +143,8 @@ def _fly_look(loop: Loop, pilot: Pilot, flight: FlightState, drag: Array) -> Fli
     world, robot, dtype = loop.world, loop.world.robot, flight.time.dtype
     key, noise_key, look_key = jax.random.split(flight.key, 3)
     noise = jax.random.normal(noise_key, robot.noise_shape, dtype)
-    path = robot.path(flight.plan)
     times = flight.time + world.timestep * jnp.arange(loop.steps_per_look, dtype=dtype)
-    references = robot.references(path, times - flight.began, world)
+    references = robot.references(flight.plan, times - flight.began, world)
     planned = flight.began + pilot.times(flight.plan)
     last = jnp.max(jnp.where(flight.present, planned, -jnp.inf))
 
@@ -228,7 +221,7 @@ def _planned_anew(
         balls=expected(loop, flight.estimates, loop.period),
         drag=flight.estimates.drag,
         present=flight.present & (pilot.times(flight.plan) > elapsed),
-        head_state=loop.world.robot.head_state(loop.world.robot.path(flight.plan), elapsed),
+        head_state=loop.world.robot.head_state(flight.plan, elapsed),
     )
     return pilot.plan_anew(scenario, flight.plan, outlook)
 
@@ -260,8 +253,7 @@ def _fly_period(
 
 def _recorded(loop: Loop, pilot: Pilot, flight: FlightState, drag: Array) -> Record:
     """Where everything is, and how wrong the balls' predictions are."""
-    world, robot = loop.world, loop.world.robot
-    path = robot.path(flight.plan)
+    world = loop.world
     horizon = flight.began + pilot.times(flight.plan) - flight.time
     now = moment(world, flight.physics)
     gravity = jnp.asarray(world.gravity, drag.dtype)
@@ -281,7 +273,7 @@ def _recorded(loop: Loop, pilot: Pilot, flight: FlightState, drag: Array) -> Rec
     return Record(
         time=flight.time,
         physics=flight.physics,
-        wanted=robot.head_state(path, flight.time - flight.began)[0],
+        wanted=world.robot.head_state(flight.plan, flight.time - flight.began)[0],
         horizon=horizon,
         error=jax.vmap(error)(
             now.ball_pos, ball_velocity(world, now.ball_vel, drag), drag, flight.estimates, horizon

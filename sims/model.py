@@ -8,9 +8,8 @@ spin (paper 002, Section II), so three slides are its joint. Ball drag is a forc
 `qfrc_applied`.
 
 In flight nothing touches: the racket's impact is the library's map and a caught ball has
-crossed the hoop's disc (`scoring`), so the batch model has no contacts. The model with contacts
-is for comparison with MuJoCo's own. Scenery and pitching machine are there to be looked at:
-they touch nothing and cost no step anything.
+crossed the hoop's disc (`scoring`), so the model has no contacts. Scenery and pitching machine are
+there to be looked at: they touch nothing and cost no step anything.
 
 MuJoCo's Euler is semi-implicit: the velocity it keeps lies half a step before the position. For
 a ball that is taken care of at both ends, by `placed` and `ball_velocity`, which makes its
@@ -55,7 +54,6 @@ class World:
     gravity: float  # [m/s^2], magnitude
     num_balls: int = 1
     timestep: float = 0.002  # [s]
-    contacts: bool = False  # of the balls with ground and tool
     scenery: tuple[Part, ...] = ()  # what else stands there, to be looked at
     mouth: tuple[float, float, float] | None = None  # [m], of the pitching machine, if any
 
@@ -73,7 +71,7 @@ class World:
 
 def mjcf(world: World) -> str:
     """The model as MJCF text."""
-    robot = world.robot.mjcf(world.timestep)
+    body, actuators = world.robot.mjcf()
     machine = machine_parts(world.mouth, _TOWARDS_NET) if world.mouth else []
     slides = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1"))
     inertia = 0.4 * BALL_MASS * BALL_RADIUS**2
@@ -83,17 +81,11 @@ def mjcf(world: World) -> str:
         f'<geom name="ball{k}" type="sphere" size="{BALL_RADIUS}" rgba="1 .5 0 1" {LOOK}/></body>'
         for k in range(world.num_balls)
     )
-    pairs = "".join(
-        f'<pair geom1="{other}" geom2="ball{k}" condim="1" {firm}/>'
-        for k in range(world.num_balls)
-        for other, firm in {"ground": "", **robot.contacts}.items()
-    )
-    switch = "" if world.contacts else ' constraint="disable" contact="disable"'
     return f"""
 <mujoco model="{world.tool.kind}">
   <option timestep="{world.timestep}" gravity="0 0 {-world.gravity}" integrator="Euler"
           iterations="1" ls_iterations="4">
-    <flag eulerdamp="disable"{switch}/>
+    <flag eulerdamp="disable" constraint="disable" contact="disable"/>
   </option>
   <visual>
     <quality shadowsize="1024"/><headlight ambient=".4 .4 .4" diffuse=".3 .3 .3"/>
@@ -102,11 +94,10 @@ def mjcf(world: World) -> str:
     <light directional="true" dir="0 .3 -1" diffuse=".5 .5 .5" castshadow="false"/>
     <geom name="ground" type="plane" size="10 10 .1" rgba="{xml_colour(GROUND_COLOUR)}" {LOOK}/>
     {"".join(map(part_xml, (*machine, *world.scenery)))}
-    {robot.body}
+    {body}
     {balls}
   </worldbody>
-  <actuator>{robot.actuators}</actuator>
-  {f"<contact>{pairs}</contact>" if world.contacts else ""}
+  <actuator>{actuators}</actuator>
 </mujoco>"""
 
 
@@ -158,23 +149,6 @@ def _drag_force(world: World, qvel: Array, drag: Array) -> Array:
     return jnp.concatenate(
         [jnp.zeros_like(qvel[:own]), (-BALL_MASS * drag[:, None] * speed * vel).ravel()]
     )
-
-
-def step_mujoco(world: World, data: mujoco.MjData, command: np.ndarray, drag: np.ndarray) -> None:
-    """One time step in plain MuJoCo, as `step`; changes `data`."""
-    own = world.robot.num_vel
-    vel = data.qvel[own:].reshape(world.num_balls, 3)
-    speed = np.linalg.norm(vel, axis=1, keepdims=True)
-    data.ctrl[:] = command
-    data.qfrc_applied[own:] = (-BALL_MASS * np.asarray(drag)[:, None] * speed * vel).ravel()
-    mujoco.mj_step(mujoco_model(world), data)
-
-
-def mujoco_data(world: World, physics: Physics) -> mujoco.MjData:
-    """Data of plain MuJoCo at a state."""
-    data = mujoco.MjData(mujoco_model(world))
-    data.qpos[:], data.qvel[:], data.act[:] = physics.qpos, physics.qvel, physics.act
-    return data
 
 
 def at_rest(world: World, place: Array) -> Physics:

@@ -34,14 +34,6 @@ class Physics:
     act: Array  # (A,), what the actuators have reached, in their units
 
 
-class RobotXml(NamedTuple):
-    """A robot's part of the MJCF."""
-
-    body: str
-    actuators: str
-    contacts: dict[str, str]  # names of geoms that a ball may touch -> attributes of that pair
-
-
 class Shape(NamedTuple):
     """A rigid part of a robot as it is drawn, in the part's own frame."""
 
@@ -62,8 +54,8 @@ class Robot(Protocol):
         """What it meets balls with."""
         ...
 
-    def mjcf(self, timestep: float) -> RobotXml:
-        """Its body and actuators; the contacts are as firm as the time step [s] bears."""
+    def mjcf(self) -> tuple[str, str]:
+        """Its body and its actuators as MJCF text."""
         ...
 
     def at_rest(self, place: Array, gravity: float) -> tuple[Array, Array, Array]:
@@ -82,16 +74,12 @@ class Robot(Protocol):
         """Of the body with the tool, in the world: place, velocity, rate and z axis, (3,) each."""
         ...
 
-    def path(self, plan: Any) -> Any:
-        """What a plan has it follow, also after the plan's end; a pytree."""
+    def head_state(self, plan: Any, time: Array) -> Array:
+        """Its state () [s] after a plan's begin, from where another begins; first row the place."""
         ...
 
-    def head_state(self, path: Any, time: Array) -> Array:
-        """Where a plan that begins at a time () [s] of the path begins; place in the first row."""
-        ...
-
-    def references(self, path: Any, times: Array, world: Any) -> Any:
-        """What is tracked at times (K,) [s] of the path, leaves (K, ...); `pos` is the place."""
+    def references(self, plan: Any, times: Array, world: Any) -> Any:
+        """What it tracks (K,) [s] after a plan's begin, leaves (K, ...); `pos` is the place."""
         ...
 
     def command(self, state: Any, reference: Any, world: Any) -> Array:

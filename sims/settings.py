@@ -8,7 +8,7 @@ import pkgutil
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-from planner_jax.sims.noise import NOISES, require_whole
+from planner_jax.sims.noise import NOISES, Sensing, require_whole
 from planner_jax.sweep.settings import SettingError, require, require_one_of
 from planner_jax.task.catch.planners import PLANNERS as CATCH_PLANNERS
 from planner_jax.task.hit.planners import PLANNERS as HIT_PLANNERS
@@ -40,6 +40,18 @@ def fly_settings(task: str) -> type["FlySettings"]:
     """
     require_one_of(FLIGHTS, "task", task)
     return pkgutil.resolve_name(FLIGHTS[task])
+
+
+def require_interval(sensing: Sensing, replan: float) -> None:
+    """Raise `ValueError` unless the interval of throws is a whole number of planning periods.
+
+    Args:
+        sensing: whose looks divide such a period.
+        replan: [Hz], of planning anew; 0 for never.
+    """
+    period = sensing.looks_per_plan(replan) / sensing.rate
+    rule = f"such that its period divides {INTERVAL:g} s"
+    require_whole(INTERVAL / period, "replan", rule, replan)
 
 
 def option(default: Any, metavar: str, words: str) -> Any:
@@ -125,9 +137,8 @@ class CatchFly(FlySettings):
     def check_rate(self) -> None:
         """Raise `ValueError` unless a plan also begins whenever a ball comes into sight."""
         super().check_rate()
-        if self.balls > 1 and self.rate > 0.0:
-            rule = f"such that its period divides {INTERVAL:g} s"
-            require_whole(INTERVAL * self.rate, "replan", rule, self.rate)
+        if self.balls > 1:
+            require_interval(NOISES[self.noise], self.rate)
 
 
 @dataclasses.dataclass(frozen=True)

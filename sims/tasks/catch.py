@@ -26,17 +26,16 @@ from planner_jax.sims.launch import (
     flight_keys,
     launched,
     ready,
-    require_start,
+    require_plan,
     require_world,
 )
 from planner_jax.sims.loop import FlightState, Flown, Loop, Outlook, expected, flown, fly_leg
 from planner_jax.sims.model import World
-from planner_jax.sims.noise import require_whole
 from planner_jax.sims.recording import Launches
 from planner_jax.sims.robot import Tool
 from planner_jax.sims.robots.quadrotor.robot import Quadrotor
 from planner_jax.sims.scoring import passage
-from planner_jax.sims.settings import INTERVAL, CatchFly
+from planner_jax.sims.settings import INTERVAL, CatchFly, require_interval
 from planner_jax.sims.task import FlightCases, Flights, FlightTask
 from planner_jax.sweep.columns import BOOL, Column, list_of
 from planner_jax.task.catch.decide import plan_catches
@@ -207,8 +206,7 @@ def scenarios(loop: Loop, flights: FlightState, new: Array, horizon: Array) -> C
             head = head.at[0].set(robot.state(flight.physics).pos)
         else:
             after = until_last_catch(flight, new)
-            path = robot.path(flight.plan)
-            head = robot.head_state(path, flight.time - flight.began + after)
+            head = robot.head_state(flight.plan, flight.time - flight.began + after)
         balls = expected(loop, flight.earlier, loop.period + after)
         horizon = horizon - after
         return dataclasses.replace(
@@ -313,8 +311,7 @@ def fly_catches(
     sizes = {name: getattr(cases, name) for name in ("gravity", "net_height", "net_radius")}
     require_world(loop, "net", num_balls, **sizes)
     if num_balls > 1:
-        rule = f"such that its period divides {INTERVAL:g} s"
-        require_whole(INTERVAL / loop.period, "replan", rule, loop.replan)
+        require_interval(loop.sensing, loop.replan)
     planner, pilot = planner or ExactCatch(), pilot or CatchPilot()
     drag = jnp.asarray(cases.drag)
     balls, believed = jax.tree.map(jnp.asarray, (cases.balls, cases.believed))
@@ -335,8 +332,10 @@ def fly_catches(
         new = np.isin(np.arange(num_balls), [ball] if given else [ball, ball + 1])
         scenario = scenarios(loop, flight, jnp.asarray(new), horizon)
         if given:
-            require_catch_plan(plan, scenario)
-            found = plan
+            found: Any = plan
+            require_plan(found, CatchPlan, scenario.head_state)
+            if found.times.shape[-1] != num_balls:
+                raise ValueError(f"plan must be of {num_balls} balls, got {found.times.shape[-1]}")
         else:
             known = jax.tree.map(np.asarray, scenario)
             began = time.perf_counter()
@@ -406,16 +405,6 @@ def within(scenarios: CatchScenario, limits: tuple[float, float] | None) -> Catc
         old, min_thrust=thrust * gravity, body_rate=np.full_like(old.body_rate, rate)
     )
     return dataclasses.replace(scenarios, limits=new)
-
-
-def require_catch_plan(plan: Any, scenario: CatchScenario) -> None:
-    """Raise `ValueError` unless a plan is one of these catches."""
-    if not isinstance(plan, CatchPlan):
-        raise ValueError(f"plan must be a CatchPlan, got a {type(plan).__name__}")
-    num = scenario.num_targets
-    if np.shape(plan.times)[-1] != num:
-        raise ValueError(f"plan must be of {num} balls, got {np.shape(plan.times)[-1]}")
-    require_start(scenario.head_state, plan)
 
 
 class CatchFlight(FlightTask):

@@ -16,7 +16,7 @@ from planner_jax.ball.impact import racket_impact
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.multistart import solve_round
 from planner_jax.optimise.problem import Planner, Round
-from planner_jax.sims.launch import flight_keys, launched, ready, require_start, require_world
+from planner_jax.sims.launch import flight_keys, launched, ready, require_plan, require_world
 from planner_jax.sims.loop import FlightState, Flown, Loop, Outlook, expected, flown, fly_leg
 from planner_jax.sims.model import World
 from planner_jax.sims.recording import Launches
@@ -262,20 +262,13 @@ def fly_hits(
     clock = time.perf_counter()
     first = jax.block_until_ready(plan_all(planner, scenario)) if plan is None else plan
     planning = time.perf_counter() - clock
-    require_hit_plan(first, scenario)
+    require_plan(first, HitPlan, scenario.head_state)
     begun = jax.tree.map(jnp.asarray, first)
     flight = dataclasses.replace(flight, plan=begun, began=flight.time, present=flight.launched)
     periods = loop.num_periods(_LONGEST - SEEN + _AFTER)
     flight, record = fly_leg(loop, pilot, flight, scenario, drag, num_periods=periods)
     landing, miss = jax.device_get(_landings(flight.contact, truth))
     return HitFlights(first, flown(flight, [record]), planning, landing, miss)
-
-
-def require_hit_plan(plan: Any, scenario: HitScenario) -> None:
-    """Raise `ValueError` unless a plan is one of these hits."""
-    if not isinstance(plan, HitPlan):
-        raise ValueError(f"plan must be a HitPlan, got a {type(plan).__name__}")
-    require_start(scenario.head_state, plan)
 
 
 class HitFlight(FlightTask):

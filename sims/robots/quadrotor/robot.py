@@ -12,18 +12,12 @@ import numpy as np
 from jax import Array
 
 from planner_jax.sims.model import BALL_RADIUS, World
-from planner_jax.sims.robot import Physics, RobotXml, Shape, Tool
+from planner_jax.sims.robot import Physics, Shape, Tool
 from planner_jax.sims.robots.quadrotor.control import Gains, RobotState, control
-from planner_jax.sims.robots.quadrotor.reference import (
-    Reference,
-    references,
-    state_at,
-    with_rest,
-)
+from planner_jax.sims.robots.quadrotor.reference import Reference, references, state_at, with_rest
 from planner_jax.sims.robots.quadrotor.vehicle import Vehicle, rotor_positions, rotor_torques
 from planner_jax.sims.rotation import rotation
 from planner_jax.sims.scenery import LOOK, xml_numbers
-from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 _SEGMENTS = 12  # capsules of the hoop
 
@@ -40,13 +34,8 @@ class Quadrotor:
     num_vel: ClassVar[int] = 6
     noise_shape: ClassVar[tuple[int, ...]] = (4, 3)
 
-    def mjcf(self, timestep: float) -> RobotXml:
-        """Body with rotors and tool, and the motors.
-
-        The plate is thin and a box, the one shape against which MJX bounces a sphere as MuJoCo
-        does; its face lies a ball's radius below the disc, so that a centred ball touches it
-        where its centre passes the disc (for the net, one ball's diameter later).
-        """
+    def mjcf(self) -> tuple[str, str]:
+        """Body with rotors and tool, and the motors."""
         vehicle = self.vehicle
         places = rotor_positions(vehicle)
         rotors = "".join(
@@ -67,12 +56,7 @@ class Quadrotor:
             f'mass="{vehicle.mass}" diaginertia="{xml_numbers(*vehicle.inertia)}"/>'
             f"{rotors}{self._tool_xml()}</body>"
         )
-        # A spring as stiff as the time step bears; damped so that a net holds and a racket
-        # bounces: a damping ratio r gives the restitution exp(-pi r / sqrt(1 - r^2)), here 0.7.
-        rate = 0.5 / timestep
-        ratio = 1.0 if self.tool.kind == "net" else 0.113
-        firm = f'solref="{xml_numbers(-(rate**2), -2.0 * ratio * rate)}" solimp=".99 .99 .001"'
-        return RobotXml(body, motors, {"plate": firm})
+        return body, motors
 
     def _tool_xml(self) -> str:
         """The hoop as a ring of capsules over a plate, or the racket as a plate."""
@@ -133,17 +117,13 @@ class Quadrotor:
         R = rotation(state.quat_wxyz)
         return state.pos, state.vel, jnp.sum(R * state.rate, axis=1), R[:, 2]
 
-    def path(self, plan: Any) -> PiecewisePolynomial:
-        """The plan's trajectory, and rest after its end."""
-        return with_rest(plan.trajectory)
+    def head_state(self, plan: Any, time: Array) -> Array:
+        """Position to jerk (4, 3), () [s] after a plan's begin; at rest some time after its end."""
+        return state_at(with_rest(plan.trajectory), time)
 
-    def head_state(self, path: PiecewisePolynomial, time: Array) -> Array:
-        """Position to jerk (4, 3) at a time () [s] of a path."""
-        return state_at(path, time)
-
-    def references(self, path: PiecewisePolynomial, times: Array, world: World) -> Reference:
-        """What is tracked at times (K,) [s] of a path, leaves (K, ...)."""
-        return references(path, times, self.vehicle, world)
+    def references(self, plan: Any, times: Array, world: World) -> Reference:
+        """What is tracked at times (K,) [s] after a plan's begin, leaves (K, ...)."""
+        return references(with_rest(plan.trajectory), times, self.vehicle, world)
 
     def command(self, state: RobotState, reference: Reference, world: World) -> Array:
         """Rotor thrusts (4,) [N]."""
