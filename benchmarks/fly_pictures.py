@@ -11,15 +11,16 @@ from pathlib import Path
 
 import numpy as np
 
-from planner_jax.sims.run import FlySettings, draw_one, success
+from planner_jax.sims.run import draw_one
+from planner_jax.sims.settings import CatchFly, HitFly
 
 PICTURES = {
     "fly_catch.png": (
-        FlySettings("catch", num=4, balls=3, seed=7),
+        CatchFly(num=4, balls=3, seed=7),
         {"title": "Three balls, 0.8 s apart, are caught", "view": (16.0, -60.0)},
     ),
     "fly_hit.png": (
-        FlySettings("hit", num=4, seed=7),
+        HitFly(num=4, seed=7),
         {"title": "A serve is hit back to its target", "view": (12.0, -75.0)},
     ),
 }
@@ -31,11 +32,12 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("docs"), metavar="DIR")
     args = parser.parse_args()
     for name, (settings, look) in PICTURES.items():
-        cases = settings.cases()
-        flights = settings.fly(cases, record=True)
-        good = success(flights)
+        task = settings.flight()
+        cases = task.cases()
+        flights = task.fly(cases, record=True)
+        good = flights.success
         lane = int(np.argmax(good))
-        draw_one(args.out / name, settings, cases, flights, lane, **look)
+        draw_one(args.out / name, task, cases, flights, lane, **look)
         print(f"{name}: flight {lane}; {good.sum()} of {len(good)} succeed", flush=True)
 
 

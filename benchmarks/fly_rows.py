@@ -13,6 +13,7 @@ program that runs comes back. Prediction errors stand beside the paper's greates
 
 import argparse
 import contextlib
+import dataclasses
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -21,11 +22,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from planner_jax.sims.catch import CatchFlights, fly_catches, throws
-from planner_jax.sims.closed_loop import Flown, Loop
-from planner_jax.sims.hit import SCENARIOS, HitFlights, fly_hits, volleys
-from planner_jax.sims.model import NET, RACKET, World
-from planner_jax.sims.sensing import NOISES
+from planner_jax.sims.loop import Flown, Loop
+from planner_jax.sims.noise import NOISES
+from planner_jax.sims.settings import HIT_SUITES
+from planner_jax.sims.tasks.catch import CATCH_WORLD, CatchFlights, fly_catches, throws
+from planner_jax.sims.tasks.hit import HIT_WORLD, HitFlights, fly_hits, volleys
 from planner_jax.sweep.summary import percent, wilson_interval
 from planner_jax.task.catch.planners import catch_planner
 from planner_jax.task.hit.planners import planner as hit_planner
@@ -33,7 +34,6 @@ from planner_jax.trajectory.polynomial import evaluate
 
 DRAG_ERROR = 0.15
 CATCH_RATE, HIT_RATE = 100.0, 50.0  # [Hz], of planning anew
-HIT = World(RACKET, gravity=9.8)
 LAB = NOISES["lab"]
 CAUGHT = {1: 0.97, 2: 0.93, 3: 0.88}  # share of flights of as many balls, to be reached
 LANDING = 0.05  # [m] from the target, to be reached without noise
@@ -132,7 +132,7 @@ def catches(
     cases = throws(args.num, loop.world.num_balls, args.seed, drag_error=drag_error)
     with limited(name, args.limit):
         flights, seconds = twice(lambda: fly_catches(loop, cases, args.seed, **options))
-        good = flights.caught.all(axis=1)
+        good = flights.success
         print(
             f"{name}: all caught {share(good)}{reached(good, bar)}; ball from the net's centre "
             f"{quantiles(flights.flown.contact.offset, 100.0, 'cm')}; {tracking(flights.flown)}; "
@@ -164,12 +164,12 @@ def exact_rows(args: Any) -> None:
     """Without noise: planned and flown contact, and the landing."""
     for rate in (0.0, CATCH_RATE):
         name = f"no noise, catch, re-planned {rate:g} Hz"
-        if flights := catches(name, Loop(World(NET), replan=rate), args, 0.0):
+        if flights := catches(name, Loop(CATCH_WORLD, replan=rate), args, 0.0):
             report_contact(flights.flown)
-    regions = tuple(dict.fromkeys(sum(SCENARIOS.values(), ())))
+    regions = tuple(dict.fromkeys(sum(HIT_SUITES.values(), ())))
     for rate in (0.0, HIT_RATE):
         name = f"no noise, hit, re-planned {rate:g} Hz"
-        if volley := hits(name, Loop(HIT, replan=rate), regions, args, 0.0):
+        if volley := hits(name, Loop(HIT_WORLD, replan=rate), regions, args, 0.0):
             report_contact(volley.flown)
             good = volley.miss <= LANDING
             print(f"  landing within {100 * LANDING:g} cm {share(good)}{reached(good, 1.0)}")
@@ -190,10 +190,10 @@ def report_contact(flown: Flown) -> None:
 def catch_rows(args: Any) -> None:
     """One, two and three balls 0.8 s apart, with noise."""
     for number in (1, 2, 3):
-        world = World(NET, num_balls=number)
+        world = dataclasses.replace(CATCH_WORLD, num_balls=number)
         loop = Loop(world, LAB, replan=CATCH_RATE)
         catches(f"lab, {number} ball(s)", loop, args, DRAG_ERROR, CAUGHT[number])
-    loop = Loop(World(NET), LAB, replan=CATCH_RATE, record=True)
+    loop = Loop(CATCH_WORLD, LAB, replan=CATCH_RATE, record=True)
     if flights := catches("lab, 1 ball, recorded", loop, args, DRAG_ERROR):
         prediction_errors(flights.flown)
 
@@ -201,8 +201,8 @@ def catch_rows(args: Any) -> None:
 def hit_rows(args: Any) -> None:
     """The six scenarios, with noise, re-planned and not."""
     for rate in (HIT_RATE, 0.0):
-        for name, regions in SCENARIOS.items():
-            loop = Loop(HIT, LAB, replan=rate, record=name == "S.6")
+        for name, regions in HIT_SUITES.items():
+            loop = Loop(HIT_WORLD, LAB, replan=rate, record=name == "S.6")
             title = f"lab, {name}, re-planned {rate:g} Hz"
             flights = hits(title, loop, regions, args, DRAG_ERROR)
             if flights and loop.record:
@@ -211,29 +211,28 @@ def hit_rows(args: Any) -> None:
 
 def ablation_rows(args: Any) -> None:
     """What each part is worth."""
-    net = World(NET)
     for name, options in (
         ("everything", {}),
         ("no Kalman filter", {"kalman": False}),
         ("no drag estimate", {"estimate_drag": False}),
         ("no re-planning", {"replan": 0.0}),
     ):
-        loop = Loop(net, LAB, **{"replan": CATCH_RATE, **options})
+        loop = Loop(CATCH_WORLD, LAB, **{"replan": CATCH_RATE, **options})
         catches(f"lab, one ball, {name}", loop, args, DRAG_ERROR)
-    loop = Loop(net, LAB)
+    loop = Loop(CATCH_WORLD, LAB)
     for name in ("catch", "mpp"):
         title = f"lab, one ball, planner {name}, no re-planning"
         catches(title, loop, args, DRAG_ERROR, planner=catch_planner(name))
-    regions = SCENARIOS["S.1"]
+    regions = HIT_SUITES["S.1"]
     for name, options in (
         ("everything", {}),
         ("no Kalman filter", {"kalman": False}),
         ("no drag estimate", {"estimate_drag": False}),
         ("no re-planning", {"replan": 0.0}),
     ):
-        loop = Loop(HIT, LAB, **{"replan": HIT_RATE, **options})
+        loop = Loop(HIT_WORLD, LAB, **{"replan": HIT_RATE, **options})
         hits(f"lab, S.1, {name}", loop, regions, args, DRAG_ERROR)
-    loop = Loop(HIT, LAB)
+    loop = Loop(HIT_WORLD, LAB)
     for name in ("bat", "bat-lite", "juggle"):
         title = f"lab, S.1, planner {name}, no re-planning"
         hits(title, loop, regions, args, DRAG_ERROR, planner=hit_planner(name))

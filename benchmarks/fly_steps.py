@@ -19,13 +19,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from planner_jax.sims.catch import HOME, SEEN, CatchPilot, scenarios, throws, with_catch
-from planner_jax.sims.closed_loop import Loop, fly_leg
 from planner_jax.sims.launch import launched, ready
-from planner_jax.sims.model import NET, World, hovering, step
-from planner_jax.sims.sensing import NOISES
+from planner_jax.sims.loop import Loop, fly_leg
+from planner_jax.sims.model import World, at_rest, step
+from planner_jax.sims.noise import NOISES
+from planner_jax.sims.tasks.catch import (
+    CATCH_WORLD,
+    SEEN,
+    CatchPilot,
+    scenarios,
+    throws,
+    with_catch,
+)
 from planner_jax.task.catch.decide import plan_catches
 from planner_jax.task.catch.exact import ExactCatch
+from planner_jax.task.catch.scenario import START
 
 RUNS = 3
 
@@ -49,7 +57,7 @@ def timed(name: str, steps: int, run: Callable[[], Any]) -> None:
 
 def open_loop(world: World, worlds: int, steps: int) -> None:
     """Physics alone."""
-    start = hovering(world, jnp.array(HOME))
+    start = at_rest(world, jnp.array(START))
     start = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (worlds, *leaf.shape)), start)
     drag = jnp.zeros(1)
 
@@ -69,7 +77,7 @@ def closed_loop(world: World, worlds: int, seconds: float) -> None:
     few = min(worlds, 256)  # different throws, repeated to fill the batch
     cases = throws(few)
     drag, believed = jnp.asarray(cases.drag), jnp.asarray(cases.believed)
-    starts = jnp.tile(jnp.array(HOME), (few, 1))
+    starts = jnp.tile(jnp.array(START), (few, 1))
     flight = ready(loop, starts, jax.random.split(jax.random.key(0), few))
     balls = jax.tree.map(jnp.asarray, cases.balls)
     flight = launched(loop, flight, balls, drag, believed, ball=0, seen=SEEN)
@@ -112,7 +120,7 @@ def main() -> None:
     parser.add_argument("--worlds", default=default)
     parser.add_argument("--seconds", type=float, default=0.4, help="of each flight")
     args = parser.parse_args()
-    world = World(NET)
+    world = CATCH_WORLD
     steps = round(args.seconds / world.timestep)
     print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}, {steps} steps of 2 ms a world")
     for worlds in [int(number) for number in args.worlds.split(",")]:

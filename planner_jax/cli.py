@@ -1,6 +1,7 @@
 """The command line: `planner-jax sweep|fly hit|catch`, `view`, `report`, `bench`, `doctor`."""
 
 import argparse
+import dataclasses
 import datetime
 import os
 import shlex
@@ -9,7 +10,7 @@ import sys
 import threading
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, get_args, get_type_hints
 
 from planner_jax.compile_cache import keep_compiled_programs
 from planner_jax.sweep.catch.settings import DECISIONS, NET_TESTS, SUITES, CatchSweep
@@ -23,7 +24,7 @@ _OPTIONS = {
     *HitSweep.__dataclass_fields__,
     *CatchSweep.__dataclass_fields__,
     *("out", "devices", "iterations", "repeat"),
-    *("noise", "replan", "balls", "scenario", "drag_error", "video", "record", "host", "port"),
+    *("noise", "replan", "balls", "drag_error", "video", "record", "host", "port"),
 }
 _FAILED, _BAD_ARGUMENT, _INTERRUPTED = 1, 2, 130
 
@@ -90,8 +91,10 @@ def _parser() -> argparse.ArgumentParser:
     _add_catch(tasks, look)
     fly = commands.add_parser("fly", help="fly many cases of a task in closed loop", **look)
     tasks = fly.add_subparsers(title="tasks", required=True, metavar="task")
-    _add_fly(tasks, look, "catch", "a quadrotor catches thrown balls with a net")
-    _add_fly(tasks, look, "hit", "a quadrotor hits served balls to a target with a racket")
+    from planner_jax.sims.settings import FLIGHTS, fly_settings
+
+    for task in FLIGHTS:
+        _add_fly(tasks, look, fly_settings(task))
     view = commands.add_parser("view", help="play a run's flights in a browser", **look)
     view.add_argument("run", metavar="RUN", help="folder of a run of flights")
     view.add_argument("--host", default="localhost", help="where to serve (default: localhost)")
@@ -222,70 +225,68 @@ def _add_catch(tasks: Any, look: dict[str, Any]) -> None:
     # fmt: on
 
 
-def _add_fly(tasks: Any, look: dict[str, Any], task: str, words: str) -> None:
-    """The arguments of `fly catch` or `fly hit`; what is not given is absent."""
+def _add_fly(tasks: Any, look: dict[str, Any], kind: Any) -> None:
+    """The arguments of `fly` for a task, made from its settings; what is not given is absent."""
     parser = tasks.add_parser(
-        task,
-        help=words,
-        description=f"Plan and fly in MuJoCo MJX: {words}, with noise, latency and wrong drag.\n"
-        "Writes a run folder: index.html, table.md, a figure, plans.parquet, flights.parquet,\n"
+        kind.TASK,
+        help=kind.WORDS,
+        description=f"Plan and fly in MuJoCo MJX: {kind.WORDS}, with noise, latency and wrong drag."
+        "\nWrites a run folder: index.html, table.md, a figure, plans.parquet, flights.parquet,\n"
         "manifest.json.",
         argument_default=argparse.SUPPRESS,
         **look,
     )
-    planners = CATCH_PLANNERS if task == "catch" else HIT_PLANNERS
     add = parser.add_argument
+    types = get_type_hints(kind)
+    for field in dataclasses.fields(kind):
+        value = next(t for t in (*get_args(types[field.name]), types[field.name]) if t is not None)
+        told = "" if field.default is None else f" (default: {field.default})"
+        add(
+            f"--{field.name.replace('_', '-')}",
+            type=value,
+            metavar=field.metadata["metavar"],
+            help=field.metadata["help"] + told,
+        )
     # fmt: off
-    add("--num", type=int, metavar="N", help="flights (default: 64)")
-    add("--noise", metavar="NAME", help="of sensing: none, lab, harsh (default: lab)")
-    add("--replan", type=float, metavar="HZ", help="plans a second, 0 for the first one only "
-        f"(default: {100 if task == 'catch' else 50} with exact, 0 with other planners)")
-    add("--planner", metavar="NAME", help=f"{', '.join(planners)} (default: exact)")
-    if task == "catch":
-        add("--balls", type=int, metavar="N", help="thrown 0.8 s apart (default: 1)")
-    else:
-        add("--scenario", metavar="NAME", help="S.1 to S.6 of the paper (default: S.1)")
-    add("--drag-error", type=float, metavar="F", help="relative, of what is believed of the "
-        "balls' drag, either way (default: 0.15)")
-    add("--seed", type=int, metavar="K", help="of balls and noise (default: 0)")
-    add("--batch", type=int, metavar="B", help="flights at once (default: all up to 4096)")
     add("--record", type=int, metavar="K",
         help="flights kept look by look for `planner-jax view`, the first ones (default: 16)")
     add("--video", nargs="?", const="flights.gif", metavar="FILE",
         help="film the first three of these into the run folder, .gif, or .mp4 where ffmpeg is "
         "installed (default name: flights.gif)")
-    add("--out", metavar="DIR", help=f"run folder (default: runs/fly-{task}-DATE-TIME)")
+    add("--out", metavar="DIR", help=f"run folder (default: runs/fly-{kind.TASK}-DATE-TIME)")
     # fmt: on
-    parser.set_defaults(command=lambda given: _fly(task, given))
+    parser.set_defaults(command=lambda given: _fly(kind, given))
 
 
-def _fly(task: str, given: dict[str, Any]) -> None:
+def _fly(kind: Any, given: dict[str, Any]) -> None:
     keep_compiled_programs()
-    from planner_jax.sims.run import FlySettings, start_flights
+    from planner_jax.sims.run import start_flights
 
     out, video = given.pop("out", None), given.pop("video", None)
-    out = out or os.path.join("runs", f"fly-{task}-{datetime.datetime.now():%Y%m%d-%H%M%S}")
+    out = out or os.path.join("runs", f"fly-{kind.TASK}-{datetime.datetime.now():%Y%m%d-%H%M%S}")
     keep = {"record": given.pop("record")} if "record" in given else {}
-    manifest = start_flights(FlySettings(task, **given), out, video, **keep)
-    _print_flights(manifest, Path(out))
+    start_flights(kind(**given), out, video, **keep)
+    _print_flights(Path(out))
 
 
-def _print_flights(manifest: dict[str, Any], out: Path) -> None:
-    from planner_jax.sims.run import headline
+def _print_flights(out: Path) -> None:
+    from planner_jax.sims.run import headline, read_flights
+    from planner_jax.sweep.run_folder import RunFolder
 
-    print("\n".join(headline(manifest)))
+    manifest, flight, _ = read_flights(RunFolder(out))
+    print("\n".join(headline(manifest, flight)))
     print(f"Look at {out / 'index.html'}, or play it: planner-jax view {shlex.quote(str(out))}")
 
 
 def _view(options: dict[str, Any]) -> None:
-    from planner_jax.sims.run import read_flights, title_of
+    from planner_jax.sims.run import read_flights
     from planner_jax.sims.view import Viewer
     from planner_jax.sweep.run_folder import RunFolder
 
-    _, settings, recording = read_flights(RunFolder(options["run"], name="RUN"))
-    titles = [title_of(settings, recording, flight) for flight in range(len(recording))]
-    world = settings.loop(record=False).world
-    viewer = Viewer(world, recording, titles, options["host"], options["port"])
+    _, flight, recording = read_flights(RunFolder(options["run"], name="RUN"))
+    titles = [flight.title(recording, row) for row in range(len(recording))]
+    where = options["host"], options["port"]
+    viewer = Viewer(flight.world(), recording, titles, flight.CONTACT, *where)
     _let_ctrl_c_stop()
     print(f"Playing {len(titles)} flights at {viewer.url}; Ctrl-C stops.", flush=True)
     viewer.run()
@@ -385,7 +386,7 @@ def _report(options: dict[str, Any]) -> None:
         from planner_jax.sims.run import write_flight_report
 
         write_flight_report(folder)
-        _print_flights(manifest, folder.path)
+        _print_flights(folder.path)
     else:
         write_report(folder)
         _print_result(manifest, folder.path)

@@ -1,4 +1,4 @@
-"""Pictures of a flight: ball, quadrotor, plan and ghost images, without a display."""
+"""Pictures of a flight: balls, robot, plan and ghost images, without a display."""
 
 import os
 import shutil
@@ -14,18 +14,15 @@ from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from planner_jax.sims.model import World
-from planner_jax.sims.recording import Recording, frame, rotation
-from planner_jax.sims.scenery import court_lines, machine_parts, outlines
-from planner_jax.sims.vehicle import rotor_positions
+from planner_jax.sims.recording import Recording, frame
+from planner_jax.sims.rotation import rotation
+from planner_jax.sims.scenery import FLAT, Part, machine_parts, outlines
 from planner_jax.sweep.figures.style import BLUE, GREEN, GREY, INK, ORANGE, PALE, PURPLE, RED, SKY
-from planner_jax.task.hit.court import DEAD_ZONE, HALF_WIDTH
 
 BALL_COLOURS = (ORANGE, PURPLE, GREEN)
 FORMATS = (".gif", ".mp4")
 _FRAME = 2  # looks a frame
 _GHOSTS, _APART = 7, 0.45  # at most; [m] of way from one to the next
-_ROTOR = 0.06  # [m], radius
-_TURN = np.linspace(0.0, 2.0 * np.pi, 25)
 
 
 class FilmError(ValueError):
@@ -38,19 +35,6 @@ def require_film(path: Path) -> None:
         raise FilmError(f"video must end in {' or '.join(FORMATS)}, got {path.name!r}")
     if path.suffix == ".mp4" and shutil.which("ffmpeg") is None:
         raise FilmError(f"video must end in .gif where ffmpeg is not installed, got {path.name!r}")
-
-
-def robot_lines(world: World, place: np.ndarray, quat_wxyz: np.ndarray) -> list[np.ndarray]:
-    """Arms, stick, rotors and, last, rim of the tool, as lines (M, 3) [m] in the world."""
-    R = rotation(quat_wxyz)
-    arms = rotor_positions(world.vehicle)
-    tool = world.tool
-    circle = np.stack([np.cos(_TURN), np.sin(_TURN), 0.0 * _TURN], axis=1)
-    top = np.array([0.0, 0.0, tool.height])
-    parts = [arms[[0, 2]], arms[[1, 3]], np.stack([0.0 * top, top])]
-    parts += [arm + _ROTOR * circle for arm in arms]
-    parts.append(top + tool.radius * circle)  # last: it is filled
-    return [place + part @ R.T for part in parts]
 
 
 class Scene:
@@ -97,12 +81,11 @@ class Scene:
             self.returned = self.axes.plot([], [], [], color=GREEN, lw=1.6, label="returned ball")[
                 0
             ]
-        on_court = world.tool.kind == "racket"
-        scenery = self._scenery()
-        sides = [[np.nan, side * HALF_WIDTH, np.nan] for side in (-1.0, 1.0) if on_court]
-        points = np.concatenate(
-            [wanted, balls.reshape(-1, 3), *scenery, np.reshape(sides, (-1, 3))]
-        )
+        flat = [part for part in world.scenery if part.size[2] <= FLAT]
+        solid = [part for part in world.scenery if part.size[2] > FLAT] + self._machine()
+        patches = [outlines(part)[1] for part in flat]
+        edges = [line for part in solid for line in outlines(part)]
+        points = np.concatenate([wanted, balls.reshape(-1, 3), *edges, *patches])
         low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
         thin = np.maximum(1.6 - (high - low), 0.0)  # [m], so that flat flights keep their depth
         low, high = low - 0.2 - 0.5 * thin, high + 0.2 + 0.5 * thin
@@ -116,10 +99,11 @@ class Scene:
             axis.labelpad = 6.0
         for path in (wanted, *np.moveaxis(balls, 1, 0)):
             self.axes.plot(path[:, 0], path[:, 1], 0.0, color=PALE, lw=1.0, zorder=0)
-        for line in scenery:
+        for line in edges:
             self.axes.plot(*line.T, color=GREY, lw=0.8, zorder=1)
-        if on_court:
-            self._court(low, high)
+        for part, patch in zip(flat, patches, strict=True):
+            look = {"facecolor": part.colour, "edgecolor": GREY, "linewidth": 0.5, "alpha": 0.4}
+            self.axes.add_collection3d(Poly3DCollection([patch], zorder=0, **look))
         self.axes.view_init(*view)
         self.axes.legend(loc="upper left", fontsize=9, frameon=False)
 
@@ -134,46 +118,34 @@ class Scene:
         at = int(np.searchsorted(self.times, end)) if np.isfinite(end) else self.num_looks
         return min(at, self.num_looks - 1)
 
-    def _scenery(self) -> list[np.ndarray]:
-        """Lines of the pitching machine, where the first ball comes from."""
+    def _machine(self) -> list[Part]:
+        """The pitching machine, where the first ball comes from."""
         launch = self.recording.launch(self.flight)
-        return (
-            [line for part in machine_parts(*launch) for line in outlines(part)] if launch else []
-        )
+        return machine_parts(*launch) if launch and self.world.mouth else []
 
-    def _court(self, low: np.ndarray, high: np.ndarray) -> None:
-        """The court's lines and its dead zone, as far as the axes show them."""
-        for a, b in np.clip(court_lines(), low, high):
-            inside = (np.abs(b - a) > 0.0).any()
-            on_edge = (a == b) & ((a == low) | (a == high))
-            if inside and not on_edge[:2].any():
-                self.axes.plot(*np.stack([a, b], axis=1), color=GREY, lw=1.0, zorder=1)
-        x, y, _ = np.clip(
-            [[-1, -1, 0], [1, 1, 0]] * np.array([DEAD_ZONE, HALF_WIDTH, 0]), low, high
-        ).T
-        corners = [(x[0], y[0], 0.0), (x[1], y[0], 0.0), (x[1], y[1], 0.0), (x[0], y[1], 0.0)]
-        zone = Poly3DCollection([corners], facecolor=RED, edgecolor="none", alpha=0.15, zorder=0)
-        self.axes.add_collection3d(zone)
-
-    def quadrotor(self, at: int, alpha: float = 1.0) -> list[Any]:
-        """The quadrotor at a look, and what it was drawn with."""
-        now = frame(self.recording, self.world.tool, self.flight, at)
-        *body, rim = robot_lines(self.world, now.robot_pos, now.robot_quat)
-        drawn = [
-            self.axes.plot(*line.T, color=BLUE, lw=1.4, alpha=alpha)[0] for line in (*body, rim)
-        ]
-        disc = Poly3DCollection([rim], facecolor=SKY, edgecolor="none", alpha=0.5 * alpha)
-        return [*drawn, self.axes.add_collection3d(disc)]
+    def robot(self, at: int, alpha: float = 1.0) -> list[Any]:
+        """The robot at a look, and what it was drawn with; its tool is filled."""
+        robot = self.world.robot
+        pose = frame(self.recording, robot, self.flight, at).robot
+        drawn: list[Any] = []
+        for shape, (place, quat) in zip(robot.shapes(), robot.places(pose), strict=True):
+            R = rotation(quat, np)
+            lines = [place + line @ R.T for line in shape.lines]
+            drawn += [self.axes.plot(*line.T, color=BLUE, lw=1.4, alpha=alpha)[0] for line in lines]
+            if shape.tool:
+                look = {"facecolor": SKY, "edgecolor": "none", "alpha": 0.5 * alpha}
+                drawn.append(self.axes.add_collection3d(Poly3DCollection([lines[-1]], **look)))
+        return drawn
 
     def ghosts(self, last: int) -> None:
-        """Images of the quadrotor and the balls at equal intervals up to a look, ever firmer."""
-        path = self.recording.robot_pos[self.flight, : last + 1]
+        """Images of the robot and the balls at equal intervals up to a look, ever firmer."""
+        path = self.world.robot.place(self.recording.robot[self.flight, : last + 1])
         path = path[np.isfinite(path).all(axis=1)]
         way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1)))
         number = int(np.clip(way[-1] / _APART, 1, _GHOSTS))
         for share in np.arange(number) / number:
             at = int(np.searchsorted(way, share * way[-1]))
-            self.quadrotor(at, 0.15 + 0.4 * share)
+            self.robot(at, 0.15 + 0.4 * share)
             for ball, trail in zip(self.balls[at], self.trails, strict=True):
                 self.axes.plot(*ball[:, None], ".", ms=7, color=trail.get_color())
 
@@ -197,7 +169,7 @@ class Scene:
             self.returned.set_data_3d(*self.back[: (at if back is None else back) + 1].T)
         for part in self.moving:
             part.remove()
-        self.moving = self.quadrotor(at)
+        self.moving = self.robot(at)
 
 
 def draw_flight(
@@ -206,6 +178,7 @@ def draw_flight(
     recording: Recording,
     flight: int,
     title: str,
+    contact: str,
     *,
     view: tuple[float, float] = (18.0, -68.0),
 ) -> None:
@@ -217,6 +190,7 @@ def draw_flight(
         recording: of the run.
         flight: row of the recording.
         title: of the picture.
+        contact: what a ball is that was met, for the legend.
         view: elevation and azimuth of the eye [degree].
     """
     figure = Figure(figsize=(7.6, 6.0))
@@ -225,7 +199,7 @@ def draw_flight(
     figure.subplots_adjust(left=0.0, right=0.96, bottom=0.04, top=0.95)
     scene.ghosts(scene.last_met())
     scene.show(scene.last_met(), scene.num_looks - 1)
-    scene.contacts("caught" if world.tool.kind == "net" else "hit")
+    scene.contacts(contact)
     _write(path, lambda scratch: figure.savefig(scratch, dpi=110, format="png"))
 
 

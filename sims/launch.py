@@ -1,4 +1,4 @@
-"""The start of a flight: a hovering quadrotor, balls that are launched, and what is seen of them.
+"""The start of a flight: a robot at rest, balls that are launched, and what is seen of them.
 
 A ball is in flight for a while before it is planned for: the papers use what they see of it
 only after 2 m (000, Section VII-A). That part is flown by the library, backwards from the
@@ -16,8 +16,8 @@ from jax import Array, lax
 
 from planner_jax.ball.flight import BallState, fly
 from planner_jax.sims import sensing as sight
-from planner_jax.sims.closed_loop import Flight, Loop
-from planner_jax.sims.model import Tool, hovering, placed
+from planner_jax.sims.loop import FlightState, Loop
+from planner_jax.sims.model import at_rest, placed
 from planner_jax.sims.scoring import no_contact
 from planner_jax.sims.sensing import Estimate
 
@@ -28,8 +28,8 @@ def flight_keys(seed: int, index: np.ndarray) -> Array:
 
 
 @functools.partial(jax.jit, static_argnames="loop")
-def ready(loop: Loop, starts: Array, keys: Array) -> Flight:
-    """Flights with the quadrotors in hover and no ball launched.
+def ready(loop: Loop, starts: Array, keys: Array) -> FlightState:
+    """Flights with the robots at rest and no ball launched.
 
     Args:
         loop: with the world.
@@ -38,12 +38,12 @@ def ready(loop: Loop, starts: Array, keys: Array) -> Flight:
     """
     number = loop.world.num_balls
 
-    def one(start: Array, key: Array) -> Flight:
+    def one(start: Array, key: Array) -> FlightState:
         zero, nothing = jnp.zeros(()), jnp.zeros(number, bool)
         unknown = jnp.zeros((number, 3)), jnp.full(number, 0.1)
         estimates = jax.vmap(sight.first_estimate)(*unknown)
-        return Flight(
-            physics=hovering(loop.world, start),
+        return FlightState(
+            physics=at_rest(loop.world, start),
             shown=jnp.zeros((loop.late_looks, number, 3)),
             estimates=estimates,
             earlier=estimates,
@@ -65,14 +65,14 @@ def ready(loop: Loop, starts: Array, keys: Array) -> Flight:
 @functools.partial(jax.jit, static_argnames=("loop", "ball", "seen"))
 def launched(
     loop: Loop,
-    flights: Flight,
+    flights: FlightState,
     balls: BallState,
     drag: Array,
     believed: Array,
     *,
     ball: int,
     seen: float,
-) -> Flight:
+) -> FlightState:
     """The flights with one more ball in the air.
 
     Args:
@@ -85,7 +85,7 @@ def launched(
         seen: [s] that it has been in flight already (static).
     """
 
-    def one(flight: Flight, balls: BallState, drag: Array, believed: Array) -> Flight:
+    def one(flight: FlightState, balls: BallState, drag: Array, believed: Array) -> FlightState:
         key, look_key = jax.random.split(flight.key)
         own = jax.tree.map(lambda leaf: leaf[ball], balls)
         shown, earlier, now = watched(loop, own, drag[ball], believed[ball], look_key, seen)
@@ -106,8 +106,8 @@ def launched(
 
 @functools.partial(jax.jit, static_argnames=("loop", "ball", "ahead"))
 def awaited(
-    loop: Loop, flights: Flight, coming: BallState, believed: Array, *, ball: int, ahead: float
-) -> Flight:
+    loop: Loop, flights: FlightState, coming: BallState, believed: Array, *, ball: int, ahead: float
+) -> FlightState:
     """The flights with a guess of one more ball, of which nothing is seen yet.
 
     What is believed of it is the guessed flight, backwards from when it will be planned for.
@@ -129,7 +129,7 @@ def awaited(
         belief = dataclasses.replace(estimate.belief, mean=jnp.concatenate([there.pos, there.vel]))
         return sight.anchored(dataclasses.replace(estimate, belief=belief), gravity)
 
-    def one(flight: Flight, believed: Array) -> Flight:
+    def one(flight: FlightState, believed: Array) -> FlightState:
         put = lambda all_balls, one_ball: all_balls.at[ball].set(one_ball)  # noqa: E731
         now, earlier = (guess(before, believed[ball]) for before in (0.0, loop.period))
         return dataclasses.replace(
@@ -180,22 +180,43 @@ def watched(
     return shown, earlier, sight.anchored(now, gravity)
 
 
-def require_world(loop: Loop, tool: Tool, num_balls: int) -> None:
-    """Raise `ValueError` unless a world has the task's tool and as many balls."""
-    world = loop.world
-    if world.tool != tool:
-        raise ValueError(f"world must carry {tool}, got {world.tool}")
-    if world.num_balls != num_balls:
-        raise ValueError(f"world must have {num_balls} balls, got {world.num_balls}")
-
-
-def require_hovering(head_state: Any, plan: Any) -> None:
-    """Raise `ValueError` unless a plan begins where the quadrotor hovers.
+def require_world(loop: Loop, kind: str, num_balls: int, **planned: Any) -> None:
+    """Raise `ValueError` unless the flown world is the one that is planned for.
 
     Args:
-        head_state: (B, 4, 3) of the quadrotor.
-        plan: with a trajectory, leaves (B, ...).
+        loop: with the world.
+        kind: of the tool.
+        num_balls: of a flight.
+        planned: (B,) each, what the plans' scenarios say of `gravity`, `net_height`,
+            `net_radius` or `racket_height`; only those that are given are compared.
     """
+    world, tool = loop.world, loop.world.tool
+    if tool.kind != kind:
+        raise ValueError(f"world must carry a {kind}, got a {tool.kind}")
+    if world.num_balls != num_balls:
+        raise ValueError(f"world must have {num_balls} balls, got {world.num_balls}")
+    flown = {"gravity": world.gravity}
+    flown |= {f"{kind}_height": tool.height, f"{kind}_radius": tool.radius}
+    for name, values in planned.items():
+        apart = ~np.isclose(values, flown[name], rtol=1e-5, atol=0.0)
+        if apart.any():
+            value = np.asarray(values)[apart][0]
+            raise ValueError(
+                f"{name} must be the same in plan and flown world, "
+                f"got {value:g} in the plan's scenario and {flown[name]:g} in the world"
+            )
+
+
+def require_plan(plan: Any, kind: type, head_state: Any) -> None:
+    """Raise `ValueError` unless a plan is one of the task and begins where the robot rests.
+
+    Args:
+        plan: with a trajectory, leaves (B, ...).
+        kind: class of the task's plans.
+        head_state: (B, 4, 3) of the robot.
+    """
+    if not isinstance(plan, kind):
+        raise ValueError(f"plan must be a {kind.__name__}, got a {type(plan).__name__}")
     begin = np.asarray(plan.trajectory.coeffs)[:, 0, 0]
     place = np.asarray(head_state)[:, 0]
     if begin.shape != place.shape:
@@ -204,6 +225,6 @@ def require_hovering(head_state: Any, plan: Any) -> None:
     if away.size and not np.nanmax(away) < 0.01:
         lane = int(np.nanargmax(away))
         raise ValueError(
-            f"plan must begin where its quadrotor is, got {away[lane]:.2f} m from there "
+            f"plan must begin where its robot is, got {away[lane]:.2f} m from there "
             f"in flight {lane}"
         )

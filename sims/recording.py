@@ -14,8 +14,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from planner_jax.ball.flight import BallState
-from planner_jax.sims.closed_loop import Flown
-from planner_jax.sims.model import BALL_RADIUS, Tool
+from planner_jax.sims.loop import Flown
+from planner_jax.sims.model import World
+from planner_jax.sims.robot import Robot
 from planner_jax.sweep.columns import BOOL, LIST, VECTOR, Column, RefereedBatch, rows_of
 from planner_jax.sweep.source import Cases
 from planner_jax.task.hit.validate import fly, landing
@@ -29,16 +30,17 @@ _LONGEST = 3.0  # [s], that a returned ball is followed
 class Recording:
     """F flights of N balls at K looks each; NumPy leaves, world frame, z up.
 
-    Times count from the first plan. NaN stands for a ball that is not in flight, a quadrotor
-    that is no longer simulated, a ball that is never met and a flight without target.
+    The robot has R joint positions, for a quadrotor three of the propeller plane's centre [m] and
+    the quaternion w x y z. Times count from the first plan. NaN stands for a ball that is not in
+    flight, a robot that is no longer simulated, a ball that is never met and a flight without
+    target.
     """
 
     index: np.ndarray  # (F,) place in the run
     success: np.ndarray  # (F,) bool
     time: np.ndarray  # (F, K) [s]
-    robot_pos: np.ndarray  # (F, K, 3) [m], of the propeller plane's centre
-    robot_quat: np.ndarray  # (F, K, 4), w x y z
-    wanted: np.ndarray  # (F, K, 3) [m], where the plan that is flown has the quadrotor
+    robot: np.ndarray  # (F, K, R), its joint positions
+    wanted: np.ndarray  # (F, K, 3) [m], where the plan that is flown has the robot
     balls: np.ndarray  # (F, K, N, 3) [m]
     met: np.ndarray  # (F, N) [s]
     contact: np.ndarray  # (F, N, 3) [m], of the ball's centre when it is met
@@ -54,7 +56,7 @@ class Recording:
 
     def num_looks(self, flight: int) -> int:
         """How many looks of a flight show anything that moves."""
-        there = np.isfinite(self.robot_pos[flight]).all(axis=1)
+        there = np.isfinite(self.robot[flight]).all(axis=1)
         there |= np.isfinite(self.balls[flight]).all(axis=2).any(axis=1)
         return int(np.flatnonzero(there)[-1]) + 1
 
@@ -72,32 +74,31 @@ class Frame(NamedTuple):
     """Where everything is at one look."""
 
     time: float  # [s]
-    robot_pos: np.ndarray  # (3,) [m]
-    robot_quat: np.ndarray  # (4,), w x y z
+    robot: np.ndarray  # (R,), its joint positions
     wanted: np.ndarray  # (3,) [m]
     balls: np.ndarray  # (N, 3) [m], NaN for those not to be seen
 
 
-def rotation(quat_wxyz: np.ndarray) -> np.ndarray:
-    """The rotation matrix (3, 3) of a unit quaternion."""
-    w, x, y, z = quat_wxyz
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+@dataclasses.dataclass(frozen=True)
+class Launches:
+    """What is known of the N balls of F flights besides what was simulated; NumPy leaves."""
+
+    balls: BallState  # leaves (F, N, 3), each when it is planned for
+    drag: Any  # (F, N) K_D [1/m], the true one
+    begins: np.ndarray  # (N,) [s], when each ball is planned for
+    seen: float  # [s] that it has been in flight by then
+    returned: BallState | None = None  # leaves (F, 3), the first ball just after its impact
+    target: Any = None  # (F, 3) [m], of a returned ball
 
 
-def frame(recording: Recording, tool: Tool, flight: int, look: int) -> Frame:
+def frame(recording: Recording, robot: Robot, flight: int, look: int) -> Frame:
     """Where everything is at a look of a flight.
 
-    The quadrotor stays where it was last simulated, and a caught ball lies in the net.
+    The robot stays where it was last simulated, and a caught ball lies in its net.
 
     Args:
         recording: of the run.
-        tool: that the quadrotor carries.
+        robot: that was flown.
         flight: row of the recording.
         look: of the flight.
 
@@ -110,51 +111,37 @@ def frame(recording: Recording, tool: Tool, flight: int, look: int) -> Frame:
     ):
         if not 0 <= value < number:
             raise ValueError(f"{name} must be >= 0 and < {number}, got {value}")
-    flown = np.isfinite(recording.robot_pos[flight]).all(axis=1)
+    flown = np.isfinite(recording.robot[flight]).all(axis=1)
     at = min(look, int(np.flatnonzero(flown)[-1]))
-    pos, quat = recording.robot_pos[flight, at], recording.robot_quat[flight, at]
+    pose = recording.robot[flight, at]
     balls, time = recording.balls[flight, look].copy(), recording.time[flight, look]
-    if tool.kind == "net":
-        caught = time > _or_never(recording.met[flight])
-        balls[caught] = pos + (tool.height - BALL_RADIUS) * rotation(quat)[:, 2]
-    return Frame(float(time), pos, quat, recording.wanted[flight, at], balls)
+    held = robot.held_ball(pose)
+    if np.isfinite(held).all():
+        balls[time > _or_never(recording.met[flight])] = held
+    return Frame(float(time), pose, recording.wanted[flight, at], balls)
 
 
 def recorded(
-    flown: Flown,
-    balls: BallState,
-    *,
-    index: np.ndarray,
-    success: np.ndarray,
-    drag: np.ndarray,
-    gravity: float,
-    begins: np.ndarray,
-    seen: float,
-    returned: BallState | None = None,
-    target: np.ndarray | None = None,
+    world: World, flown: Flown, launches: Launches, *, index: np.ndarray, success: np.ndarray
 ) -> Recording:
     """The recording of some flights: what was simulated, the balls before, and what came back.
 
     Args:
+        world: that was flown.
         flown: F flights with their record.
-        balls: leaves (F, N, 3), each when it is planned for.
+        launches: of their balls.
         index: (F,) places in the run.
         success: (F,) bool.
-        drag: (F, N) K_D [1/m], the true one.
-        gravity: [m/s^2], magnitude.
-        begins: (N,) [s], when each ball is planned for.
-        seen: [s] that it has been in flight by then.
-        returned: leaves (F, 3), just after the impact with the first ball; None for catches.
-        target: (F, 3) [m], or None.
     """
     record: Any = flown.record
-    steps, begins = np.asarray(record.time, float), np.asarray(begins, float)
+    balls, drag, seen, returned = launches.balls, launches.drag, launches.seen, launches.returned
+    steps, begins = np.asarray(record.time, float), np.asarray(launches.begins, float)
     apart = float(np.median(np.diff(steps[0])))
     number, looks = steps.shape
     met = np.where(flown.contact.met, flown.contact.time, np.nan)
     down = np.full((number, 1), np.nan)  # when the returned balls are on the ground
     if returned is not None:
-        away = landing(returned.pos, returned.vel, drag[:, 0], np.full(number, gravity))[0]
+        away = landing(returned.pos, returned.vel, drag[:, 0], np.full(number, world.gravity))[0]
         down = met[:, :1] + np.minimum(np.nan_to_num(away, nan=_LONGEST), _LONGEST)[:, None]
     before = round((seen + steps[0, 0]) / apart)
     after = int(np.ceil((np.nanmax(np.append(down, steps[0, -1])) - steps[0, -1]) / apart - 1e-6))
@@ -170,10 +157,12 @@ def recorded(
     def flight_of(ball: BallState, span: np.ndarray, drag: np.ndarray) -> np.ndarray:
         """Places (F, K, ..., 3) of balls (F, ..., 3) after spans (F, K, ...) [s]."""
         pos, vel = (np.asarray(leaf, float)[:, None] for leaf in (ball.pos, ball.vel))
-        return fly(pos, vel, span, drag[:, None], np.full(span.shape, gravity))[0]
+        return fly(pos, vel, span, drag[:, None], np.full(span.shape, world.gravity))[0]
 
-    qpos = np.asarray(record.physics.qpos, float)
-    paths = stretched(qpos[:, :, 7:].reshape(number, looks, -1, 3))
+    robot, simulated = np.split(
+        np.asarray(record.physics.qpos, float), [world.robot.num_pos], axis=2
+    )
+    paths = stretched(simulated.reshape(number, looks, -1, 3))
     own = time[:, :, None] - begins  # (F, K, N) [s], since each ball was planned for
     early = flight_of(balls, np.clip(own, -seen, 0.0), drag)
     paths = np.where((own < 0.5 * apart)[..., None], early, paths)
@@ -190,13 +179,14 @@ def recorded(
         index=np.asarray(index),
         success=np.asarray(success),
         time=time,
-        robot_pos=stretched(qpos[:, :, :3]),
-        robot_quat=stretched(qpos[:, :, 3:7]),
+        robot=stretched(robot),
         wanted=stretched(np.asarray(record.wanted, float)),
         balls=paths,
         met=met,
         contact=contact,
-        target=np.full((number, 3), np.nan) if target is None else np.asarray(target),
+        target=np.full((number, 3), np.nan)
+        if launches.target is None
+        else np.asarray(launches.target),
     )
 
 
@@ -213,11 +203,10 @@ _COLUMNS = [
     Column(name, unit, meaning, kind, _leaf(name))
     for name, unit, meaning, kind in [
         ("index", "", "place in the run", pa.int64()),
-        ("success", "", "caught, or landed within 0.5 m", BOOL),
+        ("success", "", "as its task counts it", BOOL),
         ("time", "s", "of each look", LIST),
-        ("robot_pos", "m", "looks x 3, flat; centre of the propeller plane", LIST),
-        ("robot_quat", "", "looks x 4, flat; attitude, w x y z", LIST),
-        ("wanted", "m", "looks x 3, flat; where the plan has the quadrotor", LIST),
+        ("robot", "", "looks x R, flat; joint positions as MuJoCo has them, m and rad", LIST),
+        ("wanted", "m", "looks x 3, flat; where the plan has the robot", LIST),
         ("balls", "m", "looks x balls x 3, flat; NaN where not in flight", LIST),
         ("met", "s", "when each ball is met, NaN for never", LIST),
         ("contact", "m", "balls x 3, flat; where each ball is met", LIST),
@@ -240,8 +229,8 @@ def read_recording(path: Path) -> Recording:
         for name in table.column_names
     }
     number, looks = columns["time"].shape
-    for name, width in (("robot_pos", 3), ("robot_quat", 4), ("wanted", 3)):
-        columns[name] = columns[name].reshape(number, looks, width)
+    for name in ("robot", "wanted"):
+        columns[name] = columns[name].reshape(number, looks, -1)
     columns["balls"] = columns["balls"].reshape(number, looks, -1, 3)
     columns["contact"] = columns["contact"].reshape(number, -1, 3)
     return Recording(**columns)

@@ -1,25 +1,14 @@
-"""What stands around a flight and touches nothing: the court of paper 002, the pitching machine."""
+"""What stands around a flight and touches nothing, and its form in MJCF: parts, and a machine."""
 
 import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
 
-from planner_jax.task.catch import suites
-from planner_jax.task.hit import court, serves
-
-# Where the machines of the tasks stand by default: the mouth, from which balls are launched [m].
-# Throws all come from one place, serves from anywhere in a region: the middle of the far one.
-MOUTHS = {
-    "net": suites.LAUNCH,
-    "racket": (0.5 * (court.NEAR_LINE + serves.DEPTH), 0.0, serves.SERVE_HEIGHT),
-}
-TOWARDS_NET = np.pi  # [rad], heading of a machine that throws along -x
 GROUND_COLOUR = "#A9C4A9"
-LINE_COLOUR, MIDDLE_COLOUR, DEAD_COLOUR = "#FFFFFF", "#24292F", "#D98880"
+FLAT = 0.01  # [m]: parts that are no higher lie on the ground
+LOOK = 'mass="0" contype="0" conaffinity="0"'  # MJCF, of what is there to be looked at
 _STEEL, _RUBBER = "#5B6B73", "#2E8B57"
-_LINE = 0.03  # [m], width of the court's lines
-_THIN = 0.002  # [m]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,33 +25,6 @@ class Part:
     def quat_wxyz(self) -> tuple[float, float, float, float]:
         """Attitude."""
         return (float(np.cos(0.5 * self.turn)), 0.0, 0.0, float(np.sin(0.5 * self.turn)))
-
-
-def court_lines() -> np.ndarray:
-    """The court's lines on the ground, (L, 2, 3) [m]: both ends. The first is that at the net."""
-    length, width = court.HALF_LENGTH, court.HALF_WIDTH
-    lines = [((0.0, -width), (0.0, width))]
-    for side in (-1.0, 1.0):
-        lines.append(((-length, side * width), (length, side * width)))
-        lines.append(((side * length, -width), (side * length, width)))
-        near, dead = side * court.NEAR_LINE, side * court.DEAD_ZONE
-        lines.append(((near, -court.LANE_LINE), (near, court.LANE_LINE)))
-        lines += [
-            ((dead, lane), (side * length, lane)) for lane in (-court.LANE_LINE, court.LANE_LINE)
-        ]
-    return np.pad(np.array(lines), ((0, 0), (0, 0), (0, 1)))
-
-
-def court_parts() -> list[Part]:
-    """The court as flat boxes: the dead zone, and the lines over it."""
-    dead = (2.0 * court.DEAD_ZONE, 2.0 * court.HALF_WIDTH, _THIN)
-    parts = [Part("box", dead, (0.0, 0.0, 0.5 * _THIN), DEAD_COLOUR)]
-    for number, (a, b) in enumerate(court_lines()):
-        length, width, _ = np.abs(b - a) + _LINE
-        x, y, _ = 0.5 * (a + b)
-        colour = LINE_COLOUR if number else MIDDLE_COLOUR
-        parts.append(Part("box", (length, width, 2.0 * _THIN), (x, y, _THIN), colour))
-    return parts
 
 
 def machine_parts(mouth: Sequence[float] | np.ndarray, heading: float) -> list[Part]:
@@ -108,3 +70,23 @@ def outlines(part: Part) -> list[np.ndarray]:
     )
     corners = range(0, len(ring) - 1, (len(ring) - 1) // 4)
     return [low, high, *(np.stack([low[k], high[k]]) for k in corners)]
+
+
+def xml_numbers(*values: float) -> str:
+    """Numbers as MJCF writes them."""
+    return " ".join(f"{value:.9g}" for value in values)
+
+
+def xml_colour(colour: str) -> str:
+    """The MJCF colour of #RRGGBB."""
+    return xml_numbers(*(int(colour[k : k + 2], 16) / 255.0 for k in (1, 3, 5)), 1.0)
+
+
+def part_xml(part: Part) -> str:
+    """A part as a geom of MJCF."""
+    length, width, height = (0.5 * size for size in part.size)
+    half = (length, width, height) if part.kind == "box" else (length, height)
+    return (
+        f'<geom type="{part.kind}" size="{xml_numbers(*half)}" pos="{xml_numbers(*part.centre)}" '
+        f'quat="{xml_numbers(*part.quat_wxyz)}" rgba="{xml_colour(part.colour)}" {LOOK}/>'
+    )

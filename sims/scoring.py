@@ -1,8 +1,8 @@
-"""Did it meet the ball, and where does the ball land?
+"""Did the tool meet the ball?
 
-A tool is a disc on the body z axis. The event is the passage of the ball's centre through the
-disc's plane from above, found between two steps by interpolation. A net has caught the ball
-that passes within its radius; a racket hits it there, by the library's map.
+A tool is a disc on the z axis of the body that carries it. The event is the passage of the ball's
+centre through the disc's plane from above, found between two steps by interpolation. A net has
+caught the ball that passes within its radius; a racket hits it there.
 """
 
 import jax
@@ -10,12 +10,8 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from planner_jax.ball.flight import BallState, rk4_step
-from planner_jax.ball.impact import racket_impact
-from planner_jax.sims.control import robot_state, rotation
-from planner_jax.sims.model import Physics, World, ball_states
-
-_LANDING_STEPS, _LANDING_STEP = 150, 0.02  # [s], three seconds of flight
+from planner_jax.sims.model import World, ball_states
+from planner_jax.sims.robot import Physics
 
 
 @struct.dataclass
@@ -27,11 +23,11 @@ class Contact:
     offset: Array  # () [m], of the ball from the disc's centre; inf before any passage
     ball_pos: Array  # (3,) [m]
     ball_vel: Array  # (3,) [m/s]
-    robot_pos: Array  # (3,) [m], of the propeller plane's centre
+    robot_pos: Array  # (3,) [m], of the body with the tool
     tool_vel: Array  # (3,) [m/s], of the tool at the ball, rotation included
-    normal: Array  # (3,) body z axis
+    normal: Array  # (3,) z axis of that body
     planned_time: Array  # () [s], of the plan that was flown then
-    tracking: Array  # () [m], distance of the quadrotor from its plan
+    tracking: Array  # () [m], distance of the robot from its plan
 
 
 def no_contact(num_balls: int, dtype=jnp.float32) -> Contact:
@@ -68,17 +64,8 @@ class Moment:
 
 def moment(world: World, physics: Physics) -> Moment:
     """Tool and balls in a simulated state."""
-    state = robot_state(physics)
-    R = rotation(state.quat_wxyz)
-    pos, vel = ball_states(world, physics)
-    return Moment(
-        robot_pos=state.pos,
-        robot_vel=state.vel,
-        rate=jnp.sum(R * state.rate, axis=1),
-        normal=R[:, 2],
-        ball_pos=pos,
-        ball_vel=vel,
-    )
+    motion = world.robot.tool_motion(world.robot.state(physics))
+    return Moment(*motion, *ball_states(world, physics))
 
 
 def passage(
@@ -92,7 +79,7 @@ def passage(
         after: one step later.
         time: () [s].
         planned: (N,) [s], when each ball is to be met.
-        reference: (3,) [m], where the quadrotor is to be at `time`.
+        reference: (3,) [m], where the robot is to be at `time`.
 
     Returns:
         (N,) bool, and contacts with leaves (N, ...).
@@ -136,29 +123,3 @@ def nearest(contact: Contact, passes: Array, later: Contact) -> Contact:
         return jnp.where(take.reshape(take.shape + (1,) * (old.ndim - 1)), new, old)
 
     return jax.tree.map(pick, contact, later)
-
-
-def returned(contact: Contact, restitution: Array) -> BallState:
-    """One ball just after the racket's impact, by the library's map (paper 002, eq. 3)."""
-    vel = racket_impact(contact.ball_vel, contact.tool_vel, contact.normal, restitution)
-    return BallState(pos=contact.ball_pos, vel=vel)
-
-
-def landing_point(ball: BallState, drag: Array, gravity: Array) -> tuple[Array, Array]:
-    """Where (3,) [m] one ball comes down to the ground, and when () [s] from now.
-
-    The library's flight with quadratic drag, three seconds at most; NaN for one still in the
-    air then.
-    """
-    step = jnp.full_like(drag, _LANDING_STEP)
-
-    def advance(state: BallState, _: None) -> tuple[BallState, Array]:
-        return rk4_step(state, step, drag, gravity), state.pos
-
-    _, path = jax.lax.scan(advance, ball, None, length=_LANDING_STEPS + 1)
-    falls = (path[:-1, 2] > 0.0) & (path[1:, 2] <= 0.0)
-    first = jnp.argmax(falls)
-    a, b = path[first], path[first + 1]
-    share = a[2] / jnp.where(falls[first], a[2] - b[2], 1.0)
-    point = jnp.where(falls[first], a + share * (b - a), jnp.nan)
-    return point, jnp.where(falls[first], (first + share) * step, jnp.nan)

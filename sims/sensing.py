@@ -1,4 +1,4 @@
-"""What the quadrotor sees: motion capture of the balls and of itself, and what it makes of it.
+"""What is seen of the balls by motion capture, and what is made of it.
 
 A look at a ball shows where it was a latency ago, with noise, or nothing at all. The library's
 Kalman filter turns looks into position and velocity; the energy that the ball has lost since it
@@ -23,75 +23,12 @@ from planner_jax.ball.estimation import (
     specific_energy,
 )
 from planner_jax.ball.flight import BallState, fly, rk4_step
-from planner_jax.sims.control import RobotState
+from planner_jax.sims.noise import Sensing
 
 _LEAST_STD = 1e-3  # [m], that the filter believes of a sensor without noise
 _ACCELERATION_DENSITY = 0.01  # [m^2/s^3], of what the filter's flight leaves out
 _FLIGHT_STEPS = 4  # of a prediction over latency and planning
 _DRAG_SPREAD = 0.2  # relative standard deviation of the drag believed at first
-
-
-@dataclasses.dataclass(frozen=True)
-class Sensing:
-    """Motion capture and state estimation; static under jit."""
-
-    rate: float = 100.0  # [Hz], of the looks at the balls
-    position_std: float = 0.0  # [m], of a ball's coordinate
-    dropout: float = 0.0  # probability that a look shows nothing
-    latency: float = 0.0  # [s], age of what a look shows
-    robot_position_std: float = 0.0  # [m], a coordinate; redrawn every look
-    robot_velocity_std: float = 0.0  # [m/s]
-    robot_attitude_std: float = 0.0  # [rad]
-    robot_rate_std: float = 0.0  # [rad/s]
-
-    def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            if not value >= 0.0:
-                raise ValueError(f"{field.name} must be >= 0, got {value}")
-        if not self.rate > 0.0:
-            raise ValueError(f"rate must be > 0, got {self.rate}")
-        if not self.dropout < 1.0:
-            raise ValueError(f"dropout must be < 1, got {self.dropout}")
-
-    @property
-    def robot_stds(self) -> tuple[float, ...]:
-        """Standard deviations of the quadrotor's own state, in the order of `RobotState`."""
-        return (
-            self.robot_position_std,
-            self.robot_velocity_std,
-            self.robot_attitude_std,
-            self.robot_rate_std,
-        )
-
-
-NOISES = {
-    "none": Sensing(),
-    # Both papers see with Vicon and run every module within 20 ms (002, Section VI-C), which is
-    # the latency; neither gives noise, rate or dropout. 5 mm a coordinate on a 40 mm ball at
-    # 7 m/s, 100 looks a second and 2 % of them lost are assumptions, as are the errors of the
-    # quadrotor's own state, an EKF of pose and IMU in both papers.
-    "lab": Sensing(
-        position_std=0.005,
-        dropout=0.02,
-        latency=0.02,
-        robot_position_std=0.002,
-        robot_velocity_std=0.02,
-        robot_attitude_std=0.005,
-        robot_rate_std=0.02,
-    ),
-    # Worse than the papers' halls: three times the noise, twice the latency, one look in ten
-    # lost; an assumption throughout.
-    "harsh": Sensing(
-        position_std=0.015,
-        dropout=0.1,
-        latency=0.04,
-        robot_position_std=0.006,
-        robot_velocity_std=0.06,
-        robot_attitude_std=0.015,
-        robot_rate_std=0.06,
-    ),
-}
 
 
 @struct.dataclass
@@ -112,26 +49,6 @@ def observed(key: Array, pos: Array, sensing: Sensing) -> Array:
     seen = pos + sensing.position_std * jax.random.normal(noise_key, pos.shape, pos.dtype)
     lost = jax.random.uniform(drop_key, pos.shape[:1], pos.dtype) < sensing.dropout
     return jnp.where(lost[:, None], jnp.nan, seen)
-
-
-def sensed_robot(state: RobotState, noise: Array, sensing: Sensing) -> RobotState:
-    """The quadrotor's state as it is estimated.
-
-    Args:
-        state: the true one.
-        noise: (4, 3) standard normal.
-        sensing: its standard deviations.
-    """
-    pos, vel, attitude, rate = (std * noise[k] for k, std in enumerate(sensing.robot_stds))
-    w, v = state.quat_wxyz[0], state.quat_wxyz[1:]
-    half = 0.5 * attitude  # a small rotation in the body frame
-    turned = jnp.concatenate([(w - jnp.sum(v * half))[None], v + w * half + jnp.cross(v, half)])
-    return RobotState(
-        pos=state.pos + pos,
-        vel=state.vel + vel,
-        quat_wxyz=turned / jnp.sqrt(jnp.sum(turned**2)),
-        rate=state.rate + rate,
-    )
 
 
 def _model(sensing: Sensing, drag: Array, gravity: Array) -> EkfModel:

@@ -14,17 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from planner_jax.sims.film import BALL_COLOURS, robot_lines
+from planner_jax.sims.film import BALL_COLOURS
 from planner_jax.sims.model import BALL_RADIUS, World
 from planner_jax.sims.recording import Recording, frame
-from planner_jax.sims.scenery import GROUND_COLOUR, Part, court_parts, machine_parts
-from planner_jax.sims.vehicle import rotor_positions
+from planner_jax.sims.scenery import GROUND_COLOUR, Part, machine_parts
 from planner_jax.sweep.figures.style import BLUE, GREEN, GREY, INK, RED, SKY
 from planner_jax.sweep.settings import SettingError, require
 
 _RATE = 30.0  # [Hz], of playing
 _STEP = 0.01  # [s], of the slider
-_IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 def _rgb(colour: str) -> tuple[int, int, int]:
@@ -85,7 +83,7 @@ class Viewer:
         time: slider; its `value` [s] is the time that is shown.
         playing: check box.
         speed: slider; 1 is real time.
-        robot: the quadrotor's place in the scene.
+        robot: the places of the robot's shapes in the scene.
     """
 
     def __init__(
@@ -93,6 +91,7 @@ class Viewer:
         world: World,
         recording: Recording,
         titles: Sequence[str],
+        contact: str,
         host: str = "localhost",
         port: int = 8080,
     ):
@@ -102,6 +101,7 @@ class Viewer:
             world: of the flights.
             recording: F of them.
             titles: F different ones.
+            contact: what a ball is that was met: "caught".
             host: name or address of this machine, under which the page is served.
             port: 0 takes any that is free.
 
@@ -111,6 +111,7 @@ class Viewer:
         viser = _viser()
         address = free_address(host, port)
         self.world, self.recording, self._titles = world, recording, list(titles)
+        self._contact = contact
         self._server = viser.ViserServer(address, port, label="planner-jax", verbose=False)
         bound = self._server.get_port()
         if port and bound != port:  # someone was faster
@@ -168,10 +169,9 @@ class Viewer:
         self._server.stop()
 
     def _stand(self) -> None:
-        """What is the same for all flights: ground, court, quadrotor, balls and their trails."""
+        """What is the same for all flights: ground, scenery, robot, balls and their trails."""
         add = self._scene
         add.set_up_direction("+z")
-        on_court = self.world.tool.kind == "racket"
         add.add_grid(
             "/ground",
             width=14.0,
@@ -179,19 +179,19 @@ class Viewer:
             plane_color=_rgb(GROUND_COLOUR),
             plane_opacity=1.0,
             cell_thickness=0.0,
-            section_thickness=0.0 if on_court else 1.0,
+            section_thickness=0.0 if self.world.scenery else 1.0,
             position=(0.0, 0.0, -0.01),
         )
-        if on_court:
-            self._add_parts("/court", court_parts())
-        self.robot = add.add_frame("/quadrotor", show_axes=False)
-        *body, rim = robot_lines(self.world, np.zeros(3), _IDENTITY)
-        self._add_line("/quadrotor/body", np.concatenate(list(map(segments, body))), BLUE, 0.012)
-        self._add_line("/quadrotor/rim", segments(rim), INK, 0.008)
-        tool, flat = self.world.tool, {"height": 0.004, "color": _rgb(SKY), "opacity": 0.5}
-        discs = [(place, 0.06) for place in rotor_positions(self.world.vehicle)]
-        for number, (place, radius) in enumerate([*discs, ((0.0, 0.0, tool.height), tool.radius)]):
-            add.add_cylinder(f"/quadrotor/disc{number}", radius, position=place, **flat)
+        self._add_parts("/scenery", self.world.scenery)
+        self.robot = []
+        flat = {"height": 0.004, "color": _rgb(SKY), "opacity": 0.5}
+        for number, shape in enumerate(self.world.robot.shapes()):
+            name = f"/robot{number}"
+            self.robot.append(add.add_frame(name, show_axes=False))
+            pieces = np.concatenate([segments(line) for line in shape.lines])
+            self._add_line(f"{name}/lines", pieces, BLUE, 0.012)
+            for k, (place, radius) in enumerate(shape.discs):
+                add.add_cylinder(f"{name}/disc{k}", radius, position=place, **flat)
         nothing = np.zeros((1, 2, 3))
         self._balls, self._trails = [], []
         for k in range(self.recording.num_balls):
@@ -224,9 +224,11 @@ class Viewer:
             for part in self._drawn:
                 part.remove()
             launch = recording.launch(row)
-            drawn = self._add_parts("/machine", machine_parts(*launch) if launch else [])
+            drawn = self._add_parts(
+                "/machine", machine_parts(*launch) if launch and self.world.mouth else []
+            )
             paths = [
-                ("/flown", recording.robot_pos[row], BLUE, 0.012),
+                ("/flown", self.world.robot.place(recording.robot[row]), BLUE, 0.012),
                 ("/plan", recording.wanted[row], INK, 0.006),
             ]
             paths += [
@@ -244,7 +246,7 @@ class Viewer:
                     drawn.append(dot)
             self._drawn = drawn
             met = [f"{at:.2f} s" for at in recording.met[row] if np.isfinite(at)]
-            word = "Caught" if self.world.tool.kind == "net" else "Hit"
+            word = self._contact.capitalize()
             self._note.content = f"{word} at {', '.join(met)}." if met else "No ball was met."
             self.time.value = self.time.min
             last = recording.num_looks(row) - 1
@@ -255,8 +257,10 @@ class Viewer:
         """The moving parts at the time of the slider."""
         with self._lock, self._server.atomic():
             row, look = self._row, self.look
-            now = frame(self.recording, self.world.tool, row, look)
-            self.robot.position, self.robot.wxyz = now.robot_pos, now.robot_quat
+            robot = self.world.robot
+            now = frame(self.recording, robot, row, look)
+            for shape, place in zip(self.robot, robot.places(now.robot), strict=True):
+                shape.position, shape.wxyz = place
             for k, (ball, trail) in enumerate(zip(self._balls, self._trails, strict=True)):
                 ball.visible = bool(np.isfinite(now.balls[k]).all())
                 if ball.visible:

@@ -7,16 +7,14 @@ import numpy as np
 import pytest
 
 from planner_jax.optimise.status import is_unsolved
-from planner_jax.sims.catch import fly_catches, planned_ahead, throws
-from planner_jax.sims.closed_loop import Loop
-from planner_jax.sims.hit import SCENARIOS, fly_hits, volleys
-from planner_jax.sims.model import NET, RACKET, World
-from planner_jax.sims.sensing import NOISES
+from planner_jax.sims.loop import Loop
+from planner_jax.sims.noise import NOISES
+from planner_jax.sims.settings import HIT_SUITES
+from planner_jax.sims.tasks.catch import CATCH_WORLD, fly_catches, planned_ahead, throws
+from planner_jax.sims.tasks.hit import HIT_WORLD, fly_hits, volleys
 from planner_jax.task.catch.exact import ExactCatch
 from planner_jax.task.catch.suites import make_suite
 from planner_jax.trajectory.polynomial import evaluate
-
-CATCH, HIT = World(NET), World(RACKET, gravity=9.8)
 
 
 def planned_places(flown):
@@ -34,12 +32,12 @@ def contact_errors(flown):
 
 @pytest.fixture(scope="module")
 def catches():
-    return fly_catches(Loop(CATCH), throws(3, seed=1))
+    return fly_catches(Loop(CATCH_WORLD), throws(3, seed=1))
 
 
 @pytest.fixture(scope="module")
 def hits():
-    return fly_hits(Loop(HIT), volleys(3, SCENARIOS["S.1"], seed=1))
+    return fly_hits(Loop(HIT_WORLD), volleys(3, HIT_SUITES["S.1"], seed=1))
 
 
 def test_without_noise_every_ball_is_caught_where_and_when_it_was_planned(catches):
@@ -57,14 +55,43 @@ def test_without_noise_every_ball_is_hit_where_and_when_it_was_planned(hits):
 
 def test_a_plan_of_the_other_task_is_refused(catches, hits):
     with pytest.raises(ValueError, match="^plan must be a CatchPlan, got a HitPlan$"):
-        fly_catches(Loop(CATCH), throws(3, seed=1), plan=hits.first_plan)
+        fly_catches(Loop(CATCH_WORLD), throws(3, seed=1), plan=hits.first_plan)
     with pytest.raises(ValueError, match="^plan must be a HitPlan, got a CatchPlan$"):
-        fly_hits(Loop(HIT), volleys(3, SCENARIOS["S.1"], seed=1), plan=catches.first_plan)
+        fly_hits(Loop(HIT_WORLD), volleys(3, HIT_SUITES["S.1"], seed=1), plan=catches.first_plan)
 
 
 def test_a_plan_that_is_given_is_the_one_that_is_flown(catches):
-    again = fly_catches(Loop(CATCH), throws(3, seed=1), plan=catches.first_plan)
+    again = fly_catches(Loop(CATCH_WORLD), throws(3, seed=1), plan=catches.first_plan)
     np.testing.assert_allclose(again.flown.contact.time, catches.flown.contact.time, atol=1e-5)
+
+
+def with_tool(world, **changes):
+    """The world, its robot's tool changed."""
+    robot = dataclasses.replace(world.robot, tool=dataclasses.replace(world.tool, **changes))
+    return dataclasses.replace(world, robot=robot)
+
+
+MOON = {"gravity": 1.62}
+
+
+@pytest.mark.parametrize(
+    ("fly", "world", "message"),
+    [
+        (fly_catches, with_tool(CATCH_WORLD, height=0.3), ("net_height", 0.2, 0.3)),
+        (fly_catches, with_tool(CATCH_WORLD, radius=0.1), ("net_radius", 0.125, 0.1)),
+        (fly_catches, dataclasses.replace(CATCH_WORLD, **MOON), ("gravity", 9.81, 1.62)),
+        (fly_hits, with_tool(HIT_WORLD, height=0.1), ("racket_height", 0.06, 0.1)),
+        (fly_hits, dataclasses.replace(HIT_WORLD, **MOON), ("gravity", 9.8, 1.62)),
+    ],
+)
+def test_a_world_other_than_the_planned_one_is_refused(fly, world, message):
+    name, planned, flown = message
+    with pytest.raises(ValueError) as error:
+        fly(Loop(world), throws(2) if fly is fly_catches else volleys(2))
+    assert str(error.value) == (
+        f"{name} must be the same in plan and flown world, "
+        f"got {planned} in the plan's scenario and {flown} in the world"
+    )
 
 
 @pytest.mark.parametrize(
@@ -95,29 +122,31 @@ def test_a_ball_is_planned_for_alone_where_no_plan_of_the_next_one_is_possible()
 @pytest.mark.slow
 def test_a_batch_is_flown_like_its_flights_one_by_one():
     cases = throws(3, seed=2)
-    together = fly_catches(Loop(CATCH), cases)
+    together = fly_catches(Loop(CATCH_WORLD), cases)
     for lane in range(3):
-        alone = fly_catches(Loop(CATCH), cases[[lane]])
+        alone = fly_catches(Loop(CATCH_WORLD), cases[[lane]])
         time = together.flown.contact.time[lane]
         np.testing.assert_allclose(alone.flown.contact.time[0], time, atol=1e-4)
 
 
 @pytest.mark.slow
 def test_with_noise_latency_and_wrong_drag_balls_are_caught_by_planning_anew():
-    flights = fly_catches(Loop(CATCH, NOISES["lab"], replan=100.0), throws(8, drag_error=0.15))
+    flights = fly_catches(
+        Loop(CATCH_WORLD, NOISES["lab"], replan=100.0), throws(8, drag_error=0.15)
+    )
     assert flights.caught.all()
 
 
 @pytest.mark.slow
 def test_a_second_ball_is_caught_after_the_first():
-    world = World(NET, num_balls=2)
+    world = dataclasses.replace(CATCH_WORLD, num_balls=2)
     flights = fly_catches(Loop(world, NOISES["lab"], replan=100.0), throws(4, 2, drag_error=0.15))
     assert flights.caught.sum() >= 7
 
 
 @pytest.mark.slow
 def test_a_hit_that_is_planned_anew_lands_on_the_target():
-    exact = fly_hits(Loop(HIT, replan=50.0), volleys(4, SCENARIOS["S.4"]))
+    exact = fly_hits(Loop(HIT_WORLD, replan=50.0), volleys(4, HIT_SUITES["S.4"]))
     assert exact.miss.max() < 0.05
-    noisy = fly_hits(Loop(HIT, NOISES["lab"], replan=50.0), volleys(4, SCENARIOS["S.4"]))
+    noisy = fly_hits(Loop(HIT_WORLD, NOISES["lab"], replan=50.0), volleys(4, HIT_SUITES["S.4"]))
     assert noisy.miss.max() < 0.5

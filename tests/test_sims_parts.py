@@ -1,41 +1,32 @@
 """The simulated world's parts: allocation, control, sensing, scoring, and MJX beside MuJoCo."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
 from planner_jax.ball.flight import BallState, drag_free_flight, fly
-from planner_jax.ball.impact import racket_impact
-from planner_jax.sims.closed_loop import Loop, expected, with_rest
-from planner_jax.sims.control import (
-    Gains,
-    RobotState,
-    control,
-    flat_attitude,
-    reference_at,
-    rotation_error,
-)
-from planner_jax.sims.launch import awaited, ready, require_hovering, require_world
+from planner_jax.sims.launch import awaited, ready, require_plan, require_world
+from planner_jax.sims.loop import Loop, expected
 from planner_jax.sims.model import (
-    NET,
-    RACKET,
-    World,
+    BALL_MASS,
+    at_rest,
     ball_states,
-    hovering,
-    mujoco_data,
     mujoco_model,
     placed,
     step,
-    step_mujoco,
 )
-from planner_jax.sims.scenery import court_parts, machine_parts, outlines
-from planner_jax.sims.scoring import Moment, landing_point, nearest, no_contact, passage
+from planner_jax.sims.noise import NOISES, Sensing
+from planner_jax.sims.robots.quadrotor.control import rotation_error
+from planner_jax.sims.robots.quadrotor.reference import flat_attitude, with_rest
+from planner_jax.sims.robots.quadrotor.vehicle import Vehicle, allocation, rotor_thrusts
+from planner_jax.sims.scenery import machine_parts, outlines
+from planner_jax.sims.scoring import Moment, nearest, no_contact, passage
 from planner_jax.sims.sensing import (
-    NOISES,
-    Sensing,
     anchored,
     first_estimate,
     look,
@@ -43,10 +34,11 @@ from planner_jax.sims.sensing import (
     predicted,
     with_drag,
 )
-from planner_jax.sims.vehicle import Vehicle, allocation, rotor_thrusts
+from planner_jax.sims.tasks.catch import CATCH_WORLD
+from planner_jax.sims.tasks.hit import HIT_WORLD, court_parts, landing_point
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, total_duration
 
-WORLD = World(NET)
+NET = CATCH_WORLD.tool
 GRAVITY = jnp.float32(9.81)
 
 
@@ -106,21 +98,19 @@ def test_a_trajectory_comes_to_rest_smoothly_after_its_end():
 @pytest.fixture(scope="module")
 def tracked():
     """A few quadrotors tracking the same trajectory from different attitudes, 0.8 s."""
-    world, path = WORLD, with_rest(wiggle())
+    world, robot = CATCH_WORLD, CATCH_WORLD.robot
+    plan, path = SimpleNamespace(trajectory=wiggle()), with_rest(wiggle())
 
     def one(tilt):
-        start = hovering(world, jnp.array([0.0, 0.0, 1.0]))
+        start = at_rest(world, jnp.array([0.0, 0.0, 1.0]))
         quat = jnp.stack([jnp.cos(tilt / 2), jnp.sin(tilt / 2), 0.0 * tilt, 0.0 * tilt])
         start = start.replace(qpos=start.qpos.at[3:7].set(quat))
 
         def advance(physics, time):
-            state = RobotState(
-                pos=physics.qpos[:3],
-                vel=physics.qvel[:3],
-                quat_wxyz=physics.qpos[3:7],
-                rate=physics.qvel[3:6],
+            reference = jax.tree.map(
+                lambda leaf: leaf[0], robot.references(plan, time[None], world)
             )
-            rotors = control(state, reference_at(path, time, world), Gains(), world)
+            rotors = robot.command(robot.state(physics), reference, world)
             away = jnp.linalg.norm(physics.qpos[:3] - evaluate(path, time))
             return step(world, physics, rotors, jnp.zeros(1)), (away, rotors)
 
@@ -138,11 +128,11 @@ def test_a_tilt_of_one_radian_is_recovered_from(tracked):
 
 
 def test_hover_is_an_equilibrium_and_mjx_flies_as_mujoco_does():
-    world = World(NET, contacts=False)
+    world = CATCH_WORLD
     balls = BallState(jnp.array([[0.5, 0.0, 2.0]]), jnp.array([[1.0, -2.0, 3.0]]))
     drag = jnp.array([0.06])
     start = placed(
-        world, hovering(world, jnp.array([0.0, 0.0, 1.0])), balls, drag, jnp.array([True])
+        world, at_rest(world, jnp.array([0.0, 0.0, 1.0])), balls, drag, jnp.array([True])
     )
     late = np.arange(400)[:, None] > 200
     pulses = 0.1 * late * np.sin(0.05 * np.arange(400)[:, None] * np.arange(1, 5))
@@ -154,9 +144,14 @@ def test_hover_is_an_equilibrium_and_mjx_flies_as_mujoco_does():
 
     path = jax.jit(lambda physics: jax.lax.scan(advance, physics, rotors)[1])(start)
     np.testing.assert_allclose(path[200, :7], [0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0], atol=1e-4)
-    data, reference = mujoco_data(world, start), []
+    model, reference = mujoco_model(world), []
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:], data.act[:] = start.qpos, start.qvel, start.act
     for command in np.asarray(rotors):
-        step_mujoco(world, data, command, np.asarray(drag))
+        vel = data.qvel[6:]
+        data.ctrl[:] = command
+        data.qfrc_applied[6:] = -BALL_MASS * 0.06 * np.linalg.norm(vel) * vel
+        mujoco.mj_step(model, data)
         reference.append(data.qpos.copy())
     assert np.ptp(np.array(reference)[:, 3:7], axis=0).max() > 0.01  # it did turn
     np.testing.assert_allclose(path, reference, atol=1e-4)
@@ -164,48 +159,18 @@ def test_hover_is_an_equilibrium_and_mjx_flies_as_mujoco_does():
     np.testing.assert_allclose(path[-1, 7:], truth.pos, atol=1e-3)
 
 
-@pytest.mark.parametrize("tool", [NET, RACKET])
-def test_court_and_machine_stand_there_and_touch_nothing(tool):
-    model = mujoco_model(World(tool, contacts=True))
+@pytest.mark.parametrize("world", [CATCH_WORLD, HIT_WORLD])
+def test_court_and_machine_stand_there_and_touch_nothing(world):
+    model = mujoco_model(world)
     standing = np.flatnonzero(model.geom_bodyid == 0)
     assert len(standing) >= 6
     assert not model.geom_contype.any() and not model.geom_conaffinity.any()
-    assert model.npair == 2  # the ball with ground and plate
-    ground = model.geom("ground").id
-    pairs = {*model.pair_geom1.tolist(), *model.pair_geom2.tolist()}
-    assert pairs & set(standing.tolist()) == {ground}
+    assert model.npair == 0
     assert np.ptp(model.geom_pos[standing], axis=0)[0] > 3.0  # as far as the machine
     for part in machine_parts((1.0, 2.0, 0.8), 0.5) + court_parts():
         lines = np.concatenate(outlines(part))
         np.testing.assert_allclose(0.5 * (lines.min(0) + lines.max(0)), part.centre, atol=1e-9)
         assert lines[:, 2].min() > -1e-9
-
-
-def test_a_ball_that_falls_on_the_plate_of_a_net_is_held_by_mujocos_own_contact():
-    world = World(NET, contacts=True)
-    balls = BallState(jnp.array([[0.02, 0.0, 1.5]]), jnp.array([[0.0, 0.0, -1.0]]))
-    start = placed(
-        world, hovering(world, jnp.array([0.0, 0.0, 1.0])), balls, jnp.zeros(1), jnp.array([True])
-    )
-    data = mujoco_data(world, start)
-    heights = []
-    for _ in range(150):
-        step_mujoco(world, data, np.asarray(start.act), np.zeros(1))
-        heights.append(data.qpos[9] - data.qpos[2])
-    assert min(heights) > NET.height - 0.08  # it did not fall through
-
-
-def test_mujocos_own_contact_bounces_a_ball_off_the_racket_like_the_librarys_map():
-    world = World(RACKET, timestep=0.0005, contacts=True)
-    vel = jnp.array([[0.5, 0.0, -7.0]])
-    balls = BallState(jnp.array([[0.0, 0.0, 1.1]]), vel)
-    calm = hovering(world, jnp.array([0.0, 0.0, 1.0]))
-    start = placed(world, calm, balls, jnp.zeros(1), jnp.array([True]))
-    data = mujoco_data(world, start)
-    for _ in range(40):
-        step_mujoco(world, data, np.asarray(start.act), np.zeros(1))
-    expected = racket_impact(vel[0], jnp.zeros(3), jnp.array([0.0, 0.0, 1.0]), 0.7)
-    np.testing.assert_allclose(data.qvel[6:], expected, atol=0.5)
 
 
 def moments(gap_before, gap_after, aside):
@@ -227,11 +192,11 @@ def moments(gap_before, gap_after, aside):
 )
 def test_a_ball_is_caught_from_above_inside_the_radius_at_the_interpolated_time(gaps, aside, met):
     before, after = moments(*gaps, aside)
-    passes, later = passage(WORLD, before, after, 1.0, jnp.zeros(1), jnp.zeros(3))
+    passes, later = passage(CATCH_WORLD, before, after, 1.0, jnp.zeros(1), jnp.zeros(3))
     contact = nearest(no_contact(1), passes, later)
     assert bool(contact.met[0]) == met
     if gaps[0] > 0.0:
-        np.testing.assert_allclose(contact.time, 1.0 + 0.3 * WORLD.timestep, rtol=1e-6)
+        np.testing.assert_allclose(contact.time, 1.0 + 0.3 * CATCH_WORLD.timestep, rtol=1e-6)
         np.testing.assert_allclose(contact.offset, aside, rtol=1e-5)
 
 
@@ -268,7 +233,7 @@ def test_the_drag_is_found_from_the_energy_that_is_lost():
 
 
 def test_an_awaited_ball_is_believed_to_come_as_it_is_guessed():
-    loop = Loop(World(NET, num_balls=2), NOISES["lab"], replan=100.0)
+    loop = Loop(dataclasses.replace(CATCH_WORLD, num_balls=2), NOISES["lab"], replan=100.0)
     coming = BallState(jnp.array([2.9, 0.1, 2.4]), jnp.array([-3.0, 0.5, 4.0]))
     flights = ready(loop, jnp.zeros((3, 3)), jax.random.split(jax.random.key(0), 3))
     believed = jnp.full((3, 2), 0.06)
@@ -290,15 +255,21 @@ def test_a_lost_look_shows_nothing():
     [
         (lambda: Sensing(position_std=-0.1), "position_std must be >= 0, got -0.1"),
         (lambda: Sensing(dropout=1.0), "dropout must be < 1, got 1.0"),
-        (lambda: Loop(WORLD, replan=-1.0), "replan must be >= 0, got -1.0"),
-        (lambda: Loop(WORLD, replan=30.0), "replan must be a divisor of the looks' 100 Hz, got 30"),
-        (lambda: Loop(WORLD, Sensing(rate=300.0)), "rate must be a divisor of 500 Hz, got 300"),
+        (lambda: Loop(CATCH_WORLD, replan=-1.0), "replan must be >= 0, got -1.0"),
         (
-            lambda: Loop(WORLD, Sensing(latency=0.015)),
+            lambda: Loop(CATCH_WORLD, replan=30.0),
+            "replan must be a divisor of the looks' 100 Hz, got 30",
+        ),
+        (
+            lambda: Loop(CATCH_WORLD, Sensing(rate=300.0)),
+            "rate must be a divisor of 500 Hz, got 300",
+        ),
+        (
+            lambda: Loop(CATCH_WORLD, Sensing(latency=0.015)),
             "latency must be a multiple of the looks' 0.01 s, got 0.015",
         ),
-        (lambda: World(NET, num_balls=0), "num_balls must be >= 1, got 0"),
-        (lambda: World(NET, timestep=0.0), "timestep must be > 0, got 0.0"),
+        (lambda: dataclasses.replace(CATCH_WORLD, num_balls=0), "num_balls must be >= 1, got 0"),
+        (lambda: dataclasses.replace(CATCH_WORLD, timestep=0.0), "timestep must be > 0, got 0.0"),
     ],
 )
 def test_what_cannot_be_flown_is_refused_in_one_line(build, message):
@@ -308,10 +279,10 @@ def test_what_cannot_be_flown_is_refused_in_one_line(build, message):
 
 
 def test_a_plan_or_world_of_another_robot_is_refused():
-    with pytest.raises(ValueError, match="^world must carry Tool.*net.*, got Tool.*racket"):
-        require_world(Loop(World(RACKET)), NET, 1)
+    with pytest.raises(ValueError, match="^world must carry a net, got a racket$"):
+        require_world(Loop(HIT_WORLD), "net", 1)
     with pytest.raises(ValueError, match="^world must have 2 balls, got 1$"):
-        require_world(Loop(WORLD), NET, 2)
+        require_world(Loop(CATCH_WORLD), "net", 2)
 
     @dataclasses.dataclass
     class Plan:
@@ -319,14 +290,14 @@ def test_a_plan_or_world_of_another_robot_is_refused():
 
     plan = Plan(jax.tree.map(lambda leaf: np.asarray(leaf)[None], wiggle()))
     heads = np.zeros((1, 4, 3))
-    with pytest.raises(ValueError, match="^plan must begin where its quadrotor is, got 1.00 m"):
-        require_hovering(heads, plan)
+    with pytest.raises(ValueError, match="^plan must begin where its robot is, got 1.00 m"):
+        require_plan(plan, Plan, heads)
     with pytest.raises(ValueError, match="^plan must be of 2 flights, got 1$"):
-        require_hovering(np.zeros((2, 4, 3)), plan)
+        require_plan(plan, Plan, np.zeros((2, 4, 3)))
 
 
 def test_the_presets_are_in_rising_order_of_noise():
     assert list(NOISES) == ["none", "lab", "harsh"]
     stds = [noise.position_std for noise in NOISES.values()]
     assert stds == sorted(stds)
-    assert ball_states(WORLD, hovering(WORLD, jnp.zeros(3)))[0].shape == (1, 3)
+    assert ball_states(CATCH_WORLD, at_rest(CATCH_WORLD, jnp.zeros(3)))[0].shape == (1, 3)

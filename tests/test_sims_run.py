@@ -1,37 +1,56 @@
 """Run folders of flights, films, and the command `planner-jax fly`."""
 
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
 import pytest
+from flax import struct
 from matplotlib.figure import Figure
 
+from planner_jax.ball.flight import BallState
 from planner_jax.cli import main
 from planner_jax.sims.film import FilmError, draw_flight, film_flights, require_film
-from planner_jax.sims.model import NET, RACKET, World
-from planner_jax.sims.run import FlySettings
+from planner_jax.sims.launch import flight_keys, launched, ready
+from planner_jax.sims.loop import flown, fly_leg
+from planner_jax.sims.recording import Launches
+from planner_jax.sims.run import start_flights
+from planner_jax.sims.scoring import passage
+from planner_jax.sims.settings import FLIGHTS, CatchFly, FlySettings, HitFly, fly_settings
+from planner_jax.sims.task import FlightCases, Flights, FlightTask
+from planner_jax.sims.tasks.catch import CATCH_WORLD
+from planner_jax.sims.tasks.hit import HIT_WORLD
 from planner_jax.sweep.settings import SettingError
+from planner_jax.trajectory.polynomial import PiecewisePolynomial
 from tests.recordings import recording
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    ("build", "message"),
     [
-        ({"task": "block"}, "task must be one of catch, hit, got 'block'"),
-        ({"task": "catch", "noise": "loud"}, "noise must be one of none, lab, harsh, got 'loud'"),
-        ({"task": "catch", "num": 0}, "num must be >= 1, got 0"),
+        (lambda: fly_settings("block"), "task must be one of catch, hit, got 'block'"),
+        (lambda: CatchFly(noise="loud"), "noise must be one of none, lab, harsh, got 'loud'"),
+        (lambda: CatchFly(num=0), "num must be >= 1, got 0"),
+        (lambda: CatchFly(replan=30.0), "replan must be a divisor of the looks' 100 Hz, got 30"),
         (
-            {"task": "catch", "replan": 30.0},
-            "replan must be a divisor of the looks' 100 Hz, got 30",
+            lambda: CatchFly(balls=2, replan=100.0 / 3.0),
+            "replan must be such that its period divides 0.8 s, got 33.3333",
         ),
-        ({"task": "hit", "balls": 2}, "balls must be 1 for hits, got 2"),
+        (lambda: CatchFly(balls=0), "balls must be >= 1, got 0"),
         (
-            {"task": "hit", "planner": "juggle", "replan": 50.0},
+            lambda: HitFly(planner="juggle", replan=50.0),
             "replan must be 0 for other planners, got 50.0",
         ),
-        ({"task": "catch", "drag_error": -0.1}, "drag_error must be >= 0 and < 1, got -0.1"),
+        (
+            lambda: HitFly(suite="S.7"),
+            "suite must be one of S.1, S.2, S.3, S.4, S.5, S.6, got 'S.7'",
+        ),
+        (lambda: CatchFly(drag_error=-0.1), "drag_error must be >= 0 and < 1, got -0.1"),
     ],
 )
-def test_settings_that_break_a_rule_are_refused_in_one_line(given, message):
+def test_settings_that_break_a_rule_are_refused_in_one_line(build, message):
     with pytest.raises(SettingError) as error:
-        FlySettings(**given)
+        build()
     assert str(error.value) == message
 
 
@@ -50,7 +69,7 @@ def test_the_command_says_what_is_wrong_and_writes_nothing(tmp_path, capsys):
 
 def test_a_film_is_written_without_a_display(tmp_path):
     path = tmp_path / "flights.gif"
-    film_flights(path, World(NET), recording(), ["one"])
+    film_flights(path, CATCH_WORLD, recording(), ["one"])
     assert path.read_bytes()[:4] == b"GIF8"
     assert list(tmp_path.iterdir()) == [path]
 
@@ -58,13 +77,13 @@ def test_a_film_is_written_without_a_display(tmp_path):
 def test_a_film_that_fails_leaves_nothing_behind(tmp_path, monkeypatch):
     monkeypatch.setattr(Figure, "clear", lambda self: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        film_flights(tmp_path / "flights.gif", World(NET), recording(), ["one"])
+        film_flights(tmp_path / "flights.gif", CATCH_WORLD, recording(), ["one"])
     assert not list(tmp_path.iterdir())
 
 
 def test_a_picture_of_a_hit_shows_court_machine_and_target(tmp_path):
     path = tmp_path / "flight.png"
-    draw_flight(path, World(RACKET), recording(target=(1.75, 0.0, 0.0)), 0, "one")
+    draw_flight(path, HIT_WORLD, recording(target=(1.75, 0.0, 0.0)), 0, "one", "hit")
     assert path.read_bytes()[1:4] == b"PNG"
 
 
@@ -100,3 +119,71 @@ def test_a_run_of_flights_is_written_whole(tmp_path, capsys):
     (out / "flights.parquet").unlink()
     assert main(["report", str(out)]) == 2
     assert "RUN must be finished, with its flights.parquet" in capsys.readouterr().err
+
+
+@dataclasses.dataclass(frozen=True)
+class DropFly(FlySettings):
+    """A third task: a quadrotor hovers, and a ball falls into its net."""
+
+    TASK, WORDS = "drop", "a quadrotor holds a falling ball"
+    FLIGHT = "tests.test_sims_run:DropFlight"
+    PLANNERS, RATE = {"exact": "hover"}, 0.0
+
+
+@struct.dataclass
+class HoverPlan:
+    trajectory: PiecewisePolynomial
+    status: np.ndarray
+    iterations: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class DropPilot:
+    passage = staticmethod(passage)
+
+    def times(self, plan):
+        return jnp.full(1, 0.45)
+
+
+class DropFlights(Flights):
+    @property
+    def success(self):
+        return np.all(self.flown.contact.met, axis=1)
+
+
+class DropFlight(FlightTask):
+    CONTACT, SUCCESS, PUBLISHED, COLUMNS = "caught", "held the ball", "nothing", ()
+    suite = "a fall of 1 m"
+
+    def world(self):
+        return CATCH_WORLD
+
+    def cases(self):
+        return FlightCases(np.arange(self.settings.num))
+
+    def fly(self, cases, record):
+        loop, num = self.loop(record), len(cases)
+        place, drag = jnp.tile(jnp.array([0.0, 0.0, 1.0]), (num, 1)), jnp.full((num, 1), 0.06)
+        path = jnp.zeros((num, 1, 8, 3)).at[:, 0, 0].set(place)
+        codes = np.zeros(num, int)
+        plan = HoverPlan(PiecewisePolynomial(path, jnp.ones((num, 1))), codes, codes)
+        state = ready(loop, place, flight_keys(self.settings.seed, cases.index))
+        balls = self.launches(cases, None).balls
+        state = launched(loop, state, balls, drag, drag, ball=0, seen=0.1)
+        state = state.replace(plan=plan, began=state.time, present=state.launched)
+        state, looks = fly_leg(loop, DropPilot(), state, None, drag, num_periods=60)
+        return DropFlights(plan, flown(state, [looks]), 0.0)
+
+    def launches(self, cases, flown):
+        at = np.tile(np.float32([0.0, 0.0, 2.2]), (len(cases), 1, 1))
+        return Launches(BallState(at, 0.0 * at), np.full(at.shape[:2], 0.06), np.zeros(1), 0.1)
+
+
+def test_a_third_task_is_flown_into_a_run_folder_without_an_edit(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(FLIGHTS, "drop", "tests.test_sims_run:DropFly")
+    manifest = start_flights(DropFly(num=2, noise="none"), tmp_path / "run")
+    assert manifest["kind"] == "fly drop"
+    assert (manifest["summary"]["success_rate"], manifest["summary"]["num"]) == (1.0, 2)
+    assert main(["report", str(tmp_path / "run")]) == 0
+    assert "100.00 % of 2 flights held the ball" in capsys.readouterr().out
+    assert "a fall of 1 m" in (tmp_path / "run" / "index.html").read_text()

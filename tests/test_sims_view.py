@@ -16,17 +16,28 @@ import pytest
 from planner_jax.ball.flight import BallState
 from planner_jax.cli import main
 from planner_jax.sims import view
-from planner_jax.sims.closed_loop import Flown, Record
-from planner_jax.sims.model import BALL_RADIUS, NET, RACKET, Physics, World
-from planner_jax.sims.recording import FILE, Recording, frame, read_recording, recorded, to_rows
-from planner_jax.sims.run import FlySettings
+from planner_jax.sims.loop import Flown, Record
+from planner_jax.sims.model import BALL_RADIUS
+from planner_jax.sims.recording import (
+    FILE,
+    Launches,
+    Recording,
+    frame,
+    read_recording,
+    recorded,
+    to_rows,
+)
+from planner_jax.sims.robot import Physics
 from planner_jax.sims.scoring import no_contact
+from planner_jax.sims.settings import CatchFly
+from planner_jax.sims.tasks.catch import CATCH_WORLD
+from planner_jax.sims.tasks.hit import HIT_WORLD
 from planner_jax.sims.view import Viewer, free_address, segments
 from planner_jax.sweep.run_folder import RunFolder
 from planner_jax.sweep.settings import SettingError
 from tests.recordings import recording
 
-GRAVITY = 9.81
+GRAVITY, NET = CATCH_WORLD.gravity, CATCH_WORLD.robot
 needs_viser = pytest.mark.skipif(
     importlib.util.find_spec("viser") is None,
     reason="viser is not installed; it comes with the extra view",
@@ -60,17 +71,10 @@ def flight_with_return():
 
 def kept(flown, balls, begins, **more):
     """The recording of one flight without drag."""
-    return recorded(
-        flown,
-        balls,
-        index=np.array([0]),
-        success=np.array([True]),
-        drag=np.zeros((1, len(begins))),
-        gravity=GRAVITY,
-        begins=np.array(begins),
-        seen=0.3,
-        **more,
-    )
+    drag = np.zeros((1, len(begins)))
+    launches = Launches(balls, drag, np.array(begins), seen=0.3, **more)
+    one = {"index": np.array([0]), "success": np.array([True])}
+    return recorded(CATCH_WORLD, flown, launches, **one)
 
 
 def test_a_recording_holds_the_ball_from_the_machine_to_the_ground():
@@ -88,7 +92,7 @@ def test_a_recording_holds_the_ball_from_the_machine_to_the_ground():
     assert down <= times[-1] < down + 0.02
     np.testing.assert_allclose(path[-1], [*back.pos[0, :2], 0.0], atol=1e-4)
     assert np.isfinite(path).all()
-    assert np.isnan(whole.robot_pos[0, times > 0.505]).all()  # it was simulated no further
+    assert np.isnan(whole.robot[0, times > 0.505]).all()  # it was simulated no further
     assert whole.num_looks(0) == len(times)
 
 
@@ -130,17 +134,17 @@ def test_a_recording_is_read_as_it_was_written(tmp_path):
 def test_a_frame_shows_where_everything_is_at_a_look():
     now = frame(recording(), NET, 0, 2)
     assert now.time == 0.02
-    np.testing.assert_allclose(now.robot_pos, [0.0, 0.0, 1.02])
+    np.testing.assert_allclose(now.robot[:3], [0.0, 0.0, 1.02])
     np.testing.assert_allclose(now.wanted, [0.01, 0.01, 1.03])
     np.testing.assert_allclose(now.balls, [[0.3, 0.0, 1.98]])
 
 
 def test_after_its_end_a_flight_stands_still_and_a_caught_ball_lies_in_the_net():
     last = frame(recording(), NET, 0, 5)
-    np.testing.assert_allclose(last.robot_pos, [0.0, 0.0, 1.04])
-    inside = [[0.0, 0.0, 1.04 + NET.height - BALL_RADIUS]]
+    np.testing.assert_allclose(last.robot[:3], [0.0, 0.0, 1.04])
+    inside = [[0.0, 0.0, 1.04 + NET.tool.height - BALL_RADIUS]]
     np.testing.assert_allclose(last.balls, inside)
-    assert np.isnan(frame(recording(), RACKET, 0, 5).balls).all()  # a racket holds none
+    assert np.isnan(frame(recording(), HIT_WORLD.robot, 0, 5).balls).all()  # a racket holds none
 
 
 @pytest.mark.parametrize(
@@ -178,7 +182,7 @@ def test_what_cannot_be_served_is_said_in_one_line():
 def run_folder(tmp_path):
     """A folder like that of a run of flights."""
     folder = RunFolder(tmp_path / "run")
-    settings = dataclasses.asdict(FlySettings("catch"))
+    settings = dataclasses.asdict(CatchFly())
     folder.create({"kind": "fly catch", "state": "complete", "parameters": settings})
     folder.write_rows(folder.path / FILE, to_rows(recording()))
     return folder
@@ -198,6 +202,10 @@ def test_a_folder_without_flights_is_refused_in_one_line(run_folder, tmp_path, c
     run_folder.write_manifest({**manifest, "state": "running"})
     assert said(capsys, run_folder.path).startswith("RUN must be finished, with its flights.parq")
     run_folder.write_manifest(manifest)
+    settings = {**manifest["parameters"], "task": "catch"}
+    run_folder.write_manifest({**manifest, "parameters": settings})
+    assert said(capsys, run_folder.path).startswith("RUN must be of this version, fly it again: ")
+    run_folder.write_manifest(manifest)
     (run_folder.path / FILE).write_bytes(b"half of it")
     assert said(capsys, run_folder.path).startswith("RUN must have a whole flights.parquet: ")
 
@@ -212,13 +220,13 @@ def test_a_missing_viser_is_named_with_its_remedy(run_folder, capsys, monkeypatc
 def test_a_flight_is_served_scrubbed_and_played():
     two = jax.tree.map(lambda leaf: np.repeat(leaf, 2, axis=0), vars(recording()))
     two["time"] = two["time"].astype(np.float32)
-    viewer = Viewer(World(NET), Recording(**two), ["one", "two"], port=0)
+    viewer = Viewer(CATCH_WORLD, Recording(**two), ["one", "two"], "caught", port=0)
     try:
         with urllib.request.urlopen(viewer.url, timeout=10) as page:
             assert page.status == 200 and b"<html" in page.read()
         viewer.time.value = 0.02
         assert viewer.look == 2
-        np.testing.assert_allclose(viewer.robot.position, [0.0, 0.0, 1.02])
+        np.testing.assert_allclose(viewer.robot[0].position, [0.0, 0.0, 1.02])
         viewer.flight.value = "two"
         assert viewer.look == 0
         viewer.speed.value = 1.0

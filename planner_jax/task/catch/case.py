@@ -10,6 +10,10 @@ from jax import Array
 
 from planner_jax.ball.target import TargetPath
 
+GRAVITY = 9.81  # [m/s^2]
+START = (0.0, 0.0, 1.0)  # [m], where the quadrotor hovers
+NET_HEIGHT, NET_RADIUS = 0.2, 0.125  # [m], of the hoop (paper 000, Fig. 6)
+
 
 @struct.dataclass
 class CatchLimits:
@@ -87,10 +91,10 @@ def case(
     horizon,
     *,
     present: Any = True,
-    start=(0.0, 0.0, 1.0),
-    gravity: Any = 9.81,
-    net_height=0.2,
-    net_radius=0.125,
+    start=START,
+    gravity: Any = GRAVITY,
+    net_height=NET_HEIGHT,
+    net_radius=NET_RADIUS,
     max_angle=np.pi / 6.0,
     speed=5.0,
     min_thrust=None,

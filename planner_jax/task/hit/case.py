@@ -8,6 +8,13 @@ from jax import Array
 from planner_jax.ball.flight import BallState
 from planner_jax.robot.quadrotor import QuadrotorLimits
 
+# Fit to the published landing points; the residual is 1 cm.
+DRAG = 0.0616  # K_D [1/m]
+GRAVITY = 9.8  # [m/s^2]
+# An assumption: the paper draws the hover start at the near/far boundary of the hitting half.
+START = (-3.0, 0.0, 1.5)  # [m]
+RACKET_HEIGHT = 0.06  # [m], racket centre above the propeller plane (paper 002, Fig. 2)
+
 
 @struct.dataclass
 class HitLimits:
@@ -46,11 +53,11 @@ def case(
     serve_vel,
     target,
     *,
-    start=(-3.0, 0.0, 1.5),
-    drag=0.0616,
-    gravity=9.8,
+    start=START,
+    drag=DRAG,
+    gravity=GRAVITY,
     restitution=0.7,
-    racket_height=0.06,
+    racket_height=RACKET_HEIGHT,
     speed=5.0,
     acceleration=15.0,
     body_rate=5.0,
@@ -61,9 +68,6 @@ def case(
     dtype=jnp.float32,
 ) -> HitCase:
     """A hit, or a batch of them, with the setting of paper 002, Section VI-A.
-
-    K_D and g are the fit to the published landing positions; the hover start is an
-    assumption (the paper draws it at the near/far boundary of the hitting half).
 
     Args:
         serve_pos: (..., 3) [m], ball when planning begins.

@@ -12,9 +12,9 @@ import numpy as np
 from scipy.interpolate import RectBivariateSpline
 
 from planner_jax.task.hit import court
-from planner_jax.task.hit.case import HitCase, case
+from planner_jax.task.hit.case import DRAG, GRAVITY, START, HitCase, case
 from planner_jax.task.hit.trial_files import read_trials
-from planner_jax.task.hit.validate import DRAG, GRAVITY, ServeError, fly, landing
+from planner_jax.task.hit.validate import ServeError, fly, landing
 
 # The law of the published serves, fitted to them. Position and velocity are uniform, and those
 # serves are kept that meet the following and land in the region asked for.
@@ -268,7 +268,7 @@ def uniform_starts(index: np.ndarray, seed: int) -> np.ndarray:
 def to_cases(
     serves: Serves,
     *,
-    start: Sequence[float] | str = (-3.0, 0.0, 1.5),
+    start: Sequence[float] | str = START,
     seed: int = 0,
     delay: float = 0.0,
     limit_scale: float = 1.0,

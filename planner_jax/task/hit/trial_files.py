@@ -9,7 +9,8 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from planner_jax.task.hit import court
-from planner_jax.task.hit.validate import DRAG, GRAVITY, ServeError, landing
+from planner_jax.task.hit.scenario import DRAG, GRAVITY
+from planner_jax.task.hit.validate import ServeError, landing
 
 _FILE_NAME = re.compile(r"([1-4])_([1-4])_([1-4])_([plb])\.csv")
 _FILE_PLANNER = {"p": "bat", "l": "bat-lite", "b": "juggle"}

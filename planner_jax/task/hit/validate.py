@@ -12,10 +12,6 @@ import numpy as np
 
 from planner_jax.task.hit.case import HitCase
 
-# Fit to the published landing points; the residual is 1 cm.
-DRAG = 0.0616  # K_D [1/m]
-GRAVITY = 9.8  # [m/s^2]
-
 _FLIGHT_STEPS = 16  # puts the landing point of a serve within 0.1 mm
 _NEWTON_STEPS = 5
 

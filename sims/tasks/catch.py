@@ -21,38 +21,41 @@ from planner_jax.ball.prediction import PathTable, predict_path
 from planner_jax.optimise.multistart import solve_round
 from planner_jax.optimise.problem import Planner
 from planner_jax.optimise.status import is_unsolved
-from planner_jax.sims.closed_loop import (
-    Flight,
-    Flown,
-    Loop,
-    Outlook,
-    expected,
-    flown,
-    fly_leg,
-    state_at,
-    whole,
-    with_rest,
-)
 from planner_jax.sims.launch import (
     awaited,
     flight_keys,
     launched,
     ready,
-    require_hovering,
+    require_plan,
     require_world,
 )
-from planner_jax.sims.model import NET
+from planner_jax.sims.loop import FlightState, Flown, Loop, Outlook, expected, flown, fly_leg
+from planner_jax.sims.model import World
+from planner_jax.sims.recording import Launches
+from planner_jax.sims.robot import Tool
+from planner_jax.sims.robots.quadrotor.robot import Quadrotor
+from planner_jax.sims.scoring import passage
+from planner_jax.sims.settings import INTERVAL, CatchFly, require_interval
+from planner_jax.sims.task import FlightCases, Flights, FlightTask
+from planner_jax.sweep.columns import BOOL, Column, list_of
 from planner_jax.task.catch.decide import plan_catches
 from planner_jax.task.catch.exact import ExactCatch
 from planner_jax.task.catch.plan import CatchPlan
+from planner_jax.task.catch.planners import catch_planner
 from planner_jax.task.catch.replan import ReplanCatch, ReplanScenario
-from planner_jax.task.catch.scenario import CatchScenario, catch_scenario
-from planner_jax.task.catch.suites import earliest_throw, make_suite
+from planner_jax.task.catch.scenario import (
+    GRAVITY,
+    NET_HEIGHT,
+    NET_RADIUS,
+    START,
+    CatchScenario,
+    catch_scenario,
+)
+from planner_jax.task.catch.suites import LAUNCH, earliest_throw, make_suite
+from planner_jax.task.hit.scenario import DRAG  # of the published serves; paper 000 gives none
 
-HOME = (0.0, 0.0, 1.0)  # [m], where the quadrotor hovers
-INTERVAL = 0.8  # [s], from throw to throw (paper 000, Fig. 1)
+CATCH_WORLD = World(Quadrotor(Tool("net", NET_HEIGHT, NET_RADIUS)), GRAVITY, mouth=LAUNCH)
 SEEN = 0.3  # [s], a throw's flight before it is planned for: 2 m and more (paper 000, VII-A)
-DRAG = 0.0616  # [1/m], K_D of the published serves; paper 000 gives none
 _TABLE_NODES = 36
 _AIM_RADIUS = 0.05  # [m], of the net that plans are made for; the rest is left for errors
 # Least thrust [g] and greatest body rate [rad/s] of plans. A weak thrust and a fast turn leave
@@ -68,10 +71,13 @@ class CatchPilot:
 
     # Later than 0.2 s before a catch a new plan shakes more than the news of the ball is worth.
     planner: ReplanCatch = ReplanCatch(shortest=0.2)
-    # Relative, over a limit, with which a new plan is still flown, unless the old one has more:
-    # of the last catch, and of more, where the excess is mostly on the way to those that are
-    # planned from scratch later, and an old plan would miss the ball that comes first.
+    # A new plan may break a limit by this share of the limit and is still flown; one that breaks
+    # it by more is flown only if the old plan breaks its limits by as much. The first share holds
+    # for the last catch, the second while several are left: then most of the excess lies on the
+    # way to catches that will be planned from scratch later, and keeping the old plan would miss
+    # the ball that comes first.
     excess: tuple[float, float] = (0.1, 1.0)
+    passage = staticmethod(passage)
 
     def times(self, plan: CatchPlan) -> Array:
         """When each ball is to be caught (N,) [s], in the balls' order."""
@@ -109,22 +115,16 @@ def tables(balls: BallState, drag: Array, horizon: Array, gravity: Array) -> Pat
 
 
 @dataclasses.dataclass(frozen=True)
-class Throws:
+class Throws(FlightCases):
     """B flights of N balls each, NumPy leaves. A ball's own time begins when it is planned for."""
 
     balls: BallState  # leaves (B, N, 3), each at its own time 0
     horizon: np.ndarray  # (B, N) [s], until when each may be caught, its own time
     drag: np.ndarray  # (B, N) K_D [1/m], the true one
     believed: np.ndarray  # (B, N) K_D [1/m]
-    index: np.ndarray  # (B,) place in the whole, which decides the noise
-
-    def __len__(self) -> int:
-        return self.horizon.shape[0]
-
-    def __getitem__(self, rows: Any) -> "Throws":
-        """Some of them, picked as NumPy does."""
-        columns = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        return Throws(**jax.tree.map(lambda leaf: leaf[rows], columns))
+    gravity: np.ndarray  # (B,) [m/s^2], magnitude
+    net_height: np.ndarray  # (B,) [m], of the hoop above the propeller plane
+    net_radius: np.ndarray  # (B,) [m]
 
 
 def throws(
@@ -145,63 +145,68 @@ def throws(
         raise ValueError(f"drag_error must be >= 0 and < 1, got {drag_error}")
     suite = jax.tree.map(np.asarray, make_suite("throws", num * num_balls, seed))
     shaped = lambda leaf: leaf[:, 0].reshape(num, num_balls, *leaf.shape[2:])  # noqa: E731
+    first = lambda leaf: leaf[::num_balls]  # noqa: E731
     true = np.full((num, num_balls), drag, np.float32)
     sign = np.random.default_rng([seed, 1]).choice([-1.0, 1.0], (num, 1))
     return Throws(
+        index=np.arange(num),
         balls=jax.tree.map(shaped, suite.targets.ball),
         horizon=shaped(suite.horizon),
         drag=true,
         believed=(true * (1.0 + drag_error * sign)).astype(np.float32),
-        index=np.arange(num),
+        gravity=first(suite.gravity),
+        net_height=first(suite.net.height),
+        net_radius=first(suite.net.radius),
     )
 
 
-@dataclasses.dataclass(frozen=True)
-class CatchFlights:
+class CatchFlights(Flights):
     """What came of a batch of throws; leaves with a leading axis B."""
-
-    first_plan: CatchPlan
-    flown: Flown  # times from the first plan
-    planning_seconds: float  # of the host's clock, spent on plans from scratch
 
     @property
     def caught(self) -> np.ndarray:
         """Which balls fell into the net, (B, N) bool."""
         return np.asarray(self.flown.contact.met)
 
+    @property
+    def success(self) -> np.ndarray:
+        """Which flights caught all balls, (B,) bool."""
+        return np.all(self.caught, axis=1)
+
 
 @functools.partial(jax.jit, static_argnames="loop")
-def scenarios(loop: Loop, flights: Flight, new: Array, horizon: Array) -> CatchScenario:
-    """The catches of a ball that has come into sight and of the next, as they are believed.
+def scenarios(loop: Loop, flights: FlightState, new: Array, horizon: Array) -> CatchScenario:
+    """What is believed of a ball that has come into sight and of the next one, to be planned.
 
-    They are to be planned from where the last catch of a ball seen before will have been made,
-    or from now where none is left; times count from then.
+    The plans begin where and when the last catch of a ball seen before will have been made, or
+    now where no such catch is left; times count from there.
 
     Args:
         loop: of the flights.
         flights: leaves (B, ...).
-        new: (N,) bool, which balls these are.
+        new: (N,) bool, the balls that are to be planned.
         horizon: (B, N) [s] from now, until when each may be caught.
     """
     unknown: Any = None
     least_thrust, body_rate = _FIRST if flights.plan is None else _BEHIND
+    robot = loop.world.robot
     empty = catch_scenario(
         unknown,
         np.zeros(horizon.shape),
         gravity=loop.world.gravity,
+        net_height=loop.world.tool.height,
         net_radius=_AIM_RADIUS,
         min_thrust=least_thrust * loop.world.gravity,
         body_rate=body_rate,
     )
 
-    def one(scenario: CatchScenario, flight: Flight, horizon: Array) -> CatchScenario:
+    def one(scenario: CatchScenario, flight: FlightState, horizon: Array) -> CatchScenario:
         head, after = scenario.head_state, jnp.zeros_like(flight.time)
         if flight.plan is None:
-            head = head.at[0].set(flight.physics.qpos[:3])
+            head = head.at[0].set(robot.state(flight.physics).pos)
         else:
             after = until_last_catch(flight, new)
-            path = with_rest(flight.plan.trajectory)
-            head = state_at(path, flight.time - flight.began + after)
+            head = robot.head_state(flight.plan, flight.time - flight.began + after)
         balls = expected(loop, flight.earlier, loop.period + after)
         horizon = horizon - after
         return dataclasses.replace(
@@ -215,47 +220,52 @@ def scenarios(loop: Loop, flights: Flight, new: Array, horizon: Array) -> CatchS
     return jax.vmap(one)(empty, flights, horizon)
 
 
-def until_last_catch(flight: Flight, new: Array) -> Array:
+def until_last_catch(flight: FlightState, new: Array) -> Array:
     """Time () [s] to the last catch that is planned of balls not `new` (N,); 0 if none is left."""
     planned = CatchPilot().times(flight.plan) - (flight.time - flight.began)
     return jnp.maximum(jnp.max(jnp.where(flight.present & ~new, planned, 0.0)), 0.0)
 
 
 @jax.jit
-def with_catch(flights: Flight, found: CatchPlan, new: Array) -> Flight:
-    """Flights (B, ...) with new catches behind those of the balls that were seen before.
+def with_catch(flights: FlightState, found: CatchPlan, new: Array) -> FlightState:
+    """Flights (B, ...) whose plans go on with new catches after those of the balls seen before.
+
+    Where a ball seen before is still to be caught, the new plan is appended to the one that is
+    flown, after its last such catch. Elsewhere the new plan is flown alone, from now on.
 
     Args:
-        flights: as `scenarios` saw them.
-        found: plans (B, ...) of its scenarios.
-        new: (B, N) bool, of which balls.
+        flights: the ones for which `scenarios` was called.
+        found: plans (B, ...) of the scenarios that it returned.
+        new: (B, N) bool, the balls that `found` catches.
     """
 
-    def one(flight: Flight, found: CatchPlan, new: Array) -> Flight:
+    def one(flight: FlightState, found: CatchPlan, new: Array) -> FlightState:
         present = flight.present | new
         alone = dataclasses.replace(flight, plan=found, began=flight.time, present=present)
         if flight.plan is None:
             return alone
         old, number = flight.plan, new.size
         each = found.trajectory.durations.size // number
-        lasts = jnp.sum(old.trajectory.durations.reshape(number, each), axis=1) > 0.0
-        # Of the old plan, catches that are made included; what was awaited comes last in it.
-        segments = jnp.sum(lasts & ~new[old.order])
+        used = jnp.sum(old.trajectory.durations.reshape(number, each), axis=1) > 0.0
+        # How many catches of the old plan are kept, those already made included. The catch that
+        # was only awaited comes last in the old plan; the found plan replaces it.
+        num_kept = jnp.sum(used & ~new[old.order])
         place = jnp.arange(number)
-        before = place < segments
+        kept = place < num_kept
 
         def behind(old: Array, found: Array) -> Array:
-            rows = jnp.where(before, 0, place - segments)
+            """Rows (N, ...), one a catch: those kept of the old plan, then the found plan's."""
+            rows = jnp.where(kept, 0, place - num_kept)
             shape = (number, *(1,) * (old.ndim - 1))
-            return jnp.where(before.reshape(shape), old, found[rows])
+            return jnp.where(kept.reshape(shape), old, found[rows])
 
         split = lambda leaf: leaf.reshape(number, each, *leaf.shape[1:])  # noqa: E731
         flat = lambda leaf: leaf.reshape(-1, *leaf.shape[2:])  # noqa: E731
         trajectory = jax.tree.map(
             lambda a, b: flat(behind(split(a), split(b))), old.trajectory, found.trajectory
         )
-        end = old.times[segments - 1]
-        rank = jnp.zeros_like(place).at[old.order].set(jnp.where(before, place, 2 * number))
+        end = old.times[num_kept - 1]
+        rank = jnp.zeros_like(place).at[old.order].set(jnp.where(kept, place, 2 * number))
         behind_rank = jnp.zeros_like(place).at[found.order].set(number + place)
         order = jnp.argsort(jnp.where(new, behind_rank, rank), stable=True)
         joined = dataclasses.replace(
@@ -265,8 +275,8 @@ def with_catch(flights: Flight, found: CatchPlan, new: Array) -> Flight:
             times=behind(old.times, end + found.times),
         )
         joined = dataclasses.replace(flight, plan=joined, present=present)
-        going = until_last_catch(flight, new) > 0.0
-        return jax.tree.map(lambda a, b: jnp.where(going, a, b), joined, alone)
+        busy = until_last_catch(flight, new) > 0.0  # a ball seen before is still to be caught
+        return jax.tree.map(lambda a, b: jnp.where(busy, a, b), joined, alone)
 
     return jax.vmap(one)(flights, found, new)
 
@@ -298,14 +308,15 @@ def fly_catches(
         ValueError: a world, plan or number does not fit.
     """
     num_balls = cases.horizon.shape[1]
-    require_world(loop, NET, num_balls)
+    sizes = {name: getattr(cases, name) for name in ("gravity", "net_height", "net_radius")}
+    require_world(loop, "net", num_balls, **sizes)
     if num_balls > 1:
-        whole(INTERVAL / loop.period, "replan", f"such that it divides {INTERVAL} s", loop.replan)
+        require_interval(loop.sensing, loop.replan)
     planner, pilot = planner or ExactCatch(), pilot or CatchPilot()
     drag = jnp.asarray(cases.drag)
     balls, believed = jax.tree.map(jnp.asarray, (cases.balls, cases.believed))
     keys = flight_keys(seed, cases.index)
-    flight = ready(loop, jnp.tile(jnp.array(HOME), (len(cases), 1)), keys)
+    flight = ready(loop, jnp.tile(jnp.array(START), (len(cases), 1)), keys)
     first: Any = plan
     records, planning = [], 0.0
     shortest, window = earliest_throw("throws")
@@ -321,8 +332,10 @@ def fly_catches(
         new = np.isin(np.arange(num_balls), [ball] if given else [ball, ball + 1])
         scenario = scenarios(loop, flight, jnp.asarray(new), horizon)
         if given:
-            require_catch_plan(plan, scenario)
-            found = plan
+            found: Any = plan
+            require_plan(found, CatchPlan, scenario.head_state)
+            if found.times.shape[-1] != num_balls:
+                raise ValueError(f"plan must be of {num_balls} balls, got {found.times.shape[-1]}")
         else:
             known = jax.tree.map(np.asarray, scenario)
             began = time.perf_counter()
@@ -346,7 +359,7 @@ def fly_catches(
 def planned_ahead(
     planner: Planner, known: CatchScenario, ball: int
 ) -> tuple[CatchScenario, CatchPlan]:
-    """Plans from scratch of a ball's catch and, where that is possible too, of the next one's.
+    """Plans from scratch that catch a ball and, where that is possible too, the next one.
 
     Where no plan of both is found the ball is planned for alone, and where that fails as well,
     within the widest limits. If nothing is solved, the plan that breaks its limits least is left.
@@ -394,11 +407,36 @@ def within(scenarios: CatchScenario, limits: tuple[float, float] | None) -> Catc
     return dataclasses.replace(scenarios, limits=new)
 
 
-def require_catch_plan(plan: Any, scenario: CatchScenario) -> None:
-    """Raise `ValueError` unless a plan is one of these catches."""
-    if not isinstance(plan, CatchPlan):
-        raise ValueError(f"plan must be a CatchPlan, got a {type(plan).__name__}")
-    num = scenario.num_targets
-    if np.shape(plan.times)[-1] != num:
-        raise ValueError(f"plan must be of {num} balls, got {np.shape(plan.times)[-1]}")
-    require_hovering(scenario.head_state, plan)
+class CatchFlight(FlightTask):
+    """Catches as a run of flights knows them; the settings are `CatchFly`."""
+
+    settings: CatchFly
+
+    CONTACT = "caught"
+    SUCCESS = "caught all balls"
+    PUBLISHED = "Catch Planner, 50 real throws: 64 % caught"  # paper 000, Table I
+    COLUMNS = (Column("caught", "", "each ball", list_of(BOOL), lambda b: b.verdict.caught),)
+
+    def world(self) -> World:
+        """The simulated world, with as many balls as are thrown."""
+        return dataclasses.replace(CATCH_WORLD, num_balls=self.settings.balls)
+
+    def cases(self) -> Throws:
+        """All throws of the run."""
+        settings = self.settings
+        return throws(settings.num, settings.balls, settings.seed, drag_error=settings.drag_error)
+
+    def fly(self, cases: Throws, record: bool) -> CatchFlights:
+        """Flights of some throws."""
+        planner = catch_planner(self.settings.planner)
+        return fly_catches(self.loop(record), cases, self.settings.seed, planner=planner)
+
+    def launches(self, cases: Throws, flown: Flown) -> Launches:
+        """The throws; no ball comes back."""
+        begins = INTERVAL * np.arange(self.settings.balls)
+        return Launches(cases.balls, cases.drag, begins, SEEN)
+
+    @property
+    def suite(self) -> str:
+        """How many balls are thrown."""
+        return f"{self.settings.balls} ball(s)"

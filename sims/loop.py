@@ -5,11 +5,14 @@ of these; a plan is made at the start of a row of looks, for the moment at which
 and from what was known at its start, and takes effect there. So a plan may take as long as one
 period to compute. The known latency is made up for by flying the estimate on.
 
-Written for one flight; `fly_leg` makes a batch of it. Times count from the first plan.
+The robot (`sims.robot.Robot`, in the world) says how it is tracked and commanded, the task's
+pilot what is planned and what counts as meeting a ball. Written for one flight; `fly_leg` makes a
+batch of it. Times count from the first plan.
 """
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import jax
@@ -18,16 +21,13 @@ import numpy as np
 from flax import struct
 from jax import Array, lax
 
-from planner_jax.ball.flight import BallState
+from planner_jax.ball.flight import BallState, fly
 from planner_jax.sims import sensing as sight
-from planner_jax.sims.control import Gains, control, reference_at, robot_state
-from planner_jax.sims.model import Physics, World, ball_states, ball_velocity, step
-from planner_jax.sims.scoring import Contact, moment, nearest, passage
-from planner_jax.sims.sensing import Estimate, Sensing, sensed_robot
-from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, total_duration
-
-_BRAKING = 0.8  # [s] from the end of a plan to rest
-_LOWEST_REST = 0.5  # [m]
+from planner_jax.sims.model import World, ball_states, ball_velocity, step
+from planner_jax.sims.noise import Sensing, require_whole
+from planner_jax.sims.robot import Physics
+from planner_jax.sims.scoring import Contact, moment, nearest
+from planner_jax.sims.sensing import Estimate
 
 
 @struct.dataclass
@@ -39,7 +39,7 @@ class Outlook:
     balls: BallState  # leaves (N, 3), where they are believed to be then
     drag: Array  # (N,) K_D [1/m], believed
     present: Array  # (N,) bool, which are in flight and not yet met
-    head_state: Array  # (4, 3) of the quadrotor
+    head_state: Array  # of the robot, (4, 3) for a quadrotor
 
 
 class Pilot(Protocol):
@@ -51,6 +51,11 @@ class Pilot(Protocol):
 
     def times(self, plan: Any) -> Array:
         """When each ball is to be met (N,) [s] since the plan began, in the balls' order."""
+        ...
+
+    @property
+    def passage(self) -> Callable[..., tuple[Array, Contact]]:
+        """What says which balls are met or missed within a step, like `scoring.passage`."""
         ...
 
 
@@ -65,28 +70,17 @@ class Loop:
     world: World
     sensing: Sensing = Sensing()
     replan: float = 0.0  # [Hz]; 0 flies the first plan
-    gains: Gains = Gains()
     kalman: bool = True  # filter of what is seen of the balls
     estimate_drag: bool = True  # from the energy that a ball loses
     record: bool = False  # path and prediction errors, look by look
 
     def __post_init__(self) -> None:
-        if not self.replan >= 0.0:
-            raise ValueError(f"replan must be >= 0, got {self.replan}")
-        sensing = self.sensing
-        control_rate = 1.0 / self.world.timestep
-        whole(
-            control_rate / sensing.rate, "rate", f"a divisor of {control_rate:g} Hz", sensing.rate
-        )
-        whole(
-            sensing.latency * sensing.rate,
-            "latency",
-            f"a multiple of the looks' {1.0 / sensing.rate:g} s",
-            sensing.latency,
-        )
-        if self.replan > 0.0:
-            rule = f"a divisor of the looks' {sensing.rate:g} Hz"
-            whole(sensing.rate / self.replan, "replan", rule, self.replan)
+        sensing, control_rate = self.sensing, 1.0 / self.world.timestep
+        rule = f"a divisor of {control_rate:g} Hz"
+        require_whole(control_rate / sensing.rate, "rate", rule, sensing.rate)
+        rule = f"a multiple of the looks' {1.0 / sensing.rate:g} s"
+        require_whole(sensing.latency * sensing.rate, "latency", rule, sensing.latency)
+        sensing.looks_per_plan(self.replan)
 
     @property
     def steps_per_look(self) -> int:
@@ -96,7 +90,7 @@ class Loop:
     @property
     def looks_per_plan(self) -> int:
         """Looks from plan to plan; one where nothing is planned anew."""
-        return round(self.sensing.rate / self.replan) if self.replan > 0.0 else 1
+        return self.sensing.looks_per_plan(self.replan)
 
     @property
     def period(self) -> float:
@@ -113,14 +107,8 @@ class Loop:
         return int(np.ceil(duration / self.period - 1e-6))
 
 
-def whole(ratio: float, name: str, rule: str, value: float) -> None:
-    """Raise unless a ratio is a whole number."""
-    if abs(ratio - round(ratio)) > 1e-6 or (ratio > 0.0 and round(ratio) == 0):
-        raise ValueError(f"{name} must be {rule}, got {value:g}")
-
-
 @struct.dataclass
-class Flight:
+class FlightState:
     """Everything that changes during a flight."""
 
     physics: Physics
@@ -132,7 +120,7 @@ class Flight:
     plan: Any
     began: Array  # () [s], when the plan began
     contact: Contact  # leaves (N, ...)
-    worst_tracking: Array  # () [m], of the quadrotor from its plan, up to the last contact
+    worst_tracking: Array  # () [m], of the robot from its plan, up to the last contact
     squared_tracking: Array  # () [m^2 s]
     tracked: Array  # () [s]
     time: Array  # () [s]
@@ -145,75 +133,31 @@ class Record:
 
     time: Array  # () [s]
     physics: Physics
-    wanted: Array  # (3,) [m], where the quadrotor is to be
+    wanted: Array  # (3,) [m], where the robot is to be
     horizon: Array  # (N,) [s], until each ball is to be met
     error: Array  # (N, 3) [m], of the prediction for then
 
 
-def with_rest(trajectory: PiecewisePolynomial) -> PiecewisePolynomial:
-    """The trajectory with one more piece that comes to rest, so that it goes on after its end.
-
-    The piece is the polynomial of degree 7 from the last state to rest at the end of an even
-    braking, no lower than half a metre.
-    """
-    coeffs = trajectory.coeffs
-    missing = 8 - coeffs.shape[1]
-    coeffs = jnp.pad(coeffs, ((0, 0), (0, missing), (0, 0)))
-    # Pieces of balls that are not there come last and last no time.
-    last = jnp.max(jnp.where(trajectory.durations > 0.0, jnp.arange(coeffs.shape[0]), 0))
-    piece = PiecewisePolynomial(coeffs[last][None], trajectory.durations[last][None])
-    unit = jnp.asarray([_BRAKING**k for k in range(8)], coeffs.dtype)[:, None]
-    factorials = jnp.asarray([1.0, 1.0, 2.0, 6.0], coeffs.dtype)[:, None]
-    state = jnp.stack([evaluate(piece, piece.durations[0], k) for k in range(4)])
-    low = state * unit[:4] / factorials
-    rest = state[0] + 0.5 * _BRAKING * state[1]
-    rest = rest.at[2].max(jnp.minimum(_LOWEST_REST, state[0, 2] + 1.0))
-    powers = np.arange(8)
-    rows = np.stack(
-        [np.prod([powers - i for i in range(k)], axis=0) * np.ones(8) for k in range(4)]
-    )
-    wanted = jnp.zeros_like(state).at[0].set(rest)
-    wanted -= jnp.matmul(
-        jnp.asarray(rows[:, :4], coeffs.dtype), low, precision=lax.Precision.HIGHEST
-    )
-    inverse = jnp.asarray(np.linalg.inv(rows[:, 4:]), coeffs.dtype)
-    high = jnp.matmul(inverse, wanted, precision=lax.Precision.HIGHEST)
-    braking = jnp.concatenate([low, high]) / unit
-    return PiecewisePolynomial(
-        coeffs=jnp.concatenate([coeffs, braking[None]]),
-        durations=jnp.append(trajectory.durations, jnp.asarray(_BRAKING, coeffs.dtype)),
-    )
-
-
-def state_at(trajectory: PiecewisePolynomial, time: Array) -> Array:
-    """Position to jerk (4, 3) at a time () [s]; at rest once the end is passed."""
-    time = jnp.minimum(time, total_duration(trajectory))
-    return jnp.stack([evaluate(trajectory, time, k) for k in range(4)])
-
-
-def _fly_look(loop: Loop, pilot: Pilot, flight: Flight, drag: Array) -> Flight:
+def _fly_look(loop: Loop, pilot: Pilot, flight: FlightState, drag: Array) -> FlightState:
     """Physics and control from one look to the next, and what that look says."""
-    world, dtype = loop.world, flight.time.dtype
+    world, robot, dtype = loop.world, loop.world.robot, flight.time.dtype
     key, noise_key, look_key = jax.random.split(flight.key, 3)
-    noise = jax.random.normal(noise_key, (4, 3), dtype)
-    path = with_rest(flight.plan.trajectory)
-    end = total_duration(path)
+    noise = jax.random.normal(noise_key, robot.noise_shape, dtype)
     times = flight.time + world.timestep * jnp.arange(loop.steps_per_look, dtype=dtype)
-    local = jnp.minimum(times - flight.began, end - 2.0 * world.vehicle.rotor_lag)
-    references = jax.vmap(lambda t: reference_at(path, t, world))(local)
+    references = robot.references(flight.plan, times - flight.began, world)
     planned = flight.began + pilot.times(flight.plan)
     last = jnp.max(jnp.where(flight.present, planned, -jnp.inf))
 
     def advance(carry: tuple, now: tuple) -> tuple[tuple, None]:
         physics, before, contact, worst, squared, tracked = carry
         reference, time = now
-        state = robot_state(physics)
+        state = robot.state(physics)
         if any(loop.sensing.robot_stds):
-            state = sensed_robot(state, noise, loop.sensing)
-        rotors = control(state, reference, loop.gains, world)
-        physics = step(world, physics, rotors, drag)
+            state = robot.sensed(state, noise, loop.sensing.robot_stds)
+        command = robot.command(state, reference, world)
+        physics = step(world, physics, command, drag)
         after = moment(world, physics)
-        passes, later = passage(world, before, after, time, planned, reference.pos)
+        passes, later = pilot.passage(world, before, after, time, planned, reference.pos)
         contact = nearest(contact, passes & flight.launched, later)
         counts = time <= last
         away = jnp.sum((before.robot_pos - reference.pos) ** 2)
@@ -265,7 +209,9 @@ def expected(loop: Loop, estimates: Estimate, ahead: Any) -> BallState:
     return jax.vmap(lambda estimate: sight.predicted(estimate, span, gravity))(estimates)
 
 
-def _planned_anew(loop: Loop, pilot: Pilot, flight: Flight, scenario: Any) -> tuple[Any, Array]:
+def _planned_anew(
+    loop: Loop, pilot: Pilot, flight: FlightState, scenario: Any
+) -> tuple[Any, Array]:
     """The plan for the end of this period, and whether to fly it."""
     when = flight.time + loop.period
     elapsed = when - flight.began
@@ -275,17 +221,17 @@ def _planned_anew(loop: Loop, pilot: Pilot, flight: Flight, scenario: Any) -> tu
         balls=expected(loop, flight.estimates, loop.period),
         drag=flight.estimates.drag,
         present=flight.present & (pilot.times(flight.plan) > elapsed),
-        head_state=state_at(with_rest(flight.plan.trajectory), elapsed),
+        head_state=loop.world.robot.head_state(flight.plan, elapsed),
     )
     return pilot.plan_anew(scenario, flight.plan, outlook)
 
 
 def _fly_period(
-    loop: Loop, pilot: Pilot, scenario: Any, drag: Array, flight: Flight
-) -> tuple[Flight, Record | None]:
+    loop: Loop, pilot: Pilot, scenario: Any, drag: Array, flight: FlightState
+) -> tuple[FlightState, Record | None]:
     """One period: a plan for its end, and the looks until then."""
 
-    def next_look(flight: Flight, _: None) -> tuple[Flight, Record | None]:
+    def next_look(flight: FlightState, _: None) -> tuple[FlightState, Record | None]:
         flight = _fly_look(loop, pilot, flight, drag)
         return flight, _recorded(loop, pilot, flight, drag) if loop.record else None
 
@@ -305,18 +251,17 @@ def _fly_period(
     return flight, record
 
 
-def _recorded(loop: Loop, pilot: Pilot, flight: Flight, drag: Array) -> Record:
+def _recorded(loop: Loop, pilot: Pilot, flight: FlightState, drag: Array) -> Record:
     """Where everything is, and how wrong the balls' predictions are."""
     world = loop.world
-    path = with_rest(flight.plan.trajectory)
     horizon = flight.began + pilot.times(flight.plan) - flight.time
     now = moment(world, flight.physics)
     gravity = jnp.asarray(world.gravity, drag.dtype)
 
     def error(pos: Array, vel: Array, true_drag: Array, estimate: Estimate, ahead: Array) -> Array:
         truth = BallState(pos=pos, vel=vel)
-        truth = sight.fly(truth, ahead, true_drag, gravity, num_steps=12)[0]
-        believed = sight.fly(
+        truth = fly(truth, ahead, true_drag, gravity, num_steps=12)[0]
+        believed = fly(
             estimate.belief.ball,
             ahead + loop.sensing.latency,
             estimate.drag,
@@ -328,7 +273,7 @@ def _recorded(loop: Loop, pilot: Pilot, flight: Flight, drag: Array) -> Record:
     return Record(
         time=flight.time,
         physics=flight.physics,
-        wanted=state_at(path, flight.time - flight.began)[0],
+        wanted=world.robot.head_state(flight.plan, flight.time - flight.began)[0],
         horizon=horizon,
         error=jax.vmap(error)(
             now.ball_pos, ball_velocity(world, now.ball_vel, drag), drag, flight.estimates, horizon
@@ -340,12 +285,12 @@ def _recorded(loop: Loop, pilot: Pilot, flight: Flight, drag: Array) -> Record:
 def fly_leg(
     loop: Loop,
     pilot: Pilot,
-    flight: Flight,
+    flight: FlightState,
     scenario: Any,
     drag: Array,
     *,
     num_periods: int,
-) -> tuple[Flight, Record | None]:
+) -> tuple[FlightState, Record | None]:
     """A batch of flights for some periods.
 
     Args:
@@ -361,7 +306,7 @@ def fly_leg(
         (B, K, ...).
     """
 
-    def one(flight: Flight, scenario: Any, drag: Array) -> tuple[Flight, Record | None]:
+    def one(flight: FlightState, scenario: Any, drag: Array) -> tuple[FlightState, Record | None]:
         period = functools.partial(_fly_period, loop, pilot, scenario, drag)
         flight, record = lax.scan(lambda state, _: period(state), flight, None, length=num_periods)
         flat = lambda leaf: leaf.reshape(-1, *leaf.shape[2:])  # noqa: E731
@@ -381,7 +326,7 @@ class Flown:
     record: Record | None  # leaves (B, K, ...)
 
 
-def flown(flight: Flight, records: list[Record | None]) -> Flown:
+def flown(flight: FlightState, records: list[Record | None]) -> Flown:
     """Of flights (B, ...) at their end, and the records of their legs."""
     there, records = jax.device_get((dataclasses.replace(flight, key=None), records))
     mean = np.sqrt(there.squared_tracking / np.maximum(there.tracked, 1e-6))

@@ -28,6 +28,7 @@ class Vehicle:
     torque_ratio: float = 0.016  # [m], rotor's drag torque over its thrust
     rotor_lag: float = 0.02  # [s], time constant of a rotor's thrust
     spare_thrust: float = 1.0  # [N], by which a rotor's may be raised to make room for a torque
+    rotor_radius: float = 0.06  # [m], to be looked at
 
     def __post_init__(self) -> None:
         for name in ("mass", "diagonal", "max_rotor_thrust", "torque_ratio", "rotor_lag"):

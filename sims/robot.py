@@ -1,0 +1,103 @@
+"""What the simulated world, the closed loop and the pictures ask of a robot.
+
+A robot is a frozen dataclass, static under jit; `robots/quadrotor/robot.py` is one. Its part of
+MuJoCo's state comes first in `qpos` and `qvel`, before that of the balls; all of `act` is its own.
+"""
+
+import dataclasses
+from typing import Any, ClassVar, NamedTuple, Protocol
+
+import numpy as np
+from flax import struct
+from jax import Array
+
+
+@dataclasses.dataclass(frozen=True)
+class Tool:
+    """What meets the ball: a disc that is the hoop of a net, or a racket."""
+
+    kind: str  # "net" or "racket"
+    height: float  # [m], of the disc's centre above the origin of the body that carries it
+    radius: float  # [m]
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("net", "racket"):
+            raise ValueError(f"kind must be net or racket, got {self.kind!r}")
+
+
+@struct.dataclass
+class Physics:
+    """What changes from step to step, for R joint positions of the robot and N balls."""
+
+    qpos: Array  # (R + 3 N,)
+    qvel: Array  # (R' + 3 N,)
+    act: Array  # (A,), what the actuators have reached, in their units
+
+
+class Shape(NamedTuple):
+    """A rigid part of a robot as it is drawn, in the part's own frame."""
+
+    lines: list[np.ndarray]  # each (M, 3) [m]
+    discs: list[tuple[np.ndarray, float]]  # centre (3,) [m] and radius [m], across the z axis
+    tool: bool = False  # whether the last line is the tool's rim
+
+
+class Robot(Protocol):
+    """A robot's part of a flight. `World` is `sims.model.World`, which holds the robot."""
+
+    num_pos: ClassVar[int]  # R, of its joint positions in `qpos`
+    num_vel: ClassVar[int]  # R', of its joint velocities in `qvel`
+    noise_shape: ClassVar[tuple[int, ...]]  # of the standard normal noise that `sensed` takes
+
+    @property
+    def tool(self) -> Tool:
+        """What it meets balls with."""
+        ...
+
+    def mjcf(self) -> tuple[str, str]:
+        """Its body and its actuators as MJCF text."""
+        ...
+
+    def at_rest(self, place: Array, gravity: float) -> tuple[Array, Array, Array]:
+        """Its part of `qpos` and `qvel`, and `act`, at rest at a place (3,) [m]."""
+        ...
+
+    def state(self, physics: Physics) -> Any:
+        """Its state, a pytree."""
+        ...
+
+    def sensed(self, state: Any, noise: Array, stds: tuple[float, ...]) -> Any:
+        """Its state as it is estimated, with errors of some standard deviations."""
+        ...
+
+    def tool_motion(self, state: Any) -> tuple[Array, Array, Array, Array]:
+        """Of the body with the tool, in the world: place, velocity, rate and z axis, (3,) each."""
+        ...
+
+    def head_state(self, plan: Any, time: Array) -> Array:
+        """Its state () [s] after a plan's begin, from where another begins; first row the place."""
+        ...
+
+    def references(self, plan: Any, times: Array, world: Any) -> Any:
+        """What it tracks (K,) [s] after a plan's begin, leaves (K, ...); `pos` is the place."""
+        ...
+
+    def command(self, state: Any, reference: Any, world: Any) -> Array:
+        """What is asked of the actuators (A,) to track one reference."""
+        ...
+
+    def shapes(self) -> list[Shape]:
+        """Its rigid parts as they are drawn."""
+        ...
+
+    def places(self, pose: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Position (3,) [m] and attitude (4,), w x y z, of each shape at joint positions (R,)."""
+        ...
+
+    def place(self, poses: np.ndarray) -> np.ndarray:
+        """The point (..., 3) [m] that stands for the robot at joint positions (..., R)."""
+        ...
+
+    def held_ball(self, pose: np.ndarray) -> np.ndarray:
+        """Centre (3,) [m] of a ball that lies in the tool; NaN if the tool holds none."""
+        ...

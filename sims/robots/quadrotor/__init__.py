@@ -1,0 +1,1 @@
+"""The simulated quadrotor: its parts, its body in MuJoCo, what it tracks, and how."""

@@ -1,0 +1,96 @@
+"""Cascade SE(3) control by differential flatness and the Hopf fibration.
+
+Paper 002, Section VI-C, and paper 000, Section VII-A: position and velocity feedback with the
+plan's acceleration and jerk gives the wanted thrust and, at zero heading, attitude and body
+rate (Watterson and Kumar, "Control of quadrotors using the Hopf fibration on SO(3)"); the
+attitude's error corrects the body rate, and the body rate's error asks for a torque. What the
+rotors take up only with a lag is asked of them with that lag undone.
+
+World frame, z up; body rates and torques in the body frame; quaternions w x y z.
+"""
+
+import dataclasses
+
+import jax.numpy as jnp
+from flax import struct
+from jax import Array, lax
+
+from planner_jax.robot.quadrotor import net_thrust
+from planner_jax.sims.model import World
+from planner_jax.sims.robots.quadrotor.reference import Reference, flat_attitude
+from planner_jax.sims.robots.quadrotor.vehicle import Vehicle, rotor_thrusts
+from planner_jax.sims.rotation import rotation
+
+
+@dataclasses.dataclass(frozen=True)
+class Gains:
+    """All gains of the cascade; static under jit."""
+
+    position: float = 20.0  # [1/s^2]
+    velocity: float = 8.0  # [1/s]
+    attitude: float = 16.0  # [1/s]
+    heading: float = 4.0  # [1/s], of the attitude's error about body z
+    rate: float = 25.0  # [1/s]
+    share: float = 0.5  # of the plan's thrust, largest correction of it
+    correction: float = 6.0  # [rad/s], largest body rate against an attitude's error
+
+
+@struct.dataclass
+class RobotState:
+    """The quadrotor at one instant."""
+
+    pos: Array  # (3,) [m]
+    vel: Array  # (3,) [m/s]
+    quat_wxyz: Array  # (4,) body to world
+    rate: Array  # (3,) [rad/s], body frame
+
+
+def rotation_error(R: Array, R_wanted: Array) -> Array:
+    """Rotation vector (3,) [rad], body frame, from one attitude to another up to half a turn.
+
+    sin(angle) axis is exact; from it and the cosine the angle follows without an arc cosine.
+    """
+    E = jnp.matmul(R.T, R_wanted, precision=lax.Precision.HIGHEST)
+    sine_axis = 0.5 * jnp.stack([E[2, 1] - E[1, 2], E[0, 2] - E[2, 0], E[1, 0] - E[0, 1]])
+    cosine = 0.5 * (jnp.trace(E) - 1.0)
+    sine = jnp.sqrt(jnp.maximum(jnp.sum(sine_axis**2), 1e-12))
+    return jnp.arctan2(sine, cosine) / sine * sine_axis
+
+
+def control(
+    state: RobotState, reference: Reference, vehicle: Vehicle, gains: Gains, world: World
+) -> Array:
+    """Rotor thrusts (4,) [N] that track a reference; pure, for one quadrotor.
+
+    Args:
+        state: of the quadrotor, as it is estimated.
+        reference: to be tracked.
+        vehicle: what the quadrotor is made of.
+        gains: of the cascade.
+        world: whose gravity and time step count.
+    """
+    gravity = world.gravity
+    R = rotation(state.quat_wxyz)
+    half = 0.5 * world.timestep  # the velocities of MuJoCo's Euler are that much older
+    ahead, faster = reference.pos - state.pos, reference.vel - half * reference.acc - state.vel
+    pull = net_thrust(reference.acc, jnp.asarray(gravity, ahead.dtype))
+    back = gains.position * ahead + gains.velocity * faster
+    # Unbounded, an error would turn a weak thrust any way, and the plan's with it.
+    most = gains.share * jnp.sqrt(jnp.sum(pull**2))
+    back *= jnp.minimum(most / jnp.sqrt(jnp.maximum(jnp.sum(back**2), 1e-6)), 1.0)
+    acc = reference.acc + back
+    jerk = reference.jerk + gains.position * faster
+    R_wanted, rate_wanted = flat_attitude(acc, jerk, gravity)
+    pull = net_thrust(acc, jnp.asarray(gravity, acc.dtype))
+    thrust = vehicle.mass * (jnp.sum(pull * R[:, 2]) + reference.thrust_lead)
+    stiffness = jnp.array([gains.attitude, gains.attitude, gains.heading], acc.dtype)
+    highest = lax.Precision.HIGHEST
+    turn = jnp.matmul(R.T, jnp.matmul(R_wanted, rate_wanted, precision=highest), precision=highest)
+    # Unbounded, a large error would ask for a rate that saturated rotors cannot stop in time.
+    back = jnp.clip(stiffness * rotation_error(R, R_wanted), -gains.correction, gains.correction)
+    rate = turn - half * reference.angular_acc + back
+    inertia = jnp.asarray(vehicle.inertia, acc.dtype)
+    angular_acc = reference.angular_acc + reference.torque_lead
+    angular_acc += gains.rate * (rate - state.rate)
+    torque = inertia * angular_acc + jnp.cross(state.rate, inertia * state.rate)
+    return rotor_thrusts(vehicle, jnp.maximum(thrust, 0.0), torque)

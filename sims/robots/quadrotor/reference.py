@@ -1,0 +1,135 @@
+"""What a quadrotor tracks: a plan's trajectory, at rest after its end, and its attitude.
+
+World frame, z up; body rates in the body frame.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array, lax
+
+from planner_jax.robot.quadrotor import body_z, net_thrust, tangent_basis
+from planner_jax.sims.model import World
+from planner_jax.sims.robots.quadrotor.vehicle import Vehicle
+from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, total_duration
+
+_BRAKING = 0.8  # [s] from the end of a plan to rest
+_LOWEST_REST = 0.5  # [m]
+
+
+@struct.dataclass
+class Reference:
+    """What is to be tracked at one instant."""
+
+    pos: Array  # (3,) [m]
+    vel: Array  # (3,) [m/s]
+    acc: Array  # (3,) [m/s^2]
+    jerk: Array  # (3,) [m/s^3]
+    thrust_lead: Array  # () [m/s^2], to be asked of the rotors beyond the thrust, for their lag
+    angular_acc: Array  # (3,) [rad/s^2], body frame
+    torque_lead: Array  # (3,) [rad/s^2], to be asked of them beyond that, for their lag
+
+
+def with_rest(trajectory: PiecewisePolynomial) -> PiecewisePolynomial:
+    """The trajectory with one more piece that comes to rest, so that it goes on after its end.
+
+    The piece is the polynomial of degree 7 from the last state to rest at the end of an even
+    braking, no lower than half a metre.
+    """
+    coeffs = trajectory.coeffs
+    missing = 8 - coeffs.shape[1]
+    coeffs = jnp.pad(coeffs, ((0, 0), (0, missing), (0, 0)))
+    # Pieces of balls that are not there come last and last no time.
+    last = jnp.max(jnp.where(trajectory.durations > 0.0, jnp.arange(coeffs.shape[0]), 0))
+    piece = PiecewisePolynomial(coeffs[last][None], trajectory.durations[last][None])
+    unit = jnp.asarray([_BRAKING**k for k in range(8)], coeffs.dtype)[:, None]
+    factorials = jnp.asarray([1.0, 1.0, 2.0, 6.0], coeffs.dtype)[:, None]
+    state = jnp.stack([evaluate(piece, piece.durations[0], k) for k in range(4)])
+    low = state * unit[:4] / factorials
+    rest = state[0] + 0.5 * _BRAKING * state[1]
+    rest = rest.at[2].max(jnp.minimum(_LOWEST_REST, state[0, 2] + 1.0))
+    powers = np.arange(8)
+    rows = np.stack(
+        [np.prod([powers - i for i in range(k)], axis=0) * np.ones(8) for k in range(4)]
+    )
+    wanted = jnp.zeros_like(state).at[0].set(rest)
+    wanted -= jnp.matmul(
+        jnp.asarray(rows[:, :4], coeffs.dtype), low, precision=lax.Precision.HIGHEST
+    )
+    inverse = jnp.asarray(np.linalg.inv(rows[:, 4:]), coeffs.dtype)
+    high = jnp.matmul(inverse, wanted, precision=lax.Precision.HIGHEST)
+    braking = jnp.concatenate([low, high]) / unit
+    return PiecewisePolynomial(
+        coeffs=jnp.concatenate([coeffs, braking[None]]),
+        durations=jnp.append(trajectory.durations, jnp.asarray(_BRAKING, coeffs.dtype)),
+    )
+
+
+def state_at(trajectory: PiecewisePolynomial, time: Array) -> Array:
+    """Position to jerk (4, 3) at a time () [s]; at rest once the end is passed."""
+    time = jnp.minimum(time, total_duration(trajectory))
+    return jnp.stack([evaluate(trajectory, time, k) for k in range(4)])
+
+
+def flat_attitude(acc: Array, jerk: Array, gravity: float) -> tuple[Array, Array]:
+    """Attitude and body rate of a motion, at zero heading of the Hopf fibration.
+
+    Args:
+        acc: (3,) [m/s^2].
+        jerk: (3,) [m/s^3].
+        gravity: [m/s^2].
+
+    Returns:
+        (3, 3) body to world, and (3,) [rad/s] in the body frame.
+    """
+    gravity_here = jnp.asarray(gravity, acc.dtype)
+    z = body_z(acc, gravity_here)
+    size = jnp.sqrt(jnp.maximum(jnp.sum(net_thrust(acc, gravity_here) ** 2), 1e-2))
+    z_dot = (jerk - jnp.sum(jerk * z) * z) / size
+    x, y = tangent_basis(z)
+    twist = (z[1] * z_dot[0] - z[0] * z_dot[1]) / jnp.maximum(1.0 + z[2], 1e-2)
+    rate = jnp.stack([-jnp.sum(y * z_dot), jnp.sum(x * z_dot), twist])
+    return jnp.stack([x, y, z], axis=1), rate
+
+
+def references(
+    path: PiecewisePolynomial, times: Array, vehicle: Vehicle, world: World
+) -> Reference:
+    """References (K,) of a path at times (K,) [s]; the last ones lie just before its end."""
+    times = jnp.minimum(times, total_duration(path) - 2.0 * vehicle.rotor_lag)
+    return jax.vmap(lambda time: _reference_at(path, time, vehicle, world))(times)
+
+
+def _reference_at(
+    trajectory: PiecewisePolynomial, time: Array, vehicle: Vehicle, world: World
+) -> Reference:
+    """The plan at a time () [s] since its start, with what the rotors need to know ahead."""
+    gravity = world.gravity
+    order = lambda k, at: evaluate(trajectory, at, k)  # noqa: E731
+    pos, vel, acc, jerk = (order(k, time) for k in range(4))
+    lag, step = vehicle.rotor_lag, 2.0 * world.timestep
+    # What is asked for now is taken up by the next step, and its force counts around that step's
+    # beginning: MuJoCo's Euler is a leapfrog. In between it rises by itself, on average half way.
+    ahead = time + 0.5 * world.timestep
+
+    def flat(at: Array) -> tuple[Array, Array]:
+        acc_then = order(2, at)
+        size = jnp.sqrt(jnp.sum(net_thrust(acc_then, jnp.asarray(gravity, at.dtype)) ** 2))
+        return size, flat_attitude(acc_then, order(3, at), gravity)[1]
+
+    (less, before), (size, rate), (more, after) = (flat(ahead + k * step) for k in (-1, 0, 1))
+    # A first-order lag undone: the value and `lag` times its rate of change.
+    growth = (more - less) / (2.0 * step)
+    angular_acc = (after - before) / (2.0 * step)
+    angular_jerk = (after - 2.0 * rate + before) / step**2
+    now = jnp.sqrt(jnp.sum(net_thrust(acc, jnp.asarray(gravity, acc.dtype)) ** 2))
+    return Reference(
+        pos=pos,
+        vel=vel,
+        acc=acc,
+        jerk=jerk,
+        thrust_lead=size + lag * growth - now,
+        angular_acc=angular_acc,
+        torque_lead=lag * angular_jerk,
+    )

@@ -1,0 +1,157 @@
+"""The quadrotor as the closed loop knows it: `sims.robot.Robot`, with a tool on the body z axis.
+
+`qpos` begins with the position and the quaternion (w x y z), `qvel` with the velocity (world) and
+the body rate (body frame). Rotors are MuJoCo actuators with a first-order lag.
+"""
+
+import dataclasses
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from planner_jax.sims.model import BALL_RADIUS, World
+from planner_jax.sims.robot import Physics, Shape, Tool
+from planner_jax.sims.robots.quadrotor.control import Gains, RobotState, control
+from planner_jax.sims.robots.quadrotor.reference import Reference, references, state_at, with_rest
+from planner_jax.sims.robots.quadrotor.vehicle import Vehicle, rotor_positions, rotor_torques
+from planner_jax.sims.rotation import rotation
+from planner_jax.sims.scenery import LOOK, xml_numbers
+
+_SEGMENTS = 12  # capsules of the hoop
+
+
+@dataclasses.dataclass(frozen=True)
+class Quadrotor:
+    """A quadrotor with a tool; static under jit."""
+
+    tool: Tool
+    vehicle: Vehicle = Vehicle()
+    gains: Gains = Gains()
+
+    num_pos: ClassVar[int] = 7
+    num_vel: ClassVar[int] = 6
+    noise_shape: ClassVar[tuple[int, ...]] = (4, 3)
+
+    def mjcf(self) -> tuple[str, str]:
+        """Body with rotors and tool, and the motors."""
+        vehicle = self.vehicle
+        places = rotor_positions(vehicle)
+        rotors = "".join(
+            f'<site name="rotor{i}" pos="{xml_numbers(*place)}"/>'
+            f'<geom type="cylinder" size="{vehicle.rotor_radius:g} .003" '
+            f'pos="{xml_numbers(*place)}" rgba=".2 .2 .2 .6" {LOOK}/>'
+            f'<geom type="capsule" size=".008" fromto="0 0 0 {xml_numbers(*place)}" {LOOK}/>'
+            for i, place in enumerate(places)
+        )
+        motors = "".join(
+            f'<general site="rotor{i}" gear="0 0 1 0 0 {xml_numbers(torque)}" ctrllimited="true" '
+            f'ctrlrange="0 {xml_numbers(vehicle.max_rotor_thrust)}" dyntype="filterexact" '
+            f'dynprm="{xml_numbers(vehicle.rotor_lag)}"/>'
+            for i, torque in enumerate(rotor_torques(vehicle))
+        )
+        body = (
+            '<body name="quadrotor"><freejoint/><inertial pos="0 0 0" '
+            f'mass="{vehicle.mass}" diaginertia="{xml_numbers(*vehicle.inertia)}"/>'
+            f"{rotors}{self._tool_xml()}</body>"
+        )
+        return body, motors
+
+    def _tool_xml(self) -> str:
+        """The hoop as a ring of capsules over a plate, or the racket as a plate."""
+        tool = self.tool
+        side = 0.5 * np.sqrt(np.pi) * tool.radius  # of the square of the disc's area, halved
+        drop = 0.0 if tool.kind == "racket" else 2.0 * BALL_RADIUS
+        low = tool.height - drop - 0.002 - BALL_RADIUS
+        plate = (
+            f'<geom name="plate" type="box" size="{xml_numbers(side, side, 0.002)}" '
+            f'pos="0 0 {xml_numbers(low)}" rgba=".3 .5 .9 .5" {LOOK}/>'
+        )
+        if tool.kind == "racket":
+            return plate
+        rim = _circle(np.array([0.0, 0.0, tool.height]), tool.radius, _SEGMENTS)
+        ring = "".join(
+            f'<geom type="capsule" size=".004" rgba=".2 .2 .2 1" {LOOK} '
+            f'fromto="{xml_numbers(*a, *b)}"/>'
+            for a, b in zip(rim[:-1], rim[1:], strict=True)
+        )
+        return plate + ring
+
+    def at_rest(self, place: Array, gravity: float) -> tuple[Array, Array, Array]:
+        """Hover at a place (3,) [m], with the rotors at their speed: `qpos`, `qvel`, `act`."""
+        upright = jnp.array([1.0, 0.0, 0.0, 0.0], place.dtype)
+        lift = self.vehicle.mass * gravity / 4.0
+        return (
+            jnp.concatenate([place, upright]),
+            jnp.zeros(self.num_vel, place.dtype),
+            jnp.full(4, lift, place.dtype),
+        )
+
+    def state(self, physics: Physics) -> RobotState:
+        """The quadrotor's part of the simulated state."""
+        qpos, qvel = physics.qpos, physics.qvel
+        return RobotState(pos=qpos[:3], vel=qvel[:3], quat_wxyz=qpos[3:7], rate=qvel[3:6])
+
+    def sensed(self, state: RobotState, noise: Array, stds: tuple[float, ...]) -> RobotState:
+        """The quadrotor's state as it is estimated.
+
+        Args:
+            state: the true one.
+            noise: (4, 3) standard normal.
+            stds: of position [m], velocity [m/s], attitude [rad] and body rate [rad/s].
+        """
+        pos, vel, attitude, rate = (std * noise[k] for k, std in enumerate(stds))
+        w, v = state.quat_wxyz[0], state.quat_wxyz[1:]
+        half = 0.5 * attitude  # a small rotation in the body frame
+        turned = jnp.concatenate([(w - jnp.sum(v * half))[None], v + w * half + jnp.cross(v, half)])
+        return RobotState(
+            pos=state.pos + pos,
+            vel=state.vel + vel,
+            quat_wxyz=turned / jnp.sqrt(jnp.sum(turned**2)),
+            rate=state.rate + rate,
+        )
+
+    def tool_motion(self, state: RobotState) -> tuple[Array, Array, Array, Array]:
+        """Place [m], velocity [m/s], rate [rad/s] and z axis of the body, in the world."""
+        R = rotation(state.quat_wxyz)
+        return state.pos, state.vel, jnp.sum(R * state.rate, axis=1), R[:, 2]
+
+    def head_state(self, plan: Any, time: Array) -> Array:
+        """Position to jerk (4, 3), () [s] after a plan's begin; at rest some time after its end."""
+        return state_at(with_rest(plan.trajectory), time)
+
+    def references(self, plan: Any, times: Array, world: World) -> Reference:
+        """What is tracked at times (K,) [s] after a plan's begin, leaves (K, ...)."""
+        return references(with_rest(plan.trajectory), times, self.vehicle, world)
+
+    def command(self, state: RobotState, reference: Reference, world: World) -> Array:
+        """Rotor thrusts (4,) [N]."""
+        return control(state, reference, self.vehicle, self.gains, world)
+
+    def shapes(self) -> list[Shape]:
+        """Arms, stick, rotors and tool, which are one rigid part."""
+        arms, top = rotor_positions(self.vehicle), np.array([0.0, 0.0, self.tool.height])
+        discs = [(arm, self.vehicle.rotor_radius) for arm in arms] + [(top, self.tool.radius)]
+        rims = [_circle(centre, radius, 24) for centre, radius in discs]
+        lines = [arms[[0, 2]], arms[[1, 3]], np.stack([0.0 * top, top]), *rims]
+        return [Shape(lines, discs, tool=True)]
+
+    def places(self, pose: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Position [m] and attitude, w x y z, of the one shape."""
+        return [(pose[:3], pose[3:7])]
+
+    def place(self, poses: np.ndarray) -> np.ndarray:
+        """Centre of the propeller plane (..., 3) [m]."""
+        return poses[..., :3]
+
+    def held_ball(self, pose: np.ndarray) -> np.ndarray:
+        """Centre (3,) [m] of a ball that lies in the net; NaN with a racket."""
+        up = self.tool.height - BALL_RADIUS if self.tool.kind == "net" else np.nan
+        return pose[:3] + up * rotation(pose[3:7], np)[:, 2]
+
+
+def _circle(centre: np.ndarray, radius: float, segments: int) -> np.ndarray:
+    """A closed polygon (segments + 1, 3) [m] around a centre (3,), across the z axis."""
+    turn = 2.0 * np.pi * np.arange(segments + 1) / segments
+    return centre + radius * np.stack([np.cos(turn), np.sin(turn), 0.0 * turn], axis=1)

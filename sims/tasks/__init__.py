@@ -1,0 +1,1 @@
+"""What each task adds to the closed loop and to a run of flights."""

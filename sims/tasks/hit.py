@@ -1,0 +1,327 @@
+"""Hits in flight: one served ball, volleyed to a target with a racket (paper 002)."""
+
+import dataclasses
+import functools
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from planner_jax.ball.flight import BallState, rk4_step
+from planner_jax.ball.impact import racket_impact
+from planner_jax.optimise.lbfgs import LbfgsConfig
+from planner_jax.optimise.multistart import solve_round
+from planner_jax.optimise.problem import Planner, Round
+from planner_jax.sims.launch import flight_keys, launched, ready, require_plan, require_world
+from planner_jax.sims.loop import FlightState, Flown, Loop, Outlook, expected, flown, fly_leg
+from planner_jax.sims.model import World
+from planner_jax.sims.recording import Launches
+from planner_jax.sims.robot import Tool
+from planner_jax.sims.robots.quadrotor.robot import Quadrotor
+from planner_jax.sims.scenery import Part
+from planner_jax.sims.scoring import Contact, passage
+from planner_jax.sims.settings import HIT_SUITES, HitFly
+from planner_jax.sims.task import FlightCases, Flights, FlightTask
+from planner_jax.sweep.columns import BOOL, NUMBER, VECTOR, Column
+from planner_jax.sweep.summary import percent
+from planner_jax.task.hit import court
+from planner_jax.task.hit.exact import ExactHit
+from planner_jax.task.hit.plan import HitPlan
+from planner_jax.task.hit.planners import planner as hit_planner
+from planner_jax.task.hit.replan import ReplanHit, ReplanHitScenario
+from planner_jax.task.hit.scenario import GRAVITY, RACKET_HEIGHT, HitScenario
+from planner_jax.task.hit.serves import (
+    DEPTH,
+    SERVE_HEIGHT,
+    advance,
+    generate_serves,
+    to_scenarios,
+)
+from planner_jax.task.solve import plan as plan_all
+
+SEEN = 0.25  # [s], a serve's flight before it is planned for: 2 m and more (paper 000, VII-A)
+_AFTER = 0.1  # [s] flown after the last impact planned
+_LONGEST = 1.9  # [s], the longest flight
+_LANDING_STEPS, _LANDING_STEP = 150, 0.02  # [s], three seconds of flight
+_NEAR, _FAR = 0.5, 1.0  # [m] from the target: the two rates of paper 002
+
+_LINE_COLOUR, _MIDDLE_COLOUR, _DEAD_COLOUR = "#FFFFFF", "#24292F", "#D98880"
+_LINE, _THIN = 0.03, 0.002  # [m], width and height of the court's lines
+
+
+def court_parts() -> list[Part]:
+    """The court of paper 002 as flat boxes: the dead zone, and the lines of both ends over it."""
+    length, width = court.HALF_LENGTH, court.HALF_WIDTH
+    lines = [((0.0, -width), (0.0, width))]  # first that at the net
+    for side in (-1.0, 1.0):
+        lines.append(((-length, side * width), (length, side * width)))
+        lines.append(((side * length, -width), (side * length, width)))
+        near, dead = side * court.NEAR_LINE, side * court.DEAD_ZONE
+        lines.append(((near, -court.LANE_LINE), (near, court.LANE_LINE)))
+        lines += [
+            ((dead, lane), (side * length, lane)) for lane in (-court.LANE_LINE, court.LANE_LINE)
+        ]
+    zone = (2.0 * court.DEAD_ZONE, 2.0 * width, _THIN)
+    parts = [Part("box", zone, (0.0, 0.0, 0.5 * _THIN), _DEAD_COLOUR)]
+    for number, (a, b) in enumerate(np.array(lines)):
+        length, width = np.abs(b - a) + _LINE
+        x, y = 0.5 * (a + b)
+        colour = _LINE_COLOUR if number else _MIDDLE_COLOUR
+        parts.append(Part("box", (length, width, 2.0 * _THIN), (x, y, _THIN), colour))
+    return parts
+
+
+HIT_WORLD = World(
+    Quadrotor(Tool("racket", RACKET_HEIGHT, radius=0.11)),  # paper 002, Fig. 2
+    GRAVITY,
+    scenery=tuple(court_parts()),
+    # Serves come from anywhere in a region: the middle of the far one.
+    mouth=(0.5 * (court.NEAR_LINE + DEPTH), 0.0, SERVE_HEIGHT),
+)
+
+
+def smooth_planner() -> ExactHit:
+    """`ExactHit` with a first search of 60 iterations, of drag after the impact.
+
+    What the first few iterations find meets the limits, which know no angular acceleration: one
+    plan in 150 asks more of the rotors than they have, and the ball lands up to 30 cm beside.
+    The smoother plan at the end of a longer search does not.
+    """
+    planner = ExactHit(drag_after_impact=True)
+    solver = LbfgsConfig(max_steps=60, tolerance=1e-5, patience=6)
+    return dataclasses.replace(planner, rounds=(Round(1, solver), *planner.rounds[2:]))
+
+
+@dataclasses.dataclass(frozen=True)
+class HitPilot:
+    """Plans a hit anew from the plan that is flown."""
+
+    planner: ReplanHit = ReplanHit(ExactHit(drag_after_impact=True))
+    # Least time [s] to an impact that is planned anew: the racket must settle.
+    shortest: float = 0.3
+    # A new plan may break a limit by this share of the limit and is still flown.
+    excess: float = 0.1
+    passage = staticmethod(passage)
+
+    def times(self, plan: HitPlan) -> Array:
+        """When the ball is to be hit (1,) [s]."""
+        return plan.stroke.time[None]
+
+    def plan_anew(
+        self, scenario: HitScenario, plan: HitPlan, outlook: Outlook
+    ) -> tuple[HitPlan, Array]:
+        """One short round of the re-planner, and whether its plan is good enough."""
+        task = ReplanHitScenario(
+            scenario=believed(scenario, outlook.balls, outlook.drag, outlook.head_state),
+            previous=plan,
+            elapsed=outlook.elapsed,
+        )
+        found = solve_round(self.planner, self.planner.rounds[0], task)
+        good = outlook.present[0] & (plan.stroke.time - outlook.elapsed >= self.shortest)
+        return found, good & (found.violation <= self.excess)
+
+
+def believed(scenario: HitScenario, balls: BallState, drag: Array, head: Array) -> HitScenario:
+    """One scenario for what its ball (leaves (1, 3)) seems to do, drag (1,)."""
+    ball = jax.tree.map(lambda leaf: leaf[0], balls)
+    return dataclasses.replace(scenario, ball=ball, drag=drag[0], head_state=head)
+
+
+@dataclasses.dataclass(frozen=True)
+class Volleys(FlightCases):
+    """B serves, as they are when they are planned for."""
+
+    scenarios: HitScenario  # leaves (B, ...), with the true ball and drag
+    believed: np.ndarray  # (B,) K_D [1/m]
+
+
+def volleys(
+    num: int, names: tuple[str, ...] | None = None, seed: int = 0, *, drag_error: float = 0.0
+) -> Volleys:
+    """Drawn serves, seen for `SEEN` seconds.
+
+    Args:
+        num: B >= 1.
+        names: out of `court.SCENARIOS`; all of them by default.
+        seed: >= 0, of the serves and of the signs of the drag's errors.
+        drag_error: relative error of what is believed of K_D, either way.
+    """
+    if not 0.0 <= drag_error < 1.0:
+        raise ValueError(f"drag_error must be >= 0 and < 1, got {drag_error}")
+    serves = advance(generate_serves(num, seed, names), SEEN)
+    scenarios = to_scenarios(serves)
+    sign = np.random.default_rng([seed, 1]).choice([-1.0, 1.0], num)
+    true = np.asarray(scenarios.drag)
+    believed = (true * (1.0 + drag_error * sign)).astype(np.float32)
+    return Volleys(np.arange(num), jax.tree.map(np.asarray, scenarios), believed)
+
+
+@dataclasses.dataclass(frozen=True)
+class HitFlights(Flights):
+    """What came of a batch of serves; leaves with a leading axis B, one ball (N = 1)."""
+
+    landing: np.ndarray  # (B, 3) [m], of the returned ball; NaN where it was missed
+    miss: np.ndarray  # (B,) [m], from the target; inf where the ball was missed
+
+    @property
+    def success(self) -> np.ndarray:
+        """Which balls landed near the target, (B,) bool."""
+        return self.miss <= _NEAR
+
+
+def returned(contact: Contact, restitution: Array) -> BallState:
+    """One ball just after the racket's impact, by the library's map (paper 002, eq. 3)."""
+    vel = racket_impact(contact.ball_vel, contact.tool_vel, contact.normal, restitution)
+    return BallState(pos=contact.ball_pos, vel=vel)
+
+
+def landing_point(ball: BallState, drag: Array, gravity: Array) -> tuple[Array, Array]:
+    """Where (3,) [m] one ball comes down to the ground, and when () [s] from now.
+
+    The library's flight with quadratic drag, three seconds at most; NaN for one still in the
+    air then.
+    """
+    step = jnp.full_like(drag, _LANDING_STEP)
+
+    def advance(state: BallState, _: None) -> tuple[BallState, Array]:
+        return rk4_step(state, step, drag, gravity), state.pos
+
+    _, path = jax.lax.scan(advance, ball, None, length=_LANDING_STEPS + 1)
+    falls = (path[:-1, 2] > 0.0) & (path[1:, 2] <= 0.0)
+    first = jnp.argmax(falls)
+    a, b = path[first], path[first + 1]
+    share = a[2] / jnp.where(falls[first], a[2] - b[2], 1.0)
+    point = jnp.where(falls[first], a + share * (b - a), jnp.nan)
+    return point, jnp.where(falls[first], (first + share) * step, jnp.nan)
+
+
+@functools.partial(jax.jit, static_argnames="loop")
+def _scenarios(loop: Loop, flights: FlightState, truth: HitScenario) -> HitScenario:
+    """What is to be hit, as it is believed."""
+
+    def one(flight: FlightState, scenario: HitScenario) -> HitScenario:
+        balls = expected(loop, flight.earlier, loop.period)
+        return believed(scenario, balls, flight.earlier.drag, scenario.head_state)
+
+    return jax.vmap(one)(flights, truth)
+
+
+@jax.jit
+def _landings(contact: Contact, truth: HitScenario) -> tuple[Array, Array]:
+    """Landing points (B, 3) [m] of the balls that were hit, and their distances from target."""
+
+    def one(contact: Contact, scenario: HitScenario) -> tuple[Array, Array]:
+        contact = jax.tree.map(lambda leaf: leaf[0], contact)
+        ball = returned(contact, scenario.restitution)
+        point, _ = landing_point(ball, scenario.drag, scenario.gravity)
+        miss = jnp.sqrt(jnp.sum((point - scenario.target) ** 2))
+        hit = contact.met & jnp.isfinite(miss)
+        return jnp.where(hit, point, jnp.nan), jnp.where(hit, miss, jnp.inf)
+
+    return jax.vmap(one)(contact, truth)
+
+
+def fly_hits(
+    loop: Loop,
+    cases: Volleys,
+    seed: int = 0,
+    *,
+    planner: Planner | None = None,
+    pilot: HitPilot | None = None,
+    plan: HitPlan | None = None,
+) -> HitFlights:
+    """Plan and fly a batch of serves.
+
+    Args:
+        loop: world, sensing, rates and gains.
+        cases: the serves.
+        seed: of the noise, >= 0.
+        planner: of the first plan, by default `smooth_planner()`.
+        pilot: of the plans after it.
+        plan: first plan of each flight, instead of one made here.
+
+    Raises:
+        ValueError: a world or plan does not fit.
+    """
+    planner, pilot = planner or smooth_planner(), pilot or HitPilot()
+    truth = cases.scenarios
+    require_world(loop, "racket", 1, gravity=truth.gravity, racket_height=truth.racket_height)
+    truth = jax.tree.map(jnp.asarray, truth)
+    keys = flight_keys(seed, cases.index)
+    drag = truth.drag[:, None]
+    flight = ready(loop, truth.head_state[:, 0], keys)
+    balls = jax.tree.map(lambda leaf: leaf[:, None], truth.ball)
+    guess = jnp.asarray(cases.believed)[:, None]
+    flight = launched(loop, flight, balls, drag, guess, ball=0, seen=SEEN)
+    scenario = _scenarios(loop, flight, truth)
+    jax.block_until_ready(scenario)
+    clock = time.perf_counter()
+    first = jax.block_until_ready(plan_all(planner, scenario)) if plan is None else plan
+    planning = time.perf_counter() - clock
+    require_plan(first, HitPlan, scenario.head_state)
+    begun = jax.tree.map(jnp.asarray, first)
+    flight = dataclasses.replace(flight, plan=begun, began=flight.time, present=flight.launched)
+    periods = loop.num_periods(_LONGEST - SEEN + _AFTER)
+    flight, record = fly_leg(loop, pilot, flight, scenario, drag, num_periods=periods)
+    landing, miss = jax.device_get(_landings(flight.contact, truth))
+    return HitFlights(first, flown(flight, [record]), planning, landing, miss)
+
+
+class HitFlight(FlightTask):
+    """Hits as a run of flights knows them; the settings are `HitFly`."""
+
+    settings: HitFly
+
+    CONTACT = "hit"
+    SUCCESS = f"landed within {_NEAR:g} m of the target"
+    # Paper 002 shows its rates as a figure.
+    PUBLISHED = "Bat, 600 real serves: within 0.5 m and 1 m, in a figure without numbers"
+    COLUMNS = (
+        Column("met", "", "by the racket", BOOL, lambda b: b.verdict.flown.contact.met[:, 0]),
+        Column("landing", "m", "of the returned ball", VECTOR, lambda b: b.verdict.landing),
+        Column("miss", "m", "from the target", NUMBER, lambda b: b.verdict.miss),
+    )
+
+    def world(self) -> World:
+        """The simulated world with the court."""
+        return HIT_WORLD
+
+    def cases(self) -> Volleys:
+        """All serves of the run."""
+        settings = self.settings
+        regions = HIT_SUITES[settings.suite]
+        return volleys(settings.num, regions, settings.seed, drag_error=settings.drag_error)
+
+    def fly(self, cases: Volleys, record: bool) -> HitFlights:
+        """Flights of some serves."""
+        name = self.settings.planner
+        planner = None if name == "exact" else hit_planner(name)
+        return fly_hits(self.loop(record), cases, self.settings.seed, planner=planner)
+
+    def launches(self, cases: Volleys, flown: Flown) -> Launches:
+        """The serves, and the balls that come back from the racket."""
+        scenarios = cases.scenarios
+        contact = jax.tree.map(lambda leaf: leaf[:, 0], flown.contact)
+        back = jax.device_get(jax.vmap(returned)(contact, scenarios.restitution))
+        balls = jax.tree.map(lambda leaf: leaf[:, None], scenarios.ball)
+        drag = scenarios.drag[:, None]
+        return Launches(balls, drag, np.zeros(1), SEEN, returned=back, target=scenarios.target)
+
+    @property
+    def suite(self) -> str:
+        """The suite of serves."""
+        return self.settings.suite
+
+    def counts(self, rows: Any) -> dict[str, int]:
+        """Balls that the racket met, and those that landed within the wider circle."""
+        miss, met = np.asarray(rows["miss"]), np.asarray(rows["met"])
+        return {"within_1_m": int((miss <= _FAR).sum()), "met": int(met.sum())}
+
+    def findings(self, summary: Mapping[str, Any]) -> list[str]:
+        """The wider circle, and the racket's part."""
+        within, met = (percent(summary[name], summary["num"]) for name in ("within_1_m", "met"))
+        return [f"{within} % within 1 m; the racket met the ball in {met} %."]
