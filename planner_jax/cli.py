@@ -1,31 +1,30 @@
-"""The command line: `planner-jax sweep|fly hit|catch`, `view`, `report`, `bench`, `doctor`."""
+"""The command line: `planner-jax sweep|fly TASK`, `view`, `report`, `bench`, `doctor`.
+
+Tasks come from the registry, and the options of `sweep` and `fly` from the fields of a task's
+settings: nothing here knows a task.
+"""
 
 import argparse
 import dataclasses
 import datetime
 import os
+import pkgutil
 import shlex
 import signal
 import sys
 import threading
-from collections.abc import Sequence
+import types
+import typing
+import warnings
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NoReturn, get_args, get_type_hints
+from typing import Any, NoReturn
 
 from planner_jax.compile_cache import keep_compiled_programs
-from planner_jax.sweep.catch.settings import DECISIONS, NET_TESTS, SUITES, CatchSweep
+from planner_jax.registry import Task, all_tasks, task_named
 from planner_jax.sweep.environment import installed_version, require_backend
-from planner_jax.sweep.hit.settings import HitSweep
-from planner_jax.sweep.settings import SettingError, SweepSettings, require
-from planner_jax.task.catch.planners import PLANNERS as CATCH_PLANNERS
-from planner_jax.task.hit.planners import PLANNERS as HIT_PLANNERS
+from planner_jax.sweep.settings import SettingError, require
 
-_OPTIONS = {
-    *HitSweep.__dataclass_fields__,
-    *CatchSweep.__dataclass_fields__,
-    *("out", "devices", "iterations", "repeat"),
-    *("noise", "replan", "balls", "drag_error", "video", "record", "host", "port"),
-}
 _FAILED, _BAD_ARGUMENT, _INTERRUPTED = 1, 2, 130
 
 
@@ -38,7 +37,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         The exit code: 0, 1 where the file system fails, 2 for a bad argument, 130 after Ctrl-C.
     """
-    options = vars(_parser().parse_args(arguments))
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        parser = _parser()
+    for warning in told:  # such as a task of another package that does not work
+        print(f"planner-jax: warning: {warning.message}", file=sys.stderr)
+    options = vars(parser.parse_args(arguments))
     command = options.pop("command")
     try:
         return command(options) or 0
@@ -52,17 +56,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _FAILED
 
 
+_ARGUMENTS: set[str] = set()  # names of all arguments, as they are written in Python
+
+
 def _fail(message: str) -> int:
     """Print one line, in which an argument's name is written as on the command line."""
     name, _, rest = message.partition(" ")
-    if name in _OPTIONS:
+    if name in _ARGUMENTS:
         message = f"--{name.replace('_', '-')} {rest}"
     print(f"planner-jax: error: {' '.join(message.split())}", file=sys.stderr)
     return _BAD_ARGUMENT
 
 
 class _Parser(argparse.ArgumentParser):
-    """Says what is wrong with an argument in one line."""
+    """Says what is wrong with an argument in one line; knows what it does not ask for."""
+
+    def __init__(self, **look: Any):
+        super().__init__(**{"formatter_class": _Help, "allow_abbrev": False, **look})
+
+    def add(self, flag: str, **how: Any) -> None:
+        """Add an option."""
+        _ARGUMENTS.add(self.add_argument(flag, **how).dest)
 
     def error(self, message: str) -> NoReturn:
         sys.exit(_fail(message.removeprefix("argument ")))
@@ -73,197 +87,197 @@ class _Help(argparse.RawDescriptionHelpFormatter):
         super().__init__(prog, max_help_position=28, width=100)
 
 
-def _parser() -> argparse.ArgumentParser:
-    look: dict[str, Any] = {"formatter_class": _Help, "allow_abbrev": False}
+def _parser() -> _Parser:
     parser = _Parser(
         prog="planner-jax",
         description="Plan for robots that meet flying objects, thousands of cases at once.",
         epilog="examples:\n  planner-jax sweep hit --num 9000 --out runs/first\n"
         "  planner-jax sweep catch --suite triangle3 --num 1000",
-        **look,
     )
     version = f"planner-jax {installed_version('planner-jax') or 'of a source tree'}"
     parser.add_argument("--version", action="version", version=version)
     commands = parser.add_subparsers(title="commands", required=True, metavar="command")
-    sweep = commands.add_parser("sweep", help="plan and referee many cases of a task", **look)
-    tasks = sweep.add_subparsers(title="tasks", required=True, metavar="task")
-    _add_hit(tasks, look)
-    _add_catch(tasks, look)
-    fly = commands.add_parser("fly", help="fly many cases of a task in closed loop", **look)
-    tasks = fly.add_subparsers(title="tasks", required=True, metavar="task")
-    from planner_jax.sims.settings import FLIGHTS, fly_settings
 
-    for task in FLIGHTS:
-        _add_fly(tasks, look, fly_settings(task))
-    view = commands.add_parser("view", help="play a run's flights in a browser", **look)
+    def command(name: str, words: str, run: Callable, **look: Any) -> _Parser:
+        added = commands.add_parser(name, help=words, description=look.pop("description", words))
+        added.set_defaults(command=run, **look)
+        return added
+
+    _add_tasks(commands, "sweep", "plan and referee many cases of a task", _add_sweep)
+    _add_tasks(commands, "fly", "fly many cases of a task in closed loop", _add_fly)
+    view = command("view", "play a run's flights in a browser", _view)
     view.add_argument("run", metavar="RUN", help="folder of a run of flights")
-    view.add_argument("--host", default="localhost", help="where to serve (default: localhost)")
-    view.add_argument(
+    view.add("--host", default="localhost", help="where to serve (default: localhost)")
+    view.add(
         "--port", type=int, default=8080, metavar="N", help="0 takes a free one (default: 8080)"
     )
-    view.set_defaults(command=_view)
-    report = commands.add_parser(
-        "report", help="write table, figures and page of a run anew", **look
-    )
+    report = command("report", "write table, figures and page of a run anew", _report)
     report.add_argument("run", metavar="RUN", help="folder of a finished run")
-    report.set_defaults(command=_report)
-    _add_bench(commands, look)
-    doctor = commands.add_parser(
-        "doctor", help="versions, devices, precision, cache and a timed plan", **look
-    )
-    doctor.set_defaults(command=_doctor)
+    bench = commands.add_parser("bench", help="measure this machine")
+    kinds = bench.add_subparsers(title="benchmarks", required=True, metavar="benchmark")
+    _add_throughput(kinds.add_parser("throughput", help="plans a second, with success and cost"))
+    command("doctor", "versions, devices, precision, cache and a timed plan", _doctor)
     return parser
 
 
-def _add_task(
-    tasks: Any,
-    look: dict[str, Any],
-    kind: type[SweepSettings],
-    planners: Sequence[str],
-    words: tuple[str, str],
-    cases: tuple[str, str, str],
-) -> argparse.ArgumentParser:
-    """The arguments that all sweeps have. One that is not given is absent from the namespace.
-
-    Args:
-        tasks: the parsers of all tasks.
-        look: of this parser.
-        kind: settings of the task.
-        planners: its names.
-        words: what the task is, short and long.
-        cases: what follows the default number of cases, which limits are scaled, what the seed
-            is of.
-    """
-    parser = tasks.add_parser(
-        kind.TASK,
-        help=words[0],
-        description=f"{words[1]}\n"
-        "Writes a run folder: index.html, table.md, figures, plans.parquet, manifest.json.",
-        argument_default=argparse.SUPPRESS,
-        **look,
-    )
-    default = kind()
-    more, limits, drawn = cases
-    add = parser.add_argument
-    # fmt: off
-    add("--planner", metavar="NAME", help=f"{', '.join(planners)} (default: {default.planner})")
-    add("--num", type=int, metavar="N", help=f"cases (default: {kind.DEFAULT_NUM}{more})")
-    add("--limit-scale", type=float, metavar="F",
-        help=f"factor on {limits} (default: {default.limit_scale:g})")
-    add("--batch", type=int, metavar="B",
-        help="cases planned, judged and written at once; bounds the memory "
-        f"(default: {kind.CPU_BATCH} on a CPU, {kind.GPU_BATCH} on a GPU)")
-    add("--seed", type=int, metavar="K", help=f"of {drawn} (default: {default.seed})")
-    add("--out", metavar="DIR", help=f"run folder (default: runs/{kind.TASK}-PLANNER-DATE-TIME)")
-    add("--resume", action="store_true", help="finish the interrupted run in --out")
-    # fmt: on
-    parser.set_defaults(command=lambda given: _sweep(kind, given))
-    return parser
+def _add_tasks(commands: Any, name: str, words: str, add: Callable[[_Parser, Task], None]) -> None:
+    """A command with a parser for every task."""
+    parser = commands.add_parser(name, help=words)
+    tasks = parser.add_subparsers(title="tasks", required=True, metavar="task")
+    for task in all_tasks().values():
+        if name == "sweep" or task.flight is not None:
+            look: Any = {"help": task.summary, "argument_default": argparse.SUPPRESS}
+            add(tasks.add_parser(task.name, **look), task)
 
 
-def _add_hit(tasks: Any, look: dict[str, Any]) -> None:
-    """The arguments of `sweep hit`."""
-    parser = _add_task(
-        tasks,
-        look,
-        HitSweep,
-        list(HIT_PLANNERS),
-        (
-            "a quadrotor hits served balls to a target with a racket",
-            "Plan a quadrotor's volley for thousands of serves and let a referee judge every plan.",
-        ),
-        (
-            " drawn ones, or all of the folder",
-            "the speed, acceleration and body-rate limits",
-            "drawn serves and of uniform starts",
-        ),
-    )
-    default = HitSweep()
-    start = " ".join(f"{x:g}" for x in default.start)
-    add = parser.add_argument
-    # fmt: off
-    add("--serves", metavar="DIR", help="read published trial files (default: draw serves)")
-    add("--start", nargs="+", metavar="X",
-        help=f"hover start X Y Z in m, or 'uniform' over the half court (default: {start})")
-    add("--delay", type=float, metavar="S",
-        help=f"seconds from the serve to the start of planning (default: {default.delay:g})")
-    add("--drag-after-impact", action="store_true",
-        help="plan and judge the returned ball with drag too (exact only)")
-    # fmt: on
-
-
-def _add_catch(tasks: Any, look: dict[str, Any]) -> None:
-    """The arguments of `sweep catch`."""
-    parser = _add_task(
-        tasks,
-        look,
-        CatchSweep,
-        list(CATCH_PLANNERS),
-        (
-            "a quadrotor catches flying targets with a net",
-            "Decide when and in what order a quadrotor catches flying targets, plan it for "
-            "thousands of\nscenarios of a suite, and let a referee judge every plan.",
-        ),
-        (
-            "",
-            "the speed and body-rate limits and on the thrust's distance from hover",
-            "the suite's scenarios",
-        ),
-    )
-    default = CatchSweep()
-    add = parser.add_argument
-    # fmt: off
-    add("--suite", metavar="NAME", help=f"{', '.join(SUITES)} (default: {default.suite})")
-    add("--decide", metavar="NAME",
-        help=f"order and first times: {', '.join(DECISIONS)} (default: {default.decide})")
-    add("--tolerance", type=float, metavar="R",
-        help=f"relative, of the referee (default: {default.tolerance:g}; the published protocol "
-        "has 0.05 with --net-test ball)")
-    add("--net-test", metavar="NAME",
-        help=f"where the net's radius counts, {' or '.join(NET_TESTS)}: across the net in its "
-        f"plane, or all around its centre (default: {default.net_test})")
-    # fmt: on
-
-
-def _add_fly(tasks: Any, look: dict[str, Any], kind: Any) -> None:
-    """The arguments of `fly` for a task, made from its settings; what is not given is absent."""
-    parser = tasks.add_parser(
-        kind.TASK,
-        help=kind.WORDS,
-        description=f"Plan and fly in MuJoCo MJX: {kind.WORDS}, with noise, latency and wrong drag."
-        "\nWrites a run folder: index.html, table.md, a figure, plans.parquet, flights.parquet,\n"
-        "manifest.json.",
-        argument_default=argparse.SUPPRESS,
-        **look,
-    )
-    add = parser.add_argument
-    types = get_type_hints(kind)
+def _add_settings(parser: _Parser, kind: type, task: Task) -> None:
+    """An option for every field of settings. One that is not given is absent from the namespace."""
+    hints = typing.get_type_hints(kind)
+    names = {"planner": task.all_planners(), "suite": task.all_suites()}
     for field in dataclasses.fields(kind):
-        value = next(t for t in (*get_args(types[field.name]), types[field.name]) if t is not None)
-        told = "" if field.default is None else f" (default: {field.default})"
-        add(
-            f"--{field.name.replace('_', '-')}",
-            type=value,
-            metavar=field.metadata["metavar"],
-            help=field.metadata["help"] + told,
-        )
-    # fmt: off
-    add("--record", type=int, metavar="K",
-        help="flights kept look by look for `planner-jax view`, the first ones (default: 16)")
-    add("--video", nargs="?", const="flights.gif", metavar="FILE",
+        flag, default = f"--{field.name.replace('_', '-')}", field.default
+        words = field.metadata["help"]
+        if field.name in names:
+            known = list(names[field.name])
+            words, default = f"{', '.join(known)}", known[0] if default is None else default
+        if field.name in ("num", "batch") and default is None and hasattr(kind, "DEFAULT_NUM"):
+            default = {
+                "num": kind.DEFAULT_NUM,  # type: ignore[attr-defined]
+                "batch": f"{kind.CPU_BATCH} on a CPU, {kind.GPU_BATCH} on a GPU",  # type: ignore[attr-defined]
+            }[field.name]
+        if isinstance(default, bool):
+            parser.add(flag, action="store_true", help=words)
+            continue
+        if default is not None and "(default:" not in words:
+            shown = " ".join(map(str, default)) if isinstance(default, tuple) else default
+            words += f" (default: {shown})"
+        several = {"nargs": "+"} if isinstance(field.default, tuple) else {}
+        metavar = field.metadata["metavar"]
+        parser.add(flag, type=_type_of(hints[field.name]), metavar=metavar, help=words, **several)
+
+
+def _type_of(hint: Any) -> Callable[[str], Any]:
+    """What makes a value of a word: `int` or `float` where a field holds these, or nothing."""
+    held = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+    return next((kind for kind in held if kind in (int, float)), str)
+
+
+def _add_sweep(parser: _Parser, task: Task) -> None:
+    parser.description = (
+        f"Many cases of one task, {task.summary}:\nplanned, and every plan judged by a referee.\n"
+        "Writes a run folder: index.html, table.md, figures, plans.parquet, manifest.json."
+    )
+    _add_settings(parser, pkgutil.resolve_name(task.sweep), task)
+    parser.add(
+        "--out", metavar="DIR", help=f"run folder (default: runs/{task.name}-PLANNER-DATE-TIME)"
+    )
+    parser.add("--resume", action="store_true", help="finish the interrupted run in --out")
+    parser.set_defaults(command=lambda given: _sweep(task, given))
+
+
+def _add_fly(parser: _Parser, task: Task) -> None:
+    parser.description = (
+        f"Many flights of one task, {task.summary},\n"
+        "in MuJoCo MJX with noise, latency and wrong drag.\n"
+        "Writes a run folder: index.html, table.md, a figure, plans.parquet, flights.parquet,\n"
+        "manifest.json."
+    )
+    kind = pkgutil.resolve_name(str(task.flight))
+    _add_settings(parser, kind, task)
+    parser.add(
+        "--record",
+        type=int,
+        metavar="K",
+        help="flights kept look by look for `planner-jax view`, the first ones (default: 16)",
+    )
+    parser.add(
+        "--video",
+        nargs="?",
+        const="flights.gif",
+        metavar="FILE",
         help="film the first three of these into the run folder, .gif, or .mp4 where ffmpeg is "
-        "installed (default name: flights.gif)")
-    add("--out", metavar="DIR", help=f"run folder (default: runs/fly-{kind.TASK}-DATE-TIME)")
-    # fmt: on
-    parser.set_defaults(command=lambda given: _fly(kind, given))
+        "installed (default name: flights.gif)",
+    )
+    parser.add("--out", metavar="DIR", help=f"run folder (default: runs/fly-{task.name}-DATE-TIME)")
+    parser.set_defaults(command=lambda given: _fly(task, kind, given))
 
 
-def _fly(kind: Any, given: dict[str, Any]) -> None:
+def _add_throughput(parser: _Parser) -> None:
+    parser.description = (
+        "Plans a second of batches that stay on the devices, with what the referee says of them,\n"
+        "the cost beside a long search's, compile time and memory."
+    )
+    tasks = list(all_tasks())
+    for flag, how in {
+        "--task": {"choices": tasks, "default": tasks[0], "help": f"(default: {tasks[0]})"},
+        "--planner": {"metavar": "NAME", "help": "(default: the task's first)"},
+        "--suite": {"metavar": "NAME", "help": "(default: the task's first)"},
+        "--batch": {
+            "type": int,
+            "nargs": "+",
+            "default": [1024, 8192],
+            "metavar": "B",
+            "help": "plans in one call, one or more sizes (default: 1024 8192)",
+        },
+        "--devices": {"type": int, "metavar": "N", "help": "how many share a batch (default: all)"},
+        "--iterations": {
+            "type": int,
+            "metavar": "K",
+            "help": "of the first round (default: the planner's own)",
+        },
+        "--repeat": {"type": int, "default": 5, "metavar": "R", "help": "timed calls (default: 5)"},
+        "--seed": {"type": int, "default": 0, "metavar": "K", "help": "of the cases (default: 0)"},
+        "--agree": {"action": "store_true", "help": "compare the lanes with those of a CPU, too"},
+        "--out": {
+            "metavar": "DIR",
+            "help": "run folder (default: runs/bench-throughput-DATE-TIME)",
+        },
+    }.items():
+        parser.add(flag, **how)
+    parser.set_defaults(command=_throughput)
+
+
+def _out(given: dict[str, Any], name: str) -> str:
+    """The run folder that is asked for, or one of this name and moment."""
+    out = given.pop("out", None)
+    return out or os.path.join("runs", f"{name}-{datetime.datetime.now():%Y%m%d-%H%M%S}")
+
+
+def _sweep(task: Task, given: dict[str, Any]) -> None:
+    kind, resume = pkgutil.resolve_name(task.sweep), given.pop("resume", False)
+    if resume and "out" not in given:
+        raise SettingError("out must name the folder to resume, got nothing")
+    out = given.pop("out", None)
+    settings = kind(**given).of(task)
+    out = _out({"out": out}, f"{task.name}-{settings.planner}")
+    _let_ctrl_c_stop()
+    keep_compiled_programs()
+    from planner_jax.sweep import run
+
+    try:
+        if resume:
+            manifest = run.resume_sweep(task, out, **given)
+        else:
+            manifest = run.start_sweep(task, settings, out)
+    except run.SweepInterrupted:
+        again = f"planner-jax sweep {task.name} --resume --out {shlex.quote(str(out))}"
+        raise run.SweepInterrupted(f"interrupted; finish with: {again}") from None
+    _print_sweep(manifest, Path(out))
+
+
+def _print_sweep(manifest: dict[str, Any], out: Path) -> None:
+    from planner_jax.sweep.sweep import sweep_of_run
+    from planner_jax.sweep.table import headline
+
+    print("\n".join(headline(manifest, sweep_of_run(manifest).findings(manifest))))
+    print(f"Look at {out / 'index.html'}")
+
+
+def _fly(task: Task, kind: type, given: dict[str, Any]) -> None:
     keep_compiled_programs()
     from planner_jax.sims.run import start_flights
 
-    out, video = given.pop("out", None), given.pop("video", None)
-    out = out or os.path.join("runs", f"fly-{kind.TASK}-{datetime.datetime.now():%Y%m%d-%H%M%S}")
+    out, video = _out(given, f"fly-{task.name}"), given.pop("video", None)
     keep = {"record": given.pop("record")} if "record" in given else {}
     start_flights(kind(**given), out, video, **keep)
     _print_flights(Path(out))
@@ -284,11 +298,9 @@ def _view(options: dict[str, Any]) -> None:
     from planner_jax.sweep.run_folder import RunFolder
 
     _, flight, recording = read_flights(RunFolder(options["run"], name="RUN"))
-    titles = [flight.title(recording, row) for row in range(len(recording))]
-    where = options["host"], options["port"]
-    viewer = Viewer(flight.world(), recording, titles, flight.CONTACT, *where)
+    viewer = Viewer(flight, recording, options["host"], options["port"])
     _let_ctrl_c_stop()
-    print(f"Playing {len(titles)} flights at {viewer.url}; Ctrl-C stops.", flush=True)
+    print(f"Playing {len(recording)} flights at {viewer.url}; Ctrl-C stops.", flush=True)
     viewer.run()
 
 
@@ -296,32 +308,6 @@ def _let_ctrl_c_stop() -> None:
     """A shell starts background jobs deaf to SIGINT; here it is heard there too."""
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
-def _add_bench(commands: Any, look: dict[str, Any]) -> None:
-    """The arguments of `bench throughput`."""
-    bench = commands.add_parser("bench", help="measure this machine", **look)
-    kinds = bench.add_subparsers(title="benchmarks", required=True, metavar="benchmark")
-    parser = kinds.add_parser(
-        "throughput",
-        help="plans a second, with success and cost",
-        description="Plans a second of batches that stay on the devices, with what the referee "
-        "says of them,\nthe cost beside a long search's, compile time and memory.",
-        **look,
-    )
-    add = parser.add_argument
-    # fmt: off
-    add("--task", choices=("hit", "catch"), default="hit", help="(default: hit)")
-    add("--batch", type=int, nargs="+", default=[1024, 8192], metavar="B",
-        help="plans in one call, one or more sizes (default: 1024 8192)")
-    add("--devices", type=int, metavar="N", help="how many share a batch (default: all)")
-    add("--iterations", type=int, metavar="K",
-        help="of the first round (default: the planner's own)")
-    add("--repeat", type=int, default=5, metavar="R", help="timed calls (default: 5)")
-    add("--seed", type=int, default=0, metavar="K", help="of the drawn scenarios (default: 0)")
-    add("--agree", action="store_true", help="compare the lanes with those of a CPU, too")
-    # fmt: on
-    parser.set_defaults(command=_throughput)
 
 
 def _throughput(options: dict[str, Any]) -> None:
@@ -334,50 +320,11 @@ def _throughput(options: dict[str, Any]) -> None:
     keep_compiled_programs()
     from planner_jax.benchmarks.throughput import report
 
-    report(**options)
-
-
-def _doctor(options: dict[str, Any]) -> int:
-    from planner_jax.doctor import report
-
-    return 0 if report() else _FAILED
-
-
-def _sweep(kind: type[SweepSettings], given: dict[str, Any]) -> None:
-    out, resume = given.pop("out", None), given.pop("resume", False)
-    if given.get("start") == ["uniform"]:
-        given["start"] = "uniform"
-    settings = kind(**given)
-    if resume and out is None:
-        raise SettingError("out must name the folder to resume, got nothing")
-    if out is None:
-        now = datetime.datetime.now()
-        out = os.path.join("runs", f"{kind.TASK}-{settings.planner}-{now:%Y%m%d-%H%M%S}")
-    _let_ctrl_c_stop()
-    keep_compiled_programs()
-    from planner_jax.sweep import run
-
-    try:
-        if resume:
-            manifest = run.resume_sweep(kind.TASK, out, **given)
-        else:
-            manifest = run.start_sweep(settings, out)
-    except run.SweepInterrupted:
-        again = f"planner-jax sweep {kind.TASK} --resume --out {shlex.quote(str(out))}"
-        raise run.SweepInterrupted(f"interrupted; finish with: {again}") from None
-    _print_result(manifest, Path(out))
-
-
-def _print_result(manifest: dict[str, Any], out: Path) -> None:
-    from planner_jax.sweep.table import headline
-    from planner_jax.sweep.task import task_of
-
-    print("\n".join(headline(manifest, task_of(manifest).findings(manifest))))
-    print(f"Look at {out / 'index.html'}")
+    out = _out(options, "bench-throughput")
+    report(**{**options, "task": task_named(options["task"])}, out=out)
 
 
 def _report(options: dict[str, Any]) -> None:
-    from planner_jax.sweep.report import write_report
     from planner_jax.sweep.run_folder import RunFolder
 
     folder = RunFolder(options["run"], name="RUN")
@@ -388,8 +335,16 @@ def _report(options: dict[str, Any]) -> None:
         write_flight_report(folder)
         _print_flights(folder.path)
     else:
+        from planner_jax.sweep.report import write_report
+
         write_report(folder)
-        _print_result(manifest, folder.path)
+        _print_sweep(manifest, folder.path)
+
+
+def _doctor(options: dict[str, Any]) -> int:
+    from planner_jax.doctor import report
+
+    return 0 if report() else _FAILED
 
 
 if __name__ == "__main__":

@@ -43,8 +43,9 @@ class Task:
     home: str  # module with the functions `case`, `draw`, `planner` and `judge`
     planners: Mapping[str, str]  # name -> what makes the planner of given options; default first
     suites: Mapping[str, str]  # name -> what it draws, a sentence; default first
-    sweep: str = "planner_jax.sweep.task:Sweep"  # class of its sweeps
-    flight: str | None = None  # class of its flights in `sims`
+    # Classes of the settings of its sweeps, and of its flights in `sims`; they name what runs them.
+    sweep: str = "planner_jax.sweep.settings:SweepSettings"
+    flight: str | None = None
 
     @property
     def case(self) -> Callable[..., Any]:

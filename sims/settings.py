@@ -10,8 +10,8 @@ from typing import Any, ClassVar
 
 from planner_jax.sims.noise import NOISES, Sensing, require_whole
 from planner_jax.sweep.settings import SettingError, require, require_one_of
-from planner_jax.task.catch.planners import PLANNERS as CATCH_PLANNERS
-from planner_jax.task.hit.planners import PLANNERS as HIT_PLANNERS
+from planner_jax.task.catch.card import TASK as CATCH
+from planner_jax.task.hit.card import TASK as HIT
 
 FLIGHTS = {  # the tasks that can be flown -> their settings, as "module:Class"
     "catch": "planner_jax.sims.settings:CatchFly",
@@ -127,7 +127,7 @@ class CatchFly(FlySettings):
     TASK: ClassVar[str] = "catch"
     WORDS: ClassVar[str] = "a quadrotor catches thrown balls with a net"
     FLIGHT: ClassVar[str] = "planner_jax.sims.tasks.catch:CatchFlight"
-    PLANNERS: ClassVar[Mapping[str, str]] = CATCH_PLANNERS
+    PLANNERS: ClassVar[Mapping[str, str]] = CATCH.planners
     RATE: ClassVar[float] = 100.0
 
     def __post_init__(self) -> None:
@@ -150,7 +150,7 @@ class HitFly(FlySettings):
     TASK: ClassVar[str] = "hit"
     WORDS: ClassVar[str] = "a quadrotor hits served balls to a target with a racket"
     FLIGHT: ClassVar[str] = "planner_jax.sims.tasks.hit:HitFlight"
-    PLANNERS: ClassVar[Mapping[str, str]] = HIT_PLANNERS
+    PLANNERS: ClassVar[Mapping[str, str]] = HIT.planners
     RATE: ClassVar[float] = 50.0
 
     def __post_init__(self) -> None:

@@ -13,9 +13,9 @@ from tqdm import tqdm
 
 from planner_jax.sweep.columns import RefereedBatch, rows_of
 from planner_jax.sweep.run_folder import RunFolder
-from planner_jax.sweep.source import Source
+from planner_jax.sweep.source import Chunk, Source
 from planner_jax.sweep.summary import percent
-from planner_jax.sweep.task import SweepTask
+from planner_jax.sweep.sweep import Sweep
 from planner_jax.sweep.timing import CompileClock, Stopwatch
 
 _UNDER_WAY = 2  # chunks that are judged or written while the next is planned
@@ -23,7 +23,7 @@ _MEASURED = {
     "compile_seconds": "JAX tracing, lowering, compiling or reading its cache, while chunks were "
     "made; overlapping spans counted once",
     "first_seconds": "planning the first chunk, with the compilation in it",
-    "warm_seconds": "planning of chunks in which nothing was compiled, scenarios to plans on the "
+    "warm_seconds": "planning of chunks in which nothing was compiled, cases to plans on the "
     "host: decisions, ball tables, guesses and all rounds. Where these were less than half a "
     "batch, the first chunk planned again",
     "referee_seconds": "judging, while the next chunk is planned",
@@ -36,7 +36,7 @@ _MEASURED = {
 class SweepRun:
     """A sweep under way."""
 
-    task: SweepTask
+    sweep: Sweep
     source: Source
     planner: Any
     folder: RunFolder
@@ -58,7 +58,7 @@ def plan_chunks(run: SweepRun, *, progress: bool) -> dict[str, Any]:
     if progress:
         print(f"Writing {folder.path}; the first chunk compiles.", file=sys.stderr)
     look: dict[str, Any] = {"unit": " plans", "desc": source.settings.planner}
-    tally = run.task.tally(source.settings)
+    tally = run.sweep.tally(source.settings)
     with tqdm(total=source.num, initial=done, disable=not progress, **look) as bar:
         for rows, record in _in_pipeline(run):
             tally.add(rows)
@@ -131,45 +131,44 @@ def _progress(records: Iterable[dict[str, Any]]) -> tuple[int, int]:
 class _Planned:
     """One chunk, not judged yet."""
 
-    cases: Any
-    scenarios: Any
+    chunk: Chunk
     plans: Any
     record: dict[str, Any]  # how long it took
 
 
-def _plan_chunk(run: SweepRun, cases: Any, clock: CompileClock) -> _Planned:
+def _plan_chunk(run: SweepRun, chunk: Chunk, clock: CompileClock) -> _Planned:
     """One chunk's plans. What the clock has counted since the chunk before is its compilation."""
-    (scenarios, plans), seconds, warm = _timed_plan(run, cases.scenarios)
+    plans, seconds, warm = _timed_plan(run, chunk.cases)
     record = {
-        "num": len(cases),
+        "num": len(chunk),
         "plan_seconds": seconds,
         "warm": warm,
         "compile_seconds": clock.lap(),
     }
-    return _Planned(cases, scenarios, plans, record)
+    return _Planned(chunk, plans, record)
 
 
 def _judge_chunk(
-    run: SweepRun, chunk: int, planned: _Planned, watch: Stopwatch
+    run: SweepRun, number: int, planned: _Planned, watch: Stopwatch
 ) -> tuple[int, pa.Table, dict[str, Any]]:
-    """The chunk, its rows and its record, with the seconds since the one before."""
+    """The chunk's number, its rows and its record, with the seconds since the one before."""
     own = Stopwatch()
-    verdict = run.task.judge(planned.scenarios, planned.plans, run.source.settings)
+    verdict = run.sweep.judge(planned.chunk.cases, planned.plans, run.source.settings)
     record = {
         **planned.record,
         "referee_seconds": own.lap(),
         "successes": int(np.sum(verdict.success)),
         "wall_seconds": watch.lap(),
     }
-    batch = RefereedBatch(planned.cases, planned.scenarios, planned.plans, verdict)
-    return chunk, rows_of(run.task.columns, batch, run.task.frame), record
+    batch = RefereedBatch(planned.chunk, planned.plans, verdict)
+    return number, rows_of(run.sweep.columns(batch), batch, run.sweep.frame), record
 
 
-def _timed_plan(run: SweepRun, scenarios: Any) -> tuple[Any, float, bool]:
-    """Scenarios and plans, the seconds they took, and whether nothing was compiled meanwhile."""
+def _timed_plan(run: SweepRun, cases: Any) -> tuple[Any, float, bool]:
+    """Plans, the seconds they took, and whether nothing was compiled meanwhile."""
     watch = Stopwatch()
     with CompileClock() as clock:
-        planned = run.task.plan(run.planner, scenarios, run.source.settings)
+        planned = run.sweep.plan(run.planner, cases)
     return planned, watch.lap(), not clock.compiled
 
 
@@ -195,8 +194,8 @@ def _times(run: SweepRun) -> dict[str, Any]:
 
 def _warm_first_chunk(run: SweepRun) -> tuple[int, float]:
     """Number of plans and seconds of the first chunk, planned until nothing is compiled."""
-    cases = run.source.chunk(0)
+    chunk = run.source.chunk(0)
     seconds, warm = 0.0, False
     while not warm:
-        _, seconds, warm = _timed_plan(run, cases.scenarios)
-    return len(cases), seconds
+        _, seconds, warm = _timed_plan(run, chunk.cases)
+    return len(chunk), seconds

@@ -1,24 +1,28 @@
 """The columns of `plans.parquet`: a row a case, SI units, world frame (z up)."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 
 from planner_jax.protocol import Status
-from planner_jax.sweep.source import Cases
+from planner_jax.sweep.source import Chunk
 
 
 @dataclasses.dataclass(frozen=True)
 class RefereedBatch:
     """B cases with everything that is known about them; leaves are NumPy or JAX arrays."""
 
-    cases: Cases
-    scenarios: Any  # as they were planned, with what was decided about them
+    chunk: Chunk
     plans: Any
     verdict: Any
+
+    @property
+    def cases(self) -> Any:
+        """The cases themselves."""
+        return self.chunk.cases
 
 
 class Column(NamedTuple):
@@ -32,6 +36,7 @@ class Column(NamedTuple):
 
 
 BOOL, TEXT, COUNT, NUMBER = pa.bool_(), pa.string(), pa.int32(), pa.float32()
+_KINDS = {"b": BOOL, "U": TEXT, "i": COUNT}  # kind of a NumPy type -> type of a column
 
 
 def list_of(kind: pa.DataType, length: int = -1) -> pa.DataType:
@@ -41,14 +46,7 @@ def list_of(kind: pa.DataType, length: int = -1) -> pa.DataType:
 
 VECTOR, LIST = list_of(pa.float32(), 3), list_of(pa.float32())
 
-INDEX = Column("index", "", "place in the whole", pa.int64(), lambda b: b.cases.index)
-START = Column(
-    "start",
-    "m",
-    "hover position of the quadrotor",
-    VECTOR,
-    lambda b: np.asarray(b.scenarios.head_state)[:, 0],
-)
+INDEX = Column("index", "", "place in the whole", pa.int64(), lambda b: b.chunk.index)
 
 
 def leaves_of(part: str, rows: Sequence[tuple[str, str, str, pa.DataType, str]]) -> list[Column]:
@@ -77,45 +75,57 @@ SOLVER = [
     Column("status", "", "of the solver", TEXT, lambda b: _status(b.plans.status)),
 ]
 
-OUTCOME = leaves_of(
-    "verdict",
-    [
-        ("success", "", "the referee's word", BOOL, ""),
-        ("failed_limit", "", "first limit that fails, or empty", TEXT, ""),
-        ("failed_time", "s", "where that limit is worst", NUMBER, ""),
-        ("failed_excess", "as in `sentence`", "by how much, tolerance not taken off", NUMBER, ""),
-        ("max_speed", "m/s", "of the quadrotor", NUMBER, ""),
-        ("max_body_rate", "rad/s", "of the quadrotor", NUMBER, ""),
-        ("min_height", "m", "of the propeller plane", NUMBER, ""),
-        ("min_thrust", "m/s^2", "per unit mass", NUMBER, ""),
-        ("max_thrust", "m/s^2", "per unit mass", NUMBER, ""),
-    ],
-)
-
-ERRORS = [
+OUTCOME = [
     *leaves_of(
         "verdict",
         [
-            ("continuity_error", "m", "worst jump between pieces", NUMBER, ""),
-            ("head_error", "m", "of the state at time 0", NUMBER, ""),
+            ("success", "", "the referee's word", BOOL, ""),
+            ("failed_limit", "", "first limit that fails, or empty", TEXT, ""),
+            ("failed_time", "s", "where that limit is worst", NUMBER, ""),
+            (
+                "failed_excess",
+                "as in `sentence`",
+                "by how much, tolerance not taken off",
+                NUMBER,
+                "",
+            ),
         ],
     ),
     Column("sentence", "", "what failed, in words", TEXT, lambda b: _sentences(b.verdict)),
 ]
 
-TRAJECTORY = leaves_of(
-    "plans",
-    [
-        ("durations", "s", "of the pieces", LIST, "trajectory.durations"),
-        (
-            "coeffs",
-            "m/s^k",
-            "pieces x powers k = 0..D x 3 axes, flat",
-            LIST,
-            "trajectory.coeffs",
-        ),
-    ],
-)
+
+def leaf_columns(batch: RefereedBatch) -> list[Column]:
+    """A column for every leaf of the cases, the plans and the verdict.
+
+    Names are those of the fields, joined by dots, behind "case.", "plan." or "verdict."; what
+    every task has is named as in all runs. A field's metadata may hold its `unit` and `meaning`.
+    """
+    known = {f"plan.{c.name}" for c in SOLVER} | {f"verdict.{c.name}" for c in OUTCOME}
+    found = [INDEX]
+    for part, tree in (("case", batch.cases), ("plan", batch.plans), ("verdict", batch.verdict)):
+        found += [c for c in _columns_of(tree, part, part, {}) if c.name not in known]
+    return [*found, *SOLVER, *OUTCOME]
+
+
+def _columns_of(tree: Any, name: str, part: str, words: Mapping[str, str]) -> list[Column]:
+    if dataclasses.is_dataclass(tree):
+        fields = [(f.name, getattr(tree, f.name), f.metadata) for f in dataclasses.fields(tree)]
+        return [
+            column
+            for field, value, metadata in fields
+            for column in _columns_of(value, f"{name}.{field}", part, metadata)
+        ]
+    values = np.asarray(tree)
+    kind = _KINDS.get(values.dtype.kind, NUMBER)
+    column = Column(
+        name,
+        words.get("unit", ""),
+        words.get("meaning", ""),
+        kind if values.ndim == 1 else list_of(kind),
+        lambda b: _leaf({"case": b.cases, "plan": b.plans, "verdict": b.verdict}, name),
+    )
+    return [column]
 
 
 def rows_of(columns: Sequence[Column], batch: RefereedBatch, frame: str) -> pa.Table:
@@ -126,7 +136,7 @@ def rows_of(columns: Sequence[Column], batch: RefereedBatch, frame: str) -> pa.T
         batch: the cases.
         frame: axes and times of the columns, in words, for the metadata.
     """
-    num = len(batch.cases)
+    num = len(batch.chunk)
     fields = [
         pa.field(c.name, c.type, metadata={"unit": c.unit, "meaning": c.meaning}) for c in columns
     ]
@@ -152,7 +162,7 @@ def _array(values: Any, kind: pa.DataType, num: int) -> pa.Array:
 
 def _leaf(tree: Any, path: str) -> Any:
     for name in path.split("."):
-        tree = getattr(tree, name)
+        tree = tree[name] if isinstance(tree, dict) else getattr(tree, name)
     return tree
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from planner_jax.sweep import table
-from planner_jax.sweep.task import SweepTask
+from planner_jax.sweep.sweep import Sweep
 
 _STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; color: #24292f; max-width: 68rem; margin: 2rem auto;
@@ -26,22 +26,22 @@ tr { border-bottom: 1px solid #e6e8eb; } th { border-bottom: 2px solid #8a8f98; 
 """.strip()
 
 
-def to_page(task: SweepTask, manifest: dict[str, Any], failures: Sequence[dict[str, Any]]) -> str:
+def to_page(sweep: Sweep, manifest: dict[str, Any], failures: Sequence[dict[str, Any]]) -> str:
     """The page of a run.
 
     Args:
-        task: of the run.
+        sweep: that the run is of.
         manifest: of the run.
         failures: some rows of `plans.parquet` that failed.
     """
-    title, rates = html.escape(task.title(manifest)), task.table(manifest)
-    lines = table.headline(manifest, task.findings(manifest))
+    title, rates = html.escape(sweep.title(manifest)), sweep.table(manifest)
+    lines = table.headline(manifest, sweep.findings(manifest))
     lead = "".join(f"<p class=lead>{html.escape(line)}</p>\n" for line in lines)
-    notes = "".join(f"<li>{html.escape(line)}</li>\n" for line in task.remarks(manifest))
+    notes = "".join(f"<li>{html.escape(line)}</li>\n" for line in sweep.remarks(manifest))
     figures = "".join(
         f'<figure><a href="figures/{figure.name}"><img src="figures/{figure.name}" '
         f'alt="{figure.caption}"></a>\n<figcaption>{figure.caption}</figcaption></figure>\n'
-        for figure in task.figures
+        for figure in sweep.figures
     )
     record = html.escape(json.dumps(manifest, indent=2))
     return f"""<!doctype html>
@@ -58,7 +58,7 @@ def to_page(task: SweepTask, manifest: dict[str, Any], failures: Sequence[dict[s
 {table.to_html(rates)}</div>
 <ul>
 {notes}</ul>
-{_failures(task, manifest, failures)}<h2>The run</h2>
+{_failures(sweep, manifest, failures)}<h2>The run</h2>
 <p>All rows: <a href="plans.parquet">plans.parquet</a> (units in the column metadata); this table:
 <a href="table.md">table.md</a>; everything about the run:
 <a href="manifest.json">manifest.json</a>.</p>
@@ -67,12 +67,12 @@ def to_page(task: SweepTask, manifest: dict[str, Any], failures: Sequence[dict[s
 """
 
 
-def _failures(task: SweepTask, manifest: dict[str, Any], failures: Sequence[dict[str, Any]]) -> str:
+def _failures(sweep: Sweep, manifest: dict[str, Any], failures: Sequence[dict[str, Any]]) -> str:
     """The first failures in the referee's words."""
     if not failures:
         return ""
     summary = manifest["summary"]
-    words = task.failure_words
+    words = sweep.failure_words
     rows = [[str(row[column]) for column in words.values()] for row in failures]
     total = summary["num"] - summary["successes"]
     listed = table.RateTable(f"Failures, the first {len(failures)} of {total:,}", list(words), rows)

@@ -12,8 +12,8 @@ from planner_jax.sweep.figures.style import draw
 from planner_jax.sweep.page import to_page
 from planner_jax.sweep.run_folder import RunFolder, pick_rows
 from planner_jax.sweep.settings import SettingError
+from planner_jax.sweep.sweep import RunFigure, sweep_of_run
 from planner_jax.sweep.table import headline, to_markdown
-from planner_jax.sweep.task import RunFigure, task_of
 
 PAGE = "index.html"
 _CASES_SHOWN = 60
@@ -61,31 +61,31 @@ def write_report(folder: RunFolder) -> None:
         SettingError: the folder is not that of a sweep, or the run is not finished.
     """
     manifest = folder.read_manifest()
-    task = task_of(manifest, folder.name)
+    sweep = sweep_of_run(manifest, folder.name)
     if "summary" not in manifest or not folder.plans.exists():
         raise SettingError(
             f"{folder.name} must be finished, got {str(folder.path)!r}; resume it first"
         )
     folder.figures.mkdir(exist_ok=True)
     failed = _failed_rows(folder)
-    _draw(RunRows(folder, manifest, failed), task.figures)
-    lines = headline(manifest, task.findings(manifest))
-    text = to_markdown(task.title(manifest), lines, task.table(manifest), task.remarks(manifest))
+    _draw(RunRows(folder, manifest, failed), sweep.figures)
+    lines = headline(manifest, sweep.findings(manifest))
+    text = to_markdown(sweep.title(manifest), lines, sweep.table(manifest), sweep.remarks(manifest))
     folder.write_text("table.md", text)
-    folder.write_text(PAGE, to_page(task, manifest, failed))
+    folder.write_text(PAGE, to_page(sweep, manifest, failed))
 
 
 def rewrite_page(folder: RunFolder, manifest: dict[str, Any]) -> None:
     """Write `index.html` anew with a manifest, where it has been written before."""
     if (folder.path / PAGE).exists():
-        page = to_page(task_of(manifest, folder.name), manifest, _failed_rows(folder))
+        page = to_page(sweep_of_run(manifest, folder.name), manifest, _failed_rows(folder))
         folder.write_text(PAGE, page)
 
 
 def draw_comparisons(folder: RunFolder) -> None:
     """Draw anew the figures that show other planners too, now that they have planned."""
     manifest = folder.read_manifest()
-    figures = [figure for figure in task_of(manifest, folder.name).figures if figure.compares]
+    figures = [f for f in sweep_of_run(manifest, folder.name).figures if f.compares]
     _draw(RunRows(folder, manifest, failures=[]), figures)
 
 

@@ -6,13 +6,14 @@ import os
 import sys
 from typing import Any
 
+from planner_jax.registry import Task
 from planner_jax.sweep.baselines import plan_baselines
 from planner_jax.sweep.chunks import SweepRun, plan_chunks
 from planner_jax.sweep.environment import environment, require_backend
 from planner_jax.sweep.report import PAGE, draw_comparisons, rewrite_page, write_report
 from planner_jax.sweep.run_folder import RunFolder
 from planner_jax.sweep.settings import SettingError, SweepSettings, settings_to_resume
-from planner_jax.sweep.task import SweepTask, task_named
+from planner_jax.sweep.sweep import Sweep, settings_of, sweep_of
 
 
 class SweepInterrupted(KeyboardInterrupt):
@@ -20,12 +21,13 @@ class SweepInterrupted(KeyboardInterrupt):
 
 
 def start_sweep(
-    settings: SweepSettings, out: str | os.PathLike, *, progress: bool = True
+    task: Task, settings: SweepSettings, out: str | os.PathLike, *, progress: bool = True
 ) -> dict[str, Any]:
     """Plan and referee a sweep into a new folder.
 
     Args:
-        settings: of the sweep.
+        task: that is swept.
+        settings: of the sweep, of the task's class.
         out: folder, new or empty.
         progress: show a bar on the standard error stream.
 
@@ -38,18 +40,18 @@ def start_sweep(
     """
     folder = RunFolder(out)
     folder.require_new()
-    run = _open(task_named(settings.TASK), settings, folder)
+    run = _open(sweep_of(task), settings.of(task), folder)
     folder.create(_first_manifest(run, run.source.check()))
     return _finish(run, progress)
 
 
 def resume_sweep(
-    name: str, out: str | os.PathLike, *, progress: bool = True, **given: Any
+    task: Task, out: str | os.PathLike, *, progress: bool = True, **given: Any
 ) -> dict[str, Any]:
     """Finish a sweep that was interrupted or killed; a finished one is left as it is.
 
     Args:
-        name: of its task.
+        task: that was swept.
         out: its folder.
         progress: show a bar on the standard error stream.
         **given: settings named again; they must be those of the run.
@@ -64,15 +66,15 @@ def resume_sweep(
     """
     folder = RunFolder(out)
     manifest = folder.read_manifest()
-    task = task_named(name)
-    if manifest["kind"] != task.kind:
+    sweep = sweep_of(task)
+    if manifest["kind"] != sweep.kind:
         raise SettingError(
-            f"out must be the folder of a {task.kind}, got one of a {manifest['kind']}"
+            f"out must be the folder of a {sweep.kind}, got one of a {manifest['kind']}"
         )
-    settings = settings_to_resume(task.settings, manifest["parameters"], given)
+    settings = settings_to_resume(settings_of(task), manifest["parameters"], given)
     if manifest["state"] == "complete":
         return manifest
-    run = _open(task, settings, folder)
+    run = _open(sweep, settings, folder)
     for entry, known in run.source.description().items():
         if known != manifest.get(entry):
             raise SettingError(f"{entry} must be the same as when the run began")
@@ -81,10 +83,9 @@ def resume_sweep(
     return _finish(run, progress)
 
 
-def _open(task: SweepTask, settings: SweepSettings, folder: RunFolder) -> SweepRun:
+def _open(sweep: Sweep, settings: SweepSettings, folder: RunFolder) -> SweepRun:
     batch = settings.CPU_BATCH if require_backend() == "cpu" else settings.GPU_BATCH
-    planner = task.planner(settings.planner, settings.planner_options())
-    return SweepRun(task, task.open_source(settings, batch), planner, folder)
+    return SweepRun(sweep, sweep.open_source(settings, batch), sweep.planner(settings), folder)
 
 
 def _finish(run: SweepRun, progress: bool) -> dict[str, Any]:
@@ -126,11 +127,13 @@ def _plan(run: SweepRun, progress: bool) -> None:
 
 def _add_baselines(run: SweepRun, progress: bool) -> None:
     """Plan one case with the other planners too, and show them beside the run's plan."""
-    if progress and len(run.task.planners) > 1:
+    others = run.sweep.other_planners(run.source.settings)
+    if progress and others:
         page = run.folder.path / PAGE
         print(f"First figures: {page}. Now one case with the other planners.", file=sys.stderr)
-    rows = plan_baselines(run.task, run.source, run.folder.read_manifest()["example"])
-    if rows is not None:
+    if others:
+        example = run.folder.read_manifest()["example"]
+        rows = plan_baselines(run.sweep, run.source, others, example)
         run.folder.write_rows(run.folder.baselines, rows)
         draw_comparisons(run.folder)
 
@@ -141,16 +144,31 @@ def _session() -> dict[str, Any]:
     return {"started": now, **environment()}
 
 
-def _first_manifest(run: SweepRun, scenarios: Any) -> dict[str, Any]:
+def _first_manifest(run: SweepRun, cases: Any) -> dict[str, Any]:
     settings, session = run.source.settings, _session()
     return {
-        "kind": run.task.kind,
+        "kind": run.sweep.kind,
         "state": "running",
         **session,
         "seed": settings.seed,
         "parameters": settings.parameters(),
         **run.source.description(),
-        "setting": run.task.setting(scenarios),
-        "planner": {"name": settings.planner, **dataclasses.asdict(run.planner)},
+        "setting": run.sweep.setting(cases),
+        "planner": {"name": settings.planner, **_settings_of_planner(run.planner)},
         "sessions": [session],
     }
+
+
+def _settings_of_planner(planner: Any) -> dict[str, Any]:
+    """Sizes and switches of a planner, for the manifest; of arrays, their shapes."""
+    found = {}
+    for field in dataclasses.fields(planner) if dataclasses.is_dataclass(planner) else ():
+        value = getattr(planner, field.name)
+        if dataclasses.is_dataclass(value):
+            value = {"class": type(value).__name__, **_settings_of_planner(value)}
+        elif hasattr(value, "shape"):
+            value = {"shape": list(value.shape)}
+        elif isinstance(value, tuple):
+            value = [_settings_of_planner(x) or x for x in value]
+        found[field.name] = value
+    return found

@@ -1,58 +1,88 @@
-"""What a sweep is asked to do, checked before anything is read, compiled or written."""
+"""What a run is asked to do, checked before anything is read, compiled or written.
+
+Settings are frozen dataclasses; the command line is made from their fields. Nothing here imports
+JAX.
+"""
 
 import dataclasses
-import math
-from collections.abc import Iterable, Mapping
-from typing import Any, ClassVar, TypeVar
+from collections.abc import Iterable
+from typing import Any, ClassVar, Self, TypeVar
 
-from planner_jax.task.by_name import require_planner
+from planner_jax.registry import Task, UnknownName, require_name
 
 AnySettings = TypeVar("AnySettings", bound="SweepSettings")
 
 
 class SettingError(ValueError):
-    """An argument of a sweep breaks a rule; one line that begins with the argument's name."""
+    """An argument of a run breaks a rule; one line that begins with the argument's name."""
+
+
+def option(default: Any, metavar: str, words: str) -> Any:
+    """A field of settings with what the command line says of it; no `metavar` for a switch."""
+    return dataclasses.field(default=default, metadata={"metavar": metavar, "help": words})
 
 
 @dataclasses.dataclass(frozen=True)
 class SweepSettings:
     """The arguments that the sweeps of all tasks have; a task's own class adds its own.
 
-    Together with those they decide every number of the run's table.
+    Together they decide every number of the run's table.
 
     Raises:
         SettingError: a value breaks its rule.
     """
 
-    planner: str = "exact"
-    num: int | None = None  # cases; None: `DEFAULT_NUM`, or all that a source holds
-    limit_scale: float = 1.0  # on the limits of the motion
-    batch: int | None = None  # cases planned, refereed and written at once; None: by device
-    seed: int = 0
+    planner: str | None = option(None, "NAME", "")  # None: the task's first
+    suite: str | None = option(None, "NAME", "")  # None: the task's first
+    num: int | None = option(None, "N", "cases")  # None: `DEFAULT_NUM`, or all that a source holds
+    batch: int | None = option(
+        None, "B", "cases planned, judged and written at once; bounds the memory"
+    )
+    seed: int = option(0, "K", "of what is drawn")
 
-    TASK: ClassVar[str]  # its name on the command line
-    DEFAULT_NUM: ClassVar[int]
-    CPU_BATCH: ClassVar[int]
-    GPU_BATCH: ClassVar[int]
-    PLANNERS: ClassVar[Mapping[str, str]]  # of the task, by name
+    RUN: ClassVar[str] = "planner_jax.sweep.sweep:Sweep"  # what carries it out, "module:Class"
+    DEFAULT_NUM: ClassVar[int] = 1000
+    CPU_BATCH: ClassVar[int] = 1024
+    GPU_BATCH: ClassVar[int] = 65536
 
     def __post_init__(self) -> None:
-        try:
-            require_planner(self.PLANNERS, self.planner)
-        except ValueError as error:
-            raise SettingError(str(error)) from None
         for name, least in (("num", 1), ("batch", 1), ("seed", 0)):
             value = getattr(self, name)
             require(value is None or value >= least, name, f">= {least}", value)
-        scale = self.limit_scale
-        require(0.0 < scale < math.inf, "limit_scale", "finite and > 0", scale)
+
+    def of(self, task: Task) -> Self:
+        """The same with the names of the task's planner and suite filled in, or checked.
+
+        Raises:
+            SettingError: the task has no planner or suite of the name.
+        """
+        planners, suites = task.all_planners(), task.all_suites()
+        filled = dataclasses.replace(
+            self,
+            planner=next(iter(planners)) if self.planner is None else self.planner,
+            suite=next(iter(suites)) if self.suite is None else self.suite,
+        )
+        try:
+            require_name(planners, "planner", str(filled.planner))
+            require_name(suites, "suite", str(filled.suite))
+        except UnknownName as error:
+            raise SettingError(str(error)) from None
+        return filled
 
     def parameters(self) -> dict[str, Any]:
         """The settings as plain values for `manifest.json`; the class brings them back."""
         return dataclasses.asdict(self)
 
     def planner_options(self) -> dict[str, Any]:
-        """Fields of the planner's dataclass that these settings decide."""
+        """Options of the planner that these settings decide."""
+        return {}
+
+    def draw_options(self) -> dict[str, Any]:
+        """Options of the task's `draw` that these settings decide."""
+        return {}
+
+    def judge_options(self) -> dict[str, Any]:
+        """Options of the task's `judge` that these settings decide."""
         return {}
 
 

@@ -2,20 +2,23 @@
 
 import abc
 import dataclasses
+import hashlib
 from typing import Any
 
+import jax
 import numpy as np
 
-from planner_jax.sweep.settings import SweepSettings
+from planner_jax.registry import Task
+from planner_jax.sweep.settings import SettingError, SweepSettings
 
 
 @dataclasses.dataclass(frozen=True)
-class Cases:
+class Chunk:
     """B cases that are next to each other in a sweep."""
 
     index: np.ndarray  # (B,) int, places in the whole
-    scenarios: Any  # the task's pytree, leaves with leading axis B
-    origin: Any = None  # what the scenarios were made from, where a task has that
+    cases: Any  # the task's pytree, NumPy leaves with leading axis B
+    origin: Any = None  # what the cases were made from, where a task has that
 
     def __len__(self) -> int:
         return len(self.index)
@@ -34,19 +37,19 @@ class Source(abc.ABC):
         """How many chunks the sweep has; the last one may be smaller."""
         return -(-self.num // self.batch)
 
-    def chunk(self, number: int) -> Cases:
+    def chunk(self, number: int) -> Chunk:
         """The cases of one chunk, checked."""
         return self.cases(number * self.batch, min((number + 1) * self.batch, self.num))
 
     def check(self) -> Any:
-        """Look at cases before anything is written; the scenarios of one chunk.
+        """Look at cases before anything is written; those of one chunk.
 
-        Those of one chunk stand for all, where all are drawn from one law.
+        They stand for all, where all are drawn from one law.
         """
-        return self.chunk(0).scenarios
+        return self.chunk(0).cases
 
     @abc.abstractmethod
-    def cases(self, first: int, last: int) -> Cases:
+    def cases(self, first: int, last: int) -> Chunk:
         """The cases from place `first` up to `last`, that one left out, checked.
 
         Raises:
@@ -56,6 +59,39 @@ class Source(abc.ABC):
     @abc.abstractmethod
     def description(self) -> dict[str, Any]:
         """Entries of the manifest by which the same cases are known again."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DrawnSource(Source):
+    """The cases of a suite, drawn chunk by chunk."""
+
+    task: Task
+
+    def cases(self, first: int, last: int) -> Chunk:
+        """The cases from place `first` up to `last`, that one left out.
+
+        Raises:
+            SettingError: what draws them refuses a setting.
+        """
+        settings = self.settings
+        try:
+            drawn = self.task.draw(
+                last - first,
+                settings.suite,
+                settings.seed,
+                first=first,
+                **settings.draw_options(),
+            )
+        except ValueError as error:
+            raise SettingError(str(error)) from error
+        return Chunk(index=np.arange(first, last), cases=jax.tree.map(np.asarray, drawn))
+
+    def description(self) -> dict[str, Any]:
+        """Suite, and digest of the numbers of the first chunk."""
+        digest = hashlib.sha256()
+        for leaf in jax.tree.leaves(self.chunk(0).cases):
+            digest.update(np.ascontiguousarray(leaf).tobytes())
+        return {"suite": {"name": self.settings.suite, "sha256": digest.hexdigest()}}
 
 
 def filled_in(settings: SweepSettings, num: int, batch: int) -> dict[str, Any]:

@@ -11,19 +11,17 @@ import pyarrow as pa
 
 from planner_jax.sweep.columns import (
     COUNT,
-    ERRORS,
     INDEX,
     LIST,
     NUMBER,
     OUTCOME,
     SOLVER,
-    START,
-    TRAJECTORY,
     Column,
     RefereedBatch,
     leaves_of,
     list_of,
 )
+from planner_jax.sweep.quadrotor import MOTION, TRAJECTORY
 from planner_jax.task.catch.decide import optimal_time_ratio
 
 _WHICH, _FLAGS = list_of(pa.int32()), list_of(pa.bool_())
@@ -33,7 +31,7 @@ def _of_targets(*names: str) -> Any:
     """Leaf of the targets at a path; null for targets of a class without it."""
 
     def values(batch: RefereedBatch) -> Any:
-        leaf = batch.scenarios.targets
+        leaf = batch.cases.targets
         for name in names:
             leaf = getattr(leaf, name, None)
         return leaf
@@ -65,25 +63,29 @@ _CASE = [
         ]
     ),
     *leaves_of(
-        "scenarios",
+        "cases",
         [
             ("present", "", "which of the targets there are", _FLAGS, ""),
             ("horizon", "s", "until when each target may be caught", LIST, ""),
         ],
     ),
-    START,
 ]
 
 _CATCHES = [
     *leaves_of("plans", [("order", "", "targets in the order of catching", _WHICH, "")]),
-    *leaves_of("scenarios", [("decided_times", "s", "T_p, as decided", LIST, "times")]),
-    *leaves_of("plans", [("catch_times", "s", "T_o, as planned", LIST, "times")]),
+    *leaves_of(
+        "plans",
+        [
+            ("decided_times", "s", "T_p, as decided", LIST, ""),
+            ("catch_times", "s", "T_o, as planned", LIST, "times"),
+        ],
+    ),
     Column(
         "time_ratio",
         "1",
         "mean of |T_o - T_p| / T_o",
         NUMBER,
-        lambda b: optimal_time_ratio(b.scenarios, b.plans),
+        lambda b: optimal_time_ratio(b.cases, b.plans),
     ),
 ]
 
@@ -99,4 +101,4 @@ _JUDGED = leaves_of(
 )
 
 FRAME = "world, z up; times from the start of planning"
-COLUMNS = [*_CASE, *_CATCHES, *SOLVER, *OUTCOME, *_JUDGED, *ERRORS, *TRAJECTORY]
+COLUMNS = [*_CASE, *_CATCHES, *SOLVER, *OUTCOME, *_JUDGED, *MOTION, *TRAJECTORY]

@@ -2,50 +2,59 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping
 from typing import Any, ClassVar
 
-from planner_jax.sweep.catch.published import PUBLISHED
-from planner_jax.sweep.settings import SweepSettings, require, require_one_of
-from planner_jax.task.catch.planners import PLANNERS
+from planner_jax.sweep.settings import SweepSettings, option, require, require_one_of
+from planner_jax.task.catch.card import DECISIONS
 
-# As in `planner_jax.task.catch`, `planner_jax.referee.catch`; importing those would load JAX.
-SUITES = tuple(PUBLISHED)
-DECISIONS = ("best", "greedy", "given")
-NET_TESTS = ("plane", "ball")
+NET_TESTS = ("plane", "ball")  # of `referee_catches`
 
 
 @dataclasses.dataclass(frozen=True)
-class CatchSweep(SweepSettings):
+class CatchSettings(SweepSettings):
     """The arguments of a catch sweep.
-
-    `limit_scale` is on the speed and body-rate limits and on how far the thrust may be from
-    that of hover.
 
     Raises:
         SettingError: a value breaks its rule.
     """
 
-    suite: str = "throws"
-    decide: str = "best"  # how order and first times of the catches are decided
-    tolerance: float = 1e-3  # relative, of the referee
-    net_test: str = "plane"  # "ball": within the net's radius in any direction
+    limit_scale: float = option(
+        1.0,
+        "F",
+        "factor on the speed and body-rate limits and on the thrust's distance from hover",
+    )
+    decide: str = option("best", "NAME", f"order and first times: {', '.join(DECISIONS)}")
+    tolerance: float = option(
+        1e-3,
+        "R",
+        "relative, of the referee; the published protocol has 0.05 with --net-test ball",
+    )
+    net_test: str = option(
+        "plane",
+        "NAME",
+        f"where the net's radius counts, {' or '.join(NET_TESTS)}: across the net in its plane, "
+        "or all around its centre",
+    )
 
-    TASK: ClassVar[str] = "catch"
-    DEFAULT_NUM: ClassVar[int] = 1000
-    # All orders of six targets are looked at at once: 1 MB a case.
-    CPU_BATCH: ClassVar[int] = 1024
-    GPU_BATCH: ClassVar[int] = 8192
-    PLANNERS: ClassVar[Mapping[str, str]] = PLANNERS
+    RUN: ClassVar[str] = "planner_jax.sweep.catch.sweep:CatchSweep"
+    GPU_BATCH: ClassVar[int] = 8192  # all orders of six targets at once: 1 MB a case
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_one_of(SUITES, "suite", self.suite)
+        scale, tolerance = self.limit_scale, self.tolerance
+        require(0.0 < scale < math.inf, "limit_scale", "finite and > 0", scale)
         require_one_of(DECISIONS, "decide", self.decide)
         require_one_of(NET_TESTS, "net_test", self.net_test)
-        tolerance = self.tolerance
         require(0.0 <= tolerance < math.inf, "tolerance", "finite and >= 0", tolerance)
 
-    def judgement(self) -> dict[str, Any]:
+    def planner_options(self) -> dict[str, Any]:
+        """What decides about order and times."""
+        return {"decide": self.decide}
+
+    def draw_options(self) -> dict[str, Any]:
+        """The limits."""
+        return {"limit_scale": self.limit_scale}
+
+    def judge_options(self) -> dict[str, Any]:
         """Arguments of the referee."""
         return {"tolerance": self.tolerance, "net_test": self.net_test}

@@ -6,19 +6,17 @@ import pyarrow as pa
 from planner_jax.sweep.columns import (
     BOOL,
     COUNT,
-    ERRORS,
     INDEX,
     NUMBER,
     OUTCOME,
     SOLVER,
-    START,
     TEXT,
-    TRAJECTORY,
     VECTOR,
     Column,
     leaves_of,
     list_of,
 )
+from planner_jax.sweep.quadrotor import MOTION, TRAJECTORY
 from planner_jax.task.hit import court
 from planner_jax.task.hit.serves import Serves
 
@@ -31,21 +29,20 @@ _CASE = [
         "",
         "serve, landing and target region",
         TEXT,
-        lambda b: np.array(court.SCENARIOS)[b.cases.origin.scenario],
+        lambda b: np.array(court.SCENARIOS)[b.chunk.origin.scenario],
     ),
     *leaves_of(
-        "cases",
+        "chunk",
         [
             ("file", "", "trial file of the serve", TEXT, "origin.file"),
             ("line", "", "line of that file, from 1", COUNT, "origin.line"),
             ("serve_pos", "m", "ball when served", _POINT, "origin.position"),
             ("serve_vel", "m/s", "ball when served", _POINT, "origin.velocity"),
             ("target", "m", "wanted landing point", _POINT, "origin.target"),
-            ("ball_pos", "m", "ball when planning begins", VECTOR, "scenarios.ball.pos"),
-            ("ball_vel", "m/s", "ball when planning begins", VECTOR, "scenarios.ball.vel"),
+            ("ball_pos", "m", "ball when planning begins", VECTOR, "cases.ball.pos"),
+            ("ball_vel", "m/s", "ball when planning begins", VECTOR, "cases.ball.vel"),
         ],
     ),
-    START,
 ]
 
 # Times count from the moment at which planning begins.
@@ -92,10 +89,10 @@ _PUBLISHED = [
         "",
         "published outcome, null where there is none",
         BOOL,
-        lambda b, place=place: _published(b.cases.origin, place),
+        lambda b, place=place: _published(b.chunk.origin, place),
     )
     for place, planner in enumerate(court.PLANNERS)
 ]
 
 FRAME = "world, z up, net at x = 0; times from the start of planning"
-COLUMNS = [*_CASE, *_STROKE, *SOLVER, *OUTCOME, *_JUDGED, *ERRORS, *TRAJECTORY, *_PUBLISHED]
+COLUMNS = [*_CASE, *_STROKE, *SOLVER, *OUTCOME, *_JUDGED, *MOTION, *TRAJECTORY, *_PUBLISHED]

@@ -3,40 +3,43 @@
 import dataclasses
 import math
 import os
-from collections.abc import Mapping
 from typing import Any, ClassVar
 
-from planner_jax.sweep.settings import SettingError, SweepSettings, require
-from planner_jax.task.hit.planners import PLANNERS
+from planner_jax.sweep.settings import SettingError, SweepSettings, option, require
+from planner_jax.task.hit.card import START
 
 
 @dataclasses.dataclass(frozen=True)
-class HitSweep(SweepSettings):
+class HitSettings(SweepSettings):
     """The arguments of a hit sweep.
 
-    `num` is by default the whole folder, or `DEFAULT_NUM` drawn serves; `limit_scale` is on the
-    speed, acceleration and body-rate limits; `seed` is of drawn serves and of uniform starts.
+    `num` is by default the whole folder, or `DEFAULT_NUM` drawn serves; `seed` is of drawn serves
+    and of uniform starts.
 
     Raises:
         SettingError: a value breaks its rule.
     """
 
-    serves: str | None = None  # folder of published trial files; None draws serves
-    start: tuple[float, ...] | str = (-3.0, 0.0, 1.5)  # (3,) [m] hover, or "uniform"
-    delay: float = 0.0  # [s] from the serve to the moment at which planning begins
-    drag_after_impact: bool = False  # plan and referee the returned ball with drag
+    limit_scale: float = option(1.0, "F", "factor on the speed, acceleration and body-rate limits")
+    serves: str | None = option(None, "DIR", "read published trial files (default: draw serves)")
+    start: tuple[float, ...] | str = option(
+        START, "X", "hover start X Y Z in m, or 'uniform' over the half court"
+    )
+    delay: float = option(0.0, "S", "seconds from the serve to the start of planning")
+    drag_after_impact: bool = option(
+        False, "", "plan and judge the returned ball with drag too (exact only)"
+    )
 
-    TASK: ClassVar[str] = "hit"
+    RUN: ClassVar[str] = "planner_jax.sweep.hit.sweep:HitSweep"
     DEFAULT_NUM: ClassVar[int] = 9000
-    # One block of the serve generator, or what fills a GPU.
-    CPU_BATCH: ClassVar[int] = 4608
-    GPU_BATCH: ClassVar[int] = 65536
-    PLANNERS: ClassVar[Mapping[str, str]] = PLANNERS
+    CPU_BATCH: ClassVar[int] = 4608  # one block of the serve generator
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        scale = self.limit_scale
+        require(0.0 < scale < math.inf, "limit_scale", "finite and > 0", scale)
         require(0.0 <= self.delay < math.inf, "delay", "finite and >= 0", self.delay)
-        truer = not self.drag_after_impact or self.planner == "exact"
+        truer = not self.drag_after_impact or self.planner in (None, "exact")
         require(truer, "drag_after_impact", "left out unless the planner is exact", self.planner)
         object.__setattr__(self, "start", _checked_start(self.start))
         if self.serves is not None:
@@ -46,11 +49,19 @@ class HitSweep(SweepSettings):
         """Fields of the planner's dataclass that these settings decide."""
         return {"drag_after_impact": True} if self.drag_after_impact else {}
 
+    def draw_options(self) -> dict[str, Any]:
+        """What is made of serves."""
+        return {"start": self.start, "delay": self.delay, "limit_scale": self.limit_scale}
+
+    def judge_options(self) -> dict[str, Any]:
+        """Whether the drag acts on the returned ball too."""
+        return {"drag_after_impact": self.drag_after_impact}
+
 
 def _checked_start(start: Any) -> tuple[float, ...] | str:
     rule = "three finite numbers with z > 0, or 'uniform'"
-    if start == "uniform":
-        return start
+    if start in ("uniform", ["uniform"]):
+        return "uniform"
     try:
         point = tuple(float(number) for number in start)
     except (TypeError, ValueError):

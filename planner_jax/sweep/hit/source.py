@@ -4,58 +4,51 @@ import dataclasses
 import hashlib
 from typing import Any
 
+import jax
 import numpy as np
 
-from planner_jax.sweep.hit.settings import HitSweep
+from planner_jax.sweep.hit.settings import HitSettings
 from planner_jax.sweep.settings import SettingError
-from planner_jax.sweep.source import Cases, Source, filled_in
-from planner_jax.task.hit.scenario import HitScenario
-from planner_jax.task.hit.serves import Serves, generate_serves, read_serves, to_scenarios
-from planner_jax.task.hit.validate import ScenarioError, ServeError, check_scenarios
+from planner_jax.sweep.source import Chunk, Source, filled_in
+from planner_jax.task.hit.card import REAL_SCENARIOS
+from planner_jax.task.hit.serves import Serves, generate_serves, read_serves, to_cases
+from planner_jax.task.hit.validate import CaseError, ServeError, check_cases
 
 
 @dataclasses.dataclass(frozen=True)
 class ServeSource(Source):
     """Where the serves of a sweep come from; they are the origin of its cases."""
 
-    settings: HitSweep
     folder: Serves | None  # the serves of the published files, if these were asked for
 
-    def cases(self, first: int, last: int) -> Cases:
+    def cases(self, first: int, last: int) -> Chunk:
         """The cases from place `first` up to `last`, that one left out, checked.
 
         Raises:
-            SettingError: a ball is down before planning begins, or a value of a scenario breaks
-                a rule.
+            SettingError: a ball is down before planning begins, or a value of a case breaks a
+                rule.
         """
+        settings: HitSettings = self.settings
         if self.folder is not None:
             serves = self.folder[first:last]
         else:
-            serves = generate_serves(last - first, self.settings.seed, start=first)
-        return Cases(index=serves.index, scenarios=self._scenarios(serves), origin=serves)
-
-    def check(self) -> HitScenario:
-        """Look at every serve of a folder; drawn ones obey their law."""
-        scenarios = super().check()
-        for chunk in range(1, 1 if self.folder is None else self.num_chunks):
-            self.chunk(chunk)
-        return scenarios
-
-    def _scenarios(self, serves: Serves) -> HitScenario:
+            scenarios = REAL_SCENARIOS.get(str(settings.suite))
+            serves = generate_serves(last - first, settings.seed, scenarios, first=first)
         try:
-            scenarios = to_scenarios(
-                serves,
-                start=self.settings.start,
-                seed=self.settings.seed,
-                delay=self.settings.delay,
-                limit_scale=self.settings.limit_scale,
-            )
-            check_scenarios(scenarios)
+            cases = to_cases(serves, seed=settings.seed, **settings.draw_options())
+            check_cases(cases)
         except ServeError as error:
             raise SettingError(str(error)) from error
-        except ScenarioError as error:
-            raise SettingError(f"serves must make sound scenarios: {error}") from error
-        return scenarios
+        except CaseError as error:
+            raise SettingError(f"serves must make sound cases: {error}") from error
+        return Chunk(serves.index, jax.tree.map(np.asarray, cases), serves)
+
+    def check(self) -> Any:
+        """Look at every serve of a folder; drawn ones obey their law."""
+        cases = super().check()
+        for chunk in range(1, 1 if self.folder is None else self.num_chunks):
+            self.chunk(chunk)
+        return cases
 
     def description(self) -> dict[str, Any]:
         """Source, number of distinct serves and digest of their numbers."""
@@ -72,7 +65,7 @@ class ServeSource(Source):
         return {"serves": known}
 
 
-def open_source(settings: HitSweep, batch: int) -> ServeSource:
+def open_source(settings: HitSettings, batch: int) -> ServeSource:
     """The source of a sweep's serves; a folder is read and checked whole.
 
     Args:

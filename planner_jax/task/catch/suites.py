@@ -59,9 +59,8 @@ import numpy as np
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath, HarmonicPath
 from planner_jax.task.catch.card import SUITES, TASK
-from planner_jax.task.catch.case import CatchCase, case
+from planner_jax.task.catch.case import GRAVITY, CatchCase, case
 
-GRAVITY = 9.81  # [m/s^2]
 LAUNCH = (4.0, 0.0, 0.8)  # [m], of every throw
 CATCH_HEIGHT = 0.45  # [m], least height of a thrown ball at its catch
 _BISECTIONS = 60

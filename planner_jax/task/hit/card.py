@@ -2,6 +2,10 @@
 
 from planner_jax.registry import Task
 
+# Where the quadrotor hovers: an assumption, the paper draws it at the near/far boundary of the
+# hitting half.
+START = (-3.0, 0.0, 1.5)  # [m]
+
 # Serve, landing and target region of the simulated court (`court.SCENARIOS`) for the six real
 # scenarios of paper 002, Section VI-C, which it names in words alone: an assumption.
 REAL_SCENARIOS = {
@@ -32,6 +36,6 @@ TASK = Task(
         "S.5": "Balls that come from one side and go to the same side.",
         "S.6": "Balls that come from one side and go to the other side.",
     },
-    sweep="planner_jax.sweep.hit.sweep:HitSweep",
-    flight="planner_jax.sims.tasks.hit:HitFlight",
+    sweep="planner_jax.sweep.hit.settings:HitSettings",
+    flight="planner_jax.sims.settings:HitFly",
 )

@@ -7,12 +7,11 @@ from jax import Array
 
 from planner_jax.ball.flight import BallState
 from planner_jax.robot.quadrotor import QuadrotorLimits
+from planner_jax.task.hit.card import START
 
 # Fit to the published landing points; the residual is 1 cm.
 DRAG = 0.0616  # K_D [1/m]
 GRAVITY = 9.8  # [m/s^2]
-# An assumption: the paper draws the hover start at the near/far boundary of the hitting half.
-START = (-3.0, 0.0, 1.5)  # [m]
 RACKET_HEIGHT = 0.06  # [m], racket centre above the propeller plane (paper 002, Fig. 2)
 
 

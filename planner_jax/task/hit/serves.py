@@ -12,7 +12,8 @@ import numpy as np
 from scipy.interpolate import RectBivariateSpline
 
 from planner_jax.task.hit import court
-from planner_jax.task.hit.case import DRAG, GRAVITY, START, HitCase, case
+from planner_jax.task.hit.card import START
+from planner_jax.task.hit.case import DRAG, GRAVITY, HitCase, case
 from planner_jax.task.hit.trial_files import read_trials
 from planner_jax.task.hit.validate import ServeError, fly, landing
 

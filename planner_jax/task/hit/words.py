@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from planner_jax.protocol import AnyPlanner
 from planner_jax.referee.hit import HitVerdict, referee_hits
-from planner_jax.task.hit.card import REAL_SCENARIOS, TASK
+from planner_jax.task.hit.card import REAL_SCENARIOS, START, TASK
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.plan import HitPlan
 from planner_jax.task.hit.serves import generate_serves, to_cases
@@ -20,7 +20,7 @@ def draw(
     seed: int = 0,
     *,
     first: int = 0,
-    start: Sequence[float] | str = (-3.0, 0.0, 1.5),
+    start: Sequence[float] | str = START,
     delay: float = 0.0,
     limit_scale: float = 1.0,
     dtype: Any = jnp.float32,

@@ -1,0 +1,175 @@
+"""What catches add to a sweep: targets caught, their times, the decision, and the paper's rates."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from planner_jax.sweep.catch.columns import COLUMNS, FRAME
+from planner_jax.sweep.catch.figures.flight import flight_figure
+from planner_jax.sweep.catch.figures.motion import motion_figure
+from planner_jax.sweep.catch.figures.outcomes import outcomes_figure
+from planner_jax.sweep.catch.settings import CatchSettings
+from planner_jax.sweep.summary import Tally
+from planner_jax.sweep.sweep import RunFigure, Sweep, first_values
+from planner_jax.sweep.table import RateTable, own_cells
+from planner_jax.task.catch.card import SUITES
+
+_SOLVED = ("CONVERGED", "FEASIBLE")
+_DECISIONS = {
+    "best": "the most promising of all orders planned, the earliest last catch kept",
+    "greedy": "next whatever can be caught earliest",
+    "given": "the targets as they come, at even shares of the horizon",
+}
+_NET_TESTS = {
+    "plane": "5 mm from the net's plane and there within its radius",
+    "ball": "within the net's radius of its centre in any direction",
+}
+
+
+class CatchTally(Tally):
+    """Counts targets caught, times of the catches and the optimal time ratio too.
+
+    Args:
+        decides: whether the planner begins at the decision's times; one that does not has no
+            optimal time ratio.
+    """
+
+    def __init__(self, decides: bool = True) -> None:
+        super().__init__()
+        self._decides = decides
+        self._shares = self._ratios = self._times = 0.0
+        self._num_ratios = self._num_caught = 0
+
+    def add(self, rows: pa.Table) -> None:
+        """Count some rows of `plans.parquet`."""
+        super().add(rows)
+        caught, present, times = (
+            np.stack(rows[name].to_pylist()) for name in ("caught", "present", "catch_times")
+        )
+        self._shares += float((caught.sum(axis=1) / present.sum(axis=1)).sum())
+        self._times += float(times[caught].sum())
+        self._num_caught += int(caught.sum())
+        ratio = rows["time_ratio"].to_numpy()
+        known = np.isin(rows["status"].to_numpy(), _SOLVED) & np.isfinite(ratio)
+        self._ratios += float(ratio[known].sum())
+        self._num_ratios += int(known.sum())
+
+    def summary(self) -> dict[str, Any]:
+        """Rates as fractions, 0 to 1, and times [s], for the manifest; None where unknown."""
+        num_ratios = self._num_ratios if self._decides else 0
+        return {
+            **super().summary(),
+            "caught": self._shares / self.num,
+            "mean_catch_time": _mean(self._times, self._num_caught),
+            "optimal_time_ratio": _mean(self._ratios, num_ratios),
+        }
+
+
+class CatchSweep(Sweep):
+    """Quadrotors that catch flying targets with a net."""
+
+    frame = FRAME
+    figures = (
+        RunFigure(
+            "flight.png",
+            "One plan from the side and from above, and its catches close up from the "
+            "side: targets, quadrotor, and the net at every catch.",
+            (13.0, 7.6),
+            flight_figure,
+        ),
+        RunFigure(
+            "motion.png",
+            "The same plan along its time against the limits, beside the other planners' plans "
+            "for the same case.",
+            (13.0, 6.8),
+            motion_figure,
+            compares=True,
+        ),
+        RunFigure(
+            "outcomes.png",
+            "Success with its 95 % Wilson interval beside the published rates, failures by "
+            "name, and the times of the catches that hold.",
+            (13.0, 4.4),
+            outcomes_figure,
+        ),
+    )
+
+    def columns(self, batch: Any) -> Any:
+        """The columns of `plans.parquet`."""
+        return COLUMNS
+
+    def setting(self, cases: Any) -> dict[str, Any]:
+        """Physics and limits that all cases have in common, for the manifest."""
+        limits = [field.name for field in dataclasses.fields(cases.limits)]
+        return {
+            **first_values(cases, ["gravity"]),
+            **first_values(cases.net, ["height", "radius", "max_angle"], "net_"),
+            **first_values(cases.limits, limits),
+        }
+
+    def tally(self, settings: CatchSettings) -> CatchTally:
+        """An empty count of rows."""
+        return CatchTally(decides=settings.planner != "mpp")
+
+    def table(self, manifest: dict[str, Any]) -> RateTable:
+        """Success and optimal time ratio, beside Tables I and III of paper 000, every suite."""
+        summary, settings = manifest["summary"], manifest["parameters"]
+        planner, names = settings["planner"], list(SUITES)
+        header = ["suite", "cases", f"{planner} %", "95 % interval", f"{planner} OTR"]
+        header += ["Catch Planner, paper %", "Catch Planner, paper OTR", "MPP, paper %"]
+        if settings["suite"] not in SUITES:
+            names.append(settings["suite"])
+        rows = []
+        for name in names:
+            own, suite = ["", "", "", ""], SUITES.get(name)
+            if name == settings["suite"]:
+                ratio = _number(summary["optimal_time_ratio"], 3)
+                own = [*own_cells(summary["successes"], summary["num"]), ratio]
+            words = (("success", 1), ("time_ratio", 3), ("mpp_success", 1))
+            paper = [_number(getattr(suite, word, None), digits) for word, digits in words]
+            rows.append([name, *own, *paper])
+        strong = names.index(settings["suite"])
+        return RateTable("Success beside the paper", header, rows, strong)
+
+    def findings(self, manifest: dict[str, Any]) -> list[str]:
+        """What was caught, when, and how close the decision was."""
+        summary = manifest["summary"]
+        text = f"{100.0 * summary['caught']:.2f} % of the targets caught"
+        if summary["mean_catch_time"] is not None:
+            text += f", after {summary['mean_catch_time']:.3f} s on average"
+        if summary["optimal_time_ratio"] is not None:
+            text += f"; optimal time ratio {summary['optimal_time_ratio']:.3f}"
+        return [f"{text}."]
+
+    def remarks(self, manifest: dict[str, Any]) -> list[str]:
+        """Where the numbers come from, a sentence each."""
+        settings, limits = manifest["parameters"], manifest["setting"]
+        gravity = limits["gravity"]
+        return [
+            f"Cases: {settings['num']:,} of suite {settings['suite']}, seed {settings['seed']}. "
+            "Suites of a name are of the paper's kind; the paper gives no ranges of its own.",
+            f"Order and first times, decision {settings['decide']}: "
+            f"{_DECISIONS[settings['decide']]}.",
+            f"Limits: speed {limits['speed']:g} m/s, body rate {limits['body_rate']:g} rad/s, "
+            f"thrust {limits['min_thrust'] / gravity:.3g} to {limits['max_thrust'] / gravity:.3g} "
+            f"g, height {limits['min_height']:g} m; scale {settings['limit_scale']:g} on speed, "
+            "body rate and the thrust's distance from hover.",
+            "A success is the referee's: all targets caught and every limit within "
+            f"{settings['tolerance']:g} relative, the target {_NET_TESTS[settings['net_test']]}. A "
+            "target counts as caught where its catch holds, even if a limit fails on the way.",
+            "OTR is the optimal time ratio, the mean of |T_o - T_p| / T_o over the targets of "
+            "solved cases, T_p decided and T_o optimised (eq. 29 of the paper); mpp, which decides "
+            "on its own times, has none.",
+            "Paper: throws is its Table I (50 real throws, planned), the others its Table III "
+            "(1,000 simulated each). Their limits, weights and test are not published.",
+        ]
+
+
+def _mean(total: float, num: int) -> float | None:
+    return total / num if num else None
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "" if value is None else f"{value:.{digits}f}"

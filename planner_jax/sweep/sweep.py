@@ -1,0 +1,157 @@
+"""What a run has to know of its task; every task has a sweep, and changes of it what it wants."""
+
+import dataclasses
+import pkgutil
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from planner_jax.planning.plan import plan
+from planner_jax.registry import Task, UnknownName, task_named
+from planner_jax.sweep.columns import Column, RefereedBatch, leaf_columns
+from planner_jax.sweep.figures.outcomes import outcomes_figure
+from planner_jax.sweep.settings import SettingError, SweepSettings
+from planner_jax.sweep.source import DrawnSource, Source, filled_in
+from planner_jax.sweep.summary import Tally
+from planner_jax.sweep.table import RateTable, own_cells
+
+
+@dataclasses.dataclass(frozen=True)
+class RunFigure:
+    """One figure of a task's runs."""
+
+    name: str  # of the file
+    caption: str
+    size: tuple[float, float]  # width and height [inch]
+    draw: Callable[[Figure, Any], None]  # takes an empty figure and a `report.RunRows`
+    compares: bool = False  # shows plans of the other planners too
+
+
+class Sweep:
+    """The sweep of a task: sources, planning, judging, columns, table and figures.
+
+    What stands here serves any task; a task's own class, named by `SweepSettings.RUN`, replaces
+    what it has better.
+    """
+
+    frame: ClassVar[str] = ""  # axes and times of the columns, in words
+    figures: ClassVar[Sequence[RunFigure]] = (
+        RunFigure(
+            "outcomes.png",
+            "Success with its 95 % Wilson interval, failures by name, and iterations.",
+            (13.0, 4.4),
+            outcomes_figure,
+        ),
+    )
+    failure_words: ClassVar[Mapping[str, str]] = {  # heading -> column that is shown of a failure
+        "case": "index",
+        "solver's status": "status",
+        "referee": "sentence",
+    }
+
+    def __init__(self, task: Task):
+        self.task = task
+
+    @property
+    def kind(self) -> str:
+        """Of a run, as its manifest has it."""
+        return f"sweep {self.task.name}"
+
+    def columns(self, batch: RefereedBatch) -> Sequence[Column]:
+        """The columns of `plans.parquet`; by default every leaf of case, plan and verdict."""
+        return leaf_columns(batch)
+
+    def planner(self, settings: Any) -> Any:
+        """The planner of a run."""
+        return self.task.planner(settings.planner, **settings.planner_options())
+
+    def other_planners(self, settings: Any) -> dict[str, Any]:
+        """The task's other planners, by name, to be compared with that of a run."""
+        names = [name for name in self.task.all_planners() if name != settings.planner]
+        return {name: self.task.planner(name) for name in names}
+
+    def open_source(self, settings: Any, batch: int) -> Source:
+        """The source of a sweep's cases; `batch` where the settings name none.
+
+        Raises:
+            SettingError: the settings ask for what is not there.
+        """
+        return DrawnSource(**filled_in(settings, settings.DEFAULT_NUM, batch), task=self.task)
+
+    def plan(self, planner: Any, cases: Any) -> Any:
+        """The plans of a batch."""
+        return plan(planner, cases)
+
+    def judge(self, cases: Any, plans: Any, settings: Any) -> Any:
+        """The referee's verdict on plans."""
+        return self.task.judge(cases, plans, **settings.judge_options())
+
+    def setting(self, cases: Any) -> dict[str, Any]:
+        """Physics and limits that all cases have in common, for the manifest."""
+        return {}
+
+    def tally(self, settings: Any) -> Tally:
+        """An empty count of rows."""
+        return Tally()
+
+    def title(self, manifest: dict[str, Any]) -> str:
+        """Of table and page."""
+        settings = manifest["parameters"]
+        name = self.task.name.capitalize()
+        return f"{name} sweep, suite {settings['suite']}, planner {settings['planner']}"
+
+    def table(self, manifest: dict[str, Any]) -> RateTable:
+        """Success rates."""
+        summary, settings = manifest["summary"], manifest["parameters"]
+        header = ["suite", "cases", f"{settings['planner']} %", "95 % interval"]
+        cells = own_cells(summary["successes"], summary["num"])
+        return RateTable("Success", header, [[settings["suite"], *cells]])
+
+    def findings(self, manifest: dict[str, Any]) -> list[str]:
+        """What else a run says of itself at the top, a sentence each."""
+        return []
+
+    def remarks(self, manifest: dict[str, Any]) -> list[str]:
+        """Where the numbers come from, a sentence each."""
+        settings = manifest["parameters"]
+        return [
+            f"Cases: {settings['num']:,} of suite {settings['suite']}, seed {settings['seed']}.",
+            "A success is the referee's.",
+        ]
+
+
+def settings_of(task: Task) -> type[SweepSettings]:
+    """The class of a task's sweep settings."""
+    return pkgutil.resolve_name(task.sweep)
+
+
+def sweep_of(task: Task) -> Sweep:
+    """The sweep of a task."""
+    return pkgutil.resolve_name(settings_of(task).RUN)(task)
+
+
+def sweep_of_run(manifest: dict[str, Any], name: str = "out") -> Sweep:
+    """The sweep that a run is of.
+
+    Args:
+        manifest: of the run.
+        name: of the caller's argument that holds the run's path, for the message.
+
+    Raises:
+        SettingError: the run is of another kind, or of a task that is not installed.
+    """
+    first, _, task = str(manifest["kind"]).partition(" ")
+    if first != "sweep":
+        raise SettingError(f"{name} must be the folder of a sweep, got a {manifest['kind']}")
+    try:
+        return sweep_of(task_named(task))
+    except UnknownName as error:
+        raise SettingError(f"{name} must be the folder of a known task: {error}") from None
+
+
+def first_values(tree: Any, names: Sequence[str], prefix: str = "") -> dict[str, Any]:
+    """Leaves of the first case as plain numbers, to six digits so that float32 does not show."""
+    leaves = {prefix + name: np.asarray(getattr(tree, name), float)[0] for name in names}
+    return {name: leaf.round(6).tolist() for name, leaf in leaves.items()}
