@@ -25,7 +25,8 @@ test-slow: $(VENV)/.installed-test  ## the tests marked slow
 	$(PYTEST) -m "slow and not gpu"
 
 test-wheel: $(VENV)/.installed-test  ## a wheel in an environment of its own: 1.3 GB, then removed
-	PLANNER_JAX_WHEEL=whole $(VENV)/bin/python -m pytest -m slow tests/test_wheel.py
+	PLANNER_JAX_WHEEL=whole $(VENV)/bin/python -m pytest -m slow -o tmp_path_retention_policy=failed \
+	    tests/test_wheel.py
 
 test-range:  ## default and slow tests under another interpreter: PYTHON=python3.12
 	$(MAKE) test test-slow VENV=.venv-$(PYTHON_VERSION)
@@ -42,8 +43,9 @@ format: $(VENV)/.installed-dev  ## rewrite the code as `make lint` wants it
 	$(VENV)/bin/ruff check --fix
 	$(VENV)/bin/ruff format
 
+# Not --quiet, which lets --strict pass warnings.
 docs: $(VENV)/.installed-docs  ## the documentation site, into build/site
-	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --strict
 	@echo "Look at build/site/index.html"
 
 bench: $(VENV)/.installed-test $(VENV)/.installed-oracle  ## every module of benchmarks/
