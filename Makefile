@@ -10,7 +10,7 @@ PYTEST = $(VENV)/bin/python -m pytest -n auto --maxprocesses 4 --dist loadfile
 COMPILE = $(VENV)/bin/uv pip compile pyproject.toml --universal --python-version 3.11 \
 	--all-extras --no-annotate --quiet --custom-compile-command "make constraints"
 
-.PHONY: help demo test test-slow test-range test-lowest lint format bench constraints clean
+.PHONY: help demo test test-slow test-wheel test-range test-lowest lint format docs bench constraints clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "%-12s %s\n", $$1, $$2}' Makefile
@@ -23,6 +23,10 @@ test: $(VENV)/.installed-test  ## the default tests
 
 test-slow: $(VENV)/.installed-test  ## the tests marked slow
 	$(PYTEST) -m "slow and not gpu"
+
+test-wheel: $(VENV)/.installed-test  ## a wheel in an environment of its own: 1.3 GB, then removed
+	PLANNER_JAX_WHEEL=whole $(VENV)/bin/python -m pytest -m slow -o tmp_path_retention_policy=failed \
+	    tests/test_wheel.py
 
 test-range:  ## default and slow tests under another interpreter: PYTHON=python3.12
 	$(MAKE) test test-slow VENV=.venv-$(PYTHON_VERSION)
@@ -39,7 +43,12 @@ format: $(VENV)/.installed-dev  ## rewrite the code as `make lint` wants it
 	$(VENV)/bin/ruff check --fix
 	$(VENV)/bin/ruff format
 
-bench: $(VENV)/.installed-oracle  ## every module of benchmarks/
+# Not --quiet, which lets --strict pass warnings.
+docs: $(VENV)/.installed-docs  ## the documentation site, into build/site
+	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --strict
+	@echo "Look at build/site/index.html"
+
+bench: $(VENV)/.installed-test $(VENV)/.installed-oracle  ## every module of benchmarks/
 	@set -e; for file in benchmarks/[a-z]*.py; do \
 	    name=benchmarks.$$(basename $$file .py); \
 	    echo "$(VENV)/bin/python -m $$name"; $(VENV)/bin/python -m $$name; \
