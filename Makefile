@@ -6,11 +6,14 @@ NUM ?= 9000
 RUN_NAME = $(shell date +%Y%m%d-%H%M%S)
 PYTHON_VERSION = $(shell $(PYTHON) -c 'import sys; print("%d.%d" % sys.version_info[:2])')
 PIP = $(VENV)/bin/python -m pip --disable-pip-version-check
-PYTEST = $(VENV)/bin/python -m pytest -n auto --maxprocesses 4 --dist loadfile
+# Workers get whole modules in the order of tests/conftest.py, the longest first.
+PYTEST = $(VENV)/bin/python -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
+# What shows soonest that an interpreter, or the versions pinned for it, differ from the usual.
+SHORT = public_names cli solve decide referee_hit serves
 COMPILE = $(VENV)/bin/uv pip compile pyproject.toml --universal --python-version 3.11 \
 	--all-extras --no-annotate --quiet --custom-compile-command "make constraints"
 
-.PHONY: help demo test test-slow test-range test-lowest lint format bench constraints clean
+.PHONY: help demo test test-slow test-short test-range test-lowest lint format bench constraints clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "%-12s %s\n", $$1, $$2}' Makefile
@@ -19,10 +22,13 @@ demo: $(VENV)/.installed-test  ## plan NUM=9000 serves, referee them, write runs
 	$(VENV)/bin/planner-jax sweep hit --num $(NUM) --out runs/demo-$(RUN_NAME)
 
 test: $(VENV)/.installed-test  ## the default tests
-	$(PYTEST)
+	$(PYTEST) $(TESTS)
 
 test-slow: $(VENV)/.installed-test  ## the tests marked slow
 	$(PYTEST) -m "slow and not gpu"
+
+test-short:  ## a few quick modules under another interpreter: PYTHON=python3.12
+	$(MAKE) test VENV=.venv-$(PYTHON_VERSION) TESTS='$(SHORT:%=tests/test_%.py)'
 
 test-range:  ## default and slow tests under another interpreter: PYTHON=python3.12
 	$(MAKE) test test-slow VENV=.venv-$(PYTHON_VERSION)
