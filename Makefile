@@ -6,11 +6,15 @@ NUM ?= 9000
 RUN_NAME = $(shell date +%Y%m%d-%H%M%S)
 PYTHON_VERSION = $(shell $(PYTHON) -c 'import sys; print("%d.%d" % sys.version_info[:2])')
 PIP = $(VENV)/bin/python -m pip --disable-pip-version-check
-PYTEST = $(VENV)/bin/python -m pytest -n auto --maxprocesses 4 --dist loadfile
+# Workers get whole modules in the order of tests/conftest.py, the longest first.
+PYTEST = $(VENV)/bin/python -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
+# What shows soonest that an interpreter, or the versions pinned for it, differ from the usual.
+SHORT = public_names cli solve decide referee_hit serves
 COMPILE = $(VENV)/bin/uv pip compile pyproject.toml --universal --python-version 3.11 \
 	--all-extras --no-annotate --quiet --custom-compile-command "make constraints"
 
-.PHONY: help demo test test-slow test-wheel test-range test-lowest lint format docs bench constraints clean
+.PHONY: help demo test test-slow test-short test-wheel test-range test-lowest lint format docs bench \
+	constraints clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "%-12s %s\n", $$1, $$2}' Makefile
@@ -19,7 +23,7 @@ demo: $(VENV)/.installed-test  ## plan NUM=9000 serves, referee them, write runs
 	$(VENV)/bin/planner-jax sweep hit --num $(NUM) --out runs/demo-$(RUN_NAME)
 
 test: $(VENV)/.installed-test  ## the default tests
-	$(PYTEST)
+	$(PYTEST) $(TESTS)
 
 test-slow: $(VENV)/.installed-test  ## the tests marked slow
 	$(PYTEST) -m "slow and not gpu"
@@ -27,6 +31,9 @@ test-slow: $(VENV)/.installed-test  ## the tests marked slow
 test-wheel: $(VENV)/.installed-test  ## a wheel in an environment of its own: 1.3 GB, then removed
 	PLANNER_JAX_WHEEL=whole $(VENV)/bin/python -m pytest -m slow -o tmp_path_retention_policy=failed \
 	    tests/test_wheel.py
+
+test-short:  ## a few quick modules under another interpreter: PYTHON=python3.12
+	$(MAKE) test VENV=.venv-$(PYTHON_VERSION) TESTS='$(SHORT:%=tests/test_%.py)'
 
 test-range:  ## default and slow tests under another interpreter: PYTHON=python3.12
 	$(MAKE) test test-slow VENV=.venv-$(PYTHON_VERSION)

@@ -41,6 +41,11 @@ class Status(enum.IntEnum):
         """A sentence for the user, with the remedy."""
         return _MESSAGES[self]
 
+    @classmethod
+    def _missing_(cls, value: Any) -> "Status | None":
+        """The status that a jax array of one number holds; arrays are no keys of the lookup."""
+        return next((status for status in cls if status == value), None)
+
 
 _MESSAGES = {
     Status.CONVERGED: "stationary, and every limit holds",

@@ -25,11 +25,22 @@ def float64():
         yield
 
 
-# Modules that take longest. Workers get whole modules in this order, so that none is left with a
-# long one in the end.
-LONGEST = ("test_sims_flights", "test_notebooks", "test_along", "test_catch_replan", "test_sweep")
+@pytest.fixture(scope="module")
+def finished(request, tmp_path_factory):
+    """The folder and manifest of a sweep of the module's SETTINGS that nothing disturbed."""
+    from planner_jax.sweep.run import start_sweep
+
+    out = tmp_path_factory.mktemp("runs") / "finished"
+    return out, start_sweep(request.module.SETTINGS, out, progress=False)
+
+
+# Modules that take longest, or whose compiled programs others find in the cache: the hit planner's
+# of test_exact, the catch planner's of test_decide. Workers get whole modules in this order: none
+# is left with a long one in the end, and none compiles what another one is compiling.
+FIRST = ("sims_flights", "exact", "notebooks", "decide", "baselines", "along", "estimation")
 
 
 def pytest_collection_modifyitems(items):
-    """The longest modules first."""
-    items.sort(key=lambda item: item.path.stem not in LONGEST)
+    """The modules of FIRST, then the others."""
+    places = {f"test_{name}": place for place, name in enumerate(FIRST)}
+    items.sort(key=lambda item: places.get(item.path.stem, len(FIRST)))

@@ -35,7 +35,8 @@ float64 = pytest.mark.usefixtures("float64")
 
 @pytest.fixture(scope="module")
 def scenarios():
-    return to_scenarios(generate_serves(NUM, 5))
+    """In NumPy arrays, so that batches of all sizes up to 16 are planned by one program."""
+    return jax.tree.map(np.asarray, to_scenarios(generate_serves(NUM, 5)))
 
 
 @pytest.fixture(scope="module")
@@ -292,6 +293,7 @@ def test_a_lane_that_breaks_a_limit_carries_a_status_that_says_so(scenarios, nam
     plans = request.getfixturevalue(name)
     verdict = referee_hits(scenarios, plans)
     refused = np.isin(verdict.failed_limit, ["speed", "acceleration", "body rate", "apex low"])
+    assert refused.any()
     assert set(np.asarray(plans.status)[refused]) <= {Status.INFEASIBLE, Status.MAX_STEPS}
     assert (plans.violation[refused] > 0.0).all()
 
@@ -303,19 +305,21 @@ def test_juggle_decides_nothing_and_so_never_asks_for_more_iterations(juggle_pla
 
 @pytest.mark.parametrize("make", [BatHit, JuggleHit])
 def test_no_equation_leaks_a_nan_and_its_neighbours_do_not_notice(make, scenarios):
-    broken = jax.tree.map(lambda a, b: jnp.concatenate([b[:9], a]), serves_gone_wrong(), scenarios)
+    broken = jax.tree.map(lambda a, b: np.concatenate([b[:9], a]), serves_gone_wrong(), scenarios)
     found = plan(make(), broken)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
     assert not is_solved(found.status[9]), "the target is above every path"
     verdict = referee_hits(broken, found)
-    assert verdict.success[is_solved(found.status)].all()
+    solved = is_solved(found.status)
+    assert solved.any() and verdict.success[solved].all()
     alone = plan(make(), scenarios)
     for old, new in zip(jax.tree.leaves(alone), jax.tree.leaves(found), strict=True):
         np.testing.assert_array_equal(old[:9], new[:9])
 
 
 def test_a_nan_serve_is_a_row_with_a_status(scenarios):
-    pos = scenarios.ball.pos.at[2, 0].set(jnp.nan)
+    pos = scenarios.ball.pos.copy()
+    pos[2, 0] = np.nan
     broken = dataclasses.replace(scenarios, ball=BallState(pos, scenarios.ball.vel))
     for make in (BAT, JUGGLE):
         found = plan(make, broken)

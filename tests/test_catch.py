@@ -185,8 +185,9 @@ def test_a_ball_that_is_due_too_early_is_reported_and_not_caught_late(scenarios)
 def test_all_products_of_the_objective_are_in_full_precision(scenarios):
     context = PLANNER.prepare(lane_of(scenarios, 0))
     start = jnp.zeros(2 * len(PLANNER.scale))
-    assert_full_precision(jax.grad(lambda x: PLANNER.objective(x, context).cost), start)
-    assert_full_precision(lambda x: PLANNER.decode(x, context), start)
+    slopes = jax.grad(lambda x: PLANNER.objective(x, context).cost)
+    assert assert_full_precision(slopes, start) > 0
+    assert assert_full_precision(lambda x: PLANNER.decode(x, context), start) > 0
 
 
 def test_sizes_that_make_no_sense_are_refused(scenarios):
@@ -198,8 +199,12 @@ def test_sizes_that_make_no_sense_are_refused(scenarios):
         PLANNER.guesses(PLANNER.prepare(lane_of(scenarios, 0)), 7)
 
 
-def test_shipped_scale_fits_a_segment():
-    assert len(shipped_scale("planner_jax.task.catch", "exact-6")) == 3 * (6 - 1) + 12
+def test_the_shipped_scale_is_a_positive_number_for_every_variable_of_a_segment(scenarios):
+    lane = lane_of(scenarios, 0)
+    points = jax.eval_shape(lambda one: PLANNER.guesses(PLANNER.prepare(one), 1), lane)
+    scale = shipped_scale("planner_jax.task.catch", "exact-6")
+    assert points.shape == (1, lane.num_targets * len(scale))
+    assert np.isfinite(scale).all() and min(scale) > 0.0
 
 
 # Stages, on a planner without any physics.

@@ -38,10 +38,16 @@ def throws():
     return scenarios, plans
 
 
+@jax.jit
+@jax.vmap
+def seen_at(targets, time):
+    """The states of the targets of one case at one time."""
+    return jax.vmap(lambda path: path.at(time))(targets)
+
+
 def ahead(scenarios, elapsed, noise=0.0):
     """The targets seen `elapsed` (B,) later, a little beside where they were expected."""
-    at = jax.vmap(lambda paths, time: jax.vmap(lambda path: path.at(time))(paths))
-    ball = at(scenarios.targets, np.asarray(elapsed, np.float32))
+    ball = seen_at(scenarios.targets, np.asarray(elapsed, np.float32))
     random = np.random.default_rng(1)
     moved = lambda x: np.asarray(x + noise * random.standard_normal(x.shape), np.float32)  # noqa: E731
     return dataclasses.replace(scenarios.targets, ball=BallState(moved(ball.pos), moved(ball.vel)))

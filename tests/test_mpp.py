@@ -25,7 +25,7 @@ MPP = MppCatch()
 def throws():
     """As many of the paper's throws as of the hard ones, two more targets being absent."""
     suites = [make_suite(name, NUM // 2, 4, num_targets=3) for name in ("throws", "hard")]
-    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *suites)
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *suites)
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,8 @@ def pairs():
     scenarios = make_suite("parabola2", NUM, 4, num_targets=3)
     order = np.tile([0, 1, 2], (NUM, 1))
     order[:2] = [1, 0, 2]
-    return dataclasses.replace(scenarios, order=jnp.asarray(order, jnp.int32))
+    scenarios = dataclasses.replace(scenarios, order=order.astype(np.int32))
+    return jax.tree.map(np.asarray, scenarios)
 
 
 @pytest.fixture(scope="module")

@@ -111,6 +111,13 @@ def test_a_lane_that_is_not_finite_says_so_and_spoils_no_neighbour():
     np.testing.assert_array_equal(clean.point[others], spoiled.point[others])
 
 
+@pytest.mark.parametrize("kind", [int, np.int32, np.asarray, jnp.asarray])
+def test_a_status_is_known_from_its_number_of_any_kind(kind):
+    assert Status(kind(5)) is Status.OUT_OF_REACH
+    with pytest.raises(ValueError, match="is not a valid Status"):
+        Status(kind(6))
+
+
 def test_unsolvable_lanes_keep_the_least_violation_found():
     @dataclasses.dataclass(frozen=True)
     class Hopeless(WellPlanner):

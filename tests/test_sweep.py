@@ -11,6 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 from matplotlib.figure import Figure
 from scipy.stats import binomtest
+from sweeps import columns, stop_after
 
 from planner_jax.referee.hit import referee_hits
 from planner_jax.robot import quadrotor
@@ -32,7 +33,7 @@ from planner_jax.task.hit.exact import ExactHit
 from planner_jax.task.hit.planners import planner
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
-NUM, BATCH = 84, 24
+NUM, BATCH = 84, 13  # chunks and single cases are planned by one program, for up to 16
 # Half of these fail: late, and with one short round.
 SETTINGS = HitSweep(num=NUM, batch=BATCH, delay=0.8, seed=3)
 FAILED = "failed,failed,failed"
@@ -52,37 +53,17 @@ def quick_planners():
         yield
 
 
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory):
-    """The folder and manifest of a sweep that nothing disturbed."""
-    out = tmp_path_factory.mktemp("runs") / "finished"
-    return out, start_sweep(SETTINGS, out, progress=False)
-
-
 @pytest.fixture
 def no_report(monkeypatch):
-    """Leave the drawing out."""
+    """Leave the report out."""
     monkeypatch.setattr(run, "write_report", lambda folder: None)
     monkeypatch.setattr(run, "plan_baselines", lambda task, source, index: None)
 
 
-def stop_after(monkeypatch, num_chunks):
-    """Ctrl-C in the chunk after so many."""
-    calls = iter(range(num_chunks))
-
-    def plan(*arguments):
-        if next(calls, None) is None:
-            raise KeyboardInterrupt
-        return real(*arguments)
-
-    real = task.plan
-    monkeypatch.setattr(task, "plan", plan)
-
-
-def columns(out):
-    """The rows of a run as NumPy arrays, lists stacked."""
-    table = pq.read_table(out / "plans.parquet")
-    return {name: np.array(table[name].to_pylist()) for name in table.column_names}
+@pytest.fixture
+def no_figures(monkeypatch):
+    """Draw nothing, and write the page all the same."""
+    monkeypatch.setattr(task.HitTask, "figures", ())
 
 
 def manifest_on_page(out):
@@ -201,7 +182,7 @@ def test_an_interrupted_sweep_is_resumed_to_the_same_rows(
 ):
     out = tmp_path / "run"
     with monkeypatch.context() as patch:
-        stop_after(patch, num_chunks)
+        stop_after(patch, task, "plan", num_chunks)
         with pytest.raises(SweepInterrupted):
             start_sweep(SETTINGS, out, progress=False)
     assert RunFolder(out).read_manifest()["state"] == "interrupted"
@@ -217,7 +198,7 @@ def test_a_sweep_killed_while_writing_is_resumed_to_the_same_rows(
 ):
     out = tmp_path / "run"
     with monkeypatch.context() as patch:
-        stop_after(patch, 2)
+        stop_after(patch, task, "plan", 2)
         with pytest.raises(SweepInterrupted):
             start_sweep(SETTINGS, out, progress=False)
     folder = RunFolder(out)
@@ -229,7 +210,9 @@ def test_a_sweep_killed_while_writing_is_resumed_to_the_same_rows(
     assert not list(out.rglob(".*"))
 
 
-def test_the_page_of_an_interrupted_sweep_says_so_until_it_is_resumed(tmp_path, monkeypatch):
+def test_the_page_of_an_interrupted_sweep_says_so_until_it_is_resumed(
+    tmp_path, monkeypatch, no_figures
+):
     def interrupted(*_):
         raise KeyboardInterrupt
 
@@ -245,7 +228,7 @@ def test_the_page_of_an_interrupted_sweep_says_so_until_it_is_resumed(tmp_path, 
     assert manifest["state"] == "complete" and manifest_on_page(out) == manifest
 
 
-def test_a_sweep_killed_before_its_last_manifest_is_resumed(tmp_path, monkeypatch):
+def test_a_sweep_killed_before_its_last_manifest_is_resumed(tmp_path, monkeypatch, no_figures):
     class Killed(BaseException):
         pass
 
@@ -328,7 +311,7 @@ def test_a_single_chunk_is_timed_warm_too(tmp_path, no_report):
 
 def test_resuming_needs_the_serves_that_the_run_began_with(tmp_path, monkeypatch):
     serves, out = trial_files(tmp_path / "serves"), tmp_path / "run"
-    stop_after(monkeypatch, 0)
+    stop_after(monkeypatch, task, "plan", 0)
     with pytest.raises(SweepInterrupted):
         start_sweep(HitSweep(serves=serves, num=2), out, progress=False)
     trial_files(tmp_path / "serves", num_rows=2)

@@ -8,7 +8,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from sweeps import columns, stop_after
 
+from planner_jax.optimise.lbfgs import LbfgsConfig
+from planner_jax.optimise.problem import Round
 from planner_jax.referee.catch import referee_catches
 from planner_jax.sweep.catch import task
 from planner_jax.sweep.catch.columns import COLUMNS, FRAME
@@ -33,8 +36,8 @@ FIGURES = ("flight.png", "motion.png", "outcomes.png")
 
 
 def one_round(name, **options):
-    """The planner with its first round alone, so that one program is compiled."""
-    return ExactCatch(rounds=ExactCatch().rounds[:1], **options)
+    """The planner with one round, so that one program is compiled: that of other modules."""
+    return ExactCatch(rounds=(Round(1, LbfgsConfig(max_steps=20)),), **options)
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -43,19 +46,6 @@ def quick_planners():
         patch.setattr(task, "catch_planner", one_round)
         patch.setattr(task, "PLANNERS", {"exact": "", "mpp": ""})
         yield
-
-
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory):
-    """The folder and manifest of a sweep that nothing disturbed."""
-    out = tmp_path_factory.mktemp("runs") / "finished"
-    return out, start_sweep(SETTINGS, out, progress=False)
-
-
-def columns(out):
-    """The rows of a run as NumPy arrays, lists stacked."""
-    table = pq.read_table(out / "plans.parquet")
-    return {name: np.array(table[name].to_pylist()) for name in table.column_names}
 
 
 def test_a_finished_run_holds_manifest_rows_table_figures_and_page(finished):
@@ -161,18 +151,11 @@ def test_a_plan_that_is_not_finite_is_reported_too(finished, tmp_path):
 
 
 def test_an_interrupted_sweep_is_resumed_to_the_same_rows(finished, tmp_path, monkeypatch):
-    out, calls, real = tmp_path / "run", [], task.plan_catches
-
-    def stopped(*arguments):
-        calls.append(arguments)
-        if len(calls) == 2:
-            raise KeyboardInterrupt
-        return real(*arguments)
-
+    out = tmp_path / "run"
     monkeypatch.setattr("planner_jax.sweep.run.write_report", lambda folder: None)
     monkeypatch.setattr("planner_jax.sweep.run.plan_baselines", lambda *_: None)
     with monkeypatch.context() as patch:
-        patch.setattr(task, "plan_catches", stopped)
+        stop_after(patch, task, "plan_catches", 1)
         with pytest.raises(SweepInterrupted):
             start_sweep(SETTINGS, out, progress=False)
     assert RunFolder(out).read_manifest()["state"] == "interrupted"
@@ -259,9 +242,12 @@ def test_limits_are_scaled_and_thrust_about_hover():
     assert {leaf.dtype for leaf in jax.tree.leaves(half.limits)} == {np.dtype("float32")}
 
 
-def test_the_published_protocol_can_be_asked_for():
+def test_the_published_protocol_reaches_the_referee_when_it_is_asked_for(monkeypatch):
+    asked = {}
+    monkeypatch.setattr(task, "referee_catches", lambda *_, **options: asked.update(options))
     settings = CatchSweep(planner="catch", tolerance=0.05, net_test="ball")
-    assert settings.judgement() == {"tolerance": 0.05, "net_test": "ball"}
+    task.CatchTask().judge(None, None, settings)
+    assert asked == {"tolerance": 0.05, "net_test": "ball"}
 
 
 @pytest.mark.parametrize(
