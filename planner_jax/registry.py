@@ -44,7 +44,7 @@ class Task:
     planners: Mapping[str, str]  # name -> what makes the planner of given options; default first
     suites: Mapping[str, str]  # name -> what it draws, a sentence; default first
     sweep: str = "planner_jax.sweep.task:Sweep"  # class of its sweeps
-    flight: str | None = None  # class of its flights in `sims`
+    flight: str | None = None  # class of its flights' settings, a `sims.settings.FlySettings`
 
     @property
     def case(self) -> Callable[..., Any]:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from planner_jax.optimise.status import Status
+from planner_jax.protocol import Status
 from planner_jax.sims.film import FilmError, draw_flight, film_flights, require_film
 from planner_jax.sims.recording import FILE, Recording, read_recording, to_rows
 from planner_jax.sims.settings import FlySettings, fly_settings
@@ -93,7 +93,7 @@ def start_flights(
     cases = flight.cases()
     folder.create(
         {
-            "kind": f"fly {settings.TASK}",
+            "kind": f"fly {settings.TASK.name}",
             "state": "running",
             "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
             **environment(),
@@ -258,7 +258,7 @@ def write_flight_report(folder: RunFolder) -> None:
         [[flight.suite, *cells, flight.PUBLISHED]],
     )
     lines = headline(manifest, flight)
-    title = f"Flights, {flight.settings.TASK}, {flight.suite}"
+    title = f"Flights, {flight.settings.TASK.name}, {flight.suite}"
     remarks = [
         "Everything is simulated in MuJoCo MJX: rotors with lag, body-rate, attitude and position "
         "control, motion capture with noise, dropout and latency, balls with quadratic drag.",

@@ -42,5 +42,5 @@ TASK = Task(
     },
     suites={name: suite.description for name, suite in SUITES.items()},
     sweep="planner_jax.sweep.catch.sweep:CatchSweep",
-    flight="planner_jax.sims.tasks.catch:CatchFlight",
+    flight="planner_jax.sims.settings:CatchFly",
 )

@@ -33,5 +33,5 @@ TASK = Task(
         "S.6": "Balls that come from one side and go to the other side.",
     },
     sweep="planner_jax.sweep.hit.sweep:HitSweep",
-    flight="planner_jax.sims.tasks.hit:HitFlight",
+    flight="planner_jax.sims.settings:HitFly",
 )
