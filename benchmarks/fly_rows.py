@@ -24,12 +24,11 @@ import numpy as np
 
 from planner_jax.sims.loop import Flown, Loop
 from planner_jax.sims.noise import NOISES
-from planner_jax.sims.settings import HIT_SUITES
 from planner_jax.sims.tasks.catch import CATCH_WORLD, CatchFlights, fly_catches, throws
 from planner_jax.sims.tasks.hit import HIT_WORLD, HitFlights, fly_hits, volleys
 from planner_jax.sweep.summary import percent, wilson_interval
-from planner_jax.task.catch.planners import catch_planner
-from planner_jax.task.hit.planners import planner as hit_planner
+from planner_jax.task import catch, hit
+from planner_jax.task.hit.card import REAL_SCENARIOS
 from planner_jax.trajectory.polynomial import evaluate
 
 DRAG_ERROR = 0.15
@@ -166,7 +165,7 @@ def exact_rows(args: Any) -> None:
         name = f"no noise, catch, re-planned {rate:g} Hz"
         if flights := catches(name, Loop(CATCH_WORLD, replan=rate), args, 0.0):
             report_contact(flights.flown)
-    regions = tuple(dict.fromkeys(sum(HIT_SUITES.values(), ())))
+    regions = tuple(dict.fromkeys(sum(REAL_SCENARIOS.values(), ())))
     for rate in (0.0, HIT_RATE):
         name = f"no noise, hit, re-planned {rate:g} Hz"
         if volley := hits(name, Loop(HIT_WORLD, replan=rate), regions, args, 0.0):
@@ -201,7 +200,7 @@ def catch_rows(args: Any) -> None:
 def hit_rows(args: Any) -> None:
     """The six scenarios, with noise, re-planned and not."""
     for rate in (HIT_RATE, 0.0):
-        for name, regions in HIT_SUITES.items():
+        for name, regions in REAL_SCENARIOS.items():
             loop = Loop(HIT_WORLD, LAB, replan=rate, record=name == "S.6")
             title = f"lab, {name}, re-planned {rate:g} Hz"
             flights = hits(title, loop, regions, args, DRAG_ERROR)
@@ -222,8 +221,8 @@ def ablation_rows(args: Any) -> None:
     loop = Loop(CATCH_WORLD, LAB)
     for name in ("catch", "mpp"):
         title = f"lab, one ball, planner {name}, no re-planning"
-        catches(title, loop, args, DRAG_ERROR, planner=catch_planner(name))
-    regions = HIT_SUITES["S.1"]
+        catches(title, loop, args, DRAG_ERROR, planner=catch.planner(name, decide="greedy"))
+    regions = REAL_SCENARIOS["S.1"]
     for name, options in (
         ("everything", {}),
         ("no Kalman filter", {"kalman": False}),
@@ -235,7 +234,7 @@ def ablation_rows(args: Any) -> None:
     loop = Loop(HIT_WORLD, LAB)
     for name in ("bat", "bat-lite", "juggle"):
         title = f"lab, S.1, planner {name}, no re-planning"
-        hits(title, loop, regions, args, DRAG_ERROR, planner=hit_planner(name))
+        hits(title, loop, regions, args, DRAG_ERROR, planner=hit.planner(name))
 
 
 ROWS = {"exact": exact_rows, "catch": catch_rows, "hit": hit_rows, "ablate": ablation_rows}

@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from planner_jax.planning.plan import plan
 from planner_jax.sims.launch import launched, ready
 from planner_jax.sims.loop import Loop, fly_leg
 from planner_jax.sims.model import World, at_rest, step
@@ -27,13 +28,12 @@ from planner_jax.sims.tasks.catch import (
     CATCH_WORLD,
     SEEN,
     CatchPilot,
-    scenarios,
+    believed,
     throws,
     with_catch,
 )
-from planner_jax.task.catch.decide import plan_catches
-from planner_jax.task.catch.exact import ExactCatch
-from planner_jax.task.catch.scenario import START
+from planner_jax.task import catch
+from planner_jax.task.catch.case import START
 
 RUNS = 3
 
@@ -76,22 +76,22 @@ def closed_loop(world: World, worlds: int, seconds: float) -> None:
     loop = Loop(world, NOISES["lab"])
     few = min(worlds, 256)  # different throws, repeated to fill the batch
     cases = throws(few)
-    drag, believed = jnp.asarray(cases.drag), jnp.asarray(cases.believed)
+    drag, guess = jnp.asarray(cases.drag), jnp.asarray(cases.believed)
     starts = jnp.tile(jnp.array(START), (few, 1))
     flight = ready(loop, starts, jax.random.split(jax.random.key(0), few))
     balls = jax.tree.map(jnp.asarray, cases.balls)
-    flight = launched(loop, flight, balls, drag, believed, ball=0, seen=SEEN)
-    scenario = scenarios(loop, flight, jnp.array([True]), jnp.asarray(cases.horizon))
-    _, plan = plan_catches(ExactCatch(), jax.tree.map(np.asarray, scenario))
-    begun = jax.tree.map(jnp.asarray, plan)
+    flight = launched(loop, flight, balls, drag, guess, ball=0, seen=SEEN)
+    known = believed(loop, flight, jnp.array([True]), jnp.asarray(cases.horizon))
+    plans = plan(catch.planner(), jax.tree.map(np.asarray, known))
+    begun = jax.tree.map(jnp.asarray, plans)
     flight = with_catch(flight, begun, jnp.ones((few, 1), bool)).replace(key=None)
     many = lambda leaf: jnp.resize(leaf, (worlds, *leaf.shape[1:]))  # noqa: E731
     keys = jax.random.split(jax.random.key(1), worlds)
     flight = dataclasses.replace(jax.tree.map(many, flight), key=keys)
-    scenario, drag = jax.tree.map(many, (scenario, drag))
+    known, drag = jax.tree.map(many, (known, drag))
     periods = loop.num_periods(seconds)
     steps = worlds * periods * loop.looks_per_plan * loop.steps_per_look
-    run = lambda: fly_leg(loop, CatchPilot(), flight, scenario, drag, num_periods=periods)  # noqa: E731
+    run = lambda: fly_leg(loop, CatchPilot(), flight, known, drag, num_periods=periods)  # noqa: E731
     timed(f"closed loop, {worlds} worlds", steps, lambda: run()[0].physics)
 
 

@@ -29,7 +29,7 @@ def save_arrays(path: str | os.PathLike, tree: Any) -> None:
     arrays = {name: np.asarray(leaf) for name, leaf in _leaves(tree)}
     scratch = f"{os.fspath(path)}.tmp"
     with open(scratch, "wb") as file:
-        np.savez(file, **{_HEADER: np.array(header)}, **arrays)
+        np.savez(file, **{_HEADER: np.array(header), **arrays})  # type: ignore[arg-type]
     os.replace(scratch, path)
 
 
@@ -75,7 +75,7 @@ def _leaves(tree: Any, prefix: str = "") -> list[tuple[str, Any]]:
     return named
 
 
-def _tree(kind: type, prefix: str, arrays: dict[str, np.ndarray]) -> Any:
+def _tree(kind: Any, prefix: str, arrays: dict[str, np.ndarray]) -> Any:
     """A dataclass of the arrays of its names, which are taken out."""
     types = typing.get_type_hints(kind)
     values = {}

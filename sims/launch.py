@@ -187,7 +187,7 @@ def require_world(loop: Loop, kind: str, num_balls: int, **planned: Any) -> None
         loop: with the world.
         kind: of the tool.
         num_balls: of a flight.
-        planned: (B,) each, what the plans' scenarios say of `gravity`, `net_height`,
+        planned: (B,) each, what the plans' cases say of `gravity`, `net_height`,
             `net_radius` or `racket_height`; only those that are given are compared.
     """
     world, tool = loop.world, loop.world.tool
@@ -203,7 +203,7 @@ def require_world(loop: Loop, kind: str, num_balls: int, **planned: Any) -> None
             value = np.asarray(values)[apart][0]
             raise ValueError(
                 f"{name} must be the same in plan and flown world, "
-                f"got {value:g} in the plan's scenario and {flown[name]:g} in the world"
+                f"got {value:g} in the plan's case and {flown[name]:g} in the world"
             )
 
 

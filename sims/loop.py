@@ -45,7 +45,7 @@ class Outlook:
 class Pilot(Protocol):
     """A task's part of the loop: a frozen dataclass, static under jit."""
 
-    def plan_anew(self, scenario: Any, plan: Any, outlook: Outlook) -> tuple[Any, Array]:
+    def plan_anew(self, case: Any, plan: Any, outlook: Outlook) -> tuple[Any, Array]:
         """A plan from the one that is flown; and () bool, whether to fly it."""
         ...
 
@@ -209,9 +209,7 @@ def expected(loop: Loop, estimates: Estimate, ahead: Any) -> BallState:
     return jax.vmap(lambda estimate: sight.predicted(estimate, span, gravity))(estimates)
 
 
-def _planned_anew(
-    loop: Loop, pilot: Pilot, flight: FlightState, scenario: Any
-) -> tuple[Any, Array]:
+def _planned_anew(loop: Loop, pilot: Pilot, flight: FlightState, case: Any) -> tuple[Any, Array]:
     """The plan for the end of this period, and whether to fly it."""
     when = flight.time + loop.period
     elapsed = when - flight.began
@@ -223,11 +221,11 @@ def _planned_anew(
         present=flight.present & (pilot.times(flight.plan) > elapsed),
         head_state=loop.world.robot.head_state(flight.plan, elapsed),
     )
-    return pilot.plan_anew(scenario, flight.plan, outlook)
+    return pilot.plan_anew(case, flight.plan, outlook)
 
 
 def _fly_period(
-    loop: Loop, pilot: Pilot, scenario: Any, drag: Array, flight: FlightState
+    loop: Loop, pilot: Pilot, case: Any, drag: Array, flight: FlightState
 ) -> tuple[FlightState, Record | None]:
     """One period: a plan for its end, and the looks until then."""
 
@@ -238,7 +236,7 @@ def _fly_period(
     began, plan = flight.began, flight.plan
     good = None
     if loop.replan > 0.0:
-        found, good = _planned_anew(loop, pilot, flight, scenario)
+        found, good = _planned_anew(loop, pilot, flight, case)
     flight = dataclasses.replace(flight, earlier=flight.estimates)
     flight, record = lax.scan(next_look, flight, None, length=loop.looks_per_plan)
     gone = pilot.times(plan) <= flight.time - began
@@ -286,7 +284,7 @@ def fly_leg(
     loop: Loop,
     pilot: Pilot,
     flight: FlightState,
-    scenario: Any,
+    cases: Any,
     drag: Array,
     *,
     num_periods: int,
@@ -297,7 +295,7 @@ def fly_leg(
         loop: what shapes the program.
         pilot: of the task.
         flight: at the start of the leg, leaves (B, ...).
-        scenario: of the task, leaves (B, ...); its times count like the flight's.
+        cases: of the task, leaves (B, ...); their times count like the flight's.
         drag: (B, N) K_D [1/m], the true one.
         num_periods: how many (static).
 
@@ -306,13 +304,13 @@ def fly_leg(
         (B, K, ...).
     """
 
-    def one(flight: FlightState, scenario: Any, drag: Array) -> tuple[FlightState, Record | None]:
-        period = functools.partial(_fly_period, loop, pilot, scenario, drag)
+    def one(flight: FlightState, case: Any, drag: Array) -> tuple[FlightState, Record | None]:
+        period = functools.partial(_fly_period, loop, pilot, case, drag)
         flight, record = lax.scan(lambda state, _: period(state), flight, None, length=num_periods)
         flat = lambda leaf: leaf.reshape(-1, *leaf.shape[2:])  # noqa: E731
         return flight, jax.tree.map(flat, record)
 
-    return jax.vmap(one)(flight, scenario, drag)
+    return jax.vmap(one)(flight, cases, drag)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -18,7 +18,7 @@ from planner_jax.sims.loop import Flown
 from planner_jax.sims.model import World
 from planner_jax.sims.robot import Robot
 from planner_jax.sweep.columns import BOOL, LIST, VECTOR, Column, RefereedBatch, rows_of
-from planner_jax.sweep.source import Cases
+from planner_jax.sweep.source import Chunk
 from planner_jax.task.hit.validate import fly, landing
 
 FILE = "flights.parquet"
@@ -217,7 +217,7 @@ _COLUMNS = [
 
 def to_rows(recording: Recording) -> pa.Table:
     """A row a flight."""
-    batch = RefereedBatch(Cases(recording.index, None), None, None, recording)
+    batch = RefereedBatch(Chunk(recording.index, None), None, recording)
     return rows_of(_COLUMNS, batch, "world, z up; times from the first plan")
 
 

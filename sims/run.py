@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from planner_jax.optimise.status import Status
+from planner_jax.protocol import Status
 from planner_jax.sims.film import FilmError, draw_flight, film_flights, require_film
 from planner_jax.sims.recording import FILE, Recording, read_recording, to_rows
 from planner_jax.sims.settings import FlySettings, fly_settings
@@ -21,7 +21,7 @@ from planner_jax.sweep.columns import RefereedBatch as FlownBatch
 from planner_jax.sweep.environment import environment, require_backend
 from planner_jax.sweep.run_folder import RunFolder
 from planner_jax.sweep.settings import SettingError, require
-from planner_jax.sweep.source import Cases
+from planner_jax.sweep.source import Chunk
 from planner_jax.sweep.summary import percent, wilson_interval
 from planner_jax.sweep.table import RateTable, own_cells, to_html, to_markdown
 from planner_jax.sweep.timing import CompileClock, Stopwatch
@@ -31,7 +31,7 @@ _FRAME = "world, z up; times from the first plan"
 
 
 def _contact(name: str) -> Any:
-    return lambda b: np.asarray(getattr(b.verdict.flown.contact, name)).reshape(len(b.cases), -1)
+    return lambda b: np.asarray(getattr(b.verdict.flown.contact, name)).reshape(len(b.chunk), -1)
 
 
 _COLUMNS = (
@@ -93,7 +93,7 @@ def start_flights(
     cases = flight.cases()
     folder.create(
         {
-            "kind": f"fly {settings.TASK}",
+            "kind": f"fly {settings.TASK.name}",
             "state": "running",
             "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
             **environment(),
@@ -166,7 +166,7 @@ def _fly_all(flight: FlightTask, cases: Any, shown: int) -> tuple[pa.Table, dict
         compiling += clock.seconds
         if not clock.compiled:
             warm, warm_flights = warm + seconds, warm_flights + size
-        batch = FlownBatch(Cases(lanes, None), None, flights.first_plan, flights)
+        batch = FlownBatch(Chunk(lanes, None), flights.first_plan, flights)
         rows = rows_of([*_COLUMNS, *flight.COLUMNS], batch, _FRAME)
         parts.append(rows.slice(0, min(size, num - first)))
     times = {
@@ -258,7 +258,7 @@ def write_flight_report(folder: RunFolder) -> None:
         [[flight.suite, *cells, flight.PUBLISHED]],
     )
     lines = headline(manifest, flight)
-    title = f"Flights, {flight.settings.TASK}, {flight.suite}"
+    title = f"Flights, {flight.settings.TASK.name}, {flight.suite}"
     remarks = [
         "Everything is simulated in MuJoCo MJX: rotors with lag, body-rate, attitude and position "
         "control, motion capture with noise, dropout and latency, balls with quadratic drag.",

@@ -5,41 +5,30 @@ Nothing here imports JAX or MuJoCo; `FlySettings.flight` does.
 
 import dataclasses
 import pkgutil
-from collections.abc import Mapping
 from typing import Any, ClassVar
 
+from planner_jax.registry import Task, all_tasks
 from planner_jax.sims.noise import NOISES, Sensing, require_whole
-from planner_jax.sweep.settings import SettingError, require, require_one_of
+from planner_jax.sweep.settings import SettingError, option, require, require_one_of
 from planner_jax.task.catch.card import TASK as CATCH
+from planner_jax.task.hit.card import REAL_SCENARIOS
 from planner_jax.task.hit.card import TASK as HIT
 
-FLIGHTS = {  # the tasks that can be flown -> their settings, as "module:Class"
-    "catch": "planner_jax.sims.settings:CatchFly",
-    "hit": "planner_jax.sims.settings:HitFly",
-}
-
 INTERVAL = 0.8  # [s], from throw to throw (paper 000, Fig. 1)
-
-# Serve, landing and target region of the simulated court (`court.SCENARIOS`) for the six real
-# scenarios of paper 002, Section VI-C, which it names in words alone: an assumption.
-HIT_SUITES: Mapping[str, tuple[str, ...]] = {
-    "S.1": ("FNN", "FFN"),  # from different distances
-    "S.2": ("FFF", "LFF"),  # serves from different directions
-    "S.3": ("FFN", "FLN"),  # hit from different directions
-    "S.4": ("FFL", "FNL"),  # hit straight, shoot sideways
-    "S.5": ("FLL", "LLL"),  # hit and shoot sideways to the same side
-    "S.6": ("FLR", "LLR"),  # hit and shoot sideways to different sides
-}
 
 
 def fly_settings(task: str) -> type["FlySettings"]:
     """The settings of a task's flights.
 
+    Args:
+        task: its name in the registry, which knows the settings as the task's `flight`.
+
     Raises:
-        SettingError: there is no task of that name.
+        SettingError: there is no task of that name, or it has no flights.
     """
-    require_one_of(FLIGHTS, "task", task)
-    return pkgutil.resolve_name(FLIGHTS[task])
+    flown = {name: found.flight for name, found in all_tasks().items() if found.flight}
+    require(task in flown, "task", f"one that can be flown ({', '.join(flown)})", repr(task))
+    return pkgutil.resolve_name(flown[task])
 
 
 def require_interval(sensing: Sensing, replan: float) -> None:
@@ -52,11 +41,6 @@ def require_interval(sensing: Sensing, replan: float) -> None:
     period = sensing.looks_per_plan(replan) / sensing.rate
     rule = f"such that its period divides {INTERVAL:g} s"
     require_whole(INTERVAL / period, "replan", rule, replan)
-
-
-def option(default: Any, metavar: str, words: str) -> Any:
-    """A field of settings with what the command line says of it."""
-    return dataclasses.field(default=default, metadata={"metavar": metavar, "help": words})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,10 +66,8 @@ class FlySettings:
         0.15, "F", "relative, of what is believed of the balls' drag, either way"
     )
 
-    TASK: ClassVar[str]  # its name on the command line
-    WORDS: ClassVar[str]  # what is flown, for the help
+    TASK: ClassVar[Task]  # with its name and planners
     FLIGHT: ClassVar[str]  # the `FlightTask` that flies it, as "module:Class"
-    PLANNERS: ClassVar[Mapping[str, str]]  # of the task, by name
     RATE: ClassVar[float]  # [Hz], of planning anew by default
 
     def __post_init__(self) -> None:
@@ -93,7 +75,7 @@ class FlySettings:
             value = getattr(self, name)
             require(value is None or value >= least, name, f">= {least}", value)
         require_one_of(NOISES, "noise", self.noise)
-        require_one_of(self.PLANNERS, "planner", self.planner)
+        require_one_of(self.TASK.all_planners(), "planner", self.planner)
         require(0.0 <= self.drag_error < 1.0, "drag_error", ">= 0 and < 1", self.drag_error)
         again = self.rate > 0.0
         require(not again or self.planner == "exact", "replan", "0 for other planners", self.rate)
@@ -124,10 +106,8 @@ class CatchFly(FlySettings):
 
     balls: int = option(1, "N", f"thrown {INTERVAL:g} s apart")
 
-    TASK: ClassVar[str] = "catch"
-    WORDS: ClassVar[str] = "a quadrotor catches thrown balls with a net"
+    TASK: ClassVar[Task] = CATCH
     FLIGHT: ClassVar[str] = "planner_jax.sims.tasks.catch:CatchFlight"
-    PLANNERS: ClassVar[Mapping[str, str]] = CATCH.planners
     RATE: ClassVar[float] = 100.0
 
     def __post_init__(self) -> None:
@@ -147,12 +127,10 @@ class HitFly(FlySettings):
 
     suite: str = option("S.1", "NAME", "of serves, S.1 to S.6 of the paper")
 
-    TASK: ClassVar[str] = "hit"
-    WORDS: ClassVar[str] = "a quadrotor hits served balls to a target with a racket"
+    TASK: ClassVar[Task] = HIT
     FLIGHT: ClassVar[str] = "planner_jax.sims.tasks.hit:HitFlight"
-    PLANNERS: ClassVar[Mapping[str, str]] = HIT.planners
     RATE: ClassVar[float] = 50.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_one_of(HIT_SUITES, "suite", self.suite)
+        require_one_of(REAL_SCENARIOS, "suite", self.suite)

@@ -119,4 +119,4 @@ class FlightTask(abc.ABC):
     def title(self, recording: Recording, flight: int) -> str:
         """Task, place in the run and outcome of a flight."""
         outcome = "success" if recording.success[flight] else "failure"
-        return f"{self.settings.TASK} {recording.index[flight]}, {outcome}"
+        return f"{self.settings.TASK.name} {recording.index[flight]}, {outcome}"

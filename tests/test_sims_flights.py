@@ -6,14 +6,13 @@ import jax
 import numpy as np
 import pytest
 
-from planner_jax.optimise.status import is_unsolved
+from planner_jax.protocol import is_unsolved
 from planner_jax.sims.loop import Loop
 from planner_jax.sims.noise import NOISES
-from planner_jax.sims.settings import HIT_SUITES
 from planner_jax.sims.tasks.catch import CATCH_WORLD, fly_catches, planned_ahead, throws
 from planner_jax.sims.tasks.hit import HIT_WORLD, fly_hits, volleys
-from planner_jax.task.catch.exact import ExactCatch
-from planner_jax.task.catch.suites import make_suite
+from planner_jax.task import catch
+from planner_jax.task.hit.card import REAL_SCENARIOS
 from planner_jax.trajectory.polynomial import evaluate
 
 
@@ -37,7 +36,7 @@ def catches():
 
 @pytest.fixture(scope="module")
 def hits():
-    return fly_hits(Loop(HIT_WORLD), volleys(3, HIT_SUITES["S.1"], seed=1))
+    return fly_hits(Loop(HIT_WORLD), volleys(3, REAL_SCENARIOS["S.1"], seed=1))
 
 
 def test_without_noise_every_ball_is_caught_where_and_when_it_was_planned(catches):
@@ -57,7 +56,9 @@ def test_a_plan_of_the_other_task_is_refused(catches, hits):
     with pytest.raises(ValueError, match="^plan must be a CatchPlan, got a HitPlan$"):
         fly_catches(Loop(CATCH_WORLD), throws(3, seed=1), plan=hits.first_plan)
     with pytest.raises(ValueError, match="^plan must be a HitPlan, got a CatchPlan$"):
-        fly_hits(Loop(HIT_WORLD), volleys(3, HIT_SUITES["S.1"], seed=1), plan=catches.first_plan)
+        fly_hits(
+            Loop(HIT_WORLD), volleys(3, REAL_SCENARIOS["S.1"], seed=1), plan=catches.first_plan
+        )
 
 
 def test_a_plan_that_is_given_is_the_one_that_is_flown(catches):
@@ -90,7 +91,7 @@ def test_a_world_other_than_the_planned_one_is_refused(fly, world, message):
         fly(Loop(world), throws(2) if fly is fly_catches else volleys(2))
     assert str(error.value) == (
         f"{name} must be the same in plan and flown world, "
-        f"got {planned} in the plan's scenario and {flown} in the world"
+        f"got {planned} in the plan's case and {flown} in the world"
     )
 
 
@@ -110,11 +111,11 @@ def test_cases_out_of_range_are_refused(build, message):
 
 @pytest.mark.slow
 def test_a_ball_is_planned_for_alone_where_no_plan_of_the_next_one_is_possible():
-    suite = jax.tree.map(np.asarray, make_suite("throws", 2, seed=4, num_targets=2))
+    suite = jax.tree.map(np.asarray, catch.draw(2, "throws", seed=4, num_targets=2))
     both = dataclasses.replace(suite, present=np.ones((2, 2), bool))
     # The second lane's next ball is to be caught at once.
     both = dataclasses.replace(both, horizon=both.horizon * np.array([[1.0, 2.0], [1.0, 0.02]]))
-    known, plans = planned_ahead(ExactCatch(), both, 0)
+    known, plans = planned_ahead(catch.planner(decide="greedy"), both, 0)
     assert not known.present[1, 1] and known.present[1, 0]
     assert not is_unsolved(plans.status).any()
 
@@ -146,7 +147,7 @@ def test_a_second_ball_is_caught_after_the_first():
 
 @pytest.mark.slow
 def test_a_hit_that_is_planned_anew_lands_on_the_target():
-    exact = fly_hits(Loop(HIT_WORLD, replan=50.0), volleys(4, HIT_SUITES["S.4"]))
+    exact = fly_hits(Loop(HIT_WORLD, replan=50.0), volleys(4, REAL_SCENARIOS["S.4"]))
     assert exact.miss.max() < 0.05
-    noisy = fly_hits(Loop(HIT_WORLD, NOISES["lab"], replan=50.0), volleys(4, HIT_SUITES["S.4"]))
+    noisy = fly_hits(Loop(HIT_WORLD, NOISES["lab"], replan=50.0), volleys(4, REAL_SCENARIOS["S.4"]))
     assert noisy.miss.max() < 0.5

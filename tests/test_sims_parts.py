@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from planner_jax.ball.flight import BallState, drag_free_flight, fly
+from planner_jax.robot.quadrotor import flat_attitude
 from planner_jax.sims.launch import awaited, ready, require_plan, require_world
 from planner_jax.sims.loop import Loop, expected
 from planner_jax.sims.model import (
@@ -22,7 +23,7 @@ from planner_jax.sims.model import (
 )
 from planner_jax.sims.noise import NOISES, Sensing
 from planner_jax.sims.robots.quadrotor.control import rotation_error
-from planner_jax.sims.robots.quadrotor.reference import flat_attitude, with_rest
+from planner_jax.sims.robots.quadrotor.reference import with_rest
 from planner_jax.sims.robots.quadrotor.vehicle import Vehicle, allocation, rotor_thrusts
 from planner_jax.sims.scenery import machine_parts, outlines
 from planner_jax.sims.scoring import Moment, nearest, no_contact, passage
@@ -67,7 +68,10 @@ def test_the_flat_body_rate_is_that_of_the_flat_attitude():
     times = jnp.array([0.3, 0.3 + 1e-3])
     acc = lambda t: jnp.array([4.0 * jnp.sin(3.0 * t), 3.0 * t, 2.0 * t**2])  # noqa: E731
     with jax.enable_x64(True):
-        now, then = (flat_attitude(acc(t), jax.jacfwd(acc)(t), 9.81) for t in times.astype(float))
+        now, then = (
+            flat_attitude(acc(t), jax.jacfwd(acc)(t), jnp.asarray(9.81))
+            for t in times.astype(float)
+        )
         turned = rotation_error(now[0], then[0]) / (times[1] - times[0]).astype(float)
         np.testing.assert_allclose(turned, 0.5 * (now[1] + then[1]), atol=1e-3)
 

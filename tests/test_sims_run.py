@@ -10,13 +10,14 @@ from matplotlib.figure import Figure
 
 from planner_jax.ball.flight import BallState
 from planner_jax.cli import main
+from planner_jax.registry import Task, all_tasks
 from planner_jax.sims.film import FilmError, draw_flight, film_flights, require_film
 from planner_jax.sims.launch import flight_keys, launched, ready
 from planner_jax.sims.loop import flown, fly_leg
 from planner_jax.sims.recording import Launches
 from planner_jax.sims.run import start_flights
 from planner_jax.sims.scoring import passage
-from planner_jax.sims.settings import FLIGHTS, CatchFly, FlySettings, HitFly, fly_settings
+from planner_jax.sims.settings import CatchFly, FlySettings, HitFly, fly_settings
 from planner_jax.sims.task import FlightCases, Flights, FlightTask
 from planner_jax.sims.tasks.catch import CATCH_WORLD
 from planner_jax.sims.tasks.hit import HIT_WORLD
@@ -28,7 +29,10 @@ from tests.recordings import recording
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: fly_settings("block"), "task must be one of catch, hit, got 'block'"),
+        (
+            lambda: fly_settings("block"),
+            "task must be one that can be flown (hit, catch), got 'block'",
+        ),
         (lambda: CatchFly(noise="loud"), "noise must be one of none, lab, harsh, got 'loud'"),
         (lambda: CatchFly(num=0), "num must be >= 1, got 0"),
         (lambda: CatchFly(replan=30.0), "replan must be a divisor of the looks' 100 Hz, got 30"),
@@ -121,13 +125,21 @@ def test_a_run_of_flights_is_written_whole(tmp_path, capsys):
     assert "RUN must be finished, with its flights.parquet" in capsys.readouterr().err
 
 
+DROP = Task(
+    name="drop",
+    summary="a quadrotor holds a falling ball",
+    home="tests.test_sims_run",
+    planners={"exact": "hover"},
+    suites={},
+    flight="tests.test_sims_run:DropFly",
+)
+
+
 @dataclasses.dataclass(frozen=True)
 class DropFly(FlySettings):
     """A third task: a quadrotor hovers, and a ball falls into its net."""
 
-    TASK, WORDS = "drop", "a quadrotor holds a falling ball"
-    FLIGHT = "tests.test_sims_run:DropFlight"
-    PLANNERS, RATE = {"exact": "hover"}, 0.0
+    TASK, FLIGHT, RATE = DROP, "tests.test_sims_run:DropFlight", 0.0
 
 
 @struct.dataclass
@@ -179,8 +191,15 @@ class DropFlight(FlightTask):
         return Launches(BallState(at, 0.0 * at), np.full(at.shape[:2], 0.06), np.zeros(1), 0.1)
 
 
+def test_a_task_without_flights_is_refused_in_one_line(monkeypatch):
+    monkeypatch.setitem(all_tasks(), "drop", dataclasses.replace(DROP, flight=None))
+    with pytest.raises(SettingError) as error:
+        fly_settings("drop")
+    assert str(error.value) == "task must be one that can be flown (hit, catch), got 'drop'"
+
+
 def test_a_third_task_is_flown_into_a_run_folder_without_an_edit(tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(FLIGHTS, "drop", "tests.test_sims_run:DropFly")
+    monkeypatch.setitem(all_tasks(), "drop", DROP)
     manifest = start_flights(DropFly(num=2, noise="none"), tmp_path / "run")
     assert manifest["kind"] == "fly drop"
     assert (manifest["summary"]["success_rate"], manifest["summary"]["num"]) == (1.0, 2)

@@ -18,9 +18,9 @@ from jax import Array
 
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.prediction import PathTable, predict_path
-from planner_jax.optimise.multistart import solve_round
-from planner_jax.optimise.problem import Planner
-from planner_jax.optimise.status import is_unsolved
+from planner_jax.planning.plan import plan as plan_all
+from planner_jax.planning.replan import Replanning
+from planner_jax.protocol import AnyPlanner, is_unsolved
 from planner_jax.sims.launch import (
     awaited,
     flight_keys,
@@ -38,21 +38,13 @@ from planner_jax.sims.scoring import passage
 from planner_jax.sims.settings import INTERVAL, CatchFly, require_interval
 from planner_jax.sims.task import FlightCases, Flights, FlightTask
 from planner_jax.sweep.columns import BOOL, Column, list_of
-from planner_jax.task.catch.decide import plan_catches
-from planner_jax.task.catch.exact import ExactCatch
+from planner_jax.task.catch.case import GRAVITY, NET_HEIGHT, NET_RADIUS, START, CatchCase
+from planner_jax.task.catch.case import case as catch_case
 from planner_jax.task.catch.plan import CatchPlan
-from planner_jax.task.catch.planners import catch_planner
-from planner_jax.task.catch.replan import ReplanCatch, ReplanScenario
-from planner_jax.task.catch.scenario import (
-    GRAVITY,
-    NET_HEIGHT,
-    NET_RADIUS,
-    START,
-    CatchScenario,
-    catch_scenario,
-)
-from planner_jax.task.catch.suites import LAUNCH, earliest_throw, make_suite
-from planner_jax.task.hit.scenario import DRAG  # of the published serves; paper 000 gives none
+from planner_jax.task.catch.replan import ReplanCatch
+from planner_jax.task.catch.suites import LAUNCH, draw, earliest_throw
+from planner_jax.task.catch.words import planner as catch_planner
+from planner_jax.task.hit.case import DRAG  # of the published serves; paper 000 gives none
 
 CATCH_WORLD = World(Quadrotor(Tool("net", NET_HEIGHT, NET_RADIUS)), GRAVITY, mouth=LAUNCH)
 SEEN = 0.3  # [s], a throw's flight before it is planned for: 2 m and more (paper 000, VII-A)
@@ -84,24 +76,24 @@ class CatchPilot:
         return jnp.zeros_like(plan.times).at[plan.order].set(plan.times)
 
     def plan_anew(
-        self, scenario: CatchScenario, plan: CatchPlan, outlook: Outlook
+        self, case: CatchCase, plan: CatchPlan, outlook: Outlook
     ) -> tuple[CatchPlan, Array]:
         """One short round of the re-planner, and whether its plan is good enough."""
         made = plan.times <= outlook.elapsed
         first = jnp.argsort(made, stable=True)  # what is still to be caught
         order, times = plan.order[first], plan.times[first] - outlook.elapsed
-        horizon = scenario.horizon - outlook.time
+        horizon = case.horizon - outlook.time
         left = dataclasses.replace(
-            scenario,
-            targets=tables(outlook.balls, outlook.drag, horizon, scenario.gravity),
+            case,
+            targets=tables(outlook.balls, outlook.drag, horizon, case.gravity),
             present=outlook.present,
             horizon=horizon,
             order=order,
             times=jnp.maximum(times, 0.01),
             head_state=outlook.head_state,
         )
-        task = ReplanScenario(scenario=left, previous=plan, elapsed=outlook.elapsed)
-        found = solve_round(self.planner, self.planner.rounds[0], task)
+        task = Replanning(case=left, previous=plan, elapsed=outlook.elapsed)
+        found = self.planner.solve(task, self.planner.rounds[0])
         good = outlook.present[order[0]] & (times[0] >= self.planner.shortest)
         excess = jnp.where(jnp.sum(outlook.present) > 1, self.excess[1], self.excess[0])
         return found, good & (found.violation <= jnp.maximum(excess, plan.violation))
@@ -143,7 +135,7 @@ def throws(
         raise ValueError(f"num_balls must be >= 1, got {num_balls}")
     if not 0.0 <= drag_error < 1.0:
         raise ValueError(f"drag_error must be >= 0 and < 1, got {drag_error}")
-    suite = jax.tree.map(np.asarray, make_suite("throws", num * num_balls, seed))
+    suite = jax.tree.map(np.asarray, draw(num * num_balls, "throws", seed))
     shaped = lambda leaf: leaf[:, 0].reshape(num, num_balls, *leaf.shape[2:])  # noqa: E731
     first = lambda leaf: leaf[::num_balls]  # noqa: E731
     true = np.full((num, num_balls), drag, np.float32)
@@ -175,7 +167,7 @@ class CatchFlights(Flights):
 
 
 @functools.partial(jax.jit, static_argnames="loop")
-def scenarios(loop: Loop, flights: FlightState, new: Array, horizon: Array) -> CatchScenario:
+def believed(loop: Loop, flights: FlightState, new: Array, horizon: Array) -> CatchCase:
     """What is believed of a ball that has come into sight and of the next one, to be planned.
 
     The plans begin where and when the last catch of a ball seen before will have been made, or
@@ -190,7 +182,7 @@ def scenarios(loop: Loop, flights: FlightState, new: Array, horizon: Array) -> C
     unknown: Any = None
     least_thrust, body_rate = _FIRST if flights.plan is None else _BEHIND
     robot = loop.world.robot
-    empty = catch_scenario(
+    empty = catch_case(
         unknown,
         np.zeros(horizon.shape),
         gravity=loop.world.gravity,
@@ -200,8 +192,8 @@ def scenarios(loop: Loop, flights: FlightState, new: Array, horizon: Array) -> C
         body_rate=body_rate,
     )
 
-    def one(scenario: CatchScenario, flight: FlightState, horizon: Array) -> CatchScenario:
-        head, after = scenario.head_state, jnp.zeros_like(flight.time)
+    def one(case: CatchCase, flight: FlightState, horizon: Array) -> CatchCase:
+        head, after = case.head_state, jnp.zeros_like(flight.time)
         if flight.plan is None:
             head = head.at[0].set(robot.state(flight.physics).pos)
         else:
@@ -210,8 +202,8 @@ def scenarios(loop: Loop, flights: FlightState, new: Array, horizon: Array) -> C
         balls = expected(loop, flight.earlier, loop.period + after)
         horizon = horizon - after
         return dataclasses.replace(
-            scenario,
-            targets=tables(balls, flight.earlier.drag, horizon, scenario.gravity),
+            case,
+            targets=tables(balls, flight.earlier.drag, horizon, case.gravity),
             present=new,
             horizon=horizon,
             head_state=head,
@@ -234,8 +226,8 @@ def with_catch(flights: FlightState, found: CatchPlan, new: Array) -> FlightStat
     flown, after its last such catch. Elsewhere the new plan is flown alone, from now on.
 
     Args:
-        flights: the ones for which `scenarios` was called.
-        found: plans (B, ...) of the scenarios that it returned.
+        flights: the ones for which `believed` was called.
+        found: plans (B, ...) of the cases that it returned.
         new: (B, N) bool, the balls that `found` catches.
     """
 
@@ -272,6 +264,7 @@ def with_catch(flights: FlightState, found: CatchPlan, new: Array) -> FlightStat
             found,
             trajectory=trajectory,
             order=order.astype(old.order.dtype),
+            decided_times=behind(old.decided_times, end + found.decided_times),
             times=behind(old.times, end + found.times),
         )
         joined = dataclasses.replace(flight, plan=joined, present=present)
@@ -286,7 +279,7 @@ def fly_catches(
     cases: Throws,
     seed: int = 0,
     *,
-    planner: Planner | None = None,
+    planner: AnyPlanner[CatchCase, CatchPlan] | None = None,
     pilot: CatchPilot | None = None,
     plan: CatchPlan | None = None,
 ) -> CatchFlights:
@@ -300,7 +293,7 @@ def fly_catches(
         loop: world, sensing, rates and gains.
         cases: the balls.
         seed: of the noise, >= 0.
-        planner: of the plans from scratch, by default `ExactCatch`.
+        planner: of the plans from scratch, by default `exact` that decides greedily.
         pilot: of the plans in between.
         plan: first plan of each flight, of the first ball, instead of one made here.
 
@@ -312,43 +305,43 @@ def fly_catches(
     require_world(loop, "net", num_balls, **sizes)
     if num_balls > 1:
         require_interval(loop.sensing, loop.replan)
-    planner, pilot = planner or ExactCatch(), pilot or CatchPilot()
+    planner, pilot = planner or catch_planner(decide="greedy"), pilot or CatchPilot()
     drag = jnp.asarray(cases.drag)
-    balls, believed = jax.tree.map(jnp.asarray, (cases.balls, cases.believed))
+    balls, guess = jax.tree.map(jnp.asarray, (cases.balls, cases.believed))
     keys = flight_keys(seed, cases.index)
     flight = ready(loop, jnp.tile(jnp.array(START), (len(cases), 1)), keys)
     first: Any = plan
     records, planning = [], 0.0
     shortest, window = earliest_throw("throws")
     for ball in range(num_balls):
-        flight = launched(loop, flight, balls, drag, believed, ball=ball, seen=SEEN)
+        flight = launched(loop, flight, balls, drag, guess, ball=ball, seen=SEEN)
         until = cases.horizon + INTERVAL * (np.arange(num_balls) - ball)
         given, last = plan is not None and ball == 0, ball == num_balls - 1
         if not last:
             coming = jax.tree.map(jnp.asarray, shortest)
-            flight = awaited(loop, flight, coming, believed, ball=ball + 1, ahead=INTERVAL)
+            flight = awaited(loop, flight, coming, guess, ball=ball + 1, ahead=INTERVAL)
             until[:, ball + 1] = INTERVAL + window
         horizon = jnp.asarray(until, jnp.float32)
         new = np.isin(np.arange(num_balls), [ball] if given else [ball, ball + 1])
-        scenario = scenarios(loop, flight, jnp.asarray(new), horizon)
+        known = believed(loop, flight, jnp.asarray(new), horizon)
         if given:
             found: Any = plan
-            require_plan(found, CatchPlan, scenario.head_state)
+            require_plan(found, CatchPlan, known.head_state)
             if found.times.shape[-1] != num_balls:
                 raise ValueError(f"plan must be of {num_balls} balls, got {found.times.shape[-1]}")
         else:
-            known = jax.tree.map(np.asarray, scenario)
+            known = jax.tree.map(np.asarray, known)
             began = time.perf_counter()
-            scenario, found = planned_ahead(planner, known, ball)
+            known, found = planned_ahead(planner, known, ball)
             planning += time.perf_counter() - began
         first = found if first is None else first
         begun = jax.tree.map(jnp.asarray, found)
-        flight = with_catch(flight, begun, jnp.asarray(scenario.present))
+        flight = with_catch(flight, begun, jnp.asarray(known.present))
         flight, record = fly_leg(
             loop,
             pilot,
             flight,
-            dataclasses.replace(scenario, horizon=horizon + flight.time[:, None]),
+            dataclasses.replace(known, horizon=horizon + flight.time[:, None]),
             drag,
             num_periods=loop.num_periods(float(cases.horizon.max()) + _AFTER if last else INTERVAL),
         )
@@ -357,32 +350,32 @@ def fly_catches(
 
 
 def planned_ahead(
-    planner: Planner, known: CatchScenario, ball: int
-) -> tuple[CatchScenario, CatchPlan]:
+    planner: AnyPlanner[CatchCase, CatchPlan], known: CatchCase, ball: int
+) -> tuple[CatchCase, CatchPlan]:
     """Plans from scratch that catch a ball and, where that is possible too, the next one.
 
     Where no plan of both is found the ball is planned for alone, and where that fails as well,
     within the widest limits. If nothing is solved, the plan that breaks its limits least is left.
 
     Args:
-        planner: of catches.
+        planner: of catches, which also decides about their order.
         known: of both balls, or of the last one, a batch with NumPy leaves.
         ball: its place among the targets.
 
     Returns:
-        The scenarios and their plans; `present` says which catches each has.
+        The cases and their plans; `present` says which catches each has.
     """
     alone = np.arange(known.num_targets) == ball
-    scenarios, plans = plan_catches(planner, known, "greedy")
+    cases, plans = known, plan_all(planner, known)
     last = ball == known.num_targets - 1
     for limits in (_WIDEST,) if last else (None, _WIDEST):
         lanes = np.flatnonzero(is_unsolved(np.asarray(plans.status)))
         if not lanes.size:
             break
-        part = jax.tree.map(lambda leaf, lanes=lanes: np.asarray(leaf)[lanes], scenarios)
+        part = jax.tree.map(lambda leaf, lanes=lanes: np.asarray(leaf)[lanes], cases)
         before = np.where((part.present == alone).all(axis=1), plans.violation[lanes], np.inf)
         part = within(dataclasses.replace(part, present=part.present & alone), limits)
-        tried, found = plan_catches(planner, part, "greedy")
+        found = plan_all(planner, part)
         better = ~is_unsolved(np.asarray(found.status)) | (found.violation < before)
         to, chosen = lanes[better], np.flatnonzero(better)
 
@@ -391,20 +384,20 @@ def planned_ahead(
             old[to] = np.asarray(new)[chosen]
             return old
 
-        scenarios, plans = jax.tree.map(merged, (scenarios, plans), (tried, found))
-    return scenarios, plans
+        cases, plans = jax.tree.map(merged, (cases, plans), (part, found))
+    return cases, plans
 
 
-def within(scenarios: CatchScenario, limits: tuple[float, float] | None) -> CatchScenario:
-    """Scenarios with NumPy leaves with another least thrust [g] and greatest body rate [rad/s]."""
+def within(cases: CatchCase, limits: tuple[float, float] | None) -> CatchCase:
+    """Cases with NumPy leaves with another least thrust [g] and greatest body rate [rad/s]."""
     if limits is None:
-        return scenarios
+        return cases
     thrust, rate = limits
-    gravity, old = scenarios.gravity, scenarios.limits
+    gravity, old = cases.gravity, cases.limits
     new = dataclasses.replace(
         old, min_thrust=thrust * gravity, body_rate=np.full_like(old.body_rate, rate)
     )
-    return dataclasses.replace(scenarios, limits=new)
+    return dataclasses.replace(cases, limits=new)
 
 
 class CatchFlight(FlightTask):
@@ -428,7 +421,7 @@ class CatchFlight(FlightTask):
 
     def fly(self, cases: Throws, record: bool) -> CatchFlights:
         """Flights of some throws."""
-        planner = catch_planner(self.settings.planner)
+        planner = catch_planner(self.settings.planner, decide="greedy")
         return fly_catches(self.loop(record), cases, self.settings.seed, planner=planner)
 
     def launches(self, cases: Throws, flown: Flown) -> Launches:

@@ -14,8 +14,10 @@ from jax import Array
 from planner_jax.ball.flight import BallState, rk4_step
 from planner_jax.ball.impact import racket_impact
 from planner_jax.optimise.lbfgs import LbfgsConfig
-from planner_jax.optimise.multistart import solve_round
-from planner_jax.optimise.problem import Planner, Round
+from planner_jax.optimise.problem import Round
+from planner_jax.planning.plan import plan as plan_all
+from planner_jax.planning.replan import Replanning
+from planner_jax.protocol import AnyPlanner
 from planner_jax.sims.launch import flight_keys, launched, ready, require_plan, require_world
 from planner_jax.sims.loop import FlightState, Flown, Loop, Outlook, expected, flown, fly_leg
 from planner_jax.sims.model import World
@@ -24,24 +26,18 @@ from planner_jax.sims.robot import Tool
 from planner_jax.sims.robots.quadrotor.robot import Quadrotor
 from planner_jax.sims.scenery import Part
 from planner_jax.sims.scoring import Contact, passage
-from planner_jax.sims.settings import HIT_SUITES, HitFly
+from planner_jax.sims.settings import HitFly
 from planner_jax.sims.task import FlightCases, Flights, FlightTask
 from planner_jax.sweep.columns import BOOL, NUMBER, VECTOR, Column
 from planner_jax.sweep.summary import percent
 from planner_jax.task.hit import court
+from planner_jax.task.hit.card import REAL_SCENARIOS
+from planner_jax.task.hit.case import GRAVITY, RACKET_HEIGHT, HitCase
 from planner_jax.task.hit.exact import ExactHit
 from planner_jax.task.hit.plan import HitPlan
-from planner_jax.task.hit.planners import planner as hit_planner
-from planner_jax.task.hit.replan import ReplanHit, ReplanHitScenario
-from planner_jax.task.hit.scenario import GRAVITY, RACKET_HEIGHT, HitScenario
-from planner_jax.task.hit.serves import (
-    DEPTH,
-    SERVE_HEIGHT,
-    advance,
-    generate_serves,
-    to_scenarios,
-)
-from planner_jax.task.solve import plan as plan_all
+from planner_jax.task.hit.replan import ReplanHit
+from planner_jax.task.hit.serves import DEPTH, SERVE_HEIGHT, generate_serves, to_cases
+from planner_jax.task.hit.words import planner as hit_planner
 
 SEEN = 0.25  # [s], a serve's flight before it is planned for: 2 m and more (paper 000, VII-A)
 _AFTER = 0.1  # [s] flown after the last impact planned
@@ -111,31 +107,29 @@ class HitPilot:
         """When the ball is to be hit (1,) [s]."""
         return plan.stroke.time[None]
 
-    def plan_anew(
-        self, scenario: HitScenario, plan: HitPlan, outlook: Outlook
-    ) -> tuple[HitPlan, Array]:
+    def plan_anew(self, case: HitCase, plan: HitPlan, outlook: Outlook) -> tuple[HitPlan, Array]:
         """One short round of the re-planner, and whether its plan is good enough."""
-        task = ReplanHitScenario(
-            scenario=believed(scenario, outlook.balls, outlook.drag, outlook.head_state),
+        task = Replanning(
+            case=believed(case, outlook.balls, outlook.drag, outlook.head_state),
             previous=plan,
             elapsed=outlook.elapsed,
         )
-        found = solve_round(self.planner, self.planner.rounds[0], task)
+        found = self.planner.solve(task, self.planner.rounds[0])
         good = outlook.present[0] & (plan.stroke.time - outlook.elapsed >= self.shortest)
         return found, good & (found.violation <= self.excess)
 
 
-def believed(scenario: HitScenario, balls: BallState, drag: Array, head: Array) -> HitScenario:
-    """One scenario for what its ball (leaves (1, 3)) seems to do, drag (1,)."""
+def believed(case: HitCase, balls: BallState, drag: Array, head: Array) -> HitCase:
+    """One case for what its ball (leaves (1, 3)) seems to do, drag (1,)."""
     ball = jax.tree.map(lambda leaf: leaf[0], balls)
-    return dataclasses.replace(scenario, ball=ball, drag=drag[0], head_state=head)
+    return dataclasses.replace(case, ball=ball, drag=drag[0], head_state=head)
 
 
 @dataclasses.dataclass(frozen=True)
 class Volleys(FlightCases):
     """B serves, as they are when they are planned for."""
 
-    scenarios: HitScenario  # leaves (B, ...), with the true ball and drag
+    cases: HitCase  # leaves (B, ...), with the true ball and drag
     believed: np.ndarray  # (B,) K_D [1/m]
 
 
@@ -152,12 +146,11 @@ def volleys(
     """
     if not 0.0 <= drag_error < 1.0:
         raise ValueError(f"drag_error must be >= 0 and < 1, got {drag_error}")
-    serves = advance(generate_serves(num, seed, names), SEEN)
-    scenarios = to_scenarios(serves)
+    cases = to_cases(generate_serves(num, seed, names), delay=SEEN)
     sign = np.random.default_rng([seed, 1]).choice([-1.0, 1.0], num)
-    true = np.asarray(scenarios.drag)
+    true = np.asarray(cases.drag)
     believed = (true * (1.0 + drag_error * sign)).astype(np.float32)
-    return Volleys(np.arange(num), jax.tree.map(np.asarray, scenarios), believed)
+    return Volleys(np.arange(num), jax.tree.map(np.asarray, cases), believed)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -200,25 +193,25 @@ def landing_point(ball: BallState, drag: Array, gravity: Array) -> tuple[Array, 
 
 
 @functools.partial(jax.jit, static_argnames="loop")
-def _scenarios(loop: Loop, flights: FlightState, truth: HitScenario) -> HitScenario:
+def _believed(loop: Loop, flights: FlightState, truth: HitCase) -> HitCase:
     """What is to be hit, as it is believed."""
 
-    def one(flight: FlightState, scenario: HitScenario) -> HitScenario:
+    def one(flight: FlightState, case: HitCase) -> HitCase:
         balls = expected(loop, flight.earlier, loop.period)
-        return believed(scenario, balls, flight.earlier.drag, scenario.head_state)
+        return believed(case, balls, flight.earlier.drag, case.head_state)
 
     return jax.vmap(one)(flights, truth)
 
 
 @jax.jit
-def _landings(contact: Contact, truth: HitScenario) -> tuple[Array, Array]:
+def _landings(contact: Contact, truth: HitCase) -> tuple[Array, Array]:
     """Landing points (B, 3) [m] of the balls that were hit, and their distances from target."""
 
-    def one(contact: Contact, scenario: HitScenario) -> tuple[Array, Array]:
+    def one(contact: Contact, case: HitCase) -> tuple[Array, Array]:
         contact = jax.tree.map(lambda leaf: leaf[0], contact)
-        ball = returned(contact, scenario.restitution)
-        point, _ = landing_point(ball, scenario.drag, scenario.gravity)
-        miss = jnp.sqrt(jnp.sum((point - scenario.target) ** 2))
+        ball = returned(contact, case.restitution)
+        point, _ = landing_point(ball, case.drag, case.gravity)
+        miss = jnp.sqrt(jnp.sum((point - case.target) ** 2))
         hit = contact.met & jnp.isfinite(miss)
         return jnp.where(hit, point, jnp.nan), jnp.where(hit, miss, jnp.inf)
 
@@ -230,7 +223,7 @@ def fly_hits(
     cases: Volleys,
     seed: int = 0,
     *,
-    planner: Planner | None = None,
+    planner: AnyPlanner[HitCase, HitPlan] | None = None,
     pilot: HitPilot | None = None,
     plan: HitPlan | None = None,
 ) -> HitFlights:
@@ -248,7 +241,7 @@ def fly_hits(
         ValueError: a world or plan does not fit.
     """
     planner, pilot = planner or smooth_planner(), pilot or HitPilot()
-    truth = cases.scenarios
+    truth = cases.cases
     require_world(loop, "racket", 1, gravity=truth.gravity, racket_height=truth.racket_height)
     truth = jax.tree.map(jnp.asarray, truth)
     keys = flight_keys(seed, cases.index)
@@ -257,16 +250,15 @@ def fly_hits(
     balls = jax.tree.map(lambda leaf: leaf[:, None], truth.ball)
     guess = jnp.asarray(cases.believed)[:, None]
     flight = launched(loop, flight, balls, drag, guess, ball=0, seen=SEEN)
-    scenario = _scenarios(loop, flight, truth)
-    jax.block_until_ready(scenario)
+    known = jax.block_until_ready(_believed(loop, flight, truth))
     clock = time.perf_counter()
-    first = jax.block_until_ready(plan_all(planner, scenario)) if plan is None else plan
+    first = jax.block_until_ready(plan_all(planner, known)) if plan is None else plan
     planning = time.perf_counter() - clock
-    require_plan(first, HitPlan, scenario.head_state)
+    require_plan(first, HitPlan, known.head_state)
     begun = jax.tree.map(jnp.asarray, first)
     flight = dataclasses.replace(flight, plan=begun, began=flight.time, present=flight.launched)
     periods = loop.num_periods(_LONGEST - SEEN + _AFTER)
-    flight, record = fly_leg(loop, pilot, flight, scenario, drag, num_periods=periods)
+    flight, record = fly_leg(loop, pilot, flight, known, drag, num_periods=periods)
     landing, miss = jax.device_get(_landings(flight.contact, truth))
     return HitFlights(first, flown(flight, [record]), planning, landing, miss)
 
@@ -293,7 +285,7 @@ class HitFlight(FlightTask):
     def cases(self) -> Volleys:
         """All serves of the run."""
         settings = self.settings
-        regions = HIT_SUITES[settings.suite]
+        regions = REAL_SCENARIOS[settings.suite]
         return volleys(settings.num, regions, settings.seed, drag_error=settings.drag_error)
 
     def fly(self, cases: Volleys, record: bool) -> HitFlights:
@@ -304,12 +296,12 @@ class HitFlight(FlightTask):
 
     def launches(self, cases: Volleys, flown: Flown) -> Launches:
         """The serves, and the balls that come back from the racket."""
-        scenarios = cases.scenarios
+        truth = cases.cases
         contact = jax.tree.map(lambda leaf: leaf[:, 0], flown.contact)
-        back = jax.device_get(jax.vmap(returned)(contact, scenarios.restitution))
-        balls = jax.tree.map(lambda leaf: leaf[:, None], scenarios.ball)
-        drag = scenarios.drag[:, None]
-        return Launches(balls, drag, np.zeros(1), SEEN, returned=back, target=scenarios.target)
+        back = jax.device_get(jax.vmap(returned)(contact, truth.restitution))
+        balls = jax.tree.map(lambda leaf: leaf[:, None], truth.ball)
+        drag = truth.drag[:, None]
+        return Launches(balls, drag, np.zeros(1), SEEN, returned=back, target=truth.target)
 
     @property
     def suite(self) -> str:

@@ -15,9 +15,9 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array, lax
 
-from planner_jax.robot.quadrotor import net_thrust
+from planner_jax.robot.quadrotor import flat_attitude, net_thrust
 from planner_jax.sims.model import World
-from planner_jax.sims.robots.quadrotor.reference import Reference, flat_attitude
+from planner_jax.sims.robots.quadrotor.reference import Reference
 from planner_jax.sims.robots.quadrotor.vehicle import Vehicle, rotor_thrusts
 from planner_jax.sims.rotation import rotation
 
@@ -69,11 +69,11 @@ def control(
         gains: of the cascade.
         world: whose gravity and time step count.
     """
-    gravity = world.gravity
+    gravity = jnp.asarray(world.gravity, state.pos.dtype)
     R = rotation(state.quat_wxyz)
     half = 0.5 * world.timestep  # the velocities of MuJoCo's Euler are that much older
     ahead, faster = reference.pos - state.pos, reference.vel - half * reference.acc - state.vel
-    pull = net_thrust(reference.acc, jnp.asarray(gravity, ahead.dtype))
+    pull = net_thrust(reference.acc, gravity)
     back = gains.position * ahead + gains.velocity * faster
     # Unbounded, an error would turn a weak thrust any way, and the plan's with it.
     most = gains.share * jnp.sqrt(jnp.sum(pull**2))
@@ -81,7 +81,7 @@ def control(
     acc = reference.acc + back
     jerk = reference.jerk + gains.position * faster
     R_wanted, rate_wanted = flat_attitude(acc, jerk, gravity)
-    pull = net_thrust(acc, jnp.asarray(gravity, acc.dtype))
+    pull = net_thrust(acc, gravity)
     thrust = vehicle.mass * (jnp.sum(pull * R[:, 2]) + reference.thrust_lead)
     stiffness = jnp.array([gains.attitude, gains.attitude, gains.heading], acc.dtype)
     highest = lax.Precision.HIGHEST

@@ -9,7 +9,7 @@ import numpy as np
 from flax import struct
 from jax import Array, lax
 
-from planner_jax.robot.quadrotor import body_z, net_thrust, tangent_basis
+from planner_jax.robot.quadrotor import flat_attitude, net_thrust
 from planner_jax.sims.model import World
 from planner_jax.sims.robots.quadrotor.vehicle import Vehicle
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, total_duration
@@ -72,27 +72,6 @@ def state_at(trajectory: PiecewisePolynomial, time: Array) -> Array:
     return jnp.stack([evaluate(trajectory, time, k) for k in range(4)])
 
 
-def flat_attitude(acc: Array, jerk: Array, gravity: float) -> tuple[Array, Array]:
-    """Attitude and body rate of a motion, at zero heading of the Hopf fibration.
-
-    Args:
-        acc: (3,) [m/s^2].
-        jerk: (3,) [m/s^3].
-        gravity: [m/s^2].
-
-    Returns:
-        (3, 3) body to world, and (3,) [rad/s] in the body frame.
-    """
-    gravity_here = jnp.asarray(gravity, acc.dtype)
-    z = body_z(acc, gravity_here)
-    size = jnp.sqrt(jnp.maximum(jnp.sum(net_thrust(acc, gravity_here) ** 2), 1e-2))
-    z_dot = (jerk - jnp.sum(jerk * z) * z) / size
-    x, y = tangent_basis(z)
-    twist = (z[1] * z_dot[0] - z[0] * z_dot[1]) / jnp.maximum(1.0 + z[2], 1e-2)
-    rate = jnp.stack([-jnp.sum(y * z_dot), jnp.sum(x * z_dot), twist])
-    return jnp.stack([x, y, z], axis=1), rate
-
-
 def references(
     path: PiecewisePolynomial, times: Array, vehicle: Vehicle, world: World
 ) -> Reference:
@@ -105,7 +84,7 @@ def _reference_at(
     trajectory: PiecewisePolynomial, time: Array, vehicle: Vehicle, world: World
 ) -> Reference:
     """The plan at a time () [s] since its start, with what the rotors need to know ahead."""
-    gravity = world.gravity
+    gravity = jnp.asarray(world.gravity, time.dtype)
     order = lambda k, at: evaluate(trajectory, at, k)  # noqa: E731
     pos, vel, acc, jerk = (order(k, time) for k in range(4))
     lag, step = vehicle.rotor_lag, 2.0 * world.timestep
@@ -115,7 +94,7 @@ def _reference_at(
 
     def flat(at: Array) -> tuple[Array, Array]:
         acc_then = order(2, at)
-        size = jnp.sqrt(jnp.sum(net_thrust(acc_then, jnp.asarray(gravity, at.dtype)) ** 2))
+        size = jnp.sqrt(jnp.sum(net_thrust(acc_then, gravity) ** 2))
         return size, flat_attitude(acc_then, order(3, at), gravity)[1]
 
     (less, before), (size, rate), (more, after) = (flat(ahead + k * step) for k in (-1, 0, 1))
@@ -123,7 +102,7 @@ def _reference_at(
     growth = (more - less) / (2.0 * step)
     angular_acc = (after - before) / (2.0 * step)
     angular_jerk = (after - 2.0 * rate + before) / step**2
-    now = jnp.sqrt(jnp.sum(net_thrust(acc, jnp.asarray(gravity, acc.dtype)) ** 2))
+    now = jnp.sqrt(jnp.sum(net_thrust(acc, gravity) ** 2))
     return Reference(
         pos=pos,
         vel=vel,
