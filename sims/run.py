@@ -35,7 +35,7 @@ def _contact(name: str) -> Any:
 
 
 _COLUMNS = (
-    Column("index", "", "place in the whole", pa.int64(), lambda b: b.cases.index),
+    Column("index", "", "place in the whole", pa.int64(), lambda b: b.chunk.index),
     Column("success", "", "as its task counts it", BOOL, lambda b: b.verdict.success),
     Column(
         "status",
