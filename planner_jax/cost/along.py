@@ -166,12 +166,9 @@ def _slopes_by_all(along: Along, columns: Array, durations: Array, parameters: A
 
 def _curvature(along: Along, primals: tuple, tangents: tuple) -> tuple:
     """Derivative of `_slopes_by_all` along tangents; None for those of still parameters."""
-    *free, given = primals
-    if tangents[2] is None:
-        of_free: Any = lambda *x: _slopes_by_all(along, *x, given)  # noqa: E731
-        return jax.jvp(of_free, tuple(free), tangents[:2])[1]
-    of_all: Any = functools.partial(_slopes_by_all, along)
-    return jax.jvp(of_all, primals, tangents)[1]
+    moves = 2 if tangents[2] is None else 3
+    slopes: Any = lambda *moving: _slopes_by_all(along, *moving, *primals[moves:])  # noqa: E731
+    return jax.jvp(slopes, primals[:moves], tangents[:moves])[1]
 
 
 def _contracted(slope: Array, tangent: Array) -> Array:
