@@ -37,6 +37,7 @@ def examine() -> Iterator[Finding]:
     system = f"{found['device']['system']} {found['device']['machine']}, {os.cpu_count()} cores"
     yield Finding("system", f"{system}, load average {os.getloadavg()[0]:.1f}")
     yield _devices()
+    yield _kernels()
     yield _precision()
     yield _cache(folder)
     yield from _plans()
@@ -54,6 +55,16 @@ def _devices() -> Finding:
         hint = "; there is an NVIDIA GPU that JAX does not use: pip install 'planner-jax[gpu]'"
         return Finding("devices", text + hint, good=False)
     return Finding("devices", text)
+
+
+def _kernels() -> Finding:
+    """Whether kernels take the place of JAX's operations, which on a GPU makes plans quicker."""
+    from planner_jax.lanes import pallas
+
+    state = pallas.kernels()
+    if not pallas.has_gpu():
+        return Finding("kernels", f"{state.value}; JAX has no GPU to use them on")
+    return Finding("kernels", state.value, good=state is not pallas.Kernels.MISSING)
 
 
 def _precision() -> Finding:

@@ -2,15 +2,18 @@
 
 import dataclasses
 import functools
+import os
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from planner_jax.lanes import over_lanes
+from planner_jax.lanes import over_lanes, pallas
 from planner_jax.optimise.lbfgs import LbfgsConfig
-from planner_jax.optimise.multistart import minimise_lanes
+from planner_jax.optimise.multistart import minimise_lanes, solve_batch
 from planner_jax.optimise.problem import Round
 from planner_jax.optimise.sensitivity import gradient_at
 from planner_jax.protocol import is_solved
@@ -52,6 +55,42 @@ def test_hits_are_those_of_a_cpu(devices, serves):
     np.testing.assert_array_equal(ours.status, theirs.status)
     assert is_solved(ours.status).all()
     np.testing.assert_allclose(ours.stroke.time, theirs.stroke.time, atol=1e-3)
+
+
+def test_compiled_programs_hold_their_kernels(devices, serves):
+    attempt = Round(1, LbfgsConfig(max_steps=2))
+    hits = jax.jit(lambda cases: solve_batch(ExactHit(), attempt, cases))
+    program = hits.lower(jax.device_put(serves, devices[0])).compile().as_text()
+    # The ball's table, penalties (3), direction, ends (3) and choice of a step.
+    assert program.count('custom_call_target="__gpu$xla.gpu.triton"') >= 9
+
+
+WITHOUT_KERNELS = """
+import sys
+import jax, numpy as np
+from planner_jax.lanes import pallas
+from planner_jax.task.hit.exact import ExactHit
+from planner_jax.task.hit.serves import generate_serves, to_scenarios
+from planner_jax.task.solve import plan
+
+assert jax.default_backend() == "gpu" and pallas.kernels() is pallas.Kernels.OFF
+cases = jax.tree.map(np.asarray, to_scenarios(generate_serves(int(sys.argv[1]), 0)))
+plans = plan(ExactHit(), cases, devices=jax.devices()[:1])
+np.savez(sys.argv[2], status=plans.status, time=plans.stroke.time)
+"""
+
+
+def test_hits_are_those_of_a_process_without_kernels(devices, serves, tmp_path):
+    without = tmp_path / "plans.npz"
+    off = {pallas.SWITCH: "off", "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+    subprocess.run(
+        [sys.executable, "-c", WITHOUT_KERNELS, str(LANES), str(without)],
+        env={**os.environ, **off},
+        check=True,
+    )
+    ours, theirs = plan(ExactHit(), serves, devices=devices[:1]), np.load(without)
+    np.testing.assert_array_equal(ours.status, theirs["status"])
+    np.testing.assert_allclose(ours.stroke.time, theirs["time"], atol=1e-3)
 
 
 def test_catches_are_those_of_a_cpu(devices):

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from jax.sharding import Mesh, PartitionSpec
 
-from planner_jax import lanes as lanes_module
-from planner_jax.lanes import in_one_kernel, over_lanes
-from planner_jax.lanes_kernel import Unsupported, lanes_kernel
+from planner_jax.lanes import attach, in_one_kernel, over_lanes, pallas
+from planner_jax.lanes.scalars import Unsupported, scalar_kernel
 
 MATRIX = np.random.default_rng(0).standard_normal((5, 4))
 LANES = 7
@@ -103,10 +102,10 @@ def test_a_kernel_of_single_operations_gives_the_same(name, float64):
     closed = jax.make_jaxpr(lambda *args: jax.tree.leaves(function(*args)))(x[..., 0], k[0])
     if name in NOT_IN_A_KERNEL:
         with pytest.raises(Unsupported):
-            lanes_kernel(closed, [x, k], 16, interpret=True)
+            scalar_kernel(closed, [x, k], 16, interpret=True)
         return
     expected = jax.vmap(function, in_axes=-1, out_axes=-1)(x, k)
-    found = lanes_kernel(closed, [x, k], 16, interpret=True)
+    found = scalar_kernel(closed, [x, k], 16, interpret=True)
     for ours, theirs in zip(found, jax.tree.leaves(expected), strict=True):
         assert ours.dtype == theirs.dtype
         np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-14)
@@ -117,7 +116,7 @@ def test_a_kernel_does_nothing_twice_and_nothing_in_vain():
         unused = jnp.cos(x)
         return jnp.sin(x[0]) * jnp.sin(x[0]) + 0.0 * unused.size
 
-    kernel = functools.partial(lanes_kernel, threads=16, interpret=True)
+    kernel = functools.partial(scalar_kernel, threads=16, interpret=True)
     lanes = jnp.ones((2, 16), jnp.float32)
     closed = jax.make_jaxpr(function)(lanes[:, 0])
     jaxpr = str(jax.make_jaxpr(lambda lanes: kernel(closed, [lanes]))(lanes))
@@ -129,7 +128,7 @@ def test_axes_in_front_of_some_arguments_are_in_front_of_all_results():
     closed = jax.make_jaxpr(lambda x, k: (jnp.sum(x) * k, k + 1.0))(jnp.ones(3), jnp.ones(()))
     x = jnp.arange(2.0 * 3 * 16).reshape(2, 3, 16)
     k = jnp.arange(16.0)
-    product, later = lanes_kernel(closed, [x, k], 16, interpret=True)
+    product, later = scalar_kernel(closed, [x, k], 16, interpret=True)
     np.testing.assert_allclose(product, x.sum(axis=1) * k)
     np.testing.assert_allclose(later, [k + 1.0, k + 1.0])
 
@@ -138,14 +137,14 @@ def test_arguments_that_all_lanes_share_are_constants():
     closed = jax.make_jaxpr(lambda x, c: c @ x)(jnp.ones(3), jnp.ones((2, 3)))
     x, shared = jnp.arange(3.0 * 16).reshape(3, 16), np.arange(6.0, dtype=np.float32).reshape(2, 3)
     np.testing.assert_allclose(
-        lanes_kernel(closed, [x, shared], 16, interpret=True)[0], shared @ x, rtol=1e-6
+        scalar_kernel(closed, [x, shared], 16, interpret=True)[0], shared @ x, rtol=1e-6
     )
 
 
 def test_a_function_that_would_take_long_to_compile_is_refused():
     closed = jax.make_jaxpr(lambda x: jnp.cumsum(jnp.sin(x)))(jnp.ones(500))
     with pytest.raises(Unsupported, match="too large"):
-        lanes_kernel(closed, [jnp.ones((500, 16))], 16)
+        scalar_kernel(closed, [jnp.ones((500, 16))], 16)
 
 
 @pytest.fixture
@@ -154,12 +153,12 @@ def used(monkeypatch):
     made = []
 
     def interpreted(closed, args, threads):
-        found = lanes_kernel(closed, args, threads, interpret=True)
+        found = scalar_kernel(closed, args, threads, interpret=True)
         made.append(len(args))
         return found
 
-    monkeypatch.setattr(lanes_module, "lanes_kernel", interpreted)
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(attach, "scalar_kernel", interpreted)
+    monkeypatch.setattr(pallas, "has_gpu", lambda: True)
     monkeypatch.setattr(jax.lax, "platform_dependent", lambda *x, cuda, default: cuda(*x))
     return made
 

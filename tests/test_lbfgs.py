@@ -141,6 +141,20 @@ def test_the_kernel_turns_as_the_plain_path_does():
         np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.parametrize(("size", "kept"), [(0.0, 0), (1e-30, 0), (np.nan, 0), (1e-15, 3)])
+def test_the_memory_is_kept_while_the_squared_length_of_a_step_is_above_zero(size, kept):
+    """In the kernel too. The change has no positive curvature, so that no pair is added."""
+    step, grad = jnp.full((5, 16), size, jnp.float32), jnp.ones((5, 16))
+    memory = lbfgs.Memory(jnp.ones((3, 5, 16)), jnp.ones((3, 5, 16)), jnp.full((3, 16), 0.2))
+    args = memory, step, -jnp.ones((5, 16)), grad
+    plain = jax.vmap(lbfgs.remember, in_axes=-1, out_axes=-1)(*args[:3])
+    kernel = turn_kernel(3, 2.0, interpret=True)
+    *steps_and_changes, inverse, _ = kernel(jax.tree.structure(args), jax.tree.leaves(args))
+    np.testing.assert_array_equal((plain.inverse_curvature != 0.0).sum(axis=0), kept)
+    for ours, theirs in zip((*steps_and_changes, inverse), jax.tree.leaves(plain), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
 def test_best_feasible_iterate_is_kept_when_the_minimum_is_infeasible():
     """Minimum at 0, feasible only beyond 1: the answer lies at or beyond 1."""
 

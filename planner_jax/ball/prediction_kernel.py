@@ -1,4 +1,4 @@
-"""The table of a ball in flight on many lanes as one kernel for CUDA, in Pallas' Triton.
+"""The table of a ball in flight on many lanes as one kernel for CUDA.
 
 A step needs the one before it. As operations of their own the steps of a table are some three
 hundred launches, which a small batch waits for; here a thread flies a ball to the end, and where
@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from planner_jax.ball.flight import BallState, rk4_step
-from planner_jax.lanes import block_width
+from planner_jax.lanes.pallas import block_width, kernel_by_lanes
 
 _THREADS = 32  # lanes of a block
 _VEL = 1  # place of the velocity among the arguments; numbers follow it
@@ -24,7 +24,7 @@ _VEL = 1  # place of the velocity among the arguments; numbers follow it
 def table_kernel(
     num_nodes: int, moving: tuple[int, ...] = (), *, interpret: bool = False
 ) -> Callable:
-    """What `lanes.with_kernel` takes for the states at the nodes of a `PathTable`.
+    """The kernel that `lanes.with_kernel` attaches to the states at the nodes of a `PathTable`.
 
     Args:
         num_nodes: N.
@@ -60,22 +60,20 @@ class _Direction:
 def _directions(moving: tuple[int, ...]) -> list[_Direction]:
     still = (0.0, 0.0, 0.0)
     units = [tuple(float(j == k) for j in range(3)) for k in range(3)]
-    found = []
+    directions = []
     for result, place in enumerate(moving):
         if place == _VEL:
-            found += [_Direction(result, (k,), unit, still) for k, unit in enumerate(units)]
+            directions += [_Direction(result, (k,), unit, still) for k, unit in enumerate(units)]
         else:
-            found.append(_Direction(result, (), still, units[place - _VEL - 1]))
-    return found
+            directions.append(_Direction(result, (), still, units[place - _VEL - 1]))
+    return directions
 
 
 @functools.cache
 def _call(
     num_nodes: int, moving: tuple[int, ...], lanes: int, threads: int, interpret: bool
 ) -> Callable:
-    from jax.experimental import pallas as pl
-    from jax.experimental.pallas import triton
-
+    """The kernel for tables of `num_nodes` on `lanes` lanes."""
     directions = _directions(moving)
     shapes = [(num_nodes, 3, 3) if place == _VEL else (num_nodes, 3) for place in moving]
     shapes = 2 * (shapes or [(num_nodes, 3)])  # of positions, of velocities
@@ -109,16 +107,6 @@ def _call(
         write(0, *flown(ball, moved, -1.0))
         write(num_nodes - 1, *jax.lax.fori_loop(1, num_nodes - 1, advance, (ball, moved)))
 
-    def by_lanes(*shape: int) -> pl.BlockSpec:
-        return pl.BlockSpec((*shape, threads), lambda i: (*(0 for _ in shape), i))
-
-    return pl.pallas_call(
-        body,
-        out_shape=[jax.ShapeDtypeStruct((*shape, lanes), jnp.float32) for shape in shapes],
-        grid=(lanes // threads,),
-        in_specs=[by_lanes(3), by_lanes(3), by_lanes(), by_lanes(), by_lanes()],
-        out_specs=[by_lanes(*shape) for shape in shapes],
-        compiler_params=triton.CompilerParams(num_warps=1, num_stages=1),
-        interpret=interpret,
-        name="flight_table",
-    )
+    inputs = [(3,), (3,), (), (), ()]
+    options = {"name": "flight_table", "interpret": interpret}
+    return kernel_by_lanes(body, inputs, shapes, lanes, threads, **options)

@@ -1,8 +1,9 @@
 """Penalties integrated along a trajectory of pieces in fixed proportion (paper 000, eq. 26).
 
 The innermost part of every solve. On a GPU it is one kernel (`along_kernel`), in which the
-samples of a trajectory never leave the registers, and so are its slopes and their derivatives
-along a direction; elsewhere, and for all other derivatives, it is what is written here.
+samples of a trajectory never leave the registers; its slopes are another kernel, and so are their
+derivatives along a direction. Elsewhere, and for all other derivatives, JAX compiles the functions
+of this file, which are the kernels' reference.
 """
 
 import dataclasses
@@ -86,77 +87,92 @@ def greatest_along(
     return _greatest(along)(columns, piece_durations, parameters)
 
 
+def _with_kernel(function: Callable, along: Along, mode: str, jvp: Any = None) -> Callable:
+    """A function of constants and arguments, with these constants and the kernel of a mode."""
+    kernel = along_kernel(along, mode)
+    return with_kernel(functools.partial(function, along), kernel, (mode, *along.key()), jvp)
+
+
 @functools.cache
 def _greatest(along: Along) -> Callable:
     """`greatest_along`, with a kernel."""
-
-    def of_segment(columns: Array, duration: Array, parameters: Any) -> tuple[Array, ...]:
-        motion = sample_motion(along.maps, along.nodes, columns, duration)
-        return tuple(jnp.max(excess) for excess in along.excess(motion, parameters))
-
-    segments = jax.vmap(of_segment, in_axes=(0, 0, None))
-    return with_kernel(segments, along_kernel(along, "greatest"), along.key())
+    return _with_kernel(_greatest_of_segments, along, "greatest")
 
 
 @functools.cache
 def _integral(along: Along) -> Callable:
-    """`integrate_along`, with kernels for its values, slopes and curvature."""
-    values = functools.partial(_values, along)
-    values_in_lanes = with_kernel(values, along_kernel(along, "values"), along.key())
+    """`integrate_along`, with kernels for its values, its slopes and their derivatives."""
+    values = _with_kernel(_values, along, "values")
+    slopes = _with_kernel(_slopes, along, "slopes")
+    curvature = _with_kernel(_curvature, along, "curvature")
 
-    def slopes(columns: Array, durations: Array, parameters: Any) -> tuple[Array, ...]:
-        value: Any = lambda c, h: values(c, h, parameters)  # noqa: E731
-        penalties, pull_back, worst = jax.vjp(value, columns, durations, has_aux=True)
-        return penalties, worst, *pull_back(jnp.ones_like(penalties))
+    def derived_slopes(primals: tuple, tangents: tuple) -> tuple:
+        """Slopes by all arguments, and their derivative along the tangents."""
+        moved = None if _is_still(tangents[2]) else jax.tree.map(_dense, tangents[2])
+        direction = (*map(_dense, tangents[:2]), moved)
+        return slopes_by_all(*primals), curvature(primals, direction)
 
-    slopes_in_lanes = with_kernel(slopes, along_kernel(along, "slopes"), along.key())
+    slopes_by_all = _with_kernel(_slopes_by_all, along, "slopes by all", derived_slopes)
 
-    def segment_slopes(columns: Array, duration: Array, parameters: Any) -> tuple:
+    def derived_values(primals: tuple, tangents: tuple) -> tuple:
+        """Penalties and greatest excesses, and their derivative along the tangents."""
+        is_solvers = _is_still(tangents[2])  # the solver moves columns and durations alone
+        penalties, worst, *by = (slopes if is_solvers else slopes_by_all)(*primals)
+        tangents = jax.tree.map(_dense, tangents[: len(by)] if is_solvers else tangents)
+        moved = jax.tree.leaves(jax.tree.map(_contracted, (*by,), tangents))
+        return (penalties, worst), (sum(moved[1:], moved[0]), jnp.zeros_like(worst))
+
+    integral = jax.custom_jvp(lambda *args: values(*args))
+    integral.defjvp(derived_values, symbolic_zeros=True)
+    return integral
+
+
+def _greatest_of_segments(
+    along: Along, columns: Array, durations: Array, parameters: Any
+) -> tuple[Array, ...]:
+    """Greatest excess over every limit: E arrays (N,)."""
+
+    def of_segment(columns: Array, duration: Array) -> tuple[Array, ...]:
+        motion = sample_motion(along.maps, along.nodes, columns, duration)
+        return tuple(jnp.max(excess) for excess in along.excess(motion, parameters))
+
+    return jax.vmap(of_segment)(columns, durations)
+
+
+def _values(along: Along, columns: Array, durations: Array, parameters: Any) -> tuple[Array, Array]:
+    """Penalties and greatest excesses, (N,) each."""
+    segments = jax.vmap(functools.partial(_of_segment, along), in_axes=(0, 0, None))
+    return segments(columns, durations, parameters)
+
+
+def _slopes(along: Along, columns: Array, durations: Array, parameters: Any) -> tuple[Array, ...]:
+    """Values, and slopes of the penalties by columns (N, C, 3) and durations (N,)."""
+    value: Any = lambda c, h: _values(along, c, h, parameters)  # noqa: E731
+    penalties, pull_back, worst = jax.vjp(value, columns, durations, has_aux=True)
+    return penalties, worst, *pull_back(jnp.ones_like(penalties))
+
+
+def _slopes_by_all(along: Along, columns: Array, durations: Array, parameters: Any) -> tuple:
+    """`_slopes`, and those by the parameters, which every segment has for itself: N in front."""
+
+    def of_segment(columns: Array, duration: Array, parameters: Any) -> tuple:
         value: Any = functools.partial(_of_segment, along)
         penalty, pull_back, worst = jax.vjp(value, columns, duration, parameters, has_aux=True)
         return penalty, jax.lax.stop_gradient(worst), *pull_back(jnp.ones_like(penalty))
 
-    slopes_by_all: Any = jax.vmap(segment_slopes, in_axes=(0, 0, None))
+    segments: Any = jax.vmap(of_segment, in_axes=(0, 0, None))
+    return segments(columns, durations, parameters)
 
-    def curved(primals: tuple, tangents: tuple) -> tuple:
-        """Tangents of `slopes_by_all`; None for those of parameters that do not move."""
-        *free, given = primals
-        if tangents[2] is None:
-            return jax.jvp(lambda *x: slopes_by_all(*x, given), tuple(free), tangents[:2])[1]
-        return jax.jvp(slopes_by_all, primals, tangents)[1]
 
-    curved_in_lanes = with_kernel(curved, along_kernel(along, "curvature"), along.key())
-
-    def curve(primals: tuple, tangents: tuple) -> tuple:
-        given = None if _is_still(tangents[2]) else jax.tree.map(_dense, tangents[2])
-        moving = (*map(_dense, tangents[:2]), given)
-        return slopes_by_all_in_lanes(*primals), curved_in_lanes(primals, moving)
-
-    slopes_by_all_in_lanes = with_kernel(
-        slopes_by_all, along_kernel(along, "slopes by all"), along.key(), curve
-    )
-
-    @jax.custom_jvp
-    def integral(columns: Array, durations: Array, parameters: Any) -> tuple[Array, Array]:
-        return values_in_lanes(columns, durations, parameters)
-
-    def slope(primals: tuple, tangents: tuple) -> tuple:
-        still = _is_still(tangents[2])
-        tangents = jax.tree.map(_dense, tangents)
-        if still:  # which is what the solver asks for
-            penalties, worst, *by = slopes_in_lanes(*primals)
-            tangents = tangents[:2]
-        else:
-            penalties, worst, *by = slopes_by_all_in_lanes(*primals)
-        moved = jax.tree.leaves(jax.tree.map(_contracted, (*by,), tangents))
-        return (penalties, worst), (sum(moved[1:], moved[0]), jnp.zeros_like(worst))
-
-    integral.defjvp(slope, symbolic_zeros=True)
-    return integral
+def _curvature(along: Along, primals: tuple, tangents: tuple) -> tuple:
+    """Derivative of `_slopes_by_all` along tangents; None for those of still parameters."""
+    moves = 2 if tangents[2] is None else 3
+    slopes: Any = lambda *moving: _slopes_by_all(along, *moving, *primals[moves:])  # noqa: E731
+    return jax.jvp(slopes, primals[:moves], tangents[:moves])[1]
 
 
 def _contracted(slope: Array, tangent: Array) -> Array:
-    """What a tangent moves each segment's penalty by, (N,)."""
+    """What a tangent adds to each segment's penalty, (N,)."""
     return jnp.sum(slope * tangent, axis=tuple(range(1, slope.ndim)))
 
 
@@ -171,16 +187,10 @@ def _dense(tangent: Any) -> Any:
     return jnp.zeros(aval.shape, aval.dtype)
 
 
-def _values(
-    along: Along, columns: Array, piece_durations: Array, parameters: Any
-) -> tuple[Array, Array]:
-    segments = jax.vmap(functools.partial(_of_segment, along), in_axes=(0, 0, None))
-    return segments(columns, piece_durations, parameters)
-
-
 def _of_segment(
     along: Along, columns: Array, duration: Array, parameters: Any
 ) -> tuple[Array, Array]:
+    """Penalty and greatest excess of one segment."""
     weights = jnp.asarray(along.weights(), columns.dtype)
     margins = jnp.asarray(np.array(along.margins)[:, None], columns.dtype)
     motion = sample_motion(along.maps, along.nodes, columns, duration)

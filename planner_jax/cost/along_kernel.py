@@ -1,4 +1,4 @@
-"""`integrate_along` and `greatest_along` on many lanes as one kernel for CUDA, in Pallas' Triton.
+"""`integrate_along` and `greatest_along` on many lanes as one kernel for CUDA.
 
 A thread carries a lane. It reads the columns once, makes the samples one after another, each
 from a row of the constant matrices, and adds up penalties and, by the transposed product,
@@ -6,6 +6,7 @@ slopes. Memory sees the columns, the results and nothing in between. Where there
 several threads share the samples of one.
 """
 
+import dataclasses
 import functools
 import math
 import operator
@@ -18,7 +19,7 @@ from jax import Array
 
 from planner_jax.arithmetic import reciprocal
 from planner_jax.cost.penalty import smoothed_hinge
-from planner_jax.lanes import block_width
+from planner_jax.lanes.pallas import Block, block_width, kernel_call, place_in_grid
 from planner_jax.trajectory.polynomial import Motion
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 _THREADS = 128  # lanes of a block
 _ENOUGH = 512  # blocks that keep a large GPU busy
 _AXES = ((2,), (0, 1, 2), (0, 1, 2), (0, 1, 2))  # that a motion has of position to jerk
-
+_WORST = 1  # place of the greatest excess among the results
 
 # What is made of the samples: each limit's greatest excess; the sum of penalties, and the greatest
 # excess of all; also slopes by columns and durations; also those by the parameters; or the
@@ -36,7 +37,7 @@ MODES = ("greatest", "values", "slopes", "slopes by all", "curvature")
 
 
 def along_kernel(along: "Along", mode: str, *, interpret: bool = False) -> Callable:
-    """What `lanes.with_kernel` takes: the lanes' arrays to the lanes' results, or None.
+    """The kernel that `lanes.with_kernel` attaches to one of the functions in `along`.
 
     Args:
         along: constants.
@@ -67,190 +68,232 @@ def along_kernel(along: "Along", mode: str, *, interpret: bool = False) -> Calla
 
         args = [(flat(c, num_columns, 3), flat(h), given) for c, h, given in points]
         args = tuple(args) if mode == "curvature" else args[0]
-        sizes = math.prod(lead), num_columns, lanes, threads
-        call = _call(along, mode, interpret, treedef, *sizes)
-        found = call(*jax.tree.leaves(args))
-        found = [
-            jnp.max(x, axis=0) if mode == "greatest" or k == _WORST else jnp.sum(x, axis=0)
-            for k, x in enumerate(found)
+        sizes = _Sizes(math.prod(lead), num_columns, lanes, threads)
+        shares = _call(along, mode, interpret, treedef, sizes)(*jax.tree.leaves(args))
+        results = [
+            jnp.max(share, axis=0) if mode == "greatest" or k == _WORST else jnp.sum(share, axis=0)
+            for k, share in enumerate(shares)
         ]
-        return [leaf.reshape(*lead, *leaf.shape[1:]) for leaf in found]
+        return [result.reshape(*lead, *result.shape[1:]) for result in results]
 
     return kernel
+
+
+@dataclasses.dataclass(frozen=True)
+class _Sizes:
+    """Of a kernel for some trajectories of each lane."""
+
+    trajectories: int
+    num_columns: int  # C
+    lanes: int
+    threads: int  # of a block, each of which carries a lane
+
+
+@functools.cache
+def _call(
+    along: "Along", mode: str, interpret: bool, treedef: Any, sizes: _Sizes
+) -> Callable[..., list[Array]]:
+    """The kernel, of the leaves of its arguments, to results with shares of the samples first."""
+    matrices, weights = along.matrices(), along.weights()
+    num_samples, num_columns = len(weights), sizes.num_columns
+    blocks = sizes.lanes // sizes.threads
+    shares = min(max(_ENOUGH // (sizes.trajectories * blocks), 1), 8)
+    share = -(-num_samples // shares)
+    shapes = _result_shapes(along, mode, treedef, num_columns)
+    num_greatest = len(shapes) if mode == "greatest" else 1
+    num_sums = sum(map(math.prod, shapes)) - num_greatest
+
+    def body(*refs):
+        leaves = [_loaded(ref) for ref in refs[: treedef.num_leaves]]
+        matrices_ref, weights_ref, *out = refs[treedef.num_leaves :]
+        args = jax.tree.unflatten(treedef, leaves)
+        duration = leaves[1]
+
+        def add_sample(k: Array, carry: tuple) -> tuple:
+            row = [
+                [matrices_ref[k, d * num_columns + c] for c in range(num_columns)] for d in range(4)
+            ]
+            most, sums = carry
+            greatest, terms = _of_sample(along, mode, _Sample(row, weights_ref[k]), args)
+            most = list(map(jnp.maximum, most, greatest)) if greatest else most
+            return most, list(map(jnp.add, sums, jax.tree.leaves(terms)))
+
+        zero = jnp.zeros_like(duration)
+        worst = zero if mode == "curvature" else jnp.full_like(duration, -jnp.inf)
+        first = place_in_grid(2) * share
+        last = jnp.minimum(first + share, num_samples)
+        start = [worst] * num_greatest, [zero] * num_sums
+        most, sums = jax.lax.fori_loop(first, last, add_sample, start)
+        _store(out, [*sums[:_WORST], *most, *sums[_WORST:]])
+
+    def whole(*shape: int) -> Block:
+        return shape, lambda *_: (0,) * len(shape)
+
+    def result(*shape: int) -> tuple[tuple[int, ...], Any, Block]:
+        block = (None, None, *shape, sizes.threads)
+        place = lambda t, i, s: (s, t, *(0 for _ in shape), i)  # noqa: E731
+        return (shares, sizes.trajectories, *shape, sizes.lanes), jnp.float32, (block, place)
+
+    inputs: dict[int, Block] = {  # by the axes of an argument's leaf
+        1: ((sizes.threads,), lambda t, i, s: (i,)),
+        2: ((None, sizes.threads), lambda t, i, s: (t, i)),
+        4: ((None, num_columns, 3, sizes.threads), lambda t, i, s: (t, 0, 0, i)),
+    }
+
+    def call(*leaves: Array) -> list[Array]:
+        kernel = kernel_call(
+            body,
+            (sizes.trajectories, blocks, shares),
+            [
+                *(inputs[leaf.ndim] for leaf in leaves),
+                whole(num_samples, 4 * num_columns),
+                whole(num_samples),
+            ],
+            [result(*shape) for shape in shapes],
+            name="integrate_along",
+            threads=sizes.threads,
+            interpret=interpret,
+        )
+        rows = jnp.asarray(matrices.reshape(num_samples, -1), jnp.float32)
+        return kernel(*leaves, rows, jnp.asarray(weights, jnp.float32))
+
+    return call
+
+
+def _result_shapes(
+    along: "Along", mode: str, treedef: Any, num_columns: int
+) -> list[tuple[int, ...]]:
+    """Shapes of the results for one trajectory of one lane."""
+    if mode == "greatest":
+        return [()] * len(along.margins)
+    shapes: list[tuple[int, ...]] = [(), ()]
+    if mode != "values":
+        shapes += [(num_columns, 3), ()]
+    if mode in ("slopes by all", "curvature"):
+        args = jax.tree.unflatten(treedef, range(treedef.num_leaves))
+        point = args[0] if mode == "curvature" else args
+        shapes += [()] * len(jax.tree.leaves(point[2]))
+    return shapes
+
+
+def _loaded(ref: Any) -> Any:
+    """Number of each lane, or C columns of three numbers."""
+    if len(ref.shape) != 3:
+        return ref[...]
+    return [[ref[c, axis] for axis in range(3)] for c in range(ref.shape[0])]
+
+
+def _store(refs: Sequence[Any], values: Iterable[Array]) -> None:
+    """Write the results, of which columns come number by number."""
+    numbers = iter(values)
+    for ref in refs:
+        if len(ref.shape) == 3:
+            for c in range(ref.shape[0]):
+                for axis in range(3):
+                    ref[c, axis] = next(numbers)
+        else:
+            ref[...] = next(numbers)
+
+
+@dataclasses.dataclass
+class _Sample:
+    """The constants of one sample."""
+
+    row: list[list[Array]]  # position to jerk, each from C columns
+    weight: Array
+
+    def unit_motion(self, columns: list[list[Array]]) -> list[list[Array]]:
+        """Position to jerk, in time over the duration; of the position the height alone."""
+        return [
+            [
+                _total(self.row[d][c] * columns[c][axis] for c in range(len(columns)))
+                for axis in axes
+            ]
+            for d, axes in enumerate(_AXES)
+        ]
+
+    def slope_by_columns(self, slope: list[list[Array]]) -> list[list[Array]]:
+        """What a slope by the unit motion is by the columns."""
+        return [
+            [
+                _total(
+                    self.row[d][c] * slope[d][axes.index(axis)]
+                    for d, axes in enumerate(_AXES)
+                    if axis in axes
+                )
+                for axis in range(3)
+            ]
+            for c in range(len(self.row[0]))
+        ]
 
 
 def _total(terms: Iterable) -> Any:
     return functools.reduce(operator.add, terms)
 
 
-_WORST = 1  # place of the greatest excess among the results
+def _of_sample(along: "Along", mode: str, sample: _Sample, args: Any) -> tuple[list, tuple]:
+    """What one sample gives in a mode.
+
+    Returns:
+        greatest: excesses, the greatest of which over the samples are results.
+        terms: of the sums over the samples, in the order of the results.
+    """
+    (columns, duration, given), direction = args if mode == "curvature" else (args, ())
+    free = sample.unit_motion(columns), duration
+    if mode == "greatest":
+        return list(_excess(along, *free, given)), ()
+    if mode == "values":
+        value, worst = _penalty(along, *free, given)
+        return [worst], (sample.weight * value,)
+    if mode == "slopes":
+        worst, terms = _slopes(along, sample.weight, free, (given,))
+    elif mode == "slopes by all":
+        worst, terms = _slopes(along, sample.weight, (*free, given), ())
+    else:
+        worst, terms = None, _curvature(along, sample, free, given, direction)
+    value, by_motion, *others = terms
+    terms = value, sample.slope_by_columns(by_motion), *others
+    return [] if worst is None else [worst], terms
 
 
-@functools.cache
-def _call(
-    along: "Along",
-    mode: str,
-    interpret: bool,
-    treedef: Any,
-    lead: int,
-    num_columns: int,
-    lanes: int,
-    threads: int,
-) -> Callable:
-    """The kernel for `lead` trajectories of each of `lanes` lanes."""
-    from jax.experimental import pallas as pl
-    from jax.experimental.pallas import triton
+def _excess(along: "Along", unit: list, duration: Array, given: Any) -> tuple[Array, ...]:
+    """Excess over each limit, of a motion in time over the duration."""
+    rate = reciprocal(duration)
+    rates = [None, rate, rate * rate, rate * rate * rate]
+    vel, acc, jerk = (tuple(value * rates[d] for value in unit[d]) for d in range(1, 4))
+    parts: Any = {"height": unit[0][0], "vel": vel, "acc": acc, "jerk": jerk}
+    return along.excess(Motion(**parts), given)
 
-    matrices, weights = along.matrices(), along.weights()
-    num_samples = len(weights)
-    blocks = lead * lanes // threads
-    shares = min(max(_ENOUGH // blocks, 1), 8)
-    share = -(-num_samples // shares)
-    num_leaves = treedef.num_leaves
-    places = jax.tree.unflatten(treedef, range(num_leaves))
-    point = places[0] if mode == "curvature" else places
-    by_parameters = len(jax.tree.leaves(point[2])) * (mode in ("slopes by all", "curvature"))
-    by_columns = mode not in ("greatest", "values")
-    sums_up = mode != "greatest"
-    num_greatest = 1 if sums_up else len(along.margins)
 
-    def body(*refs):
-        loaded = [
-            [[ref[c, axis] for axis in range(3)] for c in range(num_columns)]
-            if len(ref.shape) == 3
-            else ref[...]
-            for ref in refs[:num_leaves]
-        ]
-        matrices_ref, weights_ref, *out = refs[num_leaves:]
-        args = jax.tree.unflatten(treedef, loaded)
-        (columns, duration, given), direction = args if mode == "curvature" else (args, args)
+def _penalty(along: "Along", unit: list, duration: Array, given: Any) -> tuple[Array, Array]:
+    """Sum of hinges times the duration, and the greatest excess of all."""
+    excess = _excess(along, unit, duration, given)
+    hinges = [
+        smoothed_hinge(value + margin, along.hinge_width)
+        for value, margin in zip(excess, along.margins, strict=True)
+    ]
+    return duration * _total(hinges), functools.reduce(jnp.maximum, excess)
 
-        def excess_at(unit: list, duration: Array, given: Any) -> tuple[Array, ...]:
-            rate = reciprocal(duration)
-            rates = [None, rate, rate * rate, rate * rate * rate]
-            vel, acc, jerk = (tuple(value * rates[d] for value in unit[d]) for d in range(1, 4))
-            parts: Any = {"height": unit[0][0], "vel": vel, "acc": acc, "jerk": jerk}
-            return along.excess(Motion(**parts), given)
 
-        def penalty(unit: list, duration: Array, given: Any) -> tuple[Array, Array]:
-            excess = excess_at(unit, duration, given)
-            hinges = [
-                smoothed_hinge(value + margin, along.hinge_width)
-                for value, margin in zip(excess, along.margins, strict=True)
-            ]
-            return duration * _total(hinges), functools.reduce(jnp.maximum, excess)
+def _slopes(along: "Along", weight: Array, free: tuple, fixed: tuple) -> tuple[Array, tuple]:
+    """The greatest excess; and the weighted penalty with its slopes by what is free.
 
-        def sample(k: Array, carry: tuple) -> tuple:
-            most, sums = carry
-            row = [
-                [matrices_ref[k, d * num_columns + c] for c in range(num_columns)] for d in range(4)
-            ]
-            weight = weights_ref[k]
+    The arguments of `_penalty` are first the free ones, then the fixed ones.
+    """
+    value, pull_back, worst = jax.vjp(lambda *x: _penalty(along, *x, *fixed), *free, has_aux=True)
+    return worst, (weight * value, *pull_back(jnp.ones_like(value) * weight))
 
-            def unit_of(columns: list) -> list:
-                return [
-                    [
-                        _total(row[d][c] * columns[c][axis] for c in range(num_columns))
-                        for axis in axes
-                    ]
-                    for d, axes in enumerate(_AXES)
-                ]
 
-            def slopes(*free: Any, fixed: tuple = ()) -> tuple:
-                moving: Any = lambda *free: penalty(*free, *fixed)  # noqa: E731
-                value, pull_back, greatest = jax.vjp(moving, *free, has_aux=True)
-                return greatest, weight * value, *pull_back(jnp.ones_like(value) * weight)
+def _curvature(
+    along: "Along", sample: _Sample, free: tuple, given: Any, direction: tuple
+) -> tuple[Any, ...]:
+    """Derivative, along a direction, of the weighted penalty and its slopes by all arguments."""
+    columns, duration, moved_given = direction
+    moving, tangents, still = free, (sample.unit_motion(columns), duration), (given,)
+    if moved_given is not None:
+        moving, tangents, still = (*free, given), (*tangents, moved_given), ()
 
-            free = (unit_of(columns), duration)
-            greatest, found = most, ()
-            if mode == "greatest":
-                greatest = list(map(jnp.maximum, most, excess_at(*free, given)))
-            elif mode == "values":
-                value, worst = penalty(*free, given)
-                greatest, found = [jnp.maximum(most[0], worst)], (weight * value,)
-            elif mode == "slopes":
-                worst, *found = slopes(*free, fixed=(given,))
-                greatest = [jnp.maximum(most[0], worst)]
-            elif mode == "slopes by all":
-                worst, *found = slopes(*free, given)
-                greatest = [jnp.maximum(most[0], worst)]
-            else:
-                along_columns, along_duration, along_given = direction
-                tangents = (unit_of(along_columns), along_duration)
-                if along_given is None:
-                    moving: Any = lambda *free: slopes(*free, given)  # noqa: E731
-                else:
-                    moving, free, tangents = slopes, (*free, given), (*tangents, along_given)
-                _, (_, *found) = jax.jvp(moving, free, tangents)
-            if len(found) > 1:
-                found[1] = [
-                    [
-                        _total(
-                            row[d][c] * found[1][d][axes.index(axis)]
-                            for d, axes in enumerate(_AXES)
-                            if axis in axes
-                        )
-                        for axis in range(3)
-                    ]
-                    for c in range(num_columns)
-                ]
-            return greatest, list(map(jnp.add, sums, jax.tree.leaves(found)))
+    def slopes(*moving: Any) -> tuple:
+        return _slopes(along, sample.weight, (*moving, *still), ())[1]
 
-        zero = jnp.zeros_like(duration)
-        worst = zero if mode == "curvature" else jnp.full_like(duration, -jnp.inf)
-        first = pl.program_id(2) * share
-        last = jnp.minimum(first + share, num_samples)
-        num_sums = 1 + by_columns * (3 * num_columns + 1) + by_parameters if sums_up else 0
-        start = [worst] * num_greatest, [zero] * num_sums
-        most, sums = jax.lax.fori_loop(first, last, sample, start)
-        found = iter([*sums[:_WORST], *most, *sums[_WORST:]])
-        for ref in out:
-            if len(ref.shape) == 3:
-                for c in range(num_columns):
-                    for axis in range(3):
-                        ref[c, axis] = next(found)
-            else:
-                ref[...] = next(found)
-
-    def whole(*shape: int) -> pl.BlockSpec:
-        return pl.BlockSpec(shape, lambda *_: (0,) * len(shape))
-
-    one = pl.BlockSpec((None, threads), lambda t, i, s: (t, i))
-    many = pl.BlockSpec((None, num_columns, 3, threads), lambda t, i, s: (t, 0, 0, i))
-    shared = pl.BlockSpec((threads,), lambda t, i, s: (i,))
-    # Results have the shares of the samples in front.
-    one_out = pl.BlockSpec((None, None, threads), lambda t, i, s: (s, t, i))
-    many_out = pl.BlockSpec((None, None, num_columns, 3, threads), lambda t, i, s: (s, t, 0, 0, i))
-    number = jax.ShapeDtypeStruct((shares, lead, lanes), jnp.float32)
-    vector = jax.ShapeDtypeStruct((shares, lead, num_columns, 3, lanes), jnp.float32)
-
-    def call(*leaves: Array) -> list[Array]:
-        specs = {1: shared, 2: one, 4: many}
-        return pl.pallas_call(
-            body,
-            out_shape=[
-                *((number,) * (sums_up + num_greatest)),
-                *((vector, number) if by_columns else ()),
-                *((number,) * by_parameters),
-            ],
-            grid=(lead, lanes // threads, shares),
-            in_specs=[
-                *(specs[leaf.ndim] for leaf in leaves),
-                whole(num_samples, 4 * num_columns),
-                whole(num_samples),
-            ],
-            out_specs=[
-                *((one_out,) * (sums_up + num_greatest)),
-                *((many_out, one_out) if by_columns else ()),
-                *((one_out,) * by_parameters),
-            ],
-            compiler_params=triton.CompilerParams(num_warps=max(threads // 32, 1), num_stages=1),
-            interpret=interpret,
-            name="integrate_along",
-        )(
-            *leaves,
-            jnp.asarray(matrices.reshape(num_samples, -1), jnp.float32),
-            jnp.asarray(weights, jnp.float32),
-        )
-
-    return call
+    return jax.jvp(slopes, moving, tangents)[1]

@@ -1,25 +1,24 @@
-"""The inverse of a small matrix on many lanes as one kernel for CUDA, in Pallas' Triton.
+"""The inverse of a small matrix on many lanes as one kernel for CUDA.
 
-A thread keeps its lane's matrix in registers. In single operations every pivot waits for the last
-one, and all entries cross the memory at each.
+A thread keeps its lane's matrix in registers. As operations of their own
+the pivots wait for one another, and all entries cross the memory at each.
 """
 
 import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 
-from planner_jax.lanes import block_width
+from planner_jax.lanes.pallas import block_width, kernel_by_lanes
 
 _THREADS = 32  # lanes of a block
 _LARGEST = 12  # rows, all of whose entries a thread can keep
 
 
 def inverse_kernel(*, interpret: bool = False) -> Callable:
-    """What `lanes.with_kernel` takes for `sensitivity.positive_inverse`.
+    """The kernel that `lanes.with_kernel` attaches to `sensitivity.positive_inverse`.
 
     Args:
         interpret: run it without a GPU, for tests.
@@ -32,7 +31,7 @@ def inverse_kernel(*, interpret: bool = False) -> Callable:
             return None
         if matrix.shape[0] > _LARGEST:
             return None
-        return [_call(matrix.shape[0], matrix.shape[-1], width, interpret)(matrix)]
+        return _call(matrix.shape[0], matrix.shape[-1], width, interpret)(matrix)
 
     return kernel
 
@@ -40,8 +39,6 @@ def inverse_kernel(*, interpret: bool = False) -> Callable:
 @functools.cache
 def _call(size: int, lanes: int, width: int, interpret: bool) -> Callable:
     """The kernel for matrices of `size` rows on `lanes` lanes."""
-    from jax.experimental import pallas as pl
-    from jax.experimental.pallas import triton
 
     def body(matrix, out):
         entries = [[matrix[i, j] for j in range(size)] for i in range(size)]
@@ -59,14 +56,6 @@ def _call(size: int, lanes: int, width: int, interpret: bool) -> Callable:
             for j in range(size):
                 out[i, j] = entries[i][j]
 
-    block = pl.BlockSpec((size, size, width), lambda i: (0, 0, i))
-    return pl.pallas_call(
-        body,
-        out_shape=jax.ShapeDtypeStruct((size, size, lanes), jnp.float32),
-        grid=(lanes // width,),
-        in_specs=[block],
-        out_specs=block,
-        compiler_params=triton.CompilerParams(num_warps=1, num_stages=1),
-        interpret=interpret,
-        name="positive_inverse",
-    )
+    shapes = [(size, size)]
+    options = {"name": "positive_inverse", "interpret": interpret}
+    return kernel_by_lanes(body, shapes, shapes, lanes, width, **options)

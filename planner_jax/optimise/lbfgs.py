@@ -18,7 +18,7 @@ from flax import struct
 from jax import Array
 
 from planner_jax.lanes import in_one_kernel, with_kernel
-from planner_jax.optimise.lbfgs_kernel import turn_kernel
+from planner_jax.optimise.lbfgs_kernel import judged_pair, shortening, start_scale, turn_kernel
 
 
 @struct.dataclass
@@ -112,13 +112,10 @@ def init(point: Array, config: LbfgsConfig) -> LbfgsState:
 def remember(memory: Memory, step: Array, change: Array) -> Memory:
     """The memory with one pair (n,), (n,) more.
 
-    A pair without positive curvature is left out. After no step at all the memory is emptied:
-    the next direction is steepest descent.
+    A pair without positive curvature is left out. After no step, or one too short for its squared
+    length to be a number above zero, the memory is emptied: the next direction is steepest descent.
     """
-    curvature = jnp.sum(step * change)
-    keep = curvature > 1e-8 * jnp.sum(change**2)
-    moved = jnp.any(step != 0.0)
-    inverse = jnp.where(keep, 1.0 / jnp.where(keep, curvature, 1.0), 0.0)
+    keep, moved, inverse = judged_pair(jnp.sum(step * change), jnp.sum(change**2), jnp.sum(step**2))
 
     def push(old: Array, new: Array) -> Array:
         pushed = jnp.concatenate([old[1:], new[None]])
@@ -144,16 +141,12 @@ def search_direction(memory: Memory, grad: Array, step_cap: float) -> Array:
         alpha = memory.inverse_curvature[k] * jnp.sum(memory.steps[k] * q)
         q = q - alpha * memory.changes[k]
         alphas.append(alpha)
-    newest = memory.inverse_curvature[-1]
-    size = jnp.sum(memory.changes[-1] ** 2) * newest
-    slope = jnp.sqrt(jnp.maximum(jnp.sum(grad**2), 1e-30))
-    gamma = jnp.where(newest > 0.0, 1.0 / jnp.where(newest > 0.0, size, 1.0), 1.0 / slope)
-    q = gamma * q
+    newest_change = jnp.sum(memory.changes[-1] ** 2)
+    q = start_scale(memory.inverse_curvature[-1], newest_change, jnp.sum(grad**2)) * q
     for k, alpha in zip(pairs, reversed(alphas), strict=True):
         beta = memory.inverse_curvature[k] * jnp.sum(memory.changes[k] * q)
         q = q + memory.steps[k] * (alpha - beta)
-    length = jnp.sqrt(jnp.maximum(jnp.sum(q**2), 1e-30))
-    return -q * jnp.minimum(1.0, step_cap / length)
+    return -q * shortening(jnp.sum(q**2), step_cap)
 
 
 @functools.cache

@@ -47,10 +47,16 @@ def require_backend() -> str:
     """The platform that JAX computes on.
 
     Raises:
-        SettingError: JAX has none that works.
+        SettingError: JAX has none that works, or the switch for kernels has a wrong value.
     """
     import jax
 
+    from planner_jax.lanes.pallas import is_switched_on
+
+    try:
+        is_switched_on()
+    except ValueError as error:
+        raise SettingError(str(error)) from None
     try:
         return jax.default_backend()
     except (RuntimeError, AssertionError) as error:

@@ -1,9 +1,12 @@
-"""Jaxprs carried out with other values than arrays: what `lanes` and `lanes_kernel` share."""
+"""Walking through a jaxpr, JAX's list of a function's operations, with values of any kind.
+
+`over` walks with arrays that have the lanes last, `scalars` with the single numbers of a kernel.
+"""
 
 from collections.abc import Callable
 from typing import Any
 
-from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
+from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal
 
 _CALLS = frozenset(
     "checkpoint closed_call core_call custom_jvp_call custom_vjp_call jit pjit remat2".split()
@@ -14,17 +17,17 @@ _UNCHANGED = frozenset("copy copy_p reshard stop_gradient".split())
 
 
 def evaluate(
-    jaxpr: Jaxpr, consts: Any, args: list[Any], outputs: Callable[[JaxprEqn, list[Any]], list[Any]]
+    closed: ClosedJaxpr, args: list[Any], outputs: Callable[[JaxprEqn, list[Any]], list[Any]]
 ) -> list[Any]:
-    """Values of the outputs of a jaxpr.
+    """Values of the outputs of a function.
 
     Args:
-        jaxpr: to be carried out.
-        consts: values of its constants.
+        closed: the function's operations and constants.
         args: values of its arguments, of any kind that `outputs` takes.
-        outputs: values that one operation makes of those of its inputs.
+        outputs: of one operation and the values of its inputs, to the values of its outputs.
     """
-    values: dict[Any, Any] = dict(zip(jaxpr.constvars, consts, strict=True))
+    jaxpr = closed.jaxpr
+    values: dict[Any, Any] = dict(zip(jaxpr.constvars, closed.consts, strict=True))
     values.update(zip(jaxpr.invars, args, strict=True))
 
     def read(atom: Any) -> Any:
@@ -33,8 +36,7 @@ def evaluate(
     for eqn in jaxpr.eqns:
         inputs = [read(atom) for atom in eqn.invars]
         is_same = eqn.primitive.name in _UNCHANGED
-        found = inputs if is_same else outputs(eqn, inputs)
-        values.update(zip(eqn.outvars, found, strict=True))
+        values.update(zip(eqn.outvars, inputs if is_same else outputs(eqn, inputs), strict=True))
     return [read(atom) for atom in jaxpr.outvars]
 
 

@@ -1,10 +1,11 @@
-"""A small function of one lane as one kernel for CUDA, in Pallas' Triton.
+"""A small function of one lane made into one kernel, number by number.
 
-A thread carries a lane and keeps every number of every array in a register of its own. The
-function is taken apart into operations on single numbers, each done once and only if a result
-needs it. So shapes cost nothing: what would be a launch for each concatenation and each sum over
-an axis is one launch altogether. Vectors that only pass through should not: the compiler's time
-grows with the numbers that cross between a kernel and the memory.
+In the kernel a thread carries a lane and keeps every number of every array in a register of its
+own. The function is taken apart into operations on single numbers, each done once and only if a
+result needs it. So shapes cost nothing: where JAX's operations are a launch for each concatenation
+and each sum over an axis, the kernel is one launch altogether. Vectors that only pass through
+should stay outside: the compiler's time grows with the numbers that cross between a kernel and the
+memory.
 """
 
 import dataclasses
@@ -14,16 +15,16 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Primitive
 
-from planner_jax.jaxprs import called, evaluate, shape_of
+from planner_jax.lanes import pallas
+from planner_jax.lanes.walk import called, evaluate, shape_of
 
-# The compiler looks from each access to memory at all operations, and from each of these again.
-# Accesses times squared numbers: so many take it some 5 s. Larger functions are refused.
+# Triton's compiler visits, for every access to memory, all operations from all operations. So many
+# accesses times squared operations take it some 5 s; larger functions are refused.
 _MOST = 3e8
 
 _ELEMENTWISE = frozenset(
@@ -42,22 +43,22 @@ _TYPES = frozenset(map(np.dtype, (np.float32, np.float64, np.int32, np.int64, np
 
 
 class Unsupported(Exception):
-    """The function does what a kernel does not, or too much."""
+    """The function has operations that a kernel cannot have, or too many."""
 
 
-def lanes_kernel(
+def scalar_kernel(
     closed: ClosedJaxpr,
     args: Sequence[Array | np.ndarray],
     threads: int,
     *,
     interpret: bool = False,
 ) -> list[Array]:
-    """The function on many lanes.
+    """Results of the function on many lanes, by a kernel.
 
     Args:
         closed: the function of one lane.
         args: its arguments: jax arrays with the lanes on the last axis, some of which may have
-            axes more in front, that are then in front of all results; and NumPy arrays, which
+            further axes in front, that are then in front of all results; and NumPy arrays, which
             are the same for all lanes.
         threads: lanes of a block.
         interpret: run it without a GPU, for tests.
@@ -68,9 +69,6 @@ def lanes_kernel(
     Raises:
         Unsupported: no such kernel can be made.
     """
-    from jax.experimental import pallas as pl
-    from jax.experimental.pallas import triton
-
     numbers = _Numbers()
     leaves, own, values = [], [], []
     for arg, aval in zip(args, closed.in_avals, strict=True):
@@ -81,8 +79,8 @@ def lanes_kernel(
         leaves.append(arg)
         own.append(aval.shape)
     out: Any = [(aval.shape, aval.dtype) for aval in closed.out_avals]
-    found = _evaluate(numbers, closed, values)
-    results = [_entries(value, shape) for value, (shape, _) in zip(found, out, strict=True)]
+    pairs = zip(_evaluate(numbers, closed, values), out, strict=True)
+    results = [_entries(value, shape) for value, (shape, _) in pairs]
     needed = numbers.needed_by(results)
     accesses = sum(number.is_read for number in needed) + sum(entries.size for entries in results)
     if accesses * len(needed) ** 2 > _MOST:
@@ -104,30 +102,29 @@ def lanes_kernel(
             for index in np.ndindex(*shape):
                 ref[index or ...] = array(entries[index], dtype)
 
-    def spec(shape: tuple[int, ...], has_lead: bool) -> pl.BlockSpec:
+    def block(shape: tuple[int, ...], has_lead: bool = True) -> pallas.Block:
         zeros = (0,) * len(shape)
         if has_lead:
-            return pl.BlockSpec((None, *shape, threads), lambda t, i: (t, *zeros, i))
-        return pl.BlockSpec((*shape, threads), lambda t, i: (*zeros, i))
+            return (None, *shape, threads), lambda t, i: (t, *zeros, i)
+        return (*shape, threads), lambda t, i: (*zeros, i)
 
     leads = [x.shape[: x.ndim - 1 - len(shape)] for x, shape in zip(leaves, own, strict=True)]
     lead, lanes = jnp.broadcast_shapes(*leads), leaves[0].shape[-1]
-    num = math.prod(lead)
+    num: Any = math.prod(lead)
     flat = [
         jnp.broadcast_to(leaf, (*lead, *shape, lanes)).reshape(num, *shape, lanes) if has else leaf
         for leaf, shape, has in zip(leaves, own, leads, strict=True)
     ]
-    made = pl.pallas_call(
+    arrays = pallas.kernel_call(
         body,
-        out_shape=[jax.ShapeDtypeStruct((num, *shape, lanes), dtype) for shape, dtype in out],
-        grid=(num, lanes // threads),
-        in_specs=[spec(shape, bool(has)) for shape, has in zip(own, leads, strict=True)],
-        out_specs=[spec(shape, True) for shape, _ in out],
-        compiler_params=triton.CompilerParams(num_warps=max(threads // 32, 1), num_stages=1),
-        interpret=interpret,
+        (num, lanes // threads),
+        [block(shape, bool(has)) for shape, has in zip(own, leads, strict=True)],
+        [((num, *shape, lanes), dtype, block(shape)) for shape, dtype in out],
         name="lanes",
+        threads=threads,
+        interpret=interpret,
     )(*flat)
-    return [leaf.reshape(*lead, *leaf.shape[1:]) for leaf in made]
+    return [array.reshape(*lead, *array.shape[1:]) for array in arrays]
 
 
 @dataclasses.dataclass(eq=False)
@@ -141,7 +138,7 @@ class _Number:
 
 
 class _Numbers:
-    """All numbers that were asked for, each of them once."""
+    """All numbers of a kernel, each of them once."""
 
     def __init__(self) -> None:
         self.known: dict[tuple, _Number] = {}
@@ -179,14 +176,14 @@ class _Numbers:
 
     def needed_by(self, results: Sequence[np.ndarray]) -> list[_Number]:
         """The numbers that some entries are made of, and these, in order."""
-        found: dict[int, _Number] = {}
+        needed: dict[int, _Number] = {}
         waiting = [entry for entries in results for entry in entries.ravel()]
         while waiting:
             entry = waiting.pop()
-            if isinstance(entry, _Number) and entry.index not in found:
-                found[entry.index] = entry
+            if isinstance(entry, _Number) and entry.index not in needed:
+                needed[entry.index] = entry
                 waiting += entry.operands
-        return [found[index] for index in sorted(found)]
+        return [needed[index] for index in sorted(needed)]
 
 
 class _Argument:
@@ -208,12 +205,10 @@ class _Argument:
         def make(refs: Sequence[Any], array: Callable) -> Array:
             if not own:
                 return refs[self.place][tuple(index) or ...]
-            from jax.experimental.pallas import triton
-
             places = [array(k, jnp.int32) if isinstance(k, _Number) else k for k in index]
             ref = refs[self.place]
             lanes = lax.broadcasted_iota(jnp.int32, ref.shape[-1:], 0)
-            return triton.load(ref.at[(*places, lanes)])
+            return pallas.load(ref, (*places, lanes))
 
         fixed = tuple(None if isinstance(k, _Number) else k for k in index)
         number = self.numbers.number(own, make, "argument", self.place, fixed)
@@ -229,8 +224,7 @@ def _entries(value: Any, shape: tuple[int, ...]) -> np.ndarray:
     """Array of objects: a `_Number`, or what is the same for all lanes."""
     if isinstance(value, _Argument):
         return value.entries
-    found = value if isinstance(value, np.ndarray) else np.asarray(value)
-    return np.broadcast_to(found.astype(object), shape)
+    return np.broadcast_to(np.asarray(value).astype(object), shape)
 
 
 def _is(entry: Any, number: float) -> bool:
@@ -239,20 +233,19 @@ def _is(entry: Any, number: float) -> bool:
 
 def _filled(shape: tuple[int, ...], entry: Callable) -> np.ndarray:
     """The array of the entry at every index."""
-    found = np.empty(shape, object)
+    array = np.empty(shape, object)
     for index in np.ndindex(*shape):
-        found[index] = entry(index)
-    return found
+        array[index] = entry(index)
+    return array
 
 
 def _evaluate(numbers: _Numbers, closed: ClosedJaxpr, args: list[Any]) -> list[Any]:
     """Values of the outputs of a function."""
-    outputs = functools.partial(_outputs, numbers)
-    return evaluate(closed.jaxpr, closed.consts, args, outputs)
+    return evaluate(closed, args, functools.partial(_outputs, numbers))
 
 
 def _outputs(numbers: _Numbers, eqn: JaxprEqn, inputs: list[Any]) -> list[Any]:
-    """What one operation makes of its inputs."""
+    """Values of the outputs of one operation: arrays of numbers."""
     inner = called(eqn)
     if inner is not None:
         return _evaluate(numbers, inner, inputs)
@@ -286,8 +279,8 @@ def _outputs(numbers: _Numbers, eqn: JaxprEqn, inputs: list[Any]) -> list[Any]:
         pair = functools.partial(numbers.paired, dtype=dtypes[0])
         return [_product(eqn, left, right, pair(lax.mul_p), pair(lax.add_p))]
     if name in _MOVES:
-        found = _MOVES[name](eqn.params, shape, *operands)
-        return found if eqn.primitive.multiple_results else [found]
+        moved = _MOVES[name](eqn.params, shape, *operands)
+        return moved if eqn.primitive.multiple_results else [moved]
     raise Unsupported(name)
 
 
@@ -295,12 +288,12 @@ def _running(operand: np.ndarray, params: dict, add: Callable) -> np.ndarray:
     """Sums up to each entry of an axis."""
     order = slice(None, None, -1 if params["reverse"] else 1)
     rows = np.moveaxis(operand, params["axis"], -1)
-    found = np.empty(rows.shape, object)
+    sums = np.empty(rows.shape, object)
     for index in np.ndindex(rows.shape[:-1]):
-        sums = list(itertools.accumulate(rows[index][order], add))
-        for place, value in enumerate(sums[order]):
-            found[(*index, place)] = value
-    return np.moveaxis(found, -1, params["axis"])
+        running = list(itertools.accumulate(rows[index][order], add))
+        for place, value in enumerate(running[order]):
+            sums[(*index, place)] = value
+    return np.moveaxis(sums, -1, params["axis"])
 
 
 def _least(numbers: _Numbers, eqn: JaxprEqn, operand: np.ndarray) -> np.ndarray:
@@ -343,8 +336,8 @@ def _product(
         terms = map(multiply, left[(*batch, i)], right[(*batch, j)])
         return functools.reduce(add, terms)
 
-    found = _filled((*left.shape[:-1], right.shape[-2]), entry)
-    return found.reshape(shape_of(eqn.outvars[0]))
+    product = _filled((*left.shape[:-1], right.shape[-2]), entry)
+    return product.reshape(shape_of(eqn.outvars[0]))
 
 
 def _place(
@@ -417,13 +410,13 @@ def _gathered(numbers: _Numbers, eqn: JaxprEqn, inputs: list[Any]) -> np.ndarray
 def _padded(params: dict, shape: tuple[int, ...], operand: np.ndarray, value: np.ndarray) -> Any:
     if any(low < 0 or high < 0 for low, high, _ in params["padding_config"]):
         raise Unsupported("padding that takes away")
-    found = _filled(shape, lambda _: value[()])
+    padded = _filled(shape, lambda _: value[()])
     inside = tuple(
         slice(low, low + (size - 1) * (between + 1) + 1, between + 1)
         for size, (low, _, between) in zip(operand.shape, params["padding_config"], strict=True)
     )
-    found[inside] = operand
-    return found
+    padded[inside] = operand
+    return padded
 
 
 def _broadcast(params: dict, shape: tuple[int, ...], operand: np.ndarray) -> np.ndarray:

@@ -1,0 +1,6 @@
+"""Functions of one case on many, the lanes last, with kernels where programs are for CUDA."""
+
+from planner_jax.lanes.attach import in_one_kernel, with_kernel
+from planner_jax.lanes.over import over_lanes
+
+__all__ = ["in_one_kernel", "over_lanes", "with_kernel"]

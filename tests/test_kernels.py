@@ -1,0 +1,137 @@
+"""Programs for CUDA hold their kernels, which is seen without a GPU; a switch takes them away."""
+
+import re
+import sys
+
+import jax
+import numpy as np
+import pytest
+
+from planner_jax import doctor
+from planner_jax.lanes import in_one_kernel, over_lanes, pallas
+from planner_jax.optimise.lbfgs import LbfgsConfig
+from planner_jax.optimise.multistart import solve_batch
+from planner_jax.optimise.problem import Round
+from planner_jax.optimise.sensitivity import gradient_at
+from planner_jax.sweep.environment import require_backend
+from planner_jax.sweep.settings import SettingError
+from planner_jax.task.catch.exact import ExactCatch
+from planner_jax.task.catch.suites import make_suite
+from planner_jax.task.hit.exact import ExactHit
+from planner_jax.task.hit.serves import generate_serves, to_scenarios
+
+LANES = 128
+# Of one round: the ball's table; penalties with slopes, without, and the greatest of a finished
+# plan; the direction; and made by `in_one_kernel` the ends of a trajectory, at a point and at the
+# trial steps, their slopes, and the choice of a step.
+ROUND = {"flight_table": 1, "integrate_along": 3, "lanes": 4, "lbfgs_turn": 1}
+# Of gradients: the table and its slopes; penalties' slopes and curvature; the core's inverse.
+GRADIENTS = {"flight_table": 2, "integrate_along": 4, "positive_inverse": 1}
+
+
+@pytest.fixture
+def gpu(monkeypatch):
+    """As on a machine with a GPU, for which programs are lowered, but not compiled."""
+    monkeypatch.delenv(pallas.SWITCH, raising=False)
+    monkeypatch.setattr(pallas, "has_gpu", lambda: True)
+
+
+@pytest.fixture
+def no_triton(monkeypatch):
+    """A JAX without Pallas' Triton backend."""
+    monkeypatch.setitem(sys.modules, "jax.experimental.pallas.triton", None)
+
+
+def kernels_in(function, *args):
+    """How many kernels of each name the function's program for CUDA calls."""
+    device = jax.sharding.AbstractDevice("NVIDIA H100", None, "gpu")
+    mesh = jax.sharding.AbstractMesh((), (), abstract_device=device)
+    with jax.sharding.use_abstract_mesh(mesh):  # later versions of JAX ask for the kind of GPU
+        lowered = jax.jit(function).trace(*args).lower(lowering_platforms=("cuda",))
+    names = re.findall(r'\bname = "(\w+)"', lowered.as_text())
+    return {name: names.count(name) for name in set(names)}
+
+
+def round_of(planner):
+    """A function that nothing has traced before: plans of one round."""
+    attempt = Round(1, LbfgsConfig(max_steps=2))
+    return lambda cases: solve_batch(planner, attempt, cases)
+
+
+def serves():
+    return jax.tree.map(np.asarray, to_scenarios(generate_serves(LANES, 0)))
+
+
+def small():
+    """A function of one lane with one kernel, made anew."""
+
+    def sines(x):
+        return np.float32(2.0) * jax.numpy.sin(x)
+
+    return over_lanes(in_one_kernel(sines))
+
+
+X = np.ones((3, LANES), np.float32)
+
+
+def test_a_round_of_hits_holds_its_kernels(gpu):
+    """Were something of JAX renamed, kernels would go and nothing but the speed would tell."""
+    assert kernels_in(round_of(ExactHit()), serves()) == ROUND
+
+
+@pytest.mark.slow
+def test_a_round_of_catches_holds_its_kernels(gpu):
+    """All but that of the table, which takes one ball a lane and not one a target."""
+    throws = make_suite("throws", num=LANES, seed=0)
+    held = kernels_in(round_of(ExactCatch()), throws)
+    assert held == {name: num for name, num in ROUND.items() if name != "flight_table"}
+
+
+@pytest.mark.slow
+def test_gradients_hold_their_kernels(gpu):
+    planner, lanes = ExactHit(), jax.tree.map(lambda leaf: np.moveaxis(leaf, 0, -1), serves())
+    starts = jax.vmap(lambda case: planner.guesses(planner.prepare(case), 1)[0], out_axes=-1)
+
+    def gradients(case, point):
+        wrt = ("drag", "ball", "limits", "target")
+        return gradient_at(planner, case, point, "stroke.time", wrt, steps=2).by
+
+    points = np.asarray(starts(serves()))
+    assert kernels_in(over_lanes(gradients), lanes, points) == GRADIENTS
+
+
+def test_the_switch_takes_all_kernels_away(gpu, monkeypatch):
+    monkeypatch.setenv(pallas.SWITCH, "on")
+    assert kernels_in(small(), X) == {"lanes": 1}
+    monkeypatch.setenv(pallas.SWITCH, "off")
+    assert kernels_in(small(), X) == {}
+    assert kernels_in(round_of(ExactHit()), serves()) == {}
+
+
+def test_without_triton_programs_have_no_kernels_and_are_made_all_the_same(gpu, no_triton):
+    assert pallas.kernels() is pallas.Kernels.MISSING
+    assert kernels_in(small(), X) == {}
+
+
+def test_a_wrong_value_of_the_switch_is_one_line(monkeypatch):
+    monkeypatch.setenv(pallas.SWITCH, "no")
+    line = "^PLANNER_JAX_KERNELS must be one of on, off, got 'no'$"
+    with pytest.raises(ValueError, match=line):
+        small()(X)
+    with pytest.raises(ValueError, match=line):
+        pallas.kernels()
+    with pytest.raises(SettingError, match=line):  # before a command does anything
+        require_backend()
+
+
+def test_the_doctor_says_whether_there_are_kernels(gpu, monkeypatch):
+    assert doctor._kernels() == doctor.Finding("kernels", "on")
+    monkeypatch.setenv(pallas.SWITCH, "off")
+    assert doctor._kernels() == doctor.Finding("kernels", "off, by PLANNER_JAX_KERNELS")
+    monkeypatch.setattr(pallas, "has_gpu", lambda: False)
+    assert "no GPU" in doctor._kernels().text
+
+
+def test_the_doctor_calls_a_gpu_without_kernels_bad(gpu, no_triton):
+    finding = doctor._kernels()
+    assert finding.text.startswith("unavailable") and not finding.good
