@@ -46,25 +46,24 @@ class DecidedPlanner(Generic[CaseT, PlanT]):
         if not drive.is_pure:
             self.decision.check(cases)
         choices = _proposals(self.decision, cases)
-        num = jax.tree.leaves(choices)[0].shape[1]
-        if num == 1:
-            choice = jax.tree.map(lambda leaf: leaf[:, 0], choices)
-            decided = cases.decided(choice if is_resident else jax.device_get(choice))
+        if len(choices) == 1:
+            decided = cases.decided(choices[0] if is_resident else jax.device_get(choices[0]))
             plans, unsolved = drive(self.planner, decided)
         else:
-            decided, plans = self._best_choice(drive, cases, choices, num)
+            decided, plans = self._best_choice(drive, cases, choices)
             unsolved = is_unsolved(plans.status)
         if not drive.is_pure and not np.any(unsolved):
             return plans
         status = _explained(self.decision, decided, plans.status)
         return plans.replace(status=status if is_resident else np.asarray(status))
 
-    def _best_choice(self, drive: Drive, cases: Any, choices: Any, num: int) -> tuple[Any, Any]:
+    def _best_choice(self, drive: Drive, cases: Any, choices: Any) -> tuple[Any, Any]:
         """The cases as decided and their plans, after all choices have been planned together."""
         xp: Any = jnp if drive.is_pure else np
+        num = len(choices)
         if not drive.is_pure:
             cases, choices = jax.tree.map(np.asarray, (cases, choices))
-        tried = [cases.decided(jax.tree.map(lambda leaf: leaf[:, k], choices)) for k in range(num)]  # noqa: B023
+        tried = [cases.decided(choice) for choice in choices]
         together = jax.tree.map(lambda *leaves: xp.concatenate(leaves), *tried)
         *others, last = self.planner.attempts
         plans, _ = drive(self.planner, together, others or [last])
@@ -96,9 +95,11 @@ class DecidedPlanner(Generic[CaseT, PlanT]):
 
 
 @jax.jit
-def _proposals(decision: Any, cases: Any) -> Any:
-    """The choices of every case, leaves (B, F, ...)."""
-    return jax.vmap(decision.propose)(cases)
+def _proposals(decision: Any, cases: Any) -> list[Any]:
+    """The first choice of every case, the second, ..., leaves (B, ...)."""
+    choices = jax.vmap(decision.propose)(cases)
+    num = jax.tree.leaves(choices)[0].shape[1]
+    return [jax.tree.map(lambda leaf: leaf[:, k], choices) for k in range(num)]  # noqa: B023
 
 
 @jax.jit
@@ -115,5 +116,4 @@ def first_choice(decision: Decision, cases: Any) -> Any:
     if cases.batch_shape == ():
         choices = decision.propose(lax.stop_gradient(cases))
         return cases.decided(jax.tree.map(lambda leaf: leaf[0], choices))
-    choices = _proposals(decision, lax.stop_gradient(cases))
-    return cases.decided(jax.tree.map(lambda leaf: leaf[:, 0], choices))
+    return cases.decided(_proposals(decision, lax.stop_gradient(cases))[0])

@@ -18,8 +18,6 @@ from planner_jax.protocol import (
     AnyPlanner,
     Attempt,
     Case,
-    CompositePlanner,
-    HostPlanner,
     Plan,
     is_unsolved,
 )
@@ -64,7 +62,7 @@ def plan(
         return solve(planner, cases)
     _require_fit(planner, cases)
     alone = cases.batch_shape == ()
-    if alone and not isinstance(planner, HostPlanner | CompositePlanner):
+    if alone and hasattr(planner, "solve"):
         return plan_single(planner, planner.attempts, cases)
     if alone:
         cases = jax.tree.map(lambda leaf: np.asarray(leaf)[None], cases)
@@ -89,7 +87,7 @@ class _Drive:
         self, planner: Any, cases: Any, attempts: Sequence[Attempt] | None = None
     ) -> tuple[Any, Any]:
         """Plans, and numbers that are all zero if no case is unsolved."""
-        if isinstance(planner, CompositePlanner):
+        if hasattr(planner, "plan_by"):
             plans = planner.plan_by(self, cases)
             leaves = jax.tree.leaves(cases)
             if all(isinstance(leaf, jax.Array) for leaf in leaves) and not isinstance(
@@ -98,7 +96,7 @@ class _Drive:
                 plans = jax.device_put(plans, self.devices[0] if self.devices else None)
             return plans, is_unsolved(plans.status)
         tried: Sequence[Attempt] = planner.attempts if attempts is None else attempts
-        if isinstance(planner, HostPlanner):
+        if hasattr(planner, "solve_on_host"):
             return plan_on_host(planner, tried, cases)
         return plan_batch(planner, tried, cases, self.chunk, self.devices)
 
@@ -122,7 +120,7 @@ def solve(planner: AnyPlanner[CaseT, PlanT], cases: CaseT) -> PlanT:
     """
     _require_fit(planner, cases)
     _require_pure(planner)
-    if cases.batch_shape == () and isinstance(planner, CompositePlanner):
+    if cases.batch_shape == () and hasattr(planner, "plan_by"):
         plans = solve(planner, jax.tree.map(lambda leaf: leaf[None], cases))
         return jax.tree.map(lambda leaf: leaf[0], plans)
     return _solve(planner, cases)
@@ -150,7 +148,7 @@ class _DrivePurely:
         self, planner: Any, cases: Any, attempts: Sequence[Attempt] | None = None
     ) -> tuple[Any, Any]:
         """Plans, and which cases are unsolved."""
-        if isinstance(planner, CompositePlanner):
+        if hasattr(planner, "plan_by"):
             plans = planner.plan_by(self, cases)
             return plans, is_unsolved(plans.status)
         _require_pure(planner)
@@ -170,7 +168,7 @@ _drive_purely = _DrivePurely()
 
 def _require_pure(planner: Any) -> None:
     """Raise `TypeError` for a planner that works on the host."""
-    if isinstance(planner, HostPlanner):
+    if hasattr(planner, "solve_on_host"):
         raise TypeError(
             f"{type(planner).__name__} works on the host: call pj.plan outside of what is compiled"
         )
@@ -178,7 +176,7 @@ def _require_pure(planner: Any) -> None:
 
 def _require_fit(planner: Any, cases: Any) -> None:
     """Raise `TypeError` unless the planner is a pytree and the cases are of its class."""
-    if not isinstance(planner, HostPlanner) and jax.tree.leaves(planner) == [planner]:
+    if jax.tree_util.all_leaves([planner]) and not hasattr(planner, "solve_on_host"):
         raise TypeError(
             f"{type(planner).__name__} must be a pytree: put @jax.tree_util.register_static over "
             "its frozen dataclass, or make it a flax.struct.dataclass if it holds arrays"
