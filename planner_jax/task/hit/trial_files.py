@@ -9,7 +9,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from planner_jax.task.hit import court
-from planner_jax.task.hit.scenario import DRAG, GRAVITY
+from planner_jax.task.hit.case import DRAG, GRAVITY
 from planner_jax.task.hit.validate import ServeError, landing
 
 _FILE_NAME = re.compile(r"([1-4])_([1-4])_([1-4])_([plb])\.csv")
