@@ -91,16 +91,16 @@ class _Drive:
         """Plans, and numbers that are all zero if no case is unsolved."""
         if isinstance(planner, CompositePlanner):
             plans = planner.plan_by(self, cases)
-            leaves = jax.tree.leaves(cases)
-            if all(isinstance(leaf, jax.Array) for leaf in leaves) and not isinstance(
-                plans.status, jax.Array
-            ):
-                plans = jax.device_put(plans, self.devices[0] if self.devices else None)
-            return plans, is_unsolved(plans.status)
-        tried: Sequence[Attempt] = planner.attempts if attempts is None else attempts
-        if isinstance(planner, HostPlanner):
-            return plan_on_host(planner, tried, cases)
-        return plan_batch(planner, tried, cases, self.chunk, self.devices)
+        elif isinstance(planner, HostPlanner):
+            plans = plan_on_host(planner, attempts or planner.attempts, cases)
+        else:
+            return plan_batch(
+                planner, attempts or planner.attempts, cases, self.chunk, self.devices
+            )
+        is_resident = all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(cases))
+        if is_resident and not isinstance(plans.status, jax.Array):
+            plans = jax.device_put(plans, self.devices[0] if self.devices else None)
+        return plans, is_unsolved(plans.status)
 
 
 def solve(planner: AnyPlanner[CaseT, PlanT], cases: CaseT) -> PlanT:
@@ -178,7 +178,7 @@ def _require_pure(planner: Any) -> None:
 
 def _require_fit(planner: Any, cases: Any) -> None:
     """Raise `TypeError` unless the planner is a pytree and the cases are of its class."""
-    if not isinstance(planner, HostPlanner) and jax.tree.leaves(planner) == [planner]:
+    if not isinstance(planner, HostPlanner) and jax.tree_util.all_leaves([planner]):
         raise TypeError(
             f"{type(planner).__name__} must be a pytree: put @jax.tree_util.register_static over "
             "its frozen dataclass, or make it a flax.struct.dataclass if it holds arrays"
