@@ -24,12 +24,18 @@ def save_arrays(path: str | os.PathLike, tree: Any) -> None:
     Args:
         path: of the file; its name is taken as it is.
         tree: the dataclass.
+
+    Raises:
+        TypeError: a leaf is not an array of numbers.
     """
     header = json.dumps({"version": VERSION, "class": type(tree).__name__})
-    arrays = {name: np.asarray(leaf) for name, leaf in _leaves(tree)}
+    arrays: dict[str, Any] = {name: np.asarray(leaf) for name, leaf in _leaves(tree)}
+    for name, array in arrays.items():
+        if array.dtype.hasobject:  # which NumPy would pickle
+            raise TypeError(f"{name} must be an array of numbers, got {array.dtype}")
     scratch = f"{os.fspath(path)}.tmp"
     with open(scratch, "wb") as file:
-        np.savez(file, **{_HEADER: np.array(header), **arrays})  # type: ignore[arg-type]
+        np.savez(file, **{_HEADER: np.array(header), **arrays})
     os.replace(scratch, path)
 
 
@@ -40,7 +46,8 @@ def load_arrays(path: str | os.PathLike, kind: type[Kind]) -> Kind:
         PlanFileError: the file is something else, of another class or of another version.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
+        # NumPy leaves open a broken file that it has opened itself.
+        with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
             arrays = dict(file)
         header = json.loads(str(arrays.pop(_HEADER)))
         version, name = header["version"], header["class"]
@@ -81,7 +88,7 @@ def _tree(kind: Any, prefix: str, arrays: dict[str, np.ndarray]) -> Any:
     values = {}
     for field in dataclasses.fields(kind):
         inner, place = types[field.name], prefix + field.name
-        if dataclasses.is_dataclass(inner):
+        if isinstance(inner, type) and dataclasses.is_dataclass(inner):
             values[field.name] = _tree(inner, f"{place}.", arrays)
         else:
             values[field.name] = arrays.pop(place)

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from test_solve import Well, WellPlanner
 
-from planner_jax.task.solve import plan, plan_across_processes
+from planner_jax.planning.plan import plan, plan_across_processes
 
 GOALS = np.linspace(-1.0, 5.0, 203).astype(np.float32)
 

@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 from derivatives import assert_gradient_matches_differences
 
+import planner_jax as pj
 from planner_jax.ball.flight import BallState, drag_free_flight, fly
 from planner_jax.ball.impact import racket_impact
+from planner_jax.planning.plan import plan
 from planner_jax.protocol import Status, is_solved
 from planner_jax.referee.hit import referee_hits
 from planner_jax.task.hit import court
 from planner_jax.task.hit.bat import BatHit, serve_origin, transition_point
+from planner_jax.task.hit.card import TASK
 from planner_jax.task.hit.decoupled import aim_at_angle, decoupled_hit
-from planner_jax.task.hit.juggle import JuggleHit, eased_minimum_jerk
-from planner_jax.task.hit.planners import PLANNERS, planner
-from planner_jax.task.hit.scenario import hit_scenario
-from planner_jax.task.hit.serves import generate_serves, to_scenarios
-from planner_jax.task.solve import plan
-from planner_jax.trajectory.minimum_jerk import minimum_jerk
+from planner_jax.task.hit.juggle import JuggleHit
+from planner_jax.task.hit.serves import generate_serves, to_cases
+from planner_jax.trajectory.minimum_jerk import eased_minimum_jerk, minimum_jerk
 from planner_jax.trajectory.polynomial import evaluate
 
 NUM = 16
@@ -34,19 +34,19 @@ float64 = pytest.mark.usefixtures("float64")
 
 
 @pytest.fixture(scope="module")
-def scenarios():
+def cases():
     """In NumPy arrays, so that batches of all sizes up to 16 are planned by one program."""
-    return jax.tree.map(np.asarray, to_scenarios(generate_serves(NUM, 5)))
+    return jax.tree.map(np.asarray, to_cases(generate_serves(NUM, 5)))
 
 
 @pytest.fixture(scope="module")
-def bat_plans(scenarios):
-    return plan(BAT, scenarios)
+def bat_plans(cases):
+    return plan(BAT, cases)
 
 
 @pytest.fixture(scope="module")
-def juggle_plans(scenarios):
-    return plan(JUGGLE, scenarios)
+def juggle_plans(cases):
+    return plan(JUGGLE, cases)
 
 
 def lane_of(tree, lane):
@@ -63,7 +63,7 @@ def serves_gone_wrong():
     pos = [[-2.0, 0.0, 2.0]] * 3 + [[-2.0, 0.0, 1.0], [-2.0, 0.0, 0.01], [-2.0, 0.0, 3.0]]
     vel = [[0.0, 0.0, 7.0]] * 3 + [[0.0, 0.0, -4.0], [-3.0, 0.0, -8.0], [0.0, 0.0, 0.0]]
     target = [[-2.0, 0.0, 5.0], [-2.0, 0.0, 0.0], [-2.0, 3.0, 0.0]] + [[3.0, 0.0, 0.0]] * 3
-    return hit_scenario(
+    return pj.hit.case(
         np.array([*pos, [3.5, 0.3, 2.0]]),
         np.array([*vel, [-4.0, -0.2, 7.4]]),
         np.array([*target, [3.0, 1.67, 0.0]]),
@@ -187,35 +187,35 @@ def test_transition_point_of_an_example_by_hand():
 
 
 @float64
-def test_the_serve_comes_from_where_its_flight_began(scenarios):
+def test_the_serve_comes_from_where_its_flight_began(cases):
     origin = np.array([3.0, -1.0, 0.0])
     launched = BallState(jnp.array(origin), jnp.array([-4.0, 0.5, 9.5]))
     drag, gravity = jnp.asarray(0.0616), jnp.asarray(GRAVITY)
     ball, _ = fly(launched, jnp.asarray(0.25), drag, gravity, num_steps=100)
-    lane = hit_scenario(ball.pos, ball.vel, np.zeros(3), dtype=jnp.float64)
+    lane = pj.hit.case(ball.pos, ball.vel, np.zeros(3), dtype=jnp.float64)
     np.testing.assert_allclose(serve_origin(lane), origin, atol=1e-3)
     falling = dataclasses.replace(lane, ball=BallState(ball.pos, jnp.array([-9.0, 0.0, -30.0])))
     assert np.isfinite(serve_origin(falling)).all()
 
 
-def first_guess(transition, scenario):
+def first_guess(transition, case):
     """What the first guess decides: waypoints, impact, its defect, and the transition state."""
     bat = BatHit(transition=transition)
-    context = bat.prepare(scenario)
+    context = bat.prepare(case)
     natural = bat.guesses(context, 1)[0] * jnp.asarray(bat.scale)
     impact, defect = bat.impact(natural[bat.num_offsets :], context)
     waypoints = natural[: bat.num_offsets].reshape(-1, 3)
-    return waypoints, impact, defect, bat.transition_state(impact, scenario)
+    return waypoints, impact, defect, bat.transition_state(impact, case)
 
 
 position = jax.jit(lambda head, tail, end, t: evaluate(minimum_jerk(head, tail, end), t))
 
 
 @pytest.mark.parametrize("transition", [True, False])
-def test_first_waypoints_lie_on_the_primitives(scenarios, transition):
-    scenario = lane_of(scenarios, 2)
-    waypoints, impact, defect, state = jax.jit(first_guess, static_argnums=0)(transition, scenario)
-    head, tail, end = scenario.head_state[:3], impact.tail_state[:3], impact.stroke.time
+def test_first_waypoints_lie_on_the_primitives(cases, transition):
+    case = lane_of(cases, 2)
+    waypoints, impact, defect, state = jax.jit(first_guess, static_argnums=0)(transition, case)
+    head, tail, end = case.head_state[:3], impact.tail_state[:3], impact.stroke.time
     assert defect == 0.0
     np.testing.assert_allclose(end, 1.2 if transition else 0.7, rtol=1e-5)
     rise = impact.stroke.ball_vel_after
@@ -237,8 +237,8 @@ def test_first_waypoints_lie_on_the_primitives(scenarios, transition):
 # the plans
 
 
-def test_juggle_is_at_rest_first_and_in_its_fixed_stroke_last(scenarios, juggle_plans):
-    verdict = referee_hits(scenarios, juggle_plans)
+def test_juggle_is_at_rest_first_and_in_its_fixed_stroke_last(cases, juggle_plans):
+    verdict = referee_hits(cases, juggle_plans)
     assert verdict.head_error.max() < 1e-6
     assert verdict.continuity_error.max() < 1e-4
     assert verdict.contact_error.max() < 1e-3
@@ -278,8 +278,8 @@ def test_a_short_ease_leaves_the_minimum_jerk_primitive_and_joins_it_up_to_the_j
         )
 
 
-def test_bat_meets_the_ball_and_reaches_the_target_on_every_lane(scenarios, bat_plans):
-    verdict = referee_hits(scenarios, bat_plans)
+def test_bat_meets_the_ball_and_reaches_the_target_on_every_lane(cases, bat_plans):
+    verdict = referee_hits(cases, bat_plans)
     assert verdict.contact_error.max() < 1e-3
     assert verdict.landing_error.max() < 1e-2
     assert verdict.head_error.max() < 1e-4
@@ -289,9 +289,9 @@ def test_bat_meets_the_ball_and_reaches_the_target_on_every_lane(scenarios, bat_
 
 
 @pytest.mark.parametrize("name", ["bat_plans", "juggle_plans"])
-def test_a_lane_that_breaks_a_limit_carries_a_status_that_says_so(scenarios, name, request):
+def test_a_lane_that_breaks_a_limit_carries_a_status_that_says_so(cases, name, request):
     plans = request.getfixturevalue(name)
-    verdict = referee_hits(scenarios, plans)
+    verdict = referee_hits(cases, plans)
     refused = np.isin(verdict.failed_limit, ["speed", "acceleration", "body rate", "apex low"])
     assert refused.any()
     assert set(np.asarray(plans.status)[refused]) <= {Status.INFEASIBLE, Status.MAX_STEPS}
@@ -304,32 +304,32 @@ def test_juggle_decides_nothing_and_so_never_asks_for_more_iterations(juggle_pla
 
 
 @pytest.mark.parametrize("make", [BatHit, JuggleHit])
-def test_no_equation_leaks_a_nan_and_its_neighbours_do_not_notice(make, scenarios):
-    broken = jax.tree.map(lambda a, b: np.concatenate([b[:9], a]), serves_gone_wrong(), scenarios)
+def test_no_equation_leaks_a_nan_and_its_neighbours_do_not_notice(make, cases):
+    broken = jax.tree.map(lambda a, b: np.concatenate([b[:9], a]), serves_gone_wrong(), cases)
     found = plan(make(), broken)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
     assert not is_solved(found.status[9]), "the target is above every path"
     verdict = referee_hits(broken, found)
     solved = is_solved(found.status)
     assert solved.any() and verdict.success[solved].all()
-    alone = plan(make(), scenarios)
+    alone = plan(make(), cases)
     for old, new in zip(jax.tree.leaves(alone), jax.tree.leaves(found), strict=True):
         np.testing.assert_array_equal(old[:9], new[:9])
 
 
-def test_a_nan_serve_is_a_row_with_a_status(scenarios):
-    pos = scenarios.ball.pos.copy()
+def test_a_nan_serve_is_a_row_with_a_status(cases):
+    pos = cases.ball.pos.copy()
     pos[2, 0] = np.nan
-    broken = dataclasses.replace(scenarios, ball=BallState(pos, scenarios.ball.vel))
+    broken = dataclasses.replace(cases, ball=BallState(pos, cases.ball.vel))
     for make in (BAT, JUGGLE):
         found = plan(make, broken)
         assert found.status[2] == Status.NON_FINITE
         assert (np.delete(found.status, 2) != Status.NON_FINITE).all()
 
 
-def test_one_juggle_equals_its_lane_in_the_batch(scenarios, juggle_plans):
+def test_one_juggle_equals_its_lane_in_the_batch(cases, juggle_plans):
     for lane in (0, 5):
-        alone = plan(JUGGLE, lane_of(scenarios, lane))
+        alone = plan(JUGGLE, lane_of(cases, lane))
         for one, among in zip(
             jax.tree.leaves(alone), jax.tree.leaves(lane_of(juggle_plans, lane)), strict=True
         ):
@@ -337,12 +337,12 @@ def test_one_juggle_equals_its_lane_in_the_batch(scenarios, juggle_plans):
 
 
 @pytest.mark.parametrize(("make", "name"), [(BAT, "bat_plans"), (JUGGLE, "juggle_plans")])
-def test_a_lane_does_not_depend_on_the_rest_of_its_batch(make, name, scenarios, request):
+def test_a_lane_does_not_depend_on_the_rest_of_its_batch(make, name, cases, request):
     plans = request.getfixturevalue(name)
     for lane in (0, 5, 11):
         others = np.zeros(12, int)  # the first one everywhere but here
         others[lane] = lane
-        among_others = plan(make, jax.tree.map(lambda leaf, k=others: leaf[k], scenarios))
+        among_others = plan(make, jax.tree.map(lambda leaf, k=others: leaf[k], cases))
         for one, among in zip(jax.tree.leaves(among_others), jax.tree.leaves(plans), strict=True):
             np.testing.assert_array_equal(one[lane], among[lane])
 
@@ -351,20 +351,20 @@ def test_a_lane_does_not_depend_on_the_rest_of_its_batch(make, name, scenarios, 
 
 
 def test_every_published_planner_has_its_name():
-    assert {"exact", *court.PLANNERS} == set(PLANNERS)
-    assert planner("juggle") == JUGGLE
-    assert planner("bat") == BAT
-    assert planner("bat-lite", nodes=8) == BatHit(transition=False, nodes=8)
+    assert {"exact", *court.PLANNERS} == set(TASK.planners)
+    assert pj.hit.planner("juggle") == JUGGLE
+    assert pj.hit.planner("bat") == BAT
+    assert pj.hit.planner("bat-lite", nodes=8) == BatHit(transition=False, nodes=8)
     with pytest.raises(
         ValueError, match="planner must be one of exact, bat, bat-lite, juggle, got"
     ):
-        planner("bat lite")
+        pj.hit.planner("bat lite")
 
 
-@pytest.mark.parametrize("make", [BAT, JUGGLE])
-def test_the_published_planners_have_a_single_start(make):
+def test_the_published_planners_have_a_single_start():
     with pytest.raises(ValueError, match="starts must be 1, got 2"):
-        make.guesses(None, 2)
+        BAT.guesses(None, 2)
+    assert {attempt.starts for each in (BAT, JUGGLE) for attempt in each.attempts} == {1}
 
 
 def test_one_piece_has_no_waypoint_to_decide_on():

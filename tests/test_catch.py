@@ -12,59 +12,60 @@ from jax import Array
 
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
 from planner_jax.optimise.multistart import solve_round
+from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.problem import Round, Stage
 from planner_jax.optimise.scaling import shipped_scale
-from planner_jax.protocol import Status, is_solved
+from planner_jax.planning.decided import first_choice
+from planner_jax.planning.plan import plan
+from planner_jax.protocol import Plan, Status, is_solved
 from planner_jax.referee.catch import referee_catches
-from planner_jax.task.catch.decide import decided, greedy
+from planner_jax.task.catch.decide import Greedy
 from planner_jax.task.catch.exact import ExactCatch
-from planner_jax.task.catch.suites import make_suite
-from planner_jax.task.solve import plan
+from planner_jax.task.catch.suites import draw
 from planner_jax.trajectory.polynomial import evaluate
 from tests.jaxpr import assert_full_precision
 
 PLANNER = ExactCatch(rounds=(Round(1, LbfgsConfig(max_steps=20)),))
 NUM = 8
 THROWS = NUM // 2  # lanes of one throw, whose second target is absent; the others have two
-GREEDY = jax.jit(jax.vmap(greedy))
 
 
 def lane_of(tree, lane):
     return jax.tree.map(lambda leaf: jnp.asarray(leaf[lane]), tree)
 
 
-def timed(scenarios):
-    return decided(scenarios, jax.tree.map(np.asarray, GREEDY(scenarios)))
+def timed(cases):
+    return jax.tree.map(np.asarray, first_choice(Greedy(), cases))
 
 
 @pytest.fixture(scope="module")
-def scenarios():
+def cases():
     """Throws with an absent second target, then pairs of throws."""
-    suites = [make_suite(name, THROWS, 4, num_targets=2) for name in ("throws", "parabola2")]
+    suites = [draw(THROWS, name, 4, num_targets=2) for name in ("throws", "parabola2")]
     return timed(jax.tree.map(lambda *leaves: np.concatenate(leaves), *suites))
 
 
 @pytest.fixture(scope="module")
-def plans(scenarios):
-    return plan(PLANNER, scenarios)
+def plans(cases):
+    return plan(PLANNER, cases)
 
 
-def test_easy_throws_and_pairs_of_them_are_caught_and_confirmed_by_the_referee(scenarios, plans):
+def test_easy_throws_and_pairs_of_them_are_caught_and_confirmed_by_the_referee(cases, plans):
     assert is_solved(plans.status).all()
-    verdict = referee_catches(scenarios, plans)
+    verdict = referee_catches(cases, plans)
     assert verdict.success.all(), [verdict.sentence(k) for k in np.flatnonzero(~verdict.success)]
     assert verdict.num_caught.tolist() == [1] * THROWS + [2] * THROWS
 
 
-def test_any_decision_vector_has_every_ball_in_the_net(scenarios):
+def test_any_decision_vector_has_every_ball_in_the_net(cases):
     """The elimination itself: no optimisation, random variables, and still no miss."""
-    pairs = jax.tree.map(lambda leaf: np.asarray(leaf[THROWS:]), scenarios)
+    pairs = jax.tree.map(lambda leaf: np.asarray(leaf[THROWS:]), cases)
     random = np.random.default_rng(0)
 
     @jax.jit
     @jax.vmap
-    def perturbed(scenario, noise):
-        context = PLANNER.prepare(scenario)
+    def perturbed(case, noise):
+        context = PLANNER.prepare(case)
         return PLANNER.decode(PLANNER.guesses(context, 1)[0] + noise, context)
 
     size = 2 * len(PLANNER.scale)
@@ -86,8 +87,8 @@ def test_absent_targets_have_no_flight_and_the_plan_stays_at_the_last_catch(plan
     np.testing.assert_allclose(evaluate(one.trajectory, one.times[0] + 1.0), at_catch, atol=1e-4)
 
 
-def test_one_throw_planned_alone_equals_its_lane_in_a_batch_for_more_targets(scenarios, plans):
-    wide = lane_of(scenarios, 0)
+def test_one_throw_planned_alone_equals_its_lane_in_a_batch_for_more_targets(cases, plans):
+    wide = lane_of(cases, 0)
     first = lambda leaf: leaf[:1]  # noqa: E731
     alone = plan(
         PLANNER,
@@ -109,9 +110,9 @@ def test_one_throw_planned_alone_equals_its_lane_in_a_batch_for_more_targets(sce
 
 
 @pytest.mark.slow
-def test_pairs_planned_one_by_one_equal_their_lanes_in_the_batch(scenarios, plans):
+def test_pairs_planned_one_by_one_equal_their_lanes_in_the_batch(cases, plans):
     for lane in range(THROWS, NUM):
-        alone = plan(PLANNER, lane_of(scenarios, lane))
+        alone = plan(PLANNER, lane_of(cases, lane))
         assert alone.status == plans.status[lane]
         np.testing.assert_allclose(alone.times, plans.times[lane], rtol=2e-3)
         np.testing.assert_allclose(alone.cost, plans.cost[lane], rtol=1e-2)
@@ -119,15 +120,15 @@ def test_pairs_planned_one_by_one_equal_their_lanes_in_the_batch(scenarios, plan
 
 @jax.jit
 @jax.value_and_grad
-def cost_and_slopes(shift, scenario):
+def cost_and_slopes(shift, case):
     """Of a point beside the first guess."""
-    context = PLANNER.prepare(scenario)
+    context = PLANNER.prepare(case)
     return PLANNER.objective(PLANNER.guesses(context, 1)[0] + shift, context).cost
 
 
 def one_of(name, **sizes):
-    scenarios = make_suite(name, 1, 4, dtype=jnp.float64, **sizes)
-    return jax.tree.map(lambda leaf: np.asarray(leaf[0]), scenarios)
+    cases = draw(1, name, 4, dtype=jnp.float64, **sizes)
+    return jax.tree.map(lambda leaf: np.asarray(leaf[0]), cases)
 
 
 def test_absent_targets_cost_nothing_and_have_no_slope(float64):
@@ -155,48 +156,48 @@ def test_objective_gradient_agrees_with_finite_differences(float64):
         np.testing.assert_allclose(terms.sum(), numeric, atol=1e-6 * np.abs(terms).sum())
 
 
-def test_a_nan_scenario_is_a_row_and_leaves_its_neighbours_bits_alone(scenarios, plans):
-    ball = scenarios.targets.ball
+def test_a_nan_case_is_a_row_and_leaves_its_neighbours_bits_alone(cases, plans):
+    ball = cases.targets.ball
     pos = np.array(ball.pos)
     pos[5, 1, 0] = np.nan
-    targets = scenarios.targets.replace(ball=ball.replace(pos=pos))
-    found = plan(PLANNER, scenarios.replace(targets=targets))
+    targets = cases.targets.replace(ball=ball.replace(pos=pos))
+    found = plan(PLANNER, cases.replace(targets=targets))
     assert found.status[5] == Status.NON_FINITE
     for old, new in zip(jax.tree.leaves(plans), jax.tree.leaves(found), strict=True):
         np.testing.assert_array_equal(np.delete(old, 5, axis=0), np.delete(new, 5, axis=0))
 
 
-def test_an_impossible_lane_says_so_and_stays_finite(scenarios):
-    speed = np.array(scenarios.limits.speed)
+def test_an_impossible_lane_says_so_and_stays_finite(cases):
+    speed = np.array(cases.limits.speed)
     speed[[1, 6]] *= 0.05
-    found = plan(PLANNER, scenarios.replace(limits=scenarios.limits.replace(speed=speed)))
+    found = plan(PLANNER, cases.replace(limits=cases.limits.replace(speed=speed)))
     assert np.isin(found.status[[1, 6]], (Status.INFEASIBLE, Status.MAX_STEPS)).all()
     assert (found.violation[[1, 6]] > 0.0).all()
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
     assert is_solved(np.delete(found.status, [1, 6])).all()
 
 
-def test_a_ball_that_is_due_too_early_is_reported_and_not_caught_late(scenarios):
-    found = plan(PLANNER, scenarios.replace(horizon=np.asarray(scenarios.horizon) * 0.3))
+def test_a_ball_that_is_due_too_early_is_reported_and_not_caught_late(cases):
+    found = plan(PLANNER, cases.replace(horizon=np.asarray(cases.horizon) * 0.3))
     assert not is_solved(found.status).any()
     assert (found.violation > 0.0).all()
 
 
-def test_all_products_of_the_objective_are_in_full_precision(scenarios):
-    context = PLANNER.prepare(lane_of(scenarios, 0))
+def test_all_products_of_the_objective_are_in_full_precision(cases):
+    context = PLANNER.prepare(lane_of(cases, 0))
     start = jnp.zeros(2 * len(PLANNER.scale))
     slopes = jax.grad(lambda x: PLANNER.objective(x, context).cost)
     assert assert_full_precision(slopes, start) > 0
     assert assert_full_precision(lambda x: PLANNER.decode(x, context), start) > 0
 
 
-def test_sizes_that_make_no_sense_are_refused(scenarios):
+def test_sizes_that_make_no_sense_are_refused(cases):
     with pytest.raises(ValueError, match=r"proportions must be of >= 2 pieces, got \(1.0,\)"):
         ExactCatch(proportions=(1.0,))
     with pytest.raises(ValueError, match="no measured scale for 'exact-5'"):
         ExactCatch(proportions=(1.0,) * 5)
     with pytest.raises(ValueError, match="starts must be <= 6, got 7"):
-        PLANNER.guesses(PLANNER.prepare(lane_of(scenarios, 0)), 7)
+        PLANNER.guesses(PLANNER.prepare(lane_of(cases, 0)), 7)
 
 
 def test_the_shipped_scale_is_a_positive_number_for_every_variable_of_a_segment(scenarios):
@@ -211,22 +212,20 @@ def test_the_shipped_scale_is_a_positive_number_for_every_variable_of_a_segment(
 
 
 @struct.dataclass
-class Reached:
+class Reached(Plan):
     point: Array
-    cost: Array
-    violation: Array
-    iterations: Array
-    status: Array
 
 
+@jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class Bowl:
+class Bowl(OptimisedPlanner):
     """Its cost is least at `goal`, and every point is feasible."""
 
     goal: float = 0.0
+    rounds: tuple[Round, ...] = (Round(),)
 
-    def prepare(self, scenario):
-        return scenario
+    def prepare(self, case):
+        return case
 
     def guesses(self, context, num):
         return jnp.full((num, 1), 7.0)
@@ -236,8 +235,7 @@ class Bowl:
         return Evaluation(cost=away, violation=-jnp.ones_like(away))
 
     def decode(self, point, context):
-        zero = jnp.zeros((), jnp.int32)
-        return Reached(point, jnp.zeros(()), -jnp.ones(()), zero, zero)
+        return Reached(point=point, **pending(-jnp.ones(())))
 
 
 SEARCH, STAND = LbfgsConfig(max_steps=30, memory=2), LbfgsConfig(max_steps=0)

@@ -9,12 +9,12 @@ import pytest
 from planner_jax.ball.flight import BallState
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
-from planner_jax.protocol import Status, is_solved
+from planner_jax.planning.plan import plan
+from planner_jax.protocol import Status, is_solved, lane
 from planner_jax.referee.catch import referee_catches
 from planner_jax.task.catch.exact import ExactCatch
-from planner_jax.task.catch.replan import ReplanCatch, replanned
-from planner_jax.task.catch.suites import make_suite
-from planner_jax.task.solve import plan
+from planner_jax.task.catch.replan import ReplanCatch
+from planner_jax.task.catch.suites import draw
 
 SCRATCH = ExactCatch(rounds=(Round(starts=1, solver=LbfgsConfig(max_steps=40)),))
 AGAIN = ReplanCatch(
@@ -24,18 +24,18 @@ AS_IT_IS = ReplanCatch(rounds=(Round(starts=1, solver=LbfgsConfig(max_steps=0)),
 
 
 def planned(name, num):
-    """A suite's first scenarios, and plans of them."""
-    scenarios = make_suite(name, num)
-    times = np.linspace(0.7, 0.9, scenarios.num_targets) * np.asarray(scenarios.horizon)
-    scenarios = jax.tree.map(np.asarray, dataclasses.replace(scenarios, times=times))
-    return scenarios, plan(SCRATCH, scenarios)
+    """A suite's first cases, and plans of them."""
+    cases = draw(num, name)
+    times = np.linspace(0.7, 0.9, cases.num_targets) * np.asarray(cases.horizon)
+    cases = jax.tree.map(np.asarray, dataclasses.replace(cases, times=times))
+    return cases, plan(SCRATCH, cases)
 
 
 @pytest.fixture(scope="module")
 def throws():
-    scenarios, plans = planned("throws", 6)
+    cases, plans = planned("throws", 6)
     assert is_solved(plans.status).all()
-    return scenarios, plans
+    return cases, plans
 
 
 @jax.jit
@@ -45,12 +45,12 @@ def seen_at(targets, time):
     return jax.vmap(lambda path: path.at(time))(targets)
 
 
-def ahead(scenarios, elapsed, noise=0.0):
+def ahead(cases, elapsed, noise=0.0):
     """The targets seen `elapsed` (B,) later, a little beside where they were expected."""
-    ball = seen_at(scenarios.targets, np.asarray(elapsed, np.float32))
+    ball = seen_at(cases.targets, np.asarray(elapsed, np.float32))
     random = np.random.default_rng(1)
     moved = lambda x: np.asarray(x + noise * random.standard_normal(x.shape), np.float32)  # noqa: E731
-    return dataclasses.replace(scenarios.targets, ball=BallState(moved(ball.pos), moved(ball.vel)))
+    return dataclasses.replace(cases.targets, ball=BallState(moved(ball.pos), moved(ball.vel)))
 
 
 def states(trajectory, time):
@@ -73,13 +73,9 @@ def assert_same_way(old, new, elapsed, until, atol):
         )
 
 
-def lane(tree, k):
-    return jax.tree.map(lambda leaf: leaf[k], tree)
-
-
 def test_an_unchanged_target_and_no_time_give_the_plan_back(throws):
-    scenarios, plans = throws
-    again = plan(AS_IT_IS, replanned(scenarios, plans, np.zeros(6), scenarios.targets))
+    cases, plans = throws
+    again = plan(AS_IT_IS, AS_IT_IS.begin(cases, plans, np.zeros(6), targets=cases.targets))
     np.testing.assert_allclose(again.times, plans.times, atol=2e-6)
     np.testing.assert_allclose(again.cost, plans.cost, rtol=2e-3)
     for k in range(6):
@@ -88,27 +84,27 @@ def test_an_unchanged_target_and_no_time_give_the_plan_back(throws):
 
 
 def test_a_later_plan_begins_where_the_quadrotor_is_and_catches_the_target_that_moved(throws):
-    scenarios, plans = throws
+    cases, plans = throws
     elapsed = np.linspace(0.01, 0.5, 6)
-    task = replanned(scenarios, plans, elapsed, ahead(scenarios, elapsed, 0.01))
+    task = AGAIN.begin(cases, plans, elapsed, targets=ahead(cases, elapsed, 0.01))
     for k in range(6):
         expected = states(lane(plans.trajectory, k), elapsed[k])
-        np.testing.assert_allclose(task.scenario.head_state[k, :3], expected, atol=1e-3)
-    np.testing.assert_allclose(task.scenario.horizon, scenarios.horizon - elapsed[:, None])
+        np.testing.assert_allclose(task.case.head_state[k, :3], expected, atol=1e-3)
+    np.testing.assert_allclose(task.case.horizon, cases.horizon - elapsed[:, None])
     again = plan(AGAIN, task)
-    verdict = referee_catches(task.scenario, again)
+    verdict = referee_catches(task.case, again)
     assert verdict.success.all(), [verdict.sentence(k) for k in range(6)]
     assert np.abs(again.times - (plans.times - elapsed[:, None])).max() < 0.05
 
 
 def test_a_batch_is_its_cases(throws):
-    scenarios, plans = throws
+    cases, plans = throws
     elapsed = np.array([0.1, 0.2, 0.3, 0.4, 0.5, 5.0], np.float32)
-    task = replanned(scenarios, plans, elapsed, ahead(scenarios, elapsed, 0.005))
+    task = AGAIN.begin(cases, plans, elapsed, targets=ahead(cases, elapsed, 0.005))
     together = plan(AGAIN, task)
     for k in range(6):
-        alone_task = replanned(
-            lane(scenarios, k), lane(plans, k), elapsed[k], lane(task.scenario.targets, k)
+        alone_task = AGAIN.begin(
+            lane(cases, k), lane(plans, k), elapsed[k], targets=lane(task.case.targets, k)
         )
         for one, many in zip(
             jax.tree.leaves(alone_task), jax.tree.leaves(lane(task, k)), strict=True
@@ -120,10 +116,10 @@ def test_a_batch_is_its_cases(throws):
 
 
 def test_with_too_little_time_left_the_previous_plan_is_kept(throws):
-    scenarios, plans = throws
+    cases, plans = throws
     left = np.array([0.049, 0.03, 0.01, 0.002, 0.06, 0.04], np.float32)
     elapsed = plans.times[:, 0] - left
-    task = replanned(scenarios, plans, elapsed, ahead(scenarios, elapsed, 0.05))
+    task = AGAIN.begin(cases, plans, elapsed, targets=ahead(cases, elapsed, 0.05))
     again = plan(AGAIN, task)
     kept = left < AGAIN.shortest
     np.testing.assert_allclose(again.times[kept, 0], left[kept], atol=1e-6)
@@ -136,10 +132,10 @@ def test_with_too_little_time_left_the_previous_plan_is_kept(throws):
 
 
 def test_what_is_left_of_a_plan_can_be_cut_anywhere(throws):
-    scenarios, plans = throws
+    cases, plans = throws
     keeping = dataclasses.replace(AS_IT_IS, shortest=10.0)
     elapsed = np.array([0.0, 0.02, 0.21, 0.43, 0.6, 0.7], np.float32)
-    rest = plan(keeping, replanned(scenarios, plans, elapsed, ahead(scenarios, elapsed)))
+    rest = plan(keeping, keeping.begin(cases, plans, elapsed, targets=ahead(cases, elapsed)))
     assert (rest.trajectory.durations > 0.0).all()
     for k in range(6):
         old, new = lane(plans.trajectory, k), lane(rest.trajectory, k)
@@ -147,10 +143,10 @@ def test_what_is_left_of_a_plan_can_be_cut_anywhere(throws):
 
 
 def test_after_the_catch_the_plan_is_empty(throws):
-    scenarios, plans = throws
+    cases, plans = throws
     elapsed = plans.times[:, 0] + 0.01
-    task = replanned(scenarios, plans, elapsed, ahead(scenarios, elapsed))
-    assert not task.scenario.present.any()
+    task = AGAIN.begin(cases, plans, elapsed, targets=ahead(cases, elapsed))
+    assert not task.case.present.any()
     again = plan(AGAIN, task)
     assert not again.trajectory.durations.any() and np.isfinite(again.cost).all()
     assert (again.status != Status.NON_FINITE).all()
@@ -161,23 +157,23 @@ def test_after_the_catch_the_plan_is_empty(throws):
 
 @pytest.mark.slow
 def test_of_several_targets_those_not_caught_yet_are_planned_on():
-    scenarios, plans = planned("triangle3", 4)
+    cases, plans = planned("triangle3", 4)
     order = np.array([2, 0, 1], np.int32)
-    scenarios = dataclasses.replace(scenarios, order=np.tile(order, (4, 1)))
-    plans = plan(SCRATCH, scenarios)
+    cases = dataclasses.replace(cases, order=np.tile(order, (4, 1)))
+    plans = plan(SCRATCH, cases)
     solved = is_solved(plans.status)
     assert solved.any()
     elapsed = 0.5 * (plans.times[:, 0] + plans.times[:, 1])
-    task = replanned(scenarios, plans, elapsed, ahead(scenarios, elapsed, 0.005))
-    np.testing.assert_array_equal(task.scenario.order, np.tile([0, 1, 2], (4, 1)))
-    np.testing.assert_array_equal(task.scenario.present, np.tile([True, True, False], (4, 1)))
+    task = AGAIN.begin(cases, plans, elapsed, targets=ahead(cases, elapsed, 0.005))
+    np.testing.assert_array_equal(task.case.order, np.tile([0, 1, 2], (4, 1)))
+    np.testing.assert_array_equal(task.case.present, np.tile([True, True, False], (4, 1)))
     again = plan(AGAIN, task)
-    verdict = referee_catches(task.scenario, again)
+    verdict = referee_catches(task.case, again)
     assert verdict.success[solved].all(), [verdict.sentence(k) for k in range(4)]
     assert (verdict.num_caught[solved] == 2).all()
 
 
 def test_a_negative_time_is_refused_in_one_line(throws):
-    scenarios, plans = throws
+    cases, plans = throws
     with pytest.raises(ValueError, match="elapsed must be >= 0, got -0.1"):
-        replanned(lane(scenarios, 0), lane(plans, 0), -0.1, lane(scenarios.targets, 0))
+        AGAIN.begin(lane(cases, 0), lane(plans, 0), -0.1, targets=lane(cases.targets, 0))

@@ -1,4 +1,4 @@
-"""The named suites of catch scenarios: what their module says of them holds for every draw."""
+"""The named suites of catch cases: what their module says of them holds for every draw."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from planner_jax.ball.target import BallPath
-from planner_jax.task.catch.suites import CATCH_HEIGHT, LAUNCH, SUITES, earliest_throw, make_suite
+from planner_jax.task.catch.card import SUITES, TASK
+from planner_jax.task.catch.suites import CATCH_HEIGHT, LAUNCH, draw, earliest_throw
 
 NUM = 64
 THROWS = ("throws", "hard", "parabola1", "parabola2")
@@ -38,12 +39,12 @@ def leaves(tree):
     return [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
 
 
-def until_horizon(scenarios, num=60):
-    return scenarios.horizon[..., None] * jnp.linspace(0.0, 1.0, num)
+def until_horizon(cases, num=60):
+    return cases.horizon[..., None] * jnp.linspace(0.0, 1.0, num)
 
 
 def drawn(name, num=NUM, seed=3):
-    return make_suite(name, num, seed, dtype=jnp.float64)
+    return draw(num, name, seed, dtype=jnp.float64)
 
 
 def away(pos):
@@ -52,48 +53,42 @@ def away(pos):
 
 
 @pytest.mark.parametrize("name", SUITES)
-def test_a_seed_always_gives_the_same_scenarios_and_fewer_of_them_are_the_first(name):
-    once, again, fewer = make_suite(name, 9, 5), make_suite(name, 9, 5), make_suite(name, 4, 5)
+def test_a_seed_always_gives_the_same_cases_and_fewer_of_them_are_the_first(name):
+    once, again, fewer = draw(9, name, 5), draw(9, name, 5), draw(4, name, 5)
     for a, b, c in zip(leaves(once), leaves(again), leaves(fewer), strict=True):
         np.testing.assert_array_equal(a, b)
         np.testing.assert_array_equal(a[:4], c)
-    other = leaves(make_suite(name, 9, 6).targets)
+    other = leaves(draw(9, name, 6).targets)
     assert any((a != b).any() for a, b in zip(leaves(once.targets), other, strict=True))
 
 
 def test_a_suite_is_a_matter_of_its_name_and_the_seed_alone():
-    """One number of two suites: a change here is a change of published scenarios."""
-    np.testing.assert_allclose(
-        make_suite("throws", 1).targets.ball.vel[0, 0, 1], -0.10602945, rtol=1e-5
-    )
-    np.testing.assert_allclose(
-        make_suite("hexagon6", 1).targets.ball.pos[0, 0, 2], 2.3829162, rtol=1e-5
-    )
-    assert (
-        make_suite("throws", 1).targets.ball.vel != make_suite("hard", 1).targets.ball.vel
-    ).all()
+    """One number of two suites: a change here is a change of published cases."""
+    np.testing.assert_allclose(draw(1, "throws").targets.ball.vel[0, 0, 1], -0.10602945, rtol=1e-5)
+    np.testing.assert_allclose(draw(1, "hexagon6").targets.ball.pos[0, 0, 2], 2.3829162, rtol=1e-5)
+    assert (draw(1, "throws").targets.ball.vel != draw(1, "hard").targets.ball.vel).all()
 
 
 @pytest.mark.parametrize("name", SUITES)
 def test_shapes_and_setting(name):
-    scenarios, suite = make_suite(name, 3), SUITES[name]
-    assert suite.name == name and suite.description.endswith(".")
-    assert scenarios.batch_shape == (3,) and scenarios.num_targets == suite.num_targets
-    for leaf in leaves(scenarios):
+    cases, suite = draw(3, name), SUITES[name]
+    assert suite.description.endswith(".") and TASK.suites[name] == suite.description
+    assert cases.batch_shape == (3,) and cases.num_targets == suite.num_targets
+    for leaf in leaves(cases):
         assert leaf.shape[:1] == (3,) and leaf.dtype in (np.float32, np.int32, bool)
-    assert scenarios.present.all()
-    np.testing.assert_array_equal(scenarios.head_state[:, 0], np.tile([0.0, 0.0, 1.0], (3, 1)))
-    assert not scenarios.head_state[:, 1:].any()
-    many = np.asarray(make_suite(name, NUM).horizon)
+    assert cases.present.all()
+    np.testing.assert_array_equal(cases.head_state[:, 0], np.tile([0.0, 0.0, 1.0], (3, 1)))
+    assert not cases.head_state[:, 1:].any()
+    many = np.asarray(draw(NUM, name).horizon)
     assert 0.9 * suite.horizon < many.max() <= suite.horizon * (1.0 + 1e-6)
 
 
 @float64
 @pytest.mark.parametrize("name", THROWS)
 def test_a_throw_leaves_the_machine_lands_in_its_rectangle_and_flies_as_long_as_it_says(name):
-    scenarios = drawn(name)
+    cases = drawn(name)
     for i, (land, (shortest, longest), delay) in enumerate(RANGES[name]):
-        ball = jax.tree.map(lambda leaf, i=i: leaf[:, i : i + 1], scenarios.targets)
+        ball = jax.tree.map(lambda leaf, i=i: leaf[:, i : i + 1], cases.targets)
         flown = np.arange(0.0, longest, 2e-3)
         pos = np.asarray(states(ball, jnp.asarray(np.tile(flown - delay, (NUM, 1, 1)))).pos)[:, 0]
         np.testing.assert_allclose(pos[:, 0], np.tile(LAUNCH, (NUM, 1)), atol=1e-9)
@@ -112,21 +107,21 @@ def test_a_throw_leaves_the_machine_lands_in_its_rectangle_and_flies_as_long_as_
 @float64
 @pytest.mark.parametrize("name", THROWS)
 def test_a_thrown_ball_may_be_caught_until_it_falls_through_the_least_height(name):
-    scenarios = drawn(name)
-    ball = states(scenarios.targets, until_horizon(scenarios))
+    cases = drawn(name)
+    ball = states(cases.targets, until_horizon(cases))
     np.testing.assert_allclose(ball.pos[..., -1, 2], CATCH_HEIGHT, atol=1e-9)
     assert (ball.vel[..., -1, 2] < 0.0).all()
     assert (ball.pos[..., :-1, 2] > CATCH_HEIGHT).all()
     drag = 0.5 if name in ("throws", "hard") else 0.0
-    assert (scenarios.targets.drag == drag).all() and (scenarios.targets.gravity == 9.81).all()
+    assert (cases.targets.drag == drag).all() and (cases.targets.gravity == 9.81).all()
 
 
 @float64
 @pytest.mark.parametrize("name", VOLUMES)
 def test_every_target_stays_in_its_volume_and_comes_near_the_quadrotor(name):
-    scenarios, (reach, (low, high)) = drawn(name), VOLUMES[name]
-    assert (scenarios.horizon == SUITES[name].horizon).all()
-    ball = states(scenarios.targets, until_horizon(scenarios))
+    cases, (reach, (low, high)) = drawn(name), VOLUMES[name]
+    assert (cases.horizon == SUITES[name].horizon).all()
+    ball = states(cases.targets, until_horizon(cases))
     distance, height = away(ball.pos), np.asarray(ball.pos)[..., 2]
     assert distance.max() <= reach
     assert low <= height.min() and height.max() <= high
@@ -140,21 +135,21 @@ def test_every_target_stays_in_its_volume_and_comes_near_the_quadrotor(name):
 
 @float64
 def test_swings_are_near_in_time():
-    scenarios = drawn("harmonic2")
-    ball = states(scenarios.targets, until_horizon(scenarios, 141))
+    cases = drawn("harmonic2")
+    ball = states(cases.targets, until_horizon(cases, 141))
     near = away(ball.pos)[..., 40:101]  # from 2 to 5 s
     assert near.min(axis=-1).max() < 1.5 + 0.04
-    assert not scenarios.targets.amplitude[..., :2].any()
+    assert not cases.targets.amplitude[..., :2].any()
 
 
 @float64
 def test_lines_are_a_triangle_at_angles_of_120_degrees_and_a_hexagon_in_parallel():
     for name in LINES:
-        scenarios = drawn(name)
-        assert isinstance(scenarios.targets, BallPath)
-        assert not (scenarios.targets.drag.any() or scenarios.targets.gravity.any())
+        cases = drawn(name)
+        assert isinstance(cases.targets, BallPath)
+        assert not (cases.targets.drag.any() or cases.targets.gravity.any())
         num = SUITES[name].num_targets
-        ball = states(scenarios.targets, until_horizon(scenarios, 61))
+        ball = states(cases.targets, until_horizon(cases, 61))
         pos, vel = np.asarray(ball.pos), np.asarray(ball.vel)[:, :, 0]
         centre = pos.mean(axis=1, keepdims=True)
         side = np.linalg.norm(pos - np.roll(pos, 1, axis=1), axis=-1)  # (B, N, T)
@@ -176,7 +171,7 @@ def test_lines_are_a_triangle_at_angles_of_120_degrees_and_a_hexagon_in_parallel
 
 @pytest.mark.parametrize("name", ["hard", "harmonic2", "hexagon6"])
 def test_padding_leaves_the_present_targets_alone(name):
-    plain, padded = make_suite(name, 5, 2), make_suite(name, 5, 2, num_targets=8)
+    plain, padded = draw(5, name, 2), draw(5, name, 2, num_targets=8)
     own = SUITES[name].num_targets
     assert padded.num_targets == 8
     np.testing.assert_array_equal(padded.present, np.tile(np.arange(8) < own, (5, 1)))
@@ -192,21 +187,22 @@ def test_padding_leaves_the_present_targets_alone(name):
 @pytest.mark.parametrize(
     ("arguments", "options", "says"),
     [
-        (("throw", 3), {}, "suite must be one of throws, hard, .*, hexagon6, got 'throw'"),
-        (("throws", 0), {}, "num must be >= 1, got 0"),
-        (("throws", 3, -1), {}, "seed must be >= 0, got -1"),
-        (("triangle3", 3), {"num_targets": 2}, "num_targets must be >= 3 .*'triangle3', got 2"),
+        ((3, "throw"), {}, "suite must be one of throws, hard, .*, hexagon6, got 'throw'"),
+        ((0, "throws"), {}, "num must be >= 1, got 0"),
+        ((3, "throws", -1), {}, "seed must be >= 0, got -1"),
+        ((3, "throws", 0), {"first": -1}, "first must be >= 0, got -1"),
+        ((3, "triangle3"), {"num_targets": 2}, "num_targets must be >= 3 .*'triangle3', got 2"),
     ],
 )
 def test_bad_arguments_are_named_in_one_line(arguments, options, says):
     with pytest.raises(ValueError, match=says) as caught:
-        make_suite(*arguments, **options)
+        draw(*arguments, **options)
     assert "\n" not in str(caught.value)
 
 
 def test_the_earliest_throw_leaves_less_time_than_any_other_of_its_suite():
     ball, horizon = earliest_throw("throws")
-    many = make_suite("throws", 200, 3)
+    many = draw(200, "throws", 3)
     assert horizon <= np.min(many.horizon) + 1e-3
     assert ball.vel[2] <= np.min(many.targets.ball.vel[..., 2]) + 1e-3
     assert abs(ball.pos[1]) < 1e-6  # to the middle

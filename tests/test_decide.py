@@ -7,32 +7,63 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import planner_jax as pj
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
+from planner_jax.planning import batch
+from planner_jax.planning.decided import DecidedPlanner, first_choice
+from planner_jax.planning.plan import plan
 from planner_jax.protocol import Status, is_solved
 from planner_jax.referee.catch import referee_catches
-from planner_jax.task.catch import decide as decide_module
 from planner_jax.task.catch.decide import (
-    best_orders,
+    Best,
+    Given,
+    Greedy,
+    _follow,
+    _timetable,
     closest_approach,
-    decided,
-    greedy,
-    plan_catches,
+    optimal_time_ratio,
 )
 from planner_jax.task.catch.exact import ExactCatch
-from planner_jax.task.catch.scenario import catch_scenario
-from planner_jax.task.catch.suites import make_suite
+from planner_jax.task.catch.suites import draw
 
 PLANNER = ExactCatch(rounds=(Round(1, LbfgsConfig(max_steps=20)),))
-GREEDY = jax.jit(jax.vmap(greedy))
-BEST = jax.jit(jax.vmap(best_orders, in_axes=(0, None)), static_argnums=1)
 NUM = 8
 
 
-def best(scenarios):
-    return BEST(scenarios, 6)
+@jax.jit
+@jax.vmap
+def greedy(case):
+    """The one choice (N,) of `Greedy`."""
+    return jax.tree.map(lambda leaf: leaf[0], Greedy().propose(case))
+
+
+@jax.jit
+@jax.vmap
+def best(case):
+    """The six choices (6, N) of `Best`, from the best."""
+    return Best(finalists=6).propose(case)
+
+
+@jax.jit
+@jax.vmap
+def estimate(case, order):
+    """By how much the targets stay out of reach when they are caught in that order, ()."""
+    return _follow(case, _timetable(case), order)[1]
+
+
+def shortfall(cases, choices):
+    """That of every choice, with the batch shape of the choices."""
+    order = np.asarray(choices.order)
+    if order.ndim == 2:
+        return np.asarray(estimate(cases, order))
+    return np.stack([np.asarray(estimate(cases, one)) for one in np.moveaxis(order, 1, 0)], 1)
+
+
+def by(decision, planner=PLANNER):
+    return DecidedPlanner(planner, decision)
 
 
 def hanging(places, horizons):
@@ -40,7 +71,7 @@ def hanging(places, horizons):
     pos = jnp.asarray(places, jnp.float32)
     ball = BallState(pos, jnp.zeros_like(pos))
     targets = BallPath(ball, jnp.zeros_like(pos), jnp.zeros(pos.shape[:2]))
-    return catch_scenario(targets, np.asarray(horizons, float), gravity=np.full(len(pos), 9.81))
+    return pj.catch.case(targets, np.asarray(horizons, float), gravity=np.full(len(pos), 9.81))
 
 
 NEAR, FAR = (-1.0, 0.0, 1.2), (2.0, 0.0, 1.2)  # targets of a quadrotor that waits at (0, 0, 1)
@@ -50,56 +81,56 @@ NEAR, FAR = (-1.0, 0.0, 1.2), (2.0, 0.0, 1.2)  # targets of a quadrotor that wai
 def pairs():
     """A near target, and a far one that has time, is due soon, is too far, too low, or rises."""
     places = [(FAR, NEAR), (NEAR, FAR), ((100.0, 0.0, 1.2), NEAR), ((2.0, 0.0, 0.3), NEAR)]
-    scenarios = hanging([*places, (FAR, NEAR)], [(4.0, 4.0), (4.0, 1.15)] + 3 * [(4.0, 4.0)])
-    ball = scenarios.targets.ball
+    cases = hanging([*places, (FAR, NEAR)], [(4.0, 4.0), (4.0, 1.15)] + 3 * [(4.0, 4.0)])
+    ball = cases.targets.ball
     rising = ball.replace(vel=ball.vel.at[4, 0].set(jnp.array([0.2, 0.0, 1.0])))
-    return scenarios.replace(targets=scenarios.targets.replace(ball=rising))
+    return cases.replace(targets=cases.targets.replace(ball=rising))
 
 
 @pytest.fixture(scope="module")
 def triangles():
-    return make_suite("triangle3", NUM, 4)
+    return draw(NUM, "triangle3", 4)
 
 
-def orders(decision):
-    return np.asarray(decision.order).tolist()
+def orders(choices):
+    return np.asarray(choices.order).tolist()
 
 
-def rank(decision):
+def rank(cases, choices):
     """What an order is judged by: the last catch [s], with 10 s a metre out of reach."""
-    return np.asarray(decision.times[..., -1] + 10.0 * decision.shortfall)
+    return np.asarray(choices.times[..., -1]) + 10.0 * shortfall(cases, choices)
 
 
 def test_greedy_catches_next_what_it_reaches_first(pairs):
-    found = GREEDY(pairs)
+    found = greedy(pairs)
     assert orders(found) == [[1, 0], [0, 1], [1, 0], [1, 0], [1, 0]]
-    assert found.shortfall[0] == 0.0
-    assert found.shortfall[1] > 0.1  # too late for the far one
+    assert shortfall(pairs, found)[0] == 0.0
+    assert shortfall(pairs, found)[1] > 0.1  # too late for the far one
 
 
 def test_best_catches_first_what_is_due_first(pairs):
     found = best(pairs)
     assert orders(found)[0][0] == [1, 0]
     assert orders(found)[1][0] == [1, 0]
-    assert found.shortfall[1, 0] == 0.0
+    assert shortfall(pairs, found)[1, 0] == 0.0
     assert found.times[1, 0, 0] <= 1.15
 
 
 def test_times_are_those_of_a_point_that_accelerates_evenly(pairs):
     """One metre from hover at 7 m/s^2 after 0.2 s, up to one of the 64 times that are tried."""
-    found = GREEDY(pairs)
+    found = greedy(pairs)
     arrival = 0.2 + np.sqrt(2.0 * 1.0 / 7.0)
     assert arrival <= found.times[0, 0] <= arrival + 4.0 / 64.0 + 1e-6
 
 
 def test_shortfall_is_how_far_out_of_reach_a_target_stays(pairs):
     """In 4 s less the near catch the quadrotor comes nowhere near 100 m."""
-    for shortfall in (GREEDY(pairs).shortfall[2], best(pairs).shortfall[2, 0]):
-        assert 101.0 - 0.9 * 5.0 * 4.0 < shortfall < 101.0
+    for missing in (shortfall(pairs, greedy(pairs))[2], shortfall(pairs, best(pairs))[2, 0]):
+        assert 101.0 - 0.9 * 5.0 * 4.0 < missing < 101.0
 
 
 def test_a_target_near_the_floor_or_from_below_counts_as_out_of_reach(pairs):
-    low, rising = GREEDY(pairs).shortfall[3:]
+    low, rising = shortfall(pairs, greedy(pairs))[3:]
     np.testing.assert_allclose(low, 10.0 * (0.25 + 0.1 + 0.2 - 0.3), rtol=1e-4)
     np.testing.assert_allclose(rising, 10.0 * (1.0 / np.hypot(1.0, 0.2) - 0.2), rtol=1e-4)
 
@@ -108,23 +139,23 @@ def test_all_orders_are_ranked_from_the_best(triangles):
     found = best(triangles)
     assert found.order.shape == (NUM, 6, 3)
     assert len({tuple(order) for order in orders(found)[0]}) == 6
-    assert (np.diff(rank(found), axis=1) >= 0.0).all()
+    assert (np.diff(rank(triangles, found), axis=1) >= 0.0).all()
 
 
 def test_best_is_never_later_than_greedy_in_its_own_estimate(pairs, triangles):
-    for scenarios in (pairs, triangles):
-        assert (rank(best(scenarios))[:, 0] <= rank(GREEDY(scenarios))).all()
-    assert rank(best(pairs))[1, 0] < rank(GREEDY(pairs))[1]
+    for cases in (pairs, triangles):
+        assert (rank(cases, best(cases))[:, 0] <= rank(cases, greedy(cases))).all()
+    assert rank(pairs, best(pairs))[1, 0] < rank(pairs, greedy(pairs))[1]
 
 
 def test_decisions_are_permutations_with_rising_times(triangles):
-    for found in (GREEDY(triangles), best(triangles)):
+    for found in (greedy(triangles), best(triangles)):
         assert (np.sort(found.order, axis=-1) == np.arange(3)).all()
         assert (np.diff(found.times, axis=-1) > 0.0).all()
         assert (found.times > 0.0).all()
 
 
-@pytest.mark.parametrize("decide", [GREEDY, best], ids=["greedy", "best"])
+@pytest.mark.parametrize("decide", [greedy, best], ids=["greedy", "best"])
 def test_absent_targets_come_last_and_change_nothing(triangles, decide):
     masks = np.array([[k & 1, k & 2, k & 4] for k in range(NUM)], bool)
     few = dataclasses.replace(triangles, present=masks)
@@ -132,100 +163,138 @@ def test_absent_targets_come_last_and_change_nothing(triangles, decide):
     order = np.asarray(found.order).reshape(NUM, -1, 3)
     here = masks[np.arange(NUM)[:, None, None], order]
     assert (here == (np.arange(3) < masks.sum(axis=1)[:, None, None])).all()
-    np.testing.assert_array_equal(found.shortfall[0], 0.0)  # no target, nothing to miss
+    missing = shortfall(few, found)
+    np.testing.assert_array_equal(missing[0], 0.0)  # no target, nothing to miss
     whole, moved = decide(triangles), jnp.where(masks[..., None], 0.0, jnp.nan)
     pos = triangles.targets.ball.pos + moved  # absent targets may hold anything
     ball = triangles.targets.ball.replace(pos=pos)
-    hidden = decide(dataclasses.replace(few, targets=triangles.targets.replace(ball=ball)))
+    holding = dataclasses.replace(few, targets=triangles.targets.replace(ball=ball))
+    hidden = decide(holding)
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(hidden), strict=True):
         np.testing.assert_array_equal(a[1:], b[1:])
+    np.testing.assert_array_equal(missing[1:], shortfall(holding, hidden)[1:])
     assert orders(whole)[-1] == orders(found)[-1]  # where all are present
 
 
 def test_plans_follow_the_decision_and_best_catches_both_in_time(pairs):
-    chosen, plans = plan_catches(PLANNER, pairs, decide="best")
-    np.testing.assert_array_equal(plans.order, chosen.order)
+    plans = plan(by(Best()), pairs)
+    proposed = best(pairs)
+    for k in range(5):  # what is kept is one of the choices, order and times together
+        place = orders(proposed)[k].index(plans.order[k].tolist())
+        np.testing.assert_array_equal(plans.decided_times[k], proposed.times[k, place])
     assert is_solved(plans.status[:2]).all()
     assert plans.order[1].tolist() == [1, 0]
-    verdict = referee_catches(chosen, plans)
+    verdict = referee_catches(pairs, plans)
     assert verdict.success[:2].all(), [verdict.sentence(k) for k in range(2)]
-    given, same = plan_catches(PLANNER, chosen, decide="given")
-    assert given is chosen
+    same = plan(by(Given()), pairs.decided(plans.choice))
+    np.testing.assert_array_equal(same.order, plans.order)
+    np.testing.assert_array_equal(same.decided_times, plans.decided_times)
     np.testing.assert_allclose(same.times[:2], plans.times[:2], rtol=1e-5)
 
 
-@pytest.mark.parametrize("decide", ["best", "greedy"])
+@pytest.mark.parametrize("decide", [Best(), Greedy()], ids=["best", "greedy"])
 @pytest.mark.parametrize(("array", "kind"), [(np.asarray, np.ndarray), (jnp.asarray, jax.Array)])
 def test_what_comes_back_is_of_the_kind_that_was_given(decide, array, kind, pairs):
-    found = plan_catches(PLANNER, jax.tree.map(array, pairs), decide)
+    found = plan(by(decide), jax.tree.map(array, pairs))
     assert all(isinstance(leaf, kind) for leaf in jax.tree.leaves(found))
 
 
-def test_one_case_is_told_to_be_no_batch(pairs):
-    with pytest.raises(ValueError, match="must be a batch"):
-        plan_catches(PLANNER, jax.tree.map(lambda leaf: leaf[0], pairs), "greedy")
+@pytest.mark.parametrize("decide", [Best(), Greedy()], ids=["best", "greedy"])
+def test_one_case_alone_is_decided_on_and_planned_as_in_its_batch(decide, pairs):
+    alone, together = plan(by(decide), pj.lane(pairs, 1)), plan(by(decide), pairs)
+    assert alone.order.tolist() == together.order[1].tolist()
+    assert alone.status == together.status[1]
+    np.testing.assert_allclose(alone.decided_times, together.decided_times[1], rtol=1e-6)
+    np.testing.assert_allclose(alone.times, together.times[1], rtol=2e-3)
 
 
 def test_the_last_round_is_for_cases_without_any_solved_order(pairs, monkeypatch):
     """Case 0 is solved in one order at once; the other one is not tried any longer for it."""
-    planned, real = [], decide_module.plan
+    planned, real = [], batch._plan_from_host
 
-    def noted(planner, scenarios, **options):
-        planned.append((len(planner.rounds), scenarios.order.shape[0]))
-        return real(planner, scenarios, **options)
+    def noted(planner, attempts, cases, *where):
+        planned.append((len(attempts), cases.order.shape[0]))
+        return real(planner, attempts, cases, *where)
 
-    monkeypatch.setattr(decide_module, "plan", noted)
+    monkeypatch.setattr(batch, "_plan_from_host", noted)
     twice = dataclasses.replace(PLANNER, rounds=2 * PLANNER.rounds[:1])
-    _, plans = plan_catches(twice, pairs, "best")
+    plans = plan(by(Best(), twice), pairs)
     unsolved = int((~is_solved(plans.status)).sum())
     assert 0 < unsolved < 5
     assert planned == [(1, 10), (1, 2 * unsolved)]
 
 
 def test_greedy_plans_have_the_order_of_the_estimate(pairs):
-    estimate = GREEDY(pairs)
-    chosen, plans = plan_catches(PLANNER, pairs, decide="greedy")
-    np.testing.assert_array_equal(chosen.order, estimate.order)
-    np.testing.assert_array_equal(chosen.times, estimate.times)
-    np.testing.assert_array_equal(plans.order, estimate.order)
+    decided = greedy(pairs)
+    plans = plan(by(Greedy()), pairs)
+    np.testing.assert_array_equal(plans.order, decided.order)
+    np.testing.assert_array_equal(plans.decided_times, decided.times)
     assert is_solved(plans.status[0])
     assert not is_solved(plans.status[1:3]).any()  # due before, or too far
 
 
 def test_a_decision_sets_order_and_times_alone(triangles):
-    estimate = GREEDY(triangles)
-    after = decided(triangles, estimate)
-    assert after.order is estimate.order
-    assert after.times is estimate.times
+    choice = greedy(triangles)
+    after = triangles.decided(choice)
+    assert after.order is choice.order
+    assert after.times is choice.times
     assert after.targets is triangles.targets
+    first = first_choice(Greedy(), triangles)
+    np.testing.assert_array_equal(first.order, choice.order)
+    np.testing.assert_array_equal(first.times, choice.times)
+    one = first_choice(Greedy(), pj.lane(triangles, 3))
+    assert orders(one) == orders(choice)[3]
+
+
+def test_fewer_finalists_are_the_first_of_more_and_one_is_needed(triangles):
+    few = jax.jit(jax.vmap(Best(finalists=2).propose))(triangles)
+    for a, b in zip(jax.tree.leaves(few), jax.tree.leaves(best(triangles)), strict=True):
+        np.testing.assert_array_equal(a, b[:, :2])
+    with pytest.raises(ValueError, match="finalists must be >= 1, got 0"):
+        Best(finalists=0)
+
+
+def test_the_time_ratio_is_that_of_the_present_targets(pairs):
+    """Paper 000, eq. 29, by hand: of the last case the second target is absent."""
+    present = np.ones((5, 2), bool)
+    present[4, 1] = False
+    order = np.array([[0, 1], [1, 0], [0, 1], [1, 0], [0, 1]])
+    given = np.array([[1.0, 2.0]] * 5)
+    plans = plan(by(Given()), pairs).replace(
+        order=order, decided_times=given, times=given * [1.25, 0.8]
+    )
+    ratio = optimal_time_ratio(pairs.replace(present=present), plans)
+    np.testing.assert_allclose(ratio, [(0.2 + 0.25) / 2.0] * 4 + [0.2], rtol=1e-6)
 
 
 def test_an_unknown_decision_is_refused(pairs):
     with pytest.raises(ValueError, match="decide must be one of best, greedy, given, got 'worst'"):
-        plan_catches(PLANNER, pairs, decide="worst")
+        pj.catch.planner(decide="worst")
 
 
 @pytest.mark.parametrize("order", [[1, 1], [0, 2], [-1, 0]])
 def test_a_given_order_that_is_no_permutation_is_refused(pairs, order):
     given = np.array([[0, 1], order, [1, 0], [0, 1], [1, 0]], np.int32)
     wrong = dataclasses.replace(pairs, order=given)
-    line = rf"order must be a permutation of 0\.\.1, got \[{order[0]}, {order[1]}\] in scenario 1"
+    line = rf"order must be a permutation of 0\.\.1, got \[{order[0]}, {order[1]}\] in case 1"
     with pytest.raises(ValueError, match=line):
-        plan_catches(PLANNER, wrong, decide="given")
+        plan(by(Given()), wrong)
 
 
 def test_closest_approach_is_what_the_greatest_speed_leaves(pairs):
     """100 m away, 4 s at 5 m/s, the net's size, and what a 64th of the time may hide."""
-    gap = np.array(jax.jit(jax.vmap(closest_approach))(pairs))
+    gap = np.array(closest_approach(pairs))
     left = np.hypot(100.0, 0.2) - 5.0 * 4.0 - (0.2 + 0.125) - 5.0 * 4.0 / 64.0
     assert gap[2, 0] == pytest.approx(left, rel=1e-4)
+    alone = closest_approach(pj.lane(pairs, 2))
+    np.testing.assert_allclose(alone, gap[2], rtol=1e-6)
     gap[2, 0] = 0.0
     assert not gap.any()
 
 
 @pytest.mark.parametrize(("array", "kind"), [(np.asarray, np.ndarray), (jnp.asarray, jax.Array)])
 def test_a_target_out_of_reach_is_named_and_its_neighbours_are_not(array, kind, pairs):
-    _, plans = plan_catches(PLANNER, jax.tree.map(array, pairs), decide="greedy")
+    plans = plan(by(Greedy()), jax.tree.map(array, pairs))
     assert isinstance(plans.status, kind)
     assert plans.status[2] == Status.OUT_OF_REACH
     assert Status(plans.status[2]).message.startswith("a target never comes within reach")

@@ -9,11 +9,11 @@ from planner_jax.ball.aim import aim_with_drag, apex_with_drag
 from planner_jax.ball.flight import BallState, fly
 from planner_jax.ball.impact import racket_impact
 from planner_jax.optimise.scaling import shipped_scale
+from planner_jax.planning.plan import plan
 from planner_jax.protocol import Status, is_solved
 from planner_jax.referee.hit import referee_hits
 from planner_jax.task.hit.exact import ExactHit
-from planner_jax.task.hit.serves import generate_serves, to_scenarios
-from planner_jax.task.solve import plan
+from planner_jax.task.hit.serves import generate_serves, to_cases
 from planner_jax.trajectory.polynomial import evaluate, total_duration
 from tests.jaxpr import assert_full_precision
 
@@ -23,25 +23,25 @@ NUM = 16
 
 
 @pytest.fixture(scope="module")
-def scenarios():
+def cases():
     """In NumPy arrays, so that batches of all sizes up to 16 are planned by one program."""
-    return jax.tree.map(np.asarray, to_scenarios(generate_serves(NUM, 11)))
+    return jax.tree.map(np.asarray, to_cases(generate_serves(NUM, 11)))
 
 
 @pytest.fixture(scope="module")
-def plans(scenarios):
-    return plan(PLANNER, scenarios)
+def plans(cases):
+    return plan(PLANNER, cases)
 
 
-def test_every_easy_serve_is_solved_and_confirmed_by_the_referee(scenarios, plans):
+def test_every_easy_serve_is_solved_and_confirmed_by_the_referee(cases, plans):
     assert is_solved(plans.status).all()
-    verdict = referee_hits(scenarios, plans)
+    verdict = referee_hits(cases, plans)
     assert verdict.success.all(), [verdict.sentence(k) for k in np.flatnonzero(~verdict.success)]
 
 
-def test_any_decision_vector_meets_the_ball_and_reaches_the_target(scenarios):
+def test_any_decision_vector_meets_the_ball_and_reaches_the_target(cases):
     """The elimination itself: no optimisation, random variables, and still no miss."""
-    lane = jax.tree.map(lambda leaf: leaf[3], scenarios)
+    lane = jax.tree.map(lambda leaf: leaf[3], cases)
     context = PLANNER.prepare(lane)
     size = PLANNER.guesses(context, 1).shape[1]
     offsets = 0.3 * jax.random.normal(jax.random.key(0), (8, size))
@@ -63,27 +63,27 @@ def test_stroke_obeys_the_impact_map(plans):
         np.testing.assert_allclose(after, one.stroke.ball_vel_after, atol=2e-3)
 
 
-def test_one_plan_equals_its_lane_in_the_batch(scenarios, plans):
-    alone = plan(PLANNER, jax.tree.map(lambda leaf: leaf[5], scenarios))
+def test_one_plan_equals_its_lane_in_the_batch(cases, plans):
+    alone = plan(PLANNER, jax.tree.map(lambda leaf: leaf[5], cases))
     assert alone.status == plans.status[5]
     np.testing.assert_allclose(alone.stroke.time, plans.stroke.time[5], rtol=1e-3)
     np.testing.assert_allclose(alone.cost, plans.cost[5], rtol=2e-2)
 
 
-def test_a_nan_serve_is_a_row_and_leaves_its_neighbours_bits_alone(scenarios, plans):
-    pos = scenarios.ball.pos.copy()
+def test_a_nan_serve_is_a_row_and_leaves_its_neighbours_bits_alone(cases, plans):
+    pos = cases.ball.pos.copy()
     pos[2, 0] = np.nan
-    found = plan(PLANNER, scenarios.replace(ball=scenarios.ball.replace(pos=pos)))
+    found = plan(PLANNER, cases.replace(ball=cases.ball.replace(pos=pos)))
     assert found.status[2] == Status.NON_FINITE
     for old, new in zip(jax.tree.leaves(plans), jax.tree.leaves(found), strict=True):
         np.testing.assert_array_equal(np.delete(old, 2, axis=0), np.delete(new, 2, axis=0))
 
 
-def test_an_impossible_lane_says_so_and_stays_finite(scenarios):
-    crippled = scenarios.limits.scaled(0.05)
+def test_an_impossible_lane_says_so_and_stays_finite(cases):
+    crippled = cases.limits.scaled(0.05)
     crippled_lane = np.arange(NUM) == 1
-    limits = jax.tree.map(lambda a, b: np.where(crippled_lane, b, a), scenarios.limits, crippled)
-    found = plan(FIRST_ROUND, scenarios.replace(limits=limits))
+    limits = jax.tree.map(lambda a, b: np.where(crippled_lane, b, a), cases.limits, crippled)
+    found = plan(FIRST_ROUND, cases.replace(limits=limits))
     assert found.status[1] in (Status.INFEASIBLE, Status.MAX_STEPS)
     assert found.violation[1] > 0.0
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
@@ -127,8 +127,8 @@ def test_falling_ball_is_highest_now():
     assert apex_with_drag(ball, jnp.asarray(1.0), jnp.asarray(0.06), jnp.asarray(9.8)) == 2.0
 
 
-def test_all_products_of_the_objective_are_in_full_precision(scenarios):
-    lane = jax.tree.map(lambda leaf: leaf[0], scenarios)
+def test_all_products_of_the_objective_are_in_full_precision(cases):
+    lane = jax.tree.map(lambda leaf: leaf[0], cases)
     context = PLANNER.prepare(lane)
     start = PLANNER.guesses(context, 1)[0]
     slopes = jax.grad(lambda x: PLANNER.objective(x, context).cost)
@@ -137,10 +137,10 @@ def test_all_products_of_the_objective_are_in_full_precision(scenarios):
 
 
 def test_objective_gradient_agrees_with_finite_differences(float64):
-    scenario = jax.tree.map(
-        lambda leaf: leaf[0], to_scenarios(generate_serves(1, 4), delay=0.5, dtype=jnp.float64)
+    case = jax.tree.map(
+        lambda leaf: leaf[0], to_cases(generate_serves(1, 4), delay=0.5, dtype=jnp.float64)
     )
-    context = PLANNER.prepare(scenario)
+    context = PLANNER.prepare(case)
     cost = jax.jit(jax.value_and_grad(lambda x: PLANNER.objective(x, context).cost))
     point = np.asarray(PLANNER.guesses(context, 1)[0]) + 0.1
     _, slopes = cost(point)
@@ -151,12 +151,12 @@ def test_objective_gradient_agrees_with_finite_differences(float64):
         np.testing.assert_allclose(slopes[k], numeric, rtol=1e-4, atol=1e-9)
 
 
-def test_sizes_that_make_no_sense_are_refused(scenarios):
+def test_sizes_that_make_no_sense_are_refused(cases):
     with pytest.raises(ValueError, match=r"proportions must be of >= 2 pieces, got \(1.0,\)"):
         ExactHit(proportions=(1.0,))
     with pytest.raises(ValueError, match="no measured scale for 'exact-5'"):
         ExactHit(proportions=(1.0,) * 5)
-    context = PLANNER.prepare(jax.tree.map(lambda leaf: leaf[0], scenarios))
+    context = PLANNER.prepare(jax.tree.map(lambda leaf: leaf[0], cases))
     with pytest.raises(ValueError, match="starts must be <= 12, got 13"):
         PLANNER.guesses(context, 13)
 

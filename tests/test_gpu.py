@@ -11,18 +11,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import planner_jax as pj
 from planner_jax.lanes import over_lanes, pallas
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.multistart import minimise_lanes, solve_batch
 from planner_jax.optimise.problem import Round
 from planner_jax.optimise.sensitivity import gradient_at
+from planner_jax.planning.plan import plan
 from planner_jax.protocol import is_solved
-from planner_jax.task.catch.decide import plan_catches
-from planner_jax.task.catch.exact import ExactCatch
-from planner_jax.task.catch.suites import make_suite
+from planner_jax.task.catch.suites import draw
 from planner_jax.task.hit.exact import ExactHit
-from planner_jax.task.hit.serves import generate_serves, to_scenarios
-from planner_jax.task.solve import plan
+from planner_jax.task.hit.serves import generate_serves, to_cases
 
 pytestmark = pytest.mark.gpu
 
@@ -38,7 +37,7 @@ def devices():
 
 @pytest.fixture(scope="module")
 def serves():
-    return jax.tree.map(np.asarray, to_scenarios(generate_serves(LANES, 0)))
+    return jax.tree.map(np.asarray, to_cases(generate_serves(LANES, 0)))
 
 
 def run(device, function, *args):
@@ -70,11 +69,11 @@ import sys
 import jax, numpy as np
 from planner_jax.lanes import pallas
 from planner_jax.task.hit.exact import ExactHit
-from planner_jax.task.hit.serves import generate_serves, to_scenarios
-from planner_jax.task.solve import plan
+from planner_jax.task.hit.serves import generate_serves, to_cases
+from planner_jax.planning.plan import plan
 
 assert jax.default_backend() == "gpu" and pallas.kernels() is pallas.Kernels.OFF
-cases = jax.tree.map(np.asarray, to_scenarios(generate_serves(int(sys.argv[1]), 0)))
+cases = jax.tree.map(np.asarray, to_cases(generate_serves(int(sys.argv[1]), 0)))
 plans = plan(ExactHit(), cases, devices=jax.devices()[:1])
 np.savez(sys.argv[2], status=plans.status, time=plans.stroke.time)
 """
@@ -94,11 +93,11 @@ def test_hits_are_those_of_a_process_without_kernels(devices, serves, tmp_path):
 
 
 def test_catches_are_those_of_a_cpu(devices):
-    throws = make_suite("throws", num=LANES, seed=0)
+    throws = draw(LANES, "throws", 0)
     ours, theirs = (
         run(
             device,
-            lambda s, d=device: plan_catches(ExactCatch(), s, "greedy", devices=[d])[1],
+            lambda s, d=device: plan(pj.catch.planner(decide="greedy"), s, devices=[d]),
             throws,
         )
         for device in devices
@@ -113,16 +112,16 @@ def test_gradients_at_the_same_points_are_those_of_a_cpu(devices, serves):
     lanes = jax.tree.map(lambda leaf: np.moveaxis(leaf, 0, -1), serves)
 
     @jax.jit
-    def optima(scenarios):
-        contexts = over_lanes(planner.prepare)(scenarios)
+    def optima(cases):
+        contexts = over_lanes(planner.prepare)(cases)
         starts = over_lanes(lambda context: planner.guesses(context, 1)[0])(contexts)
         return minimise_lanes(planner.objective, starts, contexts, LbfgsConfig(max_steps=60)).point
 
     @jax.jit
     @over_lanes
-    def gradients(scenario, point):
-        wrt = ("drag", "ball", "limits", "target")
-        return gradient_at(planner, scenario, point, "stroke.time", wrt, steps=2).by
+    def gradients(case, point):
+        by = ("drag", "ball", "limits", "target")
+        return gradient_at(planner, case, point, "stroke.time", by, steps=2).by
 
     points = run(devices[1], optima, lanes)
     ours, theirs = (run(device, gradients, lanes, points) for device in devices)
@@ -154,7 +153,7 @@ def test_several_gpus_give_the_plans_of_one(devices, serves):
 
 
 def test_lanes_that_are_not_finite_change_no_bit_of_the_others(devices):
-    serves = to_scenarios(generate_serves(8192, 1))
+    serves = to_cases(generate_serves(8192, 1))
     broken = np.arange(8192) % 100 == 7
     spoiled = serves.replace(drag=jnp.where(broken, jnp.nan, serves.drag))
     hits = functools.partial(plan, ExactHit(), devices=[devices[0]])

@@ -9,11 +9,11 @@ from planner_jax.optimise.implicit import newton_refine, optimal_plan
 from planner_jax.optimise.lbfgs import Evaluation
 from planner_jax.protocol import Status
 from planner_jax.task.hit.exact import ExactHit
-from planner_jax.task.hit.serves import generate_serves, to_scenarios
+from planner_jax.task.hit.serves import generate_serves, to_cases
 
 PLANNER = ExactHit()
 
-# How to move one number of a scenario, for each leaf that is differentiated by.
+# How to move one number of a case, for each leaf that is differentiated by.
 MOVES = {
     "drag": lambda s, d: s.replace(drag=s.drag + d),
     "racket_height": lambda s, d: s.replace(racket_height=s.racket_height + d),
@@ -25,9 +25,9 @@ MOVES = {
 }
 
 
-def numbers(scenario):
+def numbers(case):
     """Cost, contact time and hitting point of the optimum, and its status."""
-    plan = optimal_plan(PLANNER, scenario)
+    plan = optimal_plan(PLANNER, case)
     return jnp.stack([plan.cost, plan.stroke.time, *plan.stroke.ball_pos]), plan.status
 
 
@@ -35,10 +35,10 @@ def numbers(scenario):
 def study():
     """Two late serves under weak limits, one of which presses on them, with their Jacobians."""
     with jax.enable_x64(True):
-        batch = to_scenarios(generate_serves(8, 3), delay=0.4, limit_scale=0.7, dtype=jnp.float64)
+        batch = to_cases(generate_serves(8, 3), delay=0.4, limit_scale=0.7, dtype=jnp.float64)
 
-        def moved(scenario, move, distance):
-            return numbers(jax.tree.map(lambda a, b: a + distance * b, scenario, move))
+        def moved(case, move, distance):
+            return numbers(jax.tree.map(lambda a, b: a + distance * b, case, move))
 
         along = jax.jit(lambda s, move: jax.jvp(lambda d: moved(s, move, d), (0.0,), (1.0,)))
         return [jax.tree.map(lambda leaf, k=k: leaf[k], batch) for k in (1, 3)], along
@@ -49,14 +49,14 @@ def study():
 def test_gradients_are_those_of_plans_solved_anew(study, name):
     lanes, along = study
     with jax.enable_x64(True):
-        for scenario in lanes:
-            unit = jax.tree.map(lambda a, b: a - b, MOVES[name](scenario, 1.0), scenario)
-            (value, status), (slope, _) = along(scenario, unit)
+        for case in lanes:
+            unit = jax.tree.map(lambda a, b: a - b, MOVES[name](case, 1.0), case)
+            (value, status), (slope, _) = along(case, unit)
             assert status == Status.CONVERGED
             # Large enough for the rounding of a solve, which a flat direction amplifies.
             step = 1e-4 if name == "drag" else 1e-3
-            ahead = along(MOVES[name](scenario, step), unit)[0][0]
-            behind = along(MOVES[name](scenario, -step), unit)[0][0]
+            ahead = along(MOVES[name](case, step), unit)[0][0]
+            behind = along(MOVES[name](case, -step), unit)[0][0]
             numeric = (ahead - behind) / (2 * step)
             scale = np.maximum(np.abs(value), [1e-12, 1.0, 1.0, 1.0, 1.0])
             np.testing.assert_allclose(slope / scale, numeric / scale, rtol=2e-3, atol=2e-4)
@@ -67,10 +67,10 @@ def test_a_limit_that_presses_has_a_price_and_a_slack_one_has_none(study):
     lanes, along = study
     with jax.enable_x64(True):
         slopes = []
-        for scenario in lanes:
-            move = MOVES["speed limit"](scenario, 1.0)
-            unit = jax.tree.map(lambda a, b: a - b, move, scenario)
-            slopes.append(float(along(scenario, unit)[1][0][0]))
+        for case in lanes:
+            move = MOVES["speed limit"](case, 1.0)
+            unit = jax.tree.map(lambda a, b: a - b, move, case)
+            slopes.append(float(along(case, unit)[1][0][0]))
     pressed, slack = slopes
     assert pressed < 0.0
     assert slack == 0.0

@@ -9,8 +9,8 @@ import scipy.optimize
 from planner_jax.optimise import lbfgs
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
 from planner_jax.optimise.lbfgs_kernel import turn_kernel
-from planner_jax.optimise.multistart import minimise, status_of
-from planner_jax.protocol import Status
+from planner_jax.optimise.multistart import minimise
+from planner_jax.protocol import Status, status_of
 
 
 def unlimited(cost):

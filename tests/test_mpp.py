@@ -1,7 +1,6 @@
 """The `mpp` baseline: every catch is made, at the fixed height, by the cheapest that was tried."""
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
@@ -9,13 +8,12 @@ import numpy as np
 import pytest
 
 from planner_jax.ball.flight import BallState
-from planner_jax.optimise.multistart import solve_round
+from planner_jax.planning.plan import plan
 from planner_jax.protocol import Status, is_solved
 from planner_jax.referee.catch import referee_catches
 from planner_jax.task.catch.chain import ordered_context, targets_at
 from planner_jax.task.catch.mpp import MppCatch, falling_time
-from planner_jax.task.catch.suites import make_suite
-from planner_jax.task.solve import plan
+from planner_jax.task.catch.suites import draw
 
 NUM = 16
 MPP = MppCatch()
@@ -31,11 +29,11 @@ def throws():
 @pytest.fixture(scope="module")
 def pairs():
     """Two throws and one absent target; of the first two lanes the order is the wrong way round."""
-    scenarios = make_suite("parabola2", NUM, 4, num_targets=3)
+    cases = draw(NUM, "parabola2", 4, num_targets=3)
     order = np.tile([0, 1, 2], (NUM, 1))
     order[:2] = [1, 0, 2]
-    scenarios = dataclasses.replace(scenarios, order=order.astype(np.int32))
-    return jax.tree.map(np.asarray, scenarios)
+    cases = dataclasses.replace(cases, order=order.astype(np.int32))
+    return jax.tree.map(np.asarray, cases)
 
 
 @pytest.fixture(scope="module")
@@ -52,9 +50,9 @@ def lane_of(tree, lane):
     return jax.tree.map(lambda leaf: jnp.asarray(leaf[lane]), tree)
 
 
-def heights(scenarios, plans):
+def heights(cases, plans):
     """Heights [m] of the targets at the catches, in their order."""
-    ordered = jax.vmap(ordered_context)(scenarios).targets
+    ordered = jax.vmap(ordered_context)(cases).targets
     return np.asarray(jax.jit(jax.vmap(targets_at))(ordered, plans.times).pos)[..., 2]
 
 
@@ -80,11 +78,11 @@ def test_a_plan_that_passes_the_check_afterwards_passes_the_referee(throws, thro
 
 def test_the_kept_candidate_is_the_cheapest(throws, throw_plans):
     @jax.jit
-    def tried(scenario):
-        context = ordered_context(scenario)
+    def tried(case):
+        context = ordered_context(case)
         times, _ = MPP.times(context)
         ball = jax.tree.map(lambda leaf: leaf[0], targets_at(context.targets, times))
-        return MPP.candidates(scenario.head_state, ball, times[0], scenario)
+        return MPP.candidates(case.head_state, ball, times[0], case)
 
     for lane in (0, 7):
         candidates = tried(lane_of(throws, lane))
@@ -111,7 +109,7 @@ def mean_squared_jerk(trajectory):
 
 
 def test_one_equals_its_lane_in_the_batch(pairs, pair_plans):
-    solve = jax.jit(functools.partial(solve_round, MPP, MPP.rounds[0]))
+    solve = jax.jit(lambda case: MPP.solve(case, MPP.attempts[0]))
     for lane in (3, 5, 9):
         alone = solve(lane_of(pairs, lane))
         for one, among in zip(
@@ -160,7 +158,7 @@ def test_a_target_that_never_falls_through_the_height_is_not_solved(throws):
 
 
 def test_the_first_fall_of_a_swing_is_found():
-    targets = lane_of(make_suite("harmonic2", 8, 1).targets, slice(None))
+    targets = lane_of(draw(8, "harmonic2", 1).targets, slice(None))
     middle = targets.pos[..., 2]
 
     @jax.jit
@@ -182,5 +180,4 @@ def test_bad_settings_are_named_in_one_line():
     ):
         with pytest.raises(ValueError, match=says):
             MppCatch(**options)
-    with pytest.raises(ValueError, match="starts must be 1, got 2"):
-        MPP.guesses(None, 2)
+    assert [attempt.starts for attempt in MPP.attempts] == [1]

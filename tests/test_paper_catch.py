@@ -13,12 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import planner_jax as pj
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath
+from planner_jax.planning.plan import plan
 from planner_jax.referee.catch import referee_catches
 from planner_jax.task.catch.paper import PaperCatch
-from planner_jax.task.catch.scenario import catch_scenario
-from planner_jax.task.solve import plan
 from planner_jax.trajectory.polynomial import derivative_factors
 from planner_jax.trajectory.proportional_minco import (
     equal_pieces,
@@ -36,7 +36,7 @@ pytestmark = pytest.mark.usefixtures("float64")
 
 
 def rows(name, num=None):
-    """The first rows of a file as scenarios, and its columns."""
+    """The first rows of a file as cases, and its columns."""
     path = Path(__file__).parent / "data" / f"catch_{name}.csv"
     with path.open(encoding="utf-8") as file:
         table = list(csv.DictReader(file))[:num]
@@ -47,18 +47,18 @@ def rows(name, num=None):
     )  # fmt: skip
     shape = ball.pos.shape[:2]
     targets = BallPath(ball, np.full((*shape, 3), 0.5), np.full(shape, 9.81))
-    scenarios = catch_scenario(targets, np.full(shape, 3.0), dtype=jnp.float64)
-    return scenarios.replace(times=columns["Tp"][:, None]), columns
+    cases = pj.catch.case(targets, np.full(shape, 3.0), dtype=jnp.float64)
+    return cases.replace(times=columns["Tp"][:, None]), columns
 
 
 def excess(num):
     """Costs reached on the first rows of both files, relative to the published optima, less 1."""
     (easy, published), (hard, of_hard) = (rows(name, num) for name in NAMES)
-    scenarios = jax.tree.map(lambda *leaves: np.concatenate(leaves), easy, hard)
-    plans = plan(PLANNER, scenarios)
+    cases = jax.tree.map(lambda *leaves: np.concatenate(leaves), easy, hard)
+    plans = plan(PLANNER, cases)
     cost = np.concatenate([published["cost_ref"], of_hard["cost_ref"]])
     times = np.concatenate([published["T_ref"], of_hard["T_ref"]])
-    return UNIT * plans.cost / cost - 1.0, plans.times[:, 0] - times, scenarios, plans
+    return UNIT * plans.cost / cost - 1.0, plans.times[:, 0] - times, cases, plans
 
 
 @pytest.mark.parametrize("pieces", [4, 8])
@@ -67,23 +67,21 @@ def test_guess_costs_what_the_published_protocol_says(pieces):
 
     @jax.jit
     @jax.vmap
-    def guess_cost(scenario):
-        context = planner.prepare(scenario)
+    def guess_cost(case):
+        context = planner.prepare(case)
         return planner.objective(planner.guesses(context, 1)[0], context).cost
 
     for name in NAMES:
-        scenarios, published = rows(name)
-        np.testing.assert_allclose(
-            UNIT * guess_cost(scenarios), published[f"J0_M{pieces}"], rtol=1e-6
-        )
+        cases, published = rows(name)
+        np.testing.assert_allclose(UNIT * guess_cost(cases), published[f"J0_M{pieces}"], rtol=1e-6)
 
 
 def test_converged_cost_is_the_published_optimum():
-    gap, late, scenarios, plans = excess(4)
+    gap, late, cases, plans = excess(4)
     np.testing.assert_allclose(gap, 0.0, atol=1e-4)
     np.testing.assert_allclose(late, 0.0, atol=1e-3)
     # The penalties are soft: the protocol's tolerance is 5 %, and its net is a ball.
-    verdict = referee_catches(scenarios, plans, tolerance=0.05, net_test="ball")
+    verdict = referee_catches(cases, plans, tolerance=0.05, net_test="ball")
     assert verdict.success.all(), [verdict.sentence(k) for k in np.flatnonzero(~verdict.success)]
 
 
@@ -95,11 +93,11 @@ def test_converged_costs_are_the_published_optima_on_every_row():
 
 
 def test_objective_gradient_agrees_with_finite_differences():
-    scenario = jax.tree.map(lambda leaf: leaf[0], rows("hard", 1)[0])
+    case = jax.tree.map(lambda leaf: leaf[0], rows("hard", 1)[0])
 
     def cost(shift):
         """Of a point beside the guess."""
-        context = PLANNER.prepare(scenario)
+        context = PLANNER.prepare(case)
         return PLANNER.objective(PLANNER.guesses(context, 1)[0] + shift, context).cost
 
     shift = 0.3 * np.random.default_rng(0).normal(size=len(PLANNER.scale))
@@ -137,6 +135,6 @@ def test_energy_gradient_at_the_catch_is_the_papers():
 def test_sizes_that_make_no_sense_are_refused():
     with pytest.raises(ValueError, match="num_pieces must be >= 2, got 1"):
         PaperCatch(num_pieces=1)
-    scenario = jax.tree.map(lambda leaf: leaf[0], rows("paper", 1)[0])
+    case = jax.tree.map(lambda leaf: leaf[0], rows("paper", 1)[0])
     with pytest.raises(ValueError, match="starts must be 1, got 2"):
-        PLANNER.guesses(PLANNER.prepare(scenario), 2)
+        PLANNER.guesses(PLANNER.prepare(case), 2)

@@ -7,19 +7,19 @@ import pytest
 from derivatives import assert_gradient_matches_differences
 
 from planner_jax.cost.contact import apex_excess, hitting_speed_excess
-from planner_jax.cost.quadrotor import (
-    acceleration_excess,
-    body_rate_excess,
-    ground_excess,
-    relative,
-    speed_excess,
-)
 from planner_jax.cost.penalty import (
     c1_steep_hinge,
     joined_trapezoid_weights,
     smoothed_hinge,
     steep_hinge,
     trapezoid_weights,
+)
+from planner_jax.cost.quadrotor import (
+    acceleration_excess,
+    body_rate_excess,
+    ground_excess,
+    relative,
+    speed_excess,
 )
 from planner_jax.robot.quadrotor import QuadrotorLimits
 

@@ -1,6 +1,7 @@
 """The referee of catch plans, on plans worked out by hand: no planner has a part in this."""
 
 import math
+from dataclasses import fields
 from types import SimpleNamespace
 
 import jax.numpy as jnp
@@ -12,8 +13,8 @@ from scipy.integrate import solve_ivp
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath
 from planner_jax.referee.catch import LIMITS, CatchVerdict, referee_catches
+from planner_jax.task.catch.case import CatchCase, CatchLimits, Net
 from planner_jax.task.catch.plan import CatchPlan
-from planner_jax.task.catch.scenario import CatchLimits, CatchScenario, Net
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 GRAVITY, DRAG, NET_HEIGHT, NET_RADIUS = 9.81, 0.5, 0.2, 0.125
@@ -100,8 +101,8 @@ def tree(leaves, root):
 
 
 def objects(leaves):
-    """A scenario and a plan of the referee's own fields alone."""
-    scenario = SimpleNamespace(
+    """A case and a plan of the referee's own fields alone."""
+    case = SimpleNamespace(
         targets=tree(leaves, "targets"),
         net=tree(leaves, "net"),
         limits=tree(leaves, "limits"),
@@ -109,7 +110,7 @@ def objects(leaves):
     )
     trajectory = SimpleNamespace(coeffs=leaves["coeffs"], durations=leaves["durations"])
     plan = SimpleNamespace(trajectory=trajectory, order=leaves["order"], times=leaves["times"])
-    return scenario, plan
+    return case, plan
 
 
 def judge(leaves, **options) -> CatchVerdict:
@@ -454,9 +455,9 @@ def test_beyond_its_table_a_target_goes_straight_on():
 def test_a_class_of_the_users_own_answers_through_a_function():
     leaves = good()
     known = judge(leaves)
-    scenario, plan = objects(leaves)
-    path = scenario.targets
-    scenario.targets = "falling"
+    case, plan = objects(leaves)
+    path = case.targets
+    case.targets = "falling"
 
     def states(targets, order, times):
         assert targets == "falling" and order.dtype.kind == "i"
@@ -465,13 +466,13 @@ def test_a_class_of_the_users_own_answers_through_a_function():
             pos[lane, place, 2] -= drop(times[lane, place])
         return pos, np.full(pos.shape, [0.0, 0.0, -1.0])
 
-    verdict = referee_catches(scenario, plan, target_states=states)
+    verdict = referee_catches(case, plan, target_states=states)
     assert verdict.success[0], verdict.sentence(0)
     np.testing.assert_array_equal(verdict.caught, known.caught)
     with pytest.raises(ValueError, match="targets of class str need target_states"):
-        referee_catches(scenario, plan)
+        referee_catches(case, plan)
     with pytest.raises(ValueError, match=r"target_states' pos must be \(1, 3, 3\), got \(3,\)"):
-        referee_catches(scenario, plan, target_states=lambda *_: (np.zeros(3), np.zeros(3)))
+        referee_catches(case, plan, target_states=lambda *_: (np.zeros(3), np.zeros(3)))
 
 
 def unequal_lanes():
@@ -513,7 +514,7 @@ def test_a_nan_fails_its_own_lane_and_no_other(name):
     leaves[name][(0,) + (0,) * (leaves[name].ndim - 1)] = np.nan  # the good one's
     verdict = judge(leaves)
     assert not verdict.success[0] and verdict.failed_limit[0] == "not finite"
-    assert verdict.sentence(0) == "not finite: the plan or its scenario is not finite"
+    assert verdict.sentence(0) == "not finite: the plan or its case is not finite"
     assert not verdict.caught[0].any()
     assert_same(clean, verdict, lanes=slice(1, None))
 
@@ -534,7 +535,7 @@ def test_float32_structs_of_the_planner_are_taken_as_they_are():
     }
     plain, _ = objects(leaves)
     blank = np.full(2, np.nan)  # what the plan claims beside order and times is not read
-    scenario = CatchScenario(
+    case = CatchCase(
         targets=BallPath(
             ball=BallState(**vars(plain.targets.ball)),
             drag=plain.targets.drag,
@@ -551,14 +552,16 @@ def test_float32_structs_of_the_planner_are_taken_as_they_are():
     )
     plan = CatchPlan(
         trajectory=PiecewisePolynomial(coeffs=leaves["coeffs"], durations=leaves["durations"]),
+        gravity=blank,
         order=leaves["order"],
+        decided_times=blank,
         times=leaves["times"],
         cost=blank,
         violation=blank,
         iterations=blank,
         status=blank,
     )
-    verdict = referee_catches(scenario, plan)
+    verdict = referee_catches(case, plan)
     assert verdict.success.all(), verdict.sentence(0)
     assert verdict.max_speed.dtype == np.float64
 
@@ -590,7 +593,7 @@ def test_wrong_arguments_are_named():
 
 def test_every_limit_has_its_sentence():
     lanes = len(LIMITS)
-    blank = {name: np.zeros(lanes) for name in CatchVerdict.__dataclass_fields__}
+    blank = {field.name: np.zeros(lanes) for field in fields(CatchVerdict)}
     verdict = CatchVerdict(**blank | {"failed_limit": np.array(LIMITS)})
     for lane, name in enumerate(LIMITS):
         assert verdict.sentence(lane).startswith(f"{name}: ")

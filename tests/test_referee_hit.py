@@ -3,6 +3,7 @@
 import ast
 import math
 import sys
+from dataclasses import fields
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,11 +13,11 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from planner_jax.ball.flight import BallState
-from planner_jax.referee import hit, motion
+from planner_jax.referee import hit, quadrotor
 from planner_jax.referee.hit import LIMITS, HitVerdict, referee_hits
 from planner_jax.robot.quadrotor import QuadrotorLimits
+from planner_jax.task.hit.case import HitCase, HitLimits
 from planner_jax.task.hit.plan import HitPlan, Stroke
-from planner_jax.task.hit.scenario import HitLimits, HitScenario
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 GRAVITY, DRAG, RESTITUTION, RACKET_HEIGHT = 9.8, 0.0616, 0.7, 0.06
@@ -104,20 +105,20 @@ def volley(*, target=(3.0, 0.0, 0.0), flight_time=1.5, ball_vel=BALL_VEL, pieces
 
 
 def objects(leaves):
-    """A scenario and a plan of the referee's own fields alone."""
+    """A case and a plan of the referee's own fields alone."""
 
     def part(room):
         inside = {name.split(".")[1]: v for name, v in leaves.items() if name.startswith(room)}
         return SimpleNamespace(**inside)
 
-    scenario = SimpleNamespace(
+    case = SimpleNamespace(
         ball=part("ball."),
         limits=part("limits."),
         hit_limits=part("hit_limits."),
         **{name: leaf for name, leaf in leaves.items() if "." not in name},
     )
     trajectory = SimpleNamespace(coeffs=leaves["coeffs"], durations=leaves["durations"])
-    return scenario, SimpleNamespace(trajectory=trajectory, stroke=part("stroke."))
+    return case, SimpleNamespace(trajectory=trajectory, stroke=part("stroke."))
 
 
 def judge(leaves, **options) -> HitVerdict:
@@ -496,7 +497,7 @@ def test_a_nan_fails_its_own_lane_and_no_other(name, drag_after_impact):
     leaves[name][(2,) + (-1,) * (leaves[name].ndim - 1)] = np.nan
     verdict = judge(leaves, drag_after_impact=drag_after_impact)
     assert not verdict.success[2] and verdict.failed_limit[2] == "not finite"
-    assert verdict.sentence(2) == "not finite: the plan or its scenario is not finite"
+    assert verdict.sentence(2) == "not finite: the plan or its case is not finite"
     assert_same(clean, verdict, lanes=[0, 1, 3, 4, 5])
 
 
@@ -521,7 +522,7 @@ def test_an_infinite_limit_is_no_limit():
 def test_float32_structs_of_the_planner_are_taken_as_they_are():
     leaves = {name: jnp.float32(leaf) for name, leaf in stack(volley(), volley()).items()}
     plain, _ = objects(leaves)
-    scenario = HitScenario(
+    case = HitCase(
         ball=BallState(**vars(plain.ball)),
         limits=QuadrotorLimits(**vars(plain.limits)),
         hit_limits=HitLimits(**vars(plain.hit_limits)),
@@ -533,13 +534,14 @@ def test_float32_structs_of_the_planner_are_taken_as_they_are():
     blank = np.full(2, np.nan)  # what the plan claims beside its impact time is not read
     plan = HitPlan(
         trajectory=PiecewisePolynomial(coeffs=leaves["coeffs"], durations=leaves["durations"]),
+        gravity=blank,
         stroke=Stroke(leaves["stroke.time"], blank, blank, blank, blank, blank),
         cost=blank,
         violation=blank,
         iterations=blank,
         status=blank,
     )
-    verdict = referee_hits(scenario, plan)
+    verdict = referee_hits(case, plan)
     assert verdict.success.all(), verdict.sentence(0)
     assert verdict.max_speed.dtype == np.float64
 
@@ -577,7 +579,7 @@ def test_the_referees_import_numpy_the_standard_library_and_each_other_alone():
 
 def test_every_limit_has_its_sentence():
     lanes = len(LIMITS)
-    blank = {name: np.zeros(lanes) for name in HitVerdict.__dataclass_fields__}
+    blank = {field.name: np.zeros(lanes) for field in fields(HitVerdict)}
     verdict = HitVerdict(**blank | {"failed_limit": np.array(LIMITS)})
     for lane, name in enumerate(LIMITS):
         assert verdict.sentence(lane).startswith(f"{name}: ")
@@ -586,14 +588,14 @@ def test_every_limit_has_its_sentence():
 def test_processes_judge_as_threads_do(monkeypatch):
     lanes = np.arange(600)
     case = {"durations": lanes[:, None].astype(np.float32), "value": lanes.astype(np.float32)}
-    in_threads = motion.judge_in_chunks(_halved, case, 256)
-    monkeypatch.setattr(motion, "_MANY_CORES", 1)
-    monkeypatch.setattr(motion, "_MANY_LANES", 1)
-    in_processes = motion.judge_in_chunks(_halved, case, 256)
-    assert motion.workers.cache_info().currsize == 1
+    in_threads = quadrotor.judge_in_chunks(_halved, case, 256)
+    monkeypatch.setattr(quadrotor, "_MANY_CORES", 1)
+    monkeypatch.setattr(quadrotor, "_MANY_LANES", 1)
+    in_processes = quadrotor.judge_in_chunks(_halved, case, 256)
+    assert quadrotor.workers.cache_info().currsize == 1
     np.testing.assert_array_equal(in_processes["half"], in_threads["half"])
     with pytest.raises(ValueError, match="refused"):
-        motion.workers().map(_refuse, [1, 2])
+        quadrotor.workers().map(_refuse, [1, 2])
 
 
 def _halved(case):

@@ -22,8 +22,8 @@ class BowlPlanner:
 
     scale: tuple[float, ...] = (1.0, 1.0)
 
-    def prepare(self, scenario):
-        return scenario
+    def prepare(self, case):
+        return case
 
     def guesses(self, context, num):
         return jnp.zeros((num, 2))
@@ -44,15 +44,15 @@ def test_curvature_is_the_diagonal_of_the_gauss_newton_matrix():
 
 def test_scale_is_one_over_the_root_of_twice_the_curvature():
     """Guess and solution are both counted, so a constant curvature H gives 1 / sqrt(2 H)."""
-    scenarios = Bowl(centre=jnp.array([[1.0, 0.5], [-2.0, 0.1], [0.3, 0.0]]))
-    scale = measure_scale(BowlPlanner(), scenarios, floor=0.0)
+    cases = Bowl(centre=jnp.array([[1.0, 0.5], [-2.0, 0.1], [0.3, 0.0]]))
+    scale = measure_scale(BowlPlanner(), cases, floor=0.0)
     np.testing.assert_allclose(scale, 1.0 / np.sqrt([8.0, 2e4]), rtol=1e-5)
 
 
 def test_scale_does_not_depend_on_the_one_it_was_measured_with():
-    scenarios = Bowl(centre=jnp.array([[1.0, 0.5], [-2.0, 0.1]]))
-    first = measure_scale(BowlPlanner(), scenarios)
-    second = measure_scale(BowlPlanner(scale=(30.0, 0.02)), scenarios)
+    cases = Bowl(centre=jnp.array([[1.0, 0.5], [-2.0, 0.1]]))
+    first = measure_scale(BowlPlanner(), cases)
+    second = measure_scale(BowlPlanner(scale=(30.0, 0.02)), cases)
     np.testing.assert_allclose(first, second, rtol=1e-4)
 
 

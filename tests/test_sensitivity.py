@@ -13,6 +13,7 @@ from planner_jax.optimise.implicit import newton_refine, optimal_plan
 from planner_jax.optimise.inverse_kernel import inverse_kernel
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
 from planner_jax.optimise.multistart import minimise
+from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.problem import Round
 from planner_jax.optimise.sensitivity import (
     _with_part,
@@ -21,12 +22,14 @@ from planner_jax.optimise.sensitivity import (
     part_of,
     positive_inverse,
 )
-from planner_jax.task.catch.decide import decided, greedy
+from planner_jax.planning.decided import first_choice
+from planner_jax.planning.gradient import gradient
+from planner_jax.protocol import Plan
+from planner_jax.task.catch.decide import Greedy
 from planner_jax.task.catch.exact import ExactCatch
-from planner_jax.task.catch.suites import make_suite
-from planner_jax.task.gradients import plan_with_gradients
+from planner_jax.task.catch.suites import draw
 from planner_jax.task.hit.exact import ExactHit
-from planner_jax.task.hit.serves import generate_serves, to_scenarios
+from planner_jax.task.hit.serves import generate_serves, to_cases
 
 CURVED = np.array([[3.0, 1.0, 0.2], [1.0, 2.0, 0.0], [0.2, 0.0, 1.0]])
 
@@ -45,24 +48,21 @@ class Bowl:
 
 
 @struct.dataclass
-class BowlPlan:
+class BowlPlan(Plan):
     point: jax.Array
-    cost: jax.Array
-    violation: jax.Array
-    iterations: jax.Array
-    status: jax.Array
 
 
+@jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class BowlPlanner:
+class BowlPlanner(OptimisedPlanner):
     weight: float = 1.0
     rounds: tuple = (
         Round(starts=2, solver=LbfgsConfig(max_steps=40, tolerance=1e-14), settings=()),
         Round(starts=1, solver=LbfgsConfig(max_steps=5), settings=(("weight", 2.0),)),
     )
 
-    def prepare(self, scenario):
-        return {"force": self.weight * (scenario.b + scenario.k * jnp.eye(3)[0])}
+    def prepare(self, case):
+        return {"force": self.weight * (case.b + case.k * jnp.eye(3)[0])}
 
     def guesses(self, context, num):
         return jnp.arange(num)[:, None] + 0.0 * context["force"]
@@ -72,8 +72,7 @@ class BowlPlanner:
         return Evaluation(curved - jnp.sum(point * context["force"]), -jnp.ones(()))
 
     def decode(self, point, context):
-        zero = jnp.zeros((), jnp.int32)
-        return BowlPlan(point, jnp.zeros(()), -jnp.ones(()), zero, zero)
+        return BowlPlan(point=point, **pending(-jnp.ones(())))
 
 
 def squared(plan):
@@ -88,37 +87,35 @@ def bowls(float64):
 
 @pytest.mark.parametrize("options", [{"steps": 3}, {"steps": 1, "curvature": "whole"}])
 def test_gradient_of_a_quadratic_is_the_closed_form(bowls, options):
-    plans, gradient = plan_with_gradients(BowlPlanner(), bowls, squared, ("b", "k"), **options)
+    found = gradient(BowlPlanner(), bowls, of=squared, by=("b", "k"), **options)
     inverse = np.linalg.inv(CURVED)
     best = (bowls.b + bowls.k[:, None] * np.eye(3)[0]) @ inverse
-    np.testing.assert_allclose(plans.point, best, atol=1e-6)
-    np.testing.assert_allclose(gradient.value, np.sum(best**2, axis=1), atol=1e-6)
-    np.testing.assert_allclose(gradient.by["b"], 2.0 * best @ inverse, atol=1e-5)
-    np.testing.assert_allclose(gradient.by["k"], gradient.by["b"][:, 0], atol=1e-12)
-    assert np.all(gradient.residual < 1e-6)
+    np.testing.assert_allclose(found.plans.point, best, atol=1e-6)
+    np.testing.assert_allclose(found.value, np.sum(best**2, axis=1), atol=1e-6)
+    np.testing.assert_allclose(found.by["b"], 2.0 * best @ inverse, atol=1e-5)
+    np.testing.assert_allclose(found.by["k"], found.by["b"][:, 0], atol=1e-12)
+    assert np.all(found.residual < 1e-6)
 
 
 def test_where_the_cost_curves_downward_there_is_no_gradient(bowls):
     """At a saddle the theorem has no minimum to follow; the direct part would be a false zero."""
     upside_down = dataclasses.replace(BowlPlanner(), weight=-1.0)
     first = (Round(1, LbfgsConfig(max_steps=0)),)
-    _, gradient = plan_with_gradients(
-        dataclasses.replace(upside_down, rounds=first), bowls, lambda plan: plan.point[0], ("b",)
+    found = gradient(
+        dataclasses.replace(upside_down, rounds=first), bowls, of=lambda plan: plan.point[0], by="b"
     )
-    assert np.isnan(gradient.by["b"]).all()
-    assert np.isnan(gradient.residual).all()
+    assert np.isnan(found.by["b"]).all()
+    assert np.isnan(found.residual).all()
 
 
 def test_gradient_of_the_cost_needs_no_adjoint(bowls):
-    plans, gradient = plan_with_gradients(BowlPlanner(), bowls, "cost", ("b",), steps=0)
-    np.testing.assert_allclose(gradient.by["b"], -plans.point, atol=1e-12)
-    np.testing.assert_allclose(gradient.value, plans.cost, atol=1e-12)
+    found = gradient(BowlPlanner(), bowls, of="cost", by=("b",), steps=0)
+    np.testing.assert_allclose(found.by["b"], -found.plans.point, atol=1e-12)
+    np.testing.assert_allclose(found.value, found.plans.cost, atol=1e-12)
 
 
 def test_one_name_need_not_be_in_a_list(bowls):
-    one, listed = (
-        plan_with_gradients(BowlPlanner(), bowls, "cost", wrt, steps=0)[1] for wrt in ("b", ["b"])
-    )
+    one, listed = (gradient(BowlPlanner(), bowls, of="cost", by=by, steps=0) for by in ("b", ["b"]))
     np.testing.assert_array_equal(one.by["b"], listed.by["b"])
 
 
@@ -142,11 +139,11 @@ def test_an_optimal_plan_has_the_same_gradient_forward_and_backward(bowls):
 def test_a_batch_is_its_lanes_and_a_broken_lane_spoils_no_other(bowls):
     b = bowls.b.copy()
     b[2] = np.nan
-    plans, found = plan_with_gradients(BowlPlanner(), bowls.replace(b=b), squared, ("b",), steps=2)
-    assert np.isnan(found.by["b"][2]).all() and plans.point.shape == (5, 3)
+    found = gradient(BowlPlanner(), bowls.replace(b=b), of=squared, by="b", steps=2)
+    assert np.isnan(found.by["b"][2]).all() and found.plans.point.shape == (5, 3)
     for lane in (0, 1, 3, 4):
         one = jax.tree.map(lambda leaf, k=lane: leaf[k], bowls)
-        _, alone = plan_with_gradients(BowlPlanner(), one, squared, ("b",), steps=2)
+        alone = gradient(BowlPlanner(), one, of=squared, by="b", steps=2)
         np.testing.assert_allclose(found.by["b"][lane], alone.by["b"], rtol=1e-9)
 
 
@@ -172,19 +169,19 @@ def test_the_kernel_gives_the_same_inverses():
 @pytest.mark.parametrize(
     "options, line",
     [
-        ({"wrt": ("b.x",)}, "wrt must name a place in Bowl, got 'b.x'"),
-        ({"wrt": ("kind",)}, "wrt must name floating numbers, got 'kind'"),
-        ({"wrt": ()}, "wrt must name something"),
-        ({"quantity": "speed"}, "quantity must name a place in BowlPlan, got 'speed'"),
-        ({"quantity": "point"}, r"quantity must be one number, got shape \(3,\)"),
+        ({"by": ("b.x",)}, "by must name a place in Bowl, got 'b.x'"),
+        ({"by": ("kind",)}, "by must name floating numbers, got 'kind'"),
+        ({"by": ()}, "by must name something"),
+        ({"of": "speed"}, "of must name a place in BowlPlan, got 'speed'"),
+        ({"of": "point"}, r"of must be one number, got shape \(3,\)"),
         ({"steps": -1}, "steps must be >= 0, got -1"),
         ({"curvature": "none"}, "curvature must be one of core, whole, got 'none'"),
     ],
 )
 def test_what_is_wrong_is_named(bowls, options, line):
-    asked = {"quantity": "cost", "wrt": ("b",), **options}
+    asked = {"of": "cost", "by": ("b",), **options}
     with pytest.raises(ValueError, match=line):
-        plan_with_gradients(BowlPlanner(), bowls, **asked)
+        gradient(BowlPlanner(), bowls, **asked)
 
 
 def first(lanes):
@@ -200,18 +197,17 @@ def first(lanes):
 def hit_case():
     """A serve planned late under weak limits, which press."""
     serves = generate_serves(8, 3)[1:2]
-    return to_scenarios(serves, delay=0.4, limit_scale=0.7, dtype=jnp.float64)
+    return to_cases(serves, delay=0.4, limit_scale=0.7, dtype=jnp.float64)
 
 
 def easy_hit_case():
     """A serve with time and strength to spare."""
-    return to_scenarios(generate_serves(8, 5)[1:2], dtype=jnp.float64)
+    return to_cases(generate_serves(8, 5)[1:2], dtype=jnp.float64)
 
 
 def catch_case():
     """A throw whose first guess is made by the decision."""
-    throws = make_suite("throws", 1, seed=3)
-    return decided(throws, jax.vmap(greedy)(throws))
+    return first_choice(Greedy(), draw(1, "throws", 3))
 
 
 PIECES = (0.2, 0.5, 1.0, 1.0, 1.0, 1.0)
@@ -245,18 +241,18 @@ CASES = {
     [{"margin": 0.4}, pytest.param({"drag_after_impact": True}, marks=pytest.mark.slow)],
 )
 def test_curvature_of_the_core_in_closed_form_is_that_of_tangents(options, float64):
-    planner, scenario = ExactHit(proportions=PIECES, **options), first(easy_hit_case())
+    planner, case = ExactHit(proportions=PIECES, **options), first(easy_hit_case())
 
     @jax.jit
-    def both(scenario):
-        context = planner.prepare(scenario)
+    def both(case):
+        context = planner.prepare(case)
         point = planner.guesses(context, 1)[0]
         point = point + 0.3 * jnp.cos(jnp.arange(point.size))
         core = lambda x: planner.core(x, context)  # noqa: E731
         blocks = planner.core_blocks(point.size)
         return planner.core_curvature(point, context), curvature_by_tangents(core, blocks, point)
 
-    (block, factors), (expected, others) = both(scenario)
+    (block, factors), (expected, others) = both(case)
     np.testing.assert_allclose(block, expected, rtol=1e-8, atol=1e-8 * np.abs(expected).max())
     num = planner.num_offsets
     np.testing.assert_allclose(factors[:num], others[:num], rtol=1e-10)
@@ -265,36 +261,35 @@ def test_curvature_of_the_core_in_closed_form_is_that_of_tangents(options, float
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_gradient_at_an_optimum_is_that_of_plans_solved_anew(name, float64):
-    planner, case, quantity, steps, options = CASES[name]
-    scenario = first(case())
+    planner, make, quantity, steps, options = CASES[name]
+    case = first(make())
     search = LbfgsConfig(max_steps=200, tolerance=1e-7, patience=6)
 
-    def objective_of(scenario):
-        context = planner.prepare(scenario)
+    def objective_of(case):
+        context = planner.prepare(case)
         return context, lambda x: planner.objective(x, context)
 
     @jax.jit
-    def solved(scenario, point):
+    def solved(case, point):
         """From a point near the optimum: Newton's method alone."""
-        context, objective = objective_of(scenario)
+        context, objective = objective_of(case)
         point, _ = newton_refine(objective, point, max_steps=60, stationarity=1e-15)
         plan = planner.decode(point, context)
         return point, quantity(plan) if callable(quantity) else plan.stroke.time
 
     @jax.jit
-    def searched(scenario):
-        context, objective = objective_of(scenario)
+    def searched(case):
+        context, objective = objective_of(case)
         return minimise(objective, planner.guesses(context, 1)[0], search).point
 
-    point, value = solved(scenario, searched(scenario))
-    take = functools.partial(gradient_at, planner, quantity=quantity, wrt=tuple(steps), **options)
-    gradient = jax.jit(take)(scenario, point)
-    np.testing.assert_allclose(gradient.value, value, rtol=1e-12)
+    point, value = solved(case, searched(case))
+    take = functools.partial(gradient_at, planner, quantity=quantity, by=tuple(steps), **options)
+    found = jax.jit(take)(case, point)
+    np.testing.assert_allclose(found.value, value, rtol=1e-12)
     for place, step in steps.items():
-        here = part_of(scenario, place)
+        here = part_of(case, place)
         ahead, behind = (
-            solved(_with_part(scenario, place, here + sign * step), point)[1]
-            for sign in (1.0, -1.0)
+            solved(_with_part(case, place, here + sign * step), point)[1] for sign in (1.0, -1.0)
         )
         numeric = (ahead - behind) / (2.0 * step)
-        np.testing.assert_allclose(gradient.by[place], numeric, rtol=5e-3, atol=2e-4, err_msg=place)
+        np.testing.assert_allclose(found.by[place], numeric, rtol=5e-3, atol=2e-4, err_msg=place)

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import planner_jax as pj
 from planner_jax.ball import flight
 from planner_jax.task.hit import court
-from planner_jax.task.hit.scenario import hit_scenario
 from planner_jax.task.hit.serves import (
     DEPTH,
     MAX_FLIGHT_TIME,
@@ -18,14 +18,14 @@ from planner_jax.task.hit.serves import (
     advance,
     generate_serves,
     read_serves,
-    to_scenarios,
+    to_cases,
 )
 from planner_jax.task.hit.validate import (
     DRAG,
     GRAVITY,
-    ScenarioError,
+    CaseError,
     ServeError,
-    check_scenarios,
+    check_cases,
     fly,
     landing,
 )
@@ -244,7 +244,7 @@ def same(first, second):
 def test_fewer_serves_are_the_first_of_more_and_chunks_join():
     whole = generate_serves(4700, 7)  # over the seam of two blocks
     assert same(generate_serves(40, 7), whole[:40])
-    assert same(generate_serves(200, 7, start=4500), whole[4500:])
+    assert same(generate_serves(200, 7, first=4500), whole[4500:])
     assert not np.allclose(generate_serves(40, 8).velocity, whole.velocity[:40])
 
 
@@ -326,7 +326,7 @@ def test_generated_serves_are_distributed_as_the_published_ones():
     [
         ({"num": 0}, "num must be >= 1, got 0"),
         ({"seed": -1}, "seed must be >= 0, got -1"),
-        ({"start": -5}, "start must be >= 0, got -5"),
+        ({"first": -5}, "first must be >= 0, got -5"),
         ({"scenarios": ["NNN", "NNR"]}, "scenarios must be names out of .*, got NNR"),
         ({"scenarios": []}, "scenarios must be names out of .*, got none"),
     ],
@@ -336,7 +336,7 @@ def test_arguments_of_the_generator_out_of_range_are_named(arguments, says):
         generate_serves(**{"num": 1, "seed": 0, **arguments})
 
 
-# From serves to scenarios.
+# From serves to cases.
 
 
 def test_two_delays_in_a_row_are_their_sum():
@@ -362,33 +362,33 @@ def test_a_delay_beyond_the_flight_names_the_serve():
     time, _ = landing(serves.position, serves.velocity, DRAG, GRAVITY)
     first = np.argmax(time <= 1.6)
     with pytest.raises(ServeError, match=f"{time[first]:.3f} s for serve {first}, got 1.6"):
-        to_scenarios(serves, delay=1.6)
+        to_cases(serves, delay=1.6)
 
 
-def test_scenarios_carry_the_serves_and_the_setting_of_the_paper():
+def test_cases_carry_the_serves_and_the_setting_of_the_paper():
     serves = generate_serves(5, 0)
-    scenarios = to_scenarios(serves, limit_scale=0.5)
-    np.testing.assert_allclose(scenarios.ball.pos, serves.position, rtol=1e-6)
-    np.testing.assert_allclose(scenarios.target, serves.target, rtol=1e-6)
-    np.testing.assert_allclose(scenarios.head_state[:, 0], np.tile([-3.0, 0.0, 1.5], (5, 1)))
-    np.testing.assert_array_equal(scenarios.limits.speed, np.full(5, 2.5))
-    np.testing.assert_array_equal(scenarios.hit_limits.hitting_speed[0], [4.0, 3.0, 4.0])
-    assert scenarios.drag.dtype == jnp.float32
-    plain = hit_scenario(serves.position, serves.velocity, serves.target)
-    np.testing.assert_array_equal(scenarios.drag, plain.drag)
-    np.testing.assert_array_equal(scenarios.gravity, plain.gravity)
+    cases = to_cases(serves, limit_scale=0.5)
+    np.testing.assert_allclose(cases.ball.pos, serves.position, rtol=1e-6)
+    np.testing.assert_allclose(cases.target, serves.target, rtol=1e-6)
+    np.testing.assert_allclose(cases.head_state[:, 0], np.tile([-3.0, 0.0, 1.5], (5, 1)))
+    np.testing.assert_array_equal(cases.limits.speed, np.full(5, 2.5))
+    np.testing.assert_array_equal(cases.hit_limits.hitting_speed[0], [4.0, 3.0, 4.0])
+    assert cases.drag.dtype == jnp.float32
+    plain = pj.hit.case(serves.position, serves.velocity, serves.target)
+    np.testing.assert_array_equal(cases.drag, plain.drag)
+    np.testing.assert_array_equal(cases.gravity, plain.gravity)
 
 
 def test_uniform_starts_fill_the_half_court_and_belong_to_their_serve():
     serves = generate_serves(3000, 0)
-    start = np.asarray(to_scenarios(serves, start="uniform", seed=1).head_state[:, 0])
+    start = np.asarray(to_cases(serves, start="uniform", seed=1).head_state[:, 0])
     assert (start[:, 2] == 1.5).all()
     np.testing.assert_allclose(start[:, :2].min(axis=0), [-5.0, -2.5], atol=0.01)
     np.testing.assert_allclose(start[:, :2].max(axis=0), [-0.5, 2.5], atol=0.01)
     np.testing.assert_allclose(start[:, :2].mean(axis=0), [-2.75, 0.0], atol=0.1)
-    part = to_scenarios(serves[1000:1100], start="uniform", seed=1).head_state[:, 0]
+    part = to_cases(serves[1000:1100], start="uniform", seed=1).head_state[:, 0]
     np.testing.assert_array_equal(part, start[1000:1100])
-    other = to_scenarios(serves[:10], start="uniform", seed=2).head_state[:, 0]
+    other = to_cases(serves[:10], start="uniform", seed=2).head_state[:, 0]
     assert not np.allclose(other, start[:10])
 
 
@@ -405,19 +405,19 @@ def test_uniform_starts_fill_the_half_court_and_belong_to_their_serve():
         ({"start": "uniform", "seed": -1}, "seed must be >= 0, got -1"),
     ],
 )
-def test_arguments_of_scenarios_out_of_range_are_named(arguments, says):
+def test_arguments_of_cases_out_of_range_are_named(arguments, says):
     with pytest.raises(ServeError, match=says):
-        to_scenarios(generate_serves(1, 0), **arguments)
+        to_cases(generate_serves(1, 0), **arguments)
 
 
 # The check before planning.
 
 
-def test_generated_scenarios_pass_the_check_early_and_late_and_one_by_one():
+def test_generated_cases_pass_the_check_early_and_late_and_one_by_one():
     serves = generate_serves(72, 0)
-    check_scenarios(to_scenarios(serves))
-    check_scenarios(to_scenarios(serves, delay=0.8, start="uniform", limit_scale=0.35))
-    check_scenarios(hit_scenario(serves.position[0], serves.velocity[0], serves.target[0]))
+    check_cases(to_cases(serves))
+    check_cases(to_cases(serves, delay=0.8, start="uniform", limit_scale=0.35))
+    check_cases(pj.hit.case(serves.position[0], serves.velocity[0], serves.target[0]))
 
 
 SERVE = ([2.0, 0.0, 2.0], [-4.0, 0.0, 7.0], [4.0, 0.0, 0.0])
@@ -438,24 +438,24 @@ SERVE = ([2.0, 0.0, 2.0], [-4.0, 0.0, 7.0], [4.0, 0.0, 0.0])
     ],
 )
 def test_a_setting_out_of_range_is_named(setting, says):
-    with pytest.raises(ScenarioError) as caught:
-        check_scenarios(hit_scenario(*SERVE, **setting))
+    with pytest.raises(CaseError) as caught:
+        check_cases(pj.hit.case(*SERVE, **setting))
     assert str(caught.value) == says
 
 
 def test_the_first_bad_lane_is_named_and_the_others_counted():
     batch = [np.tile(part, (6, 1)) for part in SERVE]
     with pytest.raises(
-        ScenarioError, match=r"^drag must be >= 0, got -1 in lane 2 \(1 more such lane\)$"
+        CaseError, match=r"^drag must be >= 0, got -1 in lane 2 \(1 more such lane\)$"
     ):
-        check_scenarios(hit_scenario(*batch, drag=[0.1, 0.1, -1.0, 0.1, -2.0, 0.1]))
+        check_cases(pj.hit.case(*batch, drag=[0.1, 0.1, -1.0, 0.1, -2.0, 0.1]))
     batch[1][4] = [2.0, 0.0, 7.0]
     message = r"^landing point of ball must be in the hitting half, x < 0, got 4\.\d+ in lane 4$"
-    with pytest.raises(ScenarioError, match=message):
-        check_scenarios(hit_scenario(*batch))
+    with pytest.raises(CaseError, match=message):
+        check_cases(pj.hit.case(*batch))
     batch[0][1, 1] = np.nan
-    with pytest.raises(ScenarioError, match="^ball.pos must be finite, got nan in lane 1$"):
-        check_scenarios(hit_scenario(*batch))
+    with pytest.raises(CaseError, match="^ball.pos must be finite, got nan in lane 1$"):
+        check_cases(pj.hit.case(*batch))
     batch[0][1] = [2.0, 0.0, -1.0]
-    with pytest.raises(ScenarioError, match="^height of ball.pos must be > 0, got -1 in lane 1$"):
-        check_scenarios(hit_scenario(*batch))
+    with pytest.raises(CaseError, match="^height of ball.pos must be > 0, got -1 in lane 1$"):
+        check_cases(pj.hit.case(*batch))

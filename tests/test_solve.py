@@ -10,10 +10,11 @@ from flax import struct
 from jax import Array
 
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
+from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.problem import Round
-from planner_jax.protocol import Status, is_solved
-from planner_jax.task import batch
-from planner_jax.task.solve import plan, plan_across_processes
+from planner_jax.planning import batch
+from planner_jax.planning.plan import plan, plan_across_processes
+from planner_jax.protocol import Plan, Status, is_solved
 
 
 @struct.dataclass
@@ -28,19 +29,16 @@ class Well:
 
 
 @struct.dataclass
-class Reached:
+class Reached(Plan):
     point: Array
-    cost: Array
-    violation: Array
-    iterations: Array
-    status: Array
 
 
 TRACES = []
 
 
+@jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class WellPlanner:
+class WellPlanner(OptimisedPlanner):
     """Guesses at 0 and 4; goals above 2 are only found from the second."""
 
     rounds: tuple[Round, ...] = (
@@ -48,9 +46,9 @@ class WellPlanner:
         Round(2, LbfgsConfig(max_steps=40, step_cap=0.2)),
     )
 
-    def prepare(self, scenario):
-        TRACES.append(scenario.goal)
-        return scenario
+    def prepare(self, case):
+        TRACES.append(case.goal)
+        return case
 
     def guesses(self, context, num):
         return jnp.array([[0.0], [4.0]])[:num]
@@ -61,9 +59,7 @@ class WellPlanner:
         return Evaluation(cost=away + ridge, violation=jnp.sqrt(away) - 0.05)
 
     def decode(self, point, context):
-        zero = jnp.zeros((), jnp.int32)
-        violation = self.objective(point, context).violation
-        return Reached(point, jnp.zeros_like(violation), violation, zero, zero)
+        return Reached(point=point, **pending(self.objective(point, context).violation))
 
 
 GOALS = np.array([0.5, 3.5, -1.0, 4.5, 1.0], np.float32)
@@ -119,6 +115,7 @@ def test_a_status_is_known_from_its_number_of_any_kind(kind):
 
 
 def test_unsolvable_lanes_keep_the_least_violation_found():
+    @jax.tree_util.register_static
     @dataclasses.dataclass(frozen=True)
     class Hopeless(WellPlanner):
         def objective(self, point, context):
@@ -143,7 +140,7 @@ def test_wrong_batches_are_refused():
 
 @pytest.mark.parametrize("goals", [GOALS, GOALS[0]], ids=["batch", "one case"])
 def test_a_plan_that_jax_would_transform_says_what_to_use(goals):
-    with pytest.raises(TypeError, match="plan_with_gradients and optimal_plan"):
+    with pytest.raises(TypeError, match="pj.gradient, and pj.optimal_plan"):
         jax.grad(lambda goal: jnp.sum(plan(WellPlanner(), Well(goal)).point))(jnp.asarray(goals))
 
 
@@ -170,9 +167,9 @@ def test_a_later_round_takes_only_what_is_unsolved(monkeypatch):
     monkeypatch.setattr(batch, "_is_one_cpu", lambda mesh: False)
     sizes, real = [], batch._solve
 
-    def noted(planner, attempt, mesh, scenarios):
-        sizes.append(scenarios.goal.size)
-        return real(planner, attempt, mesh, scenarios)
+    def noted(planner, attempt, mesh, cases):
+        sizes.append(cases.goal.size)
+        return real(planner, attempt, mesh, cases)
 
     monkeypatch.setattr(batch, "_solve", noted)
     goals = np.full(300, 0.5, np.float32)
@@ -192,5 +189,5 @@ def test_lanes_of_unequal_length_are_refused():
     class Pair(Well):
         other: Array
 
-    with pytest.raises(ValueError, match=r"scenarios.other must have 5 lanes, got shape \(3,\)"):
+    with pytest.raises(ValueError, match=r"cases.other must have 5 lanes, got shape \(3,\)"):
         plan(WellPlanner(), Pair(GOALS, np.zeros(3, np.float32)))

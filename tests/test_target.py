@@ -8,15 +8,15 @@ from flax import struct
 from jax import Array
 from scipy.integrate import solve_ivp
 
+import planner_jax as pj
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath, HarmonicPath
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
+from planner_jax.planning.plan import plan
 from planner_jax.protocol import is_solved
 from planner_jax.referee.catch import referee_catches
 from planner_jax.task.catch.exact import ExactCatch
-from planner_jax.task.catch.scenario import catch_scenario
-from planner_jax.task.solve import plan
 
 GRAVITY = 9.81
 POS, VEL = np.array([3.0, -0.2, 2.5]), np.array([-2.5, 0.3, 4.0])
@@ -123,10 +123,10 @@ class Corkscrew:
 def test_a_path_of_a_users_own_class_is_caught():
     leaves = [[0.8, -0.5, 4.5]], [0.4], [2.5], [2.5]
     targets = Corkscrew(*(np.asarray(leaf, np.float32) for leaf in leaves))
-    scenario = catch_scenario(targets, np.full(1, 1.6))
-    scenario = scenario.replace(times=np.ones(1, np.float32))
+    case = pj.catch.case(targets, np.full(1, 1.6))
+    case = case.replace(times=np.ones(1, np.float32))
     planner = ExactCatch(rounds=(Round(1, LbfgsConfig(max_steps=40, memory=3)),))
-    found = plan(planner, scenario)
+    found = plan(planner, case)
     assert is_solved(found.status)
 
     def flown(_, order, times):
@@ -140,6 +140,6 @@ def test_a_path_of_a_users_own_class_is_caught():
         pos = np.array([0.8, -0.5, 4.5]) + 0.4 * out + times[..., None] * down
         return pos, 0.4 * 2.5 * along + down
 
-    one = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (scenario, found))
+    one = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (case, found))
     verdict = referee_catches(*one, target_states=flown)
     assert verdict.success.all(), verdict.sentence(0)

@@ -61,8 +61,8 @@ def plan_batch(
     return (jax.device_put(plans, _sharding(mesh)) if resident else plans), unsolved
 
 
-def plan_on_host(planner: HostPlanner, attempts: Sequence[Attempt], cases: Any) -> tuple[Any, int]:
-    """As `plan_batch`, by a planner that works on the host; NumPy leaves."""
+def plan_on_host(planner: HostPlanner, attempts: Sequence[Attempt], cases: Any) -> Any:
+    """The plans of `plan_batch`, by a planner that works on the host; NumPy leaves."""
     cases = jax.tree.map(np.asarray, cases)
     plans, lanes = None, np.arange(_length(cases))
     for attempt in attempts:
@@ -71,7 +71,7 @@ def plan_on_host(planner: HostPlanner, attempts: Sequence[Attempt], cases: Any) 
         lanes = np.flatnonzero(is_unsolved(plans.status))
         if lanes.size == 0:
             break
-    return plans, lanes.size
+    return plans
 
 
 def _plan_from_host(

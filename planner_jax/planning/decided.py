@@ -33,8 +33,8 @@ class DecidedPlanner(Generic[CaseT, PlanT]):
         return getattr(self.planner, "case_type", None)
 
     def replanner(self) -> Any:
-        """That of the planner: the order of the plan that is carried out is kept."""
-        return self.planner.replanner()
+        """That of the planner, if it has one: the order of the plan that is carried out is kept."""
+        return getattr(self.planner, "replanner", lambda: self.planner)()
 
     def settled(self, case: CaseT) -> tuple[Any, CaseT]:
         """The planner inside, and the case with the decision's first choice; see `optimal_plan`."""
@@ -55,7 +55,8 @@ class DecidedPlanner(Generic[CaseT, PlanT]):
         if not drive.is_pure and not np.any(unsolved):
             return plans
         status = _explained(self.decision, decided, plans.status)
-        return plans.replace(status=status if is_resident else np.asarray(status))
+        on_devices = isinstance(plans.status, jax.Array)
+        return plans.replace(status=status if on_devices else np.asarray(status))
 
     def _best_choice(self, drive: Drive, cases: Any, choices: Any) -> tuple[Any, Any]:
         """The cases as decided and their plans, after all choices have been planned together."""

@@ -89,16 +89,16 @@ class _Drive:
         """Plans, and numbers that are all zero if no case is unsolved."""
         if hasattr(planner, "plan_by"):
             plans = planner.plan_by(self, cases)
-            leaves = jax.tree.leaves(cases)
-            if all(isinstance(leaf, jax.Array) for leaf in leaves) and not isinstance(
-                plans.status, jax.Array
-            ):
-                plans = jax.device_put(plans, self.devices[0] if self.devices else None)
-            return plans, is_unsolved(plans.status)
-        tried: Sequence[Attempt] = planner.attempts if attempts is None else attempts
-        if hasattr(planner, "solve_on_host"):
-            return plan_on_host(planner, tried, cases)
-        return plan_batch(planner, tried, cases, self.chunk, self.devices)
+        elif hasattr(planner, "solve_on_host"):
+            plans = plan_on_host(planner, attempts or planner.attempts, cases)
+        else:
+            return plan_batch(
+                planner, attempts or planner.attempts, cases, self.chunk, self.devices
+            )
+        is_resident = all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(cases))
+        if is_resident and not isinstance(plans.status, jax.Array):
+            plans = jax.device_put(plans, self.devices[0] if self.devices else None)
+        return plans, is_unsolved(plans.status)
 
 
 def solve(planner: AnyPlanner[CaseT, PlanT], cases: CaseT) -> PlanT:

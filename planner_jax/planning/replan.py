@@ -49,5 +49,5 @@ def replan(planner: Any, cases: Any, previous: PlanT, elapsed: Any, **news: Any)
     """
     again = planner.replanner() if hasattr(planner, "replanner") else planner
     if not hasattr(again, "begin"):
-        raise TypeError(f"{type(planner).__name__} cannot plan again: use the planner exact")
+        raise TypeError(f"{type(again).__name__} cannot plan again: use the planner exact")
     return plan(again, again.begin(cases, previous, elapsed, **news))

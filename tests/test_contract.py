@@ -1,0 +1,396 @@
+"""One contract, which planners of every kind and task keep; and two planners of a user's own."""
+
+import dataclasses
+import functools
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import struct
+from jax import Array, lax
+from jaxpr import assert_full_precision
+
+import planner_jax as pj
+from planner_jax.optimise.lbfgs import LbfgsConfig
+from planner_jax.optimise.problem import Round
+from planner_jax.protocol import Attempt, HostPlanner, LanesPlanner, Plan, is_solved, outcome
+
+NUM = 6  # cases of a batch; no more than one bucket
+
+# A task of a user's own: come near a place in the plane.
+
+
+@struct.dataclass
+class Place:
+    """Where to be."""
+
+    goal: Array  # (2,)
+    reach: Array  # (), how near
+
+    @property
+    def batch_shape(self):
+        return np.shape(self.reach)
+
+
+@struct.dataclass
+class Stand(Plan):
+    """Where one is then."""
+
+    point: Array  # (2,)
+
+
+def places(num):
+    goals = np.random.default_rng(0).uniform(-1.0, 1.0, (num, 2)).astype(np.float32)
+    return Place(goals, np.full(num, 0.4, np.float32))
+
+
+@struct.dataclass
+class LibraryPlanner:
+    """The nearest of some known points, in the first attempt of a few of them."""
+
+    points: Array  # (K, 2)
+    attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(1), Attempt(2))
+    case_type: ClassVar[type] = Place
+
+    def solve(self, case: Place, attempt: Attempt) -> Stand:
+        points = self.points[: 8 * attempt.starts**3]
+        along = jnp.matmul(points, case.goal, precision=lax.Precision.HIGHEST)
+        away = jnp.sum(points**2, axis=1) - 2.0 * along + jnp.sum(case.goal**2)
+        nearest = jnp.argmin(away)
+        excess = jnp.sqrt(jnp.maximum(away[nearest], 0.0)) - case.reach
+        return Stand(point=points[nearest], **outcome(away[nearest], excess, stationary=False))
+
+
+@dataclasses.dataclass(frozen=True)
+class NumpyPlanner:
+    """A step towards the goal, the length of which the attempt gives; NumPy alone."""
+
+    attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(1), Attempt(2))
+    case_type: ClassVar[type] = Place
+
+    def solve_on_host(self, cases: Place, attempt: Attempt) -> Stand:
+        away = np.linalg.norm(cases.goal, axis=1)
+        share = np.minimum(0.5 * attempt.starts / away, 1.0)[:, None]
+        point = share * cases.goal
+        left = np.linalg.norm(cases.goal - point, axis=1)
+        fields = jax.vmap(outcome)(left, left - cases.reach)
+        return Stand(point=point, **jax.tree.map(np.asarray, fields))
+
+
+def library(seed):
+    return np.random.default_rng(seed).uniform(-1.0, 1.0, (64, 2)).astype(np.float32)
+
+
+# All planners there are, made small.
+
+# Compiling is what takes time: two iterations, or the first guess as the plan.
+FEW = {"rounds": (Round(solver=LbfgsConfig(max_steps=2, memory=1, trial_steps=(1.0,))),)}
+NONE = {"rounds": (Round(solver=LbfgsConfig(max_steps=0)),)}
+SHORT = {"proportions": (0.2, 0.5, 1.0, 1.0, 1.0, 1.0), "nodes": 3, "num_table_nodes": 16}
+
+
+@dataclasses.dataclass(frozen=True)
+class Entry:
+    """A planner with its cases, and what the contract has to know of both."""
+
+    planner: Any
+    cases: Any  # of a number of them
+    broken: str  # place of a leaf of floats in the case
+    gradient: dict[str, Any] | None = None  # what to take the gradient of, and by what
+
+    @functools.cached_property
+    def batch(self):
+        return jax.tree.map(np.asarray, self.cases(NUM))
+
+    @functools.cached_property
+    def plans(self):
+        return pj.plan(self.planner, self.batch)
+
+    @property
+    def on_host(self):
+        return isinstance(self.planner, HostPlanner)
+
+
+def hit(name, gradient, **options):
+    return Entry(pj.hit.planner(name, **options), pj.hit.draw, "ball.pos", gradient)
+
+
+def catch(name, suite, gradient, **options):
+    cases = lambda num: pj.catch.draw(num, suite, 4)  # noqa: E731
+    return Entry(pj.catch.planner(name, **options), cases, "targets.ball.vel", gradient)
+
+
+def last_time(plan):
+    return plan.times[-1]
+
+
+ENTRIES = {
+    "hit exact": hit("exact", {"of": "stroke.time", "by": "racket_height"}, **SHORT, **FEW),
+    "hit bat": hit("bat", {"of": "cost", "by": ["target", "gravity"]}, nodes=6, **NONE),
+    "hit bat-lite": hit("bat-lite", {"of": "stroke.time", "by": "limits"}, nodes=6, **NONE),
+    "hit juggle": hit("juggle", None, nodes=6),
+    "catch exact": catch(
+        "exact", "throws", {"of": last_time, "by": "net"}, decide="greedy", nodes=3, **FEW
+    ),
+    "catch catch": catch(
+        "catch", "throws", {"of": "cost", "by": "net.height"}, decide="given", nodes=6, **NONE
+    ),
+    "catch mpp": catch(
+        "mpp", "parabola2", None, decide=pj.catch.Best(finalists=2), speeds=(0.0, 1.0), nodes=6
+    ),
+    "library": Entry(LibraryPlanner(library(1)), places, "goal"),
+    "NumPy": Entry(NumpyPlanner(), places, "goal"),
+}
+# They share their solver with the exact ones, and take as long to compile.
+LIKE_OTHERS = ("hit bat", "hit bat-lite", "catch catch")
+
+
+def entries(*, on_host=True, slow=()):
+    """A parameter of every planner."""
+    chosen = {name: entry for name, entry in ENTRIES.items() if on_host or not entry.on_host}
+    return pytest.mark.parametrize(
+        "entry",
+        [
+            pytest.param(entry, id=name, marks=[pytest.mark.slow] if name in slow else [])
+            for name, entry in chosen.items()
+        ],
+    )
+
+
+every, pure = entries(), entries(on_host=False)
+
+
+def inside(planner):
+    """The planner that plans, also behind a decision."""
+    return getattr(planner, "planner", planner)
+
+
+def assert_equal(ours, theirs, lanes=slice(None)):
+    """All bits of some lanes."""
+    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
+        assert a.dtype == b.dtype
+        np.testing.assert_array_equal(np.asarray(a)[lanes], np.asarray(b)[lanes])
+
+
+def assert_close(ours, theirs, tolerance=1e-3):
+    """The status, and all leaves relative to the largest number of each."""
+    np.testing.assert_array_equal(ours.status, theirs.status)
+    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
+        size = np.max(np.abs(b), initial=1e-3)
+        np.testing.assert_allclose(a, b, rtol=0.0, atol=tolerance * size)
+
+
+def with_nan(tree, name, k):
+    """The batch with NaN in lane k of one leaf."""
+    first, _, rest = name.partition(".")
+    leaf = getattr(tree, first)
+    if rest:
+        return dataclasses.replace(tree, **{first: with_nan(leaf, rest, k)})
+    leaf = np.array(leaf)
+    leaf[k] = np.nan
+    return dataclasses.replace(tree, **{first: leaf})
+
+
+def all_nan(tree, k):
+    """The batch with NaN in lane k of every leaf of floats."""
+    tree = jax.tree.map(np.array, tree)
+    for leaf in jax.tree.leaves(tree):
+        if np.issubdtype(leaf.dtype, np.floating):
+            leaf[k] = np.nan
+    return tree
+
+
+@every
+def test_a_nan_lane_says_so_and_leaves_its_neighbours_bits_alone(entry):
+    broken = all_nan(with_nan(entry.batch, entry.broken, 1), 3)
+    found = pj.plan(entry.planner, broken)
+    assert list(found.status[[1, 3]]) == [pj.Status.NON_FINITE] * 2
+    assert_equal(found, entry.plans, [0, 2, 4, 5])
+
+
+@every
+def test_a_batch_is_a_loop_over_its_cases(entry):
+    for k in (0, NUM - 1):
+        alone = pj.plan(entry.planner, pj.lane(entry.batch, k))
+        assert alone.status.shape == ()
+        assert_close(alone, pj.lane(entry.plans, k))
+
+
+@every
+def test_every_status_is_a_status_and_solved_says_which_are_good(entry):
+    plans = entry.plans
+    assert isinstance(plans, Plan)
+    assert plans.status.dtype == plans.iterations.dtype == np.int32
+    good = pj.solved(plans)
+    assert good.dtype == bool and good.shape == (NUM,)
+    for k in range(NUM):
+        status = pj.Status(plans.status[k])
+        assert good[k] == is_solved(status) == pj.solved(pj.lane(plans, k))
+        assert good[k] == (status in (pj.Status.CONVERGED, pj.Status.FEASIBLE))
+        assert not good[k] or plans.violation[k] <= 5e-4
+
+
+@pure
+def test_every_matrix_product_asks_for_full_precision(entry):
+    planner, case = inside(entry.planner), pj.lane(entry.batch, 0)
+    for attempt in planner.attempts:
+        assert_full_precision(lambda case, a=attempt: planner.solve(case, a), case)
+        if isinstance(planner, LanesPlanner):
+            assert_full_precision(lambda case, a=attempt: planner.solve_lanes(case, a), entry.batch)
+    if planner is not entry.planner:
+        assert_full_precision(entry.planner.decision.propose, case)
+
+
+@pytest.fixture
+def traces(monkeypatch):
+    """Counts, in a list, how often planners are traced; for the planners that it is called with."""
+    found = []
+
+    def noted(real):
+        def solve(self, cases, attempt):
+            found.append((type(self).__name__, attempt))
+            return real(self, cases, attempt)
+
+        return solve
+
+    def count(planner):
+        for name in {"solve", "solve_lanes"} & set(dir(planner)):
+            monkeypatch.setattr(type(planner), name, noted(getattr(type(planner), name)))
+        return found
+
+    return count
+
+
+@pure
+def test_a_second_batch_of_the_same_bucket_is_not_traced_again(entry, traces):
+    assert entry.plans is not None  # planned once
+    found = traces(inside(entry.planner))
+    pj.plan(entry.planner, entry.cases(NUM + 3))  # jax arrays of another number
+    found.clear()
+    pj.plan(entry.planner, entry.cases(NUM + 3))
+    pj.plan(entry.planner, jax.tree.map(np.asarray, entry.cases(NUM + 2)))
+    pj.plan(entry.planner, pj.lane(entry.batch, slice(0, 4)))
+    assert found == []
+
+
+def test_other_arrays_of_the_same_shapes_in_a_planner_are_not_traced_again(traces):
+    cases = places(NUM)
+    first = LibraryPlanner(library(1))
+    mine = pj.plan(first, cases)
+    pj.plan(first, pj.lane(cases, 0))
+    found = traces(first)
+    other = LibraryPlanner(library(2))
+    theirs = pj.plan(other, cases)
+    pj.plan(other, pj.lane(cases, 0))
+    assert found == []
+    assert (mine.point != theirs.point).any()
+    for plans, planner in ((mine, first), (theirs, other)):
+        assert (plans.point[:, None] == planner.points).all(axis=2).any(axis=1).all()
+
+
+@every
+def test_what_comes_back_is_of_the_kind_of_array_that_was_given(entry):
+    assert all(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(entry.plans))
+    resident = pj.plan(entry.planner, jax.tree.map(jnp.asarray, entry.batch))
+    assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(resident))
+    assert_close(resident, entry.plans)
+
+
+@entries(on_host=False, slow=LIKE_OTHERS)
+def test_solve_inside_a_compiled_function_is_plan(entry):
+    assert_close(jax.jit(pj.solve)(entry.planner, entry.batch), entry.plans)
+
+
+@pytest.mark.parametrize("name", ["library", "hit juggle", "catch mpp"])
+def test_solve_takes_one_case_and_any_transformation_but_a_derivative(name):
+    entry = ENTRIES[name]
+    solve = functools.partial(pj.solve, entry.planner)
+    assert_close(jax.jit(solve)(pj.lane(entry.batch, 2)), pj.lane(entry.plans, 2))
+    assert_close(jax.jit(jax.vmap(solve))(entry.batch), entry.plans)
+    assert_close(jax.jit(functools.partial(pj.plan, entry.planner))(entry.batch), entry.plans)
+
+
+def test_a_planner_on_the_host_cannot_be_compiled_and_names_the_call_that_it_is_for():
+    entry = ENTRIES["NumPy"]
+    solve = functools.partial(pj.solve, entry.planner)
+    plan = functools.partial(pj.plan, entry.planner)
+    for call in (solve, jax.jit(solve), jax.jit(plan)):
+        with pytest.raises(TypeError, match="^NumpyPlanner works on the host: call pj.plan"):
+            call(entry.batch)
+
+
+@pure
+@pytest.mark.parametrize("call", [pj.plan, pj.solve], ids=["plan", "solve"])
+def test_a_derivative_is_refused_with_the_names_of_what_has_one(entry, call):
+    floats, others = (
+        jax.tree.map(lambda x, f=f: x if (x.dtype.kind == "f") == f else None, entry.batch)
+        for f in (True, False)
+    )
+
+    def cost(floats):
+        both = lambda a, b: b if a is None else a  # noqa: E731
+        cases = jax.tree.map(both, floats, others, is_leaf=lambda leaf: leaf is None)
+        return jnp.sum(call(entry.planner, cases).cost)
+
+    with pytest.raises(TypeError, match=r"pj\.gradient.* pj\.optimal_plan") as caught:
+        jax.grad(cost)(floats)
+    assert "\n" not in str(caught.value)
+
+
+@entries(slow=LIKE_OTHERS)
+def test_a_gradient_is_there_where_it_is_promised_and_refused_elsewhere(entry):
+    planner = inside(entry.planner)
+    if not hasattr(planner, "objective"):
+        with pytest.raises(
+            TypeError, match=f"^{type(planner).__name__} minimises nothing"
+        ) as caught:
+            pj.gradient(entry.planner, entry.batch, of="cost", by=entry.broken)
+        assert "\n" not in str(caught.value)
+        return
+    found = pj.gradient(entry.planner, entry.batch, **entry.gradient)
+    np.testing.assert_array_equal(found.plans.status, entry.plans.status)
+    there = np.isfinite(found.residual)
+    assert found.residual.shape == found.value.shape == (NUM,)
+    by = entry.gradient["by"]
+    assert set(found.by) == {by} if isinstance(by, str) else set(by)
+    for leaf in jax.tree.leaves(found.by):
+        assert leaf.shape[0] == NUM
+        np.testing.assert_array_equal(np.isfinite(leaf.reshape(NUM, -1)).all(axis=1), there)
+        assert np.isnan(leaf[~there]).all()
+
+
+@every
+def test_plans_are_read_from_a_file_as_they_were_written(entry, tmp_path):
+    for plans in (entry.plans, pj.lane(entry.plans, 2)):
+        path = tmp_path / "plans.npz"
+        plans.save(path)
+        again = type(plans).load(path)
+        assert type(again) is type(plans)
+        assert jax.tree.structure(again) == jax.tree.structure(plans)
+        assert_equal(again, plans, ...)
+
+
+@every
+@pytest.mark.parametrize("call", [pj.plan, pj.solve], ids=["plan", "solve"])
+def test_cases_of_another_task_are_refused_in_one_line(entry, call):
+    stranger = places(2) if not isinstance(entry.batch, Place) else pj.hit.draw(2)
+    names = f"{type(entry.batch).__name__}, got {type(stranger).__name__}$"
+    with pytest.raises(TypeError, match=names) as caught:
+        call(entry.planner, stranger)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("call", [pj.plan, pj.solve], ids=["plan", "solve"])
+def test_a_planner_that_is_no_pytree_is_told_how_to_become_one(call):
+    @dataclasses.dataclass(frozen=True)
+    class Plain:
+        attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)
+
+        def solve(self, case, attempt):
+            raise AssertionError("it must not come to this")
+
+    with pytest.raises(TypeError, match=r"^Plain must be a pytree: .*register_static") as caught:
+        call(Plain(), places(2))
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,186 @@
+"""Reading batches: `pj.lane` and `pj.solved`, verdicts of one case, draws that go on."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import planner_jax as pj
+from planner_jax.protocol import is_unsolved
+from planner_jax.registry import all_tasks
+from planner_jax.task.hit import court
+from planner_jax.task.hit.card import REAL_SCENARIOS
+from planner_jax.task.hit.validate import landing
+
+TASKS = ("hit", "catch")
+SUITES = [(name, suite) for name in TASKS for suite in all_tasks()[name].suites]
+CHEAP = {
+    "hit": lambda: pj.hit.planner("juggle", nodes=6),
+    "catch": lambda: pj.catch.planner("mpp", decide="given", speeds=(0.0,), nodes=6),
+}
+
+
+def assert_same(ours, theirs):
+    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
+        assert a.dtype == b.dtype
+        np.testing.assert_array_equal(a, b)
+
+
+# Lanes.
+
+
+@pytest.mark.parametrize("array", [np.asarray, jnp.asarray])
+def test_a_lane_is_an_entry_of_every_leaf(array):
+    cases = jax.tree.map(array, pj.hit.draw(5))
+    one, some, picked = (
+        pj.lane(cases, 3),
+        pj.lane(cases, slice(1, 3)),
+        pj.lane(cases, np.array([4, 0])),
+    )
+    assert type(one) is type(cases)
+    assert (one.batch_shape, some.batch_shape, picked.batch_shape) == ((), (2,), (2,))
+    for whole, a, b, c in zip(*map(jax.tree.leaves, (cases, one, some, picked)), strict=True):
+        np.testing.assert_array_equal(a, whole[3])
+        np.testing.assert_array_equal(b, whole[1:3])
+        np.testing.assert_array_equal(c, np.asarray(whole)[[4, 0]])
+
+
+def test_a_lane_that_is_not_there_is_an_error():
+    cases = jax.tree.map(np.asarray, pj.hit.draw(2))
+    with pytest.raises(IndexError):
+        pj.lane(cases, 2)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_a_lane_of_a_verdict_is_a_verdict(task):
+    task = pj.task_named(task)
+    cases = task.draw(4)
+    verdict = task.judge(cases, pj.plan(CHEAP[task.name](), cases))
+    assert isinstance(verdict, pj.Verdict)
+    for k in range(4):
+        one = pj.lane(verdict, k)
+        assert type(one) is type(verdict)
+        assert np.shape(one.success) == () and one.success == verdict.success[k]
+        assert one.sentence() == verdict.sentence(k)
+    some = pj.lane(verdict, verdict.success)
+    assert some.success.all() and some.success.shape == (verdict.success.sum(),)
+
+
+def test_solved_is_read_from_the_status():
+    status = np.array(list(pj.Status), np.int32)
+    blank = np.zeros(status.shape)
+    plans = pj.Plan(cost=blank, violation=blank, iterations=blank, status=status)
+    good = pj.solved(plans)
+    assert good.tolist() == [True, True, False, False, False, False]
+    assert isinstance(good, np.ndarray) and good.dtype == bool
+    resident = pj.solved(jax.tree.map(jnp.asarray, plans))
+    assert isinstance(resident, np.ndarray) and resident.tolist() == good.tolist()
+    assert pj.solved(pj.lane(plans, 1)) and not pj.solved(pj.lane(plans, 4))
+    # Broken is neither solved nor worth another attempt.
+    assert is_unsolved(status).tolist() == [False, False, True, True, False, True]
+
+
+# Verdicts.
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("array", [np.asarray, jnp.asarray])
+def test_a_verdict_on_one_plan_is_that_of_its_lane(task, array):
+    task = pj.task_named(task)
+    cases = jax.tree.map(array, task.draw(4))
+    plans = pj.plan(CHEAP[task.name](), cases)
+    together = task.judge(cases, plans)
+    assert together.success.shape == (4,)
+    for k in range(4):
+        alone = task.judge(pj.lane(cases, k), pj.lane(plans, k))
+        assert np.shape(alone.success) == ()
+        assert alone.sentence() == together.sentence(k)
+        for name in vars(alone):
+            np.testing.assert_array_equal(getattr(alone, name), getattr(together, name)[k])
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_a_verdict_names_the_failure_with_when_and_by_how_much(task):
+    task = pj.task_named(task)
+    cases = task.draw(2)
+    plans = pj.plan(CHEAP[task.name](), cases)
+    coeffs = np.array(plans.trajectory.coeffs)
+    coeffs[1, 0, 0, 0] += 0.5
+    moved = plans.replace(trajectory=plans.trajectory.replace(coeffs=coeffs))
+    verdict = task.judge(cases, moved)
+    assert not verdict.success[1] and verdict.failed_limit[1] == "head state"
+    assert verdict.failed_time[1] == 0.0
+    assert verdict.failed_excess[1] == pytest.approx(0.5, rel=1e-3)
+    assert verdict.sentence(1).startswith("head state: ") and "0.5" in verdict.sentence(1)
+    assert set(verdict.SENTENCES) > {"head state", "not finite"}
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_only_cases_and_plans_of_the_task_are_judged(task):
+    own, other = pj.task_named(task), pj.task_named(TASKS[1 - TASKS.index(task)])
+    cases, strangers = own.draw(2), other.draw(2)
+    plans = pj.plan(CHEAP[task](), cases)
+    with pytest.raises(TypeError, match=r"^cases must be a \w+Case, got a \w+Case$"):
+        own.judge(strangers, plans)
+    with pytest.raises(TypeError, match=r"^plans must be a \w+Plan, got a Place$"):
+        own.judge(cases, Place())
+    with pytest.raises(ValueError, match="samples must be >= 200, got 50"):
+        own.judge(cases, plans, samples=50)
+
+
+class Place:
+    """No plan."""
+
+
+# Draws.
+
+
+@pytest.mark.parametrize(("task", "suite"), SUITES)
+def test_a_draw_from_further_on_is_the_tail_of_one_from_the_beginning(task, suite):
+    draw = pj.task_named(task).draw
+    whole = draw(12, suite, 3)
+    for first, num in ((1, 11), (5, 3), (11, 1)):
+        assert_same(draw(num, suite, 3, first=first), pj.lane(whole, slice(first, first + num)))
+
+
+@pytest.mark.parametrize(("task", "suite"), SUITES)
+def test_another_seed_is_another_draw_and_the_type_is_that_asked_for(task, suite, float64):
+    draw = pj.task_named(task).draw
+    one, other = draw(3, suite, 0, dtype=jnp.float64), draw(3, suite, 1, dtype=jnp.float64)
+    pairs = list(zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True))
+    assert any((a != b).any() for a, b in pairs)
+    assert {leaf.dtype.name for leaf, _ in pairs} <= {"float64", "int32", "bool"}
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_without_a_name_the_first_suite_is_drawn(task):
+    task = pj.task_named(task)
+    assert_same(task.draw(3), task.draw(3, next(iter(task.suites)), 0))
+
+
+def test_a_real_scenario_has_its_two_of_the_court_in_equal_shares():
+    """S.1 is served from F, lands in N or F, and goes to N."""
+    cases = jax.tree.map(np.asarray, pj.hit.draw(200, "S.1"))
+    assert REAL_SCENARIOS["S.1"] == ("FNN", "FFN")
+    _, point = landing(cases.ball.pos, cases.ball.vel, cases.drag, cases.gravity)
+    near, far = 1 + court.REGIONS.index("N"), 1 + court.REGIONS.index("F")
+    served, landed, aimed = (
+        court.region_of(place[:, 0], place[:, 1]) for place in (cases.ball.pos, point, cases.target)
+    )
+    assert set(served) == {far} and set(aimed) == {near}
+    assert (landed == near).sum() == (landed == far).sum() == 100
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_a_draw_cannot_begin_before_its_first_case(task):
+    with pytest.raises(ValueError, match="first must be >= 0, got -1"):
+        pj.task_named(task).draw(1, first=-1)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_weaker_limits_are_drawn_by_their_scale(task):
+    draw = pj.task_named(task).draw
+    whole, half = draw(2), draw(2, limit_scale=0.5)
+    np.testing.assert_allclose(half.limits.speed, 0.5 * np.asarray(whole.limits.speed))
+    np.testing.assert_allclose(half.limits.body_rate, 0.5 * np.asarray(whole.limits.body_rate))
+    assert_same(half.head_state, whole.head_state)

@@ -1,0 +1,213 @@
+"""Names of tasks, planners and suites, the library's own and those of other packages."""
+
+import subprocess
+import sys
+import warnings
+
+import numpy as np
+import pytest
+
+import planner_jax as pj
+from planner_jax.registry import Task, UnknownName, all_tasks, task_named
+from planner_jax.task.catch.suites import draw as draw_catches
+
+METADATA = "Metadata-Version: 2.1\nName: planner-jax-others\nVersion: 1.0\n"
+MODULE = '''
+from planner_jax.registry import Task
+from planner_jax.task.hit.juggle import JuggleHit
+from planner_jax.task.catch.suites import draw
+
+TASK = Task(
+    name="meet",
+    summary="two quadrotors meet",
+    home="planner_jax_others",
+    planners={"first": "planner_jax.task.hit.juggle:JuggleHit"},
+    suites={"still": "Nobody moves."},
+)
+THEIRS = Task("hit", "another hit", "planner_jax_others", {}, {})
+MISNAMED = Task("other", "of another name", "planner_jax_others", {}, {})
+NOT_A_TASK = 3
+
+
+def case():
+    """A case."""
+
+
+def gusts(num, seed, first):
+    return draw(num, "hard", seed, first=first)
+
+
+def low(height=0.8):
+    return JuggleHit(height=height)
+'''
+
+
+@pytest.fixture
+def others(tmp_path, monkeypatch):
+    """Writes a package with these entry points, {group: {name: object}}, onto the path."""
+    (tmp_path / "planner_jax_others.py").write_text(MODULE)
+    folder = tmp_path / "planner_jax_others-1.0.dist-info"
+    folder.mkdir()
+    (folder / "METADATA").write_text(METADATA)
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def install(**groups):
+        lines = [
+            line
+            for group, entries in groups.items()
+            for line in (
+                f"[planner_jax.{group}]",
+                *(f"{name} = {place}" for name, place in entries.items()),
+            )
+        ]
+        (folder / "entry_points.txt").write_text("\n".join(lines) + "\n")
+        all_tasks.cache_clear()
+
+    yield install
+    all_tasks.cache_clear()
+    sys.modules.pop("planner_jax_others", None)
+
+
+def assert_one_line(call, says, kind=UnknownName):
+    with pytest.raises(kind, match=says) as caught:
+        call()
+    assert "\n" not in str(caught.value)
+
+
+# What the library has.
+
+
+def test_the_library_has_two_tasks_that_name_themselves():
+    assert list(all_tasks()) == ["hit", "catch"]
+    for name, task in all_tasks().items():
+        assert task_named(name) is task
+        assert task.name == name
+        assert task.summary[0].islower() and not task.summary.endswith(".")
+
+
+@pytest.mark.parametrize("name", ["hit", "catch"])
+def test_every_planner_of_a_task_can_be_made_and_the_first_is_the_default(name):
+    task = task_named(name)
+    for planner in task.all_planners():
+        assert hasattr(task.make_planner(planner, {}), "attempts")
+    first = next(iter(task.planners))
+    assert task.planner() == task.planner(first)
+    made = task.planner()
+    assert getattr(made, "planner", made) == task.make_planner(first, {})
+
+
+def test_unknown_names_are_told_in_one_line_which_there_are():
+    assert_one_line(lambda: task_named("juggle"), "^task must be one of hit, catch, got 'juggle'$")
+    assert_one_line(
+        lambda: pj.hit.planner("mpp"),
+        "^planner must be one of exact, bat, bat-lite, juggle, got 'mpp'$",
+    )
+    assert_one_line(
+        lambda: pj.catch.planner("bat"), "^planner must be one of exact, catch, mpp, got 'bat'$"
+    )
+    assert_one_line(
+        lambda: pj.catch.planner(decide="late"),
+        "^decide must be one of best, greedy, given, got 'late'$",
+    )
+    assert_one_line(
+        lambda: pj.hit.draw(1, "S.7"), r"^suite must be one of court, S\.1, .*, got 'S\.7'$"
+    )
+    assert_one_line(
+        lambda: pj.catch.draw(1, "rain"), "^suite must be one of throws, .*, hexagon6, got 'rain'$"
+    )
+    assert issubclass(UnknownName, ValueError)
+
+
+# What other packages have.
+
+
+def test_a_task_of_another_package_stands_behind_the_librarys_own(others):
+    others(tasks={"meet": "planner_jax_others:TASK"})
+    assert list(all_tasks()) == ["hit", "catch", "meet"]
+    task = pj.task_named("meet")
+    assert task.summary == "two quadrotors meet"
+    assert task.case.__doc__ == "A case."
+    assert type(task.make_planner("first", {"nodes": 8})).__name__ == "JuggleHit"
+
+
+@pytest.mark.parametrize(
+    ("place", "says"),
+    [
+        ("planner_jax_others:NOTHING", "left out: AttributeError: .*NOTHING"),
+        ("planner_jax_nowhere:TASK", "left out: ModuleNotFoundError: .*planner_jax_nowhere"),
+        ("planner_jax_others:NOT_A_TASK", "left out: it is not a Task of that name, got 3"),
+        ("planner_jax_others:MISNAMED", "left out: it is not a Task of that name, got Task"),
+    ],
+)
+def test_a_task_that_does_not_work_is_warned_about_and_the_others_do(others, place, says):
+    others(tasks={"broken": place, "meet": "planner_jax_others:TASK"})
+    with pytest.warns(UserWarning, match=f"^task 'broken' of {place} is {says}") as told:
+        assert list(all_tasks()) == ["hit", "catch", "meet"]
+    assert len(told) == 1 and "\n" not in str(told[0].message)
+    assert pj.task_named("hit").draw(1).batch_shape == (1,)
+
+
+def test_a_task_of_a_name_that_is_taken_is_left_out(others):
+    others(tasks={"hit": "planner_jax_others:THEIRS"})
+    says = "^task 'hit' .* left out: the name is taken by planner_jax.task.hit$"
+    with pytest.warns(UserWarning, match=says):
+        assert all_tasks()["hit"].home == "planner_jax.task.hit"
+
+
+def test_of_two_packages_with_a_task_of_one_name_the_first_stays(others, tmp_path, monkeypatch):
+    others(tasks={"meet": "planner_jax_others:TASK"})
+    second = tmp_path / "second"
+    folder = second / "more_others-1.0.dist-info"
+    folder.mkdir(parents=True)
+    (folder / "METADATA").write_text(METADATA.replace("planner-jax", "more"))
+    (folder / "entry_points.txt").write_text(
+        "[planner_jax.tasks]\nmeet = planner_jax_others:NOT_A_TASK\n"
+    )
+    monkeypatch.setattr(sys, "path", [*sys.path, str(second)])
+    with pytest.warns(UserWarning, match="'meet' .*the name is taken by planner_jax_others$"):
+        assert isinstance(all_tasks()["meet"], Task)
+
+
+def test_a_planner_of_another_package_is_made_by_its_name(others):
+    others(planners={"hit.mine": "planner_jax_others:low", "catch.mine": "planner_jax_others:low"})
+    assert list(pj.task_named("hit").all_planners())[-1] == "mine"
+    assert pj.hit.planner("mine").height == 0.8
+    assert pj.hit.planner("mine", height=1.1) == pj.hit.planner("juggle", height=1.1)
+    assert pj.catch.planner("mine", decide="greedy").planner.height == 0.8
+    assert_one_line(lambda: pj.hit.planner("yours"), "one of exact, .*, juggle, mine, got 'yours'$")
+    plans = pj.plan(pj.hit.planner("mine"), pj.hit.draw(2))
+    assert pj.hit.judge(pj.hit.draw(2), plans).success.shape == (2,)
+
+
+def test_a_planner_of_a_name_that_is_taken_is_left_out(others):
+    others(planners={"hit.exact": "planner_jax_others:low"})
+    with pytest.warns(
+        UserWarning, match="planners 'hit.exact' .* is left out, as the name is taken"
+    ):
+        assert type(pj.hit.planner("exact")).__name__ == "ExactHit"
+
+
+def test_a_planner_that_cannot_be_loaded_says_so_when_it_is_asked_for(others):
+    others(planners={"hit.mine": "planner_jax_nowhere:low"})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert type(pj.hit.planner("exact")).__name__ == "ExactHit"
+    says = "^hit.mine of planner_jax_nowhere:low cannot be loaded: ModuleNotFoundError"
+    assert_one_line(lambda: pj.hit.planner("mine"), says)
+
+
+def test_a_suite_of_another_package_is_drawn_by_its_name(others):
+    others(suites={"catch.gusts": "planner_jax_others:gusts"})
+    assert list(pj.task_named("catch").all_suites())[-1] == "gusts"
+    found, expected = pj.catch.draw(3, "gusts", 5, first=2), draw_catches(3, "hard", 5, first=2)
+    np.testing.assert_array_equal(found.targets.ball.vel, expected.targets.ball.vel)
+    assert_one_line(lambda: pj.hit.draw(3, "gusts"), "suite must be one of court")
+
+
+def test_names_are_listed_without_jax():
+    code = (
+        "import sys; from planner_jax.registry import task_named; task = task_named('hit'); "
+        "assert 'exact' in task.all_planners() and 'court' in task.all_suites(); "
+        "sys.exit('jax' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

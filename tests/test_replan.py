@@ -1,0 +1,126 @@
+"""`pj.replan`, the same call for every task: what it gives back, and what cannot plan again."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+import planner_jax as pj
+from planner_jax.optimise.lbfgs import LbfgsConfig
+from planner_jax.optimise.problem import Round
+from planner_jax.planning.replan import Replanning
+from planner_jax.task.hit.replan import ReplanHit
+from planner_jax.trajectory.polynomial import states_at
+
+NUM = 4
+SOME = (Round(solver=LbfgsConfig(max_steps=30)),)
+NONE = (Round(solver=LbfgsConfig(max_steps=0)),)
+HIT = pj.hit.ExactHit(
+    proportions=(0.2, 0.5, 1.0, 1.0, 1.0, 1.0), nodes=4, num_table_nodes=24, rounds=SOME
+)
+CATCH = pj.catch.planner("exact", decide="greedy", rounds=SOME)
+
+
+@pytest.fixture(scope="module")
+def hits():
+    """Cases, plans, and what is known anew: the ball, where it was."""
+    cases = jax.tree.map(np.asarray, pj.hit.draw(NUM, seed=5))
+    return cases, pj.plan(HIT, cases), {"ball": cases.ball}
+
+
+@pytest.fixture(scope="module")
+def catches():
+    """Cases, plans, and what is known anew: the targets, where they were."""
+    cases = jax.tree.map(np.asarray, pj.catch.draw(NUM, "throws", 3))
+    return cases, pj.plan(CATCH, cases), {"targets": cases.targets}
+
+
+def assert_same_motion(ours, theirs, end, atol):
+    for share in np.linspace(0.0, 1.0, 9):
+        time = np.asarray(share * end)
+        found, expected = (states_at(plans.trajectory, time)[:, :3] for plans in (ours, theirs))
+        np.testing.assert_allclose(found, expected, rtol=0.0, atol=atol)
+
+
+def test_no_time_and_a_target_as_before_give_back_the_motion_of_a_catch(catches):
+    cases, plans, news = catches
+    again = pj.replan(pj.catch.ReplanCatch(CATCH.planner, rounds=NONE), cases, plans, 0.0, **news)
+    assert again.status.shape == (NUM,)
+    np.testing.assert_allclose(again.times, plans.times, atol=2e-6)
+    assert_same_motion(again, plans, plans.times[:, 0], 1e-3)
+
+
+def test_no_time_and_a_ball_as_before_give_back_the_motion_of_a_hit(hits):
+    """The search begins on the smoothest way to the stroke, and comes back to the plan's."""
+    cases, plans, news = hits
+    solved = pj.solved(plans)
+    assert solved.any()
+    begun = pj.replan(ReplanHit(HIT, rounds=NONE), cases, plans, 0.0, **news)
+    for name in ("time", "flight_time", "ball_pos", "normal", "ball_vel_after"):
+        found, expected = (getattr(each.stroke, name) for each in (begun, plans))
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
+    ends = states_at(begun.trajectory, begun.stroke.time)
+    np.testing.assert_allclose(ends, states_at(plans.trajectory, plans.stroke.time), atol=2e-2)
+    again = pj.replan(HIT, cases, plans, 0.0, **news)
+    assert pj.solved(again)[solved].all()
+    assert (again.cost[solved] <= 1.05 * plans.cost[solved]).all()
+    np.testing.assert_allclose(again.stroke.time[solved], plans.stroke.time[solved], atol=0.05)
+
+
+@pytest.mark.parametrize("task", ["hits", "catches"])
+def test_later_plans_begin_where_the_robot_is_and_the_case_says_so(task, request):
+    cases, plans, news = request.getfixturevalue(task)
+    planner = (HIT if task == "hits" else CATCH).replanner()
+    elapsed = np.linspace(0.0, 0.3, NUM).astype(np.float32)
+    work = planner.begin(cases, plans, elapsed, **news)
+    assert isinstance(work, Replanning) and work.batch_shape == (NUM,)
+    np.testing.assert_allclose(work.case.head_state, states_at(plans.trajectory, elapsed))
+    given = np.asarray(cases.head_state) + 0.01
+    moved = planner.begin(cases, plans, elapsed, head_state=given, **news)
+    np.testing.assert_array_equal(moved.case.head_state, given)
+
+
+@pytest.mark.parametrize("task", ["hits", "catches"])
+def test_one_case_is_its_lane(task, request):
+    cases, plans, news = request.getfixturevalue(task)
+    planner = (HIT if task == "hits" else CATCH).replanner()
+    planner = dataclasses.replace(planner, rounds=NONE)
+    elapsed = np.float32(0.1)
+    together = pj.replan(planner, cases, plans, np.full(NUM, elapsed), **news)
+    alone = pj.replan(planner, *pj.lane((cases, plans), 1), elapsed, **pj.lane(news, 1))
+    assert alone.status.shape == () and alone.status == together.status[1]
+    found, expected = (np.asarray(x.trajectory.durations) for x in (alone, pj.lane(together, 1)))
+    np.testing.assert_allclose(found, expected, rtol=1e-4)
+
+
+def test_a_new_drag_is_believed(hits):
+    cases, plans, news = hits
+    work = HIT.replanner().begin(cases, plans, 0.0, drag=2.0 * cases.drag, **news)
+    np.testing.assert_array_equal(work.case.drag, 2.0 * cases.drag)
+
+
+@pytest.mark.parametrize("name", ["juggle", "bat"])
+def test_a_planner_that_cannot_plan_again_names_one_that_can(hits, name):
+    cases, plans, news = hits
+    planner = pj.hit.planner(name)
+    says = f"^{type(planner).__name__} cannot plan again: use the planner exact$"
+    with pytest.raises(TypeError, match=says):
+        pj.replan(planner, cases, plans, 0.0, **news)
+
+
+def test_a_decision_about_a_planner_that_cannot_plan_again_is_no_way_around(catches):
+    cases, plans, news = catches
+    with pytest.raises(TypeError, match="^MppCatch cannot plan again: use the planner exact$"):
+        pj.replan(pj.catch.planner("mpp"), cases, plans, 0.0, **news)
+
+
+def test_a_negative_time_and_news_of_another_task_are_refused(hits, catches):
+    for planner, (cases, plans, news), others in (
+        (HIT, hits, catches[2]),
+        (CATCH, catches, hits[2]),
+    ):
+        with pytest.raises(ValueError, match="^elapsed must be >= 0, got -0.5$"):
+            pj.replan(planner, cases, plans, -0.5, **news)
+        with pytest.raises(TypeError, match=next(iter(others))):
+            pj.replan(planner, cases, plans, 0.0, **others)
