@@ -2,8 +2,8 @@
 
 The folder holds manifest.json (kind "bench NAME", state, parameters, versions, device, commit,
 times, summary), table.md with what was printed and, where there are rows, rows.json. Every summary
-has `num`, how many plans were judged, and `success_rate`, the share that the referee accepted;
-where a speed is measured also the median and the 90 % quantile of `cost_gaps`.
+has `num`, the plans that were judged, and `success_rate`; where a speed is measured also the
+median and the 90 % quantile of `cost_gaps`.
 """
 
 import argparse
@@ -23,14 +23,14 @@ from planner_jax.sweep.run_folder import RunFolder
 from planner_jax.sweep.settings import SettingError
 
 
-def argument_parser(name: str, doc: str, **counts: int) -> argparse.ArgumentParser:
+def argument_parser(name: str, doc: str | None, **counts: int) -> argparse.ArgumentParser:
     """A parser of a benchmark with --out and some counts, by name with their defaults."""
-    parser = argparse.ArgumentParser(f"python -m benchmarks.{name}", description=doc.split("\n")[0])
+    head, _, _ = (doc or "").partition("\n")
+    parser = argparse.ArgumentParser(f"python -m benchmarks.{name}", description=head)
     for count, default in counts.items():
         kind = at_least(0 if count == "seed" else 1)
         parser.add_argument(f"--{count}", type=kind, default=default, help=f"default: {default}")
-    text = f"run folder (default: runs/bench-{name}-DATE-TIME)"
-    parser.add_argument("--out", type=Path, metavar="DIR", help=text)
+    parser.add_argument("--out", type=Path, help=f"default: runs/bench-{name}-DATE-TIME")
     parser.set_defaults(benchmark=name)
     return parser
 
@@ -74,10 +74,10 @@ class Bench:
         self._folder = RunFolder(out or Path("runs", f"bench-{name}-{now:%Y%m%d-%H%M%S}"))
         self._folder.require_new()
         self.path = self._folder.path
-        self._manifest = {"kind": f"bench {name}", "state": "running", "started": now.isoformat()}
-        self._manifest |= {"parameters": plain(parameters)}
+        what = {"kind": f"bench {name}", "state": "running", "parameters": plain(parameters)}
+        self._manifest = {**what, "started": now.isoformat(timespec="seconds")}
         self._began, self._lines, self._rows = time.perf_counter(), [], []
-        self._accepted, self._gaps, self._figures = [np.zeros(0, bool)], [], {}
+        self._accepted, self._gaps, self._figures = [], [], {}
 
     def __enter__(self) -> Self:
         self._manifest |= environment()
@@ -85,16 +85,14 @@ class Bench:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: Any) -> None:
-        state = "failed" if kind else "complete"
-        accepted = np.concatenate(self._accepted)
+        accepted = np.array(self._accepted)
         rate = accepted.mean() if accepted.size else None
         summary = {"num": accepted.size, "success_rate": rate, **self._figures}
-        if self._gaps:
-            summary |= gap_figures(*self._gaps)
+        summary |= gap_figures(*self._gaps) if self._gaps else {}
         times = {"seconds": time.perf_counter() - self._began, "load_average": os.getloadavg()[0]}
         self._folder.write_text("table.md", "\n".join(self._lines) + "\n")
-        ended = {"state": state, "times": times, "summary": plain(summary)}
-        self._folder.write_manifest({**self._manifest, **ended})
+        self._manifest |= {"state": "failed" if kind else "complete", "times": times}
+        self._folder.write_manifest({**self._manifest, "summary": plain(summary)})
 
     def say(self, *lines: str) -> None:
         """Print lines, and keep them for table.md."""
@@ -108,7 +106,7 @@ class Bench:
 
     def count(self, accepted: Any, *gaps: np.ndarray | None) -> None:
         """Add plans to the summary: which the referee accepts, and their `cost_gaps` if asked."""
-        self._accepted.append(np.atleast_1d(np.asarray(accepted, bool)))
+        self._accepted += np.asarray(accepted, bool).tolist()
         self._gaps += gaps
 
     def note(self, **figures: Any) -> None:

@@ -45,6 +45,9 @@ class Task:
     suites: Mapping[str, str]  # name -> what it draws, a sentence; default first
     sweep: str = "planner_jax.sweep.task:Sweep"  # class of its sweeps
     flight: str | None = None  # class of its flights in `sims`
+    # Options of `planner` where its speed is measured.
+    bench: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    contact: str | None = None  # place in a plan of its times of contact, such as "stroke.time"
 
     @property
     def case(self) -> Callable[..., Any]:

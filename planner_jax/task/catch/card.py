@@ -43,4 +43,6 @@ TASK = Task(
     suites={name: suite.description for name, suite in SUITES.items()},
     sweep="planner_jax.sweep.catch.sweep:CatchSweep",
     flight="planner_jax.sims.tasks.catch:CatchFlight",
+    bench={"decide": "greedy"},
+    contact="times",
 )

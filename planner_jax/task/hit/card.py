@@ -34,4 +34,5 @@ TASK = Task(
     },
     sweep="planner_jax.sweep.hit.sweep:HitSweep",
     flight="planner_jax.sims.tasks.hit:HitFlight",
+    contact="stroke.time",
 )
