@@ -1,16 +1,16 @@
 """Both catch planners on the 240 throws whose optimum a C++ program has published.
 
-    python -m benchmarks.catch_reference [--data tests/data] [--repeats 5]
+    python -m benchmarks.catch_reference [--data tests/data] [--repeats 5] [--out DIR]
 
 The C++ program is the same problem on the reference MINCO and L-BFGS headers: one thread,
 double, 2.96 ms a plan and 320 plans/s on a core on the easy set (220 iterations), 4.40 ms on
 the hard one, 98 % of which it solves. Printed here: the cost of the guess against its J0
 (float64), the cost gap of `catch` to its optimum (float64 and float32), `exact`'s refereed
-success and mean catching time (float32), and the speed of both, one by one and in a batch.
+success and mean catching time (float32), and the speed of both, one by one and in a batch. The
+summary of the run folder is of `exact`.
 Run it on an idle machine; `taskset -c 0` holds it to one core.
 """
 
-import argparse
 import csv
 import dataclasses
 import os
@@ -21,21 +21,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from planner_jax.ball.flight import BallState
-from planner_jax.ball.target import BallPath
+import planner_jax as pj
+from planner_jax.benchmarks.cost_gap import cost_gaps, gap_figures
+from planner_jax.benchmarks.run import Bench, argument_parser, begin
 from planner_jax.optimise.problem import Round, Stage
-from planner_jax.referee.catch import referee_catches
-from planner_jax.task.catch.exact import ExactCatch
 from planner_jax.task.catch.paper import COST_UNIT, PaperCatch
-from planner_jax.task.catch.scenario import CatchScenario, catch_scenario
-from planner_jax.task.solve import plan
 
 SETS = ("paper", "hard")
 BATCH_COPIES = 64
 
 
-def read_set(path: Path, dtype) -> tuple[CatchScenario, dict[str, np.ndarray]]:
-    """The scenarios of a file and its published columns."""
+def read_set(path: Path, dtype) -> tuple[pj.catch.CatchCase, dict[str, np.ndarray]]:
+    """The cases of a file and its published columns."""
     with path.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
 
@@ -43,68 +40,68 @@ def read_set(path: Path, dtype) -> tuple[CatchScenario, dict[str, np.ndarray]]:
         return np.array([[float(row[name]) for name in names] for row in rows])
 
     num = len(rows)
-    ball = BallState(
+    ball = pj.BallState(
         pos=jnp.asarray(column("b0_x", "b0_y", "b0_z")[:, None], dtype),
         vel=jnp.asarray(column("bv0_x", "bv0_y", "bv0_z")[:, None], dtype),
     )
-    paths = BallPath(
+    paths = pj.BallPath(
         ball=ball, drag=jnp.full((num, 1, 3), 0.5, dtype), gravity=jnp.full((num, 1), 9.81, dtype)
     )
-    scenarios = catch_scenario(paths, np.full((num, 1), 3.0), dtype=dtype)
+    cases = pj.catch.case(paths, np.full((num, 1), 3.0), dtype=dtype)
     names = ("Tp", "J0_M4", "J0_M8", "T_ref", "cost_ref")
     known = {name: column(name)[:, 0] for name in names}
-    scenarios = dataclasses.replace(scenarios, times=jnp.asarray(known["Tp"][:, None], dtype))
-    return scenarios, known
+    cases = dataclasses.replace(cases, times=jnp.asarray(known["Tp"][:, None], dtype))
+    return cases, known
 
 
-def guess_cost(planner: PaperCatch, scenario: CatchScenario) -> jax.Array:
+def guess_cost(planner: PaperCatch, case: pj.catch.CatchCase) -> jax.Array:
     """The published cost of a planner's first guess."""
-    context = planner.prepare(scenario)
+    context = planner.prepare(case)
     return COST_UNIT * planner.objective(planner.guesses(context, 1)[0], context).cost
 
 
-def latencies(planner, scenarios: CatchScenario, repeats: int) -> str:
+def latencies(planner, cases: pj.catch.CatchCase, repeats: int) -> str:
     """Percentiles of one plan at a time."""
-    host = jax.tree.map(np.asarray, scenarios)
+    host = jax.tree.map(np.asarray, cases)
     num = host.batch_shape[0]
-    lanes = [jax.tree.map(lambda leaf, k=k: leaf[k], host) for k in range(num)]
+    lanes = [pj.lane(host, k) for k in range(num)]
     for lane in lanes:
-        plan(planner, lane)
+        pj.plan(planner, lane)
     seconds = []
     for lane in lanes * repeats:
         began = time.perf_counter()
-        plan(planner, lane)
+        pj.plan(planner, lane)
         seconds.append(time.perf_counter() - began)
     p50, p90, p99 = 1e3 * np.percentile(seconds, [50, 90, 99])
     return f"one by one p50 {p50:.3f}, p90 {p90:.3f}, p99 {p99:.3f} ms"
 
 
-def throughput(planner, scenarios: CatchScenario) -> str:
+def throughput(planner, cases: pj.catch.CatchCase) -> str:
     """Best of three warm batches."""
     many = jax.tree.map(lambda leaf: np.tile(leaf, (BATCH_COPIES,) + (1,) * (leaf.ndim - 1)),
-                        jax.tree.map(np.asarray, scenarios))  # fmt: skip
-    plan(planner, many)
+                        jax.tree.map(np.asarray, cases))  # fmt: skip
+    pj.plan(planner, many)
     best = np.inf
     for _ in range(3):
         began = time.perf_counter()
-        plan(planner, many)
+        pj.plan(planner, many)
         best = min(best, time.perf_counter() - began)
     num = many.batch_shape[0]
     return f"batch of {num}: {num / best:.0f} plans/s"
 
 
-def report_paper_planner(data: Path) -> None:
+def report_paper_planner(bench: Bench, data: Path) -> None:
     """Cost of the guess and of the optimum in float64."""
     with jax.enable_x64(True):
         for name in SETS:
-            scenarios, known = read_set(data / f"catch_{name}.csv", jnp.float64)
+            cases, known = read_set(data / f"catch_{name}.csv", jnp.float64)
             for pieces in (4, 8):
                 chosen = PaperCatch(num_pieces=pieces, scale=(1.0,) * (3 * (pieces - 1) + 13))
-                cost = jax.jit(jax.vmap(lambda s, p=chosen: guess_cost(p, s)))(scenarios)
+                cost = jax.jit(jax.vmap(lambda s, p=chosen: guess_cost(p, s)))(cases)
                 error = np.abs(np.asarray(cost) / known[f"J0_M{pieces}"] - 1.0).max()
-                print(f"{name}: cost of the guess, M = {pieces}: off by {error:.1e} at most")
-            plans = plan(PaperCatch(), scenarios)
-            print(f"{name}: catch, float64: {_gap(plans, known)}")
+                bench.say(f"{name}: cost of the guess, M = {pieces}: off by {error:.1e} at most")
+            plans = pj.plan(PaperCatch(), cases)
+            bench.say(f"{name}: catch, float64: {_gap(plans, known)}")
 
 
 def _gap(plans, known: dict[str, np.ndarray]) -> str:
@@ -130,29 +127,39 @@ def quick_paper_catch() -> PaperCatch:
     return dataclasses.replace(chosen, rounds=(Round(1, solver, (), stages),))
 
 
+def report_set(bench: Bench, data: Path, name: str, repeats: int) -> None:
+    """Both planners on one set, in float32."""
+    cases, known = read_set(data / f"catch_{name}.csv", jnp.float32)
+    quick, exact = quick_paper_catch(), pj.catch.ExactCatch()
+    bench.say(
+        f"{name}: catch, float32, quick: {_gap(pj.plan(quick, cases), known)}",
+        f"{name}: catch, float32, quick: {throughput(quick, cases)}",
+    )
+    plans = pj.plan(exact, cases)
+    success, gaps = pj.catch.judge(cases, plans).success, cost_gaps(exact, cases, plans)
+    bench.count(success, gaps)
+    later = plans.times[:, 0].mean() - known["T_ref"].mean()
+    bench.say(
+        f"{name}: exact: {success.sum()} of {success.size} pass the referee, "
+        f"caught {later:+.3f} s after the published optimum on average",
+        f"{name}: exact: {latencies(exact, cases, repeats)}",
+        f"{name}: exact: {throughput(exact, cases)}",
+    )
+    bench.row(set=name, num=success.size, success=success.mean(), **gap_figures(gaps))
+
+
 def main() -> None:
     """Print everything."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argument_parser("catch_reference", __doc__, repeats=5)
     parser.add_argument("--data", type=Path, default=Path("tests/data"))
-    parser.add_argument("--repeats", type=int, default=5, help="of every single plan")
-    args = parser.parse_args()
-    print(f"jax {jax.__version__}, {jax.devices()[0]}, load average {os.getloadavg()[0]:.1f}")
-    report_paper_planner(args.data)
-    for name in SETS:
-        scenarios, known = read_set(args.data / f"catch_{name}.csv", jnp.float32)
-        host = jax.tree.map(np.asarray, scenarios)
-        quick = quick_paper_catch()
-        print(f"{name}: catch, float32, quick: {_gap(plan(quick, scenarios), known)}")
-        print(f"{name}: catch, float32, quick: {throughput(quick, scenarios)}")
-        plans = plan(ExactCatch(), scenarios)
-        verdict = referee_catches(host, plans)
-        later = plans.times[:, 0].mean() - known["T_ref"].mean()
-        print(
-            f"{name}: exact: {verdict.success.sum()} of {verdict.success.size} pass the referee, "
-            f"caught {later:+.3f} s after the published optimum on average"
+    options = parser.parse_args()
+    with begin(parser, options) as bench:
+        bench.say(
+            f"jax {jax.__version__}, {jax.devices()[0]}, load average {os.getloadavg()[0]:.1f}"
         )
-        print(f"{name}: exact: {latencies(ExactCatch(), scenarios, args.repeats)}")
-        print(f"{name}: exact: {throughput(ExactCatch(), scenarios)}")
+        report_paper_planner(bench, options.data)
+        for name in SETS:
+            report_set(bench, options.data, name, options.repeats)
 
 
 if __name__ == "__main__":

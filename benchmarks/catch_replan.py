@@ -1,6 +1,6 @@
 """Catches re-planned while the ball flies: its path estimated from noisy sight, look by look.
 
-    python -m benchmarks.catch_replan [--num 1000] [--rate 100] [--noise 0.005]
+    python -m benchmarks.catch_replan [--num 1000] [--rate 100] [--noise 0.005] [--out DIR]
     taskset -c 1 python -m benchmarks.catch_replan --alone
 
 The balls are those of the suite `throws`. A camera sees each one at the rate, with noise on its
@@ -14,10 +14,10 @@ What was flown, from the first plan to the catch, is refereed against the ball's
 the shared protocol of paper 000 (5 %, net test "ball"). Beside it stands what the first plan
 alone would have caught. With --alone re-plans are only timed, beside plans
 from scratch of the same throws.
-Run it on an idle machine; the load average is printed.
+The summary of the run folder is of what was flown; its cost gap is that of the first re-plans, from
+the guess that each began with. Run it on an idle machine; the load average is printed.
 """
 
-import argparse
 import dataclasses
 import gc
 import os
@@ -29,23 +29,19 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+import planner_jax as pj
 from planner_jax.ball.estimation import EkfModel, ekf_init, ekf_predict, ekf_update
 from planner_jax.ball.flight import BallState
-from planner_jax.ball.target import BallPath
+from planner_jax.benchmarks.cost_gap import COMPARED, cost_gaps
+from planner_jax.benchmarks.run import Bench, argument_parser, begin
 from planner_jax.protocol import is_solved
-from planner_jax.referee.catch import referee_catches
-from planner_jax.task.catch.decide import decided, greedy
-from planner_jax.task.catch.exact import ExactCatch
+from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.plan import CatchPlan
-from planner_jax.task.catch.replan import ReplanCatch, replanned
-from planner_jax.task.catch.scenario import CatchScenario
-from planner_jax.task.catch.suites import make_suite
-from planner_jax.task.solve import plan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 SEEN = 0.1  # [s], how long the ball has been in sight when planning begins
 WARM_UP = 5  # throws that are not counted
-SCRATCH, AGAIN = ExactCatch(), ReplanCatch()
+SCRATCH, AGAIN = pj.catch.ExactCatch(), pj.catch.ReplanCatch()
 
 
 class Estimator:
@@ -92,33 +88,51 @@ class Times:
     again: list[float] = dataclasses.field(default_factory=list)
     missed: int = 0  # deadlines
     broken: int = 0  # re-plans that exceed a limit
+    # What the first of them were asked for, and what came back.
+    replans: list[tuple[Any, CatchPlan]] = dataclasses.field(default_factory=list)
+
+    def keep(self, left: Any, found: CatchPlan) -> None:
+        """Remember a re-plan if it is one of the first."""
+        if len(self.replans) < COMPARED:
+            self.replans.append((left, found))
+
+    def gaps(self) -> np.ndarray | None:
+        """By how much the first re-plans cost more than a long search from the same guess."""
+        if not self.replans:
+            return None
+        return cost_gaps(AGAIN, *stacked(self.replans))
 
 
-def first_plan(scenario: CatchScenario) -> tuple[CatchScenario, CatchPlan]:
+def stacked(trees: list) -> Any:
+    """A batch of what is alone."""
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
+
+
+def first_plan(case: CatchCase) -> tuple[CatchCase, CatchPlan]:
     """When to catch, and the plan."""
-    scenario = decided(scenario, jax.tree.map(np.asarray, _decide(scenario)))
-    return scenario, plan(SCRATCH, scenario)
+    case = case.decided(jax.tree.map(lambda leaf: np.asarray(leaf)[0], _propose(case)))
+    return case, pj.plan(SCRATCH, case)
 
 
-_decide = jax.jit(greedy)
+_propose = jax.jit(pj.catch.Greedy().propose)
 
 
-def warm_up(scenario: CatchScenario) -> None:
+def warm_up(case: CatchCase) -> None:
     """Compile every round: a quadrotor that must not move leaves none of them out."""
     stuck = dataclasses.replace(
-        scenario, limits=dataclasses.replace(scenario.limits, speed=np.float32(1e-3))
+        case, limits=dataclasses.replace(case.limits, speed=np.float32(1e-3))
     )
     _, flown = first_plan(stuck)
-    plan(AGAIN, replanned(stuck, flown, 0.01, stuck.targets))
+    pj.replan(AGAIN, stuck, flown, 0.01, targets=stuck.targets)
 
 
 def fly(
-    scenario: CatchScenario, looks: np.ndarray, estimator: Estimator, period: float, out: Times
+    case: CatchCase, looks: np.ndarray, estimator: Estimator, period: float, out: Times
 ) -> tuple[CatchPlan, CatchPlan]:
     """One throw from its first sight to the catch: what was flown, and the first plan.
 
     Args:
-        scenario: begins one period after the look at which planning begins.
+        case: begins one period after the look at which planning begins.
         looks: (K, 3) [m], one a period.
         estimator: of the ball.
         period: [s].
@@ -130,8 +144,8 @@ def fly(
         estimator.see(look)
     ball = estimator.see(looks[before])
     began = time.perf_counter()
-    targets = dataclasses.replace(scenario.targets, ball=ball)
-    task, current = first_plan(dataclasses.replace(scenario, targets=targets))
+    targets = dataclasses.replace(case.targets, ball=ball)
+    task, current = first_plan(dataclasses.replace(case, targets=targets))
     out.first.append(time.perf_counter() - began)
     first, flown, elapsed = current, [], 0.0
     for look in looks[before + 1 :]:
@@ -141,17 +155,19 @@ def fly(
         began = time.perf_counter()
         ball = estimator.see(look)
         seen = time.perf_counter()
-        left = replanned(task, current, elapsed, dataclasses.replace(task.targets, ball=ball))
-        found = plan(AGAIN, left)
+        targets = dataclasses.replace(task.targets, ball=ball)
+        left = AGAIN.begin(task, current, elapsed, targets=targets)
+        found = pj.plan(AGAIN, left)
         ended = time.perf_counter()
         out.estimate.append(seen - began)
         out.again.append(ended - seen)
+        out.keep(left, found)
         late, broken = ended - began > period, not is_solved(found.status)
         out.missed += late
         out.broken += broken
         if not (late or broken):
             flown.append(begun(current.trajectory, elapsed))
-            task, current, elapsed = left.scenario, found, 0.0
+            task, current, elapsed = left.case, found, 0.0
     path = joined([*flown, current.trajectory])
     times = path.durations.sum(keepdims=True)
     return dataclasses.replace(current, trajectory=path, times=times), first
@@ -170,16 +186,15 @@ def joined(paths: list[PiecewisePolynomial]) -> PiecewisePolynomial:
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *paths)
 
 
-def judged(scenarios: CatchScenario, plans: list[CatchPlan]) -> dict[str, np.ndarray]:
+def judged(cases: CatchCase, plans: list[CatchPlan]) -> dict[str, np.ndarray]:
     """What the referee says by the shared protocol, in the order of the plans."""
     lengths = np.array([flown.trajectory.durations.size for flown in plans])
     found: dict[str, np.ndarray] = {}
     for length in np.unique(lengths):  # he judges plans of as many pieces together
         lanes = np.flatnonzero(lengths == length)
-        together = jax.tree.map(lambda *leaves: np.stack(leaves), *[plans[k] for k in lanes])
-        verdict = referee_catches(
-            jax.tree.map(lambda leaf, lanes=lanes: leaf[lanes], scenarios),
-            together,
+        verdict = pj.catch.judge(
+            pj.lane(cases, lanes),
+            stacked([plans[k] for k in lanes]),
             tolerance=0.05,
             net_test="ball",
         )
@@ -191,30 +206,31 @@ def judged(scenarios: CatchScenario, plans: list[CatchPlan]) -> dict[str, np.nda
     return found
 
 
-def report_times(name: str, seconds: list[float]) -> None:
+def report_times(bench: Bench, name: str, seconds: list[float]) -> None:
     """One line of percentiles."""
     p50, p90, p99 = 1e3 * np.percentile(seconds, [50, 90, 99])
-    print(
+    bench.row(name=name, num=len(seconds), p50_ms=p50, p90_ms=p90, p99_ms=p99)
+    bench.say(
         f"{name}: p50 {p50:.3f} ms, p90 {p90:.3f} ms, p99 {p99:.3f} ms, "
         f"max {1e3 * max(seconds):.3f} ms ({len(seconds)})"
     )
 
 
-def report_catches(name: str, verdict: dict[str, np.ndarray]) -> None:
+def report_catches(bench: Bench, name: str, verdict: dict[str, np.ndarray]) -> None:
     """One line of success."""
     p50, p90, p99 = 100.0 * np.percentile(verdict["net_distance"], [50, 90, 99])
     limits = np.unique([limit for limit in verdict["failed_limit"] if limit], return_counts=True)
     failures = ", ".join(f"{limit} {count}" for limit, count in zip(*limits, strict=True))
-    print(
+    bench.say(
         f"{name}: refereed success {100.0 * verdict['success'].mean():.2f} %, ball from the "
         f"net's centre p50 {p50:.1f} cm, p90 {p90:.1f} cm, p99 {p99:.1f} cm"
         + (f"; failed: {failures}" if failures else "")
     )
 
 
-def throws(num: int, period: float, noise: float) -> tuple[CatchScenario, np.ndarray]:
-    """True scenarios from one period after the planning on, and looks (num, K, 3) [m]."""
-    suite = make_suite("throws", num)
+def throws(num: int, period: float, noise: float) -> tuple[CatchCase, np.ndarray]:
+    """True cases from one period after the planning on, and looks (num, K, 3) [m]."""
+    suite = pj.catch.draw(num)
     times = jnp.arange(-round(SEEN / period), int(suite.horizon.max() / period)) * period
     paths = jax.tree.map(lambda leaf: leaf[:, 0], suite.targets)
     states = jax.vmap(lambda path: jax.vmap(path.at)(times))(paths)
@@ -231,17 +247,17 @@ def throws(num: int, period: float, noise: float) -> tuple[CatchScenario, np.nda
     return jax.tree.map(np.asarray, begins), looks.astype(np.float32)
 
 
-def alone(lanes: list[CatchScenario], period: float, noise: float) -> None:
+def alone(bench: Bench, lanes: list[CatchCase], period: float, noise: float) -> None:
     """Time re-plans one after the other, each once, on paths that have moved a little."""
     random = np.random.default_rng(0)
     tasks = []
-    for scenario in lanes:
-        task, current = first_plan(scenario)
+    for case in lanes:
+        task, current = first_plan(case)
         elapsed = np.float32(period * random.integers(1, round(0.6 / period)))
-        path = scenario.targets
+        path = case.targets
         ball = jax.tree.map(
             np.asarray,
-            BallPath(
+            pj.BallPath(
                 BallState(path.ball.pos[0], path.ball.vel[0]), path.drag[0], path.gravity[0]
             ).at(elapsed),
         )
@@ -250,42 +266,54 @@ def alone(lanes: list[CatchScenario], period: float, noise: float) -> None:
             (ball.vel + noise * random.standard_normal(3)).astype(np.float32)[None],
         )
         tasks.append((task, current, elapsed, dataclasses.replace(path, ball=moved)))
-    seconds, scratch, solved = [], [], 0
-    for task in tasks:
+    seconds, scratch, times, cases = [], [], Times(), []
+    for task, current, elapsed, targets in tasks:
         began = time.perf_counter()
-        found = plan(AGAIN, replanned(*task))
+        left = AGAIN.begin(task, current, elapsed, targets=targets)
+        found = pj.plan(AGAIN, left)
         ended = time.perf_counter()
-        plan(SCRATCH, task[0])
+        pj.plan(SCRATCH, task)
         scratch.append(time.perf_counter() - ended)
         seconds.append(ended - began)
-        solved += bool(is_solved(found.status))
-    report_times("from scratch, its order and time given", scratch)
-    report_times("re-plan alone", seconds)
-    print(f"solved {100.0 * solved / len(tasks):.2f} %")
+        cases.append((left.case, found))
+        times.keep(left, found)
+    solved = [bool(is_solved(found.status)) for _, found in cases]
+    bench.count(judged(stacked([case for case, _ in cases]), [p for _, p in cases])["success"])
+    report_times(bench, "from scratch, its order and time given", scratch)
+    report_times(bench, "re-plan alone", seconds)
+    bench.say(f"solved {100.0 * np.mean(solved):.2f} %")
+    bench.count([], times.gaps())
 
 
 def main() -> None:
     """Fly the throws, or time re-plans alone."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--num", type=int, default=1000)
+    parser = argument_parser("catch_replan", __doc__, num=1000)
     parser.add_argument("--rate", type=float, default=100.0, help="looks and plans a second [Hz]")
     parser.add_argument("--noise", type=float, default=0.005, help="of a look, a coordinate [m]")
     parser.add_argument("--alone", action="store_true", help="only time re-plans")
-    args = parser.parse_args()
-    period = 1.0 / args.rate
-    scenarios, looks = throws(args.num, period, args.noise)
-    lanes = [jax.tree.map(lambda leaf, k=k: leaf[k], scenarios) for k in range(args.num)]
-    began = time.perf_counter()
-    warm_up(lanes[0])
-    print(
-        f"{args.num} throws, {jax.devices()[0].platform}, jax {jax.__version__}, load average "
-        f"{os.getloadavg()[0]:.1f}; compilation of all rounds {time.perf_counter() - began:.1f} s"
-    )
-    if args.alone:
-        alone(lanes, period, args.noise)
-        return
+    options = parser.parse_args()
+    period = 1.0 / options.rate
+    with begin(parser, options) as bench:
+        cases, looks = throws(options.num, period, options.noise)
+        lanes = [pj.lane(cases, k) for k in range(options.num)]
+        began = time.perf_counter()
+        warm_up(lanes[0])
+        bench.say(
+            f"{options.num} throws, {jax.devices()[0].platform}, jax {jax.__version__}, load "
+            f"average {os.getloadavg()[0]:.1f}; compilation of all rounds "
+            f"{time.perf_counter() - began:.1f} s"
+        )
+        if options.alone:
+            alone(bench, lanes, period, options.noise)
+        else:
+            fly_all(bench, cases, looks, period, options.noise)
+
+
+def fly_all(bench: Bench, cases: CatchCase, looks: np.ndarray, period: float, noise: float) -> None:
+    """Fly every throw, warm, and report."""
+    lanes = [pj.lane(cases, k) for k in range(len(looks))]
     path = lanes[0].targets
-    estimator = Estimator(period, args.noise, path.drag[0], path.gravity[0])
+    estimator = Estimator(period, noise, path.drag[0], path.gravity[0])
     for lane, seen in zip(lanes[:WARM_UP], looks, strict=False):
         fly(lane, seen, estimator, period, Times())
     times = Times()
@@ -295,16 +323,19 @@ def main() -> None:
         fly(lane, seen, estimator, period, times) for lane, seen in zip(lanes, looks, strict=True)
     ]
     flown, first = (list(plans) for plans in zip(*flights, strict=True))
-    report_times("estimate", times.estimate)
-    report_times("first plan, from scratch", times.first)
-    report_times("re-plan", times.again)
-    report_times("estimate and re-plan", np.add(times.estimate, times.again).tolist())
-    print(
+    report_times(bench, "estimate", times.estimate)
+    report_times(bench, "first plan, from scratch", times.first)
+    report_times(bench, "re-plan", times.again)
+    report_times(bench, "estimate and re-plan", np.add(times.estimate, times.again).tolist())
+    bench.say(
         f"deadlines of {1e3 * period:.1f} ms missed: {times.missed} of {len(times.again)}; "
         f"re-plans that broke a limit: {times.broken}; load average {os.getloadavg()[0]:.1f}"
     )
-    report_catches("re-planned", judged(scenarios, flown))
-    report_catches("first plan alone", judged(scenarios, first))
+    verdict = judged(cases, flown)
+    report_catches(bench, "re-planned", verdict)
+    report_catches(bench, "first plan alone", judged(cases, first))
+    bench.count(verdict["success"], times.gaps())
+    bench.note(missed=times.missed, replans=len(times.again), broken=times.broken)
 
 
 if __name__ == "__main__":

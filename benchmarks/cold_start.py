@@ -1,45 +1,63 @@
 """Seconds from the start of a process to its first plans, with empty and with warm caches.
 
-    python -m benchmarks.cold_start [--num 1024]
+    python -m benchmarks.cold_start [--num 1024] [--out DIR]
 
 Two fresh processes plan a batch of hits each, the second with what the first compiled.
 """
 
-import argparse
 import os
 import subprocess
 import sys
 import tempfile
 import time
 
+import planner_jax as pj
+from planner_jax.benchmarks.cost_gap import cost_gaps
+from planner_jax.benchmarks.run import argument_parser, begin
+
 FIRST_PLANS = """
 import planner_jax as pj
 pj.keep_compiled_programs()
-plans = pj.plan(pj.ExactHit(), pj.to_scenarios(pj.generate_serves({num}, 0)))
-print(int((plans.status <= 1).sum()), "of {num} solved")
+plans = pj.plan(pj.hit.planner("exact"), pj.hit.draw({num}))
+print(int(pj.solved(plans).sum()), "of {num} solved")
+plans.save({path!r})
 """
 
 
+def first_plans(num: int, path: str, caches: str) -> tuple[float, str]:
+    """Seconds that a fresh process takes, and what it says; its plans are in a file."""
+    began = time.perf_counter()
+    found = subprocess.run(
+        [sys.executable, "-c", FIRST_PLANS.format(num=num, path=path)],
+        env={**os.environ, "JAX_COMPILATION_CACHE_DIR": caches},
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    return time.perf_counter() - began, found.stdout.strip()
+
+
 def main() -> None:
-    """Run both processes."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--num", type=int, default=1024)
-    args = parser.parse_args()
+    """Run both processes, and judge their plans."""
+    parser = argument_parser("cold_start", __doc__, num=1024)
+    options = parser.parse_args()
+    bench, rows = begin(parser, options), []
     with tempfile.TemporaryDirectory() as folder:
         for caches in ("empty", "warm"):
-            began = time.perf_counter()
-            found = subprocess.run(
-                [sys.executable, "-c", FIRST_PLANS.format(num=args.num)],
-                env={**os.environ, "JAX_COMPILATION_CACHE_DIR": folder},
-                check=True,
-                capture_output=True,
-                text=True,
+            path = os.path.join(folder, f"{caches}.npz")
+            seconds, text = first_plans(options.num, path, os.path.join(folder, "compiled"))
+            bench.say(
+                f"caches {caches}: {seconds:.1f} s to the first plans, {text}; "
+                f"load average {os.getloadavg()[0]:.1f}"
             )
-            print(
-                f"caches {caches}: {time.perf_counter() - began:.1f} s to the first plans, "
-                f"{found.stdout.strip()}; load average {os.getloadavg()[0]:.1f}",
-                flush=True,
-            )
+            rows.append((caches, seconds, pj.hit.HitPlan.load(path)))
+    # A device may have room for one process only, so that this one uses none until here.
+    with bench:
+        planner, cases = pj.hit.planner("exact"), pj.hit.draw(options.num)
+        for caches, seconds, plans in rows:
+            success = pj.hit.judge(cases, plans).success
+            bench.count(success, cost_gaps(planner, cases, plans))
+            bench.row(caches=caches, seconds=seconds, success=success.mean())
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """How much quicker a batch is planned on every core than on one, on this machine, now.
 
-    python -m benchmarks.cores [--num 36000] [--turns 8]
+    python -m benchmarks.cores [--num 36000] [--turns 8] [--out DIR]
 
 Three kinds of processes stay alive and take turns, so that a slow minute of the machine meets
 all of them: one process on one core; one on every core; and a process for each core, bound to
@@ -9,13 +9,20 @@ may share caches, memory or a clock. Printed are plans a second, warm, and the r
 core of the same turn. Linux, because processes are bound to cores.
 """
 
-import argparse
+import functools
 import multiprocessing
 import os
 import statistics
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
+from typing import Any
+
+import numpy as np
+
+import planner_jax as pj
+
+# The processes import this module: what starts or measures nothing there is imported in `main`.
 
 
 def _on(cores: Sequence[int]) -> ProcessPoolExecutor:
@@ -24,70 +31,79 @@ def _on(cores: Sequence[int]) -> ProcessPoolExecutor:
     return ProcessPoolExecutor(1, spawn, initializer=os.sched_setaffinity, initargs=(0, cores))
 
 
-def _planned(num: int) -> tuple[float, str]:
-    """Seconds that planning hits took, warm, and how good the plans of the first call were."""
-    if num not in _CASES:
-        _CASES[num] = _first(num)
-    planner, scenarios, quality = _CASES[num]
-    from planner_jax.task.solve import plan
+@functools.cache
+def _cases(num: int) -> tuple[Any, Any]:
+    """A planner and hits for it."""
+    return pj.hit.planner("exact"), pj.hit.draw(num)
 
+
+def _first(num: int) -> Any:
+    """The plans, with what had to be compiled for them."""
+    return pj.plan(*_cases(num))
+
+
+def _seconds(num: int) -> float:
+    """How long planning takes, warm."""
+    planner, cases = _cases(num)
     began = time.perf_counter()
-    plan(planner, scenarios)
-    return time.perf_counter() - began, quality
-
-
-_CASES: dict = {}  # of a process, by the number of hits
-
-
-def _first(num: int) -> tuple:
-    import numpy as np
-
-    from planner_jax.referee.hit import referee_hits
-    from planner_jax.task.hit.exact import ExactHit
-    from planner_jax.task.hit.serves import generate_serves, to_scenarios
-    from planner_jax.task.solve import plan
-
-    planner, scenarios = ExactHit(), to_scenarios(generate_serves(num, 0))
-    plans = plan(planner, scenarios)
-    success = referee_hits(scenarios, plans).success.mean()
-    quality = f"{100 * success:.2f} % refereed, median cost {np.median(plans.cost):.3g}"
-    return planner, scenarios, quality
+    pj.plan(planner, cases)
+    return time.perf_counter() - began
 
 
 def main() -> None:
     """Take turns and print the rates."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--num", type=int, default=36000, help="hits a process plans at a time")
-    parser.add_argument("--turns", type=int, default=8)
-    args = parser.parse_args()
+    from planner_jax.benchmarks.cost_gap import cost_gaps, gap_figures
+    from planner_jax.benchmarks.run import argument_parser, begin
+
+    parser = argument_parser("cores", __doc__, num=36000, turns=8)
+    options = parser.parse_args()
+    bench, num = begin(parser, options), options.num
     cores = sorted(os.sched_getaffinity(0))
     groups = {
         "one core": [_on(cores[-1:])],
         f"all {len(cores)} cores": [_on(cores)],
         "a process for each core": [_on([core]) for core in cores],
     }
-    quality = {
-        name: [child.submit(_planned, args.num).result()[1] for child in children][0]
+    plans = {
+        name: [child.submit(_first, num).result() for child in children][0]
         for name, children in groups.items()
     }
     rates: dict[str, list[float]] = {name: [] for name in groups}
-    for _ in range(args.turns):
+    for _ in range(options.turns):
         for name, children in groups.items():
-            begun = [child.submit(_planned, args.num) for child in children]
-            rates[name].append(sum(args.num / one.result()[0] for one in begun))
-    print(f"load average {os.getloadavg()[0]:.1f}; {args.turns} turns")
-    print("| process | plans/s, median | lowest | highest | times one core | success |")
-    print("|---|---|---|---|---|---|")
-    alone = rates["one core"]
-    for name, found in rates.items():
-        times = statistics.median(f / a for f, a in zip(found, alone, strict=True))
-        print(
-            f"| {name} | {statistics.median(found):.0f} | {min(found):.0f} | {max(found):.0f} "
-            f"| {times:.2f} | {quality[name]} |"
-        )
+            begun = [child.submit(_seconds, num) for child in children]
+            rates[name].append(sum(num / one.result() for one in begun))
+    load = os.getloadavg()[0]
     for children in groups.values():
         for child in children:
             child.shutdown()
+    with bench:  # from here on JAX runs in this process too
+        bench.say(
+            f"load average {load:.1f}; {options.turns} turns",
+            "| process | plans/s, median | lowest | highest | times one core | success |",
+            "|---|---|---|---|---|---|",
+        )
+        planner, cases = _cases(num)
+        for name, found in rates.items():
+            pairs = zip(found, rates["one core"], strict=True)
+            times, median = statistics.median(f / a for f, a in pairs), statistics.median(found)
+            success = pj.hit.judge(cases, plans[name]).success
+            gaps = cost_gaps(planner, cases, plans[name])
+            bench.count(success, gaps)
+            bench.say(
+                f"| {name} | {median:.0f} | {min(found):.0f} | {max(found):.0f} | {times:.2f} "
+                f"| {100 * success.mean():.2f} % refereed, median cost "
+                f"{np.median(plans[name].cost):.3g} |"
+            )
+            bench.row(
+                process=name,
+                plans_per_second=median,
+                lowest=min(found),
+                highest=max(found),
+                times_one_core=times,
+                success=success.mean(),
+                **gap_figures(gaps),
+            )
 
 
 if __name__ == "__main__":

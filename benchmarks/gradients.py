@@ -1,7 +1,7 @@
 """What the gradient of a plan costs beside the plan, and how good it is.
 
     python -m benchmarks.gradients [--task hit] [--num 4096] [--iterations 7] [--steps 1]
-        [--accuracy 64]
+        [--accuracy 64] [--out DIR]
 
 Times are of whole calls from arrays on the device to arrays on the device, warm, the fastest
 and the median of `--repeat`; plain and differentiated calls take turns. The first calls, which
@@ -13,7 +13,6 @@ does and what the truncated adjoint does, which the same Hessian at the same poi
 """
 
 import argparse
-import dataclasses
 import os
 import statistics
 import time
@@ -23,19 +22,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from planner_jax.optimise.lbfgs import LbfgsConfig
-from planner_jax.optimise.problem import Round
-from planner_jax.protocol import is_solved
-from planner_jax.task.catch.decide import plan_catches
-from planner_jax.task.catch.exact import ExactCatch
-from planner_jax.task.catch.suites import make_suite
-from planner_jax.task.gradients import plan_with_gradients
-from planner_jax.task.hit.exact import ExactHit
-from planner_jax.task.hit.serves import generate_serves, to_scenarios
-from planner_jax.task.solve import plan
+import planner_jax as pj
+from planner_jax.benchmarks.cost_gap import cost_gaps
+from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin
+from planner_jax.planning.decided import first_choice
+from planner_jax.registry import task_named
 
-_LONG = LbfgsConfig(max_steps=600, memory=12, tolerance=1e-9, patience=10)
-_WRT = {
+_LONG = pj.LbfgsConfig(max_steps=600, memory=12, tolerance=1e-9, patience=10)
+_BY = {
     "hit": ("racket_height", "drag", "target", "limits"),
     "catch": ("net", "limits", "head_state"),
 }
@@ -47,13 +41,12 @@ def _last_catch(plan: Any) -> jax.Array:
 
 
 def _case(task: str, num: int) -> tuple[Any, Any, Any]:
-    """Planner, scenarios with NumPy leaves, quantity."""
+    """Planner that minimises, cases with NumPy leaves, quantity."""
     if task == "hit":
-        found = ExactHit(), to_scenarios(generate_serves(num, _SEED)), "stroke.time"
+        found = pj.hit.planner("exact"), pj.hit.draw(num, seed=_SEED), "stroke.time"
     else:
-        planner = ExactCatch()
-        throws, _ = plan_catches(planner, make_suite("throws", num, _SEED), "greedy")
-        found = planner, throws, _last_catch
+        throws = first_choice(pj.catch.Greedy(), pj.catch.draw(num, seed=_SEED))
+        found = pj.catch.ExactCatch(), throws, _last_catch
     return found[0], jax.tree.map(np.asarray, found[1]), found[2]
 
 
@@ -102,62 +95,72 @@ def _errors(found: np.ndarray, best: np.ndarray, lanes: np.ndarray) -> str:
 
 def main() -> None:
     """Print the times, then the accuracy."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--task", choices=_WRT, default="hit")
-    parser.add_argument("--num", type=int, default=4096)
-    parser.add_argument("--iterations", type=int, help="one search of as many")
-    parser.add_argument("--steps", type=int, default=1)
-    parser.add_argument("--repeat", type=int, default=10)
-    parser.add_argument("--accuracy", type=int, default=64, help="lanes compared; 0 for none")
-    args = parser.parse_args()
-    planner, scenarios, quantity = _case(args.task, args.num)
-    solver = None
-    if args.iterations is not None:
-        solver = LbfgsConfig(max_steps=args.iterations)
-        planner = dataclasses.replace(planner, rounds=(Round(starts=1, solver=solver),))
-    wrt = _WRT[args.task]
+    parser = argument_parser("gradients", __doc__, num=4096, repeat=10)
+    parser.add_argument("--task", choices=_BY, default="hit")
+    parser.add_argument("--iterations", type=at_least(1), help="one search of as many")
+    parser.add_argument("--steps", type=at_least(0), default=1)
+    parser.add_argument("--accuracy", type=at_least(0), default=64, help="compared; 0 for none")
+    options = parser.parse_args()
+    planner, cases, quantity = _case(options.task, options.num)
+    if options.iterations is not None:
+        planner = planner.with_solver(pj.LbfgsConfig(max_steps=options.iterations))
+    with begin(parser, options) as bench:
+        _measure(bench, options, planner, cases, quantity)
 
-    def differentiated(where: Any, planner: Any = planner, **options: Any) -> Any:
-        return plan_with_gradients(planner, where, quantity, wrt, **options)
 
-    resident = jax.device_put(jax.tree.map(jnp.asarray, scenarios))
+def _measure(
+    bench: Bench, options: argparse.Namespace, planner: Any, cases: Any, quantity: Any
+) -> None:
+    def differentiated(where: Any, **more: Any) -> Any:
+        return pj.gradient(planner, where, of=quantity, by=_BY[options.task], **more)
+
+    resident = jax.device_put(jax.tree.map(jnp.asarray, cases))
     seconds = _timed(
         {
-            "plan": lambda: plan(planner, resident),
-            "plan_with_gradients": lambda: differentiated(resident, steps=args.steps),
+            "plan": lambda: pj.plan(planner, resident),
+            "gradient": lambda: differentiated(resident, steps=options.steps),
         },
-        args.repeat,
+        options.repeat,
     )
-    print(
-        f"{args.task}, {args.num} plans, {jax.devices()[0].device_kind}, load average "
+    bench.say(
+        f"{options.task}, {options.num} plans, {jax.devices()[0].device_kind}, load average "
         f"{os.getloadavg()[0]:.1f}; first round of {planner.rounds[0].solver.max_steps} "
-        f"iterations, {args.steps} adjoint steps"
+        f"iterations, {options.steps} adjoint steps",
+        "| call | first [s] | fastest [ms] | median [ms] |",
+        "|---|---|---|---|",
     )
-    print("| call | first [s] | fastest [ms] | median [ms] |\n|---|---|---|---|")
     for name, (first, fastest, median) in seconds.items():
-        print(f"| {name} | {first:.1f} | {1e3 * fastest:.2f} | {1e3 * median:.2f} |")
+        bench.say(f"| {name} | {first:.1f} | {1e3 * fastest:.2f} | {1e3 * median:.2f} |")
+        bench.row(call=name, first_seconds=first, fastest_seconds=fastest, median_seconds=median)
     (_, *plain), (_, *both) = seconds.values()
     ratio = [100.0 * (b / a - 1.0) for a, b in zip(plain, both, strict=True)]
-    print(f"gradient: {ratio[0]:.0f} % of the solve's time (fastest), {ratio[1]:.0f} % (median)")
-    if args.accuracy:
-        few = jax.tree.map(lambda leaf: leaf[: args.accuracy], scenarios)
-        _, found = differentiated(few, steps=args.steps)
-        _, whole = differentiated(few, curvature="whole")
-        with jax.enable_x64(True):
-            plans, best = differentiated(_double(few), curvature="whole", solver=_LONG)
-        lanes = np.flatnonzero(is_solved(np.asarray(plans.status)))
-        num = args.accuracy
-        gradient = [_flat(each, num) for each in (found, whole, best)]
-        residual = np.nanquantile(np.asarray(found.residual)[lanes], (0.5, 0.9))
-        print(f"{lanes.size} of {num} lanes compared; difference (median, p90)")
-        print(f"- from the optimum's: {_errors(gradient[0], gradient[2], lanes)}")
-        print(
-            f"- of the whole Hessian's from the optimum's: "
-            f"{_errors(gradient[1], gradient[2], lanes)}"
-        )
-        print(f"- residual of the adjoint: {residual[0]:.2g}, {residual[1]:.2g}")
-        late = np.abs(np.asarray(found.value) - np.asarray(best.value))[lanes]
-        print(f"- of the quantity itself: {np.median(late):.3f}, {np.quantile(late, 0.9):.3f}")
+    bench.say(
+        f"gradient: {ratio[0]:.0f} % of the solve's time (fastest), {ratio[1]:.0f} % (median)"
+    )
+    plans = jax.device_get(pj.plan(planner, resident))
+    success = task_named(options.task).judge(cases, plans).success
+    bench.count(success, cost_gaps(planner, cases, plans))
+    if options.accuracy:
+        _compare(bench, options, differentiated, pj.lane(cases, slice(options.accuracy)))
+
+
+def _compare(bench: Bench, options: argparse.Namespace, differentiated: Any, few: Any) -> None:
+    """Say how far gradients are from those of the optimum."""
+    found = differentiated(few, steps=options.steps)
+    whole = differentiated(few, curvature="whole")
+    with jax.enable_x64(True):
+        best = differentiated(_double(few), curvature="whole", solver=_LONG)
+    num, lanes = len(found.value), np.flatnonzero(pj.solved(best.plans))
+    gradient = [_flat(each, num) for each in (found, whole, best)]
+    residual = np.nanquantile(np.asarray(found.residual)[lanes], (0.5, 0.9))
+    late = np.abs(np.asarray(found.value) - np.asarray(best.value))[lanes]
+    bench.say(
+        f"{lanes.size} of {num} lanes compared; difference (median, p90)",
+        f"- from the optimum's: {_errors(gradient[0], gradient[2], lanes)}",
+        f"- of the whole Hessian's from the optimum's: {_errors(gradient[1], gradient[2], lanes)}",
+        f"- residual of the adjoint: {residual[0]:.2g}, {residual[1]:.2g}",
+        f"- of the quantity itself: {np.median(late):.3f}, {np.quantile(late, 0.9):.3f}",
+    )
 
 
 if __name__ == "__main__":

@@ -1,13 +1,13 @@
 """The batched L-BFGS beside optax.lbfgs and SciPy's L-BFGS-B on the same hit objective.
 
-    python -m benchmarks.optimiser [--num 200] [--row late-0.5]
+    python -m benchmarks.optimiser [--num 200] [--row late-0.5] [--out DIR]
 
 All three get the same float32 objective in the same scaled variables from the same start.
 Time is per plan, warm: the batched solvers in one call over all serves, SciPy serve by serve
-with a compiled value and gradient. Success is the referee's.
+with a compiled value and gradient. Success is the referee's; the summary of the run folder is of
+this library's solver, all budgets of iterations together.
 """
 
-import argparse
 import time
 from collections.abc import Callable
 
@@ -17,12 +17,12 @@ import numpy as np
 import optax
 import scipy.optimize
 
+import planner_jax as pj
+from planner_jax.benchmarks.cost_gap import gap_figures
 from planner_jax.benchmarks.hit_rows import ROWS
-from planner_jax.optimise.lbfgs import LbfgsConfig
+from planner_jax.benchmarks.run import argument_parser, begin
 from planner_jax.optimise.multistart import minimise
-from planner_jax.referee.hit import referee_hits
 from planner_jax.task.hit.exact import ExactHit
-from planner_jax.task.hit.serves import generate_serves, to_scenarios
 
 PLANNER = ExactHit()
 
@@ -30,11 +30,11 @@ PLANNER = ExactHit()
 def ours(iterations: int) -> Callable:
     """This library's solver, one problem."""
 
-    def solve(scenario):
-        context = PLANNER.prepare(scenario)
+    def solve(case):
+        context = PLANNER.prepare(case)
         start = PLANNER.guesses(context, 1)[0]
         found = minimise(
-            lambda x: PLANNER.objective(x, context), start, LbfgsConfig(max_steps=iterations)
+            lambda x: PLANNER.objective(x, context), start, pj.LbfgsConfig(max_steps=iterations)
         )
         return found.point, found.iterations
 
@@ -44,8 +44,8 @@ def ours(iterations: int) -> Callable:
 def with_optax(iterations: int) -> Callable:
     """optax.lbfgs with its zoom line search, one problem."""
 
-    def solve(scenario):
-        context = PLANNER.prepare(scenario)
+    def solve(case):
+        context = PLANNER.prepare(case)
         solver = optax.lbfgs(memory_size=6)
 
         def cost(x):
@@ -66,18 +66,18 @@ def with_optax(iterations: int) -> Callable:
     return solve
 
 
-def batched(solve: Callable, scenarios) -> tuple[np.ndarray, float, float]:
+def batched(solve: Callable, cases) -> tuple[np.ndarray, float, float]:
     """Points, mean iterations and warm seconds of a batched solver."""
     compiled = jax.jit(jax.vmap(solve))
-    jax.block_until_ready(compiled(scenarios))
+    jax.block_until_ready(compiled(cases))
     began = time.perf_counter()
-    points, iterations = jax.block_until_ready(compiled(scenarios))
+    points, iterations = jax.block_until_ready(compiled(cases))
     return np.asarray(points), float(iterations.mean()), time.perf_counter() - began
 
 
-def with_scipy(scenarios, iterations: int) -> tuple[np.ndarray, float, float]:
+def with_scipy(cases, iterations: int) -> tuple[np.ndarray, float, float]:
     """Points, mean iterations and seconds of SciPy's L-BFGS-B, serve by serve."""
-    contexts = jax.jit(jax.vmap(PLANNER.prepare))(scenarios)
+    contexts = jax.jit(jax.vmap(PLANNER.prepare))(cases)
     starts = np.asarray(jax.jit(jax.vmap(lambda c: PLANNER.guesses(c, 1)[0]))(contexts), float)
     value_and_grad = jax.jit(jax.value_and_grad(lambda x, c: PLANNER.objective(x, c).cost))
     lanes = [jax.tree.map(lambda x, k=k: x[k], contexts) for k in range(len(starts))]
@@ -104,31 +104,45 @@ def with_scipy(scenarios, iterations: int) -> tuple[np.ndarray, float, float]:
 
 def main() -> None:
     """Print one line a solver and iteration budget."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--num", type=int, default=200)
+    parser = argument_parser("optimiser", __doc__, num=200)
     parser.add_argument("--row", default="late-0.5", choices=[*ROWS][:-1])
-    args = parser.parse_args()
-    scenarios = to_scenarios(generate_serves(args.num, 2), **ROWS[args.row])
+    options = parser.parse_args()
+    cases = pj.hit.draw(options.num, seed=2, **ROWS[options.row])
     final = jax.jit(jax.vmap(lambda s, x: PLANNER.objective(x, PLANNER.prepare(s)).cost))
     decode = jax.jit(jax.vmap(lambda s, x: PLANNER.decode(x, PLANNER.prepare(s))))
-    print(f"{args.num} generated serves, row {args.row}, {jax.devices()[0].platform}")
-    print("| solver | iterations | ms a plan | median cost | mean cost | success |")
-    print("|---|---|---|---|---|---|")
-    for budget in (10, 60, 200):
-        for name, run in (
-            ("planner_jax", lambda n=budget: batched(ours(n), scenarios)),
-            ("optax.lbfgs", lambda n=budget: batched(with_optax(n), scenarios)),
-            ("SciPy L-BFGS-B", lambda n=budget: with_scipy(scenarios, n)),
-        ):
-            points, iterations, seconds = run()
-            cost = np.asarray(final(scenarios, points))
-            verdict = referee_hits(scenarios, decode(scenarios, points))
-            print(
-                f"| {name} | {iterations:.0f} of {budget} | {1e3 * seconds / args.num:.3f} | "
-                f"{np.median(cost):.3g} | {cost.mean():.3g} | "
-                f"{100 * verdict.success.mean():.1f} % |",
-                flush=True,
+    with begin(parser, options) as bench:
+        bench.say(
+            f"{options.num} generated serves, row {options.row}, {jax.devices()[0].platform}",
+            "| solver | iterations | ms a plan | median cost | mean cost | success |",
+            "|---|---|---|---|---|---|",
+        )
+        best = pj.plan(PLANNER.with_solver(), jax.tree.map(np.asarray, cases))
+        runs = {
+            "planner_jax": lambda n: batched(ours(n), cases),
+            "optax.lbfgs": lambda n: batched(with_optax(n), cases),
+            "SciPy L-BFGS-B": lambda n: with_scipy(cases, n),
+        }
+        for budget, name in ((budget, name) for budget in (10, 60, 200) for name in runs):
+            points, iterations, seconds = runs[name](budget)
+            cost = np.asarray(final(cases, points))
+            success = pj.hit.judge(cases, decode(cases, points)).success
+            gaps = (cost / best.cost - 1.0)[success & pj.solved(best)]
+            bench.say(
+                f"| {name} | {iterations:.0f} of {budget} | {1e3 * seconds / options.num:.3f} | "
+                f"{np.median(cost):.3g} | {cost.mean():.3g} | {100 * success.mean():.1f} % |"
             )
+            bench.row(
+                solver=name,
+                budget=budget,
+                iterations=iterations,
+                seconds=seconds,
+                median_cost=np.median(cost),
+                mean_cost=cost.mean(),
+                success=success.mean(),
+                **gap_figures(gaps),
+            )
+            if name == "planner_jax":
+                bench.count(success, gaps)
 
 
 if __name__ == "__main__":

@@ -18,8 +18,6 @@ the extra `oracle` (CasADi).
 
 import argparse
 import functools
-import json
-import math
 from pathlib import Path
 
 import jax
@@ -28,8 +26,9 @@ import numpy as np
 import pyarrow.parquet as pq
 
 from planner_jax.benchmarks.hit_oracle.search import STARTS, Finding, find_hits, starting_points
+from planner_jax.benchmarks.run import Bench, argument_parser, begin
 from planner_jax.sweep.summary import wilson_interval
-from planner_jax.task.hit.serves import generate_serves, read_serves, to_scenarios
+from planner_jax.task.hit.serves import generate_serves, read_serves, to_cases
 from planner_jax.task.hit.validate import ServeError
 
 NUM_GENERATED = 9000  # serves that are drawn where no folder is given
@@ -45,7 +44,7 @@ def failed_indices(plans: Path) -> np.ndarray:
 def summarise(findings: list[Finding]) -> dict:
     """Counts with Wilson intervals, and times."""
     num, summary = len(findings), {"num": len(findings)}
-    for name in ("feasible", "infeasible", "undecided"):
+    for name in VERDICTS:
         count = sum(finding.verdict == name for finding in findings)
         interval = list(wilson_interval(count, num))
         summary[name] = {"count": count, "share": count / num, "wilson_95": interval}
@@ -63,7 +62,7 @@ def summarise(findings: list[Finding]) -> dict:
 def table_of(summary: dict) -> str:
     """The summary as a Markdown table and two sentences."""
     lines = ["| verdict | cases | share | 95 % interval |", "|---|---|---|---|"]
-    for name in ("feasible", "infeasible", "undecided"):
+    for name in VERDICTS:
         row = summary[name]
         low, high = (100.0 * bound for bound in row["wilson_95"])
         share = 100.0 * row["share"]
@@ -79,31 +78,25 @@ def table_of(summary: dict) -> str:
     return "\n".join(lines)
 
 
-def write(out: Path, arguments: dict, summary: dict, indices, findings: list[Finding]) -> None:
-    """oracle.json, table.md, and hits.npz with the trajectories that were found."""
-    out.mkdir(parents=True, exist_ok=True)
-    rows = []
+def keep(bench: Bench, summary: dict, indices: np.ndarray, findings: list[Finding]) -> None:
+    """Rows of all cases, and hits.npz with the trajectories that were found."""
     for index, finding in zip(indices, findings, strict=True):
         numbers = {k: v for k, v in vars(finding).items() if k not in ("coeffs", "durations")}
-        finite = {k: None if v in (math.inf, math.nan) or v != v else v for k, v in numbers.items()}
-        rows.append({"index": int(index), "verdict": finding.verdict} | finite)
-    record = {"arguments": arguments, "summary": summary, "cases": rows}
-    (out / "oracle.json").write_text(json.dumps(record, indent=1, allow_nan=False) + "\n", "utf-8")
-    (out / "table.md").write_text(table_of(summary) + "\n", "utf-8")
+        bench.row(index=index, verdict=finding.verdict, **numbers)
+    bench.count([finding.feasible for finding in findings])
+    bench.note(**summary)
     hits = [(i, f) for i, f in zip(indices, findings, strict=True) if f.feasible]
     np.savez(
-        out / "hits.npz",
+        bench.path / "hits.npz",
         index=np.array([i for i, _ in hits], int),
         coeffs=np.array([f.coeffs for _, f in hits]),
         durations=np.array([f.durations for _, f in hits]),
     )
 
 
-def arguments_of(line: list[str] | None) -> tuple[argparse.ArgumentParser, argparse.Namespace]:
-    """The parser, and the arguments checked."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.oracle_hit", description=__doc__.splitlines()[0]
-    )
+def parser_of_arguments() -> argparse.ArgumentParser:
+    """The parser."""
+    parser = argument_parser("oracle_hit", __doc__, num=200, starts=len(STARTS), seed=0, workers=1)
     add = parser.add_argument
     add("--serves", type=Path, help="folder of published trial files (default: draw serves)")
     add("--delay", type=float, default=0.0, help="seconds from the serve to the planning")
@@ -111,21 +104,13 @@ def arguments_of(line: list[str] | None) -> tuple[argparse.ArgumentParser, argpa
     which = parser.add_mutually_exclusive_group()
     which.add_argument("--failures", type=Path, help="plans.parquet of a sweep (default: all)")
     which.add_argument("--indices", type=Path, help=".npy file with indices of serves")
-    add("--num", type=int, default=200, help="size of the sample")
-    add("--starts", type=int, default=len(STARTS), help="starts a case")
-    add("--seed", type=int, default=0, help="of the sample, further starts and drawn serves")
-    add("--workers", type=int, default=1, help="processes")
-    add("--out", type=Path, help="folder for oracle.json, table.md and hits.npz")
-    options = parser.parse_args(line)
-    for name, least in (("num", 1), ("starts", 1), ("seed", 0), ("workers", 1)):
-        if getattr(options, name) < least:
-            parser.error(f"argument --{name}: must be >= {least}, got {getattr(options, name)}")
-    return parser, options
+    return parser
 
 
-def main(line: list[str] | None = None) -> None:
+def main() -> None:
     """Judge a sample of cases."""
-    parser, options = arguments_of(line)
+    parser = parser_of_arguments()
+    options = parser.parse_args()
     try:
         drawn = functools.partial(generate_serves, NUM_GENERATED, options.seed)
         serves = read_serves(options.serves) if options.serves else drawn()
@@ -138,7 +123,7 @@ def main(line: list[str] | None = None) -> None:
             parser.error(f"indices must be some of 0..{len(serves) - 1}, got {pool}")
         sample = np.random.default_rng(options.seed).permutation(pool)[: options.num]
         with jax.enable_x64(True):
-            scenarios = to_scenarios(
+            cases = to_cases(
                 serves[sample],
                 delay=options.delay,
                 limit_scale=options.limit_scale,
@@ -146,17 +131,12 @@ def main(line: list[str] | None = None) -> None:
             )
     except (ServeError, OSError, ValueError) as error:
         parser.error(str(error))
-    findings = find_hits(
-        scenarios, starting_points(options.starts, options.seed), workers=options.workers
-    )
-    summary = summarise(findings) | {"of": int(pool.size)}
-    if options.out:
-        arguments = {
-            name: str(value) if isinstance(value, Path) else value
-            for name, value in vars(options).items()
-        }
-        write(options.out, arguments, summary, sample, findings)
-    print(table_of(summary))
+    with begin(parser, options) as bench:
+        starts = starting_points(options.starts, options.seed)
+        findings = find_hits(cases, starts, workers=options.workers)
+        summary = summarise(findings) | {"of": int(pool.size)}
+        bench.say(table_of(summary))
+        keep(bench, summary, sample, findings)
 
 
 if __name__ == "__main__":

@@ -1,18 +1,20 @@
 """Plans a second of batches that stay on the devices: `planner-jax bench throughput`.
 
-    planner-jax bench throughput --task hit --batch 1024 65536 288000 [--devices N]
-    python -m benchmarks.throughput          both tasks, small
+    planner-jax bench throughput --task hit --batch 1024 65536 288000 [--devices N] [--out DIR]
+    python -m benchmarks.throughput [--tasks hit,catch] [--out DIR]
 
 One row a batch size: the first call, with what it compiles; then, after half a second of calls
 that bring up the device's clock, the fastest and the median of some more; the share that the
 referee accepts; and by how much the cost is above that of a long search from the same guess. For
 several devices also the efficiency beside one, and what each takes for its share alone. What
-is timed is the whole of `plan` (for catches `plan_catches` with the decision "greedy"): ball
-tables, guesses, all rounds, and the check of the limits, from arrays on the devices to arrays on
-the devices, where each holds its share. The referee is not part of it.
+is timed is the whole of `plan`, by any planner of any task, with the options that the task's card
+has for this (catches are decided "greedy"): ball tables, guesses, all rounds, and the check of
+the limits, from arrays on the devices to arrays on the devices, where each holds its share. The
+referee is not part of it.
 """
 
 import dataclasses
+import operator
 import os
 import resource
 import statistics
@@ -24,120 +26,103 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from planner_jax.optimise.lbfgs import LbfgsConfig
-from planner_jax.optimise.problem import Round
-from planner_jax.protocol import is_solved
-from planner_jax.referee.catch import referee_catches
-from planner_jax.referee.hit import referee_hits
+from planner_jax.benchmarks.cost_gap import COMPARED, cost_gaps, gap_figures
+from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
+from planner_jax.optimise.planner import OptimisedPlanner
+from planner_jax.planning.decided import DecidedPlanner
+from planner_jax.planning.plan import plan
+from planner_jax.registry import Task, all_tasks, task_named
 from planner_jax.sweep.settings import require
 from planner_jax.sweep.timing import CompileClock
-from planner_jax.task.catch.decide import plan_catches
-from planner_jax.task.catch.exact import ExactCatch
-from planner_jax.task.catch.suites import make_suite
-from planner_jax.task.hit.exact import ExactHit
-from planner_jax.task.hit.serves import generate_serves, to_scenarios
-from planner_jax.task.solve import plan
 
-_LONG = (Round(starts=1, solver=LbfgsConfig(max_steps=300, tolerance=1e-7, patience=6)),)
 _WARM_UP = 0.5  # [s]
 _JUDGED = 300_000  # lanes of a batch that the referee sees, at most
-_COMPARED = 1024  # lanes whose cost is held against a long search's, and with the CPU's
 
 
-class _Hits:
-    """Generated serves and `ExactHit`."""
+def report(*, out: str | os.PathLike | None = None, **settings: Any) -> None:
+    """Measure, print one row a batch size, and write a run folder.
 
-    planner = ExactHit()
+    Args:
+        out: run folder, new or empty; None for one of runs/.
+        **settings: of `measure`.
 
-    def scenarios(self, num: int, seed: int) -> Any:
-        return to_scenarios(generate_serves(num, seed))
-
-    def plan(self, planner: Any, scenarios: Any, devices: Any) -> tuple[Any, Any]:
-        return scenarios, plan(planner, scenarios, devices=devices)
-
-    def accepted(self, scenarios: Any, plans: Any) -> np.ndarray:
-        return referee_hits(scenarios, plans).success
-
-    def contact(self, plans: Any) -> Any:
-        return plans.stroke.time
+    Raises:
+        SettingError: the folder cannot be written; or as `measure` says.
+        UnknownName: as `measure` says.
+    """
+    with Bench("throughput", settings, out) as bench:
+        measure(bench, **settings)
 
 
-class _Catches:
-    """The suite `throws` and `ExactCatch`."""
-
-    planner = ExactCatch()
-
-    def scenarios(self, num: int, seed: int) -> Any:
-        return make_suite("throws", num=num, seed=seed)
-
-    def plan(self, planner: Any, scenarios: Any, devices: Any) -> tuple[Any, Any]:
-        return plan_catches(planner, scenarios, "greedy", devices=devices)
-
-    def accepted(self, scenarios: Any, plans: Any) -> np.ndarray:
-        return referee_catches(scenarios, plans).success
-
-    def contact(self, plans: Any) -> Any:
-        return plans.times[..., 0]
-
-
-_TASKS: dict[str, Any] = {"hit": _Hits, "catch": _Catches}
-
-
-def report(
+def measure(
+    bench: Bench,
     *,
-    task: str,
-    batch: Sequence[int],
-    devices: int | None,
-    iterations: int | None,
-    repeat: int,
-    seed: int,
-    agree: bool,
+    task: str = "hit",
+    planner: str | None = None,
+    suite: str | None = None,
+    batch: Sequence[int] = (1024, 8192),
+    devices: int | None = None,
+    iterations: int | None = None,
+    repeat: int = 5,
+    seed: int = 0,
+    agree: bool = False,
 ) -> None:
     """Measure and print one row a batch size.
 
     Args:
-        task: "hit" or "catch".
+        bench: the run.
+        task: name.
+        planner: name; None for the task's first.
+        suite: of which cases are drawn; None for the task's first.
         batch: sizes.
         devices: how many share a batch; None for all.
         iterations: of the planner's first round; None for its own.
         repeat: timed calls.
-        seed: of the scenarios.
+        seed: of the cases.
         agree: whether the first lanes are compared with a CPU's.
 
     Raises:
-        SettingError: there are fewer devices.
+        SettingError: there are fewer devices, or the planner has no rounds.
+        UnknownName: there is no such task, planner or suite.
     """
-    kind = _TASKS[task]()
-    local = jax.local_devices()
+    card, local = task_named(task), jax.local_devices()
     require(devices is None or devices <= len(local), "devices", f"<= {len(local)}", devices)
     used = local[: devices or len(local)]
-    planner = kind.planner
+    made = card.planner(planner or next(iter(card.planners)), **card.bench)
+    solver = made.planner if isinstance(made, DecidedPlanner) else made
+    has_rounds = isinstance(solver, OptimisedPlanner)
     if iterations is not None:
-        first, *rest = planner.rounds
-        solver = dataclasses.replace(first.solver, max_steps=iterations)
-        rounds = (dataclasses.replace(first, solver=solver), *rest)
-        planner = dataclasses.replace(planner, rounds=rounds)
-    print(
+        rule = "left out for a planner without rounds"
+        require(has_rounds, "iterations", rule, iterations)
+        made = _with_iterations(made, iterations)
+    first = iterations or (solver.rounds[0].solver.max_steps if has_rounds else None)
+    bench.say(
         f"{task}, {len(used)} x {used[0].device_kind}, jax {jax.__version__}, load average "
-        f"{os.getloadavg()[0]:.1f}; first round: {planner.rounds[0].solver.max_steps} iterations"
+        f"{os.getloadavg()[0]:.1f}" + (f"; first round: {first} iterations" if first else ""),
+        "| plans | first call [s] | of it compiling [s] | fastest [ms] | median [ms] | plans/s | "
+        "refereed | cost above a long search's (median, p90) | memory [GiB] |",
+        "|---|---|---|---|---|---|---|---|---|",
     )
-    print(
-        "| plans | first call [s] | of it compiling [s] | fastest [ms] | median [ms] | plans/s |",
-        end="",
-    )
-    print(" refereed | cost above a long search's (median, p90) | memory [GiB] |")
-    print("|---|---|---|---|---|---|---|---|---|")
     beside = []
     for num in batch:
-        host = jax.tree.map(np.asarray, kind.scenarios(num, seed))
-        timed = _timed(kind, planner, host, used, repeat)
-        print(_row(kind, planner, host, used, timed), flush=True)
+        host = jax.tree.map(np.asarray, card.draw(num, suite, seed))
+        timed = _timed(made, host, used, repeat)
+        _add_row(bench, card, made, host, used, timed)
         if num >= len(used) > 1:
-            beside.append(_efficiency(kind, planner, host, used, repeat, timed))
-    for line in beside:
-        print(line)
+            beside.append(_efficiency(made, host, used, repeat, timed))
+    if beside:
+        bench.say(*beside)
     if agree:
-        print(_agreement(kind, planner, seed, used))
+        bench.say(_agreement(card, made, card.draw(COMPARED, suite, seed), used))
+
+
+def _with_iterations(planner: Any, iterations: int) -> Any:
+    """A planner with another number of iterations in its first round."""
+    if isinstance(planner, DecidedPlanner):
+        return dataclasses.replace(planner, planner=_with_iterations(planner.planner, iterations))
+    first, *rest = planner.rounds
+    solver = dataclasses.replace(first.solver, max_steps=iterations)
+    return planner.changed((("rounds", (dataclasses.replace(first, solver=solver), *rest)),))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,7 +132,6 @@ class _Timed:
     first: float  # [s]
     compiling: float  # [s], of the first
     seconds: list[float]  # of the others
-    decided: Any  # the scenarios, with what was decided on before they were planned
     plans: Any
 
     @property
@@ -155,58 +139,67 @@ class _Timed:
         return min(self.seconds)
 
 
-def _timed(kind: Any, planner: Any, host: Any, devices: list, repeat: int) -> _Timed:
+def _timed(planner: Any, host: Any, devices: list, repeat: int) -> _Timed:
     """Plan a batch that the devices hold in equal shares, once and then `repeat` times, warm."""
     num = jax.tree.leaves(host)[0].shape[0]
     shares = NamedSharding(Mesh(np.array(devices), "lanes"), PartitionSpec("lanes"))
     there = shares if len(devices) > 1 and num % len(devices) == 0 else devices[0]
-    scenarios = jax.block_until_ready(jax.device_put(host, there))
+    cases = jax.block_until_ready(jax.device_put(host, there))
 
     def call() -> tuple[float, Any]:
         began = time.perf_counter()
-        found = jax.block_until_ready(kind.plan(planner, scenarios, devices))
-        return time.perf_counter() - began, found
+        plans = jax.block_until_ready(plan(planner, cases, devices=devices))
+        return time.perf_counter() - began, plans
 
     with CompileClock() as clock:
         first, _ = call()
     began = time.perf_counter()
     while time.perf_counter() - began < _WARM_UP:
         call()
-    seconds = []
-    for _ in range(repeat):
-        took, (decided, plans) = call()
-        seconds.append(took)
-    return _Timed(first, clock.seconds, seconds, decided, plans)
+    calls = [call() for _ in range(repeat)]
+    return _Timed(first, clock.seconds, [took for took, _ in calls], calls[-1][1])
 
 
-def _row(kind: Any, planner: Any, host: Any, devices: list, timed: _Timed) -> str:
+def _add_row(
+    bench: Bench, card: Task, planner: Any, host: Any, devices: list, timed: _Timed
+) -> None:
     plans = jax.device_get(timed.plans)
-    judged = jax.tree.map(lambda leaf: np.asarray(leaf)[:_JUDGED], (timed.decided, plans))
-    accepted = kind.accepted(*judged)
-    first = jax.tree.map(lambda leaf: leaf[:_COMPARED], (host, plans))
-    _, best = kind.plan(dataclasses.replace(planner, rounds=_LONG), first[0], devices)
-    both = is_solved(first[1].status) & is_solved(best.status)
-    gap = 100.0 * (first[1].cost / best.cost - 1.0)[both]
-    num, median = plans.status.size, statistics.median(timed.seconds)
-    return (
-        f"| {num:,} | {timed.first:.1f} | {timed.compiling:.1f} | {1e3 * timed.fastest:.2f} | "
-        f"{1e3 * median:.2f} | {num / timed.fastest:,.0f} | {100.0 * accepted.mean():.3f} % "
-        f"({(~accepted).sum()} of {accepted.size:,} fail) | {np.median(gap):.1f} %, "
-        f"{np.quantile(gap, 0.9):.1f} % | {_memory(devices):.1f} |"
+    success = card.judge(*jax.tree.map(lambda leaf: leaf[:_JUDGED], (host, plans))).success
+    gaps = cost_gaps(planner, host, plans, devices)
+    bench.count(success, gaps)
+    figures = gap_figures(gaps)
+    row = {
+        "task": card.name,
+        "num": plans.status.size,
+        "first_seconds": timed.first,
+        "compiling_seconds": timed.compiling,
+        "fastest_seconds": timed.fastest,
+        "median_seconds": statistics.median(timed.seconds),
+        "plans_per_second": plans.status.size / timed.fastest,
+        "judged": success.size,
+        "success": success.mean(),
+        **figures,
+        "memory_gib": _memory(devices),
+    }
+    gap = ", ".join("-" if x is None else f"{100.0 * x:.1f} %" for x in figures.values())
+    bench.say(
+        f"| {row['num']:,} | {timed.first:.1f} | {timed.compiling:.1f} | "
+        f"{1e3 * timed.fastest:.2f} | {1e3 * row['median_seconds']:.2f} | "
+        f"{row['plans_per_second']:,.0f} | {100.0 * success.mean():.3f} % "
+        f"({(~success).sum()} of {success.size:,} fail) | {gap} | {row['memory_gib']:.1f} |"
     )
+    bench.row(**row)
 
 
-def _efficiency(
-    kind: Any, planner: Any, host: Any, devices: list, repeat: int, timed: _Timed
-) -> str:
+def _efficiency(planner: Any, host: Any, devices: list, repeat: int, timed: _Timed) -> str:
     """What several devices make of a batch beside one, and beside each of them alone."""
     num = timed.plans.status.size
-    whole = _timed(kind, planner, host, devices[:1], repeat).fastest
+    whole = _timed(planner, host, devices[:1], repeat).fastest
     ends = np.linspace(0, num, len(devices) + 1).astype(int)
     alone = []
-    for device, begin, end in zip(devices, ends[:-1], ends[1:], strict=True):
-        share = jax.tree.map(lambda leaf: leaf[begin:end], host)  # noqa: B023
-        alone.append(_timed(kind, planner, share, [device], repeat).fastest)
+    for device, begins, ended in zip(devices, ends[:-1], ends[1:], strict=True):
+        share = jax.tree.map(lambda leaf: leaf[begins:ended], host)  # noqa: B023
+        alone.append(_timed(planner, share, [device], repeat).fastest)
     shares = ", ".join(f"{1e3 * seconds:.2f}" for seconds in alone)
     return (
         f"{num:,} plans: one device takes {1e3 * whole:.2f} ms, so that {len(devices)} have an "
@@ -224,30 +217,35 @@ def _memory(devices: list) -> float:
     return peak / 2**30
 
 
-def _agreement(kind: Any, planner: Any, seed: int, devices: list) -> str:
+def _agreement(card: Task, planner: Any, cases: Any, devices: list) -> str:
     """How far plans of the devices differ from those of a CPU, lane by lane."""
-    scenarios = jax.tree.map(np.asarray, kind.scenarios(_COMPARED, seed))
-    _, ours = kind.plan(planner, scenarios, devices)
+    cases = jax.tree.map(np.asarray, cases)
+    ours = plan(planner, cases, devices=devices)
     with jax.default_device(jax.devices("cpu")[0]):
-        _, theirs = kind.plan(planner, scenarios, jax.devices("cpu")[:1])
+        theirs = plan(planner, cases, devices=jax.devices("cpu")[:1])
     same = np.asarray(ours.status) == np.asarray(theirs.status)
-    later = np.abs(np.asarray(kind.contact(ours)) - np.asarray(kind.contact(theirs)))
-    cost = np.abs(ours.cost / theirs.cost - 1.0)
-    return (
-        f"beside a CPU, {_COMPARED} lanes: status equal on {100.0 * same.mean():.2f} %; contact "
-        f"time differs by {1e3 * np.quantile(later, 0.99):.3f} ms on 99 % and "
-        f"{1e3 * later.max():.3f} at most; cost by {100.0 * np.quantile(cost, 0.99):.2g} % on 99 %"
-    )
+    text = f"beside a CPU, {COMPARED} lanes: status equal on {100.0 * same.mean():.2f} %"
+    if card.contact:
+        contact = operator.attrgetter(card.contact)
+        later = np.abs(contact(ours) - contact(theirs))
+        text += (
+            f"; contact time differs by {1e3 * np.quantile(later, 0.99):.3f} ms on 99 % and "
+            f"{1e3 * later.max():.3f} at most"
+        )
+    cost = np.abs(ours.cost - theirs.cost) / np.maximum(np.abs(theirs.cost), 1e-30)
+    return f"{text}; cost by {100.0 * np.quantile(cost, 0.99):.2g} % on 99 %"
+
+
+def main() -> None:
+    """Both tasks of the library, or others, small."""
+    parser = argument_parser("throughput", __doc__, seed=0)
+    parser.add_argument("--tasks", default="hit,catch", help="comma-separated")
+    options = parser.parse_args()
+    tasks = chosen(parser, "--tasks", options.tasks, all_tasks())
+    with begin(parser, options) as bench:
+        for task in tasks:
+            measure(bench, task=task, seed=options.seed, agree=True)
 
 
 if __name__ == "__main__":
-    for name in _TASKS:
-        report(
-            task=name,
-            batch=(1024, 8192),
-            devices=None,
-            iterations=None,
-            repeat=5,
-            seed=0,
-            agree=True,
-        )
+    main()

@@ -99,23 +99,19 @@ def _plans() -> Iterator[Finding]:
     import jax
     import numpy as np
 
-    from planner_jax.referee.hit import referee_hits
-    from planner_jax.task.hit.exact import ExactHit
-    from planner_jax.task.hit.serves import generate_serves, to_scenarios
-    from planner_jax.task.solve import plan
+    from planner_jax.planning.plan import plan
+    from planner_jax.protocol import lane
+    from planner_jax.registry import task_named
 
-    batch = jax.tree.map(np.asarray, to_scenarios(generate_serves(_BATCH, 0)))
-    single = jax.tree.map(lambda leaf: leaf[0], batch)
-    for name, scenarios in (("one plan", single), (f"{_BATCH} plans", batch)):
+    hit = task_named("hit")
+    planner, batch = hit.planner(), jax.tree.map(np.asarray, hit.draw(_BATCH))
+    for name, cases in (("one plan", lane(batch, 0)), (f"{_BATCH} plans", batch)):
         seconds = []
         for _ in range(6):
             began = time.perf_counter()
-            plans = plan(ExactHit(), scenarios)
+            plans = plan(planner, cases)
             seconds.append(time.perf_counter() - began)
-        lanes = scenarios.batch_shape != ()
-        if not lanes:
-            scenarios, plans = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (scenarios, plans))
-        success = float(referee_hits(scenarios, plans).success.mean())
+        success = float(np.mean(hit.judge(cases, plans).success))
         text = (
             f"{1e3 * min(seconds[1:]):.2f} ms (the first call, with what had to be compiled, "
             f"{seconds[0]:.1f} s); the referee accepts {100.0 * success:.1f} %"

@@ -46,6 +46,9 @@ class Task:
     # Classes of the settings of its sweeps, and of its flights in `sims`; they name what runs them.
     sweep: str = "planner_jax.sweep.settings:SweepSettings"
     flight: str | None = None
+    # Options of `planner` where its speed is measured.
+    bench: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    contact: str | None = None  # place in a plan of its times of contact, such as "stroke.time"
 
     @property
     def case(self) -> Callable[..., Any]:

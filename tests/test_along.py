@@ -9,8 +9,8 @@ import pytest
 
 from planner_jax.cost.along import Along, _greatest, greatest_along, integrate_along
 from planner_jax.cost.along_kernel import MODES, along_kernel
-from planner_jax.cost.quadrotor import motion_excess
 from planner_jax.cost.penalty import smoothed_hinge
+from planner_jax.cost.quadrotor import motion_excess
 from planner_jax.lanes import over_lanes
 from planner_jax.robot.quadrotor import QuadrotorLimits
 from planner_jax.trajectory.proportional_minco import proportional_minco, sample_motion

@@ -22,7 +22,7 @@ MPP = MppCatch()
 @pytest.fixture(scope="module")
 def throws():
     """As many of the paper's throws as of the hard ones, two more targets being absent."""
-    suites = [make_suite(name, NUM // 2, 4, num_targets=3) for name in ("throws", "hard")]
+    suites = [draw(NUM // 2, name, 4, num_targets=3) for name in ("throws", "hard")]
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *suites)
 
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from planner_jax.task.hit.serves import generate_serves, to_cases
+import planner_jax as pj
 
 pytest.importorskip("casadi")
 from planner_jax.benchmarks.hit_oracle.search import (
@@ -16,14 +16,14 @@ from planner_jax.benchmarks.hit_oracle.search import (
 )
 
 
-def case(limit_scale):
+def serve(limit_scale):
     with jax.enable_x64(True):
-        batch = to_cases(generate_serves(1, 5), limit_scale=limit_scale, dtype=jnp.float64)
-        return jax.tree.map(lambda leaf: np.asarray(leaf)[0], batch)
+        batch = pj.hit.draw(1, seed=5, limit_scale=limit_scale, dtype=jnp.float64)
+        return pj.lane(jax.tree.map(np.asarray, batch), 0)
 
 
 def test_an_easy_serve_is_proven_feasible_by_a_trajectory_that_the_referee_passes():
-    easy = case(1.0)
+    easy = serve(1.0)
     finding = find_hit(easy, starting_points(2, 0))
     assert finding.verdict == "feasible"
     assert passes_referee(easy, finding.coeffs, finding.durations)
@@ -32,7 +32,7 @@ def test_an_easy_serve_is_proven_feasible_by_a_trajectory_that_the_referee_passe
 
 def test_a_hopeless_serve_is_called_infeasible():
     """At a fifth of the limits nobody arrives in time."""
-    finding = find_hit(case(0.2), starting_points(4, 0))
+    finding = find_hit(serve(0.2), starting_points(4, 0))
     assert finding.verdict == "infeasible"
     assert finding.least_excess > 0.1
     assert finding.coeffs is None

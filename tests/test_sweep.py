@@ -10,6 +10,8 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from matplotlib.figure import Figure
+from planner_jax.sweep.hit.table import rate_table, remarks
+from planner_jax.task.hit.planners import planner
 from scipy.stats import binomtest
 from sweeps import columns, stop_after
 
@@ -21,7 +23,6 @@ from planner_jax.sweep.hit import task
 from planner_jax.sweep.hit.figures.motion import motion_figure
 from planner_jax.sweep.hit.settings import HitSweep
 from planner_jax.sweep.hit.source import open_source
-from planner_jax.sweep.hit.table import rate_table, remarks
 from planner_jax.sweep.report import RunRows, write_report
 from planner_jax.sweep.run import SweepInterrupted, resume_sweep, start_sweep
 from planner_jax.sweep.run_folder import RunFolder, pick_rows
@@ -30,7 +31,6 @@ from planner_jax.sweep.summary import percent, wilson_interval
 from planner_jax.sweep.timing import CompileClock
 from planner_jax.task.hit import court
 from planner_jax.task.hit.exact import ExactHit
-from planner_jax.task.hit.planners import planner
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 NUM, BATCH = 84, 13  # chunks and single cases are planned by one program, for up to 16

@@ -8,6 +8,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from planner_jax.sweep.catch.source import open_source
+from planner_jax.sweep.catch.summary import CatchTally
+from planner_jax.sweep.catch.table import rate_table
 from sweeps import columns, stop_after
 
 from planner_jax.optimise.lbfgs import LbfgsConfig
@@ -17,9 +20,6 @@ from planner_jax.sweep.catch import task
 from planner_jax.sweep.catch.columns import COLUMNS, FRAME
 from planner_jax.sweep.catch.published import PUBLISHED
 from planner_jax.sweep.catch.settings import DECISIONS, SUITES, CatchSweep
-from planner_jax.sweep.catch.source import open_source
-from planner_jax.sweep.catch.summary import CatchTally
-from planner_jax.sweep.catch.table import rate_table
 from planner_jax.sweep.catch.targets import target_positions
 from planner_jax.sweep.columns import RefereedBatch, rows_of
 from planner_jax.sweep.report import write_report

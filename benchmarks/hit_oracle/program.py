@@ -12,7 +12,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.interpolate import BPoly
 
-from planner_jax.task.hit.scenario import HitScenario
+from planner_jax.task.hit.case import HitCase
 
 BALL_DEGREE = 10  # of the ball's path up to its landing; below 1e-7 m off the integration
 # Sizes of position, velocity, acceleration and jerk, and of snap, in a program's variables.
@@ -49,10 +49,10 @@ OPTIONS = {
 }
 
 
-def case_parameters(scenario: HitScenario) -> dict[str, np.ndarray]:
-    """The values of `PARAMETERS` for one scenario (no batch axis); the ball by integration."""
-    drag, floor = float(scenario.drag), float(scenario.target[2])
-    fall = np.array([0.0, 0.0, -float(scenario.gravity)])
+def case_parameters(case: HitCase) -> dict[str, np.ndarray]:
+    """The values of `PARAMETERS` for one case (no batch axis); the ball by integration."""
+    drag, floor = float(case.drag), float(case.target[2])
+    fall = np.array([0.0, 0.0, -float(case.gravity)])
 
     def rate(_, state):
         return np.r_[state[3:], fall - drag * np.linalg.norm(state[3:]) * state[3:]]
@@ -61,19 +61,19 @@ def case_parameters(scenario: HitScenario) -> dict[str, np.ndarray]:
         return state[2] - floor
 
     height.terminal, height.direction = True, -1.0
-    begin = np.r_[np.asarray(scenario.ball.pos, float), np.asarray(scenario.ball.vel, float)]
+    begin = np.r_[np.asarray(case.ball.pos, float), np.asarray(case.ball.vel, float)]
     accuracy = {"rtol": 1e-11, "atol": 1e-11, "dense_output": True}
     flight = solve_ivp(rate, (0.0, 30.0), begin, "DOP853", events=height, **accuracy)
     nodes = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, 41))
     path = flight.sol(nodes * flight.t[-1])[:3].T
-    case = {
+    found = {
         "ball": np.polynomial.polynomial.polyfit(nodes, path, BALL_DEGREE),
         "landing_time": flight.t[-1],
     }
-    for source in (scenario, scenario.limits, scenario.hit_limits):
+    for source in (case, case.limits, case.hit_limits):
         fields = {field.name for field in dataclasses.fields(source)}
-        case |= {name: getattr(source, name) for name in fields & PARAMETERS.keys() - case.keys()}
-    return {name: np.asarray(case[name], float).ravel() for name in PARAMETERS}
+        found |= {name: getattr(source, name) for name in fields & PARAMETERS.keys() - found.keys()}
+    return {name: np.asarray(found[name], float).ravel() for name in PARAMETERS}
 
 
 def unpack(vector, sizes: dict[str, int]) -> dict:

@@ -12,8 +12,8 @@ from tqdm import tqdm
 
 from planner_jax.benchmarks.hit_oracle.program import Program, case_parameters, later
 from planner_jax.referee.hit import referee_hits
+from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.plan import HitPlan, Stroke
-from planner_jax.task.hit.scenario import HitScenario
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 TOLERANCE = 1e-3  # of the referee, relative
@@ -42,11 +42,11 @@ STARTS = (
 START_RANGES = ((0.5, 0.98), (0.6, 2.3), (0.8, 2.3))  # of starts beyond these
 
 
-def worst_ratios(motion: list[np.ndarray], durations: np.ndarray, case: dict) -> np.ndarray:
+def worst_ratios(motion: list[np.ndarray], durations: np.ndarray, values: dict) -> np.ndarray:
     """Largest of speed, acceleration and body rate over their limits on every piece, (M,)."""
     times = durations[:, None, None] * np.linspace(0.0, 1.0, 41)[:, None]
     _, vel, acc, jerk, _ = later([part[:, None] for part in motion], times)
-    thrust = acc + case["gravity"] * np.array([0.0, 0.0, 1.0])
+    thrust = acc + values["gravity"] * np.array([0.0, 0.0, 1.0])
     size, cross = np.linalg.norm(thrust, axis=-1), np.cross(thrust, jerk)
     rate = np.hypot(np.linalg.norm(cross, axis=-1) / size, cross[..., 2] / (size + thrust[..., 2]))
     ratios = {
@@ -54,7 +54,7 @@ def worst_ratios(motion: list[np.ndarray], durations: np.ndarray, case: dict) ->
         "acceleration": np.linalg.norm(acc, axis=-1),
         "body_rate": rate / size,
     }
-    return np.max([value / case[name] for name, value in ratios.items()], axis=(0, 2))
+    return np.max([value / values[name] for name, value in ratios.items()], axis=(0, 2))
 
 
 @dataclasses.dataclass
@@ -93,16 +93,16 @@ class Oracle:
         self.coarse = Program(COARSE_PIECES, COARSE_SAMPLES, COARSE_FLOOR)
         self.fine = Program(2 * COARSE_PIECES, FINE_SAMPLES, FINE_FLOOR)
 
-    def find(self, scenario: HitScenario, starts) -> Finding:
-        """Look for a hit in one scenario (NumPy leaves, no batch axis) from several starts."""
+    def find(self, case: HitCase, starts) -> Finding:
+        """Look for a hit in one case (NumPy leaves, no batch axis) from several starts."""
         began, finding, in_vain = time.process_time(), Finding(), math.inf
-        case = case_parameters(scenario)
+        values = case_parameters(case)
         for start in starts:
             finding.starts += 1
-            unknowns, converged = self.coarse.solve(case, self.coarse.guess(case, start))
+            unknowns, converged = self.coarse.solve(values, self.coarse.guess(values, start))
             excess = unknowns[-1]
             if excess < min(REFINED_BELOW, in_vain - NEW_BELOW):
-                refined = self._refine(scenario, case, unknowns, finding)
+                refined = self._refine(case, values, unknowns, finding)
                 if finding.feasible:
                     break
                 if TOLERANCE < refined < math.inf:
@@ -117,32 +117,32 @@ class Oracle:
         finding.cpu_seconds = time.process_time() - began
         return finding
 
-    def _refine(self, scenario, case: dict, coarse: np.ndarray, finding: Finding) -> float:
+    def _refine(self, case: HitCase, values: dict, coarse: np.ndarray, finding: Finding) -> float:
         """Halve the pieces and tighten what peaks between samples; the excess, if it converged."""
-        guess, margins = self.coarse.halved(case, coarse), np.zeros(self.fine.pieces)
-        unknowns, converged = self.fine.solve(case, guess)
+        guess, margins = self.coarse.halved(values, coarse), np.zeros(self.fine.pieces)
+        unknowns, converged = self.fine.solve(values, guess)
         if not converged:
-            unknowns, converged = self.fine.solve(case, guess, margins)
+            unknowns, converged = self.fine.solve(values, guess, margins)
         if not converged:
             return math.inf
         for _ in range(1 + MOST_TIGHTENINGS):
-            motion, durations = self.fine.motion(case, unknowns)
+            motion, durations = self.fine.motion(values, unknowns)
             finding.note(unknowns, durations)
             coeffs = np.stack([m / math.factorial(k) for k, m in enumerate(motion)], axis=1)
-            finding.feasible = passes_referee(scenario, coeffs, durations)
+            finding.feasible = passes_referee(case, coeffs, durations)
             if finding.feasible:
                 finding.coeffs, finding.durations = coeffs, durations
                 break
             excess = max(unknowns[-1], 0.5 * TOLERANCE)
-            peaks = np.maximum(worst_ratios(motion, durations, case) - 1.0 - excess, 0.0)
+            peaks = np.maximum(worst_ratios(motion, durations, values) - 1.0 - excess, 0.0)
             if unknowns[-1] > TOLERANCE or not peaks.any():
                 break
             margins = margins + peaks
-            unknowns, _ = self.fine.solve(case, unknowns, margins)
+            unknowns, _ = self.fine.solve(values, unknowns, margins)
         return unknowns[-1]
 
 
-def passes_referee(scenario: HitScenario, coeffs: np.ndarray, durations: np.ndarray) -> bool:
+def passes_referee(case: HitCase, coeffs: np.ndarray, durations: np.ndarray) -> bool:
     """Whether the library's referee passes one trajectory."""
     none = np.zeros(1)
     stroke = Stroke(
@@ -155,13 +155,14 @@ def passes_referee(scenario: HitScenario, coeffs: np.ndarray, durations: np.ndar
     )
     plan = HitPlan(
         trajectory=PiecewisePolynomial(coeffs=coeffs[None], durations=durations[None]),
+        gravity=none,
         stroke=stroke,
         cost=none,
         violation=none,
         iterations=none,
         status=none,
     )
-    batch = jax.tree.map(lambda leaf: leaf[None], scenario)
+    batch = jax.tree.map(lambda leaf: leaf[None], case)
     return bool(referee_hits(batch, plan, tolerance=TOLERANCE).success[0])
 
 
@@ -178,16 +179,16 @@ def oracle() -> Oracle:
     return Oracle()
 
 
-def find_hit(scenario: HitScenario, starts) -> Finding:
-    """What the process's oracle finds about one scenario."""
-    return oracle().find(scenario, starts)
+def find_hit(case: HitCase, starts) -> Finding:
+    """What the process's oracle finds about one case."""
+    return oracle().find(case, starts)
 
 
-def find_hits(scenarios: HitScenario, starts, workers: int = 1) -> list[Finding]:
-    """Findings for a batch of scenarios, in order, with a progress bar."""
-    scenarios = jax.tree.map(np.asarray, scenarios)
-    num = len(scenarios.drag)
-    lanes = [jax.tree.map(lambda leaf, i=i: leaf[i], scenarios) for i in range(num)]
+def find_hits(cases: HitCase, starts, workers: int = 1) -> list[Finding]:
+    """Findings for a batch of cases, in order, with a progress bar."""
+    cases = jax.tree.map(np.asarray, cases)
+    num = len(cases.drag)
+    lanes = [jax.tree.map(lambda leaf, i=i: leaf[i], cases) for i in range(num)]
     look = functools.partial(find_hit, starts=starts)
     if workers == 1:
         return list(tqdm(map(look, lanes), total=num, unit="case"))

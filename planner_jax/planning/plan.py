@@ -62,8 +62,9 @@ def plan(
         return solve(planner, cases)
     _require_fit(planner, cases)
     alone = cases.batch_shape == ()
-    if alone and hasattr(planner, "solve"):
-        return plan_single(planner, planner.attempts, cases)
+    one: Any = planner
+    if alone and hasattr(one, "solve"):
+        return plan_single(one, one.attempts, cases)
     if alone:
         cases = jax.tree.map(lambda leaf: np.asarray(leaf)[None], cases)
     require_batch(cases)

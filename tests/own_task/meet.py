@@ -1,8 +1,8 @@
-"""A task from outside the library: a point mass in the plane meets a point that moves straight on.
+"""A task from outside the library: a point mass in the plane meets a point that moves on.
 
-The robot is a double integrator; its acceleration runs in a straight line over time, a(t) = b + c t,
-and may not exceed a limit. What is to be found are the meeting time and b; c follows from them, so
-that every plan meets the target. Among those the earliest is wanted.
+The robot is a double integrator whose acceleration changes evenly, a(t) = b + c t, and may not
+exceed a limit. To be found are the meeting time and b; c follows from them, so that every plan
+meets the target. The earliest is wanted.
 """
 
 import dataclasses

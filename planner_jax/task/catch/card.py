@@ -53,4 +53,6 @@ TASK = Task(
     suites={name: suite.description for name, suite in SUITES.items()},
     sweep="planner_jax.sweep.catch.settings:CatchSettings",
     flight="planner_jax.sims.settings:CatchFly",
+    bench={"decide": "greedy"},
+    contact="times",
 )

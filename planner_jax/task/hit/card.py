@@ -38,4 +38,5 @@ TASK = Task(
     },
     sweep="planner_jax.sweep.hit.settings:HitSettings",
     flight="planner_jax.sims.settings:HitFly",
+    contact="stroke.time",
 )

@@ -1,0 +1,112 @@
+"""Benchmarks write run folders, and throughput is measured of tasks that nobody has heard of."""
+
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import struct
+
+import planner_jax as pj
+from planner_jax import registry
+from planner_jax.benchmarks.cost_gap import gap_figures
+from planner_jax.benchmarks.run import Bench
+from planner_jax.benchmarks.throughput import report
+from planner_jax.sweep.settings import SettingError
+
+
+def read(folder, name="manifest.json"):
+    return json.loads((folder / name).read_text())
+
+
+def test_a_run_folder_says_what_was_run_where_and_with_what_success(tmp_path, capsys):
+    with Bench("nothing", {"num": np.int64(4), "from": tmp_path}, tmp_path / "run") as bench:
+        bench.say("| a | b |", "|---|---|")
+        bench.row(name="one", seconds=np.float32(0.5), ratio=np.nan)
+        bench.count(np.array([True, True, False, True]), np.array([0.1, 0.3]), None)
+    manifest = read(tmp_path / "run")
+    assert (manifest["kind"], manifest["state"]) == ("bench nothing", "complete")
+    assert manifest["parameters"] == {"num": 4, "from": str(tmp_path)}
+    assert {"versions", "device", "git_commit", "started", "times"} <= manifest.keys()
+    assert manifest["summary"]["num"] == 4
+    assert manifest["summary"]["success_rate"] == 0.75
+    assert manifest["summary"]["cost_gap_median"] == pytest.approx(0.2)
+    assert read(tmp_path / "run", "rows.json") == [{"name": "one", "seconds": 0.5, "ratio": None}]
+    assert (tmp_path / "run" / "table.md").read_text() == capsys.readouterr().out
+
+
+def test_what_was_not_measured_is_null(tmp_path):
+    with Bench("nothing", {}, tmp_path / "run"):
+        pass
+    assert read(tmp_path / "run")["summary"] == {"num": 0, "success_rate": None}
+    assert gap_figures(None) == {"cost_gap_median": None, "cost_gap_p90": None}
+
+
+def test_a_run_that_fails_says_so_and_no_run_is_overwritten(tmp_path):
+    with pytest.raises(ZeroDivisionError), Bench("nothing", {}, tmp_path / "run"):
+        _ = 1 / 0
+    assert read(tmp_path / "run")["state"] == "failed"
+    with pytest.raises(SettingError, match="out must be a new or empty folder"):
+        Bench("nothing", {}, tmp_path / "run")
+
+
+@struct.dataclass
+class Number:
+    """A case of a task that has nothing to do with quadrotors."""
+
+    value: jax.Array
+
+    @property
+    def batch_shape(self):
+        return np.shape(self.value)
+
+
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class Half:
+    """A planner that minimises nothing."""
+
+    attempts = (pj.Attempt(),)
+
+    def solve(self, case, attempt):
+        violation = jnp.where(case.value < 3.0, -1.0, 1.0)
+        return pj.Plan(**pj.outcome(0.5 * case.value, violation))
+
+
+def draw(num, suite=None, seed=0, *, first=0):
+    return Number(value=jnp.arange(first, first + num, dtype=jnp.float32))
+
+
+def planner(name="half", **options):
+    return Half(**options)
+
+
+def judge(cases, plans):
+    return pj.Verdict(
+        success=np.asarray(plans.violation) <= 0.0,
+        failed_limit=np.full(len(cases.value), ""),
+        failed_time=np.zeros(len(cases.value)),
+        failed_excess=np.zeros(len(cases.value)),
+    )
+
+
+@pytest.fixture
+def halving(monkeypatch):
+    card = registry.Task("halve", "halves numbers", __name__, {"half": ""}, {})
+    monkeypatch.setattr(registry, "all_tasks", lambda: {"halve": card})
+
+
+def test_throughput_is_measured_of_any_task(halving, tmp_path, capsys):
+    report(task="halve", batch=[4, 8], repeat=1, agree=True, out=tmp_path / "run")
+    manifest = read(tmp_path / "run")
+    assert (manifest["summary"]["num"], manifest["summary"]["success_rate"]) == (12, 0.5)
+    assert manifest["summary"]["cost_gap_median"] is None
+    assert [row["success"] for row in read(tmp_path / "run", "rows.json")] == [0.75, 0.375]
+    assert "status equal on 100.00 %" in capsys.readouterr().out
+
+
+def test_a_planner_without_rounds_has_no_iterations_to_set(halving, tmp_path):
+    with pytest.raises(SettingError, match="iterations must be left out"):
+        report(task="halve", batch=[4], repeat=1, iterations=7, out=tmp_path / "run")
