@@ -7,6 +7,7 @@ MuJoCo's state comes first in `qpos` and `qvel`, before that of the balls; all o
 import dataclasses
 from typing import Any, ClassVar, NamedTuple, Protocol
 
+import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array
@@ -40,6 +41,23 @@ class Shape(NamedTuple):
     lines: list[np.ndarray]  # each (M, 3) [m]
     discs: list[tuple[np.ndarray, float]]  # centre (3,) [m] and radius [m], across the z axis
     tool: bool = False  # whether the last line is the tool's rim
+
+
+def rotation(quat_wxyz: Any, array_library: Any = jnp) -> Any:
+    """Rotation matrix (3, 3), body to world, of a unit quaternion (4,).
+
+    Args:
+        quat_wxyz: w x y z.
+        array_library: `jax.numpy`, or `numpy` for a result in the precision of the host.
+    """
+    w, x, y, z = quat_wxyz
+    return array_library.array(
+        [
+            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+            [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+            [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+        ]
+    )
 
 
 class Robot(Protocol):

@@ -17,9 +17,9 @@ from jax import Array, lax
 
 from planner_jax.robot.quadrotor import net_thrust
 from planner_jax.sims.model import World
+from planner_jax.sims.robot import rotation
 from planner_jax.sims.robots.quadrotor.reference import Reference, flat_attitude
 from planner_jax.sims.robots.quadrotor.vehicle import Vehicle, rotor_thrusts
-from planner_jax.sims.rotation import rotation
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,15 +60,7 @@ def rotation_error(R: Array, R_wanted: Array) -> Array:
 def control(
     state: RobotState, reference: Reference, vehicle: Vehicle, gains: Gains, world: World
 ) -> Array:
-    """Rotor thrusts (4,) [N] that track a reference; pure, for one quadrotor.
-
-    Args:
-        state: of the quadrotor, as it is estimated.
-        reference: to be tracked.
-        vehicle: what the quadrotor is made of.
-        gains: of the cascade.
-        world: whose gravity and time step count.
-    """
+    """Rotor thrusts (4,) [N] that track a reference; pure, for one quadrotor."""
     gravity = world.gravity
     R = rotation(state.quat_wxyz)
     half = 0.5 * world.timestep  # the velocities of MuJoCo's Euler are that much older
