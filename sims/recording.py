@@ -49,11 +49,6 @@ class Recording:
     def __len__(self) -> int:
         return len(self.index)
 
-    @property
-    def num_balls(self) -> int:
-        """N."""
-        return self.balls.shape[2]
-
     def num_looks(self, flight: int) -> int:
         """How many looks of a flight show anything that moves."""
         there = np.isfinite(self.robot[flight]).all(axis=1)

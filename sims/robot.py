@@ -63,6 +63,7 @@ def rotation(quat_wxyz: Any, array_library: Any = jnp) -> Any:
 class Robot(Protocol):
     """A robot's part of a flight. `World` is `sims.model.World`, which holds the robot."""
 
+    WORDS: ClassVar[str]  # how it is simulated and controlled, for the page of a run
     num_pos: ClassVar[int]  # R, of its joint positions in `qpos`
     num_vel: ClassVar[int]  # R', of its joint velocities in `qvel`
     noise_shape: ClassVar[tuple[int, ...]]  # of the standard normal noise that `sensed` takes

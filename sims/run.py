@@ -134,8 +134,8 @@ def read_flights(folder: RunFolder) -> tuple[dict[str, Any], FlightTask, Recordi
             "fly it again"
         )
     try:
-        recording = read_recording(path)
         settings = fly_settings(task)(**manifest["parameters"])
+        recording = read_recording(path)
     except (pa.ArrowException, KeyError) as error:
         raise SettingError(f"{folder.name} must have a whole {FILE}: {error}") from None
     except TypeError as error:
@@ -240,8 +240,8 @@ def write_flight_report(folder: RunFolder) -> None:
     lines = headline(manifest, flight)
     title = f"Flights, {flight.settings.TASK}, {flight.suite}"
     remarks = [
-        "Everything is simulated in MuJoCo MJX: rotors with lag, body-rate, attitude and position "
-        "control, motion capture with noise, dropout and latency, balls with quadratic drag.",
+        f"Everything is simulated in MuJoCo MJX: {flight.world().robot.WORDS}, motion capture with "
+        "noise, dropout and latency, balls with quadratic drag.",
     ]
     folder.write_text("table.md", to_markdown(title, lines, table, remarks))
     lead = "".join(f"<p>{html.escape(line)}</p>\n" for line in lines)

@@ -192,7 +192,7 @@ class Viewer:
                 add.add_cylinder(f"{name}/disc{k}", radius, position=place, **flat)
         nothing = np.zeros((1, 2, 3))
         self._balls, self._trails = [], []
-        for k in range(self.recording.num_balls):
+        for k in range(self.world.num_balls):
             colour = BALL_COLOURS[k % len(BALL_COLOURS)]
             ball = add.add_icosphere(f"/ball{k}", BALL_RADIUS, _rgb(colour))
             self._balls.append(ball)
@@ -231,7 +231,7 @@ class Viewer:
             ]
             paths += [
                 (f"/path{k}", recording.balls[row, :, k], GREY, 0.004)
-                for k in range(recording.num_balls)
+                for k in range(self.world.num_balls)
             ]
             for name, path, colour, thickness in paths:
                 drawn.append(self._add_line(name, segments(path), colour, thickness))

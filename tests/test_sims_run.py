@@ -178,6 +178,7 @@ class DropFlight(FlightTask):
         return Launches(BallState(at, 0.0 * at), np.full(at.shape[:2], 0.06), np.zeros(1), 0.1)
 
 
+@pytest.mark.slow
 def test_a_third_task_is_flown_into_a_run_folder_without_an_edit(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(FLIGHTS, "drop", "tests.test_sims_run:DropFly")
     manifest = start_flights(DropFly(num=2, noise="none"), tmp_path / "run")

@@ -31,6 +31,7 @@ class Quadrotor:
     vehicle: Vehicle = Vehicle()
     gains: Gains = Gains()
 
+    WORDS: ClassVar[str] = "rotors with lag, body-rate, attitude and position control"
     num_pos: ClassVar[int] = 7
     num_vel: ClassVar[int] = 6
     noise_shape: ClassVar[tuple[int, ...]] = (4, 3)
