@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from planner_jax.sims.run import draw_one
+from planner_jax.sims.film import draw_flight
 from planner_jax.sims.settings import CatchFly, HitFly
 
 PICTURES = {
@@ -37,7 +37,8 @@ def main() -> None:
         flights = task.fly(cases, record=True)
         good = flights.success
         lane = int(np.argmax(good))
-        draw_one(args.out / name, task, cases, flights, lane, **look)
+        recording = task.recording(cases, flights, np.array([lane]))
+        draw_flight(args.out / name, task, recording, 0, **look)
         print(f"{name}: flight {lane}; {good.sum()} of {len(good)} succeed", flush=True)
 
 

@@ -298,9 +298,7 @@ def _view(options: dict[str, Any]) -> None:
     from planner_jax.sweep.run_folder import RunFolder
 
     _, flight, recording = read_flights(RunFolder(options["run"], name="RUN"))
-    titles = [flight.title(recording, row) for row in range(len(recording))]
-    where = options["host"], options["port"]
-    viewer = Viewer(flight.world(), recording, titles, flight.CONTACT, *where)
+    viewer = Viewer(flight, recording, options["host"], options["port"])
     _let_ctrl_c_stop()
     print(f"Playing {len(recording)} flights at {viewer.url}; Ctrl-C stops.", flush=True)
     viewer.run()

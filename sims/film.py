@@ -2,7 +2,6 @@
 
 import os
 import shutil
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +14,9 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from planner_jax.sims.model import World
 from planner_jax.sims.recording import Recording, frame
-from planner_jax.sims.rotation import rotation
+from planner_jax.sims.robot import rotation
 from planner_jax.sims.scenery import FLAT, Part, machine_parts, outlines
+from planner_jax.sims.task import FlightTask
 from planner_jax.sweep.figures.style import BLUE, GREEN, GREY, INK, ORANGE, PALE, PURPLE, RED, SKY
 
 BALL_COLOURS = (ORANGE, PURPLE, GREEN)
@@ -174,48 +174,42 @@ class Scene:
 
 def draw_flight(
     path: Path,
-    world: World,
+    task: FlightTask,
     recording: Recording,
     flight: int,
-    title: str,
-    contact: str,
     *,
+    title: str | None = None,
     view: tuple[float, float] = (18.0, -68.0),
 ) -> None:
     """Write a picture of one flight with ghost images.
 
     Args:
         path: ends in .png.
-        world: of the flight.
+        task: that was flown.
         recording: of the run.
         flight: row of the recording.
-        title: of the picture.
-        contact: what a ball is that was met, for the legend.
+        title: of the picture; by default the task's.
         view: elevation and azimuth of the eye [degree].
     """
+    title = title or task.title(recording, flight)
     figure = Figure(figsize=(7.6, 6.0))
     FigureCanvasAgg(figure)
-    scene = Scene(figure, world, recording, flight, title, view)
+    scene = Scene(figure, task.world(), recording, flight, title, view)
     figure.subplots_adjust(left=0.0, right=0.96, bottom=0.04, top=0.95)
     scene.ghosts(scene.last_met())
     scene.show(scene.last_met(), scene.num_looks - 1)
-    scene.contacts(contact)
+    scene.contacts(task.CONTACT)
     _write(path, lambda scratch: figure.savefig(scratch, dpi=110, format="png"))
 
 
-def film_flights(
-    path: Path,
-    world: World,
-    recording: Recording,
-    titles: Sequence[str],
-) -> None:
+def film_flights(path: Path, task: FlightTask, recording: Recording, num: int) -> None:
     """Write a film of the first flights, one after the other; whole or not at all.
 
     Args:
         path: ends in .gif, or in .mp4 where ffmpeg is installed.
-        world: of the flights.
+        task: that was flown.
         recording: of the run.
-        titles: one a flight that is filmed.
+        num: how many flights are filmed.
 
     Raises:
         FilmError: the file cannot be of that kind.
@@ -229,9 +223,10 @@ def film_flights(
         FigureCanvasAgg(figure)
         writer = kind(fps=fps)
         with writer.saving(figure, str(scratch), 90):
-            for flight, title in enumerate(titles):
+            for flight in range(num):
                 figure.clear()
-                scene = Scene(figure, world, recording, flight, title)
+                title = task.title(recording, flight)
+                scene = Scene(figure, task.world(), recording, flight, title)
                 for at in range(0, scene.num_looks, _FRAME):
                     scene.show(at)
                     writer.grab_frame()

@@ -31,7 +31,7 @@ with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp, not need
     from mujoco import mjx
 
 from planner_jax.ball.flight import BallState, ball_acceleration
-from planner_jax.sims.robot import Physics, Robot, Tool
+from planner_jax.sims.robot import Physics, Robot
 from planner_jax.sims.scenery import (
     GROUND_COLOUR,
     LOOK,
@@ -63,11 +63,6 @@ class World:
         if not self.timestep > 0.0:
             raise ValueError(f"timestep must be > 0, got {self.timestep}")
 
-    @property
-    def tool(self) -> Tool:
-        """The robot's."""
-        return self.robot.tool
-
 
 def mjcf(world: World) -> str:
     """The model as MJCF text."""
@@ -82,7 +77,7 @@ def mjcf(world: World) -> str:
         for k in range(world.num_balls)
     )
     return f"""
-<mujoco model="{world.tool.kind}">
+<mujoco model="flight">
   <option timestep="{world.timestep}" gravity="0 0 {-world.gravity}" integrator="Euler"
           iterations="1" ls_iterations="4">
     <flag eulerdamp="disable" constraint="disable" contact="disable"/>

@@ -49,20 +49,15 @@ class Recording:
     def __len__(self) -> int:
         return len(self.index)
 
-    @property
-    def num_balls(self) -> int:
-        """N."""
-        return self.balls.shape[2]
-
     def num_looks(self, flight: int) -> int:
         """How many looks of a flight show anything that moves."""
         there = np.isfinite(self.robot[flight]).all(axis=1)
         there |= np.isfinite(self.balls[flight]).all(axis=2).any(axis=1)
         return int(np.flatnonzero(there)[-1]) + 1
 
-    def launch(self, flight: int, ball: int = 0) -> tuple[np.ndarray, float] | None:
-        """Where a ball leaves its machine (3,) [m], and in which heading [rad]; None if never."""
-        path = self.balls[flight, :, ball]
+    def launch(self, flight: int) -> tuple[np.ndarray, float] | None:
+        """Where the first ball is launched (3,) [m], and in which heading [rad]; None if never."""
+        path = self.balls[flight, :, 0]
         path = path[np.isfinite(path).all(axis=1)]
         if len(path) < 2:
             return None

@@ -7,6 +7,7 @@ MuJoCo's state comes first in `qpos` and `qvel`, before that of the balls; all o
 import dataclasses
 from typing import Any, ClassVar, NamedTuple, Protocol
 
+import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array
@@ -42,9 +43,27 @@ class Shape(NamedTuple):
     tool: bool = False  # whether the last line is the tool's rim
 
 
+def rotation(quat_wxyz: Any, array_library: Any = jnp) -> Any:
+    """Rotation matrix (3, 3), body to world, of a unit quaternion (4,).
+
+    Args:
+        quat_wxyz: w x y z.
+        array_library: `jax.numpy`, or `numpy` for a result in the precision of the host.
+    """
+    w, x, y, z = quat_wxyz
+    return array_library.array(
+        [
+            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+            [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+            [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+        ]
+    )
+
+
 class Robot(Protocol):
     """A robot's part of a flight. `World` is `sims.model.World`, which holds the robot."""
 
+    WORDS: ClassVar[str]  # how it is simulated and controlled, for the page of a run
     num_pos: ClassVar[int]  # R, of its joint positions in `qpos`
     num_vel: ClassVar[int]  # R', of its joint velocities in `qvel`
     noise_shape: ClassVar[tuple[int, ...]]  # of the standard normal noise that `sensed` takes

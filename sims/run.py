@@ -109,8 +109,7 @@ def start_flights(
     recording = flight.recording(cases, flights, np.arange(kept))
     folder.write_rows(folder.path / FILE, to_rows(recording))
     if video is not None:
-        titles = [flight.title(recording, lane) for lane in range(min(film, kept))]
-        film_flights(folder.path / video, flight.world(), recording, titles)
+        film_flights(folder.path / video, flight, recording, min(film, kept))
     done = {"state": "complete", "summary": _summary(flight, rows), "times": times}
     manifest = {**folder.read_manifest(), **done}
     folder.write_manifest(manifest)
@@ -135,8 +134,8 @@ def read_flights(folder: RunFolder) -> tuple[dict[str, Any], FlightTask, Recordi
             "fly it again"
         )
     try:
-        recording = read_recording(path)
         settings = fly_settings(task)(**manifest["parameters"])
+        recording = read_recording(path)
     except (pa.ArrowException, KeyError) as error:
         raise SettingError(f"{folder.name} must have a whole {FILE}: {error}") from None
     except TypeError as error:
@@ -195,24 +194,6 @@ def _summary(flight: FlightTask, rows: pa.Table) -> dict[str, Any]:
     }
 
 
-def draw_one(
-    path: Path, flight: FlightTask, cases: Any, flights: Any, lane: int, **look: Any
-) -> None:
-    """Write the picture of one of some flights that were recorded.
-
-    Args:
-        path: ends in .png.
-        flight: task of the run.
-        cases: that were flown.
-        flights: what came of them.
-        lane: which one.
-        look: `title` and `view` for `film.draw_flight`.
-    """
-    recording = flight.recording(cases, flights, np.array([lane]))
-    look = {"title": flight.title(recording, 0), **look}
-    draw_flight(path, flight.world(), recording, 0, contact=flight.CONTACT, **look)
-
-
 def headline(manifest: dict[str, Any], flight: FlightTask) -> list[str]:
     """Success and times of a run, a sentence each."""
     summary, times, device = manifest["summary"], manifest["times"], manifest["device"]
@@ -248,8 +229,7 @@ def write_flight_report(folder: RunFolder) -> None:
     """
     manifest, flight, recording = read_flights(folder)
     folder.figures.mkdir(exist_ok=True)
-    title, picture = flight.title(recording, 0), folder.figures / "flight.png"
-    draw_flight(picture, flight.world(), recording, 0, title, flight.CONTACT)
+    draw_flight(folder.figures / "flight.png", flight, recording, 0)
     summary, video = manifest["summary"], manifest["video"]
     cells = own_cells(summary["successes"], summary["num"])
     table = RateTable(
@@ -260,8 +240,8 @@ def write_flight_report(folder: RunFolder) -> None:
     lines = headline(manifest, flight)
     title = f"Flights, {flight.settings.TASK.name}, {flight.suite}"
     remarks = [
-        "Everything is simulated in MuJoCo MJX: rotors with lag, body-rate, attitude and position "
-        "control, motion capture with noise, dropout and latency, balls with quadratic drag.",
+        f"Everything is simulated in MuJoCo MJX: {flight.world().robot.WORDS}, motion capture with "
+        "noise, dropout and latency, balls with quadratic drag.",
     ]
     folder.write_text("table.md", to_markdown(title, lines, table, remarks))
     lead = "".join(f"<p>{html.escape(line)}</p>\n" for line in lines)

@@ -14,6 +14,7 @@ from planner_jax.task.catch.card import TASK as CATCH
 from planner_jax.task.hit.card import REAL_SCENARIOS
 from planner_jax.task.hit.card import TASK as HIT
 
+_REPLAN = "plans a second, 0 for the first only (default: {} with exact, 0 with other planners)"
 INTERVAL = 0.8  # [s], from throw to throw (paper 000, Fig. 1)
 
 
@@ -53,15 +54,10 @@ class FlySettings:
 
     num: int = option(64, "N", "flights")
     noise: str = option("lab", "NAME", f"of sensing: {', '.join(NOISES)}")
-    replan: float | None = option(
-        None,
-        "HZ",
-        "plans a second, 0 for the first one only (default: the task's own rate with exact, "
-        "0 with other planners)",
-    )
+    replan: float | None = option(None, "HZ", _REPLAN.format("the task's own rate"))
     seed: int = option(0, "K", "of balls and noise")
     batch: int | None = option(None, "B", "flights at once (default: all up to 4096)")
-    planner: str = option("exact", "NAME", "of the plans from scratch")
+    planner: str = option("exact", "NAME", "that makes the plans from scratch")
     drag_error: float = option(
         0.15, "F", "relative, of what is believed of the balls' drag, either way"
     )
@@ -104,6 +100,8 @@ class FlySettings:
 class CatchFly(FlySettings):
     """Flights that catch thrown balls."""
 
+    replan: float | None = option(None, "HZ", _REPLAN.format(100))
+    planner: str = option("exact", "NAME", "of plans from scratch")
     balls: int = option(1, "N", f"thrown {INTERVAL:g} s apart")
 
     TASK: ClassVar[Task] = CATCH
@@ -125,6 +123,8 @@ class CatchFly(FlySettings):
 class HitFly(FlySettings):
     """Flights that hit served balls."""
 
+    replan: float | None = option(None, "HZ", _REPLAN.format(50))
+    planner: str = option("exact", "NAME", "of plans from scratch")
     suite: str = option("S.1", "NAME", "of serves, S.1 to S.6 of the paper")
 
     TASK: ClassVar[Task] = HIT

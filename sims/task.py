@@ -93,7 +93,7 @@ class FlightTask(abc.ABC):
         sensing = NOISES[settings.noise]
         return Loop(self.world(), sensing, replan=settings.rate, record=record)
 
-    def recording(self, cases: Any, flights: Any, lanes: np.ndarray) -> Recording:
+    def recording(self, cases: Any, flights: Any, lanes: Sequence[int] | np.ndarray) -> Recording:
         """The recording of some of the flights that were recorded.
 
         Args:

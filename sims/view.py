@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 
 from planner_jax.sims.film import BALL_COLOURS
-from planner_jax.sims.model import BALL_RADIUS, World
+from planner_jax.sims.model import BALL_RADIUS
 from planner_jax.sims.recording import Recording, frame
 from planner_jax.sims.scenery import GROUND_COLOUR, Part, machine_parts
+from planner_jax.sims.task import FlightTask
 from planner_jax.sweep.figures.style import BLUE, GREEN, GREY, INK, RED, SKY
 from planner_jax.sweep.settings import SettingError, require
 
@@ -79,7 +80,7 @@ class Viewer:
 
     Attributes:
         url: of the page.
-        flight: choice of the flight; its `value` is one of the titles.
+        flight: choice of the flight; its `value` is one of the task's titles.
         time: slider; its `value` [s] is the time that is shown.
         playing: check box.
         speed: slider; 1 is real time.
@@ -88,20 +89,16 @@ class Viewer:
 
     def __init__(
         self,
-        world: World,
+        task: FlightTask,
         recording: Recording,
-        titles: Sequence[str],
-        contact: str,
         host: str = "localhost",
         port: int = 8080,
     ):
         """Start to serve and to show the first flight.
 
         Args:
-            world: of the flights.
-            recording: F of them.
-            titles: F different ones.
-            contact: what a ball is that was met: "caught".
+            task: that was flown.
+            recording: of the flights.
             host: name or address of this machine, under which the page is served.
             port: 0 takes any that is free.
 
@@ -110,8 +107,9 @@ class Viewer:
         """
         viser = _viser()
         address = free_address(host, port)
-        self.world, self.recording, self._titles = world, recording, list(titles)
-        self._contact = contact
+        self.world, self.recording = task.world(), recording
+        self._titles = [task.title(recording, row) for row in range(len(recording))]
+        self._contact = task.CONTACT
         self._server = viser.ViserServer(address, port, label="planner-jax", verbose=False)
         bound = self._server.get_port()
         if port and bound != port:  # someone was faster
@@ -194,7 +192,7 @@ class Viewer:
                 add.add_cylinder(f"{name}/disc{k}", radius, position=place, **flat)
         nothing = np.zeros((1, 2, 3))
         self._balls, self._trails = [], []
-        for k in range(self.recording.num_balls):
+        for k in range(self.world.num_balls):
             colour = BALL_COLOURS[k % len(BALL_COLOURS)]
             ball = add.add_icosphere(f"/ball{k}", BALL_RADIUS, _rgb(colour))
             self._balls.append(ball)
@@ -233,7 +231,7 @@ class Viewer:
             ]
             paths += [
                 (f"/path{k}", recording.balls[row, :, k], GREY, 0.004)
-                for k in range(recording.num_balls)
+                for k in range(self.world.num_balls)
             ]
             for name, path, colour, thickness in paths:
                 drawn.append(self._add_line(name, segments(path), colour, thickness))

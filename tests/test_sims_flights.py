@@ -68,7 +68,7 @@ def test_a_plan_that_is_given_is_the_one_that_is_flown(catches):
 
 def with_tool(world, **changes):
     """The world, its robot's tool changed."""
-    robot = dataclasses.replace(world.robot, tool=dataclasses.replace(world.tool, **changes))
+    robot = dataclasses.replace(world.robot, tool=dataclasses.replace(world.robot.tool, **changes))
     return dataclasses.replace(world, robot=robot)
 
 

@@ -39,7 +39,7 @@ from planner_jax.sims.tasks.catch import CATCH_WORLD
 from planner_jax.sims.tasks.hit import HIT_WORLD, court_parts, landing_point
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, total_duration
 
-NET = CATCH_WORLD.tool
+NET = CATCH_WORLD.robot.tool
 GRAVITY = jnp.float32(9.81)
 
 

@@ -20,7 +20,6 @@ from planner_jax.sims.scoring import passage
 from planner_jax.sims.settings import CatchFly, FlySettings, HitFly, fly_settings
 from planner_jax.sims.task import FlightCases, Flights, FlightTask
 from planner_jax.sims.tasks.catch import CATCH_WORLD
-from planner_jax.sims.tasks.hit import HIT_WORLD
 from planner_jax.sweep.settings import SettingError
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 from tests.recordings import recording
@@ -73,7 +72,7 @@ def test_the_command_says_what_is_wrong_and_writes_nothing(tmp_path, capsys):
 
 def test_a_film_is_written_without_a_display(tmp_path):
     path = tmp_path / "flights.gif"
-    film_flights(path, CATCH_WORLD, recording(), ["one"])
+    film_flights(path, CatchFly().flight(), recording(), 1)
     assert path.read_bytes()[:4] == b"GIF8"
     assert list(tmp_path.iterdir()) == [path]
 
@@ -81,13 +80,13 @@ def test_a_film_is_written_without_a_display(tmp_path):
 def test_a_film_that_fails_leaves_nothing_behind(tmp_path, monkeypatch):
     monkeypatch.setattr(Figure, "clear", lambda self: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        film_flights(tmp_path / "flights.gif", CATCH_WORLD, recording(), ["one"])
+        film_flights(tmp_path / "flights.gif", CatchFly().flight(), recording(), 1)
     assert not list(tmp_path.iterdir())
 
 
 def test_a_picture_of_a_hit_shows_court_machine_and_target(tmp_path):
     path = tmp_path / "flight.png"
-    draw_flight(path, HIT_WORLD, recording(target=(1.75, 0.0, 0.0)), 0, "one", "hit")
+    draw_flight(path, HitFly().flight(), recording(target=(1.75, 0.0, 0.0)), 0)
     assert path.read_bytes()[1:4] == b"PNG"
 
 
@@ -198,6 +197,7 @@ def test_a_task_without_flights_is_refused_in_one_line(monkeypatch):
     assert str(error.value) == "task must be one that can be flown (hit, catch), got 'drop'"
 
 
+@pytest.mark.slow
 def test_a_third_task_is_flown_into_a_run_folder_without_an_edit(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(all_tasks(), "drop", DROP)
     manifest = start_flights(DropFly(num=2, noise="none"), tmp_path / "run")

@@ -220,14 +220,15 @@ def test_a_missing_viser_is_named_with_its_remedy(run_folder, capsys, monkeypatc
 def test_a_flight_is_served_scrubbed_and_played():
     two = jax.tree.map(lambda leaf: np.repeat(leaf, 2, axis=0), vars(recording()))
     two["time"] = two["time"].astype(np.float32)
-    viewer = Viewer(CATCH_WORLD, Recording(**two), ["one", "two"], "caught", port=0)
+    two["index"] = np.arange(2)
+    viewer = Viewer(CatchFly().flight(), Recording(**two), port=0)
     try:
         with urllib.request.urlopen(viewer.url, timeout=10) as page:
             assert page.status == 200 and b"<html" in page.read()
         viewer.time.value = 0.02
         assert viewer.look == 2
         np.testing.assert_allclose(viewer.robot[0].position, [0.0, 0.0, 1.02])
-        viewer.flight.value = "two"
+        viewer.flight.value = "catch 1, success"
         assert viewer.look == 0
         viewer.speed.value = 1.0
         viewer.advance(0.03)

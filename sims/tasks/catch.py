@@ -186,7 +186,7 @@ def believed(loop: Loop, flights: FlightState, new: Array, horizon: Array) -> Ca
         unknown,
         np.zeros(horizon.shape),
         gravity=loop.world.gravity,
-        net_height=loop.world.tool.height,
+        net_height=loop.world.robot.tool.height,
         net_radius=_AIM_RADIUS,
         min_thrust=least_thrust * loop.world.gravity,
         body_rate=body_rate,

@@ -17,9 +17,9 @@ from jax import Array, lax
 
 from planner_jax.robot.quadrotor import flat_attitude, net_thrust
 from planner_jax.sims.model import World
+from planner_jax.sims.robot import rotation
 from planner_jax.sims.robots.quadrotor.reference import Reference
 from planner_jax.sims.robots.quadrotor.vehicle import Vehicle, rotor_thrusts
-from planner_jax.sims.rotation import rotation
 
 
 @dataclasses.dataclass(frozen=True)

@@ -3,7 +3,6 @@
 World frame, z up; body rates in the body frame.
 """
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -12,7 +11,7 @@ from jax import Array, lax
 from planner_jax.robot.quadrotor import flat_attitude, net_thrust
 from planner_jax.sims.model import World
 from planner_jax.sims.robots.quadrotor.vehicle import Vehicle
-from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, total_duration
+from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 _BRAKING = 0.8  # [s] from the end of a plan to rest
 _LOWEST_REST = 0.5  # [m]
@@ -66,21 +65,7 @@ def with_rest(trajectory: PiecewisePolynomial) -> PiecewisePolynomial:
     )
 
 
-def state_at(trajectory: PiecewisePolynomial, time: Array) -> Array:
-    """Position to jerk (4, 3) at a time () [s]; at rest once the end is passed."""
-    time = jnp.minimum(time, total_duration(trajectory))
-    return jnp.stack([evaluate(trajectory, time, k) for k in range(4)])
-
-
-def references(
-    path: PiecewisePolynomial, times: Array, vehicle: Vehicle, world: World
-) -> Reference:
-    """References (K,) of a path at times (K,) [s]; the last ones lie just before its end."""
-    times = jnp.minimum(times, total_duration(path) - 2.0 * vehicle.rotor_lag)
-    return jax.vmap(lambda time: _reference_at(path, time, vehicle, world))(times)
-
-
-def _reference_at(
+def reference_at(
     trajectory: PiecewisePolynomial, time: Array, vehicle: Vehicle, world: World
 ) -> Reference:
     """The plan at a time () [s] since its start, with what the rotors need to know ahead."""

@@ -7,17 +7,18 @@ the body rate (body frame). Rotors are MuJoCo actuators with a first-order lag.
 import dataclasses
 from typing import Any, ClassVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from planner_jax.sims.model import BALL_RADIUS, World
-from planner_jax.sims.robot import Physics, Shape, Tool
+from planner_jax.sims.robot import Physics, Shape, Tool, rotation
 from planner_jax.sims.robots.quadrotor.control import Gains, RobotState, control
-from planner_jax.sims.robots.quadrotor.reference import Reference, references, state_at, with_rest
+from planner_jax.sims.robots.quadrotor.reference import Reference, reference_at, with_rest
 from planner_jax.sims.robots.quadrotor.vehicle import Vehicle, rotor_positions, rotor_torques
-from planner_jax.sims.rotation import rotation
 from planner_jax.sims.scenery import LOOK, xml_numbers
+from planner_jax.trajectory.polynomial import evaluate, total_duration
 
 _SEGMENTS = 12  # capsules of the hoop
 
@@ -30,6 +31,7 @@ class Quadrotor:
     vehicle: Vehicle = Vehicle()
     gains: Gains = Gains()
 
+    WORDS: ClassVar[str] = "rotors with lag, body-rate, attitude and position control"
     num_pos: ClassVar[int] = 7
     num_vel: ClassVar[int] = 6
     noise_shape: ClassVar[tuple[int, ...]] = (4, 3)
@@ -61,11 +63,9 @@ class Quadrotor:
     def _tool_xml(self) -> str:
         """The hoop as a ring of capsules over a plate, or the racket as a plate."""
         tool = self.tool
-        side = 0.5 * np.sqrt(np.pi) * tool.radius  # of the square of the disc's area, halved
-        drop = 0.0 if tool.kind == "racket" else 2.0 * BALL_RADIUS
-        low = tool.height - drop - 0.002 - BALL_RADIUS
+        low = tool.height - BALL_RADIUS * (1.0 if tool.kind == "racket" else 3.0)
         plate = (
-            f'<geom name="plate" type="box" size="{xml_numbers(side, side, 0.002)}" '
+            f'<geom type="cylinder" size="{xml_numbers(tool.radius)} .002" '
             f'pos="0 0 {xml_numbers(low)}" rgba=".3 .5 .9 .5" {LOOK}/>'
         )
         if tool.kind == "racket":
@@ -119,11 +119,15 @@ class Quadrotor:
 
     def head_state(self, plan: Any, time: Array) -> Array:
         """Position to jerk (4, 3), () [s] after a plan's begin; at rest some time after its end."""
-        return state_at(with_rest(plan.trajectory), time)
+        path = with_rest(plan.trajectory)
+        time = jnp.minimum(time, total_duration(path))
+        return jnp.stack([evaluate(path, time, k) for k in range(4)])
 
     def references(self, plan: Any, times: Array, world: World) -> Reference:
-        """What is tracked at times (K,) [s] after a plan's begin, leaves (K, ...)."""
-        return references(with_rest(plan.trajectory), times, self.vehicle, world)
+        """What is tracked (K,) [s] after a plan's begin, or at its end; leaves (K, ...)."""
+        path = with_rest(plan.trajectory)
+        times = jnp.minimum(times, total_duration(path) - 2.0 * self.vehicle.rotor_lag)
+        return jax.vmap(lambda time: reference_at(path, time, self.vehicle, world))(times)
 
     def command(self, state: RobotState, reference: Reference, world: World) -> Array:
         """Rotor thrusts (4,) [N]."""
