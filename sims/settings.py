@@ -11,7 +11,6 @@ from planner_jax.registry import Task, all_tasks
 from planner_jax.sims.noise import NOISES, Sensing, require_whole
 from planner_jax.sweep.settings import SettingError, option, require, require_one_of
 from planner_jax.task.catch.card import TASK as CATCH
-from planner_jax.task.hit.card import REAL_SCENARIOS
 from planner_jax.task.hit.card import TASK as HIT
 
 _REPLAN = "plans a second, 0 for the first only (default: {} with exact, 0 with other planners)"
@@ -125,7 +124,7 @@ class HitFly(FlySettings):
 
     replan: float | None = option(None, "HZ", _REPLAN.format(50))
     planner: str = option("exact", "NAME", "of plans from scratch")
-    suite: str = option("S.1", "NAME", "of serves, S.1 to S.6 of the paper")
+    suite: str = option("S.1", "NAME", "of serves")
 
     TASK: ClassVar[Task] = HIT
     FLIGHT: ClassVar[str] = "planner_jax.sims.tasks.hit:HitFlight"
@@ -133,4 +132,4 @@ class HitFly(FlySettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_one_of(REAL_SCENARIOS, "suite", self.suite)
+        require_one_of(HIT.suites, "suite", self.suite)

@@ -285,7 +285,7 @@ class HitFlight(FlightTask):
     def cases(self) -> Volleys:
         """All serves of the run."""
         settings = self.settings
-        regions = REAL_SCENARIOS[settings.suite]
+        regions = REAL_SCENARIOS.get(settings.suite)
         return volleys(settings.num, regions, settings.seed, drag_error=settings.drag_error)
 
     def fly(self, cases: Volleys, record: bool) -> HitFlights:
