@@ -236,9 +236,10 @@ def test_every_status_is_a_status_and_solved_says_which_are_good(entry):
 def test_every_matrix_product_asks_for_full_precision(entry):
     planner, case = inside(entry.planner), pj.lane(entry.batch, 0)
     for attempt in planner.attempts:
-        assert_full_precision(lambda case, a=attempt: planner.solve(case, a), case)
+        assert_full_precision(lambda p, case, a=attempt: p.solve(case, a), planner, case)
         if isinstance(planner, LanesPlanner):
-            assert_full_precision(lambda case, a=attempt: planner.solve_lanes(case, a), entry.batch)
+            solve = lambda p, cases, a=attempt: p.solve_lanes(cases, a)  # noqa: E731
+            assert_full_precision(solve, planner, entry.batch)
     if planner is not entry.planner:
         assert_full_precision(entry.planner.decision.propose, case)
 

@@ -105,7 +105,7 @@ class ReplanCatch(OptimisedPlanner):
             ValueError: a negative time.
         """
         dtype = np.asarray(cases.gravity).dtype
-        elapsed = np.asarray(elapsed, dtype)
+        elapsed = np.broadcast_to(np.asarray(elapsed, dtype), cases.batch_shape)
         if not (elapsed >= 0.0).all():
             raise ValueError(f"elapsed must be >= 0, got {np.min(elapsed)}")
         if head_state is None:

@@ -78,12 +78,14 @@ class ReplanHit(OptimisedPlanner):
         Raises:
             ValueError: a negative time.
         """
-        elapsed = np.asarray(elapsed, np.asarray(cases.gravity).dtype)
+        dtype = np.asarray(cases.gravity).dtype
+        elapsed = np.broadcast_to(np.asarray(elapsed, dtype), cases.batch_shape)
         if not (elapsed >= 0.0).all():
             raise ValueError(f"elapsed must be >= 0, got {np.min(elapsed)}")
         if head_state is None:
             head_state = states_at(previous.trajectory, elapsed)
         drag = cases.drag if drag is None else drag
+        head_state = np.asarray(head_state, dtype)
         now = dataclasses.replace(cases, ball=ball, drag=drag, head_state=head_state)
         return Replanning(case=now, previous=previous, elapsed=elapsed)
 
