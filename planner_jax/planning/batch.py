@@ -61,17 +61,19 @@ def plan_batch(
     return (jax.device_put(plans, _sharding(mesh)) if resident else plans), unsolved
 
 
-def plan_on_host(planner: HostPlanner, attempts: Sequence[Attempt], cases: Any) -> Any:
-    """The plans of `plan_batch`, by a planner that works on the host; NumPy leaves."""
-    cases = jax.tree.map(np.asarray, cases)
+def plan_on_host(planner: HostPlanner, attempts: Sequence[Attempt], cases: Any) -> tuple[Any, int]:
+    """As `plan_batch`, by a planner that works on the host; NumPy leaves. One case will do, too."""
+    alone = cases.batch_shape == ()
+    cases = jax.tree.map(lambda leaf: np.asarray(leaf)[None] if alone else np.asarray(leaf), cases)
     plans, lanes = None, np.arange(_length(cases))
     for attempt in attempts:
-        later = planner.solve_on_host(jax.tree.map(lambda leaf: leaf[lanes], cases), attempt)  # noqa: B023
+        some = jax.tree.map(lambda leaf, lanes=lanes: leaf[lanes], cases)
+        later = planner.solve_on_host(some, attempt)
         plans = jax.tree.map(np.array, later) if plans is None else merged(plans, later, lanes)
         lanes = np.flatnonzero(is_unsolved(plans.status))
         if lanes.size == 0:
             break
-    return plans
+    return jax.tree.map(lambda leaf: leaf[0], plans) if alone else plans, lanes.size
 
 
 def _plan_from_host(

@@ -41,7 +41,7 @@ class DecidedPlanner(Generic[CaseT, PlanT]):
         return self.planner, first_choice(self.decision, case)
 
     def plan_by(self, drive: Drive, cases: Any) -> Any:
-        """The plans of a batch, with what was decided in them."""
+        """The plans of one case or of a batch, with what was decided in them."""
         is_resident = all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(cases))
         if not drive.is_pure:
             self.decision.check(cases)
@@ -49,6 +49,11 @@ class DecidedPlanner(Generic[CaseT, PlanT]):
         if len(choices) == 1:
             decided = cases.decided(choices[0] if is_resident else jax.device_get(choices[0]))
             plans, unsolved = drive(self.planner, decided)
+        elif cases.batch_shape == ():
+            one = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (cases, choices))
+            best = self._best_choice(drive, *one)
+            decided, plans = jax.tree.map(lambda leaf: leaf[0], best)
+            unsolved = is_unsolved(plans.status)
         else:
             decided, plans = self._best_choice(drive, cases, choices)
             unsolved = is_unsolved(plans.status)
@@ -97,7 +102,11 @@ class DecidedPlanner(Generic[CaseT, PlanT]):
 
 @jax.jit
 def _proposals(decision: Any, cases: Any) -> list[Any]:
-    """The first choice of every case, the second, ..., leaves (B, ...)."""
+    """The first choice of one case or of each of a batch, the second, ..."""
+    if cases.batch_shape == ():
+        choices = decision.propose(cases)
+        num = jax.tree.leaves(choices)[0].shape[0]
+        return [jax.tree.map(lambda leaf: leaf[k], choices) for k in range(num)]  # noqa: B023
     choices = jax.vmap(decision.propose)(cases)
     num = jax.tree.leaves(choices)[0].shape[1]
     return [jax.tree.map(lambda leaf: leaf[:, k], choices) for k in range(num)]  # noqa: B023
@@ -105,8 +114,9 @@ def _proposals(decision: Any, cases: Any) -> list[Any]:
 
 @jax.jit
 def _explained(decision: Any, cases: Any, status: Array) -> Array:
-    """The statuses (B,), those of unsolved cases with what the decision knows of them."""
-    return jax.vmap(decision.explain)(cases, status)
+    """The status of one case or of each of a batch; of the unsolved, what the decision knows."""
+    explain = decision.explain if cases.batch_shape == () else jax.vmap(decision.explain)
+    return explain(cases, status)
 
 
 def first_choice(decision: Decision, cases: Any) -> Any:
@@ -114,7 +124,4 @@ def first_choice(decision: Decision, cases: Any) -> Any:
 
     It is pure, and constant to derivatives.
     """
-    if cases.batch_shape == ():
-        choices = decision.propose(lax.stop_gradient(cases))
-        return cases.decided(jax.tree.map(lambda leaf: leaf[0], choices))
     return cases.decided(_proposals(decision, lax.stop_gradient(cases))[0])

@@ -61,19 +61,29 @@ def plan(
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((planner, cases))):
         return solve(planner, cases)
     _require_fit(planner, cases)
+    any_planner: Any = planner
     alone = cases.batch_shape == ()
-    one: Any = planner
-    if alone and hasattr(one, "solve"):
-        return plan_single(one, one.attempts, cases)
-    if alone:
-        cases = jax.tree.map(lambda leaf: np.asarray(leaf)[None], cases)
-    require_batch(cases)
+    if alone and hasattr(any_planner, "solve"):
+        return plan_single(any_planner, any_planner.attempts, cases)
     if chunk is not None and chunk < 1:
         raise ValueError(f"chunk must be >= 1, got {chunk}")
     if devices is not None and not len(devices):
         raise ValueError("devices must be at least one, got none")
-    plans, _ = _Drive(chunk, devices)(planner, cases)
-    return jax.tree.map(lambda leaf: leaf[0], plans) if alone else plans
+    if not alone:
+        require_batch(cases)
+    drive = _Drive(chunk, devices)
+    if hasattr(any_planner, "plan_by"):
+        plans = any_planner.plan_by(drive, cases)
+    else:
+        plans, _ = drive(planner, cases)
+    if not alone and _is_resident(cases) and not _is_resident(plans):
+        plans = jax.device_put(plans, devices[0] if devices else None)
+    return plans
+
+
+def _is_resident(tree: Any) -> bool:
+    """Whether all leaves are jax arrays."""
+    return all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(tree))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,19 +97,17 @@ class _Drive:
     def __call__(
         self, planner: Any, cases: Any, attempts: Sequence[Attempt] | None = None
     ) -> tuple[Any, Any]:
-        """Plans, and numbers that are all zero if no case is unsolved."""
+        """Plans of one case or of a batch, and numbers that are all zero if none is unsolved."""
         if hasattr(planner, "plan_by"):
             plans = planner.plan_by(self, cases)
-        elif hasattr(planner, "solve_on_host"):
-            plans = plan_on_host(planner, attempts or planner.attempts, cases)
-        else:
-            return plan_batch(
-                planner, attempts or planner.attempts, cases, self.chunk, self.devices
-            )
-        is_resident = all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(cases))
-        if is_resident and not isinstance(plans.status, jax.Array):
-            plans = jax.device_put(plans, self.devices[0] if self.devices else None)
-        return plans, is_unsolved(plans.status)
+            return plans, is_unsolved(plans.status)
+        tried: Sequence[Attempt] = attempts or planner.attempts
+        if hasattr(planner, "solve_on_host"):
+            return plan_on_host(planner, tried, cases)
+        if cases.batch_shape == ():
+            one = plan_single(planner, tried, cases)
+            return one, is_unsolved(one.status)
+        return plan_batch(planner, tried, cases, self.chunk, self.devices)
 
 
 def solve(planner: AnyPlanner[CaseT, PlanT], cases: CaseT) -> PlanT:
