@@ -12,10 +12,9 @@ too; the last 0.05 s are flown as they were planned.
 
 What was flown, from the first plan to the catch, is refereed against the ball's true path, by
 the shared protocol of paper 000 (5 %, net test "ball"). Beside it stands what the first plan
-alone would have caught. With --alone re-plans are only timed, beside plans
-from scratch of the same throws.
-The summary of the run folder is of what was flown; its cost gap is that of the first re-plans, from
-the guess that each began with. Run it on an idle machine; the load average is printed.
+alone would have caught. With --alone re-plans are only timed, beside plans from scratch of the
+same throws. The summary of the run folder is of what was flown, or of the re-plans alone; its cost
+gap is that of the first re-plans. Run it on an idle machine; the load average is printed.
 """
 
 import dataclasses
@@ -266,7 +265,7 @@ def alone(bench: Bench, lanes: list[CatchCase], period: float, noise: float) -> 
             (ball.vel + noise * random.standard_normal(3)).astype(np.float32)[None],
         )
         tasks.append((task, current, elapsed, dataclasses.replace(path, ball=moved)))
-    seconds, scratch, times, cases = [], [], Times(), []
+    seconds, scratch, replans = [], [], []
     for task, current, elapsed, targets in tasks:
         began = time.perf_counter()
         left = AGAIN.begin(task, current, elapsed, targets=targets)
@@ -275,14 +274,13 @@ def alone(bench: Bench, lanes: list[CatchCase], period: float, noise: float) -> 
         pj.plan(SCRATCH, task)
         scratch.append(time.perf_counter() - ended)
         seconds.append(ended - began)
-        cases.append((left.case, found))
-        times.keep(left, found)
-    solved = [bool(is_solved(found.status)) for _, found in cases]
-    bench.count(judged(stacked([case for case, _ in cases]), [p for _, p in cases])["success"])
+        replans.append((left, found))
     report_times(bench, "from scratch, its order and time given", scratch)
     report_times(bench, "re-plan alone", seconds)
-    bench.say(f"solved {100.0 * np.mean(solved):.2f} %")
-    bench.count([], times.gaps())
+    cases, plans = stacked(replans)
+    bench.say(f"solved {100.0 * pj.solved(plans).mean():.2f} %")
+    success = judged(cases.case, [found for _, found in replans])["success"]
+    bench.count(success, cost_gaps(AGAIN, cases, plans))
 
 
 def main() -> None:
