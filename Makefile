@@ -56,7 +56,7 @@ docs: $(VENV)/.installed-docs  ## the documentation site, into build/site
 	@echo "Look at build/site/index.html"
 
 bench: $(VENV)/.installed-test $(VENV)/.installed-oracle  ## every module of benchmarks/
-	@set -e; for file in benchmarks/[a-z]*.py; do \
+	@set -e; for file in $$(grep -l __main__ benchmarks/*.py); do \
 	    name=benchmarks.$$(basename $$file .py); \
 	    echo "$(VENV)/bin/python -m $$name"; $(VENV)/bin/python -m $$name; \
 	done

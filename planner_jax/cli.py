@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from planner_jax.compile_cache import keep_compiled_programs
-from planner_jax.registry import Task, all_tasks, task_named
+from planner_jax.registry import Task, UnknownName, all_tasks
 from planner_jax.sweep.environment import installed_version, require_backend
 from planner_jax.sweep.settings import SettingError, require
 
@@ -49,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt as stop:
         print(f"planner-jax: {str(stop) or 'interrupted'}", file=sys.stderr)
         return _INTERRUPTED
-    except SettingError as error:
+    except (SettingError, UnknownName) as error:
         return _fail(str(error))
     except OSError as error:
         _fail(str(error))
@@ -320,8 +320,7 @@ def _throughput(options: dict[str, Any]) -> None:
     keep_compiled_programs()
     from planner_jax.benchmarks.throughput import report
 
-    out = _out(options, "bench-throughput")
-    report(**{**options, "task": task_named(options["task"])}, out=out)
+    report(**options)
 
 
 def _report(options: dict[str, Any]) -> None:
