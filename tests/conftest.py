@@ -27,7 +27,7 @@ def float64():
 
 @pytest.fixture(scope="module")
 def finished(request, tmp_path_factory):
-    """The folder and manifest of a sweep of the module's TASK and SETTINGS that nothing disturbed."""
+    """The folder and manifest of an undisturbed sweep of the module's TASK and SETTINGS."""
     from planner_jax.sweep.run import start_sweep
 
     out = tmp_path_factory.mktemp("runs") / "finished"

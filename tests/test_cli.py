@@ -98,6 +98,44 @@ def test_a_bad_argument_of_a_catch_gets_one_line_and_leaves_nothing(
     assert not list(elsewhere.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        (["--task", "juggling"], ["--task", "juggling"]),
+        (["--planner", "mpp"], ["--planner must be one of exact, bat", "got 'mpp'"]),
+        (["--task", "catch", "--suite", "court"], ["--suite must be one of throws", "'court'"]),
+        (["--batch", "16", "0"], ["--batch must be >= 1, got 0"]),
+        (["--seed", "-1"], ["--seed must be >= 0, got -1"]),
+        (["--repeat", "0"], ["--repeat must be >= 1, got 0"]),
+    ],
+)
+def test_a_bad_argument_of_a_benchmark_gets_one_line_and_leaves_nothing(
+    capsys, elsewhere, arguments, parts
+):
+    expect_one_line(capsys, ["bench", "throughput", *arguments], *parts)
+    assert not list(elsewhere.iterdir())
+
+
+def test_a_throughput_is_measured_with_what_was_asked_for(capsys, elsewhere, monkeypatch):
+    asked = {}
+    monkeypatch.setattr("planner_jax.benchmarks.throughput.report", lambda **k: asked.update(k))
+    code, _, err = run(capsys, "bench", "throughput", "--task", "catch", "--batch", "4", "8")
+    assert (code, err) == (0, "")
+    assert (asked["task"], asked["planner"], asked["batch"]) == ("catch", None, [4, 8])
+    assert asked["out"].startswith("runs/bench-throughput-")
+
+
+@pytest.mark.parametrize("command", [["sweep", "hit", "--num", "0"], ["bench", "throughput", "-x"]])
+def test_a_command_that_needs_no_flights_needs_no_extra_of_flights(
+    capsys, elsewhere, monkeypatch, command
+):
+    """Simulation without MuJoCo says so as soon as it is imported."""
+    monkeypatch.setitem(sys.modules, "planner_jax.sims.settings", None)
+    expect_one_line(capsys, command)
+    with pytest.raises(ModuleNotFoundError):
+        run(capsys, "fly", "hit")
+
+
 def test_bad_serves_are_named_by_file_and_line(capsys, elsewhere, tmp_path):
     nan = trial_file(tmp_path / "nan", "nan -0.3 2,-4.3 0.02 7.3")
     gone = trial_file(tmp_path / "gone", GONE)
