@@ -14,6 +14,7 @@ from scipy.stats import binomtest
 from sweeps import columns, stop_after
 
 import planner_jax as pj
+from planner_jax.planning.plan import plan
 from planner_jax.referee.hit import referee_hits
 from planner_jax.robot import quadrotor
 from planner_jax.sweep import run
@@ -29,6 +30,7 @@ from planner_jax.sweep.settings import SettingError
 from planner_jax.sweep.summary import percent, wilson_interval
 from planner_jax.sweep.timing import CompileClock
 from planner_jax.task.hit import court
+from planner_jax.task.hit.card import REAL_SCENARIOS
 from planner_jax.task.hit.exact import ExactHit
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
@@ -260,7 +262,7 @@ def test_resuming_what_is_no_run_is_refused(tmp_path):
 def test_a_serve_drawn_late_that_breaks_a_rule_leaves_nothing_behind(tmp_path):
     # The first chunk holds no ball that is down by then; a later one does.
     settings = HitSettings(num=40, batch=4, delay=1.56, seed=0)
-    source = open_source(settings, batch=4)
+    source = open_source(settings.of(TASK), batch=4)
     source.check()
     out = tmp_path / "runs" / "run"
     with pytest.raises(SettingError, match="delay must be shorter than each serve's flight"):
@@ -307,6 +309,18 @@ def test_a_single_chunk_is_timed_warm_too(tmp_path, no_report):
     manifest = start_sweep(TASK, HitSettings(serves=serves), tmp_path / "run", progress=False)
     times = manifest["times"]
     assert times["warm_plans"] == 3 and times["warm_seconds"] < times["first_seconds"]
+
+
+def test_a_planner_that_compiles_in_every_call_is_timed_all_the_same(
+    tmp_path, monkeypatch, no_report
+):
+    def compiling(_, planner, cases):
+        jax.jit(lambda x: x + 1.0)(0.0)
+        return plan(planner, cases)
+
+    monkeypatch.setattr(HitSweep, "plan", compiling)
+    manifest = start_sweep(TASK, HitSettings(num=2), tmp_path / "run", progress=False)
+    assert manifest["times"]["warm_plans"] == 2 and manifest["times"]["warm_seconds"] > 0.0
 
 
 def test_resuming_needs_the_serves_that_the_run_began_with(tmp_path, monkeypatch):
@@ -461,10 +475,22 @@ def test_planners_are_found_by_name():
 
 
 def test_chunks_join_to_the_whole_without_a_seam():
-    whole = open_source(HitSettings(num=50, batch=50), batch=1).chunk(0)
-    source = open_source(HitSettings(num=50, batch=20), batch=1)
+    whole = open_source(HitSettings(num=50, batch=50).of(TASK), batch=1).chunk(0)
+    source = open_source(HitSettings(num=50, batch=20).of(TASK), batch=1)
     assert source.num_chunks == 3
     parts = [source.chunk(number) for number in range(3)]
     velocity = np.concatenate([part.origin.velocity for part in parts])
     np.testing.assert_array_equal(velocity, whole.origin.velocity)
     np.testing.assert_array_equal(np.concatenate([p.index for p in parts]), np.arange(50))
+
+
+@pytest.mark.parametrize("suite", ["S.1", "S.6"])
+def test_a_real_scenario_is_served_by_its_own_two(suite):
+    source = open_source(HitSettings(suite=suite, num=6).of(TASK), batch=6)
+    served = {court.SCENARIOS[place] for place in source.chunk(0).origin.scenario}
+    assert served == set(REAL_SCENARIOS[suite])
+
+
+def test_a_suite_without_serves_is_refused_before_anything_is_drawn():
+    with pytest.raises(SettingError, match=r"^suite must be one of court, S\.1, .* got 'gusts'$"):
+        open_source(HitSettings(suite="gusts"), batch=1)
