@@ -5,8 +5,10 @@ settings: nothing here knows a task.
 """
 
 import argparse
+import contextlib
 import dataclasses
 import datetime
+import functools
 import os
 import pkgutil
 import shlex
@@ -16,14 +18,14 @@ import threading
 import types
 import typing
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 from planner_jax.compile_cache import keep_compiled_programs
 from planner_jax.registry import Task, UnknownName, all_tasks
 from planner_jax.sweep.environment import installed_version, require_backend
-from planner_jax.sweep.settings import SettingError, require
+from planner_jax.sweep.settings import SettingError, SweepSettings, require
 
 _FAILED, _BAD_ARGUMENT, _INTERRUPTED = 1, 2, 130
 
@@ -37,15 +39,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         The exit code: 0, 1 where the file system fails, 2 for a bad argument, 130 after Ctrl-C.
     """
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always")
-        parser = _parser()
-    for warning in told:  # such as a task of another package that does not work
-        print(f"planner-jax: warning: {warning.message}", file=sys.stderr)
-    options = vars(parser.parse_args(arguments))
-    command = options.pop("command")
     try:
-        return command(options) or 0
+        with _warnings_in_lines():
+            options = vars(_parser().parse_args(arguments))
+        return options.pop("command")(options) or 0
     except KeyboardInterrupt as stop:
         print(f"planner-jax: {str(stop) or 'interrupted'}", file=sys.stderr)
         return _INTERRUPTED
@@ -54,6 +51,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except OSError as error:
         _fail(str(error))
         return _FAILED
+
+
+@contextlib.contextmanager
+def _warnings_in_lines() -> Iterator[None]:
+    """Print a line for every warning, such as one of another package whose task does not work."""
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        try:
+            yield
+        finally:
+            for warning in told:
+                print(f"planner-jax: warning: {warning.message}", file=sys.stderr)
 
 
 _ARGUMENTS: set[str] = set()  # names of all arguments, as they are written in Python
@@ -69,10 +78,15 @@ def _fail(message: str) -> int:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Says what is wrong with an argument in one line; knows what it does not ask for."""
+    """Says what is wrong with an argument in one line; has no options until it is asked."""
 
-    def __init__(self, **look: Any):
+    def __init__(self, *, fill: Callable[["_Parser"], None] = lambda parser: None, **look: Any):
         super().__init__(**{"formatter_class": _Help, "allow_abbrev": False, **look})
+        self._fill = fill
+
+    def parse_known_args(self, *arguments: Any, **how: Any) -> Any:
+        self._fill(self)
+        return super().parse_known_args(*arguments, **how)
 
     def add(self, flag: str, **how: Any) -> None:
         """Add an option."""
@@ -126,8 +140,13 @@ def _add_tasks(commands: Any, name: str, words: str, add: Callable[[_Parser, Tas
     tasks = parser.add_subparsers(title="tasks", required=True, metavar="task")
     for task in all_tasks().values():
         if name == "sweep" or task.flight is not None:
-            look: Any = {"help": task.summary, "argument_default": argparse.SUPPRESS}
-            add(tasks.add_parser(task.name, **look), task)
+            # Settings are imported for the one task that is asked for.
+            tasks.add_parser(
+                task.name,
+                help=task.summary,
+                argument_default=argparse.SUPPRESS,
+                fill=functools.partial(add, task=task),
+            )
 
 
 def _add_settings(parser: _Parser, kind: type, task: Task) -> None:
@@ -149,7 +168,7 @@ def _add_settings(parser: _Parser, kind: type, task: Task) -> None:
             parser.add(flag, action="store_true", help=words)
             continue
         if default is not None and "(default:" not in words:
-            shown = " ".join(map(str, default)) if isinstance(default, tuple) else default
+            shown = " ".join(f"{x:g}" for x in default) if isinstance(default, tuple) else default
             words += f" (default: {shown})"
         several = {"nargs": "+"} if isinstance(field.default, tuple) else {}
         metavar = field.metadata["metavar"]
@@ -315,7 +334,8 @@ def _throughput(options: dict[str, Any]) -> None:
         value = options[name]
         require(value is None or value >= 1, name, ">= 1", value)
     require(min(options["batch"]) >= 1, "batch", ">= 1", min(options["batch"]))
-    require(options["seed"] >= 0, "seed", ">= 0", options["seed"])
+    named = {name: options[name] for name in ("planner", "suite", "seed")}
+    SweepSettings(**named).of(task_named(options["task"]))
     require_backend()
     keep_compiled_programs()
     from planner_jax.benchmarks.throughput import report

@@ -21,7 +21,7 @@ from planner_jax.sweep.columns import (
     leaves_of,
     list_of,
 )
-from planner_jax.sweep.quadrotor import MOTION, TRAJECTORY
+from planner_jax.sweep.quadrotor import MOTION, START, TRAJECTORY
 from planner_jax.task.catch.decide import optimal_time_ratio
 
 _WHICH, _FLAGS = list_of(pa.int32()), list_of(pa.bool_())
@@ -101,4 +101,4 @@ _JUDGED = leaves_of(
 )
 
 FRAME = "world, z up; times from the start of planning"
-COLUMNS = [*_CASE, *_CATCHES, *SOLVER, *OUTCOME, *_JUDGED, *MOTION, *TRAJECTORY]
+COLUMNS = [*_CASE, START, *_CATCHES, *SOLVER, *OUTCOME, *_JUDGED, *MOTION, *TRAJECTORY]

@@ -16,7 +16,7 @@ from planner_jax.sweep.columns import (
     leaves_of,
     list_of,
 )
-from planner_jax.sweep.quadrotor import MOTION, TRAJECTORY
+from planner_jax.sweep.quadrotor import MOTION, START, TRAJECTORY
 from planner_jax.task.hit import court
 from planner_jax.task.hit.serves import Serves
 
@@ -95,4 +95,4 @@ _PUBLISHED = [
 ]
 
 FRAME = "world, z up, net at x = 0; times from the start of planning"
-COLUMNS = [*_CASE, *_STROKE, *SOLVER, *OUTCOME, *_JUDGED, *MOTION, *TRAJECTORY, *_PUBLISHED]
+COLUMNS = [*_CASE, START, *_STROKE, *SOLVER, *OUTCOME, *_JUDGED, *MOTION, *TRAJECTORY, *_PUBLISHED]

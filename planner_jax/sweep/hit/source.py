@@ -8,9 +8,9 @@ import jax
 import numpy as np
 
 from planner_jax.sweep.hit.settings import HitSettings
-from planner_jax.sweep.settings import SettingError
+from planner_jax.sweep.settings import SettingError, require_one_of
 from planner_jax.sweep.source import Chunk, Source, filled_in
-from planner_jax.task.hit.card import REAL_SCENARIOS
+from planner_jax.task.hit.card import REAL_SCENARIOS, TASK
 from planner_jax.task.hit.serves import Serves, generate_serves, read_serves, to_cases
 from planner_jax.task.hit.validate import CaseError, ServeError, check_cases
 
@@ -73,9 +73,10 @@ def open_source(settings: HitSettings, batch: int) -> ServeSource:
         batch: cases a chunk, where the settings name none.
 
     Raises:
-        SettingError: the folder is missing, a row of it is not sound, or more serves are asked
-            for than it holds.
+        SettingError: the suite is of another package, the folder is missing, a row of it is not
+            sound, or more serves are asked for than it holds.
     """
+    require_one_of(TASK.suites, "suite", str(settings.suite))  # others know no serves
     try:
         folder = None if settings.serves is None else read_serves(settings.serves)
     except ServeError as error:
