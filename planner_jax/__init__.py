@@ -15,10 +15,11 @@ Every task, `hit`, `catch` and those of other packages (`task_named`), has the w
 * `gradient`: of a number of every plan by parts of its case; `optimal_plan` inside a loss
 * `lane`, `solved`, `Status`: reading plans; a plan has `sample`, `save` and `load`
 
-Where targets are: `BallState`, `fly`, `BallPath`, `HarmonicPath`, `predict_path`, `target_at`. What
-a trajectory does: `PiecewisePolynomial`, `evaluate`. For planners and tasks of one's own: `Plan`,
-`Attempt`, `outcome`, `OptimisedPlanner`, `pending`, `Round`, `LbfgsConfig`, `Evaluation`,
-`Verdict`, `Task`.
+Limits and costs of one's own along the way, a case's `extras`: `KeepOut`, `Geofence`, `SpeedZone`,
+`Dislike`, or any class with their methods. Where targets are: `BallState`, `fly`, `BallPath`,
+`HarmonicPath`, `predict_path`, `target_at`. What a trajectory does: `PiecewisePolynomial`,
+`evaluate`. For planners and tasks of one's own: `Plan`, `Attempt`, `outcome`, `OptimisedPlanner`,
+`pending`, `Round`, `LbfgsConfig`, `Evaluation`, `Verdict`, `Task`.
 
 Everything is imported on first use, so that `import planner_jax` itself is quick.
 """

@@ -5,6 +5,10 @@ from .ball.prediction import target_at as target_at
 from .ball.target import BallPath as BallPath
 from .ball.target import HarmonicPath as HarmonicPath
 from .compile_cache import keep_compiled_programs as keep_compiled_programs
+from .cost.extras import Dislike as Dislike
+from .cost.extras import Geofence as Geofence
+from .cost.extras import KeepOut as KeepOut
+from .cost.extras import SpeedZone as SpeedZone
 from .optimise.implicit import optimal_plan as optimal_plan
 from .optimise.lbfgs import Evaluation as Evaluation
 from .optimise.lbfgs import LbfgsConfig as LbfgsConfig

@@ -13,7 +13,16 @@ OUTSIDE = {"sims", "policies", "benchmarks"}
 # What each room imports of planner_jax, besides itself: no more, and no less.
 ALLOWED = {
     "__init__": {
-        *("ball", "compile_cache", "optimise", "planning", "protocol", "referee", "registry"),
+        *(
+            "ball",
+            "compile_cache",
+            "cost",
+            "optimise",
+            "planning",
+            "protocol",
+            "referee",
+            "registry",
+        ),
         *("task", "trajectory"),
     },
     "arithmetic": set(),

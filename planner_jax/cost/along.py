@@ -26,6 +26,8 @@ from planner_jax.trajectory.proportional_minco import ProportionalMinco, sample_
 # Of a motion and any pytree of numbers: E arrays, each of the shape of the motion's height,
 # positive where a limit is exceeded. It must know no other array.
 Excess = Callable[[Motion, Any], tuple[Array, ...]]
+# Of the same: a cost a second at each sample.
+Rate = Callable[[Motion, Any], Array]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,7 +35,7 @@ class Along:
     """Which penalties are integrated, and how: constants of a planner.
 
     One segment's penalty is the integral of the sum of smoothed hinges of excess + margin, by
-    the trapezoid rule.
+    the trapezoid rule, and that of the rate if there is one.
     """
 
     maps: ProportionalMinco
@@ -41,12 +43,14 @@ class Along:
     excess: Excess
     margins: tuple[float, ...]  # (E,), in the unit of each excess
     hinge_width: float
+    # Of a case's extras. They look at the whole position, and are not made for a kernel.
+    rate: Rate | None = None
 
     def key(self) -> tuple:
         """All of it in numbers and names."""
         code = self.excess.__module__, getattr(self.excess, "__qualname__", "")
         shape = self.maps.order, tuple(self.maps.proportions.tolist()), self.nodes
-        return *shape, *code, self.margins, self.hinge_width
+        return *shape, *code, self.margins, self.hinge_width, self.rate is None
 
     def matrices(self) -> np.ndarray:
         """Position to jerk at the samples, in time over h, from the columns: (K, 4, C)."""
@@ -196,4 +200,7 @@ def _of_segment(
     motion = sample_motion(along.maps, along.nodes, columns, duration)
     excess = jnp.stack(along.excess(motion, parameters))
     hinges = smoothed_hinge(excess + margins, along.hinge_width)
-    return duration * jnp.sum(hinges * weights), jnp.max(excess)
+    penalty = duration * jnp.sum(hinges * weights)
+    if along.rate is not None:
+        penalty = penalty + duration * jnp.sum(along.rate(motion, parameters) * weights)
+    return penalty, jnp.max(excess)

@@ -53,6 +53,8 @@ def along_kernel(along: "Along", mode: str, *, interpret: bool = False) -> Calla
         shape: Any = leaves[0].shape
         *_, num_columns, _, lanes = shape
         threads = block_width(lanes, _THREADS)
+        if along.rate is not None:  # extras take vectors, and the position that is not made here
+            return None
         if any(leaf.dtype != jnp.float32 for leaf in leaves) or threads is None:
             return None
         if any(leaf.ndim != 1 for leaf in parameters):

@@ -341,7 +341,7 @@ positive_inverse = with_kernel(_gauss_jordan, inverse_kernel())
 
 
 def part_of(tree: Any, name: str) -> Any:
-    """What stands at a place, names joined by dots, in a case.
+    """What stands at a place, names and places in tuples joined by dots, in a case.
 
     Raises:
         ValueError: there is no such place, or it holds something else than floating numbers.
@@ -356,20 +356,29 @@ def part_of(tree: Any, name: str) -> Any:
 def _found(tree: Any, name: str, argument: str) -> Any:
     part = tree
     for field in name.split("."):
-        known = getattr(part, "__dataclass_fields__", {})
+        known = _members(part)
         if field not in known:
             raise ValueError(
                 f"{argument} must name a place in {type(tree).__name__}, got {name!r}: "
                 f"{type(part).__name__} has {', '.join(known) or 'no fields'}"
             )
-        part = getattr(part, field)
+        part = known[field]
     return part
+
+
+def _members(tree: Any) -> dict[str, Any]:
+    """What a tuple or a dataclass holds, by place or name."""
+    if isinstance(tree, tuple):
+        return {str(k): member for k, member in enumerate(tree)}
+    return {name: getattr(tree, name) for name in getattr(tree, "__dataclass_fields__", {})}
 
 
 def _with_part(tree: Any, name: str, part: Any) -> Any:
     """The tree with something else at a place."""
     first, _, rest = name.partition(".")
-    inner = _with_part(getattr(tree, first), rest, part) if rest else part
+    inner = _with_part(_members(tree)[first], rest, part) if rest else part
+    if isinstance(tree, tuple):
+        return tuple((_members(tree) | {first: inner}).values())
     return dataclasses.replace(tree, **{first: inner})
 
 

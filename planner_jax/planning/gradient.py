@@ -57,7 +57,8 @@ def gradient(
         cases: one case or a batch.
         of: the number: names joined by dots, such as "stroke.time", "cost" or "violation", or a
             function of one plan. A function is compiled for anew with every new function object.
-        by: a place in the case, or some, such as "racket_height", "limits", "net.radius".
+        by: a place in the case, or some, such as "racket_height", "limits", "net.radius" or
+            "extras.0.radius".
         steps: of the conjugate gradients for the adjoint. One is exact where no limit binds;
             0 is exact for "cost", by the envelope theorem.
         curvature: "core" is quick; "whole" takes the Hessian itself, exact where limits bind

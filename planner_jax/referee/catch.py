@@ -20,10 +20,12 @@ import numpy as np
 from planner_jax.referee.quadrotor import (
     CONTACT_TIME_TOLERANCE,
     above,
+    bare,
     check_sampling,
     checked_coeffs,
     checked_leaf,
     derivative,
+    extra_leaves,
     finite_lanes,
     first_failures,
     intervals_of,
@@ -48,6 +50,7 @@ _SENTENCES = {
     "thrust high": "{excess:.2%} above the greatest thrust at {time:.3f} s",
     "body rate": "{excess:.2%} above its limit at {time:.3f} s",
     "ground": "{excess:.2%} below the least height at {time:.3f} s",
+    "extra": "{excess:.2%} beyond extras[{worst_extra}] of the case at {time:.3f} s",
     "net": "the target is {excess:.2%} outside the hoop's radius at {time:.3f} s",
     "net plane": "the target is {excess:.3g} m off the hoop's plane at {time:.3f} s",
     "angle": "{excess:.2%} above its limit between the net's axis and the target's way back at "
@@ -84,6 +87,7 @@ class CatchVerdict(Verdict):
     num_caught: np.ndarray  # (B,) int
     continuity_error: np.ndarray  # (B,) [m], worst jump between pieces, as displacement
     head_error: np.ndarray  # (B,) [m], error at time 0, likewise
+    worst_extra: np.ndarray  # (B,) int, place of the extra that is kept worst; -1 without any
 
     def praise(self, k: int | tuple) -> str:
         """What is said of a success."""
@@ -113,6 +117,8 @@ def referee_catches(
     Speed, thrust, body rate and height are sampled at both ends and inside of every piece and
     their peaks searched on the polynomial itself. Errors at time 0 and between pieces count as
     displacement (`referee.quadrotor.joint_errors`). A lane without targets has nothing to fail.
+
+    The case's extra limits are asked for their excess at the samples, in float64.
 
     The target's place is worked out here, in float64, for a path with the fields of `BallPath`
     (known by `ball`), of `HarmonicPath` (`amplitude`) or of `PathTable` (`resolution`; between
@@ -167,6 +173,7 @@ def referee_catches(
     leaves["target vel"] = checked_leaf("target_states' vel", vel, (*shape, 3))
     judge = functools.partial(
         _judge,
+        extras=bare(cases.extras),
         intervals=intervals_of(samples, leaves["durations"].shape[1] // shape[1]),
         net_test=net_test,
         tolerances={
@@ -207,7 +214,7 @@ def _leaves(cases, plans) -> dict[str, np.ndarray]:
     leaves = {"coeffs": coeffs, "present": present}
     for name, (value, shape) in trailing.items():
         leaves[name] = checked_leaf(name, value, batch + shape)
-    return leaves
+    return leaves | extra_leaves(cases.extras, len(coeffs))
 
 
 def _ends(durations: np.ndarray, num: int) -> np.ndarray:
@@ -316,7 +323,7 @@ def _table_states(pos, vel, resolution, times) -> tuple[np.ndarray, np.ndarray]:
     return read(pos) + (times - inside)[..., None] * at, at
 
 
-def _judge(case: dict, intervals: int, net_test: str, tolerances: dict) -> dict:
+def _judge(case: dict, extras: tuple, intervals: int, net_test: str, tolerances: dict) -> dict:
     """The fields of `CatchVerdict` for one chunk of lanes."""
     durations, present = case["durations"], case["present"] != 0.0
     num = present.shape[1]
@@ -339,7 +346,7 @@ def _judge(case: dict, intervals: int, net_test: str, tolerances: dict) -> dict:
         "target vel": np.where(held[..., None], case["target vel"], 0.0),
     }
     motion, tests = judge_motion(
-        pieces, case, intervals, tolerances["relative"], tolerances["continuity"]
+        pieces, case, extras, intervals, tolerances["relative"], tolerances["continuity"]
     )
     del motion["max_acceleration"]  # it has no limit: the thrust has
     flying = flown.any(axis=1)

@@ -17,10 +17,12 @@ import numpy as np
 from planner_jax.referee.quadrotor import (
     CONTACT_TIME_TOLERANCE,
     above,
+    bare,
     check_sampling,
     checked_coeffs,
     checked_leaf,
     derivative,
+    extra_leaves,
     finite_lanes,
     first_failures,
     intervals_of,
@@ -42,6 +44,7 @@ _SENTENCES = {
     "acceleration": "{excess:.2%} above its limit at {time:.3f} s",
     "body rate": "{excess:.2%} above its limit at {time:.3f} s",
     "ground": "{excess:.2%} below the least height at {time:.3f} s",
+    "extra": "{excess:.2%} beyond extras[{worst_extra}] of the case at {time:.3f} s",
     "hitting speed x": "{excess:.2%} above its limit at {time:.3f} s",
     "hitting speed y": "{excess:.2%} above its limit at {time:.3f} s",
     "hitting speed z": "{excess:.2%} above its limit at {time:.3f} s",
@@ -83,6 +86,7 @@ class HitVerdict(Verdict):
     contact_error: np.ndarray  # (B,) [m], racket centre to ball at the impact
     continuity_error: np.ndarray  # (B,) [m], worst jump between pieces, as displacement
     head_error: np.ndarray  # (B,) [m], error at time 0, likewise
+    worst_extra: np.ndarray  # (B,) int, place of the extra that is kept worst; -1 without any
 
     def praise(self, k: int | tuple) -> str:
         """What is said of a success."""
@@ -110,6 +114,8 @@ def referee_hits(
     count as the displacement |e_n| h^n / n! that they make over one mean piece h (at least
     `SHORTEST_PIECE`). Eight minimum-snap pieces computed in float32 with coordinates up to
     4.5 m have at most 1.3e-4 m of it, under a third of the default tolerance.
+
+    The case's extra limits are asked for their excess at the samples, in float64.
 
     Args:
         cases: object with the fields of `HitCase`, leaves with leading axis B.
@@ -141,6 +147,7 @@ def referee_hits(
     }
     judge = functools.partial(
         _judge,
+        extras=bare(cases.extras),
         intervals=intervals_of(samples, leaves["durations"].shape[1]),
         drag_after_impact=drag_after_impact,
         tolerances=tolerances,
@@ -175,14 +182,16 @@ def _leaves(cases, plans) -> dict[str, np.ndarray]:
     leaves = {"coeffs": coeffs}
     for name, (value, shape) in trailing.items():
         leaves[name] = checked_leaf(name, value, coeffs.shape[:1] + shape)
-    return leaves
+    return leaves | extra_leaves(cases.extras, len(coeffs))
 
 
-def _judge(case: dict, intervals: int, drag_after_impact: bool, tolerances: dict) -> dict:
+def _judge(
+    case: dict, extras: tuple, intervals: int, drag_after_impact: bool, tolerances: dict
+) -> dict:
     """The fields of `HitVerdict` for one chunk of lanes."""
     pieces = pieces_of(case["coeffs"], case["durations"])
     measured, tests = judge_motion(
-        pieces, case, intervals, tolerances["relative"], tolerances["continuity"]
+        pieces, case, extras, intervals, tolerances["relative"], tolerances["continuity"]
     )
     at_impact, impact_tests = _judge_impact(case, drag_after_impact, tolerances)
     return first_failures(tests | impact_tests, LIMITS, finite_lanes(case)) | measured | at_impact

@@ -10,7 +10,8 @@ import numpy as np
 class Verdict:
     """The referee's word on plans, one entry a plan; without an axis for one plan alone."""
 
-    # Limit -> what is said when it fails, with `time` and `excess`; in the order of the tests.
+    # Limit -> what is said when it fails, with `time`, `excess` and any field of the verdict; in
+    # the order of the tests.
     SENTENCES: ClassVar[dict[str, str]]
     # The same for an excess that is infinite.
     UNBOUNDED: ClassVar[dict[str, str]] = {}
@@ -34,7 +35,9 @@ class Verdict:
             return f"success: {self.praise(at)}"
         time, excess = np.asarray(self.failed_time)[at], np.asarray(self.failed_excess)[at]
         text = self.UNBOUNDED.get(name) if np.isinf(excess) else None
-        return f"{name}: " + (text or self.SENTENCES[name]).format(time=time, excess=excess)
+        found = {f.name: np.asarray(getattr(self, f.name))[at] for f in dataclasses.fields(self)}
+        text = (text or self.SENTENCES[name]).format(time=time, excess=excess, **found)
+        return f"{name}: {text}"
 
     def praise(self, k: int | tuple) -> str:
         """What is said of a success."""

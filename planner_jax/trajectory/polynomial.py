@@ -1,6 +1,7 @@
 """Piecewise polynomials in time: the one form in which every planner returns a trajectory."""
 
 import functools
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,13 +21,15 @@ class PiecewisePolynomial:
 class Motion:
     """Samples of a trajectory at N times: what the limits look at.
 
-    In a kernel each vector is a tuple of its three components.
+    In a kernel each vector is a tuple of its three components, and of the position there is the
+    height alone: in a compiled program what is not looked at costs nothing.
     """
 
     height: Array  # (N,) [m]
     vel: Array  # (N, 3) [m/s]
     acc: Array  # (N, 3) [m/s^2]
     jerk: Array  # (N, 3) [m/s^3]
+    pos: Any = None  # (N, 3) [m]
 
 
 def derivative_factors(degree: int, order: int) -> np.ndarray:
@@ -94,7 +97,8 @@ def sample_pieces(trajectory: PiecewisePolynomial, nodes: int) -> Motion:
             value = value * times[..., None] + factors[k] * coeffs[:, None, k]
         return value.reshape(-1, 3)
 
-    return Motion(height=sample(0)[:, 2], vel=sample(1), acc=sample(2), jerk=sample(3))
+    pos = sample(0)
+    return Motion(height=pos[:, 2], vel=sample(1), acc=sample(2), jerk=sample(3), pos=pos)
 
 
 def states_at(trajectory: PiecewisePolynomial, times: np.ndarray) -> np.ndarray:

@@ -124,7 +124,7 @@ def boundary_rows(head_state: Array, tail_state: Array, piece_duration: Array) -
 def sample_motion(
     maps: ProportionalMinco, nodes: int, columns: Array, piece_duration: Array
 ) -> Motion:
-    """Height, velocity, acceleration and jerk at `nodes` intervals a piece.
+    """Position, velocity, acceleration and jerk at `nodes` intervals a piece.
 
     Args:
         maps: constant maps of M pieces.
@@ -143,7 +143,7 @@ def sample_motion(
     rate = reciprocal(piece_duration)
     rates = jnp.stack([jnp.ones_like(rate), rate, rate * rate, rate * rate * rate])
     pos, vel, acc, jerk = unit * rates[:, None, None]
-    return Motion(height=pos[:, 2], vel=vel, acc=acc, jerk=jerk)
+    return Motion(height=pos[:, 2], vel=vel, acc=acc, jerk=jerk, pos=pos)
 
 
 def trajectory_energy(maps: ProportionalMinco, rows: Array, offsets: Array, piece_duration: Array):

@@ -1,6 +1,7 @@
 """One catching task: up to N targets, the quadrotor, its net and its limits."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ from flax import struct
 from jax import Array
 
 from planner_jax.ball.target import TargetPath
+from planner_jax.cost.extras import Extra, for_batch
 
 GRAVITY = 9.81  # [m/s^2]
 START = (0.0, 0.0, 1.0)  # [m], where the quadrotor hovers
@@ -55,7 +57,7 @@ class CatchChoice:
 
 @struct.dataclass
 class CatchCase:
-    """One case. Every field is a leaf: batch it, randomise it, differentiate by it.
+    """One case. Every number is a leaf: batch it, randomise it, differentiate by it.
 
     Times count from the moment at which planning begins. The N targets are caught in the
     order `order`, which a decision fills in together with `times`.
@@ -70,6 +72,7 @@ class CatchCase:
     gravity: Array  # () [m/s^2], magnitude
     net: Net
     limits: CatchLimits
+    extras: tuple[Any, ...] = ()  # limits and costs of the user's own, see `cost.extras`
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -101,6 +104,7 @@ def case(
     max_thrust=None,
     body_rate=5.0,
     min_height=0.25,
+    extras: Sequence[Extra] = (),
     dtype=jnp.float32,
 ) -> CatchCase:
     """A catch, or a batch of them, with the setting of paper 000.
@@ -124,6 +128,8 @@ def case(
         max_thrust: [m/s^2]; 2.5 g if not given.
         body_rate: [rad/s].
         min_height: [m].
+        extras: such as `pj.KeepOut`, each for one case, which all of them get, or with the
+            batch's axes on every leaf.
         dtype: of every floating leaf.
     """
     shape = np.shape(horizon)
@@ -152,4 +158,5 @@ def case(
             body_rate=leaf(body_rate),
             min_height=leaf(min_height),
         ),
+        extras=for_batch(extras, batch, dtype),
     )

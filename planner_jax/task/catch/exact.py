@@ -16,6 +16,7 @@ from flax import struct
 from jax import Array
 
 from planner_jax.cost.along import Along, greatest_along, integrate_along
+from planner_jax.cost.extras import extra_excess, extra_rate, num_limits
 from planner_jax.cost.penalty import smoothed_hinge
 from planner_jax.cost.quadrotor import body_rate_excess, ground_excess, speed_excess, thrust_excess
 from planner_jax.lanes import in_one_kernel
@@ -58,14 +59,19 @@ _ENCODED_RIM = 0.99  # share of that which a point made by `encode` may use
 _GUESSES = np.array([(1.0, 0.5), (1.0, 1.0), (1.15, 0.3), (1.3, 0.0), (0.9, 1.0), (1.5, 0.2)])
 
 
-def _limits_along(motion: Motion, given: tuple[Array, CatchLimits]) -> tuple[Array, ...]:
-    """Speed, body rate, weak and strong thrust, ground."""
-    gravity, limits = given
+# Gravity, limits and extras of a case.
+_Given = tuple[Array, CatchLimits, tuple[Any, ...]]
+
+
+def _limits_along(motion: Motion, given: _Given) -> tuple[Array, ...]:
+    """Speed, body rate, weak and strong thrust, ground, and the extra limits."""
+    gravity, limits, extras = given
     return (
         speed_excess(motion.vel, limits),
         body_rate_excess(motion.acc, motion.jerk, gravity, limits),
         *thrust_excess(motion.acc, gravity, limits.min_thrust, limits.max_thrust),
         ground_excess(motion.height, limits),
+        *extra_excess(motion, extras),
     )
 
 
@@ -90,8 +96,8 @@ class ExactCatch(OptimisedPlanner):
     catch less the net's height along z_d and a place inside the hoop is the quadrotor's.
 
     Cost: time_weight * total time + energy_weight * integral |snap|^2 + integral of the
-    smoothed hinges of the limits (paper 000, eqs 26-28) + hinges of the angle (eq. 25) and of
-    the horizon.
+    smoothed hinges of the limits (paper 000, eqs 26-28), and of the case's extras + hinges of the
+    angle (eq. 25) and of the horizon.
     """
 
     case_type = CatchCase
@@ -250,10 +256,12 @@ class ExactCatch(OptimisedPlanner):
         late = catch.times / context.horizon - 1.0 + FEASIBILITY_TOLERANCE
         return jnp.where(context.active, jnp.stack([catch.angle_excess, late]), -1.0)
 
-    def _along(self, nodes: int) -> Along:
+    def _along(self, nodes: int, extras: tuple[Any, ...]) -> Along:
         """Penalties along the way: squares carry twice the relative margin."""
-        margins = tuple(self.margin * factor for factor in (2.0, 2.0, 2.0, 2.0, 1.0))
-        return Along(self.maps, nodes, _limits_along, margins, self.hinge_width)
+        factors = (2.0, 2.0, 2.0, 2.0, 1.0) + (1.0,) * num_limits(extras)
+        margins = tuple(self.margin * factor for factor in factors)
+        rate = extra_rate if extras else None
+        return Along(self.maps, nodes, _limits_along, margins, self.hinge_width, rate)
 
     def objective(self, point: Array, context: CatchContext) -> Evaluation:
         """Cost, and the largest excess at the penalty nodes (squares over squares)."""
@@ -261,10 +269,10 @@ class ExactCatch(OptimisedPlanner):
         ends = in_one_kernel(ExactCatch.ends, self)
         rows, durations, core, at_catches = ends(natural, context)
         penalties, worst = integrate_along(
-            self._along(self.nodes),
+            self._along(self.nodes, context.case.extras),
             jnp.concatenate([rows, offsets], axis=1),
             durations,
-            (context.case.gravity, context.case.limits),
+            (context.case.gravity, context.case.limits, context.case.extras),
         )
         along = penalties + self._offset_costs(offsets, durations)
         cost = core + jnp.sum(jnp.where(context.active, along, 0.0))
@@ -323,11 +331,11 @@ class ExactCatch(OptimisedPlanner):
         The smoothed hinge bends at most with 3 / (2 hinge_width); the residuals bend alike.
         """
         chain, catch = self._unpack(point, context)
-        along = self._along(self.nodes)
+        along = self._along(self.nodes, context.case.extras)
         bend = jnp.sqrt(1.5 / self.hinge_width)
         margins = jnp.asarray(along.margins, point.dtype)[:, None, None]
         motion, case = chain_motion(self.maps, self.nodes, chain), context.case
-        excess = jnp.stack(_limits_along(motion, (case.gravity, case.limits)))
+        excess = jnp.stack(_limits_along(motion, (case.gravity, case.limits, case.extras)))
         excess = jnp.where(context.active[:, None], excess, -1.0)
         inside = jnp.maximum(excess + margins, 0.0)
         weights = jnp.asarray(along.weights(), point.dtype)
@@ -345,17 +353,17 @@ class ExactCatch(OptimisedPlanner):
         """The plan at a point, its violation looked for at 40 nodes a piece."""
         chain, catch = self._unpack(point, context)
         greatest = greatest_along(
-            self._along(_DECODE_NODES),
+            self._along(_DECODE_NODES, context.case.extras),
             chain.columns,
             chain.piece_durations,
-            (context.case.gravity, context.case.limits),
+            (context.case.gravity, context.case.limits, context.case.extras),
         )
-        speed, rate, weak, strong, ground = (
+        speed, rate, weak, strong, ground, *others = (
             jnp.max(jnp.where(context.active, excess, -1.0)) for excess in greatest
         )
         at_catch = self._at_catch(catch, context)
         squared = jnp.maximum(jnp.maximum(speed, rate), strong)
-        plain = jnp.maximum(ground, jnp.max(at_catch))
+        plain = functools.reduce(jnp.maximum, others, jnp.maximum(ground, jnp.max(at_catch)))
         weak = 1.0 - jnp.sqrt(jnp.maximum(1.0 - weak, 0.0))
         ratio = jnp.sqrt(jnp.maximum(squared + 1.0, 0.0)) - 1.0
         violation = jnp.maximum(jnp.maximum(ratio, weak), plain)

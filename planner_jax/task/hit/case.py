@@ -1,11 +1,15 @@
 """One volley to plan: the incoming ball, the hovering quadrotor, the target and the limits."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array
 
 from planner_jax.ball.flight import BallState
+from planner_jax.cost.extras import Extra, for_batch
 from planner_jax.robot.quadrotor import QuadrotorLimits
 from planner_jax.task.hit.card import START
 
@@ -26,7 +30,7 @@ class HitLimits:
 
 @struct.dataclass
 class HitCase:
-    """One case. Every field is a leaf: batch it, randomise it, differentiate by it.
+    """One case. Every number is a leaf: batch it, randomise it, differentiate by it.
 
     Times count from the moment at which planning begins.
     """
@@ -40,6 +44,7 @@ class HitCase:
     racket_height: Array  # () [m], racket centre above the propeller plane
     limits: QuadrotorLimits
     hit_limits: HitLimits
+    extras: tuple[Any, ...] = ()  # limits and costs of the user's own, see `cost.extras`
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -64,6 +69,7 @@ def case(
     hitting_speed=(4.0, 3.0, 4.0),
     min_apex=2.2,
     max_apex=6.2,
+    extras: Sequence[Extra] = (),
     dtype=jnp.float32,
 ) -> HitCase:
     """A hit, or a batch of them, with the setting of paper 002, Section VI-A.
@@ -84,6 +90,8 @@ def case(
         hitting_speed: (3,) [m/s], per axis.
         min_apex: [m].
         max_apex: [m].
+        extras: such as `pj.KeepOut`, each for one case, which all of them get, or with the
+            batch's axes on every leaf.
         dtype: of every leaf.
 
     Returns:
@@ -115,4 +123,5 @@ def case(
             min_apex=leaf(min_apex),
             max_apex=leaf(max_apex),
         ),
+        extras=for_batch(extras, batch, dtype),
     )

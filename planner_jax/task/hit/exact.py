@@ -25,6 +25,7 @@ from planner_jax.ball.impact import required_impact
 from planner_jax.ball.prediction import target_at
 from planner_jax.cost.along import Along, greatest_along, integrate_along
 from planner_jax.cost.contact import apex_excess, hitting_speed_excess
+from planner_jax.cost.extras import extra_excess, extra_rate, num_limits
 from planner_jax.cost.penalty import smoothed_hinge
 from planner_jax.cost.quadrotor import motion_excess
 from planner_jax.lanes import in_one_kernel
@@ -52,11 +53,14 @@ _ORDER = 4  # minimum snap
 _DECODE_NODES = 16  # intervals a piece at which a finished plan is looked at
 
 
-def _limits_along(
-    motion: Motion, given: tuple[Array, QuadrotorLimits]
-) -> tuple[Array, Array, Array, Array]:
-    gravity, limits = given
-    return motion_excess(motion, gravity, limits)
+# Gravity, limits and extras of a case.
+_Given = tuple[Array, QuadrotorLimits, tuple[Any, ...]]
+
+
+def _limits_along(motion: Motion, given: _Given) -> tuple[Array, ...]:
+    """Speed, acceleration, body rate, ground, and the extra limits."""
+    gravity, limits, extras = given
+    return (*motion_excess(motion, gravity, limits), *extra_excess(motion, extras))
 
 
 # Starting points, best first: impact time over landing time, flight time afterwards [s],
@@ -91,7 +95,8 @@ class ExactHit(OptimisedPlanner):
     002, eqs 11-12), and so position, velocity and acceleration at the impact.
 
     Cost: energy_weight * integral |snap|^2 + integral of the smoothed hinges of the limits
-    (paper 002, eq. 18a) + hinges of apex (eq. 21) and hitting speed (eq. 24).
+    (paper 002, eq. 18a), and of the case's extras + hinges of apex (eq. 21) and hitting speed
+    (eq. 24).
     """
 
     case_type = HitCase
@@ -226,20 +231,22 @@ class ExactHit(OptimisedPlanner):
             ]
         )
 
-    def _along(self, nodes: int) -> Along:
+    def _along(self, nodes: int, extras: tuple[Any, ...]) -> Along:
         """Penalties along the way: squares carry twice the relative margin."""
-        margins = tuple(self.margin * factor for factor in (2.0, 2.0, 2.0, 1.0))
-        return Along(self.maps, nodes, _limits_along, margins, self.hinge_width)
+        factors = (2.0, 2.0, 2.0, 1.0) + (1.0,) * num_limits(extras)
+        margins = tuple(self.margin * factor for factor in factors)
+        rate = extra_rate if extras else None
+        return Along(self.maps, nodes, _limits_along, margins, self.hinge_width, rate)
 
     def objective(self, point: Array, context: HitContext) -> Evaluation:
         """Cost, and the largest excess at the penalty nodes (squares over squares)."""
         offsets, natural = self._split(point)
         rows, duration, core, at_impact = in_one_kernel(ExactHit.ends, self)(natural, context)
         penalties, worst = integrate_along(
-            self._along(self.nodes),
+            self._along(self.nodes, context.case.extras),
             jnp.concatenate([rows, offsets])[None],
             duration[None],
-            (context.case.gravity, context.case.limits),
+            (context.case.gravity, context.case.limits, context.case.extras),
         )
         energy = self.energy_weight * offset_energy(self.maps, offsets, duration)
         # Peaks between nodes are a little higher than the nodes show.
@@ -335,9 +342,9 @@ class ExactHit(OptimisedPlanner):
         The smoothed hinge bends at most with 3 / (2 hinge_width); the residuals bend alike.
         """
         offsets, rows, duration, impact = self._unpack(point, context)
-        along = self._along(self.nodes)
+        along = self._along(self.nodes, context.case.extras)
         motion = sample_motion(self.maps, self.nodes, jnp.concatenate([rows, offsets]), duration)
-        given = (context.case.gravity, context.case.limits)
+        given = (context.case.gravity, context.case.limits, context.case.extras)
         excess = jnp.stack(_limits_along(motion, given))
         at_impact = self._at_impact(impact, context)
         bend = jnp.sqrt(1.5 / self.hinge_width)
@@ -351,15 +358,15 @@ class ExactHit(OptimisedPlanner):
     def decode(self, point: Array, context: HitContext) -> HitPlan:
         """The plan at a point, its violation looked for at 16 nodes a piece."""
         offsets, rows, duration, impact = self._unpack(point, context)
-        *squares, ground = greatest_along(
-            self._along(_DECODE_NODES),
+        speed, acceleration, rate, *others = greatest_along(
+            self._along(_DECODE_NODES, context.case.extras),
             jnp.concatenate([rows, offsets])[None],
             duration[None],
-            (context.case.gravity, context.case.limits),
+            (context.case.gravity, context.case.limits, context.case.extras),
         )
         at_impact = self._at_impact(impact, context)
-        squared = jnp.concatenate([*squares, at_impact[2:]])
-        plain = jnp.concatenate([ground, at_impact[:2]])
+        squared = jnp.concatenate([speed, acceleration, rate, at_impact[2:]])
+        plain = jnp.concatenate([*others, at_impact[:2]])
         violation = jnp.maximum(jnp.max(jnp.sqrt(squared + 1.0) - 1.0), jnp.max(plain))
         return HitPlan(
             trajectory=proportional_trajectory(self.maps, rows, offsets, duration),

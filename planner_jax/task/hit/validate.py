@@ -142,7 +142,10 @@ def check_cases(cases: HitCase) -> None:
     """
     batch = np.shape(cases.drag)
     paths, _ = jax.tree_util.tree_flatten_with_path(cases)
-    leaves = {".".join(key.name for key in path): np.asarray(leaf, float) for path, leaf in paths}
+    leaves = {
+        jax.tree_util.keystr(path, simple=True, separator="."): np.asarray(leaf, float)
+        for path, leaf in paths
+    }
     for name, leaf in leaves.items():
         _require(name, leaf, np.isfinite(leaf), "finite", batch)
 
