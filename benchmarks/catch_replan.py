@@ -60,7 +60,7 @@ class Estimator:
 
         def look(vector: jax.Array) -> jax.Array:
             """Belief and observation to belief, and the ball one period ahead, as vectors."""
-            state, _ = ekf_update(unravel(vector[:-3]), vector[-3:], model)
+            state = ekf_update(unravel(vector[:-3]), vector[-3:], model)
             ahead = ekf_predict(state, jnp.asarray(period), model)
             return ravel_pytree(ahead)[0]
 

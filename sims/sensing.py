@@ -75,7 +75,7 @@ def look(estimate: Estimate, seen: Array, sensing: Sensing, gravity: Array) -> E
     model = _model(sensing, estimate.drag, gravity)
     period = jnp.full_like(estimate.drag, 1.0 / sensing.rate)
     ahead = ekf_predict(estimate.belief, period, model, flight=rk4_step)
-    belief, _ = ekf_update(ahead, seen, model)
+    belief = ekf_update(ahead, seen, model)
     speed = jnp.sqrt(jnp.sum(belief.ball.vel**2))
     return dataclasses.replace(estimate, belief=belief, lever=estimate.lever + speed**3 * period)
 

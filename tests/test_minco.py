@@ -1,4 +1,4 @@
-"""MINCO, general and with durations in fixed proportion, against a dense quadratic program."""
+"""MINCO with durations in fixed proportion against a dense quadratic program."""
 
 import functools
 import itertools
@@ -8,9 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from derivatives import assert_gradient_matches_differences, value_and_gradient
+from derivatives import assert_gradient_matches_differences
 
-from planner_jax.trajectory.minco import minco
 from planner_jax.trajectory.polynomial import evaluate, snap_energy
 from planner_jax.trajectory.proportional_minco import (
     boundary_rows,
@@ -32,9 +31,6 @@ every_order = pytest.mark.parametrize("order", ORDERS)
 every_size = pytest.mark.parametrize(("order", "pieces"), SIZES)
 few_sizes = pytest.mark.parametrize(("order", "pieces"), FEW_SIZES)
 
-# Compiled once for all tests of equal shapes and dtype.
-minco_one = jax.jit(minco)
-
 
 def durations_of(pieces):
     """In fixed proportion, none like the next, 0.45 s on average."""
@@ -55,6 +51,17 @@ def proportional_one(order, pieces, rows, offsets, duration):
         sample_motion(args[0], NODES, jnp.concatenate(args[1:3]), args[3]),
         trajectory_energy(*args),
     )
+
+
+def minco_one(head, tail, waypoints, durations):
+    """The trajectory of given ends, waypoints and durations."""
+    maps = proportional_minco(len(head), tuple(np.asarray(durations, np.float64).tolist()))
+    rows = np.asarray(rows_of(head, tail, durations.mean()), head.dtype)
+    offsets = (maps.offsets @ np.concatenate([rows, waypoints])).astype(head.dtype)
+    return trajectory_of(maps, rows, offsets, durations.mean())
+
+
+trajectory_of = jax.jit(proportional_trajectory, static_argnums=0)
 
 
 def problem(order, pieces, seed=0, dtype=np.float64):
@@ -140,17 +147,17 @@ def energy(coeffs, form):
     return np.sum(flat * (form @ flat))
 
 
-# The general map
+# The trajectory
 
 
 @float64
 @every_size
-def test_minco_is_the_solution_of_the_dense_quadratic_program(order, pieces):
+def test_the_trajectory_is_the_solution_of_the_dense_quadratic_program(order, pieces):
     given = problem(order, pieces)
     trajectory = minco_one(*given)
     expected = dense_solution(*given)
     assert trajectory.coeffs.shape == (pieces, 2 * order, 3)
-    np.testing.assert_array_equal(trajectory.durations, given[-1])
+    np.testing.assert_allclose(trajectory.durations, given[-1], rtol=1e-14)
     np.testing.assert_allclose(trajectory.coeffs, expected, atol=1e-9 * np.abs(expected).max())
 
 
@@ -217,41 +224,6 @@ def test_stretched_time_divides_the_derivatives_by_its_powers(order):
     np.testing.assert_allclose(slow.coeffs, expected, atol=1e-11 * np.abs(expected).max())
 
 
-def energy_and_coefficients(point):
-    """The energy, and a sum in which every coefficient counts."""
-    given, weight = point
-    trajectory = minco(*given)
-    weights = weight * jnp.cos(jnp.arange(trajectory.coeffs.size, dtype=weight.dtype))
-    return snap_energy(trajectory, given[0].shape[0]) + weights @ trajectory.coeffs.ravel()
-
-
-@float64
-@pytest.mark.parametrize(("order", "pieces"), [(2, 2), (4, 1), (4, 4)])
-def test_the_gradient_in_ends_waypoints_and_durations_matches_finite_differences(order, pieces):
-    point = problem(order, pieces), 1.0
-    assert_gradient_matches_differences(energy_and_coefficients, point, rtol=1e-6)
-
-
-@float64
-def test_the_energy_gradient_in_a_waypoint_is_twice_the_jump_of_the_derivative_2s_minus_1():
-    """By parts; other derivatives at the joint adapt, so that they do not count."""
-    given = problem(4, 4)
-    _, (gradient, _) = value_and_gradient(energy_and_coefficients)((given, np.array(0.0)))
-    start, end = ends(np.asarray(minco_one(*given).coeffs), given[-1], 7)
-    np.testing.assert_allclose(gradient[2], 2.0 * (start[1:] - end[:-1]), rtol=1e-8)
-
-
-@float64
-def test_batch_equals_loop():
-    many = [problem(4, 5, seed) for seed in range(3)]
-    many[1] = tuple(10.0 * x for x in many[1])
-    together = jax.jit(jax.vmap(minco))(*(np.stack(x) for x in zip(*many, strict=True)))
-    together = np.asarray(together.coeffs)
-    for k, given in enumerate(many):
-        coeffs = np.asarray(minco_one(*given).coeffs)
-        np.testing.assert_allclose(together[k], coeffs, atol=1e-11 * np.abs(coeffs).max())
-
-
 def test_a_trajectory_in_float32_is_right_to_a_tenth_of_a_millimetre(float64):
     """Of waypoints a metre apart, six pieces and the durations 0.3 s to 1.2 s."""
     single = minco_one(*problem(4, 6, dtype=np.float32))
@@ -266,17 +238,35 @@ def test_a_trajectory_in_float32_is_right_to_a_tenth_of_a_millimetre(float64):
     np.testing.assert_allclose(*positions, atol=1e-4)
 
 
-def test_what_cannot_be_a_trajectory_is_refused():
-    head, tail, waypoints, durations = problem(4, 3)
-    with pytest.raises(ValueError, match=r"^head_state must have 2, 3 or 4 rows, got 1$"):
-        minco(head[:1], tail[:1], waypoints, durations)
-    with pytest.raises(
-        ValueError, match=r"^waypoints must be \(M - 1, 3\) = \(2, 3\), got \(1, 3\)$"
-    ):
-        minco(head, tail, waypoints[:1], durations)
+# The maps
 
 
-# The equal-duration maps
+def energy_and_coefficients(maps, point):
+    """The energy, and a sum in which every coefficient counts."""
+    rows, offsets, duration, weight = point
+    trajectory = proportional_trajectory(maps, rows, offsets, duration)
+    weights = weight * jnp.cos(jnp.arange(trajectory.coeffs.size, dtype=weight.dtype))
+    return snap_energy(trajectory, maps.order) + weights @ trajectory.coeffs.ravel()
+
+
+@float64
+@pytest.mark.parametrize(("order", "pieces"), [(2, 2), (4, 1), (4, 4)])
+def test_the_gradient_in_boundary_offsets_and_duration_matches_finite_differences(order, pieces):
+    point = *proportional_problem(order, pieces), PIECE_DURATION, 1.0
+    function = functools.partial(energy_and_coefficients, maps_of(order, pieces))
+    assert_gradient_matches_differences(function, point, rtol=1e-6)
+
+
+@float64
+def test_the_energy_gradient_in_a_waypoint_is_twice_the_jump_of_the_derivative_2s_minus_1():
+    """By parts; other derivatives at the joint adapt, so that they do not count."""
+    maps, (rows, offsets) = maps_of(4, 4), proportional_problem(4, 4)
+    args = maps, rows, offsets, PIECE_DURATION
+    by_offsets = jax.jit(jax.grad(trajectory_energy, argnums=2), static_argnums=0)(*args)
+    gradient = maps.offsets[:, 8:].T @ by_offsets
+    coeffs = np.asarray(trajectory_of(*args).coeffs)
+    start, end = ends(coeffs, durations_of(4), 7)
+    np.testing.assert_allclose(gradient, 2.0 * (start[1:] - end[:-1]), rtol=1e-8)
 
 
 def rows_of(head, tail, duration=PIECE_DURATION):
@@ -294,20 +284,6 @@ def proportional_problem(order, pieces):
 def solve_proportional(order, pieces, dtype=np.float64):
     args = (x.astype(dtype) for x in (*proportional_problem(order, pieces), PIECE_DURATION))
     return proportional_one(order, pieces, *args)
-
-
-@float64
-@few_sizes
-def test_both_maps_give_the_same_trajectory(order, pieces):
-    rows, offsets = proportional_problem(order, pieces)
-    powers = PIECE_DURATION ** np.arange(order)[:, None]
-    head, tail = rows[:order] / powers, rows[order:] / powers
-    waypoints = maps_of(order, pieces).waypoints @ np.concatenate([rows, offsets])
-    general = minco_one(head, tail, waypoints, durations_of(pieces))
-    trajectory, _, _ = solve_proportional(order, pieces)
-    size = np.abs(np.asarray(general.coeffs)).max()
-    np.testing.assert_allclose(trajectory.coeffs, general.coeffs, atol=1e-10 * size)
-    np.testing.assert_allclose(trajectory.durations, general.durations, rtol=1e-14)
 
 
 @float64

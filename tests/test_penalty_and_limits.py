@@ -8,7 +8,6 @@ from derivatives import assert_gradient_matches_differences
 
 from planner_jax.cost.contact import apex_excess, hitting_speed_excess
 from planner_jax.cost.penalty import (
-    c1_steep_hinge,
     joined_trapezoid_weights,
     smoothed_hinge,
     steep_hinge,
@@ -28,7 +27,7 @@ GRAVITY = 9.8
 
 float64 = pytest.mark.usefixtures("float64")
 
-SHAPES = {"smoothed": smoothed_hinge, "steep": steep_hinge, "c1 steep": c1_steep_hinge}
+SHAPES = {"smoothed": smoothed_hinge, "steep": steep_hinge}
 
 
 @jax.jit
@@ -87,23 +86,6 @@ def test_the_printed_steep_hinge_is_continuous_and_loses_its_slope_at_the_joint(
     np.testing.assert_allclose(slope, [3.0 * WIDTH**2, 0.0], atol=1e-8)
 
 
-@float64
-def test_the_c1_steep_hinge_keeps_its_slope_and_is_the_printed_one_below_the_joint():
-    value, slope, _ = value_slope_bend("c1 steep", WIDTH + np.array([-1e-12, 0.0, 1e-12]))
-    np.testing.assert_allclose(value, WIDTH**3, atol=1e-12)
-    np.testing.assert_allclose(slope, 3.0 * WIDTH**2, atol=1e-8)
-    below, above = np.array([-0.2, 0.0, 0.07]), np.array([0.15, 0.4])
-    np.testing.assert_array_equal(
-        value_slope_bend("c1 steep", below)[0], value_slope_bend("steep", below)[0]
-    )
-    extra = 3.0 * WIDTH**2 * (above - WIDTH)
-    np.testing.assert_allclose(
-        value_slope_bend("c1 steep", above)[0] - value_slope_bend("steep", above)[0],
-        extra,
-        rtol=1e-9,
-    )
-
-
 @pytest.mark.parametrize("name", SHAPES)
 def test_penalties_and_their_slopes_are_finite_and_not_negative_in_float32(name):
     x = np.array([-1e6, -WIDTH, 0.0, 1e-20, WIDTH, 1e3], np.float32)
@@ -115,7 +97,7 @@ def test_penalties_and_their_slopes_are_finite_and_not_negative_in_float32(name)
 
 def sum_of_penalties(point):
     x, width = point
-    shapes = (smoothed_hinge, steep_hinge, c1_steep_hinge)
+    shapes = (smoothed_hinge, steep_hinge)
     return sum(jnp.sum(shape(x, width)) for shape in shapes)
 
 

@@ -7,8 +7,6 @@ import pytest
 from jax import lax
 from jaxpr import assert_full_precision
 
-from planner_jax.trajectory.minco import minco
-from planner_jax.trajectory.polynomial import snap_energy
 from planner_jax.trajectory.proportional_minco import (
     equal_pieces,
     proportional_minco,
@@ -28,10 +26,6 @@ def custom_derivative(product):
     function = jax.custom_jvp(lambda a, b: product(a, b))
     function.defjvp(lambda primals, tangents: (product(*primals), product(*tangents)))
     return function
-
-
-def general_energy(head, tail, waypoints, durations):
-    return snap_energy(minco(head, tail, waypoints, durations))
 
 
 def proportional_values(rows, offsets, duration):
@@ -74,17 +68,6 @@ def test_a_product_of_less_precision_is_found_wherever_it_hides(nest):
 
 
 # The library
-
-
-@pytest.mark.parametrize("order", [2, 3, 4])
-def test_the_general_map_and_its_gradient_ask_for_full_precision(order):
-    ends = ROWS[:order]
-    given = ends, -ends, 0.5 * ROWS[:3], np.full(4, 0.4, np.float32)
-    assert assert_full_precision(general_energy, *given) > 0
-    gradient = jax.grad(general_energy, argnums=(0, 1, 2, 3))
-    assert assert_full_precision(gradient, *given) > 0
-    many = (np.stack([x, 2.0 * x]) for x in given)
-    assert assert_full_precision(jax.vmap(gradient), *many) > 0
 
 
 def test_the_equal_duration_maps_and_their_gradients_ask_for_full_precision():

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from closed_forms import region_of
 
 import planner_jax as pj
 from planner_jax.protocol import is_unsolved
@@ -165,7 +166,7 @@ def test_a_real_scenario_has_its_two_of_the_court_in_equal_shares():
     _, point = landing(cases.ball.pos, cases.ball.vel, cases.drag, cases.gravity)
     near, far = 1 + court.REGIONS.index("N"), 1 + court.REGIONS.index("F")
     served, landed, aimed = (
-        court.region_of(place[:, 0], place[:, 1]) for place in (cases.ball.pos, point, cases.target)
+        region_of(place[:, 0], place[:, 1]) for place in (cases.ball.pos, point, cases.target)
     )
     assert set(served) == {far} and set(aimed) == {near}
     assert (landed == near).sum() == (landed == far).sum() == 100

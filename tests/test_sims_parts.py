@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from closed_forms import drag_free_flight
 
-from planner_jax.ball.flight import BallState, drag_free_flight, fly
+from planner_jax.ball.flight import BallState, fly
 from planner_jax.robot.quadrotor import flat_attitude
 from planner_jax.sims.launch import awaited, ready, require_plan, require_world
 from planner_jax.sims.loop import Loop, expected

@@ -1,4 +1,4 @@
-"""Ball flight: quadratic drag (paper 002, eq. 2), and the closed forms for no drag and linear drag.
+"""Ball flight: quadratic drag (paper 002, eq. 2), and the closed form for linear drag.
 
 World frame, z up, SI units. Everything here is written for one ball; `jax.vmap` makes many.
 """
@@ -100,15 +100,6 @@ def fly(
         return after, after
 
     return jax.lax.scan(advance, ball, None, length=num_steps)
-
-
-def drag_free_flight(ball: BallState, duration: Array, gravity: Array) -> BallState:
-    """The ball after `duration` [s] under gravity alone (closed form)."""
-    g = gravity_vector(gravity)
-    return BallState(
-        pos=ball.pos + ball.vel * duration + 0.5 * g * duration**2,
-        vel=ball.vel + g * duration,
-    )
 
 
 def linear_drag_flight(ball: BallState, duration: Array, drag: Array, gravity: Array) -> BallState:

@@ -126,7 +126,7 @@ def target_at(table: PathTable, time: Array) -> BallState:
 
     Inside the table both position and velocity are cubic convolutions (paper 002, eq. 9).
     Outside [0, horizon] the target goes on from the end of the table at the velocity it has
-    there: defined, differentiable, and easy to notice with `covers`.
+    there: defined and differentiable.
 
     Args:
         table: N nodes.
@@ -145,8 +145,3 @@ def target_at(table: PathTable, time: Array) -> BallState:
 
     vel = read(table.vel)
     return BallState(pos=read(table.pos) + vel * (time - inside), vel=vel)
-
-
-def covers(table: PathTable, time: Array) -> Array:
-    """Whether the table answers a time, () bool."""
-    return (time >= 0.0) & (time <= horizon_of(table))

@@ -25,7 +25,7 @@ def steep_hinge(x: Array, width: float | Array) -> Array:
     """L_eps: cubic up to eps, then a far steeper cubic (paper 000, eq. 23).
 
     eps^3 + (x - eps)^2 x / eps^4 above eps, as printed: the value is continuous there, but
-    the slope drops from 3 eps^2 to 0 and grows again. See `c1_steep_hinge`.
+    the slope drops from 3 eps^2 to 0 and grows again.
 
     Args:
         x: (...) violation.
@@ -34,11 +34,6 @@ def steep_hinge(x: Array, width: float | Array) -> Array:
     inside = jnp.clip(x, 0.0, width)
     beyond = jnp.maximum(x - width, 0.0)
     return inside**3 + beyond**2 * (beyond + width) / width**4 * (x > width)
-
-
-def c1_steep_hinge(x: Array, width: float | Array) -> Array:
-    """L_eps with its slope kept: adds 3 eps^2 (x - eps) beyond eps, so that it is C1."""
-    return steep_hinge(x, width) + 3.0 * width**2 * jnp.maximum(x - width, 0.0)
 
 
 def trapezoid_weights(num_intervals: int) -> np.ndarray:

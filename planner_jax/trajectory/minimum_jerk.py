@@ -32,26 +32,6 @@ def minimum_jerk(head_state: Array, tail_state: Array, duration: Array) -> Piece
     return PiecewisePolynomial(coeffs=coeffs[None], durations=jnp.reshape(t, (1,)))
 
 
-def mean_squared_jerk(primitive: PiecewisePolynomial) -> Array:
-    """Cost (1/T) integral |jerk|^2 dt of a one-piece quintic (paper 002, eq. 15).
-
-    With jerk = alpha t^2 / 2 + beta t + gamma this is
-    gamma^2 + beta gamma T + beta^2 T^2/3 + alpha gamma T^2/3 + alpha beta T^3/4
-    + alpha^2 T^4/20, summed over the axes.
-    """
-    t = primitive.durations[0]
-    gamma = 6.0 * primitive.coeffs[0, 3]
-    beta = 24.0 * primitive.coeffs[0, 4]
-    alpha = 120.0 * primitive.coeffs[0, 5]
-    return jnp.sum(
-        gamma**2
-        + beta * gamma * t
-        + (beta**2 + alpha * gamma) * t**2 / 3.0
-        + alpha * beta * t**3 / 4.0
-        + alpha**2 * t**4 / 20.0
-    )
-
-
 def eased_minimum_jerk(
     head_state: Array, tail_state: Array, duration: Array, ease: float
 ) -> PiecewisePolynomial:

@@ -1,5 +1,9 @@
 """MINCO with durations in fixed proportion: constant matrices in normalised time.
 
+MINCO is the piecewise polynomial of least integral |p^(s)|^2 through given waypoints (paper 002,
+eq. 19; Wang, Zhou, Xu, Gao, "Geometrically Constrained Trajectory Optimization for
+Multicopters"): 2s - 2 times differentiable, of degree 2s - 1 on every piece.
+
 When the M pieces last r_i h seconds with constant r_i of mean one, so that h = T / M, the map
 from boundary rows and waypoints to coefficients, and to samples of position, velocity,
 acceleration and jerk, is one constant matrix in time over h. Boundary rows are
@@ -13,6 +17,7 @@ the smoothest guess for any boundary, and the energy is a boundary part plus a m
 
 import dataclasses
 import functools
+import math
 from typing import Any
 
 import jax
@@ -22,7 +27,6 @@ from flax import struct
 from jax import Array, lax
 
 from planner_jax.arithmetic import reciprocal
-from planner_jax.trajectory.minco import hermite_energy, hermite_map
 from planner_jax.trajectory.polynomial import Motion, PiecewisePolynomial, derivative_factors
 
 
@@ -64,6 +68,32 @@ def equal_pieces(num_pieces: int) -> tuple[float, ...]:
 
 
 @functools.cache
+def _hermite_map(order: int) -> np.ndarray:
+    """Unit-time coefficients from end derivatives, (2s, 2s) float64.
+
+    Columns: derivatives 0..s-1 at time 0, then the same at time 1.
+    """
+    size = 2 * order
+    ends = np.zeros((size, size))
+    for d in range(order):
+        ends[d, d] = math.factorial(d)
+        ends[order + d] = derivative_factors(size - 1, d)
+    return np.linalg.inv(ends)
+
+
+@functools.cache
+def _hermite_energy(order: int) -> np.ndarray:
+    """Energy of a unit-time piece as a quadratic form in its end derivatives, (2s, 2s)."""
+    size = 2 * order
+    factors = derivative_factors(size - 1, order)
+    powers = np.arange(size)
+    exponents = np.maximum(powers[:, None] + powers[None, :] - 2 * order + 1, 1)
+    gram = np.outer(factors, factors) / exponents
+    hermite = _hermite_map(order)
+    return hermite.T @ gram @ hermite
+
+
+@functools.cache
 def proportional_minco(order: int, proportions: tuple[float, ...]) -> ProportionalMinco:
     """Build the constant maps (cached).
 
@@ -77,7 +107,7 @@ def proportional_minco(order: int, proportions: tuple[float, ...]) -> Proportion
     shares = np.array(proportions) * m / np.sum(proportions)
     # Derivative d of a node in the unit time of piece i is r_i^d of that in time over h.
     units = np.tile(shares[:, None] ** np.arange(s), 2)
-    piece_energy = hermite_energy(s)
+    piece_energy = _hermite_energy(s)
     total = np.zeros(((m + 1) * s, (m + 1) * s))
     for i in range(m):
         span = slice(i * s, (i + 2) * s)
@@ -107,7 +137,7 @@ def proportional_minco(order: int, proportions: tuple[float, ...]) -> Proportion
     return ProportionalMinco(
         order=s,
         proportions=shares,
-        coefficients=hermite_map(s) @ (units[:, :, None] * pieces) / powers[:, :, None],
+        coefficients=_hermite_map(s) @ (units[:, :, None] * pieces) / powers[:, :, None],
         waypoints=from_offsets[q],
         offsets=to_offsets[q],
         boundary_energy=energy[b, b] + energy[b, q] @ smooth,

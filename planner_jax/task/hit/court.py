@@ -71,23 +71,6 @@ def published_rates() -> PublishedRates:
     return PublishedRates(paper=columns("paper"), trials=columns("data"))
 
 
-def region_of(x, y) -> np.ndarray:
-    """Code of the region that a point of the floor lies in, whichever the half.
-
-    Args:
-        x: (...) [m].
-        y: (...) [m].
-
-    Returns:
-        (...) int, 1 to 4 for N, F, L, R; 0 in the dead zone, outside the court, or for NaN.
-    """
-    depth, aside = np.abs(x), np.abs(y)
-    inside = (depth >= DEAD_ZONE) & (depth <= HALF_LENGTH) & (aside <= HALF_WIDTH)
-    middle = np.where(depth < NEAR_LINE, 1, 2)
-    side = np.where(np.asarray(y) > 0.0, 3, 4)
-    return np.where(inside, np.where(aside < LANE_LINE, middle, side), 0)
-
-
 def region_bounds(depth: float = HALF_LENGTH) -> np.ndarray:
     """Edges of the regions as (4, 2, 2) [m]: region; |x| or y; lower or upper.
 
