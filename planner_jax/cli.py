@@ -8,7 +8,6 @@ import argparse
 import contextlib
 import dataclasses
 import datetime
-import functools
 import os
 import pkgutil
 import shlex
@@ -23,7 +22,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from planner_jax.compile_cache import keep_compiled_programs
-from planner_jax.registry import Task, UnknownName, all_tasks
+from planner_jax.registry import Task, UnknownName, all_tasks, task_named
 from planner_jax.sweep.environment import installed_version, require_backend
 from planner_jax.sweep.settings import SettingError, SweepSettings, require
 
@@ -145,7 +144,7 @@ def _add_tasks(commands: Any, name: str, words: str, add: Callable[[_Parser, Tas
                 task.name,
                 help=task.summary,
                 argument_default=argparse.SUPPRESS,
-                fill=functools.partial(add, task=task),
+                fill=lambda parser, task=task: add(parser, task),
             )
 
 
