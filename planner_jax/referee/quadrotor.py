@@ -440,7 +440,7 @@ def _worst_extras(pieces: Pieces, case: dict, extras: tuple[Any, ...], u: np.nda
         for k in limits:
             own = {name: case[f"extras.{k}.{name}"][lane] for name in _array_fields(extras[k])}
             found.append(np.asarray(dataclasses.replace(extras[k], **own).excess(*samples)))
-        place, sample = divmod(int(np.argmax(found)), np.shape(found)[1])
+        place, sample = divmod(int(np.argmax(found)), len(found[0]))
         worst[lane], which[lane] = found[place][sample], limits[place]
         time[lane] = _time(here, np.array([sample]), u)[0]
     return worst, time, which
