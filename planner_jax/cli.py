@@ -8,7 +8,6 @@ import argparse
 import contextlib
 import dataclasses
 import datetime
-import functools
 import os
 import pkgutil
 import shlex
@@ -145,7 +144,7 @@ def _add_tasks(commands: Any, name: str, words: str, add: Callable[[_Parser, Tas
                 task.name,
                 help=task.summary,
                 argument_default=argparse.SUPPRESS,
-                fill=functools.partial(add, task=task),
+                fill=lambda parser, task=task: add(parser, task),
             )
 
 
