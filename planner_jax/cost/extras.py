@@ -93,7 +93,7 @@ class Dislike:
     weight: Any  # () [1/s]; the planners' other costs are of the order of 1e-5 to 1
 
     def cost(self, pos: Any, vel: Any, acc: Any) -> Any:
-        """weight * (1 - distance^2 / radius^2)^2 inside, nothing outside."""
+        """Weight * (1 - distance^2 / radius^2)^2 inside, nothing outside."""
         inside = 1.0 - ((pos - self.centre) ** 2).sum(-1) / self.radius**2
         return self.weight * inside.clip(0.0, 1.0) ** 2
 
