@@ -1,10 +1,9 @@
 """Limits and cost terms of a user's own along a quadrotor's way: a part of the case.
 
 An extra is a `flax.struct.dataclass` of arrays with a method `excess`, `cost` or both, pure and for
-one case. The planner calls them on jax arrays and the referee calls `excess` on float64 NumPy
-arrays, so they use operators and the methods that both kinds of arrays have. Another value in an
-extra compiles nothing anew; another class does. What is smaller than the way between two samples
-of a plan, some centimetres, may be missed.
+one case. They are called on jax arrays, and `excess` on float64 NumPy arrays by the referee: use
+operators and the methods of both. Another value compiles nothing anew; another class does. What is
+smaller than the way between two samples of a plan, some centimetres, may be missed.
 """
 
 from collections.abc import Sequence
@@ -24,14 +23,7 @@ class ExtraLimit(Protocol):
     """A limit; the planner keeps it, the referee judges it."""
 
     def excess(self, pos: Any, vel: Any, acc: Any) -> Any:
-        """Excess (...) relative to the limit, > 0 where it is broken; it may have no NaN.
-
-        Args:
-            pos: (..., 3) [m], of the quadrotor in the world.
-            vel: (..., 3) [m/s].
-            acc: (..., 3) [m/s^2].
-        """
-        ...
+        """Excess (...) relative to the limit, > 0 where it is broken; arguments (..., 3), SI."""
 
 
 @runtime_checkable
@@ -39,8 +31,7 @@ class ExtraCost(Protocol):
     """A term of the planner's cost; the referee does not look at it."""
 
     def cost(self, pos: Any, vel: Any, acc: Any) -> Any:
-        """Cost a second (...), >= 0, which is integrated along the way; arguments as above."""
-        ...
+        """Cost a second (...), >= 0, integrated along the way; arguments (..., 3), SI."""
 
 
 Extra = ExtraLimit | ExtraCost
@@ -53,99 +44,82 @@ def _size(vector: Any) -> Any:
 
 @struct.dataclass
 class KeepOut:
-    """A sphere that the quadrotor's centre may not enter; the excess is the depth over radius."""
+    """A sphere that may not be entered."""
 
-    centre: Array  # (3,) [m]
-    radius: Array  # () [m], > 0
+    centre: Any  # (3,) [m]
+    radius: Any  # () [m], > 0
 
     def excess(self, pos: Any, vel: Any, acc: Any) -> Any:
-        """1 - distance / radius."""
+        """Depth over radius."""
         return 1.0 - _size(pos - self.centre) / self.radius
 
 
 @struct.dataclass
 class Geofence:
-    """A box that the quadrotor's centre may not leave; a metre outside is an excess of one.
+    """A box that may not be left, its sides finite."""
 
-    Its sides are finite: an open one takes a number such as 100.
-    """
-
-    low: Array  # (3,) [m]
-    high: Array  # (3,) [m]
+    low: Any  # (3,) [m]
+    high: Any  # (3,) [m]
 
     def excess(self, pos: Any, vel: Any, acc: Any) -> Any:
-        """How far outside the farthest side is, in metres."""
+        """Metres outside, of the worst axis."""
         half = 0.5 * (self.high - self.low)
         return (abs(pos - self.low - half) - half).max(-1)
 
 
 @struct.dataclass
 class SpeedZone:
-    """A speed limit within a sphere.
+    """A speed limit within a sphere, which fades up to 1.25 radii.
 
-    From the surface to 1.25 radii the limit rises to infinity, speed / (u^2 (3 - 2 u)) with u
-    falling from one to zero. So its slope is continuous, and a solver sees that it may slow down
-    or go round.
+    There it is speed / (u^2 (3 - 2 u)), u falling from one to zero: continuous with its slope.
     """
 
-    centre: Array  # (3,) [m]
-    radius: Array  # () [m], > 0
-    speed: Array  # () [m/s], > 0
+    centre: Any  # (3,) [m]
+    radius: Any  # () [m], > 0
+    speed: Any  # () [m/s], > 0
 
     def excess(self, pos: Any, vel: Any, acc: Any) -> Any:
-        """Speed over the limit there, less one."""
+        """Speed over the limit, less one."""
         u = (5.0 - 4.0 * _size(pos - self.centre) / self.radius).clip(0.0, 1.0)
         return u * u * (3.0 - 2.0 * u) * _size(vel) / self.speed - 1.0
 
 
 @struct.dataclass
 class Dislike:
-    """A sphere that is better avoided: cost a second, falling smoothly to zero at its surface."""
+    """A sphere that is better avoided."""
 
-    centre: Array  # (3,) [m]
-    radius: Array  # () [m], > 0
-    weight: Array  # () [1/s], at the centre; of the order of 1 beside the planners' other costs
+    centre: Any  # (3,) [m]
+    radius: Any  # () [m], > 0
+    weight: Any  # () [1/s]; the planners' other costs are of the order of 1e-5 to 1
 
     def cost(self, pos: Any, vel: Any, acc: Any) -> Any:
-        """Weight * (1 - distance^2 / radius^2)^2 inside."""
-        inside = (1.0 - ((pos - self.centre) ** 2).sum(-1) / self.radius**2).clip(0.0, 1.0)
-        return self.weight * inside**2
+        """Weight * (1 - distance^2 / radius^2)^2 inside, nothing outside."""
+        inside = 1.0 - ((pos - self.centre) ** 2).sum(-1) / self.radius**2
+        return self.weight * inside.clip(0.0, 1.0) ** 2
 
 
 def for_batch(extras: Sequence[Extra], batch: tuple[int, ...], dtype: Any) -> tuple[Any, ...]:
-    """Extras whose leaves carry the batch shape of the cases.
-
-    Args:
-        extras: each for one case, which all of them get, or with the batch's axes on every leaf.
-        batch: () or (B,).
-        dtype: of every leaf.
+    """Extras whose leaves have a dtype and the axes of a batch, () or (B,), in front.
 
     Raises:
-        ValueError: an extra is neither, or gives anything but a number a sample.
+        ValueError: an extra is not for one case, and not all of its leaves have these axes.
     """
 
-    def spread(k: int, extra: Any) -> Any:
+    def spread(extra: Any) -> Any:
         extra = jax.tree.map(np.asarray, extra, is_leaf=lambda x: isinstance(x, tuple | list))
-        leaves = jax.tree.leaves(extra)
-        methods = [m for m in ("excess", "cost") if hasattr(extra, m)]
-        # So many samples that no axis of a leaf can be taken for theirs.
-        num = 1 + max((2, *batch, *(n for leaf in leaves for n in leaf.shape)))
-        sample = np.linspace(0.1, 1.0, 3 * num).reshape(num, 3)
+        shapes = [leaf.shape for leaf in jax.tree.leaves(extra)]
+        sample = np.ones((2 + max((0, *batch, *sum(shapes, ()))), 3))  # longer than any leaf
+        methods = [getattr(extra, m) for m in ("excess", "cost") if hasattr(extra, m)]
         try:
-            one = {np.shape(getattr(extra, m)(sample, sample, sample)) for m in methods} == {(num,)}
+            alike = {np.shape(m(sample, sample, sample)) for m in methods} == {sample.shape[:1]}
         except (ValueError, TypeError):
-            one = False
-        alike = batch and all(leaf.shape[: len(batch)] == batch for leaf in leaves)
-        if not methods or not (one or alike):
-            raise ValueError(
-                f"extras[{k}] must give a number a sample by excess or cost, its leaves those of "
-                f"one case or all of them with the leading axes {batch}: {type(extra).__name__}"
-            )
-        lead = batch if one else ()
-        whole = lambda leaf: jnp.asarray(np.broadcast_to(leaf, lead + leaf.shape), dtype)  # noqa: E731
-        return jax.tree.map(whole, extra)
+            alike = False
+        if not alike and (not batch or any(shape[: len(batch)] != batch for shape in shapes)):
+            raise ValueError(f"extras must be for one case or have axes {batch}, got {extra}")
+        lead = batch if alike else ()
+        return jax.tree.map(lambda x: jnp.asarray(np.broadcast_to(x, lead + x.shape), dtype), extra)
 
-    return tuple(spread(k, extra) for k, extra in enumerate(extras))
+    return tuple(map(spread, extras))
 
 
 def num_limits(extras: tuple[Any, ...]) -> int:

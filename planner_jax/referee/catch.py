@@ -20,12 +20,10 @@ import numpy as np
 from planner_jax.referee.quadrotor import (
     CONTACT_TIME_TOLERANCE,
     above,
-    bare,
     check_sampling,
     checked_coeffs,
     checked_leaf,
     derivative,
-    extra_leaves,
     finite_lanes,
     first_failures,
     intervals_of,
@@ -173,7 +171,7 @@ def referee_catches(
     leaves["target vel"] = checked_leaf("target_states' vel", vel, (*shape, 3))
     judge = functools.partial(
         _judge,
-        extras=bare(cases.extras),
+        extras=cases.extras,
         intervals=intervals_of(samples, leaves["durations"].shape[1] // shape[1]),
         net_test=net_test,
         tolerances={
@@ -211,10 +209,10 @@ def _leaves(cases, plans) -> dict[str, np.ndarray]:
         "limits.body_rate": (limits.body_rate, ()),
         "limits.min_height": (limits.min_height, ()),
     }
-    leaves = {"coeffs": coeffs, "present": present}
+    leaves = {"lane": np.arange(len(coeffs)), "coeffs": coeffs, "present": present}
     for name, (value, shape) in trailing.items():
         leaves[name] = checked_leaf(name, value, batch + shape)
-    return leaves | extra_leaves(cases.extras, len(coeffs))
+    return leaves
 
 
 def _ends(durations: np.ndarray, num: int) -> np.ndarray:

@@ -17,12 +17,10 @@ import numpy as np
 from planner_jax.referee.quadrotor import (
     CONTACT_TIME_TOLERANCE,
     above,
-    bare,
     check_sampling,
     checked_coeffs,
     checked_leaf,
     derivative,
-    extra_leaves,
     finite_lanes,
     first_failures,
     intervals_of,
@@ -147,7 +145,7 @@ def referee_hits(
     }
     judge = functools.partial(
         _judge,
-        extras=bare(cases.extras),
+        extras=cases.extras,
         intervals=intervals_of(samples, leaves["durations"].shape[1]),
         drag_after_impact=drag_after_impact,
         tolerances=tolerances,
@@ -179,10 +177,10 @@ def _leaves(cases, plans) -> dict[str, np.ndarray]:
         "hit_limits.min_apex": (stroke_limits.min_apex, ()),
         "hit_limits.max_apex": (stroke_limits.max_apex, ()),
     }
-    leaves = {"coeffs": coeffs}
+    leaves = {"lane": np.arange(len(coeffs)), "coeffs": coeffs}
     for name, (value, shape) in trailing.items():
         leaves[name] = checked_leaf(name, value, coeffs.shape[:1] + shape)
-    return leaves | extra_leaves(cases.extras, len(coeffs))
+    return leaves
 
 
 def _judge(

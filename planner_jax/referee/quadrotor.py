@@ -105,26 +105,6 @@ def checked_coeffs(value) -> np.ndarray:
     return coeffs
 
 
-def extra_leaves(extras: tuple[Any, ...], num_lanes: int) -> dict[str, np.ndarray]:
-    """The arrays of a batch's extras by name; ValueError for one without the leading axis."""
-    leaves = {}
-    for k, extra in enumerate(extras):
-        for field in _array_fields(extra):
-            leaf, name = np.asarray(getattr(extra, field)), f"extras.{k}.{field}"
-            leaves[name] = checked_leaf(name, leaf, (num_lanes, *leaf.shape[1:]))
-    return leaves
-
-
-def _array_fields(extra: Any) -> list[str]:
-    static = {"pytree_node": False}
-    return [f.name for f in dataclasses.fields(extra) if not static.items() <= f.metadata.items()]
-
-
-def bare(extras: tuple[Any, ...]) -> tuple[Any, ...]:
-    """The extras without their arrays, which the judge of a chunk puts back lane by lane."""
-    return tuple(dataclasses.replace(e, **dict.fromkeys(_array_fields(e))) for e in extras)
-
-
 def _cut(num_lanes: int, size: int) -> list[slice]:
     """Runs of so many lanes; one of no lanes if there are none."""
     return [slice(start, start + size) for start in range(0, max(num_lanes, 1), size)]
@@ -425,34 +405,33 @@ def joint_errors(pieces: Pieces, head_state: np.ndarray) -> tuple:
     return head_error.max(axis=0), jump.max(axis=1), pieces.starts[lanes, worst], scale
 
 
-def _worst_extras(pieces: Pieces, case: dict, extras: tuple[Any, ...], u: np.ndarray) -> tuple:
+def _worst_extras(pieces: Pieces, lanes: np.ndarray, extras: tuple, u: np.ndarray) -> tuple:
     """Greatest relative excess (B,) over extra limits, its time, and which extra it is of.
 
-    It is looked for at the samples u (S,) of every piece; -1 without a limit.
+    Extras are those of all cases, of which these are `lanes`. The excess is looked for at the
+    samples u (S,) of every piece; it is -1 without a limit.
     """
     limits = [k for k, extra in enumerate(extras) if hasattr(extra, "excess")]
-    num = len(pieces.durations)
-    worst, time, which = np.full(num, -1.0), np.zeros(num), np.full(num, -1)
-    for lane in range(num) if limits else ():
-        here = pieces.of(slice(lane, lane + 1))
+    worst, time, which = np.full(len(lanes), -1.0), np.zeros(len(lanes)), np.full(len(lanes), -1)
+    for i, lane in enumerate(lanes.astype(int) if limits else ()):
+        here = pieces.of(slice(i, i + 1))
         samples = [np.moveaxis(values, 0, -1).reshape(-1, 3) for values in _motion(here, u)[:3]]
-        found = []
-        for k in limits:
-            own = {name: case[f"extras.{k}.{name}"][lane] for name in _array_fields(extras[k])}
-            found.append(np.asarray(dataclasses.replace(extras[k], **own).excess(*samples)))
-        place, sample = divmod(int(np.argmax(found)), len(found[0]))
-        worst[lane], which[lane] = found[place][sample], limits[place]
-        time[lane] = _time(here, np.array([sample]), u)[0]
+        found = np.stack([_of_lane(extras[k], lane).excess(*samples) for k in limits])
+        place, top = divmod(int(found.argmax()), found.shape[1])
+        worst[i], which[i] = found[place, top], limits[place]
+        time[i] = _time(here, np.array([top]), u)[0]
     return worst, time, which
 
 
+def _of_lane(extra: Any, lane: int) -> Any:
+    """An extra with the arrays of one lane in float64."""
+    numbers = [f.name for f in dataclasses.fields(extra) if f.metadata.get("pytree_node", True)]
+    own = {name: np.asarray(getattr(extra, name), float)[lane] for name in numbers}
+    return dataclasses.replace(extra, **own)
+
+
 def judge_motion(
-    pieces: Pieces,
-    case: dict,
-    extras: tuple[Any, ...],
-    intervals: int,
-    relative: float,
-    continuity: float,
+    pieces: Pieces, case: dict, extras: tuple, intervals: int, relative: float, continuity: float
 ) -> tuple[dict, dict]:
     """What a trajectory does, and the tests of it: name -> failed, excess, time.
 
@@ -460,8 +439,8 @@ def judge_motion(
         pieces: of B lanes.
         case: leaves with leading axis B: "head_state", "gravity" and "limits.<name>"; of
             speed, acceleration, body rate, least and greatest thrust those are tested that
-            have a limit, and the least height; and "extras.<k>.<name>".
-        extras: `bare`.
+            have a limit, and the least height; and "lane" among all cases.
+        extras: of all cases.
         intervals: between the samples of one piece.
         relative: tolerance of every limit.
         continuity: tolerance of head state and joints, times the scale of the coordinates.
@@ -478,9 +457,8 @@ def judge_motion(
         "continuity_error": jump,
         "head_error": head,
     }
-    beyond, at, measured["worst_extra"] = _worst_extras(
-        pieces, case, extras, np.linspace(0.0, 1.0, intervals + 1)
-    )
+    u = np.linspace(0.0, 1.0, intervals + 1)
+    beyond, at, measured["worst_extra"] = _worst_extras(pieces, case["lane"], extras, u)
     allowed = continuity * scale
     tests = {
         "head state": (head > allowed, head, np.zeros_like(head)),

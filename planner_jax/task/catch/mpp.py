@@ -103,6 +103,8 @@ class MppCatch:
 
     A target that does not fall through the height before its horizon, or before the one that
     is due earlier does, leaves the lane unsolved: this planner has no other time to offer.
+
+    It does not look at a case's extras; the referee does.
     """
 
     attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)

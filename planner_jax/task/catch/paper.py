@@ -75,6 +75,8 @@ class PaperCatch(OptimisedPlanner):
     as whitened offsets, the position at the catch as the net's distance from the ball.
     Decision variables, N segments with 3 (M - 1) + 13 each: offsets, log duration, miss,
     velocity, acceleration and jerk (unused at the last catch).
+
+    It does not look at a case's extras; the referee does.
     """
 
     case_type = CatchCase

@@ -132,6 +132,8 @@ class BatHit(OptimisedPlanner):
 
     So what the two-stage guess buys here is above all a first impact time nearer to the best
     one, and a solver that is left to converge needs it less than the published one did.
+
+    It does not look at a case's extras; the referee does.
     """
 
     case_type = HitCase

@@ -75,6 +75,8 @@ class JuggleHit:
     0.32: a racket that must rise at 3 m/s at the impact instead of nearly resting. With that
     restitution in the cases it succeeds on one in ten, and mostly in those of the 36
     cases in which the published one did (correlation 0.65).
+
+    It does not look at a case's extras; the referee does.
     """
 
     attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)

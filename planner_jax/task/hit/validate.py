@@ -4,6 +4,7 @@ Everything here is float64 NumPy over whole batches, so that a bad value is foun
 before a program is compiled for it.
 """
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -142,10 +143,8 @@ def check_cases(cases: HitCase) -> None:
     """
     batch = np.shape(cases.drag)
     paths, _ = jax.tree_util.tree_flatten_with_path(cases)
-    leaves = {
-        jax.tree_util.keystr(path, simple=True, separator="."): np.asarray(leaf, float)
-        for path, leaf in paths
-    }
+    name_of = functools.partial(jax.tree_util.keystr, simple=True, separator=".")
+    leaves = {name_of(path): np.asarray(leaf, float) for path, leaf in paths}
     for name, leaf in leaves.items():
         _require(name, leaf, np.isfinite(leaf), "finite", batch)
 

@@ -1,0 +1,238 @@
+"""Limits and costs of a user's own along the way, planned by `exact` and judged by the referee."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import struct
+
+import planner_jax as pj
+from planner_jax.cost.extras import for_batch
+from planner_jax.trajectory.polynomial import PiecewisePolynomial, states_at
+from tests.derivatives import assert_gradient_matches_differences
+
+FREE, CATCH = pj.hit.planner("exact"), pj.catch.planner("exact", decide="given")
+HIT = FREE.changed((("rounds", FREE.rounds[1:2]),))  # one attempt: one program to compile
+NUM, AT, FAR = 4, np.zeros(3), np.full((4, 3), 50.0)
+TRACES = []
+
+
+@struct.dataclass
+class Ceiling:
+    """A limit of this test's own, which notes on what it is called."""
+
+    height: jax.Array  # () [m]
+
+    def excess(self, pos, vel, acc):
+        TRACES.append(isinstance(pos, np.ndarray))
+        return pos[..., 2] / self.height - 1.0
+
+
+def having(cases, centre=FAR, radius=1.0, disliked=FAR, weight=0.0, height=99.0):
+    """Cases with three extras, which change nothing unless told: all of one compiled program."""
+    batch = cases.batch_shape
+    full = lambda value: np.broadcast_to(np.asarray(value, np.float32), batch)  # noqa: E731
+    zones = (
+        pj.KeepOut(np.asarray(centre[: batch[0]], np.float32), full(radius)),
+        pj.Dislike(np.asarray(disliked[: batch[0]], np.float32), full(0.4), full(weight)),
+        Ceiling(full(height)),
+    )
+    return cases.replace(extras=zones)
+
+
+def way(plans, k, num=200):
+    """Positions (num, 3) of plan k at equal steps, the ends included."""
+    path = pj.lane(plans.trajectory, k)
+    many = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf)[None], num, axis=0), path)
+    return states_at(many, np.linspace(0.0, path.durations.sum(), num))[:, 0]
+
+
+@pytest.fixture(scope="module")
+def hits():
+    return jax.tree.map(np.asarray, pj.hit.draw(NUM, seed=11))
+
+
+@pytest.fixture(scope="module")
+def free(hits):
+    return pj.plan(FREE, hits)
+
+
+@pytest.fixture(scope="module")
+def middle(free):
+    return np.array([way(free, k)[100] for k in range(NUM)])
+
+
+@pytest.fixture(scope="module")
+def blocked(hits, middle):
+    """The same hits, a sphere in the middle of each free way; radii of their own."""
+    return having(hits, middle, np.array([0.2, 0.25, 0.15, 0.2]))
+
+
+@pytest.fixture(scope="module")
+def around(blocked):
+    return pj.plan(HIT, blocked)
+
+
+def test_excess_and_cost_have_their_closed_forms():
+    pos = np.array([[0.5, 0.0, 0.0], [0.0, 3.0, 4.0], [0.0, 0.0, 2.25]])
+    vel = np.array([[3.0, 0.0, 4.0], [0.0, 5.0, 0.0], [0.0, 0.0, 5.0]])
+    found = pj.KeepOut(AT, 2.0).excess(pos, vel, vel)
+    np.testing.assert_allclose(found, [0.75, -1.5, -0.125], atol=1e-9)
+    found = pj.Geofence(np.array([-1.0, -1.0, 0.0]), np.full(3, 3.5)).excess(pos, vel, vel)
+    np.testing.assert_allclose(found, [0.0, 0.5, -1.0], atol=1e-12)
+    # Inside, beyond 1.25 radii, and half way between, where u = 1/2 and the limit is twice as high.
+    found = pj.SpeedZone(AT, 2.0, 2.5).excess(pos, vel, vel)
+    np.testing.assert_allclose(found, [1.0, -1.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(pj.Dislike(AT, 1.0, 2.0).cost(pos, vel, vel), [1.125, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    "extra",
+    [
+        pj.KeepOut(AT, 2.0),
+        pj.Geofence(AT - 1.0, AT + 0.5),
+        pj.SpeedZone(AT, 0.8, 2.0),
+        pj.Dislike(AT, 2.0, 1.0),
+    ],
+    ids=lambda extra: type(extra).__name__,
+)
+def test_gradients_are_those_of_differences(extra, float64):
+    pos = np.array([[0.5, 0.1, 0.0], [0.3, 0.7, 0.4]])
+    method = getattr(extra, "excess", None) or extra.cost
+    name = method.__name__
+
+    def value(point):
+        extra, pos, vel = point
+        return jnp.sum(jnp.sin(getattr(extra, name)(pos, vel, vel)))
+
+    assert_gradient_matches_differences(value, (extra, pos, 2.0 * pos + 1.0), step=1e-6, rtol=1e-6)
+    at_centre = jax.grad(lambda pos: jnp.sum(getattr(extra, name)(pos, pos, pos)))(jnp.zeros(3))
+    assert np.isfinite(at_centre).all()
+
+
+def test_a_case_gives_its_extras_the_shape_of_the_batch():
+    pos, vel, target = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)
+    one = pj.Geofence((-1, -1, 0), (1, 1, 2))  # three numbers, and a batch of three
+    many = pj.KeepOut(np.ones((3, 3)), np.ones(3))
+    cases = pj.hit.case(pos, vel, target, extras=(one, many))
+    assert [leaf.shape for leaf in jax.tree.leaves(cases.extras)] == [(3, 3), (3, 3), (3, 3), (3,)]
+    assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(cases.extras))
+    with pytest.raises(ValueError, match="for one case or have axes"):
+        pj.hit.case(pos, vel, target, extras=(pj.KeepOut(np.ones(3), np.ones(2)),))
+    with pytest.raises(ValueError, match="for one case or have axes"):
+        for_batch((many,), (), jnp.float32)
+
+
+def test_a_blocked_way_is_planned_around_and_the_referee_says_which_was_not(
+    hits, free, blocked, around
+):
+    assert pj.solved(free).all() and pj.hit.judge(hits, free).success.all()
+    verdict = pj.hit.judge(blocked, free)
+    assert (verdict.failed_limit == "extra").all() and (verdict.worst_extra == 0).all()
+    assert verdict.failed_excess.min() > 0.9
+    assert "beyond extras[0] of the case at 0." in verdict.sentence(0)
+    assert pj.solved(around).all()
+    verdict = pj.hit.judge(blocked, around)
+    assert verdict.success.all(), [verdict.sentence(k) for k in range(4)]
+
+
+def test_the_referee_finds_the_depth_its_time_and_the_extra(hits, free):
+    """A straight way at 2 m/s through two spheres, the second of them deeper."""
+    path = free.trajectory
+    coeffs = np.zeros_like(path.coeffs[:1])
+    starts = np.cumsum(path.durations[:1], axis=1) - path.durations[:1]
+    coeffs[:, :, 0, 0], coeffs[:, :, 1, 0] = 2.0 * starts, 2.0
+    plan = pj.lane(free, slice(0, 1))
+    plan = plan.replace(trajectory=PiecewisePolynomial(coeffs, path.durations[:1]))
+    head = np.zeros((1, 4, 3), np.float32)
+    head[0, 1, 0] = 2.0
+    limits = dataclasses.replace(hits.limits, min_height=hits.limits.min_height - 9.0)
+    case = pj.lane(hits.replace(limits=limits), slice(0, 1)).replace(head_state=head)
+    zones = (
+        pj.KeepOut(np.array([[0.3, 0.4, 0.0]]), np.array([0.5])),
+        pj.Dislike(np.zeros((1, 3)), np.ones(1), np.ones(1)),
+        pj.KeepOut(np.array([[1.0, 0.3, 0.0]]), np.array([0.5])),
+    )
+    verdict = pj.hit.judge(case.replace(extras=zones), plan)
+    assert verdict.failed_limit[0] == "extra" and verdict.worst_extra[0] == 2
+    np.testing.assert_allclose(verdict.failed_excess, 0.4, atol=1e-3)
+    np.testing.assert_allclose(verdict.failed_time, 0.5, atol=5e-3)
+    broken = (*zones[:2], pj.KeepOut(np.full((1, 3), np.nan), np.array([0.5])))
+    assert pj.hit.judge(case.replace(extras=broken), plan).failed_limit[0] == "not finite"
+
+
+def test_lanes_of_a_batch_are_those_planned_alone(blocked, around):
+    for k in (0, 2):
+        alone = pj.plan(HIT, pj.lane(blocked, slice(k, k + 1)))
+        np.testing.assert_allclose(
+            alone.trajectory.coeffs[0, :, 0], around.trajectory.coeffs[k, :, 0], atol=2e-3
+        )
+
+
+def test_another_value_compiles_nothing_anew(hits, around):
+    traced = TRACES.count(False)
+    assert traced
+    pj.plan(HIT, having(hits, radius=0.3, height=7.0))
+    assert TRACES.count(False) == traced
+
+
+def test_a_class_of_ones_own_is_planned_with_and_judged(hits, free):
+    heights = [way(free, k)[:, 2] for k in range(NUM)]
+    room = np.array([height.max() / max(height[0], height[-1]) for height in heights])
+    k = int(room.argmax())  # the way that rises most above its ends, so that it can be lower
+    assert room[k] > 1.01
+    lower = having(pj.lane(hits, slice(k, k + 1)), height=heights[k].max() / room[k] ** 0.7)
+    assert pj.hit.judge(lower, pj.lane(free, slice(k, k + 1))).worst_extra == 2
+    verdict = pj.hit.judge(lower, pj.plan(HIT, lower))
+    assert verdict.success.all(), verdict.sentence(0)
+    assert TRACES.count(True)  # by the referee
+
+
+def test_a_cost_moves_the_way(hits, free, middle):
+    moved = pj.plan(HIT, having(hits, disliked=middle, weight=0.05))
+    assert pj.hit.judge(hits, moved).success.all()
+    for k in range(NUM):
+        before, after = (
+            np.linalg.norm(way(plans, k) - middle[k], axis=1).min() for plans in (free, moved)
+        )
+        assert after > before + 0.05
+
+
+def test_a_catch_stays_inside_a_fence():
+    case = jax.tree.map(np.asarray, pj.lane(pj.catch.draw(1, "throws", seed=3), slice(0, 1)))
+    free = pj.plan(CATCH, case)
+    assert pj.catch.judge(case, free).success.all()
+    flown = way(free, 0)
+    ends = flown[[0, -1]]
+    low, high = ends.min(axis=0) - 0.12, ends.max(axis=0) + 0.12
+    outside = np.maximum(flown - high, low - flown).max(axis=0)
+    axis = int(outside.argmax())
+    assert outside[axis] > 0.02, outside
+    fenced = case.replace(extras=for_batch((pj.Geofence(low, high),), (1,), np.float32))
+    assert pj.catch.judge(fenced, free).failed_limit[0] == "extra"
+    kept = pj.plan(CATCH, fenced)
+    verdict = pj.catch.judge(fenced, kept)
+    assert pj.solved(kept).all() and verdict.success.all(), verdict.sentence(0)
+
+
+@pytest.mark.slow
+def test_the_gradient_by_a_radius_is_that_of_plans_made_anew(blocked, float64):
+    case = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), pj.lane(blocked, 0))
+    solver = pj.LbfgsConfig(max_steps=2000, tolerance=1e-13, patience=40)
+    found = pj.gradient(HIT, case, of="cost", by="extras.0.radius", steps=0, solver=solver)
+
+    def cost(radius):
+        zones = (case.extras[0].replace(radius=np.asarray(radius)), *case.extras[1:])
+        return float(pj.plan(HIT.with_solver(solver), case.replace(extras=zones)).cost)
+
+    radius, step = float(case.extras[0].radius), 1e-4
+    slope = (cost(radius + step) - cost(radius - step)) / (2.0 * step)
+    assert slope > 0.0
+    np.testing.assert_allclose(found.by["extras.0.radius"], slope, rtol=0.02)
+
+
+def test_a_place_in_the_extras_that_is_not_there_is_named(blocked):
+    with pytest.raises(ValueError, match=r"'extras.3.radius': tuple has 0, 1, 2"):
+        pj.gradient(HIT, blocked, of="cost", by="extras.3.radius")
