@@ -1,6 +1,7 @@
 """What `planner-jax bench throughput` is asked to do; imports no JAX."""
 
 import dataclasses
+from typing import ClassVar
 
 from planner_jax.sweep.settings import option, require
 
@@ -22,6 +23,11 @@ class ThroughputSettings:
     repeat: int = option(5, "R", "timed calls")
     seed: int = option(0, "K", "of the cases")
     agree: bool = option(False, "", "compare the first lanes with those of a CPU, too")
+
+    DESCRIPTION: ClassVar[str] = (
+        "Plans a second of batches that stay on the devices, with what the referee says of them,\n"
+        "the cost beside a long search's, compile time and memory."
+    )
 
     def __post_init__(self) -> None:
         for name in ("devices", "iterations", "repeat"):

@@ -28,10 +28,6 @@ from planner_jax.sweep.settings import SettingError
 _HELP = argparse.RawDescriptionHelpFormatter
 _FAILED, _BAD_ARGUMENT, _INTERRUPTED = 1, 2, 130
 _BENCH = "planner_jax.benchmarks.throughput"
-_THROUGHPUT = (
-    "Plans a second of batches that stay on the devices, with what the referee says of them,\n"
-    "the cost beside a long search's, compile time and memory."
-)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -125,8 +121,9 @@ def _parser() -> _Parser:
     bench = commands.add_parser("bench", help="measure this machine")
     kinds = bench.add_subparsers(title="benchmarks", required=True, metavar="benchmark")
     plans = kinds.add_parser("throughput", help="plans a second, with success and cost", **hidden)
-    plans.description = _THROUGHPUT
-    _add_settings(plans, pkgutil.resolve_name(f"{_BENCH}_settings:ThroughputSettings"))
+    kind = pkgutil.resolve_name(f"{_BENCH}_settings:ThroughputSettings")
+    plans.description = kind.DESCRIPTION
+    _add_settings(plans, kind)
     plans.add("--out", metavar="DIR", help="run folder (default: runs/bench-throughput-DATE-TIME)")
     plans.set_defaults(command=_throughput)
     command("doctor", "versions, devices, precision, cache and a timed plan", _doctor)

@@ -29,16 +29,11 @@ _NET_TESTS = {
 
 
 class CatchTally(Tally):
-    """Counts targets caught, times of the catches and the optimal time ratio too.
-
-    Args:
-        decides: whether the planner begins at the decision's times; one that does not has no
-            optimal time ratio.
-    """
+    """Counts targets caught, times of the catches and the optimal time ratio too."""
 
     def __init__(self, decides: bool = True) -> None:
         super().__init__()
-        self._decides = decides
+        self._decides = decides  # whether plans begin at the decision's times; else it has no ratio
         self._shares = self._ratios = self._times = 0.0
         self._num_ratios = self._num_caught = 0
 
@@ -101,11 +96,9 @@ class CatchSweep(Sweep):
     def table(self, manifest: dict[str, Any]) -> RateTable:
         """Success and optimal time ratio, beside Tables I and III of paper 000, every suite."""
         summary, settings = manifest["summary"], manifest["parameters"]
-        planner, names = settings["planner"], list(SUITES)
+        planner, names = settings["planner"], list({**SUITES, settings["suite"]: None})
         header = ["suite", "cases", f"{planner} %", "95 % interval", f"{planner} OTR"]
         header += ["Catch Planner, paper %", "Catch Planner, paper OTR", "MPP, paper %"]
-        if settings["suite"] not in SUITES:
-            names.append(settings["suite"])
         strong, words = names.index(settings["suite"]), ("success", "time_ratio", "mpp_success")
         rows = []
         for place, name in enumerate(names):

@@ -46,9 +46,7 @@ class SampledCatch(NamedTuple):
     catches: np.ndarray  # (n,) places of the n catches among the times
 
 
-def sampled_catch(
-    row: dict[str, Any], motion: SampledMotion, setting: dict[str, Any]
-) -> SampledCatch:
+def sampled_catch(row: dict, motion: SampledMotion, setting: dict) -> SampledCatch:
     """A row whose plan has been sampled, with the physics of the manifest's `setting`."""
     thrust = net_thrust(motion, setting["gravity"])
     axis = thrust / np.maximum(np.linalg.norm(thrust, axis=1, keepdims=True), 1e-9)

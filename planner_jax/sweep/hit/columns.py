@@ -7,7 +7,6 @@ from planner_jax.sweep import columns as known
 from planner_jax.sweep.columns import BOOL, COUNT, TEXT, VECTOR, Column, leaves_of, list_of
 from planner_jax.sweep.quadrotor import MOTION, START, TRAJECTORY
 from planner_jax.task.hit import court
-from planner_jax.task.hit.serves import Serves
 
 FRAME = "world, z up, net at x = 0; times from the start of planning"
 _POINT = list_of(pa.float64(), 3)
@@ -18,11 +17,15 @@ def published_column(planner: str) -> str:
     return f"published_{planner.replace('-', '_')}"
 
 
-def _published(serves: Serves, place: int) -> pa.Array | None:
-    if serves.published is None:
-        return None
-    outcome = serves.published[:, place]
-    return pa.array(outcome == 1.0, pa.bool_(), mask=np.isnan(outcome))
+def _published(place: int, planner: str) -> Column:
+    def values(batch: known.RefereedBatch) -> pa.Array | None:
+        if (found := batch.chunk.origin.published) is None:
+            return None
+        outcome = found[:, place]
+        return pa.array(outcome == 1.0, pa.bool_(), mask=np.isnan(outcome))
+
+    meaning = "published outcome, null where there is none"
+    return Column(published_column(planner), "", meaning, BOOL, values)
 
 
 def _scenarios(batch: known.RefereedBatch) -> np.ndarray:
@@ -65,14 +68,5 @@ COLUMNS = [
     ),
     *MOTION,
     *TRAJECTORY,
-    *(
-        Column(
-            published_column(planner),
-            "",
-            "published outcome, null where there is none",
-            BOOL,
-            lambda b, place=place: _published(b.chunk.origin, place),
-        )
-        for place, planner in enumerate(court.PLANNERS)
-    ),
+    *(_published(*place) for place in enumerate(court.PLANNERS)),
 ]

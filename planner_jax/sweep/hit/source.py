@@ -58,15 +58,10 @@ class ServeSource(Source):
 
 
 def open_source(settings: HitSettings, batch: int) -> ServeSource:
-    """The source of a sweep's serves; a folder is read and checked whole.
-
-    Args:
-        settings: of the sweep.
-        batch: cases a chunk, where the settings name none.
+    """As `Sweep.open_source`; a folder is read and checked whole.
 
     Raises:
-        SettingError: the folder is missing, a row of it is not sound, or more serves are asked
-            for than it holds.
+        SettingError: the folder is missing, a row is not sound, or too few serves are in it.
     """
     try:
         folder = None if settings.serves is None else read_serves(settings.serves)

@@ -78,9 +78,7 @@ def _draw_view(axes: Axes, plan: SampledCatch, second: int, only: int | None = N
         _draw_quadrotor(axes, plan, at, where, 0.35 if at == 0 else 1.0)
 
 
-def _draw_quadrotor(
-    axes: Axes, plan: SampledCatch, at: int, where: list[int], alpha: float
-) -> None:
+def _draw_quadrotor(axes: Axes, plan: SampledCatch, at: int, where: list, alpha: float) -> None:
     """Hoop, stick and rotor circle at one time."""
     axis, centre, pos = plan.axis[at], plan.centre[at], plan.motion.pos[at]
     across = np.cross(axis, [0.0, 1.0, 0.0])

@@ -33,7 +33,11 @@ def court_figure(figure: Figure, run: RunRows) -> None:
         axes.set_aspect("equal")
         axes.set_xlim(-court.HALF_LENGTH - 0.6, court.HALF_LENGTH + 0.6)
     _draw_floor(above)
-    _mark_side(side)
+    side.axhline(0.0, color=style.GREY, linewidth=1.5)
+    side.axvline(0.0, color=style.INK, linewidth=1.2, linestyle=":", zorder=1)
+    for x, y, _ in court.TARGETS:
+        above.plot(x, y, markersize=11, zorder=6, **_TARGET)
+        side.plot(x, 0.0, markersize=11, zorder=6, **_TARGET)
     num_failed = sum(not row["success"] for row in rows)
     title = f"From above: {len(rows)} cases" + (f", {num_failed} failed" if num_failed else "")
     style.label(above, "", "y [m]", title)
@@ -81,7 +85,7 @@ def _draw_case(
 
 
 def _draw_floor(axes: Axes) -> None:
-    """Lines, dead zone, region letters and targets, from above."""
+    """Lines, dead zone and region letters, from above."""
     length, width, dead = court.HALF_LENGTH, court.HALF_WIDTH, court.DEAD_ZONE
     line: dict[str, Any] = {"color": style.GREY, "linewidth": 1.0, "zorder": 1}
     whole: dict[str, Any] = {"facecolor": _FLOOR, "edgecolor": style.GREY}
@@ -97,17 +101,7 @@ def _draw_floor(axes: Axes) -> None:
         axes.plot([way * court.NEAR_LINE] * 2, [-court.LANE_LINE, court.LANE_LINE], **line)
         for letter, x, y in (("N", 1.0, 0.0), ("F", 4.7, 0.0), ("L", 4.7, 2.2), ("R", 4.7, -2.2)):
             axes.text(way * x, y, letter, color=style.INK, **look)
-    for x, y, _ in court.TARGETS:
-        axes.plot(x, y, markersize=11, zorder=6, **_TARGET)
     axes.grid(visible=False)
-
-
-def _mark_side(axes: Axes) -> None:
-    """Ground, net and targets, from the side."""
-    axes.axhline(0.0, color=style.GREY, linewidth=1.5)
-    axes.axvline(0.0, color=style.INK, linewidth=1.2, linestyle=":", zorder=1)
-    for x, _, _ in court.TARGETS:
-        axes.plot(x, 0.0, markersize=11, zorder=6, **_TARGET)
 
 
 def _legend(figure: Figure, failures: bool) -> None:
