@@ -17,7 +17,6 @@ import jax
 import planner_jax as pj
 from planner_jax.benchmarks.cost_gap import cost_gaps, gap_figures
 from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
-from planner_jax.sweep.catch.published import PUBLISHED
 from planner_jax.sweep.summary import wilson_interval
 from planner_jax.task.catch.card import DECISIONS, SUITES, TASK
 
@@ -83,7 +82,7 @@ def main() -> None:
             bench.say(
                 f"| {suite} | {name} | {100 * row['success']:.2f} % | "
                 f"{100 * low:.2f}..{100 * high:.2f} | {100 * row['success_protocol']:.2f} % | "
-                f"{PUBLISHED[suite].success or '-'} | {ratio} | {last} s | "
+                f"{SUITES[suite].success or '-'} | {ratio} | {last} s | "
                 f"{row['warm_seconds']:.2f} s |"
             )
             bench.row(**row)

@@ -19,7 +19,6 @@ import os
 import resource
 import statistics
 import time
-from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -28,6 +27,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from planner_jax.benchmarks.cost_gap import COMPARED, cost_gaps, gap_figures
 from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
+from planner_jax.benchmarks.throughput_settings import ThroughputSettings
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.planning.plan import plan
@@ -44,51 +44,30 @@ def report(*, out: str | os.PathLike | None = None, **settings: Any) -> None:
 
     Args:
         out: run folder, new or empty; None for one of runs/.
-        **settings: of `measure`.
+        **settings: of `ThroughputSettings`.
 
     Raises:
-        SettingError: the folder cannot be written; or as `measure` says.
+        SettingError: the folder cannot be written, or a setting breaks a rule.
         UnknownName: as `measure` says.
     """
-    with Bench("throughput", settings, out) as bench:
-        measure(bench, **settings)
+    asked = ThroughputSettings(**settings)
+    with Bench("throughput", dataclasses.asdict(asked), out) as bench:
+        measure(bench, asked)
 
 
-def measure(
-    bench: Bench,
-    *,
-    task: str = "hit",
-    planner: str | None = None,
-    suite: str | None = None,
-    batch: Sequence[int] = (1024, 8192),
-    devices: int | None = None,
-    iterations: int | None = None,
-    repeat: int = 5,
-    seed: int = 0,
-    agree: bool = False,
-) -> None:
+def measure(bench: Bench, settings: ThroughputSettings) -> None:
     """Measure and print one row a batch size.
-
-    Args:
-        bench: the run.
-        task: name.
-        planner: name; None for the task's first.
-        suite: of which cases are drawn; None for the task's first.
-        batch: sizes.
-        devices: how many share a batch; None for all.
-        iterations: of the planner's first round; None for its own.
-        repeat: timed calls.
-        seed: of the cases.
-        agree: whether the first lanes are compared with a CPU's.
 
     Raises:
         SettingError: there are fewer devices, or the planner has no rounds.
         UnknownName: there is no such task, planner or suite.
     """
-    card, local = task_named(task), jax.local_devices()
+    devices, iterations = settings.devices, settings.iterations
+    suite, repeat = settings.suite, settings.repeat
+    card, local = task_named(settings.task), jax.local_devices()
     require(devices is None or devices <= len(local), "devices", f"<= {len(local)}", devices)
     used = local[: devices or len(local)]
-    made = card.planner(planner or next(iter(card.planners)), **card.bench)
+    made = card.planner(settings.planner or next(iter(card.planners)), **card.bench)
     solver = made.planner if isinstance(made, DecidedPlanner) else made
     has_rounds = isinstance(solver, OptimisedPlanner)
     if iterations is not None:
@@ -97,23 +76,23 @@ def measure(
         made = _with_iterations(made, iterations)
     first = iterations or (solver.rounds[0].solver.max_steps if has_rounds else None)
     bench.say(
-        f"{task}, {len(used)} x {used[0].device_kind}, jax {jax.__version__}, load average "
+        f"{card.name}, {len(used)} x {used[0].device_kind}, jax {jax.__version__}, load average "
         f"{os.getloadavg()[0]:.1f}" + (f"; first round: {first} iterations" if first else ""),
         "| plans | first call [s] | of it compiling [s] | fastest [ms] | median [ms] | plans/s | "
         "refereed | cost above a long search's (median, p90) | memory [GiB] |",
         "|---|---|---|---|---|---|---|---|---|",
     )
     beside = []
-    for num in batch:
-        host = jax.tree.map(np.asarray, card.draw(num, suite, seed))
+    for num in settings.batch:
+        host = jax.tree.map(np.asarray, card.draw(num, suite, settings.seed))
         timed = _timed(made, host, used, repeat)
         _add_row(bench, card, made, host, used, timed)
         if num >= len(used) > 1:
             beside.append(_efficiency(made, host, used, repeat, timed))
     if beside:
         bench.say(*beside)
-    if agree:
-        bench.say(_agreement(card, made, card.draw(COMPARED, suite, seed), used))
+    if settings.agree:
+        bench.say(_agreement(card, made, card.draw(COMPARED, suite, settings.seed), used))
 
 
 def _with_iterations(planner: Any, iterations: int) -> Any:
@@ -244,7 +223,7 @@ def main() -> None:
     tasks = chosen(parser, "--tasks", options.tasks, all_tasks())
     with begin(parser, options) as bench:
         for task in tasks:
-            measure(bench, task=task, seed=options.seed, agree=True)
+            measure(bench, ThroughputSettings(task=task, seed=options.seed, agree=True))
 
 
 if __name__ == "__main__":

@@ -8,13 +8,13 @@ import argparse
 import contextlib
 import dataclasses
 import datetime
+import functools
 import os
 import pkgutil
 import shlex
 import signal
 import sys
 import threading
-import types
 import typing
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -22,11 +22,13 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from planner_jax.compile_cache import keep_compiled_programs
-from planner_jax.registry import Task, UnknownName, all_tasks, task_named
+from planner_jax.registry import Task, UnknownName, all_tasks
 from planner_jax.sweep.environment import installed_version, require_backend
-from planner_jax.sweep.settings import SettingError, SweepSettings, require
+from planner_jax.sweep.settings import SettingError
 
+_HELP = argparse.RawDescriptionHelpFormatter
 _FAILED, _BAD_ARGUMENT, _INTERRUPTED = 1, 2, 130
+_BENCH = "planner_jax.benchmarks.throughput"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -80,7 +82,8 @@ class _Parser(argparse.ArgumentParser):
     """Says what is wrong with an argument in one line; has no options until it is asked."""
 
     def __init__(self, *, fill: Callable[["_Parser"], None] = lambda parser: None, **look: Any):
-        super().__init__(**{"formatter_class": _Help, "allow_abbrev": False, **look})
+        shape = functools.partial(_HELP, max_help_position=28, width=100)
+        super().__init__(**{"formatter_class": shape, "allow_abbrev": False, **look})
         self._fill = fill
 
     def parse_known_args(self, *arguments: Any, **how: Any) -> Any:
@@ -95,11 +98,6 @@ class _Parser(argparse.ArgumentParser):
         sys.exit(_fail(message.removeprefix("argument ")))
 
 
-class _Help(argparse.RawDescriptionHelpFormatter):
-    def __init__(self, prog: str):
-        super().__init__(prog, max_help_position=28, width=100)
-
-
 def _parser() -> _Parser:
     parser = _Parser(
         prog="planner-jax",
@@ -111,89 +109,87 @@ def _parser() -> _Parser:
     parser.add_argument("--version", action="version", version=version)
     commands = parser.add_subparsers(title="commands", required=True, metavar="command")
 
-    def command(name: str, words: str, run: Callable, **look: Any) -> _Parser:
-        added = commands.add_parser(name, help=words, description=look.pop("description", words))
-        added.set_defaults(command=run, **look)
+    def command(name: str, words: str, run: Callable) -> _Parser:
+        added = commands.add_parser(name, help=words, description=words)
+        added.set_defaults(command=run)
         return added
 
-    _add_tasks(commands, "sweep", "plan and referee many cases of a task", _add_sweep)
-    _add_tasks(commands, "fly", "fly many cases of a task in closed loop", _add_fly)
+    hidden: Any = {"argument_default": argparse.SUPPRESS}
+    for name, words, add in (
+        ("sweep", "plan and referee many cases of a task", _add_sweep),
+        ("fly", "fly many cases of a task in closed loop", _add_fly),
+    ):
+        among = commands.add_parser(name, help=words)
+        tasks = among.add_subparsers(title="tasks", required=True, metavar="task")
+        for task in all_tasks().values():
+            if name == "sweep" or task.flight is not None:
+                # Settings are imported for the one task that is asked for.
+                fill = functools.partial(add, task)
+                tasks.add_parser(task.name, help=task.summary, fill=fill, **hidden)
     view = command("view", "play a run's flights in a browser", _view)
     view.add_argument("run", metavar="RUN", help="folder of a run of flights")
     view.add("--host", default="localhost", help="where to serve (default: localhost)")
-    view.add(
-        "--port", type=int, default=8080, metavar="N", help="0 takes a free one (default: 8080)"
-    )
+    free = "0 takes a free one (default: 8080)"
+    view.add("--port", type=int, default=8080, metavar="N", help=free)
     report = command("report", "write table, figures and page of a run anew", _report)
     report.add_argument("run", metavar="RUN", help="folder of a finished run")
     bench = commands.add_parser("bench", help="measure this machine")
     kinds = bench.add_subparsers(title="benchmarks", required=True, metavar="benchmark")
-    _add_throughput(kinds.add_parser("throughput", help="plans a second, with success and cost"))
+    plans = kinds.add_parser("throughput", help="plans a second, with success and cost", **hidden)
+    kind = pkgutil.resolve_name(f"{_BENCH}_settings:ThroughputSettings")
+    plans.description = kind.DESCRIPTION
+    _add_settings(plans, kind)
+    plans.add("--out", metavar="DIR", help="run folder (default: runs/bench-throughput-DATE-TIME)")
+    plans.set_defaults(command=_throughput)
     command("doctor", "versions, devices, precision, cache and a timed plan", _doctor)
     return parser
 
 
-def _add_tasks(commands: Any, name: str, words: str, add: Callable[[_Parser, Task], None]) -> None:
-    """A command with a parser for every task."""
-    parser = commands.add_parser(name, help=words)
-    tasks = parser.add_subparsers(title="tasks", required=True, metavar="task")
-    for task in all_tasks().values():
-        if name == "sweep" or task.flight is not None:
-            # Settings are imported for the one task that is asked for.
-            tasks.add_parser(
-                task.name,
-                help=task.summary,
-                argument_default=argparse.SUPPRESS,
-                fill=lambda parser, task=task: add(parser, task),
-            )
-
-
-def _add_settings(parser: _Parser, kind: type, task: Task) -> None:
+def _add_settings(parser: _Parser, kind: Any, task: Task | None = None) -> None:
     """An option for every field of settings. One that is not given is absent from the namespace."""
     hints = typing.get_type_hints(kind)
-    names = {"planner": task.all_planners(), "suite": task.all_suites()}
+    names = {"planner": task.all_planners(), "suite": task.all_suites()} if task else {}
+    defaults: dict[str, Any] = {}
+    if hasattr(kind, "DEFAULT_NUM"):
+        batch = f"{kind.CPU_BATCH} on a CPU, {kind.GPU_BATCH} on a GPU"
+        defaults = {"num": kind.DEFAULT_NUM, "batch": batch}
     for field in dataclasses.fields(kind):
-        flag, default = f"--{field.name.replace('_', '-')}", field.default
-        words = field.metadata["help"]
+        words, default = field.metadata["help"], field.default
         if field.name in names:
-            known = list(names[field.name])
-            words, default = f"{', '.join(known)}", known[0] if default is None else default
-        if field.name in ("num", "batch") and default is None and hasattr(kind, "DEFAULT_NUM"):
-            default = {
-                "num": kind.DEFAULT_NUM,  # type: ignore[attr-defined]
-                "batch": f"{kind.CPU_BATCH} on a CPU, {kind.GPU_BATCH} on a GPU",  # type: ignore[attr-defined]
-            }[field.name]
-        if isinstance(default, bool):
-            parser.add(flag, action="store_true", help=words)
-            continue
-        if default is not None and "(default:" not in words:
-            shown = " ".join(f"{x:g}" for x in default) if isinstance(default, tuple) else default
-            words += f" (default: {shown})"
-        several = {"nargs": "+"} if isinstance(field.default, tuple) else {}
-        metavar = field.metadata["metavar"]
-        parser.add(flag, type=_type_of(hints[field.name]), metavar=metavar, help=words, **several)
+            words = ", ".join(names[field.name])
+            defaults[field.name] = next(iter(names[field.name]))
+        default = defaults.get(field.name) if default is None else default
+        how: dict[str, Any] = {"action": "store_true"}
+        if not isinstance(default, bool):
+            if default is not None and "(default:" not in words:
+                shown = (
+                    " ".join(f"{x:g}" for x in default) if isinstance(default, tuple) else default
+                )
+                words += f" (default: {shown})"
+            how = {"type": _type_of(hints[field.name]), "metavar": field.metadata["metavar"]}
+            how |= {"nargs": "+"} if isinstance(default, tuple) else {}
+        parser.add(f"--{field.name.replace('_', '-')}", help=words, **how)
 
 
 def _type_of(hint: Any) -> Callable[[str], Any]:
     """What makes a value of a word: `int` or `float` where a field holds these, or nothing."""
-    held = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+    held = typing.get_args(hint) or (hint,)
     return next((kind for kind in held if kind in (int, float)), str)
 
 
-def _add_sweep(parser: _Parser, task: Task) -> None:
+def _add_sweep(task: Task, parser: _Parser) -> None:
     parser.description = (
         f"Many cases of one task, {task.summary}:\nplanned, and every plan judged by a referee.\n"
         "Writes a run folder: index.html, table.md, figures, plans.parquet, manifest.json."
     )
     _add_settings(parser, pkgutil.resolve_name(task.sweep), task)
-    parser.add(
-        "--out", metavar="DIR", help=f"run folder (default: runs/{task.name}-PLANNER-DATE-TIME)"
-    )
+    where = f"run folder (default: runs/{task.name}-PLANNER-DATE-TIME)"
+    parser.add("--out", metavar="DIR", help=where)
     parser.add("--resume", action="store_true", help="finish the interrupted run in --out")
     parser.set_defaults(command=lambda given: _sweep(task, given))
 
 
-def _add_fly(parser: _Parser, task: Task) -> None:
+def _add_fly(task: Task, parser: _Parser) -> None:
     parser.description = (
         f"Many flights of one task, {task.summary},\n"
         "in MuJoCo MJX with noise, latency and wrong drag.\n"
@@ -202,72 +198,28 @@ def _add_fly(parser: _Parser, task: Task) -> None:
     )
     kind = pkgutil.resolve_name(str(task.flight))
     _add_settings(parser, kind, task)
-    parser.add(
-        "--record",
-        type=int,
-        metavar="K",
-        help="flights kept look by look for `planner-jax view`, the first ones (default: 16)",
+    kept = "flights kept look by look for `planner-jax view`, the first ones (default: 16)"
+    parser.add("--record", type=int, metavar="K", help=kept)
+    film = (
+        "film the first three of these into the run folder, .gif, or .mp4 where ffmpeg is "
+        "installed (default name: flights.gif)"
     )
-    parser.add(
-        "--video",
-        nargs="?",
-        const="flights.gif",
-        metavar="FILE",
-        help="film the first three of these into the run folder, .gif, or .mp4 where ffmpeg is "
-        "installed (default name: flights.gif)",
-    )
+    parser.add("--video", nargs="?", const="flights.gif", metavar="FILE", help=film)
     parser.add("--out", metavar="DIR", help=f"run folder (default: runs/fly-{task.name}-DATE-TIME)")
     parser.set_defaults(command=lambda given: _fly(task, kind, given))
 
 
-def _add_throughput(parser: _Parser) -> None:
-    parser.description = (
-        "Plans a second of batches that stay on the devices, with what the referee says of them,\n"
-        "the cost beside a long search's, compile time and memory."
-    )
-    tasks = list(all_tasks())
-    for flag, how in {
-        "--task": {"choices": tasks, "default": tasks[0], "help": f"(default: {tasks[0]})"},
-        "--planner": {"metavar": "NAME", "help": "(default: the task's first)"},
-        "--suite": {"metavar": "NAME", "help": "(default: the task's first)"},
-        "--batch": {
-            "type": int,
-            "nargs": "+",
-            "default": [1024, 8192],
-            "metavar": "B",
-            "help": "plans in one call, one or more sizes (default: 1024 8192)",
-        },
-        "--devices": {"type": int, "metavar": "N", "help": "how many share a batch (default: all)"},
-        "--iterations": {
-            "type": int,
-            "metavar": "K",
-            "help": "of the first round (default: the planner's own)",
-        },
-        "--repeat": {"type": int, "default": 5, "metavar": "R", "help": "timed calls (default: 5)"},
-        "--seed": {"type": int, "default": 0, "metavar": "K", "help": "of the cases (default: 0)"},
-        "--agree": {"action": "store_true", "help": "compare the lanes with those of a CPU, too"},
-        "--out": {
-            "metavar": "DIR",
-            "help": "run folder (default: runs/bench-throughput-DATE-TIME)",
-        },
-    }.items():
-        parser.add(flag, **how)
-    parser.set_defaults(command=_throughput)
-
-
-def _out(given: dict[str, Any], name: str) -> str:
-    """The run folder that is asked for, or one of this name and moment."""
-    out = given.pop("out", None)
-    return out or os.path.join("runs", f"{name}-{datetime.datetime.now():%Y%m%d-%H%M%S}")
+def _run_folder(name: str) -> str:
+    """The run folder of this name and moment."""
+    return os.path.join("runs", f"{name}-{datetime.datetime.now():%Y%m%d-%H%M%S}")
 
 
 def _sweep(task: Task, given: dict[str, Any]) -> None:
-    kind, resume = pkgutil.resolve_name(task.sweep), given.pop("resume", False)
-    if resume and "out" not in given:
+    resume, out = given.pop("resume", False), given.pop("out", None)
+    if resume and out is None:
         raise SettingError("out must name the folder to resume, got nothing")
-    out = given.pop("out", None)
-    settings = kind(**given).of(task)
-    out = _out({"out": out}, f"{task.name}-{settings.planner}")
+    settings = pkgutil.resolve_name(task.sweep)(**given).of(task)
+    out = out or _run_folder(f"{task.name}-{settings.planner}")
     _let_ctrl_c_stop()
     keep_compiled_programs()
     from planner_jax.sweep import run
@@ -295,8 +247,10 @@ def _fly(task: Task, kind: type, given: dict[str, Any]) -> None:
     keep_compiled_programs()
     from planner_jax.sims.run import start_flights
 
-    out, video = _out(given, f"fly-{task.name}"), given.pop("video", None)
-    keep = {"record": given.pop("record")} if "record" in given else {}
+    out = given.pop("out", None) or _run_folder(f"fly-{task.name}")
+    video, keep = given.pop("video", None), {}
+    if "record" in given:
+        keep["record"] = given.pop("record")
     start_flights(kind(**given), out, video, **keep)
     _print_flights(Path(out))
 
@@ -328,18 +282,10 @@ def _let_ctrl_c_stop() -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-def _throughput(options: dict[str, Any]) -> None:
-    for name in ("devices", "iterations", "repeat"):
-        value = options[name]
-        require(value is None or value >= 1, name, ">= 1", value)
-    require(min(options["batch"]) >= 1, "batch", ">= 1", min(options["batch"]))
-    named = {name: options[name] for name in ("planner", "suite", "seed")}
-    SweepSettings(**named).of(task_named(options["task"]))
+def _throughput(given: dict[str, Any]) -> None:
     require_backend()
     keep_compiled_programs()
-    from planner_jax.benchmarks.throughput import report
-
-    report(**options)
+    pkgutil.resolve_name(f"{_BENCH}:report")(**given)
 
 
 def _report(options: dict[str, Any]) -> None:

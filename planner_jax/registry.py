@@ -21,10 +21,7 @@ from importlib import metadata
 from typing import Any
 
 _GROUP = "planner_jax"
-_OWN = {
-    "hit": "planner_jax.task.hit.card:TASK",
-    "catch": "planner_jax.task.catch.card:TASK",
-}
+_OWN = {"hit": "planner_jax.task.hit.card:TASK", "catch": "planner_jax.task.catch.card:TASK"}
 
 
 class UnknownName(ValueError):

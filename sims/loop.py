@@ -260,11 +260,7 @@ def _recorded(loop: Loop, pilot: Pilot, flight: FlightState, drag: Array) -> Rec
         truth = BallState(pos=pos, vel=vel)
         truth = fly(truth, ahead, true_drag, gravity, num_steps=12)[0]
         believed = fly(
-            estimate.belief.ball,
-            ahead + loop.sensing.latency,
-            estimate.drag,
-            gravity,
-            num_steps=12,
+            estimate.belief.ball, ahead + loop.sensing.latency, estimate.drag, gravity, num_steps=12
         )[0]
         return believed.pos - truth.pos
 
@@ -281,13 +277,7 @@ def _recorded(loop: Loop, pilot: Pilot, flight: FlightState, drag: Array) -> Rec
 
 @functools.partial(jax.jit, static_argnames=("loop", "pilot", "num_periods"))
 def fly_leg(
-    loop: Loop,
-    pilot: Pilot,
-    flight: FlightState,
-    cases: Any,
-    drag: Array,
-    *,
-    num_periods: int,
+    loop: Loop, pilot: Pilot, flight: FlightState, cases: Any, drag: Array, *, num_periods: int
 ) -> tuple[FlightState, Record | None]:
     """A batch of flights for some periods.
 

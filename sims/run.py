@@ -241,7 +241,7 @@ def write_flight_report(folder: RunFolder) -> None:
     title = f"Flights, {flight.settings.TASK.name}, {flight.suite}"
     remarks = [
         f"Everything is simulated in MuJoCo MJX: {flight.world().robot.WORDS}, motion capture with "
-        "noise, dropout and latency, balls with quadratic drag.",
+        "noise, dropout and latency, balls with quadratic drag."
     ]
     folder.write_text("table.md", to_markdown(title, lines, table, remarks))
     lead = "".join(f"<p>{html.escape(line)}</p>\n" for line in lines)

@@ -88,11 +88,7 @@ class Viewer:
     """
 
     def __init__(
-        self,
-        task: FlightTask,
-        recording: Recording,
-        host: str = "localhost",
-        port: int = 8080,
+        self, task: FlightTask, recording: Recording, host: str = "localhost", port: int = 8080
     ):
         """Start to serve and to show the first flight.
 

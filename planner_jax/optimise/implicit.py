@@ -95,11 +95,7 @@ def newton_refine(
 
 
 def optimal_plan(
-    planner: Any,
-    case: Any,
-    *,
-    solver: LbfgsConfig | None = None,
-    newton_steps: int = 100,
+    planner: Any, case: Any, *, solver: LbfgsConfig | None = None, newton_steps: int = 100
 ) -> Any:
     """The plan at the optimum of the first guess's basin, differentiable by the case.
 

@@ -49,28 +49,29 @@ VECTOR, LIST = list_of(pa.float32(), 3), list_of(pa.float32())
 INDEX = Column("index", "", "place in the whole", pa.int64(), lambda b: b.chunk.index)
 
 
-def leaves_of(part: str, rows: Sequence[tuple[str, str, str, pa.DataType, str]]) -> list[Column]:
+def leaves_of(part: str, *rows: tuple) -> list[Column]:
     """Columns that are leaves of one part of a batch.
 
     Args:
-        part: field of `RefereedBatch`.
-        rows: name, unit, meaning and type of a column, and the dotted path of the leaf; the
-            path "" is the name itself.
+        part: dotted path of it in a `RefereedBatch`.
+        *rows: name, unit and meaning of a column; then, where they are not these, its type,
+            NUMBER, and the leaf's dotted path in the part, the name.
     """
-    return [
-        Column(name, unit, meaning, kind, lambda b, at=path or name: _leaf(getattr(b, part), at))
-        for name, unit, meaning, kind, path in rows
-    ]
+    return [_leaf_column(part, *row) for row in rows]
+
+
+def _leaf_column(
+    part: str, name: str, unit: str, meaning: str, kind: pa.DataType = NUMBER, path: str = ""
+) -> Column:
+    return Column(name, unit, meaning, kind, lambda b: _leaf(b, f"{part}.{path or name}"))
 
 
 SOLVER = [
     *leaves_of(
         "plans",
-        [
-            ("cost", "1", "the planner's own objective", NUMBER, ""),
-            ("violation", "1", "largest relative excess the planner saw", NUMBER, ""),
-            ("iterations", "", "of the round that gave the plan", COUNT, ""),
-        ],
+        ("cost", "1", "the planner's own objective"),
+        ("violation", "1", "largest relative excess the planner saw"),
+        ("iterations", "", "of the round that gave the plan", COUNT),
     ),
     Column("status", "", "of the solver", TEXT, lambda b: _status(b.plans.status)),
 ]
@@ -78,18 +79,10 @@ SOLVER = [
 OUTCOME = [
     *leaves_of(
         "verdict",
-        [
-            ("success", "", "the referee's word", BOOL, ""),
-            ("failed_limit", "", "first limit that fails, or empty", TEXT, ""),
-            ("failed_time", "s", "where that limit is worst", NUMBER, ""),
-            (
-                "failed_excess",
-                "as in `sentence`",
-                "by how much, tolerance not taken off",
-                NUMBER,
-                "",
-            ),
-        ],
+        ("success", "", "the referee's word", BOOL),
+        ("failed_limit", "", "first limit that fails, or empty", TEXT),
+        ("failed_time", "s", "where that limit is worst"),
+        ("failed_excess", "as in `sentence`", "by how much, tolerance not taken off"),
     ),
     Column("sentence", "", "what failed, in words", TEXT, lambda b: _sentences(b.verdict)),
 ]

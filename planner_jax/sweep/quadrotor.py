@@ -2,40 +2,28 @@
 
 import numpy as np
 
-from planner_jax.sweep.columns import LIST, NUMBER, VECTOR, Column, leaves_of
+from planner_jax.sweep.columns import LIST, VECTOR, Column, RefereedBatch, leaves_of
 
-START = Column(
-    "start",
-    "m",
-    "hover position of the quadrotor",
-    VECTOR,
-    lambda b: np.asarray(b.cases.head_state)[:, 0],
-)
 
+def _starts(batch: RefereedBatch) -> np.ndarray:
+    return np.asarray(batch.cases.head_state)[:, 0]
+
+
+START = Column("start", "m", "hover position of the quadrotor", VECTOR, _starts)
 
 MOTION = leaves_of(
     "verdict",
-    [
-        ("max_speed", "m/s", "of the quadrotor", NUMBER, ""),
-        ("max_body_rate", "rad/s", "of the quadrotor", NUMBER, ""),
-        ("min_height", "m", "of the propeller plane", NUMBER, ""),
-        ("min_thrust", "m/s^2", "per unit mass", NUMBER, ""),
-        ("max_thrust", "m/s^2", "per unit mass", NUMBER, ""),
-        ("continuity_error", "m", "worst jump between pieces", NUMBER, ""),
-        ("head_error", "m", "of the state at time 0", NUMBER, ""),
-    ],
+    ("max_speed", "m/s", "of the quadrotor"),
+    ("max_body_rate", "rad/s", "of the quadrotor"),
+    ("min_height", "m", "of the propeller plane"),
+    ("min_thrust", "m/s^2", "per unit mass"),
+    ("max_thrust", "m/s^2", "per unit mass"),
+    ("continuity_error", "m", "worst jump between pieces"),
+    ("head_error", "m", "of the state at time 0"),
 )
 
 TRAJECTORY = leaves_of(
-    "plans",
-    [
-        ("durations", "s", "of the pieces", LIST, "trajectory.durations"),
-        (
-            "coeffs",
-            "m/s^k",
-            "pieces x powers k = 0..D x 3 axes, flat",
-            LIST,
-            "trajectory.coeffs",
-        ),
-    ],
+    "plans.trajectory",
+    ("durations", "s", "of the pieces", LIST),
+    ("coeffs", "m/s^k", "pieces x powers k = 0..D x 3 axes, flat", LIST),
 )

@@ -44,6 +44,10 @@ class SweepSettings:
     DEFAULT_NUM: ClassVar[int] = 1000
     CPU_BATCH: ClassVar[int] = 1024
     GPU_BATCH: ClassVar[int] = 65536
+    # Names of the settings that are options of the task's `planner`, `draw` and `judge`.
+    PLANNER: ClassVar[tuple[str, ...]] = ()
+    DRAW: ClassVar[tuple[str, ...]] = ()
+    JUDGE: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
         for name, least in (("num", 1), ("batch", 1), ("seed", 0)):
@@ -75,15 +79,15 @@ class SweepSettings:
 
     def planner_options(self) -> dict[str, Any]:
         """Options of the planner that these settings decide."""
-        return {}
+        return {name: getattr(self, name) for name in self.PLANNER}
 
     def draw_options(self) -> dict[str, Any]:
         """Options of the task's `draw` that these settings decide."""
-        return {}
+        return {name: getattr(self, name) for name in self.DRAW}
 
     def judge_options(self) -> dict[str, Any]:
         """Options of the task's `judge` that these settings decide."""
-        return {}
+        return {name: getattr(self, name) for name in self.JUDGE}
 
 
 def require(holds: bool, name: str, rule: str, value: Any) -> None:

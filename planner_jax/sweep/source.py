@@ -76,11 +76,7 @@ class DrawnSource(Source):
         settings = self.settings
         try:
             drawn = self.task.draw(
-                last - first,
-                settings.suite,
-                settings.seed,
-                first=first,
-                **settings.draw_options(),
+                last - first, settings.suite, settings.seed, first=first, **settings.draw_options()
             )
         except ValueError as error:
             raise SettingError(str(error)) from error

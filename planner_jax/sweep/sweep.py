@@ -37,6 +37,7 @@ class Sweep:
     """
 
     frame: ClassVar[str] = ""  # axes and times of the columns, in words
+    own_columns: ClassVar[Sequence[Column]] = ()
     figures: ClassVar[Sequence[RunFigure]] = (
         RunFigure(
             "outcomes.png",
@@ -60,8 +61,8 @@ class Sweep:
         return f"sweep {self.task.name}"
 
     def columns(self, batch: RefereedBatch) -> Sequence[Column]:
-        """The columns of `plans.parquet`; by default every leaf of case, plan and verdict."""
-        return leaf_columns(batch)
+        """The columns of `plans.parquet`: the task's own, or every leaf of case, plan, verdict."""
+        return self.own_columns or leaf_columns(batch)
 
     def planner(self, settings: Any) -> Any:
         """The planner of a run."""
@@ -151,7 +152,11 @@ def sweep_of_run(manifest: dict[str, Any], name: str = "out") -> Sweep:
         raise SettingError(f"{name} must be the folder of a known task: {error}") from None
 
 
-def first_values(tree: Any, names: Sequence[str], prefix: str = "") -> dict[str, Any]:
-    """Leaves of the first case as plain numbers, to six digits so that float32 does not show."""
+def first_values(tree: Any, names: Sequence[str] = (), prefix: str = "") -> dict[str, Any]:
+    """Leaves of the first case as plain numbers, to six digits so that float32 does not show.
+
+    Without `names` these are all fields of the tree.
+    """
+    names = names or [field.name for field in dataclasses.fields(tree)]
     leaves = {prefix + name: np.asarray(getattr(tree, name), float)[0] for name in names}
     return {name: leaf.round(6).tolist() for name, leaf in leaves.items()}

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from planner_jax.sweep.settings import SweepSettings, option, require, require_one_of
 from planner_jax.task.catch.card import DECISIONS
@@ -12,22 +12,14 @@ NET_TESTS = ("plane", "ball")  # of `referee_catches`
 
 @dataclasses.dataclass(frozen=True)
 class CatchSettings(SweepSettings):
-    """The arguments of a catch sweep.
-
-    Raises:
-        SettingError: a value breaks its rule.
-    """
+    """The arguments of a catch sweep."""
 
     limit_scale: float = option(
-        1.0,
-        "F",
-        "factor on the speed and body-rate limits and on the thrust's distance from hover",
+        1.0, "F", "factor on the speed and body-rate limits and on the thrust's distance from hover"
     )
     decide: str = option("best", "NAME", f"order and first times: {', '.join(DECISIONS)}")
     tolerance: float = option(
-        1e-3,
-        "R",
-        "relative, of the referee; the published protocol has 0.05 with --net-test ball",
+        1e-3, "R", "relative, of the referee; the published protocol has 0.05 with --net-test ball"
     )
     net_test: str = option(
         "plane",
@@ -37,6 +29,9 @@ class CatchSettings(SweepSettings):
     )
 
     RUN: ClassVar[str] = "planner_jax.sweep.catch.sweep:CatchSweep"
+    PLANNER: ClassVar[tuple[str, ...]] = ("decide",)
+    DRAW: ClassVar[tuple[str, ...]] = ("limit_scale",)
+    JUDGE: ClassVar[tuple[str, ...]] = ("tolerance", "net_test")
     GPU_BATCH: ClassVar[int] = 8192  # all orders of six targets at once: 1 MB a case
 
     def __post_init__(self) -> None:
@@ -46,15 +41,3 @@ class CatchSettings(SweepSettings):
         require_one_of(DECISIONS, "decide", self.decide)
         require_one_of(NET_TESTS, "net_test", self.net_test)
         require(0.0 <= tolerance < math.inf, "tolerance", "finite and >= 0", tolerance)
-
-    def planner_options(self) -> dict[str, Any]:
-        """What decides about order and times."""
-        return {"decide": self.decide}
-
-    def draw_options(self) -> dict[str, Any]:
-        """The limits."""
-        return {"limit_scale": self.limit_scale}
-
-    def judge_options(self) -> dict[str, Any]:
-        """Arguments of the referee."""
-        return {"tolerance": self.tolerance, "net_test": self.net_test}

@@ -1,6 +1,5 @@
 """What catches add to a sweep: targets caught, their times, the decision, and the paper's rates."""
 
-import dataclasses
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,7 @@ from planner_jax.sweep.catch.figures.flight import flight_figure
 from planner_jax.sweep.catch.figures.motion import motion_figure
 from planner_jax.sweep.catch.figures.outcomes import outcomes_figure
 from planner_jax.sweep.catch.settings import CatchSettings
+from planner_jax.sweep.figures.motion import CAPTION as MOTION
 from planner_jax.sweep.summary import Tally
 from planner_jax.sweep.sweep import RunFigure, Sweep, first_values
 from planner_jax.sweep.table import RateTable, own_cells
@@ -29,16 +29,11 @@ _NET_TESTS = {
 
 
 class CatchTally(Tally):
-    """Counts targets caught, times of the catches and the optimal time ratio too.
-
-    Args:
-        decides: whether the planner begins at the decision's times; one that does not has no
-            optimal time ratio.
-    """
+    """Counts targets caught, times of the catches and the optimal time ratio too."""
 
     def __init__(self, decides: bool = True) -> None:
         super().__init__()
-        self._decides = decides
+        self._decides = decides  # whether plans begin at the decision's times; else it has no ratio
         self._shares = self._ratios = self._times = 0.0
         self._num_ratios = self._num_caught = 0
 
@@ -70,7 +65,7 @@ class CatchTally(Tally):
 class CatchSweep(Sweep):
     """Quadrotors that catch flying targets with a net."""
 
-    frame = FRAME
+    frame, own_columns = FRAME, COLUMNS
     figures = (
         RunFigure(
             "flight.png",
@@ -79,14 +74,7 @@ class CatchSweep(Sweep):
             (13.0, 7.6),
             flight_figure,
         ),
-        RunFigure(
-            "motion.png",
-            "The same plan along its time against the limits, beside the other planners' plans "
-            "for the same case.",
-            (13.0, 6.8),
-            motion_figure,
-            compares=True,
-        ),
+        RunFigure("motion.png", MOTION, (13.0, 6.8), motion_figure, compares=True),
         RunFigure(
             "outcomes.png",
             "Success with its 95 % Wilson interval beside the published rates, failures by "
@@ -96,18 +84,10 @@ class CatchSweep(Sweep):
         ),
     )
 
-    def columns(self, batch: Any) -> Any:
-        """The columns of `plans.parquet`."""
-        return COLUMNS
-
     def setting(self, cases: Any) -> dict[str, Any]:
         """Physics and limits that all cases have in common, for the manifest."""
-        limits = [field.name for field in dataclasses.fields(cases.limits)]
-        return {
-            **first_values(cases, ["gravity"]),
-            **first_values(cases.net, ["height", "radius", "max_angle"], "net_"),
-            **first_values(cases.limits, limits),
-        }
+        net = first_values(cases.net, ["height", "radius", "max_angle"], "net_")
+        return {**first_values(cases, ["gravity"]), **net, **first_values(cases.limits)}
 
     def tally(self, settings: CatchSettings) -> CatchTally:
         """An empty count of rows."""
@@ -116,21 +96,18 @@ class CatchSweep(Sweep):
     def table(self, manifest: dict[str, Any]) -> RateTable:
         """Success and optimal time ratio, beside Tables I and III of paper 000, every suite."""
         summary, settings = manifest["summary"], manifest["parameters"]
-        planner, names = settings["planner"], list(SUITES)
+        planner, names = settings["planner"], list({**SUITES, settings["suite"]: None})
         header = ["suite", "cases", f"{planner} %", "95 % interval", f"{planner} OTR"]
         header += ["Catch Planner, paper %", "Catch Planner, paper OTR", "MPP, paper %"]
-        if settings["suite"] not in SUITES:
-            names.append(settings["suite"])
+        strong, words = names.index(settings["suite"]), ("success", "time_ratio", "mpp_success")
         rows = []
-        for name in names:
-            own, suite = ["", "", "", ""], SUITES.get(name)
-            if name == settings["suite"]:
+        for place, name in enumerate(names):
+            own = ["", "", "", ""]
+            if place == strong:
                 ratio = _number(summary["optimal_time_ratio"], 3)
                 own = [*own_cells(summary["successes"], summary["num"]), ratio]
-            words = (("success", 1), ("time_ratio", 3), ("mpp_success", 1))
-            paper = [_number(getattr(suite, word, None), digits) for word, digits in words]
-            rows.append([name, *own, *paper])
-        strong = names.index(settings["suite"])
+            paper = [getattr(SUITES.get(name), word, None) for word in words]
+            rows.append([name, *own, *map(_number, paper, (1, 3, 1))])
         return RateTable("Success beside the paper", header, rows, strong)
 
     def findings(self, manifest: dict[str, Any]) -> list[str]:

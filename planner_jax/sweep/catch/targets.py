@@ -1,6 +1,6 @@
-"""Paths of the targets of one row of `plans.parquet`."""
+"""Where the targets, the quadrotor and its net of one row of `plans.parquet` are."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +8,7 @@ import numpy as np
 
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath, HarmonicPath
+from planner_jax.sweep.figures.motion import SampledMotion, net_thrust
 
 
 def target_paths(row: dict[str, Any]) -> BallPath | HarmonicPath:
@@ -19,13 +20,8 @@ def target_paths(row: dict[str, Any]) -> BallPath | HarmonicPath:
     if row["swing_pos"] is None:
         ball = BallState(leaf("ball_pos", 3), leaf("ball_vel", 3))
         return BallPath(ball, leaf("drag", 3), leaf("ball_gravity"))
-    return HarmonicPath(
-        pos=leaf("swing_pos", 3),
-        vel=leaf("swing_vel", 3),
-        amplitude=leaf("swing_amplitude", 3),
-        rate=leaf("swing_rate"),
-        phase=leaf("swing_phase"),
-    )
+    vectors = {name: leaf(f"swing_{name}", 3) for name in ("pos", "vel", "amplitude")}
+    return HarmonicPath(**vectors, rate=leaf("swing_rate"), phase=leaf("swing_phase"))
 
 
 def target_positions(row: dict[str, Any], times: np.ndarray) -> np.ndarray:
@@ -36,3 +32,38 @@ def target_positions(row: dict[str, Any], times: np.ndarray) -> np.ndarray:
 @jax.jit
 def _positions(paths: BallPath | HarmonicPath, times: jax.Array) -> jax.Array:
     return jax.vmap(lambda path: jax.vmap(lambda time: path.at(time).pos)(times))(paths)
+
+
+class SampledCatch(NamedTuple):
+    """A row, and its quadrotor, net and N targets at K times."""
+
+    row: dict[str, Any]
+    motion: SampledMotion
+    axis: np.ndarray  # (K, 3) thrust direction
+    centre: np.ndarray  # (K, 3) [m], of the hoop
+    radius: float  # [m], of the hoop
+    targets: np.ndarray  # (N, K, 3) [m]
+    catches: np.ndarray  # (n,) places of the n catches among the times
+
+
+def sampled_catch(row: dict, motion: SampledMotion, setting: dict) -> SampledCatch:
+    """A row whose plan has been sampled, with the physics of the manifest's `setting`."""
+    thrust = net_thrust(motion, setting["gravity"])
+    axis = thrust / np.maximum(np.linalg.norm(thrust, axis=1, keepdims=True), 1e-9)
+    centre = motion.pos + setting["net_height"] * axis
+    targets = target_positions(row, motion.time)
+    times = np.array(row["catch_times"])[: int(np.sum(row["present"]))]
+    catches = np.abs(motion.time[:, None] - times).argmin(axis=0)
+    return SampledCatch(row, motion, axis, centre, setting["net_radius"], targets, catches)
+
+
+def due_distance(plan: SampledCatch) -> np.ndarray:
+    """Distance (K,) [m] from the net's centre to the target that is to be caught next.
+
+    NaN at the first time after a catch, so that curves have a gap there.
+    """
+    times, num = plan.motion.time, len(plan.catches)
+    place = np.searchsorted(np.array(plan.row["catch_times"])[:num], times - 1e-6)
+    due = np.array(plan.row["order"])[np.minimum(place, num - 1)]
+    distance = np.linalg.norm(plan.targets[due, np.arange(len(times))] - plan.centre, axis=1)
+    return np.where(np.diff(place, prepend=0) > 0, np.nan, distance)

@@ -1,17 +1,24 @@
-"""Plans along their time: samples of a trajectory, and what panels of all tasks share."""
+"""A quadrotor's plans along their time: samples of a trajectory, and the figure of them."""
 
 import dataclasses
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from planner_jax.sweep.figures import style
+from planner_jax.sweep.report import RunRows
 
 DASHED: dict[str, Any] = {"color": style.RED, "linewidth": 1.2, "linestyle": "--", "zorder": 1}
 FORBIDDEN: dict[str, Any] = {"color": style.RED, "alpha": 0.08, "linewidth": 0.0}
+_SAMPLES = 800  # of a plan
+CAPTION = (
+    "One plan along its time against the limits, beside the other planners' plans for the same "
+    "case."
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,6 +30,14 @@ class SampledMotion:
     vel: np.ndarray  # (N, 3) [m/s]
     acc: np.ndarray  # (N, 3) [m/s^2]
     jerk: np.ndarray  # (N, 3) [m/s^3]
+
+
+class Drawn(NamedTuple):
+    """A plan of the figure."""
+
+    row: dict[str, Any]  # of `plans.parquet`
+    motion: SampledMotion
+    look: dict[str, Any]  # of its curves
 
 
 def sample_motion(coeffs: Sequence[float], durations: Sequence[float], num: int) -> SampledMotion:
@@ -67,17 +82,75 @@ def body_rate(motion: SampledMotion, gravity: float) -> np.ndarray:
         return np.hypot(across, about)
 
 
-def planner_look(place: int, name: str, good: bool) -> dict[str, Any]:
+# What is drawn of a plan: (label of the axis, title, values (N,) of a motion and the gravity).
+PANELS: dict[str, tuple[str, str, Callable[[SampledMotion, float], np.ndarray]]] = {
+    "speed": ("|v| [m/s]", "Speed", lambda m, g: np.linalg.norm(m.vel, axis=1)),
+    "acceleration": ("|a| [m/s²]", "Acceleration", lambda m, g: np.linalg.norm(m.acc, axis=1)),
+    "jerk": ("|j| [m/s³]", "Jerk", lambda m, g: np.linalg.norm(m.jerk, axis=1)),
+    "body_rate": ("|ω| [rad/s]", "Body rate", body_rate),
+    "thrust": (
+        "‖τ‖ [m/s²]",
+        "Thrust per mass (dotted: hover)",
+        lambda m, g: np.linalg.norm(net_thrust(m, g), axis=1),
+    ),
+}
+
+
+def quadrotor_figure(
+    figure: Figure,
+    run: RunRows,
+    panels: Sequence[str],
+    first: Callable[[Axes, dict[str, Any], list[Drawn]], None],
+    word: Callable[[dict[str, Any]], str],
+    which: str,
+) -> None:
+    """A quadrotor's plans for the same case along their time against the limits.
+
+    Args:
+        figure: empty.
+        run: its example and the other planners' plans for the same case are shown.
+        panels: four names of `PANELS`.
+        first: draws the panel before these, from its axes, the run's setting and the plans, the
+            run's own last.
+        word: what the referee says of a row that succeeds.
+        which: what the case is of, behind its index.
+    """
+    plans, setting = run.same_case(), run.manifest["setting"]
+    axes = figure.subplots(2, 3, sharex=True)
+    drawn = [
+        Drawn(row, sample_motion(row["coeffs"], row["durations"], _SAMPLES), _look(k, name, row))
+        for k, (name, row) in enumerate(plans)
+    ][::-1]
+    first(axes[0, 0], setting, drawn)
+    for panel, name in zip(axes.flat[1:5], panels, strict=True):
+        unit, title, values = PANELS[name]
+        for plan in drawn:
+            curve = values(plan.motion, setting["gravity"])
+            panel.plot(plan.motion.time, curve, **plan.look)
+            if name == "jerk" and plan is drawn[-1]:
+                panel.set_ylim(0.0, 3.0 * np.nan_to_num(np.max(curve)) or None)
+        style.label(panel, "", unit, title)
+        if name == "thrust":
+            _draw_thrust_limits(panel, setting)
+        elif name in setting:
+            _draw_upper_limit(panel, setting[name])
+    axes[0, 2].tick_params(labelbottom=True)
+    for panel in (*axes[1, :2], axes[0, 2]):
+        panel.set_xlabel("time since planning began [s]")
+    _write_verdicts(axes[1, 2], f"Case {plans[0][1]['index']}, {which}", plans, word)
+
+
+def _look(place: int, name: str, row: dict[str, Any]) -> dict[str, Any]:
     """Of a plan's curves: dashed if it failed, thick for the first, the sweep's own."""
     return {
         "color": style.PLANNER_COLOURS.get(name, style.INK),
-        "linestyle": "-" if good else (0, (4, 1.5)),
+        "linestyle": "-" if row["success"] else (0, (4, 1.5)),
         "linewidth": 2.2 if place == 0 else 1.5,
         "zorder": 3 if place == 0 else 2,
     }
 
 
-def draw_upper_limit(axes: Axes, limit: float) -> None:
+def _draw_upper_limit(axes: Axes, limit: float) -> None:
     """A limit as a dashed line, the forbidden side above it shaded."""
     top = min(max(axes.get_ylim()[1], 1.15 * limit), 3.0 * limit)
     axes.axhline(limit, **DASHED)
@@ -85,23 +158,36 @@ def draw_upper_limit(axes: Axes, limit: float) -> None:
     axes.set_ylim(0.0, top)
 
 
-def write_verdicts(axes: Axes, case: str, plans: Sequence[tuple[str, bool, str]]) -> None:
-    """The legend, each planner with the referee's word.
+def _draw_thrust_limits(axes: Axes, setting: dict[str, Any]) -> None:
+    """Hover and limits; a bound that only follows from the acceleration's is grey, not red."""
+    gravity = setting["gravity"]
+    axes.axhline(gravity, color=style.GREY, linewidth=1.0, linestyle=":")
+    if "max_thrust" in setting:
+        _draw_upper_limit(axes, setting["max_thrust"])
+        axes.axhline(setting["min_thrust"], **DASHED)
+        axes.axhspan(0.0, setting["min_thrust"], **FORBIDDEN)
+        return
+    most = setting["acceleration"]
+    bound = gravity + most
+    axes.set_ylim(0.0, min(max(axes.get_ylim()[1], 1.1 * bound), 3.0 * most))
+    axes.axhline(bound, **{**DASHED, "color": style.GREY})
+    words = {"textcoords": "offset points", "color": style.GREY, "fontsize": 8.5}
+    axes.annotate("g + acceleration limit", (0.0, bound), (4, 3), **words)
 
-    Args:
-        axes: a panel for itself.
-        case: which one it is.
-        plans: planner, whether its plan succeeds, and what the referee says.
-    """
+
+def _write_verdicts(
+    axes: Axes,
+    case: str,
+    plans: Sequence[tuple[str, dict[str, Any]]],
+    word: Callable[[dict[str, Any]], str],
+) -> None:
+    """The legend, each planner with the referee's word."""
     axes.axis("off")
-    place = 1.0
-    text = f"{case}\nlimits: red; curves of failed plans: dashed"
-    axes.text(0.0, place, text, va="top", transform=axes.transAxes)
-    for name, good, word in plans:
-        place -= 0.22
+    look: dict[str, Any] = {"va": "top", "transform": axes.transAxes}
+    axes.text(0.0, 1.0, f"{case}\nlimits: red; curves of failed plans: dashed", **look)
+    for place, (name, row) in enumerate(plans):
+        top = 0.78 - 0.22 * place
+        text = f"success: {word(row)}" if row["success"] else f"fails: {row['sentence']}"
         colour = style.PLANNER_COLOURS.get(name, style.INK)
-        word = f"{'success' if good else 'fails'}: {word}"
-        axes.text(0.0, place, name, va="top", color=colour, weight="bold", transform=axes.transAxes)
-        axes.text(
-            0.0, place - 0.075, word, va="top", wrap=True, fontsize=9.0, transform=axes.transAxes
-        )
+        axes.text(0.0, top, name, color=colour, weight="bold", **look)
+        axes.text(0.0, top - 0.075, text, wrap=True, fontsize=9.0, **look)

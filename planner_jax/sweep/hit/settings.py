@@ -15,9 +15,6 @@ class HitSettings(SweepSettings):
 
     `num` is by default the whole folder, or `DEFAULT_NUM` drawn serves; `seed` is of drawn serves
     and of uniform starts.
-
-    Raises:
-        SettingError: a value breaks its rule.
     """
 
     limit_scale: float = option(1.0, "F", "factor on the speed, acceleration and body-rate limits")
@@ -31,6 +28,8 @@ class HitSettings(SweepSettings):
     )
 
     RUN: ClassVar[str] = "planner_jax.sweep.hit.sweep:HitSweep"
+    DRAW: ClassVar[tuple[str, ...]] = ("start", "delay", "limit_scale")
+    JUDGE: ClassVar[tuple[str, ...]] = ("drag_after_impact",)
     DEFAULT_NUM: ClassVar[int] = 9000
     CPU_BATCH: ClassVar[int] = 4608  # one block of the serve generator
 
@@ -48,14 +47,6 @@ class HitSettings(SweepSettings):
     def planner_options(self) -> dict[str, Any]:
         """Fields of the planner's dataclass that these settings decide."""
         return {"drag_after_impact": True} if self.drag_after_impact else {}
-
-    def draw_options(self) -> dict[str, Any]:
-        """What is made of serves."""
-        return {"start": self.start, "delay": self.delay, "limit_scale": self.limit_scale}
-
-    def judge_options(self) -> dict[str, Any]:
-        """Whether the drag acts on the returned ball too."""
-        return {"drag_after_impact": self.drag_after_impact}
 
 
 def _checked_start(start: Any) -> tuple[float, ...] | str:

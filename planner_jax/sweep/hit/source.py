@@ -22,12 +22,7 @@ class ServeSource(Source):
     folder: Serves | None  # the serves of the published files, if these were asked for
 
     def cases(self, first: int, last: int) -> Chunk:
-        """The cases from place `first` up to `last`, that one left out, checked.
-
-        Raises:
-            SettingError: a ball is down before planning begins, or a value of a case breaks a
-                rule.
-        """
+        """As `Source.cases`; a ball that is down before planning begins breaks a rule, too."""
         settings: HitSettings = self.settings
         if self.folder is not None:
             serves = self.folder[first:last]
@@ -56,21 +51,14 @@ class ServeSource(Source):
             return {"serves": {"source": "generated", "distinct": self.num, "sha256": None}}
         used = self.folder[: self.num]
         balls = np.column_stack([used.position, used.velocity])
-        digest = hashlib.sha256(np.column_stack([balls, used.target]).tobytes())
-        known = {
-            "source": self.settings.serves,
-            "distinct": len(np.unique(balls, axis=0)),
-            "sha256": digest.hexdigest(),
-        }
+        digest = hashlib.sha256(np.column_stack([balls, used.target]).tobytes()).hexdigest()
+        distinct = len(np.unique(balls, axis=0))
+        known = {"source": self.settings.serves, "distinct": distinct, "sha256": digest}
         return {"serves": known}
 
 
 def open_source(settings: HitSettings, batch: int) -> ServeSource:
-    """The source of a sweep's serves; a folder is read and checked whole.
-
-    Args:
-        settings: of the sweep.
-        batch: cases a chunk, where the settings name none.
+    """As `Sweep.open_source`; a folder is read and checked whole.
 
     Raises:
         SettingError: the suite is of another package, the folder is missing, a row of it is not
@@ -83,7 +71,6 @@ def open_source(settings: HitSettings, batch: int) -> ServeSource:
         raise SettingError(str(error)) from error
     fields = filled_in(settings, settings.DEFAULT_NUM if folder is None else len(folder), batch)
     if folder is not None and fields["num"] > len(folder):
-        raise SettingError(
-            f"num must be <= {len(folder)}, the serves that the folder holds, got {fields['num']}"
-        )
+        rule = f"num must be <= {len(folder)}, the serves that the folder holds"
+        raise SettingError(f"{rule}, got {fields['num']}")
     return ServeSource(**fields, folder=folder)

@@ -1,12 +1,12 @@
 """What hits add to a sweep: serves, the 36 scenarios of the court, and their published rates."""
 
-import dataclasses
 from collections import Counter
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
+from planner_jax.sweep.figures.motion import CAPTION as MOTION
 from planner_jax.sweep.hit.columns import COLUMNS, FRAME, published_column
 from planner_jax.sweep.hit.figures.court import court_figure
 from planner_jax.sweep.hit.figures.motion import motion_figure
@@ -24,24 +24,23 @@ class HitTally(Tally):
 
     def __init__(self) -> None:
         super().__init__()
-        self.scenario_num: Counter[str] = Counter()
-        self.scenario_successes: Counter[str] = Counter()
-        self.published: dict[str, Counter[str]] = {name: Counter() for name in court.PLANNERS}
-        self.published_num: dict[str, Counter[str]] = {name: Counter() for name in court.PLANNERS}
+        self._num: Counter[str] = Counter()  # by scenario
+        self._successes: Counter[str] = Counter()
+        self._published: Counter[tuple[str, str]] = Counter()  # by planner and scenario
+        self._num_published: Counter[tuple[str, str]] = Counter()
 
     def add(self, rows: pa.Table) -> None:
         """Count some rows of `plans.parquet`."""
         super().add(rows)
         scenario = rows["scenario"].to_numpy()
-        success = rows["success"].to_numpy().astype(bool)
-        self.scenario_num.update(scenario)
-        self.scenario_successes.update(scenario[success])
+        self._num.update(scenario)
+        self._successes.update(scenario[rows["success"].to_numpy().astype(bool)])
         for planner in court.PLANNERS:
             outcome = rows[published_column(planner)]
             known = outcome.is_valid().to_numpy().astype(bool)
             solved = outcome.fill_null(False).to_numpy().astype(bool)
-            self.published_num[planner].update(scenario[known])
-            self.published[planner].update(scenario[solved])
+            self._num_published.update((planner, name) for name in scenario[known])
+            self._published.update((planner, name) for name in scenario[solved])
 
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
         """Which rows (B,) make examples, the best kind first."""
@@ -50,32 +49,28 @@ class HitTally(Tally):
         return [left_to_far, *super().examples(rows, success)]
 
     def summary(self) -> dict[str, Any]:
-        """Rates as fractions, 0 to 1, for the manifest."""
+        """Rates as fractions, 0 to 1, for the manifest; published ones of these very serves."""
         per_scenario = {
             name: {
-                "num": self.scenario_num[name],
-                "successes": self.scenario_successes[name],
-                "success_rate": self.scenario_successes[name] / self.scenario_num[name],
-                "published_on_these_serves": self._published_rates(name),
+                "num": self._num[name],
+                "successes": self._successes[name],
+                "success_rate": self._successes[name] / self._num[name],
+                "published_on_these_serves": {
+                    planner: self._published[planner, name] / self._num_published[planner, name]
+                    for planner in court.PLANNERS
+                    if self._num_published[planner, name]
+                },
             }
             for name in court.SCENARIOS
-            if self.scenario_num[name]
+            if self._num[name]
         }
         return {**super().summary(), "per_scenario": per_scenario}
-
-    def _published_rates(self, scenario: str) -> dict[str, float]:
-        """Published rates of a scenario on the very serves of the sweep, where known."""
-        return {
-            planner: self.published[planner][scenario] / self.published_num[planner][scenario]
-            for planner in court.PLANNERS
-            if self.published_num[planner][scenario]
-        }
 
 
 class HitSweep(Sweep):
     """Quadrotors that return served balls with a racket."""
 
-    frame = FRAME
+    frame, own_columns = FRAME, COLUMNS
     figures = (
         RunFigure(
             "court.png",
@@ -85,14 +80,7 @@ class HitSweep(Sweep):
             (9.0, 10.6),
             court_figure,
         ),
-        RunFigure(
-            "motion.png",
-            "One plan along its time against the limits, beside the other planners' plans for "
-            "the same serve.",
-            (13.0, 6.8),
-            motion_figure,
-            compares=True,
-        ),
+        RunFigure("motion.png", MOTION, (13.0, 6.8), motion_figure, compares=True),
         RunFigure(
             "rates.png",
             "Success per scenario with 95 % Wilson intervals, beside the published rates.",
@@ -102,10 +90,6 @@ class HitSweep(Sweep):
     )
     failure_words = {"case": "index", "scenario": "scenario", **Sweep.failure_words}
 
-    def columns(self, batch: Any) -> Any:
-        """The columns of `plans.parquet`."""
-        return COLUMNS
-
     def open_source(self, settings: HitSettings, batch: int) -> ServeSource:
         """The source of a sweep's serves."""
         return open_source(settings, batch)
@@ -113,9 +97,7 @@ class HitSweep(Sweep):
     def setting(self, cases: Any) -> dict[str, Any]:
         """Physics and limits that all cases have in common, for the manifest."""
         setting = first_values(cases, ["drag", "gravity", "restitution", "racket_height"])
-        for group in (cases.limits, cases.hit_limits):
-            setting |= first_values(group, [field.name for field in dataclasses.fields(group)])
-        return setting
+        return setting | first_values(cases.limits) | first_values(cases.hit_limits)
 
     def tally(self, settings: HitSettings) -> HitTally:
         """An empty count of rows."""
@@ -123,20 +105,19 @@ class HitSweep(Sweep):
 
     def table(self, manifest: dict[str, Any]) -> RateTable:
         """Success per scenario in percent, beside the published rates of `compared_with`."""
-        planner = manifest["parameters"]["planner"]
-        other, summary = compared_with(planner), manifest["summary"]
+        planner, summary = manifest["parameters"]["planner"], manifest["summary"]
+        other = compared_with(planner)
         published, column = court.published_rates(), court.PLANNERS.index(other)
+        beside = [rates[:, column] for rates in (published.paper, published.trials)]
         header = ["scenario", "cases", f"{planner} %", "95 % interval"]
         header += [f"{other}, paper %", f"{other}, trial files %"]
         same = _knows_same_serves(summary, other)
         header += [f"{other}, same serves %"] if same else []
-        rows: list[list[str]] = []
-        known, solved = 0, 0.0
+        rows, known, solved = [], 0, 0.0
         for place, name in enumerate(court.SCENARIOS):
             counts = summary["per_scenario"].get(name)
             own = own_cells(counts["successes"], counts["num"]) if counts else ["0", "", ""]
-            row = [name, *own]
-            row += [f"{rates[place, column]:.1f}" for rates in (published.paper, published.trials)]
+            row = [name, *own, *(f"{rates[place]:.1f}" for rates in beside)]
             if same:
                 rate = counts["published_on_these_serves"].get(other) if counts else None
                 row.append("" if rate is None else f"{100.0 * rate:.1f}")
@@ -144,32 +125,24 @@ class HitSweep(Sweep):
                     known, solved = known + counts["num"], solved + counts["num"] * rate
             rows.append(row)
         total = ["all", *own_cells(summary["successes"], summary["num"])]
-        total += [f"{rates[:, column].mean():.2f}" for rates in (published.paper, published.trials)]
+        total += [f"{rates.mean():.2f}" for rates in beside]
         total += [f"{100.0 * solved / known:.2f}"] if same else []
         return RateTable("Success per scenario", header, [*rows, total], strong=len(rows))
 
     def remarks(self, manifest: dict[str, Any]) -> list[str]:
         """Where the numbers come from, a sentence each."""
         summary, settings = manifest["summary"], manifest["parameters"]
-        other = compared_with(settings["planner"])
-        origin = f"Serves: {summary['num']:,} cases of published trial files"
-        if settings["serves"] is None:
-            origin = (
-                f"Serves: {summary['num']:,} drawn from the published law, suite "
-                f"{settings['suite']}, seed {settings['seed']}"
-            )
-        start = settings["start"]
+        other, start = compared_with(settings["planner"]), settings["start"]
+        law = f"drawn from the published law, suite {settings['suite']}, seed {settings['seed']}"
+        origin = "cases of published trial files" if settings["serves"] else law
         start = "uniform over the half court" if start == "uniform" else f"{tuple(start)} m"
         truth = "with" if settings["drag_after_impact"] else "without"
         same = ""
         if _knows_same_serves(summary, other):
-            same = (
-                '"Same serves" are the published outcomes of the very cases of this run, where '
-                "known. "
-            )
+            same = '"Same serves" are the published outcomes of this run\'s cases, where known. '
         return [
-            f"{origin}; {manifest['serves']['distinct']:,} distinct balls (cases may share a ball "
-            "and differ in the target).",
+            f"Serves: {summary['num']:,} {origin}; {manifest['serves']['distinct']:,} distinct "
+            "balls (cases may share a ball and differ in the target).",
             f"Hover start {start}; planning begins {settings['delay']:g} s after the serve; speed, "
             f"acceleration and body-rate limits x {settings['limit_scale']:g}; returned ball "
             f"{truth} drag.",

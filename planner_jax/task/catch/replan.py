@@ -24,11 +24,7 @@ from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.chain import CatchContext, targets_at
 from planner_jax.task.catch.exact import ExactCatch
 from planner_jax.task.catch.plan import CatchPlan
-from planner_jax.trajectory.polynomial import (
-    PiecewisePolynomial,
-    state_basis,
-    states_at,
-)
+from planner_jax.trajectory.polynomial import PiecewisePolynomial, state_basis, states_at
 from planner_jax.trajectory.proportional_minco import boundary_rows
 
 _ORDERS = 4  # position to jerk

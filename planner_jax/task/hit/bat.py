@@ -191,21 +191,10 @@ class BatHit(OptimisedPlanner):
         case, time = context.case, jnp.exp(natural[0])
         ball = target_at(context.path, time)
         hit = decoupled_hit(
-            ball,
-            case.target,
-            natural[1:3],
-            natural[3:5],
-            case.restitution,
-            case.gravity,
+            ball, case.target, natural[1:3], natural[3:5], case.restitution, case.gravity
         )
         impact = make_impact(
-            time,
-            hit.flight_time,
-            ball,
-            hit.ball_vel_after,
-            hit.racket_vel,
-            hit.thrust,
-            case,
+            time, hit.flight_time, ball, hit.ball_vel_after, hit.racket_vel, hit.thrust, case
         )
         return impact, hit.defect
 

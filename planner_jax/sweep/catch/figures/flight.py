@@ -7,59 +7,51 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from planner_jax.sweep.catch.figures.net import NetMotion, at_catches, net_motion
-from planner_jax.sweep.catch.targets import target_positions
+from planner_jax.sweep.catch.targets import SampledCatch, sampled_catch
 from planner_jax.sweep.figures import style
+from planner_jax.sweep.figures.motion import sample_motion
 from planner_jax.sweep.report import RunRows
 
 _SAMPLES = 1601
 _ROTORS = 0.165  # [m], half the diagonal between the paper's propellers
 _CLOSE, _AROUND = 0.5, 0.4  # [m], half side of a close-up; [s], the way shown in it
-_TARGET_COLOURS = (style.ORANGE, style.GREEN, style.PURPLE, style.SKY, "#8C564B", style.INK)
+_TARGETS = (style.ORANGE, style.GREEN, style.PURPLE, style.SKY, "#8C564B", style.INK)
 
 
 def flight_figure(figure: Figure, run: RunRows) -> None:
-    """The example from the side and from above, with a close-up of every catch.
-
-    Args:
-        figure: empty.
-        run: its example is shown.
-    """
+    """The example from the side and from above, with a close-up of every catch."""
     setting, (_, row) = run.manifest["setting"], run.same_case()[0]
-    net = net_motion(row, setting, _SAMPLES)
-    targets = target_positions(row, net.motion.time)
+    motion = sample_motion(row["coeffs"], row["durations"], _SAMPLES)
+    plan = sampled_catch(row, motion, setting)
     parts: Any = figure.subfigures(1, 2, width_ratios=[3.0, 1.6])
     left, right = parts
-    low, high = _window(row, net, targets)
-    spans = (high - low)[[2, 1]]
-    views = left.subplots(2, 1, sharex=True, height_ratios=spans)
+    low, high = _window(plan)
+    views = left.subplots(2, 1, sharex=True, height_ratios=(high - low)[[2, 1]])
     for axes, second in zip(views, (2, 1), strict=True):
-        _draw_view(axes, row, net, targets, second, setting["net_radius"])
+        _draw_view(axes, plan, second)
         axes.set(xlim=(low[0], high[0]), ylim=(low[second], high[second]), aspect="equal")
     views[0].axhline(setting["min_height"], color=style.RED, linewidth=1.2, linestyle="--")
     end = "success" if row["success"] else row["sentence"]
     style.label(views[0], "", "z [m]", f"Case {row['index']} from the side ({end})")
     style.label(views[1], "x [m]", "y [m]", "From above")
-    catches = at_catches(row, net.motion.time)
-    panels = right.subplots(max(-(-len(catches) // 2), 2), 2 if len(catches) > 2 else 1).flat
-    for place, (axes, at) in enumerate(zip(panels, catches, strict=False)):
-        _draw_view(axes, row, net, targets, 2, setting["net_radius"], only=place)
-        x, _, z = np.nan_to_num(net.centre[at])
+    num = len(plan.catches)
+    panels = right.subplots(max(-(-num // 2), 2), 2 if num > 2 else 1).flat
+    for place, (axes, at) in enumerate(zip(panels, plan.catches, strict=False)):
+        _draw_view(axes, plan, 2, only=place)
+        x, _, z = np.nan_to_num(plan.centre[at])
         axes.set(xlim=(x - _CLOSE, x + _CLOSE), ylim=(z - _CLOSE, z + _CLOSE), aspect="equal")
         axes.tick_params(labelsize=8)
-        style.label(axes, "", "", f"Catch {place + 1}, {net.motion.time[at]:.2f} s")
-    for axes in panels[len(catches) :]:
+        style.label(axes, "", "", f"Catch {place + 1}, {motion.time[at]:.2f} s")
+    for axes in panels[num:]:
         axes.axis("off")
     _legend(figure)
 
 
-def _window(
-    row: dict[str, Any], net: NetMotion, targets: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _window(plan: SampledCatch) -> tuple[np.ndarray, np.ndarray]:
     """Least and greatest coordinates (3,) [m] that hold the plan and every target until caught."""
-    catches = at_catches(row, net.motion.time)
-    paths = [targets[row["order"][place]][: at + 1] for place, at in enumerate(catches)]
-    points = np.concatenate([net.motion.pos, net.centre, *paths])
+    caught = zip(plan.row["order"], plan.catches, strict=False)
+    paths = [plan.targets[target][: at + 1] for target, at in caught]
+    points = np.concatenate([plan.motion.pos, plan.centre, *paths])
     points = np.nan_to_num(points)  # of a plan that is not finite too
     low, high = points.min(axis=0), points.max(axis=0)
     # No side is so short that its panel cannot be read.
@@ -68,45 +60,33 @@ def _window(
     return middle - half, middle + half
 
 
-def _draw_view(
-    axes: Axes,
-    row: dict[str, Any],
-    net: NetMotion,
-    targets: np.ndarray,
-    second: int,
-    radius: float,
-    only: int | None = None,
-) -> None:
+def _draw_view(axes: Axes, plan: SampledCatch, second: int, only: int | None = None) -> None:
     """Paths and catches in the plane of x and a second axis; `only` one catch, close up."""
-    catches = at_catches(row, net.motion.time)
-    where = [0, second]
+    where, catches, time = [0, second], plan.catches, plan.motion.time
     for place, at in enumerate(catches):
         if only not in (None, place):
             continue
-        target = row["order"][place]
-        path, colour = targets[target][:, where], _TARGET_COLOURS[target % len(_TARGET_COLOURS)]
+        target = plan.row["order"][place]
+        path, colour = plan.targets[target][:, where], _TARGETS[target % len(_TARGETS)]
         axes.plot(*path[: at + 1].T, color=colour, linewidth=1.6)
         axes.plot(*path[at:].T, color=colour, linewidth=1.0, linestyle=":", alpha=0.7)
         axes.plot(*path[0], "s", color=colour, markersize=4)
         axes.plot(*path[at], "o", color=colour, markersize=5, mec=style.INK, zorder=6)
-    near = np.abs(net.motion.time - net.motion.time[catches[only]]) if only is not None else 0.0
-    pos = net.motion.pos[np.broadcast_to(near, len(targets[0])) <= _AROUND][:, where]
-    axes.plot(*pos.T, color=style.BLUE, linewidth=2.0, zorder=3)
+    near = 0.0 * time if only is None else np.abs(time - time[catches[only]])
+    axes.plot(*plan.motion.pos[near <= _AROUND][:, where].T, color=style.BLUE, lw=2.0, zorder=3)
     for at in (0, *catches) if only is None else (catches[only],):
-        _draw_quadrotor(axes, net, at, where, radius, 0.35 if at == 0 else 1.0)
+        _draw_quadrotor(axes, plan, at, where, 0.35 if at == 0 else 1.0)
 
 
-def _draw_quadrotor(
-    axes: Axes, net: NetMotion, at: int, where: list[int], radius: float, alpha: float
-) -> None:
+def _draw_quadrotor(axes: Axes, plan: SampledCatch, at: int, where: list, alpha: float) -> None:
     """Hoop, stick and rotor circle at one time."""
-    axis, centre, pos = net.axis[at], net.centre[at], net.motion.pos[at]
+    axis, centre, pos = plan.axis[at], plan.centre[at], plan.motion.pos[at]
     across = np.cross(axis, [0.0, 1.0, 0.0])
     across /= max(np.linalg.norm(across), 1e-9)
     turn = np.linspace(0.0, 2.0 * np.pi, 41)[:, None]
     circle = np.cos(turn) * across + np.sin(turn) * np.cross(axis, across)
     look: dict[str, Any] = {"alpha": alpha, "zorder": 5}
-    axes.plot(*(centre + radius * circle)[:, where].T, color=style.RED, linewidth=1.5, **look)
+    axes.plot(*(centre + plan.radius * circle)[:, where].T, color=style.RED, linewidth=1.5, **look)
     axes.plot(*(pos + _ROTORS * circle)[:, where].T, color=style.BLUE, linewidth=1.2, **look)
     axes.plot(*np.stack([pos, centre])[:, where].T, color=style.GREY, linewidth=1.2, **look)
 

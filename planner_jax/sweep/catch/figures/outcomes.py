@@ -16,12 +16,7 @@ _COLOURS = (style.BLUE, style.ORANGE, style.GREEN, style.PURPLE, style.SKY, styl
 
 
 def outcomes_figure(figure: Figure, run: RunRows) -> None:
-    """Rates, failures and a histogram of the catches that hold, by their place in the order.
-
-    Args:
-        figure: empty.
-        run: all of it is shown.
-    """
+    """Rates, failures and a histogram of the catches that hold, by their place in the order."""
     suite: Any = SUITES.get(run.manifest["parameters"]["suite"])
     rates = (suite.success, suite.mpp_success) if suite else (None, None)
     labelled = zip(("Catch\nPlanner,\npaper", "MPP,\npaper"), rates, strict=True)
@@ -32,13 +27,9 @@ def outcomes_figure(figure: Figure, run: RunRows) -> None:
     if not caught.any():
         return
     places, edges = range(caught.shape[1]), np.linspace(0.0, 1.02 * times[caught].max(), 41)
-    axes.hist(
-        [times[caught[:, place], place] for place in places],
-        edges,
-        stacked=True,
-        color=[_COLOURS[place % len(_COLOURS)] for place in places],
-        label=[_PLACES[place % len(_PLACES)] for place in places],
-    )
+    held = [times[caught[:, place], place] for place in places]
+    colours, labels = ([kind[k % len(kind)] for k in places] for kind in (_COLOURS, _PLACES))
+    axes.hist(held, edges, stacked=True, color=colours, label=labels)
     axes.set_xlim(edges[0], edges[-1])
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     axes.axvline(times[caught].mean(), color=style.INK, linewidth=1.2, linestyle="--", label="mean")

@@ -1,6 +1,5 @@
 """Success per scenario, beside what was published."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -16,12 +15,7 @@ _WIDTH = 0.26
 
 
 def rates_figure(figure: Figure, run: RunRows) -> None:
-    """A bar a scenario with its Wilson interval, and both published rates of `compared_with`.
-
-    Args:
-        figure: empty.
-        run: whose manifest is shown.
-    """
+    """A bar a scenario with its Wilson interval, and both published rates of `compared_with`."""
     manifest = run.manifest
     summary, name = manifest["summary"], manifest["parameters"]["planner"]
     other = compared_with(name)
@@ -36,17 +30,11 @@ def rates_figure(figure: Figure, run: RunRows) -> None:
             (0.0, published.paper, style.PALE, "paper, Table I"),
             (0.28, published.trials, style.SKY, "trial files"),
         ):
-            axes.bar(
-                np.arange(len(places)) + shift,
-                rates[places, column],
-                _WIDTH,
-                color=colour,
-                label=f"{other}: {source}",
-            )
+            look: dict[str, Any] = {"color": colour, "label": f"{other}: {source}"}
+            axes.bar(np.arange(len(places)) + shift, rates[places, column], _WIDTH, **look)
         axes.set_xticks(range(len(places)), [court.SCENARIOS[i] for i in places])
         axes.grid(axis="x", visible=False)
-        axes.set_ylim(0.0, 104.0)
-        axes.set_xlim(-0.6, len(places) - 0.4)
+        axes.set(xlim=(-0.6, len(places) - 0.4), ylim=(0.0, 104.0))
         style.label(axes, "", "success [%]", f"Served from {words[serve]}")
     panels["F"].set_ylabel("")
     panels["L"].set_xlabel(
@@ -56,24 +44,17 @@ def rates_figure(figure: Figure, run: RunRows) -> None:
     legend.set_in_layout(False)
 
 
-def _draw_bars(
-    axes: Axes, per_scenario: dict[str, Any], places: Sequence[int], planner: str
-) -> None:
+def _draw_bars(axes: Axes, counted: dict[str, Any], places: list[int], planner: str) -> None:
     """The run's own rates with their intervals; a gap for a scenario without cases."""
-    counts = [per_scenario.get(court.SCENARIOS[i], {"successes": 0, "num": 0}) for i in places]
+    counts = [counted.get(court.SCENARIOS[i], {"successes": 0, "num": 0}) for i in places]
     num = np.array([count["num"] for count in counts])
     rates = 100.0 * np.array([count["successes"] for count in counts]) / np.maximum(num, 1)
     ends = np.array([wilson_interval(count["successes"], count["num"]) for count in counts])
-    axes.bar(
-        np.arange(len(places)) - 0.28,
-        np.where(num > 0, rates, np.nan),
-        _WIDTH,
-        yerr=np.abs(100.0 * ends.T - rates),
-        color=style.PLANNER_COLOURS.get(planner, style.INK),
-        ecolor=style.INK,
-        error_kw={"linewidth": 0.9, "capsize": 1.5},
-        label=f"{planner}: this run",
-    )
+    look: dict[str, Any] = {"color": style.PLANNER_COLOURS.get(planner, style.INK)}
+    look |= {"ecolor": style.INK, "error_kw": {"linewidth": 0.9, "capsize": 1.5}}
+    look["label"] = f"{planner}: this run"
+    known, off = np.where(num > 0, rates, np.nan), np.abs(100.0 * ends.T - rates)
+    axes.bar(np.arange(len(places)) - 0.28, known, _WIDTH, yerr=off, **look)
 
 
 def compared_with(planner: str) -> str:

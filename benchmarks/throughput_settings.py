@@ -1,0 +1,37 @@
+"""What `planner-jax bench throughput` is asked to do; imports no JAX."""
+
+import dataclasses
+from typing import ClassVar
+
+from planner_jax.sweep.settings import option, require
+
+
+@dataclasses.dataclass(frozen=True)
+class ThroughputSettings:
+    """The arguments of a measurement.
+
+    Raises:
+        SettingError: a value breaks its rule.
+    """
+
+    task: str = option("hit", "NAME", "whose cases are planned")
+    planner: str | None = option(None, "NAME", "(default: the task's first)")
+    suite: str | None = option(None, "NAME", "(default: the task's first)")
+    batch: tuple[int, ...] = option((1024, 8192), "B", "plans in one call, one or more sizes")
+    devices: int | None = option(None, "N", "how many share a batch (default: all)")
+    iterations: int | None = option(None, "K", "of the first round (default: the planner's own)")
+    repeat: int = option(5, "R", "timed calls")
+    seed: int = option(0, "K", "of the cases")
+    agree: bool = option(False, "", "compare the first lanes with those of a CPU, too")
+
+    DESCRIPTION: ClassVar[str] = (
+        "Plans a second of batches that stay on the devices, with what the referee says of them,\n"
+        "the cost beside a long search's, compile time and memory."
+    )
+
+    def __post_init__(self) -> None:
+        for name in ("devices", "iterations", "repeat"):
+            value = getattr(self, name)
+            require(value is None or value >= 1, name, ">= 1", value)
+        require(min(self.batch) >= 1, "batch", ">= 1", min(self.batch))
+        require(self.seed >= 0, "seed", ">= 0", self.seed)
