@@ -3,7 +3,8 @@
 import dataclasses
 from typing import ClassVar
 
-from planner_jax.sweep.settings import option, require
+from planner_jax.registry import task_named
+from planner_jax.sweep.settings import SweepSettings, option, require
 
 
 @dataclasses.dataclass(frozen=True)
@@ -12,6 +13,7 @@ class ThroughputSettings:
 
     Raises:
         SettingError: a value breaks its rule.
+        UnknownName: there is no such task.
     """
 
     task: str = option("hit", "NAME", "whose cases are planned")
@@ -34,4 +36,4 @@ class ThroughputSettings:
             value = getattr(self, name)
             require(value is None or value >= 1, name, ">= 1", value)
         require(min(self.batch) >= 1, "batch", ">= 1", min(self.batch))
-        require(self.seed >= 0, "seed", ">= 0", self.seed)
+        SweepSettings(self.planner, self.suite, seed=self.seed).of(task_named(self.task))

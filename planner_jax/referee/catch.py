@@ -171,7 +171,7 @@ def referee_catches(
     leaves["target vel"] = checked_leaf("target_states' vel", vel, (*shape, 3))
     judge = functools.partial(
         _judge,
-        extras=cases.extras,
+        extras=getattr(cases, "extras", ()),
         intervals=intervals_of(samples, leaves["durations"].shape[1] // shape[1]),
         net_test=net_test,
         tolerances={

@@ -145,7 +145,7 @@ def referee_hits(
     }
     judge = functools.partial(
         _judge,
-        extras=cases.extras,
+        extras=getattr(cases, "extras", ()),
         intervals=intervals_of(samples, leaves["durations"].shape[1]),
         drag_after_impact=drag_after_impact,
         tolerances=tolerances,
