@@ -1,6 +1,7 @@
 """Limits and costs of a user's own along the way, planned by `exact` and judged by the referee."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,24 +21,26 @@ TRACES = []
 
 
 @struct.dataclass
-class Ceiling:
+class Gentle:
     """A limit of this test's own, which notes on what it is called."""
 
-    height: jax.Array  # () [m]
+    acceleration: Any  # () [m/s^2], horizontal
 
     def excess(self, pos, vel, acc):
         TRACES.append(isinstance(pos, np.ndarray))
-        return pos[..., 2] / self.height - 1.0
+        return (acc[..., :2] ** 2).sum(-1) / self.acceleration**2 - 1.0
 
 
-def having(cases, centre=FAR, radius=1.0, disliked=FAR, weight=0.0, height=99.0):
+def having(
+    cases, centre=FAR, radius: Any = 1.0, disliked=FAR, weight=0.0, acceleration: Any = 99.0
+):
     """Cases with three extras, which change nothing unless told: all of one compiled program."""
     batch = cases.batch_shape
     full = lambda value: np.broadcast_to(np.asarray(value, np.float32), batch)  # noqa: E731
     zones = (
         pj.KeepOut(np.asarray(centre[: batch[0]], np.float32), full(radius)),
         pj.Dislike(np.asarray(disliked[: batch[0]], np.float32), full(0.4), full(weight)),
-        Ceiling(full(height)),
+        Gentle(full(acceleration)),
     )
     return cases.replace(extras=zones)
 
@@ -47,6 +50,16 @@ def way(plans, k, num=200):
     path = pj.lane(plans.trajectory, k)
     many = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf)[None], num, axis=0), path)
     return states_at(many, np.linspace(0.0, path.durations.sum(), num))[:, 0]
+
+
+def places(plans):
+    """Of each way the place (3,) half as far from its start as its end is."""
+    found = []
+    for k in range(NUM):
+        flown = way(plans, k)
+        distance = np.linalg.norm(flown - flown[0], axis=1)
+        found.append(flown[np.argmax(distance > 0.5 * distance[-1])])
+    return np.array(found)
 
 
 @pytest.fixture(scope="module")
@@ -61,13 +74,13 @@ def free(hits):
 
 @pytest.fixture(scope="module")
 def middle(free):
-    return np.array([way(free, k)[100] for k in range(NUM)])
+    return places(free)
 
 
 @pytest.fixture(scope="module")
 def blocked(hits, middle):
-    """The same hits, a sphere in the middle of each free way; radii of their own."""
-    return having(hits, middle, np.array([0.2, 0.25, 0.15, 0.2]))
+    """The same hits, a sphere beside the middle of each free way; radii of their own."""
+    return having(hits, middle + np.array([0.0, 0.03, 0.0]), np.array([0.2, 0.25, 0.15, 0.2]))
 
 
 @pytest.fixture(scope="module")
@@ -131,8 +144,8 @@ def test_a_blocked_way_is_planned_around_and_the_referee_says_which_was_not(
     assert pj.solved(free).all() and pj.hit.judge(hits, free).success.all()
     verdict = pj.hit.judge(blocked, free)
     assert (verdict.failed_limit == "extra").all() and (verdict.worst_extra == 0).all()
-    assert verdict.failed_excess.min() > 0.9
-    assert "beyond extras[0] of the case at 0." in verdict.sentence(0)
+    assert verdict.failed_excess.min() > 0.7
+    assert "beyond extras[0] of the case at " in verdict.sentence(0)
     assert pj.solved(around).all()
     verdict = pj.hit.judge(blocked, around)
     assert verdict.success.all(), [verdict.sentence(k) for k in range(4)]
@@ -174,18 +187,17 @@ def test_lanes_of_a_batch_are_those_planned_alone(blocked, around):
 def test_another_value_compiles_nothing_anew(hits, around):
     traced = TRACES.count(False)
     assert traced
-    pj.plan(HIT, having(hits, radius=0.3, height=7.0))
+    pj.plan(HIT, having(hits, radius=0.3, acceleration=30.0))
     assert TRACES.count(False) == traced
 
 
 def test_a_class_of_ones_own_is_planned_with_and_judged(hits, free):
-    heights = [way(free, k)[:, 2] for k in range(NUM)]
-    room = np.array([height.max() / max(height[0], height[-1]) for height in heights])
-    k = int(room.argmax())  # the way that rises most above its ends, so that it can be lower
-    assert room[k] > 1.01
-    lower = having(pj.lane(hits, slice(k, k + 1)), height=heights[k].max() / room[k] ** 0.7)
-    assert pj.hit.judge(lower, pj.lane(free, slice(k, k + 1))).worst_extra == 2
-    verdict = pj.hit.judge(lower, pj.plan(HIT, lower))
+    samples = pj.lane(free, 0).sample(200.0)
+    taken = np.linalg.norm(samples.acc[:, :2], axis=1).max()
+    gentle = having(hits, acceleration=np.r_[0.8 * taken, [99.0] * (NUM - 1)])
+    verdict = pj.hit.judge(gentle, free)
+    assert list(verdict.failed_limit) == ["extra", "", "", ""] and verdict.worst_extra[0] == 2
+    verdict = pj.hit.judge(gentle, pj.plan(HIT, gentle))
     assert verdict.success.all(), verdict.sentence(0)
     assert TRACES.count(True)  # by the referee
 
@@ -200,37 +212,41 @@ def test_a_cost_moves_the_way(hits, free, middle):
         assert after > before + 0.05
 
 
-def test_a_catch_stays_inside_a_fence():
-    case = jax.tree.map(np.asarray, pj.lane(pj.catch.draw(1, "throws", seed=3), slice(0, 1)))
-    free = pj.plan(CATCH, case)
-    assert pj.catch.judge(case, free).success.all()
-    flown = way(free, 0)
-    ends = flown[[0, -1]]
-    low, high = ends.min(axis=0) - 0.12, ends.max(axis=0) + 0.12
-    outside = np.maximum(flown - high, low - flown).max(axis=0)
-    axis = int(outside.argmax())
-    assert outside[axis] > 0.02, outside
-    fenced = case.replace(extras=for_batch((pj.Geofence(low, high),), (1,), np.float32))
-    assert pj.catch.judge(fenced, free).failed_limit[0] == "extra"
+def test_catches_stay_inside_a_fence():
+    """Each may go 85 % as far from its start, along one axis, as the catch that is free."""
+    cases = jax.tree.map(np.asarray, pj.catch.draw(NUM, "throws", seed=3))
+    free = pj.plan(CATCH, cases)
+    assert pj.catch.judge(cases, free).success.all()
+    low, high = -FAR, FAR.copy()
+    for k in range(NUM):
+        first, last = way(free, k)[[0, -1]]
+        axis = np.abs(last - first).argmax()
+        reach = 0.85 * abs(last - first)[axis]
+        low[k, axis], high[k, axis] = first[axis] - reach, first[axis] + reach
+    fenced = cases.replace(extras=for_batch((pj.Geofence(low, high),), (NUM,), np.float32))
+    verdict = pj.catch.judge(fenced, free)
+    assert (verdict.failed_limit == "extra").all() and (verdict.worst_extra == 0).all()
     kept = pj.plan(CATCH, fenced)
     verdict = pj.catch.judge(fenced, kept)
-    assert pj.solved(kept).all() and verdict.success.all(), verdict.sentence(0)
+    assert pj.solved(kept).all() and verdict.success.all(), verdict.failed_limit
 
 
 @pytest.mark.slow
-def test_the_gradient_by_a_radius_is_that_of_plans_made_anew(blocked, float64):
-    case = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), pj.lane(blocked, 0))
+def test_the_gradient_by_a_radius_is_that_of_plans_made_anew(hits, float64):
     solver = pj.LbfgsConfig(max_steps=2000, tolerance=1e-13, patience=40)
-    found = pj.gradient(HIT, case, of="cost", by="extras.0.radius", steps=0, solver=solver)
+    long = HIT.with_solver(solver)
+    double = lambda cases: jax.tree.map(lambda leaf: np.asarray(leaf, float), cases)  # noqa: E731
+    centre = places(pj.plan(long, double(having(hits)))) + np.array([0.0, 0.05, 0.0])
+    cases = double(having(hits, centre, 0.15))
+    found = pj.gradient(HIT, cases, of="cost", by="extras.0.radius", steps=0, solver=solver)
 
-    def cost(radius):
-        zones = (case.extras[0].replace(radius=np.asarray(radius)), *case.extras[1:])
-        return float(pj.plan(HIT.with_solver(solver), case.replace(extras=zones)).cost)
+    def costs(change):
+        zone = cases.extras[0].replace(radius=cases.extras[0].radius + change)
+        return pj.plan(long, cases.replace(extras=(zone, *cases.extras[1:]))).cost
 
-    radius, step = float(case.extras[0].radius), 1e-4
-    slope = (cost(radius + step) - cost(radius - step)) / (2.0 * step)
-    assert slope > 0.0
-    np.testing.assert_allclose(found.by["extras.0.radius"], slope, rtol=0.02)
+    slopes = (costs(1e-4) - costs(-1e-4)) / 2e-4
+    assert slopes.min() > 1e-6
+    np.testing.assert_allclose(found.by["extras.0.radius"], slopes, rtol=1e-3)
 
 
 def test_a_place_in_the_extras_that_is_not_there_is_named(blocked):
