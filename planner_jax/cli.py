@@ -21,33 +21,29 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from planner_jax.compile_cache import keep_compiled_programs
-from planner_jax.registry import Task, UnknownName, all_tasks
+from planner_jax.registry import Task, UnknownName, all_tasks, task_named
 from planner_jax.sweep.environment import installed_version, require_backend
-from planner_jax.sweep.settings import SettingError
+from planner_jax.sweep.settings import SettingError, SweepSettings
 
 _HELP = argparse.RawDescriptionHelpFormatter
 _FAILED, _BAD_ARGUMENT, _INTERRUPTED = 1, 2, 130
-_BENCH = "planner_jax.benchmarks.throughput"
+_THROUGHPUT = "planner_jax.benchmarks.throughput_settings:ThroughputSettings"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command.
-
-    Args:
-        arguments: of the command line; by default those of the process.
+    """Run a command of these arguments, by default those of the process.
 
     Returns:
         The exit code: 0, 1 where the file system fails, 2 for a bad argument, 130 after Ctrl-C.
     """
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always")
-        parser = _parser()
-    for warning in told:  # such as a task of another package that does not work
-        print(f"planner-jax: warning: {warning.message}", file=sys.stderr)
-    options = vars(parser.parse_args(arguments))
-    command = options.pop("command")
     try:
-        return command(options) or 0
+        with warnings.catch_warnings():  # of another package, such as a task that does not work
+            warnings.simplefilter("always")
+            warnings.showwarning = lambda told, *_, **__: print(
+                f"planner-jax: warning: {told}", file=sys.stderr
+            )
+            options = vars(_parser().parse_args(arguments))
+        return options.pop("command")(options) or 0
     except KeyboardInterrupt as stop:
         print(f"planner-jax: {str(stop) or 'interrupted'}", file=sys.stderr)
         return _INTERRUPTED
@@ -71,11 +67,16 @@ def _fail(message: str) -> int:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Says what is wrong with an argument in one line; knows what it does not ask for."""
+    """Says what is wrong with an argument in one line; has no options until it is asked."""
 
-    def __init__(self, **look: Any):
+    def __init__(self, *, fill: Callable[["_Parser"], None] = lambda parser: None, **look: Any):
         shape = functools.partial(_HELP, max_help_position=28, width=100)
         super().__init__(**{"formatter_class": shape, "allow_abbrev": False, **look})
+        self._fill = fill
+
+    def parse_known_args(self, *arguments: Any, **how: Any) -> Any:
+        self._fill(self)
+        return super().parse_known_args(*arguments, **how)
 
     def add(self, flag: str, **how: Any) -> None:
         """Add an option."""
@@ -110,7 +111,9 @@ def _parser() -> _Parser:
         tasks = among.add_subparsers(title="tasks", required=True, metavar="task")
         for task in all_tasks().values():
             if name == "sweep" or task.flight is not None:
-                add(tasks.add_parser(task.name, help=task.summary, **hidden), task)
+                # Settings are imported for the one task that is asked for.
+                fill: Any = lambda parser, add=add, task=task: add(parser, task)  # noqa: E731
+                tasks.add_parser(task.name, help=task.summary, fill=fill, **hidden)
     view = command("view", "play a run's flights in a browser", _view)
     view.add_argument("run", metavar="RUN", help="folder of a run of flights")
     view.add("--host", default="localhost", help="where to serve (default: localhost)")
@@ -120,14 +123,18 @@ def _parser() -> _Parser:
     report.add_argument("run", metavar="RUN", help="folder of a finished run")
     bench = commands.add_parser("bench", help="measure this machine")
     kinds = bench.add_subparsers(title="benchmarks", required=True, metavar="benchmark")
-    plans = kinds.add_parser("throughput", help="plans a second, with success and cost", **hidden)
-    kind = pkgutil.resolve_name(f"{_BENCH}_settings:ThroughputSettings")
-    plans.description = kind.DESCRIPTION
-    _add_settings(plans, kind)
-    plans.add("--out", metavar="DIR", help="run folder (default: runs/bench-throughput-DATE-TIME)")
-    plans.set_defaults(command=_throughput)
+    words = "plans a second, with success and cost"
+    kinds.add_parser("throughput", help=words, fill=_add_throughput, **hidden)
     command("doctor", "versions, devices, precision, cache and a timed plan", _doctor)
     return parser
+
+
+def _add_throughput(parser: _Parser) -> None:
+    kind = pkgutil.resolve_name(_THROUGHPUT)
+    parser.description = kind.DESCRIPTION
+    _add_settings(parser, kind)
+    parser.add("--out", metavar="DIR", help="run folder (default: runs/bench-throughput-DATE-TIME)")
+    parser.set_defaults(command=_throughput)
 
 
 def _add_settings(parser: _Parser, kind: Any, task: Task | None = None) -> None:
@@ -147,7 +154,9 @@ def _add_settings(parser: _Parser, kind: Any, task: Task | None = None) -> None:
         how: dict[str, Any] = {"action": "store_true"}
         if not isinstance(default, bool):
             if default is not None and "(default:" not in words:
-                shown = " ".join(map(str, default)) if isinstance(default, tuple) else default
+                shown = (
+                    " ".join(f"{x:g}" for x in default) if isinstance(default, tuple) else default
+                )
                 words += f" (default: {shown})"
             how = {"type": _type_of(hints[field.name]), "metavar": field.metadata["metavar"]}
             how |= {"nargs": "+"} if isinstance(default, tuple) else {}
@@ -231,10 +240,8 @@ def _fly(task: Task, kind: type, given: dict[str, Any]) -> None:
     from planner_jax.sims.run import start_flights
 
     out = given.pop("out", None) or _run_folder(f"fly-{task.name}")
-    video, keep = given.pop("video", None), {}
-    if "record" in given:
-        keep["record"] = given.pop("record")
-    start_flights(kind(**given), out, video, **keep)
+    kept = {name: given.pop(name) for name in ("video", "record") if name in given}
+    start_flights(kind(**given), out, **kept)
     _print_flights(Path(out))
 
 
@@ -266,9 +273,15 @@ def _let_ctrl_c_stop() -> None:
 
 
 def _throughput(given: dict[str, Any]) -> None:
+    out = given.pop("out", None) or _run_folder("bench-throughput")
+    asked = dataclasses.asdict(pkgutil.resolve_name(_THROUGHPUT)(**given))
+    named = {name: asked[name] for name in ("planner", "suite")}
+    SweepSettings(**named).of(task_named(asked["task"]))
     require_backend()
     keep_compiled_programs()
-    pkgutil.resolve_name(f"{_BENCH}:report")(**given)
+    from planner_jax.benchmarks.throughput import report
+
+    report(**asked, out=out)
 
 
 def _report(options: dict[str, Any]) -> None:

@@ -27,11 +27,12 @@ def float64():
 
 @pytest.fixture(scope="module")
 def finished(request, tmp_path_factory):
-    """The folder and manifest of a sweep of the module's SETTINGS that nothing disturbed."""
+    """The folder and manifest of an undisturbed sweep of the module's TASK and SETTINGS."""
     from planner_jax.sweep.run import start_sweep
 
     out = tmp_path_factory.mktemp("runs") / "finished"
-    return out, start_sweep(request.module.SETTINGS, out, progress=False)
+    module = request.module
+    return out, start_sweep(module.TASK, module.SETTINGS, out, progress=False)
 
 
 # Modules that take longest, or whose compiled programs others find in the cache: the hit planner's

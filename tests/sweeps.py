@@ -10,8 +10,8 @@ def columns(out):
     return {name: np.array(table[name].to_pylist()) for name in table.column_names}
 
 
-def stop_after(monkeypatch, module, name, num_chunks):
-    """Ctrl-C in the chunk after so many: in the call of that function of the task's module."""
+def stop_after(monkeypatch, sweep, num_chunks):
+    """Ctrl-C in the chunk after so many: in the call of `plan` of that class of sweeps."""
     calls = iter(range(num_chunks))
 
     def plan(*arguments):
@@ -19,5 +19,5 @@ def stop_after(monkeypatch, module, name, num_chunks):
             raise KeyboardInterrupt
         return real(*arguments)
 
-    real = getattr(module, name)
-    monkeypatch.setattr(module, name, plan)
+    real = sweep.plan
+    monkeypatch.setattr(sweep, "plan", plan)

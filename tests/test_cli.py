@@ -8,7 +8,7 @@ import pytest
 
 from planner_jax.cli import main
 from planner_jax.sweep import run as sweep_run
-from planner_jax.sweep.hit import task as hit_task
+from planner_jax.sweep.hit.sweep import HitSweep
 
 HEADER = "number,serve position,serve velocity,landing position,target,hit,velocity,attitude"
 GOOD, GONE = "2.5 -0.3 2,-4.3 0.02 7.3", "2.5 -0.3 2,4.3 0.02 7.3"
@@ -61,6 +61,7 @@ def elsewhere(tmp_path, monkeypatch):
         (["--delay", "-0.5"], ["--delay must be finite and >= 0", "got -0.5"]),
         (["--delay", "3"], ["--delay must be shorter than each serve's flight", "got 3"]),
         (["--planner", "nobody"], ["--planner must be one of", "exact", "got 'nobody'"]),
+        (["--suite", "throws"], ["--suite must be one of court, S.1", "got 'throws'"]),
         (["--start", "1", "2"], ["--start must be three finite numbers", "got 1 2"]),
         (["--start", "0", "nan", "1"], ["--start must be three finite numbers", "got 0 nan 1"]),
         (["--serves", "nowhere"], ["--serves must be an existing folder", "nowhere"]),
@@ -95,6 +96,44 @@ def test_a_bad_argument_of_a_catch_gets_one_line_and_leaves_nothing(
 ):
     expect_one_line(capsys, ["sweep", "catch", *arguments], *parts)
     assert not list(elsewhere.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        (["--task", "juggling"], ["--task", "juggling"]),
+        (["--planner", "mpp"], ["--planner must be one of exact, bat", "got 'mpp'"]),
+        (["--task", "catch", "--suite", "court"], ["--suite must be one of throws", "'court'"]),
+        (["--batch", "16", "0"], ["--batch must be >= 1, got 0"]),
+        (["--seed", "-1"], ["--seed must be >= 0, got -1"]),
+        (["--repeat", "0"], ["--repeat must be >= 1, got 0"]),
+    ],
+)
+def test_a_bad_argument_of_a_benchmark_gets_one_line_and_leaves_nothing(
+    capsys, elsewhere, arguments, parts
+):
+    expect_one_line(capsys, ["bench", "throughput", *arguments], *parts)
+    assert not list(elsewhere.iterdir())
+
+
+def test_a_throughput_is_measured_with_what_was_asked_for(capsys, elsewhere, monkeypatch):
+    asked = {}
+    monkeypatch.setattr("planner_jax.benchmarks.throughput.report", lambda **k: asked.update(k))
+    code, _, err = run(capsys, "bench", "throughput", "--task", "catch", "--batch", "4", "8")
+    assert (code, err) == (0, "")
+    assert (asked["task"], asked["planner"], asked["batch"]) == ("catch", None, [4, 8])
+    assert asked["out"].startswith("runs/bench-throughput-")
+
+
+@pytest.mark.parametrize("command", [["sweep", "hit", "--num", "0"], ["bench", "throughput", "-x"]])
+def test_a_command_that_needs_no_flights_needs_no_extra_of_flights(
+    capsys, elsewhere, monkeypatch, command
+):
+    """Simulation without MuJoCo says so as soon as it is imported."""
+    monkeypatch.setitem(sys.modules, "planner_jax.sims.settings", None)
+    expect_one_line(capsys, command)
+    with pytest.raises(ModuleNotFoundError):
+        run(capsys, "fly", "hit")
 
 
 def test_bad_serves_are_named_by_file_and_line(capsys, elsewhere, tmp_path):
@@ -160,7 +199,7 @@ def test_ctrl_c_says_how_to_resume(capsys, elsewhere, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(hit_task, "plan", interrupted)
+    monkeypatch.setattr(HitSweep, "plan", interrupted)
     code, out, err = run(capsys, "sweep", "hit", "--num", "3", "--out", "a run")
     assert code == 130 and out == ""
     expected = "planner-jax: interrupted; finish with: planner-jax sweep hit --resume --out 'a run'"
@@ -170,8 +209,8 @@ def test_ctrl_c_says_how_to_resume(capsys, elsewhere, monkeypatch):
 def test_a_sweep_prints_rate_and_speed_together(capsys, elsewhere, monkeypatch):
     asked = {}
 
-    def sweep(settings, out):
-        asked.update(settings=settings, out=out)
+    def sweep(task, settings, out):
+        asked.update(task=task.name, settings=settings, out=out)
         return {
             "kind": "sweep hit",
             "parameters": {"planner": "exact"},
@@ -194,6 +233,7 @@ def test_a_sweep_prints_rate_and_speed_together(capsys, elsewhere, monkeypatch):
     assert "90.00 % success, 9 of 10" in out and "4,000 plans/s warm" in out
     assert asked["out"].startswith("runs/hit-exact-") and asked["out"] in out
     settings = asked["settings"]
+    assert (asked["task"], settings.planner) == ("hit", "exact")
     assert (settings.start, settings.delay, settings.seed) == ("uniform", 0.3, 5)
     assert settings.drag_after_impact
 

@@ -7,6 +7,7 @@ import jax
 import numpy as np
 import pytest
 
+import planner_jax as pj
 from planner_jax import doctor
 from planner_jax.lanes import in_one_kernel, over_lanes, pallas
 from planner_jax.optimise.lbfgs import LbfgsConfig
@@ -16,9 +17,7 @@ from planner_jax.optimise.sensitivity import gradient_at
 from planner_jax.sweep.environment import require_backend
 from planner_jax.sweep.settings import SettingError
 from planner_jax.task.catch.exact import ExactCatch
-from planner_jax.task.catch.suites import make_suite
 from planner_jax.task.hit.exact import ExactHit
-from planner_jax.task.hit.serves import generate_serves, to_scenarios
 
 LANES = 128
 # Of one round: the ball's table; penalties with slopes, without, and the greatest of a finished
@@ -59,7 +58,7 @@ def round_of(planner):
 
 
 def serves():
-    return jax.tree.map(np.asarray, to_scenarios(generate_serves(LANES, 0)))
+    return jax.tree.map(np.asarray, pj.hit.draw(LANES))
 
 
 def small():
@@ -82,7 +81,7 @@ def test_a_round_of_hits_holds_its_kernels(gpu):
 @pytest.mark.slow
 def test_a_round_of_catches_holds_its_kernels(gpu):
     """All but that of the table, which takes one ball a lane and not one a target."""
-    throws = make_suite("throws", num=LANES, seed=0)
+    throws = pj.catch.draw(LANES, "throws")
     held = kernels_in(round_of(ExactCatch()), throws)
     assert held == {name: num for name, num in ROUND.items() if name != "flight_table"}
 

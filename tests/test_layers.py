@@ -32,9 +32,9 @@ ALLOWED = {
         *("ball", "cost", "lanes", "optimise", "planning", "protocol", "referee", "registry"),
         *("robot", "trajectory"),
     },
-    "sweep": {"ball", "protocol", "referee", "task"},
+    "sweep": {"ball", "lanes", "planning", "protocol", "registry", "task"},
     "compile_cache": set(),
-    "doctor": {"compile_cache", "lanes", "sweep", "task"},
+    "doctor": {"compile_cache", "lanes", "planning", "protocol", "registry", "sweep"},
     "cli": {"compile_cache", "doctor", "registry", "sweep"},
 }
 LIBRARY = ROOT / "planner_jax"

@@ -9,6 +9,7 @@ import pytest
 import planner_jax as pj
 from planner_jax.ball import flight
 from planner_jax.task.hit import court
+from planner_jax.task.hit.case import DRAG, GRAVITY
 from planner_jax.task.hit.serves import (
     DEPTH,
     MAX_FLIGHT_TIME,
@@ -21,8 +22,6 @@ from planner_jax.task.hit.serves import (
     to_cases,
 )
 from planner_jax.task.hit.validate import (
-    DRAG,
-    GRAVITY,
     CaseError,
     ServeError,
     check_cases,

@@ -10,19 +10,19 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from matplotlib.figure import Figure
-from planner_jax.sweep.hit.table import rate_table, remarks
-from planner_jax.task.hit.planners import planner
 from scipy.stats import binomtest
 from sweeps import columns, stop_after
 
+import planner_jax as pj
+from planner_jax.planning.plan import plan
 from planner_jax.referee.hit import referee_hits
 from planner_jax.robot import quadrotor
 from planner_jax.sweep import run
 from planner_jax.sweep.figures.motion import body_rate, net_thrust, sample_motion
-from planner_jax.sweep.hit import task
 from planner_jax.sweep.hit.figures.motion import motion_figure
-from planner_jax.sweep.hit.settings import HitSweep
+from planner_jax.sweep.hit.settings import HitSettings
 from planner_jax.sweep.hit.source import open_source
+from planner_jax.sweep.hit.sweep import HitSweep
 from planner_jax.sweep.report import RunRows, write_report
 from planner_jax.sweep.run import SweepInterrupted, resume_sweep, start_sweep
 from planner_jax.sweep.run_folder import RunFolder, pick_rows
@@ -30,17 +30,19 @@ from planner_jax.sweep.settings import SettingError
 from planner_jax.sweep.summary import percent, wilson_interval
 from planner_jax.sweep.timing import CompileClock
 from planner_jax.task.hit import court
+from planner_jax.task.hit.card import REAL_SCENARIOS
 from planner_jax.task.hit.exact import ExactHit
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
+TASK = pj.task_named("hit")
 NUM, BATCH = 84, 13  # chunks and single cases are planned by one program, for up to 16
 # Half of these fail: late, and with one short round.
-SETTINGS = HitSweep(num=NUM, batch=BATCH, delay=0.8, seed=3)
+SETTINGS = HitSettings(num=NUM, batch=BATCH, delay=0.8, seed=3)
 FAILED = "failed,failed,failed"
 FIGURES = ("court.png", "motion.png", "rates.png")
 
 
-def one_round(name, **options):
+def one_round(**options):
     """The planner with its first round alone, so that one program is compiled."""
     return ExactHit(rounds=ExactHit().rounds[:1], **options)
 
@@ -48,8 +50,8 @@ def one_round(name, **options):
 @pytest.fixture(autouse=True, scope="module")
 def quick_planners():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(task, "planner", one_round)
-        patch.setattr(task, "PLANNERS", {"exact": "", "bat": ""})
+        patch.setattr(HitSweep, "planner", lambda _, s: one_round(**s.planner_options()))
+        patch.setattr(HitSweep, "other_planners", lambda *_: {"bat": one_round()})
         yield
 
 
@@ -57,13 +59,13 @@ def quick_planners():
 def no_report(monkeypatch):
     """Leave the report out."""
     monkeypatch.setattr(run, "write_report", lambda folder: None)
-    monkeypatch.setattr(run, "plan_baselines", lambda task, source, index: None)
+    monkeypatch.setattr(HitSweep, "other_planners", lambda *_: {})
 
 
 @pytest.fixture
 def no_figures(monkeypatch):
     """Draw nothing, and write the page all the same."""
-    monkeypatch.setattr(task.HitTask, "figures", ())
+    monkeypatch.setattr(HitSweep, "figures", ())
 
 
 def manifest_on_page(out):
@@ -91,7 +93,7 @@ def test_a_finished_run_holds_manifest_rows_table_figures_and_page(finished):
 
 def test_the_manifest_says_what_was_run_where_and_how_long(finished):
     _, manifest = finished
-    assert HitSweep(**manifest["parameters"]) == SETTINGS
+    assert HitSettings(**manifest["parameters"]) == SETTINGS.of(TASK)
     assert manifest["seed"] == 3
     assert {"python", "jax", "numpy", "planner-jax"} <= manifest["versions"].keys()
     assert manifest["device"]["platform"] == jax.default_backend()
@@ -136,7 +138,7 @@ def test_the_rows_alone_lead_the_referee_to_the_same_verdict(finished):
         return SimpleNamespace(**{n: np.tile(setting[n], (NUM, 1)).squeeze() for n in names})
 
     physics = vars(same("drag", "gravity", "restitution", "racket_height"))
-    scenarios = SimpleNamespace(
+    cases = SimpleNamespace(
         ball=SimpleNamespace(pos=rows["ball_pos"], vel=rows["ball_vel"]),
         head_state=head,
         target=rows["target"],
@@ -151,7 +153,7 @@ def test_the_rows_alone_lead_the_referee_to_the_same_verdict(finished):
     plans = SimpleNamespace(
         trajectory=trajectory, stroke=SimpleNamespace(time=rows["contact_time"])
     )
-    verdict = referee_hits(scenarios, plans)
+    verdict = referee_hits(cases, plans)
     np.testing.assert_array_equal(verdict.success, rows["success"])
     np.testing.assert_array_equal(verdict.failed_limit, rows["failed_limit"])
     np.testing.assert_allclose(verdict.max_speed, rows["max_speed"], rtol=1e-5)
@@ -182,15 +184,15 @@ def test_an_interrupted_sweep_is_resumed_to_the_same_rows(
 ):
     out = tmp_path / "run"
     with monkeypatch.context() as patch:
-        stop_after(patch, task, "plan", num_chunks)
+        stop_after(patch, HitSweep, num_chunks)
         with pytest.raises(SweepInterrupted):
-            start_sweep(SETTINGS, out, progress=False)
+            start_sweep(TASK, SETTINGS, out, progress=False)
     assert RunFolder(out).read_manifest()["state"] == "interrupted"
-    manifest = resume_sweep("hit", out, progress=False, num=NUM, delay=0.8)
+    manifest = resume_sweep(TASK, out, progress=False, num=NUM, delay=0.8)
     assert manifest["state"] == "complete" and len(manifest["sessions"]) == 2
     assert (out / "plans.parquet").read_bytes() == (finished[0] / "plans.parquet").read_bytes()
     assert manifest["summary"]["successes"] == finished[1]["summary"]["successes"]
-    assert resume_sweep("hit", out, progress=False) == manifest
+    assert resume_sweep(TASK, out, progress=False) == manifest
 
 
 def test_a_sweep_killed_while_writing_is_resumed_to_the_same_rows(
@@ -198,14 +200,14 @@ def test_a_sweep_killed_while_writing_is_resumed_to_the_same_rows(
 ):
     out = tmp_path / "run"
     with monkeypatch.context() as patch:
-        stop_after(patch, task, "plan", 2)
+        stop_after(patch, HitSweep, 2)
         with pytest.raises(SweepInterrupted):
-            start_sweep(SETTINGS, out, progress=False)
+            start_sweep(TASK, SETTINGS, out, progress=False)
     folder = RunFolder(out)
     folder.write_manifest({**folder.read_manifest(), "state": "running"})
     (out / "parts" / ".part-000002.parquet.tmp").write_bytes(b"half a part")
     (out / ".plans.parquet.tmp").write_bytes(b"half a table")
-    resume_sweep("hit", out, progress=False)
+    resume_sweep(TASK, out, progress=False)
     assert (out / "plans.parquet").read_bytes() == (finished[0] / "plans.parquet").read_bytes()
     assert not list(out.rglob(".*"))
 
@@ -220,11 +222,11 @@ def test_the_page_of_an_interrupted_sweep_says_so_until_it_is_resumed(
     with monkeypatch.context() as patch:
         patch.setattr(run, "plan_baselines", interrupted)
         with pytest.raises(SweepInterrupted):
-            start_sweep(SETTINGS, out, progress=False)
+            start_sweep(TASK, SETTINGS, out, progress=False)
     assert manifest_on_page(out)["state"] == "interrupted"
     assert manifest_on_page(out) == RunFolder(out).read_manifest()
-    monkeypatch.setattr(run, "plan_baselines", lambda *_: None)
-    manifest = resume_sweep("hit", out, progress=False)
+    monkeypatch.setattr(HitSweep, "other_planners", lambda *_: {})
+    manifest = resume_sweep(TASK, out, progress=False)
     assert manifest["state"] == "complete" and manifest_on_page(out) == manifest
 
 
@@ -237,34 +239,34 @@ def test_a_sweep_killed_before_its_last_manifest_is_resumed(tmp_path, monkeypatc
         raise Killed
 
     out, real = tmp_path / "run", run.rewrite_page
-    monkeypatch.setattr(run, "plan_baselines", lambda *_: None)
+    monkeypatch.setattr(HitSweep, "other_planners", lambda *_: {})
     with monkeypatch.context() as patch:
         patch.setattr(run, "rewrite_page", killed)
         with pytest.raises(Killed):
-            start_sweep(SETTINGS, out, progress=False)
+            start_sweep(TASK, SETTINGS, out, progress=False)
     assert RunFolder(out).read_manifest()["state"] == "running"
-    manifest = resume_sweep("hit", out, progress=False)
+    manifest = resume_sweep(TASK, out, progress=False)
     assert manifest["state"] == "complete" and manifest_on_page(out) == manifest
 
 
 def test_resuming_with_another_setting_names_it(finished):
     with pytest.raises(SettingError, match=r"delay must be 0.8 as in the run .*, got 0.5"):
-        resume_sweep("hit", finished[0], delay=0.5)
+        resume_sweep(TASK, finished[0], delay=0.5)
 
 
 def test_resuming_what_is_no_run_is_refused(tmp_path):
     with pytest.raises(SettingError, match="out must be the folder of a run"):
-        resume_sweep("hit", tmp_path)
+        resume_sweep(TASK, tmp_path)
 
 
 def test_a_serve_drawn_late_that_breaks_a_rule_leaves_nothing_behind(tmp_path):
     # The first chunk holds no ball that is down by then; a later one does.
-    settings = HitSweep(num=40, batch=4, delay=1.56, seed=0)
-    source = open_source(settings, batch=4)
+    settings = HitSettings(num=40, batch=4, delay=1.56, seed=0)
+    source = open_source(settings.of(TASK), batch=4)
     source.check()
     out = tmp_path / "runs" / "run"
     with pytest.raises(SettingError, match="delay must be shorter than each serve's flight"):
-        start_sweep(settings, out, progress=False)
+        start_sweep(TASK, settings, out, progress=False)
     assert not list(tmp_path.iterdir())
 
 
@@ -287,7 +289,7 @@ def trial_files(folder, num_rows=3):
 
 def test_published_outcomes_stand_beside_the_plans_of_the_same_serves(tmp_path, no_report):
     serves, out = trial_files(tmp_path / "serves"), tmp_path / "run"
-    manifest = start_sweep(HitSweep(serves=serves), out, progress=False)
+    manifest = start_sweep(TASK, HitSettings(serves=serves), out, progress=False)
     rows = columns(out)
     assert rows["published_bat"].tolist() == [True, False, True]
     assert rows["published_juggle"].tolist() == [False] * 3
@@ -295,32 +297,44 @@ def test_published_outcomes_stand_beside_the_plans_of_the_same_serves(tmp_path, 
     assert rows["file"].tolist() == ["1_1_1_b.csv"] * 3 and rows["line"].tolist() == [1, 2, 3]
     published = manifest["summary"]["per_scenario"]["NNN"]["published_on_these_serves"]
     assert published == pytest.approx({"bat": 2 / 3, "juggle": 0.0})
-    table = rate_table(manifest)
+    table = HitSweep(TASK).table(manifest)
     assert table.header[-1] == "bat, same serves %"
-    assert any('"Same serves"' in line for line in remarks(manifest))
+    assert any('"Same serves"' in line for line in HitSweep(TASK).remarks(manifest))
     assert table.rows[0][-1] == "66.7" and table.rows[1][-1] == "" and table.rows[-1][-1] == "66.67"
 
 
 def test_a_single_chunk_is_timed_warm_too(tmp_path, no_report):
     jax.clear_caches()
     serves = trial_files(tmp_path / "serves")
-    manifest = start_sweep(HitSweep(serves=serves), tmp_path / "run", progress=False)
+    manifest = start_sweep(TASK, HitSettings(serves=serves), tmp_path / "run", progress=False)
     times = manifest["times"]
     assert times["warm_plans"] == 3 and times["warm_seconds"] < times["first_seconds"]
 
 
+def test_a_planner_that_compiles_in_every_call_is_timed_all_the_same(
+    tmp_path, monkeypatch, no_report
+):
+    def compiling(_, planner, cases):
+        jax.jit(lambda x: x + 1.0)(0.0)
+        return plan(planner, cases)
+
+    monkeypatch.setattr(HitSweep, "plan", compiling)
+    manifest = start_sweep(TASK, HitSettings(num=2), tmp_path / "run", progress=False)
+    assert manifest["times"]["warm_plans"] == 2 and manifest["times"]["warm_seconds"] > 0.0
+
+
 def test_resuming_needs_the_serves_that_the_run_began_with(tmp_path, monkeypatch):
     serves, out = trial_files(tmp_path / "serves"), tmp_path / "run"
-    stop_after(monkeypatch, task, "plan", 0)
+    stop_after(monkeypatch, HitSweep, 0)
     with pytest.raises(SweepInterrupted):
-        start_sweep(HitSweep(serves=serves, num=2), out, progress=False)
+        start_sweep(TASK, HitSettings(serves=serves, num=2), out, progress=False)
     trial_files(tmp_path / "serves", num_rows=2)
     with pytest.raises(SweepInterrupted):
-        resume_sweep("hit", out, progress=False)
+        resume_sweep(TASK, out, progress=False)
     for path in (tmp_path / "serves").iterdir():
         path.write_text(path.read_text().replace("7.2", "7.0"))
     with pytest.raises(SettingError, match="serves must be the same as when the run began"):
-        resume_sweep("hit", out, progress=False)
+        resume_sweep(TASK, out, progress=False)
 
 
 # Tables.
@@ -328,7 +342,7 @@ def test_resuming_needs_the_serves_that_the_run_began_with(tmp_path, monkeypatch
 
 def test_the_table_has_all_scenarios_beside_both_published_rates(finished):
     _, manifest = finished
-    table, rates = rate_table(manifest), court.published_rates()
+    table, rates = HitSweep(TASK).table(manifest), court.published_rates()
     assert [row[0] for row in table.rows] == [*court.SCENARIOS, "all"]
     assert table.header[-2:] == ["bat, paper %", "bat, trial files %"]
     column = court.PLANNERS.index("bat")
@@ -341,7 +355,10 @@ def test_the_table_has_all_scenarios_beside_both_published_rates(finished):
 def test_a_published_planner_stands_beside_its_own_rates(finished):
     _, manifest = finished
     manifest = {**manifest, "parameters": {**manifest["parameters"], "planner": "juggle"}}
-    assert rate_table(manifest).header[-2:] == ["juggle, paper %", "juggle, trial files %"]
+    assert HitSweep(TASK).table(manifest).header[-2:] == [
+        "juggle, paper %",
+        "juggle, trial files %",
+    ]
 
 
 def test_the_table_says_which_rates_are_compared_and_how_many_serves_are_distinct(finished):
@@ -424,6 +441,7 @@ def test_hover_is_named_where_no_curve_runs(finished):
     ("given", "message"),
     [
         ({"planner": "nobody"}, "planner must be one of .*exact.*, got 'nobody'"),
+        ({"suite": "throws"}, "suite must be one of court, S.1, .*, got 'throws'"),
         ({"num": 0}, "num must be >= 1, got 0"),
         ({"batch": -2}, "batch must be >= 1, got -2"),
         ({"seed": -1}, "seed must be >= 0, got -1"),
@@ -436,32 +454,43 @@ def test_hover_is_named_where_no_curve_runs(finished):
 )
 def test_a_setting_out_of_its_range_is_named(given, message):
     with pytest.raises(SettingError, match=message):
-        HitSweep(**given)
+        HitSettings(**given).of(TASK)
 
 
-def test_the_truer_model_is_for_the_exact_planner_alone(monkeypatch):
-    monkeypatch.setattr("planner_jax.task.hit.planners.PLANNERS", {"exact": "", "bat": ""})
-    assert HitSweep(drag_after_impact=True).planner_options() == {"drag_after_impact": True}
+def test_the_truer_model_is_for_the_exact_planner_alone():
+    assert HitSettings(drag_after_impact=True).planner_options() == {"drag_after_impact": True}
     with pytest.raises(SettingError, match="drag_after_impact must be left out"):
-        HitSweep(planner="bat", drag_after_impact=True)
+        HitSettings(planner="bat", drag_after_impact=True)
 
 
 def test_settings_survive_the_manifest():
-    settings = HitSweep(num=7, start=(-1, 0, 2), serves="somewhere")
-    assert HitSweep(**json.loads(json.dumps(settings.parameters()))) == settings
+    settings = HitSettings(num=7, start=(-1, 0, 2), serves="somewhere")
+    assert HitSettings(**json.loads(json.dumps(settings.parameters()))) == settings
 
 
 def test_planners_are_found_by_name():
-    assert planner("exact", nodes=6) == ExactHit(nodes=6)
+    assert pj.hit.planner("exact", nodes=6) == ExactHit(nodes=6)
     with pytest.raises(ValueError, match="planner must be one of exact"):
-        planner("nobody")
+        pj.hit.planner("nobody")
 
 
 def test_chunks_join_to_the_whole_without_a_seam():
-    whole = open_source(HitSweep(num=50, batch=50), batch=1).chunk(0)
-    source = open_source(HitSweep(num=50, batch=20), batch=1)
+    whole = open_source(HitSettings(num=50, batch=50).of(TASK), batch=1).chunk(0)
+    source = open_source(HitSettings(num=50, batch=20).of(TASK), batch=1)
     assert source.num_chunks == 3
     parts = [source.chunk(number) for number in range(3)]
     velocity = np.concatenate([part.origin.velocity for part in parts])
     np.testing.assert_array_equal(velocity, whole.origin.velocity)
     np.testing.assert_array_equal(np.concatenate([p.index for p in parts]), np.arange(50))
+
+
+@pytest.mark.parametrize("suite", ["S.1", "S.6"])
+def test_a_real_scenario_is_served_by_its_own_two(suite):
+    source = open_source(HitSettings(suite=suite, num=6).of(TASK), batch=6)
+    served = {court.SCENARIOS[place] for place in source.chunk(0).origin.scenario}
+    assert served == set(REAL_SCENARIOS[suite])
+
+
+def test_a_suite_without_serves_is_refused_before_anything_is_drawn():
+    with pytest.raises(SettingError, match=r"^suite must be one of court, S\.1, .* got 'gusts'$"):
+        open_source(HitSettings(suite="gusts"), batch=1)

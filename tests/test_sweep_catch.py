@@ -8,43 +8,45 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from planner_jax.sweep.catch.source import open_source
-from planner_jax.sweep.catch.summary import CatchTally
-from planner_jax.sweep.catch.table import rate_table
 from sweeps import columns, stop_after
 
+import planner_jax as pj
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
 from planner_jax.referee.catch import referee_catches
-from planner_jax.sweep.catch import task
 from planner_jax.sweep.catch.columns import COLUMNS, FRAME
-from planner_jax.sweep.catch.published import PUBLISHED
-from planner_jax.sweep.catch.settings import DECISIONS, SUITES, CatchSweep
+from planner_jax.sweep.catch.settings import CatchSettings
+from planner_jax.sweep.catch.sweep import CatchSweep, CatchTally
 from planner_jax.sweep.catch.targets import target_positions
 from planner_jax.sweep.columns import RefereedBatch, rows_of
 from planner_jax.sweep.report import write_report
 from planner_jax.sweep.run import SweepInterrupted, resume_sweep, start_sweep
 from planner_jax.sweep.run_folder import RunFolder
 from planner_jax.sweep.settings import SettingError
-from planner_jax.task.catch import decide, suites
-from planner_jax.task.catch.exact import ExactCatch
+from planner_jax.task.catch.card import SUITES
 
+TASK = pj.task_named("catch")
 NUM, BATCH = 8, 4
 # Some of these fail, with one short round.
-SETTINGS = CatchSweep(suite="parabola2", decide="greedy", num=NUM, batch=BATCH, seed=2)
+SETTINGS = CatchSettings(suite="parabola2", decide="greedy", num=NUM, batch=BATCH, seed=2)
 FIGURES = ("flight.png", "motion.png", "outcomes.png")
 
 
-def one_round(name, **options):
+def one_round(settings):
     """The planner with one round, so that one program is compiled: that of other modules."""
-    return ExactCatch(rounds=(Round(1, LbfgsConfig(max_steps=20)),), **options)
+    rounds = (Round(1, LbfgsConfig(max_steps=20)),)
+    return pj.catch.planner(rounds=rounds, **settings.planner_options())
+
+
+def open_source(settings, batch):
+    return CatchSweep(TASK).open_source(settings.of(TASK), batch)
 
 
 @pytest.fixture(autouse=True, scope="module")
 def quick_planners():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(task, "catch_planner", one_round)
-        patch.setattr(task, "PLANNERS", {"exact": "", "mpp": ""})
+        patch.setattr(CatchSweep, "planner", lambda _, settings: one_round(settings))
+        patch.setattr(CatchSweep, "other_planners", lambda _, s: {"mpp": one_round(s)})
         yield
 
 
@@ -52,7 +54,7 @@ def test_a_finished_run_holds_manifest_rows_table_figures_and_page(finished):
     out, manifest = finished
     assert manifest == json.loads((out / "manifest.json").read_text())
     assert manifest["state"] == "complete" and manifest["kind"] == "sweep catch"
-    assert CatchSweep(**manifest["parameters"]) == SETTINGS
+    assert CatchSettings(**manifest["parameters"]) == SETTINGS.of(TASK)
     page = (out / "index.html").read_text()
     for name in FIGURES:
         assert (out / "figures" / name).read_bytes().startswith(b"\x89PNG")
@@ -82,7 +84,7 @@ def test_a_planner_that_decides_itself_has_no_optimal_time_ratio(finished):
     tally = CatchTally(decides=False)
     tally.add(pq.read_table(finished[0] / "plans.parquet"))
     assert tally.summary()["optimal_time_ratio"] is None
-    assert task.CatchTask().tally(CatchSweep(planner="mpp"))._decides is False
+    assert CatchSweep(TASK).tally(CatchSettings(planner="mpp"))._decides is False
 
 
 def test_every_column_has_its_unit_and_meaning(finished):
@@ -102,7 +104,7 @@ def test_the_rows_alone_lead_the_referee_to_the_same_verdict(finished):
     head[:, 0] = rows["start"]
     by_target = {name: rows[name].reshape(NUM, 2, 3) for name in ("ball_pos", "ball_vel", "drag")}
     ball = SimpleNamespace(pos=by_target["ball_pos"], vel=by_target["ball_vel"])
-    scenarios = SimpleNamespace(
+    cases = SimpleNamespace(
         targets=SimpleNamespace(ball=ball, drag=by_target["drag"], gravity=rows["ball_gravity"]),
         present=rows["present"],
         horizon=rows["horizon"],
@@ -120,7 +122,7 @@ def test_the_rows_alone_lead_the_referee_to_the_same_verdict(finished):
         order=rows["order"],
         times=rows["catch_times"],
     )
-    verdict = referee_catches(scenarios, plans)
+    verdict = referee_catches(cases, plans)
     np.testing.assert_array_equal(verdict.success, rows["success"])
     np.testing.assert_array_equal(verdict.failed_limit, rows["failed_limit"])
     np.testing.assert_allclose(verdict.net_distance, rows["net_distance"], atol=1e-5)
@@ -153,13 +155,13 @@ def test_a_plan_that_is_not_finite_is_reported_too(finished, tmp_path):
 def test_an_interrupted_sweep_is_resumed_to_the_same_rows(finished, tmp_path, monkeypatch):
     out = tmp_path / "run"
     monkeypatch.setattr("planner_jax.sweep.run.write_report", lambda folder: None)
-    monkeypatch.setattr("planner_jax.sweep.run.plan_baselines", lambda *_: None)
+    monkeypatch.setattr(CatchSweep, "other_planners", lambda *_: {})
     with monkeypatch.context() as patch:
-        stop_after(patch, task, "plan_catches", 1)
+        stop_after(patch, CatchSweep, 1)
         with pytest.raises(SweepInterrupted):
-            start_sweep(SETTINGS, out, progress=False)
+            start_sweep(TASK, SETTINGS, out, progress=False)
     assert RunFolder(out).read_manifest()["state"] == "interrupted"
-    manifest = resume_sweep("catch", out, progress=False, suite="parabola2")
+    manifest = resume_sweep(TASK, out, progress=False, suite="parabola2")
     assert manifest["state"] == "complete" and len(manifest["sessions"]) == 2
     assert (out / "plans.parquet").read_bytes() == (finished[0] / "plans.parquet").read_bytes()
 
@@ -173,28 +175,26 @@ def test_an_interrupted_sweep_is_resumed_to_the_same_rows(finished, tmp_path, mo
 )
 def test_a_run_is_resumed_as_what_it_is(finished, name, given, message):
     with pytest.raises(SettingError, match=message):
-        resume_sweep(name, finished[0], **given)
+        resume_sweep(pj.task_named(name), finished[0], **given)
 
 
-def test_scenarios_that_are_drawn_otherwise_are_not_mixed_into_a_run(
-    finished, tmp_path, monkeypatch
-):
+def test_cases_that_are_drawn_otherwise_are_not_mixed_into_a_run(finished, tmp_path, monkeypatch):
     out = tmp_path / "run"
     out.mkdir()
     manifest = {**finished[1], "state": "interrupted"}
     (out / "manifest.json").write_text(json.dumps(manifest))
-    real = suites.make_suite
+    real = pj.catch.draw
     monkeypatch.setattr(
-        "planner_jax.sweep.catch.source.make_suite",
-        lambda name, num, seed: real(name, num, seed + 1),
+        "planner_jax.task.catch.draw",
+        lambda num, suite, seed, **options: real(num, suite, seed + 1, **options),
     )
     with pytest.raises(SettingError, match="suite must be the same as when the run began"):
-        resume_sweep("catch", out)
+        resume_sweep(TASK, out)
 
 
 def test_the_table_has_the_papers_rates_beside_its_own_suite(finished):
-    table = rate_table(finished[1])
-    assert [row[0] for row in table.rows] == list(PUBLISHED)
+    table = CatchSweep(TASK).table(finished[1])
+    assert [row[0] for row in table.rows] == list(SUITES)
     rows = {row[0]: row for row in table.rows}
     assert rows["throws"] == ["throws", "", "", "", "", "96.0", "0.092", "14.0"]
     assert rows["hexagon6"][-3:] == ["76.3", "0.458", ""]
@@ -202,51 +202,49 @@ def test_the_table_has_the_papers_rates_beside_its_own_suite(finished):
     assert table.rows[table.strong][0] == "parabola2"
 
 
-def test_names_that_are_checked_without_jax_are_those_of_the_library():
-    assert SUITES == tuple(suites.SUITES) and DECISIONS == decide.DECISIONS
-
-
 @pytest.mark.parametrize("suite", ["parabola2", "harmonic2"])
 def test_the_columns_of_the_targets_bring_their_paths_back(suite):
-    source = open_source(CatchSweep(suite=suite, num=3), batch=2)
-    cases = source.chunk(1)
+    source = open_source(CatchSettings(suite=suite, num=3), batch=2)
+    chunk = source.chunk(1)
     case_columns = [c for c in COLUMNS if c.name.startswith(("index", "ball", "drag", "swing"))]
-    batch = RefereedBatch(cases, cases.scenarios, None, None)
+    batch = RefereedBatch(chunk, None, None)
     row = rows_of(case_columns, batch, FRAME).to_pylist()[0]
     assert row["index"] == 2
     times = np.array([0.0, 0.7, 1.3], np.float32)
-    targets = jax.tree.map(lambda leaf: leaf[0], cases.scenarios.targets)
+    targets = jax.tree.map(lambda leaf: leaf[0], chunk.cases.targets)
     expected = jax.vmap(lambda path: jax.vmap(path.at)(times))(targets).pos
     np.testing.assert_allclose(target_positions(row, times), expected, atol=1e-5)
 
 
-def test_chunks_join_to_the_whole_and_a_seed_is_a_set_of_scenarios():
-    whole = open_source(CatchSweep(num=5, batch=5), batch=1)
-    parts = open_source(CatchSweep(num=5), batch=2)
-    joined = [parts.chunk(number).scenarios.targets.ball.vel for number in range(3)]
-    np.testing.assert_array_equal(np.concatenate(joined), whole.scenarios.targets.ball.vel)
-    assert parts.description() == whole.description()
-    assert parts.description() != open_source(CatchSweep(num=5, seed=1), batch=2).description()
+def test_chunks_join_to_the_whole_and_a_seed_is_a_set_of_cases():
+    whole = open_source(CatchSettings(num=5, batch=5), batch=1)
+    parts = open_source(CatchSettings(num=5), batch=2)
+    assert parts.num_chunks == 3
+    joined = [parts.chunk(number).cases.targets.ball.vel for number in range(3)]
+    np.testing.assert_array_equal(np.concatenate(joined), whole.chunk(0).cases.targets.ball.vel)
+    assert parts.description() == open_source(CatchSettings(num=6), batch=2).description()
+    assert parts.description() != open_source(CatchSettings(num=5, seed=1), batch=2).description()
 
 
 def test_limits_are_scaled_and_thrust_about_hover():
-    full = open_source(CatchSweep(num=2), batch=1).scenarios
-    half = open_source(CatchSweep(num=2, limit_scale=0.5), batch=1).scenarios
-    wide = open_source(CatchSweep(num=2, limit_scale=2.0), batch=1).scenarios
-    np.testing.assert_allclose(half.limits.speed, 0.5 * full.limits.speed)
-    np.testing.assert_allclose(half.limits.body_rate, 0.5 * full.limits.body_rate)
-    np.testing.assert_allclose(half.limits.min_height, full.limits.min_height)
-    np.testing.assert_allclose(half.limits.min_thrust, 0.65 * 9.81, rtol=1e-6)
-    np.testing.assert_allclose(half.limits.max_thrust, 1.75 * 9.81, rtol=1e-6)
-    np.testing.assert_allclose(wide.limits.min_thrust, 0.0)
-    assert {leaf.dtype for leaf in jax.tree.leaves(half.limits)} == {np.dtype("float32")}
+    def limits(**settings):
+        return open_source(CatchSettings(num=2, **settings), batch=2).chunk(0).cases.limits
+
+    full, half, wide = limits(), limits(limit_scale=0.5), limits(limit_scale=2.0)
+    np.testing.assert_allclose(half.speed, 0.5 * full.speed)
+    np.testing.assert_allclose(half.body_rate, 0.5 * full.body_rate)
+    np.testing.assert_allclose(half.min_height, full.min_height)
+    np.testing.assert_allclose(half.min_thrust, 0.65 * 9.81, rtol=1e-6)
+    np.testing.assert_allclose(half.max_thrust, 1.75 * 9.81, rtol=1e-6)
+    np.testing.assert_allclose(wide.min_thrust, 0.0)
+    assert {leaf.dtype for leaf in jax.tree.leaves(half)} == {np.dtype("float32")}
 
 
 def test_the_published_protocol_reaches_the_referee_when_it_is_asked_for(monkeypatch):
     asked = {}
-    monkeypatch.setattr(task, "referee_catches", lambda *_, **options: asked.update(options))
-    settings = CatchSweep(planner="catch", tolerance=0.05, net_test="ball")
-    task.CatchTask().judge(None, None, settings)
+    monkeypatch.setattr("planner_jax.task.catch.judge", lambda *_, **given: asked.update(given))
+    settings = CatchSettings(planner="catch", tolerance=0.05, net_test="ball")
+    CatchSweep(TASK).judge(None, None, settings)
     assert asked == {"tolerance": 0.05, "net_test": "ball"}
 
 
@@ -263,4 +261,4 @@ def test_the_published_protocol_reaches_the_referee_when_it_is_asked_for(monkeyp
 )
 def test_a_setting_out_of_its_range_is_named(given, message):
     with pytest.raises(SettingError, match=message):
-        CatchSweep(**given)
+        CatchSettings(**given).of(TASK)

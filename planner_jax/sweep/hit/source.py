@@ -8,9 +8,9 @@ import jax
 import numpy as np
 
 from planner_jax.sweep.hit.settings import HitSettings
-from planner_jax.sweep.settings import SettingError
+from planner_jax.sweep.settings import SettingError, require_one_of
 from planner_jax.sweep.source import Chunk, Source, filled_in
-from planner_jax.task.hit.card import REAL_SCENARIOS
+from planner_jax.task.hit.card import REAL_SCENARIOS, TASK
 from planner_jax.task.hit.serves import Serves, generate_serves, read_serves, to_cases
 from planner_jax.task.hit.validate import CaseError, ServeError, check_cases
 
@@ -61,8 +61,10 @@ def open_source(settings: HitSettings, batch: int) -> ServeSource:
     """As `Sweep.open_source`; a folder is read and checked whole.
 
     Raises:
-        SettingError: the folder is missing, a row is not sound, or too few serves are in it.
+        SettingError: the suite is of another package, the folder is missing, a row is not sound,
+            or too few serves are in it.
     """
+    require_one_of(TASK.suites, "suite", str(settings.suite))  # others know no serves
     try:
         folder = None if settings.serves is None else read_serves(settings.serves)
     except ServeError as error:

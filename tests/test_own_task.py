@@ -1,0 +1,236 @@
+"""A task from outside the library, tests/own_task, works without an edit of the library."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+import planner_jax as pj
+from planner_jax.registry import all_tasks
+
+OWN_TASK = Path(__file__).parent / "own_task"
+BROKEN = {
+    "METADATA": "Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n",
+    "entry_points.txt": "[planner_jax.tasks]\nbroken = nowhere_at_all:TASK\n",
+}
+
+
+# From the command line, in processes of their own.
+
+
+def process(folder, *arguments, path=()):
+    """A command in a folder, with the task and other folders where Python looks for packages."""
+    others = [str(OWN_TASK), *map(str, path), os.environ.get("PYTHONPATH", "")]
+    return subprocess.Popen(
+        [sys.executable, "-m", "planner_jax.cli", *arguments],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(others)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def command(folder, *arguments, path=()):
+    """Exit code of a command, and what it prints."""
+    running = process(folder, *arguments, path=path)
+    out, err = running.communicate()
+    return SimpleNamespace(code=running.returncode, out=out, err=err)
+
+
+def manifest_of(folder):
+    return json.loads((folder / "manifest.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory):
+    """The folder of a sweep, and what the command printed."""
+    folder = tmp_path_factory.mktemp("own")
+    done = command(folder, "sweep", "meet", "--num", "24", "--batch", "16", "--out", "run")
+    assert done.code == 0, done.err
+    return folder / "run", done.out
+
+
+def test_the_task_is_one_short_file():
+    assert len((OWN_TASK / "meet.py").read_text().splitlines()) <= 150
+
+
+def test_a_sweep_writes_the_whole_run_folder(swept):
+    out, said = swept
+    manifest = manifest_of(out)
+    assert (manifest["kind"], manifest["state"]) == ("sweep meet", "complete")
+    assert manifest["summary"]["num"] == 24
+    assert manifest["summary"]["success_rate"] == 1.0
+    assert "100.00 % success, 24 of 24 plans pass the referee" in said
+    page = (out / "index.html").read_text()
+    assert "Meet sweep, suite square, planner smooth" in page
+    assert 'src="figures/outcomes.png"' in page
+    assert (out / "figures" / "outcomes.png").read_bytes().startswith(b"\x89PNG")
+    assert "| square | 24 | 100.00 |" in (out / "table.md").read_text()
+    assert pq.read_table(out / "baselines.parquet")["planner"].to_pylist() == ["scipy"]
+
+
+def test_the_rows_are_the_leaves_of_case_plan_and_verdict(swept, meet):
+    rows = pq.read_table(swept[0] / "plans.parquet")
+    assert rows["index"].to_pylist() == list(range(24))
+    assert set(rows["status"].to_pylist()) <= {"CONVERGED", "FEASIBLE"}
+    cases, columns = meet.draw(24), {"case.most": "most", "case.target_pos": "target_pos"}
+    for name, leaf in columns.items():
+        np.testing.assert_array_equal(rows[name].to_pylist(), getattr(cases, leaf).tolist())
+    plans = pj.plan(meet.planner(), cases)
+    np.testing.assert_allclose(rows["plan.time"].to_numpy(), plans.time, rtol=1e-4)
+    assert max(rows["verdict.miss"].to_pylist()) < 1e-3
+
+
+def test_a_report_is_made_anew_from_the_folder(swept):
+    out, said = swept
+    page = (out / "index.html").read_text()
+    (out / "index.html").unlink()
+    done = command(out.parent, "report", "run")
+    assert done.code == 0 and done.out == said
+    assert (out / "index.html").read_text() == page
+
+
+@pytest.mark.slow
+def test_a_sweep_by_a_planner_on_the_host(tmp_path):
+    done = command(tmp_path, "sweep", "meet", "--planner", "scipy", "--num", "6", "--out", "run")
+    assert done.code == 0, done.err
+    manifest = manifest_of(tmp_path / "run")
+    assert (manifest["summary"]["num"], manifest["summary"]["success_rate"]) == (6, 1.0)
+    assert manifest["parameters"]["planner"] == "scipy"
+
+
+@pytest.mark.slow
+def test_a_sweep_that_ctrl_c_stops_is_resumed_to_the_same_rows(swept, tmp_path):
+    settings = ["--planner", "scipy", "--num", "6", "--batch", "1", "--out", "run"]
+    whole = command(tmp_path, "sweep", "meet", *settings[:-1], "whole")
+    assert whole.code == 0, whole.err
+    running = process(tmp_path, "sweep", "meet", *settings)
+    while not list(tmp_path.glob("run/parts/part-*.parquet")):
+        assert running.poll() is None
+    running.send_signal(signal.SIGINT)
+    _, err = running.communicate()
+    assert running.returncode == 130
+    assert err.splitlines()[-1].endswith("planner-jax sweep meet --resume --out run")
+    assert manifest_of(tmp_path / "run")["state"] == "interrupted"
+    done = command(tmp_path, "sweep", "meet", "--resume", "--out", "run")
+    assert done.code == 0, done.err
+    rows = [(tmp_path / name / "plans.parquet").read_bytes() for name in ("run", "whole")]
+    assert rows[0] == rows[1]
+
+
+def test_throughput_is_measured_with_success_and_cost_beside(tmp_path):
+    done = command(
+        tmp_path, "bench", "throughput", "--task", "meet", "--batch", "16", "--out", "run"
+    )
+    assert done.code == 0, done.err
+    manifest = manifest_of(tmp_path / "run")
+    summary = manifest["summary"]
+    assert (manifest["kind"], manifest["state"]) == ("bench throughput", "complete")
+    assert (summary["num"], summary["success_rate"]) == (16, 1.0)
+    assert -1e-3 < summary["cost_gap_median"] <= summary["cost_gap_p90"] < 0.05
+
+
+def test_throughput_of_a_planner_that_minimises_nothing_has_no_cost_gap(tmp_path):
+    settings = ["--planner", "scipy", "--batch", "2", "--repeat", "1", "--out", "run"]
+    done = command(tmp_path, "bench", "throughput", "--task", "meet", *settings)
+    assert done.code == 0, done.err
+    summary = manifest_of(tmp_path / "run")["summary"]
+    assert (summary["num"], summary["success_rate"]) == (2, 1.0)
+    assert summary["cost_gap_median"] is None and summary["cost_gap_p90"] is None
+
+
+def test_an_unknown_planner_is_one_line(tmp_path):
+    done = command(tmp_path, "sweep", "meet", "--planner", "nobody")
+    assert (done.code, done.out) == (2, "")
+    line = "planner-jax: error: --planner must be one of smooth, scipy, got 'nobody'\n"
+    assert done.err == line
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_broken_package_beside_it_is_named_in_one_line_and_the_rest_works(tmp_path):
+    folder = tmp_path / "site" / "broken-1.0.dist-info"
+    folder.mkdir(parents=True)
+    for name, text in BROKEN.items():
+        (folder / name).write_text(text)
+    done = command(tmp_path, "sweep", "--help", path=[folder.parent])
+    assert done.code == 0
+    assert done.err.count("\n") == 1
+    assert done.err.startswith(
+        "planner-jax: warning: task 'broken' of nowhere_at_all:TASK is left out: "
+        "ModuleNotFoundError"
+    )
+    for words in ("hit ", "catch ", "meet      a point mass in the plane meets a moving point"):
+        assert words in done.out
+
+
+# From Python.
+
+
+@pytest.fixture(scope="module")
+def meet():
+    """The task, on the path of packages for this module's tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(OWN_TASK)
+        all_tasks.cache_clear()
+        yield pj.task_named("meet")
+    all_tasks.cache_clear()
+    sys.modules.pop("meet", None)
+
+
+def exact_planner(meet):
+    """The task's planner, searching until float64 has no more to give."""
+    search = pj.LbfgsConfig(400, tolerance=1e-12, patience=20)
+    return meet.planner("smooth", rounds=(pj.Round(1, search),))
+
+
+def doubles(cases):
+    return jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), cases)
+
+
+@pytest.mark.parametrize("name", ["smooth", "scipy"])
+def test_a_lane_that_is_not_finite_says_so_and_leaves_its_neighbours_alone(meet, name):
+    cases, planner = jax.tree.map(np.array, meet.draw(6, seed=1)), meet.planner(name)
+    plans = pj.plan(planner, cases)
+    assert pj.solved(plans).all() and meet.judge(cases, plans).success.all()
+    cases.pos[2] = np.nan
+    broken = pj.plan(planner, cases)
+    assert broken.status[2] == pj.Status.NON_FINITE
+    verdict = meet.judge(cases, broken)
+    assert verdict.success.tolist() == [True, True, False, True, True, True]
+    assert verdict.sentence(2) == "not finite: the plan or its case is not finite"
+    for there, before in zip(jax.tree.leaves(broken), jax.tree.leaves(plans), strict=True):
+        np.testing.assert_array_equal(np.delete(there, 2, axis=0), np.delete(before, 2, axis=0))
+
+
+def test_a_batch_has_the_plans_of_its_cases_one_by_one(meet, float64):
+    cases, planner = doubles(meet.draw(6, seed=1)), exact_planner(meet)
+    plans = pj.plan(planner, cases)
+    assert len(set(plans.iterations.tolist())) > 1  # unequal lanes
+    for k in range(6):
+        alone = pj.plan(planner, pj.lane(cases, k))
+        np.testing.assert_allclose(alone.time, plans.time[k], rtol=1e-8)
+        np.testing.assert_allclose(alone.acc, plans.acc[k], atol=1e-6)
+
+
+def test_the_gradient_is_that_of_plans_made_anew(meet, float64):
+    cases, planner = doubles(meet.draw(6, seed=1)), exact_planner(meet)
+    found = pj.gradient(planner, cases, of="time", by="most", steps=3)
+    apart = 1e-4 * cases.most
+    later, sooner = (pj.plan(planner, cases.replace(most=cases.most + d)) for d in (apart, -apart))
+    slope = (later.time - sooner.time) / (2.0 * apart)
+    np.testing.assert_allclose(found.by["most"], slope, rtol=1e-4)
+    assert (slope < 0.0).all()  # who may accelerate more is there earlier
+
+
+def test_a_planner_on_the_host_has_no_gradient_and_says_so(meet):
+    with pytest.raises(TypeError, match="ScipyMeet minimises nothing"):
+        pj.gradient(meet.planner("scipy"), meet.draw(2), of="time", by="most")
