@@ -5,7 +5,6 @@ settings: nothing here knows a task.
 """
 
 import argparse
-import contextlib
 import dataclasses
 import datetime
 import functools
@@ -17,7 +16,7 @@ import sys
 import threading
 import typing
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -28,20 +27,21 @@ from planner_jax.sweep.settings import SettingError
 
 _HELP = argparse.RawDescriptionHelpFormatter
 _FAILED, _BAD_ARGUMENT, _INTERRUPTED = 1, 2, 130
-_BENCH = "planner_jax.benchmarks.throughput"
+_THROUGHPUT = "planner_jax.benchmarks.throughput_settings:ThroughputSettings"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command.
-
-    Args:
-        arguments: of the command line; by default those of the process.
+    """Run a command of these arguments, by default those of the process.
 
     Returns:
         The exit code: 0, 1 where the file system fails, 2 for a bad argument, 130 after Ctrl-C.
     """
     try:
-        with _warnings_in_lines():
+        with warnings.catch_warnings():  # of another package, such as a task that does not work
+            warnings.simplefilter("always")
+            warnings.showwarning = lambda told, *_, **__: print(
+                f"planner-jax: warning: {told}", file=sys.stderr
+            )
             options = vars(_parser().parse_args(arguments))
         return options.pop("command")(options) or 0
     except KeyboardInterrupt as stop:
@@ -52,18 +52,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except OSError as error:
         _fail(str(error))
         return _FAILED
-
-
-@contextlib.contextmanager
-def _warnings_in_lines() -> Iterator[None]:
-    """Print a line for every warning, such as one of another package whose task does not work."""
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always")
-        try:
-            yield
-        finally:
-            for warning in told:
-                print(f"planner-jax: warning: {warning.message}", file=sys.stderr)
 
 
 _ARGUMENTS: set[str] = set()  # names of all arguments, as they are written in Python
@@ -135,14 +123,18 @@ def _parser() -> _Parser:
     report.add_argument("run", metavar="RUN", help="folder of a finished run")
     bench = commands.add_parser("bench", help="measure this machine")
     kinds = bench.add_subparsers(title="benchmarks", required=True, metavar="benchmark")
-    plans = kinds.add_parser("throughput", help="plans a second, with success and cost", **hidden)
-    kind = pkgutil.resolve_name(f"{_BENCH}_settings:ThroughputSettings")
-    plans.description = kind.DESCRIPTION
-    _add_settings(plans, kind)
-    plans.add("--out", metavar="DIR", help="run folder (default: runs/bench-throughput-DATE-TIME)")
-    plans.set_defaults(command=_throughput)
+    words = "plans a second, with success and cost"
+    kinds.add_parser("throughput", help=words, fill=_add_throughput, **hidden)
     command("doctor", "versions, devices, precision, cache and a timed plan", _doctor)
     return parser
+
+
+def _add_throughput(parser: _Parser) -> None:
+    kind = pkgutil.resolve_name(_THROUGHPUT)
+    parser.description = kind.DESCRIPTION
+    _add_settings(parser, kind)
+    parser.add("--out", metavar="DIR", help="run folder (default: runs/bench-throughput-DATE-TIME)")
+    parser.set_defaults(command=_throughput)
 
 
 def _add_settings(parser: _Parser, kind: Any, task: Task | None = None) -> None:
@@ -248,10 +240,8 @@ def _fly(task: Task, kind: type, given: dict[str, Any]) -> None:
     from planner_jax.sims.run import start_flights
 
     out = given.pop("out", None) or _run_folder(f"fly-{task.name}")
-    video, keep = given.pop("video", None), {}
-    if "record" in given:
-        keep["record"] = given.pop("record")
-    start_flights(kind(**given), out, video, **keep)
+    kept = {name: given.pop(name) for name in ("video", "record") if name in given}
+    start_flights(kind(**given), out, **kept)
     _print_flights(Path(out))
 
 
@@ -285,7 +275,9 @@ def _let_ctrl_c_stop() -> None:
 def _throughput(given: dict[str, Any]) -> None:
     require_backend()
     keep_compiled_programs()
-    pkgutil.resolve_name(f"{_BENCH}:report")(**given)
+    from planner_jax.benchmarks.throughput import report
+
+    report(**given)
 
 
 def _report(options: dict[str, Any]) -> None:

@@ -166,17 +166,8 @@ class Planner(Protocol[CaseT, PlanT]):
 
 
 @runtime_checkable
-class LanesPlanner(Protocol[CaseT, PlanT]):
+class LanesPlanner(Planner[CaseT, PlanT], Protocol[CaseT, PlanT]):
     """A `Planner` that solves a batch in a layout of its own."""
-
-    @property
-    def attempts(self) -> Sequence[Attempt]:
-        """What to try, in order."""
-        ...
-
-    def solve(self, case: CaseT, attempt: Any, /) -> PlanT:
-        """The plan that one attempt makes of one case."""
-        ...
 
     def solve_lanes(self, cases: CaseT, attempt: Any, /) -> PlanT:
         """The plans that one attempt makes of a batch; a leading axis on every leaf; pure."""

@@ -257,12 +257,9 @@ def _recorded(loop: Loop, pilot: Pilot, flight: FlightState, drag: Array) -> Rec
     gravity = jnp.asarray(world.gravity, drag.dtype)
 
     def error(pos: Array, vel: Array, true_drag: Array, estimate: Estimate, ahead: Array) -> Array:
-        truth = BallState(pos=pos, vel=vel)
-        truth = fly(truth, ahead, true_drag, gravity, num_steps=12)[0]
-        believed = fly(
-            estimate.belief.ball, ahead + loop.sensing.latency, estimate.drag, gravity, num_steps=12
-        )[0]
-        return believed.pos - truth.pos
+        truth = fly(BallState(pos, vel), ahead, true_drag, gravity, num_steps=12)[0]
+        ball, late = estimate.belief.ball, ahead + loop.sensing.latency
+        return fly(ball, late, estimate.drag, gravity, num_steps=12)[0].pos - truth.pos
 
     return Record(
         time=flight.time,

@@ -17,7 +17,7 @@ from planner_jax.ball.flight import BallState
 from planner_jax.sims.loop import Flown
 from planner_jax.sims.model import World
 from planner_jax.sims.robot import Robot
-from planner_jax.sweep.columns import BOOL, LIST, VECTOR, Column, RefereedBatch, rows_of
+from planner_jax.sweep.columns import BOOL, LIST, VECTOR, RefereedBatch, leaves_of, rows_of
 from planner_jax.sweep.source import Chunk
 from planner_jax.task.hit.validate import fly, landing
 
@@ -170,6 +170,7 @@ def recorded(
         path = flight_of(returned, span, drag[:, 0])
         paths[:, :, 0] = np.where(back[..., None], path, paths[:, :, 0])
     contact = np.where(np.isfinite(met)[..., None], flown.contact.ball_pos, np.nan)
+    no_target = np.full((number, 3), np.nan)
     return Recording(
         index=np.asarray(index),
         success=np.asarray(success),
@@ -179,9 +180,7 @@ def recorded(
         balls=paths,
         met=met,
         contact=contact,
-        target=np.full((number, 3), np.nan)
-        if launches.target is None
-        else np.asarray(launches.target),
+        target=no_target if launches.target is None else np.asarray(launches.target),
     )
 
 
@@ -190,24 +189,18 @@ def _or_never(time: np.ndarray) -> np.ndarray:
     return np.nan_to_num(time, nan=np.inf)
 
 
-def _leaf(name: str) -> Any:
-    return lambda batch: getattr(batch.verdict, name)
-
-
-_COLUMNS = [
-    Column(name, unit, meaning, kind, _leaf(name))
-    for name, unit, meaning, kind in [
-        ("index", "", "place in the run", pa.int64()),
-        ("success", "", "as its task counts it", BOOL),
-        ("time", "s", "of each look", LIST),
-        ("robot", "", "looks x R, flat; joint positions as MuJoCo has them, m and rad", LIST),
-        ("wanted", "m", "looks x 3, flat; where the plan has the robot", LIST),
-        ("balls", "m", "looks x balls x 3, flat; NaN where not in flight", LIST),
-        ("met", "s", "when each ball is met, NaN for never", LIST),
-        ("contact", "m", "balls x 3, flat; where each ball is met", LIST),
-        ("target", "m", "of a returned ball, NaN for catches", VECTOR),
-    ]
-]
+_COLUMNS = leaves_of(
+    "verdict",
+    ("index", "", "place in the run", pa.int64()),
+    ("success", "", "as its task counts it", BOOL),
+    ("time", "s", "of each look", LIST),
+    ("robot", "", "looks x R, flat; joint positions as MuJoCo has them, m and rad", LIST),
+    ("wanted", "m", "looks x 3, flat; where the plan has the robot", LIST),
+    ("balls", "m", "looks x balls x 3, flat; NaN where not in flight", LIST),
+    ("met", "s", "when each ball is met, NaN for never", LIST),
+    ("contact", "m", "balls x 3, flat; where each ball is met", LIST),
+    ("target", "m", "of a returned ball, NaN for catches", VECTOR),
+)
 
 
 def to_rows(recording: Recording) -> pa.Table:

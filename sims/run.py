@@ -11,12 +11,21 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from planner_jax.protocol import Status
 from planner_jax.sims.film import FilmError, draw_flight, film_flights, require_film
 from planner_jax.sims.recording import FILE, Recording, read_recording, to_rows
 from planner_jax.sims.settings import FlySettings, fly_settings
 from planner_jax.sims.task import FlightTask
-from planner_jax.sweep.columns import BOOL, COUNT, LIST, NUMBER, TEXT, Column, rows_of
+from planner_jax.sweep.columns import (
+    BOOL,
+    COUNT,
+    INDEX,
+    LIST,
+    NUMBER,
+    Column,
+    leaves_of,
+    rows_of,
+    status_column,
+)
 from planner_jax.sweep.columns import RefereedBatch as FlownBatch
 from planner_jax.sweep.environment import environment, require_backend
 from planner_jax.sweep.run_folder import RunFolder
@@ -30,27 +39,20 @@ _RECORDED = 256  # flights of a batch that are recorded whole
 _FRAME = "world, z up; times from the first plan"
 
 
-def _contact(name: str) -> Any:
-    return lambda b: np.asarray(getattr(b.verdict.flown.contact, name)).reshape(len(b.chunk), -1)
-
-
 _COLUMNS = (
-    Column("index", "", "place in the whole", pa.int64(), lambda b: b.chunk.index),
-    Column("success", "", "as its task counts it", BOOL, lambda b: b.verdict.success),
-    Column(
-        "status",
-        "",
-        "of the first plan",
-        TEXT,
-        lambda b: np.array([Status(code).name for code in np.asarray(b.plans.status)]),
+    INDEX,
+    *leaves_of("verdict", ("success", "", "as its task counts it", BOOL)),
+    status_column("of the first plan"),
+    *leaves_of("plans", ("iterations", "", "of the first plan", COUNT)),
+    *leaves_of(
+        "verdict.flown.contact",
+        ("contact_time", "s", "of each ball's nearest passage", LIST, "time"),
+        ("planned_time", "s", "of that contact", LIST),
+        ("offset", "m", "ball from the tool's centre", LIST),
+        ("contact_ball_pos", "m", "a point a ball", LIST, "ball_pos"),
+        ("contact_robot_pos", "m", "a point a ball", LIST, "robot_pos"),
+        ("contact_tracking", "m", "robot from its plan then", LIST, "tracking"),
     ),
-    Column("iterations", "", "of the first plan", COUNT, lambda b: b.plans.iterations),
-    Column("contact_time", "s", "of each ball's nearest passage", LIST, _contact("time")),
-    Column("planned_time", "s", "of that contact", LIST, _contact("planned_time")),
-    Column("offset", "m", "ball from the tool's centre", LIST, _contact("offset")),
-    Column("contact_ball_pos", "m", "a point a ball", LIST, _contact("ball_pos")),
-    Column("contact_robot_pos", "m", "a point a ball", LIST, _contact("robot_pos")),
-    Column("contact_tracking", "m", "robot from its plan then", LIST, _contact("tracking")),
     Column("tracking_rms", "m", "on the way", NUMBER, lambda b: b.verdict.flown.tracking[:, 0]),
     Column("tracking_worst", "m", "on the way", NUMBER, lambda b: b.verdict.flown.tracking[:, 1]),
 )
@@ -129,19 +131,16 @@ def read_flights(folder: RunFolder) -> tuple[dict[str, Any], FlightTask, Recordi
     if kind != "fly":
         raise SettingError(f"{folder.name} must be a run of flights, got a {manifest['kind']}")
     if manifest["state"] != "complete" or not path.exists():
-        raise SettingError(
-            f"{folder.name} must be finished, with its {FILE}, got {str(folder.path)!r}; "
-            "fly it again"
-        )
+        rule = f"{folder.name} must be finished, with its {FILE}"
+        raise SettingError(f"{rule}, got {str(folder.path)!r}; fly it again")
     try:
         settings = fly_settings(task)(**manifest["parameters"])
         recording = read_recording(path)
     except (pa.ArrowException, KeyError) as error:
         raise SettingError(f"{folder.name} must have a whole {FILE}: {error}") from None
     except TypeError as error:
-        raise SettingError(
-            f"{folder.name} must be of this version, fly it again: {error}"
-        ) from None
+        rule = f"{folder.name} must be of this version, fly it again"
+        raise SettingError(f"{rule}: {error}") from None
     return manifest, settings.flight(), recording
 
 

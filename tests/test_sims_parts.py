@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from closed_forms import drag_free_flight
 
 from planner_jax.ball.flight import BallState, fly
 from planner_jax.robot.quadrotor import flat_attitude
@@ -37,7 +36,7 @@ from planner_jax.sims.sensing import (
     with_drag,
 )
 from planner_jax.sims.tasks.catch import CATCH_WORLD
-from planner_jax.sims.tasks.hit import HIT_WORLD, court_parts, landing_point
+from planner_jax.sims.tasks.hit import HIT_WORLD, court_parts
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, total_duration
 
 NET = CATCH_WORLD.robot.tool
@@ -203,18 +202,6 @@ def test_a_ball_is_caught_from_above_inside_the_radius_at_the_interpolated_time(
     if gaps[0] > 0.0:
         np.testing.assert_allclose(contact.time, 1.0 + 0.3 * CATCH_WORLD.timestep, rtol=1e-6)
         np.testing.assert_allclose(contact.offset, aside, rtol=1e-5)
-
-
-def test_the_landing_point_is_that_of_the_closed_form_without_drag():
-    ball = BallState(jnp.array([0.0, 1.0, 2.0]), jnp.array([3.0, -1.0, 4.0]))
-    point, time = landing_point(ball, jnp.float32(0.0), GRAVITY)
-    np.testing.assert_allclose(
-        drag_free_flight(ball, time, GRAVITY).pos, [*point[:2], 0.0], atol=2e-3
-    )
-    away, _ = landing_point(
-        ball.replace(vel=jnp.array([0.0, 0.0, 40.0])), jnp.float32(0.0), GRAVITY
-    )
-    assert np.isnan(away).all()
 
 
 def test_the_drag_is_found_from_the_energy_that_is_lost():

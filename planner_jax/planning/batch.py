@@ -17,8 +17,7 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh, NamedSharding, PartitionSpec, Sharding, SingleDeviceSharding
 
-from planner_jax.planning.solved import solve_cases
-from planner_jax.protocol import Attempt, HostPlanner, is_solved, is_unsolved
+from planner_jax.protocol import Attempt, HostPlanner, LanesPlanner, is_solved, is_unsolved
 
 # Lanes of a device in one call. Few, because every one is a program of its own to compile.
 BUCKETS = (16, 128, 1024, 8192, 65536)
@@ -59,6 +58,15 @@ def plan_batch(
         return _plan_resident(planner, attempts, cases, chunk, mesh)
     plans, unsolved = _plan_from_host(planner, attempts, cases, chunk, mesh)
     return (jax.device_put(plans, _sharding(mesh)) if resident else plans), unsolved
+
+
+def solve_cases(planner: Any, cases: Any, attempt: Attempt) -> Any:
+    """The plans of one case, or of a batch with a leading axis on every leaf; pure."""
+    if cases.batch_shape == ():
+        return planner.solve(cases, attempt)
+    if isinstance(planner, LanesPlanner):
+        return planner.solve_lanes(cases, attempt)
+    return jax.vmap(lambda case: planner.solve(case, attempt))(cases)
 
 
 def plan_on_host(planner: HostPlanner, attempts: Sequence[Attempt], cases: Any) -> tuple[Any, int]:

@@ -11,9 +11,8 @@ from jax import lax
 from jax.core import Tracer
 from jax.experimental import multihost_utils
 
-from planner_jax.planning.batch import better_of, plan_batch, plan_on_host
+from planner_jax.planning.batch import better_of, plan_batch, plan_on_host, solve_cases
 from planner_jax.planning.single import plan_single
-from planner_jax.planning.solved import solve_cases
 from planner_jax.protocol import AnyPlanner, Attempt, Case, Plan, is_unsolved
 
 CaseT = TypeVar("CaseT", bound=Case)

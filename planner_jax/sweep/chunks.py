@@ -3,7 +3,7 @@
 import dataclasses
 import sys
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
@@ -54,8 +54,8 @@ def plan_chunks(run: SweepRun, *, progress: bool) -> dict[str, Any]:
         Entries for the manifest: `summary`, `times`, and `example`, a case worth a figure.
     """
     source, folder = run.source, run.folder
-    records = (folder.part_record(chunk) for chunk in range(source.num_chunks))
-    done, successes = _progress(record for record in records if record)
+    there = [r for r in map(folder.part_record, range(source.num_chunks)) if r]
+    done, successes = (sum(record[name] for record in there) for name in ("num", "successes"))
     if progress:
         print(f"Writing {folder.path}; the first chunk compiles.", file=sys.stderr)
     look: dict[str, Any] = {"unit": " plans", "desc": source.settings.planner}
@@ -120,14 +120,6 @@ def _in_pipeline(run: SweepRun) -> Iterator[tuple[pa.Table, dict[str, Any] | Non
             yield pending.popleft().result()
 
 
-def _progress(records: Iterable[dict[str, Any]]) -> tuple[int, int]:
-    """How many plans some parts hold, and how many of them succeed."""
-    done, successes = 0, 0
-    for record in records:
-        done, successes = done + record["num"], successes + record["successes"]
-    return done, successes
-
-
 @dataclasses.dataclass(frozen=True)
 class _Planned:
     """One chunk, not judged yet."""
@@ -140,12 +132,8 @@ class _Planned:
 def _plan_chunk(run: SweepRun, chunk: Chunk, clock: CompileClock) -> _Planned:
     """One chunk's plans. What the clock has counted since the chunk before is its compilation."""
     plans, seconds, warm = _timed_plan(run, chunk.cases)
-    record = {
-        "num": len(chunk),
-        "plan_seconds": seconds,
-        "warm": warm,
-        "compile_seconds": clock.lap(),
-    }
+    record = {"num": len(chunk), "plan_seconds": seconds, "warm": warm}
+    record["compile_seconds"] = clock.lap()
     return _Planned(chunk, plans, record)
 
 

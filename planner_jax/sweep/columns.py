@@ -66,6 +66,14 @@ def _leaf_column(
     return Column(name, unit, meaning, kind, lambda b: _leaf(b, f"{part}.{path or name}"))
 
 
+_STATUS_NAMES = np.array([Status(code).name for code in range(len(Status))])
+
+
+def status_column(meaning: str) -> Column:
+    """The column of the plans' statuses, by name."""
+    return Column("status", "", meaning, TEXT, lambda b: _STATUS_NAMES[np.asarray(b.plans.status)])
+
+
 SOLVER = [
     *leaves_of(
         "plans",
@@ -73,7 +81,7 @@ SOLVER = [
         ("violation", "1", "largest relative excess the planner saw"),
         ("iterations", "", "of the round that gave the plan", COUNT),
     ),
-    Column("status", "", "of the solver", TEXT, lambda b: _status(b.plans.status)),
+    status_column("of the solver"),
 ]
 
 OUTCOME = [
@@ -157,13 +165,6 @@ def _leaf(tree: Any, path: str) -> Any:
     for name in path.split("."):
         tree = tree[name] if isinstance(tree, dict) else getattr(tree, name)
     return tree
-
-
-_STATUS_NAMES = np.array([Status(code).name for code in range(len(Status))])
-
-
-def _status(status: Any) -> np.ndarray:
-    return _STATUS_NAMES[np.asarray(status)]
 
 
 def _sentences(verdict: Any) -> np.ndarray:

@@ -6,13 +6,16 @@ import os
 import sys
 from typing import Any
 
+import pyarrow as pa
+
 from planner_jax.registry import Task
-from planner_jax.sweep.baselines import plan_baselines
 from planner_jax.sweep.chunks import SweepRun, plan_chunks
+from planner_jax.sweep.columns import RefereedBatch, rows_of
 from planner_jax.sweep.environment import environment, require_backend
 from planner_jax.sweep.report import PAGE, draw_comparisons, rewrite_page, write_report
 from planner_jax.sweep.run_folder import RunFolder
 from planner_jax.sweep.settings import SettingError, SweepSettings, settings_to_resume
+from planner_jax.sweep.source import Source
 from planner_jax.sweep.sweep import Sweep, settings_of, sweep_of
 
 
@@ -136,6 +139,28 @@ def _add_baselines(run: SweepRun, progress: bool) -> None:
         rows = plan_baselines(run.sweep, run.source, others, example)
         run.folder.write_rows(run.folder.baselines, rows)
         draw_comparisons(run.folder)
+
+
+def plan_baselines(sweep: Sweep, source: Source, planners: dict[str, Any], index: int) -> pa.Table:
+    """Refereed plans of other planners for one case, solved or not.
+
+    Args:
+        sweep: of the run.
+        source: of its cases.
+        planners: by name, one or more.
+        index: place of the case in the run.
+
+    Returns:
+        The columns of `plans.parquet` behind a column `planner`.
+    """
+    chunk, tables = source.cases(index, index + 1), []
+    for name, planner in planners.items():
+        plans = sweep.plan(planner, chunk.cases)
+        verdict = sweep.judge(chunk.cases, plans, source.settings)
+        batch = RefereedBatch(chunk, plans, verdict)
+        rows = rows_of(sweep.columns(batch), batch, sweep.frame)
+        tables.append(rows.add_column(0, "planner", pa.array([name])))
+    return pa.concat_tables(tables)
 
 
 def _session() -> dict[str, Any]:

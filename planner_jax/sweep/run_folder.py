@@ -49,9 +49,7 @@ class RunFolder:
             raise SettingError(f"{self.name} must be {rule}, got {str(self.path)!r}")
         ancestor = next(p for p in [self.path, *self.path.absolute().parents] if p.exists())
         if not ancestor.is_dir() or not os.access(ancestor, os.W_OK | os.X_OK):
-            raise SettingError(
-                f"{self.name} must be a folder that can be written, got {str(self.path)!r}"
-            )
+            raise SettingError(self._unwritable())
 
     def create(self, manifest: dict[str, Any]) -> None:
         """Make the folder with its first manifest.
@@ -65,10 +63,10 @@ class RunFolder:
             self.write_manifest(manifest)
         except OSError as error:
             self.discard()
-            raise SettingError(
-                f"{self.name} must be a folder that can be written, got {str(self.path)!r} "
-                f"({error.strerror})"
-            ) from None
+            raise SettingError(f"{self._unwritable()} ({error.strerror})") from None
+
+    def _unwritable(self) -> str:
+        return f"{self.name} must be a folder that can be written, got {str(self.path)!r}"
 
     def discard(self) -> None:
         """Undo `create` and the parts written since."""
@@ -124,7 +122,8 @@ class RunFolder:
     def read_part(self, number: int) -> pa.Table:
         """The rows of a part that is there."""
         rows = pq.read_table(self._part(number))
-        return rows.replace_schema_metadata(_without_record(rows.schema.metadata))
+        kept = {key: value for key, value in rows.schema.metadata.items() if key != _PART_RECORD}
+        return rows.replace_schema_metadata(kept)
 
     @contextlib.contextmanager
     def joining_parts(self) -> Iterator[Callable[[pa.Table], None]]:
@@ -190,10 +189,6 @@ def _encoding(schema: pa.Schema) -> dict[str, Any]:
     }
 
 
-def _without_record(metadata: dict[bytes, bytes]) -> dict[bytes, bytes]:
-    return {key: value for key, value in metadata.items() if key != _PART_RECORD}
-
-
 def pick_rows(
     path: Path, rows: Sequence[int], columns: Sequence[str] | None = None
 ) -> list[dict[str, Any]]:
@@ -204,7 +199,6 @@ def pick_rows(
             size = file.metadata.row_group(group).num_rows
             local = [row - first for row in wanted if first <= row < first + size]
             if local:
-                table = file.read_row_group(group, columns=columns)
-                picked += table.take(local).to_pylist()
+                picked += file.read_row_group(group, columns=columns).take(local).to_pylist()
             first += size
     return picked

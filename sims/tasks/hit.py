@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from planner_jax.ball.flight import BallState, rk4_step
+from planner_jax.ball.flight import BallState
 from planner_jax.ball.impact import racket_impact
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
@@ -37,12 +37,12 @@ from planner_jax.task.hit.exact import ExactHit
 from planner_jax.task.hit.plan import HitPlan
 from planner_jax.task.hit.replan import ReplanHit
 from planner_jax.task.hit.serves import DEPTH, SERVE_HEIGHT, generate_serves, to_cases
+from planner_jax.task.hit.validate import landing
 from planner_jax.task.hit.words import planner as hit_planner
 
 SEEN = 0.25  # [s], a serve's flight before it is planned for: 2 m and more (paper 000, VII-A)
 _AFTER = 0.1  # [s] flown after the last impact planned
 _LONGEST = 1.9  # [s], the longest flight
-_LANDING_STEPS, _LANDING_STEP = 150, 0.02  # [s], three seconds of flight
 _NEAR, _FAR = 0.5, 1.0  # [m] from the target: the two rates of paper 002
 
 _LINE_COLOUR, _MIDDLE_COLOUR, _DEAD_COLOUR = "#FFFFFF", "#24292F", "#D98880"
@@ -172,26 +172,6 @@ def returned(contact: Contact, restitution: Array) -> BallState:
     return BallState(pos=contact.ball_pos, vel=vel)
 
 
-def landing_point(ball: BallState, drag: Array, gravity: Array) -> tuple[Array, Array]:
-    """Where (3,) [m] one ball comes down to the ground, and when () [s] from now.
-
-    The library's flight with quadratic drag, three seconds at most; NaN for one still in the
-    air then.
-    """
-    step = jnp.full_like(drag, _LANDING_STEP)
-
-    def advance(state: BallState, _: None) -> tuple[BallState, Array]:
-        return rk4_step(state, step, drag, gravity), state.pos
-
-    _, path = jax.lax.scan(advance, ball, None, length=_LANDING_STEPS + 1)
-    falls = (path[:-1, 2] > 0.0) & (path[1:, 2] <= 0.0)
-    first = jnp.argmax(falls)
-    a, b = path[first], path[first + 1]
-    share = a[2] / jnp.where(falls[first], a[2] - b[2], 1.0)
-    point = jnp.where(falls[first], a + share * (b - a), jnp.nan)
-    return point, jnp.where(falls[first], (first + share) * step, jnp.nan)
-
-
 @functools.partial(jax.jit, static_argnames="loop")
 def _believed(loop: Loop, flights: FlightState, truth: HitCase) -> HitCase:
     """What is to be hit, as it is believed."""
@@ -203,19 +183,11 @@ def _believed(loop: Loop, flights: FlightState, truth: HitCase) -> HitCase:
     return jax.vmap(one)(flights, truth)
 
 
-@jax.jit
-def _landings(contact: Contact, truth: HitCase) -> tuple[Array, Array]:
-    """Landing points (B, 3) [m] of the balls that were hit, and their distances from target."""
-
-    def one(contact: Contact, case: HitCase) -> tuple[Array, Array]:
-        contact = jax.tree.map(lambda leaf: leaf[0], contact)
-        ball = returned(contact, case.restitution)
-        point, _ = landing_point(ball, case.drag, case.gravity)
-        miss = jnp.sqrt(jnp.sum((point - case.target) ** 2))
-        hit = contact.met & jnp.isfinite(miss)
-        return jnp.where(hit, point, jnp.nan), jnp.where(hit, miss, jnp.inf)
-
-    return jax.vmap(one)(contact, truth)
+def _returned(contact: Contact, truth: HitCase) -> BallState:
+    """Balls just after their impacts, leaves (B, 3) in NumPy, NaN where they were missed."""
+    one = jax.tree.map(lambda leaf: leaf[:, 0], contact)
+    balls = jax.device_get(jax.vmap(returned)(one, truth.restitution))
+    return jax.tree.map(lambda leaf: np.where(np.asarray(one.met)[:, None], leaf, np.nan), balls)
 
 
 def fly_hits(
@@ -259,8 +231,10 @@ def fly_hits(
     flight = dataclasses.replace(flight, plan=begun, began=flight.time, present=flight.launched)
     periods = loop.num_periods(_LONGEST - SEEN + _AFTER)
     flight, record = fly_leg(loop, pilot, flight, known, drag, num_periods=periods)
-    landing, miss = jax.device_get(_landings(flight.contact, truth))
-    return HitFlights(first, flown(flight, [record]), planning, landing, miss)
+    back, truth = _returned(flight.contact, truth), cases.cases
+    point = landing(back.pos, back.vel, truth.drag, truth.gravity)[1]
+    miss = np.nan_to_num(np.linalg.norm(point - truth.target, axis=1), nan=np.inf)
+    return HitFlights(first, flown(flight, [record]), planning, point, miss)
 
 
 class HitFlight(FlightTask):
@@ -297,8 +271,7 @@ class HitFlight(FlightTask):
     def launches(self, cases: Volleys, flown: Flown) -> Launches:
         """The serves, and the balls that come back from the racket."""
         truth = cases.cases
-        contact = jax.tree.map(lambda leaf: leaf[:, 0], flown.contact)
-        back = jax.device_get(jax.vmap(returned)(contact, truth.restitution))
+        back = _returned(flown.contact, truth)
         balls = jax.tree.map(lambda leaf: leaf[:, None], truth.ball)
         drag = truth.drag[:, None]
         return Launches(balls, drag, np.zeros(1), SEEN, returned=back, target=truth.target)

@@ -53,12 +53,11 @@ class CatchTally(Tally):
 
     def summary(self) -> dict[str, Any]:
         """Rates as fractions, 0 to 1, and times [s], for the manifest; None where unknown."""
-        num_ratios = self._num_ratios if self._decides else 0
         return {
             **super().summary(),
             "caught": self._shares / self.num,
             "mean_catch_time": _mean(self._times, self._num_caught),
-            "optimal_time_ratio": _mean(self._ratios, num_ratios),
+            "optimal_time_ratio": _mean(self._ratios, self._num_ratios if self._decides else 0),
         }
 
 

@@ -10,6 +10,7 @@ from planner_jax.task.hit import court
 
 FRAME = "world, z up, net at x = 0; times from the start of planning"
 _POINT = list_of(pa.float64(), 3)
+_names = lambda b: np.array(court.SCENARIOS)[b.chunk.origin.scenario]  # noqa: E731
 
 
 def published_column(planner: str) -> str:
@@ -28,13 +29,9 @@ def _published(place: int, planner: str) -> Column:
     return Column(published_column(planner), "", meaning, BOOL, values)
 
 
-def _scenarios(batch: known.RefereedBatch) -> np.ndarray:
-    return np.array(court.SCENARIOS)[batch.chunk.origin.scenario]
-
-
 COLUMNS = [
     known.INDEX,
-    Column("scenario", "", "serve, landing and target region", TEXT, _scenarios),
+    Column("scenario", "", "serve, landing and target region", TEXT, _names),
     *leaves_of(
         "chunk",
         ("file", "", "trial file of the serve", TEXT, "origin.file"),

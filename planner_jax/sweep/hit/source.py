@@ -61,8 +61,8 @@ def open_source(settings: HitSettings, batch: int) -> ServeSource:
     """As `Sweep.open_source`; a folder is read and checked whole.
 
     Raises:
-        SettingError: the suite is of another package, the folder is missing, a row of it is not
-            sound, or more serves are asked for than it holds.
+        SettingError: the suite is of another package, the folder is missing, a row is not sound,
+            or too few serves are in it.
     """
     require_one_of(TASK.suites, "suite", str(settings.suite))  # others know no serves
     try:

@@ -44,7 +44,14 @@ def flight_figure(figure: Figure, run: RunRows) -> None:
         style.label(axes, "", "", f"Catch {place + 1}, {motion.time[at]:.2f} s")
     for axes in panels[num:]:
         axes.axis("off")
-    _legend(figure)
+    entries = [
+        Line2D([], [], color=style.BLUE, linewidth=2, label="quadrotor, rotors"),
+        Line2D([], [], color=style.RED, label="net"),
+        Line2D([], [], color=style.INK, marker="s", markersize=4, label="target from time 0"),
+        Line2D([], [], color=style.INK, marker="o", linestyle="", label="catch"),
+        Line2D([], [], color=style.INK, linestyle=":", label="target, if not caught"),
+    ]
+    figure.legend(handles=entries, loc="outside upper center", ncols=len(entries))
 
 
 def _window(plan: SampledCatch) -> tuple[np.ndarray, np.ndarray]:
@@ -89,14 +96,3 @@ def _draw_quadrotor(axes: Axes, plan: SampledCatch, at: int, where: list, alpha:
     axes.plot(*(centre + plan.radius * circle)[:, where].T, color=style.RED, linewidth=1.5, **look)
     axes.plot(*(pos + _ROTORS * circle)[:, where].T, color=style.BLUE, linewidth=1.2, **look)
     axes.plot(*np.stack([pos, centre])[:, where].T, color=style.GREY, linewidth=1.2, **look)
-
-
-def _legend(figure: Figure) -> None:
-    entries = [
-        Line2D([], [], color=style.BLUE, linewidth=2, label="quadrotor, rotors"),
-        Line2D([], [], color=style.RED, label="net"),
-        Line2D([], [], color=style.INK, marker="s", markersize=4, label="target from time 0"),
-        Line2D([], [], color=style.INK, marker="o", linestyle="", label="catch"),
-        Line2D([], [], color=style.INK, linestyle=":", label="target, if not caught"),
-    ]
-    figure.legend(handles=entries, loc="outside upper center", ncols=len(entries))

@@ -25,13 +25,11 @@ def court_figure(figure: Figure, run: RunRows) -> None:
     drag_after = run.manifest["parameters"]["drag_after_impact"]
     aside, top = court.HALF_WIDTH + 0.3, 6.4
     above, side = figure.subplots(2, 1, sharex=True, height_ratios=[2.0 * aside, top + 0.25])
-    above.set_ylim(-aside, aside)
-    side.set_ylim(-0.25, top)
-    for axes, second in ((above, 1), (side, 2)):
+    across = court.HALF_LENGTH + 0.6
+    for axes, second, limits in ((above, 1, (-aside, aside)), (side, 2, (-0.25, top))):
         for row in rows:
             _draw_case(axes, row, second, setting, drag_after)
-        axes.set_aspect("equal")
-        axes.set_xlim(-court.HALF_LENGTH - 0.6, court.HALF_LENGTH + 0.6)
+        axes.set(aspect="equal", xlim=(-across, across), ylim=limits)
     _draw_floor(above)
     side.axhline(0.0, color=style.GREY, linewidth=1.5)
     side.axvline(0.0, color=style.INK, linewidth=1.2, linestyle=":", zorder=1)
@@ -42,7 +40,17 @@ def court_figure(figure: Figure, run: RunRows) -> None:
     title = f"From above: {len(rows)} cases" + (f", {num_failed} failed" if num_failed else "")
     style.label(above, "", "y [m]", title)
     style.label(side, "x [m], net at 0, opponent to the right", "z [m]", "From the side")
-    _legend(figure, num_failed > 0)
+    entries = [
+        Line2D([], [], color=style.ORANGE, label="served ball"),
+        Line2D([], [], color=style.BLUE, linewidth=2, label="quadrotor"),
+        Line2D([], [], color=style.INK, marker="o", markersize=4, linestyle="", label="impact"),
+        Line2D([], [], color=style.GREEN, label="returned ball"),
+        Line2D([], [], markersize=9, linestyle="", label="target", **_TARGET),
+    ]
+    if num_failed:
+        look: dict[str, Any] = {"color": style.RED, "linestyle": "--", "marker": "X"}
+        entries.append(Line2D([], [], label="failed: ball and plan", **look))
+    figure.legend(handles=entries, loc="outside upper center", ncols=len(entries))
 
 
 def ball_path(
@@ -102,17 +110,3 @@ def _draw_floor(axes: Axes) -> None:
         for letter, x, y in (("N", 1.0, 0.0), ("F", 4.7, 0.0), ("L", 4.7, 2.2), ("R", 4.7, -2.2)):
             axes.text(way * x, y, letter, color=style.INK, **look)
     axes.grid(visible=False)
-
-
-def _legend(figure: Figure, failures: bool) -> None:
-    entries = [
-        Line2D([], [], color=style.ORANGE, label="served ball"),
-        Line2D([], [], color=style.BLUE, linewidth=2, label="quadrotor"),
-        Line2D([], [], color=style.INK, marker="o", markersize=4, linestyle="", label="impact"),
-        Line2D([], [], color=style.GREEN, label="returned ball"),
-        Line2D([], [], markersize=9, linestyle="", label="target", **_TARGET),
-    ]
-    if failures:
-        look: dict[str, Any] = {"color": style.RED, "linestyle": "--", "marker": "X"}
-        entries.append(Line2D([], [], label="failed: ball and plan", **look))
-    figure.legend(handles=entries, loc="outside upper center", ncols=len(entries))
