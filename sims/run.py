@@ -35,6 +35,7 @@ from planner_jax.sweep.summary import percent, wilson_interval
 from planner_jax.sweep.table import RateTable, own_cells, to_html, to_markdown
 from planner_jax.sweep.timing import CompileClock, Stopwatch
 
+_FILMED = 3  # flights at most
 _RECORDED = 256  # flights of a batch that are recorded whole
 _FRAME = "world, z up; times from the first plan"
 
@@ -64,7 +65,6 @@ def start_flights(
     video: str | None = None,
     *,
     record: int = 16,
-    film: int = 3,
 ) -> dict[str, Any]:
     """Fly into a new folder.
 
@@ -73,7 +73,6 @@ def start_flights(
         out: folder, new or empty.
         video: name of a film in the folder, .gif or .mp4; None makes none.
         record: how many flights are kept look by look, the first ones.
-        film: how many of these the film shows, the first ones.
 
     Returns:
         The manifest.
@@ -111,7 +110,7 @@ def start_flights(
     recording = flight.recording(cases, flights, np.arange(kept))
     folder.write_rows(folder.path / FILE, to_rows(recording))
     if video is not None:
-        film_flights(folder.path / video, flight, recording, min(film, kept))
+        film_flights(folder.path / video, flight, recording, min(_FILMED, kept))
     done = {"state": "complete", "summary": _summary(flight, rows), "times": times}
     manifest = {**folder.read_manifest(), **done}
     folder.write_manifest(manifest)

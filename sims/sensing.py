@@ -116,7 +116,7 @@ def with_drag(estimate: Estimate, gravity: Array) -> Estimate:
     """
     energy, variance = _energy(estimate.belief, gravity)
     std = jnp.sqrt(jnp.maximum(variance + estimate.energy_variance, 1e-12))
-    found = rls_update(estimate.prior, estimate.lever / std, (estimate.energy - energy) / std, 1.0)
+    found = rls_update(estimate.prior, estimate.lever / std, (estimate.energy - energy) / std)
     return dataclasses.replace(estimate, drag=found.estimate)
 
 

@@ -147,21 +147,18 @@ class RlsState:
     variance: Array  # () of the estimate; 1/variance of the start counts as that many y, h = 1
 
 
-def rls_update(
-    state: RlsState, regressor: Array, measurement: Array, forgetting: Array | float
-) -> RlsState:
+def rls_update(state: RlsState, regressor: Array, measurement: Array) -> RlsState:
     """The estimate with one measurement more.
 
     Args:
         state: the estimate so far.
         regressor: () h.
         measurement: () y; where it is not finite the estimate stays as it is.
-        forgetting: () in (0, 1]: the weight of all that came before shrinks by this factor.
     """
     usable = jnp.isfinite(measurement)
     y = jnp.where(usable, measurement, 0.0)
-    # P / (lambda + h^2 P) is the textbook's (1 - K h) P / lambda without its cancellation.
-    variance = state.variance / (forgetting + regressor**2 * state.variance)
+    # P / (1 + h^2 P) is the textbook's (1 - K h) P without its cancellation.
+    variance = state.variance / (1.0 + regressor**2 * state.variance)
     error = y - regressor * state.estimate
     after = RlsState(estimate=state.estimate + variance * regressor * error, variance=variance)
     return jax.tree.map(lambda new, old: jnp.where(usable, new, old), after, state)

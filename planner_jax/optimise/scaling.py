@@ -1,7 +1,7 @@
 """Measuring the diagonal scale of a planner's decision variables.
 
 Quasi-Newton steps are only as good as the coordinates. The scale of variable i is
-c_i = gain / sqrt(floor + median H_ii), where H = J^T J is the Gauss-Newton curvature of the
+c_i = 1 / sqrt(floor + median H_ii), where H = J^T J is the Gauss-Newton curvature of the
 planner's residuals in natural units, and the median runs over cases, each taken at its
 first guess and at a solution. A new task offers `residuals` and gets its scale from here.
 """
@@ -21,6 +21,8 @@ from jax import Array
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.multistart import minimise
 from planner_jax.optimise.problem import Problem
+
+_ROUNDS = 3  # of measuring with the scale that the round before has found
 
 
 class ScaledPlanner(Problem, Protocol):
@@ -62,14 +64,7 @@ def curvature_diagonal(residuals: Callable[[Array], Array], point: Array) -> Arr
     return jnp.sum(jacobian**2, axis=0)
 
 
-def measure_scale(
-    planner: ScaledPlanner,
-    cases: Any,
-    *,
-    gain: float = 1.0,
-    floor: float = 1e-4,
-    num_rounds: int = 3,
-) -> np.ndarray:
+def measure_scale(planner: ScaledPlanner, cases: Any, *, floor: float = 1e-4) -> np.ndarray:
     """Scale of every decision variable, measured on a batch of cases.
 
     Solutions depend on the scale they were found with, so measuring is repeated with its own
@@ -79,16 +74,14 @@ def measure_scale(
         planner: a frozen dataclass with a `scale` field, the first value of which only has
             to be sensible.
         cases: a batch; a few hundred, hard ones among them, so that limits are active.
-        gain: multiplies the result; below one for smaller first steps.
         floor: curvature that is taken as none, so that a variable which hardly matters keeps
             a finite scale.
-        num_rounds: repetitions.
 
     Returns:
         (n,) float64.
     """
     config = LbfgsConfig(max_steps=30)
-    for _ in range(num_rounds):
+    for _ in range(_ROUNDS):
 
         def diagonals(case: Any, planner: ScaledPlanner = planner) -> Array:
             context = planner.prepare(case)
@@ -104,6 +97,6 @@ def measure_scale(
             return at(start) + at(optimum.point)
 
         curvature = np.asarray(jax.jit(jax.vmap(diagonals))(cases), np.float64)
-        scale = gain / np.sqrt(floor + np.nanmedian(curvature, axis=0))
+        scale = 1.0 / np.sqrt(floor + np.nanmedian(curvature, axis=0))
         planner = dataclasses.replace(planner, scale=tuple(scale.tolist()))
     return np.asarray(planner.scale)

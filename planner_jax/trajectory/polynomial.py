@@ -71,16 +71,23 @@ def total_duration(trajectory: PiecewisePolynomial) -> Array:
     return jnp.sum(trajectory.durations, axis=-1)
 
 
+def energy_form(degree: int, order: int) -> tuple[np.ndarray, np.ndarray]:
+    """Integral of the squared `order`-th derivative over a unit of time, as a quadratic form.
+
+    Returns:
+        The form in the coefficients, (degree + 1, degree + 1), and the power of the time that
+        each entry grows with.
+    """
+    factors, powers = derivative_factors(degree, order), np.arange(degree + 1)
+    exponents = np.maximum(powers[:, None] + powers[None, :] - 2 * order + 1, 1)
+    return np.outer(factors, factors) / exponents, exponents
+
+
 def snap_energy(trajectory: PiecewisePolynomial, order: int = 4) -> Array:
     """Integral of the squared `order`-th derivative over the whole trajectory, exactly."""
     coeffs, durations = trajectory.coeffs, trajectory.durations
-    degree = coeffs.shape[1] - 1
-    factors = derivative_factors(degree, order)
-    powers = np.arange(degree + 1)
-    exponents = powers[:, None] + powers[None, :] - 2 * order + 1
-    valid = (powers[:, None] >= order) & (powers[None, :] >= order)
-    weights = np.where(valid, np.outer(factors, factors) / np.maximum(exponents, 1), 0.0)
-    gram = jnp.asarray(weights, coeffs.dtype) * durations[:, None, None] ** np.maximum(exponents, 0)
+    form, exponents = energy_form(coeffs.shape[1] - 1, order)
+    gram = jnp.asarray(form, coeffs.dtype) * durations[:, None, None] ** exponents
     return jnp.einsum("mki,mkl,mli->", coeffs, gram, coeffs, precision=lax.Precision.HIGHEST)
 
 

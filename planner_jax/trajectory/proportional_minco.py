@@ -27,7 +27,12 @@ from flax import struct
 from jax import Array, lax
 
 from planner_jax.arithmetic import reciprocal
-from planner_jax.trajectory.polynomial import Motion, PiecewisePolynomial, derivative_factors
+from planner_jax.trajectory.polynomial import (
+    Motion,
+    PiecewisePolynomial,
+    derivative_factors,
+    energy_form,
+)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -84,13 +89,8 @@ def _hermite_map(order: int) -> np.ndarray:
 @functools.cache
 def _hermite_energy(order: int) -> np.ndarray:
     """Energy of a unit-time piece as a quadratic form in its end derivatives, (2s, 2s)."""
-    size = 2 * order
-    factors = derivative_factors(size - 1, order)
-    powers = np.arange(size)
-    exponents = np.maximum(powers[:, None] + powers[None, :] - 2 * order + 1, 1)
-    gram = np.outer(factors, factors) / exponents
     hermite = _hermite_map(order)
-    return hermite.T @ gram @ hermite
+    return hermite.T @ energy_form(2 * order - 1, order)[0] @ hermite
 
 
 @functools.cache
