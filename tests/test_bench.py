@@ -94,7 +94,7 @@ def judge(cases, plans):
 
 @pytest.fixture
 def halving(monkeypatch):
-    card = registry.Task("halve", "halves numbers", __name__, {"half": ""}, {})
+    card = registry.Task("halve", "halves numbers", __name__, {"half": ""}, {"counted": ""})
     monkeypatch.setattr(registry, "all_tasks", lambda: {"halve": card})
 
 

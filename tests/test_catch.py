@@ -200,8 +200,8 @@ def test_sizes_that_make_no_sense_are_refused(cases):
         PLANNER.guesses(PLANNER.prepare(lane_of(cases, 0)), 7)
 
 
-def test_the_shipped_scale_is_a_positive_number_for_every_variable_of_a_segment(scenarios):
-    lane = lane_of(scenarios, 0)
+def test_the_shipped_scale_is_a_positive_number_for_every_variable_of_a_segment(cases):
+    lane = lane_of(cases, 0)
     points = jax.eval_shape(lambda one: PLANNER.guesses(PLANNER.prepare(one), 1), lane)
     scale = shipped_scale("planner_jax.task.catch", "exact-6")
     assert points.shape == (1, lane.num_targets * len(scale))

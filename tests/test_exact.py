@@ -162,8 +162,8 @@ def test_sizes_that_make_no_sense_are_refused(cases):
 
 
 @pytest.mark.parametrize("pieces", [6, 12])
-def test_a_shipped_scale_is_a_positive_number_for_every_decision_variable(scenarios, pieces):
-    lane = jax.tree.map(lambda leaf: leaf[0], scenarios)
+def test_a_shipped_scale_is_a_positive_number_for_every_decision_variable(cases, pieces):
+    lane = jax.tree.map(lambda leaf: leaf[0], cases)
     planner = ExactHit(proportions=(1.0,) * pieces)
     points = jax.eval_shape(lambda one: planner.guesses(planner.prepare(one), 1), lane)
     scale = shipped_scale("planner_jax.task.hit", f"exact-{pieces}")

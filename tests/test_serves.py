@@ -5,6 +5,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from closed_forms import region_of
 
 import planner_jax as pj
 from planner_jax.ball import flight
@@ -91,13 +92,13 @@ def test_published_rates_have_the_known_means():
 def test_a_point_lies_in_the_same_region_of_either_half(half):
     x = np.array([1.0, 4.0, 2.0, 4.9, 0.4, 5.1, 2.0, np.nan])
     y = np.array([0.8, -0.8, 0.9, -2.4, 0.0, 0.0, 2.6, 0.0])
-    np.testing.assert_array_equal(court.region_of(half * x, y), [1, 2, 3, 4, 0, 0, 0, 0])
+    np.testing.assert_array_equal(region_of(half * x, y), [1, 2, 3, 4, 0, 0, 0, 0])
 
 
 def test_each_target_lies_in_the_region_that_its_scenario_names():
     target = court.target_of(np.arange(36))
     named = [1 + court.REGIONS.index(name[2]) for name in court.SCENARIOS]
-    np.testing.assert_array_equal(court.region_of(target[:, 0], target[:, 1]), named)
+    np.testing.assert_array_equal(region_of(target[:, 0], target[:, 1]), named)
 
 
 # The published files.
@@ -264,11 +265,11 @@ def test_serves_start_and_land_in_their_regions():
     regions = court.scenario_regions(serves.scenario)
     x, y, z = serves.position.T
     assert (x > 0.0).all() and (z == SERVE_HEIGHT).all()
-    np.testing.assert_array_equal(court.region_of(x, y), regions[:, 0])
+    np.testing.assert_array_equal(region_of(x, y), regions[:, 0])
     point = floor_points(serves.position, serves.velocity)
     # A landing point within the error of the two integrations of a line may fall beyond it.
     inward = [
-        court.region_of(point[:, 0] + dx, point[:, 1] + dy)
+        region_of(point[:, 0] + dx, point[:, 1] + dy)
         for dx, dy in [(0, 0), (1e-3, 0), (-1e-3, 0), (0, 1e-3), (0, -1e-3)]
     ]
     assert (np.stack(inward) == regions[:, 1]).any(axis=0).all()
@@ -291,7 +292,7 @@ def test_the_shortcut_of_the_generator_draws_uniform_serves():
     low, high = [0.5, 0.84, 2.0, -8.5, -5.5, 6.5], [4.5, 2.5, 2.0, -2.0, -0.5, 8.73]
     plain = random.uniform(low, high, (40000, 6))
     time, point = landing(plain[:, :3], plain[:, 3:], DRAG, GRAVITY)
-    kept = (court.region_of(point[:, 0], point[:, 1]) == 4) & (time < MAX_FLIGHT_TIME)
+    kept = (region_of(point[:, 0], point[:, 1]) == 4) & (time < MAX_FLIGHT_TIME)
     plain = plain[kept & (point[:, 0] < 0.0) & (point[:, 0] > -DEPTH)]
     serves = generate_serves(8000, 0, ["LRN"])
     shortcut = np.hstack([serves.position, serves.velocity])

@@ -46,7 +46,7 @@ from tests.recordings import recording
         ),
         (
             lambda: HitFly(suite="S.7"),
-            "suite must be one of S.1, S.2, S.3, S.4, S.5, S.6, got 'S.7'",
+            "suite must be one of court, S.1, S.2, S.3, S.4, S.5, S.6, got 'S.7'",
         ),
         (lambda: CatchFly(drag_error=-0.1), "drag_error must be >= 0 and < 1, got -0.1"),
     ],

@@ -100,9 +100,11 @@ def test_the_manifest_says_what_was_run_where_and_how_long(finished):
     assert manifest["device"]["cpu_count"] >= 1
     assert manifest["setting"]["speed"] == 5.0
     times, summary = manifest["times"], manifest["summary"]
-    for name in ("compile_seconds", "first_seconds", "warm_seconds", "referee_seconds"):
+    for name in ("first_seconds", "warm_seconds", "referee_seconds"):
         assert 0.0 < times[name] and name in times["measured"]
-    assert times["compile_seconds"] < times["wall_seconds"]
+    # Another module of the same process may have compiled the program already.
+    assert 0.0 <= times["compile_seconds"] < times["wall_seconds"]
+    assert "compile_seconds" in times["measured"]
     assert summary["compile_seconds"] == times["compile_seconds"]
     assert summary["plans_per_second_warm"] > 0.0
 
