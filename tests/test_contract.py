@@ -159,7 +159,7 @@ def entries(*, on_host=True, slow=()):
     )
 
 
-every, pure = entries(), entries(on_host=False)
+every, pure = entries(slow=LIKE_OTHERS), entries(on_host=False, slow=LIKE_OTHERS)
 
 
 def inside(planner):
@@ -299,12 +299,14 @@ def test_what_comes_back_is_of_the_kind_of_array_that_was_given(entry):
     assert_close(resident, entry.plans)
 
 
-@entries(on_host=False, slow=LIKE_OTHERS)
+@pure
 def test_solve_inside_a_compiled_function_is_plan(entry):
     assert_close(jax.jit(pj.solve)(entry.planner, entry.batch), entry.plans)
 
 
-@pytest.mark.parametrize("name", ["library", "hit juggle", "catch mpp"])
+@pytest.mark.parametrize(
+    "name", ["library", "hit juggle", pytest.param("catch mpp", marks=pytest.mark.slow)]
+)
 def test_solve_takes_one_case_and_any_transformation_but_a_derivative(name):
     entry = ENTRIES[name]
     solve = functools.partial(pj.solve, entry.planner)
@@ -340,7 +342,7 @@ def test_a_derivative_is_refused_with_the_names_of_what_has_one(entry, call):
     assert "\n" not in str(caught.value)
 
 
-@entries(slow=LIKE_OTHERS)
+@entries(slow=(*LIKE_OTHERS, "catch exact"))
 def test_a_gradient_is_there_where_it_is_promised_and_refused_elsewhere(entry):
     planner = inside(entry.planner)
     if not hasattr(planner, "objective"):

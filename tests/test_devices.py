@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 SCRIPT = Path(__file__).with_name("spread.py")
 
 
@@ -26,6 +28,7 @@ def finish(process):
     assert output.endswith("equal\n")
 
 
+@pytest.mark.slow
 def test_several_devices_give_the_plans_of_one():
     finish(start("devices", devices=4))
 

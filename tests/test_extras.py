@@ -212,6 +212,7 @@ def test_a_cost_moves_the_way(hits, free, middle):
         assert after > before + 0.05
 
 
+@pytest.mark.slow
 def test_catches_stay_inside_a_fence():
     """Each may go 85 % as far from its start, along one axis, as the catch that is free."""
     cases = jax.tree.map(np.asarray, pj.catch.draw(NUM, "throws", seed=3))

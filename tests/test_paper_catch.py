@@ -76,6 +76,7 @@ def test_guess_costs_what_the_published_protocol_says(pieces):
         np.testing.assert_allclose(UNIT * guess_cost(cases), published[f"J0_M{pieces}"], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_converged_cost_is_the_published_optimum():
     gap, late, cases, plans = excess(4)
     np.testing.assert_allclose(gap, 0.0, atol=1e-4)

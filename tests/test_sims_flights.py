@@ -46,12 +46,14 @@ def test_without_noise_every_ball_is_caught_where_and_when_it_was_planned(catche
     assert catches.flown.tracking[:, 1].max() < 0.02
 
 
+@pytest.mark.slow
 def test_without_noise_every_ball_is_hit_where_and_when_it_was_planned(hits):
     places, times = contact_errors(hits.flown)
     assert places.max() < 0.02 and times.max() < 0.002
     assert hits.miss.max() < 0.05  # from the target, after a second and a half of flight
 
 
+@pytest.mark.slow
 def test_a_plan_of_the_other_task_is_refused(catches, hits):
     with pytest.raises(ValueError, match="^plan must be a CatchPlan, got a HitPlan$"):
         fly_catches(Loop(CATCH_WORLD), throws(3, seed=1), plan=hits.first_plan)
