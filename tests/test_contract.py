@@ -264,7 +264,7 @@ def traces(monkeypatch):
     return count
 
 
-@pure
+@entries(on_host=False, slow=(*LIKE_OTHERS, "catch mpp"))
 def test_a_second_batch_of_the_same_bucket_is_not_traced_again(entry, traces):
     assert entry.plans is not None  # planned once
     found = traces(inside(entry.planner))

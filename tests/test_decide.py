@@ -176,6 +176,7 @@ def test_absent_targets_come_last_and_change_nothing(triangles, decide):
     assert orders(whole)[-1] == orders(found)[-1]  # where all are present
 
 
+@pytest.mark.slow
 def test_plans_follow_the_decision_and_best_catches_both_in_time(pairs):
     plans = plan(by(Best()), pairs)
     proposed = best(pairs)

@@ -33,6 +33,7 @@ def test_several_devices_give_the_plans_of_one():
     finish(start("devices", devices=4))
 
 
+@pytest.mark.slow
 def test_two_processes_give_the_plans_of_one():
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

@@ -39,6 +39,7 @@ def hits():
     return fly_hits(Loop(HIT_WORLD), volleys(3, REAL_SCENARIOS["S.1"], seed=1))
 
 
+@pytest.mark.slow
 def test_without_noise_every_ball_is_caught_where_and_when_it_was_planned(catches):
     assert catches.caught.all()
     places, times = contact_errors(catches.flown)
@@ -63,6 +64,7 @@ def test_a_plan_of_the_other_task_is_refused(catches, hits):
         )
 
 
+@pytest.mark.slow
 def test_a_plan_that_is_given_is_the_one_that_is_flown(catches):
     again = fly_catches(Loop(CATCH_WORLD), throws(3, seed=1), plan=catches.first_plan)
     np.testing.assert_allclose(again.flown.contact.time, catches.flown.contact.time, atol=1e-5)
