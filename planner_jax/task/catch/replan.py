@@ -20,11 +20,12 @@ from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.problem import Round
 from planner_jax.planning.replan import Replanning
 from planner_jax.robot.quadrotor import body_z
+from planner_jax.robot.quadrotor_plan import handover
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.chain import CatchContext, targets_at
 from planner_jax.task.catch.exact import ExactCatch
 from planner_jax.task.catch.plan import CatchPlan
-from planner_jax.trajectory.polynomial import PiecewisePolynomial, state_basis, states_at
+from planner_jax.trajectory.polynomial import PiecewisePolynomial, state_basis
 from planner_jax.trajectory.proportional_minco import boundary_rows
 
 _ORDERS = 4  # position to jerk
@@ -100,12 +101,7 @@ class ReplanCatch(OptimisedPlanner):
         Raises:
             ValueError: a negative time.
         """
-        dtype = np.asarray(cases.gravity).dtype
-        elapsed = np.broadcast_to(np.asarray(elapsed, dtype), cases.batch_shape)
-        if not (elapsed >= 0.0).all():
-            raise ValueError(f"elapsed must be >= 0, got {np.min(elapsed)}")
-        if head_state is None:
-            head_state = states_at(previous.trajectory, elapsed)
+        elapsed, head_state = handover(cases, previous, elapsed, head_state)
         since = elapsed[..., None]
         order, times = np.asarray(previous.order), np.asarray(previous.times)
         present, horizon = np.asarray(cases.present), np.asarray(cases.horizon)
@@ -125,7 +121,7 @@ class ReplanCatch(OptimisedPlanner):
             horizon=horizon - since,
             order=order,
             times=np.maximum(times - since, _SHORTEST),
-            head_state=np.asarray(head_state, dtype),
+            head_state=head_state,
         )
         return Replanning(case=left, previous=previous, elapsed=elapsed)
 

@@ -11,7 +11,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 from jax import Array
 
@@ -21,11 +20,12 @@ from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.problem import Round
 from planner_jax.planning.replan import Replanning
 from planner_jax.robot.quadrotor import net_thrust, tangent_basis
+from planner_jax.robot.quadrotor_plan import handover
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.context import HitContext
 from planner_jax.task.hit.exact import ExactHit
 from planner_jax.task.hit.plan import HitPlan
-from planner_jax.trajectory.polynomial import evaluate, states_at, total_duration
+from planner_jax.trajectory.polynomial import evaluate, total_duration
 
 _SHORTEST = 0.01  # [s], least time to the impact that is guessed
 _TRIALS = (1.0, 0.2, 0.04)  # step lengths: the first direction, without curvature, is too long
@@ -78,14 +78,8 @@ class ReplanHit(OptimisedPlanner):
         Raises:
             ValueError: a negative time.
         """
-        dtype = np.asarray(cases.gravity).dtype
-        elapsed = np.broadcast_to(np.asarray(elapsed, dtype), cases.batch_shape)
-        if not (elapsed >= 0.0).all():
-            raise ValueError(f"elapsed must be >= 0, got {np.min(elapsed)}")
-        if head_state is None:
-            head_state = states_at(previous.trajectory, elapsed)
+        elapsed, head_state = handover(cases, previous, elapsed, head_state)
         drag = cases.drag if drag is None else drag
-        head_state = np.asarray(head_state, dtype)
         now = dataclasses.replace(cases, ball=ball, drag=drag, head_state=head_state)
         return Replanning(case=now, previous=previous, elapsed=elapsed)
 
