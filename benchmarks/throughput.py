@@ -135,8 +135,12 @@ def _timed(planner: Any, host: Any, devices: list, repeat: int) -> _Timed:
     began = time.perf_counter()
     while time.perf_counter() - began < _WARM_UP:
         call()
-    calls = [call() for _ in range(repeat)]
-    return _Timed(first, clock.seconds, [took for took, _ in calls], calls[-1][1])
+    seconds, plans = [], None
+    for _ in range(repeat):
+        del plans  # or their memory would be counted, too
+        took, plans = call()
+        seconds.append(took)
+    return _Timed(first, clock.seconds, seconds, plans)
 
 
 def _add_row(

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array, lax
+from jax.core import Tracer
 
 from planner_jax.planning.batch import better_of, merged
 from planner_jax.protocol import Attempt, Case, Decision, Drive, Plan, is_solved, is_unsolved
@@ -39,6 +40,13 @@ class DecidedPlanner(Generic[CaseT, PlanT]):
     def settled(self, case: CaseT) -> tuple[Any, CaseT]:
         """The planner inside, and the case with the decision's first choice; see `optimal_plan`."""
         return self.planner, first_choice(self.decision, case)
+
+    def only_choice(self, cases: Any) -> Any:
+        """The choice about every case if the decision leaves but one, or else None."""
+        if not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(cases)):
+            self.decision.check(cases)
+        choices = _proposals(self.decision, cases)
+        return choices[0] if len(choices) == 1 else None
 
     def plan_by(self, drive: Drive, cases: Any) -> Any:
         """The plans of one case or of a batch, with what was decided in them."""

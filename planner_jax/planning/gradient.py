@@ -75,8 +75,10 @@ def gradient(
     for name in by:
         part_of(cases, name)
     if isinstance(planner, DecidedPlanner):
-        cases = cases.decided(plan(planner, cases, chunk=chunk, devices=devices).choice)
-        planner = planner.planner
+        only = planner.only_choice(cases)
+        if only is None:
+            only = plan(planner, cases, chunk=chunk, devices=devices).choice
+        cases, planner = cases.decided(only), planner.planner
     if not hasattr(planner, "objective"):
         raise TypeError(
             f"{type(planner).__name__} minimises nothing, so that its plans have no gradient: use "
