@@ -1,6 +1,7 @@
 """Penalties along a trajectory: what they integrate, their slopes, and the kernel for both."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -41,13 +42,30 @@ def cases(num=LANES, dtype=np.float32):
     return columns.astype(dtype), durations.astype(dtype), (limit(9, 10), limits)
 
 
+@jax.jit
+def sampled(columns, durations, given):
+    """The excess over every limit at every sample of a trajectory's segments, and the hinges."""
+    motion = jax.vmap(functools.partial(sample_motion, ALONG.maps, ALONG.nodes))(columns, durations)
+    excess = jnp.stack(jax.vmap(lambda segment: motion_excess(segment, *given))(motion), axis=1)
+    return excess, smoothed_hinge(excess + np.array(ALONG.margins)[:, None], ALONG.hinge_width)
+
+
+@jax.jit
+def along_a_line(t, x, direction):
+    """The penalties' sum beside x, with its slope and its curvature in the direction."""
+
+    def value(t):
+        columns, durations, given = jax.tree.map(lambda a, b: a + t * b, x, direction)
+        return jnp.sum(integrate_along(ALONG, columns, durations, given)[0])
+
+    return value(t), *jax.jvp(jax.grad(value), (t,), (jnp.ones_like(t),))
+
+
 def test_it_is_the_trapezoid_sum_of_the_hinges(float64):
     columns, durations, given = jax.tree.map(lambda x: x[0], cases(dtype=np.float64))
-    penalties, worst = integrate_along(ALONG, columns, durations, given)
-    for n in range(SEGMENTS):
-        motion = sample_motion(ALONG.maps, ALONG.nodes, columns[n], durations[n])
-        excess = np.stack(motion_excess(motion, *given))
-        hinges = smoothed_hinge(excess + np.array(ALONG.margins)[:, None], 0.2).sum(axis=0)
+    penalties, worst = jax.jit(functools.partial(integrate_along, ALONG))(columns, durations, given)
+    for n, (excess, hinges) in enumerate(zip(*sampled(columns, durations, given), strict=True)):
+        excess, hinges = np.asarray(excess), np.asarray(hinges).sum(axis=0)
         times = np.concatenate([[0.0], np.cumsum(np.repeat(ALONG.maps.proportions, 5) / 5)])
         expected = durations[n] * np.trapezoid(hinges, times)
         np.testing.assert_allclose(penalties[n], expected, rtol=1e-12)
@@ -55,45 +73,43 @@ def test_it_is_the_trapezoid_sum_of_the_hinges(float64):
 
 
 def test_slopes_and_curvature_are_those_of_finite_differences(float64):
-    columns, durations, given = jax.tree.map(lambda x: jnp.asarray(x[1]), cases(dtype=np.float64))
-
-    def value(x):
-        c, h, g = x
-        penalties, _ = integrate_along(ALONG, c, h, g)
-        return jnp.sum(penalties)
-
-    x = (columns, durations, given)
+    x = jax.tree.map(lambda x: x[1], cases(dtype=np.float64))
+    step = 1e-5
     for moving in ((True, False), (False, True), (True, True)):  # the unknowns, the parameters
         direction = (
             jax.tree.map(
-                lambda leaf, m=moving[0]: m * jnp.cos(jnp.arange(leaf.size)).reshape(leaf.shape),
+                lambda leaf, m=moving[0]: m * np.cos(np.arange(leaf.size)).reshape(leaf.shape),
                 x[:2],
             ),
-            jax.tree.map(lambda leaf, m=moving[1]: m * jnp.ones_like(leaf), given),
+            jax.tree.map(lambda leaf, m=moving[1]: m * np.ones_like(leaf), x[2]),
         )
         direction = (*direction[0], direction[1])
-        along = lambda t, d=direction: value(jax.tree.map(lambda a, b: a + t * b, x, d))  # noqa: E731
-        for function, tolerance in ((along, 1e-7), (jax.grad(along), 1e-6)):
-            step = 1e-5
-            expected = (function(step) - function(-step)) / (2.0 * step)
-            found = jax.grad(function)(0.0) if function is along else jax.jacfwd(function)(0.0)
-            np.testing.assert_allclose(found, expected, rtol=tolerance, atol=1e-6)
+        behind, here, ahead = (along_a_line(t, x, direction) for t in (-step, 0.0, step))
+        for order, tolerance in ((0, 1e-7), (1, 1e-6)):
+            expected = (ahead[order] - behind[order]) / (2.0 * step)
+            np.testing.assert_allclose(here[order + 1], expected, rtol=tolerance, atol=1e-6)
 
 
 def test_the_greatest_of_every_limit_is_among_the_samples(float64):
     columns, durations, given = jax.tree.map(lambda x: x[0], cases(dtype=np.float64))
-    greatest = greatest_along(ALONG, columns, durations, given)
-    for n in range(SEGMENTS):
-        motion = sample_motion(ALONG.maps, ALONG.nodes, columns[n], durations[n])
-        expected = np.stack(motion_excess(motion, *given)).max(axis=1)
+
+    @jax.jit
+    @functools.partial(jax.value_and_grad, has_aux=True)
+    def first_limit(h):
+        greatest = greatest_along(ALONG, columns, h, given)
+        return greatest[0][0], greatest
+
+    (_, greatest), slope = first_limit(durations)
+    for n, excess in enumerate(sampled(columns, durations, given)[0]):
+        expected = np.asarray(excess).max(axis=1)
         np.testing.assert_allclose(np.stack(greatest)[:, n], expected, rtol=1e-12)
-    slope = jax.grad(lambda h: greatest_along(ALONG, columns, h, given)[0][0])(durations)
     assert slope[0] < 0.0 and slope[1] == 0.0  # slower is less
 
 
 def test_worst_has_no_derivative():
-    columns, durations, given = jax.tree.map(lambda x: jnp.asarray(x[1]), cases())
-    slope = jax.grad(lambda c: jnp.sum(integrate_along(ALONG, c, durations, given)[1]))(columns)
+    columns, durations, given = jax.tree.map(lambda x: x[1], cases())
+    worst = lambda c: jnp.sum(integrate_along(ALONG, c, durations, given)[1])  # noqa: E731
+    slope = jax.jit(jax.grad(worst))(columns)
     np.testing.assert_array_equal(slope, 0.0)
 
 
@@ -134,8 +150,8 @@ def test_the_kernel_gives_the_same_numbers(mode):
     if mode == "curvature":
         random = np.random.default_rng(1)
         args = (args, jax.tree.map(lambda x: random.standard_normal(x.shape).astype(x.dtype), args))
-    expected = jax.tree.leaves(jax.vmap(asked(mode), out_axes=-1)(*args))
-    lanes = jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), args)
+    expected = jax.tree.leaves(jax.jit(jax.vmap(asked(mode), out_axes=-1))(*args))
+    lanes = jax.tree.map(lambda x: jnp.asarray(np.moveaxis(x, 0, -1)), args)
     kernel = along_kernel(ALONG, mode, interpret=True)
     found = kernel(jax.tree.structure(args), jax.tree.leaves(lanes))
     assert len(found) == len(expected)
@@ -201,7 +217,7 @@ def test_the_kernel_leaves_alone_what_it_is_not_made_for():
     kernel = along_kernel(ALONG, "values")
     for num, dtype in ((LANES, np.float16), (7, np.float32)):
         args = cases(num, dtype)
-        lanes = jax.tree.leaves(jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), args))
+        lanes = jax.tree.leaves(jax.tree.map(lambda x: jnp.asarray(np.moveaxis(x, 0, -1)), args))
         assert kernel(jax.tree.structure(args), lanes) is None
 
 

@@ -12,7 +12,7 @@ from planner_jax.lanes import attach, in_one_kernel, over_lanes, pallas
 from planner_jax.lanes.scalars import Unsupported, scalar_kernel
 
 MATRIX = np.random.default_rng(0).standard_normal((5, 4))
-LANES = 7
+LANES = 32  # what a kernel takes
 
 
 @jax.custom_jvp
@@ -55,14 +55,22 @@ FUNCTIONS = {
 }
 
 
-@pytest.mark.parametrize("name", FUNCTIONS)
-def test_is_vmap_with_the_lanes_last(name, float64):
+def lanes():
+    """What the functions are called with."""
     random = np.random.default_rng(1)
     x = jnp.asarray(random.standard_normal((4, 3, LANES)))
-    k = jnp.asarray(random.integers(-1, 5, LANES))
-    function = FUNCTIONS[name]
-    expected = jax.vmap(function, in_axes=-1, out_axes=-1)(x, k)
-    found = over_lanes(function)(x, k)
+    return x, jnp.asarray(random.integers(-1, 5, LANES))
+
+
+@functools.cache
+def by_vmap(name):
+    """What a function gives, in float64."""
+    return jax.jit(jax.vmap(FUNCTIONS[name], in_axes=-1, out_axes=-1))(*lanes())
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_is_vmap_with_the_lanes_last(name, float64):
+    expected, found = by_vmap(name), jax.jit(over_lanes(FUNCTIONS[name]))(*lanes())
     assert jax.tree.structure(found) == jax.tree.structure(expected)
     for ours, theirs in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         assert ours.dtype == theirs.dtype
@@ -95,18 +103,14 @@ NOT_IN_A_KERNEL = {"loop", "branches", "order", "window of a constant"}
 
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_a_kernel_of_single_operations_gives_the_same(name, float64):
-    random = np.random.default_rng(1)
-    x = jnp.asarray(random.standard_normal((4, 3, 32)))
-    k = jnp.asarray(random.integers(-1, 5, 32))
-    function = FUNCTIONS[name]
+    (x, k), function = lanes(), FUNCTIONS[name]
     closed = jax.make_jaxpr(lambda *args: jax.tree.leaves(function(*args)))(x[..., 0], k[0])
     if name in NOT_IN_A_KERNEL:
         with pytest.raises(Unsupported):
             scalar_kernel(closed, [x, k], 16, interpret=True)
         return
-    expected = jax.vmap(function, in_axes=-1, out_axes=-1)(x, k)
-    found = scalar_kernel(closed, [x, k], 16, interpret=True)
-    for ours, theirs in zip(found, jax.tree.leaves(expected), strict=True):
+    found = jax.jit(lambda *args: scalar_kernel(closed, [*args], 16, interpret=True))(x, k)
+    for ours, theirs in zip(found, jax.tree.leaves(by_vmap(name)), strict=True):
         assert ours.dtype == theirs.dtype
         np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-14)
 
@@ -201,8 +205,8 @@ def test_halves_of_a_function_in_one_kernel_are_kernels(used, float64):
         (2, lambda f: jax.grad(lambda x, g: jnp.sum(jax.grad(lambda y: total(f, y, g))(x) ** 2))),
     ):
         used.clear()
-        expected = jax.vmap(asked(plain), in_axes=-1, out_axes=-1)(x, given)
-        found = over_lanes(asked(one))(x, given)
+        expected = jax.jit(jax.vmap(asked(plain), in_axes=-1, out_axes=-1))(x, given)
+        found = jax.jit(over_lanes(asked(one)))(x, given)
         assert len(used) >= number and bool(used) == bool(number)
         for ours, theirs in zip(*map(jax.tree.leaves, (found, expected)), strict=True):
             np.testing.assert_allclose(ours, theirs, rtol=1e-10, atol=1e-12)

@@ -1,6 +1,7 @@
 """The simulated world's parts: allocation, control, sensing, scoring, and MJX beside MuJoCo."""
 
 import dataclasses
+import functools
 from types import SimpleNamespace
 
 import jax
@@ -37,7 +38,7 @@ from planner_jax.sims.sensing import (
 )
 from planner_jax.sims.tasks.catch import CATCH_WORLD
 from planner_jax.sims.tasks.hit import HIT_WORLD, court_parts
-from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, total_duration
+from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 NET = CATCH_WORLD.robot.tool
 GRAVITY = jnp.float32(9.81)
@@ -65,15 +66,18 @@ def test_a_torque_raises_a_weak_thrust_no_further_than_is_spared_for_it():
 
 
 def test_the_flat_body_rate_is_that_of_the_flat_attitude():
-    times = jnp.array([0.3, 0.3 + 1e-3])
     acc = lambda t: jnp.array([4.0 * jnp.sin(3.0 * t), 3.0 * t, 2.0 * t**2])  # noqa: E731
-    with jax.enable_x64(True):
+
+    @jax.jit
+    def turned(t, step):
+        """The turn in a step, and what the body rates at its ends make of it."""
         now, then = (
-            flat_attitude(acc(t), jax.jacfwd(acc)(t), jnp.asarray(9.81))
-            for t in times.astype(float)
+            flat_attitude(acc(t), jax.jacfwd(acc)(t), jnp.asarray(9.81)) for t in (t, t + step)
         )
-        turned = rotation_error(now[0], then[0]) / (times[1] - times[0]).astype(float)
-        np.testing.assert_allclose(turned, 0.5 * (now[1] + then[1]), atol=1e-3)
+        return rotation_error(now[0], then[0]) / step, 0.5 * (now[1] + then[1])
+
+    with jax.enable_x64(True):
+        np.testing.assert_allclose(*turned(0.3, 1e-3), atol=1e-3)
 
 
 def wiggle():
@@ -85,18 +89,20 @@ def wiggle():
 
 
 def test_a_trajectory_comes_to_rest_smoothly_after_its_end():
-    path = with_rest(wiggle())
-    end, rest = total_duration(wiggle()), total_duration(path)
+    resting, at = jax.jit(with_rest), jax.jit(evaluate, static_argnums=2)
+    path = resting(wiggle())
+    end, rest = (np.sum(each.durations) for each in (wiggle(), path))
     for order in range(4):
-        before, after = evaluate(wiggle(), end, order), evaluate(path, end + 1e-5, order)
+        before, after = at(wiggle(), end, order), at(path, np.float32(end + 1e-5), order)
         np.testing.assert_allclose(after, before, rtol=2e-3, atol=1e-3)
     absent = PiecewisePolynomial(
-        jnp.concatenate([wiggle().coeffs, jnp.zeros((2, 8, 3))]), jnp.array([1.0, 0.0, 0.0])
+        np.concatenate([wiggle().coeffs, np.zeros((2, 8, 3), np.float32)]),
+        np.array([1.0, 0.0, 0.0], np.float32),
     )
-    braking = with_rest(absent).coeffs[-1]
-    np.testing.assert_allclose(braking, path.coeffs[-1], atol=1e-5)
+    braking = np.asarray(resting(absent).coeffs)[-1]
+    np.testing.assert_allclose(braking, np.asarray(path.coeffs)[-1], atol=1e-5)
     for order in (1, 2, 3):
-        np.testing.assert_allclose(evaluate(path, rest, order), 0.0, atol=2e-2)
+        np.testing.assert_allclose(at(path, rest, order), 0.0, atol=2e-2)
 
 
 @pytest.fixture(scope="module")
@@ -159,7 +165,8 @@ def test_hover_is_an_equilibrium_and_mjx_flies_as_mujoco_does():
         reference.append(data.qpos.copy())
     assert np.ptp(np.array(reference)[:, 3:7], axis=0).max() > 0.01  # it did turn
     np.testing.assert_allclose(path, reference, atol=1e-4)
-    truth = fly(jax.tree.map(lambda x: x[0], balls), 0.8, drag[0], GRAVITY, num_steps=100)[0]
+    flown = jax.jit(functools.partial(fly, num_steps=100))
+    truth = flown(jax.tree.map(lambda x: x[0], balls), 0.8, drag[0], GRAVITY)[0]
     np.testing.assert_allclose(path[-1, 7:], truth.pos, atol=1e-3)
 
 
