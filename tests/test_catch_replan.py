@@ -16,7 +16,7 @@ from planner_jax.task.catch.exact import ExactCatch
 from planner_jax.task.catch.replan import ReplanCatch
 from planner_jax.task.catch.suites import draw
 
-SCRATCH = ExactCatch(rounds=(Round(starts=1, solver=LbfgsConfig(max_steps=40)),))
+SCRATCH = ExactCatch(rounds=(Round(starts=1, solver=LbfgsConfig(max_steps=20)),))
 AGAIN = ReplanCatch(
     rounds=(Round(starts=1, solver=LbfgsConfig(max_steps=12, trial_steps=(1.0, 0.2, 0.04))),)
 )

@@ -17,9 +17,9 @@ NUM = 4
 SOME = (Round(solver=LbfgsConfig(max_steps=30)),)
 NONE = (Round(solver=LbfgsConfig(max_steps=0)),)
 HIT = pj.hit.ExactHit(
-    proportions=(0.2, 0.5, 1.0, 1.0, 1.0, 1.0), nodes=4, num_table_nodes=24, rounds=SOME
+    proportions=(0.2, 0.5, 1.0, 1.0, 1.0, 1.0), nodes=3, num_table_nodes=16, rounds=SOME
 )
-CATCH = pj.catch.planner("exact", decide="greedy", rounds=SOME)
+CATCH = pj.catch.planner("exact", decide="greedy", rounds=(Round(1, LbfgsConfig(max_steps=20)),))
 
 
 @pytest.fixture(scope="module")
