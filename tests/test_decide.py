@@ -284,10 +284,10 @@ def test_a_given_order_that_is_no_permutation_is_refused(pairs, order):
 
 def test_closest_approach_is_what_the_greatest_speed_leaves(pairs):
     """100 m away, 4 s at 5 m/s, the net's size, and what a 64th of the time may hide."""
-    gap = np.array(closest_approach(pairs))
+    gap = np.array(jax.jit(closest_approach)(pairs))
     left = np.hypot(100.0, 0.2) - 5.0 * 4.0 - (0.2 + 0.125) - 5.0 * 4.0 / 64.0
     assert gap[2, 0] == pytest.approx(left, rel=1e-4)
-    alone = closest_approach(pj.lane(pairs, 2))
+    alone = jax.jit(closest_approach)(pj.lane(pairs, 2))
     np.testing.assert_allclose(alone, gap[2], rtol=1e-6)
     gap[2, 0] = 0.0
     assert not gap.any()

@@ -1,10 +1,13 @@
 """The exact hit planner: what is exact by construction, what is promised, what is refused."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import planner_jax as pj
 from planner_jax.ball.aim import aim_with_drag, apex_with_drag
 from planner_jax.ball.flight import BallState, fly
 from planner_jax.ball.impact import racket_impact
@@ -20,6 +23,13 @@ from tests.jaxpr import assert_full_precision
 PLANNER = ExactHit()
 FIRST_ROUND = ExactHit(rounds=PLANNER.rounds[:1])
 NUM = 16
+
+
+@jax.jit
+def begun(case):
+    """The context of one case, and its first guess."""
+    context = PLANNER.prepare(case)
+    return context, PLANNER.guesses(context, 1)[0]
 
 
 @pytest.fixture(scope="module")
@@ -42,11 +52,9 @@ def test_every_easy_serve_is_solved_and_confirmed_by_the_referee(cases, plans):
 def test_any_decision_vector_meets_the_ball_and_reaches_the_target(cases):
     """The elimination itself: no optimisation, random variables, and still no miss."""
     lane = jax.tree.map(lambda leaf: leaf[3], cases)
-    context = PLANNER.prepare(lane)
-    size = PLANNER.guesses(context, 1).shape[1]
-    offsets = 0.3 * jax.random.normal(jax.random.key(0), (8, size))
-    points = PLANNER.guesses(context, 1) + offsets
-    found = jax.jit(jax.vmap(lambda x: PLANNER.decode(x, context)))(points)
+    context, guess = begun(lane)
+    points = guess + 0.3 * np.random.default_rng(0).normal(size=(8, guess.size))
+    found = jax.jit(jax.vmap(lambda x: PLANNER.decode(x, context)))(points.astype(np.float32))
     many = jax.tree.map(lambda leaf: np.repeat(leaf[None], 8, axis=0), lane)
     verdict = referee_hits(many, found)
     assert verdict.contact_error.max() < 1e-3
@@ -54,12 +62,17 @@ def test_any_decision_vector_meets_the_ball_and_reaches_the_target(cases):
     assert verdict.head_error.max() < 1e-4
 
 
+@jax.jit
+def after_the_end(trajectory, stroke):
+    """The ball's velocity after the impact at the trajectory's end."""
+    vel = evaluate(trajectory, total_duration(trajectory), 1)
+    return racket_impact(stroke.ball_vel, vel, stroke.normal, 0.7)
+
+
 def test_stroke_obeys_the_impact_map(plans):
     for lane in range(NUM):
-        one = jax.tree.map(lambda leaf, k=lane: jnp.asarray(leaf[k]), plans)
-        end = total_duration(one.trajectory)
-        vel = evaluate(one.trajectory, end, 1)
-        after = racket_impact(one.stroke.ball_vel, vel, one.stroke.normal, 0.7)
+        one = pj.lane(plans, lane)
+        after = after_the_end(one.trajectory, one.stroke)
         np.testing.assert_allclose(after, one.stroke.ball_vel_after, atol=2e-3)
 
 
@@ -90,14 +103,18 @@ def test_an_impossible_lane_says_so_and_stays_finite(cases):
     assert is_solved(np.delete(found.status, 1)).all()
 
 
+apex_of = jax.jit(apex_with_drag)
+
+
 def test_drag_after_the_impact_is_aimed_for(float64):
-    pos, target = jnp.array([-2.0, 0.4, 1.5]), jnp.array([4.0, -0.5, 0.0])
-    time, drag, gravity = jnp.asarray(1.7), jnp.asarray(0.0616), jnp.asarray(9.8)
+    pos, target = np.array([-2.0, 0.4, 1.5]), np.array([4.0, -0.5, 0.0])
+    time, drag, gravity = np.array(1.7), np.array(0.0616), np.array(9.8)
     vel = jax.jit(aim_with_drag)(pos, target, time, drag, gravity)
-    landed, path = fly(BallState(pos, vel), time, drag, gravity, num_steps=400)
+    flown = jax.jit(functools.partial(fly, num_steps=400))
+    landed, path = flown(BallState(pos, vel), time, drag, gravity)
     np.testing.assert_allclose(landed.pos, target, atol=2e-4)
-    apex = apex_with_drag(BallState(pos, vel), time, drag, gravity)
-    np.testing.assert_allclose(apex, path.pos[:, 2].max(), atol=2e-3)
+    apex = apex_of(BallState(pos, vel), time, drag, gravity)
+    np.testing.assert_allclose(apex, np.asarray(path.pos)[:, 2].max(), atol=2e-3)
 
 
 @jax.jit
@@ -123,14 +140,13 @@ def test_aim_with_drag_has_the_gradient_of_the_root(float64, leaf):
 
 
 def test_falling_ball_is_highest_now():
-    ball = BallState(jnp.array([0.0, 0.0, 2.0]), jnp.array([3.0, 0.0, -1.0]))
-    assert apex_with_drag(ball, jnp.asarray(1.0), jnp.asarray(0.06), jnp.asarray(9.8)) == 2.0
+    ball = BallState(np.array([0.0, 0.0, 2.0], np.float32), np.array([3.0, 0.0, -1.0], np.float32))
+    assert apex_of(ball, *np.array([1.0, 0.06, 9.8], np.float32)) == 2.0
 
 
 def test_all_products_of_the_objective_are_in_full_precision(cases):
     lane = jax.tree.map(lambda leaf: leaf[0], cases)
-    context = PLANNER.prepare(lane)
-    start = PLANNER.guesses(context, 1)[0]
+    context, start = begun(lane)
     slopes = jax.grad(lambda x: PLANNER.objective(x, context).cost)
     assert assert_full_precision(slopes, start) > 0
     assert assert_full_precision(lambda x: PLANNER.decode(x, context), start) > 0
@@ -140,9 +156,9 @@ def test_objective_gradient_agrees_with_finite_differences(float64):
     case = jax.tree.map(
         lambda leaf: leaf[0], to_cases(generate_serves(1, 4), delay=0.5, dtype=jnp.float64)
     )
-    context = PLANNER.prepare(case)
+    context, guess = begun(case)
     cost = jax.jit(jax.value_and_grad(lambda x: PLANNER.objective(x, context).cost))
-    point = np.asarray(PLANNER.guesses(context, 1)[0]) + 0.1
+    point = np.asarray(guess) + 0.1
     _, slopes = cost(point)
     for k in range(point.size):
         step = np.zeros_like(point)
@@ -156,7 +172,7 @@ def test_sizes_that_make_no_sense_are_refused(cases):
         ExactHit(proportions=(1.0,))
     with pytest.raises(ValueError, match="no measured scale for 'exact-5'"):
         ExactHit(proportions=(1.0,) * 5)
-    context = PLANNER.prepare(jax.tree.map(lambda leaf: leaf[0], cases))
+    context, _ = begun(pj.lane(cases, 0))
     with pytest.raises(ValueError, match="starts must be <= 12, got 13"):
         PLANNER.guesses(context, 13)
 

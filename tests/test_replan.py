@@ -14,11 +14,8 @@ from planner_jax.task.hit.replan import ReplanHit
 from planner_jax.trajectory.polynomial import states_at
 
 NUM = 4
-SOME = (Round(solver=LbfgsConfig(max_steps=30)),)
 NONE = (Round(solver=LbfgsConfig(max_steps=0)),)
-HIT = pj.hit.ExactHit(
-    proportions=(0.2, 0.5, 1.0, 1.0, 1.0, 1.0), nodes=3, num_table_nodes=16, rounds=SOME
-)
+HIT = pj.hit.ExactHit(rounds=pj.hit.ExactHit().rounds[:1])  # a program of test_exact
 CATCH = pj.catch.planner("exact", decide="greedy", rounds=(Round(1, LbfgsConfig(max_steps=20)),))
 
 
