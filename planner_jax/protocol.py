@@ -35,6 +35,8 @@ class Status(enum.IntEnum):
     MAX_STEPS = 3
     NON_FINITE = 4
     OUT_OF_REACH = 5
+    NO_PATH = 6
+    BLOCKED = 7
 
     @property
     def message(self) -> str:
@@ -54,6 +56,8 @@ _MESSAGES = {
     Status.MAX_STEPS: "out of iterations with a limit exceeded; allow more iterations or starts",
     Status.NON_FINITE: "the case or its cost is not finite; check the case for NaN",
     Status.OUT_OF_REACH: "a target never comes within reach; `closest_approach` says by how much",
+    Status.NO_PATH: "no way was found through the obstacles in time; allow more time",
+    Status.BLOCKED: "the start or the goal lies in an obstacle or off the map; move it",
 }
 
 
@@ -63,8 +67,9 @@ def is_solved(status: Any) -> Any:
 
 
 def is_unsolved(status: Any) -> Any:
-    """Which statuses are worth another attempt: not solved, and not broken either."""
-    return (status >= Status.INFEASIBLE) & (status != Status.NON_FINITE)
+    """Which statuses are worth another attempt: not solved, but neither broken nor hopeless."""
+    worth = (status == Status.INFEASIBLE) | (status == Status.MAX_STEPS)
+    return worth | (status == Status.OUT_OF_REACH)
 
 
 # Plans are refereed to 1e-3 of a limit; half of that is left for peaks between samples.

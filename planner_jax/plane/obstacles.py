@@ -1,0 +1,193 @@
+"""Convex polygons that stand or move evenly, and how far a point is from them."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+
+@struct.dataclass
+class Obstacles:
+    """Up to N convex polygons of up to V corners; those that stand have no velocity.
+
+    World frame in the plane, SI units. An obstacle moves evenly and does not turn (paper 003,
+    eq. 5, with constant speeds as in its Section IV-A).
+    """
+
+    centre: Array  # (N, 2) [m], at time 0
+    corners: Array  # (N, V, 2) [m] from the centre, counter-clockwise; the last one repeated
+    velocity: Array  # (N, 2) [m/s]
+    present: Array  # (N,) bool, which of the N there are
+
+    def vertices(self, time: Any) -> Array:
+        """Corners in the world at one time () [s], (N, V, 2) [m]."""
+        return (self.centre + self.velocity * time)[..., None, :] + self.corners
+
+
+def obstacles(
+    polygons: Sequence[Any],
+    velocities: Any = 0.0,
+    *,
+    room: tuple[int, int] | None = None,
+    dtype: Any = jnp.float32,
+) -> Obstacles:
+    """Obstacles of one case.
+
+    Args:
+        polygons: of each its corners (V_k, 2) [m] at time 0, convex, in either sense.
+        velocities: (2,) for all or (N, 2), one each [m/s].
+        room: how many obstacles, and how many corners of each, the arrays hold; just those that
+            are given if left out. Cases of one room share a compiled program.
+        dtype: of every floating leaf.
+
+    Raises:
+        ValueError: a polygon is empty or not convex, or there are more than there is room for;
+            one line that says which, and for one that is not convex what parts would do.
+    """
+    checked = [_checked(k, corners) for k, corners in enumerate(polygons)]
+    most = max((len(each) for each in checked), default=3)
+    num, size = room or (max(len(checked), 1), most)
+    if len(checked) > num or most > size:
+        raise ValueError(
+            f"polygons must be at most {num} of at most {size} corners, got {len(checked)} of "
+            f"up to {most}: give more room"
+        )
+    speeds = np.broadcast_to(np.asarray(velocities, float), (len(checked), 2))
+    centre, velocity = np.zeros((num, 2)), np.zeros((num, 2))
+    corners = np.zeros((num, size, 2))
+    for k, polygon in enumerate(checked):
+        centre[k], velocity[k] = polygon.mean(axis=0), speeds[k]
+        corners[k] = polygon[np.minimum(np.arange(size), len(polygon) - 1)] - centre[k]
+    return Obstacles(
+        centre=jnp.asarray(centre, dtype),
+        corners=jnp.asarray(corners, dtype),
+        velocity=jnp.asarray(velocity, dtype),
+        present=jnp.asarray(np.arange(num) < len(checked)),
+    )
+
+
+def _checked(k: int, corners: Any) -> np.ndarray:
+    """Corners counter-clockwise; raises `ValueError` unless they are those of a convex polygon."""
+    polygon = np.asarray(corners, float)
+    if polygon.ndim != 2 or polygon.shape[1:] != (2,) or len(polygon) < 3:
+        raise ValueError(f"polygon {k} must have corners (V, 2), V >= 3, got {polygon.shape}")
+    if not np.isfinite(polygon).all():
+        raise ValueError(f"polygon {k} must be finite")
+    edges = np.roll(polygon, -1, axis=0) - polygon
+    after = np.roll(edges, -1, axis=0)
+    turns = edges[:, 0] * after[:, 1] - edges[:, 1] * after[:, 0]
+    area = 0.5 * np.sum(polygon[:, 0] * np.roll(polygon[:, 1], -1))
+    area -= 0.5 * np.sum(polygon[:, 1] * np.roll(polygon[:, 0], -1))
+    if abs(area) < 1e-9:
+        raise ValueError(f"polygon {k} must have an area, got none")
+    if area < 0.0:
+        polygon, turns = polygon[::-1], -turns
+    if (turns < -1e-9).any():
+        raise ValueError(
+            f"polygon {k} must be convex: cut it into convex parts, such as the triangles of "
+            "scipy.spatial.Delaunay whose centres lie inside, and give each as one"
+        )
+    return polygon
+
+
+def distances(
+    corners: Array, present: Array, x: Array, y: Array
+) -> tuple[Array, tuple[Array, Array]]:
+    """How far points are outside of convex polygons, and in which direction away from them.
+
+    Args:
+        corners: (N, V, 2) [m], counter-clockwise; they may be repeated.
+        present: (N,) bool; polygons that are not there are far away.
+        x: (N, P) or (1, P) [m], of points, each row for one polygon or one for all.
+        y: likewise.
+
+    Returns:
+        distance: (N, P) [m]; negative inside, where it is the way to the nearest edge's line.
+        away: two of (N, P), the unit vector that is its gradient by the point.
+    """
+    before = jnp.roll(corners, 1, axis=1)
+    edge = corners - before
+    square = jnp.sum(edge**2, axis=2)
+    is_edge = square > 1e-10
+    inverse = jnp.where(is_edge, 1.0 / jnp.where(is_edge, square, 1.0), 0.0)
+    root = jnp.sqrt(inverse)
+    shape = jnp.broadcast_shapes((corners.shape[0], 1), x.shape)
+    nearest, highest = jnp.full(shape, 1e6, x.dtype), jnp.full(shape, -1e6, x.dtype)
+    gap_x = gap_y = face_x = face_y = jnp.zeros(shape, x.dtype)
+    for k in range(corners.shape[1]):  # an edge at a time, so that points fill the registers
+        there = is_edge[:, k, None]
+        from_x, from_y = x - before[:, k, :1], y - before[:, k, 1:]
+        edge_x, edge_y = edge[:, k, :1], edge[:, k, 1:]
+        share = jnp.clip((from_x * edge_x + from_y * edge_y) * inverse[:, k, None], 0.0, 1.0)
+        to_x, to_y = from_x - share * edge_x, from_y - share * edge_y
+        away = to_x**2 + to_y**2
+        closer = there & (away < nearest)
+        nearest = jnp.where(closer, away, nearest)
+        gap_x, gap_y = jnp.where(closer, to_x, gap_x), jnp.where(closer, to_y, gap_y)
+        normal_x, normal_y = edge_y * root[:, k, None], -edge_x * root[:, k, None]
+        height = from_x * normal_x + from_y * normal_y
+        higher = there & (height > highest)
+        highest = jnp.where(higher, height, highest)
+        face_x, face_y = jnp.where(higher, normal_x, face_x), jnp.where(higher, normal_y, face_y)
+    outside = highest > 0.0
+    length = jnp.sqrt(jnp.maximum(nearest, 1e-12))
+    distance = jnp.where(outside, length, highest)
+    direction = (
+        jnp.where(outside, gap_x / length, face_x),
+        jnp.where(outside, gap_y / length, face_y),
+    )
+    return jnp.where(present[:, None], distance, 1e3), direction
+
+
+def separation(
+    corners: Array, present: Array, x: Array, y: Array, heading: Array, body: tuple
+) -> Array:
+    """How far a rectangle is from convex polygons along the axis that parts them best.
+
+    It is positive just where they do not touch (the theorem of separating axes), and at most
+    their distance.
+
+    Args:
+        corners: (N, V, 2) [m], as for `distances`.
+        present: (N,) bool.
+        x: (N, P) or (1, P) [m], of a point on the rectangle's long axis.
+        y: likewise.
+        heading: (P,) [rad], of that axis.
+        body: ends of the rectangle behind and ahead of the point, and half its width [m].
+
+    Returns:
+        (N, P) [m].
+    """
+    behind, ahead, half = body
+    cos, sin = jnp.cos(heading), jnp.sin(heading)
+    ends = [(a, b) for a in (behind, ahead) for b in (-half, half)]
+    points = [(x + a * cos - b * sin, y + a * sin + b * cos) for a, b in ends]
+    before = jnp.roll(corners, 1, axis=1)
+    edge = corners - before
+    square = jnp.sum(edge**2, axis=2)
+    is_edge = square > 1e-10
+    root = 1.0 / jnp.sqrt(jnp.where(is_edge, square, 1.0))
+    best = jnp.full(jnp.broadcast_shapes((corners.shape[0], 1), x.shape), -1e6, x.dtype)
+    low = [jnp.full_like(best, 1e6), jnp.full_like(best, 1e6)]
+    high = [jnp.full_like(best, -1e6), jnp.full_like(best, -1e6)]
+    for k in range(corners.shape[1]):
+        normal_x, normal_y = edge[:, k, 1:] * root[:, k, None], -edge[:, k, :1] * root[:, k, None]
+        heights = [
+            (px - before[:, k, :1]) * normal_x + (py - before[:, k, 1:]) * normal_y
+            for px, py in points
+        ]
+        least = jnp.minimum(
+            jnp.minimum(heights[0], heights[1]), jnp.minimum(heights[2], heights[3])
+        )
+        best = jnp.where(is_edge[:, k, None], jnp.maximum(best, least), best)
+        from_x, from_y = corners[:, k, :1] - x, corners[:, k, 1:] - y
+        for axis, place in enumerate((from_x * cos + from_y * sin, from_y * cos - from_x * sin)):
+            low[axis] = jnp.minimum(low[axis], place)
+            high[axis] = jnp.maximum(high[axis], place)
+    along = jnp.maximum(low[0] - ahead, behind - high[0])
+    across = jnp.maximum(low[1] - half, -half - high[1])
+    best = jnp.maximum(best, jnp.maximum(along, across))
+    return jnp.where(present[:, None], best, 1e3)

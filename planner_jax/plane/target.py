@@ -1,0 +1,83 @@
+"""Paths of targets in the plane: anything that says where it is, and how fast, at a time.
+
+A path is a pytree with a method `at(time) -> PointState`, differentiable in time and in every
+leaf. The ones here cover paper 003's targets and what is fitted to observations of them; a class
+of a user's own serves as well. World frame in the plane, SI units.
+"""
+
+from typing import Protocol
+
+import jax.numpy as jnp
+from flax import struct
+from jax import Array
+
+
+@struct.dataclass
+class PointState:
+    """A point that moves in the plane."""
+
+    pos: Array  # (2,) [m]
+    vel: Array  # (2,) [m/s]
+
+
+class PlanePath(Protocol):
+    """What a planner needs to know about a target."""
+
+    def at(self, time: Array) -> PointState:
+        """Position [m] and velocity [m/s] at one time () [s]."""
+        ...
+
+
+@struct.dataclass
+class TurningPath:
+    """A target of constant speed whose direction turns evenly; without turning, a straight line.
+
+    The two modes of paper 003, Section V-A, as something that stays on its map.
+    """
+
+    pos: Array  # (2,) [m], at time 0
+    vel: Array  # (2,) [m/s], at time 0
+    turn_rate: Array  # () [rad/s], to the left
+
+    def at(self, time: Array) -> PointState:
+        """Position [m] and velocity [m/s] at one time () [s]."""
+        ahead, aside = arc(self.turn_rate, time)
+        left = jnp.stack([-self.vel[1], self.vel[0]])
+        cos, sin = jnp.cos(self.turn_rate * time), jnp.sin(self.turn_rate * time)
+        return PointState(
+            pos=self.pos + ahead * self.vel + aside * left, vel=cos * self.vel + sin * left
+        )
+
+
+@struct.dataclass
+class PolynomialPath:
+    """A polynomial in time on each axis (paper 003, eq. 9)."""
+
+    coeffs: Array  # (n + 1, 2) [m/s^k], the power of the time rising
+    origin: Array  # () [s], the time at which the powers are zero
+
+    def at(self, time: Array) -> PointState:
+        """Position [m] and velocity [m/s] at one time () [s]."""
+        passed = time - self.origin
+        pos = vel = jnp.zeros_like(self.coeffs[0])
+        for row in self.coeffs[::-1]:
+            pos, vel = pos * passed + row, vel * passed + pos
+        return PointState(pos=pos, vel=vel)
+
+
+def arc(turn_rate: Array, time: Array) -> tuple[Array, Array]:
+    """How far ahead and to the left (...) [s] a target of unit speed is after a time (...) [s]."""
+    angle = turn_rate * time
+    return time * _sinc(angle), time * _cosc(angle)
+
+
+def _sinc(angle: Array) -> Array:
+    """sin(x) / x."""
+    small = jnp.abs(angle) < 1e-2
+    safe = jnp.where(small, 1.0, angle)
+    return jnp.where(small, 1.0 - angle**2 / 6.0, jnp.sin(safe) / safe)
+
+
+def _cosc(angle: Array) -> Array:
+    """(1 - cos(x)) / x, as 2 sin(x / 2)^2 / x: nothing cancels."""
+    return 0.5 * angle * _sinc(0.5 * angle) ** 2

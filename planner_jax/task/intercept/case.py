@@ -1,0 +1,170 @@
+"""One interception: a car, its target, and what stands or moves in its way."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+from planner_jax.plane.obstacles import Obstacles, obstacles
+from planner_jax.plane.target import PlanePath
+from planner_jax.robot.car import CarBody, CarLimits
+
+
+@struct.dataclass
+class InterceptCase:
+    """One case. Every number is a leaf: batch it, randomise it, differentiate by it.
+
+    World frame in the plane, SI units. Times count from the moment at which the car sets out.
+    The middle of the car's body meets the target.
+    """
+
+    start: Array  # (3,) x [m], y [m] of the rear axle's middle and heading [rad] at time 0
+    speed: Array  # () [m/s], at time 0
+    curvature: Array  # () [1/m], at time 0, from the steering angle
+    target: PlanePath  # where it is expected to be
+    time: Array  # () [s], when to meet it; the latest time for planners that choose it
+    tolerance: Array  # () [m], how far from the target the body's middle may then be
+    end_heading: Array  # () [rad], at the meeting
+    heading_tolerance: Array  # () [rad]; pi leaves the heading free
+    walls: Obstacles  # that stand
+    movers: Obstacles  # that move
+    lower: Array  # (2,) [m], corner of the map, which the body's middle does not leave
+    upper: Array  # (2,) [m], the opposite corner
+    body: CarBody
+    limits: CarLimits
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """() for one case, (B,) for a batch."""
+        return np.shape(self.time)
+
+
+def case(
+    target: PlanePath,
+    time: Any = 10.0,
+    *,
+    start: Any = (0.8, 4.0, 0.0),
+    initial_speed: Any = 0.5,
+    initial_curvature: Any = 0.0,
+    walls: Sequence[Any] | Obstacles = (),
+    movers: Sequence[Any] | Obstacles = (),
+    mover_velocities: Any = 0.0,
+    tolerance: Any = 0.05,
+    end_heading: Any = None,
+    heading_tolerance: Any = 0.05,
+    lower: Any = (0.0, 0.0),
+    upper: Any = (8.0, 8.0),
+    length: Any = 0.4,
+    width: Any = 0.25,
+    wheelbase: Any = 0.3,
+    rear_overhang: Any = 0.05,
+    speed: Any = 1.5,
+    acceleration: Any = 1.0,
+    lateral_acceleration: Any = 0.8,
+    curvature: Any = 2.0,
+    steering_rate: Any = 2.0,
+    dtype: Any = jnp.float32,
+) -> InterceptCase:
+    """An interception, or a batch of them, by default with the setting of paper 003.
+
+    The paper gives a map of 80 x 80 pixels, T = 10 s and 0.5 m/s at the start (Section V); sizes
+    and limits of the car are those of a model car of scale 1:10 on a map of 8 m x 8 m: an
+    assumption.
+
+    Args:
+        target: a path pytree such as `TurningPath`, leaves with the batch's axes first.
+        time: () or (B,) [s], when to meet it, > 0. This and all that follow may be one value, or
+            one a case.
+        start: (3,) x, y of the rear axle's middle [m], and heading [rad].
+        initial_speed: [m/s].
+        initial_curvature: [1/m].
+        walls: polygons (V, 2) [m] each, convex, the same for all cases; or `Obstacles` with the
+            batch's axes on every leaf.
+        movers: likewise, where they are at time 0.
+        mover_velocities: (2,) or (N, 2) [m/s], of polygons in `movers`.
+        tolerance: [m], how far from the target the body's middle may be at the end.
+        end_heading: [rad]; left free if not given.
+        heading_tolerance: [rad], of a given heading.
+        lower: (2,) [m], corner of the map.
+        upper: (2,) [m], the opposite corner.
+        length: [m], of the body.
+        width: [m], of the body.
+        wheelbase: [m].
+        rear_overhang: [m], from the rear axle to the rear end.
+        speed: greatest [m/s].
+        acceleration: greatest [m/s^2].
+        lateral_acceleration: greatest [m/s^2].
+        curvature: greatest [1/m].
+        steering_rate: greatest [rad/s].
+        dtype: of every floating leaf.
+
+    Raises:
+        ValueError: a time, a limit or a size is not positive, a polygon is not convex, or the
+            target's path has not the batch's shape; one line.
+    """
+    batch = np.broadcast_shapes(*(np.shape(each) for each in (time, initial_speed, tolerance)))
+    batch = np.broadcast_shapes(batch, np.shape(start)[:-1])
+
+    def leaf(value: Any, *trailing: int) -> Array:
+        return jnp.asarray(np.broadcast_to(np.asarray(value), batch + trailing), dtype)
+
+    positive = {
+        "time": time,
+        "length": length,
+        "width": width,
+        "wheelbase": wheelbase,
+        "speed": speed,
+        "acceleration": acceleration,
+        "lateral_acceleration": lateral_acceleration,
+        "curvature": curvature,
+        "steering_rate": steering_rate,
+    }
+    for name, value in positive.items():
+        if not np.all(np.asarray(value) > 0.0):
+            raise ValueError(f"{name} must be > 0, got {np.min(value)}")
+    for path in jax.tree.leaves(target):
+        if np.shape(path)[: len(batch)] != batch:
+            raise ValueError(
+                f"target must have leaves that begin with the batch shape {batch}, got "
+                f"{np.shape(path)}"
+            )
+    free = end_heading is None
+    return InterceptCase(
+        start=leaf(start, 3),
+        speed=leaf(initial_speed),
+        curvature=leaf(initial_curvature),
+        target=target,
+        time=leaf(time),
+        tolerance=leaf(tolerance),
+        end_heading=leaf(0.0 if free else end_heading),
+        heading_tolerance=leaf(np.pi if free else heading_tolerance),
+        walls=_for_batch(walls, 0.0, batch, dtype),
+        movers=_for_batch(movers, mover_velocities, batch, dtype),
+        lower=leaf(lower, 2),
+        upper=leaf(upper, 2),
+        body=CarBody(
+            length=leaf(length),
+            width=leaf(width),
+            wheelbase=leaf(wheelbase),
+            rear_overhang=leaf(rear_overhang),
+        ),
+        limits=CarLimits(
+            speed=leaf(speed),
+            acceleration=leaf(acceleration),
+            lateral_acceleration=leaf(lateral_acceleration),
+            curvature=leaf(curvature),
+            steering_rate=leaf(steering_rate),
+        ),
+    )
+
+
+def _for_batch(given: Any, velocities: Any, batch: tuple[int, ...], dtype: Any) -> Obstacles:
+    """Obstacles with the batch's axes on every leaf."""
+    if isinstance(given, Obstacles):
+        return given
+    one = obstacles(given, velocities, dtype=dtype)
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, batch + leaf.shape), one)
