@@ -118,7 +118,7 @@ def judge_in_chunks(
     The lanes are shared among threads, one for each core: NumPy lets go of the interpreter
     inside its loops. Many lanes and many cores are worth processes, if `judge` can be sent.
     """
-    num_lanes, cores = len(leaves["durations"]), os.cpu_count() or 1
+    num_lanes, cores = len(next(iter(leaves.values()))), os.cpu_count() or 1
     size = min(chunk, max(math.ceil(num_lanes / cores), _FEWEST_LANES))
     judged = functools.partial(_judged, judge)
     cases = [
@@ -150,7 +150,7 @@ def _can_be_sent(judge: Callable) -> bool:
 
 def finite_lanes(case: dict, unbounded: tuple[str, ...] = ()) -> np.ndarray:
     """Lanes (B,) whose inputs are finite; limits and `unbounded` may be infinite, but not NaN."""
-    finite = np.ones(len(case["coeffs"]), bool)
+    finite = np.ones(len(next(iter(case.values()))), bool)
     for name, leaf in case.items():
         limit = "limits." in name or name in unbounded
         good = ~np.isnan(leaf) if limit else np.isfinite(leaf)

@@ -1,0 +1,390 @@
+"""Float64 NumPy referee of interceptions: the kinematics alone decides whether a plan succeeds.
+
+It shares no code with the planners: the car's equations of motion (paper 003, eq. 1) are
+integrated here from the plan's start along its speed and curvature, the rectangle of its body is
+held against every obstacle at every sample by separating axes, and the target is followed along
+its path. A plan's own claims (status, cost, meeting point) are not trusted. World frame in the
+plane, SI units, headings counter-clockwise from the x axis.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+
+import numpy as np
+
+from planner_jax.referee.clearance import clearances
+from planner_jax.referee.quadrotor import (
+    CONTACT_TIME_TOLERANCE,
+    SMALLEST_LIMIT,
+    above,
+    checked_leaf,
+    finite_lanes,
+    first_failures,
+    judge_in_chunks,
+)
+from planner_jax.referee.verdict import Verdict
+
+# Limit -> what is said when it fails. In the order in which they are tested: a failed plan is
+# named after its first failure.
+_SENTENCES = {
+    "not finite": "the plan or its case is not finite",
+    "time": "the plan ends at {time:.3f} s, off by {excess:.3g} s; it must end after time 0, and "
+    "not after the case's time nor after an hour",
+    "start": "the plan starts {excess:.3g} off the case in position [m], heading [rad], speed "
+    "[m/s] or curvature [1/m]",
+    "speed": "{excess:.2%} of its limit above it or below zero at {time:.3f} s",
+    "acceleration": "{excess:.2%} above its limit at {time:.3f} s",
+    "curvature": "{excess:.2%} above its limit at {time:.3f} s",
+    "steering rate": "{excess:.2%} above its limit at {time:.3f} s",
+    "lateral acceleration": "{excess:.2%} above its limit at {time:.3f} s",
+    "map": "the body's middle is {excess:.3g} m off the map at {time:.3f} s",
+    "wall": "the body is {excess:.3g} m inside walls[{nearest_wall}] at {time:.3f} s",
+    "mover": "the body is {excess:.3g} m inside movers[{nearest_mover}] at {time:.3f} s",
+    "meeting": "the body's middle is {excess:.3g} m from the target at {time:.3f} s",
+    "heading": "the heading is {excess:.3g} rad off the one asked for at {time:.3f} s",
+}
+LIMITS = tuple(_SENTENCES)
+# Leaves that may be infinite, besides the limits of the car.
+_UNBOUNDED = ("lower", "upper", "tolerance", "heading_tolerance")
+
+# Longest time [s] between two samples, and longest plan [s] that is judged.
+LONGEST_STEP = 0.02
+LONGEST_PLAN = 3600.0
+# Gauss-Legendre nodes and weights on (0, 1), exact to order 5; used between every two samples.
+_NODES = np.polynomial.legendre.leggauss(3)
+_NODE, _WEIGHT = 0.5 * (_NODES[0] + 1.0), 0.5 * _NODES[1]
+
+
+@dataclasses.dataclass(frozen=True)
+class InterceptVerdict(Verdict):
+    """What the referee found, one entry a lane.
+
+    What is measured is NaN where the inputs are not finite or the plan's time is not in
+    (0, an hour]. Clearances are those at the samples: the distance of the body from the nearest
+    obstacle, and where it is inside of one minus the shortest way out; infinite without any.
+    """
+
+    SENTENCES = _SENTENCES
+
+    max_speed: np.ndarray  # (B,) [m/s]
+    max_acceleration: np.ndarray  # (B,) [m/s^2], along the way, magnitude
+    rms_acceleration: np.ndarray  # (B,) [m/s^2], along the way: sqrt(1/T int v'^2 dt)
+    max_curvature: np.ndarray  # (B,) [1/m], magnitude
+    max_steering_rate: np.ndarray  # (B,) [rad/s], magnitude, of atan(wheelbase * curvature)
+    max_lateral_acceleration: np.ndarray  # (B,) [m/s^2], magnitude, of the rear axle
+    wall_clearance: np.ndarray  # (B,) [m], least
+    mover_clearance: np.ndarray  # (B,) [m], least
+    nearest_wall: np.ndarray  # (B,) int, place of the wall that comes nearest; -1 without any
+    nearest_mover: np.ndarray  # (B,) int, likewise
+    miss: np.ndarray  # (B,) [m], from the body's middle to the target when the plan ends
+    meeting_time: np.ndarray  # (B,) [s], when the plan ends
+
+    def praise(self, k: int | tuple) -> str:
+        """What is said of a success."""
+        miss, time = np.asarray(self.miss)[k], np.asarray(self.meeting_time)[k]
+        return f"the body's middle is {miss:.2g} m from the target after {time:.3g} s"
+
+
+def referee_intercepts(
+    cases,
+    plans,
+    *,
+    truth=None,
+    target_positions: Callable | None = None,
+    tolerance: float = 1e-3,
+    contact_tolerance: float = 1e-3,
+    step: float = LONGEST_STEP,
+    chunk: int = 128,
+) -> InterceptVerdict:
+    """The verdict on every plan of a batch.
+
+    Between two knots speed and curvature are lines, so that the heading is a cubic; the position
+    is integrated between every two samples by Gauss-Legendre quadrature, to rounding. Speed,
+    acceleration, curvature, steering rate and lateral acceleration are held against their limits
+    at their extrema inside of each piece, not at samples.
+
+    The map, the walls and the movers are looked at in samples: the knots, and between them at
+    most `step` apart. There the test of rectangle against convex polygon is exact. In between,
+    nothing is looked at: at 1.5 m/s the car drives 3 cm in a step of 20 ms.
+
+    Where the target is is worked out here, in float64, for a path with the fields of
+    `TurningPath` (known by `turn_rate`) or of `PolynomialPath` (`coeffs`).
+
+    Args:
+        cases: object with the fields of `InterceptCase`, leaves with leading axis B. Polygons
+            are convex, in either sense, and may repeat corners. What belongs to an absent
+            obstacle is not looked at.
+        plans: object with the fields of `InterceptPlan`, leaves with leading axis B; speed and
+            curvature (B, K + 1). The meeting point that it claims is not read.
+        truth: path of what the target really does, of the kind of `cases.target`, with leading
+            axis B; it takes the place of `cases.target`, which may be a prediction.
+        target_positions: for targets of any other class:
+            `(target, times (B,) [s]) -> positions (B, 2) [m]`. If given, it answers for the
+            known classes as well.
+        tolerance: relative, of every limit of the car, of the case's tolerance and its heading
+            tolerance; and how far the plan's first pose, speed and curvature may be from the
+            case's, in their own units.
+        contact_tolerance: [m], how far the body may be inside an obstacle, and its middle off
+            the map.
+        step: [s], longest time between two samples, at most `LONGEST_STEP`.
+        chunk: most lanes that a thread judges at once; it bounds the memory.
+
+    Returns:
+        An `InterceptVerdict` of float64 arrays. A lane that is not finite fails as "not finite"
+        and leaves the others alone. Limits, tolerances and the map's bounds may be infinite.
+
+    Raises:
+        ValueError: a leaf has the wrong shape, the class of the target is not known, `step` is
+            not in (0, LONGEST_STEP] or `chunk` < 1.
+    """
+    if not 0.0 < step <= LONGEST_STEP:
+        raise ValueError(f"step must be > 0 and <= {LONGEST_STEP}, got {step}")
+    if chunk < 1:
+        raise ValueError(f"chunk must be >= 1, got {chunk}")
+    leaves = _leaves(cases, plans)
+    times = leaves["plan.time"].astype(np.float64)
+    target = cases.target if truth is None else truth
+    # A broken lane is told by its verdict, not by a warning.
+    with np.errstate(all="ignore"):
+        where = (target_positions or _target_positions)(target, times)
+    leaves["target"] = checked_leaf("target_positions", where, (*times.shape, 2))
+    judge = functools.partial(_judge, step=step, relative=tolerance, contact=contact_tolerance)
+    return InterceptVerdict(**judge_in_chunks(judge, leaves, chunk))
+
+
+def _leaves(cases, plans) -> dict[str, np.ndarray]:
+    """Every array that the referee reads but the target's, by name, its shape checked."""
+    speed = np.asarray(plans.speed)
+    if speed.ndim != 2 or speed.shape[1] < 2:
+        raise ValueError(f"plan.speed must be (B, K + 1), K >= 1, got {speed.shape}")
+    trailing = {
+        "plan.start": (plans.start, (3,)),
+        "plan.time": (plans.time, ()),
+        "plan.curvature": (plans.curvature, speed.shape[1:]),
+        "start": (cases.start, (3,)),
+        "lower": (cases.lower, (2,)),
+        "upper": (cases.upper, (2,)),
+    }
+    names = ("speed", "curvature", "time", "tolerance", "end_heading", "heading_tolerance")
+    trailing |= {name: (getattr(cases, name), ()) for name in names}
+    names = ("length", "width", "wheelbase", "rear_overhang")
+    trailing |= {f"body.{name}": (getattr(cases.body, name), ()) for name in names}
+    names = ("speed", "acceleration", "lateral_acceleration", "curvature", "steering_rate")
+    trailing |= {f"limits.{name}": (getattr(cases.limits, name), ()) for name in names}
+    leaves = {"plan.speed": speed}
+    for name, (value, shape) in trailing.items():
+        leaves[name] = checked_leaf(name, value, speed.shape[:1] + shape)
+    for name, group in (("walls", cases.walls), ("movers", cases.movers)):
+        leaves |= _obstacle_leaves(name, group, len(speed))
+    return leaves
+
+
+def _obstacle_leaves(name: str, group, batch: int) -> dict[str, np.ndarray]:
+    """The arrays of walls or movers by name; those of absent ones are zero."""
+    corners = np.asarray(group.corners)
+    if corners.ndim != 4 or corners.shape[::3] != (batch, 2) or corners.shape[2] < 3:
+        raise ValueError(f"{name}.corners must be ({batch}, N, V >= 3, 2), got {corners.shape}")
+    shape = corners.shape[:2]
+    present = checked_leaf(f"{name}.present", group.present, shape)
+    centre = checked_leaf(f"{name}.centre", group.centre, (*shape, 2))
+    velocity = checked_leaf(f"{name}.velocity", group.velocity, (*shape, 2))
+    return {
+        f"{name}.present": present,
+        f"{name}.centre": np.where(present[..., None], centre, 0.0),
+        f"{name}.velocity": np.where(present[..., None], velocity, 0.0),
+        f"{name}.corners": np.where(present[..., None, None], corners, 0.0),
+    }
+
+
+def _target_positions(target, times: np.ndarray) -> np.ndarray:
+    """Positions (B, 2) [m] at times (B,) of targets of the classes that are known here."""
+    batch = times.shape
+
+    def leaf(name: str, *trailing: int) -> np.ndarray:
+        value = checked_leaf(f"target.{name}", getattr(target, name), batch + trailing)
+        return value.astype(np.float64)
+
+    if hasattr(target, "turn_rate"):
+        # The chord of an arc: shorter than it by the sinc of half the angle, and turned by that.
+        half = 0.5 * leaf("turn_rate") * times
+        (x, y), chord = leaf("vel", 2).T, times * np.sinc(half / np.pi)
+        cos, sin = np.cos(half), np.sin(half)
+        way = np.stack([cos * x - sin * y, sin * x + cos * y], axis=1)
+        return leaf("pos", 2) + chord[:, None] * way
+    if hasattr(target, "coeffs"):
+        shape = np.shape(target.coeffs)
+        if len(shape) != 3:
+            raise ValueError(f"target.coeffs must be ({len(times)}, n + 1, 2), got {shape}")
+        powers = (times - leaf("origin"))[:, None] ** np.arange(shape[1])
+        return np.einsum("bk,bki->bi", powers, leaf("coeffs", shape[1], 2))
+    raise ValueError(f"a target of class {type(target).__name__} needs target_positions")
+
+
+def _judge(case: dict, step: float, relative: float, contact: float) -> dict:
+    """The fields of `InterceptVerdict` for one chunk of lanes."""
+    end = case["plan.time"]
+    finite = finite_lanes(case, _UNBOUNDED)
+    driven = finite & (end > 0.0) & (end <= LONGEST_PLAN)
+    span = np.where(driven, end, 0.0) / (case["plan.speed"].shape[1] - 1)
+    measured, tests = _judge_limits(case, span, relative)
+    times, poses = _driven(case, span, step)
+    found, more = _judge_way(case, times, poses, contact)
+    measured, tests = measured | found, tests | more
+    middle, heading = poses[:, -1, :2], poses[:, -1, 2]
+    miss = np.linalg.norm(middle - case["target"], axis=1)
+    off = np.abs(_wrapped(heading - case["end_heading"]))
+    tests["start"] = _start(case, relative)
+    tests["meeting"] = (miss > case["tolerance"] * (1.0 + relative), miss, end)
+    tests["heading"] = (off > case["heading_tolerance"] * (1.0 + relative), off, end)
+    tests = {
+        name: (failed & driven, np.where(driven, excess, 0.0), time)
+        for name, (failed, excess, time) in tests.items()
+    }
+    late = end - np.minimum(case["time"], LONGEST_PLAN)
+    tests["time"] = (
+        (late > CONTACT_TIME_TOLERANCE) | (finite & ~driven),
+        np.where(finite, np.maximum(late, -end), 0.0),
+        end,
+    )
+    measured |= {"miss": miss, "meeting_time": end}
+    for name, value in measured.items():
+        broken = -1 if value.dtype.kind == "i" else np.nan
+        measured[name] = np.where(driven, value, broken)
+    return first_failures(tests, LIMITS, finite) | measured
+
+
+def _wrapped(angle: np.ndarray) -> np.ndarray:
+    """Angles [rad] as those in (-pi, pi]."""
+    return np.arctan2(np.sin(angle), np.cos(angle))
+
+
+def _start(case: dict, allowed: float) -> tuple:
+    """Test of the plan's first pose, speed and curvature: failed, largest error, time."""
+    away = case["plan.start"] - case["start"]
+    errors = [
+        np.linalg.norm(away[:, :2], axis=1),
+        np.abs(_wrapped(away[:, 2])),
+        np.abs(case["plan.speed"][:, 0] - case["speed"]),
+        np.abs(case["plan.curvature"][:, 0] - case["curvature"]),
+    ]
+    worst = np.max(errors, axis=0)
+    return worst > allowed, worst, np.zeros_like(worst)
+
+
+def _greatest(values: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The greatest of values (B, M), and when (B,) it is reached."""
+    lanes, top = np.arange(len(values)), values.argmax(axis=1)
+    return values[lanes, top], np.broadcast_to(times, values.shape)[lanes, top]
+
+
+def _judge_limits(case: dict, span: np.ndarray, relative: float) -> tuple[dict, dict]:
+    """What the car's motion asks of it, and the tests of that: name -> failed, excess, time.
+
+    Args:
+        case: leaves of B lanes.
+        span: (B,) [s], of every piece.
+        relative: tolerance.
+    """
+    v, k, h = case["plan.speed"], case["plan.curvature"], span[:, None]
+    knots = h * np.arange(v.shape[1])
+    v0, k0, k1, starts = v[:, :-1], k[:, :-1], k[:, 1:], knots[:, :-1]
+    rise, bend = np.diff(v) / h, np.diff(k) / h
+    # delta = atan(L k) turns fastest where the curvature is least.
+    zero = np.clip(np.where(bend == 0.0, 0.0, -k0 / bend), 0.0, h)
+    zero = np.where(k0 * k1 < 0.0, zero, np.where(np.abs(k0) <= np.abs(k1), 0.0, h))
+    least = np.where(k0 * k1 < 0.0, 0.0, np.minimum(np.abs(k0), np.abs(k1)))
+    wheelbase = case["body.wheelbase"][:, None]
+    steering = np.abs(wheelbase * bend) / (1.0 + (wheelbase * least) ** 2)
+    # v^2 k has its extrema where v = 0, and where 2 v' k + v k' = 0.
+    slope = 3.0 * rise * bend
+    inside = np.where(slope == 0.0, 0.0, -(2.0 * rise * k0 + bend * v0) / slope)
+    inside = np.clip(inside, 0.0, h)
+    bent = (v0 + rise * inside) ** 2 * (k0 + bend * inside)
+    lateral = np.abs(np.concatenate([v**2 * k, bent], axis=1))
+    lateral_times = np.concatenate([knots, starts + inside], axis=1)
+    peaks = {
+        "speed": _greatest(v, knots),
+        "acceleration": _greatest(np.abs(rise), starts),
+        "curvature": _greatest(np.abs(k), knots),
+        "steering rate": _greatest(steering, starts + zero),
+        "lateral acceleration": _greatest(lateral, lateral_times),
+    }
+    measured = {f"max_{name.replace(' ', '_')}": value for name, (value, _) in peaks.items()}
+    measured["rms_acceleration"] = np.sqrt(np.mean(rise**2, axis=1))
+    tests = {
+        name: above(value, case[f"limits.{name.replace(' ', '_')}"], relative, time)
+        for name, (value, time) in peaks.items()
+    }
+    # It does not reverse either: below zero is as wrong as above the limit.
+    limit = case["limits.speed"][:, None]
+    scale = np.where(np.isinf(limit), 1.0, np.maximum(limit, SMALLEST_LIMIT))
+    excess, when = _greatest(np.maximum(v - limit, -v) / scale, knots)
+    tests["speed"] = (excess > relative, excess, when)
+    return measured, tests
+
+
+def _driven(case: dict, span: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
+    """Where the car drives: times (B, S) [s] and poses (B, S, 3) of its body's middle.
+
+    Lanes of fewer samples than others stay at the end of each piece until all have theirs.
+
+    Args:
+        case: leaves of B lanes.
+        span: (B,) [s], of each of the K pieces.
+        step: [s], longest time between two samples.
+    """
+    v, k = case["plan.speed"][..., None], case["plan.curvature"][..., None]
+    num, h = v.shape[1] - 1, span[:, None, None]
+    v0, k0 = v[:, :-1], k[:, :-1]
+    rise, bend = (np.where(h > 0.0, np.diff(each, axis=1) / h, 0.0) for each in (v, k))
+
+    def turned(tau: np.ndarray) -> np.ndarray:
+        """Angle (B, K, ...) since the beginning of each piece: the integral of v k."""
+        return tau * (v0 * k0 + tau * (0.5 * (v0 * bend + rise * k0) + tau * rise * bend / 3.0))
+
+    count = np.maximum(np.ceil(span / step - 1e-9), 1.0)
+    most = int(count.max(initial=1.0))
+    tau = span[:, None] * np.minimum(np.arange(most + 1) / count[:, None], 1.0)  # (B, most + 1)
+    whole = turned(h)[..., 0]
+    before = case["plan.start"][:, 2:] + np.cumsum(whole, axis=1) - whole  # (B, K)
+    moved = np.zeros((len(v), num, most, 2))
+    for node, weight in zip(_NODE, _WEIGHT, strict=True):
+        at = (tau[:, :-1] + node * np.diff(tau, axis=1))[:, None]
+        angle = before[..., None] + turned(at)
+        length = weight * np.diff(tau, axis=1)[:, None] * (v0 + rise * at)
+        moved[..., 0] += length * np.cos(angle)
+        moved[..., 1] += length * np.sin(angle)
+    headings = (before[..., None] + turned(tau[:, None, :-1])).reshape(len(v), num * most)
+    last = before[:, -1:] + whole[:, -1:]
+    times = (span[:, None] * np.arange(num))[..., None] + tau[:, None, :-1]
+    times = np.concatenate([times.reshape(len(v), num * most), num * span[:, None]], axis=1)
+    poses = np.zeros((*times.shape, 3))
+    poses[..., 2] = np.concatenate([headings, last], axis=1)
+    poses[:, 1:, :2] = np.cumsum(moved.reshape(len(v), num * most, 2), axis=1)
+    ahead = 0.5 * case["body.length"] - case["body.rear_overhang"]
+    poses[..., 0] += case["plan.start"][:, 0, None] + ahead[:, None] * np.cos(poses[..., 2])
+    poses[..., 1] += case["plan.start"][:, 1, None] + ahead[:, None] * np.sin(poses[..., 2])
+    return times, poses
+
+
+def _judge_way(case: dict, times: np.ndarray, poses: np.ndarray, contact: float) -> tuple:
+    """Clearances along the way, and the tests of map, walls and movers.
+
+    Args:
+        case: leaves of B lanes.
+        times: (B, S) [s].
+        poses: (B, S, 3), of the body's middle.
+        contact: tolerance [m].
+    """
+    middle = poses[..., :2]
+    outside = np.maximum(case["lower"][:, None] - middle, middle - case["upper"][:, None])
+    off, when = _greatest(outside.max(axis=2), times)
+    tests, measured = {"map": (off > contact, off, when)}, {}
+    half = 0.5 * np.stack([case["body.length"], case["body.width"]], axis=1)
+    for name, one in (("walls", "wall"), ("movers", "mover")):
+        group = {key: case[f"{name}.{key}"] for key in ("centre", "velocity", "corners", "present")}
+        least, when, nearest = clearances(group, half, times, poses)
+        measured |= {f"{one}_clearance": least, f"nearest_{one}": nearest}
+        tests[one] = (-least > contact, -least, when)
+    return measured, tests

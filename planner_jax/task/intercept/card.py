@@ -1,0 +1,56 @@
+"""What the registry knows of interceptions; imports no JAX."""
+
+import dataclasses
+
+from planner_jax.registry import Task
+
+
+@dataclasses.dataclass(frozen=True)
+class Suite:
+    """One kind of interception: how much stands and moves in the way, and how much time there is.
+
+    The shapes of a suite's arrays depend on its room alone, so that all of its cases share a
+    compiled program.
+    """
+
+    description: str
+    num_walls: tuple[int, int]  # fewest and most; of a maze, of the walls across the map
+    num_movers: tuple[int, int]  # fewest and most
+    mover_speed: tuple[float, float] = (0.1, 0.6)  # [m/s]
+    time: float = 10.0  # [s], when the target is to be met
+    is_maze: bool = False
+    # How many polygons of how many corners the arrays hold.
+    wall_room: tuple[int, int] = (12, 6)
+    mover_room: tuple[int, int] = (4, 6)
+
+
+# The other ranges are those of `planner_jax.task.intercept.suites`.
+SUITES = {
+    "easy": Suite("Four to six walls and one mover.", (4, 6), (1, 1)),
+    "medium": Suite("Seven to nine walls, two or three movers.", (7, 9), (2, 3)),
+    "hard": Suite("Ten to twelve walls, three or four movers.", (10, 12), (3, 4)),
+    "storm": Suite(
+        "Twelve movers, the fastest at 1 m/s, among five to eight walls.",
+        (5, 8),
+        (12, 12),
+        mover_speed=(0.2, 1.0),
+        mover_room=(12, 6),
+    ),
+    "gale": Suite("Eight movers among eight to twelve walls.", (8, 12), (8, 8), mover_room=(12, 6)),
+    "maze": Suite(
+        "Two or three walls across the map, each with one gap, and dead ends before them.",
+        (2, 3),
+        (1, 2),
+        time=15.0,
+        is_maze=True,
+    ),
+}
+
+TASK = Task(
+    name="intercept",
+    summary="a car meets a moving target among obstacles that stand and move",
+    home="planner_jax.task.intercept",
+    planners={"spacetime": "planner_jax.task.intercept.spacetime:SpacetimeIntercept"},
+    suites={name: suite.description for name, suite in SUITES.items()},
+    contact="time",
+)

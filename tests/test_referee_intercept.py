@@ -1,0 +1,524 @@
+"""The referee of interceptions, on plans worked out by hand: no planner has a part in this."""
+
+import math
+from dataclasses import fields
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from planner_jax.plane.obstacles import Obstacles
+from planner_jax.plane.target import PolynomialPath, TurningPath
+from planner_jax.referee.clearance import clearances
+from planner_jax.referee.intercept import LIMITS, InterceptVerdict, referee_intercepts
+from planner_jax.robot.car import CarBody, CarLimits
+from planner_jax.task.intercept.case import InterceptCase
+from planner_jax.task.intercept.plan import InterceptPlan
+
+LENGTH, WIDTH, WHEELBASE, REAR = 0.4, 0.25, 0.3, 0.05
+MIDDLE, FRONT = 0.5 * LENGTH - REAR, LENGTH - REAR  # ahead of the rear axle
+START = (0.8, 4.0, 0.0)
+TIME, SPEED, KNOTS = 5.0, 0.8, 11
+
+
+def square(x, y, half, sense=1):
+    """Corners of a square around (x, y)."""
+    return np.array([x, y]) + half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])[::sense]
+
+
+def group(polygons=(), velocities=(), room=(3, 6)):
+    """Leaves of obstacles, with leading axis 1; what is absent holds NaN."""
+    centre, corners = np.full((room[0], 2), np.nan), np.full((*room, 2), np.nan)
+    velocity = np.full((room[0], 2), np.nan)
+    for k, polygon in enumerate(polygons):
+        centre[k] = np.mean(polygon, axis=0)
+        corners[k] = np.asarray(polygon)[np.minimum(np.arange(room[1]), len(polygon) - 1)]
+        corners[k] -= centre[k]
+        velocity[k] = velocities[k] if velocities else 0.0
+    present = np.arange(room[0]) < len(polygons)
+    leaves = {"centre": centre, "corners": corners, "velocity": velocity, "present": present}
+    return {name: leaf[None] for name, leaf in leaves.items()}
+
+
+def good(speed=SPEED, curvature=0.0, time=TIME, start=START, end=None, walls=(), movers=((), ())):
+    """Leaves, with leading axis 1, of a car that drives along its knots to its target.
+
+    Without another end it drives straight on, evenly.
+    """
+    start = np.asarray(start, float)
+    speed, curvature = (np.broadcast_to(each, KNOTS).astype(float) for each in (speed, curvature))
+    ahead = np.array([math.cos(start[2]), math.sin(start[2])])
+    end = start[:2] + (speed[0] * time + MIDDLE) * ahead if end is None else np.asarray(end)
+    leaves = {
+        "plan.start": start,
+        "plan.time": time,
+        "plan.speed": speed,
+        "plan.curvature": curvature,
+        "start": start,
+        "speed": speed[0],
+        "curvature": curvature[0],
+        "time": time,
+        "tolerance": 0.05,
+        "end_heading": 0.0,
+        "heading_tolerance": math.pi,
+        "lower": (0.0, 0.0),
+        "upper": (8.0, 8.0),
+        "target.pos": end - [0.0, 0.3 * time],
+        "target.vel": (0.0, 0.3),
+        "target.turn_rate": 0.0,
+        "body.length": LENGTH,
+        "body.width": WIDTH,
+        "body.wheelbase": WHEELBASE,
+        "body.rear_overhang": REAR,
+        "limits.speed": 1.5,
+        "limits.acceleration": 1.0,
+        "limits.lateral_acceleration": 0.8,
+        "limits.curvature": 2.0,
+        "limits.steering_rate": 2.0,
+    }
+    leaves = {name: np.array(leaf, float)[None] for name, leaf in leaves.items()}
+    for name, (polygons, velocities) in {"walls": (walls, ()), "movers": movers}.items():
+        leaves |= {f"{name}.{k}": leaf for k, leaf in group(polygons, velocities).items()}
+    return leaves
+
+
+def tree(leaves, root=""):
+    """The object whose fields are the leaves named `root<field>`, and so on inwards."""
+    inside = {k.removeprefix(root): v for k, v in leaves.items() if k.startswith(root)}
+    parts = {k.split(".")[0] for k in inside if "." in k}
+    plain = {k: v for k, v in inside.items() if "." not in k}
+    return SimpleNamespace(**plain, **{part: tree(inside, f"{part}.") for part in parts})
+
+
+def judge(leaves, **options) -> InterceptVerdict:
+    case = tree(leaves)
+    return referee_intercepts(case, case.plan, **options)
+
+
+def stack(*cases):
+    return {name: np.concatenate([case[name] for case in cases]) for name in cases[0]}
+
+
+def assert_good(leaves, **options):
+    verdict = judge(leaves, **options)
+    assert verdict.success[0], verdict.sentence(0)
+    return verdict
+
+
+def assert_fails(leaves, name, *, excess=None, time=None, says="", **options):
+    verdict = judge(leaves, **options)
+    assert not verdict.success[0] and verdict.failed_limit[0] == name, verdict.sentence(0)
+    assert verdict.sentence(0).startswith(f"{name}: ") and says in verdict.sentence(0)
+    if excess is not None:
+        assert verdict.failed_excess[0] == pytest.approx(excess, rel=1e-6, abs=1e-9)
+    if time is not None:
+        assert verdict.failed_time[0] == pytest.approx(time, abs=1e-9)
+    return verdict
+
+
+def test_a_straight_drive_meets_its_target():
+    verdict = assert_good(good())
+    assert verdict.failed_limit[0] == "" and np.isnan(verdict.failed_time[0])
+    assert verdict.max_speed[0] == SPEED and verdict.meeting_time[0] == TIME
+    assert verdict.miss[0] < 1e-12
+    for name in ("max_acceleration", "rms_acceleration", "max_curvature", "max_steering_rate"):
+        assert getattr(verdict, name)[0] == 0.0
+    assert np.isposinf(verdict.wall_clearance[0]) and np.isposinf(verdict.mover_clearance[0])
+    assert verdict.nearest_wall[0] == verdict.nearest_mover[0] == -1
+    assert "from the target after 5 s" in verdict.sentence(0)
+
+
+@pytest.mark.parametrize("step", [0.02, 0.0031])
+def test_a_circle_returns_to_where_it_began(step):
+    speed, curvature = 0.7, 1.5
+    around = 2.0 * math.pi / (speed * curvature)
+    middle = np.array(START[:2]) + [MIDDLE, 0.0]
+    leaves = good(speed, curvature, around, end=middle)
+    leaves["heading_tolerance"][:] = 1e-9
+    verdict = assert_good(leaves, step=step)
+    assert verdict.miss[0] < 1e-9
+    assert verdict.max_lateral_acceleration[0] == pytest.approx(speed**2 * curvature)
+    leaves["end_heading"][:] = 0.3
+    assert_fails(leaves, "heading", excess=0.3, time=around)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_end_of_any_plan_is_where_integration_puts_it(seed):
+    random = np.random.default_rng(seed)
+    speed, curvature = random.uniform(0.0, 1.5, KNOTS), random.uniform(-2.0, 2.0, KNOTS)
+    start, time = random.uniform([1, 1, -3], [7, 7, 3]), random.uniform(4.0, 12.0)
+    knots = np.linspace(0.0, time, KNOTS)
+
+    def drive(t, state):
+        v, k = np.interp(t, knots, speed), np.interp(t, knots, curvature)
+        return [v * np.cos(state[2]), v * np.sin(state[2]), v * k]
+
+    state = start
+    for begin, end in zip(knots[:-1], knots[1:], strict=True):
+        solved = solve_ivp(drive, (begin, end), state, method="DOP853", rtol=1e-11, atol=1e-11)
+        state = solved.y[:, -1]
+    middle = state[:2] + MIDDLE * np.array([np.cos(state[2]), np.sin(state[2])])
+    leaves = good(speed, curvature, time, start, middle)
+    leaves["end_heading"][:] = state[2]
+    for name in ("limits.acceleration", "limits.lateral_acceleration", "limits.steering_rate"):
+        leaves[name][:] = np.inf
+    leaves["lower"][:], leaves["upper"][:] = -np.inf, np.inf
+    leaves["heading_tolerance"][:] = 1e-8
+    assert assert_good(leaves).miss[0] < 1e-8
+
+
+def test_acceleration_is_that_of_the_steepest_piece_and_the_root_mean_square_of_all():
+    speed = SPEED + 0.1 * np.array([0, 1, 3, 3, 2, 0, 0, 0, 0, 0, 0])
+    h = TIME / (KNOTS - 1)
+    end = np.array(START[:2]) + [h * (speed.sum() - SPEED) + MIDDLE, 0.0]
+    verdict = assert_good(good(speed, end=end))
+    rise = np.diff(speed) / h
+    assert verdict.max_acceleration[0] == pytest.approx(0.4)
+    assert verdict.rms_acceleration[0] == pytest.approx(math.sqrt(np.mean(rise**2)))
+    leaves = good(speed, end=end)
+    leaves["limits.acceleration"][:] = 0.32
+    assert_fails(leaves, "acceleration", excess=0.25, time=h)
+
+
+def test_lateral_acceleration_peaks_inside_of_a_piece():
+    """v = v_0 (1 - u), kappa = kappa_0 u: v^2 kappa has its maximum 4/27 v_0^2 kappa_0 at 1/3."""
+    speed, curvature = np.zeros(KNOTS), np.zeros(KNOTS)
+    speed[:4], curvature[4:] = 1.5, -2.0
+    leaves = good(speed, curvature)
+    for name in ("limits.acceleration", "limits.steering_rate", "tolerance"):
+        leaves[name][:] = np.inf
+    verdict = assert_good(leaves)
+    peak = 4.0 / 27.0 * 1.5**2 * 2.0
+    assert verdict.max_lateral_acceleration[0] == pytest.approx(peak)
+    leaves["limits.lateral_acceleration"][:] = 0.5 * peak
+    h = TIME / (KNOTS - 1)
+    assert_fails(leaves, "lateral acceleration", excess=1.0, time=(3.0 + 1.0 / 3.0) * h)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "least", "place"),
+    [(-0.5, 1.5, 0.0, 0.25), (0.4, 1.2, 0.4, 0.0), (-1.2, -0.4, 0.4, 1.0)],
+)
+def test_steering_is_fastest_where_the_curvature_is_least(first, second, least, place):
+    """delta = atan(L kappa): delta' = L kappa' / (1 + (L kappa)^2)."""
+    h = TIME / (KNOTS - 1)
+    curvature = np.array([first] * 3 + [second] * (KNOTS - 3))
+    leaves = good(SPEED, curvature)
+    for name in ("limits.lateral_acceleration", "tolerance"):
+        leaves[name][:] = np.inf
+    rate = WHEELBASE * abs(second - first) / h / (1.0 + (WHEELBASE * least) ** 2)
+    assert assert_good(leaves).max_steering_rate[0] == pytest.approx(rate)
+    leaves["limits.steering_rate"][:] = 0.8 * rate
+    assert_fails(leaves, "steering rate", excess=0.25, time=(2.0 + place) * h)
+
+
+def test_a_car_that_stops_too_late_is_as_deep_in_the_wall_as_it_is_late():
+    end = START[0] + SPEED * TIME + FRONT
+    wall = [[end - 0.07, 3.0], [end + 2.0, 3.0], [end + 2.0, 5.0], [end - 0.07, 5.0]]
+    verdict = assert_fails(good(walls=[square(7, 1, 0.2), wall]), "wall", excess=0.07, time=TIME)
+    assert verdict.nearest_wall[0] == 1 and verdict.wall_clearance[0] == pytest.approx(-0.07)
+    assert verdict.sentence(0) == "wall: the body is 0.07 m inside walls[1] at 5.000 s"
+    touching = np.array(wall) + [0.07 - 9e-4, 0.0]
+    assert assert_good(good(walls=[touching])).wall_clearance[0] == pytest.approx(-9e-4)
+    assert_fails(good(walls=[touching]), "wall", contact_tolerance=8e-4)
+
+
+def test_corners_graze_at_the_distance_of_their_diagonals():
+    """A car at 45 degrees passes the corner of a square, and stops before another one's."""
+    start = (2.0, 2.0, math.pi / 4.0)
+    ahead, left = np.array([1.0, 1.0]) / math.sqrt(2.0), np.array([-1.0, 1.0]) / math.sqrt(2.0)
+    beside = np.array(start[:2]) + 1.5 * ahead + (0.5 * WIDTH + 0.03) * left
+    passed = good(start=start, walls=[square(*(beside + [-0.4, 0.4]), 0.4)])
+    assert assert_good(passed).wall_clearance[0] == pytest.approx(0.03)
+    corner = np.array(start[:2]) + (SPEED * TIME + FRONT) * ahead + 0.5 * WIDTH * left
+    corners = np.array([[0.0, 0.0], ahead, ahead + left, left])
+    stopped = good(start=start, walls=[corner + 0.02 * ahead + 0.03 * left + corners])
+    assert assert_good(stopped).wall_clearance[0] == pytest.approx(math.hypot(0.02, 0.03))
+    wedged = good(start=start, walls=[corner - 0.02 * ahead - 0.03 * left + corners])
+    assert_fails(wedged, "wall", excess=0.02, time=TIME)
+
+
+def test_a_mover_is_met_where_and_when_it_is():
+    """A square of side 0.4 m passes the side of a car at rest: abreast of it at 2 s."""
+    still, way = {"speed": 0.0, "time": 4.0}, [(0.5, 0.0)]
+    x, y = START[0] + MIDDLE - 1.0, START[1] + 0.5 * WIDTH + 0.2
+    passing = good(**still, movers=([square(x, y + 0.05, 0.2)], way))
+    assert assert_good(passing).mover_clearance[0] == pytest.approx(0.05)
+    hit = good(**still, movers=([square(7.0, 1.0, 0.2), square(x, y - 0.05, 0.2)], way * 2))
+    verdict = assert_fails(hit, "mover", excess=0.05, says="inside movers[1]")
+    # From 0.05 m of overlap along the car on, the way out is to the side.
+    assert verdict.failed_time[0] == pytest.approx(2.0 - 0.35 / 0.5, abs=0.02)
+    convoy = good(movers=([square(START[0] + FRONT + 0.3, 4.0, 0.2)], [(SPEED, 0.0)]))
+    assert assert_good(convoy).mover_clearance[0] == pytest.approx(0.1)
+    slow = good(movers=([square(START[0] + FRONT + 0.3, 4.0, 0.2)], [(SPEED - 0.03, 0.0)]))
+    assert_fails(slow, "mover", excess=0.05, time=TIME)
+
+
+def random_polygon(random, most=6):
+    """Corners (most, 2) of a convex polygon around the origin, the last one repeated."""
+    num = random.integers(3, most + 1)
+    angles = 2.0 * np.pi * (np.arange(num) + random.uniform(0.1, 0.9, num)) / num
+    corners = random.uniform(0.1, 0.6) * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    return corners[np.minimum(np.arange(most), num - 1)]
+
+
+def test_clearances_are_the_greatest_gap_in_any_direction():
+    """Distance and depth of convex sets: max over unit u of (min u.b - max u.a)."""
+    random = np.random.default_rng(0)
+    lanes, samples, num = 40, 5, 3
+    half = np.tile([0.2, 0.125], (lanes, 1))
+    obstacles = {
+        "centre": random.uniform(-0.8, 0.8, (lanes, num, 2)),
+        "velocity": random.uniform(-0.3, 0.3, (lanes, num, 2)),
+        "corners": np.array([[random_polygon(random) for _ in range(num)] for _ in range(lanes)]),
+        "present": random.uniform(size=(lanes, num)) < 0.7,
+    }
+    times = np.tile(np.arange(samples, dtype=float), (lanes, 1))
+    poses = random.uniform([-0.8, -0.8, -3], [0.8, 0.8, 3], (lanes, samples, 3))
+    least, when, nearest = clearances(obstacles, half, times, poses)
+    angles = np.linspace(0.0, 2.0 * np.pi, 2881)
+    u = np.stack([np.cos(angles), np.sin(angles)])
+    cos, sin = np.cos(poses[..., 2]), np.sin(poses[..., 2])
+    turn = np.stack([np.stack([cos, -sin], axis=-1), np.stack([sin, cos], axis=-1)], axis=-2)
+    box = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half[0]
+    box = poses[..., None, :2] + np.einsum("bsij,kj->bski", turn, box)
+    centre = obstacles["centre"][:, None] + obstacles["velocity"][:, None] * times[..., None, None]
+    corners = centre[:, :, :, None] + obstacles["corners"][:, None]
+    gaps = ((corners @ u).min(axis=3) - (box @ u).max(axis=2)[:, :, None]).max(axis=3)
+    gaps = np.where(obstacles["present"][:, None], gaps, np.inf)
+    found = np.isfinite(least)
+    np.testing.assert_array_equal(found, obstacles["present"].any(axis=1))
+    assert (least[found] > 0.0).any() and (least[found] < 0.0).any()
+    np.testing.assert_allclose(least, gaps.min(axis=(1, 2)), atol=2e-3)
+    at = gaps[np.arange(lanes), when.astype(int), nearest]
+    np.testing.assert_allclose(at[found], least[found], atol=2e-3)
+    assert (nearest[~found] == -1).all()
+
+
+def test_corners_may_be_in_either_sense_and_repeated_and_absent_obstacles_hold_anything():
+    wall = square(3.0, 4.5, 0.3)
+    plain, turned = good(walls=[wall]), good(walls=[wall[::-1]])
+    tight = good()
+    tight |= {f"walls.{k}": leaf for k, leaf in group([wall], room=(1, 4)).items()}
+    for leaves in (turned, tight):
+        np.testing.assert_allclose(
+            assert_good(leaves).wall_clearance, assert_good(plain).wall_clearance, rtol=1e-12
+        )
+    assert assert_good(plain).wall_clearance[0] == pytest.approx(0.2 - 0.5 * WIDTH)
+
+
+def failing():
+    """Name -> leaves that fail it first, by how much, and when."""
+    h = TIME / (KNOTS - 1)
+    fast, bent, turned = good(), good(SPEED, 0.5), good()
+    fast["limits.speed"][:] = 0.64
+    backwards = good(np.array([SPEED] * 6 + [-0.15] + [SPEED] * 4))
+    backwards["limits.acceleration"][:] = np.inf
+    bent["limits.curvature"][:], bent["plan.curvature"][0, 4] = 0.5, 0.6
+    late, long, early = good(), good(), good()
+    late["time"][:] = TIME - 0.5
+    early["plan.time"][:] = -1.0
+    long["plan.time"][:] = long["time"][:] = 4000.0
+    turned["plan.start"][0, 2] += 2.0 * math.pi + 0.02
+    elsewhere, slow, straight = good(), good(), good()
+    elsewhere["start"][0, :2] += [0.3, 0.4]
+    slow["speed"][:] += 0.1
+    straight["curvature"][:] += 0.2
+    off, missed = good(), good()
+    off["upper"][0, 0] = START[0] + MIDDLE + SPEED * TIME - 0.4
+    missed["target.pos"][0, 1] += 0.2
+    return [
+        ("time", late, 0.5, TIME),
+        ("time", early, 1.0, -1.0),
+        ("time", long, 400.0, 4000.0),
+        ("start", elsewhere, 0.5, 0.0),
+        ("start", turned, 0.02, 0.0),
+        ("start", slow, 0.1, 0.0),
+        ("start", straight, 0.2, 0.0),
+        ("speed", fast, 0.25, 0.0),
+        ("speed", backwards, 0.1, 6 * h),
+        ("curvature", bent, 0.2, 4 * h),
+        ("map", off, 0.4, TIME),
+        ("meeting", missed, 0.2, TIME),
+    ]
+
+
+@pytest.mark.parametrize("k", range(len(failing())), ids=[name for name, *_ in failing()])
+def test_every_failure_has_its_name_size_and_time(k):
+    name, leaves, excess, time = failing()[k]
+    assert_fails(leaves, name, excess=excess, time=time)
+
+
+def test_a_plan_may_end_before_the_cases_time_and_is_held_against_the_target_there():
+    leaves = good()
+    leaves["time"][:] = 10.0
+    assert assert_good(leaves).meeting_time[0] == TIME
+
+
+def test_targets_turn_or_follow_polynomials():
+    turn_rate, time, vel = -0.4, 3.7, np.array([0.3, -0.2])
+
+    def turning(t, state):
+        return [state[2], state[3], -turn_rate * state[3], turn_rate * state[2]]
+
+    path = solve_ivp(turning, (0.0, time), [1.0, 2.0, *vel], rtol=1e-11, atol=1e-11).y[:, -1]
+    leaves = good(time=time, end=path[:2], start=(*(path[:2] - [SPEED * time + MIDDLE, 0.0]), 0.0))
+    leaves["lower"][:] = -np.inf
+    target = {"pos": [1.0, 2.0], "vel": vel, "turn_rate": turn_rate}
+    leaves |= {f"target.{k}": np.asarray(v, float)[None] for k, v in target.items()}
+    assert assert_good(leaves).miss[0] < 1e-9
+    other = {k: v for k, v in leaves.items() if not k.startswith("target.")}
+    # (t - 1)^2 times the velocity, from where it ends up there.
+    coeffs = np.array([path[:2] - vel * (time - 1.0) ** 2, [0.0, 0.0], vel])
+    other |= {"target.coeffs": coeffs[None], "target.origin": np.ones(1)}
+    assert assert_good(other).miss[0] < 1e-12
+
+
+def test_the_truth_takes_the_place_of_what_was_expected():
+    leaves = good()
+    truth = SimpleNamespace(
+        pos=leaves["target.pos"] + [[0.3, 0.0]],
+        vel=leaves["target.vel"],
+        turn_rate=leaves["target.turn_rate"],
+    )
+    assert_fails(leaves, "meeting", excess=0.3, truth=truth)
+    leaves["target.pos"][:] = np.nan
+    truth.pos -= [0.3, 0.0]
+    assert_good(leaves, truth=truth)
+
+
+def test_a_class_of_the_users_own_answers_through_a_function():
+    case = tree(good())
+    known, case.target = case.target, "hovering"
+
+    def positions(target, times):
+        assert target == "hovering"
+        return known.pos + known.vel * times[:, None]
+
+    assert referee_intercepts(case, case.plan, target_positions=positions).success[0]
+    with pytest.raises(ValueError, match="a target of class str needs target_positions"):
+        referee_intercepts(case, case.plan)
+    with pytest.raises(ValueError, match=r"target_positions must be \(1, 2\), got \(3,\)"):
+        referee_intercepts(case, case.plan, target_positions=lambda *_: np.zeros(3))
+
+
+def unequal_lanes():
+    wall, mover = square(3.0, 4.5, 0.3), square(3.0, 5.0, 0.3)
+    return [
+        good(walls=[wall], movers=([mover], [(0.0, -0.1)])),
+        good(walls=[wall, square(4.0, 4.0, 0.2)]),
+        good(1.3, time=3.0, movers=([square(2.0, 4.0, 0.3), mover], [(0.0, 0.0), (0.1, 0.0)])),
+        good(np.linspace(0.5, 1.2, KNOTS), np.linspace(0.0, 0.4, KNOTS)),
+        failing()[0][1],
+        good(),
+    ]
+
+
+def assert_same(a: InterceptVerdict, b: InterceptVerdict, lanes=slice(None)):
+    for name, left in vars(a).items():
+        np.testing.assert_array_equal(left[lanes], getattr(b, name)[lanes], err_msg=name)
+
+
+@pytest.mark.parametrize("chunk", [1, 4, 512])
+def test_batch_equals_loop(chunk):
+    lanes = unequal_lanes()
+    batch = judge(stack(*lanes), chunk=chunk)
+    for i, lane in enumerate(lanes):
+        own = {k: v[i : i + 1] for k, v in vars(batch).items()}
+        assert_same(judge(lane), InterceptVerdict(**own))
+    names = ["", "wall", "mover", "meeting", "time", ""]
+    np.testing.assert_array_equal(batch.failed_limit, names)
+
+
+FLOATS = sorted(name for name, leaf in good().items() if leaf.dtype.kind == "f")
+
+
+@pytest.mark.parametrize("name", FLOATS)
+def test_a_nan_fails_its_own_lane_and_no_other(name):
+    leaves = stack(*unequal_lanes())
+    clean = judge(leaves)
+    leaves[name][(0,) + (0,) * (leaves[name].ndim - 1)] = np.nan  # the good one's
+    verdict = judge(leaves)
+    assert not verdict.success[0] and verdict.failed_limit[0] == "not finite"
+    assert verdict.sentence(0) == "not finite: the plan or its case is not finite"
+    assert np.isnan(verdict.miss[0]) and verdict.nearest_wall[0] == -1
+    assert_same(clean, verdict, lanes=slice(1, None))
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["plan.speed", "plan.curvature", "plan.time", "plan.start", "target.vel", "walls.centre"],
+)
+@pytest.mark.parametrize("value", [1e300, -1e30, np.inf])
+def test_absurd_numbers_fail_without_a_warning(name, value):
+    leaves = good(walls=[square(6.0, 1.0, 0.3)])
+    leaves[name] = np.full_like(leaves[name], value)
+    assert judge(leaves).success[0] == (name == "walls.centre" and np.isfinite(value))
+
+
+def test_float32_structs_of_the_planner_are_taken_as_they_are():
+    leaves = stack(*unequal_lanes()[:2])
+    leaves = {
+        k: jnp.asarray(leaf, None if leaf.dtype == bool else jnp.float32)
+        for k, leaf in leaves.items()
+    }
+    plain, blank = tree(leaves), np.full(2, np.nan)  # what the plan claims is not read
+    parts = {
+        "target": TurningPath(**vars(plain.target)),
+        "walls": Obstacles(**vars(plain.walls)),
+        "movers": Obstacles(**vars(plain.movers)),
+        "body": CarBody(**vars(plain.body)),
+        "limits": CarLimits(**vars(plain.limits)),
+    }
+    own = {k: leaf for k, leaf in vars(plain).items() if k != "plan"}
+    case = InterceptCase(**own | parts)
+    claims = dict.fromkeys(("cost", "violation", "iterations", "status", "meeting"), blank)
+    plan = InterceptPlan(**vars(plain.plan), **claims)
+    verdict = referee_intercepts(case, plan)
+    np.testing.assert_array_equal(verdict.failed_limit, ["", "wall"])
+    assert verdict.miss.dtype == np.float64
+    truth = PolynomialPath(
+        coeffs=jnp.stack([plain.target.pos, plain.target.vel], axis=1), origin=jnp.zeros(2)
+    )
+    np.testing.assert_allclose(referee_intercepts(case, plan, truth=truth).miss, 0.0, atol=1e-5)
+
+
+def test_an_empty_batch_has_an_empty_verdict():
+    verdict = judge({name: leaf[:0] for name, leaf in good().items()})
+    assert verdict.success.shape == verdict.miss.shape == (0,)
+
+
+def test_there_may_be_no_room_for_obstacles():
+    leaves = good()
+    leaves |= {f"walls.{k}": leaf for k, leaf in group(room=(0, 4)).items()}
+    assert np.isposinf(assert_good(leaves).wall_clearance[0])
+
+
+@pytest.mark.parametrize(
+    ("changes", "options", "says"),
+    [
+        ({}, {"step": 0.05}, r"step must be > 0 and <= 0.02, got 0.05"),
+        ({}, {"step": 0.0}, r"step must be > 0 and <= 0.02, got 0.0"),
+        ({}, {"chunk": 0}, r"chunk must be >= 1, got 0"),
+        ({"plan.speed": np.zeros(4)}, {}, r"plan.speed must be \(B, K \+ 1\), K >= 1, got \(4,\)"),
+        ({"plan.curvature": np.zeros((1, 4))}, {}, r"plan.curvature must be \(1, 11\)"),
+        ({"limits.speed": np.array(1.0)}, {}, r"limits.speed must be \(1,\), got \(\)"),
+        ({"walls.corners": np.zeros((1, 3, 2))}, {}, r"walls.corners must be \(1, N, V >= 3, 2\)"),
+        ({"movers.present": np.ones((1, 2))}, {}, r"movers.present must be \(1, 3\), got \(1, 2\)"),
+        ({"target.vel": np.zeros(2)}, {}, r"target.vel must be \(1, 2\), got \(2,\)"),
+    ],
+)  # fmt: skip
+def test_wrong_arguments_are_named(changes, options, says):
+    with pytest.raises(ValueError, match=says) as caught:
+        judge(good() | changes, **options)
+    assert "\n" not in str(caught.value)
+
+
+def test_every_limit_has_its_sentence():
+    lanes = len(LIMITS)
+    blank = {field.name: np.zeros(lanes) for field in fields(InterceptVerdict)}
+    verdict = InterceptVerdict(**blank | {"failed_limit": np.array(LIMITS)})
+    for lane, name in enumerate(LIMITS):
+        assert verdict.sentence(lane).startswith(f"{name}: ")
