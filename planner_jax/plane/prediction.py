@@ -1,0 +1,271 @@
+"""Where a target in the plane will be, and how surely, from noisy observations of its position.
+
+Paper 003, Section III-A, fits a polynomial (`polynomial_fit.py`) of a degree that it does not
+give. `select` weighs a straight line against an even turn instead, and its prediction says how
+far it can be trusted: `covariance`, `chance_within`. World frame in the plane, SI units, one
+target; `jax.vmap` makes many. Noise is Gaussian, equal on both axes.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array, lax
+
+from planner_jax.plane.observed import centred, safe_sqrt
+from planner_jax.plane.target import TurningPath, arc
+from planner_jax.plane.turn_fit import best_turn, given_rate, path_of, tangent
+
+_REACH = 5.0  # standard deviations of the turn rate that are looked at, to either side
+_OFFSETS = np.linspace(-1.0, 1.0, 49)  # where, in reaches
+# Gauss-Legendre nodes and weights on (-1, 1).
+_NODE, _WEIGHT = np.polynomial.legendre.leggauss(24)
+
+
+@struct.dataclass
+class TurnPrior:
+    """What is taken for granted about targets before the first observation.
+
+    They go straight, or turn at a rate whose size has a log-normal distribution, to either side
+    alike. The numbers are for targets of 0.2 to 0.5 m/s that turn at 0.03 to 0.1 rad/s. Faster
+    turns lose little by them, but slower ones are mistaken for straight paths more often than
+    the stated errors say: for these take a wider prior, such as `TurnPrior(0.5, 0.03, 1.0)`,
+    which predicts straight targets less well.
+    """
+
+    chance: Any = 0.4  # () of a turn, between 0 and 1
+    typical: Any = 0.065  # () [rad/s] > 0, median size of the turn rate
+    spread: Any = 0.4  # () > 0, standard deviation of the logarithm of its size
+
+    def log_density(self, rate: Array) -> Array:
+        """Logarithm (...) of the density [s/rad] of turn rates (...) [rad/s], given a turn."""
+        turns = rate != 0.0
+        size = jnp.log(jnp.where(turns, jnp.abs(rate), 1.0))
+        apart = (size - jnp.log(self.typical)) / self.spread
+        density = -size - 0.5 * apart**2 - jnp.log(self.spread) - 0.5 * np.log(8.0 * np.pi)
+        return jnp.where(turns, density, -jnp.inf)
+
+    @property
+    def variance(self) -> Array:
+        """Of the turn rate, given a turn, () [rad^2/s^2]."""
+        return jnp.square(self.typical) * jnp.exp(2.0 * jnp.square(self.spread))
+
+
+USUAL = TurnPrior()
+
+
+@struct.dataclass
+class Alternatives:
+    """Paths that the observations leave open, and how probable each is; the first is straight.
+
+    Path k is at  centre + velocity_k g_k(t - middle), a product of complex numbers, where g is how
+    far a target of its turn rate goes that begins at unit velocity along x, less the lever. Its
+    error there is Gaussian and round, of the variance  centre_variance +
+    velocity_variance_k |g_k(t - middle)|^2.
+    """
+
+    chance: Array  # (K,), sum 1
+    turn_rate: Array  # (K,) [rad/s]
+    velocity: Array  # (K, 2) [m/s], at the middle
+    lever: Array  # (K, 2) [s], weighted mean of the ways at the times of observation
+    centre: Array  # (2,) [m], weighted mean of the observations
+    middle: Array  # () [s], weighted mean of the times of observation
+    centre_variance: Array  # () [m^2]
+    velocity_variance: Array  # (K,) [m^2/s^2]
+
+
+@struct.dataclass
+class Prediction:
+    """The path that is expected, and what is known about its error."""
+
+    path: TurningPath  # of turn rate 0 if it is straight
+    is_turning: Array  # () bool, which model was chosen
+    chance_turning: Array  # () that the target turns
+    gain: Array  # () by how much the best turn lowers the sum of squared residuals, in noise^2
+    residual: Array  # () [m], root mean square a coordinate, of the observations from the path
+    noise: Array  # () [m], standard deviation of a coordinate, given or estimated
+    alternatives: Alternatives
+
+
+def select(
+    times: Any,
+    positions: Any,
+    noise: Any = None,
+    weights: Any = None,
+    *,
+    prior: TurnPrior = USUAL,
+    threshold: Any = None,
+    fastest: Any = 1.0,
+) -> Prediction:
+    """A straight path, or one that turns evenly.
+
+    Every turn rate gets its probability by Bayes, with the prior for turns and none for place and
+    velocity, by quadrature along the rate. The path is that of the median rate, which is zero
+    unless the target turns to one side rather than not: a weak turn is taken for less than it
+    looks, and the path does not jump as observations change (posterior median thresholding,
+    Johnstone and Silverman, Ann. Statist. 32, 2004). With a threshold a test chooses instead
+    between the line and the turn of least squares. What the prediction says about its error is
+    the same for both: all rates at their probabilities, zero among them.
+
+    A residual well above the noise says that the target does neither: then do not trust the rest.
+    Where fewer than three observations are present, or four if the noise is to be estimated, the
+    path is straight and the error unbounded.
+
+    Args:
+        times: (L,) [s]. The path counts from time 0, which should not be far.
+        positions: (L, 2) [m].
+        noise: () [m] > 0, standard deviation of a coordinate of an observation of weight 1. If
+            not given, it is estimated from the residuals of the best turn.
+        weights: (L,) >= 0, proportional to the inverse variance of each observation; 1 if not
+            given. One of weight zero, or not finite, is absent.
+        prior: how often targets turn, and how fast.
+        threshold: () of the gain, above which a target turns; that of a straight one exceeds 6.6
+            once in a hundred times.
+        fastest: () [rad/s], where the search for a turn begins at most. The target should not
+            turn at that rate by more than 24 rad within the observations, and by less than pi
+            between two.
+
+    Raises:
+        ValueError: there is no room for as many observations, the shapes do not match, or the
+            noise is a number that is not positive; one line.
+    """
+    if isinstance(noise, int | float) and not noise > 0.0:
+        raise ValueError(f"noise must be > 0, got {noise}")
+    least = 4 if noise is None else 3
+    seen = centred(times, positions, weights, least)
+    dtype = seen.after.dtype
+    best = best_turn(seen, fastest)
+    enough, freedom = seen.num >= least, jnp.maximum(2.0 * seen.num - 5.0, 3.0)
+    if noise is None:
+        extent = jnp.sum(seen.weight * (seen.place[0] ** 2 + seen.place[1] ** 2))
+        rounding = (4.0 * jnp.finfo(dtype).eps) ** 2 * extent
+        variance = jnp.maximum(best.squares / freedom, jnp.maximum(rounding, 1e-30))
+        # The variance of Student's distribution, which an error has in terms of such an estimate.
+        error_variance = variance * freedom / (freedom - 2.0)
+    else:
+        variance = error_variance = jnp.square(jnp.asarray(noise, dtype))
+
+    def gain(squares: Array) -> Array:
+        """Twice the logarithm of how much better the best turn explains what was seen."""
+        excess = (squares - best.squares) / variance
+        return excess if noise is not None else (freedom + 1.0) * jnp.log1p(excess / freedom)
+
+    # Around the best turn rate, or where the observations say little of it, those of the prior.
+    information = tangent(seen, best)[1] / variance
+    precision = information + 1.0 / jnp.asarray(prior.variance, dtype)
+    reach = _REACH / jnp.sqrt(precision)
+    step = reach * (_OFFSETS[1] - _OFFSETS[0])
+    rates = best.rate * information / precision + reach * jnp.asarray(_OFFSETS, dtype)
+    fits = jax.vmap(given_rate, in_axes=(None, 0))(seen, jnp.append(jnp.zeros((), dtype), rates))
+    chance = jnp.asarray(prior.chance, dtype)
+    of_turns = prior.log_density(rates) + jnp.log(step) + jnp.log(chance)
+    log_prior = jnp.append(jnp.log1p(-chance), of_turns)
+    power, gains = jnp.where(fits.power > 0.0, fits.power, 1.0), gain(fits.squares)
+    likely = jax.nn.softmax(log_prior - 0.5 * gains - jnp.log(power))
+    if threshold is None:
+        rate = _median(rates, step, likely[1:], likely[0])
+    else:
+        rate = jnp.where(gains[0] > threshold, best.rate, 0.0)
+    chosen = given_rate(seen, jnp.where(enough, rate, 0.0))
+    return Prediction(
+        path=path_of(seen, chosen),
+        is_turning=chosen.rate != 0.0,
+        chance_turning=jnp.sum(likely[1:]),
+        gain=gains[0],
+        residual=safe_sqrt(chosen.squares / (2.0 * seen.total)),
+        noise=jnp.sqrt(variance),
+        alternatives=Alternatives(
+            chance=likely,
+            turn_rate=fits.rate,
+            velocity=jnp.stack(fits.velocity, axis=-1),
+            lever=jnp.stack(fits.lever, axis=-1),
+            centre=jnp.stack(seen.centre),
+            middle=seen.middle,
+            centre_variance=jnp.where(enough, error_variance / seen.total, jnp.inf),
+            velocity_variance=error_variance / power,
+        ),
+    )
+
+
+def _median(rates: Array, step: Array, chance: Array, of_zero: Array) -> Array:
+    """Median () of a rate that is zero or in cells of a width () around rates (K,), rising."""
+    below = jnp.cumsum(chance) - chance
+    right = jnp.sum(jnp.where(rates < 0.0, chance, 0.0)) <= 0.5  # the median is not negative
+    level = jnp.where(right, 0.5 - of_zero, 0.5)
+    wide = chance > jnp.finfo(chance.dtype).eps
+    inside = jnp.clip((level - below) / jnp.where(wide, chance, 1.0), 0.0, 1.0)
+    share = jnp.where(wide, inside, level > below)
+    rate = rates[0] + step * (jnp.sum(share) - 0.5)
+    return jnp.where(right, jnp.maximum(rate, 0.0), jnp.minimum(rate, 0.0))
+
+
+def mean_position(prediction: Prediction, time: Any) -> Array:
+    """Mean (2,) [m] over all alternatives at one time () [s]: the least expected square error."""
+    offset, _ = _errors(prediction, time)
+    mean = jnp.sum(prediction.alternatives.chance[:, None] * offset, axis=0)
+    return prediction.path.at(time).pos + mean
+
+
+def covariance(prediction: Prediction, time: Any) -> Array:
+    """Mean square (2, 2) [m^2] of the error of the chosen path's position at one time () [s].
+
+    About that position, not about the mean of the alternatives. Its diagonal is infinite where
+    there were too few observations.
+    """
+    offset, variance = _errors(prediction, time)
+    chance = prediction.alternatives.chance
+    apart = jnp.sum(chance[:, None, None] * offset[:, :, None] * offset[:, None, :], axis=0)
+    alike = prediction.alternatives.centre_variance + jnp.sum(chance * variance)
+    return apart + jnp.where(jnp.eye(2, dtype=bool), alike, 0.0)
+
+
+def chance_within(prediction: Prediction, time: Any, radius: Any) -> Array:
+    """Probability () that the target is within a radius () [m] of the path at one time () [s].
+
+    Zero where there were too few observations.
+    """
+    offset, variance = _errors(prediction, time)
+    centre_variance = prediction.alternatives.centre_variance
+    known = jnp.isfinite(centre_variance)
+    std = jnp.sqrt(jnp.where(known, centre_variance + variance, 1.0))
+    distance = safe_sqrt(jnp.sum(offset**2, axis=-1))
+    inside = jax.vmap(_chance_in_circle, in_axes=(0, 0, None))(distance, std, jnp.asarray(radius))
+    return jnp.sum(prediction.alternatives.chance * jnp.where(known, inside, 0.0))
+
+
+def _errors(prediction: Prediction, time: Any) -> tuple[Array, Array]:
+    """Where each alternative is from the chosen path, (K, 2) [m], and its variance (K,) [m^2].
+
+    The variance of the centre, which is the same for all, is to be added.
+    """
+    among = prediction.alternatives
+    time = jnp.asarray(time, among.middle.dtype)
+    ahead, aside = arc(among.turn_rate, time - among.middle)
+    ahead, aside = ahead - among.lever[:, 0], aside - among.lever[:, 1]
+    x, y = among.velocity[:, 0], among.velocity[:, 1]
+    way = jnp.stack([x * ahead - y * aside, x * aside + y * ahead], axis=-1)
+    offset = among.centre - prediction.path.at(time).pos + way
+    return offset, among.velocity_variance * (ahead**2 + aside**2)
+
+
+def _chance_in_circle(distance: Array, std: Array, radius: Array) -> Array:
+    """Probability () of a circle whose centre is at a distance from that of a round Gaussian.
+
+    Strips of the circle across the line of centres, equally spaced in angle near the Gaussian.
+    """
+
+    def angle(along: Array) -> Array:
+        within = jnp.abs(along) < 1.0
+        inner = jnp.arcsin(jnp.where(within, along, 0.0))
+        return jnp.where(within, inner, jnp.sign(along) * 0.5 * np.pi)
+
+    safe = jnp.where(radius > 0.0, radius, 1.0)
+    low, high = angle((distance - 7.0 * std) / safe), angle((distance + 7.0 * std) / safe)
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    phi = middle + half * jnp.asarray(_NODE, distance.dtype)
+    along, across = radius * jnp.sin(phi), radius * jnp.cos(phi)
+    density = jnp.exp(-0.5 * ((along - distance) / std) ** 2) * across / std
+    chords = density * lax.erf(across / (std * np.sqrt(2.0))) / np.sqrt(2.0 * np.pi)
+    return half * jnp.sum(chords * jnp.asarray(_WEIGHT, distance.dtype))

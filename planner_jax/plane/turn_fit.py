@@ -1,0 +1,213 @@
+"""Even turns through observations of a target, and what no fit of them can do better.
+
+Once the turn rate is known, a path of constant speed is linear in a place and a velocity. In terms
+of complex numbers it is  place + velocity g(t), with the arc g(t) = (exp(i w t) - 1) / (i w). Both
+follow from the rate in closed form, and one unknown remains (variable projection). Their errors
+are Gaussian and round, since a turn of the plane turns both. Here complex numbers are pairs.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from planner_jax.plane.observed import Centred, Pair, centred, safe_sqrt
+from planner_jax.plane.target import TurningPath, arc
+
+_RATES = 33  # turn rates from which the best one is refined
+_STEPS = 8  # of Gauss-Newton, in the turn rate alone
+
+
+class TurnFit(NamedTuple):
+    """The place and the velocity that suit a turn rate best."""
+
+    rate: Array  # () [rad/s]
+    velocity: Pair  # each () [m/s], in the middle of the observations
+    lever: Pair  # each () [s], weighted mean of the arcs
+    power: Array  # () [s^2], weighted sum of |arc - lever|^2
+    residual: Pair  # each (L,) [m]
+    squares: Array  # () [m^2], weighted sum of |residual|^2
+
+
+def fit_turn(times: Any, positions: Any, weights: Any = None, *, fastest: Any = 1.0) -> TurningPath:
+    """The path of constant speed and turn rate of least squares through observations.
+
+    Gauss-Newton in the rate from the best of 33 equally spaced ones. The path is straight where
+    fewer than three observations are present.
+
+    Args:
+        times: (L,) [s]. The path counts from time 0, which should not be far.
+        positions: (L, 2) [m].
+        weights: (L,) >= 0, proportional to the inverse variance of each observation; 1 if not
+            given. One of weight zero, or not finite, is absent.
+        fastest: () [rad/s], where the search begins at most. The target should not turn at that
+            rate by more than 24 rad within the observations, and by less than pi between two.
+
+    Raises:
+        ValueError: there is no room for three observations, or the shapes do not match; one line.
+    """
+    seen = centred(times, positions, weights, 3)
+    return path_of(seen, best_turn(seen, fastest))
+
+
+def given_rate(seen: Centred, rate: Array) -> TurnFit:
+    """Place and velocity of least squares for a turn rate () [rad/s]."""
+    arcs = arc(rate, seen.after)
+    lever = _mean(seen, arcs)
+    arm = _minus(arcs, lever)
+    power = _sum(seen, arm, arm)
+    velocity = _share(seen, arm, power, seen.place)
+    residual = _minus(seen.place, _times(velocity, arm))
+    return TurnFit(rate, velocity, lever, power, residual, _sum(seen, residual, residual))
+
+
+def tangent(seen: Centred, fit: TurnFit) -> tuple[Callable[[Array], Pair], Array]:
+    """How the path moves with the turn rate when place and velocity follow.
+
+    Returns:
+        slope: of times (...) [s] after the middle the slopes, each (...) [m s/rad].
+        information: () [m^2 s^2/rad^2], weighted sum of their squares over the observations.
+    """
+
+    def bent(after: Array) -> tuple[Pair, Pair]:
+        """Arcs, and how the ways along them move with the rate alone."""
+        one = jnp.ones_like(fit.rate)
+        arcs, slopes = jax.jvp(lambda rate: arc(rate, after), (fit.rate,), (one,))
+        return arcs, _times(fit.velocity, slopes)
+
+    arcs, moved = bent(seen.after)
+    mean = _mean(seen, moved)
+    follows = _share(seen, _minus(arcs, fit.lever), fit.power, moved)
+
+    def left(arcs: Pair, moved: Pair) -> Pair:
+        return _minus(_minus(moved, mean), _times(follows, _minus(arcs, fit.lever)))
+
+    of_seen = left(arcs, moved)
+    return lambda after: left(*bent(after)), _sum(seen, of_seen, of_seen)
+
+
+def best_turn(seen: Centred, fastest: Any) -> TurnFit:
+    """The turn of least squares; its derivatives are those of the optimum."""
+
+    def downhill(rate: Array) -> Array:
+        """Half of how fast the sum of squares falls with the rate, () [m^2 s/rad]."""
+        fit = given_rate(seen, rate)
+        _, slopes = jax.jvp(lambda rate: arc(rate, seen.after), (rate,), (jnp.ones_like(rate),))
+        return _sum(seen, _times(fit.velocity, slopes), fit.residual)
+
+    spacing = jnp.asarray(fastest, seen.after.dtype) * (2.0 / (_RATES - 1))
+    rate = lax.stop_gradient(_searched(lax.stop_gradient(seen), spacing))
+    # By the implicit function theorem a step of Newton from where the slope vanishes has the
+    # derivatives of the optimum, the curvature taken as constant.
+    slope, curvature = jax.jvp(downhill, (rate,), (jnp.ones_like(rate),))
+    curved = (curvature < 0.0) & (seen.num >= 3)
+    step = slope / lax.stop_gradient(jnp.where(curved, curvature, -1.0))
+    return given_rate(seen, rate - jnp.where(curved, jnp.clip(step, -spacing, spacing), 0.0))
+
+
+def _searched(seen: Centred, spacing: Array) -> Array:
+    """The best turn rate, by Gauss-Newton in it alone (Kaufman's variable projection).
+
+    It begins from the best of rates that are equally spaced around zero, and goes no further than
+    the next ones.
+    """
+    rates = spacing * (jnp.arange(_RATES) - _RATES // 2)
+    squares = jax.vmap(lambda rate: given_rate(seen, rate).squares)(rates)
+
+    def refine(k: int, rate: Array) -> Array:
+        fit = given_rate(seen, rate)
+        slope, information = tangent(seen, fit)
+        step = _sum(seen, slope(seen.after), fit.residual)
+        step = step / jnp.where(information > 0.0, information, 1.0)
+        most = spacing * 0.5 ** (k + 1)
+        return rate + jnp.clip(step, -most, most)
+
+    best = rates[jnp.argmin(squares)]
+    return jnp.where(seen.num >= 3, lax.fori_loop(0, _STEPS, refine, best), 0.0)
+
+
+def path_of(seen: Centred, fit: TurnFit) -> TurningPath:
+    """The path of a fit, which counts from time 0."""
+    place = jnp.stack(_minus(seen.centre, _times(fit.velocity, fit.lever)))
+    start = TurningPath(place, jnp.stack(fit.velocity), fit.rate).at(-seen.middle)
+    return TurningPath(start.pos, start.vel, fit.rate)
+
+
+def cramer_rao(
+    path: TurningPath, times: Any, noise: Any, time: Any, *, turning: bool = True
+) -> Array:
+    """Least covariance (2, 2) [m^2] of an unbiased prediction of where a target is at one time.
+
+    The inverse of the exact Fisher information of place, velocity and turn rate, taken to the
+    position by its derivatives.
+
+    Args:
+        path: of the target.
+        times: (L,) [s], of the observations.
+        noise: () [m], standard deviation of a coordinate.
+        time: () [s], of the prediction.
+        turning: whether the turn rate is unknown too; False for one who knows that it is zero.
+
+    Raises:
+        ValueError: there is no room for two observations, or for three of a turn.
+    """
+    times = jnp.asarray(times)
+    seen = centred(times, jnp.zeros((*times.shape, 2)), None, 3 if turning else 2)
+    velocity = path.at(seen.middle).vel
+    fit = given_rate(seen, path.turn_rate)._replace(velocity=(velocity[0], velocity[1]))
+    variance = jnp.square(jnp.asarray(noise, seen.after.dtype))
+    after = time - seen.middle
+    ahead, aside = _minus(arc(path.turn_rate, after), fit.lever)
+    shared = variance * (1.0 / seen.total + (ahead**2 + aside**2) / fit.power)
+    bound = shared * jnp.eye(2, dtype=shared.dtype)
+    if turning:
+        slope, information = tangent(seen, fit)
+        moved = jnp.stack(slope(after))
+        bound += variance / information * moved[:, None] * moved
+    return bound
+
+
+def mean_distance(bound: Array) -> Array:
+    """Mean length () [m] of a Gaussian error of a covariance (2, 2) [m^2]."""
+    return np.sqrt(0.5 * np.pi) * jnp.mean(safe_sqrt(_around(bound)))
+
+
+def share_within(bound: Array, radius: Any) -> Array:
+    """Probability () that a Gaussian error of a covariance (2, 2) [m^2] is within a radius [m]."""
+    return 1.0 - jnp.mean(jnp.exp(-0.5 * radius**2 / _around(bound)))
+
+
+def _around(bound: Array) -> Array:
+    """Squares (64,) of the standard ellipse's radius at equal steps of its parameter."""
+    mean = 0.5 * (bound[0, 0] + bound[1, 1])
+    apart = safe_sqrt((0.5 * (bound[0, 0] - bound[1, 1])) ** 2 + bound[0, 1] ** 2)
+    return mean + apart * jnp.asarray(np.cos(np.arange(64) * (np.pi / 32.0)), bound.dtype)
+
+
+def _minus(a: Pair, b: Pair) -> Pair:
+    return a[0] - b[0], a[1] - b[1]
+
+
+def _times(a: Pair, b: Pair) -> Pair:
+    """Product of complex numbers."""
+    return a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]
+
+
+def _sum(seen: Centred, a: Pair, b: Pair) -> Array:
+    """Weighted sum () of the scalar products of points."""
+    return jnp.sum(seen.weight * (a[0] * b[0] + a[1] * b[1]))
+
+
+def _mean(seen: Centred, a: Pair) -> Pair:
+    """Weighted mean, each ()."""
+    x, y = (jnp.sum(seen.weight * each) / seen.total for each in a)
+    return x, y
+
+
+def _share(seen: Centred, arm: Pair, power: Array, a: Pair) -> Pair:
+    """The complex number that makes arms of a power most like points in the least squares."""
+    safe = jnp.where(power > 0.0, power, 1.0)
+    return _sum(seen, arm, a) / safe, _sum(seen, (-arm[1], arm[0]), a) / safe
