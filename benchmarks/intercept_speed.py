@@ -1,0 +1,327 @@
+"""Speed along a known way: the planners of paper 003's Table II, and more, on seeded problems.
+
+    python -m benchmarks.intercept_speed [--num 500] [--seed 0] [--batch 65536] [--out DIR]
+
+Every planner has the same dynamic programming, cost, limits and end; what differs is how polygons
+become bounds. A plan is good that has status CONVERGED and meets no polygon at any millisecond.
+Acceleration, jerk and clearance are means over good plans, or the least of all; the second table
+compares pairs on the problems where both are good. Times are of one problem at a time, warm, from
+its arrays to the plan's, the planners in turns; --batch adds how many a second the device solves at
+once. With the extra `peers` the programs of the trapezoids are solved by Clarabel and OSQP too:
+the cost gap of the summary is to Clarabel's.
+"""
+
+import dataclasses
+import os
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from planner_jax.benchmarks.qp_peers import INSTALL, PEERS, installed
+from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin
+from planner_jax.optimise.qp import solve_qp
+from planner_jax.plane.station_time import reference_line, stations_at_joints
+from planner_jax.protocol import Status
+from planner_jax.task.intercept.speed import (
+    SPEED_PLANNERS,
+    SpeedPlanner,
+    constant_speed,
+    plan_speed,
+    speed_bounds,
+    speed_matrices,
+    speed_template,
+)
+from planner_jax.task.intercept.speed_problems import speed_problems
+from planner_jax.trajectory.bezier import bernstein, hodograph
+
+PIECES = (10, 20)
+CONSTANT = "constant speed"
+OURS = "this library"
+# Each against what it shall be better than, on the problems where both are good.
+PAIRS = (
+    ("trapezoid", "em"),
+    ("trapezoid-twice", "em"),
+    ("trapezoid-edges", "em"),
+    ("trapezoid", "trapezoid-edges"),
+    ("trapezoid", "rectangle"),
+    ("trapezoid", "em-exact"),
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Judged:
+    """What became of all problems with one planner, one number a problem."""
+
+    good: np.ndarray  # bool: solved, and clear of every polygon
+    rms: np.ndarray  # [m/s^2]
+    peak: np.ndarray  # [m/s^2]
+    jerk: np.ndarray  # [m/s^3], greatest
+    end_error: np.ndarray  # [m]
+    clearance: np.ndarray  # [m], least; negative inside of a polygon
+
+
+def planners() -> dict[str, SpeedPlanner]:
+    """Every planner with every number of pieces; samples stay 0.1 s apart for 10 s."""
+    return {
+        f"{name}, {pieces}": dataclasses.replace(
+            planner, pieces=pieces, samples=planner.samples and 100 // pieces
+        )
+        for pieces in PIECES
+        for name, planner in SPEED_PLANNERS.items()
+    }
+
+
+def judge(problems: Any, points: np.ndarray, solved: np.ndarray) -> Judged:
+    """Curves (B, K, n + 1) looked at every millisecond, in double precision."""
+    pieces, degree = points.shape[1], points.shape[2] - 1
+    horizon = float(problems.horizon[0])
+    times = np.linspace(0.0, horizon, round(1000 * horizon) + 1)
+    piece = np.minimum((times / horizon * pieces).astype(int), pieces - 1)
+    share = times / horizon * pieces - piece
+    points = points.astype(float)
+
+    def derivative(order: int, lane: int) -> np.ndarray:
+        basis = bernstein(degree - order, share) @ hodograph(degree, order, pieces)
+        return np.sum(basis * points[lane, piece], axis=1) / horizon**order
+
+    rows = []
+    for lane in range(len(points)):
+        station, acceleration, jerk = (derivative(order, lane) for order in (0, 2, 3))
+        blocked = jax.tree.map(lambda leaf, lane=lane: leaf[lane], problems.blocked)
+        passed = (times[:, None] - blocked.start) / (blocked.end - blocked.start)
+        lower, upper = (
+            edge[:, 0] + passed * (edge[:, 1] - edge[:, 0])
+            for edge in (blocked.lower.astype(float), blocked.upper.astype(float))
+        )
+        away = np.maximum(lower - station[:, None], station[:, None] - upper)
+        is_met = (passed >= 0.0) & (passed <= 1.0) & blocked.present
+        rows.append(
+            (
+                np.sqrt(np.trapezoid(acceleration**2, times) / horizon),
+                np.abs(acceleration).max(),
+                np.abs(jerk).max(),
+                abs(station[-1] - problems.end_station[lane]),
+                np.where(is_met, away, np.inf).min(),
+            )
+        )
+    rms, peak, jerk, end_error, clearance = np.array(rows).T
+    return Judged(solved & (clearance >= 0.0), rms, peak, jerk, end_error, clearance)
+
+
+def in_turns(runs: dict[str, Callable], lanes: list[tuple]) -> tuple[dict, dict]:
+    """What every function makes of the lanes, one at a time and in random turns, and in what time.
+
+    Returns:
+        results: by name, the lanes' together, NumPy.
+        seconds: by name, (N,), the fastest of three calls, as other programs may be running too.
+    """
+    seconds = {name: np.full(len(lanes), np.inf) for name in runs}
+    results: dict[str, list] = {name: [] for name in runs}
+    for run in runs.values():
+        jax.block_until_ready(run(*lanes[0]))
+    rng = np.random.default_rng(0)
+    for k, lane in enumerate(lanes):
+        for _ in range(3):
+            for name in rng.permutation(list(runs)):
+                began = time.perf_counter()
+                result = jax.block_until_ready(runs[name](*lane))
+                seconds[name][k] = min(seconds[name][k], time.perf_counter() - began)
+                results[name][k:] = [result]
+    stacked = {
+        name: jax.tree.map(lambda *leaves: np.stack(leaves), *each)
+        for name, each in results.items()
+    }
+    return stacked, seconds
+
+
+def lanes_of(*batches: Any) -> list[tuple]:
+    """The lanes of batches, on the device."""
+    num = len(jax.tree.leaves(batches)[0])
+    return [jax.tree.map(lambda leaf, k=k: jnp.asarray(leaf[k]), batches) for k in range(num)]
+
+
+def table_of_planners(bench: Bench, problems: Any) -> dict[str, Judged]:
+    """One row a planner; returns what became of the problems."""
+    named = planners()
+    single = {
+        name: jax.jit(lambda problem, planner=planner: plan_speed(problem, planner))
+        for name, planner in named.items()
+    }
+    single[CONSTANT] = jax.jit(constant_speed)
+    planned, seconds = in_turns(single, lanes_of(problems))
+    bench.say(
+        "| planner, pieces | good | rms acc. [m/s2] | peak acc. [m/s2] | peak jerk [m/s3] "
+        "| greatest end error [m] | least clearance [m] | p50 / p95 / p99 [ms] |",
+        "|---|---|---|---|---|---|---|---|",
+    )
+    judged = {}
+    for name in single:
+        if name == CONSTANT:
+            points, solved = planned[name].points, np.ones(len(problems.horizon), bool)
+        else:
+            points, solved = planned[name].curve.points, planned[name].status == Status.CONVERGED
+        judged[name] = found = judge(problems, points, solved)
+        good = found.good
+        times = 1e3 * np.percentile(seconds[name], [50, 95, 99])
+        figures = {
+            "good": good.mean(),
+            "rms": found.rms[good].mean(),
+            "peak": found.peak[good].mean(),
+            "jerk": found.jerk[good].mean(),
+            "end_error": found.end_error[good].max(),
+            "clearance": found.clearance[solved].min(),
+        }
+        bench.say(
+            f"| {name} | {100 * figures['good']:.1f} % | {figures['rms']:.4f} | "
+            f"{figures['peak']:.4f} | {figures['jerk']:.3f} | {figures['end_error']:.1e} | "
+            f"{figures['clearance']:.4f} | {times[0]:.3f} / {times[1]:.3f} / {times[2]:.3f} |"
+        )
+        bench.row(table="planners", planner=name, **figures, ms=times)
+    bench.say("", *_pairs(bench, judged, seconds))
+    return judged
+
+
+def _pairs(bench: Bench, judged: dict[str, Judged], seconds: dict[str, np.ndarray]) -> list[str]:
+    """The table of pairs, on problems where both planners are good."""
+    lines = [
+        "| beside | both good | good, more by | rms acc. | peak acc. | time, median |",
+        "|---|---|---|---|---|---|",
+    ]
+    for pieces in PIECES:
+        for pair in PAIRS:
+            ours, theirs = (f"{name}, {pieces}" for name in pair)
+            one, other = judged[ours], judged[theirs]
+            both = one.good & other.good
+            figures = {
+                "both_good": both.mean(),
+                "more_good": one.good.mean() - other.good.mean(),
+                "rms": one.rms[both].mean() / other.rms[both].mean() - 1.0,
+                "peak": one.peak[both].mean() / other.peak[both].mean() - 1.0,
+                "time": np.median(seconds[ours] / seconds[theirs]) - 1.0,
+            }
+            lines.append(
+                f"| {ours} beside {pair[1]} | {100 * figures['both_good']:.1f} % | "
+                f"{100 * figures['more_good']:+.1f} points | {100 * figures['rms']:+.1f} % | "
+                f"{100 * figures['peak']:+.1f} % | {100 * figures['time']:+.1f} % |"
+            )
+            bench.row(table="pairs", planner=ours, beside=theirs, **figures)
+    return lines
+
+
+def table_of_solvers(bench: Bench, problems: Any) -> list[np.ndarray]:
+    """The quadratic programs alone, beside the peers' solvers; returns cost gaps to Clarabel."""
+    bench.say(
+        "",
+        "| program of | solver | solved | cost above Clarabel's, median / 95 % / most "
+        "| p50 / p95 / p99 [ms] |",
+        "|---|---|---|---|---|",
+    )
+    gaps = []
+    named = planners()
+    for name in (f"{kind}, {pieces}" for pieces in PIECES for kind in ("trapezoid", "em")):
+        rows = solved_by_all(problems, named[name])
+        for solver, (solved, cost, seconds) in rows.items():
+            times = 1e3 * np.nanpercentile(seconds, [50, 95, 99])
+            gap = np.full(3, np.nan)
+            if "clarabel" in rows:
+                best_solved, best, _ = rows["clarabel"]
+                both = solved & best_solved
+                relative = cost[both] / best[both] - 1.0
+                gap = np.percentile(relative, [50, 95, 100])
+                gaps += [relative] if solver == OURS else []
+            bench.say(
+                f"| {name} | {solver} | {100 * solved.mean():.1f} % | "
+                f"{gap[0]:.1e} / {gap[1]:.1e} / {gap[2]:.1e} | "
+                f"{times[0]:.3f} / {times[1]:.3f} / {times[2]:.3f} |"
+            )
+            bench.row(table="solvers", planner=name, solver=solver, ms=times, gaps=gap)
+    missing = [peer for peer in PEERS if not installed(peer)]
+    if missing:
+        bench.say(f"{' and '.join(missing)} not installed: {INSTALL}")
+    return gaps
+
+
+def solved_by_all(problems: Any, planner: SpeedPlanner) -> dict[str, tuple]:
+    """By solver which programs of a planner it solves, at what cost and in how many seconds."""
+    programs = jax.jit(jax.vmap(lambda problem: first_program(problem, planner)))(problems)
+    template = speed_template(planner)
+    solve = jax.jit(lambda *program: solve_qp(template, *program))
+    results, seconds = in_turns({OURS: solve}, lanes_of(*programs))
+    found = results[OURS]
+    rows: dict[str, tuple] = {
+        OURS: (found.status == Status.CONVERGED, found.cost.astype(float), seconds[OURS])
+    }
+    on_host = list(zip(*map(np.asarray, programs), strict=True))
+    for peer, make in PEERS.items():
+        if installed(peer):
+            run = make(speed_matrices(planner))
+            # All programs once before any again: one may begin with the solution before.
+            tries = [[run(*program) for program in on_host] for _ in range(3)]
+            rows[peer] = (
+                np.array([each.solved for each in tries[0]]),
+                np.array([each.cost for each in tries[0]]),
+                np.min([[one.seconds for one in each] for each in tries], axis=0),
+            )
+    return rows
+
+
+def first_program(problem: Any, planner: SpeedPlanner) -> tuple:
+    """Right sides and bounds of the first round of a planner."""
+    reference = reference_line(problem, planner.grid)
+    ends = stations_at_joints(reference.station, planner.pieces)
+    slope = (ends[1:] - ends[:-1]) * planner.pieces / problem.horizon
+    return speed_bounds(problem, reference, planner, slope)
+
+
+def table_of_batches(bench: Bench, problems: Any, batch: int) -> None:
+    """Whole plans and programs alone a second, of one batch on the device."""
+    places = np.arange(batch) % len(problems.horizon)
+    many = jax.device_put(jax.tree.map(lambda leaf: leaf[places], problems))
+    bench.say("", "| batch | planner, pieces | plans a second | programs alone a second |")
+    bench.say("|---|---|---|---|")
+    for name, planner in planners().items():
+        if not name.startswith("trapezoid,"):
+            continue
+        template = speed_template(planner)
+        programs = jax.jit(
+            jax.vmap(lambda problem, planner=planner: first_program(problem, planner))
+        )(many)
+        whole = jax.jit(jax.vmap(lambda problem, planner=planner: plan_speed(problem, planner)))
+        alone = jax.jit(jax.vmap(lambda *program, t=template: solve_qp(t, *program)))
+        rates = {}
+        for kind, run, given in (("plans", whole, (many,)), ("programs", alone, programs)):
+            seconds = []
+            for _ in range(6):
+                began = time.perf_counter()
+                jax.block_until_ready(run(*given))
+                seconds.append(time.perf_counter() - began)
+            rates[kind] = batch / np.median(seconds[1:])
+        bench.say(f"| {batch} | {name} | {rates['plans']:.3g} | {rates['programs']:.3g} |")
+        bench.row(table="batches", batch=batch, planner=name, **rates)
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argument_parser("intercept_speed", __doc__, num=500, seed=0)
+    parser.add_argument("--batch", type=at_least(0), default=0, help="default: 0, none")
+    options = parser.parse_args()
+    with begin(parser, options) as bench:
+        problems = speed_problems(options.num, options.seed)
+        bench.say(
+            f"{options.num} problems, seed {options.seed}, {jax.devices()[0].platform}, "
+            f"jax {jax.__version__}, load average {os.getloadavg()[0]:.1f}",
+            "",
+        )
+        judged = table_of_planners(bench, problems)
+        gaps = table_of_solvers(bench, problems)
+        if options.batch:
+            table_of_batches(bench, problems, options.batch)
+        bench.count(judged[f"trapezoid, {PIECES[0]}"].good, *gaps)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,119 @@
+"""Published solvers on the quadratic programs of `planner_jax.optimise.qp`: the extra `peers`."""
+
+import dataclasses
+import importlib
+import importlib.util
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+
+INSTALL = "pip install 'planner-jax[peers]' adds Clarabel and OSQP to compare with"
+
+
+def installed(name: str) -> bool:
+    """Whether a peer can be imported."""
+    return importlib.util.find_spec(name) is not None
+
+
+@dataclasses.dataclass(frozen=True)
+class PeerSolution:
+    """What a peer found, and how long it took on one program, warm."""
+
+    point: np.ndarray  # (n,)
+    cost: float
+    solved: bool
+    seconds: float
+
+
+def clarabel_solver(matrices: Mapping[str, np.ndarray]) -> Callable[..., PeerSolution]:
+    """A solver of programs of these matrices (as of `qp_template`): an interior-point method.
+
+    It is set up anew for every program, as its interface has no other bounds for the same matrices
+    where some are infinite; that is part of its time.
+    """
+    clarabel: Any = importlib.import_module("clarabel")
+
+    hessian, equalities, rows = _sparse(matrices)
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-9
+
+    def solve(right_side: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> PeerSolution:
+        has_lower, has_upper = np.isfinite(lower), np.isfinite(upper)
+        matrix = scipy.sparse.vstack([equalities, rows[has_upper], -rows[has_lower]], format="csc")
+        known = np.concatenate([_known(matrices, right_side), upper[has_upper], -lower[has_lower]])
+        inequalities = len(known) - equalities.shape[0]
+        cones = [
+            clarabel.ZeroConeT(equalities.shape[0]),
+            clarabel.NonnegativeConeT(inequalities),
+        ]
+        began = time.perf_counter()
+        linear = np.zeros(hessian.shape[0])
+        found = clarabel.DefaultSolver(hessian, linear, matrix, known, cones, settings).solve()
+        seconds = time.perf_counter() - began
+        solved = str(found.status) in ("Solved", "AlmostSolved")
+        return _solution(matrices, np.asarray(found.x), solved, seconds)
+
+    return solve
+
+
+def osqp_solver(matrices: Mapping[str, np.ndarray]) -> Callable[..., PeerSolution]:
+    """A solver of programs of these matrices (as of `qp_template`): OSQP, the paper's.
+
+    It is set up once, and gets new bounds for every program, warm from the solution before.
+    """
+    osqp: Any = importlib.import_module("osqp")
+
+    hessian, equalities, rows = _sparse(matrices)
+    matrix = scipy.sparse.vstack([equalities, rows], format="csc")
+    unbounded = np.full(equalities.shape[0] + rows.shape[0], np.inf)
+    solver = osqp.OSQP()
+    solver.setup(
+        hessian,
+        np.zeros(hessian.shape[0]),
+        matrix,
+        -unbounded,
+        unbounded,
+        verbose=False,
+        eps_abs=1e-5,
+        eps_rel=1e-5,
+        max_iter=20_000,
+    )
+
+    def solve(right_side: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> PeerSolution:
+        known = _known(matrices, right_side)
+        low, high = np.concatenate([known, lower]), np.concatenate([known, upper])
+        if (low > high).any():  # which OSQP refuses to look at
+            return _solution(matrices, np.full(hessian.shape[0], np.nan), False, np.nan)
+        began = time.perf_counter()
+        solver.update(l=low, u=high)
+        found = solver.solve(raise_error=False)
+        seconds = time.perf_counter() - began
+        return _solution(matrices, np.asarray(found.x), found.info.status == "solved", seconds)
+
+    return solve
+
+
+def _sparse(matrices: Mapping[str, np.ndarray]) -> tuple[Any, Any, Any]:
+    """Upper triangle of the Hessian, all equalities and the rows, as sparse matrices."""
+    equalities = np.concatenate([matrices["equalities"], matrices["zeros"]])
+    hessian = scipy.sparse.csc_matrix(np.triu(matrices["hessian"]))
+    return hessian, scipy.sparse.csr_matrix(equalities), scipy.sparse.csr_matrix(matrices["rows"])
+
+
+def _known(matrices: Mapping[str, np.ndarray], right_side: np.ndarray) -> np.ndarray:
+    """Right sides of all equalities."""
+    return np.concatenate([np.asarray(right_side, float), np.zeros(len(matrices["zeros"]))])
+
+
+def _solution(
+    matrices: Mapping[str, np.ndarray], point: np.ndarray, solved: bool, seconds: float
+) -> PeerSolution:
+    cost = 0.5 * point @ matrices["hessian"] @ point
+    return PeerSolution(point=point, cost=float(cost), solved=solved, seconds=seconds)
+
+
+PEERS = {"clarabel": clarabel_solver, "osqp": osqp_solver}

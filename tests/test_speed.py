@@ -1,0 +1,189 @@
+"""Speed along a way: plans are clear of every polygon, keep the limits, and nothing is cheaper."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from derivatives import assert_gradient_matches_differences
+
+from planner_jax.benchmarks.qp_peers import clarabel_solver
+from planner_jax.protocol import Status
+from planner_jax.task.intercept.speed import (
+    SPEED_PLANNERS,
+    SpeedPlanner,
+    constant_speed,
+    plan_speed,
+    speed_bounds,
+    speed_matrices,
+)
+from planner_jax.task.intercept.speed_problems import speed_problems
+from planner_jax.trajectory.bezier import BezierCurve, bernstein, hodograph
+
+NUM = 32
+TRAPEZOID = SPEED_PLANNERS["trapezoid"]
+many = jax.jit(jax.vmap(plan_speed))
+
+
+def with_slow_parts(problems):
+    """The same problems, the middle third of every second one with a lower speed limit."""
+    limit = np.repeat(problems.speed_limit, 3, axis=1)
+    limit[::2, 1] = 0.9
+    return dataclasses.replace(problems, speed_limit=limit)
+
+
+PROBLEMS = with_slow_parts(speed_problems(NUM))
+
+
+@pytest.fixture(scope="module")
+def plans():
+    return jax.tree.map(np.asarray, many(PROBLEMS))
+
+
+def dense(points, horizon, order, times):
+    """A derivative of curves (B, K, n + 1) at times (M,) in double precision, (B, M)."""
+    pieces, degree = points.shape[1], points.shape[2] - 1
+    place = times / horizon * pieces
+    piece = np.minimum(place.astype(int), pieces - 1)
+    rows = bernstein(degree - order, place - piece) @ hodograph(degree, order, pieces)
+    value = np.einsum("mi,bmi->bm", rows, points.astype(float)[:, piece])
+    return value / horizon**order
+
+
+TIMES = np.linspace(0.0, 10.0, 10001)
+
+
+def clearance(problems, station):
+    """How far stations (B, M) at TIMES stay from the polygons at least, (B,)."""
+    blocked = problems.blocked
+    time = TIMES[:, None, None]
+    share = (time - blocked.start) / (blocked.end - blocked.start)
+    lower, upper = (
+        edge[..., 0] + share * (edge[..., 1] - edge[..., 0])
+        for edge in (blocked.lower.astype(float), blocked.upper.astype(float))
+    )
+    away = np.maximum(lower - station.T[..., None], station.T[..., None] - upper)
+    is_met = (share >= 0.0) & (share <= 1.0) & blocked.present
+    return np.where(is_met, away, np.inf).min(axis=(0, 2))
+
+
+def test_plans_are_clear_of_polygons_at_every_millisecond_and_keep_every_limit(plans):
+    solved = plans.status == Status.CONVERGED
+    assert solved.mean() > 0.9 and (plans.violation[solved] < 1e-5).all()
+    station, speed, acceleration = (
+        dense(plans.curve.points, 10.0, order, TIMES)[solved] for order in range(3)
+    )
+    away = clearance(jax.tree.map(lambda leaf: leaf[solved], PROBLEMS), station)
+    assert (away > 0.9 * TRAPEZOID.margin).all() and np.median(away) < 0.1
+    assert speed.min() > -1e-4 and np.abs(acceleration).max() < 2.0
+    part = np.clip((station / 2.0).astype(int), 0, 2)
+    limit = np.take_along_axis(PROBLEMS.speed_limit[solved], part, axis=1)
+    assert (speed <= limit + 1e-4).all() and (limit == np.float32(0.9)).any()
+    np.testing.assert_allclose(station[:, 0], 0.0, atol=1e-6)
+    np.testing.assert_allclose(station[:, -1], 6.0, atol=1e-5)
+    np.testing.assert_allclose(speed[:, 0], 0.5, atol=1e-5)
+    np.testing.assert_allclose(acceleration[:, 0], 0.0, atol=1e-4)
+
+
+def test_pieces_join_up_to_the_acceleration_whose_squared_integral_is_the_cost(plans):
+    before = dense(plans.curve.points, 10.0, 2, np.arange(1, 10) - 1e-9)
+    after = dense(plans.curve.points, 10.0, 2, np.arange(1, 10) + 1e-9)
+    np.testing.assert_allclose(before, after, atol=1e-4)
+    squared = dense(plans.curve.points, 10.0, 2, TIMES) ** 2
+    np.testing.assert_allclose(plans.cost, np.trapezoid(squared, TIMES), rtol=1e-3, atol=1e-6)
+
+
+def test_without_a_line_or_with_broken_numbers_a_plan_says_so_and_others_stay_the_same(plans):
+    problems = jax.tree.map(np.array, PROBLEMS)
+    problems.blocked.lower[3], problems.blocked.upper[3] = -1.0, 7.0
+    problems.initial_speed[4] = np.nan
+    problems.initial_acceleration[5] = 2.5  # above the limit from the first moment
+    found = many(problems)
+    assert list(found.status[3:6]) == [Status.NO_PATH, Status.NON_FINITE, Status.INFEASIBLE]
+    np.testing.assert_array_equal(found.curve.points[6:], plans.curve.points[6:])
+
+
+def test_constant_speed_arrives_in_time_without_acceleration():
+    curve = constant_speed(jax.tree.map(lambda leaf: leaf[0], PROBLEMS))
+    points = np.asarray(curve.points)[None]
+    np.testing.assert_allclose(dense(points, 10.0, 0, TIMES)[0], 0.6 * TIMES, atol=1e-6)
+    np.testing.assert_allclose(dense(points, 10.0, 2, TIMES), 0.0, atol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("float64")
+def test_the_gradient_of_the_cost_is_that_of_differences():
+    """By everything but what dynamic programming decides, which is the side of each polygon."""
+    problems = speed_problems(4, dtype=np.float64)
+    case = jax.tree.map(lambda leaf: leaf[1], problems)
+    place = jax.tree.map(np.asarray, jax.jit(plan_speed)(case))
+    assert place.status == Status.CONVERGED and place.iterations >= 1
+
+    def cost(leaves):
+        blocked = dataclasses.replace(case.blocked, lower=leaves[0], upper=leaves[1])
+        problem = dataclasses.replace(case, initial_speed=leaves[2], blocked=blocked)
+        return plan_speed(problem).cost
+
+    given = case.blocked.lower, case.blocked.upper, case.initial_speed
+    assert_gradient_matches_differences(cost, given, step=1e-7, rtol=1e-5)
+
+
+def test_the_first_problems_are_the_same_whatever_their_number_and_others_by_another_seed():
+    few, others = speed_problems(5), speed_problems(5, seed=1)
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a, b[:5]), few, speed_problems(300))
+    assert not np.array_equal(few.blocked.start, others.blocked.start)
+    assert few.horizon.dtype == np.float32
+    assert speed_problems(1, dtype=np.float64).horizon.dtype == np.float64
+
+
+def test_no_other_solver_finds_a_cheaper_curve_in_the_same_corridor(plans):
+    pytest.importorskip("clarabel", reason="the extra `peers` is not installed")
+    solve = clarabel_solver(speed_matrices(TRAPEZOID))
+    bounds = jax.jit(jax.vmap(lambda *given: speed_bounds(*given[:2], TRAPEZOID, given[2])))
+    slopes = np.diff(plans.reference.station[:, ::2], axis=1)
+    programs = map(np.asarray, bounds(PROBLEMS, plans.reference, slopes))
+    peers = [solve(*program) for program in zip(*programs, strict=True)]
+    solved = np.array([peer.solved for peer in peers])
+    np.testing.assert_array_equal(solved, plans.status == Status.CONVERGED)
+    cost = np.array([peer.cost for peer in peers])[solved] * 6.0**2 / 10.0**3
+    np.testing.assert_allclose(plans.cost[solved], cost, rtol=1e-4, atol=1e-7)
+
+
+@pytest.mark.slow
+def test_every_planner_of_the_table_keeps_its_promise():
+    """Bounds on points are clear everywhere, exact bounds at samples are not; tilted is best."""
+    problems = speed_problems(64)
+    planned = {}
+    for name, planner in SPEED_PLANNERS.items():
+        found = jax.jit(jax.vmap(lambda p, planner=planner: plan_speed(p, planner)))(problems)
+        away = clearance(problems, dense(np.asarray(found.curve.points), 10.0, 0, TIMES))
+        planned[name] = np.asarray(found.status == Status.CONVERGED), away, np.asarray(found.cost)
+    for name in ("trapezoid", "trapezoid-twice", "trapezoid-edges", "rectangle"):
+        solved, away, _ = planned[name]
+        assert (away[solved] > 0.0).all()
+    assert (planned["em-exact"][1] < 0.0).mean() > 0.3
+    everywhere = np.all([planned[name][0] for name in planned], axis=0)
+    mean = {name: cost[everywhere].mean() for name, (_, _, cost) in planned.items()}
+    order = ["em-exact", "trapezoid-twice", "trapezoid", "trapezoid-edges", "em", "rectangle"]
+    assert sorted(mean, key=mean.__getitem__) == order
+    assert planned["trapezoid"][0].mean() > planned["trapezoid-edges"][0].mean()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("float64")
+def test_a_soft_end_trades_station_for_acceleration_and_a_stiff_one_is_exact():
+    problems = speed_problems(8, dtype=np.float64)
+    costs, ends = [], []
+    for weight in (300.0, 1e7, None):
+        planner = SpeedPlanner(end_weight=weight)
+        found = jax.jit(jax.vmap(lambda p, planner=planner: plan_speed(p, planner)))(problems)
+        costs.append(np.asarray(found.cost))
+        ends.append(np.asarray(found.curve.points[:, -1, -1]))
+    assert (costs[0] < costs[2]).all() and np.abs(ends[0] - 6.0).max() > 0.1
+    np.testing.assert_allclose(costs[1], costs[2], rtol=1e-3)
+    np.testing.assert_allclose(ends[1], 6.0, atol=1e-3)
+    squared = dense(np.asarray(found.curve.points), 10.0, 2, TIMES) ** 2
+    np.testing.assert_allclose(costs[2], np.trapezoid(squared, TIMES), rtol=1e-5)
+    single = BezierCurve(found.curve.points[0], found.curve.horizon[0])
+    np.testing.assert_allclose(single.at(jnp.asarray(10.0)), 6.0)
