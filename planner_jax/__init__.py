@@ -6,8 +6,8 @@
     plans = pj.plan(pj.hit.planner("exact"), cases)
     verdict = pj.hit.judge(cases, plans)
 
-Every task, `hit`, `catch` and those of other packages (`task_named`), has the words `case`, `draw`,
-`planner` and `judge`. The calls are the same for all of them:
+Every task, `hit`, `catch`, `intercept` and those of other packages (`task_named`), has the words
+`case`, `draw`, `planner` and `judge`. The calls are the same for all of them:
 
 * `plan`: one case or many, on all devices; `solve`, the same for the inside of compiled functions;
   `plan_across_processes`; `keep_compiled_programs`
@@ -17,7 +17,8 @@ Every task, `hit`, `catch` and those of other packages (`task_named`), has the w
 
 Limits and costs of one's own along the way, a case's `extras`: `KeepOut`, `Geofence`, `SpeedZone`,
 `Dislike`, or any class with their methods. Where targets are: `BallState`, `fly`, `BallPath`,
-`HarmonicPath`, `predict_path`, `target_at`. What a trajectory does: `PiecewisePolynomial`,
+`HarmonicPath`, `predict_path`, `target_at`; in the plane `TurningPath`, `PolynomialPath`, and what
+is in a car's way, `Obstacles`, made by `obstacles`. What a trajectory does: `PiecewisePolynomial`,
 `evaluate`. For planners and tasks of one's own: `Plan`, `Attempt`, `outcome`, `OptimisedPlanner`,
 `pending`, `Round`, `LbfgsConfig`, `Evaluation`, `Verdict`, `Task`.
 

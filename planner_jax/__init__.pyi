@@ -15,6 +15,10 @@ from .optimise.lbfgs import LbfgsConfig as LbfgsConfig
 from .optimise.planner import OptimisedPlanner as OptimisedPlanner
 from .optimise.planner import pending as pending
 from .optimise.problem import Round as Round
+from .plane.obstacles import Obstacles as Obstacles
+from .plane.obstacles import obstacles as obstacles
+from .plane.target import PolynomialPath as PolynomialPath
+from .plane.target import TurningPath as TurningPath
 from .planning.gradient import gradient as gradient
 from .planning.plan import plan as plan
 from .planning.plan import plan_across_processes as plan_across_processes
@@ -31,5 +35,6 @@ from .registry import Task as Task
 from .registry import task_named as task_named
 from .task import catch as catch
 from .task import hit as hit
+from .task import intercept as intercept
 from .trajectory.polynomial import PiecewisePolynomial as PiecewisePolynomial
 from .trajectory.polynomial import evaluate as evaluate

@@ -21,7 +21,7 @@ from importlib import metadata
 from typing import Any
 
 _GROUP = "planner_jax"
-_OWN = {"hit": "planner_jax.task.hit.card:TASK", "catch": "planner_jax.task.catch.card:TASK"}
+_OWN = {name: f"planner_jax.task.{name}.card:TASK" for name in ("hit", "catch", "intercept")}
 
 
 class UnknownName(ValueError):

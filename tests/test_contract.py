@@ -14,8 +14,11 @@ from jaxpr import assert_full_precision
 
 import planner_jax as pj
 from planner_jax.optimise.lbfgs import LbfgsConfig
+from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.optimise.problem import Round
+from planner_jax.plane.reach import Lattice
 from planner_jax.protocol import Attempt, HostPlanner, LanesPlanner, Plan, is_solved, outcome
+from planner_jax.task.intercept.spacetime import Search
 
 NUM = 6  # cases of a batch; no more than one bucket
 
@@ -140,6 +143,17 @@ ENTRIES = {
     ),
     "catch mpp": catch(
         "mpp", "parabola2", None, decide=pj.catch.Best(finalists=2), speeds=(0.0, 1.0), nodes=6
+    ),
+    "intercept spacetime": Entry(
+        pj.intercept.planner(
+            pieces=6,
+            samples=2,
+            checked=2,
+            lattice=Lattice(layers=20, headings=16),
+            searches=(Search(1, LevenbergConfig(2)),),
+        ),
+        lambda num: pj.intercept.draw(num, "easy", 4),
+        "start",
     ),
     "library": Entry(LibraryPlanner(library(1)), places, "goal"),
     "NumPy": Entry(NumpyPlanner(), places, "goal"),
@@ -303,7 +317,7 @@ def test_what_comes_back_is_of_the_kind_of_array_that_was_given(entry):
     assert_close(resident, entry.plans)
 
 
-@entries(on_host=False, slow=(*LIKE_OTHERS, "catch exact"))
+@entries(on_host=False, slow=(*LIKE_OTHERS, "catch exact", "intercept spacetime"))
 def test_solve_inside_a_compiled_function_is_plan(entry):
     assert_close(jax.jit(pj.solve)(entry.planner, entry.batch), entry.plans)
 

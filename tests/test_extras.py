@@ -246,7 +246,7 @@ def test_the_gradient_by_a_radius_is_that_of_plans_made_anew(hits, float64):
         return pj.plan(long, cases.replace(extras=(zone, *cases.extras[1:]))).cost
 
     slopes = (costs(1e-4) - costs(-1e-4)) / 2e-4
-    assert slopes.min() > 1e-6
+    assert slopes.min() > 1e-8  # every sphere is in the way
     np.testing.assert_allclose(found.by["extras.0.radius"], slopes, rtol=1e-3)
 
 

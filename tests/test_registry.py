@@ -77,15 +77,15 @@ def assert_one_line(call, says, kind=UnknownName):
 # What the library has.
 
 
-def test_the_library_has_two_tasks_that_name_themselves():
-    assert list(all_tasks()) == ["hit", "catch"]
+def test_the_library_has_three_tasks_that_name_themselves():
+    assert list(all_tasks()) == ["hit", "catch", "intercept"]
     for name, task in all_tasks().items():
         assert task_named(name) is task
         assert task.name == name
         assert task.summary[0].islower() and not task.summary.endswith(".")
 
 
-@pytest.mark.parametrize("name", ["hit", "catch"])
+@pytest.mark.parametrize("name", ["hit", "catch", "intercept"])
 def test_every_planner_of_a_task_can_be_made_and_the_first_is_the_default(name):
     task = task_named(name)
     for planner in task.all_planners():
@@ -97,7 +97,9 @@ def test_every_planner_of_a_task_can_be_made_and_the_first_is_the_default(name):
 
 
 def test_unknown_names_are_told_in_one_line_which_there_are():
-    assert_one_line(lambda: task_named("juggle"), "^task must be one of hit, catch, got 'juggle'$")
+    assert_one_line(
+        lambda: task_named("juggle"), "^task must be one of hit, catch, intercept, got 'juggle'$"
+    )
     assert_one_line(
         lambda: pj.hit.planner("mpp"),
         "^planner must be one of exact, bat, bat-lite, juggle, got 'mpp'$",
@@ -123,7 +125,7 @@ def test_unknown_names_are_told_in_one_line_which_there_are():
 
 def test_a_task_of_another_package_stands_behind_the_librarys_own(others):
     others(tasks={"meet": "planner_jax_others:TASK"})
-    assert list(all_tasks()) == ["hit", "catch", "meet"]
+    assert list(all_tasks()) == ["hit", "catch", "intercept", "meet"]
     task = pj.task_named("meet")
     assert task.summary == "two quadrotors meet"
     assert task.case.__doc__ == "A case."
@@ -142,7 +144,7 @@ def test_a_task_of_another_package_stands_behind_the_librarys_own(others):
 def test_a_task_that_does_not_work_is_warned_about_and_the_others_do(others, place, says):
     others(tasks={"broken": place, "meet": "planner_jax_others:TASK"})
     with pytest.warns(UserWarning, match=f"^task 'broken' of {place} is {says}") as told:
-        assert list(all_tasks()) == ["hit", "catch", "meet"]
+        assert list(all_tasks()) == ["hit", "catch", "intercept", "meet"]
     assert len(told) == 1 and "\n" not in str(told[0].message)
     assert pj.task_named("hit").draw(1).batch_shape == (1,)
 

@@ -1,2 +1,3 @@
 from . import catch as catch
 from . import hit as hit
+from . import intercept as intercept

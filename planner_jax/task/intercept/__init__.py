@@ -1,0 +1,5 @@
+"""Interceptions: a car meets a moving target among standing and moving obstacles (paper 003)."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,9 @@
+from .case import InterceptCase as InterceptCase
+from .case import case as case
+from .plan import InterceptPlan as InterceptPlan
+from .spacetime import SpacetimeIntercept as SpacetimeIntercept
+from .suites import drawn as drawn
+from .suites import observe as observe
+from .words import draw as draw
+from .words import judge as judge
+from .words import planner as planner

@@ -1,0 +1,201 @@
+"""What stands and moves in the plane, and what a car can reach among it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import planner_jax as pj
+from planner_jax.plane import reach
+from planner_jax.plane.obstacles import distances, separation
+
+SQUARE = [[2.0, 2.0], [3.0, 2.0], [3.0, 3.0], [2.0, 3.0]]
+
+
+def brute_distance(polygon, point, num=4000):
+    """To the nearest of many points of a polygon's boundary."""
+    share = np.linspace(0.0, 1.0, num)[:, None]
+    ends = np.roll(polygon, -1, axis=0)
+    along = [a + share * (b - a) for a, b in zip(polygon, ends, strict=True)]
+    return np.linalg.norm(np.concatenate(along) - point, axis=1).min()
+
+
+def test_distance_to_a_polygon_is_that_to_the_nearest_point_of_its_boundary(float64):
+    rng = np.random.default_rng(0)
+    angle = np.sort(rng.uniform(0.0, 2.0 * np.pi, 5))
+    polygon = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    one = pj.obstacles([polygon], room=(2, 7), dtype=jnp.float64)
+    points = rng.uniform(-3.0, 3.0, (200, 2))
+
+    @jax.jit
+    def measured(points):
+        x, y = points.T
+        return distances(one.vertices(0.0), one.present, x[None], y[None])
+
+    distance, away = measured(points)
+    outside = np.asarray(distance[0]) > 0.0
+    expected = [brute_distance(polygon, point) for point in points[outside]]
+    np.testing.assert_allclose(distance[0][outside], expected, atol=1e-5)
+    assert outside.any() and not outside.all()
+    np.testing.assert_allclose(np.hypot(*away)[0], 1.0, rtol=1e-6)
+    # What is not there is far, and the direction is the slope of the distance.
+    assert (distance[1] > 100.0).all()
+    step = 1e-6
+    for axis in range(2):
+        ahead, _ = measured(points + step * np.eye(2)[axis])
+        slope = (ahead[0] - distance[0]) / step
+        close = np.isclose(slope, away[axis][0], atol=1e-4)
+        assert close.mean() > 0.99  # but where another edge becomes the nearest
+
+
+def test_a_rectangle_is_apart_from_a_polygon_just_where_no_point_is_in_both(float64):
+    rng = np.random.default_rng(1)
+    one = pj.obstacles([SQUARE], dtype=jnp.float64)
+    x, y = rng.uniform(1.0, 4.0, (2, 400))
+    heading = rng.uniform(-np.pi, np.pi, 400)
+    body = (-0.1, 0.5, 0.15)
+    apart = jax.jit(separation)(one.vertices(0.0), one.present, x[None], y[None], heading, body)[0]
+    along, across = np.meshgrid(np.linspace(-0.1, 0.5, 61), np.linspace(-0.15, 0.15, 31))
+    cos, sin = np.cos(heading)[:, None], np.sin(heading)[:, None]
+    of_x = x[:, None] + along.ravel() * cos - across.ravel() * sin
+    of_y = y[:, None] + along.ravel() * sin + across.ravel() * cos
+    gap = np.maximum(np.abs(of_x - 2.5), np.abs(of_y - 2.5)).min(axis=1) - 0.5
+    sure = np.abs(gap) > 0.02
+    np.testing.assert_array_equal((np.asarray(apart) > 0.0)[sure], (gap > 0.0)[sure])
+
+
+@pytest.mark.parametrize(
+    "polygons, message",
+    [
+        ([[[0, 0], [1, 0]]], "polygon 0 must have corners"),
+        ([SQUARE, [[0, 0], [2, 0], [0.5, 0.5], [0, 2]]], "polygon 1 must be convex: cut it"),
+        ([[[0, 0], [1, 1], [2, 2]]], "polygon 0 must have an area"),
+        ([[[0, 0], [1, np.nan], [2, 2]]], "polygon 0 must be finite"),
+        ([SQUARE] * 3, "polygons must be at most 2 of at most 4 corners, got 3"),
+    ],
+)
+def test_what_is_no_convex_polygon_is_refused_in_one_line(polygons, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        pj.obstacles(polygons, room=(2, 4))
+    assert "\n" not in str(caught.value)
+
+
+def test_corners_may_be_given_in_either_sense():
+    ours, theirs = pj.obstacles([SQUARE]), pj.obstacles([SQUARE[::-1]])
+    assert {tuple(c) for c in np.asarray(ours.corners[0]).tolist()} == {
+        tuple(c) for c in np.asarray(theirs.corners[0]).tolist()
+    }
+    inside = jnp.array([[2.5]])
+    for one in (ours, theirs):
+        distance, _ = distances(one.vertices(0.0), one.present, inside, inside)
+        np.testing.assert_allclose(distance, -0.5, atol=1e-6)
+
+
+def test_a_path_that_turns_is_a_circle_and_straight_without_turning(float64):
+    pos, vel = jnp.array([1.0, 2.0]), jnp.array([0.3, 0.4])
+    line = pj.TurningPath(pos, vel, jnp.array(0.0)).at(3.0)
+    np.testing.assert_allclose(line.pos, [1.9, 3.2], rtol=1e-12)
+    circle = pj.TurningPath(pos, vel, jnp.array(0.5))
+    round_trip = circle.at(2.0 * np.pi / 0.5)
+    np.testing.assert_allclose(round_trip.pos, pos, atol=1e-12)
+    half = circle.at(np.pi / 0.5)
+    np.testing.assert_allclose(np.linalg.norm(half.pos - pos), 2.0 * 0.5 / 0.5, rtol=1e-12)
+    for path in (circle, pj.PolynomialPath(jnp.array([pos, vel, vel**2]), jnp.array(0.5))):
+        ahead, behind = path.at(1.0 + 1e-6).pos, path.at(1.0 - 1e-6).pos
+        np.testing.assert_allclose((ahead - behind) / 2e-6, path.at(1.0).vel, rtol=1e-7)
+
+
+# A reach set of a map of 8 m by 8 m.
+
+LATTICE = reach.Lattice(layers=20)
+
+
+def reached(target, time=10.0, **scene):
+    """Layers in which a place of the map can be met by the rear axle, bool (layers + 1,)."""
+    case = pj.intercept.case(
+        pj.TurningPath(jnp.asarray(target, jnp.float32), jnp.zeros(2), jnp.array(0.0)),
+        time,
+        **scene,
+    )
+    return np.asarray(_reached(case))
+
+
+@jax.jit
+def _reached(case):
+    grid = reach.grid_of(LATTICE, case.start, case.time, case.limits.speed, case.lower, case.upper)
+    found = reach.reach_set(
+        LATTICE,
+        grid,
+        reach.distance_field(grid, case.walls, case.lower, case.upper),
+        case.movers,
+        reach.Footprint(jnp.array(0.16), jnp.array([0.05, 0.25])),
+        case.limits.speed,
+        case.speed,
+        case.start,
+        jnp.array([0.0, 1.0, 0.8, 0.53]),
+        case.lower,
+        case.upper,
+        grid.num,
+    )
+    goal = case.target.pos
+
+    def is_there(bits):
+        every = jnp.ones(LATTICE.headings, bool)
+        return jnp.any(reach.goal_cells(LATTICE, grid, bits, goal, 0.0, every)[1])
+
+    n = jnp.arange(LATTICE.layers + 1)
+    return jax.vmap(is_there)(found.bits) & (n <= grid.num)
+
+
+WALL = [[3.9, -0.5], [4.1, -0.5], [4.1, 8.5], [3.9, 8.5]]
+ROOM = {"start": (0.8, 4.0, 0.0)}
+
+
+def scene(walls=(), movers=(), velocities=0.0):
+    return {
+        "walls": pj.obstacles(walls, room=(2, 4)),
+        "movers": pj.obstacles(movers, velocities, room=(2, 4)),
+        **ROOM,
+    }
+
+
+def test_a_reach_set_meets_what_lies_ahead_no_sooner_than_the_greatest_speed_allows():
+    there = reached((5.3, 4.0), **scene())
+    first = np.argmax(there)
+    step = 10.0 / 19.5
+    # 4.5 m at no more than 1.5 m/s, from 0.5 m/s.
+    assert there.any() and 3.0 <= (first + 0.5) * step <= 4.2
+    assert there[first:20].all()  # it may come later, too
+
+
+def test_a_wall_across_the_map_cannot_be_passed_but_one_with_a_gap_can():
+    assert not reached((6.0, 4.0), **scene([WALL])).any()
+    low = [[3.9, -0.5], [4.1, -0.5], [4.1, 5.0], [3.9, 5.0]]
+    high = [[3.9, 6.0], [4.1, 6.0], [4.1, 8.5], [3.9, 8.5]]
+    there = reached((6.0, 4.0), **scene([low, high]))
+    assert there.any()
+    assert np.argmax(there) > np.argmax(reached((6.0, 4.0), **scene()))
+
+
+def test_something_that_moves_is_in_the_way_when_it_is_there():
+    lid = [[3.0, 3.0], [5.0, 3.0], [5.0, 5.0], [3.0, 5.0]]
+    goal = (4.0, 4.0)
+    assert not reached(goal, **scene(movers=[lid])).any()
+    leaving = reached(goal, **scene(movers=[lid], velocities=(0.0, 0.5)))
+    step = 10.0 / 19.5
+    # Its edge, with the car's half width, is past the goal after (1 + 0.16) / 0.5 s.
+    assert leaving.any() and (np.argmax(leaving) + 0.5) * step >= 2.0
+    coming = reached(goal, **scene(movers=[np.array(lid) + [0.0, 3.0]], velocities=(0.0, -0.5)))
+    during = (np.arange(21) + 0.5) * step
+    during = (during > 4.0) & (during < 8.0)
+    assert coming[:8].any() and not coming[during].any() and coming[16:].any()
+
+
+def test_the_cell_size_follows_the_time_so_that_layers_end_at_it():
+    grid = reach.grid_of(
+        LATTICE, jnp.array([0.8, 4.0, 0.3]), jnp.array(4.37), jnp.array(1.5), jnp.zeros(2),
+        jnp.full(2, 8.0),
+    )  # fmt: skip
+    np.testing.assert_allclose((grid.num + 0.5) * grid.step, 4.37, rtol=1e-6)
+    offset = (np.array([0.8, 4.0]) - grid.corner) / grid.cell
+    np.testing.assert_allclose(offset, np.round(offset), atol=1e-4)
