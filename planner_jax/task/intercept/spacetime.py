@@ -90,7 +90,7 @@ class SpacetimeIntercept:
             return k + 1, better_of_two(best, self.improved(case, found, chance, attempt))
 
         _, best = lax.while_loop(
-            lambda s: (s[0] < ways) & (s[1].violation > 0.0), try_way, (0, self.at_rest(case))
+            lambda s: (s[0] < ways) & (s[1].violation > 0.0), try_way, (0, self.straight_on(case))
         )
         return explained(case, found, best)
 
@@ -269,7 +269,7 @@ class SpacetimeIntercept:
             meeting=goal,
         )
 
-    def at_rest(self, case: InterceptCase) -> InterceptPlan:
+    def straight_on(self, case: InterceptCase) -> InterceptPlan:
         """A plan that goes straight on, for want of a better one."""
         num = self.pieces + 1
         return InterceptPlan(
