@@ -8,12 +8,13 @@ searched together, so that a car can wait for an obstacle to pass, or be there b
 answers all ways round the obstacles, all headings and all meeting times. Ways are then drawn
 backwards from the goal at random, each a homotopy of its own.
 
-The cells of a row are the bits of two words, so that a move is a choice of rows and a shift. What
+The cells of a row are the bits of words, so that a move is a choice of rows and a shift. What
 is found is coarse: it is where an optimiser begins.
 """
 
 import dataclasses
 import functools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -23,9 +24,8 @@ from jax import Array, lax
 
 from planner_jax.plane.obstacles import Obstacles, distances
 
-CELLS = 64  # along either side of the grid
-_WORDS = 2  # a row's bits
 _STENCIL = 32  # cells along either side of what is drawn of one moving obstacle
+_FARTHEST = 16  # cells that the car moves in half a layer, at most
 _SPAN = 2  # bins of heading to either side that a layer may turn, at most
 
 
@@ -34,6 +34,7 @@ _SPAN = 2  # bins of heading to either side that a layer may turn, at most
 class Lattice:
     """Sizes of a reach set."""
 
+    cells: int = 64  # along either side of the grid, a multiple of 32
     layers: int = 30  # in time, at most
     levels: int = 4  # of speed, with standing
     headings: int = 32
@@ -44,18 +45,32 @@ class Lattice:
 class Grid:
     """Where the cells and layers of one case lie."""
 
+    lattice: Lattice = struct.field(pytree_node=False)
+    lower: Array  # (2,) [m], corner of the map, which the vehicle's middle does not leave
+    upper: Array  # (2,) [m], opposite corner
     corner: Array  # (2,) [m], middle of the cell (0, 0)
     cell: Array  # () [m]
     step: Array  # () [s], from layer to layer; layer n is at (n + 1/2) steps
     num: Array  # () int32, the layer at the horizon
-    heading: Array  # () [rad], of bin 0
+    start: Array  # (2,) int32, the cell of the start
+    heading: Array  # () [rad], of bin 0: that of the start
+
+
+@struct.dataclass
+class Vehicle:
+    """What moves over the grid: a reference point with two discs that cover the body."""
+
+    radius: Array  # () [m], of the discs
+    ahead: Array  # (2,) [m], of their middles from the reference point
+    speed: Array  # () [m/s], the greatest
+    turn_rates: Array  # (levels,) [rad/s], the greatest at each level of speed
 
 
 @struct.dataclass
 class ReachSet:
     """Bits of all layers, and how they came about."""
 
-    bits: Array  # (layers + 1, 2, levels, headings, CELLS) uint32; rows are y, bits are x
+    bits: Array  # (layers + 1, words, levels, headings, cells) uint32; rows are y, bits x
     moves: Array  # (layers, levels, headings, 2, 2) int32, cells [x, y] in either half of a step
     turns: Array  # (levels, 2 _SPAN + 1) bool, which turns a level of speed allows
 
@@ -81,30 +96,22 @@ def grid_of(
         lower: (2,) [m], corner of the map.
         upper: (2,) [m], opposite corner.
     """
-    cell = jnp.max(upper - lower) / CELLS
+    cell = jnp.max(upper - lower) / lattice.cells
     paces = jnp.floor(time * speed / (lattice.pace * cell) - 0.5 + 1e-3)
     num = jnp.clip(paces, 1, lattice.layers)
     step = time / (num + 0.5)
     offset = jnp.round((start[:2] - lower) / cell - 0.5)
     return Grid(
+        lattice=lattice,
+        lower=lower,
+        upper=upper,
         corner=start[:2] - cell * offset,
         cell=cell,
         step=step,
         num=num.astype(jnp.int32),
+        start=offset.astype(jnp.int32),
         heading=start[2],
     )
-
-
-def distance_field(grid: Grid, walls: Obstacles, lower: Array, upper: Array) -> Array:
-    """How far every cell's middle is from the nearest wall, (CELLS, CELLS) [m], rows are y.
-
-    Negative inside of a wall. The edge of the map is none.
-    """
-    place = grid.cell * jnp.arange(CELLS, dtype=grid.corner.dtype)
-    x, y = jnp.meshgrid(grid.corner[0] + place, grid.corner[1] + place)
-    vertices = walls.vertices(jnp.zeros_like(grid.cell))
-    far, _ = distances(vertices, walls.present, x.reshape(1, -1), y.reshape(1, -1))
-    return jnp.min(far, axis=0).reshape(CELLS, CELLS)
 
 
 def _packed(cells: Array) -> Array:
@@ -114,29 +121,56 @@ def _packed(cells: Array) -> Array:
     return jnp.moveaxis(words, -1, 0)
 
 
-def _shifted(rows: Array, move: Array) -> Array:
-    """Cells moved by [x, y]; what leaves the grid is lost.
+def _along_y(rows: Array, move: Array) -> Array:
+    """Rows moved by so many cells, at most `_FARTHEST`; what leaves the grid is lost.
 
     Args:
-        rows: (2, ..., CELLS) uint32.
-        move: (..., 2) int32, |x| < 32.
+        rows: (words, ..., cells) uint32.
+        move: (...) int32.
     """
-    y = jnp.arange(CELLS) - move[..., 1:]
-    lane = CELLS * np.arange(y.size // CELLS, dtype=np.int32).reshape(*y.shape[:-1], 1)
-    place = jnp.clip(y, 0, CELLS - 1) + lane
-    none = jnp.uint32(0)
-    inside = (y >= 0) & (y < CELLS)
-    low, high = (
-        jnp.where(inside, word.reshape(-1).at[place].get(mode="promise_in_bounds"), none)
-        for word in rows
-    )
-    by = jnp.abs(move[..., :1]).astype(jnp.uint32)
+    words, cells = rows.shape[0], rows.shape[-1]
+    padded = jnp.pad(rows.reshape(words, -1, cells), ((0, 0), (0, 0), (_FARTHEST, _FARTHEST)))
+    moved = jax.vmap(
+        lambda row, by: lax.dynamic_slice(row, (0, _FARTHEST - by), (words, cells)),
+        in_axes=(1, 0),
+        out_axes=1,
+    )(padded, move.reshape(-1))
+    return moved.reshape(rows.shape)
+
+
+def _along_x(rows: Array, move: Array) -> Array:
+    """Bits (words, ..., cells) moved by (...) cells, fewer than 32; what leaves the grid is lost."""
+    none = jnp.zeros_like(rows[0])
+    by = jnp.abs(move[..., None]).astype(jnp.uint32)
     carry = (32 - by) & 31
-    some = by > 0
-    up = (low << by, (high << by) | jnp.where(some, low >> carry, none))
-    down = ((low >> by) | jnp.where(some, high << carry, none), high >> by)
-    right = move[..., :1] >= 0
-    return jnp.stack([jnp.where(right, a, b) for a, b in zip(up, down, strict=True)])
+    some, right = by > 0, move[..., None] >= 0
+    moved = []
+    for word, before, after in zip(rows, [none, *rows[:-1]], [*rows[1:], none], strict=True):
+        up = (word << by) | jnp.where(some, before >> carry, 0)
+        down = (word >> by) | jnp.where(some, after << carry, 0)
+        moved.append(jnp.where(right, up, down))
+    return jnp.stack(moved)
+
+
+def _shifted(rows: Array, move: Array) -> Array:
+    """Cells (words, ..., cells) moved by (..., 2) [x, y]; what leaves the grid is lost."""
+    return _along_x(_along_y(rows, move[..., 1]), move[..., 0])
+
+
+def _of_each(body: Callable[[Array], Array], over: Array, needed: Array) -> Array:
+    """What a function makes of the first entries, as many as needed.
+
+    On a CPU in a loop, so that each is there in full before it is used.
+    """
+
+    def looped(over: Array, needed: Array) -> Array:
+        one = jax.eval_shape(body, over[0])
+        made = jnp.zeros((over.shape[0], *one.shape), one.dtype)
+        return lax.fori_loop(0, needed, lambda k, made: made.at[k].set(body(over[k])), made)
+
+    return lax.platform_dependent(
+        over, needed, cpu=looped, default=lambda over, _: jax.vmap(body)(over)
+    )
 
 
 def _stencils(grid: Grid, movers: Obstacles, radius: Array) -> Array:
@@ -148,16 +182,17 @@ def _stencils(grid: Grid, movers: Obstacles, radius: Array) -> Array:
 
 
 def _blocked_by(grid: Grid, movers: Obstacles, stencils: Array, time: Array) -> Array:
-    """Cells that moving obstacles take at one time, (2, CELLS) uint32."""
+    """Cells that moving obstacles take at one time, (words, cells) uint32."""
+    cells = grid.lattice.cells
     middle = (movers.centre + movers.velocity * time - grid.corner) / grid.cell
-    at = jnp.round(jnp.clip(middle, -64.0, 128.0)).astype(jnp.int32) - _STENCIL // 2
+    at = jnp.round(jnp.clip(middle, -cells, 2.0 * cells)).astype(jnp.int32) - _STENCIL // 2
 
     def of_one(stencil: Array, at: Array) -> Array:
-        y = jnp.arange(CELLS) - at[1]
+        y = jnp.arange(cells) - at[1]
         row = jnp.where(
             (y >= 0) & (y < _STENCIL), stencil[jnp.clip(y, 0, _STENCIL - 1)], jnp.uint32(0)
         )
-        words = [_word_of(row, at[0] - 32 * word) for word in range(_WORDS)]
+        words = [_word_of(row, at[0] - 32 * word) for word in range(cells // 32)]
         return jnp.stack(words)
 
     return lax.reduce(
@@ -172,45 +207,26 @@ def _word_of(row: Array, at: Array) -> Array:
     return jnp.where(jnp.abs(at) < 32, moved, jnp.uint32(0))
 
 
-@struct.dataclass
-class Footprint:
-    """The body as two discs, for the grid."""
-
-    radius: Array  # () [m]
-    ahead: Array  # (2,) [m], their middles from the rear axle
-
-
 def reach_set(
-    lattice: Lattice,
     grid: Grid,
     field: Array,
     movers: Obstacles,
-    footprint: Footprint,
-    speed: Array,
+    vehicle: Vehicle,
     initial_speed: Array,
-    start: Array,
-    turn_rates: Array,
-    lower: Array,
-    upper: Array,
     needed: Array,
 ) -> ReachSet:
-    """All that the car can reach.
+    """All that a vehicle can reach.
 
     Args:
-        lattice: sizes.
         grid: of `grid_of`.
-        field: of `distance_field`.
+        field: (cells, cells) [m], how far every cell's middle is from what stands; rows are y.
         movers: obstacles that move.
-        footprint: of the car.
-        speed: () [m/s], the greatest.
+        vehicle: what moves among them.
         initial_speed: () [m/s].
-        start: (3,) pose of the rear axle.
-        turn_rates: (levels,) [rad/s], the greatest at each level of speed.
-        lower: (2,) [m], corner of the map, which the footprint's middle does not leave.
-        upper: (2,) [m], opposite corner.
         needed: () int32, layers to work out; of a batch the same for all, the most.
     """
-    levels, headings = lattice.levels, lattice.headings
+    lattice, speed = grid.lattice, vehicle.speed
+    levels, headings, num_cells = lattice.levels, lattice.headings, lattice.cells
     dtype = grid.corner.dtype
     width = 2.0 * np.pi / headings
     angle = grid.heading + width * jnp.arange(headings, dtype=dtype)
@@ -221,62 +237,85 @@ def reach_set(
     passed = jnp.arange(2 * lattice.layers + 2, dtype=dtype)[:, None, None, None]
     cells = jnp.round(0.5 * passed * pace[:, None, None] * direction).astype(jnp.int32)
     halves = jnp.diff(cells, axis=0)  # (2 layers + 1, levels, headings, 2)
+    halves = jnp.clip(halves, -_FARTHEST, _FARTHEST)
     moves = jnp.moveaxis(halves[1:].reshape(-1, 2, levels, headings, 2), 1, 3)
-    most = turn_rates * grid.step / width
+    most = vehicle.turn_rates * grid.step / width
     span = jnp.abs(jnp.arange(-_SPAN, _SPAN + 1))
     turns = span <= most[:, None] + 0.1
-    walls = _packed(field < footprint.radius)
-    stencils = _stencils(grid, movers, footprint.radius)
-    discs = jnp.round(-footprint.ahead[:, None, None] * direction / grid.cell).astype(jnp.int32)
-    middle = jnp.mean(footprint.ahead) * direction  # of the body from the rear axle
-    place = grid.corner[:, None] + grid.cell * jnp.arange(CELLS, dtype=dtype)
-    on_map = (place + middle[:, :, None] > lower[:, None]) & (
-        place + middle[:, :, None] < upper[:, None]
+    walls = _packed(field < vehicle.radius)
+    stencils = _stencils(grid, movers, vehicle.radius)
+    discs = jnp.round(-vehicle.ahead[:, None, None] * direction / grid.cell).astype(jnp.int32)
+    middle = jnp.mean(vehicle.ahead) * direction  # of the body from the rear axle
+    place = grid.corner[:, None] + grid.cell * jnp.arange(num_cells, dtype=dtype)
+    on_map = (place + middle[:, :, None] > grid.lower[:, None]) & (
+        place + middle[:, :, None] < grid.upper[:, None]
     )
     columns = _packed(on_map[:, 0])[..., None]
     allowed = jnp.where(on_map[:, 1], columns, jnp.uint32(0))
 
-    def free_at(time: Array) -> Array:
-        """Where the rear axle can be with every heading, (2, headings, CELLS)."""
-        blocked = walls | _blocked_by(grid, movers, stencils, time)
-        each = jnp.broadcast_to(blocked[:, None], (_WORDS, headings, CELLS))
+    times = 0.5 * grid.step * jnp.arange(2 * lattice.layers + 2, dtype=dtype)
+    halves_needed = 2 * needed + 2
+
+    def blocked_at(time: Array) -> Array:
+        """Cells that something takes, (words, cells)."""
+        return walls | _blocked_by(grid, movers, stencils, time)
+
+    blocked = _of_each(blocked_at, times, halves_needed)
+
+    def free_of(blocked: Array) -> Array:
+        """Where the rear axle can be with every heading, (words, headings, cells)."""
+        each = jnp.broadcast_to(blocked[:, None], (num_cells // 32, headings, num_cells))
         return allowed & ~(_shifted(each, discs[0]) | _shifted(each, discs[1]))
 
-    def change(bits: Array, n: Array) -> Array:
-        return _turned(_faster_or_slower(bits), turns)
+    free = _of_each(free_of, blocked, halves_needed)  # at every half layer
 
-    def move(bits: Array, n: Array, half: int) -> Array:
-        free = free_at((n + 0.5 * (half + 2)) * grid.step)[:, None]
-        return free & jnp.concatenate(
-            [bits[:, :1], _shifted(bits[:, 1:], moves[n, 1:, :, half])], axis=1
-        )
+    def along_y(bits: Array, n: Array, half: int) -> Array:
+        moved = _along_y(bits[:, 1:], moves[n, 1:, :, half, 1])
+        return jnp.concatenate([bits[:, :1], moved], axis=1)
 
-    # Each third of a layer is a step of the loop of its own: a compiler that joins them works
-    # out the first anew for every bit that the next one looks up.
-    thirds = [change, functools.partial(move, half=0), functools.partial(move, half=1)]
+    def along_x(bits: Array, n: Array, half: int) -> Array:
+        moved = _along_x(bits[:, 1:], moves[n, 1:, :, half, 0])
+        moved = jnp.concatenate([bits[:, :1], moved], axis=1)
+        return moved & free[2 * n + half + 2][:, None]
 
-    def third(k: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+    parts = [
+        lambda bits, n: _faster_or_slower(bits),
+        lambda bits, n: _turned(bits, turns),
+        *(functools.partial(move, half=half) for half in range(2) for move in (along_y, along_x)),
+    ]
+
+    def apart(bits: Array, n: Array) -> Array:
+        """One layer, each part a step of a loop of its own.
+
+        A compiler for CPUs that joins them works out the first anew for every bit that the next
+        one looks up.
+        """
+        return lax.fori_loop(0, len(parts), lambda k, bits: lax.switch(k, parts, bits, n), bits)
+
+    def at_once(bits: Array, n: Array) -> Array:
+        for part in parts:
+            bits = part(bits, n)
+        return bits
+
+    def layer(n: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
         bits, layers = state
-        n = k // 3
-        bits = lax.switch(k % 3, thirds, bits, n)
+        bits = lax.platform_dependent(bits, n, cpu=apart, default=at_once)
         return bits, lax.dynamic_update_index_in_dim(layers, bits, n + 1, 0)
 
-    first = _start_bits(lattice, grid, start, initial_speed, speed)
-    first = _shifted(first & free_at(jnp.zeros((), dtype))[:, None], halves[0])
-    first &= free_at(0.5 * grid.step)[:, None]
+    first = _start_bits(grid, initial_speed, speed)
+    first = _shifted(first & free[0][:, None], halves[0]) & free[1][:, None]
     layers = jnp.zeros((lattice.layers + 1, *first.shape), first.dtype).at[0].set(first)
-    _, layers = lax.fori_loop(0, 3 * needed, third, (first, layers))
+    _, layers = lax.fori_loop(0, needed, layer, (first, layers))
     return ReachSet(bits=layers, moves=moves, turns=turns)
 
 
-def _start_bits(
-    lattice: Lattice, grid: Grid, start: Array, initial_speed: Array, speed: Array
-) -> Array:
-    """The first layer: the levels of speed about that of the car."""
-    cell = jnp.round((start[:2] - grid.corner) / grid.cell).astype(jnp.int32)
+def _start_bits(grid: Grid, initial_speed: Array, speed: Array) -> Array:
+    """The first layer: the levels of speed about that of the vehicle."""
+    lattice, cell = grid.lattice, grid.start
     level = initial_speed / speed * (lattice.levels - 1)
     near = jnp.abs(jnp.arange(lattice.levels) - level) < 1.0
-    at = (jnp.arange(CELLS)[:, None] == cell[1]) & (jnp.arange(CELLS) == cell[0])
+    place = jnp.arange(lattice.cells)
+    at = (place[:, None] == cell[1]) & (place == cell[0])
     here = near[:, None, None] & (jnp.arange(lattice.headings) == 0)[:, None]
     return jnp.where(here, _packed(at)[:, None, None], jnp.uint32(0))
 
@@ -298,23 +337,22 @@ def _turned(bits: Array, turns: Array) -> Array:
 
 
 def bit_at(bits: Array, level: Array, heading: Array, cell: Array) -> Array:
-    """Whether a layer (2, levels, headings, CELLS) holds a cell (2,) [x, y]; bool."""
-    _, levels, headings, _ = bits.shape
-    inside = jnp.all((cell >= 0) & (cell < CELLS)) & (level >= 0) & (level < levels)
-    x, y = jnp.clip(cell, 0, CELLS - 1)
+    """Whether a layer (words, levels, headings, cells) holds a cell (2,) [x, y]; bool."""
+    _, levels, headings, cells = bits.shape
+    inside = jnp.all((cell >= 0) & (cell < cells)) & (level >= 0) & (level < levels)
+    x, y = jnp.clip(cell, 0, cells - 1)
     word = bits[x // 32, jnp.clip(level, 0, levels - 1), heading % headings, y]
     return inside & (((word >> (x % 32).astype(jnp.uint32)) & 1) > 0)
 
 
 def goal_cells(
-    lattice: Lattice, grid: Grid, layer: Array, goal: Array, ahead: Array, headings: Array
+    grid: Grid, layer: Array, goal: Array, ahead: Array, headings: Array
 ) -> tuple[Array, Array]:
     """What of a layer lies at a goal.
 
     Args:
-        lattice: sizes.
         grid: of the reach set.
-        layer: (2, levels, headings, CELLS) uint32.
+        layer: (words, levels, headings, cells) uint32.
         goal: (2,) [m].
         ahead: () [m], from the rear axle to what meets the goal.
         headings: (headings,) bool, which may.
@@ -323,6 +361,7 @@ def goal_cells(
         cells: (headings, 9, 2) int32, those about the goal.
         is_there: (levels, headings, 9) bool.
     """
+    lattice = grid.lattice
     width = 2.0 * np.pi / lattice.headings
     bins = jnp.arange(lattice.headings)
     angle = grid.heading + width * bins.astype(grid.cell.dtype)
@@ -341,6 +380,7 @@ def goal_cells(
 class Chance:
     """Gumbel noise that one random way takes, or that of some with a leading axis."""
 
+    layers: Array  # (layers + 1,), on when it ends
     ends: Array  # (levels, headings, 9), on where it ends
     steps: Array  # (layers, 3 (2 _SPAN + 1)), on where it comes from
 
@@ -350,11 +390,12 @@ def draw_chance(lattice: Lattice, num: int, seed: int) -> Chance:
     rng = np.random.default_rng(seed)
     ends = rng.gumbel(size=(num, lattice.levels, lattice.headings, 9))
     steps = rng.gumbel(size=(num, lattice.layers, 3 * (2 * _SPAN + 1)))
-    return Chance(ends=jnp.asarray(ends, jnp.float32), steps=jnp.asarray(steps, jnp.float32))
+    layers = rng.gumbel(size=(num, lattice.layers + 1))
+    return Chance(*(jnp.asarray(each, jnp.float32) for each in (layers, ends, steps)))
 
 
 def draw_way(
-    lattice: Lattice,
+    grid: Grid,
     reach: ReachSet,
     num: Array,
     cells: Array,
@@ -364,13 +405,14 @@ def draw_way(
     """A random way to a goal, walked back from it.
 
     Args:
-        lattice: sizes.
+        grid: of the reach set.
         reach: the set.
         num: () int32, the layer that meets the goal.
         cells: of `goal_cells`.
         there: of `goal_cells`; without any the way means nothing.
         chance: what makes it this way and no other.
     """
+    lattice = grid.lattice
     noise = chance.ends + jnp.where(jnp.arange(9) == 0, 1.0, 0.0)  # rather at the goal itself
     best = jnp.argmax(jnp.where(there, noise, -jnp.inf))
     level, heading, around = jnp.unravel_index(best, there.shape)

@@ -1,9 +1,14 @@
-"""Speed and curvature at knots, the way that follows, and how it changes with them.
+"""Speed and curvature at knots, the way that follows, and what a cost of the way is by the knots.
 
 Between equal knots both change evenly, so that the heading is a cubic in time, known exactly; the
-position is its integral by Simpson's rule. Slopes by the knots' values are sums over the same
-nodes. Unknowns (2 K,): speeds at the knots 1..K, then curvatures there; those at knot 0 are where
-the car is.
+position is its integral by Simpson's rule. Unknowns: speeds at the knots 1..K, then curvatures
+there, then, where it is free, the time of the end; values at knot 0 are where the car is.
+
+A knot bends the way in the two pieces beside it. All that comes later turns and moves with their
+end as one rigid piece, so that a small change of a knot is a twist (..., 3) of the rest: (a, b)
+moves a pose at p by a + b (-p_y, p_x) and turns it by b. Gradient and curvature of a sum over
+samples are then sums over pieces and products of twists; no matrix of all samples by all unknowns
+is ever made.
 """
 
 import functools
@@ -14,32 +19,53 @@ from flax import struct
 from jax import Array, lax
 
 _HIGHEST = lax.Precision.HIGHEST
+# What a piece is changed by: both values at its beginning and end, and the time of the end.
+V_LEFT, V_RIGHT, C_LEFT, C_RIGHT, TIME = range(5)
 
 
 @struct.dataclass
 class Motion:
-    """The way at M equally spaced times, the last one at the end."""
+    """The way at K pieces of S equally spaced samples, the last one of each at its end."""
 
-    pos: Array  # (M, 2) [m], of the rear axle's middle
-    heading: Array  # (M,) [rad]
-    pos_slope: Array  # (M, 2, 2 K), by the unknowns
-    heading_slope: Array  # (M, 2 K)
+    pos: Array  # (K, S, 2) [m], of the rear axle's middle
+    heading: Array  # (K, S) [rad]
+    direction: Array  # (K, S, 2), the heading's cosine and sine
+    time: Array  # (K, S) [s]
+    # By what the samples' own piece is changed by, and by a twist of what was before it: x, y,
+    # heading and time of each sample.
+    slope: Array  # (K, S, 4, 8)
+    right: Array  # (K, 2, 3), twist after a piece by speed and curvature at its end
+    left: Array  # (K, 2, 3), the same by those at its beginning
+
+
+@struct.dataclass
+class Quadratic:
+    """A cost of the way near it: half its gradient, and the curvature that goes with it."""
+
+    push: Array  # (K, S, 4), by x, y, heading and time of every sample
+    stiffness: Array  # (K, S, 4, 4)
+    piece_push: Array  # (K, 5), by what each piece is changed by
+    piece_stiffness: Array  # (K, 5, 5)
 
 
 @functools.cache
 def _weights(samples: int) -> tuple[np.ndarray, ...]:
-    """What is the same for all pieces: integrals at the nodes of one piece.
+    """What is the same for all pieces, of the 2 S + 1 nodes of one piece at u = 0 .. 1.
 
-    A piece has 2 S + 1 nodes at u = 0 .. 1. With hat functions l = 1 - u and r = u of its two
-    knots, the integrals from 0 to u of l l, l r and r r; and Simpson's weights from the piece's
-    beginning to each of its S samples, (S, 2 S + 1).
+    With hat functions l = 1 - u and r = u of its two knots: the integrals from 0 to u of l l, l r
+    and r r at the nodes, (3, 2 S + 1); and weights of the nodes (2 S + 1, 9 S) that pick each of S
+    samples, and integrate up to each by Simpson's rule l, r, and these times the three integrals.
     """
     u = np.linspace(0.0, 1.0, 2 * samples + 1)
-    ll, lr, rr = u - u**2 + u**3 / 3.0, u**2 / 2.0 - u**3 / 3.0, u**3 / 3.0
+    hats = np.stack([1.0 - u, u])
+    turned = np.stack([u - u**2 + u**3 / 3.0, u**2 / 2.0 - u**3 / 3.0, u**3 / 3.0])
     simpson = np.zeros((samples, 2 * samples + 1))
     for k in range(samples):
         simpson[k:, 2 * k : 2 * k + 3] += np.array([1.0, 4.0, 1.0]) / (6.0 * samples)
-    return u, ll, lr, rr, simpson
+    factors = np.concatenate([hats, (hats[:, None] * turned).reshape(6, -1)])
+    picked = np.eye(2 * samples + 1)[2::2]
+    weights = np.concatenate([picked, (factors[:, None] * simpson).reshape(8 * samples, -1)])
+    return turned, weights.T
 
 
 def motion(start: Array, time: Array, speed: Array, curvature: Array, samples: int) -> Motion:
@@ -50,57 +76,151 @@ def motion(start: Array, time: Array, speed: Array, curvature: Array, samples: i
         time: () [s], the end.
         speed: (K + 1,) [m/s], at the knots.
         curvature: (K + 1,) [1/m], at the knots.
-        samples: of every piece, static; the way has M = K * samples of them.
+        samples: S, of every piece, static.
     """
     num, dtype = speed.shape[0] - 1, speed.dtype
-    u, ll, lr, rr, simpson = (jnp.asarray(each, dtype) for each in _weights(samples))
+    turned, weights = (jnp.asarray(each, dtype) for each in _weights(samples))
     step = time / num
     v0, v1, c0, c1 = (
         each[:, None] for each in (speed[:-1], speed[1:], curvature[:-1], curvature[1:])
     )
-    # Of the heading, since the beginning of each piece, and by the four numbers of the piece.
-    by_v0, by_v1 = step * (ll * c0 + lr * c1), step * (lr * c0 + rr * c1)
-    by_c0, by_c1 = step * (ll * v0 + lr * v1), step * (lr * v0 + rr * v1)
-    turned = v0 * by_v0 + v1 * by_v1
-    whole = turned[:, -1]
-    heading = start[2] + (jnp.cumsum(whole) - whole)[:, None] + turned  # (K, nodes)
-    own, nxt = np.eye(num, num + 1), np.eye(num, num + 1, 1)
-    earlier = np.tri(num, num, -1)
-
-    def spread(at_own: Array, at_next: Array) -> Array:
-        """Slopes by the values at all knots but the first, (K, nodes, K), of a running integral."""
-        local = at_own[:, :, None] * own[:, None, 1:] + at_next[:, :, None] * nxt[:, None, 1:]
-        ends = jnp.diag(at_next[:, -1]) + jnp.diag(at_own[1:, -1], -1)  # of each piece, (K, K)
-        passed = jnp.matmul(jnp.asarray(earlier, dtype), ends, precision=_HIGHEST)
-        return local + passed[:, None, :]
-
-    # (K, nodes, 2 K)
-    heading_slope = jnp.concatenate([spread(by_v0, by_v1), spread(by_c0, by_c1)], axis=2)
-    fast = v0 + (v1 - v0) * u
-    cos, sin = jnp.cos(heading), jnp.sin(heading)
-    # The integrals up to every sample are sums over nodes, whose weights take in the direction:
-    # of the slopes of speed, then of heading.
-    along = jnp.stack([cos, sin]), jnp.stack([-fast * sin, fast * cos])  # (2, K, nodes)
-    sums = jnp.concatenate([each[:, :, None] * simpson for each in along], axis=-1)
-    hats = (1.0 - u)[None, :, None] * own[:, None, 1:] + u[None, :, None] * nxt[:, None, 1:]
-    fast_slope = jnp.concatenate([hats, jnp.zeros((num, u.size, num), dtype)], axis=2)
-    slopes = jnp.concatenate([fast_slope, heading_slope], axis=1)  # (K, 2 nodes, 2 K)
-    sums = jnp.moveaxis(sums, 0, 1).reshape(num, 2 * samples, -1)
-    local_slope = step * jnp.matmul(sums, slopes, precision=_HIGHEST)
-    local_slope = local_slope.reshape(num, 2, samples, 2 * num)
-    local = step * jnp.sum((along[0] * fast)[:, :, None] * simpson, axis=-1)  # (2, K, samples)
-    local = jnp.moveaxis(local, 0, 1)
-    tri = jnp.asarray(earlier, dtype)
-
-    def passed(part: Array) -> Array:
-        """Sums since the start of sums since the beginning of each piece, (K, 2, samples, ...)."""
-        ends = jnp.matmul(tri, part[:, :, -1].reshape(num, -1), precision=_HIGHEST)
-        return part + ends.reshape(part[:, :, -1:].shape)
-
-    pos, pos_slope = (jnp.moveaxis(passed(part), 1, 2) for part in (local, local_slope))
+    ll, lr, rr = turned
+    angle = step * (v0 * (ll * c0 + lr * c1) + v1 * (lr * c0 + rr * c1))  # (K, nodes)
+    whole = angle[:, -1]
+    heading = start[2] + (jnp.cumsum(whole) - whole)[:, None] + angle
+    direction = jnp.concatenate([jnp.cos(heading), jnp.sin(heading)])
+    # The only place where they are used: all else follows from sums over nodes.
+    sums = jnp.matmul(direction, weights, precision=_HIGHEST).reshape(2, num, 9, samples)
+    cos, sin = sums[:, :, 0]
+    by_hat = sums[:, :, 1:3]  # (2, K, 2, S), integrals of the direction
+    aside = jnp.stack([-sums[1, :, 3:], sums[0, :, 3:]]).reshape(2, num, 2, 3, samples)
+    p0, p1, p2 = (v0 * aside[:, :, 0, k] + v1 * aside[:, :, 1, k] for k in range(3))  # (2, K, S)
+    hat0, hat1 = by_hat[:, :, 0], by_hat[:, :, 1]
+    local = step * (v0 * hat0 + v1 * hat1)
+    bent = (v0 * c0) * p0 + (v0 * c1 + v1 * c0) * p1 + (v1 * c1) * p2
+    ends = local[:, :, -1]
+    pos = start[:2, None, None] + (jnp.cumsum(ends, axis=1) - ends)[:, :, None] + local
+    x, y = pos  # (K, S)
+    at_ll, at_lr, at_rr = turned[:, 2::2]
+    square = step * step
+    own = jnp.stack(  # x, y and heading of the samples by the five, (5, 3, K, S)
+        [
+            jnp.stack([*moved, turning])
+            for moved, turning in (
+                (step * hat0 + square * (c0 * p0 + c1 * p1), step * (at_ll * c0 + at_lr * c1)),
+                (step * hat1 + square * (c0 * p1 + c1 * p2), step * (at_lr * c0 + at_rr * c1)),
+                (square * (v0 * p0 + v1 * p1), step * (at_ll * v0 + at_lr * v1)),
+                (square * (v0 * p1 + v1 * p2), step * (at_lr * v0 + at_rr * v1)),
+                ((local + square * bent) / time, angle[:, 2::2] / time),
+            )
+        ]
+    )
+    last = own[..., -1]  # (5, 3, K)
+    end_x, end_y = x[:, -1], y[:, -1]
+    after = jnp.stack(  # as twists, (5, K, 3)
+        [last[:, 0] + last[:, 2] * end_y, last[:, 1] - last[:, 2] * end_x, last[:, 2]], axis=-1
+    )
+    # A later piece is changed by time all along, and by its left values also through what the
+    # piece before made of them.
+    zero = jnp.zeros((1, 3), dtype)
+    before = jnp.stack(
+        [
+            jnp.concatenate([zero, after[V_RIGHT, :-1]]),
+            jnp.zeros_like(after[0]),
+            jnp.concatenate([zero, after[C_RIGHT, :-1]]),
+            jnp.zeros_like(after[0]),
+            jnp.cumsum(after[TIME], axis=0) - after[TIME],
+        ]
+    )
+    a, b, turn = (before[..., k, None] for k in range(3))  # (5, K, 1)
+    moved = own + jnp.stack([a - turn * y, b + turn * x, turn + 0.0 * x], axis=1)
+    share = jnp.asarray((np.arange(num)[:, None] + np.arange(1, samples + 1) / samples) / num)
+    share = share.astype(dtype)
+    zeros, ones = jnp.zeros_like(x), jnp.ones_like(x)
+    later = jnp.stack([zeros, zeros, zeros, zeros, share])[:, None]
+    rigid = jnp.stack(
+        [
+            jnp.stack([ones, zeros, zeros, zeros]),
+            jnp.stack([zeros, ones, zeros, zeros]),
+            jnp.stack([-y, x, ones, zeros]),
+        ]
+    )
+    slope = jnp.concatenate([jnp.concatenate([moved, later], axis=1), rigid])  # (8, 4, K, S)
     return Motion(
-        pos=start[:2] + pos.reshape(-1, 2),
-        heading=heading[:, 2::2].reshape(-1),
-        pos_slope=pos_slope.reshape(num * samples, 2, 2 * num),
-        heading_slope=heading_slope[:, 2::2].reshape(-1, 2 * num),
+        pos=jnp.moveaxis(pos, 0, -1),
+        heading=heading[:, 2::2],
+        direction=jnp.stack([cos, sin], axis=-1),
+        time=share * time,
+        slope=jnp.moveaxis(slope, (0, 1), (-1, -2)),
+        right=jnp.moveaxis(after[V_RIGHT::2][:2], 0, 1),
+        left=jnp.moveaxis(after[V_LEFT:TIME:2], 0, 1),
+    )
+
+
+def by_unknowns(way: Motion, cost: Quadratic, is_time_free: bool) -> tuple[Array, Array]:
+    """Gradient (n,) and curvature (n, n) of a cost by the unknowns, n = 2 K or 2 K + 1.
+
+    Both halved, as `Quadratic` has them.
+    """
+    num, samples = way.heading.shape
+    flat = way.slope.reshape(num, samples * 4, 8)
+    pushed = jnp.matmul(cost.stiffness, way.slope, precision=_HIGHEST).reshape(flat.shape)
+    pushed = jnp.concatenate([pushed, cost.push.reshape(num, -1, 1)], axis=2)
+    seen = jnp.matmul(flat.swapaxes(1, 2), pushed, precision=_HIGHEST)  # (K, 8, 9)
+    own = seen[:, :5, :5] + cost.piece_stiffness
+    pull = seen[:, :5, 8] + cost.piece_push
+
+    def later(values: Array, by: int) -> Array:
+        """Those of `by` pieces on, zero past the end."""
+        if by >= num:
+            return jnp.zeros_like(values)
+        return jnp.concatenate([values[by:], jnp.zeros_like(values[:by])])
+
+    # Sums over all pieces from the second one after each knot on.
+    rest = later(jnp.cumsum(seen[::-1, 5:], axis=0)[::-1], 2)  # (K, 3, 9)
+    lefts, rights = np.array([V_LEFT, C_LEFT]), np.array([V_RIGHT, C_RIGHT])
+    twist = way.right + later(way.left, 1)  # (K, 2, 3)
+    rigid = jnp.sum(rest[:, None, :, 5:8] * twist[:, :, None], axis=-1)  # (K, 2, 3)
+    next_left = later(seen[:, 5:, lefts], 1).swapaxes(1, 2)  # (K, 2, 3)
+    own_right = seen[:, 5:, rights].swapaxes(1, 2)
+    beside = own[:, rights][:, :, lefts]  # (K, 2, 2), of a knot with the one before
+    same = own[:, rights][:, :, rights] + later(own[:, lefts][:, :, lefts], 1)
+
+    def flattened(values: Array) -> Array:
+        """(K, 2, ...) in the order of the unknowns, (2 K, ...)."""
+        return values.swapaxes(0, 1).reshape(2 * num, *values.shape[2:])
+
+    size = 2 * num
+    place = np.arange(size) % num
+    gap = place[:, None] - place
+    twists = flattened(twist)
+
+    def product(left: Array) -> Array:
+        left = flattened(left)
+        return sum(left[:, None, k] * twists[None, :, k] for k in range(3))
+
+    def banded(values: Array) -> Array:
+        """(K, 2, 2) as rows of the unknowns' knots, for all columns of either kind, (n, n)."""
+        return jnp.repeat(flattened(values), num, axis=1)
+
+    lower = jnp.where(
+        gap >= 2,
+        product(rigid + next_left + own_right),
+        jnp.where(
+            gap == 1,
+            product(rigid + next_left) + banded(beside),
+            product(rigid) + banded(same),
+        ),
+    )
+    curvature = jnp.where(gap >= 0, lower, lower.T)
+    gradient = pull[:, rights] + later(pull[:, lefts], 1)
+    gradient = flattened(gradient + jnp.sum(twist * rest[:, None, :, 8], axis=-1))
+    if not is_time_free:
+        return gradient, curvature
+    with_time = own[:, rights, TIME] + later(own[:, lefts, TIME], 1)
+    with_time = flattened(with_time + jnp.sum(twist * rest[:, None, :, TIME], axis=-1))
+    last = jnp.sum(own[:, TIME, TIME])
+    return (
+        jnp.append(gradient, jnp.sum(pull[:, TIME])),
+        jnp.block([[curvature, with_time[:, None]], [with_time[None], last[None, None]]]),
     )

@@ -8,7 +8,7 @@ one that keeps every limit is taken, smoothed.
 """
 
 import dataclasses
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -18,26 +18,40 @@ from jax import Array, lax
 
 from planner_jax.optimise.levenberg import LevenbergConfig, Model, least_squares
 from planner_jax.plane import reach
-from planner_jax.protocol import Attempt, Status, status_of
+from planner_jax.plane.distance_field import DistanceField, distance_field
+from planner_jax.protocol import Attempt, Status, is_solved, status_of
 from planner_jax.task.intercept.case import InterceptCase
-from planner_jax.task.intercept.motion import motion
+from planner_jax.task.intercept.motion import Quadratic, by_unknowns, motion
 from planner_jax.task.intercept.plan import InterceptPlan
 from planner_jax.task.intercept.terms import (
     Weights,
     clearance,
     discs_of,
     is_blocked,
-    limit_rows,
-    meeting_rows,
+    limit_terms,
+    meeting_terms,
     obstacle_terms,
     wrapped,
 )
 
-_HIGHEST = lax.Precision.HIGHEST
+if TYPE_CHECKING:
+    from planner_jax.task.intercept.replan import ReplanIntercept
 
+_FIELD = 128  # places of the distance field along either side of the map
+
+_FIELD = 128  # places of the distance field along either side of the map
+_LEAST = 0.01  # share of the case's time that a meeting takes at least
+_SPREAD = 3  # layers from the earliest one on at which ways to the earliest meeting end
+
+_GRAZING = 5e-3  # [m], from obstacles, so that nothing is touched between two looks
 
 # A way takes about as much memory as so many starts of planners with few unknowns.
 _ROOM = 8
+_ROOM_OF_WORD = 1 / 32768  # the same of a word of a reach set
+
+
+# For what rounding to wider cells closes.
+_FINE = reach.Lattice(cells=128, layers=62, levels=7, headings=64)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,51 +62,96 @@ class Search(Attempt):
     ways: int = 16
     solver: LevenbergConfig = LevenbergConfig()
     seed: int = 0  # of the ways
+    lattice: reach.Lattice = reach.Lattice()
+    girth: float = 1.0  # of the body in the reach set; less finds ways that rounding would close
 
     def __post_init__(self) -> None:
         if self.ways < 1:
             raise ValueError(f"ways must be >= 1, got {self.ways}")
-        object.__setattr__(self, "starts", _ROOM * self.ways)
+        lattice = self.lattice
+        words = lattice.cells**2 // 32 * lattice.levels * lattice.headings * lattice.layers
+        starts = max(_ROOM * self.ways, round(_ROOM_OF_WORD * words))
+        object.__setattr__(self, "starts", starts)
+
+
+@struct.dataclass
+class Found:
+    """What of a case all its ways share."""
+
+    grid: reach.Grid
+    field: DistanceField  # of what stands
+    reach: reach.ReachSet
+    layers: Array  # (layers + 1,) bool, at which a way of cells leads to the target
+
+    @property
+    def is_reached(self) -> Array:
+        """Whether there is any, () bool."""
+        return jnp.any(self.layers)
 
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class SpacetimeIntercept:
-    """Meets the target at the case's time."""
+    """Meets the target at the case's time, or earlier.
+
+    `meet` says when: at the "given" time, as "early" as it can until then, or at that time until
+    then which takes the "least" effort, the integral of the squared acceleration. A plan's cost
+    is the meeting time of the early ones [s], and the effort of the others [m^2/s^3].
+    """
 
     case_type: ClassVar[type] = InterceptCase
-    lattice: reach.Lattice = reach.Lattice()
+    meet: Literal["given", "early", "least"] = "given"
     pieces: int = 32  # of speed and curvature
-    samples: int = 4  # of each piece, where obstacles are looked at
+    samples: int = 3  # of each piece, where obstacles are looked at
     checked: int = 10  # the same, of the plan that is given back
-    margin: float = 0.02  # [m], kept from obstacles
+    margin: float = 0.03  # [m], kept from obstacles
     slack: float = 0.015  # share of every limit that is kept free
     searches: tuple[Search, ...] = (
-        Search(4),
-        Search(16, seed=1),
-        Search(32, LevenbergConfig(40), seed=2),
+        Search(2, LevenbergConfig(12)),
+        Search(8, seed=1, girth=0.9),
+        Search(32, LevenbergConfig(40), seed=2, girth=0.85, lattice=_FINE),
     )
+
+    def __post_init__(self) -> None:
+        if self.meet not in ("given", "early", "least"):
+            raise ValueError(f"meet must be given, early or least, got {self.meet!r}")
 
     @property
     def attempts(self) -> tuple[Search, ...]:
         """The searches."""
         return self.searches
 
+    @property
+    def is_time_free(self) -> bool:
+        """Whether the meeting time is an unknown."""
+        return self.meet != "given"
+
+    def replanner(self) -> "ReplanIntercept":
+        """What plans again from a plan that is being driven; see `pj.replan`."""
+        from planner_jax.task.intercept.replan import ReplanIntercept
+
+        return ReplanIntercept(self)
+
     def solve(self, case: InterceptCase, attempt: Search) -> InterceptPlan:
-        """The plan of one case: way after way, until one keeps every limit."""
-        found = self.prepare(case)
+        """The plan of one case: way after way, until one keeps every limit.
+
+        Of a free meeting time all ways are tried, and the best one is taken.
+        """
+        found = self.prepare(case, attempt)
         chances = self.chances(attempt)
         ways = jnp.where(found.is_reached, attempt.ways, 0)
 
         def try_way(state: tuple) -> tuple:
             k, best = state
             chance = jax.tree.map(lambda leaf: leaf[k], chances)
-            return k + 1, better_of_two(best, self.improved(case, found, chance, attempt))
+            return k + 1, self.better_of_two(best, self.improved(case, found, chance, attempt))
 
-        _, best = lax.while_loop(
-            lambda s: (s[0] < ways) & (s[1].violation > 0.0), try_way, (0, self.straight_on(case))
-        )
-        return explained(case, found, best)
+        def is_wanted(state: tuple) -> Array:
+            k, best = state
+            return (k < ways) & (self.is_time_free | ~is_solved(best.status))
+
+        _, best = lax.while_loop(is_wanted, try_way, (0, self.straight_on(case)))
+        return self.explained(case, attempt, found.is_reached, best)
 
     def solve_lanes(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:
         """The plans of a batch: on a CPU one after another, else all ways of all at once."""
@@ -105,160 +164,194 @@ class SpacetimeIntercept:
     def solve_at_once(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:
         """The plans of a batch: all ways of all cases together, of each the best one."""
         # All go through as many layers as the one with the most, so that they stay in step.
-        layers = jnp.max(jax.vmap(self.grid)(cases).num)
+        layers = jnp.max(jax.vmap(lambda case: self.grid(case, attempt).num)(cases))
         return jax.vmap(lambda case: self.best_of_all(case, attempt, layers))(cases)
 
     def best_of_all(self, case: InterceptCase, attempt: Search, layers: Array) -> InterceptPlan:
         """The plan of one case: all ways together, the best one."""
-        found = self.prepare(case, layers)
+        found = self.prepare(case, attempt, layers)
         improved = jax.vmap(lambda chance: self.improved(case, found, chance, attempt))
         plans = improved(self.chances(attempt))
-        cost = jnp.where(plans.violation <= 0.0, plans.cost - 1e6, plans.violation)
+        cost = jnp.where(is_solved(plans.status), plans.cost - 1e6, plans.violation)
         best = jnp.argmin(jnp.where(jnp.isfinite(cost), cost, jnp.inf))
-        return explained(case, found, jax.tree.map(lambda leaf: leaf[best], plans))
+        plan = jax.tree.map(lambda leaf: leaf[best], plans)
+        return self.explained(case, attempt, found.is_reached, plan)
 
     def chances(self, attempt: Search) -> reach.Chance:
         """What makes the ways of an attempt, a leading axis for its starts."""
-        return reach.draw_chance(self.lattice, attempt.ways, attempt.seed)
+        return reach.draw_chance(attempt.lattice, attempt.ways, attempt.seed)
 
-    def grid(self, case: InterceptCase) -> reach.Grid:
+    def grid(self, case: InterceptCase, attempt: Search) -> reach.Grid:
         """Where the cells and layers of a case lie."""
         return reach.grid_of(
-            self.lattice, case.start, case.time, case.limits.speed, case.lower, case.upper
+            attempt.lattice, case.start, case.time, case.limits.speed, case.lower, case.upper
         )
 
-    def prepare(self, case: InterceptCase, layers: Array | None = None) -> "Found":
+    def field(self, case: InterceptCase, grid: reach.Grid) -> DistanceField:
+        """Distances from what stands, some places for each cell."""
+        spacing = grid.cell * (grid.lattice.cells / _FIELD)
+        return distance_field(case.walls, grid.corner, spacing, _FIELD)
+
+    def prepare(self, case: InterceptCase, attempt: Search, layers: Array | None = None) -> Found:
         """Grid and reach set of a case, of so many layers; by default those up to its time."""
-        grid = self.grid(case)
-        field = reach.distance_field(grid, case.walls, case.lower, case.upper)
+        grid = self.grid(case, attempt)
+        field = self.field(case, grid)
         radius, ahead = discs_of(case.body, 2)
-        level = case.limits.speed * jnp.linspace(0.0, 1.0, self.lattice.levels)
+        level = case.limits.speed * jnp.linspace(0.0, 1.0, attempt.lattice.levels)
         turn_rates = jnp.minimum(
             case.limits.curvature * level,
             case.limits.lateral_acceleration / jnp.maximum(level, 0.1 * case.limits.speed),
         )
-        found = reach.reach_set(
-            self.lattice,
-            grid,
-            field,
-            case.movers,
-            reach.Footprint(radius, ahead),
-            case.limits.speed,
-            case.speed,
-            case.start,
-            turn_rates,
-            case.lower,
-            case.upper,
-            grid.num if layers is None else layers,
+        vehicle = reach.Vehicle(
+            radius=attempt.girth * radius,
+            ahead=ahead,
+            speed=case.limits.speed,
+            turn_rates=turn_rates,
         )
-        cells, there = reach.goal_cells(
-            self.lattice,
-            grid,
-            found.bits[grid.num],
-            case.target.at(case.time).pos,
-            case.body.middle,
-            self.end_headings(case, grid),
-        )
-        return Found(grid=grid, reach=found, cells=cells, there=there)
+        needed = grid.num if layers is None else layers
+        by = _FIELD // attempt.lattice.cells
+        coarse = field.values[::by, ::by]
+        found = reach.reach_set(grid, coarse, case.movers, vehicle, case.speed, needed)
+        places = jnp.arange(attempt.lattice.layers + 1)
+        is_there = jax.vmap(lambda n: jnp.any(self.meetings(case, grid, found, n)[1]))
+        if self.is_time_free:
+            reached = is_there(places) & (places >= 1) & (places <= grid.num)
+        else:
+            reached = is_there(grid.num[None])[0] & (places == grid.num)
+        return Found(grid=grid, field=field, reach=found, layers=reached)
 
-    def improved(
-        self, case: InterceptCase, found: "Found", chance: reach.Chance, attempt: Search
-    ) -> InterceptPlan:
-        """The plan that one random way leads to."""
-        way = reach.draw_way(
-            self.lattice, found.reach, found.grid.num, found.cells, found.there, chance
-        )
-        return self.refined(case, self.guess(case, found.grid, way), case.time, attempt.solver)
-
-    def refined(
-        self, case: InterceptCase, guess: Array, time: Array, solver: LevenbergConfig
-    ) -> InterceptPlan:
-        """The plan that least squares make of a guess (2 K,)."""
-        goal = case.target.at(time).pos
-        weights = Weights()
-        end = least_squares(lambda x: self.model(x, case, time, goal, weights), guess, solver)
-        return self.plan_at(case, end.point, time, goal, end.steps)
+    def meetings(
+        self, case: InterceptCase, grid: reach.Grid, found: reach.ReachSet, layer: Array
+    ) -> tuple[Array, Array]:
+        """The cells of a layer at which the target is met; see `reach.goal_cells`."""
+        goal = case.target.at((layer + 0.5) * grid.step).pos
+        headings = self.end_headings(case, grid)
+        return reach.goal_cells(grid, found.bits[layer], goal, case.body.middle, headings)
 
     def end_headings(self, case: InterceptCase, grid: reach.Grid) -> Array:
         """Which bins of heading a meeting may have."""
-        width = 2.0 * np.pi / self.lattice.headings
-        angle = grid.heading + width * jnp.arange(self.lattice.headings)
+        num = grid.lattice.headings
+        width = 2.0 * np.pi / num
+        angle = grid.heading + width * jnp.arange(num)
         return jnp.abs(wrapped(angle - case.end_heading)) <= case.heading_tolerance + width
 
-    def guess(self, case: InterceptCase, grid: reach.Grid, way: reach.Way) -> Array:
-        """Speed and curvature at the knots, (2 K,), along a way of cells."""
-        width = 2.0 * np.pi / self.lattice.headings
-        pace = case.limits.speed / (self.lattice.levels - 1)
-        at = jnp.arange(1, self.pieces + 1) * ((grid.num + 0.5) / self.pieces)  # in steps
+    def improved(
+        self, case: InterceptCase, found: Found, chance: reach.Chance, attempt: Search
+    ) -> InterceptPlan:
+        """The plan that one random way leads to."""
+        layer = self.layer(found, chance)
+        cells, there = self.meetings(case, found.grid, found.reach, layer)
+        way = reach.draw_way(found.grid, found.reach, layer, cells, there, chance)
+        guess = self.guess(case, found.grid, way, layer)
+        return self.refined(case, found.field, guess, attempt.solver)
+
+    def layer(self, found: Found, chance: reach.Chance) -> Array:
+        """The layer at which a way ends: one of the first that reach the target, or of all."""
+        if self.meet == "given":
+            return found.grid.num
+        allowed = found.layers
+        if self.meet == "early":
+            allowed &= jnp.cumsum(found.layers) <= _SPREAD
+        return jnp.argmax(jnp.where(allowed, chance.layers, -jnp.inf))
+
+    def refined(
+        self, case: InterceptCase, field: DistanceField, guess: Array, solver: LevenbergConfig
+    ) -> InterceptPlan:
+        """The plan that least squares make of a guess (n,)."""
+        weights = Weights()
+        end = least_squares(lambda x: self.model(x, case, field, weights), guess, solver)
+        return self.plan_at(case, end.point, end.steps)
+
+    def guess(self, case: InterceptCase, grid: reach.Grid, way: reach.Way, layer: Array) -> Array:
+        """The unknowns (n,) along a way of cells up to a layer."""
+        width = 2.0 * np.pi / grid.lattice.headings
+        pace = case.limits.speed / (grid.lattice.levels - 1)
+        steps = layer + 0.5
+        at = jnp.arange(1, self.pieces + 1) * (steps / self.pieces)  # in steps
 
         def between(values: Array, first: Array, place: Array) -> Array:
             """Values on the way; the first is that of time 0, then one at every step."""
-            place = jnp.clip(place - 1.0, -1.0, grid.num - 1.0)
+            place = jnp.clip(place - 1.0, -1.0, layer - 1.0)
             below = jnp.floor(place).astype(jnp.int32)
             share = place - below
             low = jnp.where(below < 0, first, values[jnp.maximum(below, 0)])
-            return (1.0 - share) * low + share * values[jnp.minimum(below + 1, grid.num - 1)]
+            return (1.0 - share) * low + share * values[jnp.minimum(below + 1, layer - 1)]
 
         speed = between(pace * way.level.astype(grid.cell.dtype), case.speed, at)
         bins = width * way.bin.astype(grid.cell.dtype)
         straight = jnp.round(bins[0] / (2.0 * np.pi)) * 2.0 * np.pi  # bin 0, on its turn
         rate = (between(bins, straight, at + 0.5) - between(bins, straight, at - 0.5)) / grid.step
         # The car may not turn yet where the way of cells already does: it makes up for it soon.
-        knot = case.time / self.pieces
+        time = steps * grid.step
+        knot = time / self.pieces
         first = case.speed * case.curvature
         turned = 0.5 * knot * (first + 2.0 * rate[0] + rate[1])
         lag = between(bins, straight, at)[1] - straight - turned
         rate = rate.at[:2].add(0.5 * lag / knot)
         curvature = rate / jnp.maximum(speed, 0.3 * case.limits.speed)
         limit = case.limits.curvature
-        return jnp.concatenate([speed, jnp.clip(curvature, -limit, limit)])
+        return self.point(speed, jnp.clip(curvature, -limit, limit), time)
 
-    def knots(self, case: InterceptCase, point: Array) -> tuple[Array, Array]:
-        """Speed and curvature at all knots, (K + 1,) each."""
-        speed, curvature = jnp.split(point, 2)
+    def point(self, speed: Array, curvature: Array, time: Array) -> Array:
+        """The unknowns (n,): values at the knots 1..K, and the time where it is free."""
+        parts = [speed, curvature, time[None]]
+        return jnp.concatenate(parts if self.is_time_free else parts[:2])
+
+    def parts(self, case: InterceptCase, point: Array) -> tuple[Array, Array, Array]:
+        """Speed and curvature at all knots, (K + 1,) each, and the time of the meeting."""
+        speed, curvature = point[: self.pieces], point[self.pieces : 2 * self.pieces]
+        time = jnp.clip(point[-1], _LEAST * case.time, case.time)
         return (
             jnp.concatenate([case.speed[None], speed]),
             jnp.concatenate([case.curvature[None], curvature]),
+            time if self.is_time_free else case.time,
         )
 
     def model(
-        self, point: Array, case: InterceptCase, time: Array, goal: Array, weights: Weights
+        self, point: Array, case: InterceptCase, field: DistanceField, weights: Weights
     ) -> Model:
-        """Sum of squares of a point (2 K,): miss, obstacles, limits, effort."""
-        speed, curvature = self.knots(case, point)
+        """Sum of squares of a point: miss, obstacles, limits, effort."""
+        speed, curvature, time = self.parts(case, point)
         way = motion(case.start, time, speed, curvature, self.samples)
-        rows, values, violation = limit_rows(case, time, speed, curvature, weights, self.slack, 4)
-        end, end_values, missed = meeting_rows(case, way, goal, weights)
-        rows = jnp.concatenate([rows, end])
-        values = jnp.concatenate([values, end_values])
-        push, stiffness, cost, close = obstacle_terms(case, way, time, weights, self.margin)
-        slopes = jnp.concatenate([way.pos_slope, way.heading_slope[:, None]], axis=1)  # (M, 3, 2 K)
-        stiff = jnp.sum(stiffness[..., None] * slopes[:, None], axis=2)
-        # One product for curvature and gradient.
-        pushed = jnp.concatenate([stiff, push[..., None]], axis=2).reshape(-1, point.size + 1)
-        pulled = jnp.concatenate([rows, values[:, None]], axis=1)
-        seen = jnp.matmul(slopes.reshape(-1, point.size).T, pushed, precision=_HIGHEST)
-        seen += jnp.matmul(rows.T, pulled, precision=_HIGHEST)
+        limits, violation = limit_terms(case, time, speed, curvature, weights, self.slack, 4)
+        end, missed = meeting_terms(case, way, time, weights)
+        squares, close = obstacle_terms(case, field, way, weights, self.margin)
+        squares = squares.at[-1, -1].add(end)
+        cost = Quadratic(
+            push=squares[..., :4, 4],
+            stiffness=squares[..., :4, :4],
+            piece_push=limits[:, :5, 5],
+            piece_stiffness=limits[:, :5, :5],
+        )
+        gradient, curvature = by_unknowns(way, cost, self.is_time_free)
+        total = jnp.sum(squares[..., 4, 4]) + jnp.sum(limits[:, 5, 5])
+        if self.is_time_free:
+            # Later than the case's time it costs much, and earlier it costs little.
+            late = jnp.maximum(point[-1] / case.time - 1.0, 0.0)
+            pull = weights.early if self.meet == "early" else 0.0
+            push = (weights.limit * late + pull * time / case.time) / case.time
+            gradient = gradient.at[-1].add(push)
+            stiffness = pull + jnp.where(late > 0.0, weights.limit, 0.0)
+            curvature = curvature.at[-1, -1].add(stiffness / case.time**2)
+            total += weights.limit * late**2 + pull * (time / case.time) ** 2
         return Model(
-            cost=jnp.sum(values**2) + cost,
-            gradient=seen[:, -1],
-            curvature=seen[:, :-1],
+            cost=total,
+            gradient=gradient,
+            curvature=curvature,
             violation=jnp.maximum(jnp.maximum(violation, missed), close),
         )
 
-    def plan_at(
-        self, case: InterceptCase, point: Array, time: Array, goal: Array, steps: Array
-    ) -> InterceptPlan:
+    def plan_at(self, case: InterceptCase, point: Array, steps: Array) -> InterceptPlan:
         """The plan of a point, looked at more closely."""
-        speed, curvature = self.knots(case, point)
+        speed, curvature, time = self.parts(case, point)
         way = motion(case.start, time, speed, curvature, self.checked)
-        _, _, violation = limit_rows(case, time, speed, curvature, Weights(), 0.0, 12)
-        _, _, missed = meeting_rows(case, way, goal, Weights())
-        bumped = -jnp.min(clearance(case, way, time)) / case.body.width
+        _, violation = limit_terms(case, time, speed, curvature, Weights(), 0.0, 12)
+        _, missed = meeting_terms(case, way, time, Weights())
+        bumped = (_GRAZING - jnp.min(clearance(case, way))) / case.body.width
         worst = jnp.maximum(jnp.maximum(violation, missed), bumped)
         effort = jnp.sum((speed[1:] - speed[:-1]) ** 2) * self.pieces / time
         return InterceptPlan(
-            cost=effort,
+            cost=time if self.meet == "early" else effort,
             violation=worst,
             iterations=steps,
             status=status_of(effort, worst, True),
@@ -266,7 +359,7 @@ class SpacetimeIntercept:
             time=time,
             speed=speed,
             curvature=curvature,
-            meeting=goal,
+            meeting=case.target.at(time).pos,
         )
 
     def straight_on(self, case: InterceptCase) -> InterceptPlan:
@@ -284,36 +377,27 @@ class SpacetimeIntercept:
             meeting=case.target.at(case.time).pos,
         )
 
+    def explained(
+        self, case: InterceptCase, attempt: Search, is_reached: Array, plan: InterceptPlan
+    ) -> InterceptPlan:
+        """The plan with a status that says why there is none."""
+        unsolved = ~is_solved(plan.status) & (plan.status != Status.NON_FINITE)
+        reason = plan.status
+        if attempt == self.searches[-1]:
+            reason = jnp.where(is_reached, reason, Status.NO_PATH)
+        here, there = is_blocked(case)
+        blocked = here if self.is_time_free else here | there
+        reason = jnp.where(blocked, Status.BLOCKED, reason)
+        leaves = jax.tree.leaves(case)
+        floats = [leaf for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.floating)]
+        is_finite = jnp.all(jnp.stack([jnp.all(~jnp.isnan(leaf)) for leaf in floats]))
+        reason = jnp.where(is_finite, reason, Status.NON_FINITE)
+        status = jnp.where(unsolved | ~is_finite, reason, plan.status).astype(jnp.int32)
+        return dataclasses.replace(plan, status=status)
 
-def explained(case: InterceptCase, found: "Found", plan: InterceptPlan) -> InterceptPlan:
-    """The plan with a status that says why there is none."""
-    unsolved = (plan.status == Status.INFEASIBLE) | (plan.status == Status.MAX_STEPS)
-    reason = jnp.where(found.is_reached, plan.status, Status.NO_PATH)
-    reason = jnp.where(is_blocked(case), Status.BLOCKED, reason)
-    floats = [leaf for leaf in jax.tree.leaves(case) if jnp.issubdtype(leaf.dtype, jnp.floating)]
-    is_finite = jnp.all(jnp.stack([jnp.all(~jnp.isnan(leaf)) for leaf in floats]))
-    reason = jnp.where(is_finite, reason, Status.NON_FINITE)
-    return dataclasses.replace(
-        plan, status=jnp.where(unsolved | ~is_finite, reason, plan.status).astype(jnp.int32)
-    )
-
-
-@struct.dataclass
-class Found:
-    """What of a case all its ways share."""
-
-    grid: reach.Grid
-    reach: reach.ReachSet
-    cells: Array  # of `reach.goal_cells`
-    there: Array
-
-    @property
-    def is_reached(self) -> Array:
-        """Whether a way of cells leads to the target, () bool."""
-        return jnp.any(self.there)
-
-
-def better_of_two(plan: InterceptPlan, later: InterceptPlan) -> InterceptPlan:
-    """The later plan where it violates less."""
-    better = (later.violation < plan.violation) | ~jnp.isfinite(plan.violation)
-    return jax.tree.map(lambda new, old: jnp.where(better, new, old), later, plan)
+    def better_of_two(self, plan: InterceptPlan, later: InterceptPlan) -> InterceptPlan:
+        """The later plan where it is solved at less cost, or violates less than an unsolved one."""
+        both = is_solved(plan.status) & is_solved(later.status)
+        less = (later.violation < plan.violation) | ~jnp.isfinite(plan.violation)
+        better = jnp.where(both, later.cost < plan.cost, less & ~is_solved(plan.status))
+        return jax.tree.map(lambda new, old: jnp.where(better, new, old), later, plan)

@@ -7,13 +7,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jax import Array
+from jax import Array, lax
 
+from planner_jax.plane.distance_field import DistanceField
 from planner_jax.plane.obstacles import Obstacles, distances, separation
 from planner_jax.robot.car import CarBody
 from planner_jax.task.intercept.case import InterceptCase
-from planner_jax.task.intercept.motion import Motion
+from planner_jax.task.intercept.motion import (
+    C_LEFT,
+    C_RIGHT,
+    TIME,
+    V_LEFT,
+    V_RIGHT,
+    Motion,
+)
 
+_HIGHEST = lax.Precision.HIGHEST
 _DISCS = 3  # that cover the body
 
 
@@ -23,9 +32,10 @@ class Weights:
 
     miss: float = 300.0  # of the distance to the target over its tolerance of 0.05 m
     obstacle: float = 1e3
-    limit: float = 100.0
-    effort: float = 0.02
-    turning: float = 1e-3
+    limit: float = 1e3
+    effort: float = 0.064  # of the squared acceleration's integral over time
+    early: float = 100.0  # of the share of the case's time until the meeting, where it is free
+    turning: float = 3e-3  # the same of the change of curvature
 
 
 def wrapped(angle: Array) -> Array:
@@ -41,7 +51,7 @@ def discs_of(body: CarBody, num: int) -> tuple[Array, Array]:
     return radius, body.middle + half * jnp.asarray(places, body.length.dtype)
 
 
-def limit_rows(
+def limit_terms(
     case: InterceptCase,
     time: Array,
     speed: Array,
@@ -49,138 +59,170 @@ def limit_rows(
     weights: Weights,
     slack: float,
     places: int,
-) -> tuple[Array, Array, Array]:
-    """Hinges on the car's limits, and effort, as rows of a linear least-squares problem.
+) -> tuple[Array, Array]:
+    """Hinges on the car's limits, and effort.
 
     Returns:
-        rows: (R, 2 K), slopes of the residuals by the unknowns.
-        values: (R,), residuals.
+        squares: (K, 6, 6), of every piece the products of its residuals' slopes by what it is
+            changed by, see `motion`, and of the residuals, which are the last of the six.
         violation: (), largest relative excess.
     """
-    limits, num, dtype = case.limits, speed.shape[0] - 1, speed.dtype
-    rate = num / time
-    own, last = np.eye(num), np.eye(num, k=-1)
-    change, none = own - last, np.zeros((num, num))
+    limits, dtype = case.limits, speed.dtype
+    rate = (speed.shape[0] - 1) / time
+    none = jnp.zeros_like(speed[1:])
     v, c = speed[1:], curvature[1:]
-    acceleration = (speed[1:] - speed[:-1]) * rate
+    acceleration = (v - speed[:-1]) * rate
     # The steering angle changes quickest where the curvature is least.
-    flat = jnp.where(
-        curvature[1:] * curvature[:-1] > 0.0, jnp.minimum(c**2, curvature[:-1] ** 2), 0.0
-    )
+    flat = jnp.where(c * curvature[:-1] > 0.0, jnp.minimum(c**2, curvature[:-1] ** 2), 0.0)
     gain = case.body.wheelbase / (1.0 + case.body.wheelbase**2 * flat) * rate
-    steering = gain * (curvature[1:] - curvature[:-1])
-    excesses, rows = [], []
+    steering = gain * (c - curvature[:-1])
+    excesses, squares = [], SumOfSquares(6)
 
-    def hinge(value: Array, limit: Array, by_speed: Any, by_curvature: Any) -> None:
+    def hinge(value: Array, limit: Array, by: dict[int, Any]) -> None:
         excess = jnp.abs(value) / limit - 1.0
         inside = jnp.maximum(excess + slack, 0.0)
         sign = jnp.where(inside > 0.0, jnp.sign(value), 0.0) / limit
         excesses.append(excess)
-        row = jnp.concatenate([jnp.asarray(by_speed, dtype), jnp.asarray(by_curvature, dtype)], 1)
-        rows.append((inside * root, row * (sign * root)[:, None]))
+        squares.add({**{k: sign * each for k, each in by.items()}, 5: inside}, weights.limit)
 
-    root = jnp.sqrt(jnp.asarray(weights.limit, dtype))
     # Between 0 and the limit: as far from the middle as half of it.
-    hinge(v - 0.5 * limits.speed, 0.5 * limits.speed, own, none)
-    hinge(c, limits.curvature, none, own)
-    hinge(acceleration, limits.acceleration, change * rate, none)
-    hinge(steering, limits.steering_rate, none, change * gain[:, None])
+    hinge(v - 0.5 * limits.speed, 0.5 * limits.speed, {V_RIGHT: 1.0})
+    hinge(c, limits.curvature, {C_RIGHT: 1.0})
+    by = {V_LEFT: -rate, V_RIGHT: rate, TIME: -acceleration / time}
+    hinge(acceleration, limits.acceleration, by)
+    hinge(steering, limits.steering_rate, {C_LEFT: -gain, C_RIGHT: gain, TIME: -steering / time})
     for share in (np.arange(places) + 1.0) / places:  # of every piece
-        at = share * own + (1.0 - share) * last
         fast, bend = (share * each[1:] + (1.0 - share) * each[:-1] for each in (speed, curvature))
-        by_speed, by_curvature = (2.0 * fast * bend)[:, None] * at, (fast**2)[:, None] * at
-        hinge(fast**2 * bend, limits.lateral_acceleration, by_speed, by_curvature)
-    effort = jnp.sqrt(jnp.asarray(weights.effort, dtype)) * rate
-    turning = jnp.sqrt(jnp.asarray(weights.turning, dtype)) * rate
-    rows.append((effort * (speed[1:] - speed[:-1]), effort * jnp.concatenate([change, none], 1)))
-    rows.append(
-        (turning * (curvature[1:] - curvature[:-1]), turning * jnp.concatenate([none, change], 1))
-    )
-    values, slopes = zip(*rows, strict=True)
-    return jnp.concatenate(slopes), jnp.concatenate(values), jnp.max(jnp.stack(excesses))
+        by_speed, by_curvature = 2.0 * fast * bend, fast**2
+        by = {
+            V_LEFT: (1.0 - share) * by_speed,
+            V_RIGHT: share * by_speed,
+            C_LEFT: (1.0 - share) * by_curvature,
+            C_RIGHT: share * by_curvature,
+        }
+        hinge(fast**2 * bend, limits.lateral_acceleration, by)
+    for value, weight, left, right in (
+        (acceleration, weights.effort, V_LEFT, V_RIGHT),
+        ((c - curvature[:-1]) * rate, weights.turning, C_LEFT, C_RIGHT),
+    ):
+        by = {left: -rate, right: rate, TIME: -0.5 * value / time, 5: value}
+        squares.add(by, weight / rate)
+    return squares.matrix(none), jnp.max(jnp.stack(excesses)).astype(dtype)
 
 
-def meeting_rows(
-    case: InterceptCase, way: Motion, goal: Array, weights: Weights
-) -> tuple[Array, Array, Array]:
-    """Miss and heading at the end; as `limit_rows`."""
-    heading = way.heading[-1]
-    direction = jnp.stack([jnp.cos(heading), jnp.sin(heading)])
+class SumOfSquares:
+    """Products of residuals' slopes, added up one by one: zeros cost nothing."""
+
+    def __init__(self, size: int):
+        """Of so many numbers that a residual has: its slopes, and itself."""
+        self._size, self._sums = size, {}
+
+    def add(self, row: dict[int, Any], weight: Any) -> None:
+        """Add the products of one residual's numbers, those that are not zero."""
+        for a, left in row.items():
+            for b, right in row.items():
+                if a <= b:
+                    self._sums[a, b] = self._sums.get((a, b), 0.0) + weight * (left * right)
+
+    def matrix(self, like: Array) -> Array:
+        """The sums (..., size, size) of arrays that broadcast to `like`."""
+        places = range(self._size)
+        sums = [
+            jnp.broadcast_to(self._sums.get((min(a, b), max(a, b)), 0.0), like.shape)
+            for a in places
+            for b in places
+        ]
+        stacked = jnp.stack(sums).astype(like.dtype)
+        return jnp.moveaxis(stacked.reshape(self._size, self._size, *like.shape), (0, 1), (-2, -1))
+
+
+def meeting_terms(
+    case: InterceptCase, way: Motion, time: Array, weights: Weights
+) -> tuple[Array, Array]:
+    """Miss and heading at the end.
+
+    Returns:
+        squares: (5, 5), products of the residuals' slopes by x, y, heading and time of the last
+            sample, and of the residuals, which are the last of the five.
+        violation: (), largest relative excess.
+    """
+    pos, heading, direction = way.pos[-1, -1], way.heading[-1, -1], way.direction[-1, -1]
+    target = case.target.at(time)
     aside = jnp.stack([-direction[1], direction[0]])
-    miss = way.pos[-1] + case.body.middle * direction - goal
-    slope = way.pos_slope[-1] + case.body.middle * aside[:, None] * way.heading_slope[-1]
+    miss = pos + case.body.middle * direction - target.pos
     off = wrapped(heading - case.end_heading)
     turned = jnp.abs(off) / case.heading_tolerance - 1.0
     over = jnp.where(case.heading_tolerance < np.pi, jnp.maximum(turned + 0.1, 0.0), 0.0)
     sign = jnp.where(over > 0.0, jnp.sign(off), 0.0) / case.heading_tolerance
-    root = jnp.sqrt(jnp.asarray(weights.miss, miss.dtype))
-    rows = jnp.concatenate([root * slope, (sign * way.heading_slope[-1])[None]])
-    values = jnp.concatenate([root * miss, over[None]])
+    columns = [jnp.eye(2), case.body.middle * aside[:, None], -target.vel[:, None], miss[:, None]]
+    rows = jnp.concatenate(columns, axis=1)
+    none = jnp.zeros_like(sign)
+    turn = jnp.stack([none, none, sign, none, over])
+    squares = weights.miss * jnp.matmul(rows.T, rows, precision=_HIGHEST) + turn[:, None] * turn
     missed = jnp.sqrt(jnp.sum(miss**2) + 1e-12) / case.tolerance - 1.0
-    return rows, values, jnp.maximum(missed, turned)
+    return squares, jnp.maximum(missed, turned)
 
 
 def obstacle_terms(
-    case: InterceptCase, way: Motion, time: Array, weights: Weights, margin: float
-) -> tuple[Array, Array, Array, Array]:
-    """Hinges on the distance of the body's discs from obstacles and from the map's edge.
+    case: InterceptCase, field: DistanceField, way: Motion, weights: Weights, margin: float
+) -> tuple[Array, Array]:
+    """Hinges on the distance of the body's discs from obstacles, and on the map's edge.
 
     Returns:
-        push: (M, 3), half the gradient of the cost by x, y and heading at every sample.
-        stiffness: (M, 3, 3), the curvature that goes with it.
-        cost: ().
-        close: (), largest excess of a disc into an obstacle, relative to the body's width.
+        squares: (K, S, 5, 5), products of the residuals' slopes by x, y, heading and time of
+            every sample, and of the residuals, which are the last of the five.
+        close: (), largest excess of a disc into an obstacle, or of the body's middle beyond the
+            map, relative to the body's width.
     """
     radius, ahead = discs_of(case.body, _DISCS)
-    num = way.heading.shape[0]
-    times = time / num * jnp.arange(1, num + 1)
-    cos, sin = jnp.cos(way.heading), jnp.sin(way.heading)
-    weight = weights.obstacle * (100.0 / num)
-    both = together(case.walls, case.movers)
-    x, y = way.pos[:, 0] + ahead[:, None] * cos, way.pos[:, 1] + ahead[:, None] * sin  # (discs, M)
-    moved = both.centre[:, None] + both.velocity[:, None] * times[:, None]  # (N, M, 2)
-    rel_x, rel_y = x[None] - moved[:, None, :, 0], y[None] - moved[:, None, :, 1]
-    far, (away_x, away_y) = distances(
-        both.corners,
-        both.present,
-        rel_x.reshape(rel_x.shape[0], -1),
-        rel_y.reshape(rel_y.shape[0], -1),
+    shape = way.heading.shape
+    x, y = (way.pos[..., k].reshape(-1) for k in range(2))  # (M,)
+    cos, sin = (way.direction[..., k].reshape(-1) for k in range(2))
+    weight = weights.obstacle * (100.0 / x.size)
+    movers, times = case.movers, way.time.reshape(-1)
+    velocity = movers.velocity[..., None]  # (N, 2, 1)
+
+    def around(place: Array) -> tuple[Array, Array, Array]:
+        """Distances and ways out (1 + N, M) of one disc, from what stands and what moves."""
+        at_x, at_y = x + place * cos, y + place * sin
+        still = field.near(at_x, at_y)
+        moved = movers.centre[..., None] + velocity * times  # (N, 2, M)
+        far, away = distances(
+            movers.corners, movers.present, at_x - moved[:, 0], at_y - moved[:, 1]
+        )
+        return tuple(
+            jnp.concatenate([one[None], each])
+            for one, each in zip(still, (far, *away), strict=True)
+        )
+
+    # A loop, so that a compiler works the distances out once and not for every use.
+    far, away_x, away_y = lax.map(around, ahead)  # (discs, 1 + N, M)
+    inside = jnp.maximum(radius + margin - far, 0.0)
+    is_inside = inside > 0.0
+    speed_x, speed_y = (
+        jnp.concatenate([jnp.zeros((1, 1), x.dtype), velocity[:, k]]) for k in range(2)
     )
-    depth = (radius - far).reshape(rel_x.shape)  # (N, discs, M)
-    away_x, away_y = away_x.reshape(rel_x.shape), away_y.reshape(rel_y.shape)
-    over = weight * jnp.maximum(depth + margin, 0.0)
-    active = jnp.where(over > 0.0, weight, 0.0)
-    turn = ahead[:, None] * (away_y * cos - away_x * sin)
-    slopes = (away_x, away_y, turn)
-    push = -jnp.stack([jnp.sum(over * slope, axis=(0, 1)) for slope in slopes], axis=1)
-    products = {
-        (a, b): jnp.sum(active * slopes[a] * slopes[b], axis=(0, 1))
-        for a in range(3)
-        for b in range(a, 3)
-    }
-    stiffness = jnp.stack(
-        [jnp.stack([products[min(a, b), max(a, b)] for b in range(3)], axis=1) for a in range(3)],
-        axis=1,
-    )
-    cost = jnp.sum(over * over) / weight
-    close = jnp.max(depth) / case.body.width
+    turn = ahead[:, None, None] * (away_y * cos - away_x * sin)
+    passing = -(away_x * speed_x + away_y * speed_y)
+    slopes = [jnp.where(is_inside, -each, 0.0) for each in (away_x, away_y, turn, passing)]
+    rows = [*slopes, inside]
+    sums = {(a, b): jnp.sum(rows[a] * rows[b], axis=(0, 1)) for a in range(5) for b in range(a, 5)}
     middle = case.body.middle
-    pos = way.pos + middle * jnp.stack([cos, sin], axis=1)
-    beyond = jnp.maximum(pos - case.upper, 0.0) - jnp.maximum(case.lower - pos, 0.0)
-    is_beyond = jnp.where(beyond != 0.0, weight, 0.0)
-    turn = middle * jnp.stack([-sin, cos], axis=1)
-    slopes = jnp.stack(  # of x and y by x, y and heading, (M, 2, 3)
-        [
-            jnp.stack([jnp.ones(num), jnp.zeros(num), turn[:, 0]], axis=1),
-            jnp.stack([jnp.zeros(num), jnp.ones(num), turn[:, 1]], axis=1),
-        ],
-        axis=1,
-    ).astype(pos.dtype)
-    push += jnp.sum((weight * beyond)[..., None] * slopes, axis=1)
-    stiffness += jnp.sum(
-        is_beyond[..., None, None] * slopes[..., :, None] * slopes[..., None, :], axis=1
-    )
-    return push, stiffness, cost + weight * jnp.sum(beyond**2), close
+    off_map = []
+    for axis, (at, slope) in enumerate(((x + middle * cos, -sin), (y + middle * sin, cos))):
+        above, below = at - case.upper[axis], case.lower[axis] - at
+        off_map += [above, below]
+        beyond = jnp.maximum(above + margin, 0.0) - jnp.maximum(below + margin, 0.0)
+        is_beyond = jnp.where(beyond != 0.0, 1.0, 0.0)
+        row = {axis: is_beyond, 2: middle * slope * is_beyond, 4: beyond}
+        for a, left in row.items():
+            for b, right in row.items():
+                if a <= b:
+                    sums[a, b] += left * right
+    squares = jnp.stack([sums[min(a, b), max(a, b)] for a in range(5) for b in range(5)])
+    squares = weight * jnp.moveaxis(squares.reshape(5, 5, *shape), (0, 1), (-2, -1))
+    close = jnp.maximum(jnp.max(radius - far), jnp.max(jnp.stack(off_map)))
+    return squares, close / case.body.width
 
 
 def together(walls: Obstacles, movers: Obstacles) -> Obstacles:
@@ -202,29 +244,26 @@ def ends_of(body: CarBody) -> tuple[Array, Array, Array]:
     return -body.rear_overhang, body.length - body.rear_overhang, 0.5 * body.width
 
 
-def clearance(case: InterceptCase, way: Motion, time: Array) -> Array:
+def clearance(case: InterceptCase, way: Motion) -> Array:
     """How far the body is from obstacles, and its middle inside of the map, at M samples [m]."""
-    num = way.heading.shape[0]
-    times = time / num * jnp.arange(1, num + 1)
-    middle = way.pos + case.body.middle * jnp.stack(
-        [jnp.cos(way.heading), jnp.sin(way.heading)], axis=1
-    )
+    pos, heading, times = way.pos.reshape(-1, 2), way.heading.reshape(-1), way.time.reshape(-1)
+    middle = pos + case.body.middle * way.direction.reshape(-1, 2)
     free = jnp.min(jnp.minimum(middle - case.lower, case.upper - middle), axis=1)
     both = together(case.walls, case.movers)
     moved = both.centre[:, None] + both.velocity[:, None] * times[:, None]
     apart = separation(
         both.corners,
         both.present,
-        way.pos[:, 0] - moved[..., 0],
-        way.pos[:, 1] - moved[..., 1],
-        way.heading,
+        pos[:, 0] - moved[..., 0],
+        pos[:, 1] - moved[..., 1],
+        heading,
         ends_of(case.body),
     )
     return jnp.minimum(free, jnp.min(apart, axis=0))
 
 
-def is_blocked(case: InterceptCase) -> Array:
-    """Whether the car stands in an obstacle, or cannot be where it is to meet the target; ()."""
+def is_blocked(case: InterceptCase) -> tuple[Array, Array]:
+    """Whether the car stands in an obstacle, and whether it cannot be at the meeting; () each."""
     goal = case.target.at(case.time).pos
     both = together(case.walls, case.movers)
     before = both.centre - case.start[:2]
@@ -239,4 +278,4 @@ def is_blocked(case: InterceptCase) -> Array:
     apart = goal - (both.centre + both.velocity * case.time)
     there, _ = distances(both.corners, both.present, apart[:, :1], apart[:, 1:])
     on_map = jnp.all((goal > case.lower) & (goal < case.upper))
-    return (jnp.min(here) < 0.0) | (jnp.min(there) < 0.5 * case.body.width) | ~on_map
+    return jnp.min(here) < 0.0, (jnp.min(there) < 0.5 * case.body.width) | ~on_map

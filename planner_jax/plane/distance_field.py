@@ -1,0 +1,62 @@
+"""How far the nearest standing obstacle is, worked out once on a grid and looked up between."""
+
+import jax.numpy as jnp
+from flax import struct
+from jax import Array, lax
+
+from planner_jax.plane.obstacles import Obstacles, distances
+
+
+@struct.dataclass
+class DistanceField:
+    """Distances at equally spaced places; negative inside of an obstacle."""
+
+    values: Array  # (F, F) [m], rows are y
+    corner: Array  # (2,) [m], the place of entry (0, 0)
+    spacing: Array  # () [m]
+
+    def near(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
+        """Distances [m] of points and their slopes by x and y, bilinear; arrays as `x`.
+
+        Between the places it is too far by up to spacing^2 / (4 distance) beside a corner. Points
+        beyond the grid are as far as the nearest one on it.
+        """
+        most = self.values.shape[0] - 2
+        at = [(each - low) / self.spacing for each, low in zip((x, y), self.corner, strict=True)]
+        below = [jnp.clip(jnp.floor(each), 0, most).astype(jnp.int32) for each in at]
+        (u, v) = (jnp.clip(each - low, 0.0, 1.0) for each, low in zip(at, below, strict=True))
+        place = below[1] * self.values.shape[1] + below[0]
+        flat = self.values.reshape(-1)
+        corners = [
+            flat.at[place + by].get(mode="promise_in_bounds")
+            for by in (0, 1, self.values.shape[1], self.values.shape[1] + 1)
+        ]
+        low, high = (corners[k] + u * (corners[k + 1] - corners[k]) for k in (0, 2))
+        left, right = (corners[k] + v * (corners[k + 2] - corners[k]) for k in (0, 1))
+        return low + v * (high - low), (right - left) / self.spacing, (high - low) / self.spacing
+
+
+def distance_field(walls: Obstacles, corner: Array, spacing: Array, size: int) -> DistanceField:
+    """The field of what stands.
+
+    Args:
+        walls: obstacles; where they are at time 0.
+        corner: (2,) [m], of the grid.
+        spacing: () [m].
+        size: F, places along either side, static.
+    """
+    place = spacing * jnp.arange(size, dtype=corner.dtype)
+    x, y = jnp.meshgrid(corner[0] + place, corner[1] + place)
+    vertices = walls.vertices(jnp.zeros_like(spacing))
+
+    def nearer(k: Array, nearest: Array) -> Array:
+        one = (
+            lax.dynamic_slice_in_dim(vertices, k, 1),
+            lax.dynamic_slice_in_dim(walls.present, k, 1),
+        )
+        return jnp.minimum(nearest, distances(*one, x.reshape(1, -1), y.reshape(1, -1))[0])
+
+    # One after another: all at once is a program that takes a compiler minutes.
+    none = jnp.full((1, size * size), 1e3, corner.dtype)
+    nearest = lax.fori_loop(0, vertices.shape[0], nearer, none)
+    return DistanceField(values=nearest.reshape(size, size), corner=corner, spacing=spacing)

@@ -1,0 +1,151 @@
+"""Re-planning: from the plan that is being driven, for what the target is now thought to do.
+
+Between two looks at a target its expected path moves by centimetres, and so does the best way.
+What is left of the previous plan is a guess from which a few steps of least squares suffice;
+planning from scratch stays for what they do not mend.
+"""
+
+import dataclasses
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from planner_jax.optimise.levenberg import LevenbergConfig
+from planner_jax.plane.obstacles import Obstacles
+from planner_jax.plane.target import PlanePath
+from planner_jax.planning.replan import Replanning
+from planner_jax.protocol import Attempt
+from planner_jax.robot.car import pose_at
+from planner_jax.task.intercept.case import InterceptCase
+from planner_jax.task.intercept.plan import InterceptPlan
+from planner_jax.task.intercept.spacetime import Search, SpacetimeIntercept
+
+
+@dataclasses.dataclass(frozen=True)
+class Warm(Attempt):
+    """An attempt: steps of least squares from what is left of the previous plan; static."""
+
+    solver: LevenbergConfig = LevenbergConfig(8)
+
+
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class ReplanIntercept:
+    """Interceptions re-planned from the previous plan, as `pj.replan` asks for them.
+
+    With less than `shortest` left until the meeting nothing is planned: what is left of the
+    previous plan comes back.
+    """
+
+    case_type: ClassVar[type] = Replanning
+    planner: SpacetimeIntercept = SpacetimeIntercept()
+    warm: Warm = Warm()
+    shortest: float = 0.1  # [s]
+
+    @property
+    def attempts(self) -> tuple[Attempt, ...]:
+        """From the previous plan, then from scratch."""
+        return (self.warm, *self.planner.attempts)
+
+    def begin(
+        self,
+        cases: InterceptCase,
+        previous: InterceptPlan,
+        elapsed: Any,
+        *,
+        target: PlanePath,
+        movers: Obstacles | None = None,
+        start: Any = None,
+        speed: Any = None,
+        curvature: Any = None,
+    ) -> Replanning:
+        """What is left of a case, or of a batch, some time into its plan; see `pj.replan`.
+
+        Args:
+            cases: what `previous` was planned for.
+            previous: the plan that is being driven.
+            elapsed: () or (B,) [s], since it began, >= 0.
+            target: its path as expected now, with times that count from now.
+            movers: the moving obstacles as they are now; moved on evenly if not given.
+            start: (3,) or (B, 3), where the rear axle is: x, y [m] and heading [rad].
+            speed: () or (B,) [m/s], now.
+            curvature: () or (B,) [1/m], now. Of these three what is not given is the plan's own.
+
+        Raises:
+            ValueError: a negative time.
+        """
+        dtype, batch = np.asarray(cases.time).dtype, cases.batch_shape
+        elapsed = np.broadcast_to(np.asarray(elapsed, dtype), batch)
+        if not np.all(elapsed >= 0.0):
+            raise ValueError(f"elapsed must be >= 0, got {np.min(elapsed)}")
+        own = [np.asarray(leaf) for leaf in (_states if batch else _state)(previous, elapsed)]
+        start, speed, curvature = (
+            mine if given is None else np.broadcast_to(np.asarray(given, dtype), mine.shape)
+            for given, mine in zip((start, speed, curvature), own, strict=True)
+        )
+        if movers is None:
+            passed = cases.movers.velocity * elapsed[..., None, None]
+            movers = dataclasses.replace(cases.movers, centre=cases.movers.centre + passed)
+        # A plan that was free to choose its time may choose a later one again.
+        until = cases.time if self.planner.is_time_free else previous.time
+        left = dataclasses.replace(
+            cases,
+            start=start,
+            speed=speed,
+            curvature=curvature,
+            target=target,
+            time=np.maximum(np.asarray(until) - elapsed, 0.5 * self.shortest).astype(dtype),
+            movers=movers,
+        )
+        return Replanning(case=left, previous=previous, elapsed=elapsed)
+
+    def solve(self, task: Replanning, attempt: Any) -> InterceptPlan:
+        """The plan of one case."""
+        if isinstance(attempt, Search):
+            return self.planner.solve(task.case, attempt)
+        case, planner = task.case, self.planner
+        time = jnp.maximum(task.previous.time - task.elapsed, 0.5 * self.shortest)
+        guess = planner.point(*self.rest(task, time), time)
+        grid = planner.grid(case, planner.searches[0])
+        plan = planner.refined(case, planner.field(case, grid), guess, attempt.solver)
+        kept = planner.plan_at(case, guess, jnp.zeros((), jnp.int32))
+        is_late = time < self.shortest
+        return jax.tree.map(lambda old, new: jnp.where(is_late, old, new), kept, plan)
+
+    def solve_lanes(self, tasks: Replanning, attempt: Any) -> InterceptPlan:
+        """The plans of a batch: on a CPU one after another."""
+        if isinstance(attempt, Search):
+            return self.planner.solve_lanes(tasks.case, attempt)
+        return lax.platform_dependent(
+            tasks,
+            cpu=lambda tasks: lax.map(lambda task: self.solve(task, attempt), tasks),
+            default=lambda tasks: jax.vmap(lambda task: self.solve(task, attempt))(tasks),
+        )
+
+    def rest(self, task: Replanning, time: Array) -> tuple[Array, Array]:
+        """Speed and curvature of the previous plan at the new knots 1..K, (K,) each."""
+        previous, num = task.previous, self.planner.pieces
+        at = task.elapsed + time * (jnp.arange(1, num + 1) / num)
+        old = previous.time * jnp.linspace(0.0, 1.0, previous.speed.shape[0])
+        speed, curvature = (
+            jnp.interp(at, old, values) for values in (previous.speed, previous.curvature)
+        )
+        return speed, curvature
+
+
+@jax.jit
+def _state(plan: InterceptPlan, time: Array) -> tuple[Array, Array, Array]:
+    """Pose (3,), speed and curvature at one time of a plan."""
+    time = jnp.minimum(time, plan.time)
+    old = plan.time * jnp.linspace(0.0, 1.0, plan.speed.shape[0])
+    return (
+        pose_at(plan.start, plan.time, plan.speed, plan.curvature, time),
+        jnp.interp(time, old, plan.speed),
+        jnp.interp(time, old, plan.curvature),
+    )
+
+
+_states = jax.jit(jax.vmap(_state))
