@@ -26,7 +26,7 @@ from planner_jax.plane.obstacles import Obstacles, distances
 
 _STENCIL = 32  # cells along either side of what is drawn of one moving obstacle
 _FARTHEST = 16  # cells that the car moves in half a layer, at most
-_SPAN = 2  # bins of heading to either side that a layer may turn, at most
+_SPAN = 3  # bins of heading to either side that a layer may turn, at most
 
 
 @jax.tree_util.register_static
@@ -72,7 +72,7 @@ class ReachSet:
 
     bits: Array  # (layers + 1, words, levels, headings, cells) uint32; rows are y, bits x
     moves: Array  # (layers, levels, headings, 2, 2) int32, cells [x, y] in either half of a step
-    turns: Array  # (levels, 2 _SPAN + 1) bool, which turns a level of speed allows
+    turns: Array  # (layers, levels, 2 _SPAN + 1) bool, which turns a level of speed allows
 
 
 @struct.dataclass
@@ -240,8 +240,11 @@ def reach_set(
     halves = jnp.clip(halves, -_FARTHEST, _FARTHEST)
     moves = jnp.moveaxis(halves[1:].reshape(-1, 2, levels, headings, 2), 1, 3)
     most = vehicle.turn_rates * grid.step / width
+    # Whole bins in each layer, so that they add up to what the turn rates allow.
+    layer = jnp.arange(lattice.layers + 1, dtype=dtype)[:, None]
+    whole = jnp.diff(jnp.floor(layer * most + 0.1), axis=0)  # (layers, levels)
     span = jnp.abs(jnp.arange(-_SPAN, _SPAN + 1))
-    turns = span <= most[:, None] + 0.1
+    turns = span <= whole[..., None]
     walls = _packed(field < vehicle.radius)
     stencils = _stencils(grid, movers, vehicle.radius)
     discs = jnp.round(-vehicle.ahead[:, None, None] * direction / grid.cell).astype(jnp.int32)
@@ -280,7 +283,7 @@ def reach_set(
 
     parts = [
         lambda bits, n: _faster_or_slower(bits),
-        lambda bits, n: _turned(bits, turns),
+        lambda bits, n: _turned(bits, turns[n]),
         *(functools.partial(move, half=half) for half in range(2) for move in (along_y, along_x)),
     ]
 
@@ -428,7 +431,7 @@ def draw_way(
         from_level, turn = level + choices[:, 0], choices[:, 1]
         bits = reach.bits[n]
         is_way = jax.vmap(lambda v, h: bit_at(bits, v, h, before))(from_level, heading - turn)
-        is_way &= reach.turns[level, turn + _SPAN]
+        is_way &= reach.turns[n, level, turn + _SPAN]
         rough = jnp.abs(turn) + jnp.abs(turn - last) + jnp.abs(choices[:, 0])
         chosen = jnp.argmax(jnp.where(is_way, chance.steps[n] - 0.5 * rough, -jnp.inf))
         after = (from_level[chosen], heading - turn[chosen], before, turn[chosen])
