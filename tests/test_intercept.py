@@ -10,12 +10,13 @@ import pytest
 import planner_jax as pj
 from planner_jax.plane.reach import Lattice
 from planner_jax.robot.car import pose_at
-from planner_jax.task.intercept.motion import motion
+from planner_jax.task.intercept.motion import Quadratic, by_unknowns, motion
 from planner_jax.task.intercept.spacetime import Search
-from planner_jax.task.intercept.terms import Weights, limit_rows, meeting_rows, obstacle_terms
+from planner_jax.task.intercept.terms import Weights
 
 # One search is one program to compile.
-PLANNER = pj.intercept.planner(searches=(Search(12),), lattice=Lattice(layers=22))
+SEARCHES = (Search(12, lattice=Lattice(layers=22)),)
+PLANNER = pj.intercept.planner(searches=SEARCHES)
 START = np.array([0.8, 4.0, 0.3])
 
 
@@ -25,26 +26,61 @@ def way():
     return rng.uniform(0.2, 1.5, 9), rng.uniform(-2.0, 2.0, 9)
 
 
-def test_the_way_is_that_of_the_car_and_its_slopes_are_those_of_tangents(way, float64):
+def test_the_way_is_that_of_the_car(way, float64):
     speed, curvature = map(jnp.asarray, way)
     num = len(speed) - 1
-
-    def at(point):
-        v, c = jnp.split(point, 2)
-        return motion(
-            jnp.asarray(START), 4.0, jnp.append(speed[:1], v), jnp.append(curvature[:1], c), 5
-        )
-
-    point = jnp.append(speed[1:], curvature[1:])
-    found, (by_pos, by_heading) = jax.jit(
-        lambda x: (at(x), jax.jacfwd(lambda x: (at(x).pos, at(x).heading))(x))
-    )(point)
+    found = jax.jit(lambda: motion(jnp.asarray(START), 4.0, speed, curvature, 5))()
     times = jnp.linspace(0.0, 4.0, 5 * num + 1)[1:]
     poses = jax.vmap(lambda t: pose_at(jnp.asarray(START), 4.0, speed, curvature, t))(times)
-    np.testing.assert_allclose(found.pos, poses[:, :2], atol=2e-5)
-    np.testing.assert_allclose(found.heading, poses[:, 2], atol=1e-12)
-    np.testing.assert_allclose(found.pos_slope, by_pos, atol=1e-12)
-    np.testing.assert_allclose(found.heading_slope, by_heading, atol=1e-12)
+    np.testing.assert_allclose(found.pos.reshape(-1, 2), poses[:, :2], atol=2e-5)
+    np.testing.assert_allclose(found.heading.ravel(), poses[:, 2], atol=1e-12)
+    np.testing.assert_allclose(found.time.ravel(), times, atol=1e-12)
+    np.testing.assert_allclose(found.direction[..., 0], np.cos(found.heading), atol=1e-12)
+
+
+def test_gradient_and_curvature_by_the_unknowns_are_those_of_tangents(way, float64):
+    speed, curvature = map(jnp.asarray, way)
+    num, samples = len(speed) - 1, 3
+    rng = np.random.default_rng(1)
+    roots = rng.normal(size=(num, samples, 4, 4)), rng.normal(size=(num, 5, 5))
+    squares = [jnp.asarray(root @ root.swapaxes(-1, -2)) for root in roots]
+    cost = Quadratic(
+        push=jnp.asarray(rng.normal(size=(num, samples, 4))),
+        stiffness=squares[0],
+        piece_push=jnp.asarray(rng.normal(size=(num, 5))),
+        piece_stiffness=squares[1],
+    )
+
+    def knots(point):
+        v, c = jnp.append(speed[:1], point[:num]), jnp.append(curvature[:1], point[num:-1])
+        return v, c, point[-1]
+
+    def samples_of(point):
+        v, c, time = knots(point)
+        found = motion(jnp.asarray(START), time, v, c, samples)
+        return jnp.concatenate([found.pos, found.heading[..., None], found.time[..., None]], -1)
+
+    def pieces_of(point):
+        v, c, time = knots(point)
+        return jnp.stack([v[:-1], v[1:], c[:-1], c[1:], jnp.full(num, time)], axis=1)
+
+    @jax.jit
+    def both(point):
+        v, c, time = knots(point)
+        way = motion(jnp.asarray(START), time, v, c, samples)
+        slopes = jax.jacfwd(samples_of)(point), jax.jacfwd(pieces_of)(point)
+        return slopes, by_unknowns(way, cost, True), by_unknowns(way, cost, False)
+
+    point = jnp.concatenate([speed[1:], curvature[1:], jnp.array([4.0])])
+    (of_samples, of_pieces), free, given = both(point)
+    gradient = np.einsum("ksi,ksin->n", cost.push, of_samples)
+    gradient += np.einsum("ki,kin->n", cost.piece_push, of_pieces)
+    curvature = np.einsum("ksin,ksij,ksjm->nm", of_samples, cost.stiffness, of_samples)
+    curvature += np.einsum("kin,kij,kjm->nm", of_pieces, cost.piece_stiffness, of_pieces)
+    np.testing.assert_allclose(free[0], gradient, atol=1e-10)
+    np.testing.assert_allclose(free[1], curvature, atol=1e-10)
+    np.testing.assert_allclose(given[0], gradient[:-1], atol=1e-10)
+    np.testing.assert_allclose(given[1], curvature[:-1, :-1], atol=1e-10)
 
 
 def test_a_pose_is_the_integral_of_the_car_s_kinematics(way, float64):
@@ -61,41 +97,25 @@ def test_a_pose_is_the_integral_of_the_car_s_kinematics(way, float64):
     np.testing.assert_allclose(found, expected, atol=1e-7)
 
 
-def test_rows_of_limits_and_of_the_meeting_have_the_slopes_of_finite_differences(way, float64):
+@pytest.mark.parametrize("meet", ["given", "early"])
+def test_the_gradient_of_a_cost_is_that_of_finite_differences(way, float64, meet):
     case = jax.tree.map(
         lambda leaf: jnp.asarray(leaf[0], jnp.float64 if leaf.dtype != bool else bool),
         pj.intercept.draw(1, "hard", 5),
     )
     case = dataclasses.replace(case, end_heading=jnp.array(2.0), heading_tolerance=jnp.array(0.1))
-    weights = Weights()
-
-    @jax.jit
-    def residuals(point):
-        speed, curvature = (
-            jnp.append(first, rest)
-            for first, rest in zip((case.speed, case.curvature), jnp.split(point, 2), strict=True)
-        )
-        rows, values, _ = limit_rows(case, case.time, speed, curvature, weights, 0.015, 4)
-        drive = motion(case.start, case.time, speed, curvature, 4)
-        goal = case.target.at(case.time).pos
-        end_rows, end_values, _ = meeting_rows(case, drive, goal, weights)
-        push, _, cost, _ = obstacle_terms(case, drive, case.time, weights, 0.02)
-        slopes = jnp.concatenate([drive.pos_slope, drive.heading_slope[:, None]], axis=1)
-        gradient = jnp.einsum("ma,man->n", push, slopes, precision="highest")
-        rows, values = jnp.concatenate([rows, end_rows]), jnp.concatenate([values, end_values])
-        return values, rows, cost, 2.0 * gradient
-
-    point = jnp.asarray(1.2 * np.concatenate([each[1:] for each in way]))
-    values, rows, cost, gradient = residuals(point)
-    assert (np.abs(values) > 0.0).sum() > 20 and cost > 0.0
-    differences, slopes = [], []
-    for k in range(point.size):
-        step = 1e-6 * jnp.eye(point.size)[k]
-        (after, _, high, _), (before, _, low, _) = residuals(point + step), residuals(point - step)
-        differences.append((after - before) / 2e-6)
-        slopes.append((high - low) / 2e-6)
-    np.testing.assert_allclose(rows.T, differences, atol=1e-4)
-    np.testing.assert_allclose(gradient, slopes, rtol=1e-4, atol=1e-3 * np.abs(gradient).max())
+    planner = pj.intercept.planner(pieces=8, meet=meet)
+    field = planner.field(case, planner.grid(case, SEARCHES[0]))
+    model = jax.jit(lambda point: planner.model(point, case, field, Weights()))
+    speed, curvature = (jnp.asarray(1.2 * each[1:]) for each in way)
+    point = planner.point(speed, curvature, jnp.array(9.0))
+    found = model(point)
+    assert found.cost > 1.0 and found.violation > 0.0
+    steps = 1e-6 * jnp.eye(point.size)
+    slopes = [(model(point + step).cost - model(point - step).cost) / 2e-6 for step in steps]
+    # Half of it, and without what the gain of the steering changes by.
+    scale = np.abs(found.gradient).max()
+    np.testing.assert_allclose(2.0 * found.gradient, slopes, rtol=2e-3, atol=2e-3 * scale)
 
 
 @pytest.fixture(scope="module")
