@@ -18,15 +18,14 @@ from jax import Array, lax
 
 from planner_jax.optimise.levenberg import LevenbergConfig, Model, least_squares
 from planner_jax.plane import reach
-from planner_jax.protocol import Attempt, Status, status_of
+from planner_jax.protocol import Attempt
 from planner_jax.task.intercept.case import InterceptCase
+from planner_jax.task.intercept.checked import checked_plan, explained, straight_on
 from planner_jax.task.intercept.motion import motion
 from planner_jax.task.intercept.plan import InterceptPlan
 from planner_jax.task.intercept.terms import (
     Weights,
-    clearance,
     discs_of,
-    is_blocked,
     limit_rows,
     meeting_rows,
     obstacle_terms,
@@ -90,9 +89,11 @@ class SpacetimeIntercept:
             return k + 1, better_of_two(best, self.improved(case, found, chance, attempt))
 
         _, best = lax.while_loop(
-            lambda s: (s[0] < ways) & (s[1].violation > 0.0), try_way, (0, self.straight_on(case))
+            lambda s: (s[0] < ways) & (s[1].violation > 0.0),
+            try_way,
+            (0, straight_on(case, self.pieces)),
         )
-        return explained(case, found, best)
+        return explained(case, found.is_reached, best)
 
     def solve_lanes(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:
         """The plans of a batch: on a CPU one after another, else all ways of all at once."""
@@ -115,7 +116,7 @@ class SpacetimeIntercept:
         plans = improved(self.chances(attempt))
         cost = jnp.where(plans.violation <= 0.0, plans.cost - 1e6, plans.violation)
         best = jnp.argmin(jnp.where(jnp.isfinite(cost), cost, jnp.inf))
-        return explained(case, found, jax.tree.map(lambda leaf: leaf[best], plans))
+        return explained(case, found.is_reached, jax.tree.map(lambda leaf: leaf[best], plans))
 
     def chances(self, attempt: Search) -> reach.Chance:
         """What makes the ways of an attempt, a leading axis for its starts."""
@@ -177,7 +178,7 @@ class SpacetimeIntercept:
         goal = case.target.at(time).pos
         weights = Weights()
         end = least_squares(lambda x: self.model(x, case, time, goal, weights), guess, solver)
-        return self.plan_at(case, end.point, time, goal, end.steps)
+        return self.plan_at(case, end.point, time, end.steps)
 
     def end_headings(self, case: InterceptCase, grid: reach.Grid) -> Array:
         """Which bins of heading a meeting may have."""
@@ -247,55 +248,13 @@ class SpacetimeIntercept:
         )
 
     def plan_at(
-        self, case: InterceptCase, point: Array, time: Array, goal: Array, steps: Array
+        self, case: InterceptCase, point: Array, time: Array, steps: Array
     ) -> InterceptPlan:
         """The plan of a point, looked at more closely."""
         speed, curvature = self.knots(case, point)
-        way = motion(case.start, time, speed, curvature, self.checked)
-        _, _, violation = limit_rows(case, time, speed, curvature, Weights(), 0.0, 12)
-        _, _, missed = meeting_rows(case, way, goal, Weights())
-        bumped = -jnp.min(clearance(case, way, time)) / case.body.width
-        worst = jnp.maximum(jnp.maximum(violation, missed), bumped)
-        effort = jnp.sum((speed[1:] - speed[:-1]) ** 2) * self.pieces / time
-        return InterceptPlan(
-            cost=effort,
-            violation=worst,
-            iterations=steps,
-            status=status_of(effort, worst, True),
-            start=case.start,
-            time=time,
-            speed=speed,
-            curvature=curvature,
-            meeting=goal,
+        return checked_plan(
+            case, time, speed, curvature, samples=self.checked, places=12, steps=steps
         )
-
-    def straight_on(self, case: InterceptCase) -> InterceptPlan:
-        """A plan that goes straight on, for want of a better one."""
-        num = self.pieces + 1
-        return InterceptPlan(
-            cost=jnp.zeros_like(case.time),
-            violation=jnp.full_like(case.time, jnp.inf),
-            iterations=jnp.zeros((), jnp.int32),
-            status=jnp.full((), Status.INFEASIBLE, jnp.int32),
-            start=case.start,
-            time=case.time,
-            speed=jnp.full(num, case.speed),
-            curvature=jnp.full(num, case.curvature),
-            meeting=case.target.at(case.time).pos,
-        )
-
-
-def explained(case: InterceptCase, found: "Found", plan: InterceptPlan) -> InterceptPlan:
-    """The plan with a status that says why there is none."""
-    unsolved = (plan.status == Status.INFEASIBLE) | (plan.status == Status.MAX_STEPS)
-    reason = jnp.where(found.is_reached, plan.status, Status.NO_PATH)
-    reason = jnp.where(is_blocked(case), Status.BLOCKED, reason)
-    floats = [leaf for leaf in jax.tree.leaves(case) if jnp.issubdtype(leaf.dtype, jnp.floating)]
-    is_finite = jnp.all(jnp.stack([jnp.all(~jnp.isnan(leaf)) for leaf in floats]))
-    reason = jnp.where(is_finite, reason, Status.NON_FINITE)
-    return dataclasses.replace(
-        plan, status=jnp.where(unsolved | ~is_finite, reason, plan.status).astype(jnp.int32)
-    )
 
 
 @struct.dataclass

@@ -1,0 +1,159 @@
+"""Paths among what stands, each another way round it: what a split of path and speed begins with.
+
+They come from the machinery of `spacetime`, with nothing that moves and a target that stands where
+it will be met. Random ways through the reach set are told apart by the side on which they pass
+each wall: the angle by which a way turns around a wall's middle differs from that of another one
+by whole turns just if the wall lies between them. Those that differ are refined by least squares,
+at a time soon after the earliest at which the car could be there, and their speed is forgotten.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+from planner_jax.plane import reach
+from planner_jax.plane.obstacles import Obstacles
+from planner_jax.plane.target import TurningPath
+from planner_jax.task.intercept.case import InterceptCase
+from planner_jax.task.intercept.motion import motion
+from planner_jax.task.intercept.path import Path, path_of_drive
+from planner_jax.task.intercept.spacetime import Found, Search, SpacetimeIntercept
+from planner_jax.task.intercept.terms import wrapped
+
+
+@struct.dataclass
+class StaticPaths:
+    """P paths of one case."""
+
+    paths: Path  # leaves (P, ...)
+    violation: Array  # (P,), largest relative excess of the drive they come from; <= 0 is good
+    is_reached: Array  # () bool, whether a way of cells leads to the meeting in time
+    steps: Array  # () int32, of least squares, the most of any path
+
+
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class PathSource:
+    """Finds paths; as many as an attempt has ways."""
+
+    planner: SpacetimeIntercept = SpacetimeIntercept()
+    drawn: int = 4  # ways for every path, of which those that differ are refined
+    later: int = 3  # layers after the earliest arrival that ways arrive at, in turns
+    points: int = 129  # of a path
+
+    def paths(
+        self, case: InterceptCase, attempt: Search, layers: Array | None = None
+    ) -> StaticPaths:
+        """The paths of one case; see `SpacetimeIntercept.prepare` for the layers of a batch."""
+        still = standing(case)
+        found = self.planner.prepare(still, layers)
+        arrivals, there = self.arrivals(still, found)
+        is_reached = jnp.any(arrivals)
+        first = jnp.argmax(arrivals)
+        num = self.drawn * attempt.ways
+        layer = jnp.minimum(first + 1 + np.arange(num) % self.later, found.grid.num)
+        layer = jnp.where(arrivals[layer], layer, first).astype(jnp.int32)
+        chances = reach.draw_chance(self.planner.lattice, num, attempt.seed)
+        times, guesses = jax.vmap(lambda n, chance: self.guess(still, found, there[n], n, chance))(
+            layer, chances
+        )
+        chosen = self.different(still, times, guesses)[: attempt.ways]
+        plans = jax.vmap(
+            lambda time, guess: self.planner.refined(
+                dataclasses.replace(still, time=time), guess, time, attempt.solver
+            )
+        )(times[chosen], guesses[chosen])
+        paths = jax.vmap(
+            lambda plan: path_of_drive(
+                plan.start, plan.time, jnp.maximum(plan.speed, 0.0), plan.curvature, self.points
+            )
+        )(plans)
+        return StaticPaths(
+            paths=paths,
+            violation=jnp.where(is_reached, plans.violation, jnp.inf),
+            is_reached=is_reached,
+            steps=jnp.max(plans.iterations),
+        )
+
+    def arrivals(self, case: InterceptCase, found: Found) -> tuple[Array, Array]:
+        """Which layers (layers + 1,) meet the target, and where: (layers + 1, ...) bool."""
+        headings = self.planner.end_headings(case, found.grid)
+
+        def at(bits: Array) -> Array:
+            return reach.goal_cells(
+                self.planner.lattice,
+                found.grid,
+                bits,
+                case.target.at(case.time).pos,
+                case.body.middle,
+                headings,
+            )[1]
+
+        there = jax.vmap(at)(found.reach.bits)
+        place = jnp.arange(there.shape[0])
+        in_time = (place >= 1) & (place <= found.grid.num)
+        return jnp.any(there, axis=(1, 2, 3)) & in_time, there
+
+    def guess(
+        self, case: InterceptCase, found: Found, there: Array, layer: Array, chance: reach.Chance
+    ) -> tuple[Array, Array]:
+        """When a random way arrives that ends at a layer, and speed and curvature along it."""
+        grid = dataclasses.replace(found.grid, num=layer)
+        time = (layer + 0.5) * grid.step
+        way = reach.draw_way(
+            self.planner.lattice, found.reach, layer, found.cells, there, chance
+        )
+        return time, self.planner.guess(dataclasses.replace(case, time=time), grid, way)
+
+    def different(self, case: InterceptCase, times: Array, guesses: Array) -> Array:
+        """Places of guesses (D, 2 K), the shortest of every homotopy first, then the others."""
+        goal = case.target.at(case.time).pos
+
+        def way(time: Array, guess: Array) -> tuple[Array, Array]:
+            speed, curvature = self.planner.knots(case, guess)
+            pos = motion(case.start, time, speed, curvature, 1).pos
+            length = jnp.mean(0.5 * (speed[1:] + speed[:-1])) * time
+            return turns_around(case.walls, case.start[:2], pos, goal), length
+
+        turns, length = jax.vmap(way)(times, guesses)
+        is_same = jnp.all((turns[:, None] == turns) | ~case.walls.present, axis=2)
+        place = jnp.arange(length.shape[0])
+        is_before = (length < length[:, None]) | (
+            (length == length[:, None]) & (place < place[:, None])
+        )
+        is_repeated = jnp.any(is_same & is_before, axis=1)
+        return jnp.argsort(length + jnp.where(is_repeated, 1e6, 0.0))
+
+
+def standing(case: InterceptCase) -> InterceptCase:
+    """The case without movers, of a target that stands where it will be met."""
+    goal = case.target.at(case.time).pos
+    still = TurningPath(pos=goal, vel=jnp.zeros_like(goal), turn_rate=jnp.zeros_like(case.time))
+    # One that is absent, so that nothing is worked out for movers.
+    none = Obstacles(
+        centre=jnp.zeros((1, 2), goal.dtype),
+        corners=jnp.zeros((1, 3, 2), goal.dtype),
+        velocity=jnp.zeros((1, 2), goal.dtype),
+        present=jnp.zeros(1, bool),
+    )
+    return dataclasses.replace(case, target=still, movers=none)
+
+
+def turns_around(walls: Obstacles, start: Array, pos: Array, goal: Array) -> Array:
+    """How many turns more than the straight line a way makes around every wall's middle, (N,).
+
+    Args:
+        walls: N of them.
+        start: (2,) [m].
+        pos: (M, 2) [m], of the way, close enough together not to jump past a wall's middle.
+        goal: (2,) [m].
+    """
+    points = jnp.concatenate([start[None], pos, goal[None]])[:, None] - walls.centre
+    angle = jnp.arctan2(points[..., 1], points[..., 0])  # (M + 2, N)
+    turned = jnp.sum(wrapped(jnp.diff(angle, axis=0)), axis=0)
+    straight = wrapped(angle[-1] - angle[0])
+    return jnp.round((turned - straight) / (2.0 * np.pi)).astype(jnp.int32)
