@@ -1,9 +1,13 @@
 """A way of the rear axle, without a speed: the first half of a plan that splits both."""
 
-import jax.numpy as jnp
-from flax import struct
-from jax import Array
+import dataclasses
 
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array, lax
+
+from planner_jax.optimise.levenberg import LevenbergConfig, Model, least_squares
 from planner_jax.task.intercept.motion import motion
 
 
@@ -58,3 +62,79 @@ def path_of_drive(
     station = jnp.concatenate([jnp.zeros_like(moved[:1]), jnp.cumsum(moved)])
     even = jnp.linspace(0.0, 1.0, num) * station[-1]
     return path_along(start, station[-1], jnp.interp(even, station, c))
+
+
+@dataclasses.dataclass(frozen=True)
+class FollowConfig:
+    """How a car follows given points; static."""
+
+    stride: int = 2  # every how many points the curvature has a knot
+    miss: float = 0.01  # [m], away from a point counts as much as
+    rate: float = 1.0  # ... such a share of the greatest rate of the curvature
+    slack: float = 0.02  # share of every limit that is kept free
+    solver: LevenbergConfig = LevenbergConfig(30)
+
+
+def path_beside(
+    start: Array,
+    curvature: Array,
+    points: Array,
+    bends: Array,
+    length: Array,
+    most: Array,
+    rate: Array,
+    config: FollowConfig = FollowConfig(),
+) -> Path:
+    """A path that a car can drive along given points: its curvature does not jump.
+
+    Searched and smoothed paths begin with a curvature that the car does not have, and consist of
+    arcs. This is the path nearest to their points by least squares among those whose curvature
+    changes evenly between knots and keeps its limits, as far as that goes.
+
+    Args:
+        start: (3,) x, y [m] and heading [rad].
+        curvature: () [1/m], at the start.
+        points: (N, 2) [m], at equal distances, the first one the start's; N - 1 is a multiple of
+            the stride.
+        bends: (N,) [1/m], curvature there, as a first guess.
+        length: () [m], of the path.
+        most: () [1/m], the greatest curvature.
+        rate: () [1/m^2], the greatest change of curvature by the way.
+        config: weights and sizes.
+    """
+    num = (points.shape[0] - 1) // config.stride
+    change = (np.eye(num) - np.eye(num, k=-1)) * num
+    limits = most * (1.0 - config.slack), rate * (1.0 - config.slack)
+
+    def at(unknown: Array) -> Array:
+        return jnp.concatenate([curvature[None], unknown])
+
+    def evaluate(unknown: Array) -> Model:
+        knots = at(unknown)
+        way = motion(start, length, jnp.ones_like(knots), knots, config.stride)
+        away = (way.pos - points[1:]).reshape(-1) / config.miss
+        slopes = way.pos_slope[..., num:].reshape(-1, num) / config.miss
+        rates = (knots[1:] - knots[:-1]) * (num / length)
+        values, rows = [away], [slopes]
+        for value, row, limit in zip(
+            (unknown, rates), (np.eye(num), change / length), limits, strict=True
+        ):
+            over = jnp.maximum(jnp.abs(value) / limit - 1.0, 0.0)
+            sign = jnp.where(over > 0.0, jnp.sign(value), 0.0) / limit
+            values.append(100.0 * over)
+            rows.append(100.0 * sign[:, None] * row)
+        values.append(config.rate * rates / limits[1])
+        rows.append(config.rate * change.astype(slopes.dtype) / (length * limits[1]))
+        residuals, jacobian = jnp.concatenate(values), jnp.concatenate(rows)
+        excess = jnp.maximum(jnp.max(jnp.abs(unknown)) / most, jnp.max(jnp.abs(rates)) / rate)
+        return Model(
+            cost=jnp.sum(residuals**2),
+            gradient=jnp.matmul(jacobian.T, residuals, precision=lax.Precision.HIGHEST),
+            curvature=jnp.matmul(jacobian.T, jacobian, precision=lax.Precision.HIGHEST),
+            violation=excess - 1.0,
+        )
+
+    guess = jnp.clip(bends[config.stride :: config.stride], -most, most)
+    knots = at(least_squares(evaluate, guess, config.solver).point)
+    places = jnp.arange(points.shape[0]) / config.stride
+    return path_along(start, length, jnp.interp(places, jnp.arange(num + 1), knots))

@@ -47,9 +47,7 @@ class SpeedStep:
             self.slack,
         )
 
-    def drive(
-        self, case: InterceptCase, path: Path, problem: StationTimeProblem
-    ) -> InterceptPlan:
+    def drive(self, case: InterceptCase, path: Path, problem: StationTimeProblem) -> InterceptPlan:
         """The plan of one path: its speed, and the curvature that the path has there."""
         times = jnp.linspace(0.0, 1.0, self.pieces + 1) * case.time
         if self.speed is None:

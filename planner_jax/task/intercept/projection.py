@@ -140,9 +140,7 @@ def overlap(
     def narrow(interval: tuple, x: Array, y: Array, is_axis: Array) -> tuple:
         """What an axis for every obstacle and point, x and y (M, 1) or (1, N), leaves of it."""
         mine = [x * corner[:, 0] + y * corner[:, 1] for corner in own]
-        other = [
-            x * theirs[:, k, :1] + y * theirs[:, k, 1:] for k in range(theirs.shape[1])
-        ]
+        other = [x * theirs[:, k, :1] + y * theirs[:, k, 1:] for k in range(theirs.shape[1])]
         rate = x * movers.velocity[:, :1] + y * movers.velocity[:, 1:]
         # They overlap while -behind < rate t < before.
         before = _most(mine) - _least(other)

@@ -3,8 +3,9 @@
 They come from the machinery of `spacetime`, with nothing that moves and a target that stands where
 it will be met. Random ways through the reach set are told apart by the side on which they pass
 each wall: the angle by which a way turns around a wall's middle differs from that of another one
-by whole turns just if the wall lies between them. Those that differ are refined by least squares,
-at a time soon after the earliest at which the car could be there, and their speed is forgotten.
+by whole turns just if the wall lies between them. Those that differ most are refined by least
+squares, each at the time of its own arrival, and their speed is forgotten. Some are longer than
+they need to be: what moves may block all the short ones.
 """
 
 import dataclasses
@@ -13,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jax import Array
+from jax import Array, lax
 
 from planner_jax.plane import reach
 from planner_jax.plane.obstacles import Obstacles
@@ -23,6 +24,10 @@ from planner_jax.task.intercept.motion import motion
 from planner_jax.task.intercept.path import Path, path_of_drive
 from planner_jax.task.intercept.spacetime import Found, Search, SpacetimeIntercept
 from planner_jax.task.intercept.terms import wrapped
+
+
+_SHARES = 8  # of a way, where it is compared with others
+_OTHER_SIDE = 8.0  # [m], how much farther apart ways are that pass a wall on different sides
 
 
 @struct.dataclass
@@ -41,8 +46,8 @@ class PathSource:
     """Finds paths; as many as an attempt has ways."""
 
     planner: SpacetimeIntercept = SpacetimeIntercept()
-    drawn: int = 4  # ways for every path, of which those that differ are refined
-    later: int = 3  # layers after the earliest arrival that ways arrive at, in turns
+    drawn: int = 8  # ways for every path, of which those that differ are refined
+    later: int = 10  # layers after the earliest arrival that ways arrive at, in turns
     points: int = 129  # of a path
 
     def paths(
@@ -61,22 +66,26 @@ class PathSource:
         times, guesses = jax.vmap(lambda n, chance: self.guess(still, found, there[n], n, chance))(
             layer, chances
         )
-        chosen = self.different(still, times, guesses)[: attempt.ways]
-        plans = jax.vmap(
-            lambda time, guess: self.planner.refined(
-                dataclasses.replace(still, time=time), guess, time, attempt.solver
-            )
-        )(times[chosen], guesses[chosen])
-        paths = jax.vmap(
-            lambda plan: path_of_drive(
-                plan.start, plan.time, jnp.maximum(plan.speed, 0.0), plan.curvature, self.points
-            )
-        )(plans)
+        chosen = self.different(still, times, guesses, attempt.ways)
+
+        def path(start: tuple[Array, Array]) -> tuple[Path, Array, Array]:
+            time, guess = start
+            drive = dataclasses.replace(still, time=time)
+            plan = self.planner.refined(drive, guess, time, attempt.solver)
+            speed = jnp.maximum(plan.speed, 0.0)
+            found = path_of_drive(plan.start, time, speed, plan.curvature, self.points)
+            return found, plan.violation, plan.iterations
+
+        paths, violation, steps = lax.platform_dependent(
+            (times[chosen], guesses[chosen]),
+            cpu=lambda starts: lax.map(path, starts),
+            default=jax.vmap(path),
+        )
         return StaticPaths(
             paths=paths,
-            violation=jnp.where(is_reached, plans.violation, jnp.inf),
+            violation=jnp.where(is_reached, violation, jnp.inf),
             is_reached=is_reached,
-            steps=jnp.max(plans.iterations),
+            steps=jnp.max(steps),
         )
 
     def arrivals(self, case: InterceptCase, found: Found) -> tuple[Array, Array]:
@@ -104,29 +113,39 @@ class PathSource:
         """When a random way arrives that ends at a layer, and speed and curvature along it."""
         grid = dataclasses.replace(found.grid, num=layer)
         time = (layer + 0.5) * grid.step
-        way = reach.draw_way(
-            self.planner.lattice, found.reach, layer, found.cells, there, chance
-        )
+        way = reach.draw_way(self.planner.lattice, found.reach, layer, found.cells, there, chance)
         return time, self.planner.guess(dataclasses.replace(case, time=time), grid, way)
 
-    def different(self, case: InterceptCase, times: Array, guesses: Array) -> Array:
-        """Places of guesses (D, 2 K), the shortest of every homotopy first, then the others."""
+    def different(self, case: InterceptCase, times: Array, guesses: Array, num: int) -> Array:
+        """Places of some guesses (D, 2 K), the shortest first, then those farthest from the rest.
+
+        Ways are as far apart as their points at equal shares of their lengths are on average, and
+        farther apart than any others if they pass a wall on different sides.
+        """
         goal = case.target.at(case.time).pos
 
-        def way(time: Array, guess: Array) -> tuple[Array, Array]:
+        def way(time: Array, guess: Array) -> tuple[Array, Array, Array]:
             speed, curvature = self.planner.knots(case, guess)
             pos = motion(case.start, time, speed, curvature, 1).pos
-            length = jnp.mean(0.5 * (speed[1:] + speed[:-1])) * time
-            return turns_around(case.walls, case.start[:2], pos, goal), length
+            moved = jnp.cumsum(jnp.maximum(0.5 * (speed[1:] + speed[:-1]), 1e-3))
+            share = moved / moved[-1]
+            at = jnp.linspace(0.0, 1.0, _SHARES + 1)[1:]
+            points = jnp.stack([jnp.interp(at, share, pos[:, k]) for k in range(2)], axis=1)
+            turns = turns_around(case.walls, case.start[:2], pos, goal)
+            return points, turns, moved[-1] * time
 
-        turns, length = jax.vmap(way)(times, guesses)
-        is_same = jnp.all((turns[:, None] == turns) | ~case.walls.present, axis=2)
-        place = jnp.arange(length.shape[0])
-        is_before = (length < length[:, None]) | (
-            (length == length[:, None]) & (place < place[:, None])
-        )
-        is_repeated = jnp.any(is_same & is_before, axis=1)
-        return jnp.argsort(length + jnp.where(is_repeated, 1e6, 0.0))
+        points, turns, length = jax.vmap(way)(times, guesses)
+        apart = jnp.mean(jnp.linalg.norm(points[:, None] - points, axis=-1), axis=-1)
+        is_other = jnp.any((turns[:, None] != turns) & case.walls.present, axis=2)
+        apart = apart + jnp.where(is_other, _OTHER_SIDE, 0.0)
+        first = jnp.argmin(length)
+
+        def farthest(nearest: Array, _: None) -> tuple[Array, Array]:
+            place = jnp.argmax(nearest)
+            return jnp.minimum(nearest, apart[place]), place
+
+        _, others = lax.scan(farthest, apart[first], length=num - 1)
+        return jnp.concatenate([first[None], others])
 
 
 def standing(case: InterceptCase) -> InterceptCase:
