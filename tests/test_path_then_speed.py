@@ -143,7 +143,7 @@ def test_speed_is_limited_by_lateral_acceleration_and_by_the_steering_rate():
     arc = path_along(jnp.zeros(3), jnp.asarray(2.0), jnp.full(9, -1.6))
     np.testing.assert_allclose(speed_limits(arc, body, limits), np.sqrt(0.8 / 1.6), rtol=1e-6)
     np.testing.assert_allclose(speed_limits(STRAIGHT, body, limits), 1.5)
-    # From straight to 0.5 / m in 0.05 m: tan(delta) = 0.3 * curvature, fastest where it is straight.
+    # From straight to 0.5 / m in 0.05 m; tan(delta) = 0.3 * curvature, fastest where straight.
     step = path_along(jnp.zeros(3), jnp.asarray(0.05), jnp.array([0.0, 0.5]))
     np.testing.assert_allclose(speed_limits(step, body, limits), [2.0 / (0.3 * 10.0)], rtol=1e-5)
 
@@ -157,7 +157,9 @@ def test_the_way_of_a_drive_is_that_of_the_car():
     end = pose_at(start, time, jnp.asarray(speed), jnp.asarray(curvature), time)
     np.testing.assert_allclose(path.pos[-1], end[:2], atol=5e-3)
     np.testing.assert_allclose(path.heading[-1], end[2], atol=5e-3)
-    np.testing.assert_allclose(path.length, np.mean(0.5 * (speed[1:] + speed[:-1])) * 4.0, rtol=1e-5)
+    np.testing.assert_allclose(
+        path.length, np.mean(0.5 * (speed[1:] + speed[:-1])) * 4.0, rtol=1e-5
+    )
 
 
 def test_a_car_drives_beside_arcs_without_a_jump_of_its_curvature():
@@ -166,7 +168,9 @@ def test_a_car_drives_beside_arcs_without_a_jump_of_its_curvature():
     poses = sample_dubins(way, 129)
     bends = jnp.diff(poses[:, 2], append=poses[-1:, 2]) * (128 / way.length)
     rate = jnp.asarray(8.0)
-    path = path_beside(start, jnp.zeros(()), poses[:, :2], bends, way.length, jnp.asarray(2.0), rate)
+    path = path_beside(
+        start, jnp.zeros(()), poses[:, :2], bends, way.length, jnp.asarray(2.0), rate
+    )
     away = np.linalg.norm(path.pos - poses[:, :2], axis=1)
     assert away.max() < 0.06
     assert path.curvature[0] == 0.0 and np.abs(path.curvature).max() <= 2.0
@@ -242,7 +246,10 @@ PLANNER = lattice(source=SMALL, searches=(Search(4),))
 BARRIER = [[3.9, -0.5], [4.1, -0.5], [4.1, 8.5], [3.9, 8.5]]
 SCENES = {
     "free": (scene(), pj.Status.CONVERGED),
-    "a mover crosses": (scene(movers=[SQUARE + [3.5, 1.5]], velocities=[0.0, 0.5]), pj.Status.CONVERGED),
+    "a mover crosses": (
+        scene(movers=[SQUARE + [3.5, 1.5]], velocities=[0.0, 0.5]),
+        pj.Status.CONVERGED,
+    ),
     "parked on every path": (scene(movers=[BARRIER]), pj.Status.NO_PATH),
     "a wall across": (scene(walls=[BARRIER]), pj.Status.NO_PATH),
     "parked on the goal": (scene(movers=[SQUARE + [6.0, 4.0]]), pj.Status.BLOCKED),

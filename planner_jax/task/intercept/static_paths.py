@@ -25,7 +25,6 @@ from planner_jax.task.intercept.path import Path, path_of_drive
 from planner_jax.task.intercept.spacetime import Found, Search, SpacetimeIntercept
 from planner_jax.task.intercept.terms import wrapped
 
-
 _SHARES = 8  # of a way, where it is compared with others
 _OTHER_SIDE = 8.0  # [m], how much farther apart ways are that pass a wall on different sides
 
