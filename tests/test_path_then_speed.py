@@ -48,7 +48,7 @@ def scene(target=(6.0, 4.0), movers=(), velocities=0.0, walls=(), **settings):
 
 
 EMPTY = scene()
-STRAIGHT = path_along(jnp.array([0.8, 4.0, 0.0]), jnp.asarray(5.05), jnp.zeros(65))
+STRAIGHT = path_along(jnp.array([0.8, 4.0, 0.0]), jnp.asarray(5.05), jnp.zeros(129))
 BENT = path_along(
     jnp.array([0.8, 2.0, 0.0]),
     jnp.asarray(7.0),
@@ -67,24 +67,21 @@ def crossing(rng, path, num):
     return obstacles(list(polygons), velocity)
 
 
-def overlaps(path, movers, body, times, stations):
-    """Whether the body, just as it is, overlaps any mover: (times, stations) bool, by brute force.
+@jax.jit
+def least_distance(path, movers, times, stations):
+    """How far the body, just as it is, is from the nearest mover [m], (times, stations).
 
-    Between its points a path is interpolated.
+    Negative where they overlap; by brute force. Between its points a path is interpolated.
     """
-    place = np.linspace(0.0, float(path.length), len(path.heading))
-    x, y, heading = (
-        np.interp(stations, place, each).astype(np.float32)
-        for each in (*np.asarray(path.pos).T, path.heading)
-    )
+    place = jnp.linspace(0.0, 1.0, len(path.heading)) * path.length
+    x, y, heading = (jnp.interp(stations, place, each) for each in (*path.pos.T, path.heading))
 
     def at(time):
-        apart = separation(
-            movers.vertices(time), movers.present, x[None], y[None], heading, ends_of(body)
-        )
+        corners = movers.vertices(time)
+        apart = separation(corners, movers.present, x[None], y[None], heading, ends_of(EMPTY.body))
         return jnp.min(apart, axis=0)
 
-    return np.asarray(jax.jit(jax.vmap(at))(times))
+    return jax.vmap(at)(times)
 
 
 def is_inside(blocked, times, stations):
@@ -95,18 +92,20 @@ def is_inside(blocked, times, stations):
     return np.asarray(((lower[:, None] <= s) & (s <= upper[:, None]) & is_now[:, None]).any(2))
 
 
+@jax.jit
+def project(path, movers):
+    return blocked_by(path, movers, EMPTY.body, EMPTY.time, Projection(margin=0.0))
+
+
 @pytest.mark.parametrize("path", [STRAIGHT, BENT], ids=["straight", "bent"])
 def test_quadrangles_hold_whatever_the_body_meets_and_little_else(path):
     times = np.linspace(0.0, 10.0, 101, dtype=np.float32)
     stations = np.linspace(0.0, float(path.length), 211, dtype=np.float32)
-    project = jax.jit(
-        lambda movers: blocked_by(path, movers, EMPTY.body, EMPTY.time, Projection(margin=0.0))
-    )
     held = exact = near = 0
-    for seed in range(12):
+    for seed in range(10):
         movers = crossing(np.random.default_rng(seed), path, 2)
-        apart = overlaps(path, movers, EMPTY.body, times, stations)
-        found = is_inside(project(movers), times, stations)
+        apart = np.asarray(least_distance(path, movers, times, stations))
+        found = is_inside(project(path, movers), times, stations)
         assert not (~found & (apart < -1e-4)).any()
         held, exact = held + found.sum(), exact + (apart < 0.0).sum()
         near += (found & (apart < 0.1)).sum()
@@ -199,7 +198,7 @@ def test_a_drive_follows_its_path_and_ends_where_it_ends():
     end = np.asarray(BENT.pos[-1]) + 0.15 * np.array(
         [np.cos(BENT.heading[-1]), np.sin(BENT.heading[-1])]
     )
-    case = scene(tuple(end), movers, [0.0, 0.4], time=14.0)
+    case = scene(tuple(end), movers, [0.0, 0.4], time=14.0, start=(0.8, 2.0, 0.0))
     plan = drive(case, BENT)
     assert plan.status == pj.Status.CONVERGED, pj.intercept.judge(case, plan).sentence()
     assert pj.intercept.judge(case, plan).success
@@ -281,11 +280,9 @@ def test_what_is_claimed_of_drawn_cases_the_referee_confirms(scenes):
     solved = pj.solved(plans)
     assert solved.sum() >= 4
     np.testing.assert_array_equal(pj.intercept.judge(cases, plans).success, solved)
-    alone = pj.plan(PLANNER, pj.lane(cases, 3))
-    assert alone.status == plans.status[3]
-    np.testing.assert_allclose(alone.speed, plans.speed[3], atol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_paper_s_planner_searches_smooths_and_drives(scenes):
     pytest.importorskip("numba", reason="the extra `baselines` is not installed")
     plans = pj.plan(pj.intercept.planner("paper"), scenes[0])

@@ -79,13 +79,14 @@ class PaperIntercept:
         numbers += jax.tree.leaves((case.body, case.walls.corners, case.walls.centre))
         if not all(np.isfinite(each).all() for each in numbers):
             return None
+        behind, ahead, half = (float(end) for end in ends_of(case.body))
         has_heading = case.heading_tolerance < np.pi
         return hybrid_astar(
             case.start,
             goal,
             case.walls,
             curvature=float(case.limits.curvature),
-            body=tuple(float(end) for end in ends_of(case.body)),
+            body=(behind, ahead, half),
             lower=case.lower,
             upper=case.upper,
             end_heading=float(case.end_heading) if has_heading else None,

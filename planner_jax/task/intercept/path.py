@@ -3,7 +3,6 @@
 import dataclasses
 
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 from jax import Array, lax
 
@@ -103,7 +102,8 @@ def path_beside(
         config: weights and sizes.
     """
     num = (points.shape[0] - 1) // config.stride
-    change = (np.eye(num) - np.eye(num, k=-1)) * num
+    own = jnp.eye(num, dtype=points.dtype)
+    change = (own - jnp.eye(num, k=-1, dtype=points.dtype)) * num
     limits = most * (1.0 - config.slack), rate * (1.0 - config.slack)
 
     def at(unknown: Array) -> Array:
@@ -116,15 +116,14 @@ def path_beside(
         slopes = way.pos_slope[..., num:].reshape(-1, num) / config.miss
         rates = (knots[1:] - knots[:-1]) * (num / length)
         values, rows = [away], [slopes]
-        for value, row, limit in zip(
-            (unknown, rates), (np.eye(num), change / length), limits, strict=True
-        ):
+        each = ((unknown, own, limits[0]), (rates, change / length, limits[1]))
+        for value, row, limit in each:
             over = jnp.maximum(jnp.abs(value) / limit - 1.0, 0.0)
             sign = jnp.where(over > 0.0, jnp.sign(value), 0.0) / limit
             values.append(100.0 * over)
             rows.append(100.0 * sign[:, None] * row)
         values.append(config.rate * rates / limits[1])
-        rows.append(config.rate * change.astype(slopes.dtype) / (length * limits[1]))
+        rows.append(config.rate * change / (length * limits[1]))
         residuals, jacobian = jnp.concatenate(values), jnp.concatenate(rows)
         excess = jnp.maximum(jnp.max(jnp.abs(unknown)) / most, jnp.max(jnp.abs(rates)) / rate)
         return Model(

@@ -5,7 +5,7 @@ several paths are tried, each another way round what stands.
 """
 
 import dataclasses
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -165,7 +165,7 @@ def best_of(plans: InterceptPlan) -> Array:
     return jnp.argmin(cost + jnp.where(plans.status == Status.NO_PATH, 1e6, 0.0))
 
 
-def lattice(**fields: object) -> PathThenSpeed:
+def lattice(**fields: Any) -> PathThenSpeed:
     """Up to eight paths, on each a curve of least acceleration in a corridor of trapezoids.
 
     Args:
@@ -174,7 +174,7 @@ def lattice(**fields: object) -> PathThenSpeed:
     return PathThenSpeed(**fields)
 
 
-def em(kind: Literal["em", "em-exact"] = "em", **fields: object) -> PathThenSpeed:
+def em(kind: Literal["em", "em-exact"] = "em", **fields: Any) -> PathThenSpeed:
     """The best path with the speed step of the EM planner, at the same setting.
 
     Args:
@@ -185,7 +185,7 @@ def em(kind: Literal["em", "em-exact"] = "em", **fields: object) -> PathThenSpee
     return PathThenSpeed(**{"tries": 1, "step": SpeedStep(speed=speed), **fields})
 
 
-def constant(**fields: object) -> PathThenSpeed:
+def constant(**fields: Any) -> PathThenSpeed:
     """The best path with constant speed after a short ramp, whatever moves.
 
     Args:
