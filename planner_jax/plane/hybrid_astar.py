@@ -37,13 +37,13 @@ class HybridAstar:
     # How far, relative, the cost may be above the heuristic's bound on the least on the lattice.
     slack: float = 0.1
     margin: float = 0.01  # [m], from polygons, for what lies between samples and nodes
-    spacing: float = 0.05  # [m], between poses of the result, at most
+    poses: int = 129  # of the result
     max_expansions: int = 200_000
 
 
 @dataclasses.dataclass(frozen=True)
 class HybridPath:
-    """What a search found; without a way the arrays are empty, length and cost infinite.
+    """What a search found; without a way the arrays are NaN, length and cost infinite.
 
     Poses lie at equal distances along the way. It consists of arcs and straight lines, so that
     curvatures jump between two poses.
@@ -131,7 +131,7 @@ def hybrid_astar(
     status, curvatures, lengths, cost, expansions = kernels.search(
         start, goal, scene, rules, node_of
     )
-    poses, bends = _sampled(start, curvatures, lengths, settings.spacing)
+    poses, bends = _sampled(start, curvatures, lengths, settings.poses)
     found = status == kernels.FOUND
     return HybridPath(
         poses=poses,
@@ -174,32 +174,32 @@ def _require(start, meeting, lower, upper, curvature, body, end_heading, setting
         raise ValueError(f"body must be (behind, ahead > behind, half width > 0), got {body}")
     if end_heading is not None and not np.isfinite(end_heading):
         raise ValueError(f"end_heading must be finite, got {end_heading}")
-    positive = {"curvature": curvature, "cell": settings.cell, "spacing": settings.spacing}
+    positive = {"curvature": curvature, "cell": settings.cell}
     for name, value in (positive | {"max_expansions": settings.max_expansions}).items():
         if not (np.isfinite(value) and value > 0):
             raise ValueError(f"{name} must be > 0 and finite, got {value}")
     for name in ("turn_price", "slack", "margin"):
         if not 0.0 <= getattr(settings, name) < np.inf:
             raise ValueError(f"{name} must be >= 0 and finite, got {getattr(settings, name)}")
-    if settings.headings < 8:
-        raise ValueError(f"headings must be >= 8, got {settings.headings}")
+    for name, least in (("headings", 8), ("poses", 2)):
+        if getattr(settings, name) < least:
+            raise ValueError(f"{name} must be >= {least}, got {getattr(settings, name)}")
     if settings.heuristic not in HEURISTICS:
         known = ", ".join(HEURISTICS)
         raise ValueError(f"heuristic must be one of {known}, got {settings.heuristic!r}")
 
 
 def _sampled(
-    start: np.ndarray, curvatures: np.ndarray, lengths: np.ndarray, spacing: float
+    start: np.ndarray, curvatures: np.ndarray, lengths: np.ndarray, num: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Poses (N, 3) and curvatures (N,) at equal distances along arcs (P,) from a pose."""
-    lengths, curvatures = lengths[lengths > 0.0], curvatures[lengths > 0.0]
+    """Poses (num, 3) and curvatures (num,) at equal distances along arcs (P,) from a pose."""
     if not len(lengths):
-        return np.zeros((0, 3)), np.zeros(0)
+        return np.full((num, 3), np.nan), np.full(num, np.nan)
     ends = np.cumsum(lengths)
     heading = start[2] + np.append(0.0, np.cumsum(curvatures * lengths))
     steps = _chords(heading[:-1], curvatures, lengths)
     corners = start[:2] + np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
-    stations = np.linspace(0.0, ends[-1], int(np.ceil(ends[-1] / spacing)) + 1)
+    stations = np.linspace(0.0, ends[-1], num)
     part = np.minimum(np.searchsorted(ends, stations, side="right"), len(ends) - 1)
     along = stations - np.append(0.0, ends)[part]
     places = corners[part] + _chords(heading[part], curvatures[part], along)
