@@ -126,12 +126,12 @@ class PathSource:
         def way(time: Array, guess: Array) -> tuple[Array, Array, Array]:
             speed, curvature = self.planner.knots(case, guess)
             pos = motion(case.start, time, speed, curvature, 1).pos
-            moved = jnp.cumsum(jnp.maximum(0.5 * (speed[1:] + speed[:-1]), 1e-3))
-            share = moved / moved[-1]
-            at = jnp.linspace(0.0, 1.0, _SHARES + 1)[1:]
-            points = jnp.stack([jnp.interp(at, share, pos[:, k]) for k in range(2)], axis=1)
+            step = time / (speed.shape[0] - 1)
+            station = jnp.cumsum(jnp.maximum(0.5 * (speed[1:] + speed[:-1]), 1e-3) * step)
+            at = jnp.linspace(0.0, 1.0, _SHARES + 1)[1:] * station[-1]
+            points = jnp.stack([jnp.interp(at, station, pos[:, k]) for k in range(2)], axis=1)
             turns = turns_around(case.walls, case.start[:2], pos, goal)
-            return points, turns, moved[-1] * time
+            return points, turns, station[-1]
 
         points, turns, length = jax.vmap(way)(times, guesses)
         apart = jnp.mean(jnp.linalg.norm(points[:, None] - points, axis=-1), axis=-1)
