@@ -120,6 +120,11 @@ def seconds_of(planner: Any, lanes: list) -> dict[str, np.ndarray]:
     return best
 
 
+def mean_of(values: np.ndarray) -> float:
+    """The mean, NaN of none."""
+    return float(values.mean()) if len(values) else np.nan
+
+
 def table_of_outcomes(bench: Bench, outcomes: dict[str, Outcome]) -> None:
     """One row a planner: success, what is said of failures, accelerations."""
     bench.say(
@@ -138,8 +143,8 @@ def table_of_outcomes(bench: Bench, outcomes: dict[str, Outcome]) -> None:
         figures = {
             "success": good.mean(),
             "refused": int((claimed & ~good).sum()),
-            "rms": verdict.rms_acceleration[good].mean(),
-            "peak": verdict.max_acceleration[good].mean(),
+            "rms": mean_of(verdict.rms_acceleration[good]),
+            "peak": mean_of(verdict.max_acceleration[good]),
         }
         bench.say(
             f"| {name} | {100 * figures['success']:.1f} % | {figures['refused']} | "
@@ -167,7 +172,7 @@ def table_of_accelerations(bench: Bench, outcomes: dict[str, Outcome]) -> None:
         one, other = (outcomes[name].verdict for name in pair)
         both = one.success & other.success
         figures = {
-            name: (getattr(one, leaf)[both].mean(), getattr(other, leaf)[both].mean())
+            name: (mean_of(getattr(one, leaf)[both]), mean_of(getattr(other, leaf)[both]))
             for name, leaf in (("rms", "rms_acceleration"), ("peak", "max_acceleration"))
         }
         cells = " | ".join(

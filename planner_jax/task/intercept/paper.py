@@ -26,6 +26,8 @@ from planner_jax.task.intercept.spacetime import Search
 from planner_jax.task.intercept.speed import SPEED_PLANNERS
 from planner_jax.task.intercept.terms import ends_of
 
+_PACE = 1.2  # times those speeds, at which the steering angle can still follow a path
+
 
 def printed_speed(end_weight: float | None = None) -> SpeedStep:
     """The speed step as paper 003 has it: edges of polygons continued, pieces of a tenth.
@@ -106,8 +108,9 @@ class PaperIntercept:
             upper=case.upper,
             settings=self.smoothing,
         )
-        # The steering angle can follow at the mean speed, were the wheels straight.
-        rate = case.limits.steering_rate / case.body.wheelbase * case.time / smooth.length
+        # Slow enough a change for the speeds that the car has at the start and needs on average.
+        pace = _PACE * jnp.maximum(case.speed, smooth.length / case.time)
+        rate = case.limits.steering_rate / (case.body.wheelbase * pace)
         return path_beside(
             case.start,
             case.curvature,
