@@ -1,6 +1,7 @@
 """Path, then speed: what movers block along a path, what is driven, and what cannot be solved."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -37,7 +38,7 @@ def still(x, y):
     return pj.TurningPath(jnp.array([x, y]), jnp.zeros(2), jnp.array(0.0))
 
 
-def scene(target=(6.0, 4.0), movers=(), velocities=0.0, walls=(), **settings):
+def scene(target=(6.0, 4.0), movers=(), velocities: Any = 0.0, walls=(), **settings):
     """A case with the room of drawn ones."""
     return pj.intercept.case(
         still(*target),
@@ -152,7 +153,7 @@ def test_the_way_of_a_drive_is_that_of_the_car():
     speed = np.append(rng.uniform(0.2, 1.2, 16), 0.0).astype(np.float32)
     curvature = rng.uniform(-1.5, 1.5, 17).astype(np.float32)
     start, time = jnp.array([1.0, 2.0, 0.3]), jnp.asarray(4.0)
-    path = path_of_drive(start, time, speed, curvature, 129)
+    path = path_of_drive(start, time, jnp.asarray(speed), jnp.asarray(curvature), 129)
     end = pose_at(start, time, jnp.asarray(speed), jnp.asarray(curvature), time)
     np.testing.assert_allclose(path.pos[-1], end[:2], atol=5e-3)
     np.testing.assert_allclose(path.heading[-1], end[2], atol=5e-3)
