@@ -89,9 +89,9 @@ def parts_of(planner: Any) -> dict[str, Callable]:
             "speed": jax.jit(lambda found: planner.best_drive(*found)),
         }
     if isinstance(planner, PaperIntercept):
-        smooth = jax.jit(lambda case, *way: (case, planner.path(case, *way)))
+        smooth = jax.jit(lambda case, way: (case, planner.path(case, way[0], way[1], way[2])))
         return {
-            "path": lambda case: smooth(case, *planner.searched(case)[:3]),
+            "path": lambda case: smooth(case, planner.searched(case)),
             "speed": jax.jit(
                 lambda found: planner.step.drive(*found, planner.step.problem(*found))
             ),
