@@ -93,7 +93,9 @@ def parts_of(planner: Any) -> dict[str, Callable]:
         return {
             "path": lambda case: smooth(case, planner.searched(case)),
             "speed": jax.jit(
-                lambda found: planner.step.drive(*found, planner.step.problem(*found))
+                lambda found: planner.step.drive(
+                    found[0], found[1], planner.step.problem(found[0], found[1])
+                )
             ),
         }
     attempt = planner.attempts[0]
