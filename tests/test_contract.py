@@ -18,7 +18,9 @@ from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.optimise.problem import Round
 from planner_jax.plane.reach import Lattice
 from planner_jax.protocol import Attempt, HostPlanner, LanesPlanner, Plan, is_solved, outcome
-from planner_jax.task.intercept.spacetime import Search
+from planner_jax.task.intercept.projection import Projection
+from planner_jax.task.intercept.spacetime import Search, SpacetimeIntercept
+from planner_jax.task.intercept.static_paths import PathSource
 
 NUM = 6  # cases of a batch; no more than one bucket
 
@@ -129,6 +131,18 @@ def last_time(plan):
     return plan.times[-1]
 
 
+def path_then_speed(name, **options):
+    small = SpacetimeIntercept(pieces=6, samples=2, checked=2)
+    source = PathSource(planner=small, drawn=2, later=2, points=33)
+    projection = Projection(runs=1, slabs=2)
+    step = pj.intercept.planner(name).step
+    speed = step.speed and dataclasses.replace(step.speed, pieces=4)
+    step = dataclasses.replace(step, speed=speed, projection=projection, pieces=40)
+    searches = (Search(2, LevenbergConfig(2), lattice=Lattice(layers=20, headings=16)),)
+    planner = pj.intercept.planner(name, source=source, step=step, searches=searches, **options)
+    return Entry(planner, lambda num: pj.intercept.draw(num, "easy", 4), "start")
+
+
 ENTRIES = {
     # Of the cost, which needs no adjoint: with it the program takes three times as long.
     "hit exact": hit("exact", {"of": "cost", "by": "racket_height", "steps": 0}, **SHORT, **NONE),
@@ -149,12 +163,14 @@ ENTRIES = {
             pieces=6,
             samples=2,
             checked=2,
-            lattice=Lattice(layers=20, headings=16),
-            searches=(Search(1, LevenbergConfig(2)),),
+            searches=(Search(1, LevenbergConfig(2), lattice=Lattice(layers=20, headings=16)),),
         ),
         lambda num: pj.intercept.draw(num, "easy", 4),
         "start",
     ),
+    "intercept lattice": path_then_speed("lattice"),
+    "intercept em": path_then_speed("em", tries=1),
+    "intercept constant": path_then_speed("constant", tries=1),
     "library": Entry(LibraryPlanner(library(1)), places, "goal"),
     "NumPy": Entry(NumpyPlanner(), places, "goal"),
 }

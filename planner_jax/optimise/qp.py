@@ -164,7 +164,7 @@ def solve_qp(
         jnp.where(jnp.isfinite(lower), (lower - reached) / (1.0 + jnp.abs(lower)), -jnp.inf),
         jnp.where(jnp.isfinite(upper), (reached - upper) / (1.0 + jnp.abs(upper)), -jnp.inf),
     )
-    cost = right_side @ _product(t.base_cost, right_side) + 0.5 * jnp.sum(point**2)
+    cost = _product(right_side, _product(t.base_cost, right_side)) + 0.5 * jnp.sum(point**2)
     pressure = search.sides * _product(inverse, point)
     is_row = search.rows[:, None] == jnp.arange(lower.shape[0])
     multiplier = jnp.sum(jnp.where(is_row, pressure[:, None], 0.0), axis=0) / t.scales

@@ -139,7 +139,7 @@ def _along_y(rows: Array, move: Array) -> Array:
 
 
 def _along_x(rows: Array, move: Array) -> Array:
-    """Bits (words, ..., cells) moved by (...) cells, fewer than 32; what leaves the grid is lost."""
+    """Bits (words, ..., cells) moved by (...) cells, under 32; what leaves the grid is lost."""
     none = jnp.zeros_like(rows[0])
     by = jnp.abs(move[..., None]).astype(jnp.uint32)
     carry = (32 - by) & 31

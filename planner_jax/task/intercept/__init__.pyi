@@ -1,5 +1,7 @@
 from .case import InterceptCase as InterceptCase
 from .case import case as case
+from .paper import PaperIntercept as PaperIntercept
+from .path_then_speed import PathThenSpeed as PathThenSpeed
 from .plan import InterceptPlan as InterceptPlan
 from .spacetime import SpacetimeIntercept as SpacetimeIntercept
 from .suites import drawn as drawn

@@ -50,7 +50,13 @@ TASK = Task(
     name="intercept",
     summary="a car meets a moving target among obstacles that stand and move",
     home="planner_jax.task.intercept",
-    planners={"spacetime": "planner_jax.task.intercept.spacetime:SpacetimeIntercept"},
+    planners={
+        "spacetime": "planner_jax.task.intercept.spacetime:SpacetimeIntercept",
+        "lattice": "planner_jax.task.intercept.path_then_speed:lattice",
+        "paper": "planner_jax.task.intercept.paper:PaperIntercept",
+        "em": "planner_jax.task.intercept.path_then_speed:em",
+        "constant": "planner_jax.task.intercept.path_then_speed:constant",
+    },
     suites={name: suite.description for name, suite in SUITES.items()},
     contact="time",
 )

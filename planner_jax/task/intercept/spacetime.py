@@ -19,15 +19,14 @@ from jax import Array, lax
 from planner_jax.optimise.levenberg import LevenbergConfig, Model, least_squares
 from planner_jax.plane import reach
 from planner_jax.plane.distance_field import DistanceField, distance_field
-from planner_jax.protocol import Attempt, Status, is_solved, status_of
+from planner_jax.protocol import Attempt, Status, is_solved
 from planner_jax.task.intercept.case import InterceptCase
+from planner_jax.task.intercept.checked import checked_plan, explained, straight_on
 from planner_jax.task.intercept.motion import Quadratic, by_unknowns, motion
 from planner_jax.task.intercept.plan import InterceptPlan
 from planner_jax.task.intercept.terms import (
     Weights,
-    clearance,
     discs_of,
-    is_blocked,
     limit_terms,
     meeting_terms,
     obstacle_terms,
@@ -42,8 +41,6 @@ _FIELD = 128  # places of the distance field along either side of the map
 _FIELD = 128  # places of the distance field along either side of the map
 _LEAST = 0.01  # share of the case's time that a meeting takes at least
 _SPREAD = 3  # layers from the earliest one on at which ways to the earliest meeting end
-
-_GRAZING = 5e-3  # [m], from obstacles, so that nothing is touched between two looks
 
 # A way takes about as much memory as so many starts of planners with few unknowns.
 _ROOM = 8
@@ -150,7 +147,7 @@ class SpacetimeIntercept:
             k, best = state
             return (k < ways) & (self.is_time_free | ~is_solved(best.status))
 
-        _, best = lax.while_loop(is_wanted, try_way, (0, self.straight_on(case)))
+        _, best = lax.while_loop(is_wanted, try_way, (0, straight_on(case, self.pieces)))
         return self.explained(case, attempt, found.is_reached, best)
 
     def solve_lanes(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:
@@ -344,56 +341,19 @@ class SpacetimeIntercept:
     def plan_at(self, case: InterceptCase, point: Array, steps: Array) -> InterceptPlan:
         """The plan of a point, looked at more closely."""
         speed, curvature, time = self.parts(case, point)
-        way = motion(case.start, time, speed, curvature, self.checked)
-        _, violation = limit_terms(case, time, speed, curvature, Weights(), 0.0, 12)
-        _, missed = meeting_terms(case, way, time, Weights())
-        bumped = (_GRAZING - jnp.min(clearance(case, way))) / case.body.width
-        worst = jnp.maximum(jnp.maximum(violation, missed), bumped)
-        effort = jnp.sum((speed[1:] - speed[:-1]) ** 2) * self.pieces / time
-        return InterceptPlan(
-            cost=time if self.meet == "early" else effort,
-            violation=worst,
-            iterations=steps,
-            status=status_of(effort, worst, True),
-            start=case.start,
-            time=time,
-            speed=speed,
-            curvature=curvature,
-            meeting=case.target.at(time).pos,
+        plan = checked_plan(
+            case, time, speed, curvature, samples=self.checked, places=12, steps=steps
         )
-
-    def straight_on(self, case: InterceptCase) -> InterceptPlan:
-        """A plan that goes straight on, for want of a better one."""
-        num = self.pieces + 1
-        return InterceptPlan(
-            cost=jnp.zeros_like(case.time),
-            violation=jnp.full_like(case.time, jnp.inf),
-            iterations=jnp.zeros((), jnp.int32),
-            status=jnp.full((), Status.INFEASIBLE, jnp.int32),
-            start=case.start,
-            time=case.time,
-            speed=jnp.full(num, case.speed),
-            curvature=jnp.full(num, case.curvature),
-            meeting=case.target.at(case.time).pos,
-        )
+        return dataclasses.replace(plan, cost=time) if self.meet == "early" else plan
 
     def explained(
         self, case: InterceptCase, attempt: Search, is_reached: Array, plan: InterceptPlan
     ) -> InterceptPlan:
         """The plan with a status that says why there is none."""
-        unsolved = ~is_solved(plan.status) & (plan.status != Status.NON_FINITE)
         reason = plan.status
         if attempt == self.searches[-1]:
             reason = jnp.where(is_reached, reason, Status.NO_PATH)
-        here, there = is_blocked(case)
-        blocked = here if self.is_time_free else here | there
-        reason = jnp.where(blocked, Status.BLOCKED, reason)
-        leaves = jax.tree.leaves(case)
-        floats = [leaf for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.floating)]
-        is_finite = jnp.all(jnp.stack([jnp.all(~jnp.isnan(leaf)) for leaf in floats]))
-        reason = jnp.where(is_finite, reason, Status.NON_FINITE)
-        status = jnp.where(unsolved | ~is_finite, reason, plan.status).astype(jnp.int32)
-        return dataclasses.replace(plan, status=status)
+        return explained(case, reason, plan, is_time_free=self.is_time_free)
 
     def better_of_two(self, plan: InterceptPlan, later: InterceptPlan) -> InterceptPlan:
         """The later plan where it is solved at less cost, or violates less than an unsolved one."""

@@ -47,13 +47,19 @@ def planner(name: str = "spacetime", **options: Any) -> AnyPlanner[InterceptCase
     """The intercept planner of a name, with some of its fields set.
 
     * `spacetime`: way and speed together, from a reach set in space and time.
+    * `lattice`: a path among what stands, then a speed along it among what moves, on eight paths
+      from a reach set; the best one is kept.
+    * `paper`: one path by Hybrid A*, smoothed, then a speed along it, as paper 003 has it; on the
+      host, with the extra `baselines`.
+    * `em`: the best path of `lattice` with the speed step of the EM planner.
+    * `constant`: the best path of `lattice` at constant speed, whatever moves.
 
     Args:
-        name: this, or one that another package offers.
-        **options: fields of that planner's dataclass, for example `pieces`.
+        name: one of these, or one that another package offers.
+        **options: fields of that planner's dataclass, for example `pieces` of `spacetime`.
 
     Returns:
-        A planner for `pj.plan`, `SpacetimeIntercept`.
+        A planner for `pj.plan`: `SpacetimeIntercept`, `PathThenSpeed` or `PaperIntercept`.
 
     Raises:
         ValueError: there is no planner of that name.

@@ -1,0 +1,251 @@
+"""Hybrid A*: its closed forms, its bound on the cost, traps, and what it says where no way is."""
+
+import dataclasses
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from planner_jax.plane.dubins import dubins
+from planner_jax.plane.hybrid_astar import HEURISTICS, HybridAstar, hybrid_astar
+from planner_jax.plane.obstacles import distances, obstacles, separation
+
+pytest.importorskip("numba", reason="needs the extra baselines")
+from planner_jax.plane import hybrid_astar_kernels as kernels  # noqa: E402
+
+CURVATURE, BODY, MIDDLE = 2.0, (-0.05, 0.35, 0.125), 0.15
+START = np.array([0.8, 4.0, 0.0])
+DEFAULT = HybridAstar()
+
+
+def box(left, low, right, high):
+    return [(left, low), (right, low), (right, high), (left, high)]
+
+
+# A dead end that is open to the start's side.
+TRAP = [box(4.0, 2.5, 4.2, 5.5), box(2.6, 2.5, 4.0, 2.7), box(2.6, 5.3, 4.0, 5.5)]
+
+
+def found(meeting, polygons=(), end_heading=None, start=START, **settings):
+    return hybrid_astar(
+        start,
+        meeting,
+        obstacles(polygons),
+        curvature=CURVATURE,
+        body=BODY,
+        lower=(0.0, 0.0),
+        upper=(8.0, 8.0),
+        end_heading=end_heading,
+        settings=dataclasses.replace(DEFAULT, **settings),
+    )
+
+
+def rear(meeting, heading):
+    """The rear axle's pose where the body's middle is on a point."""
+    direction = np.array([np.cos(heading), np.sin(heading)])
+    return np.append(meeting - MIDDLE * direction, heading)
+
+
+@jax.jit
+def dubins_lengths(starts, goals):
+    return jax.vmap(lambda start, goal: dubins(start, goal, CURVATURE).length)(starts, goals)
+
+
+def least_lengths(start, meeting):
+    """Dubins's lengths (720,) to every heading at a meeting."""
+    goals = np.stack([rear(meeting, heading) for heading in 2.0 * np.pi * np.arange(720) / 720])
+    with jax.enable_x64(True):
+        return np.asarray(dubins_lengths(np.broadcast_to(start, goals.shape), goals))
+
+
+def assert_drivable(path, meeting, polygons=(), start=START):
+    """It leads from the start to the meeting along arcs that are allowed, clear of polygons."""
+    assert path.found and not path.blocked
+    x, y, heading = path.poses.T
+    np.testing.assert_allclose(path.poses[0], start, atol=1e-12)
+    middle = path.poses[:, :2] + MIDDLE * np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    np.testing.assert_allclose(middle[-1], meeting, atol=1e-9)
+    assert (middle >= 0.0).all() and (middle <= 8.0).all()
+    assert (np.abs(path.curvature) <= CURVATURE * (1.0 + 1e-12)).all()
+    spacing = path.length / (len(x) - 1)
+    assert (np.abs(np.diff(heading)) <= CURVATURE * spacing + 1e-9).all()
+    assert (np.hypot(np.diff(x), np.diff(y)) <= spacing + 1e-9).all()
+    half = 0.5 * (heading[1:] + heading[:-1])
+    aside = np.cos(half) * np.diff(y) - np.sin(half) * np.diff(x)
+    assert (np.abs(aside) <= 0.25 * CURVATURE * spacing**2).all()
+    walls = obstacles(polygons)
+    gap = separation(walls.vertices(0.0), walls.present, x[None], y[None], heading, BODY)
+    assert gap.min() > 0.0
+    least = np.hypot(*(meeting - middle[0]))
+    assert path.cost >= path.length >= least - 1e-9
+
+
+@pytest.fixture(scope="module")
+def pairs():
+    rng = np.random.default_rng(0)
+    return rng.uniform([-2.0, -2.0, -np.pi], [2.0, 2.0, np.pi], (2, 400, 3))
+
+
+def test_the_closed_form_to_a_pose_is_dubins_of_the_library(pairs):
+    starts, goals = pairs
+    lengths = np.empty((6, 3))
+    ours = [
+        kernels.least_length(start, kernels.Goal(goal, True), 0.0, CURVATURE, lengths)
+        for start, goal in zip(starts, goals, strict=True)
+    ]
+    with jax.enable_x64(True):
+        theirs = dubins_lengths(starts, goals)
+    np.testing.assert_allclose(ours, theirs, atol=1e-9)
+
+
+def test_the_closed_form_to_a_point_is_the_least_over_all_headings(pairs):
+    lengths = np.empty((6, 3))
+    places = np.concatenate([pairs[1][:40, :2], 0.3 * pairs[1][40:80, :2]])  # and in the circles
+    for place in places:
+        goal = kernels.Goal(np.append(place, 0.0), False)
+        ours = kernels.least_length(np.zeros(3), goal, 0.0, CURVATURE, lengths)
+        goals = np.stack([np.append(place, angle) for angle in np.linspace(0.0, 2 * np.pi, 720)])
+        with jax.enable_x64(True):
+            theirs = dubins_lengths(np.zeros((720, 3)), goals).min()
+        assert ours <= theirs + 1e-9
+        assert ours == pytest.approx(theirs, abs=5e-3)
+
+
+def test_distances_are_those_of_the_library_up_to_their_cap():
+    walls = obstacles([*TRAP, [(1.0, 1.0), (1.9, 1.2), (1.4, 2.0)]])
+    corners = np.asarray(walls.vertices(0.0), float)
+    field = kernels.distance_field(
+        corners, np.asarray(walls.present), np.array([-0.2, -0.2]), 0.1, (84, 84), 0.4
+    )
+    nodes = -0.2 + 0.1 * np.arange(84)
+    x, y = (each.reshape(1, -1) for each in np.meshgrid(nodes, nodes, indexing="ij"))
+    far = np.asarray(distances(jnp.asarray(corners), walls.present, x, y)[0]).min(axis=0)
+    np.testing.assert_allclose(field.ravel(), np.minimum(far, 0.4), atol=2e-3)
+
+
+def test_the_wavefront_goes_round_walls_at_the_length_of_straight_lines():
+    is_open, sources = np.ones((60, 60), bool), np.zeros((60, 60), bool)
+    sources[30, 10] = True
+    i, j = np.indices((60, 60))
+    straight = 0.1 * np.hypot(i - 30, j - 10)
+    free = kernels.wavefront(is_open, sources, 0.1).reshape(60, 60)
+    assert (free >= straight - 1e-9).all() and (free <= 1.01 * straight + 0.12).all()
+    is_open[10:, 30] = False
+    behind = kernels.wavefront(is_open, sources, 0.1).reshape(60, 60)
+    np.testing.assert_array_equal(behind[:, :30] < np.inf, True)
+    round_the_end = 0.1 * (np.hypot(21.0, 20.0) + np.hypot(21.0, 20.0))
+    assert behind[30, 50] == pytest.approx(round_the_end, rel=0.04)
+    is_open[:, 30] = False
+    assert (kernels.wavefront(is_open, sources, 0.1).reshape(60, 60)[:, 31:] == np.inf).all()
+
+
+@pytest.mark.parametrize("heuristic", HEURISTICS)
+@pytest.mark.parametrize("end_heading", [None, 2.5])
+def test_without_walls_the_way_is_the_shortest_to_within_a_primitive(heuristic, end_heading):
+    rng = np.random.default_rng(1)
+    for meeting in rng.uniform(2.0, 6.0, (8, 2)):
+        path = found(meeting, (), end_heading, heuristic=heuristic)
+        assert_drivable(path, meeting)
+        if end_heading is None:
+            least = least_lengths(START, meeting).min()
+        else:
+            with jax.enable_x64(True):
+                goal = rear(meeting, end_heading)
+                least = float(dubins_lengths(START[None], goal[None])[0])
+            np.testing.assert_allclose(path.poses[-1], goal, atol=2.0 * np.pi + 1e-9)
+            assert np.cos(path.poses[-1, 2] - end_heading) == pytest.approx(1.0, abs=1e-12)
+        assert least - 1e-4 <= path.length <= least + 0.1745
+
+
+@pytest.mark.parametrize("end_heading", [None, 0.0])
+def test_all_heuristics_leave_the_trap_at_nearly_one_cost_and_the_grid_expands_fewest(end_heading):
+    meeting = np.array([6.5, 4.0])
+    paths = {
+        name: found(meeting, TRAP, end_heading, heuristic=name, slack=0.05) for name in HEURISTICS
+    }
+    for path in paths.values():
+        assert_drivable(path, meeting, TRAP)
+        assert path.length > 1.05 * least_lengths(START, meeting).min()
+    costs = [path.cost for path in paths.values()]
+    # Slack, and how well one state stands for a cell.
+    assert max(costs) <= 1.08 * min(costs)
+    assert paths["both"].expansions < 0.5 * paths["dubins"].expansions
+
+
+def test_more_slack_costs_more_and_no_more_than_allowed():
+    meeting = np.array([6.5, 4.0])
+    exact, loose = (found(meeting, TRAP, slack=slack) for slack in (0.0, 0.5))
+    assert loose.expansions < exact.expansions
+    assert loose.cost <= 1.5 * exact.cost
+
+
+def test_a_start_in_the_trap_finds_the_way_out():
+    start, meeting = np.array([2.8, 3.9, 0.0]), np.array([6.5, 4.0])
+    path = found(meeting, TRAP, start=start)
+    assert_drivable(path, meeting, TRAP, start)
+
+
+def test_walls_all_round_leave_no_way():
+    ring = [box(5.0, 3.0, 7.0, 3.2), box(5.0, 4.8, 7.0, 5.0)]
+    ring += [box(5.0, 3.2, 5.2, 4.8), box(6.8, 3.2, 7.0, 4.8)]
+    for heuristic in HEURISTICS:
+        path = found((6.0, 4.0), ring, heuristic=heuristic, max_expansions=3000)
+        assert not path.found and not path.blocked
+        assert path.length == path.cost == np.inf
+        assert path.poses.shape == (DEFAULT.poses, 3) and np.isnan(path.poses).all()
+    assert found((6.0, 4.0), ring).expansions == 1  # for the grid knows at once
+
+
+def test_the_search_ends_after_so_many_expansions():
+    path = found((6.5, 4.0), TRAP, max_expansions=20)
+    assert path.expansions == 20 and not path.found
+
+
+@pytest.mark.parametrize("meeting", [(4.1, 4.0), (8.3, 4.0)])
+def test_a_goal_in_a_wall_or_off_the_map_is_blocked(meeting):
+    path = found(meeting, TRAP)
+    assert path.blocked and not path.found and path.expansions == 0
+
+
+def test_the_case_turned_and_mirrored_has_the_mirrored_way():
+    """The grid is the same upside down, so that even the rounding of cells is."""
+    meeting = np.array([6.5, 4.4])
+    flip = np.array([1.0, -1.0, -1.0])
+    path = found(meeting, TRAP[:2])
+    upside_down = [[(x, 8.0 - y) for x, y in polygon] for polygon in TRAP[:2]]
+    mirrored = found((6.5, 3.6), upside_down)
+    assert mirrored.cost == pytest.approx(path.cost, rel=0.05)
+    assert_drivable(mirrored, (6.5, 3.6), upside_down)
+    if mirrored.cost == pytest.approx(path.cost, rel=1e-9):
+        np.testing.assert_allclose(mirrored.poses - [0, 8, 0], path.poses * flip, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"start": (0.0, 0.0)}, r"start must be \(3,\) and finite"),
+        ({"meeting": (np.nan, 0.0)}, r"meeting must be \(2,\) and finite"),
+        ({"upper": (0.0, 8.0)}, "upper must be > lower"),
+        ({"curvature": 0.0}, "curvature must be > 0"),
+        ({"body": (0.4, 0.3, 0.1)}, "body must be"),
+        ({"end_heading": np.inf}, "end_heading must be finite"),
+        ({"settings": HybridAstar(cell=-0.1)}, "cell must be > 0"),
+        ({"settings": HybridAstar(slack=-0.1)}, "slack must be >= 0"),
+        ({"settings": HybridAstar(headings=3)}, "headings must be >= 8"),
+        ({"settings": HybridAstar(heuristic="none")}, "heuristic must be one of dubins, grid"),
+    ],
+)
+def test_what_is_out_of_its_range_is_told_in_a_line(change, words):
+    given = {"start": START, "meeting": (6.0, 4.0), "walls": obstacles([])}
+    given |= {"curvature": CURVATURE, "body": BODY, "lower": (0.0, 0.0), "upper": (8.0, 8.0)}
+    with pytest.raises(ValueError, match=words):
+        hybrid_astar(**(given | change))
+
+
+def test_without_numba_the_error_says_what_to_install(monkeypatch):
+    monkeypatch.delitem(sys.modules, "planner_jax.plane.hybrid_astar_kernels")
+    monkeypatch.setitem(sys.modules, "numba", None)
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'planner-jax\[baselines\]'"):
+        found((6.0, 4.0))
