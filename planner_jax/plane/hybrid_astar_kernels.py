@@ -45,7 +45,7 @@ class Rules(NamedTuple):
     cell: float  # [m], side of a cell
     headings: int  # bins of a turn
     price: float  # what a metre at the tightest curvature costs more than a straight one [m]
-    slack: float  # by how much, relative, a cost may be above the least that is possible
+    slack: float  # by how much, relative, the heuristic is stretched
     with_dubins: bool  # whether the heuristic knows lengths without obstacles
     with_grid: bool  # whether it knows lengths among obstacles, without the curvature
     max_expansions: int
