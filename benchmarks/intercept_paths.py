@@ -89,7 +89,8 @@ def _gap(poses: jax.Array, walls: Any, body: jax.Array) -> jax.Array:
 def is_clear(case: Any, poses: np.ndarray, num: int = 513) -> bool:
     """Whether the body is clear of walls at poses (N, 3), of which `num` at most are looked at."""
     places = np.linspace(0, len(poses) - 1, num).astype(int)
-    return bool(_gap(np.float32(poses[places]), case.walls, np.float32(body_of(case))) > 0.0)
+    body = jnp.asarray(body_of(case), jnp.float32)
+    return bool(_gap(jnp.asarray(poses[places], jnp.float32), case.walls, body) > 0.0)
 
 
 def row_of(cases: list, paths: list[HybridPath], ms: np.ndarray) -> Row:
@@ -127,7 +128,7 @@ def peer_row(cases: list, meetings: np.ndarray, headings: list[float]) -> Row:
         corner = case.lower.astype(float) - PAD
         size = np.ceil((case.upper + PAD - corner) / CELL - 1e-6).astype(int)
         x, y = (corner[k] + CELL * (np.arange(size[k]) + 0.5) for k in range(2))
-        east, north = (np.float32(each).reshape(1, -1) for each in np.meshgrid(x, y))
+        east, north = (jnp.asarray(each, jnp.float32).reshape(1, -1) for each in np.meshgrid(x, y))
         far = distances(case.walls.vertices(np.float32(0.0)), case.walls.present, east, north)[0]
         searches.append(
             {
