@@ -4,7 +4,6 @@ import dataclasses
 import sys
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -53,6 +52,13 @@ def dubins_lengths(starts, goals):
     return jax.vmap(lambda start, goal: dubins(start, goal, CURVATURE).length)(starts, goals)
 
 
+@jax.jit
+def gaps(poses, walls):
+    """How far the body is from walls (N, M) [m] at poses (M, 3)."""
+    x, y, heading = poses.T
+    return separation(walls.vertices(0.0), walls.present, x[None], y[None], heading, BODY)
+
+
 def least_lengths(start, meeting):
     """Dubins's lengths (720,) to every heading at a meeting."""
     goals = np.stack([rear(meeting, heading) for heading in 2.0 * np.pi * np.arange(720) / 720])
@@ -75,10 +81,8 @@ def assert_drivable(path, meeting, polygons=(), start=START):
     half = 0.5 * (heading[1:] + heading[:-1])
     aside = np.cos(half) * np.diff(y) - np.sin(half) * np.diff(x)
     assert (np.abs(aside) <= 0.25 * CURVATURE * spacing**2).all()
-    walls = obstacles(polygons)
-    gap = separation(walls.vertices(0.0), walls.present, x[None], y[None], heading, BODY)
-    assert gap.min() > 0.0
-    least = np.hypot(*(meeting - middle[0]))
+    assert gaps(np.float32(path.poses), obstacles(polygons, room=(4, 4))).min() > 0.0
+    least = np.hypot(x[-1] - x[0], y[-1] - y[0])
     assert path.cost >= path.length >= least - 1e-9
 
 
@@ -108,7 +112,7 @@ def test_the_closed_form_to_a_point_is_the_least_over_all_headings(pairs):
         ours = kernels.least_length(np.zeros(3), goal, 0.0, CURVATURE, lengths)
         goals = np.stack([np.append(place, angle) for angle in np.linspace(0.0, 2 * np.pi, 720)])
         with jax.enable_x64(True):
-            theirs = dubins_lengths(np.zeros((720, 3)), goals).min()
+            theirs = np.asarray(dubins_lengths(np.zeros((720, 3)), goals)).min()
         assert ours <= theirs + 1e-9
         assert ours == pytest.approx(theirs, abs=5e-3)
 
@@ -120,9 +124,9 @@ def test_distances_are_those_of_the_library_up_to_their_cap():
         corners, np.asarray(walls.present), np.array([-0.2, -0.2]), 0.1, (84, 84), 0.4
     )
     nodes = -0.2 + 0.1 * np.arange(84)
-    x, y = (each.reshape(1, -1) for each in np.meshgrid(nodes, nodes, indexing="ij"))
-    far = np.asarray(distances(jnp.asarray(corners), walls.present, x, y)[0]).min(axis=0)
-    np.testing.assert_allclose(field.ravel(), np.minimum(far, 0.4), atol=2e-3)
+    x, y = (np.float32(each).reshape(1, -1) for each in np.meshgrid(nodes, nodes, indexing="ij"))
+    far = jax.jit(distances)(np.float32(corners), walls.present, x, y)[0]
+    np.testing.assert_allclose(field.ravel(), np.minimum(far, 0.4).min(axis=0), atol=1e-5)
 
 
 def test_the_wavefront_goes_round_walls_at_the_length_of_straight_lines():
@@ -136,7 +140,7 @@ def test_the_wavefront_goes_round_walls_at_the_length_of_straight_lines():
     behind = kernels.wavefront(is_open, sources, 0.1).reshape(60, 60)
     np.testing.assert_array_equal(behind[:, :30] < np.inf, True)
     round_the_end = 0.1 * (np.hypot(21.0, 20.0) + np.hypot(21.0, 20.0))
-    assert behind[30, 50] == pytest.approx(round_the_end, rel=0.04)
+    assert behind[30, 50] == pytest.approx(round_the_end, rel=0.06)
     is_open[:, 30] = False
     assert (kernels.wavefront(is_open, sources, 0.1).reshape(60, 60)[:, 31:] == np.inf).all()
 

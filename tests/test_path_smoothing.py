@@ -1,5 +1,7 @@
 """Smoothing of paths: slopes, a falling cost, ends that stay, and what is kept as it was."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +21,7 @@ from planner_jax.plane.path_smoothing import (
 CURVATURE, BODY = 2.0, (-0.05, 0.35, 0.125)
 NUM = 65
 SETTINGS = Smoothing(stride=2, iterations=60)
-WALLS = [[(2.0, 2.6), (3.0, 2.6), (2.6, 3.4)], [(4.0, 1.0), (5.0, 1.2), (4.4, 1.9)]]
+WALLS = [[(0.8, 4.0), (1.6, 4.0), (1.2, 4.8)], [(3.0, 0.6), (4.0, 0.6), (3.5, 1.0)]]
 START = np.array([0.8, 2.0, 0.2])
 GOALS = np.array([[6.0, 2.5, -0.4], [6.0, 4.5, 1.0], [5.5, 0.8, -2.0], [3.5, 6.0, 2.0]])
 
@@ -29,14 +31,14 @@ def walls_of(polygons=WALLS):
 
 
 def paths(goals):
-    """Dubins's ways (B, NUM, 3) at nine tenths of the curvature, their curvatures and lengths."""
+    """Dubins's ways (B, NUM, 3) at eight tenths of the curvature, their curvatures and lengths."""
 
     def one(goal):
-        path = dubins(jnp.asarray(START), goal, 0.9 * CURVATURE)
+        path = dubins(jnp.asarray(START), goal, 0.8 * CURVATURE)
         poses = sample_dubins(path, NUM)
         spacing = path.length / (NUM - 1)
-        bends = jnp.append(jnp.diff(poses[:, 2]) / spacing, 0.0)
-        return poses, bends, path.length
+        bends = jnp.diff(poses[:, 2]) / spacing
+        return poses, jnp.append(bends, bends[-1]), path.length
 
     return jax.vmap(one)(goals)
 
@@ -55,79 +57,102 @@ def smooth(poses, bends, length, walls):
     )
 
 
+@jax.jit
+def cost(points, unit, walls):
+    return smoothing_cost(points, unit, walls, CURVATURE)
+
+
+@functools.partial(jax.jit, static_argnames="iterations")
+def descended(points, walls, iterations):
+    return smooth_points(points, walls, CURVATURE, Smoothing(iterations=iterations))
+
+
+@jax.jit
+def gaps(poses, walls):
+    """How far the body is from walls (B, N, NUM) [m] along paths."""
+
+    def one(poses):
+        x, y, heading = poses.T
+        return separation(walls.vertices(0.0), walls.present, x[None], y[None], heading, BODY)
+
+    return jax.vmap(one)(poses)
+
+
+all_smooth = jax.jit(jax.vmap(smooth, in_axes=(0, 0, 0, None)))
+
+
 @pytest.fixture(scope="module")
 def batch():
-    """Given paths and smooth ones, in double precision."""
-    with jax.enable_x64(True):
-        given = paths(jnp.asarray(GOALS))
-        walls = walls_of()
-        smoothed = jax.jit(jax.vmap(smooth, in_axes=(0, 0, 0, None)))(*given, walls)
-        return jax.tree.map(np.asarray, (given, smoothed))
+    """Given paths, and smooth ones."""
+    given = jax.jit(paths)(jnp.asarray(GOALS, jnp.float32))
+    return jax.tree.map(np.asarray, (given, all_smooth(*given, walls_of())))
 
 
 @pytest.fixture
 def crooked():
     """Points that come near a wall, and turn more than is allowed."""
     rng = np.random.default_rng(0)
-    line = np.stack([np.linspace(0.5, 5.5, 24), np.full(24, 2.2)], axis=1)
+    line = np.stack([np.linspace(0.5, 5.5, 24), np.full(24, 1.3)], axis=1)
     return line + rng.normal(0.0, 0.06, line.shape)
 
 
 def test_the_slope_of_the_cost_is_that_of_finite_differences(crooked, float64):
-    def cost(points):
-        return smoothing_cost(points, jnp.asarray(0.21), walls_of(), CURVATURE)
-
-    slope = jax.jit(jax.grad(cost))(jnp.asarray(crooked))
-    directions = np.random.default_rng(1).normal(size=(20, *crooked.shape))
+    walls = walls_of()
+    slope = np.asarray(jax.jit(jax.grad(cost))(crooked, 0.21, walls))
     step = 1e-6
-    ends = jnp.asarray(crooked + step * np.array([1.0, -1.0])[:, None, None, None] * directions)
-    above, below = jax.jit(jax.vmap(jax.vmap(cost)))(ends)
-    expected = (above - below) / (2.0 * step)
-    np.testing.assert_allclose(np.sum(slope * directions, axis=(1, 2)), expected, rtol=1e-5)
+    for direction in np.random.default_rng(1).normal(size=(20, *crooked.shape)):
+        ahead, back = (
+            float(cost(crooked + sign * step * direction, 0.21, walls)) for sign in (1, -1)
+        )
+        assert np.sum(slope * direction) == pytest.approx((ahead - back) / (2 * step), rel=1e-5)
 
 
 def test_terms_have_their_closed_forms(float64):
     nothing, settings = walls_of([]), Smoothing()
-    line = jnp.stack([jnp.arange(9.0), jnp.zeros(9)], axis=1)
-    assert smoothing_cost(line, jnp.asarray(1.0), nothing, CURVATURE) == 0.0
-    # A right angle between steps of 0.5 m: 2 inner displacements of 1 unit that differ by sqrt(2).
-    corner = jnp.array([[-0.5, 0.0], [0.0, 0.0], [0.0, 0.5]])
+    line = np.stack([np.arange(9.0), np.zeros(9)], axis=1)
+    assert cost(line, 1.0, nothing) == 0.0
+    # A right angle between steps of 0.5 m: two displacements of one unit that differ by sqrt(2).
+    corner = np.array(
+        [[-0.5 * k, 0.0] for k in range(5)][::-1] + [[0, 0.5 * k] for k in range(1, 5)]
+    )
     excess = np.pi / 2 - CURVATURE * 0.5
     expected = settings.curvature * excess**2 + settings.smoothness * 2.0
-    found = smoothing_cost(corner, jnp.asarray(0.5), nothing, CURVATURE)
-    assert found == pytest.approx(expected)
+    assert cost(corner, 0.5, nothing) == pytest.approx(expected)
     # 0.2 m above an edge of a wall, in units of 0.1 m.
     wall = walls_of([[(-9.0, -1.0), (9.0, -1.0), (9.0, 0.0), (-9.0, 0.0)]])
-    found = smoothing_cost(line + jnp.array([0.0, 0.2]), jnp.asarray(0.1), wall, CURVATURE)
-    assert found == pytest.approx(settings.obstacle * 9 * (5.0 - 2.0) ** 2 + 0.0)
+    found = cost(line + [0.0, 0.2], 0.1, wall)
+    assert found == pytest.approx(settings.obstacle * 9 * (5.0 - 2.0) ** 2)
 
 
-def test_smoothing_lowers_the_cost_at_every_look_and_holds_the_ends(crooked, float64):
-    unit = np.linalg.norm(np.diff(crooked, axis=0), axis=1).mean()
-    costs = []
-    for iterations in (0, 5, 60):
-        settings = Smoothing(iterations=iterations)
-        points = jax.jit(lambda points, s=settings: smooth_points(points, walls_of(), CURVATURE, s))
-        moved = points(jnp.asarray(crooked))
+def test_smoothing_lowers_the_cost_and_holds_the_ends(crooked, float64):
+    walls, unit = walls_of(), np.linalg.norm(np.diff(crooked, axis=0), axis=1).mean()
+    costs = [cost(crooked, unit, walls)]
+    for iterations in (5, 60):
+        moved = descended(crooked, walls, iterations)
         np.testing.assert_array_equal(moved[:2], crooked[:2])
         np.testing.assert_array_equal(moved[-2:], crooked[-2:])
-        costs.append(float(smoothing_cost(moved, unit, walls_of(), CURVATURE)))
+        costs.append(cost(moved, unit, walls))
     assert costs[0] > 2.0 * costs[1] > 2.0 * costs[2] > 0.0
 
 
 def test_a_straight_path_far_from_walls_stays(float64):
-    line = jnp.stack([jnp.linspace(1.0, 7.0, 24), jnp.full(24, 7.0)], axis=1)
-    np.testing.assert_allclose(smooth_points(line, walls_of(), CURVATURE), line, atol=1e-12)
+    line = np.stack([np.linspace(1.0, 7.0, 24), np.full(24, 7.0)], axis=1)
+    np.testing.assert_allclose(descended(line, walls_of(), 60), line, atol=1e-12)
 
 
 def test_the_spline_of_an_arc_is_that_arc(float64):
     angle = np.linspace(0.0, 2.0, 17)
-    points = jnp.asarray(np.stack([np.sin(angle), 1.0 - np.cos(angle)], axis=1))
-    poses, curvature, length = resampled(control_points(points), 0.0, 2.0, 41)
+    given = np.stack([np.sin(angle), 1.0 - np.cos(angle), angle], axis=1)
+
+    @jax.jit
+    def spline(poses):
+        return resampled(control_points(poses, jnp.ones(17)), 0.0, 2.0, 41)
+
+    poses, curvature, length = jax.tree.map(np.asarray, spline(given))
     even = np.linspace(0.0, 2.0, 41)
     expected = np.stack([np.sin(even), 1.0 - np.cos(even), even], axis=1)
     np.testing.assert_allclose(poses, expected, atol=2e-3)
-    np.testing.assert_allclose(poses[[0, -1]], expected[[0, -1]], atol=1e-12)
+    np.testing.assert_allclose(poses[::40], expected[::40], atol=1e-12)
     np.testing.assert_allclose(curvature, 1.0, atol=0.02)
     assert length == pytest.approx(2.0, abs=1e-3)
 
@@ -135,16 +160,12 @@ def test_the_spline_of_an_arc_is_that_arc(float64):
 def test_smooth_paths_have_their_ends_and_keep_clear_within_the_curvature(batch):
     (given, _, _), found = batch
     assert found.is_smooth.all() and (found.share > 0.0).any()
-    np.testing.assert_allclose(found.poses[:, 0], given[:, 0], atol=1e-9)
-    np.testing.assert_allclose(found.poses[:, -1, :2], given[:, -1, :2], atol=1e-9)
+    np.testing.assert_allclose(found.poses[:, 0], given[:, 0], atol=1e-5)
+    np.testing.assert_allclose(found.poses[:, -1, :2], given[:, -1, :2], atol=1e-5)
     turned = found.poses[:, -1, 2] - given[:, -1, 2]
-    np.testing.assert_allclose(np.sin(0.5 * turned), 0.0, atol=1e-9)
+    np.testing.assert_allclose(np.sin(0.5 * turned), 0.0, atol=1e-5)
     assert (np.abs(found.curvature) <= CURVATURE * 1.001).all()
-    walls = walls_of()
-    for poses in found.poses:
-        x, y, heading = poses.T
-        gap = separation(walls.vertices(0.0), walls.present, x[None], y[None], heading, BODY)
-        assert gap.min() > 0.0
+    assert np.asarray(gaps(found.poses, walls_of())).min() > 0.0
 
 
 def test_poses_are_equally_far_apart_and_turn_by_their_curvature(batch):
@@ -161,24 +182,14 @@ def test_poses_are_equally_far_apart_and_turn_by_their_curvature(batch):
 def test_a_path_that_cannot_be_made_smooth_is_kept_and_leaves_its_neighbours_alone(batch):
     """One runs through a wall, one is not there at all."""
     (poses, bends, length), found = batch
-    with jax.enable_x64(True):
-        poses, length = poses.copy(), length.copy()
-        poses[1] = poses[0] + np.array([0.0, 0.7, 0.0])
-        poses[2], length[2] = np.nan, np.inf
-        again = jax.jit(jax.vmap(smooth, in_axes=(0, 0, 0, None)))(poses, bends, length, walls_of())
+    poses, length = poses.copy(), length.copy()
+    poses[1] = poses[0] + np.array([0.0, -1.4, 0.0])
+    poses[2], length[2] = np.nan, np.inf
+    again = jax.tree.map(np.asarray, all_smooth(poses, bends, length, walls_of()))
     np.testing.assert_array_equal(again.is_smooth, [True, False, False, True])
     np.testing.assert_array_equal(again.poses[1], poses[1])
     assert np.isnan(again.poses[2]).all() and again.length[2] == np.inf
-    np.testing.assert_allclose(again.poses[[0, 3]], found.poses[[0, 3]], atol=1e-12)
-
-
-def test_single_precision_finds_the_same_paths(batch):
-    given, found = batch
-    given = jax.tree.map(np.float32, given)
-    again = jax.jit(jax.vmap(smooth, in_axes=(0, 0, 0, None)))(*given, walls_of())
-    assert again.poses.dtype == np.float32
-    np.testing.assert_array_equal(again.is_smooth, found.is_smooth)
-    np.testing.assert_allclose(again.poses, found.poses, atol=2e-3)
+    np.testing.assert_allclose(again.poses[[0, 3]], found.poses[[0, 3]], atol=1e-5)
 
 
 def test_a_number_of_poses_that_does_not_fit_is_told_in_a_line():

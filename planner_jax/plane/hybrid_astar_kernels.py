@@ -45,7 +45,7 @@ class Rules(NamedTuple):
     cell: float  # [m], side of a cell
     headings: int  # bins of a turn
     price: float  # what a metre at the tightest curvature costs more than a straight one [m]
-    slack: float  # by how much, relative, a cost may be above the least that is possible
+    slack: float  # by how much, relative, the heuristic is stretched
     with_dubins: bool  # whether the heuristic knows lengths without obstacles
     with_grid: bool  # whether it knows lengths among obstacles, without the curvature
     max_expansions: int
@@ -258,7 +258,7 @@ def wavefront(is_open, sources, cell):
 
     The eikonal equation by sweeps in four directions in turns (H. Zhao, A fast sweeping method
     for eikonal equations, 2005): unlike sums of steps between neighbours it is nearly the same in
-    all directions.
+    all directions. It is of first order, a few hundredths too long beyond the end of a wall.
 
     Args:
         is_open: (X, Y) bool, cells that may be entered; sources may be closed.

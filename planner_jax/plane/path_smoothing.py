@@ -101,7 +101,7 @@ def smooth_path(
         raise ValueError(
             f"poses must be {settings.stride} k + 1, k >= 4, for this stride, got {poses.shape[0]}"
         )
-    given = control_points(poses[:: settings.stride, :2])
+    given = control_points(poses[:: settings.stride], bends[:: settings.stride])
     smooth = smooth_points(given, walls, curvature, settings)
     corners = walls.vertices(jnp.zeros_like(length))
     middle = 0.5 * (body[0] + body[1])
@@ -196,13 +196,27 @@ def smoothing_cost(
     )
 
 
-def control_points(points: Array) -> Array:
-    """Control points (n + 1, 2) of a B-spline that runs close to points (n + 1, 2).
+def control_points(poses: Array, bends: Array) -> Array:
+    """Control points (n + 1, 2) [m] of a B-spline that runs close to poses (n + 1, 3).
 
-    It cuts corners by a sixth of how far three points are off a line; they are moved by as much.
+    The spline cuts corners by a sixth of how far three points are off a line; inner points are
+    moved by as much, and those beside the ends so that the curvatures there are the given ones.
+
+    Args:
+        poses: (n + 1, 3), about equally far apart.
+        bends: (n + 1,) [1/m], curvature there.
     """
-    bend = points[2:] - 2.0 * points[1:-1] + points[:-2]
-    return points.at[1:-1].add(-bend / 6.0)
+    points = poses[:, :2]
+    step = _mean_distance(points)
+    inner = points[1:-1] - (points[2:] - 2.0 * points[1:-1] + points[:-2]) / 6.0
+
+    def beside(pose: Array, bend: Array, step: Array) -> Array:
+        ahead = jnp.stack([jnp.cos(pose[2]), jnp.sin(pose[2])])
+        left = jnp.stack([-ahead[1], ahead[0]])
+        return pose[:2] + step * ahead + (bend * step**2 / 3.0) * left
+
+    first, last = beside(poses[0], bends[0], step), beside(poses[-1], bends[-1], -step)
+    return jnp.concatenate([points[:1], first[None], inner[1:-1], last[None], points[-1:]])
 
 
 def resampled(

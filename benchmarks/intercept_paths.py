@@ -1,0 +1,245 @@
+"""Paths among standing walls: Hybrid A* with every heuristic, a published one, and smoothing.
+
+    python -m benchmarks.intercept_paths [--num 50] [--seed 0] [--out DIR]
+
+The walls, starts and meetings of the suites `hard` and `maze`, without what moves. First the
+heading at the meeting is free; then it is given, the one that was found, as the peer needs one:
+fastsim-navigation (C++, extra `peers`), which gets the same poses and the exact rectangle of the
+body. It looks for walls in cells of 0.1 m, this library in a distance field with discs that cover
+the body. Times are of one search, warm, from walls to poses, the fastest of three calls. A path is
+clear if the body's rectangle meets no wall at any of its poses; lengths are means over the searches
+that every row of the table has found. The last table smooths the paths that were searched with
+nine tenths of the curvature.
+"""
+
+import dataclasses
+import functools
+import os
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from planner_jax.benchmarks.path_peers import CELL, INSTALL, PAD, installed, searched
+from planner_jax.benchmarks.run import Bench, argument_parser, begin
+from planner_jax.plane.hybrid_astar import HEURISTICS, HybridAstar, HybridPath, hybrid_astar
+from planner_jax.plane.obstacles import distances, separation
+from planner_jax.plane.path_smoothing import smooth_path
+from planner_jax.task.intercept.suites import draw_cases
+from planner_jax.task.intercept.words import positions
+
+SUITES = ("hard", "maze")
+ROOM = 0.9  # of the curvature, for paths that are made smooth
+REPEATS = 3
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """What became of all searches with one planner."""
+
+    found: np.ndarray  # (B,) bool
+    clear: np.ndarray  # (B,) bool
+    length: np.ndarray  # (B,) [m]
+    ms: np.ndarray  # (B,), NaN where there was no answer
+    note: str = ""
+
+
+def body_of(case: Any) -> tuple[float, float, float]:
+    """Ends of the body behind and ahead of the rear axle, and half its width [m]."""
+    behind = -float(case.body.rear_overhang)
+    return behind, behind + float(case.body.length), 0.5 * float(case.body.width)
+
+
+def search(case: Any, meeting: np.ndarray, room: float = 1.0, **options: Any) -> HybridPath:
+    """The path of one case, whose leaves are NumPy arrays."""
+    return hybrid_astar(
+        case.start,
+        meeting,
+        case.walls,
+        curvature=room * float(case.limits.curvature),
+        body=body_of(case),
+        lower=case.lower,
+        upper=case.upper,
+        **options,
+    )
+
+
+def fastest(run: Callable[[], Any]) -> tuple[Any, float]:
+    """What a function returns, and the time of its fastest call [ms]."""
+    seconds, result = [], None
+    for _ in range(REPEATS):
+        began = time.perf_counter()
+        result = jax.block_until_ready(run())
+        seconds.append(time.perf_counter() - began)
+    return result, 1e3 * min(seconds)
+
+
+@jax.jit
+def _gap(poses: jax.Array, walls: Any, body: jax.Array) -> jax.Array:
+    x, y, heading = poses.T
+    vertices = walls.vertices(jnp.zeros_like(x[0]))
+    return separation(vertices, walls.present, x[None], y[None], heading, tuple(body)).min()
+
+
+def is_clear(case: Any, poses: np.ndarray, num: int = 513) -> bool:
+    """Whether the body is clear of walls at poses (N, 3), of which `num` at most are looked at."""
+    places = np.linspace(0, len(poses) - 1, num).astype(int)
+    body = jnp.asarray(body_of(case), jnp.float32)
+    return bool(_gap(jnp.asarray(poses[places], jnp.float32), case.walls, body) > 0.0)
+
+
+def row_of(cases: list, paths: list[HybridPath], ms: np.ndarray) -> Row:
+    """The row of this library's paths."""
+    found = np.array([path.found for path in paths])
+    pairs = zip(cases, paths, strict=True)
+    clear = [path.found and is_clear(case, path.poses) for case, path in pairs]
+    length = np.array([path.length for path in paths])
+    median = np.median([path.expansions for path in paths])
+    return Row(found, np.array(clear), length, ms, f"{median:.0f} expansions, median")
+
+
+def searches_of(cases: list, meetings: np.ndarray, headings: list[float | None]) -> dict[str, Row]:
+    """Rows of every heuristic; None leaves the heading free."""
+    rows = {}
+    for heuristic in HEURISTICS:
+        settings = HybridAstar(heuristic=heuristic)
+        results = [
+            fastest(
+                functools.partial(search, case, meeting, end_heading=heading, settings=settings)
+            )
+            for case, meeting, heading in zip(cases, meetings, headings, strict=True)
+        ]
+        paths, ms = zip(*results, strict=True)
+        rows[f"this library, {heuristic}"] = row_of(cases, list(paths), np.array(ms))
+    return rows
+
+
+def peer_row(cases: list, meetings: np.ndarray, headings: list[float]) -> Row:
+    """The row of fastsim-navigation."""
+    searches = []
+    for case, meeting, heading in zip(cases, meetings, headings, strict=True):
+        behind, ahead, half = body_of(case)
+        direction = np.array([np.cos(heading), np.sin(heading)])
+        corner = case.lower.astype(float) - PAD
+        size = np.ceil((case.upper + PAD - corner) / CELL - 1e-6).astype(int)
+        x, y = (corner[k] + CELL * (np.arange(size[k]) + 0.5) for k in range(2))
+        east, north = (jnp.asarray(each, jnp.float32).reshape(1, -1) for each in np.meshgrid(x, y))
+        far = distances(case.walls.vertices(np.float32(0.0)), case.walls.present, east, north)[0]
+        searches.append(
+            {
+                "start": case.start.tolist(),
+                "goal": [*(meeting - 0.5 * (behind + ahead) * direction), heading],
+                "distance": np.asarray(far).min(axis=0).reshape(size[::-1]).tolist(),
+                "corner": corner.tolist(),
+                "curvature": float(case.limits.curvature),
+                "body": [[behind, -half], [ahead, -half], [ahead, half], [behind, half]],
+            }
+        )
+    with tempfile.TemporaryDirectory() as folder:
+        results = searched(searches, Path(folder))
+    found = np.array([each["found"] for each in results])
+    paths = [np.array(each["poses"]) if each["found"] else np.zeros((1, 3)) for each in results]
+    steps = [np.diff(path[:, :2], axis=0) for path in paths]
+    length = np.array([np.hypot(*step.T).sum() for step in steps])
+    clear = [f and is_clear(case, path) for f, case, path in zip(found, cases, paths, strict=True)]
+    aborted = sum(each["aborted"] for each in results)
+    ms = np.array([each.get("ms", np.nan) for each in results])
+    return Row(found, np.array(clear), length, ms, f"{aborted} aborted")
+
+
+def say_rows(bench: Bench, suite: str, heading: str, rows: dict[str, Row]) -> None:
+    """Print a table of rows."""
+    together = np.logical_and.reduce([row.found for row in rows.values()])
+    for name, row in rows.items():
+        ms = np.nanpercentile(row.ms, [50, 95, 99]) if np.isfinite(row.ms).any() else [np.nan] * 3
+        length = row.length[together].mean() if together.any() else np.nan
+        bench.say(
+            f"| {suite} | {heading} | {name} | {100 * row.found.mean():.0f} % | "
+            f"{100 * row.clear.mean():.0f} % | {length:.3f} | "
+            f"{ms[0]:.2f} / {ms[1]:.2f} / {ms[2]:.2f} | {row.note} |"
+        )
+        figures = {"found": row.found.mean(), "clear": row.clear.mean(), "length": length, "ms": ms}
+        bench.row(suite=suite, heading=heading, planner=name, **figures)
+
+
+def say_smoothing(bench: Bench, suite: str, batch: Any, cases: list, meetings: np.ndarray) -> None:
+    """Print what smoothing does to paths that are searched with some room in the curvature."""
+    pairs = zip(cases, meetings, strict=True)
+    paths = [search(case, meeting, ROOM) for case, meeting in pairs]
+
+    @jax.jit
+    def smooth(poses: jax.Array, bends: jax.Array, length: jax.Array, case: Any) -> Any:
+        behind = -case.body.rear_overhang
+        return smooth_path(
+            *(poses, bends, length, case.walls),
+            curvature=case.limits.curvature,
+            body=(behind, behind + case.body.length, 0.5 * case.body.width),
+            lower=case.lower,
+            upper=case.upper,
+        )
+
+    results = []
+    for k, path in enumerate(paths):
+        if path.found:
+            case = jax.tree.map(lambda leaf, k=k: leaf[k], batch)
+            given = (np.float32(leaf) for leaf in (path.poses, path.curvature, path.length))
+            given = (*given, case)
+            smooth(*given)
+            found, ms = fastest(lambda given=given: smooth(*given))
+            results.append((path.length, float(found.length), bool(found.is_smooth), ms))
+    before, after, is_smooth, ms = np.array(results).T
+    times = np.percentile(ms, [50, 95, 99])
+    bench.say(
+        f"| {suite} | {len(results)} | {100 * is_smooth.mean():.0f} % | {before.mean():.3f} | "
+        f"{after.mean():.3f} | {times[0]:.2f} / {times[1]:.2f} / {times[2]:.2f} |"
+    )
+    bench.row(suite=suite, smoothed=is_smooth.mean(), before=before.mean(), after=after.mean())
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argument_parser("intercept_paths", __doc__, num=50, seed=0)
+    options = parser.parse_args()
+    with begin(parser, options) as bench:
+        bench.say(
+            f"{options.num} cases a suite, seed {options.seed}, load average "
+            f"{os.getloadavg()[0]:.1f}",
+            "",
+            "| suite | heading | search | found | clear | length [m] | p50 / p95 / p99 [ms] | |",
+            "|---|---|---|---|---|---|---|---|",
+        )
+        drawn = {}
+        for suite in SUITES:
+            batch = draw_cases(suite, options.num, options.seed)
+            meetings = positions(batch.target, np.asarray(batch.time))
+            host = jax.tree.map(np.asarray, batch)
+            cases = [jax.tree.map(lambda leaf, k=k: leaf[k], host) for k in range(options.num)]
+            drawn[suite] = (batch, cases, meetings)
+            paths = [search(case, meeting) for case, meeting in zip(cases, meetings, strict=True)]
+            rows = searches_of(cases, meetings, [None] * options.num)
+            say_rows(bench, suite, "free", rows)
+            bench.count(rows[f"this library, {HybridAstar().heuristic}"].clear)
+            # Where no path was found, any heading is as good.
+            headings = [float(path.poses[-1, 2]) if path.found else 0.0 for path in paths]
+            rows = searches_of(cases, meetings, list(headings))
+            if installed():
+                rows["fastsim-navigation"] = peer_row(cases, meetings, headings)
+            say_rows(bench, suite, "given", rows)
+        if not installed():
+            bench.say("", INSTALL)
+        bench.say(
+            "",
+            "| suite | paths | smooth | length before [m] | after [m] | p50 / p95 / p99 [ms] |",
+            "|---|---|---|---|---|---|",
+        )
+        for suite, given in drawn.items():
+            say_smoothing(bench, suite, *given)
+
+
+if __name__ == "__main__":
+    main()
