@@ -150,7 +150,7 @@ class Lattice:
                 low,
                 -(-np.array(drawn.shape[::-1]) // FINER),
                 [
-                    [_integer(drawn[i::FINER, j::FINER], stride) for j in range(FINER)]
+                    [as_integer(drawn[i::FINER, j::FINER], stride) for j in range(FINER)]
                     for i in range(FINER)
                 ],
             )
@@ -179,7 +179,7 @@ class Lattice:
             for ahead in self.ahead:
                 j, i = pad + _whole(ahead * np.array([x, y]) / _FINE)
                 is_free &= ~blocked[i::FINER, j::FINER][: self.count[1], : self.count[0]]
-            free.append(_integer(is_free, self.stride))
+            free.append(as_integer(is_free, self.stride))
         return free
 
     def _moves(self) -> tuple[np.ndarray, list, list[int]]:
@@ -220,7 +220,7 @@ class Lattice:
         """Cells at which a car of one heading touches nothing after so many half layers."""
         blocked = 0
         for stencil, shift in self.placed[half][heading]:
-            blocked |= _shifted(stencil, shift)
+            blocked |= shifted(stencil, shift)
         walls = self.walls[heading]
         return walls ^ (walls & blocked)
 
@@ -267,7 +267,7 @@ class Lattice:
         """What is reached another half layer later."""
         return [
             [
-                _shifted(plane, shift) & self.free(half + 1, heading) if plane else 0
+                shifted(plane, shift) & self.free(half + 1, heading) if plane else 0
                 for heading, (plane, shift) in enumerate(zip(row, shifts, strict=True))
             ]
             for row, shifts in zip(planes, self.shifts[half], strict=True)
@@ -330,14 +330,14 @@ class Lattice:
         return [0.5 * half * self.scene.dt, x, y, angle, self.levels[level]]
 
 
-def _integer(cells: np.ndarray, stride: int) -> int:
+def as_integer(cells: np.ndarray, stride: int) -> int:
     """Bits of cells (Y, X), the rows `stride` apart."""
     padded = np.zeros((len(cells), stride), bool)
     padded[:, : cells.shape[1]] = cells
     return int.from_bytes(np.packbits(padded, bitorder="little").tobytes(), "little")
 
 
-def _shifted(plane: int, shift: int) -> int:
+def shifted(plane: int, shift: int) -> int:
     """Bits moved up, or down."""
     return plane << shift if shift >= 0 else plane >> -shift
 
