@@ -4,6 +4,8 @@ The body's middle is taken for a point that may go in any direction at once, no 
 that gives all it has from the start, and that keeps half the body's width from everything. Cells
 here hold every such point: one that is reached in part counts in full, and one that is blocked in
 part is free. So a target that they do not meet at a layer's time cannot be met at that time.
+Obstacles are looked at after every half layer; a car's way in one is less than what half its width
+on both sides makes of the thinnest wall.
 """
 
 import numpy as np
@@ -35,31 +37,33 @@ def earliest_bound(scene: Scene) -> tuple[bool, float]:
     free = as_integer(~blocked, stride)
     stencils = [(low, drawn.shape[::-1], as_integer(drawn, stride)) for low, drawn in movers]
     plane, earliest, meets = 1 << int(first[1] * stride + first[0]), np.inf, False
-    for layer, way in enumerate(ways, 1):
+    for half, way in enumerate(ways, 1):
         plane = _grown(plane, way / CELL, stride) & free
         for velocity, (low, size, stencil) in zip(scene.velocities, stencils, strict=True):
-            moved = (velocity * layer * scene.dt - origin) / CELL
+            moved = (0.5 * velocity * half * scene.dt - origin) / CELL
             cell = np.floor(moved + 0.5).astype(int) + low
             if (cell < count).all() and (cell + size > 0).all():
                 plane ^= plane & shifted(stencil, int(cell[1] * stride + cell[0]))
-        meets = bool(plane & _goal(scene, layer, origin, count, stride))
-        earliest = min(earliest, layer * scene.dt) if meets else earliest
+        if half % 2 == 0:
+            meets = bool(plane & _goal(scene, half // 2, origin, count, stride))
+            earliest = min(earliest, 0.5 * half * scene.dt) if meets else earliest
     return meets, earliest
 
 
 def _ways(scene: Scene) -> np.ndarray:
-    """How far (L,) [m] the body's middle comes in each layer at most.
+    """How far (2 L,) [m] the body's middle comes in each half layer at most.
 
     Its speed is sqrt(v^2 + (b v kappa)^2), b ahead of the rear axle; (v kappa)^2 is the product
     of kappa and v^2 kappa, both of which have limits. It is convex in v, so that the trapezoid
     of an even rise is no less than the integral.
     """
-    times = scene.dt * np.arange(len(scene.target))
+    step = 0.5 * scene.dt
+    times = step * np.arange(2 * len(scene.target) - 1)
     v = np.minimum(scene.speed, scene.initial_speed + scene.acceleration * times)
     aside = scene.middle**2 * scene.curvature * scene.lateral_acceleration
     speed = np.sqrt(v**2 + aside)
-    rising = 0.5 * scene.dt * (speed[:-1] + speed[1:])
-    return np.where(v[1:] < scene.speed, rising, scene.dt * speed[1:])
+    rising = 0.5 * step * (speed[:-1] + speed[1:])
+    return np.where(v[1:] < scene.speed, rising, step * speed[1:])
 
 
 def _drawn(corners: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
