@@ -6,9 +6,10 @@ Nothing is shared with the planners. World frame in the plane, SI units.
 
 In a layer of `dt` a car moves for half of it, changes speed by at most one level (the greatest
 acceleration) and turns by at most as many headings as curvature and lateral acceleration allow at
-its new speed, and moves for the other half. How far a state is along its heading is rounded from
-what it adds up to since time 0, so that slow and slanted motion is not lost. The lattice begins
-at the case's start, and obstacles are held against it to 1/8 of a cell, after every half layer.
+its new speed, and moves for the other half. How far a state moves along its heading is rounded
+from what it adds up to since time 0, so that slow and slanted motion is not lost. A cell is just
+at the case's start, its heading and its speed are the nearest ones, and obstacles are held against
+the cells to 1/8 of their side, after every half layer.
 """
 
 import dataclasses
@@ -54,7 +55,9 @@ class Rules:
     """Which rounding of turns and which part of the body a lattice takes."""
 
     discs: int  # 1: half the width around the middle, inside of the body; 2: they cover the body
-    turns_up: bool  # whether a turn between two numbers of headings is the greater number
+    # Whether a limit between two numbers of headings is the greater one in every layer. If not,
+    # limits add up: over many layers a car turns by at most one heading more than it can.
+    turns_up: bool
 
 
 MINIMAL = Rules(discs=1, turns_up=True)
@@ -160,7 +163,9 @@ class Lattice:
     def _draw_walls(self) -> list[int]:
         """For each heading the cells at which the car is on the map and touches no wall."""
         scene, pad = self.scene, int(np.ceil(max(self.ahead) / _FINE)) + 1
-        fine = [self.origin[k] + _FINE * np.arange(-pad, FINER * self.count[k] + pad) for k in (0, 1)]
+        fine = [
+            self.origin[k] + _FINE * np.arange(-pad, FINER * self.count[k] + pad) for k in (0, 1)
+        ]
         blocked = np.zeros((len(fine[1]), len(fine[0])), bool)
         for corners in scene.walls:
             reach = self.radius + _FINE
@@ -182,8 +187,8 @@ class Lattice:
             free.append(as_integer(is_free, self.stride))
         return free
 
-    def _moves(self) -> tuple[np.ndarray, list, list[int]]:
-        """Speeds (S,) [m/s]; shifts of bits, by half layer, speed and heading; greatest turns."""
+    def _moves(self) -> tuple[np.ndarray, list, list]:
+        """Speeds (S,) [m/s]; shifts by half layer, speed and heading; turns by layer and speed."""
         scene = self.scene
         level = scene.acceleration * scene.dt
         levels = level * np.arange(int(scene.speed / level + 1e-6) + 1)
@@ -195,8 +200,11 @@ class Lattice:
             scene.curvature * levels, scene.lateral_acceleration / np.maximum(levels, 1e-9)
         )
         turn = rate * scene.dt * HEADINGS / (2.0 * np.pi)
-        turn = np.ceil(turn - 0.1) if self.rules.turns_up else np.floor(turn + 0.1)
-        return levels, shifts, turn.astype(int).tolist()
+        added = np.floor(turn * np.arange(self.layers + 1)[:, None] + 1e-6)
+        turns = np.diff(added, axis=0)
+        if self.rules.turns_up:
+            turns = np.broadcast_to(np.ceil(turn - 0.1), turns.shape)
+        return levels, shifts, turns.astype(int).tolist()
 
     def _place_movers(self) -> list:
         """Where movers are drawn: shifts of stencils, by half layer and heading."""
@@ -254,8 +262,9 @@ class Lattice:
                 [a | b | c for a, b, c in zip(*self._beside(planes, k), strict=True)]
                 for k in range(num)
             ]
-            turned = [_spread(row, turn) for row, turn in zip(planes, self.turns, strict=True)]
-            planes = self._moved(turned, 2 * layer + 1)
+            turns = self.turns[layer]
+            planes = [_spread(row, turn) for row, turn in zip(planes, turns, strict=True)]
+            planes = self._moved(planes, 2 * layer + 1)
             yield planes
 
     def _beside(self, planes: list[list[int]], k: int) -> list[list[int]]:
@@ -297,12 +306,12 @@ class Lattice:
         return Reach(at_end=at_end, earliest=earliest, way=way)
 
     def _way_back(self, kept: list, state: tuple[int, int, int]) -> np.ndarray:
-        """A way (2 n + 1, 5) through sets of n layers to a state; the fields are those of `Reach`."""
+        """A way (2 n + 1, 5) through sets of n layers to a state; see `Reach`."""
         rows = [self._row(2 * len(kept) - 2, state)]
         for layer in range(len(kept) - 2, -1, -1):
             bit, level, heading = state
             bit -= self.shifts[2 * layer + 1][level][heading]
-            turn = self.turns[level]
+            turn = self.turns[layer][level]
             before = [
                 (bit - self.shifts[2 * layer][slower][(heading + by) % HEADINGS], slower, by)
                 for slower in range(max(level - 1, 0), min(level + 2, len(self.levels)))
