@@ -123,7 +123,6 @@ class Lattice:
         self.direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)  # (HEADINGS, 2)
         self._lay_grid()
         self._draw_movers()
-        self.stride = self.count[0] + self.guard
         self.walls = self._draw_walls()
         self.placed = self._place_movers()
         self.levels, self.shifts, self.turns = self._moves()
@@ -138,26 +137,28 @@ class Lattice:
         self.origin = scene.start[:2] - first * CELL
 
     def _draw_movers(self) -> None:
-        """Each mover as integers, one for every place within a cell; and their width."""
-        self.stencils, widest = [], int(np.ceil(self.scene.speed * self.scene.dt / CELL)) + 2
+        """Each mover's first place, size in cells, and bits for every place within a cell."""
+        drawn = []
         for corners in self.scene.movers:
             low = np.floor((corners.min(axis=0) - self.radius) / _FINE).astype(int)
             high = np.ceil((corners.max(axis=0) + self.radius) / _FINE).astype(int)
-            x, y = (np.arange(low[axis], high[axis] + 1) * _FINE for axis in range(2))
-            self.stencils.append((low, near(x, y, corners, self.radius)))
-            widest = max(widest, -(-len(x) // FINER))
-        self.guard = widest  # columns that part the rows, so that nothing runs into the next one
-        stride = self.count[0] + widest
+            x, y = (_FINE * np.arange(low[k], high[k] + 1) for k in (0, 1))
+            drawn.append((low, near(x, y, corners, self.radius)))
+        # Columns that part the rows, so that nothing which moves runs into the next row.
+        farthest = int(np.ceil(self.scene.speed * self.scene.dt / CELL)) + 2
+        guard = max([farthest, *(-(-cells.shape[1] // FINER) for _, cells in drawn)])
+        self.stride = int(self.count[0]) + guard
+        parts = range(FINER)
         self.stencils = [
             (
                 low,
-                -(-np.array(drawn.shape[::-1]) // FINER),
+                -(-np.array(cells.shape[::-1]) // FINER),
                 [
-                    [as_integer(drawn[i::FINER, j::FINER], stride) for j in range(FINER)]
-                    for i in range(FINER)
+                    [as_integer(cells[i::FINER, j::FINER], self.stride) for j in parts]
+                    for i in parts
                 ],
             )
-            for low, drawn in self.stencils
+            for low, cells in drawn
         ]
 
     def _draw_walls(self) -> list[int]:
@@ -253,7 +254,8 @@ class Lattice:
         """What is reached after 0, 1, ... L layers, by speed and heading."""
         num, start = len(self.levels), int(self.first[1] * self.stride + self.first[0])
         planes = [[0] * HEADINGS for _ in range(num)]
-        level = min(int(_whole(self.scene.initial_speed / self.levels[1])), num - 1)
+        rise = self.scene.acceleration * self.scene.dt
+        level = min(int(_whole(self.scene.initial_speed / rise)), num - 1)
         planes[level][0] = (1 << start) & self.free(0, 0)
         yield planes
         for layer in range(self.layers):
