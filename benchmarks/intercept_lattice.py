@@ -255,7 +255,7 @@ class Lattice:
         num, start = len(self.levels), int(self.first[1] * self.stride + self.first[0])
         planes = [[0] * HEADINGS for _ in range(num)]
         rise = self.scene.acceleration * self.scene.dt
-        level = min(int(_whole(self.scene.initial_speed / rise)), num - 1)
+        level = min(int(self.scene.initial_speed / rise + 0.5), num - 1)
         planes[level][0] = (1 << start) & self.free(0, 0)
         yield planes
         for layer in range(self.layers):
