@@ -1,0 +1,363 @@
+"""What a car can reach in space and time: a lattice of pose and speed, layer by layer.
+
+A state is the rear axle's cell, one of 64 headings and a speed. All cells of one heading and speed
+are the bits of one Python integer, so that a move is a shift of it, and what is in the way a mask.
+Nothing is shared with the planners. World frame in the plane, SI units.
+
+In a layer of `dt` a car moves for half of it, changes speed by at most one level (the greatest
+acceleration) and turns by at most as many headings as curvature and lateral acceleration allow at
+its new speed, and moves for the other half. How far a state moves along its heading is rounded
+from what it adds up to since time 0, so that slow and slanted motion is not lost. A cell is just
+at the case's start, its heading and its speed are the nearest ones, and obstacles are held against
+the cells to 1/8 of their side, after every half layer.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Iterator
+
+import numpy as np
+
+CELL = 0.05  # [m], side of a cell
+HEADINGS = 64
+LAYER = 0.25  # [s], longest layer
+FINER = 4  # in how many parts a cell's side is cut where obstacles are drawn
+_FINE = CELL / FINER
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """One interception as plain numbers, with the target's places at the layers."""
+
+    start: np.ndarray  # (3,) x [m], y [m] of the rear axle's middle and heading [rad]
+    initial_speed: float  # [m/s]
+    dt: float  # [s], of a layer; the last one of L ends at the case's time
+    target: np.ndarray  # (L + 1, 2) [m]
+    tolerance: float  # [m]
+    end_heading: float  # [rad]
+    heading_tolerance: float  # [rad]
+    walls: tuple[np.ndarray, ...]  # corners (V, 2) [m] each, counter-clockwise
+    movers: tuple[np.ndarray, ...]  # likewise, at time 0
+    velocities: np.ndarray  # (M, 2) [m/s], of the movers
+    lower: np.ndarray  # (2,) [m], of the map, which the body's middle does not leave
+    upper: np.ndarray  # (2,) [m]
+    length: float  # [m], of the body
+    width: float  # [m]
+    middle: float  # [m], from the rear axle to the body's middle
+    speed: float  # [m/s], greatest
+    acceleration: float  # [m/s^2], greatest
+    lateral_acceleration: float  # [m/s^2], greatest
+    curvature: float  # [1/m], greatest
+
+
+@dataclasses.dataclass(frozen=True)
+class Rules:
+    """Which rounding of turns and which part of the body a lattice takes."""
+
+    discs: int  # 1: half the width around the middle, inside of the body; 2: they cover the body
+    # Whether a limit between two numbers of headings is the greater one in every layer. If not,
+    # limits add up: over many layers a car turns by at most one heading more than it can.
+    turns_up: bool
+
+
+MINIMAL = Rules(discs=1, turns_up=True)
+STRICT = Rules(discs=2, turns_up=False)
+
+
+@dataclasses.dataclass(frozen=True)
+class Reach:
+    """What a lattice says of one scene."""
+
+    at_end: bool  # whether the target can be met at the case's time
+    earliest: float  # [s], first layer at which it can be met; inf if there is none
+    way: np.ndarray | None  # (2 n + 1, 5): time, x, y, heading, speed at half layers, if asked
+
+
+def footprint(scene: Scene, rules: Rules) -> tuple[list[float], float]:
+    """Where discs are ahead of the rear axle [m], and their radius [m]."""
+    half = 0.5 * scene.width
+    if rules.discs == 1:
+        return [scene.middle], half
+    part = 0.5 * scene.length / rules.discs
+    ahead = part * (2 * np.arange(rules.discs) + 1 - rules.discs)
+    return (scene.middle + ahead).tolist(), float(np.hypot(part, half))
+
+
+def near(x: np.ndarray, y: np.ndarray, corners: np.ndarray, radius: float) -> np.ndarray:
+    """Whether (Y, X) points of a grid are within a radius [m] of a convex polygon.
+
+    Args:
+        x: (X,) [m].
+        y: (Y,) [m].
+        corners: (V, 2) [m], counter-clockwise; they may be repeated.
+        radius: [m].
+    """
+    inside = np.ones((len(y), len(x)), bool)
+    close = np.zeros_like(inside)
+    for (ax, ay), (bx, by) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        ex, ey = bx - ax, by - ay
+        square = ex**2 + ey**2
+        from_x, from_y = x - ax, (y - ay)[:, None]
+        inside &= ex * from_y >= ey * from_x
+        along = ex * from_x + ey * from_y
+        share = np.clip(along / square, 0.0, 1.0) if square > 1e-12 else 0.0 * along
+        close |= (from_x - share * ex) ** 2 + (from_y - share * ey) ** 2 <= radius**2
+    return inside | close
+
+
+def _whole(value: np.ndarray) -> np.ndarray:
+    """The nearest whole numbers; halves go up, wherever they are."""
+    return np.floor(value + 0.5).astype(int)
+
+
+class Lattice:
+    """The lattice of one scene and one set of rules."""
+
+    def __init__(self, scene: Scene, rules: Rules):
+        if not np.isfinite([*scene.lower, *scene.upper, scene.speed, scene.acceleration]).all():
+            raise ValueError("the map, the speed and the acceleration must be finite")
+        self.scene, self.rules = scene, rules
+        self.layers = len(scene.target) - 1
+        self.ahead, self.radius = footprint(scene, rules)
+        angle = scene.start[2] + 2.0 * np.pi * np.arange(HEADINGS) / HEADINGS
+        self.direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)  # (HEADINGS, 2)
+        self._lay_grid()
+        self._draw_movers()
+        self.walls = self._draw_walls()
+        self.placed = self._place_movers()
+        self.levels, self.shifts, self.turns = self._moves()
+        self.free = functools.cache(self._free)
+
+    def _lay_grid(self) -> None:
+        """Cells that hold every place of the rear axle, one of them just at the start."""
+        scene = self.scene
+        first = np.ceil((scene.start[:2] - scene.lower + scene.middle) / CELL).astype(int)
+        last = np.ceil((scene.upper + scene.middle - scene.start[:2]) / CELL).astype(int)
+        self.first, self.count = first, first + last + 1
+        self.origin = scene.start[:2] - first * CELL
+
+    def _draw_movers(self) -> None:
+        """Each mover's first place, size in cells, and bits for every place within a cell."""
+        drawn = []
+        for corners in self.scene.movers:
+            low = np.floor((corners.min(axis=0) - self.radius) / _FINE).astype(int)
+            high = np.ceil((corners.max(axis=0) + self.radius) / _FINE).astype(int)
+            x, y = (_FINE * np.arange(low[k], high[k] + 1) for k in (0, 1))
+            drawn.append((low, near(x, y, corners, self.radius)))
+        # Columns that part the rows, so that nothing which moves runs into the next row.
+        farthest = int(np.ceil(self.scene.speed * self.scene.dt / CELL)) + 2
+        guard = max([farthest, *(-(-cells.shape[1] // FINER) for _, cells in drawn)])
+        self.stride = int(self.count[0]) + guard
+        parts = range(FINER)
+        self.stencils = [
+            (
+                low,
+                -(-np.array(cells.shape[::-1]) // FINER),
+                [
+                    [as_integer(cells[i::FINER, j::FINER], self.stride) for j in parts]
+                    for i in parts
+                ],
+            )
+            for low, cells in drawn
+        ]
+
+    def _draw_walls(self) -> list[int]:
+        """For each heading the cells at which the car is on the map and touches no wall."""
+        scene, pad = self.scene, int(np.ceil(max(self.ahead) / _FINE)) + 1
+        fine = [
+            self.origin[k] + _FINE * np.arange(-pad, FINER * self.count[k] + pad) for k in (0, 1)
+        ]
+        blocked = np.zeros((len(fine[1]), len(fine[0])), bool)
+        for corners in scene.walls:
+            reach = self.radius + _FINE
+            box = [
+                slice(*np.searchsorted(axis, [low - reach, high + reach]))
+                for axis, low, high in zip(fine, corners.min(0), corners.max(0), strict=True)
+            ]
+            blocked[box[1], box[0]] |= near(fine[0][box[0]], fine[1][box[1]], corners, self.radius)
+        free = []
+        columns, rows = (self.origin[k] + CELL * np.arange(self.count[k]) for k in (0, 1))
+        for x, y in self.direction:
+            at_x, at_y = columns + scene.middle * x, rows + scene.middle * y
+            is_free = ((at_y >= scene.lower[1]) & (at_y <= scene.upper[1]))[:, None] & (
+                (at_x >= scene.lower[0]) & (at_x <= scene.upper[0])
+            )
+            for ahead in self.ahead:
+                j, i = pad + _whole(ahead * np.array([x, y]) / _FINE)
+                is_free &= ~blocked[i::FINER, j::FINER][: self.count[1], : self.count[0]]
+            free.append(as_integer(is_free, self.stride))
+        return free
+
+    def _moves(self) -> tuple[np.ndarray, list, list]:
+        """Speeds (S,) [m/s]; shifts by half layer, speed and heading; turns by layer and speed."""
+        scene = self.scene
+        level = scene.acceleration * scene.dt
+        levels = level * np.arange(int(scene.speed / level + 1e-6) + 1)
+        half = 0.5 * scene.dt * levels[:, None, None] * self.direction / CELL  # (S, HEADINGS, 2)
+        passed = _whole(half * np.arange(2 * self.layers + 1)[:, None, None, None])
+        steps = np.diff(passed, axis=0)
+        shifts = (steps[..., 1] * self.stride + steps[..., 0]).tolist()
+        rate = np.minimum(
+            scene.curvature * levels, scene.lateral_acceleration / np.maximum(levels, 1e-9)
+        )
+        turn = rate * scene.dt * HEADINGS / (2.0 * np.pi)
+        added = np.floor(turn * np.arange(self.layers + 1)[:, None] + 1e-6)
+        turns = np.diff(added, axis=0)
+        if self.rules.turns_up:
+            turns = np.broadcast_to(np.ceil(turn - 0.1), turns.shape)
+        return levels, shifts, turns.astype(int).tolist()
+
+    def _place_movers(self) -> list:
+        """Where movers are drawn: shifts of stencils, by half layer and heading."""
+        scene, num = self.scene, 2 * self.layers + 1
+        times = 0.5 * scene.dt * np.arange(num)
+        drawn: list[list[list]] = [[[] for _ in range(HEADINGS)] for _ in range(num)]
+        for velocity, (low, size, stencil) in zip(scene.velocities, self.stencils, strict=True):
+            for ahead in self.ahead:
+                place = (velocity * times[:, None] - self.origin)[:, None] - ahead * self.direction
+                place = _whole(place / _FINE) + low
+                cell = -(-place // FINER)
+                within = FINER * cell - place
+                shift = cell[..., 1] * self.stride + cell[..., 0]
+                seen = ((cell < self.count) & (cell + size > 0)).all(axis=2)
+                for half, heading in np.argwhere(seen).tolist():
+                    j, i = within[half, heading]
+                    drawn[half][heading].append((stencil[i][j], int(shift[half, heading])))
+        return drawn
+
+    def _free(self, half: int, heading: int) -> int:
+        """Cells at which a car of one heading touches nothing after so many half layers."""
+        blocked = 0
+        for stencil, shift in self.placed[half][heading]:
+            blocked |= shifted(stencil, shift)
+        walls = self.walls[heading]
+        return walls ^ (walls & blocked)
+
+    def _goal(self, layer: int) -> list[int]:
+        """For each heading the cells at which the body's middle is at the target."""
+        scene = self.scene
+        reach = scene.tolerance + CELL * np.sqrt(0.5)
+        place = (scene.target[layer] - self.origin - scene.middle * self.direction) / CELL
+        side = np.arange(-int(reach / CELL) - 1, int(reach / CELL) + 2)
+        cells = np.stack(np.meshgrid(side, side), axis=2).reshape(-1, 2) + _whole(place)[:, None]
+        meets = np.linalg.norm(cells - place[:, None], axis=2) * CELL <= reach
+        meets &= ((cells >= 0) & (cells < self.count)).all(axis=2)
+        angle = scene.start[2] - scene.end_heading + 2.0 * np.pi * np.arange(HEADINGS) / HEADINGS
+        off = np.abs(np.arctan2(np.sin(angle), np.cos(angle)))
+        meets &= (off <= scene.heading_tolerance + np.pi / HEADINGS)[:, None]
+        bits = cells[..., 1] * self.stride + cells[..., 0]
+        return [
+            sum(1 << int(bit) for bit in row[hits]) for row, hits in zip(bits, meets, strict=True)
+        ]
+
+    def sets(self) -> Iterator[list[list[int]]]:
+        """What is reached after 0, 1, ... L layers, by speed and heading."""
+        num, start = len(self.levels), int(self.first[1] * self.stride + self.first[0])
+        planes = [[0] * HEADINGS for _ in range(num)]
+        rise = self.scene.acceleration * self.scene.dt
+        level = min(int(self.scene.initial_speed / rise + 0.5), num - 1)
+        planes[level][0] = (1 << start) & self.free(0, 0)
+        yield planes
+        for layer in range(self.layers):
+            planes = self._moved(planes, 2 * layer)
+            planes = [
+                [a | b | c for a, b, c in zip(*self._beside(planes, k), strict=True)]
+                for k in range(num)
+            ]
+            turns = self.turns[layer]
+            planes = [_spread(row, turn) for row, turn in zip(planes, turns, strict=True)]
+            planes = self._moved(planes, 2 * layer + 1)
+            yield planes
+
+    def _beside(self, planes: list[list[int]], k: int) -> list[list[int]]:
+        """What is reached with a speed, and with the next lower and the next higher one."""
+        last = len(planes) - 1
+        return [planes[max(k - 1, 0)], planes[k], planes[min(k + 1, last)]]
+
+    def _moved(self, planes: list[list[int]], half: int) -> list[list[int]]:
+        """What is reached another half layer later."""
+        return [
+            [
+                shifted(plane, shift) & self.free(half + 1, heading) if plane else 0
+                for heading, (plane, shift) in enumerate(zip(row, shifts, strict=True))
+            ]
+            for row, shifts in zip(planes, self.shifts[half], strict=True)
+        ]
+
+    def meets(self, planes: list[list[int]], layer: int) -> list[tuple[int, int, int]]:
+        """A cell's bit, level and heading of states that meet the target, one a plane."""
+        goal = self._goal(layer)
+        found = [
+            (plane & goal[heading], level, heading)
+            for level, row in enumerate(planes)
+            for heading, plane in enumerate(row)
+        ]
+        return [(bits.bit_length() - 1, level, h) for bits, level, h in found if bits]
+
+    def reach(self, keep_way: bool = False) -> Reach:
+        """Whether and when the target can be met, with the way to the earliest meeting if asked."""
+        earliest, at_end, kept, way = np.inf, False, [], None
+        for layer, planes in enumerate(self.sets()):
+            if keep_way and way is None:
+                kept.append(planes)
+            found = self.meets(planes, layer) if layer else []
+            at_end = bool(found)
+            if found and np.isinf(earliest):
+                earliest = layer * self.scene.dt
+                way = self._way_back(kept, found[0]) if keep_way else None
+        return Reach(at_end=at_end, earliest=earliest, way=way)
+
+    def _way_back(self, kept: list, state: tuple[int, int, int]) -> np.ndarray:
+        """A way (2 n + 1, 5) through sets of n layers to a state; see `Reach`."""
+        rows = [self._row(2 * len(kept) - 2, state)]
+        for layer in range(len(kept) - 2, -1, -1):
+            bit, level, heading = state
+            bit -= self.shifts[2 * layer + 1][level][heading]
+            turn = self.turns[layer][level]
+            before = [
+                (bit - self.shifts[2 * layer][slower][(heading + by) % HEADINGS], slower, by)
+                for slower in range(max(level - 1, 0), min(level + 2, len(self.levels)))
+                for by in range(-turn, turn + 1)
+            ]
+            options = [
+                (abs(by) + abs(slower - level), at, slower, (heading + by) % HEADINGS)
+                for at, slower, by in before
+                if at >= 0
+                and kept[layer][slower][(heading + by) % HEADINGS] >> at & 1
+                and self.free(2 * layer + 1, (heading + by) % HEADINGS) >> bit & 1
+            ]
+            _, at, slower, turned = min(options)
+            rows.append(self._row(2 * layer + 1, (bit, slower, turned)))
+            state = (at, slower, turned)
+            rows.append(self._row(2 * layer, state))
+        return np.array(rows[::-1])
+
+    def _row(self, half: int, state: tuple[int, int, int]) -> list[float]:
+        """Time [s], x [m], y [m], heading [rad] and speed [m/s] of a state."""
+        bit, level, heading = state
+        row, column = divmod(bit, self.stride)
+        x, y = self.origin + CELL * np.array([column, row])
+        angle = self.scene.start[2] + 2.0 * np.pi * heading / HEADINGS
+        return [0.5 * half * self.scene.dt, x, y, angle, self.levels[level]]
+
+
+def as_integer(cells: np.ndarray, stride: int) -> int:
+    """Bits of cells (Y, X), the rows `stride` apart."""
+    padded = np.zeros((len(cells), stride), bool)
+    padded[:, : cells.shape[1]] = cells
+    return int.from_bytes(np.packbits(padded, bitorder="little").tobytes(), "little")
+
+
+def shifted(plane: int, shift: int) -> int:
+    """Bits moved up, or down."""
+    return plane << shift if shift >= 0 else plane >> -shift
+
+
+def _spread(row: list[int], turn: int) -> list[int]:
+    """What is in each plane of a ring or in up to `turn` beside it, by doubling."""
+    wanted, width, spread = 2 * turn + 1, 1, row  # spread[h] holds row[h] to row[h + width - 1]
+    while width < wanted:
+        step = min(width, wanted - width)
+        spread = [spread[h] | spread[(h + step) % HEADINGS] for h in range(HEADINGS)]
+        width += step
+    return spread[-turn:] + spread[:-turn] if turn else spread

@@ -1,0 +1,195 @@
+"""Which interceptions of a suite can be solved at all, and how early their targets can be met.
+
+    python -m benchmarks.intercept_oracle [--suite hard] [--num 200] [--seed 1] [--first 0]
+        [--workers N] [--out FILE.npz]
+
+It shares no code with the planners. Three searches in space and time answer for each case whether
+the target can be met at the case's time, and which is the earliest layer, of 0.25 s, to meet it:
+
+* `strict`: a lattice of pose and speed (`intercept_lattice`) where two discs that cover the body
+  keep off everything. What it reaches is feasible up to the grid: a cell is 0.05 m, a heading
+  5.6 degrees, obstacles are looked at every 0.125 s, and nobody looks at the steering rate.
+* `minimal`: the same lattice where one disc inside of the body does, and turns are rounded up in
+  every layer. But for the rounding of cells, which closes ways as well as it opens some, it
+  reaches what any car reaches. That it does not reach a target is strong evidence, no proof.
+* `bound`: a point that goes in any direction, no faster than the car (`intercept_bound`). It is
+  sound: no car meets a target at the time of a layer at which this point does not.
+
+So a case is proven infeasible where `bound` fails; where `minimal` fails, it is so in all
+likelihood; where `strict` succeeds, it can be solved up to the grid. What is between `minimal` and
+`strict` is open. Planners are to be judged on what is not infeasible. Meetings are looked at with
+the case's tolerance, in lattices half a diagonal of a cell more, at the times of layers alone.
+"""
+
+import argparse
+import multiprocessing
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+import numpy as np
+from tqdm import tqdm
+
+import planner_jax as pj
+from planner_jax.benchmarks.intercept_bound import earliest_bound
+from planner_jax.benchmarks.intercept_lattice import LAYER, MINIMAL, STRICT, Lattice, Scene
+from planner_jax.benchmarks.run import Bench, at_least
+from planner_jax.plane.obstacles import Obstacles
+from planner_jax.plane.target import PlanePath
+from planner_jax.task.intercept.card import SUITES
+from planner_jax.task.intercept.case import InterceptCase
+
+SEARCHES = ("bound", "minimal", "strict")
+
+
+def scenes(cases: InterceptCase) -> list[Scene]:
+    """The cases of a batch as plain numbers."""
+    ends = np.asarray(cases.time, float)
+    layers = np.maximum(np.ceil(ends / LAYER - 1e-6), 1).astype(int)
+    times = ends[:, None] / layers[:, None] * np.arange(layers.max() + 1)
+    with jax.enable_x64(True):
+        cases = jax.tree.map(
+            lambda leaf: np.asarray(leaf, bool if leaf.dtype == bool else float), cases
+        )
+        targets = np.asarray(_places(cases.target, times))
+    found = []
+    for k, (num, places) in enumerate(zip(layers, targets, strict=True)):
+        one = jax.tree.map(lambda leaf, k=k: leaf[k], cases)
+        movers, velocities = _polygons(one.movers)
+        found.append(
+            Scene(
+                start=one.start,
+                initial_speed=float(one.speed),
+                dt=float(ends[k] / num),
+                target=places[: num + 1],
+                tolerance=float(one.tolerance),
+                end_heading=float(one.end_heading),
+                heading_tolerance=float(one.heading_tolerance),
+                walls=_polygons(one.walls)[0],
+                movers=movers,
+                velocities=velocities,
+                lower=one.lower,
+                upper=one.upper,
+                length=float(one.body.length),
+                width=float(one.body.width),
+                middle=float(one.body.middle),
+                speed=float(one.limits.speed),
+                acceleration=float(one.limits.acceleration),
+                lateral_acceleration=float(one.limits.lateral_acceleration),
+                curvature=float(one.limits.curvature),
+            )
+        )
+    return found
+
+
+@jax.jit
+@jax.vmap
+def _places(path: PlanePath, times: jax.Array) -> jax.Array:
+    """Where a target is at times (T,) [s], (T, 2) [m]."""
+    return jax.vmap(lambda time: path.at(time).pos)(times)
+
+
+def _polygons(group: Obstacles) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
+    """Corners (V, 2) [m] of those that are present, and their velocities (N, 2) [m/s]."""
+    corners, present = group.vertices(0.0), np.asarray(group.present)
+    return tuple(np.asarray(corners)[present]), np.asarray(group.velocity)[present]
+
+
+def search(scene: Scene) -> tuple[list[bool], list[float]]:
+    """Of each of `SEARCHES`, whether there is a meeting at the case's time; the earliest [s]."""
+    of_bound = earliest_bound(scene)
+    reaches = [Lattice(scene, rules).reach() for rules in (MINIMAL, STRICT)]
+    found = [of_bound, *((reach.at_end, reach.earliest) for reach in reaches)]
+    return [at_end for at_end, _ in found], [earliest for _, earliest in found]
+
+
+def search_all(found: list[Scene], workers: int) -> tuple[np.ndarray, np.ndarray]:
+    """Of B scenes whether (B, 3) they can be solved at their time, and the earliest (B, 3) [s]."""
+
+    def gathered(results: Iterator) -> tuple[np.ndarray, np.ndarray]:
+        pairs = list(tqdm(results, total=len(found), unit="case"))
+        return np.array([pair[0] for pair in pairs]), np.array([pair[1] for pair in pairs])
+
+    if workers == 1:
+        return gathered(map(search, found))
+    with multiprocessing.get_context("spawn").Pool(workers) as pool:
+        return gathered(pool.imap(search, found))
+
+
+def listed(indices: np.ndarray) -> str:
+    """Places of cases, as text."""
+    return ", ".join(map(str, indices)) or "none"
+
+
+def report(bench: Bench, index: np.ndarray, at_end: np.ndarray, earliest: np.ndarray) -> None:
+    """Say what was found of B cases: at their time (B, 3), and the earliest (B, 3) [s]."""
+    bench.say(
+        "| search | solved at the case's time | at any time up to it | earliest median | p95 "
+        "| not at the case's time |",
+        "|---|---|---|---|---|---|",
+    )
+    for k, name in enumerate(SEARCHES):
+        median, late = np.quantile(earliest[:, k], (0.5, 0.95), method="higher")
+        bench.say(
+            f"| {name} | {100 * at_end[:, k].mean():.1f} % "
+            f"| {100 * np.isfinite(earliest[:, k]).mean():.1f} % | {median:.2f} s | {late:.2f} s "
+            f"| {listed(index[~at_end[:, k]])} |"
+        )
+        bench.note(
+            **{
+                f"{name}_at_end": at_end[:, k].mean(),
+                f"{name}_earliest_median": median,
+                f"{name}_earliest_p95": late,
+            }
+        )
+    same = at_end[:, 1] == at_end[:, 2]
+    both = np.isfinite(earliest).all(axis=1)
+    gaps = np.diff(earliest[both], axis=1)
+    bench.say(
+        "",
+        f"minimal and strict agree on {100 * same.mean():.1f} %; strict is later by "
+        f"{gaps[:, 1].mean() if both.any() else np.nan:.2f} s, minimal than the bound by "
+        f"{gaps[:, 0].mean() if both.any() else np.nan:.2f} s (means of those met).",
+    )
+    bench.note(agreement=same.mean())
+    bench.count(at_end[:, SEARCHES.index("strict")])
+
+
+def main() -> None:
+    """Search one suite's cases."""
+    parser = argparse.ArgumentParser(
+        "python -m benchmarks.intercept_oracle", description=(__doc__ or "").partition("\n")[0]
+    )
+    add = parser.add_argument
+    add("--suite", choices=SUITES, default="hard")
+    for name, least, default in (("num", 1, 200), ("seed", 0, 1), ("first", 0, 0)):
+        add(f"--{name}", type=at_least(least), default=default, help=f"default: {default}")
+    add("--workers", type=at_least(1), default=os.cpu_count(), help="default: one a core")
+    add("--out", type=Path, help="an .npz file for what is found of every case")
+    options = parser.parse_args()
+    with Bench("intercept_oracle", vars(options)) as bench:
+        cases = pj.intercept.draw(options.num, options.suite, options.seed, first=options.first)
+        began = time.perf_counter()
+        at_end, earliest = search_all(scenes(cases), options.workers)
+        seconds = time.perf_counter() - began
+        index = options.first + np.arange(options.num)
+        bench.say(
+            f"{options.suite}, seed {options.seed}, cases {index[0]} to {index[-1]}: "
+            f"{seconds:.0f} s with {options.workers} processes",
+            "",
+        )
+        report(bench, index, at_end, earliest)
+        found: dict[str, np.ndarray] = {}
+        found |= {f"{name}_at_end": at_end[:, k] for k, name in enumerate(SEARCHES)}
+        found |= {f"{name}_earliest": earliest[:, k] for k, name in enumerate(SEARCHES)}
+        times = np.asarray(cases.time, float)
+        found |= {"suite": np.array(options.suite), "seed": np.array(options.seed)}
+        found |= {"index": index, "time": times}
+        for path in [bench.path / "oracle.npz", *([options.out] if options.out else [])]:
+            np.savez(path, allow_pickle=False, **found)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,179 @@
+"""The oracle of interceptions: what it says agrees with closed forms, and with the referee."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import planner_jax as pj
+from planner_jax.benchmarks.intercept_bound import earliest_bound
+from planner_jax.benchmarks.intercept_lattice import (
+    CELL,
+    HEADINGS,
+    LAYER,
+    MINIMAL,
+    STRICT,
+    Lattice,
+)
+from planner_jax.benchmarks.intercept_oracle import scenes, search
+from planner_jax.referee.clearance import clearances
+
+START, SPEED, TOP, ACCELERATION, MIDDLE, TOLERANCE = (0.8, 4.0, 0.0), 0.5, 1.5, 1.0, 0.15, 0.05
+
+both = pytest.mark.parametrize("rules", [MINIMAL, STRICT], ids=["minimal", "strict"])
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    """Three cases of many movers."""
+    return scenes(pj.intercept.draw(3, "storm", 4))
+
+
+def scene(pos, vel=(0.0, 0.0), time=5.0, **more):
+    leaves = (jnp.asarray(leaf, jnp.float32) for leaf in (pos, vel, 0.0))
+    one = pj.intercept.case(pj.TurningPath(*leaves), time, start=START, initial_speed=SPEED, **more)
+    return scenes(jax.tree.map(lambda leaf: leaf[None], one))[0]
+
+
+def box(left, low, right, high):
+    return np.array([[left, low], [right, low], [right, high], [left, high]])
+
+
+def gate(closing, time=6.0):
+    """A wall with a gap straight ahead, and a mover that shuts it from the side."""
+    return scene(
+        (6.0, 4.0),
+        time=time,
+        walls=[box(3.0, 0.0, 3.2, 3.5), box(3.0, 4.5, 3.2, 8.0)],
+        movers=[box(2.95, -1.6, 3.25, 3.4)],
+        mover_velocities=(0.0, closing),
+    )
+
+
+def distance(scene, points, times):
+    """Of points (P, 2) from the nearest wall or mover at times (P,)."""
+    polygons = np.array([*scene.walls, *scene.movers])
+    centre = polygons.mean(axis=1)
+    velocity = np.concatenate([np.zeros((len(scene.walls), 2)), scene.velocities])
+    group = {"corners": polygons - centre[:, None], "present": np.ones(len(polygons), bool)}
+    group |= {"centre": centre, "velocity": velocity}
+    group = {
+        name: np.broadcast_to(leaf, (len(points), *leaf.shape)) for name, leaf in group.items()
+    }
+    poses = np.concatenate([points, np.zeros((len(points), 1))], axis=1)[:, None]
+    return clearances(group, np.zeros((len(points), 2)), times[:, None], poses)[0]
+
+
+@both
+@pytest.mark.parametrize("away", [0.1, 0.45])
+def test_on_an_open_map_a_chase_takes_as_long_as_its_closed_form(rules, away):
+    """A target that flees straight ahead, and is caught up with at the difference of speeds."""
+    ahead, times = 1.0, np.linspace(0.0, 6.0, 60001)
+    rising = np.minimum(times, (TOP - SPEED) / ACCELERATION)
+    driven = SPEED * rising + 0.5 * ACCELERATION * rising**2 + TOP * (times - rising)
+    exact = times[np.argmax(ahead + away * times - MIDDLE - driven <= TOLERANCE)]
+    chase = scene((START[0] + ahead, START[1]), (away, 0.0))
+    cell = CELL * (1.0 + np.sqrt(0.5)) / (TOP - away)
+    assert exact - cell <= Lattice(chase, rules).reach().earliest <= exact + cell + LAYER
+    assert exact - 0.1 * exact <= earliest_bound(chase)[1] <= exact + LAYER
+
+
+@both
+def test_to_a_place_at_the_side_a_car_goes_no_shorter_than_an_arc_and_a_tangent(rules):
+    """At top speed the lateral acceleration bounds the curvature; braking takes as long."""
+    found = Lattice(scene((START[0] + MIDDLE, START[1] + 2.0)), rules).reach()
+    straight = earliest_bound(scene((START[0] + MIDDLE, START[1] + 2.0)))[1]
+    quarter = 0.5 * np.pi / np.sqrt(0.8 * 2.0)  # [s], at the greatest yaw rate there is
+    assert max(straight, quarter) < found.earliest < 5.0
+
+
+@both
+def test_through_a_wall_across_the_whole_map_there_is_no_way(rules):
+    parted = scene((6.0, 4.0), walls=[box(3.0, -0.5, 3.1, 8.5)])
+    found = Lattice(parted, rules).reach()
+    assert not found.at_end and found.earliest == np.inf
+    assert earliest_bound(parted) == (False, np.inf)
+
+
+@both
+def test_a_gate_is_passed_before_it_closes_and_not_after(rules):
+    slow, fast = (Lattice(gate(closing), rules).reach() for closing in (0.1, 1.0))
+    assert slow.at_end and not fast.at_end and fast.earliest == np.inf
+    assert slow.earliest == Lattice(gate(0.0), rules).reach().earliest
+    assert earliest_bound(gate(0.1))[0] and not earliest_bound(gate(1.0))[0]
+
+
+def test_a_gap_narrower_than_the_body_is_passed_by_no_one_and_a_tight_one_by_the_inner_disc():
+    def gap(width):
+        walls = [box(3.0, 0.0, 3.2, 4.0 - width / 2), box(3.0, 4.0 + width / 2, 3.2, 8.0)]
+        return search(scene((6.0, 4.0), walls=walls))[0]
+
+    assert gap(0.2) == [False, False, False]
+    assert gap(0.3) == [True, True, False]
+    assert gap(0.45) == [True, True, True]
+
+
+def test_a_target_that_comes_near_too_early_or_too_late_is_not_met_at_the_end():
+    """Met on its way, but out of reach when the case ends."""
+    passing = scene((1.8, 4.0), (1.6, 0.0), time=3.5)
+    for rules in (MINIMAL, STRICT):
+        assert not Lattice(passing, rules).reach().at_end
+    waiting = scene((1.8, 4.0), time=3.5)
+    found = Lattice(waiting, STRICT).reach()
+    assert found.at_end and found.earliest < 1.1
+
+
+@both
+def test_what_is_free_is_free_by_the_referee(drawn, rules):
+    """Cells, headings and times at random: discs against exact distances."""
+    random, one = np.random.default_rng(0), drawn[0]
+    lattice = Lattice(one, rules)
+    half = random.integers(0, 2 * lattice.layers + 1, 300)
+    heading = random.integers(0, HEADINGS, 300)
+    cells = random.integers(0, lattice.count, (300, 2))
+    free = [
+        lattice.free(h, k) >> int(row * lattice.stride + column) & 1
+        for h, k, (column, row) in zip(half, heading, cells, strict=True)
+    ]
+    rear, way = lattice.origin + CELL * cells, lattice.direction[heading]
+    times = 0.5 * half * one.dt
+    room = np.min([distance(one, rear + a * way, times) for a in lattice.ahead], axis=0)
+    middle = rear + one.middle * way
+    on_map = np.minimum(middle - one.lower, one.upper - middle).min(axis=1)
+    margin = np.minimum(room - lattice.radius, on_map)
+    clear = np.abs(margin) > CELL / 4
+    assert (margin > 0.0)[clear].any() and (margin < 0.0)[clear].any() and clear.sum() > 250
+    np.testing.assert_array_equal(np.array(free, bool)[clear], (margin > 0.0)[clear])
+
+
+def test_a_way_leads_from_the_start_to_the_target_within_the_limits_and_touches_nothing(drawn):
+    for one in (*drawn[:2], gate(0.1)):
+        found = Lattice(one, STRICT).reach(keep_way=True)
+        assert found.way is not None
+        time, x, y, heading, speed = found.way.T
+        np.testing.assert_allclose([x[0], y[0], heading[0]], one.start, atol=1e-9)
+        assert time[-1] == found.earliest
+        places = np.stack([x, y], axis=1)
+        middle = places + MIDDLE * np.stack([np.cos(heading), np.sin(heading)], axis=1)
+        layer = round(found.earliest / one.dt)
+        assert np.linalg.norm(middle[-1] - one.target[layer]) <= TOLERANCE + CELL
+        assert np.abs(np.diff(speed[::2])).max() <= ACCELERATION * one.dt + 1e-9
+        turned = np.abs(np.angle(np.exp(1j * np.diff(heading[::2]))))
+        slack = 2.0 * np.pi / HEADINGS
+        assert (turned <= 2.0 * speed[2::2] * one.dt + slack).all()
+        assert (turned * speed[2::2] <= 0.8 * one.dt + slack * speed[2::2]).all()
+        steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
+        assert (np.abs(steps - 0.5 * one.dt * speed[1:]) <= np.sqrt(2.0) * CELL).all()
+        assert distance(one, middle, time).min() > 0.125 - CELL / 4
+
+
+def test_the_bound_is_no_later_than_the_inner_disc_and_that_no_later_than_the_whole_body(drawn):
+    at_end, earliest = search(drawn[2])
+    assert earliest == sorted(earliest) and at_end == [True] * 3
+
+
+def test_a_map_without_bounds_is_an_error():
+    with pytest.raises(ValueError, match="must be finite"):
+        Lattice(replace(scene((2.0, 4.0)), upper=np.array([np.inf, 8.0])), MINIMAL)
