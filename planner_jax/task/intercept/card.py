@@ -52,5 +52,6 @@ TASK = Task(
     home="planner_jax.task.intercept",
     planners={"spacetime": "planner_jax.task.intercept.spacetime:SpacetimeIntercept"},
     suites={name: suite.description for name, suite in SUITES.items()},
+    flight="planner_jax.sims.settings:InterceptFly",
     contact="time",
 )
