@@ -28,7 +28,7 @@ _TRUST = 0.1  # share of what a shown pose differs that is believed, at every st
 
 @dataclasses.dataclass(frozen=True)
 class DriveLoop:
-    """Everything that shapes a drive's program; static under jit.
+    """World and sensing of a drive; static under jit. Noise alone compiles nothing anew.
 
     Raises:
         ValueError: a frame or the latency is not a whole number of steps.
@@ -48,18 +48,7 @@ class DriveLoop:
     @property
     def car(self) -> Car:
         """The robot."""
-        assert isinstance(self.world.robot, Car)
-        return self.world.robot
-
-    @property
-    def frame_rate(self) -> int:
-        """[Hz]."""
-        return FRAME_RATE
-
-    @property
-    def steps_per_frame(self) -> int:
-        """Physics steps from frame to frame."""
-        return round(1.0 / (FRAME_RATE * self.world.timestep))
+        return _car(self.world)
 
     @property
     def late_steps(self) -> int:
@@ -80,6 +69,7 @@ class DriveState:
     squared_tracking: Array  # () [m^2 s]
     saturated: Array  # (2,) [s], how long more was asked than drive and steering can do
     time: Array  # () [s]
+    pose_stds: Array  # (2,), errors of a shown coordinate [m] and heading [rad]
     key: Array
 
 
@@ -90,6 +80,11 @@ class Frame:
     time: Array  # () [s]
     pose: Array  # (3,) x, y [m] of the rear axle's middle and heading [rad]
     wanted: Array  # (2,) [m], where the plan has it
+
+
+def _car(world: World) -> Car:
+    assert isinstance(world.robot, Car)  # a `DriveLoop` has seen to it
+    return world.robot
 
 
 def reckoned(pose: Array, speed: Array, curvature: Array, span: Any) -> Array:
@@ -122,6 +117,7 @@ def started(loop: DriveLoop, plans: CarPlan, keys: Array) -> DriveState:
             squared_tracking=zero,
             saturated=jnp.zeros(2, plan.time.dtype),
             time=zero,
+            pose_stds=jnp.asarray(loop.sensing.pose_stds, plan.time.dtype),
             key=key,
         )
 
@@ -135,10 +131,10 @@ def believed_state(loop: DriveLoop, drive: DriveState) -> tuple[Array, Array, Ar
     return drive.believed[-1], state.speed, curvature
 
 
-def _one_frame(loop: DriveLoop, drive: DriveState, until: Array) -> tuple[DriveState, Frame]:
+def _one_frame(world: World, drive: DriveState, until: Array) -> tuple[DriveState, Frame]:
     """The drive one frame later; tracking and saturation count up to a time () [s]."""
-    world, car, dtype = loop.world, loop.car, drive.time.dtype
-    steps, span = loop.steps_per_frame, world.timestep
+    car, dtype, span = _car(world), drive.time.dtype, world.timestep
+    steps = round(1.0 / (FRAME_RATE * span))
     key, noise_key = jax.random.split(drive.key)
     noise = jax.random.normal(noise_key, (steps, *car.noise_shape), dtype)
     times = drive.time + span * jnp.arange(steps, dtype=dtype)
@@ -156,7 +152,7 @@ def _one_frame(loop: DriveLoop, drive: DriveState, until: Array) -> tuple[DriveS
         physics = step(world, physics, command, jnp.zeros(0, dtype))
         after = car.state(physics)
         # What is shown now is a latency old, as is what had been reckoned for then.
-        seen = car.sensed(dataclasses.replace(true, pose=shown[0]), noise, loop.sensing.pose_stds)
+        seen = car.sensed(dataclasses.replace(true, pose=shown[0]), noise, drive.pose_stds)
         correction = _TRUST * (seen.pose - believed[0])
         next_pose = _reckoned_on(car, believed[-1], true, after, span) + correction
         shown = jnp.concatenate([shown[1:], after.pose[None]])
@@ -197,14 +193,14 @@ def _reckoned_on(car: Car, pose: Array, before: CarState, after: CarState, span:
     return reckoned(pose, after.speed, curvature, span)
 
 
-@functools.partial(jax.jit, static_argnames=("loop", "num_frames"))
+@functools.partial(jax.jit, static_argnames=("world", "num_frames"))
 def drive_on(
-    loop: DriveLoop, drives: DriveState, until: Array, *, num_frames: int
+    world: World, drives: DriveState, until: Array, *, num_frames: int
 ) -> tuple[DriveState, Frame]:
     """A batch of drives for some frames.
 
     Args:
-        loop: what shapes the program.
+        world: with a car.
         drives: leaves (B, ...).
         until: (B,) [s], up to when tracking and saturation count.
         num_frames: how many (static).
@@ -215,7 +211,7 @@ def drive_on(
 
     def one(drive: DriveState, until: Array) -> tuple[DriveState, Frame]:
         return lax.scan(
-            lambda state, _: _one_frame(loop, state, until), drive, None, length=num_frames
+            lambda state, _: _one_frame(world, state, until), drive, None, length=num_frames
         )
 
     return jax.vmap(one)(drives, until)

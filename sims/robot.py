@@ -88,7 +88,7 @@ class Robot(Protocol):
         """Its state, a pytree."""
         ...
 
-    def sensed(self, state: Any, noise: Array, stds: tuple[float, ...]) -> Any:
+    def sensed(self, state: Any, noise: Array, stds: Any) -> Any:
         """Its state as it is estimated, with errors of some standard deviations."""
         ...
 

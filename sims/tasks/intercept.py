@@ -36,6 +36,7 @@ from planner_jax.sims.drive import (
 )
 from planner_jax.sims.launch import flight_keys
 from planner_jax.sims.model import World
+from planner_jax.sims.noise import FRAME_RATE
 from planner_jax.sims.recording import Recording
 from planner_jax.sims.robots.car.robot import Car
 from planner_jax.sims.robots.car.vehicle import GRAVITY, NO_SLIP, SLIPPING, Vehicle
@@ -230,6 +231,7 @@ def fly_intercepts(
     *,
     replan: float = 1.0,
     planner: Any = None,
+    plan: InterceptPlan | None = None,
     known: bool = False,
     see_movers: bool = False,
 ) -> InterceptFlights:
@@ -244,6 +246,7 @@ def fly_intercepts(
         seed: of the noise on the car's pose, >= 0.
         replan: [Hz]; 0 drives the first plan.
         planner: of all plans, by default `spacetime`.
+        plan: first plan of each drive, instead of one made here.
         known: whether the targets' ways are known instead of predicted.
         see_movers: whether movers are predicted from looks instead of known.
 
@@ -263,15 +266,15 @@ def fly_intercepts(
         truth, jnp.zeros_like(until), target, movers, truth.start, truth.speed, truth.curvature
     )
     clock = time.perf_counter()
-    first = jax.block_until_ready(plan_all(planner, begun))
+    first = jax.block_until_ready(plan_all(planner, begun)) if plan is None else plan
     planning = time.perf_counter() - clock
     drive = started(loop, jax.tree.map(jnp.asarray, first), flight_keys(seed, cases.index))
     number = np.ones(len(cases), int)
     parts, seen = [], []
-    periods = int(np.ceil(float(jnp.max(until)) * loop.frame_rate / frames - 1e-6))
+    periods = int(np.ceil(float(jnp.max(until)) * FRAME_RATE / frames - 1e-6))
     for period in range(periods):
         seen.append((_sampled(target, until - drive.time), frames))
-        drive, part = drive_on(loop, drive, until, num_frames=frames)
+        drive, part = drive_on(loop.world, drive, until, num_frames=frames)
         parts.append(part)
         if replan > 0.0 and period + 1 < periods:
             target, movers = ways(drive.time[0])
@@ -282,7 +285,7 @@ def fly_intercepts(
             good = is_solved(found.status) & (left.time >= _SHORTEST)
             drive, begun = _changed(good, (drive.plan, drive.began, begun), found, left, drive)
             number += np.asarray(good)
-    flown = _driven(loop, truth, drive, parts, seen, number)
+    flown = _driven(truth, drive, parts, seen, number)
     return scored(cases.cases, first, flown, planning)
 
 
@@ -308,7 +311,6 @@ def _sampled(path: TurningPath, span: Array) -> Array:
 
 
 def _driven(
-    loop: DriveLoop,
     truth: InterceptCase,
     drive: DriveState,
     parts: list[Frame],
@@ -322,7 +324,7 @@ def _driven(
     end = np.asarray(truth.time)
     ways = np.concatenate([np.repeat(way[:, None], count, axis=1) for way, count in seen], axis=1)
     return Driven(
-        times=np.arange(frames.time.shape[1] + 1) / loop.frame_rate,
+        times=np.arange(frames.time.shape[1] + 1) / FRAME_RATE,
         poses=np.concatenate([start, frames.pose], axis=1).astype(float),
         wanted=np.concatenate([start[..., :2], frames.wanted], axis=1).astype(float),
         meeting=np.asarray(drive.began + drive.plan.time, float),

@@ -131,16 +131,15 @@ class Car:
             steering=physics.act[1],
         )
 
-    def sensed(self, state: CarState, noise: Array, stds: tuple[float, ...]) -> CarState:
+    def sensed(self, state: CarState, noise: Array, stds: Any) -> CarState:
         """The car's state as it is estimated.
 
         Args:
             state: the true one.
             noise: (3,) standard normal.
-            stds: of a coordinate [m] and of the heading [rad].
+            stds: (2,), of a coordinate [m] and of the heading [rad].
         """
-        place, heading = stds
-        errors = jnp.asarray([place, place, heading], noise.dtype) * noise
+        errors = jnp.asarray(stds, noise.dtype)[np.array([0, 0, 1])] * noise
         return dataclasses.replace(state, pose=state.pose + errors)
 
     def references(self, plan: Any, times: Array, world: World) -> Reference:
