@@ -1,4 +1,4 @@
-"""What a run of flights asks of a task; those in `tasks` answer."""
+"""What a run of flights asks of a task; the classes in `tasks` answer."""
 
 import abc
 import dataclasses

@@ -39,7 +39,7 @@ from planner_jax.sims.model import World
 from planner_jax.sims.noise import FRAME_RATE
 from planner_jax.sims.recording import Recording
 from planner_jax.sims.robots.car.robot import Car
-from planner_jax.sims.robots.car.vehicle import GRAVITY, NO_SLIP, SLIPPING, Vehicle
+from planner_jax.sims.robots.car.vehicle import GRAVITY, Tyres, Vehicle
 from planner_jax.sims.scenery import Prism
 from planner_jax.sims.settings import InterceptFly
 from planner_jax.sims.task import FlightCases, Flights, FlightTask
@@ -429,7 +429,7 @@ class InterceptFlight(FlightTask):
 
     def world(self) -> World:
         """The ground with the car; what stands around differs from drive to drive."""
-        tyres = SLIPPING if self.settings.slip else NO_SLIP
+        tyres = Tyres() if self.settings.slip else None
         return dataclasses.replace(CAR_WORLD, robot=Car(Vehicle(tyres=tyres)))
 
     def loop(self) -> DriveLoop:

@@ -62,15 +62,17 @@ def tyre_forces(
     )
     slip = jnp.sum(rows * free, axis=1)
     tyres, loads = vehicle.tyres, jnp.asarray(vehicle.loads, dtype)
-    speed = jnp.maximum(jnp.abs(along), _STANDING)
-    give = speed / (tyres.stiffness * loads)  # of each axle, 0 without slip
+    give = jnp.zeros_like(loads)  # of each axle, slip per force
+    if tyres is not None:
+        give = jnp.maximum(jnp.abs(along), _STANDING) / (tyres.stiffness * loads)
     moved = jnp.sum(rows[:, None, :] * inverse, axis=2)  # J M^-1, (2, 3)
     matrix = timestep * jnp.sum(moved[:, None, :] * rows, axis=2) + jnp.diag(give)
     a, c, d = matrix[0, 0], matrix[0, 1], matrix[1, 1]
     solved = jnp.stack([d * slip[0] - c * slip[1], a * slip[1] - c * slip[0]])
     force = -solved / (a * d - c * c)
-    most = tyres.friction * loads
-    force = jnp.clip(force, -most, most)
+    if tyres is not None:
+        most = tyres.friction * loads
+        force = jnp.clip(force, -most, most)
     pushed = jnp.sum(rows * force[:, None], axis=0)
     return jnp.stack(
         [cos * pushed[0] - sin * pushed[1], sin * pushed[0] + cos * pushed[1], pushed[2]]

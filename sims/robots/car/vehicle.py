@@ -7,8 +7,6 @@ control works with.
 
 import dataclasses
 
-import numpy as np
-
 GRAVITY = 9.81  # [m/s^2]
 
 
@@ -16,22 +14,17 @@ GRAVITY = 9.81  # [m/s^2]
 class Tyres:
     """Lateral forces of both axles, linear in the slip angle up to what friction allows.
 
-    Infinite stiffness and friction is a car that does not slip.
+    The numbers are for hard rubber on a smooth floor: an assumption.
     """
 
-    stiffness: float = np.inf  # [1/rad], of lateral force over load, per slip angle
-    friction: float = np.inf  # greatest lateral force over load
+    stiffness: float = 5.0  # [1/rad], of lateral force over load, per slip angle
+    friction: float = 0.5  # greatest lateral force over load
 
     def __post_init__(self) -> None:
         for name in ("stiffness", "friction"):
             value = getattr(self, name)
             if not value > 0.0:
                 raise ValueError(f"{name} must be > 0, got {value}")
-
-
-NO_SLIP = Tyres()
-# Hard rubber on a smooth floor: an assumption.
-SLIPPING = Tyres(stiffness=5.0, friction=0.5)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,7 +44,7 @@ class Vehicle:
     steering_rate: float = 3.0  # [rad/s], greatest
     drive_lag: float = 0.05  # [s], first order
     steering_lag: float = 0.05  # [s], first order
-    tyres: Tyres = NO_SLIP
+    tyres: Tyres | None = None  # that slip; None for tyres that do not
 
     @property
     def loads(self) -> tuple[float, float]:
