@@ -57,6 +57,7 @@ SUCCESS, NEAR, FAR = 0.3, 0.05, 0.5  # [m], of the miss: what counts, and two mo
 TOUCH = 1e-3  # [m] inside of an obstacle that is a contact, as the referee has it
 _SHORTEST = 0.3  # [s] before the meeting, up to when plans are made anew
 _LEAST_STD = 1e-3  # [m], that the prediction believes of looks without noise
+_SMALL = 256  # cases of a batch that is planned in a program of its own size
 _POINTS = 9  # of the path that is expected, in a recording
 _KEPT = 2  # frames from one that is recorded to the next
 _WALL, _MOVER = "#8C959F", "#D9A441"  # colours
@@ -224,6 +225,12 @@ def quick(planner: SpacetimeIntercept) -> SpacetimeIntercept:
     return dataclasses.replace(planner, searches=planner.searches[:1])
 
 
+def planned(planner: Any, cases: InterceptCase) -> InterceptPlan:
+    """Plans of a batch; a small one is planned by a program of its size, and not filled up."""
+    number = cases.batch_shape[0]
+    return plan_all(planner, cases, chunk=number if number <= _SMALL else None)
+
+
 def fly_intercepts(
     loop: DriveLoop,
     cases: Meetings,
@@ -266,7 +273,7 @@ def fly_intercepts(
         truth, jnp.zeros_like(until), target, movers, truth.start, truth.speed, truth.curvature
     )
     clock = time.perf_counter()
-    first = jax.block_until_ready(plan_all(planner, begun)) if plan is None else plan
+    first = jax.block_until_ready(planned(planner, begun)) if plan is None else plan
     planning = time.perf_counter() - clock
     drive = started(loop, jax.tree.map(jnp.asarray, first), flight_keys(seed, cases.index))
     number = np.ones(len(cases), int)
@@ -281,7 +288,7 @@ def fly_intercepts(
             elapsed = drive.time - drive.began
             pose, speed, curvature = jax.vmap(functools.partial(believed_state, loop))(drive)
             left = remaining(begun, elapsed, target, movers, pose, speed, curvature)
-            found = jax.tree.map(jnp.asarray, plan_all(again, left))
+            found = jax.tree.map(jnp.asarray, planned(again, left))
             good = is_solved(found.status) & (left.time >= _SHORTEST)
             drive, begun = _changed(good, (drive.plan, drive.began, begun), found, left, drive)
             number += np.asarray(good)
