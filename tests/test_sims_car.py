@@ -13,11 +13,13 @@ from jax import lax
 from planner_jax.cli import main
 from planner_jax.robot.car import CarPlan
 from planner_jax.sims.drive import DriveLoop, drive_on, started
+from planner_jax.sims.film import draw_flight
 from planner_jax.sims.model import step
 from planner_jax.sims.noise import PlaneSensing
 from planner_jax.sims.robots.car.robot import Car
 from planner_jax.sims.robots.car.tyres import tyre_forces
 from planner_jax.sims.robots.car.vehicle import Tyres, Vehicle
+from planner_jax.sims.scenery import Prism
 from planner_jax.sims.settings import InterceptFly
 from planner_jax.sims.tasks.catch import CATCH_WORLD
 from planner_jax.sims.tasks.intercept import (
@@ -31,6 +33,7 @@ from planner_jax.sims.tasks.intercept import (
 from planner_jax.sweep.settings import SettingError
 from planner_jax.task import intercept
 from planner_jax.task.intercept.plan import InterceptPlan
+from tests.recordings import recording
 
 CAR = Vehicle()
 CURVATURE = 1.3  # [1/m]
@@ -235,9 +238,46 @@ def test_another_robot_or_car_is_refused_in_one_line():
         DriveLoop(CATCH_WORLD)
     with pytest.raises(ValueError, match="^latency must be a multiple of the steps' 0.005 s"):
         DriveLoop(CAR_WORLD, PlaneSensing(latency=0.012))
+    with pytest.raises(TypeError, match="^robot must carry a tool, got a Car$"):
+        _ = CAR_WORLD.carrier
     cases = intercept.draw(1, "easy")
     with pytest.raises(ValueError, match="^wheelbase must be the same in plan and simulated car"):
         require_car(dataclasses.replace(CAR, wheelbase=0.25), cases)
+
+
+def test_a_prism_moves_evenly_and_its_mesh_has_its_sides_and_top():
+    square = np.array([(0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (0.0, 1.0)])
+    prism = Prism(square, 0.5, "#FFFFFF", (0.3, -0.1))
+    base, top, *sides = prism.outlines(10.0)
+    np.testing.assert_allclose(base[0], [3.0, -1.0, 0.0])
+    assert (top[:, 2] == 0.5).all() and len(sides) == 4
+    vertices, faces = prism.mesh()
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+    np.testing.assert_allclose(area, 2.0 + 6.0 * 0.5)
+
+
+def test_a_picture_shows_walls_movers_and_what_is_expected(tmp_path):
+    kept = recording()
+    way = np.zeros((1, kept.time.shape[1], 9, 3))
+    way[..., 0] = np.linspace(2.0, 3.0, 9)
+    pose = np.concatenate([kept.robot[..., :2], 0.0 * kept.robot[..., :1]], axis=2)
+    kept = dataclasses.replace(kept, robot=pose, expected=way)
+    path = tmp_path / "drive.png"
+    draw_flight(path, InterceptFly(suite="hard").flight(), kept, 0)
+    assert path.read_bytes()[1:4] == b"PNG"
+
+
+@pytest.mark.slow
+def test_what_can_be_reached_begins_at_the_start_and_keeps_off_walls():
+    task = InterceptFly(suite="hard", seed=2).flight()
+    layers, cases = task.reachable(1), intercept.draw(1, "hard", 2, first=1)
+    times = [time for time, _ in layers]
+    assert times == sorted(times) and times[-1] == pytest.approx(float(cases.time[0]), rel=1e-5)
+    start, cell = np.asarray(cases.start[0, :2]), 8.0 / 64
+    ahead = start + [times[0] * float(cases.speed[0]), 0.0]
+    assert np.abs(layers[0][1] - ahead).max() < 1.5 * cell
+    assert len(layers[-1][1]) > len(layers[0][1])
 
 
 @pytest.mark.slow
