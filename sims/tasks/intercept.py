@@ -285,15 +285,39 @@ def fly_intercepts(
         parts.append(part)
         if replan > 0.0 and period + 1 < periods:
             target, movers = ways(drive.time[0])
-            elapsed = drive.time - drive.began
-            pose, speed, curvature = jax.vmap(functools.partial(believed_state, loop))(drive)
-            left = remaining(begun, elapsed, target, movers, pose, speed, curvature)
-            found = jax.tree.map(jnp.asarray, planned(again, left))
-            good = is_solved(found.status) & (left.time >= _SHORTEST)
-            drive, begun = _changed(good, (drive.plan, drive.began, begun), found, left, drive)
+            drive, begun, good = planned_anew(loop, again, drive, begun, target, movers)
             number += np.asarray(good)
     flown = _driven(truth, drive, parts, seen, number)
     return scored(cases.cases, first, flown, planning)
+
+
+def planned_anew(
+    loop: DriveLoop,
+    planner: Any,
+    drive: DriveState,
+    begun: InterceptCase,
+    target: TurningPath,
+    movers: Obstacles,
+) -> tuple[DriveState, InterceptCase, Array]:
+    """Plans from where cars believe to be, driven where they keep every limit.
+
+    Args:
+        loop: of the drives.
+        planner: of what is left.
+        drive: leaves (B, ...).
+        begun: the cases that the plans driven until now are of, from when these began.
+        target: expected from now on.
+        movers: likewise.
+
+    Returns:
+        The drives, the cases that their plans are of, and (B,) bool, which plans are new.
+    """
+    pose, speed, curvature = jax.vmap(functools.partial(believed_state, loop))(drive)
+    elapsed = drive.time - drive.began
+    left = remaining(begun, elapsed, target, movers, pose, speed, curvature)
+    found = jax.tree.map(jnp.asarray, planned(planner, left))
+    good = is_solved(found.status) & (left.time >= _SHORTEST)
+    return *_changed(good, (drive.plan, drive.began, begun), found, left, drive), good
 
 
 @jax.jit
