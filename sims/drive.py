@@ -13,12 +13,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jax import Array, lax
 
 from planner_jax.robot.car import CarPlan, pose_at
 from planner_jax.sims.model import World, step
-from planner_jax.sims.noise import FRAME_RATE, PlaneSensing, require_whole
+from planner_jax.sims.noise import CONTROL_RATE, FRAME_RATE, PlaneSensing
 from planner_jax.sims.robot import Physics
 from planner_jax.sims.robots.car.control import CarState
 from planner_jax.sims.robots.car.robot import Car
@@ -31,7 +32,7 @@ class DriveLoop:
     """World and sensing of a drive; static under jit. Noise alone compiles nothing anew.
 
     Raises:
-        ValueError: a frame or the latency is not a whole number of steps.
+        ValueError: the world has no car, or steps of another length than that of control.
     """
 
     world: World  # with a car
@@ -40,10 +41,9 @@ class DriveLoop:
     def __post_init__(self) -> None:
         if not isinstance(self.world.robot, Car):
             raise ValueError(f"world must hold a car, got a {type(self.world.robot).__name__}")
-        steps = 1.0 / self.world.timestep
-        require_whole(steps / FRAME_RATE, "timestep", f"a divisor of {1.0 / FRAME_RATE:g} s", steps)
-        rule = f"a multiple of the steps' {self.world.timestep:g} s"
-        require_whole(self.sensing.latency * steps, "latency", rule, self.sensing.latency)
+        if not np.isclose(self.world.timestep * CONTROL_RATE, 1.0):
+            rule = f"timestep must be {1.0 / CONTROL_RATE:g}"
+            raise ValueError(f"{rule}, got {self.world.timestep}")
 
     @property
     def car(self) -> Car:
@@ -53,7 +53,7 @@ class DriveLoop:
     @property
     def late_steps(self) -> int:
         """How many steps old is the pose that is shown."""
-        return round(self.sensing.latency / self.world.timestep)
+        return round(self.sensing.latency * CONTROL_RATE)
 
 
 @struct.dataclass
@@ -134,7 +134,7 @@ def believed_state(loop: DriveLoop, drive: DriveState) -> tuple[Array, Array, Ar
 def _one_frame(world: World, drive: DriveState, until: Array) -> tuple[DriveState, Frame]:
     """The drive one frame later; tracking and saturation count up to a time () [s]."""
     car, dtype, span = _car(world), drive.time.dtype, world.timestep
-    steps = round(1.0 / (FRAME_RATE * span))
+    steps = CONTROL_RATE // FRAME_RATE
     key, noise_key = jax.random.split(drive.key)
     noise = jax.random.normal(noise_key, (steps, *car.noise_shape), dtype)
     times = drive.time + span * jnp.arange(steps, dtype=dtype)

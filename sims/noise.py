@@ -74,6 +74,10 @@ NOISES = {
 }
 
 
+CONTROL_RATE = 200  # [Hz], of the control steps of a drive
+FRAME_RATE = 50  # [Hz], of the poses of a drive that are kept and held against obstacles
+
+
 @dataclasses.dataclass(frozen=True)
 class PlaneSensing:
     """How a car sees a target and movers in the plane, and itself; static under jit.
@@ -95,6 +99,8 @@ class PlaneSensing:
             value = getattr(self, field.name)
             if not all(part >= 0.0 for part in (value if isinstance(value, tuple) else (value,))):
                 raise ValueError(f"{field.name} must be >= 0, got {value}")
+        rule = f"a multiple of the control steps' {1.0 / CONTROL_RATE:g} s"
+        require_whole(self.latency * CONTROL_RATE, "latency", rule, self.latency)
 
     def frames_per_plan(self, replan: float) -> int:
         """Frames from plan to plan at a rate of planning anew; those of a second if it is 0.
@@ -112,8 +118,6 @@ class PlaneSensing:
         require_whole(FRAME_RATE / replan, "replan", f"a divisor of {FRAME_RATE} Hz", replan)
         return round(FRAME_RATE / replan)
 
-
-FRAME_RATE = 50  # [Hz], of the poses of a drive that are kept and held against obstacles
 
 PLANE_NOISES = {
     "none": PlaneSensing(),

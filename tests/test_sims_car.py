@@ -220,6 +220,10 @@ def test_what_is_expected_of_a_target_rests_on_what_was_shown_until_then():
     [
         (lambda: InterceptFly(replan=3.0), "replan must be a divisor of 50 Hz, got 3"),
         (lambda: InterceptFly(noise="lab"), "noise must be one of none, paper, got 'lab'"),
+        (
+            lambda: InterceptFly(latency=0.012),
+            "latency must be a multiple of the control steps' 0.005 s, got 0.012",
+        ),
         (lambda: InterceptFly(latency=-1.0), "latency must be >= 0, got -1.0"),
         (
             lambda: InterceptFly(suite="hardest"),
@@ -236,8 +240,8 @@ def test_settings_that_break_a_rule_are_refused_in_one_line(build, message):
 def test_another_robot_or_car_is_refused_in_one_line():
     with pytest.raises(ValueError, match="^world must hold a car, got a Quadrotor$"):
         DriveLoop(CATCH_WORLD)
-    with pytest.raises(ValueError, match="^latency must be a multiple of the steps' 0.005 s"):
-        DriveLoop(CAR_WORLD, PlaneSensing(latency=0.012))
+    with pytest.raises(ValueError, match="^timestep must be 0.005, got 0.002$"):
+        DriveLoop(dataclasses.replace(CAR_WORLD, timestep=0.002))
     with pytest.raises(TypeError, match="^robot must carry a tool, got a Car$"):
         _ = CAR_WORLD.carrier
     cases = intercept.draw(1, "easy")

@@ -36,7 +36,7 @@ from planner_jax.sims.drive import (
 )
 from planner_jax.sims.launch import flight_keys
 from planner_jax.sims.model import World
-from planner_jax.sims.noise import FRAME_RATE
+from planner_jax.sims.noise import CONTROL_RATE, FRAME_RATE
 from planner_jax.sims.recording import Recording
 from planner_jax.sims.robots.car.robot import Car
 from planner_jax.sims.robots.car.vehicle import GRAVITY, Tyres, Vehicle
@@ -52,12 +52,13 @@ from planner_jax.task.intercept.suites import observe
 from planner_jax.task.intercept.words import draw, positions
 from planner_jax.task.intercept.words import planner as intercept_planner
 
-CAR_WORLD = World(Car(), GRAVITY, num_balls=0, timestep=0.005)
+CAR_WORLD = World(Car(), GRAVITY, num_balls=0, timestep=1.0 / CONTROL_RATE)
 SUCCESS, NEAR, FAR = 0.3, 0.05, 0.5  # [m], of the miss: what counts, and two more that are told
 TOUCH = 1e-3  # [m] inside of an obstacle that is a contact, as the referee has it
 _SHORTEST = 0.3  # [s] before the meeting, up to when plans are made anew
 _LEAST_STD = 1e-3  # [m], that the prediction believes of looks without noise
 _SMALL = 256  # cases of a batch that is planned in a program of its own size
+_CAUTION = 2.0  # standard deviations by which movers that are seen are grown
 _POINTS = 9  # of the path that is expected, in a recording
 _KEPT = 2  # frames from one that is recorded to the next
 _WALL, _MOVER = "#8C959F", "#D9A441"  # colours
@@ -120,6 +121,8 @@ def expected(
 ) -> tuple[TurningPath, Obstacles]:
     """Where targets and movers are believed to go; both count from now.
 
+    Movers that are seen are grown by what their place is uncertain by, `_CAUTION` times.
+
     Args:
         loop: with the sensing.
         meetings: leaves (B, ...).
@@ -142,12 +145,21 @@ def expected(
         else:
             target = select(times, meeting.target, noise, weights).path
         movers = case.movers
-        centre, velocity = movers.centre + movers.velocity * now, movers.velocity
-        if see_movers:
-            fit = lambda seen: fit_polynomial(times, seen, 1, weights).at(0.0 * now)  # noqa: E731
-            state = jax.vmap(fit, in_axes=1)(meeting.movers)
-            centre, velocity = state.pos, state.vel
-        return target, dataclasses.replace(movers, centre=centre, velocity=velocity)
+        if not see_movers:
+            centre = movers.centre + movers.velocity * now
+            return target, dataclasses.replace(movers, centre=centre)
+        fit = lambda seen: fit_polynomial(times, seen, 1, weights).at(0.0 * now)  # noqa: E731
+        state = jax.vmap(fit, in_axes=1)(meeting.movers)
+        # Variance of a line's value at time 0, in terms of that of one look.
+        number = jnp.sum(weights)
+        middle = jnp.sum(weights * times) / number
+        spread = jnp.sum(weights * (times - middle) ** 2)
+        std = sensing.target_std * jnp.sqrt(1.0 / number + middle**2 / spread)
+        size = jnp.sqrt(jnp.sum(movers.corners**2, axis=-1, keepdims=True))
+        growth = 1.0 + _CAUTION * std / jnp.maximum(size, 1e-3)
+        return target, dataclasses.replace(
+            movers, centre=state.pos, velocity=state.vel, corners=growth * movers.corners
+        )
 
     return jax.vmap(one)(meetings)
 
