@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 from jax import lax
 
+import planner_jax as pj
 from planner_jax.cli import main
+from planner_jax.plane.target import TurningPath
 from planner_jax.robot.car import CarPlan
 from planner_jax.sims.drive import DriveLoop, drive_on, started
 from planner_jax.sims.film import draw_flight
@@ -25,7 +27,9 @@ from planner_jax.sims.tasks.catch import CATCH_WORLD
 from planner_jax.sims.tasks.intercept import (
     CAR_WORLD,
     Driven,
+    Meetings,
     expected,
+    fly_intercepts,
     meetings,
     require_car,
     scored,
@@ -213,6 +217,58 @@ def test_what_is_expected_of_a_target_rests_on_what_was_shown_until_then():
     there = seen.cases.movers.centre + 3.04 * seen.cases.movers.velocity
     off = np.linalg.norm(movers.centre - there, axis=2)[seen.cases.movers.present]
     assert 0.0 < off.max() < 0.2
+
+
+@dataclasses.dataclass
+class StraightOn:
+    """Plans with one even acceleration along the heading; unsolved once it has made `solved`."""
+
+    case_type = intercept.InterceptCase
+    attempts = (pj.Attempt(),)
+    solved: int
+    starts: list = dataclasses.field(default_factory=list)
+
+    def solve_on_host(self, cases, attempt):
+        self.starts.append(cases.start)
+        ahead = np.stack([np.cos(cases.start[:, 2]), np.sin(cases.start[:, 2])], axis=1)
+        goal = cases.target.pos - cases.start[:, :2]
+        way = np.sum(goal * ahead, axis=1) - cases.body.length / 2.0 + cases.body.rear_overhang
+        last = 2.0 * way / cases.time - cases.speed
+        status = pj.Status.CONVERGED if len(self.starts) <= self.solved else pj.Status.INFEASIBLE
+        nothing = np.zeros(len(way), np.float32)
+        return InterceptPlan(
+            cost=nothing,
+            violation=nothing,
+            iterations=nothing.astype(np.int32),
+            status=np.full(len(way), status, np.int32),
+            start=cases.start,
+            time=cases.time,
+            speed=np.float32(cases.speed[:, None] * (1.0 - SHARE) + last[:, None] * SHARE),
+            curvature=np.zeros((len(way), PIECES + 1), np.float32),
+            meeting=cases.target.pos,
+        )
+
+
+@pytest.mark.parametrize("solved", [1, 2])
+def test_a_plan_made_anew_begins_where_the_car_is_and_is_driven_if_it_is_good(solved):
+    start = np.array([[0.8, 2.0, 0.0], [0.8, 4.0, 0.0], [0.8, 6.0, 0.0]], np.float32)
+    goal = start[:, :2] + np.float32([[2.0, 0.0], [2.5, 0.0], [3.0, 0.0]])
+    still = TurningPath(pos=goal, vel=0.0 * goal, turn_rate=np.zeros(3, np.float32))
+    cases = jax.tree.map(np.asarray, intercept.case(still, np.full(3, END), start=start))
+    seen = Meetings(
+        np.arange(3), cases, np.zeros((3, 1)), goal[:, None], np.zeros((3, 1, 1, 2), np.float32)
+    )
+    planner = StraightOn(solved)
+    flights = fly_intercepts(
+        DriveLoop(CAR_WORLD, NOISY), seen, 5, replan=0.5, planner=planner, known=True
+    )
+    assert flights.flown.plans.tolist() == [solved] * 3
+    assert flights.success.all() and flights.miss.max() < 0.03
+    first, again = planner.starts
+    np.testing.assert_allclose(first, start)
+    there = flights.flown.poses[:, 100]
+    assert 1e-5 < np.abs(again - there).max() < 0.02  # where it believes to be
+    assert flights.flown.meeting == pytest.approx(END, rel=1e-5)
 
 
 @pytest.mark.parametrize(
