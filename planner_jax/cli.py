@@ -184,7 +184,7 @@ def _add_sweep(task: Task, parser: _Parser) -> None:
 def _add_fly(task: Task, parser: _Parser) -> None:
     parser.description = (
         f"Many flights of one task, {task.summary},\n"
-        "in MuJoCo MJX with noise, latency and wrong drag.\n"
+        "in MuJoCo MJX with noise and latency.\n"
         "Writes a run folder: index.html, table.md, a figure, plans.parquet, flights.parquet,\n"
         "manifest.json."
     )

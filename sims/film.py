@@ -1,4 +1,4 @@
-"""Pictures of a flight: balls, robot, plan and ghost images, without a display."""
+"""Pictures of a flight: what is to be met, robot, plan and ghost images, without a display."""
 
 import os
 import shutil
@@ -12,10 +12,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-from planner_jax.sims.model import World
 from planner_jax.sims.recording import Recording, frame
 from planner_jax.sims.robot import rotation
-from planner_jax.sims.scenery import FLAT, Part, machine_parts, outlines
+from planner_jax.sims.scenery import FLAT, Part, Prism, machine_parts, outlines
 from planner_jax.sims.task import FlightTask
 from planner_jax.sweep.figures.style import BLUE, GREEN, GREY, INK, ORANGE, PALE, PURPLE, RED, SKY
 
@@ -43,22 +42,23 @@ class Scene:
     def __init__(
         self,
         figure: Figure,
-        world: World,
+        task: FlightTask,
         recording: Recording,
         flight: int,
-        title: str,
-        view: tuple[float, float] = (18.0, -68.0),
+        title: str | None = None,
+        view: tuple[float, float] | None = None,
     ):
         """Draw what does not move.
 
         Args:
             figure: an empty one.
-            world: of the flight.
+            task: that was flown.
             recording: of the run.
             flight: row of the recording.
-            title: of the picture.
-            view: elevation and azimuth of the eye [degree].
+            title: of the picture; by default the task's.
+            view: elevation and azimuth of the eye [degree]; by default the task's.
         """
+        world = task.world()
         self.world, self.recording, self.flight = world, recording, flight
         self.num_looks = recording.num_looks(flight)
         self.times, self.met = recording.time[flight], recording.met[flight]
@@ -70,8 +70,9 @@ class Scene:
         wanted = self.wanted()
         plan = self.axes.plot(*wanted.T, color=INK, lw=1.0, ls="--", label="plan")
         self.moving = plan[:0]
-        colours = [BALL_COLOURS[k % len(BALL_COLOURS)] for k in range(world.num_balls)]
-        names = ["ball"] if len(colours) == 1 else [f"ball {k + 1}" for k in range(len(colours))]
+        number, thing = balls.shape[1], task.THING
+        colours = [BALL_COLOURS[k % len(BALL_COLOURS)] for k in range(number)]
+        names = [thing] if number == 1 else [f"{thing} {k + 1}" for k in range(number)]
         self.trails = [
             self.axes.plot([], [], [], color=colour, lw=1.6, label=name)[0]
             for colour, name in zip(colours, names, strict=True)
@@ -81,10 +82,18 @@ class Scene:
             self.returned = self.axes.plot([], [], [], color=GREEN, lw=1.6, label="returned ball")[
                 0
             ]
+        self.ways = []
+        if recording.expected.shape[2]:
+            look = {"color": RED, "lw": 1.0, "ls": ":", "label": f"{thing} as expected"}
+            self.ways = self.axes.plot([], [], [], **look)
+        prisms = task.surroundings(int(recording.index[flight]))
+        standing = [prism for prism in prisms if not any(prism.velocity)]
+        self.movers = [prism for prism in prisms if any(prism.velocity)]
         flat = [part for part in world.scenery if part.size[2] <= FLAT]
         solid = [part for part in world.scenery if part.size[2] > FLAT] + self._machine()
         patches = [outlines(part)[1] for part in flat]
         edges = [line for part in solid for line in outlines(part)]
+        edges += [line for prism in standing for line in prism.outlines(0.0)]
         points = np.concatenate([wanted, balls.reshape(-1, 3), *edges, *patches])
         low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
         thin = np.maximum(1.6 - (high - low), 0.0)  # [m], so that flat flights keep their depth
@@ -92,6 +101,7 @@ class Scene:
         low[2] = 0.0
         self.axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
         self.axes.set_box_aspect(high - low, zoom=1.15)
+        title = title or task.title(recording, flight)
         self.axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", title=title)
         for axis in (self.axes.xaxis, self.axes.yaxis, self.axes.zaxis):
             axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10], prune="both"))
@@ -104,8 +114,16 @@ class Scene:
         for part, patch in zip(flat, patches, strict=True):
             look = {"facecolor": part.colour, "edgecolor": GREY, "linewidth": 0.5, "alpha": 0.4}
             self.axes.add_collection3d(Poly3DCollection([patch], zorder=0, **look))
-        self.axes.view_init(*view)
+        for prism in standing:
+            self._fill(prism, 0.0)
+        self.axes.view_init(*(view or task.VIEW))
         self.axes.legend(loc="upper left", fontsize=9, frameon=False)
+
+    def _fill(self, prism: Prism, time: float) -> list[Any]:
+        """A prism's top at a time [s], filled; what it was drawn with."""
+        top = prism.outlines(time)[1]
+        look = {"facecolor": prism.colour, "edgecolor": GREY, "linewidth": 0.5, "alpha": 0.6}
+        return [self.axes.add_collection3d(Poly3DCollection([top], **look))]
 
     def wanted(self) -> np.ndarray:
         """The path of the plans that are flown (M, 3) [m], from the first to the last contact."""
@@ -170,6 +188,10 @@ class Scene:
         for part in self.moving:
             part.remove()
         self.moving = self.robot(at)
+        for prism in self.movers:
+            self.moving += self._fill(prism, float(self.times[at]))
+        for way in self.ways:
+            way.set_data_3d(*self.recording.expected[self.flight, at].T)
 
 
 def draw_flight(
@@ -179,7 +201,7 @@ def draw_flight(
     flight: int,
     *,
     title: str | None = None,
-    view: tuple[float, float] = (18.0, -68.0),
+    view: tuple[float, float] | None = None,
 ) -> None:
     """Write a picture of one flight with ghost images.
 
@@ -189,12 +211,11 @@ def draw_flight(
         recording: of the run.
         flight: row of the recording.
         title: of the picture; by default the task's.
-        view: elevation and azimuth of the eye [degree].
+        view: elevation and azimuth of the eye [degree]; by default the task's.
     """
-    title = title or task.title(recording, flight)
     figure = Figure(figsize=(7.6, 6.0))
     FigureCanvasAgg(figure)
-    scene = Scene(figure, task.world(), recording, flight, title, view)
+    scene = Scene(figure, task, recording, flight, title, view)
     figure.subplots_adjust(left=0.0, right=0.96, bottom=0.04, top=0.95)
     scene.ghosts(scene.last_met())
     scene.show(scene.last_met(), scene.num_looks - 1)
@@ -225,8 +246,7 @@ def film_flights(path: Path, task: FlightTask, recording: Recording, num: int) -
         with writer.saving(figure, str(scratch), 90):
             for flight in range(num):
                 figure.clear()
-                title = task.title(recording, flight)
-                scene = Scene(figure, task.world(), recording, flight, title)
+                scene = Scene(figure, task, recording, flight)
                 for at in range(0, scene.num_looks, _FRAME):
                     scene.show(at)
                     writer.grab_frame()

@@ -190,7 +190,7 @@ def require_world(loop: Loop, kind: str, num_balls: int, **planned: Any) -> None
         planned: (B,) each, what the plans' cases say of `gravity`, `net_height`,
             `net_radius` or `racket_height`; only those that are given are compared.
     """
-    world, tool = loop.world, loop.world.robot.tool
+    world, tool = loop.world, loop.world.carrier.tool
     if tool.kind != kind:
         raise ValueError(f"world must carry a {kind}, got a {tool.kind}")
     if world.num_balls != num_balls:

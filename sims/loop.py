@@ -219,7 +219,7 @@ def _planned_anew(loop: Loop, pilot: Pilot, flight: FlightState, case: Any) -> t
         balls=expected(loop, flight.estimates, loop.period),
         drag=flight.estimates.drag,
         present=flight.present & (pilot.times(flight.plan) > elapsed),
-        head_state=loop.world.robot.head_state(flight.plan, elapsed),
+        head_state=loop.world.carrier.head_state(flight.plan, elapsed),
     )
     return pilot.plan_anew(case, flight.plan, outlook)
 
@@ -264,7 +264,7 @@ def _recorded(loop: Loop, pilot: Pilot, flight: FlightState, drag: Array) -> Rec
     return Record(
         time=flight.time,
         physics=flight.physics,
-        wanted=world.robot.head_state(flight.plan, flight.time - flight.began)[0],
+        wanted=world.carrier.head_state(flight.plan, flight.time - flight.began)[0],
         horizon=horizon,
         error=jax.vmap(error)(
             now.ball_pos, ball_velocity(world, now.ball_vel, drag), drag, flight.estimates, horizon

@@ -20,6 +20,7 @@ import contextlib
 import dataclasses
 import functools
 import io
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +32,7 @@ with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp, not need
     from mujoco import mjx
 
 from planner_jax.ball.flight import BallState, ball_acceleration
-from planner_jax.sims.robot import Physics, Robot
+from planner_jax.sims.robot import Physics, Robot, ToolRobot
 from planner_jax.sims.scenery import (
     GROUND_COLOUR,
     LOOK,
@@ -58,10 +59,21 @@ class World:
     mouth: tuple[float, float, float] | None = None  # [m], of the pitching machine, if any
 
     def __post_init__(self) -> None:
-        if self.num_balls < 1:
-            raise ValueError(f"num_balls must be >= 1, got {self.num_balls}")
+        if self.num_balls < 0:
+            raise ValueError(f"num_balls must be >= 0, got {self.num_balls}")
         if not self.timestep > 0.0:
             raise ValueError(f"timestep must be > 0, got {self.timestep}")
+
+    @property
+    def carrier(self) -> ToolRobot:
+        """The robot as one that meets balls.
+
+        Raises:
+            TypeError: it carries no tool.
+        """
+        if not hasattr(self.robot, "tool"):
+            raise TypeError(f"robot must carry a tool, got a {type(self.robot).__name__}")
+        return cast(ToolRobot, self.robot)
 
 
 def mjcf(world: World) -> str:
@@ -125,25 +137,24 @@ def step(world: World, physics: Physics, command: Array, drag: Array) -> Physics
         drag: (N,) K_D [1/m] of the balls.
     """
     model, data = _mjx_model(world)
+    controls, forces = world.robot.drive(physics, command, world.timestep)
+    drags = _drag_force(world, physics.qvel[world.robot.num_vel :], drag)
     data = data.replace(
         qpos=physics.qpos,
         qvel=physics.qvel,
         act=physics.act,
-        ctrl=command,
-        qfrc_applied=_drag_force(world, physics.qvel, drag),
+        ctrl=controls,
+        qfrc_applied=jnp.concatenate([forces, drags]),
     )
     data = mjx.step(model, data)
     return Physics(qpos=data.qpos, qvel=data.qvel, act=data.act)
 
 
 def _drag_force(world: World, qvel: Array, drag: Array) -> Array:
-    """Quadratic drag  -m K_D |v| v  of every ball as generalised forces (R' + 3 N,)."""
-    own = world.robot.num_vel
-    vel = qvel[own:].reshape(world.num_balls, 3)
+    """Quadratic drag  -m K_D |v| v  of every ball as generalised forces (3 N,)."""
+    vel = qvel.reshape(world.num_balls, 3)
     speed = jnp.sqrt(jnp.sum(vel**2, axis=1, keepdims=True))
-    return jnp.concatenate(
-        [jnp.zeros_like(qvel[:own]), (-BALL_MASS * drag[:, None] * speed * vel).ravel()]
-    )
+    return (-BALL_MASS * drag[:, None] * speed * vel).ravel()
 
 
 def at_rest(world: World, place: Array) -> Physics:

@@ -1,4 +1,4 @@
-"""How well a flight's balls and robot are seen: rates, latency and noise, and three presets.
+"""How well a flight's balls and robot are seen: rates, latency and noise, with presets.
 
 Nothing here needs JAX or MuJoCo, so that settings can be checked before either is imported.
 """
@@ -71,4 +71,57 @@ NOISES = {
     "harsh": Sensing(
         position_std=0.015, dropout=0.1, latency=0.04, robot_stds=(0.006, 0.06, 0.015, 0.06)
     ),
+}
+
+
+CONTROL_RATE = 200  # [Hz], of the control steps of a drive
+FRAME_RATE = 50  # [Hz], of the poses of a drive that are kept and held against obstacles
+
+
+@dataclasses.dataclass(frozen=True)
+class PlaneSensing:
+    """How a car sees a target and movers in the plane, and itself; static under jit.
+
+    What is shown is a latency old. Poses of the car come at every control step; its own speed and
+    steering angle it knows at once.
+
+    Raises:
+        ValueError: a value is out of its range.
+    """
+
+    target_std: float = 0.0  # [m], of a coordinate of the target or of a mover
+    pose_stds: tuple[float, float] = (0.0, 0.0)  # of a coordinate [m] and of the heading [rad]
+    looks: float = 1.0  # [Hz], of looks at the target during the drive; 0 for none
+    latency: float = 0.05  # [s]; that of the planner is a part of it
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if not all(part >= 0.0 for part in (value if isinstance(value, tuple) else (value,))):
+                raise ValueError(f"{field.name} must be >= 0, got {value}")
+        rule = f"a multiple of the control steps' {1.0 / CONTROL_RATE:g} s"
+        require_whole(self.latency * CONTROL_RATE, "latency", rule, self.latency)
+
+    def frames_per_plan(self, replan: float) -> int:
+        """Frames from plan to plan at a rate of planning anew; those of a second if it is 0.
+
+        Args:
+            replan: [Hz].
+
+        Raises:
+            ValueError: the rate is negative or does not divide that of the frames.
+        """
+        if not replan >= 0.0:
+            raise ValueError(f"replan must be >= 0, got {replan}")
+        if replan == 0.0:
+            return FRAME_RATE
+        require_whole(FRAME_RATE / replan, "replan", f"a divisor of {FRAME_RATE} Hz", replan)
+        return round(FRAME_RATE / replan)
+
+
+PLANE_NOISES = {
+    "none": PlaneSensing(),
+    # Paper 003, Section V-A, sees targets once a second with a variance of 0.01 m^2 a coordinate,
+    # and says nothing of the car's own pose, of which 1 cm and 0.01 rad are assumptions.
+    "paper": PlaneSensing(target_std=0.1, pose_stds=(0.01, 0.01)),
 }

@@ -31,9 +31,9 @@ class Recording:
     """F flights of N balls at K looks each; NumPy leaves, world frame, z up.
 
     The robot has R joint positions, for a quadrotor three of the propeller plane's centre [m] and
-    the quaternion w x y z. Times count from the first plan. NaN stands for a ball that is not in
-    flight, a robot that is no longer simulated, a ball that is never met and a flight without
-    target.
+    the quaternion w x y z. A target that drives counts as a ball. Times count from the first
+    plan. NaN stands for a ball that is not in flight, a robot that is no longer simulated, a ball
+    that is never met and a flight without target.
     """
 
     index: np.ndarray  # (F,) place in the run
@@ -45,6 +45,8 @@ class Recording:
     met: np.ndarray  # (F, N) [s]
     contact: np.ndarray  # (F, N, 3) [m], of the ball's centre when it is met
     target: np.ndarray  # (F, 3) [m]
+    # (F, K, M, 3) [m], where the first ball was expected to be from then on; M = 0 if not kept
+    expected: np.ndarray
 
     def __len__(self) -> int:
         return len(self.index)
@@ -181,6 +183,7 @@ def recorded(
         met=met,
         contact=contact,
         target=no_target if launches.target is None else np.asarray(launches.target),
+        expected=np.zeros((number, grid.size, 0, 3)),
     )
 
 
@@ -200,6 +203,7 @@ _COLUMNS = leaves_of(
     ("met", "s", "when each ball is met, NaN for never", LIST),
     ("contact", "m", "balls x 3, flat; where each ball is met", LIST),
     ("target", "m", "of a returned ball, NaN for catches", VECTOR),
+    ("expected", "m", "looks x points x 3, flat; the way expected of what is to be met", LIST),
 )
 
 
@@ -221,4 +225,6 @@ def read_recording(path: Path) -> Recording:
         columns[name] = columns[name].reshape(number, looks, -1)
     columns["balls"] = columns["balls"].reshape(number, looks, -1, 3)
     columns["contact"] = columns["contact"].reshape(number, -1, 3)
+    points = columns["expected"].shape[1] // (3 * looks)
+    columns["expected"] = columns["expected"].reshape(number, looks, points, 3)
     return Recording(**columns)

@@ -1,7 +1,8 @@
 """What the simulated world, the closed loop and the pictures ask of a robot.
 
-A robot is a frozen dataclass, static under jit; `robots/quadrotor/robot.py` is one. Its part of
-MuJoCo's state comes first in `qpos` and `qvel`, before that of the balls; all of `act` is its own.
+A robot is a frozen dataclass, static under jit: `robots/quadrotor/robot.py` is one, which carries a
+tool, and `robots/car/robot.py` one without. Its part of MuJoCo's state comes first in `qpos` and
+`qvel`, before that of the balls; all of `act` is its own.
 """
 
 import dataclasses
@@ -68,11 +69,6 @@ class Robot(Protocol):
     num_vel: ClassVar[int]  # R', of its joint velocities in `qvel`
     noise_shape: ClassVar[tuple[int, ...]]  # of the standard normal noise that `sensed` takes
 
-    @property
-    def tool(self) -> Tool:
-        """What it meets balls with."""
-        ...
-
     def mjcf(self) -> tuple[str, str]:
         """Its body and its actuators as MJCF text."""
         ...
@@ -81,20 +77,19 @@ class Robot(Protocol):
         """Its part of `qpos` and `qvel`, and `act`, at rest at a place (3,) [m]."""
         ...
 
+    def drive(self, physics: Physics, command: Array, timestep: float) -> tuple[Array, Array]:
+        """What a command (A,) makes of its controls (A,), and forces on its joints (R',).
+
+        The forces are those that no actuator of the model has, such as those of tyres.
+        """
+        ...
+
     def state(self, physics: Physics) -> Any:
         """Its state, a pytree."""
         ...
 
-    def sensed(self, state: Any, noise: Array, stds: tuple[float, ...]) -> Any:
+    def sensed(self, state: Any, noise: Array, stds: Any) -> Any:
         """Its state as it is estimated, with errors of some standard deviations."""
-        ...
-
-    def tool_motion(self, state: Any) -> tuple[Array, Array, Array, Array]:
-        """Of the body with the tool, in the world: place, velocity, rate and z axis, (3,) each."""
-        ...
-
-    def head_state(self, plan: Any, time: Array) -> Array:
-        """Its state () [s] after a plan's begin, from where another begins; first row the place."""
         ...
 
     def references(self, plan: Any, times: Array, world: Any) -> Any:
@@ -119,4 +114,21 @@ class Robot(Protocol):
 
     def held_ball(self, pose: np.ndarray) -> np.ndarray:
         """Centre (3,) [m] of a ball that lies in the tool; NaN if the tool holds none."""
+        ...
+
+
+class ToolRobot(Robot, Protocol):
+    """A robot that meets balls with a tool."""
+
+    @property
+    def tool(self) -> Tool:
+        """What it meets balls with."""
+        ...
+
+    def tool_motion(self, state: Any) -> tuple[Array, Array, Array, Array]:
+        """Of the body with the tool, in the world: place, velocity, rate and z axis, (3,) each."""
+        ...
+
+    def head_state(self, plan: Any, time: Array) -> Array:
+        """Its state () [s] after a plan's begin, from where another begins; first row the place."""
         ...

@@ -19,7 +19,6 @@ from planner_jax.sweep.columns import (
     BOOL,
     COUNT,
     INDEX,
-    LIST,
     NUMBER,
     Column,
     leaves_of,
@@ -45,15 +44,6 @@ _COLUMNS = (
     *leaves_of("verdict", ("success", "", "as its task counts it", BOOL)),
     status_column("of the first plan"),
     *leaves_of("plans", ("iterations", "", "of the first plan", COUNT)),
-    *leaves_of(
-        "verdict.flown.contact",
-        ("contact_time", "s", "of each ball's nearest passage", LIST, "time"),
-        ("planned_time", "s", "of that contact", LIST),
-        ("offset", "m", "ball from the tool's centre", LIST),
-        ("contact_ball_pos", "m", "a point a ball", LIST, "ball_pos"),
-        ("contact_robot_pos", "m", "a point a ball", LIST, "robot_pos"),
-        ("contact_tracking", "m", "robot from its plan then", LIST, "tracking"),
-    ),
     Column("tracking_rms", "m", "on the way", NUMBER, lambda b: b.verdict.flown.tracking[:, 0]),
     Column("tracking_worst", "m", "on the way", NUMBER, lambda b: b.verdict.flown.tracking[:, 1]),
 )
@@ -100,7 +90,7 @@ def start_flights(
             **environment(),
             "seed": settings.seed,
             "parameters": dataclasses.asdict(settings),
-            "loop": dataclasses.asdict(flight.loop(record=False)),
+            "loop": flight.parameters(),
             "video": video,
         }
     )
@@ -164,7 +154,7 @@ def _fly_all(flight: FlightTask, cases: Any, shown: int) -> tuple[pa.Table, dict
         if not clock.compiled:
             warm, warm_flights = warm + seconds, warm_flights + size
         batch = FlownBatch(Chunk(lanes, None), flights.first_plan, flights)
-        rows = rows_of([*_COLUMNS, *flight.COLUMNS], batch, _FRAME)
+        rows = rows_of([*_COLUMNS, *flight.every_column()], batch, _FRAME)
         parts.append(rows.slice(0, min(size, num - first)))
     times = {
         "compile_seconds": round(compiling, 3),
@@ -205,7 +195,7 @@ def headline(manifest: dict[str, Any], flight: FlightTask) -> list[str]:
     ]
     again = f"planned anew at {settings.rate:g} Hz" if settings.rate else "never planned anew"
     lines.append(
-        f"Noise {settings.noise}, drag believed {100 * settings.drag_error:g} % wrong, {again}. "
+        f"{flight.conditions}, {again}. "
         f"Tracking error {100 * summary['tracking_rms_median']:.2f} cm rms in the median flight, "
         f"{100 * summary['tracking_worst']:.1f} cm at worst."
     )
@@ -237,10 +227,7 @@ def write_flight_report(folder: RunFolder) -> None:
     )
     lines = headline(manifest, flight)
     title = f"Flights, {flight.settings.TASK.name}, {flight.suite}"
-    remarks = [
-        f"Everything is simulated in MuJoCo MJX: {flight.world().robot.WORDS}, motion capture with "
-        "noise, dropout and latency, balls with quadratic drag."
-    ]
+    remarks = [f"Everything is simulated in MuJoCo MJX: {flight.simulated}."]
     folder.write_text("table.md", to_markdown(title, lines, table, remarks))
     lead = "".join(f"<p>{html.escape(line)}</p>\n" for line in lines)
     shown = f'<p><img src="{html.escape(video)}" alt="film"></p>\n' if video else ""

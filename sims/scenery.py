@@ -27,6 +27,35 @@ class Part:
         return (float(np.cos(0.5 * self.turn)), 0.0, 0.0, float(np.sin(0.5 * self.turn)))
 
 
+@dataclasses.dataclass(frozen=True)
+class Prism:
+    """An upright prism on the ground that stands, or moves evenly without turning."""
+
+    corners: np.ndarray  # (V, 2) [m], of its base at time 0, convex, in either sense
+    height: float  # [m]
+    colour: str  # as #RRGGBB
+    velocity: tuple[float, float] = (0.0, 0.0)  # [m/s]
+
+    def outlines(self, time: float) -> list[np.ndarray]:
+        """Its edges at a time [s] as lines, each (M, 3) [m]; first base and top, closed."""
+        base = self.corners + time * np.asarray(self.velocity)
+        ring = np.concatenate([base, base[:1]])
+        low, high = (np.pad(ring, ((0, 0), (0, 1)), constant_values=z) for z in (0.0, self.height))
+        return [low, high, *(np.stack([low[k], high[k]]) for k in range(len(base)))]
+
+    def mesh(self) -> tuple[np.ndarray, np.ndarray]:
+        """Corners (2 V, 3) [m] at time 0 and triangles (T, 3) of sides and top."""
+        num = len(self.corners)
+        low, high = (
+            np.pad(self.corners, ((0, 0), (0, 1)), constant_values=z) for z in (0.0, self.height)
+        )
+        own = np.arange(num)
+        after = (own + 1) % num
+        sides = [(own, after, after + num), (own, after + num, own + num)]
+        top = np.stack([np.full(num - 2, num), num + own[1:-1], num + own[2:]], axis=1)
+        return np.concatenate([low, high]), np.concatenate([*(np.stack(s, 1) for s in sides), top])
+
+
 def machine_parts(mouth: Sequence[float] | np.ndarray, heading: float) -> list[Part]:
     """A pitching machine: two wheels beside the mouth, a case behind it, mast and foot.
 

@@ -64,7 +64,7 @@ class Moment:
 
 def moment(world: World, physics: Physics) -> Moment:
     """Tool and balls in a simulated state."""
-    motion = world.robot.tool_motion(world.robot.state(physics))
+    motion = world.carrier.tool_motion(world.robot.state(physics))
     return Moment(*motion, *ball_states(world, physics))
 
 
@@ -87,7 +87,7 @@ def passage(
 
     def gap(at: Moment) -> Array:
         """Height (N,) [m] of the balls over the disc's plane."""
-        return jnp.sum((at.ball_pos - at.robot_pos) * at.normal, axis=1) - world.robot.tool.height
+        return jnp.sum((at.ball_pos - at.robot_pos) * at.normal, axis=1) - world.carrier.tool.height
 
     start, end = gap(before), gap(after)
     passes = (start > 0.0) & (end <= 0.0)
@@ -99,10 +99,10 @@ def passage(
     at, moving = at_share(share), at_share(share + 0.5)  # leaves (N, 3)
     normal = at.normal / jnp.sqrt(jnp.maximum(jnp.sum(at.normal**2, axis=1, keepdims=True), 1e-12))
     arm = at.ball_pos - at.robot_pos
-    aside = arm - world.robot.tool.height * normal
+    aside = arm - world.carrier.tool.height * normal
     offset = jnp.sqrt(jnp.sum(aside**2, axis=1))
     return passes, Contact(
-        met=offset <= world.robot.tool.radius,
+        met=offset <= world.carrier.tool.radius,
         time=time + share * world.timestep,
         offset=offset,
         ball_pos=at.ball_pos,

@@ -8,12 +8,13 @@ import pkgutil
 from typing import Any, ClassVar
 
 from planner_jax.registry import Task, all_tasks
-from planner_jax.sims.noise import NOISES, Sensing, require_whole
+from planner_jax.sims.noise import NOISES, PLANE_NOISES, PlaneSensing, Sensing, require_whole
 from planner_jax.sweep.settings import SettingError, option, require, require_one_of
 from planner_jax.task.catch.card import TASK as CATCH
 from planner_jax.task.hit.card import TASK as HIT
+from planner_jax.task.intercept.card import TASK as INTERCEPT
 
-_REPLAN = "plans a second, 0 for the first only (default: {} with exact, 0 with other planners)"
+_REPLAN = "plans a second, 0 for the first only (default: {} with {}, 0 with other planners)"
 INTERVAL = 0.8  # [s], from throw to throw (paper 000, Fig. 1)
 
 
@@ -52,16 +53,12 @@ class FlySettings:
     """
 
     num: int = option(64, "N", "flights")
-    noise: str = option("lab", "NAME", f"of sensing: {', '.join(NOISES)}")
-    replan: float | None = option(None, "HZ", _REPLAN.format("the task's own rate"))
-    seed: int = option(0, "K", "of balls and noise")
+    seed: int = option(0, "K", "of what is drawn and of noise")
     batch: int | None = option(None, "B", "flights at once (default: all up to 4096)")
     planner: str = option("exact", "NAME", "that makes the plans from scratch")
-    drag_error: float = option(
-        0.15, "F", "relative, of what is believed of the balls' drag, either way"
-    )
+    replan: float | None = option(None, "HZ", _REPLAN.format("the task's own rate", "the first"))
 
-    TASK: ClassVar[Task]  # with its name and planners
+    TASK: ClassVar[Task]  # with its name and planners; the first one is also planned anew
     FLIGHT: ClassVar[str]  # the `FlightTask` that flies it, as "module:Class"
     RATE: ClassVar[float]  # [Hz], of planning anew by default
 
@@ -69,11 +66,9 @@ class FlySettings:
         for name, least in (("num", 1), ("batch", 1), ("seed", 0)):
             value = getattr(self, name)
             require(value is None or value >= least, name, f">= {least}", value)
-        require_one_of(NOISES, "noise", self.noise)
         require_one_of(self.TASK.all_planners(), "planner", self.planner)
-        require(0.0 <= self.drag_error < 1.0, "drag_error", ">= 0 and < 1", self.drag_error)
         again = self.rate > 0.0
-        require(not again or self.planner == "exact", "replan", "0 for other planners", self.rate)
+        require(not again or self._is_first, "replan", "0 for other planners", self.rate)
         try:
             self.check_rate()
         except ValueError as error:
@@ -81,14 +76,18 @@ class FlySettings:
 
     @property
     def rate(self) -> float:
-        """[Hz] of planning anew; only `exact` is planned anew by default."""
+        """[Hz] of planning anew; only the task's first planner is planned anew."""
         if self.replan is not None:
             return self.replan
-        return self.RATE if self.planner == "exact" else 0.0
+        return self.RATE if self._is_first else 0.0
+
+    @property
+    def _is_first(self) -> bool:
+        return self.planner == next(iter(self.TASK.planners))
 
     def check_rate(self) -> None:
         """Raise `ValueError` unless plans can be made anew at `rate`."""
-        NOISES[self.noise].looks_per_plan(self.rate)
+        require(self.rate >= 0.0, "replan", ">= 0", self.rate)
 
     def flight(self) -> Any:
         """The task's `sims.task.FlightTask` with these settings."""
@@ -96,10 +95,29 @@ class FlySettings:
 
 
 @dataclasses.dataclass(frozen=True)
-class CatchFly(FlySettings):
+class BallFly(FlySettings):
+    """The settings that flights among balls have besides."""
+
+    noise: str = option("lab", "NAME", f"of sensing: {', '.join(NOISES)}")
+    drag_error: float = option(
+        0.15, "F", "relative, of what is believed of the balls' drag, either way"
+    )
+
+    def __post_init__(self) -> None:
+        require_one_of(NOISES, "noise", self.noise)
+        super().__post_init__()
+        require(0.0 <= self.drag_error < 1.0, "drag_error", ">= 0 and < 1", self.drag_error)
+
+    def check_rate(self) -> None:
+        """Raise `ValueError` unless a period of planning is a whole number of looks."""
+        NOISES[self.noise].looks_per_plan(self.rate)
+
+
+@dataclasses.dataclass(frozen=True)
+class CatchFly(BallFly):
     """Flights that catch thrown balls."""
 
-    replan: float | None = option(None, "HZ", _REPLAN.format(100))
+    replan: float | None = option(None, "HZ", _REPLAN.format(100, "exact"))
     planner: str = option("exact", "NAME", "of plans from scratch")
     balls: int = option(1, "N", f"thrown {INTERVAL:g} s apart")
 
@@ -119,10 +137,10 @@ class CatchFly(FlySettings):
 
 
 @dataclasses.dataclass(frozen=True)
-class HitFly(FlySettings):
+class HitFly(BallFly):
     """Flights that hit served balls."""
 
-    replan: float | None = option(None, "HZ", _REPLAN.format(50))
+    replan: float | None = option(None, "HZ", _REPLAN.format(50, "exact"))
     planner: str = option("exact", "NAME", "of plans from scratch")
     suite: str = option("S.1", "NAME", "of serves")
 
@@ -133,3 +151,41 @@ class HitFly(FlySettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_one_of(HIT.suites, "suite", self.suite)
+
+
+@dataclasses.dataclass(frozen=True)
+class InterceptFly(FlySettings):
+    """Drives of a car that meets a moving target among obstacles."""
+
+    replan: float | None = option(None, "HZ", _REPLAN.format(1, "spacetime"))
+    planner: str = option("spacetime", "NAME", "of plans from scratch")
+    suite: str = option("easy", "NAME", "of interceptions")
+    noise: str = option("paper", "NAME", f"of what is seen: {', '.join(PLANE_NOISES)}")
+    latency: float = option(0.05, "S", "age of what is seen [s]")
+    looks: float = option(1.0, "HZ", "looks at the target a second, during the drive")
+    known: bool = option(False, "", "the target's way is known, not predicted from looks")
+    see_movers: bool = option(False, "", "movers too are predicted from looks, not known")
+    slip: bool = option(False, "", "tyres that slip")
+
+    TASK: ClassVar[Task] = INTERCEPT
+    FLIGHT: ClassVar[str] = "planner_jax.sims.tasks.intercept:InterceptFlight"
+    RATE: ClassVar[float] = 1.0
+
+    def __post_init__(self) -> None:
+        require_one_of(PLANE_NOISES, "noise", self.noise)
+        require_one_of(INTERCEPT.all_suites(), "suite", self.suite)
+        super().__post_init__()
+
+    @property
+    def sensing(self) -> PlaneSensing:
+        """How car and target are seen.
+
+        Raises:
+            ValueError: a value is out of its range.
+        """
+        preset = PLANE_NOISES[self.noise]
+        return dataclasses.replace(preset, latency=self.latency, looks=self.looks)
+
+    def check_rate(self) -> None:
+        """Raise `ValueError` unless a period of planning is a whole number of frames."""
+        self.sensing.frames_per_plan(self.rate)

@@ -1,4 +1,4 @@
-"""What a run of flights asks of a task; `tasks/catch.py` and `tasks/hit.py` answer."""
+"""What a run of flights asks of a task; the classes in `tasks` answer."""
 
 import abc
 import dataclasses
@@ -9,10 +9,12 @@ import jax
 import numpy as np
 
 from planner_jax.sims.loop import Flown, Loop
-from planner_jax.sims.model import World
+from planner_jax.sims.model import BALL_RADIUS, World
 from planner_jax.sims.noise import NOISES
 from planner_jax.sims.recording import Launches, Recording, recorded
-from planner_jax.sweep.columns import Column
+from planner_jax.sims.scenery import Prism
+from planner_jax.sims.settings import BallFly
+from planner_jax.sweep.columns import LIST, Column, leaves_of
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +37,7 @@ class Flights(abc.ABC):
     """What came of a batch of flights; leaves with a leading axis B."""
 
     first_plan: Any
-    flown: Flown  # times from the first plan
+    flown: Any  # what was simulated; `tracking` (B, 2) [m], root mean square and worst, and more
     planning_seconds: float  # of the host's clock, spent on plans from scratch
 
     @property
@@ -48,15 +50,25 @@ class Flights(abc.ABC):
 class FlightTask(abc.ABC):
     """A task as a run of flights knows it, with the settings of the run.
 
-    Its class is named by the settings' `FLIGHT`; `run.py` knows nothing else of a task.
+    Its class is named by the settings' `FLIGHT`; `run.py` knows nothing else of a task. One that
+    meets balls inherits from `BallFlightTask`.
     """
 
     settings: Any  # of the task's class of `FlySettings`
 
-    CONTACT: ClassVar[str]  # what a ball is that was met, in pictures: "caught"
+    THING: ClassVar[str] = "ball"  # what is to be met, in pictures
+    THING_RADIUS: ClassVar[float] = BALL_RADIUS  # [m]
+    CONTACT: ClassVar[str]  # what a thing is that was met, in pictures: "caught"
     SUCCESS: ClassVar[str]  # what a flight has done that succeeded: "caught all balls"
     PUBLISHED: ClassVar[str]  # what is published of the task, for the table
     COLUMNS: ClassVar[Sequence[Column]]  # of `plans.parquet`, besides those of all tasks
+    HAS_REACH: ClassVar[bool] = False  # whether `reachable` can say anything
+    VIEW: ClassVar[tuple[float, float]] = (18.0, -68.0)  # elevation and azimuth of pictures [deg]
+    # Where the eye of the viewer is, and where it looks [m].
+    EYE: ClassVar[tuple[tuple[float, float, float], tuple[float, float, float]]] = (
+        (1.5, -8.0, 3.0),
+        (1.9, 0.0, 1.2),
+    )
 
     @abc.abstractmethod
     def world(self) -> World:
@@ -71,28 +83,6 @@ class FlightTask(abc.ABC):
         """Plan and fly some cases, with a record of every look or without; `Flights`."""
 
     @abc.abstractmethod
-    def launches(self, cases: Any, flown: Flown) -> Launches:
-        """What is known of the balls of some flights before and after these were simulated."""
-
-    @property
-    @abc.abstractmethod
-    def suite(self) -> str:
-        """What was flown, in a word or two for title and table."""
-
-    def counts(self, rows: Any) -> dict[str, int]:
-        """What else is counted over the rows of a run, for the summary."""
-        return {}
-
-    def findings(self, summary: Mapping[str, Any]) -> list[str]:
-        """What else is said of a run at its top, a sentence each."""
-        return []
-
-    def loop(self, record: bool) -> Loop:
-        """The closed loop of the flights, with a record of every look or without."""
-        settings = self.settings
-        sensing = NOISES[settings.noise]
-        return Loop(self.world(), sensing, replan=settings.rate, record=record)
-
     def recording(self, cases: Any, flights: Any, lanes: Sequence[int] | np.ndarray) -> Recording:
         """The recording of some of the flights that were recorded.
 
@@ -101,6 +91,103 @@ class FlightTask(abc.ABC):
             flights: what came of them.
             lanes: (F,) which of them.
         """
+
+    @property
+    @abc.abstractmethod
+    def suite(self) -> str:
+        """What was flown, in a word or two for title and table."""
+
+    @property
+    @abc.abstractmethod
+    def conditions(self) -> str:
+        """Under what noise and errors was flown, as the begin of a sentence."""
+
+    @property
+    @abc.abstractmethod
+    def simulated(self) -> str:
+        """What is simulated, for the page of a run."""
+
+    @abc.abstractmethod
+    def parameters(self) -> dict[str, Any]:
+        """Everything that shapes the simulation, as plain values for the manifest."""
+
+    def every_column(self) -> Sequence[Column]:
+        """The task's columns."""
+        return self.COLUMNS
+
+    def surroundings(self, index: int) -> Sequence[Prism]:
+        """What else stands or moves in one flight of the run, to be looked at."""
+        return ()
+
+    def reachable(self, index: int) -> Sequence[tuple[float, np.ndarray]]:
+        """Where the robot of a flight could be and when: times [s] and points (P, 2) [m]."""
+        return ()
+
+    def counts(self, rows: Any) -> dict[str, Any]:
+        """What else is said in numbers of the rows of a run, for the summary."""
+        return {}
+
+    def findings(self, summary: Mapping[str, Any]) -> list[str]:
+        """What else is said of a run at its top, a sentence each."""
+        return []
+
+    def title(self, recording: Recording, flight: int) -> str:
+        """Task, place in the run and outcome of a flight."""
+        outcome = "success" if recording.success[flight] else "failure"
+        return f"{self.settings.TASK.name} {recording.index[flight]}, {outcome}"
+
+
+_CONTACTS = leaves_of(
+    "verdict.flown.contact",
+    ("contact_time", "s", "of each ball's nearest passage", LIST, "time"),
+    ("planned_time", "s", "of that contact", LIST),
+    ("offset", "m", "ball from the tool's centre", LIST),
+    ("contact_ball_pos", "m", "a point a ball", LIST, "ball_pos"),
+    ("contact_robot_pos", "m", "a point a ball", LIST, "robot_pos"),
+    ("contact_tracking", "m", "robot from its plan then", LIST, "tracking"),
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class BallFlightTask(FlightTask):
+    """A task that meets balls, flown in `sims.loop`."""
+
+    settings: BallFly
+
+    @abc.abstractmethod
+    def launches(self, cases: Any, flown: Flown) -> Launches:
+        """What is known of the balls of some flights before and after these were simulated."""
+
+    def every_column(self) -> Sequence[Column]:
+        """The contacts, and the task's columns."""
+        return [*_CONTACTS, *self.COLUMNS]
+
+    @property
+    def conditions(self) -> str:
+        """Noise and wrong drag."""
+        settings = self.settings
+        return f"Noise {settings.noise}, drag believed {100 * settings.drag_error:g} % wrong"
+
+    @property
+    def simulated(self) -> str:
+        """Robot, motion capture and balls."""
+        return (
+            f"{self.world().robot.WORDS}, motion capture with noise, dropout and latency, balls "
+            "with quadratic drag"
+        )
+
+    def parameters(self) -> dict[str, Any]:
+        """Those of the closed loop."""
+        return dataclasses.asdict(self.loop(record=False))
+
+    def loop(self, record: bool) -> Loop:
+        """The closed loop of the flights, with a record of every look or without."""
+        settings = self.settings
+        sensing = NOISES[settings.noise]
+        return Loop(self.world(), sensing, replan=settings.rate, record=record)
+
+    def recording(self, cases: Any, flights: Any, lanes: Sequence[int] | np.ndarray) -> Recording:
+        """The recording of some of the flights that were recorded; see `FlightTask`."""
         pick = lambda leaf: np.asarray(leaf)[lanes]  # noqa: E731
         flown = dataclasses.replace(
             flights.flown,
@@ -115,8 +202,3 @@ class FlightTask(abc.ABC):
             index=some.index,
             success=pick(flights.success),
         )
-
-    def title(self, recording: Recording, flight: int) -> str:
-        """Task, place in the run and outcome of a flight."""
-        outcome = "success" if recording.success[flight] else "failure"
-        return f"{self.settings.TASK.name} {recording.index[flight]}, {outcome}"

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from planner_jax.sims.film import BALL_COLOURS
-from planner_jax.sims.model import BALL_RADIUS
 from planner_jax.sims.recording import Recording, frame
 from planner_jax.sims.scenery import GROUND_COLOUR, Part, machine_parts
 from planner_jax.sims.task import FlightTask
@@ -84,6 +83,7 @@ class Viewer:
         time: slider; its `value` [s] is the time that is shown.
         playing: check box.
         speed: slider; 1 is real time.
+        reach: check box, whether to show where the robot could be; None if the task cannot say.
         robot: the places of the robot's shapes in the scene.
     """
 
@@ -103,9 +103,8 @@ class Viewer:
         """
         viser = _viser()
         address = free_address(host, port)
-        self.world, self.recording = task.world(), recording
+        self.task, self.world, self.recording = task, task.world(), recording
         self._titles = [task.title(recording, row) for row in range(len(recording))]
-        self._contact = task.CONTACT
         self._server = viser.ViserServer(address, port, label="planner-jax", verbose=False)
         bound = self._server.get_port()
         if port and bound != port:  # someone was faster
@@ -121,11 +120,16 @@ class Viewer:
         first, last = round(float(times[0]), 3), round(float(times[-1]), 3)
         self.time = gui.add_slider("Time [s]", first, last, _STEP, first)
         self.speed = gui.add_slider("Speed", 0.1, 2.0, 0.1, 0.5)
+        self.reach = None
+        if task.HAS_REACH:
+            self.reach = gui.add_checkbox("What can be reached", False)
         self._note = gui.add_markdown("")
         self._stand()
         self._draw_flight()
         self.flight.on_update(lambda _: self._draw_flight())
         self.time.on_update(lambda _: self._show())
+        if self.reach is not None:
+            self.reach.on_update(lambda _: self._draw_flight())
 
     @property
     def look(self) -> int:
@@ -168,8 +172,8 @@ class Viewer:
         add.set_up_direction("+z")
         add.add_grid(
             "/ground",
-            width=14.0,
-            height=10.0,
+            width=20.0,
+            height=20.0,
             plane_color=_rgb(GROUND_COLOUR),
             plane_opacity=1.0,
             cell_thickness=0.0,
@@ -188,13 +192,14 @@ class Viewer:
                 add.add_cylinder(f"{name}/disc{k}", radius, position=place, **flat)
         nothing = np.zeros((1, 2, 3))
         self._balls, self._trails = [], []
-        for k in range(self.world.num_balls):
+        for k in range(self.recording.balls.shape[2]):
             colour = BALL_COLOURS[k % len(BALL_COLOURS)]
-            ball = add.add_icosphere(f"/ball{k}", BALL_RADIUS, _rgb(colour))
+            ball = add.add_icosphere(f"/ball{k}", self.task.THING_RADIUS, _rgb(colour))
             self._balls.append(ball)
             self._trails.append(self._add_line(f"/trail{k}", nothing, colour, 0.012))
         camera = self._server.initial_camera
-        camera.position, camera.look_at = (1.5, -8.0, 3.0), (1.9, 0.0, 1.2)
+        camera.position, camera.look_at = self.task.EYE
+        self._way = self._add_line("/expected", nothing, RED, 0.006)
 
     def _add_line(self, name: str, pieces: np.ndarray, colour: str, thickness: float) -> Any:
         return self._scene.add_line_segments(name, pieces, _rgb(colour), thickness=thickness)
@@ -227,7 +232,7 @@ class Viewer:
             ]
             paths += [
                 (f"/path{k}", recording.balls[row, :, k], GREY, 0.004)
-                for k in range(self.world.num_balls)
+                for k in range(recording.balls.shape[2])
             ]
             for name, path, colour, thickness in paths:
                 drawn.append(self._add_line(name, segments(path), colour, thickness))
@@ -235,13 +240,31 @@ class Viewer:
             points.append(("/target", recording.target[row], GREEN))
             for number, (name, place, colour) in enumerate(points):
                 if np.isfinite(place).all():
-                    name, radius = f"{name}{number}", 1.5 * BALL_RADIUS
+                    name, radius = f"{name}{number}", 1.5 * self.task.THING_RADIUS
                     dot = self._scene.add_icosphere(name, radius, _rgb(colour), position=place)
                     drawn.append(dot)
+            self._prisms, self._layers = [], []
+            for number, prism in enumerate(self.task.surroundings(int(recording.index[row]))):
+                vertices, faces = prism.mesh()
+                solid = self._scene.add_mesh_simple(
+                    f"/prism{number}",
+                    vertices.astype(np.float32),
+                    faces.astype(np.uint32),
+                    color=_rgb(prism.colour),
+                    flat_shading=True,
+                )
+                self._prisms.append((prism, solid))
+                drawn.append(solid)
+            if self.reach is not None and self.reach.value:
+                self._layers = list(self.task.reachable(int(recording.index[row])))
+                self._cells = self._scene.add_point_cloud(
+                    "/reach", np.zeros((1, 3), np.float32), _rgb(SKY), point_size=0.04
+                )
+                drawn.append(self._cells)
             self._drawn = drawn
             met = [f"{at:.2f} s" for at in recording.met[row] if np.isfinite(at)]
-            word = self._contact.capitalize()
-            self._note.content = f"{word} at {', '.join(met)}." if met else "No ball was met."
+            word, none = self.task.CONTACT.capitalize(), f"No {self.task.THING} was met."
+            self._note.content = f"{word} at {', '.join(met)}." if met else none
             self.time.value = self.time.min
             last = recording.num_looks(row) - 1
             self.time.max = round(float(recording.time[row, last]), 3)
@@ -255,6 +278,17 @@ class Viewer:
             now = frame(self.recording, robot, row, look)
             for shape, place in zip(self.robot, robot.places(now.robot), strict=True):
                 shape.position, shape.wxyz = place
+            for prism, solid in self._prisms:
+                solid.position = (*(now.time * np.asarray(prism.velocity)), 0.0)
+            way = segments(self.recording.expected[row, look])
+            self._way.visible = len(way) > 0
+            if self._way.visible:
+                self._way.points = way.astype(np.float32)
+            if self._layers:
+                nearest = np.argmin([abs(time - now.time) for time, _ in self._layers])
+                points = self._layers[nearest][1]
+                self._cells.points = np.pad(points, ((0, 0), (0, 1))).astype(np.float32)
+                self._cells.colors = np.tile(np.array(_rgb(SKY), np.uint8), (len(points), 1))
             for k, (ball, trail) in enumerate(zip(self._balls, self._trails, strict=True)):
                 ball.visible = bool(np.isfinite(now.balls[k]).all())
                 if ball.visible:

@@ -25,4 +25,5 @@ def recording(looks=6, met=0.04, target=(np.nan,) * 3):
         met=np.array([[met]]),
         contact=np.array([[[0.1, 0.0, 1.96]]]),
         target=np.array([target]),
+        expected=np.zeros((1, looks, 0, 3)),
     )

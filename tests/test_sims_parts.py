@@ -267,7 +267,7 @@ def test_a_lost_look_shows_nothing():
             lambda: Loop(CATCH_WORLD, Sensing(latency=0.015)),
             "latency must be a multiple of the looks' 0.01 s, got 0.015",
         ),
-        (lambda: dataclasses.replace(CATCH_WORLD, num_balls=0), "num_balls must be >= 1, got 0"),
+        (lambda: dataclasses.replace(CATCH_WORLD, num_balls=-1), "num_balls must be >= 0, got -1"),
         (lambda: dataclasses.replace(CATCH_WORLD, timestep=0.0), "timestep must be > 0, got 0.0"),
     ],
 )

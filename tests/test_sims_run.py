@@ -17,8 +17,8 @@ from planner_jax.sims.loop import flown, fly_leg
 from planner_jax.sims.recording import Launches
 from planner_jax.sims.run import start_flights
 from planner_jax.sims.scoring import passage
-from planner_jax.sims.settings import CatchFly, FlySettings, HitFly, fly_settings
-from planner_jax.sims.task import FlightCases, Flights, FlightTask
+from planner_jax.sims.settings import BallFly, CatchFly, HitFly, fly_settings
+from planner_jax.sims.task import BallFlightTask, FlightCases, Flights
 from planner_jax.sims.tasks.catch import CATCH_WORLD
 from planner_jax.sweep.settings import SettingError
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
@@ -30,7 +30,7 @@ from tests.recordings import recording
     [
         (
             lambda: fly_settings("block"),
-            "task must be one that can be flown (hit, catch), got 'block'",
+            "task must be one that can be flown (hit, catch, intercept), got 'block'",
         ),
         (lambda: CatchFly(noise="loud"), "noise must be one of none, lab, harsh, got 'loud'"),
         (lambda: CatchFly(num=0), "num must be >= 1, got 0"),
@@ -135,7 +135,7 @@ DROP = Task(
 
 
 @dataclasses.dataclass(frozen=True)
-class DropFly(FlySettings):
+class DropFly(BallFly):
     """A third task: a quadrotor hovers, and a ball falls into its net."""
 
     TASK, FLIGHT, RATE = DROP, "tests.test_sims_run:DropFlight", 0.0
@@ -162,7 +162,7 @@ class DropFlights(Flights):
         return np.all(self.flown.contact.met, axis=1)
 
 
-class DropFlight(FlightTask):
+class DropFlight(BallFlightTask):
     CONTACT, SUCCESS, PUBLISHED, COLUMNS = "caught", "held the ball", "nothing", ()
     suite = "a fall of 1 m"
 
@@ -194,7 +194,8 @@ def test_a_task_without_flights_is_refused_in_one_line(monkeypatch):
     monkeypatch.setitem(all_tasks(), "drop", dataclasses.replace(DROP, flight=None))
     with pytest.raises(SettingError) as error:
         fly_settings("drop")
-    assert str(error.value) == "task must be one that can be flown (hit, catch), got 'drop'"
+    rule = "task must be one that can be flown (hit, catch, intercept)"
+    assert str(error.value) == f"{rule}, got 'drop'"
 
 
 @pytest.mark.slow

@@ -120,6 +120,17 @@ def pose_at(start: Array, end: Array, speed: Array, curvature: Array, time: Arra
     return start + jnp.stack([x, y, jnp.sum(whole)])
 
 
+def knots_at(end: Array, speed: Array, curvature: Array, time: Array) -> tuple[Array, Array, Array]:
+    """Speed [m/s], curvature [1/m] and acceleration [m/s^2] at one time () of knots (K + 1,)."""
+    num = speed.shape[0] - 1
+    place = jnp.clip(time / end * num, 0.0, num)
+    k = jnp.clip(place.astype(jnp.int32), 0, num - 1)
+    share = place - k
+    v = (1.0 - share) * speed[k] + share * speed[k + 1]
+    c = (1.0 - share) * curvature[k] + share * curvature[k + 1]
+    return v, c, (speed[k + 1] - speed[k]) * num / end
+
+
 @jax.jit
 def _sampled(
     start: Array, end: Array, speed: Array, curvature: Array, time: Array
@@ -129,18 +140,13 @@ def _sampled(
     def at(
         start: Array, end: Array, speed: Array, curvature: Array, time: Array
     ) -> dict[str, Array]:
-        num = speed.shape[0] - 1
-        place = jnp.clip(time / end * num, 0.0, num)
-        k = jnp.clip(place.astype(jnp.int32), 0, num - 1)
-        share = place - k
         pose = pose_at(start, end, speed, curvature, time)
-        v = (1.0 - share) * speed[k] + share * speed[k + 1]
-        c = (1.0 - share) * curvature[k] + share * curvature[k + 1]
+        v, c, acceleration = knots_at(end, speed, curvature, time)
         return {
             "pos": pose[:2],
             "heading": pose[2],
             "speed": v,
-            "acceleration": (speed[k + 1] - speed[k]) * num / end,
+            "acceleration": acceleration,
             "curvature": c,
             "yaw_rate": v * c,
         }

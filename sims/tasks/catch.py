@@ -36,7 +36,7 @@ from planner_jax.sims.robot import Tool
 from planner_jax.sims.robots.quadrotor.robot import Quadrotor
 from planner_jax.sims.scoring import passage
 from planner_jax.sims.settings import INTERVAL, CatchFly, require_interval
-from planner_jax.sims.task import FlightCases, Flights, FlightTask
+from planner_jax.sims.task import BallFlightTask, FlightCases, Flights
 from planner_jax.sweep.columns import BOOL, Column, list_of
 from planner_jax.task.catch.case import GRAVITY, NET_HEIGHT, NET_RADIUS, START, CatchCase
 from planner_jax.task.catch.case import case as catch_case
@@ -181,12 +181,12 @@ def believed(loop: Loop, flights: FlightState, new: Array, horizon: Array) -> Ca
     """
     unknown: Any = None
     least_thrust, body_rate = _FIRST if flights.plan is None else _BEHIND
-    robot = loop.world.robot
+    robot = loop.world.carrier
     empty = catch_case(
         unknown,
         np.zeros(horizon.shape),
         gravity=loop.world.gravity,
-        net_height=loop.world.robot.tool.height,
+        net_height=robot.tool.height,
         net_radius=_AIM_RADIUS,
         min_thrust=least_thrust * loop.world.gravity,
         body_rate=body_rate,
@@ -400,7 +400,7 @@ def within(cases: CatchCase, limits: tuple[float, float] | None) -> CatchCase:
     return dataclasses.replace(cases, limits=new)
 
 
-class CatchFlight(FlightTask):
+class CatchFlight(BallFlightTask):
     """Catches as a run of flights knows them; the settings are `CatchFly`."""
 
     settings: CatchFly

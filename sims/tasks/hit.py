@@ -27,7 +27,7 @@ from planner_jax.sims.robots.quadrotor.robot import Quadrotor
 from planner_jax.sims.scenery import Part
 from planner_jax.sims.scoring import Contact, passage
 from planner_jax.sims.settings import HitFly
-from planner_jax.sims.task import FlightCases, Flights, FlightTask
+from planner_jax.sims.task import BallFlightTask, FlightCases, Flights
 from planner_jax.sweep.columns import BOOL, NUMBER, VECTOR, Column
 from planner_jax.sweep.summary import percent
 from planner_jax.task.hit import court
@@ -237,7 +237,7 @@ def fly_hits(
     return HitFlights(first, flown(flight, [record]), planning, point, miss)
 
 
-class HitFlight(FlightTask):
+class HitFlight(BallFlightTask):
     """Hits as a run of flights knows them; the settings are `HitFly`."""
 
     settings: HitFly

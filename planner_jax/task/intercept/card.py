@@ -58,5 +58,6 @@ TASK = Task(
         "constant": "planner_jax.task.intercept.path_then_speed:constant",
     },
     suites={name: suite.description for name, suite in SUITES.items()},
+    flight="planner_jax.sims.settings:InterceptFly",
     contact="time",
 )

@@ -88,6 +88,10 @@ class Quadrotor:
             jnp.full(4, lift, place.dtype),
         )
 
+    def drive(self, physics: Physics, command: Array, timestep: float) -> tuple[Array, Array]:
+        """The thrusts asked for, and no other forces."""
+        return command, jnp.zeros(self.num_vel, command.dtype)
+
     def state(self, physics: Physics) -> RobotState:
         """The quadrotor's part of the simulated state."""
         qpos, qvel = physics.qpos, physics.qvel

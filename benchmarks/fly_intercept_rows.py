@@ -1,0 +1,137 @@
+"""Every row of the drives' protocol: which share of targets is met in closed loop, and by what.
+
+    python -m benchmarks.fly_intercept_rows [--suite hard] [--num 50] [--seed 0]
+                                            [--rows sensing,replan,latency,slip]
+
+Misses are those of the body's middle from the TRUE target when the plan ends; a meeting counts
+within 0.3 m if the car touched nothing, by exact polygons every 20 ms. Targets are seen 15 times
+before the start and then once a second with 0.1 m of noise, the car's pose with 1 cm and 0.01 rad,
+everything 50 ms late, and plans are made anew once a second, unless a row says otherwise. The
+command of a row flies the same drives into a run folder.
+"""
+
+import argparse
+import dataclasses
+import time
+from typing import Any
+
+import jax
+import numpy as np
+
+from planner_jax.sims.settings import InterceptFly
+from planner_jax.sims.tasks.intercept import (
+    FAR,
+    NEAR,
+    SUCCESS,
+    TOUCH,
+    InterceptFlights,
+    fly_intercepts,
+)
+from planner_jax.sweep.summary import percent, wilson_interval
+from planner_jax.task.intercept.plan import InterceptPlan
+
+# Row -> settings that differ from the task's own.
+ROWS: dict[str, dict[str, dict[str, Any]]] = {
+    "sensing": {
+        "everything known": {"known": True, "noise": "none", "latency": 0.0, "replan": 0.0},
+        "everything known, planned anew": {"known": True, "noise": "none", "latency": 0.0},
+        "target known, noise and latency": {"known": True},
+        "target predicted": {},
+        "target predicted, never planned anew": {"replan": 0.0},
+        "ten looks a second": {"looks": 10.0},
+        "movers seen as well": {"see_movers": True},
+    },
+    "replan": {f"planned anew at {rate:g} Hz": {"replan": rate} for rate in (0.0, 1.0, 2.0, 10.0)},
+    "latency": {f"latency {1e3 * age:g} ms": {"latency": age} for age in (0.0, 0.05, 0.1)},
+    "slip": {
+        "tyres that slip": {"slip": True},
+        "tyres that slip, never planned anew": {"slip": True, "replan": 0.0},
+    },
+}
+HEADER = (
+    "| row | success % (95 %) | <= 0.05 / 0.3 / 0.5 m, % | miss p50, m | wall / mover touched, % | "
+    "tracking rms p50 / worst, cm | drive / steering saturated, % | s |"
+)
+
+
+def line(name: str, flights: InterceptFlights, seconds: float) -> str:
+    """One row of the table."""
+    good, miss, number = flights.success, flights.miss, len(flights.miss)
+    low, high = wilson_interval(int(good.sum()), number)
+    within = " / ".join(percent(int((miss <= d).sum()), number) for d in (NEAR, SUCCESS, FAR))
+    touched = " / ".join(
+        percent(int((clearance < -TOUCH).sum()), number)
+        for clearance in (flights.wall_clearance, flights.mover_clearance)
+    )
+    tracking = flights.flown.tracking
+    rms, worst = 100.0 * np.median(tracking[:, 0]), 100.0 * tracking[:, 1].max()
+    drive, steering = 100.0 * flights.flown.saturation.mean(axis=0)
+    return (
+        f"| {name} | {percent(int(good.sum()), number)} ({100 * low:.1f} to {100 * high:.1f}) | "
+        f"{within} | {np.median(miss):.3f} | {touched} | {rms:.2f} / {worst:.1f} | "
+        f"{drive:.2f} / {steering:.2f} | {seconds:.0f} |"
+    )
+
+
+def command(settings: InterceptFly) -> str:
+    """What flies a row into a run folder."""
+    own = InterceptFly(suite=settings.suite, num=settings.num, seed=settings.seed)
+    words = [f"--suite {settings.suite} --num {settings.num} --seed {settings.seed}"]
+    for field in dataclasses.fields(settings):
+        value = getattr(settings, field.name)
+        if value != getattr(own, field.name):
+            flag = f"--{field.name.replace('_', '-')}"
+            shown = value if isinstance(value, str) else f"{value:g}"
+            words.append(flag if value is True else f"{flag} {shown}")
+    return " ".join(["planner-jax fly intercept", *words])
+
+
+def flown(
+    settings: InterceptFly, first_plans: dict[tuple, InterceptPlan]
+) -> tuple[InterceptFlights, float]:
+    """The drives of a row, and the seconds that they took.
+
+    First plans depend on what was seen before the start alone: they are made once for all rows.
+    """
+    task, key = settings.flight(), (settings.known, settings.see_movers, settings.noise)
+    began = time.perf_counter()
+    flights = fly_intercepts(
+        task.loop(),
+        task.cases(),
+        settings.seed,
+        replan=settings.rate,
+        plan=first_plans.get(key),
+        known=settings.known,
+        see_movers=settings.see_movers,
+    )
+    first_plans[key] = flights.first_plan
+    return flights, time.perf_counter() - began
+
+
+def main() -> None:
+    """Print the rows asked for, and the command of each."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--suite", default="hard")
+    parser.add_argument("--num", type=int, default=50, help="drives a row")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--rows", default=",".join(ROWS), help=f"out of {', '.join(ROWS)}")
+    args = parser.parse_args()
+    names = args.rows.split(",")
+    if unknown := [name for name in names if name not in ROWS]:
+        parser.error(f"rows must be out of {', '.join(ROWS)}, got {unknown[0]!r}")
+    device = jax.devices()[0].device_kind
+    print(f"{args.num} drives a row, suite {args.suite}, {device}, jax {jax.__version__}")
+    print(f"{HEADER}\n|{'---|' * 8}", flush=True)
+    commands, first_plans, lines = [], {}, {}
+    for name in names:
+        for row, options in ROWS[name].items():
+            settings = InterceptFly(suite=args.suite, num=args.num, seed=args.seed, **options)
+            commands.append(f"{row}: {command(settings)}")
+            if settings not in lines:
+                lines[settings] = flown(settings, first_plans)
+            print(line(row, *lines[settings]), flush=True)
+    print("\n".join(["", *commands]))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,217 @@
+"""Drives in closed loop: estimate, track, and a plan that is changed from outside between frames.
+
+A physics step is a control step; a number of steps makes a frame, at whose end the pose is kept.
+Between frames a new plan may be put in (`sims.tasks.intercept` does). The car is shown its pose a
+latency late, with noise; in between it reckons from its own speed and steering angle, and what it
+is shown corrects what it had reckoned for then. Written for one drive; `drive_on` makes a batch of
+it. Times count from the first plan.
+"""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array, lax
+
+from planner_jax.robot.car import CarPlan, pose_at
+from planner_jax.sims.model import World, step
+from planner_jax.sims.noise import CONTROL_RATE, FRAME_RATE, PlaneSensing
+from planner_jax.sims.robot import Physics
+from planner_jax.sims.robots.car.control import CarState
+from planner_jax.sims.robots.car.robot import Car
+
+_TRUST = 0.1  # share of what a shown pose differs that is believed, at every step
+
+
+@dataclasses.dataclass(frozen=True)
+class DriveLoop:
+    """World and sensing of a drive; static under jit. Noise alone compiles nothing anew.
+
+    Raises:
+        ValueError: the world has no car, or steps of another length than that of control.
+    """
+
+    world: World  # with a car
+    sensing: PlaneSensing = PlaneSensing()
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.world.robot, Car):
+            raise ValueError(f"world must hold a car, got a {type(self.world.robot).__name__}")
+        if not np.isclose(self.world.timestep * CONTROL_RATE, 1.0):
+            rule = f"timestep must be {1.0 / CONTROL_RATE:g}"
+            raise ValueError(f"{rule}, got {self.world.timestep}")
+
+    @property
+    def car(self) -> Car:
+        """The robot."""
+        return _car(self.world)
+
+    @property
+    def late_steps(self) -> int:
+        """How many steps old is the pose that is shown."""
+        return round(self.sensing.latency * CONTROL_RATE)
+
+
+@struct.dataclass
+class DriveState:
+    """Everything that changes during a drive."""
+
+    physics: Physics
+    shown: Array  # (L + 1, 3), true poses of the last steps, the newest last
+    believed: Array  # (L + 1, 3), poses that were reckoned then
+    plan: CarPlan
+    began: Array  # () [s], when the plan began
+    worst_tracking: Array  # () [m], of the rear axle from its plan
+    squared_tracking: Array  # () [m^2 s]
+    saturated: Array  # (2,) [s], how long more was asked than drive and steering can do
+    time: Array  # () [s]
+    pose_stds: Array  # (2,), errors of a shown coordinate [m] and heading [rad]
+    key: Array
+
+
+@struct.dataclass
+class Frame:
+    """The end of a frame."""
+
+    time: Array  # () [s]
+    pose: Array  # (3,) x, y [m] of the rear axle's middle and heading [rad]
+    wanted: Array  # (2,) [m], where the plan has it
+
+
+def _car(world: World) -> Car:
+    assert isinstance(world.robot, Car)  # a `DriveLoop` has seen to it
+    return world.robot
+
+
+def reckoned(pose: Array, speed: Array, curvature: Array, span: Any) -> Array:
+    """The pose (3,) a short span [s] later, at a speed () on a way of a curvature ()."""
+    turned = speed * curvature * span
+    middle = pose[2] + 0.5 * turned
+    way = speed * span
+    return pose + jnp.stack([way * jnp.cos(middle), way * jnp.sin(middle), turned])
+
+
+def started(loop: DriveLoop, plans: CarPlan, keys: Array) -> DriveState:
+    """Drives at the begin of their plans.
+
+    Args:
+        loop: with the world.
+        plans: leaves (B, ...).
+        keys: (B,) of the noise.
+    """
+
+    def one(plan: CarPlan, key: Array) -> DriveState:
+        zero = jnp.zeros_like(plan.time)
+        history = jnp.tile(plan.start, (loop.late_steps + 1, 1))
+        return DriveState(
+            physics=loop.car.moving(plan.start, plan.speed[0], plan.curvature[0]),
+            shown=history,
+            believed=history,
+            plan=plan,
+            began=zero,
+            worst_tracking=zero,
+            squared_tracking=zero,
+            saturated=jnp.zeros(2, plan.time.dtype),
+            time=zero,
+            pose_stds=jnp.asarray(loop.sensing.pose_stds, plan.time.dtype),
+            key=key,
+        )
+
+    return jax.vmap(one)(plans, keys)
+
+
+def believed_state(loop: DriveLoop, drive: DriveState) -> tuple[Array, Array, Array]:
+    """What is believed of pose (3,), speed () [m/s] and curvature () [1/m]."""
+    state = loop.car.state(drive.physics)
+    curvature = jnp.tan(state.steering) / loop.car.vehicle.wheelbase
+    return drive.believed[-1], state.speed, curvature
+
+
+def _one_frame(world: World, drive: DriveState, until: Array) -> tuple[DriveState, Frame]:
+    """The drive one frame later; tracking and saturation count up to a time () [s]."""
+    car, dtype, span = _car(world), drive.time.dtype, world.timestep
+    steps = CONTROL_RATE // FRAME_RATE
+    key, noise_key = jax.random.split(drive.key)
+    noise = jax.random.normal(noise_key, (steps, *car.noise_shape), dtype)
+    times = drive.time + span * jnp.arange(steps, dtype=dtype)
+    references = car.references(drive.plan, times - drive.began, world)
+
+    def advance(carry: tuple, now: tuple) -> tuple[tuple, None]:
+        physics, shown, believed, worst, squared, saturated = carry
+        reference, noise, time = now
+        true = car.state(physics)
+        counts = time < until
+        off = jnp.sum((true.pose[:2] - reference.pos) ** 2)
+        state = dataclasses.replace(true, pose=believed[-1])
+        command = car.command(state, reference, world)
+        over = car.saturation(physics, command)
+        physics = step(world, physics, command, jnp.zeros(0, dtype))
+        after = car.state(physics)
+        # What is shown now is a latency old, as is what had been reckoned for then.
+        seen = car.sensed(dataclasses.replace(true, pose=shown[0]), noise, drive.pose_stds)
+        correction = _TRUST * (seen.pose - believed[0])
+        next_pose = _reckoned_on(car, believed[-1], true, after, span) + correction
+        shown = jnp.concatenate([shown[1:], after.pose[None]])
+        believed = jnp.concatenate([believed[1:] + correction, next_pose[None]])
+        worst = jnp.where(counts, jnp.maximum(worst, off), worst)
+        squared = squared + jnp.where(counts, off * span, 0.0)
+        saturated = saturated + jnp.where(counts, over * span, 0.0)
+        return (physics, shown, believed, worst, squared, saturated), None
+
+    sums = drive.worst_tracking**2, drive.squared_tracking, drive.saturated
+    carry, _ = lax.scan(
+        advance,
+        (drive.physics, drive.shown, drive.believed, *sums),
+        (references, noise, times),
+    )
+    physics, shown, believed, worst, squared, saturated = carry
+    time = drive.time + 1.0 / FRAME_RATE
+    plan = drive.plan
+    wanted = pose_at(plan.start, plan.time, plan.speed, plan.curvature, time - drive.began)[:2]
+    drive = dataclasses.replace(
+        drive,
+        physics=physics,
+        shown=shown,
+        believed=believed,
+        worst_tracking=jnp.sqrt(worst),
+        squared_tracking=squared,
+        saturated=saturated,
+        time=time,
+        key=key,
+    )
+    return drive, Frame(time=time, pose=physics.qpos[:3], wanted=wanted)
+
+
+def _reckoned_on(car: Car, pose: Array, before: CarState, after: CarState, span: float) -> Array:
+    """A believed pose one step on, from the speed and steering angle that the car knows."""
+    steering = 0.5 * (before.steering + after.steering)
+    curvature = jnp.tan(steering) / car.vehicle.wheelbase
+    return reckoned(pose, after.speed, curvature, span)
+
+
+@functools.partial(jax.jit, static_argnames=("world", "num_frames"))
+def drive_on(
+    world: World, drives: DriveState, until: Array, *, num_frames: int
+) -> tuple[DriveState, Frame]:
+    """A batch of drives for some frames.
+
+    Args:
+        world: with a car.
+        drives: leaves (B, ...).
+        until: (B,) [s], up to when tracking and saturation count.
+        num_frames: how many (static).
+
+    Returns:
+        The drives at the end, and the frames, leaves (B, num_frames, ...).
+    """
+
+    def one(drive: DriveState, until: Array) -> tuple[DriveState, Frame]:
+        return lax.scan(
+            lambda state, _: _one_frame(world, state, until), drive, None, length=num_frames
+        )
+
+    return jax.vmap(one)(drives, until)

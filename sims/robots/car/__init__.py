@@ -1,0 +1,1 @@
+"""The car: chassis, tyres, control and its form in MuJoCo."""

@@ -1,0 +1,53 @@
+"""Sizes and limits of the simulated car, and its tyres.
+
+A model car of scale 1:10, as `planner_jax.task.intercept.case` has it; paper 003 gives none of
+these numbers. Drive and steering can do half as much again as plans ask for, which is what
+control works with.
+"""
+
+import dataclasses
+
+GRAVITY = 9.81  # [m/s^2]
+
+
+@dataclasses.dataclass(frozen=True)
+class Tyres:
+    """Lateral forces of both axles, linear in the slip angle up to what friction allows.
+
+    The numbers are for hard rubber on a smooth floor: an assumption.
+    """
+
+    stiffness: float = 5.0  # [1/rad], of lateral force over load, per slip angle
+    friction: float = 0.5  # greatest lateral force over load
+
+    def __post_init__(self) -> None:
+        for name in ("stiffness", "friction"):
+            value = getattr(self, name)
+            if not value > 0.0:
+                raise ValueError(f"{name} must be > 0, got {value}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Vehicle:
+    """A car with rear drive and front steering; static under jit."""
+
+    mass: float = 3.0  # [kg]
+    yaw_inertia: float = 0.055  # [kg m^2], about the centre of mass
+    length: float = 0.4  # [m], of the body
+    width: float = 0.25  # [m]
+    wheelbase: float = 0.3  # [m]
+    rear_overhang: float = 0.05  # [m], from the rear axle to the rear end
+    mass_ahead: float = 0.15  # [m], centre of mass ahead of the rear axle
+    wheel_radius: float = 0.05  # [m]
+    acceleration: float = 1.5  # [m/s^2], greatest drive or brake force over mass
+    steering: float = 0.62  # [rad], greatest steering angle
+    steering_rate: float = 3.0  # [rad/s], greatest
+    drive_lag: float = 0.05  # [s], first order
+    steering_lag: float = 0.05  # [s], first order
+    tyres: Tyres | None = None  # that slip; None for tyres that do not
+
+    @property
+    def loads(self) -> tuple[float, float]:
+        """What rests on the rear axle and on the front axle [N]."""
+        front = self.mass_ahead / self.wheelbase
+        return (1.0 - front) * self.mass * GRAVITY, front * self.mass * GRAVITY

@@ -1,0 +1,641 @@
+"""Interceptions in closed loop: a car meets a moving target among obstacles (paper 003).
+
+Before it sets out the car has seen its target 15 times, a second apart; on the way it looks on. At
+every planning it predicts where the target will be from what it has been shown until then, and
+plans from where it believes to be. Walls are known; movers are too, unless they are to be seen
+like the target. World frame in the plane, SI units; times count from the first plan.
+"""
+
+import dataclasses
+import functools
+import time
+import zlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from planner_jax.plane.obstacles import Obstacles
+from planner_jax.plane.polynomial_fit import fit_polynomial
+from planner_jax.plane.prediction import select
+from planner_jax.plane.reach import CELLS
+from planner_jax.plane.target import PointState, TurningPath
+from planner_jax.planning.plan import plan as plan_all
+from planner_jax.protocol import is_solved
+from planner_jax.referee.clearance import clearances
+from planner_jax.sims.drive import (
+    DriveLoop,
+    DriveState,
+    Frame,
+    believed_state,
+    drive_on,
+    started,
+)
+from planner_jax.sims.launch import flight_keys
+from planner_jax.sims.model import World
+from planner_jax.sims.noise import CONTROL_RATE, FRAME_RATE
+from planner_jax.sims.recording import Recording
+from planner_jax.sims.robots.car.robot import Car
+from planner_jax.sims.robots.car.vehicle import GRAVITY, Tyres, Vehicle
+from planner_jax.sims.scenery import Prism
+from planner_jax.sims.settings import InterceptFly
+from planner_jax.sims.task import FlightCases, Flights, FlightTask
+from planner_jax.sweep.columns import NUMBER, Column, leaves_of
+from planner_jax.sweep.summary import percent
+from planner_jax.task.intercept.case import InterceptCase
+from planner_jax.task.intercept.plan import InterceptPlan
+from planner_jax.task.intercept.spacetime import SpacetimeIntercept
+from planner_jax.task.intercept.suites import observe
+from planner_jax.task.intercept.words import draw, positions
+from planner_jax.task.intercept.words import planner as intercept_planner
+
+CAR_WORLD = World(Car(), GRAVITY, num_balls=0, timestep=1.0 / CONTROL_RATE)
+SUCCESS, NEAR, FAR = 0.3, 0.05, 0.5  # [m], of the miss: what counts, and two more that are told
+TOUCH = 1e-3  # [m] inside of an obstacle that is a contact, as the referee has it
+_SHORTEST = 0.3  # [s] before the meeting, up to when plans are made anew
+_LEAST_STD = 1e-3  # [m], that the prediction believes of looks without noise
+_SMALL = 256  # cases of a batch that is planned in a program of its own size
+_CAUTION = 2.0  # standard deviations by which movers that are seen are grown
+_POINTS = 9  # of the path that is expected, in a recording
+_KEPT = 2  # frames from one that is recorded to the next
+_WALL, _MOVER = "#8C959F", "#D9A441"  # colours
+_WALL_HEIGHT, _MOVER_HEIGHT, _TARGET_HEIGHT = 0.25, 0.2, 0.08  # [m], as they are drawn
+
+
+@dataclasses.dataclass(frozen=True)
+class Meetings(FlightCases):
+    """B interceptions and what is seen of them, NumPy leaves."""
+
+    cases: InterceptCase  # as they truly are
+    times: np.ndarray  # (B, L) [s], of the looks
+    target: np.ndarray  # (B, L, 2) [m], the target as it looks
+    movers: np.ndarray  # (B, L, N, 2) [m], the movers' centres as they look
+
+
+jax.tree_util.register_dataclass(Meetings, [each.name for each in dataclasses.fields(Meetings)], [])
+
+
+def meetings(
+    suite: str, num: int, seed: int = 0, *, noise: float = 0.1, looks: float = 1.0
+) -> Meetings:
+    """Interceptions of a suite, with looks before the start and on the way.
+
+    Args:
+        suite: of `pj.intercept.draw`.
+        num: B >= 1.
+        seed: >= 0, of cases and noise.
+        noise: [m], standard deviation of a coordinate that is seen.
+        looks: [Hz], on the way; 0 for none.
+    """
+    cases = jax.tree.map(np.asarray, draw(num, suite, seed))
+    before, seen = observe(cases, seed, noise)
+    end = float(np.max(cases.time))
+    later = np.arange(1, int(end * looks + 1e-6) + 1) / looks if looks > 0.0 else np.zeros(0)
+    times = np.concatenate([before, later])
+    of_path = jax.jit(jax.vmap(lambda path: jax.vmap(lambda at: path.at(at).pos)(later)))
+    ahead = np.asarray(of_path(cases.target)) if later.size else np.zeros((num, 0, 2))
+    shape = (times.size, 1 + cases.movers.present.shape[1], 2)
+    tag = zlib.crc32(b"looks on the way")
+    errors = np.stack(
+        [np.random.default_rng([seed, k, tag]).standard_normal(shape) for k in range(num)]
+    )
+    centre, velocity = cases.movers.centre[:, None], cases.movers.velocity[:, None]
+    ahead = ahead + noise * errors[:, before.size :, 0]
+    return Meetings(
+        index=np.arange(num),
+        cases=cases,
+        times=np.tile(times.astype(np.float32), (num, 1)),
+        target=np.concatenate([seen, ahead], axis=1).astype(np.float32),
+        movers=(centre + velocity * times[:, None, None] + noise * errors[:, :, 1:]).astype(
+            np.float32
+        ),
+    )
+
+
+@functools.partial(jax.jit, static_argnames=("loop", "known", "see_movers"))
+def expected(
+    loop: DriveLoop, meetings: Meetings, now: Array, *, known: bool, see_movers: bool
+) -> tuple[TurningPath, Obstacles]:
+    """Where targets and movers are believed to go; both count from now.
+
+    Movers that are seen are grown by what their place is uncertain by, `_CAUTION` times.
+
+    Args:
+        loop: with the sensing.
+        meetings: leaves (B, ...).
+        now: () [s].
+        known: whether the targets' ways are known (static).
+        see_movers: whether the movers' are not (static).
+    """
+    sensing = loop.sensing
+    noise = max(sensing.target_std, _LEAST_STD)
+
+    def one(meeting: Meetings) -> tuple[TurningPath, Obstacles]:
+        case = meeting.cases
+        # The car sets out once it has been shown what it has seen up to then.
+        shown = (meeting.times <= 0.0) | (meeting.times + sensing.latency <= now + 1e-4)
+        times, weights = meeting.times - now, shown.astype(now.dtype)
+        if known:
+            there: PointState = case.target.at(now)
+            rate = getattr(case.target, "turn_rate", jnp.zeros_like(now))
+            target = TurningPath(pos=there.pos, vel=there.vel, turn_rate=rate)
+        else:
+            target = select(times, meeting.target, noise, weights).path
+        movers = case.movers
+        if not see_movers:
+            centre = movers.centre + movers.velocity * now
+            return target, dataclasses.replace(movers, centre=centre)
+        fit = lambda seen: fit_polynomial(times, seen, 1, weights).at(0.0 * now)  # noqa: E731
+        state = jax.vmap(fit, in_axes=1)(meeting.movers)
+        # Variance of a line's value at time 0, in terms of that of one look.
+        number = jnp.sum(weights)
+        middle = jnp.sum(weights * times) / number
+        spread = jnp.sum(weights * (times - middle) ** 2)
+        std = sensing.target_std * jnp.sqrt(1.0 / number + middle**2 / spread)
+        size = jnp.sqrt(jnp.sum(movers.corners**2, axis=-1, keepdims=True))
+        growth = 1.0 + _CAUTION * std / jnp.maximum(size, 1e-3)
+        return target, dataclasses.replace(
+            movers, centre=state.pos, velocity=state.vel, corners=growth * movers.corners
+        )
+
+    return jax.vmap(one)(meetings)
+
+
+@jax.jit
+def remaining(
+    cases: InterceptCase,
+    elapsed: Array,
+    target: TurningPath,
+    movers: Obstacles,
+    pose: Array,
+    speed: Array,
+    curvature: Array,
+) -> InterceptCase:
+    """What is left of cases, leaves (B, ...), `elapsed` (B,) [s] after their begin.
+
+    Args:
+        cases: whose times count from their begin.
+        elapsed: (B,) [s].
+        target: expected paths, which count from now.
+        movers: expected ones, at their places of now.
+        pose: (B, 3) [m, m, rad], of the rear axle.
+        speed: (B,) [m/s].
+        curvature: (B,) [1/m].
+    """
+    limits = cases.limits
+    return dataclasses.replace(
+        cases,
+        start=pose,
+        speed=jnp.clip(speed, 0.0, limits.speed),
+        curvature=jnp.clip(curvature, -limits.curvature, limits.curvature),
+        target=target,
+        time=cases.time - elapsed,
+        movers=movers,
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Driven:
+    """What came of a batch of drives, on the host; leaves with a leading axis B."""
+
+    times: np.ndarray  # (S,) [s], of the frames, the first 0
+    poses: np.ndarray  # (B, S, 3) of the rear axle's middle [m], and heading [rad]
+    wanted: np.ndarray  # (B, S, 2) [m], where the plans have it
+    meeting: np.ndarray  # (B,) [s], when the last plan ends
+    tracking: np.ndarray  # (B, 2) [m], of the rear axle from its plans: rms and worst
+    saturation: np.ndarray  # (B, 2), share of the time with drive and steering saturated
+    plans: np.ndarray  # (B,) int, how many plans were driven
+    ways: np.ndarray  # (B, S, M, 2) [m], where the target was expected from then on
+
+
+@dataclasses.dataclass(frozen=True)
+class InterceptFlights(Flights):
+    """What came of a batch of interceptions; leaves with a leading axis B."""
+
+    flown: Driven
+    miss: np.ndarray  # (B,) [m], from the body's middle to the true target when the plan ends
+    target: np.ndarray  # (B, 2) [m], where the target truly is then
+    wall_clearance: np.ndarray  # (B,) [m], least; negative inside
+    mover_clearance: np.ndarray  # (B,) [m]
+
+    @property
+    def touched(self) -> np.ndarray:
+        """Which cars ran into something, (B,) bool."""
+        return np.minimum(self.wall_clearance, self.mover_clearance) < -TOUCH
+
+    @property
+    def success(self) -> np.ndarray:
+        """Which cars met their target and touched nothing, (B,) bool."""
+        return (self.miss <= SUCCESS) & ~self.touched
+
+
+def quick(planner: SpacetimeIntercept) -> SpacetimeIntercept:
+    """The planner with its first search alone, for plans that are made anew."""
+    return dataclasses.replace(planner, searches=planner.searches[:1])
+
+
+def planned(planner: Any, cases: InterceptCase) -> InterceptPlan:
+    """Plans of a batch; a small one is planned by a program of its size, and not filled up."""
+    number = cases.batch_shape[0]
+    return plan_all(planner, cases, chunk=number if number <= _SMALL else None)
+
+
+def fly_intercepts(
+    loop: DriveLoop,
+    cases: Meetings,
+    seed: int = 0,
+    *,
+    replan: float = 1.0,
+    planner: Any = None,
+    plan: InterceptPlan | None = None,
+    known: bool = False,
+    see_movers: bool = False,
+) -> InterceptFlights:
+    """Plan and drive a batch of interceptions.
+
+    A plan made anew begins where the car believes to be, and is driven if it keeps every limit;
+    otherwise the old one goes on.
+
+    Args:
+        loop: world and sensing.
+        cases: what is to be met, and what is seen.
+        seed: of the noise on the car's pose, >= 0.
+        replan: [Hz]; 0 drives the first plan.
+        planner: of all plans, by default `spacetime`.
+        plan: first plan of each drive, instead of one made here.
+        known: whether the targets' ways are known instead of predicted.
+        see_movers: whether movers are predicted from looks instead of known.
+
+    Raises:
+        ValueError: `replan` does not divide the rate of the frames, or the cases' car is not
+            the one that is simulated.
+    """
+    require_car(loop.car.vehicle, cases.cases)
+    frames = loop.sensing.frames_per_plan(replan)
+    planner = planner or intercept_planner()
+    again = quick(planner) if isinstance(planner, SpacetimeIntercept) else planner
+    ways = functools.partial(expected, loop, cases, known=known, see_movers=see_movers)
+    truth = jax.tree.map(jnp.asarray, cases.cases)
+    until, zero = truth.time, jnp.zeros((), truth.time.dtype)
+    target, movers = ways(zero)
+    begun = remaining(
+        truth, jnp.zeros_like(until), target, movers, truth.start, truth.speed, truth.curvature
+    )
+    clock = time.perf_counter()
+    first = jax.block_until_ready(planned(planner, begun)) if plan is None else plan
+    planning = time.perf_counter() - clock
+    drive = started(loop, jax.tree.map(jnp.asarray, first), flight_keys(seed, cases.index))
+    number = np.ones(len(cases), int)
+    parts, seen = [], []
+    periods = int(np.ceil(float(jnp.max(until)) * FRAME_RATE / frames - 1e-6))
+    for period in range(periods):
+        seen.append((_sampled(target, until - drive.time), frames))
+        drive, part = drive_on(loop.world, drive, until, num_frames=frames)
+        parts.append(part)
+        if replan > 0.0 and period + 1 < periods:
+            target, movers = ways(drive.time[0])
+            drive, begun, good = planned_anew(loop, again, drive, begun, target, movers)
+            number += np.asarray(good)
+    flown = _driven(truth, drive, parts, seen, number)
+    return scored(cases.cases, first, flown, planning)
+
+
+def planned_anew(
+    loop: DriveLoop,
+    planner: Any,
+    drive: DriveState,
+    begun: InterceptCase,
+    target: TurningPath,
+    movers: Obstacles,
+) -> tuple[DriveState, InterceptCase, Array]:
+    """Plans from where cars believe to be, driven where they keep every limit.
+
+    Args:
+        loop: of the drives.
+        planner: of what is left.
+        drive: leaves (B, ...).
+        begun: the cases that the plans driven until now are of, from when these began.
+        target: expected from now on.
+        movers: likewise.
+
+    Returns:
+        The drives, the cases that their plans are of, and (B,) bool, which plans are new.
+    """
+    pose, speed, curvature = jax.vmap(functools.partial(believed_state, loop))(drive)
+    elapsed = drive.time - drive.began
+    left = remaining(begun, elapsed, target, movers, pose, speed, curvature)
+    found = jax.tree.map(jnp.asarray, planned(planner, left))
+    good = is_solved(found.status) & (left.time >= _SHORTEST)
+    return *_changed(good, (drive.plan, drive.began, begun), found, left, drive), good
+
+
+@jax.jit
+def _changed(
+    good: Array, old: tuple, found: InterceptPlan, left: InterceptCase, drive: DriveState
+) -> tuple[DriveState, InterceptCase]:
+    """Drives, and what their plans are of, with new plans where those are good (B,)."""
+
+    def pick(new: Array, before: Array) -> Array:
+        return jnp.where(good.reshape(good.shape + (1,) * (new.ndim - 1)), new, before)
+
+    plan, began, begun = jax.tree.map(pick, (found, drive.time, left), old)
+    return dataclasses.replace(drive, plan=plan, began=began), begun
+
+
+@jax.jit
+def _sampled(path: TurningPath, span: Array) -> Array:
+    """Points (B, M, 2) [m] on paths up to spans (B,) [s]."""
+    shares = jnp.linspace(0.0, 1.0, _POINTS)
+    of_one = lambda path, span: jax.vmap(lambda share: path.at(share * span).pos)(shares)  # noqa: E731
+    return jax.vmap(of_one)(path, span)
+
+
+def _driven(
+    truth: InterceptCase,
+    drive: DriveState,
+    parts: list[Frame],
+    seen: list[tuple[Array, int]],
+    number: np.ndarray,
+) -> Driven:
+    """Drives at their end, on the host."""
+    drive, parts, seen = jax.device_get((dataclasses.replace(drive, key=None), parts, seen))
+    frames = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *parts)
+    start = np.asarray(truth.start)[:, None]
+    end = np.asarray(truth.time)
+    ways = np.concatenate([np.repeat(way[:, None], count, axis=1) for way, count in seen], axis=1)
+    return Driven(
+        times=np.arange(frames.time.shape[1] + 1) / FRAME_RATE,
+        poses=np.concatenate([start, frames.pose], axis=1).astype(float),
+        wanted=np.concatenate([start[..., :2], frames.wanted], axis=1).astype(float),
+        meeting=np.asarray(drive.began + drive.plan.time, float),
+        tracking=np.stack([np.sqrt(drive.squared_tracking / end), drive.worst_tracking], axis=1),
+        saturation=np.asarray(drive.saturated) / end[:, None],
+        plans=number,
+        ways=np.concatenate([ways[:, :1], ways], axis=1),
+    )
+
+
+def scored(
+    cases: InterceptCase, first: InterceptPlan, flown: Driven, planning_seconds: float = 0.0
+) -> InterceptFlights:
+    """Drives held against what truly was: miss and contacts, in float64.
+
+    Args:
+        cases: as they truly are, leaves (B, ...).
+        first: the first plans.
+        flown: the drives.
+        planning_seconds: of the host's clock.
+    """
+    meeting = flown.meeting
+    times = np.minimum(flown.times, meeting[:, None])  # (B, S)
+    body = np.stack(
+        [
+            np.stack([np.interp(at, flown.times, of) for of in pose.T], axis=1)
+            for at, pose in zip(times, flown.poses, strict=True)
+        ]
+    )
+    length, width, overhang = (
+        np.asarray(leaf, float)
+        for leaf in (cases.body.length, cases.body.width, cases.body.rear_overhang)
+    )
+    ahead = (0.5 * length - overhang)[:, None]
+    body[..., 0] += ahead * np.cos(body[..., 2])
+    body[..., 1] += ahead * np.sin(body[..., 2])
+    target = positions(cases.target, meeting)
+    half = 0.5 * np.stack([length, width], axis=1)
+    least = {
+        name: clearances(_group(group), half, times, body)[0]
+        for name, group in (("wall", cases.walls), ("mover", cases.movers))
+    }
+    return InterceptFlights(
+        first_plan=first,
+        flown=flown,
+        planning_seconds=planning_seconds,
+        miss=np.linalg.norm(body[:, -1, :2] - target, axis=1),
+        target=target,
+        wall_clearance=least["wall"],
+        mover_clearance=least["mover"],
+    )
+
+
+def _group(obstacles: Obstacles) -> dict[str, np.ndarray]:
+    """Obstacles as the referee's clearance takes them; what is absent is zero."""
+    present = np.asarray(obstacles.present)
+    leaves = {name: np.asarray(getattr(obstacles, name), float) for name in ("centre", "velocity")}
+    leaves["corners"] = np.asarray(obstacles.corners, float)
+    there = {
+        name: np.where(present.reshape(present.shape + (1,) * (leaf.ndim - 2)), leaf, 0.0)
+        for name, leaf in leaves.items()
+    }
+    return {**there, "present": present}
+
+
+def require_car(vehicle: Vehicle, cases: InterceptCase) -> None:
+    """Raise `ValueError` unless the simulated car is the one that is planned for."""
+    for name in ("length", "width", "wheelbase", "rear_overhang"):
+        own, planned = getattr(vehicle, name), np.asarray(getattr(cases.body, name))
+        if not np.allclose(planned, own, rtol=1e-5):
+            raise ValueError(
+                f"{name} must be the same in plan and simulated car, got {planned.flat[0]:g} in "
+                f"the plan's case and {own:g} in the car"
+            )
+
+
+class InterceptFlight(FlightTask):
+    """Interceptions as a run of flights knows them; the settings are `InterceptFly`."""
+
+    settings: InterceptFly
+
+    THING = "target"
+    THING_RADIUS = 0.06
+    CONTACT = "met"
+    SUCCESS = f"met the target within {SUCCESS:g} m and touched nothing"
+    PUBLISHED = "paper 003 shows single drives, without rates"
+    HAS_REACH = True
+    VIEW = (58.0, -90.0)
+    EYE = ((4.0, -5.0, 9.0), (4.0, 3.8, 0.0))
+    COLUMNS = (
+        *leaves_of(
+            "verdict",
+            ("miss", "m", "from the body's middle to the true target"),
+            ("wall_clearance", "m", "least; negative inside"),
+            ("mover_clearance", "m", "least; negative inside"),
+        ),
+        Column("meeting_time", "s", "end of the last plan", NUMBER, lambda b: _flown(b).meeting),
+        Column("drive_saturated", "1", "share", NUMBER, lambda b: _flown(b).saturation[:, 0]),
+        Column("steering_saturated", "1", "share", NUMBER, lambda b: _flown(b).saturation[:, 1]),
+        Column("num_plans", "", "that were driven", NUMBER, lambda b: _flown(b).plans),
+    )
+
+    def world(self) -> World:
+        """The ground with the car; what stands around differs from drive to drive."""
+        tyres = Tyres() if self.settings.slip else None
+        return dataclasses.replace(CAR_WORLD, robot=Car(Vehicle(tyres=tyres)))
+
+    def loop(self) -> DriveLoop:
+        """The closed loop of the drives."""
+        return DriveLoop(self.world(), self.settings.sensing)
+
+    def parameters(self) -> dict[str, Any]:
+        """Those of the closed loop."""
+        return dataclasses.asdict(self.loop())
+
+    def cases(self) -> Meetings:
+        """All interceptions of the run."""
+        settings = self.settings
+        sensing = settings.sensing
+        return meetings(
+            settings.suite,
+            settings.num,
+            settings.seed,
+            noise=sensing.target_std,
+            looks=sensing.looks,
+        )
+
+    def fly(self, cases: Meetings, record: bool) -> InterceptFlights:
+        """Drives of some interceptions; they are recorded in any case."""
+        settings = self.settings
+        return fly_intercepts(
+            self.loop(),
+            cases,
+            settings.seed,
+            replan=settings.rate,
+            planner=intercept_planner(settings.planner),
+            known=settings.known,
+            see_movers=settings.see_movers,
+        )
+
+    def recording(
+        self, cases: Meetings, flights: InterceptFlights, lanes: Sequence[int] | np.ndarray
+    ) -> Recording:
+        """The recording of some of the drives; see `FlightTask`."""
+        some, flown = cases[np.asarray(lanes)], flights.flown
+        kept = np.arange(0, flown.times.size, _KEPT)
+        times = np.tile(flown.times[kept], (len(some), 1))
+        seen = [positions(some.cases.target, at) for at in times.T.astype(np.float32)]
+        met = np.where(flights.miss <= SUCCESS, flown.meeting, np.nan)[lanes]
+        where = np.where(np.isfinite(met)[:, None], flights.target[lanes], np.nan)
+        return Recording(
+            index=some.index,
+            success=flights.success[lanes],
+            time=times,
+            robot=flown.poses[lanes][:, kept],
+            wanted=_raised(flown.wanted[lanes][:, kept], 0.0),
+            balls=_raised(np.stack(seen, axis=1), _TARGET_HEIGHT)[:, :, None],
+            met=met[:, None],
+            contact=_raised(where, _TARGET_HEIGHT)[:, None],
+            target=np.full((len(some), 3), np.nan),
+            expected=_raised(flown.ways[lanes][:, kept], _TARGET_HEIGHT),
+        )
+
+    @property
+    def suite(self) -> str:
+        """The suite of interceptions."""
+        return self.settings.suite
+
+    @property
+    def conditions(self) -> str:
+        """Noise, latency, prediction and tyres."""
+        settings = self.settings
+        of = "known" if settings.known else f"predicted from looks at {settings.looks:g} Hz"
+        movers = "seen" if settings.see_movers else "known"
+        tyres = "slipping tyres" if settings.slip else "tyres without slip"
+        return (
+            f"Noise {settings.noise}, latency {1e3 * settings.latency:g} ms, the target {of}, "
+            f"movers {movers}, {tyres}"
+        )
+
+    @property
+    def simulated(self) -> str:
+        """The car, and what it sees."""
+        return f"{self.world().robot.WORDS}; poses and looks with noise and latency"
+
+    def surroundings(self, index: int) -> Sequence[Prism]:
+        """Walls and movers of one drive."""
+        case = self._case(index)
+        found = []
+        for group, height, colour in (
+            (case.walls, _WALL_HEIGHT, _WALL),
+            (case.movers, _MOVER_HEIGHT, _MOVER),
+        ):
+            for k in np.flatnonzero(group.present):
+                corners = np.asarray(group.centre[k] + group.corners[k], float)
+                own = corners[np.any(corners != np.roll(corners, 1, axis=0), axis=1)]
+                x, y = np.asarray(group.velocity[k], float)
+                found.append(Prism(own, height, colour, (float(x), float(y))))
+        return found
+
+    def reachable(self, index: int) -> Sequence[tuple[float, np.ndarray]]:
+        """Cells of the planner's reach set, layer by layer."""
+        return reach_layers(SpacetimeIntercept(), jax.tree.map(jnp.asarray, self._case(index)))
+
+    def _case(self, index: int) -> InterceptCase:
+        settings = self.settings
+        one = draw(1, settings.suite, settings.seed, first=index)
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[0], one)
+
+    def counts(self, rows: Any) -> dict[str, Any]:
+        """Nearer and farther meetings, contacts, and how often an actuator was at its limit."""
+        miss = np.asarray(rows["miss"])
+        wall, mover = (np.asarray(rows[f"{name}_clearance"]) < -TOUCH for name in ("wall", "mover"))
+        return {
+            "within_0.05_m": int((miss <= NEAR).sum()),
+            "within_0.3_m": int((miss <= SUCCESS).sum()),
+            "within_0.5_m": int((miss <= FAR).sum()),
+            "miss_median": float(np.median(miss)),
+            "touched_wall": int(wall.sum()),
+            "touched_mover": int(mover.sum()),
+            "drive_saturated": float(np.mean(rows["drive_saturated"])),
+            "steering_saturated": float(np.mean(rows["steering_saturated"])),
+        }
+
+    def findings(self, summary: Mapping[str, Any]) -> list[str]:
+        """Misses and contacts; saturation."""
+        number = summary["num"]
+        near, success, far = (
+            percent(summary[f"within_{width:g}_m"], number) for width in (NEAR, SUCCESS, FAR)
+        )
+        walls, movers = (percent(summary[f"touched_{one}"], number) for one in ("wall", "mover"))
+        drive, steering = (100.0 * summary[f"{one}_saturated"] for one in ("drive", "steering"))
+        return [
+            f"Whatever they touched, {near} % came within {NEAR:g} m of the true target, "
+            f"{success} % within {SUCCESS:g} m, {far} % within {FAR:g} m; "
+            f"{walls} % touched a wall, {movers} % a mover.",
+            f"Drive saturated {drive:.2f} % of the time, steering {steering:.2f} %.",
+        ]
+
+
+def _flown(batch: Any) -> Driven:
+    return batch.verdict.flown
+
+
+def _raised(points: np.ndarray, height: float) -> np.ndarray:
+    """Points of the plane (..., 2) at a height, (..., 3) [m]."""
+    high = np.where(np.isfinite(points[..., :1]), height, np.nan)
+    return np.concatenate([points, high], axis=-1)
+
+
+def reach_layers(
+    planner: SpacetimeIntercept, case: InterceptCase
+) -> list[tuple[float, np.ndarray]]:
+    """Where the car of one case could be: time [s] and middles (P, 2) [m] of the cells, by layer.
+
+    Args:
+        planner: whose reach set it is.
+        case: one.
+    """
+    found = jax.device_get(jax.jit(planner.prepare)(case))
+    grid, words = found.grid, np.bitwise_or.reduce(found.reach.bits, axis=(2, 3))
+    layers = []
+    for number in range(int(grid.num) + 1):
+        bits = np.unpackbits(
+            words[number].transpose(1, 0).copy().view(np.uint8), axis=1, bitorder="little"
+        ).astype(bool)  # (CELLS, CELLS), rows are y
+        assert bits.shape == (CELLS, CELLS)
+        y, x = np.nonzero(bits)
+        points = grid.corner + grid.cell * np.stack([x, y], axis=1)
+        layers.append((float((number + 0.5) * grid.step), points))
+    return layers
