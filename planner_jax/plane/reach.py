@@ -241,8 +241,8 @@ def reach_set(
     moves = jnp.moveaxis(halves[1:].reshape(-1, 2, levels, headings, 2), 1, 3)
     most = vehicle.turn_rates * grid.step / width
     # Whole bins in each layer, so that they add up to what the turn rates allow.
-    layer = jnp.arange(lattice.layers + 1, dtype=dtype)[:, None]
-    whole = jnp.diff(jnp.floor(layer * most + 0.1), axis=0)  # (layers, levels)
+    before = jnp.arange(lattice.layers + 1, dtype=dtype)[:, None]
+    whole = jnp.diff(jnp.floor(before * most + 0.1), axis=0)  # (layers, levels)
     span = jnp.abs(jnp.arange(-_SPAN, _SPAN + 1))
     turns = span <= whole[..., None]
     walls = _packed(field < vehicle.radius)

@@ -21,7 +21,6 @@ from jax import Array
 from planner_jax.plane.obstacles import Obstacles
 from planner_jax.plane.polynomial_fit import fit_polynomial
 from planner_jax.plane.prediction import select
-from planner_jax.plane.reach import CELLS
 from planner_jax.plane.target import PointState, TurningPath
 from planner_jax.planning.plan import plan as plan_all
 from planner_jax.protocol import is_solved
@@ -57,7 +56,6 @@ SUCCESS, NEAR, FAR = 0.3, 0.05, 0.5  # [m], of the miss: what counts, and two mo
 TOUCH = 1e-3  # [m] inside of an obstacle that is a contact, as the referee has it
 _SHORTEST = 0.3  # [s] before the meeting, up to when plans are made anew
 _LEAST_STD = 1e-3  # [m], that the prediction believes of looks without noise
-_SMALL = 256  # cases of a batch that is planned in a program of its own size
 _CAUTION = 2.0  # standard deviations by which movers that are seen are grown
 _POINTS = 9  # of the path that is expected, in a recording
 _KEPT = 2  # frames from one that is recorded to the next
@@ -232,17 +230,6 @@ class InterceptFlights(Flights):
         return (self.miss <= SUCCESS) & ~self.touched
 
 
-def quick(planner: SpacetimeIntercept) -> SpacetimeIntercept:
-    """The planner with its first search alone, for plans that are made anew."""
-    return dataclasses.replace(planner, searches=planner.searches[:1])
-
-
-def planned(planner: Any, cases: InterceptCase) -> InterceptPlan:
-    """Plans of a batch; a small one is planned by a program of its size, and not filled up."""
-    number = cases.batch_shape[0]
-    return plan_all(planner, cases, chunk=number if number <= _SMALL else None)
-
-
 def fly_intercepts(
     loop: DriveLoop,
     cases: Meetings,
@@ -276,7 +263,6 @@ def fly_intercepts(
     require_car(loop.car.vehicle, cases.cases)
     frames = loop.sensing.frames_per_plan(replan)
     planner = planner or intercept_planner()
-    again = quick(planner) if isinstance(planner, SpacetimeIntercept) else planner
     ways = functools.partial(expected, loop, cases, known=known, see_movers=see_movers)
     truth = jax.tree.map(jnp.asarray, cases.cases)
     until, zero = truth.time, jnp.zeros((), truth.time.dtype)
@@ -285,7 +271,7 @@ def fly_intercepts(
         truth, jnp.zeros_like(until), target, movers, truth.start, truth.speed, truth.curvature
     )
     clock = time.perf_counter()
-    first = jax.block_until_ready(planned(planner, begun)) if plan is None else plan
+    first = jax.block_until_ready(plan_all(planner, begun)) if plan is None else plan
     planning = time.perf_counter() - clock
     drive = started(loop, jax.tree.map(jnp.asarray, first), flight_keys(seed, cases.index))
     number = np.ones(len(cases), int)
@@ -297,7 +283,7 @@ def fly_intercepts(
         parts.append(part)
         if replan > 0.0 and period + 1 < periods:
             target, movers = ways(drive.time[0])
-            drive, begun, good = planned_anew(loop, again, drive, begun, target, movers)
+            drive, begun, good = planned_anew(loop, planner, drive, begun, target, movers)
             number += np.asarray(good)
     flown = _driven(truth, drive, parts, seen, number)
     return scored(cases.cases, first, flown, planning)
@@ -326,8 +312,15 @@ def planned_anew(
     """
     pose, speed, curvature = jax.vmap(functools.partial(believed_state, loop))(drive)
     elapsed = drive.time - drive.began
-    left = remaining(begun, elapsed, target, movers, pose, speed, curvature)
-    found = jax.tree.map(jnp.asarray, planned(planner, left))
+    if hasattr(planner, "replanner"):
+        again = planner.replanner()
+        now = {"start": pose, "speed": speed, "curvature": curvature}
+        task = again.begin(begun, drive.plan, elapsed, target=target, movers=movers, **now)
+        left, found = task.case, plan_all(again, task)
+    else:
+        left = remaining(begun, elapsed, target, movers, pose, speed, curvature)
+        found = plan_all(planner, left)
+    left, found = jax.tree.map(jnp.asarray, (left, found))
     good = is_solved(found.status) & (left.time >= _SHORTEST)
     return *_changed(good, (drive.plan, drive.began, begun), found, left, drive), good
 
@@ -627,14 +620,14 @@ def reach_layers(
         planner: whose reach set it is.
         case: one.
     """
-    found = jax.device_get(jax.jit(planner.prepare)(case))
+    search = planner.searches[0]
+    found = jax.device_get(jax.jit(lambda case: planner.prepare(case, search))(case))
     grid, words = found.grid, np.bitwise_or.reduce(found.reach.bits, axis=(2, 3))
     layers = []
     for number in range(int(grid.num) + 1):
         bits = np.unpackbits(
             words[number].transpose(1, 0).copy().view(np.uint8), axis=1, bitorder="little"
-        ).astype(bool)  # (CELLS, CELLS), rows are y
-        assert bits.shape == (CELLS, CELLS)
+        ).astype(bool)  # (cells, cells), rows are y
         y, x = np.nonzero(bits)
         points = grid.corner + grid.cell * np.stack([x, y], axis=1)
         layers.append((float((number + 0.5) * grid.step), points))

@@ -197,7 +197,8 @@ def by_unknowns(way: Motion, cost: Quadratic, is_time_free: bool) -> tuple[Array
 
     def product(left: Array) -> Array:
         left = flattened(left)
-        return sum(left[:, None, k] * twists[None, :, k] for k in range(3))
+        x, y, turn = (left[:, None, k] * twists[None, :, k] for k in range(3))
+        return x + y + turn
 
     def banded(values: Array) -> Array:
         """(K, 2, 2) as rows of the unknowns' knots, for all columns of either kind, (n, n)."""

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from planner_jax.plane.station_time import StationTimeProblem, reference_line
+from planner_jax.planning.one_by_one import one_by_one
 from planner_jax.protocol import Status, is_solved
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.checked import checked_plan, explained
@@ -118,7 +119,7 @@ class PathThenSpeed:
         """The plans of a batch: on a CPU one after another, else all at once."""
         return lax.platform_dependent(
             cases,
-            cpu=lambda cases: lax.map(lambda case: self.solve(case, attempt), cases),
+            cpu=lambda cases: one_by_one(lambda case: self.solve(case, attempt), cases),
             default=lambda cases: self.solve_at_once(cases, attempt),
         )
 

@@ -16,6 +16,7 @@ from jax import Array, lax
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.plane.obstacles import Obstacles
 from planner_jax.plane.target import PlanePath
+from planner_jax.planning.one_by_one import one_by_one
 from planner_jax.planning.replan import Replanning
 from planner_jax.protocol import Attempt
 from planner_jax.robot.car import pose_at
@@ -47,8 +48,8 @@ class ReplanIntercept:
 
     @property
     def attempts(self) -> tuple[Attempt, ...]:
-        """From the previous plan, then from scratch."""
-        return (self.warm, *self.planner.attempts)
+        """From the previous plan, then the first from scratch: others take too long."""
+        return (self.warm, self.planner.attempts[0])
 
     def begin(
         self,
@@ -72,7 +73,8 @@ class ReplanIntercept:
             movers: the moving obstacles as they are now; moved on evenly if not given.
             start: (3,) or (B, 3), where the rear axle is: x, y [m] and heading [rad].
             speed: () or (B,) [m/s], now.
-            curvature: () or (B,) [1/m], now. Of these three what is not given is the plan's own.
+            curvature: () or (B,) [1/m], now. Of these three what is not given is the plan's own;
+                what is beyond the car's limits counts as at them.
 
         Raises:
             ValueError: a negative time.
@@ -86,6 +88,9 @@ class ReplanIntercept:
             mine if given is None else np.broadcast_to(np.asarray(given, dtype), mine.shape)
             for given, mine in zip((start, speed, curvature), own, strict=True)
         )
+        limits = cases.limits
+        speed = np.clip(speed, 0.0, limits.speed)
+        curvature = np.clip(curvature, -np.asarray(limits.curvature), limits.curvature)
         if movers is None:
             passed = cases.movers.velocity * elapsed[..., None, None]
             movers = dataclasses.replace(cases.movers, centre=cases.movers.centre + passed)
@@ -121,7 +126,7 @@ class ReplanIntercept:
             return self.planner.solve_lanes(tasks.case, attempt)
         return lax.platform_dependent(
             tasks,
-            cpu=lambda tasks: lax.map(lambda task: self.solve(task, attempt), tasks),
+            cpu=lambda tasks: one_by_one(lambda task: self.solve(task, attempt), tasks),
             default=lambda tasks: jax.vmap(lambda task: self.solve(task, attempt))(tasks),
         )
 

@@ -19,6 +19,7 @@ from jax import Array, lax
 from planner_jax.optimise.levenberg import LevenbergConfig, Model, least_squares
 from planner_jax.plane import reach
 from planner_jax.plane.distance_field import DistanceField, distance_field
+from planner_jax.planning.one_by_one import one_by_one
 from planner_jax.protocol import Attempt, Status, is_solved
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.checked import checked_plan, explained, straight_on
@@ -154,7 +155,7 @@ class SpacetimeIntercept:
         """The plans of a batch: on a CPU one after another, else all ways of all at once."""
         return lax.platform_dependent(
             cases,
-            cpu=lambda cases: lax.map(lambda case: self.solve(case, attempt), cases),
+            cpu=lambda cases: one_by_one(lambda case: self.solve(case, attempt), cases),
             default=lambda cases: self.solve_at_once(cases, attempt),
         )
 

@@ -185,14 +185,15 @@ def obstacle_terms(
     def around(place: Array) -> tuple[Array, Array, Array]:
         """Distances and ways out (1 + N, M) of one disc, from what stands and what moves."""
         at_x, at_y = x + place * cos, y + place * sin
-        still = field.near(at_x, at_y)
+        still, still_x, still_y = (each[None] for each in field.near(at_x, at_y))
         moved = movers.centre[..., None] + velocity * times  # (N, 2, M)
-        far, away = distances(
+        far, (away_x, away_y) = distances(
             movers.corners, movers.present, at_x - moved[:, 0], at_y - moved[:, 1]
         )
-        return tuple(
-            jnp.concatenate([one[None], each])
-            for one, each in zip(still, (far, *away), strict=True)
+        return (
+            jnp.concatenate([still, far]),
+            jnp.concatenate([still_x, away_x]),
+            jnp.concatenate([still_y, away_y]),
         )
 
     # A loop, so that a compiler works the distances out once and not for every use.
