@@ -620,7 +620,7 @@ def reach_layers(
         planner: whose reach set it is.
         case: one.
     """
-    search = planner.searches[0]
+    search = planner.attempts[0]
     found = jax.device_get(jax.jit(lambda case: planner.prepare(case, search))(case))
     grid, words = found.grid, np.bitwise_or.reduce(found.reach.bits, axis=(2, 3))
     layers = []

@@ -114,7 +114,7 @@ class ReplanIntercept:
         case, planner = task.case, self.planner
         time = jnp.maximum(task.previous.time - task.elapsed, 0.5 * self.shortest)
         guess = planner.point(*self.rest(task, time), time)
-        grid = planner.grid(case, planner.searches[0])
+        grid = planner.grid(case, planner.attempts[0])
         plan = planner.refined(case, planner.field(case, grid), guess, attempt.solver)
         kept = planner.plan_at(case, guess, jnp.zeros((), jnp.int32))
         is_late = time < self.shortest

@@ -48,10 +48,6 @@ _ROOM = 8
 _ROOM_OF_WORD = 1 / 32768  # the same of a word of a reach set
 
 
-# For what rounding to wider cells closes.
-_FINE = reach.Lattice(cells=128, layers=62, levels=7, headings=64)
-
-
 @dataclasses.dataclass(frozen=True)
 class Search(Attempt):
     """An attempt: so many ways, and so many steps from each; static."""
@@ -61,7 +57,7 @@ class Search(Attempt):
     solver: LevenbergConfig = LevenbergConfig()
     seed: int = 0  # of the ways
     lattice: reach.Lattice = reach.Lattice()
-    girth: float = 1.0  # of the body in the reach set; less finds ways that rounding would close
+    girth: float = 1.0  # of the body in the reach set; less finds ways that rounding closes
 
     def __post_init__(self) -> None:
         if self.ways < 1:
@@ -70,6 +66,13 @@ class Search(Attempt):
         words = lattice.cells**2 // 32 * lattice.levels * lattice.headings * lattice.layers
         starts = max(_ROOM * self.ways, round(_ROOM_OF_WORD * words))
         object.__setattr__(self, "starts", starts)
+
+
+_WIDE = Search(8, seed=1, girth=0.9)
+_LAST = Search(16, LevenbergConfig(30), seed=2, girth=0.75)
+_OF_GIVEN_TIME = (Search(2, LevenbergConfig(12)), _WIDE, _LAST)
+# The best of several ways, settled.
+_OF_FREE_TIME = (Search(8, LevenbergConfig(40, tolerance=2e-3)), _WIDE, _LAST)
 
 
 @struct.dataclass
@@ -104,11 +107,7 @@ class SpacetimeIntercept:
     checked: int = 10  # the same, of the plan that is given back
     margin: float = 0.03  # [m], kept from obstacles
     slack: float = 0.015  # share of every limit that is kept free
-    searches: tuple[Search, ...] = (
-        Search(2, LevenbergConfig(12)),
-        Search(8, seed=1, girth=0.9),
-        Search(32, LevenbergConfig(40), seed=2, girth=0.85, lattice=_FINE),
-    )
+    searches: tuple[Search, ...] | None = None  # by default those that suit `meet`
 
     def __post_init__(self) -> None:
         if self.meet not in ("given", "early", "least"):
@@ -117,7 +116,7 @@ class SpacetimeIntercept:
     @property
     def attempts(self) -> tuple[Search, ...]:
         """The searches."""
-        return self.searches
+        return self.searches or (_OF_FREE_TIME if self.is_time_free else _OF_GIVEN_TIME)
 
     @property
     def is_time_free(self) -> bool:
@@ -352,7 +351,7 @@ class SpacetimeIntercept:
     ) -> InterceptPlan:
         """The plan with a status that says why there is none."""
         reason = plan.status
-        if attempt == self.searches[-1]:
+        if attempt == self.attempts[-1]:
             reason = jnp.where(is_reached, reason, Status.NO_PATH)
         return explained(case, reason, plan, is_time_free=self.is_time_free)
 
