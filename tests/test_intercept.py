@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import planner_jax as pj
+from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.plane.reach import Lattice
 from planner_jax.robot.car import pose_at
 from planner_jax.task.intercept.motion import Quadratic, by_unknowns, motion
@@ -205,6 +206,72 @@ def test_a_given_heading_is_kept_at_the_meeting(scenes, name, heading):
     plan = pj.lane(scenes[1], list(SCENES).index(name))
     off = plan.sample(10.0).heading[-1] - heading
     assert abs(np.angle(np.exp(1j * off))) <= 0.051
+
+
+@pytest.fixture(scope="module")
+def early():
+    """An open map, a wall to go round, and one across, for a planner that picks the time."""
+    cases = [scene((5.0, 5.0)), scene((6.0, 4.0), [HALF]), scene((6.0, 4.0), [WALL])]
+    cases = [jax.tree.map(np.asarray, case) for case in cases]
+    batch = jax.tree.map(lambda *leaves: np.stack(leaves), *cases)
+    planner = pj.intercept.planner(
+        meet="early", searches=(dataclasses.replace(SEARCHES[0], solver=LevenbergConfig(40)),)
+    )
+    return batch, pj.plan(planner, batch)
+
+
+HALF = [[3.9, -0.5], [4.1, -0.5], [4.1, 5.5], [3.9, 5.5]]
+
+
+def test_an_early_meeting_is_at_most_as_late_as_the_straight_line_takes(early):
+    cases, plans = early
+    verdict = pj.intercept.judge(cases, plans)
+    assert verdict.success[:2].all() and plans.status[2] == pj.Status.NO_PATH
+    # From 0.5 to 1.5 m/s in 1 s, and at that speed on: 1 m and the rest of the way.
+    start = cases.start[:, :2] + [0.15, 0.0]
+    way = np.linalg.norm(plans.meeting - start, axis=1)
+    least = 1.0 + (way - 0.05 - 1.0) / 1.5
+    assert np.all(plans.time[:2] > least[:2])
+    assert plans.time[0] < least[0] + 0.6  # it has to turn by 15 degrees
+    assert plans.time[0] < plans.time[1] < 10.0
+    np.testing.assert_array_equal(plans.cost[:2], plans.time[:2])
+
+
+def test_a_plan_goes_on_as_it_was_for_a_target_as_before(planned):
+    cases, plans = planned
+    good = np.flatnonzero(pj.solved(plans))
+    cases, plans = pj.lane((cases, plans), good)
+    elapsed = 2.0
+    target = jax.vmap(lambda path: path.at(elapsed))(cases.target)
+    turned = pj.TurningPath(target.pos, target.vel, cases.target.turn_rate)
+    again = pj.replan(PLANNER, cases, plans, elapsed, target=turned)
+    assert pj.solved(again).all()
+    np.testing.assert_allclose(again.time, 8.0, atol=1e-5)
+    np.testing.assert_allclose(again.meeting, plans.meeting, atol=1e-3)
+    before, after = plans.sample(10.0), again.sample(10.0)
+    np.testing.assert_allclose(after.pos[:, 0], before.pos[:, 20], atol=1e-4)
+    # The new way is beside what was left of the old one.
+    apart = np.linalg.norm(after.pos - before.pos[:, 20:], axis=-1)
+    assert np.median(apart) < 0.1
+    moved = dataclasses.replace(
+        cases,
+        start=again.start,
+        speed=again.speed[:, 0],
+        curvature=again.curvature[:, 0],
+        target=turned,
+        time=again.time,
+        movers=dataclasses.replace(
+            cases.movers, centre=cases.movers.centre + elapsed * cases.movers.velocity
+        ),
+    )
+    assert pj.intercept.judge(moved, again).success.all()
+    with pytest.raises(ValueError, match="elapsed must be >= 0"):
+        pj.replan(PLANNER, cases, plans, -1.0, target=turned)
+
+
+def test_a_time_of_meeting_that_is_not_known_is_refused():
+    with pytest.raises(ValueError, match="meet must be given, early or least, got 'soon'"):
+        pj.intercept.planner(meet="soon")
 
 
 @pytest.mark.parametrize(
