@@ -132,13 +132,13 @@ def last_time(plan):
 
 
 def path_then_speed(name, **options):
-    small = SpacetimeIntercept(pieces=6, samples=2, checked=2)
+    small = SpacetimeIntercept(pieces=12, samples=2, checked=2)
     source = PathSource(planner=small, drawn=2, later=2, points=33)
     projection = Projection(runs=1, slabs=2)
     step = pj.intercept.planner(name).step
     speed = step.speed and dataclasses.replace(step.speed, pieces=4)
     step = dataclasses.replace(step, speed=speed, projection=projection, pieces=40)
-    searches = (Search(2, LevenbergConfig(2), lattice=Lattice(layers=20, headings=16)),)
+    searches = (Search(2, LevenbergConfig(15), lattice=Lattice(layers=20)),)
     planner = pj.intercept.planner(name, source=source, step=step, searches=searches, **options)
     return Entry(planner, lambda num: pj.intercept.draw(num, "easy", 4), "start")
 
@@ -212,7 +212,7 @@ def assert_close(ours, theirs, tolerance=1e-3):
     """The status, and all leaves relative to the largest number of each."""
     np.testing.assert_array_equal(ours.status, theirs.status)
     for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
-        size = np.max(np.abs(b), initial=1e-3)
+        size = np.max(np.abs(b), initial=1e-3, where=np.isfinite(b))  # others have to be equal
         np.testing.assert_allclose(a, b, rtol=0.0, atol=tolerance * size)
 
 

@@ -7,6 +7,7 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.plane import reach
+from planner_jax.plane.distance_field import distance_field
 from planner_jax.plane.obstacles import distances, separation
 
 SQUARE = [[2.0, 2.0], [3.0, 2.0], [3.0, 3.0], [2.0, 3.0]]
@@ -123,25 +124,19 @@ def reached(target, time=10.0, **scene):
 @jax.jit
 def _reached(case):
     grid = reach.grid_of(LATTICE, case.start, case.time, case.limits.speed, case.lower, case.upper)
-    found = reach.reach_set(
-        LATTICE,
-        grid,
-        reach.distance_field(grid, case.walls, case.lower, case.upper),
-        case.movers,
-        reach.Footprint(jnp.array(0.16), jnp.array([0.05, 0.25])),
-        case.limits.speed,
-        case.speed,
-        case.start,
-        jnp.array([0.0, 1.0, 0.8, 0.53]),
-        case.lower,
-        case.upper,
-        grid.num,
+    vehicle = reach.Vehicle(
+        radius=jnp.array(0.16),
+        ahead=jnp.array([0.05, 0.25]),
+        speed=case.limits.speed,
+        turn_rates=jnp.array([0.0, 1.0, 0.8, 0.53]),
     )
+    field = distance_field(case.walls, grid.corner, grid.cell, LATTICE.cells)
+    found = reach.reach_set(grid, field.values, case.movers, vehicle, case.speed, grid.num)
     goal = case.target.pos
 
     def is_there(bits):
         every = jnp.ones(LATTICE.headings, bool)
-        return jnp.any(reach.goal_cells(LATTICE, grid, bits, goal, 0.0, every)[1])
+        return jnp.any(reach.goal_cells(grid, bits, goal, 0.0, every)[1])
 
     n = jnp.arange(LATTICE.layers + 1)
     return jax.vmap(is_there)(found.bits) & (n <= grid.num)
@@ -189,6 +184,27 @@ def test_something_that_moves_is_in_the_way_when_it_is_there():
     during = (np.arange(21) + 0.5) * step
     during = (during > 4.0) & (during < 8.0)
     assert coming[:8].any() and not coming[during].any() and coming[16:].any()
+
+
+def test_a_distance_field_is_the_distance_between_its_places_and_its_slopes_are_its_own(float64):
+    rng = np.random.default_rng(3)
+    box = pj.obstacles([[[2.0, 2.0], [5.0, 2.0], [5.0, 4.0], [2.0, 4.0]]], dtype=jnp.float64)
+    corner, spacing = jnp.zeros(2), jnp.array(0.0625)
+    x, y = jnp.asarray(rng.uniform(0.1, 7.8, (2, 400)))
+    look = jax.jit(lambda x, y: distance_field(box, corner, spacing, 128).near(x, y))
+    far, by_x, by_y = look(x, y)
+    exact = distances(box.vertices(0.0), box.present, x[None], y[None])[0][0]
+    outside = exact > 0.1
+    # Beside a corner the distance bends by 1 / distance.
+    np.testing.assert_allclose(far[outside], exact[outside], atol=0.0625**2 / (4.0 * 0.1))
+    assert np.all(far >= exact - 1e-3) and np.all(far[exact < -0.1] < 0.0)
+    step = 1e-6
+    # Within a cell, so that both sides are of one bilinear piece.
+    inner = np.all(np.abs(np.mod([x / spacing, y / spacing], 1.0) - 0.5) < 0.49, axis=0)
+    slope = (look(x + step, y)[0] - look(x - step, y)[0]) / (2.0 * step)
+    np.testing.assert_allclose(by_x[inner], slope[inner], atol=1e-6)
+    slope = (look(x, y + step)[0] - look(x, y - step)[0]) / (2.0 * step)
+    np.testing.assert_allclose(by_y[inner], slope[inner], atol=1e-6)
 
 
 def test_the_cell_size_follows_the_time_so_that_layers_end_at_it():
