@@ -115,10 +115,9 @@ class ReplanIntercept:
         time = jnp.maximum(task.previous.time - task.elapsed, 0.5 * self.shortest)
         guess = planner.point(*self.rest(task, time), time)
         grid = planner.grid(case, planner.attempts[0])
-        plan = planner.refined(case, planner.field(case, grid), guess, attempt.solver)
-        kept = planner.plan_at(case, guess, jnp.zeros((), jnp.int32))
-        is_late = time < self.shortest
-        return jax.tree.map(lambda old, new: jnp.where(is_late, old, new), kept, plan)
+        end = planner.settled(case, planner.field(case, grid), guess, attempt.solver)
+        point = jnp.where(time < self.shortest, guess, end.point)
+        return planner.plan_at(case, point, end.steps)
 
     def solve_lanes(self, tasks: Replanning, attempt: Any) -> InterceptPlan:
         """The plans of a batch: on a CPU one after another."""

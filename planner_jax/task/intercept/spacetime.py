@@ -16,7 +16,12 @@ import numpy as np
 from flax import struct
 from jax import Array, lax
 
-from planner_jax.optimise.levenberg import LevenbergConfig, Model, least_squares
+from planner_jax.optimise.levenberg import (
+    LevenbergConfig,
+    LevenbergState,
+    Model,
+    least_squares,
+)
 from planner_jax.plane import reach
 from planner_jax.plane.distance_field import DistanceField, distance_field
 from planner_jax.planning.one_by_one import one_by_one
@@ -72,7 +77,7 @@ _WIDE = Search(8, seed=1, girth=0.9)
 _LAST = Search(16, LevenbergConfig(30), seed=2, girth=0.75)
 _OF_GIVEN_TIME = (Search(2, LevenbergConfig(12)), _WIDE, _LAST)
 # The best of several ways, settled.
-_OF_FREE_TIME = (Search(8, LevenbergConfig(40, tolerance=2e-3)), _WIDE, _LAST)
+_OF_FREE_TIME = (Search(16, LevenbergConfig(60, tolerance=5e-4)), _WIDE, _LAST)
 
 
 @struct.dataclass
@@ -255,9 +260,15 @@ class SpacetimeIntercept:
         self, case: InterceptCase, field: DistanceField, guess: Array, solver: LevenbergConfig
     ) -> InterceptPlan:
         """The plan that least squares make of a guess (n,)."""
-        weights = Weights()
-        end = least_squares(lambda x: self.model(x, case, field, weights), guess, solver)
+        end = self.settled(case, field, guess, solver)
         return self.plan_at(case, end.point, end.steps)
+
+    def settled(
+        self, case: InterceptCase, field: DistanceField, guess: Array, solver: LevenbergConfig
+    ) -> LevenbergState:
+        """Where least squares end from a guess (n,)."""
+        weights = Weights()
+        return least_squares(lambda x: self.model(x, case, field, weights), guess, solver)
 
     def guess(self, case: InterceptCase, grid: reach.Grid, way: reach.Way, layer: Array) -> Array:
         """The unknowns (n,) along a way of cells up to a layer."""

@@ -34,7 +34,7 @@ class Weights:
     obstacle: float = 1e3
     limit: float = 1e3
     effort: float = 0.064  # of the squared acceleration's integral over time
-    early: float = 100.0  # of the share of the case's time until the meeting, where it is free
+    early: float = 300.0  # of the share of the case's time until the meeting, where it is free
     turning: float = 3e-3  # the same of the change of curvature
 
 
