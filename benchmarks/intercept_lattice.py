@@ -31,6 +31,7 @@ class Scene:
 
     start: np.ndarray  # (3,) x [m], y [m] of the rear axle's middle and heading [rad]
     initial_speed: float  # [m/s]
+    initial_curvature: float  # [1/m]
     dt: float  # [s], of a layer; the last one of L ends at the case's time
     target: np.ndarray  # (L + 1, 2) [m]
     tolerance: float  # [m]
@@ -44,10 +45,12 @@ class Scene:
     length: float  # [m], of the body
     width: float  # [m]
     middle: float  # [m], from the rear axle to the body's middle
+    wheelbase: float  # [m]
     speed: float  # [m/s], greatest
     acceleration: float  # [m/s^2], greatest
     lateral_acceleration: float  # [m/s^2], greatest
     curvature: float  # [1/m], greatest
+    steering_rate: float  # [rad/s], greatest; lattices do not look at it
 
 
 @dataclasses.dataclass(frozen=True)

@@ -3,12 +3,15 @@
     python -m benchmarks.intercept_oracle [--suite hard] [--num 200] [--seed 1] [--first 0]
         [--workers N] [--out FILE.npz]
 
-It shares no code with the planners. Three searches in space and time answer for each case whether
-the target can be met at the case's time, and which is the earliest layer, of 0.25 s, to meet it:
+Three searches in space and time, which share no code with the planners, answer for each case
+whether the target can be met at the case's time, and which is the earliest layer, of 0.25 s, to
+meet it:
 
 * `strict`: a lattice of pose and speed (`intercept_lattice`) where two discs that cover the body
   keep off everything. What it reaches is feasible up to the grid: a cell is 0.05 m, a heading
-  5.6 degrees, obstacles are looked at every 0.125 s, and nobody looks at the steering rate.
+  5.6 degrees, obstacles are looked at every 0.125 s, and nobody looks at the steering rate. Cars
+  that turn at once get away from starts which no car gets away from, so states without a grid and
+  with a steering rate (`intercept_departure`) must get away from the start as well.
 * `minimal`: the same lattice where one disc inside of the body does, and turns are rounded up in
   every layer. But for the rounding of cells, which closes ways as well as it opens some, it
   reaches what any car reaches. That it does not reach a target is strong evidence, no proof.
@@ -17,8 +20,11 @@ the target can be met at the case's time, and which is the earliest layer, of 0.
 
 So a case is proven infeasible where `bound` fails; where `minimal` fails, it is so in all
 likelihood; where `strict` succeeds, it can be solved up to the grid. What is between `minimal` and
-`strict` is open. Planners are to be judged on what is not infeasible. Meetings are looked at with
-the case's tolerance, in lattices half a diagonal of a cell more, at the times of layers alone.
+`strict` is open. Meetings are looked at with the case's tolerance, in lattices half a diagonal of a
+cell more, at the times of layers alone.
+
+The default planner plans the same cases. Those that `strict` reaches, or that were solved, are
+taken for feasible; which of them it solved is its success, by the referee.
 """
 
 import argparse
@@ -34,10 +40,12 @@ from tqdm import tqdm
 
 import planner_jax as pj
 from planner_jax.benchmarks.intercept_bound import earliest_bound
+from planner_jax.benchmarks.intercept_departure import departs
 from planner_jax.benchmarks.intercept_lattice import LAYER, MINIMAL, STRICT, Lattice, Scene
 from planner_jax.benchmarks.run import Bench, at_least
 from planner_jax.plane.obstacles import Obstacles
 from planner_jax.plane.target import PlanePath
+from planner_jax.sweep.summary import percent, wilson_interval
 from planner_jax.task.intercept.card import SUITES
 from planner_jax.task.intercept.case import InterceptCase
 
@@ -62,6 +70,7 @@ def scenes(cases: InterceptCase) -> list[Scene]:
             Scene(
                 start=one.start,
                 initial_speed=float(one.speed),
+                initial_curvature=float(one.curvature),
                 dt=float(ends[k] / num),
                 target=places[: num + 1],
                 tolerance=float(one.tolerance),
@@ -75,10 +84,12 @@ def scenes(cases: InterceptCase) -> list[Scene]:
                 length=float(one.body.length),
                 width=float(one.body.width),
                 middle=float(one.body.middle),
+                wheelbase=float(one.body.wheelbase),
                 speed=float(one.limits.speed),
                 acceleration=float(one.limits.acceleration),
                 lateral_acceleration=float(one.limits.lateral_acceleration),
                 curvature=float(one.limits.curvature),
+                steering_rate=float(one.limits.steering_rate),
             )
         )
     return found
@@ -100,8 +111,9 @@ def _polygons(group: Obstacles) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
 def search(scene: Scene) -> tuple[list[bool], list[float]]:
     """Of each of `SEARCHES`, whether there is a meeting at the case's time; the earliest [s]."""
     of_bound = earliest_bound(scene)
-    reaches = [Lattice(scene, rules).reach() for rules in (MINIMAL, STRICT)]
-    found = [of_bound, *((reach.at_end, reach.earliest) for reach in reaches)]
+    minimal, strict = (Lattice(scene, rules).reach() for rules in (MINIMAL, STRICT))
+    of_strict = (strict.at_end, strict.earliest) if departs(scene) else (False, np.inf)
+    found = [of_bound, (minimal.at_end, minimal.earliest), of_strict]
     return [at_end for at_end, _ in found], [earliest for _, earliest in found]
 
 
@@ -154,11 +166,26 @@ def report(bench: Bench, index: np.ndarray, at_end: np.ndarray, earliest: np.nda
         f"{gaps[:, 0].mean() if both.any() else np.nan:.2f} s (means of those met).",
     )
     bench.note(agreement=same.mean())
-    bench.count(at_end[:, SEARCHES.index("strict")])
+
+
+def compare(bench: Bench, index: np.ndarray, reached: np.ndarray, solved: np.ndarray) -> None:
+    """Say how many of the feasible ones of B cases were solved, (B,) bool each."""
+    feasible = reached | solved
+    good, num = int(solved.sum()), int(feasible.sum())
+    low, high = wilson_interval(good, num)
+    bench.say(
+        "",
+        f"The planner solves {percent(good, num)} % of the {num} that are feasible (95 % interval "
+        f"{100 * low:.1f} to {100 * high:.1f} %), and {percent(good, len(index))} % of all; "
+        f"{int((solved & ~reached).sum())} that `strict` does not reach. "
+        f"Feasible and not solved: {listed(index[feasible & ~solved])}.",
+    )
+    bench.note(of_feasible=good / max(num, 1))
+    bench.count(solved)
 
 
 def main() -> None:
-    """Search one suite's cases."""
+    """Search one suite's cases, and plan them."""
     parser = argparse.ArgumentParser(
         "python -m benchmarks.intercept_oracle", description=(__doc__ or "").partition("\n")[0]
     )
@@ -181,12 +208,15 @@ def main() -> None:
             "",
         )
         report(bench, index, at_end, earliest)
+        plans = pj.plan(pj.intercept.planner(), cases)
+        solved = np.asarray(pj.intercept.judge(cases, plans).success)
+        compare(bench, index, at_end[:, SEARCHES.index("strict")], solved)
         found: dict[str, np.ndarray] = {}
         found |= {f"{name}_at_end": at_end[:, k] for k, name in enumerate(SEARCHES)}
         found |= {f"{name}_earliest": earliest[:, k] for k, name in enumerate(SEARCHES)}
         times = np.asarray(cases.time, float)
         found |= {"suite": np.array(options.suite), "seed": np.array(options.seed)}
-        found |= {"index": index, "time": times}
+        found |= {"index": index, "time": times, "solved": solved}
         for path in [bench.path / "oracle.npz", *([options.out] if options.out else [])]:
             np.savez(path, allow_pickle=False, **found)
 

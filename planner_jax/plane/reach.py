@@ -26,6 +26,7 @@ from planner_jax.plane.obstacles import Obstacles, distances
 
 _STENCIL = 32  # cells along either side of what is drawn of one moving obstacle
 _FARTHEST = 16  # cells that the car moves in half a layer, at most
+_UNEVEN = 2.0  # how much a change of speed counts in a way, where a turn by a bin counts one
 _SPAN = 3  # bins of heading to either side that a layer may turn, at most
 
 
@@ -77,10 +78,11 @@ class ReachSet:
 
 @struct.dataclass
 class Way:
-    """Speed and heading after every layer of a way through a reach set."""
+    """Speed, heading and cell after every layer of a way through a reach set."""
 
     level: Array  # (layers,) int32, of speed from one layer to the next
     bin: Array  # (layers,) int32, of heading, not wrapped
+    cell: Array  # (layers, 2) int32
 
 
 def grid_of(
@@ -432,11 +434,11 @@ def draw_way(
         bits = reach.bits[n]
         is_way = jax.vmap(lambda v, h: bit_at(bits, v, h, before))(from_level, heading - turn)
         is_way &= reach.turns[n, level, turn + _SPAN]
-        rough = jnp.abs(turn) + jnp.abs(turn - last) + jnp.abs(choices[:, 0])
+        rough = jnp.abs(turn) + jnp.abs(turn - last) + _UNEVEN * jnp.abs(choices[:, 0])
         chosen = jnp.argmax(jnp.where(is_way, chance.steps[n] - 0.5 * rough, -jnp.inf))
         after = (from_level[chosen], heading - turn[chosen], before, turn[chosen])
         new = jax.tree.map(lambda a, b: jnp.where(n < num, a, b), after, state)
-        return new, (level, heading)
+        return new, (level, heading, cell)
 
     start = (
         level.astype(jnp.int32),
@@ -444,6 +446,6 @@ def draw_way(
         cells[heading, around],
         jnp.int32(0),
     )
-    _, (levels, bins) = lax.scan(back, start, jnp.arange(lattice.layers), reverse=True)
+    _, (levels, bins, passed) = lax.scan(back, start, jnp.arange(lattice.layers), reverse=True)
     # Bins of heading count from the start on, without a jump.
-    return Way(level=levels, bin=bins)
+    return Way(level=levels, bin=bins, cell=passed)

@@ -22,7 +22,7 @@ from planner_jax.protocol import Attempt
 from planner_jax.robot.car import pose_at
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.plan import InterceptPlan
-from planner_jax.task.intercept.spacetime import Search, SpacetimeIntercept
+from planner_jax.task.intercept.spacetime import Guess, Search, SpacetimeIntercept
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,6 +30,7 @@ class Warm(Attempt):
     """An attempt: steps of least squares from what is left of the previous plan; static."""
 
     solver: LevenbergConfig = LevenbergConfig(8)
+    settling: int = 4  # steps towards less effort
 
 
 @jax.tree_util.register_static
@@ -113,11 +114,15 @@ class ReplanIntercept:
             return self.planner.solve(task.case, attempt)
         case, planner = task.case, self.planner
         time = jnp.maximum(task.previous.time - task.elapsed, 0.5 * self.shortest)
-        guess = planner.point(*self.rest(task, time), time)
+        point = planner.point(*self.rest(task, time), time)
+        guess = Guess(point=point, places=jnp.zeros((planner.pieces, 2), point.dtype))
         grid = planner.grid(case, planner.attempts[0])
-        end = planner.settled(case, planner.field(case, grid), guess, attempt.solver)
-        point = jnp.where(time < self.shortest, guess, end.point)
-        return planner.plan_at(case, point, end.steps)
+        stages = [
+            dataclasses.replace(stage, steps=jnp.where(time < self.shortest, 0, stage.steps))
+            for stage in planner.last_stages(attempt)
+        ]
+        field = planner.field(case, grid)
+        return planner.plan_of_stages(case, field, guess, attempt.solver, stages)
 
     def solve_lanes(self, tasks: Replanning, attempt: Any) -> InterceptPlan:
         """The plans of a batch: on a CPU one after another."""

@@ -3,8 +3,9 @@
 Paper 003 plans a path among what stands and then a speed along it among what moves; where the
 path crosses something that stays on it, no speed helps. Here both are planned together. A reach
 set of cells (`plane.reach`) says what the car can reach and when; ways through it, each drawn at
-random, are where Levenberg-Marquardt begins on speed and curvature at knots (`motion`). The first
-one that keeps every limit is taken, smoothed.
+random, are where Levenberg-Marquardt begins on speed and curvature at knots (`motion`). It does so
+in stages: a motion that follows the cells, for speeds and turns of cells alone drift through walls
+on the way; one that keeps every limit; and, once one does, one of less effort.
 """
 
 import dataclasses
@@ -33,6 +34,7 @@ from planner_jax.task.intercept.plan import InterceptPlan
 from planner_jax.task.intercept.terms import (
     Weights,
     discs_of,
+    following_terms,
     limit_terms,
     meeting_terms,
     obstacle_terms,
@@ -40,9 +42,7 @@ from planner_jax.task.intercept.terms import (
 )
 
 if TYPE_CHECKING:
-    from planner_jax.task.intercept.replan import ReplanIntercept
-
-_FIELD = 128  # places of the distance field along either side of the map
+    from planner_jax.task.intercept.replan import ReplanIntercept, Warm
 
 _FIELD = 128  # places of the distance field along either side of the map
 _LEAST = 0.01  # share of the case's time that a meeting takes at least
@@ -59,7 +59,9 @@ class Search(Attempt):
 
     starts: int = dataclasses.field(init=False, default=1)
     ways: int = 16
-    solver: LevenbergConfig = LevenbergConfig()
+    solver: LevenbergConfig = LevenbergConfig()  # of the stage that keeps limits
+    following: int = 4  # steps along the way of cells
+    settling: int = 16  # steps towards less effort
     seed: int = 0  # of the ways
     lattice: reach.Lattice = reach.Lattice()
     girth: float = 1.0  # of the body in the reach set; less finds ways that rounding closes
@@ -73,11 +75,42 @@ class Search(Attempt):
         object.__setattr__(self, "starts", starts)
 
 
-_WIDE = Search(8, seed=1, girth=0.9)
-_LAST = Search(16, LevenbergConfig(30), seed=2, girth=0.75)
-_OF_GIVEN_TIME = (Search(2, LevenbergConfig(12)), _WIDE, _LAST)
+_OF_GIVEN_TIME = (
+    Search(2, LevenbergConfig(12)),
+    Search(8, LevenbergConfig(20), seed=1, girth=0.9),
+    Search(16, LevenbergConfig(30), seed=2, girth=0.75),
+)
 # The best of several ways, settled.
-_OF_FREE_TIME = (Search(16, LevenbergConfig(60, tolerance=5e-4)), _WIDE, _LAST)
+_OF_FREE_TIME = (
+    Search(16, LevenbergConfig(60, tolerance=5e-4)),
+    Search(8, seed=1, girth=0.9),
+    Search(16, LevenbergConfig(30), seed=2, girth=0.75),
+)
+
+
+# What each stage minimises.
+_FOLLOWING = Weights(follow=10.0, obstacle=0.0, early=0.0)
+_KEEPING = Weights()
+_SETTLING = Weights(effort=10.0)
+
+
+@struct.dataclass
+class Stage:
+    """Some steps of least squares."""
+
+    weights: Weights
+    steps: Array | int  # at most
+    tolerance: Array | float = 1.0  # see `LevenbergConfig`; 1 ends at the first good point
+    settled: Array | int = 1  # likewise
+    of_good: Array | bool = False  # whether only a point that keeps every limit goes through it
+
+
+@struct.dataclass
+class Guess:
+    """Where least squares begin: the unknowns, and the places that cells give the car."""
+
+    point: Array  # (n,)
+    places: Array  # (K, 2) [m], of the rear axle's middle at the knots 1..K
 
 
 @struct.dataclass
@@ -245,7 +278,7 @@ class SpacetimeIntercept:
         cells, there = self.meetings(case, found.grid, found.reach, layer)
         way = reach.draw_way(found.grid, found.reach, layer, cells, there, chance)
         guess = self.guess(case, found.grid, way, layer)
-        return self.refined(case, found.field, guess, attempt.solver)
+        return self.refined(case, found.field, guess, attempt)
 
     def layer(self, found: Found, chance: reach.Chance) -> Array:
         """The layer at which a way ends: one of the first that reach the target, or of all."""
@@ -257,21 +290,58 @@ class SpacetimeIntercept:
         return jnp.argmax(jnp.where(allowed, chance.layers, -jnp.inf))
 
     def refined(
-        self, case: InterceptCase, field: DistanceField, guess: Array, solver: LevenbergConfig
+        self, case: InterceptCase, field: DistanceField, guess: Guess, attempt: Search
     ) -> InterceptPlan:
-        """The plan that least squares make of a guess (n,)."""
-        end = self.settled(case, field, guess, solver)
-        return self.plan_at(case, end.point, end.steps)
+        """The plan that least squares make of a guess."""
+        stages = [Stage(_FOLLOWING, attempt.following), *self.last_stages(attempt)]
+        return self.plan_of_stages(case, field, guess, attempt.solver, stages)
 
-    def settled(
-        self, case: InterceptCase, field: DistanceField, guess: Array, solver: LevenbergConfig
-    ) -> LevenbergState:
-        """Where least squares end from a guess (n,)."""
-        weights = Weights()
-        return least_squares(lambda x: self.model(x, case, field, weights), guess, solver)
+    def last_stages(self, attempt: "Search | Warm") -> list[Stage]:
+        """What a guess that is near to a plan goes through."""
+        solver = attempt.solver
+        if self.is_time_free:
+            return [Stage(_KEEPING, solver.max_steps, solver.tolerance, solver.settled)]
+        steps = attempt.settling
+        return [
+            Stage(_KEEPING, solver.max_steps),
+            Stage(_SETTLING, steps, settled=steps, of_good=True),
+        ]
 
-    def guess(self, case: InterceptCase, grid: reach.Grid, way: reach.Way, layer: Array) -> Array:
-        """The unknowns (n,) along a way of cells up to a layer."""
+    def plan_of_stages(
+        self,
+        case: InterceptCase,
+        field: DistanceField,
+        guess: Guess,
+        solver: LevenbergConfig,
+        stages: list[Stage],
+    ) -> InterceptPlan:
+        """The plan at the end of stages of least squares, each from where the last one ended.
+
+        Where the last stage, towards less effort, breaks a limit, the plan is that before it.
+        """
+
+        def staged(state: tuple[Array, Array], stage: Stage) -> tuple[tuple, LevenbergState]:
+            point, is_good = state
+            most = jnp.where(stage.of_good & ~is_good, 0, stage.steps)
+            config = dataclasses.replace(
+                solver, max_steps=most, tolerance=stage.tolerance, settled=stage.settled
+            )
+            model = lambda x: self.model(x, case, field, stage.weights, guess.places)  # noqa: E731
+            end = least_squares(model, point, config)
+            return (end.point, end.model.violation <= 0.0), end
+
+        # A loop over stages, so that all of them share one compiled step.
+        stacked = jax.tree.map(lambda *each: jnp.stack([jnp.asarray(x) for x in each]), *stages)
+        _, ends = lax.scan(staged, (guess.point, jnp.asarray(False)), stacked)
+        steps = jnp.sum(ends.steps).astype(jnp.int32)
+        if self.is_time_free:
+            return self.plan_at(case, ends.point[-1], steps)
+        plans = lax.map(lambda point: self.plan_at(case, point, steps), ends.point[-2:])
+        kept, settled = (jax.tree.map(lambda leaf, k=k: leaf[k], plans) for k in range(2))
+        return self.better_of_two(kept, settled)
+
+    def guess(self, case: InterceptCase, grid: reach.Grid, way: reach.Way, layer: Array) -> Guess:
+        """Unknowns and places along a way of cells up to a layer."""
         width = 2.0 * np.pi / grid.lattice.headings
         pace = case.limits.speed / (grid.lattice.levels - 1)
         steps = layer + 0.5
@@ -281,8 +351,10 @@ class SpacetimeIntercept:
             """Values on the way; the first is that of time 0, then one at every step."""
             place = jnp.clip(place - 1.0, -1.0, layer - 1.0)
             below = jnp.floor(place).astype(jnp.int32)
-            share = place - below
-            low = jnp.where(below < 0, first, values[jnp.maximum(below, 0)])
+            share, is_first = (
+                each.reshape(-1, *[1] * (values.ndim - 1)) for each in (place - below, below < 0)
+            )
+            low = jnp.where(is_first, first, values[jnp.maximum(below, 0)])
             return (1.0 - share) * low + share * values[jnp.minimum(below + 1, layer - 1)]
 
         speed = between(pace * way.level.astype(grid.cell.dtype), case.speed, at)
@@ -298,7 +370,9 @@ class SpacetimeIntercept:
         rate = rate.at[:2].add(0.5 * lag / knot)
         curvature = rate / jnp.maximum(speed, 0.3 * case.limits.speed)
         limit = case.limits.curvature
-        return self.point(speed, jnp.clip(curvature, -limit, limit), time)
+        point = self.point(speed, jnp.clip(curvature, -limit, limit), time)
+        cells = grid.corner + grid.cell * way.cell.astype(grid.cell.dtype)
+        return Guess(point=point, places=between(cells, case.start[:2], at - 0.5))
 
     def point(self, speed: Array, curvature: Array, time: Array) -> Array:
         """The unknowns (n,): values at the knots 1..K, and the time where it is free."""
@@ -316,14 +390,20 @@ class SpacetimeIntercept:
         )
 
     def model(
-        self, point: Array, case: InterceptCase, field: DistanceField, weights: Weights
+        self,
+        point: Array,
+        case: InterceptCase,
+        field: DistanceField,
+        weights: Weights,
+        places: Array,
     ) -> Model:
-        """Sum of squares of a point: miss, obstacles, limits, effort."""
+        """Sum of squares of a point: miss, obstacles, limits, effort, distance from places."""
         speed, curvature, time = self.parts(case, point)
         way = motion(case.start, time, speed, curvature, self.samples)
         limits, violation = limit_terms(case, time, speed, curvature, weights, self.slack, 4)
         end, missed = meeting_terms(case, way, time, weights)
         squares, close = obstacle_terms(case, field, way, weights, self.margin)
+        squares = squares.at[:, -1].add(following_terms(way, places, weights))
         squares = squares.at[-1, -1].add(end)
         cost = Quadratic(
             push=squares[..., :4, 4],

@@ -22,7 +22,7 @@ from planner_jax.plane.target import TurningPath
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.motion import motion
 from planner_jax.task.intercept.path import Path, path_of_drive
-from planner_jax.task.intercept.spacetime import Found, Search, SpacetimeIntercept
+from planner_jax.task.intercept.spacetime import Found, Guess, Search, SpacetimeIntercept
 from planner_jax.task.intercept.terms import wrapped
 
 _SHARES = 8  # of a way, where it is compared with others
@@ -67,16 +67,16 @@ class PathSource:
         )
         chosen = self.different(still, times, guesses, attempt.ways)
 
-        def path(start: tuple[Array, Array]) -> tuple[Path, Array, Array]:
+        def path(start: tuple[Array, Guess]) -> tuple[Path, Array, Array]:
             time, guess = start
             drive = dataclasses.replace(still, time=time)
-            plan = self.planner.refined(drive, found.field, guess, attempt.solver)
+            plan = self.planner.refined(drive, found.field, guess, attempt)
             speed = jnp.maximum(plan.speed, 0.0)
             driven = path_of_drive(plan.start, time, speed, plan.curvature, self.points)
             return driven, plan.violation, plan.iterations
 
         paths, violation, steps = lax.platform_dependent(
-            (times[chosen], guesses[chosen]),
+            (times[chosen], jax.tree.map(lambda leaf: leaf[chosen], guesses)),
             cpu=lambda starts: lax.map(path, starts),
             default=jax.vmap(path),
         )
@@ -96,8 +96,8 @@ class PathSource:
 
     def guess(
         self, case: InterceptCase, found: Found, layer: Array, chance: reach.Chance
-    ) -> tuple[Array, Array]:
-        """When a random way arrives that ends at a layer, and speed and curvature along it."""
+    ) -> tuple[Array, Guess]:
+        """When a random way arrives that ends at a layer, and where least squares begin."""
         grid = found.grid
         cells, there = self.planner.meetings(case, grid, found.reach, layer)
         way = reach.draw_way(grid, found.reach, layer, cells, there, chance)
@@ -105,16 +105,16 @@ class PathSource:
         guess = self.planner.guess(dataclasses.replace(case, time=time), grid, way, layer)
         return time, guess
 
-    def different(self, case: InterceptCase, times: Array, guesses: Array, num: int) -> Array:
-        """Places of some guesses (D, 2 K), the shortest first, then those farthest from the rest.
+    def different(self, case: InterceptCase, times: Array, guesses: Guess, num: int) -> Array:
+        """Places of some of D guesses, the shortest first, then those farthest from the rest.
 
         Ways are as far apart as their points at equal shares of their lengths are on average, and
         farther apart than any others if they pass a wall on different sides.
         """
         goal = case.target.at(case.time).pos
 
-        def way(time: Array, guess: Array) -> tuple[Array, Array, Array]:
-            speed, curvature, _ = self.planner.parts(case, guess)
+        def way(time: Array, guess: Guess) -> tuple[Array, Array, Array]:
+            speed, curvature, _ = self.planner.parts(case, guess.point)
             pos = motion(case.start, time, speed, curvature, 1).pos[:, 0]
             step = time / (speed.shape[0] - 1)
             station = jnp.cumsum(jnp.maximum(0.5 * (speed[1:] + speed[:-1]), 1e-3) * step)

@@ -36,6 +36,7 @@ class Weights:
     effort: float = 0.064  # of the squared acceleration's integral over time
     early: float = 300.0  # of the share of the case's time until the meeting, where it is free
     turning: float = 3e-3  # the same of the change of curvature
+    follow: float = 0.0  # of the squared distance at knots from the places of a guess [1/m^2]
 
 
 def wrapped(angle: Array) -> Array:
@@ -161,6 +162,19 @@ def meeting_terms(
     squares = weights.miss * jnp.matmul(rows.T, rows, precision=_HIGHEST) + turn[:, None] * turn
     missed = jnp.sqrt(jnp.sum(miss**2) + 1e-12) / case.tolerance - 1.0
     return squares, jnp.maximum(missed, turned)
+
+
+def following_terms(way: Motion, places: Array, weights: Weights) -> Array:
+    """Distance from places (K, 2) [m] at the end of every piece.
+
+    Returns:
+        squares: (K, 5, 5), as those of `meeting_terms`, for the last sample of every piece.
+    """
+    x, y = (way.pos[:, -1] - places).T
+    squares = SumOfSquares(5)
+    squares.add({0: 1.0, 4: x}, weights.follow)
+    squares.add({1: 1.0, 4: y}, weights.follow)
+    return squares.matrix(x)
 
 
 def obstacle_terms(

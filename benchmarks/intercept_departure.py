@@ -1,0 +1,116 @@
+"""Whether a car gets away from its start at all: every motion of its first seconds, by sampling.
+
+A car that sets out at speed cannot turn on the spot, nor go back. Where something stands or comes
+close ahead, all of its ways may end in it, although a lattice, whose cars turn at once and whose
+places are rounded, finds one. Here states keep their exact numbers, and only those in the same
+small cell count as one. Nothing is shared with the planners. World frame in the plane, SI units.
+
+In a step the steering angle changes at one of five rates and the speed at one of three, up to the
+greatest. What would exceed a limit of curvature or lateral acceleration is held at it, even where
+the wheels could not be turned back in time, and obstacles are looked at every 0.05 s alone: both
+err on the side of a way. What a cell and a thinned set leave out errs on the other.
+"""
+
+import numpy as np
+
+from planner_jax.benchmarks.intercept_lattice import Scene
+
+STEP = 0.1  # [s]
+_PARTS = 2  # of a step, after each of which obstacles are looked at
+_CELL = np.array([0.015, 0.015, 0.03, 0.08, 0.15])  # x, y [m], heading [rad], speed, steering
+_MOST = 20_000  # states that are followed; more are thinned at random
+_RATES = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])  # of the greatest steering rate
+_PEDALS = np.array([-1.0, 0.0, 1.0])  # of the greatest acceleration
+
+
+def departs(scene: Scene, far: float = 1.5, until: float = 6.0) -> bool:
+    """Whether some motion that touches nothing gets `far` [m] from the start in `until` [s].
+
+    A target that is to be met nearer than that counts as departed for.
+    """
+    random = np.random.default_rng(0)
+    steering = np.arctan(scene.wheelbase * scene.initial_curvature)
+    states = np.array([[*scene.start, scene.initial_speed, steering]])
+    end = scene.dt * (len(scene.target) - 1)
+    if end < until or np.linalg.norm(scene.target[-1] - scene.start[:2]) < far + scene.length:
+        return True
+    for number in range(int(until / STEP + 1e-6)):
+        states = _advanced(scene, states, number * STEP)
+        if not len(states):
+            return False
+        if np.linalg.norm(states[:, :2] - scene.start[:2], axis=1).max() >= far:
+            return True
+        cells = np.round((states - states[0]) / _CELL).astype(np.int64)
+        states = states[np.unique(cells, axis=0, return_index=True)[1]]
+        if len(states) > _MOST:
+            states = states[random.choice(len(states), _MOST, replace=False)]
+    return False
+
+
+def _advanced(scene: Scene, states: np.ndarray, time: float) -> np.ndarray:
+    """All states (M, 5) one step after states (N, 5) at a time [s] that touch nothing."""
+    x, y, heading, speed, steering = (
+        np.repeat(column, len(_RATES) * len(_PEDALS)) for column in states.T
+    )
+    rates = scene.steering_rate * np.tile(np.repeat(_RATES, len(_PEDALS)), len(states))
+    pedals = scene.acceleration * np.tile(_PEDALS, len(_RATES) * len(states))
+    span = STEP / _PARTS
+    for part in range(_PARTS):
+        faster = np.clip(speed + span * pedals, 0.0, scene.speed)
+        square = np.maximum(faster**2, 1e-9)
+        most = np.minimum(scene.curvature, scene.lateral_acceleration / square)
+        most = np.arctan(scene.wheelbase * most)
+        turned = np.clip(steering + span * rates, -most, most)
+        curvature = np.tan(0.5 * (steering + turned)) / scene.wheelbase
+        way = 0.5 * span * (speed + faster)
+        middle = heading + 0.5 * way * curvature
+        x, y = x + way * np.cos(middle), y + way * np.sin(middle)
+        heading, speed, steering = heading + way * curvature, faster, turned
+        free = is_free(scene, x, y, heading, time + (part + 1) * span)
+        x, y, heading, speed, steering, rates, pedals = (
+            each[free] for each in (x, y, heading, speed, steering, rates, pedals)
+        )
+    return np.stack([x, y, heading, speed, steering], axis=1)
+
+
+def is_free(
+    scene: Scene, x: np.ndarray, y: np.ndarray, heading: np.ndarray, time: float
+) -> np.ndarray:
+    """Whether cars at (N,) poses touch nothing at a time [s] and are on the map, (N,) bool."""
+    cos, sin = np.cos(heading), np.sin(heading)
+    x, y = x + scene.middle * cos, y + scene.middle * sin
+    free = (x >= scene.lower[0]) & (x <= scene.upper[0])
+    free &= (y >= scene.lower[1]) & (y <= scene.upper[1])
+    around = 0.5 * np.hypot(scene.length, scene.width)
+    placed = [(corners, np.zeros(2)) for corners in scene.walls]
+    placed += [
+        (corners, velocity * time)
+        for corners, velocity in zip(scene.movers, scene.velocities, strict=True)
+    ]
+    for corners, moved in placed:
+        corners = corners + moved
+        middle = corners.mean(axis=0)
+        size = np.linalg.norm(corners - middle, axis=1).max()
+        near = np.flatnonzero(free & (np.hypot(x - middle[0], y - middle[1]) < size + around))
+        free[near] = _is_apart(scene, corners, x[near], y[near], cos[near], sin[near])
+    return free
+
+
+def _is_apart(scene: Scene, corners, x, y, cos, sin) -> np.ndarray:
+    """Whether bodies with middles (N,) do not overlap a polygon (V, 2): by separating axes."""
+    half = 0.5 * np.array([scene.length, scene.width])
+    from_x, from_y = corners[:, 0, None] - x, corners[:, 1, None] - y  # (V, N)
+    along, across = cos * from_x + sin * from_y, cos * from_y - sin * from_x
+    gap = np.maximum(along.min(axis=0), -along.max(axis=0)) - half[0]
+    gap = np.maximum(gap, np.maximum(across.min(axis=0), -across.max(axis=0)) - half[1])
+    for (ax, ay), (bx, by) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        out = np.array([by - ay, ax - bx])
+        length = np.hypot(*out)
+        if length < 1e-9:
+            continue
+        out /= length
+        height = out[0] * (x - ax) + out[1] * (y - ay)
+        reach = half[0] * np.abs(out[0] * cos + out[1] * sin)
+        reach = reach + half[1] * np.abs(out[1] * cos - out[0] * sin)
+        gap = np.maximum(gap, height - reach)
+    return gap > 0.0
