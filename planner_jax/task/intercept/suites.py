@@ -20,6 +20,12 @@ to 0.8 m on the side of the start, 0.8 to 1.4 m apart, make a dead end of the pl
 straight line to the meeting point runs into a wall, or of the nearest one that leaves the gap
 alone; walls less than 2.5 m from the map's edge have none, so that the start has room to turn.
 
+A rush is what `hard` draws, with a tag of its own, and its target is to be met earlier than after
+the 10 s that the rest is drawn for: 0.5 s after the first layer of the reach set of
+`planner_jax.task.intercept.arrival`, worked out in double precision. So its time differs from case
+to case. A target that is not reached within 10 s is drawn anew, as is one at which something is
+wrong at the new time.
+
 Whether the target turns and how many walls and movers there are is drawn once a case; the rest is
 drawn anew until `planner_jax.task.intercept.rejection` finds nothing wrong with it. World frame in
 the plane, SI units.
@@ -36,7 +42,9 @@ from jax import Array
 
 from planner_jax.plane.obstacles import Obstacles
 from planner_jax.plane.target import PlanePath, TurningPath
+from planner_jax.protocol import lane
 from planner_jax.registry import require_name
+from planner_jax.task.intercept.arrival import earliest_arrival
 from planner_jax.task.intercept.card import SUITES, Suite
 from planner_jax.task.intercept.case import InterceptCase, case
 from planner_jax.task.intercept.rejection import CAUSES, SIZE, TOP_SPEED, first_cause, moved
@@ -95,6 +103,11 @@ def drawn(suite: str, num: int, seed: int, first: int = 0, *, dtype: Any = jnp.f
         uniform = np.stack([randoms[k].random(_columns(own)) for k in pending])
         candidates = _candidates(own, kinds[pending], uniform)
         cause = first_cause(own, candidates)
+        if own.spare is not None and (good := np.flatnonzero(cause == len(CAUSES))).size:
+            some = _hurried(own, {name: leaf[good] for name, leaf in candidates.items()})
+            cause[good] = first_cause(own, some)
+            for name, leaf in some.items():
+                candidates[name][good] = leaf
         draws[pending] += 1
         is_good = cause == len(CAUSES)
         rejected[cause[~is_good], pending[~is_good]] += 1
@@ -104,7 +117,7 @@ def drawn(suite: str, num: int, seed: int, first: int = 0, *, dtype: Any = jnp.f
             accepted[name][pending[is_good]] = leaf[is_good]
         pending = pending[~is_good]
     counts = dict(zip(CAUSES, rejected, strict=True))
-    return Drawn(cases=_cases(own, accepted, dtype), draws=draws, rejected=counts)
+    return Drawn(cases=_cases(accepted, dtype), draws=draws, rejected=counts)
 
 
 def observe(
@@ -209,6 +222,8 @@ def _candidates(suite: Suite, kinds: np.ndarray, uniform: np.ndarray) -> dict[st
     return {
         "start": start,
         "meeting": meeting,
+        "time": np.full(len(u), suite.time),
+        "reached": np.ones(len(u), bool),
         "pos": meeting - moved(angle, speed, rate, np.full(len(u), suite.time)),
         "angle": angle,
         "speed": speed,
@@ -219,6 +234,22 @@ def _candidates(suite: Suite, kinds: np.ndarray, uniform: np.ndarray) -> dict[st
         "movers present": np.arange(suite.mover_room[0]) < count_movers[:, None],
         "velocity": velocity,
     }
+
+
+def _hurried(suite: Suite, drawn: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The same draws with an earlier meeting, and whether the reach set meets the target at all."""
+    with jax.enable_x64(True):
+        cases = jax.tree.map(np.asarray, _cases(drawn, jnp.float64))
+        num = len(drawn["time"])
+        arrivals = np.array([float(_earliest(lane(cases, k))) for k in range(num)])
+    reached = np.isfinite(arrivals)
+    time = np.where(reached, arrivals + suite.spare, drawn["time"])
+    way = moved(drawn["angle"], drawn["speed"], drawn["rate"], time)
+    return {**drawn, "time": time, "reached": reached, "meeting": drawn["pos"] + way}
+
+
+# One case at a time, so that what comes of it is no matter of the batch.
+_earliest = jax.jit(earliest_arrival)
 
 
 def _polygons(
@@ -285,7 +316,7 @@ def _boxes(left, low, right, high) -> np.ndarray:
     return np.stack([x, y], axis=-1)
 
 
-def _cases(suite: Suite, drawn: dict[str, np.ndarray], dtype: Any) -> InterceptCase:
+def _cases(drawn: dict[str, np.ndarray], dtype: Any) -> InterceptCase:
     """The cases of accepted draws."""
 
     def cast(value: np.ndarray) -> Array:
@@ -310,7 +341,7 @@ def _cases(suite: Suite, drawn: dict[str, np.ndarray], dtype: Any) -> InterceptC
     )
     return case(
         target,
-        np.full(len(start), suite.time),
+        drawn["time"],
         start=start,
         initial_speed=START_SPEED,
         walls=group("walls", np.zeros(2)),

@@ -28,8 +28,8 @@ def draw(
 
     Args:
         num: how many, >= 1.
-        suite: "easy", the default, "medium", "hard", "storm", "gale" or "maze", or one that
-            another package offers.
+        suite: "easy", the default, "medium", "hard", "storm", "gale", "maze" or "rush", or
+            one that another package offers.
         seed: >= 0. Case k of a suite and seed is always the same one.
         first: place of the first one, >= 0.
         dtype: of every floating leaf.
