@@ -24,6 +24,7 @@ class Suite:
     # How many polygons of how many corners the arrays hold.
     wall_room: tuple[int, int] = (12, 6)
     mover_room: tuple[int, int] = (4, 6)
+    num_targets: tuple[int, int] = (1, 1)  # fewest and most, for which there is room
 
 
 # The other ranges are those of `planner_jax.task.intercept.suites`.
@@ -54,6 +55,23 @@ SUITES = {
     ),
 }
 
+# Of several targets: their cases are of a class of their own.
+GROUPS = {
+    "group": Suite(
+        "Two to four targets for one car, five to eight walls, two or three movers.",
+        (5, 8),
+        (2, 3),
+        time=15.0,
+        num_targets=(2, 4),
+    ),
+}
+
+DECISIONS = {
+    "best": "planner_jax.task.intercept.group_decide:Best",
+    "greedy": "planner_jax.task.intercept.group_decide:Greedy",
+    "given": "planner_jax.task.intercept.group_decide:Given",
+}
+
 TASK = Task(
     name="intercept",
     summary="a car meets a moving target among obstacles that stand and move",
@@ -64,8 +82,9 @@ TASK = Task(
         "paper": "planner_jax.task.intercept.paper:PaperIntercept",
         "em": "planner_jax.task.intercept.path_then_speed:em",
         "constant": "planner_jax.task.intercept.path_then_speed:constant",
+        "group": "planner_jax.task.intercept.group_planner:GroupIntercept",
     },
-    suites={name: suite.description for name, suite in SUITES.items()},
+    suites={name: suite.description for name, suite in {**SUITES, **GROUPS}.items()},
     flight="planner_jax.sims.settings:InterceptFly",
     contact="time",
 )

@@ -1,0 +1,158 @@
+"""Groups planned leg after leg: each target as early as it can be met, from where the last was.
+
+A leg is an interception of its own, with the car as the leg before leaves it, and targets and
+movers moved on to that time; `SpacetimeIntercept` plans it. Legs of all groups of a batch, and of
+all orders that are tried, are planned together: first all first ones, then all second ones.
+"""
+
+import dataclasses
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from planner_jax.protocol import Attempt, Drive, Status, is_solved
+from planner_jax.robot.car import pose_at
+from planner_jax.task.intercept.case import InterceptCase
+from planner_jax.task.intercept.group import CarState, GroupPlan, InterceptGroup
+from planner_jax.task.intercept.plan import InterceptPlan
+from planner_jax.task.intercept.spacetime import SpacetimeIntercept
+
+
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class GroupIntercept:
+    """A `CompositePlanner` of groups whose order is decided.
+
+    What it gives up for the sake of speed: every leg ends as early as it can, whatever that
+    means for the next one.
+    """
+
+    case_type: ClassVar[type] = InterceptGroup
+    attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)
+    planner: SpacetimeIntercept = SpacetimeIntercept(meet="early")
+
+    def plan_by(self, drive: Drive, cases: InterceptGroup) -> GroupPlan:
+        """The plans of a batch, or of one group."""
+        if cases.batch_shape == ():
+            plans = self.plan_by(drive, jax.tree.map(lambda leaf: leaf[None], cases))
+            return jax.tree.map(lambda leaf: leaf[0], plans)
+        shared = cases.shared
+        car = CarState(pose=shared.start, speed=shared.speed, curvature=shared.curvature)
+        begin, fine = jnp.zeros_like(shared.time), jnp.ones(shared.time.shape, bool)
+        begins, legs = [], []
+        for k in range(cases.num_targets):
+            case, wanted = _leg(cases, k, begin, car, fine)
+            plan = self._planned(drive, case, wanted)
+            plan = _of_wanted(case, plan, wanted)
+            begins.append(begin)
+            legs.append(plan)
+            car, begin, fine = _after(plan, begin, fine, wanted)
+        plans = _joined(cases, begins, legs)
+        return plans if drive.is_pure else jax.device_get(plans)
+
+    def _planned(self, drive: Drive, case: InterceptCase, wanted: Array) -> InterceptPlan:
+        """Plans of the legs that are wanted, (B,) bool; what the others hold means nothing."""
+        if drive.is_pure:
+            return drive(self.planner, case)[0]
+        case, wanted = jax.tree.map(np.asarray, (case, wanted))
+        # Orders that begin alike have legs in common. Without any leg, one stands for all.
+        some = np.flatnonzero(wanted) if np.any(wanted) else np.zeros(1, int)
+        leaves = [leaf[some].reshape(some.size, -1) for leaf in jax.tree.leaves(case)]
+        rows = np.concatenate(leaves, axis=1)
+        _, first, place = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+        plans, _ = drive(self.planner, jax.tree.map(lambda leaf: leaf[some[first]], case))
+        places = np.zeros(len(wanted), int)
+        places[some] = place
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[places], plans)
+
+
+@jax.jit
+def _leg(
+    cases: InterceptGroup, k: Any, begin: Array, car: CarState, fine: Array
+) -> tuple[InterceptCase, Array]:
+    """The legs to the targets at a place of the order, and which of them are to be planned.
+
+    Args:
+        cases: leaves with leading axis B.
+        k: that place.
+        begin: (B,) [s], when these legs begin.
+        car: leaves (B, ...), where the cars then are.
+        fine: (B,) bool, whether all legs before are solved.
+    """
+
+    def of_one(case: InterceptGroup, begin: Array, car: CarState) -> tuple[InterceptCase, Array]:
+        target = case.order[k]
+        return case.leg(target, begin, car), case.present[target]
+
+    legs, present = jax.vmap(of_one)(cases, begin, car)
+    return legs, present & fine
+
+
+@jax.jit
+def _of_wanted(cases: InterceptCase, plans: InterceptPlan, wanted: Array) -> InterceptPlan:
+    """The plans (B, ...) of legs; where none is wanted, one that takes no time."""
+    num = plans.speed.shape[1]
+    zero = jnp.zeros_like(plans.time)
+    nothing = InterceptPlan(
+        cost=zero,
+        violation=zero,
+        iterations=jnp.zeros_like(plans.iterations),
+        status=jnp.full_like(plans.status, Status.CONVERGED),
+        start=cases.start,
+        time=zero,
+        speed=jnp.repeat(cases.speed[:, None], num, axis=1),
+        curvature=jnp.repeat(cases.curvature[:, None], num, axis=1),
+        meeting=plans.meeting,
+    )
+
+    def pick(plan: Array, other: Array) -> Array:
+        return jnp.where(wanted.reshape(-1, *[1] * (plan.ndim - 1)), plan, other)
+
+    return jax.tree.map(pick, plans, nothing)
+
+
+@jax.jit
+def _after(
+    plans: InterceptPlan, begin: Array, fine: Array, wanted: Array
+) -> tuple[CarState, Array, Array]:
+    """Where the cars are after legs (B, ...), when (B,) [s], and whether all was solved (B,)."""
+
+    def end(plan: InterceptPlan) -> CarState:
+        return CarState(
+            pose=pose_at(
+                plan.start,
+                jnp.where(plan.time > 0.0, plan.time, 1.0),
+                plan.speed,
+                plan.curvature,
+                plan.time,
+            ),
+            speed=plan.speed[-1],
+            curvature=plan.curvature[-1],
+        )
+
+    return jax.vmap(end)(plans), begin + plans.time, fine & (is_solved(plans.status) | ~wanted)
+
+
+@jax.jit
+def _joined(cases: InterceptGroup, begins: list[Array], legs: list[InterceptPlan]) -> GroupPlan:
+    """The plans of legs, N entries of (B, ...)."""
+    of_all: InterceptPlan = jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=1), *legs)
+    begin = jnp.stack(begins, axis=1)
+    # What the first leg that is not solved says goes for the whole; the last if all are.
+    first = jnp.argmax(~is_solved(of_all.status), axis=1)
+    lanes = jnp.arange(first.size)
+    solved = jnp.all(is_solved(of_all.status), axis=1)
+    return GroupPlan(
+        cost=jnp.max(begin + of_all.time, axis=1),
+        violation=jnp.where(
+            solved, jnp.max(of_all.violation, axis=1), of_all.violation[lanes, first]
+        ),
+        iterations=jnp.sum(of_all.iterations, axis=1),
+        status=of_all.status[lanes, first],
+        order=cases.order,
+        begins=begin,
+        legs=of_all,
+    )
