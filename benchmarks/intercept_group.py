@@ -65,8 +65,7 @@ def bound(groups: InterceptGroup) -> np.ndarray:
         np.float32(STEP) * np.arange(num, dtype=np.float32), (len(shared.time), num)
     )
     places = np.asarray(_places(shared.target, times), float)
-    limits, body = shared.limits, shared.body
-    ahead = np.asarray(body.middle)
+    limits, ahead = shared.limits, np.asarray(shared.body.middle)
     # The middle's speed is sqrt(v^2 + (ahead v kappa)^2), and (v kappa)^2 the product of kappa and
     # v^2 kappa, both of which have limits. It never falls: at the end of a step it is greatest.
     v = np.minimum(
@@ -74,12 +73,11 @@ def bound(groups: InterceptGroup) -> np.ndarray:
     )
     speed = np.sqrt(v**2 + (ahead**2 * limits.curvature * limits.lateral_acceleration)[:, None])
     way = np.cumsum(STEP * np.concatenate([0.0 * speed[:, :1], speed[:, 1:]], axis=1), axis=1)
-    heading = shared.start[:, 2]
-    middle = shared.start[:, :2] + ahead[:, None] * np.stack([np.cos(heading), np.sin(heading)], 1)
+    start, tolerance = np.asarray(shared.start), np.asarray(shared.tolerance)
+    heading = start[:, 2]
+    middle = start[:, :2] + ahead[:, None] * np.stack([np.cos(heading), np.sin(heading)], 1)
     orders = itertools.permutations(range(TARGETS))
-    return np.min(
-        [_met(order, middle, way, times, places, shared.tolerance) for order in orders], axis=0
-    )
+    return np.min([_met(order, middle, way, times, places, tolerance) for order in orders], axis=0)
 
 
 def _met(

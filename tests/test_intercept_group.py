@@ -15,6 +15,7 @@ from planner_jax.planning.decided import first_choice
 from planner_jax.robot.car import pose_at
 from planner_jax.sweep.run import start_sweep
 from planner_jax.sweep.settings import SettingError, SweepSettings
+from planner_jax.sweep.sweep import sweep_of
 from planner_jax.task.intercept.card import GROUPS, TASK
 from planner_jax.task.intercept.group import CarState
 from planner_jax.task.intercept.group_decide import Best, Given, Greedy
@@ -138,6 +139,14 @@ def test_what_is_solved_the_referee_confirms(planned, decide):
     assert verdict.sentence(5).startswith(verdict.failed_limit[5] + ": leg ")
 
 
+@pytest.mark.slow
+def test_groups_can_be_planned_inside_a_compiled_function(planned):
+    groups, plans = planned[0], planned[1]["greedy"]
+    traced = jax.eval_shape(lambda groups: pj.solve(planner("greedy"), groups), groups)
+    for ours, theirs in zip(jax.tree.leaves(traced), jax.tree.leaves(plans), strict=True):
+        assert (ours.shape, ours.dtype) == (theirs.shape, theirs.dtype)
+
+
 def test_the_best_order_is_no_later_than_the_greedy_one(planned):
     best, greedy = planned[1]["best"], planned[1]["greedy"]
     both = pj.solved(best) & pj.solved(greedy)
@@ -217,3 +226,7 @@ def test_groups_and_single_targets_are_told_apart(tmp_path):
     with pytest.raises(SettingError, match="planner must be one of the cases of suite group"):
         start_sweep(TASK, settings, tmp_path / "run")
     assert not (tmp_path / "run").exists()
+    # Neither is compared with the other either.
+    sweep, alone = sweep_of(TASK), SweepSettings(planner="lattice", suite="easy")
+    assert not sweep.other_planners(dataclasses.replace(settings, planner="group"))
+    assert set(sweep.other_planners(alone)) == {"spacetime", "paper", "em", "constant"}

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 
 from planner_jax.protocol import Attempt, Drive, Status, is_solved
 from planner_jax.robot.car import pose_at
@@ -41,17 +41,23 @@ class GroupIntercept:
             return jax.tree.map(lambda leaf: leaf[0], plans)
         shared = cases.shared
         car = CarState(pose=shared.start, speed=shared.speed, curvature=shared.curvature)
-        begin, fine = jnp.zeros_like(shared.time), jnp.ones(shared.time.shape, bool)
-        begins, legs = [], []
-        for k in range(cases.num_targets):
+        state = (car, jnp.zeros_like(shared.time), jnp.ones(shared.time.shape, bool))
+
+        def leg(state: tuple, k: Any) -> tuple[tuple, tuple[Array, InterceptPlan]]:
+            car, begin, fine = state
             case, wanted = _leg(cases, k, begin, car, fine)
-            plan = self._planned(drive, case, wanted)
-            plan = _of_wanted(case, plan, wanted)
-            begins.append(begin)
-            legs.append(plan)
-            car, begin, fine = _after(plan, begin, fine, wanted)
-        plans = _joined(cases, begins, legs)
-        return plans if drive.is_pure else jax.device_get(plans)
+            plans = _of_wanted(case, self._planned(drive, case, wanted), wanted)
+            return _after(plans, begin, fine, wanted), (begin, plans)
+
+        if drive.is_pure:
+            _, (begins, legs) = lax.scan(leg, state, jnp.arange(cases.num_targets))
+            return _joined(cases, begins, legs)
+        found = []
+        for k in range(cases.num_targets):
+            state, one = leg(state, k)
+            found.append(one)
+        begins, legs = jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
+        return jax.device_get(_joined(cases, begins, legs))
 
     def _planned(self, drive: Drive, case: InterceptCase, wanted: Array) -> InterceptPlan:
         """Plans of the legs that are wanted, (B,) bool; what the others hold means nothing."""
@@ -137,10 +143,9 @@ def _after(
 
 
 @jax.jit
-def _joined(cases: InterceptGroup, begins: list[Array], legs: list[InterceptPlan]) -> GroupPlan:
-    """The plans of legs, N entries of (B, ...)."""
-    of_all: InterceptPlan = jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=1), *legs)
-    begin = jnp.stack(begins, axis=1)
+def _joined(cases: InterceptGroup, begins: Array, legs: InterceptPlan) -> GroupPlan:
+    """The plans of legs (N, B, ...), which begin at times (N, B) [s]."""
+    begin, of_all = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), (begins, legs))
     # What the first leg that is not solved says goes for the whole; the last if all are.
     first = jnp.argmax(~is_solved(of_all.status), axis=1)
     lanes = jnp.arange(first.size)

@@ -98,7 +98,9 @@ def decision(decide: str | Decision) -> Decision:
     return pkgutil.resolve_name(DECISIONS[decide])()
 
 
-def judge(cases: InterceptCase, plans: InterceptPlan, **settings: Any) -> InterceptVerdict:
+def judge(
+    cases: InterceptCase | InterceptGroup, plans: InterceptPlan | GroupPlan, **settings: Any
+) -> InterceptVerdict:
     """What the referee says of one plan or of a batch: the physics alone decides.
 
     Args:
