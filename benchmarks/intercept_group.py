@@ -1,6 +1,6 @@
 """Groups of three targets, one car: what deciding the order is worth, beside a bound.
 
-    python -m benchmarks.intercept_group [--num 40] [--seed 1] [--out DIR]
+    python -m benchmarks.intercept_group [--num 30] [--seed 1] [--out DIR]
 
 The first three targets of groups of the suite `group` are met in the best of all six orders, each
 planned; in the best of the three orders that the estimate has in front; in greedy order, next
@@ -166,7 +166,7 @@ def measure(bench: Bench, options: argparse.Namespace) -> None:
 
 def main() -> None:
     """Print a row of every way to decide, and the bound."""
-    parser = argument_parser("intercept_group", __doc__, num=40, seed=1)
+    parser = argument_parser("intercept_group", __doc__, num=30, seed=1)
     options = parser.parse_args()
     with begin(parser, options) as bench:
         measure(bench, options)

@@ -28,7 +28,7 @@ LEGS = SpacetimeIntercept(meet="early", pieces=16, searches=(SEARCH,))
 
 
 def planner(decide):
-    return pj.intercept.planner("group", decide=decide, planner=LEGS)
+    return pj.intercept.planner("group", decide=decide, planner=LEGS, patient=LEGS)
 
 
 def numpy(tree):
@@ -155,6 +155,15 @@ def test_the_best_order_is_no_later_than_the_greedy_one(planned):
     same = both & (best.order == greedy.order).all(axis=1)
     assert same.any()
     np.testing.assert_allclose(best.cost[same], greedy.cost[same], atol=1e-3)
+
+
+@pytest.mark.parametrize("decide", ["best", "greedy"])
+def test_one_group_is_planned_as_in_a_batch(planned, decide):
+    k = int(np.argmax(pj.solved(planned[1][decide])))
+    one, batch = pj.plan(planner(decide), pj.lane(planned[0], k)), pj.lane(planned[1][decide], k)
+    assert one.status == batch.status and one.order.tolist() == batch.order.tolist()
+    np.testing.assert_allclose(one.cost, batch.cost, atol=1e-3)
+    assert pj.intercept.judge(pj.lane(planned[0], k), one).success
 
 
 def test_legs_join(planned):

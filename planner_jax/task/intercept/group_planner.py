@@ -1,8 +1,10 @@
 """Groups planned leg after leg: each target as early as it can be met, from where the last was.
 
 A leg is an interception of its own, with the car as the leg before leaves it, and targets and
-movers moved on to that time; `SpacetimeIntercept` plans it. Legs of all groups of a batch, and of
-all orders that are tried, are planned together: first all first ones, then all second ones.
+movers moved on to that time. `SpacetimeIntercept` plans it as early as it can; or where that fails,
+since a car cannot always drive what a reach set of cells has as early, with the least effort. Legs
+of all groups of a batch, and of all orders that are tried, are planned together: first all first
+ones, then all second ones.
 """
 
 import dataclasses
@@ -13,12 +15,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from planner_jax.protocol import Attempt, Drive, Status, is_solved
+from planner_jax.planning.batch import better_of, merged
+from planner_jax.protocol import Attempt, Drive, Status, is_solved, is_unsolved
 from planner_jax.robot.car import pose_at
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.group import CarState, GroupPlan, InterceptGroup
 from planner_jax.task.intercept.plan import InterceptPlan
 from planner_jax.task.intercept.spacetime import SpacetimeIntercept
+
+_EARLY = SpacetimeIntercept("early")
 
 
 @jax.tree_util.register_static
@@ -32,7 +37,9 @@ class GroupIntercept:
 
     case_type: ClassVar[type] = InterceptGroup
     attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)
-    planner: SpacetimeIntercept = SpacetimeIntercept(meet="early")
+    # One search: where it fails, others take long.
+    planner: SpacetimeIntercept = SpacetimeIntercept("early", searches=_EARLY.attempts[:1])
+    patient: SpacetimeIntercept = SpacetimeIntercept("least")  # of legs that it leaves unsolved
 
     def plan_by(self, drive: Drive, cases: InterceptGroup) -> GroupPlan:
         """The plans of a batch, or of one group."""
@@ -62,17 +69,30 @@ class GroupIntercept:
     def _planned(self, drive: Drive, case: InterceptCase, wanted: Array) -> InterceptPlan:
         """Plans of the legs that are wanted, (B,) bool; what the others hold means nothing."""
         if drive.is_pure:
-            return drive(self.planner, case)[0]
+            plans, _ = drive(self.planner, case)
+            left = wanted & _is_left(plans.status)
+            again = lambda plans: better_of(plans, drive(self.patient, case)[0], left)  # noqa: E731
+            return lax.cond(jnp.any(left), again, lambda plans: plans, plans)
         case, wanted = jax.tree.map(np.asarray, (case, wanted))
         # Orders that begin alike have legs in common. Without any leg, one stands for all.
         some = np.flatnonzero(wanted) if np.any(wanted) else np.zeros(1, int)
         leaves = [leaf[some].reshape(some.size, -1) for leaf in jax.tree.leaves(case)]
         rows = np.concatenate(leaves, axis=1)
         _, first, place = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-        plans, _ = drive(self.planner, jax.tree.map(lambda leaf: leaf[some[first]], case))
+        case = jax.tree.map(lambda leaf: leaf[some[first]], case)
+        plans, _ = drive(self.planner, case)
+        left = np.flatnonzero(_is_left(plans.status))
+        if left.size:
+            later, _ = drive(self.patient, jax.tree.map(lambda leaf: leaf[left], case))
+            plans = merged(plans, later, left)
         places = np.zeros(len(wanted), int)
         places[some] = place
-        return jax.tree.map(lambda leaf: np.asarray(leaf)[places], plans)
+        return jax.tree.map(lambda leaf: leaf[places], plans)
+
+
+def _is_left(status: Any) -> Any:
+    """Which legs are worth another planner; it has other meeting times, and thinner bodies."""
+    return is_unsolved(status) | (status == Status.NO_PATH)
 
 
 @jax.jit

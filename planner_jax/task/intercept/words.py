@@ -61,8 +61,8 @@ def planner(name: str = "spacetime", **options: Any) -> AnyPlanner[Any, Any]:
       host, with the extra `baselines`.
     * `em`: the best path of `lattice` with the speed step of the EM planner.
     * `constant`: the best path of `lattice` at constant speed, whatever moves.
-    * `group`: groups of targets, one after another by `spacetime`, each as early as it can be
-      met, behind a decision about their order.
+    * `group`: groups of targets, one after another by `spacetime`, each as early as it is found
+      to be met, behind a decision about their order.
 
     Args:
         name: one of these, or one that another package offers.
