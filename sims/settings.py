@@ -12,6 +12,7 @@ from planner_jax.sims.noise import NOISES, PLANE_NOISES, PlaneSensing, Sensing, 
 from planner_jax.sweep.settings import SettingError, option, require, require_one_of
 from planner_jax.task.catch.card import TASK as CATCH
 from planner_jax.task.hit.card import TASK as HIT
+from planner_jax.task.intercept.card import GROUPS
 from planner_jax.task.intercept.card import TASK as INTERCEPT
 
 _REPLAN = "plans a second, 0 for the first only (default: {} with {}, 0 with other planners)"
@@ -173,7 +174,10 @@ class InterceptFly(FlySettings):
 
     def __post_init__(self) -> None:
         require_one_of(PLANE_NOISES, "noise", self.noise)
-        require_one_of(INTERCEPT.all_suites(), "suite", self.suite)
+        # The car is after one target.
+        suites = [name for name in INTERCEPT.all_suites() if name not in GROUPS]
+        require_one_of(suites, "suite", self.suite)
+        require(self.planner != "group", "planner", "of single targets", self.planner)
         super().__post_init__()
 
     @property

@@ -7,8 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from planner_jax.protocol import lane
 from planner_jax.referee.clearance import clearances
 from planner_jax.referee.intercept import referee_intercepts
+from planner_jax.task.intercept.arrival import earliest_arrival
 from planner_jax.task.intercept.card import SUITES
 from planner_jax.task.intercept.plan import InterceptPlan
 from planner_jax.task.intercept.rejection import BODY_MIDDLE, CAUSES, SIZE, first_cause
@@ -37,7 +39,7 @@ def numpy(tree):
 
 
 def places(target, times):
-    """Where (B, M, 2) the targets are at times (M,): chords of arcs, by hand."""
+    """Where (B, M, 2) the targets are at times (M,) or (B, M): chords of arcs, by hand."""
     half = 0.5 * np.asarray(target.turn_rate)[:, None] * times
     (x, y), chord = np.asarray(target.vel).T[..., None], times * np.sinc(half / np.pi)
     way = [np.cos(half) * x - np.sin(half) * y, np.sin(half) * x + np.cos(half) * y]
@@ -75,6 +77,7 @@ def test_a_suite_is_a_matter_of_its_name_and_the_seed_alone():
     """One number of two suites: a change here is a change of published cases."""
     np.testing.assert_allclose(draw_cases("hard", 1, 0).start[0, 1], 5.625709, rtol=1e-5)
     np.testing.assert_allclose(draw_cases("maze", 1, 0).start[0, 1], 4.843411, rtol=1e-5)
+    np.testing.assert_allclose(draw_cases("rush", 2, 0).time, [4.8589745, 5.8846154], rtol=1e-5)
 
 
 @each_suite
@@ -84,7 +87,8 @@ def test_shapes_are_those_of_the_suite_and_starts_those_of_the_paper(batches, na
     for group, room in ((cases.walls, suite.wall_room), (cases.movers, suite.mover_room)):
         assert group.corners.shape == (NUM, *room, 2)
         assert group.present.shape == (NUM, room[0])
-    np.testing.assert_array_equal(cases.time, suite.time)
+    if suite.spare is None:
+        np.testing.assert_array_equal(cases.time, suite.time)
     start = np.asarray(cases.start)
     assert (start[:, [0, 2]] == [0.8, 0.0]).all() and (cases.speed == 0.5).all()
     assert start[:, 1].min() >= 1.0 and start[:, 1].max() <= 7.0 and np.ptp(start[:, 1]) > 4.0
@@ -170,6 +174,23 @@ def test_start_and_meeting_are_clear(batches, name):
     assert end.min() >= 0.3 - 1e-9 and end.max() <= SIZE - 0.3 + 1e-9
 
 
+def test_a_rush_ends_half_a_second_after_the_first_layer_that_meets_its_target(batches):
+    cases, suite = batches["rush"].cases, SUITES["rush"]
+    assert replace(suite, description="", spare=None) == replace(SUITES["hard"], description="")
+    steps = (cases.time - 0.5) / (10.0 / 19.5) - 0.5  # 19 layers of 6 cells of 0.125 m at 1.5 m/s
+    np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)
+    assert steps.min() >= 1.0 and steps.max() <= 19.0 and np.ptp(steps) > 5.0
+    with jax.enable_x64(True):
+        full = replace(cases, time=np.full(NUM, suite.time))
+        first = jax.jit(earliest_arrival)
+        arrivals = np.array([first(lane(full, k)) for k in range(3)])
+    np.testing.assert_allclose(cases.time[:3], arrivals + 0.5)
+    end = places(cases.target, cases.time[:, None])
+    assert end.min() >= 0.0 and end.max() <= SIZE
+    assert least_distance(cases.walls, end).min() >= 0.4
+    assert least_distance(cases.movers, end, cases.time[:, None, None]).min() >= 0.4
+
+
 @each_suite
 def test_a_car_that_brakes_at_once_stops_before_every_wall(batches, name):
     cases = batches[name].cases
@@ -235,6 +256,8 @@ def plain_draw(**changes):
         "walls present": [True, False],
         "movers": [[3.0, 7.0] + mover],
         "movers present": [True],
+        "time": 10.0,
+        "reached": True,
         "velocity": [[0.1, -0.2]],
     }
     return {name: np.array(leaf)[None] for name, leaf in (draw | changes).items()}
@@ -261,6 +284,7 @@ def test_every_cause_is_told_by_its_name():
         "mover at the meeting": plain_draw(**mover(5.0, 7.0, [0.0, -0.25])),
         "too far": plain_draw(start=[-11.0, 4.0]),
         "no way": plain_draw(walls=plain_draw()["walls"][0] * [1.0, 1.1]),
+        "out of reach": plain_draw(reached=False),
     }
     assert tuple(ends) == ("", *CAUSES)
     names = (*CAUSES, "")
@@ -278,6 +302,7 @@ def test_nothing_is_wrong_with_what_is_just_far_enough():
         plain_draw(**mover(0.95, 4.56, [0.0, 1.0])),
         plain_draw(**mover(5.0, 7.0, [0.0, -0.235])),
         plain_draw(**mover(5.0, 4.0, [0.0, 0.07])),  # gone when the target is there
+        plain_draw(**mover(5.0, 7.0, [0.0, -0.25]), time=9.0),  # not there yet
     ]
     drawn = {k: np.concatenate([each[k] for each in far]) for k in far[0]}
     np.testing.assert_array_equal(first_cause(SUITES["hard"], drawn), len(CAUSES))
@@ -300,7 +325,7 @@ def test_observations_are_of_the_targets_past_with_noise():
 @pytest.mark.parametrize(
     ("arguments", "options", "says"),
     [
-        (("storms", 3, 0), {}, "suite must be one of easy, medium, .*, maze, got 'storms'"),
+        (("storms", 3, 0), {}, "suite must be one of easy, medium, .*, rush, got 'storms'"),
         (("easy", 0, 0), {}, "num must be >= 1, got 0"),
         (("easy", 3, -1), {}, "seed must be >= 0, got -1"),
         (("easy", 3, 0), {"first": -1}, "first must be >= 0, got -1"),

@@ -133,7 +133,7 @@ def _along_y(rows: Array, move: Array) -> Array:
     words, cells = rows.shape[0], rows.shape[-1]
     padded = jnp.pad(rows.reshape(words, -1, cells), ((0, 0), (0, 0), (_FARTHEST, _FARTHEST)))
     moved = jax.vmap(
-        lambda row, by: lax.dynamic_slice(row, (0, _FARTHEST - by), (words, cells)),
+        lambda row, by: lax.dynamic_slice_in_dim(row, _FARTHEST - by, cells, axis=1),
         in_axes=(1, 0),
         out_axes=1,
     )(padded, move.reshape(-1))

@@ -65,6 +65,18 @@ class PolynomialPath:
         return PointState(pos=pos, vel=vel)
 
 
+@struct.dataclass
+class LaterPath:
+    """Any path, with times that count from a later moment."""
+
+    path: PlanePath
+    begin: Array  # () [s], that moment in the path's own times
+
+    def at(self, time: Array) -> PointState:
+        """Position [m] and velocity [m/s] at one time () [s] after that moment."""
+        return self.path.at(self.begin + time)
+
+
 def arc(turn_rate: Array, time: Array) -> tuple[Array, Array]:
     """How far ahead and to the left (...) [s] a target of unit speed is after a time (...) [s]."""
     angle = turn_rate * time

@@ -147,7 +147,7 @@ def referee_intercepts(
     target = cases.target if truth is None else truth
     # A broken lane is told by its verdict, not by a warning.
     with np.errstate(all="ignore"):
-        where = (target_positions or _target_positions)(target, times)
+        where = (target_positions or target_positions_of)(target, times)
     leaves["target"] = checked_leaf("target_positions", where, (*times.shape, 2))
     judge = functools.partial(_judge, step=step, relative=tolerance, contact=contact_tolerance)
     return InterceptVerdict(**judge_in_chunks(judge, leaves, chunk))
@@ -197,7 +197,7 @@ def _obstacle_leaves(name: str, group, batch: int) -> dict[str, np.ndarray]:
     }
 
 
-def _target_positions(target, times: np.ndarray) -> np.ndarray:
+def target_positions_of(target, times: np.ndarray) -> np.ndarray:
     """Positions (B, 2) [m] at times (B,) of targets of the classes that are known here."""
     batch = times.shape
 
@@ -252,6 +252,29 @@ def _judge(case: dict, step: float, relative: float, contact: float) -> dict:
         broken = -1 if value.dtype.kind == "i" else np.nan
         measured[name] = np.where(driven, value, broken)
     return first_failures(tests, LIMITS, finite) | measured
+
+
+def final_poses(plans, body) -> np.ndarray:
+    """Where the rear axle and the heading are at the end of plans, (B, 3).
+
+    Args:
+        plans: object with the fields of `CarPlan`, leaves with leading axis B.
+        body: of the cars, object with the fields of `CarBody`.
+    """
+    names = ("start", "speed", "curvature")
+    case = {f"plan.{name}": np.asarray(getattr(plans, name), np.float64) for name in names}
+    for name in ("length", "rear_overhang"):
+        case[f"body.{name}"] = np.asarray(getattr(body, name), np.float64)
+    end = np.asarray(plans.time, np.float64)
+    # What is not driven ends where it begins.
+    end = np.where((end > 0.0) & (end <= LONGEST_PLAN), end, 0.0)
+    span = end / (case["plan.speed"].shape[1] - 1)
+    with np.errstate(all="ignore"):
+        pose = _driven(case, span, LONGEST_STEP)[1][:, -1]
+    ahead = 0.5 * case["body.length"] - case["body.rear_overhang"]
+    pose[:, 0] -= ahead * np.cos(pose[:, 2])
+    pose[:, 1] -= ahead * np.sin(pose[:, 2])
+    return pose
 
 
 def _wrapped(angle: np.ndarray) -> np.ndarray:

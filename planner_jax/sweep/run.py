@@ -44,7 +44,9 @@ def start_sweep(
     folder = RunFolder(out)
     folder.require_new()
     run = _open(sweep_of(task), settings.of(task), folder)
-    folder.create(_first_manifest(run, run.source.check()))
+    cases = run.source.check()
+    run.sweep.require_fit(run.source.settings, run.planner, cases)
+    folder.create(_first_manifest(run, cases))
     return _finish(run, progress)
 
 

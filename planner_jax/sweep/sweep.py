@@ -12,7 +12,7 @@ from planner_jax.planning.plan import plan
 from planner_jax.registry import Task, UnknownName, task_named
 from planner_jax.sweep.columns import Column, RefereedBatch, leaf_columns
 from planner_jax.sweep.figures.outcomes import outcomes_figure
-from planner_jax.sweep.settings import SettingError, SweepSettings
+from planner_jax.sweep.settings import SettingError, SweepSettings, require
 from planner_jax.sweep.source import DrawnSource, Source, filled_in
 from planner_jax.sweep.summary import Tally
 from planner_jax.sweep.table import RateTable, own_cells
@@ -69,9 +69,22 @@ class Sweep:
         return self.task.planner(settings.planner, **settings.planner_options())
 
     def other_planners(self, settings: Any) -> dict[str, Any]:
-        """The task's other planners, by name, to be compared with that of a run."""
+        """The task's other planners of such cases, by name, to be compared with that of a run."""
         names = [name for name in self.task.all_planners() if name != settings.planner]
-        return {name: self.task.planner(name) for name in names}
+        made = {name: self.task.planner(name) for name in names}
+        kind = _case_type(self.planner(settings))
+        fits = lambda one: kind is None or _case_type(one) in (None, kind)  # noqa: E731
+        return {name: one for name, one in made.items() if fits(one)}
+
+    def require_fit(self, settings: Any, planner: Any, cases: Any) -> None:
+        """Raise `SettingError` unless the planner is one of such cases."""
+        kind = _case_type(planner)
+        require(
+            kind is None or isinstance(cases, kind),
+            "planner",
+            f"one of the cases of suite {settings.suite}",
+            settings.planner,
+        )
 
     def open_source(self, settings: Any, batch: int) -> Source:
         """The source of a sweep's cases; `batch` where the settings name none.
@@ -121,6 +134,11 @@ class Sweep:
             f"Cases: {settings['num']:,} of suite {settings['suite']}, seed {settings['seed']}.",
             "A success is the referee's.",
         ]
+
+
+def _case_type(planner: Any) -> type | None:
+    """The class of a planner's cases, where it tells."""
+    return getattr(planner, "case_type", None)
 
 
 def settings_of(task: Task) -> type[SweepSettings]:

@@ -1,5 +1,9 @@
 from .case import InterceptCase as InterceptCase
 from .case import case as case
+from .group import GroupPlan as GroupPlan
+from .group import InterceptGroup as InterceptGroup
+from .group import group as group
+from .group_decide import Best as Best
 from .paper import PaperIntercept as PaperIntercept
 from .path_then_speed import PathThenSpeed as PathThenSpeed
 from .plan import InterceptPlan as InterceptPlan

@@ -18,10 +18,13 @@ class Suite:
     num_movers: tuple[int, int]  # fewest and most
     mover_speed: tuple[float, float] = (0.1, 0.6)  # [m/s]
     time: float = 10.0  # [s], when the target is to be met
+    # [s], if the target is to be met earlier: so long after a reach set first meets it.
+    spare: float | None = None
     is_maze: bool = False
     # How many polygons of how many corners the arrays hold.
     wall_room: tuple[int, int] = (12, 6)
     mover_room: tuple[int, int] = (4, 6)
+    num_targets: tuple[int, int] = (1, 1)  # fewest and most, for which there is room
 
 
 # The other ranges are those of `planner_jax.task.intercept.suites`.
@@ -44,6 +47,29 @@ SUITES = {
         time=15.0,
         is_maze=True,
     ),
+    "rush": Suite(
+        "What stands and moves in `hard`, to be met 0.5 s after a reach set first meets it.",
+        (10, 12),
+        (3, 4),
+        spare=0.5,
+    ),
+}
+
+# Of several targets: their cases are of a class of their own.
+GROUPS = {
+    "group": Suite(
+        "Two to four targets for one car, five to eight walls, two or three movers.",
+        (5, 8),
+        (2, 3),
+        time=15.0,
+        num_targets=(2, 4),
+    ),
+}
+
+DECISIONS = {
+    "best": "planner_jax.task.intercept.group_decide:Best",
+    "greedy": "planner_jax.task.intercept.group_decide:Greedy",
+    "given": "planner_jax.task.intercept.group_decide:Given",
 }
 
 TASK = Task(
@@ -56,8 +82,9 @@ TASK = Task(
         "paper": "planner_jax.task.intercept.paper:PaperIntercept",
         "em": "planner_jax.task.intercept.path_then_speed:em",
         "constant": "planner_jax.task.intercept.path_then_speed:constant",
+        "group": "planner_jax.task.intercept.group_planner:GroupIntercept",
     },
-    suites={name: suite.description for name, suite in SUITES.items()},
+    suites={name: suite.description for name, suite in {**SUITES, **GROUPS}.items()},
     flight="planner_jax.sims.settings:InterceptFly",
     contact="time",
 )

@@ -10,18 +10,21 @@
 | mover at the meeting | the target is then less than 0.4 m from one |
 | too far | farther than the car comes straight on at its greatest speed |
 | no way | walls part start and meeting point for a disc as wide as the car, on a grid of 0.1 m |
+| out of reach | no layer of the reach set meets the target, where that sets the time to meet it |
 
-They are looked at in this order. The last two are safeguards: with the ranges of the suites they
-hardly ever apply.
+They are looked at in this order. "too far" and "no way" are safeguards: with the ranges of the
+suites they hardly ever apply.
 
 Draws are dictionaries of arrays with leading axis B: "start" and "meeting" (B, 2) [m], the rear
-axle's middle and where the target is to be met; the target's "pos" (B, 2) [m], "angle" [rad] and
-"speed" [m/s] at time 0, and its turn "rate" [rad/s]; corners of "walls" and, at time 0, "movers"
-(B, N, V, 2) [m], counter-clockwise and possibly repeated; "walls present" and "movers present"
-(B, N); and the "velocity" (B, N, 2) [m/s] of movers. World frame in the plane, SI units.
+axle's middle and where the target is to be met; the "time" (B,) [s] at which that is, and whether
+it is "reached" (B,) by then; the target's "pos" (B, 2) [m], "angle" [rad] and "speed" [m/s] at time
+0, and its turn "rate" [rad/s]; corners of "walls" and, at time 0, "movers" (B, N, V, 2) [m],
+counter-clockwise and possibly repeated; "walls present" and "movers present" (B, N); and the
+"velocity" (B, N, 2) [m/s] of movers. World frame in the plane, SI units.
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
@@ -49,7 +52,7 @@ def moved(angle, speed, rate, time) -> np.ndarray:
 
 def _path(suite: Suite, drawn: dict) -> np.ndarray:
     """Where the targets are (B, M, 2) [m] from time 0 to the meeting."""
-    times = np.linspace(0.0, suite.time, round(suite.time / _LOOK) + 1)
+    times = np.linspace(0.0, drawn["time"], round(suite.time / _LOOK) + 1, axis=1)
     angle, speed, rate = (drawn[name][:, None] for name in ("angle", "speed", "rate"))
     return drawn["pos"][:, None] + moved(angle, speed, rate, times)
 
@@ -65,17 +68,18 @@ def _middle(drawn: dict) -> np.ndarray:
     return drawn["start"] + [BODY_MIDDLE, 0.0]
 
 
-def _too_far(suite: Suite, drawn: dict) -> np.ndarray:
+def _too_far(_: Suite, drawn: dict) -> np.ndarray:
     """Whether (B,) greatest speed does not suffice."""
     way = drawn["meeting"] - _middle(drawn)
-    return np.linalg.norm(way, axis=1) > TOP_SPEED * suite.time
+    return np.linalg.norm(way, axis=1) > TOP_SPEED * drawn["time"]
 
 
-def _room(drawn: dict, kind: str, points: np.ndarray, time: float = 0.0) -> np.ndarray:
-    """Least distance (B,) [m] of points (B, 2) or (B, M, 2) from walls or movers at one time."""
+def _room(drawn: dict, kind: str, points: np.ndarray, times: Any = 0.0) -> np.ndarray:
+    """Least distance (B,) [m] of points (B, 2) or (B, M, 2) from walls or movers at times (B,)."""
     corners, points = drawn[kind], points if points.ndim == 3 else points[:, None]
     if kind == "movers":
-        corners = corners + time * drawn["velocity"][:, :, None]
+        times = np.broadcast_to(times, len(points))[:, None, None, None]
+        corners = corners + times * drawn["velocity"][:, :, None]
     least = np.full(len(points), np.inf)
     for k in range(corners.shape[1]):
         there = drawn[f"{kind} present"][:, k]
@@ -129,11 +133,12 @@ _APPLIES: dict[str, Callable[[Suite, dict], np.ndarray]] = {
         _room(drawn, "walls", _path(suite, drawn)) < TARGET_ROOM
     ),
     "mover at the start": lambda _, drawn: _room(drawn, "movers", _middle(drawn)) < START_ROOM,
-    "mover at the meeting": lambda suite, drawn: (
-        _room(drawn, "movers", drawn["meeting"], suite.time) < MEETING_ROOM
+    "mover at the meeting": lambda _, drawn: (
+        _room(drawn, "movers", drawn["meeting"], drawn["time"]) < MEETING_ROOM
     ),
     "too far": _too_far,
     "no way": _no_way,
+    "out of reach": lambda _, drawn: ~drawn["reached"],
 }
 CAUSES = tuple(_APPLIES)
 

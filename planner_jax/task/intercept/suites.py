@@ -20,6 +20,12 @@ to 0.8 m on the side of the start, 0.8 to 1.4 m apart, make a dead end of the pl
 straight line to the meeting point runs into a wall, or of the nearest one that leaves the gap
 alone; walls less than 2.5 m from the map's edge have none, so that the start has room to turn.
 
+A rush is what `hard` draws, with a tag of its own, and its target is to be met earlier than after
+the 10 s that the rest is drawn for: 0.5 s after the first layer of the reach set of
+`planner_jax.task.intercept.arrival`, worked out in double precision. So its time differs from case
+to case. A target that is not reached within 10 s is drawn anew, as is one at which something is
+wrong at the new time.
+
 Whether the target turns and how many walls and movers there are is drawn once a case; the rest is
 drawn anew until `planner_jax.task.intercept.rejection` finds nothing wrong with it. World frame in
 the plane, SI units.
@@ -36,7 +42,9 @@ from jax import Array
 
 from planner_jax.plane.obstacles import Obstacles
 from planner_jax.plane.target import PlanePath, TurningPath
+from planner_jax.protocol import lane
 from planner_jax.registry import require_name
+from planner_jax.task.intercept.arrival import earliest_arrival
 from planner_jax.task.intercept.card import SUITES, Suite
 from planner_jax.task.intercept.case import InterceptCase, case
 from planner_jax.task.intercept.rejection import CAUSES, SIZE, TOP_SPEED, first_cause, moved
@@ -82,11 +90,35 @@ def draw_cases(
 def drawn(suite: str, num: int, seed: int, first: int = 0, *, dtype: Any = jnp.float32) -> Drawn:
     """The same cases, and how many draws of each were rejected, and why; see `draw_cases`."""
     require_name(SUITES, "suite", suite)
+    own, randoms = SUITES[suite], generators(suite, num, seed, first)
+    accepted, draws, rejected = accepted_draws(own, randoms)
+    return Drawn(cases=cases_of(accepted, dtype), draws=draws, rejected=rejected)
+
+
+def generators(suite: str, num: int, seed: int, first: int) -> list[np.random.Generator]:
+    """A generator of its own for every case, so that none depends on the others.
+
+    Raises:
+        ValueError: an argument is out of its range; one line.
+    """
     for name, value, least in (("num", num, 1), ("seed", seed, 0), ("first", first, 0)):
         if value < least:
             raise ValueError(f"{name} must be >= {least}, got {value}")
-    own, tag = SUITES[suite], zlib.crc32(suite.encode())
-    randoms = [np.random.default_rng([seed, first + k, tag]) for k in range(num)]
+    tag = zlib.crc32(suite.encode())
+    return [np.random.default_rng([seed, first + k, tag]) for k in range(num)]
+
+
+def accepted_draws(
+    own: Suite, randoms: list[np.random.Generator]
+) -> tuple[dict[str, np.ndarray], np.ndarray, dict[str, np.ndarray]]:
+    """Of every generator the first draw in which nothing is wrong.
+
+    Returns:
+        accepted: see `planner_jax.task.intercept.rejection`.
+        draws: (B,) int, as of `Drawn`.
+        rejected: likewise.
+    """
+    num = len(randoms)
     kinds = np.stack([random.random(3) for random in randoms])
     pending, draws = np.arange(num), np.zeros(num, int)
     rejected = np.zeros((len(CAUSES), num), int)
@@ -95,6 +127,11 @@ def drawn(suite: str, num: int, seed: int, first: int = 0, *, dtype: Any = jnp.f
         uniform = np.stack([randoms[k].random(_columns(own)) for k in pending])
         candidates = _candidates(own, kinds[pending], uniform)
         cause = first_cause(own, candidates)
+        if own.spare is not None and (good := np.flatnonzero(cause == len(CAUSES))).size:
+            some = _hurried(own, {name: leaf[good] for name, leaf in candidates.items()})
+            cause[good] = first_cause(own, some)
+            for name, leaf in some.items():
+                candidates[name][good] = leaf
         draws[pending] += 1
         is_good = cause == len(CAUSES)
         rejected[cause[~is_good], pending[~is_good]] += 1
@@ -103,8 +140,7 @@ def drawn(suite: str, num: int, seed: int, first: int = 0, *, dtype: Any = jnp.f
                 accepted[name] = np.zeros((num, *leaf.shape[1:]), leaf.dtype)
             accepted[name][pending[is_good]] = leaf[is_good]
         pending = pending[~is_good]
-    counts = dict(zip(CAUSES, rejected, strict=True))
-    return Drawn(cases=_cases(own, accepted, dtype), draws=draws, rejected=counts)
+    return accepted, draws, dict(zip(CAUSES, rejected, strict=True))
 
 
 def observe(
@@ -186,7 +222,7 @@ def _candidates(suite: Suite, kinds: np.ndarray, uniform: np.ndarray) -> dict[st
     cuts = np.cumsum([7, suite.wall_room[0] * (2 + _SHAPE)])
     u, walls, movers = np.split(uniform, cuts, axis=1)
     start = np.stack([np.full(len(u), START_X), _between(u[:, 0], 1.0, SIZE - 1.0)], axis=1)
-    meeting = _between(u[:, 1:3], EDGE_ROOM, SIZE - EDGE_ROOM)
+    meeting = anywhere(u[:, 1:3])
     walls = walls.reshape(len(u), suite.wall_room[0], 2 + _SHAPE)
     if suite.is_maze:
         across = _across(walls[:, :3, 0], count_walls)
@@ -196,9 +232,7 @@ def _candidates(suite: Suite, kinds: np.ndarray, uniform: np.ndarray) -> dict[st
         corners = _between(walls[..., None, :2], 0.0, SIZE)
         corners = corners + _polygons(walls[..., 2:], (3, 6), (0.2, 0.8))
         present = np.arange(suite.wall_room[0]) < count_walls[:, None]
-    side = np.where(u[:, 6] < 0.5, 1.0, -1.0)
-    rate = np.where(turning, side * _between(u[:, 5], 0.03, 0.1), 0.0)
-    angle, speed = 2.0 * np.pi * u[:, 3], _between(u[:, 4], 0.2, 0.5)
+    target = target_to(meeting, suite.time, turning, u[:, 3:7])
     movers = movers.reshape(len(u), suite.mover_room[0], 3 + _SHAPE)
     when = suite.time * _between(movers[..., 2], 0.2, 0.8)
     way = (meeting - start)[:, None]
@@ -209,16 +243,54 @@ def _candidates(suite: Suite, kinds: np.ndarray, uniform: np.ndarray) -> dict[st
     return {
         "start": start,
         "meeting": meeting,
-        "pos": meeting - moved(angle, speed, rate, np.full(len(u), suite.time)),
-        "angle": angle,
-        "speed": speed,
-        "rate": rate,
+        "time": np.full(len(u), suite.time),
+        "reached": np.ones(len(u), bool),
+        **target,
         "walls": corners,
         "walls present": present,
         "movers": middle[..., None, :] + _polygons(movers[..., 3:], (4, 6), (0.2, 0.4)),
         "movers present": np.arange(suite.mover_room[0]) < count_movers[:, None],
         "velocity": velocity,
     }
+
+
+def anywhere(uniform: np.ndarray) -> np.ndarray:
+    """Places (..., 2) [m] where targets may be met, from numbers of [0, 1)."""
+    return _between(uniform, EDGE_ROOM, SIZE - EDGE_ROOM)
+
+
+def target_to(
+    meeting: np.ndarray, time: float, turning: np.ndarray, uniform: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Targets that are at a place at a time, as draws have them.
+
+    Args:
+        meeting: (B, 2) [m], that place.
+        time: [s].
+        turning: (B,) bool, whether they turn.
+        uniform: (B, 4), numbers of [0, 1).
+    """
+    side = np.where(uniform[:, 3] < 0.5, 1.0, -1.0)
+    rate = np.where(turning, side * _between(uniform[:, 2], 0.03, 0.1), 0.0)
+    angle, speed = 2.0 * np.pi * uniform[:, 0], _between(uniform[:, 1], 0.2, 0.5)
+    pos = meeting - moved(angle, speed, rate, np.full(len(meeting), time))
+    return {"pos": pos, "angle": angle, "speed": speed, "rate": rate}
+
+
+def _hurried(suite: Suite, drawn: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The same draws with an earlier meeting, and whether the reach set meets the target at all."""
+    with jax.enable_x64(True):
+        cases = jax.tree.map(np.asarray, cases_of(drawn, jnp.float64))
+        num = len(drawn["time"])
+        arrivals = np.array([float(_earliest(lane(cases, k))) for k in range(num)])
+    reached = np.isfinite(arrivals)
+    time = np.where(reached, arrivals + suite.spare, drawn["time"])
+    way = moved(drawn["angle"], drawn["speed"], drawn["rate"], time)
+    return {**drawn, "time": time, "reached": reached, "meeting": drawn["pos"] + way}
+
+
+# One case at a time, so that what comes of it is no matter of the batch.
+_earliest = jax.jit(earliest_arrival)
 
 
 def _polygons(
@@ -285,7 +357,16 @@ def _boxes(left, low, right, high) -> np.ndarray:
     return np.stack([x, y], axis=-1)
 
 
-def _cases(suite: Suite, drawn: dict[str, np.ndarray], dtype: Any) -> InterceptCase:
+def path_of(drawn: dict[str, np.ndarray], dtype: Any) -> TurningPath:
+    """The path of targets (...), as draws have them."""
+    return TurningPath(
+        pos=jnp.asarray(drawn["pos"], dtype),
+        vel=jnp.asarray(drawn["speed"][..., None] * _unit(drawn["angle"]), dtype),
+        turn_rate=jnp.asarray(drawn["rate"], dtype),
+    )
+
+
+def cases_of(drawn: dict[str, np.ndarray], dtype: Any) -> InterceptCase:
     """The cases of accepted draws."""
 
     def cast(value: np.ndarray) -> Array:
@@ -303,14 +384,9 @@ def _cases(suite: Suite, drawn: dict[str, np.ndarray], dtype: Any) -> InterceptC
         )
 
     start = np.concatenate([drawn["start"], np.zeros((len(drawn["start"]), 1))], axis=1)
-    target = TurningPath(
-        pos=cast(drawn["pos"]),
-        vel=cast(drawn["speed"][:, None] * _unit(drawn["angle"])),
-        turn_rate=cast(drawn["rate"]),
-    )
     return case(
-        target,
-        np.full(len(start), suite.time),
+        path_of(drawn, dtype),
+        drawn["time"],
         start=start,
         initial_speed=START_SPEED,
         walls=group("walls", np.zeros(2)),

@@ -1,5 +1,6 @@
 """The words of the task: `pj.intercept.draw`, `planner` and `judge`; `case` stands beside."""
 
+import pkgutil
 from typing import Any
 
 import jax
@@ -7,10 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from planner_jax.plane.target import PlanePath
-from planner_jax.protocol import AnyPlanner
+from planner_jax.planning.decided import DecidedPlanner
+from planner_jax.protocol import AnyPlanner, Decision
 from planner_jax.referee.intercept import InterceptVerdict, referee_intercepts
-from planner_jax.task.intercept.card import TASK
+from planner_jax.referee.intercept_group import referee_groups
+from planner_jax.registry import require_name
+from planner_jax.task.intercept.card import DECISIONS, GROUPS, SUITES, TASK
 from planner_jax.task.intercept.case import InterceptCase
+from planner_jax.task.intercept.group import GroupPlan, InterceptGroup
+from planner_jax.task.intercept.group_suites import draw_groups
 from planner_jax.task.intercept.plan import InterceptPlan
 from planner_jax.task.intercept.suites import draw_cases
 from planner_jax.task.judged import judged
@@ -23,13 +29,13 @@ def draw(
     *,
     first: int = 0,
     dtype: Any = jnp.float32,
-) -> InterceptCase:
+) -> InterceptCase | InterceptGroup:
     """Drawn interceptions as a batch of cases; see `drawn` for how many draws were rejected.
 
     Args:
         num: how many, >= 1.
-        suite: "easy", the default, "medium", "hard", "storm", "gale" or "maze", or one that
-            another package offers.
+        suite: "easy", the default, "medium", "hard", "storm", "gale", "maze" or "rush"; or
+            "group", of several targets each; or one that another package offers.
         seed: >= 0. Case k of a suite and seed is always the same one.
         first: place of the first one, >= 0.
         dtype: of every floating leaf.
@@ -38,12 +44,14 @@ def draw(
         ValueError: an argument is out of its range, or there is no such suite.
     """
     suite = suite or "easy"
-    if suite not in TASK.suites:
+    if suite in GROUPS:
+        return draw_groups(suite, num, seed, first, dtype=dtype)
+    if suite not in SUITES:
         return TASK.other_suite(suite)(num, seed, first)
     return draw_cases(suite, num, seed, first, dtype=dtype)
 
 
-def planner(name: str = "spacetime", **options: Any) -> AnyPlanner[InterceptCase, InterceptPlan]:
+def planner(name: str = "spacetime", **options: Any) -> AnyPlanner[Any, Any]:
     """The intercept planner of a name, with some of its fields set.
 
     * `spacetime`: way and speed together, from a reach set in space and time.
@@ -53,38 +61,66 @@ def planner(name: str = "spacetime", **options: Any) -> AnyPlanner[InterceptCase
       host, with the extra `baselines`.
     * `em`: the best path of `lattice` with the speed step of the EM planner.
     * `constant`: the best path of `lattice` at constant speed, whatever moves.
+    * `group`: groups of targets, one after another by `spacetime`, each as early as it is found
+      to be met, behind a decision about their order.
 
     Args:
         name: one of these, or one that another package offers.
-        **options: fields of that planner's dataclass, for example `pieces` of `spacetime`.
+        **options: fields of that planner's dataclass, for example `pieces` of `spacetime`. That of
+            `group` takes `decide` besides: "best", the default, plans the most promising of all
+            orders and keeps the earliest last meeting, "greedy" meets next what it can meet
+            first, as estimated, "given" takes the order of the cases; or a decision with
+            settings, such as `Best(finalists=3)`.
 
     Returns:
-        A planner for `pj.plan`: `SpacetimeIntercept`, `PathThenSpeed` or `PaperIntercept`.
+        A planner for `pj.plan`: `SpacetimeIntercept`, `PathThenSpeed` or `PaperIntercept`; for
+        groups a `DecidedPlanner`, whose `planner` is a `GroupIntercept`.
 
     Raises:
-        ValueError: there is no planner of that name.
+        ValueError: there is no planner or decision of that name.
         TypeError: the planner has no such field.
     """
-    return TASK.make_planner(name, options)
+    if name != "group":
+        return TASK.make_planner(name, options)
+    decide = options.pop("decide", "best")
+    return DecidedPlanner(TASK.make_planner(name, options), decision(decide))
 
 
-def judge(cases: InterceptCase, plans: InterceptPlan, **settings: Any) -> InterceptVerdict:
+def decision(decide: str | Decision) -> Decision:
+    """The decision of a name, or the decision itself.
+
+    Raises:
+        ValueError: there is no decision of that name.
+    """
+    if not isinstance(decide, str):
+        return decide
+    require_name(DECISIONS, "decide", decide)
+    return pkgutil.resolve_name(DECISIONS[decide])()
+
+
+def judge(
+    cases: InterceptCase | InterceptGroup, plans: InterceptPlan | GroupPlan, **settings: Any
+) -> InterceptVerdict:
     """What the referee says of one plan or of a batch: the physics alone decides.
 
     Args:
-        cases: one case, or a batch.
+        cases: one case, or a batch; or groups.
         plans: of them.
-        **settings: such as `tolerance`, and `truth`: a path, or a batch of them, that the target
-            really takes, where the case holds one that was predicted; see `referee_intercepts`.
+        **settings: such as `tolerance`, and but for groups `truth`: a path, or a batch of them,
+            that the target really takes, where the case holds one that was predicted; see
+            `referee_intercepts`.
 
     Returns:
         A verdict with the batch shape of the cases: `success`, `sentence(k)`, and what was
-        measured.
+        measured. Of groups every leg is judged, see `referee_groups`.
 
     Raises:
         TypeError: the cases or plans are not interceptions.
         ValueError: shapes that do not fit, or a setting out of its range.
     """
+    if isinstance(cases, InterceptGroup):
+        settings = {"target_positions": positions, **settings}
+        return judged(referee_groups, cases, plans, (InterceptGroup, GroupPlan), settings)
     if cases.batch_shape == () and settings.get("truth") is not None:
         one = jax.tree.map(lambda leaf: np.asarray(leaf)[None], settings["truth"])
         settings = {**settings, "truth": one}

@@ -1,0 +1,177 @@
+"""Groups of three targets, one car: what deciding the order is worth, beside a bound.
+
+    python -m benchmarks.intercept_group [--num 20] [--seed 1] [--out DIR]
+
+The first three targets of groups of the suite `group` are met in the best of all six orders, each
+planned; in the best of the three orders that the estimate has in front; in greedy order, next
+whatever can be met earliest as estimated; and in the order in which they were drawn, which is
+random. Success is the referee's; times of the last meeting are those of groups that all four solve.
+
+No plan meets all targets earlier than the bound, the least over all orders: a point that goes
+straight on in any direction at once, no faster than the middle of the body of a car that gives all
+it has from the start, and through everything. It meets targets within the case's tolerance and
+begins the next leg as far off again. Meeting as early as it can is best for it, since it is faster
+than its targets and can stay with them.
+
+Times of planning are those of a second call, warm, of all groups at once; ways to decide share
+compiled programs, and the first one compiles most of them. The summary's success is
+that of the best of all orders.
+"""
+
+import argparse
+import dataclasses
+import itertools
+import os
+import time
+
+import jax
+import numpy as np
+
+import planner_jax as pj
+from planner_jax.benchmarks.run import Bench, argument_parser, begin
+from planner_jax.plane.target import PlanePath
+from planner_jax.task.intercept.group import GroupPlan, InterceptGroup
+from planner_jax.task.intercept.group_decide import Best
+
+TARGETS = 3
+DECISIONS = {
+    "best of all six orders": Best(6),
+    "best of three orders": Best(3),
+    "greedy": "greedy",
+    "random": "given",
+}
+STEP = 0.005  # [s], of the bound
+
+
+def draw(num: int, seed: int) -> InterceptGroup:
+    """Groups of three, NumPy leaves."""
+    groups = jax.tree.map(np.asarray, pj.intercept.draw(num, "group", seed))
+    present = np.broadcast_to(np.arange(groups.num_targets) < TARGETS, groups.present.shape)
+    return dataclasses.replace(groups, present=present)
+
+
+@jax.jit
+@jax.vmap
+def _places(paths: PlanePath, times: jax.Array) -> jax.Array:
+    """Where targets with a leading axis N are at times (T,) [s], (N, T, 2) [m]."""
+    at = jax.vmap(lambda path, time: path.at(time).pos, (None, 0))
+    return jax.vmap(at, (0, None))(paths, times)
+
+
+def bound(groups: InterceptGroup) -> np.ndarray:
+    """Earliest time (B,) [s] at which the last of the first three targets can be met; or inf."""
+    shared = groups.shared
+    num = int(np.ceil(shared.time.max() / STEP)) + 1
+    times = np.broadcast_to(
+        np.float32(STEP) * np.arange(num, dtype=np.float32), (len(shared.time), num)
+    )
+    places = np.asarray(_places(shared.target, times), float)
+    limits, ahead = shared.limits, np.asarray(shared.body.middle)
+    # The middle's speed is sqrt(v^2 + (ahead v kappa)^2), and (v kappa)^2 the product of kappa and
+    # v^2 kappa, both of which have limits. It never falls: at the end of a step it is greatest.
+    v = np.minimum(
+        limits.speed[:, None], shared.speed[:, None] + limits.acceleration[:, None] * times
+    )
+    speed = np.sqrt(v**2 + (ahead**2 * limits.curvature * limits.lateral_acceleration)[:, None])
+    way = np.cumsum(STEP * np.concatenate([0.0 * speed[:, :1], speed[:, 1:]], axis=1), axis=1)
+    start, tolerance = np.asarray(shared.start), np.asarray(shared.tolerance)
+    heading = start[:, 2]
+    middle = start[:, :2] + ahead[:, None] * np.stack([np.cos(heading), np.sin(heading)], 1)
+    orders = itertools.permutations(range(TARGETS))
+    return np.min([_met(order, middle, way, times, places, tolerance) for order in orders], axis=0)
+
+
+def _met(
+    order: tuple[int, ...],
+    place: np.ndarray,
+    way: np.ndarray,
+    times: np.ndarray,
+    places: np.ndarray,
+    tolerance: np.ndarray,
+) -> np.ndarray:
+    """When (B,) [s] the bound's point meets the last target of an order; or inf.
+
+    Args:
+        order: places of targets.
+        place: (B, 2) [m], where it is at time 0.
+        way: (B, T) [m], how far it comes up to each time at most.
+        times: (B, T) [s].
+        places: (B, N, T, 2) [m], of the targets.
+        tolerance: (B,) [m].
+    """
+    lanes, at, slack = np.arange(len(way)), np.zeros(len(way), int), tolerance
+    met = np.ones(len(way), bool)
+    for target in order:
+        far = np.linalg.norm(places[:, target] - place[:, None], axis=2)
+        meets = far <= way - way[lanes, at, None] + slack[:, None]
+        meets &= np.arange(way.shape[1]) >= at[:, None]
+        met &= meets.any(axis=1)
+        # Between two of the times it may meet earlier than at the later one.
+        at = np.maximum(meets.argmax(axis=1) - 1, at)
+        place, slack = places[lanes, target, at], 2.0 * tolerance
+    return np.where(met, times[lanes, at], np.inf)
+
+
+def timed(groups: InterceptGroup, decide: str | Best) -> tuple[GroupPlan, float, float]:
+    """Plans, and the seconds of the first call and of another one."""
+    planner, seconds = pj.intercept.planner("group", decide=decide), []
+    for _ in range(2):
+        began = time.perf_counter()
+        plans = pj.plan(planner, groups)
+        seconds.append(time.perf_counter() - began)
+    return plans, *seconds
+
+
+def measure(bench: Bench, options: argparse.Namespace) -> None:
+    """Plan the groups in all four ways, and print a row of each."""
+    groups = draw(options.num, options.seed)
+    least, found = bound(groups), {}
+    for name, decide in DECISIONS.items():
+        plans, cold, warm = timed(groups, decide)
+        success = pj.intercept.judge(groups, plans).success
+        found[name] = np.asarray(plans.cost), success, max(cold - warm, 0.0), warm
+    common = np.all([success for _, success, _, _ in found.values()], axis=0)
+    bench.say(
+        f"{options.num} groups of {TARGETS}, seed {options.seed}; times of the {common.sum()} that "
+        f"all solve; load average {os.getloadavg()[0]:.1f}",
+        "",
+        "| order | refereed success | last meeting, median | p90 | over the bound, median "
+        "| earliest of all six | ms a group, warm | compiling |",
+        "|---|---|---|---|---|---|---|---|",
+    )
+    best, *_ = found["best of all six orders"]
+    for name, (times, success, compiling, warm) in found.items():
+        median, late = np.quantile(times[common], (0.5, 0.9))
+        over = np.median(times[common] / least[common] - 1.0)
+        same = np.mean(times[common] <= best[common] + 1e-3)
+        each = 1e3 * warm / options.num
+        bench.say(
+            f"| {name} | {100 * success.mean():.1f} % | {median:.2f} s | {late:.2f} s "
+            f"| {100 * over:.0f} % | {100 * same:.0f} % | {each:.0f} | {compiling:.0f} s |"
+        )
+        bench.row(
+            order=name,
+            success_rate=success.mean(),
+            median=median,
+            p90=late,
+            over_bound=over,
+            as_early_as_best=same,
+            ms_a_group=each,
+            compile_seconds=compiling,
+        )
+    median, late = np.quantile(least[common], (0.5, 0.9))
+    bench.say(f"| bound | | {median:.2f} s | {late:.2f} s | 0 % | | | |")
+    bench.note(bound_median=median, bound_p90=late)
+    bench.count(found["best of all six orders"][1])
+
+
+def main() -> None:
+    """Print a row of every way to decide, and the bound."""
+    parser = argument_parser("intercept_group", __doc__, num=20, seed=1)
+    options = parser.parse_args()
+    with begin(parser, options) as bench:
+        measure(bench, options)
+
+
+if __name__ == "__main__":
+    main()

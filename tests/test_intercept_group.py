@@ -1,0 +1,241 @@
+"""Groups of targets for one car: how they are drawn, ordered, planned leg after leg, and judged."""
+
+import dataclasses
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import planner_jax as pj
+from planner_jax.optimise.levenberg import LevenbergConfig
+from planner_jax.plane.reach import Lattice
+from planner_jax.planning.decided import first_choice
+from planner_jax.robot.car import pose_at
+from planner_jax.sweep.run import start_sweep
+from planner_jax.sweep.settings import SettingError, SweepSettings
+from planner_jax.sweep.sweep import sweep_of
+from planner_jax.task.intercept.card import GROUPS, TASK
+from planner_jax.task.intercept.group import CarState
+from planner_jax.task.intercept.group_decide import Best, Given, Greedy
+from planner_jax.task.intercept.rejection import SIZE
+from planner_jax.task.intercept.spacetime import Search, SpacetimeIntercept
+
+# One search is one program to compile.
+SEARCH = Search(12, LevenbergConfig(40), lattice=Lattice(layers=22))
+LEGS = SpacetimeIntercept(meet="early", pieces=16, searches=(SEARCH,))
+
+
+def planner(decide):
+    return pj.intercept.planner("group", decide=decide, planner=LEGS, patient=LEGS)
+
+
+def numpy(tree):
+    return jax.tree.map(np.asarray, tree)
+
+
+def draw(num, seed, count):
+    """Drawn groups with so many targets each."""
+    groups = numpy(pj.intercept.draw(num, "group", seed))
+    present = np.broadcast_to(np.arange(4) < count, (num, 4))
+    return dataclasses.replace(groups, present=present)
+
+
+def line(*xs, present=True, **settings):
+    """Targets that stand on a line ahead of the car."""
+    places = jnp.array([[x, 4.0] for x in xs])
+    path = pj.TurningPath(places, jnp.zeros_like(places), jnp.zeros(len(xs)))
+    return pj.intercept.group(path, present=present, **settings)
+
+
+def test_a_group_is_the_same_in_every_batch():
+    whole, again = pj.intercept.draw(7, "group", 5), pj.intercept.draw(3, "group", 5, first=2)
+    for a, b in zip(*map(jax.tree.leaves, (whole, again)), strict=True):
+        np.testing.assert_array_equal(a[2:5], b)
+        assert a.dtype in (np.float32, np.int32, bool)
+    # A change here is a change of published cases.
+    place = pj.intercept.draw(1, "group", 0).shared.target.pos[0, 3]
+    np.testing.assert_allclose(place, [7.109591, 4.838748], rtol=1e-5)
+
+
+def test_groups_have_two_to_four_targets_that_stay_on_the_map():
+    groups, suite = numpy(pj.intercept.draw(40, "group", 3)), GROUPS["group"]
+    assert set(groups.present.sum(axis=1)) == {2, 3, 4}
+    assert not (groups.present[:, 1:] & ~groups.present[:, :-1]).any()
+    np.testing.assert_array_equal(groups.shared.time, suite.time)
+    assert groups.shared.walls.corners.shape[:3] == (40, *suite.wall_room)
+    at = jax.vmap(lambda path, time: path.at(time).pos, (None, 0))
+    places = jax.jit(jax.vmap(jax.vmap(at, (0, None)), (0, None)))(
+        groups.shared.target, jnp.linspace(0.0, suite.time, 100)
+    )
+    assert places.min() >= -1e-3 and places.max() <= SIZE + 1e-3
+    turns = groups.shared.target.turn_rate != 0.0
+    assert (turns.mean(axis=0) > 0.25).all() and (turns.mean(axis=0) < 0.75).all()
+
+
+def test_a_leg_has_targets_and_movers_moved_on():
+    group = pj.lane(draw(1, 2, 4), 0)
+    car = CarState(jnp.array([1.0, 2.0, 0.3]), jnp.array(1.2), jnp.array(-0.5))
+    leg = group.leg(2, 4.0, car)
+    path = jax.tree.map(lambda leaf: leaf[2], group.shared.target)
+    np.testing.assert_allclose(leg.target.at(1.5).pos, path.at(5.5).pos, rtol=1e-6)
+    np.testing.assert_allclose(leg.time, 11.0)
+    np.testing.assert_allclose(
+        leg.movers.vertices(1.5), group.shared.movers.vertices(5.5), atol=1e-5
+    )
+    np.testing.assert_array_equal(leg.start, car.pose)
+    assert (leg.speed, leg.curvature) == (car.speed, car.curvature)
+    assert group.leg(2, 20.0, car).time > 0.0
+
+
+@pytest.mark.parametrize("decision", [Best(6), Greedy()])
+def test_targets_on_a_line_are_met_as_they_come(decision):
+    group = line(6.0, 2.0, 3.0, 4.5)
+    assert first_choice(decision, group).order.tolist() == [1, 2, 3, 0]
+    without = dataclasses.replace(group, present=jnp.array([True, False, True, True]))
+    assert first_choice(decision, without).order.tolist() == [2, 3, 0, 1]
+
+
+def test_the_best_of_all_orders_looks_at_each_once():
+    group = line(6.0, 2.0, 3.0, 4.5, present=[True, False, True, True])
+    propose = jax.jit(Best(6).propose)
+    three = {(*front, 1) for front in itertools.permutations([0, 2, 3])}
+    orders = propose(group).order.tolist()
+    assert len(orders) == 6 and set(map(tuple, orders)) == three
+    two = dataclasses.replace(group, present=jnp.array([True, False, False, True]))
+    assert set(map(tuple, propose(two).order.tolist())) == {(0, 3, 1, 2), (3, 0, 1, 2)}
+
+
+def test_a_given_order_is_kept_and_has_to_be_one():
+    group = line(6.0, 2.0, 3.0, present=[True, False, True])
+    given = dataclasses.replace(group, order=jnp.array([1, 2, 0], jnp.int32))
+    Given().check(given)
+    assert first_choice(Given(), given).order.tolist() == [2, 0, 1]
+    with pytest.raises(ValueError, match=r"permutation of 0..2, got \[1, 1, 0\] in case 0"):
+        Given().check(dataclasses.replace(group, order=jnp.array([1, 1, 0], jnp.int32)))
+
+
+@pytest.fixture(scope="module")
+def planned():
+    """Groups of two, the last one with too little time for both."""
+    groups = draw(6, 4, 2)
+    time = np.array([15.0, 15.0, 15.0, 15.0, 15.0, 1.0], np.float32)
+    groups = dataclasses.replace(groups, shared=dataclasses.replace(groups.shared, time=time))
+    return groups, {name: pj.plan(planner(name), groups) for name in ("best", "greedy")}
+
+
+@pytest.mark.parametrize("decide", ["best", "greedy"])
+def test_what_is_solved_the_referee_confirms(planned, decide):
+    groups, plans = planned[0], planned[1][decide]
+    verdict = pj.intercept.judge(groups, plans)
+    assert all(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(plans))
+    np.testing.assert_array_equal(verdict.success, pj.solved(plans))
+    assert verdict.success[:5].sum() >= 4 and plans.status[5] == pj.Status.NO_PATH
+    good = np.flatnonzero(verdict.success)
+    assert (verdict.num_met[good] == 2).all()
+    np.testing.assert_allclose(verdict.meeting_time[good], plans.cost[good], atol=1e-5)
+    assert verdict.sentence(int(good[0])).startswith("success: 2 targets are met")
+    assert verdict.sentence(5).startswith(verdict.failed_limit[5] + ": leg ")
+
+
+@pytest.mark.slow
+def test_groups_can_be_planned_inside_a_compiled_function(planned):
+    groups, plans = planned[0], planned[1]["greedy"]
+    traced = jax.eval_shape(lambda groups: pj.solve(planner("greedy"), groups), groups)
+    for ours, theirs in zip(jax.tree.leaves(traced), jax.tree.leaves(plans), strict=True):
+        assert (ours.shape, ours.dtype) == (theirs.shape, theirs.dtype)
+
+
+def test_the_best_order_is_no_later_than_the_greedy_one(planned):
+    best, greedy = planned[1]["best"], planned[1]["greedy"]
+    both = pj.solved(best) & pj.solved(greedy)
+    assert pj.solved(best).sum() >= pj.solved(greedy).sum()
+    assert np.all(best.cost[both] <= greedy.cost[both] + 1e-3)
+    same = both & (best.order == greedy.order).all(axis=1)
+    assert same.any()
+    np.testing.assert_allclose(best.cost[same], greedy.cost[same], atol=1e-3)
+
+
+@pytest.mark.parametrize("decide", ["best", "greedy"])
+def test_one_group_is_planned_as_in_a_batch(planned, decide):
+    k = int(np.argmax(pj.solved(planned[1][decide])))
+    one, batch = pj.plan(planner(decide), pj.lane(planned[0], k)), pj.lane(planned[1][decide], k)
+    assert one.status == batch.status and one.order.tolist() == batch.order.tolist()
+    np.testing.assert_allclose(one.cost, batch.cost, atol=1e-3)
+    assert pj.intercept.judge(pj.lane(planned[0], k), one).success
+
+
+def test_legs_join(planned):
+    plans = planned[1]["best"]
+    plan = pj.lane(plans, int(np.argmax(pj.solved(plans))))
+    first, second = (pj.lane(plan.legs, k) for k in (0, 1))
+    end = pose_at(first.start, first.time, first.speed, first.curvature, first.time)
+    np.testing.assert_allclose(second.start, end, atol=1e-5)
+    assert second.speed[0] == first.speed[-1] and second.curvature[0] == first.curvature[-1]
+    np.testing.assert_allclose(plan.begins[1], first.time)
+    np.testing.assert_array_equal(plan.legs.time[2:], 0.0)
+
+
+def test_one_target_is_planned_as_an_interception(planned):
+    groups = dataclasses.replace(planned[0], present=np.broadcast_to(np.arange(4) < 1, (6, 4)))
+    plans = pj.plan(planner("best"), groups)
+    shared = groups.shared
+    cars = CarState(shared.start, shared.speed, shared.curvature)
+    leg = jax.vmap(lambda group, car: group.leg(0, jnp.float32(0.0), car))
+    alone = pj.plan(LEGS, numpy(jax.jit(leg)(groups, cars)))
+    np.testing.assert_array_equal(plans.status, alone.status)
+    solved = pj.solved(alone)
+    assert solved.sum() >= 4
+    np.testing.assert_allclose(plans.cost[solved], alone.time[solved], rtol=1e-6)
+    np.testing.assert_allclose(plans.legs.speed[solved, 0], alone.speed[solved], atol=1e-6)
+    assert pj.intercept.judge(groups, plans).success[solved].all()
+
+
+def cut(plans, **changes):
+    """The plans with other leaves in their legs."""
+    return dataclasses.replace(plans, legs=dataclasses.replace(plans.legs, **changes))
+
+
+def test_the_referee_refuses_a_plan_with_a_wrong_leg(planned):
+    groups, plans = planned[0], planned[1]["best"]
+    good = np.flatnonzero(pj.solved(plans))
+    groups, plans = pj.lane((groups, plans), good)
+    legs = plans.legs
+    shorter = np.array([1.0, 0.9, 1.0, 1.0], np.float32)
+    aside = np.zeros((4, 3), np.float32)
+    aside[1, 0] = 0.01
+    faster = legs.speed + 0.01 * (np.arange(4) == 1)[:, None]
+    other = plans.order[:, [1, 0, 2, 3]]
+    wrong = {
+        "a leg that is cut": (cut(plans, time=shorter * legs.time), 1, {"meeting", "acceleration"}),
+        "a leg that begins aside": (cut(plans, start=legs.start + aside), 1, {"start"}),
+        "a leg that begins faster": (cut(plans, speed=faster), 1, {"start"}),
+        "the other order": (dataclasses.replace(plans, order=other), 0, {"meeting"}),
+        "a target twice": (dataclasses.replace(plans, order=plans.order * 0), 0, {"order"}),
+    }
+    for name, (broken, leg, limits) in wrong.items():
+        verdict = pj.intercept.judge(groups, broken)
+        assert not verdict.success.any(), name
+        assert set(verdict.failed_limit) <= limits, name
+        if limits != {"order"}:
+            np.testing.assert_array_equal(verdict.leg, leg)
+    one = pj.intercept.judge(*pj.lane((groups, wrong["a leg that begins aside"][0]), 0))
+    assert one.sentence().startswith("start: leg 1: the plan starts 0.01 off")
+
+
+def test_groups_and_single_targets_are_told_apart(tmp_path):
+    with pytest.raises(ValueError, match="decide must be one of best, greedy, given, got 'worst'"):
+        pj.intercept.planner("group", decide="worst")
+    with pytest.raises(TypeError, match="decide"):
+        pj.intercept.planner("spacetime", decide="best")
+    with pytest.raises(TypeError, match="class InterceptCase, got InterceptGroup"):
+        pj.plan(pj.intercept.planner(), draw(1, 0, 2))
+    settings = SweepSettings(planner="spacetime", suite="group", num=1)
+    with pytest.raises(SettingError, match="planner must be one of the cases of suite group"):
+        start_sweep(TASK, settings, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+    # Neither is compared with the other either.
+    sweep, alone = sweep_of(TASK), SweepSettings(planner="lattice", suite="easy")
+    assert not sweep.other_planners(dataclasses.replace(settings, planner="group"))
+    assert set(sweep.other_planners(alone)) == {"spacetime", "paper", "em", "constant"}
