@@ -122,7 +122,7 @@ class ReplanIntercept:
             for stage in planner.last_stages(attempt)
         ]
         field = planner.field(case, grid)
-        return planner.plan_of_stages(case, field, guess, attempt.solver, stages)
+        return planner.refined(case, field, guess, attempt.solver, stages)
 
     def solve_lanes(self, tasks: Replanning, attempt: Any) -> InterceptPlan:
         """The plans of a batch: on a CPU one after another."""

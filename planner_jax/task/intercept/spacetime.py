@@ -5,7 +5,7 @@ path crosses something that stays on it, no speed helps. Here both are planned t
 set of cells (`plane.reach`) says what the car can reach and when; ways through it, each drawn at
 random, are where Levenberg-Marquardt begins on speed and curvature at knots (`motion`). It does so
 in stages: a motion that follows the cells, for speeds and turns of cells alone drift through walls
-on the way; one that keeps every limit; and, once one does, one of less effort.
+on the way; one that keeps every limit; and, once one does, one of less effort, or an earlier one.
 """
 
 import dataclasses
@@ -45,8 +45,8 @@ if TYPE_CHECKING:
     from planner_jax.task.intercept.replan import ReplanIntercept, Warm
 
 _FIELD = 128  # places of the distance field along either side of the map
-_LEAST = 0.01  # share of the case's time that a meeting takes at least
-_SPREAD = 3  # layers from the earliest one on at which ways to the earliest meeting end
+_SOONEST = 0.01  # share of the case's time that a meeting takes at least
+_SPREAD = 2  # layers from the earliest one on at which ways to the earliest meeting end
 
 # A way takes about as much memory as so many starts of planners with few unknowns.
 _ROOM = 8
@@ -61,7 +61,7 @@ class Search(Attempt):
     ways: int = 16
     solver: LevenbergConfig = LevenbergConfig()  # of the stage that keeps limits
     following: int = 4  # steps along the way of cells
-    settling: int = 16  # steps towards less effort
+    settling: int = 12  # steps towards less effort, or an earlier meeting
     seed: int = 0  # of the ways
     lattice: reach.Lattice = reach.Lattice()
     girth: float = 1.0  # of the body in the reach set; less finds ways that rounding closes
@@ -75,23 +75,27 @@ class Search(Attempt):
         object.__setattr__(self, "starts", starts)
 
 
-_OF_GIVEN_TIME = (
-    Search(2, LevenbergConfig(12)),
-    Search(8, LevenbergConfig(20), seed=1, girth=0.9),
-    Search(16, LevenbergConfig(30), seed=2, girth=0.75),
+_GIVEN = (
+    Search(2, LevenbergConfig(10), following=3),
+    Search(4, LevenbergConfig(16), seed=1, girth=0.9),
+    Search(8, LevenbergConfig(24), seed=2, girth=0.75),
 )
-# The best of several ways, settled.
-_OF_FREE_TIME = (
-    Search(16, LevenbergConfig(60, tolerance=5e-4)),
-    Search(8, seed=1, girth=0.9),
-    Search(16, LevenbergConfig(30), seed=2, girth=0.75),
-)
-
+# Of a free time every way is tried, until it brings little, and the best one is kept. To hurry is
+# to leave the cells: early meetings come out earlier where nothing follows them.
+_EARLY = Search(32, LevenbergConfig(60, tolerance=5e-4), following=0, girth=0.85)
+_LEAST = Search(16, LevenbergConfig(60, tolerance=5e-4))
+_LATER = (Search(8, seed=1, girth=0.9), Search(16, LevenbergConfig(30), seed=2, girth=0.75))
+_SEARCHES = {
+    "given": _GIVEN,
+    "early": (_EARLY, *_LATER),
+    "least": (_LEAST, *_LATER),
+}
 
 # What each stage minimises.
 _FOLLOWING = Weights(follow=10.0, obstacle=0.0, early=0.0)
 _KEEPING = Weights()
 _SETTLING = Weights(effort=10.0)
+_HURRYING = Weights(early=1000.0)  # in place of it, for meetings as early as they can be
 
 
 @struct.dataclass
@@ -154,7 +158,7 @@ class SpacetimeIntercept:
     @property
     def attempts(self) -> tuple[Search, ...]:
         """The searches."""
-        return self.searches or (_OF_FREE_TIME if self.is_time_free else _OF_GIVEN_TIME)
+        return self.searches or _SEARCHES[self.meet]
 
     @property
     def is_time_free(self) -> bool:
@@ -203,13 +207,19 @@ class SpacetimeIntercept:
         return jax.vmap(lambda case: self.best_of_all(case, attempt, layers))(cases)
 
     def best_of_all(self, case: InterceptCase, attempt: Search, layers: Array) -> InterceptPlan:
-        """The plan of one case: all ways together, the best one."""
+        """The plan of one case: all ways together, of which the best one is settled."""
         found = self.prepare(case, attempt, layers)
-        improved = jax.vmap(lambda chance: self.improved(case, found, chance, attempt))
-        plans = improved(self.chances(attempt))
+
+        def kept(chance: reach.Chance) -> InterceptPlan:
+            guess, stages = self.begun(case, found, chance), self.stages(attempt)[:-1]
+            points, steps = self.staged(case, found.field, guess, attempt.solver, stages)
+            return self.plan_at(case, points[-1], steps)
+
+        plans = jax.vmap(kept)(self.chances(attempt))
         cost = jnp.where(is_solved(plans.status), plans.cost - 1e6, plans.violation)
         best = jnp.argmin(jnp.where(jnp.isfinite(cost), cost, jnp.inf))
         plan = jax.tree.map(lambda leaf: leaf[best], plans)
+        plan = self.settled(case, found.field, plan, attempt)
         return self.explained(case, attempt, found.is_reached, plan)
 
     def chances(self, attempt: Search) -> reach.Chance:
@@ -274,11 +284,15 @@ class SpacetimeIntercept:
         self, case: InterceptCase, found: Found, chance: reach.Chance, attempt: Search
     ) -> InterceptPlan:
         """The plan that one random way leads to."""
+        guess = self.begun(case, found, chance)
+        return self.refined(case, found.field, guess, attempt.solver, self.stages(attempt))
+
+    def begun(self, case: InterceptCase, found: Found, chance: reach.Chance) -> Guess:
+        """Where least squares begin on a random way."""
         layer = self.layer(found, chance)
         cells, there = self.meetings(case, found.grid, found.reach, layer)
         way = reach.draw_way(found.grid, found.reach, layer, cells, there, chance)
-        guess = self.guess(case, found.grid, way, layer)
-        return self.refined(case, found.field, guess, attempt)
+        return self.guess(case, found.grid, way, layer)
 
     def layer(self, found: Found, chance: reach.Chance) -> Array:
         """The layer at which a way ends: one of the first that reach the target, or of all."""
@@ -289,38 +303,38 @@ class SpacetimeIntercept:
             allowed &= jnp.cumsum(found.layers) <= _SPREAD
         return jnp.argmax(jnp.where(allowed, chance.layers, -jnp.inf))
 
-    def refined(
-        self, case: InterceptCase, field: DistanceField, guess: Guess, attempt: Search
-    ) -> InterceptPlan:
-        """The plan that least squares make of a guess."""
-        stages = [Stage(_FOLLOWING, attempt.following), *self.last_stages(attempt)]
-        return self.plan_of_stages(case, field, guess, attempt.solver, stages)
+    def stages(self, attempt: Search) -> list[Stage]:
+        """What a guess along a way of cells goes through."""
+        return [Stage(_FOLLOWING, attempt.following), *self.last_stages(attempt)]
 
     def last_stages(self, attempt: "Search | Warm") -> list[Stage]:
         """What a guess that is near to a plan goes through."""
-        solver = attempt.solver
+        keeping = Stage(_KEEPING, attempt.solver.max_steps)
         if self.is_time_free:
-            return [Stage(_KEEPING, solver.max_steps, solver.tolerance, solver.settled)]
+            solver = attempt.solver
+            keeping = dataclasses.replace(
+                keeping, tolerance=solver.tolerance, settled=solver.settled
+            )
+        weights = _HURRYING if self.meet == "early" else _SETTLING
         steps = attempt.settling
-        return [
-            Stage(_KEEPING, solver.max_steps),
-            Stage(_SETTLING, steps, settled=steps, of_good=True),
-        ]
+        return [keeping, Stage(weights, steps, settled=steps, of_good=True)]
 
-    def plan_of_stages(
+    def staged(
         self,
         case: InterceptCase,
         field: DistanceField,
         guess: Guess,
         solver: LevenbergConfig,
         stages: list[Stage],
-    ) -> InterceptPlan:
-        """The plan at the end of stages of least squares, each from where the last one ended.
+    ) -> tuple[Array, Array]:
+        """Where each of S stages of least squares ends, which begins where the last one ended.
 
-        Where the last stage, towards less effort, breaks a limit, the plan is that before it.
+        Returns:
+            points: (S, n).
+            steps: () int32, of all stages.
         """
 
-        def staged(state: tuple[Array, Array], stage: Stage) -> tuple[tuple, LevenbergState]:
+        def one(state: tuple[Array, Array], stage: Stage) -> tuple[tuple, LevenbergState]:
             point, is_good = state
             most = jnp.where(stage.of_good & ~is_good, 0, stage.steps)
             config = dataclasses.replace(
@@ -332,13 +346,34 @@ class SpacetimeIntercept:
 
         # A loop over stages, so that all of them share one compiled step.
         stacked = jax.tree.map(lambda *each: jnp.stack([jnp.asarray(x) for x in each]), *stages)
-        _, ends = lax.scan(staged, (guess.point, jnp.asarray(False)), stacked)
-        steps = jnp.sum(ends.steps).astype(jnp.int32)
-        if self.is_time_free:
-            return self.plan_at(case, ends.point[-1], steps)
-        plans = lax.map(lambda point: self.plan_at(case, point, steps), ends.point[-2:])
-        kept, settled = (jax.tree.map(lambda leaf, k=k: leaf[k], plans) for k in range(2))
-        return self.better_of_two(kept, settled)
+        _, ends = lax.scan(one, (guess.point, jnp.asarray(False)), stacked)
+        return ends.point, jnp.sum(ends.steps).astype(jnp.int32)
+
+    def refined(
+        self,
+        case: InterceptCase,
+        field: DistanceField,
+        guess: Guess,
+        solver: LevenbergConfig,
+        stages: list[Stage],
+    ) -> InterceptPlan:
+        """The plan at the end of some stages, or before the last one where that breaks a limit."""
+        points, steps = self.staged(case, field, guess, solver, stages)
+        plans = lax.map(lambda point: self.plan_at(case, point, steps), points[-2:])
+        before, after = (jax.tree.map(lambda leaf, k=k: leaf[k], plans) for k in range(2))
+        return self.better_of_two(before, after)
+
+    def settled(
+        self, case: InterceptCase, field: DistanceField, plan: InterceptPlan, attempt: Search
+    ) -> InterceptPlan:
+        """A plan after the last stage alone, if it is solved."""
+        point = self.point(plan.speed[1:], plan.curvature[1:], plan.time)
+        guess = Guess(point=point, places=jnp.zeros((self.pieces, 2), point.dtype))
+        last = self.last_stages(attempt)[-1]
+        steps = jnp.where(is_solved(plan.status), last.steps, 0)
+        stage = dataclasses.replace(last, steps=steps, of_good=False)
+        points, steps = self.staged(case, field, guess, attempt.solver, [stage])
+        return self.better_of_two(plan, self.plan_at(case, points[0], plan.iterations + steps))
 
     def guess(self, case: InterceptCase, grid: reach.Grid, way: reach.Way, layer: Array) -> Guess:
         """Unknowns and places along a way of cells up to a layer."""
@@ -382,7 +417,7 @@ class SpacetimeIntercept:
     def parts(self, case: InterceptCase, point: Array) -> tuple[Array, Array, Array]:
         """Speed and curvature at all knots, (K + 1,) each, and the time of the meeting."""
         speed, curvature = point[: self.pieces], point[self.pieces : 2 * self.pieces]
-        time = jnp.clip(point[-1], _LEAST * case.time, case.time)
+        time = jnp.clip(point[-1], _SOONEST * case.time, case.time)
         return (
             jnp.concatenate([case.speed[None], speed]),
             jnp.concatenate([case.curvature[None], curvature]),

@@ -70,7 +70,8 @@ class PathSource:
         def path(start: tuple[Array, Guess]) -> tuple[Path, Array, Array]:
             time, guess = start
             drive = dataclasses.replace(still, time=time)
-            plan = self.planner.refined(drive, found.field, guess, attempt)
+            stages = self.planner.stages(attempt)
+            plan = self.planner.refined(drive, found.field, guess, attempt.solver, stages)
             speed = jnp.maximum(plan.speed, 0.0)
             driven = path_of_drive(plan.start, time, speed, plan.curvature, self.points)
             return driven, plan.violation, plan.iterations
