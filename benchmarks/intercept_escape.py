@@ -5,10 +5,10 @@
 
 What targets can do, how they flee and what is drawn stands in
 `planner_jax.task.intercept.escape`. The car drives its plans exactly and plans anew five times a
-second, `meet="early"`, from where it is; where no plan keeps every limit it goes on with the old
-one, and brakes at its end. Rows:
+second, `meet="early"`, from where it is; where no plan is better it goes on with the old one, and
+brakes at its end. Rows:
 
-* `greedy` takes the target to go straight on.
+* `greedy` takes the target to go straight on, until a wall or the map's edge stops it.
 * `reach` knows what the target can do, not what it will. It plans for the target that goes
   straight on, for the middle of where it can be at any time, and for where it is now, and drives
   the plan which passes the target least far in the worst case of 16 manoeuvres.

@@ -302,33 +302,35 @@ def renewed(
 ) -> Pursuit:
     """The chase with the best of new plans, leaves (N, ...), that keep every limit; pure.
 
-    Greedy cars take the new plan. The others keep the one that is driven where no new one is
-    better, by `worst_case` or by how soon the target's `reaction` to it lets it be captured.
+    The plan that is driven stays where no new one is better: by how soon the target is captured in
+    its `reaction`, or by the `worst_case` of what the row takes it to do.
     """
-    good = is_solved(plans.status)
-    if row == "greedy":
-        best, is_better = 0, good[0]
-    else:
-        places = manoeuvres(evader, chase.runner, AHEAD)
+    places = manoeuvres(evader, chase.runner, AHEAD)[: 1 if row == "greedy" else None]
 
-        def badness(each: Pursuit) -> Array:
-            if row == "reach":
-                return worst_case(case, each, places)
+    def badness(each: Pursuit) -> Array:
+        if row == "informed":
             return reaction(case, evader, each)[1]
+        return worst_case(case, each, places)
 
-        found = jax.vmap(lambda each: badness(_with(chase, each)))(plans)
-        found = jnp.where(good, found, jnp.inf)
-        best = jnp.argmin(found)
-        is_better = found[best] < badness(chase)
+    found = jax.vmap(lambda each: badness(_with(chase, each)))(plans)
+    found = jnp.where(is_solved(plans.status), found, jnp.inf)
+    best = jnp.argmin(found)
     new = _with(chase, jax.tree.map(lambda leaf: leaf[best], plans))
+    is_better = found[best] < badness(chase)
     return jax.tree.map(lambda new, old: jnp.where(is_better, new, old), new, chase)
 
 
-def worst_case(case: InterceptCase, chase: Pursuit, places: Array) -> Array:
-    """How far () [m] a plan passes a target in the worst case of what this can do; pure.
+def _with(chase: Pursuit, plan: InterceptPlan) -> Pursuit:
+    """The chase with a plan that begins now."""
+    return dataclasses.replace(chase, plan=plan, began=chase.time)
 
-    That is the greatest over all manoeuvres of the least distance at any time, and `_HASTE` times
-    the mean time until the car is near enough, which tells plans of equal worst cases apart.
+
+def worst_case(case: InterceptCase, chase: Pursuit, places: Array) -> Array:
+    """How far () [m] a plan misses a target in the worst case of what this can do; pure.
+
+    That is the greatest over all manoeuvres of how far the car is from capturing it when it is
+    nearest, and `_HASTE` times the mean time until a capture, which tells plans of equal worst
+    cases apart.
 
     Args:
         case: one.
@@ -349,12 +351,8 @@ def worst_case(case: InterceptCase, chase: Pursuit, places: Array) -> Array:
     miss = jnp.linalg.norm(nearest, axis=-1)  # (K, S), least in every step
     near = miss <= CAPTURE
     until = STEP * jnp.where(jnp.any(near, axis=1), 1.0 + jnp.argmax(near, axis=1), steps)
-    return jnp.max(jnp.min(miss, axis=1)) + _HASTE * jnp.mean(until)
-
-
-def _with(chase: Pursuit, plan: InterceptPlan) -> Pursuit:
-    """The chase with a plan that begins now."""
-    return dataclasses.replace(chase, plan=plan, began=chase.time)
+    worst = jnp.max(jnp.min(miss, axis=1))
+    return jnp.maximum(worst - CAPTURE, 0.0) + _HASTE * jnp.mean(until)
 
 
 def begun(case: InterceptCase, runner: Runner) -> Pursuit:
