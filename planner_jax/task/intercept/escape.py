@@ -40,6 +40,9 @@ from planner_jax.task.intercept.plan import InterceptPlan
 from planner_jax.task.intercept.spacetime import Search, SpacetimeIntercept
 from planner_jax.task.intercept.suites import draw_cases
 
+# Of all rows; few ways and steps, since it plans five times a second.
+PLANNER = SpacetimeIntercept(meet="early", searches=(Search(4, LevenbergConfig(20)),))
+
 CAPTURE = 0.3  # [m], from the middle of the car's body to the target
 HORIZON = 15.0  # [s], in which it is to be captured
 STEP = 0.2  # [s], from one look of the target to the next, and from plan to plan
@@ -256,9 +259,6 @@ def reaction(case: InterceptCase, evader: Evader, chase: Pursuit) -> tuple[Array
     until = jnp.where(jnp.any(near), until, STEP * AHEAD + jnp.min(apart))
     last = jnp.broadcast_to(places[-1], (AHEAD - _REACTION, 2))
     return jnp.concatenate([chase.runner.pos[None], places, last]), until
-
-
-PLANNER = SpacetimeIntercept(meet="early", searches=(Search(4, LevenbergConfig(20)),))
 
 
 def aims(row: Row, case: InterceptCase, evader: Evader, chase: Pursuit) -> Array:
