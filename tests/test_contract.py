@@ -174,8 +174,11 @@ ENTRIES = {
     "library": Entry(LibraryPlanner(library(1)), places, "goal"),
     "NumPy": Entry(NumpyPlanner(), places, "goal"),
 }
-# They share their solver with the exact ones, and take as long to compile.
-LIKE_OTHERS = ("hit bat", "hit bat-lite", "catch catch")
+# They share their solver with others, and take as long to compile.
+LIKE_OTHERS = (
+    *("hit bat", "hit bat-lite", "catch catch"),
+    *("intercept lattice", "intercept em", "intercept constant"),
+)
 
 
 def entries(*, on_host=True, slow=()):

@@ -308,7 +308,7 @@ def test_nothing_is_wrong_with_what_is_just_far_enough():
     np.testing.assert_array_equal(first_cause(SUITES["hard"], drawn), len(CAUSES))
 
 
-def test_observations_are_of_the_targets_past_with_noise():
+def test_observations_are_of_the_targets_way_with_noise():
     cases = numpy(draw_cases("easy", 200, 1))
     times, positions = observe(cases, 4)
     np.testing.assert_array_equal(times, np.arange(-14.0, 1.0))
@@ -317,6 +317,9 @@ def test_observations_are_of_the_targets_past_with_noise():
     assert np.abs(noise.mean()) < 0.01 and noise.std() == pytest.approx(0.1, rel=0.05)
     some, again = observe(jax.tree.map(lambda leaf: leaf[3:5], cases), 4, first=3)
     np.testing.assert_array_equal(again, positions[3:5])
+    times, longer = observe(cases, 4, until=9.5)
+    np.testing.assert_array_equal(times, np.arange(-14.0, 10.0))
+    np.testing.assert_allclose(longer[:, :15], positions, atol=1e-6)
     times, exact = observe(cases, 4, noise=0.0, count=3, interval=0.5)
     np.testing.assert_array_equal(times, [-1.0, -0.5, 0.0])
     np.testing.assert_allclose(exact, places(cases.target, times), atol=1e-5)
@@ -344,6 +347,7 @@ def test_bad_arguments_are_named_in_one_line(arguments, options, says):
         ({"noise": -0.1}, "noise must be >= 0, got -0.1"),
         ({"interval": 0.0}, "interval must be > 0, got 0.0"),
         ({"first": -2}, "first must be >= 0, got -2"),
+        ({"until": -1.0}, "until must be >= 0, got -1.0"),
     ],
 )
 def test_bad_observations_are_named_in_one_line(options, says):

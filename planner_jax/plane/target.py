@@ -77,6 +77,26 @@ class LaterPath:
         return self.path.at(self.begin + time)
 
 
+@struct.dataclass
+class SampledPath:
+    """Places at equal times from 0 on, straight lines between them; it stays at the last one."""
+
+    places: Array  # (S, 2) [m], S >= 2
+    step: Array  # () [s], from one place to the next
+
+    def at(self, time: Array) -> PointState:
+        """Position [m] and velocity [m/s] at one time () [s]."""
+        last = self.places.shape[0] - 1
+        place = jnp.clip(time / self.step, 0.0, last)
+        below = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, last - 1)
+        way = self.places[below + 1] - self.places[below]
+        moves = (time >= 0.0) & (time < last * self.step)
+        return PointState(
+            pos=self.places[below] + (place - below) * way,
+            vel=jnp.where(moves, way / self.step, 0.0),
+        )
+
+
 def arc(turn_rate: Array, time: Array) -> tuple[Array, Array]:
     """How far ahead and to the left (...) [s] a target of unit speed is after a time (...) [s]."""
     angle = turn_rate * time

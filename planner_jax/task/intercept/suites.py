@@ -150,34 +150,38 @@ def observe(
     count: int = 15,
     interval: float = 1.0,
     first: int = 0,
+    until: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What was seen of the targets until the cars set out (paper 003, eq. 4).
+    """What was seen of the targets until the cars set out (paper 003, eq. 4), or longer.
 
     Args:
         cases: leaves with leading axis B.
         seed: >= 0. What is seen in case k is always the same.
         noise: [m], standard deviation on each axis.
-        count: L, how many observations; the last one at time 0.
+        count: how many observations up to time 0, when the last of them is made.
         interval: [s], between two of them.
         first: place of the first case, >= 0.
+        until: [s], how long the targets are still looked at after time 0, >= 0. What is seen
+            before is the same for all.
 
     Returns:
-        times: (L,) [s], the last one 0.
+        times: (L,) [s], L = count + floor(until / interval).
         positions: (B, L, 2) [m].
 
     Raises:
         ValueError: an argument is out of its range; one line.
     """
-    for name, value, least in (("count", count, 1), ("noise", noise, 0), ("first", first, 0)):
+    given = {"count": (count, 1), "noise": (noise, 0), "first": (first, 0), "until": (until, 0)}
+    for name, (value, least) in given.items():
         if not value >= least:
             raise ValueError(f"{name} must be >= {least}, got {value}")
     if not interval > 0.0:
         raise ValueError(f"interval must be > 0, got {interval}")
-    times = interval * np.arange(1.0 - count, 1.0)
+    times = interval * np.arange(1.0 - count, 1.0 + np.floor(until / interval + 1e-9))
     positions = np.asarray(_seen(cases.target, times.astype(cases.time.dtype)))
     tag = zlib.crc32(b"observations")
     errors = [
-        np.random.default_rng([seed, first + k, tag]).standard_normal((count, 2))
+        np.random.default_rng([seed, first + k, tag]).standard_normal((len(times), 2))
         for k in range(len(positions))
     ]
     return times, positions + noise * np.stack(errors)
