@@ -78,7 +78,7 @@ class Search(Attempt):
 _GIVEN = (
     Search(2, LevenbergConfig(10), following=3),
     Search(4, LevenbergConfig(16), seed=1, girth=0.9),
-    Search(8, LevenbergConfig(24), seed=2, girth=0.75),
+    Search(16, LevenbergConfig(24), seed=2, girth=0.75),
 )
 # Of a free time every way is tried, until it brings little, and the best one is kept. To hurry is
 # to leave the cells: early meetings come out earlier where nothing follows them.
