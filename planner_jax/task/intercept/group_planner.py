@@ -23,7 +23,8 @@ from planner_jax.task.intercept.group import CarState, GroupPlan, InterceptGroup
 from planner_jax.task.intercept.plan import InterceptPlan
 from planner_jax.task.intercept.spacetime import SpacetimeIntercept
 
-_EARLY = SpacetimeIntercept("early")
+# Fewer ways than one target alone is met by: there are many legs.
+_EARLY = dataclasses.replace(SpacetimeIntercept("early").attempts[0], ways=12)
 
 
 @jax.tree_util.register_static
@@ -38,7 +39,7 @@ class GroupIntercept:
     case_type: ClassVar[type] = InterceptGroup
     attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)
     # One search: where it fails, others take long.
-    planner: SpacetimeIntercept = SpacetimeIntercept("early", searches=_EARLY.attempts[:1])
+    planner: SpacetimeIntercept = SpacetimeIntercept("early", searches=(_EARLY,))
     patient: SpacetimeIntercept = SpacetimeIntercept("least")  # of legs that it leaves unsolved
 
     def plan_by(self, drive: Drive, cases: InterceptGroup) -> GroupPlan:
