@@ -58,6 +58,7 @@ TASK = Task(
         "constant": "planner_jax.task.intercept.path_then_speed:constant",
     },
     suites={name: suite.description for name, suite in SUITES.items()},
+    sweep="planner_jax.sweep.intercept.settings:InterceptSettings",
     flight="planner_jax.sims.settings:InterceptFly",
     contact="time",
 )
