@@ -25,7 +25,7 @@ from planner_jax.sweep.intercept.figures.scene import (
 from planner_jax.sweep.report import RunRows
 
 _SAMPLES = 241
-_PANELS, _FAILURES = 6, 2
+_PANELS, _COLUMNS, _FAILURES = 6, 3, 2
 _MOST_BODIES, _MOST_MOVERS = 6, 16  # of instants, and of polygons that are drawn of all movers
 
 
@@ -35,7 +35,9 @@ def plane_figure(figure: Figure, run: RunRows) -> None:
     drives = [sampled_drive(row, setting, _SAMPLES) for row in chosen(run)]
     latest = max(drive.row["due_time"] for drive in drives)
     colours = ScalarMappable(Normalize(0.0, latest), colours_of_time())
-    panels = figure.subplots(2, 3, sharex=True, sharey=True, squeeze=False)
+    num_rows = -(-len(drives) // _COLUMNS)
+    figure.set_size_inches(13.0, 0.7 + 4.0 * num_rows)
+    panels = figure.subplots(num_rows, _COLUMNS, sharex=True, sharey=True, squeeze=False)
     for axes, drive in zip(panels.flat, drives, strict=False):
         draw_drive(axes, drive, colours)
     for axes in panels.flat[len(drives) :]:
@@ -44,7 +46,7 @@ def plane_figure(figure: Figure, run: RunRows) -> None:
         axes.set_xlabel("x [m]")
     for axes in panels[:, 0]:
         axes.set_ylabel("y [m]")
-    figure.colorbar(colours, ax=panels, label="time since the car sets out [s]", aspect=40)
+    figure.colorbar(colours, ax=panels, label="time since the car sets out [s]", aspect=20 * num_rows)
     figure.legend(handles=entries(colours), loc="outside upper center", ncols=6)
 
 
