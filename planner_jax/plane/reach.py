@@ -131,7 +131,7 @@ def _along_y(rows: Array, move: Array) -> Array:
     words, cells = rows.shape[0], rows.shape[-1]
     padded = jnp.pad(rows.reshape(words, -1, cells), ((0, 0), (0, 0), (_FARTHEST, _FARTHEST)))
     moved = jax.vmap(
-        lambda row, by: lax.dynamic_slice(row, (0, _FARTHEST - by), (words, cells)),
+        lambda row, by: lax.dynamic_slice(row, (0 * by, _FARTHEST - by), (words, cells)),
         in_axes=(1, 0),
         out_axes=1,
     )(padded, move.reshape(-1))
@@ -422,7 +422,8 @@ def draw_way(
     choices = jnp.asarray(
         np.stack(
             np.meshgrid([-1, 0, 1], np.arange(-_SPAN, _SPAN + 1), indexing="ij"), axis=-1
-        ).reshape(-1, 2)
+        ).reshape(-1, 2),
+        jnp.int32,
     )
 
     def back(state: tuple, n: Array) -> tuple[tuple, tuple]:

@@ -41,6 +41,7 @@ from planner_jax.task.intercept.terms import (
 
 if TYPE_CHECKING:
     from planner_jax.task.intercept.replan import ReplanIntercept
+    from planner_jax.task.intercept.smooth import BegunCase, SmoothIntercept
 
 _FIELD = 128  # places of the distance field along either side of the map
 
@@ -133,6 +134,21 @@ class SpacetimeIntercept:
         from planner_jax.task.intercept.replan import ReplanIntercept
 
         return ReplanIntercept(self)
+
+    def smooth_near(
+        self, cases: InterceptCase, plans: InterceptPlan
+    ) -> "tuple[SmoothIntercept, BegunCase]":
+        """What minimises the cost from plans on, and the cases with these; see `pj.gradient`."""
+        from planner_jax.task.intercept.smooth import SmoothIntercept, begun_case
+
+        parts = [plans.speed[..., 1:], plans.curvature[..., 1:], plans.time[..., None]]
+        begun = jnp.concatenate(parts if self.is_time_free else parts[:2], axis=-1)
+        return SmoothIntercept(self), begun_case(cases, begun)
+
+    def smooth(self, case: InterceptCase) -> "tuple[SmoothIntercept, BegunCase]":
+        """The same from the plan of the first search, constant to derivatives."""
+        plan = self.solve(lax.stop_gradient(case), self.attempts[0])
+        return self.smooth_near(case, plan)
 
     def solve(self, case: InterceptCase, attempt: Search) -> InterceptPlan:
         """The plan of one case: way after way, until one keeps every limit.

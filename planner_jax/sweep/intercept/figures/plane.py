@@ -46,7 +46,9 @@ def plane_figure(figure: Figure, run: RunRows) -> None:
         axes.set_xlabel("x [m]")
     for axes in panels[:, 0]:
         axes.set_ylabel("y [m]")
-    figure.colorbar(colours, ax=panels, label="time since the car sets out [s]", aspect=20 * num_rows)
+    figure.colorbar(
+        colours, ax=panels, label="time since the car sets out [s]", aspect=20 * num_rows
+    )
     figure.legend(handles=entries(colours), loc="outside upper center", ncols=6)
 
 
