@@ -43,7 +43,7 @@ ALLOWED = {
         *("ball", "cost", "lanes", "optimise", "planning", "protocol", "referee", "registry"),
         *("plane", "robot", "trajectory"),
     },
-    "sweep": {"ball", "lanes", "planning", "protocol", "registry", "task"},
+    "sweep": {"ball", "lanes", "plane", "planning", "protocol", "registry", "robot", "task"},
     "compile_cache": set(),
     "doctor": {"compile_cache", "lanes", "planning", "protocol", "registry", "sweep"},
     "cli": {"compile_cache", "doctor", "registry", "sweep"},

@@ -105,7 +105,8 @@ def optimal_plan(
 
     Args:
         planner: one that minimises. Of one that decides first it is the first choice that is
-            planned, and it is constant to derivatives.
+            planned, and of one that searches for a way first the first search's; both are
+            constant to derivatives.
         case: one case; the leaves to differentiate by.
         solver: of the search before the refinement; 200 iterations by default.
         newton_steps: of the refinement, at most.
@@ -122,8 +123,8 @@ def optimal_plan(
             f"case must be one case, got batch shape {case.batch_shape}; for batches "
             "there is pj.gradient, or jax.vmap of this"
         )
-    if hasattr(planner, "settled"):
-        planner, case = planner.settled(case)
+    if hasattr(planner, "smooth"):
+        planner, case = planner.smooth(case)
     solver = solver or LbfgsConfig(max_steps=200, tolerance=1e-7, patience=6)
     context = planner.prepare(case)
     start = lax.stop_gradient(planner.guesses(context, 1)[0])

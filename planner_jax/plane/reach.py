@@ -424,7 +424,8 @@ def draw_way(
     choices = jnp.asarray(
         np.stack(
             np.meshgrid([-1, 0, 1], np.arange(-_SPAN, _SPAN + 1), indexing="ij"), axis=-1
-        ).reshape(-1, 2)
+        ).reshape(-1, 2),
+        jnp.int32,
     )
 
     def back(state: tuple, n: Array) -> tuple[tuple, tuple]:

@@ -37,7 +37,7 @@ class DecidedPlanner(Generic[CaseT, PlanT]):
         """That of the planner, if it has one: the order of the plan that is carried out is kept."""
         return getattr(self.planner, "replanner", lambda: self.planner)()
 
-    def settled(self, case: CaseT) -> tuple[Any, CaseT]:
+    def smooth(self, case: CaseT) -> tuple[Any, CaseT]:
         """The planner inside, and the case with the decision's first choice; see `optimal_plan`."""
         return self.planner, first_choice(self.decision, case)
 

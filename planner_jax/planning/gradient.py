@@ -35,7 +35,7 @@ def gradient(
     of: Quantity,
     by: str | Sequence[str],
     steps: int = 1,
-    curvature: str = "core",
+    curvature: str | None = None,
     solver: LbfgsConfig | None = None,
     chunk: int | None = None,
     devices: Sequence[Any] | None = None,
@@ -53,7 +53,7 @@ def gradient(
 
     Args:
         planner: one that minimises, such as `pj.hit.planner("exact")`. What it decides on first,
-            such as an order, is kept fixed.
+            such as an order or the way round obstacles, is kept fixed.
         cases: one case or a batch.
         of: the number: names joined by dots, such as "stroke.time", "cost" or "violation", or a
             function of one plan. A function is compiled for anew with every new function object.
@@ -62,7 +62,8 @@ def gradient(
         steps: of the conjugate gradients for the adjoint. One is exact where no limit binds;
             0 is exact for "cost", by the envelope theorem.
         curvature: "core" is quick; "whole" takes the Hessian itself, exact where limits bind
-            too, at the cost of some n solver iterations.
+            too, at the cost of some n solver iterations. By default "core", and "whole" of
+            planners that search for a way first, such as `pj.intercept.planner("spacetime")`.
         solver: one search with this in the place of the planner's rounds.
         chunk: as for `plan`.
         devices: as for `plan`.
@@ -79,6 +80,10 @@ def gradient(
         if only is None:
             only = plan(planner, cases, chunk=chunk, devices=devices).choice
         cases, planner = cases.decided(only), planner.planner
+    elif hasattr(planner, "smooth_near"):
+        found = plan(planner, cases, chunk=chunk, devices=devices)
+        planner, cases = planner.smooth_near(cases, found)
+        curvature = curvature or "whole"
     if not hasattr(planner, "objective"):
         raise TypeError(
             f"{type(planner).__name__} minimises nothing, so that its plans have no gradient: use "
@@ -86,7 +91,7 @@ def gradient(
         )
     if solver is not None:
         planner = planner.with_solver(solver)
-    differentiated = Differentiated(planner, of, by, steps, curvature)
+    differentiated = Differentiated(planner, of, by, steps, curvature or "core")
     plans = plan(differentiated, cases, chunk=chunk, devices=devices)
     return PlanGradient(plans=plans.whole_plan(), **_fields(plans.gradient))
 

@@ -118,7 +118,7 @@ def quadrotor_figure(
     plans, setting = run.same_case(), run.manifest["setting"]
     axes = figure.subplots(2, 3, sharex=True)
     drawn = [
-        Drawn(row, sample_motion(row["coeffs"], row["durations"], _SAMPLES), _look(k, name, row))
+        Drawn(row, sample_motion(row["coeffs"], row["durations"], _SAMPLES), look_of(k, name, row))
         for k, (name, row) in enumerate(plans)
     ][::-1]
     first(axes[0, 0], setting, drawn)
@@ -133,14 +133,14 @@ def quadrotor_figure(
         if name == "thrust":
             _draw_thrust_limits(panel, setting)
         elif name in setting:
-            _draw_upper_limit(panel, setting[name])
+            draw_upper_limit(panel, setting[name])
     axes[0, 2].tick_params(labelbottom=True)
     for panel in (*axes[1, :2], axes[0, 2]):
         panel.set_xlabel("time since planning began [s]")
-    _write_verdicts(axes[1, 2], f"Case {plans[0][1]['index']}, {which}", plans, word)
+    write_verdicts(axes[1, 2], f"Case {plans[0][1]['index']}, {which}", plans, word)
 
 
-def _look(place: int, name: str, row: dict[str, Any]) -> dict[str, Any]:
+def look_of(place: int, name: str, row: dict[str, Any]) -> dict[str, Any]:
     """Of a plan's curves: dashed if it failed, thick for the first, the sweep's own."""
     return {
         "color": style.PLANNER_COLOURS.get(name, style.INK),
@@ -150,7 +150,7 @@ def _look(place: int, name: str, row: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _draw_upper_limit(axes: Axes, limit: float) -> None:
+def draw_upper_limit(axes: Axes, limit: float) -> None:
     """A limit as a dashed line, the forbidden side above it shaded."""
     top = min(max(axes.get_ylim()[1], 1.15 * limit), 3.0 * limit)
     axes.axhline(limit, **DASHED)
@@ -163,7 +163,7 @@ def _draw_thrust_limits(axes: Axes, setting: dict[str, Any]) -> None:
     gravity = setting["gravity"]
     axes.axhline(gravity, color=style.GREY, linewidth=1.0, linestyle=":")
     if "max_thrust" in setting:
-        _draw_upper_limit(axes, setting["max_thrust"])
+        draw_upper_limit(axes, setting["max_thrust"])
         axes.axhline(setting["min_thrust"], **DASHED)
         axes.axhspan(0.0, setting["min_thrust"], **FORBIDDEN)
         return
@@ -175,7 +175,7 @@ def _draw_thrust_limits(axes: Axes, setting: dict[str, Any]) -> None:
     axes.annotate("g + acceleration limit", (0.0, bound), (4, 3), **words)
 
 
-def _write_verdicts(
+def write_verdicts(
     axes: Axes,
     case: str,
     plans: Sequence[tuple[str, dict[str, Any]]],
@@ -185,8 +185,9 @@ def _write_verdicts(
     axes.axis("off")
     look: dict[str, Any] = {"va": "top", "transform": axes.transAxes}
     axes.text(0.0, 1.0, f"{case}\nlimits: red; curves of failed plans: dashed", **look)
+    step = min(0.22, 0.9 / len(plans))
     for place, (name, row) in enumerate(plans):
-        top = 0.78 - 0.22 * place
+        top = 0.78 - step * place
         text = f"success: {word(row)}" if row["success"] else f"fails: {row['sentence']}"
         colour = style.PLANNER_COLOURS.get(name, style.INK)
         axes.text(0.0, top, name, color=colour, weight="bold", **look)

@@ -20,6 +20,11 @@ PLANNER_COLOURS = {
     "juggle": PURPLE,
     "catch": ORANGE,
     "mpp": PURPLE,
+    "spacetime": BLUE,
+    "lattice": GREEN,
+    "paper": ORANGE,
+    "em": PURPLE,
+    "constant": SKY,
 }
 
 _LOOK: dict[Any, Any] = {

@@ -85,6 +85,7 @@ TASK = Task(
         "group": "planner_jax.task.intercept.group_planner:GroupIntercept",
     },
     suites={name: suite.description for name, suite in {**SUITES, **GROUPS}.items()},
+    sweep="planner_jax.sweep.intercept.settings:InterceptSettings",
     flight="planner_jax.sims.settings:InterceptFly",
     contact="time",
 )

@@ -43,6 +43,7 @@ from planner_jax.task.intercept.terms import (
 
 if TYPE_CHECKING:
     from planner_jax.task.intercept.replan import ReplanIntercept, Warm
+    from planner_jax.task.intercept.smooth import BegunCase, SmoothIntercept
 
 _FIELD = 128  # places of the distance field along either side of the map
 _SOONEST = 0.01  # share of the case's time that a meeting takes at least
@@ -165,11 +166,31 @@ class SpacetimeIntercept:
         """Whether the meeting time is an unknown."""
         return self.meet != "given"
 
+    @property
+    def weights(self) -> Weights:
+        """What a plan ends at the least of."""
+        return _HURRYING if self.meet == "early" else _SETTLING
+
     def replanner(self) -> "ReplanIntercept":
         """What plans again from a plan that is being driven; see `pj.replan`."""
         from planner_jax.task.intercept.replan import ReplanIntercept
 
         return ReplanIntercept(self)
+
+    def smooth_near(
+        self, cases: InterceptCase, plans: InterceptPlan
+    ) -> "tuple[SmoothIntercept, BegunCase]":
+        """What minimises the cost from plans on, and the cases with these; see `pj.gradient`."""
+        from planner_jax.task.intercept.smooth import SmoothIntercept, begun_case
+
+        parts = [plans.speed[..., 1:], plans.curvature[..., 1:], plans.time[..., None]]
+        begun = jnp.concatenate(parts if self.is_time_free else parts[:2], axis=-1)
+        return SmoothIntercept(self), begun_case(cases, begun)
+
+    def smooth(self, case: InterceptCase) -> "tuple[SmoothIntercept, BegunCase]":
+        """The same from the plan of the first search, constant to derivatives."""
+        plan = self.solve(lax.stop_gradient(case), self.attempts[0])
+        return self.smooth_near(case, plan)
 
     def solve(self, case: InterceptCase, attempt: Search) -> InterceptPlan:
         """The plan of one case: way after way, until one keeps every limit.
@@ -315,9 +336,8 @@ class SpacetimeIntercept:
             keeping = dataclasses.replace(
                 keeping, tolerance=solver.tolerance, settled=solver.settled
             )
-        weights = _HURRYING if self.meet == "early" else _SETTLING
         steps = attempt.settling
-        return [keeping, Stage(weights, steps, settled=steps, of_good=True)]
+        return [keeping, Stage(self.weights, steps, settled=steps, of_good=True)]
 
     def staged(
         self,

@@ -1,0 +1,112 @@
+"""Cases from above: what stands, and where car, target and movers are at some times.
+
+After paper 003, Fig. 3, where one case is shown at four times.
+"""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from planner_jax.sweep.figures import style
+from planner_jax.sweep.intercept.drive import SampledDrive, sampled_drive
+from planner_jax.sweep.intercept.figures.scene import (
+    colours_of_time,
+    draw_map,
+    draw_polygons,
+    instants,
+)
+from planner_jax.sweep.report import RunRows
+
+_SAMPLES = 241
+_PANELS, _COLUMNS, _FAILURES = 6, 3, 2
+_MOST_BODIES, _MOST_MOVERS = 6, 16  # of instants, and of polygons that are drawn of all movers
+
+
+def plane_figure(figure: Figure, run: RunRows) -> None:
+    """The run's example and cases beside it."""
+    setting = run.manifest["setting"]
+    drives = [sampled_drive(row, setting, _SAMPLES) for row in chosen(run)]
+    latest = max(drive.row["due_time"] for drive in drives)
+    colours = ScalarMappable(Normalize(0.0, latest), colours_of_time())
+    num_rows = -(-len(drives) // _COLUMNS)
+    figure.set_size_inches(13.0, 0.7 + 4.0 * num_rows)
+    panels = figure.subplots(num_rows, _COLUMNS, sharex=True, sharey=True, squeeze=False)
+    for axes, drive in zip(panels.flat, drives, strict=False):
+        draw_drive(axes, drive, colours)
+    for axes in panels.flat[len(drives) :]:
+        axes.axis("off")
+    for axes in panels[-1]:
+        axes.set_xlabel("x [m]")
+    for axes in panels[:, 0]:
+        axes.set_ylabel("y [m]")
+    figure.colorbar(
+        colours, ax=panels, label="time since the car sets out [s]", aspect=20 * num_rows
+    )
+    figure.legend(handles=entries(colours), loc="outside upper center", ncols=6)
+
+
+def chosen(run: RunRows) -> list[dict[str, Any]]:
+    """Rows to be shown: the example, others evenly from the run, and failures at the end."""
+    (_, example), rows = run.same_case()[0], run.sample()
+    others = [row for row in rows if row["index"] != example["index"]]
+    failures = [row for row in others if not row["success"]][:_FAILURES]
+    good = [row for row in others if row["success"]]
+    places = np.linspace(0, len(good) - 1, min(len(good), _PANELS - 1 - len(failures)))
+    return [example, *(good[k] for k in places.astype(int)), *failures]
+
+
+def draw_drive(axes: Axes, drive: SampledDrive, colours: ScalarMappable) -> None:
+    """One case, all its instants on top of each other."""
+    row = drive.row
+    draw_map(axes, drive.setting, drive.walls)
+    end = float(np.nan_to_num(row["meeting_time"]))
+    times = instants(end, _MOST_BODIES)
+    every = max(-(-len(times) * len(drive.movers) // _MOST_MOVERS), 1)
+    for time in times[::every]:
+        moved = [m + time * v for m, v in zip(drive.movers, drive.velocities, strict=True)]
+        draw_polygons(axes, moved, colours.to_rgba(time))
+    for corners, velocity in zip(drive.movers, drive.velocities, strict=True):
+        way = corners.mean(axis=0) + np.array([[0.0], [end]]) * velocity
+        axes.plot(*way.T, color=style.GREY, linewidth=0.7, zorder=1.5)
+    way = drive.target_at(np.linspace(0.0, row["due_time"], 101))
+    axes.plot(*way.T, color=style.INK, linewidth=1.0, linestyle=(0, (4, 2)), zorder=3)
+    for time in times:
+        look = {"color": colours.to_rgba(time), "markersize": 5.5, "mec": style.INK, "mew": 0.6}
+        axes.plot(*drive.target_at(time), "o", zorder=6, **look)
+    parts = np.stack([drive.middle[:-1], drive.middle[1:]], axis=1)
+    line = LineCollection(list(parts), cmap=colours.cmap, norm=colours.norm, linewidths=2.2)
+    line.set(array=drive.time[:-1], zorder=4, capstyle="round")
+    axes.add_collection(line)
+    for time in times:
+        body = [drive.footprint(drive.pose_at(time))]
+        draw_polygons(axes, body, colours.to_rgba(time), alpha=0.55, zorder=5)
+    look = {"marker": "o", "markersize": 13, "mfc": "none", "mew": 1.8, "zorder": 7}
+    axes.plot(*drive.target_at(end), mec=style.INK if row["success"] else style.RED, **look)
+    if row["success"]:
+        text = f"met at {row['meeting_time']:.1f} s, {1e3 * row['miss']:.2g} mm off"
+    else:
+        text = f"fails: {row['failed_limit']}"
+        moment = drive.pose_at(float(np.nan_to_num(row["failed_time"])))
+        axes.plot(*moment[:2], "X", color=style.RED, markersize=10, mec="white", zorder=8)
+    style.label(axes, "", "", f"Case {row['index']}, {text}")
+
+
+def entries(colours: ScalarMappable) -> list[Any]:
+    """What the legend explains."""
+    early: Any = colours.get_cmap()(0.3)
+    look: dict[str, Any] = {"linestyle": "", "marker": "o"}
+    return [
+        Patch(facecolor=style.PALE, edgecolor=style.GREY, label="wall"),
+        Patch(facecolor=(*early[:3], 0.25), edgecolor=early, label="mover"),
+        Line2D([], [], color=style.INK, linestyle=(0, (4, 2)), label="way of the target"),
+        Line2D([], [], color=early, markersize=5.5, mec=style.INK, mew=0.6, label="target", **look),
+        Line2D([], [], color=early, linewidth=2.2, marker="s", markersize=8, label="car"),
+        Line2D([], [], mfc="none", mec=style.INK, mew=1.8, markersize=11, label="meeting", **look),
+    ]

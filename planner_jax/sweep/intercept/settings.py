@@ -1,0 +1,15 @@
+"""What an intercept sweep is asked to do."""
+
+import dataclasses
+from typing import ClassVar
+
+from planner_jax.sweep.settings import SweepSettings
+
+
+@dataclasses.dataclass(frozen=True)
+class InterceptSettings(SweepSettings):
+    """The arguments of an intercept sweep."""
+
+    RUN: ClassVar[str] = "planner_jax.sweep.intercept.sweep:InterceptSweep"
+    CPU_BATCH: ClassVar[int] = 256  # some ms a case
+    GPU_BATCH: ClassVar[int] = 4096

@@ -1,0 +1,141 @@
+"""Derivatives of interceptions: those of the point of least cost about a plan."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import planner_jax as pj
+from planner_jax.optimise.sensitivity import gradient_at
+from planner_jax.plane.reach import Lattice
+from planner_jax.plane.target import TurningPath
+from planner_jax.task.intercept.checked import straight_on
+from planner_jax.task.intercept.spacetime import Search
+
+BY = ("movers.centre", "walls.centre", "limits.acceleration", "target.vel", "speed")
+# One search with few ways, a few unknowns.
+SMALL = {"pieces": 8, "samples": 3, "searches": (Search(4, lattice=Lattice(layers=22)),)}
+
+
+def crossing(dtype):
+    """A target that passes ahead, a wall on the left and a mover that comes from the right."""
+    target = TurningPath(*(jnp.asarray(x, dtype) for x in ([3.5, 4.4], [0.0, -0.2], 0.0)))
+    wall = [(1.6, 4.0), (2.4, 4.0), (2.0, 5.0)]
+    mover = [(2.5, 3.1), (3.0, 3.1), (3.0, 3.6), (2.5, 3.6)]
+    return pj.intercept.case(
+        target,
+        6.0,
+        walls=[wall],
+        movers=[mover],
+        mover_velocities=(0.0, 0.2),
+        curvature=1.0,
+        dtype=dtype,
+    )
+
+
+def duration(plan):
+    return plan.time
+
+
+@functools.cache
+def settle(planner):
+    """What leads from a case to the unknowns of least cost, compiled."""
+    return jax.jit(lambda case: planner.guesses(planner.prepare(case), 1)[0])
+
+
+def at_rest(planner, case):
+    """The problem about a drive straight on, with a case that begins where its cost is least."""
+    smooth, begun = planner.smooth_near(case, straight_on(case, planner.pieces))
+    return smooth, dataclasses.replace(begun, begun=settle(smooth)(begun))
+
+
+@functools.cache
+def differentiate(planner, quantity, by, steps):
+    """What leads from a case at rest to a gradient, compiled."""
+    options = {"steps": steps, "curvature": "whole"}
+    return jax.jit(lambda case: gradient_at(planner, case, case.begun, quantity, by, **options))
+
+
+def moved(case, name, by):
+    first, _, rest = name.partition(".")
+    inner = getattr(case, first)
+    new = moved(inner, rest, by) if rest else inner + by
+    return dataclasses.replace(case, **{first: new})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("meet", "binding"), [("early", "movers"), ("given", "walls")])
+def test_gradients_are_those_of_plans_made_anew(meet, binding, float64):
+    """Central differences; a drive is planned anew from the one that is differentiated."""
+    planner = pj.intercept.planner(meet=meet, **SMALL)
+    smooth, case = at_rest(planner, crossing(jnp.float64))
+    quantity = duration if meet == "early" else "cost"
+    steps = 1 if meet == "early" else 0
+    found = differentiate(smooth, quantity, BY, steps)(case)
+
+    @jax.jit
+    def settled_value(case):
+        point = settle(smooth)(case)
+        if meet == "early":
+            return smooth.decode(point, smooth.prepare(case)).time
+        return smooth.objective(point, smooth.prepare(case)).cost
+
+    assert found.value == pytest.approx(float(settled_value(case)))
+    rng = np.random.default_rng(2)
+    for name in BY:
+        part = functools.reduce(getattr, name.split("."), case)
+        direction = jnp.asarray(rng.normal(size=part.shape))
+        ends = [moved(case, name, sign * 1e-4 * direction) for sign in (1.0, -1.0)]
+        difference = (settled_value(ends[0]) - settled_value(ends[1])) / 2e-4
+        along = float(jnp.sum(found.by[name] * direction))
+        assert along == pytest.approx(float(difference), rel=1e-3, abs=1e-5), name
+    assert np.any(np.abs(found.by[f"{binding}.centre"]) > 1e-2)
+
+
+@pytest.mark.slow
+def test_an_obstacle_that_is_far_away_does_not_matter(float64):
+    planner = pj.intercept.planner(meet="early", **SMALL)
+    case = crossing(jnp.float64)
+    far = dataclasses.replace(case.walls, centre=case.walls.centre + jnp.array([0.0, 2.0]))
+    smooth, case = at_rest(planner, dataclasses.replace(case, walls=far))
+    assert not np.any(differentiate(smooth, duration, BY, 1)(case).by["walls.centre"])
+
+
+@pytest.mark.slow
+def test_a_batch_has_gradients_of_its_plans():
+    """In float32, of drawn cases; a car that may be faster is there earlier."""
+    planner = pj.intercept.planner(meet="early")
+    cases = pj.intercept.draw(8, "medium", 0)
+    found = pj.gradient(planner, cases, of="time", by=["limits.acceleration", "movers"])
+    assert pj.solved(found.plans).all()
+    np.testing.assert_allclose(found.value, found.plans.time)
+    assert found.by["movers"].centre.shape == cases.movers.centre.shape
+    by_limit = found.by["limits.acceleration"]
+    assert np.isfinite(by_limit).all() and (by_limit < 1e-3).all() and (by_limit < -1e-2).any()
+
+
+@pytest.mark.slow
+def test_an_optimal_plan_has_the_same_gradient(float64):
+    planner = pj.intercept.planner(meet="early", **SMALL)
+    case = crossing(jnp.float64)
+
+    def time(acceleration):
+        limits = dataclasses.replace(case.limits, acceleration=acceleration)
+        plan = pj.optimal_plan(planner, dataclasses.replace(case, limits=limits))
+        return plan.time, plan
+
+    slope, plan = jax.jit(jax.grad(time, has_aux=True))(case.limits.acceleration)
+    assert pj.solved(plan)
+    smooth, begun = planner.smooth(case)
+    begun = dataclasses.replace(begun, begun=settle(smooth)(begun))
+    found = differentiate(smooth, duration, BY, 1)(begun)
+    assert slope == pytest.approx(float(found.by["limits.acceleration"]), rel=1e-3)
+
+
+@pytest.mark.parametrize("name", ["lattice", "constant"])
+def test_planners_that_split_path_and_speed_have_no_gradient(name):
+    with pytest.raises(TypeError, match="minimises nothing"):
+        pj.gradient(pj.intercept.planner(name), crossing(jnp.float32), of="cost", by="limits")

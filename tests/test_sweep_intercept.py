@@ -1,0 +1,159 @@
+"""The intercept sweep: rows that hold a case and its drive, figures, counts."""
+
+import json
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from sweeps import columns
+
+import planner_jax as pj
+from planner_jax.plane.reach import Lattice
+from planner_jax.plane.target import PolynomialPath
+from planner_jax.referee.intercept import referee_intercepts
+from planner_jax.sweep.columns import RefereedBatch
+from planner_jax.sweep.intercept.columns import COLUMNS, WAY_POINTS
+from planner_jax.sweep.intercept.drive import case_of, sampled_drive
+from planner_jax.sweep.intercept.figures.scene import instants
+from planner_jax.sweep.intercept.settings import InterceptSettings
+from planner_jax.sweep.intercept.sweep import InterceptSweep
+from planner_jax.sweep.report import write_report
+from planner_jax.sweep.run_folder import RunFolder
+from planner_jax.sweep.source import Chunk
+from planner_jax.task.intercept.spacetime import Search
+
+TASK = pj.task_named("intercept")
+NUM, BATCH = 12, 6
+SETTINGS = InterceptSettings(suite="hard", num=NUM, batch=BATCH, seed=0)  # some of these fail
+FIGURES = ("plane.png", "station_time.png", "reach.png", "motion.png", "outcomes.png")
+
+
+def one_search():
+    """The planner with one search, so that one program is compiled: that of test_intercept."""
+    return pj.intercept.planner(searches=(Search(12, lattice=Lattice(layers=22)),))
+
+
+@pytest.fixture(autouse=True, scope="module")
+def quick_planners():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(InterceptSweep, "planner", lambda *_: one_search())
+        patch.setattr(InterceptSweep, "other_planners", lambda *_: {"lattice": one_search()})
+        yield
+
+
+@pytest.fixture
+def rows(finished):
+    return pq.read_table(finished[0] / "plans.parquet").to_pylist()
+
+
+def test_a_finished_run_holds_rows_figures_and_page(finished):
+    out, manifest = finished
+    assert manifest == json.loads((out / "manifest.json").read_text())
+    assert manifest["state"] == "complete" and manifest["kind"] == "sweep intercept"
+    assert InterceptSettings(**manifest["parameters"]) == SETTINGS.of(TASK)
+    page = (out / "index.html").read_text()
+    for name in FIGURES:
+        assert (out / "figures" / name).read_bytes().startswith(b"\x89PNG")
+        assert f'src="figures/{name}"' in page
+    for field in pq.read_schema(out / "plans.parquet"):
+        assert field.metadata.keys() == {b"unit", b"meaning"} and field.metadata[b"meaning"]
+
+
+def test_the_summary_counts_the_rows(finished):
+    out, manifest = finished
+    found, summary = columns(out), manifest["summary"]
+    good = found["success"].astype(bool)
+    assert 0 < good.sum() < NUM == len(good) == summary["num"]
+    assert summary["successes"] == good.sum()
+    for name in ("meeting_time", "miss", "rms_acceleration"):
+        assert summary[f"mean_{name}"] == pytest.approx(found[name][good].mean(), rel=1e-5)
+
+
+def test_the_example_is_a_success_near_a_mover_if_there_is_one(finished):
+    out, manifest = finished
+    found = columns(out)
+    near = found["success"].astype(bool) & (found["mover_clearance"] < 0.1)
+    assert near.any() and manifest["example"] == np.flatnonzero(near)[0]
+
+
+def test_the_rows_alone_lead_the_referee_to_the_same_verdict(finished, rows):
+    out, manifest = finished
+    found = columns(out)
+    cases = [case_of(row, manifest["setting"]) for row in rows]
+    cases = jax.tree.map(lambda *leaves: np.stack(leaves), *cases)
+    plans = SimpleNamespace(**{name: found[name] for name in ("start", "speed", "curvature")})
+    plans.time = found["meeting_time"]
+    end = cases.target.places[:, -1]
+    verdict = referee_intercepts(cases, plans, target_positions=lambda *_: end)
+    np.testing.assert_array_equal(verdict.success, found["success"])
+    np.testing.assert_array_equal(verdict.failed_limit, found["failed_limit"])
+    np.testing.assert_allclose(verdict.miss, found["miss"], atol=1e-5)
+    np.testing.assert_allclose(verdict.mover_clearance, found["mover_clearance"], atol=1e-5)
+
+
+def test_a_row_s_drive_ends_where_the_referee_sees_it(finished, rows):
+    setting = finished[1]["setting"]
+    for row in rows:
+        drive = sampled_drive(row, setting, 41)
+        away = np.linalg.norm(drive.middle[-1] - drive.target[-1])
+        assert away == pytest.approx(row["miss"], abs=1e-4)
+        assert drive.time[-1] == pytest.approx(row["meeting_time"])
+        sides = np.diff(drive.footprint(drive.pose[-1]), axis=0)
+        lengths = np.linalg.norm(sides, axis=1)
+        np.testing.assert_allclose(lengths, [0.4, 0.25, 0.4], rtol=1e-5)
+        # The body's middle is the mean of its corners.
+        np.testing.assert_allclose(
+            drive.footprint(drive.pose[20]).mean(axis=0), drive.middle[20], atol=1e-6
+        )
+
+
+def test_a_case_comes_back_from_its_row(finished, rows):
+    drawn = pj.lane(pj.intercept.draw(1, "hard", 0, first=7), 0)
+    back = case_of(rows[7], finished[1]["setting"])
+    for name in ("walls", "movers"):
+        own, other = getattr(drawn, name), getattr(back, name)
+        there = np.asarray(own.present)
+        np.testing.assert_array_equal(there, other.present)
+        for time in (0.0, 10.0):
+            np.testing.assert_allclose(
+                own.vertices(time)[there], other.vertices(time)[there], atol=1e-5
+            )
+    own, other = (jax.jit(case.target.at)(jnp.float32(4.3)) for case in (drawn, back))
+    np.testing.assert_allclose(own.pos, other.pos, atol=1e-3)
+    np.testing.assert_allclose(own.vel, other.vel, atol=1e-2)
+
+
+def test_a_target_of_another_class_has_a_way_and_no_leaves():
+    coeffs = jnp.array([[[1.0, 2.0], [0.5, 0.0], [0.0, 0.1]]])
+    case = pj.intercept.case(PolynomialPath(coeffs, jnp.zeros(1)), np.full(1, 4.0))
+    batch = RefereedBatch(Chunk(np.arange(1), case), None, None)
+    of_target = {c.name: c.values(batch) for c in COLUMNS if c.name.startswith("target_")}
+    assert of_target.pop("target_way").shape == (1, WAY_POINTS, 2)
+    assert list(of_target.values()) == [None, None, None]
+
+
+def test_a_plan_that_is_not_finite_is_reported_too(finished, tmp_path):
+    out, manifest = finished
+    table = pq.read_table(out / "plans.parquet").slice(manifest["example"], 1)
+    row = table.to_pylist()[0]
+    row |= {"index": 0, "success": False, "sentence": "not finite", "failed_limit": "not finite"}
+    row |= dict.fromkeys(("meeting_time", "failed_time", "miss", "mover_clearance"), float("nan"))
+    for name in ("speed", "curvature"):
+        row[name] = [float("nan")] * len(row[name])
+    folder = RunFolder(tmp_path)
+    folder.write_manifest({**manifest, "example": 0})
+    folder.write_rows(folder.plans, pa.Table.from_pylist([row], schema=table.schema))
+    write_report(folder)
+    assert "not finite" in (tmp_path / "index.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("end", "expected"),
+    [(10.0, [0, 2, 4, 6, 8, 10]), (3.7, [0, 1, 2, 3]), (0.0, [0]), (0.3, [0, 0.1, 0.2, 0.3])],
+)
+def test_instants_are_few_and_round(end, expected):
+    np.testing.assert_allclose(instants(end, 6), expected, atol=1e-9)
