@@ -13,8 +13,9 @@ from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.plane.reach import Lattice
 from planner_jax.planning.decided import first_choice
 from planner_jax.robot.car import pose_at
+from planner_jax.sweep.intercept.settings import InterceptSettings
 from planner_jax.sweep.run import start_sweep
-from planner_jax.sweep.settings import SettingError, SweepSettings
+from planner_jax.sweep.settings import SettingError
 from planner_jax.sweep.sweep import sweep_of
 from planner_jax.task.intercept.card import GROUPS, TASK
 from planner_jax.task.intercept.group import CarState
@@ -231,11 +232,14 @@ def test_groups_and_single_targets_are_told_apart(tmp_path):
         pj.intercept.planner("spacetime", decide="best")
     with pytest.raises(TypeError, match="class InterceptCase, got InterceptGroup"):
         pj.plan(pj.intercept.planner(), draw(1, 0, 2))
-    settings = SweepSettings(planner="spacetime", suite="group", num=1)
-    with pytest.raises(SettingError, match="planner must be one of the cases of suite group"):
+    for planner in ("spacetime", "group"):
+        settings = InterceptSettings(planner=planner, suite="group", num=1)
+        with pytest.raises(SettingError, match="suite must be of single targets"):
+            start_sweep(TASK, settings, tmp_path / "run")
+    settings = InterceptSettings(planner="group", suite="easy", num=1)
+    with pytest.raises(SettingError, match="planner must be one that takes the cases of suite"):
         start_sweep(TASK, settings, tmp_path / "run")
     assert not (tmp_path / "run").exists()
     # Neither is compared with the other either.
-    sweep, alone = sweep_of(TASK), SweepSettings(planner="lattice", suite="easy")
-    assert not sweep.other_planners(dataclasses.replace(settings, planner="group"))
-    assert set(sweep.other_planners(alone)) == {"spacetime", "paper", "em", "constant"}
+    others = sweep_of(TASK).other_planners(InterceptSettings(planner="lattice", suite="easy"))
+    assert set(others) == {"spacetime"}

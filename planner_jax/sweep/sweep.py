@@ -82,7 +82,7 @@ class Sweep:
         require(
             kind is None or isinstance(cases, kind),
             "planner",
-            f"one of the cases of suite {settings.suite}",
+            f"one that takes the cases of suite {settings.suite}",
             settings.planner,
         )
 

@@ -1,6 +1,5 @@
 """What interceptions add to a sweep: rows of their own, times and effort, and figures."""
 
-import importlib.util
 from typing import Any
 
 import numpy as np
@@ -14,8 +13,12 @@ from planner_jax.sweep.intercept.figures.plane import plane_figure
 from planner_jax.sweep.intercept.figures.reach import reach_figure
 from planner_jax.sweep.intercept.figures.station_time import station_time_figure
 from planner_jax.sweep.intercept.settings import InterceptSettings
+from planner_jax.sweep.settings import require
 from planner_jax.sweep.summary import Tally
 from planner_jax.sweep.sweep import RunFigure, Sweep, first_values
+from planner_jax.task.intercept.case import InterceptCase
+
+COMPARED = ("lattice", "spacetime")  # beside a run's own planner, for one case
 
 
 class InterceptTally(Tally):
@@ -85,11 +88,15 @@ class InterceptSweep(Sweep):
     )
 
     def other_planners(self, settings: InterceptSettings) -> dict[str, Any]:
-        """The task's other planners, by name; `paper` where what it needs is installed."""
+        """The best that splits path and speed, or the default: each takes a minute to compile."""
         others = super().other_planners(settings)
-        if importlib.util.find_spec("numba") is None:
-            others.pop("paper", None)
-        return others
+        return {name: others[name] for name in COMPARED if name in others}
+
+    def require_fit(self, settings: InterceptSettings, planner: Any, cases: Any) -> None:
+        """Raise `SettingError` unless these are cases of one target, and of the planner."""
+        rule = "of single targets (of groups: python -m planner_jax.benchmarks.intercept_group)"
+        require(isinstance(cases, InterceptCase), "suite", rule, settings.suite)
+        super().require_fit(settings, planner, cases)
 
     def setting(self, cases: Any) -> dict[str, Any]:
         """Map, body and limits that all cases have in common, for the manifest."""
