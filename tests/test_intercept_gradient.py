@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,15 +21,15 @@ BY = ("movers.centre", "walls.centre", "limits.acceleration", "target.vel", "spe
 SMALL = {"pieces": 8, "samples": 3, "searches": (Search(4, lattice=Lattice(layers=22)),)}
 
 
-def crossing(dtype):
-    """A target that passes ahead, a wall on the left and a mover that comes from the right."""
+def crossing(dtype, wall=0.0):
+    """A target that passes ahead, a mover that comes from the right, and so far a wall [m]."""
     target = TurningPath(*(jnp.asarray(x, dtype) for x in ([3.5, 4.4], [0.0, -0.2], 0.0)))
-    wall = [(1.6, 4.0), (2.4, 4.0), (2.0, 5.0)]
+    corners = np.array([(1.6, 4.0), (2.4, 4.0), (2.0, 5.0)]) + [0.0, wall]
     mover = [(2.5, 3.1), (3.0, 3.1), (3.0, 3.6), (2.5, 3.6)]
     return pj.intercept.case(
         target,
         6.0,
-        walls=[wall],
+        walls=[corners],
         movers=[mover],
         mover_velocities=(0.0, 0.2),
         curvature=1.0,
@@ -98,29 +99,27 @@ def test_gradients_are_those_of_plans_made_anew(meet, binding, float64):
 @pytest.mark.slow
 def test_an_obstacle_that_is_far_away_does_not_matter(float64):
     planner = pj.intercept.planner(meet="early", **SMALL)
-    case = crossing(jnp.float64)
-    far = dataclasses.replace(case.walls, centre=case.walls.centre + jnp.array([0.0, 2.0]))
-    smooth, case = at_rest(planner, dataclasses.replace(case, walls=far))
+    smooth, case = at_rest(planner, crossing(jnp.float64, wall=2.0))
     assert not np.any(differentiate(smooth, duration, BY, 1)(case).by["walls.centre"])
 
 
 @pytest.mark.slow
 def test_a_batch_has_gradients_of_its_plans():
-    """In float32, of drawn cases; a car that may be faster is there earlier."""
-    planner = pj.intercept.planner(meet="early")
-    cases = pj.intercept.draw(8, "medium", 0)
-    found = pj.gradient(planner, cases, of="time", by=["limits.acceleration", "movers"])
-    assert pj.solved(found.plans).all()
+    """In float32, of drawn cases; a car that may be quicker is there earlier."""
+    planner = pj.intercept.planner(meet="early", **SMALL)
+    cases = pj.intercept.draw(8, "easy", 0)
+    found = pj.gradient(planner, cases, of="time", by=["limits.acceleration", "movers.centre"])
     np.testing.assert_allclose(found.value, found.plans.time)
-    assert found.by["movers"].centre.shape == cases.movers.centre.shape
-    by_limit = found.by["limits.acceleration"]
-    assert np.isfinite(by_limit).all() and (by_limit < 1e-3).all() and (by_limit < -1e-2).any()
+    assert found.by["movers.centre"].shape == cases.movers.centre.shape
+    good = pj.solved(found.plans)
+    by_limit = found.by["limits.acceleration"][good]
+    assert good.sum() > 4 and (by_limit < 1e-3).all() and (by_limit < -0.1).any()
 
 
 @pytest.mark.slow
 def test_an_optimal_plan_has_the_same_gradient(float64):
-    planner = pj.intercept.planner(meet="early", **SMALL)
-    case = crossing(jnp.float64)
+    planner: Any = pj.intercept.planner(meet="early", **SMALL)
+    case = crossing(jnp.float64, wall=2.0)
 
     def time(acceleration):
         limits = dataclasses.replace(case.limits, acceleration=acceleration)
