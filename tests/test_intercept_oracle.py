@@ -9,6 +9,7 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.benchmarks.intercept_bound import earliest_bound
+from planner_jax.benchmarks.intercept_departure import departs
 from planner_jax.benchmarks.intercept_lattice import (
     CELL,
     HEADINGS,
@@ -177,3 +178,16 @@ def test_the_bound_is_no_later_than_the_inner_disc_and_that_no_later_than_the_wh
 def test_a_map_without_bounds_is_an_error():
     with pytest.raises(ValueError, match="must be finite"):
         Lattice(replace(scene((2.0, 4.0)), upper=np.array([np.inf, 8.0])), MINIMAL)
+
+
+@pytest.mark.parametrize(("ahead", "gets_away"), [(0.1, False), (1.2, True)])
+def test_a_car_gets_away_from_a_wall_ahead_if_it_can_still_turn(ahead, gets_away):
+    # It neither reverses nor turns within less than half a metre.
+    front = START[0] + MIDDLE + 0.2
+    one = scene((6.0, 4.0), time=8.0, walls=[box(front + ahead, 2.0, front + ahead + 0.2, 6.0)])
+    assert departs(one, far=0.8, until=2.0) == gets_away
+
+
+def test_a_target_nearby_needs_no_departure():
+    near = scene((1.5, 4.0), time=2.0, walls=[box(2.0, 2.0, 2.2, 6.0)])
+    assert departs(near)
