@@ -96,7 +96,7 @@ def is_inside(blocked, times, stations):
 
 
 @functools.partial(jax.jit, static_argnames="projection")
-def project(path, movers, projection=Projection(margin=0.0)):
+def project(path, movers, projection):
     return blocked_by(path, movers, EMPTY.body, EMPTY.time, projection)
 
 
@@ -113,7 +113,7 @@ def test_quadrangles_hold_whatever_the_body_meets_and_little_else(path):
     for seed in range(10):
         movers = crossing(np.random.default_rng(seed), path, 2)
         apart = np.asarray(least_distance(path, movers, times, stations))
-        found = is_inside(project(path, movers), times, stations)
+        found = is_inside(project(path, movers, Projection(margin=0.0)), times, stations)
         assert not (~found & (apart < -1e-4)).any()
         held, exact = held + found.sum(), exact + (apart < 0.0).sum()
         near += (found & (apart < 0.1)).sum()
