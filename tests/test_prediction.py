@@ -237,16 +237,14 @@ def test_the_kernel_gives_the_same_table():
     numbers = [random.uniform(*ends, lanes).astype(np.float32) for ends in ((0.01, 0.1), (0, 0.3))]
     gravity = np.full(lanes, 9.8, np.float32)
     args = [jnp.asarray(x) for x in (pos, vel, *numbers, gravity)]
-    kernel = table_kernel(nodes, interpret=True)
-    found = jax.jit(lambda *args: kernel(None, list(args)))(*args)
-    of_balls = jax.vmap(
+    found = table_kernel(nodes, interpret=True)(None, args)
+    table = jax.vmap(
         lambda p, v, step, drag, g: predict_path(
             BallState(p, v), step * (nodes - 3), drag, g, num_nodes=nodes
         ),
         in_axes=-1,
         out_axes=-1,
-    )
-    table = jax.jit(of_balls)(*args)
+    )(*args)
     np.testing.assert_allclose(found[0], table.pos, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(found[1], table.vel, rtol=1e-5, atol=1e-5)
 
@@ -260,8 +258,7 @@ def test_the_kernel_gives_the_same_derivatives_of_the_table():
         random.uniform(*ends, lanes).astype(np.float32) for ends in ((0.01, 0.1), (0, 0.3))
     )
     args = [jnp.asarray(x) for x in (pos, vel, step, drag, np.full(lanes, 9.8, np.float32))]
-    kernel = table_kernel(nodes, moving, interpret=True)
-    found = jax.jit(lambda *args: kernel(None, list(args)))(*args)
+    found = table_kernel(nodes, moving, interpret=True)(None, args)
 
     def table(p, v, step, drag, g):
         path = predict_path(BallState(p, v), step * (nodes - 3), drag, g, num_nodes=nodes)
