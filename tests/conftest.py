@@ -38,7 +38,10 @@ def finished(request, tmp_path_factory):
 # Modules that take longest, or whose compiled programs others find in the cache: the hit planner's
 # of test_exact, the catch planner's of test_decide. Workers get whole modules in this order: none
 # is left with a long one in the end, and none compiles what another one is compiling.
-FIRST = ("sims_flights", "exact", "notebooks", "decide", "baselines", "along", "estimation")
+FIRST = (
+    *("sims_flights", "path_then_speed", "exact", "notebooks", "intercept", "decide"),
+    *("contract", "own_task", "baselines", "along", "estimation"),
+)
 
 
 def pytest_collection_modifyitems(items):

@@ -336,7 +336,7 @@ def test_what_comes_back_is_of_the_kind_of_array_that_was_given(entry):
     assert_close(resident, entry.plans)
 
 
-@entries(on_host=False, slow=(*LIKE_OTHERS, "catch exact", "intercept spacetime"))
+@entries(on_host=False, slow=(*LIKE_OTHERS, *OF_THEIR_OWN, "catch mpp", "intercept spacetime"))
 def test_solve_inside_a_compiled_function_is_plan(entry):
     assert_close(jax.jit(pj.solve)(entry.planner, entry.batch), entry.plans)
 

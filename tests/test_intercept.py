@@ -28,11 +28,14 @@ def way():
 
 
 def test_the_way_is_that_of_the_car(way, float64):
-    speed, curvature = map(jnp.asarray, way)
-    num = len(speed) - 1
-    found = jax.jit(lambda: motion(jnp.asarray(START), 4.0, speed, curvature, 5))()
-    times = jnp.linspace(0.0, 4.0, 5 * num + 1)[1:]
-    poses = jax.vmap(lambda t: pose_at(jnp.asarray(START), 4.0, speed, curvature, t))(times)
+    times = np.linspace(0.0, 4.0, 5 * (len(way[0]) - 1) + 1)[1:]
+
+    @jax.jit
+    def both(speed, curvature):
+        poses = jax.vmap(lambda t: pose_at(START, 4.0, speed, curvature, t))(times)
+        return motion(jnp.asarray(START), 4.0, speed, curvature, 5), poses
+
+    found, poses = jax.device_get(both(*way))
     np.testing.assert_allclose(found.pos.reshape(-1, 2), poses[:, :2], atol=2e-5)
     np.testing.assert_allclose(found.heading.ravel(), poses[:, 2], atol=1e-12)
     np.testing.assert_allclose(found.time.ravel(), times, atol=1e-12)
@@ -94,11 +97,12 @@ def test_a_pose_is_the_integral_of_the_car_s_kinematics(way, float64):
     heading = START[2] + np.cumsum(turn) - 0.5 * turn
     step = v * 2.3 / num
     expected = START + [np.sum(step * np.cos(heading)), np.sum(step * np.sin(heading)), turn.sum()]
-    found = pose_at(jnp.asarray(START), 4.0, jnp.asarray(speed), jnp.asarray(curvature), 2.3)
+    found = jax.jit(pose_at)(START, 4.0, speed, curvature, 2.3)
     np.testing.assert_allclose(found, expected, atol=1e-7)
 
 
-@pytest.mark.parametrize("meet", ["given", "early"])
+# The one that picks the time has the other's unknowns, and the time.
+@pytest.mark.parametrize("meet", [pytest.param("given", marks=pytest.mark.slow), "early"])
 def test_the_gradient_of_a_cost_is_that_of_finite_differences(way, float64, meet):
     case = jax.tree.map(
         lambda leaf: jnp.asarray(leaf[0], jnp.float64 if leaf.dtype != bool else bool),
@@ -106,8 +110,8 @@ def test_the_gradient_of_a_cost_is_that_of_finite_differences(way, float64, meet
     )
     case = dataclasses.replace(case, end_heading=jnp.array(2.0), heading_tolerance=jnp.array(0.1))
     planner = pj.intercept.planner(pieces=8, meet=meet)
-    field = planner.field(case, planner.grid(case, SEARCHES[0]))
-    places = jnp.asarray(np.random.default_rng(3).uniform(1.0, 7.0, (8, 2)))
+    field = jax.jit(lambda case: planner.field(case, planner.grid(case, SEARCHES[0])))(case)
+    places = np.random.default_rng(3).uniform(1.0, 7.0, (8, 2))
     model = jax.jit(lambda point: planner.model(point, case, field, Weights(follow=1.0), places))
     speed, curvature = (jnp.asarray(1.2 * each[1:]) for each in way)
     point = planner.point(speed, curvature, jnp.array(9.0))

@@ -14,6 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import planner_jax as pj
+from planner_jax.cli import main
 from planner_jax.registry import all_tasks
 
 OWN_TASK = Path(__file__).parent / "own_task"
@@ -23,7 +24,18 @@ BROKEN = {
 }
 
 
-# From the command line, in processes of their own.
+# From the command line: in processes of their own, or in this one, which has JAX already.
+
+
+@pytest.fixture(scope="module")
+def meet():
+    """The task, on the path of packages for this module's tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(OWN_TASK)
+        all_tasks.cache_clear()
+        yield pj.task_named("meet")
+    all_tasks.cache_clear()
+    sys.modules.pop("meet", None)
 
 
 def process(folder, *arguments, path=()):
@@ -85,17 +97,18 @@ def test_the_rows_are_the_leaves_of_case_plan_and_verdict(swept, meet):
     cases, columns = meet.draw(24), {"case.most": "most", "case.target_pos": "target_pos"}
     for name, leaf in columns.items():
         np.testing.assert_array_equal(rows[name].to_pylist(), getattr(cases, leaf).tolist())
-    plans = pj.plan(meet.planner(), cases)
+    # By the program of the sweep.
+    plans = pj.plan(meet.planner(), jax.tree.map(np.asarray, cases), chunk=16)
     np.testing.assert_allclose(rows["plan.time"].to_numpy(), plans.time, rtol=1e-4)
     assert max(rows["verdict.miss"].to_pylist()) < 1e-3
 
 
-def test_a_report_is_made_anew_from_the_folder(swept):
+def test_a_report_is_made_anew_from_the_folder(swept, meet, capsys):
     out, said = swept
     page = (out / "index.html").read_text()
     (out / "index.html").unlink()
-    done = command(out.parent, "report", "run")
-    assert done.code == 0 and done.out == said
+    assert main(["report", str(out)]) == 0
+    assert capsys.readouterr().out.replace(str(out), "run") == said
     assert (out / "index.html").read_text() == page
 
 
@@ -127,11 +140,9 @@ def test_a_sweep_that_ctrl_c_stops_is_resumed_to_the_same_rows(swept, tmp_path):
     assert rows[0] == rows[1]
 
 
-def test_throughput_is_measured_with_success_and_cost_beside(tmp_path):
-    done = command(
-        tmp_path, "bench", "throughput", "--task", "meet", "--batch", "16", "--out", "run"
-    )
-    assert done.code == 0, done.err
+def test_throughput_is_measured_with_success_and_cost_beside(meet, tmp_path):
+    settings = ["--task", "meet", "--batch", "16", "--out", str(tmp_path / "run")]
+    assert main(["bench", "throughput", *settings]) == 0
     manifest = manifest_of(tmp_path / "run")
     summary = manifest["summary"]
     assert (manifest["kind"], manifest["state"]) == ("bench throughput", "complete")
@@ -139,10 +150,10 @@ def test_throughput_is_measured_with_success_and_cost_beside(tmp_path):
     assert -1e-3 < summary["cost_gap_median"] <= summary["cost_gap_p90"] < 0.05
 
 
-def test_throughput_of_a_planner_that_minimises_nothing_has_no_cost_gap(tmp_path):
-    settings = ["--planner", "scipy", "--batch", "2", "--repeat", "1", "--out", "run"]
-    done = command(tmp_path, "bench", "throughput", "--task", "meet", *settings)
-    assert done.code == 0, done.err
+def test_throughput_of_a_planner_that_minimises_nothing_has_no_cost_gap(meet, tmp_path):
+    settings = ["--planner", "scipy", "--batch", "2", "--repeat", "1", "--out"]
+    settings = ["--task", "meet", *settings, str(tmp_path / "run")]
+    assert main(["bench", "throughput", *settings]) == 0
     summary = manifest_of(tmp_path / "run")["summary"]
     assert (summary["num"], summary["success_rate"]) == (2, 1.0)
     assert summary["cost_gap_median"] is None and summary["cost_gap_p90"] is None
@@ -173,17 +184,6 @@ def test_a_broken_package_beside_it_is_named_in_one_line_and_the_rest_works(tmp_
 
 
 # From Python.
-
-
-@pytest.fixture(scope="module")
-def meet():
-    """The task, on the path of packages for this module's tests."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(OWN_TASK)
-        all_tasks.cache_clear()
-        yield pj.task_named("meet")
-    all_tasks.cache_clear()
-    sys.modules.pop("meet", None)
 
 
 def exact_planner(meet):

@@ -1,6 +1,7 @@
 """Path, then speed: what movers block along a path, what is driven, and what cannot be solved."""
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
@@ -49,11 +50,12 @@ def scene(target=(6.0, 4.0), movers=(), velocities: Any = 0.0, walls=(), **setti
 
 
 EMPTY = scene()
-STRAIGHT = path_along(jnp.array([0.8, 4.0, 0.0]), jnp.asarray(5.05), jnp.zeros(129))
-BENT = path_along(
-    jnp.array([0.8, 2.0, 0.0]),
-    jnp.asarray(7.0),
-    jnp.asarray(1.2 * np.sin(np.linspace(0.0, 4.0 * np.pi, 129)), jnp.float32),
+along = jax.jit(path_along)
+STRAIGHT = along(np.float32([0.8, 4.0, 0.0]), np.float32(5.05), np.zeros(129, np.float32))
+BENT = along(
+    np.float32([0.8, 2.0, 0.0]),
+    np.float32(7.0),
+    np.float32(1.2 * np.sin(np.linspace(0.0, 4.0 * np.pi, 129))),
 )
 
 
@@ -87,15 +89,20 @@ def least_distance(path, movers, times, stations):
 
 def is_inside(blocked, times, stations):
     """Whether a quadrangle holds points of the plane, (times, stations) bool."""
-    lower, upper = blocked.edges_at(times[:, None])  # (times, P)
+    blocked, (lower, upper) = jax.device_get((blocked, edges_at(blocked, times[:, None])))
     is_now = (blocked.start <= times[:, None]) & (times[:, None] <= blocked.end) & blocked.present
     s = stations[:, None]
-    return np.asarray(((lower[:, None] <= s) & (s <= upper[:, None]) & is_now[:, None]).any(2))
+    return ((lower[:, None] <= s) & (s <= upper[:, None]) & is_now[:, None]).any(2)
 
 
-@jax.jit
-def project(path, movers):
-    return blocked_by(path, movers, EMPTY.body, EMPTY.time, Projection(margin=0.0))
+@functools.partial(jax.jit, static_argnames="projection")
+def project(path, movers, projection):
+    return blocked_by(path, movers, EMPTY.body, EMPTY.time, projection)
+
+
+edges_at = jax.jit(lambda blocked, times: blocked.edges_at(times))
+overlaps = jax.jit(lambda path, movers: overlap(path, movers, EMPTY.body, jnp.zeros(()), 0.0))
+limits_along = jax.jit(lambda path: speed_limits(path, EMPTY.body, EMPTY.limits))
 
 
 @pytest.mark.parametrize("path", [STRAIGHT, BENT], ids=["straight", "bent"])
@@ -106,7 +113,7 @@ def test_quadrangles_hold_whatever_the_body_meets_and_little_else(path):
     for seed in range(10):
         movers = crossing(np.random.default_rng(seed), path, 2)
         apart = np.asarray(least_distance(path, movers, times, stations))
-        found = is_inside(project(path, movers), times, stations)
+        found = is_inside(project(path, movers, Projection(margin=0.0)), times, stations)
         assert not (~found & (apart < -1e-4)).any()
         held, exact = held + found.sum(), exact + (apart < 0.0).sum()
         near += (found & (apart < 0.1)).sum()
@@ -116,45 +123,48 @@ def test_quadrangles_hold_whatever_the_body_meets_and_little_else(path):
 
 def test_a_square_that_crosses_a_straight_path_blocks_it_just_as_long_as_they_overlap():
     movers = obstacles([SQUARE + [3.0, 2.0]], [0.0, 0.5])
-    begin, finish = overlap(STRAIGHT, movers, EMPTY.body, jnp.zeros(()), 0.0)
+    begin, finish = jax.device_get(overlaps(STRAIGHT, movers))
     x = np.asarray(STRAIGHT.pos)[:, 0]
     meets = (x + 0.35 > 2.8) & (x - 0.05 < 3.2)
     # Their sides meet after 2 m less 0.2 m and half the width of 0.25 m, at 0.5 m/s.
     np.testing.assert_allclose(begin[0, meets], (2.0 - 0.325) / 0.5, rtol=1e-5)
     np.testing.assert_allclose(finish[0, meets], (2.0 + 0.325) / 0.5, rtol=1e-5)
-    assert (np.asarray(begin[0, ~meets]) >= np.asarray(finish[0, ~meets])).all()
+    assert (begin[0, ~meets] >= finish[0, ~meets]).all()
 
 
 def test_a_path_that_comes_back_is_blocked_in_two_runs():
-    length = jnp.asarray(5.0)
-    loop = path_along(jnp.zeros(3), length, jnp.full(129, 2.0 * np.pi / 5.0))
+    loop = along(np.zeros(3, np.float32), np.float32(5.0), np.full(129, 0.4 * np.pi, np.float32))
     movers = obstacles([SQUARE], [0.0, 1e-3])  # stays at its beginning, which is its end
-    found = blocked_by(loop, movers, EMPTY.body, EMPTY.time, Projection(runs=2, slabs=1))
+    found = project(loop, movers, Projection(runs=2, slabs=1))
     assert found.present.tolist() == [True, True]
-    middle = np.asarray(found.edges_at(jnp.asarray(5.0))).mean(axis=0)
+    middle = np.asarray(edges_at(found, np.float32(5.0))).mean(axis=0)
     assert middle[0] < 1.0 and middle[1] > 4.0
-    one = blocked_by(loop, movers, EMPTY.body, EMPTY.time, Projection(runs=1, slabs=1))
-    low, high = one.edges_at(jnp.asarray(5.0))
+    one = project(loop, movers, Projection(runs=1, slabs=1))
+    low, high = jax.device_get(edges_at(one, np.float32(5.0)))
     assert low[0] <= 0.0 and high[0] >= 5.0  # joined, they block all that lies between
 
 
 def test_speed_is_limited_by_lateral_acceleration_and_by_the_steering_rate():
-    body, limits = EMPTY.body, EMPTY.limits
-    arc = path_along(jnp.zeros(3), jnp.asarray(2.0), jnp.full(9, -1.6))
-    np.testing.assert_allclose(speed_limits(arc, body, limits), np.sqrt(0.8 / 1.6), rtol=1e-6)
-    np.testing.assert_allclose(speed_limits(STRAIGHT, body, limits), 1.5)
+    origin = np.zeros(3, np.float32)
+    arc = along(origin, np.float32(2.0), np.full(129, -1.6, np.float32))
+    np.testing.assert_allclose(limits_along(arc), np.sqrt(0.8 / 1.6), rtol=1e-6)
+    np.testing.assert_allclose(limits_along(STRAIGHT), 1.5)
     # From straight to 0.5 / m in 0.05 m; tan(delta) = 0.3 * curvature, fastest where straight.
-    step = path_along(jnp.zeros(3), jnp.asarray(0.05), jnp.array([0.0, 0.5]))
-    np.testing.assert_allclose(speed_limits(step, body, limits), [2.0 / (0.3 * 10.0)], rtol=1e-5)
+    step = along(origin, np.float32(0.05), np.float32([0.0, 0.5]))
+    np.testing.assert_allclose(limits_along(step), [2.0 / (0.3 * 10.0)], rtol=1e-5)
 
 
 def test_the_way_of_a_drive_is_that_of_the_car():
     rng = np.random.default_rng(1)
     speed = np.append(rng.uniform(0.2, 1.2, 16), 0.0).astype(np.float32)
     curvature = rng.uniform(-1.5, 1.5, 17).astype(np.float32)
-    start, time = jnp.array([1.0, 2.0, 0.3]), jnp.asarray(4.0)
-    path = path_of_drive(start, time, jnp.asarray(speed), jnp.asarray(curvature), 129)
-    end = pose_at(start, time, jnp.asarray(speed), jnp.asarray(curvature), time)
+
+    @jax.jit
+    def driven(*drive):
+        return path_of_drive(*drive, 129), pose_at(*drive, drive[1])
+
+    start = np.float32([1.0, 2.0, 0.3])
+    path, end = jax.device_get(driven(start, np.float32(4.0), speed, curvature))
     np.testing.assert_allclose(path.pos[-1], end[:2], atol=5e-3)
     np.testing.assert_allclose(path.heading[-1], end[2], atol=5e-3)
     np.testing.assert_allclose(
@@ -163,14 +173,19 @@ def test_the_way_of_a_drive_is_that_of_the_car():
 
 
 def test_a_car_drives_beside_arcs_without_a_jump_of_its_curvature():
-    start = jnp.array([0.0, 0.0, 0.0])
-    way = dubins(start, jnp.array([1.5, 1.5, 2.0]), jnp.asarray(1.6))
-    poses = sample_dubins(way, 129)
-    bends = jnp.diff(poses[:, 2], append=poses[-1:, 2]) * (128 / way.length)
-    rate = jnp.asarray(8.0)
-    path = path_beside(
-        start, jnp.zeros(()), poses[:, :2], bends, way.length, jnp.asarray(2.0), rate
-    )
+
+    @jax.jit
+    def beside(start, goal):
+        """The way of arcs, its curvature, and the path of a car beside it."""
+        way = dubins(start, goal, jnp.asarray(1.6))
+        poses = sample_dubins(way, 129)
+        bends = jnp.diff(poses[:, 2], append=poses[-1:, 2]) * (128 / way.length)
+        most, rate = jnp.asarray(2.0), jnp.asarray(8.0)
+        path = path_beside(start, jnp.zeros(()), poses[:, :2], bends, way.length, most, rate)
+        return poses, bends, path
+
+    goal = np.float32([1.5, 1.5, 2.0])
+    poses, bends, path = jax.device_get(beside(np.zeros(3, np.float32), goal))
     away = np.linalg.norm(path.pos - poses[:, :2], axis=1)
     assert away.max() < 0.06
     assert path.curvature[0] == 0.0 and np.abs(path.curvature).max() <= 2.0
@@ -212,14 +227,19 @@ def test_a_drive_follows_its_path_and_ends_where_it_ends():
     np.testing.assert_allclose(poses[-1, :2], BENT.pos[-1], atol=0.01)
 
 
-@pytest.mark.parametrize("length", [3.0, 5.0, 8.0])
-def test_constant_speed_is_reached_by_the_shortest_ramp_and_ends_in_time(length):
-    path = dataclasses.replace(STRAIGHT, length=jnp.asarray(length))
+@jax.jit
+def ramped(path, times):
     problem = station_time_problem(
         path, EMPTY.movers, EMPTY.body, EMPTY.limits, EMPTY.time, EMPTY.speed
     )
-    times = jnp.linspace(0.0, 10.0, 1001)
-    station, speed = ramp_and_cruise(problem, times)
+    return ramp_and_cruise(problem, times)
+
+
+@pytest.mark.parametrize("length", [3.0, 5.0, 8.0])
+def test_constant_speed_is_reached_by_the_shortest_ramp_and_ends_in_time(length):
+    times = np.linspace(0.0, 10.0, 1001, dtype=np.float32)
+    path = dataclasses.replace(STRAIGHT, length=np.float32(length))
+    station, speed = jax.device_get(ramped(path, times))
     np.testing.assert_allclose(station[-1], length, rtol=1e-5)
     np.testing.assert_allclose(np.gradient(station, times)[1:-1], speed[1:-1], atol=6e-3)
     rise = np.diff(speed) * 100.0
@@ -228,12 +248,14 @@ def test_constant_speed_is_reached_by_the_shortest_ramp_and_ends_in_time(length)
 
 def test_ways_on_either_side_of_a_wall_differ_by_a_turn_and_others_by_none():
     walls = obstacles([SQUARE + [4.0, 4.0], SQUARE + [4.0, 1.0]])
-    start, goal = jnp.array([1.0, 4.0]), jnp.array([7.0, 4.1])
+    start, goal = np.float32([1.0, 4.0]), np.float32([7.0, 4.1])
+    turning = jax.jit(turns_around)
     x = np.linspace(1.2, 6.8, 30)
     bend = np.sin((x - 1.0) / 6.0 * np.pi)
 
     def turns(height):
-        return turns_around(walls, start, jnp.asarray(np.stack([x, 4.0 + height * bend], 1)), goal)
+        points = np.stack([x, 4.0 + height * bend], 1, dtype=np.float32)
+        return np.asarray(turning(walls, start, points, goal))
 
     above, far_above, below = turns(1.0), turns(2.5), turns(-1.0)
     np.testing.assert_array_equal(above, far_above)

@@ -109,7 +109,7 @@ def test_a_trajectory_comes_to_rest_smoothly_after_its_end():
 def tracked():
     """A few quadrotors tracking the same trajectory from different attitudes, 0.8 s."""
     world, robot = CATCH_WORLD, CATCH_WORLD.robot
-    plan, path = SimpleNamespace(trajectory=wiggle()), with_rest(wiggle())
+    plan, path = SimpleNamespace(trajectory=wiggle()), jax.jit(with_rest)(wiggle())
 
     def one(tilt):
         start = at_rest(world, jnp.array([0.0, 0.0, 1.0]))
@@ -197,14 +197,19 @@ def moments(gap_before, gap_after, aside):
     return at(gap_before), at(gap_after)
 
 
+@jax.jit
+def contact_of(before, after):
+    passes, later = passage(CATCH_WORLD, before, after, 1.0, jnp.zeros(1), jnp.zeros(3))
+    return nearest(no_contact(1), passes, later)
+
+
 @pytest.mark.parametrize(
     ("gaps", "aside", "met"),
     [((0.003, -0.007), 0.1, True), ((0.003, -0.007), 0.13, False), ((-0.007, 0.003), 0.1, False)],
 )
 def test_a_ball_is_caught_from_above_inside_the_radius_at_the_interpolated_time(gaps, aside, met):
     before, after = moments(*gaps, aside)
-    passes, later = passage(CATCH_WORLD, before, after, 1.0, jnp.zeros(1), jnp.zeros(3))
-    contact = nearest(no_contact(1), passes, later)
+    contact = contact_of(before, after)
     assert bool(contact.met[0]) == met
     if gaps[0] > 0.0:
         np.testing.assert_allclose(contact.time, 1.0 + 0.3 * CATCH_WORLD.timestep, rtol=1e-6)
@@ -214,8 +219,9 @@ def test_a_ball_is_caught_from_above_inside_the_radius_at_the_interpolated_time(
 def test_the_drag_is_found_from_the_energy_that_is_lost():
     sensing, true = Sensing(position_std=0.002), jnp.float32(0.0616)
     ball = BallState(jnp.array([4.0, 0.0, 0.8]), jnp.array([-4.0, 0.5, 7.0]))
-    path = fly(ball, 1.2, true, GRAVITY, num_steps=120)[1].pos
-    seen = observed(jax.random.key(0), path, sensing)
+    flown = jax.jit(functools.partial(fly, num_steps=130))(ball, 1.3, true, GRAVITY)
+    path, ahead = flown[1].pos[:120], flown[0].pos
+    seen = jax.jit(lambda path: observed(jax.random.key(0), path, sensing))(path)
 
     def advance(estimate, now):
         number, at = now
@@ -225,27 +231,46 @@ def test_the_drag_is_found_from_the_energy_that_is_lost():
         return jax.tree.map(lambda a, b: jnp.where(number < 30, a, b), fresh, later), None
 
     first = first_estimate(path[0], 1.15 * true)
-    found, _ = jax.jit(lambda e: jax.lax.scan(advance, e, (jnp.arange(120), seen)))(first)
-    assert abs(found.drag / true - 1.0) < 0.06
-    ahead = fly(ball, 1.3, true, GRAVITY, num_steps=130)[0].pos
-    np.testing.assert_allclose(predicted(found, 0.1, GRAVITY).pos, ahead, atol=0.02)
+
+    @jax.jit
+    def followed(first):
+        last = jax.lax.scan(advance, first, (jnp.arange(120), seen))[0]
+        return last.drag, predicted(last, 0.1, GRAVITY).pos
+
+    drag, later = followed(first)
+    assert abs(drag / true - 1.0) < 0.06
+    np.testing.assert_allclose(later, ahead, atol=0.02)
 
 
 def test_an_awaited_ball_is_believed_to_come_as_it_is_guessed():
     loop = Loop(dataclasses.replace(CATCH_WORLD, num_balls=2), NOISES["lab"], replan=100.0)
     coming = BallState(jnp.array([2.9, 0.1, 2.4]), jnp.array([-3.0, 0.5, 4.0]))
-    flights = ready(loop, jnp.zeros((3, 3)), jax.random.split(jax.random.key(0), 3))
-    believed = jnp.full((3, 2), 0.06)
-    flights = awaited(loop, flights, coming, believed, ball=1, ahead=0.8)
-    for estimates, ahead in ((flights.estimates, 0.8), (flights.earlier, 0.8 + loop.period)):
-        then = jax.vmap(lambda known, ahead=ahead: expected(loop, known, ahead))(estimates)
-        np.testing.assert_allclose(then.pos[:, 1], jnp.tile(coming.pos, (3, 1)), atol=2e-3)
-        np.testing.assert_allclose(then.vel[:, 1], jnp.tile(coming.vel, (3, 1)), atol=5e-3)
-    np.testing.assert_allclose(flights.estimates.drag[:, 1], 0.06)
+
+    @jax.jit
+    def believed(coming):
+        """The balls then, of both estimates, and the drag."""
+        flights = ready(loop, jnp.zeros((3, 3)), jax.random.split(jax.random.key(0), 3))
+        drag = jnp.full((3, 2), 0.06)
+        flights = awaited(loop, flights, coming, drag, ball=1, ahead=0.8)
+        then = [
+            jax.vmap(lambda known, ahead=ahead: expected(loop, known, ahead))(estimates)
+            for estimates, ahead in (
+                (flights.estimates, 0.8),
+                (flights.earlier, 0.8 + loop.period),
+            )
+        ]
+        return then, flights.estimates.drag
+
+    both, drag = jax.device_get(believed(coming))
+    for then in both:
+        np.testing.assert_allclose(then.pos[:, 1], np.tile(coming.pos, (3, 1)), atol=2e-3)
+        np.testing.assert_allclose(then.vel[:, 1], np.tile(coming.vel, (3, 1)), atol=5e-3)
+    np.testing.assert_allclose(drag[:, 1], 0.06)
 
 
 def test_a_lost_look_shows_nothing():
-    seen = observed(jax.random.key(1), jnp.zeros((2000, 3)), Sensing(dropout=0.25))
+    sensing = Sensing(dropout=0.25)
+    seen = jax.jit(lambda key: observed(key, jnp.zeros((2000, 3)), sensing))(jax.random.key(1))
     assert abs(np.isnan(seen[:, 0]).mean() - 0.25) < 0.04
 
 
