@@ -1,16 +1,15 @@
 """The words of the task: `pj.catch.planner` and `judge`; `case` and `draw` stand beside."""
 
-import pkgutil
 from typing import Any
 
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.protocol import Decision
 from planner_jax.referee.catch import CatchVerdict, referee_catches
-from planner_jax.registry import require_name
 from planner_jax.task.catch.card import DECISIONS, TASK
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.task.judged import judged
+from planner_jax.task.named_decision import named_decision
 
 
 def planner(
@@ -37,19 +36,7 @@ def planner(
         ValueError: there is no planner or decision of that name.
         TypeError: the planner has no such field.
     """
-    return DecidedPlanner(TASK.make_planner(name, options), decision(decide))
-
-
-def decision(decide: str | Decision) -> Decision:
-    """The decision of a name, or the decision itself.
-
-    Raises:
-        ValueError: there is no decision of that name.
-    """
-    if not isinstance(decide, str):
-        return decide
-    require_name(DECISIONS, "decide", decide)
-    return pkgutil.resolve_name(DECISIONS[decide])()
+    return DecidedPlanner(TASK.make_planner(name, options), named_decision(DECISIONS, decide))
 
 
 def judge(cases: CatchCase, plans: CatchPlan, **settings: Any) -> CatchVerdict:

@@ -22,7 +22,7 @@ from planner_jax.protocol import Attempt
 from planner_jax.robot.car import pose_at
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.plan import InterceptPlan
-from planner_jax.task.intercept.spacetime import Guess, Search, SpacetimeIntercept
+from planner_jax.task.intercept.spacetime import Search, SpacetimeIntercept
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,7 +115,7 @@ class ReplanIntercept:
         case, planner = task.case, self.planner
         time = jnp.maximum(task.previous.time - task.elapsed, 0.5 * self.shortest)
         point = planner.point(*self.rest(task, time), time)
-        guess = Guess(point=point, places=jnp.zeros((planner.pieces, 2), point.dtype))
+        guess = planner.guess_at(point)
         grid = planner.grid(case, planner.attempts[0])
         stages = [
             dataclasses.replace(stage, steps=jnp.where(time < self.shortest, 0, stage.steps))

@@ -79,8 +79,8 @@ class SmoothIntercept(OptimisedPlanner):
     def model(self, point: Array, context: _Context) -> Model:
         """The sum of squares and its quadratic model."""
         planner = self.planner
-        nowhere = jnp.zeros((planner.pieces, 2), point.dtype)  # nothing is followed
-        return planner.model(point, context.moving, context.field, planner.weights, nowhere)
+        places = planner.guess_at(point).places
+        return planner.model(point, context.moving, context.field, planner.weights, places)
 
     def exact_model(self, point: Array, context: _Context) -> Model:
         """The same with the gradient of the cost itself.

@@ -388,12 +388,16 @@ class SpacetimeIntercept:
     ) -> InterceptPlan:
         """A plan after the last stage alone, if it is solved."""
         point = self.point(plan.speed[1:], plan.curvature[1:], plan.time)
-        guess = Guess(point=point, places=jnp.zeros((self.pieces, 2), point.dtype))
+        guess = self.guess_at(point)
         last = self.last_stages(attempt)[-1]
         steps = jnp.where(is_solved(plan.status), last.steps, 0)
         stage = dataclasses.replace(last, steps=steps, of_good=False)
         points, steps = self.staged(case, field, guess, attempt.solver, [stage])
         return self.better_of_two(plan, self.plan_at(case, points[0], plan.iterations + steps))
+
+    def guess_at(self, point: Array) -> Guess:
+        """A guess of unknowns (n,) for stages that follow no way of cells."""
+        return Guess(point=point, places=jnp.zeros((self.pieces, 2), point.dtype))
 
     def guess(self, case: InterceptCase, grid: reach.Grid, way: reach.Way, layer: Array) -> Guess:
         """Unknowns and places along a way of cells up to a layer."""

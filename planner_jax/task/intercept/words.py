@@ -1,6 +1,5 @@
 """The words of the task: `pj.intercept.draw`, `planner` and `judge`; `case` stands beside."""
 
-import pkgutil
 from typing import Any
 
 import jax
@@ -9,10 +8,9 @@ import numpy as np
 
 from planner_jax.plane.target import PlanePath
 from planner_jax.planning.decided import DecidedPlanner
-from planner_jax.protocol import AnyPlanner, Decision
+from planner_jax.protocol import AnyPlanner
 from planner_jax.referee.intercept import InterceptVerdict, referee_intercepts
 from planner_jax.referee.intercept_group import referee_groups
-from planner_jax.registry import require_name
 from planner_jax.task.intercept.card import DECISIONS, GROUPS, SUITES, TASK
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.group import GroupPlan, InterceptGroup
@@ -20,6 +18,7 @@ from planner_jax.task.intercept.group_suites import draw_groups
 from planner_jax.task.intercept.plan import InterceptPlan
 from planner_jax.task.intercept.suites import draw_cases
 from planner_jax.task.judged import judged
+from planner_jax.task.named_decision import named_decision
 
 
 def draw(
@@ -83,19 +82,7 @@ def planner(name: str = "spacetime", **options: Any) -> AnyPlanner[Any, Any]:
     if name != "group":
         return TASK.make_planner(name, options)
     decide = options.pop("decide", "best")
-    return DecidedPlanner(TASK.make_planner(name, options), decision(decide))
-
-
-def decision(decide: str | Decision) -> Decision:
-    """The decision of a name, or the decision itself.
-
-    Raises:
-        ValueError: there is no decision of that name.
-    """
-    if not isinstance(decide, str):
-        return decide
-    require_name(DECISIONS, "decide", decide)
-    return pkgutil.resolve_name(DECISIONS[decide])()
+    return DecidedPlanner(TASK.make_planner(name, options), named_decision(DECISIONS, decide))
 
 
 def judge(
