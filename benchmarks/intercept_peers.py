@@ -36,6 +36,9 @@ from planner_jax.task.intercept.path_then_speed import PathThenSpeed
 BASELINES = "numba not installed: pip install 'planner-jax[baselines]' for the planner paper"
 SOFT_END = 3.0 * 10.0**3 / 10.0  # w_2 T^3 / w_1 of the paper's weights, 3 and 10, and T = 10 s
 PAIRS = (
+    ("spacetime", "em"),
+    ("best", "lattice"),
+    ("best", "em-exact"),
     ("lattice, best path", "em"),
     ("lattice, best path", "em-exact"),
     ("lattice, best path", "constant"),
@@ -50,7 +53,7 @@ TABLE_III = {"path": 150.0, "speed": 3.0, "total": 154.0}  # [ms], means; the sp
 def planners() -> dict[str, Any]:
     """Every planner by name."""
     named = {
-        "spacetime": pj.intercept.planner("spacetime"),
+        **{name: pj.intercept.planner(name) for name in ("spacetime", "best", "quick")},
         "lattice": pj.intercept.planner("lattice"),
         "lattice, best path": pj.intercept.planner("lattice", tries=1),
         "em": pj.intercept.planner("em"),

@@ -26,7 +26,9 @@ from planner_jax.plane.obstacles import Obstacles, distances
 
 _STENCIL = 32  # cells along either side of what is drawn of one moving obstacle
 _FARTHEST = 16  # cells that the car moves in half a layer, at most
-_UNEVEN = 2.0  # how much a change of speed counts in a way, where a turn by a bin counts one
+# What counts against a step of a way, beside noise.
+_TURNING = 0.5  # a turn by a bin, and a change of the turn
+_UNEVEN = 1.0  # a change of speed by a level
 _SPAN = 3  # bins of heading to either side that a layer may turn, at most
 
 
@@ -383,20 +385,50 @@ def goal_cells(
 
 @struct.dataclass
 class Chance:
-    """Gumbel noise that one random way takes, or that of some with a leading axis."""
+    """Gumbel noise that one way takes, the smoothest of D, or many ways with a leading axis."""
 
     layers: Array  # (layers + 1,), on when it ends
-    ends: Array  # (levels, headings, 9), on where it ends
-    steps: Array  # (layers, 3 (2 _SPAN + 1)), on where it comes from
+    ends: Array  # (D, levels, headings, 9), on where it ends
+    steps: Array  # (D, layers, 3 (2 _SPAN + 1)), on where it comes from
 
 
-def draw_chance(lattice: Lattice, num: int, seed: int) -> Chance:
+def draw_chance(lattice: Lattice, num: int, seed: int, drawn: int) -> Chance:
     """Noise for some ways, the same for all cases, so that none draws it anew."""
     rng = np.random.default_rng(seed)
-    ends = rng.gumbel(size=(num, lattice.levels, lattice.headings, 9))
-    steps = rng.gumbel(size=(num, lattice.layers, 3 * (2 * _SPAN + 1)))
+    ends = rng.gumbel(size=(num, drawn, lattice.levels, lattice.headings, 9))
+    steps = rng.gumbel(size=(num, drawn, lattice.layers, 3 * (2 * _SPAN + 1)))
     layers = rng.gumbel(size=(num, lattice.layers + 1))
     return Chance(*(jnp.asarray(each, jnp.float32) for each in (layers, ends, steps)))
+
+
+def smooth_way(
+    grid: Grid,
+    reach: ReachSet,
+    num: Array,
+    cells: Array,
+    there: Array,
+    chance: Chance,
+    directness: float,
+) -> Way:
+    """The smoothest of some random ways to a goal; arguments as of `draw_way`."""
+    ways = jax.vmap(
+        lambda ends, steps: draw_way(grid, reach, num, cells, there, ends, steps, directness)
+    )(chance.ends, chance.steps)
+    best = jnp.argmin(jax.vmap(lambda way: _roughness(way, grid.lattice, num))(ways))
+    return jax.tree.map(lambda leaf: leaf[best], ways)
+
+
+def _velocity(level: Array, heading: Array, lattice: Lattice) -> Array:
+    """Velocities (..., 2) of levels and bins (...), in levels, along the heading of bin 0."""
+    angle = (2.0 * np.pi / lattice.headings) * heading
+    return level[..., None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
+
+
+def _roughness(way: Way, lattice: Lattice, num: Array) -> Array:
+    """Sum of the squared changes of velocity over two layers, in levels of speed."""
+    velocity = _velocity(way.level, way.bin, lattice)
+    change = jnp.sum((velocity[2:] - velocity[:-2]) ** 2, axis=1)
+    return jnp.sum(jnp.where(jnp.arange(2, lattice.layers) < num, change, 0.0))
 
 
 def draw_way(
@@ -405,7 +437,9 @@ def draw_way(
     num: Array,
     cells: Array,
     there: Array,
-    chance: Chance,
+    ends: Array,
+    steps: Array,
+    directness: float,
 ) -> Way:
     """A random way to a goal, walked back from it.
 
@@ -415,10 +449,13 @@ def draw_way(
         num: () int32, the layer that meets the goal.
         cells: of `goal_cells`.
         there: of `goal_cells`; without any the way means nothing.
-        chance: what makes it this way and no other.
+        ends: (levels, headings, 9), noise on where it ends.
+        steps: (layers, 3 (2 _SPAN + 1)), noise on where it comes from.
+        directness: what counts against a velocity beside the mean of the way up to there, squared,
+            in levels of speed; more makes ways straight and even, none makes them differ more.
     """
     lattice = grid.lattice
-    noise = chance.ends + jnp.where(jnp.arange(9) == 0, 1.0, 0.0)  # rather at the goal itself
+    noise = ends + jnp.where(jnp.arange(9) == 0, 1.0, 0.0)  # rather at the goal itself
     best = jnp.argmax(jnp.where(there, noise, -jnp.inf))
     level, heading, around = jnp.unravel_index(best, there.shape)
     choices = jnp.asarray(
@@ -428,6 +465,11 @@ def draw_way(
         jnp.int32,
     )
 
+    # Velocities are in levels of speed, along the heading of bin 0 and across.
+    cosine, sine = jnp.cos(grid.heading), jnp.sin(grid.heading)
+    along = jnp.stack([jnp.stack([cosine, sine]), jnp.stack([-sine, cosine])])
+    along *= (lattice.levels - 1) / lattice.pace
+
     def back(state: tuple, n: Array) -> tuple[tuple, tuple]:
         level, heading, cell, last = state
         before = cell - jnp.sum(reach.moves[n, level, heading % lattice.headings], axis=0)
@@ -435,8 +477,12 @@ def draw_way(
         bits = reach.bits[n]
         is_way = jax.vmap(lambda v, h: bit_at(bits, v, h, before))(from_level, heading - turn)
         is_way &= reach.turns[n, level, turn + _SPAN]
-        rough = jnp.abs(turn) + jnp.abs(turn - last) + _UNEVEN * jnp.abs(choices[:, 0])
-        chosen = jnp.argmax(jnp.where(is_way, chance.steps[n] - 0.5 * rough, -jnp.inf))
+        rough = _TURNING * (jnp.abs(turn) + jnp.abs(turn - last))
+        rough += _UNEVEN * jnp.abs(choices[:, 0])
+        mean = jnp.dot(along, (before - grid.start) / (n + 0.5), precision=lax.Precision.HIGHEST)
+        velocity = _velocity(from_level, heading - turn, lattice)
+        rough += directness * jnp.sum((velocity - mean) ** 2, axis=-1)
+        chosen = jnp.argmax(jnp.where(is_way, steps[n] - rough, -jnp.inf))
         after = (from_level[chosen], heading - turn[chosen], before, turn[chosen])
         new = jax.tree.map(lambda a, b: jnp.where(n < num, a, b), after, state)
         return new, (level, heading, cell)

@@ -78,6 +78,8 @@ TASK = Task(
     home="planner_jax.task.intercept",
     planners={
         "spacetime": "planner_jax.task.intercept.spacetime:SpacetimeIntercept",
+        "quick": "planner_jax.task.intercept.spacetime:quick",
+        "best": "planner_jax.task.intercept.spacetime:best",
         "lattice": "planner_jax.task.intercept.path_then_speed:lattice",
         "paper": "planner_jax.task.intercept.paper:PaperIntercept",
         "em": "planner_jax.task.intercept.path_then_speed:em",

@@ -9,7 +9,7 @@ on the way; one that keeps every limit; and, once one does, one of less effort, 
 """
 
 import dataclasses
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -62,8 +62,10 @@ class Search(Attempt):
     ways: int = 16
     solver: LevenbergConfig = LevenbergConfig()  # of the stage that keeps limits
     following: int = 4  # steps along the way of cells
-    settling: int = 12  # steps towards less effort, or an earlier meeting
+    settling: int = 16  # steps towards less effort, or an earlier meeting
     seed: int = 0  # of the ways
+    drawn: int = 4  # ways for each that is tried: the smoothest of them
+    directness: float = 2.0  # of these ways; see `reach.draw_way`
     lattice: reach.Lattice = reach.Lattice()
     girth: float = 1.0  # of the body in the reach set; less finds ways that rounding closes
 
@@ -79,13 +81,29 @@ class Search(Attempt):
 _GIVEN = (
     Search(2, LevenbergConfig(10), following=3),
     Search(4, LevenbergConfig(16), seed=1, girth=0.9),
-    Search(16, LevenbergConfig(24), seed=2, girth=0.75),
+    Search(16, LevenbergConfig(24), seed=2, girth=0.75, drawn=1, directness=0.0),
 )
+_QUICK = (
+    Search(2, LevenbergConfig(8), following=3, settling=12),
+    Search(4, LevenbergConfig(10), settling=12, seed=1, girth=0.9),
+    Search(6, LevenbergConfig(14), settling=12, seed=2, girth=0.75, drawn=1, directness=0.0),
+)
+_BEST = (Search(8, LevenbergConfig(10), following=3, settling=48), *_GIVEN[1:])
 # Of a free time every way is tried, until it brings little, and the best one is kept. To hurry is
 # to leave the cells: early meetings come out earlier where nothing follows them.
-_EARLY = Search(32, LevenbergConfig(60, tolerance=5e-4), following=0, girth=0.85)
+_EARLY = Search(
+    32,
+    LevenbergConfig(60, tolerance=5e-4),
+    following=0,
+    girth=0.85,
+    drawn=1,
+    directness=0.0,
+)
 _LEAST = Search(16, LevenbergConfig(60, tolerance=5e-4))
-_LATER = (Search(8, seed=1, girth=0.9), Search(16, LevenbergConfig(30), seed=2, girth=0.75))
+_LATER = (
+    Search(8, seed=1, girth=0.9),
+    Search(16, LevenbergConfig(30), seed=2, girth=0.75, drawn=1, directness=0.0),
+)
 _SEARCHES = {
     "given": _GIVEN,
     "early": (_EARLY, *_LATER),
@@ -150,6 +168,7 @@ class SpacetimeIntercept:
     checked: int = 10  # the same, of the plan that is given back
     margin: float = 0.03  # [m], kept from obstacles
     slack: float = 0.015  # share of every limit that is kept free
+    tries_all: bool = False  # ways of a search, of which the best is kept; of a free time always
     searches: tuple[Search, ...] | None = None  # by default those that suit `meet`
 
     def __post_init__(self) -> None:
@@ -195,7 +214,7 @@ class SpacetimeIntercept:
     def solve(self, case: InterceptCase, attempt: Search) -> InterceptPlan:
         """The plan of one case: way after way, until one keeps every limit.
 
-        Of a free meeting time all ways are tried, and the best one is taken.
+        With `tries_all`, or of a free meeting time, all are tried, and the best one is taken.
         """
         found = self.prepare(case, attempt)
         chances = self.chances(attempt)
@@ -208,7 +227,8 @@ class SpacetimeIntercept:
 
         def is_wanted(state: tuple) -> Array:
             k, best = state
-            return (k < ways) & (self.is_time_free | ~is_solved(best.status))
+            tries_all = self.tries_all or self.is_time_free
+            return (k < ways) & (tries_all | ~is_solved(best.status))
 
         _, best = lax.while_loop(is_wanted, try_way, (0, straight_on(case, self.pieces)))
         return self.explained(case, attempt, found.is_reached, best)
@@ -228,24 +248,31 @@ class SpacetimeIntercept:
         return jax.vmap(lambda case: self.best_of_all(case, attempt, layers))(cases)
 
     def best_of_all(self, case: InterceptCase, attempt: Search, layers: Array) -> InterceptPlan:
-        """The plan of one case: all ways together, of which the best one is settled."""
+        """The plan of one case: all ways together, of which the best one is settled.
+
+        With `tries_all` each is settled first, and the best one is what it is then.
+        """
         found = self.prepare(case, attempt, layers)
 
         def kept(chance: reach.Chance) -> InterceptPlan:
-            guess, stages = self.begun(case, found, chance), self.stages(attempt)[:-1]
+            guess, stages = self.begun(case, found, chance, attempt), self.stages(attempt)[:-1]
             points, steps = self.staged(case, found.field, guess, attempt.solver, stages)
             return self.plan_at(case, points[-1], steps)
 
-        plans = jax.vmap(kept)(self.chances(attempt))
+        def improved(chance: reach.Chance) -> InterceptPlan:
+            return self.improved(case, found, chance, attempt)
+
+        plans = jax.vmap(improved if self.tries_all else kept)(self.chances(attempt))
         cost = jnp.where(is_solved(plans.status), plans.cost - 1e6, plans.violation)
         best = jnp.argmin(jnp.where(jnp.isfinite(cost), cost, jnp.inf))
         plan = jax.tree.map(lambda leaf: leaf[best], plans)
-        plan = self.settled(case, found.field, plan, attempt)
+        if not self.tries_all:
+            plan = self.settled(case, found.field, plan, attempt)
         return self.explained(case, attempt, found.is_reached, plan)
 
     def chances(self, attempt: Search) -> reach.Chance:
         """What makes the ways of an attempt, a leading axis for its starts."""
-        return reach.draw_chance(attempt.lattice, attempt.ways, attempt.seed)
+        return reach.draw_chance(attempt.lattice, attempt.ways, attempt.seed, attempt.drawn)
 
     def grid(self, case: InterceptCase, attempt: Search) -> reach.Grid:
         """Where the cells and layers of a case lie."""
@@ -305,14 +332,18 @@ class SpacetimeIntercept:
         self, case: InterceptCase, found: Found, chance: reach.Chance, attempt: Search
     ) -> InterceptPlan:
         """The plan that one random way leads to."""
-        guess = self.begun(case, found, chance)
+        guess = self.begun(case, found, chance, attempt)
         return self.refined(case, found.field, guess, attempt.solver, self.stages(attempt))
 
-    def begun(self, case: InterceptCase, found: Found, chance: reach.Chance) -> Guess:
+    def begun(
+        self, case: InterceptCase, found: Found, chance: reach.Chance, attempt: Search
+    ) -> Guess:
         """Where least squares begin on a random way."""
         layer = self.layer(found, chance)
         cells, there = self.meetings(case, found.grid, found.reach, layer)
-        way = reach.draw_way(found.grid, found.reach, layer, cells, there, chance)
+        way = reach.smooth_way(
+            found.grid, found.reach, layer, cells, there, chance, attempt.directness
+        )
         return self.guess(case, found.grid, way, layer)
 
     def layer(self, found: Found, chance: reach.Chance) -> Array:
@@ -511,3 +542,21 @@ class SpacetimeIntercept:
         less = (later.violation < plan.violation) | ~jnp.isfinite(plan.violation)
         better = jnp.where(both, later.cost < plan.cost, less & ~is_solved(plan.status))
         return jax.tree.map(lambda new, old: jnp.where(better, new, old), later, plan)
+
+
+def quick(**fields: Any) -> SpacetimeIntercept:
+    """The default planner with fewer ways and steps, for meetings at the case's time.
+
+    Args:
+        **fields: of `SpacetimeIntercept`.
+    """
+    return SpacetimeIntercept(**{"searches": _QUICK, **fields})
+
+
+def best(**fields: Any) -> SpacetimeIntercept:
+    """The default planner with more ways and steps, of which the plan of least effort is kept.
+
+    Args:
+        **fields: of `SpacetimeIntercept`.
+    """
+    return SpacetimeIntercept(**{"searches": _BEST, "tries_all": True, **fields})

@@ -61,7 +61,7 @@ class PathSource:
         num = self.drawn * attempt.ways
         layer = jnp.minimum(first + 1 + np.arange(num) % self.later, found.grid.num)
         layer = jnp.where(arrivals[layer], layer, first).astype(jnp.int32)
-        chances = reach.draw_chance(attempt.lattice, num, attempt.seed)
+        chances = reach.draw_chance(attempt.lattice, num, attempt.seed, 1)
         times, guesses = jax.vmap(lambda n, chance: self.guess(still, found, n, chance))(
             layer, chances
         )
@@ -101,7 +101,7 @@ class PathSource:
         """When a random way arrives that ends at a layer, and where least squares begin."""
         grid = found.grid
         cells, there = self.planner.meetings(case, grid, found.reach, layer)
-        way = reach.draw_way(grid, found.reach, layer, cells, there, chance)
+        way = reach.smooth_way(grid, found.reach, layer, cells, there, chance, 0.0)
         time = (layer + 0.5) * grid.step
         guess = self.planner.guess(dataclasses.replace(case, time=time), grid, way, layer)
         return time, guess

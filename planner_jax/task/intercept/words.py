@@ -54,6 +54,8 @@ def planner(name: str = "spacetime", **options: Any) -> AnyPlanner[Any, Any]:
     """The intercept planner of a name, with some of its fields set.
 
     * `spacetime`: way and speed together, from a reach set in space and time.
+    * `quick`: the same with fewer ways and steps, for large batches on a GPU.
+    * `best`: the same with more ways and steps, of which the plan of least effort is kept.
     * `lattice`: a path among what stands, then a speed along it among what moves, on eight paths
       from a reach set; the best one is kept.
     * `paper`: one path by Hybrid A*, smoothed, then a speed along it, as paper 003 has it; on the
