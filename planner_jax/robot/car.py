@@ -14,6 +14,7 @@ from flax import struct
 from jax import Array
 
 from planner_jax.protocol import Plan
+from planner_jax.robot.setpoints import sampled_at_rate
 
 
 @struct.dataclass
@@ -73,24 +74,17 @@ class CarPlan(Plan):
         Raises:
             ValueError: the rate is not positive.
         """
-        if not rate > 0.0:
-            raise ValueError(f"rate must be > 0, got {rate}")
-        is_one = np.ndim(self.time) == 0
-        start, end, speed, curvature = (
-            np.asarray(leaf)[None] if is_one else np.asarray(leaf)
-            for leaf in (self.start, self.time, self.speed, self.curvature)
+        leaves = map(np.asarray, (self.start, self.time, self.speed, self.curvature))
+        start, end, speed, curvature = leaves
+        if end.ndim == 0:
+            start, speed, curvature = start[None], speed[None], curvature[None]
+        ends = np.reshape(end, (-1,))
+        time, setpoints = sampled_at_rate(
+            rate,
+            end,
+            lambda time: _sampled(start, ends, speed, curvature, time.astype(speed.dtype)),
         )
-        last = np.nanmax(end, initial=0.0)
-        time = np.arange(int(last * rate * (1.0 + 1e-6)) + 1) / rate
-        sampled = jax.tree.map(
-            np.array, _sampled(start, end, speed, curvature, time.astype(speed.dtype))
-        )
-        past = ~(time <= end[:, None] * (1.0 + 1e-6))
-        for leaf in sampled.values():
-            leaf[past] = np.nan
-        return CarSetpoints(
-            time=time, **{name: leaf[0] if is_one else leaf for name, leaf in sampled.items()}
-        )
+        return CarSetpoints(time=time, **setpoints)
 
 
 # Gauss-Legendre nodes and weights on (0, 1), exact to order 9.

@@ -11,6 +11,7 @@ from jax import Array
 
 from planner_jax.protocol import Plan
 from planner_jax.robot.quadrotor import body_z, flat_attitude, net_thrust, tilt_quaternion
+from planner_jax.robot.setpoints import sampled_at_rate
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, states_at
 
 
@@ -43,23 +44,14 @@ class QuadrotorPlan(Plan):
         Raises:
             ValueError: the rate is not positive.
         """
-        if not rate > 0.0:
-            raise ValueError(f"rate must be > 0, got {rate}")
-        is_one = np.ndim(self.gravity) == 0
-        path, gravity = jax.tree.map(
-            lambda leaf: np.asarray(leaf)[None] if is_one else np.asarray(leaf),
-            (self.trajectory, self.gravity),
-        )
+        path, gravity = jax.tree.map(np.asarray, (self.trajectory, self.gravity))
         ends = path.durations.sum(axis=-1)
-        last = np.nanmax(ends, initial=0.0)
-        time = np.arange(int(last * rate * (1.0 + 1e-6)) + 1) / rate
-        sampled = jax.tree.map(np.array, _sampled(path, gravity, time.astype(path.coeffs.dtype)))
-        past = ~(time <= ends[:, None] * (1.0 + 1e-6))
-        for leaf in sampled.values():
-            leaf[past] = np.nan
-        return QuadrotorSetpoints(
-            time=time, **{name: leaf[0] if is_one else leaf for name, leaf in sampled.items()}
+        if ends.ndim == 0:
+            path, gravity = jax.tree.map(lambda leaf: leaf[None], (path, gravity))
+        time, setpoints = sampled_at_rate(
+            rate, ends, lambda time: _sampled(path, gravity, time.astype(path.coeffs.dtype))
         )
+        return QuadrotorSetpoints(time=time, **setpoints)
 
 
 def handover(

@@ -1,0 +1,5 @@
+"""Blocks: an arm with a shield protects a box from thrown balls (paper 004)."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

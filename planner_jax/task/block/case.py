@@ -1,0 +1,124 @@
+"""One thrown ball, and the arm that is to block it."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+from planner_jax.ball.flight import BallState
+from planner_jax.registry import require_name
+from planner_jax.robot.arm import REGIMES, Arm, ArmLimits
+from planner_jax.robot.arm_mjcf import irb1600
+from planner_jax.task.block.scene import Scene, paper_scene
+
+# How exactly the ball is to be met: greatest distance from the middle of the shield [m], and
+# greatest angle [rad] between the shield's normal and the way that the ball comes from.
+TOLERANCES = {"strict": (0.002, np.deg2rad(0.5)), "wide": (0.1, np.deg2rad(30.0))}
+
+
+@struct.dataclass
+class BlockCase:
+    """One case. Every number is a leaf: batch it, randomise it, differentiate by it.
+
+    Robot base frame, z up, SI units. Times count from the moment at which the ball is first seen.
+    """
+
+    ball: BallState  # when it is first seen; it falls freely
+    gravity: Array  # () [m/s^2], magnitude
+    delay: Array  # () [s], until the arm may start
+    angles: Array  # (6,) [rad], of the arm until then
+    rates: Array  # (6,) [rad/s], of the joints then
+    arm: Arm
+    limits: ArmLimits
+    ends_at_rest: Array  # () bool, whether the arm must stand when it meets the ball
+    offset: Array  # () [m], greatest distance of the ball from the shield's middle then
+    tilt: Array  # () [rad], greatest angle between the shield's normal and the ball's way
+    scene: Scene
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """() for one case, (B,) for a batch."""
+        return np.shape(self.gravity)
+
+
+def case(
+    ball_pos: Any,
+    ball_vel: Any,
+    *,
+    delay: Any = 0.0,
+    regime: str = "R2",
+    tolerance: str = "strict",
+    scene: Scene | None = None,
+    arm: Arm | None = None,
+    angles: Any = None,
+    rates: Any = 0.0,
+    gravity: Any = 9.81,
+    dtype: Any = jnp.float32,
+) -> BlockCase:
+    """A ball to block, or a batch of them, by default in the scene of paper 004.
+
+    Args:
+        ball_pos: (3,) or (B, 3) [m], where the ball is first seen.
+        ball_vel: likewise [m/s].
+        delay: () or (B,) [s], until the arm may start, >= 0. So may be the angles, rates and
+            gravity: one value, or one a case.
+        regime: a key of `planner_jax.robot.arm.REGIMES`: "R1", the limits that the paper's
+            authors plan with, end velocity free; "R2", the data sheet's speeds and 30 rad/s^2,
+            from rest to rest; "R3", R1's limits from rest to rest.
+        tolerance: "strict", the ball at the shield's middle and straight on; or "wide", within
+            0.1 m and 30 degrees.
+        scene: without the batch's axes; that of the paper if not given.
+        arm: likewise; an IRB 1600 with a shield if not given.
+        angles: (6,) [rad], at the start; the arm's home if not given.
+        rates: (6,) [rad/s], at the start.
+        gravity: [m/s^2], > 0.
+        dtype: of every floating leaf.
+
+    Raises:
+        ValueError: a number is out of its range, or a name is not known; one line.
+    """
+    require_name(REGIMES, "regime", regime)
+    require_name(TOLERANCES, "tolerance", tolerance)
+    arm = irb1600() if arm is None else arm
+    angles = arm.home if angles is None else angles
+    ball_pos, ball_vel, angles, rates = map(np.asarray, (ball_pos, ball_vel, angles, rates))
+    vectors = {"ball_pos": (ball_pos, 3), "ball_vel": (ball_vel, 3), "angles": (angles, 6)}
+    for name, (value, size) in vectors.items():
+        if value.shape[-1:] != (size,):
+            raise ValueError(f"{name} must end with {size} numbers, got the shape {value.shape}")
+    if not np.all(np.asarray(delay) >= 0.0):
+        raise ValueError(f"delay must be >= 0, got {np.min(delay)}")
+    if not np.all(np.asarray(gravity) > 0.0):
+        raise ValueError(f"gravity must be > 0, got {np.min(gravity)}")
+    shapes = (value.shape[:-1] for value in (ball_pos, ball_vel, angles))
+    batch = np.broadcast_shapes(*shapes, np.shape(delay), np.shape(gravity))
+
+    def leaf(value: Any, *trailing: int) -> Array:
+        return jnp.asarray(np.broadcast_to(np.asarray(value), batch + trailing), dtype)
+
+    def shared(tree: Any) -> Any:
+        def one(value: Any) -> Array:
+            value = np.asarray(value)
+            kind = dtype if value.dtype.kind == "f" else value.dtype
+            return jnp.asarray(np.broadcast_to(value, batch + value.shape), kind)
+
+        return jax.tree.map(one, tree)
+
+    chosen = REGIMES[regime]
+    offset, tilt = TOLERANCES[tolerance]
+    return BlockCase(
+        ball=BallState(pos=leaf(ball_pos, 3), vel=leaf(ball_vel, 3)),
+        gravity=leaf(gravity),
+        delay=leaf(delay),
+        angles=leaf(angles, 6),
+        rates=leaf(rates, 6),
+        arm=shared(arm),
+        limits=shared(chosen.limits),
+        ends_at_rest=jnp.broadcast_to(jnp.asarray(chosen.ends_at_rest), batch),
+        offset=leaf(offset),
+        tilt=leaf(tilt),
+        scene=shared(paper_scene() if scene is None else scene),
+    )

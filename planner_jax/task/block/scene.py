@@ -1,0 +1,102 @@
+"""What an arm protects, and what stands in its way (paper 004, Sections IV-C and V-A).
+
+Robot base frame, z up, SI units.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+from planner_jax.ball.flight import BallState
+
+INNER_HALF, INNER_HEIGHT = 0.4, 1.35  # [m], of the box that is protected
+OUTER_HALF, OUTER_HEIGHT = 1.0, 1.85  # [m], of the box in which a ball may be met
+POLE, POLE_RADIUS = (0.806, 0.0), 0.05  # [m]
+FLOOR = -0.4826  # [m]
+RIG_HALF, RIG_LENGTH = 0.559, 1.09  # [m], of the square of beams around the pedestal
+RIG_HEIGHT, RIG_RADIUS = -0.08, 0.0401  # [m]; a beam of 0.025 x 0.076 m lies within the radius
+
+
+@struct.dataclass
+class Box:
+    """A box along the axes."""
+
+    lower: Array  # (3,) [m]
+    upper: Array  # (3,) [m]
+
+
+@struct.dataclass
+class Scene:
+    """Two boxes, called domes by the paper, and obstacles."""
+
+    inner: Box  # is protected
+    outer: Box  # in it the shield may meet a ball
+    pole: Array  # (2,) [m], axis of a vertical pole, taller than what the arm reaches
+    pole_radius: Array  # () [m]
+    has_pole: Array  # () bool
+    floor: Array  # () [m], height
+    beam_ends: Array  # (N, 2, 3) [m], capsules around beams
+    beam_radius: Array  # (N,) [m]
+
+
+def paper_scene(*, has_pole: bool = True) -> Scene:
+    """The scene of the paper's simulation, NumPy float32 leaves.
+
+    The sizes are those of the authors' model (their repository of the planner); the paper shows
+    them in its Fig. 5. The box that keeps the arm from the camera is left out: the authors' own
+    home pose reaches into it.
+    """
+
+    def box(half: float, height: float) -> Box:
+        lower, upper = np.array([-half, -half, 0.0]), np.array([half, half, height])
+        return Box(lower=lower.astype(np.float32), upper=upper.astype(np.float32))
+
+    ends = []
+    for along in range(2):
+        for side in (-RIG_HALF, RIG_HALF):
+            pair = np.full((2, 3), RIG_HEIGHT)
+            pair[:, along] = -0.5 * RIG_LENGTH, 0.5 * RIG_LENGTH
+            pair[:, 1 - along] = side
+            ends.append(pair)
+    return Scene(
+        inner=box(INNER_HALF, INNER_HEIGHT),
+        outer=box(OUTER_HALF, OUTER_HEIGHT),
+        pole=np.array(POLE, np.float32),
+        pole_radius=np.float32(POLE_RADIUS),
+        has_pole=np.bool_(has_pole),
+        floor=np.float32(FLOOR),
+        beam_ends=np.array(ends, np.float32),
+        beam_radius=np.full(4, RIG_RADIUS, np.float32),
+    )
+
+
+def position_at(ball: BallState, gravity: Array, time: Array) -> Array:
+    """Where a ball is after a time () [s] of free fall, (3,) [m] (paper 004, eqs 5 to 7)."""
+    fallen = jnp.zeros_like(ball.pos).at[2].set(0.5 * gravity * time**2)
+    return ball.pos + ball.vel * time - fallen
+
+
+def velocity_at(ball: BallState, gravity: Array, time: Array) -> Array:
+    """Its velocity then, (3,) [m/s]."""
+    return ball.vel.at[2].add(-gravity * time)
+
+
+def entry_time(box: Box, ball: BallState, gravity: Array) -> tuple[Array, Array]:
+    """When a ball that comes from outside gets into a box, through a side or the top.
+
+    Returns:
+        time: () [s].
+        enters: () bool; a ball that begins inside, or comes through the bottom, does not.
+    """
+    moves = jnp.where(jnp.abs(ball.vel[:2]) > 1e-6, ball.vel[:2], 1e-6)
+    at_lower, at_upper = ((edge[:2] - ball.pos[:2]) / moves for edge in (box.lower, box.upper))
+    from_side = jnp.max(jnp.minimum(at_lower, at_upper))
+    until = jnp.min(jnp.maximum(at_lower, at_upper))
+    # Down through the height of the top.
+    above = ball.vel[2] ** 2 + 2.0 * gravity * (ball.pos[2] - box.upper[2])
+    from_top = (ball.vel[2] + jnp.sqrt(jnp.maximum(above, 0.0))) / gravity
+    is_above = position_at(ball, gravity, from_side)[2] > box.upper[2]
+    time = jnp.where(is_above, from_top, from_side)
+    height = position_at(ball, gravity, time)[2]
+    return time, (time > 0.0) & (time <= until) & (height > box.lower[2])
