@@ -1,0 +1,31 @@
+"""What the registry knows of blocks; imports no JAX."""
+
+import dataclasses
+
+from planner_jax.registry import Task
+
+
+@dataclasses.dataclass(frozen=True)
+class Suite:
+    """One kind of throw."""
+
+    description: str
+    distance: tuple[float, float] = (6.0, 12.0)  # [m], from the arm's axis to where it is thrown
+    has_pole: bool = True
+
+
+# The other ranges are those of `planner_jax.task.block.suites`.
+SUITES = {
+    "pole": Suite("Throws from 6 to 12 m, a pole in front of the arm."),
+    "open": Suite("The same without a pole.", has_pole=False),
+    "short": Suite("Throws from 6 to 8 m, a pole in front of the arm.", distance=(6.0, 8.0)),
+}
+
+TASK = Task(
+    name="block",
+    summary="an arm with a shield protects a box from thrown balls",
+    home="planner_jax.task.block",
+    planners={"online": "planner_jax.task.block.online:OnlineBlock"},
+    suites={name: suite.description for name, suite in SUITES.items()},
+    contact="contact_time",
+)

@@ -1,0 +1,418 @@
+"""The default planner: a straight motion of the joints if one is free, else least squares.
+
+The shield may meet a ball anywhere between the boxes, with the wrist and the elbow on either side.
+Each of these end poses has a straight motion of the joints, all of them in step; the first that
+is in time and touches nothing is taken. Where none is, end pose, time of contact and motion are
+optimised together by Levenberg-Marquardt, from straight motions with a bump to one side, until one
+keeps every limit. Paper 004 looks its motions up in a library instead; nothing is stored here but
+the bumps.
+"""
+
+import dataclasses
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array, lax
+
+from planner_jax.optimise.levenberg import LevenbergConfig, Model, least_squares
+from planner_jax.planning.one_by_one import one_by_one
+from planner_jax.protocol import FEASIBILITY_TOLERANCE, Attempt, Status, is_solved
+from planner_jax.robot.arm import shield_jacobian, shield_pose
+from planner_jax.task.block.case import BlockCase
+from planner_jax.task.block.clearance import clearances
+from planner_jax.task.block.end_poses import (
+    EndPoses,
+    Flight,
+    all_profiles,
+    coasted,
+    end_poses,
+    facing,
+    flight_of,
+    frame_of,
+)
+from planner_jax.task.block.motion import angles_at, polynomial, sums
+from planner_jax.task.block.plan import BlockPlan
+from planner_jax.task.block.scene import position_at, velocity_at
+
+_HIGHEST = lax.Precision.HIGHEST
+_STEP = 1e-3  # [rad], of difference quotients of distances
+_PLANE = 1e-3  # [m], how far from the shield's plane the ball may be at the contact
+
+
+@dataclasses.dataclass(frozen=True)
+class Search(Attempt):
+    """An attempt: so many straight motions, then least squares from so many starts; static."""
+
+    starts: int = 8
+    straight: int = 48  # motions that are looked at
+    tries: int = 12  # starts of least squares
+    solver: LevenbergConfig = LevenbergConfig(
+        16, damping=1e-2, ease=0.25, tighten=6.0, settled=1, tolerance=1.0
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Weights:
+    """What residuals are multiplied by; static."""
+
+    meeting: float = 100.0  # [1/m]
+    tilt: float = 30.0  # [1/rad]
+    limits: float = 30.0  # of relative excesses
+    clearance: float = 100.0  # [1/m]
+    effort: float = 0.1  # of accelerations in shares of their limits
+
+
+@struct.dataclass
+class _Excess:
+    """How far a motion is over each kind of limit; at most zero if it keeps it."""
+
+    joints: Array  # (), relative, of angles, rates and accelerations
+    contact: Array  # (), relative, of the places and angles of the contact
+    clearance: Array  # () [m], how much too near it comes
+
+    @property
+    def greatest(self) -> Array:
+        """The largest, relative; of clearances beside a centimetre."""
+        return jnp.maximum(jnp.maximum(self.joints, self.contact), 100.0 * self.clearance)
+
+
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class OnlineBlock:
+    """Meets a ball somewhere between the boxes; the cost of a plan is its execution time [s]."""
+
+    case_type: ClassVar[type] = BlockCase
+    pieces: int = 10  # of rates
+    points: int = 48  # of the ball's way, where end poses are looked at
+    samples: int = 32  # of a motion, where least squares look at distances
+    worst: int = 8  # of them, those at which slopes are worked out
+    checked: int = 96  # samples of the plan that is given back
+    margin: float = 0.012  # [m], kept from everything
+    kept: float = 0.004  # [m], the same of the plan that is given back
+    slack: float = 0.004  # share of every limit that is kept free
+    weights: Weights = Weights()
+    searches: tuple[Search, ...] = (Search(),)
+
+    @property
+    def attempts(self) -> tuple[Search, ...]:
+        """The searches."""
+        return self.searches
+
+    def solve(self, case: BlockCase, attempt: Search) -> BlockPlan:
+        """The plan of one case."""
+        flight = flight_of(case)
+        poses = end_poses(case, flight, self.points, self.pieces)
+        order = self.order(poses)
+        bumps = self.bumps(attempt)
+        in_time = jnp.sum(poses.effort <= 1.0 - self.slack)
+        straight = jnp.minimum(in_time, attempt.straight)
+
+        def next_one(state: tuple) -> tuple:
+            k, best = state
+            is_straight = k < straight
+            rank = jnp.where(is_straight, k, k - straight)
+            start = self.straight_point(case, poses, order[rank])
+            bump = jnp.where(is_straight, 0.0, bumps[jnp.minimum(rank, len(bumps) - 1)])
+            start = start.at[:-1].add(self.bump(bump).reshape(-1))
+            steps = jnp.where(is_straight, -1, attempt.solver.max_steps)
+            config = dataclasses.replace(attempt.solver, max_steps=steps)
+            end = least_squares(lambda point: self.model(point, case, flight), start, config)
+            plan = self.plan_at(case, flight, end.point, jnp.maximum(end.steps, 0))
+            return k + 1, self.better_of_two(best, plan)
+
+        def is_open(state: tuple) -> Array:
+            k, best = state
+            return (k < straight + attempt.tries) & flight.comes & ~is_solved(best.status)
+
+        _, best = lax.while_loop(is_open, next_one, (0, self.no_plan(case)))
+        reason = jnp.where(flight.comes, best.status, Status.OUT_OF_REACH)
+        return dataclasses.replace(
+            best, status=jnp.where(is_solved(best.status), best.status, reason).astype(jnp.int32)
+        )
+
+    def solve_lanes(self, cases: BlockCase, attempt: Search) -> BlockPlan:
+        """The plans of a batch: on a CPU one after another, else in step."""
+        return lax.platform_dependent(
+            cases,
+            cpu=lambda cases: one_by_one(lambda case: self.solve(case, attempt), cases),
+            default=jax.vmap(lambda case: self.solve(case, attempt)),
+        )
+
+    def order(self, poses: EndPoses) -> Array:
+        """Places of poses, those first that ask little, mixed so that they differ, (C,) int32."""
+        rng = np.random.default_rng(0)
+        mixed = jnp.asarray(rng.random(poses.effort.shape[0]), poses.effort.dtype)
+        late = jnp.where(poses.effort > 1.0 - self.slack, 10.0 * poses.effort, 0.0)
+        return jnp.argsort(poses.effort + mixed + late)
+
+    def no_plan(self, case: BlockCase) -> BlockPlan:
+        """A plan to stay, which is none."""
+        still = jnp.zeros((self.pieces, 6), case.angles.dtype)
+        none = jnp.full((), jnp.inf, case.angles.dtype)
+        return BlockPlan(
+            motion=polynomial(case.angles, still[0], still, case.delay + 1.0),
+            contact_time=case.delay + 1.0,
+            cost=none,
+            violation=none,
+            iterations=jnp.zeros((), jnp.int32),
+            status=jnp.full((), Status.INFEASIBLE, jnp.int32),
+        )
+
+    def straight_point(self, case: BlockCase, poses: EndPoses, place: Array) -> Array:
+        """The unknowns of a straight motion."""
+        time = poses.time[place]
+        duration = jnp.maximum(time - case.delay, 1e-3)
+        turned = poses.angles[place] - coasted(case, duration, self.pieces)
+        shapes = jnp.asarray(all_profiles(self.pieces)[0], turned.dtype)
+        steps = shapes[poses.profile[place]][:, None] * turned
+        return jnp.append(steps.reshape(-1), time)
+
+    def bumps(self, attempt: Search) -> Array:
+        """How far starts go beside straight motions, (N, 6) [rad]."""
+        rng = np.random.default_rng(1)
+        drawn = rng.normal(0.0, 1.0, (max(attempt.tries, 1), 6)) * [0.5, 0.4, 0.4, 0.3, 0.5, 0.0]
+        return jnp.asarray(drawn, jnp.float32)
+
+    def bump(self, height: Array) -> Array:
+        """Steps (K, 6) that turn joints by up to so much (6,) [rad] and back: a squared sine."""
+        knots = np.arange(1, self.pieces + 1) / self.pieces
+        return jnp.asarray(np.pi * np.sin(2.0 * np.pi * knots), height.dtype)[:, None] * height
+
+    def parts(self, case: BlockCase, point: Array) -> tuple[Array, Array, Array]:
+        """Steps (K, 6), the first one's rates times the duration (6,), and the duration () [s]."""
+        steps = point[:-1].reshape(self.pieces, 6)
+        duration = jnp.maximum(point[-1] - case.delay, 1e-3)
+        last = jnp.where(case.ends_at_rest, 0.0, steps[-1])
+        return steps.at[-1].set(last), case.rates * duration, duration
+
+    def model(self, point: Array, case: BlockCase, flight: Flight) -> Model:
+        """Sum of squares: the contact, the joints' limits, distances, effort."""
+        steps, first, duration = self.parts(case, point)
+        pieces, dtype = self.pieces, point.dtype
+        of_joints, joints_push, joints_stiffness, joints_excess = self.joint_terms(
+            case, steps, first, duration
+        )
+        # Samples: the end, and those at which the arm comes nearest to something.
+        shares = tuple(np.arange(1, self.samples + 1) / self.samples)
+        angles = angles_at(case.angles, first, steps, shares)
+        gaps = jax.vmap(lambda q: clearances(case.arm, case.scene, q))(angles)  # (S, R)
+        near, worst = lax.top_k(-jnp.min(gaps, axis=1), self.worst)
+        here = angles[worst]
+        moved = here[:, None] + _STEP * jnp.eye(6, dtype=dtype)
+        there = jax.vmap(jax.vmap(lambda q: clearances(case.arm, case.scene, q)))(moved)
+        slopes = (there - gaps[worst][:, None]) / _STEP  # (W, 6, R)
+        short = self.weights.clearance * jnp.maximum(self.margin - gaps[worst], 0.0)  # (W, R)
+        active = jnp.where(short > 0.0, 1.0, 0.0)
+        lifts = -self.weights.clearance * slopes * active[:, None]
+        lifts = jnp.concatenate([lifts, jnp.zeros_like(lifts[:, :1])], axis=1)  # by q and time
+        grams = jnp.einsum("wir,wjr->wij", lifts, lifts, precision=_HIGHEST)
+        pushes = jnp.einsum("wir,wr->wi", lifts, short, precision=_HIGHEST)
+        rows, row_slopes, contact_excess = self.contact_terms(case, flight, angles[-1], point[-1])
+        gram = jnp.matmul(row_slopes.T, row_slopes, precision=_HIGHEST)
+        push = jnp.matmul(row_slopes.T, rows, precision=_HIGHEST)
+        grams = jnp.concatenate([grams, gram[None]])
+        pushes = jnp.concatenate([pushes, push[None]])
+        # From angles and time at samples to the unknowns.
+        of_first, of_steps = (jnp.asarray(each, dtype) for each in sums(pieces, shares))
+        chosen = jnp.append(worst, self.samples - 1)
+        lift, drift = of_steps[chosen], of_first[chosen][:, None] * case.rates  # (W + 1, K), (., 6)
+        # Later contacts carry the angles on at the rates of the beginning.
+        grams_q, grams_t = grams[:, :6, :6], grams[:, :6, 6]
+        carried = jnp.einsum("wij,wj->wi", grams_q, drift, precision=_HIGHEST) + grams_t
+        time_stiffness = jnp.sum(grams[:, 6, 6] + jnp.sum(drift * (carried + grams_t), axis=1))
+        time_push = jnp.sum(pushes[:, 6] + jnp.sum(drift * pushes[:, :6], axis=1))
+        stiffness = jnp.einsum("wk,wl,wij->kilj", lift, lift, grams_q, precision=_HIGHEST)
+        coupling = jnp.einsum("wk,wi->ki", lift, carried, precision=_HIGHEST)
+        steps_push = jnp.einsum("wk,wi->ki", lift, pushes[:, :6], precision=_HIGHEST)
+        each = jnp.eye(6, dtype=dtype)
+        stiffness += jnp.einsum("ikl,ij->kilj", joints_stiffness[:, :-1, :-1], each)
+        coupling += joints_stiffness[:, :-1, -1].T
+        steps_push += joints_push[:, :-1].T
+        time_push += jnp.sum(joints_push[:, -1])
+        time_stiffness += jnp.sum(joints_stiffness[:, -1, -1])
+        size = 6 * pieces
+        curvature = jnp.zeros((size + 1, size + 1), dtype)
+        curvature = curvature.at[:size, :size].set(stiffness.reshape(size, size))
+        curvature = curvature.at[:size, size].set(coupling.reshape(-1))
+        curvature = curvature.at[size, :size].set(coupling.reshape(-1))
+        curvature = curvature.at[size, size].set(time_stiffness)
+        gradient = jnp.append(steps_push.reshape(-1), time_push)
+        held = jnp.where(case.ends_at_rest, 0.0, 1.0)
+        free = jnp.ones(size + 1, dtype).at[size - 6 : size].set(held)
+        excess = _Excess(
+            joints=joints_excess, contact=contact_excess, clearance=near[0] + 0.5 * self.margin
+        )
+        return Model(
+            cost=of_joints + jnp.sum(rows**2) + jnp.sum(short**2),
+            gradient=gradient * free,
+            curvature=curvature * free[:, None] * free,
+            violation=excess.greatest,
+        )
+
+    def joint_terms(
+        self, case: BlockCase, steps: Array, first: Array, duration: Array
+    ) -> tuple[Array, Array, Array, Array]:
+        """Limits and effort of the joints.
+
+        Returns:
+            cost: ().
+            push: (6, K + 1), by each joint's steps and the time of contact.
+            stiffness: (6, K + 1, K + 1).
+            excess: (), relative.
+        """
+        pieces, dtype = self.pieces, steps.dtype
+        knots = tuple(np.arange(1, pieces + 1) / pieces)
+        of_first, of_steps = (jnp.asarray(each, dtype) for each in sums(pieces, knots))
+        rise = jnp.asarray(np.eye(pieces) - np.eye(pieces, k=-1), dtype)
+        rates = steps / duration
+        risen = steps - jnp.concatenate([first[None], steps[:-1]])
+        accelerations = risen * (pieces / duration**2)
+        angles = angles_at(case.angles, first, steps, knots)
+        middle = 0.5 * (case.arm.upper + case.arm.lower)
+        half = 0.5 * (case.arm.upper - case.arm.lower)
+
+        def row(
+            value: Array, by_steps: Array, by_time: Array, slope: float | Array
+        ) -> tuple[Array, Array]:
+            """Residuals (6, K) and their slopes (6, K, K + 1)."""
+            slopes = jnp.concatenate([by_steps, by_time.T[:, :, None]], axis=2)
+            return value.T, slopes * jnp.broadcast_to(slope, value.shape).T[:, :, None]
+
+        def hinge(
+            share: Array, by_steps: Array, by_time: Array, most: float
+        ) -> tuple[Array, Array]:
+            over = self.weights.limits * jnp.maximum(jnp.abs(share) - most, 0.0)
+            sign = self.weights.limits * jnp.sign(share) * (over > 0.0)
+            return row(over, by_steps, by_time, sign)
+
+        most = 1.0 - self.slack
+        of_rate = jnp.eye(pieces, dtype=dtype) / (duration * case.limits.velocity[:, None, None])
+        rate_shares = rates / case.limits.velocity
+        of_rise = rise * (pieces / duration**2 / case.limits.acceleration[:, None, None])
+        rise_shares = accelerations / case.limits.acceleration
+        # The first of the rises falls with the duration by half as much as the others.
+        carried = jnp.zeros_like(rise_shares).at[0].set(first * pieces / duration**2)
+        by_time = (-2.0 * rise_shares - carried / case.limits.acceleration) / duration
+        angle_shares = (angles - middle) / half
+        of_angle = of_steps / half[:, None, None]
+        effort = self.weights.effort
+        parts = [
+            hinge(rate_shares, of_rate, -rate_shares / duration, most),
+            hinge(rise_shares, of_rise, by_time, most),
+            hinge(angle_shares, of_angle, of_first[:, None] * case.rates / half, most),
+            row(effort * rise_shares, of_rise, by_time, effort),
+        ]
+        values = jnp.concatenate([value for value, _ in parts], axis=1)
+        slopes = jnp.concatenate([slope for _, slope in parts], axis=1)
+        excess = [jnp.max(jnp.abs(each)) for each in (rate_shares, rise_shares, angle_shares)]
+        return (
+            jnp.sum(values**2),
+            jnp.einsum("irk,ir->ik", slopes, values, precision=_HIGHEST),
+            jnp.einsum("irk,irl->ikl", slopes, slopes, precision=_HIGHEST),
+            jnp.max(jnp.stack(excess)) - 1.0,
+        )
+
+    def contact_terms(
+        self, case: BlockCase, flight: Flight, angles: Array, time: Array
+    ) -> tuple[Array, Array, Array]:
+        """How the shield meets the ball.
+
+        Returns:
+            rows: (7,): off the plane, off the middle, tilted, too early or late.
+            slopes: (7, 7), by the angles at the end and the time.
+            excess: (), relative.
+        """
+        rotation, middle = shield_pose(case.arm, angles)
+        jacobian = shield_jacobian(case.arm, angles)
+        ball = position_at(case.ball, case.gravity, time)
+        velocity = velocity_at(case.ball, case.gravity, time)
+        normal = rotation[:, 0]
+        away = ball - middle
+        turns = jacobian[3:].T  # (6, 3), the axes
+        moves = jacobian[:3].T
+        by_normal = jnp.cross(turns, normal)
+        # Off the plane of the shield.
+        off = jnp.sum(away * normal)
+        off_slope = jnp.append(-moves @ normal + by_normal @ away, jnp.sum(velocity * normal))
+        # Off its middle, within the plane.
+        beside = away - off * normal
+        beside_slope = jnp.concatenate([-moves, velocity[None]])
+        beside_slope -= jnp.sum(beside_slope * normal, axis=1)[:, None] * normal
+        distance = jnp.sqrt(jnp.maximum(jnp.sum(beside**2), 1e-12))
+        spare = jnp.maximum(0.95 * case.offset - 0.002, 0.0)
+        beside_share = jnp.maximum(1.0 - spare / distance, 0.0)
+        # Tilted against the ball's way.
+        wanted = facing(velocity)
+        tilt = jnp.cross(wanted, normal)
+        tilt_slope = jnp.cross(wanted, by_normal)
+        sine = jnp.sqrt(jnp.maximum(jnp.sum(tilt**2), 1e-12))
+        angle = jnp.arctan2(sine, jnp.sum(wanted * normal))
+        room = jnp.maximum(0.93 * case.tilt - np.deg2rad(0.5), 0.0)
+        tilt_share = jnp.maximum(1.0 - room / angle, 0.0) * angle / sine
+        frame = frame_of(wanted)[:, 1:]
+        weights = self.weights
+        early = jnp.maximum(flight.earliest + 2e-3 - time, 0.0)
+        late = jnp.maximum(time - flight.latest + 2e-3, 0.0)
+        edge = jnp.where(early > 0.0, -1.0, jnp.where(late > 0.0, 1.0, 0.0))
+        # A millisecond counts as much as a centimetre.
+        pace = 10.0 * weights.meeting
+        across = rotation[:, 1:]
+        no_time = jnp.zeros((2, 1), angles.dtype)
+        rows = jnp.concatenate(
+            [
+                weights.meeting * off[None],
+                weights.meeting * beside_share * (beside @ across),
+                weights.tilt * tilt_share * (tilt @ frame),
+                pace * (early + late)[None],
+            ]
+        )
+        is_beside = jnp.where(beside_share > 0.0, weights.meeting, 0.0)
+        is_tilted = jnp.where(tilt_share > 0.0, weights.tilt, 0.0)
+        tilt_rows = jnp.concatenate([(tilt_slope @ frame).T, no_time], axis=1)
+        slopes = jnp.concatenate(
+            [
+                weights.meeting * off_slope[None],
+                is_beside * (beside_slope @ across).T,
+                is_tilted * tilt_rows,
+                pace * jnp.zeros((1, 7), angles.dtype).at[0, 6].set(edge),
+            ]
+        )
+        excess = jnp.stack(
+            [
+                jnp.abs(off) / _PLANE - 1.0,
+                distance / case.offset - 1.0,
+                angle / case.tilt - 1.0,
+                jnp.maximum(flight.earliest - time, time - flight.latest) / 1e-3,
+            ]
+        )
+        return rows, slopes, jnp.max(excess)
+
+    def plan_at(self, case: BlockCase, flight: Flight, point: Array, steps: Array) -> BlockPlan:
+        """The plan of a point, looked at more closely."""
+        moves, first, duration = self.parts(case, point)
+        joints = self.joint_terms(case, moves, first, duration)[3]
+        shares = tuple(np.arange(1, self.checked + 1) / self.checked)
+        angles = angles_at(case.angles, first, moves, shares)
+        gaps = jax.vmap(lambda q: jnp.min(clearances(case.arm, case.scene, q)))(angles)
+        contact = self.contact_terms(case, flight, angles[-1], point[-1])[2]
+        excess = _Excess(joints=joints, contact=contact, clearance=self.kept - jnp.min(gaps))
+        violation = jnp.where(point[-1] > case.delay, excess.greatest, jnp.inf)
+        is_finite = jnp.isfinite(violation)
+        status = jnp.where(violation <= FEASIBILITY_TOLERANCE, Status.FEASIBLE, Status.INFEASIBLE)
+        return BlockPlan(
+            motion=polynomial(case.angles, first, moves, duration),
+            contact_time=point[-1],
+            cost=duration,
+            violation=violation,
+            iterations=jnp.asarray(steps, jnp.int32),
+            status=jnp.where(is_finite, status, Status.NON_FINITE).astype(jnp.int32),
+        )
+
+    def better_of_two(self, plan: BlockPlan, later: BlockPlan) -> BlockPlan:
+        """The later plan where it is solved, or violates less than an unsolved one."""
+        less = (later.violation < plan.violation) | ~jnp.isfinite(plan.violation)
+        better = ~is_solved(plan.status) & less
+        return jax.tree.map(lambda new, old: jnp.where(better, new, old), later, plan)

@@ -1,0 +1,120 @@
+"""Named, seeded suites of thrown balls.
+
+Paper 004 throws from 6 to 12 m and says that its 200 projectiles cross both boxes (Section V-A); it
+gives no other range. Those here and in `planner_jax.task.block.card` are this library's, and part
+of each suite's name: a change of a range is another suite. All draws are uniform.
+
+| what | drawn from |
+|---|---|
+| launch | -60 to 60 degrees about the x axis, the suite's distance, -0.48 to 1 m high |
+| aim | anywhere on those of the inner box's sides +x, +y and -y that face the launch |
+| flight time to it | the distance over 7 to 10 m/s |
+
+A throw is drawn anew unless the ball, of 0.05 m radius, gets into the outer box through a side or
+the top, from there into the inner box, and touches no pole before. Robot base frame, z up, SI units.
+"""
+
+import zlib
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from planner_jax.registry import require_name
+from planner_jax.task.block.card import SUITES, Suite
+from planner_jax.task.block.case import BlockCase, case
+from planner_jax.task.block.scene import INNER_HALF, INNER_HEIGHT, OUTER_HALF, OUTER_HEIGHT
+from planner_jax.task.block.scene import POLE, POLE_RADIUS, paper_scene
+
+GRAVITY = 9.81  # [m/s^2]
+BALL_RADIUS = 0.05  # [m]
+AZIMUTH = np.deg2rad(60.0)  # [rad], greatest, either way
+HEIGHT = (-0.48, 1.0)  # [m], of the launch
+SPEED = (7.0, 10.0)  # [m/s], distance over flight time
+_LOOK = 0.002  # [s], between two places of a ball that are looked at
+
+
+def draw_cases(
+    suite: str,
+    num: int,
+    seed: int,
+    first: int = 0,
+    *,
+    regime: str = "R2",
+    tolerance: str = "strict",
+    delay: float = 0.0,
+    dtype: Any = jnp.float32,
+) -> BlockCase:
+    """A batch of cases of a suite, drawn in float64 and then cast.
+
+    Args:
+        suite: a key of `SUITES`.
+        num: B, how many, >= 1.
+        seed: >= 0. Throw k of a suite and seed is always the same one.
+        first: place of the first one, >= 0.
+        regime: see `planner_jax.task.block.case.case`, as for the next two.
+        tolerance: "strict" or "wide".
+        delay: [s].
+        dtype: of every floating leaf.
+
+    Raises:
+        ValueError: an argument is out of its range; one line.
+    """
+    require_name(SUITES, "suite", suite)
+    for name, value, least in (("num", num, 1), ("seed", seed, 0), ("first", first, 0)):
+        if value < least:
+            raise ValueError(f"{name} must be >= {least}, got {value}")
+    own, tag = SUITES[suite], zlib.crc32(suite.encode())
+    randoms = (np.random.default_rng([seed, first + k, tag]) for k in range(num))
+    thrown = np.array([_throw(own, random) for random in randoms])
+    return case(
+        thrown[:, 0],
+        thrown[:, 1],
+        delay=delay,
+        regime=regime,
+        tolerance=tolerance,
+        scene=paper_scene(has_pole=own.has_pole),
+        dtype=dtype,
+    )
+
+
+def _throw(suite: Suite, random: np.random.Generator) -> np.ndarray:
+    """The first draw that counts: position [m] and velocity [m/s] at the launch, (2, 3)."""
+    while True:
+        azimuth, distance = random.uniform(-AZIMUTH, AZIMUTH), random.uniform(*suite.distance)
+        pos = np.array(
+            [distance * np.cos(azimuth), distance * np.sin(azimuth), random.uniform(*HEIGHT)]
+        )
+        duration = distance / random.uniform(*SPEED)
+        sides = [(0, 1.0)] + [(1, side) for side in (1.0, -1.0) if side * pos[1] > INNER_HALF]
+        axis, side = sides[random.integers(len(sides))]
+        aim = np.empty(3)
+        aim[axis] = side * INNER_HALF
+        aim[1 - axis] = random.uniform(-INNER_HALF, INNER_HALF)
+        aim[2] = random.uniform(0.0, INNER_HEIGHT)
+        vel = (aim - pos) / duration
+        vel[2] += 0.5 * GRAVITY * duration
+        if _counts(suite, pos, vel, duration):
+            return np.stack([pos, vel])
+
+
+def _counts(suite: Suite, pos: np.ndarray, vel: np.ndarray, duration: float) -> bool:
+    """Whether a ball that comes to the inner box at a time [s] enters both boxes, past the pole."""
+    times = np.linspace(0.0, duration, int(np.ceil(duration / _LOOK)) + 1)[:-1]
+    places = pos + vel * times[:, None]
+    places[:, 2] -= 0.5 * GRAVITY * times**2
+    if suite.has_pole:
+        away = np.linalg.norm(places[:, :2] - POLE, axis=1)
+        if away.min() < POLE_RADIUS + BALL_RADIUS:
+            return False
+
+    def within(half: float, height: float) -> np.ndarray:
+        inside = (np.abs(places[:, :2]) < half).all(axis=1)
+        return inside & (places[:, 2] > 0.0) & (places[:, 2] < height)
+
+    outer = within(OUTER_HALF, OUTER_HEIGHT)
+    if not outer.any() or within(INNER_HALF, INNER_HEIGHT).any():
+        return False
+    entered = int(outer.argmax())
+    # From there on it stays inside; what came from below was in the box's shadow just before.
+    return bool(outer[entered:].all()) and entered > 0 and places[entered - 1, 2] > 0.0

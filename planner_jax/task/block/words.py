@@ -1,0 +1,60 @@
+"""The words of the task: `pj.block.draw`, `planner` and `judge`; `case` stands beside."""
+
+from typing import Any
+
+import jax.numpy as jnp
+
+from planner_jax.protocol import AnyPlanner
+from planner_jax.task.block.card import SUITES, TASK
+from planner_jax.task.block.case import BlockCase
+from planner_jax.task.block.suites import draw_cases
+
+
+def draw(
+    num: int,
+    suite: str | None = None,
+    seed: int = 0,
+    *,
+    first: int = 0,
+    regime: str = "R2",
+    tolerance: str = "strict",
+    delay: float = 0.0,
+    dtype: Any = jnp.float32,
+) -> BlockCase:
+    """Drawn throws as a batch of cases.
+
+    Args:
+        num: how many, >= 1.
+        suite: "pole", the default, "open" or "short"; or one that another package offers.
+        seed: >= 0. Throw k of a suite and seed is always the same one.
+        first: place of the first one, >= 0.
+        regime: "R1", "R2" or "R3"; see `case`.
+        tolerance: "strict" or "wide".
+        delay: [s], until the arm may start.
+        dtype: of every floating leaf.
+
+    Raises:
+        ValueError: an argument is out of its range, or there is no such suite.
+    """
+    suite = suite or "pole"
+    if suite not in SUITES:
+        return TASK.other_suite(suite)(num, seed, first)
+    settings = {"regime": regime, "tolerance": tolerance, "delay": delay, "dtype": dtype}
+    return draw_cases(suite, num, seed, first, **settings)
+
+
+def planner(name: str = "online", **options: Any) -> AnyPlanner[Any, Any]:
+    """The block planner of a name, with some of its fields set.
+
+    * `online`: a straight motion of the joints if one is free, else end pose, time of contact and
+      motion together, by least squares from many starts.
+
+    Args:
+        name: one of these, or one that another package offers.
+        **options: fields of that planner's dataclass.
+
+    Raises:
+        ValueError: there is no planner of that name.
+        TypeError: the planner has no such field.
+    """
+    return TASK.make_planner(name, options)
