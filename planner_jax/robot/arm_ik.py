@@ -7,8 +7,6 @@ wrist, each across the next. Their seven lengths a1, a2, b, c1, c2, c3, c4 are t
 frames of an `Arm`, wherever these frames lie and whichever way the joints turn.
 """
 
-import itertools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,9 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from planner_jax.robot.arm import Arm, joint_axes, link_frames, product
 
-# Of the eight branches: whether the arm faces the wrist's centre or reaches it over its shoulder,
-# on which side of the line between the two the elbow is, and which way the wrist bends.
-_BRANCHES = np.array(list(itertools.product((1, -1), repeat=3)))
+# Whether the arm faces the wrist's centre (1) or reaches it over its shoulder (-1), and on which
+# side of the line between the two the elbow is.
+_ARM_BRANCHES = np.array([(1, 1), (1, -1), (-1, 1), (-1, -1)]).T
 # Largest deviation [m or rad] from the geometry that the closed form is for.
 _MISFIT = 1e-5
 
@@ -101,15 +99,16 @@ def inverse_kinematics(arm: Arm, rotation: Array, middle: Array) -> tuple[Array,
     wrist = product(geometry.basis.T, wrist)
     tip = product(product(geometry.basis.T, rotation), geometry.after)
 
-    def branch(signs: Array) -> tuple[Array, Array]:
-        front, elbow, flip = signs
+    def branches(front: Array, elbow: Array) -> tuple[Array, Array]:
         first, reached = _arm_angles(geometry, wrist, front, elbow)
         pitch = first[1] + geometry.elbow_sign * first[2]
         turned = product(_about_z(first[0]), product(_about_y(pitch), geometry.before))
-        last = _wrist_angles(product(turned.T, tip), flip, geometry.bend)
-        return jnp.concatenate([first, last]), reached
+        wanted = product(turned.T, tip)
+        both = [jnp.append(first, _wrist_angles(wanted, flip, geometry.bend)) for flip in (1, -1)]
+        return jnp.stack(both), jnp.stack([reached, reached])
 
-    angles, reached = jax.vmap(branch)(jnp.asarray(_BRANCHES, wrist.dtype))
+    angles, reached = jax.vmap(branches)(*jnp.asarray(_ARM_BRANCHES, wrist.dtype))
+    angles, reached = angles.reshape(8, 6), reached.reshape(8)
     lower, upper = jnp.asarray(arm.lower), jnp.asarray(arm.upper)
     turns = jnp.round((angles - 0.5 * (lower + upper)) / (2.0 * jnp.pi))
     angles = angles - 2.0 * jnp.pi * turns
@@ -138,7 +137,7 @@ def _arm_angles(
     return jnp.stack([first, second, geometry.elbow_sign * third]), reached
 
 
-def _wrist_angles(wanted: Array, flip: Array, bend: Array) -> Array:
+def _wrist_angles(wanted: Array, flip: int, bend: Array) -> Array:
     """Joints 4 to 6 (3,) [rad] of the rotation (3, 3) = X(j4) Y(j5 + bend) X(j6), by one branch."""
     fourth = _angle(flip * wanted[1, 0], -flip * wanted[2, 0])
     sine, cosine = jnp.sin(fourth), jnp.cos(fourth)

@@ -10,6 +10,7 @@ world's geoms, lights, cameras, actuators, sensors, options) is no part of it an
 
 import functools
 import importlib.resources
+import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable
 from pathlib import Path
@@ -78,7 +79,7 @@ def read_arm(path_or_xml: str, *, dtype: Any = np.float32) -> Arm:
         "axis": [axis for axis, _ in joints],
         "lower": [limits[0] for _, limits in joints],
         "upper": [limits[1] for _, limits in joints],
-        "home": _home(root),
+        "home": _home(root, np.array([limits for _, limits in joints])),
         "mass": [mass for mass, _, _ in inertials],
         "centre": [centre for _, centre, _ in inertials],
         "inertia": [inertia for _, _, inertia in inertials],
@@ -107,11 +108,10 @@ class _Reader:
         angle, self.sequence = told.get("angle", "degree"), told.get("eulerseq", "xyz")
         if angle not in ("degree", "radian"):
             raise ValueError(f'<compiler>: angle must be degree or radian, got "{angle}"')
-        if len(self.sequence) != 3 or not set(self.sequence) <= set("xyz"):
-            if not set(self.sequence) <= set("XYZ"):
-                raise ValueError(
-                    f"<compiler>: eulerseq must be three of xyz or of XYZ, got {self.sequence!r}"
-                )
+        if not re.fullmatch("[xyz]{3}|[XYZ]{3}", self.sequence):
+            raise ValueError(
+                f'<compiler>: eulerseq must be three of xyz or of XYZ, got "{self.sequence}"'
+            )
         self.unit = np.pi / 180.0 if angle == "degree" else 1.0
 
     def frame(self, element: ET.Element) -> tuple[np.ndarray, Rotation]:
@@ -234,11 +234,14 @@ def _box(geom: ET.Element) -> tuple[np.ndarray, np.ndarray]:
     return half, _numbers(geom, "pos", 3, (0.0, 0.0, 0.0))
 
 
-def _home(root: ET.Element) -> np.ndarray:
-    """Angles (6,) [rad] of the key named home."""
+def _home(root: ET.Element, limits: np.ndarray) -> np.ndarray:
+    """Angles (6,) [rad] of the key named home, within position limits (6, 2) [rad]."""
     for key in root.iterfind("keyframe/key"):
         if key.get("name") == "home":
-            return _numbers(key, "qpos", 6)
+            home = _numbers(key, "qpos", 6)
+            if np.any((home < limits[:, 0]) | (home > limits[:, 1])):
+                raise ValueError(f"{_tag(key)}: qpos must be within the ranges of the joints")
+            return home
     raise ValueError("<keyframe> must have a key named home")
 
 
