@@ -23,6 +23,9 @@ from planner_jax.space.distances import (
 from planner_jax.task.block.scene import Scene
 
 FAR = 10.0  # [m], of a pole that is not there
+# The forearm ends in a fork around the wrist, which a capsule would round off: towards the shield it
+# is no thicker than this share of the way from the wrist to the shield's face.
+_FORK = 0.75
 
 
 def clearances(arm: Arm, scene: Scene, angles: Array) -> Array:
@@ -44,7 +47,9 @@ def clearances(arm: Arm, scene: Scene, angles: Array) -> Array:
     fixed_radius = jnp.concatenate([radius[trunk], scene.beam_radius])
     among = jax.vmap(of_links, (0, None))(ends[moving], fixed)
     near_shield = jnp.concatenate([ends[before], scene.beam_ends])
-    near_radius = jnp.concatenate([radius[before], scene.beam_radius])
+    wrist = jnp.sqrt(jnp.sum((arm.origin[5] + arm.shield_centre) ** 2))
+    thin = jnp.where(link[before] == 3, jnp.minimum(radius[before], _FORK * wrist), radius[before])
+    near_radius = jnp.concatenate([thin, scene.beam_radius])
     of_shield = jax.vmap(segment_to_rectangle, (0, None, None))(near_shield, middle, edges)
     on_pole = jax.vmap(segment_to_vertical_line, (0, None))(ends[moving], scene.pole)
     shield_on_pole = rectangle_to_vertical_line(middle, edges, scene.pole)
@@ -63,6 +68,15 @@ def clearances(arm: Arm, scene: Scene, angles: Array) -> Array:
         shield_on_base[None],
     ]
     return jnp.concatenate(rows)
+
+
+def is_of_pole(arm: Arm, scene: Scene) -> np.ndarray:
+    """Which of the pairs are those with the pole, (R,) bool."""
+    link = np.asarray(arm.capsule_link)
+    moving, trunk = int(np.sum(link >= 2)), int(np.sum(link == 0))
+    before, beams = int(np.sum((link >= 0) & (link <= 3))), scene.beam_radius.shape[-1]
+    others = moving * (trunk + beams) + before + beams
+    return np.repeat([False, True, False], [others, moving + 1, 2 * (moving + 1)])
 
 
 def _outline(middle: Array, edges: Array) -> Array:

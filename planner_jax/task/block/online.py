@@ -22,7 +22,7 @@ from planner_jax.planning.one_by_one import one_by_one
 from planner_jax.protocol import FEASIBILITY_TOLERANCE, Attempt, Status, is_solved
 from planner_jax.robot.arm import shield_jacobian, shield_pose
 from planner_jax.task.block.case import BlockCase
-from planner_jax.task.block.clearance import clearances
+from planner_jax.task.block.clearance import clearances, is_of_pole
 from planner_jax.task.block.end_poses import (
     EndPoses,
     Flight,
@@ -90,8 +90,8 @@ class OnlineBlock:
     samples: int = 32  # of a motion, where least squares look at distances
     worst: int = 8  # of them, those at which slopes are worked out
     checked: int = 96  # samples of the plan that is given back
-    margin: float = 0.012  # [m], kept from everything
-    kept: float = 0.004  # [m], the same of the plan that is given back
+    margin: float = 0.003  # [m], kept from everything
+    pole_margin: float = 0.012  # [m], the same of the pole, which samples may pass by
     slack: float = 0.004  # share of every limit that is kept free
     weights: Weights = Weights()
     searches: tuple[Search, ...] = (Search(),)
@@ -199,12 +199,13 @@ class OnlineBlock:
         shares = tuple(np.arange(1, self.samples + 1) / self.samples)
         angles = angles_at(case.angles, first, steps, shares)
         gaps = jax.vmap(lambda q: clearances(case.arm, case.scene, q))(angles)  # (S, R)
-        near, worst = lax.top_k(-jnp.min(gaps, axis=1), self.worst)
+        margins = np.where(is_of_pole(case.arm, case.scene), self.pole_margin, 1.3 * self.margin)
+        near, worst = lax.top_k(jnp.max(margins - gaps, axis=1), self.worst)
         here = angles[worst]
         moved = here[:, None] + _STEP * jnp.eye(6, dtype=dtype)
         there = jax.vmap(jax.vmap(lambda q: clearances(case.arm, case.scene, q)))(moved)
         slopes = (there - gaps[worst][:, None]) / _STEP  # (W, 6, R)
-        short = self.weights.clearance * jnp.maximum(self.margin - gaps[worst], 0.0)  # (W, R)
+        short = jnp.maximum(margins - gaps[worst], 0.0) * self.weights.clearance  # (W, R)
         active = jnp.where(short > 0.0, 1.0, 0.0)
         lifts = -self.weights.clearance * slopes * active[:, None]
         lifts = jnp.concatenate([lifts, jnp.zeros_like(lifts[:, :1])], axis=1)  # by q and time
@@ -243,7 +244,7 @@ class OnlineBlock:
         held = jnp.where(case.ends_at_rest, 0.0, 1.0)
         free = jnp.ones(size + 1, dtype).at[size - 6 : size].set(held)
         excess = _Excess(
-            joints=joints_excess, contact=contact_excess, clearance=near[0] + 0.5 * self.margin
+            joints=joints_excess, contact=contact_excess, clearance=near[0] - 0.3 * self.margin
         )
         return Model(
             cost=of_joints + jnp.sum(rows**2) + jnp.sum(short**2),
@@ -360,7 +361,11 @@ class OnlineBlock:
         # A millisecond counts as much as a centimetre.
         pace = 10.0 * weights.meeting
         across = rotation[:, 1:]
-        no_time = jnp.zeros((2, 1), angles.dtype)
+        # The ball's way bends: its direction turns with the part of gravity across it.
+        pace_squared = jnp.maximum(jnp.sum(velocity**2), 1e-12)
+        pull = jnp.zeros(3, angles.dtype).at[2].set(case.gravity)
+        bent = (pull - wanted * jnp.sum(wanted * pull)) / jnp.sqrt(pace_squared)
+        by_time = jnp.cross(bent, normal)
         rows = jnp.concatenate(
             [
                 weights.meeting * off[None],
@@ -371,12 +376,12 @@ class OnlineBlock:
         )
         is_beside = jnp.where(beside_share > 0.0, weights.meeting, 0.0)
         is_tilted = jnp.where(tilt_share > 0.0, weights.tilt, 0.0)
-        tilt_rows = jnp.concatenate([(tilt_slope @ frame).T, no_time], axis=1)
+        tilt_rows = jnp.concatenate([tilt_slope, by_time[None]]) @ frame
         slopes = jnp.concatenate(
             [
                 weights.meeting * off_slope[None],
                 is_beside * (beside_slope @ across).T,
-                is_tilted * tilt_rows,
+                is_tilted * tilt_rows.T,
                 pace * jnp.zeros((1, 7), angles.dtype).at[0, 6].set(edge),
             ]
         )
@@ -398,7 +403,7 @@ class OnlineBlock:
         angles = angles_at(case.angles, first, moves, shares)
         gaps = jax.vmap(lambda q: jnp.min(clearances(case.arm, case.scene, q)))(angles)
         contact = self.contact_terms(case, flight, angles[-1], point[-1])[2]
-        excess = _Excess(joints=joints, contact=contact, clearance=self.kept - jnp.min(gaps))
+        excess = _Excess(joints=joints, contact=contact, clearance=self.margin - jnp.min(gaps))
         violation = jnp.where(point[-1] > case.delay, excess.greatest, jnp.inf)
         is_finite = jnp.isfinite(violation)
         status = jnp.where(violation <= FEASIBILITY_TOLERANCE, Status.FEASIBLE, Status.INFEASIBLE)
