@@ -1,0 +1,414 @@
+"""A six-axis arm with a shield: kinematics, inverse kinematics, dynamics, and reading it from MJCF.
+
+Closed forms are those of the IRB 1600-6/1.2; what has none is compared with MuJoCo, also for an arm
+whose frames lie askew.
+"""
+
+import dataclasses
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import struct
+from jaxpr import assert_full_precision
+
+import planner_jax.robot
+from planner_jax.robot.arm import REGIMES, capsules, link_frames, shield_jacobian, shield_pose
+from planner_jax.robot.arm_dynamics import inverse_dynamics
+from planner_jax.robot.arm_ik import inverse_kinematics
+from planner_jax.robot.arm_mjcf import irb1600, read_arm
+
+FILE = Path(planner_jax.robot.__file__).parent / "models" / "irb1600.xml"
+IRB1600 = FILE.read_text("utf-8")
+# Degrees, frames turned at will, joints that turn the other way, a base that leans, a wrist beside
+# the plane of the arm, links 2 and 3 at an angle to it, and a shield whose normal is not axis 6.
+ASKEW = """
+<mujoco>
+  <compiler eulerseq="XYZ"/>
+  <option><flag contact="disable"/></option>
+  <worldbody>
+    <body name="base">
+      <geom name="base" type="box" size=".2 .2 .1" pos="0 0 .1"/>
+      <geom name="foot" type="capsule" size=".05 .3" pos=".1 .2 .3" euler="40 -20 10"/>
+      <body name="a" pos=".02 -.01 .3" euler="10 20 30">
+        <joint axis="0 0 -1" range="-170 170"/>
+        <inertial pos=".01 .02 .03" mass="12" fullinertia=".5 .6 .4 .05 -.04 .03"/>
+        <body name="b" pos=".1 .05 .2" euler="90 0 0">
+          <joint axis="0 0 2" range="-150 120"/>
+          <inertial pos="0 .2 0" mass="6" diaginertia=".2 .1 .15" euler="10 0 40"/>
+          <body name="c" pos=".05 .5 .03" euler="0 0 20">
+            <joint axis="0 0 -1" range="-100 200"/>
+            <inertial pos=".1 0 .02" mass="5" diaginertia=".1 .1 .1"/>
+            <body name="d" pos=".1 .06 -.02" euler="0 90 0">
+              <joint range="-175 175"/>
+              <inertial pos="0 .01 .2" mass="2" diaginertia=".03 .02 .04" quat="1 .2 .3 0"/>
+              <geom name="wrist" type="capsule" size=".04" fromto="0 0 .05 .01 .02 .4"/>
+              <body name="e" pos="0 0 .4" quat="3 3 0 0">
+                <joint axis="0 0 1" range="-115 115"/>
+                <inertial pos="0 0 0" mass=".3" diaginertia=".001 .001 .001"/>
+                <geom name="ball" type="sphere" size=".06" pos=".01 0 0"/>
+                <body name="f" pos="-.07517540966 .02736161147 0" euler="0 0 70">
+                  <joint type="hinge" axis="0 1 0" range="-180 180"/>
+                  <inertial pos=".01 .02 0" mass=".5" diaginertia=".002 .001 .002"/>
+                  <geom name="shield" type="box" size=".01 .2 .2" pos=".03 .04 -.02"/>
+                  <site name="shield" pos=".04 .04 -.02"/>
+                </body>
+              </body>
+            </body>
+          </body>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <keyframe><key name="home" qpos="0 .1 .2 .3 .4 .5"/></keyframe>
+</mujoco>"""
+MODELS = {"irb1600": IRB1600, "askew": ASKEW}
+NUM = 200  # angles in the one program that most tests share
+CHAIN = np.array([[0.15, 0, 0.4865], [0, 0, 0.475], [0.3, 0, 0], [0.3, 0, 0], [0.065, 0, 0]])
+
+float64 = pytest.mark.usefixtures("float64")
+of_each_arm = pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
+
+
+def arm_of(model, dtype=np.float64):
+    return read_arm(model, dtype=dtype)
+
+
+def some_angles(arm, num, seed=0):
+    """Angles (num, 6) within the limits, and within those turns that inverse kinematics gives."""
+    share = np.random.default_rng(seed).uniform(0.01, 0.99, size=(num, 6))
+    middle = 0.5 * (arm.lower + arm.upper)
+    half = np.minimum(0.5 * (arm.upper - arm.lower), np.pi)
+    return (middle + (2.0 * share - 1.0) * half).astype(arm.home.dtype)
+
+
+def without_capsules(arm):
+    """The arm as one that shares its compiled programs with others."""
+    none = {"capsule_ends": arm.capsule_ends[:0], "capsule_radius": arm.capsule_radius[:0]}
+    return dataclasses.replace(arm, **none, capsule_link=())
+
+
+@struct.dataclass
+class Everything:
+    """What the library says of an arm at angles, of N of them with leaves (N, ...)."""
+
+    frames: tuple
+    pose: tuple
+    jacobian: jax.Array
+    torques: jax.Array
+    branches: jax.Array
+    found: jax.Array
+    off: jax.Array  # of the branches' poses from the pose, the largest number
+
+
+def everything_at(arm, angles, velocity, acceleration):
+    rotation, middle = shield_pose(arm, angles)
+    branches, found = inverse_kinematics(arm, rotation, middle)
+    turned, place = jax.vmap(lambda q: shield_pose(arm, q))(branches)
+    turned_off, place_off = jnp.abs(turned - rotation), jnp.abs(place - middle)
+    return Everything(
+        frames=link_frames(arm, angles),
+        pose=(rotation, middle),
+        jacobian=shield_jacobian(arm, angles),
+        torques=inverse_dynamics(arm, angles, velocity, acceleration),
+        branches=branches,
+        found=found,
+        off=jnp.maximum(jnp.max(turned_off, axis=(1, 2)), jnp.max(place_off, axis=1)),
+    )
+
+
+one_at, many_at = (
+    jax.jit(function)
+    for function in (everything_at, jax.vmap(everything_at, in_axes=(None, 0, 0, 0)))
+)
+
+
+def everything(arm, angles, velocity=0.0, acceleration=0.0):
+    """`Everything` of an arm without its capsules at N <= NUM angles, by one program for all."""
+    motion = np.broadcast_arrays(angles, velocity, acceleration)
+    rows = (np.resize(each, (NUM, 6)).astype(angles.dtype) for each in motion)
+    found = many_at(without_capsules(arm), *rows)
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[: len(angles)], found)
+
+
+@jax.jit
+def moved(arm, rotation, middle, velocity, spin):
+    """Branches of poses (N, ...), and their rates as these move and turn, (N, 3) each."""
+
+    def of_one(rotation, middle, velocity, spin):
+        turning = jnp.cross(spin, rotation.T).T
+        return jax.jvp(
+            lambda r, m: inverse_kinematics(arm, r, m), (rotation, middle), (turning, velocity)
+        )
+
+    (branches, found), (rates, _) = jax.vmap(of_one)(rotation, middle, velocity, spin)
+    return branches, found, rates
+
+
+# Kinematics
+
+
+@float64
+def test_at_angle_zero_the_arm_stands_upright_with_its_forearm_forward():
+    rotations, positions = everything(arm_of(IRB1600), np.zeros((1, 6))).frames
+    np.testing.assert_array_equal(rotations[0], np.tile(np.eye(3), (6, 1, 1)))
+    np.testing.assert_array_equal(positions[0, 0], np.zeros(3))
+    np.testing.assert_allclose(positions[0, 1:], np.cumsum(CHAIN, axis=0), rtol=1e-15)
+
+
+def test_at_home_the_shield_is_low_in_front():
+    arm = irb1600()
+    rotation, middle = everything(arm, arm.home[None]).pose
+    normal = rotation[0, :, 0]
+    np.testing.assert_allclose(normal, [0.62, 0.17, -0.77], atol=5e-3)
+    np.testing.assert_allclose(middle[0] - 0.01 * normal, [1.091, 0.281, 0.190], atol=5e-4)
+
+
+@float64
+@of_each_arm
+def test_the_jacobian_is_that_of_the_moving_shield(model):
+    """By central differences; the angular velocity from  omega^ = dR/dq R^T."""
+    arm, step = arm_of(model), 1e-6
+    angles = some_angles(arm, 1)[0]
+    steps = step * np.concatenate([np.zeros((1, 6)), np.eye(6), -np.eye(6)])
+    at = everything(arm, angles + steps)
+    rotation, middle = at.pose
+    rates = (rotation[1:7] - rotation[7:]) / (2.0 * step) @ rotation[0].T
+    turning = np.stack([rates[:, 2, 1], rates[:, 0, 2], rates[:, 1, 0]])
+    moving = (middle[1:7] - middle[7:]).T / (2.0 * step)
+    np.testing.assert_allclose(at.jacobian[0], np.concatenate([moving, turning]), atol=1e-9)
+
+
+# Beside MuJoCo
+
+
+@pytest.fixture(scope="module", params=MODELS.values(), ids=MODELS)
+def simulated(request):
+    """An arm, its model in MuJoCo, angles, velocities and accelerations (9, 6)."""
+    mujoco = pytest.importorskip("mujoco", reason="the extra `sims` is not installed")
+    arm, rng = arm_of(request.param), np.random.default_rng(1)
+    motion = some_angles(arm, 9), *rng.normal(scale=(3.0, 20.0), size=(9, 6, 2)).transpose(2, 0, 1)
+    return mujoco, mujoco.MjModel.from_xml_string(request.param), arm, motion
+
+
+@float64
+def test_links_capsules_and_jacobian_are_where_mujoco_has_them(simulated):
+    mujoco, model, arm, (angles, _, _) = simulated
+    data, jacobian = mujoco.MjData(model), np.zeros((2, 3, 6))
+    at = everything(arm, angles)
+    rotations, positions = at.frames
+    ends = np.asarray(jax.jit(jax.vmap(lambda q: capsules(arm, q)))(angles))
+    geoms = [k for k in range(model.ngeom) if model.geom_type[k] != mujoco.mjtGeom.mjGEOM_BOX]
+    for k, each in enumerate(angles):
+        data.qpos[:] = each
+        mujoco.mj_forward(model, data)
+        np.testing.assert_allclose(rotations[k], data.xmat[2:].reshape(6, 3, 3), atol=1e-13)
+        np.testing.assert_allclose(positions[k], data.xpos[2:], atol=1e-13)
+        np.testing.assert_allclose(ends[k].mean(axis=1), data.geom_xpos[geoms], atol=1e-13)
+        along = 2.0 * model.geom_size[geoms, 1:2] * data.geom_xmat[geoms][:, 2::3]
+        np.testing.assert_allclose(np.abs(ends[k, :, 1] - ends[k, :, 0]), np.abs(along), atol=1e-13)
+        mujoco.mj_jacSite(model, data, jacobian[0], jacobian[1], model.site("shield").id)
+        np.testing.assert_allclose(at.pose[1][k], data.site("shield").xpos, atol=1e-13)
+        np.testing.assert_allclose(at.jacobian[k], jacobian.reshape(6, 6), atol=1e-13)
+    np.testing.assert_array_equal(arm.capsule_link, model.geom_bodyid[geoms] - 2)
+    np.testing.assert_allclose(arm.capsule_radius, model.geom_size[geoms, 0], rtol=1e-15)
+    np.testing.assert_allclose(arm.shield_half, model.geom("shield").size[1:], rtol=1e-15)
+    np.testing.assert_allclose(np.stack([arm.lower, arm.upper], axis=1), model.jnt_range)
+    np.testing.assert_array_equal(arm.home, model.key("home").qpos)
+
+
+@float64
+def test_the_torques_of_a_motion_are_those_of_mujoco(simulated):
+    mujoco, model, arm, motion = simulated
+    data = mujoco.MjData(model)
+    ours = everything(arm, *motion).torques
+    for k in range(len(ours)):
+        data.qpos[:], data.qvel[:], data.qacc[:] = (each[k] for each in motion)
+        mujoco.mj_inverse(model, data)
+        np.testing.assert_allclose(ours[k], data.qfrc_inverse, rtol=1e-10, atol=1e-10)
+
+
+# Dynamics
+
+
+def test_at_home_the_motors_hold_the_weight_of_the_arm():
+    arm = irb1600()
+    (held,) = everything(arm, arm.home[None]).torques
+    np.testing.assert_allclose(held[:3], [0.0, -117.0, -13.8], atol=0.5)
+
+
+# Inverse kinematics
+
+
+def from_the_nearest(at, angles):
+    """How far (N,) [rad] the original angles (N, 6) are from a branch."""
+    distance = np.max(np.abs(at.branches - angles[:, None]), axis=2)
+    return np.min(np.where(at.found, distance, np.inf), axis=1)
+
+
+@float64
+@of_each_arm
+def test_every_branch_reaches_the_pose_and_one_is_the_original(model):
+    arm = arm_of(model)
+    angles = some_angles(arm, NUM)
+    at = everything(arm, angles)
+    assert np.all(np.isfinite(at.branches)) and np.max(from_the_nearest(at, angles)) < 1e-7
+    within = np.all((at.branches >= arm.lower) & (at.branches <= arm.upper), axis=2)
+    np.testing.assert_array_equal(at.found, within & (at.off < 1e-9))
+    assert np.max(np.sum(at.found, axis=1)) == 8
+    for every, good in zip(at.branches, at.found, strict=True):
+        apart = np.max(np.abs(every[good][:, None] - every[good][None]), axis=2)
+        assert np.all(apart + np.eye(len(apart)) > 1e-3)
+
+
+def test_inverse_kinematics_is_right_to_rounding_in_float32():
+    arm = irb1600()
+    angles = some_angles(arm, NUM)
+    at = everything(arm, angles)
+    assert at.branches.dtype == np.float32 and np.max(at.off[at.found]) < 2e-6
+    # Where the arm is stretched, or the wrist straight, angles are roots of what was rounded.
+    assert np.max(from_the_nearest(at, angles)) < 1e-2
+
+
+def test_the_branches_move_as_the_jacobian_says():
+    arm = without_capsules(irb1600())
+    rotation, middle = everything(arm, some_angles(arm, len(EDGES))).pose
+    velocity, spin = np.random.default_rng(2).normal(size=(2, *middle.shape)).astype(np.float32)
+    branches, found, rates = (
+        np.asarray(leaf) for leaf in moved(arm, rotation, middle, velocity, spin)
+    )
+    driven = np.einsum("nij,nj->ni", everything(arm, branches[found]).jacobian, rates[found])
+    wanted = np.concatenate([velocity, spin], axis=1)
+    np.testing.assert_allclose(driven, wanted[np.nonzero(found)[0]], atol=1e-3)
+
+
+# Shields of the IRB 1600 that look along +x, with the wrist's centre at these places [m].
+EDGES = {
+    "straight wrist": ((0.75, 0.0, 0.9615), True),
+    "straight arm": ((1.225, 0.0, 0.4865), True),
+    "wrist on axis 1": ((0.0, 0.0, 1.3), True),
+    "wrist on axis 2": ((0.15, 0.0, 0.4865), False),
+    "just too far": ((1.2252, 0.0, 0.4865), False),
+    "far away": ((7.0, -2.0, 0.3), False),
+    "too near": ((0.2, 0.0, 0.5), False),
+}
+
+
+def test_at_the_edges_of_the_workspace_angles_and_rates_are_finite():
+    arm = without_capsules(irb1600())
+    places, reached = (np.array(each) for each in zip(*EDGES.values(), strict=True))
+    middle = (places + [0.075, 0.0, 0.0]).astype(np.float32)
+    rotation = np.tile(np.eye(3, dtype=np.float32), (len(EDGES), 1, 1))
+    velocity, spin = np.random.default_rng(3).normal(size=(2, len(EDGES), 3)).astype(np.float32)
+    branches, found, rates = (
+        np.asarray(leaf) for leaf in moved(arm, rotation, middle, velocity, spin)
+    )
+    assert np.all(np.isfinite(branches)) and np.all(np.isfinite(rates))
+    assert dict(zip(EDGES, np.any(found, axis=1), strict=True)) == dict(
+        zip(EDGES, reached, strict=True)
+    )
+
+
+# All of it
+
+
+def test_a_batch_is_a_loop():
+    arm = irb1600()
+    angles = some_angles(arm, 4, seed=5)
+    motion = angles, 0.5 * angles, 2.0 * angles
+    batch = everything(arm, *motion)
+    for k in range(len(angles)):
+        alone = one_at(without_capsules(arm), *(each[k] for each in motion))
+        for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(batch), strict=True):
+            np.testing.assert_allclose(a, b[k], atol=2e-4)
+
+
+def test_every_product_asks_for_full_precision():
+    arm = irb1600()
+    assert assert_full_precision(everything_at, arm, *[arm.home] * 3) > 0
+    assert assert_full_precision(capsules, arm, arm.home) > 0
+
+
+def test_the_regimes_differ_in_speed_acceleration_and_end():
+    speeds = [150.0, 160.0, 170.0, 320.0, 400.0, 450.0]  # [deg/s], of the datasheet
+    for name, factor, acceleration, ends_at_rest in (
+        ("R1", 2.0, 60.0, False),
+        ("R2", 1.0, 30.0, True),
+        ("R3", 2.0, 60.0, True),
+    ):
+        limits = REGIMES[name].limits
+        np.testing.assert_allclose(np.rad2deg(limits.velocity) / factor, speeds, rtol=1e-6)
+        np.testing.assert_array_equal(limits.acceleration, np.full(6, acceleration))
+        assert REGIMES[name].ends_at_rest is ends_at_rest
+
+
+# Reading MJCF
+
+
+def test_the_packaged_arm_is_read_once_as_float32():
+    assert irb1600() is irb1600()
+    assert {(type(leaf), leaf.dtype.name) for leaf in jax.tree.leaves(irb1600())} == {
+        (np.ndarray, "float32")
+    }
+
+
+def test_a_file_is_read_as_its_text_and_wherever_its_base_stands(tmp_path):
+    place = tmp_path / "arm.xml"
+    place.write_text(IRB1600.replace('<body name="base">', '<body name="base" pos="1 2 3">'))
+    assert jax.tree.all(jax.tree.map(np.array_equal, read_arm(str(place)), irb1600()))
+
+
+BAD = [
+    ("</mujoco>", "", "MJCF must be well-formed XML: no element found"),
+    ("<worldbody>", "<default/><worldbody>", "<default> in <mujoco .*> is not understood"),
+    ('angle="radian"', 'angle="turn"', 'angle must be degree or radian, got "turn"'),
+    ('angle="radian"', 'eulerseq="xYz"', 'eulerseq must be three of xyz or of XYZ, got "xYz"'),
+    ('angle="radian"', 'coordinate="local"', "<compiler .*>: coordinate is not understood"),
+    (
+        '<joint name="joint_4"',
+        '<joint type="slide"',
+        r"six links with one .*, got hinge, hinge, hin",
+    ),
+    ('<joint name="joint_4" axis="1 0 0" range="-3.4906 3.4906"/>', "", "hinge, none, hinge, hin"),
+    ('name="link_5" pos', 'name="link_5" axisangle', "<body .*>: axisangle is not understood"),
+    ('name="link_2" pos="0.15 0', 'name="link_2" pos="0.15', "pos must be 3 finite number"),
+    (
+        'name="link_2"',
+        'euler="0 0 0" quat="1 0 0 0"',
+        "<body .*> must have quat or euler, not both",
+    ),
+    ('name="link_2"', 'quat="0 0 0 0"', "<body .*>: quat must not be zero"),
+    ('name="joint_2"', 'pos="0 0 1"', "<joint .*>: pos must be 0 0 0"),
+    ('name="joint_2"', 'limited="false"', "<joint .*> must be limited"),
+    ('name="joint_2"', 'damping="1"', "<joint .*>: damping is not understood"),
+    ('range="-1.0995 1.9198"', "", "<joint .*>: range must be 2 finite"),
+    ('range="-1.0995 1.9198"', 'range="2 1"', "<joint .*>: range must rise"),
+    ('mass="16.0317"', 'mass="x"', "<inertial .*>: mass must be 1 finite"),
+    ('mass="16.0317"', 'mass="-1"', "<inertial .*>: mass and inertia must be positive"),
+    ('type="sphere"', 'type="mesh"', "<geom .*> must be a capsule or a sphere"),
+    ('type="sphere" size="0.054"', 'type="sphere" size="-1"', "<geom .*>: its radius must be > 0"),
+    ('<geom name="base" type="box"', '<geom type="sphere"', "must have one box, got 0"),
+    ('<site name="shield"', '<site name="face"', "<body .*> must have a geom and a site named sh"),
+    ('size="0.005 0.15 0.15"', 'size="0.005 0.15 0.2"', "<geom .*> must be square across x"),
+    (
+        'shield" pos="0.01 0 0"',
+        'shield" pos="0 0 0"',
+        "<site .*>: pos must be the middle of the sh",
+    ),
+    ('name="home"', 'name="away"', "<keyframe> must have a key named home"),
+    ('qpos="0.25136 ', 'qpos="4 ', "<key .*>: qpos must be within the ranges of the joints"),
+    ('"joint_2" axis="0 1 0"', '"joint_2" axis="0 1 1"', "closed form .*: axis 2 must be at right"),
+    ('"joint_3" axis="0 1 0"', '"joint_3" axis="1 0 0"', "closed form .*: axis 3 must be parallel"),
+    ('"link_5" pos="0.3 0 0"', '"link_5" pos="0.3 0 .1"', "axes 4, 5 and 6 must meet in one point"),
+    ('"link_3" pos="0 0 0.475"', '"link_3" pos="0 1 0"', "a distance between axis 2 and 3"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "message"), BAD, ids=lambda text: text[:30])
+def test_what_is_no_such_arm_is_refused_in_one_line(old, new, message):
+    assert IRB1600.count(old) >= 1
+    with pytest.raises(ValueError, match=message) as refused:
+        read_arm(IRB1600.replace(old, new))
+    assert "\n" not in str(refused.value)
