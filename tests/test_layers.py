@@ -35,6 +35,7 @@ ALLOWED = {
     "trajectory": {"arithmetic"},
     "robot": {"arithmetic", "protocol", "trajectory"},
     "plane": set(),
+    "space": set(),
     "cost": {"arithmetic", "lanes", "robot", "trajectory"},
     "optimise": {"lanes", "protocol"},
     "planning": {"optimise", "protocol"},

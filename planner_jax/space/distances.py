@@ -8,7 +8,7 @@ Each distance is |gap| at the nearest points, and these are where the gap is sho
 along their bodies therefore changes the distance only in second order, so its slope is that of the
 gap between points that are held (the envelope theorem). `_shortest` says so to JAX: slopes cost
 little more than values, and need no division by the sine of two bodies that are nearly parallel.
-Bodies that touch have distance 0 and slope 0. Where several points are nearest, as between
+Bodies that cross have distance 0 and slope 0. Where several points are nearest, as between
 parallel bodies, the slope is that for one pair of them.
 
 Vectors are tuples of components here, so that everything is one elementwise loop over the lanes.
@@ -238,9 +238,9 @@ def _share_nearest_to_slabs(slabs: list[_Slab]) -> Array:
     falls: its zero lies between the last bend with no more than 0 and the first with no less, and
     is found there by interpolation. Where it is 0 on a whole interval, the middle is taken.
 
-    In this form the slope never falls in float32 either, and a slab adds exactly 0 at its own
-    bends. From coordinates it would be wrong there by a rounding, which for a segment nearly along
-    a face is as much as the whole slope on the other side of the zero.
+    Written so, a slab adds exactly 0 at its own bends in float32 too. Computed from coordinates it
+    would add the rounding of a segment that runs across it, beside which the slope of the others,
+    if the segment is nearly along them, is nothing: the zero would be found elsewhere.
     """
 
     def slope(s: Array | float) -> Array:
@@ -280,13 +280,13 @@ def _nearest_of_projection(middle: Array, edges: Array, place: Array) -> Any:
     """
     e, f = _ground(edges)
     to_x, to_y = to = tuple(x - m for x, m in zip(place, middle[:2], strict=True))
-    squares, cosine = (_dot(e, e), _dot(f, f)), _dot(e, f)
+    squares, product = (_dot(e, e), _dot(f, f)), _dot(e, f)
     ahead = (_dot(to, e), _dot(to, f))
-    nearest = jnp.full_like(cosine, jnp.inf)
-    p = q = jnp.zeros_like(cosine)
+    nearest = jnp.full_like(product, jnp.inf)
+    p = q = jnp.zeros_like(product)
     for side in (-1.0, 1.0):
-        on_f = jnp.clip(_ratio(ahead[1] - side * cosine, squares[1]), -1.0, 1.0)
-        on_e = jnp.clip(_ratio(ahead[0] - side * cosine, squares[0]), -1.0, 1.0)
+        on_f = jnp.clip(_ratio(ahead[1] - side * product, squares[1]), -1.0, 1.0)
+        on_e = jnp.clip(_ratio(ahead[0] - side * product, squares[0]), -1.0, 1.0)
         for along_e, along_f in ((side, on_f), (on_e, side)):
             gap_x = to_x - along_e * e[0] - along_f * f[0]
             gap_y = to_y - along_e * e[1] - along_f * f[1]
@@ -297,7 +297,7 @@ def _nearest_of_projection(middle: Array, edges: Array, place: Array) -> Any:
     area = jnp.abs(_area(e, f))
     inside = (jnp.abs(_area(to, f)) < area) & (jnp.abs(_area(e, to)) < area)
     # A projection without width has points far off on its line that the areas do not tell apart.
-    inside = inside & (_dot(to, to) <= squares[0] + squares[1] + 2.0 * jnp.abs(cosine))
+    inside = inside & (_dot(to, to) <= squares[0] + squares[1] + 2.0 * jnp.abs(product))
     return p, q, ~inside
 
 

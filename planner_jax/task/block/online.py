@@ -20,7 +20,7 @@ from jax import Array, lax
 from planner_jax.optimise.levenberg import LevenbergConfig, Model, least_squares
 from planner_jax.planning.one_by_one import one_by_one
 from planner_jax.protocol import FEASIBILITY_TOLERANCE, Attempt, Status, is_solved
-from planner_jax.robot.arm import shield_jacobian, shield_pose
+from planner_jax.robot.arm import product, shield_jacobian, shield_pose
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import clearances, is_of_pole
 from planner_jax.task.block.end_poses import (
@@ -337,7 +337,7 @@ class OnlineBlock:
         by_normal = jnp.cross(turns, normal)
         # Off the plane of the shield.
         off = jnp.sum(away * normal)
-        off_slope = jnp.append(-moves @ normal + by_normal @ away, jnp.sum(velocity * normal))
+        off_slope = jnp.append(product(by_normal, away) - product(moves, normal), jnp.sum(velocity * normal))
         # Off its middle, within the plane.
         beside = away - off * normal
         beside_slope = jnp.concatenate([-moves, velocity[None]])
@@ -369,18 +369,18 @@ class OnlineBlock:
         rows = jnp.concatenate(
             [
                 weights.meeting * off[None],
-                weights.meeting * beside_share * (beside @ across),
-                weights.tilt * tilt_share * (tilt @ frame),
+                weights.meeting * beside_share * product(beside, across),
+                weights.tilt * tilt_share * product(tilt, frame),
                 pace * (early + late)[None],
             ]
         )
         is_beside = jnp.where(beside_share > 0.0, weights.meeting, 0.0)
         is_tilted = jnp.where(tilt_share > 0.0, weights.tilt, 0.0)
-        tilt_rows = jnp.concatenate([tilt_slope, by_time[None]]) @ frame
+        tilt_rows = product(jnp.concatenate([tilt_slope, by_time[None]]), frame)
         slopes = jnp.concatenate(
             [
                 weights.meeting * off_slope[None],
-                is_beside * (beside_slope @ across).T,
+                is_beside * product(beside_slope, across).T,
                 is_tilted * tilt_rows.T,
                 pace * jnp.zeros((1, 7), angles.dtype).at[0, 6].set(edge),
             ]

@@ -28,6 +28,10 @@ if TYPE_CHECKING:
     from planner_jax.task.intercept.spacetime import SpacetimeIntercept
 
 
+# What being early weighs: so little beside the limits that the least cost lies within their slack.
+_EARLY = 30.0
+
+
 @struct.dataclass
 class BegunCase(InterceptCase):
     """A case of which the way round the obstacles is settled."""
@@ -79,8 +83,9 @@ class SmoothIntercept(OptimisedPlanner):
     def model(self, point: Array, context: _Context) -> Model:
         """The sum of squares and its quadratic model."""
         planner = self.planner
+        weights = dataclasses.replace(planner.weights, early=_EARLY)
         places = planner.guess_at(point).places
-        return planner.model(point, context.moving, context.field, planner.weights, places)
+        return planner.model(point, context.moving, context.field, weights, places)
 
     def exact_model(self, point: Array, context: _Context) -> Model:
         """The same with the gradient of the cost itself.

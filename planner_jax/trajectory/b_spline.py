@@ -1,0 +1,132 @@
+"""Clamped uniform B-splines of any degree: smooth curves between control points.
+
+With m control points p_i and a degree k, over shares s from 0 to 1 of the duration,
+
+    q(s) = sum_i  p_i N_{i,k}(s),    i = 0 .. m - 1    (paper 004, eq. 3),
+
+and the basis N by the recursion of Cox and de Boor (eq. 2) over knots s_0 .. s_{m+k},
+
+    N_{i,0}(s) = 1 where s_i <= s < s_{i+1}, else 0,
+    N_{i,k}(s) = (s - s_i) / (s_{i+k} - s_i) N_{i,k-1}(s)
+                 + (s_{i+k+1} - s) / (s_{i+k+1} - s_{i+1}) N_{i+1,k-1}(s),
+
+with 0 / 0 = 0. In print eq. 2 has s_{i+k-1} and s_{i+k} for s_{i+k} and s_{i+k+1}: that is right
+if k is the order, degree + 1, while the text calls it the degree; and eq. 3 sums m + 1 of m
+points. The knots are not printed: clamped means that the first and the last stand k + 1 times, so
+that the curve begins and ends at its first and last point; uniform, that the m - k spans between
+the others are equally long.
+
+A curve lies between its control points, and so do its derivatives: a bound on the points of
+`hodograph` bounds them everywhere. Everything that is linear in the points is a constant matrix,
+a NumPy array in double precision.
+"""
+
+import math
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.typing import ArrayLike
+
+from planner_jax.trajectory.polynomial import PiecewisePolynomial
+
+
+def basis(degree: int, num: int, shares: ArrayLike) -> np.ndarray:
+    """The basis at shares (...) of the duration: times control points the curve, (..., num).
+
+    Args:
+        degree: k >= 0.
+        num: of control points, more than the degree.
+        shares: from 0 to 1.
+
+    Raises:
+        ValueError: there are too few control points, or a share is outside; one line that says so.
+    """
+    shares = np.asarray(shares, float)
+    if not ((shares >= 0.0) & (shares <= 1.0)).all():
+        outside = np.ravel(shares)[np.argmax(np.abs(np.ravel(shares) - 0.5))]
+        raise ValueError(f"shares must be from 0 to 1, got {outside:g}")
+    return _basis(degree, num, shares * _spans(degree, num))
+
+
+def hodograph(degree: int, order: int, num: int) -> np.ndarray:
+    """From the control points to those of a derivative by the share, (num - order, num).
+
+    The derivative is a B-spline again, of a degree less by the order, over the same spans. A point
+    of the first one is the difference of two neighbours, times the degree, over the share between
+    the knots where their common part of the basis begins and ends. Divided by the duration to the
+    power of the order it is the derivative by the time.
+
+    Args:
+        degree: k.
+        order: of the derivative, 0 to k.
+        num: of control points, more than the degree.
+
+    Raises:
+        ValueError: there are no more control points than the degree.
+    """
+    spans = _spans(degree, num)
+    points = np.eye(num)
+    for k in range(degree, degree - order, -1):
+        knots = _knots(k, spans)[1:-1]
+        widths = (knots[k:] - knots[:-k]) / spans
+        points = k * np.diff(points, axis=0) / widths[:, None]
+    return points
+
+
+def b_spline(degree: int, points: ArrayLike, duration: ArrayLike) -> PiecewisePolynomial:
+    """The B-spline of some control points as a piecewise polynomial, a piece for each span.
+
+    Args:
+        degree: k.
+        points: (m, D), m > k, of which the first is where the curve begins and the last its end.
+        duration: () [s], > 0.
+
+    Returns:
+        m - k pieces of equal duration, with coefficients (m - k, k + 1, D).
+
+    Raises:
+        ValueError: there are no more control points than the degree.
+    """
+    points = jnp.asarray(points)
+    num = points.shape[0]
+    spans = _spans(degree, num)
+    taylor = [
+        _basis(degree - k, num - k, np.arange(spans))
+        @ hodograph(degree, k, num)
+        / math.factorial(k)
+        for k in range(degree + 1)
+    ]
+    of_points = jnp.asarray(np.stack(taylor, axis=1), points.dtype)
+    coeffs = jnp.einsum("ikm,md->ikd", of_points, points, precision=lax.Precision.HIGHEST)
+    duration = jnp.asarray(duration, points.dtype)
+    return PiecewisePolynomial(
+        coeffs=coeffs / duration ** np.arange(degree + 1)[:, None],
+        durations=jnp.full(spans, duration / spans),
+    )
+
+
+def _spans(degree: int, num: int) -> int:
+    if num <= degree:
+        raise ValueError(f"control points must be more than the degree {degree}, got {num}")
+    return num - degree
+
+
+def _knots(degree: int, spans: int) -> np.ndarray:
+    """The knots (spans + 2 degree + 1,), in spans: whole numbers."""
+    return np.clip(np.arange(spans + 2 * degree + 1) - degree, 0, spans)
+
+
+def _basis(degree: int, num: int, places: np.ndarray) -> np.ndarray:
+    """The basis (..., num) at places (...) in spans, from 0 to their number."""
+    spans = num - degree
+    knots = _knots(degree, spans)
+    span = np.minimum(np.floor(places), spans - 1)  # the last one holds its end too
+    is_in = np.arange(spans) == span[..., None]
+    values = np.zeros((*places.shape, spans + 2 * degree))
+    values[..., degree : degree + spans] = is_in
+    for k in range(1, degree + 1):
+        rises = (places[..., None] - knots[: -k - 1]) / np.maximum(knots[k:-1] - knots[: -k - 1], 1)
+        falls = (knots[k + 1 :] - places[..., None]) / np.maximum(knots[k + 1 :] - knots[1:-k], 1)
+        values = rises * values[..., :-1] + falls * values[..., 1:]
+    return values

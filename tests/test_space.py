@@ -1,0 +1,213 @@
+"""Distances of segments, rectangles, boxes and vertical lines in space."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from derivatives import assert_gradient_matches_differences
+from scipy.optimize import lsq_linear
+
+from planner_jax.space.distances import (
+    lowest_of_rectangle,
+    lowest_of_segment,
+    rectangle_to_vertical_line,
+    segment_to_box,
+    segment_to_rectangle,
+    segment_to_segment,
+    segment_to_vertical_line,
+)
+
+# Enough lanes of every kind below that rare arrangements of bends come up.
+NUM = 60
+DISTANCES = {
+    "segments": segment_to_segment,
+    "rectangle": segment_to_rectangle,
+    "box": segment_to_box,
+    "line": segment_to_vertical_line,
+    "rectangle to line": rectangle_to_vertical_line,
+}
+every_distance = pytest.mark.parametrize("name", DISTANCES)
+
+
+def gap_of(name, bodies):
+    """The gap of two bodies as first + columns @ shares, over shares from 0 to 1."""
+    if name == "segments":
+        (a, a_end), (b, b_end) = bodies
+        return a - b, [a_end - a, b - b_end]
+    if name == "rectangle":
+        (a, a_end), middle, (e, f) = bodies
+        return a - middle - e - f, [a_end - a, 2.0 * e, 2.0 * f]
+    if name == "box":
+        (a, a_end), lower, upper = bodies
+        return a - lower, [a_end - a, *np.diag(lower - upper)]
+    if name == "line":
+        (a, a_end), place = bodies
+        return (a[:2] - place), [(a_end - a)[:2]]
+    middle, (e, f), place = bodies
+    return (middle - e - f)[:2] - place, [2.0 * e[:2], 2.0 * f[:2]]
+
+
+def least_distances(name, bodies):
+    """Distances (N,) as bounded least squares over all points of both bodies."""
+    results = []
+    for pair in zip(*(np.asarray(body, float) for body in bodies), strict=True):
+        first, columns = gap_of(name, pair)
+        matrix = np.stack(columns, axis=1)
+        shares = lsq_linear(matrix, -first, bounds=(0.0, 1.0), method="bvls", tol=1e-14).x
+        results.append(np.linalg.norm(first + matrix @ shares))
+    return np.array(results)
+
+
+def segments(rng, kind):
+    """Segments (NUM, 2, 3) [m] of one kind."""
+    ends = rng.uniform(-1.0, 1.0, (NUM, 2, 3))
+    if kind == "points":
+        ends[:, 1] = ends[:, 0]
+    if kind == "along":  # nearly along an axis, in float32 down to a last bit
+        ends[:, 1, :2] = ends[:, 0, :2] + 10.0 ** rng.uniform(-8.0, -2.0, (NUM, 2))
+    if kind == "grid":  # along axes, through corners, in faces, of no length
+        ends = rng.integers(-2, 3, (NUM, 2, 3)) / 4.0
+    return ends
+
+
+def pairs(name, kind, seed=0):
+    """Bodies of NUM pairs, segments among them of one kind, as float32."""
+    rng = np.random.default_rng(seed)
+    ends = segments(rng, kind)
+    place, middle = rng.uniform(-0.7, 0.7, (NUM, 2)), rng.uniform(-0.3, 0.3, (NUM, 3))
+    axes = np.linalg.qr(rng.normal(size=(NUM, 3, 3)))[0]
+    edges = axes[:, :2] * rng.uniform(0.1, 0.6, (NUM, 2, 1))
+    upper = rng.uniform(0.0, 0.6, (NUM, 3))
+    if kind in ("along", "grid"):
+        upper = np.round(4.0 * upper) / 4.0
+        edges, middle = np.broadcast_to(np.eye(3)[1:] / 4.0, (NUM, 2, 3)), np.zeros((NUM, 3))
+        place[: NUM // 2] = np.round(4.0 * place[: NUM // 2]) / 4.0
+    other = np.concatenate([ends[: NUM // 2] + place[: NUM // 2, :1, None], ends[NUM // 2 :][::-1]])
+    bodies = {
+        "segments": (ends, other),
+        "rectangle": (ends, middle, edges),
+        "box": (ends, -upper, upper),
+        "line": (ends, place),
+        "rectangle to line": (middle, edges, place),
+    }[name]
+    return tuple(np.asarray(body, np.float32) for body in bodies)
+
+
+@functools.cache
+def measured(name):
+    """Distances of many pairs, and their slopes by everything."""
+    distance = DISTANCES[name]
+    count = len(pairs(name, "any"))
+    return jax.jit(jax.vmap(jax.value_and_grad(distance, argnums=tuple(range(count)))))
+
+
+def distances(name, bodies):
+    return np.asarray(measured(name)(*bodies)[0])
+
+
+@every_distance
+@pytest.mark.parametrize("kind", ["any", "points", "along", "grid"])
+def test_a_distance_is_the_least_over_all_points_of_both_bodies_to_float32(name, kind):
+    bodies = pairs(name, kind)
+    value, slopes = measured(name)(*bodies)
+    np.testing.assert_allclose(value, least_distances(name, bodies), atol=2e-6)
+    # As a distance changes by no more than the bodies move, also where they touch or are parallel.
+    for slope in slopes:
+        assert np.isfinite(slope).all()
+        assert (np.linalg.norm(slope.reshape(NUM, -1), axis=1) <= np.sqrt(2.0) + 1e-5).all()
+
+
+def smooth_pairs(name):
+    """Bodies in float64 whose distance is smooth: neither touching nor parallel."""
+    bodies = pairs(name, "any")
+    smooth = distances(name, bodies) > 0.05
+    if name == "segments":
+        smooth[: NUM // 2] = False
+    assert smooth.sum() > 10
+    return [body[smooth].astype(np.float64) for body in bodies]
+
+
+@every_distance
+def test_a_slope_is_that_of_finite_differences(name, float64):
+    many = jax.vmap(DISTANCES[name])
+    assert_gradient_matches_differences(
+        lambda bodies: jnp.sum(many(*bodies)), smooth_pairs(name), step=1e-7, rtol=1e-6
+    )
+
+
+@pytest.mark.parametrize("name", ["segments", "rectangle", "box", "line"])
+def test_a_slope_has_the_slope_that_comes_from_nearest_points_moving_along(name, float64):
+    ends, *others = smooth_pairs(name)
+    direction = np.random.default_rng(1).normal(size=ends.shape)
+    many = jax.vmap(DISTANCES[name])
+
+    def slope(ends):
+        return jnp.sum(jax.jvp(lambda ends: many(ends, *others), (ends,), (direction,))[1])
+
+    assert_gradient_matches_differences(slope, ends, step=1e-7, rtol=1e-6)
+
+
+def test_segments_that_are_swapped_or_turned_round_are_as_far(float64):
+    a, b = (np.asarray(ends, float) for ends in pairs("segments", "any"))
+    expected = distances("segments", (a, b))
+    np.testing.assert_allclose(distances("segments", (b, a)), expected, atol=1e-12)
+    np.testing.assert_allclose(distances("segments", (a[:, ::-1], b)), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["rectangle", "rectangle to line"])
+def test_it_does_not_matter_which_way_a_rectangles_edges_point_or_which_is_first(name, float64):
+    bodies = [np.asarray(body, float) for body in pairs(name, "any")]
+    k = 2 if name == "rectangle" else 1
+    expected = distances(name, bodies)
+    for edges in (bodies[k][:, ::-1], bodies[k] * [[1.0], [-1.0]]):
+        same = distances(name, [*bodies[:k], edges, *bodies[k + 1 :]])
+        np.testing.assert_allclose(same, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["rectangle", "box", "rectangle to line"])
+def test_bodies_that_cross_have_exactly_no_distance_and_no_slope(name):
+    bodies = pairs(name, "any")
+    crosses = least_distances(name, bodies) < 1e-7
+    assert 3 < crosses.sum() < NUM - 3
+    value, slopes = measured(name)(*bodies)
+    assert (value[crosses] == 0.0).all() and (value[~crosses] > 0.0).all()
+    for slope in slopes:
+        assert (slope[crosses] == 0.0).all()
+
+
+def test_a_segment_nearly_along_an_edge_of_a_box_is_exact_in_float32_too():
+    """A bend of the slope that is missed by a rounding would shift the zero by a tenth of all."""
+    rng = np.random.default_rng(0)
+    ends = rng.uniform(-1.0, 1.0, (1000, 2, 3)) * [0.9, 4e-4, 4e-4] + [0.0, 0.3, 0.1]
+    upper = np.broadcast_to(np.asarray([0.6, 0.3, 0.1], np.float32), (1000, 3))
+    bodies = (ends.astype(np.float32), -upper, upper)
+    np.testing.assert_allclose(distances("box", bodies), least_distances("box", bodies), atol=5e-7)
+
+
+def test_an_upright_rectangle_does_not_reach_a_line_beyond_its_end():
+    """Its projection has no area, by which the line could be told to be outside of it."""
+    rng = np.random.default_rng(0)
+    angle, roll = rng.uniform(0.0, 6.0, 1000), rng.uniform(0.0, 1.5, (1000, 1))
+    along = np.stack([np.cos(angle), np.sin(angle), np.zeros(1000)], axis=1)
+    e = np.cos(roll) * along + np.sin(roll) * [0.0, 0.0, 1.0]
+    f = np.cos(roll) * [0.0, 0.0, 1.0] - np.sin(roll) * along
+    half = 0.15 * np.ravel(np.cos(roll) + np.sin(roll))
+    beyond = rng.uniform(-0.1, 0.5, 1000)
+    place = (half + beyond)[:, None] * along[:, :2]
+    bodies = (np.zeros((1000, 3)), 0.15 * np.stack([e, f], axis=1), place)
+    found = distances("rectangle to line", [body.astype(np.float32) for body in bodies])
+    np.testing.assert_allclose(found, np.maximum(beyond, 0.0), atol=1e-6)
+
+
+def test_the_lowest_points_are_those_of_the_corners():
+    rng = np.random.default_rng(0)
+    ends, edges = rng.normal(size=(2, NUM, 2, 3))
+    middle = rng.normal(size=(NUM, 3))
+    corners = [middle + a * edges[:, 0] + b * edges[:, 1] for a in (-1.0, 1.0) for b in (-1.0, 1.0)]
+    low = jax.jit(jax.vmap(lowest_of_rectangle))(middle, edges)
+    np.testing.assert_allclose(low, np.min(corners, axis=0)[:, 2], atol=1e-6)
+    np.testing.assert_allclose(
+        jax.jit(jax.vmap(lowest_of_segment))(ends), ends[..., 2].min(axis=1), rtol=1e-6
+    )
