@@ -2,7 +2,7 @@
 
 Capsules and the shield's face against a pole, the floor, beams, the base and each other. Links that
 are neighbours are left out, and so are links 5 and 6 against the shield that they carry. The shield
-is a plate without thickness here: planners keep a margin.
+is a plate of 0.01 m, its face the front one, with rounded edges.
 """
 
 import jax
@@ -23,15 +23,17 @@ from planner_jax.space.distances import (
 from planner_jax.task.block.scene import Scene
 
 FAR = 10.0  # [m], of a pole that is not there
-# The forearm ends in a fork around the wrist, which a capsule would round off: towards the shield it
-# is no thicker than this share of the way from the wrist to the shield's face.
+# The forearm ends in a fork around the wrist, which a capsule would round off: towards the
+# shield it is no thicker than this share of the way from the wrist to the shield's face.
 _FORK = 0.75
+_HALF_THICKNESS = 0.005  # [m], of the shield
 
 
 def clearances(arm: Arm, scene: Scene, angles: Array) -> Array:
     """Distances (R,) [m] of all pairs at angles (6,); capsules that overlap have negative ones."""
     ends = capsules(arm, angles)
     rotation, middle = shield_pose(arm, angles)
+    middle = middle - _HALF_THICKNESS * rotation[:, 0]
     edges = arm.shield_half * rotation[:, 1:].T
     link = np.asarray(arm.capsule_link)
     moving, trunk = np.flatnonzero(link >= 2), np.flatnonzero(link == 0)
@@ -59,13 +61,13 @@ def clearances(arm: Arm, scene: Scene, angles: Array) -> Array:
     shield_on_base = jnp.min(on_base(shield_edges, lower, upper))
     rows = [
         (among - radius[moving][:, None] - fixed_radius).reshape(-1),
-        of_shield - near_radius,
+        of_shield - near_radius - _HALF_THICKNESS,
         to_pole(on_pole - radius[moving]),
-        to_pole(shield_on_pole)[None],
+        to_pole(shield_on_pole - _HALF_THICKNESS)[None],
         on_floor - radius[moving],
-        lowest_of_rectangle(middle, edges)[None] - scene.floor,
+        lowest_of_rectangle(middle, edges)[None] - _HALF_THICKNESS - scene.floor,
         on_base(ends[moving], lower, upper) - radius[moving],
-        shield_on_base[None],
+        shield_on_base[None] - _HALF_THICKNESS,
     ]
     return jnp.concatenate(rows)
 

@@ -1,4 +1,4 @@
-"""Poses at which the shield meets a ball, and the straight motions of the joints that lead there."""
+"""Poses at which the shield meets a ball, and straight motions of the joints that lead there."""
 
 import jax
 import jax.numpy as jnp

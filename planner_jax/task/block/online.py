@@ -9,6 +9,9 @@ the bumps.
 """
 
 import dataclasses
+import functools
+import json
+from pathlib import Path
 from typing import ClassVar
 
 import jax
@@ -48,10 +51,18 @@ class Search(Attempt):
 
     starts: int = 8
     straight: int = 48  # motions that are looked at
-    tries: int = 12  # starts of least squares
+    tries: int = 15  # starts of least squares
     solver: LevenbergConfig = LevenbergConfig(
         16, damping=1e-2, ease=0.25, tighten=6.0, settled=1, tolerance=1.0
     )
+
+
+@functools.cache
+def learned_starts() -> tuple[np.ndarray, np.ndarray]:
+    """Where least squares begin: places (N,) in the order of poses, and bumps (N, 6) [rad]."""
+    found = json.loads((Path(__file__).parent / "learned_starts.json").read_text())
+    ranks = np.array([start["rank"] for start in found], np.int32)
+    return ranks, np.array([start["bump"] for start in found], np.float32)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,16 +117,17 @@ class OnlineBlock:
         flight = flight_of(case)
         poses = end_poses(case, flight, self.points, self.pieces)
         order = self.order(poses)
-        bumps = self.bumps(attempt)
+        ranks, bumps = (jnp.asarray(each) for each in learned_starts())
         in_time = jnp.sum(poses.effort <= 1.0 - self.slack)
         straight = jnp.minimum(in_time, attempt.straight)
 
         def next_one(state: tuple) -> tuple:
             k, best = state
             is_straight = k < straight
-            rank = jnp.where(is_straight, k, k - straight)
+            number = jnp.where(is_straight, 0, (k - straight) % len(ranks))
+            rank = jnp.where(is_straight, k, ranks[number])
             start = self.straight_point(case, poses, order[rank])
-            bump = jnp.where(is_straight, 0.0, bumps[jnp.minimum(rank, len(bumps) - 1)])
+            bump = jnp.where(is_straight, 0.0, bumps[number])
             start = start.at[:-1].add(self.bump(bump).reshape(-1))
             steps = jnp.where(is_straight, -1, attempt.solver.max_steps)
             config = dataclasses.replace(attempt.solver, max_steps=steps)
@@ -169,12 +181,6 @@ class OnlineBlock:
         shapes = jnp.asarray(all_profiles(self.pieces)[0], turned.dtype)
         steps = shapes[poses.profile[place]][:, None] * turned
         return jnp.append(steps.reshape(-1), time)
-
-    def bumps(self, attempt: Search) -> Array:
-        """How far starts go beside straight motions, (N, 6) [rad]."""
-        rng = np.random.default_rng(1)
-        drawn = rng.normal(0.0, 1.0, (max(attempt.tries, 1), 6)) * [0.5, 0.4, 0.4, 0.3, 0.5, 0.0]
-        return jnp.asarray(drawn, jnp.float32)
 
     def bump(self, height: Array) -> Array:
         """Steps (K, 6) that turn joints by up to so much (6,) [rad] and back: a squared sine."""
@@ -337,7 +343,9 @@ class OnlineBlock:
         by_normal = jnp.cross(turns, normal)
         # Off the plane of the shield.
         off = jnp.sum(away * normal)
-        off_slope = jnp.append(product(by_normal, away) - product(moves, normal), jnp.sum(velocity * normal))
+        off_slope = jnp.append(
+            product(by_normal, away) - product(moves, normal), jnp.sum(velocity * normal)
+        )
         # Off its middle, within the plane.
         beside = away - off * normal
         beside_slope = jnp.concatenate([-moves, velocity[None]])

@@ -11,7 +11,7 @@ of each suite's name: a change of a range is another suite. All draws are unifor
 | flight time to it | the distance over 7 to 10 m/s |
 
 A throw is drawn anew unless the ball, of 0.05 m radius, gets into the outer box through a side or
-the top, from there into the inner box, and touches no pole before. Robot base frame, z up, SI units.
+the top, from there into the inner box, and touches no pole before. Robot base frame, z up, SI.
 """
 
 import zlib
@@ -23,8 +23,15 @@ import numpy as np
 from planner_jax.registry import require_name
 from planner_jax.task.block.card import SUITES, Suite
 from planner_jax.task.block.case import BlockCase, case
-from planner_jax.task.block.scene import INNER_HALF, INNER_HEIGHT, OUTER_HALF, OUTER_HEIGHT
-from planner_jax.task.block.scene import POLE, POLE_RADIUS, paper_scene
+from planner_jax.task.block.scene import (
+    INNER_HALF,
+    INNER_HEIGHT,
+    OUTER_HALF,
+    OUTER_HEIGHT,
+    POLE,
+    POLE_RADIUS,
+    paper_scene,
+)
 
 GRAVITY = 9.81  # [m/s^2]
 BALL_RADIUS = 0.05  # [m]
