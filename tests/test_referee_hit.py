@@ -13,7 +13,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from planner_jax.ball.flight import BallState
-from planner_jax.referee import hit, quadrotor
+from planner_jax.referee import hit, judging
 from planner_jax.referee.hit import LIMITS, HitVerdict, referee_hits
 from planner_jax.robot.quadrotor import QuadrotorLimits
 from planner_jax.task.hit.case import HitCase, HitLimits
@@ -588,14 +588,14 @@ def test_every_limit_has_its_sentence():
 def test_processes_judge_as_threads_do(monkeypatch):
     lanes = np.arange(600)
     case = {"durations": lanes[:, None].astype(np.float32), "value": lanes.astype(np.float32)}
-    in_threads = quadrotor.judge_in_chunks(_halved, case, 256)
-    monkeypatch.setattr(quadrotor, "_MANY_CORES", 1)
-    monkeypatch.setattr(quadrotor, "_MANY_LANES", 1)
-    in_processes = quadrotor.judge_in_chunks(_halved, case, 256)
-    assert quadrotor.workers.cache_info().currsize == 1
+    in_threads = judging.judge_in_chunks(_halved, case, 256)
+    monkeypatch.setattr(judging, "_MANY_CORES", 1)
+    monkeypatch.setattr(judging, "_MANY_LANES", 1)
+    in_processes = judging.judge_in_chunks(_halved, case, 256)
+    assert judging.workers.cache_info().currsize == 1
     np.testing.assert_array_equal(in_processes["half"], in_threads["half"])
     with pytest.raises(ValueError, match="refused"):
-        quadrotor.workers().map(_refuse, [1, 2])
+        judging.workers().map(_refuse, [1, 2])
 
 
 def _halved(case):

@@ -17,17 +17,19 @@ from typing import Literal
 
 import numpy as np
 
-from planner_jax.referee.quadrotor import (
+from planner_jax.referee.judging import (
     CONTACT_TIME_TOLERANCE,
     above,
-    check_sampling,
-    checked_coeffs,
     checked_leaf,
     derivative,
     finite_lanes,
     first_failures,
-    intervals_of,
     judge_in_chunks,
+)
+from planner_jax.referee.quadrotor import (
+    check_sampling,
+    checked_coeffs,
+    intervals_of,
     judge_motion,
     pieces_of,
 )

@@ -14,7 +14,7 @@ from collections.abc import Callable
 import numpy as np
 
 from planner_jax.referee.clearance import clearances
-from planner_jax.referee.quadrotor import (
+from planner_jax.referee.judging import (
     CONTACT_TIME_TOLERANCE,
     SMALLEST_LIMIT,
     above,

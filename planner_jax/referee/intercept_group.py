@@ -18,7 +18,7 @@ from planner_jax.referee.intercept import (
     referee_intercepts,
     target_positions_of,
 )
-from planner_jax.referee.quadrotor import checked_leaf
+from planner_jax.referee.judging import checked_leaf
 
 
 @dataclasses.dataclass(frozen=True)

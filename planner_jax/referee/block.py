@@ -1,0 +1,477 @@
+"""Float64 NumPy referee of blocks: the kinematics alone decides whether a plan succeeds.
+
+It shares no code with the planners: the joints' polynomials are held against their limits at
+their extrema, the arm and its shield against all that they must not touch at every sample, and
+the ball falls along its parabola (paper 004, eqs 5 to 7). A plan's own claims (status, cost) are
+not trusted; of the contact only the time that it claims is read. Robot base frame, z up, SI
+units. Times count from the moment at which the ball is first seen.
+"""
+
+import dataclasses
+import functools
+
+import numpy as np
+
+from planner_jax.referee.arm_clearance import KINDS, clearances, links_of, shield_middle
+from planner_jax.referee.judging import (
+    CONTACT_TIME_TOLERANCE,
+    SMALLEST_LIMIT,
+    above,
+    checked_leaf,
+    derivative,
+    finite_lanes,
+    first_failures,
+    flat,
+    judge_in_chunks,
+)
+from planner_jax.referee.solids import turned_back
+from planner_jax.referee.verdict import Verdict
+
+# Limit -> what is said when it fails. In the order in which they are tested: a failed plan is
+# named after its first failure.
+_SENTENCES = {
+    "not finite": "the plan or its case is not finite",
+    "time": "the contact at {time:.3f} s is off by {excess:.3g} s; it must not come before the arm "
+    "may start nor before its motion ends nor after a minute, and no piece may last less than 0 s",
+    "start": "{failed_part} starts {excess:.3g} rad or rad/s off the case",
+    "continuity": "{failed_part} jumps by {excess:.3g} rad or rad/s at {time:.3f} s",
+    "position": "{failed_part} is {excess:.3g} rad beyond its limit at {time:.3f} s",
+    "velocity": "{failed_part} is {excess:.2%} above its limit at {time:.3f} s",
+    "acceleration": "{failed_part} is {excess:.2%} above its limit at {time:.3f} s",
+    "rest": "{failed_part} turns at {excess:.3g} rad/s when the motion ends, at {time:.3f} s; an "
+    "arm that is to stand, or ends before the contact, must be at rest there",
+    "floor": "{failed_part} is {excess:.3g} m below the floor at {time:.3f} s",
+    "pole": "{failed_part} is {excess:.3g} m inside the pole at {time:.3f} s",
+    "rig": "{failed_part} is {excess:.3g} m inside a beam of the rig at {time:.3f} s",
+    "base": "{failed_part} is {excess:.3g} m inside the base at {time:.3f} s",
+    "self": "{failed_part} are {excess:.3g} m inside each other at {time:.3f} s",
+    "ball": "the ball is {height:.3g} m off the plane of the shield's face and {miss:.3g} m from "
+    "its middle in that plane at {time:.3f} s",
+    "tilt": "the shield's normal is {excess:.3g} rad off the way that the ball comes from at "
+    "{time:.3f} s",
+    "tunnel": "the contact at {time:.3f} s is {excess:.3g} s off the time that the ball is in the "
+    "outer box before it gets into the inner one",
+}
+_UNBOUNDED = {"tunnel": "the ball never gets into the outer box"}
+LIMITS = tuple(_SENTENCES)
+# Leaves that may be infinite, besides the limits of the joints.
+_UNBOUNDED_LEAVES = ("arm.lower", "arm.upper", "offset", "tilt")
+_SIDES = ("lower", "upper")
+_JOINTS = np.array([f"joint {k}" for k in range(1, 7)])
+
+LONGEST_STEP = 0.002  # [s], between two samples
+LARGEST_TURN = 0.017  # [rad], of all joints together, between two samples
+# Joints that turn faster than this [rad/s] together are sampled as if they did not.
+_FASTEST = 100.0
+LONGEST_PLAN = 60.0  # [s], until the contact
+REST = 0.01  # [rad/s], fastest joint of an arm at rest
+# Halvings of a piece in the search for a root, and samples of arms that are worked out at once:
+# few enough for the cache.
+_HALVINGS, _SAMPLES = 45, 16384
+
+
+@dataclasses.dataclass(frozen=True)
+class BlockVerdict(Verdict):
+    """What the referee found, one entry a lane.
+
+    What is measured is NaN where the inputs are not finite or the plan's times are wrong.
+    Clearances are those at the samples; where solids overlap they are minus the depth, though for
+    a capsule no less than minus its radius. They are infinite where there is nothing to touch.
+    """
+
+    SENTENCES = _SENTENCES
+    UNBOUNDED = _UNBOUNDED
+
+    failed_part: np.ndarray  # (B,) str, the joint, link or shield that fails; "" without any
+    contact_time: np.ndarray  # (B,) [s]
+    execution_time: np.ndarray  # (B,) [s], of the motion
+    velocity_share: np.ndarray  # (B,) of a joint's limit, greatest
+    acceleration_share: np.ndarray  # (B,) likewise
+    floor_clearance: np.ndarray  # (B,) [m], least
+    pole_clearance: np.ndarray  # (B,) [m], least
+    rig_clearance: np.ndarray  # (B,) [m], least
+    base_clearance: np.ndarray  # (B,) [m], least
+    self_clearance: np.ndarray  # (B,) [m], least
+    miss: np.ndarray  # (B,) [m], from the shield's middle to the ball at the contact, in its plane
+    height: np.ndarray  # (B,) [m], of the ball above the plane of the shield's face then
+    tilt: np.ndarray  # (B,) [rad], of the shield's normal to the way that the ball comes from
+
+    def praise(self, k: int | tuple) -> str:
+        """What is said of a success."""
+        miss, time = np.asarray(self.miss)[k], np.asarray(self.contact_time)[k]
+        return f"the ball is {miss:.2g} m from the shield's middle at {time:.3g} s"
+
+
+def referee_blocks(
+    cases,
+    plans,
+    *,
+    tolerance: float = 1e-3,
+    contact_tolerance: float = 1e-3,
+    step: float = LONGEST_STEP,
+    chunk: int = 256,
+) -> BlockVerdict:
+    """The verdict on every plan of a batch.
+
+    Angles, rates and accelerations are held against their limits at the ends of each piece and at
+    their extrema inside of it. Those are the roots of the next derivative, which lie between its
+    own extrema, and so on up to the derivative that is constant; each is found by bisection.
+
+    Clearances are looked at in samples: the ends of the pieces, and between them at most `step`
+    and `LARGEST_TURN` apart, though never under 0.17 ms. There the distances of capsules, the
+    shield's plate and boxes are exact to rounding (`referee.arm_clearance` says which solids are
+    held against which). In between, nothing is looked at.
+
+    The motion begins at the case's delay, and the arm stays where it ends: it has to be at rest
+    there if the case asks for that, or if that is before the contact.
+
+    Args:
+        cases: object with the fields of `BlockCase`, leaves with leading axis B; gravity > 0.
+        plans: object with the fields of `BlockPlan`, leaves with leading axis B; coefficients
+            (B, M, D + 1, 6), durations (B, M).
+        tolerance: relative, of velocities, accelerations, the case's offset and its tilt; [rad]
+            and [rad/s] of the start and of jumps between pieces, [rad] of positions.
+        contact_tolerance: [m], how far the ball's centre may be off the plane of the shield's
+            face and outside of its square, how far the arm may be inside of what it must not
+            touch, and the ball outside the outer box or inside the inner one.
+        step: [s], longest time between two samples, at most `LONGEST_STEP`.
+        chunk: most lanes that a thread judges at once; it bounds the memory.
+
+    Returns:
+        A `BlockVerdict` of float64 arrays. A lane that is not finite fails as "not finite" and
+        leaves the others alone. Limits, the offset and the tilt may be infinite.
+
+    Raises:
+        ValueError: a leaf has the wrong shape, `step` is not in (0, LONGEST_STEP] or `chunk` < 1.
+    """
+    if not 0.0 < step <= LONGEST_STEP:
+        raise ValueError(f"step must be > 0 and <= {LONGEST_STEP}, got {step}")
+    if chunk < 1:
+        raise ValueError(f"chunk must be >= 1, got {chunk}")
+    leaves, links = _leaves(cases, plans)
+    judge = functools.partial(
+        _judge, links=links, step=step, relative=tolerance, contact=contact_tolerance
+    )
+    return BlockVerdict(**judge_in_chunks(judge, leaves, chunk))
+
+
+def _leaves(cases, plans) -> tuple[dict[str, np.ndarray], tuple[int, ...]]:
+    """Every array that the referee reads, by name, its shape checked; the capsules' links."""
+    coeffs = np.asarray(plans.motion.coeffs)
+    if coeffs.ndim != 4 or coeffs.shape[-1] != 6 or 0 in coeffs.shape[1:]:
+        raise ValueError(f"plan.motion.coeffs must be (B, M, D + 1, 6), got {coeffs.shape}")
+    arm, limits, scene = cases.arm, cases.limits, cases.scene
+    links = tuple(int(link) for link in arm.capsule_link)
+    if not all(-1 <= link <= 5 for link in links):
+        raise ValueError(f"arm.capsule_link must be in -1, ..., 5, got {links}")
+    beams = np.shape(scene.beam_radius)
+    if len(beams) != 2:
+        raise ValueError(f"scene.beam_radius must be ({len(coeffs)}, N), got {beams}")
+    trailing = {
+        "plan.motion.durations": (plans.motion.durations, coeffs.shape[1:2]),
+        "plan.contact_time": (plans.contact_time, ()),
+        "ball.pos": (cases.ball.pos, (3,)),
+        "ball.vel": (cases.ball.vel, (3,)),
+        "angles": (cases.angles, (6,)),
+        "rates": (cases.rates, (6,)),
+        "arm.origin": (arm.origin, (6, 3)),
+        "arm.turn": (arm.turn, (6, 4)),
+        "arm.axis": (arm.axis, (6, 3)),
+        "arm.lower": (arm.lower, (6,)),
+        "arm.upper": (arm.upper, (6,)),
+        "arm.capsule_ends": (arm.capsule_ends, (len(links), 2, 3)),
+        "arm.capsule_radius": (arm.capsule_radius, (len(links),)),
+        "arm.base_box": (arm.base_box, (2, 3)),
+        "arm.shield_centre": (arm.shield_centre, (3,)),
+        "arm.shield_half": (arm.shield_half, ()),
+        "limits.velocity": (limits.velocity, (6,)),
+        "limits.acceleration": (limits.acceleration, (6,)),
+        "scene.pole": (scene.pole, (2,)),
+        "scene.beam_ends": (scene.beam_ends, (*beams[1:], 2, 3)),
+        "scene.beam_radius": (scene.beam_radius, beams[1:]),
+    }
+    names = ("gravity", "delay", "ends_at_rest", "offset", "tilt")
+    trailing |= {name: (getattr(cases, name), ()) for name in names}
+    names = ("pole_radius", "has_pole", "floor")
+    trailing |= {f"scene.{name}": (getattr(scene, name), ()) for name in names}
+    for name, box in (("inner", scene.inner), ("outer", scene.outer)):
+        trailing |= {f"scene.{name}.{side}": (getattr(box, side), (3,)) for side in _SIDES}
+    leaves = {"plan.motion.coeffs": coeffs}
+    for name, (value, shape) in trailing.items():
+        leaves[name] = checked_leaf(name, value, coeffs.shape[:1] + shape)
+    absent = leaves["scene.has_pole"] == 0
+    leaves["scene.pole"] = np.where(absent[:, None], 0.0, leaves["scene.pole"])
+    leaves["scene.pole_radius"] = np.where(absent, 0.0, leaves["scene.pole_radius"])
+    return leaves, links
+
+
+def _judge(case: dict, links: tuple, step: float, relative: float, contact: float) -> dict:
+    """The fields of `BlockVerdict` for one chunk of lanes."""
+    finite = finite_lanes(case, _UNBOUNDED_LEAVES)
+    execution = case["plan.motion.durations"].sum(axis=1)
+    # How long the arm stays where its motion ends.
+    stays = case["plan.contact_time"] - case["delay"] - execution
+    wrong_times = _times(case, stays)
+    sound = finite & ~wrong_times[0]
+    durations = np.where(sound[:, None], case["plan.motion.durations"], 0.0)
+    motion = _Motion(
+        coeffs=np.where(sound[:, None], case["plan.motion.coeffs"].transpose(2, 3, 0, 1), 0.0),
+        durations=durations,
+        starts=case["delay"][:, None] + np.cumsum(durations, axis=1) - durations,
+    )
+    extremes = _extremes(motion)
+    measured, tests, parts = _judge_limits(case, motion, extremes, relative)
+    found, more = _judge_contact(case, _final(motion, stays), relative, contact)
+    measured, tests = measured | found, tests | more
+    rest, parts["rest"] = _rest(case, motion, stays)
+    tests["rest"] = rest
+    turning = np.sqrt((np.abs(extremes[1][0]).max(axis=0) ** 2).sum(axis=0))
+    for kind, (least, time, part) in _clearances(case, links, motion, turning, step).items():
+        measured[f"{kind}_clearance"] = least
+        tests[kind], parts[kind] = (-least > contact, -least, time), part
+    measured = {name: np.where(sound, value, np.nan) for name, value in measured.items()}
+    measured |= {"contact_time": case["plan.contact_time"], "execution_time": execution}
+    tests = {
+        name: (failed & sound, np.where(sound, excess, 0.0), time)
+        for name, (failed, excess, time) in tests.items()
+    }
+    tests["time"] = (wrong_times[0], np.where(finite, wrong_times[1], 0.0), wrong_times[2])
+    found = first_failures(tests, LIMITS, finite)
+    failed_part = np.full(len(finite), "")
+    for name, part in parts.items():
+        failed_part = np.where(found["failed_limit"] == name, part, failed_part)
+    return found | {"failed_part": failed_part} | measured
+
+
+def _times(case: dict, stays: np.ndarray) -> tuple:
+    """Test of the plan's times: failed, how far off the worst is, the contact."""
+    contact = case["plan.contact_time"]
+    shortest = case["plan.motion.durations"].min(axis=1)
+    off = np.maximum.reduce([case["delay"] - contact, -stays, contact - LONGEST_PLAN, -shortest])
+    return (off > CONTACT_TIME_TOLERANCE) | (shortest < 0.0), off, contact
+
+
+@dataclasses.dataclass(frozen=True)
+class _Motion:
+    """Angles of the joints of B lanes in M pieces."""
+
+    coeffs: np.ndarray  # (D + 1, 6, B, M), rising powers of the time [s] since the piece's start
+    durations: np.ndarray  # (B, M) [s]
+    starts: np.ndarray  # (B, M) [s]
+
+
+def _extremes(motion: _Motion) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Angles, rates and accelerations (K, 6, B, M) at their extrema and at the pieces' ends.
+
+    Each with the times (K, 6, B, M) [s] since the piece's start; K differs.
+    """
+    degree, shape = len(motion.coeffs) - 1, motion.coeffs.shape[1:]
+    ends = np.stack([np.zeros(shape), np.broadcast_to(motion.durations, shape)])
+    times, found = ends, []
+    for order in range(max(degree, 2), -1, -1):
+        values = derivative(motion.coeffs, times, order)
+        found.append((values, times))
+        if order >= degree:
+            continue  # it is constant, and has no roots
+        # Between two neighbours the derivative rises or falls: it has one root at most.
+        low, high, is_below = times[:-1], times[1:], values[:-1] < 0.0
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (low + high)
+            is_before = (derivative(motion.coeffs, middle, order) < 0.0) == is_below
+            low, high = np.where(is_before, middle, low), np.where(is_before, high, middle)
+        times = np.concatenate([ends[:1], high, ends[1:]])
+    return found[:-4:-1]
+
+
+def _worst(excess: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The greatest of values (K, 6, B, M), its time (B,) and its joint (B,) str.
+
+    Args:
+        excess: of joints and pieces.
+        times: [s], broadcasts to the same.
+    """
+    by_lane = flat(np.moveaxis(excess, 2, 0))
+    lanes, top = np.arange(len(by_lane)), by_lane.argmax(axis=1)
+    k, joint, piece = np.unravel_index(top, (*excess.shape[:2], excess.shape[3]))
+    time = np.broadcast_to(times, excess.shape)[k, joint, lanes, piece]
+    return by_lane[lanes, top], time, _JOINTS[joint]
+
+
+def _judge_limits(case: dict, motion: _Motion, extremes: list, relative: float) -> tuple:
+    """What the motion asks of the joints; the tests of that; and the joints that are worst.
+
+    The tests are name -> failed, excess, time, the joints name -> (B,) str.
+    """
+    tests, parts, measured = {}, {}, {}
+
+    def test(name: str, excess: np.ndarray, times: np.ndarray, allowed: float) -> None:
+        worst, time, parts[name] = _worst(excess, times)
+        tests[name] = (worst > allowed, worst, time)
+
+    # Angles and rates where each piece begins, and what they were before.
+    begin, end = (
+        np.stack([derivative(motion.coeffs, times, order) for order in range(2)])
+        for times in (np.zeros_like(motion.durations), motion.durations)
+    )
+    given = np.stack([case["angles"].T, case["rates"].T])[..., None]
+    jumps = np.abs(begin - np.concatenate([given, end[..., :-1]], axis=3))
+    is_first = np.arange(jumps.shape[3]) == 0
+    test("start", np.where(is_first, jumps, 0.0), motion.starts, relative)
+    test("continuity", np.where(is_first, 0.0, jumps), motion.starts, relative)
+    angles, times = extremes[0]
+    lower, upper = (case[f"arm.{side}"].T[..., None] for side in _SIDES)
+    test("position", np.maximum(angles - upper, lower - angles), motion.starts + times, relative)
+    for name, (values, times) in zip(("velocity", "acceleration"), extremes[1:], strict=True):
+        size, limit = np.abs(values), case[f"limits.{name}"].T[..., None]
+        test(name, above(size, limit, relative, times)[1], motion.starts + times, relative)
+        share = size / np.maximum(limit, SMALLEST_LIMIT)
+        measured[f"{name}_share"] = share.max(axis=(0, 1, 3))
+    return measured, tests, parts
+
+
+def _rest(case: dict, motion: _Motion, stays: np.ndarray) -> tuple[tuple, np.ndarray]:
+    """Test of the rates where the motion ends, and the fastest joint (B,) str."""
+    rates = np.abs(derivative(motion.coeffs[..., -1], motion.durations[:, -1], 1))
+    has_to = (case["ends_at_rest"] != 0.0) | (stays > CONTACT_TIME_TOLERANCE)
+    time = motion.starts[:, -1] + motion.durations[:, -1]
+    worst, time, joint = _worst(rates[None, ..., None], time[:, None])
+    return (has_to & (worst > REST), worst, time), joint
+
+
+def _final(motion: _Motion, stays: np.ndarray) -> np.ndarray:
+    """Angles (6, B) [rad] at the contact.
+
+    A motion that ends earlier or later by less than what counts is continued or cut short.
+    """
+    beyond = np.where(np.abs(stays) > CONTACT_TIME_TOLERANCE, 0.0, stays)
+    return derivative(motion.coeffs[..., -1], motion.durations[:, -1] + beyond, 0)
+
+
+def _clearances(
+    case: dict, links: tuple, motion: _Motion, turning: np.ndarray, step: float
+) -> dict[str, tuple]:
+    """Least distances (B,) [m] by kind, their times (B,) [s], and what (B,) str comes so close.
+
+    Args:
+        case: leaves of B lanes.
+        links: of the capsules.
+        motion: of the lanes.
+        turning: (B, M) [rad/s], that all joints together are not faster than.
+        step: [s], longest time between two samples.
+    """
+    turning = np.fmin(np.fmax(turning, np.finfo(float).tiny), _FASTEST)
+    longest = np.minimum(step, LARGEST_TURN / turning)
+    count = np.maximum(np.ceil(motion.durations / longest - 1e-9), 1.0)
+    most = count.sum(axis=1).astype(int) + 1
+    # Lanes of about as many samples are worked out together.
+    order, begin = np.argsort(-most), 0
+    nothing = np.zeros(0), np.zeros(0), np.zeros(0, str)
+    found = {kind: [nothing] for kind in KINDS}
+    while begin < len(order):
+        lanes = order[begin : begin + max(_SAMPLES // int(most[order[begin]]), 1)]
+        begin += len(lanes)
+        sample = np.arange(most[lanes[0]])
+        times, angles = _sampled(motion, lanes, count[lanes], sample)
+        of_lanes = {name: leaf[lanes] for name, leaf in case.items()}
+        near = clearances(of_lanes, links, angles, sample < most[lanes, None])
+        for kind, (least, at, part) in near.items():
+            found[kind].append((least, times[np.arange(len(lanes)), at], part))
+    back = np.argsort(order)
+    return {
+        kind: tuple(np.concatenate(values)[back] for values in zip(*parts, strict=True))
+        for kind, parts in found.items()
+    }
+
+
+def _sampled(
+    motion: _Motion, lanes: np.ndarray, count: np.ndarray, sample: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Times (B, S) [s] and angles (6, B, S) [rad] of some lanes at their samples.
+
+    Lanes of fewer samples than others stay at their end.
+
+    Args:
+        motion: of all lanes.
+        lanes: (B,) int.
+        count: (B, M), steps in each piece of these lanes.
+        sample: (S,), numbers of the samples.
+    """
+    behind = np.cumsum(count, axis=1)
+    piece = (sample >= behind[..., None]).sum(axis=1).clip(max=count.shape[1] - 1)  # (B, S)
+    rows, lanes = np.arange(len(lanes))[:, None], lanes[:, None]
+    steps = count[rows, piece]
+    share = np.minimum((sample - behind[rows, piece]) / steps + 1.0, 1.0)
+    local = share * motion.durations[lanes, piece]
+    angles = derivative(motion.coeffs[:, :, lanes, piece], local, 0)
+    return motion.starts[lanes, piece] + local, angles
+
+
+def _judge_contact(case: dict, angles: np.ndarray, relative: float, contact: float) -> tuple:
+    """Where and how the ball meets the shield, and the tests of ball, tilt and tunnel.
+
+    Args:
+        case: leaves of B lanes.
+        angles: (6, B) [rad], at the contact.
+        relative: tolerance of the offset and the tilt.
+        contact: tolerance [m].
+    """
+    time, fall = case["plan.contact_time"], np.array([[0.0], [0.0], [1.0]]) * case["gravity"]
+    place = case["ball.pos"].T + case["ball.vel"].T * time - 0.5 * fall * time**2
+    turns, places = links_of(case, angles[..., None])
+    turn, middle = turns[5][..., 0], shield_middle(case, turns, places)[..., 0]
+    height, *beside = turned_back(turn, place - middle)
+    toward, *across = turned_back(turn, fall * time - case["ball.vel"].T)
+    miss, tilt = np.hypot(*beside), np.arctan2(np.hypot(*across), toward)
+    is_off = np.abs(height) > contact
+    is_beside = (miss > case["offset"] * (1.0 + relative)) | (
+        np.abs(beside).max(axis=0) > case["arm.shield_half"] + contact
+    )
+    tests = {
+        "ball": (is_off | is_beside, np.where(is_off, np.abs(height), miss), time),
+        "tilt": (tilt > case["tilt"] * (1.0 + relative), tilt, time),
+        "tunnel": _tunnel(case, contact),
+    }
+    return {"miss": miss, "height": height, "tilt": tilt}, tests
+
+
+def _tunnel(case: dict, contact: float) -> tuple:
+    """Test of the contact's time against those of the ball in both boxes."""
+    time = case["plan.contact_time"]
+
+    def off(grown: float) -> np.ndarray:
+        """How far (B,) [s] it is off with the tunnel so much larger [m] at both ends."""
+        begin, end = times_inside(case, "outer", grown)
+        out = np.maximum(np.maximum(begin - time, time - end), 0.0).min(axis=0)
+        begin, end = times_inside(case, "inner", -grown)
+        entry = np.where(end >= 0.0, np.maximum(begin, 0.0), np.inf).min(axis=0)
+        return np.maximum(out, time - entry)
+
+    return off(contact) > 0.0, off(0.0), time
+
+
+def times_inside(case: dict, name: str, grown: float) -> tuple[np.ndarray, np.ndarray]:
+    """When balls are inside a box that is grown on all sides [m]: begins and ends (2, B) [s].
+
+    On their way up, and on their way down. What never is begins at infinity and ends at minus
+    infinity.
+    """
+    pos, vel, gravity = case["ball.pos"].T, case["ball.vel"].T, case["gravity"]
+    lower = case[f"scene.{name}.lower"].T - pos - grown
+    upper = case[f"scene.{name}.upper"].T - pos + grown
+    # Along z: between the bottom and the top, on either side of the highest point.
+    highest = vel[2] / gravity
+    over, under = (
+        np.sqrt(vel[2] ** 2 - 2.0 * gravity * side[2]) / gravity for side in (upper, lower)
+    )
+    over = np.where(np.isnan(over), 0.0, over)
+    begin = np.stack([highest - under, highest + over])
+    end = np.stack([highest - over, highest + under])
+    never = np.isnan(under)
+    for k in range(2):
+        stands = vel[k] == 0.0
+        crossings = np.stack([lower[k], upper[k]]) / np.where(stands, 1.0, vel[k])
+        begin = np.where(stands, begin, np.maximum(begin, crossings.min(axis=0)))
+        end = np.where(stands, end, np.minimum(end, crossings.max(axis=0)))
+        never |= stands & ((lower[k] > 0.0) | (upper[k] < 0.0))
+    never = never | (begin > end)  # of each of the two
+    return np.where(never, np.inf, begin), np.where(never, -np.inf, end)

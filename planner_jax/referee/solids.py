@@ -1,0 +1,139 @@
+"""Distances in space between points, segments and boxes, in float64 NumPy.
+
+It shares no code with the planners. Vectors (3, ...) [m] have their components first; whatever
+is compared broadcasts. All are closed forms, exact to rounding.
+"""
+
+import itertools
+
+import numpy as np
+
+# Two edges whose directions have a product shorter than this are taken for parallel.
+_PARALLEL = 1e-9
+
+
+def dot(a: np.ndarray | list, b: np.ndarray | list) -> np.ndarray:
+    """Inner products (...) of vectors (3, ...), or of lists of their components."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def length(vector: np.ndarray | list) -> np.ndarray:
+    """Lengths (...) of vectors (3, ...)."""
+    return np.sqrt(dot(vector, vector))
+
+
+def turned(rotation: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """Products (3, ...) of matrices (3, 3, ...) and vectors (3, ...)."""
+    return np.stack([dot(rotation[k], vector) for k in range(3)])
+
+
+def turned_back(rotation: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """Vectors (3, ...) in the frames that rotations (3, 3, ...) lead out of."""
+    return np.stack([dot(rotation[:, k], vector) for k in range(3)])
+
+
+def from_segment(point: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Distances (...) [m] of points from segments between two ends, which may be one point."""
+    way, away = second - first, point - first
+    square = dot(way, way)
+    share = np.clip(_ratio(dot(away, way), square), 0.0, 1.0)
+    return length(away - share * way)
+
+
+def between_segments(
+    first: np.ndarray, second: np.ndarray, third: np.ndarray, fourth: np.ndarray
+) -> np.ndarray:
+    """Distances (...) [m] of segments from `first` to `second` from those to `fourth`.
+
+    The shares of either way at the nearest points: those of the two lines, held in [0, 1] one
+    after the other (Ericson, Real-Time Collision Detection, Section 5.1.9).
+    """
+    way, other, away = second - first, fourth - third, first - third
+    a, b, c = dot(way, way), dot(way, other), dot(other, other)
+    d, e = dot(way, away), dot(other, away)
+    share = np.clip(_ratio(b * e - c * d, a * c - b * b), 0.0, 1.0)
+    along = np.clip(_ratio(b * share + e, c), 0.0, 1.0)
+    share = np.clip(_ratio(b * along - d, a), 0.0, 1.0)
+    return length(away + share * way - along * other)
+
+
+def segment_to_box(first: np.ndarray, second: np.ndarray, half: np.ndarray) -> np.ndarray:
+    """Distances (...) [m] of segments from boxes around the origin; zero where they meet.
+
+    The squared distance is convex along the segment, and its slope is a line between the places
+    where the segment crosses the planes of the box's sides: the root lies between the last of
+    them with a slope below zero and the first with one above.
+
+    Args:
+        first: (3, ...), one end in the box's frame.
+        second: (3, ...), the other one.
+        half: (3, ...), half edges of the box.
+    """
+    way = second - first
+
+    def beyond(share: np.ndarray) -> list:
+        """How far out of the box a place on the segment is, component by component."""
+        places = (first[k] + share * way[k] for k in range(3))
+        return [place - np.clip(place, -half[k], half[k]) for k, place in enumerate(places)]
+
+    low, high = np.zeros(way.shape[1:]), np.ones(way.shape[1:])
+    crossings = [(sign * half[k] - first[k], way[k]) for k in range(3) for sign in (-1.0, 1.0)]
+    below, above = np.zeros_like(low), np.zeros_like(low)
+    for share in (low, high, *(np.clip(_ratio(*crossing), 0.0, 1.0) for crossing in crossings)):
+        slope = dot(beyond(share), way)
+        later, earlier = (slope <= 0.0) & (share >= low), (slope >= 0.0) & (share <= high)
+        low, below = np.where(later, share, low), np.where(later, slope, below)
+        high, above = np.where(earlier, share, high), np.where(earlier, slope, above)
+    share = low - _ratio(below * (high - low), above - below)
+    return length(beyond(np.clip(share, 0.0, 1.0)))
+
+
+def between_boxes(
+    middle: np.ndarray, rotation: np.ndarray, half: np.ndarray, other: np.ndarray
+) -> np.ndarray:
+    """Distances (P,) [m] between boxes; of overlapping ones minus the depth.
+
+    By separating axes: if the greatest gap along the normals of sides and the products of edges
+    is negative the two overlap, and it is the shortest way out. If not, the nearest points lie
+    on an edge of one of them and on the other.
+
+    Args:
+        middle: (3, P), of the first box in the frame of the second.
+        rotation: (3, 3, P), of the first one's frame to that of the second.
+        half: (3, P), half edges of the first.
+        other: (3, P), half edges of the second, around the origin.
+    """
+    axes = [np.broadcast_to(axis[:, None], middle.shape) for axis in np.eye(3)]
+    own = [rotation[:, k] for k in range(3)]
+    gap = np.full(middle.shape[1:], -np.inf)
+    for axis in (*axes, *own, *(np.cross(a, b, axis=0) for a in axes for b in own)):
+        size = length(axis)
+        reach = dot(np.abs(axis), other) + sum(
+            half[k] * np.abs(dot(axis, own[k])) for k in range(3)
+        )
+        apart = _ratio(np.abs(dot(axis, middle)) - reach, size)
+        gap = np.where(size > _PARALLEL, np.maximum(gap, apart), gap)
+    free = np.flatnonzero(gap > 0.0)
+    middle, rotation, half, other = (part[..., free] for part in (middle, rotation, half, other))
+    out, back = -turned_back(rotation, middle), np.swapaxes(rotation, 0, 1)
+    gap[free] = np.minimum(
+        _edges_to_box(middle, rotation, half, other), _edges_to_box(out, back, other, half)
+    )
+    return gap
+
+
+def _edges_to_box(middle, rotation, half, other) -> np.ndarray:
+    """Distances (P,) [m] of boxes' nearest edges from others, as `between_boxes` is asked."""
+    edges = rotation * half  # (3, 3, P), half of each
+    starts = [
+        middle + first * edges[:, (k + 1) % 3] + second * edges[:, (k + 2) % 3] - edges[:, k]
+        for k, first, second in itertools.product(range(3), (-1.0, 1.0), (-1.0, 1.0))
+    ]
+    starts, ways = np.stack(starts, axis=1), np.repeat(2.0 * edges, 4, axis=1)  # (3, 12, P)
+    return segment_to_box(starts, starts + ways, other[:, None]).min(axis=0)
+
+
+def _ratio(value: np.ndarray, by: np.ndarray) -> np.ndarray:
+    """The quotient, and zero where `by` is."""
+    none = by == 0.0
+    return np.where(none, 0.0, value / np.where(none, 1.0, by))

@@ -1,0 +1,719 @@
+"""The referee of blocks, on motions worked out by hand: no planner has a part in this."""
+
+import dataclasses
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from scipy.optimize import least_squares, lsq_linear
+from scipy.spatial.transform import Rotation
+
+from planner_jax.referee import block, solids
+from planner_jax.referee.block import LIMITS, BlockVerdict, referee_blocks, times_inside
+from planner_jax.robot.arm import REGIMES, shield_pose
+from planner_jax.robot.arm_mjcf import irb1600
+from planner_jax.task.block.case import BlockCase, case
+from planner_jax.task.block.plan import BlockPlan
+
+GRAVITY, DELAY, SPAN = 9.81, 0.1, 0.9
+CONTACT_TIME = DELAY + SPAN
+CONTACT = np.array([0.7, 0.5, 0.7])  # between the boxes, and clear of the pole
+INCOMING = np.array([-7.0, -0.3, -3.0])  # velocity of the ball there
+PIECES = (0.3, 0.6)
+ARM = jax.tree.map(lambda leaf: np.asarray(leaf, float), irb1600())
+HOME = ARM.home
+THICKNESS = 0.01
+# Coefficients of the fifth-order polynomial from 0 to 1 that begins and ends at rest.
+REST_TO_REST, FROM_REST = (0.0, 0.0, 0.0, 10.0, -15.0, 6.0), (0.0, 0.0, 1.0)
+
+
+def links(angles):
+    """Rotations and places of the links, one product after the other."""
+    rotation, place, found = np.eye(3), np.zeros(3), []
+    for k in range(6):
+        place = place + rotation @ ARM.origin[k]
+        own = Rotation.from_quat(ARM.turn[k], scalar_first=True)
+        turned = own * Rotation.from_rotvec(angles[k] * ARM.axis[k])
+        rotation = rotation @ turned.as_matrix()
+        found.append((rotation, place))
+    return found
+
+
+def shield(angles):
+    """Rotation of the shield, and the middle of its face."""
+    rotation, place = links(angles)[5]
+    return rotation, place + rotation @ ARM.shield_centre
+
+
+def angles_for(middle, normal):
+    """Angles that bring the shield there, with the last joint near where it was."""
+
+    def off(angles):
+        rotation, place = shield(angles)
+        return np.concatenate([place - middle, rotation[:, 0] - normal])
+
+    found = least_squares(off, HOME, bounds=(ARM.lower, ARM.upper), xtol=1e-15, gtol=1e-15)
+    assert np.abs(found.fun).max() < 1e-12
+    angles = found.x
+    angles[5] -= 0.5 * np.pi * np.round((angles[5] - HOME[5]) / (0.5 * np.pi))
+    return angles
+
+
+GOAL = angles_for(CONTACT, -INCOMING / np.linalg.norm(INCOMING))
+ROTATION = shield(GOAL)[0]
+
+
+def motion(shape, end=GOAL, durations=PIECES, start=HOME):
+    """Coefficients (M, D + 1, 6) of a way from start to end, cut into pieces.
+
+    The shape holds coefficients of a polynomial in the share of the whole time.
+    """
+    total = sum(durations)
+    shifted = np.polynomial.Polynomial(np.array(shape) / total ** np.arange(len(shape)))
+    pieces, begin = [], 0.0
+    for duration in durations:
+        here = shifted(np.polynomial.Polynomial([begin, 1.0])).coef
+        begin += duration
+        piece = np.outer(np.pad(here, (0, len(shape) - len(here))), np.asarray(end) - start)
+        piece[0] += start
+        pieces.append(piece)
+    return np.array(pieces)
+
+
+def flatten(tree, root=""):
+    """Leaves of nested dataclasses by their dotted names."""
+    leaves = {}
+    for field in dataclasses.fields(tree):
+        value, name = getattr(tree, field.name), f"{root}{field.name}"
+        if dataclasses.is_dataclass(value):
+            leaves |= flatten(value, f"{name}.")
+        elif field.metadata.get("pytree_node", True):
+            leaves[name] = np.asarray(value)
+    return leaves
+
+
+def good(shape=REST_TO_REST, end=GOAL, durations=PIECES, velocity=INCOMING, at=CONTACT, **options):
+    """Leaves, with leading axis 1, of an arm that meets its ball."""
+    fall = np.array([0.0, 0.0, GRAVITY])
+    begin = velocity + fall * CONTACT_TIME
+    pos = at - begin * CONTACT_TIME + 0.5 * fall * CONTACT_TIME**2
+    leaves = flatten(case(pos, begin, delay=DELAY, **options))
+    leaves |= {"ball.pos": pos, "ball.vel": begin, "gravity": GRAVITY, "delay": DELAY}
+    leaves |= {
+        "plan.motion.coeffs": motion(shape, end, durations),
+        "plan.motion.durations": durations,
+        "plan.contact_time": CONTACT_TIME,
+        "angles": HOME,
+    }
+    leaves = {name: np.array(leaf)[None] for name, leaf in leaves.items()}
+    return {k: leaf if leaf.dtype == bool else leaf.astype(float) for k, leaf in leaves.items()}
+
+
+def tree(leaves, root=""):
+    """The object whose fields are the leaves named `root<field>`, and so on inwards."""
+    inside = {k.removeprefix(root): v for k, v in leaves.items() if k.startswith(root)}
+    parts = {k.split(".")[0] for k in inside if "." in k}
+    plain = {k: v for k, v in inside.items() if "." not in k}
+    return SimpleNamespace(**plain, **{part: tree(inside, f"{part}.") for part in parts})
+
+
+def judge(leaves, capsule_link=ARM.capsule_link, **options) -> BlockVerdict:
+    judged = tree(leaves)
+    judged.arm.capsule_link = capsule_link
+    return referee_blocks(judged, judged.plan, **options)
+
+
+def stack(*lanes):
+    return {name: np.concatenate([lane[name] for lane in lanes]) for name in lanes[0]}
+
+
+def assert_good(leaves, **options):
+    verdict = judge(leaves, **options)
+    assert verdict.success[0], verdict.sentence(0)
+    return verdict
+
+
+def assert_fails(leaves, name, *, excess=None, time=None, part="", **options):
+    verdict = judge(leaves, **options)
+    assert not verdict.success[0] and verdict.failed_limit[0] == name, verdict.sentence(0)
+    assert verdict.sentence(0).startswith(f"{name}: {part}")
+    assert verdict.failed_part[0] == part
+    if excess is not None:
+        assert verdict.failed_excess[0] == pytest.approx(excess, rel=1e-6, abs=1e-9)
+    if time is not None:
+        assert verdict.failed_time[0] == pytest.approx(time, abs=1e-9)
+    return verdict
+
+
+def still(angles, **options):
+    """Leaves of an arm that stays where it is."""
+    leaves = good(durations=(SPAN,), **options)
+    angles = np.asarray(angles, float)
+    return leaves | {"plan.motion.coeffs": angles[None, None, None], "angles": angles[None]}
+
+
+def test_an_arm_that_swings_to_the_balls_place_blocks_it():
+    verdict = assert_good(good())
+    assert verdict.failed_limit[0] == verdict.failed_part[0] == ""
+    assert np.isnan(verdict.failed_time[0])
+    assert verdict.miss[0] < 1e-9 and abs(verdict.height[0]) < 1e-9 and verdict.tilt[0] < 1e-7
+    assert verdict.execution_time[0] == pytest.approx(SPAN)
+    assert verdict.contact_time[0] == CONTACT_TIME
+    assert verdict.sentence(0).endswith("from the shield's middle at 1 s")
+
+
+def test_rates_and_accelerations_are_those_of_the_fastest_joint_between_the_ends():
+    """Rest to rest by a fifth-order polynomial: 15/8 d/T halfway, 10/sqrt(3) d/T^2 beside it."""
+    verdict = assert_good(good())
+    limits, way = REGIMES["R2"].limits, np.abs(GOAL - HOME)
+    rates, accelerations = 1.875 * way / SPAN, 10.0 / np.sqrt(3.0) * way / SPAN**2
+    share = np.max(rates / limits.velocity)
+    assert verdict.velocity_share[0] == pytest.approx(share)
+    share = np.max(accelerations / limits.acceleration)
+    assert verdict.acceleration_share[0] == pytest.approx(share)
+
+
+def test_the_shield_is_where_the_library_puts_it():
+    """Two descriptions of the same kinematics, which share no code."""
+    angles = np.random.default_rng(0).uniform(ARM.lower, ARM.upper, (5, 6))
+    rotations, middles = jax.jit(jax.vmap(shield_pose, in_axes=(None, 0)))(ARM, angles)
+    for found, rotation, middle in zip(angles, rotations, middles, strict=True):
+        at, own = shield(found)[1], shield(found)[0]
+        np.testing.assert_allclose(rotation, own, atol=1e-5)
+        np.testing.assert_allclose(middle, at, atol=1e-5)
+        verdict = judge(still(found, at=at + 0.03 * own[:, 0] + 0.04 * own[:, 1]))
+        assert verdict.height[0] == pytest.approx(0.03) and verdict.miss[0] == pytest.approx(0.04)
+
+
+def edited(edits):
+    """A good plan with other leaves, by name: a value, or a function of what it was."""
+    leaves = good()
+    for name, edit in edits.items():
+        leaves[name][:] = edit(leaves[name]) if callable(edit) else edit
+    return leaves
+
+
+def shifted(place, value):
+    """A function that adds a value at one place of a leaf."""
+
+    def edit(leaf):
+        leaf = leaf.copy()
+        leaf[(0, *place)] += value
+        return leaf
+
+    return edit
+
+
+WAY = GOAL - HOME
+FASTEST = int(np.argmax(np.abs(WAY) / np.asarray(REGIMES["R2"].limits.velocity)))
+STEEPEST = int(np.argmax(np.abs(WAY)))  # all joints have one limit
+TURN = Rotation.from_rotvec(0.1 * ROTATION[:, 1]).as_matrix()
+TIP = 27.0 / 4.0 * 0.4  # u (1 - u)^2 is 4 / 27 at its greatest, a third of the way
+
+
+def overshooting(**edits):
+    """Joint 6 swings by 0.4 rad and back."""
+    leaves = good((0.0, TIP, -2.0 * TIP, TIP), end=HOME + np.eye(6)[5], durations=(SPAN,))
+    leaves["rates"][0, 5] = TIP / SPAN
+    leaves["limits.velocity"][:] = leaves["limits.acceleration"][:] = np.inf
+    for name, value in edits.items():
+        leaves[f"arm.{name}"][0, 5] = value
+    return leaves
+
+
+def bent():
+    """The wrist folds until the shield's edge is in the forearm."""
+    end = HOME.copy()
+    end[4] = 1.9
+    return good(end=end)
+
+
+FAILURES = {
+    "time: before the arm may start": (
+        "time",
+        edited({"plan.contact_time": 0.07, "plan.motion.durations": 0.0}),
+        {"excess": 0.03, "time": 0.07},
+    ),
+    "time: motion too long": (
+        "time",
+        edited({"plan.contact_time": 0.9}),
+        {"excess": 0.1, "time": 0.9},
+    ),
+    "time: negative": (
+        "time",
+        edited({"plan.motion.durations": [[-0.25, 0.6]]}),
+        {"excess": 0.25, "time": CONTACT_TIME},
+    ),
+    "time: an hour": ("time", edited({"plan.contact_time": 3600.0}), {"excess": 3540.0}),
+    "start: angle": (
+        "start",
+        edited({"angles": shifted((2,), 0.02)}),
+        {"excess": 0.02, "time": DELAY, "part": "joint 3"},
+    ),
+    "start: rate": (
+        "start",
+        edited({"rates": shifted((4,), 0.3)}),
+        {"excess": 0.3, "part": "joint 5"},
+    ),
+    "continuity: angle": (
+        "continuity",
+        edited({"plan.motion.coeffs": shifted((1, 0, 3), 0.01)}),
+        {"excess": 0.01, "time": DELAY + PIECES[0], "part": "joint 4"},
+    ),
+    "continuity: rate": (
+        "continuity",
+        edited({"plan.motion.coeffs": shifted((1, 1, 0), -0.1)}),
+        {"excess": 0.1, "time": DELAY + PIECES[0], "part": "joint 1"},
+    ),
+    "position: above": (
+        "position",
+        overshooting(upper=HOME[5] + 0.35),
+        {"excess": 0.05, "time": DELAY + SPAN / 3.0, "part": "joint 6"},
+    ),
+    "position: below": (
+        "position",
+        overshooting(lower=HOME[5] + 0.1),
+        {"excess": 0.1, "part": "joint 6"},
+    ),
+    "velocity": (
+        "velocity",
+        edited({"limits.velocity": lambda limit: 0.8 * judge(good()).velocity_share * limit}),
+        {"excess": 0.25, "time": DELAY + 0.5 * SPAN, "part": f"joint {FASTEST + 1}"},
+    ),
+    "acceleration": (
+        "acceleration",
+        edited({"limits.acceleration": 10.0 / np.sqrt(3.0) * abs(WAY[STEEPEST]) / SPAN**2 / 1.5}),
+        {"excess": 0.5, "part": f"joint {STEEPEST + 1}"},
+    ),
+    "rest: asked for": (
+        "rest",
+        good(FROM_REST, regime="R3"),
+        {"excess": 2.0 * abs(WAY[STEEPEST]) / SPAN, "part": f"joint {STEEPEST + 1}"},
+    ),
+    "rest: stops at once": (
+        "rest",
+        good(FROM_REST, regime="R1", durations=(0.2, 0.6)),
+        {"excess": 2.0 * abs(WAY[STEEPEST]) / 0.8, "time": 0.9, "part": f"joint {STEEPEST + 1}"},
+    ),
+    "self": ("self", bent(), {"part": "link 4 and the shield", "time": CONTACT_TIME}),
+    "ball: beside": (
+        "ball",
+        good(at=CONTACT + 0.01 * ROTATION[:, 2]),
+        {"excess": 0.01, "time": CONTACT_TIME},
+    ),
+    "ball: in front": ("ball", good(at=CONTACT + 0.005 * ROTATION[:, 0]), {"excess": 0.005}),
+    "tilt": ("tilt", good(velocity=TURN @ INCOMING), {"excess": 0.1, "time": CONTACT_TIME}),
+    "tunnel: not yet": (
+        "tunnel",
+        edited({"scene.outer.upper": [[0.6, 1.0, 1.85]]}),
+        {"excess": 0.1 / 7.0},
+    ),
+    "tunnel: too late": (
+        "tunnel",
+        edited({"scene.inner.upper": [[0.75, 0.55, 0.8]]}),
+        {"excess": 0.05 / 7.0, "time": CONTACT_TIME},
+    ),
+    "tunnel: through and out again": (
+        "tunnel",
+        edited({"scene.inner.lower": [[0.8, 0.4, 0.6]], "scene.inner.upper": [[0.9, 0.6, 1.2]]}),
+        {"excess": 0.2 / 7.0},
+    ),
+    "tunnel: never": (
+        "tunnel",
+        edited({"scene.outer.lower": [[-1.0, 0.9, 0.0]]}),
+        {"excess": np.inf},
+    ),
+}
+
+
+@pytest.mark.parametrize("key", FAILURES)
+def test_every_failure_has_its_name_size_and_time(key):
+    name, leaves, found = FAILURES[key]
+    assert_fails(leaves, name, **found)
+
+
+NEARER = {
+    "floor": ("scene.floor", ...),
+    "pole": ("scene.pole_radius", ...),
+    "rig": ("scene.beam_radius", ...),
+    "base": ("arm.base_box", (0, 1, 2)),  # its top: link 2 is above it
+}
+
+
+def test_each_limit_has_a_failure_here():
+    assert {name for name, _, _ in FAILURES.values()} | {"not finite"} | NEARER.keys() == {*LIMITS}
+
+
+@pytest.mark.parametrize("kind", NEARER)
+def test_what_comes_nearer_is_touched_by_as_much_as_it_comes_too_near(kind):
+    leaves, (name, place) = good(), NEARER[kind]
+    room = getattr(judge(leaves), f"{kind}_clearance")[0]
+    leaves[name][place] += room - 0.002
+    assert getattr(assert_good(leaves), f"{kind}_clearance")[0] == pytest.approx(0.002)
+    leaves[name][place] += 0.003
+    assert_good(leaves, contact_tolerance=0.0011)
+    leaves[name][place] += 0.019
+    verdict = judge(leaves)
+    assert verdict.failed_limit[0] == kind and verdict.failed_excess[0] == pytest.approx(0.02)
+    assert f"{verdict.failed_part[0]} is 0.02 m " in verdict.sentence(0)
+
+
+def test_an_absent_pole_is_in_nobodys_way():
+    leaves = good()
+    leaves["scene.pole"][:] = CONTACT[:2]
+    assert_fails(leaves, "pole", part="link 4")
+    leaves["scene.has_pole"][:] = False
+    assert np.isposinf(assert_good(leaves).pole_clearance[0])
+    leaves["scene.pole"][:], leaves["scene.pole_radius"][:] = np.nan, np.inf
+    assert_good(leaves)
+
+
+def test_a_rig_without_beams_is_in_nobodys_way():
+    leaves = good()
+    for name in ("scene.beam_ends", "scene.beam_radius"):
+        leaves[name] = leaves[name][:, :0]
+    assert np.isposinf(assert_good(leaves).rig_clearance[0])
+
+
+def test_an_arm_that_may_pass_through_must_not_stop_at_once_nor_has_to_rest():
+    leaves = good(FROM_REST, regime="R1")
+    assert_good(leaves)
+    leaves["ends_at_rest"][:] = True
+    assert_fails(leaves, "rest", part=f"joint {STEEPEST + 1}")
+    # At rest before the ball comes, it waits, whether it must stand or not.
+    for regime in ("R1", "R3"):
+        assert_good(good(regime=regime, durations=(0.2, 0.4)))
+
+
+def test_a_motion_that_ends_a_little_off_the_contact_is_where_it_is_then():
+    leaves = good(FROM_REST, regime="R1")
+    assert_good(leaves, contact_tolerance=1e-7)
+    for early in (-5e-5, 5e-5):
+        leaves["plan.motion.durations"][0, -1] = PIECES[-1] - early
+        assert_good(leaves, contact_tolerance=1e-7)
+
+
+def test_the_shield_may_be_met_beside_its_middle_and_at_an_angle_but_not_beyond_its_edge():
+    assert_good(good(velocity=TURN @ INCOMING, tolerance="wide"))
+    assert_good(good(at=CONTACT + 0.09 * ROTATION[:, 2], tolerance="wide"))
+    for beside, verdict in ((0.149, ""), (0.16, "ball")):
+        leaves = good(at=CONTACT + beside * (ROTATION[:, 1] - 0.5 * ROTATION[:, 2]))
+        leaves["offset"][:] = np.inf
+        assert judge(leaves).failed_limit[0] == verdict
+
+
+# Times and samples --------------------------------------------------------------------------------
+
+
+def test_a_ball_is_inside_a_box_when_it_is_found_there():
+    random = np.random.default_rng(3)
+    num, times = 200, np.linspace(-1.0, 3.0, 4001)
+    lower = random.uniform([-1.0, -1.0, 0.0], 0.0, (num, 3))
+    moves = random.random((num, 3)) < 0.8
+    leaves = {
+        "ball.pos": random.uniform(-1.0, 1.0, (num, 3)) * [1.0, 1.0, 0.0],
+        "ball.vel": random.uniform([-1.0, -1.0, 3.0], [1.0, 1.0, 7.0], (num, 3)) * moves,
+        "gravity": random.uniform(5.0, 10.0, num),
+        "scene.box.lower": lower + [0.0, 0.0, 0.3],
+        "scene.box.upper": lower + [1.5, 1.5, 0.7],
+    }
+    with np.errstate(invalid="ignore"):
+        begin, end = times_inside(leaves, "box", 0.05)
+    told = ((begin[..., None] <= times) & (times <= end[..., None])).any(axis=0)
+    fall = 0.5 * np.array([0.0, 0.0, 1.0]) * leaves["gravity"][:, None]
+    place = leaves["ball.pos"][:, None] + leaves["ball.vel"][:, None] * times[:, None]
+    place = place - fall[:, None] * times[:, None] ** 2
+    box = (leaves[f"scene.box.{side}"][:, None] for side in ("lower", "upper"))
+    low, high = next(box) - 0.05, next(box) + 0.05
+    seen = ((low <= place) & (place <= high)).all(axis=2)
+    np.testing.assert_array_equal(told, seen)
+    changes = np.abs(np.diff(seen.astype(int), axis=1)).sum(axis=1)
+    assert (changes == 4).sum() > 5 and (changes == 0).sum() > 5
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_extrema_are_the_greatest_of_many_samples(seed):
+    """Of any degree, from a line to one of order 7, through pieces that do not even join."""
+    random = np.random.default_rng(seed)
+    coeffs = random.normal(size=(1, 2, (2, 4, 8)[seed], 6))
+    leaves = good(durations=(0.3, 0.6)) | {"plan.motion.coeffs": coeffs}
+    verdict = judge(leaves)
+    for order, name in ((1, "velocity"), (2, "acceleration")):
+        found = []
+        for piece, duration in enumerate(PIECES):
+            times = np.linspace(0.0, duration, 3001)
+            derived = np.polynomial.polynomial.polyder(coeffs[0, piece], order)
+            found.append(np.abs(np.polynomial.polynomial.polyval(times, derived)).max(axis=1))
+        share = np.max(np.max(found, axis=0) / leaves[f"limits.{name}"])
+        assert getattr(verdict, f"{name}_share")[0] == pytest.approx(share, rel=1e-5)
+        assert getattr(verdict, f"{name}_share")[0] >= share * (1.0 - 1e-12)
+
+
+@pytest.mark.parametrize("durations", [(0.3, 0.6), (0.05, 0.02), (0.0, 0.9)])
+def test_samples_are_close_in_time_and_in_angle_and_hold_both_ends(monkeypatch, durations):
+    seen = {}
+
+    def watched(case, links, angles, sampled):
+        seen.update(angles=angles[:, 0, sampled[0]])
+        return original(case, links, angles, sampled)
+
+    original = block.clearances
+    monkeypatch.setattr(block, "clearances", watched)
+    judge(good(durations=durations))
+    angles = seen["angles"]
+    steps = np.linalg.norm(np.diff(angles), axis=0)
+    assert steps.max() <= block.LARGEST_TURN
+    assert len(steps) >= sum(durations) / block.LONGEST_STEP
+    np.testing.assert_allclose(angles[:, [0, -1]].T, [HOME, GOAL], atol=1e-12)
+
+
+def test_the_least_clearance_of_a_motion_is_that_of_a_pose_on_its_way():
+    leaves = good()
+    verdict = judge(leaves)
+    shares = np.linspace(0.0, 1.0, 201)
+    angles = HOME + np.polynomial.polynomial.polyval(shares, REST_TO_REST)[:, None] * WAY
+    poses = judge(stack(*(still(each) for each in angles)))
+    for kind in ("floor", "pole", "rig", "base", "self"):
+        name = f"{kind}_clearance"
+        least = getattr(poses, name).min()
+        assert 0.0 <= least - getattr(verdict, name)[0] + 1e-12 < 1e-4
+
+
+# Solids -------------------------------------------------------------------------------------------
+
+
+def gap(first, second):
+    """Distance of two solids, each a middle, the rows that span it, and a radius, by a solver."""
+    (middle, spans, radius), (other, others, more) = first, second
+    columns = np.concatenate([spans, -np.asarray(others)]).T
+    found = lsq_linear(columns, other - middle, bounds=(-1.0, 1.0), method="bvls", tol=1e-14)
+    return np.sqrt(2.0 * found.cost) - radius - more
+
+
+def solids_of(angles):
+    """The arm's solids by name: capsules of links and the shield."""
+    frames, found = links(angles), []
+    for k, (first, second) in enumerate(ARM.capsule_ends):
+        rotation, place = frames[ARM.capsule_link[k]]
+        middle, half = place + rotation @ (0.5 * (first + second)), 0.5 * (second - first)
+        found.append((ARM.capsule_link[k], middle, [rotation @ half], ARM.capsule_radius[k]))
+    rotation, middle = shield(angles)
+    half = np.array([0.5 * THICKNESS, ARM.shield_half, ARM.shield_half])
+    plate = (6, middle - 0.5 * THICKNESS * rotation[:, 0], list(half[:, None] * rotation.T), 0.0)
+    return [*found, plate]
+
+
+def brute_clearances(angles, scene):
+    """Least distances by kind, every pair by a solver."""
+    arm = solids_of(angles)
+    pole = (np.array([*scene.pole[0], 0.0]), [np.array([0.0, 0.0, 5.0])], scene.pole_radius[0])
+    beams = [
+        (0.5 * (a + b), [0.5 * (b - a)], radius)
+        for (a, b), radius in zip(scene.beam_ends[0], scene.beam_radius[0], strict=True)
+    ]
+    low, high = ARM.base_box
+    base = (0.5 * (low + high), list(0.5 * np.diag(high - low)), 0.0)
+    # Of link 4 that which does not reach through the shield while the wrist is straight.
+    wrist, plate = solids_of(np.zeros(6))[5], solids_of(np.zeros(6))[8]
+    thin = min(wrist[3], gap((*wrist[1:3], 0.0), plate[1:]))
+    found = {
+        "floor": [
+            m[2] - np.abs(np.array(s)[:, 2]).sum() - r - scene.floor[0] for _, m, s, r in arm
+        ],
+        "pole": [gap(solid, pole) for _, *solid in arm],
+        "rig": [gap(solid, beam) for _, *solid in arm for beam in beams],
+        "base": [gap(solid, base) for link, *solid in arm if link > 0],
+        "self": [gap(a, b) for i, *a in arm if i == 0 for j, *b in arm if j > 1],
+    }
+    for link, middle, spans, radius in arm:
+        if link in (1, 2, 3):
+            room = thin if link == 3 else radius
+            found["self"].append(gap((middle, spans, room), arm[-1][1:]))
+    if gap(arm[-1][1:], base) < 1e-6:  # a solver knows no depth of boxes
+        del found["base"]
+    return {kind: min(values) for kind, values in found.items()}
+
+
+def test_clearances_are_those_of_a_solver():
+    low, high = [-1.0, 0.0, -3.5, -3.0, -2.0, -3.0], [1.0, 1.9, 0.9, 3.0, 2.0, 3.0]
+    angles = np.random.default_rng(4).uniform(low, high, (20, 6))
+    leaves = stack(*map(still, angles))
+    leaves["scene.floor"][:] = -0.1
+    verdict, scene, touched = judge(leaves), tree(leaves).scene, set()
+    for k, pose in enumerate(angles):
+        for kind, least in brute_clearances(pose, scene).items():
+            assert getattr(verdict, f"{kind}_clearance")[k] == pytest.approx(least, abs=1e-8)
+            touched |= {kind} if least < 0.0 else set()
+    assert touched == {"floor", "pole", "rig", "base", "self"}
+
+
+def test_a_straight_wrist_does_not_touch_its_shield_and_a_folded_one_does():
+    for bend, success in ((0.0, True), (1.5, True), (-1.5, True), (1.75, False), (-1.75, False)):
+        angles = np.array([0.5, 0.2, 0.0, 0.3, bend, 0.0])
+        assert (judge(still(angles)).self_clearance[0] > -1e-6) == success
+
+
+def test_capsules_of_the_base_are_kept_off_like_its_box():
+    leaves = good()
+    leaves["arm.capsule_ends"][0, 0] = [[0.9, 0.45, 0.0], [0.9, 0.45, 0.5]]  # under the wrist
+    verdict = judge(leaves, (-1, *ARM.capsule_link[1:]))
+    assert verdict.failed_limit[0] == "base" and verdict.failed_part[0] == "link 4"
+
+
+def vectors(random, num):
+    return random.normal(size=(3, num))
+
+
+def spans_of(first, second):
+    return [0.5 * (second - first)]
+
+
+def test_distances_of_segments_are_those_of_a_solver():
+    random, num = np.random.default_rng(0), 60
+    a, b, c, d = (vectors(random, num) for _ in range(4))
+    b[:, :5] = a[:, :5]  # points
+    d[:, 3:10] = c[:, 3:10]
+    d[:, 10:20] = c[:, 10:20] + (b - a)[:, 10:20] * random.normal(size=10)  # parallel
+    found, points = solids.between_segments(a, b, c, d), solids.from_segment(c, a, b)
+    for k in range(num):
+        first = 0.5 * (a + b)[:, k], spans_of(a[:, k], b[:, k]), 0.0
+        second = 0.5 * (c + d)[:, k], spans_of(c[:, k], d[:, k]), 0.0
+        assert found[k] == pytest.approx(gap(first, second), abs=1e-9)
+        assert points[k] == pytest.approx(gap(first, (c[:, k], np.zeros((1, 3)), 0.0)), abs=1e-9)
+
+
+def test_distances_of_boxes_are_those_of_a_solver():
+    random, num = np.random.default_rng(1), 60
+    a, b, middle = (vectors(random, num) for _ in range(3))
+    b[0, :10] = a[0, :10]
+    b[1, 5:15] = a[1, 5:15]
+    half, other = random.uniform(0.01, 1.0, (2, 3, num))
+    rotation = np.moveaxis(Rotation.random(num, rng=random).as_matrix(), 0, -1).copy()
+    rotation[..., :5] = np.eye(3)[..., None]
+    segments = solids.segment_to_box(a, b, half)
+    boxes = solids.between_boxes(1.5 * middle, rotation, half, other)
+    assert (segments == 0.0).any() and (boxes < 0.0).any()
+    for k in range(num):
+        box = np.zeros(3), np.diag(half[:, k]), 0.0
+        segment = 0.5 * (a + b)[:, k], spans_of(a[:, k], b[:, k]), 0.0
+        assert segments[k] == pytest.approx(gap(box, segment), abs=1e-9)
+        turned = 1.5 * middle[:, k], (rotation[..., k] * half[:, k]).T, 0.0
+        apart = gap(turned, (np.zeros(3), np.diag(other[:, k]), 0.0))
+        assert max(boxes[k], 0.0) == pytest.approx(apart, abs=1e-7)
+
+
+def test_overlapping_boxes_are_as_deep_as_the_shortest_way_out():
+    half, other = np.array([[0.1], [0.2], [0.3]]), np.array([[1.0], [1.0], [1.0]])
+    turn = Rotation.from_euler("z", 45.0, degrees=True).as_matrix()[..., None]
+    middle = np.array([[0.9], [0.0], [0.2]])
+    assert solids.between_boxes(middle, np.eye(3)[..., None], half, other)[0] == pytest.approx(-0.2)
+    corner = np.sqrt(0.5) * 0.3
+    found = solids.between_boxes(middle, turn, half, other)[0]
+    assert found == pytest.approx(-(0.1 + corner))
+
+
+# Batches and what is handed in --------------------------------------------------------------------
+
+
+def unequal_lanes():
+    return [
+        good(),
+        FAILURES["tilt"][1],
+        good(durations=(0.05, 0.06)),
+        good(durations=(0.1, 0.3)),
+        FAILURES["time: an hour"][1],
+        FAILURES["self"][1],
+        good(),
+    ]
+
+
+def assert_same(a: BlockVerdict, b: BlockVerdict, lanes=slice(None)):
+    for name, left in vars(a).items():
+        right = getattr(b, name)
+        if left.dtype.kind == "f":
+            np.testing.assert_allclose(left[lanes], right[lanes], rtol=1e-12, atol=1e-12)
+        else:
+            np.testing.assert_array_equal(left[lanes], right[lanes], err_msg=name)
+
+
+@pytest.mark.parametrize("chunk", [1, 3, 256])
+def test_batch_equals_loop(chunk):
+    lanes = unequal_lanes()
+    batch = judge(stack(*lanes), chunk=chunk)
+    for i, lane in enumerate(lanes):
+        own = {k: v[i : i + 1] for k, v in vars(batch).items()}
+        assert_same(judge(lane), BlockVerdict(**own))
+    names = ["", "tilt", "velocity", "velocity", "time", "self", ""]
+    np.testing.assert_array_equal(batch.failed_limit, names)
+
+
+def test_no_plans_have_no_verdict():
+    none = judge({name: leaf[:0] for name, leaf in good().items()})
+    assert all(value.shape == (0,) for value in vars(none).values())
+
+
+# Angles where the arm waits, and what dynamics need, are not looked at.
+UNREAD = {"arm.home", "arm.mass", "arm.centre", "arm.inertia"}
+PLANNED = ("plan.motion.coeffs", "plan.motion.durations", "plan.contact_time")
+READ = sorted(name for name, leaf in good().items() if leaf.dtype == float and name not in UNREAD)
+
+
+@pytest.mark.parametrize("name", READ)
+def test_a_nan_fails_its_own_lane_and_no_other(name):
+    leaves = stack(*unequal_lanes()[-2:], good())
+    clean = judge(leaves)
+    leaves[name][(2,) + (0,) * (leaves[name].ndim - 1)] = np.nan
+    verdict = judge(leaves)
+    assert verdict.sentence(2) == "not finite: the plan or its case is not finite"
+    assert np.isnan(verdict.miss[2]) and np.isnan(verdict.pole_clearance[2])
+    assert_same(clean, verdict, lanes=slice(0, 2))
+
+
+@pytest.mark.parametrize("name", ["ball.pos", "angles", "arm.origin", "scene.pole", *PLANNED])
+@pytest.mark.parametrize("value", [1e300, -1e30, np.inf])
+def test_absurd_numbers_are_judged_without_a_warning(name, value):
+    leaves = good()
+    leaves[name] = np.full_like(leaves[name], value)
+    assert judge(leaves).success[0] == (name == "scene.pole" and np.isfinite(value))
+
+
+def test_float32_structs_of_the_library_are_taken_as_they_are():
+    leaves = {
+        k: leaf if leaf.dtype == bool else leaf.astype(np.float32) for k, leaf in good().items()
+    }
+    pos, vel = leaves["ball.pos"], leaves["ball.vel"]
+    cases = case(pos, vel, delay=[DELAY])
+    assert isinstance(cases, BlockCase)
+    plain = tree(leaves, "plan.")
+    claims: dict[str, Any] = dict.fromkeys(
+        ("cost", "violation", "iterations", "status"), np.full(1, np.nan)
+    )
+    plans = BlockPlan(motion=plain.motion, contact_time=plain.contact_time, **claims)
+    verdict = referee_blocks(cases, plans)
+    assert verdict.success[0], verdict.sentence(0)
+    assert verdict.miss.dtype == np.float64 and verdict.miss[0] < 1e-5
+
+
+@pytest.mark.parametrize("name", sorted({*READ, "scene.has_pole", "ends_at_rest"}))
+def test_a_leaf_of_the_wrong_shape_is_named(name):
+    leaves = good()
+    leaves[name] = leaves[name][..., None]
+    with pytest.raises(ValueError, match=f"{name} must be "):
+        judge(leaves)
+
+
+def test_bad_options_and_links_are_refused():
+    for options, message in (
+        ({"step": 0.0}, "step must be > 0 and <= 0.002, got 0.0"),
+        ({"step": 0.003}, "step must be > 0 and <= 0.002, got 0.003"),
+        ({"chunk": 0}, "chunk must be >= 1, got 0"),
+        ({"capsule_link": (6,) * 8}, "arm.capsule_link must be in -1, ..., 5"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            judge(good(), **options)
+    leaves = good()
+    leaves["plan.motion.coeffs"] = leaves["plan.motion.coeffs"][..., :5]
+    with pytest.raises(ValueError, match=r"coeffs must be \(B, M, D \+ 1, 6\), got"):
+        judge(leaves)
