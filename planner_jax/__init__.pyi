@@ -33,6 +33,7 @@ from .protocol import solved as solved
 from .referee.verdict import Verdict as Verdict
 from .registry import Task as Task
 from .registry import task_named as task_named
+from .task import block as block
 from .task import catch as catch
 from .task import hit as hit
 from .task import intercept as intercept

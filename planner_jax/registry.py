@@ -21,7 +21,9 @@ from importlib import metadata
 from typing import Any
 
 _GROUP = "planner_jax"
-_OWN = {name: f"planner_jax.task.{name}.card:TASK" for name in ("hit", "catch", "intercept")}
+_OWN = {
+    name: f"planner_jax.task.{name}.card:TASK" for name in ("hit", "catch", "intercept", "block")
+}
 
 
 class UnknownName(ValueError):

@@ -42,7 +42,7 @@ ALLOWED = {
     "referee": set(),
     "task": {
         *("ball", "cost", "lanes", "optimise", "planning", "protocol", "referee", "registry"),
-        *("plane", "robot", "trajectory"),
+        *("plane", "robot", "space", "trajectory"),
     },
     "sweep": {"ball", "lanes", "plane", "planning", "protocol", "registry", "robot", "task"},
     "compile_cache": set(),

@@ -1,3 +1,4 @@
+from . import block as block
 from . import catch as catch
 from . import hit as hit
 from . import intercept as intercept

@@ -1,5 +1,9 @@
 from .case import BlockCase as BlockCase
 from .case import case as case
+from .online import OnlineBlock as OnlineBlock
 from .plan import BlockPlan as BlockPlan
 from .scene import Scene as Scene
 from .scene import paper_scene as paper_scene
+from .words import draw as draw
+from .words import judge as judge
+from .words import planner as planner

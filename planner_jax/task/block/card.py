@@ -27,5 +27,6 @@ TASK = Task(
     home="planner_jax.task.block",
     planners={"online": "planner_jax.task.block.online:OnlineBlock"},
     suites={name: suite.description for name, suite in SUITES.items()},
+    sweep="planner_jax.sweep.block.settings:BlockSettings",
     contact="contact_time",
 )

@@ -14,9 +14,10 @@ from planner_jax.robot.arm import REGIMES, Arm, ArmLimits
 from planner_jax.robot.arm_mjcf import irb1600
 from planner_jax.task.block.scene import Scene, paper_scene
 
-# How exactly the ball is to be met: greatest distance from the middle of the shield [m], and
-# greatest angle [rad] between the shield's normal and the way that the ball comes from.
-TOLERANCES = {"strict": (0.002, np.deg2rad(0.5)), "wide": (0.1, np.deg2rad(30.0))}
+# How exactly a ball is to be met: greatest distance from the middle of the shield [m], and greatest
+# angle [rad] between the shield's normal and the way that the ball comes from.
+STRICT = (0.002, np.deg2rad(0.5))
+WIDE = (0.1, np.deg2rad(30.0))
 
 
 @struct.dataclass
@@ -50,7 +51,7 @@ def case(
     *,
     delay: Any = 0.0,
     regime: str = "R2",
-    tolerance: str = "strict",
+    wide: bool = False,
     scene: Scene | None = None,
     arm: Arm | None = None,
     angles: Any = None,
@@ -68,8 +69,8 @@ def case(
         regime: a key of `planner_jax.robot.arm.REGIMES`: "R1", the limits that the paper's
             authors plan with, end velocity free; "R2", the data sheet's speeds and 30 rad/s^2,
             from rest to rest; "R3", R1's limits from rest to rest.
-        tolerance: "strict", the ball at the shield's middle and straight on; or "wide", within
-            0.1 m and 30 degrees.
+        wide: whether the ball may be 0.1 m off the shield's middle and 30 degrees off straight
+            on, and not 2 mm and half a degree.
         scene: without the batch's axes; that of the paper if not given.
         arm: likewise; an IRB 1600 with a shield if not given.
         angles: (6,) [rad], at the start; the arm's home if not given.
@@ -78,10 +79,9 @@ def case(
         dtype: of every floating leaf.
 
     Raises:
-        ValueError: a number is out of its range, or a name is not known; one line.
+        ValueError: a number is out of its range, or there is no such regime; one line.
     """
     require_name(REGIMES, "regime", regime)
-    require_name(TOLERANCES, "tolerance", tolerance)
     arm = irb1600() if arm is None else arm
     angles = arm.home if angles is None else angles
     ball_pos, ball_vel, angles, rates = map(np.asarray, (ball_pos, ball_vel, angles, rates))
@@ -108,7 +108,7 @@ def case(
         return jax.tree.map(one, tree)
 
     chosen = REGIMES[regime]
-    offset, tilt = TOLERANCES[tolerance]
+    offset, tilt = WIDE if wide else STRICT
     return BlockCase(
         ball=BallState(pos=leaf(ball_pos, 3), vel=leaf(ball_vel, 3)),
         gravity=leaf(gravity),

@@ -25,7 +25,7 @@ from planner_jax.task.block.scene import Scene
 FAR = 10.0  # [m], of a pole that is not there
 # The forearm ends in a fork around the wrist, which a capsule would round off: towards the
 # shield it is no thicker than this share of the way from the wrist to the shield's face.
-_FORK = 0.75
+_FORK = 0.71
 _HALF_THICKNESS = 0.005  # [m], of the shield
 
 

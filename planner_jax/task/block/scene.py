@@ -96,7 +96,7 @@ def entry_time(box: Box, ball: BallState, gravity: Array) -> tuple[Array, Array]
     # Down through the height of the top.
     above = ball.vel[2] ** 2 + 2.0 * gravity * (ball.pos[2] - box.upper[2])
     from_top = (ball.vel[2] + jnp.sqrt(jnp.maximum(above, 0.0))) / gravity
-    is_above = position_at(ball, gravity, from_side)[2] > box.upper[2]
+    is_above = position_at(ball, gravity, jnp.maximum(from_side, 0.0))[2] > box.upper[2]
     time = jnp.where(is_above, from_top, from_side)
     height = position_at(ball, gravity, time)[2]
     return time, (time > 0.0) & (time <= until) & (height > box.lower[2])

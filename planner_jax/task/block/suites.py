@@ -48,7 +48,7 @@ def draw_cases(
     first: int = 0,
     *,
     regime: str = "R2",
-    tolerance: str = "strict",
+    wide: bool = False,
     delay: float = 0.0,
     dtype: Any = jnp.float32,
 ) -> BlockCase:
@@ -59,8 +59,8 @@ def draw_cases(
         num: B, how many, >= 1.
         seed: >= 0. Throw k of a suite and seed is always the same one.
         first: place of the first one, >= 0.
-        regime: see `planner_jax.task.block.case.case`, as for the next two.
-        tolerance: "strict" or "wide".
+        regime: see `planner_jax.task.block.case.case`, as for the next one.
+        wide: likewise.
         delay: [s].
         dtype: of every floating leaf.
 
@@ -79,7 +79,7 @@ def draw_cases(
         thrown[:, 1],
         delay=delay,
         regime=regime,
-        tolerance=tolerance,
+        wide=wide,
         scene=paper_scene(has_pole=own.has_pole),
         dtype=dtype,
     )

@@ -5,9 +5,12 @@ from typing import Any
 import jax.numpy as jnp
 
 from planner_jax.protocol import AnyPlanner
+from planner_jax.referee.block import BlockVerdict, referee_blocks
 from planner_jax.task.block.card import SUITES, TASK
 from planner_jax.task.block.case import BlockCase
+from planner_jax.task.block.plan import BlockPlan
 from planner_jax.task.block.suites import draw_cases
+from planner_jax.task.judged import judged
 
 
 def draw(
@@ -17,7 +20,7 @@ def draw(
     *,
     first: int = 0,
     regime: str = "R2",
-    tolerance: str = "strict",
+    wide: bool = False,
     delay: float = 0.0,
     dtype: Any = jnp.float32,
 ) -> BlockCase:
@@ -29,7 +32,7 @@ def draw(
         seed: >= 0. Throw k of a suite and seed is always the same one.
         first: place of the first one, >= 0.
         regime: "R1", "R2" or "R3"; see `case`.
-        tolerance: "strict" or "wide".
+        wide: whether balls may be met off the shield's middle and aslant; see `case`.
         delay: [s], until the arm may start.
         dtype: of every floating leaf.
 
@@ -39,7 +42,7 @@ def draw(
     suite = suite or "pole"
     if suite not in SUITES:
         return TASK.other_suite(suite)(num, seed, first)
-    settings = {"regime": regime, "tolerance": tolerance, "delay": delay, "dtype": dtype}
+    settings = {"regime": regime, "wide": wide, "delay": delay, "dtype": dtype}
     return draw_cases(suite, num, seed, first, **settings)
 
 
@@ -58,3 +61,22 @@ def planner(name: str = "online", **options: Any) -> AnyPlanner[Any, Any]:
         TypeError: the planner has no such field.
     """
     return TASK.make_planner(name, options)
+
+
+def judge(cases: BlockCase, plans: BlockPlan, **settings: Any) -> BlockVerdict:
+    """What the referee says of one plan or of a batch: kinematics and geometry alone decide.
+
+    Args:
+        cases: one case, or a batch.
+        plans: of them.
+        **settings: such as `tolerance`; see `referee_blocks`.
+
+    Returns:
+        A verdict with the batch shape of the cases: `success`, `sentence(k)`, and what was
+        measured.
+
+    Raises:
+        TypeError: the cases or plans are not blocks.
+        ValueError: shapes that do not fit, or a setting out of its range.
+    """
+    return judged(referee_blocks, cases, plans, (BlockCase, BlockPlan), settings)

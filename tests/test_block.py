@@ -1,0 +1,204 @@
+"""Blocks: throws, the motion of joints, least squares, and plans that the referee confirms."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import planner_jax as pj
+from planner_jax.ball.flight import BallState
+from planner_jax.optimise.levenberg import LevenbergConfig
+from planner_jax.robot.arm_mjcf import irb1600
+from planner_jax.task.block.clearance import clearances, is_of_pole
+from planner_jax.task.block.end_poses import end_poses, flight_of
+from planner_jax.task.block.motion import angles_at, polynomial, profiles, sums
+from planner_jax.task.block.online import OnlineBlock, Search
+from planner_jax.task.block.scene import entry_time, paper_scene, position_at
+from planner_jax.trajectory.polynomial import evaluate
+
+SMALL = OnlineBlock(
+    pieces=6, points=10, searches=(Search(straight=12, tries=3, solver=LevenbergConfig(8)),)
+)
+
+
+def thrown(**options):
+    return pj.block.case((9.0, 0.5, 0.3), (-8.0, -0.4, 5.4), **options)
+
+
+def test_a_throw_is_the_same_wherever_a_batch_begins():
+    many, one = pj.block.draw(6, seed=3), pj.block.draw(1, seed=3, first=4)
+    np.testing.assert_array_equal(many.ball.pos[4], one.ball.pos[0])
+    np.testing.assert_array_equal(many.ball.vel[4], one.ball.vel[0])
+
+
+@pytest.mark.parametrize(("suite", "farthest"), [("pole", 12.0), ("open", 12.0), ("short", 8.0)])
+def test_balls_come_into_both_boxes_past_the_pole(suite, farthest):
+    cases = pj.block.draw(100, suite)
+    flights = jax.jit(jax.vmap(flight_of))(cases)
+    assert flights.comes.all()
+    away = np.linalg.norm(cases.ball.pos[:, :2], axis=1)
+    assert (away >= 6.0).all() and (away <= farthest).all()
+    assert np.all(cases.scene.has_pole) == (suite != "open")
+    if suite != "open":
+        shares = np.linspace(0.0, 1.0, 400)
+        at = jax.jit(jax.vmap(jax.vmap(position_at, (None, None, 0)), (0, 0, 0)))
+        places = at(cases.ball, cases.gravity, shares * flights.latest[:, None])
+        gaps = np.linalg.norm(places[..., :2] - np.array([0.806, 0.0]), axis=-1)
+        assert gaps.min() > 0.099
+
+
+def test_a_ball_gets_into_a_box_when_it_is_there(float64):
+    """Through a side, through the top, or not at all."""
+    box = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), paper_scene().outer)
+
+    def entry(pos, vel):
+        ball = BallState(pos=jnp.asarray(pos), vel=jnp.asarray(vel))
+        return entry_time(box, ball, jnp.asarray(9.81))
+
+    time, enters = entry((5.0, 0.2, 1.0), (-8.0, 0.0, 1.0))
+    assert enters and time == pytest.approx(0.5)
+    time, enters = entry((0.0, 0.0, 3.85), (0.0, 0.0, 0.0))
+    assert enters and time == pytest.approx(np.sqrt(4.0 / 9.81))
+    assert not entry((5.0, 3.0, 1.0), (-8.0, 0.0, 1.0))[1]  # passes by
+    assert not entry((5.0, 0.0, 1.0), (8.0, 0.0, 1.0))[1]  # goes away
+    assert not entry((5.0, 0.0, 0.1), (-8.0, 0.0, 0.0))[1]  # from below
+
+
+def test_steps_add_up_to_the_integral_of_rates():
+    pieces, shares = 7, tuple(np.linspace(0.0, 1.0, 23))
+    rng = np.random.default_rng(0)
+    rates = rng.normal(size=pieces + 1)
+    fine = np.linspace(0.0, 1.0, 70001)
+    values = np.interp(fine, np.linspace(0.0, 1.0, pieces + 1), rates)
+    integral = np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1])) / 70000])
+    first, steps = sums(pieces, shares)
+    found = first * rates[0] + steps @ rates[1:]
+    np.testing.assert_allclose(found, np.interp(shares, fine, integral), atol=1e-8)
+
+
+def test_polynomials_are_the_same_motion(float64):
+    rng = np.random.default_rng(1)
+    start, first, steps = rng.normal(size=6), rng.normal(size=6), rng.normal(size=(5, 6))
+    shares, duration = tuple(np.linspace(0.0, 1.0, 11)), 0.7
+
+    @jax.jit
+    def both(start, first, steps):
+        motion = polynomial(start, first, steps, jnp.asarray(duration))
+        at = jax.vmap(lambda share: evaluate(motion, share * duration))
+        rates = jax.vmap(lambda share: evaluate(motion, share * duration, 1))
+        there = jnp.asarray(shares)
+        return at(there), angles_at(start, first, steps, shares), rates(there)
+
+    of_pieces, of_sums, rates = both(*map(jnp.asarray, (start, first, steps)))
+    np.testing.assert_allclose(of_pieces, of_sums, atol=1e-12)
+    np.testing.assert_allclose(rates[0], first / duration)
+    np.testing.assert_allclose(rates[-1], steps[-1] / duration)
+
+
+@pytest.mark.parametrize("ends_at_rest", [True, False])
+def test_profiles_turn_by_one(ends_at_rest):
+    shapes = profiles(10, ends_at_rest)
+    assert shapes @ sums(10, (1.0,))[1][0] == pytest.approx(np.ones(len(shapes)))
+    assert np.all((shapes[:, -1] == 0.0) == ends_at_rest)
+
+
+def test_the_arm_is_clear_at_home_and_not_when_it_reaches_into_the_pole():
+    arm, scene = jax.tree.map(jnp.asarray, (irb1600(), paper_scene()))
+    at = jax.jit(lambda angles, scene: clearances(arm, scene, angles))
+    home = at(arm.home, scene)
+    assert home.min() > 0.003 and home.shape == is_of_pole(arm, scene).shape
+    ahead = jnp.zeros(6).at[1].set(0.9)
+    of_pole = is_of_pole(arm, scene)
+    assert at(ahead, scene)[of_pole].min() < 0.0 < at(ahead, scene)[~of_pole].min()
+    assert at(ahead, dataclasses.replace(scene, has_pole=jnp.asarray(False))).min() > 0.0
+
+
+def test_end_poses_meet_the_ball(float64):
+    """Straight on and at the middle, on the ball's way between the boxes."""
+    case = thrown(dtype=jnp.float64)
+
+    @jax.jit
+    def found(case):
+        flight = flight_of(case)
+        poses = end_poses(case, flight, 10, 6)
+        of_pose = jax.vmap(lambda q, t: SMALL.contact_terms(case, flight, q, t)[2])
+        return poses, of_pose(poses.angles, poses.time)
+
+    poses, excess = found(case)
+    there = np.isfinite(poses.effort)
+    assert there.sum() > 10 and (excess[there] < 0.0).all()
+    np.testing.assert_allclose(poses.angles[:, 5], case.angles[5])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("regime", ["R1", "R2"])
+def test_slopes_of_least_squares_are_those_of_the_cost(regime, float64, monkeypatch):
+    """By central differences, from rates that are not zero and with a contact too late."""
+    monkeypatch.setattr("planner_jax.task.block.online._STEP", 1e-6)
+    case = thrown(regime=regime, rates=(0.3, -0.2, 0.1, 0.2, -0.4, 0.5), dtype=jnp.float64)
+    flight = flight_of(case)
+    poses = end_poses(case, flight, SMALL.points, SMALL.pieces)
+    start = SMALL.straight_point(case, poses, SMALL.order(poses)[0])
+    rng = np.random.default_rng(0)
+    # Small ones: the slope of an angle is taken for that of its sine.
+    point = start + jnp.asarray(rng.normal(0.0, 0.02, start.shape)).at[-1].set(0.0)
+    point = point.at[-1].set(flight.latest + 0.01)
+    model = jax.jit(lambda point: SMALL.model(point, case, flight))
+    gradient = 2.0 * np.asarray(model(point).gradient)
+    shifts = 1e-6 * np.eye(point.size)
+    slopes = [(model(point + s).cost - model(point - s).cost) / 2e-6 for s in shifts]
+    np.testing.assert_allclose(gradient, slopes, atol=2e-2 * np.abs(gradient).max())
+
+
+@pytest.mark.slow
+def test_claims_are_confirmed_by_the_referee():
+    """All three regimes; most balls are blocked, and nothing is claimed that is not so."""
+    planner = pj.block.planner()
+    for regime, wide, least in (("R1", True, 0.95), ("R2", False, 0.8), ("R3", False, 0.9)):
+        cases = pj.block.draw(60, seed=5, regime=regime, wide=wide)
+        plans = pj.plan(planner, cases)
+        verdict: Any = pj.block.judge(cases, plans)
+        assert verdict.success.mean() >= least
+        np.testing.assert_array_equal(verdict.success, pj.solved(plans))
+    one = pj.plan(planner, pj.lane(cases, 3))
+    assert one.status == plans.status[3]
+    np.testing.assert_allclose(one.contact_time, plans.contact_time[3], atol=1e-4)
+
+
+def test_plans_of_a_batch_say_what_became_of_each_ball():
+    cases = jax.tree.map(np.array, pj.block.draw(6, seed=8, regime="R1", wide=True))
+    cases.ball.vel[1, 0] *= -1.0  # flies away
+    cases.ball.pos[2] = np.nan
+    plans = pj.plan(SMALL, cases)
+    verdict: Any = pj.block.judge(cases, plans)
+    assert plans.status[1] == pj.Status.OUT_OF_REACH
+    assert not pj.solved(plans)[2] and verdict.failed_limit[2] == "not finite"
+    others = [0, 3, 4, 5]
+    assert pj.solved(plans)[others].sum() >= 3
+    np.testing.assert_array_equal(verdict.success[others], pj.solved(plans)[others])
+    setpoints = plans.sample(100.0)
+    np.testing.assert_allclose(setpoints.angles[0, 0], cases.angles[0], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"regime": "R9"}, "regime must be one of R1, R2, R3, got 'R9'"),
+        ({"delay": -0.1}, "delay must be >= 0, got -0.1"),
+        ({"gravity": 0.0}, "gravity must be > 0, got 0.0"),
+        ({"angles": (0.0, 1.0)}, r"angles must end with 6 numbers, got the shape \(2,\)"),
+    ],
+)
+def test_what_is_wrong_with_a_case_is_named(options, message):
+    with pytest.raises(ValueError, match=f"^{message}$"):
+        thrown(**options)
+
+
+def test_what_is_wrong_with_a_draw_is_named():
+    with pytest.raises(ValueError, match="^num must be >= 1, got 0$"):
+        pj.block.draw(0)
+    with pytest.raises(ValueError, match="^suite must be one of pole, open, short, got 'x'$"):
+        pj.block.draw(1, "x")
