@@ -111,7 +111,11 @@ def leaf_columns(batch: RefereedBatch) -> list[Column]:
 
 def _columns_of(tree: Any, name: str, part: str, words: Mapping[str, str]) -> list[Column]:
     if dataclasses.is_dataclass(tree):
-        fields = [(f.name, getattr(tree, f.name), f.metadata) for f in dataclasses.fields(tree)]
+        fields = [
+            (f.name, getattr(tree, f.name), f.metadata)
+            for f in dataclasses.fields(tree)
+            if f.metadata.get("pytree_node", True)  # what is static is not of one row
+        ]
         return [
             column
             for field, value, metadata in fields

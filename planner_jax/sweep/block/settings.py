@@ -24,6 +24,7 @@ class BlockSettings(SweepSettings):
     )
     delay: float = option(0.0, "S", "seconds until the arm may start")
 
+    RUN: ClassVar[str] = "planner_jax.sweep.block.sweep:BlockSweep"
     DRAW: ClassVar[tuple[str, ...]] = ("regime", "wide", "delay")
     CPU_BATCH: ClassVar[int] = 256  # some ms a case
     GPU_BATCH: ClassVar[int] = 4096

@@ -54,7 +54,10 @@ def planner(name: str = "online", **options: Any) -> AnyPlanner[Any, Any]:
 
     Args:
         name: one of these, or one that another package offers.
-        **options: fields of that planner's dataclass.
+        **options: fields of that planner's dataclass, for example `points` of `online`.
+
+    Returns:
+        A planner for `pj.plan`: `OnlineBlock`.
 
     Raises:
         ValueError: there is no planner of that name.
