@@ -37,12 +37,12 @@ class ArmPlan(Plan):
         Raises:
             ValueError: the rate is not positive.
         """
-        coeffs, durations = np.asarray(self.motion.coeffs), np.asarray(self.motion.durations)
-        motion = PiecewisePolynomial(coeffs=coeffs, durations=durations)
-        if durations.ndim == 1:
+        motion = jax.tree.map(np.asarray, self.motion)
+        ends, dtype = motion.durations.sum(axis=-1), motion.coeffs.dtype
+        if ends.ndim == 0:
             motion = jax.tree.map(lambda leaf: leaf[None], motion)
         times, setpoints = sampled_at_rate(
-            rate, durations.sum(axis=-1), lambda times: _sampled(motion, times.astype(coeffs.dtype))
+            rate, ends, lambda times: _sampled(motion, times.astype(dtype))
         )
         return ArmSetpoints(time=times, **setpoints)
 

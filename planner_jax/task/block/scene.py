@@ -3,6 +3,8 @@
 Robot base frame, z up, SI units.
 """
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -48,10 +50,13 @@ def paper_scene(*, has_pole: bool = True) -> Scene:
     home pose reaches into it.
     """
 
-    def box(half: float, height: float) -> Box:
-        lower, upper = np.array([-half, -half, 0.0]), np.array([half, half, height])
-        return Box(lower=lower.astype(np.float32), upper=upper.astype(np.float32))
+    def leaf(value: Any) -> Any:
+        return np.asarray(value, np.float32)
 
+    def box(half: float, height: float) -> Box:
+        return Box(lower=leaf([-half, -half, 0.0]), upper=leaf([half, half, height]))
+
+    is_there: Any = np.asarray(has_pole)
     ends = []
     for along in range(2):
         for side in (-RIG_HALF, RIG_HALF):
@@ -62,12 +67,12 @@ def paper_scene(*, has_pole: bool = True) -> Scene:
     return Scene(
         inner=box(INNER_HALF, INNER_HEIGHT),
         outer=box(OUTER_HALF, OUTER_HEIGHT),
-        pole=np.array(POLE, np.float32),
-        pole_radius=np.float32(POLE_RADIUS),
-        has_pole=np.bool_(has_pole),
-        floor=np.float32(FLOOR),
-        beam_ends=np.array(ends, np.float32),
-        beam_radius=np.full(4, RIG_RADIUS, np.float32),
+        pole=leaf(POLE),
+        pole_radius=leaf(POLE_RADIUS),
+        has_pole=is_there,
+        floor=leaf(FLOOR),
+        beam_ends=leaf(ends),
+        beam_radius=leaf(np.full(4, RIG_RADIUS)),
     )
 
 
