@@ -1,0 +1,170 @@
+"""Learn where the block planner's least squares begin, beside straight motions.
+
+    python -m benchmarks.block_starts [--num 60] [--tries 24] [--lanes 512] [--write] [--out DIR]
+
+Throws of the suite `pole`, seed 1001, in regime R2, straight on, with a delay of 0.05 s; no figure
+of the results is of them. Those that no straight motion blocks are tried from random starts: an end
+pose, by its rank in the planner's order, and a bump of the joints to one side. How far the plans
+that are found lie beside straight motions, and the bumps that led to them, are candidates. Each is
+tried at the first ranks on all throws that were blocked; the starts are then chosen one by one,
+each the one that blocks most of what is left. --write makes the shipped file anew. That was learned
+with --num 2400 --tries 384 --lanes 16384, in half a minute on one H200.
+"""
+
+import dataclasses
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from scipy.cluster.vq import kmeans2
+
+import planner_jax as pj
+from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin
+from planner_jax.optimise.levenberg import least_squares
+from planner_jax.protocol import is_solved
+from planner_jax.task.block import online
+from planner_jax.task.block.end_poses import all_profiles, end_poses, flight_of
+from planner_jax.task.block.motion import angles_at
+
+SEED, DELAY = 1001, 0.05
+STRAIGHT = 32  # straight motions that are looked at
+SPREAD = np.array([0.5, 0.4, 0.4, 0.3, 0.5, 0.0])  # [rad], of random bumps
+RANKS, LATER_RANKS = 10, 24  # of end poses: of candidates, of random starts
+KINDS = 48  # candidates of either kind
+MOST = 16  # starts that are kept
+SHARES = tuple(np.arange(1, 33) / 32)
+
+
+@jax.jit
+def tried(
+    planner: online.OnlineBlock, cases: pj.block.BlockCase, bumps: Array, ranks: Array, steps: Array
+) -> tuple[Array, Array]:
+    """Least squares from starts (B,) of cases (B,).
+
+    Returns:
+        is_good: (B,) bool.
+        found: (B, 6) [rad], how far the motion that was found lies beside the straight one to its
+            own end: the height of a bump that fits it best.
+    """
+    solver = planner.attempts[0].solver
+
+    def one(case: Any, bump: Array, rank: Array) -> tuple[Array, Array]:
+        flight = flight_of(case)
+        poses = end_poses(case, flight, planner.points, planner.pieces)
+        place = planner.order(poses)[rank]
+        start = planner.straight_point(case, poses, place)
+        start = start.at[:-1].add(planner.bump(bump).reshape(-1))
+        config = dataclasses.replace(solver, max_steps=steps)
+        end = least_squares(lambda point: planner.model(point, case, flight), start, config)
+        plan = planner.plan_at(case, flight, end.point, end.steps)
+        moves, first, _ = planner.parts(case, end.point)
+        angles = angles_at(case.angles, first, moves, SHARES)
+        shape = jnp.asarray(all_profiles(planner.pieces)[0], angles.dtype)[poses.profile[place]]
+        straight = shape[:, None] * (angles[-1] - case.angles)
+        beside = angles - angles_at(case.angles, first, straight, SHARES)
+        weight = jnp.asarray(np.sin(np.pi * np.array(SHARES)) ** 2, angles.dtype)
+        return is_solved(plan.status), jnp.sum(beside * weight[:, None], axis=0) / jnp.sum(
+            weight**2
+        )
+
+    return jax.vmap(one)(cases, bumps, ranks)
+
+
+def tried_in_parts(
+    cases: Any, index: np.ndarray, bumps: np.ndarray, ranks: np.ndarray, steps: int, lanes: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """The same of starts (N,) of the cases with an index (N,), so many at once."""
+
+    def parts() -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        for first in range(0, len(index), lanes):
+            here = np.arange(first, min(first + lanes, len(index)))
+            full = np.resize(here, lanes)
+            given = (jnp.asarray(bumps[full], jnp.float32), jnp.asarray(ranks[full]))
+            some = pj.lane(cases, index[full])
+            found = tried(online.OnlineBlock(), some, *given, jnp.asarray(steps))
+            yield tuple(np.asarray(each)[: len(here)] for each in found)
+
+    good, beside = zip(*parts(), strict=True)
+    return np.concatenate(good), np.concatenate(beside)
+
+
+def chosen_starts(solves: np.ndarray) -> list[int]:
+    """Columns of a table (throws, starts) bool: each the one that solves most of what is left."""
+    left, chosen = np.ones(len(solves), bool), []
+    while left.any() and len(chosen) < MOST:
+        gain = solves[left].sum(axis=0)
+        best = int(np.lexsort((solves.sum(axis=0), gain))[-1])
+        if not gain[best]:
+            break
+        chosen.append(best)
+        left &= ~solves[:, best]
+    return chosen
+
+
+def learn(bench: Bench, num: int, tries: int, lanes: int) -> list[dict[str, Any]]:
+    """The starts, in the order in which they are tried."""
+    rng = np.random.default_rng(0)
+    cases = pj.block.draw(num, "pole", SEED, regime="R2", delay=DELAY)
+    places, none = np.repeat(np.arange(num), STRAIGHT), np.zeros((num * STRAIGHT, 6))
+    ranks = np.tile(np.arange(STRAIGHT), num)
+    straight = tried_in_parts(cases, places, none, ranks, -1, lanes)[0].reshape(num, -1).any(axis=1)
+    hard = np.flatnonzero(~straight)
+    bench.say(f"{100 * straight.mean():.1f} % of {num} throws by straight motions")
+
+    size = (len(hard) * tries, 6)
+    bumps = rng.normal(size=size) * SPREAD * rng.uniform(0.3, 1.8, (size[0], 1))
+    ranks, places = rng.integers(0, LATER_RANKS, size[0]), np.repeat(hard, tries)
+    good, beside = tried_in_parts(cases, places, bumps, ranks, 20, lanes)
+    solvable = hard[good.reshape(-1, tries).any(axis=1)]
+    bench.say(
+        f"{len(solvable)} of the {len(hard)} others from one of {tries} random starts; one start "
+        f"blocks {100 * good.mean():.1f} %"
+    )
+
+    if not solvable.size:
+        return []
+
+    # As many of each throw, so that easy ones do not outvote the others.
+    some = [rng.permutation(np.flatnonzero(good & (places == throw)))[:8] for throw in solvable]
+    picked = np.concatenate(some)
+    middles, _ = kmeans2(beside[picked], min(KINDS, len(picked)), seed=1, minit="points")
+    candidates = np.concatenate([middles, bumps[rng.permutation(picked)[:KINDS]]])
+    throw, kind, rank = np.meshgrid(
+        solvable, np.arange(len(candidates)), np.arange(RANKS), indexing="ij"
+    )
+    solves, _ = tried_in_parts(
+        cases, throw.ravel(), candidates[kind.ravel()], rank.ravel(), 16, lanes
+    )
+    solves = solves.reshape(len(solvable), -1)
+    chosen = chosen_starts(solves)
+    for count in range(1, len(chosen) + 1):
+        share = solves[:, chosen[:count]].any(axis=1).mean()
+        bench.say(f"{count} starts: {100 * share:.1f} % of these")
+    bench.count(solves[:, chosen].any(axis=1))
+    return [
+        {"rank": k % RANKS, "bump": [round(float(x), 3) for x in candidates[k // RANKS]]}
+        for k in chosen
+    ]
+
+
+def main() -> None:
+    """Learn the starts, and ship them if asked."""
+    parser = argument_parser("block_starts", __doc__, num=60, tries=24)
+    parser.add_argument("--lanes", type=at_least(1), default=512, help="starts tried at once")
+    parser.add_argument("--write", action="store_true", help="make the shipped file anew")
+    options = parser.parse_args()
+    with begin(parser, options) as bench:
+        starts = learn(bench, options.num, options.tries, options.lanes)
+        if starts and options.write:
+            path = Path(online.__file__).parent / "learned_starts.json"
+            path.write_text(json.dumps(starts, indent=1) + "\n")
+            bench.say(f"Written: {path.name}, {len(starts)} starts.")
+
+
+if __name__ == "__main__":
+    main()
