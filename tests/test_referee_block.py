@@ -396,8 +396,8 @@ def test_a_motion_that_ends_a_little_off_the_contact_is_where_it_is_then():
 
 
 def test_the_shield_may_be_met_beside_its_middle_and_at_an_angle_but_not_beyond_its_edge():
-    assert_good(good(velocity=TURN @ INCOMING, tolerance="wide"))
-    assert_good(good(at=CONTACT + 0.09 * ROTATION[:, 2], tolerance="wide"))
+    assert_good(good(velocity=TURN @ INCOMING, wide=True))
+    assert_good(good(at=CONTACT + 0.09 * ROTATION[:, 2], wide=True))
     for beside, verdict in ((0.149, ""), (0.16, "ball")):
         leaves = good(at=CONTACT + beside * (ROTATION[:, 1] - 0.5 * ROTATION[:, 2]))
         leaves["offset"][:] = np.inf
