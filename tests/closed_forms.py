@@ -2,16 +2,7 @@
 
 import numpy as np
 
-from planner_jax.ball.flight import BallState, gravity_vector
 from planner_jax.task.hit import court
-
-
-def drag_free_flight(ball, duration, gravity):
-    """The ball after `duration` [s] under gravity alone."""
-    g = gravity_vector(gravity)
-    return BallState(
-        pos=ball.pos + ball.vel * duration + 0.5 * g * duration**2, vel=ball.vel + g * duration
-    )
 
 
 def region_of(x, y):

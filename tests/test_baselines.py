@@ -7,11 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from closed_forms import drag_free_flight
 from derivatives import assert_gradient_matches_differences
 
 import planner_jax as pj
-from planner_jax.ball.flight import BallState, fly
+from planner_jax.ball.flight import BallState, drag_free_flight, fly
 from planner_jax.ball.impact import racket_impact
 from planner_jax.planning.plan import plan
 from planner_jax.protocol import Status, is_solved

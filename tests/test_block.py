@@ -9,14 +9,16 @@ import numpy as np
 import pytest
 
 import planner_jax as pj
-from planner_jax.ball.flight import BallState
+from planner_jax.ball.flight import BallState, drag_free_flight
 from planner_jax.optimise.levenberg import LevenbergConfig
+from planner_jax.robot.arm import REGIMES
 from planner_jax.robot.arm_mjcf import irb1600
-from planner_jax.task.block.clearance import clearances, is_of_pole
+from planner_jax.sweep.block.settings import REGIMES as SWEPT
+from planner_jax.task.block.clearance import clearances, num_of_pole
 from planner_jax.task.block.end_poses import end_poses, flight_of
 from planner_jax.task.block.motion import angles_at, polynomial, profiles, sums
 from planner_jax.task.block.online import OnlineBlock, Search
-from planner_jax.task.block.scene import entry_time, paper_scene, position_at
+from planner_jax.task.block.scene import entry_time, paper_scene
 from planner_jax.trajectory.polynomial import evaluate
 
 SMALL = OnlineBlock(
@@ -44,8 +46,8 @@ def test_balls_come_into_both_boxes_past_the_pole(suite, farthest):
     assert np.all(cases.scene.has_pole) == (suite != "open")
     if suite != "open":
         shares = np.linspace(0.0, 1.0, 400)
-        at = jax.jit(jax.vmap(jax.vmap(position_at, (None, None, 0)), (0, 0, 0)))
-        places = at(cases.ball, cases.gravity, shares * flights.latest[:, None])
+        at = jax.jit(jax.vmap(jax.vmap(drag_free_flight, (None, 0, None))))
+        places = at(cases.ball, shares * flights.latest[:, None], cases.gravity).pos
         gaps = np.linalg.norm(places[..., :2] - np.array([0.806, 0.0]), axis=-1)
         assert gaps.min() > 0.099
 
@@ -109,10 +111,10 @@ def test_the_arm_is_clear_at_home_and_not_when_it_reaches_into_the_pole():
     arm, scene = jax.tree.map(jnp.asarray, (irb1600(), paper_scene()))
     at = jax.jit(lambda angles, scene: clearances(arm, scene, angles))
     home = at(arm.home, scene)
-    assert home.min() > 0.003 and home.shape == is_of_pole(arm, scene).shape
+    assert home.min() > 0.003 and home.size > num_of_pole(arm)
     ahead = jnp.zeros(6).at[1].set(0.9)
-    of_pole = is_of_pole(arm, scene)
-    assert at(ahead, scene)[of_pole].min() < 0.0 < at(ahead, scene)[~of_pole].min()
+    num = num_of_pole(arm)
+    assert at(ahead, scene)[:num].min() < 0.0 < at(ahead, scene)[num:].min()
     assert at(ahead, dataclasses.replace(scene, has_pole=jnp.asarray(False))).min() > 0.0
 
 
@@ -195,6 +197,10 @@ def test_plans_of_a_batch_say_what_became_of_each_ball():
 def test_what_is_wrong_with_a_case_is_named(options, message):
     with pytest.raises(ValueError, match=f"^{message}$"):
         thrown(**options)
+
+
+def test_sweeps_know_the_regimes():
+    assert tuple(REGIMES) == SWEPT
 
 
 def test_what_is_wrong_with_a_draw_is_named():

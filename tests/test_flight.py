@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from closed_forms import drag_free_flight
 from convergence import observed_order
 from derivatives import assert_gradient_matches_differences
 from scipy.integrate import solve_ivp
@@ -16,6 +15,7 @@ from planner_jax.ball.flight import (
     ball_acceleration,
     drag_free_apex,
     drag_free_fall_time,
+    drag_free_flight,
     fly,
     linear_drag_flight,
     rk4_step,

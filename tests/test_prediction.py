@@ -6,11 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from closed_forms import drag_free_flight
 from convergence import observed_order
 from derivatives import assert_gradient_matches_differences
 
-from planner_jax.ball.flight import BallState, rk4_step
+from planner_jax.ball.flight import BallState, drag_free_flight, rk4_step
 from planner_jax.ball.prediction import (
     PathTable,
     convolution_weights,

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares, lsq_linear
 from scipy.spatial.transform import Rotation
+from verdicts import assert_same
 
 from planner_jax.referee import block, solids
 from planner_jax.referee.block import LIMITS, BlockVerdict, referee_blocks, times_inside
@@ -627,15 +628,6 @@ def unequal_lanes():
         FAILURES["self"][1],
         good(),
     ]
-
-
-def assert_same(a: BlockVerdict, b: BlockVerdict, lanes=slice(None)):
-    for name, left in vars(a).items():
-        right = getattr(b, name)
-        if left.dtype.kind == "f":
-            np.testing.assert_allclose(left[lanes], right[lanes], rtol=1e-12, atol=1e-12)
-        else:
-            np.testing.assert_array_equal(left[lanes], right[lanes], err_msg=name)
 
 
 @pytest.mark.parametrize("chunk", [1, 3, 256])

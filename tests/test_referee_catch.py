@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.polynomial import Polynomial
 from scipy.integrate import solve_ivp
+from verdicts import assert_same
 
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath
@@ -486,15 +487,6 @@ def unequal_lanes():
     single["present"][0], single["order"][0] = [False, False, True], [2, 1, 0]
     single["durations"][0, 2:] = 0.0
     return [good(), fast, single, shifted, missed, swapped]
-
-
-def assert_same(a: CatchVerdict, b: CatchVerdict, lanes=slice(None)):
-    for name, left in vars(a).items():
-        right = getattr(b, name)
-        if left.dtype.kind == "f":
-            np.testing.assert_allclose(left[lanes], right[lanes], rtol=1e-12, atol=1e-12)
-        else:
-            np.testing.assert_array_equal(left[lanes], right[lanes], err_msg=name)
 
 
 @pytest.mark.parametrize("chunk", [1, 4, 512])

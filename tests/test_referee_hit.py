@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from verdicts import assert_same
 
 from planner_jax.ball.flight import BallState
 from planner_jax.referee import hit, judging
@@ -457,15 +458,6 @@ def unequal_lanes():
     shifted["head_state"][0, 0] += 0.2
     missed["target"][0, 0] += 0.5
     return [volley(), fast, volley(flight_time=1.6), shifted, missed, volley(target=(3.5, 1, 0))]
-
-
-def assert_same(a: HitVerdict, b: HitVerdict, lanes=slice(None)):
-    for name, left in vars(a).items():
-        right = getattr(b, name)
-        if left.dtype.kind == "f":
-            np.testing.assert_allclose(left[lanes], right[lanes], rtol=1e-12, atol=1e-12)
-        else:
-            np.testing.assert_array_equal(left[lanes], right[lanes], err_msg=name)
 
 
 @pytest.mark.parametrize("drag_after_impact", [False, True])

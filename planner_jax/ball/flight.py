@@ -137,6 +137,20 @@ def _phi(x: Array) -> tuple[Array, Array]:
     return 1.0 - x * phi_2, phi_2
 
 
+def drag_free_flight(ball: BallState, duration: Array, gravity: Array) -> BallState:
+    """The ball after `duration` [s] of free fall (paper 004, eqs 5 to 7).
+
+    Args:
+        ball: one ball.
+        duration: () [s].
+        gravity: () [m/s^2], magnitude.
+    """
+    g = gravity_vector(gravity)
+    return BallState(
+        pos=ball.pos + ball.vel * duration + 0.5 * g * duration**2, vel=ball.vel + g * duration
+    )
+
+
 def drag_free_apex(ball: BallState, gravity: Array) -> Array:
     """Greatest height [m] that a drag-free ball reaches from now on.
 

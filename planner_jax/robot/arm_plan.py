@@ -37,13 +37,8 @@ class ArmPlan(Plan):
         Raises:
             ValueError: the rate is not positive.
         """
-        motion = jax.tree.map(np.asarray, self.motion)
-        ends, dtype = motion.durations.sum(axis=-1), motion.coeffs.dtype
-        if ends.ndim == 0:
-            motion = jax.tree.map(lambda leaf: leaf[None], motion)
-        times, setpoints = sampled_at_rate(
-            rate, ends, lambda times: _sampled(motion, times.astype(dtype))
-        )
+        ends = np.sum(np.asarray(self.motion.durations), axis=-1)
+        times, setpoints = sampled_at_rate(rate, ends, self.motion, _sampled)
         return ArmSetpoints(time=times, **setpoints)
 
 

@@ -74,15 +74,9 @@ class CarPlan(Plan):
         Raises:
             ValueError: the rate is not positive.
         """
-        leaves = map(np.asarray, (self.start, self.time, self.speed, self.curvature))
-        start, end, speed, curvature = leaves
-        if end.ndim == 0:
-            start, speed, curvature = start[None], speed[None], curvature[None]
-        ends = np.reshape(end, (-1,))
+        leaves = (self.start, self.time, self.speed, self.curvature)
         time, setpoints = sampled_at_rate(
-            rate,
-            end,
-            lambda time: _sampled(start, ends, speed, curvature, time.astype(speed.dtype)),
+            rate, self.time, leaves, lambda leaves, time: _sampled(*leaves, time)
         )
         return CarSetpoints(time=time, **setpoints)
 

@@ -44,12 +44,12 @@ class QuadrotorPlan(Plan):
         Raises:
             ValueError: the rate is not positive.
         """
-        path, gravity = jax.tree.map(np.asarray, (self.trajectory, self.gravity))
-        ends = path.durations.sum(axis=-1)
-        if ends.ndim == 0:
-            path, gravity = jax.tree.map(lambda leaf: leaf[None], (path, gravity))
+        ends = np.sum(np.asarray(self.trajectory.durations), axis=-1)
         time, setpoints = sampled_at_rate(
-            rate, ends, lambda time: _sampled(path, gravity, time.astype(path.coeffs.dtype))
+            rate,
+            ends,
+            (self.trajectory, self.gravity),
+            lambda leaves, time: _sampled(*leaves, time),
         )
         return QuadrotorSetpoints(time=time, **setpoints)
 

@@ -1,6 +1,7 @@
 """Plans at equally spaced times, whatever robot they are of."""
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import jax
 import numpy as np
@@ -9,16 +10,18 @@ from jax import Array
 
 def sampled_at_rate(
     rate: float,
-    ends: np.ndarray,
-    sample: Callable[[np.ndarray], Mapping[str, Array]],
+    ends: Any,
+    leaves: Any,
+    sample: Callable[[Any, np.ndarray], Mapping[str, Array]],
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """A plan, or a batch of them, at a rate [Hz] from its beginning up to its end.
 
     Args:
         rate: [Hz].
         ends: () or (B,) [s], when each plan ends.
-        sample: of times (K,) [s] the setpoints of all plans by name, leaves (B, K, ...) with B = 1
-            for one plan.
+        leaves: a pytree of what else there is of the plans, with their batch shape.
+        sample: of these leaves, (B, ...) with B = 1 for one plan, and times (K,) [s] the setpoints
+            by name, (B, K, ...).
 
     Returns:
         times: (K,) [s].
@@ -29,12 +32,16 @@ def sampled_at_rate(
     """
     if not rate > 0.0:
         raise ValueError(f"rate must be > 0, got {rate}")
+    leaves, ends = jax.tree.map(np.asarray, (leaves, ends))
+    is_one = ends.ndim == 0
+    if is_one:
+        leaves, ends = jax.tree.map(lambda leaf: leaf[None], (leaves, ends))
     last = np.nanmax(ends, initial=0.0)
     times = np.arange(int(last * rate * (1.0 + 1e-6)) + 1) / rate
-    setpoints = jax.tree.map(np.array, dict(sample(times)))
-    past = ~(times <= np.reshape(ends, (-1, 1)) * (1.0 + 1e-6))
+    setpoints = jax.tree.map(np.array, dict(sample(leaves, times.astype(ends.dtype))))
+    past = ~(times <= ends[:, None] * (1.0 + 1e-6))
     for leaf in setpoints.values():
         leaf[past] = np.nan
-    if np.ndim(ends) == 0:
+    if is_one:
         setpoints = {name: leaf[0] for name, leaf in setpoints.items()}
     return times, setpoints

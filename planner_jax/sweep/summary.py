@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pyarrow as pa
@@ -39,6 +39,8 @@ def percent(successes: int, num: int) -> str:
 class Tally:
     """Counts over the rows of a sweep, chunk by chunk; its size does not grow with them."""
 
+    MEANS: ClassVar[tuple[str, ...]] = ()  # columns whose mean over the successes is told
+
     def __init__(self) -> None:
         self.num = 0
         self.successes = 0
@@ -47,6 +49,7 @@ class Tally:
         # Index of the case that the figure of one plan shows.
         self.example = 0
         self._example_rank: int | None = None
+        self._sums = dict.fromkeys(self.MEANS, 0.0)
 
     def add(self, rows: pa.Table) -> None:
         """Count some rows of `plans.parquet`."""
@@ -55,6 +58,8 @@ class Tally:
         self.successes += int(success.sum())
         self.status.update(rows["status"].to_numpy())
         self.failed_limits.update(rows["failed_limit"].to_numpy()[~success])
+        for name in self.MEANS:
+            self._sums[name] += float(rows[name].to_numpy()[success].sum())
         index = rows["index"].to_numpy()
         for rank, there in enumerate(self.examples(rows, success)):
             better = self._example_rank is None or rank < self._example_rank
@@ -66,7 +71,9 @@ class Tally:
         return [success, np.ones_like(success)]
 
     def summary(self) -> dict[str, Any]:
-        """Rates as fractions, 0 to 1, for the manifest."""
+        """Rates as fractions, 0 to 1, and means, None without any success, for the manifest."""
+        num = self.successes
+        means = {f"mean_{name}": total / num if num else None for name, total in self._sums.items()}
         return {
             "success_rate": self.successes / self.num,
             "num": self.num,
@@ -74,4 +81,5 @@ class Tally:
             "wilson_95": list(wilson_interval(self.successes, self.num)),
             "status_counts": dict(self.status.most_common()),
             "failed_limits": dict(self.failed_limits.most_common()),
+            **means,
         }

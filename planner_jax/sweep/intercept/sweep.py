@@ -27,29 +27,13 @@ class InterceptTally(Tally):
     The example is a success that something that moves comes near to.
     """
 
+    MEANS = ("meeting_time", "miss", "rms_acceleration")
     NEAR = 0.1  # [m]
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._sums = {"meeting_time": 0.0, "miss": 0.0, "rms_acceleration": 0.0}
-
-    def add(self, rows: pa.Table) -> None:
-        """Count some rows of `plans.parquet`."""
-        super().add(rows)
-        success = rows["success"].to_numpy().astype(bool)
-        for name in self._sums:
-            self._sums[name] += float(rows[name].to_numpy()[success].sum())
 
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
         """Which rows (B,) make examples, the best kind first."""
         is_near = rows["mover_clearance"].to_numpy() < self.NEAR
         return [success & is_near, *super().examples(rows, success)]
-
-    def summary(self) -> dict[str, Any]:
-        """Rates as fractions, 0 to 1, and means over the successes, None without any."""
-        num = self.successes
-        means = {f"mean_{name}": total / num if num else None for name, total in self._sums.items()}
-        return {**super().summary(), **means}
 
 
 class InterceptSweep(Sweep):

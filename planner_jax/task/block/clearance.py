@@ -30,13 +30,16 @@ _HALF_THICKNESS = 0.005  # [m], of the shield
 
 
 def clearances(arm: Arm, scene: Scene, angles: Array) -> Array:
-    """Distances (R,) [m] of all pairs at angles (6,); capsules that overlap have negative ones."""
+    """Distances (R,) [m] of all pairs at angles (6,); capsules that overlap have negative ones.
+
+    The first `num_of_pole(arm)` are those from the pole.
+    """
     ends = capsules(arm, angles)
     rotation, middle = shield_pose(arm, angles)
     middle = middle - _HALF_THICKNESS * rotation[:, 0]
     edges = arm.shield_half * rotation[:, 1:].T
     link = np.asarray(arm.capsule_link)
-    moving, trunk = np.flatnonzero(link >= 2), np.flatnonzero(link == 0)
+    moving, trunk = _moving(arm), np.flatnonzero(link == 0)
     before = np.flatnonzero((link >= 0) & (link <= 3))
     radius = jnp.asarray(arm.capsule_radius)
     shield_edges = _outline(middle, edges)
@@ -60,10 +63,10 @@ def clearances(arm: Arm, scene: Scene, angles: Array) -> Array:
     lower, upper = jnp.asarray(arm.base_box)
     shield_on_base = jnp.min(on_base(shield_edges, lower, upper))
     rows = [
-        (among - radius[moving][:, None] - fixed_radius).reshape(-1),
-        of_shield - near_radius - _HALF_THICKNESS,
         to_pole(on_pole - radius[moving]),
         to_pole(shield_on_pole - _HALF_THICKNESS)[None],
+        (among - radius[moving][:, None] - fixed_radius).reshape(-1),
+        of_shield - near_radius - _HALF_THICKNESS,
         on_floor - radius[moving],
         lowest_of_rectangle(middle, edges)[None] - _HALF_THICKNESS - scene.floor,
         on_base(ends[moving], lower, upper) - radius[moving],
@@ -72,13 +75,14 @@ def clearances(arm: Arm, scene: Scene, angles: Array) -> Array:
     return jnp.concatenate(rows)
 
 
-def is_of_pole(arm: Arm, scene: Scene) -> np.ndarray:
-    """Which of the pairs are those with the pole, (R,) bool."""
-    link = np.asarray(arm.capsule_link)
-    moving, trunk = int(np.sum(link >= 2)), int(np.sum(link == 0))
-    before, beams = int(np.sum((link >= 0) & (link <= 3))), scene.beam_radius.shape[-1]
-    others = moving * (trunk + beams) + before + beams
-    return np.repeat([False, True, False], [others, moving + 1, 2 * (moving + 1)])
+def num_of_pole(arm: Arm) -> int:
+    """How many of the pairs are those with the pole: a capsule each, and the shield."""
+    return len(_moving(arm)) + 1
+
+
+def _moving(arm: Arm) -> np.ndarray:
+    """Places of the capsules of links 3 to 6, which reach what stands around."""
+    return np.flatnonzero(np.asarray(arm.capsule_link) >= 2)
 
 
 def _outline(middle: Array, edges: Array) -> Array:

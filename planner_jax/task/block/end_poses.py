@@ -6,10 +6,11 @@ import numpy as np
 from flax import struct
 from jax import Array
 
+from planner_jax.ball.flight import drag_free_flight
 from planner_jax.robot.arm_ik import inverse_kinematics
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.motion import profiles, sums
-from planner_jax.task.block.scene import entry_time, position_at, velocity_at
+from planner_jax.task.block.scene import entry_time
 
 # Where on the shield balls are met, in shares of the greatest offset: along its two edges.
 _PLACES = np.array([(0.0, 0.0), (0.8, 0.0), (0.0, 0.8), (-0.8, 0.0), (0.0, -0.8)])
@@ -58,11 +59,10 @@ def end_poses(case: BlockCase, flight: Flight, points: int, pieces: int) -> EndP
     place = case.offset * jnp.asarray(_PLACES[np.arange(points) % len(_PLACES)], time.dtype)
 
     def of_point(time: Array, place: Array) -> tuple[Array, Array]:
-        normal = facing(velocity_at(case.ball, case.gravity, time))
-        rotation = frame_of(normal)
+        ball = drag_free_flight(case.ball, time, case.gravity)
+        rotation = frame_of(facing(ball.vel))
         shift = place[0] * rotation[:, 1] + place[1] * rotation[:, 2]
-        middle = position_at(case.ball, case.gravity, time) + shift
-        return inverse_kinematics(case.arm, rotation, middle)
+        return inverse_kinematics(case.arm, rotation, ball.pos + shift)
 
     angles, found = jax.vmap(of_point)(time, place)
     angles = angles.at[:, :, 5].set(case.angles[5]).reshape(-1, 6)

@@ -17,15 +17,16 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 from jax import Array, lax
 
+from planner_jax.ball.flight import drag_free_flight
 from planner_jax.optimise.levenberg import LevenbergConfig, Model, least_squares
+from planner_jax.planning.batch import better_of
 from planner_jax.planning.one_by_one import one_by_one
-from planner_jax.protocol import FEASIBILITY_TOLERANCE, Attempt, Status, is_solved
+from planner_jax.protocol import FEASIBILITY_TOLERANCE, Attempt, Status, is_solved, status_of
 from planner_jax.robot.arm import product, shield_jacobian, shield_pose
 from planner_jax.task.block.case import BlockCase
-from planner_jax.task.block.clearance import clearances, is_of_pole
+from planner_jax.task.block.clearance import clearances, num_of_pole
 from planner_jax.task.block.end_poses import (
     EndPoses,
     Flight,
@@ -38,7 +39,6 @@ from planner_jax.task.block.end_poses import (
 )
 from planner_jax.task.block.motion import angles_at, polynomial, sums
 from planner_jax.task.block.plan import BlockPlan
-from planner_jax.task.block.scene import position_at, velocity_at
 
 _HIGHEST = lax.Precision.HIGHEST
 _STEP = 1e-3  # [rad], of difference quotients of distances
@@ -76,18 +76,15 @@ class Weights:
     effort: float = 0.1  # of accelerations in shares of their limits
 
 
-@struct.dataclass
-class _Excess:
-    """How far a motion is over each kind of limit; at most zero if it keeps it."""
+def _violation(joints: Array, contact: Array, too_near: Array) -> Array:
+    """The largest excess over a limit; a centimetre too near counts as much as a whole limit.
 
-    joints: Array  # (), relative, of angles, rates and accelerations
-    contact: Array  # (), relative, of the places and angles of the contact
-    clearance: Array  # () [m], how much too near it comes
-
-    @property
-    def greatest(self) -> Array:
-        """The largest, relative; of clearances beside a centimetre."""
-        return jnp.maximum(jnp.maximum(self.joints, self.contact), 100.0 * self.clearance)
+    Args:
+        joints: (), relative, of angles, rates and accelerations.
+        contact: (), relative, of the places and angles of the contact.
+        too_near: () [m].
+    """
+    return jnp.maximum(jnp.maximum(joints, contact), 100.0 * too_near)
 
 
 @jax.tree_util.register_static
@@ -133,17 +130,15 @@ class OnlineBlock:
             config = dataclasses.replace(attempt.solver, max_steps=steps)
             end = least_squares(lambda point: self.model(point, case, flight), start, config)
             plan = self.plan_at(case, flight, end.point, jnp.maximum(end.steps, 0))
-            return k + 1, self.better_of_two(best, plan)
+            return k + 1, better_of(best, plan, jnp.asarray(True))
 
         def is_open(state: tuple) -> Array:
             k, best = state
             return (k < straight + attempt.tries) & flight.comes & ~is_solved(best.status)
 
         _, best = lax.while_loop(is_open, next_one, (0, self.no_plan(case)))
-        reason = jnp.where(flight.comes, best.status, Status.OUT_OF_REACH)
-        return dataclasses.replace(
-            best, status=jnp.where(is_solved(best.status), best.status, reason).astype(jnp.int32)
-        )
+        status = jnp.where(flight.comes, best.status, Status.OUT_OF_REACH)
+        return dataclasses.replace(best, status=status.astype(jnp.int32))
 
     def solve_lanes(self, cases: BlockCase, attempt: Search) -> BlockPlan:
         """The plans of a batch: on a CPU one after another, else in step."""
@@ -205,7 +200,8 @@ class OnlineBlock:
         shares = tuple(np.arange(1, self.samples + 1) / self.samples)
         angles = angles_at(case.angles, first, steps, shares)
         gaps = jax.vmap(lambda q: clearances(case.arm, case.scene, q))(angles)  # (S, R)
-        margins = np.where(is_of_pole(case.arm, case.scene), self.pole_margin, 1.3 * self.margin)
+        is_of_pole = np.arange(gaps.shape[1]) < num_of_pole(case.arm)
+        margins = np.where(is_of_pole, self.pole_margin, 1.3 * self.margin)
         near, worst = lax.top_k(jnp.max(margins - gaps, axis=1), self.worst)
         here = angles[worst]
         moved = here[:, None] + _STEP * jnp.eye(6, dtype=dtype)
@@ -249,14 +245,12 @@ class OnlineBlock:
         gradient = jnp.append(steps_push.reshape(-1), time_push)
         held = jnp.where(case.ends_at_rest, 0.0, 1.0)
         free = jnp.ones(size + 1, dtype).at[size - 6 : size].set(held)
-        excess = _Excess(
-            joints=joints_excess, contact=contact_excess, clearance=near[0] - 0.3 * self.margin
-        )
+        too_near = near[0] - 0.3 * self.margin
         return Model(
             cost=of_joints + jnp.sum(rows**2) + jnp.sum(short**2),
             gradient=gradient * free,
             curvature=curvature * free[:, None] * free,
-            violation=excess.greatest,
+            violation=_violation(joints_excess, contact_excess, too_near),
         )
 
     def joint_terms(
@@ -334,10 +328,10 @@ class OnlineBlock:
         """
         rotation, middle = shield_pose(case.arm, angles)
         jacobian = shield_jacobian(case.arm, angles)
-        ball = position_at(case.ball, case.gravity, time)
-        velocity = velocity_at(case.ball, case.gravity, time)
+        ball = drag_free_flight(case.ball, time, case.gravity)
+        velocity = ball.vel
         normal = rotation[:, 0]
-        away = ball - middle
+        away = ball.pos - middle
         turns = jacobian[3:].T  # (6, 3), the axes
         moves = jacobian[:3].T
         by_normal = jnp.cross(turns, normal)
@@ -411,21 +405,13 @@ class OnlineBlock:
         angles = angles_at(case.angles, first, moves, shares)
         gaps = jax.vmap(lambda q: jnp.min(clearances(case.arm, case.scene, q)))(angles)
         contact = self.contact_terms(case, flight, angles[-1], point[-1])[2]
-        excess = _Excess(joints=joints, contact=contact, clearance=self.margin - jnp.min(gaps))
-        violation = jnp.where(point[-1] > case.delay, excess.greatest, jnp.inf)
-        is_finite = jnp.isfinite(violation)
-        status = jnp.where(violation <= FEASIBILITY_TOLERANCE, Status.FEASIBLE, Status.INFEASIBLE)
+        excess = _violation(joints, contact, self.margin - jnp.min(gaps))
+        violation = jnp.where(point[-1] > case.delay, excess, jnp.inf)
         return BlockPlan(
             motion=polynomial(case.angles, first, moves, duration),
             contact_time=point[-1],
             cost=duration,
             violation=violation,
             iterations=jnp.asarray(steps, jnp.int32),
-            status=jnp.where(is_finite, status, Status.NON_FINITE).astype(jnp.int32),
+            status=status_of(duration, violation, violation > FEASIBILITY_TOLERANCE),
         )
-
-    def better_of_two(self, plan: BlockPlan, later: BlockPlan) -> BlockPlan:
-        """The later plan where it is solved, or violates less than an unsolved one."""
-        less = (later.violation < plan.violation) | ~jnp.isfinite(plan.violation)
-        better = ~is_solved(plan.status) & less
-        return jax.tree.map(lambda new, old: jnp.where(better, new, old), later, plan)

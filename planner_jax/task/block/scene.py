@@ -10,7 +10,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.ball.flight import BallState
+from planner_jax.ball.flight import BallState, drag_free_fall_time, drag_free_flight
 
 INNER_HALF, INNER_HEIGHT = 0.4, 1.35  # [m], of the box that is protected
 OUTER_HALF, OUTER_HEIGHT = 1.0, 1.85  # [m], of the box in which a ball may be met
@@ -76,17 +76,6 @@ def paper_scene(*, has_pole: bool = True) -> Scene:
     )
 
 
-def position_at(ball: BallState, gravity: Array, time: Array) -> Array:
-    """Where a ball is after a time () [s] of free fall, (3,) [m] (paper 004, eqs 5 to 7)."""
-    fallen = jnp.zeros_like(ball.pos).at[2].set(0.5 * gravity * time**2)
-    return ball.pos + ball.vel * time - fallen
-
-
-def velocity_at(ball: BallState, gravity: Array, time: Array) -> Array:
-    """Its velocity then, (3,) [m/s]."""
-    return ball.vel.at[2].add(-gravity * time)
-
-
 def entry_time(box: Box, ball: BallState, gravity: Array) -> tuple[Array, Array]:
     """When a ball that comes from outside gets into a box, through a side or the top.
 
@@ -98,10 +87,8 @@ def entry_time(box: Box, ball: BallState, gravity: Array) -> tuple[Array, Array]
     at_lower, at_upper = ((edge[:2] - ball.pos[:2]) / moves for edge in (box.lower, box.upper))
     from_side = jnp.max(jnp.minimum(at_lower, at_upper))
     until = jnp.min(jnp.maximum(at_lower, at_upper))
-    # Down through the height of the top.
-    above = ball.vel[2] ** 2 + 2.0 * gravity * (ball.pos[2] - box.upper[2])
-    from_top = (ball.vel[2] + jnp.sqrt(jnp.maximum(above, 0.0))) / gravity
-    is_above = position_at(ball, gravity, jnp.maximum(from_side, 0.0))[2] > box.upper[2]
-    time = jnp.where(is_above, from_top, from_side)
-    height = position_at(ball, gravity, time)[2]
+    from_top, _ = drag_free_fall_time(ball, box.upper[2], gravity)
+    beside = drag_free_flight(ball, jnp.maximum(from_side, 0.0), gravity)
+    time = jnp.where(beside.pos[2] > box.upper[2], from_top, from_side)
+    height = drag_free_flight(ball, time, gravity).pos[2]
     return time, (time > 0.0) & (time <= until) & (height > box.lower[2])

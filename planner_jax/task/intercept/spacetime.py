@@ -83,12 +83,11 @@ _GIVEN = (
     Search(4, LevenbergConfig(16), seed=1, girth=0.9),
     Search(16, LevenbergConfig(24), seed=2, girth=0.75, drawn=1, directness=0.0),
 )
-_QUICK = (
-    Search(2, LevenbergConfig(8), following=3, settling=12),
-    Search(4, LevenbergConfig(10), settling=12, seed=1, girth=0.9),
-    Search(6, LevenbergConfig(14), settling=12, seed=2, girth=0.75, drawn=1, directness=0.0),
+_QUICK = tuple(
+    dataclasses.replace(search, ways=ways, solver=LevenbergConfig(steps), settling=12)
+    for search, ways, steps in zip(_GIVEN, (2, 4, 6), (8, 10, 14), strict=True)
 )
-_BEST = (Search(8, LevenbergConfig(10), following=3, settling=48), *_GIVEN[1:])
+_BEST = (dataclasses.replace(_GIVEN[0], ways=8, settling=48), *_GIVEN[1:])
 # Of a free time every way is tried, until it brings little, and the best one is kept. To hurry is
 # to leave the cells: early meetings come out earlier where nothing follows them.
 _EARLY = Search(
@@ -102,7 +101,7 @@ _EARLY = Search(
 _LEAST = Search(16, LevenbergConfig(60, tolerance=5e-4))
 _LATER = (
     Search(8, seed=1, girth=0.9),
-    Search(16, LevenbergConfig(30), seed=2, girth=0.75, drawn=1, directness=0.0),
+    dataclasses.replace(_GIVEN[2], solver=LevenbergConfig(30)),
 )
 _SEARCHES = {
     "given": _GIVEN,
