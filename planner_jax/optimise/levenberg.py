@@ -7,6 +7,7 @@ next one, and dropped with more if not.
 """
 
 import dataclasses
+import math
 from collections.abc import Callable
 
 import jax
@@ -37,6 +38,10 @@ class LevenbergConfig:
     longest: float = 1.5  # change of an unknown in one step
     settled: int = 2  # steps without a share `tolerance` less cost end the search of a good point
     tolerance: float = 1e-2
+    # A search is given up once its cost is above `hope` x `fade`^k, k steps after the step `trial`.
+    trial: int = 0
+    hope: float = math.inf
+    fade: float = 1.0
 
 
 @struct.dataclass
@@ -63,6 +68,11 @@ def least_squares(
     Returns:
         The last state. It is settled if `stalled` has reached `config.settled`.
     """
+    return go_on(evaluate, begun(start, config), config)
+
+
+def begun(start: Array, config: LevenbergConfig) -> LevenbergState:
+    """The state of a search that has not looked at its start (n,) yet."""
     # The first step, of no length, looks at the start: to evaluate it here would compile the
     # model twice.
     zero = jnp.zeros((), start.dtype)
@@ -72,18 +82,27 @@ def least_squares(
         curvature=jnp.eye(start.size, dtype=start.dtype),
         violation=zero + jnp.inf,
     )
-    first = LevenbergState(
+    return LevenbergState(
         point=start,
         model=nothing,
         damping=zero + config.damping / config.ease,
         steps=jnp.full((), -1, jnp.int32),
         stalled=jnp.zeros((), jnp.int32),
     )
-    return lax.while_loop(
-        lambda s: (s.steps < config.max_steps) & (s.stalled < config.settled),
-        lambda s: _step(evaluate, s, config),
-        first,
-    )
+
+
+def go_on(
+    evaluate: Callable[[Array], Model], state: LevenbergState, config: LevenbergConfig
+) -> LevenbergState:
+    """The last state of a search that goes on from one; the limit of steps counts all of them."""
+
+    def goes_on(state: LevenbergState) -> Array:
+        behind = state.steps - config.trial
+        bound = config.hope * config.fade ** jnp.maximum(behind, 0)
+        hopeful = (behind < 0) | (state.model.cost <= bound)
+        return (state.steps < config.max_steps) & (state.stalled < config.settled) & hopeful
+
+    return lax.while_loop(goes_on, lambda state: _step(evaluate, state, config), state)
 
 
 def _step(

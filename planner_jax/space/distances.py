@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 
 Vector = tuple[Array, ...]
 
@@ -123,7 +123,8 @@ def _shortest(nearest: Callable, gap: Callable, bodies: tuple[Array, ...]) -> Ar
 @_shortest.defjvp
 def _shortest_jvp(nearest: Callable, gap: Callable, primals: Any, tangents: Any) -> Any:
     (bodies,) = primals
-    held = nearest(*bodies)
+    # Held, since every slope would work it out anew.
+    held = lax.optimization_barrier(nearest(*bodies))
     return jax.jvp(lambda bodies: _length(gap(held, *bodies)), primals, tangents)
 
 

@@ -3,14 +3,20 @@
 Capsules and the shield's face against a pole, the floor, beams, the base and each other. Links that
 are neighbours are left out, and so are links 5 and 6 against the shield that they carry. The shield
 is a plate of 0.01 m, its face the front one, with rounded edges.
+
+Functions take N poses of the arm at once, and arrays have these on their last axis: so a processor
+works on several poses with one instruction.
 """
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 
-from planner_jax.robot.arm import Arm, capsules, shield_pose
+from planner_jax.robot.arm import Arm, link_frames
 from planner_jax.space.distances import (
     lowest_of_rectangle,
     lowest_of_segment,
@@ -27,52 +33,76 @@ FAR = 10.0  # [m], of a pole that is not there
 # shield it is no thicker than this share of the way from the wrist to the shield's face.
 _FORK = 0.71
 _HALF_THICKNESS = 0.005  # [m], of the shield
+_SHIELD_LINK = 5
+
+
+class _Poses(NamedTuple):
+    """Where everything of the arm is in N poses."""
+
+    ends: Array  # (2, 3, C, N) [m], of the capsules' segments
+    middle: Array  # (3, N) [m], of the shield's plate
+    edges: Array  # (2, 3, N) [m], halves of its edges
+    axes: Array  # (6, 3, N), directions of the joints
+    origins: Array  # (6, 3, N) [m], of the joints
+
+
+class _Body(NamedTuple):
+    """What turns with a link: points, and vectors between such. As in `space.distances`."""
+
+    points: Array  # (I, 3, P, N) [m]
+    vectors: Array  # (J, 3, P, N) [m]
+
+
+class _Pairs(NamedTuple):
+    """P pairs of a body that moves and one that it must not touch."""
+
+    distance: Callable[[_Body], Array]  # (P, N) [m]
+    body: _Body  # that moves
+    link: Any  # (P,) or (), 0 to 5, that it turns with
+    fixed: Any = -1  # likewise of the other body; -1 if it stands
 
 
 def clearances(arm: Arm, scene: Scene, angles: Array) -> Array:
-    """Distances (R,) [m] of all pairs at angles (6,); capsules that overlap have negative ones.
+    """Distances (R, N) [m] of all pairs; capsules that overlap have negative ones.
 
     The first `num_of_pole(arm)` are those from the pole.
+
+    Args:
+        arm: the arm.
+        scene: what stands around.
+        angles: (N, 6) [rad], poses.
     """
-    ends = capsules(arm, angles)
-    rotation, middle = shield_pose(arm, angles)
-    middle = middle - _HALF_THICKNESS * rotation[:, 0]
-    edges = arm.shield_half * rotation[:, 1:].T
-    link = np.asarray(arm.capsule_link)
-    moving, trunk = _moving(arm), np.flatnonzero(link == 0)
-    before = np.flatnonzero((link >= 0) & (link <= 3))
-    radius = jnp.asarray(arm.capsule_radius)
-    shield_edges = _outline(middle, edges)
+    every = _pairs(arm, scene, _poses(arm, angles))
+    return jnp.concatenate([pairs.distance(pairs.body) for pairs in every])
 
-    def to_pole(distance: Array) -> Array:
-        return jnp.where(scene.has_pole, distance - scene.pole_radius, FAR)
 
-    of_links = jax.vmap(segment_to_segment, (None, 0))
-    fixed = jnp.concatenate([ends[trunk], scene.beam_ends])
-    fixed_radius = jnp.concatenate([radius[trunk], scene.beam_radius])
-    among = jax.vmap(of_links, (0, None))(ends[moving], fixed)
-    near_shield = jnp.concatenate([ends[before], scene.beam_ends])
-    wrist = jnp.sqrt(jnp.sum((arm.origin[5] + arm.shield_centre) ** 2))
-    thin = jnp.where(link[before] == 3, jnp.minimum(radius[before], _FORK * wrist), radius[before])
-    near_radius = jnp.concatenate([thin, scene.beam_radius])
-    of_shield = jax.vmap(segment_to_rectangle, (0, None, None))(near_shield, middle, edges)
-    on_pole = jax.vmap(segment_to_vertical_line, (0, None))(ends[moving], scene.pole)
-    shield_on_pole = rectangle_to_vertical_line(middle, edges, scene.pole)
-    on_floor = jax.vmap(lowest_of_segment)(ends[moving]) - scene.floor
-    on_base = jax.vmap(segment_to_box, (0, None, None))
-    lower, upper = jnp.asarray(arm.base_box)
-    shield_on_base = jnp.min(on_base(shield_edges, lower, upper))
-    rows = [
-        to_pole(on_pole - radius[moving]),
-        to_pole(shield_on_pole - _HALF_THICKNESS)[None],
-        (among - radius[moving][:, None] - fixed_radius).reshape(-1),
-        of_shield - near_radius - _HALF_THICKNESS,
-        on_floor - radius[moving],
-        lowest_of_rectangle(middle, edges)[None] - _HALF_THICKNESS - scene.floor,
-        on_base(ends[moving], lower, upper) - radius[moving],
-        shield_on_base[None] - _HALF_THICKNESS,
-    ]
-    return jnp.concatenate(rows)
+def clearance_slopes(arm: Arm, scene: Scene, angles: Array) -> Array:
+    """How `clearances` change with each joint, (R, 6, N) [m/rad].
+
+    A joint that turns both bodies of a pair leaves their distance as it is.
+    """
+    poses = _poses(arm, angles)
+    joint = np.arange(6)[:, None]
+    slopes = []
+    for pairs in _pairs(arm, scene, poses):
+
+        def by_joint(axis: Array, origin: Array, pairs: _Pairs = pairs) -> Array:
+            """Slopes (P, N) by a joint with an axis (3, N) through a point (3, N)."""
+            arms = pairs.body.points - origin[:, None]
+            moves = _Body(points=_turns(axis, arms), vectors=_turns(axis, pairs.body.vectors))
+            return jax.jvp(pairs.distance, (pairs.body,), (moves,))[1]
+
+        between = (joint > np.asarray(pairs.fixed)) & (joint <= np.asarray(pairs.link))
+        moved = jax.vmap(by_joint)(poses.axes, poses.origins)
+        slopes.append(jnp.where(between[:, :, None], moved, 0.0))
+    return jnp.swapaxes(jnp.concatenate(slopes, axis=1), 0, 1)
+
+
+def _turns(axis: Array, arms: Array) -> Array:
+    """How vectors (I, 3, P, N) change as they turn about an axis (3, N)."""
+    x, y, z = axis
+    a, b, c = arms[:, 0], arms[:, 1], arms[:, 2]
+    return jnp.stack([y * c - z * b, z * a - x * c, x * b - y * a], axis=1)
 
 
 def num_of_pole(arm: Arm) -> int:
@@ -85,8 +115,118 @@ def _moving(arm: Arm) -> np.ndarray:
     return np.flatnonzero(np.asarray(arm.capsule_link) >= 2)
 
 
-def _outline(middle: Array, edges: Array) -> Array:
-    """The four edges (4, 2, 3) of a rectangle."""
-    signs = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)])
-    corners = middle + signs[:, :1] * edges[0] + signs[:, 1:] * edges[1]
-    return jnp.stack([corners, jnp.roll(corners, -1, axis=0)], axis=1)
+def _poses(arm: Arm, angles: Array) -> _Poses:
+    """Where the arm is at angles (N, 6)."""
+    # Held, since the loops over distances would each work them out anew.
+    rotations, origins = lax.optimization_barrier(
+        jax.vmap(lambda angles: link_frames(arm, angles), out_axes=-1)(angles)
+    )
+
+    def turned(rotations: Array, vector: Array) -> Array:
+        """Vectors (..., 3) of links in the base frame, (..., 3, N)."""
+        return sum(rotations[..., j, :] * vector[..., j, None, None] for j in range(3))
+
+    # The base is the last link, where -1 finds it.
+    num = angles.shape[0]
+    fixed = jnp.broadcast_to(jnp.eye(3, dtype=rotations.dtype)[None, :, :, None], (1, 3, 3, num))
+    link = np.asarray(arm.capsule_link, np.int32)
+    of_links = jnp.concatenate([rotations, fixed])[link]
+    places = jnp.concatenate([origins, jnp.zeros((1, 3, num), origins.dtype)])[link]
+    shield = rotations[_SHIELD_LINK]
+    face = origins[_SHIELD_LINK] + turned(shield, jnp.asarray(arm.shield_centre))
+    ends = [turned(of_links, arm.capsule_ends[:, k]) + places for k in range(2)]
+    return lax.optimization_barrier(
+        _Poses(
+            ends=jnp.swapaxes(jnp.stack(ends), 1, 2),
+            middle=face - _HALF_THICKNESS * shield[:, 0],
+            edges=arm.shield_half * jnp.swapaxes(shield[:, 1:], 0, 1),
+            axes=turned(rotations, jnp.asarray(arm.axis)),
+            origins=origins,
+        )
+    )
+
+
+def _pairs(arm: Arm, scene: Scene, poses: _Poses) -> list[_Pairs]:
+    """All pairs, those with the pole first."""
+    link, radius = np.asarray(arm.capsule_link), jnp.asarray(arm.capsule_radius)
+    moving, trunk = _moving(arm), np.flatnonzero(link == 0)
+    before = np.flatnonzero((link >= 0) & (link <= 3))
+    num = poses.middle.shape[-1]
+    none = jnp.zeros((0, 3, 1, num), poses.ends.dtype)
+    links = _Body(points=poses.ends[:, :, moving], vectors=none)
+    middle, edges = poses.middle[None, :, None], poses.edges[:, :, None]
+    plate = _Body(points=middle, vectors=edges)
+    corners = [
+        middle + a * edges[:1] + b * edges[1:] for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))
+    ]
+    outline = jnp.concatenate(
+        [jnp.concatenate(corners, axis=2), jnp.concatenate(corners[1:] + corners[:1], axis=2)]
+    )
+    thick = radius[moving][:, None]
+    beams = jnp.moveaxis(jnp.asarray(scene.beam_ends), 0, 2)[..., None]  # (2, 3, N, 1)
+    beams = jnp.broadcast_to(beams, (*beams.shape[:3], num))
+    num_beams = beams.shape[2]
+
+    def with_beams(places: np.ndarray) -> Array:
+        """Segments (2, 3, K, N) of capsules and of all beams."""
+        return jnp.concatenate([poses.ends[:, :, places], beams], axis=2)
+
+    def to_pole(distance: Array) -> Array:
+        return jnp.where(scene.has_pole, distance - scene.pole_radius, FAR)
+
+    wrist = jnp.sqrt(jnp.sum((arm.origin[5] + arm.shield_centre) ** 2))
+    thin = jnp.where(link[before] == 3, jnp.minimum(radius[before], _FORK * wrist), radius[before])
+    near_radius = jnp.concatenate([thin, scene.beam_radius])[:, None] + _HALF_THICKNESS
+    # Every link that moves against everything that is fixed to the trunk or to the ground.
+    fixed = with_beams(trunk)
+    sizes = len(moving), fixed.shape[2]
+    among = _Body(points=jnp.repeat(links.points, sizes[1], axis=2), vectors=none)
+    against = jnp.tile(fixed, (1, 1, sizes[0], 1))
+    fixed_radius = jnp.concatenate([radius[trunk], scene.beam_radius])
+    among_radius = (thick + fixed_radius).reshape(-1, 1)
+    of_fixed = np.tile([0] * len(trunk) + [-1] * num_beams, sizes[0])
+    near, (lower, upper) = with_beams(before), jnp.asarray(arm.base_box)
+    of_near = np.append(link[before], np.full(num_beams, -1))
+    return [
+        _Pairs(
+            lambda body: to_pole(segment_to_vertical_line(body.points, scene.pole) - thick),
+            links,
+            link[moving],
+        ),
+        _Pairs(
+            lambda body: to_pole(
+                rectangle_to_vertical_line(body.points[0], body.vectors, scene.pole)
+                - _HALF_THICKNESS
+            ),
+            plate,
+            _SHIELD_LINK,
+        ),
+        _Pairs(
+            lambda body: segment_to_segment(body.points, against) - among_radius,
+            among,
+            np.repeat(link[moving], sizes[1]),
+            of_fixed,
+        ),
+        _Pairs(
+            lambda body: segment_to_rectangle(near, body.points[0], body.vectors) - near_radius,
+            _Body(*(jnp.repeat(each, near.shape[2], axis=2) for each in plate)),
+            _SHIELD_LINK,
+            of_near,
+        ),
+        _Pairs(
+            lambda body: lowest_of_segment(body.points) - thick - scene.floor, links, link[moving]
+        ),
+        _Pairs(
+            lambda body: (
+                lowest_of_rectangle(body.points[0], body.vectors) - _HALF_THICKNESS - scene.floor
+            ),
+            plate,
+            _SHIELD_LINK,
+        ),
+        _Pairs(lambda body: segment_to_box(body.points, lower, upper) - thick, links, link[moving]),
+        _Pairs(
+            lambda body: segment_to_box(body.points, lower, upper) - _HALF_THICKNESS,
+            _Body(points=outline, vectors=none),
+            _SHIELD_LINK,
+        ),
+    ]

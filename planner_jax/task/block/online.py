@@ -11,6 +11,7 @@ the bumps.
 import dataclasses
 import functools
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import ClassVar
 
@@ -20,13 +21,13 @@ import numpy as np
 from jax import Array, lax
 
 from planner_jax.ball.flight import drag_free_flight
-from planner_jax.optimise.levenberg import LevenbergConfig, Model, least_squares
+from planner_jax.optimise.levenberg import LevenbergConfig, Model, begun, go_on, least_squares
 from planner_jax.planning.batch import better_of
 from planner_jax.planning.one_by_one import one_by_one
 from planner_jax.protocol import FEASIBILITY_TOLERANCE, Attempt, Status, is_solved, status_of
 from planner_jax.robot.arm import product, shield_jacobian, shield_pose
 from planner_jax.task.block.case import BlockCase
-from planner_jax.task.block.clearance import clearances, num_of_pole
+from planner_jax.task.block.clearance import clearance_slopes, clearances, num_of_pole
 from planner_jax.task.block.end_poses import (
     EndPoses,
     Flight,
@@ -41,19 +42,24 @@ from planner_jax.task.block.motion import angles_at, polynomial, sums
 from planner_jax.task.block.plan import BlockPlan
 
 _HIGHEST = lax.Precision.HIGHEST
-_STEP = 1e-3  # [rad], of difference quotients of distances
 _PLANE = 1e-3  # [m], how far from the shield's plane the ball may be at the contact
 
 
 @dataclasses.dataclass(frozen=True)
 class Search(Attempt):
-    """An attempt: so many straight motions, then least squares from so many starts; static."""
+    """An attempt: so many straight motions, then least squares from so many starts; static.
+
+    Two cases in three have a straight motion, nearly all of them among the first few.
+    """
 
     starts: int = 8
     straight: int = 48  # motions that are looked at
     tries: int = 15  # starts of least squares
+    first: int = 0  # place of the first of these
+    kept: int = 5  # of the tries, those that lanes in step go on with after the solver's trial
+    # Of starts that led to a plan, hardly any ever cost more than the solver hopes for.
     solver: LevenbergConfig = LevenbergConfig(
-        16, damping=1e-2, ease=0.25, tighten=6.0, settled=1, tolerance=1.0
+        *(16, 1e-2, 0.25, 6.0), settled=1, tolerance=1.0, trial=4, hope=540.0, fade=0.6
     )
 
 
@@ -102,7 +108,11 @@ class OnlineBlock:
     pole_margin: float = 0.012  # [m], the same of the pole, which samples may pass by
     slack: float = 0.004  # share of every limit that is kept free
     weights: Weights = Weights()
-    searches: tuple[Search, ...] = (Search(),)
+    searches: tuple[Search, ...] = (
+        Search(straight=6, tries=0),
+        Search(straight=32, tries=4, kept=2),
+        Search(straight=0, tries=11, first=4, kept=4),
+    )
 
     @property
     def attempts(self) -> tuple[Search, ...]:
@@ -111,49 +121,88 @@ class OnlineBlock:
 
     def solve(self, case: BlockCase, attempt: Search) -> BlockPlan:
         """The plan of one case."""
-        flight = flight_of(case)
-        poses = end_poses(case, flight, self.points, self.pieces)
-        order = self.order(poses)
-        ranks, bumps = (jnp.asarray(each) for each in learned_starts())
-        in_time = jnp.sum(poses.effort <= 1.0 - self.slack)
-        straight = jnp.minimum(in_time, attempt.straight)
-
-        def next_one(state: tuple) -> tuple:
-            k, best = state
-            is_straight = k < straight
-            number = jnp.where(is_straight, 0, (k - straight) % len(ranks))
-            rank = jnp.where(is_straight, k, ranks[number])
-            start = self.straight_point(case, poses, order[rank])
-            bump = jnp.where(is_straight, 0.0, bumps[number])
-            start = start.at[:-1].add(self.bump(bump).reshape(-1))
-            steps = jnp.where(is_straight, -1, attempt.solver.max_steps)
-            config = dataclasses.replace(attempt.solver, max_steps=steps)
-            end = least_squares(lambda point: self.model(point, case, flight), start, config)
-            plan = self.plan_at(case, flight, end.point, jnp.maximum(end.steps, 0))
-            return k + 1, better_of(best, plan, jnp.asarray(True))
-
-        def is_open(state: tuple) -> Array:
-            k, best = state
-            return (k < straight + attempt.tries) & flight.comes & ~is_solved(best.status)
-
-        _, best = lax.while_loop(is_open, next_one, (0, self.no_plan(case)))
-        status = jnp.where(flight.comes, best.status, Status.OUT_OF_REACH)
-        return dataclasses.replace(best, status=status.astype(jnp.int32))
+        return self._solve(case, attempt, self._one_after_another)
 
     def solve_lanes(self, cases: BlockCase, attempt: Search) -> BlockPlan:
         """The plans of a batch: on a CPU one after another, else in step."""
         return lax.platform_dependent(
             cases,
             cpu=lambda cases: one_by_one(lambda case: self.solve(case, attempt), cases),
-            default=jax.vmap(lambda case: self.solve(case, attempt)),
+            default=jax.vmap(lambda case: self._solve(case, attempt, self._in_step)),
         )
 
-    def order(self, poses: EndPoses) -> Array:
-        """Places of poses, those first that ask little, mixed so that they differ, (C,) int32."""
+    def _solve(self, case: BlockCase, attempt: Search, bend: Callable) -> BlockPlan:
+        """The plan of one case: a straight motion, else what `bend` makes of the starts."""
+        flight = flight_of(case)
+        poses = end_poses(case, flight, self.points, self.pieces)
+        ranks, bumps = (
+            each[attempt.first : attempt.first + attempt.tries] for each in learned_starts()
+        )
+        order = self.order(poses, max(attempt.straight, 1 + max(ranks, default=0)))
+        in_time = jnp.sum(poses.effort <= 1.0 - self.slack)
+        straight = jnp.minimum(in_time, attempt.straight)
+
+        def next_one(state: tuple) -> tuple:
+            k, best = state
+            point = self.straight_point(case, poses, order[k])
+            plan = self.plan_at(case, flight, point, jnp.zeros((), jnp.int32))
+            return k + 1, better_of(best, plan, jnp.asarray(True))
+
+        def is_open(state: tuple) -> Array:
+            k, best = state
+            return (k < straight) & flight.comes & ~is_solved(best.status)
+
+        _, best = lax.while_loop(is_open, next_one, (0, self.no_plan(case)))
+        if attempt.tries:
+            points = jax.vmap(lambda rank: self.straight_point(case, poses, order[rank]))(ranks)
+            bent = jax.vmap(self.bump)(jnp.asarray(bumps, points.dtype))
+            points = points.at[:, :-1].add(bent.reshape(attempt.tries, -1))
+            best = bend(case, flight, points, attempt, best)
+        status = jnp.where(flight.comes, best.status, Status.OUT_OF_REACH)
+        return dataclasses.replace(best, status=status.astype(jnp.int32))
+
+    def _one_after_another(
+        self, case: BlockCase, flight: Flight, points: Array, attempt: Search, best: BlockPlan
+    ) -> BlockPlan:
+        """Least squares from each start (N, n) until one leads to a plan."""
+
+        def next_one(state: tuple) -> tuple:
+            k, best = state
+            end = least_squares(self._model_of(case, flight), points[k], attempt.solver)
+            plan = self.plan_at(case, flight, end.point, end.steps)
+            return k + 1, better_of(best, plan, jnp.asarray(True))
+
+        def is_open(state: tuple) -> Array:
+            k, best = state
+            return (k < attempt.tries) & flight.comes & ~is_solved(best.status)
+
+        return lax.while_loop(is_open, next_one, (0, best))[1]
+
+    def _in_step(
+        self, case: BlockCase, flight: Flight, points: Array, attempt: Search, best: BlockPlan
+    ) -> BlockPlan:
+        """Least squares from all starts (N, n) for a trial, then from those that cost least."""
+        model, solver = self._model_of(case, flight), attempt.solver
+        trial = dataclasses.replace(solver, max_steps=solver.trial)
+        tried = jax.vmap(lambda point: go_on(model, begun(point, solver), trial))(points)
+        solved_first = jnp.where(tried.stalled >= solver.settled, -1.0, tried.model.cost)
+        _, chosen = lax.top_k(-solved_first, attempt.kept)
+        kept = jax.tree.map(lambda leaf: leaf[chosen], tried)
+        ends = jax.vmap(lambda state: go_on(model, state, solver))(kept)
+        plans = jax.vmap(lambda end: self.plan_at(case, flight, end.point, end.steps))(ends)
+        least = jnp.argmin(jnp.where(jnp.isnan(plans.violation), jnp.inf, plans.violation))
+        plan = jax.tree.map(lambda leaf: leaf[least], plans)
+        return better_of(best, plan, ~is_solved(best.status))
+
+    def _model_of(self, case: BlockCase, flight: Flight) -> Callable[[Array], Model]:
+        return lambda point: self.model(point, case, flight)
+
+    def order(self, poses: EndPoses, num: int) -> Array:
+        """Places (num,) of poses, those first that ask little, mixed so that they differ."""
         rng = np.random.default_rng(0)
         mixed = jnp.asarray(rng.random(poses.effort.shape[0]), poses.effort.dtype)
         late = jnp.where(poses.effort > 1.0 - self.slack, 10.0 * poses.effort, 0.0)
-        return jnp.argsort(poses.effort + mixed + late)
+        return lax.top_k(-(poses.effort + mixed + late), num)[1]
 
     def no_plan(self, case: BlockCase) -> BlockPlan:
         """A plan to stay, which is none."""
@@ -199,20 +248,19 @@ class OnlineBlock:
         # Samples: the end, and those at which the arm comes nearest to something.
         shares = tuple(np.arange(1, self.samples + 1) / self.samples)
         angles = angles_at(case.angles, first, steps, shares)
-        gaps = jax.vmap(lambda q: clearances(case.arm, case.scene, q))(angles)  # (S, R)
-        is_of_pole = np.arange(gaps.shape[1]) < num_of_pole(case.arm)
-        margins = np.where(is_of_pole, self.pole_margin, 1.3 * self.margin)
-        near, worst = lax.top_k(jnp.max(margins - gaps, axis=1), self.worst)
-        here = angles[worst]
-        moved = here[:, None] + _STEP * jnp.eye(6, dtype=dtype)
-        there = jax.vmap(jax.vmap(lambda q: clearances(case.arm, case.scene, q)))(moved)
-        slopes = (there - gaps[worst][:, None]) / _STEP  # (W, 6, R)
-        short = jnp.maximum(margins - gaps[worst], 0.0) * self.weights.clearance  # (W, R)
-        active = jnp.where(short > 0.0, 1.0, 0.0)
-        lifts = -self.weights.clearance * slopes * active[:, None]
-        lifts = jnp.concatenate([lifts, jnp.zeros_like(lifts[:, :1])], axis=1)  # by q and time
-        grams = jnp.einsum("wir,wjr->wij", lifts, lifts, precision=_HIGHEST)
-        pushes = jnp.einsum("wir,wr->wi", lifts, short, precision=_HIGHEST)
+        gaps = lax.optimization_barrier(clearances(case.arm, case.scene, angles))  # (R, S)
+        is_of_pole = np.arange(gaps.shape[0]) < num_of_pole(case.arm)
+        margins = np.where(is_of_pole, self.pole_margin, 1.3 * self.margin)[:, None]
+        near, worst = lax.top_k(jnp.max(margins - gaps, axis=0), self.worst)
+        slopes = clearance_slopes(case.arm, case.scene, angles[worst])  # (R, 6, W)
+        short = jnp.maximum(margins - gaps[:, worst], 0.0) * self.weights.clearance  # (R, W)
+        active = jnp.where(short > 0.0, -self.weights.clearance, 0.0)
+        # Held, since products would work them out anew for each of their terms.
+        lifts, short = lax.optimization_barrier((slopes * active[:, None], short))
+        grams = jnp.einsum("riw,rjw->wij", lifts, lifts, precision=_HIGHEST)
+        pushes = jnp.einsum("riw,rw->wi", lifts, short, precision=_HIGHEST)
+        # Distances do not depend on the time.
+        grams, pushes = jnp.pad(grams, ((0, 0), (0, 1), (0, 1))), jnp.pad(pushes, ((0, 0), (0, 1)))
         rows, row_slopes, contact_excess = self.contact_terms(case, flight, angles[-1], point[-1])
         gram = jnp.matmul(row_slopes.T, row_slopes, precision=_HIGHEST)
         push = jnp.matmul(row_slopes.T, rows, precision=_HIGHEST)
@@ -403,7 +451,7 @@ class OnlineBlock:
         joints = self.joint_terms(case, moves, first, duration)[3]
         shares = tuple(np.arange(1, self.checked + 1) / self.checked)
         angles = angles_at(case.angles, first, moves, shares)
-        gaps = jax.vmap(lambda q: jnp.min(clearances(case.arm, case.scene, q)))(angles)
+        gaps = clearances(case.arm, case.scene, angles)
         contact = self.contact_terms(case, flight, angles[-1], point[-1])[2]
         excess = _violation(joints, contact, self.margin - jnp.min(gaps))
         violation = jnp.where(point[-1] > case.delay, excess, jnp.inf)
