@@ -32,6 +32,7 @@ ALLOWED = {
     "protocol": {"plan_files"},
     "registry": set(),
     "ball": {"arithmetic", "lanes"},
+    "perception": {"ball"},
     "trajectory": {"arithmetic"},
     "robot": {"arithmetic", "protocol", "trajectory"},
     "plane": set(),
