@@ -43,7 +43,7 @@ ALLOWED = {
     "referee": set(),
     "task": {
         *("ball", "cost", "lanes", "optimise", "planning", "protocol", "referee", "registry"),
-        *("plane", "robot", "space", "trajectory"),
+        *("perception", "plane", "robot", "space", "trajectory"),
     },
     "sweep": {"ball", "lanes", "plane", "planning", "protocol", "registry", "robot", "task"},
     "compile_cache": set(),

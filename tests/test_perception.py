@@ -13,18 +13,19 @@ from planner_jax.ball.flight import BallState, drag_free_flight
 from planner_jax.perception.calibrate import calibrate, hand_eye, pose, rigid_motion
 from planner_jax.perception.camera import back_project, in_view, looking_at, project
 from planner_jax.perception.fit import Sight, across_std, believed_at, error_across, fit_flight
-from planner_jax.perception.segment import (
-    ball_look,
-    colour_mask,
-    hue_saturation_value,
-    sighting,
-)
-from planner_jax.perception.stereo import (
+from planner_jax.perception.noise import (
+    RoundNoise,
     depth_std,
     information,
     noisy_depth,
     sightings,
     stereo_noise,
+)
+from planner_jax.perception.segment import (
+    ball_look,
+    colour_mask,
+    hue_saturation_value,
+    sighting,
 )
 
 GRAVITY = 9.81
@@ -255,6 +256,13 @@ def test_the_information_of_a_sighting_is_the_inverse_of_its_covariance():
     expected = np.linalg.inv(np.asarray(information(CAMERA, noise, place), float))
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
     np.testing.assert_allclose(np.cov(many.T) / scale, expected / scale, atol=0.03)
+
+
+def test_round_noise_is_alike_in_every_direction():
+    noise, place = RoundNoise(std=jnp.asarray(0.02)), jnp.array([4.0, 1.0, 1.5])
+    many = jax.jit(sightings)(jax.random.key(0), CAMERA, noise, jnp.broadcast_to(place, (9000, 3)))
+    np.testing.assert_allclose(np.cov(many.T), 4e-4 * np.eye(3), atol=2e-5)
+    np.testing.assert_allclose(information(CAMERA, noise, place), 2500.0 * np.eye(3), rtol=1e-5)
 
 
 def test_what_is_lost_or_out_of_view_is_not_seen():

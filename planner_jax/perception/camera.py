@@ -62,6 +62,14 @@ def looking_at(
     return Camera(**arrays, size=size)
 
 
+def placed(camera: Camera, pose: np.ndarray) -> Camera:
+    """The same camera where a pose (4, 4) has it, such as one that calibration found."""
+    there: Any = np.asarray(pose, np.float32)
+    return Camera(
+        rotation=there[:3, :3], position=there[:3, 3], focal=camera.focal, size=camera.size
+    )
+
+
 def to_camera(camera: Camera, points: Array) -> Array:
     """Points (..., 3) [m] of the world along the camera's axes."""
     away = points - camera.position

@@ -18,6 +18,7 @@ WINDOW = 64  # [px], edge of the square around the mask's middle that is looked 
 # Of a sphere's visible half, seen from afar: mean height above the plane through its middle, in
 # radii.
 _MEAN_HEIGHT = 2.0 / 3.0
+_WHOLE = 0.7  # least share of the pixels that a ball at its depth has
 
 
 @struct.dataclass
@@ -71,7 +72,7 @@ class Sighting:
     place: Array  # (3,) [m], of the ball's middle, world frame
     pixel: Array  # (2,) [px], column and row
     depth: Array  # () [m], of the ball's middle, along the camera's axis
-    pixels: Array  # () int32, how many it was made of
+    pixels: Array  # () int32, how many its depth was made of
 
 
 def hue_saturation_value(rgb: Array) -> Array:
@@ -118,10 +119,12 @@ def sighting(
     """The ball in one frame.
 
     The middle of the mask is where half of its pixels are on either side, which stray pixels do not
-    move far; in a window of 64 pixels around it, those count that have confidence, and a depth no
-    more than three robust standard deviations (1.48 times the median deviation) and a radius off
-    the median. Depths are of the ball's surface, whose mean over the visible half is two thirds of
-    a radius before its middle.
+    move far. In a window of 64 pixels around it those tell the depth that have confidence, and a
+    depth no more than three robust standard deviations (1.48 times the median deviation) and a
+    radius off the median; the centroid is that of all the mask's pixels near them. Depths are of
+    the ball's surface, whose mean over the visible half is two thirds of a radius before its
+    middle. A ball of which less than 0.7 is to be seen, such as behind a pole, counts as not seen:
+    its middle would be off.
 
     Args:
         image: (rows, columns, 3) bytes, red, green and blue; at least 64 each way.
@@ -141,17 +144,23 @@ def sighting(
     spread = 1.4826 * _median(jnp.abs(depth - middle), usable)
     usable = usable & (jnp.abs(depth - middle) <= 3.0 * spread + look.radius)
     num = jnp.sum(usable)
-    total = jnp.maximum(num, 1)
 
-    def mean(values: Array) -> Array:
-        return jnp.sum(jnp.where(usable, values, 0.0)) / total
+    def mean(values: Array, of: Array) -> Array:
+        return jnp.sum(jnp.where(of, values, 0.0)) / jnp.maximum(jnp.sum(of), 1)
 
     row, column = jnp.meshgrid(jnp.arange(WINDOW), jnp.arange(WINDOW), indexing="ij")
-    pixel = jnp.stack([mean(column) + corner[1], mean(row) + corner[0]])
-    across = (pixel - camera.centre) / camera.focal
+    first = jnp.stack([mean(column, usable), mean(row, usable)])
+    across = (first + jnp.stack(corner[::-1]) - camera.centre) / camera.focal
     along = jnp.sqrt(1.0 + jnp.sum(across**2))
-    deep = mean(depth) + _MEAN_HEIGHT * look.radius / along
-    seen = num >= look.pixels
+    deep = mean(depth, usable) + _MEAN_HEIGHT * look.radius / along
+    # Holes in the depth leave an image of the ball that is not round: where it is in the image,
+    # all of its colour say that are as near as it is large. Off the axis it is seen drawn out.
+    round_px = camera.focal * look.radius / jnp.maximum(deep, look.radius)
+    within = 1.5 * along * round_px + 1.0
+    near = mask & ((column - first[0]) ** 2 + (row - first[1]) ** 2 <= within**2)
+    pixel = jnp.stack([mean(column, near), mean(row, near)]) + jnp.stack(corner[::-1])
+    whole = jnp.sum(near) >= _WHOLE * jnp.pi * round_px**2 * along
+    seen = (num >= look.pixels) & whole
     place = back_project(camera, pixel, deep)
     return Sighting(
         place=jnp.where(seen, place, jnp.nan),

@@ -1,8 +1,9 @@
-"""How well a stereo camera sees a ball: sharply across the ray, and worse along it with distance.
+"""How well a camera sees a ball, frame by frame.
 
 A stereo camera measures the disparity  d = f b / z  of two images a baseline b apart. An error of
 the disparity is one of the depth z of  z^2 / (f b)  times as much, so the noise of depth grows with
-the square of the distance, whereas that across grows with the distance itself.
+the square of the distance, whereas that across the ray grows with the distance itself. Round noise,
+as large in every direction and at every distance, stands beside it for comparisons.
 """
 
 from typing import Any
@@ -26,6 +27,16 @@ class StereoNoise:
     speckle_std: Array  # () [px], of the disparity of one pixel, beside that
     dropout: Array  # () probability that a pixel, or in `sightings` a frame, has no depth
     mismatch: Array  # () probability that a pixel has the depth of something else
+
+
+@struct.dataclass
+class RoundNoise:
+    """Errors that are alike in every direction; those of frames do not depend on each other."""
+
+    std: Array  # () [m], of each coordinate
+
+
+Noise = StereoNoise | RoundNoise
 
 
 def stereo_noise(
@@ -64,12 +75,16 @@ def depth_std(camera: Camera, noise: StereoNoise, depths: Array) -> Array:
     return depths**2 * noise.disparity_std / (camera.focal * noise.baseline)
 
 
-def information(camera: Camera, noise: StereoNoise, points: Array) -> Array:
+def information(camera: Camera, noise: Noise, points: Array) -> Array:
     """Inverses (..., 3, 3) [1/m^2] of the covariance with which balls at (..., 3) [m] are seen.
 
-    The error is that of the pixel along the image, and that of the depth along the ray. World
-    frame; to first order in the errors.
+    The error of a stereo camera is that of the pixel along the image, and that of the depth along
+    the ray. World frame; to first order in the errors. Places where balls were seen serve as well
+    as those where they were.
     """
+    if isinstance(noise, RoundNoise):
+        alike = jnp.eye(3, dtype=points.dtype) / noise.std**2
+        return jnp.broadcast_to(alike, (*points.shape[:-1], 3, 3))
     own = to_camera(camera, points)
     depth = jnp.maximum(own[..., 2], 1e-3)
     sharp = camera.focal / (depth * noise.pixel_std)
@@ -86,16 +101,19 @@ def information(camera: Camera, noise: StereoNoise, points: Array) -> Array:
     return jnp.einsum("...ki,...kj->...ij", white, white, precision=lax.Precision.HIGHEST)
 
 
-def sightings(key: Array, camera: Camera, noise: StereoNoise, points: Array) -> Array:
+def sightings(key: Array, camera: Camera, noise: Noise, points: Array) -> Array:
     """Where balls at (N, 3) [m] are seen, a frame each; NaN where they are not.
 
-    This is what `segment.sighting` makes of images, without the images: pixels and disparities
-    have Gaussian errors, frames are lost, and a ball outside the image is not seen. Nothing stands
-    in the way of balls here.
+    This is what `segment.sighting` makes of images, without the images. A ball outside the image is
+    not seen, but nothing stands in its way either. A stereo camera's pixels and disparities have
+    Gaussian errors, and frames are lost.
 
     Returns:
         (N, 3) [m], world frame.
     """
+    if isinstance(noise, RoundNoise):
+        seen = points + noise.std * jax.random.normal(key, points.shape, points.dtype)
+        return jnp.where(in_view(camera, points)[:, None], seen, jnp.nan)
     to_pixel, to_disparity, to_loss = jax.random.split(key, 3)
     pixels, depths = project(camera, points)
     dtype = points.dtype
