@@ -12,7 +12,9 @@ from planner_jax.ball.flight import drag_free_flight
 from planner_jax.perception.camera import in_view, looking_at
 from planner_jax.perception.fit import Sight, believed_at, error_across
 from planner_jax.task.block.end_poses import flight_of
-from planner_jax.task.block.eye import eye, frame_times, mast_camera, see
+from planner_jax.task.block.eye import cautious, eye, frame_times, mast_camera, see
+from planner_jax.task.block.met import as_met
+from tests.test_block import SMALL
 
 
 @pytest.mark.parametrize("suite", ["pole", "short"])
@@ -54,14 +56,54 @@ def test_planners_get_the_fitted_ball_from_when_the_fit_is_there():
 
 def test_a_camera_that_never_sees_the_ball_is_a_status_all_the_way():
     """Of the fit, then of the plan; and the referee refuses."""
-    cases = pj.block.draw(3, seed=5)
+    cases = pj.block.draw(6, seed=5, regime="R1", wide=True)
     away = looking_at((0.0, 0.0, 1.0), (-5.0, 0.0, 1.0), size=(64, 64), field_of_view=1.0)
     seen = see(cases, eye(camera=away), 0.25)
     assert (seen.fits.status == Sight.NEVER_SEEN).all() and np.isnan(seen.cases.ball.pos).all()
-    plans = pj.plan(pj.block.planner("online"), jax.tree.map(np.asarray, seen.cases))
+    plans = pj.plan(SMALL, jax.tree.map(np.asarray, cautious(seen.cases)))
     assert not np.isin(plans.status, [0, 1]).any()
     truth = dataclasses.replace(cases, delay=seen.cases.delay)
-    assert not pj.block.judge(truth, plans).success.any()
+    assert not pj.block.judge(truth, as_met(truth, plans)).success.any()
+
+
+@pytest.mark.parametrize("regime", ["R1", "R2"])
+def test_the_referee_agrees_on_plans_for_the_true_ball(regime):
+    cases = jax.tree.map(np.asarray, pj.block.draw(6, seed=8, regime=regime, wide=True))
+    plans = pj.plan(SMALL, cases)
+    solved = pj.solved(plans)
+    met = as_met(cases, plans)
+    assert solved.sum() >= 3
+    np.testing.assert_allclose(met.contact_time[solved], plans.contact_time[solved], atol=2e-4)
+    if regime == "R1":
+        np.testing.assert_array_equal(pj.block.judge(cases, met).success[solved], True)
+
+
+def test_a_ball_that_comes_later_meets_a_braking_arm_that_was_there_in_time():
+    """By 10 ms, which moves the contact by about as much: the shield is met where it then is."""
+    cases = jax.tree.map(np.asarray, pj.block.draw(6, seed=8, regime="R1", wide=True))
+    near_middle = cautious(cases, offset=0.01)
+    plans = pj.plan(SMALL, jax.tree.map(np.asarray, near_middle))
+    solved = pj.solved(plans)
+    assert solved.sum() >= 3
+    back = jax.vmap(drag_free_flight)(cases.ball, np.full(6, -0.01, np.float32), cases.gravity)
+    late = dataclasses.replace(cases, ball=back)
+    met = as_met(late, plans)
+    moved = met.contact_time - plans.contact_time
+    np.testing.assert_allclose(moved[solved], 0.01, atol=5e-3)
+    verdict = pj.block.judge(late, met)
+    assert verdict.success[solved].any()
+    np.testing.assert_allclose(verdict.height[solved], 0.0, atol=1e-3)
+
+
+def test_planners_are_to_be_cautious_with_balls_that_seem_to_pass_by():
+    cases = pj.block.draw(4, seed=1, wide=True)
+    ball = dataclasses.replace(cases.ball, vel=cases.ball.vel.at[1, 2].add(9.0))
+    cases = dataclasses.replace(cases, ball=ball)
+    given = cautious(cases, offset=0.03, grow=0.2)
+    np.testing.assert_allclose(given.offset, 0.03)
+    larger = given.scene.inner.upper - cases.scene.inner.upper
+    np.testing.assert_allclose(larger[:, 0], [0.0, 0.2, 0.0, 0.0], atol=1e-6)
+    np.testing.assert_array_equal(given.scene.inner.lower[:, 2], cases.scene.inner.lower[:, 2])
 
 
 def test_frames_count_from_the_first_to_the_moment_itself():

@@ -19,6 +19,7 @@ from planner_jax.perception.camera import Camera, looking_at
 from planner_jax.perception.fit import FlightFit, believed_at, fit_flight
 from planner_jax.perception.noise import Noise, RoundNoise, information, sightings, stereo_noise
 from planner_jax.task.block.case import BlockCase
+from planner_jax.task.block.end_poses import flight_of
 from planner_jax.task.block.scene import RIG_HALF
 
 
@@ -115,9 +116,9 @@ def see(
 ) -> SeenThrows:
     """A batch of throws after some seconds of flight were seen.
 
-    Plan with the cases that come back, and judge with those that were given: `dataclasses.replace`
-    of the given ones' `delay` by the others' makes both start alike. A ball that was not seen at
-    two times is NaN, and `fits.status` says why.
+    Plan with the cases that come back, made `cautious`. To judge, give the true cases the delay of
+    these, and the plans to `planner_jax.task.block.met.as_met` with them. A ball that was not seen
+    at two times is NaN, and `fits.status` says why.
 
     Args:
         cases: a batch of B, with the true balls.
@@ -136,6 +137,31 @@ def see(
     balls, fits = _seen(cases, eye, times, jax.random.key(seed))
     delay = jnp.full_like(cases.delay, seconds + overhead)
     return SeenThrows(cases=dataclasses.replace(cases, ball=balls, delay=delay), fits=fits)
+
+
+def cautious(cases: BlockCase, *, offset: float = 0.02, grow: float = 0.1) -> BlockCase:
+    """A batch of seen cases as a planner should get it, which takes the ball at its word.
+
+    The ball is to be met near the shield's middle, so that the rest of the shield is left for the
+    error of the fit. One that is believed to pass the protected box by may well come into it: for
+    it, the box that a planner sees is larger.
+
+    Args:
+        cases: a batch with fitted balls.
+        offset: [m], greatest distance of the ball from the shield's middle, where the case allows
+            more.
+        grow: [m], by how much that box is larger on its sides and at its top.
+    """
+    inner = cases.scene.inner
+    passes = ~jax.jit(jax.vmap(flight_of))(cases).comes
+    more = jnp.where(passes, grow, 0.0)[:, None]
+    lower, upper = inner.lower - more * np.array([1.0, 1.0, 0.0]), inner.upper + more
+    grown = dataclasses.replace(inner, lower=lower, upper=upper)
+    return dataclasses.replace(
+        cases,
+        offset=jnp.minimum(cases.offset, offset),
+        scene=dataclasses.replace(cases.scene, inner=grown),
+    )
 
 
 @jax.jit
