@@ -32,6 +32,7 @@ ALLOWED = {
     "protocol": {"plan_files"},
     "registry": set(),
     "ball": {"arithmetic", "lanes"},
+    "perception": {"ball"},
     "trajectory": {"arithmetic"},
     "robot": {"arithmetic", "protocol", "trajectory"},
     "plane": set(),
@@ -42,7 +43,7 @@ ALLOWED = {
     "referee": set(),
     "task": {
         *("ball", "cost", "lanes", "optimise", "planning", "protocol", "referee", "registry"),
-        *("plane", "robot", "space", "trajectory"),
+        *("perception", "plane", "robot", "space", "trajectory"),
     },
     "sweep": {"ball", "lanes", "plane", "planning", "protocol", "registry", "robot", "task"},
     "compile_cache": set(),

@@ -49,19 +49,20 @@ def _congruence(A: Array, P: Array) -> Array:
     return 0.5 * (full + full.T)
 
 
-def _solve_definite(A: Array, B: Array) -> Array:
-    """The X (3, n) of  A X = B  for a symmetric positive definite A (3, 3).
+def solve_definite(A: Array, B: Array) -> Array:
+    """The X (m, n) of  A X = B  for a symmetric positive definite A (m, m), m small.
 
     Elimination without exchanges, written out: plain arithmetic on every device, at full
     precision, without a library call a lane.
     """
     U, X = list(A), list(B)
-    for i in range(3):
-        for j in range(i + 1, 3):
+    size = len(U)
+    for i in range(size):
+        for j in range(i + 1, size):
             factor = U[j][i] / U[i][i]
             U[j], X[j] = U[j] - factor * U[i], X[j] - factor * X[i]
-    for i in (2, 1, 0):
-        X[i] = (X[i] - sum(U[i][k] * X[k] for k in range(i + 1, 3))) / U[i][i]
+    for i in reversed(range(size)):
+        X[i] = (X[i] - sum(U[i][k] * X[k] for k in range(i + 1, size))) / U[i][i]
     return jnp.stack(X)
 
 
@@ -121,7 +122,7 @@ def ekf_update(state: EkfState, observation: Array, model: EkfModel) -> EkfState
     R = jnp.diag(jnp.ones(3, dtype) * model.observation_std**2)
     P = state.covariance
     residual = jnp.where(observed, observation, state.mean[:3]) - state.mean[:3]
-    K = _solve_definite(P[:3, :3] + R, P[:3]).T
+    K = solve_definite(P[:3, :3] + R, P[:3]).T
     kept = jnp.eye(6, dtype=dtype) - jnp.pad(K, ((0, 0), (0, 3)))  # I - K H
     return EkfState(
         mean=state.mean + jnp.matmul(K, residual, precision=lax.Precision.HIGHEST),

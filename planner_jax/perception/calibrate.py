@@ -1,0 +1,135 @@
+"""Where a camera stands beside a robot: hand-eye calibration, on the host, in float64.
+
+The robot holds a board of known points before the camera, which does not move. With A_k the pose of
+the flange in the robot's base frame, Z that of the board on the flange, X that of the camera in the
+base frame and B_k that of the board as the camera sees it,  A_k Z = X B_k.  Z falls out between two
+views:  (A_j A_k^-1) X = X (B_j B_k^-1),  the equation A X = X B of the literature. It is solved in
+closed form and then refined on the seen points themselves. Poses are (4, 4) matrices, lengths [m].
+"""
+
+import dataclasses
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+_LEAST_TURN = 0.05  # [rad], of a motion between two views that counts
+
+
+@dataclasses.dataclass(frozen=True)
+class Calibration:
+    """Where the camera and the board are, and how well the views agree."""
+
+    camera: np.ndarray  # (4, 4), pose of the camera in the robot's base frame
+    board: np.ndarray  # (4, 4), pose of the board on the flange
+    residual: float  # root mean square of the misfit, in standard deviations
+
+
+def pose(rotation: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Poses (..., 4, 4) of rotations (..., 3, 3) and places (..., 3) [m]."""
+    found = np.zeros((*np.shape(rotation)[:-2], 4, 4))
+    found[..., :3, :3], found[..., :3, 3], found[..., 3, 3] = rotation, place, 1.0
+    return found
+
+
+def rigid_motion(points: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """The pose (4, 4) that takes points (M, 3) [m] nearest to others (M, 3) [m].
+
+    In closed form by a singular value decomposition (W. Kabsch, 1976), never a mirror image.
+
+    Raises:
+        ValueError: fewer than three points, or all on one line; one line.
+    """
+    points, seen = np.asarray(points, float), np.asarray(seen, float)
+    if points.shape != seen.shape or points.ndim != 2 or points.shape[1] != 3 or len(points) < 3:
+        raise ValueError(
+            f"points must be (M, 3) with M >= 3, and as many seen, got {points.shape} and "
+            f"{seen.shape}"
+        )
+    middles = points.mean(axis=0), seen.mean(axis=0)
+    U, singular, V = np.linalg.svd((seen - middles[1]).T @ (points - middles[0]))
+    if not singular[1] > 1e-9 * max(singular[0], 1e-300):
+        raise ValueError("points must not lie on one line")
+    proper = np.diag([1.0, 1.0, np.linalg.det(U @ V)])
+    rotation = U @ proper @ V
+    return pose(rotation, middles[1] - rotation @ middles[0])
+
+
+def hand_eye(flange: np.ndarray, views: np.ndarray) -> np.ndarray:
+    """The pose X (4, 4) of the camera that solves A X = X B over every pair of views.
+
+    The rotation is that which best takes the rotation vectors of the camera's motions to those of
+    the robot's, by a singular value decomposition as in F. C. Park and B. J. Martin, Robot sensor
+    calibration (1994); the place then follows from linear least squares.
+
+    Args:
+        flange: (K, 4, 4) A_k, poses of the flange in the base frame, K >= 3.
+        views: (K, 4, 4) B_k, poses of the board as the camera sees it.
+
+    Raises:
+        ValueError: too few views, or they turn about one axis only, which leaves the camera's
+            place along it open; one line.
+    """
+    flange, views = np.asarray(flange, float), np.asarray(views, float)
+    if flange.shape != views.shape or flange.shape[1:] != (4, 4):
+        raise ValueError(
+            f"flange and views must be (K, 4, 4) each, got {flange.shape} and {views.shape}"
+        )
+    first, second = np.triu_indices(len(flange), 1)
+    A = flange[second] @ np.linalg.inv(flange[first])
+    B = views[second] @ np.linalg.inv(views[first])
+    turns = [Rotation.from_matrix(each[:, :3, :3]).as_rotvec() for each in (A, B)]
+    counts = np.minimum(*(np.linalg.norm(each, axis=1) for each in turns)) > _LEAST_TURN
+    A, B, (a, b) = A[counts], B[counts], (each[counts] for each in turns)
+    U, singular, V = np.linalg.svd(a.T @ b)
+    if len(a) < 2 or not singular[1] > 1e-3 * singular[0]:
+        raise ValueError(
+            f"views must be three or more that turn about different axes, got {len(flange)}"
+        )
+    rotation = U @ np.diag([1.0, 1.0, np.linalg.det(U @ V)]) @ V
+    system = (A[:, :3, :3] - np.eye(3)).reshape(-1, 3)
+    right = (np.einsum("ij,kj->ki", rotation, B[:, :3, 3]) - A[:, :3, 3]).reshape(-1)
+    return pose(rotation, np.linalg.lstsq(system, right, rcond=None)[0])
+
+
+def calibrate(
+    flange: np.ndarray, points: np.ndarray, seen: np.ndarray, std: np.ndarray | float = 1.0
+) -> Calibration:
+    """Where the camera is, from a board that the robot shows to it.
+
+    Every view gives the board's pose by `rigid_motion`, all of them the camera's by `hand_eye`.
+    Both poses are then moved together until the points that were seen are nearest to where they
+    should have been, each error in its own standard deviation (Levenberg-Marquardt).
+
+    Args:
+        flange: (K, 4, 4), poses of the flange in the base frame, K >= 3.
+        points: (M, 3) [m], of the board in its own frame, M >= 3.
+        seen: (K, M, 3) [m], the same as the camera sees them, along its own axes.
+        std: [m], of what is seen: a number, or (K, M, 3) along the camera's axes.
+
+    Raises:
+        ValueError: what `rigid_motion` and `hand_eye` say.
+    """
+    flange, points, seen = (np.asarray(each, float) for each in (flange, points, seen))
+    views = np.stack([rigid_motion(points, each) for each in seen])
+    camera = hand_eye(flange, views)
+    # One board for all views: the mean of where each of them has it.
+    boards = np.linalg.inv(flange) @ camera @ views
+    turn = Rotation.from_matrix(boards[:, :3, :3]).mean().as_matrix()
+    board = pose(turn, boards[:, :3, 3].mean(axis=0))
+
+    def moved(change: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        turns = Rotation.from_rotvec(change[:6].reshape(2, 3)).as_matrix()
+        there = pose(turns, change[6:].reshape(2, 3))
+        return camera @ there[0], board @ there[1]
+
+    def errors(change: np.ndarray) -> np.ndarray:
+        at, held = moved(change)
+        to_camera = np.linalg.inv(at) @ flange @ held
+        expected = points @ np.swapaxes(to_camera[:, :3, :3], 1, 2) + to_camera[:, None, :3, 3]
+        return ((expected - seen) / std).reshape(-1)
+
+    refined = least_squares(errors, np.zeros(12), method="lm", x_scale="jac")
+    camera, board = moved(refined.x)
+    free = max(seen.size - 12, 1)
+    return Calibration(camera, board, float(np.sqrt(2.0 * refined.cost / free)))

@@ -1,0 +1,110 @@
+"""A pinhole camera: from points of the world to pixels with depths, and back.
+
+A pixel is (column, row), and whole numbers are the middles of pixels. The camera's own axes are x
+to the right and y down in the image, and z ahead. Depth is measured along z, as depth images have
+it, not along the ray. Points and pixels may have any leading axes.
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array, lax
+
+
+@struct.dataclass
+class Camera:
+    """Where a camera is, where it looks and how large its image is."""
+
+    rotation: Array  # (3, 3), its columns are the camera's axes in the world frame
+    position: Array  # (3,) [m], world frame
+    focal: Array  # () [px]
+    size: tuple[int, int] = struct.field(pytree_node=False)  # columns and rows of the image
+
+    @property
+    def centre(self) -> Array:
+        """Where the optical axis meets the image (2,) [px]."""
+        return jnp.asarray(0.5 * (np.array(self.size) - 1.0), jnp.result_type(self.focal))
+
+
+def looking_at(
+    position: Any, target: Any, *, size: tuple[int, int], field_of_view: float
+) -> Camera:
+    """A camera that looks at a target, its image level; NumPy float32 leaves.
+
+    Args:
+        position: (3,) [m].
+        target: (3,) [m], neither above nor below.
+        size: columns and rows of the image.
+        field_of_view: [rad], of the image's width, between 0 and pi.
+
+    Raises:
+        ValueError: an argument is out of its range; one line.
+    """
+    position, target = np.asarray(position, float), np.asarray(target, float)
+    ahead = target - position
+    if not np.hypot(*ahead[:2]) > 1e-6:
+        raise ValueError("target must be beside the camera, not above, below or within it")
+    if not 0.0 < field_of_view < np.pi:
+        raise ValueError(f"field_of_view must be between 0 and pi, got {field_of_view:g}")
+    if not min(size) >= 1:
+        raise ValueError(f"size must be >= 1 each way, got {size}")
+    z = ahead / np.linalg.norm(ahead)
+    x = np.cross(z, [0.0, 0.0, 1.0])
+    x /= np.linalg.norm(x)
+    leaves = {
+        "rotation": np.stack([x, np.cross(z, x), z], axis=1),
+        "position": position,
+        "focal": 0.5 * size[0] / np.tan(0.5 * field_of_view),
+    }
+    arrays: Any = {name: np.asarray(leaf, np.float32) for name, leaf in leaves.items()}
+    return Camera(**arrays, size=size)
+
+
+def placed(camera: Camera, pose: np.ndarray) -> Camera:
+    """The same camera where a pose (4, 4) has it, such as one that calibration found."""
+    there: Any = np.asarray(pose, np.float32)
+    return Camera(
+        rotation=there[:3, :3], position=there[:3, 3], focal=camera.focal, size=camera.size
+    )
+
+
+def to_camera(camera: Camera, points: Array) -> Array:
+    """Points (..., 3) [m] of the world along the camera's axes."""
+    away = points - camera.position
+    return jnp.matmul(away, jnp.asarray(camera.rotation), precision=lax.Precision.HIGHEST)
+
+
+def to_world(camera: Camera, points: Array) -> Array:
+    """Points (..., 3) [m] along the camera's axes in the world frame."""
+    rotation = jnp.asarray(camera.rotation)
+    return camera.position + jnp.matmul(points, rotation.T, precision=lax.Precision.HIGHEST)
+
+
+def project(camera: Camera, points: Array) -> tuple[Array, Array]:
+    """Where points (..., 3) [m] of the world are seen.
+
+    Returns:
+        pixels: (..., 2) [px], within the image or not; of a point that is not ahead of the camera,
+            any finite numbers.
+        depths: (...) [m], negative behind the camera.
+    """
+    own = to_camera(camera, points)
+    depths = own[..., 2]
+    safe = jnp.where(depths > 1e-6, depths, 1.0)
+    return camera.centre + camera.focal * own[..., :2] / safe[..., None], depths
+
+
+def back_project(camera: Camera, pixels: Array, depths: Array) -> Array:
+    """The points (..., 3) [m] of the world that are seen at pixels (..., 2) in depths (...) [m]."""
+    across = (pixels - camera.centre) / camera.focal
+    ray = jnp.concatenate([across, jnp.ones_like(across[..., :1])], axis=-1)
+    return to_world(camera, ray * depths[..., None])
+
+
+def in_view(camera: Camera, points: Array) -> Array:
+    """Which points (..., 3) [m] of the world lie ahead of the camera and within its image."""
+    pixels, depths = project(camera, points)
+    inside = (pixels > -0.5) & (pixels < np.array(camera.size) - 0.5)
+    return (depths > 1e-6) & jnp.all(inside, axis=-1)

@@ -1,0 +1,94 @@
+"""Where plans meet a ball that is not quite the one that they were made for.
+
+A plan names the time at which its ball is met. The true ball comes to the shield a little earlier
+or later, and a little beside. `as_met` names that time instead, so that the referee judges what
+then happens. Robot base frame, z up, SI units.
+"""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from planner_jax.ball.flight import drag_free_flight
+from planner_jax.robot.arm import shield_pose
+from planner_jax.task.block.case import BlockCase
+from planner_jax.task.block.end_poses import flight_of
+from planner_jax.task.block.plan import BlockPlan
+from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
+
+_SAMPLES = 256  # times at which ball and shield are looked at
+_HALVINGS = 24  # of the time between two of them
+
+
+def as_met(cases: BlockCase, plans: BlockPlan) -> BlockPlan:
+    """The same motions up to where they meet the balls of these cases.
+
+    An arm that is not to stand when it meets the ball brakes evenly after its motion, as fast as
+    its limits allow, and is met on the way, or standing. Where the shield's plane is crossed
+    several times, the time counts at which the ball is nearest to the shield's middle. A ball that
+    never crosses it leaves the plan as it is, for the referee to refuse.
+
+    Args:
+        cases: a batch of B, with the true balls, and the delays that were planned with.
+        plans: of them, for other balls; polynomials of degree 2 or more.
+
+    Returns:
+        Plans with one piece more, of no length if the arm is met before.
+    """
+    return _as_met(cases, plans)
+
+
+@jax.jit
+@jax.vmap
+def _as_met(case: BlockCase, plan: BlockPlan) -> BlockPlan:
+    motion = _braked(case, plan.motion)
+
+    def above(time: Array) -> tuple[Array, Array]:
+        """Height () [m] of the ball over the shield's plane, and how far it is from the middle."""
+        ends = jnp.sum(motion.durations)
+        angles = evaluate(motion, jnp.clip(time - case.delay, 0.0, ends))
+        rotation, middle = shield_pose(case.arm, angles)
+        away = drag_free_flight(case.ball, time, case.gravity).pos - middle
+        return jnp.sum(rotation[:, 0] * away), jnp.sum(away**2)
+
+    latest = jnp.maximum(flight_of(case).latest, case.delay)
+    times = case.delay + (latest - case.delay) * jnp.linspace(0.0, 1.0, _SAMPLES)
+    height, away = jax.vmap(above)(times)
+    crosses = (height[:-1] > 0.0) & (height[1:] <= 0.0)
+    nearest = jnp.argmin(jnp.where(crosses, away[1:], jnp.inf))
+
+    def halve(_: Any, between: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = between
+        middle = 0.5 * (low + high)
+        before = above(middle)[0] > 0.0
+        return jnp.where(before, middle, low), jnp.where(before, high, middle)
+
+    low, high = lax.fori_loop(0, _HALVINGS, halve, (times[nearest], times[nearest + 1]))
+    time = jnp.where(jnp.any(crosses), 0.5 * (low + high), plan.contact_time)
+    starts = case.delay + jnp.cumsum(motion.durations) - motion.durations
+    until = jnp.clip(time - starts, 0.0, motion.durations)
+    # Pieces that are not begun, of no length, go on from where the motion ends.
+    after = jnp.minimum(time - case.delay, jnp.sum(motion.durations))
+    end = jnp.stack([evaluate(motion, after), evaluate(motion, after, 1)])
+    rest = jnp.zeros_like(motion.coeffs[0]).at[:2].set(end)
+    coeffs = jnp.where((starts >= time)[:, None, None], rest, motion.coeffs)
+    return dataclasses.replace(
+        plan, motion=PiecewisePolynomial(coeffs=coeffs, durations=until), contact_time=time
+    )
+
+
+def _braked(case: BlockCase, motion: PiecewisePolynomial) -> PiecewisePolynomial:
+    """A motion, and after it all joints slowing down evenly until they stand at the same time."""
+    end = jnp.sum(motion.durations)
+    angles, rates = evaluate(motion, end), evaluate(motion, end, 1)
+    duration = jnp.max(jnp.abs(rates) / case.limits.acceleration)
+    duration = jnp.where(case.ends_at_rest, 0.0, duration)
+    slowing = -0.5 * rates / jnp.where(duration > 0.0, duration, 1.0)
+    piece = jnp.zeros_like(motion.coeffs[:1]).at[0, :3].set(jnp.stack([angles, rates, slowing]))
+    return PiecewisePolynomial(
+        coeffs=jnp.concatenate([motion.coeffs, piece]),
+        durations=jnp.append(motion.durations, duration),
+    )

@@ -1,0 +1,80 @@
+"""A board that the arm shows to a camera, from which it is calibrated, without images.
+
+The board is as large as the shield and lies on its face. Its corners are seen with the noise of a
+stereo camera, each for itself. Whether the arm can get to where it shows the board is not asked.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from planner_jax.perception.calibrate import Calibration, calibrate, pose
+from planner_jax.perception.camera import Camera, in_view, placed, to_camera
+from planner_jax.perception.noise import StereoNoise, depth_std
+from planner_jax.robot.arm import Arm, link_frames
+
+_CORNERS = 6  # each way
+_FACING = 0.5  # least cosine between the board's normal and the way to the camera
+
+
+class BoardViews(NamedTuple):
+    """What `calibrate` takes, of K views."""
+
+    flange: np.ndarray  # (K, 4, 4), poses of the flange in the base frame
+    points: np.ndarray  # (M, 3) [m], corners in the flange's frame
+    seen: np.ndarray  # (K, M, 3) [m], along the camera's axes
+    std: np.ndarray  # (K, M, 3) [m], of that
+
+
+def show_board(
+    arm: Arm, camera: Camera, noise: StereoNoise, num: int, *, seed: int = 0, draws: int = 20000
+) -> BoardViews:
+    """Views of the board from `num` poses of the arm, drawn from all that its joints allow.
+
+    Args:
+        arm: NumPy leaves.
+        camera: where it really stands.
+        noise: of what it sees.
+        num: how many views, >= 1.
+        seed: of poses and noise.
+        draws: poses of the arm that are looked at.
+
+    Raises:
+        ValueError: the camera does not see the board in as many of them; one line.
+    """
+    rng = np.random.default_rng(seed)
+    angles = rng.uniform(arm.lower, arm.upper, (draws, 6)).astype(np.float32)
+    rotations, places = jax.jit(jax.vmap(link_frames, (None, 0)))(arm, angles)
+    flange = pose(np.asarray(rotations[:, 5], float), np.asarray(places[:, 5], float))
+    half = float(arm.shield_half)
+    grid = np.stack(np.meshgrid(*[np.linspace(-half, half, _CORNERS)] * 2), axis=-1)
+    points = np.asarray(arm.shield_centre) + np.pad(grid.reshape(-1, 2), ((0, 0), (1, 0)))
+    shown = points @ np.swapaxes(flange[:, :3, :3], 1, 2) + flange[:, None, :3, 3]
+    away = np.asarray(camera.position) - shown.mean(axis=1)
+    facing = np.sum(flange[:, :3, 0] * away, axis=1) / np.linalg.norm(away, axis=1)
+    all_seen = np.asarray(in_view(camera, jnp.asarray(shown, jnp.float32))).all(axis=1)
+    chosen = np.flatnonzero(all_seen & (facing > _FACING))[:num]
+    if len(chosen) < num:
+        raise ValueError(f"the camera sees the board in {len(chosen)} of {draws} poses, not {num}")
+    own = np.asarray(to_camera(camera, jnp.asarray(shown[chosen], jnp.float32)), float)
+    depth = own[..., 2]
+    across = depth * float(noise.pixel_std) / float(camera.focal)
+    along = np.asarray(depth_std(camera, noise, jnp.asarray(depth, jnp.float32)))
+    # The error of the depth lies along the ray, whose other components are small beside it.
+    ray = own / depth[..., None]
+    none = np.zeros_like(depth)
+    errors = rng.normal(size=own.shape)
+    off = errors * np.stack([across, across, none], axis=-1)
+    seen = own + off + (errors[..., 2] * along)[..., None] * ray
+    std = np.sqrt(np.stack([across, across, none], axis=-1) ** 2 + (along[..., None] * ray) ** 2)
+    return BoardViews(flange[chosen], points, seen, std)
+
+
+def calibrated(
+    arm: Arm, camera: Camera, noise: StereoNoise, num: int = 20, *, seed: int = 0
+) -> tuple[Camera, Calibration]:
+    """The camera where `num` views of the board say that it stands, and the calibration itself."""
+    found = calibrate(*show_board(arm, camera, noise, num, seed=seed))
+    return placed(camera, found.camera), found

@@ -1,0 +1,240 @@
+# MuJoCo's names come from a compiled module.
+# pyright: reportAttributeAccessIssue=false
+"""What a camera sees of the arm's scene: colour and depth images, rendered off-screen by MuJoCo.
+
+Robot base frame, z up, SI units. The scene has the arm, the pole, the rig's beams, a floor, walls
+and a ball. The boxes that are protected and met in are nothing to be seen. Light is even, shutters
+take no time: there is no blur.
+
+An OpenGL without a display is needed, by default that of EGL; `MUJOCO_GL` may name another one, as
+MuJoCo has it.
+"""
+
+import importlib.resources
+import os
+import xml.etree.ElementTree as ET
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax import Array
+
+from planner_jax.perception.camera import Camera
+from planner_jax.perception.noise import StereoNoise, noisy_depth
+from planner_jax.perception.segment import BallLook, Sighting, sighting
+from planner_jax.sims.scenery import GROUND_COLOUR, xml_colour, xml_numbers
+from planner_jax.task.block.scene import Scene
+
+_ARM = importlib.resources.files("planner_jax.robot") / "models" / "irb1600.xml"
+_POLE_TOP = 2.52  # [m]: 3 m from the floor, as in the authors' model
+_WALLS, _HIGH = 13.0, 6.0  # [m], from the arm to the walls, and their height
+_NEAR, _FAR = 0.1, 40.0  # [m], what is rendered
+_BALL, _POLE, _STEEL, _ARM_COLOUR, _WALL = "#FF7A0A", "#E59BC0", "#A7AFB5", "#D9D9D4", "#9AA7B4"
+
+
+class RenderError(RuntimeError):
+    """Images that cannot be rendered here, in one line."""
+
+
+class SceneCamera:
+    """A camera that takes images of the arm's scene. Close it, or use it in a `with`."""
+
+    def __init__(
+        self, camera: Camera, scene: Scene, *, ball_radius: float = 0.05, arm_xml: str | None = None
+    ):
+        """Set up scene and OpenGL.
+
+        Args:
+            camera: NumPy leaves.
+            scene: of one case.
+            ball_radius: [m].
+            arm_xml: MJCF text of the arm; that of the paper if not given.
+
+        Raises:
+            RenderError: there is no OpenGL here; one line.
+        """
+        text = _ARM.read_text("utf-8") if arm_xml is None else arm_xml
+        self.camera = camera
+        self._model = _scene_model(text, camera, scene, ball_radius)
+        self._data = mujoco.MjData(self._model)
+        self._data.qpos[:6] = self._model.key("home").qpos
+        width, height = camera.size
+        try:
+            self._context: Any = _context_class()(width, height)
+            self._context.make_current()
+            self._to: Any = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        # The bindings of OpenGL raise whatever the library that is missing leads to.
+        except Exception as error:
+            reason = str(error).partition("\n")[0] or type(error).__name__
+            raise RenderError(
+                f"images need an OpenGL without a display, EGL or what MUJOCO_GL names: {reason}"
+            ) from None
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._to)
+        self._to.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
+        self._view = mujoco.MjvCamera()
+        self._view.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self._view.fixedcamid = self._model.camera("eye").id
+        self._shown = mujoco.MjvScene(self._model, maxgeom=200)
+        for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+            self._shown.flags[flag] = False
+
+    def __enter__(self) -> "SceneCamera":
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Give OpenGL's context back."""
+        self._to.free()
+        self._context.free()
+
+    def take(
+        self, ball: np.ndarray | None, angles: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """One frame, without noise.
+
+        Args:
+            ball: (3,) [m], its middle; None for a scene without a ball.
+            angles: (6,) [rad], of the arm's joints; those of the frame before if not given, home
+                at first.
+
+        Returns:
+            image: (rows, columns, 3) bytes, red, green and blue.
+            depth: (rows, columns) [m] along the camera's axis.
+        """
+        if angles is not None:
+            self._data.qpos[:6] = angles
+        away = np.array([0.0, 0.0, -100.0])
+        self._data.mocap_pos[0] = away if ball is None else ball
+        mujoco.mj_kinematics(self._model, self._data)
+        mujoco.mj_camlight(self._model, self._data)
+        every = mujoco.mjtCatBit.mjCAT_ALL
+        option = mujoco.MjvOption()
+        mujoco.mjv_updateScene(
+            self._model, self._data, option, None, self._view, every, self._shown
+        )
+        width, height = self.camera.size
+        image = np.empty((height, width, 3), np.uint8)
+        far_to_near = np.empty((height, width), np.float32)
+        whole = mujoco.MjrRect(0, 0, width, height)
+        self._context.make_current()
+        mujoco.mjr_render(whole, self._shown, self._to)
+        mujoco.mjr_readPixels(image, far_to_near, whole, self._to)
+        # The buffer is linear in one over the depth, 0 at the far plane and 1 at the near one.
+        extent = self._model.stat.extent
+        near, far = self._model.vis.map.znear * extent, self._model.vis.map.zfar * extent
+        closeness = 1.0 / far + far_to_near[::-1].astype(float) * (1.0 / near - 1.0 / far)
+        return image[::-1], (1.0 / closeness).astype(np.float32)
+
+
+@jax.jit
+def look(
+    key: Array, image: Array, depth: Array, camera: Camera, noise: StereoNoise, ball: BallLook
+) -> Sighting:
+    """The ball in one frame of a stereo camera, from an image and its true depth.
+
+    Args:
+        key: of the noise.
+        image: (rows, columns, 3) bytes.
+        depth: (rows, columns) [m], without noise.
+        camera: as calibrated: where it is believed to stand.
+        noise: of depths.
+        ball: what it looks like.
+    """
+    seen, confidence = noisy_depth(key, camera, noise, depth)
+    return sighting(image, seen, confidence, camera, ball)
+
+
+def sightings_of(
+    eye: SceneCamera,
+    places: np.ndarray,
+    noise: StereoNoise,
+    ball: BallLook,
+    *,
+    seed: int = 0,
+    believed: Camera | None = None,
+) -> np.ndarray:
+    """Where a ball at places (N, 3) [m] is seen in N rendered frames, (N, 3) [m] or NaN.
+
+    Args:
+        eye: that takes the frames; the arm stands still.
+        places: (N, 3) [m], of the ball's middle.
+        noise: of depths.
+        ball: what it looks like.
+        seed: of the noise.
+        believed: where the camera is thought to stand, by calibration; where it is if not given.
+    """
+    camera = eye.camera if believed is None else believed
+    keys = jax.random.split(jax.random.key(seed), len(places))
+    found = [
+        look(key, *map(jnp.asarray, eye.take(place)), camera, noise, ball).place
+        for key, place in zip(keys, np.asarray(places, float), strict=True)
+    ]
+    return np.array(found)
+
+
+def _context_class() -> Any:
+    """MuJoCo's class of an OpenGL context: EGL's where nothing else is asked for."""
+    if os.environ.get("MUJOCO_GL", "").lower().strip() in ("", "egl") and os.name == "posix":
+        from mujoco.egl import GLContext
+
+        return GLContext
+    return mujoco.GLContext
+
+
+def _scene_model(arm_xml: str, camera: Camera, scene: Scene, ball_radius: float) -> mujoco.MjModel:
+    """The arm's model with all that stands around it, a ball and the camera."""
+    root = ET.fromstring(arm_xml)
+    for geom in root.iter("geom"):
+        geom.set("rgba", xml_colour(_ARM_COLOUR))
+    width, height = camera.size
+    root.append(_element("statistic", extent=1.0))  # so that near and far are lengths
+    visual = _element("visual")
+    visual.append(_element("map", znear=_NEAR, zfar=_FAR))
+    visual.append(_element("global", offwidth=width, offheight=height))
+    # Smoothed edges would shift small things by up to half a pixel, by which samples are blended.
+    visual.append(_element("quality", offsamples=0, numslices=48, numstacks=48))
+    visual.append(_element("headlight", ambient=[0.45] * 3, diffuse=[0.25] * 3))
+    root.append(visual)
+    world = root.find("worldbody")
+    assert world is not None
+    world.append(_element("light", type="directional", dir=[0.3, 0.2, -1.0], diffuse=[0.5] * 3))
+
+    def add(kind: str, colour: str, **numbers: Any) -> None:
+        world.append(_element("geom", type=kind, rgba=xml_colour(colour), **numbers))
+
+    floor = float(scene.floor)
+    add("plane", GROUND_COLOUR, pos=[0.0, 0.0, floor], size=[20.0, 20.0, 1.0])
+    for axis in range(2):
+        for side in (-_WALLS, _WALLS):
+            middle, half = [0.0, 0.0, floor + 0.5 * _HIGH], [_WALLS, _WALLS, 0.5 * _HIGH]
+            middle[axis], half[axis] = side, 0.05
+            add("box", _WALL, pos=middle, size=half)
+    if bool(scene.has_pole):
+        middle, half = 0.5 * (_POLE_TOP + floor), 0.5 * (_POLE_TOP - floor)
+        add("cylinder", _POLE, pos=[*scene.pole, middle], size=[scene.pole_radius, half])
+    for ends, radius in zip(
+        np.asarray(scene.beam_ends), np.asarray(scene.beam_radius), strict=True
+    ):
+        add("capsule", _STEEL, fromto=ends.reshape(-1), size=[radius])
+    ball = _element("body", name="ball", mocap="true")
+    ball.append(_element("geom", type="sphere", size=[ball_radius], rgba=xml_colour(_BALL)))
+    world.append(ball)
+    # MuJoCo's cameras have y up, and look against z.
+    axes = np.asarray(camera.rotation, float)
+    angle = np.rad2deg(2.0 * np.arctan(0.5 * height / float(camera.focal)))
+    eye = {"pos": camera.position, "xyaxes": [*axes[:, 0], *-axes[:, 1]], "fovy": angle}
+    world.append(_element("camera", name="eye", **eye))
+    return mujoco.MjModel.from_xml_string(ET.tostring(root, "unicode"))
+
+
+def _element(tag: str, **attributes: Any) -> ET.Element:
+    """An element of MJCF; lists and arrays of numbers are written with blanks."""
+    written = {
+        name: value if isinstance(value, str) else xml_numbers(*np.atleast_1d(value))
+        for name, value in attributes.items()
+    }
+    return ET.Element(tag, written)

@@ -1,0 +1,445 @@
+"""Seeing a ball: camera, stereo noise, colour masks, fits of flights, hand-eye calibration."""
+
+import colorsys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from planner_jax.ball.estimation import EkfModel, ekf_init, ekf_predict, ekf_update
+from planner_jax.ball.flight import BallState, drag_free_flight
+from planner_jax.perception.calibrate import calibrate, hand_eye, pose, rigid_motion
+from planner_jax.perception.camera import back_project, in_view, looking_at, project
+from planner_jax.perception.fit import Sight, across_std, believed_at, error_across, fit_flight
+from planner_jax.perception.noise import (
+    RoundNoise,
+    depth_std,
+    information,
+    noisy_depth,
+    sightings,
+    stereo_noise,
+)
+from planner_jax.perception.segment import (
+    ball_look,
+    colour_mask,
+    hue_saturation_value,
+    sighting,
+)
+
+GRAVITY = 9.81
+NUM = 16
+TIMES = np.arange(NUM, dtype=np.float32) / 60.0
+STD = 0.02  # [m]
+AHEAD = 0.8  # [s], at which flights are compared
+BALL = BallState(pos=np.float32([6.8, -1.5, 0.4]), vel=np.float32([-7.7, 1.6, 4.6]))
+CAMERA = looking_at(
+    (-0.5, 0.1, 1.7), (5.0, 0.4, 1.0), size=(320, 192), field_of_view=np.deg2rad(110.0)
+)
+
+paths = jax.jit(jax.vmap(drag_free_flight, (None, 0, None)))
+fit_one = jax.jit(fit_flight)
+fit_many = jax.jit(jax.vmap(fit_flight, (0, 0, 0, None)))
+believed = jax.jit(believed_at)
+sighting_one = jax.jit(sighting)
+
+
+@jax.jit
+def errors(fits, truth):
+    """What many fits say of the ball `AHEAD` [s] after the first look, and how far they are off."""
+    beliefs = jax.vmap(believed_at, (0, None, None))(fits, AHEAD, GRAVITY)
+    stds = jax.vmap(across_std)(beliefs)
+    return beliefs, stds, jax.vmap(error_across, (0, None))(beliefs, truth)
+
+
+def seen(num, rng, std=STD):
+    """Noisy places (num, NUM, 3) of one flight."""
+    places = np.asarray(paths(BALL, TIMES, GRAVITY).pos)
+    return (places + std * rng.normal(size=(num, *places.shape))).astype(np.float32)
+
+
+def repeated(value, num):
+    return np.broadcast_to(value, (num, *np.shape(value)))
+
+
+# Fits of flights.
+
+
+def test_a_flight_without_noise_is_found_exactly(float64):
+    exact = BallState(pos=jnp.array([6.8, -1.5, 0.4]), vel=jnp.array([-7.7, 1.6, 4.6]))
+    times = jnp.arange(6) / 30.0
+    fit = fit_one(times, paths(exact, times, GRAVITY).pos, 1.0, GRAVITY)
+    there = believed(fit, 0.0, GRAVITY)
+    np.testing.assert_allclose(there.mean, jnp.concatenate([exact.pos, exact.vel]), atol=1e-12)
+    assert fit.status == Sight.SEEN and fit.num == 6 and fit.misfit < 1e-12
+
+
+def test_float32_finds_a_flight_whose_depths_are_much_less_certain():
+    """Where a direction counts 10,000 times less than the others, and it lies aslant."""
+    turn = Rotation.from_rotvec([0.4, -0.8, 0.3]).as_matrix()
+    weights = turn @ np.diag([1e6, 1e6, 1e2]) @ turn.T
+    weights = repeated(weights.astype(np.float32), NUM)
+    fit = fit_one(TIMES, paths(BALL, TIMES, GRAVITY).pos, weights, GRAVITY)
+    ahead = believed(fit, AHEAD, GRAVITY)
+    truth = drag_free_flight(BALL, AHEAD, GRAVITY)
+    np.testing.assert_allclose(ahead.mean[:3], truth.pos, atol=1e-4)
+    assert fit.misfit < 0.05
+
+
+def test_the_covariance_is_that_of_many_fits():
+    rng = np.random.default_rng(0)
+    num = 4000
+    fits = fit_many(
+        repeated(TIMES, num), seen(num, rng), repeated(np.float32(STD**-2), num), GRAVITY
+    )
+    truth = drag_free_flight(BALL, AHEAD, GRAVITY)
+    beliefs, stds, off = errors(fits, truth)
+    off_mean = np.asarray(beliefs.mean) - np.concatenate([truth.pos, truth.vel])
+    believed_covariance = np.asarray(beliefs.covariance[0])
+    deviations = np.sqrt(np.diag(believed_covariance))
+    np.testing.assert_allclose(
+        np.cov(off_mean.T) / np.outer(deviations, deviations),
+        believed_covariance / np.outer(deviations, deviations),
+        atol=0.06,
+    )
+    assert np.sqrt(np.mean(off**2)) == pytest.approx(float(stds[0]), rel=0.04)
+    assert np.sqrt(np.mean(fits.misfit**2)) == pytest.approx(1.0, abs=0.02)
+
+
+def test_the_estimate_is_that_of_polynomials():
+    """With equal weights each axis is a line, z after the fall is taken off (paper 004, eq. 8)."""
+    places = seen(1, np.random.default_rng(1))[0]
+    there = believed(fit_one(TIMES, places, 1.0, GRAVITY), 0.0, GRAVITY)
+    fallen = places.astype(float)
+    fallen[:, 2] += 0.5 * GRAVITY * TIMES**2
+    slopes, heights = np.polyfit(TIMES, fallen, 1)
+    np.testing.assert_allclose(there.mean, np.concatenate([heights, slopes]), rtol=1e-4, atol=1e-4)
+
+
+def test_what_is_not_seen_leaves_no_trace():
+    places = seen(1, np.random.default_rng(2))[0]
+    weights = np.ones(NUM, np.float32)
+    holes = places.copy()
+    holes[3], holes[8, 1] = np.nan, np.inf
+    ignored = weights.copy()
+    ignored[12] = 0.0
+    keep = np.delete(np.arange(NUM), [3, 8, 12])
+    fit = fit_one(TIMES, holes, ignored, GRAVITY)
+    alone = fit_one(TIMES[keep], places[keep], weights[keep], GRAVITY)
+    assert fit.num == len(keep)
+    np.testing.assert_allclose(fit.belief.mean, alone.belief.mean, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(fit.belief.covariance, alone.belief.covariance, rtol=1e-3, atol=1e-5)
+
+
+def test_a_batch_is_its_lanes_one_by_one():
+    """Lanes of very different observations, one of them never seen."""
+    rng = np.random.default_rng(3)
+    places = seen(4, rng)
+    places[1, 5:] = np.nan
+    places[2] = np.nan
+    weights = rng.uniform(1.0, 50.0, (4, NUM)).astype(np.float32)
+    times = (TIMES + rng.uniform(0.0, 1.0, (4, 1))).astype(np.float32)
+    many = fit_many(times, places, weights, GRAVITY)
+    for k in range(4):
+        one = fit_one(times[k], places[k], weights[k], GRAVITY)
+        jax.tree.map(
+            lambda a, b, k=k: np.testing.assert_allclose(a, b[k], rtol=2e-4, atol=2e-5), one, many
+        )
+    assert many.status.tolist() == [Sight.SEEN, Sight.SEEN, Sight.NEVER_SEEN, Sight.SEEN]
+
+
+def test_a_ball_that_is_not_seen_at_two_times_has_a_status_and_a_sentence():
+    places = seen(1, np.random.default_rng(4))[0]
+    never, once = np.full_like(places, np.nan), np.full_like(places, np.nan)
+    once[7] = places[7]
+    for given, status in ((never, Sight.NEVER_SEEN), (once, Sight.SEEN_ONCE)):
+        fit = fit_one(TIMES, given, 1.0, GRAVITY)
+        assert fit.status == status and np.isnan(fit.belief.mean).all() and np.isnan(fit.misfit)
+    assert "never sees the ball" in Sight.NEVER_SEEN.message
+    same_time = np.full_like(TIMES, 0.3)
+    assert fit_one(same_time, places, 1.0, GRAVITY).status == Sight.SEEN_ONCE
+
+
+def test_the_fit_is_what_a_kalman_filter_with_a_wide_prior_comes_to(float64):
+    places = jnp.asarray(seen(1, np.random.default_rng(5))[0], jnp.float64)
+    times = jnp.asarray(TIMES, jnp.float64)
+    model = EkfModel(jnp.zeros(3), jnp.asarray(GRAVITY), jnp.asarray(0.0), jnp.asarray(STD))
+    state = ekf_init(places[0], jnp.zeros(3), pos_std=jnp.asarray(1e3), vel_std=jnp.asarray(1e4))
+
+    def advance(state, given):
+        duration, place = given
+        return ekf_update(ekf_predict(state, duration, model), place, model), None
+
+    filtered, _ = jax.jit(lambda: jax.lax.scan(advance, state, (jnp.full(NUM, 1 / 60.0), places)))()
+    fit = fit_one(jnp.arange(NUM) / 60.0, places, STD**-2, GRAVITY)
+    last = believed(fit, (NUM - 1) / 60.0, GRAVITY)
+    np.testing.assert_allclose(filtered.mean, last.mean, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(filtered.covariance, last.covariance, rtol=1e-5, atol=1e-8)
+    assert times.dtype == jnp.float64
+
+
+def test_gradients_of_a_fit_are_finite_with_and_without_a_ball():
+    places = seen(1, np.random.default_rng(6))[0]
+    holes = places.copy()
+    holes[3] = np.nan
+
+    def across(places):
+        fit = fit_flight(TIMES, places, 1.0, GRAVITY)
+        return across_std(believed_at(fit, AHEAD, GRAVITY)) + jnp.sum(fit.ball.pos)
+
+    slope = jax.jit(jax.grad(across))
+    found = slope(holes)
+    assert np.isfinite(found).all() and np.abs(found[4]).max() > 0.01
+    np.testing.assert_allclose(found[3], 0.0)
+
+
+# Cameras.
+
+
+def test_points_come_back_from_their_pixels():
+    rng = np.random.default_rng(0)
+    points = rng.uniform([0.5, -4.0, -1.0], [12.0, 4.0, 4.0], (50, 3)).astype(np.float32)
+    pixels, depths = project(CAMERA, points)
+    np.testing.assert_allclose(back_project(CAMERA, pixels, depths), points, atol=2e-5)
+
+
+def test_a_camera_sees_what_it_looks_at_in_the_middle_and_the_right_way_round():
+    pixel, depth = project(CAMERA, jnp.array([5.0, 0.4, 1.0]))
+    np.testing.assert_allclose(pixel, CAMERA.centre, atol=1e-3)
+    assert depth == pytest.approx(np.linalg.norm([5.5, 0.3, -0.7]), rel=1e-5)
+    left, _ = project(CAMERA, jnp.array([5.0, 1.4, 1.0]))  # it looks along +x
+    above, _ = project(CAMERA, jnp.array([5.0, 0.4, 2.0]))
+    assert left[0] < pixel[0] and above[1] < pixel[1]
+    assert np.linalg.det(CAMERA.rotation) == pytest.approx(1.0, abs=1e-5)
+
+
+def test_the_field_of_view_ends_where_it_should():
+    half, far = np.deg2rad(55.0), 10.0
+    forward = np.asarray(CAMERA.rotation) @ np.array([0.0, 0.0, far])
+    right = np.asarray(CAMERA.rotation) @ np.array([far * np.tan(half), 0.0, 0.0])
+    points = CAMERA.position + np.stack([forward + share * right for share in (0.99, 1.01, -0.99)])
+    behind = CAMERA.position - forward
+    found = in_view(CAMERA, jnp.asarray(np.vstack([points, behind]), jnp.float32))
+    assert found.tolist() == [True, False, True, False]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"target": (1.0, 2.0, 9.0)}, "target must be beside the camera"),
+        ({"field_of_view": 3.5}, "field_of_view must be between 0 and pi, got 3.5"),
+        ({"size": (0, 4)}, "size must be >= 1"),
+    ],
+)
+def test_a_camera_that_cannot_be_is_refused_in_a_line(options, message):
+    given = {"target": (5.0, 0.0, 1.0), "size": (64, 64), "field_of_view": 1.0} | options
+    with pytest.raises(ValueError, match=message) as caught:
+        looking_at((1.0, 2.0, 3.0), **given)
+    assert "\n" not in str(caught.value)
+
+
+# Stereo noise.
+
+
+def test_the_noise_of_depth_grows_with_the_square_of_the_distance():
+    noise = stereo_noise()
+    near, far = depth_std(CAMERA, noise, jnp.array([2.0, 8.0]))
+    assert far == pytest.approx(16.0 * near)
+    assert near == pytest.approx(4.0 * 0.1 / (CAMERA.focal * 0.12), rel=1e-5)
+
+
+def test_the_information_of_a_sighting_is_the_inverse_of_its_covariance():
+    noise = stereo_noise(dropout=0.0, disparity_std=0.02)
+    place = jnp.array([4.0, 1.0, 1.5])
+    many = jax.jit(sightings)(jax.random.key(0), CAMERA, noise, jnp.broadcast_to(place, (40000, 3)))
+    expected = np.linalg.inv(np.asarray(information(CAMERA, noise, place), float))
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    np.testing.assert_allclose(np.cov(many.T) / scale, expected / scale, atol=0.03)
+
+
+def test_round_noise_is_alike_in_every_direction():
+    noise, place = RoundNoise(std=jnp.asarray(0.02)), jnp.array([4.0, 1.0, 1.5])
+    many = jax.jit(sightings)(jax.random.key(0), CAMERA, noise, jnp.broadcast_to(place, (9000, 3)))
+    np.testing.assert_allclose(np.cov(many.T), 4e-4 * np.eye(3), atol=2e-5)
+    np.testing.assert_allclose(information(CAMERA, noise, place), 2500.0 * np.eye(3), rtol=1e-5)
+
+
+def test_what_is_lost_or_out_of_view_is_not_seen():
+    look = jax.jit(sightings)
+    inside = jnp.broadcast_to(jnp.array([4.0, 1.0, 1.5]), (2000, 3))
+    lost = np.isnan(look(jax.random.key(1), CAMERA, stereo_noise(dropout=0.3), inside)).any(axis=1)
+    assert lost.mean() == pytest.approx(0.3, abs=0.04)
+    behind = inside * jnp.array([-1.0, 1.0, 1.0])
+    assert np.isnan(look(jax.random.key(1), CAMERA, stereo_noise(), behind)).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"baseline": 0.0}, "baseline must be > 0, got 0"),
+        ({"dropout": 1.0}, "dropout must be < 1, got 1"),
+        ({"pixel_std": -0.1}, "pixel_std must be >= 0, got -0.1"),
+    ],
+)
+def test_noise_that_cannot_be_is_refused_in_a_line(options, message):
+    with pytest.raises(ValueError, match=message):
+        stereo_noise(**options)
+
+
+# Colours and frames.
+
+
+def test_hue_saturation_and_value_are_those_of_the_standard_library():
+    rng = np.random.default_rng(0)
+    colours = np.concatenate(
+        [rng.integers(0, 256, (300, 3)), np.repeat([[0], [7], [255]], 3, 1), np.eye(3) * 255]
+    ).astype(np.float32)
+    found = jax.jit(hue_saturation_value)(colours / 255.0)
+    expected = [colorsys.rgb_to_hsv(*(float(x) for x in colour / 255.0)) for colour in colours]
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("hues", [(0.02, 0.13), (0.9, 0.1)])
+def test_the_mask_compares_hue_saturation_and_value(hues):
+    rng = np.random.default_rng(1)
+    image = rng.integers(0, 256, (40, 50, 3)).astype(np.uint8)
+    look = ball_look((hues[0], 0.4, 0.3), (hues[1], 0.9, 0.95))
+    hsv = np.asarray(hue_saturation_value(image.astype(np.float32) / 255.0), float)
+    edges = np.stack([look.lower, look.upper])
+    near = (np.abs(hsv[:, :, None] - edges) < 1e-5).any(axis=(2, 3))  # rounding decides there
+    hue = (hsv[..., 0] >= hues[0]) & (hsv[..., 0] <= hues[1])
+    if hues[0] > hues[1]:
+        hue = (hsv[..., 0] >= hues[0]) | (hsv[..., 0] <= hues[1])
+    others = [(hsv[..., k] >= look.lower[k]) & (hsv[..., k] <= look.upper[k]) for k in (1, 2)]
+    expected = hue & others[0] & others[1]
+    found = np.asarray(colour_mask(image, look))
+    np.testing.assert_array_equal(found[~near], expected[~near])
+    assert 20 < expected.sum() < 1000
+
+
+def ball_frame(place, radius=0.05):
+    """Image and depth of an orange ball at (3,) [m] before a grey wall, ray by ray."""
+    column, row = np.meshgrid(*(np.arange(size) for size in CAMERA.size))
+    across = (np.stack([column, row], axis=-1) - CAMERA.centre) / CAMERA.focal
+    ray = np.concatenate([across, np.ones((*across.shape[:2], 1))], axis=-1)
+    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+    middle = np.asarray(CAMERA.rotation).T @ (place - np.asarray(CAMERA.position))
+    along = ray @ middle
+    gap = radius**2 - (middle @ middle - along**2)
+    hit = gap > 0.0
+    distance = along - np.sqrt(np.where(hit, gap, 0.0))
+    depth = np.where(hit, distance * ray[..., 2], 13.0).astype(np.float32)
+    image = np.full((*depth.shape, 3), 128, np.uint8)
+    image[hit] = (240, 110, 10)
+    return image, depth
+
+
+@pytest.mark.parametrize("place", [(1.5, 0.4, 1.2), (4.0, 1.0, 1.5), (3.0, -2.0, 2.0)])
+def test_a_ball_is_seen_where_it_is(place):
+    image, depth = ball_frame(np.array(place))
+    found = sighting_one(image, depth, np.ones_like(depth), CAMERA, ball_look())
+    pixel, distance = project(CAMERA, jnp.array(place))
+    np.testing.assert_allclose(found.pixel, pixel, atol=0.35)
+    assert found.depth == pytest.approx(float(distance), abs=0.02)
+
+
+def test_pixels_of_little_confidence_or_another_depth_are_dropped():
+    place = np.array([2.0, 0.3, 1.3])
+    image, depth = ball_frame(place)
+    clean = sighting_one(image, depth, np.ones_like(depth), CAMERA, ball_look())
+    ball = np.argwhere(depth < 12.0)
+    wrong = ball[:: len(ball) // 6]
+    spoiled, trust = depth.copy(), np.ones_like(depth)
+    spoiled[tuple(wrong[::2].T)] *= 1.8  # confident, but elsewhere
+    spoiled[tuple(wrong[1::2].T)] *= 1.02
+    trust[tuple(wrong[1::2].T)] = 0.1
+    image[:3, :2] = image[tuple(ball[0])]  # as if something far away had the colour
+    found = sighting_one(image, spoiled, trust, CAMERA, ball_look())
+    assert found.pixels == clean.pixels - len(wrong)
+    np.testing.assert_allclose(found.place, clean.place, atol=0.02)
+
+
+def test_a_frame_without_the_ball_shows_nothing():
+    image, depth = ball_frame(np.array([2.0, 0.3, 1.3]))
+    trust = np.ones_like(depth)
+    for frame in (
+        (np.full_like(image, 90), depth, trust),
+        (image, np.full_like(depth, np.nan), trust),
+        (image, depth, 0.0 * trust),
+        (image, 20.0 * depth, trust),
+    ):
+        found = sighting_one(*frame, CAMERA, ball_look())
+        assert found.pixels == 0 and np.isnan(found.place).all() and np.isnan(found.depth)
+
+
+def test_noisy_depth_images_have_the_noise_that_is_asked_for():
+    noise = stereo_noise(disparity_std=0.0, speckle_std=0.05, mismatch=0.02, dropout=0.1)
+    depth = jnp.full((192, 320), 3.0)
+    found, trust = jax.jit(noisy_depth)(jax.random.key(0), CAMERA, noise, depth)
+    assert np.isnan(found).mean() == pytest.approx(0.1, abs=0.01)
+    believed_in = np.asarray(found)[(np.asarray(trust) > 0.6) & np.isfinite(found)]
+    expected = 9.0 * 0.05 / (CAMERA.focal * 0.12)
+    assert believed_in.std() == pytest.approx(float(expected), rel=0.05)
+    common = stereo_noise(speckle_std=0.0, mismatch=0.0, dropout=0.0)
+    found, _ = jax.jit(noisy_depth)(jax.random.key(0), CAMERA, common, depth)
+    assert found.std() < 1e-5 and abs(found[0, 0] - 3.0) > 1e-3
+
+
+# Hand-eye calibration.
+
+
+def views(rng, std, num=12):
+    """A camera's and a board's poses, those of the flange, the board's points and as seen."""
+    facing = Rotation.from_matrix(np.asarray(CAMERA.rotation, float)).as_matrix()
+    camera = pose(facing, np.asarray(CAMERA.position, float))
+    board = pose(Rotation.from_rotvec([0.2, -0.4, 1.0]).as_matrix(), np.array([0.02, 0.05, 0.1]))
+    turns = Rotation.from_rotvec(rng.uniform(-0.8, 0.8, (num, 3))).as_matrix()
+    places = rng.uniform([0.4, -0.5, 0.5], [1.2, 0.5, 1.2], (num, 3))
+    flange = pose(turns, places)
+    grid = np.arange(4) * 0.08
+    points = np.stack([*np.meshgrid(grid, grid), np.zeros((4, 4))], axis=-1).reshape(-1, 3)
+    to_camera = np.linalg.inv(camera) @ flange @ board
+    where = points @ np.swapaxes(to_camera[:, :3, :3], 1, 2) + to_camera[:, None, :3, 3]
+    return camera, board, flange, points, where + std * rng.normal(size=where.shape)
+
+
+def test_calibration_finds_camera_and_board_exactly():
+    camera, board, flange, points, where = views(np.random.default_rng(0), 0.0)
+    found = calibrate(flange, points, where)
+    np.testing.assert_allclose(found.camera, camera, atol=1e-9)
+    np.testing.assert_allclose(found.board, board, atol=1e-9)
+    boards = np.stack([rigid_motion(points, each) for each in where])
+    np.testing.assert_allclose(hand_eye(flange, boards), camera, atol=1e-9)
+
+
+def test_refinement_is_nearer_than_the_closed_form_and_knows_its_noise():
+    rng = np.random.default_rng(1)
+    std = np.array([0.001, 0.001, 0.006])  # [m], along the camera's axes
+    off = []
+    for _ in range(10):
+        camera, _, flange, points, where = views(rng, std)
+        found = calibrate(flange, points, where, std)
+        closed = hand_eye(flange, np.stack([rigid_motion(points, each) for each in where]))
+        turned = [
+            Rotation.from_matrix(each[:3, :3].T @ camera[:3, :3]).magnitude()
+            for each in (found.camera, closed)
+        ]
+        moved = [np.linalg.norm((each - camera)[:3, 3]) for each in (found.camera, closed)]
+        off.append([turned, moved])
+        assert found.residual == pytest.approx(1.0, abs=0.15)
+    (turned, moved) = np.median(off, axis=0)
+    assert turned[0] < 0.5 * turned[1] and moved[0] < 0.5 * moved[1]
+    assert turned[0] < 2e-3 and moved[0] < 2e-3
+
+
+def test_too_little_to_calibrate_from_is_refused_in_a_line():
+    camera, _, flange, points, where = views(np.random.default_rng(2), 0.0)
+    with pytest.raises(ValueError, match="turn about different axes, got 2"):
+        calibrate(flange[:2], points, where[:2])
+    with pytest.raises(ValueError, match="must not lie on one line"):
+        rigid_motion(points[:4], where[0, :4])
+    turns = Rotation.from_rotvec(np.outer(np.linspace(0.0, 1.0, 8), [0.0, 0.0, 1.0])).as_matrix()
+    about_z = pose(turns, np.zeros((8, 3)))
+    with pytest.raises(ValueError, match="turn about different axes, got 8"):
+        hand_eye(about_z, np.linalg.inv(camera) @ about_z)

@@ -1,0 +1,104 @@
+"""Rendered images of the arm's scene, and what is made of them. They skip where there is no OpenGL.
+
+A small image, so that rendering without a graphics card takes some milliseconds.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import planner_jax as pj
+from planner_jax.ball.flight import drag_free_flight
+from planner_jax.perception.camera import project
+from planner_jax.perception.fit import believed_at, error_across, fit_flight
+from planner_jax.perception.noise import information, stereo_noise
+from planner_jax.perception.segment import ball_look, sighting
+from planner_jax.robot.arm_mjcf import irb1600
+from planner_jax.sims import camera as scene_camera
+from planner_jax.sims.board import calibrated, show_board
+from planner_jax.sims.camera import RenderError, SceneCamera, sightings_of
+from planner_jax.task.block.eye import mast_camera
+from planner_jax.task.block.scene import paper_scene
+
+CAMERA = mast_camera(size=(640, 360))
+GRAVITY = 9.81
+see = jax.jit(sighting)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    try:
+        with SceneCamera(CAMERA, paper_scene()) as scene:
+            yield scene
+    except RenderError as error:
+        pytest.skip(str(error))
+
+
+@pytest.mark.parametrize("place", [(1.2, 0.4, 1.2), (2.5, -1.8, 1.0), (3.0, 3.0, 2.2)])
+def test_a_rendered_ball_is_seen_where_it_is(scene, place):
+    image, depth = scene.take(np.array(place))
+    found = see(image, depth, np.ones_like(depth), CAMERA, ball_look())
+    pixel, distance = project(CAMERA, jnp.array(place))
+    np.testing.assert_allclose(found.pixel, pixel, atol=0.3)
+    assert found.depth == pytest.approx(float(distance), abs=0.01)
+
+
+def test_depths_are_those_of_the_scene(scene):
+    """Of the pole, and of the floor at the bottom of the image."""
+    image, depth = scene.take(None)
+    column, row = np.round(project(CAMERA, jnp.array([0.806, 0.0, 1.5]))[0]).astype(int)
+    pole = np.array([0.806, 0.0]) - CAMERA.position[:2]
+    expected = CAMERA.rotation[:2, 2] @ pole * (1.0 - 0.05 / np.linalg.norm(pole))
+    expected = expected + CAMERA.rotation[2, 2] * (1.5 - CAMERA.position[2])
+    assert depth[row, column] == pytest.approx(expected, abs=0.01)
+    column, row = np.round(project(CAMERA, jnp.array([4.0, -2.0, -0.4826]))[0]).astype(int)
+    _, expected = project(CAMERA, jnp.array([4.0, -2.0, -0.4826]))
+    assert depth[row, column] == pytest.approx(float(expected), rel=0.02)
+
+
+def test_a_ball_behind_the_pole_or_out_of_view_is_not_seen(scene):
+    behind = np.asarray(CAMERA.position) + 3.0 * (
+        np.array([0.806, 0.0, 1.5]) - np.asarray(CAMERA.position)
+    )
+    half_hidden = behind + 0.5 * 0.15 * np.asarray(CAMERA.rotation)[:, 0]
+    for place in (behind, half_hidden, np.array([-4.0, 0.0, 1.0]), None):
+        image, depth = scene.take(place)
+        found = see(image, depth, np.ones_like(depth), CAMERA, ball_look())
+        assert found.pixels == 0 and np.isnan(found.place).all()
+
+
+def test_a_flight_through_images_is_found_as_well_as_it_is_believed(scene):
+    cases = pj.block.draw(1, "short", seed=1)
+    ball = jax.tree.map(lambda leaf: leaf[0], cases.ball)
+    noise = stereo_noise()
+    # The last part of the flight, where this small image has enough pixels of the ball.
+    times = jnp.arange(10) / 30.0 + 0.4
+    places = jax.vmap(drag_free_flight, (None, 0, None))(ball, times, GRAVITY).pos
+    seen = sightings_of(scene, np.asarray(places), noise, ball_look(), seed=3)
+    assert np.isfinite(seen).all(axis=1).sum() >= 8
+    fit = jax.jit(fit_flight)(times, seen, information(CAMERA, noise, jnp.asarray(seen)), GRAVITY)
+    truth = drag_free_flight(ball, times[-1], GRAVITY)
+    belief = believed_at(fit, times[-1], GRAVITY)
+    assert error_across(belief, truth) < 0.05
+    assert 0.4 < fit.misfit < 1.8
+
+
+def test_no_opengl_is_one_line(monkeypatch):
+    def none(*_):
+        raise ImportError("no library\nmore of it")
+
+    monkeypatch.setattr(scene_camera, "_context_class", lambda: none)
+    with pytest.raises(RenderError, match="images need an OpenGL .*: no library$") as caught:
+        SceneCamera(CAMERA, paper_scene())
+    assert "\n" not in str(caught.value)
+
+
+def test_the_arm_shows_a_board_from_which_the_camera_is_found():
+    arm, noise = irb1600(), stereo_noise()
+    found, calibration = calibrated(arm, CAMERA, noise, 12)
+    np.testing.assert_allclose(found.position, CAMERA.position, atol=0.002)
+    np.testing.assert_allclose(found.rotation, CAMERA.rotation, atol=0.002)
+    assert calibration.residual == pytest.approx(1.0, abs=0.1)
+    with pytest.raises(ValueError, match="sees the board in .* of 50 poses, not 40"):
+        show_board(arm, CAMERA, noise, 40, draws=50)
