@@ -29,8 +29,8 @@ from tests.recordings import recording
     ("build", "message"),
     [
         (
-            lambda: fly_settings("block"),
-            "task must be one that can be flown (hit, catch, intercept), got 'block'",
+            lambda: fly_settings("dodge"),
+            "task must be one that can be flown (hit, catch, intercept, block), got 'dodge'",
         ),
         (lambda: CatchFly(noise="loud"), "noise must be one of none, lab, harsh, got 'loud'"),
         (lambda: CatchFly(num=0), "num must be >= 1, got 0"),
