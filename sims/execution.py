@@ -210,9 +210,7 @@ def execute(
     planned: Course = jax.tree.map(jnp.asarray, courses)
     begins = planned.begin + jnp.asarray(late + drives.latency, dtype)
     setting = _Setting(
-        course=dataclasses.replace(
-            planned, begin=planned.begin + jnp.asarray(late + drives.latency, dtype)
-        ),
+        course=dataclasses.replace(planned, begin=begins),
         since=jnp.asarray(since, dtype),
         until=jnp.asarray(until, dtype),
         torques=shared(drives.torques),

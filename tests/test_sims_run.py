@@ -194,7 +194,7 @@ def test_a_task_without_flights_is_refused_in_one_line(monkeypatch):
     monkeypatch.setitem(all_tasks(), "drop", dataclasses.replace(DROP, flight=None))
     with pytest.raises(SettingError) as error:
         fly_settings("drop")
-    rule = "task must be one that can be flown (hit, catch, intercept)"
+    rule = "task must be one that can be flown (hit, catch, intercept, block)"
     assert str(error.value) == f"{rule}, got 'drop'"
 
 

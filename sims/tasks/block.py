@@ -216,14 +216,15 @@ def fly_blocks(
     allowed = allowed or 0.0
     solved = np.asarray(is_solved(plan.status))
     entry = entry_times(case)
-    contact = np.where(solved, np.asarray(plan.contact_time, float), entry)
+    last = np.where(np.isfinite(entry), entry, delay)
+    contact = np.where(solved, np.asarray(plan.contact_time, float), last)
     flown = execute(
         world,
         courses_of(case, plan),
         flight_keys(seed, cases.index),
         since=delay,
         until=contact,
-        end=float(np.max(np.maximum(contact, entry))) + _AFTER,
+        end=float(np.max(np.maximum(contact, last))) + _AFTER,
         late=np.maximum(seconds - allowed, 0.0),
         drives=drives,
     )
