@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -58,14 +59,16 @@ def batch(*trees):
 def plans(*motions, contact, status=None):
     """Plans of motions."""
     num = len(motions)
-    none = np.zeros(num, np.float32)
+    none: Any = np.zeros(num, np.float32)
+    states: Any = np.zeros(num, np.int32) if status is None else np.array(status, np.int32)
+    contacts: Any = np.full(num, contact, np.float32)
     return BlockPlan(
         cost=none,
         violation=none,
         iterations=none.astype(np.int32),
-        status=np.zeros(num, np.int32) if status is None else np.array(status, np.int32),
+        status=states,
         motion=batch(*motions),
-        contact_time=np.full(num, contact, np.float32),
+        contact_time=contacts,
     )
 
 
@@ -76,11 +79,9 @@ MOTIONS = (STILL, motion(TURN), motion(-0.3 * TURN), motion(0.6 * TURN, ends_at_
 
 def carried_out(drives=IDEAL, **options):
     """The arm along MOTIONS, which begin after 0.05 s."""
-    courses = Course(
-        motion=batch(*MOTIONS),
-        begin=np.full(LANES, 0.05, np.float32),
-        braking=np.full((LANES, 6), 30.0, np.float32),
-    )
+    begin: Any = np.full(LANES, 0.05, np.float32)
+    braking: Any = np.full((LANES, 6), 30.0, np.float32)
+    courses = Course(motion=batch(*MOTIONS), begin=begin, braking=braking)
     since, until = np.full(LANES, 0.05), np.full(LANES, 0.05 + MOVING)
     options = {"since": since, "until": until, "end": 0.8, "drives": drives, **options}
     return courses, execute(BLOCK_WORLD, courses, flight_keys(0, np.arange(LANES)), **options)
@@ -363,7 +364,8 @@ def test_another_robot_arm_or_time_is_refused_in_one_line():
         fly_blocks(CAR_WORLD, cases)
     with pytest.raises(ValueError, match="^timestep must be 0.001, got 0.002$"):
         carried = dataclasses.replace(BLOCK_WORLD, timestep=2.0 * TIMESTEP)
-        execute(carried, Course(None, None, None), None, since=None, until=None, end=1.0)
+        nothing: Any = (None, None)
+        execute(carried, *nothing, since=np.zeros(1), until=np.zeros(1), end=1.0)
     with pytest.raises(ValueError, match="^allowed must be >= 0 and <= the delay 0.1, got 0.2$"):
         fly_blocks(BLOCK_WORLD, cases, allowed=0.2)
     heavy = dataclasses.replace(cases.cases.arm, mass=2.0 * cases.cases.arm.mass)
