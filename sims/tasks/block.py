@@ -364,7 +364,10 @@ def _strikes(
 def _least(
     case: dict[str, np.ndarray], links: Sequence[int], angles: np.ndarray, looked: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Least clearance (B,) [m] of arms at the frames that are looked at, and what comes so near."""
+    """Least clearance (B,) [m] of arms at the frames that are looked at, and what comes so near.
+
+    It is infinite where no frame is looked at.
+    """
     least, names = [], []
     for begin in range(0, len(looked), _LANES):
         some = slice(begin, begin + _LANES)
@@ -375,7 +378,7 @@ def _least(
         parts = np.stack([np.char.add(part, f", {kind}") for kind, (_, _, part) in found.items()])
         least.append(distances[which, lanes])
         names.append(parts[which, lanes])
-    return np.concatenate(least), np.concatenate(names)
+    return np.where(looked.any(axis=1), np.concatenate(least), np.inf), np.concatenate(names)
 
 
 def _boxed(box: Box, colour: str, opacity: float) -> Part:
