@@ -37,13 +37,13 @@ ROWS: dict[str, dict[str, Any]] = {
 }
 HEADER = (
     "| regime | row | success % (95 %) | blocked, % | touched / after it, % | "
-    "miss p50 / worst, cm | tracking p50 / worst, cm | error rms of joints 1 to 6, mrad | "
+    "miss of blocked p50 / worst, cm | tracking p50 / worst, cm | error rms of joints 1 to 6, mrad | "
     "torque rms of joints 1 to 3, N m | worst, N m | at the limit, % of the time | s |"
 )
 
 
 def line(regime: str, name: str, flights: Any, seconds: float) -> str:
-    """One row of the table; joints, tracking and misses of arms with a plan."""
+    """One row of the table; joints, tracking and contacts are those of arms with a plan."""
     from planner_jax.sims.tasks.block import TOUCH
 
     number, good, some = len(flights.miss), flights.success, flights.planned
@@ -52,11 +52,13 @@ def line(regime: str, name: str, flights: Any, seconds: float) -> str:
         percent(int((clearance[some] < -TOUCH).sum()), int(some.sum()))
         for clearance in (flights.clearance, flights.clearance_after)
     )
-    flown, miss = flights.flown, 100.0 * flights.miss[some]
+    flown, miss = flights.flown, 100.0 * flights.miss[flights.blocked]
     tracking = 100.0 * flown.tracking[some]
     error = 1e3 * np.sqrt((flown.error_rms[some] ** 2).mean(axis=0))
     torque = np.sqrt((flown.torque_rms[some, :3] ** 2).mean(axis=0))
     most, share = flown.torque_worst[some, :3].max(axis=0), flown.saturation[some, :3].mean(axis=0)
+
+    missed = f"{np.median(miss):.2f} / {miss.max():.1f}" if miss.size else "-"
 
     def joined(values: np.ndarray, form: str) -> str:
         return " / ".join(format(value, form) for value in values)
@@ -64,7 +66,7 @@ def line(regime: str, name: str, flights: Any, seconds: float) -> str:
     return (
         f"| {regime} | {name} | {percent(int(good.sum()), number)} ({low:.1f} to {high:.1f}) | "
         f"{percent(int(flights.blocked.sum()), number)} | {touched} / {after} | "
-        f"{np.nanmedian(miss):.2f} / {np.nanmax(miss):.1f} | "
+        f"{missed} | "
         f"{np.median(tracking[:, 0]):.2f} / {tracking[:, 1].max():.1f} | {joined(error, '.2f')} | "
         f"{joined(torque, '.0f')} | {joined(most, '.0f')} | {joined(100.0 * share, '.1f')} | "
         f"{seconds:.1f} |"
