@@ -38,7 +38,8 @@ ROWS: dict[str, dict[str, Any]] = {
 HEADER = (
     "| regime | row | success % (95 %) | blocked, % | touched / after it, % | "
     "miss of blocked p50 / worst, cm | tracking p50 / worst, cm | "
-    "error rms of joints 1 to 6, mrad | torque rms of joints 1 to 3, N m | worst, N m | at the limit, % of the time | s |"
+    "error rms of joints 1 to 6, mrad | torque rms of joints 1 to 3, N m | worst, N m | "
+    "at the limit, % of the time | s |"
 )
 
 
