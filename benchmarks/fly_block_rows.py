@@ -129,11 +129,12 @@ def measure(bench: Bench, regime: str, rows: list[str], options: Any) -> None:
 
 def main() -> None:
     """Print the rows asked for."""
+    known = ", ".join(ROWS).replace("%", "%%")
     parser = argument_parser("fly_block_rows", __doc__, num=200, seed=0)
     parser.add_argument("--suite", default="pole", choices=("pole", "open", "short"))
     parser.add_argument("--planner", default="online")
     parser.add_argument("--regimes", default="R1,R2", help=f"out of {', '.join(REGIMES)}")
-    parser.add_argument("--rows", default=",".join(ROWS), help=f"out of {', '.join(ROWS)}")
+    parser.add_argument("--rows", default=",".join(ROWS), help=f"out of {known}")
     parser.add_argument("--wide", action="store_true", help="balls met off the middle and aslant")
     parser.add_argument("--count", action="store_true", help="plans that take too long come late")
     options = parser.parse_args()
