@@ -1,4 +1,4 @@
-"""Flight of the plans in simulation: quadrotors that catch and hit in closed loop."""
+"""Plans in simulation, in closed loop: quadrotors that catch and hit, a car, an arm."""
 
 import importlib.util
 

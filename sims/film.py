@@ -13,8 +13,8 @@ from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from planner_jax.sims.recording import Recording, frame
-from planner_jax.sims.robot import rotation
-from planner_jax.sims.scenery import FLAT, Part, Prism, machine_parts, outlines
+from planner_jax.sims.robot import Solid, rotation
+from planner_jax.sims.scenery import FLAT, Part, Prism, machine_parts, outlines, part_solid
 from planner_jax.sims.task import FlightTask
 from planner_jax.sweep.figures.style import BLUE, GREEN, GREY, INK, ORANGE, PALE, PURPLE, RED, SKY
 
@@ -77,6 +77,7 @@ class Scene:
             self.axes.plot([], [], [], color=colour, lw=1.6, label=name)[0]
             for colour, name in zip(colours, names, strict=True)
         ]
+        self.dots = [self.axes.plot([], [], [], "o", ms=5, color=colour)[0] for colour in colours]
         self.returned = None
         if np.isfinite(self.back).any():
             self.returned = self.axes.plot([], [], [], color=GREEN, lw=1.6, label="returned ball")[
@@ -94,11 +95,15 @@ class Scene:
         patches = [outlines(part)[1] for part in flat]
         edges = [line for part in solid for line in outlines(part)]
         edges += [line for prism in standing for line in prism.outlines(0.0)]
-        points = np.concatenate([wanted, balls.reshape(-1, 3), *edges, *patches])
-        low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
-        thin = np.maximum(1.6 - (high - low), 0.0)  # [m], so that flat flights keep their depth
-        low, high = low - 0.2 - 0.5 * thin, high + 0.2 + 0.5 * thin
-        low[2] = 0.0
+        if task.BOUNDS is None:
+            points = np.concatenate([wanted, balls.reshape(-1, 3), *edges, *patches])
+            low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
+            thin = np.maximum(1.6 - (high - low), 0.0)  # [m], so that flat flights keep depth
+            low, high = low - 0.2 - 0.5 * thin, high + 0.2 + 0.5 * thin
+            low[2] = 0.0
+        else:
+            low, high = map(np.array, task.BOUNDS)
+            balls = self._within(low, high)
         self.axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
         self.axes.set_box_aspect(high - low, zoom=1.15)
         title = title or task.title(recording, flight)
@@ -116,14 +121,32 @@ class Scene:
             self.axes.add_collection3d(Poly3DCollection([patch], zorder=0, **look))
         for prism in standing:
             self._fill(prism, 0.0)
+        for part in solid:
+            if part.opacity < 1.0:
+                self._add_solid(part_solid(part), part.colour, part.opacity)
         self.axes.view_init(*(view or task.VIEW))
         self.axes.legend(loc="upper left", fontsize=9, frameon=False)
+
+    def _within(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """The balls (K, N, 3), NaN outside of what is shown, before and after a contact alike."""
+        balls = self.recording.balls[self.flight]
+        inside = ((balls >= low) & (balls <= high)).all(axis=2, keepdims=True)
+        self.balls = np.where(inside, self.balls, np.nan)
+        self.back = np.where(inside[:, 0], self.back, np.nan)
+        return np.where(inside, balls, np.nan)
 
     def _fill(self, prism: Prism, time: float) -> list[Any]:
         """A prism's top at a time [s], filled; what it was drawn with."""
         top = prism.outlines(time)[1]
         look = {"facecolor": prism.colour, "edgecolor": GREY, "linewidth": 0.5, "alpha": 0.6}
         return [self.axes.add_collection3d(Poly3DCollection([top], **look))]
+
+    def _add_solid(self, solid: Solid, colour: str, opacity: float, shade: bool = False) -> Any:
+        """The faces of a solid in the world; what they are drawn with."""
+        faces = solid.corners[solid.triangles]
+        look = {"facecolors": colour, "edgecolors": colour, "linewidth": 0.0}
+        look |= {"alpha": opacity, "shade": shade}
+        return self.axes.add_collection3d(Poly3DCollection(faces, **look))
 
     def wanted(self) -> np.ndarray:
         """The path of the plans that are flown (M, 3) [m], from the first to the last contact."""
@@ -149,6 +172,10 @@ class Scene:
         for shape, (place, quat) in zip(robot.shapes(), robot.places(pose), strict=True):
             R = rotation(quat, np)
             lines = [place + line @ R.T for line in shape.lines]
+            for corners, triangles in shape.solids:
+                solid = Solid(place + corners @ R.T, triangles)
+                colour = SKY if shape.tool else shape.colour
+                drawn.append(self._add_solid(solid, colour, alpha, shade=True))
             drawn += [self.axes.plot(*line.T, color=BLUE, lw=1.4, alpha=alpha)[0] for line in lines]
             if shape.tool:
                 look = {"facecolor": SKY, "edgecolor": "none", "alpha": 0.5 * alpha}
@@ -183,6 +210,10 @@ class Scene:
         """The moving parts at a look; the returned ball's path up to another one, if given."""
         for trail, path in zip(self.trails, np.moveaxis(self.balls[: at + 1], 1, 0), strict=True):
             trail.set_data_3d(*path.T)
+        for k, dot in enumerate(self.dots):
+            place = self.balls[at, k]
+            back = k == 0 and np.isfinite(self.back[at]).all()
+            dot.set_data_3d(*(self.back[at] if back else place)[:, None])
         if self.returned is not None:
             self.returned.set_data_3d(*self.back[: (at if back is None else back) + 1].T)
         for part in self.moving:

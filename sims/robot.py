@@ -1,8 +1,8 @@
 """What the simulated world, the closed loop and the pictures ask of a robot.
 
 A robot is a frozen dataclass, static under jit: `robots/quadrotor/robot.py` is one, which carries a
-tool, and `robots/car/robot.py` one without. Its part of MuJoCo's state comes first in `qpos` and
-`qvel`, before that of the balls; all of `act` is its own.
+tool, `robots/car/robot.py` and `robots/arm/robot.py` are two without. Its part of MuJoCo's state
+comes first in `qpos` and `qvel`, before that of the balls; all of `act` is its own.
 """
 
 import dataclasses
@@ -36,12 +36,21 @@ class Physics:
     act: Array  # (A,), what the actuators have reached, in their units
 
 
+class Solid(NamedTuple):
+    """The surface of a body, closed and convex."""
+
+    corners: np.ndarray  # (V, 3) [m]
+    triangles: np.ndarray  # (T, 3) int, seen from outside counter-clockwise
+
+
 class Shape(NamedTuple):
     """A rigid part of a robot as it is drawn, in the part's own frame."""
 
     lines: list[np.ndarray]  # each (M, 3) [m]
     discs: list[tuple[np.ndarray, float]]  # centre (3,) [m] and radius [m], across the z axis
     tool: bool = False  # whether the last line is the tool's rim
+    solids: tuple[Solid, ...] = ()
+    colour: str = "#D9A441"  # of the solids
 
 
 def rotation(quat_wxyz: Any, array_library: Any = jnp) -> Any:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 
 from planner_jax.sims.film import FilmError, draw_flight, film_flights, require_film
 from planner_jax.sims.recording import FILE, Recording, read_recording, to_rows
@@ -218,6 +219,9 @@ def write_flight_report(folder: RunFolder) -> None:
     manifest, flight, recording = read_flights(folder)
     folder.figures.mkdir(exist_ok=True)
     draw_flight(folder.figures / "flight.png", flight, recording, 0)
+    rows = pq.read_table(folder.plans)
+    figures = ["flight.png", *flight.draw(folder.figures, rows)]
+    more = flight.tables(rows)
     summary, video = manifest["summary"], manifest["video"]
     cells = own_cells(summary["successes"], summary["num"])
     table = RateTable(
@@ -228,7 +232,9 @@ def write_flight_report(folder: RunFolder) -> None:
     lines = headline(manifest, flight)
     title = f"Flights, {flight.settings.TASK.name}, {flight.suite}"
     remarks = [f"Everything is simulated in MuJoCo MJX: {flight.simulated}."]
-    folder.write_text("table.md", to_markdown(title, lines, table, remarks))
+    text = to_markdown(title, lines, table, remarks)
+    text += "".join(f"\n{to_markdown(each.title, (), each, ())}" for each in more)
+    folder.write_text("table.md", text)
     lead = "".join(f"<p>{html.escape(line)}</p>\n" for line in lines)
     shown = f'<p><img src="{html.escape(video)}" alt="film"></p>\n' if video else ""
     if video and video.endswith(".mp4"):
@@ -238,10 +244,16 @@ def write_flight_report(folder: RunFolder) -> None:
         "index.html",
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         f"<title>{html.escape(title)}</title></head>\n<body>\n<h1>{html.escape(title)}</h1>\n"
-        f'{lead}{shown}<p><img src="figures/flight.png" alt="one flight"></p>\n'
-        f'{to_html(table)}<p>All rows: <a href="plans.parquet">plans.parquet</a>. The first '
+        f"{lead}{shown}{''.join(_image(name) for name in figures)}{to_html(table)}"
+        f"{''.join(f'<h2>{html.escape(each.title)}</h2>{chr(10)}{to_html(each)}' for each in more)}"
+        f'<p>All rows: <a href="plans.parquet">plans.parquet</a>. The first '
         f"{len(recording)} flights look by look: "
         f'<a href="{FILE}">{FILE}</a>; play them with <code>planner-jax view</code>.</p>\n'
         f"<details><summary>manifest.json</summary><pre>{record}</pre></details>\n"
         "</body></html>\n",
     )
+
+
+def _image(name: str) -> str:
+    """A figure of the run folder as HTML."""
+    return f'<p><img src="figures/{name}" alt="{name.partition(".")[0]}"></p>\n'

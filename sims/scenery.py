@@ -4,11 +4,15 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.spatial import ConvexHull
+
+from planner_jax.sims.robot import Solid
 
 GROUND_COLOUR = "#A9C4A9"
 FLAT = 0.01  # [m]: parts that are no higher lie on the ground
 LOOK = 'mass="0" contype="0" conaffinity="0"'  # MJCF, of what is there to be looked at
 _STEEL, _RUBBER = "#5B6B73", "#2E8B57"
+_SIDES, _RINGS = 14, 3  # of a capsule as it is drawn, around it and at each end
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,6 +24,7 @@ class Part:
     centre: tuple[float, float, float]  # [m], world frame
     colour: str  # as #RRGGBB
     turn: float = 0.0  # [rad] about z
+    opacity: float = 1.0  # less than 1 for what is to be looked through
 
     @property
     def quat_wxyz(self) -> tuple[float, float, float, float]:
@@ -101,14 +106,52 @@ def outlines(part: Part) -> list[np.ndarray]:
     return [low, high, *(np.stack([low[k], high[k]]) for k in corners)]
 
 
+def hull(points: np.ndarray) -> Solid:
+    """The convex hull of points (P, 3) [m] that are all on it."""
+    found = ConvexHull(points)
+    a, b, c = (points[found.simplices[:, k]] for k in range(3))
+    inward = np.sum(np.cross(b - a, c - a) * found.equations[:, :3], axis=1) < 0.0
+    triangles = np.where(inward[:, None], found.simplices[:, ::-1], found.simplices)
+    return Solid(points, triangles)
+
+
+def box_solid(lower: np.ndarray, upper: np.ndarray) -> Solid:
+    """A box along the axes between two corners (3,) [m]."""
+    share = np.stack(np.meshgrid(*[[0.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
+    return hull(lower + share * (np.asarray(upper) - lower))
+
+
+def capsule_solid(first: np.ndarray, second: np.ndarray, radius: float) -> Solid:
+    """A capsule around the segment of two ends (3,) [m], as rings of points about its axis."""
+    along = np.asarray(second, float) - first
+    length = float(np.linalg.norm(along))
+    axis = along / length if length > 0.0 else np.array([1.0, 0.0, 0.0])
+    aside = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+    aside /= np.linalg.norm(aside)
+    turn = np.linspace(0.0, 2.0 * np.pi, _SIDES, endpoint=False)[:, None]
+    ring = np.cos(turn) * aside + np.sin(turn) * np.cross(axis, aside)
+    rise = np.linspace(0.0, 0.5 * np.pi, _RINGS + 1)[:-1, None, None]
+    cap = radius * (np.cos(rise) * ring + np.sin(rise) * axis).reshape(-1, 3)
+    ends = np.concatenate([cap, radius * axis[None]])
+    points = np.concatenate([second + ends, first - ends])
+    if length == 0.0:
+        points = np.unique(points.round(9), axis=0)
+    return hull(points)
+
+
+def part_solid(part: Part) -> Solid:
+    """The surface of a part in the world."""
+    return hull(np.concatenate([line[:-1] for line in outlines(part)[:2]]))
+
+
 def xml_numbers(*values: float) -> str:
     """Numbers as MJCF writes them."""
     return " ".join(f"{value:.9g}" for value in values)
 
 
-def xml_colour(colour: str) -> str:
+def xml_colour(colour: str, opacity: float = 1.0) -> str:
     """The MJCF colour of #RRGGBB."""
-    return xml_numbers(*(int(colour[k : k + 2], 16) / 255.0 for k in (1, 3, 5)), 1.0)
+    return xml_numbers(*(int(colour[k : k + 2], 16) / 255.0 for k in (1, 3, 5)), opacity)
 
 
 def part_xml(part: Part) -> str:
@@ -117,5 +160,6 @@ def part_xml(part: Part) -> str:
     half = (length, width, height) if part.kind == "box" else (length, height)
     return (
         f'<geom type="{part.kind}" size="{xml_numbers(*half)}" pos="{xml_numbers(*part.centre)}" '
-        f'quat="{xml_numbers(*part.quat_wxyz)}" rgba="{xml_colour(part.colour)}" {LOOK}/>'
+        f'quat="{xml_numbers(*part.quat_wxyz)}" '
+        f'rgba="{xml_colour(part.colour, part.opacity)}" {LOOK}/>'
     )

@@ -4,12 +4,16 @@ Nothing here imports JAX or MuJoCo; `FlySettings.flight` does.
 """
 
 import dataclasses
+import math
 import pkgutil
 from typing import Any, ClassVar
 
 from planner_jax.registry import Task, all_tasks
 from planner_jax.sims.noise import NOISES, PLANE_NOISES, PlaneSensing, Sensing, require_whole
+from planner_jax.sims.robots.arm.drives import ENCODERS, TORQUES, Drives
+from planner_jax.sweep.block.settings import REGIMES
 from planner_jax.sweep.settings import SettingError, option, require, require_one_of
+from planner_jax.task.block.card import TASK as BLOCK
 from planner_jax.task.catch.card import TASK as CATCH
 from planner_jax.task.hit.card import TASK as HIT
 from planner_jax.task.intercept.card import GROUPS
@@ -193,3 +197,60 @@ class InterceptFly(FlySettings):
     def check_rate(self) -> None:
         """Raise `ValueError` unless a period of planning is a whole number of frames."""
         self.sensing.frames_per_plan(self.rate)
+
+
+@dataclasses.dataclass(frozen=True)
+class BlockFly(FlySettings):
+    """Blocks of an arm with a shield."""
+
+    replan: float | None = option(None, "HZ", "0: a block is planned once")
+    planner: str = option("online", "NAME", "of all plans, made one at a time")
+    suite: str = option("pole", "NAME", "of throws")
+    regime: str = option("R2", "NAME", f"limits that plans keep: {', '.join(REGIMES)}")
+    wide: bool = option(
+        False, "", "the ball may be 0.1 m off the shield's middle and 30 degrees off straight on"
+    )
+    # Paper 004, Section VI-B: 82.9 ms for perception and 50 ms for the rest of the system.
+    sense: float = option(0.133, "S", "until the ball's flight is known")
+    allowed: float = option(0.03, "S", "that plans may take; then the arm sets out")
+    torque: float = option(1.0, "F", "share of the drives' torques that is there")
+    lag: float = option(0.005, "S", "of the torques, first order")
+    latency: float = option(0.0, "S", "by which plans come late to the joints")
+    encoders: str = option("fine", "NAME", f"noise of angles and rates: {', '.join(ENCODERS)}")
+    mass_error: float = option(0.05, "F", "relative, of the masses that control believes")
+
+    TASK: ClassVar[Task] = BLOCK
+    FLIGHT: ClassVar[str] = "planner_jax.sims.tasks.block:BlockFlight"
+    RATE: ClassVar[float] = 0.0
+
+    def __post_init__(self) -> None:
+        require_one_of(ENCODERS, "encoders", self.encoders)
+        require_one_of(REGIMES, "regime", self.regime)
+        require_one_of(BLOCK.suites, "suite", self.suite)
+        for name in ("sense", "allowed"):
+            value = getattr(self, name)
+            require(0.0 <= value < math.inf, name, "finite and >= 0", value)
+        require(0.0 < self.torque < math.inf, "torque", "finite and > 0", self.torque)
+        super().__post_init__()
+
+    @property
+    def drives(self) -> Drives:
+        """What drives and encoders can do.
+
+        Raises:
+            ValueError: a value is out of its range.
+        """
+        angle_std, rate_std = ENCODERS[self.encoders]
+        return Drives(
+            torques=tuple(self.torque * each for each in TORQUES),
+            lag=self.lag,
+            latency=self.latency,
+            angle_std=angle_std,
+            rate_std=rate_std,
+            mass_error=self.mass_error,
+        )
+
+    def check_rate(self) -> None:
+        """Raise `ValueError` unless plans are made once and the drives are possible."""
+        require(self.rate == 0.0, "replan", "0, a block is planned once", self.rate)
+        _ = self.drives

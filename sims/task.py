@@ -3,6 +3,7 @@
 import abc
 import dataclasses
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, ClassVar, Self
 
 import jax
@@ -15,6 +16,7 @@ from planner_jax.sims.recording import Launches, Recording, recorded
 from planner_jax.sims.scenery import Prism
 from planner_jax.sims.settings import BallFly
 from planner_jax.sweep.columns import LIST, Column, leaves_of
+from planner_jax.sweep.table import RateTable
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,6 +64,8 @@ class FlightTask(abc.ABC):
     SUCCESS: ClassVar[str]  # what a flight has done that succeeded: "caught all balls"
     PUBLISHED: ClassVar[str]  # what is published of the task, for the table
     COLUMNS: ClassVar[Sequence[Column]]  # of `plans.parquet`, besides those of all tasks
+    # Corners of what pictures show [m]; None for all that moves and stands.
+    BOUNDS: ClassVar[tuple[tuple[float, float, float], tuple[float, float, float]] | None] = None
     HAS_REACH: ClassVar[bool] = False  # whether `reachable` can say anything
     VIEW: ClassVar[tuple[float, float]] = (18.0, -68.0)  # elevation and azimuth of pictures [deg]
     # Where the eye of the viewer is, and where it looks [m].
@@ -130,6 +134,14 @@ class FlightTask(abc.ABC):
     def findings(self, summary: Mapping[str, Any]) -> list[str]:
         """What else is said of a run at its top, a sentence each."""
         return []
+
+    def tables(self, rows: Any) -> Sequence[RateTable]:
+        """What else is told of the rows of a run, in tables under that of the rates."""
+        return ()
+
+    def draw(self, folder: Path, rows: Any) -> Sequence[str]:
+        """Write more figures of the rows of a run into a folder; the names of their files."""
+        return ()
 
     def title(self, recording: Recording, flight: int) -> str:
         """Task, place in the run and outcome of a flight."""

@@ -186,8 +186,12 @@ class Viewer:
         for number, shape in enumerate(self.world.robot.shapes()):
             name = f"/robot{number}"
             self.robot.append(add.add_frame(name, show_axes=False))
-            pieces = np.concatenate([segments(line) for line in shape.lines])
-            self._add_line(f"{name}/lines", pieces, BLUE, 0.012)
+            if shape.lines:
+                pieces = np.concatenate([segments(line) for line in shape.lines])
+                self._add_line(f"{name}/lines", pieces, BLUE, 0.012)
+            for k, solid in enumerate(shape.solids):
+                colour = SKY if shape.tool else shape.colour
+                self._add_mesh(f"{name}/solid{k}", *solid, colour)
             for k, (place, radius) in enumerate(shape.discs):
                 add.add_cylinder(f"{name}/disc{k}", radius, position=place, **flat)
         nothing = np.zeros((1, 2, 3))
@@ -204,10 +208,21 @@ class Viewer:
     def _add_line(self, name: str, pieces: np.ndarray, colour: str, thickness: float) -> Any:
         return self._scene.add_line_segments(name, pieces, _rgb(colour), thickness=thickness)
 
+    def _add_mesh(self, name: str, corners: np.ndarray, triangles: np.ndarray, colour: str) -> Any:
+        return self._scene.add_mesh_simple(
+            name,
+            corners.astype(np.float32),
+            triangles.astype(np.uint32),
+            color=_rgb(colour),
+            flat_shading=True,
+        )
+
     def _add_parts(self, name: str, parts: Sequence[Part]) -> list[Any]:
         drawn = []
         for number, part in enumerate(parts):
             look = {"color": _rgb(part.colour), "wxyz": part.quat_wxyz, "position": part.centre}
+            if part.opacity < 1.0:
+                look["opacity"] = part.opacity
             own = f"{name}/{number}"
             if part.kind == "box":
                 drawn.append(self._scene.add_box(own, dimensions=part.size, **look))
@@ -246,13 +261,7 @@ class Viewer:
             self._prisms, self._layers = [], []
             for number, prism in enumerate(self.task.surroundings(int(recording.index[row]))):
                 vertices, faces = prism.mesh()
-                solid = self._scene.add_mesh_simple(
-                    f"/prism{number}",
-                    vertices.astype(np.float32),
-                    faces.astype(np.uint32),
-                    color=_rgb(prism.colour),
-                    flat_shading=True,
-                )
+                solid = self._add_mesh(f"/prism{number}", vertices, faces, prism.colour)
                 self._prisms.append((prism, solid))
                 drawn.append(solid)
             if self.reach is not None and self.reach.value:

@@ -29,8 +29,8 @@ from tests.recordings import recording
     ("build", "message"),
     [
         (
-            lambda: fly_settings("block"),
-            "task must be one that can be flown (hit, catch, intercept), got 'block'",
+            lambda: fly_settings("dodge"),
+            "task must be one that can be flown (hit, catch, intercept, block), got 'dodge'",
         ),
         (lambda: CatchFly(noise="loud"), "noise must be one of none, lab, harsh, got 'loud'"),
         (lambda: CatchFly(num=0), "num must be >= 1, got 0"),
@@ -194,7 +194,7 @@ def test_a_task_without_flights_is_refused_in_one_line(monkeypatch):
     monkeypatch.setitem(all_tasks(), "drop", dataclasses.replace(DROP, flight=None))
     with pytest.raises(SettingError) as error:
         fly_settings("drop")
-    rule = "task must be one that can be flown (hit, catch, intercept)"
+    rule = "task must be one that can be flown (hit, catch, intercept, block)"
     assert str(error.value) == f"{rule}, got 'drop'"
 
 

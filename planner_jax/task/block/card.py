@@ -28,5 +28,6 @@ TASK = Task(
     planners={"online": "planner_jax.task.block.online:OnlineBlock"},
     suites={name: suite.description for name, suite in SUITES.items()},
     sweep="planner_jax.sweep.block.settings:BlockSettings",
+    flight="planner_jax.sims.settings:BlockFly",
     contact="contact_time",
 )

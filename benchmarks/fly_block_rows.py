@@ -1,0 +1,150 @@
+"""Every row of the blocks' protocol: which share of balls is blocked in simulation, and by what.
+
+    python -m benchmarks.fly_block_rows [--num 200] [--seed 0] [--suite pole]
+                                        [--regimes R1,R2] [--rows ideal,drives,...] [--count]
+
+Plans are made once for each regime, one at a time, and carried out in every row; a ball is blocked
+when it comes down on the face of the shield before its centre is in the inner box, and a block
+counts if the arm touched nothing until then. The arm may start 163 ms after a ball is first seen:
+83 ms of perception and 50 ms of overheads (paper 004, Section VI-B), and 30 ms for planning. A plan
+that took longer counts as there in time, since the clock is that of the machine at hand, unless
+`--count` is given. The share of plans that the referee accepts is what an ideal arm reaches.
+"""
+
+import dataclasses
+import time
+from typing import Any
+
+import numpy as np
+
+from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
+from planner_jax.sweep.block.settings import REGIMES
+from planner_jax.sweep.summary import percent, wilson_interval
+
+# Row -> fields of `Drives` that differ from ideal ones, with "share" of the torques.
+ROWS: dict[str, dict[str, Any]] = {
+    "ideal": {},
+    "lag 5 ms": {"lag": 0.005},
+    "fine encoders": {"angle_std": 1e-4, "rate_std": 0.01},
+    "coarse encoders": {"angle_std": 1e-3, "rate_std": 0.1},
+    "masses believed 5 % wrong": {"mass_error": 0.05},
+    "masses believed 20 % wrong": {"mass_error": 0.2},
+    "default": {"lag": 0.005, "angle_std": 1e-4, "rate_std": 0.01, "mass_error": 0.05},
+    "latency 10 ms": {"latency": 0.01},
+    "latency 30 ms": {"latency": 0.03},
+    "torques halved": {"share": 0.5},
+    "torques quartered": {"share": 0.25},
+}
+HEADER = (
+    "| regime | row | success % (95 %) | blocked, % | touched / after it, % | "
+    "miss of blocked p50 / worst, cm | tracking p50 / worst, cm | "
+    "error rms of joints 1 to 6, mrad | torque rms of joints 1 to 3, N m | worst, N m | "
+    "at the limit, % of the time | s |"
+)
+
+
+def line(regime: str, name: str, flights: Any, seconds: float) -> str:
+    """One row of the table; joints, tracking and contacts are those of arms with a plan."""
+    from planner_jax.sims.tasks.block import TOUCH
+
+    number, good, some = len(flights.miss), flights.success, flights.planned
+    low, high = (100.0 * end for end in wilson_interval(int(good.sum()), number))
+    touched, after = (
+        percent(int((clearance[some] < -TOUCH).sum()), int(some.sum()))
+        for clearance in (flights.clearance, flights.clearance_after)
+    )
+    flown, miss = flights.flown, 100.0 * flights.miss[flights.blocked]
+    tracking = 100.0 * flown.tracking[some]
+    error = 1e3 * np.sqrt((flown.error_rms[some] ** 2).mean(axis=0))
+    torque = np.sqrt((flown.torque_rms[some, :3] ** 2).mean(axis=0))
+    most, share = flown.torque_worst[some, :3].max(axis=0), flown.saturation[some, :3].mean(axis=0)
+
+    missed = f"{np.median(miss):.2f} / {miss.max():.1f}" if miss.size else "-"
+
+    def joined(values: np.ndarray, form: str) -> str:
+        return " / ".join(format(value, form) for value in values)
+
+    return (
+        f"| {regime} | {name} | {percent(int(good.sum()), number)} ({low:.1f} to {high:.1f}) | "
+        f"{percent(int(flights.blocked.sum()), number)} | {touched} / {after} | "
+        f"{missed} | "
+        f"{np.median(tracking[:, 0]):.2f} / {tracking[:, 1].max():.1f} | {joined(error, '.2f')} | "
+        f"{joined(torque, '.0f')} | {joined(most, '.0f')} | {joined(100.0 * share, '.1f')} | "
+        f"{seconds:.1f} |"
+    )
+
+
+def measure(bench: Bench, regime: str, rows: list[str], options: Any) -> None:
+    """Plan once, and carry the plans out in every row."""
+    from planner_jax.protocol import is_solved
+    from planner_jax.sims.robots.arm.drives import TORQUES, Drives
+    from planner_jax.sims.tasks.block import BLOCK_WORLD, fly_blocks, throws, timed_plans
+    from planner_jax.task.block.words import judge, planner
+
+    sense, allowed = 0.133, 0.03
+    cases = throws(
+        options.suite,
+        options.num,
+        options.seed,
+        regime=regime,
+        wide=options.wide,
+        delay=sense + allowed,
+    )
+    plan, seconds = timed_plans(planner(options.planner), cases.cases)
+    accepted = judge(cases.cases, plan).success & is_solved(plan.status)
+    quick, slow = (1e3 * np.quantile(seconds, share) for share in (0.5, 0.99))
+    bench.say(
+        f"{regime}: {percent(int(accepted.sum()), len(accepted))} % of the balls have a plan that "
+        f"the referee accepts; planning p50 {quick:.1f} ms, p99 {slow:.1f} ms, "
+        f"{percent(int((seconds > allowed).sum()), len(seconds))} % above {1e3 * allowed:g} ms"
+    )
+    for name in rows:
+        given = dict(ROWS[name])
+        share = given.pop("share", 1.0)
+        drives = Drives(torques=tuple(share * torque for torque in TORQUES), **given)
+        began = time.perf_counter()
+        flights = fly_blocks(
+            BLOCK_WORLD,
+            cases,
+            options.seed,
+            drives=drives,
+            allowed=allowed if options.count else None,
+            plan=plan,
+            seconds=seconds,
+        )
+        spent = time.perf_counter() - began
+        bench.say(line(regime, name, flights, spent))
+        bench.count(flights.success)
+        bench.row(
+            regime=regime,
+            row=name,
+            drives=dataclasses.asdict(drives),
+            success=int(flights.success.sum()),
+            blocked=int(flights.blocked.sum()),
+            accepted=int(accepted.sum()),
+            num=len(flights.success),
+            seconds=spent,
+        )
+
+
+def main() -> None:
+    """Print the rows asked for."""
+    known = ", ".join(ROWS).replace("%", "%%")
+    parser = argument_parser("fly_block_rows", __doc__, num=200, seed=0)
+    parser.add_argument("--suite", default="pole", choices=("pole", "open", "short"))
+    parser.add_argument("--planner", default="online")
+    parser.add_argument("--regimes", default="R1,R2", help=f"out of {', '.join(REGIMES)}")
+    parser.add_argument("--rows", default=",".join(ROWS), help=f"out of {known}")
+    parser.add_argument("--wide", action="store_true", help="balls met off the middle and aslant")
+    parser.add_argument("--count", action="store_true", help="plans that take too long come late")
+    options = parser.parse_args()
+    regimes = chosen(parser, "--regimes", options.regimes, REGIMES)
+    rows = chosen(parser, "--rows", options.rows, ROWS)
+    with begin(parser, options) as bench:
+        bench.say(HEADER, "|---" * HEADER.count(" | ") + "|---|")
+        for regime in regimes:
+            measure(bench, regime, rows, options)
+
+
+if __name__ == "__main__":
+    main()

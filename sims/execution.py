@@ -1,0 +1,255 @@
+"""Plans of an arm carried out in closed loop: read the joints, ask for torques, step the world.
+
+A physics step is a control step; two of them make a frame, at whose end the joints are kept. The
+arm waits until its course begins, follows it, and brakes where it ends. Written for one arm;
+`execute` makes a batch of it. Times count from the moment at which the ball is first seen.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array, lax
+
+from planner_jax.sims.model import World, step
+from planner_jax.sims.robot import Physics
+from planner_jax.sims.robots.arm.control import Course, JointReference
+from planner_jax.sims.robots.arm.drives import IDEAL, Drives
+from planner_jax.sims.robots.arm.robot import ShieldArm
+
+TIMESTEP = 1e-3  # [s], of physics and control
+_STEPS, _FRAMES = 2, 50  # steps a frame, frames of one compiled call
+FRAME = _STEPS * TIMESTEP  # [s]
+
+
+@struct.dataclass
+class ArmState:
+    """Everything that changes while an arm follows a course."""
+
+    physics: Physics
+    torques: Array  # (6,) [N m], that act
+    squared_error: Array  # (6,) [rad^2 s], of the angles from the course
+    worst_error: Array  # (6,) [rad]
+    squared_torque: Array  # (6,) [N^2 m^2 s]
+    worst_torque: Array  # (6,) [N m]
+    saturated: Array  # (6,) [s], how long more was asked than a drive can do
+    time: Array  # () [s]
+    key: Array
+
+
+@struct.dataclass
+class _Setting:
+    """What an arm does and with which drives, the same at all times."""
+
+    course: Course
+    since: Array  # () [s], from when on errors and torques count
+    until: Array  # () [s]
+    torques: Array  # (6,) [N m]
+    lag: Array  # () [s]
+    stds: Array  # (2,) [rad], [rad/s]
+    mass_error: Array  # ()
+
+
+@dataclasses.dataclass(frozen=True)
+class Executed:
+    """What came of a batch of courses, on the host in float64; leaves with a leading axis B.
+
+    Errors and torques count from the time at which the arm may start to that of its contact.
+    """
+
+    times: np.ndarray  # (S,) [s], of the frames, the first 0
+    angles: np.ndarray  # (B, S, 6) [rad]
+    wanted: np.ndarray  # (B, S, 6) [rad], by the course as it was planned
+    tracking: np.ndarray  # (B, 2) [m], of the shield's middle from its plan: rms and worst
+    error_rms: np.ndarray  # (B, 6) [rad], of angles from what the joints were told, maybe late
+    error_worst: np.ndarray  # (B, 6) [rad]
+    torque_rms: np.ndarray  # (B, 6) [N m]
+    torque_worst: np.ndarray  # (B, 6) [N m]
+    saturation: np.ndarray  # (B, 6), share of the time that a drive was at its limit
+    last_rates: np.ndarray  # (B, 6) [rad/s], at the last frame, where another plan may begin
+
+
+def _arm(world: World) -> ShieldArm:
+    assert isinstance(world.robot, ShieldArm)  # `execute` has seen to it
+    return world.robot
+
+
+def _one_frame(
+    world: World, setting: _Setting, state: ArmState
+) -> tuple[ArmState, tuple[Array, Array]]:
+    """The arm one frame later, and its angles (6,) and rates (6,) there."""
+    robot, dtype, span = _arm(world), state.time.dtype, world.timestep
+    key, noise_key = jax.random.split(state.key)
+    noise = jax.random.normal(noise_key, (_STEPS, *robot.noise_shape), dtype)
+    times = state.time + span * jnp.arange(_STEPS, dtype=dtype)
+    # What the drives lag behind is asked for earlier.
+    references = robot.references(setting.course, times, world)
+    ahead = robot.references(setting.course, times + setting.lag, world)
+    references = dataclasses.replace(references, accelerations=ahead.accelerations)
+    follows = 1.0 - jnp.exp(-span / jnp.maximum(setting.lag, 1e-6))
+
+    def advance(state: ArmState, now: tuple[JointReference, Array, Array]) -> tuple[ArmState, None]:
+        reference, noise, time = now
+        true = robot.state(state.physics)
+        asked = robot.command(
+            robot.sensed(true, noise, setting.stds), reference, world, setting.mass_error
+        )
+        limited = jnp.clip(asked, -setting.torques, setting.torques)
+        torques = state.torques + follows * (limited - state.torques)
+        counts = jnp.where((time >= setting.since) & (time < setting.until), 1.0, 0.0)
+        error = counts * jnp.abs(true.angles - reference.angles)
+        size = counts * jnp.abs(torques)
+        return ArmState(
+            physics=step(world, state.physics, torques, jnp.zeros(0, dtype)),
+            torques=torques,
+            squared_error=state.squared_error + span * error**2,
+            worst_error=jnp.maximum(state.worst_error, error),
+            squared_torque=state.squared_torque + span * size**2,
+            worst_torque=jnp.maximum(state.worst_torque, size),
+            saturated=state.saturated + span * counts * (jnp.abs(asked) > setting.torques),
+            time=state.time,
+            key=state.key,
+        ), None
+
+    state, _ = lax.scan(advance, state, (references, noise, times))
+    state = dataclasses.replace(state, time=state.time + _STEPS * span, key=key)
+    after = robot.state(state.physics)
+    return state, (after.angles, after.rates)
+
+
+def _frames(world: World, setting: _Setting, state: ArmState) -> tuple[ArmState, Any]:
+    return lax.scan(lambda state, _: _one_frame(world, setting, state), state, None, length=_FRAMES)
+
+
+def _begun(world: World, setting: _Setting, key: Array) -> ArmState:
+    """An arm at time 0 of its course, with the torques that it needs there."""
+    robot, zero = _arm(world), jnp.zeros_like(setting.course.begin)
+    reference = jax.tree.map(
+        lambda leaf: leaf[0], robot.references(setting.course, zero[None], world)
+    )
+    physics = Physics(qpos=reference.angles, qvel=reference.rates, act=jnp.zeros(0, zero.dtype))
+    torques = robot.command(robot.state(physics), reference, world)
+    none = jnp.zeros_like(torques)
+    return ArmState(physics, torques, none, none, none, none, none, zero, key)
+
+
+@functools.cache
+def _compiled(world: World) -> tuple[Callable, Callable, Callable]:
+    """What begins a batch, what carries it on for some frames, and where its courses are."""
+    options = compiler_options()
+    begun = jax.jit(jax.vmap(functools.partial(_begun, world)))
+    on = jax.jit(jax.vmap(functools.partial(_frames, world)), compiler_options=options)
+
+    def angles(course: Course, times: Array) -> Array:
+        return _arm(world).references(course, times, world).angles
+
+    wanted = jax.jit(jax.vmap(angles, (0, None)))
+    return begun, on, wanted
+
+
+@functools.cache
+def compiler_options() -> dict[str, Any] | None:
+    """Options with which XLA compiles steps of an arm.
+
+    On a CPU the newer way of fusing operations works out a link's place anew in all that rest on
+    it, a chain of six links hundreds of times over: without it a step is 200 times as fast.
+    """
+    if jax.default_backend() != "cpu":
+        return None
+    options = {"xla_cpu_use_fusion_emitters": False}
+    try:
+        jax.jit(jnp.negative, compiler_options=options).lower(0.0).compile()
+    except jax.errors.JaxRuntimeError:
+        return None  # of another version, in which there is no such option
+    return options
+
+
+def execute(
+    world: World,
+    courses: Course,
+    keys: Array,
+    *,
+    since: np.ndarray,
+    until: np.ndarray,
+    end: float,
+    late: np.ndarray | float = 0.0,
+    drives: Drives = IDEAL,
+) -> Executed:
+    """Carry out a batch of courses.
+
+    Args:
+        world: with an arm, and steps of `TIMESTEP`.
+        courses: leaves (B, ...), as planned.
+        keys: (B,) of the noise.
+        since: (B,) [s], from when on errors and torques count.
+        until: (B,) [s], up to when.
+        end: [s], up to when at least the arms are simulated.
+        late: (B,) or () [s], by how much later than planned a course begins; the drives' latency
+            comes on top.
+        drives: of all arms.
+
+    Raises:
+        ValueError: the world has no arm, or steps of another length.
+    """
+    if not isinstance(world.robot, ShieldArm):
+        raise ValueError(f"world must hold an arm, got a {type(world.robot).__name__}")
+    if not np.isclose(world.timestep, TIMESTEP):
+        raise ValueError(f"timestep must be {TIMESTEP:g}, got {world.timestep}")
+    begin, on, wanted = _compiled(world)
+    dtype = jnp.asarray(courses.begin).dtype
+    num = len(courses.begin)
+
+    def shared(value: Any) -> Array:
+        return jnp.broadcast_to(jnp.asarray(value, dtype), (num, *np.shape(value)))
+
+    planned: Course = jax.tree.map(jnp.asarray, courses)
+    begins = planned.begin + jnp.asarray(late + drives.latency, dtype)
+    setting = _Setting(
+        course=dataclasses.replace(planned, begin=begins),
+        since=jnp.asarray(since, dtype),
+        until=jnp.asarray(until, dtype),
+        torques=shared(drives.torques),
+        lag=shared(drives.lag),
+        stds=shared((drives.angle_std, drives.rate_std)),
+        mass_error=shared(drives.mass_error),
+    )
+    state = begin(setting, keys)
+    first = state.physics.qpos[:, None]
+    parts, rates = [], state.physics.qvel
+    for _ in range(max(int(np.ceil(end / (_FRAMES * FRAME) - 1e-6)), 1)):
+        state, (angles, each) = on(setting, state)
+        parts.append(angles)
+        rates = each[:, -1]
+    times = FRAME * np.arange(1 + _FRAMES * len(parts))
+    state, angles, rates, planned_angles = jax.device_get(
+        (
+            dataclasses.replace(state, key=None),
+            jnp.concatenate([first, *parts], axis=1),
+            rates,
+            wanted(planned, jnp.asarray(times, dtype)),
+        )
+    )
+    angles, planned_angles = (np.asarray(each, float) for each in (angles, planned_angles))
+    place = _arm(world).place
+    off = np.linalg.norm(place(angles) - place(planned_angles), axis=2)
+    counts = (times >= since[:, None]) & (times < until[:, None])
+    off = np.where(counts, off, 0.0)
+    rms = np.sqrt((off**2).sum(axis=1) / np.maximum(counts.sum(axis=1), 1))
+    span = np.maximum(np.minimum(until, times[-1]) - since, FRAME)[:, None]
+    return Executed(
+        times=times,
+        angles=angles,
+        wanted=planned_angles,
+        tracking=np.stack([rms, off.max(axis=1)], axis=1),
+        error_rms=np.sqrt(state.squared_error / span),
+        error_worst=np.asarray(state.worst_error, float),
+        torque_rms=np.sqrt(state.squared_torque / span),
+        torque_worst=np.asarray(state.worst_torque, float),
+        saturation=np.asarray(state.saturated / span, float),
+        last_rates=np.asarray(rates, float),
+    )

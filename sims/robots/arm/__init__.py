@@ -1,0 +1,1 @@
+"""The arm: drives of its joints, control and its form in MuJoCo."""

@@ -1,0 +1,207 @@
+"""The arm as the closed loop knows it: `sims.robot.Robot`, six hinges on a base that stands still.
+
+`qpos` begins with the angles of the joints, `qvel` with their rates, and its actuators are their
+torques. The base frame, that of plans, has the axes of the world's and lies above the ground.
+There are no stops at the position limits, and nothing that the arm runs into holds it up; flights
+are scored for that.
+"""
+
+import dataclasses
+import functools
+import importlib.resources
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from scipy.spatial.transform import Rotation
+
+from planner_jax.referee.arm_clearance import links_of, shield_middle
+from planner_jax.robot.arm import Arm
+from planner_jax.robot.arm_mjcf import read_arm
+from planner_jax.sims.model import World
+from planner_jax.sims.robot import Physics, Shape, Solid
+from planner_jax.sims.robots.arm.control import (
+    Course,
+    Gains,
+    JointReference,
+    JointState,
+    control,
+    reference_at,
+)
+from planner_jax.sims.scenery import LOOK, box_solid, capsule_solid, xml_numbers
+
+_MODELS = importlib.resources.files("planner_jax.robot") / "models"
+_IRB1600 = (_MODELS / "irb1600.xml").read_text("utf-8")
+_THICKNESS = 0.01  # [m], of the shield
+
+
+@functools.cache
+def _arm(xml: str) -> Any:
+    """The `Arm` of MJCF text, NumPy float64 leaves."""
+    return read_arm(xml, dtype=np.float64)
+
+
+def lanes_of(arm: Arm) -> dict[str, np.ndarray]:
+    """One arm as the referee's kinematics take a batch of one lane."""
+    names = ("origin", "turn", "axis", "shield_centre")
+    return {f"arm.{name}": np.asarray(getattr(arm, name), float)[None] for name in names}
+
+
+@dataclasses.dataclass(frozen=True)
+class ShieldArm:
+    """A six-axis arm with a shield; static under jit."""
+
+    xml: str = dataclasses.field(default=_IRB1600, repr=False)  # MJCF, as `read_arm` takes it
+    base_height: float = 0.0  # [m], of the base frame above the ground
+    gains: Gains = Gains()
+
+    WORDS: ClassVar[str] = (
+        "an arm with torques, their limits and lag, computed torque on what its encoders say"
+    )
+    num_pos: ClassVar[int] = 6
+    num_vel: ClassVar[int] = 6
+    noise_shape: ClassVar[tuple[int, ...]] = (2, 6)
+
+    @property
+    def arm(self) -> Any:
+        """The `Arm` that plans are made for, NumPy float64 leaves."""
+        return _arm(self.xml)
+
+    def mjcf(self) -> tuple[str, str]:
+        """The chain of links with capsules and shield, and a motor a joint."""
+        arm = self.arm
+        solids = {k: [] for k in range(-1, 6)}
+        for link, ends, radius in zip(
+            arm.capsule_link, arm.capsule_ends, arm.capsule_radius, strict=True
+        ):
+            # MuJoCo takes no capsule without a length.
+            ends = ends + [[0.0, 0.0, 0.0], [1e-6, 0.0, 0.0]]
+            solids[link].append(
+                f'<geom type="capsule" fromto="{xml_numbers(*np.ravel(ends))}" '
+                f'size="{xml_numbers(radius)}" rgba=".9 .6 .2 1" {LOOK}/>'
+            )
+        middle, half = _box(arm.base_box)
+        solids[-1].append(
+            f'<geom type="box" pos="{xml_numbers(*middle)}" size="{xml_numbers(*half)}" '
+            f'rgba=".3 .3 .3 1" {LOOK}/>'
+        )
+        plate = [0.5 * _THICKNESS, arm.shield_half, arm.shield_half]
+        behind = arm.shield_centre - [0.5 * _THICKNESS, 0.0, 0.0]
+        solids[5].append(
+            f'<geom name="shield" type="box" pos="{xml_numbers(*behind)}" '
+            f'size="{xml_numbers(*plate)}" rgba=".2 .5 .8 1" {LOOK}/>'
+        )
+        base = f'<body name="base" pos="{xml_numbers(0.0, 0.0, self.base_height)}">'
+        chain = "".join(self._link(k) + "".join(solids[k]) for k in range(6))
+        motors = "".join(f'<motor joint="joint_{k + 1}"/>' for k in range(6))
+        return base + "".join(solids[-1]) + chain + 7 * "</body>", motors
+
+    def _link(self, k: int) -> str:
+        """The begin of link k + 1: its body, joint and inertial."""
+        arm = self.arm
+        inertia = arm.inertia[k]
+        full = [*np.diag(inertia), inertia[0, 1], inertia[0, 2], inertia[1, 2]]
+        return (
+            f'<body name="link_{k + 1}" pos="{xml_numbers(*arm.origin[k])}" '
+            f'quat="{xml_numbers(*arm.turn[k])}">'
+            f'<joint name="joint_{k + 1}" type="hinge" axis="{xml_numbers(*arm.axis[k])}"/>'
+            f'<inertial pos="{xml_numbers(*arm.centre[k])}" mass="{xml_numbers(arm.mass[k])}" '
+            f'fullinertia="{xml_numbers(*full)}"/>'
+        )
+
+    def at_rest(self, place: Array, gravity: float) -> tuple[Array, Array, Array]:
+        """At home; an arm stands where its base does, whatever the place (3,) [m]."""
+        home = jnp.asarray(self.arm.home, place.dtype)
+        return home, jnp.zeros_like(home), jnp.zeros(0, place.dtype)
+
+    def drive(self, physics: Physics, command: Array, timestep: float) -> tuple[Array, Array]:
+        """The torques (6,) [N m] as they are, and no other forces."""
+        return command, jnp.zeros_like(command)
+
+    def state(self, physics: Physics) -> JointState:
+        """The arm's part of the simulated state."""
+        return JointState(angles=physics.qpos[:6], rates=physics.qvel[:6])
+
+    def sensed(self, state: JointState, noise: Array, stds: Any) -> JointState:
+        """What the encoders say.
+
+        Args:
+            state: the true one.
+            noise: (2, 6) standard normal.
+            stds: (2,), of an angle [rad] and of a rate [rad/s].
+        """
+        errors = jnp.asarray(stds, noise.dtype)[:, None] * noise
+        return JointState(angles=state.angles + errors[0], rates=state.rates + errors[1])
+
+    def references(self, plan: Course, times: Array, world: World) -> JointReference:
+        """What is tracked at times (K,) [s]; leaves (K, ...).
+
+        MuJoCo keeps rates of half a step before, and applies a torque until a step later.
+        """
+        half = 0.5 * world.timestep
+
+        def at(time: Array) -> JointReference:
+            reference, ahead = reference_at(plan, time), reference_at(plan, time + half)
+            rates = reference.rates - half * reference_at(plan, time - half).accelerations
+            return dataclasses.replace(reference, rates=rates, accelerations=ahead.accelerations)
+
+        return jax.vmap(at)(times)
+
+    def command(
+        self, state: JointState, reference: JointReference, world: World, mass_error: Any = 0.0
+    ) -> Array:
+        """Torques (6,) [N m], of an arm whose masses are believed so much wrong, relative."""
+        dtype = state.angles.dtype
+        arm = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), self.arm)
+        factor = 1.0 + mass_error
+        believed = dataclasses.replace(arm, mass=factor * arm.mass, inertia=factor * arm.inertia)
+        return control(state, reference, believed, self.gains, world.gravity)
+
+    def shapes(self) -> list[Shape]:
+        """The base, links 1 to 6 with their capsules, and the shield."""
+        arm = self.arm
+        solids: list[list[Solid]] = [[] for _ in range(7)]
+        solids[0].append(box_solid(*arm.base_box))
+        for link, ends, radius in zip(
+            arm.capsule_link, arm.capsule_ends, arm.capsule_radius, strict=True
+        ):
+            solids[link + 1].append(capsule_solid(ends[0], ends[1], float(radius)))
+        ring = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]) * arm.shield_half
+        rim = arm.shield_centre + np.pad(ring, ((0, 0), (1, 0)))
+        return [
+            *(Shape([], [], solids=tuple(each)) for each in solids),
+            Shape(
+                [rim],
+                [],
+                tool=True,
+                solids=(box_solid(rim.min(axis=0) - [_THICKNESS, 0, 0], rim.max(axis=0)),),
+            ),
+        ]
+
+    def places(self, pose: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Position [m] and attitude, w x y z, of base, links and shield."""
+        turns, places = links_of(lanes_of(self.arm), np.reshape(pose, (6, 1, 1)))
+        base = np.array([0.0, 0.0, self.base_height])
+        found = [(base, np.array([1.0, 0.0, 0.0, 0.0]))]
+        for turn, place in zip(turns, places, strict=True):
+            quat = Rotation.from_matrix(turn[..., 0, 0]).as_quat(scalar_first=True)
+            found.append((base + np.broadcast_to(place, (3, 1, 1))[:, 0, 0], quat))
+        return [*found, found[-1]]
+
+    def place(self, poses: np.ndarray) -> np.ndarray:
+        """The middle of the shield's face, (..., 3) [m]."""
+        case = lanes_of(self.arm)
+        angles = np.moveaxis(np.reshape(poses, (1, -1, 6)), 2, 0)
+        middle = shield_middle(case, *links_of(case, angles))[:, 0].T
+        return middle.reshape(*np.shape(poses)[:-1], 3) + [0.0, 0.0, self.base_height]
+
+    def held_ball(self, pose: np.ndarray) -> np.ndarray:
+        """NaN (3,): it holds none."""
+        return np.full(3, np.nan)
+
+
+def _box(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Middle and half edges (3,) [m] of a box of two corners (2, 3)."""
+    return 0.5 * (corners[0] + corners[1]), 0.5 * (corners[1] - corners[0])

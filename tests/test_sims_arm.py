@@ -1,0 +1,375 @@
+"""The simulated arm: what it holds and follows, what counts as a block, and a run of flights."""
+
+import dataclasses
+import json
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import planner_jax as pj
+from planner_jax.cli import main
+from planner_jax.referee.arm_clearance import KINDS
+from planner_jax.robot.arm import shield_pose
+from planner_jax.robot.arm_mjcf import irb1600
+from planner_jax.sims.execution import FRAME, TIMESTEP, Executed, execute
+from planner_jax.sims.film import draw_flight
+from planner_jax.sims.launch import flight_keys
+from planner_jax.sims.robot import rotation
+from planner_jax.sims.robots.arm.control import Course, reference_at
+from planner_jax.sims.robots.arm.drives import IDEAL, TORQUES, Drives
+from planner_jax.sims.robots.arm.robot import ShieldArm
+from planner_jax.sims.scenery import box_solid, capsule_solid
+from planner_jax.sims.settings import BlockFly
+from planner_jax.sims.tasks.block import (
+    BLOCK_ARM,
+    BLOCK_WORLD,
+    Budget,
+    Throws,
+    courses_of,
+    fly_blocks,
+    require_arm,
+    scored,
+    throws,
+)
+from planner_jax.sims.tasks.intercept import CAR_WORLD
+from planner_jax.sims.view import Viewer
+from planner_jax.sweep.settings import SettingError
+from planner_jax.task.block.motion import polynomial, profiles
+from planner_jax.task.block.plan import BlockPlan
+
+HOME, LANES = np.asarray(irb1600().home), 4  # all batches are of one size: one program
+TURN = np.array([-0.4, -0.5, 0.4, 0.6, -0.5, 0.8])  # [rad], of a motion that touches nothing
+MOVING = 0.5  # [s]
+
+
+def motion(turn, duration=MOVING, ends_at_rest=True):
+    """From home by so much (6,) [rad], in the shape of the quickest straight motion."""
+    shape = profiles(10, ends_at_rest)[-1]
+    steps = jnp.asarray(shape[:, None] * turn, jnp.float32)
+    return polynomial(jnp.asarray(HOME), jnp.zeros(6), steps, jnp.float32(duration))
+
+
+def batch(*trees):
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
+
+
+def plans(*motions, contact, status=None):
+    """Plans of motions."""
+    num = len(motions)
+    none: Any = np.zeros(num, np.float32)
+    states: Any = np.zeros(num, np.int32) if status is None else np.array(status, np.int32)
+    contacts: Any = np.full(num, contact, np.float32)
+    return BlockPlan(
+        cost=none,
+        violation=none,
+        iterations=none.astype(np.int32),
+        status=states,
+        motion=batch(*motions),
+        contact_time=contacts,
+    )
+
+
+STILL = motion(0.0 * TURN)
+# None, one that comes to rest, one the other way, one that does not come to rest.
+MOTIONS = (STILL, motion(TURN), motion(-0.3 * TURN), motion(0.6 * TURN, ends_at_rest=False))
+
+
+def carried_out(drives=IDEAL, **options):
+    """The arm along MOTIONS, which begin after 0.05 s."""
+    begin: Any = np.full(LANES, 0.05, np.float32)
+    braking: Any = np.full((LANES, 6), 30.0, np.float32)
+    courses = Course(motion=batch(*MOTIONS), begin=begin, braking=braking)
+    since, until = np.full(LANES, 0.05), np.full(LANES, 0.05 + MOVING)
+    options = {"since": since, "until": until, "end": 0.8, "drives": drives, **options}
+    return courses, execute(BLOCK_WORLD, courses, flight_keys(0, np.arange(LANES)), **options)
+
+
+@pytest.fixture(scope="module")
+def ideal():
+    return carried_out()
+
+
+def test_the_arm_holds_its_home_against_gravity_without_drift(ideal):
+    _, flown = ideal
+    assert np.abs(flown.angles[0] - HOME).max() < 1e-5
+    assert flown.torque_rms[0, 1] > 100.0  # [N m], that joint 2 bears there
+    assert flown.tracking[0].max() < 1e-5
+
+
+def test_a_plan_is_tracked_within_a_milliradian_by_ideal_drives(ideal):
+    _, flown = ideal
+    assert np.abs(flown.angles - flown.wanted).max() < 1e-3
+    assert flown.error_worst.max() < 1e-3 and flown.error_rms[1:].min() > 0.0
+    assert np.abs(flown.angles[1, -1] - HOME - TURN).max() < 1e-3
+    assert flown.tracking[:, 1].max() < 1e-3
+    assert (flown.saturation == 0.0).all()
+
+
+def test_joints_that_turn_when_a_plan_ends_are_braked(ideal):
+    courses, flown = ideal
+    end = 0.05 + MOVING
+    at = np.searchsorted(flown.times, end)
+    rates = (flown.angles[3, at] - flown.angles[3, at - 2]) / (2.0 * FRAME)
+    assert np.abs(rates).min() > 0.5
+    assert np.abs(flown.last_rates).max() < 1e-3
+    there = HOME + 0.6 * TURN + 0.5 * np.sign(rates) * rates**2 / 30.0
+    assert np.abs(flown.angles[3, -1] - there).max() < 0.02
+
+
+def test_a_reference_is_smooth_where_a_plan_begins_and_its_rates_are_slopes():
+    course = Course(MOTIONS[3], jnp.float32(0.05), jnp.full(6, 30.0))
+    times = jnp.linspace(0.0, 0.8, 1601)
+    reference = jax.jit(jax.vmap(lambda time: reference_at(course, time)))(times)
+    step = float(times[1])
+    slopes = np.gradient(np.asarray(reference.angles, float), step, axis=0)
+    assert np.abs(slopes - reference.rates)[1:-1].max() < 0.03  # a jump in acceleration, halved
+    rises = np.diff(np.asarray(reference.rates, float), axis=0) / step
+    assert np.median(np.abs(rises - reference.accelerations[:-1])) < 0.02
+
+
+def test_torque_limits_bite_and_are_kept():
+    small = tuple(0.2 * torque for torque in TORQUES)
+    _, flown = carried_out(Drives(torques=small))
+    assert (flown.torque_worst <= np.array(small) * (1.0 + 1e-6)).all()
+    assert flown.saturation[1, :2].max() > 0.05
+    assert flown.error_worst[1].max() > 1e-2
+    assert flown.error_worst[0].max() < 1e-4  # what holds the arm is enough
+
+
+def test_a_late_plan_is_followed_as_exactly_but_later(ideal):
+    late = 0.02
+    _, flown = carried_out(Drives(latency=0.5 * late), late=0.5 * late)
+    frames = round(late / FRAME)
+    apart = flown.angles[:, frames:] - ideal[1].angles[:, :-frames]
+    assert np.abs(apart).max() < 1e-3
+    assert flown.error_worst.max() < 1e-3
+    assert flown.tracking[1, 1] > 0.01
+
+
+def test_noise_lag_and_wrong_masses_cost_little_and_a_seed_gives_the_same_bits():
+    drives = Drives(lag=0.005, angle_std=1e-4, rate_std=0.01, mass_error=0.05)
+    _, flown = carried_out(drives)
+    _, again = carried_out(drives)
+    np.testing.assert_array_equal(flown.angles, again.angles)
+    assert 1e-4 < flown.error_worst.max() < 1e-2
+    assert flown.tracking[:, 1].max() < 2e-3
+
+
+def thrown(places, speed=8.0):
+    """Balls that fly straight at the shield of an arm at home, past its middle by places (B, 2).
+
+    They are in the plane of its face after 0.5 s.
+    """
+    turn, middle = map(np.asarray, shield_pose(irb1600(), jnp.asarray(HOME)))
+    goal = middle + np.asarray(places) @ turn[:, 1:].T
+    vel = np.tile(-speed * turn[:, 0], (len(places), 1))
+    return pj.block.case(goal - 0.5 * vel, vel, gravity=1e-6)
+
+
+def as_planned(cases, angles, end=0.8):
+    """What is said of arms that are at angles (6,) all the time."""
+    times = FRAME * np.arange(round(end / FRAME) + 1)
+    num = len(cases.gravity)
+    held = np.broadcast_to(angles, (num, times.size, 6)).astype(float)
+    nothing, none = np.zeros((num, 6)), np.zeros(num)
+    flown = Executed(times, held, held, np.zeros((num, 2)), *[nothing] * 6)
+    cases = jax.tree.map(np.asarray, cases)
+    return scored(cases, plans(*[STILL] * num, contact=0.5), flown, Budget(*[none] * 6))
+
+
+def test_a_ball_on_the_shield_is_blocked_and_one_beside_it_is_not():
+    places = [(0.0, 0.0), (0.1, -0.14), (0.16, 0.0), (0.0, -0.5)]
+    found = as_planned(thrown(places), HOME)
+    assert found.blocked.tolist() == [True, True, False, False]
+    assert found.success.tolist() == found.blocked.tolist()
+    np.testing.assert_allclose(found.miss, np.linalg.norm(places, axis=1), atol=1e-4)
+    # The ball touches the face its radius before its centre is there.
+    np.testing.assert_allclose(found.contact[:2], 0.5 - 0.05 / 8.0, atol=1e-4)
+    assert np.isnan(found.contact[2:]).all() and np.isnan(found.contact_pos[2:]).all()
+
+
+def test_a_ball_that_comes_from_behind_or_too_late_is_not_blocked():
+    from_behind = thrown([(0.0, 0.0)], speed=-8.0)
+    assert not as_planned(from_behind, HOME).blocked.any()
+    cases = thrown([(0.0, 0.0)])
+    lower, upper = np.full((1, 3), -50.0), np.full((1, 3), 50.0)
+    everywhere = dataclasses.replace(cases.scene.inner, lower=lower, upper=upper)
+    inside = dataclasses.replace(cases, scene=dataclasses.replace(cases.scene, inner=everywhere))
+    found = as_planned(inside, HOME)
+    assert not found.blocked.any() and np.isnan(found.miss).all()
+
+
+def test_an_arm_that_runs_into_the_pole_does_not_succeed():
+    ahead = np.array([0.0, 1.0, -0.6, 0.0, 0.0, 0.0])
+    turn, middle = map(np.asarray, shield_pose(irb1600(), jnp.asarray(ahead)))
+    vel = -8.0 * turn[:, 0]
+    found = as_planned(pj.block.case([middle - 0.5 * vel], [vel], gravity=1e-6), ahead)
+    assert found.blocked.all() and found.touched.all() and not found.success.any()
+    assert found.nearest[0].endswith(", pole") and found.clearance[0] < -0.01
+
+
+def test_clearances_of_an_exact_execution_are_those_of_the_referee():
+    cases = throws("pole", LANES, 3).cases
+    plan = plans(*MOTIONS, contact=MOVING)
+    verdict = pj.block.judge(cases, plan)
+    least = np.min([getattr(verdict, f"{kind}_clearance") for kind in KINDS], axis=0)
+    course = courses_of(cases, plan)
+    times = FRAME * np.arange(round(MOVING / FRAME) + 1)
+    at = jax.jit(jax.vmap(jax.vmap(lambda c, t: reference_at(c, t).angles, (None, 0)), (0, None)))
+    angles = np.asarray(at(course, times.astype(np.float32)), float)
+    nothing = np.zeros((LANES, 6))
+    flown = Executed(times, angles, angles, np.zeros((LANES, 2)), *[nothing] * 6)
+    found = scored(cases, plan, flown, Budget(*[np.zeros(LANES)] * 6))
+    np.testing.assert_allclose(found.clearance, least, atol=1e-3)
+    assert found.clearance.min() < found.clearance.max()
+
+
+def test_the_parts_of_the_time_budget_add_up_and_a_plan_that_is_late_begins_late():
+    cases = throws("open", LANES, 1, regime="R1", delay=0.15)
+    seconds = np.array([0.01, 0.05, 0.07, 0.02])
+    plan = plans(*MOTIONS, contact=0.15 + MOVING, status=[0, 0, 0, 2])
+    found = fly_blocks(BLOCK_WORLD, cases, plan=plan, seconds=seconds, allowed=0.05)
+    budget = found.budget
+    np.testing.assert_allclose(budget.sense, 0.1, atol=1e-6)
+    np.testing.assert_allclose(budget.wait, [0.04, 0.0, 0.0, 0.03], atol=1e-6)
+    np.testing.assert_allclose(budget.stand[:3], [0.0, 0.0, -0.02], atol=1e-6)
+    assert found.planned.tolist() == [True, True, True, False]
+    at = np.searchsorted(found.flown.times, 0.15 + 0.5 * MOVING)
+    off = np.abs(found.flown.angles - found.flown.wanted)[:, at].max(axis=1)
+    assert off[1] < 1e-3 and off[2] > 5e-3
+    assert np.abs(found.flown.angles[3] - HOME).max() < 1e-4  # without a plan it stays
+    inside = budget.flight[:, None] + np.array([-1e-3, 1e-3])
+    box, ball = cases.cases.scene.inner, cases.cases.ball
+    pos, vel = ball.pos[:, None], ball.vel[:, None]
+    places = pos + vel * inside[..., None]
+    places[..., 2] -= 0.5 * 9.81 * inside**2
+    within = ((places > box.lower[:, None]) & (places < box.upper[:, None])).all(axis=2)
+    assert within.tolist() == [[False, True]] * LANES
+
+
+def test_solids_of_capsules_and_boxes_are_closed_and_seen_from_outside():
+    first, second = np.array([0.1, 0.2, 0.3]), np.array([0.1, 0.5, 0.3])
+    for solid, volume in (
+        (capsule_solid(first, second, 0.1), np.pi * 0.1**2 * (0.3 + 4.0 / 3.0 * 0.1)),
+        (capsule_solid(first, first, 0.1), 4.0 / 3.0 * np.pi * 0.1**3),
+        (box_solid(first, first + [0.1, 0.2, 0.4]), 0.1 * 0.2 * 0.4),
+    ):
+        a, b, c = (solid.corners[solid.triangles[:, k]] - first for k in range(3))
+        own = np.sum(a * np.cross(b, c)) / 6.0
+        assert 0.85 * volume < own <= volume * (1.0 + 1e-9)
+
+
+def test_shapes_stand_where_the_links_are():
+    robot = ShieldArm(base_height=0.4)
+    places = robot.places(HOME)
+    assert len(places) == len(robot.shapes()) == 8
+    turn, middle = map(np.asarray, shield_pose(irb1600(), jnp.asarray(HOME)))
+    place, quat = places[-1]
+    np.testing.assert_allclose(rotation(quat, np), turn, atol=1e-5)
+    rim = place + robot.shapes()[-1].lines[-1][:-1] @ turn.T
+    np.testing.assert_allclose(rim.mean(axis=0), middle + [0.0, 0.0, 0.4], atol=1e-5)
+    shield = robot.place(np.tile(HOME, (2, 3, 1)))
+    np.testing.assert_allclose(shield[1, 2], rim.mean(axis=0), atol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    """Task and recording of four arms, one of which blocks its ball."""
+    task = BlockFly(num=LANES).flight()
+    places = [(0.05, 0.0)] + [(0.0, 0.3)] * (LANES - 1)
+    cases = Throws(np.arange(LANES), jax.tree.map(np.asarray, thrown(places)))
+    plan = plans(*[STILL] * LANES, contact=0.5)
+    flights = fly_blocks(BLOCK_WORLD, cases, plan=plan)
+    return task, flights, task.recording(cases, flights, np.arange(LANES))
+
+
+def test_a_recording_shows_the_ball_until_and_after_its_block(recorded):
+    _, flights, kept = recorded
+    assert flights.blocked.tolist() == [True, False, False, False]
+    path, met = kept.balls[0, :, 0], kept.met[0, 0]
+    there = np.isfinite(path[:, 0])  # it comes from below the floor, and falls back there
+    steps = np.diff(path[there & (kept.time[0] < met)], axis=0)
+    np.testing.assert_allclose(np.linalg.norm(steps, axis=1), 0.08, rtol=1e-3)
+    after = np.diff(path[there & (kept.time[0] > met)], axis=0)
+    # Back the way it came, half as fast, from where it met the shield.
+    assert len(steps) > 5 and len(after) > 5
+    np.testing.assert_allclose(after, np.tile(-0.5 * steps[0], (len(after), 1)), atol=1e-3)
+    at = np.searchsorted(kept.time[0], met)
+    assert np.linalg.norm(path[at - 1 : at + 1] - kept.contact[0, 0], axis=1).max() < 0.08
+    assert np.isnan(kept.met[1:]).all()
+
+
+def test_a_picture_shows_the_arm_and_what_it_protects(recorded, tmp_path):
+    task, _, kept = recorded
+    draw_flight(tmp_path / "block.png", task, kept, 0)
+    assert (tmp_path / "block.png").read_bytes()[1:4] == b"PNG"
+
+
+def test_the_viewer_places_the_links_of_the_arm(recorded):
+    pytest.importorskip("viser")
+    task, _, kept = recorded
+    viewer = Viewer(task, kept, port=0)
+    try:
+        viewer.time.value = 0.3
+        there = BLOCK_ARM.places(kept.robot[0, viewer.look])
+        for shown, (place, _) in zip(viewer.robot, there, strict=True):
+            np.testing.assert_allclose(shown.position, place, atol=1e-6)
+    finally:
+        viewer.close()
+
+
+@pytest.mark.slow
+def test_four_balls_are_blocked_from_the_command_line(tmp_path, capsys):
+    out = tmp_path / "run"
+    command = ["fly", "block", "--num", "4", "--regime", "R1", "--suite", "open"]
+    assert main([*command, "--sense", "0.1", "--allowed", "0.2", "--out", str(out)]) == 0
+    assert "of 4 flights blocked the ball" in capsys.readouterr().out
+    manifest = json.loads((out / "manifest.json").read_text())
+    assert manifest["kind"] == "fly block"
+    assert (out / "figures" / "budget.png").exists()
+    page = (out / "index.html").read_text()
+    assert "Joints, from the start" in page and "budget.png" in page
+    assert main(["report", str(out)]) == 0
+    assert (out / "index.html").read_text() == page
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: BlockFly(replan=10.0), "replan must be 0, a block is planned once, got 10.0"),
+        (
+            lambda: BlockFly(encoders="no"),
+            "encoders must be one of none, fine, coarse, got 'no'",
+        ),
+        (lambda: BlockFly(regime="R4"), "regime must be one of R1, R2, R3, got 'R4'"),
+        (lambda: BlockFly(suite="hail"), "suite must be one of pole, open, short, got 'hail'"),
+        (lambda: BlockFly(sense=-0.1), "sense must be finite and >= 0, got -0.1"),
+        (lambda: BlockFly(torque=0.0), "torque must be finite and > 0, got 0.0"),
+        (lambda: BlockFly(latency=-1.0), "latency must be >= 0, got -1.0"),
+        (lambda: BlockFly(mass_error=-1.0), "mass_error must be > -1, got -1.0"),
+    ],
+)
+def test_settings_that_break_a_rule_are_refused_in_one_line(build, message):
+    with pytest.raises(SettingError) as error:
+        build()
+    assert str(error.value) == message
+
+
+def test_another_robot_arm_or_time_is_refused_in_one_line():
+    cases = throws("open", 1, delay=0.1)
+    with pytest.raises(ValueError, match="^world must hold an arm, got a Car$"):
+        fly_blocks(CAR_WORLD, cases)
+    with pytest.raises(ValueError, match="^timestep must be 0.001, got 0.002$"):
+        carried = dataclasses.replace(BLOCK_WORLD, timestep=2.0 * TIMESTEP)
+        nothing: Any = (None, None)
+        execute(carried, *nothing, since=np.zeros(1), until=np.zeros(1), end=1.0)
+    with pytest.raises(ValueError, match="^allowed must be >= 0 and <= the delay 0.1, got 0.2$"):
+        fly_blocks(BLOCK_WORLD, cases, allowed=0.2)
+    heavy = dataclasses.replace(cases.cases.arm, mass=2.0 * cases.cases.arm.mass)
+    with pytest.raises(ValueError, match="^mass must be the same in plan and simulated arm$"):
+        require_arm(BLOCK_WORLD, dataclasses.replace(cases.cases, arm=heavy))
+    with pytest.raises(ValueError, match="^torques must be six numbers > 0, got "):
+        Drives(torques=(1.0, 2.0))
