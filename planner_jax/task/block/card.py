@@ -25,7 +25,10 @@ TASK = Task(
     name="block",
     summary="an arm with a shield protects a box from thrown balls",
     home="planner_jax.task.block",
-    planners={"online": "planner_jax.task.block.online:OnlineBlock"},
+    planners={
+        "online": "planner_jax.task.block.online:OnlineBlock",
+        "direct": "planner_jax.task.block.direct:DirectBlock",
+    },
     suites={name: suite.description for name, suite in SUITES.items()},
     sweep="planner_jax.sweep.block.settings:BlockSettings",
     contact="contact_time",
