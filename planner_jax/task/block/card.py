@@ -28,6 +28,7 @@ TASK = Task(
     planners={
         "online": "planner_jax.task.block.online:OnlineBlock",
         "direct": "planner_jax.task.block.direct:DirectBlock",
+        "rrt-connect": "planner_jax.task.block.rrt_connect:RrtConnectBlock",
     },
     suites={name: suite.description for name, suite in SUITES.items()},
     sweep="planner_jax.sweep.block.settings:BlockSettings",
