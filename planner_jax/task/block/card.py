@@ -29,6 +29,7 @@ TASK = Task(
         "online": "planner_jax.task.block.online:OnlineBlock",
         "direct": "planner_jax.task.block.direct:DirectBlock",
         "rrt-connect": "planner_jax.task.block.rrt_connect:RrtConnectBlock",
+        "epase": "planner_jax.task.block.epase:EpaseBlock",
     },
     suites={name: suite.description for name, suite in SUITES.items()},
     sweep="planner_jax.sweep.block.settings:BlockSettings",
