@@ -46,7 +46,8 @@ PLANNERS: dict[str, tuple[str, dict[str, Any]]] = {
     "rrt-connect": ("rrt-connect", {}),
     "rrt-connect-plain": ("rrt-connect", {"patient": False, "shortcuts": False}),
     "epase": ("epase", {}),
-    "epase-plain": ("epase", {"patient": False}),
+    "epase-plain": ("epase", {"patient": False, "longest": 2.0}),
+    "insat": ("insat", {}),
 }
 NEED_PEERS = ("rrt-connect", "epase")
 LASTS_UNTIL_CONTACT = ("online",)

@@ -30,6 +30,7 @@ TASK = Task(
         "direct": "planner_jax.task.block.direct:DirectBlock",
         "rrt-connect": "planner_jax.task.block.rrt_connect:RrtConnectBlock",
         "epase": "planner_jax.task.block.epase:EpaseBlock",
+        "insat": "planner_jax.task.block.insat:InsatBlock",
     },
     suites={name: suite.description for name, suite in SUITES.items()},
     sweep="planner_jax.sweep.block.settings:BlockSettings",

@@ -56,6 +56,7 @@ def cell_of(angles: np.ndarray) -> tuple[int, ...]:
 class EpaseBlock(WayThenTime):
     """Tries end poses one after another; needs the extra `arm-peers`."""
 
+    longest: float = 0.05  # [s]; past this few searches end, while other poses are easy
     weight: float = 10.0  # of the heuristic
 
     def way_to(

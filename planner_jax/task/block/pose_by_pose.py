@@ -64,7 +64,7 @@ class PoseByPose(abc.ABC):
     degree: ClassVar[int]
     points: int = 12  # of the ball's way, where end poses are looked at
     budget: float = 2.0  # [s], of the search of each case; the paper's
-    longest: float = 0.5  # [s] of it, for one pose
+    longest: float = 0.25  # [s] of it, for one pose
     patient: bool = True  # whether poses are tried on until a motion is in time, not only found
     margin: float = 0.003  # [m], kept from everything
 
