@@ -113,7 +113,7 @@ def outcome_of(planner: Any, cases: Any, warm: Any, *, lasts: bool) -> Outcome:
     plans, query = planned(planner, cases)
     verdict = pj.block.judge(cases, plans)
     motion = moving(plans.motion)
-    execution = motion.durations.sum(axis=1)
+    execution = np.asarray(motion.durations).sum(axis=1)
     if lasts:
         reserve = np.float32(np.percentile(query, RESERVE))
         later = dataclasses.replace(cases, delay=cases.delay + reserve)
@@ -183,16 +183,19 @@ def table_of_torques(bench: Bench, outcomes: dict[str, Outcome], common: np.ndar
             for throws, which_ones in (("own", one.verdict.success), ("common", common)):
                 if not which_ones.any():
                     continue
-                rms = [with_spread(torques.rms[which_ones, k], 1 if k < 3 else 3) for k in range(6)]
-                peaks = [f"{torques.peak[which_ones, k].mean():.0f}" for k in range(3)]
+                all_rms, all_peaks = (
+                    np.asarray(each)[which_ones] for each in (torques.rms, torques.peak)
+                )
+                rms = [with_spread(all_rms[:, k], 1 if k < 3 else 4) for k in range(6)]
+                peaks = [f"{all_peaks[:, k].mean():.0f}" for k in range(3)]
                 bench.say(f"| {name}{kind} | {throws} | {' | '.join([*rms, *peaks])} |")
                 bench.row(
                     table="II",
                     planner=name,
                     gravity=not kind,
                     throws=throws,
-                    rms=torques.rms[which_ones].mean(axis=0),
-                    peak=torques.peak[which_ones].mean(axis=0),
+                    rms=all_rms.mean(axis=0),
+                    peak=all_peaks.mean(axis=0),
                 )
 
 

@@ -1,5 +1,6 @@
 """Published baselines of blocks: bang-bang motions, torques, plans that the referee confirms."""
 
+import sys
 from typing import Any
 
 import jax
@@ -11,6 +12,10 @@ import planner_jax as pj
 from planner_jax.robot.arm import REGIMES
 from planner_jax.robot.arm_dynamics import inverse_dynamics, motion_torques
 from planner_jax.robot.arm_mjcf import irb1600
+from planner_jax.task.block import rrt_connect
+from planner_jax.task.block.free_space import FreeSpace
+from planner_jax.task.block.pose_by_pose import Goal
+from planner_jax.task.block.way_timing import PIECES, timed_way
 from planner_jax.trajectory.bang_bang import bang_bang, least_times
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
@@ -105,3 +110,123 @@ def test_direct_is_confirmed_by_the_referee_and_says_what_became_of_each_ball():
     cases.limits.acceleration[:] = 0.5
     late = pj.plan(planner, cases)
     assert (late.status[[0, 3, 4, 5]] == pj.Status.INFEASIBLE).all()
+
+
+def test_edges_are_free_where_all_of_their_samples_are():
+    case = pj.lane(jax.tree.map(np.asarray, pj.block.draw(1, seed=8)), 0)
+    free = FreeSpace(case, 0.003)
+    ends = case.angles + np.random.default_rng(0).uniform(-1.0, 1.0, (30, 6))
+    ends[0] = case.angles
+    found = free.are_edges_free(case.angles, ends)
+    lines = case.angles + np.linspace(0.0, 1.0, 401)[:, None, None] * (ends - case.angles)
+    exact = free.is_free(lines.reshape(-1, 6)).reshape(401, 30).all(axis=0)
+    assert found[0] and 3 < found.sum() < 27
+    assert (found == exact).sum() >= 29  # an edge may just touch between its samples
+    coeffs = np.stack([np.broadcast_to(case.angles, ends.shape), ends - case.angles], axis=1)
+    for k in range(30):
+        assert free.is_motion_free(coeffs[k : k + 1], np.ones(1)) == found[k]
+    assert not free.is_free(case.arm.upper[None] + 0.01).any()
+
+
+def test_a_straight_way_takes_the_time_of_its_closed_form():
+    pytest.importorskip("toppra", reason="the extra `arm-peers` is not installed")
+    velocity, acceleration = (np.asarray(x, float) for x in (LIMITS.velocity, LIMITS.acceleration))
+    for far in (0.1, 1.5):
+        points = np.array([np.zeros(6), far * np.array([1.0, -0.5, 0.3, 0.2, 0.1, 1.0])])
+        fastest = (velocity / np.abs(points[1])).min()
+        hardest = (acceleration / np.abs(points[1])).min()
+        ramps = min(fastest**2 / hardest, 1.0)
+        expected = 2.0 * np.sqrt(ramps / hardest) + (1.0 - ramps) / fastest
+        motion = timed_way(points, velocity, acceleration)
+        assert motion is not None
+        assert motion[1].sum() == pytest.approx(expected, rel=5e-3)
+
+
+def test_ways_with_corners_are_timed_within_limits():
+    pytest.importorskip("toppra", reason="the extra `arm-peers` is not installed")
+    velocity, acceleration = (np.asarray(x, float) for x in (LIMITS.velocity, LIMITS.acceleration))
+    points = np.cumsum(np.random.default_rng(1).normal(0.0, 0.4, (7, 6)), axis=0)
+    motion = timed_way(points, velocity, acceleration)
+    assert motion is not None
+    coeffs, durations = motion
+    assert len(durations) <= PIECES
+    powers = np.arange(coeffs.shape[1])
+    ends = (coeffs * durations[:, None, None] ** powers[:, None]).sum(axis=1)
+    np.testing.assert_allclose(coeffs[0, 0], points[0], atol=1e-9)
+    np.testing.assert_allclose(ends[-1], points[-1], atol=1e-9)
+    np.testing.assert_allclose(ends[:-1], coeffs[1:, 0], atol=1e-9)
+    for share in np.linspace(0.0, 1.0, 31):
+        time = share * durations[:, None]
+        rate = sum(k * coeffs[:, k] * time ** (k - 1) for k in range(1, 7))
+        rise = sum(k * (k - 1) * coeffs[:, k] * time ** (k - 2) for k in range(2, 7))
+        assert (np.abs(rate) <= 1.0005 * velocity).all()
+        assert (np.abs(rise) <= 1.0005 * acceleration).all()
+
+
+def test_planners_on_the_host_say_why_there_is_no_plan():
+    cases = jax.tree.map(np.array, pj.block.draw(5, "open", seed=8))
+    cases.scene.floor[0] = 0.5  # above the shield
+    cases.ball.vel[1, 0] *= -1.0  # flies away
+    cases.rates[2] = 0.1  # is moving already
+    cases.limits.acceleration[3] = 0.5
+    cases.ball.pos[4] = np.nan
+    plans = pj.plan(pj.block.planner("insat", **QUICK), cases)
+    wanted = ("BLOCKED", "OUT_OF_REACH", "INFEASIBLE", "INFEASIBLE", "OUT_OF_REACH")
+    assert [pj.Status(status).name for status in plans.status] == list(wanted)
+    assert np.isinf(plans.violation).all()
+    hurried = pj.block.planner("insat", points=3, budget=1e-9)
+    plan = pj.plan(hurried, pj.lane(pj.block.draw(5, "open", seed=8), 4))
+    assert plan.status == pj.Status.NO_PATH and plan.iterations == 0
+    with pytest.raises(ValueError, match="^budget and longest must be > 0, got 0 and 0.05$"):
+        pj.block.planner("insat", budget=0.0)
+
+
+@pytest.mark.parametrize("package", ["ompl", "toppra"])
+def test_without_the_extra_the_error_says_what_to_install(package, monkeypatch):
+    monkeypatch.setitem(sys.modules, package, None)
+    monkeypatch.setattr(rrt_connect, "_ompl", rrt_connect._ompl.__wrapped__)
+    case = pj.lane(jax.tree.map(np.asarray, pj.block.draw(1, seed=8)), 0)
+    goal = Goal(case.angles, 1.0)
+    with pytest.raises(ModuleNotFoundError, match=rf"{package}.*'planner-jax\[arm-peers\]'"):
+        if package == "ompl":
+            rrt_connect.RrtConnectBlock().way_to(case, FreeSpace(case, 0.0), goal, lambda: 1.0)
+        timed_way(np.eye(2, 6), np.ones(6), np.ones(6))
+
+
+# Throws of an open scene, where the first way that is tried is free.
+QUICK = {"points": 3, "budget": 20.0, "longest": 20.0}
+
+
+def confirmed(name, regime, **options):
+    """Plans of two throws, which the referee must confirm, and the cases."""
+    cases = jax.tree.map(np.array, pj.block.draw(2, "open", seed=8, regime=regime))
+    plans = pj.plan(pj.block.planner(name, **QUICK, **options), cases)
+    verdict: Any = pj.block.judge(cases, plans)
+    assert verdict.success.all(), verdict.sentence(0)
+    assert (plans.status == pj.Status.FEASIBLE).all()
+    return cases, plans, verdict
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("regime", ["R1", "R2"])
+@pytest.mark.parametrize("name", ["rrt-connect", "epase"])
+def test_ways_that_are_timed_are_confirmed_by_the_referee(name, regime):
+    for package in ("ompl", "toppra"):
+        pytest.importorskip(package, reason="the extra `arm-peers` is not installed")
+    _, plans, verdict = confirmed(name, regime)
+    np.testing.assert_allclose(verdict.execution_time, plans.cost, rtol=1e-5)
+    quickest = pj.plan(pj.block.planner("direct", points=3), pj.block.draw(2, "open", seed=8))
+    assert regime == "R1" or (plans.cost > 0.99 * quickest.cost).all()
+
+
+@pytest.mark.parametrize("regime", ["R1", "R2"])
+def test_splines_are_confirmed_by_the_referee(regime):
+    """At rest at the end if they have to be, else waiting until the ball is there."""
+    cases, plans, verdict = confirmed("insat", regime)
+    rests = cases.ends_at_rest
+    ends = jnp.sum(plans.motion.durations, axis=1)
+    last = jax.jit(jax.vmap(lambda motion, time: evaluate(motion, time, 1)))(plans.motion, ends)
+    np.testing.assert_array_equal(np.abs(last).max(axis=1) < 1e-2, rests)
+    if not rests.any():
+        np.testing.assert_allclose(verdict.execution_time, plans.contact_time, rtol=1e-5)
+        assert (plans.cost < 0.9 * verdict.execution_time).all()

@@ -82,11 +82,12 @@ class State:
     parent: "State | None" = None
     way: np.ndarray | None = None  # (S, 6) [rad], samples of its spline from the start
 
-    def ancestors(self) -> "list[State]":
-        """Lifted states before this one, the nearest first and the start last."""
+    def ways(self) -> list[np.ndarray]:
+        """Ways of the lifted states before this one, the nearest first and the start last."""
         found, state = [], self.parent
         while state is not None:
-            found.append(state)
+            if state.way is not None:
+                found.append(state.way)
             state = state.parent
         return found
 
@@ -97,6 +98,7 @@ class InsatBlock(PoseByPose):
 
     pieces: ClassVar[int] = POINTS - DEGREE + 1  # the first one to wait
     degree: ClassVar[int] = DEGREE
+    longest: float = 0.05  # [s]; past this few searches end, while other poses are easy
     weight: float = 10.0  # of the heuristic
     solver: lbfgs.LbfgsConfig = lbfgs.LbfgsConfig(max_steps=12)
 
@@ -158,9 +160,9 @@ class InsatBlock(PoseByPose):
         Returns:
             Its control points (m, 6), duration, length and samples (S, 6), or None.
         """
-        before, dtype = state.ancestors(), case.angles.dtype
+        before, dtype = state.ways(), case.angles.dtype
         before = before[: ANCESTORS - 1] + before[ANCESTORS - 1 :][-1:]
-        guesses = np.stack([_fitted(each.way, state.angles, rests) for each in before])
+        guesses = np.stack([_fitted(way, state.angles, rests) for way in before])
         filled = np.concatenate([guesses, np.repeat(guesses[:1], ANCESTORS - len(before), axis=0)])
         splines = jax.tree.map(
             lambda leaf: np.asarray(leaf)[: len(before)],

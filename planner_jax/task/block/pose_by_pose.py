@@ -64,7 +64,7 @@ class PoseByPose(abc.ABC):
     degree: ClassVar[int]
     points: int = 12  # of the ball's way, where end poses are looked at
     budget: float = 2.0  # [s], of the search of each case; the paper's
-    longest: float = 0.25  # [s] of it, for one pose
+    longest: float = 0.25  # [s] of it, for one pose; twice as much whenever all were tried
     patient: bool = True  # whether poses are tried on until a motion is in time, not only found
     margin: float = 0.003  # [m], kept from everything
 
@@ -99,14 +99,14 @@ class PoseByPose(abc.ABC):
         if not (is_free[0] and is_free[1:].any()):
             return self._plan(case, Status.BLOCKED)
         best, least, contact, tries = None, np.inf, case.delay, 0
-        for place in order[is_free[1:]]:
-            begin, enough = time.perf_counter(), 0.0 if self.patient else np.inf
-            if begin >= until or (best is not None and least <= enough):
-                break
-            end = min(until, begin + self.longest)
+        enough = 0.0 if self.patient else np.inf
+        places = order[is_free[1:]]
+        while (begin := time.perf_counter()) < until and (best is None or least > enough):
+            again, turn = divmod(tries, len(places))
+            place, tries = places[turn], tries + 1
+            end = min(until, begin + self.longest * 2**again)
             goal = Goal(angles[place], float(contacts[place] - case.delay))
             found = self.motion_to(case, free, goal, lambda end=end: end - time.perf_counter())
-            tries += 1
             late = np.inf if found is None else found.execution / goal.available - 1.0
             if late < least:
                 best, least, contact = found, late, contacts[place]
