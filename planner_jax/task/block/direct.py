@@ -1,9 +1,8 @@
 """The baseline `direct`: all joints as fast as they may turn, straight to an end pose, and stand.
 
 No way is planned around anything: end poses are taken in the order in which the arm can be there,
-and the first one that is in time and whose motion touches nothing is the plan. With `tries` of 1 it
-is the lower bound on the time of execution that facts about this task are compared with: the pose
-that is reached soonest, free or not.
+and the first one that is in time and whose motion touches nothing is the plan. With `tries` of 1
+only the pose is looked at that is reached soonest: no motion from rest to rest takes less time.
 """
 
 import dataclasses

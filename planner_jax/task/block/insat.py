@@ -44,9 +44,10 @@ from planner_jax.task.block.pose_by_pose import Clock, Goal, HostMotion, PoseByP
 from planner_jax.trajectory.b_spline import b_spline, basis, hodograph
 
 DEGREE = 3
-POINTS = 7  # control points of a spline
+CONTROL_POINTS = 7  # of a spline
 ANCESTORS = 8  # that are looked at at once: the first, and the nearest
 TIME_WEIGHT, LENGTH_WEIGHT = 1.0, 0.1  # [1/s], [1/rad]
+LEAST_TIME = 0.1  # [s], of a spline; the greatest is the time there is
 _SHARES = np.linspace(0.0, 1.0, 33)  # of a spline's duration, where it is sampled
 _OUTSIDE = 100.0  # [1/rad^2], weight of control points beyond the position limits
 _NORM = 16  # of the smoothed maximum
@@ -96,7 +97,7 @@ class State:
 class InsatBlock(PoseByPose):
     """Tries end poses one after another; motions end at rest only if the case asks for that."""
 
-    pieces: ClassVar[int] = POINTS - DEGREE + 1  # the first one to wait
+    pieces: ClassVar[int] = CONTROL_POINTS - DEGREE + 1  # the first one to wait
     degree: ClassVar[int] = DEGREE
     longest: float = 0.05  # [s]; past this few searches end, while other poses are easy
     weight: float = 10.0  # of the heuristic
@@ -207,7 +208,7 @@ def _bounds(case: BlockCase) -> Bounds:
 def _compile(dtype: Any, config: lbfgs.LbfgsConfig) -> None:
     """Have the programs compiled, which must not count as time of a search."""
     joints = np.zeros(6, dtype)
-    guesses: Any = np.zeros((ANCESTORS, POINTS, 6), dtype)
+    guesses: Any = np.zeros((ANCESTORS, CONTROL_POINTS, 6), dtype)
     bounds: Any = Bounds(joints, joints, joints + 1, joints + 1)  # type: ignore[arg-type]
     _optimised(joints, joints, guesses, False, bounds, config)  # type: ignore[arg-type]
     _pieces(guesses[0], 1.0)
@@ -220,8 +221,8 @@ def _fitted(way: np.ndarray, end: np.ndarray, rests: bool) -> np.ndarray:
     lengths = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1)))
     places = _SHARES * lengths[-1]
     wanted = np.stack([np.interp(places, lengths, joint) for joint in curve.T], axis=1)
-    points = np.stack([way[0]] * 2 + [end] * (POINTS - 2))
-    free = slice(2, POINTS - (2 if rests else 1))
+    points = np.stack([way[0]] * 2 + [end] * (CONTROL_POINTS - 2))
+    free = slice(2, CONTROL_POINTS - (2 if rests else 1))
     of_points, of_free = _fit(free.stop)
     points[free] += of_free @ (wanted - of_points @ points)
     return points
@@ -230,7 +231,7 @@ def _fitted(way: np.ndarray, end: np.ndarray, rests: bool) -> np.ndarray:
 @functools.cache
 def _fit(stop: int) -> tuple[np.ndarray, np.ndarray]:
     """The basis (S, m), and least squares by its columns from 2 to `stop`."""
-    of_points = basis(DEGREE, POINTS, _SHARES)
+    of_points = basis(DEGREE, CONTROL_POINTS, _SHARES)
     return of_points, np.linalg.pinv(of_points[:, 2:stop])
 
 
@@ -269,7 +270,7 @@ def _optimised(
         """Squares of the durations that bounds ask for."""
         rates = (product(first, points) / bounds.velocity) ** 2
         rises = jnp.abs(product(second, points)) / bounds.acceleration
-        return jnp.maximum(jnp.concatenate([rates, rises]), 1e-8)
+        return jnp.maximum(jnp.concatenate([rates, rises]), LEAST_TIME**2)
 
     def length_of(points: Array) -> tuple[Array, Array]:
         angles = product(of_points, points)

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from planner_jax.protocol import FEASIBILITY_TOLERANCE, Attempt, Status, lane
+from planner_jax.protocol import Attempt, Status, lane
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.direct import poses_in_time
 from planner_jax.task.block.end_poses import flight_of
@@ -104,7 +104,7 @@ class PoseByPose(abc.ABC):
         while (begin := time.perf_counter()) < until and (best is None or least > enough):
             again, turn = divmod(tries, len(places))
             place, tries = places[turn], tries + 1
-            end = min(until, begin + self.longest * 2**again)
+            end = min(until, begin + self.longest * 2.0 ** min(again, 30))
             goal = Goal(angles[place], float(contacts[place] - case.delay))
             found = self.motion_to(case, free, goal, lambda end=end: end - time.perf_counter())
             late = np.inf if found is None else found.execution / goal.available - 1.0
@@ -130,8 +130,7 @@ class PoseByPose(abc.ABC):
         else:
             coeffs, durations, cost = motion.coeffs, motion.durations, motion.execution
             violation = cost / (contact - case.delay) - 1.0
-            in_time = violation <= FEASIBILITY_TOLERANCE
-            status = Status.FEASIBLE if in_time else Status.INFEASIBLE
+            status = Status.FEASIBLE if violation <= 0.0 else Status.INFEASIBLE
         rest = np.zeros((self.pieces - len(durations), self.degree + 1, 6))
         rest[:, 0] = sum(coeffs[-1, k] * durations[-1] ** k for k in range(self.degree + 1))
         leaves: dict[str, Any] = {
@@ -177,12 +176,18 @@ class WayThenTime(PoseByPose):
     def motion_to(
         self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
     ) -> HostMotion | None:
-        """The way with its timing.
+        """The way with its timing; none at all where the arm is at the goal already.
 
         The spline through a way's points may leave the way: where it then touches something,
         points are put half-way between the others, so that it follows the way more closely.
         """
         points = self.way_to(case, free, goal, left)
+        if points is not None:
+            apart = np.linalg.norm(np.diff(points, axis=0), axis=1) > 1e-6
+            points = points[np.append(apart, True)]
+            if len(points) == 1:
+                stay = points[:, None] * (np.arange(DEGREE + 1) == 0)[:, None]
+                return HostMotion(stay, np.zeros(1), 0.0)
         limits = (np.asarray(x, float) for x in (case.limits.velocity, case.limits.acceleration))
         velocity, acceleration = limits
         while points is not None and 2 * len(points) <= PIECES:

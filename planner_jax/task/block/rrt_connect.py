@@ -76,9 +76,7 @@ class RrtConnectBlock(WayThenTime):
         path = problem.getSolutionPath()
         if self.shortcuts:
             geometric.PathSimplifier(information).simplify(path, max(left(), 0.0))
-        points = np.stack([_numbers(state) for state in path.getStates()])
-        apart = np.linalg.norm(np.diff(points, axis=0), axis=1) > 1e-6
-        return points[np.append(apart, True)]
+        return np.stack([_numbers(state) for state in path.getStates()])
 
 
 def _numbers(state: Any) -> np.ndarray:
