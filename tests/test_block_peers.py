@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 import planner_jax as pj
+from planner_jax.registry import MissingExtra
 from planner_jax.robot.arm import REGIMES
 from planner_jax.robot.arm_dynamics import inverse_dynamics, motion_torques
 from planner_jax.robot.arm_mjcf import irb1600
-from planner_jax.task.block import rrt_connect
+from planner_jax.sweep.block.settings import BlockSettings
+from planner_jax.sweep.block.sweep import BlockSweep
+from planner_jax.task.block.card import TASK
 from planner_jax.task.block.free_space import FreeSpace
-from planner_jax.task.block.pose_by_pose import Goal
 from planner_jax.task.block.way_timing import PIECES, timed_way
 from planner_jax.trajectory.bang_bang import bang_bang, least_times
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
@@ -181,16 +183,16 @@ def test_planners_on_the_host_say_why_there_is_no_plan():
         pj.block.planner("insat", budget=0.0)
 
 
-@pytest.mark.parametrize("package", ["ompl", "toppra"])
-def test_without_the_extra_the_error_says_what_to_install(package, monkeypatch):
+@pytest.mark.parametrize(("name", "package"), [("rrt-connect", "ompl"), ("epase", "toppra")])
+def test_without_the_extra_the_error_says_what_to_install(name, package, monkeypatch):
+    if name == "rrt-connect":
+        pytest.importorskip("toppra", reason="the extra `arm-peers` is not installed")
     monkeypatch.setitem(sys.modules, package, None)
-    monkeypatch.setattr(rrt_connect, "_ompl", rrt_connect._ompl.__wrapped__)
-    case = pj.lane(jax.tree.map(np.asarray, pj.block.draw(1, seed=8)), 0)
-    goal = Goal(case.angles, 1.0)
-    with pytest.raises(ModuleNotFoundError, match=rf"{package}.*'planner-jax\[arm-peers\]'"):
-        if package == "ompl":
-            rrt_connect.RrtConnectBlock().way_to(case, FreeSpace(case, 0.0), goal, lambda: 1.0)
-        timed_way(np.eye(2, 6), np.ones(6), np.ones(6))
+    message = rf"^rrt-connect and epase need {package}: pip install 'planner-jax\[arm-peers\]'$"
+    with pytest.raises(MissingExtra, match=message):
+        pj.block.planner(name)
+    others = BlockSweep(TASK).other_planners(BlockSettings(planner="online"))
+    assert name not in others and {"direct", "insat"} <= others.keys()
 
 
 # Throws of an open scene, where the first way that is tried is free.

@@ -26,7 +26,7 @@ from planner_jax.task.block.direct import poses_in_time
 from planner_jax.task.block.end_poses import flight_of
 from planner_jax.task.block.free_space import FreeSpace
 from planner_jax.task.block.plan import BlockPlan
-from planner_jax.task.block.way_timing import DEGREE, PIECES, timed_way
+from planner_jax.task.block.way_timing import DEGREE, PIECES, required, timed_way
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 Clock = Callable[[], float]  # seconds that are left
@@ -164,10 +164,19 @@ def _goals(case: BlockCase, points: int) -> tuple[Array, Array, Array, Array]:
 
 @dataclasses.dataclass(frozen=True)
 class WayThenTime(PoseByPose):
-    """A planner that finds a way of the joints, which is timed by TOPP-RA then."""
+    """A planner that finds a way of the joints, which is timed by TOPP-RA then.
+
+    Raises `MissingExtra` unless its packages are installed.
+    """
 
     pieces: ClassVar[int] = PIECES
     degree: ClassVar[int] = DEGREE
+    packages: ClassVar[tuple[str, ...]] = ("toppra",)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in self.packages:
+            required(name)
 
     @abc.abstractmethod
     def way_to(self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock) -> Any:

@@ -7,7 +7,7 @@ has. Edges are looked at in one batch each.
 
 import dataclasses
 import functools
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -22,7 +22,6 @@ _SEED = 1  # of OMPL's random numbers: one sequence a process
 @functools.cache
 def _ompl() -> tuple[Any, Any]:
     """OMPL's modules `base` and `geometric`, told to be silent and what to draw."""
-    required("ompl")
     util = required("ompl.util")
     util.setLogLevel(util.LOG_ERROR)
     util.RNG.setSeed(_SEED)
@@ -33,17 +32,14 @@ def _ompl() -> tuple[Any, Any]:
 class RrtConnectBlock(WayThenTime):
     """Tries end poses one after another; needs the extra `arm-peers`."""
 
+    packages: ClassVar[tuple[str, ...]] = ("toppra", "ompl")
     reach: float = 1.0  # [rad], longest edge
     shortcuts: bool = True  # whether a way is made simpler and shorter before it is timed
 
     def way_to(
         self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
     ) -> np.ndarray | None:
-        """Points of a way, or None.
-
-        Raises:
-            ModuleNotFoundError: OMPL is not installed.
-        """
+        """Points of a way, or None."""
         base, geometric = _ompl()
         space = base.RealVectorStateSpace(6)
         bounds = base.RealVectorBounds(6)

@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from planner_jax.registry import MissingExtra
+
 INSTALL = "rrt-connect and epase need {name}: pip install 'planner-jax[arm-peers]'"
 PIECES = 128  # of a timed motion, at most
 DEGREE = 6  # a cubic of a quadratic
@@ -19,14 +21,18 @@ _SPARE = 2e-4  # share of the limits that is kept free
 
 
 def required(name: str) -> ModuleType:
-    """A module of the extra `arm-peers`; says what to install where its package is missing."""
+    """A module of the extra `arm-peers`.
+
+    Raises:
+        MissingExtra: its package is not installed.
+    """
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:
         package = name.partition(".")[0]
         if error.name != package:
             raise
-        raise ModuleNotFoundError(INSTALL.format(name=package), name=package) from None
+        raise MissingExtra(INSTALL.format(name=package), name=package) from None
 
 
 def timed_way(
@@ -46,7 +52,7 @@ def timed_way(
         Coefficients (M, DEGREE + 1, 6) [rad/s^k] and durations (M,) [s] of M <= `PIECES` pieces.
 
     Raises:
-        ModuleNotFoundError: toppra is not installed.
+        MissingExtra: toppra is not installed.
     """
     toppra = required("toppra")
     constraint = importlib.import_module("toppra.constraint")

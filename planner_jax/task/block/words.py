@@ -69,6 +69,7 @@ def planner(name: str = "online", **options: Any) -> AnyPlanner[Any, Any]:
     Raises:
         ValueError: there is no planner of that name.
         TypeError: the planner has no such field.
+        ModuleNotFoundError: the planner needs an extra that is not installed.
     """
     return TASK.make_planner(name, options)
 
