@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from planner_jax.compile_cache import keep_compiled_programs
-from planner_jax.registry import Task, UnknownName, all_tasks
+from planner_jax.registry import MissingExtra, Task, UnknownName, all_tasks
 from planner_jax.sweep.environment import installed_version, require_backend
 from planner_jax.sweep.settings import SettingError
 
@@ -47,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt as stop:
         print(f"planner-jax: {str(stop) or 'interrupted'}", file=sys.stderr)
         return _INTERRUPTED
-    except (SettingError, UnknownName) as error:
+    except (SettingError, UnknownName, MissingExtra) as error:
         return _fail(str(error))
     except OSError as error:
         _fail(str(error))

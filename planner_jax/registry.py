@@ -30,6 +30,10 @@ class UnknownName(ValueError):
     """There is no task, planner or suite of a name; one line that lists those there are."""
 
 
+class MissingExtra(ModuleNotFoundError):
+    """A planner needs a package that is not installed; one line that says how to install it."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Task:
     """What makes a task: its four words, planners, suites, and what runs of it need.

@@ -1,5 +1,6 @@
 """What a run has to know of its task; every task has a sweep, and changes of it what it wants."""
 
+import contextlib
 import dataclasses
 import pkgutil
 from collections.abc import Callable, Mapping, Sequence
@@ -9,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from planner_jax.planning.plan import plan
-from planner_jax.registry import Task, UnknownName, task_named
+from planner_jax.registry import MissingExtra, Task, UnknownName, task_named
 from planner_jax.sweep.columns import Column, RefereedBatch, leaf_columns
 from planner_jax.sweep.figures.outcomes import outcomes_figure
 from planner_jax.sweep.settings import SettingError, SweepSettings, require
@@ -69,9 +70,15 @@ class Sweep:
         return self.task.planner(settings.planner, **settings.planner_options())
 
     def other_planners(self, settings: Any) -> dict[str, Any]:
-        """The task's other planners of such cases, by name, to be compared with that of a run."""
+        """The task's other planners of such cases, by name, to be compared with that of a run.
+
+        Without those whose packages are not installed.
+        """
         names = [name for name in self.task.all_planners() if name != settings.planner]
-        made = {name: self.task.planner(name) for name in names}
+        made = {}
+        for name in names:
+            with contextlib.suppress(MissingExtra):
+                made[name] = self.task.planner(name)
         kind = _case_type(self.planner(settings))
         fits = lambda one: kind is None or _case_type(one) in (None, kind)  # noqa: E731
         return {name: one for name, one in made.items() if fits(one)}

@@ -51,17 +51,25 @@ def planner(name: str = "online", **options: Any) -> AnyPlanner[Any, Any]:
 
     * `online`: a straight motion of the joints if one is free, else end pose, time of contact and
       motion together, by least squares from many starts.
+    * `direct`: all joints as fast as they may turn, to the end pose that is reached soonest of
+      those to which that touches nothing.
+    * `rrt-connect`, `epase`: ways by OMPL's RRT-Connect, or by a weighted A* over steps of the
+      joints, to one end pose after another, timed by TOPP-RA; on the host, with the extra
+      `arm-peers`.
+    * `insat`: that A* interleaved with B-splines, Algorithm 2 of paper 004; on the host.
 
     Args:
         name: one of these, or one that another package offers.
         **options: fields of that planner's dataclass, for example `points` of `online`.
 
     Returns:
-        A planner for `pj.plan`: `OnlineBlock`.
+        A planner for `pj.plan`: `OnlineBlock`, `DirectBlock`, `RrtConnectBlock`, `EpaseBlock` or
+        `InsatBlock`.
 
     Raises:
         ValueError: there is no planner of that name.
         TypeError: the planner has no such field.
+        ModuleNotFoundError: the planner needs an extra that is not installed.
     """
     return TASK.make_planner(name, options)
 

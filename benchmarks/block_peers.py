@@ -1,0 +1,243 @@
+"""All block planners on the same throws: Tables I and II of paper 004 beside our figures.
+
+    python -m benchmarks.block_peers [--suite pole] [--regime R1] [--num 100] [--out DIR]
+
+A block is what the referee says, whatever a planner claims; `found` is a motion that touches
+nothing, in time or not. Every throw is planned alone, from NumPy arrays to NumPy arrays, warm, by
+one call on one core. The second rate of blocks counts that time: the motion and the call together
+have to fit between the moment at which the arm may start and the contact. A motion that always
+lasts until the contact, as those of `online` do, is made anew for an arm that may start later, by
+the 90 % quantile of the times of all calls; calls that take longer fail.
+
+The execution is how long the arm moves. Torques are root mean squares over that time, by inverse
+dynamics, with the mass that the links have and a shield without any. Both are means over the
+blocks of each planner, and over the throws that all planners of the run block.
+
+The paper's rows are as printed: of 200 throws that it does not give, on a Threadripper Pro 5995WX,
+with limits, poses and torques that it does not tell; its percentages are multiples of 1/209. Hence
+compare rows of one table, and of the paper's numbers their ratios.
+"""
+
+import dataclasses
+import importlib.util
+import os
+import time
+from typing import Any
+
+import jax
+import numpy as np
+
+import planner_jax as pj
+from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
+from planner_jax.referee.block import BlockVerdict
+from planner_jax.robot.arm_dynamics import Torques, motion_torques
+from planner_jax.sweep.block.settings import REGIMES
+from planner_jax.task.block.card import SUITES
+from planner_jax.task.block.plan import BlockPlan
+from planner_jax.trajectory.polynomial import PiecewisePolynomial
+
+PEERS = "ompl and toppra not installed: pip install 'planner-jax[arm-peers]' for rrt-connect, epase"
+# By name: the planner and its options. `direct-soonest` looks at one motion; plain ones take
+# the first way that is found as it is, as the paper must have.
+PLANNERS: dict[str, tuple[str, dict[str, Any]]] = {
+    "online": ("online", {}),
+    "direct": ("direct", {}),
+    "direct-soonest": ("direct", {"tries": 1}),
+    "rrt-connect": ("rrt-connect", {}),
+    "rrt-connect-plain": ("rrt-connect", {"patient": False, "shortcuts": False}),
+    "epase": ("epase", {}),
+    "epase-plain": ("epase", {"patient": False, "longest": 2.0}),
+    "insat": ("insat", {}),
+}
+NEED_PEERS = ("rrt-connect", "epase")
+LASTS_UNTIL_CONTACT = ("online",)
+RESERVE = 90.0  # [%], of the times of calls that such a planner is told to keep free
+WARM = 2  # throws of another seed, planned before the others
+# Tables I and II as printed: found, blocked, the same without query time [%], query [ms] and
+# execution [s] with their standard deviations; torques [N m].
+TABLE_I = {
+    "paper: theirs": (70.33, 68.9, 68.9, (0.109, 0.033), (0.31, 0.2)),
+    "paper: RRT-Connect": (59.81, 27.27, 27.27, (17.5, 31.7), (1.3, 0.97)),
+    "paper: ePA*SE": (50.71, 9.57, 11.0, (231.0, 377.0), (1.8, 0.87)),
+}
+TABLE_II = {
+    "paper: theirs": (11.0, 24.5, 16.2, 0.031, 0.036, 0.0003),
+    "paper: RRT-Connect": (102.0, 130.2, 43.6, 0.35, 0.13, 0.015),
+    "paper: ePA*SE": (61.4, 131.0, 39.5, 0.34, 0.11, 0.012),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What became of all throws with one planner; B of them."""
+
+    verdict: BlockVerdict
+    found: np.ndarray  # (B,) bool
+    counted: np.ndarray  # (B,) bool, blocked although the time of the call counts
+    query: np.ndarray  # (B,) [s]
+    execution: np.ndarray  # (B,) [s]
+    with_gravity: Torques  # leaves (B, 6) [N m]
+    without: Torques
+
+
+def planned(planner: Any, cases: Any) -> tuple[BlockPlan, np.ndarray]:
+    """Plans of a batch, made one at a time, and how long each call took (B,) [s]."""
+    plans, seconds = [], []
+    for k in range(cases.batch_shape[0]):
+        case = pj.lane(cases, k)
+        began = time.perf_counter()
+        plan = jax.tree.map(np.asarray, pj.plan(planner, case))
+        seconds.append(time.perf_counter() - began)
+        plans.append(plan)
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *plans), np.array(seconds)
+
+
+def moving(motion: PiecewisePolynomial) -> PiecewisePolynomial:
+    """Motions (B, ...) without the pieces in which the arm waits."""
+    coeffs = np.asarray(motion.coeffs)
+    moves = np.any(coeffs[:, :, 1:] != 0.0, axis=(2, 3))
+    durations: Any = np.where(moves, motion.durations, 0.0)
+    return PiecewisePolynomial(coeffs=motion.coeffs, durations=durations)
+
+
+def is_found(plans: BlockPlan, verdict: BlockVerdict) -> np.ndarray:
+    """Which plans (B,) touch nothing, in time or not."""
+    claims = pj.solved(plans)
+    late = np.isfinite(plans.violation) & (verdict.failed_limit == "time")
+    return (claims & verdict.success) | (late & ~claims)
+
+
+def outcome_of(planner: Any, cases: Any, warm: Any, *, lasts: bool) -> Outcome:
+    """Plan throws one by one and have them judged; `lasts`: whether motions end at the contact."""
+    planned(planner, warm)
+    plans, query = planned(planner, cases)
+    verdict = pj.block.judge(cases, plans)
+    motion = moving(plans.motion)
+    execution = np.asarray(motion.durations).sum(axis=1)
+    if lasts:
+        reserve = np.float32(np.percentile(query, RESERVE))
+        later = dataclasses.replace(cases, delay=cases.delay + reserve)
+        again, seconds = planned(planner, later)
+        counted = pj.block.judge(later, again).success & (seconds <= reserve)
+    else:
+        counted = verdict.success & (cases.delay + query + execution <= plans.contact_time)
+    torques = jax.jit(jax.vmap(motion_torques, (0, 0, None)))
+    with_gravity, without = (
+        jax.tree.map(np.asarray, torques(cases.arm, motion, gravity)) for gravity in (9.81, 0.0)
+    )
+    found = is_found(plans, verdict)
+    return Outcome(verdict, found, counted, query, execution, with_gravity, without)
+
+
+def with_spread(values: np.ndarray, digits: int) -> str:
+    """Mean and standard deviation; a dash of none."""
+    if not len(values):
+        return "-"
+    return f"{values.mean():.{digits}f} ± {values.std():.{digits}f}"
+
+
+def table_of_rates(bench: Bench, outcomes: dict[str, Outcome], common: np.ndarray) -> None:
+    """Table I."""
+    bench.say(
+        "| Table I | found | blocked | with query time | query [ms] | p50 | p99 | execution [s] "
+        f"| on the {common.sum()} common |",
+        "|---|---|---|---|---|---|---|---|---|",
+    )
+    for name, (found, counted, blocked, query, execution) in TABLE_I.items():
+        bench.say(
+            f"| {name} | {found} % | {blocked} % | {counted} % | {query[0]} ± {query[1]} | - | - "
+            f"| {execution[0]} ± {execution[1]} | - |"
+        )
+    for name, one in outcomes.items():
+        good = one.verdict.success
+        p50, p99 = 1e3 * np.percentile(one.query, [50, 99])
+        bench.say(
+            f"| {name} | {100 * one.found.mean():.1f} % | {100 * good.mean():.1f} % "
+            f"| {100 * one.counted.mean():.1f} % | {with_spread(1e3 * one.query, 1)} | {p50:.2f} "
+            f"| {p99:.2f} | {with_spread(one.execution[good], 3)} "
+            f"| {with_spread(one.execution[common], 3)} |"
+        )
+        bench.row(
+            table="I",
+            planner=name,
+            found=one.found.mean(),
+            blocked=good.mean(),
+            counted=one.counted.mean(),
+            query={"mean": one.query.mean(), "sd": one.query.std(), "p50": p50, "p99": p99},
+            execution=one.execution[good].mean() if good.any() else None,
+            execution_common=one.execution[common].mean() if common.any() else None,
+        )
+
+
+def table_of_torques(bench: Bench, outcomes: dict[str, Outcome], common: np.ndarray) -> None:
+    """Table II: over each planner's own blocks and over the common ones."""
+    bench.say(
+        "",
+        "| Table II, RMS [N m] | throws | 1 | 2 | 3 | 4 | 5 | 6 | peak 1 | peak 2 | peak 3 |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
+    )
+    for name, row in TABLE_II.items():
+        bench.say(f"| {name} | own | {' | '.join(map(str, row))} | - | - | - |")
+    for name, one in outcomes.items():
+        for kind, torques in (("", one.with_gravity), (", no gravity", one.without)):
+            for throws, which_ones in (("own", one.verdict.success), ("common", common)):
+                if not which_ones.any():
+                    continue
+                all_rms, all_peaks = (
+                    np.asarray(each)[which_ones] for each in (torques.rms, torques.peak)
+                )
+                rms = [with_spread(all_rms[:, k], 1 if k < 3 else 4) for k in range(6)]
+                peaks = [f"{all_peaks[:, k].mean():.0f}" for k in range(3)]
+                bench.say(f"| {name}{kind} | {throws} | {' | '.join([*rms, *peaks])} |")
+                bench.row(
+                    table="II",
+                    planner=name,
+                    gravity=not kind,
+                    throws=throws,
+                    rms=all_rms.mean(axis=0),
+                    peak=all_peaks.mean(axis=0),
+                )
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argument_parser("block_peers", __doc__, num=100, seed=0)
+    parser.add_argument("--suite", choices=list(SUITES), default="pole", help="default: pole")
+    parser.add_argument("--regime", choices=REGIMES, default="R2", help="default: R2")
+    parser.add_argument("--wide", action="store_true", help="balls off the shield's middle, aslant")
+    parser.add_argument("--delay", type=float, default=0.0, help="[s]; default: 0")
+    parser.add_argument("--planners", default=",".join(PLANNERS), help="by name; default: all")
+    options = parser.parse_args()
+    names = chosen(parser, "--planners", options.planners, PLANNERS)
+    if not 0.0 <= options.delay < np.inf:
+        parser.error(f"argument --delay: must be finite and >= 0, got {options.delay:g}")
+    if hasattr(os, "sched_setaffinity"):  # before JAX starts its threads
+        os.sched_setaffinity(0, [max(os.sched_getaffinity(0))])
+    with begin(parser, options) as bench:
+        settings = {"regime": options.regime, "wide": options.wide, "delay": options.delay}
+        cases, warm = (
+            jax.tree.map(np.asarray, pj.block.draw(num, options.suite, seed, **settings))
+            for num, seed in ((options.num, options.seed), (WARM, options.seed + 1))
+        )
+        bench.say(
+            f"{options.num} throws, {options.suite}, seed {options.seed}, {options.regime}, "
+            f"{'wide' if options.wide else 'strict'}, delay {options.delay:g} s, one core, "
+            f"jax {jax.__version__}, load average {os.getloadavg()[0]:.1f}",
+            "",
+        )
+        if any(importlib.util.find_spec(name) is None for name in ("ompl", "toppra")):
+            bench.say(PEERS, "")
+            names = [name for name in names if PLANNERS[name][0] not in NEED_PEERS]
+        outcomes = {}
+        for name in names:
+            kind, changes = PLANNERS[name]
+            lasts = kind in LASTS_UNTIL_CONTACT
+            outcomes[name] = outcome_of(pj.block.planner(kind, **changes), cases, warm, lasts=lasts)
+        common = np.all([one.verdict.success for one in outcomes.values()], axis=0)
+        table_of_rates(bench, outcomes, common)
+        table_of_torques(bench, outcomes, common)
+        bench.count(outcomes[names[0]].verdict.success)
+
+
+if __name__ == "__main__":
+    main()

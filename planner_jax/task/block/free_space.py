@@ -1,0 +1,109 @@
+"""Which angles of an arm touch nothing: distances of batches of them, asked for by the host.
+
+Searches on the host ask for a few angles at a time. These are filled up to one of a few fixed
+numbers, for each of which there is one compiled program.
+"""
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from planner_jax.robot.arm import Arm
+from planner_jax.task.block.case import BlockCase
+from planner_jax.task.block.clearance import clearances
+from planner_jax.task.block.scene import Scene
+
+RESOLUTION = 0.05 / 3.0  # [rad], of all joints together: between samples of an edge, as in [1]
+_BATCHES = (1, 64, 256, 1024)  # angles of a program
+
+# [1] The planners' code behind paper 004, github.com/sbpl/parallel_search.
+
+
+@jax.jit
+def _nearest(arm: Arm, scene: Scene, angles: Array) -> Array:
+    """Least distances (N,) [m] at angles (N, 6)."""
+    return jax.vmap(lambda q: jnp.min(clearances(arm, scene, q)))(angles)
+
+
+@functools.cache
+def _compile(tree: Any, layout: tuple, dtype: Any) -> None:
+    """Have all programs compiled, which must not count as time of a search."""
+    arm, scene = jax.tree.unflatten(tree, [np.zeros(*leaf) for leaf in layout])
+    for size in _BATCHES:
+        _nearest(arm, scene, np.zeros((size, 6), dtype))
+
+
+class FreeSpace:
+    """The angles within the position limits of one case's arm at which it touches nothing."""
+
+    def __init__(self, case: BlockCase, margin: float) -> None:
+        """Of a case with NumPy leaves; `margin` [m] is kept from everything."""
+        self.lower, self.upper = np.asarray(case.arm.lower), np.asarray(case.arm.upper)
+        self._dtype = np.asarray(case.angles).dtype
+        self._arm, self._scene = jax.device_put((case.arm, case.scene))
+        self._margin = margin
+        leaves, tree = jax.tree.flatten((case.arm, case.scene))
+        _compile(tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves), self._dtype)
+
+    def is_free(self, angles: np.ndarray) -> np.ndarray:
+        """Whether each of angles (N, 6) [rad] is, (N,) bool."""
+        num, begin, gaps = len(angles), 0, []
+        while begin < num:
+            size = next((size for size in _BATCHES if size >= num - begin), _BATCHES[-1])
+            some = angles[begin : begin + size]
+            filled = np.empty((size, 6), self._dtype)
+            filled[: len(some)], filled[len(some) :] = some, some[-1]
+            gaps.append(np.asarray(_nearest(self._arm, self._scene, filled))[: len(some)])
+            begin += size
+        is_within = np.all((angles >= self.lower) & (angles <= self.upper), axis=1)
+        return is_within & (np.concatenate(gaps) >= self._margin)
+
+    def are_edges_free(self, begins: np.ndarray, ends: np.ndarray) -> np.ndarray:
+        """Whether straight motions of the joints are, (N,) bool; the ends count, begins do not.
+
+        Args:
+            begins: (N, 6) [rad], or (6,) of all.
+            ends: (N, 6) [rad].
+        """
+        begins = np.broadcast_to(begins, ends.shape)
+        lengths = np.linalg.norm(ends - begins, axis=1)
+        counts = np.maximum(np.ceil(lengths / RESOLUTION - 1e-6), 1.0).astype(int)
+        edge = np.repeat(np.arange(len(ends)), counts)
+        number = np.arange(len(edge)) - np.repeat(np.cumsum(counts) - counts, counts) + 1
+        share = (number / counts[edge])[:, None]
+        angles = begins[edge] + share * (ends - begins)[edge]
+        # Ends and every eighth sample first: that is where most edges fail.
+        is_first = (number % 8 == 0) | (number == counts[edge])
+        found = np.ones(len(ends), bool)
+        for some in (is_first, ~is_first):
+            some = some & found[edge]
+            if some.any():
+                found[edge[some][~self.is_free(angles[some])]] = False
+        return found
+
+    def is_motion_free(self, coeffs: np.ndarray, durations: np.ndarray) -> bool:
+        """Whether a piecewise polynomial of the joints is, at samples no farther apart.
+
+        Args:
+            coeffs: (M, D + 1, 6), rising powers of the time [s] since the piece began.
+            durations: (M,) [s].
+        """
+        rough = _sampled(coeffs, durations, np.full(len(durations), 8))
+        lengths = np.linalg.norm(np.diff(rough.reshape(-1, 9, 6), axis=1), axis=2).sum(axis=1)
+        counts = np.maximum(np.ceil(1.1 * lengths / RESOLUTION), 1.0).astype(int)
+        return bool(self.is_free(_sampled(coeffs, durations, counts)).all())
+
+
+def _sampled(coeffs: np.ndarray, durations: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Angles of every piece at both ends and between, so many steps each, one after another."""
+    piece = np.repeat(np.arange(len(counts)), counts + 1)
+    number = np.arange(len(piece)) - np.repeat(np.cumsum(counts + 1) - counts - 1, counts + 1)
+    time = (number / counts[piece] * durations[piece])[:, None]
+    angles = np.zeros((len(piece), coeffs.shape[2]))
+    for k in range(coeffs.shape[1] - 1, -1, -1):
+        angles = angles * time + coeffs[piece, k]
+    return angles

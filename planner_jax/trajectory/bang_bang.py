@@ -1,0 +1,92 @@
+"""Motions of joints that are only accelerated as hard as they may be, coast, and brake to rest.
+
+Each joint is a double integrator with a greatest rate v and a greatest acceleration a. The quickest
+way to turn by d from a rate u is to accelerate towards the goal, coast at v if that is reached, and
+brake. A joint that would arrive before the slowest one coasts more slowly, so that all arrive
+together: with a peak p and a duration T,
+
+    d = (u + p) |p - u| / 2a  +  p (T - |p - u| / a - p / a)  +  p^2 / 2a.
+"""
+
+import jax.numpy as jnp
+from flax import struct
+from jax import Array
+
+from planner_jax.trajectory.polynomial import PiecewisePolynomial
+
+
+@struct.dataclass
+class _Mirrored:
+    """Joints mirrored so that each has to be braked from a rate >= 0."""
+
+    side: Array  # (J,), 1 or -1
+    turn: Array  # (J,) [rad]
+    rate: Array  # (J,) [rad/s]
+
+
+def _mirrored(turn: Array, rate: Array, acceleration: Array) -> _Mirrored:
+    stopping = 0.5 * rate * jnp.abs(rate) / acceleration
+    side = jnp.where(turn >= stopping, 1.0, -1.0)
+    return _Mirrored(side=side, turn=side * turn, rate=side * rate)
+
+
+def _root(square: Array) -> Array:
+    """Square root with a finite slope at zero, and zero below."""
+    return jnp.where(square > 0.0, jnp.sqrt(jnp.where(square > 0.0, square, 1.0)), 0.0)
+
+
+def least_times(turn: Array, rate: Array, velocity: Array, acceleration: Array) -> Array:
+    """The shortest time (J,) [s] in which each joint turns so far and stands.
+
+    Args:
+        turn: (J,) [rad].
+        rate: (J,) [rad/s], at the start, no faster than the limit.
+        velocity: (J,) [rad/s], > 0, limit.
+        acceleration: (J,) [rad/s^2], > 0, limit.
+    """
+    joints = _mirrored(turn, rate, acceleration)
+    peak = _root(acceleration * joints.turn + 0.5 * joints.rate**2)
+    fast = jnp.minimum(peak, velocity)
+    ramps = (fast**2 - 0.5 * joints.rate**2) / acceleration
+    coasting = jnp.where(peak > velocity, (joints.turn - ramps) / velocity, 0.0)
+    return (2.0 * fast - joints.rate) / acceleration + coasting
+
+
+def bang_bang(
+    start: Array, rate: Array, turn: Array, duration: Array, acceleration: Array
+) -> PiecewisePolynomial:
+    """The motion in which all joints arrive after the duration, and stand.
+
+    Args:
+        start: (J,) [rad].
+        rate: (J,) [rad/s], at the start.
+        turn: (J,) [rad], how far each joint turns.
+        duration: () [s], no shorter than any of `least_times`; rates then keep their limits.
+        acceleration: (J,) [rad/s^2], > 0, what the joints accelerate and brake with.
+
+    Returns:
+        2 J + 1 pieces of degree 2, cut where a joint begins or ends to coast; some may last 0 s.
+    """
+    joints = _mirrored(turn, rate, acceleration)
+    u, d, a = joints.rate, joints.turn, acceleration
+    # Peaks above the rate at the start are a root of the quadratic above; others are linear in d.
+    b, c = a * duration + u, a * d + 0.5 * u**2
+    above = 2.0 * c / jnp.maximum(b + _root(b**2 - 4.0 * c), 1e-9)
+    below = (d - 0.5 * u**2 / a) / jnp.maximum(duration - u / a, 1e-9)
+    peak = jnp.where(d < u * duration - 0.5 * u**2 / a, below, above)
+    rises = jnp.abs(peak - u) / a  # [s], until a joint coasts
+    brakes = duration - peak / a  # [s], when it begins to brake
+    first = jnp.sign(peak - u) * a
+
+    times = jnp.sort(jnp.clip(jnp.concatenate([rises, brakes]), 0.0, duration))
+    times = jnp.concatenate([jnp.zeros_like(times[:1]), times, jnp.full_like(times[:1], duration)])
+    begins, ends = times[:-1, None], times[1:, None]
+    middle = 0.5 * (begins + ends)
+    accelerations = jnp.where(middle < rises, first, jnp.where(middle > brakes, -a, 0.0))
+    rising, braking = jnp.minimum(begins, rises), jnp.maximum(begins - brakes, 0.0)
+    rates = u + first * rising - a * braking
+    coasted = jnp.clip(begins, rises, jnp.maximum(brakes, rises)) - rises
+    angles = u * rising + 0.5 * first * rising**2 + peak * (coasted + braking)
+    angles = angles - 0.5 * a * braking**2
+    rows = [start + joints.side * angles, joints.side * rates, 0.5 * joints.side * accelerations]
+    return PiecewisePolynomial(coeffs=jnp.stack(rows, axis=1), durations=times[1:] - times[:-1])

@@ -1,0 +1,249 @@
+"""Published baselines of blocks: bang-bang motions, torques, plans that the referee confirms."""
+
+import sys
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import planner_jax as pj
+from planner_jax.registry import MissingExtra
+from planner_jax.robot.arm import REGIMES
+from planner_jax.robot.arm_dynamics import inverse_dynamics, motion_torques
+from planner_jax.robot.arm_mjcf import irb1600
+from planner_jax.sweep.block.settings import BlockSettings
+from planner_jax.sweep.block.sweep import BlockSweep
+from planner_jax.task.block.card import TASK
+from planner_jax.task.block.free_space import FreeSpace
+from planner_jax.task.block.way_timing import PIECES, timed_way
+from planner_jax.trajectory.bang_bang import bang_bang, least_times
+from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
+
+LIMITS = REGIMES["R2"].limits
+
+
+@jax.jit
+def quickest(turn, rate, stretch):
+    """The motion with a duration of so many times the least, sampled, and the least times."""
+    times = least_times(turn, rate, LIMITS.velocity, LIMITS.acceleration)
+    duration = stretch * jnp.max(times)
+    motion = bang_bang(jnp.zeros(6), rate, turn, duration, jnp.asarray(LIMITS.acceleration))
+    at = jax.vmap(
+        lambda share: jnp.stack([evaluate(motion, share * duration, k) for k in range(3)])
+    )
+    return at(jnp.linspace(0.0, 1.0, 400)), times
+
+
+def test_joints_from_rest_take_the_times_of_closed_forms(float64):
+    """2 sqrt(d / a) below the greatest rate v, else d / v + v / a."""
+    v, a = LIMITS.velocity.astype(float), LIMITS.acceleration.astype(float)
+    turn = np.array([0.1, -0.2, 0.0, 1.5, -2.5, 4.0])
+    times = quickest(turn, np.zeros(6), 1.0)[1]
+    far = np.abs(turn) / v + v / a
+    expected = np.where(np.abs(turn) > v**2 / a, far, 2.0 * np.sqrt(np.abs(turn) / a))
+    np.testing.assert_allclose(times, expected, rtol=1e-12)
+    assert (np.abs(turn) > v**2 / a).any()
+
+
+@pytest.mark.parametrize("stretch", [1.0, 1.3, 3.0])
+def test_joints_arrive_together_at_rest_within_their_limits(stretch, float64):
+    """From rest and in motion, towards the goal, away from it and too fast to stop before it."""
+    rng = np.random.default_rng(0)
+    for scale in (0.0, 1.0):
+        turn = rng.uniform(-1.5, 1.5, 6) * np.array([1, 1, 1, 1, 0.01, 0.0])
+        rate = scale * rng.uniform(-1.0, 1.0, 6) * LIMITS.velocity
+        angles, rates, accelerations = np.moveaxis(quickest(turn, rate, stretch)[0], 1, 0)
+        np.testing.assert_allclose(angles[0], 0.0, atol=1e-12)
+        np.testing.assert_allclose(rates[0], rate, atol=1e-12)
+        np.testing.assert_allclose(angles[-1], turn, atol=1e-9)
+        np.testing.assert_allclose(rates[-1], 0.0, atol=1e-9)
+        assert (np.abs(rates) <= LIMITS.velocity + 1e-6).all()
+        assert (np.abs(accelerations) <= LIMITS.acceleration + 1e-6).all()
+        steps = np.diff(angles, axis=0)
+        assert np.abs(steps).max() < 0.2  # no jump between pieces
+
+
+@jax.jit
+def torques(arm, motion, gravity):
+    return motion_torques(arm, motion, gravity, samples=64)
+
+
+def test_an_arm_that_stands_exerts_what_gravity_asks(float64):
+    arm: Any = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), irb1600())
+    still = PiecewisePolynomial(coeffs=arm.home[None, None], durations=jnp.array([0.7]))
+    found = torques(arm, still, 9.81)
+    expected = np.abs(inverse_dynamics(arm, arm.home, jnp.zeros(6), jnp.zeros(6)))
+    np.testing.assert_allclose(found.rms, expected, atol=1e-9)
+    np.testing.assert_allclose(found.peak, expected, atol=1e-9)
+    np.testing.assert_allclose(torques(arm, still, 0.0).peak, 0.0, atol=1e-9)
+
+
+def test_torques_of_even_ramps_are_those_of_inertia(float64):
+    """Joint 1 alone, half of the time forwards and half back, without gravity."""
+    arm: Any = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), irb1600())
+    acceleration, half = 3.0, 0.2
+    rows = np.zeros((2, 3, 6))
+    rows[:, 0] = arm.home
+    rows[0, 2, 0], rows[1, 2, 0] = 0.5 * acceleration, -0.5 * acceleration
+    rows[1, 0, 0] += 0.5 * acceleration * half**2
+    rows[1, 1, 0] = acceleration * half
+    motion = PiecewisePolynomial(jnp.asarray(rows), jnp.full(2, half))
+    one = jnp.zeros(6).at[0].set(1.0)
+    inertia = inverse_dynamics(arm, arm.home, jnp.zeros(6), one, 0.0)[0]
+    found = torques(arm, motion, 0.0)
+    assert found.rms[0] == pytest.approx(acceleration * inertia)
+    assert found.peak[0] == pytest.approx(acceleration * inertia)
+
+
+def test_direct_is_confirmed_by_the_referee_and_says_what_became_of_each_ball():
+    cases = jax.tree.map(np.array, pj.block.draw(6, "open", seed=8))
+    cases.ball.vel[1, 0] *= -1.0  # flies away
+    cases.ball.pos[2] = np.nan
+    cases.rates[3] = (0.3, -0.2, 0.1, 0.2, -0.4, 0.5)
+    planner = pj.block.planner("direct", points=6)
+    plans = pj.plan(planner, cases)
+    verdict = pj.block.judge(cases, plans)
+    assert plans.status[1] == plans.status[2] == pj.Status.OUT_OF_REACH
+    np.testing.assert_array_equal(verdict.success, pj.solved(plans))
+    assert pj.solved(plans)[[0, 3, 4, 5]].all()
+    np.testing.assert_allclose(verdict.execution_time[3:], plans.cost[3:], rtol=1e-5)
+    cases.limits.acceleration[:] = 0.5
+    late = pj.plan(planner, cases)
+    assert (late.status[[0, 3, 4, 5]] == pj.Status.INFEASIBLE).all()
+
+
+def test_edges_are_free_where_all_of_their_samples_are():
+    case = pj.lane(jax.tree.map(np.asarray, pj.block.draw(1, seed=8)), 0)
+    free = FreeSpace(case, 0.003)
+    ends = case.angles + np.random.default_rng(0).uniform(-1.0, 1.0, (30, 6))
+    ends[0] = case.angles
+    found = free.are_edges_free(case.angles, ends)
+    lines = case.angles + np.linspace(0.0, 1.0, 401)[:, None, None] * (ends - case.angles)
+    exact = free.is_free(lines.reshape(-1, 6)).reshape(401, 30).all(axis=0)
+    assert found[0] and 3 < found.sum() < 27
+    assert (found == exact).sum() >= 29  # an edge may just touch between its samples
+    coeffs = np.stack([np.broadcast_to(case.angles, ends.shape), ends - case.angles], axis=1)
+    for k in range(30):
+        assert free.is_motion_free(coeffs[k : k + 1], np.ones(1)) == found[k]
+    assert not free.is_free(case.arm.upper[None] + 0.01).any()
+
+
+def test_a_straight_way_takes_the_time_of_its_closed_form():
+    pytest.importorskip("toppra", reason="the extra `arm-peers` is not installed")
+    velocity, acceleration = (np.asarray(x, float) for x in (LIMITS.velocity, LIMITS.acceleration))
+    for far in (0.1, 1.5):
+        points = np.array([np.zeros(6), far * np.array([1.0, -0.5, 0.3, 0.2, 0.1, 1.0])])
+        fastest = (velocity / np.abs(points[1])).min()
+        hardest = (acceleration / np.abs(points[1])).min()
+        ramps = min(fastest**2 / hardest, 1.0)
+        expected = 2.0 * np.sqrt(ramps / hardest) + (1.0 - ramps) / fastest
+        motion = timed_way(points, velocity, acceleration)
+        assert motion is not None
+        assert motion[1].sum() == pytest.approx(expected, rel=5e-3)
+
+
+def test_ways_with_corners_are_timed_within_limits():
+    pytest.importorskip("toppra", reason="the extra `arm-peers` is not installed")
+    velocity, acceleration = (np.asarray(x, float) for x in (LIMITS.velocity, LIMITS.acceleration))
+    points = np.cumsum(np.random.default_rng(1).normal(0.0, 0.4, (7, 6)), axis=0)
+    motion = timed_way(points, velocity, acceleration)
+    assert motion is not None
+    coeffs, durations = motion
+    assert len(durations) <= PIECES
+    powers = np.arange(coeffs.shape[1])
+    ends = (coeffs * durations[:, None, None] ** powers[:, None]).sum(axis=1)
+    np.testing.assert_allclose(coeffs[0, 0], points[0], atol=1e-9)
+    np.testing.assert_allclose(ends[-1], points[-1], atol=1e-9)
+    np.testing.assert_allclose(ends[:-1], coeffs[1:, 0], atol=1e-9)
+    for share in np.linspace(0.0, 1.0, 31):
+        time = share * durations[:, None]
+        rate = sum(k * coeffs[:, k] * time ** (k - 1) for k in range(1, 7))
+        rise = sum(k * (k - 1) * coeffs[:, k] * time ** (k - 2) for k in range(2, 7))
+        assert (np.abs(rate) <= 1.0005 * velocity).all()
+        assert (np.abs(rise) <= 1.0005 * acceleration).all()
+
+
+def test_planners_on_the_host_say_why_there_is_no_plan():
+    cases = jax.tree.map(np.array, pj.block.draw(5, "open", seed=8))
+    cases.scene.floor[0] = 0.5  # above the shield
+    cases.ball.vel[1, 0] *= -1.0  # flies away
+    cases.rates[2] = 0.1  # is moving already
+    cases.limits.acceleration[3] = 0.5
+    cases.ball.pos[4] = np.nan
+    plans = pj.plan(pj.block.planner("insat", **QUICK), cases)
+    wanted = ("BLOCKED", "OUT_OF_REACH", "INFEASIBLE", "INFEASIBLE", "OUT_OF_REACH")
+    assert [pj.Status(status).name for status in plans.status] == list(wanted)
+    assert np.isinf(plans.violation).all()
+    hurried = pj.block.planner("insat", points=6, budget=1e-9)
+    plan = pj.plan(hurried, pj.lane(pj.block.draw(5, "open", seed=8), 4))
+    assert plan.status == pj.Status.NO_PATH and plan.iterations == 0
+    with pytest.raises(ValueError, match="^budget and longest must be > 0, got 0 and 0.05$"):
+        pj.block.planner("insat", budget=0.0)
+
+
+@pytest.mark.parametrize(("name", "package"), [("rrt-connect", "ompl"), ("epase", "toppra")])
+def test_without_the_extra_the_error_says_what_to_install(name, package, monkeypatch):
+    if name == "rrt-connect":
+        pytest.importorskip("toppra", reason="the extra `arm-peers` is not installed")
+    monkeypatch.setitem(sys.modules, package, None)
+    message = rf"^rrt-connect and epase need {package}: pip install 'planner-jax\[arm-peers\]'$"
+    with pytest.raises(MissingExtra, match=message):
+        pj.block.planner(name)
+    others = BlockSweep(TASK).other_planners(BlockSettings(planner="online"))
+    assert name not in others and {"direct", "insat"} <= others.keys()
+
+
+# Throws of an open scene, where the first way that is tried is free.
+QUICK = {"points": 6, "budget": 20.0, "longest": 20.0}
+
+
+def confirmed(name, regime, **options):
+    """Plans of two throws, which the referee must confirm, and the cases."""
+    cases = jax.tree.map(np.array, pj.block.draw(2, "open", seed=8, regime=regime))
+    plans = pj.plan(pj.block.planner(name, **QUICK, **options), cases)
+    verdict: Any = pj.block.judge(cases, plans)
+    assert verdict.success.all(), verdict.sentence(0)
+    assert (plans.status == pj.Status.FEASIBLE).all()
+    return cases, plans, verdict
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("regime", ["R1", "R2"])
+@pytest.mark.parametrize("name", ["rrt-connect", "epase"])
+def test_ways_that_are_timed_are_confirmed_by_the_referee(name, regime):
+    for package in ("ompl", "toppra"):
+        pytest.importorskip(package, reason="the extra `arm-peers` is not installed")
+    _, plans, verdict = confirmed(name, regime)
+    np.testing.assert_allclose(verdict.execution_time, plans.cost, rtol=1e-5)
+    quickest = pj.plan(pj.block.planner("direct", points=6), pj.block.draw(2, "open", seed=8))
+    assert regime == "R1" or (plans.cost > 0.99 * quickest.cost).all()
+
+
+@pytest.mark.parametrize("regime", ["R1", "R2"])
+def test_splines_are_confirmed_by_the_referee(regime):
+    """At rest at the end if they have to be, else waiting until the ball is there."""
+    cases, plans, verdict = confirmed("insat", regime)
+    rests = cases.ends_at_rest
+    ends = jnp.sum(plans.motion.durations, axis=1)
+    last = jax.jit(jax.vmap(lambda motion, time: evaluate(motion, time, 1)))(plans.motion, ends)
+    np.testing.assert_array_equal(np.abs(last).max(axis=1) < 1e-2, rests)
+    if not rests.any():
+        np.testing.assert_allclose(verdict.execution_time, plans.contact_time, rtol=1e-5)
+        assert (plans.cost < 0.9 * verdict.execution_time).all()
+
+
+@pytest.mark.parametrize("name", ["direct", "insat", "epase"])
+def test_an_arm_that_waits_where_the_ball_comes_stays(name):
+    if name == "epase":
+        pytest.importorskip("toppra", reason="the extra `arm-peers` is not installed")
+    cases = jax.tree.map(np.array, pj.block.draw(2, "open", seed=8))
+    motion = pj.plan(pj.block.planner("direct", points=6), cases).motion
+    ends = np.sum(motion.durations, axis=1)
+    cases.angles[:] = jax.jit(jax.vmap(evaluate))(motion, ends)
+    options = {"points": 6} if name == "direct" else QUICK
+    plans = pj.plan(pj.block.planner(name, **options), cases)
+    verdict: Any = pj.block.judge(cases, plans)
+    assert verdict.success.all(), verdict.sentence(0)
+    assert (plans.cost < 0.11).all()  # no spline is shorter than 0.1 s
