@@ -211,7 +211,7 @@ def _sweep(task: Task, given: dict[str, Any]) -> None:
     if resume and out is None:
         raise SettingError("out must name the folder to resume, got nothing")
     settings = pkgutil.resolve_name(task.sweep)(**given).of(task)
-    out = out or _run_folder(f"{task.name}-{settings.planner}")
+    out = out or _run_folder(f"{task.name}-{task.split_planner(settings.planner)[0]}")
     _let_ctrl_c_stop()
     keep_compiled_programs()
     from planner_jax.sweep import run

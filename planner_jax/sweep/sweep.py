@@ -70,7 +70,12 @@ class Sweep:
 
     def other_planners(self, settings: Any) -> dict[str, Any]:
         """The task's other planners of such cases, by name, to be compared with that of a run."""
-        names = [name for name in self.task.all_planners() if name != settings.planner]
+        own, _ = self.task.split_planner(settings.planner)
+        names = [
+            name
+            for name in self.task.all_planners()
+            if name != own and name not in self.task.from_file
+        ]
         made = {name: self.task.planner(name) for name in names}
         kind = _case_type(self.planner(settings))
         fits = lambda one: kind is None or _case_type(one) in (None, kind)  # noqa: E731

@@ -25,7 +25,11 @@ TASK = Task(
     name="block",
     summary="an arm with a shield protects a box from thrown balls",
     home="planner_jax.task.block",
-    planners={"online": "planner_jax.task.block.online:OnlineBlock"},
+    planners={
+        "online": "planner_jax.task.block.online:OnlineBlock",
+        "library": "planner_jax.task.block.library.planner:library_planner",
+    },
+    from_file={"library": "planner-jax library build FILE"},
     suites={name: suite.description for name, suite in SUITES.items()},
     sweep="planner_jax.sweep.block.settings:BlockSettings",
     contact="contact_time",

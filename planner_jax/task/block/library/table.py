@@ -1,0 +1,193 @@
+"""The library: a stored motion for every pair of cells, and how a ball's is looked up.
+
+A lookup is two intersections of the ball's parabola with the boxes, two cells, and one row of a
+table (paper 004, Section IV-D2). It takes as long for every ball and searches nothing. What is
+added to the paper's is the moment at which this very ball crosses the plane of the shield that
+waits for it, and where on the shield.
+"""
+
+import dataclasses
+import hashlib
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+from planner_jax.ball.flight import BallState, drag_free_flight
+from planner_jax.robot.arm import Arm, ArmLimits
+from planner_jax.task.block.case import BlockCase
+from planner_jax.task.block.library.cells import Layout, cell_of
+from planner_jax.task.block.scene import Box, Scene, entry_time
+
+
+@struct.dataclass
+class Setting:
+    """What motions are planned for, besides a ball and where the arm starts."""
+
+    arm: Arm
+    limits: ArmLimits
+    ends_at_rest: Array  # () bool
+    scene: Scene
+
+
+def setting_of(case: BlockCase) -> Setting:
+    """The setting of a case, or of a batch."""
+    return Setting(
+        arm=case.arm, limits=case.limits, ends_at_rest=case.ends_at_rest, scene=case.scene
+    )
+
+
+def fingerprint(setting: Setting) -> str:
+    """Twelve hexadecimal digits that tell settings apart, by all of their numbers in float32."""
+    digest = hashlib.sha256(repr(setting.arm.capsule_link).encode())
+    for path, leaf in jax.tree_util.tree_leaves_with_path(setting):
+        value = np.asarray(leaf)
+        value = value.astype("<f4") if value.dtype.kind == "f" else value.astype("<i4")
+        digest.update(f"{jax.tree_util.keystr(path)}{value.shape}".encode())
+        digest.update(value.tobytes())
+    return digest.hexdigest()[:12]
+
+
+@struct.dataclass
+class Table:
+    """What a lookup reads. Row p of a home is `Row`s fields for pair p, one after another."""
+
+    rows: Array  # (H, P, 6 K + 10) float32
+    homes: Array  # (H, 6) [rad], where stored motions begin, at rest
+    inner: Box
+    outer: Box
+    layout: Layout = struct.field(pytree_node=False)
+
+
+@struct.dataclass
+class Row:
+    """A stored motion and the shield at its end; also a batch, with leading axes."""
+
+    steps: Array  # (K, 6) [rad], see `planner_jax.task.block.motion`
+    duration: Array  # () [s]; infinite where no motion is stored
+    middle: Array  # (3,) [m], of the shield's face
+    normal: Array  # (3,) unit
+    edge: Array  # (3,) unit, along one of its edges
+
+
+def pieces_of(rows: Any) -> int:
+    """K of rows (..., 6 K + 10)."""
+    return (rows.shape[-1] - 10) // 6
+
+
+def packed(row: Row) -> np.ndarray:
+    """Rows (..., 6 K + 10) of a table, float32."""
+    steps, duration = np.asarray(row.steps), np.asarray(row.duration)
+    flat = steps.reshape(*steps.shape[:-2], -1)
+    parts = (flat, duration[..., None], row.middle, row.normal, row.edge)
+    return np.concatenate(parts, axis=-1).astype(np.float32)
+
+
+def unpacked(values: Any) -> Row:
+    """The fields of rows (..., 6 K + 10) of a table."""
+    pieces = pieces_of(values)
+    rest = values[..., 6 * pieces :]
+    return Row(
+        steps=values[..., : 6 * pieces].reshape(*values.shape[:-1], pieces, 6),
+        duration=rest[..., 0],
+        middle=rest[..., 1:4],
+        normal=rest[..., 4:7],
+        edge=rest[..., 7:10],
+    )
+
+
+@struct.dataclass
+class Answer:
+    """What the table has for a ball."""
+
+    row: Row
+    pair: Array  # () int32, number of the pair of cells; 0 without one
+    stored: Array  # () bool, whether the ball goes through two cells with a stored motion
+    time: Array  # () [s], when it crosses the plane of that motion's shield
+    slack: Array  # () [s], how long it is then still in the outer and outside of the inner box
+    beside: Array  # (2,) [m], where on the shield, along its edges from the middle
+    cosine: Array  # (), of the angle between the shield's normal and the ball's way
+
+
+def lookup(table: Table, ball: BallState, gravity: Array, home: Array | int = 0) -> Answer:
+    """What is stored for a ball; pure, for one: constant in time, without a search.
+
+    Args:
+        table: of a library.
+        ball: when it is first seen.
+        gravity: () [m/s^2], magnitude.
+        home: () int32, from which of the homes.
+    """
+    outside, enters = entry_time(table.outer, ball, gravity)
+    inside, hits = entry_time(table.inner, ball, gravity)
+    entry = drag_free_flight(ball, outside, gravity)
+    ends = drag_free_flight(ball, inside, gravity)
+    first, is_first = cell_of(table.layout.outer, table.outer, entry.pos)
+    last, is_last = cell_of(table.layout.inner, table.inner, ends.pos)
+    passes = enters & hits & is_first & is_last & (inside > outside)
+    pair = jnp.where(passes, first * table.layout.num_inner + last, 0)
+    row = unpacked(table.rows[home, pair])
+    # The nearer root of the way to the plane, a parabola in time.
+    away = jnp.sum(row.normal * (entry.pos - row.middle))
+    toward = -jnp.sum(row.normal * entry.vel)
+    squared = toward**2 + 2.0 * gravity * row.normal[2] * away
+    root = jnp.sqrt(jnp.maximum(squared, 0.0))
+    after = 2.0 * away / jnp.maximum(toward + root, 1e-6)
+    time = outside + after
+    there = drag_free_flight(ball, time, gravity)
+    across = there.pos - row.middle
+    beside = jnp.stack(
+        [jnp.sum(across * row.edge), jnp.sum(across * jnp.cross(row.normal, row.edge))]
+    )
+    speed = jnp.sqrt(jnp.maximum(jnp.sum(there.vel**2), 1e-12))
+    return Answer(
+        row=row,
+        pair=pair,
+        stored=passes & jnp.isfinite(row.duration),
+        time=time,
+        slack=jnp.minimum(after, inside - time),
+        beside=beside,
+        cosine=-jnp.sum(row.normal * there.vel) / speed,
+    )
+
+
+@struct.dataclass
+class Library:
+    """Stored motions, and all that they were planned for."""
+
+    table: Table
+    setting: Setting
+
+    @property
+    def found(self) -> np.ndarray:
+        """Which pairs have a motion, (H, P) bool."""
+        return np.isfinite(np.asarray(unpacked(self.table.rows).duration))
+
+    @property
+    def num_bytes(self) -> int:
+        """Memory of the table."""
+        return sum(np.asarray(leaf).nbytes for leaf in jax.tree.leaves(self.table))
+
+
+def library_of(rows: Any, homes: Any, layout: Layout, setting: Setting) -> Library:
+    """A library of rows (H, P, 6 K + 10) from homes (H, 6)."""
+    scene = setting.scene
+    table = Table(rows=rows, homes=homes, inner=scene.inner, outer=scene.outer, layout=layout)
+    return Library(table=table, setting=setting)
+
+
+def moved(library: Library, scene: Scene) -> Library:
+    """The same motions in another scene with the same boxes.
+
+    Raises:
+        ValueError: a box is another one, so that cells would be others.
+    """
+    for name in ("inner", "outer"):
+        old, new = getattr(library.setting.scene, name), getattr(scene, name)
+        for side in ("lower", "upper"):
+            if not np.array_equal(getattr(old, side), getattr(new, side)):
+                raise ValueError(f"scene.{name} must be the library's, got another box")
+    return dataclasses.replace(library, setting=dataclasses.replace(library.setting, scene=scene))
