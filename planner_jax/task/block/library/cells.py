@@ -151,12 +151,12 @@ def tunnels(layout: Layout, inner: Box, outer: Box) -> Tunnels:
     # Towards a face along its axis the lower corner moves, else the higher one.
     near, far = np.where(side > 0, 0, 1), np.where(side > 0, 1, 0)
     begin[rows, near, axis] = side * np.maximum(side * begin[rows, near, axis], side * plane)
-    feasible = side * (begin[rows, far, axis] - plane) > 1e-9
+    feasible = side * (begin[rows, far, axis] - plane) > 1e-6
     return Tunnels(
         outer=begin,
         inner=end,
         is_feasible=feasible,
-        is_centred=side * (middle - plane) > 1e-9,
+        is_centred=side * (middle - plane) > 1e-6,
     )
 
 
