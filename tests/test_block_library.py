@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 
 import planner_jax as pj
-from planner_jax.ball.flight import BallState, drag_free_flight
+from planner_jax.ball.flight import drag_free_flight
 from planner_jax.robot.arm import REGIMES
 from planner_jax.robot.arm_mjcf import irb1600
 from planner_jax.sweep.block import library as command
 from planner_jax.sweep.settings import SettingError
 from planner_jax.task.block.library import build as building
-from planner_jax.task.block.library import file as files
 from planner_jax.task.block.library.cells import (
     GRAVITY,
     LAYOUTS,
@@ -85,7 +84,7 @@ def test_a_point_of_a_cell_is_in_that_cell(name):
         assert len(corners) == sum(face.num for face in faces)
         share = rng.uniform(size=(len(corners), 3))
         points = corners[:, 0] + share * (corners[:, 1] - corners[:, 0])
-        cells, found = jax.jit(jax.vmap(lambda p: cell_of(faces, box, p)))(points)  # noqa: B023
+        cells, found = jax.jit(jax.vmap(lambda p: cell_of(faces, box, tuple(p))))(points)  # noqa: B023
         assert found.all()
         np.testing.assert_array_equal(cells, np.arange(len(corners)))
 
@@ -99,7 +98,7 @@ def _no_boxes():
 
 def test_points_on_edges_are_in_one_cell_whichever_face_they_are_said_to_be_of():
     box = paper_scene().outer
-    at = jax.jit(lambda point: cell_of(TINY.outer, box, point))
+    at = jax.jit(lambda point: cell_of(TINY.outer, box, tuple(point)))
     assert at(jnp.array([1.0, 0.0, 0.9])) == (2, True)  # between two cells: the greater y
     assert at(jnp.array([1.0, 0.0, 0.9250001])) == (3, True)
     assert at(jnp.array([1.0, 0.3, 1.85])) == (3, True)  # an edge of two faces: that across x

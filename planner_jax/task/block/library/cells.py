@@ -88,7 +88,9 @@ LAYOUTS = {
 }
 
 
-def cell_of(faces: tuple[Face, ...], box: Box, point: Array) -> tuple[Array, Array]:
+def cell_of(
+    faces: tuple[Face, ...], box: Box, point: tuple[Array, Array, Array]
+) -> tuple[Array, Array]:
     """The cell in which a point of a box's surface lies, in closed form.
 
     The point is of the face that it is farthest out towards, in shares of the box; where these are
@@ -98,17 +100,16 @@ def cell_of(faces: tuple[Face, ...], box: Box, point: Array) -> tuple[Array, Arr
     Args:
         faces: that have cells.
         box: the whole box.
-        point: (3,) [m]; rounding may put it off the surface.
+        point: three numbers () [m]; rounding may put it off the surface.
 
     Returns:
         cell: () int32, its number; 0 where there is none.
         found: () bool, whether the face has cells.
     """
-    share = (point - box.lower) / (box.upper - box.lower)
-    x, y, z = away = [jnp.abs(2.0 * share[k] - 1.0) for k in range(3)]
+    share = [(point[k] - box.lower[k]) / (box.upper[k] - box.lower[k]) for k in range(3)]
+    x, y, z = (jnp.abs(2.0 * each - 1.0) for each in share)
     is_axis = ((x >= y) & (x >= z), (y > x) & (y >= z), (z > x) & (z > y))
-    cell, found = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
-    begin = 0
+    begin, cell, found = 0, jnp.zeros((), jnp.int32), jnp.zeros((), bool)
     for face in faces:
         there = is_axis[face.axis] & (face.side * (share[face.axis] - 0.5) > 0.0)
         first, second = (
@@ -118,7 +119,7 @@ def cell_of(faces: tuple[Face, ...], box: Box, point: Array) -> tuple[Array, Arr
         cell = jnp.where(there, begin + first * face.cells[1] + second, cell)
         found = found | there
         begin += face.num
-    return cell, found & jnp.isfinite(sum(away))
+    return cell, found
 
 
 @struct.dataclass

@@ -214,7 +214,10 @@ class StraightPair(PairPlanner):
     It looks at one after another, those of the earliest balls first.
     """
 
-    attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)
+    @property
+    def attempts(self) -> tuple[Attempt, ...]:
+        """One."""
+        return (Attempt(),)
 
     def solve(self, pair: PairCase, attempt: Attempt) -> PairPlan:
         """The plan of one pair."""

@@ -1,7 +1,7 @@
 """The planner that looks motions up; see `planner_jax.task.block.library.table`."""
 
 import os
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -9,16 +9,19 @@ import numpy as np
 from flax import struct
 from jax import Array
 
+from planner_jax.ball.flight import BallState
 from planner_jax.protocol import FEASIBILITY_TOLERANCE, Attempt, Status, status_of
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.library.file import load_library
 from planner_jax.task.block.library.table import (
+    Answer,
     Library,
     Setting,
     Table,
     fingerprint,
     lookup,
     setting_of,
+    unpacked,
 )
 from planner_jax.task.block.motion import polynomial
 from planner_jax.task.block.plan import BlockPlan
@@ -46,7 +49,11 @@ class LibraryBlock:
     library: Library
 
     case_type: ClassVar[type] = BlockCase
-    attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)
+
+    @property
+    def attempts(self) -> tuple[Attempt, ...]:
+        """One: an answer does not get better."""
+        return (Attempt(),)
 
     def check(self, cases: BlockCase) -> None:
         """Raise `OtherLibrary` unless the first of the cases is what the library was built for.
@@ -81,6 +88,46 @@ class LibraryBlock:
         plan = _answered(table, case, home)
         status = jnp.where(fits, plan.status, Status.BLOCKED)
         return plan.replace(status=status.astype(jnp.int32))  # type: ignore[attr-defined]
+
+
+class OneBall:
+    """Looks up one ball after another at the least latency, by a program compiled for the CPU.
+
+    A ball goes in as one vector and its answer comes back as one: every array that crosses into a
+    compiled program, or out of it, costs a microsecond. The motion is left as it is stored.
+    """
+
+    def __init__(self, library: Library, gravity: float = 9.81, home: int = 0):
+        """Compile the lookup of a library, for an arm that waits at one of its homes."""
+        own = library.table
+
+        def packed(rows: Array, vector: Array) -> Array:
+            table = Table(
+                rows=rows, homes=own.homes, inner=own.inner, outer=own.outer, layout=own.layout
+            )
+            ball = BallState(pos=vector[:3], vel=vector[3:])
+            found = lookup(table, ball, jnp.asarray(gravity, vector.dtype), home)
+            numbers = (found.pair, found.stored, found.time, found.slack, *found.beside)
+            numbers = jnp.stack([jnp.asarray(x, vector.dtype) for x in (*numbers, found.cosine)])
+            return jnp.concatenate([rows[home, found.pair], numbers])
+
+        self._rows = jax.device_put(own.rows, jax.local_devices(backend="cpu")[0])
+        vector = jax.ShapeDtypeStruct((6,), np.float32)
+        self._lookup = jax.jit(packed).lower(self._rows, vector).compile()
+
+    def answer(self, pos: Any, vel: Any) -> Answer:
+        """What `lookup` finds for a ball, in NumPy arrays and plain numbers.
+
+        Args:
+            pos: (3,) [m], when it is first seen.
+            vel: (3,) [m/s].
+        """
+        vector = np.empty(6, np.float32)
+        vector[:3], vector[3:] = pos, vel
+        found = np.asarray(self._lookup(self._rows, vector))
+        pair, stored, time, slack, along, across, cosine = found[-7:].tolist()
+        numbers: Any = (int(pair), bool(stored), time, slack, (along, across), cosine)
+        return Answer(unpacked(found[:-7]), *numbers)
 
 
 def _is_same(own: Setting, asked: Setting) -> Array:
@@ -119,11 +166,12 @@ def _answered(table: Table, case: BlockCase, home: Array) -> BlockPlan:
     waits = jnp.zeros_like(motion.coeffs[:1]).at[0, 0].set(start)
     # What counts is whether it is on time; a limit of the contact may be met to a tolerance.
     early = (1.0 + FEASIBILITY_TOLERANCE) * duration / jnp.maximum(contact - case.delay, 1e-6)
+    beside = jnp.stack(answer.beside)
     angle = jnp.arccos(jnp.clip(answer.cosine, -1.0, 1.0))
     excess = [
         early - 1.0,
-        jnp.max(jnp.abs(answer.beside)) / case.arm.shield_half - 1.0,
-        jnp.sqrt(jnp.maximum(jnp.sum(answer.beside**2), 1e-12)) / case.offset - 1.0,
+        jnp.max(jnp.abs(beside)) / case.arm.shield_half - 1.0,
+        jnp.sqrt(jnp.maximum(jnp.sum(beside**2), 1e-12)) / case.offset - 1.0,
         angle / case.tilt - 1.0,
         -answer.slack / 1e-3,
     ]

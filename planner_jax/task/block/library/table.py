@@ -16,7 +16,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.ball.flight import BallState, drag_free_flight
+from planner_jax.ball.flight import BallState
 from planner_jax.robot.arm import Arm, ArmLimits
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.library.cells import Layout, cell_of
@@ -101,19 +101,21 @@ def unpacked(values: Any) -> Row:
 
 @struct.dataclass
 class Answer:
-    """What the table has for a ball."""
+    """What the table has for a ball, and how the ball meets the shield at the motion's end."""
 
     row: Row
     pair: Array  # () int32, number of the pair of cells; 0 without one
     stored: Array  # () bool, whether the ball goes through two cells with a stored motion
-    time: Array  # () [s], when it crosses the plane of that motion's shield
-    slack: Array  # () [s], how long it is then still in the outer and outside of the inner box
-    beside: Array  # (2,) [m], where on the shield, along its edges from the middle
+    time: Array  # () [s], when it crosses the plane of the shield
+    slack: Array  # () [s], since it is in the outer box, or until it is in the inner one
+    beside: tuple[Array, Array]  # () [m] each, along the shield's edges from its middle
     cosine: Array  # (), of the angle between the shield's normal and the ball's way
 
 
 def lookup(table: Table, ball: BallState, gravity: Array, home: Array | int = 0) -> Answer:
     """What is stored for a ball; pure, for one: constant in time, without a search.
+
+    By components, so that a compiled program of one ball has few loops.
 
     Args:
         table: of a library.
@@ -121,37 +123,53 @@ def lookup(table: Table, ball: BallState, gravity: Array, home: Array | int = 0)
         gravity: () [m/s^2], magnitude.
         home: () int32, from which of the homes.
     """
+    layout = table.layout
+
+    def at(time: Array) -> tuple[list[Array], list[Array]]:
+        """Where the ball is [m], and its velocity [m/s]."""
+        x, y, z = (ball.pos[k] + ball.vel[k] * time for k in range(3))
+        fall = gravity * time
+        return [x, y, z - 0.5 * fall * time], [ball.vel[0], ball.vel[1], ball.vel[2] - fall]
+
     outside, enters = entry_time(table.outer, ball, gravity)
     inside, hits = entry_time(table.inner, ball, gravity)
-    entry = drag_free_flight(ball, outside, gravity)
-    ends = drag_free_flight(ball, inside, gravity)
-    first, is_first = cell_of(table.layout.outer, table.outer, entry.pos)
-    last, is_last = cell_of(table.layout.inner, table.inner, ends.pos)
+    place, velocity = at(outside)
+    first, is_first = cell_of(layout.outer, table.outer, place)
+    last, is_last = cell_of(layout.inner, table.inner, at(inside)[0])
     passes = enters & hits & is_first & is_last & (inside > outside)
-    pair = jnp.where(passes, first * table.layout.num_inner + last, 0)
+    pair = jnp.where(passes, first * layout.num_inner + last, 0)
     row = unpacked(table.rows[home, pair])
     # The nearer root of the way to the plane, a parabola in time.
-    away = jnp.sum(row.normal * (entry.pos - row.middle))
-    toward = -jnp.sum(row.normal * entry.vel)
-    squared = toward**2 + 2.0 * gravity * row.normal[2] * away
-    root = jnp.sqrt(jnp.maximum(squared, 0.0))
+    middle, normal, edge = (tuple(each) for each in (row.middle, row.normal, row.edge))
+    away = _dot(normal, _minus(place, middle))
+    toward = -_dot(normal, velocity)
+    root = jnp.sqrt(jnp.maximum(toward**2 + 2.0 * gravity * normal[2] * away, 0.0))
     after = 2.0 * away / jnp.maximum(toward + root, 1e-6)
-    time = outside + after
-    there = drag_free_flight(ball, time, gravity)
-    across = there.pos - row.middle
-    beside = jnp.stack(
-        [jnp.sum(across * row.edge), jnp.sum(across * jnp.cross(row.normal, row.edge))]
+    place, velocity = at(outside + after)
+    across = _minus(place, middle)
+    other = (
+        normal[1] * edge[2] - normal[2] * edge[1],
+        normal[2] * edge[0] - normal[0] * edge[2],
+        normal[0] * edge[1] - normal[1] * edge[0],
     )
-    speed = jnp.sqrt(jnp.maximum(jnp.sum(there.vel**2), 1e-12))
+    speed = jnp.sqrt(jnp.maximum(_dot(velocity, velocity), 1e-12))
     return Answer(
         row=row,
         pair=pair,
         stored=passes & jnp.isfinite(row.duration),
-        time=time,
-        slack=jnp.minimum(after, inside - time),
-        beside=beside,
-        cosine=-jnp.sum(row.normal * there.vel) / speed,
+        time=outside + after,
+        slack=jnp.minimum(after, inside - outside - after),
+        beside=(_dot(across, edge), _dot(across, other)),
+        cosine=-_dot(normal, velocity) / speed,
     )
+
+
+def _minus(a: Any, b: Any) -> list[Array]:
+    return [x - y for x, y in zip(a, b, strict=True)]
+
+
+def _dot(a: Any, b: Any) -> Array:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @struct.dataclass
