@@ -17,8 +17,7 @@ from planner_jax.task.block.library.planner import LibraryBlock
 from planner_jax.task.block.library.table import Library, Row, unpacked
 
 _SPEEDS = (7.0, 10.0)  # [m/s], of balls between the boxes
-_SPARE = 2e-3  # [s], by which balls come later than the motion takes
-_AWAY = 0.1  # [s], from where balls are first seen to the outer box, at least
+_SPARE = 2e-3  # [s], longer than the motion: how long balls are seen before they get into a box
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,7 +113,8 @@ def _thrown(
     vel = way / span[:, None]
     vel[:, 2] += 0.5 * GRAVITY * span
     ball = BallState(pos=jnp.asarray(ends[0], jnp.float32), vel=jnp.asarray(vel, jnp.float32))
-    before = jax.tree.map(np.asarray, _earlier(ball))
+    duration = unpacked(np.asarray(library.table.rows)[home, pairs]).duration
+    before = jax.tree.map(np.asarray, _earlier(ball, jnp.asarray(duration + _SPARE)))
 
     def shared(leaf: np.ndarray) -> np.ndarray:
         return np.broadcast_to(leaf, (num, *np.shape(leaf)))
@@ -138,6 +138,6 @@ def _thrown(
 
 
 @jax.jit
-def _earlier(balls: BallState) -> BallState:
-    """Balls some time before."""
-    return jax.vmap(lambda ball: drag_free_flight(ball, -_AWAY, jnp.asarray(GRAVITY)))(balls)
+def _earlier(balls: BallState, times: Array) -> BallState:
+    """Balls (B,) so much time (B,) [s] before."""
+    return jax.vmap(drag_free_flight, (0, 0, None))(balls, -times, jnp.asarray(GRAVITY))
