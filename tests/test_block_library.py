@@ -10,6 +10,7 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.ball.flight import drag_free_flight
+from planner_jax.cli import main
 from planner_jax.robot.arm import REGIMES
 from planner_jax.robot.arm_mjcf import irb1600
 from planner_jax.sweep.block import library as command
@@ -27,8 +28,15 @@ from planner_jax.task.block.library.cells import (
 )
 from planner_jax.task.block.library.coverage import check, coverage
 from planner_jax.task.block.library.file import LibraryFileError, load_library, save_library
-from planner_jax.task.block.library.planner import LibraryBlock, OtherLibrary
-from planner_jax.task.block.library.table import Row, Setting, library_of, packed, unpacked
+from planner_jax.task.block.library.planner import LibraryBlock, OneBall, OtherLibrary
+from planner_jax.task.block.library.table import (
+    Row,
+    Setting,
+    library_of,
+    lookup,
+    packed,
+    unpacked,
+)
 from planner_jax.task.block.motion import profiles
 from planner_jax.task.block.scene import Box, paper_scene
 
@@ -179,6 +187,23 @@ def test_a_lookup_gives_back_what_is_stored_and_when_the_ball_is_there():
         there = np.array([p + v * t for (p, v), t in zip(shots, plans.contact_time, strict=True)])
         np.testing.assert_allclose(there[:, 0], 0.7, atol=1e-5)
         np.testing.assert_allclose(plans.cost, 0.4)
+
+
+def test_one_ball_is_looked_up_as_many_are():
+    library = made_up(homes=2)
+    cases = pj.block.draw(40, seed=2)
+    of_many = jax.jit(jax.vmap(lookup, (None, 0, 0, None)))
+    many = of_many(jax.device_put(library.table), cases.ball, cases.gravity, 1)
+    one = OneBall(library, home=1)
+    assert 0 < np.sum(many.stored) < 40
+    for k in np.flatnonzero(many.stored):
+        found = one.answer(cases.ball.pos[k], cases.ball.vel[k])
+        assert (found.pair, found.stored) == (many.pair[k], True)
+        np.testing.assert_array_equal(found.row.steps, many.row.steps[k])
+        np.testing.assert_allclose(found.time, many.time[k], rtol=1e-6)
+        np.testing.assert_allclose(found.beside, [each[k] for each in many.beside], atol=1e-5)
+    missed = int(np.flatnonzero(~np.asarray(many.stored))[0])
+    assert not one.answer(cases.ball.pos[missed], cases.ball.vel[missed]).stored
 
 
 def test_statuses_say_why_a_stored_motion_will_not_do():
@@ -409,6 +434,22 @@ def test_a_library_is_shown_with_a_map(tmp_path, capsys):
         command.show_library(str(tmp_path / "b.lib"))
 
 
+def test_the_command_line_shows_a_library_and_refuses_what_is_none(tmp_path, capsys):
+    path = tmp_path / "a.lib"
+    save_library(path, made_up())
+    assert main(["library", "show", str(path)]) == 0
+    assert "Setting " in capsys.readouterr().out
+    for arguments in (
+        ["library", "check", str(tmp_path / "b.lib")],
+        ["sweep", "block", "--planner", f"library:{tmp_path / 'b.lib'}"],
+        ["sweep", "block", "--planner", "library"],
+        ["sweep", "block", "--planner", f"library:{path}", "--regime", "R1", "--num", "2"],
+    ):
+        assert main(arguments) == 2
+        told = capsys.readouterr().err
+        assert told.startswith("planner-jax: error: ") and told.count("\n") == 1
+
+
 def test_a_planner_of_a_file_needs_the_file_and_others_take_none():
     with pytest.raises(ValueError, match="library:FILE, which `planner-jax library build FILE`"):
         pj.block.planner("library")
@@ -423,7 +464,6 @@ def test_a_planner_of_a_file_needs_the_file_and_others_take_none():
 def test_the_referee_confirms_what_is_built(regime, tmp_path):
     """Every pair has a motion, its shield blocks nearly all balls, and no claim is refused."""
     path = tmp_path / "a.lib"
-    layout = Layout((Face(0, 1, (8, 8)),), (Face(0, 1, (1, 1)),))
     layout = Layout((Face(0, 1, (4, 4)),), (Face(0, 1, (2, 2)),))
     home = irb1600().home
     library = building.build(path, setting(regime), home, layout, progress=False)

@@ -145,11 +145,7 @@ def repair(
 
 
 def plan_pairs(
-    setting: Setting,
-    home: np.ndarray,
-    tunnel: Tunnels,
-    pairs: np.ndarray,
-    old: np.ndarray | None = None,
+    setting: Setting, home: Any, tunnel: Tunnels, pairs: np.ndarray, old: Any = None
 ) -> np.ndarray:
     """Rows (N, 6 K + 10) of a table for some pairs (N,), from one home.
 
@@ -167,7 +163,7 @@ def plan_pairs(
     straight, bent = StraightPair(setting, home), BentPair(setting, home)
     corners = (getattr(tunnel, name)[pairs].astype(np.float32) for name in ("outer", "inner"))
     outer, inner = corners
-    given = np.zeros((len(pairs), 6 * straight.online.pieces + 1), np.float32)
+    given: Any = np.zeros((len(pairs), 6 * straight.online.pieces + 1), np.float32)
     has_old = np.zeros(len(pairs), bool)
     if old is not None:
         row = unpacked(old)
@@ -183,14 +179,9 @@ def plan_pairs(
     def improve(planner: PairPlanner, some: np.ndarray, start: int, is_coarse: bool) -> None:
         if not some.size:
             return
-        cases = PairCase(
-            outer=outer[some],
-            inner=inner[some],
-            is_coarse=np.full(len(some), is_coarse),
-            best=found.entry[some],
-            start=np.full(len(some), start, np.int32),
-            given=given[some],
-        )
+        same: Any = (np.full(len(some), is_coarse), np.full(len(some), start, np.int32))
+        best: Any = found.entry[some]
+        cases = PairCase(outer[some], inner[some], same[0], best, same[1], given[some])
         plans = _planned(planner, cases)
         better = solved(plans) & (plans.cost < found.entry[some])
         found.point[some[better]] = plans.point[better]
@@ -210,7 +201,7 @@ def plan_pairs(
     return _rows_of(straight, found)
 
 
-def _planned(planner: PairPlanner, cases: PairCase) -> Any:
+def _planned(planner: Any, cases: PairCase) -> Any:
     """Plans of a batch, in calls of one size, so that one program is compiled."""
     lanes = _CPU_LANES if jax.default_backend() == "cpu" else _GPU_LANES
     num = len(cases.best)
@@ -225,21 +216,16 @@ def _rows_of(planner: PairPlanner, found: _Motions) -> np.ndarray:
     """Rows of a table for motions; those without one have an infinite duration."""
     stored = np.isfinite(found.entry)
     pieces = planner.online.pieces
-    steps = found.point[:, :-1].reshape(-1, pieces, 6).copy()
+    steps: Any = found.point[:, :-1].reshape(-1, pieces, 6).copy()
     if planner.setting.ends_at_rest:
         steps[:, -1] = 0.0
     steps[~stored] = 0.0
     ends = [_ends(planner.setting, planner.home, some) for some in _in_parts(steps)]
-    rotation, middle = (np.concatenate(each)[: len(steps)] for each in zip(*ends, strict=True))
-    return packed(
-        Row(
-            steps=steps,  # type: ignore[arg-type]
-            duration=np.where(stored, found.point[:, -1], np.inf),  # type: ignore[arg-type]
-            middle=middle,
-            normal=rotation[:, :, 0],
-            edge=rotation[:, :, 1],
-        )
-    )
+    parts: Any = (np.concatenate(each)[: len(steps)] for each in zip(*ends, strict=True))
+    rotation, middle = parts
+    duration: Any = np.where(stored, found.point[:, -1], np.inf)
+    row: Any = Row(steps, duration, middle, rotation[:, :, 0], rotation[:, :, 1])
+    return packed(row)
 
 
 def _in_parts(array: np.ndarray) -> list[np.ndarray]:
@@ -260,7 +246,7 @@ def _ends(setting: Setting, home: Array, steps: Array) -> tuple[Array, Array]:
     return jax.vmap(end)(steps)
 
 
-def _is_free(setting: Setting, home: np.ndarray, rows: np.ndarray) -> np.ndarray:
+def _is_free(setting: Setting, home: Any, rows: np.ndarray) -> np.ndarray:
     """Which of some stored motions keep the planner's margin from everything, (N,) bool."""
     online = StraightPair(setting, home).online
     if not len(rows):

@@ -7,6 +7,7 @@ axes in the order x, y, z, the last one fastest. Robot base frame, z up, SI unit
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -88,9 +89,7 @@ LAYOUTS = {
 }
 
 
-def cell_of(
-    faces: tuple[Face, ...], box: Box, point: tuple[Array, Array, Array]
-) -> tuple[Array, Array]:
+def cell_of(faces: tuple[Face, ...], box: Box, point: Sequence[Array]) -> tuple[Array, Array]:
     """The cell in which a point of a box's surface lies, in closed form.
 
     The point is of the face that it is farthest out towards, in shares of the box; where these are

@@ -1,6 +1,7 @@
 """How much of what balls can do a library covers, and whether its motions hold."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -116,28 +117,28 @@ def _thrown(
     duration = unpacked(np.asarray(library.table.rows)[home, pairs]).duration
     before = jax.tree.map(np.asarray, _earlier(ball, jnp.asarray(duration + _SPARE)))
 
-    def shared(leaf: np.ndarray) -> np.ndarray:
+    def shared(leaf: Any) -> Any:
         return np.broadcast_to(leaf, (num, *np.shape(leaf)))
 
     setting = jax.tree.map(shared, setting)
-    same = lambda value: np.full(num, value, np.float32)  # noqa: E731
-    case = BlockCase(
+    same = lambda value: shared(np.asarray(value, np.float32))  # noqa: E731
+    return BlockCase(
         ball=before,
-        gravity=same(GRAVITY),  # type: ignore[arg-type]
-        delay=same(0.0),  # type: ignore[arg-type]
-        angles=shared(np.asarray(library.table.homes)[home]),  # type: ignore[arg-type]
-        rates=np.zeros((num, 6), np.float32),  # type: ignore[arg-type]
+        gravity=same(GRAVITY),
+        delay=same(0.0),
+        angles=shared(np.asarray(library.table.homes)[home]),
+        rates=shared(np.zeros(6, np.float32)),
         arm=setting.arm,
         limits=setting.limits,
         ends_at_rest=setting.ends_at_rest,
-        offset=same(ANYWHERE[0]),  # type: ignore[arg-type]
-        tilt=same(ANYWHERE[1]),  # type: ignore[arg-type]
+        offset=same(ANYWHERE[0]),
+        tilt=same(ANYWHERE[1]),
         scene=setting.scene,
     )
-    return case
 
 
 @jax.jit
 def _earlier(balls: BallState, times: Array) -> BallState:
     """Balls (B,) so much time (B,) [s] before."""
-    return jax.vmap(drag_free_flight, (0, 0, None))(balls, -times, jnp.asarray(GRAVITY))
+    gravity = jnp.asarray(GRAVITY, times.dtype)
+    return jax.vmap(drag_free_flight, (0, 0, None))(balls, -times, gravity)

@@ -103,7 +103,7 @@ def load_library(path: str | os.PathLike) -> Library:
         raise LibraryFileError(
             f"library must be a whole file of {header['size']} bytes, got {size} in {shown}"
         )
-    arrays = {
+    arrays: dict[str, Any] = {
         name: np.memmap(path, kind, "r", place, tuple(shape))
         if shape
         else np.memmap(path, kind, "r", place, (1,))[0]
