@@ -1,7 +1,7 @@
 """Measure the library of blocks: build, coverage, queries, repair, and how many balls it blocks.
 
     python -m benchmarks.block_library [--library FILE] [--layout B] [--regime R2] [--num 2000]
-        [--queries 20000] [--batch 1048576] [--shift 0.1] [--skip-repair] [--out DIR]
+        [--queries 20000] [--batch 1048576] [--shift -0.1] [--skip-repair] [--out DIR]
 
 Without --library one is built, after a few pairs by which everything is compiled. Then
 * coverage, over the pairs that a ball can pass through, and memory;
@@ -214,7 +214,7 @@ def main() -> None:
     parser.add_argument("--library", type=Path, help="a file that has been built")
     parser.add_argument("--layout", default="B", help=f"of {', '.join(LAYOUTS)}; default: B")
     parser.add_argument("--regime", default="R2", help=f"of {', '.join(REGIMES)}; default: R2")
-    parser.add_argument("--shift", type=float, default=0.1, help="[m], of the pole; default: 0.1")
+    parser.add_argument("--shift", type=float, default=-0.1, help="[m], of the pole; default: -0.1")
     parser.add_argument("--skip-repair", action="store_true", help="without the repair")
     options = parser.parse_args()
     chosen(parser, "--layout", options.layout, LAYOUTS)

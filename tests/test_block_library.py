@@ -376,7 +376,7 @@ def test_a_repair_plans_anew_only_what_is_no_longer_free(counted, monkeypatch):
     rows = np.pad(library.table.rows, ((0, 0), (0, 0), (0, 36)))  # as long as those of the stub
     library = library_of(rows, library.table.homes, LAYOUTS["A"], library.setting)
     monkeypatch.setattr(type(library), "found", property(lambda self: _found(self, PIECES)))
-    scene = dataclasses.replace(paper_scene(), pole=np.array([0.906, 0.0], np.float32))
+    scene = dataclasses.replace(paper_scene(), pole=np.array([0.806, -0.1], np.float32))
     fixed, touched = building.repair(library, scene, progress=False)
     np.testing.assert_array_equal(touched[0], hit)
     np.testing.assert_array_equal(np.sort(np.concatenate(counted)), pairs[hit])
@@ -405,6 +405,9 @@ def test_a_home_in_collision_is_refused(tmp_path):
     home[1] = 1.9
     with pytest.raises(ValueError, match="^homes must be free, got -.* m to .* at home 0$"):
         building.build(tmp_path / "a", setting(), home, TINY)
+    pole: Any = np.array([0.806, 0.1], np.float32)  # where the forearm is at home
+    with pytest.raises(ValueError, match="^homes must be free"):
+        building.repair(made_up(), dataclasses.replace(paper_scene(), pole=pole))
 
 
 # The command.
@@ -475,7 +478,7 @@ def test_the_referee_confirms_what_is_built(regime, tmp_path):
     planner = pj.block.planner(f"library:{path}")
     plans = pj.plan(planner, found.cases)
     np.testing.assert_array_equal(pj.solved(plans), found.claimed)
-    shifted: Any = np.array([0.806, 0.1], np.float32)
+    shifted: Any = np.array([0.806, -0.1], np.float32)
     scene = dataclasses.replace(paper_scene(), pole=shifted)
     fixed, touched = building.repair(library, scene, progress=False)
     same = ~touched & library.found

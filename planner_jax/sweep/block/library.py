@@ -129,7 +129,10 @@ def repair_library(path: str, *, pole: Sequence[float], out: str, retry: bool = 
     there: Any = np.asarray(True)
     scene = library.setting.scene.replace(pole=place, has_pole=there)  # type: ignore[attr-defined]
     began = time.perf_counter()
-    repaired, touched = repair(library, scene, retry=retry)
+    try:
+        repaired, touched = repair(library, scene, retry=retry)
+    except ValueError as error:
+        raise SettingError(str(error)) from None
     save_library(out, repaired)
     print(
         f"Planned {touched.sum()} of {library.found.sum()} motions anew in "

@@ -78,10 +78,7 @@ def build(
         OSError: the file or the folder cannot be written.
     """
     homes = np.atleast_2d(np.asarray(homes, np.float32))
-    for k, home in enumerate(homes):
-        near = float(_nearest(setting, home[None, None])[0])
-        if not near > 0.0:
-            raise ValueError(f"homes must be free, got {near:.3g} m to what is nearest at home {k}")
+    _require_free(setting, homes)
     tunnel = tunnels(layout, setting.scene.inner, setting.scene.outer)
     feasible = np.flatnonzero(tunnel.is_feasible)
     parts = _Parts(Path(f"{os.fspath(path)}.parts"), setting, homes, layout)
@@ -122,9 +119,11 @@ def repair(
         others are the old ones, bit for bit.
 
     Raises:
-        ValueError: a box of the scene is not that of the library.
+        ValueError: a box of the scene is not that of the library, or the arm touches something at
+            a home.
     """
     table, setting = library.table, moved(library, scene).setting
+    _require_free(setting, table.homes)
     rows = np.array(table.rows)
     tunnel = tunnels(table.layout, scene.inner, scene.outer)
     touched = np.zeros(rows.shape[:2], bool)
@@ -142,6 +141,14 @@ def repair(
                 rows[k, pairs] = plan_pairs(setting, home, tunnel, pairs, rows[k, pairs])
                 bar.update(len(pairs))
     return library_of(rows, table.homes, table.layout, setting), touched
+
+
+def _require_free(setting: Setting, homes: Any) -> None:
+    """Raise `ValueError` where the arm touches something at a home."""
+    for k, home in enumerate(np.asarray(homes)):
+        near = float(_nearest(setting, home[None, None])[0])
+        if not near > 0.0:
+            raise ValueError(f"homes must be free, got {near:.3g} m to what is nearest at home {k}")
 
 
 def plan_pairs(
