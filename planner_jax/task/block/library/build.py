@@ -36,7 +36,9 @@ from planner_jax.task.block.motion import angles_at
 from planner_jax.task.block.online import learned_starts
 from planner_jax.task.block.scene import Scene
 
-STARTS = 6  # learned starts that are tried, in their order; all where nothing is found
+# Learned starts that are tried where there is a motion already; all where there is none. In a
+# repair, what began with the old motion is as good mostly, and one more will do.
+STARTS, REPAIR_STARTS = (2, 0, 1, 3, 4, 5), (2,)
 _WORTH = 0.03  # [s], earlier: what a search for a better motion has to promise
 # Pairs that are planned before the next part is written, and lanes of one call of a device.
 _CPU_PART, _GPU_PART = 256, 32768
@@ -195,13 +197,16 @@ def plan_pairs(
         found.entry[some[better]] = plans.cost[better]
         found.quickest[some] = plans.quickest
 
+    improving = (-1, *(STARTS if old is None else REPAIR_STARTS))
+    others = [start for start in range(len(learned_starts()[0])) if start not in STARTS]
+    order = [-1, *STARTS, *others]
     for is_coarse in (False, True):
         left = np.isinf(found.entry)
         improve(straight, np.flatnonzero(left), 0, is_coarse)
-        for start in range(-1, len(learned_starts()[0]) if is_coarse else STARTS):
+        for start in order[: None if is_coarse else len(STARTS) + 1]:
             with np.errstate(invalid="ignore"):
                 hard = left & ~(found.entry - found.quickest <= _WORTH)
-            if start >= STARTS:
+            if start not in improving:
                 hard &= np.isinf(found.entry)
             hard &= np.isfinite(found.quickest) & (has_old if start < 0 else True)
             improve(bent, np.flatnonzero(hard), start, is_coarse)
