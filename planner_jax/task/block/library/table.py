@@ -8,7 +8,7 @@ waits for it, and where on the shield.
 
 import dataclasses
 import hashlib
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -62,9 +62,11 @@ class Table:
     layout: Layout = struct.field(pytree_node=False)
 
 
-@struct.dataclass
-class Row:
-    """A stored motion and the shield at its end; also a batch, with leading axes."""
+class Row(NamedTuple):
+    """A stored motion and the shield at its end; also a batch, with leading axes.
+
+    A tuple, as is `Answer`: on the host it is made in a tenth of the time of a dataclass.
+    """
 
     steps: Array  # (K, 6) [rad], see `planner_jax.task.block.motion`
     duration: Array  # () [s]; infinite where no motion is stored
@@ -99,8 +101,7 @@ def unpacked(values: Any) -> Row:
     )
 
 
-@struct.dataclass
-class Answer:
+class Answer(NamedTuple):
     """What the table has for a ball, and how the ball meets the shield at the motion's end."""
 
     row: Row
