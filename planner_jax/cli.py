@@ -1,4 +1,4 @@
-"""The command line: `planner-jax sweep|fly TASK`, `view`, `report`, `bench`, `doctor`.
+"""The command line: `planner-jax sweep|fly TASK`, `library`, `view`, `report`, `bench`, `doctor`.
 
 Tasks come from the registry, and the options of `sweep` and `fly` from the fields of a task's
 settings: nothing here knows a task.
@@ -114,6 +114,8 @@ def _parser() -> _Parser:
                 # Settings are imported for the one task that is asked for.
                 fill = functools.partial(add, task)
                 tasks.add_parser(task.name, help=task.summary, fill=fill, **hidden)
+    library = commands.add_parser("library", help="motions that the block planner looks up")
+    _add_library(library.add_subparsers(title="commands", required=True, metavar="command"))
     view = command("view", "play a run's flights in a browser", _view)
     view.add_argument("run", metavar="RUN", help="folder of a run of flights")
     view.add("--host", default="localhost", help="where to serve (default: localhost)")
@@ -127,6 +129,43 @@ def _parser() -> _Parser:
     kinds.add_parser("throughput", help=words, fill=_add_throughput, **hidden)
     command("doctor", "versions, devices, precision, cache and a timed plan", _doctor)
     return parser
+
+
+def _add_library(commands: Any) -> None:
+    """What can be done with a file of stored motions."""
+    hidden: Any = {"argument_default": argparse.SUPPRESS}
+
+    def command(name: str, words: str) -> _Parser:
+        added = commands.add_parser(name, help=words, description=words, **hidden)
+        added.add_argument("path", metavar="FILE", help="of the library")
+        added.set_defaults(command=functools.partial(_library, f"{name}_library"))
+        return added
+
+    build = command("build", "plan for every pair of cells; goes on where it was interrupted")
+    build.add("--layout", metavar="NAME", help="full, or A, B, C, D of fewer (default: full)")
+    build.add("--regime", metavar="NAME", help="limits of the joints: R1, R2, R3 (default: R2)")
+    build.add("--no-pole", dest="pole", action="store_false", help="the scene without its pole")
+    build.add("--arm", metavar="FILE", help="an MJCF file (default: the IRB 1600)")
+    angles = "six angles [rad] where the arm waits, or six for each of several homes"
+    build.add("--home", type=float, nargs="+", metavar="Q", help=angles)
+    show = command("show", "coverage, memory and hashes of a library")
+    show.add("--map", metavar="FILE", help="write a picture of the coverage")
+    check = command("check", "have the referee judge stored motions as answers to random balls")
+    check.add("--num", type=int, metavar="N", help="balls for each home (default: 2000)")
+    check.add("--seed", type=int, metavar="K", help="of the balls (default: 0)")
+    repair = command("repair", "plan anew what touches a pole that has moved")
+    place = "where it stands now [m]"
+    repair.add("--pole", type=float, nargs=2, metavar="M", help=place, required=True)
+    repair.add("--out", metavar="FILE", help="of the new library", required=True)
+    repair.add("--retry", action="store_true", help="pairs without a motion, too")
+
+
+def _library(name: str, given: dict[str, Any]) -> None:
+    _let_ctrl_c_stop()
+    keep_compiled_programs()
+    from planner_jax.sweep.block import library
+
+    getattr(library, name)(**given)
 
 
 def _add_throughput(parser: _Parser) -> None:
@@ -211,7 +250,7 @@ def _sweep(task: Task, given: dict[str, Any]) -> None:
     if resume and out is None:
         raise SettingError("out must name the folder to resume, got nothing")
     settings = pkgutil.resolve_name(task.sweep)(**given).of(task)
-    out = out or _run_folder(f"{task.name}-{settings.planner}")
+    out = out or _run_folder(f"{task.name}-{task.split_planner(settings.planner)[0]}")
     _let_ctrl_c_stop()
     keep_compiled_programs()
     from planner_jax.sweep import run

@@ -46,6 +46,8 @@ class Task:
     home: str  # module with the functions `case`, `draw`, `planner` and `judge`
     planners: Mapping[str, str]  # name -> what makes the planner of given options; default first
     suites: Mapping[str, str]  # name -> what it draws, a sentence; default first
+    # Planners that are read from a file, such as "library:motions.bin" -> what makes the file.
+    from_file: Mapping[str, str] = dataclasses.field(default_factory=dict)
     # Classes of the settings of its sweeps, and of its flights in `sims`; they name what runs them.
     sweep: str = "planner_jax.sweep.settings:SweepSettings"
     flight: str | None = None
@@ -85,19 +87,35 @@ class Task:
         others = _offered("suites", self.name, self.suites)
         return {**self.suites, **{name: f"{entry.value}." for name, entry in others.items()}}
 
+    def split_planner(self, name: str) -> tuple[str, str]:
+        """The key of `all_planners` in a planner's name, and its file, or nothing.
+
+        Raises:
+            UnknownName: there is no planner of that name, or it needs a file or takes none.
+        """
+        planner, _, file = name.partition(":")
+        require_name(self.all_planners(), "planner", planner)
+        if planner in self.from_file and not file:
+            raise UnknownName(
+                f"planner must name its file, as in {planner}:FILE, which "
+                f"`{self.from_file[planner]}` makes, got {name!r}"
+            )
+        if planner not in self.from_file and planner != name:
+            raise UnknownName(f"planner {planner} takes no file, got {name!r}")
+        return planner, file
+
     def make_planner(self, name: str, options: Mapping[str, Any]) -> Any:
         """The planner of a name.
 
         Args:
-            name: a key of `all_planners`.
-            options: keyword arguments of what makes it.
+            name: a key of `all_planners`; of those in `from_file` with ":" and the file behind it.
+            options: keyword arguments of what makes it, which also takes the file first.
 
         Raises:
-            UnknownName: there is no planner of that name.
+            UnknownName: there is no planner of that name, or it needs a file or takes none.
         """
-        planners = self.all_planners()
-        require_name(planners, "planner", name)
-        return _resolved(planners[name])(**options)
+        planner, file = self.split_planner(name)
+        return _resolved(self.all_planners()[planner])(*filter(None, [file]), **options)
 
     def other_suite(self, name: str) -> Callable[..., Any]:
         """What draws a suite of another package: `draw(num, seed, first)`.

@@ -67,7 +67,7 @@ class SweepSettings:
             suite=next(iter(suites)) if self.suite is None else self.suite,
         )
         try:
-            require_name(planners, "planner", str(filled.planner))
+            task.split_planner(str(filled.planner))
             require_name(suites, "suite", str(filled.suite))
         except UnknownName as error:
             raise SettingError(str(error)) from None

@@ -72,13 +72,14 @@ class Sweep:
     def other_planners(self, settings: Any) -> dict[str, Any]:
         """The task's other planners of such cases, by name, to be compared with that of a run.
 
-        Without those whose packages are not installed.
+        Without those that come from a file, or whose packages are not installed.
         """
-        names = [name for name in self.task.all_planners() if name != settings.planner]
+        own, _ = self.task.split_planner(settings.planner)
         made = {}
-        for name in names:
-            with contextlib.suppress(MissingExtra):
-                made[name] = self.task.planner(name)
+        for name in self.task.all_planners():
+            if name != own and name not in self.task.from_file:
+                with contextlib.suppress(MissingExtra):
+                    made[name] = self.task.planner(name)
         kind = _case_type(self.planner(settings))
         fits = lambda one: kind is None or _case_type(one) in (None, kind)  # noqa: E731
         return {name: one for name, one in made.items() if fits(one)}

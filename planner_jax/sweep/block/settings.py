@@ -22,10 +22,11 @@ class BlockSettings(SweepSettings):
     wide: bool = option(
         False, "", "the ball may be 0.1 m off the shield's middle and 30 degrees off straight on"
     )
+    anywhere: bool = option(False, "", "any place on the shield will do, at any angle")
     delay: float = option(0.0, "S", "seconds until the arm may start")
 
     RUN: ClassVar[str] = "planner_jax.sweep.block.sweep:BlockSweep"
-    DRAW: ClassVar[tuple[str, ...]] = ("regime", "wide", "delay")
+    DRAW: ClassVar[tuple[str, ...]] = ("regime", "wide", "anywhere", "delay")
     CPU_BATCH: ClassVar[int] = 256  # some ms a case
     GPU_BATCH: ClassVar[int] = 4096
 

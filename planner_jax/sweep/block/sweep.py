@@ -3,9 +3,11 @@
 from typing import Any
 
 from planner_jax.sweep.block.columns import COLUMNS, FRAME
-from planner_jax.sweep.settings import SweepSettings
+from planner_jax.sweep.settings import SettingError, SweepSettings
 from planner_jax.sweep.summary import Tally
 from planner_jax.sweep.sweep import Sweep
+from planner_jax.task.block.library.file import LibraryFileError
+from planner_jax.task.block.library.planner import LibraryBlock, OtherLibrary
 
 
 class BlockTally(Tally):
@@ -18,6 +20,22 @@ class BlockSweep(Sweep):
     """Arms that block thrown balls."""
 
     frame, own_columns = FRAME, COLUMNS
+
+    def planner(self, settings: SweepSettings) -> Any:
+        """The planner of a run; `SettingError` where its file is no library."""
+        try:
+            return super().planner(settings)
+        except LibraryFileError as error:
+            raise SettingError(str(error)) from None
+
+    def require_fit(self, settings: SweepSettings, planner: Any, cases: Any) -> None:
+        """Raise `SettingError` unless the planner is one of such cases, and a library of these."""
+        super().require_fit(settings, planner, cases)
+        if isinstance(planner, LibraryBlock):
+            try:
+                planner.check(cases)
+            except OtherLibrary as error:
+                raise SettingError(str(error)) from None
 
     def tally(self, settings: SweepSettings) -> BlockTally:
         """An empty count of rows."""

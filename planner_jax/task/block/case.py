@@ -18,6 +18,7 @@ from planner_jax.task.block.scene import Scene, paper_scene
 # angle [rad] between the shield's normal and the way that the ball comes from.
 STRICT = (0.002, np.deg2rad(0.5))
 WIDE = (0.1, np.deg2rad(30.0))
+ANYWHERE = (0.25, np.deg2rad(90.0))  # beyond the shield's corners: on its face
 
 
 @struct.dataclass
@@ -52,6 +53,7 @@ def case(
     delay: Any = 0.0,
     regime: str = "R2",
     wide: bool = False,
+    anywhere: bool = False,
     scene: Scene | None = None,
     arm: Arm | None = None,
     angles: Any = None,
@@ -71,6 +73,8 @@ def case(
             from rest to rest; "R3", R1's limits from rest to rest.
         wide: whether the ball may be 0.1 m off the shield's middle and 30 degrees off straight
             on, and not 2 mm and half a degree.
+        anywhere: whether any place on the shield will do, at any angle, as with motions that were
+            not planned for the very ball.
         scene: without the batch's axes; that of the paper if not given.
         arm: likewise; an IRB 1600 with a shield if not given.
         angles: (6,) [rad], at the start; the arm's home if not given.
@@ -108,7 +112,7 @@ def case(
         return jax.tree.map(one, tree)
 
     chosen = REGIMES[regime]
-    offset, tilt = WIDE if wide else STRICT
+    offset, tilt = ANYWHERE if anywhere else WIDE if wide else STRICT
     return BlockCase(
         ball=BallState(pos=leaf(ball_pos, 3), vel=leaf(ball_vel, 3)),
         gravity=leaf(gravity),

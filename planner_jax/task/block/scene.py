@@ -10,7 +10,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.ball.flight import BallState, drag_free_fall_time, drag_free_flight
+from planner_jax.ball.flight import BallState, drag_free_fall_time
 
 INNER_HALF, INNER_HEIGHT = 0.4, 1.35  # [m], of the box that is protected
 OUTER_HALF, OUTER_HEIGHT = 1.0, 1.85  # [m], of the box in which a ball may be met
@@ -79,16 +79,24 @@ def paper_scene(*, has_pole: bool = True) -> Scene:
 def entry_time(box: Box, ball: BallState, gravity: Array) -> tuple[Array, Array]:
     """When a ball that comes from outside gets into a box, through a side or the top.
 
+    By components, so that a compiled program of one ball has few loops.
+
     Returns:
         time: () [s].
         enters: () bool; a ball that begins inside, or comes through the bottom, does not.
     """
-    moves = jnp.where(jnp.abs(ball.vel[:2]) > 1e-6, ball.vel[:2], 1e-6)
-    at_lower, at_upper = ((edge[:2] - ball.pos[:2]) / moves for edge in (box.lower, box.upper))
-    from_side = jnp.max(jnp.minimum(at_lower, at_upper))
-    until = jnp.min(jnp.maximum(at_lower, at_upper))
+    between = []
+    for axis in range(2):
+        x, v = ball.pos[axis], ball.vel[axis]
+        moves = jnp.where(jnp.abs(v) > 1e-6, v, 1e-6)
+        between.append(((box.lower[axis] - x) / moves, (box.upper[axis] - x) / moves))
+    from_side = jnp.maximum(*(jnp.minimum(*times) for times in between))
+    until = jnp.minimum(*(jnp.maximum(*times) for times in between))
     from_top, _ = drag_free_fall_time(ball, box.upper[2], gravity)
-    beside = drag_free_flight(ball, jnp.maximum(from_side, 0.0), gravity)
-    time = jnp.where(beside.pos[2] > box.upper[2], from_top, from_side)
-    height = drag_free_flight(ball, time, gravity).pos[2]
-    return time, (time > 0.0) & (time <= until) & (height > box.lower[2])
+
+    def height(time: Array) -> Array:
+        return ball.pos[2] + ball.vel[2] * time - 0.5 * gravity * time**2
+
+    beside = height(jnp.maximum(from_side, 0.0))
+    time = jnp.where(beside > box.upper[2], from_top, from_side)
+    return time, (time > 0.0) & (time <= until) & (height(time) > box.lower[2])

@@ -49,6 +49,7 @@ def draw_cases(
     *,
     regime: str = "R2",
     wide: bool = False,
+    anywhere: bool = False,
     delay: float = 0.0,
     dtype: Any = jnp.float32,
 ) -> BlockCase:
@@ -61,6 +62,7 @@ def draw_cases(
         first: place of the first one, >= 0.
         regime: see `planner_jax.task.block.case.case`, as for the next one.
         wide: likewise.
+        anywhere: likewise.
         delay: [s].
         dtype: of every floating leaf.
 
@@ -80,6 +82,7 @@ def draw_cases(
         delay=delay,
         regime=regime,
         wide=wide,
+        anywhere=anywhere,
         scene=paper_scene(has_pole=own.has_pole),
         dtype=dtype,
     )

@@ -21,6 +21,7 @@ def draw(
     first: int = 0,
     regime: str = "R2",
     wide: bool = False,
+    anywhere: bool = False,
     delay: float = 0.0,
     dtype: Any = jnp.float32,
 ) -> BlockCase:
@@ -33,6 +34,7 @@ def draw(
         first: place of the first one, >= 0.
         regime: "R1", "R2" or "R3"; see `case`.
         wide: whether balls may be met off the shield's middle and aslant; see `case`.
+        anywhere: whether any place on the shield will do, at any angle.
         delay: [s], until the arm may start.
         dtype: of every floating leaf.
 
@@ -42,13 +44,24 @@ def draw(
     suite = suite or "pole"
     if suite not in SUITES:
         return TASK.other_suite(suite)(num, seed, first)
-    settings = {"regime": regime, "wide": wide, "delay": delay, "dtype": dtype}
-    return draw_cases(suite, num, seed, first, **settings)
+    return draw_cases(
+        suite,
+        num,
+        seed,
+        first,
+        regime=regime,
+        wide=wide,
+        anywhere=anywhere,
+        delay=delay,
+        dtype=dtype,
+    )
 
 
 def planner(name: str = "online", **options: Any) -> AnyPlanner[Any, Any]:
     """The block planner of a name, with some of its fields set.
 
+    * `library:FILE`: the motion that a file of `planner-jax library build` has for the two cells
+      through which the ball comes.
     * `online`: a straight motion of the joints if one is free, else end pose, time of contact and
       motion together, by least squares from many starts.
     * `direct`: all joints as fast as they may turn, to the end pose that is reached soonest of
@@ -63,8 +76,8 @@ def planner(name: str = "online", **options: Any) -> AnyPlanner[Any, Any]:
         **options: fields of that planner's dataclass, for example `points` of `online`.
 
     Returns:
-        A planner for `pj.plan`: `OnlineBlock`, `DirectBlock`, `RrtConnectBlock`, `EpaseBlock` or
-        `InsatBlock`.
+        A planner for `pj.plan`: `OnlineBlock`, `LibraryBlock`, `DirectBlock`, `RrtConnectBlock`,
+        `EpaseBlock` or `InsatBlock`.
 
     Raises:
         ValueError: there is no planner of that name.

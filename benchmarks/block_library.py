@@ -1,0 +1,227 @@
+"""Measure the library of blocks: build, coverage, queries, repair, and how many balls it blocks.
+
+    python -m benchmarks.block_library [--library FILE] [--layout B] [--regime R2] [--num 2000]
+        [--queries 20000] [--batch 1048576] [--shift -0.1] [--skip-repair] [--out DIR]
+
+Without --library one is built, after a few pairs by which everything is compiled. Then
+* coverage, over the pairs that a ball can pass through, and memory;
+* random balls through stored tunnels, by the referee: claims that it refuses;
+* the suites `pole` and `short`, balls that nothing was tuned on (seed 20260), met anywhere on
+  the shield and as `wide`, with no delay and 0.133 s;
+* queries of one ball, from host to host on the CPU, balls of the suite `pole`;
+* queries of a batch on the default device. The table is an argument of what is compiled, so that
+  it cannot be folded into it, and answers stay on the device;
+* the pole moved by --shift along y: a repair, and how many of its motions the referee refuses.
+"""
+
+import argparse
+import dataclasses
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import planner_jax as pj
+from planner_jax.ball.flight import BallState
+from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
+from planner_jax.robot.arm import REGIMES
+from planner_jax.robot.arm_mjcf import irb1600
+from planner_jax.task.block.library import build as building
+from planner_jax.task.block.library.cells import LAYOUTS, tunnels
+from planner_jax.task.block.library.coverage import check, coverage
+from planner_jax.task.block.library.file import load_library
+from planner_jax.task.block.library.planner import LibraryBlock, OneBall
+from planner_jax.task.block.library.table import Answer, Library, Setting, Table, lookup
+from planner_jax.task.block.scene import paper_scene
+
+SEED = 20260
+ROUNDS = 20  # of a batch of queries
+
+
+def timed(function: Any, *arguments: Any, **how: Any) -> tuple[Any, float]:
+    """What a function gives, and how long [s] it takes."""
+    began = time.perf_counter()
+    found = function(*arguments, **how)
+    return found, time.perf_counter() - began
+
+
+def built(bench: Bench, path: Path, layout: str, regime: str) -> Library:
+    """A library built into a file."""
+    given: Any = REGIMES[regime]
+    at_rest: Any = np.asarray(given.ends_at_rest)
+    scene = paper_scene()
+    setting = Setting(irb1600(), given.limits, at_rest, scene)
+    home = irb1600().home
+    own = LAYOUTS[layout]
+    tunnel = tunnels(own, scene.inner, scene.outer)
+    # Spread, so that some of them need least squares, too.
+    few = np.flatnonzero(tunnel.is_feasible)[:: tunnel.is_feasible.sum() // 64]
+    _, compiling = timed(building.plan_pairs, setting, home, tunnel, few)
+    library, seconds = timed(building.build, path, setting, home, own)
+    bench.say(
+        f"Build of {own.num_pairs} pairs, {tunnel.is_feasible.sum()} of them feasible: "
+        f"{seconds:.1f} s, after {compiling:.1f} s with the compilation."
+    )
+    bench.note(build_seconds=seconds, first_pairs_seconds=compiling)
+    return library
+
+
+def describe(bench: Bench, library: Library) -> None:
+    """Coverage and memory."""
+    covered = coverage(library)
+    shares = {
+        "feasible": float(covered.share(covered.is_feasible)[0]),
+        "centred": float(covered.share(covered.is_centred)[0]),
+        "all": float(covered.found[0].mean()),
+        "sure": float(covered.is_sure[0].sum() / covered.found[0].sum()),
+    }
+    bench.say(
+        f"Motions for {100 * shares['feasible']:.2f} % of the feasible pairs, "
+        f"{100 * shares['centred']:.2f} % of those feasible from the outer cell's middle, "
+        f"{100 * shares['all']:.1f} % of all; {100 * shares['sure']:.1f} % of the shields block "
+        f"their whole tunnel; {library.num_bytes / 1e6:.1f} MB."
+    )
+    bench.note(coverage=shares, megabytes=library.num_bytes / 1e6)
+
+
+def referee(bench: Bench, library: Library, num: int, name: str) -> None:
+    """Random balls through stored tunnels."""
+    found = check(library, num, SEED)
+    wrong = int((found.claimed & ~found.verdict.success).sum())
+    bench.say(
+        f"{name}: {100 * found.verdict.success.mean():.2f} % of {num} balls through stored tunnels "
+        f"are blocked; of {found.claimed.sum()} claims the referee refuses {wrong}."
+    )
+    bench.note(**{f"refused_{name}": wrong, f"claims_{name}": int(found.claimed.sum())})
+
+
+def block_rates(bench: Bench, library: Library, regime: str, num: int) -> None:
+    """Balls of the suites."""
+    planner = LibraryBlock(library)
+    for suite in ("pole", "short"):
+        for how in ({"anywhere": True}, {"wide": True}):
+            for delay in (0.0, 0.133):
+                cases = pj.block.draw(num, suite, SEED, regime=regime, delay=delay, **how)
+                plans = pj.plan(planner, cases)
+                verdict: Any = pj.block.judge(cases, plans)
+                found = np.asarray(plans.status) != pj.Status.OUT_OF_REACH
+                claims = pj.solved(plans)
+                refused = int((claims & ~verdict.success).sum())
+                (met,) = how
+                bench.say(
+                    f"{suite}, {met}, delay {delay} s: stored for {100 * found.mean():.1f} %, "
+                    f"{100 * verdict.success.mean():.1f} % of {num} blocked, "
+                    f"{refused} of {claims.sum()} claims refused"
+                )
+                bench.row(
+                    suite=suite,
+                    met=met,
+                    delay=delay,
+                    regime=regime,
+                    found=found.mean(),
+                    success=verdict.success.mean(),
+                    refused=refused,
+                )
+                bench.count(verdict.success)
+
+
+def single_queries(bench: Bench, library: Library, num: int) -> None:
+    """One ball at a time."""
+    one, cases = OneBall(library), pj.block.draw(min(num, 2000), "pole", SEED)
+    balls = list(zip(np.asarray(cases.ball.pos), np.asarray(cases.ball.vel), strict=True))
+    seconds = []
+    for k in range(-500, num):
+        pos, vel = balls[k % len(balls)]
+        began = time.perf_counter_ns()
+        one.answer(pos, vel)
+        if k >= 0:
+            seconds.append(time.perf_counter_ns() - began)
+    quantiles = np.percentile(np.array(seconds) / 1e6, [50, 95, 99])
+    mean, spread = np.mean(seconds) / 1e6, np.std(seconds) / 1e6
+    bench.say(
+        f"Query of one, host to host: p50 {quantiles[0]:.4f} ms, p95 {quantiles[1]:.4f} ms, p99 "
+        f"{quantiles[2]:.4f} ms, mean {mean:.4f} +- {spread:.4f} ms of {num}."
+    )
+    bench.note(query_p50_ms=quantiles[0], query_p99_ms=quantiles[2])
+
+
+@jax.jit
+def looked_up(table: Table, balls: BallState, gravity: Any) -> Answer:
+    """Answers for a batch."""
+    return jax.vmap(lookup, (None, 0, None))(table, balls, gravity)
+
+
+def batch_queries(bench: Bench, library: Library, batch: int) -> None:
+    """A batch on the default device."""
+    cases = pj.block.draw(2000, "pole", SEED)
+    pick = np.random.default_rng(SEED).integers(0, 2000, batch)
+    balls = jax.device_put(jax.tree.map(lambda leaf: np.asarray(leaf)[pick], cases.ball))
+    table = jax.device_put(library.table)
+    gravity = jnp.asarray(9.81, jnp.float32)
+    _, compiling = timed(lambda: jax.block_until_ready(looked_up(table, balls, gravity)))
+
+    def rounds() -> None:
+        for _ in range(ROUNDS):
+            found = looked_up(table, balls, gravity)
+        jax.block_until_ready(found)
+
+    rounds()
+    _, seconds = timed(rounds)
+    rate = batch * ROUNDS / seconds
+    device = jax.devices()[0].device_kind
+    bench.say(f"Batch of {batch}: {rate:.3g} queries/s on {device}, compiled in {compiling:.1f} s.")
+    bench.note(batch_queries_per_second=rate)
+
+
+def repaired(bench: Bench, library: Library, shift: float, num: int) -> None:
+    """The pole moved along y."""
+    scene = library.setting.scene
+    pole: Any = np.asarray(scene.pole) + np.array([0.0, shift], np.float32)
+    moved = dataclasses.replace(scene, pole=pole)
+    (fixed, touched), seconds = timed(building.repair, library, moved, progress=False)
+    stored = int(library.found.sum())
+    bench.say(
+        f"Pole moved by {shift} m: {touched.sum()} of {stored} motions planned anew in "
+        f"{seconds:.1f} s; motions for {fixed.found.sum()} then."
+    )
+    bench.note(repair_seconds=seconds, repaired=int(touched.sum()))
+    referee(bench, fixed, num, "repaired")
+
+
+def measure(bench: Bench, options: argparse.Namespace) -> None:
+    """Everything."""
+    if options.library is None:
+        path = bench.path / "library.bin"
+        library = built(bench, path, options.layout, options.regime)
+    else:
+        library = load_library(options.library)
+    describe(bench, library)
+    referee(bench, library, options.num, "built")
+    block_rates(bench, library, options.regime, options.num)
+    single_queries(bench, library, options.queries)
+    batch_queries(bench, library, options.batch)
+    if not options.skip_repair:
+        repaired(bench, library, options.shift, options.num)
+
+
+def main() -> None:
+    """Measure."""
+    counts = {"num": 2000, "queries": 20000, "batch": 1 << 20}
+    parser = argument_parser("block_library", __doc__, **counts)
+    parser.add_argument("--library", type=Path, help="a file that has been built")
+    parser.add_argument("--layout", default="B", help=f"of {', '.join(LAYOUTS)}; default: B")
+    parser.add_argument("--regime", default="R2", help=f"of {', '.join(REGIMES)}; default: R2")
+    parser.add_argument("--shift", type=float, default=-0.1, help="[m], of the pole; default: -0.1")
+    parser.add_argument("--skip-repair", action="store_true", help="without the repair")
+    options = parser.parse_args()
+    chosen(parser, "--layout", options.layout, LAYOUTS)
+    chosen(parser, "--regime", options.regime, REGIMES)
+    with begin(parser, options) as bench:
+        measure(bench, options)
+
+
+if __name__ == "__main__":
+    main()

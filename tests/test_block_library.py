@@ -1,0 +1,489 @@
+"""Libraries of blocks: cells, lookups, files, what is built, gone on with and repaired."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import planner_jax as pj
+from planner_jax.ball.flight import drag_free_flight
+from planner_jax.cli import main
+from planner_jax.robot.arm import REGIMES
+from planner_jax.robot.arm_mjcf import irb1600
+from planner_jax.sweep.block import library as command
+from planner_jax.sweep.settings import SettingError
+from planner_jax.task.block.library import build as building
+from planner_jax.task.block.library.cells import (
+    GRAVITY,
+    LAYOUTS,
+    Face,
+    Layout,
+    cell_of,
+    farthest_crossing,
+    nominal_ball,
+    tunnels,
+)
+from planner_jax.task.block.library.coverage import check, coverage
+from planner_jax.task.block.library.file import LibraryFileError, load_library, save_library
+from planner_jax.task.block.library.planner import LibraryBlock, OneBall, OtherLibrary
+from planner_jax.task.block.library.table import (
+    Row,
+    Setting,
+    library_of,
+    lookup,
+    packed,
+    unpacked,
+)
+from planner_jax.task.block.motion import profiles
+from planner_jax.task.block.scene import Box, paper_scene
+
+TINY = Layout((Face(0, 1, (2, 2)), Face(2, 1, (1, 2))), (Face(0, 1, (2, 2)),))
+PIECES = 4
+
+
+def setting(regime="R2", **scene):
+    chosen: Any = REGIMES[regime]
+    at_rest: Any = np.asarray(chosen.ends_at_rest)
+    return Setting(irb1600(), chosen.limits, at_rest, dataclasses.replace(paper_scene(), **scene))
+
+
+def made_up(layout=TINY, regime="R2", homes=1):
+    """Rows whose steps tell pair and home, with shields that face +x at x = 0.7 m."""
+    num = layout.num_pairs
+    shape = profiles(PIECES, True)[0]
+    turn = 1e-4 * (1.0 + np.arange(homes)[:, None] * num + np.arange(num))
+    steps = shape[:, None] * turn[..., None, None] * np.ones(6)
+    home = irb1600().home + 0.1 * np.arange(homes, dtype=np.float32)[:, None]
+    duration = np.full((homes, num), 0.4)
+    duration[:, -1] = np.inf
+
+    def vectors(*values):
+        return np.broadcast_to(np.array(values), (homes, num, 3))
+
+    middle, normal, edge = (0.7, 0.0, 0.9), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
+    values = map(lambda v: vectors(*v), (middle, normal, edge))
+    row: Any = Row(steps, duration, *values)  # type: ignore[arg-type]
+    return library_of(packed(row), home, layout, setting(regime))
+
+
+def ball_through(outer, inner, speed=8.0, before=0.6):
+    """A ball from one point to another, seen some time [s] before it is at the first."""
+    outer, inner = np.asarray(outer), np.asarray(inner)
+    span = np.linalg.norm(inner - outer) / speed
+    vel = (inner - outer) / span + (0.0, 0.0, 0.5 * GRAVITY * span)
+    away = np.array([0.0, 0.0, -0.5 * GRAVITY * before**2])
+    return outer - vel * before + away, vel + np.array([0.0, 0.0, GRAVITY * before])
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_a_point_of_a_cell_is_in_that_cell(name):
+    layout, scene = LAYOUTS[name], paper_scene()
+    rng = np.random.default_rng(0)
+    tunnel = tunnels(layout, scene.inner, scene.outer)
+    whole = tunnels(dataclasses.replace(layout, inner=(Face(0, -1, (1, 1)),)), *_no_boxes())
+    sides = (
+        (layout.inner, scene.inner, tunnel.inner[: layout.num_inner]),
+        (layout.outer, scene.outer, whole.outer),
+    )
+    for faces, box, corners in sides:
+        assert len(corners) == sum(face.num for face in faces)
+        share = rng.uniform(size=(len(corners), 3))
+        points = corners[:, 0] + share * (corners[:, 1] - corners[:, 0])
+        cells, found = jax.jit(jax.vmap(lambda p: cell_of(faces, box, tuple(p))))(points)  # noqa: B023
+        assert found.all()
+        np.testing.assert_array_equal(cells, np.arange(len(corners)))
+
+
+def _no_boxes():
+    """Boxes of which the inner one's back cuts nothing off the outer one's cells."""
+    outer = paper_scene().outer
+    behind: Any = np.array([3.0, 0.0, 0.0])
+    return Box(behind, behind + 1.0), outer
+
+
+def test_points_on_edges_are_in_one_cell_whichever_face_they_are_said_to_be_of():
+    box = paper_scene().outer
+    at = jax.jit(lambda point: cell_of(TINY.outer, box, tuple(point)))
+    assert at(jnp.array([1.0, 0.0, 0.9])) == (2, True)  # between two cells: the greater y
+    assert at(jnp.array([1.0, 0.0, 0.9250001])) == (3, True)
+    assert at(jnp.array([1.0, 0.3, 1.85])) == (3, True)  # an edge of two faces: that across x
+    assert at(jnp.array([0.999, 0.3, 1.85])) == (5, True)
+    assert at(jnp.array([1.0, 1.0, 0.1])) == (2, True)
+    assert not at(jnp.array([0.3, 1.0, 0.1]))[1]  # no cells on +y
+    assert not at(jnp.array([-1.0, 0.3, 0.1]))[1]
+    assert not at(jnp.array([jnp.nan, 0.3, 0.1]))[1]
+
+
+def test_tunnels_are_cut_off_where_no_ball_can_come_from():
+    """Every point of what is left sees the inner cell from in front; nothing else does."""
+    layout, scene = LAYOUTS["full"], paper_scene()
+    tunnel = tunnels(layout, scene.inner, scene.outer)
+    assert len(tunnel.outer) == layout.num_pairs == 21504
+    assert (tunnel.is_feasible | ~tunnel.is_centred).all()
+    face = (np.arange(layout.num_pairs) % layout.num_inner) // 28
+    for place, (axis, side) in enumerate(((0, 1), (1, 1), (1, -1))):
+        here = tunnel.is_feasible & (face == place)
+        ahead = side * tunnel.outer[here][..., axis]
+        assert ahead.min() >= 0.4 - 1e-6 and here.any()
+        assert np.all(
+            side * tunnel.outer[~tunnel.is_feasible & (face == place)][..., axis] <= 0.4 + 1e-6
+        )
+    # 37.5 and 45.8 % of the pairs of A and B are feasible from the middle of the outer cell.
+    for name, share in (("A", 0.375), ("B", 11 / 24)):
+        centred = tunnels(LAYOUTS[name], scene.inner, scene.outer).is_centred
+        assert centred.mean() == pytest.approx(share)
+
+
+def test_a_shield_as_large_as_the_farthest_crossing_blocks_the_tunnel():
+    """Random balls come up to it and not beyond."""
+    scene, rng = paper_scene(), np.random.default_rng(1)
+    tunnel = tunnels(LAYOUTS["D"], scene.inner, scene.outer)
+    pair = rng.choice(np.flatnonzero(tunnel.is_centred))
+    outer, inner = tunnel.outer[pair], tunnel.inner[pair]
+    ball, span = nominal_ball(outer, inner)
+    there = drag_free_flight(ball, 0.5 * span, jnp.asarray(GRAVITY))
+    normal = -there.vel / np.linalg.norm(there.vel)
+    side = np.cross(normal, (0.0, 0.0, 1.0))
+    side /= np.linalg.norm(side)
+    rotation = np.stack([normal, side, np.cross(normal, side)], axis=1)
+    far = float(farthest_crossing(outer, inner, there.pos, rotation))
+    begin, end = (
+        corners[0] + rng.uniform(size=(20000, 3)).round() * (corners[1] - corners[0])
+        for corners in (outer, inner)
+    )
+    share = np.linspace(0.0, 1.0, 2001)[:, None]
+    reached = []
+    for a, b in zip(begin[:64], end[:64], strict=True):
+        way = a + share * (b - a)
+        way[:, 2] += 0.5 * GRAVITY * (share * (1.0 - share))[:, 0] * float(span) ** 2
+        beside = (way - there.pos) @ rotation
+        reached.append(np.abs(beside[np.abs(beside[:, 0]).argmin(), 1:]).max())
+    assert max(reached) == pytest.approx(far, abs=4e-3)
+    behind = there.pos + 2.0 * (inner.mean(axis=0) - there.pos)
+    assert np.isinf(farthest_crossing(outer, inner, behind, rotation))
+
+
+def test_a_lookup_gives_back_what_is_stored_and_when_the_ball_is_there():
+    """From either home; at the moment, and the place on the shield, of the parabola."""
+    library = made_up(homes=2)
+    scene = paper_scene()
+    tunnel = tunnels(TINY, scene.inner, scene.outer)
+    pairs = np.flatnonzero(tunnel.is_feasible)[:-1]
+    shots = [ball_through(tunnel.outer[p].mean(0), tunnel.inner[p].mean(0)) for p in pairs]
+    planner = LibraryBlock(library)
+    for home in range(2):
+        angles = library.table.homes[home]
+        cases = pj.block.case(*np.swapaxes(shots, 0, 1), angles=angles, anywhere=True)
+        plans = pj.plan(planner, cases)
+        np.testing.assert_allclose(plans.motion.coeffs[:, 1, 0], np.tile(angles, (len(pairs), 1)))
+        turned = 1e-4 * (1 + home * TINY.num_pairs + pairs)
+        ends = plans.motion.coeffs[:, -1, 0] + (
+            plans.motion.coeffs[:, -1, 1:] * np.array([0.1, 0.01])[:, None]
+        ).sum(axis=1)
+        np.testing.assert_allclose(ends[:, 2] - angles[2], turned, rtol=2e-3)
+        there = np.array([p + v * t for (p, v), t in zip(shots, plans.contact_time, strict=True)])
+        np.testing.assert_allclose(there[:, 0], 0.7, atol=1e-5)
+        np.testing.assert_allclose(plans.cost, 0.4)
+
+
+def test_one_ball_is_looked_up_as_many_are():
+    library = made_up(homes=2)
+    cases = pj.block.draw(40, seed=2)
+    of_many = jax.jit(jax.vmap(lookup, (None, 0, 0, None)))
+    many = of_many(jax.device_put(library.table), cases.ball, cases.gravity, 1)
+    one = OneBall(library, home=1)
+    assert 0 < np.sum(many.stored) < 40
+    for k in np.flatnonzero(many.stored):
+        found = one.answer(cases.ball.pos[k], cases.ball.vel[k])
+        assert (found.pair, found.stored) == (many.pair[k], True)
+        np.testing.assert_array_equal(found.row.steps, many.row.steps[k])
+        np.testing.assert_allclose(found.time, many.time[k], rtol=1e-6)
+        np.testing.assert_allclose(found.beside, [each[k] for each in many.beside], atol=1e-5)
+    missed = int(np.flatnonzero(~np.asarray(many.stored))[0])
+    assert not one.answer(cases.ball.pos[missed], cases.ball.vel[missed]).stored
+
+
+def test_statuses_say_why_a_stored_motion_will_not_do():
+    library = made_up()
+    # From the middle of the cell y, z > 0 to that of the same on the inner box, and others.
+    good = ball_through((1.0, 0.05, 1.2), (0.4, 0.05, 0.8))
+    shots = [
+        good,
+        ball_through((1.0, 0.05, 1.2), (0.4, 0.05, 0.8), before=0.3),  # too soon
+        ball_through((1.0, 0.9, 1.2), (0.4, 0.05, 0.8)),  # beside the shield
+        ball_through((0.1, 1.0, 1.2), (0.1, 0.4, 0.8)),  # no cells on +y
+        ball_through((0.45, 0.5, 1.85), (0.4, 0.3, 0.8)),  # the last pair, which has no motion
+        (good[0], -good[1]),  # flies away
+        (good[0] * np.nan, good[1]),
+        good,
+        good,
+    ]
+    angles = np.tile(irb1600().home, (len(shots), 1))
+    angles[7, 2] += 1e-2  # not at home
+    cases = pj.block.case(*np.swapaxes(shots, 0, 1), angles=angles, anywhere=True)
+    cases = jax.tree.map(np.array, cases)
+    cases.limits.velocity[8] *= 0.5
+    S = pj.Status
+    plans = pj.plan(LibraryBlock(library), cases)
+    assert [S(int(s)) for s in plans.status] == [
+        *(S.CONVERGED, S.INFEASIBLE, S.INFEASIBLE, S.OUT_OF_REACH, S.OUT_OF_REACH),
+        *(S.OUT_OF_REACH, S.OUT_OF_REACH, S.BLOCKED, S.BLOCKED),
+    ]
+    strict = pj.block.case(*good)
+    assert pj.plan(LibraryBlock(library), strict).status == S.INFEASIBLE
+
+
+def test_motions_that_end_in_motion_wait_and_others_begin_at_once():
+    good = ball_through((1.0, 0.05, 1.2), (0.4, 0.05, 0.8))
+    for regime in ("R1", "R3"):
+        case = pj.block.case(*good, regime=regime, delay=0.05, anywhere=True)
+        plan = pj.plan(LibraryBlock(made_up(regime=regime)), case)
+        waits = plan.contact_time - 0.05 - 0.4
+        assert waits > 0.1
+        np.testing.assert_allclose(
+            plan.motion.durations[0], waits if regime == "R1" else 0.0, atol=1e-6
+        )
+
+
+def test_a_library_of_other_cases_is_refused_with_both_hashes():
+    planner = LibraryBlock(made_up())
+    planner.check(pj.block.draw(2))
+    with pytest.raises(OtherLibrary, match=r"one of [0-9a-f]{12} for cases of [0-9a-f]{12}$"):
+        planner.check(pj.block.draw(1, regime="R3"))
+    with pytest.raises(OtherLibrary, match="one of"):
+        planner.check(pj.block.draw(1, "open"))
+    with pytest.raises(OtherLibrary, match="angles must be a home of the library"):
+        planner.check(pj.block.case(np.ones(3), np.ones(3), angles=np.zeros(6)))
+
+
+# Files.
+
+
+def test_a_file_holds_the_library_and_is_mapped(tmp_path):
+    library, path = made_up(homes=2), tmp_path / "a.lib"
+    save_library(path, library)
+    again = load_library(path)
+    assert isinstance(again.table.rows, np.memmap)
+    for a, b in zip(jax.tree.leaves(library), jax.tree.leaves(again), strict=True):
+        assert np.asarray(a).dtype == np.asarray(b).dtype
+        np.testing.assert_array_equal(a, b)
+    assert jax.tree.structure(library) == jax.tree.structure(again)
+    LibraryBlock(again).check(pj.block.draw(1))
+    assert not list(tmp_path.glob("*.tmp"))
+
+
+def test_what_is_wrong_with_a_file_is_told_in_one_line(tmp_path, monkeypatch):
+    path = tmp_path / "a.lib"
+
+    def refused(says):
+        with pytest.raises(LibraryFileError, match=says) as caught:
+            load_library(path)
+        assert "\n" not in str(caught.value)
+
+    refused("^library must be a file, got .* `planner-jax library build .*a.lib` makes one$")
+    path.write_bytes(b"PK\x03\x04 something else\n")
+    refused("^library must be a file of a block library, got")
+    save_library(path, made_up())
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-1])
+    refused(f"^library must be a whole file of {len(whole)} bytes, got {len(whole) - 1} in")
+    path.write_bytes(whole[:100])
+    refused("is cut off$")
+    path.write_bytes(whole.replace(b"library 1\n", b"library 9\n", 1))
+    refused("^library must be of version 1, got version 9 in")
+    at = whole.index(np.float32(0.806).tobytes())  # the pole
+    path.write_bytes(whole[:at] + np.float32(0.7).tobytes() + whole[at + 4 :])
+    refused("^library must have the setting [0-9a-f]{12}, got [0-9a-f]{12} in")
+
+
+# Building.
+
+
+@pytest.fixture
+def counted(monkeypatch):
+    """Planning replaced by what tells pair, home and number of the call."""
+    calls = []
+
+    def plan_pairs(setting, home, tunnel, pairs, old=None):
+        calls.append(np.array(pairs))
+        row = np.zeros((len(pairs), 70), np.float32)
+        row[:, 0], row[:, 1], row[:, 60] = pairs, home[0], 0.3
+        row[pairs % 7 == 0, 60] = np.inf
+        return row
+
+    monkeypatch.setattr(building, "plan_pairs", plan_pairs)
+    monkeypatch.setattr(building, "_CPU_PART", 5)
+    return calls
+
+
+def test_a_build_that_is_interrupted_goes_on_to_the_same_library(tmp_path, counted, monkeypatch):
+    homes = np.stack([irb1600().home, irb1600().home])
+    homes[1, 0] += 0.1
+    given = (setting(), homes, TINY)
+    whole = building.build(tmp_path / "whole", *given, progress=False)
+    num, plain = len(counted), building.plan_pairs
+
+    def stop(*arguments):
+        if len(counted) == num + 3:
+            raise KeyboardInterrupt
+        return plain(*arguments)
+
+    monkeypatch.setattr(building, "plan_pairs", stop)
+    with pytest.raises(KeyboardInterrupt):
+        building.build(tmp_path / "cut", *given, progress=False)
+    assert not (tmp_path / "cut").exists()
+    monkeypatch.setattr(building, "plan_pairs", plain)
+    building.build(tmp_path / "cut", *given, progress=False)
+    assert len(counted) == 2 * num
+    assert (tmp_path / "cut").read_bytes() == (tmp_path / "whole").read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["cut", "whole"]
+    feasible = tunnels(TINY, paper_scene().inner, paper_scene().outer).is_feasible
+    pairs = np.arange(TINY.num_pairs)
+    np.testing.assert_array_equal(whole.found[0], feasible & (pairs % 7 > 0))
+    np.testing.assert_array_equal(
+        np.asarray(whole.table.rows)[1, whole.found[1], 1], homes[1, 0].astype(np.float32)
+    )
+
+
+def test_parts_of_another_library_are_not_gone_on_with(tmp_path, counted, monkeypatch):
+    parts = tmp_path / "a.parts"
+    plain = building.plan_pairs
+    monkeypatch.setattr(building, "save_library", lambda *_: (_ for _ in ()).throw(OSError))
+    home = irb1600().home
+    with pytest.raises(OSError):
+        building.build(tmp_path / "a", setting("R2"), home, TINY, progress=False)
+    kept, num = len(list(parts.glob("*.npy"))), len(counted)
+    assert kept == num
+    monkeypatch.undo()
+    monkeypatch.setattr(building, "plan_pairs", plain)
+    monkeypatch.setattr(building, "_CPU_PART", 5)
+    building.build(tmp_path / "a", setting("R3"), home, TINY, progress=False)
+    assert len(counted) == 2 * num
+
+
+def test_a_repair_plans_anew_only_what_is_no_longer_free(counted, monkeypatch):
+    library = made_up(LAYOUTS["A"])
+    pairs = np.arange(LAYOUTS["A"].num_pairs)
+    hit = (pairs % 100 == 3) & library.found[0]
+
+    def is_free(setting, home, rows):
+        return ~hit[library.found[0]]
+
+    monkeypatch.setattr(building, "_is_free", is_free)
+    rows = np.pad(library.table.rows, ((0, 0), (0, 0), (0, 36)))  # as long as those of the stub
+    library = library_of(rows, library.table.homes, LAYOUTS["A"], library.setting)
+    monkeypatch.setattr(type(library), "found", property(lambda self: _found(self, PIECES)))
+    scene = dataclasses.replace(paper_scene(), pole=np.array([0.806, -0.1], np.float32))
+    fixed, touched = building.repair(library, scene, progress=False)
+    np.testing.assert_array_equal(touched[0], hit)
+    np.testing.assert_array_equal(np.sort(np.concatenate(counted)), pairs[hit])
+    np.testing.assert_array_equal(fixed.table.rows[0, ~hit], rows[0, ~hit])
+    assert (fixed.table.rows[0, hit, 0] == pairs[hit]).all()
+    assert fixed.setting.scene is scene
+    counted.clear()
+    _, touched = building.repair(library, scene, retry=True, progress=False)
+    feasible = tunnels(LAYOUTS["A"], scene.inner, scene.outer).is_feasible
+    np.testing.assert_array_equal(touched[0], hit | (feasible & ~library.found[0]))
+
+
+def _found(library, pieces):
+    return np.isfinite(library.table.rows[..., 6 * pieces])
+
+
+def test_a_repair_needs_the_same_boxes():
+    scene = paper_scene()
+    other = dataclasses.replace(scene, inner=Box(scene.inner.lower, 0.9 * scene.inner.upper))
+    with pytest.raises(ValueError, match="^scene.inner must be the library's, got another box$"):
+        building.repair(made_up(), other)
+
+
+def test_a_home_in_collision_is_refused(tmp_path):
+    home = irb1600().home.copy()
+    home[1] = 1.9
+    with pytest.raises(ValueError, match="^homes must be free, got -.* m to .* at home 0$"):
+        building.build(tmp_path / "a", setting(), home, TINY)
+    pole: Any = np.array([0.806, 0.1], np.float32)  # where the forearm is at home
+    with pytest.raises(ValueError, match="^homes must be free"):
+        building.repair(made_up(), dataclasses.replace(paper_scene(), pole=pole))
+
+
+# The command.
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"layout": "E"}, "^layout must be one of full, A, B, C, D, got 'E'$"),
+        ({"regime": "R4"}, "^regime must be one of R1, R2, R3, got 'R4'$"),
+        ({"home": [0.0] * 7}, "^home must be six angles for each home, got 7 numbers$"),
+    ],
+)
+def test_what_is_wrong_with_a_build_is_named(options, says, tmp_path):
+    with pytest.raises(SettingError, match=says):
+        command.build_library(str(tmp_path / "a"), **options)
+
+
+def test_a_library_is_shown_with_a_map(tmp_path, capsys):
+    path, picture = tmp_path / "a.lib", tmp_path / "a.png"
+    save_library(path, made_up())
+    command.show_library(str(path), map=str(picture))
+    told = capsys.readouterr().out
+    assert "24 pairs of cells, outer +x 2x2 +z 1x2; inner +x 2x2" in told
+    assert picture.stat().st_size > 10_000
+    with pytest.raises(SettingError, match="^library must be a file, got"):
+        command.show_library(str(tmp_path / "b.lib"))
+
+
+def test_the_command_line_shows_a_library_and_refuses_what_is_none(tmp_path, capsys):
+    path = tmp_path / "a.lib"
+    save_library(path, made_up())
+    assert main(["library", "show", str(path)]) == 0
+    assert "Setting " in capsys.readouterr().out
+    for arguments in (
+        ["library", "check", str(tmp_path / "b.lib")],
+        ["sweep", "block", "--planner", f"library:{tmp_path / 'b.lib'}"],
+        ["sweep", "block", "--planner", "library"],
+        ["sweep", "block", "--planner", f"library:{path}", "--regime", "R1", "--num", "2"],
+    ):
+        assert main(arguments) == 2
+        told = capsys.readouterr().err
+        assert told.startswith("planner-jax: error: ") and told.count("\n") == 1
+
+
+def test_a_planner_of_a_file_needs_the_file_and_others_take_none():
+    with pytest.raises(ValueError, match="library:FILE, which `planner-jax library build FILE`"):
+        pj.block.planner("library")
+    with pytest.raises(ValueError, match="^planner online takes no file, got 'online:x'$"):
+        pj.block.planner("online:x")
+    with pytest.raises(LibraryFileError, match="^library must be a file, got 'no/file'"):
+        pj.block.planner("library:no/file")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("regime", ["R1", "R2"])
+def test_the_referee_confirms_what_is_built(regime, tmp_path):
+    """Every pair has a motion, its shield blocks nearly all balls, and no claim is refused."""
+    path = tmp_path / "a.lib"
+    layout = Layout((Face(0, 1, (4, 4)),), (Face(0, 1, (2, 2)),))
+    home = irb1600().home
+    library = building.build(path, setting(regime), home, layout, progress=False)
+    covered = coverage(library)
+    assert covered.share(covered.is_feasible)[0] >= 0.95
+    found = check(library, 200)
+    assert found.claimed.any()
+    assert not (found.claimed & ~found.verdict.success).any()
+    planner = pj.block.planner(f"library:{path}")
+    plans = pj.plan(planner, found.cases)
+    np.testing.assert_array_equal(pj.solved(plans), found.claimed)
+    shifted: Any = np.array([0.806, -0.1], np.float32)
+    scene = dataclasses.replace(paper_scene(), pole=shifted)
+    fixed, touched = building.repair(library, scene, progress=False)
+    same = ~touched & library.found
+    assert touched.any() and same.any()
+    np.testing.assert_array_equal(fixed.table.rows[same], library.table.rows[same])
+    again = check(fixed, 200)
+    assert not (again.claimed & ~again.verdict.success).any()
+    assert unpacked(fixed.table.rows).duration[fixed.found].max() < 3.0
