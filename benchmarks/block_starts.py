@@ -13,6 +13,7 @@ with --num 2400 --tries 384 --lanes 16384, in half a minute on one H200.
 
 import dataclasses
 import json
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -56,10 +57,10 @@ def tried(
     def one(case: Any, bump: Array, rank: Array) -> tuple[Array, Array]:
         flight = flight_of(case)
         poses = end_poses(case, flight, planner.points, planner.pieces)
-        place = planner.order(poses)[rank]
+        place = planner.order(poses, LATER_RANKS)[rank]
         start = planner.straight_point(case, poses, place)
         start = start.at[:-1].add(planner.bump(bump).reshape(-1))
-        config = dataclasses.replace(solver, max_steps=steps)
+        config = dataclasses.replace(solver, max_steps=steps, hope=math.inf)
         end = least_squares(lambda point: planner.model(point, case, flight), start, config)
         plan = planner.plan_at(case, flight, end.point, end.steps)
         moves, first, _ = planner.parts(case, end.point)

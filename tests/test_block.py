@@ -109,7 +109,7 @@ def test_profiles_turn_by_one(ends_at_rest):
 
 def test_the_arm_is_clear_at_home_and_not_when_it_reaches_into_the_pole():
     arm, scene = jax.tree.map(jnp.asarray, (irb1600(), paper_scene()))
-    at = jax.jit(lambda angles, scene: clearances(arm, scene, angles))
+    at = jax.jit(lambda angles, scene: clearances(arm, scene, angles[None])[:, 0])
     home = at(arm.home, scene)
     assert home.min() > 0.003 and home.size > num_of_pole(arm)
     ahead = jnp.zeros(6).at[1].set(0.9)
@@ -143,7 +143,7 @@ def test_slopes_of_least_squares_are_those_of_the_cost(regime, float64, monkeypa
     case = thrown(regime=regime, rates=(0.3, -0.2, 0.1, 0.2, -0.4, 0.5), dtype=jnp.float64)
     flight = flight_of(case)
     poses = end_poses(case, flight, SMALL.points, SMALL.pieces)
-    start = SMALL.straight_point(case, poses, SMALL.order(poses)[0])
+    start = SMALL.straight_point(case, poses, SMALL.order(poses, 1)[0])
     rng = np.random.default_rng(0)
     # Small ones: the slope of an angle is taken for that of its sine.
     point = start + jnp.asarray(rng.normal(0.0, 0.02, start.shape)).at[-1].set(0.0)

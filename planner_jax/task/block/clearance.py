@@ -76,6 +76,11 @@ def clearances(arm: Arm, scene: Scene, angles: Array) -> Array:
     return jnp.concatenate([pairs.distance(pairs.body) for pairs in every])
 
 
+def least_clearances(arm: Arm, scene: Scene, angles: Array) -> Array:
+    """The least of `clearances` in each of N poses, (N,) [m]."""
+    return jnp.min(clearances(arm, scene, angles), axis=0)
+
+
 def clearance_slopes(arm: Arm, scene: Scene, angles: Array) -> Array:
     """How `clearances` change with each joint, (R, 6, N) [m/rad].
 
@@ -124,7 +129,8 @@ def _poses(arm: Arm, angles: Array) -> _Poses:
 
     def turned(rotations: Array, vector: Array) -> Array:
         """Vectors (..., 3) of links in the base frame, (..., 3, N)."""
-        return sum(rotations[..., j, :] * vector[..., j, None, None] for j in range(3))
+        x, y, z = (rotations[..., j, :] * vector[..., j, None, None] for j in range(3))
+        return x + y + z
 
     # The base is the last link, where -1 finds it.
     num = angles.shape[0]

@@ -17,7 +17,7 @@ from planner_jax.planning.batch import better_of
 from planner_jax.planning.one_by_one import one_by_one
 from planner_jax.protocol import Attempt, Status, is_solved, status_of
 from planner_jax.task.block.case import BlockCase
-from planner_jax.task.block.clearance import clearances
+from planner_jax.task.block.clearance import least_clearances
 from planner_jax.task.block.end_poses import EndPoses, end_poses, flight_of
 from planner_jax.task.block.plan import BlockPlan
 from planner_jax.trajectory.bang_bang import bang_bang, least_times
@@ -119,7 +119,7 @@ class DirectBlock:
         motion = bang_bang(case.angles, case.rates, turn, duration, case.limits.acceleration)
         shares = np.arange(1, self.samples + 1) / self.samples
         angles = jax.vmap(lambda share: evaluate(motion, share * duration))(shares)
-        gaps = jax.vmap(lambda q: jnp.min(clearances(case.arm, case.scene, q)))(angles)
+        gaps = least_clearances(case.arm, case.scene, angles)
         # A joint that is moving at the start may have to go beyond its goal before it comes back.
         beyond = jnp.max(jnp.maximum(angles - case.arm.upper, case.arm.lower - angles))
         # A centimetre too near counts as much as a whole limit.

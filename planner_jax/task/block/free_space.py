@@ -8,13 +8,12 @@ import functools
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from planner_jax.robot.arm import Arm
 from planner_jax.task.block.case import BlockCase
-from planner_jax.task.block.clearance import clearances
+from planner_jax.task.block.clearance import least_clearances
 from planner_jax.task.block.scene import Scene
 
 RESOLUTION = 0.05 / 3.0  # [rad], of all joints together: between samples of an edge, as in [1]
@@ -26,7 +25,7 @@ _BATCHES = (1, 64, 256, 1024)  # angles of a program
 @jax.jit
 def _nearest(arm: Arm, scene: Scene, angles: Array) -> Array:
     """Least distances (N,) [m] at angles (N, 6)."""
-    return jax.vmap(lambda q: jnp.min(clearances(arm, scene, q)))(angles)
+    return least_clearances(arm, scene, angles)
 
 
 @functools.cache

@@ -27,7 +27,12 @@ from planner_jax.planning.one_by_one import one_by_one
 from planner_jax.protocol import FEASIBILITY_TOLERANCE, Attempt, Status, is_solved, status_of
 from planner_jax.robot.arm import product, shield_jacobian, shield_pose
 from planner_jax.task.block.case import BlockCase
-from planner_jax.task.block.clearance import clearance_slopes, clearances, num_of_pole
+from planner_jax.task.block.clearance import (
+    clearance_slopes,
+    clearances,
+    least_clearances,
+    num_of_pole,
+)
 from planner_jax.task.block.end_poses import (
     EndPoses,
     Flight,
@@ -59,7 +64,7 @@ class Search(Attempt):
     kept: int = 5  # of the tries, those that lanes in step go on with after the solver's trial
     # Of starts that led to a plan, hardly any ever cost more than the solver hopes for.
     solver: LevenbergConfig = LevenbergConfig(
-        *(16, 1e-2, 0.25, 6.0), settled=1, tolerance=1.0, trial=4, hope=540.0, fade=0.6
+        *(16, 1e-2, 0.25, 6.0), settled=1, tolerance=1.0, trial=5, hope=500.0, fade=0.6
     )
 
 
@@ -110,7 +115,7 @@ class OnlineBlock:
     weights: Weights = Weights()
     searches: tuple[Search, ...] = (
         Search(straight=6, tries=0),
-        Search(straight=32, tries=4, kept=2),
+        Search(tries=4, kept=2),
         Search(straight=0, tries=11, first=4, kept=4),
     )
 
@@ -185,8 +190,8 @@ class OnlineBlock:
         model, solver = self._model_of(case, flight), attempt.solver
         trial = dataclasses.replace(solver, max_steps=solver.trial)
         tried = jax.vmap(lambda point: go_on(model, begun(point, solver), trial))(points)
-        solved_first = jnp.where(tried.stalled >= solver.settled, -1.0, tried.model.cost)
-        _, chosen = lax.top_k(-solved_first, attempt.kept)
+        cost = jnp.where(tried.stalled >= solver.settled, -1.0, tried.model.cost)
+        _, chosen = lax.top_k(-cost, min(attempt.kept, attempt.tries))
         kept = jax.tree.map(lambda leaf: leaf[chosen], tried)
         ends = jax.vmap(lambda state: go_on(model, state, solver))(kept)
         plans = jax.vmap(lambda end: self.plan_at(case, flight, end.point, end.steps))(ends)
@@ -451,7 +456,7 @@ class OnlineBlock:
         joints = self.joint_terms(case, moves, first, duration)[3]
         shares = tuple(np.arange(1, self.checked + 1) / self.checked)
         angles = angles_at(case.angles, first, moves, shares)
-        gaps = clearances(case.arm, case.scene, angles)
+        gaps = least_clearances(case.arm, case.scene, angles)
         contact = self.contact_terms(case, flight, angles[-1], point[-1])[2]
         excess = _violation(joints, contact, self.margin - jnp.min(gaps))
         violation = jnp.where(point[-1] > case.delay, excess, jnp.inf)

@@ -17,7 +17,7 @@ from tqdm import tqdm
 from planner_jax.planning.plan import plan
 from planner_jax.protocol import solved
 from planner_jax.robot.arm import shield_pose
-from planner_jax.task.block.clearance import clearances
+from planner_jax.task.block.clearance import least_clearances
 from planner_jax.task.block.library.cells import Layout, Tunnels, tunnels
 from planner_jax.task.block.library.file import BUILD_VERSION, save_library
 from planner_jax.task.block.library.pairs import BentPair, PairCase, PairPlanner, StraightPair
@@ -280,8 +280,8 @@ def _nearest_on_way(setting: Setting, home: Array, steps: Array, shares: tuple) 
 @jax.jit
 def _nearest(setting: Setting, angles: Array) -> Array:
     """Least distances (N,) [m] at angles (N, S, 6)."""
-    near = lambda q: jnp.min(clearances(setting.arm, setting.scene, q))  # noqa: E731
-    return jnp.min(jax.vmap(jax.vmap(near))(angles), axis=1)
+    flat = least_clearances(setting.arm, setting.scene, angles.reshape(-1, 6))
+    return jnp.min(flat.reshape(angles.shape[:2]), axis=1)
 
 
 def _empty_rows(homes: int, layout: Layout, planner: PairPlanner) -> np.ndarray:

@@ -29,7 +29,7 @@ from planner_jax.protocol import (
 from planner_jax.robot.arm import product, shield_jacobian, shield_pose
 from planner_jax.robot.arm_ik import inverse_kinematics
 from planner_jax.task.block.case import STRICT, BlockCase
-from planner_jax.task.block.clearance import clearances
+from planner_jax.task.block.clearance import least_clearances
 from planner_jax.task.block.end_poses import EndPoses, Flight, all_profiles, facing, frame_of
 from planner_jax.task.block.library.cells import GRAVITY, farthest_crossing, nominal_ball
 from planner_jax.task.block.library.table import Setting
@@ -146,7 +146,7 @@ class PairPlanner:
         durations = jnp.maximum(of_rate[:, None] * rates, of_rise[:, None] * np.sqrt(rises))
         durations = jnp.where(rests | ~self.setting.ends_at_rest, durations, jnp.inf)
         duration = jnp.maximum(jnp.min(durations, axis=1), 1e-3)
-        near = jax.vmap(lambda q: jnp.min(clearances(arm, self.setting.scene, q)))(angles)
+        near = least_clearances(arm, self.setting.scene, angles)
         entry = duration - jnp.repeat(after, 8)
         entry = jnp.where(near >= online.margin, entry, entry + _TOUCHING)
         return EndPoses(
