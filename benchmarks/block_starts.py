@@ -13,7 +13,6 @@ with --num 2400 --tries 384 --lanes 16384, in half a minute on one H200.
 
 import dataclasses
 import json
-import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -60,7 +59,7 @@ def tried(
         place = planner.order(poses, LATER_RANKS)[rank]
         start = planner.straight_point(case, poses, place)
         start = start.at[:-1].add(planner.bump(bump).reshape(-1))
-        config = dataclasses.replace(solver, max_steps=steps, hope=math.inf)
+        config = dataclasses.replace(solver, max_steps=steps, hope=None)
         end = least_squares(lambda point: planner.model(point, case, flight), start, config)
         plan = planner.plan_at(case, flight, end.point, end.steps)
         moves, first, _ = planner.parts(case, end.point)

@@ -75,3 +75,10 @@ def test_a_batch_is_its_lanes_and_a_broken_one_spoils_no_other():
     for k in (0, 2):
         np.testing.assert_allclose(batch.point[k], solve(starts[k], LONG).point, atol=2e-3)
     assert not np.isfinite(batch.model.cost[1])
+
+
+def test_a_search_without_hope_is_given_up_after_its_trial(float64):
+    start = jnp.array([-1.2, 1.0])
+    hopes = ({"trial": 3, "hope": 0.0}, {"trial": 3, "hope": 1e9}, {})
+    ends = [solve(start, dataclasses.replace(LONG, **options)) for options in hopes]
+    assert [int(end.steps) for end in ends] == [3, 60, 60]

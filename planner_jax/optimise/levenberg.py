@@ -7,7 +7,6 @@ next one, and dropped with more if not.
 """
 
 import dataclasses
-import math
 from collections.abc import Callable
 
 import jax
@@ -40,7 +39,7 @@ class LevenbergConfig:
     tolerance: float = 1e-2
     # A search is given up once its cost is above `hope` x `fade`^k, k steps after the step `trial`.
     trial: int = 0
-    hope: float = math.inf
+    hope: float | None = None
     fade: float = 1.0
 
 
@@ -97,10 +96,12 @@ def go_on(
     """The last state of a search that goes on from one; the limit of steps counts all of them."""
 
     def goes_on(state: LevenbergState) -> Array:
+        is_open = (state.steps < config.max_steps) & (state.stalled < config.settled)
+        if config.hope is None:
+            return is_open
         behind = state.steps - config.trial
         bound = config.hope * config.fade ** jnp.maximum(behind, 0)
-        hopeful = (behind < 0) | (state.model.cost <= bound)
-        return (state.steps < config.max_steps) & (state.stalled < config.settled) & hopeful
+        return is_open & ((behind < 0) | (state.model.cost <= bound))
 
     return lax.while_loop(goes_on, lambda state: _step(evaluate, state, config), state)
 

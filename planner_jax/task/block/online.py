@@ -64,7 +64,7 @@ class Search(Attempt):
     kept: int = 5  # of the tries, those that lanes in step go on with after the solver's trial
     # Of starts that led to a plan, hardly any ever cost more than the solver hopes for.
     solver: LevenbergConfig = LevenbergConfig(
-        *(16, 1e-2, 0.25, 6.0), settled=1, tolerance=1.0, trial=5, hope=500.0, fade=0.6
+        *(26, 1e-2, 0.25, 6.0), settled=1, tolerance=1.0, trial=4, hope=500.0, fade=0.7
     )
 
 
