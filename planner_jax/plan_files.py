@@ -29,7 +29,7 @@ def save_arrays(path: str | os.PathLike, tree: Any) -> None:
         TypeError: a leaf is not an array of numbers.
     """
     header = json.dumps({"version": VERSION, "class": type(tree).__name__})
-    arrays: dict[str, Any] = {name: np.asarray(leaf) for name, leaf in _leaves(tree)}
+    arrays: dict[str, Any] = {name: np.asarray(leaf) for name, leaf in named_leaves(tree).items()}
     for name, array in arrays.items():
         if array.dtype.hasobject:  # which NumPy would pickle
             raise TypeError(f"{name} must be an array of numbers, got {array.dtype}")
@@ -71,14 +71,15 @@ def load_arrays(path: str | os.PathLike, kind: type[Kind]) -> Kind:
     return tree
 
 
-def _leaves(tree: Any, prefix: str = "") -> list[tuple[str, Any]]:
-    """Names, joined by dots, and arrays of a dataclass."""
-    named = []
+def named_leaves(tree: Any, prefix: str = "") -> dict[str, Any]:
+    """The arrays of a dataclass by their names, joined by dots; without what is static."""
+    named = {}
     for field in dataclasses.fields(tree):
-        value = getattr(tree, field.name)
-        inner = dataclasses.is_dataclass(value)
-        place = prefix + field.name
-        named += _leaves(value, f"{place}.") if inner else [(place, value)]
+        if field.metadata.get("pytree_node", True):
+            value = getattr(tree, field.name)
+            place = prefix + field.name
+            inner = dataclasses.is_dataclass(value)
+            named |= named_leaves(value, f"{place}.") if inner else {place: value}
     return named
 
 

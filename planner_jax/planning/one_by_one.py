@@ -11,6 +11,25 @@ CaseT = TypeVar("CaseT")
 PlanT = TypeVar("PlanT")
 
 
+def suited(
+    solve: Callable[[CaseT], PlanT],
+    cases: CaseT,
+    at_once: Callable[[CaseT], PlanT] | None = None,
+) -> PlanT:
+    """The plans of a batch as suits the device: on a CPU one after another, else all at once; pure.
+
+    Args:
+        solve: the plan of one case.
+        cases: leaves with a leading axis.
+        at_once: the plans of the batch; by default `solve` of all cases in step.
+    """
+    return lax.platform_dependent(
+        cases,
+        cpu=lambda cases: one_by_one(solve, cases),
+        default=at_once or jax.vmap(solve),
+    )
+
+
 def one_by_one(solve: Callable[[CaseT], PlanT], cases: CaseT) -> PlanT:
     """What a function makes of every case, leaves with a leading axis; pure.
 

@@ -17,8 +17,9 @@ from typing import Any
 import jax
 import numpy as np
 
+from planner_jax.plan_files import named_leaves
 from planner_jax.planning.plan import plan as plan_all
-from planner_jax.protocol import is_solved
+from planner_jax.protocol import is_solved, lane
 from planner_jax.referee.arm_clearance import clearances, links_of, shield_middle
 from planner_jax.referee.block import times_inside
 from planner_jax.referee.solids import from_segment, turned, turned_back
@@ -150,7 +151,7 @@ def timed_plans(planner: Any, cases: BlockCase) -> tuple[BlockPlan, np.ndarray]:
 
     The first one is made twice, so that no compiling is in them.
     """
-    every = [jax.tree.map(lambda leaf, k=k: leaf[k], cases) for k in range(len(cases.gravity))]
+    every = [lane(cases, k) for k in range(len(cases.gravity))]
     plan_all(planner, every[0])
     plans, seconds = [], []
     for case in every:
@@ -253,25 +254,15 @@ def require_arm(world: World, cases: BlockCase) -> None:
             raise ValueError(f"{name} must be the same in plan and simulated arm")
 
 
-def named_leaves(cases: BlockCase) -> dict[str, np.ndarray]:
+def referee_leaves(cases: BlockCase) -> dict[str, np.ndarray]:
     """All leaves of cases (B, ...) in float64 by their dotted names, as the referee has them."""
-
-    def leaves(name: str, tree: Any) -> dict[str, np.ndarray]:
-        if not dataclasses.is_dataclass(tree):
-            return {name[1:]: np.asarray(tree, float)}
-        found = {}
-        for field in dataclasses.fields(tree):
-            if field.metadata.get("pytree_node", True):
-                found |= leaves(f"{name}.{field.name}", getattr(tree, field.name))
-        return found
-
-    return leaves("", cases)
+    return {name: np.asarray(leaf, float) for name, leaf in named_leaves(cases).items()}
 
 
 def entry_times(cases: BlockCase) -> np.ndarray:
     """When balls get into the inner box, (B,) [s]; infinite if never."""
     with np.errstate(invalid="ignore"):  # of balls that never rise so high
-        begin, end = times_inside(named_leaves(cases), "inner", 0.0)
+        begin, end = times_inside(referee_leaves(cases), "inner", 0.0)
     return np.where(end >= 0.0, np.maximum(begin, 0.0), np.inf).min(axis=0)
 
 
@@ -296,7 +287,7 @@ def scored(cases: BlockCase, plans: BlockPlan, flown: Executed, budget: Budget) 
         flown: the motions.
         budget: the times.
     """
-    case, times = named_leaves(cases), flown.times
+    case, times = referee_leaves(cases), flown.times
     angles = flown.angles.transpose(2, 0, 1)
     turns, places = links_of(case, angles)
     middle, turn = shield_middle(case, turns, places), turns[5]
@@ -658,7 +649,7 @@ def _part(batch: Any, name: str) -> np.ndarray:
 
 def _balls(cases: BlockCase, flights: BlockFlights, lanes: np.ndarray) -> np.ndarray:
     """Places (F, S, 3) [m] of balls as they are drawn: on their way, and off the shield."""
-    case, flown = named_leaves(cases), flights.flown
+    case, flown = referee_leaves(cases), flights.flown
     times, met = flown.times, flights.contact[lanes]
     free = np.moveaxis(ball_places(case, times), 0, 2)
     turns, places = links_of(case, flown.angles[lanes].transpose(2, 0, 1))

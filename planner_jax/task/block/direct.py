@@ -14,12 +14,12 @@ import numpy as np
 from jax import Array, lax
 
 from planner_jax.planning.batch import better_of
-from planner_jax.planning.one_by_one import one_by_one
+from planner_jax.planning.one_by_one import suited
 from planner_jax.protocol import Attempt, Status, is_solved, status_of
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import least_clearances
 from planner_jax.task.block.end_poses import EndPoses, end_poses, flight_of
-from planner_jax.task.block.plan import BlockPlan
+from planner_jax.task.block.plan import BlockPlan, no_plan
 from planner_jax.trajectory.bang_bang import bang_bang, least_times
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
@@ -81,30 +81,14 @@ class DirectBlock:
             k, best = state
             return (k < num) & ~is_solved(best.status)
 
-        start = jnp.zeros((), jnp.int32), self.no_plan(case)
+        start = jnp.zeros((), jnp.int32), no_plan(case, staying(case, 13, 2))
         _, best = lax.while_loop(is_open, next_one, start)
         status = jnp.where(flight_of(case).comes, best.status, Status.OUT_OF_REACH)
         return dataclasses.replace(best, status=status.astype(jnp.int32))
 
     def solve_lanes(self, cases: BlockCase, attempt: Attempt) -> BlockPlan:
         """The plans of a batch: on a CPU one after another, else in step."""
-        return lax.platform_dependent(
-            cases,
-            cpu=lambda cases: one_by_one(lambda case: self.solve(case, attempt), cases),
-            default=jax.vmap(lambda case: self.solve(case, attempt)),
-        )
-
-    def no_plan(self, case: BlockCase) -> BlockPlan:
-        """A plan to stay, which is none."""
-        none = jnp.full((), jnp.inf, case.angles.dtype)
-        return BlockPlan(
-            motion=staying(case, 13, 2),
-            contact_time=case.delay + 1.0,
-            cost=none,
-            violation=none,
-            iterations=jnp.zeros((), jnp.int32),
-            status=jnp.full((), Status.INFEASIBLE, jnp.int32),
-        )
+        return suited(lambda case: self.solve(case, attempt), cases)
 
     def plan_to(self, case: BlockCase, goal: Array, contact: Array, duration: Array) -> BlockPlan:
         """The plan to one end pose.

@@ -49,6 +49,13 @@ def all_profiles(pieces: int) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([at_rest, free]), np.arange(len(at_rest) + len(free)) < len(at_rest)
 
 
+def profile_peaks(pieces: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of all profiles (P,) in 1 s: greatest rates and accelerations, and which end at rest."""
+    shapes, rests = all_profiles(pieces)
+    rises = np.diff(shapes, axis=1, prepend=0.0) * pieces
+    return np.max(np.abs(shapes), axis=1), np.max(np.abs(rises), axis=1), rests
+
+
 def end_poses(case: BlockCase, flight: Flight, points: int, pieces: int) -> EndPoses:
     """Eight poses at each of some points of the ball's way between the boxes.
 
@@ -69,9 +76,7 @@ def end_poses(case: BlockCase, flight: Flight, points: int, pieces: int) -> EndP
     time = jnp.repeat(time, 8)
     duration = jnp.maximum(time - case.delay, 1e-3)
     turned = jnp.abs(angles - coasted(case, duration, pieces))
-    shapes, rests = all_profiles(pieces)
-    rates = np.max(np.abs(shapes), axis=1)
-    rises = np.max(np.abs(np.diff(shapes, axis=1, prepend=0.0)), axis=1) * pieces
+    rates, rises, rests = profile_peaks(pieces)
     of_rate = jnp.max(turned / case.limits.velocity, axis=1) / duration
     of_rise = jnp.max(turned / case.limits.acceleration, axis=1) / duration**2
     efforts = jnp.maximum(of_rate[:, None] * rates, of_rise[:, None] * rises)

@@ -23,7 +23,7 @@ from jax import Array, lax
 from planner_jax.ball.flight import drag_free_flight
 from planner_jax.optimise.levenberg import LevenbergConfig, Model, begun, go_on, least_squares
 from planner_jax.planning.batch import better_of
-from planner_jax.planning.one_by_one import one_by_one
+from planner_jax.planning.one_by_one import suited
 from planner_jax.protocol import FEASIBILITY_TOLERANCE, Attempt, Status, is_solved, status_of
 from planner_jax.robot.arm import product, shield_jacobian, shield_pose
 from planner_jax.task.block.case import BlockCase
@@ -44,7 +44,7 @@ from planner_jax.task.block.end_poses import (
     frame_of,
 )
 from planner_jax.task.block.motion import angles_at, polynomial, sums
-from planner_jax.task.block.plan import BlockPlan
+from planner_jax.task.block.plan import BlockPlan, no_plan
 
 _HIGHEST = lax.Precision.HIGHEST
 _PLANE = 1e-3  # [m], how far from the shield's plane the ball may be at the contact
@@ -130,10 +130,10 @@ class OnlineBlock:
 
     def solve_lanes(self, cases: BlockCase, attempt: Search) -> BlockPlan:
         """The plans of a batch: on a CPU one after another, else in step."""
-        return lax.platform_dependent(
+        return suited(
+            lambda case: self.solve(case, attempt),
             cases,
-            cpu=lambda cases: one_by_one(lambda case: self.solve(case, attempt), cases),
-            default=jax.vmap(lambda case: self._solve(case, attempt, self._in_step)),
+            at_once=jax.vmap(lambda case: self._solve(case, attempt, self._in_step)),
         )
 
     def _solve(self, case: BlockCase, attempt: Search, bend: Callable) -> BlockPlan:
@@ -157,7 +157,9 @@ class OnlineBlock:
             k, best = state
             return (k < straight) & flight.comes & ~is_solved(best.status)
 
-        _, best = lax.while_loop(is_open, next_one, (0, self.no_plan(case)))
+        still = jnp.zeros((self.pieces, 6), case.angles.dtype)
+        stay = polynomial(case.angles, still[0], still, case.delay + 1.0)
+        _, best = lax.while_loop(is_open, next_one, (0, no_plan(case, stay)))
         if attempt.tries:
             points = jax.vmap(lambda rank: self.straight_point(case, poses, order[rank]))(ranks)
             bent = jax.vmap(self.bump)(jnp.asarray(bumps, points.dtype))
@@ -208,19 +210,6 @@ class OnlineBlock:
         mixed = jnp.asarray(rng.random(poses.effort.shape[0]), poses.effort.dtype)
         late = jnp.where(poses.effort > 1.0 - self.slack, 10.0 * poses.effort, 0.0)
         return lax.top_k(-(poses.effort + mixed + late), num)[1]
-
-    def no_plan(self, case: BlockCase) -> BlockPlan:
-        """A plan to stay, which is none."""
-        still = jnp.zeros((self.pieces, 6), case.angles.dtype)
-        none = jnp.full((), jnp.inf, case.angles.dtype)
-        return BlockPlan(
-            motion=polynomial(case.angles, still[0], still, case.delay + 1.0),
-            contact_time=case.delay + 1.0,
-            cost=none,
-            violation=none,
-            iterations=jnp.zeros((), jnp.int32),
-            status=jnp.full((), Status.INFEASIBLE, jnp.int32),
-        )
 
     def straight_point(self, case: BlockCase, poses: EndPoses, place: Array) -> Array:
         """The unknowns of a straight motion."""

@@ -1,9 +1,13 @@
 """What a block planner returns."""
 
+import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
+from planner_jax.protocol import Status
 from planner_jax.robot.arm_plan import ArmPlan
+from planner_jax.task.block.case import BlockCase
+from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 
 @struct.dataclass
@@ -15,3 +19,16 @@ class BlockPlan(ArmPlan):
     """
 
     contact_time: Array  # () [s], when the shield meets the ball, since the ball was first seen
+
+
+def no_plan(case: BlockCase, stay: PiecewisePolynomial) -> BlockPlan:
+    """What is given back without a plan, of one case: a motion that is none, and no success."""
+    none = jnp.full((), jnp.inf, case.angles.dtype)
+    return BlockPlan(
+        motion=stay,
+        contact_time=case.delay + 1.0,
+        cost=none,
+        violation=none,
+        iterations=jnp.zeros((), jnp.int32),
+        status=jnp.full((), Status.INFEASIBLE, jnp.int32),
+    )

@@ -9,10 +9,10 @@ from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
-from jax import Array, lax
+from jax import Array
 
 from planner_jax.plane.station_time import StationTimeProblem, reference_line
-from planner_jax.planning.one_by_one import one_by_one
+from planner_jax.planning.one_by_one import suited
 from planner_jax.protocol import Status, is_solved
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.checked import checked_plan, explained
@@ -117,10 +117,10 @@ class PathThenSpeed:
 
     def solve_lanes(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:
         """The plans of a batch: on a CPU one after another, else all at once."""
-        return lax.platform_dependent(
+        return suited(
+            lambda case: self.solve(case, attempt),
             cases,
-            cpu=lambda cases: one_by_one(lambda case: self.solve(case, attempt), cases),
-            default=lambda cases: self.solve_at_once(cases, attempt),
+            at_once=lambda cases: self.solve_at_once(cases, attempt),
         )
 
     def solve_at_once(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:

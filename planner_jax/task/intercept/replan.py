@@ -11,12 +11,12 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array, lax
+from jax import Array
 
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.plane.obstacles import Obstacles
 from planner_jax.plane.target import PlanePath
-from planner_jax.planning.one_by_one import one_by_one
+from planner_jax.planning.one_by_one import suited
 from planner_jax.planning.replan import Replanning
 from planner_jax.protocol import Attempt
 from planner_jax.robot.car import pose_at
@@ -128,11 +128,7 @@ class ReplanIntercept:
         """The plans of a batch: on a CPU one after another."""
         if isinstance(attempt, Search):
             return self.planner.solve_lanes(tasks.case, attempt)
-        return lax.platform_dependent(
-            tasks,
-            cpu=lambda tasks: one_by_one(lambda task: self.solve(task, attempt), tasks),
-            default=lambda tasks: jax.vmap(lambda task: self.solve(task, attempt))(tasks),
-        )
+        return suited(lambda task: self.solve(task, attempt), tasks)
 
     def rest(self, task: Replanning, time: Array) -> tuple[Array, Array]:
         """Speed and curvature of the previous plan at the new knots 1..K, (K,) each."""

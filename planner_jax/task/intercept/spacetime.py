@@ -25,7 +25,7 @@ from planner_jax.optimise.levenberg import (
 )
 from planner_jax.plane import reach
 from planner_jax.plane.distance_field import DistanceField, distance_field
-from planner_jax.planning.one_by_one import one_by_one
+from planner_jax.planning.one_by_one import suited
 from planner_jax.protocol import Attempt, Status, is_solved
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.checked import checked_plan, explained, straight_on
@@ -234,10 +234,10 @@ class SpacetimeIntercept:
 
     def solve_lanes(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:
         """The plans of a batch: on a CPU one after another, else all ways of all at once."""
-        return lax.platform_dependent(
+        return suited(
+            lambda case: self.solve(case, attempt),
             cases,
-            cpu=lambda cases: one_by_one(lambda case: self.solve(case, attempt), cases),
-            default=lambda cases: self.solve_at_once(cases, attempt),
+            at_once=lambda cases: self.solve_at_once(cases, attempt),
         )
 
     def solve_at_once(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:

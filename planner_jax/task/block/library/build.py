@@ -41,8 +41,7 @@ from planner_jax.task.block.scene import Scene
 STARTS, REPAIR_STARTS = (2, 0, 1, 3, 4, 5), (2,)
 _WORTH = 0.03  # [s], earlier: what a search for a better motion has to promise
 # Pairs that are planned before the next part is written, and lanes of one call of a device.
-_CPU_PART, _GPU_PART = 256, 32768
-_CPU_LANES, _GPU_LANES = 16, 8192
+_ON_CPU, _ON_GPU = (256, 16), (32768, 8192)
 _LOOKED_AT = 1024  # stored motions whose distances are worked out at once
 
 
@@ -84,7 +83,7 @@ def build(
     tunnel = tunnels(layout, setting.scene.inner, setting.scene.outer)
     feasible = np.flatnonzero(tunnel.is_feasible)
     parts = _Parts(Path(f"{os.fspath(path)}.parts"), setting, homes, layout)
-    size = _CPU_PART if jax.default_backend() == "cpu" else _GPU_PART
+    size, _ = _sizes()
     work = [
         (k, feasible[begin : begin + size])
         for k in range(len(homes))
@@ -134,7 +133,7 @@ def repair(
         touched[k, stored] = ~_is_free(setting, home, rows[k, stored])
         if retry:
             touched[k] |= tunnel.is_feasible & ~library.found[k]
-    size = _CPU_PART if jax.default_backend() == "cpu" else _GPU_PART
+    size, _ = _sizes()
     with _bar(int(touched.sum()), "pairs", progress) as bar:
         for k, home in enumerate(np.asarray(table.homes)):
             anew = np.flatnonzero(touched[k])
@@ -143,6 +142,11 @@ def repair(
                 rows[k, pairs] = plan_pairs(setting, home, tunnel, pairs, rows[k, pairs])
                 bar.update(len(pairs))
     return library_of(rows, table.homes, table.layout, setting), touched
+
+
+def _sizes() -> tuple[int, int]:
+    """Pairs of a part, and lanes of a call, of this process's devices."""
+    return _ON_CPU if jax.default_backend() == "cpu" else _ON_GPU
 
 
 def _require_free(setting: Setting, homes: Any) -> None:
@@ -215,7 +219,7 @@ def plan_pairs(
 
 def _planned(planner: Any, cases: PairCase) -> Any:
     """Plans of a batch, in calls of one size, so that one program is compiled."""
-    lanes = _CPU_LANES if jax.default_backend() == "cpu" else _GPU_LANES
+    _, lanes = _sizes()
     num = len(cases.best)
     whole = -(-num // (lanes * jax.local_device_count())) * lanes * jax.local_device_count()
     # The last one again: on a CPU it is not solved again.

@@ -17,7 +17,7 @@ from jax import Array, lax
 
 from planner_jax.ball.flight import drag_free_flight
 from planner_jax.optimise.levenberg import LevenbergConfig, Model, least_squares
-from planner_jax.planning.one_by_one import one_by_one
+from planner_jax.planning.one_by_one import suited
 from planner_jax.protocol import (
     FEASIBILITY_TOLERANCE,
     Attempt,
@@ -30,7 +30,7 @@ from planner_jax.robot.arm import product, shield_jacobian, shield_pose
 from planner_jax.robot.arm_ik import inverse_kinematics
 from planner_jax.task.block.case import STRICT, BlockCase
 from planner_jax.task.block.clearance import least_clearances
-from planner_jax.task.block.end_poses import EndPoses, Flight, all_profiles, facing, frame_of
+from planner_jax.task.block.end_poses import EndPoses, Flight, facing, frame_of, profile_peaks
 from planner_jax.task.block.library.cells import GRAVITY, farthest_crossing, nominal_ball
 from planner_jax.task.block.library.table import Setting
 from planner_jax.task.block.motion import angles_at, sums
@@ -136,9 +136,7 @@ class PairPlanner:
         roll = angles[:, 5] + quarter * jnp.round((self.home[5] - angles[:, 5]) / quarter)
         angles = angles.at[:, 5].set(roll)
         found = found & (roll >= arm.lower[5]) & (roll <= arm.upper[5])
-        shapes, rests = all_profiles(online.pieces)
-        rates = np.max(np.abs(shapes), axis=1)
-        rises = np.max(np.abs(np.diff(shapes, axis=1, prepend=0.0)), axis=1) * online.pieces
+        rates, rises, rests = profile_peaks(online.pieces)
         most = 1.0 - online.slack
         turned = jnp.abs(angles - self.home)
         of_rate = jnp.max(turned / limits.velocity, axis=1) / most
@@ -202,9 +200,7 @@ class PairPlanner:
     def solve_lanes(self, pairs: PairCase, attempt: Attempt) -> PairPlan:
         """The plans of a batch: on a CPU one after another, else in step."""
         solve: Any = lambda pair: self.solve(pair, attempt)  # type: ignore[attr-defined]  # noqa: E731
-        return lax.platform_dependent(
-            pairs, cpu=lambda pairs: one_by_one(solve, pairs), default=jax.vmap(solve)
-        )
+        return suited(solve, pairs)
 
 
 @struct.dataclass
