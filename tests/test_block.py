@@ -11,6 +11,9 @@ import pytest
 import planner_jax as pj
 from planner_jax.ball.flight import BallState, drag_free_flight
 from planner_jax.optimise.levenberg import LevenbergConfig
+from planner_jax.plan_files import named_leaves
+from planner_jax.referee.arm_clearance import KINDS
+from planner_jax.referee.arm_clearance import clearances as referee_clearances
 from planner_jax.robot.arm import REGIMES
 from planner_jax.robot.arm_mjcf import irb1600
 from planner_jax.sweep.block.settings import REGIMES as SWEPT
@@ -118,6 +121,33 @@ def test_the_arm_is_clear_at_home_and_not_when_it_reaches_into_the_pole():
     assert at(ahead, dataclasses.replace(scene, has_pole=jnp.asarray(False))).min() > 0.0
 
 
+def test_no_pose_is_freer_than_the_referee_says(float64):
+    """Wherever pole, floor and beams are, if it keeps the planner's margin."""
+    rng, num = np.random.default_rng(3), 2000
+    arm, scene = irb1600(), paper_scene()
+    moved = {
+        "pole": rng.uniform(-1.2, 1.2, (num, 2)),
+        "floor": rng.uniform(-0.6, -0.3, num),
+        "beam_ends": scene.beam_ends + rng.uniform(-0.3, 0.3, (num, 1, 1, 3)),
+    }
+    case = pj.block.case(
+        np.full((num, 3), 9.0), np.ones(3), angles=rng.uniform(arm.lower, arm.upper, (num, 6))
+    )
+    case = dataclasses.replace(case, scene=dataclasses.replace(case.scene, **moved))
+    each = jax.jit(jax.vmap(lambda case: clearances(case.arm, case.scene, case.angles[None])[:, 0]))
+    least = each(case).min(axis=1)
+    leaves = {name: np.asarray(leaf, float) for name, leaf in named_leaves(case).items()}
+    angles = np.asarray(case.angles, float).T[:, :, None]
+    kinds = referee_clearances(leaves, arm.capsule_link, angles, np.ones((num, 1), bool))
+    distances = np.array([kinds[kind][0] for kind in KINDS])
+    theirs = distances.min(axis=0)
+    assert (theirs[least >= OnlineBlock().margin] > -1e-3).all()  # what the referee allows
+    free = theirs > 0.01
+    np.testing.assert_allclose(least[free], theirs[free], atol=6e-3)
+    nearest = np.array([kinds[kind][2] for kind in KINDS])[distances.argmin(axis=0), np.arange(num)]
+    assert {"link 1", "link 2", "link 3"} <= set(nearest[theirs < 0.0])
+
+
 def test_end_poses_meet_the_ball(float64):
     """Straight on and at the middle, on the ball's way between the boxes."""
     case = thrown(dtype=jnp.float64)
@@ -137,9 +167,8 @@ def test_end_poses_meet_the_ball(float64):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("regime", ["R1", "R2"])
-def test_slopes_of_least_squares_are_those_of_the_cost(regime, float64, monkeypatch):
+def test_slopes_of_least_squares_are_those_of_the_cost(regime, float64):
     """By central differences, from rates that are not zero and with a contact too late."""
-    monkeypatch.setattr("planner_jax.task.block.online._STEP", 1e-6)
     case = thrown(regime=regime, rates=(0.3, -0.2, 0.1, 0.2, -0.4, 0.5), dtype=jnp.float64)
     flight = flight_of(case)
     poses = end_poses(case, flight, SMALL.points, SMALL.pieces)

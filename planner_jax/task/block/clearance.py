@@ -112,12 +112,12 @@ def _turns(axis: Array, arms: Array) -> Array:
 
 def num_of_pole(arm: Arm) -> int:
     """How many of the pairs are those with the pole: a capsule each, and the shield."""
-    return len(_moving(arm)) + 1
+    return len(_from_link(arm, 1)) + 1
 
 
-def _moving(arm: Arm) -> np.ndarray:
-    """Places of the capsules of links 3 to 6, which reach what stands around."""
-    return np.flatnonzero(np.asarray(arm.capsule_link) >= 2)
+def _from_link(arm: Arm, first: int) -> np.ndarray:
+    """Places of the capsules of a link, 1 to 6, and of those behind it."""
+    return np.flatnonzero(np.asarray(arm.capsule_link) >= first - 1)
 
 
 def _poses(arm: Arm, angles: Array) -> _Poses:
@@ -155,11 +155,15 @@ def _poses(arm: Arm, angles: Array) -> _Poses:
 def _pairs(arm: Arm, scene: Scene, poses: _Poses) -> list[_Pairs]:
     """All pairs, those with the pole first."""
     link, radius = np.asarray(arm.capsule_link), jnp.asarray(arm.capsule_radius)
-    moving, trunk = _moving(arm), np.flatnonzero(link == 0)
+    turning, swung, far = (_from_link(arm, first) for first in (1, 2, 3))
+    trunk = np.flatnonzero(link == 0)
     before = np.flatnonzero((link >= 0) & (link <= 3))
     num = poses.middle.shape[-1]
     none = jnp.zeros((0, 3, 1, num), poses.ends.dtype)
-    links = _Body(points=poses.ends[:, :, moving], vectors=none)
+
+    def links(places: np.ndarray) -> _Body:
+        return _Body(points=poses.ends[:, :, places], vectors=none)
+
     middle, edges = poses.middle[None, :, None], poses.edges[:, :, None]
     plate = _Body(points=middle, vectors=edges)
     corners = [
@@ -168,7 +172,6 @@ def _pairs(arm: Arm, scene: Scene, poses: _Poses) -> list[_Pairs]:
     outline = jnp.concatenate(
         [jnp.concatenate(corners, axis=2), jnp.concatenate(corners[1:] + corners[:1], axis=2)]
     )
-    thick = radius[moving][:, None]
     beams = jnp.moveaxis(jnp.asarray(scene.beam_ends), 0, 2)[..., None]  # (2, 3, N, 1)
     beams = jnp.broadcast_to(beams, (*beams.shape[:3], num))
     num_beams = beams.shape[2]
@@ -183,21 +186,26 @@ def _pairs(arm: Arm, scene: Scene, poses: _Poses) -> list[_Pairs]:
     wrist = jnp.sqrt(jnp.sum((arm.origin[5] + arm.shield_centre) ** 2))
     thin = jnp.where(link[before] == 3, jnp.minimum(radius[before], _FORK * wrist), radius[before])
     near_radius = jnp.concatenate([thin, scene.beam_radius])[:, None] + _HALF_THICKNESS
-    # Every link that moves against everything that is fixed to the trunk or to the ground.
+    # Links against what is fixed to the trunk or to the ground; link 2 turns on the trunk itself.
     fixed = with_beams(trunk)
-    sizes = len(moving), fixed.shape[2]
-    among = _Body(points=jnp.repeat(links.points, sizes[1], axis=2), vectors=none)
-    against = jnp.tile(fixed, (1, 1, sizes[0], 1))
+    place, fixture = (
+        np.array(
+            [(k, j) for k in turning for j in range(fixed.shape[2]) if j >= len(trunk) or k in far]
+        )
+    ).T
+    against = fixed[:, :, fixture]
     fixed_radius = jnp.concatenate([radius[trunk], scene.beam_radius])
-    among_radius = (thick + fixed_radius).reshape(-1, 1)
-    of_fixed = np.tile([0] * len(trunk) + [-1] * num_beams, sizes[0])
+    among_radius = radius[place] + fixed_radius[fixture]
+    of_fixed = np.where(fixture < len(trunk), 0, -1)
     near, (lower, upper) = with_beams(before), jnp.asarray(arm.base_box)
     of_near = np.append(link[before], np.full(num_beams, -1))
     return [
         _Pairs(
-            lambda body: to_pole(segment_to_vertical_line(body.points, scene.pole) - thick),
-            links,
-            link[moving],
+            lambda body: to_pole(
+                segment_to_vertical_line(body.points, scene.pole) - radius[turning][:, None]
+            ),
+            links(turning),
+            link[turning],
         ),
         _Pairs(
             lambda body: to_pole(
@@ -208,9 +216,9 @@ def _pairs(arm: Arm, scene: Scene, poses: _Poses) -> list[_Pairs]:
             _SHIELD_LINK,
         ),
         _Pairs(
-            lambda body: segment_to_segment(body.points, against) - among_radius,
-            among,
-            np.repeat(link[moving], sizes[1]),
+            lambda body: segment_to_segment(body.points, against) - among_radius[:, None],
+            links(place),
+            link[place],
             of_fixed,
         ),
         _Pairs(
@@ -220,7 +228,9 @@ def _pairs(arm: Arm, scene: Scene, poses: _Poses) -> list[_Pairs]:
             of_near,
         ),
         _Pairs(
-            lambda body: lowest_of_segment(body.points) - thick - scene.floor, links, link[moving]
+            lambda body: lowest_of_segment(body.points) - radius[swung][:, None] - scene.floor,
+            links(swung),
+            link[swung],
         ),
         _Pairs(
             lambda body: (
@@ -229,7 +239,11 @@ def _pairs(arm: Arm, scene: Scene, poses: _Poses) -> list[_Pairs]:
             plate,
             _SHIELD_LINK,
         ),
-        _Pairs(lambda body: segment_to_box(body.points, lower, upper) - thick, links, link[moving]),
+        _Pairs(
+            lambda body: segment_to_box(body.points, lower, upper) - radius[swung][:, None],
+            links(swung),
+            link[swung],
+        ),
         _Pairs(
             lambda body: segment_to_box(body.points, lower, upper) - _HALF_THICKNESS,
             _Body(points=outline, vectors=none),
