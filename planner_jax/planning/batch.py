@@ -5,9 +5,10 @@ lanes that are still unsolved are packed together for the next one. Every device
 in a loop of its own and waits for no other.
 """
 
+import dataclasses
 import functools
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -17,12 +18,40 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh, NamedSharding, PartitionSpec, Sharding, SingleDeviceSharding
 
+from planner_jax.planning.one_by_one import OneByOne
 from planner_jax.protocol import Attempt, HostPlanner, LanesPlanner, is_solved, is_unsolved
 
 # Lanes of a device in one call. Few, because every one is a program of its own to compile.
 BUCKETS = (16, 128, 1024, 8192, 65536)
 _CPU_CHUNK, _GPU_CHUNK = 256, 65536  # what fits the cache of a core, and what fills a GPU
+_GPU_BUSY = 8192  # starts in one call that keep a GPU busy
 _LANES = PartitionSpec("lanes")
+
+
+@dataclasses.dataclass(frozen=True)
+class _Sizes:
+    """Of the calls of one attempt, in lanes of a device."""
+
+    most: int
+    busy: int  # that keep a GPU busy
+
+    def next(self, num: int) -> int:
+        """Of the call that takes the next of `num` lanes.
+
+        Where they would fill less than half of it, calls of the next smaller size take them if
+        these still keep a GPU busy.
+        """
+        fits = next((bucket for bucket in BUCKETS if num <= bucket <= self.most), self.most)
+        smaller = max((bucket for bucket in BUCKETS if bucket < fits), default=0)
+        return smaller if smaller >= self.busy and 2 * num <= fits else fits
+
+    def cuts(self, num: int) -> Iterator[tuple[int, int]]:
+        """Where the calls that take `num` lanes begin, and their sizes."""
+        begin = 0
+        while begin < num:
+            size = self.next(num - begin)
+            yield begin, size
+            begin += size
 
 
 def plan_batch(
@@ -51,7 +80,7 @@ def plan_batch(
         planner = jax.device_put(planner, _whole(mesh))
     resident = all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(cases))
     num = _length(cases)
-    in_one_call = num == _bucket(num, chunk or _default_chunk(attempts[0], mesh))
+    in_one_call = num == _sizes(planner, attempts[0], chunk, mesh).next(num)
     # One CPU's memory is the host's: there a thread for each core plans chunks, and they are cut
     # and joined without programs, which would be compiled for every new size.
     if resident and (in_one_call or not _is_one_cpu(mesh)):
@@ -92,7 +121,7 @@ def _plan_from_host(
     lanes = np.arange(_length(cases))
     plans: Any = None
     for attempt in attempts:
-        calls = _calls(lanes, chunk or _default_chunk(attempt, mesh), mesh)
+        calls = _calls(lanes, _sizes(planner, attempt, chunk, mesh), mesh)
         found = _solved_from_host(planner, attempt, cases, [call for call, _ in calls], mesh)
         if plans is None:
             trimmed = [
@@ -121,18 +150,16 @@ def _plan_resident(
         cases = _taken(cases, np.arange(-(-num // mesh.size) * mesh.size))
     cases = _placed(cases, mesh)
     first, *others = attempts
-    plans, unsolved = _first_plans(
-        planner, first, cases, chunk or _default_chunk(first, mesh), mesh
-    )
+    sizes = _sizes(planner, first, chunk, mesh)
+    plans, unsolved = _first_plans(planner, first, cases, sizes, mesh)
     for attempt in others:
         unsolved.copy_to_host_async()  # on its way as soon as it is known
         most = np.asarray(unsolved).max()  # of the devices
         if most == 0:
             break
-        size, before = chunk or _default_chunk(attempt, mesh), plans.status
-        for begin in range(0, most, size):
-            bucket = _bucket(most - begin, size)
-            part, lanes = _cut_unsolved(mesh, bucket, cases, before, _number(mesh, begin))
+        sizes, before = _sizes(planner, attempt, chunk, mesh), plans.status
+        for begin, size in sizes.cuts(most):
+            part, lanes = _cut_unsolved(mesh, size, cases, before, _number(mesh, begin))
             later, _ = _solve(planner, attempt, mesh, part)
             plans, unsolved = _merged_locally(mesh, plans, later, lanes)
     if num % mesh.size:  # arrays have equal shares or none
@@ -141,15 +168,15 @@ def _plan_resident(
 
 
 def _first_plans(
-    planner: Any, attempt: Attempt, cases: Any, chunk: int, mesh: Mesh
+    planner: Any, attempt: Attempt, cases: Any, sizes: _Sizes, mesh: Mesh
 ) -> tuple[Any, Array]:
     """One attempt at all lanes of every device, chunk by chunk; as `_solve`."""
     share = _length(cases) // mesh.size
-    if share == _bucket(share, chunk):
+    if share == sizes.next(share):
         return _solve(planner, attempt, mesh, cases)
     found = []
-    for begin in range(0, share, chunk):
-        part = _cut(mesh, _bucket(share - begin, chunk), cases, _number(mesh, begin))
+    for begin, size in sizes.cuts(share):
+        part = _cut(mesh, size, cases, _number(mesh, begin))
         found.append(_solve(planner, attempt, mesh, part)[0])
     return _joined_locally(mesh, found, share)
 
@@ -163,22 +190,25 @@ def _length(tree: Any) -> int:
     return jax.tree.leaves(tree)[0].shape[0]
 
 
-def _default_chunk(attempt: Attempt, mesh: Mesh) -> int:
-    on_cpu = mesh.devices[0].platform == "cpu"
-    return max(128, (_CPU_CHUNK if on_cpu else _GPU_CHUNK) // attempt.starts)
+def _sizes(planner: Any, attempt: Attempt, chunk: int | None, mesh: Mesh) -> _Sizes:
+    """As `chunk` says, or as it suits the device."""
+    busy = _GPU_BUSY // attempt.starts
+    if chunk is not None:
+        return _Sizes(chunk, busy)
+    if mesh.devices[0].platform != "cpu":
+        return _Sizes(max(128, _GPU_CHUNK // attempt.starts), busy)
+    # One after another, few are as quick as many, and no core waits long for the others' last.
+    if isinstance(planner, OneByOne):
+        return _Sizes(BUCKETS[0], busy)
+    return _Sizes(max(128, _CPU_CHUNK // attempt.starts), busy)
 
 
-def _bucket(num: int, chunk: int) -> int:
-    """Lanes of the call that takes the next of `num` lanes of a device."""
-    return next((bucket for bucket in BUCKETS if num <= bucket <= chunk), chunk)
-
-
-def _calls(lanes: np.ndarray, chunk: int, mesh: Mesh) -> list[tuple[np.ndarray, int]]:
+def _calls(lanes: np.ndarray, sizes: _Sizes, mesh: Mesh) -> list[tuple[np.ndarray, int]]:
     """The lanes of every call, filled up with its first one, and how many of them count."""
     calls = []
-    for begin in range(0, lanes.size, chunk * mesh.size):
-        part = lanes[begin : begin + chunk * mesh.size]
-        length = _bucket(-(-part.size // mesh.size), chunk) * mesh.size
+    for begin, size in sizes.cuts(-(-lanes.size // mesh.size)):
+        length = size * mesh.size
+        part = lanes[begin * mesh.size :][:length]
         calls.append((np.append(part, np.full(length - part.size, part[0])), part.size))
     return calls
 
@@ -245,10 +275,22 @@ def _solved_from_host(
 
     if threads == 1:  # calls return before they are done, so that the next is under way
         return [solve(lanes) for lanes in calls]
-    # The first call compiles; the others then find the program in the cache.
-    first = solve(calls[0])
+    # A first call compiles, once for all threads; what is compiled is found by all.
+    program = _program(planner, attempt, calls[0].size, cases)
+    alone = [] if program in _COMPILED else [solve(calls[0])]
+    _COMPILED.add(program)
     with ThreadPoolExecutor(threads) as pool:
-        return [first, *pool.map(solve, calls[1:])]
+        return [*alone, *pool.map(solve, calls[len(alone) :])]
+
+
+_COMPILED: set[Hashable] = set()  # what `_program` names of the programs that threads have called
+
+
+def _program(planner: Any, attempt: Attempt, num: int, cases: Any) -> Hashable:
+    """What tells a compiled `_solve` of so many lanes on one CPU apart from the others."""
+    own = tuple((leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(planner))
+    given = tuple((leaf.shape[1:], leaf.dtype) for leaf in jax.tree.leaves(cases))
+    return jax.tree.structure((planner, cases)), own, given, attempt, num
 
 
 @functools.partial(jax.jit, static_argnames=("attempt", "mesh"))

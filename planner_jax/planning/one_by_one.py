@@ -1,33 +1,49 @@
 """Cases planned one after another, as suits a CPU where they differ in how long they take."""
 
+import functools
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
+from jax.extend.backend import backends
 
 CaseT = TypeVar("CaseT")
 PlanT = TypeVar("PlanT")
 
 
-def suited(
-    solve: Callable[[CaseT], PlanT],
-    cases: CaseT,
-    at_once: Callable[[CaseT], PlanT] | None = None,
-) -> PlanT:
-    """The plans of a batch as suits the device: on a CPU one after another, else all at once; pure.
+class OneByOne:
+    """A planner whose batches a CPU plans one case after another, and others all at once.
 
-    Args:
-        solve: the plan of one case.
-        cases: leaves with a leading axis.
-        at_once: the plans of the batch; by default `solve` of all cases in step.
+    For planners of which a case may take many times as long as another: in step, all would wait
+    for it. A batch of which a CPU's cores plan a part each is cut into small ones.
     """
-    return lax.platform_dependent(
-        cases,
-        cpu=lambda cases: one_by_one(solve, cases),
-        default=at_once or jax.vmap(solve),
-    )
+
+    def solve(self, case: Any, attempt: Any) -> Any:
+        """The plan of one case."""
+        raise NotImplementedError
+
+    def solve_lanes(self, cases: Any, attempt: Any) -> Any:
+        """The plans of a batch: on a CPU one after another, else all at once; pure."""
+        in_turn = functools.partial(one_by_one, lambda case: self.solve(case, attempt))
+        # Where there is nothing but a CPU, what is for others is not traced, which takes longer.
+        if has_only_cpu():
+            return in_turn(cases)
+        return lax.platform_dependent(
+            cases,
+            cpu=in_turn,
+            default=lambda cases: self.solve_at_once(cases, attempt),
+        )
+
+    def solve_at_once(self, cases: Any, attempt: Any) -> Any:
+        """The plans of a batch, all in step."""
+        return jax.vmap(lambda case: self.solve(case, attempt))(cases)
+
+
+def has_only_cpu() -> bool:
+    """Whether all devices that JAX has are CPUs."""
+    return set(backends()) == {"cpu"}
 
 
 def one_by_one(solve: Callable[[CaseT], PlanT], cases: CaseT) -> PlanT:

@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array, lax
 
 from planner_jax.planning.batch import better_of
-from planner_jax.planning.one_by_one import suited
+from planner_jax.planning.one_by_one import OneByOne
 from planner_jax.protocol import Attempt, Status, is_solved, status_of
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import least_clearances
@@ -55,7 +55,7 @@ def staying(case: BlockCase, pieces: int, degree: int) -> PiecewisePolynomial:
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class DirectBlock:
+class DirectBlock(OneByOne):
     """Bang-bang motions of the joints; the cost of a plan is its execution time [s]."""
 
     case_type: ClassVar[type] = BlockCase
@@ -85,10 +85,6 @@ class DirectBlock:
         _, best = lax.while_loop(is_open, next_one, start)
         status = jnp.where(flight_of(case).comes, best.status, Status.OUT_OF_REACH)
         return dataclasses.replace(best, status=status.astype(jnp.int32))
-
-    def solve_lanes(self, cases: BlockCase, attempt: Attempt) -> BlockPlan:
-        """The plans of a batch: on a CPU one after another, else in step."""
-        return suited(lambda case: self.solve(case, attempt), cases)
 
     def plan_to(self, case: BlockCase, goal: Array, contact: Array, duration: Array) -> BlockPlan:
         """The plan to one end pose.

@@ -23,7 +23,7 @@ from jax import Array, lax
 from planner_jax.ball.flight import drag_free_flight
 from planner_jax.optimise.levenberg import LevenbergConfig, Model, begun, go_on, least_squares
 from planner_jax.planning.batch import better_of
-from planner_jax.planning.one_by_one import suited
+from planner_jax.planning.one_by_one import OneByOne
 from planner_jax.protocol import FEASIBILITY_TOLERANCE, Attempt, Status, is_solved, status_of
 from planner_jax.robot.arm import product, shield_jacobian, shield_pose
 from planner_jax.task.block.case import BlockCase
@@ -100,7 +100,7 @@ def _violation(joints: Array, contact: Array, too_near: Array) -> Array:
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class OnlineBlock:
+class OnlineBlock(OneByOne):
     """Meets a ball somewhere between the boxes; the cost of a plan is its execution time [s]."""
 
     case_type: ClassVar[type] = BlockCase
@@ -115,7 +115,8 @@ class OnlineBlock:
     weights: Weights = Weights()
     searches: tuple[Search, ...] = (
         Search(straight=6, tries=0),
-        Search(tries=4, kept=2),
+        Search(tries=0),
+        Search(straight=0, tries=4, kept=2),
         Search(straight=0, tries=11, first=4, kept=4),
     )
 
@@ -128,13 +129,9 @@ class OnlineBlock:
         """The plan of one case."""
         return self._solve(case, attempt, self._one_after_another)
 
-    def solve_lanes(self, cases: BlockCase, attempt: Search) -> BlockPlan:
-        """The plans of a batch: on a CPU one after another, else in step."""
-        return suited(
-            lambda case: self.solve(case, attempt),
-            cases,
-            at_once=jax.vmap(lambda case: self._solve(case, attempt, self._in_step)),
-        )
+    def solve_at_once(self, cases: BlockCase, attempt: Search) -> BlockPlan:
+        """The plans of a batch, all starts of all cases in step."""
+        return jax.vmap(lambda case: self._solve(case, attempt, self._in_step))(cases)
 
     def _solve(self, case: BlockCase, attempt: Search, bend: Callable) -> BlockPlan:
         """The plan of one case: a straight motion, else what `bend` makes of the starts."""

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from planner_jax.plane.station_time import StationTimeProblem, reference_line
-from planner_jax.planning.one_by_one import suited
+from planner_jax.planning.one_by_one import OneByOne
 from planner_jax.protocol import Status, is_solved
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.checked import checked_plan, explained
@@ -95,7 +95,7 @@ def ramp_and_cruise(problem: StationTimeProblem, times: Array) -> tuple[Array, A
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class PathThenSpeed:
+class PathThenSpeed(OneByOne):
     """Meets the target at the case's time along one of several paths among what stands."""
 
     case_type: ClassVar[type] = InterceptCase
@@ -114,14 +114,6 @@ class PathThenSpeed:
     def solve(self, case: InterceptCase, attempt: Search) -> InterceptPlan:
         """The plan of one case: of all paths that got a speed, the best."""
         return self.solve_in_layers(case, attempt, None)
-
-    def solve_lanes(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:
-        """The plans of a batch: on a CPU one after another, else all at once."""
-        return suited(
-            lambda case: self.solve(case, attempt),
-            cases,
-            at_once=lambda cases: self.solve_at_once(cases, attempt),
-        )
 
     def solve_at_once(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:
         """The plans of a batch, all together."""

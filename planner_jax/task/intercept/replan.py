@@ -16,7 +16,7 @@ from jax import Array
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.plane.obstacles import Obstacles
 from planner_jax.plane.target import PlanePath
-from planner_jax.planning.one_by_one import suited
+from planner_jax.planning.one_by_one import OneByOne
 from planner_jax.planning.replan import Replanning
 from planner_jax.protocol import Attempt
 from planner_jax.robot.car import pose_at
@@ -35,7 +35,7 @@ class Warm(Attempt):
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class ReplanIntercept:
+class ReplanIntercept(OneByOne):
     """Interceptions re-planned from the previous plan, as `pj.replan` asks for them.
 
     With less than `shortest` left until the meeting nothing is planned: what is left of the
@@ -124,11 +124,11 @@ class ReplanIntercept:
         field = planner.field(case, grid)
         return planner.refined(case, field, guess, attempt.solver, stages)
 
-    def solve_lanes(self, tasks: Replanning, attempt: Any) -> InterceptPlan:
-        """The plans of a batch: on a CPU one after another."""
+    def solve_at_once(self, tasks: Replanning, attempt: Any) -> InterceptPlan:
+        """The plans of a batch, all at once."""
         if isinstance(attempt, Search):
-            return self.planner.solve_lanes(tasks.case, attempt)
-        return suited(lambda task: self.solve(task, attempt), tasks)
+            return self.planner.solve_at_once(tasks.case, attempt)
+        return super().solve_at_once(tasks, attempt)
 
     def rest(self, task: Replanning, time: Array) -> tuple[Array, Array]:
         """Speed and curvature of the previous plan at the new knots 1..K, (K,) each."""

@@ -25,7 +25,7 @@ from planner_jax.optimise.levenberg import (
 )
 from planner_jax.plane import reach
 from planner_jax.plane.distance_field import DistanceField, distance_field
-from planner_jax.planning.one_by_one import suited
+from planner_jax.planning.one_by_one import OneByOne
 from planner_jax.protocol import Attempt, Status, is_solved
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.checked import checked_plan, explained, straight_on
@@ -152,7 +152,7 @@ class Found:
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class SpacetimeIntercept:
+class SpacetimeIntercept(OneByOne):
     """Meets the target at the case's time, or earlier.
 
     `meet` says when: at the "given" time, as "early" as it can until then, or at that time until
@@ -231,14 +231,6 @@ class SpacetimeIntercept:
 
         _, best = lax.while_loop(is_wanted, try_way, (0, straight_on(case, self.pieces)))
         return self.explained(case, attempt, found.is_reached, best)
-
-    def solve_lanes(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:
-        """The plans of a batch: on a CPU one after another, else all ways of all at once."""
-        return suited(
-            lambda case: self.solve(case, attempt),
-            cases,
-            at_once=lambda cases: self.solve_at_once(cases, attempt),
-        )
 
     def solve_at_once(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:
         """The plans of a batch: all ways of all cases together, of each the best one."""

@@ -7,7 +7,7 @@ the paper's least time for a ball that is infinitely fast.
 """
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from jax import Array, lax
 
 from planner_jax.ball.flight import drag_free_flight
 from planner_jax.optimise.levenberg import LevenbergConfig, Model, least_squares
-from planner_jax.planning.one_by_one import suited
+from planner_jax.planning.one_by_one import OneByOne
 from planner_jax.protocol import (
     FEASIBILITY_TOLERANCE,
     Attempt,
@@ -73,7 +73,7 @@ class PairPlan(Plan):
 
 
 @struct.dataclass
-class PairPlanner:
+class PairPlanner(OneByOne):
     """What both planners of pairs share: where the arm starts, and its surroundings.
 
     The shield's edges lie along those of the frame whose second axis is horizontal, as those of
@@ -196,11 +196,6 @@ class PairPlanner:
             point=point,
             quickest=entry,
         )
-
-    def solve_lanes(self, pairs: PairCase, attempt: Attempt) -> PairPlan:
-        """The plans of a batch: on a CPU one after another, else in step."""
-        solve: Any = lambda pair: self.solve(pair, attempt)  # type: ignore[attr-defined]  # noqa: E731
-        return suited(solve, pairs)
 
 
 @struct.dataclass
