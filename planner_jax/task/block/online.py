@@ -273,7 +273,8 @@ class OnlineBlock:
         coupling = jnp.einsum("wk,wi->ki", lift, carried, precision=_HIGHEST)
         steps_push = jnp.einsum("wk,wi->ki", lift, pushes[:, :6], precision=_HIGHEST)
         each = jnp.eye(6, dtype=dtype)
-        stiffness += jnp.einsum("ikl,ij->kilj", joints_stiffness[:, :-1, :-1], each)
+        of_each = joints_stiffness[:, :-1, :-1]
+        stiffness += jnp.einsum("ikl,ij->kilj", of_each, each, precision=_HIGHEST)
         coupling += joints_stiffness[:, :-1, -1].T
         steps_push += joints_push[:, :-1].T
         time_push += jnp.sum(joints_push[:, -1])
