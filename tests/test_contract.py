@@ -11,6 +11,7 @@ import pytest
 from flax import struct
 from jax import Array, lax
 from jaxpr import assert_full_precision
+from test_block_library import made_up
 
 import planner_jax as pj
 from planner_jax.optimise.lbfgs import LbfgsConfig
@@ -18,6 +19,8 @@ from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.optimise.problem import Round
 from planner_jax.plane.reach import Lattice
 from planner_jax.protocol import Attempt, HostPlanner, LanesPlanner, Plan, is_solved, outcome
+from planner_jax.task.block.library.planner import LibraryBlock
+from planner_jax.task.block.online import Search as BlockSearch
 from planner_jax.task.intercept.projection import Projection
 from planner_jax.task.intercept.spacetime import Search, SpacetimeIntercept
 from planner_jax.task.intercept.static_paths import PathSource
@@ -93,6 +96,12 @@ def library(seed):
 # Compiling is what takes time: two iterations, or the first guess as the plan.
 FEW = {"rounds": (Round(solver=LbfgsConfig(max_steps=2, memory=1, trial_steps=(1.0,))),)}
 NONE = {"rounds": (Round(solver=LbfgsConfig(max_steps=0)),)}
+# Of test_block, test_block_peers and test_block_library.
+SMALL_SEARCH = {
+    "pieces": 6,
+    "points": 10,
+    "searches": (BlockSearch(straight=12, tries=3, solver=LevenbergConfig(8)),),
+}
 SHORT = {"proportions": (0.2, 0.5, 1.0, 1.0, 1.0, 1.0), "nodes": 3, "num_table_nodes": 16}
 
 
@@ -143,6 +152,11 @@ def path_then_speed(name, **options):
     return Entry(planner, lambda num: pj.intercept.draw(num, "easy", 4), "start")
 
 
+def block(name, suite="pole", **options):
+    cases = lambda num: pj.block.draw(num, suite, 8, regime="R1", wide=True)  # noqa: E731
+    return Entry(pj.block.planner(name, **options), cases, "ball.vel")
+
+
 ENTRIES = {
     # Of the cost, which needs no adjoint: with it the program takes three times as long.
     "hit exact": hit("exact", {"of": "cost", "by": "racket_height", "steps": 0}, **SHORT, **NONE),
@@ -172,6 +186,15 @@ ENTRIES = {
     "intercept lattice": path_then_speed("lattice"),
     "intercept em": path_then_speed("em", tries=1),
     "intercept constant": path_then_speed("constant", tries=1),
+    "block online": block("online", **SMALL_SEARCH),
+    "block direct": block("direct", points=6),
+    # Without a pole the first spline is found at once, long before the clock ends a search.
+    "block insat": block("insat", "open"),
+    "block library": Entry(
+        LibraryBlock(made_up(regime="R1")),
+        lambda num: pj.block.draw(num, "pole", 8, regime="R1", anywhere=True),
+        "ball.vel",
+    ),
     "library": Entry(LibraryPlanner(library(1)), places, "goal"),
     "NumPy": Entry(NumpyPlanner(), places, "goal"),
 }
@@ -196,8 +219,9 @@ def entries(*, on_host=True, slow=()):
 
 every, pure = entries(slow=LIKE_OTHERS), entries(on_host=False, slow=LIKE_OTHERS)
 # By default these claims about one case are those of test_exact and test_decide, of programs that
-# they share with others.
-OF_THEIR_OWN = ("hit exact", "catch exact")
+# they share with others. Of blocks, the others compile programs of batches alone.
+BLOCKS = ("block online", "block direct")
+OF_THEIR_OWN = ("hit exact", "catch exact", *BLOCKS)
 
 
 def inside(planner):
@@ -302,7 +326,7 @@ def traces(monkeypatch):
     return count
 
 
-@entries(on_host=False, slow=(*LIKE_OTHERS, "catch mpp"))
+@entries(on_host=False, slow=(*LIKE_OTHERS, *BLOCKS, "catch mpp"))
 def test_a_second_batch_of_the_same_bucket_is_not_traced_again(entry, traces):
     assert entry.plans is not None  # planned once
     found = traces(inside(entry.planner))

@@ -24,7 +24,7 @@ from planner_jax.ball.flight import drag_free_flight
 from planner_jax.optimise.levenberg import LevenbergConfig, Model, begun, go_on, least_squares
 from planner_jax.planning.batch import better_of
 from planner_jax.planning.one_by_one import suited
-from planner_jax.protocol import FEASIBILITY_TOLERANCE, Attempt, Status, is_solved, status_of
+from planner_jax.protocol import FEASIBILITY_TOLERANCE, Attempt, is_solved, status_of
 from planner_jax.robot.arm import product, shield_jacobian, shield_pose
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import (
@@ -44,7 +44,7 @@ from planner_jax.task.block.end_poses import (
     frame_of,
 )
 from planner_jax.task.block.motion import angles_at, polynomial, sums
-from planner_jax.task.block.plan import BlockPlan, no_plan
+from planner_jax.task.block.plan import BlockPlan, explained, no_plan
 
 _HIGHEST = lax.Precision.HIGHEST
 _PLANE = 1e-3  # [m], how far from the shield's plane the ball may be at the contact
@@ -165,8 +165,7 @@ class OnlineBlock:
             bent = jax.vmap(self.bump)(jnp.asarray(bumps, points.dtype))
             points = points.at[:, :-1].add(bent.reshape(attempt.tries, -1))
             best = bend(case, flight, points, attempt, best)
-        status = jnp.where(flight.comes, best.status, Status.OUT_OF_REACH)
-        return dataclasses.replace(best, status=status.astype(jnp.int32))
+        return dataclasses.replace(best, status=explained(case, flight.comes, best.status))
 
     def _one_after_another(
         self, case: BlockCase, flight: Flight, points: Array, attempt: Search, best: BlockPlan
