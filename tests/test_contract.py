@@ -18,6 +18,7 @@ from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.optimise.problem import Round
 from planner_jax.plane.reach import Lattice
+from planner_jax.planning import one_by_one
 from planner_jax.protocol import Attempt, HostPlanner, LanesPlanner, Plan, is_solved, outcome
 from planner_jax.task.block.library.planner import LibraryBlock
 from planner_jax.task.block.online import Search as BlockSearch
@@ -295,7 +296,8 @@ def test_every_status_is_a_status_and_solved_says_which_are_good(entry):
 
 
 @pure
-def test_every_matrix_product_asks_for_full_precision(entry):
+def test_every_matrix_product_asks_for_full_precision(entry, monkeypatch):
+    monkeypatch.setattr(one_by_one, "has_only_cpu", lambda: False)  # also in what is for a GPU
     planner, case = inside(entry.planner), pj.lane(entry.batch, 0)
     for attempt in planner.attempts:
         assert_full_precision(lambda p, case, a=attempt: p.solve(case, a), planner, case)
@@ -447,6 +449,21 @@ def test_cases_of_another_task_are_refused_in_one_line(entry, call):
     with pytest.raises(TypeError, match=names) as caught:
         call(entry.planner, stranger)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("only_cpu", [True, False])
+def test_what_is_for_other_devices_is_not_traced_where_there_are_none(only_cpu, monkeypatch):
+    monkeypatch.setattr(one_by_one, "has_only_cpu", lambda: only_cpu)
+    traced = []
+
+    def at_once(cases):
+        traced.append(cases)
+        return 2.0 * cases
+
+    cases = np.arange(3.0, dtype=np.float32)
+    plans = jax.jit(lambda cases: one_by_one.suited(lambda x: 2.0 * x, cases, at_once))(cases)
+    np.testing.assert_array_equal(plans, 2.0 * cases)
+    assert bool(traced) != only_cpu
 
 
 @pytest.mark.parametrize("call", [pj.plan, pj.solve], ids=["plan", "solve"])

@@ -6,6 +6,7 @@ from typing import TypeVar
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
+from jax.extend.backend import backends
 
 CaseT = TypeVar("CaseT")
 PlanT = TypeVar("PlanT")
@@ -18,16 +19,25 @@ def suited(
 ) -> PlanT:
     """The plans of a batch as suits the device: on a CPU one after another, else all at once; pure.
 
+    Where there is nothing but a CPU, what is for others is not even traced, which takes longer.
+
     Args:
         solve: the plan of one case.
         cases: leaves with a leading axis.
         at_once: the plans of the batch; by default `solve` of all cases in step.
     """
+    if has_only_cpu():
+        return one_by_one(solve, cases)
     return lax.platform_dependent(
         cases,
         cpu=lambda cases: one_by_one(solve, cases),
         default=at_once or jax.vmap(solve),
     )
+
+
+def has_only_cpu() -> bool:
+    """Whether all devices that JAX has are CPUs."""
+    return set(backends()) == {"cpu"}
 
 
 def one_by_one(solve: Callable[[CaseT], PlanT], cases: CaseT) -> PlanT:
