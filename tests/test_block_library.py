@@ -230,7 +230,7 @@ def test_statuses_say_why_a_stored_motion_will_not_do():
     plans = pj.plan(LibraryBlock(library), cases)
     assert [S(int(s)) for s in plans.status] == [
         *(S.CONVERGED, S.INFEASIBLE, S.INFEASIBLE, S.OUT_OF_REACH, S.OUT_OF_REACH),
-        *(S.OUT_OF_REACH, S.OUT_OF_REACH, S.BLOCKED, S.BLOCKED),
+        *(S.OUT_OF_REACH, S.NON_FINITE, S.BLOCKED, S.BLOCKED),
     ]
     strict = pj.block.case(*good)
     assert pj.plan(LibraryBlock(library), strict).status == S.INFEASIBLE

@@ -11,13 +11,17 @@ import pytest
 from flax import struct
 from jax import Array, lax
 from jaxpr import assert_full_precision
+from test_block_library import made_up
 
 import planner_jax as pj
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.optimise.problem import Round
 from planner_jax.plane.reach import Lattice
+from planner_jax.planning import one_by_one
 from planner_jax.protocol import Attempt, HostPlanner, LanesPlanner, Plan, is_solved, outcome
+from planner_jax.task.block.library.planner import LibraryBlock
+from planner_jax.task.block.online import Search as BlockSearch
 from planner_jax.task.intercept.projection import Projection
 from planner_jax.task.intercept.spacetime import Search, SpacetimeIntercept
 from planner_jax.task.intercept.static_paths import PathSource
@@ -93,6 +97,12 @@ def library(seed):
 # Compiling is what takes time: two iterations, or the first guess as the plan.
 FEW = {"rounds": (Round(solver=LbfgsConfig(max_steps=2, memory=1, trial_steps=(1.0,))),)}
 NONE = {"rounds": (Round(solver=LbfgsConfig(max_steps=0)),)}
+# Of test_block, test_block_peers and test_block_library.
+SMALL_SEARCH = {
+    "pieces": 6,
+    "points": 10,
+    "searches": (BlockSearch(straight=12, tries=3, solver=LevenbergConfig(8)),),
+}
 SHORT = {"proportions": (0.2, 0.5, 1.0, 1.0, 1.0, 1.0), "nodes": 3, "num_table_nodes": 16}
 
 
@@ -143,6 +153,11 @@ def path_then_speed(name, **options):
     return Entry(planner, lambda num: pj.intercept.draw(num, "easy", 4), "start")
 
 
+def block(name, suite="pole", **options):
+    cases = lambda num: pj.block.draw(num, suite, 8, regime="R1", wide=True)  # noqa: E731
+    return Entry(pj.block.planner(name, **options), cases, "ball.vel")
+
+
 ENTRIES = {
     # Of the cost, which needs no adjoint: with it the program takes three times as long.
     "hit exact": hit("exact", {"of": "cost", "by": "racket_height", "steps": 0}, **SHORT, **NONE),
@@ -172,6 +187,15 @@ ENTRIES = {
     "intercept lattice": path_then_speed("lattice"),
     "intercept em": path_then_speed("em", tries=1),
     "intercept constant": path_then_speed("constant", tries=1),
+    "block online": block("online", **SMALL_SEARCH),
+    "block direct": block("direct", points=6),
+    # Without a pole the first spline is found at once, long before the clock ends a search.
+    "block insat": block("insat", "open"),
+    "block library": Entry(
+        LibraryBlock(made_up(regime="R1")),
+        lambda num: pj.block.draw(num, "pole", 8, regime="R1", anywhere=True),
+        "ball.vel",
+    ),
     "library": Entry(LibraryPlanner(library(1)), places, "goal"),
     "NumPy": Entry(NumpyPlanner(), places, "goal"),
 }
@@ -196,8 +220,9 @@ def entries(*, on_host=True, slow=()):
 
 every, pure = entries(slow=LIKE_OTHERS), entries(on_host=False, slow=LIKE_OTHERS)
 # By default these claims about one case are those of test_exact and test_decide, of programs that
-# they share with others.
-OF_THEIR_OWN = ("hit exact", "catch exact")
+# they share with others. Of blocks, the others compile programs of batches alone.
+BLOCKS = ("block online", "block direct")
+OF_THEIR_OWN = ("hit exact", "catch exact", *BLOCKS)
 
 
 def inside(planner):
@@ -271,7 +296,8 @@ def test_every_status_is_a_status_and_solved_says_which_are_good(entry):
 
 
 @pure
-def test_every_matrix_product_asks_for_full_precision(entry):
+def test_every_matrix_product_asks_for_full_precision(entry, monkeypatch):
+    monkeypatch.setattr(one_by_one, "has_only_cpu", lambda: False)  # also in what is for a GPU
     planner, case = inside(entry.planner), pj.lane(entry.batch, 0)
     for attempt in planner.attempts:
         assert_full_precision(lambda p, case, a=attempt: p.solve(case, a), planner, case)
@@ -302,7 +328,7 @@ def traces(monkeypatch):
     return count
 
 
-@entries(on_host=False, slow=(*LIKE_OTHERS, "catch mpp"))
+@entries(on_host=False, slow=(*LIKE_OTHERS, *BLOCKS, "catch mpp"))
 def test_a_second_batch_of_the_same_bucket_is_not_traced_again(entry, traces):
     assert entry.plans is not None  # planned once
     found = traces(inside(entry.planner))
@@ -423,6 +449,102 @@ def test_cases_of_another_task_are_refused_in_one_line(entry, call):
     with pytest.raises(TypeError, match=names) as caught:
         call(entry.planner, stranger)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("only_cpu", [True, False])
+def test_what_is_for_other_devices_is_not_traced_where_there_are_none(only_cpu, monkeypatch):
+    monkeypatch.setattr(one_by_one, "has_only_cpu", lambda: only_cpu)
+    traced = []
+
+    class Doubles(one_by_one.OneByOne):
+        def solve(self, case, attempt):
+            return 2.0 * case
+
+        def solve_at_once(self, cases, attempt):
+            traced.append(cases)
+            return 2.0 * cases
+
+    cases = np.arange(3.0, dtype=np.float32)
+    plans = jax.jit(lambda cases: Doubles().solve_lanes(cases, None))(cases)
+    np.testing.assert_array_equal(plans, 2.0 * cases)
+    assert bool(traced) != only_cpu
+
+
+@pytest.mark.parametrize("call", [pj.plan, pj.solve], ids=["plan", "solve"])
+def test_a_derivative_is_refused_with_the_names_of_what_has_one(entry, call):
+    floats, others = (
+        jax.tree.map(lambda x, f=f: x if (x.dtype.kind == "f") == f else None, entry.batch)
+        for f in (True, False)
+    )
+
+    def cost(floats):
+        both = lambda a, b: b if a is None else a  # noqa: E731
+        cases = jax.tree.map(both, floats, others, is_leaf=lambda leaf: leaf is None)
+        return jnp.sum(call(entry.planner, cases).cost)
+
+    with pytest.raises(TypeError, match=r"pj\.gradient.* pj\.optimal_plan") as caught:
+        jax.grad(cost)(floats)
+    assert "\n" not in str(caught.value)
+
+
+@entries(slow=(*LIKE_OTHERS, "catch exact", "intercept spacetime"))
+def test_a_gradient_is_there_where_it_is_promised_and_refused_elsewhere(entry):
+    planner = inside(entry.planner)
+    searches_first = hasattr(planner, "smooth_near")  # plans are then settled anew
+    if not (hasattr(planner, "objective") or searches_first):
+        with pytest.raises(
+            TypeError, match=f"^{type(planner).__name__} minimises nothing"
+        ) as caught:
+            pj.gradient(entry.planner, entry.batch, of="cost", by=entry.broken)
+        assert "\n" not in str(caught.value)
+        return
+    found = pj.gradient(entry.planner, entry.batch, **entry.gradient)
+    if not searches_first:
+        np.testing.assert_array_equal(found.plans.status, entry.plans.status)
+    there = np.isfinite(found.residual)
+    assert found.residual.shape == found.value.shape == (NUM,)
+    by = entry.gradient["by"]
+    assert set(found.by) == {by} if isinstance(by, str) else set(by)
+    for leaf in jax.tree.leaves(found.by):
+        assert leaf.shape[0] == NUM
+        np.testing.assert_array_equal(np.isfinite(leaf.reshape(NUM, -1)).all(axis=1), there)
+        assert np.isnan(leaf[~there]).all()
+
+
+@every
+def test_plans_are_read_from_a_file_as_they_were_written(entry, tmp_path):
+    for plans in (entry.plans, pj.lane(entry.plans, 2)):
+        path = tmp_path / "plans.npz"
+        plans.save(path)
+        again = type(plans).load(path)
+        assert type(again) is type(plans)
+        assert jax.tree.structure(again) == jax.tree.structure(plans)
+        assert_equal(again, plans, ...)
+
+
+@every
+@pytest.mark.parametrize("call", [pj.plan, pj.solve], ids=["plan", "solve"])
+def test_cases_of_another_task_are_refused_in_one_line(entry, call):
+    stranger = places(2) if not isinstance(entry.batch, Place) else pj.hit.draw(2)
+    names = f"{type(entry.batch).__name__}, got {type(stranger).__name__}$"
+    with pytest.raises(TypeError, match=names) as caught:
+        call(entry.planner, stranger)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("only_cpu", [True, False])
+def test_what_is_for_other_devices_is_not_traced_where_there_are_none(only_cpu, monkeypatch):
+    monkeypatch.setattr(one_by_one, "has_only_cpu", lambda: only_cpu)
+    traced = []
+
+    def at_once(cases):
+        traced.append(cases)
+        return 2.0 * cases
+
+    cases = np.arange(3.0, dtype=np.float32)
+    plans = jax.jit(lambda cases: one_by_one.suited(lambda x: 2.0 * x, cases, at_once))(cases)
+    np.testing.assert_array_equal(plans, 2.0 * cases)
+    assert bool(traced) != only_cpu
 
 
 @pytest.mark.parametrize("call", [pj.plan, pj.solve], ids=["plan", "solve"])

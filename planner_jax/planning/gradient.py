@@ -87,7 +87,7 @@ def gradient(
     if not hasattr(planner, "objective"):
         raise TypeError(
             f"{type(planner).__name__} minimises nothing, so that its plans have no gradient: use "
-            "the planner exact"
+            "a planner that does, such as hits' and catches' exact or intercepts' spacetime"
         )
     if solver is not None:
         planner = planner.with_solver(solver)

@@ -15,11 +15,11 @@ from jax import Array, lax
 
 from planner_jax.planning.batch import better_of
 from planner_jax.planning.one_by_one import OneByOne
-from planner_jax.protocol import Attempt, Status, is_solved, status_of
+from planner_jax.protocol import Attempt, is_solved, status_of
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import least_clearances
 from planner_jax.task.block.end_poses import EndPoses, end_poses, flight_of
-from planner_jax.task.block.plan import BlockPlan, no_plan
+from planner_jax.task.block.plan import BlockPlan, explained, no_plan
 from planner_jax.trajectory.bang_bang import bang_bang, least_times
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
@@ -83,8 +83,8 @@ class DirectBlock(OneByOne):
 
         start = jnp.zeros((), jnp.int32), no_plan(case, staying(case, 13, 2))
         _, best = lax.while_loop(is_open, next_one, start)
-        status = jnp.where(flight_of(case).comes, best.status, Status.OUT_OF_REACH)
-        return dataclasses.replace(best, status=status.astype(jnp.int32))
+        status = explained(case, flight_of(case).comes, best.status)
+        return dataclasses.replace(best, status=status)
 
     def plan_to(self, case: BlockCase, goal: Array, contact: Array, duration: Array) -> BlockPlan:
         """The plan to one end pose.

@@ -24,7 +24,7 @@ from planner_jax.ball.flight import drag_free_flight
 from planner_jax.optimise.levenberg import LevenbergConfig, Model, begun, go_on, least_squares
 from planner_jax.planning.batch import better_of
 from planner_jax.planning.one_by_one import OneByOne
-from planner_jax.protocol import FEASIBILITY_TOLERANCE, Attempt, Status, is_solved, status_of
+from planner_jax.protocol import FEASIBILITY_TOLERANCE, Attempt, is_solved, status_of
 from planner_jax.robot.arm import product, shield_jacobian, shield_pose
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import (
@@ -44,7 +44,7 @@ from planner_jax.task.block.end_poses import (
     frame_of,
 )
 from planner_jax.task.block.motion import angles_at, polynomial, sums
-from planner_jax.task.block.plan import BlockPlan, no_plan
+from planner_jax.task.block.plan import BlockPlan, explained, no_plan
 
 _HIGHEST = lax.Precision.HIGHEST
 _PLANE = 1e-3  # [m], how far from the shield's plane the ball may be at the contact
@@ -162,8 +162,7 @@ class OnlineBlock(OneByOne):
             bent = jax.vmap(self.bump)(jnp.asarray(bumps, points.dtype))
             points = points.at[:, :-1].add(bent.reshape(attempt.tries, -1))
             best = bend(case, flight, points, attempt, best)
-        status = jnp.where(flight.comes, best.status, Status.OUT_OF_REACH)
-        return dataclasses.replace(best, status=status.astype(jnp.int32))
+        return dataclasses.replace(best, status=explained(case, flight.comes, best.status))
 
     def _one_after_another(
         self, case: BlockCase, flight: Flight, points: Array, attempt: Search, best: BlockPlan
@@ -270,7 +269,8 @@ class OnlineBlock(OneByOne):
         coupling = jnp.einsum("wk,wi->ki", lift, carried, precision=_HIGHEST)
         steps_push = jnp.einsum("wk,wi->ki", lift, pushes[:, :6], precision=_HIGHEST)
         each = jnp.eye(6, dtype=dtype)
-        stiffness += jnp.einsum("ikl,ij->kilj", joints_stiffness[:, :-1, :-1], each)
+        of_each = joints_stiffness[:, :-1, :-1]
+        stiffness += jnp.einsum("ikl,ij->kilj", of_each, each, precision=_HIGHEST)
         coupling += joints_stiffness[:, :-1, -1].T
         steps_push += joints_push[:, :-1].T
         time_push += jnp.sum(joints_push[:, -1])

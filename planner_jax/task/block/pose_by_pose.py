@@ -25,7 +25,7 @@ from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.direct import poses_in_time
 from planner_jax.task.block.end_poses import flight_of
 from planner_jax.task.block.free_space import FreeSpace
-from planner_jax.task.block.plan import BlockPlan
+from planner_jax.task.block.plan import BlockPlan, explained
 from planner_jax.task.block.way_timing import DEGREE, PIECES, required, timed_way
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
@@ -87,9 +87,9 @@ class PoseByPose(abc.ABC):
 
     def plan_of(self, case: BlockCase) -> BlockPlan:
         """The plan of one case with NumPy leaves."""
-        comes, angles, contacts, shares = (np.asarray(x) for x in _goals(case, self.points))
-        if not comes:
-            return self._plan(case, Status.OUT_OF_REACH)
+        hopeless, angles, contacts, shares = (np.asarray(x) for x in _goals(case, self.points))
+        if hopeless != Status.NO_PATH:
+            return self._plan(case, Status(int(hopeless)))
         order = np.argsort(shares)[: np.isfinite(shares).sum()]
         if np.any(case.rates != 0.0) or not order.size:
             return self._plan(case, Status.INFEASIBLE)
@@ -149,17 +149,18 @@ class PoseByPose(abc.ABC):
 
 @functools.partial(jax.jit, static_argnames="points")
 def _goals(case: BlockCase, points: int) -> tuple[Array, Array, Array, Array]:
-    """Whether the ball comes, and end poses.
+    """Why there can be no plan, and end poses.
 
     Returns:
-        comes: () bool.
+        status: () int32, NO_PATH unless the case itself says that there is none.
         angles: (C, 6) [rad].
         contact: (C,) [s].
         share: (C,) of the time there is that a bang-bang motion takes; infinite if it is too late.
     """
     poses, times = poses_in_time(case, points)
     share = times / jnp.maximum(poses.time - case.delay, 1e-6)
-    return flight_of(case).comes, poses.angles, poses.time, share
+    status = explained(case, flight_of(case).comes, jnp.asarray(Status.NO_PATH))
+    return status, poses.angles, poses.time, share
 
 
 @dataclasses.dataclass(frozen=True)

@@ -24,7 +24,7 @@ from planner_jax.task.block.library.table import (
     unpacked,
 )
 from planner_jax.task.block.motion import polynomial
-from planner_jax.task.block.plan import BlockPlan
+from planner_jax.task.block.plan import BlockPlan, has_nan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 _SAME_START = 1e-4  # [rad] and [rad/s], how exactly the arm has to be where stored motions begin
@@ -87,6 +87,7 @@ class LibraryBlock:
         fits = fits & _is_same(self.library.setting, setting_of(case))
         plan = _answered(table, case, home)
         status = jnp.where(fits, plan.status, Status.BLOCKED)
+        status = jnp.where(has_nan(case), Status.NON_FINITE, status)
         return plan.replace(status=status.astype(jnp.int32))  # type: ignore[attr-defined]
 
 
