@@ -48,11 +48,11 @@ class Effort(Attempt):
     """An attempt: so many stored motions warped, some of them checked, some bent; static."""
 
     neighbours: int = 8  # motions that are warped, up to 16
-    points: int = 8  # of the ball's way, to each of which they are
+    points: int = 6  # of the ball's way, to each of which they are
     screened: int = 8  # of the warped ones, whose distances from the pole are looked at
-    samples: int = 10  # of them then
-    checks: int = 2  # of them at most, closely, those first that are turned least
-    checked: int = 48  # samples of a check
+    samples: int = 12  # of each then
+    checks: int = 1  # of them at most, closely, those first that promise most
+    checked: int = 40  # samples of a check
     bent: int = 0  # least squares that begin with them at most
     solver: LevenbergConfig = LevenbergConfig(
         *(12, 1e-2, 0.25, 6.0), settled=1, tolerance=1.0, trial=4, hope=500.0, fade=0.7
@@ -81,7 +81,10 @@ class AdaptBlock:
     online: OnlineBlock = struct.field(pytree_node=False, default=OnlineBlock())
     efforts: tuple[Effort, ...] = struct.field(
         pytree_node=False,
-        default=(Effort(), Effort(neighbours=16, screened=16, checks=6, checked=96, bent=6)),
+        default=(
+            Effort(),
+            Effort(neighbours=16, points=8, screened=16, checks=6, checked=96, bent=6),
+        ),
     )
 
     case_type: ClassVar[type] = BlockCase
@@ -165,13 +168,15 @@ class AdaptBlock:
         least, place = lax.top_k(-promise, effort.screened)
         moves = moves.reshape(-1, pieces, 6)[place]
         short = self.short_of_pole(case, moves, effort.samples)
-        order = jnp.argsort(-least + _NEAR * jnp.maximum(short, 0.0))
+        cost = _NEAR * jnp.maximum(short, 0.0) - least
+        order = lax.top_k(-cost, effort.screened)[1]
         place, moves = place[order], moves[order]
         points = moves.reshape(effort.screened, -1)
         return Warped(
             points=jnp.concatenate([points, time[place % num][:, None]], axis=1),
             promise=-least[order],
-            is_open=(late.reshape(-1)[place] <= 0.0) & (short[order] <= 0.0),
+            is_open=(late.reshape(-1)[place] <= 0.0)
+            & (short[order] <= online.pole_margin - online.margin),
         )
 
     def neighbours(
@@ -196,7 +201,10 @@ class AdaptBlock:
         away = (first_away[:, None] + last_away).reshape(-1)
         pairs = (first[:, None] * layout.num_inner + last).reshape(-1)
         away, nearest = lax.top_k(-away, num)
-        row = unpacked(jnp.asarray(table.rows)[home, pairs[nearest]])
+        rows = jnp.asarray(table.rows)
+        places = home * rows.shape[1] + pairs[nearest]
+        flat = rows.reshape(-1, rows.shape[2])  # gathered quicker than by two places
+        row = unpacked(flat.at[places].get(mode="promise_in_bounds"))
         found = jnp.isfinite(row.duration) & is_first & is_last
         return jnp.where(found[:, None, None], row.steps, 0.0), -away, found
 
@@ -206,7 +214,7 @@ class AdaptBlock:
         rest = jnp.zeros_like(case.angles)
         angles = jax.vmap(lambda steps: angles_at(case.angles, rest, steps, shares))(moves)
         gaps = clearances(case.arm, case.scene, angles.reshape(-1, 6))[: num_of_pole(case.arm)]
-        return self.online.margin - jnp.min(gaps.reshape(-1, len(moves), samples), axis=(0, 2))
+        return self.online.pole_margin - jnp.min(gaps.reshape(-1, len(moves), samples), axis=(0, 2))
 
 
 def adapt_planner(file: str | os.PathLike) -> AdaptBlock:
