@@ -40,7 +40,7 @@ _HIGHEST = lax.Precision.HIGHEST
 _WEIGHTS = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.0])
 _AWAY = 0.02  # [rad^2], of a motion whose pair's cells are one cell off
 _LATE = 10.0  # [rad^2], of a whole limit exceeded
-_NEAR = 30.0  # [rad^2/m], of a pole that is too near
+_NEAR = 30.0  # [rad^2/m], of a pole that is too near at a sample
 
 
 @dataclasses.dataclass(frozen=True)
@@ -172,11 +172,11 @@ class AdaptBlock:
         order = lax.top_k(-cost, effort.screened)[1]
         place, moves = place[order], moves[order]
         points = moves.reshape(effort.screened, -1)
+        spare = online.pole_margin - online.margin
         return Warped(
             points=jnp.concatenate([points, time[place % num][:, None]], axis=1),
             promise=-least[order],
-            is_open=(late.reshape(-1)[place] <= 0.0)
-            & (short[order] <= online.pole_margin - online.margin),
+            is_open=(late.reshape(-1)[place] <= 0.0) & (short[order] <= spare),
         )
 
     def neighbours(
