@@ -6,6 +6,7 @@ from planner_jax.sweep.block.columns import COLUMNS, FRAME
 from planner_jax.sweep.settings import SettingError, SweepSettings
 from planner_jax.sweep.summary import Tally
 from planner_jax.sweep.sweep import Sweep
+from planner_jax.task.block.library.adapt import AdaptBlock
 from planner_jax.task.block.library.file import LibraryFileError
 from planner_jax.task.block.library.planner import LibraryBlock, OtherLibrary
 
@@ -31,7 +32,7 @@ class BlockSweep(Sweep):
     def require_fit(self, settings: SweepSettings, planner: Any, cases: Any) -> None:
         """Raise `SettingError` unless the planner is one of such cases, and a library of these."""
         super().require_fit(settings, planner, cases)
-        if isinstance(planner, LibraryBlock):
+        if isinstance(planner, LibraryBlock | AdaptBlock):
             try:
                 planner.check(cases)
             except OtherLibrary as error:

@@ -62,6 +62,7 @@ def planner(name: str = "online", **options: Any) -> AnyPlanner[Any, Any]:
 
     * `library:FILE`: the motion that a file of `planner-jax library build` has for the two cells
       through which the ball comes.
+    * `adapt:FILE`: motions of that file warped to the very ball, then least squares from these.
     * `online`: a straight motion of the joints if one is free, else end pose, time of contact and
       motion together, by least squares from many starts.
     * `direct`: all joints as fast as they may turn, to the end pose that is reached soonest of
@@ -76,8 +77,8 @@ def planner(name: str = "online", **options: Any) -> AnyPlanner[Any, Any]:
         **options: fields of that planner's dataclass, for example `points` of `online`.
 
     Returns:
-        A planner for `pj.plan`: `OnlineBlock`, `LibraryBlock`, `DirectBlock`, `RrtConnectBlock`,
-        `EpaseBlock` or `InsatBlock`.
+        A planner for `pj.plan`: `OnlineBlock`, `LibraryBlock`, `AdaptBlock`, `DirectBlock`,
+        `RrtConnectBlock`, `EpaseBlock` or `InsatBlock`.
 
     Raises:
         ValueError: there is no planner of that name.

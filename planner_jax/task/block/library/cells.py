@@ -121,6 +121,40 @@ def cell_of(faces: tuple[Face, ...], box: Box, point: Sequence[Array]) -> tuple[
     return cell, found
 
 
+def cells_around(
+    faces: tuple[Face, ...], box: Box, point: Sequence[Array]
+) -> tuple[Array, Array, Array]:
+    """The cells nearest to a point of a box's surface: up to two each way, of the point's face.
+
+    Args:
+        faces: that have cells.
+        box: the whole box.
+        point: three numbers () [m]; its face is that of `cell_of`.
+
+    Returns:
+        cells: (4,) int32, their numbers; where a face has only one cell across, it is there twice.
+        away: (4,), square of the distance from the point to their middles, in cells.
+        found: () bool, whether the face has cells.
+    """
+    own, found = cell_of(faces, box, point)
+    share = [(point[k] - box.lower[k]) / (box.upper[k] - box.lower[k]) for k in range(3)]
+    cells, away, begin = jnp.zeros(4, jnp.int32), jnp.zeros(4, share[0].dtype), 0
+    for face in faces:
+        places = []
+        for axis, count in zip(face.across, face.cells, strict=True):
+            place = share[axis] * count - 0.5  # in cells, from the middle of the first
+            lower = jnp.clip(jnp.floor(place), 0, max(count - 2, 0))
+            pair = jnp.minimum(jnp.stack([lower, lower + 1.0]), count - 1.0)
+            places.append((pair.astype(jnp.int32), (pair - place) ** 2))
+        (first, first_away), (second, second_away) = places
+        there = (own >= begin) & (own < begin + face.num)
+        of_face = begin + first[:, None] * face.cells[1] + second
+        cells = jnp.where(there, of_face.reshape(-1), cells)
+        away = jnp.where(there, (first_away[:, None] + second_away).reshape(-1), away)
+        begin += face.num
+    return cells, away, found
+
+
 @struct.dataclass
 class Tunnels:
     """The tunnels of all pairs of a layout, NumPy float64 leaves."""

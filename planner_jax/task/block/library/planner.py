@@ -79,16 +79,18 @@ class LibraryBlock:
 
     def solve(self, case: BlockCase, attempt: Attempt) -> BlockPlan:
         """The plan of one case; pure."""
-        table = self.library.table
-        homes = jnp.asarray(table.homes)
-        off = jnp.max(jnp.abs(homes - case.angles), axis=1)
-        home = jnp.argmin(off)
-        fits = (off[home] <= _SAME_START) & (jnp.max(jnp.abs(case.rates)) <= _SAME_START)
-        fits = fits & _is_same(self.library.setting, setting_of(case))
-        plan = _answered(table, case, home)
+        home, fits = self.home_of(case)
+        plan = _answered(self.library.table, case, home)
         status = jnp.where(fits, plan.status, Status.BLOCKED)
         status = jnp.where(has_nan(case), Status.NON_FINITE, status)
         return plan.replace(status=status.astype(jnp.int32))  # type: ignore[attr-defined]
+
+    def home_of(self, case: BlockCase) -> tuple[Array, Array]:
+        """The home () int32 nearest to where the arm is, and whether the library is of the case."""
+        off = jnp.max(jnp.abs(jnp.asarray(self.library.table.homes) - case.angles), axis=1)
+        home = jnp.argmin(off)
+        fits = (off[home] <= _SAME_START) & (jnp.max(jnp.abs(case.rates)) <= _SAME_START)
+        return home, fits & _is_same(self.library.setting, setting_of(case))
 
 
 class OneBall:

@@ -1,0 +1,118 @@
+"""Measure the planner that warps stored motions to the very ball, one ball at a time on one core.
+
+    taskset -c 0 python -m benchmarks.block_adapt [--library FILE] [--layout full] [--regime R2]
+        [--num 1000] [--seed 7] [--out DIR]
+
+Throws of the suite `pole`, straight on and in the middle, no delay. Without --library one is
+built. Beside `adapt` with its first effort alone and with both, on the same throws: the library's
+motions as they are stored, which may meet a ball anywhere on the shield; straight motions alone,
+six and forty-eight of them; and `online`. Each is compiled for one ball by `BallByBall`; times are
+from the ball's arrays to the plan's, and beside them the processor's own, which other work on the
+machine changes less; success is the referee's, and what a planner called solved
+and the referee refuses is counted.
+"""
+
+import argparse
+import dataclasses
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+import planner_jax as pj
+from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
+from planner_jax.robot.arm import REGIMES
+from planner_jax.sweep.block.library import build_library
+from planner_jax.task.block.ball_by_ball import BallByBall
+from planner_jax.task.block.library.adapt import adapt_planner
+from planner_jax.task.block.library.cells import LAYOUTS
+from planner_jax.task.block.online import OnlineBlock, Search
+
+WARM = 50  # balls before the clock counts
+
+
+def measured(bench: Bench, name: str, planner: Any, cases: Any) -> None:
+    """One planner on all throws."""
+    cases = jax.tree.map(np.asarray, cases)
+    lanes = [pj.lane(cases, k) for k in range(cases.batch_shape[0])]
+    began = time.perf_counter()
+    one = BallByBall(planner, lanes[0])
+    compiling = time.perf_counter() - began
+    for case in lanes[:WARM]:
+        one.plan(case.ball.pos, case.ball.vel)
+    seconds, busy, plans = [], [], []
+    for case in lanes:
+        began, begun = time.perf_counter(), time.process_time()
+        plans.append(one.plan(case.ball.pos, case.ball.vel))
+        seconds.append(time.perf_counter() - began)
+        busy.append(time.process_time() - begun)
+    together: Any = jax.tree.map(lambda *leaves: np.stack(leaves), *plans)
+    success, claims = pj.block.judge(cases, together).success, pj.solved(together)
+    refused = int((claims & ~success).sum())
+    p50, p99 = 1e3 * np.percentile(seconds, [50, 99])
+    mean = 1e3 * float(np.mean(seconds))
+    own = 1e3 * float(np.median(busy)), 1e3 * float(np.mean(busy))
+    bench.say(
+        f"{name}: {100 * success.mean():.1f} % blocked, {100 * claims.mean():.1f} % called solved, "
+        f"{refused} of these refused; p50 {p50:.3f} ms, mean {mean:.3f} ms, p99 {p99:.3f} ms, "
+        f"of the processor's own time p50 {own[0]:.3f} ms, mean {own[1]:.3f} ms; "
+        f"compiled in {compiling:.1f} s"
+    )
+    bench.row(
+        planner=name,
+        success=success.mean(),
+        claims=claims.mean(),
+        refused=refused,
+        p50_ms=p50,
+        mean_ms=mean,
+        p99_ms=p99,
+        processor_p50_ms=own[0],
+        processor_mean_ms=own[1],
+        compile_seconds=compiling,
+    )
+    bench.count(success)
+
+
+def measure(bench: Bench, options: argparse.Namespace) -> None:
+    """All planners."""
+    path = options.library
+    if path is None:
+        path = bench.path / "library.bin"
+        build_library(str(path), layout=options.layout, regime=options.regime)
+    adapt = adapt_planner(path)
+
+    def drawn(**how: Any) -> Any:
+        return pj.block.draw(options.num, "pole", options.seed, regime=options.regime, **how)
+
+    cases = drawn()
+    adapt.check(cases)
+    bench.say(f"{options.num} throws, load average {os.getloadavg()[0]:.1f}")
+    few, many = (OnlineBlock(searches=(Search(straight=k, tries=0),)) for k in (6, 48))
+    measured(
+        bench, "adapt, first effort", dataclasses.replace(adapt, efforts=adapt.efforts[:1]), cases
+    )
+    measured(bench, "adapt, both efforts", adapt, cases)
+    measured(bench, "library, anywhere on the shield", adapt.stored, drawn(anywhere=True))
+    measured(bench, "straight, 6 motions", few, cases)
+    measured(bench, "straight, 48 motions", many, cases)
+    measured(bench, "online", OnlineBlock(), cases)
+
+
+def main() -> None:
+    """Measure."""
+    parser = argument_parser("block_adapt", __doc__, num=1000, seed=7)
+    parser.add_argument("--library", type=Path, help="a file that has been built")
+    parser.add_argument("--layout", default="full", help=f"of {', '.join(LAYOUTS)}; default: full")
+    parser.add_argument("--regime", default="R2", help=f"of {', '.join(REGIMES)}; default: R2")
+    options = parser.parse_args()
+    chosen(parser, "--layout", options.layout, LAYOUTS)
+    chosen(parser, "--regime", options.regime, REGIMES)
+    with begin(parser, options) as bench:
+        measure(bench, options)
+
+
+if __name__ == "__main__":
+    main()

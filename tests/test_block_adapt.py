@@ -1,0 +1,173 @@
+"""Motions of a library that are warped to the very ball, and one ball planned after another."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import planner_jax as pj
+from planner_jax.robot.arm import REGIMES
+from planner_jax.robot.arm_mjcf import irb1600
+from planner_jax.task.block.ball_by_ball import BallByBall
+from planner_jax.task.block.end_poses import end_poses, flight_of
+from planner_jax.task.block.library import build as building
+from planner_jax.task.block.library.adapt import AdaptBlock, Effort, adapt_planner
+from planner_jax.task.block.library.cells import Face, Layout, cell_of, cells_around
+from planner_jax.task.block.library.file import LibraryFileError, save_library
+from planner_jax.task.block.library.planner import LibraryBlock, OtherLibrary
+from planner_jax.task.block.library.table import Row, Setting, library_of, packed
+from planner_jax.task.block.motion import profiles
+from planner_jax.task.block.online import OnlineBlock
+from planner_jax.task.block.scene import paper_scene
+
+ONLINE = OnlineBlock(pieces=6, points=10)
+LAYOUT = Layout((Face(0, 1, (3, 2)),), (Face(0, 1, (1, 2)),))
+EFFORT = Effort(neighbours=4, points=4, screened=6, samples=8, checks=3)
+BALL = ((9.0, 0.5, 0.3), (-8.0, -0.4, 5.4))
+
+
+def setting(regime="R2", has_pole=True):
+    chosen: Any = REGIMES[regime]
+    at_rest: Any = np.asarray(chosen.ends_at_rest)
+    return Setting(irb1600(), chosen.limits, at_rest, paper_scene(has_pole=has_pole))
+
+
+def library(pieces=6, has_pole=True):
+    """For each pair a straight motion to some pose at which the shield meets one ball."""
+    case = pj.block.case(*BALL, scene=paper_scene(has_pole=has_pole))
+    found = jax.jit(lambda case: end_poses(case, flight_of(case), 10, 6))(case)
+    good = np.flatnonzero(np.asarray(found.effort) <= 0.99)
+    ends = np.asarray(found.angles)[np.resize(good, LAYOUT.num_pairs)]
+    steps = profiles(pieces, True)[0][:, None] * (ends - irb1600().home)[:, None]
+    num = (1, LAYOUT.num_pairs)
+    vectors = (np.broadcast_to(each, (*num, 3)) for each in np.eye(3))
+    row: Any = Row(steps[None], np.full(num, 0.9), *vectors)  # type: ignore[arg-type]
+    return library_of(packed(row), irb1600().home[None], LAYOUT, setting(has_pole=has_pole))
+
+
+def planner(has_pole=True):
+    stored = LibraryBlock(library(has_pole=has_pole))
+    return AdaptBlock(stored, online=ONLINE, efforts=(EFFORT,))
+
+
+def test_the_cells_around_a_point_are_the_nearest_of_its_face():
+    layout, box = Layout((Face(0, 1, (4, 3)), Face(2, 1, (1, 5))), ()), paper_scene().outer
+    faces = layout.outer
+    at = jax.jit(lambda p: (cells_around(faces, box, tuple(p)), cell_of(faces, box, tuple(p))))
+    rng = np.random.default_rng(0)
+    middles = np.indices((4, 3)).reshape(2, -1).T
+    for point in rng.uniform((1.0, -1.0, 0.0), (1.0, 1.0, 1.85), (20, 3)):
+        (cells, away, found), (own, _) = at(point)
+        share = (point[1:] - box.lower[1:]) / (box.upper[1:] - box.lower[1:])
+        apart = ((share * (4, 3) - 0.5 - middles) ** 2).sum(axis=1)
+        assert found and own in cells and len(set(cells.tolist())) == 4
+        np.testing.assert_allclose(away, apart[cells], atol=1e-5)
+        np.testing.assert_allclose(np.min(away), apart.min(), atol=1e-5)
+    (cells, _, found), _ = at(np.array([0.0, 0.3, 1.85]))  # on a face with one cell across
+    assert found and set(cells.tolist()) == {12 + 2, 12 + 3}
+    assert not at(np.array([0.0, 1.0, 0.9]))[0][2]
+
+
+def test_warped_motions_end_where_the_ball_is_and_open_ones_keep_their_limits():
+    """For another ball than that of the stored motions; limits at knots are exact."""
+    own = planner(has_pole=False)
+    scene = paper_scene(has_pole=False)
+    case = pj.block.case((9.0, 0.45, 0.35), BALL[1], scene=scene)
+
+    @jax.jit
+    def looked_at(case):
+        flight = flight_of(case)
+        warped = own.warped(case, flight, jnp.asarray(0), EFFORT)
+
+        def one(point):
+            steps, first, duration = ONLINE.parts(case, point)
+            excess = ONLINE.joint_terms(case, steps, first, duration)[3]
+            angles = case.angles + jnp.asarray(1.0 / 6.0) * jnp.sum(steps, axis=0)
+            return ONLINE.contact_terms(case, flight, angles, point[-1])[2], excess
+
+        return warped, *jax.vmap(one)(warped.points)
+
+    warped, contact, joints = looked_at(case)
+    there = np.isfinite(warped.promise)
+    assert there.any() and np.asarray(warped.is_open).any()
+    assert (np.asarray(contact)[there] < 0.0).all()
+    assert (np.asarray(joints)[np.asarray(warped.is_open)] <= -ONLINE.slack + 1e-5).all()
+
+
+def test_a_stored_motion_for_the_very_ball_is_not_warped():
+    """Then the plan is one of the stored straight motions, in the time that there is."""
+    own = planner(has_pole=False)
+    case = pj.block.case(*BALL, scene=paper_scene(has_pole=False))
+    same = dataclasses.replace(EFFORT, points=10)
+    warped = jax.jit(lambda case: own.warped(case, flight_of(case), jnp.asarray(0), same))(case)
+    shape = profiles(6, True)[0]
+    steps = np.asarray(warped.points[:, :-1]).reshape(-1, 6, 6)
+    turned = steps.sum(axis=1, keepdims=True) / shape.sum()
+    np.testing.assert_allclose(steps, shape[:, None] * turned, atol=1e-4)
+    assert np.min(warped.promise) < 0.1
+
+
+def test_statuses_of_a_batch_say_why_and_single_plans_are_the_same():
+    own = planner(has_pole=False)
+    rng = np.random.default_rng(2)
+    num = 8
+    cases = pj.block.case(
+        np.array(BALL[0]) + rng.uniform(-0.15, 0.15, (num, 3)),
+        np.tile(BALL[1], (num, 1)),
+        scene=paper_scene(has_pole=False),
+    )
+    cases = jax.tree.map(np.array, cases)
+    cases.ball.vel[1, 0] *= -1.0  # flies away
+    cases.ball.pos[2] = np.nan
+    cases.angles[3, 2] += 1e-2  # not at home
+    cases.limits.velocity[4] *= 0.5  # other limits
+    cases.rates[5, 0] = 0.1  # not at rest
+    plans = pj.plan(own, cases)
+    S = pj.Status
+    assert plans.status[1] == S.OUT_OF_REACH and not pj.solved(plans)[2]
+    assert [S(int(s)) for s in plans.status[3:6]] == [S.BLOCKED] * 3
+    good = [0, 6, 7]
+    verdict: Any = pj.block.judge(cases, plans)
+    assert pj.solved(plans)[good].all() and verdict.success[good].all()
+    one = BallByBall(own, pj.lane(cases, 0))
+    for k in good:
+        plan = one.plan(cases.ball.pos[k], cases.ball.vel[k])
+        assert pj.Status(int(plan.status)) == plans.status[k]
+        np.testing.assert_allclose(plan.contact_time, plans.contact_time[k], atol=1e-5)
+        np.testing.assert_allclose(plan.motion.coeffs, plans.motion.coeffs[k], atol=1e-3)
+    assert one.plan(cases.ball.pos[1], cases.ball.vel[1]).status == S.OUT_OF_REACH
+
+
+def test_what_is_wrong_with_a_file_or_with_cases_is_named(tmp_path):
+    with pytest.raises(ValueError, match="adapt:FILE, which `planner-jax library build FILE`"):
+        pj.block.planner("adapt")
+    with pytest.raises(LibraryFileError, match="^library must be a file, got 'no/file'"):
+        pj.block.planner("adapt:no/file")
+    path = tmp_path / "a.lib"
+    save_library(path, library())
+    with pytest.raises(LibraryFileError, match="^library must have motions of 10 pieces, got 6 in"):
+        pj.block.planner(f"adapt:{path}")
+    save_library(path, library(pieces=10))
+    own = adapt_planner(path)
+    own.check(pj.block.draw(2))
+    with pytest.raises(OtherLibrary, match=r"one of [0-9a-f]{12} for cases of [0-9a-f]{12}$"):
+        own.check(pj.block.draw(1, regime="R1"))
+
+
+@pytest.mark.slow
+def test_the_referee_confirms_what_is_warped_and_bent(tmp_path):
+    """Both efforts claim nothing that is not so, and the longer one blocks more."""
+    path = tmp_path / "a.lib"
+    layout = Layout((Face(0, 1, (4, 4)),), (Face(0, 1, (3, 3)),))
+    building.build(path, setting(), irb1600().home, layout, progress=False)
+    own, cases = adapt_planner(path), pj.block.draw(60, seed=11)
+    blocked = []
+    for efforts in (own.efforts[:1], own.efforts):
+        plans = pj.plan(dataclasses.replace(own, efforts=efforts), cases)
+        verdict: Any = pj.block.judge(cases, plans)
+        assert not (pj.solved(plans) & ~verdict.success).any()
+        blocked.append(pj.solved(plans))
+    assert (blocked[1] | ~blocked[0]).all() and blocked[1].sum() > blocked[0].sum() > 0
