@@ -21,7 +21,7 @@ from jax import Array, lax
 from planner_jax.ball.flight import drag_free_flight
 from planner_jax.optimise.levenberg import LevenbergConfig, least_squares
 from planner_jax.planning.batch import better_of
-from planner_jax.planning.one_by_one import suited
+from planner_jax.planning.one_by_one import OneByOne
 from planner_jax.protocol import Attempt, Status, is_solved
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import clearances, num_of_pole
@@ -32,7 +32,7 @@ from planner_jax.task.block.library.planner import LibraryBlock
 from planner_jax.task.block.library.table import pieces_of, unpacked
 from planner_jax.task.block.motion import angles_at, polynomial, profiles, sums
 from planner_jax.task.block.online import OnlineBlock
-from planner_jax.task.block.plan import BlockPlan, no_plan
+from planner_jax.task.block.plan import BlockPlan, explained, no_plan
 
 _HIGHEST = lax.Precision.HIGHEST
 # How far joints are to be turned, squared, counts less for those of the wrist, which carry little;
@@ -69,7 +69,7 @@ class Warped:
 
 
 @struct.dataclass
-class AdaptBlock:
+class AdaptBlock(OneByOne):
     """Meets the very ball with a stored motion that is warped; the cost is its duration [s].
 
     Arm, limits and scene have to be those of the library, and the arm has to stand at one of its
@@ -130,13 +130,8 @@ class AdaptBlock:
             there = jnp.sum(jnp.isfinite(warped.promise))
             most = jnp.where(goes, jnp.minimum(there, attempt.bent), 0)
             _, best = lax.while_loop(is_open(most), bend_next, (0, best))
-        status = jnp.where(flight.comes, best.status, Status.OUT_OF_REACH)
-        status = jnp.where(fits, status, Status.BLOCKED)
-        return dataclasses.replace(best, status=status.astype(jnp.int32))
-
-    def solve_lanes(self, cases: BlockCase, attempt: Effort) -> BlockPlan:
-        """The plans of a batch: on a CPU one after another, else in step."""
-        return suited(lambda case: self.solve(case, attempt), cases)
+        status = explained(case, flight.comes, jnp.where(fits, best.status, Status.BLOCKED))
+        return dataclasses.replace(best, status=status)
 
     def warped(self, case: BlockCase, flight: Flight, home: Array, effort: Effort) -> Warped:
         """Stored motions from a home, warped to points of the ball's way."""
