@@ -8,8 +8,8 @@ built. Beside `adapt` with its first effort alone and with both, on the same thr
 motions as they are stored, which may meet a ball anywhere on the shield; straight motions alone,
 six and forty-eight of them; and `online`. Each is compiled for one ball by `BallByBall`; times are
 from the ball's arrays to the plan's, and beside them the processor's own, which other work on the
-machine changes less; success is the referee's, and what a planner called solved
-and the referee refuses is counted.
+machine changes less. Success is the referee's; what a planner called solved and the referee refuses
+is counted.
 """
 
 import argparse

@@ -443,6 +443,10 @@ class OnlineBlock(OneByOne):
         shares = tuple(np.arange(1, self.checked + 1) / self.checked)
         angles = angles_at(case.angles, first, moves, shares)
         gaps = least_clearances(case.arm, case.scene, angles)
+        # Between knots, too, where a joint may turn back beyond its limit.
+        middle = 0.5 * (case.arm.upper + case.arm.lower)
+        half = 0.5 * (case.arm.upper - case.arm.lower)
+        joints = jnp.maximum(joints, jnp.max(jnp.abs(angles - middle) / half) - 1.0)
         contact = self.contact_terms(case, flight, angles[-1], point[-1])[2]
         excess = _violation(joints, contact, self.margin - jnp.min(gaps))
         violation = jnp.where(point[-1] > case.delay, excess, jnp.inf)

@@ -52,7 +52,7 @@ class Effort(Attempt):
     screened: int = 8  # of the warped ones, whose distances from the pole are looked at
     samples: int = 12  # of each then
     checks: int = 1  # of them at most, closely, those first that promise most
-    checked: int = 40  # samples of a check
+    checked: int = 48  # samples of a check
     bent: int = 0  # least squares that begin with them at most
     solver: LevenbergConfig = LevenbergConfig(
         *(12, 1e-2, 0.25, 6.0), settled=1, tolerance=1.0, trial=4, hope=500.0, fade=0.7
@@ -167,11 +167,10 @@ class AdaptBlock(OneByOne):
         order = lax.top_k(-cost, effort.screened)[1]
         place, moves = place[order], moves[order]
         points = moves.reshape(effort.screened, -1)
-        spare = online.pole_margin - online.margin
         return Warped(
             points=jnp.concatenate([points, time[place % num][:, None]], axis=1),
             promise=-least[order],
-            is_open=(late.reshape(-1)[place] <= 0.0) & (short[order] <= spare),
+            is_open=(late.reshape(-1)[place] <= 0.0) & (short[order] <= 0.0),
         )
 
     def neighbours(
