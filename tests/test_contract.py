@@ -295,7 +295,7 @@ def test_every_status_is_a_status_and_solved_says_which_are_good(entry):
         assert not good[k] or plans.violation[k] <= 5e-4
 
 
-@pure
+@entries(on_host=False, slow=(*LIKE_OTHERS, "block online"))
 def test_every_matrix_product_asks_for_full_precision(entry, monkeypatch):
     monkeypatch.setattr(one_by_one, "has_only_cpu", lambda: False)  # also in what is for a GPU
     planner, case = inside(entry.planner), pj.lane(entry.batch, 0)
