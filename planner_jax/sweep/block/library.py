@@ -126,6 +126,7 @@ def repair_library(path: str, *, pole: Sequence[float], out: str, retry: bool = 
     """
     library = _loaded(path)
     require(len(pole) == 2, "pole", "two numbers [m]", f"{len(pole)} numbers")
+    require(bool(np.isfinite(pole).all()), "pole", "finite", list(pole))
     require_backend()
     place: Any = np.asarray(pole, np.float32)
     there: Any = np.asarray(True)
