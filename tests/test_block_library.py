@@ -418,6 +418,7 @@ def test_a_home_in_collision_is_refused(tmp_path):
     [
         ({"layout": "E"}, "^layout must be one of full, A, B, C, D, got 'E'$"),
         ({"regime": "R4"}, "^regime must be one of R1, R2, R3, got 'R4'$"),
+        ({"arm": "none.xml"}, "^arm must be a file, got 'none.xml' .No such file or directory.$"),
         ({"home": [0.0] * 7}, "^home must be six angles for each home, got 7 numbers$"),
     ],
 )
@@ -435,6 +436,8 @@ def test_a_library_is_shown_with_a_map(tmp_path, capsys):
     assert picture.stat().st_size > 10_000
     with pytest.raises(SettingError, match="^library must be a file, got"):
         command.show_library(str(tmp_path / "b.lib"))
+    with pytest.raises(SettingError, match=r"^pole must be finite, got \[0\.8, nan\]$"):
+        command.repair_library(str(path), pole=[0.8, float("nan")], out=str(tmp_path / "b.lib"))
 
 
 def test_the_command_line_shows_a_library_and_refuses_what_is_none(tmp_path, capsys):

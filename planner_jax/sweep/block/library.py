@@ -56,6 +56,8 @@ def build_library(
         body = irb1600() if arm is None else read_arm(arm)
     except ValueError as error:
         raise SettingError(f"arm {error}") from None
+    except OSError as error:
+        raise SettingError(f"arm must be a file, got {arm!r} ({error.strerror})") from None
     chosen: Any = REGIMES[regime]
     at_rest: Any = np.asarray(chosen.ends_at_rest)
     scene = paper_scene(has_pole=pole)
@@ -124,6 +126,7 @@ def repair_library(path: str, *, pole: Sequence[float], out: str, retry: bool = 
     """
     library = _loaded(path)
     require(len(pole) == 2, "pole", "two numbers [m]", f"{len(pole)} numbers")
+    require(bool(np.isfinite(pole).all()), "pole", "finite", list(pole))
     require_backend()
     place: Any = np.asarray(pole, np.float32)
     there: Any = np.asarray(True)

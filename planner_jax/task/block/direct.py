@@ -83,7 +83,7 @@ class DirectBlock(OneByOne):
 
         start = jnp.zeros((), jnp.int32), no_plan(case, staying(case, 13, 2))
         _, best = lax.while_loop(is_open, next_one, start)
-        status = explained(case, flight_of(case).comes, best.status)
+        status = explained(case, poses, best.status)
         return dataclasses.replace(best, status=status)
 
     def plan_to(self, case: BlockCase, goal: Array, contact: Array, duration: Array) -> BlockPlan:

@@ -162,7 +162,7 @@ class OnlineBlock(OneByOne):
             bent = jax.vmap(self.bump)(jnp.asarray(bumps, points.dtype))
             points = points.at[:, :-1].add(bent.reshape(attempt.tries, -1))
             best = bend(case, flight, points, attempt, best)
-        return dataclasses.replace(best, status=explained(case, flight.comes, best.status))
+        return dataclasses.replace(best, status=explained(case, poses, best.status))
 
     def _one_after_another(
         self, case: BlockCase, flight: Flight, points: Array, attempt: Search, best: BlockPlan

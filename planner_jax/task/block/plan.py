@@ -5,10 +5,11 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from planner_jax.protocol import Status
+from planner_jax.protocol import Status, is_solved
 from planner_jax.robot.arm_plan import ArmPlan
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import least_clearances
+from planner_jax.task.block.end_poses import EndPoses
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 
@@ -43,16 +44,18 @@ def has_nan(case: BlockCase) -> Array:
     return jnp.any(jnp.isnan(jnp.concatenate(numbers)))
 
 
-def explained(case: BlockCase, comes: Array, status: Array) -> Array:
-    """The status () int32 of a plan, or the one that says why there can be none.
+def explained(case: BlockCase, poses: EndPoses, status: Array) -> Array:
+    """The status () int32 of a plan, or the one that says why there is none.
 
     Args:
-        case: one case. The status is NON_FINITE if it has a NaN, and BLOCKED if the arm touches
-            something where it starts.
-        comes: () bool, whether the ball gets into both boxes; OUT_OF_REACH if it does not.
+        case: one case. Without a plan the status is NON_FINITE if it has a NaN; OUT_OF_REACH if
+            the ball does not get into both boxes, or the shield nowhere to it; and BLOCKED if the
+            arm touches something where it starts.
+        poses: of the case, in which the shield meets the ball.
         status: () int32, of the plan.
     """
     nearest = least_clearances(case.arm, case.scene, case.angles[None])[0]
-    status = jnp.where(nearest < 0.0, Status.BLOCKED, status)
-    status = jnp.where(comes, status, Status.OUT_OF_REACH)
-    return jnp.where(has_nan(case), Status.NON_FINITE, status).astype(jnp.int32)
+    reason = jnp.where(nearest < 0.0, Status.BLOCKED, status)
+    reason = jnp.where(jnp.any(jnp.isfinite(poses.effort)), reason, Status.OUT_OF_REACH)
+    reason = jnp.where(has_nan(case), Status.NON_FINITE, reason)
+    return jnp.where(is_solved(status), status, reason).astype(jnp.int32)

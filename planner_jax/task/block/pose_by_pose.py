@@ -23,7 +23,6 @@ from jax import Array
 from planner_jax.protocol import Attempt, Status, lane
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.direct import poses_in_time
-from planner_jax.task.block.end_poses import flight_of
 from planner_jax.task.block.free_space import FreeSpace
 from planner_jax.task.block.plan import BlockPlan, explained
 from planner_jax.task.block.way_timing import DEGREE, PIECES, required, timed_way
@@ -159,7 +158,7 @@ def _goals(case: BlockCase, points: int) -> tuple[Array, Array, Array, Array]:
     """
     poses, times = poses_in_time(case, points)
     share = times / jnp.maximum(poses.time - case.delay, 1e-6)
-    status = explained(case, flight_of(case).comes, jnp.asarray(Status.NO_PATH))
+    status = explained(case, poses, jnp.asarray(Status.NO_PATH))
     return status, poses.angles, poses.time, share
 
 
