@@ -53,6 +53,12 @@ def planner(has_pole=True):
     return AdaptBlock(stored, online=ONLINE, efforts=(EFFORT,))
 
 
+def warped_by(own, case, effort):
+    flight = flight_of(case)
+    poses = end_poses(case, flight, effort.points, own.online.pieces)
+    return own.warped(case, flight, jnp.asarray(0), poses, effort)
+
+
 def test_the_cells_around_a_point_are_the_nearest_of_its_face():
     layout, box = Layout((Face(0, 1, (4, 3)), Face(2, 1, (1, 5))), ()), paper_scene().outer
     faces = layout.outer
@@ -80,7 +86,7 @@ def test_warped_motions_end_where_the_ball_is_and_open_ones_keep_their_limits():
     @jax.jit
     def looked_at(case):
         flight = flight_of(case)
-        warped = own.warped(case, flight, jnp.asarray(0), EFFORT)
+        warped = warped_by(own, case, EFFORT)
 
         def one(point):
             steps, first, duration = ONLINE.parts(case, point)
@@ -102,7 +108,7 @@ def test_a_stored_motion_for_the_very_ball_is_not_warped():
     own = planner(has_pole=False)
     case = pj.block.case(*BALL, scene=paper_scene(has_pole=False))
     same = dataclasses.replace(EFFORT, points=10)
-    warped = jax.jit(lambda case: own.warped(case, flight_of(case), jnp.asarray(0), same))(case)
+    warped = jax.jit(lambda case: warped_by(own, case, same))(case)
     shape = profiles(6, True)[0]
     steps = np.asarray(warped.points[:, :-1]).reshape(-1, 6, 6)
     turned = steps.sum(axis=1, keepdims=True) / shape.sum()

@@ -25,7 +25,7 @@ from planner_jax.planning.one_by_one import OneByOne
 from planner_jax.protocol import Attempt, Status, is_solved
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import clearances, num_of_pole
-from planner_jax.task.block.end_poses import Flight, end_poses, flight_of
+from planner_jax.task.block.end_poses import EndPoses, Flight, end_poses, flight_of
 from planner_jax.task.block.library.cells import cells_around
 from planner_jax.task.block.library.file import LibraryFileError, load_library
 from planner_jax.task.block.library.planner import LibraryBlock
@@ -102,7 +102,8 @@ class AdaptBlock(OneByOne):
         """The plan of one case."""
         flight = flight_of(case)
         home, fits = self.stored.home_of(case)
-        warped = self.warped(case, flight, home, attempt)
+        poses = end_poses(case, flight, attempt.points, self.online.pieces)
+        warped = self.warped(case, flight, home, poses, attempt)
         goes = flight.comes & fits
         tries = jnp.where(goes, jnp.minimum(jnp.sum(warped.is_open), attempt.checks), 0)
         online = dataclasses.replace(self.online, checked=attempt.checked)
@@ -130,17 +131,18 @@ class AdaptBlock(OneByOne):
             there = jnp.sum(jnp.isfinite(warped.promise))
             most = jnp.where(goes, jnp.minimum(there, attempt.bent), 0)
             _, best = lax.while_loop(is_open(most), bend_next, (0, best))
-        status = explained(case, flight.comes, jnp.where(fits, best.status, Status.BLOCKED))
+        status = explained(case, poses, jnp.where(fits, best.status, Status.BLOCKED))
         return dataclasses.replace(best, status=status)
 
-    def warped(self, case: BlockCase, flight: Flight, home: Array, effort: Effort) -> Warped:
-        """Stored motions from a home, warped to points of the ball's way."""
+    def warped(
+        self, case: BlockCase, flight: Flight, home: Array, poses: EndPoses, effort: Effort
+    ) -> Warped:
+        """Stored motions from a home, warped to end poses at points of the ball's way."""
         online, dtype = self.online, case.angles.dtype
         pieces, num = online.pieces, effort.points
         steps, away, found = self.neighbours(case, flight, home, effort.neighbours)
         total = jnp.asarray(sums(pieces, (1.0,))[1][0], dtype)
         ends = case.angles + jnp.einsum("k,nki->ni", total, steps, precision=_HIGHEST)
-        poses = end_poses(case, flight, num, pieces)
         angles, is_pose = poses.angles.reshape(num, 8, 6), jnp.isfinite(poses.effort)
         # To the branch that is nearest to the stored end; a whole turn is none.
         turn = angles - ends[:, None, None]
