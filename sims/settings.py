@@ -8,7 +8,7 @@ import math
 import pkgutil
 from typing import Any, ClassVar
 
-from planner_jax.registry import Task, all_tasks
+from planner_jax.registry import Task, UnknownName, all_tasks
 from planner_jax.sims.noise import NOISES, PLANE_NOISES, PlaneSensing, Sensing, require_whole
 from planner_jax.sims.robots.arm.drives import ENCODERS, TORQUES, Drives
 from planner_jax.sweep.block.settings import REGIMES
@@ -71,7 +71,10 @@ class FlySettings:
         for name, least in (("num", 1), ("batch", 1), ("seed", 0)):
             value = getattr(self, name)
             require(value is None or value >= least, name, f">= {least}", value)
-        require_one_of(self.TASK.all_planners(), "planner", self.planner)
+        try:
+            self.TASK.split_planner(self.planner)
+        except UnknownName as error:
+            raise SettingError(str(error)) from None
         again = self.rate > 0.0
         require(not again or self._is_first, "replan", "0 for other planners", self.rate)
         try:
@@ -249,6 +252,22 @@ class BlockFly(FlySettings):
             rate_std=rate_std,
             mass_error=self.mass_error,
         )
+
+    def flight(self) -> Any:
+        """As for every task.
+
+        Raises:
+            SettingError: the planner's file is no library, or one of another scene or limits.
+        """
+        if BLOCK.split_planner(self.planner)[1]:
+            from planner_jax.task.block import draw
+
+            try:
+                planner = BLOCK.make_planner(self.planner, {})
+                planner.check(draw(1, self.suite, regime=self.regime))
+            except ValueError as error:
+                raise SettingError(str(error)) from None
+        return super().flight()
 
     def check_rate(self) -> None:
         """Raise `ValueError` unless plans are made once and the drives are possible."""

@@ -190,7 +190,7 @@ ENTRIES = {
     "block online": block("online", **SMALL_SEARCH),
     "block direct": block("direct", points=6),
     # Without a pole the first spline is found at once, long before the clock ends a search.
-    "block insat": block("insat", "open"),
+    "block insat": block("insat", "open", points=6, budget=20.0, longest=20.0),
     "block library": Entry(
         LibraryBlock(made_up(regime="R1")),
         lambda num: pj.block.draw(num, "pole", 8, regime="R1", anywhere=True),
@@ -295,7 +295,7 @@ def test_every_status_is_a_status_and_solved_says_which_are_good(entry):
         assert not good[k] or plans.violation[k] <= 5e-4
 
 
-@entries(on_host=False, slow=(*LIKE_OTHERS, "block online"))
+@entries(on_host=False, slow=(*LIKE_OTHERS, *BLOCKS))
 def test_every_matrix_product_asks_for_full_precision(entry, monkeypatch):
     monkeypatch.setattr(one_by_one, "has_only_cpu", lambda: False)  # also in what is for a GPU
     planner, case = inside(entry.planner), pj.lane(entry.batch, 0)

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from test_block_library import made_up
 
 import planner_jax as pj
 from planner_jax.cli import main
@@ -37,6 +38,7 @@ from planner_jax.sims.tasks.block import (
 from planner_jax.sims.tasks.intercept import CAR_WORLD
 from planner_jax.sims.view import Viewer
 from planner_jax.sweep.settings import SettingError
+from planner_jax.task.block.library.file import save_library
 from planner_jax.task.block.motion import polynomial, profiles
 from planner_jax.task.block.plan import BlockPlan
 
@@ -356,6 +358,20 @@ def test_settings_that_break_a_rule_are_refused_in_one_line(build, message):
     with pytest.raises(SettingError) as error:
         build()
     assert str(error.value) == message
+
+
+def test_flights_take_a_library_of_their_limits_and_scene_alone(tmp_path):
+    path = tmp_path / "a.lib"
+    save_library(path, made_up(regime="R1"))
+    assert BlockFly(planner=f"library:{path}", regime="R1").flight().settings.regime == "R1"
+    for options in ({"regime": "R2"}, {"regime": "R1", "suite": "open"}):
+        with pytest.raises(SettingError, match="^library must be of the cases' arm, limits and"):
+            BlockFly(planner=f"library:{path}", **options).flight()
+    path.write_bytes(path.read_bytes()[:2000])
+    with pytest.raises(SettingError, match="^library must be a whole file"):
+        BlockFly(planner=f"library:{path}", regime="R1").flight()
+    with pytest.raises(SettingError, match="^planner must name its file, as in library:FILE"):
+        BlockFly(planner="library")
 
 
 def test_another_robot_arm_or_time_is_refused_in_one_line():
