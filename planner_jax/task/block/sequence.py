@@ -21,14 +21,14 @@ from flax import struct
 from jax import Array
 
 from planner_jax.ball.flight import BallState, drag_free_flight
-from planner_jax.planning.plan import plan, require_batch
-from planner_jax.protocol import AnyPlanner, Status, is_solved, lane, solved
+from planner_jax.planning.plan import require_batch
+from planner_jax.protocol import AnyPlanner, is_solved, solved
 from planner_jax.referee.block import BlockVerdict, referee_blocks
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import least_clearances
 from planner_jax.task.block.end_poses import flight_of
 from planner_jax.task.block.motion import cut
-from planner_jax.task.block.plan import BlockPlan
+from planner_jax.task.block.plan import BlockPlan, chosen, plans_where
 from planner_jax.task.block.scene import Box
 from planner_jax.task.block.suites import draw_cases
 from planner_jax.trajectory.bang_bang import bang_bang, least_times
@@ -219,18 +219,9 @@ class _Turn:
 def _planned(planner: Any, coming: _Coming, arm: _Arm, returns: bool, wanted: np.ndarray) -> _Turn:
     """The turns of B balls; those that are not wanted (B,) are not planned, and unsolved."""
     case, wait, asked = _begun(coming, arm, returns)
-    plans = _plans_of(planner, _on_host(asked), wanted)
+    plans = plans_where(planner, _on_host(asked), wanted)
     motion = _one_after_another(wait, asked.delay, plans.motion)
     return _on_host(_Turn(arm.time, case, dataclasses.replace(plans, motion=motion)))
-
-
-def _plans_of(planner: Any, cases: BlockCase, wanted: np.ndarray) -> BlockPlan:
-    """Plans of those of B cases that are wanted (B,), at least one; others are unsolved."""
-    plans = plan(planner, lane(cases, np.flatnonzero(wanted)))
-    places = np.maximum(np.cumsum(wanted) - 1, 0)
-    plans = jax.tree.map(lambda leaf: np.asarray(leaf)[places], plans)
-    status = np.where(wanted, plans.status, Status.INFEASIBLE).astype(np.int32)
-    return dataclasses.replace(plans, status=status)
 
 
 def _reconsidered(
@@ -243,7 +234,7 @@ def _reconsidered(
     for part in PARTS:
         if not is_open.any():
             break
-        plans = _plans_of(planner, narrowed(again, *part), is_open)
+        plans = plans_where(planner, narrowed(again, *part), is_open)
         motion = _one_after_another(last.plan.motion, again.delay, plans.motion)
         other = _on_host(dataclasses.replace(last, plan=dataclasses.replace(plans, motion=motion)))
         wanted = is_open & solved(plans)
@@ -252,7 +243,8 @@ def _reconsidered(
         following = _planned(planner, coming, _on_host(_after(other)), returns, wanted)
         better = wanted & solved(following.plan)
         is_open = is_open & ~better
-        last, turn = _chosen(better, other, last), _chosen(better, following, turn)
+        last = chosen(better, *_of_one_length([other, last]))
+        turn = chosen(better, *_of_one_length([following, turn]))
     return last, turn
 
 
@@ -368,14 +360,6 @@ def _waiting(case: BlockCase, returns: bool) -> PiecewisePolynomial:
             [motion.coeffs, jnp.zeros_like(motion.coeffs[:1]).at[0, 0].set(end)]
         ),
         durations=jnp.append(motion.durations, _LONG),
-    )
-
-
-def _chosen(better: np.ndarray, one: _Turn, other: _Turn) -> _Turn:
-    """Of B turns the ones that are better, else the others."""
-    return jax.tree.map(
-        lambda a, b: np.where(better.reshape(-1, *(1,) * (a.ndim - 1)), a, b),
-        *_of_one_length([one, other]),
     )
 
 
