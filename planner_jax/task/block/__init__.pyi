@@ -2,8 +2,17 @@ from .case import BlockCase as BlockCase
 from .case import case as case
 from .online import OnlineBlock as OnlineBlock
 from .plan import BlockPlan as BlockPlan
+from .rail import Rail as Rail
+from .rail import RailPlan as RailPlan
+from .rail import plan_on_rail as plan_on_rail
+from .rail import shifted as shifted
 from .scene import Scene as Scene
 from .scene import paper_scene as paper_scene
+from .sequence import BlockSequence as BlockSequence
+from .sequence import PlannedSequence as PlannedSequence
+from .sequence import draw_sequences as draw_sequences
+from .sequence import judge_in_turn as judge_in_turn
+from .sequence import plan_in_turn as plan_in_turn
 from .words import draw as draw
 from .words import judge as judge
 from .words import planner as planner

@@ -16,6 +16,7 @@ from planner_jax.ball.flight import drag_free_flight
 from planner_jax.robot.arm import shield_pose
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.end_poses import flight_of
+from planner_jax.task.block.motion import cut
 from planner_jax.task.block.plan import BlockPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
@@ -68,16 +69,7 @@ def _as_met(case: BlockCase, plan: BlockPlan) -> BlockPlan:
 
     low, high = lax.fori_loop(0, _HALVINGS, halve, (times[nearest], times[nearest + 1]))
     time = jnp.where(jnp.any(crosses), 0.5 * (low + high), plan.contact_time)
-    starts = case.delay + jnp.cumsum(motion.durations) - motion.durations
-    until = jnp.clip(time - starts, 0.0, motion.durations)
-    # Pieces that are not begun, of no length, go on from where the motion ends.
-    after = jnp.minimum(time - case.delay, jnp.sum(motion.durations))
-    end = jnp.stack([evaluate(motion, after), evaluate(motion, after, 1)])
-    rest = jnp.zeros_like(motion.coeffs[0]).at[:2].set(end)
-    coeffs = jnp.where((starts >= time)[:, None, None], rest, motion.coeffs)
-    return dataclasses.replace(
-        plan, motion=PiecewisePolynomial(coeffs=coeffs, durations=until), contact_time=time
-    )
+    return dataclasses.replace(plan, motion=cut(motion, time - case.delay), contact_time=time)
 
 
 def _braked(case: BlockCase, motion: PiecewisePolynomial) -> PiecewisePolynomial:

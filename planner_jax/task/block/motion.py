@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from planner_jax.trajectory.polynomial import PiecewisePolynomial
+from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 
 @functools.cache
@@ -57,6 +57,21 @@ def polynomial(start: Array, first: Array, steps: Array, duration: Array) -> Pie
     return PiecewisePolynomial(
         coeffs=jnp.stack([angles, rates[:-1], 0.5 * rise], axis=1),
         durations=jnp.broadcast_to(step, (pieces,)),
+    )
+
+
+def cut(motion: PiecewisePolynomial, time: Array) -> PiecewisePolynomial:
+    """A motion up to a time () [s] since its start, or as a whole if it ends before.
+
+    What is not begun by then lasts 0 s, and goes on from where the motion is cut.
+    """
+    starts = jnp.cumsum(motion.durations) - motion.durations
+    last = jnp.minimum(time, jnp.sum(motion.durations))
+    end = jnp.stack([evaluate(motion, last), evaluate(motion, last, 1)])
+    rest = jnp.zeros_like(motion.coeffs[0]).at[:2].set(end)
+    return PiecewisePolynomial(
+        coeffs=jnp.where((starts >= time)[:, None, None], rest, motion.coeffs),
+        durations=jnp.clip(time - starts, 0.0, motion.durations),
     )
 
 
