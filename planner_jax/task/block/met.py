@@ -44,7 +44,7 @@ def as_met(cases: BlockCase, plans: BlockPlan) -> BlockPlan:
 @jax.jit
 @jax.vmap
 def _as_met(case: BlockCase, plan: BlockPlan) -> BlockPlan:
-    motion = _braked(case, plan.motion)
+    motion = braked(case, plan.motion)
 
     def above(time: Array) -> tuple[Array, Array]:
         """Height () [m] of the ball over the shield's plane, and how far it is from the middle."""
@@ -80,8 +80,11 @@ def _as_met(case: BlockCase, plan: BlockPlan) -> BlockPlan:
     )
 
 
-def _braked(case: BlockCase, motion: PiecewisePolynomial) -> PiecewisePolynomial:
-    """A motion, and after it all joints slowing down evenly until they stand at the same time."""
+def braked(case: BlockCase, motion: PiecewisePolynomial) -> PiecewisePolynomial:
+    """A motion, and after it all joints slowing down evenly until they stand at the same time.
+
+    An arm that has to end at rest does so already: the piece that is added is of no length.
+    """
     end = jnp.sum(motion.durations)
     angles, rates = evaluate(motion, end), evaluate(motion, end, 1)
     duration = jnp.max(jnp.abs(rates) / case.limits.acceleration)

@@ -1,0 +1,280 @@
+"""Receding horizon: the motion is decided anew while more of the ball's flight is seen.
+
+At given moments all that was seen so far is fitted anew. A motion that would still meet the ball of
+the new fit goes on. Else one is planned from where the arm will be once it can be there, with the
+rates that it then has; if none is found, the old one goes on, and brakes after its contact. What
+the arm has done by the end is one plan, of pieces of all of them, which the referee judges against
+the true ball. With one moment this is what an arm does that decides once. Robot base frame, z up,
+SI units.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+from planner_jax.perception.fit import FlightFit, Sight, believed_at
+from planner_jax.planning.batch import merged
+from planner_jax.planning.plan import plan
+from planner_jax.protocol import Status, is_solved, lane
+from planner_jax.task.block.case import BlockCase
+from planner_jax.task.block.end_poses import flight_of
+from planner_jax.task.block.eye import Eye, cautious, fitted, frame_times, watched
+from planner_jax.task.block.met import as_met, braked
+from planner_jax.task.block.online import OnlineBlock
+from planner_jax.task.block.plan import BlockPlan
+from planner_jax.task.block.replan import ReplanBlock
+from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
+
+_KEPT = 0.25  # share by which the contact of a motion that goes on may exceed what was aimed for
+_LONG = 100.0  # [s], that an arm stands after its motion
+
+
+@dataclasses.dataclass(frozen=True)
+class Aim:
+    """How a ball that is not known exactly is to be met; as in `cautious`."""
+
+    offset: float  # [m]
+    at_rest: bool = False
+    edge: float = 0.03  # [m]
+
+
+# In order: each for the balls for which nothing was found by those before.
+AIMS = (Aim(0.01, at_rest=True), Aim(0.01), Aim(0.03), Aim(0.09))
+
+
+@struct.dataclass
+class Decided:
+    """A batch of throws, and what arms did that decided while they watched."""
+
+    cases: BlockCase  # the true balls, with the delay from which on the motions count
+    plans: BlockPlan  # give them to `as_met`, then to the referee, with these cases
+    fits: FlightFit  # the last ones
+    motions: Array  # (B,) int32, how many motions were begun
+
+
+def plan_with_aims(
+    planner: Any, cases: Any, aims: Sequence[Aim] = AIMS, *, of: Callable = lambda cases: cases
+) -> BlockPlan:
+    """Plans of a batch with fitted balls, by the first aim that leads to one.
+
+    Args:
+        planner: of blocks; or of what `of` finds the cases in.
+        cases: a batch of B.
+        aims: one or more.
+        of: the `BlockCase` in an entry.
+    """
+    cases, plans = jax.tree.map(np.asarray, cases), None
+    lanes = np.arange(cases.batch_shape[0])
+    for aim in aims:
+        some = lane(cases, lanes)
+        aimed = cautious(of(some), **dataclasses.asdict(aim))
+        # NumPy arrays, for which there are programs already.
+        aimed = jax.tree.map(np.asarray, aimed)
+        given = aimed if some is of(some) else dataclasses.replace(some, case=aimed)
+        found = jax.tree.map(np.array, plan(planner, given))
+        plans = found if plans is None else merged(plans, found, lanes)
+        lanes = np.flatnonzero(~is_solved(plans.status))
+        if not lanes.size:
+            break
+    assert plans is not None
+    return plans
+
+
+def decide(
+    planner: OnlineBlock,
+    cases: BlockCase,
+    eye: Eye,
+    moments: Sequence[float],
+    *,
+    overhead: float = 0.05,
+    seed: int = 0,
+    aims: Sequence[Aim] = AIMS,
+    shortest: float = 0.03,
+) -> Decided:
+    """What arms do that watch their balls and decide at given moments.
+
+    Args:
+        planner: of the first motion, and of those that the previous one does not lead to.
+        cases: a batch of B, with the true balls; arms are where they say until the first moment.
+        eye: that sees the balls.
+        moments: [s], at which flights are fitted, rising; frames until then count.
+        overhead: [s], from a moment until its motion may begin, planning included, >= 0.
+        seed: of the noise.
+        aims: how balls are to be met, tried in this order.
+        shortest: [s], least time that is left for a new motion.
+
+    Raises:
+        ValueError: moments that do not rise from 0 or later, or a negative overhead; one line.
+    """
+    moments = tuple(float(moment) for moment in moments)
+    if not moments or moments[0] < 0.0 or not np.all(np.diff(moments) > 0.0):
+        raise ValueError(f"moments must rise from 0 or later, got {moments}")
+    if not overhead >= 0.0:
+        raise ValueError(f"overhead must be >= 0, got {overhead:g}")
+    cases = jax.tree.map(np.asarray, cases)
+    dtype, num = cases.gravity.dtype, cases.batch_shape[0]
+    times = jnp.asarray(frame_times(eye, moments[-1]), dtype)
+    places = _watch(cases, eye, times, jax.random.key(seed))
+    begin = np.full(num, moments[0] + overhead, dtype)
+    cases = dataclasses.replace(cases, delay=begin)
+    arms = _Arms(cases, planner.pieces)
+    fits = None
+    for moment in moments:
+        balls, fits = jax.tree.map(np.asarray, _fit(cases, eye, times, places, dtype.type(moment)))
+        begin = np.full(num, moment + overhead, dtype)
+        known = dataclasses.replace(cases, ball=balls, delay=begin)
+        open_ = np.asarray(fits.status) == Sight.SEEN
+        open_ &= np.asarray(_latest(known)) - begin > shortest
+        open_ &= ~arms.meet(planner, known, aims[0])
+        arms.decide(planner, known, np.flatnonzero(open_), aims)
+    assert fits is not None
+    plans = arms.composed()
+    seen = np.asarray(fits.status) == Sight.SEEN
+    status = np.where(seen | is_solved(plans.status), plans.status, Status.NON_FINITE)
+    plans = dataclasses.replace(plans, status=status.astype(np.int32))
+    return Decided(cases=cases, plans=plans, fits=fits, motions=arms.motions)
+
+
+class _Arms:
+    """The arms of a batch: the motions that they carry out, and the pieces that they have."""
+
+    def __init__(self, cases: BlockCase, pieces: int):
+        num, dtype = cases.batch_shape[0], cases.gravity.dtype
+        coeffs: Any = np.zeros((num, pieces, 3, 6), dtype)
+        coeffs[:, :, 0], coeffs[:, :, 1] = cases.angles[:, None], cases.rates[:, None]
+        durations: Any = np.zeros((num, pieces), dtype)
+        none: Any = np.full(num, np.inf, dtype)
+        contact: Any = np.array(cases.delay)
+        steps: Any = np.zeros(num, np.int32)
+        status: Any = np.full(num, Status.INFEASIBLE, np.int32)
+        self.cases, self.since = cases, np.array(cases.delay)
+        self.plans = BlockPlan(
+            motion=PiecewisePolynomial(coeffs=coeffs, durations=durations),
+            contact_time=contact,
+            cost=none,
+            violation=none.copy(),
+            iterations=steps,
+            status=status,
+        )
+        motions: Any = np.zeros(num, np.int32)
+        self.done, self.motions = [], motions
+
+    def meet(self, planner: OnlineBlock, known: BlockCase, aim: Aim) -> np.ndarray:
+        """Which of the motions would meet the balls as they are now known, (B,) bool."""
+        aimed = cautious(dataclasses.replace(known, delay=self.since), offset=aim.offset)
+        return is_solved(self.plans.status) & np.asarray(_meets(planner, aimed, self.plans))
+
+    def decide(
+        self, planner: OnlineBlock, known: BlockCase, lanes: np.ndarray, aims: Sequence[Aim]
+    ) -> None:
+        """Go over to new motions in some lanes (N,), where there are any."""
+        moves = is_solved(self.plans.status[lanes])
+        for some, planned in ((lanes[~moves], False), (lanes[moves], True)):
+            if not some.size:
+                continue
+            again = ReplanBlock(planner=planner)
+            begun = dataclasses.replace(lane(self.cases, some), delay=self.since[some])
+            elapsed = known.delay[some] - self.since[some]
+            tasks = again.begin(begun, lane(self.plans, some), elapsed, ball=lane(known.ball, some))
+            if planned:
+                found = plan_with_aims(again, tasks, aims, of=lambda tasks: tasks.case)
+            else:
+                found = plan_with_aims(planner, tasks.case, aims)
+            self._begin(np.asarray(known.delay), some, found)
+
+    def _begin(self, begin: np.ndarray, lanes: np.ndarray, found: BlockPlan) -> None:
+        """Go over to the plans found for some lanes (N,) that are solved."""
+        good = is_solved(found.status)
+        if not good.any():
+            return
+        lanes, found = lanes[good], lane(found, good)
+        until = np.array(self.since)
+        until[lanes] = begin[lanes]
+        self.done.append(
+            jax.tree.map(np.asarray, _begun(self.cases, self.plans.motion, until - self.since))
+        )
+
+        def put(old: np.ndarray, new: Any) -> np.ndarray:
+            old[lanes] = new
+            return old
+
+        steps = self.plans.iterations[lanes]
+        self.plans = jax.tree.map(put, jax.tree.map(np.array, self.plans), found)
+        self.plans.iterations[lanes] += steps
+        self.since[lanes] = begin[lanes]
+        self.motions[lanes] += 1
+
+    def composed(self) -> BlockPlan:
+        """What the arms have done and are about to do, as one plan each."""
+        motions = [*self.done, self.plans.motion]
+        coeffs: Any = np.concatenate([motion.coeffs for motion in motions], axis=1)
+        durations: Any = np.concatenate([motion.durations for motion in motions], axis=1)
+        # Pieces of no length go behind the others, and there go on from the end.
+        order = np.argsort(durations <= 0.0, axis=1, kind="stable")
+        num = max(int((durations > 0.0).sum(axis=1).max()), 1)
+        coeffs = np.take_along_axis(coeffs, order[:, :num, None, None], axis=1)
+        durations = np.take_along_axis(durations, order[:, :num], axis=1)
+        last = np.maximum((durations > 0.0).sum(axis=1) - 1, 0)
+        rows = np.arange(len(last))
+        of_last, long = coeffs[rows, last], durations[rows, last, None]
+        end = np.zeros_like(of_last)
+        end[:, 0] = of_last[:, 0] + long * (of_last[:, 1] + long * of_last[:, 2])
+        end[:, 1] = of_last[:, 1] + 2.0 * long * of_last[:, 2]
+        coeffs = np.where((durations > 0.0)[:, :, None, None], coeffs, end[:, None])
+        return dataclasses.replace(
+            self.plans,
+            motion=PiecewisePolynomial(coeffs=coeffs, durations=durations),
+            cost=self.plans.cost + self.since - self.cases.delay,
+        )
+
+
+_watch = jax.jit(watched)
+
+
+@jax.jit
+def _fit(cases: BlockCase, eye: Eye, times: Array, places: Array, moment: Array) -> Any:
+    """Balls at the time 0, and fits, of what was seen until a moment."""
+    fits = jax.vmap(fitted, (None, None, 0, 0, None))(eye, times, places, cases.gravity, moment)
+    start = jnp.zeros((), times.dtype)
+    return jax.vmap(believed_at, (0, None, 0))(fits, start, cases.gravity).ball, fits
+
+
+@jax.jit
+@jax.vmap
+def _latest(case: BlockCase) -> Array:
+    return flight_of(case).latest
+
+
+@jax.jit
+def _meets(planner: OnlineBlock, cases: BlockCase, plans: BlockPlan) -> Array:
+    """Whether motions meet the balls of some cases as these ask for, (B,) bool."""
+
+    def one(case: BlockCase, plan: BlockPlan) -> Array:
+        time = plan.contact_time - case.delay
+        angles = evaluate(plan.motion, jnp.minimum(time, jnp.sum(plan.motion.durations)))
+        flight = flight_of(case)
+        excess = planner.contact_terms(case, flight, angles, plan.contact_time)[2]
+        return flight.comes & (excess <= _KEPT)
+
+    return jax.vmap(one)(cases, as_met(cases, plans))
+
+
+@jax.jit
+@jax.vmap
+def _begun(case: BlockCase, motion: PiecewisePolynomial, time: Array) -> PiecewisePolynomial:
+    """The pieces of a motion, of its braking and of standing thereafter, until a time () [s]."""
+    motion = braked(case, motion)
+    end = jnp.sum(motion.durations)
+    stand = jnp.zeros_like(motion.coeffs[:1]).at[0, 0].set(evaluate(motion, end))
+    durations = jnp.append(motion.durations, jnp.asarray(_LONG, end.dtype))
+    starts = jnp.cumsum(durations) - durations
+    return PiecewisePolynomial(
+        coeffs=jnp.concatenate([motion.coeffs, stand]),
+        durations=jnp.clip(time - starts, 0.0, durations),
+    )
