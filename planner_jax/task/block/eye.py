@@ -77,6 +77,12 @@ def frame_times(eye: Eye, seconds: float) -> np.ndarray:
 def watched(cases: BlockCase, eye: Eye, times: Array, key: Array) -> Array:
     """Where the balls of a batch of cases are seen at times (N,) [s]; pure.
 
+    Args:
+        cases: a batch of B, with the true balls.
+        eye: that sees them.
+        times: (N,) [s], of frames.
+        key: of the noise, or (B,) of them.
+
     Returns:
         (B, N, 3) [m]; NaN where a ball is not seen.
     """
@@ -85,7 +91,7 @@ def watched(cases: BlockCase, eye: Eye, times: Array, key: Array) -> Array:
         places = jax.vmap(drag_free_flight, (None, 0, None))(ball, times, gravity).pos
         return sightings(key, eye.camera, eye.noise, places)
 
-    keys = jax.random.split(key, cases.batch_shape[0])
+    keys = key if key.ndim else jax.random.split(key, cases.batch_shape[0])
     return jax.vmap(one)(cases.ball, cases.gravity, keys)
 
 

@@ -21,6 +21,7 @@ from jax import Array
 from planner_jax.perception.fit import FlightFit, Sight, believed_at
 from planner_jax.planning.batch import merged
 from planner_jax.planning.plan import plan
+from planner_jax.planning.replan import Replanning
 from planner_jax.protocol import Status, is_solved, lane
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.end_poses import flight_of
@@ -28,7 +29,7 @@ from planner_jax.task.block.eye import Eye, cautious, fitted, frame_times, watch
 from planner_jax.task.block.met import as_met, braked
 from planner_jax.task.block.online import OnlineBlock
 from planner_jax.task.block.plan import BlockPlan
-from planner_jax.task.block.replan import ReplanBlock
+from planner_jax.task.block.replan import ReplanBlock, WarmBlock
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 _KEPT = 0.25  # share by which the contact of a motion that goes on may exceed what was aimed for
@@ -41,11 +42,16 @@ class Aim:
 
     offset: float  # [m]
     at_rest: bool = False
-    edge: float = 0.03  # [m]
+    edge: float = 0.0  # [m]
 
 
 # In order: each for the balls for which nothing was found by those before.
-AIMS = (Aim(0.01, at_rest=True), Aim(0.01), Aim(0.03), Aim(0.09))
+AIMS = (
+    Aim(0.005, at_rest=True, edge=0.05),
+    Aim(0.005, edge=0.05),
+    Aim(0.03, edge=0.03),
+    Aim(0.09),
+)
 
 
 @struct.dataclass
@@ -54,7 +60,7 @@ class Decided:
 
     cases: BlockCase  # the true balls, with the delay from which on the motions count
     plans: BlockPlan  # give them to `as_met`, then to the referee, with these cases
-    fits: FlightFit  # the last ones
+    fits: FlightFit  # leaves (M, B, ...), of every moment
     motions: Array  # (B,) int32, how many motions were begun
 
 
@@ -87,75 +93,90 @@ def plan_with_aims(
 
 
 def decide(
-    planner: OnlineBlock,
+    planner: Any,
     cases: BlockCase,
     eye: Eye,
     moments: Sequence[float],
     *,
     overhead: float = 0.05,
-    seed: int = 0,
+    seed: Any = 0,
     aims: Sequence[Aim] = AIMS,
     shortest: float = 0.03,
+    patient: bool = False,
+    again: bool = True,
 ) -> Decided:
     """What arms do that watch their balls and decide at given moments.
 
     Args:
-        planner: of the first motion, and of those that the previous one does not lead to.
+        planner: of the first motion, and of those that the previous one does not lead to. One that
+            is no `OnlineBlock` decides once.
         cases: a batch of B, with the true balls; arms are where they say until the first moment.
         eye: that sees the balls.
         moments: [s], at which flights are fitted, rising; frames until then count.
         overhead: [s], from a moment until its motion may begin, planning included, >= 0.
-        seed: of the noise.
+        seed: of the noise; or (B,), of each throw's own.
         aims: how balls are to be met, tried in this order.
         shortest: [s], least time that is left for a new motion.
+        patient: whether an arm that stands waits, and sees more, while it could meet the ball by
+            the first of the aims if it began at the next moment.
+        again: whether motions are decided anew; if not, an arm begins one motion.
 
     Raises:
         ValueError: moments that do not rise from 0 or later, or a negative overhead; one line.
+        TypeError: several moments for another planner than `OnlineBlock`.
     """
-    moments = tuple(float(moment) for moment in moments)
-    if not moments or moments[0] < 0.0 or not np.all(np.diff(moments) > 0.0):
+    moments = [float(moment) for moment in moments]
+    if len(moments) == 0 or moments[0] < 0.0 or not np.all(np.diff(moments) > 0.0):
         raise ValueError(f"moments must rise from 0 or later, got {moments}")
     if not overhead >= 0.0:
         raise ValueError(f"overhead must be >= 0, got {overhead:g}")
+    if len(moments) > 1 and not isinstance(planner, OnlineBlock):
+        raise TypeError(f"{type(planner).__name__} decides once: give it one moment")
     cases = jax.tree.map(np.asarray, cases)
     dtype, num = cases.gravity.dtype, cases.batch_shape[0]
     times = jnp.asarray(frame_times(eye, moments[-1]), dtype)
-    places = _watch(cases, eye, times, jax.random.key(seed))
+    places = _watch(cases, eye, times, _keys(seed))
     begin = np.full(num, moments[0] + overhead, dtype)
     cases = dataclasses.replace(cases, delay=begin)
-    arms = _Arms(cases, planner.pieces)
-    fits = None
-    for moment in moments:
-        balls, fits = jax.tree.map(np.asarray, _fit(cases, eye, times, places, dtype.type(moment)))
+    arms = _Arms(cases)
+    fits = []
+    for moment, following in zip(moments, [*moments[1:], None], strict=True):
+        balls, fit = jax.tree.map(np.asarray, _fit(cases, eye, times, places, dtype.type(moment)))
         begin = np.full(num, moment + overhead, dtype)
         known = dataclasses.replace(cases, ball=balls, delay=begin)
-        open_ = np.asarray(fits.status) == Sight.SEEN
-        open_ &= np.asarray(_latest(known)) - begin > shortest
+        fits.append(fit)
+        open_ = np.asarray(fit.status) == Sight.SEEN
+        left = np.asarray(_latest(cautious(known))) - begin
+        stands = arms.motions == 0
+        open_ &= (left > shortest) & (again | stands)
         open_ &= ~arms.meet(planner, known, aims[0])
+        if patient and following is not None:
+            later = np.full(num, following + overhead, dtype)
+            lanes = np.flatnonzero(open_ & stands)
+            if lanes.size:
+                some = lane(dataclasses.replace(known, delay=later), lanes)
+                open_[lanes] = ~is_solved(plan_with_aims(planner, some, aims[:1]).status)
         arms.decide(planner, known, np.flatnonzero(open_), aims)
-    assert fits is not None
     plans = arms.composed()
-    seen = np.asarray(fits.status) == Sight.SEEN
+    seen = np.asarray(fits[-1].status) == Sight.SEEN
     status = np.where(seen | is_solved(plans.status), plans.status, Status.NON_FINITE)
     plans = dataclasses.replace(plans, status=status.astype(np.int32))
-    return Decided(cases=cases, plans=plans, fits=fits, motions=arms.motions)
+    every = jax.tree.map(lambda *leaves: np.stack(leaves), *fits)
+    return Decided(cases=cases, plans=plans, fits=every, motions=arms.motions)
 
 
 class _Arms:
     """The arms of a batch: the motions that they carry out, and the pieces that they have."""
 
-    def __init__(self, cases: BlockCase, pieces: int):
+    def __init__(self, cases: BlockCase):
         num, dtype = cases.batch_shape[0], cases.gravity.dtype
-        coeffs: Any = np.zeros((num, pieces, 3, 6), dtype)
-        coeffs[:, :, 0], coeffs[:, :, 1] = cases.angles[:, None], cases.rates[:, None]
-        durations: Any = np.zeros((num, pieces), dtype)
         none: Any = np.full(num, np.inf, dtype)
         contact: Any = np.array(cases.delay)
         steps: Any = np.zeros(num, np.int32)
         status: Any = np.full(num, Status.INFEASIBLE, np.int32)
         self.cases, self.since = cases, np.array(cases.delay)
         self.plans = BlockPlan(
-            motion=PiecewisePolynomial(coeffs=coeffs, durations=durations),
+            motion=_still(cases, (1, 3)),
             contact_time=contact,
             cost=none,
             violation=none.copy(),
@@ -165,28 +186,31 @@ class _Arms:
         motions: Any = np.zeros(num, np.int32)
         self.done, self.motions = [], motions
 
-    def meet(self, planner: OnlineBlock, known: BlockCase, aim: Aim) -> np.ndarray:
+    def meet(self, planner: Any, known: BlockCase, aim: Aim) -> np.ndarray:
         """Which of the motions would meet the balls as they are now known, (B,) bool."""
+        if not self.motions.any():
+            return np.zeros(len(self.motions), bool)
         aimed = cautious(dataclasses.replace(known, delay=self.since), offset=aim.offset)
         return is_solved(self.plans.status) & np.asarray(_meets(planner, aimed, self.plans))
 
     def decide(
-        self, planner: OnlineBlock, known: BlockCase, lanes: np.ndarray, aims: Sequence[Aim]
+        self, planner: Any, known: BlockCase, lanes: np.ndarray, aims: Sequence[Aim]
     ) -> None:
         """Go over to new motions in some lanes (N,), where there are any."""
+        begun = dataclasses.replace(self.cases, delay=self.since)
+        tasks = ReplanBlock().begin(begun, self.plans, known.delay - self.since, ball=known.ball)
         moves = is_solved(self.plans.status[lanes])
-        for some, planned in ((lanes[~moves], False), (lanes[moves], True)):
-            if not some.size:
-                continue
-            again = ReplanBlock(planner=planner)
-            begun = dataclasses.replace(lane(self.cases, some), delay=self.since[some])
-            elapsed = known.delay[some] - self.since[some]
-            tasks = again.begin(begun, lane(self.plans, some), elapsed, ball=lane(known.ball, some))
-            if planned:
-                found = plan_with_aims(again, tasks, aims, of=lambda tasks: tasks.case)
-            else:
-                found = plan_with_aims(planner, tasks.case, aims)
-            self._begin(np.asarray(known.delay), some, found)
+        for some, plans in (
+            (lanes[~moves], lambda some: plan_with_aims(planner, lane(tasks.case, some), aims)),
+            (lanes[moves], lambda some: self._again(planner, lane(tasks, some), aims)),
+        ):
+            if some.size:
+                self._begin(np.asarray(known.delay), some, plans(some))
+
+    def _again(self, planner: OnlineBlock, tasks: Replanning, aims: Sequence[Aim]) -> BlockPlan:
+        """Plans for arms that move."""
+        again = ReplanBlock(warm=WarmBlock(planner=planner), planner=planner)
+        return plan_with_aims(again, tasks, aims, of=lambda tasks: tasks.case)
 
     def _begin(self, begin: np.ndarray, lanes: np.ndarray, found: BlockPlan) -> None:
         """Go over to the plans found for some lanes (N,) that are solved."""
@@ -194,6 +218,9 @@ class _Arms:
         if not good.any():
             return
         lanes, found = lanes[good], lane(found, good)
+        if not self.motions.any():  # from now on motions are of this shape
+            still = _still(self.cases, found.motion.coeffs.shape[1:3])
+            self.plans = dataclasses.replace(self.plans, motion=still)
         until = np.array(self.since)
         until[lanes] = begin[lanes]
         self.done.append(
@@ -223,15 +250,30 @@ class _Arms:
         last = np.maximum((durations > 0.0).sum(axis=1) - 1, 0)
         rows = np.arange(len(last))
         of_last, long = coeffs[rows, last], durations[rows, last, None]
-        end = np.zeros_like(of_last)
-        end[:, 0] = of_last[:, 0] + long * (of_last[:, 1] + long * of_last[:, 2])
-        end[:, 1] = of_last[:, 1] + 2.0 * long * of_last[:, 2]
+        end, power = np.zeros_like(of_last), np.arange(of_last.shape[1])
+        end[:, 0] = np.sum(of_last * long[..., None] ** power[:, None], axis=1)
+        slope = power * long ** np.maximum(power - 1, 0)
+        end[:, 1] = np.sum(of_last * slope[..., None], axis=1)
         coeffs = np.where((durations > 0.0)[:, :, None, None], coeffs, end[:, None])
         return dataclasses.replace(
             self.plans,
             motion=PiecewisePolynomial(coeffs=coeffs, durations=durations),
             cost=self.plans.cost + self.since - self.cases.delay,
         )
+
+
+def _still(cases: BlockCase, shape: tuple[int, ...]) -> PiecewisePolynomial:
+    """Motions of no length, of so many pieces and powers, from where the arms are."""
+    num, dtype = cases.batch_shape[0], cases.gravity.dtype
+    coeffs: Any = np.zeros((num, *shape, 6), dtype)
+    coeffs[:, :, 0], coeffs[:, :, 1] = cases.angles[:, None], cases.rates[:, None]
+    durations: Any = np.zeros((num, shape[0]), dtype)
+    return PiecewisePolynomial(coeffs=coeffs, durations=durations)
+
+
+def _keys(seed: Any) -> Array:
+    """A key, or (B,) of them."""
+    return jax.vmap(jax.random.key)(seed) if np.ndim(seed) else jax.random.key(seed)
 
 
 _watch = jax.jit(watched)
