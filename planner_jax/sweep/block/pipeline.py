@@ -115,22 +115,24 @@ class CountedPlanner:
 
 
 def timed_plans(planner: Any, cases: BlockCase) -> tuple[BlockPlan, np.ndarray]:
-    """Plans of cases, made one after another, and the seconds (B,) that each took.
+    """Plans of cases, made one after another, and the seconds (B,) that each took."""
+    found = [timed_plan(planner, lane(cases, k)) for k in range(cases.batch_shape[0])]
+    plans = jax.tree.map(lambda *leaves: np.stack(leaves), *(each for each, _ in found))
+    return plans, np.array([seconds for _, seconds in found])
 
-    One for which something was compiled is made again.
+
+def timed_plan(planner: Any, case: Any) -> tuple[Any, float]:
+    """The plan of one case, and the seconds that it took.
+
+    If something was compiled meanwhile it is made again.
     """
-    plans, seconds = [], []
-    for k in range(cases.batch_shape[0]):
-        case, warm, spent, found = lane(cases, k), False, 0.0, None
-        while not warm:
-            with CompileClock() as clock:
-                began = time.perf_counter()
-                found = plan(planner, case)
-                spent = time.perf_counter() - began
-            warm = not clock.compiled
-        plans.append(found)
-        seconds.append(spent)
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *plans), np.array(seconds)
+    while True:
+        with CompileClock() as clock:
+            began = time.perf_counter()
+            found = plan(planner, case)
+            seconds = time.perf_counter() - began
+        if not clock.compiled:
+            return found, seconds
 
 
 @jax.jit

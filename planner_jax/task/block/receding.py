@@ -61,6 +61,7 @@ class Decided:
     cases: BlockCase  # the true balls, with the delay from which on the motions count
     plans: BlockPlan  # give them to `as_met`, then to the referee, with these cases
     fits: FlightFit  # leaves (M, B, ...), of every moment
+    begun: Array  # (B,) [s], when the first motion began; infinite without any
     motions: Array  # (B,) int32, how many motions were begun
 
 
@@ -162,7 +163,7 @@ def decide(
     status = np.where(seen | is_solved(plans.status), plans.status, Status.NON_FINITE)
     plans = dataclasses.replace(plans, status=status.astype(np.int32))
     every = jax.tree.map(lambda *leaves: np.stack(leaves), *fits)
-    return Decided(cases=cases, plans=plans, fits=every, motions=arms.motions)
+    return Decided(cases=cases, plans=plans, fits=every, begun=arms.first, motions=arms.motions)
 
 
 class _Arms:
@@ -184,7 +185,8 @@ class _Arms:
             status=status,
         )
         motions: Any = np.zeros(num, np.int32)
-        self.done, self.motions = [], motions
+        first: Any = np.full(num, np.inf, dtype)
+        self.done, self.first, self.motions = [], first, motions
 
     def meet(self, planner: Any, known: BlockCase, aim: Aim) -> np.ndarray:
         """Which of the motions would meet the balls as they are now known, (B,) bool."""
@@ -235,6 +237,7 @@ class _Arms:
         self.plans = jax.tree.map(put, jax.tree.map(np.array, self.plans), found)
         self.plans.iterations[lanes] += steps
         self.since[lanes] = begin[lanes]
+        self.first[lanes] = np.minimum(self.first[lanes], begin[lanes])
         self.motions[lanes] += 1
 
     def composed(self) -> BlockPlan:
