@@ -65,7 +65,7 @@ OVERHEAD = 0.05  # [s]
 PARTS = ("errors", "images", "pipeline", "planning")
 # Row -> noise [m] of each coordinate, None for the stereo camera's; the moments of fits from, to
 # [s] and their rate [Hz]; options of `decide`.
-PIPELINES: dict[str, tuple[float | None, tuple[float, float, float], dict[str, bool]]] = {
+PIPELINES: dict[str, tuple[float | None, tuple[float, float, float], dict[str, Any]]] = {
     "once": (0.02, (0.25, 0.25, 60.0), {}),
     "once, stereo": (None, (0.25, 0.25, 60.0), {}),
     "once, when it has to": (0.02, (0.2, 0.3, 60.0), {"patient": True, "again": False}),

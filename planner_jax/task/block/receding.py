@@ -1,11 +1,11 @@
 """Receding horizon: the motion is decided anew while more of the ball's flight is seen.
 
 At given moments all that was seen so far is fitted anew. A motion that would still meet the ball of
-the new fit goes on. Else one is planned from where the arm will be once it can be there, with the
-rates that it then has; if none is found, the old one goes on, and brakes after its contact. What
-the arm has done by the end is one plan, of pieces of all of them, which the referee judges against
-the true ball. With one moment this is what an arm does that decides once. Robot base frame, z up,
-SI units.
+the new fit near where it was aimed to goes on. Else one is planned from where the arm will be once
+it can begin, with the rates that it then has; if none is found that meets the ball closer to the
+shield's middle, the old one goes on, and brakes after its contact. What the arm has done by the end
+is one plan, of pieces of all of them, which the referee judges against the true ball. With one
+moment this is what an arm does that decides once. Robot base frame, z up, SI units.
 """
 
 import dataclasses
@@ -21,7 +21,6 @@ from jax import Array
 from planner_jax.perception.fit import FlightFit, Sight, believed_at
 from planner_jax.planning.batch import merged
 from planner_jax.planning.plan import plan
-from planner_jax.planning.replan import Replanning
 from planner_jax.protocol import Status, is_solved, lane
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.end_poses import flight_of
@@ -32,7 +31,9 @@ from planner_jax.task.block.plan import BlockPlan
 from planner_jax.task.block.replan import ReplanBlock, WarmBlock
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
-_KEPT = 0.25  # share by which the contact of a motion that goes on may exceed what was aimed for
+# [m]; a motion that would meet the ball within so much of the shield's middle needs no better one.
+_NEAR = 0.02
+_EXCESS = 0.05  # share by which the contact of a motion that goes on may exceed what is asked for
 _LONG = 100.0  # [s], that an arm stands after its motion
 
 
@@ -116,7 +117,7 @@ def decide(
         moments: [s], at which flights are fitted, rising; frames until then count.
         overhead: [s], from a moment until its motion may begin, planning included, >= 0.
         seed: of the noise; or (B,), of each throw's own.
-        aims: how balls are to be met, tried in this order.
+        aims: how balls are to be met, tried in this order; offsets must not fall.
         shortest: [s], least time that is left for a new motion.
         patient: whether an arm that stands waits, and sees more, while it could meet the ball by
             the first of the aims if it began at the next moment.
@@ -150,14 +151,14 @@ def decide(
         left = np.asarray(_latest(cautious(known))) - begin
         stands = arms.motions == 0
         open_ &= (left > shortest) & (again | stands)
-        open_ &= ~arms.meet(planner, known, aims[0])
+        useful = arms.useful(planner, known, aims)
         if patient and following is not None:
             later = np.full(num, following + overhead, dtype)
             lanes = np.flatnonzero(open_ & stands)
             if lanes.size:
                 some = lane(dataclasses.replace(known, delay=later), lanes)
                 open_[lanes] = ~is_solved(plan_with_aims(planner, some, aims[:1]).status)
-        arms.decide(planner, known, np.flatnonzero(open_), aims)
+        arms.decide(planner, known, np.where(open_, useful, 0), aims)
     plans = arms.composed()
     seen = np.asarray(fits[-1].status) == Sight.SEEN
     status = np.where(seen | is_solved(plans.status), plans.status, Status.NON_FINITE)
@@ -188,31 +189,47 @@ class _Arms:
         first: Any = np.full(num, np.inf, dtype)
         self.done, self.first, self.motions = [], first, motions
 
-    def meet(self, planner: Any, known: BlockCase, aim: Aim) -> np.ndarray:
-        """Which of the motions would meet the balls as they are now known, (B,) bool."""
+    def useful(self, planner: Any, known: BlockCase, aims: Sequence[Aim]) -> np.ndarray:
+        """How many of the aims (B,) are closer than motions would meet the balls now known.
+
+        All of them for an arm whose motion misses the ball, or that has none.
+        """
+        num = np.full(len(self.motions), len(aims))
         if not self.motions.any():
-            return np.zeros(len(self.motions), bool)
-        aimed = cautious(dataclasses.replace(known, delay=self.since), offset=aim.offset)
-        return is_solved(self.plans.status) & np.asarray(_meets(planner, aimed, self.plans))
+            return num
+        since = dataclasses.replace(known, delay=self.since)
+        moves = is_solved(self.plans.status)
+        for offset in sorted({aim.offset for aim in aims}, reverse=True):
+            closer = sum(aim.offset < offset for aim in aims)
+            near = cautious(since, offset=max(offset, _NEAR))
+            meets = np.asarray(_meets(planner, near, self.plans))
+            num = np.where(moves & meets, closer, num)
+        return num
 
     def decide(
-        self, planner: Any, known: BlockCase, lanes: np.ndarray, aims: Sequence[Aim]
+        self, planner: Any, known: BlockCase, useful: np.ndarray, aims: Sequence[Aim]
     ) -> None:
-        """Go over to new motions in some lanes (N,), where there are any."""
+        """Go over to new motions where there are any.
+
+        Args:
+            planner: of motions.
+            known: the balls as they are known now, and when motions may begin.
+            useful: (B,) int, how many of the aims are worth trying.
+            aims: those that ask for less offset first.
+        """
         begun = dataclasses.replace(self.cases, delay=self.since)
         tasks = ReplanBlock().begin(begun, self.plans, known.delay - self.since, ball=known.ball)
-        moves = is_solved(self.plans.status[lanes])
-        for some, plans in (
-            (lanes[~moves], lambda some: plan_with_aims(planner, lane(tasks.case, some), aims)),
-            (lanes[moves], lambda some: self._again(planner, lane(tasks, some), aims)),
-        ):
-            if some.size:
-                self._begin(np.asarray(known.delay), some, plans(some))
-
-    def _again(self, planner: OnlineBlock, tasks: Replanning, aims: Sequence[Aim]) -> BlockPlan:
-        """Plans for arms that move."""
-        again = ReplanBlock(warm=WarmBlock(planner=planner), planner=planner)
-        return plan_with_aims(again, tasks, aims, of=lambda tasks: tasks.case)
+        moves, begin = is_solved(self.plans.status), np.asarray(known.delay)
+        for num in np.unique(useful[moves & (useful > 0)]):
+            lanes = np.flatnonzero(moves & (useful == num))
+            warm, some = WarmBlock(planner=planner), lane(tasks, lanes)
+            found = plan_with_aims(warm, some, aims[:num], of=lambda tasks: tasks.case)
+            self._begin(begin, lanes, found)
+            useful[lanes[is_solved(found.status)]] = 0
+        # A search from scratch takes long: only for a ball that is missed else.
+        lanes = np.flatnonzero(useful == len(aims))
+        if lanes.size:
+            self._begin(begin, lanes, plan_with_aims(planner, lane(tasks.case, lanes), aims))
 
     def _begin(self, begin: np.ndarray, lanes: np.ndarray, found: BlockPlan) -> None:
         """Go over to the plans found for some lanes (N,) that are solved."""
@@ -305,7 +322,7 @@ def _meets(planner: OnlineBlock, cases: BlockCase, plans: BlockPlan) -> Array:
         angles = evaluate(plan.motion, jnp.minimum(time, jnp.sum(plan.motion.durations)))
         flight = flight_of(case)
         excess = planner.contact_terms(case, flight, angles, plan.contact_time)[2]
-        return flight.comes & (excess <= _KEPT)
+        return flight.comes & (excess <= _EXCESS)
 
     return jax.vmap(one)(cases, as_met(cases, plans))
 
