@@ -144,6 +144,7 @@ def test_times_before_a_motion_are_refused(cases):
         ({"frame_rate": 0.0}, "frame_rate"),
         ({"perception": True, "delay": 0.1}, "delay"),
         ({"perception": True, "count": 0.1}, "count"),
+        ({"perception": True, "refit": 20.0, "wait": 0.1}, "wait"),
     ],
 )
 def test_settings_that_do_not_fit_are_named(given, name):

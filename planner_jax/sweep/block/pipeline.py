@@ -43,6 +43,7 @@ class SeeingArms:
     sense: float  # [s], until the first fit
     overhead: float  # [s]
     refit: float  # [Hz], rate of later fits; 0 for none
+    wait: float  # [s], that an arm may watch longer before it begins
     noise: float  # [m], round; 0 for that of a stereo camera
     frame_rate: float  # [Hz]
     seed: int
@@ -57,6 +58,8 @@ class SeeingArms:
             self.moments(cases),
             overhead=self.overhead,
             seed=self._seeds(cases),
+            patient=self.wait > 0.0,
+            again=self.refit > 0.0,
         )
         fits = [lane(done.fits, place) for place in (0, -1)]
         (error, std), (last, _) = (_errors(done.cases, fit) for fit in fits)
@@ -76,8 +79,11 @@ class SeeingArms:
         )
 
     def moments(self, cases: BlockCase) -> list[float]:
-        """When flights are fitted [s]: until the last ball of a batch is there."""
+        """When flights are fitted [s]; anew until the last ball of a batch is there."""
         moments = [self.sense]
+        if self.wait:
+            num = int(self.wait * self.frame_rate + 1e-6)
+            moments += [self.sense + k / self.frame_rate for k in range(1, num + 1)]
         if self.refit:
             latest = float(np.max(jax.jit(jax.vmap(flight_of))(cases).latest))
             step = 1.0 / self.refit

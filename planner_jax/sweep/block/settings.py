@@ -40,6 +40,12 @@ class BlockSettings(SweepSettings):
     refit: float = option(
         0.0, "HZ", "with --perception: rate at which the motion is decided anew; 0 for once"
     )
+    wait: float = option(
+        0.0,
+        "S",
+        "with --perception: how much longer than --sense an arm may watch before it begins, frame "
+        "by frame while it could still meet the ball",
+    )
     noise: float = option(
         0.02,
         "M",
@@ -55,13 +61,15 @@ class BlockSettings(SweepSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_one_of(REGIMES, "regime", self.regime)
-        for name in ("delay", "count", "sense", "overhead", "refit", "noise"):
+        for name in ("delay", "count", "sense", "overhead", "refit", "wait", "noise"):
             value = getattr(self, name)
             require(value is None or 0.0 <= value < math.inf, name, "finite and >= 0", value)
         require(0.0 < self.frame_rate < math.inf, "frame_rate", "finite and > 0", self.frame_rate)
         if self.perception:
             rule = "0 with perception, whose sense and overhead it is"
             require(self.delay == 0.0, "delay", rule, self.delay)
+            once = self.refit == 0.0 or self.wait == 0.0
+            require(once, "wait", "0 with refit", self.wait)
             require(self.count is None, "count", "left out with perception", self.count)
 
     def draw_options(self) -> dict[str, Any]:

@@ -67,11 +67,13 @@ class BlockSweep(Sweep):
         except LibraryFileError as error:
             raise SettingError(str(error)) from None
         if settings.perception:
-            again = isinstance(planner, OnlineBlock) or not settings.refit
-            require(again, "refit", "0 for a planner other than online", settings.refit)
+            for name in ("refit", "wait"):
+                value = getattr(settings, name)
+                may = isinstance(planner, OnlineBlock) or value == 0.0
+                require(may, name, "0 for a planner other than online", value)
             own = not isinstance(planner, LibraryBlock)
             require(own, "planner", "one that plans for the very ball", settings.planner)
-            names = ("sense", "overhead", "refit", "noise", "frame_rate", "seed")
+            names = ("sense", "overhead", "refit", "wait", "noise", "frame_rate", "seed")
             return SeeingArms(planner, **{name: getattr(settings, name) for name in names})
         if settings.count is not None:
             return CountedPlanner(planner, settings.count)
