@@ -1,6 +1,8 @@
 """How well thrown balls are seen: errors where shields meet them, and times of frames and fits.
 
-    python -m benchmarks.block_perception [--num 2000] [--rendered 12] [--seed 7] [--out DIR]
+    python -m benchmarks.block_perception [--num 2000] [--throws 1000] [--timed 50]
+                                          [--rendered 12] [--seed 7] [--out DIR]
+                                          [--parts errors,images,pipeline,planning]
 
 Balls are watched from the first frame, at time 0, until some moment, and their flight is fitted
 once, with gravity known (paper 004, eqs 5 to 8). The error is that of the ball's position across
@@ -14,10 +16,20 @@ outlier rejection, centroid, the frame of a simulated calibration and the fit, b
 camera's model without images on the same throws. Frames are timed from the image and depth on the
 host to the centroid, fits from observations to the flight, on one core, warm; the noise is not part
 of it, nor is what a real camera needs to compute depth.
+
+Then the whole pipeline: throws of `short` with the limits R1, wide (0.1 m off the middle, 30
+degrees), seen, fitted, planned for and judged against the true ball. An arm decides once at a fixed
+moment; or once, at the first frame after which it could not wait for another; or again and again.
+Its motion begins 50 ms after the frame, and what is behind `on it` are balls that meet the shield
+anywhere on its face. Beside it is paper 004's eq. 1: sensing, overhead and motion have to be over
+when the ball is there. The planning in between is timed one throw at a time, and is to be shorter
+than the overhead.
 """
 
+import dataclasses
 import os
 import time
+from collections import Counter
 from typing import Any
 
 import jax
@@ -27,14 +39,20 @@ from jax import Array
 
 import planner_jax as pj
 from planner_jax.ball.flight import BallState, drag_free_flight
-from planner_jax.benchmarks.run import Bench, argument_parser, begin
+from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
 from planner_jax.perception.camera import project
 from planner_jax.perception.fit import across_std, believed_at, error_across, fit_flight
 from planner_jax.perception.noise import StereoNoise, depth_std, information, noisy_depth
 from planner_jax.perception.segment import ball_look, sighting
 from planner_jax.robot.arm_mjcf import irb1600
+from planner_jax.sweep.block.pipeline import timed_plan
+from planner_jax.sweep.summary import percent, wilson_interval
+from planner_jax.task.block.case import ANYWHERE
 from planner_jax.task.block.end_poses import flight_of
-from planner_jax.task.block.eye import Eye, eye, fitted, frame_times, watched
+from planner_jax.task.block.eye import Eye, cautious, eye, fitted, frame_times, see, watched
+from planner_jax.task.block.met import as_met
+from planner_jax.task.block.receding import AIMS, decide
+from planner_jax.task.block.replan import ReplanBlock
 
 RATES = (30.0, 60.0, 120.0)  # [Hz]
 STDS = (0.01, 0.02, 0.03)  # [m]
@@ -43,6 +61,19 @@ ROOM = 0.1  # [m]
 BAR = ("short", 60.0, 0.02, 0.25)
 RENDERED_RATE = 60.0  # [Hz]
 TIMED = 200  # frames and fits
+OVERHEAD = 0.05  # [s]
+PARTS = ("errors", "images", "pipeline", "planning")
+# Row -> noise [m] of each coordinate, None for the stereo camera's; the moments of fits from, to
+# [s] and their rate [Hz]; options of `decide`.
+PIPELINES: dict[str, tuple[float | None, tuple[float, float, float], dict[str, Any]]] = {
+    "once": (0.02, (0.25, 0.25, 60.0), {}),
+    "once, stereo": (None, (0.25, 0.25, 60.0), {}),
+    "once, when it has to": (0.02, (0.2, 0.3, 60.0), {"patient": True, "again": False}),
+    "again, 10 Hz": (0.02, (0.25, 0.75, 10.0), {}),
+    "again, 20 Hz": (0.02, (0.25, 0.75, 20.0), {}),
+    "again, 20 Hz, stereo": (None, (0.25, 0.75, 20.0), {}),
+    "again from 0.15 s, 20 Hz": (0.02, (0.15, 0.75, 20.0), {}),
+}
 
 
 @jax.jit
@@ -228,13 +259,128 @@ def report_times(
     bench.note(**figures)
 
 
+def moments_of(first: float, last: float, rate: float) -> list[float]:
+    """Moments [s] of fits at a rate [Hz]."""
+    return [first + k / rate for k in range(int(np.floor((last - first) * rate + 1e-6)) + 1)]
+
+
+def pipeline(bench: Bench, num: int, seed: int) -> None:
+    """What arms block that see the balls."""
+    bench.say("", f"{num} throws of short, R1 wide, seed {seed}: the whole pipeline", "")
+    bench.say(
+        "| decided | noise | success % (95 %) | on it, % | without a plan, % | motions | "
+        "first fit within 0.1 m, % | sensing + overhead + motion = contact, s (medians) | s |",
+        "|" + "---|" * 9,
+    )
+    planner = pj.block.planner()
+    cases = jax.tree.map(np.asarray, pj.block.draw(num, "short", seed, regime="R1", wide=True))
+    middle = middle_of(cases)
+    for name, (std, (first, last, rate), options) in PIPELINES.items():
+        seer, began = eye(std=std), time.perf_counter()
+        moments = moments_of(first, last, rate)
+        done = decide(planner, cases, seer, moments, overhead=OVERHEAD, seed=seed, **options)
+        met = as_met(done.cases, done.plans)
+        some = pj.solved(met)
+        verdict = pj.block.judge(done.cases, met)
+        anywhere = dataclasses.replace(
+            done.cases,
+            offset=np.full_like(done.cases.offset, ANYWHERE[0]),
+            tilt=np.full_like(done.cases.tilt, ANYWHERE[1]),
+        )
+        good, on_it = verdict.success & some, pj.block.judge(anywhere, met).success & some
+        errors = fit_errors(done.cases, pj.lane(done.fits, 0), middle)
+        start = np.median(np.asarray(done.begun)[good])
+        contact = np.median(np.asarray(met.contact_time)[good])
+        low, high = (100.0 * end for end in wilson_interval(int(good.sum()), num))
+        spent = time.perf_counter() - began
+        bench.say(
+            f"| {name} | {'stereo' if std is None else f'{100 * std:g} cm'} | "
+            f"{percent(int(good.sum()), num)} ({low:.1f} to {high:.1f}) | "
+            f"{percent(int(on_it.sum()), num)} | {percent(int((~some).sum()), num)} | "
+            f"{done.motions.mean():.1f} | {100.0 * np.mean(np.asarray(errors) < ROOM):.1f} | "
+            f"{start - OVERHEAD:.3f} + {OVERHEAD:g} + {contact - start:.3f} = {contact:.3f} | "
+            f"{spent:.0f} |"
+        )
+        bench.count(good)
+        bench.row(
+            pipeline=name,
+            std=std,
+            num=num,
+            success=int(good.sum()),
+            on_shield=int(on_it.sum()),
+            planned=int(some.sum()),
+            failed=dict(Counter(verdict.failed_limit[some & ~good].tolist())),
+            motions=done.motions.mean(),
+            begun=start,
+            contact=contact,
+        )
+
+
+@jax.jit
+@jax.vmap
+def fit_errors(case: Any, fit: Any, middle: Array) -> Array:
+    """Errors (B,) [m] of fits across the flight."""
+    truth = drag_free_flight(case.ball, middle, case.gravity)
+    return error_across(believed_at(fit, middle, case.gravity), truth)
+
+
+def planning(bench: Bench, num: int, seed: int) -> None:
+    """What planning takes for one throw: the first motion, and the next ones."""
+    cases = jax.tree.map(np.asarray, pj.block.draw(num, "short", seed, regime="R1", wide=True))
+    planner, seer = pj.block.planner(), eye(std=0.02)
+    known = [see(cases, seer, moment, overhead=OVERHEAD, seed=seed).cases for moment in (0.25, 0.3)]
+    first, later = (jax.tree.map(np.asarray, each) for each in known)
+    plans, seconds = timed_with_aims(planner, first)
+    tasks = ReplanBlock().begin(first, plans, later.delay - first.delay, ball=later.ball)
+    moving = pj.lane(tasks, np.flatnonzero(pj.solved(plans)))
+    _, more = timed_with_aims(ReplanBlock(), moving)
+    for name, spent in (("first", seconds), ("next", more)):
+        quick, slow = 1e3 * np.percentile(spent, [50, 99])
+        bench.say(
+            "",
+            f"Planning the {name} motion of one throw, {len(spent)} throws: p50 {quick:.1f} ms, "
+            f"p99 {slow:.1f} ms, {100.0 * np.mean(spent > OVERHEAD):.1f} % above the overhead; "
+            f"{jax.devices()[0].platform}, load average {os.getloadavg()[0]:.1f}",
+        )
+        bench.note(**{f"{name}_planning_p50_ms": quick, f"{name}_planning_p99_ms": slow})
+
+
+def timed_with_aims(planner: Any, entries: Any) -> tuple[Any, np.ndarray]:
+    """As `plan_with_aims`, one entry after another, and the seconds (B,) of its planning alone."""
+    (num,), own = entries.batch_shape, isinstance(planner, ReplanBlock)
+    aimed = []
+    for aim in AIMS:
+        case = cautious(entries.case if own else entries, **dataclasses.asdict(aim))
+        case = jax.tree.map(np.asarray, case)
+        aimed.append(dataclasses.replace(entries, case=case) if own else case)
+    found, seconds = [], np.zeros(num)
+    for k in range(num):
+        plan: Any = None
+        for each in aimed:
+            plan, spent = timed_plan(planner, pj.lane(each, k))
+            seconds[k] += spent
+            if pj.solved(plan):
+                break
+        found.append(plan)
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *found), seconds
+
+
 def main() -> None:
-    """Measure the models, then images."""
-    parser = argument_parser("block_perception", __doc__, num=2000, rendered=12, seed=7)
+    """Measure the models, then images, then what comes of it."""
+    counts = {"num": 2000, "throws": 1000, "timed": 50, "rendered": 12, "seed": 7}
+    parser = argument_parser("block_perception", __doc__, **counts)
+    parser.add_argument("--parts", default=",".join(PARTS), help=f"out of {', '.join(PARTS)}")
     options = parser.parse_args()
+    parts = chosen(parser, "--parts", options.parts, PARTS)
     with begin(parser, options) as bench:
-        modelled(bench, options.num, options.seed)
-        rendered(bench, options.rendered, options.seed)
+        if "errors" in parts:
+            modelled(bench, options.num, options.seed)
+        if "images" in parts:
+            rendered(bench, options.rendered, options.seed)
+        if "pipeline" in parts:
+            pipeline(bench, options.throws, options.seed)
+        if "planning" in parts:
+            planning(bench, options.timed, options.seed)
 
 
 if __name__ == "__main__":

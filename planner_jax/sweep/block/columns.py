@@ -1,7 +1,10 @@
 """The columns of a block run: ball, plan and verdict."""
 
+import numpy as np
+
+from planner_jax.perception.fit import Sight
 from planner_jax.sweep import columns as known
-from planner_jax.sweep.columns import LIST, VECTOR, leaves_of
+from planner_jax.sweep.columns import LIST, VECTOR, Column, RefereedBatch, leaves_of
 
 FRAME = "base of the robot, z up; times from the moment at which the ball is first seen"
 
@@ -48,3 +51,24 @@ COLUMNS = [
     ),
     *known.OUTCOME,
 ]
+
+# What runs with --perception have besides, and what those with --count have.
+SEEN_COLUMNS = [
+    Column(
+        "sight", "", "what became of looking for the ball", known.TEXT, lambda batch: _sights(batch)
+    ),
+    *leaves_of(
+        "plans",
+        ("sightings", "", "frames with the ball until the first fit", known.COUNT),
+        ("fit_error", "m", "of the first fit, across the flight midway between the boxes"),
+        ("fit_std", "m", "what it is believed to be"),
+        ("last_fit_error", "m", "of the last fit"),
+        ("motions", "", "that were begun", known.COUNT),
+    ),
+]
+TIMED_COLUMNS = leaves_of("plans", ("planning_time", "s", "of this plan alone"))
+
+
+def _sights(batch: RefereedBatch) -> np.ndarray:
+    names = np.array([Sight(code).name for code in range(len(Sight))])
+    return names[np.asarray(batch.plans.sight)]

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from planner_jax.sweep.settings import SweepSettings, option, require, require_one_of
 
@@ -24,6 +24,34 @@ class BlockSettings(SweepSettings):
     )
     anywhere: bool = option(False, "", "any place on the shield will do, at any angle")
     delay: float = option(0.0, "S", "seconds until the arm may start")
+    count: float | None = option(
+        None,
+        "S",
+        "plan one after another by the clock: motions start so many seconds after the delay, and "
+        "as much later as planning took longer",
+    )
+    perception: bool = option(
+        False, "", "plan with what a camera has seen of the ball; the referee has the true one"
+    )
+    sense: float = option(0.25, "S", "with --perception: seconds until the flight is fitted")
+    overhead: float = option(
+        0.05, "S", "with --perception: seconds from a fit until its motion may start"
+    )
+    refit: float = option(
+        0.0, "HZ", "with --perception: rate at which the motion is decided anew; 0 for once"
+    )
+    wait: float = option(
+        0.0,
+        "S",
+        "with --perception: how much longer than --sense an arm may watch before it begins, frame "
+        "by frame while it could still meet the ball",
+    )
+    noise: float = option(
+        0.02,
+        "M",
+        "with --perception: standard deviation of each coordinate; 0 for a stereo camera's",
+    )
+    frame_rate: float = option(60.0, "HZ", "with --perception: of the camera")
 
     RUN: ClassVar[str] = "planner_jax.sweep.block.sweep:BlockSweep"
     DRAW: ClassVar[tuple[str, ...]] = ("regime", "wide", "anywhere", "delay")
@@ -33,4 +61,18 @@ class BlockSettings(SweepSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_one_of(REGIMES, "regime", self.regime)
-        require(0.0 <= self.delay < math.inf, "delay", "finite and >= 0", self.delay)
+        for name in ("delay", "count", "sense", "overhead", "refit", "wait", "noise"):
+            value = getattr(self, name)
+            require(value is None or 0.0 <= value < math.inf, name, "finite and >= 0", value)
+        require(0.0 < self.frame_rate < math.inf, "frame_rate", "finite and > 0", self.frame_rate)
+        if self.perception:
+            rule = "0 with perception, whose sense and overhead it is"
+            require(self.delay == 0.0, "delay", rule, self.delay)
+            once = self.refit == 0.0 or self.wait == 0.0
+            require(once, "wait", "0 with refit", self.wait)
+            require(self.count is None, "count", "left out with perception", self.count)
+
+    def draw_options(self) -> dict[str, Any]:
+        """Options of the task's `draw`: the delay is until the first motion may start."""
+        first = self.sense + self.overhead if self.perception else self.delay + (self.count or 0.0)
+        return {**super().draw_options(), "delay": first}

@@ -1,36 +1,94 @@
-"""What blocks add to a sweep: rows of their own, and how long the arm moves."""
+"""What blocks add to a sweep: rows of their own, how long the arm moves, and what it saw."""
 
+from collections.abc import Sequence
 from typing import Any
 
-from planner_jax.sweep.block.columns import COLUMNS, FRAME
-from planner_jax.sweep.settings import SettingError, SweepSettings
+import numpy as np
+import pyarrow as pa
+
+from planner_jax.sweep.block.columns import COLUMNS, FRAME, SEEN_COLUMNS, TIMED_COLUMNS
+from planner_jax.sweep.block.pipeline import CountedPlanner, SeeingArms, SeenPlan, TimedPlan
+from planner_jax.sweep.block.settings import BlockSettings
+from planner_jax.sweep.columns import Column, RefereedBatch
+from planner_jax.sweep.settings import SettingError, require
 from planner_jax.sweep.summary import Tally
 from planner_jax.sweep.sweep import Sweep
 from planner_jax.task.block.library.adapt import AdaptBlock
 from planner_jax.task.block.library.file import LibraryFileError
 from planner_jax.task.block.library.planner import LibraryBlock, OtherLibrary
+from planner_jax.task.block.online import OnlineBlock
+
+_ROOM = 0.1  # [m], of a ball that may be met off the shield's middle
 
 
 class BlockTally(Tally):
-    """Sums up how long the arm moves, too."""
+    """Sums up how long the arm moves, how well balls were seen, and how long planning took."""
 
     MEANS = ("execution_time",)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._errors, self._seconds = [], []
+
+    def add(self, rows: pa.Table) -> None:
+        """Count some rows of `plans.parquet`."""
+        super().add(rows)
+        for name, values in (("fit_error", self._errors), ("planning_time", self._seconds)):
+            if name in rows.column_names:
+                values.append(rows[name].to_numpy())
+
+    def summary(self) -> dict[str, Any]:
+        """Those of every sweep; with a camera or a clock also errors [m] and times [s]."""
+        found = super().summary()
+        if self._errors:
+            errors = np.concatenate(self._errors)
+            seen = errors[np.isfinite(errors)]
+            found["fit_error_median"] = float(np.median(seen)) if seen.size else None
+            found["fit_within_room"] = float(np.mean(errors <= _ROOM))
+        if self._seconds:
+            quick, slow = np.quantile(np.concatenate(self._seconds), (0.5, 0.99))
+            found |= {"planning_p50": float(quick), "planning_p99": float(slow)}
+        return found
 
 
 class BlockSweep(Sweep):
     """Arms that block thrown balls."""
 
-    frame, own_columns = FRAME, COLUMNS
+    frame = FRAME
 
-    def planner(self, settings: SweepSettings) -> Any:
+    def columns(self, batch: RefereedBatch) -> Sequence[Column]:
+        """The columns of blocks, and what the arms saw or waited for."""
+        more = {SeenPlan: SEEN_COLUMNS, TimedPlan: TIMED_COLUMNS}.get(type(batch.plans), [])
+        return [*COLUMNS, *more]
+
+    def planner(self, settings: BlockSettings) -> Any:
         """The planner of a run; `SettingError` where its file is no library."""
         try:
-            return super().planner(settings)
+            planner = super().planner(settings)
         except LibraryFileError as error:
             raise SettingError(str(error)) from None
+        if settings.perception:
+            for name in ("refit", "wait"):
+                value = getattr(settings, name)
+                may = isinstance(planner, OnlineBlock) or value == 0.0
+                require(may, name, "0 for a planner other than online", value)
+            own = not isinstance(planner, LibraryBlock)
+            require(own, "planner", "one that plans for the very ball", settings.planner)
+            names = ("sense", "overhead", "refit", "wait", "noise", "frame_rate", "seed")
+            return SeeingArms(planner, **{name: getattr(settings, name) for name in names})
+        if settings.count is not None:
+            return CountedPlanner(planner, settings.count)
+        return planner
 
-    def require_fit(self, settings: SweepSettings, planner: Any, cases: Any) -> None:
+    def other_planners(self, settings: BlockSettings) -> dict[str, Any]:
+        """The task's other planners, to be compared; none where a camera or a clock has a say."""
+        if settings.perception or settings.count is not None:
+            return {}
+        return super().other_planners(settings)
+
+    def require_fit(self, settings: BlockSettings, planner: Any, cases: Any) -> None:
         """Raise `SettingError` unless the planner is one of such cases, and a library of these."""
+        planner = getattr(planner, "planner", planner)
         super().require_fit(settings, planner, cases)
         if isinstance(planner, LibraryBlock | AdaptBlock):
             try:
@@ -38,13 +96,27 @@ class BlockSweep(Sweep):
             except OtherLibrary as error:
                 raise SettingError(str(error)) from None
 
-    def tally(self, settings: SweepSettings) -> BlockTally:
+    def plan(self, planner: Any, cases: Any) -> Any:
+        """The plans of a batch; of arms that see or wait, what they do."""
+        if isinstance(planner, SeeingArms | CountedPlanner):
+            return planner.plans(cases)
+        return super().plan(planner, cases)
+
+    def tally(self, settings: BlockSettings) -> BlockTally:
         """An empty count of rows."""
         return BlockTally()
 
     def findings(self, manifest: dict[str, Any]) -> list[str]:
-        """How long the arm moves."""
-        mean = manifest["summary"]["mean_execution_time"]
-        if mean is None:
-            return []
-        return [f"The arm moves for {mean:.3f} s, in the mean of the successes."]
+        """How long the arm moves, how well the ball was seen, and how long planning took."""
+        summary, found = manifest["summary"], []
+        if (mean := summary["mean_execution_time"]) is not None:
+            found.append(f"The arm moves for {mean:.3f} s, in the mean of the successes.")
+        if (error := summary.get("fit_error_median")) is not None:
+            found.append(
+                f"The first fit is {error:.3f} m off across the flight (median), and within "
+                f"{_ROOM:g} m for {100.0 * summary['fit_within_room']:.1f} % of the balls."
+            )
+        if "planning_p50" in summary:
+            quick, slow = (1e3 * summary[name] for name in ("planning_p50", "planning_p99"))
+            found.append(f"Planning one at a time takes {quick:.1f} ms (p50), {slow:.1f} ms (p99).")
+        return found

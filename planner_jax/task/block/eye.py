@@ -20,7 +20,7 @@ from planner_jax.perception.fit import FlightFit, believed_at, fit_flight
 from planner_jax.perception.noise import Noise, RoundNoise, information, sightings, stereo_noise
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.end_poses import flight_of
-from planner_jax.task.block.scene import RIG_HALF
+from planner_jax.task.block.scene import RIG_HALF, Box
 
 
 @struct.dataclass
@@ -77,6 +77,12 @@ def frame_times(eye: Eye, seconds: float) -> np.ndarray:
 def watched(cases: BlockCase, eye: Eye, times: Array, key: Array) -> Array:
     """Where the balls of a batch of cases are seen at times (N,) [s]; pure.
 
+    Args:
+        cases: a batch of B, with the true balls.
+        eye: that sees them.
+        times: (N,) [s], of frames.
+        key: of the noise, or (B,) of them.
+
     Returns:
         (B, N, 3) [m]; NaN where a ball is not seen.
     """
@@ -85,7 +91,7 @@ def watched(cases: BlockCase, eye: Eye, times: Array, key: Array) -> Array:
         places = jax.vmap(drag_free_flight, (None, 0, None))(ball, times, gravity).pos
         return sightings(key, eye.camera, eye.noise, places)
 
-    keys = jax.random.split(key, cases.batch_shape[0])
+    keys = key if key.ndim else jax.random.split(key, cases.batch_shape[0])
     return jax.vmap(one)(cases.ball, cases.gravity, keys)
 
 
@@ -139,7 +145,14 @@ def see(
     return SeenThrows(cases=dataclasses.replace(cases, ball=balls, delay=delay), fits=fits)
 
 
-def cautious(cases: BlockCase, *, offset: float = 0.02, grow: float = 0.1) -> BlockCase:
+def cautious(
+    cases: BlockCase,
+    *,
+    offset: float = 0.02,
+    grow: float = 0.1,
+    edge: float = 0.0,
+    at_rest: bool = False,
+) -> BlockCase:
     """A batch of seen cases as a planner should get it, which takes the ball at its word.
 
     The ball is to be met near the shield's middle, so that the rest of the shield is left for the
@@ -151,16 +164,22 @@ def cautious(cases: BlockCase, *, offset: float = 0.02, grow: float = 0.1) -> Bl
         offset: [m], greatest distance of the ball from the shield's middle, where the case allows
             more.
         grow: [m], by how much that box is larger on its sides and at its top.
+        edge: [m], kept from both ends of the ball's way between the boxes, since it is not where
+            it is believed to be along its way either.
+        at_rest: whether the arm must stand when it meets the ball, whatever the case says: then it
+            does not matter if the ball is late.
     """
-    inner = cases.scene.inner
+    inner, outer = cases.scene.inner, cases.scene.outer
     passes = ~jax.jit(jax.vmap(flight_of))(cases).comes
-    more = jnp.where(passes, grow, 0.0)[:, None]
-    lower, upper = inner.lower - more * np.array([1.0, 1.0, 0.0]), inner.upper + more
-    grown = dataclasses.replace(inner, lower=lower, upper=upper)
+    more = (edge + jnp.where(passes, grow, 0.0))[:, None]
+    sides = np.array([1.0, 1.0, 0.0], np.float32)
+    grown = Box(lower=inner.lower - more * sides, upper=inner.upper + more)
+    shrunk = Box(lower=outer.lower + edge * sides, upper=outer.upper - edge)
     return dataclasses.replace(
         cases,
+        ends_at_rest=cases.ends_at_rest | at_rest,
         offset=jnp.minimum(cases.offset, offset),
-        scene=dataclasses.replace(cases.scene, inner=grown),
+        scene=dataclasses.replace(cases.scene, inner=grown, outer=shrunk),
     )
 
 

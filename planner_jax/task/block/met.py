@@ -42,10 +42,39 @@ def as_met(cases: BlockCase, plans: BlockPlan) -> BlockPlan:
     return _as_met(cases, plans)
 
 
+def begun_late(cases: BlockCase, plans: BlockPlan, late: Any) -> BlockPlan:
+    """The same motions begun later, up to where they meet their balls as `as_met` has it.
+
+    Args:
+        cases: a batch of B, of arms that stand.
+        plans: of them.
+        late: (B,) [s], by how much, >= 0. A plan of 0 keeps its motion and its contact.
+
+    Returns:
+        Plans with two pieces more.
+    """
+    return _begun_late(cases, plans, late)
+
+
 @jax.jit
 @jax.vmap
-def _as_met(case: BlockCase, plan: BlockPlan) -> BlockPlan:
-    motion = _braked(case, plan.motion)
+def _begun_late(case: BlockCase, plan: BlockPlan, late: Array) -> BlockPlan:
+    motion = plan.motion
+    still = jnp.zeros_like(motion.coeffs[:1]).at[0, 0].set(case.angles)
+    waited = PiecewisePolynomial(
+        coeffs=jnp.concatenate([still, motion.coeffs]),
+        durations=jnp.concatenate([late[None], motion.durations]),
+    )
+    whole = braked(case, waited)
+    in_time = dataclasses.replace(
+        plan, motion=dataclasses.replace(whole, durations=whole.durations.at[-1].set(0.0))
+    )
+    met = _met(case, dataclasses.replace(plan, motion=waited))
+    return jax.tree.map(lambda ours, theirs: jnp.where(late > 0.0, ours, theirs), met, in_time)
+
+
+def _met(case: BlockCase, plan: BlockPlan) -> BlockPlan:
+    motion = braked(case, plan.motion)
 
     def above(time: Array) -> tuple[Array, Array]:
         """Height () [m] of the ball over the shield's plane, and how far it is from the middle."""
@@ -72,8 +101,14 @@ def _as_met(case: BlockCase, plan: BlockPlan) -> BlockPlan:
     return dataclasses.replace(plan, motion=cut(motion, time - case.delay), contact_time=time)
 
 
-def _braked(case: BlockCase, motion: PiecewisePolynomial) -> PiecewisePolynomial:
-    """A motion, and after it all joints slowing down evenly until they stand at the same time."""
+_as_met = jax.jit(jax.vmap(_met))
+
+
+def braked(case: BlockCase, motion: PiecewisePolynomial) -> PiecewisePolynomial:
+    """A motion, and after it all joints slowing down evenly until they stand at the same time.
+
+    An arm that has to end at rest does so already: the piece that is added is of no length.
+    """
     end = jnp.sum(motion.durations)
     angles, rates = evaluate(motion, end), evaluate(motion, end, 1)
     duration = jnp.max(jnp.abs(rates) / case.limits.acceleration)

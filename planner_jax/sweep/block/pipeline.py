@@ -1,0 +1,155 @@
+"""Sweeps of blocks with more of the pipeline: balls that are only seen, planning by the clock."""
+
+import dataclasses
+import time
+import zlib
+from typing import Any
+
+import jax
+import numpy as np
+from flax import struct
+from jax import Array
+
+from planner_jax.ball.flight import drag_free_flight
+from planner_jax.perception.fit import FlightFit, across_std, believed_at, error_across
+from planner_jax.planning.plan import plan
+from planner_jax.protocol import lane
+from planner_jax.sweep.timing import CompileClock
+from planner_jax.task.block.case import BlockCase
+from planner_jax.task.block.end_poses import flight_of
+from planner_jax.task.block.eye import eye
+from planner_jax.task.block.met import as_met, begun_late
+from planner_jax.task.block.plan import BlockPlan
+from planner_jax.task.block.receding import decide
+
+
+@struct.dataclass
+class SeenPlan(BlockPlan):
+    """What an arm does that sees its ball, up to the true contact; and how well it saw."""
+
+    sight: Array  # () int32, a `Sight`, of the first fit
+    sightings: Array  # () int32, of the first fit
+    fit_error: Array  # () [m], of the first fit, across the flight midway between the boxes
+    fit_std: Array  # () [m], what it is believed to be
+    last_fit_error: Array  # () [m], of the last fit
+    motions: Array  # () int32, that were begun
+
+
+@dataclasses.dataclass(frozen=True)
+class SeeingArms:
+    """Arms that plan with what a camera has seen, once or again and again."""
+
+    planner: Any
+    sense: float  # [s], until the first fit
+    overhead: float  # [s]
+    refit: float  # [Hz], rate of later fits; 0 for none
+    wait: float  # [s], that an arm may watch longer before it begins
+    noise: float  # [m], round; 0 for that of a stereo camera
+    frame_rate: float  # [Hz]
+    seed: int
+
+    def plans(self, cases: BlockCase) -> SeenPlan:
+        """What the arms of a batch do, up to where they meet the true balls."""
+        seen = eye(rate=self.frame_rate, std=self.noise or None)
+        done = decide(
+            self.planner,
+            cases,
+            seen,
+            self.moments(cases),
+            overhead=self.overhead,
+            seed=self._seeds(cases),
+            patient=self.wait > 0.0,
+            again=self.refit > 0.0,
+        )
+        fits = [lane(done.fits, place) for place in (0, -1)]
+        (error, std), (last, _) = (_errors(done.cases, fit) for fit in fits)
+        met = as_met(done.cases, done.plans)
+        parts = {field.name: getattr(met, field.name) for field in dataclasses.fields(met)}
+        return jax.tree.map(
+            np.asarray,
+            SeenPlan(
+                **parts,
+                sight=fits[0].status,
+                sightings=fits[0].num,
+                fit_error=error,
+                fit_std=std,
+                last_fit_error=last,
+                motions=done.motions,
+            ),
+        )
+
+    def moments(self, cases: BlockCase) -> list[float]:
+        """When flights are fitted [s]; anew until the last ball of a batch is there."""
+        moments = [self.sense]
+        if self.wait:
+            num = int(self.wait * self.frame_rate + 1e-6)
+            moments += [self.sense + k / self.frame_rate for k in range(1, num + 1)]
+        if self.refit:
+            latest = float(np.max(jax.jit(jax.vmap(flight_of))(cases).latest))
+            step = 1.0 / self.refit
+            moments += list(np.arange(self.sense + step, latest - self.overhead, step))
+        return moments
+
+    def _seeds(self, cases: BlockCase) -> np.ndarray:
+        """A seed (B,) of each throw's noise, the same in whatever batch it is."""
+        balls = np.concatenate([cases.ball.pos, cases.ball.vel], axis=1).astype(np.float32)
+        return np.array([zlib.crc32(ball.tobytes(), self.seed) for ball in balls], np.uint32)
+
+
+@struct.dataclass
+class TimedPlan(BlockPlan):
+    """A plan that was waited for."""
+
+    planning_time: Array  # () [s]
+
+
+@dataclasses.dataclass(frozen=True)
+class CountedPlanner:
+    """Plans one after another by the clock; a plan that comes too late begins so much later."""
+
+    planner: Any
+    allowed: float  # [s], that planning may take; in the delay already
+
+    def plans(self, cases: BlockCase) -> TimedPlan:
+        """The plans of a batch, up to where they meet the balls."""
+        plans, spent = timed_plans(self.planner, cases)
+        seconds: Any = spent
+        late = np.maximum(seconds - self.allowed, 0.0).astype(cases.delay.dtype)
+        met = begun_late(cases, plans, late)
+        parts = {field.name: getattr(met, field.name) for field in dataclasses.fields(met)}
+        return jax.tree.map(np.asarray, TimedPlan(**parts, planning_time=seconds))
+
+
+def timed_plans(planner: Any, cases: BlockCase) -> tuple[BlockPlan, np.ndarray]:
+    """Plans of cases, made one after another, and the seconds (B,) that each took."""
+    found = [timed_plan(planner, lane(cases, k)) for k in range(cases.batch_shape[0])]
+    plans = jax.tree.map(lambda *leaves: np.stack(leaves), *(each for each, _ in found))
+    return plans, np.array([seconds for _, seconds in found])
+
+
+def timed_plan(planner: Any, case: Any) -> tuple[Any, float]:
+    """The plan of one case, and the seconds that it took.
+
+    If something was compiled meanwhile it is made again.
+    """
+    while True:
+        with CompileClock() as clock:
+            began = time.perf_counter()
+            found = plan(planner, case)
+            seconds = time.perf_counter() - began
+        if not clock.compiled:
+            return found, seconds
+
+
+@jax.jit
+def _errors(cases: BlockCase, fits: FlightFit) -> tuple[Array, Array]:
+    """Errors (B,) [m] across the flight midway between the boxes, and what they are believed."""
+
+    def one(case: BlockCase, fit: FlightFit) -> tuple[Array, Array]:
+        flight = flight_of(case)
+        middle = 0.5 * (flight.earliest + flight.latest)
+        belief = believed_at(fit, middle, case.gravity)
+        truth = drag_free_flight(case.ball, middle, case.gravity)
+        return error_across(belief, truth), across_std(belief)
+
+    return jax.vmap(one)(cases, fits)

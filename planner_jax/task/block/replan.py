@@ -1,0 +1,164 @@
+"""Re-planning of blocks: from the motion that is carried out, for what is now known of the ball.
+
+From one look at a ball to the next its believed flight moves by centimetres, and so does the best
+motion. What is left of the previous one, its contact moved along with the ball, is a start from
+which a few steps of least squares suffice; a search from scratch stays for what they do not mend.
+"""
+
+import dataclasses
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from planner_jax.ball.flight import BallState, drag_free_flight
+from planner_jax.optimise.levenberg import LevenbergConfig, least_squares
+from planner_jax.planning.batch import better_of, merged
+from planner_jax.planning.one_by_one import suited
+from planner_jax.planning.replan import Replanning
+from planner_jax.protocol import Attempt, Drive, is_unsolved, lane
+from planner_jax.robot.arm import shield_pose
+from planner_jax.task.block.case import BlockCase
+from planner_jax.task.block.end_poses import flight_of
+from planner_jax.task.block.met import braked
+from planner_jax.task.block.online import OnlineBlock
+from planner_jax.task.block.plan import BlockPlan
+from planner_jax.trajectory.polynomial import evaluate
+
+_SHORTEST = 0.02  # [s], of a guess from a motion that has all but ended
+
+
+@dataclasses.dataclass(frozen=True)
+class Warm(Attempt):
+    """An attempt: steps of least squares from what is left of the previous motion; static."""
+
+    solver: LevenbergConfig = LevenbergConfig(*(12, 1e-2, 0.25, 6.0), settled=1, tolerance=1.0)
+
+
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class WarmBlock:
+    """Motions bent from those that are carried out; of tasks as `ReplanBlock.begin` makes them."""
+
+    case_type: ClassVar[type] = Replanning
+    planner: OnlineBlock = OnlineBlock()  # whose unknowns, limits and weights these are
+    attempts: tuple[Warm, ...] = (Warm(),)
+
+    def solve(self, task: Replanning, attempt: Warm) -> BlockPlan:
+        """The plan of one case."""
+        case, planner = task.case, self.planner
+        flight = flight_of(case)
+        point = self.rest(task)
+        end = least_squares(lambda point: planner.model(point, case, flight), point, attempt.solver)
+        return planner.plan_at(case, flight, end.point, end.steps)
+
+    def solve_lanes(self, tasks: Replanning, attempt: Warm) -> BlockPlan:
+        """The plans of a batch: on a CPU one after another."""
+        return suited(lambda task: self.solve(task, attempt), tasks)
+
+    def rest(self, task: Replanning) -> Array:
+        """The unknowns of what is left of the previous motion, over the time until the contact.
+
+        The contact is moved to when the ball, as it is now known, is nearest to where the shield
+        was to meet it.
+        """
+        case, previous = task.case, task.previous
+        ends = jnp.sum(previous.motion.durations)
+        _, middle = shield_pose(case.arm, evaluate(previous.motion, ends))
+        ball = drag_free_flight(case.ball, previous.contact_time, case.gravity)
+        square = jnp.maximum(jnp.sum(ball.vel**2), 1e-12)
+        time = previous.contact_time + jnp.sum(ball.vel * (middle - ball.pos)) / square
+        time = jnp.maximum(time, case.delay + _SHORTEST)
+        left = jnp.maximum(ends - task.elapsed, 0.0)
+        shares = np.arange(1, self.planner.pieces + 1) / self.planner.pieces
+        motion = braked(case, previous.motion)
+        at = lambda share: evaluate(motion, task.elapsed + left * share, 1)  # noqa: E731
+        steps = left * jax.vmap(at)(jnp.asarray(shares, time.dtype))
+        return jnp.append(steps.reshape(-1), time)
+
+
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class ReplanBlock:
+    """Blocks re-planned from the motion that is carried out, as `pj.replan` asks for them.
+
+    Times of cases and plans go on counting from when the ball was first seen; what moves on is the
+    delay, from which on the new motion is carried out.
+    """
+
+    case_type: ClassVar[type] = Replanning
+    warm: WarmBlock = WarmBlock()
+    planner: OnlineBlock = OnlineBlock()  # for what the warm start does not solve
+
+    def begin(
+        self,
+        cases: BlockCase,
+        previous: BlockPlan,
+        elapsed: Any,
+        *,
+        ball: BallState | None = None,
+        angles: Any = None,
+        rates: Any = None,
+    ) -> Replanning:
+        """What is left of a case, or of a batch, some time into its motion; see `pj.replan`.
+
+        Args:
+            cases: what `previous` was planned for.
+            previous: the plan that is carried out.
+            elapsed: () or (B,) [s], since its motion began, >= 0: when a new one may begin.
+            ball: as it is known now, at the time 0 of the cases; theirs if not given.
+            angles: (6,) or (B, 6) [rad], of the arm when the new motion begins.
+            rates: likewise [rad/s]. What of these is not given is the previous plan's own, which
+                brakes where it has ended.
+
+        Raises:
+            ValueError: a negative time.
+        """
+        dtype, batch = np.asarray(cases.delay).dtype, cases.batch_shape
+        elapsed = np.broadcast_to(np.asarray(elapsed, dtype), batch)
+        if not np.all(elapsed >= 0.0):
+            raise ValueError(f"elapsed must be >= 0, got {np.min(elapsed)}")
+        own = (_states if batch else _state)(cases, previous, elapsed)
+        angles, rates = (
+            np.asarray(mine)
+            if given is None
+            else np.broadcast_to(np.asarray(given, dtype), mine.shape)
+            for given, mine in zip((angles, rates), own, strict=True)
+        )
+        left = dataclasses.replace(
+            cases,
+            ball=cases.ball if ball is None else ball,
+            delay=np.asarray(cases.delay) + elapsed,
+            angles=angles,
+            rates=rates,
+        )
+        return Replanning(case=left, previous=previous, elapsed=elapsed)
+
+    def plan_by(self, drive: Drive, tasks: Replanning) -> BlockPlan:
+        """The plans of one case or of a batch: warm, and from scratch where that fails."""
+        plans, _ = drive(self.warm, tasks)
+        unsolved = is_unsolved(plans.status)
+        if drive.is_pure:
+            return better_of(plans, drive(self.planner, tasks.case)[0], unsolved)
+        if not tasks.batch_shape:
+            return drive(self.planner, tasks.case)[0] if unsolved else plans
+        lanes = np.flatnonzero(unsolved)
+        if not lanes.size:
+            return plans
+        plans, cases = jax.tree.map(np.array, (plans, tasks.case))
+        return merged(plans, drive(self.planner, lane(cases, lanes))[0], lanes)
+
+
+@jax.jit
+def _state(case: BlockCase, plan: BlockPlan, elapsed: Array) -> tuple[Array, Array]:
+    """Angles (6,) [rad] and rates (6,) [rad/s] some time [s] into the motion of a plan."""
+    motion = braked(case, plan.motion)
+    is_over = elapsed >= jnp.sum(motion.durations)
+    elapsed = jnp.minimum(elapsed, jnp.sum(motion.durations))
+    rates = jnp.where(is_over, 0.0, evaluate(motion, elapsed, 1))
+    return evaluate(motion, elapsed), rates
+
+
+_states = jax.jit(jax.vmap(_state))

@@ -1,0 +1,177 @@
+"""Arms that decide while they watch: what is seen, planned anew, and put together."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+import planner_jax as pj
+from planner_jax.ball.flight import drag_free_flight
+from planner_jax.perception.camera import looking_at
+from planner_jax.perception.fit import Sight
+from planner_jax.protocol import Status, lane
+from planner_jax.sweep.block.settings import BlockSettings
+from planner_jax.sweep.run import start_sweep
+from planner_jax.sweep.settings import SettingError
+from planner_jax.task.block.card import TASK
+from planner_jax.task.block.eye import cautious, eye
+from planner_jax.task.block.met import as_met, begun_late
+from planner_jax.task.block.receding import Aim, decide
+from planner_jax.task.block.replan import ReplanBlock, WarmBlock
+from tests.test_block import SMALL
+
+AIMS = (Aim(0.02), Aim(0.09))
+AGAIN = ReplanBlock(warm=WarmBlock(planner=SMALL), planner=SMALL)
+
+
+@pytest.fixture(scope="module")
+def cases():
+    return jax.tree.map(np.asarray, pj.block.draw(6, "short", seed=8, regime="R1", wide=True))
+
+
+def accepted(done):
+    plans = as_met(done.cases, done.plans)
+    return pj.block.judge(done.cases, plans), pj.solved(plans)
+
+
+def test_a_perfect_camera_gives_the_plans_of_no_camera(cases):
+    done = decide(SMALL, cases, eye(std=1e-6), [0.25], aims=AIMS[:1])
+    aimed = cautious(dataclasses.replace(cases, delay=done.cases.delay), offset=AIMS[0].offset)
+    plans = pj.plan(SMALL, jax.tree.map(np.asarray, aimed))
+    solved = pj.solved(plans)
+    assert solved.sum() >= 2
+    np.testing.assert_array_equal(pj.solved(done.plans), solved)
+    np.testing.assert_allclose(
+        done.plans.contact_time[solved], plans.contact_time[solved], atol=1e-3
+    )
+    ours, theirs = (each.motion.coeffs[solved, :, 0] for each in (done.plans, plans))
+    np.testing.assert_allclose(ours, theirs, atol=1e-2)
+
+
+def test_with_exact_fits_deciding_again_changes_nothing(cases):
+    """A motion that meets the ball goes on; what had none may still get one."""
+    once, again = (
+        decide(SMALL, cases, eye(std=1e-6), moments, aims=AIMS[:1])
+        for moments in ([0.2], [0.2, 0.3, 0.4])
+    )
+    had = once.motions == 1
+    assert had.sum() >= 2
+    np.testing.assert_array_equal(again.motions[had], 1)
+    (first, _), (second, _) = accepted(once), accepted(again)
+    assert (second.success >= first.success)[had].all() and first.success[had].any()
+
+
+def test_what_is_put_together_is_one_motion_of_rates_within_their_limits(cases):
+    done = decide(SMALL, cases, eye(std=0.02), [0.15, 0.25, 0.35, 0.45], aims=AIMS)
+    verdict, solved = accepted(done)
+    assert (done.motions[solved] >= 1).all() and done.motions.max() >= 2
+    # A position limit may be passed while an arm brakes after a contact that did not come.
+    of_joints = ("time", "start", "continuity", "velocity", "acceleration", "rest")
+    assert not np.isin(verdict.failed_limit[solved], of_joints).any()
+    assert verdict.success[done.motions >= 2].any()
+
+
+def test_a_ball_that_is_never_seen_leaves_the_arm_at_home(cases):
+    away = looking_at((0.0, 0.0, 1.0), (-5.0, 0.0, 1.0), size=(64, 64), field_of_view=1.0)
+    done = decide(SMALL, cases, eye(camera=away), [0.2, 0.3])
+    assert (done.fits.status == Sight.NEVER_SEEN).all() and not done.motions.any()
+    assert (done.plans.status == Status.NON_FINITE).all() and np.isinf(done.begun).all()
+    np.testing.assert_array_equal(done.plans.motion.coeffs[:, 0, 0], cases.angles)
+    assert not done.plans.motion.durations.any()
+
+
+def test_replanning_goes_on_from_the_motion_for_the_ball_as_it_is_now_known(cases):
+    plans = pj.plan(SMALL, cases)
+    solved = pj.solved(plans)
+    off = np.array([0.0, 0.03, 0.03], np.float32)
+    ball = dataclasses.replace(cases.ball, pos=cases.ball.pos + off)
+    tasks = AGAIN.begin(cases, plans, 0.1, ball=ball)
+    warm = pj.plan(AGAIN.warm, tasks)
+    both = solved & pj.solved(warm)
+    assert both.sum() >= 3
+    assert pj.block.judge(lane(tasks.case, both), lane(warm, both)).success.all()
+    again = pj.replan(AGAIN, cases, plans, 0.1, ball=ball)
+    np.testing.assert_array_equal(again.contact_time[both], warm.contact_time[both])
+
+
+def test_a_motion_that_begins_late_is_met_later_or_not_in_time(cases):
+    plans = pj.plan(SMALL, cases)
+    solved = pj.solved(plans)
+    in_time = begun_late(cases, plans, np.zeros(6, np.float32))
+    np.testing.assert_array_equal(in_time.contact_time, plans.contact_time)
+    assert pj.block.judge(cases, in_time).success[solved].all()
+    late = begun_late(cases, plans, np.full(6, 0.25, np.float32))
+    verdict = pj.block.judge(cases, late)
+    assert not verdict.success.any()
+    assert not np.isin(verdict.failed_limit[solved], ("start", "continuity", "velocity")).any()
+
+
+def test_the_noise_of_a_throw_can_be_its_own_in_any_batch(cases):
+    seeds = np.arange(6, dtype=np.uint32)
+    every = decide(SMALL, cases, eye(std=0.02), [0.2], seed=seeds, aims=AIMS[:1])
+    some = decide(SMALL, lane(cases, slice(2, 5)), eye(std=0.02), [0.2], seed=seeds[2:5], aims=AIMS)
+    np.testing.assert_allclose(
+        every.fits.belief.mean[:, 2:5], some.fits.belief.mean, rtol=1e-4, atol=1e-4
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"moments": []}, ValueError, "moments must rise from 0 or later"),
+        ({"moments": [0.3, 0.2]}, ValueError, "moments must rise from 0 or later"),
+        ({"overhead": -0.1}, ValueError, "overhead must be >= 0, got -0.1"),
+        ({"planner": pj.block.planner("direct")}, TypeError, "DirectBlock decides once"),
+    ],
+)
+def test_what_cannot_be_decided_is_refused_in_a_line(cases, change, error, message):
+    given = {"planner": SMALL, "moments": [0.2, 0.3], **change}
+    with pytest.raises(error, match=message):
+        decide(given.pop("planner"), cases, eye(), **given)
+
+
+def test_times_before_a_motion_are_refused(cases):
+    plans = pj.plan(SMALL, cases)
+    with pytest.raises(ValueError, match="elapsed must be >= 0, got -0.1"):
+        AGAIN.begin(cases, plans, -0.1)
+
+
+@pytest.mark.parametrize(
+    ("given", "name"),
+    [
+        ({"count": -1.0}, "count"),
+        ({"frame_rate": 0.0}, "frame_rate"),
+        ({"perception": True, "delay": 0.1}, "delay"),
+        ({"perception": True, "count": 0.1}, "count"),
+        ({"perception": True, "refit": 20.0, "wait": 0.1}, "wait"),
+    ],
+)
+def test_settings_that_do_not_fit_are_named(given, name):
+    with pytest.raises(SettingError, match=f"^{name} must be"):
+        BlockSettings(**given)
+
+
+@pytest.mark.slow
+def test_sweeps_show_what_was_seen_and_how_long_planning_took(tmp_path):
+    seen = BlockSettings(planner="direct", regime="R1", wide=True, num=4, perception=True)
+    manifest = start_sweep(TASK, seen, tmp_path / "seen", progress=False)
+    assert 0.0 < manifest["summary"]["fit_error_median"] < 0.3
+    counted = BlockSettings(planner="direct", regime="R1", num=4, count=0.0)
+    manifest = start_sweep(TASK, counted, tmp_path / "counted", progress=False)
+    assert 0.0 < manifest["summary"]["planning_p50"] <= manifest["summary"]["planning_p99"]
+    assert (
+        start_sweep(
+            TASK, dataclasses.replace(counted, count=5.0), tmp_path / "late", progress=False
+        )["summary"]["successes"]
+        == 0
+    )  # the ball is there before
+
+
+def test_balls_that_come_back_in_time_are_those_of_the_case(cases):
+    """The ball of a re-planned case is at its time 0, whatever the delay is by then."""
+    plans = pj.plan(SMALL, cases)
+    task = AGAIN.begin(cases, plans, 0.2)
+    here = jax.vmap(drag_free_flight)(task.case.ball, task.case.delay, task.case.gravity)
+    there = jax.vmap(drag_free_flight)(cases.ball, cases.delay + 0.2, cases.gravity)
+    np.testing.assert_allclose(here.pos, there.pos, atol=1e-5)
