@@ -78,7 +78,8 @@ def measure(bench: Bench, regime: str, rows: list[str], options: Any) -> None:
     """Plan once, and carry the plans out in every row."""
     from planner_jax.protocol import is_solved
     from planner_jax.sims.robots.arm.drives import TORQUES, Drives
-    from planner_jax.sims.tasks.block import BLOCK_WORLD, fly_blocks, throws, timed_plans
+    from planner_jax.sims.tasks.block import BLOCK_WORLD, fly_blocks, throws
+    from planner_jax.sweep.timing import timed_plans
     from planner_jax.task.block.words import judge, planner
 
     sense, allowed = 0.133, 0.03

@@ -16,10 +16,9 @@ from planner_jax.sweep.run_folder import RunFolder
 from planner_jax.sweep.source import Chunk, Source
 from planner_jax.sweep.summary import percent
 from planner_jax.sweep.sweep import Sweep
-from planner_jax.sweep.timing import CompileClock, Stopwatch
+from planner_jax.sweep.timing import WARM_CALLS, CompileClock, Stopwatch
 
 _UNDER_WAY = 2  # chunks that are judged or written while the next is planned
-_WARM_CALLS = 3  # at most, until nothing is compiled
 _MEASURED = {
     "compile_seconds": "JAX tracing, lowering, compiling or reading its cache, while chunks were "
     "made; overlapping spans counted once",
@@ -188,7 +187,7 @@ def _warm_first_chunk(run: SweepRun) -> tuple[int, float]:
     """
     chunk = run.source.chunk(0)
     seconds = 0.0
-    for _ in range(_WARM_CALLS):
+    for _ in range(WARM_CALLS):
         _, seconds, warm = _timed_plan(run, chunk.cases)
         if warm:
             break

@@ -3,11 +3,17 @@
 import time
 from typing import Any
 
+import jax
 import jax.monitoring
+import numpy as np
+
+from planner_jax.planning.plan import plan
+from planner_jax.protocol import lane
 
 # Tracing, lowering and the backend's compilation, which includes reading the compile cache.
 # Inner functions are traced inside outer ones: spans are joined, not added.
 _COMPILING = "/jax/core/compile/"
+WARM_CALLS = 3  # at most, until nothing is compiled
 
 
 class CompileClock:
@@ -58,3 +64,24 @@ class Stopwatch:
         """Seconds since the last call, or since the start."""
         last, self._last = self._last, time.perf_counter()
         return self._last - last
+
+
+def timed_plans(planner: Any, cases: Any) -> tuple[Any, np.ndarray]:
+    """Plans of cases (B,), made one after another, and the seconds (B,) that each took.
+
+    A plan in whose time something was compiled is made again; by a planner that compiles in every
+    call it is timed with that.
+    """
+    plans, seconds = [], []
+    for k in range(cases.batch_shape[0]):
+        case = lane(cases, k)
+        for _ in range(WARM_CALLS):
+            with CompileClock() as clock:
+                watch = Stopwatch()
+                found = plan(planner, case)
+                spent = watch.lap()
+            if not clock.compiled:
+                break
+        plans.append(found)
+        seconds.append(spent)
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *plans), np.array(seconds)

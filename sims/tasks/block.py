@@ -9,7 +9,6 @@ seen; places are in the robot's base frame, those of recordings in the world, th
 """
 
 import dataclasses
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,8 +17,7 @@ import jax
 import numpy as np
 
 from planner_jax.plan_files import named_leaves
-from planner_jax.planning.plan import plan as plan_all
-from planner_jax.protocol import is_solved, lane
+from planner_jax.protocol import is_solved
 from planner_jax.referee.arm_clearance import clearances, links_of, shield_middle
 from planner_jax.referee.block import times_inside
 from planner_jax.referee.solids import from_segment, turned, turned_back
@@ -48,6 +46,7 @@ from planner_jax.sweep.figures.style import (
 )
 from planner_jax.sweep.summary import percent
 from planner_jax.sweep.table import RateTable
+from planner_jax.sweep.timing import timed_plans
 from planner_jax.task.block.card import SUITES
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.plan import BlockPlan
@@ -144,21 +143,6 @@ def throws(
     """Throws of a suite; see `pj.block.draw`."""
     cases = draw_throws(num, suite, seed, regime=regime, wide=wide, delay=delay)
     return Throws(index=np.arange(num), cases=jax.tree.map(np.asarray, cases))
-
-
-def timed_plans(planner: Any, cases: BlockCase) -> tuple[BlockPlan, np.ndarray]:
-    """Plans of cases, made one after another, and the seconds (B,) that each took.
-
-    The first one is made twice, so that no compiling is in them.
-    """
-    every = [lane(cases, k) for k in range(len(cases.gravity))]
-    plan_all(planner, every[0])
-    plans, seconds = [], []
-    for case in every:
-        began = time.perf_counter()
-        plans.append(plan_all(planner, case))
-        seconds.append(time.perf_counter() - began)
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *plans), np.array(seconds)
 
 
 def courses_of(cases: BlockCase, plans: BlockPlan) -> Course:

@@ -1,7 +1,6 @@
 """Sweeps of blocks with more of the pipeline: balls that are only seen, planning by the clock."""
 
 import dataclasses
-import time
 import zlib
 from typing import Any
 
@@ -12,9 +11,8 @@ from jax import Array
 
 from planner_jax.ball.flight import drag_free_flight
 from planner_jax.perception.fit import FlightFit, across_std, believed_at, error_across
-from planner_jax.planning.plan import plan
 from planner_jax.protocol import lane
-from planner_jax.sweep.timing import CompileClock
+from planner_jax.sweep.timing import timed_plans
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.end_poses import flight_of
 from planner_jax.task.block.eye import eye
@@ -118,27 +116,6 @@ class CountedPlanner:
         met = begun_late(cases, plans, late)
         parts = {field.name: getattr(met, field.name) for field in dataclasses.fields(met)}
         return jax.tree.map(np.asarray, TimedPlan(**parts, planning_time=seconds))
-
-
-def timed_plans(planner: Any, cases: BlockCase) -> tuple[BlockPlan, np.ndarray]:
-    """Plans of cases, made one after another, and the seconds (B,) that each took."""
-    found = [timed_plan(planner, lane(cases, k)) for k in range(cases.batch_shape[0])]
-    plans = jax.tree.map(lambda *leaves: np.stack(leaves), *(each for each, _ in found))
-    return plans, np.array([seconds for _, seconds in found])
-
-
-def timed_plan(planner: Any, case: Any) -> tuple[Any, float]:
-    """The plan of one case, and the seconds that it took.
-
-    If something was compiled meanwhile it is made again.
-    """
-    while True:
-        with CompileClock() as clock:
-            began = time.perf_counter()
-            found = plan(planner, case)
-            seconds = time.perf_counter() - began
-        if not clock.compiled:
-            return found, seconds
 
 
 @jax.jit

@@ -16,7 +16,7 @@ from jax import Array
 from planner_jax.ball.flight import BallState, drag_free_flight
 from planner_jax.optimise.levenberg import LevenbergConfig, least_squares
 from planner_jax.planning.batch import better_of, merged
-from planner_jax.planning.one_by_one import suited
+from planner_jax.planning.one_by_one import OneByOne
 from planner_jax.planning.replan import Replanning
 from planner_jax.protocol import Attempt, Drive, is_unsolved, lane
 from planner_jax.robot.arm import shield_pose
@@ -39,7 +39,7 @@ class Warm(Attempt):
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class WarmBlock:
+class WarmBlock(OneByOne):
     """Motions bent from those that are carried out; of tasks as `ReplanBlock.begin` makes them."""
 
     case_type: ClassVar[type] = Replanning
@@ -53,10 +53,6 @@ class WarmBlock:
         point = self.rest(task)
         end = least_squares(lambda point: planner.model(point, case, flight), point, attempt.solver)
         return planner.plan_at(case, flight, end.point, end.steps)
-
-    def solve_lanes(self, tasks: Replanning, attempt: Warm) -> BlockPlan:
-        """The plans of a batch: on a CPU one after another."""
-        return suited(lambda task: self.solve(task, attempt), tasks)
 
     def rest(self, task: Replanning) -> Array:
         """The unknowns of what is left of the previous motion, over the time until the contact.

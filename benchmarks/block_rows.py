@@ -1,0 +1,183 @@
+"""Every row of the blocks' protocol, and beside each what other methods make of the same throws.
+
+    python -m benchmarks.block_rows [--num 2000] [--seed 7] [--rows "R2,R2 late"] [--starts 192]
+        [--lanes N] [--planner online] [--write] [--out DIR]
+
+Planning time is not taken off. Of each row, in percent of all throws:
+* end pose: a pose of the shield that meets the ball, touches nothing and, by the limits of the
+  joints, can be reached in time by a straight motion, whatever it would run into: nearly an upper
+  bound, as far as the poses that are looked at go;
+* straight: the same motion, if it touches nothing;
+* planner: what is measured here;
+* long: of those that none of these blocks, least squares from --starts random starts of 40 steps
+  each, none given up;
+* union: by any of the last three. The share is the planner's of it.
+
+All but the end poses are what the referee says. --write keeps the throws with these columns in
+`block_throws.csv` beside this file, a line a throw: of each method a digit for every row of the
+throw's suite, in the order that the head of the file gives, 1 where it blocks the throw.
+"""
+
+import csv
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+import planner_jax as pj
+from planner_jax.benchmarks.block_starts import LATER_RANKS, SPREAD
+from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin, chosen
+from planner_jax.optimise.levenberg import least_squares
+from planner_jax.sweep.summary import wilson_interval
+from planner_jax.task.block.clearance import least_clearances
+from planner_jax.task.block.end_poses import end_poses, flight_of
+from planner_jax.task.block.online import OnlineBlock, Search
+
+# Suite and settings of a row; late: 0.133 s until the arm may start.
+LATE = 0.133
+ROWS: dict[str, tuple[str, dict[str, Any]]] = {
+    "R1": ("pole", {"regime": "R1"}),
+    "R1 late": ("pole", {"regime": "R1", "delay": LATE}),
+    "R1 wide": ("pole", {"regime": "R1", "wide": True}),
+    "R2": ("pole", {}),
+    "R2 late": ("pole", {"delay": LATE}),
+    "R2 wide": ("pole", {"wide": True}),
+    "R2 wide late": ("pole", {"wide": True, "delay": LATE}),
+    "short R2 wide late": ("short", {"wide": True, "delay": LATE}),
+    "open R1": ("open", {"regime": "R1"}),
+    "open R2": ("open", {}),
+    "open R2 late": ("open", {"delay": LATE}),
+}
+METHODS = ("end pose", "straight", "planner", "long", "union")
+STEPS = 40  # of least squares, of the long search
+STRAIGHT = OnlineBlock(searches=(Search(tries=0),))
+
+
+@jax.jit
+@jax.vmap
+def has_end_pose(case: pj.block.BlockCase) -> Array:
+    """Whether there is a pose in time that touches nothing, () bool."""
+    poses = end_poses(case, flight_of(case), STRAIGHT.points, STRAIGHT.pieces)
+    gaps = least_clearances(case.arm, case.scene, poses.angles)
+    inside = (poses.angles >= case.arm.lower) & (poses.angles <= case.arm.upper)
+    return jnp.any((poses.effort <= 1.0) & (gaps > 0.0) & jnp.all(inside, axis=1))
+
+
+@jax.jit
+def long_search(cases: pj.block.BlockCase, bumps: Array, ranks: Array) -> pj.block.BlockPlan:
+    """The best plan of each case (B,) from starts with bumps (N, 6) [rad] and ranks (N,)."""
+    online = OnlineBlock()
+    solver = dataclasses.replace(Search().solver, max_steps=STEPS, hope=None)
+
+    def of_case(case: pj.block.BlockCase) -> pj.block.BlockPlan:
+        flight = flight_of(case)
+        poses = end_poses(case, flight, online.points, online.pieces)
+        order = online.order(poses, LATER_RANKS)
+
+        def of_start(bump: Array, rank: Array) -> pj.block.BlockPlan:
+            start = online.straight_point(case, poses, order[rank])
+            start = start.at[:-1].add(online.bump(bump).reshape(-1))
+            end = least_squares(lambda point: online.model(point, case, flight), start, solver)
+            return online.plan_at(case, flight, end.point, end.steps)
+
+        plans = jax.vmap(of_start)(bumps, ranks)
+        excess = jnp.where(jnp.isnan(plans.violation), jnp.inf, plans.violation)
+        return jax.tree.map(lambda leaf: leaf[jnp.argmin(excess)], plans)
+
+    return jax.vmap(of_case)(cases)
+
+
+def blocked_long(cases: pj.block.BlockCase, index: np.ndarray, starts: int, lanes: int) -> Any:
+    """Which of the cases with an index (N,) a long search blocks, by the referee, (N,) bool."""
+    rng = np.random.default_rng(2)
+    bumps = rng.normal(size=(starts, 6)) * SPREAD * rng.uniform(0.3, 1.8, (starts, 1))
+    ranks = rng.integers(0, LATER_RANKS, starts)
+    given = jnp.asarray(bumps, jnp.float32), jnp.asarray(ranks)
+    size, found = max(1, lanes // starts), []
+    for first in range(0, len(index), size):
+        here = index[first : first + size]
+        some = pj.lane(cases, np.resize(here, size))
+        plans = jax.device_get(long_search(some, *given))
+        good = pj.block.judge(some, plans).success & pj.solved(plans)
+        found.append(good[: len(here)])
+    return np.concatenate([np.zeros(0, bool), *found])
+
+
+def blocked(cases: pj.block.BlockCase, planner: Any) -> np.ndarray:
+    """Which cases (B,) a planner blocks, by the referee."""
+    plans = pj.plan(planner, cases)
+    return np.asarray(pj.block.judge(cases, plans).success & pj.solved(plans))
+
+
+def measure(bench: Bench, name: str, options: Any) -> dict[str, np.ndarray]:
+    """One row: which throws each method blocks, (N,) bool each."""
+    suite, settings = ROWS[name]
+    cases = pj.block.draw(options.num, suite, options.seed, **settings)
+    found = {
+        "end pose": np.asarray(has_end_pose(cases)),
+        "straight": blocked(cases, STRAIGHT),
+        "planner": blocked(cases, pj.block.planner(options.planner)),
+    }
+    left = np.flatnonzero(~(found["straight"] | found["planner"]))
+    found["long"] = np.zeros(options.num, bool)
+    found["long"][left] = blocked_long(cases, left, options.starts, options.lanes)
+    found["union"] = found["straight"] | found["planner"] | found["long"]
+    share = found["planner"].sum() / max(1, found["union"].sum())
+    low, high = wilson_interval(int(found["planner"].sum()), options.num)
+    rates = " | ".join(f"{100 * found[method].mean():.2f}" for method in METHODS)
+    bench.say(f"| {name} | {rates} | {100 * share:.1f} | {100 * low:.1f} to {100 * high:.1f} |")
+    bench.row(row=name, share=share, **{method: int(found[method].sum()) for method in METHODS})
+    bench.count(found["planner"])
+    return found
+
+
+def keep(path: Path, results: dict[str, dict[str, np.ndarray]], options: Any) -> None:
+    """Write the throws, and which method blocks each in which rows."""
+    suites = {ROWS[name][0]: [] for name in results}
+    for name in results:
+        suites[ROWS[name][0]].append(name)
+    with path.open("w", newline="") as file:
+        for suite, names in suites.items():
+            file.write(f"# {suite}: a digit each for {', '.join(names)}\n")
+        writer = csv.writer(file, lineterminator="\n")
+        place = ("x [m]", "y [m]", "z [m]", "vx [m/s]", "vy [m/s]", "vz [m/s]")
+        writer.writerow(["suite", "throw", *place, *METHODS])
+        for suite, names in suites.items():
+            balls = pj.block.draw(options.num, suite, options.seed).ball
+            states = np.concatenate([balls.pos, balls.vel], axis=1)
+            for throw, state in enumerate(states):
+                marks = (
+                    "".join("01"[int(results[name][method][throw])] for name in names)
+                    for method in METHODS
+                )
+                numbers = (f"{number:.6g}" for number in state)
+                writer.writerow([suite, throw, *numbers, *marks])
+
+
+def main() -> None:
+    """Print the rows asked for."""
+    parser = argument_parser("block_rows", __doc__, num=2000, seed=7, starts=192)
+    parser.add_argument("--rows", default=",".join(ROWS), help=f"out of {', '.join(ROWS)}")
+    parser.add_argument("--lanes", type=at_least(1), default=192, help="starts tried at once")
+    parser.add_argument("--planner", default="online", help="default: online")
+    parser.add_argument("--write", action="store_true", help="keep throws and columns in a file")
+    options = parser.parse_args()
+    names = chosen(parser, "--rows", options.rows, ROWS)
+    with begin(parser, options) as bench:
+        bench.say(
+            f"| row | {' | '.join(METHODS)} | of the union | 95 % |",
+            "|---" * (len(METHODS) + 3) + "|",
+        )
+        results = {name: measure(bench, name, options) for name in names}
+        if options.write:
+            path = Path(__file__).with_name("block_throws.csv")
+            keep(path, results, options)
+            bench.say(f"Written: {path.name}.")
+
+
+if __name__ == "__main__":
+    main()
