@@ -333,13 +333,17 @@ def planning(bench: Bench, num: int, seed: int) -> None:
     plans, seconds = timed_with_aims(planner, first)
     tasks = ReplanBlock().begin(first, plans, later.delay - first.delay, ball=later.ball)
     moving = pj.lane(tasks, np.flatnonzero(pj.solved(plans)))
-    _, more = timed_with_aims(ReplanBlock(), moving)
-    for name, spent in (("first", seconds), ("next", more)):
+    again, more = timed_with_aims(ReplanBlock(), moving)
+    rows = (("first", seconds, plans), ("next", more, again))
+    for name, spent, found in rows:
+        some = pj.solved(found)
         quick, slow = 1e3 * np.percentile(spent, [50, 99])
         bench.say(
             "",
             f"Planning the {name} motion of one throw, {len(spent)} throws: p50 {quick:.1f} ms, "
-            f"p99 {slow:.1f} ms, {100.0 * np.mean(spent > OVERHEAD):.1f} % above the overhead; "
+            f"p99 {slow:.1f} ms; {percent(int(some.sum()), len(some))} % have one, and "
+            f"{percent(int((some & (spent > OVERHEAD)).sum()), len(some))} % later than the "
+            "overhead allows; "
             f"{jax.devices()[0].platform}, load average {os.getloadavg()[0]:.1f}",
         )
         bench.note(**{f"{name}_planning_p50_ms": quick, f"{name}_planning_p99_ms": slow})

@@ -45,7 +45,10 @@ ALLOWED = {
         *("ball", "cost", "lanes", "optimise", "planning", "protocol", "referee", "registry"),
         *("perception", "plane", "robot", "space", "trajectory"),
     },
-    "sweep": {"ball", "lanes", "plane", "planning", "protocol", "registry", "robot", "task"},
+    "sweep": {
+        *("ball", "lanes", "perception", "plane"),
+        *("planning", "protocol", "registry", "robot", "task"),
+    },
     "compile_cache": set(),
     "doctor": {"compile_cache", "lanes", "planning", "protocol", "registry", "sweep"},
     "cli": {"compile_cache", "doctor", "registry", "sweep"},
