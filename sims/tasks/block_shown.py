@@ -1,0 +1,112 @@
+"""How blocks are shown: the scene around the arm, the time budget, what the joints did."""
+
+from typing import Any
+
+import numpy as np
+
+from planner_jax.robot.arm import Arm
+from planner_jax.sims.scenery import Part
+from planner_jax.sweep.figures.style import BLUE, GREEN, GREY, INK, PALE, PURPLE, RED, SKY, label
+from planner_jax.sweep.table import RateTable
+from planner_jax.task.block.scene import FLOOR, Box, paper_scene
+
+_POLE = 3.0  # [m], of the pole as it is drawn
+_BARS = 32  # balls at most, in the picture of the time budget
+# What becomes of the time of flight, the parts of `Budget`.
+BUDGET = {
+    "sense": "until the ball's flight is known",
+    "plan": "making the plan, by the clock",
+    "wait": "of what planning is allowed, left over",
+    "move": "the plan's motion",
+    "stand": "at its end, until the planned contact",
+    "rest": "from there until the ball is in the inner box",
+}
+
+
+def _boxed(box: Box, colour: str, opacity: float) -> Part:
+    """A box of the scene as it is drawn, in the world."""
+    lower, upper = np.asarray(box.lower, float), np.asarray(box.upper, float)
+    (x, y, z), (length, width, height) = 0.5 * (lower + upper), upper - lower
+    return Part("box", (length, width, height), (x, y, z - FLOOR), colour, opacity=opacity)
+
+
+def _around(ends: np.ndarray, radius: float) -> np.ndarray:
+    """Corners (2, 3) [m] of the box around a beam along an axis, of two ends (2, 3)."""
+    across = radius * (ends[0] == ends[1])
+    return np.stack([ends.min(axis=0) - across, ends.max(axis=0) + across])
+
+
+def scenery(arm: Arm, has_pole: bool) -> tuple[Part, ...]:
+    """Both boxes, the beams, what the arm stands on and the pole, as they are drawn."""
+    scene, (lower, upper) = paper_scene(), arm.base_box
+    parts = [_boxed(scene.inner, GREEN, 0.1), _boxed(scene.outer, SKY, 0.07)]
+    for ends, radius in zip(scene.beam_ends, scene.beam_radius, strict=True):
+        parts.append(_boxed(Box(*_around(np.asarray(ends, float), float(radius))), GREY, 1.0))
+    x, y, _ = 0.5 * (lower + upper)
+    length, width, _ = upper - lower
+    parts.append(Part("box", (length, width, -FLOOR), (x, y, -0.5 * FLOOR), GREY))
+    if has_pole:
+        x, y = map(float, scene.pole)
+        wide = 2.0 * float(scene.pole_radius)
+        parts.append(Part("cylinder", (wide, wide, _POLE), (x, y, 0.5 * _POLE), "#5B6B73"))
+    return tuple(parts)
+
+
+def budget_table(rows: Any) -> RateTable:
+    """Where the time of flight goes: eq. (1) of paper 004, from the rows of a run."""
+    planned = np.asarray(rows["planned"])
+    parts = {name: 1e3 * np.asarray(rows[f"time_{name}"])[planned] for name in BUDGET}
+    parts["flight, the sum"] = np.sum(list(parts.values()), axis=0)
+    cells = []
+    for name, values in parts.items():
+        figures = [values.mean(), *np.quantile(values, (0.1, 0.5, 0.9))] if values.size else []
+        words = f"{name}: {BUDGET[name]}" if name in BUDGET else name
+        cells.append([words, *(f"{figure:.1f}" for figure in figures)])
+    title = "Time until the ball gets into the inner box, of balls with a plan [ms]"
+    return RateTable(title, ["part", "mean", "10 %", "median", "90 %"], cells)
+
+
+def joint_table(rows: Any) -> RateTable:
+    """Errors and torques of the joints of arms with a plan."""
+    planned = np.asarray(rows["planned"])
+
+    def of(name: str) -> np.ndarray:
+        return np.stack(rows[name].to_numpy(zero_copy_only=False))[planned]
+
+    cells = []
+    for joint in range(6) if planned.any() else ():
+        rms = (np.sqrt((of(name)[:, joint] ** 2).mean()) for name in ("error_rms", "torque_rms"))
+        error, torque = rms
+        worst = (of(name)[:, joint].max() for name in ("error_worst", "torque_worst"))
+        error_worst, torque_worst = worst
+        share = 100.0 * of("saturated")[:, joint].mean()
+        cells.append(
+            [
+                f"{joint + 1}",
+                f"{1e3 * error:.2f}",
+                f"{1e3 * error_worst:.2f}",
+                f"{torque:.3g}",
+                f"{torque_worst:.3g}",
+                f"{share:.2f}",
+            ]
+        )
+    header = ["joint", "error rms [mrad]", "worst", "torque rms [N m]", "worst", "at its limit %"]
+    return RateTable("Joints, from the start of the arm to the contact", header, cells)
+
+
+def budget_figure(figure: Any, rows: Any) -> None:
+    """A bar a ball, from when it is first seen until it gets into the inner box."""
+    axes = figure.add_subplot()
+    number = min(len(rows), _BARS)
+    flights = np.arange(number)
+    left = np.zeros(number)
+    for name, colour in zip(BUDGET, (PURPLE, RED, PALE, BLUE, GREEN, SKY), strict=True):
+        width = 1e3 * np.asarray(rows[f"time_{name}"])[:number]
+        axes.barh(flights, np.maximum(width, 0.0), 0.8, left, color=colour, label=name)
+        left += width  # negative where an arm moves beyond the planned contact
+    contact = 1e3 * np.asarray(rows["contact_time"])[:number]
+    axes.plot(contact, flights, "|", color=INK, ms=9, label="blocked")
+    axes.set_yticks([])
+    axes.invert_yaxis()
+    axes.legend(ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.06))
+    label(axes, "time since the ball is first seen [ms]", f"the first {number} balls")
