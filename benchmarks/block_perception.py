@@ -45,8 +45,8 @@ from planner_jax.perception.fit import across_std, believed_at, error_across, fi
 from planner_jax.perception.noise import StereoNoise, depth_std, information, noisy_depth
 from planner_jax.perception.segment import ball_look, sighting
 from planner_jax.robot.arm_mjcf import irb1600
-from planner_jax.sweep.block.pipeline import timed_plan
 from planner_jax.sweep.summary import percent, wilson_interval
+from planner_jax.sweep.timing import timed_warm
 from planner_jax.task.block.case import ANYWHERE
 from planner_jax.task.block.end_poses import flight_of
 from planner_jax.task.block.eye import Eye, cautious, eye, fitted, frame_times, see, watched
@@ -361,7 +361,8 @@ def timed_with_aims(planner: Any, entries: Any) -> tuple[Any, np.ndarray]:
     for k in range(num):
         plan: Any = None
         for each in aimed:
-            plan, spent = timed_plan(planner, pj.lane(each, k))
+            entry = pj.lane(each, k)
+            plan, spent = timed_warm(lambda entry=entry: pj.plan(planner, entry))
             seconds[k] += spent
             if pj.solved(plan):
                 break

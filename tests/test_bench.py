@@ -1,7 +1,9 @@
 """Benchmarks write run folders, and throughput is measured of tasks that nobody has heard of."""
 
 import dataclasses
+import importlib
 import json
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -10,11 +12,20 @@ import pytest
 from flax import struct
 
 import planner_jax as pj
-from planner_jax import registry
+from planner_jax import benchmarks, registry
 from planner_jax.benchmarks.cost_gap import gap_figures
 from planner_jax.benchmarks.run import Bench
 from planner_jax.benchmarks.throughput import report
 from planner_jax.sweep.settings import SettingError
+
+BENCHMARKS = sorted(Path(benchmarks.__path__[0]).glob("*.py"))
+
+
+@pytest.mark.parametrize("path", BENCHMARKS, ids=lambda path: path.stem)
+def test_what_a_benchmark_imports_is_there(path):
+    if path.stem == "oracle_hit":
+        pytest.importorskip("casadi")
+    importlib.import_module(f"planner_jax.benchmarks.{path.stem}")
 
 
 def read(folder, name="manifest.json"):

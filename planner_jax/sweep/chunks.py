@@ -16,7 +16,7 @@ from planner_jax.sweep.run_folder import RunFolder
 from planner_jax.sweep.source import Chunk, Source
 from planner_jax.sweep.summary import percent
 from planner_jax.sweep.sweep import Sweep
-from planner_jax.sweep.timing import WARM_CALLS, CompileClock, Stopwatch
+from planner_jax.sweep.timing import CompileClock, Stopwatch, timed, timed_warm
 
 _UNDER_WAY = 2  # chunks that are judged or written while the next is planned
 _MEASURED = {
@@ -130,7 +130,7 @@ class _Planned:
 
 def _plan_chunk(run: SweepRun, chunk: Chunk, clock: CompileClock) -> _Planned:
     """One chunk's plans. What the clock has counted since the chunk before is its compilation."""
-    plans, seconds, warm = _timed_plan(run, chunk.cases)
+    plans, seconds, warm = timed(lambda: run.sweep.plan(run.planner, chunk.cases))
     record = {"num": len(chunk), "plan_seconds": seconds, "warm": warm}
     record["compile_seconds"] = clock.lap()
     return _Planned(chunk, plans, record)
@@ -150,14 +150,6 @@ def _judge_chunk(
     }
     batch = RefereedBatch(planned.chunk, planned.plans, verdict)
     return number, rows_of(run.sweep.columns(batch), batch, run.sweep.frame), record
-
-
-def _timed_plan(run: SweepRun, cases: Any) -> tuple[Any, float, bool]:
-    """Plans, the seconds they took, and whether nothing was compiled meanwhile."""
-    watch = Stopwatch()
-    with CompileClock() as clock:
-        planned = run.sweep.plan(run.planner, cases)
-    return planned, watch.lap(), not clock.compiled
 
 
 def _times(run: SweepRun) -> dict[str, Any]:
@@ -181,14 +173,7 @@ def _times(run: SweepRun) -> dict[str, Any]:
 
 
 def _warm_first_chunk(run: SweepRun) -> tuple[int, float]:
-    """Number of plans and seconds of the first chunk, planned until nothing is compiled.
-
-    A planner that compiles something in every call is timed with that.
-    """
+    """Number of plans and seconds of the first chunk, planned until nothing is compiled."""
     chunk = run.source.chunk(0)
-    seconds = 0.0
-    for _ in range(WARM_CALLS):
-        _, seconds, warm = _timed_plan(run, chunk.cases)
-        if warm:
-            break
+    _, seconds = timed_warm(lambda: run.sweep.plan(run.planner, chunk.cases))
     return len(chunk), seconds

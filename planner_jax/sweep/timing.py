@@ -1,7 +1,8 @@
 """Seconds of a sweep: those in which JAX compiled apart from those of warm planning."""
 
 import time
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import jax
 import jax.monitoring
@@ -13,7 +14,9 @@ from planner_jax.protocol import AnyPlanner, lane
 # Tracing, lowering and the backend's compilation, which includes reading the compile cache.
 # Inner functions are traced inside outer ones: spans are joined, not added.
 _COMPILING = "/jax/core/compile/"
-WARM_CALLS = 3  # at most, until nothing is compiled
+_WARM_CALLS = 3  # at most, until nothing is compiled
+
+FoundT = TypeVar("FoundT")
 
 
 class CompileClock:
@@ -66,23 +69,29 @@ class Stopwatch:
         return self._last - last
 
 
-def timed_plans(planner: AnyPlanner[CaseT, PlanT], cases: CaseT) -> tuple[PlanT, np.ndarray]:
-    """Plans of cases (B,), made one after another, and the seconds (B,) that each took.
+def timed(call: Callable[[], FoundT]) -> tuple[FoundT, float, bool]:
+    """What a call gives, the seconds that it took, and whether nothing was compiled meanwhile."""
+    watch = Stopwatch()
+    with CompileClock() as clock:
+        found = call()
+    return found, watch.lap(), not clock.compiled
 
-    A plan in whose time something was compiled is made again; by a planner that compiles in every
-    call it is timed with that.
+
+def timed_warm(call: Callable[[], FoundT]) -> tuple[FoundT, float]:
+    """What a call gives, and the seconds that it takes once nothing is compiled.
+
+    One that compiles something in every call is timed with that.
     """
-    plans: list[PlanT] = []
-    seconds: list[float] = []
-    for k in range(jax.tree.leaves(cases)[0].shape[0]):
-        case = lane(cases, k)
-        for call in range(WARM_CALLS):
-            with CompileClock() as clock:
-                watch = Stopwatch()
-                found = plan(planner, case)
-                spent = watch.lap()
-            if not clock.compiled or call == WARM_CALLS - 1:
-                plans.append(found)
-                seconds.append(spent)
-                break
+    for _ in range(_WARM_CALLS - 1):
+        found, seconds, warm = timed(call)
+        if warm:
+            return found, seconds
+    return timed(call)[:2]
+
+
+def timed_plans(planner: AnyPlanner[CaseT, PlanT], cases: CaseT) -> tuple[PlanT, np.ndarray]:
+    """Plans of cases (B,), made one after another, and the seconds (B,) that each takes, warm."""
+    num = jax.tree.leaves(cases)[0].shape[0]
+    timed_each = [timed_warm(lambda k=k: plan(planner, lane(cases, k))) for k in range(num)]
+    plans, seconds = zip(*timed_each, strict=True)
     return jax.tree.map(lambda *leaves: np.stack(leaves), *plans), np.array(seconds)

@@ -180,7 +180,8 @@ def fly_blocks(
     if allowed is not None and not 0.0 <= allowed <= delay.min() + 1e-6:
         raise ValueError(f"allowed must be >= 0 and <= the delay {delay.min():g}, got {allowed:g}")
     if plan is None:
-        plan, seconds = timed_plans(planner or block_planner(), case)
+        made: tuple[BlockPlan, np.ndarray] = timed_plans(planner or block_planner(), case)
+        plan, seconds = made
     seconds = np.zeros(len(cases)) if seconds is None or allowed is None else seconds
     allowed = allowed or 0.0
     solved = np.asarray(is_solved(plan.status))
