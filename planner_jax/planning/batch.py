@@ -10,22 +10,24 @@ import functools
 import os
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec, Sharding, SingleDeviceSharding
 
 from planner_jax.planning.one_by_one import OneByOne
-from planner_jax.protocol import Attempt, HostPlanner, LanesPlanner, is_solved, is_unsolved
+from planner_jax.protocol import Attempt, HostPlanner, LanesPlanner, Plan, is_solved, is_unsolved
 
 # Lanes of a device in one call. Few, because every one is a program of its own to compile.
 BUCKETS = (16, 128, 1024, 8192, 65536)
 _CPU_CHUNK, _GPU_CHUNK = 256, 65536  # what fits the cache of a core, and what fills a GPU
 _GPU_BUSY = 8192  # starts in one call that keep a GPU busy
 _LANES = PartitionSpec("lanes")
+
+PlanT = TypeVar("PlanT", bound=Plan)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -363,6 +365,26 @@ def better_of(plans: Any, later: Any, where: Array) -> Any:
         return jnp.where(chosen.reshape(chosen.shape + (1,) * (new.ndim - chosen.ndim)), new, old)
 
     return jax.tree.map(pick, plans, later)
+
+
+def first_solved(plan_of: Callable[[Array], PlanT], num: Array | int, best: PlanT) -> PlanT:
+    """The first of a line of plans of one case that is solved, or the best where none is.
+
+    Args:
+        plan_of: makes the plan at a place () int32 of the line.
+        num: () int32, of plans in the line.
+        best: what there is already; if it is solved, nothing is made.
+    """
+
+    def next_one(state: tuple[Array, PlanT]) -> tuple[Array, PlanT]:
+        place, best = state
+        return place + 1, better_of(best, plan_of(place), jnp.asarray(True))
+
+    def is_open(state: tuple[Array, PlanT]) -> Array:
+        place, best = state
+        return (place < num) & ~is_solved(best.status)
+
+    return lax.while_loop(is_open, next_one, (jnp.zeros((), jnp.int32), best))[1]
 
 
 def merged(plans: Any, later: Any, lanes: np.ndarray) -> Any:

@@ -11,18 +11,19 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array, lax
+from jax import Array
 
-from planner_jax.planning.batch import better_of
+from planner_jax.planning.batch import first_solved
 from planner_jax.planning.one_by_one import OneByOne
-from planner_jax.protocol import Attempt, is_solved, status_of
+from planner_jax.protocol import Attempt, status_of
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import least_clearances
 from planner_jax.task.block.end_poses import EndPoses, end_poses, flight_of
 from planner_jax.task.block.plan import BlockPlan, explained, no_plan
 from planner_jax.trajectory.bang_bang import bang_bang, least_times
-from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
+from planner_jax.trajectory.polynomial import evaluate
 
+_BANG_BANG_PIECES = 13  # of the motions of six joints
 _PIECES = 10  # of the straight motions by which `end_poses` tells which poses there are
 
 
@@ -45,14 +46,6 @@ def poses_in_time(case: BlockCase, points: int) -> tuple[EndPoses, Array]:
     return poses, jnp.where(is_in_time, times, jnp.inf)
 
 
-def staying(case: BlockCase, pieces: int, degree: int) -> PiecewisePolynomial:
-    """A motion of a second that is none, of so many pieces: what is returned without a plan."""
-    coeffs = jnp.zeros((pieces, degree + 1, 6), case.angles.dtype).at[:, 0].set(case.angles)
-    return PiecewisePolynomial(
-        coeffs=coeffs, durations=jnp.zeros(pieces, case.angles.dtype).at[0].set(1.0)
-    )
-
-
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class DirectBlock(OneByOne):
@@ -71,20 +64,12 @@ class DirectBlock(OneByOne):
         order = jnp.argsort(times)
         num = jnp.minimum(jnp.sum(jnp.isfinite(times)), self.tries)
 
-        def next_one(state: tuple[Array, BlockPlan]) -> tuple[Array, BlockPlan]:
-            k, best = state
+        def plan_of(k: Array) -> BlockPlan:
             place = order[k]
-            plan = self.plan_to(case, poses.angles[place], poses.time[place], times[place])
-            return k + 1, better_of(best, plan, jnp.asarray(True))
+            return self.plan_to(case, poses.angles[place], poses.time[place], times[place])
 
-        def is_open(state: tuple[Array, BlockPlan]) -> Array:
-            k, best = state
-            return (k < num) & ~is_solved(best.status)
-
-        start = jnp.zeros((), jnp.int32), no_plan(case, staying(case, 13, 2))
-        _, best = lax.while_loop(is_open, next_one, start)
-        status = explained(case, poses, best.status)
-        return dataclasses.replace(best, status=status)
+        best = first_solved(plan_of, num, no_plan(case, _BANG_BANG_PIECES))
+        return dataclasses.replace(best, status=explained(case, poses, best.status))
 
     def plan_to(self, case: BlockCase, goal: Array, contact: Array, duration: Array) -> BlockPlan:
         """The plan to one end pose.

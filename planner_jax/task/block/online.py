@@ -22,7 +22,7 @@ from jax import Array, lax
 
 from planner_jax.ball.flight import drag_free_flight
 from planner_jax.optimise.levenberg import LevenbergConfig, Model, begun, go_on, least_squares
-from planner_jax.planning.batch import better_of
+from planner_jax.planning.batch import better_of, first_solved
 from planner_jax.planning.one_by_one import OneByOne
 from planner_jax.protocol import FEASIBILITY_TOLERANCE, Attempt, is_solved, status_of
 from planner_jax.robot.arm import product, shield_jacobian, shield_pose
@@ -142,21 +142,13 @@ class OnlineBlock(OneByOne):
         )
         order = self.order(poses, max(attempt.straight, 1 + max(ranks, default=0)))
         in_time = jnp.sum(poses.effort <= 1.0 - self.slack)
-        straight = jnp.minimum(in_time, attempt.straight)
+        straight = jnp.where(flight.comes, jnp.minimum(in_time, attempt.straight), 0)
 
-        def next_one(state: tuple) -> tuple:
-            k, best = state
+        def plan_of(k: Array) -> BlockPlan:
             point = self.straight_point(case, poses, order[k])
-            plan = self.plan_at(case, flight, point, jnp.zeros((), jnp.int32))
-            return k + 1, better_of(best, plan, jnp.asarray(True))
+            return self.plan_at(case, flight, point, jnp.zeros((), jnp.int32))
 
-        def is_open(state: tuple) -> Array:
-            k, best = state
-            return (k < straight) & flight.comes & ~is_solved(best.status)
-
-        still = jnp.zeros((self.pieces, 6), case.angles.dtype)
-        stay = polynomial(case.angles, still[0], still, case.delay + 1.0)
-        _, best = lax.while_loop(is_open, next_one, (0, no_plan(case, stay)))
+        best = first_solved(plan_of, straight, no_plan(case, self.pieces))
         if attempt.tries:
             points = jax.vmap(lambda rank: self.straight_point(case, poses, order[rank]))(ranks)
             bent = jax.vmap(self.bump)(jnp.asarray(bumps, points.dtype))
@@ -168,18 +160,9 @@ class OnlineBlock(OneByOne):
         self, case: BlockCase, flight: Flight, points: Array, attempt: Search, best: BlockPlan
     ) -> BlockPlan:
         """Least squares from each start (N, n) until one leads to a plan."""
-
-        def next_one(state: tuple) -> tuple:
-            k, best = state
-            end = least_squares(self._model_of(case, flight), points[k], attempt.solver)
-            plan = self.plan_at(case, flight, end.point, end.steps)
-            return k + 1, better_of(best, plan, jnp.asarray(True))
-
-        def is_open(state: tuple) -> Array:
-            k, best = state
-            return (k < attempt.tries) & flight.comes & ~is_solved(best.status)
-
-        return lax.while_loop(is_open, next_one, (0, best))[1]
+        tries = jnp.where(flight.comes, attempt.tries, 0)
+        bent = lambda k: self.bent(case, flight, points[k], attempt.solver)  # noqa: E731
+        return first_solved(bent, tries, best)
 
     def _in_step(
         self, case: BlockCase, flight: Flight, points: Array, attempt: Search, best: BlockPlan
@@ -196,6 +179,13 @@ class OnlineBlock(OneByOne):
         least = jnp.argmin(jnp.where(jnp.isnan(plans.violation), jnp.inf, plans.violation))
         plan = jax.tree.map(lambda leaf: leaf[least], plans)
         return better_of(best, plan, ~is_solved(best.status))
+
+    def bent(
+        self, case: BlockCase, flight: Flight, point: Array, solver: LevenbergConfig
+    ) -> BlockPlan:
+        """The plan to which least squares lead from unknowns (n,)."""
+        end = least_squares(self._model_of(case, flight), point, solver)
+        return self.plan_at(case, flight, end.point, end.steps)
 
     def _model_of(self, case: BlockCase, flight: Flight) -> Callable[[Array], Model]:
         return lambda point: self.model(point, case, flight)

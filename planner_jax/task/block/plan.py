@@ -10,7 +10,7 @@ from planner_jax.robot.arm_plan import ArmPlan
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import least_clearances
 from planner_jax.task.block.end_poses import EndPoses
-from planner_jax.trajectory.polynomial import PiecewisePolynomial
+from planner_jax.task.block.motion import polynomial
 
 
 @struct.dataclass
@@ -24,12 +24,14 @@ class BlockPlan(ArmPlan):
     contact_time: Array  # () [s], when the shield meets the ball, since the ball was first seen
 
 
-def no_plan(case: BlockCase, stay: PiecewisePolynomial) -> BlockPlan:
-    """What is given back without a plan, of one case: a motion that is none, and no success."""
+def no_plan(case: BlockCase, pieces: int) -> BlockPlan:
+    """What is given back without a plan, of one case: no success, and no motion for a second."""
     none = jnp.full((), jnp.inf, case.angles.dtype)
+    still = jnp.zeros((pieces, 6), case.angles.dtype)
+    second = jnp.ones((), case.angles.dtype)
     return BlockPlan(
-        motion=stay,
-        contact_time=case.delay + 1.0,
+        motion=polynomial(case.angles, still[0], still, second),
+        contact_time=case.delay + second,
         cost=none,
         violation=none,
         iterations=jnp.zeros((), jnp.int32),

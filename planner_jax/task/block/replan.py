@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array
 
 from planner_jax.ball.flight import BallState, drag_free_flight
-from planner_jax.optimise.levenberg import LevenbergConfig, least_squares
+from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.planning.batch import better_of, merged
 from planner_jax.planning.one_by_one import OneByOne
 from planner_jax.planning.replan import Replanning
@@ -49,10 +49,7 @@ class WarmBlock(OneByOne):
     def solve(self, task: Replanning, attempt: Warm) -> BlockPlan:
         """The plan of one case."""
         case, planner = task.case, self.planner
-        flight = flight_of(case)
-        point = self.rest(task)
-        end = least_squares(lambda point: planner.model(point, case, flight), point, attempt.solver)
-        return planner.plan_at(case, flight, end.point, end.steps)
+        return planner.bent(case, flight_of(case), self.rest(task), attempt.solver)
 
     def rest(self, task: Replanning) -> Array:
         """The unknowns of what is left of the previous motion, over the time until the contact.

@@ -19,10 +19,10 @@ from flax import struct
 from jax import Array, lax
 
 from planner_jax.ball.flight import drag_free_flight
-from planner_jax.optimise.levenberg import LevenbergConfig, least_squares
-from planner_jax.planning.batch import better_of
+from planner_jax.optimise.levenberg import LevenbergConfig
+from planner_jax.planning.batch import first_solved
 from planner_jax.planning.one_by_one import OneByOne
-from planner_jax.protocol import Attempt, Status, is_solved
+from planner_jax.protocol import Attempt, Status
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import clearances, num_of_pole
 from planner_jax.task.block.end_poses import EndPoses, Flight, end_poses, flight_of
@@ -30,7 +30,7 @@ from planner_jax.task.block.library.cells import cells_around
 from planner_jax.task.block.library.file import LibraryFileError, load_library
 from planner_jax.task.block.library.planner import LibraryBlock
 from planner_jax.task.block.library.table import pieces_of, unpacked
-from planner_jax.task.block.motion import angles_at, polynomial, profiles, sums
+from planner_jax.task.block.motion import angles_at, profiles, sums
 from planner_jax.task.block.online import OnlineBlock
 from planner_jax.task.block.plan import BlockPlan, explained, no_plan
 
@@ -108,29 +108,17 @@ class AdaptBlock(OneByOne):
         tries = jnp.where(goes, jnp.minimum(jnp.sum(warped.is_open), attempt.checks), 0)
         online = dataclasses.replace(self.online, checked=attempt.checked)
 
-        def check_next(state: tuple) -> tuple:
-            k, best = state
-            plan = online.plan_at(case, flight, warped.points[k], jnp.zeros((), jnp.int32))
-            return k + 1, better_of(best, plan, jnp.asarray(True))
+        def as_warped(k: Array) -> BlockPlan:
+            return online.plan_at(case, flight, warped.points[k], jnp.zeros((), jnp.int32))
 
-        def bend_next(state: tuple) -> tuple:
-            k, best = state
-            model = lambda point: online.model(point, case, flight)  # noqa: E731
-            end = least_squares(model, warped.points[k], attempt.solver)
-            plan = online.plan_at(case, flight, end.point, end.steps)
-            return k + 1, better_of(best, plan, jnp.asarray(True))
+        def bent(k: Array) -> BlockPlan:
+            return online.bent(case, flight, warped.points[k], attempt.solver)
 
-        def is_open(most: Any) -> Any:
-            return lambda state: (state[0] < most) & ~is_solved(state[1].status)
-
-        still = jnp.zeros((online.pieces, 6), case.angles.dtype)
-        stay = polynomial(case.angles, still[0], still, case.delay + 1.0)
-        best = no_plan(case, stay)
-        _, best = lax.while_loop(is_open(tries), check_next, (0, best))
+        best = first_solved(as_warped, tries, no_plan(case, online.pieces))
         if attempt.bent:
             there = jnp.sum(jnp.isfinite(warped.promise))
             most = jnp.where(goes, jnp.minimum(there, attempt.bent), 0)
-            _, best = lax.while_loop(is_open(most), bend_next, (0, best))
+            best = first_solved(bent, most, best)
         status = explained(case, poses, jnp.where(fits, best.status, Status.BLOCKED))
         return dataclasses.replace(best, status=status)
 
