@@ -49,7 +49,16 @@ from planner_jax.sweep.summary import percent, wilson_interval
 from planner_jax.sweep.timing import timed_warm
 from planner_jax.task.block.case import ANYWHERE
 from planner_jax.task.block.end_poses import flight_of
-from planner_jax.task.block.eye import Eye, cautious, eye, fitted, frame_times, see, watched
+from planner_jax.task.block.eye import (
+    Eye,
+    cautious,
+    eye,
+    fit_errors,
+    fitted,
+    frame_times,
+    see,
+    watched,
+)
 from planner_jax.task.block.met import as_met
 from planner_jax.task.block.receding import AIMS, decide
 from planner_jax.task.block.replan import ReplanBlock
@@ -274,7 +283,6 @@ def pipeline(bench: Bench, num: int, seed: int) -> None:
     )
     planner = pj.block.planner()
     cases = jax.tree.map(np.asarray, pj.block.draw(num, "short", seed, regime="R1", wide=True))
-    middle = middle_of(cases)
     for name, (std, (first, last, rate), options) in PIPELINES.items():
         seer, began = eye(std=std), time.perf_counter()
         moments = moments_of(first, last, rate)
@@ -288,7 +296,7 @@ def pipeline(bench: Bench, num: int, seed: int) -> None:
             tilt=np.full_like(done.cases.tilt, ANYWHERE[1]),
         )
         good, on_it = verdict.success & some, pj.block.judge(anywhere, met).success & some
-        errors = fit_errors(done.cases, pj.lane(done.fits, 0), middle)
+        errors, _ = fit_errors(done.cases, pj.lane(done.fits, 0))
         start = np.median(np.asarray(done.begun)[good])
         contact = np.median(np.asarray(met.contact_time)[good])
         low, high = (100.0 * end for end in wilson_interval(int(good.sum()), num))
@@ -314,14 +322,6 @@ def pipeline(bench: Bench, num: int, seed: int) -> None:
             begun=start,
             contact=contact,
         )
-
-
-@jax.jit
-@jax.vmap
-def fit_errors(case: Any, fit: Any, middle: Array) -> Array:
-    """Errors (B,) [m] of fits across the flight."""
-    truth = drag_free_flight(case.ball, middle, case.gravity)
-    return error_across(believed_at(fit, middle, case.gravity), truth)
 
 
 def planning(bench: Bench, num: int, seed: int) -> None:

@@ -200,21 +200,21 @@ def test_claims_are_confirmed_by_the_referee():
 
 
 def test_plans_of_a_batch_say_what_became_of_each_ball():
-    cases = jax.tree.map(np.array, pj.block.draw(6, seed=8, regime="R1", wide=True))
+    cases = jax.tree.map(np.array, pj.block.draw(8, seed=8, regime="R1", wide=True))
     cases.ball.vel[1, 0] *= -1.0  # flies away
     cases.ball.pos[2] = np.nan
-    cases.scene.floor[3] = 0.5  # above the shield
+    cases.scene.floor[6] = 0.5  # above the shield
     for box in (cases.scene.inner, cases.scene.outer):  # where the arm cannot reach
-        box.lower[4, 2] += 4.0
-        box.upper[4, 2] += 4.0
-    cases.ball.pos[4, 2] += 4.0
+        box.lower[7, 2] += 4.0
+        box.upper[7, 2] += 4.0
+    cases.ball.pos[7, 2] += 4.0
     plans = pj.plan(SMALL, cases)
     verdict: Any = pj.block.judge(cases, plans)
-    names = [pj.Status(status).name for status in plans.status[1:5]]
+    names = [pj.Status(status).name for status in plans.status[[1, 2, 6, 7]]]
     assert names == ["OUT_OF_REACH", "NON_FINITE", "BLOCKED", "OUT_OF_REACH"]
-    assert verdict.failed_limit[2] == "not finite" and not verdict.success[3]
-    others = [0, 5]
-    assert pj.solved(plans)[others].any()
+    assert verdict.failed_limit[2] == "not finite" and not verdict.success[6]
+    others = [0, 3, 4, 5]
+    assert pj.solved(plans)[others].sum() >= 3
     np.testing.assert_array_equal(verdict.success[others], pj.solved(plans)[others])
     setpoints = plans.sample(100.0)
     np.testing.assert_allclose(setpoints.angles[0, 0], cases.angles[0], atol=1e-6)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from test_block import SMALL
 
 import planner_jax as pj
 from planner_jax.ball.flight import drag_free_flight
@@ -14,7 +15,6 @@ from planner_jax.perception.fit import Sight, believed_at, error_across
 from planner_jax.task.block.end_poses import flight_of
 from planner_jax.task.block.eye import cautious, eye, frame_times, mast_camera, see
 from planner_jax.task.block.met import as_met
-from tests.test_block import SMALL
 
 
 @pytest.mark.parametrize("suite", ["pole", "short"])

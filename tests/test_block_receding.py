@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
+from test_block import SMALL
 
 import planner_jax as pj
 from planner_jax.ball.flight import drag_free_flight
@@ -19,7 +20,6 @@ from planner_jax.task.block.eye import cautious, eye
 from planner_jax.task.block.met import as_met, begun_late
 from planner_jax.task.block.receding import Aim, decide
 from planner_jax.task.block.replan import ReplanBlock, WarmBlock
-from tests.test_block import SMALL
 
 AIMS = (Aim(0.02), Aim(0.09))
 AGAIN = ReplanBlock(warm=WarmBlock(planner=SMALL), planner=SMALL)

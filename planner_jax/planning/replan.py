@@ -2,6 +2,8 @@
 
 from typing import Any, Generic, TypeVar
 
+import jax
+import numpy as np
 from flax import struct
 from jax import Array
 
@@ -24,6 +26,29 @@ class Replanning(Generic[CaseT, PlanT]):
     def batch_shape(self) -> tuple[int, ...]:
         """() for one case, (B,) for a batch."""
         return self.case.batch_shape
+
+
+def moment_of(cases: Case, elapsed: Any) -> np.ndarray:
+    """When plans that are being carried out are left, in the cases' shape and type of numbers.
+
+    Args:
+        cases: one case, or a batch.
+        elapsed: () or (B,) [s], since the plans began, >= 0.
+
+    Raises:
+        ValueError: a negative time.
+    """
+    dtypes = (np.asarray(leaf).dtype for leaf in jax.tree.leaves(cases))
+    dtype = next(dtype for dtype in dtypes if np.issubdtype(dtype, np.floating))
+    elapsed = np.broadcast_to(np.asarray(elapsed, dtype), cases.batch_shape)
+    if not np.all(elapsed >= 0.0):
+        raise ValueError(f"elapsed must be >= 0, got {np.min(elapsed)}")
+    return elapsed
+
+
+def given_or_own(given: Any, own: Any, dtype: Any) -> np.ndarray:
+    """What is known of a state, in the shape of a plan's own, which counts where it is None."""
+    return np.broadcast_to(np.asarray(own if given is None else given, dtype), np.shape(own))
 
 
 def replan(planner: Any, cases: Any, previous: PlanT, elapsed: Any, **news: Any) -> PlanT:

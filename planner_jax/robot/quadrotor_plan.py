@@ -1,7 +1,6 @@
 """Plans that a quadrotor flies, and what a controller wants to know of them."""
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +11,7 @@ from jax import Array
 from planner_jax.protocol import Plan
 from planner_jax.robot.quadrotor import body_z, flat_attitude, net_thrust, tilt_quaternion
 from planner_jax.robot.setpoints import sampled_at_rate
-from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, states_at
+from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,33 +51,6 @@ class QuadrotorPlan(Plan):
             lambda leaves, time: _sampled(*leaves, time),
         )
         return QuadrotorSetpoints(time=time, **setpoints)
-
-
-def handover(
-    cases: Any, previous: QuadrotorPlan, elapsed: Any, head_state: Any
-) -> tuple[np.ndarray, np.ndarray]:
-    """When plans that are being flown are left for new ones, and where the quadrotor is then.
-
-    Args:
-        cases: one case, or a batch, that `previous` was planned for.
-        previous: the plans that are being flown.
-        elapsed: () or (B,) [s], since they began, >= 0.
-        head_state: (4, 3) or (B, 4, 3), where the quadrotor is; None for where the plan has it.
-
-    Returns:
-        elapsed: with the batch shape of the cases, in their type of numbers.
-        head_state: (4, 3) or (B, 4, 3), likewise.
-
-    Raises:
-        ValueError: a negative time.
-    """
-    dtype = np.asarray(cases.gravity).dtype
-    elapsed = np.broadcast_to(np.asarray(elapsed, dtype), cases.batch_shape)
-    if not (elapsed >= 0.0).all():
-        raise ValueError(f"elapsed must be >= 0, got {np.min(elapsed)}")
-    if head_state is None:
-        head_state = states_at(previous.trajectory, elapsed)
-    return elapsed, np.asarray(head_state, dtype)
 
 
 @jax.jit

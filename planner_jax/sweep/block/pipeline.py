@@ -9,13 +9,11 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.ball.flight import drag_free_flight
-from planner_jax.perception.fit import FlightFit, across_std, believed_at, error_across
 from planner_jax.protocol import lane
 from planner_jax.sweep.timing import timed_plans
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.end_poses import flight_of
-from planner_jax.task.block.eye import eye
+from planner_jax.task.block.eye import eye, fit_errors
 from planner_jax.task.block.met import as_met, begun_late
 from planner_jax.task.block.plan import BlockPlan
 from planner_jax.task.block.receding import decide
@@ -60,7 +58,7 @@ class SeeingArms:
             again=self.refit > 0.0,
         )
         fits = [lane(done.fits, place) for place in (0, -1)]
-        (error, std), (last, _) = (_errors(done.cases, fit) for fit in fits)
+        (error, std), (last, _) = (fit_errors(done.cases, fit) for fit in fits)
         met = as_met(done.cases, done.plans)
         parts = {field.name: getattr(met, field.name) for field in dataclasses.fields(met)}
         return jax.tree.map(
@@ -116,17 +114,3 @@ class CountedPlanner:
         met = begun_late(cases, plans, late)
         parts = {field.name: getattr(met, field.name) for field in dataclasses.fields(met)}
         return jax.tree.map(np.asarray, TimedPlan(**parts, planning_time=seconds))
-
-
-@jax.jit
-def _errors(cases: BlockCase, fits: FlightFit) -> tuple[Array, Array]:
-    """Errors (B,) [m] across the flight midway between the boxes, and what they are believed."""
-
-    def one(case: BlockCase, fit: FlightFit) -> tuple[Array, Array]:
-        flight = flight_of(case)
-        middle = 0.5 * (flight.earliest + flight.latest)
-        belief = believed_at(fit, middle, case.gravity)
-        truth = drag_free_flight(case.ball, middle, case.gravity)
-        return error_across(belief, truth), across_std(belief)
-
-    return jax.vmap(one)(cases, fits)

@@ -16,7 +16,13 @@ from jax import Array
 
 from planner_jax.ball.flight import BallState, drag_free_flight
 from planner_jax.perception.camera import Camera, looking_at
-from planner_jax.perception.fit import FlightFit, believed_at, fit_flight
+from planner_jax.perception.fit import (
+    FlightFit,
+    across_std,
+    believed_at,
+    error_across,
+    fit_flight,
+)
 from planner_jax.perception.noise import Noise, RoundNoise, information, sightings, stereo_noise
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.end_poses import flight_of
@@ -181,6 +187,25 @@ def cautious(
         offset=jnp.minimum(cases.offset, offset),
         scene=dataclasses.replace(cases.scene, inner=grown, outer=shrunk),
     )
+
+
+@jax.jit
+def fit_errors(cases: BlockCase, fits: FlightFit) -> tuple[Array, Array]:
+    """Errors of fits across the flight midway between the boxes, of a batch with the true balls.
+
+    Returns:
+        error: (B,) [m].
+        std: (B,) [m], what they are believed to be.
+    """
+
+    def one(case: BlockCase, fit: FlightFit) -> tuple[Array, Array]:
+        flight = flight_of(case)
+        middle = 0.5 * (flight.earliest + flight.latest)
+        belief = believed_at(fit, middle, case.gravity)
+        truth = drag_free_flight(case.ball, middle, case.gravity)
+        return error_across(belief, truth), across_std(belief)
+
+    return jax.vmap(one)(cases, fits)
 
 
 @jax.jit

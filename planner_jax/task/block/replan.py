@@ -17,7 +17,7 @@ from planner_jax.ball.flight import BallState, drag_free_flight
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.planning.batch import better_of, merged
 from planner_jax.planning.one_by_one import OneByOne
-from planner_jax.planning.replan import Replanning
+from planner_jax.planning.replan import Replanning, given_or_own, moment_of
 from planner_jax.protocol import Attempt, Drive, is_unsolved, lane
 from planner_jax.robot.arm import shield_pose
 from planner_jax.task.block.case import BlockCase
@@ -109,15 +109,10 @@ class ReplanBlock:
         Raises:
             ValueError: a negative time.
         """
-        dtype, batch = np.asarray(cases.delay).dtype, cases.batch_shape
-        elapsed = np.broadcast_to(np.asarray(elapsed, dtype), batch)
-        if not np.all(elapsed >= 0.0):
-            raise ValueError(f"elapsed must be >= 0, got {np.min(elapsed)}")
-        own = (_states if batch else _state)(cases, previous, elapsed)
+        elapsed = moment_of(cases, elapsed)
+        own = (_states if cases.batch_shape else _state)(cases, previous, elapsed)
         angles, rates = (
-            np.asarray(mine)
-            if given is None
-            else np.broadcast_to(np.asarray(given, dtype), mine.shape)
+            given_or_own(given, mine, elapsed.dtype)
             for given, mine in zip((angles, rates), own, strict=True)
         )
         left = dataclasses.replace(

@@ -18,14 +18,13 @@ from jax import Array
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.problem import Round
-from planner_jax.planning.replan import Replanning
+from planner_jax.planning.replan import Replanning, given_or_own, moment_of
 from planner_jax.robot.quadrotor import body_z
-from planner_jax.robot.quadrotor_plan import handover
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.chain import CatchContext, targets_at
 from planner_jax.task.catch.exact import ExactCatch
 from planner_jax.task.catch.plan import CatchPlan
-from planner_jax.trajectory.polynomial import PiecewisePolynomial, state_basis
+from planner_jax.trajectory.polynomial import PiecewisePolynomial, state_basis, states_at
 from planner_jax.trajectory.proportional_minco import boundary_rows
 
 _ORDERS = 4  # position to jerk
@@ -101,7 +100,9 @@ class ReplanCatch(OptimisedPlanner):
         Raises:
             ValueError: a negative time.
         """
-        elapsed, head_state = handover(cases, previous, elapsed, head_state)
+        elapsed = moment_of(cases, elapsed)
+        own = states_at(previous.trajectory, elapsed)
+        head_state = given_or_own(head_state, own, elapsed.dtype)
         since = elapsed[..., None]
         order, times = np.asarray(previous.order), np.asarray(previous.times)
         present, horizon = np.asarray(cases.present), np.asarray(cases.horizon)

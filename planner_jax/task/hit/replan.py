@@ -18,14 +18,13 @@ from planner_jax.ball.flight import BallState
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.problem import Round
-from planner_jax.planning.replan import Replanning
+from planner_jax.planning.replan import Replanning, given_or_own, moment_of
 from planner_jax.robot.quadrotor import net_thrust, tangent_basis
-from planner_jax.robot.quadrotor_plan import handover
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.context import HitContext
 from planner_jax.task.hit.exact import ExactHit
 from planner_jax.task.hit.plan import HitPlan
-from planner_jax.trajectory.polynomial import evaluate, total_duration
+from planner_jax.trajectory.polynomial import evaluate, states_at, total_duration
 
 _SHORTEST = 0.01  # [s], least time to the impact that is guessed
 _TRIALS = (1.0, 0.2, 0.04)  # step lengths: the first direction, without curvature, is too long
@@ -78,7 +77,9 @@ class ReplanHit(OptimisedPlanner):
         Raises:
             ValueError: a negative time.
         """
-        elapsed, head_state = handover(cases, previous, elapsed, head_state)
+        elapsed = moment_of(cases, elapsed)
+        own = states_at(previous.trajectory, elapsed)
+        head_state = given_or_own(head_state, own, elapsed.dtype)
         drag = cases.drag if drag is None else drag
         now = dataclasses.replace(cases, ball=ball, drag=drag, head_state=head_state)
         return Replanning(case=now, previous=previous, elapsed=elapsed)

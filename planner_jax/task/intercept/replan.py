@@ -17,7 +17,7 @@ from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.plane.obstacles import Obstacles
 from planner_jax.plane.target import PlanePath
 from planner_jax.planning.one_by_one import OneByOne
-from planner_jax.planning.replan import Replanning
+from planner_jax.planning.replan import Replanning, given_or_own, moment_of
 from planner_jax.protocol import Attempt
 from planner_jax.robot.car import pose_at
 from planner_jax.task.intercept.case import InterceptCase
@@ -80,13 +80,10 @@ class ReplanIntercept(OneByOne):
         Raises:
             ValueError: a negative time.
         """
-        dtype, batch = np.asarray(cases.time).dtype, cases.batch_shape
-        elapsed = np.broadcast_to(np.asarray(elapsed, dtype), batch)
-        if not np.all(elapsed >= 0.0):
-            raise ValueError(f"elapsed must be >= 0, got {np.min(elapsed)}")
-        own = [np.asarray(leaf) for leaf in (_states if batch else _state)(previous, elapsed)]
+        elapsed = moment_of(cases, elapsed)
+        own = (_states if cases.batch_shape else _state)(previous, elapsed)
         start, speed, curvature = (
-            mine if given is None else np.broadcast_to(np.asarray(given, dtype), mine.shape)
+            given_or_own(given, mine, elapsed.dtype)
             for given, mine in zip((start, speed, curvature), own, strict=True)
         )
         limits = cases.limits
@@ -103,7 +100,7 @@ class ReplanIntercept(OneByOne):
             speed=speed,
             curvature=curvature,
             target=target,
-            time=np.maximum(np.asarray(until) - elapsed, 0.5 * self.shortest).astype(dtype),
+            time=np.maximum(np.asarray(until) - elapsed, 0.5 * self.shortest).astype(elapsed.dtype),
             movers=movers,
         )
         return Replanning(case=left, previous=previous, elapsed=elapsed)
