@@ -122,8 +122,8 @@ def tried_in_parts(
             full = np.resize(here, lanes)
             given = (jnp.asarray(bumps[full], jnp.float32), jnp.asarray(ranks[full]))
             some = pj.lane(cases, index[full])
-            found = tried(online.OnlineBlock(), some, *given, jnp.asarray(steps))
-            yield tuple(np.asarray(each)[: len(here)] for each in found)
+            good, beside = tried(online.OnlineBlock(), some, *given, jnp.asarray(steps))
+            yield np.asarray(good)[: len(here)], np.asarray(beside)[: len(here)]
 
     good, beside = zip(*parts(), strict=True)
     return np.concatenate(good), np.concatenate(beside)
@@ -167,7 +167,9 @@ def learn(bench: Bench, num: int, tries: int, lanes: int) -> list[dict[str, Any]
     # As many of each throw, so that easy ones do not outvote the others.
     some = [rng.permutation(np.flatnonzero(good & (places == throw)))[:8] for throw in solvable]
     picked = np.concatenate(some)
-    middles, _ = kmeans2(beside[picked], min(KINDS, len(picked)), seed=1, minit="points")
+    # Drawn here, because SciPy gives up the argument `seed`, and its `rng` draws others.
+    first = np.random.RandomState(1).choice(len(picked), min(KINDS, len(picked)), replace=False)
+    middles, _ = kmeans2(beside[picked], beside[picked[first]], minit="matrix")
     candidates = np.concatenate([middles, bumps[rng.permutation(picked)[:KINDS]]])
     throw, kind, rank = np.meshgrid(
         solvable, np.arange(len(candidates)), np.arange(RANKS), indexing="ij"
