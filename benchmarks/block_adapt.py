@@ -16,19 +16,17 @@ import argparse
 import dataclasses
 import os
 import time
-from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
 import planner_jax as pj
-from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
-from planner_jax.robot.arm import REGIMES
+from planner_jax.benchmarks.block_library import library_options
+from planner_jax.benchmarks.run import Bench, argument_parser, begin
 from planner_jax.sweep.block.library import build_library
 from planner_jax.task.block.ball_by_ball import BallByBall
 from planner_jax.task.block.library.adapt import adapt_planner
-from planner_jax.task.block.library.cells import LAYOUTS
 from planner_jax.task.block.online import OnlineBlock, Search
 
 WARM = 50  # balls before the clock counts
@@ -104,12 +102,7 @@ def measure(bench: Bench, options: argparse.Namespace) -> None:
 def main() -> None:
     """Measure."""
     parser = argument_parser("block_adapt", __doc__, num=1000, seed=7)
-    parser.add_argument("--library", type=Path, help="a file that has been built")
-    parser.add_argument("--layout", default="full", help=f"of {', '.join(LAYOUTS)}; default: full")
-    parser.add_argument("--regime", default="R2", help=f"of {', '.join(REGIMES)}; default: R2")
-    options = parser.parse_args()
-    chosen(parser, "--layout", options.layout, LAYOUTS)
-    chosen(parser, "--regime", options.regime, REGIMES)
+    options = library_options(parser, layout="full")
     with begin(parser, options) as bench:
         measure(bench, options)
 

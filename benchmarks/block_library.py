@@ -207,18 +207,28 @@ def measure(bench: Bench, options: argparse.Namespace) -> None:
         repaired(bench, library, options.shift, options.num)
 
 
+def library_options(parser: argparse.ArgumentParser, layout: str) -> argparse.Namespace:
+    """What is asked for, with --library, --layout (by default this one) and --regime.
+
+    An unknown layout or regime ends the program with a line.
+    """
+    parser.add_argument("--library", type=Path, help="a file that has been built")
+    known = ", ".join(LAYOUTS)
+    parser.add_argument("--layout", default=layout, help=f"of {known}; default: {layout}")
+    parser.add_argument("--regime", default="R2", help=f"of {', '.join(REGIMES)}; default: R2")
+    options = parser.parse_args()
+    chosen(parser, "--layout", options.layout, LAYOUTS)
+    chosen(parser, "--regime", options.regime, REGIMES)
+    return options
+
+
 def main() -> None:
     """Measure."""
     counts = {"num": 2000, "queries": 20000, "batch": 1 << 20}
     parser = argument_parser("block_library", __doc__, **counts)
-    parser.add_argument("--library", type=Path, help="a file that has been built")
-    parser.add_argument("--layout", default="B", help=f"of {', '.join(LAYOUTS)}; default: B")
-    parser.add_argument("--regime", default="R2", help=f"of {', '.join(REGIMES)}; default: R2")
     parser.add_argument("--shift", type=float, default=-0.1, help="[m], of the pole; default: -0.1")
     parser.add_argument("--skip-repair", action="store_true", help="without the repair")
-    options = parser.parse_args()
-    chosen(parser, "--layout", options.layout, LAYOUTS)
-    chosen(parser, "--regime", options.regime, REGIMES)
+    options = library_options(parser, layout="B")
     with begin(parser, options) as bench:
         measure(bench, options)
 

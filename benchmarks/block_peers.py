@@ -4,10 +4,11 @@
 
 A block is what the referee says, whatever a planner claims; `found` is a motion that touches
 nothing, in time or not. Every throw is planned alone, from NumPy arrays to NumPy arrays, warm, by
-one call on one core. The second rate of blocks counts that time: the motion and the call together
-have to fit between the moment at which the arm may start and the contact. A motion that always
-lasts until the contact, as those of `online` do, is made anew for an arm that may start later, by
-the 90 % quantile of the times of all calls; calls that take longer fail.
+one call on one core; a call in which something is compiled is made again. The second rate of
+blocks counts that time: the motion and the call together have to fit between the moment at which
+the arm may start and the contact. A motion that always lasts until the contact, as those of
+`online` do, is made anew for an arm that may start later, by the 90 % quantile of the times of all
+calls; calls that take longer fail.
 
 The execution is how long the arm moves. Torques are root mean squares over that time, by inverse
 dynamics, with the mass that the links have and a shield without any. Both are means over the
@@ -21,7 +22,6 @@ compare rows of one table, and of the paper's numbers their ratios.
 import dataclasses
 import importlib.util
 import os
-import time
 from typing import Any
 
 import jax
@@ -32,6 +32,7 @@ from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
 from planner_jax.referee.block import BlockVerdict
 from planner_jax.robot.arm_dynamics import Torques, motion_torques
 from planner_jax.sweep.block.settings import REGIMES
+from planner_jax.sweep.timing import timed_plans
 from planner_jax.task.block.card import SUITES
 from planner_jax.task.block.plan import BlockPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
@@ -80,18 +81,6 @@ class Outcome:
     without: Torques
 
 
-def planned(planner: Any, cases: Any) -> tuple[BlockPlan, np.ndarray]:
-    """Plans of a batch, made one at a time, and how long each call took (B,) [s]."""
-    plans, seconds = [], []
-    for k in range(cases.batch_shape[0]):
-        case = pj.lane(cases, k)
-        began = time.perf_counter()
-        plan = jax.tree.map(np.asarray, pj.plan(planner, case))
-        seconds.append(time.perf_counter() - began)
-        plans.append(plan)
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *plans), np.array(seconds)
-
-
 def moving(motion: PiecewisePolynomial) -> PiecewisePolynomial:
     """Motions (B, ...) without the pieces in which the arm waits."""
     coeffs = np.asarray(motion.coeffs)
@@ -109,15 +98,17 @@ def is_found(plans: BlockPlan, verdict: BlockVerdict) -> np.ndarray:
 
 def outcome_of(planner: Any, cases: Any, warm: Any, *, lasts: bool) -> Outcome:
     """Plan throws one by one and have them judged; `lasts`: whether motions end at the contact."""
-    planned(planner, warm)
-    plans, query = planned(planner, cases)
+    # Once each: RRT-Connect draws on where it left off, so that further calls change its ways.
+    for k in range(WARM):
+        pj.plan(planner, pj.lane(warm, k))
+    plans, query = timed_plans(planner, cases)
     verdict = pj.block.judge(cases, plans)
     motion = moving(plans.motion)
     execution = np.asarray(motion.durations).sum(axis=1)
     if lasts:
         reserve = np.float32(np.percentile(query, RESERVE))
         later = dataclasses.replace(cases, delay=cases.delay + reserve)
-        again, seconds = planned(planner, later)
+        again, seconds = timed_plans(planner, later)
         counted = pj.block.judge(later, again).success & (seconds <= reserve)
     else:
         counted = verdict.success & (cases.delay + query + execution <= plans.contact_time)

@@ -19,7 +19,6 @@ throw's suite, in the order that the head of the file gives, 1 where it blocks t
 """
 
 import csv
-import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +28,8 @@ import numpy as np
 from jax import Array
 
 import planner_jax as pj
-from planner_jax.benchmarks.block_starts import LATER_RANKS, SPREAD
+from planner_jax.benchmarks.block_starts import follow, random_starts
 from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin, chosen
-from planner_jax.optimise.levenberg import least_squares
 from planner_jax.sweep.summary import wilson_interval
 from planner_jax.task.block.clearance import least_clearances
 from planner_jax.task.block.end_poses import end_poses, flight_of
@@ -71,18 +69,10 @@ def has_end_pose(case: pj.block.BlockCase) -> Array:
 def long_search(cases: pj.block.BlockCase, bumps: Array, ranks: Array) -> pj.block.BlockPlan:
     """The best plan of each case (B,) from starts with bumps (N, 6) [rad] and ranks (N,)."""
     online = OnlineBlock()
-    solver = dataclasses.replace(Search().solver, max_steps=STEPS, hope=None)
 
     def of_case(case: pj.block.BlockCase) -> pj.block.BlockPlan:
-        flight = flight_of(case)
-        poses = end_poses(case, flight, online.points, online.pieces)
-        order = online.order(poses, LATER_RANKS)
-
         def of_start(bump: Array, rank: Array) -> pj.block.BlockPlan:
-            start = online.straight_point(case, poses, order[rank])
-            start = start.at[:-1].add(online.bump(bump).reshape(-1))
-            end = least_squares(lambda point: online.model(point, case, flight), start, solver)
-            return online.plan_at(case, flight, end.point, end.steps)
+            return follow(online, case, bump, rank, STEPS).plan
 
         plans = jax.vmap(of_start)(bumps, ranks)
         excess = jnp.where(jnp.isnan(plans.violation), jnp.inf, plans.violation)
@@ -93,9 +83,7 @@ def long_search(cases: pj.block.BlockCase, bumps: Array, ranks: Array) -> pj.blo
 
 def blocked_long(cases: pj.block.BlockCase, index: np.ndarray, starts: int, lanes: int) -> Any:
     """Which of the cases with an index (N,) a long search blocks, by the referee, (N,) bool."""
-    rng = np.random.default_rng(2)
-    bumps = rng.normal(size=(starts, 6)) * SPREAD * rng.uniform(0.3, 1.8, (starts, 1))
-    ranks = rng.integers(0, LATER_RANKS, starts)
+    bumps, ranks = random_starts(np.random.default_rng(2), starts)
     given = jnp.asarray(bumps, jnp.float32), jnp.asarray(ranks)
     size, found = max(1, lanes // starts), []
     for first in range(0, len(index), size):

@@ -20,6 +20,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import struct
 from jax import Array
 from scipy.cluster.vq import kmeans2
 
@@ -30,6 +31,7 @@ from planner_jax.protocol import is_solved
 from planner_jax.task.block import online
 from planner_jax.task.block.end_poses import all_profiles, end_poses, flight_of
 from planner_jax.task.block.motion import angles_at
+from planner_jax.task.block.plan import BlockPlan
 
 SEED, DELAY = 1001, 0.05
 STRAIGHT = 32  # straight motions that are looked at
@@ -38,6 +40,48 @@ RANKS, LATER_RANKS = 10, 24  # of end poses: of candidates, of random starts
 KINDS = 48  # candidates of either kind
 MOST = 16  # starts that are kept
 SHARES = tuple(np.arange(1, 33) / 32)
+
+
+def random_starts(rng: np.random.Generator, num: int) -> tuple[np.ndarray, np.ndarray]:
+    """Bumps (num, 6) [rad] of all sizes, and then as many ranks (num,) of end poses."""
+    bumps = rng.normal(size=(num, 6)) * SPREAD * rng.uniform(0.3, 1.8, (num, 1))
+    return bumps, rng.integers(0, LATER_RANKS, num)
+
+
+@struct.dataclass
+class Followed:
+    """Where least squares came to from one start."""
+
+    plan: BlockPlan
+    point: Array  # (n,), the unknowns
+    profile: Array  # () int, of the straight motion that was bent, as `all_profiles` has them
+
+
+def follow(
+    planner: online.OnlineBlock,
+    case: pj.block.BlockCase,
+    bump: Array,
+    rank: Array,
+    steps: int | Array,
+) -> Followed:
+    """Least squares of one case from a bent straight motion, never given up.
+
+    Args:
+        planner: whose unknowns and residuals these are.
+        case: one case.
+        bump: (6,) [rad], of the joints.
+        rank: () int < `LATER_RANKS`, of the end pose, in the planner's order.
+        steps: of least squares at most; a number, or () int.
+    """
+    flight = flight_of(case)
+    poses = end_poses(case, flight, planner.points, planner.pieces)
+    place = planner.order(poses, LATER_RANKS)[rank]
+    start = planner.straight_point(case, poses, place)
+    start = start.at[:-1].add(planner.bump(bump).reshape(-1))
+    solver = dataclasses.replace(planner.attempts[0].solver, max_steps=steps, hope=None)
+    end = least_squares(lambda point: planner.model(point, case, flight), start, solver)
+    plan = planner.plan_at(case, flight, end.point, end.steps)
+    return Followed(plan, end.point, poses.profile[place])
 
 
 @jax.jit
@@ -51,24 +95,16 @@ def tried(
         found: (B, 6) [rad], how far the motion that was found lies beside the straight one to its
             own end: the height of a bump that fits it best.
     """
-    solver = planner.attempts[0].solver
 
-    def one(case: Any, bump: Array, rank: Array) -> tuple[Array, Array]:
-        flight = flight_of(case)
-        poses = end_poses(case, flight, planner.points, planner.pieces)
-        place = planner.order(poses, LATER_RANKS)[rank]
-        start = planner.straight_point(case, poses, place)
-        start = start.at[:-1].add(planner.bump(bump).reshape(-1))
-        config = dataclasses.replace(solver, max_steps=steps, hope=None)
-        end = least_squares(lambda point: planner.model(point, case, flight), start, config)
-        plan = planner.plan_at(case, flight, end.point, end.steps)
+    def one(case: pj.block.BlockCase, bump: Array, rank: Array) -> tuple[Array, Array]:
+        end = follow(planner, case, bump, rank, steps)
         moves, first, _ = planner.parts(case, end.point)
         angles = angles_at(case.angles, first, moves, SHARES)
-        shape = jnp.asarray(all_profiles(planner.pieces)[0], angles.dtype)[poses.profile[place]]
+        shape = jnp.asarray(all_profiles(planner.pieces)[0], angles.dtype)[end.profile]
         straight = shape[:, None] * (angles[-1] - case.angles)
         beside = angles - angles_at(case.angles, first, straight, SHARES)
         weight = jnp.asarray(np.sin(np.pi * np.array(SHARES)) ** 2, angles.dtype)
-        return is_solved(plan.status), jnp.sum(beside * weight[:, None], axis=0) / jnp.sum(
+        return is_solved(end.plan.status), jnp.sum(beside * weight[:, None], axis=0) / jnp.sum(
             weight**2
         )
 
@@ -86,8 +122,8 @@ def tried_in_parts(
             full = np.resize(here, lanes)
             given = (jnp.asarray(bumps[full], jnp.float32), jnp.asarray(ranks[full]))
             some = pj.lane(cases, index[full])
-            found = tried(online.OnlineBlock(), some, *given, jnp.asarray(steps))
-            yield tuple(np.asarray(each)[: len(here)] for each in found)
+            good, beside = tried(online.OnlineBlock(), some, *given, jnp.asarray(steps))
+            yield np.asarray(good)[: len(here)], np.asarray(beside)[: len(here)]
 
     good, beside = zip(*parts(), strict=True)
     return np.concatenate(good), np.concatenate(beside)
@@ -116,9 +152,8 @@ def learn(bench: Bench, num: int, tries: int, lanes: int) -> list[dict[str, Any]
     hard = np.flatnonzero(~straight)
     bench.say(f"{100 * straight.mean():.1f} % of {num} throws by straight motions")
 
-    size = (len(hard) * tries, 6)
-    bumps = rng.normal(size=size) * SPREAD * rng.uniform(0.3, 1.8, (size[0], 1))
-    ranks, places = rng.integers(0, LATER_RANKS, size[0]), np.repeat(hard, tries)
+    bumps, ranks = random_starts(rng, len(hard) * tries)
+    places = np.repeat(hard, tries)
     good, beside = tried_in_parts(cases, places, bumps, ranks, 20, lanes)
     solvable = hard[good.reshape(-1, tries).any(axis=1)]
     bench.say(
@@ -132,7 +167,9 @@ def learn(bench: Bench, num: int, tries: int, lanes: int) -> list[dict[str, Any]
     # As many of each throw, so that easy ones do not outvote the others.
     some = [rng.permutation(np.flatnonzero(good & (places == throw)))[:8] for throw in solvable]
     picked = np.concatenate(some)
-    middles, _ = kmeans2(beside[picked], min(KINDS, len(picked)), seed=1, minit="points")
+    # Drawn here, because SciPy gives up the argument `seed`, and its `rng` draws others.
+    first = np.random.RandomState(1).choice(len(picked), min(KINDS, len(picked)), replace=False)
+    middles, _ = kmeans2(beside[picked], beside[picked[first]], minit="matrix")
     candidates = np.concatenate([middles, bumps[rng.permutation(picked)[:KINDS]]])
     throw, kind, rank = np.meshgrid(
         solvable, np.arange(len(candidates)), np.arange(RANKS), indexing="ij"

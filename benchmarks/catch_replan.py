@@ -74,8 +74,9 @@ class Estimator:
 
     def see(self, observation: np.ndarray) -> BallState:
         """The ball one period after this observation (3,), leaves (1, 3)."""
-        self._belief = np.asarray(self._look(np.concatenate([self._belief, observation])))
-        return BallState(pos=self._belief[None, :3], vel=self._belief[None, 3:6])
+        belief: Any = np.asarray(self._look(np.concatenate([self._belief, observation])))
+        self._belief = belief
+        return BallState(pos=belief[None, :3], vel=belief[None, 3:6])
 
 
 @dataclasses.dataclass
@@ -105,6 +106,12 @@ class Times:
 def stacked(trees: list) -> Any:
     """A batch of what is alone."""
     return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
+
+
+def balls_of(case: CatchCase) -> pj.BallPath:
+    """The targets of a case of `throws`."""
+    assert isinstance(case.targets, pj.BallPath)
+    return case.targets
 
 
 def first_plan(case: CatchCase) -> tuple[CatchCase, CatchPlan]:
@@ -143,7 +150,7 @@ def fly(
         estimator.see(look)
     ball = estimator.see(looks[before])
     began = time.perf_counter()
-    targets = dataclasses.replace(case.targets, ball=ball)
+    targets = dataclasses.replace(balls_of(case), ball=ball)
     task, current = first_plan(dataclasses.replace(case, targets=targets))
     out.first.append(time.perf_counter() - began)
     first, flown, elapsed = current, [], 0.0
@@ -154,7 +161,7 @@ def fly(
         began = time.perf_counter()
         ball = estimator.see(look)
         seen = time.perf_counter()
-        targets = dataclasses.replace(task.targets, ball=ball)
+        targets = dataclasses.replace(balls_of(task), ball=ball)
         left = AGAIN.begin(task, current, elapsed, targets=targets)
         found = pj.plan(AGAIN, left)
         ended = time.perf_counter()
@@ -239,7 +246,7 @@ def throws(num: int, period: float, noise: float) -> tuple[CatchCase, np.ndarray
     begins = dataclasses.replace(
         suite,
         targets=dataclasses.replace(
-            suite.targets, ball=jax.tree.map(lambda leaf: leaf[:, None], ahead)
+            balls_of(suite), ball=jax.tree.map(lambda leaf: leaf[:, None], ahead)
         ),
         horizon=suite.horizon - period,
     )
@@ -253,12 +260,12 @@ def alone(bench: Bench, lanes: list[CatchCase], period: float, noise: float) -> 
     for case in lanes:
         task, current = first_plan(case)
         elapsed = np.float32(period * random.integers(1, round(0.6 / period)))
-        path = case.targets
+        path = balls_of(case)
         ball = jax.tree.map(
             np.asarray,
             pj.BallPath(
                 BallState(path.ball.pos[0], path.ball.vel[0]), path.drag[0], path.gravity[0]
-            ).at(elapsed),
+            ).at(jnp.asarray(elapsed)),
         )
         moved = BallState(
             (ball.pos + noise * random.standard_normal(3)).astype(np.float32)[None],
@@ -310,7 +317,7 @@ def main() -> None:
 def fly_all(bench: Bench, cases: CatchCase, looks: np.ndarray, period: float, noise: float) -> None:
     """Fly every throw, warm, and report."""
     lanes = [pj.lane(cases, k) for k in range(len(looks))]
-    path = lanes[0].targets
+    path = balls_of(lanes[0])
     estimator = Estimator(period, noise, path.drag[0], path.gravity[0])
     for lane, seen in zip(lanes[:WARM_UP], looks, strict=False):
         fly(lane, seen, estimator, period, Times())

@@ -110,7 +110,7 @@ def flown(
 
 def main() -> None:
     """Print the rows asked for, and the command of each."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--suite", default="hard")
     parser.add_argument("--num", type=int, default=50, help="drives a row")
     parser.add_argument("--seed", type=int, default=0)

@@ -28,7 +28,7 @@ PICTURES = {
 
 def main() -> None:
     """Fly and draw."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--out", type=Path, default=Path("docs"), metavar="DIR")
     args = parser.parse_args()
     for name, (settings, look) in PICTURES.items():

@@ -208,28 +208,26 @@ def hit_rows(args: Any) -> None:
                 prediction_errors(flights.flown)
 
 
+def ablated(whole: Loop) -> dict[str, Loop]:
+    """A loop, and the same without one part each, by what is missing."""
+    return {
+        "everything": whole,
+        "no Kalman filter": dataclasses.replace(whole, kalman=False),
+        "no drag estimate": dataclasses.replace(whole, estimate_drag=False),
+        "no re-planning": dataclasses.replace(whole, replan=0.0),
+    }
+
+
 def ablation_rows(args: Any) -> None:
     """What each part is worth."""
-    for name, options in (
-        ("everything", {}),
-        ("no Kalman filter", {"kalman": False}),
-        ("no drag estimate", {"estimate_drag": False}),
-        ("no re-planning", {"replan": 0.0}),
-    ):
-        loop = Loop(CATCH_WORLD, LAB, **{"replan": CATCH_RATE, **options})
+    for name, loop in ablated(Loop(CATCH_WORLD, LAB, replan=CATCH_RATE)).items():
         catches(f"lab, one ball, {name}", loop, args, DRAG_ERROR)
     loop = Loop(CATCH_WORLD, LAB)
     for name in ("catch", "mpp"):
         title = f"lab, one ball, planner {name}, no re-planning"
         catches(title, loop, args, DRAG_ERROR, planner=catch.planner(name, decide="greedy"))
     regions = REAL_SCENARIOS["S.1"]
-    for name, options in (
-        ("everything", {}),
-        ("no Kalman filter", {"kalman": False}),
-        ("no drag estimate", {"estimate_drag": False}),
-        ("no re-planning", {"replan": 0.0}),
-    ):
-        loop = Loop(HIT_WORLD, LAB, **{"replan": HIT_RATE, **options})
+    for name, loop in ablated(Loop(HIT_WORLD, LAB, replan=HIT_RATE)).items():
         hits(f"lab, S.1, {name}", loop, regions, args, DRAG_ERROR)
     loop = Loop(HIT_WORLD, LAB)
     for name in ("bat", "bat-lite", "juggle"):
@@ -242,7 +240,7 @@ ROWS = {"exact": exact_rows, "catch": catch_rows, "hit": hit_rows, "ablate": abl
 
 def main() -> None:
     """Print the rows asked for."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--num", type=int, default=1000, help="flights a row")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--limit", type=int, default=300, help="seconds a line (default: 300)")

@@ -10,6 +10,7 @@ steps beside ours, without a ball. Compilation is apart.
 
 import argparse
 import dataclasses
+import importlib
 import os
 import time
 from collections.abc import Callable
@@ -99,11 +100,11 @@ def crazyflow(worlds: int, steps: int) -> None:
     """The peer's steps, where it is installed."""
     os.environ.setdefault("SCIPY_ARRAY_API", "1")
     try:
-        from crazyflow.sim import Sim
+        peer: Any = importlib.import_module("crazyflow.sim")
     except ImportError as error:
         print(f"crazyflow: not measured ({error})")
         return
-    sim = Sim(n_worlds=worlds, n_drones=1, freq=500, device=jax.default_backend())
+    sim = peer.Sim(n_worlds=worlds, n_drones=1, freq=500, device=jax.default_backend())
     sim.reset()
 
     def run() -> Any:
@@ -115,7 +116,7 @@ def crazyflow(worlds: int, steps: int) -> None:
 
 def main() -> None:
     """Print all lines."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     default = "256" if jax.default_backend() == "cpu" else "4096,65536"
     parser.add_argument("--worlds", default=default)
     parser.add_argument("--seconds", type=float, default=0.4, help="of each flight")

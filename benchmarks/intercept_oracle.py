@@ -49,6 +49,7 @@ from planner_jax.plane.target import PlanePath
 from planner_jax.sweep.summary import percent, wilson_interval
 from planner_jax.task.intercept.card import SUITES
 from planner_jax.task.intercept.case import InterceptCase
+from planner_jax.task.intercept.suites import draw_cases
 
 SEARCHES = ("bound", "minimal", "strict")
 
@@ -199,7 +200,7 @@ def main() -> None:
     add("--out", type=Path, help="an .npz file for what is found of every case")
     options = parser.parse_args()
     with Bench("intercept_oracle", vars(options)) as bench:
-        cases = pj.intercept.draw(options.num, options.suite, options.seed, first=options.first)
+        cases = draw_cases(options.suite, options.num, options.seed, options.first)
         plans = pj.plan(pj.intercept.planner(), cases)
         solved = np.asarray(pj.intercept.judge(cases, plans).success)
         drawn = np.arange(options.num)

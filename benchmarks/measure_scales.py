@@ -9,6 +9,7 @@ that is made with the measured one; --write makes the shipped files anew.
 """
 
 import dataclasses
+import functools
 import json
 from pathlib import Path
 from typing import Any
@@ -37,16 +38,14 @@ _CATCH_FLOOR = 0.1
 def hard_serves(num: int, seed: int) -> pj.hit.HitCase:
     """`num` serves of each of five kinds: late, very late, weak, very weak, any start."""
     kinds = (
-        {"delay": 0.5},
-        {"delay": 0.6},
-        {"limit_scale": 0.5},
-        {"limit_scale": 0.35},
-        {"start": "uniform"},
+        functools.partial(pj.hit.to_cases, delay=0.5),
+        functools.partial(pj.hit.to_cases, delay=0.6),
+        functools.partial(pj.hit.to_cases, limit_scale=0.5),
+        functools.partial(pj.hit.to_cases, limit_scale=0.35),
+        functools.partial(pj.hit.to_cases, start="uniform"),
     )
     serves = pj.hit.generate_serves(num * len(kinds), seed)
-    batches = [
-        pj.hit.to_cases(serves[i * num : (i + 1) * num], **kind) for i, kind in enumerate(kinds)
-    ]
+    batches = [kind(serves[i * num : (i + 1) * num]) for i, kind in enumerate(kinds)]
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *batches)
 
 

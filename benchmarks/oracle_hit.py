@@ -43,15 +43,17 @@ def failed_indices(plans: Path) -> np.ndarray:
 
 def summarise(findings: list[Finding]) -> dict:
     """Counts with Wilson intervals, and times."""
-    num, summary = len(findings), {"num": len(findings)}
+    num, verdicts = len(findings), {}
     for name in VERDICTS:
         count = sum(finding.verdict == name for finding in findings)
         interval = list(wilson_interval(count, num))
-        summary[name] = {"count": count, "share": count / num, "wilson_95": interval}
+        verdicts[name] = {"count": count, "share": count / num, "wilson_95": interval}
     excess = [f.least_excess for f in findings if f.verdict == "infeasible"]
     quartiles = np.quantile(excess, (0.0, 0.25, 0.5, 0.75, 1.0)).tolist() if excess else None
     seconds = np.array([finding.cpu_seconds for finding in findings])
-    return summary | {
+    return {
+        "num": num,
+        **verdicts,
         "least_excess_quartiles_of_infeasible": quartiles,
         "cpu_seconds_median": float(np.median(seconds)),
         "cpu_seconds_p90": float(np.quantile(seconds, 0.9)),

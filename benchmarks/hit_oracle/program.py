@@ -5,14 +5,17 @@ from case to case are parameters. World frame, z up, SI units.
 """
 
 import dataclasses
+import importlib
 import math
+from typing import Any
 
-import casadi as ca
 import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.interpolate import BPoly
 
 from planner_jax.task.hit.case import HitCase
+
+ca: Any = importlib.import_module("casadi")  # of the extra `oracle`
 
 BALL_DEGREE = 10  # of the ball's path up to its landing; below 1e-7 m off the integration
 # Sizes of position, velocity, acceleration and jerk, and of snap, in a program's variables.
@@ -110,7 +113,7 @@ def impact(case: dict, ball: list, impact_time, flight_time, up, norm) -> tuple:
     return pos, before, after, (after - before) / jump, jump
 
 
-def path_limits(motion: list, case: dict, room) -> tuple[list, ca.SX]:
+def path_limits(motion: list, case: dict, room) -> tuple[list, Any]:
     """What must be <= 0 at one sample, and the body z axis there.
 
     `room` is 1 + the excess that is granted. Body rates (Hopf fibration, zero heading) are

@@ -5,6 +5,7 @@ import functools
 import math
 import multiprocessing
 import time
+from typing import Any
 
 import jax
 import numpy as np
@@ -144,7 +145,8 @@ class Oracle:
 
 def passes_referee(case: HitCase, coeffs: np.ndarray, durations: np.ndarray) -> bool:
     """Whether the library's referee passes one trajectory."""
-    none = np.zeros(1)
+    none: Any = np.zeros(1)
+    path: Any = coeffs[None], durations[None]
     stroke = Stroke(
         time=durations.sum(keepdims=True),
         ball_pos=none,
@@ -154,7 +156,7 @@ def passes_referee(case: HitCase, coeffs: np.ndarray, durations: np.ndarray) -> 
         flight_time=none,
     )
     plan = HitPlan(
-        trajectory=PiecewisePolynomial(coeffs=coeffs[None], durations=durations[None]),
+        trajectory=PiecewisePolynomial(*path),
         gravity=none,
         stroke=stroke,
         cost=none,
