@@ -79,10 +79,13 @@ def end_poses(case: BlockCase, flight: Flight, points: int, pieces: int) -> EndP
     rates, rises, rests = profile_peaks(pieces)
     of_rate = jnp.max(turned / case.limits.velocity, axis=1) / duration
     of_rise = jnp.max(turned / case.limits.acceleration, axis=1) / duration**2
-    efforts = jnp.maximum(of_rate[:, None] * rates, of_rise[:, None] * rises)
-    efforts = jnp.where(rests | ~case.ends_at_rest, efforts, jnp.inf)
-    profile = jnp.argmin(efforts, axis=1)
-    effort = jnp.min(efforts, axis=1)
+    of_rates, of_rises = of_rate[:, None] * rates, of_rise[:, None] * rises
+    efforts = jnp.maximum(of_rates, of_rises)
+    # Of motions from rest to rest that which could be made in the least time.
+    paces = jnp.where(case.ends_at_rest, jnp.maximum(of_rates, jnp.sqrt(of_rises)), efforts)
+    is_one = rests | ~case.ends_at_rest
+    profile = jnp.argmin(jnp.where(is_one, paces, jnp.inf), axis=1)
+    effort = jnp.min(jnp.where(is_one, efforts, jnp.inf), axis=1)
     is_there = found.reshape(-1) & (time > case.delay) & flight.comes
     return EndPoses(
         angles=angles,

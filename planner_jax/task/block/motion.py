@@ -60,6 +60,29 @@ def polynomial(start: Array, first: Array, steps: Array, duration: Array) -> Pie
     )
 
 
+def quickened(
+    motion: PiecewisePolynomial, velocity: Array, acceleration: Array
+) -> tuple[PiecewisePolynomial, Array]:
+    """A motion from rest to rest on the same way, as quick as limits allow, but no slower.
+
+    Args:
+        motion: of degree 2.
+        velocity: (6,) [rad/s], the most.
+        acceleration: (6,) [rad/s^2], the most.
+
+    Returns:
+        motion: the same, in time.
+        pace: () in (0, 1], the share of the duration that it takes.
+    """
+    rates = motion.coeffs[:, 1] / velocity
+    rises = 2.0 * motion.coeffs[:, 2] / acceleration
+    pace = jnp.maximum(jnp.max(jnp.abs(rates)), jnp.sqrt(jnp.max(jnp.abs(rises))))
+    pace = jnp.clip(pace, 1e-3, 1.0)
+    return PiecewisePolynomial(
+        coeffs=motion.coeffs / (pace ** jnp.arange(3))[:, None], durations=pace * motion.durations
+    ), pace
+
+
 def cut(motion: PiecewisePolynomial, time: Array) -> PiecewisePolynomial:
     """A motion up to a time () [s] since its start, or as a whole if it ends before.
 

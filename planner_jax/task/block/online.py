@@ -43,7 +43,7 @@ from planner_jax.task.block.end_poses import (
     flight_of,
     frame_of,
 )
-from planner_jax.task.block.motion import angles_at, polynomial, sums
+from planner_jax.task.block.motion import angles_at, polynomial, quickened, sums
 from planner_jax.task.block.plan import BlockPlan, explained, no_plan
 
 _HIGHEST = lax.Precision.HIGHEST
@@ -112,6 +112,9 @@ class OnlineBlock(OneByOne):
     margin: float = 0.003  # [m], kept from everything
     pole_margin: float = 0.012  # [m], the same of the pole, which samples may pass by
     slack: float = 0.004  # share of every limit that is kept free
+    # Whether a motion from rest to rest is made as quick as limits allow: the arm then stands and
+    # waits for the ball. Otherwise it moves until the ball is there, which asks for less torque.
+    brisk: bool = False
     weights: Weights = Weights()
     searches: tuple[Search, ...] = (
         Search(straight=6, tries=0),
@@ -154,7 +157,17 @@ class OnlineBlock(OneByOne):
             bent = jax.vmap(self.bump)(jnp.asarray(bumps, points.dtype))
             points = points.at[:, :-1].add(bent.reshape(attempt.tries, -1))
             best = bend(case, flight, points, attempt, best)
+        if self.brisk:
+            best = self.quickened(case, best)
         return dataclasses.replace(best, status=explained(case, poses, best.status))
+
+    def quickened(self, case: BlockCase, plan: BlockPlan) -> BlockPlan:
+        """The plan on the same way as quick as limits allow, if it is from rest to rest."""
+        limits, most = case.limits, 1.0 - self.slack
+        motion, pace = quickened(plan.motion, most * limits.velocity, most * limits.acceleration)
+        rests = is_solved(plan.status) & case.ends_at_rest & jnp.all(case.rates == 0.0)
+        quick = dataclasses.replace(plan, motion=motion, cost=pace * plan.cost)
+        return jax.tree.map(lambda new, old: jnp.where(rests, new, old), quick, plan)
 
     def _one_after_another(
         self, case: BlockCase, flight: Flight, points: Array, attempt: Search, best: BlockPlan
