@@ -220,8 +220,8 @@ def test_plans_of_a_batch_say_what_became_of_each_ball():
     np.testing.assert_allclose(setpoints.angles[0, 0], cases.angles[0], atol=1e-6)
 
 
-def test_brisk_motions_take_the_same_way_in_less_time():
-    """As quick as one limit allows, and confirmed by the referee."""
+def test_brisk_motions_end_before_the_ball_is_there():
+    """As quick as one limit allows, if the arm has to stand in the end, and so the referee says."""
     cases = jax.tree.map(np.array, pj.block.draw(8, seed=8))
     cases.ends_at_rest[5] = False
     plans, quick = (pj.plan(dataclasses.replace(SMALL, brisk=b), cases) for b in (False, True))
@@ -230,15 +230,12 @@ def test_brisk_motions_take_the_same_way_in_less_time():
     assert some.sum() >= 4 and some[5]
     verdict: Any = pj.block.judge(cases, quick)
     assert verdict.success[some].all()
-    np.testing.assert_array_equal(quick.motion.coeffs[5], plans.motion.coeffs[5])
-    np.testing.assert_array_equal(quick.contact_time, plans.contact_time)
-    rests = some & (np.arange(8) != 5)
-    np.testing.assert_allclose(
-        quick.motion.coeffs[rests, :, 0], plans.motion.coeffs[rests, :, 0], atol=1e-6
-    )
     durations = quick.motion.durations.sum(axis=1)
+    np.testing.assert_allclose(quick.cost[some], durations[some], rtol=1e-5)
+    np.testing.assert_allclose(durations[5], quick.contact_time[5], rtol=1e-5)
+    rests = some & (np.arange(8) != 5)
+    assert np.all(durations[rests] < quick.contact_time[rests])
     assert np.all(durations[rests] < plans.motion.durations.sum(axis=1)[rests])
-    np.testing.assert_allclose(quick.cost[rests], durations[rests], rtol=1e-5)
     rates = np.abs(quick.motion.coeffs[:, :, 1]) / cases.limits.velocity[:, None]
     rises = 2.0 * np.abs(quick.motion.coeffs[:, :, 2]) / cases.limits.acceleration[:, None]
     share = np.maximum(rates.max(axis=(1, 2)), rises.max(axis=(1, 2)))

@@ -188,6 +188,7 @@ ENTRIES = {
     "intercept em": path_then_speed("em", tries=1),
     "intercept constant": path_then_speed("constant", tries=1),
     "block online": block("online", **SMALL_SEARCH),
+    "block brisk": block("brisk", **SMALL_SEARCH),
     "block direct": block("direct", points=6),
     # Without a pole the first spline is found at once, long before the clock ends a search.
     "block insat": block("insat", "open", points=6, budget=20.0, longest=20.0),
@@ -202,7 +203,7 @@ ENTRIES = {
 # They share their solver with others, and take as long to compile.
 LIKE_OTHERS = (
     *("hit bat", "hit bat-lite", "catch catch"),
-    *("intercept lattice", "intercept em", "intercept constant"),
+    *("intercept lattice", "intercept em", "intercept constant", "block brisk"),
 )
 
 

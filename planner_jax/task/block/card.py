@@ -27,6 +27,7 @@ TASK = Task(
     home="planner_jax.task.block",
     planners={
         "online": "planner_jax.task.block.online:OnlineBlock",
+        "brisk": "planner_jax.task.block.online:brisk",
         "direct": "planner_jax.task.block.direct:DirectBlock",
         "rrt-connect": "planner_jax.task.block.rrt_connect:RrtConnectBlock",
         "epase": "planner_jax.task.block.epase:EpaseBlock",

@@ -13,7 +13,7 @@ import functools
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -68,6 +68,14 @@ class Search(Attempt):
     )
 
 
+_LEAST_SQUARES = (
+    Search(straight=0, tries=4, kept=2),
+    Search(straight=0, tries=11, first=4, kept=4),
+)
+_SEARCHES = (Search(straight=6, tries=0), Search(tries=0), *_LEAST_SQUARES)
+_BRISK = (Search(tries=0), *_LEAST_SQUARES)
+
+
 @functools.cache
 def learned_starts() -> tuple[np.ndarray, np.ndarray]:
     """Where least squares begin: places (N,) in the order of poses, and bumps (N, 6) [rad]."""
@@ -112,16 +120,12 @@ class OnlineBlock(OneByOne):
     margin: float = 0.003  # [m], kept from everything
     pole_margin: float = 0.012  # [m], the same of the pole, which samples may pass by
     slack: float = 0.004  # share of every limit that is kept free
-    # Whether a motion from rest to rest is made as quick as limits allow: the arm then stands and
-    # waits for the ball. Otherwise it moves until the ball is there, which asks for less torque.
+    # Whether motions from rest to rest are made as quick as limits allow, and of the straight ones
+    # that are looked at the quickest is taken: the arm then stands and waits for the ball.
+    # Otherwise it moves until the ball is there, which asks for less torque.
     brisk: bool = False
     weights: Weights = Weights()
-    searches: tuple[Search, ...] = (
-        Search(straight=6, tries=0),
-        Search(tries=0),
-        Search(straight=0, tries=4, kept=2),
-        Search(straight=0, tries=11, first=4, kept=4),
-    )
+    searches: tuple[Search, ...] = _SEARCHES
 
     @property
     def attempts(self) -> tuple[Search, ...]:
@@ -149,16 +153,25 @@ class OnlineBlock(OneByOne):
 
         def plan_of(k: Array) -> BlockPlan:
             point = self.straight_point(case, poses, order[k])
-            return self.plan_at(case, flight, point, jnp.zeros((), jnp.int32))
+            plan = self.plan_at(case, flight, point, jnp.zeros((), jnp.int32))
+            return self.quickened(case, plan) if self.brisk else plan
 
-        best = first_solved(plan_of, straight, no_plan(case, self.pieces))
+        def quicker(k: Array, best: BlockPlan) -> BlockPlan:
+            plan = plan_of(k)
+            return better_of(best, plan, ~is_solved(best.status) | (plan.cost < best.cost))
+
+        best = no_plan(case, self.pieces)
+        if self.brisk:
+            best = lax.fori_loop(0, straight, quicker, best)
+        else:
+            best = first_solved(plan_of, straight, best)
         if attempt.tries:
             points = jax.vmap(lambda rank: self.straight_point(case, poses, order[rank]))(ranks)
             bent = jax.vmap(self.bump)(jnp.asarray(bumps, points.dtype))
             points = points.at[:, :-1].add(bent.reshape(attempt.tries, -1))
             best = bend(case, flight, points, attempt, best)
-        if self.brisk:
-            best = self.quickened(case, best)
+            if self.brisk:  # what is so already stays as it is
+                best = self.quickened(case, best)
         return dataclasses.replace(best, status=explained(case, poses, best.status))
 
     def quickened(self, case: BlockCase, plan: BlockPlan) -> BlockPlan:
@@ -461,3 +474,12 @@ class OnlineBlock(OneByOne):
             iterations=jnp.asarray(steps, jnp.int32),
             status=status_of(duration, violation, violation > FEASIBILITY_TOLERANCE),
         )
+
+
+def brisk(**fields: Any) -> OnlineBlock:
+    """The default planner, of motions that end as early as may be; the arm then waits.
+
+    Args:
+        **fields: of `OnlineBlock`.
+    """
+    return OnlineBlock(**{"searches": _BRISK, "brisk": True, **fields})

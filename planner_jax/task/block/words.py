@@ -65,6 +65,8 @@ def planner(name: str = "online", **options: Any) -> AnyPlanner[Any, Any]:
     * `adapt:FILE`: motions of that file warped to the very ball, then least squares from these.
     * `online`: a straight motion of the joints if one is free, else end pose, time of contact and
       motion together, by least squares from many starts.
+    * `brisk`: as `online`, but of motions from rest to rest the quickest; the arm then stands and
+      waits for the ball, at the price of torque.
     * `direct`: all joints as fast as they may turn, to the end pose that is reached soonest of
       those to which that touches nothing.
     * `rrt-connect`, `epase`: ways by OMPL's RRT-Connect, or by a weighted A* over steps of the
