@@ -153,8 +153,7 @@ class OnlineBlock(OneByOne):
 
         def plan_of(k: Array) -> BlockPlan:
             point = self.straight_point(case, poses, order[k])
-            plan = self.plan_at(case, flight, point, jnp.zeros((), jnp.int32))
-            return self.quickened(case, plan) if self.brisk else plan
+            return self.plan_at(case, flight, point, jnp.zeros((), jnp.int32))
 
         def quicker(k: Array, best: BlockPlan) -> BlockPlan:
             plan = plan_of(k)
@@ -170,8 +169,6 @@ class OnlineBlock(OneByOne):
             bent = jax.vmap(self.bump)(jnp.asarray(bumps, points.dtype))
             points = points.at[:, :-1].add(bent.reshape(attempt.tries, -1))
             best = bend(case, flight, points, attempt, best)
-            if self.brisk:  # what is so already stays as it is
-                best = self.quickened(case, best)
         return dataclasses.replace(best, status=explained(case, poses, best.status))
 
     def quickened(self, case: BlockCase, plan: BlockPlan) -> BlockPlan:
@@ -466,7 +463,7 @@ class OnlineBlock(OneByOne):
         contact = self.contact_terms(case, flight, angles[-1], point[-1])[2]
         excess = _violation(joints, contact, self.margin - jnp.min(gaps))
         violation = jnp.where(point[-1] > case.delay, excess, jnp.inf)
-        return BlockPlan(
+        plan = BlockPlan(
             motion=polynomial(case.angles, first, moves, duration),
             contact_time=point[-1],
             cost=duration,
@@ -474,6 +471,7 @@ class OnlineBlock(OneByOne):
             iterations=jnp.asarray(steps, jnp.int32),
             status=status_of(duration, violation, violation > FEASIBILITY_TOLERANCE),
         )
+        return self.quickened(case, plan) if self.brisk else plan
 
 
 def brisk(**fields: Any) -> OnlineBlock:
