@@ -6,6 +6,7 @@ of the same problem converges to.
 """
 
 import csv
+import dataclasses
 from pathlib import Path
 
 import jax
@@ -51,11 +52,22 @@ def rows(name, num=None):
     return cases.replace(times=columns["Tp"][:, None]), columns
 
 
+def converged():
+    """The planner with as many steps as every row takes.
+
+    With the stages before, the slowest of the 240 takes 181 to 217 steps, as the rounding of a
+    release of JAX has it, and the planner ends after 185. In float32 more bring nothing.
+    """
+    (full,) = PLANNER.rounds
+    patient = dataclasses.replace(full.solver, max_steps=250)
+    return dataclasses.replace(PLANNER, rounds=(dataclasses.replace(full, solver=patient),))
+
+
 def excess(num):
     """Costs reached on the first rows of both files, relative to the published optima, less 1."""
     (easy, published), (hard, of_hard) = (rows(name, num) for name in NAMES)
     cases = jax.tree.map(lambda *leaves: np.concatenate(leaves), easy, hard)
-    plans = plan(PLANNER, cases)
+    plans = plan(converged(), cases)
     cost = np.concatenate([published["cost_ref"], of_hard["cost_ref"]])
     times = np.concatenate([published["T_ref"], of_hard["T_ref"]])
     return UNIT * plans.cost / cost - 1.0, plans.times[:, 0] - times, cases, plans
