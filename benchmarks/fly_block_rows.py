@@ -45,7 +45,7 @@ HEADER = (
 
 def line(regime: str, name: str, flights: Any, seconds: float) -> str:
     """One row of the table; joints, tracking and contacts are those of arms with a plan."""
-    from planner_jax.sims.tasks.block import TOUCH
+    from planner_jax.sims.tasks.block_flights import TOUCH
 
     number, good, some = len(flights.miss), flights.success, flights.planned
     low, high = (100.0 * end for end in wilson_interval(int(good.sum()), number))
@@ -78,7 +78,7 @@ def measure(bench: Bench, regime: str, rows: list[str], options: Any) -> None:
     """Plan once, and carry the plans out in every row."""
     from planner_jax.protocol import is_solved
     from planner_jax.sims.robots.arm.drives import TORQUES, Drives
-    from planner_jax.sims.tasks.block import BLOCK_WORLD, fly_blocks, throws
+    from planner_jax.sims.tasks.block_flights import BLOCK_WORLD, fly_blocks, throws
     from planner_jax.sweep.timing import timed_plans
     from planner_jax.task.block.words import judge, planner
 

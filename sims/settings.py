@@ -206,16 +206,32 @@ class InterceptFly(FlySettings):
 class BlockFly(FlySettings):
     """Blocks of an arm with a shield."""
 
-    replan: float | None = option(None, "HZ", "0: a block is planned once")
+    replan: float | None = option(
+        None, "HZ", "with --perception: rate at which the motion is decided anew (default: 0, once)"
+    )
     planner: str = option("online", "NAME", "of all plans, made one at a time")
     suite: str = option("pole", "NAME", "of throws")
     regime: str = option("R2", "NAME", f"limits that plans keep: {', '.join(REGIMES)}")
     wide: bool = option(
         False, "", "the ball may be 0.1 m off the shield's middle and 30 degrees off straight on"
     )
-    # Paper 004, Section VI-B: 82.9 ms for perception and 50 ms for the rest of the system.
-    sense: float = option(0.133, "S", "until the ball's flight is known")
-    allowed: float = option(0.03, "S", "that plans may take; then the arm sets out")
+    perception: bool = option(
+        False, "", "plan with what a camera has seen of the ball, which flies on as it does"
+    )
+    sense: float | None = option(
+        None, "S", "until the ball's flight is known (default: 0.133, with --perception 0.25)"
+    )
+    allowed: float | None = option(
+        None,
+        "S",
+        "that plans may take; then the arm sets out (default: 0.03, with --perception 0.05)",
+    )
+    noise: float = option(
+        0.02,
+        "M",
+        "with --perception: standard deviation of each coordinate; 0 for a stereo camera's",
+    )
+    frame_rate: float = option(60.0, "HZ", "with --perception: of the camera")
     torque: float = option(1.0, "F", "share of the drives' torques that is there")
     lag: float = option(0.005, "S", "of the torques, first order")
     latency: float = option(0.0, "S", "by which plans come late to the joints")
@@ -230,11 +246,29 @@ class BlockFly(FlySettings):
         require_one_of(ENCODERS, "encoders", self.encoders)
         require_one_of(REGIMES, "regime", self.regime)
         require_one_of(BLOCK.suites, "suite", self.suite)
-        for name in ("sense", "allowed"):
+        for name in ("sense", "allowed", "noise"):
             value = getattr(self, name)
-            require(0.0 <= value < math.inf, name, "finite and >= 0", value)
+            require(value is None or 0.0 <= value < math.inf, name, "finite and >= 0", value)
+        require(0.0 < self.frame_rate < math.inf, "frame_rate", "finite and > 0", self.frame_rate)
+        own = self.planner.partition(":")[0] != "library"
+        require(
+            own or not self.perception, "planner", "one that plans for the very ball", self.planner
+        )
         require(0.0 < self.torque < math.inf, "torque", "finite and > 0", self.torque)
         super().__post_init__()
+
+    @property
+    def until_known(self) -> float:
+        """[s], from when the ball is first seen until its flight is known, or first fitted."""
+        # Paper 004, Section VI-B: 82.9 ms for perception and 50 ms for the rest of the system.
+        usual = 0.25 if self.perception else 0.133
+        return usual if self.sense is None else self.sense
+
+    @property
+    def until_set(self) -> float:
+        """[s], from then on until the arm sets out."""
+        usual = 0.05 if self.perception else 0.03
+        return usual if self.allowed is None else self.allowed
 
     @property
     def drives(self) -> Drives:
@@ -270,6 +304,8 @@ class BlockFly(FlySettings):
         return super().flight()
 
     def check_rate(self) -> None:
-        """Raise `ValueError` unless plans are made once and the drives are possible."""
-        require(self.rate == 0.0, "replan", "0, a block is planned once", self.rate)
+        """Raise `ValueError` unless plans can be made anew, and the drives are possible."""
+        rule = ">= 0, and 0 without perception: a block is planned once"
+        most = math.inf if self.perception else 1e-9
+        require(0.0 <= self.rate < most, "replan", rule, self.rate)
         _ = self.drives

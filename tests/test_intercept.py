@@ -140,6 +140,14 @@ def test_what_the_planner_claims_the_referee_confirms(planned):
     assert "target" in verdict.sentence(int(np.argmax(solved)))
 
 
+@pytest.mark.slow
+def test_best_also_solves_starts_beside_walls_that_leave_no_room_for_margins():
+    cases = pj.lane(pj.intercept.draw(600, "hard", 1), np.array([20, 176, 291, 506]))
+    usual, best = (pj.plan(pj.intercept.planner(name), cases) for name in ("spacetime", "best"))
+    success = pj.intercept.judge(cases, best).success
+    assert success.sum() > pj.solved(usual).sum() and (success | ~pj.solved(best)).all()
+
+
 def test_a_plan_is_sampled_at_a_rate_up_to_its_end(planned):
     cases, plans = planned
     k = int(np.argmax(pj.solved(plans)))

@@ -188,6 +188,9 @@ def test_a_car_gets_away_from_a_wall_ahead_if_it_can_still_turn(ahead, gets_away
     assert departs(one, far=0.8, until=2.0) == gets_away
 
 
-def test_a_target_nearby_needs_no_departure():
-    near = scene((1.5, 4.0), time=2.0, walls=[box(2.0, 2.0, 2.2, 6.0)])
-    assert departs(near)
+@pytest.mark.parametrize(("ahead", "lives"), [(0.05, False), (0.5, True)])
+def test_of_a_target_nearby_it_is_enough_to_touch_nothing(ahead, lives):
+    # The car sets out at a speed at which it takes 0.125 m to stand.
+    front = START[0] + MIDDLE + 0.2
+    near = scene((1.5, 4.0), time=2.0, walls=[box(front + ahead, 2.0, front + ahead + 0.2, 6.0)])
+    assert departs(replace(near, initial_speed=0.5)) == lives

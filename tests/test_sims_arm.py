@@ -24,7 +24,7 @@ from planner_jax.sims.robots.arm.drives import IDEAL, TORQUES, Drives
 from planner_jax.sims.robots.arm.robot import ShieldArm
 from planner_jax.sims.scenery import box_solid, capsule_solid
 from planner_jax.sims.settings import BlockFly
-from planner_jax.sims.tasks.block import (
+from planner_jax.sims.tasks.block_flights import (
     BLOCK_ARM,
     BLOCK_WORLD,
     Budget,
@@ -38,9 +38,11 @@ from planner_jax.sims.tasks.block import (
 from planner_jax.sims.tasks.intercept import CAR_WORLD
 from planner_jax.sims.view import Viewer
 from planner_jax.sweep.settings import SettingError
+from planner_jax.task.block.eye import eye, see
 from planner_jax.task.block.library.file import save_library
 from planner_jax.task.block.motion import polynomial, profiles
 from planner_jax.task.block.plan import BlockPlan
+from planner_jax.task.block.receding import Decided
 
 HOME, LANES = np.asarray(irb1600().home), 4  # all batches are of one size: one program
 TURN = np.array([-0.4, -0.5, 0.4, 0.6, -0.5, 0.8])  # [rad], of a motion that touches nothing
@@ -252,6 +254,28 @@ def test_the_parts_of_the_time_budget_add_up_and_a_plan_that_is_late_begins_late
     assert within.tolist() == [[False, True]] * LANES
 
 
+def test_arms_that_only_see_their_balls_do_what_they_decided_on():
+    cases = throws("open", LANES, 1, regime="R1", delay=0.15)
+    plan = plans(*MOTIONS, contact=0.15 + MOVING)
+    sights = [see(cases.cases, eye(std=std), 0.1) for std in (0.02, 1e-5)]
+    none = np.zeros(LANES, np.float32)
+    decided = Decided(
+        cases=jax.tree.map(jnp.asarray, cases.cases),
+        plans=plan,
+        fits=batch(*[sight.fits for sight in sights]),
+        begun=jnp.asarray(none),
+        motions=jnp.asarray(2 + np.arange(LANES)),
+    )
+    found = fly_blocks(BLOCK_WORLD, cases, decided=decided, allowed=0.05)
+    known = fly_blocks(BLOCK_WORLD, cases, plan=plan, allowed=0.05)
+    np.testing.assert_array_equal(found.flown.angles, known.flown.angles)
+    np.testing.assert_array_equal(found.miss, known.miss)
+    assert found.motions.tolist() == [2, 3, 4, 5] and known.motions.tolist() == [1] * LANES
+    assert (found.last_fit_error < 1e-3).all() and (found.fit_error > 5e-3).all()
+    assert np.isnan(known.fit_error).all() and np.isnan(known.last_fit_error).all()
+    np.testing.assert_allclose(found.budget.plan + found.budget.wait, 0.05, atol=1e-6)
+
+
 def test_solids_of_capsules_and_boxes_are_closed_and_seen_from_outside():
     first, second = np.array([0.1, 0.2, 0.3]), np.array([0.1, 0.5, 0.3])
     for solid, volume in (
@@ -338,10 +362,34 @@ def test_four_balls_are_blocked_from_the_command_line(tmp_path, capsys):
     assert (out / "index.html").read_text() == page
 
 
+@pytest.mark.slow
+def test_balls_that_are_only_seen_are_blocked_from_the_command_line(tmp_path, capsys):
+    out = tmp_path / "run"
+    command = ["fly", "block", "--num", "4", "--regime", "R1", "--suite", "open", "--wide"]
+    assert main([*command, "--perception", "--replan", "10", "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert "The flight as it was first seen was" in said and "anew at 10 Hz" in said
+    summary = json.loads((out / "manifest.json").read_text())["summary"]
+    assert summary["motions"] >= 4 and summary["blocked"] >= 3
+    assert summary["last_fit_error_median"] < summary["fit_error_median"]
+
+
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: BlockFly(replan=10.0), "replan must be 0, a block is planned once, got 10.0"),
+        (
+            lambda: BlockFly(replan=10.0),
+            "replan must be >= 0, and 0 without perception: a block is planned once, got 10.0",
+        ),
+        (lambda: BlockFly(perception=True, noise=-1.0), "noise must be finite and >= 0, got -1.0"),
+        (
+            lambda: BlockFly(perception=True, frame_rate=0.0),
+            "frame_rate must be finite and > 0, got 0.0",
+        ),
+        (
+            lambda: BlockFly(perception=True, planner="library:some.lib"),
+            "planner must be one that plans for the very ball, got library:some.lib",
+        ),
         (
             lambda: BlockFly(encoders="no"),
             "encoders must be one of none, fine, coarse, got 'no'",

@@ -16,7 +16,7 @@ from planner_jax.task.block.end_poses import flight_of
 from planner_jax.task.block.eye import eye, fit_errors
 from planner_jax.task.block.met import as_met, begun_late
 from planner_jax.task.block.plan import BlockPlan
-from planner_jax.task.block.receding import decide
+from planner_jax.task.block.receding import Decided, decide
 
 
 @struct.dataclass
@@ -46,17 +46,7 @@ class SeeingArms:
 
     def plans(self, cases: BlockCase) -> SeenPlan:
         """What the arms of a batch do, up to where they meet the true balls."""
-        seen = eye(rate=self.frame_rate, std=self.noise or None)
-        done = decide(
-            self.planner,
-            cases,
-            seen,
-            self.moments(cases),
-            overhead=self.overhead,
-            seed=self._seeds(cases),
-            patient=self.wait > 0.0,
-            again=self.refit > 0.0,
-        )
+        done = self.decided(cases)
         fits = [lane(done.fits, place) for place in (0, -1)]
         (error, std), (last, _) = (fit_errors(done.cases, fit) for fit in fits)
         met = as_met(done.cases, done.plans)
@@ -72,6 +62,19 @@ class SeeingArms:
                 last_fit_error=last,
                 motions=done.motions,
             ),
+        )
+
+    def decided(self, cases: BlockCase) -> Decided:
+        """What the arms of a batch do, wherever they meet their balls."""
+        return decide(
+            self.planner,
+            cases,
+            eye(rate=self.frame_rate, std=self.noise or None),
+            self.moments(cases),
+            overhead=self.overhead,
+            seed=self._seeds(cases),
+            patient=self.wait > 0.0,
+            again=self.refit > 0.0,
         )
 
     def moments(self, cases: BlockCase) -> list[float]:

@@ -45,7 +45,7 @@ def checked_plan(
         steps: () int32, its iterations.
     """
     way = motion(case.start, time, speed, curvature, samples)
-    _, violation = limit_terms(case, time, speed, curvature, Weights(), 0.0, places)
+    _, violation = limit_terms(case, time, speed, curvature, Weights(), places)
     _, missed = meeting_terms(case, way, time, Weights())
     bumped = (GRAZING - jnp.min(clearance(case, way))) / case.body.width
     worst = jnp.maximum(jnp.maximum(violation, missed), bumped)

@@ -31,6 +31,9 @@ class Warm(Attempt):
 
     solver: LevenbergConfig = LevenbergConfig(8)
     settling: int = 4  # steps towards less effort
+    margin: float = 0.03  # as of a `Search`
+    slack: float = 0.015
+    discs: int = 3
 
 
 @jax.tree_util.register_static
@@ -119,7 +122,7 @@ class ReplanIntercept(OneByOne):
             for stage in planner.last_stages(attempt)
         ]
         field = planner.field(case, grid)
-        return planner.refined(case, field, guess, attempt.solver, stages)
+        return planner.refined(case, field, guess, attempt, stages)
 
     def solve_at_once(self, tasks: Replanning, attempt: Any) -> InterceptPlan:
         """The plans of a batch, all at once."""

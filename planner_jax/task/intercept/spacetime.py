@@ -63,6 +63,9 @@ class Search(Attempt):
     solver: LevenbergConfig = LevenbergConfig()  # of the stage that keeps limits
     following: int = 4  # steps along the way of cells
     settling: int = 16  # steps towards less effort, or an earlier meeting
+    margin: float = 0.03  # [m], kept from obstacles
+    slack: float = 0.015  # share of every limit that is kept free
+    discs: int = 3  # that the body counts as in least squares
     seed: int = 0  # of the ways
     drawn: int = 4  # ways for each that is tried: the smoothest of them
     directness: float = 2.0  # of these ways; see `reach.draw_way`
@@ -87,7 +90,12 @@ _QUICK = tuple(
     dataclasses.replace(search, ways=ways, solver=LevenbergConfig(steps), settling=12)
     for search, ways, steps in zip(_GIVEN, (2, 4, 6), (8, 10, 14), strict=True)
 )
-_BEST = (dataclasses.replace(_GIVEN[0], ways=8, settling=48), *_GIVEN[1:])
+# A car that begins beside a wall has no room for margins: many ways, which keep next to none.
+_NARROW = tuple(
+    Search(64, LevenbergConfig(60), seed=seed, girth=girth, margin=0.006, slack=1e-3, discs=7)
+    for seed, girth in ((3, 0.9), (4, 0.75), (6, 0.9))
+)
+_BEST = (dataclasses.replace(_GIVEN[0], ways=8, settling=48), *_GIVEN[1:], *_NARROW)
 # Of a free time every way is tried, until it brings little, and the best one is kept. To hurry is
 # to leave the cells: early meetings come out earlier where nothing follows them.
 _EARLY = Search(
@@ -165,8 +173,6 @@ class SpacetimeIntercept(OneByOne):
     pieces: int = 32  # of speed and curvature
     samples: int = 3  # of each piece, where obstacles are looked at
     checked: int = 10  # the same, of the plan that is given back
-    margin: float = 0.03  # [m], kept from obstacles
-    slack: float = 0.015  # share of every limit that is kept free
     tries_all: bool = False  # ways of a search, of which the best is kept; of a free time always
     searches: tuple[Search, ...] | None = None  # by default those that suit `meet`
 
@@ -247,7 +253,7 @@ class SpacetimeIntercept(OneByOne):
 
         def kept(chance: reach.Chance) -> InterceptPlan:
             guess, stages = self.begun(case, found, chance, attempt), self.stages(attempt)[:-1]
-            points, steps = self.staged(case, found.field, guess, attempt.solver, stages)
+            points, steps = self.staged(case, found.field, guess, attempt, stages)
             return self.plan_at(case, points[-1], steps)
 
         def improved(chance: reach.Chance) -> InterceptPlan:
@@ -324,7 +330,7 @@ class SpacetimeIntercept(OneByOne):
     ) -> InterceptPlan:
         """The plan that one random way leads to."""
         guess = self.begun(case, found, chance, attempt)
-        return self.refined(case, found.field, guess, attempt.solver, self.stages(attempt))
+        return self.refined(case, found.field, guess, attempt, self.stages(attempt))
 
     def begun(
         self, case: InterceptCase, found: Found, chance: reach.Chance, attempt: Search
@@ -352,21 +358,23 @@ class SpacetimeIntercept(OneByOne):
 
     def last_stages(self, attempt: "Search | Warm") -> list[Stage]:
         """What a guess that is near to a plan goes through."""
-        keeping = Stage(_KEEPING, attempt.solver.max_steps)
+        kept = {"margin": attempt.margin, "slack": attempt.slack}
+        keeping = Stage(dataclasses.replace(_KEEPING, **kept), attempt.solver.max_steps)
         if self.is_time_free:
             solver = attempt.solver
             keeping = dataclasses.replace(
                 keeping, tolerance=solver.tolerance, settled=solver.settled
             )
         steps = attempt.settling
-        return [keeping, Stage(self.weights, steps, settled=steps, of_good=True)]
+        weights = dataclasses.replace(self.weights, **kept)
+        return [keeping, Stage(weights, steps, settled=steps, of_good=True)]
 
     def staged(
         self,
         case: InterceptCase,
         field: DistanceField,
         guess: Guess,
-        solver: LevenbergConfig,
+        attempt: "Search | Warm",
         stages: list[Stage],
     ) -> tuple[Array, Array]:
         """Where each of S stages of least squares ends, which begins where the last one ended.
@@ -380,9 +388,12 @@ class SpacetimeIntercept(OneByOne):
             point, is_good = state
             most = jnp.where(stage.of_good & ~is_good, 0, stage.steps)
             config = dataclasses.replace(
-                solver, max_steps=most, tolerance=stage.tolerance, settled=stage.settled
+                attempt.solver, max_steps=most, tolerance=stage.tolerance, settled=stage.settled
             )
-            model = lambda x: self.model(x, case, field, stage.weights, guess.places)  # noqa: E731
+
+            def model(x: Array) -> Model:
+                return self.model(x, case, field, stage.weights, guess.places, attempt.discs)
+
             end = least_squares(model, point, config)
             return (end.point, end.model.violation <= 0.0), end
 
@@ -396,11 +407,11 @@ class SpacetimeIntercept(OneByOne):
         case: InterceptCase,
         field: DistanceField,
         guess: Guess,
-        solver: LevenbergConfig,
+        attempt: "Search | Warm",
         stages: list[Stage],
     ) -> InterceptPlan:
         """The plan at the end of some stages, or before the last one where that breaks a limit."""
-        points, steps = self.staged(case, field, guess, solver, stages)
+        points, steps = self.staged(case, field, guess, attempt, stages)
         plans = lax.map(lambda point: self.plan_at(case, point, steps), points[-2:])
         before, after = (jax.tree.map(lambda leaf, k=k: leaf[k], plans) for k in range(2))
         return self.better_of_two(before, after)
@@ -414,7 +425,7 @@ class SpacetimeIntercept(OneByOne):
         last = self.last_stages(attempt)[-1]
         steps = jnp.where(is_solved(plan.status), last.steps, 0)
         stage = dataclasses.replace(last, steps=steps, of_good=False)
-        points, steps = self.staged(case, field, guess, attempt.solver, [stage])
+        points, steps = self.staged(case, field, guess, attempt, [stage])
         return self.better_of_two(plan, self.plan_at(case, points[0], plan.iterations + steps))
 
     def guess_at(self, point: Array) -> Guess:
@@ -477,13 +488,17 @@ class SpacetimeIntercept(OneByOne):
         field: DistanceField,
         weights: Weights,
         places: Array,
+        discs: int = 3,
     ) -> Model:
-        """Sum of squares of a point: miss, obstacles, limits, effort, distance from places."""
+        """Sum of squares of a point: miss, obstacles, limits, effort, distance from places.
+
+        Of obstacles the body keeps off as so many discs, static.
+        """
         speed, curvature, time = self.parts(case, point)
         way = motion(case.start, time, speed, curvature, self.samples)
-        limits, violation = limit_terms(case, time, speed, curvature, weights, self.slack, 4)
+        limits, violation = limit_terms(case, time, speed, curvature, weights, 4)
         end, missed = meeting_terms(case, way, time, weights)
-        squares, close = obstacle_terms(case, field, way, weights, self.margin)
+        squares, close = obstacle_terms(case, field, way, weights, discs)
         squares = squares.at[:, -1].add(following_terms(way, places, weights))
         squares = squares.at[-1, -1].add(end)
         cost = Quadratic(

@@ -71,7 +71,7 @@ class PathSource:
             time, guess = start
             drive = dataclasses.replace(still, time=time)
             stages = self.planner.stages(attempt)
-            plan = self.planner.refined(drive, found.field, guess, attempt.solver, stages)
+            plan = self.planner.refined(drive, found.field, guess, attempt, stages)
             speed = jnp.maximum(plan.speed, 0.0)
             driven = path_of_drive(plan.start, time, speed, plan.curvature, self.points)
             return driven, plan.violation, plan.iterations

@@ -23,12 +23,14 @@ from planner_jax.task.intercept.motion import (
 )
 
 _HIGHEST = lax.Precision.HIGHEST
-_DISCS = 3  # that cover the body
 
 
 @struct.dataclass
 class Weights:
-    """Of the squares; costs are made comparable by the limits themselves."""
+    """Of the squares, and where the hinges among them set in.
+
+    Costs are made comparable by the limits themselves.
+    """
 
     miss: float = 300.0  # of the distance to the target over its tolerance of 0.05 m
     obstacle: float = 1e3
@@ -37,6 +39,8 @@ class Weights:
     early: float = 300.0  # of the share of the case's time until the meeting, where it is free
     turning: float = 3e-3  # the same of the change of curvature
     follow: float = 0.0  # of the squared distance at knots from the places of a guess [1/m^2]
+    margin: float = 0.03  # [m], kept from obstacles
+    slack: float = 0.015  # share of every limit that is kept free
 
 
 def wrapped(angle: Array) -> Array:
@@ -58,7 +62,6 @@ def limit_terms(
     speed: Array,
     curvature: Array,
     weights: Weights,
-    slack: float,
     places: int,
 ) -> tuple[Array, Array]:
     """Hinges on the car's limits, and effort.
@@ -81,7 +84,7 @@ def limit_terms(
 
     def hinge(value: Array, limit: Array, by: dict[int, Any]) -> None:
         excess = jnp.abs(value) / limit - 1.0
-        inside = jnp.maximum(excess + slack, 0.0)
+        inside = jnp.maximum(excess + weights.slack, 0.0)
         sign = jnp.where(inside > 0.0, jnp.sign(value), 0.0) / limit
         excesses.append(excess)
         squares.add({**{k: sign * each for k, each in by.items()}, 5: inside}, weights.limit)
@@ -178,9 +181,12 @@ def following_terms(way: Motion, places: Array, weights: Weights) -> Array:
 
 
 def obstacle_terms(
-    case: InterceptCase, field: DistanceField, way: Motion, weights: Weights, margin: float
+    case: InterceptCase, field: DistanceField, way: Motion, weights: Weights, discs: int
 ) -> tuple[Array, Array]:
-    """Hinges on the distance of the body's discs from obstacles, and on the map's edge.
+    """Hinges on the distance of the body from obstacles, and on the map's edge.
+
+    The body counts as so many discs, static, that cover it: the fewer they are, the more they
+    stand out at its sides.
 
     Returns:
         squares: (K, S, 5, 5), products of the residuals' slopes by x, y, heading and time of
@@ -188,7 +194,7 @@ def obstacle_terms(
         close: (), largest excess of a disc into an obstacle, or of the body's middle beyond the
             map, relative to the body's width.
     """
-    radius, ahead = discs_of(case.body, _DISCS)
+    radius, ahead = discs_of(case.body, discs)
     shape = way.heading.shape
     x, y = (way.pos[..., k].reshape(-1) for k in range(2))  # (M,)
     cos, sin = (way.direction[..., k].reshape(-1) for k in range(2))
@@ -212,7 +218,7 @@ def obstacle_terms(
 
     # A loop, so that a compiler works the distances out once and not for every use.
     far, away_x, away_y = lax.map(around, ahead)  # (discs, 1 + N, M)
-    inside = jnp.maximum(radius + margin - far, 0.0)
+    inside = jnp.maximum(radius + weights.margin - far, 0.0)
     is_inside = inside > 0.0
     speed_x, speed_y = (
         jnp.concatenate([jnp.zeros((1, 1), x.dtype), velocity[:, k]]) for k in range(2)
@@ -227,7 +233,8 @@ def obstacle_terms(
     for axis, (at, slope) in enumerate(((x + middle * cos, -sin), (y + middle * sin, cos))):
         above, below = at - case.upper[axis], case.lower[axis] - at
         off_map += [above, below]
-        beyond = jnp.maximum(above + margin, 0.0) - jnp.maximum(below + margin, 0.0)
+        over, under = (jnp.maximum(each + weights.margin, 0.0) for each in (above, below))
+        beyond = over - under
         is_beyond = jnp.where(beyond != 0.0, 1.0, 0.0)
         row = {axis: is_beyond, 2: middle * slope * is_beyond, 4: beyond}
         for a, left in row.items():

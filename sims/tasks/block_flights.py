@@ -1,0 +1,344 @@
+"""Blocks in closed loop: an arm with a shield carries out plans against thrown balls (paper 004).
+
+The ball's flight is known once it has been seen for a while; then a plan is made, by a clock on the
+wall, and the arm sets out when the time that plans are allowed is over, or later if its plan is
+not there by then. Its torques are limited, and nothing else but them moves it. What is counted is
+what the simulated arm does, in float64 and by the referee's geometry: balls fall along their
+parabola, so that they need no simulation. Times count from the moment at which the ball is first
+seen; places are in the robot's base frame, those of recordings in the world, the floor at height 0.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from planner_jax.plan_files import named_leaves
+from planner_jax.protocol import is_solved, lane
+from planner_jax.referee.arm_clearance import clearances, links_of, shield_middle
+from planner_jax.referee.block import times_inside
+from planner_jax.referee.solids import from_segment, turned, turned_back
+from planner_jax.sims.execution import FRAME, TIMESTEP, Executed, execute
+from planner_jax.sims.launch import flight_keys
+from planner_jax.sims.model import World
+from planner_jax.sims.robots.arm.control import Course
+from planner_jax.sims.robots.arm.drives import IDEAL, Drives
+from planner_jax.sims.robots.arm.robot import ShieldArm
+from planner_jax.sims.task import FlightCases, Flights
+from planner_jax.sweep.timing import timed_plans
+from planner_jax.task.block.case import BlockCase
+from planner_jax.task.block.eye import fit_errors
+from planner_jax.task.block.plan import BlockPlan
+from planner_jax.task.block.receding import Decided
+from planner_jax.task.block.scene import FLOOR
+from planner_jax.task.block.suites import BALL_RADIUS, GRAVITY
+from planner_jax.task.block.words import draw as draw_throws
+from planner_jax.task.block.words import planner as block_planner
+
+BLOCK_ARM = ShieldArm(base_height=-FLOOR)
+BLOCK_WORLD = World(BLOCK_ARM, GRAVITY, num_balls=0, timestep=TIMESTEP)
+TOUCH = 1e-3  # [m] inside of something that is a contact, as the referee has it
+_AFTER = 0.3  # [s], that an arm is simulated after its contact: in it, joints brake
+_LANES = 64  # whose clearances are worked out at once
+FALL = np.array([0.0, 0.0, 1.0])
+
+
+@dataclasses.dataclass(frozen=True)
+class Throws(FlightCases):
+    """B thrown balls, NumPy leaves."""
+
+    cases: BlockCase  # the delay is the time for sensing and planning
+
+
+@dataclasses.dataclass(frozen=True)
+class Budget:
+    """Where the time until the contact goes, (B,) [s] each: eq. (1) of paper 004.
+
+    The ball is blocked if the time of its flight is at least that of the others; what is planned
+    after the time that it is allowed makes the arm late.
+    """
+
+    sense: np.ndarray  # until the ball's flight is known
+    plan: np.ndarray  # by the clock
+    wait: np.ndarray  # after the plan, until the arm starts
+    move: np.ndarray  # of the plan's motion
+    stand: np.ndarray  # after the motion, up to the planned contact; negative if it is too late
+    rest: np.ndarray  # from the planned contact until the ball gets into the inner box
+
+    @property
+    def flight(self) -> np.ndarray:
+        """Until the ball gets into the inner box, (B,) [s]."""
+        return np.sum([getattr(self, field.name) for field in dataclasses.fields(self)], axis=0)
+
+
+@dataclasses.dataclass(frozen=True)
+class BlockFlights(Flights):
+    """What came of a batch of blocks; leaves with a leading axis B."""
+
+    flown: Executed
+    budget: Budget
+    blocked: np.ndarray  # (B,) bool: on the face of the shield before it was in the inner box
+    contact: np.ndarray  # (B,) [s], of the ball with the shield; NaN without one
+    contact_pos: np.ndarray  # (B, 3) [m], of the ball's centre then; NaN likewise
+    miss: np.ndarray  # (B,) [m], of the ball from the shield's middle where it is in its plane
+    struck: np.ndarray  # (B,) bool, whether the ball touched base or links 1 to 3 before
+    clearance: np.ndarray  # (B,) [m], least up to the contact; negative inside
+    nearest: np.ndarray  # (B,) str, what came so near
+    clearance_after: np.ndarray  # (B,) [m], least from then on, while the arm brakes
+    planned: np.ndarray  # (B,) bool, whether there was a plan
+    motions: np.ndarray  # (B,) int, that were begun
+    fit_error: np.ndarray  # (B,) [m], across the flight as first seen; NaN if it is known
+    last_fit_error: np.ndarray  # (B,) [m], the same as last seen
+
+    @property
+    def touched(self) -> np.ndarray:
+        """Which arms ran into something before the contact, (B,) bool."""
+        return self.clearance < -TOUCH
+
+    @property
+    def success(self) -> np.ndarray:
+        """Which balls were blocked by an arm that touched nothing, (B,) bool."""
+        return self.blocked & ~self.touched
+
+
+def throws(
+    suite: str,
+    num: int,
+    seed: int = 0,
+    *,
+    regime: str = "R2",
+    wide: bool = False,
+    delay: float = 0.0,
+) -> Throws:
+    """Throws of a suite; see `pj.block.draw`."""
+    cases = draw_throws(num, suite, seed, regime=regime, wide=wide, delay=delay)
+    return Throws(index=np.arange(num), cases=jax.tree.map(np.asarray, cases))
+
+
+def courses_of(cases: BlockCase, plans: BlockPlan) -> Course:
+    """What arms follow: their plans from the delay on; without a plan they stay where they are.
+
+    Joints brake as hard as plans may speed them up.
+    """
+    coeffs = np.asarray(plans.motion.coeffs)
+    solved = np.asarray(is_solved(plans.status))
+    still = np.zeros_like(coeffs)
+    still[:, :, 0], still[:, :, 1] = cases.angles[:, None], cases.rates[:, None]
+    motion = dataclasses.replace(
+        plans.motion,
+        coeffs=np.where(solved[:, None, None, None], coeffs, still),
+        durations=np.where(solved[:, None], plans.motion.durations, 0.0).astype(coeffs.dtype),
+    )
+    return Course(motion=motion, begin=cases.delay, braking=cases.limits.acceleration)
+
+
+def fly_blocks(
+    world: World,
+    cases: Throws,
+    seed: int = 0,
+    *,
+    drives: Drives = IDEAL,
+    planner: Any = None,
+    allowed: float | None = None,
+    plan: BlockPlan | None = None,
+    seconds: np.ndarray | None = None,
+    decided: Decided | None = None,
+) -> BlockFlights:
+    """Plan and carry out a batch of blocks.
+
+    Args:
+        world: with an arm.
+        cases: what is thrown.
+        seed: of the noise of encoders, >= 0.
+        drives: of the arm.
+        planner: of all plans, by default `online`.
+        allowed: [s], the end of the delay, that plans may take; a plan that takes longer is
+            carried out as much later. None: planning takes no time.
+        plan: of each case, instead of one made here.
+        seconds: (B,) [s], that these took.
+        decided: what arms do that only see their balls, instead of plans; with the same delays.
+
+    Raises:
+        ValueError: the arm of the cases is not the one that is simulated, or plans are allowed
+            more than the delay.
+    """
+    case = cases.cases
+    require_arm(world, case)
+    delay = np.asarray(case.delay, float)
+    if allowed is not None and not 0.0 <= allowed <= delay.min() + 1e-6:
+        raise ValueError(f"allowed must be >= 0 and <= the delay {delay.min():g}, got {allowed:g}")
+    if decided is not None:
+        plan = decided.plans
+    if plan is None:
+        made: tuple[BlockPlan, np.ndarray] = timed_plans(planner or block_planner(), case)
+        plan, seconds = made
+    seconds = np.zeros(len(cases)) if seconds is None or allowed is None else seconds
+    allowed = allowed or 0.0
+    solved = np.asarray(is_solved(plan.status))
+    entry = entry_times(case)
+    last = np.where(np.isfinite(entry), entry, delay)
+    contact = np.where(solved, np.asarray(plan.contact_time, float), last)
+    flown = execute(
+        world,
+        courses_of(case, plan),
+        flight_keys(seed, cases.index),
+        since=delay,
+        until=contact,
+        end=float(np.max(np.maximum(contact, last))) + _AFTER,
+        late=np.maximum(seconds - allowed, 0.0),
+        drives=drives,
+    )
+    move = np.where(solved, np.sum(np.asarray(plan.motion.durations, float), axis=1), 0.0)
+    budget = Budget(
+        sense=delay - allowed,
+        plan=seconds,
+        wait=np.maximum(allowed - seconds, 0.0),
+        move=move,
+        stand=contact - (delay - allowed) - np.maximum(allowed, seconds) - move,
+        rest=entry - contact,
+    )
+    flights = scored(case, plan, flown, budget)
+    if decided is None:
+        return flights
+    errors = (fit_errors(case, lane(decided.fits, place))[0] for place in (0, -1))
+    first, last = (np.asarray(error, float) for error in errors)
+    return dataclasses.replace(
+        flights, motions=np.asarray(decided.motions), fit_error=first, last_fit_error=last
+    )
+
+
+def require_arm(world: World, cases: BlockCase) -> None:
+    """Raise `ValueError` unless the simulated arm is the one that is planned for."""
+    if not isinstance(world.robot, ShieldArm):
+        raise ValueError(f"world must hold an arm, got a {type(world.robot).__name__}")
+    own = jax.tree.leaves_with_path(world.robot.arm)
+    for (path, value), planned in zip(own, jax.tree.leaves(cases.arm), strict=True):
+        name = path[-1].name
+        same = np.shape(planned)[1:] == np.shape(value)
+        # Each case says itself where its arm begins.
+        if name != "home" and not (same and np.allclose(planned, value, rtol=1e-5, atol=1e-6)):
+            raise ValueError(f"{name} must be the same in plan and simulated arm")
+
+
+def referee_leaves(cases: BlockCase) -> dict[str, np.ndarray]:
+    """All leaves of cases (B, ...) in float64 by their dotted names, as the referee has them."""
+    return {name: np.asarray(leaf, float) for name, leaf in named_leaves(cases).items()}
+
+
+def entry_times(cases: BlockCase) -> np.ndarray:
+    """When balls get into the inner box, (B,) [s]; infinite if never."""
+    with np.errstate(invalid="ignore"):  # of balls that never rise so high
+        begin, end = times_inside(referee_leaves(cases), "inner", 0.0)
+    return np.where(end >= 0.0, np.maximum(begin, 0.0), np.inf).min(axis=0)
+
+
+def ball_places(case: dict[str, np.ndarray], times: np.ndarray) -> np.ndarray:
+    """Places (3, B, S) [m] of balls at times (S,) or (B, S) [s]."""
+    pos, vel = case["ball.pos"].T[..., None], case["ball.vel"].T[..., None]
+    fall = np.multiply.outer(FALL, case["gravity"])[..., None]
+    return pos + vel * times - 0.5 * fall * times**2
+
+
+def scored(cases: BlockCase, plans: BlockPlan, flown: Executed, budget: Budget) -> BlockFlights:
+    """What arms did, held against the balls and all that they must not touch, in float64.
+
+    A ball is blocked when it comes down on the face of the shield, from in front and with its
+    centre over the face, before its centre is in the inner box and before it touches the arm. Miss
+    is how far from the middle it is there, or where it passes the shield's plane otherwise; it is
+    NaN where it does not come to it in time.
+
+    Args:
+        cases: leaves (B, ...).
+        plans: of them.
+        flown: the motions.
+        budget: the times.
+    """
+    case, times = referee_leaves(cases), flown.times
+    angles = flown.angles.transpose(2, 0, 1)
+    turns, places = links_of(case, angles)
+    middle, turn = shield_middle(case, turns, places), turns[5]
+    ball = ball_places(case, times)
+    height, *beside = turned_back(turn, ball - middle)
+    gap, beside = height - BALL_RADIUS, np.stack(beside)
+    entry = entry_times(cases)
+
+    comes = (gap[:, :-1] > 0.0) & (gap[:, 1:] <= 0.0)
+    share = np.where(comes, gap[:, :-1] / np.where(comes, gap[:, :-1] - gap[:, 1:], 1.0), 0.0)
+    when = times[:-1] + share * FRAME
+    there = beside[..., :-1] + share * (beside[..., 1:] - beside[..., :-1])
+    miss = np.where(comes & (when < entry[:, None]), np.linalg.norm(there, axis=0), np.inf)
+    over = np.abs(there).max(axis=0) <= case["arm.shield_half"][:, None]
+    lanes, first = np.arange(len(entry)), np.where(over, miss, np.inf).argmin(axis=1)
+    hit = over[lanes, first] & np.isfinite(miss[lanes, first])
+    nearest = miss.argmin(axis=1)
+    at = np.where(hit, first, nearest)
+    contact = np.where(hit, when[lanes, at], np.inf)
+    links = cases.arm.capsule_link
+    strikes = _strikes(case, links, turns, places, ball)
+    struck = np.any(strikes & (times < np.minimum(contact, entry)[:, None]), axis=1)
+    blocked = hit & ~struck
+
+    touching = ball_places(case, np.where(blocked, contact, 0.0)[:, None])[..., 0].T
+    until = np.where(np.isfinite(contact), contact, entry)
+    before = times <= until[:, None]
+    least, name = _least(case, links, angles, before)
+    planned, unknown = np.asarray(is_solved(plans.status)), np.full(len(entry), np.nan)
+    return BlockFlights(
+        first_plan=plans,
+        flown=flown,
+        planning_seconds=float(budget.plan.sum()),
+        budget=budget,
+        blocked=blocked,
+        contact=np.where(blocked, contact, np.nan),
+        contact_pos=np.where(blocked[:, None], touching, np.nan),
+        miss=np.where(np.isfinite(miss[lanes, at]), miss[lanes, at], np.nan),
+        struck=struck,
+        clearance=least,
+        nearest=name,
+        clearance_after=_least(case, links, angles, ~before)[0],
+        planned=planned,
+        motions=planned.astype(int),
+        fit_error=unknown,
+        last_fit_error=unknown,
+    )
+
+
+def _strikes(
+    case: dict[str, np.ndarray], links: Sequence[int], turns: list, places: list, ball: np.ndarray
+) -> np.ndarray:
+    """Which balls touch the base or links 1 to 3 at which frame, (B, S) bool.
+
+    The capsules of the wrist behind the shield bulge out of its face, where the links do not.
+    """
+    found = np.zeros(ball.shape[1:], bool)
+    for k, link in enumerate(links):
+        if link > 2:
+            continue
+        first, second = case["arm.capsule_ends"][:, k].transpose(1, 2, 0)[..., None]
+        if link >= 0:
+            first, second = (places[link] + turned(turns[link], end) for end in (first, second))
+        apart = from_segment(ball, first, second) - case["arm.capsule_radius"][:, k, None]
+        found |= apart < BALL_RADIUS
+    return found
+
+
+def _least(
+    case: dict[str, np.ndarray], links: Sequence[int], angles: np.ndarray, looked: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Least clearance (B,) [m] of arms at the frames that are looked at, and what comes so near.
+
+    It is infinite where no frame is looked at.
+    """
+    least, names = [], []
+    for begin in range(0, len(looked), _LANES):
+        some = slice(begin, begin + _LANES)
+        own = {name: leaf[some] for name, leaf in case.items()}
+        found = clearances(own, links, angles[:, some], looked[some])
+        distances = np.stack([distance for distance, _, _ in found.values()])
+        which, lanes = distances.argmin(axis=0), np.arange(distances.shape[1])
+        parts = np.stack([np.char.add(part, f", {kind}") for kind, (_, _, part) in found.items()])
+        least.append(distances[which, lanes])
+        names.append(parts[which, lanes])
+    return np.where(looked.any(axis=1), np.concatenate(least), np.inf), np.concatenate(names)
