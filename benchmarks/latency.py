@@ -1,14 +1,18 @@
-"""Time of one hit plan, batch 1, warm, with its success and cost beside it.
+"""Time of one plan, batch 1, warm, with its success and cost beside it.
 
-    python -m benchmarks.latency [--num 2000] [--out DIR]
+    python -m benchmarks.latency [--num 2000] [--task hit] [--planner NAME] [--suite NAME]
+        [--seed 1] [--elapsed S] [--out DIR]
 
-Every plan is a different generated serve, from the case's arrays to the plan's: ball table,
-guess, solve and the check of the limits included. Compile time is printed apart. Run it on an
-idle machine; the load average is printed.
+Every plan is of a different case of the suite, from the case's arrays to the plan's: all that the
+planner prepares, all its searches and the check of the limits included. Compile time is apart. With
+--elapsed an interception is planned, and what is timed is planning it again so many seconds into
+each plan, from where the car then is, for a target that goes on as before. Run it on an idle
+machine, bound to one core; the load average is printed.
 """
 
 import os
 import time
+from typing import Any
 
 import jax
 import numpy as np
@@ -16,42 +20,70 @@ import numpy as np
 import planner_jax as pj
 from planner_jax.benchmarks.cost_gap import cost_gaps
 from planner_jax.benchmarks.run import argument_parser, begin
+from planner_jax.plane.target import LaterPath
+from planner_jax.registry import all_tasks, task_named
+from planner_jax.sweep.timing import timed_plans
+
+
+def planned_again(planner: Any, cases: Any, elapsed: float) -> tuple[Any, Any]:
+    """The re-planner, and what it gets some seconds into the solved plans of a batch."""
+    plans = pj.plan(planner, cases)
+    lanes = np.flatnonzero(pj.solved(plans) & (np.asarray(plans.time) > elapsed))
+    cases, plans = jax.tree.map(np.asarray, pj.lane((cases, plans), lanes))
+    since: Any = np.full(len(lanes), elapsed, cases.time.dtype)
+    again = planner.replanner()
+    return again, again.begin(cases, plans, since, target=LaterPath(cases.target, since))
 
 
 def main() -> None:
-    """Time `plan` serve by serve."""
-    parser = argument_parser("latency", __doc__, num=2000)
+    """Time `plan` case by case."""
+    parser = argument_parser("latency", __doc__, num=2000, seed=1)
+    parser.add_argument("--task", choices=all_tasks(), default="hit", help="default: hit")
+    parser.add_argument("--planner", help="default: the task's first")
+    parser.add_argument("--suite", help="default: the task's first")
+    parser.add_argument("--elapsed", type=float, help="time re-plans of interceptions [s]")
     options = parser.parse_args()
-    num, planner = options.num, pj.hit.planner("exact")
+    card = task_named(options.task)
+    if options.elapsed is not None and options.task != "intercept":
+        parser.error("--elapsed is for --task intercept")
+    suite = options.suite or next(iter(card.suites))
+    try:
+        planner = card.make_planner(options.planner or next(iter(card.planners)), {})
+        batch = jax.tree.map(np.asarray, card.draw(options.num, suite, options.seed))
+    except ValueError as error:
+        parser.error(str(error))
     with begin(parser, options) as bench:
-        batch = jax.tree.map(np.asarray, pj.hit.draw(num, seed=1))
-        lanes = [pj.lane(batch, k) for k in range(num)]
+        judged = batch
+        if options.elapsed is not None:
+            planner, batch = planned_again(planner, batch, options.elapsed)
+            judged = batch.case
+        num = jax.tree.leaves(batch)[0].shape[0]
         began = time.perf_counter()
-        pj.plan(planner, lanes[0])
-        compile_seconds = time.perf_counter() - began
-        seconds, plans = [], []
-        for case in lanes:
-            began = time.perf_counter()
-            plans.append(pj.plan(planner, case))
-            seconds.append(time.perf_counter() - began)
-        together = jax.tree.map(lambda *leaves: np.stack(leaves), *plans)
-        success = pj.hit.judge(batch, together).success
+        pj.plan(planner, pj.lane(batch, 0))
+        first = time.perf_counter() - began
+        plans, seconds = timed_plans(planner, batch)
+        success = np.asarray(card.judge(judged, plans).success)
         p50, p90, p99 = 1e3 * np.percentile(seconds, [50, 90, 99])
+        of_good = seconds[success] if success.any() else np.nan
+        solved = 1e3 * np.percentile(of_good, [50, 90, 99])
+        what = "re-plans" if options.elapsed is not None else "plans"
         bench.say(
-            f"{num} serves, {jax.devices()[0].platform}, jax {jax.__version__}, "
-            f"load average {os.getloadavg()[0]:.1f}",
-            f"p50 {p50:.3f} ms, p90 {p90:.3f} ms, p99 {p99:.3f} ms; "
-            f"first call with compilation {compile_seconds:.1f} s",
+            f"{num} {what} of {card.name}, suite {suite}, {jax.devices()[0].platform}, jax "
+            f"{jax.__version__}, load average {os.getloadavg()[0]:.1f}",
+            f"p50 {p50:.3f} ms, p90 {p90:.3f} ms, p99 {p99:.3f} ms; of the successes "
+            f"{solved[0]:.3f}, {solved[1]:.3f} and {solved[2]:.3f} ms; "
+            f"first call with compilation {first:.1f} s",
             f"refereed success {100 * success.mean():.2f} %, "
-            f"median cost {np.median(together.cost):.3g}",
+            f"median cost {np.median(plans.cost[success]):.3g}",
         )
-        bench.count(success, cost_gaps(planner, batch, together))
+        bench.count(success, cost_gaps(planner, batch, plans))
         bench.note(
             p50_ms=p50,
             p90_ms=p90,
             p99_ms=p99,
-            first_seconds=compile_seconds,
-            median_cost=np.median(together.cost),
+            solved_p99_ms=solved[2],
+            first_seconds=first,
+            median_cost=np.median(plans.cost[success]),
         )
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import planner_jax as pj
+from planner_jax.benchmarks.latency import planned_again
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.plane.reach import Lattice
 from planner_jax.robot.car import pose_at
@@ -280,6 +281,18 @@ def test_a_plan_goes_on_as_it_was_for_a_target_as_before(planned):
     assert pj.intercept.judge(moved, again).success.all()
     with pytest.raises(ValueError, match="elapsed must be >= 0"):
         pj.replan(PLANNER, cases, plans, -1.0, target=turned)
+
+
+def test_what_latency_plans_again_is_what_is_left_of_solved_plans(planned):
+    cases, plans = planned
+    planner, tasks = planned_again(PLANNER, cases, 2.0)
+    assert planner == PLANNER.replanner()
+    assert len(tasks.case.time) == pj.solved(plans).sum()
+    np.testing.assert_allclose(tasks.case.time, 8.0, atol=1e-5)
+    goals = [
+        jax.vmap(lambda path, t: path.at(t).pos)(c.target, c.time) for c in (tasks.case, cases)
+    ]
+    np.testing.assert_allclose(goals[0], goals[1][pj.solved(plans)], atol=1e-4)
 
 
 def test_a_time_of_meeting_that_is_not_known_is_refused():
