@@ -15,7 +15,8 @@ Planning time is not taken off. Of each row, in percent of all throws:
 
 All but the end poses are what the referee says. --write keeps the throws with these columns in
 `block_throws.csv` beside this file, a line a throw: of each method a digit for every row of the
-throw's suite, in the order that the head of the file gives, 1 where it blocks the throw.
+throw's suite, in the order that the head of the file gives, 1 where it blocks the throw. Read these
+as text: they begin with zeros.
 """
 
 import csv

@@ -1,5 +1,6 @@
 """Benchmarks write run folders, and throughput is measured of tasks that nobody has heard of."""
 
+import csv
 import dataclasses
 import importlib
 import json
@@ -13,6 +14,7 @@ from flax import struct
 
 import planner_jax as pj
 from planner_jax import benchmarks, registry
+from planner_jax.benchmarks.block_rows import METHODS, ROWS
 from planner_jax.benchmarks.cost_gap import gap_figures
 from planner_jax.benchmarks.run import Bench
 from planner_jax.benchmarks.throughput import report
@@ -26,6 +28,29 @@ def test_what_a_benchmark_imports_is_there(path):
     if path.stem == "oracle_hit":
         pytest.importorskip("casadi")
     importlib.import_module(f"planner_jax.benchmarks.{path.stem}")
+
+
+def test_the_throws_that_are_kept_are_those_of_the_seed():
+    path = Path(benchmarks.__path__[0]) / "block_throws.csv"
+    lines = path.read_text().splitlines()
+    heads = [line for line in lines if line.startswith("#")]
+    table = list(csv.DictReader(lines[len(heads) :]))
+    for head in heads:
+        suite, _, names = head.lstrip("# ").partition(": a digit each for ")
+        rows = [row for row in table if row["suite"] == suite]
+        assert len(rows) == 2000 and set(names.split(", ")) <= set(ROWS)
+        balls = pj.block.draw(2, suite, 7).ball
+        kept = [[float(row[f"{axis} [m]"]) for axis in "xyz"] for row in rows[:2]]
+        np.testing.assert_allclose(kept, balls.pos, rtol=1e-5)
+        marks = {
+            name: np.array([[digit == "1" for digit in row[name]] for row in rows])
+            for name in METHODS
+        }
+        assert marks["union"].shape == (2000, len(names.split(", ")))
+        known = marks["straight"] | marks["planner"]
+        np.testing.assert_array_equal(marks["union"], known | marks["long"])
+        assert not (marks["long"] & known).any()
+        assert (marks["planner"].sum(axis=0) >= 0.96 * marks["union"].sum(axis=0)).all()
 
 
 def read(folder, name="manifest.json"):
