@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from planner_jax.plan_files import named_leaves
-from planner_jax.protocol import is_solved, lane
+from planner_jax.protocol import is_solved
 from planner_jax.referee.arm_clearance import clearances, links_of, shield_middle
 from planner_jax.referee.block import times_inside
 from planner_jax.referee.solids import from_segment, turned, turned_back
@@ -29,7 +29,6 @@ from planner_jax.sims.robots.arm.robot import ShieldArm
 from planner_jax.sims.task import FlightCases, Flights
 from planner_jax.sweep.timing import timed_plans
 from planner_jax.task.block.case import BlockCase
-from planner_jax.task.block.eye import fit_errors
 from planner_jax.task.block.plan import BlockPlan
 from planner_jax.task.block.receding import Decided
 from planner_jax.task.block.scene import FLOOR
@@ -202,8 +201,7 @@ def fly_blocks(
     flights = scored(case, plan, flown, budget)
     if decided is None:
         return flights
-    errors = (fit_errors(case, lane(decided.fits, place))[0] for place in (0, -1))
-    first, last = (np.asarray(error, float) for error in errors)
+    first, last = (np.asarray(decided.fit_errors(place)[0], float) for place in (0, -1))
     return dataclasses.replace(
         flights, motions=np.asarray(decided.motions), fit_error=first, last_fit_error=last
     )

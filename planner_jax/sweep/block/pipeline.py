@@ -13,7 +13,7 @@ from planner_jax.protocol import lane
 from planner_jax.sweep.timing import timed_plans
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.end_poses import flight_of
-from planner_jax.task.block.eye import eye, fit_errors
+from planner_jax.task.block.eye import eye
 from planner_jax.task.block.met import as_met, begun_late
 from planner_jax.task.block.plan import BlockPlan
 from planner_jax.task.block.receding import Decided, decide
@@ -47,16 +47,16 @@ class SeeingArms:
     def plans(self, cases: BlockCase) -> SeenPlan:
         """What the arms of a batch do, up to where they meet the true balls."""
         done = self.decided(cases)
-        fits = [lane(done.fits, place) for place in (0, -1)]
-        (error, std), (last, _) = (fit_errors(done.cases, fit) for fit in fits)
+        (error, std), (last, _) = (done.fit_errors(place) for place in (0, -1))
+        first = lane(done.fits, 0)
         met = as_met(done.cases, done.plans)
         parts = {field.name: getattr(met, field.name) for field in dataclasses.fields(met)}
         return jax.tree.map(
             np.asarray,
             SeenPlan(
                 **parts,
-                sight=fits[0].status,
-                sightings=fits[0].num,
+                sight=first.status,
+                sightings=first.num,
                 fit_error=error,
                 fit_std=std,
                 last_fit_error=last,

@@ -24,7 +24,14 @@ from planner_jax.planning.plan import plan
 from planner_jax.protocol import Status, is_solved, lane
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.end_poses import flight_of
-from planner_jax.task.block.eye import Eye, cautious, fitted, frame_times, watched
+from planner_jax.task.block.eye import (
+    Eye,
+    cautious,
+    fit_errors,
+    fitted,
+    frame_times,
+    watched,
+)
 from planner_jax.task.block.met import as_met, braked
 from planner_jax.task.block.online import OnlineBlock
 from planner_jax.task.block.plan import BlockPlan
@@ -64,6 +71,10 @@ class Decided:
     fits: FlightFit  # leaves (M, B, ...), of every moment
     begun: Array  # (B,) [s], when the first motion began; infinite without any
     motions: Array  # (B,) int32, how many motions were begun
+
+    def fit_errors(self, place: int) -> tuple[Array, Array]:
+        """Errors (B,) [m] of the fits of a moment, and what they are believed to be."""
+        return fit_errors(self.cases, lane(self.fits, place))
 
 
 def plan_with_aims(
