@@ -57,9 +57,12 @@ def built(bench: Bench, path: Path, layout: str, regime: str) -> Library:
     home = irb1600().home
     own = LAYOUTS[layout]
     tunnel = tunnels(own, scene.inner, scene.outer)
-    # Spread, so that some of them need least squares, too.
+    # Spread, so that some of them need least squares, too; as many as calls of every size take.
     few = np.flatnonzero(tunnel.is_feasible)[:: tunnel.is_feasible.sum() // 64]
-    _, compiling = timed(building.plan_pairs, setting, home, tunnel, few)
+    compiling = sum(
+        timed(building.plan_pairs, setting, home, tunnel, np.resize(few, max(size, len(few))))[1]
+        for size in building.sizes()[1]
+    )
     library, seconds = timed(building.build, path, setting, home, own)
     bench.say(
         f"Build of {own.num_pairs} pairs, {tunnel.is_feasible.sum()} of them feasible: "

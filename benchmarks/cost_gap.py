@@ -1,4 +1,4 @@
-"""How much plans cost beside those of a long search from the same guess."""
+"""How much plans cost beside those of a longer search."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -10,31 +10,45 @@ from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.planning.plan import plan
 from planner_jax.protocol import solved
+from planner_jax.registry import Task
 
 COMPARED = 1024  # plans of a batch that are looked at, at most
 
 
 def cost_gaps(
-    planner: Any, cases: Any, plans: Any, devices: Sequence[Any] | None = None
+    planner: Any,
+    cases: Any,
+    plans: Any,
+    devices: Sequence[Any] | None = None,
+    *,
+    card: Task | None = None,
 ) -> np.ndarray | None:
-    """By how much plans cost more than those of a long search from the same guess.
+    """By how much plans cost more than those of a longer search.
+
+    That is a long one from the same guess, for a planner that minimises by rounds; for others the
+    planner that their task's card names as a yardstick, with its own options.
 
     Args:
         planner: that made the plans; what it decided on first is kept.
         cases: a batch, of which the first `COMPARED` are looked at.
         plans: of them.
         devices: as for `plan`.
+        card: of the planner's task, for its yardstick.
 
     Returns:
-        (K,), relative, of the cases that both solve: 0.33 is 33 %. None where the planner
-        minimises nothing.
+        (K,), relative, of the cases that both solve: 0.33 is 33 %. None where the planner has no
+        rounds, and its task no yardstick.
     """
     cases, plans = jax.tree.map(lambda leaf: np.asarray(leaf[:COMPARED]), (cases, plans))
     if isinstance(planner, DecidedPlanner):
         cases, planner = cases.decided(plans.choice), planner.planner
-    if not isinstance(planner, OptimisedPlanner):
+    if isinstance(planner, OptimisedPlanner):
+        longer = planner.with_solver()
+    elif card is not None and card.yardstick is not None:
+        longer = card.planner(card.yardstick)
+    else:
         return None
-    best = plan(planner.with_solver(), cases, devices=devices)
+    best = plan(longer, cases, devices=devices)
     both = solved(plans) & solved(best)
     return plans.cost[both] / best.cost[both] - 1.0
 

@@ -5,7 +5,7 @@
 
 One row a batch size: the first call, with what it compiles; then, after half a second of calls
 that bring up the device's clock, the fastest and the median of some more; the share that the
-referee accepts; and by how much the cost is above that of a long search from the same guess. For
+referee accepts; and by how much the cost is above that of a longer search (`cost_gap`). For
 several devices also the efficiency beside one, and what each takes for its share alone. What
 is timed is the whole of `plan`, by any planner of any task, with the options that the task's card
 has for this (catches are decided "greedy"): ball tables, guesses, all rounds, and the check of
@@ -79,7 +79,7 @@ def measure(bench: Bench, settings: ThroughputSettings) -> None:
         f"{card.name}, {len(used)} x {used[0].device_kind}, jax {jax.__version__}, load average "
         f"{os.getloadavg()[0]:.1f}" + (f"; first round: {first} iterations" if first else ""),
         "| plans | first call [s] | of it compiling [s] | fastest [ms] | median [ms] | plans/s | "
-        "refereed | cost above a long search's (median, p90) | memory [GiB] |",
+        "refereed | cost above a longer search's (median, p90) | memory [GiB] |",
         "|---|---|---|---|---|---|---|---|---|",
     )
     beside = []
@@ -148,7 +148,7 @@ def _add_row(
 ) -> None:
     plans = jax.device_get(timed.plans)
     success = card.judge(*jax.tree.map(lambda leaf: leaf[:_JUDGED], (host, plans))).success
-    gaps = cost_gaps(planner, host, plans, devices)
+    gaps = cost_gaps(planner, host, plans, devices, card=card)
     bench.count(success, gaps)
     figures = gap_figures(gaps)
     row = {

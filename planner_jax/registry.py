@@ -54,6 +54,8 @@ class Task:
     # Options of `planner` where its speed is measured.
     bench: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     contact: str | None = None  # place in a plan of its times of contact, such as "stroke.time"
+    # The planner with whose costs those of planners are compared that have no longer search.
+    yardstick: str | None = None
 
     @property
     def case(self) -> Callable[..., Any]:

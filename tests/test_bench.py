@@ -15,7 +15,7 @@ from flax import struct
 import planner_jax as pj
 from planner_jax import benchmarks, registry
 from planner_jax.benchmarks.block_rows import METHODS, ROWS
-from planner_jax.benchmarks.cost_gap import gap_figures
+from planner_jax.benchmarks.cost_gap import cost_gaps, gap_figures
 from planner_jax.benchmarks.run import Bench
 from planner_jax.benchmarks.throughput import report
 from planner_jax.sweep.settings import SettingError
@@ -115,8 +115,18 @@ def draw(num, suite=None, seed=0, *, first=0):
     return Number(value=jnp.arange(first, first + num, dtype=jnp.float32))
 
 
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class Third(Half):
+    """Costs two thirds of `Half`."""
+
+    def solve(self, case, attempt):
+        plan = super().solve(case, attempt)
+        return dataclasses.replace(plan, cost=plan.cost / 1.5)
+
+
 def planner(name="half", **options):
-    return Half(**options)
+    return {"half": Half, "third": Third}[name](**options)
 
 
 def judge(cases, plans):
@@ -141,6 +151,16 @@ def test_throughput_is_measured_of_any_task(halving, tmp_path, capsys):
     assert manifest["summary"]["cost_gap_median"] is None
     assert [row["success"] for row in read(tmp_path / "run", "rows.json")] == [0.75, 0.375]
     assert "status equal on 100.00 %" in capsys.readouterr().out
+
+
+def test_costs_without_rounds_are_compared_with_those_of_the_tasks_yardstick():
+    card = registry.Task("halve", "halves numbers", __name__, {"half": ""}, {}, yardstick="third")
+    cases = draw(4, first=1)
+    plans = pj.plan(Half(), cases)
+    # Of 1 and 2, which both solve.
+    np.testing.assert_allclose(cost_gaps(Half(), cases, plans, card=card), [0.5, 0.5], rtol=1e-6)
+    no_yardstick = dataclasses.replace(card, yardstick=None)
+    assert cost_gaps(Half(), cases, plans, card=no_yardstick) is None
 
 
 def test_a_planner_without_rounds_has_no_iterations_to_set(halving, tmp_path):

@@ -17,7 +17,7 @@ from planner_jax.referee.arm_clearance import clearances as referee_clearances
 from planner_jax.robot.arm import REGIMES
 from planner_jax.robot.arm_mjcf import irb1600
 from planner_jax.sweep.block.settings import REGIMES as SWEPT
-from planner_jax.task.block.clearance import clearances, num_of_pole
+from planner_jax.task.block.clearance import clearance_slopes, clearances, num_of_pole
 from planner_jax.task.block.end_poses import end_poses, flight_of
 from planner_jax.task.block.motion import angles_at, polynomial, profiles, sums
 from planner_jax.task.block.online import OnlineBlock, Search
@@ -119,6 +119,17 @@ def test_the_arm_is_clear_at_home_and_not_when_it_reaches_into_the_pole():
     num = num_of_pole(arm)
     assert at(ahead, scene)[:num].min() < 0.0 < at(ahead, scene)[num:].min()
     assert at(ahead, dataclasses.replace(scene, has_pole=jnp.asarray(False))).min() > 0.0
+
+
+def test_clearances_change_with_the_joints_as_their_slopes_say(float64):
+    arm, scene = jax.tree.map(jnp.asarray, (irb1600(), paper_scene()))
+    rng = np.random.default_rng(1)
+    angles = jnp.asarray(rng.uniform(arm.lower, arm.upper, (20, 6)))
+    each = jax.jacfwd(lambda angles: clearances(arm, scene, angles[None])[:, 0])
+    expected = jnp.moveaxis(jax.vmap(each)(angles), 0, -1)
+    found = clearance_slopes(arm, scene, angles)
+    assert found.shape == expected.shape == (clearances(arm, scene, angles).shape[0], 6, 20)
+    np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
 def test_no_pose_is_freer_than_the_referee_says(float64):

@@ -315,7 +315,7 @@ def counted(monkeypatch):
         return row
 
     monkeypatch.setattr(building, "plan_pairs", plan_pairs)
-    monkeypatch.setattr(building, "_ON_CPU", (5, 16))
+    monkeypatch.setattr(building, "_ON_CPU", (5, (16,)))
     return calls
 
 
@@ -359,7 +359,7 @@ def test_parts_of_another_library_are_not_gone_on_with(tmp_path, counted, monkey
     assert kept == num
     monkeypatch.undo()
     monkeypatch.setattr(building, "plan_pairs", plain)
-    monkeypatch.setattr(building, "_ON_CPU", (5, 16))
+    monkeypatch.setattr(building, "_ON_CPU", (5, (16,)))
     building.build(tmp_path / "a", setting("R3"), home, TINY, progress=False)
     assert len(counted) == 2 * num
 

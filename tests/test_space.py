@@ -10,6 +10,7 @@ from derivatives import assert_gradient_matches_differences
 from scipy.optimize import lsq_linear
 
 from planner_jax.space.distances import (
+    approach,
     lowest_of_rectangle,
     lowest_of_segment,
     rectangle_to_vertical_line,
@@ -147,6 +148,38 @@ def test_a_slope_has_the_slope_that_comes_from_nearest_points_moving_along(name,
         return jnp.sum(jax.jvp(lambda ends: many(ends, *others), (ends,), (direction,))[1])
 
     assert_gradient_matches_differences(slope, ends, step=1e-7, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", [*DISTANCES, "low segment", "low rectangle"])
+def test_an_approach_has_the_slope_by_a_turn_and_a_move_of_the_first_body(name, float64):
+    """The body turns about an axis through the origin and moves; what stands does not."""
+    of = {**DISTANCES, "low segment": lowest_of_segment, "low rectangle": lowest_of_rectangle}
+    distance = of[name]
+    if name.startswith("low"):
+        first, others = smooth_pairs("rectangle" if name == "low rectangle" else "segments"), ()
+        first = first[1:] if name == "low rectangle" else first[:1]
+    else:
+        first, others = smooth_pairs(name), ()
+        num = 2 if name == "rectangle to line" else 1
+        first, others = first[:num], first[num:]
+    is_place = [True, False] if len(first) == 2 else [True]  # edges only turn
+
+    def slopes(first, others):
+        def at(twist):
+            turn, move = twist[:3], twist[3:]
+            moved = [
+                body + jnp.cross(turn, body) + move * place
+                for body, place in zip(first, is_place, strict=True)
+            ]
+            return distance(*moved, *others)
+
+        line = approach(distance, *first, *others)
+        expected = jax.grad(at)(jnp.zeros(6))
+        return expected, jnp.concatenate([jnp.stack(line.moment), jnp.stack(line.direction)])
+
+    expected, found = jax.vmap(slopes)(tuple(first), tuple(others))
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+    assert np.abs(found[:, :3]).max() > 0.1
 
 
 def test_segments_that_are_swapped_or_turned_round_are_as_far(float64):

@@ -91,12 +91,23 @@ def begun(start: Array, config: LevenbergConfig) -> LevenbergState:
 
 
 def go_on(
-    evaluate: Callable[[Array], Model], state: LevenbergState, config: LevenbergConfig
+    evaluate: Callable[[Array], Model],
+    state: LevenbergState,
+    config: LevenbergConfig,
+    most: Array | int | None = None,
 ) -> LevenbergState:
-    """The last state of a search that goes on from one; the limit of steps counts all of them."""
+    """The last state of a search that goes on from one.
+
+    Args:
+        evaluate: the model at a point (n,).
+        state: to go on from.
+        config: sizes and switches, static.
+        most: () int32, steps in all; None for `config.max_steps`.
+    """
+    most = config.max_steps if most is None else most
 
     def goes_on(state: LevenbergState) -> Array:
-        is_open = (state.steps < config.max_steps) & (state.stalled < config.settled)
+        is_open = (state.steps < most) & (state.stalled < config.settled)
         if config.hope is None:
             return is_open
         behind = state.steps - config.trial

@@ -9,7 +9,8 @@ along their bodies therefore changes the distance only in second order, so its s
 gap between points that are held (the envelope theorem). `_shortest` says so to JAX: slopes cost
 little more than values, and need no division by the sine of two bodies that are nearly parallel.
 Bodies that cross have distance 0 and slope 0. Where several points are nearest, as between
-parallel bodies, the slope is that for one pair of them.
+parallel bodies, the slope is that for one pair of them. `approach` gives the line through both,
+from which the slopes by many turns and moves follow in a few products.
 
 Vectors are tuples of components here, so that everything is one elementwise loop over the lanes.
 """
@@ -108,13 +109,38 @@ def lowest_of_rectangle(middle: Array, edges: Array) -> Array:
     return middle[2] - jnp.abs(edges[0, 2]) - jnp.abs(edges[1, 2])
 
 
+class Approach(NamedTuple):
+    """The line through the nearest points of two bodies, in Pluecker's coordinates."""
+
+    direction: Vector  # 3 times (), unit, from the second body to the first; 0 where they cross
+    moment: Vector  # 3 times () [m], point x direction, of any point of the line
+
+
+def approach(distance: Callable, *bodies: Array) -> Approach:
+    """Where bodies have a distance of this module.
+
+    If the first body turns about an axis a through a point o, its distance changes by
+    a . (moment - o x direction) a radian; if the second one does, by as much the other way.
+
+    Args:
+        distance: a function of this module. Of the lowest points, the second body is the ground.
+        bodies: its arguments.
+    """
+    point, gap = _SIDES[distance](*bodies)
+    # Quotients in the end: XLA works such out once, and what is no division once for each use.
+    length = _length(gap)
+    length = jnp.where(length > 0.0, length, jnp.inf)
+    direction, moment = (tuple(x / length for x in each) for each in (gap, cross(point, gap)))
+    return Approach(direction, moment)
+
+
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _shortest(nearest: Callable, gap: Callable, bodies: tuple[Array, ...]) -> Array:
     """The distance () [m] of bodies.
 
     Args:
         nearest: from the bodies to what names their nearest points, such as shares of segments.
-        gap: from that and the bodies to the vector between those points.
+        gap: from that and the bodies to the vector between those points, to the first body's.
         bodies: the arrays that both take.
     """
     return _length(gap(nearest(*bodies), *bodies))
@@ -138,16 +164,16 @@ def _nearest_of_segments(ends_a: Array, ends_b: Array) -> tuple[Array, Array]:
     """
     (start_a, end_a), (start_b, end_b) = _rows(ends_a), _rows(ends_b)
     u, v, between = _minus(end_a, start_a), _minus(end_b, start_b), _minus(start_b, start_a)
-    normal = _cross(u, v)
-    share_a = _unit(_ratio(_dot(_cross(between, v), normal), _dot(normal, normal)))
-    along = _dot(u, v)
-    share_b = _unit(_ratio(share_a * along - _dot(between, v), _dot(v, v)))
-    share_a = _unit(_ratio(share_b * along + _dot(between, u), _dot(u, u)))
+    normal = cross(u, v)
+    share_a = _unit(_ratio(dot(cross(between, v), normal), dot(normal, normal)))
+    along = dot(u, v)
+    share_b = _unit(_ratio(share_a * along - dot(between, v), dot(v, v)))
+    share_a = _unit(_ratio(share_b * along + dot(between, u), dot(u, u)))
     return share_a, share_b
 
 
 def _gap_of_segments(shares: tuple[Array, Array], ends_a: Array, ends_b: Array) -> Vector:
-    return _minus(_point(ends_b, shares[1]), _point(ends_a, shares[0]))
+    return _minus(_point(ends_a, shares[0]), _point(ends_b, shares[1]))
 
 
 def _nearest_of_box(ends: Array, lower: Array, upper: Array) -> Array:
@@ -176,10 +202,10 @@ def _nearest_of_rectangle(ends: Array, middle: Array, edges: Array) -> Any:
     """
     (start, end), (e, f) = _rows(ends), _rows(edges)
     step, away = _minus(end, start), _minus(start, tuple(middle))
-    squares = _dot(e, e), _dot(f, f)
-    places = [(_dot(away, axis), _dot(step, axis)) for axis in (e, f)]
-    normal = _cross(e, f)
-    height, climb = _dot(away, normal), _dot(step, normal)
+    squares = dot(e, e), dot(f, f)
+    places = [(dot(away, axis), dot(step, axis)) for axis in (e, f)]
+    normal = cross(e, f)
+    height, climb = dot(away, normal), dot(step, normal)
     plane = _slab(-height, -height, climb, climb * climb)
     slabs = [
         _slab(-square - place, square - place, speed, speed * speed * other)
@@ -260,14 +286,14 @@ def _share_nearest_to_slabs(slabs: list[_Slab]) -> Array:
             high = jnp.where(value >= 0.0, jnp.minimum(high, bend), high)
     fall, rise = slope(low), slope(high)
     rises = rise > fall
-    share = jnp.where(rises, -fall / jnp.where(rises, rise - fall, 1.0), 0.5)
-    return low + _unit(share) * (high - low)
+    between = jnp.where(rises, low * rise - high * fall, 0.5 * (low + high))
+    return between / jnp.where(rises, rise - fall, 1.0)
 
 
 def _nearest_to_line(ends: Array, place: Array) -> Array:
     start, end = _ground(ends)
     step = _minus(end, start)
-    return _unit(_ratio(_dot(_minus(tuple(place), start), step), _dot(step, step)))
+    return _unit(_ratio(dot(_minus(tuple(place), start), step), dot(step, step)))
 
 
 def _gap_to_line(share: Array, ends: Array, place: Array) -> Vector:
@@ -281,8 +307,8 @@ def _nearest_of_projection(middle: Array, edges: Array, place: Array) -> Any:
     """
     e, f = _ground(edges)
     to_x, to_y = to = tuple(x - m for x, m in zip(place, middle[:2], strict=True))
-    squares, product = (_dot(e, e), _dot(f, f)), _dot(e, f)
-    ahead = (_dot(to, e), _dot(to, f))
+    squares, product = (dot(e, e), dot(f, f)), dot(e, f)
+    ahead = (dot(to, e), dot(to, f))
     nearest = jnp.full_like(product, jnp.inf)
     p = q = jnp.zeros_like(product)
     for side in (-1.0, 1.0):
@@ -298,7 +324,7 @@ def _nearest_of_projection(middle: Array, edges: Array, place: Array) -> Any:
     area = jnp.abs(_area(e, f))
     inside = (jnp.abs(_area(to, f)) < area) & (jnp.abs(_area(e, to)) < area)
     # A projection without width has points far off on its line that the areas do not tell apart.
-    inside = inside & (_dot(to, to) <= squares[0] + squares[1] + 2.0 * jnp.abs(product))
+    inside = inside & (dot(to, to) <= squares[0] + squares[1] + 2.0 * jnp.abs(product))
     return p, q, ~inside
 
 
@@ -313,7 +339,7 @@ def _gap_of_projection(nearest: Any, middle: Array, edges: Array, place: Array) 
 
 def _length(vector: Vector) -> Array:
     """Length () of a vector; 0, with slope 0, of one that is too short to have a direction."""
-    square = _dot(vector, vector)
+    square = dot(vector, vector)
     apart = square > _TINY
     return jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1.0)), 0.0)
 
@@ -348,15 +374,79 @@ def _minus(a: Vector, b: Vector) -> Vector:
     return tuple(x - y for x, y in zip(a, b, strict=True))
 
 
-def _dot(a: Vector, b: Vector) -> Array:
+def dot(a: Vector, b: Vector) -> Array:
+    """The scalar product of two vectors."""
     first, *others = (x * y for x, y in zip(a, b, strict=True))
     return sum(others, first)
 
 
-def _cross(a: Vector, b: Vector) -> Vector:
+def cross(a: Vector, b: Vector) -> Vector:
+    """The cross product of two vectors."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
 def _area(a: Vector, b: Vector) -> Array:
     """Signed area () of the parallelogram of two vectors in the plane."""
     return a[0] * b[1] - a[1] * b[0]
+
+
+def _sides_of_segments(ends_a: Array, ends_b: Array) -> tuple[Vector, Vector]:
+    shares = _nearest_of_segments(ends_a, ends_b)
+    return _point(ends_a, shares[0]), _gap_of_segments(shares, ends_a, ends_b)
+
+
+def _sides_of_rectangle(ends: Array, middle: Array, edges: Array) -> tuple[Vector, Vector]:
+    nearest = _nearest_of_rectangle(ends, middle, edges)
+    return _point(ends, nearest[0]), _gap_to_rectangle(nearest, ends, middle, edges)
+
+
+def _sides_of_box(ends: Array, lower: Array, upper: Array) -> tuple[Vector, Vector]:
+    share = _nearest_of_box(ends, lower, upper)
+    return _point(ends, share), _gap_to_box(share, ends, lower, upper)
+
+
+def _sides_of_line(ends: Array, place: Array) -> tuple[Vector, Vector]:
+    share = _nearest_to_line(ends, place)
+    return _point(ends, share), _level(_gap_to_line(share, ends, place))
+
+
+def _sides_of_projection(middle: Array, edges: Array, place: Array) -> tuple[Vector, Vector]:
+    nearest = _nearest_of_projection(middle, edges, place)
+    (e, f), (p, q, _) = _rows(edges), nearest
+    point = tuple(m + p * a + q * b for m, a, b in zip(middle, e, f, strict=True))
+    return point, _level(_gap_of_projection(nearest, middle, edges, place))
+
+
+def _sides_of_low_segment(ends: Array) -> tuple[Vector, Vector]:
+    start, end = _rows(ends)
+    point = tuple(jnp.where(start[2] < end[2], a, b) for a, b in zip(start, end, strict=True))
+    return point, _up(point)
+
+
+def _sides_of_low_rectangle(middle: Array, edges: Array) -> tuple[Vector, Vector]:
+    e, f = _rows(edges)
+    p, q = jnp.sign(e[2]), jnp.sign(f[2])
+    point = tuple(m - p * a - q * b for m, a, b in zip(middle, e, f, strict=True))
+    return point, _up(point)
+
+
+def _level(gap: Vector) -> Vector:
+    """A vector of the plane of x and y, in space."""
+    return (*gap, jnp.zeros_like(gap[0]))
+
+
+def _up(like: Vector) -> Vector:
+    """The unit vector upwards, in the shape of another vector."""
+    return (jnp.zeros_like(like[0]), jnp.zeros_like(like[0]), jnp.ones_like(like[0]))
+
+
+# Of each distance: the point of the first body, and the gap there.
+_SIDES: dict[Callable, Callable[..., tuple[Vector, Vector]]] = {
+    segment_to_segment: _sides_of_segments,
+    segment_to_rectangle: _sides_of_rectangle,
+    segment_to_box: _sides_of_box,
+    segment_to_vertical_line: _sides_of_line,
+    rectangle_to_vertical_line: _sides_of_projection,
+    lowest_of_segment: _sides_of_low_segment,
+    lowest_of_rectangle: _sides_of_low_rectangle,
+}

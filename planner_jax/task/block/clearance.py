@@ -18,6 +18,9 @@ from jax import Array, lax
 
 from planner_jax.robot.arm import Arm, link_frames
 from planner_jax.space.distances import (
+    approach,
+    cross,
+    dot,
     lowest_of_rectangle,
     lowest_of_segment,
     rectangle_to_vertical_line,
@@ -28,7 +31,7 @@ from planner_jax.space.distances import (
 )
 from planner_jax.task.block.scene import Scene
 
-FAR = 10.0  # [m], of a pole that is not there
+FAR = 10.0  # [m], how much farther a pole is taken to be that is not there
 # The forearm ends in a fork around the wrist, which a capsule would round off: towards the
 # shield it is no thicker than this share of the way from the wrist to the shield's face.
 _FORK = 0.71
@@ -46,20 +49,15 @@ class _Poses(NamedTuple):
     origins: Array  # (6, 3, N) [m], of the joints
 
 
-class _Body(NamedTuple):
-    """What turns with a link: points, and vectors between such. As in `space.distances`."""
-
-    points: Array  # (I, 3, P, N) [m]
-    vectors: Array  # (J, 3, P, N) [m]
-
-
 class _Pairs(NamedTuple):
     """P pairs of a body that moves and one that it must not touch."""
 
-    distance: Callable[[_Body], Array]  # (P, N) [m]
-    body: _Body  # that moves
-    link: Any  # (P,) or (), 0 to 5, that it turns with
+    measure: Callable  # of `space.distances`
+    bodies: tuple[Array, ...]  # what it takes, with lanes (P or 1, N) on the last axes
+    thick: Any  # (P, 1) or () [m], what both bodies reach beyond that
+    link: Any  # (P,) or (), 0 to 5, that the one turns with
     fixed: Any = -1  # likewise of the other body; -1 if it stands
+    first: bool = True  # whether the body that moves is the measure's first one
 
 
 def clearances(arm: Arm, scene: Scene, angles: Array) -> Array:
@@ -73,7 +71,7 @@ def clearances(arm: Arm, scene: Scene, angles: Array) -> Array:
         angles: (N, 6) [rad], poses.
     """
     every = _pairs(arm, scene, _poses(arm, angles))
-    return jnp.concatenate([pairs.distance(pairs.body) for pairs in every])
+    return jnp.concatenate([pairs.measure(*pairs.bodies) - pairs.thick for pairs in every])
 
 
 def least_clearances(arm: Arm, scene: Scene, angles: Array) -> Array:
@@ -87,27 +85,19 @@ def clearance_slopes(arm: Arm, scene: Scene, angles: Array) -> Array:
     A joint that turns both bodies of a pair leaves their distance as it is.
     """
     poses = _poses(arm, angles)
+    # A joint turns about its axis a through an origin o, and a . (o x n) is (a x o) . n.
+    axes, origins = (tuple(jnp.moveaxis(each, 1, 0)) for each in poses[3:])  # 3 times (6, N)
+    arms = cross(axes, origins)
     joint = np.arange(6)[:, None]
     slopes = []
     for pairs in _pairs(arm, scene, poses):
-
-        def by_joint(axis: Array, origin: Array, pairs: _Pairs = pairs) -> Array:
-            """Slopes (P, N) by a joint with an axis (3, N) through a point (3, N)."""
-            arms = pairs.body.points - origin[:, None]
-            moves = _Body(points=_turns(axis, arms), vectors=_turns(axis, pairs.body.vectors))
-            return jax.jvp(pairs.distance, (pairs.body,), (moves,))[1]
-
-        between = (joint > np.asarray(pairs.fixed)) & (joint <= np.asarray(pairs.link))
-        moved = jax.vmap(by_joint)(poses.axes, poses.origins)
-        slopes.append(jnp.where(between[:, :, None], moved, 0.0))
-    return jnp.swapaxes(jnp.concatenate(slopes, axis=1), 0, 1)
-
-
-def _turns(axis: Array, arms: Array) -> Array:
-    """How vectors (I, 3, P, N) change as they turn about an axis (3, N)."""
-    x, y, z = axis
-    a, b, c = arms[:, 0], arms[:, 1], arms[:, 2]
-    return jnp.stack([y * c - z * b, z * a - x * c, x * b - y * a], axis=1)
+        line = approach(pairs.measure, *pairs.bodies)
+        direction, moment = (tuple(each[:, None] for each in vector) for vector in line)
+        slope = dot(axes, moment) - dot(arms, direction)  # (P, 6, N)
+        of_link, of_fixed = (np.reshape(each, (-1, 1, 1)) for each in (pairs.link, pairs.fixed))
+        between = (joint > of_fixed) & (joint <= of_link)
+        slopes.append(jnp.where(between, slope if pairs.first else -slope, 0.0))
+    return jnp.concatenate(slopes)
 
 
 def num_of_pole(arm: Arm) -> int:
@@ -158,30 +148,20 @@ def _pairs(arm: Arm, scene: Scene, poses: _Poses) -> list[_Pairs]:
     turning, swung, far = (_from_link(arm, first) for first in (1, 2, 3))
     trunk = np.flatnonzero(link == 0)
     before = np.flatnonzero((link >= 0) & (link <= 3))
-    num = poses.middle.shape[-1]
-    none = jnp.zeros((0, 3, 1, num), poses.ends.dtype)
-
-    def links(places: np.ndarray) -> _Body:
-        return _Body(points=poses.ends[:, :, places], vectors=none)
-
-    middle, edges = poses.middle[None, :, None], poses.edges[:, :, None]
-    plate = _Body(points=middle, vectors=edges)
+    middle, edges = poses.middle[:, None], poses.edges[:, :, None]
     corners = [
-        middle + a * edges[:1] + b * edges[1:] for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))
+        middle + a * edges[0] + b * edges[1] for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))
     ]
-    outline = jnp.concatenate(
-        [jnp.concatenate(corners, axis=2), jnp.concatenate(corners[1:] + corners[:1], axis=2)]
+    outline = jnp.stack(
+        [jnp.concatenate(corners, axis=1), jnp.concatenate(corners[1:] + corners[:1], axis=1)]
     )
     beams = jnp.moveaxis(jnp.asarray(scene.beam_ends), 0, 2)[..., None]  # (2, 3, N, 1)
-    beams = jnp.broadcast_to(beams, (*beams.shape[:3], num))
+    beams = jnp.broadcast_to(beams, (*beams.shape[:3], poses.middle.shape[-1]))
     num_beams = beams.shape[2]
 
     def with_beams(places: np.ndarray) -> Array:
         """Segments (2, 3, K, N) of capsules and of all beams."""
         return jnp.concatenate([poses.ends[:, :, places], beams], axis=2)
-
-    def to_pole(distance: Array) -> Array:
-        return jnp.where(scene.has_pole, distance - scene.pole_radius, FAR)
 
     wrist = jnp.sqrt(jnp.sum((arm.origin[5] + arm.shield_centre) ** 2))
     thin = jnp.where(link[before] == 3, jnp.minimum(radius[before], _FORK * wrist), radius[before])
@@ -199,54 +179,42 @@ def _pairs(arm: Arm, scene: Scene, poses: _Poses) -> list[_Pairs]:
     of_fixed = np.where(fixture < len(trunk), 0, -1)
     near, (lower, upper) = with_beams(before), jnp.asarray(arm.base_box)
     of_near = np.append(link[before], np.full(num_beams, -1))
+    pole = jnp.where(scene.has_pole, scene.pole_radius, -FAR)
+    thick = radius[:, None]
+
+    def ends(places: np.ndarray) -> Array:
+        return poses.ends[:, :, places]
+
     return [
         _Pairs(
-            lambda body: to_pole(
-                segment_to_vertical_line(body.points, scene.pole) - radius[turning][:, None]
-            ),
-            links(turning),
+            segment_to_vertical_line,
+            (ends(turning), scene.pole),
+            thick[turning] + pole,
             link[turning],
         ),
         _Pairs(
-            lambda body: to_pole(
-                rectangle_to_vertical_line(body.points[0], body.vectors, scene.pole)
-                - _HALF_THICKNESS
-            ),
-            plate,
+            rectangle_to_vertical_line,
+            (middle, edges, scene.pole),
+            _HALF_THICKNESS + pole,
             _SHIELD_LINK,
         ),
         _Pairs(
-            lambda body: segment_to_segment(body.points, against) - among_radius[:, None],
-            links(place),
+            segment_to_segment,
+            (ends(place), against),
+            among_radius[:, None],
             link[place],
             of_fixed,
         ),
         _Pairs(
-            lambda body: segment_to_rectangle(near, body.points[0], body.vectors) - near_radius,
-            _Body(*(jnp.repeat(each, near.shape[2], axis=2) for each in plate)),
+            segment_to_rectangle,
+            (near, middle, edges),
+            near_radius,
             _SHIELD_LINK,
             of_near,
+            first=False,
         ),
-        _Pairs(
-            lambda body: lowest_of_segment(body.points) - radius[swung][:, None] - scene.floor,
-            links(swung),
-            link[swung],
-        ),
-        _Pairs(
-            lambda body: (
-                lowest_of_rectangle(body.points[0], body.vectors) - _HALF_THICKNESS - scene.floor
-            ),
-            plate,
-            _SHIELD_LINK,
-        ),
-        _Pairs(
-            lambda body: segment_to_box(body.points, lower, upper) - radius[swung][:, None],
-            links(swung),
-            link[swung],
-        ),
-        _Pairs(
-            lambda body: segment_to_box(body.points, lower, upper) - _HALF_THICKNESS,
-            _Body(points=outline, vectors=none),
-            _SHIELD_LINK,
-        ),
+        _Pairs(lowest_of_segment, (ends(swung),), thick[swung] + scene.floor, link[swung]),
+        _Pairs(lowest_of_rectangle, (middle, edges), _HALF_THICKNESS + scene.floor, _SHIELD_LINK),
+        _Pairs(segment_to_box, (ends(swung), lower, upper), thick[swung], link[swung]),
+        _Pairs(segment_to_box, (outline, lower, upper), _HALF_THICKNESS, _SHIELD_LINK),
     ]

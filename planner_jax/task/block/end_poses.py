@@ -56,10 +56,20 @@ def profile_peaks(pieces: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.max(np.abs(shapes), axis=1), np.max(np.abs(rises), axis=1), rests
 
 
-def end_poses(case: BlockCase, flight: Flight, points: int, pieces: int) -> EndPoses:
+def end_poses(
+    case: BlockCase, flight: Flight, points: int, pieces: int, *, quickest: bool = False
+) -> EndPoses:
     """Eight poses at each of some points of the ball's way between the boxes.
 
     The joint at the flange, whose turns leave the ball on the shield, stays as it is.
+
+    Args:
+        case: one case.
+        flight: of its ball.
+        points: P, of the ball's way.
+        pieces: of the straight motions.
+        quickest: whether motions from rest to rest have the profile that could be made in the
+            least time, not that of the least effort.
     """
     share = (np.arange(points) + 0.5) / points
     time = flight.earliest + share * (flight.latest - flight.earliest)
@@ -81,9 +91,10 @@ def end_poses(case: BlockCase, flight: Flight, points: int, pieces: int) -> EndP
     of_rise = jnp.max(turned / case.limits.acceleration, axis=1) / duration**2
     of_rates, of_rises = of_rate[:, None] * rates, of_rise[:, None] * rises
     efforts = jnp.maximum(of_rates, of_rises)
-    # Of motions from rest to rest that which could be made in the least time.
-    paces = jnp.where(case.ends_at_rest, jnp.maximum(of_rates, jnp.sqrt(of_rises)), efforts)
     is_one = rests | ~case.ends_at_rest
+    paces = efforts
+    if quickest:
+        paces = jnp.where(case.ends_at_rest, jnp.maximum(of_rates, jnp.sqrt(of_rises)), efforts)
     profile = jnp.argmin(jnp.where(is_one, paces, jnp.inf), axis=1)
     effort = jnp.min(jnp.where(is_one, efforts, jnp.inf), axis=1)
     is_there = found.reshape(-1) & (time > case.delay) & flight.comes

@@ -21,7 +21,14 @@ import numpy as np
 from jax import Array, lax
 
 from planner_jax.ball.flight import drag_free_flight
-from planner_jax.optimise.levenberg import LevenbergConfig, Model, begun, go_on, least_squares
+from planner_jax.optimise.levenberg import (
+    LevenbergConfig,
+    LevenbergState,
+    Model,
+    begun,
+    go_on,
+    least_squares,
+)
 from planner_jax.planning.batch import better_of, first_solved
 from planner_jax.planning.one_by_one import OneByOne
 from planner_jax.protocol import FEASIBILITY_TOLERANCE, Attempt, is_solved, status_of
@@ -61,16 +68,18 @@ class Search(Attempt):
     straight: int = 48  # motions that are looked at
     tries: int = 15  # starts of least squares
     first: int = 0  # place of the first of these
-    kept: int = 5  # of the tries, those that lanes in step go on with after the solver's trial
+    kept: int = 5  # of the tries, those that are gone on with after the solver's trial
+    # Whether a lane by itself has no trial, but follows each start to its end before the next.
+    in_turn: bool = True
     # Of starts that led to a plan, hardly any ever cost more than the solver hopes for.
     solver: LevenbergConfig = LevenbergConfig(
-        *(26, 1e-2, 0.25, 6.0), settled=1, tolerance=1.0, trial=4, hope=500.0, fade=0.7
+        *(26, 1e-2, 0.25, 6.0), settled=1, tolerance=1.0, trial=3, hope=1000.0, fade=0.7
     )
 
 
 _LEAST_SQUARES = (
     Search(straight=0, tries=4, kept=2),
-    Search(straight=0, tries=11, first=4, kept=4),
+    Search(straight=0, tries=11, first=4, kept=5, in_turn=False),
 )
 _SEARCHES = (Search(straight=6, tries=0), Search(tries=0), *_LEAST_SQUARES)
 _BRISK = (Search(tries=0), *_LEAST_SQUARES)
@@ -104,6 +113,11 @@ def _violation(joints: Array, contact: Array, too_near: Array) -> Array:
         too_near: () [m].
     """
     return jnp.maximum(jnp.maximum(joints, contact), 100.0 * too_near)
+
+
+def _hopes(tried: LevenbergState, solver: LevenbergConfig) -> Array:
+    """What searches are put in order by after their trial: their cost, the settled ones first."""
+    return jnp.where(tried.stalled >= solver.settled, -1.0, tried.model.cost)
 
 
 @jax.tree_util.register_static
@@ -143,7 +157,7 @@ class OnlineBlock(OneByOne):
     def _solve(self, case: BlockCase, attempt: Search, bend: Callable) -> BlockPlan:
         """The plan of one case: a straight motion, else what `bend` makes of the starts."""
         flight = flight_of(case)
-        poses = end_poses(case, flight, self.points, self.pieces)
+        poses = end_poses(case, flight, self.points, self.pieces, quickest=self.brisk)
         ranks, bumps = (
             each[attempt.first : attempt.first + attempt.tries] for each in learned_starts()
         )
@@ -182,10 +196,42 @@ class OnlineBlock(OneByOne):
     def _one_after_another(
         self, case: BlockCase, flight: Flight, points: Array, attempt: Search, best: BlockPlan
     ) -> BlockPlan:
-        """Least squares from each start (N, n) until one leads to a plan."""
-        tries = jnp.where(flight.comes, attempt.tries, 0)
-        bent = lambda k: self.bent(case, flight, points[k], attempt.solver)  # noqa: E731
-        return first_solved(bent, tries, best)
+        """Least squares from one start (N, n) after another until one leads to a plan."""
+        if attempt.in_turn:
+            tries = jnp.where(flight.comes, attempt.tries, 0)
+            bent = lambda k: self.bent(case, flight, points[k], attempt.solver)  # noqa: E731
+            return first_solved(bent, tries, best)
+        return self._cheapest_first(case, flight, points, attempt, best)
+
+    def _cheapest_first(
+        self, case: BlockCase, flight: Flight, points: Array, attempt: Search, best: BlockPlan
+    ) -> BlockPlan:
+        """A trial of every start (N, n), then those to their end that cost least."""
+        model, solver, tries = self._model_of(case, flight), attempt.solver, attempt.tries
+        total = jnp.where(flight.comes, tries + min(attempt.kept, tries), 0)
+
+        def next_one(turn: tuple[Array, LevenbergState, Array, BlockPlan]) -> tuple:
+            k, searches, costs, best = turn
+            is_trial = k < tries
+            place = jnp.where(is_trial, k, jnp.argmin(costs))
+            most = jnp.where(is_trial, solver.trial, solver.max_steps)
+            search = go_on(model, jax.tree.map(lambda leaf: leaf[place], searches), solver, most)
+            searches = jax.tree.map(lambda old, new: old.at[place].set(new), searches, search)
+            costs = costs.at[place].set(jnp.where(is_trial, _hopes(search, solver), jnp.inf))
+            plan = lax.cond(
+                is_trial,
+                lambda search: best,
+                lambda search: self.plan_at(case, flight, search.point, search.steps),
+                search,
+            )
+            return k + 1, searches, costs, better_of(best, plan, jnp.asarray(True))
+
+        def is_open(turn: tuple[Array, LevenbergState, Array, BlockPlan]) -> Array:
+            return (turn[0] < total) & ~is_solved(turn[-1].status)
+
+        searches = jax.vmap(lambda point: begun(point, solver))(points)
+        turn = (jnp.zeros((), jnp.int32), searches, jnp.full(tries, jnp.inf, points.dtype), best)
+        return lax.while_loop(is_open, next_one, turn)[-1]
 
     def _in_step(
         self, case: BlockCase, flight: Flight, points: Array, attempt: Search, best: BlockPlan
@@ -194,8 +240,7 @@ class OnlineBlock(OneByOne):
         model, solver = self._model_of(case, flight), attempt.solver
         trial = dataclasses.replace(solver, max_steps=solver.trial)
         tried = jax.vmap(lambda point: go_on(model, begun(point, solver), trial))(points)
-        cost = jnp.where(tried.stalled >= solver.settled, -1.0, tried.model.cost)
-        _, chosen = lax.top_k(-cost, min(attempt.kept, attempt.tries))
+        _, chosen = lax.top_k(-_hopes(tried, solver), min(attempt.kept, attempt.tries))
         kept = jax.tree.map(lambda leaf: leaf[chosen], tried)
         ends = jax.vmap(lambda state: go_on(model, state, solver))(kept)
         plans = jax.vmap(lambda end: self.plan_at(case, flight, end.point, end.steps))(ends)

@@ -90,4 +90,5 @@ TASK = Task(
     sweep="planner_jax.sweep.intercept.settings:InterceptSettings",
     flight="planner_jax.sims.settings:InterceptFly",
     contact="time",
+    yardstick="best",
 )

@@ -40,8 +40,8 @@ from planner_jax.task.block.scene import Scene
 # repair, what began with the old motion is as good mostly, and one more will do.
 STARTS, REPAIR_STARTS = (2, 0, 1, 3, 4, 5), (2,)
 _WORTH = 0.03  # [s], earlier: what a search for a better motion has to promise
-# Pairs that are planned before the next part is written, and lanes of one call of a device.
-_ON_CPU, _ON_GPU = (256, 16), (32768, 8192)
+# Pairs that are planned before the next part is written, and sizes of a call in lanes of a device.
+_ON_CPU, _ON_GPU = (256, (16,)), (32768, (1024, 8192))
 _LOOKED_AT = 1024  # stored motions whose distances are worked out at once
 
 
@@ -83,7 +83,7 @@ def build(
     tunnel = tunnels(layout, setting.scene.inner, setting.scene.outer)
     feasible = np.flatnonzero(tunnel.is_feasible)
     parts = _Parts(Path(f"{os.fspath(path)}.parts"), setting, homes, layout)
-    size, _ = _sizes()
+    size, _ = sizes()
     work = [
         (k, feasible[begin : begin + size])
         for k in range(len(homes))
@@ -133,7 +133,7 @@ def repair(
         touched[k, stored] = ~_is_free(setting, home, rows[k, stored])
         if retry:
             touched[k] |= tunnel.is_feasible & ~library.found[k]
-    size, _ = _sizes()
+    size, _ = sizes()
     with _bar(int(touched.sum()), "pairs", progress) as bar:
         for k, home in enumerate(np.asarray(table.homes)):
             anew = np.flatnonzero(touched[k])
@@ -144,8 +144,8 @@ def repair(
     return library_of(rows, table.homes, table.layout, setting), touched
 
 
-def _sizes() -> tuple[int, int]:
-    """Pairs of a part, and lanes of a call, of this process's devices."""
+def sizes() -> tuple[int, tuple[int, ...]]:
+    """Pairs of a part, and sizes of a call in lanes, of this process's devices."""
     return _ON_CPU if jax.default_backend() == "cpu" else _ON_GPU
 
 
@@ -218,10 +218,11 @@ def plan_pairs(
 
 
 def _planned(planner: Any, cases: PairCase) -> Any:
-    """Plans of a batch, in calls of one size, so that one program is compiled."""
-    _, lanes = _sizes()
-    num = len(cases.best)
-    whole = -(-num // (lanes * jax.local_device_count())) * lanes * jax.local_device_count()
+    """Plans of a batch, in calls of few sizes, so that few programs are compiled."""
+    num, devices = len(cases.best), jax.local_device_count()
+    most = sizes()[1][-1]
+    lanes = next((size for size in sizes()[1] if num <= size * devices), most)
+    whole = -(-num // (lanes * devices)) * lanes * devices
     # The last one again: on a CPU it is not solved again.
     filled = jax.tree.map(lambda leaf: leaf[np.minimum(np.arange(whole), num - 1)], cases)
     plans: Any = plan(planner, filled, chunk=lanes)
