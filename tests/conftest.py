@@ -17,6 +17,19 @@ os.environ.setdefault("MPLBACKEND", "agg")
 import jax  # noqa: E402
 import pytest  # noqa: E402
 
+# Every compiled program takes some of the mappings that Linux lets a process have, 65,530 by
+# default; without any left a compilation aborts the process.
+MOST_MAPPINGS = 40_000
+
+
+def pytest_runtest_teardown(item, nextitem):
+    """Forget compiled programs where there are many, after a module or a slow test."""
+    ends_module = nextitem is None or nextitem.path != item.path
+    mappings = Path("/proc/self/maps")
+    if (ends_module or item.get_closest_marker("slow")) and mappings.exists():
+        if mappings.read_bytes().count(b"\n") > MOST_MAPPINGS:
+            jax.clear_caches()
+
 
 @pytest.fixture
 def float64():
