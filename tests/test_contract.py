@@ -23,7 +23,8 @@ from planner_jax.protocol import Attempt, HostPlanner, LanesPlanner, Plan, is_so
 from planner_jax.task.block.library.planner import LibraryBlock
 from planner_jax.task.block.online import Search as BlockSearch
 from planner_jax.task.intercept.projection import Projection
-from planner_jax.task.intercept.spacetime import Search, SpacetimeIntercept
+from planner_jax.task.intercept.searches import Search
+from planner_jax.task.intercept.spacetime import SpacetimeIntercept
 from planner_jax.task.intercept.static_paths import PathSource
 
 NUM = 6  # cases of a batch; no more than one bucket

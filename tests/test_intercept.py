@@ -13,7 +13,7 @@ from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.plane.reach import Lattice
 from planner_jax.robot.car import pose_at
 from planner_jax.task.intercept.motion import Quadratic, by_unknowns, motion
-from planner_jax.task.intercept.spacetime import Search
+from planner_jax.task.intercept.searches import Search
 from planner_jax.task.intercept.terms import Weights
 
 # One search is one program to compile.

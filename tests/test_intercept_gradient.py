@@ -14,7 +14,7 @@ from planner_jax.optimise.sensitivity import gradient_at
 from planner_jax.plane.reach import Lattice
 from planner_jax.plane.target import TurningPath
 from planner_jax.task.intercept.checked import straight_on
-from planner_jax.task.intercept.spacetime import Search
+from planner_jax.task.intercept.searches import Search
 
 BY = ("movers.centre", "walls.centre", "limits.acceleration", "target.vel", "speed")
 # One search with few ways, a few unknowns.

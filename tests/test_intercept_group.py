@@ -21,7 +21,8 @@ from planner_jax.task.intercept.card import GROUPS, TASK
 from planner_jax.task.intercept.group import CarState
 from planner_jax.task.intercept.group_decide import Best, Given, Greedy
 from planner_jax.task.intercept.rejection import SIZE
-from planner_jax.task.intercept.spacetime import Search, SpacetimeIntercept
+from planner_jax.task.intercept.searches import Search
+from planner_jax.task.intercept.spacetime import SpacetimeIntercept
 
 # One search is one program to compile.
 SEARCH = Search(12, LevenbergConfig(40), lattice=Lattice(layers=22))

@@ -28,7 +28,7 @@ from planner_jax.task.intercept.projection import (
     speed_limits,
     station_time_problem,
 )
-from planner_jax.task.intercept.spacetime import Search
+from planner_jax.task.intercept.searches import Search
 from planner_jax.task.intercept.static_paths import turns_around
 from planner_jax.task.intercept.terms import ends_of
 

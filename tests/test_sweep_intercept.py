@@ -24,7 +24,7 @@ from planner_jax.sweep.intercept.sweep import InterceptSweep
 from planner_jax.sweep.report import write_report
 from planner_jax.sweep.run_folder import RunFolder
 from planner_jax.sweep.source import Chunk
-from planner_jax.task.intercept.spacetime import Search
+from planner_jax.task.intercept.searches import Search
 
 TASK = pj.task_named("intercept")
 NUM, BATCH = 12, 6

@@ -5,7 +5,8 @@ from jax import Array
 
 from planner_jax.plane.reach import Lattice
 from planner_jax.task.intercept.case import InterceptCase
-from planner_jax.task.intercept.spacetime import Search, SpacetimeIntercept
+from planner_jax.task.intercept.searches import Search
+from planner_jax.task.intercept.spacetime import SpacetimeIntercept
 
 # Spelled out, since what is drawn by them is published.
 _SEARCH = Search(ways=1, lattice=Lattice(64, 30, 4, 32, 6.0), girth=1.0)

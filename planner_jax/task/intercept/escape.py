@@ -37,7 +37,8 @@ from planner_jax.protocol import is_solved
 from planner_jax.robot.car import pose_at
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.plan import InterceptPlan
-from planner_jax.task.intercept.spacetime import Search, SpacetimeIntercept
+from planner_jax.task.intercept.searches import Search
+from planner_jax.task.intercept.spacetime import SpacetimeIntercept
 from planner_jax.task.intercept.suites import draw_cases
 
 # Of all rows; few ways and steps, since it plans five times a second.

@@ -22,7 +22,7 @@ from planner_jax.task.intercept.checked import explained
 from planner_jax.task.intercept.path import FollowConfig, Path, path_beside
 from planner_jax.task.intercept.path_then_speed import SpeedStep
 from planner_jax.task.intercept.plan import InterceptPlan
-from planner_jax.task.intercept.spacetime import Search
+from planner_jax.task.intercept.searches import Search
 from planner_jax.task.intercept.speed import SPEED_PLANNERS
 from planner_jax.task.intercept.terms import ends_of
 

@@ -19,7 +19,7 @@ from planner_jax.task.intercept.checked import checked_plan, explained
 from planner_jax.task.intercept.path import Path
 from planner_jax.task.intercept.plan import InterceptPlan
 from planner_jax.task.intercept.projection import Projection, station_time_problem
-from planner_jax.task.intercept.spacetime import Search
+from planner_jax.task.intercept.searches import Search
 from planner_jax.task.intercept.speed import SPEED_PLANNERS, SpeedPlanner, plan_speed
 from planner_jax.task.intercept.static_paths import PathSource, StaticPaths
 

@@ -22,7 +22,8 @@ from planner_jax.protocol import Attempt
 from planner_jax.robot.car import pose_at
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.plan import InterceptPlan
-from planner_jax.task.intercept.spacetime import Search, SpacetimeIntercept
+from planner_jax.task.intercept.searches import Search
+from planner_jax.task.intercept.spacetime import SpacetimeIntercept
 
 
 @dataclasses.dataclass(frozen=True)

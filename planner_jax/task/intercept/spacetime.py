@@ -18,7 +18,6 @@ from flax import struct
 from jax import Array, lax
 
 from planner_jax.optimise.levenberg import (
-    LevenbergConfig,
     LevenbergState,
     Model,
     least_squares,
@@ -26,11 +25,12 @@ from planner_jax.optimise.levenberg import (
 from planner_jax.plane import reach
 from planner_jax.plane.distance_field import DistanceField, distance_field
 from planner_jax.planning.one_by_one import OneByOne
-from planner_jax.protocol import Attempt, Status, is_solved
+from planner_jax.protocol import Status, is_solved
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.checked import checked_plan, explained, straight_on
 from planner_jax.task.intercept.motion import Quadratic, by_unknowns, motion
 from planner_jax.task.intercept.plan import InterceptPlan
+from planner_jax.task.intercept.searches import BEST, QUICK, SEARCHES, Search
 from planner_jax.task.intercept.terms import (
     Weights,
     discs_of,
@@ -48,74 +48,6 @@ if TYPE_CHECKING:
 _FIELD = 128  # places of the distance field along either side of the map
 _SOONEST = 0.01  # share of the case's time that a meeting takes at least
 _SPREAD = 2  # layers from the earliest one on at which ways to the earliest meeting end
-
-# A way takes about as much memory as so many starts of planners with few unknowns.
-_ROOM = 8
-_ROOM_OF_WORD = 1 / 32768  # the same of a word of a reach set
-
-
-@dataclasses.dataclass(frozen=True)
-class Search(Attempt):
-    """An attempt: so many ways, and so many steps from each; static."""
-
-    starts: int = dataclasses.field(init=False, default=1)
-    ways: int = 16
-    solver: LevenbergConfig = LevenbergConfig()  # of the stage that keeps limits
-    following: int = 4  # steps along the way of cells
-    settling: int = 16  # steps towards less effort, or an earlier meeting
-    margin: float = 0.03  # [m], kept from obstacles
-    slack: float = 0.015  # share of every limit that is kept free
-    discs: int = 3  # that the body counts as in least squares
-    seed: int = 0  # of the ways
-    drawn: int = 4  # ways for each that is tried: the smoothest of them
-    directness: float = 2.0  # of these ways; see `reach.draw_way`
-    lattice: reach.Lattice = reach.Lattice()
-    girth: float = 1.0  # of the body in the reach set; less finds ways that rounding closes
-
-    def __post_init__(self) -> None:
-        if self.ways < 1:
-            raise ValueError(f"ways must be >= 1, got {self.ways}")
-        lattice = self.lattice
-        words = lattice.cells**2 // 32 * lattice.levels * lattice.headings * lattice.layers
-        starts = max(_ROOM * self.ways, round(_ROOM_OF_WORD * words))
-        object.__setattr__(self, "starts", starts)
-
-
-_GIVEN = (
-    Search(2, LevenbergConfig(10), following=3),
-    Search(4, LevenbergConfig(16), seed=1, girth=0.9),
-    Search(16, LevenbergConfig(24), seed=2, girth=0.75, drawn=1, directness=0.0),
-)
-_QUICK = tuple(
-    dataclasses.replace(search, ways=ways, solver=LevenbergConfig(steps), settling=12)
-    for search, ways, steps in zip(_GIVEN, (2, 4, 6), (8, 10, 14), strict=True)
-)
-# A car that begins beside a wall has no room for margins: many ways, which keep next to none.
-_NARROW = tuple(
-    Search(64, LevenbergConfig(60), seed=seed, girth=girth, margin=0.006, slack=1e-3, discs=7)
-    for seed, girth in ((3, 0.9), (4, 0.75), (6, 0.9))
-)
-_BEST = (dataclasses.replace(_GIVEN[0], ways=8, settling=48), *_GIVEN[1:], *_NARROW)
-# Of a free time every way is tried, until it brings little, and the best one is kept. To hurry is
-# to leave the cells: early meetings come out earlier where nothing follows them.
-_EARLY = Search(
-    32,
-    LevenbergConfig(60, tolerance=5e-4),
-    following=0,
-    girth=0.85,
-    drawn=1,
-    directness=0.0,
-)
-_LEAST = Search(16, LevenbergConfig(60, tolerance=5e-4))
-_LATER = (
-    Search(8, seed=1, girth=0.9),
-    dataclasses.replace(_GIVEN[2], solver=LevenbergConfig(30)),
-)
-_SEARCHES = {
-    "given": _GIVEN,
-    "early": (_EARLY, *_LATER),
-    "least": (_LEAST, *_LATER),
-}
 
 # What each stage minimises.
 _FOLLOWING = Weights(follow=10.0, obstacle=0.0, early=0.0)
@@ -183,7 +115,7 @@ class SpacetimeIntercept(OneByOne):
     @property
     def attempts(self) -> tuple[Search, ...]:
         """The searches."""
-        return self.searches or _SEARCHES[self.meet]
+        return self.searches or SEARCHES[self.meet]
 
     @property
     def is_time_free(self) -> bool:
@@ -556,7 +488,7 @@ def quick(**fields: Any) -> SpacetimeIntercept:
     Args:
         **fields: of `SpacetimeIntercept`.
     """
-    return SpacetimeIntercept(**{"searches": _QUICK, **fields})
+    return SpacetimeIntercept(**{"searches": QUICK, **fields})
 
 
 def best(**fields: Any) -> SpacetimeIntercept:
@@ -565,4 +497,4 @@ def best(**fields: Any) -> SpacetimeIntercept:
     Args:
         **fields: of `SpacetimeIntercept`.
     """
-    return SpacetimeIntercept(**{"searches": _BEST, "tries_all": True, **fields})
+    return SpacetimeIntercept(**{"searches": BEST, "tries_all": True, **fields})

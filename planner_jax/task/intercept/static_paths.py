@@ -22,7 +22,8 @@ from planner_jax.plane.target import TurningPath
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.motion import motion
 from planner_jax.task.intercept.path import Path, path_of_drive
-from planner_jax.task.intercept.spacetime import Found, Guess, Search, SpacetimeIntercept
+from planner_jax.task.intercept.searches import Search
+from planner_jax.task.intercept.spacetime import Found, Guess, SpacetimeIntercept
 from planner_jax.task.intercept.terms import wrapped
 
 _SHARES = 8  # of a way, where it is compared with others
