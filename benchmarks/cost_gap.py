@@ -37,20 +37,29 @@ def cost_gaps(
 
     Returns:
         (K,), relative, of the cases that both solve: 0.33 is 33 %. None where the planner has no
-        rounds, and its task no yardstick.
+        rounds, and its task no yardstick for such cases.
     """
     cases, plans = jax.tree.map(lambda leaf: np.asarray(leaf[:COMPARED]), (cases, plans))
     if isinstance(planner, DecidedPlanner):
         cases, planner = cases.decided(plans.choice), planner.planner
-    if isinstance(planner, OptimisedPlanner):
-        longer = planner.with_solver()
-    elif card is not None and card.yardstick is not None:
-        longer = card.planner(card.yardstick)
-    else:
+    longer = _longer(planner, cases, card)
+    if longer is None:
         return None
     best = plan(longer, cases, devices=devices)
     both = solved(plans) & solved(best)
     return plans.cost[both] / best.cost[both] - 1.0
+
+
+def _longer(planner: Any, cases: Any, card: Task | None) -> Any:
+    """The planner with whose costs those of a planner are compared, None if there is none."""
+    if isinstance(planner, OptimisedPlanner):
+        return planner.with_solver()
+    if card is None or card.yardstick is None:
+        return None
+    yardstick = card.planner(card.yardstick)
+    # A task's groups, and what is planned again, are cases of other classes.
+    kind = getattr(yardstick, "case_type", None)
+    return yardstick if kind is None or isinstance(cases, kind) else None
 
 
 def gap_figures(*gaps: np.ndarray | None) -> dict[str, float | None]:

@@ -18,7 +18,7 @@ import jax
 import numpy as np
 
 import planner_jax as pj
-from planner_jax.benchmarks.cost_gap import cost_gaps
+from planner_jax.benchmarks.cost_gap import cost_gaps, gap_figures
 from planner_jax.benchmarks.run import argument_parser, begin
 from planner_jax.plane.target import LaterPath
 from planner_jax.registry import all_tasks, task_named
@@ -76,12 +76,13 @@ def main() -> None:
             f"refereed success {100 * success.mean():.2f} %, "
             f"median cost {np.median(plans.cost[success]):.3g}",
         )
-        gaps = cost_gaps(planner, batch, plans, card=None if options.elapsed else card)
+        gaps = cost_gaps(planner, batch, plans, card=card)
         bench.count(success, gaps)
-        if gaps is not None:
-            median, p90 = 100.0 * np.quantile(gaps, (0.5, 0.9))
+        median, p90 = gap_figures(gaps).values()
+        if median is not None and p90 is not None:
             bench.say(
-                f"cost above a longer search's: {median:.1f} % at the median, p90 {p90:.1f} %"
+                f"cost above a longer search's: {100.0 * median:.1f} % at the median, p90 "
+                f"{100.0 * p90:.1f} %"
             )
         bench.note(
             p50_ms=p50,

@@ -163,6 +163,13 @@ def test_costs_without_rounds_are_compared_with_those_of_the_tasks_yardstick():
     assert cost_gaps(Half(), cases, plans, card=no_yardstick) is None
 
 
+def test_a_yardstick_for_cases_of_another_class_is_none():
+    """As are a car's group of targets, and an interception that is planned again."""
+    cases = pj.hit.draw(2)
+    plans = pj.plan(pj.hit.planner("bat-lite"), cases)
+    assert cost_gaps(Half(), cases, plans, card=registry.task_named("intercept")) is None
+
+
 def test_a_planner_without_rounds_has_no_iterations_to_set(halving, tmp_path):
     with pytest.raises(SettingError, match="iterations must be left out"):
         report(task="halve", batch=[4], repeat=1, iterations=7, out=tmp_path / "run")

@@ -126,7 +126,11 @@ def approach(distance: Callable, *bodies: Array) -> Approach:
         distance: a function of this module. Of the lowest points, the second body is the ground.
         bodies: its arguments.
     """
-    point, gap = _SIDES[distance](*bodies)
+    nearest_of, gap_of, point_of = _SIDES[distance]
+    nearest = nearest_of(*bodies)
+    point, gap = point_of(nearest, *bodies), gap_of(nearest, *bodies)
+    # Within the plane of x and y it has two components.
+    gap = (*gap, *[jnp.zeros_like(gap[0])] * (3 - len(gap)))
     # Quotients in the end: XLA works such out once, and what is no division once for each use.
     length = _length(gap)
     length = jnp.where(length > 0.0, length, jnp.inf)
@@ -390,63 +394,47 @@ def _area(a: Vector, b: Vector) -> Array:
     return a[0] * b[1] - a[1] * b[0]
 
 
-def _sides_of_segments(ends_a: Array, ends_b: Array) -> tuple[Vector, Vector]:
-    shares = _nearest_of_segments(ends_a, ends_b)
-    return _point(ends_a, shares[0]), _gap_of_segments(shares, ends_a, ends_b)
-
-
-def _sides_of_rectangle(ends: Array, middle: Array, edges: Array) -> tuple[Vector, Vector]:
-    nearest = _nearest_of_rectangle(ends, middle, edges)
-    return _point(ends, nearest[0]), _gap_to_rectangle(nearest, ends, middle, edges)
-
-
-def _sides_of_box(ends: Array, lower: Array, upper: Array) -> tuple[Vector, Vector]:
-    share = _nearest_of_box(ends, lower, upper)
-    return _point(ends, share), _gap_to_box(share, ends, lower, upper)
-
-
-def _sides_of_line(ends: Array, place: Array) -> tuple[Vector, Vector]:
-    share = _nearest_to_line(ends, place)
-    return _point(ends, share), _level(_gap_to_line(share, ends, place))
-
-
-def _sides_of_projection(middle: Array, edges: Array, place: Array) -> tuple[Vector, Vector]:
-    nearest = _nearest_of_projection(middle, edges, place)
-    (e, f), (p, q, _) = _rows(edges), nearest
-    point = tuple(m + p * a + q * b for m, a, b in zip(middle, e, f, strict=True))
-    return point, _level(_gap_of_projection(nearest, middle, edges, place))
-
-
-def _sides_of_low_segment(ends: Array) -> tuple[Vector, Vector]:
+def _nearest_end(ends: Array) -> Vector:
+    """The lower end of a segment."""
     start, end = _rows(ends)
-    point = tuple(jnp.where(start[2] < end[2], a, b) for a, b in zip(start, end, strict=True))
-    return point, _up(point)
+    return tuple(jnp.where(start[2] < end[2], a, b) for a, b in zip(start, end, strict=True))
 
 
-def _sides_of_low_rectangle(middle: Array, edges: Array) -> tuple[Vector, Vector]:
-    e, f = _rows(edges)
-    p, q = jnp.sign(e[2]), jnp.sign(f[2])
-    point = tuple(m - p * a - q * b for m, a, b in zip(middle, e, f, strict=True))
-    return point, _up(point)
+def _nearest_corner(middle: Array, edges: Array) -> Vector:
+    """The lowest point of a rectangle."""
+    p, q = -jnp.sign(edges[0, 2]), -jnp.sign(edges[1, 2])
+    return _point_of_rectangle((p, q), middle, edges)
 
 
-def _level(gap: Vector) -> Vector:
-    """A vector of the plane of x and y, in space."""
-    return (*gap, jnp.zeros_like(gap[0]))
+def _gap_to_ground(lowest: Vector, *bodies: Array) -> Vector:
+    """Upwards, of any length."""
+    return (jnp.zeros_like(lowest[0]), jnp.zeros_like(lowest[0]), jnp.ones_like(lowest[0]))
 
 
-def _up(like: Vector) -> Vector:
-    """The unit vector upwards, in the shape of another vector."""
-    return (jnp.zeros_like(like[0]), jnp.zeros_like(like[0]), jnp.ones_like(like[0]))
+def _point_of_rectangle(nearest: Any, middle: Array, edges: Array, *other: Array) -> Vector:
+    (e, f), (p, q, *_) = _rows(edges), nearest
+    return tuple(m + p * a + q * b for m, a, b in zip(middle, e, f, strict=True))
 
 
-# Of each distance: the point of the first body, and the gap there.
-_SIDES: dict[Callable, Callable[..., tuple[Vector, Vector]]] = {
-    segment_to_segment: _sides_of_segments,
-    segment_to_rectangle: _sides_of_rectangle,
-    segment_to_box: _sides_of_box,
-    segment_to_vertical_line: _sides_of_line,
-    rectangle_to_vertical_line: _sides_of_projection,
-    lowest_of_segment: _sides_of_low_segment,
-    lowest_of_rectangle: _sides_of_low_rectangle,
+def _point_of_first(shares: Any, ends: Array, *other: Array) -> Vector:
+    return _point(ends, shares[0])
+
+
+def _point_of_share(share: Array, ends: Array, *other: Array) -> Vector:
+    return _point(ends, share)
+
+
+def _point_itself(lowest: Vector, *bodies: Array) -> Vector:
+    return lowest
+
+
+# Of each distance: what names the nearest points, the gap between them, the first body's point.
+_SIDES: dict[Callable, tuple[Callable, Callable, Callable]] = {
+    segment_to_segment: (_nearest_of_segments, _gap_of_segments, _point_of_first),
+    segment_to_rectangle: (_nearest_of_rectangle, _gap_to_rectangle, _point_of_first),
+    segment_to_box: (_nearest_of_box, _gap_to_box, _point_of_share),
+    segment_to_vertical_line: (_nearest_to_line, _gap_to_line, _point_of_share),
+    rectangle_to_vertical_line: (_nearest_of_projection, _gap_of_projection, _point_of_rectangle),
+    lowest_of_segment: (_nearest_end, _gap_to_ground, _point_itself),
+    lowest_of_rectangle: (_nearest_corner, _gap_to_ground, _point_itself),
 }

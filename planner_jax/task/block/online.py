@@ -238,8 +238,8 @@ class OnlineBlock(OneByOne):
     ) -> BlockPlan:
         """Least squares from all starts (N, n) for a trial, then from those that cost least."""
         model, solver = self._model_of(case, flight), attempt.solver
-        trial = dataclasses.replace(solver, max_steps=solver.trial)
-        tried = jax.vmap(lambda point: go_on(model, begun(point, solver), trial))(points)
+        trial = lambda point: go_on(model, begun(point, solver), solver, solver.trial)  # noqa: E731
+        tried = jax.vmap(trial)(points)
         _, chosen = lax.top_k(-_hopes(tried, solver), min(attempt.kept, attempt.tries))
         kept = jax.tree.map(lambda leaf: leaf[chosen], tried)
         ends = jax.vmap(lambda state: go_on(model, state, solver))(kept)
