@@ -62,13 +62,13 @@ def built(bench: Bench, path: Path, layout: str, regime: str) -> Library:
     # Spread, so that some of them need least squares, too; as many as calls of every size take.
     few = np.flatnonzero(tunnel.is_feasible)[:: tunnel.is_feasible.sum() // 64]
     began = time.perf_counter()
-    for size in building.sizes()[1]:
+    for size in set(building.portions().lanes):
         building.plan_pairs(setting, home, tunnel, np.resize(few, max(size, len(few))))
     compiling = time.perf_counter() - began
     library, seconds = timed(building.build, path, setting, home, own)
     bench.say(
         f"Build of {own.num_pairs} pairs, {tunnel.is_feasible.sum()} of them feasible: "
-        f"{seconds:.1f} s, after {compiling:.1f} s with the compilation."
+        f"{seconds:.2f} s, after {compiling:.1f} s with the compilation."
     )
     bench.note(build_seconds=seconds, first_pairs_seconds=compiling)
     return library
@@ -190,7 +190,7 @@ def repaired(bench: Bench, library: Library, shift: float, num: int) -> None:
     stored = int(library.found.sum())
     bench.say(
         f"Pole moved by {shift} m: {touched.sum()} of {stored} motions planned anew in "
-        f"{seconds:.1f} s; motions for {fixed.found.sum()} then."
+        f"{seconds:.2f} s; motions for {fixed.found.sum()} then."
     )
     bench.note(repair_seconds=seconds, repaired=int(touched.sum()))
     referee(bench, fixed, num, "repaired")

@@ -315,7 +315,7 @@ def counted(monkeypatch):
         return row
 
     monkeypatch.setattr(building, "plan_pairs", plan_pairs)
-    monkeypatch.setattr(building, "_ON_CPU", (5, (16,)))
+    monkeypatch.setattr(building, "_ON_CPU", building.Portions(5, (16, 16), 1))
     return calls
 
 
@@ -359,7 +359,7 @@ def test_parts_of_another_library_are_not_gone_on_with(tmp_path, counted, monkey
     assert kept == num
     monkeypatch.undo()
     monkeypatch.setattr(building, "plan_pairs", plain)
-    monkeypatch.setattr(building, "_ON_CPU", (5, (16,)))
+    monkeypatch.setattr(building, "_ON_CPU", building.Portions(5, (16, 16), 1))
     building.build(tmp_path / "a", setting("R3"), home, TINY, progress=False)
     assert len(counted) == 2 * num
 
@@ -466,9 +466,13 @@ def test_a_planner_of_a_file_needs_the_file_and_others_take_none():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("regime", ["R1", "R2"])
-def test_the_referee_confirms_what_is_built(regime, tmp_path):
-    """Every pair has a motion, its shield blocks nearly all balls, and no claim is refused."""
+@pytest.mark.parametrize("regime, starts", [("R1", 1), ("R2", 1), ("R2", 16)])
+def test_the_referee_confirms_what_is_built(regime, starts, tmp_path, monkeypatch):
+    """Every pair has a motion, its shield blocks nearly all balls, and no claim is refused.
+
+    Whether starts are tried one after another, as on a CPU, or at once.
+    """
+    monkeypatch.setattr(building, "_ON_CPU", building.Portions(256, (16, 16), starts))
     path = tmp_path / "a.lib"
     layout = Layout((Face(0, 1, (4, 4)),), (Face(0, 1, (2, 2)),))
     home = irb1600().home

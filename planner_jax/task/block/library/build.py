@@ -5,6 +5,7 @@ import functools
 import json
 import os
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,9 +41,23 @@ from planner_jax.task.block.scene import Scene
 # repair, what began with the old motion is as good mostly, and one more will do.
 STARTS, REPAIR_STARTS = (2, 0, 1, 3, 4, 5), (2,)
 _WORTH = 0.03  # [s], earlier: what a search for a better motion has to promise
-# Pairs that are planned before the next part is written, and sizes of a call in lanes of a device.
-_ON_CPU, _ON_GPU = (256, (16,)), (32768, (1024, 8192))
 _LOOKED_AT = 1024  # stored motions whose distances are worked out at once
+
+
+@dataclasses.dataclass(frozen=True)
+class Portions:
+    """How much is planned at a time."""
+
+    pairs: int  # before the next part is written
+    lanes: tuple[int, int]  # of a device in a call, of few and of many
+    # Of one pair in a call. One, where those that come after a motion was found are work saved;
+    # all, where a few lanes take as long as thousands.
+    starts: int
+
+
+_ON_CPU = Portions(256, (16, 16), 1)
+_ON_GPU = Portions(32768, (512, 8192), 16)
+_FEW = 6  # calls of few lanes that take about as long as one of many
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,7 +98,7 @@ def build(
     tunnel = tunnels(layout, setting.scene.inner, setting.scene.outer)
     feasible = np.flatnonzero(tunnel.is_feasible)
     parts = _Parts(Path(f"{os.fspath(path)}.parts"), setting, homes, layout)
-    size, _ = sizes()
+    size = portions().pairs
     work = [
         (k, feasible[begin : begin + size])
         for k in range(len(homes))
@@ -133,7 +148,7 @@ def repair(
         touched[k, stored] = ~_is_free(setting, home, rows[k, stored])
         if retry:
             touched[k] |= tunnel.is_feasible & ~library.found[k]
-    size, _ = sizes()
+    size = portions().pairs
     with _bar(int(touched.sum()), "pairs", progress) as bar:
         for k, home in enumerate(np.asarray(table.homes)):
             anew = np.flatnonzero(touched[k])
@@ -144,8 +159,8 @@ def repair(
     return library_of(rows, table.homes, table.layout, setting), touched
 
 
-def sizes() -> tuple[int, tuple[int, ...]]:
-    """Pairs of a part, and sizes of a call in lanes, of this process's devices."""
+def portions() -> Portions:
+    """How much this process's devices plan at a time."""
     return _ON_CPU if jax.default_backend() == "cpu" else _ON_GPU
 
 
@@ -189,39 +204,52 @@ def plan_pairs(
         quickest=np.full(len(pairs), np.inf, np.float32),
     )
 
-    def improve(planner: PairPlanner, some: np.ndarray, start: int, is_coarse: bool) -> None:
+    def improve(
+        planner: PairPlanner, some: np.ndarray, starts: Sequence[int], is_coarse: bool
+    ) -> None:
         if not some.size:
             return
-        same: Any = (np.full(len(some), is_coarse), np.full(len(some), start, np.int32))
-        best: Any = found.entry[some]
-        cases = PairCase(outer[some], inner[some], same[0], best, same[1], given[some])
+        lanes = np.repeat(some, len(starts))
+        start: Any = np.tile(np.asarray(starts, np.int32), len(some))
+        coarse: Any = np.full(len(lanes), is_coarse)
+        best: Any = found.entry[lanes]
+        cases = PairCase(outer[lanes], inner[lanes], coarse, best, start, given[lanes])
         plans = _planned(planner, cases)
-        better = solved(plans) & (plans.cost < found.entry[some])
-        found.point[some[better]] = plans.point[better]
-        found.entry[some[better]] = plans.cost[better]
-        found.quickest[some] = plans.quickest
+        cost = np.where(solved(plans), plans.cost, np.inf).reshape(len(some), -1)
+        first = np.arange(0, len(lanes), len(starts)) + np.argmin(cost, axis=1)
+        cost = np.min(cost, axis=1)
+        better = cost < found.entry[some]
+        found.point[some[better]] = plans.point[first[better]]
+        found.entry[some[better]] = cost[better]
+        found.quickest[some] = plans.quickest[first]
 
-    improving = (-1, *(STARTS if old is None else REPAIR_STARTS))
+    improving = STARTS if old is None else (-1, *REPAIR_STARTS)
+    rest = [start for start in STARTS if start not in improving]
     others = [start for start in range(len(learned_starts()[0])) if start not in STARTS]
-    order = [-1, *STARTS, *others]
     for is_coarse in (False, True):
         left = np.isinf(found.entry)
-        improve(straight, np.flatnonzero(left), 0, is_coarse)
-        for start in order[: None if is_coarse else len(STARTS) + 1]:
+        improve(straight, np.flatnonzero(left), [0], is_coarse)
+        for starts in (*_groups(improving), *_groups(rest + others * is_coarse)):
             with np.errstate(invalid="ignore"):
                 hard = left & ~(found.entry - found.quickest <= _WORTH)
-            if start not in improving:
+            if starts[0] not in improving:
                 hard &= np.isinf(found.entry)
-            hard &= np.isfinite(found.quickest) & (has_old if start < 0 else True)
-            improve(bent, np.flatnonzero(hard), start, is_coarse)
+            hard &= np.isfinite(found.quickest) & (has_old if tuple(starts) == (-1,) else True)
+            improve(bent, np.flatnonzero(hard), starts, is_coarse)
     return _rows_of(straight, found)
+
+
+def _groups(starts: Sequence[int]) -> list[Sequence[int]]:
+    """Starts in groups, each for one call."""
+    num = portions().starts
+    return [starts[begin : begin + num] for begin in range(0, len(starts), num)]
 
 
 def _planned(planner: Any, cases: PairCase) -> Any:
     """Plans of a batch, in calls of few sizes, so that few programs are compiled."""
     num, devices = len(cases.best), jax.local_device_count()
-    most = sizes()[1][-1]
-    lanes = next((size for size in sizes()[1] if num <= size * devices), most)
+    few, many = portions().lanes
+    lanes = few if num <= _FEW * few * devices else many
     whole = -(-num // (lanes * devices)) * lanes * devices
     # The last one again: on a CPU it is not solved again.
     filled = jax.tree.map(lambda leaf: leaf[np.minimum(np.arange(whole), num - 1)], cases)

@@ -1,0 +1,54 @@
+"""How many hard balls a second all cores plan for: those that no straight motion blocks.
+
+    python -m benchmarks.block_hard [--num 2000] [--seed 20261] [--regime R2] [--repeat 3] [--out DIR]
+
+Throws of the suite `pole`. Those that a straight motion blocks, nearly three in four with R2, are left
+out: what remains needs least squares, or cannot be blocked at all. They are planned in one call,
+compiled before; the best of --repeat calls is reported, with what the referee confirms of it and
+how much longer its motions last than those of `brisk`.
+"""
+
+import jax
+import numpy as np
+
+import planner_jax as pj
+from planner_jax.benchmarks.block_rows import STRAIGHT
+from planner_jax.benchmarks.cost_gap import cost_gaps, gap_figures
+from planner_jax.benchmarks.run import argument_parser, begin
+from planner_jax.registry import task_named
+from planner_jax.sweep.block.settings import REGIMES
+from planner_jax.sweep.timing import timed_warm
+
+
+def main() -> None:
+    """Time one call."""
+    parser = argument_parser("block_hard", __doc__, num=2000, seed=20261, repeat=3)
+    parser.add_argument("--regime", choices=REGIMES, default="R2", help="default: R2")
+    options = parser.parse_args()
+    planner = pj.block.planner()
+    with begin(parser, options) as bench:
+        cases = pj.block.draw(options.num, "pole", options.seed, regime=options.regime)
+        hard = np.flatnonzero(~pj.solved(pj.plan(STRAIGHT, cases)))
+        if not hard.size:
+            bench.say("A straight motion blocks every throw.")
+            return
+        some = jax.tree.map(np.asarray, pj.lane(cases, hard))
+        calls = [timed_warm(lambda: pj.plan(planner, some)) for _ in range(options.repeat)]
+        (plans, _), seconds = calls[0], [each for _, each in calls]
+        success = pj.block.judge(some, plans).success
+        refused = int((pj.solved(plans) & ~success).sum())
+        gaps = cost_gaps(planner, some, plans, card=task_named("block"))
+        bench.count(success, gaps)
+        bench.note(seconds=min(seconds), refused=refused)
+        bench.say(
+            f"{hard.size} of {options.num} throws have no straight motion: "
+            f"{hard.size / min(seconds):.0f}/s, {100 * success.mean():.1f} % of them blocked, "
+            f"{refused} claims refused."
+        )
+        median = gap_figures(gaps)["cost_gap_median"]
+        if median is not None:
+            bench.say(f"Motions last {100.0 * median:.0f} % longer than brisk's at the median.")
+
+
+if __name__ == "__main__":
+    main()
