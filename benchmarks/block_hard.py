@@ -1,11 +1,12 @@
 """How many hard balls a second all cores plan for: those that no straight motion blocks.
 
-    python -m benchmarks.block_hard [--num 2000] [--seed 20261] [--regime R2] [--repeat 3] [--out DIR]
+    python -m benchmarks.block_hard [--num 2000] [--seed 20261] [--regime R2] [--repeat 3]
+        [--out DIR]
 
-Throws of the suite `pole`. Those that a straight motion blocks, nearly three in four with R2, are left
-out: what remains needs least squares, or cannot be blocked at all. They are planned in one call,
-compiled before; the best of --repeat calls is reported, with what the referee confirms of it and
-how much longer its motions last than those of `brisk`.
+Throws of the suite `pole`. Those that a straight motion blocks, nearly three in four with R2, are
+left out: what remains needs least squares, or cannot be blocked at all. They are planned in one
+call, compiled before; the best of --repeat calls is reported, with what the referee confirms of it
+and how much longer its motions last than those of `brisk`.
 """
 
 import jax
