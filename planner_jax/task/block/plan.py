@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jax import Array
+from jax import Array, lax
 
 from planner_jax.protocol import Status, is_solved
 from planner_jax.robot.arm_plan import ArmPlan
@@ -56,8 +56,12 @@ def explained(case: BlockCase, poses: EndPoses, status: Array) -> Array:
         poses: of the case, in which the shield meets the ball.
         status: () int32, of the plan.
     """
-    nearest = least_clearances(case.arm, case.scene, case.angles[None])[0]
-    reason = jnp.where(nearest < 0.0, Status.BLOCKED, status)
-    reason = jnp.where(jnp.any(jnp.isfinite(poses.effort)), reason, Status.OUT_OF_REACH)
-    reason = jnp.where(has_nan(case), Status.NON_FINITE, reason)
-    return jnp.where(is_solved(status), status, reason).astype(jnp.int32)
+
+    def reason() -> Array:
+        nearest = least_clearances(case.arm, case.scene, case.angles[None])[0]
+        why = jnp.where(nearest < 0.0, Status.BLOCKED, status)
+        why = jnp.where(jnp.any(jnp.isfinite(poses.effort)), why, Status.OUT_OF_REACH)
+        return jnp.where(has_nan(case), Status.NON_FINITE, why).astype(jnp.int32)
+
+    # One ball that is solved does not wait for it.
+    return lax.cond(is_solved(status), lambda: status.astype(jnp.int32), reason)
