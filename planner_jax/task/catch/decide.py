@@ -1,9 +1,4 @@
-"""When and in what order to catch: by estimated arrival, or the best of all orders.
-
-The estimate sees a point that accelerates evenly to its greatest speed, and a target that may
-be caught while it is high enough and does not come from below. It serves to rank orders and to
-guess times; the planner then optimises the times together with the trajectory.
-"""
+"""When and in what order to catch: by estimated arrival, or the best of all orders."""
 
 import dataclasses
 import functools
@@ -12,83 +7,12 @@ import itertools
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 from jax import Array
 
-from planner_jax.ball.flight import BallState
 from planner_jax.protocol import Status, is_unsolved
 from planner_jax.task.catch.case import CatchCase, CatchChoice
+from planner_jax.task.catch.estimate import GRID, earliest_next, follow, sampled, timetable
 from planner_jax.task.catch.plan import CatchPlan
-
-_GRID = 64  # times at which every target is looked at
-_ACCELERATION = 7.0  # [m/s^2], sustained, of the estimate
-_TURNING = 0.2  # [s] to begin to move
-_STEEPEST = -0.2  # least upward part of the way back along the target's path
-
-
-@struct.dataclass
-class _Timetable:
-    """Where every target is, when, and whether it may be caught there."""
-
-    times: Array  # (N, K) [s]
-    places: Array  # (N, K, 3) [m], of the quadrotor
-    penalty: Array  # (N, K) [m], above zero where a catch is hardly possible
-
-
-def _sampled(case: CatchCase) -> tuple[Array, BallState, Array]:
-    """Times (N, K) up to the horizon, the targets' states and their speeds (N, K) then."""
-    shares = jnp.asarray(np.arange(1, _GRID + 1) / _GRID, case.gravity.dtype)
-    times = case.horizon[:, None] * shares
-    states = jax.vmap(lambda target, at: jax.vmap(target.at)(at))(case.targets, times)
-    speed = jnp.sqrt(jnp.maximum(jnp.sum(states.vel**2, axis=-1), 1e-6))
-    return times, states, speed
-
-
-def _timetable(case: CatchCase) -> _Timetable:
-    net, limits = case.net, case.limits
-    times, states, speed = _sampled(case)
-    up = jnp.array([0.0, 0.0, 1.0], times.dtype)
-    from_below = jnp.maximum(states.vel[..., 2] / speed + _STEEPEST, 0.0)
-    places = states.pos - net.height * up
-    low = jnp.maximum(limits.min_height + 0.1 - places[..., 2], 0.0)
-    return _Timetable(times=times, places=places, penalty=10.0 * from_below + 10.0 * low)
-
-
-def _arrival(
-    table: _Timetable, target: Array, begin: Array, place: Array, speed: Array
-) -> tuple[Array, Array, Array]:
-    """Earliest time (), place (3,) and shortfall () of the next catch."""
-    times, places, penalty = table.times[target], table.places[target], table.penalty[target]
-    distance = jnp.sqrt(jnp.maximum(jnp.sum((places - place) ** 2, axis=-1), 1e-12))
-    span = jnp.maximum(times - begin - _TURNING, 0.0)
-    rise = speed / _ACCELERATION
-    reach = jnp.where(span < rise, 0.5 * _ACCELERATION * span**2, speed * span - 0.5 * speed * rise)
-    late = jnp.where(times > begin, 0.0, 100.0)
-    shortfall = jnp.maximum(distance - reach, 0.0) + penalty + late
-    possible = shortfall <= 0.0
-    first = jnp.where(jnp.any(possible), jnp.argmax(possible), jnp.argmin(shortfall))
-    return times[first], places[first], shortfall[first]
-
-
-def _follow(case: CatchCase, table: _Timetable, order: Array) -> tuple[CatchChoice, Array]:
-    """Estimated times of one order (N,), present targets moved to the front.
-
-    Also by how much () [m] the targets stay out of the estimate's reach.
-    """
-    order = order[jnp.argsort(~case.present[order], stable=True)]
-    speed = 0.9 * case.limits.speed
-
-    def advance(state: tuple, target: Array) -> tuple[tuple, tuple[Array, Array]]:
-        begin, place = state
-        time, there, shortfall = _arrival(table, target, begin, place, speed)
-        here = case.present[target]
-        time = jnp.where(here, jnp.maximum(time, begin + 0.05), begin + 0.05)
-        there = jnp.where(here, there, place)
-        return (time, there), (time, jnp.where(here, shortfall, 0.0))
-
-    start = (jnp.zeros_like(case.gravity), case.head_state[0])
-    _, (times, shortfalls) = jax.lax.scan(advance, start, order)
-    return CatchChoice(order=order, times=times), jnp.sum(shortfalls)
 
 
 def closest_approach(cases: CatchCase) -> Array:
@@ -106,11 +30,11 @@ def closest_approach(cases: CatchCase) -> Array:
 def _closest_approach(case: CatchCase) -> Array:
     """`closest_approach` of one case."""
     net, limits = case.net, case.limits
-    times, states, speed = _sampled(case)
+    times, states, speed = sampled(case)
     offset = states.pos - case.head_state[0]
     distance = jnp.sqrt(jnp.maximum(jnp.sum(offset**2, axis=-1), 1e-12))
     # The target moves on between two of the times.
-    slack = net.height + net.radius + (speed + limits.speed) * case.horizon[:, None] / _GRID
+    slack = net.height + net.radius + (speed + limits.speed) * case.horizon[:, None] / GRID
     far = distance - limits.speed * times - slack
     low = limits.min_height - states.pos[..., 2] - slack
     gap = jnp.min(jnp.maximum(jnp.maximum(far, low), 0.0), axis=1)
@@ -168,8 +92,8 @@ class Best(CatchDecision):
     def propose(self, case: CatchCase) -> CatchChoice:
         """The finalists of one case, leaves (F, N)."""
         orders = jnp.asarray(list(itertools.permutations(range(case.num_targets))), jnp.int32)
-        table = _timetable(case)
-        choices, shortfall = jax.vmap(functools.partial(_follow, case, table))(orders)
+        table = timetable(case)
+        choices, shortfall = jax.vmap(functools.partial(follow, case, table))(orders)
         rank = choices.times[:, -1] + 10.0 * shortfall
         chosen = jnp.argsort(rank)[: min(self.finalists, len(orders))]
         return jax.tree.map(lambda leaf: leaf[chosen], choices)
@@ -182,22 +106,7 @@ class Greedy(CatchDecision):
 
     def propose(self, case: CatchCase) -> CatchChoice:
         """The one choice for one case, leaves (1, N)."""
-        table = _timetable(case)
-        num, speed = case.num_targets, 0.9 * case.limits.speed
-        begin, place = jnp.zeros_like(case.gravity), case.head_state[0]
-        left, order = jnp.ones(num, bool), []
-        for _ in range(num):
-            arrive = lambda target, t=begin, p=place: _arrival(table, target, t, p, speed)  # noqa: E731
-            times, places, shortfalls = jax.vmap(arrive)(jnp.arange(num))
-            # Absent targets come last, in any order.
-            rank = jnp.where(case.present, times + 10.0 * shortfalls, 1e9)
-            target = jnp.argmin(jnp.where(left, rank, jnp.inf))
-            here = case.present[target]
-            begin = jnp.where(here, jnp.maximum(times[target], begin + 0.05), begin)
-            place = jnp.where(here, places[target], place)
-            left = left & (jnp.arange(num) != target)
-            order.append(target)
-        choice, _ = _follow(case, table, jnp.stack(order).astype(jnp.int32))
+        choice = earliest_next(case, timetable(case), jnp.zeros_like(case.horizon))
         return jax.tree.map(lambda leaf: leaf[None], choice)
 
 

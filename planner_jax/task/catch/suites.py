@@ -55,6 +55,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath, HarmonicPath
@@ -126,7 +127,10 @@ def draw(
     if size < own:
         raise ValueError(f"num_targets must be >= {own} for suite {suite!r}, got {size}")
     random = np.random.default_rng([seed, zlib.crc32(suite.encode())])
-    targets, horizon = _targets(suite, random, num, first)
+    # One row a case: what stands in front is passed over.
+    columns = _columns(suite)
+    random.bit_generator.advance(first * columns)  # type: ignore[attr-defined]
+    targets, horizon = _targets(suite, random.random((num, columns)))
     # Which of the suite's targets has each place.
     place = np.where(np.arange(size) < own, np.arange(size), 0)
     cases = case(
@@ -139,36 +143,69 @@ def draw(
     return dataclasses.replace(cases, limits=cases.limits.scaled(limit_scale, cases.gravity))
 
 
-def _targets(suite: str, random: np.random.Generator, num: int, first: int) -> tuple[Any, Any]:
-    """Targets with NumPy leaves (num, N, ...) and their horizons (num, N) [s]."""
+def draw_by_key(key: Array, num: int, suite: str) -> CatchCase:
+    """A batch of cases as `draw` draws them, by a key of `jax.random`: pure, in float32.
+
+    Args:
+        key: of `jax.random`.
+        num: B, how many, >= 1.
+        suite: a key of `SUITES`.
+    """
+    uniform = jax.random.uniform(key, (num, _columns(suite)))
+    targets, horizon = _targets(suite, uniform)
+    one = draw(1, suite)
+    cases = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (num, *leaf.shape[1:])), one)
+    return dataclasses.replace(
+        cases,
+        targets=jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), targets),
+        horizon=jnp.asarray(horizon, jnp.float32),
+    )
+
+
+def _columns(suite: str) -> int:
+    """How many numbers a case of a suite takes."""
     throws = _THROWS.get(suite)
-    columns = 3 * len(throws) if throws else _PATHS[suite][0]
-    # One row a case: what stands in front is passed over.
-    random.bit_generator.advance(first * columns)  # type: ignore[attr-defined]
-    uniform = random.random((num, columns))
+    return 3 * len(throws) if throws else _PATHS[suite][0]
+
+
+def _targets(suite: str, uniform: Any) -> tuple[Any, Any]:
+    """Targets, leaves (num, N, ...), and horizons (num, N) [s] from numbers of [0, 1).
+
+    Args:
+        suite: a key of `SUITES`.
+        uniform: (num, C), NumPy or JAX, and so are the targets.
+    """
+    throws = _THROWS.get(suite)
     if throws:
         return _throws(uniform, throws)
     targets = _PATHS[suite][1](uniform)
-    return targets, np.full((num, SUITES[suite].num_targets), SUITES[suite].horizon)
+    return targets, np.full((len(uniform), SUITES[suite].num_targets), SUITES[suite].horizon)
 
 
-def _between(uniform: np.ndarray, low: float, high: float) -> np.ndarray:
+def _module(array: Any) -> Any:
+    """What computes with an array: jax.numpy or NumPy."""
+    return jnp if isinstance(array, jax.Array) else np
+
+
+def _between(uniform: Any, low: float, high: float) -> Any:
     """Numbers of [0, 1) spread over an interval."""
     return low + uniform * (high - low)
 
 
-def _unit(angle: np.ndarray) -> np.ndarray:
+def _unit(angle: Any) -> Any:
     """Level unit vectors (..., 3) at angles (...) [rad]."""
-    return np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1)
+    xp = _module(angle)
+    return xp.stack([xp.cos(angle), xp.sin(angle), xp.zeros_like(angle)], axis=-1)
 
 
 # Throws.
 
 
-def _throws(uniform: np.ndarray, throws: tuple[_Throw, ...]) -> tuple[BallPath, np.ndarray]:
+def _throws(uniform: Any, throws: tuple[_Throw, ...]) -> tuple[BallPath, Any]:
     """Thrown balls from three numbers each, and when they fall through `CATCH_HEIGHT`."""
-    drawn = [_throw(u, t) for u, t in zip(np.split(uniform, len(throws), 1), throws, strict=True)]
-    pos, vel, horizon = (np.stack(column, axis=1) for column in zip(*drawn, strict=True))
+    xp = _module(uniform)
+    drawn = [_throw(u, t) for u, t in zip(xp.split(uniform, len(throws), 1), throws, strict=True)]
+    pos, vel, horizon = (xp.stack(column, axis=1) for column in zip(*drawn, strict=True))
     drag = np.broadcast_to([[t.drag] * 3 for t in throws], pos.shape)
     return _balls(pos, vel, drag, np.full(horizon.shape, GRAVITY)), horizon
 
@@ -178,24 +215,25 @@ def _balls(pos: Any, vel: Any, drag: Any, gravity: Any) -> BallPath:
     return BallPath(ball=BallState(pos=pos, vel=vel), drag=drag, gravity=gravity)
 
 
-def _throw(uniform: np.ndarray, throw: _Throw) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _throw(uniform: Any, throw: _Throw) -> tuple[Any, Any, Any]:
     """Position (B, 3), velocity (B, 3) at the planning and horizon (B,) of one ball a row."""
-    land = np.zeros_like(uniform)
-    land[:, :2] = (2.0 * uniform[:, :2] - 1.0) * throw.land
+    xp = _module(uniform)
+    level = (2.0 * uniform[:, :2] - 1.0) * xp.asarray(throw.land)
+    land = xp.concatenate([level, xp.zeros_like(level[:, :1])], axis=1)
     flight = _between(uniform[:, 2], *throw.flight)
     launch = np.broadcast_to(LAUNCH, land.shape)
     # The landing point is affine in the velocity at the launch.
-    without, _ = _fly(launch, np.zeros_like(land), flight, throw.drag)
-    share, _ = _fly(np.zeros_like(land), np.ones_like(land), flight, throw.drag, gravity=0.0)
+    without, _ = _fly(launch, xp.zeros_like(land), flight, throw.drag)
+    share, _ = _fly(xp.zeros_like(land), xp.ones_like(land), flight, throw.drag, gravity=0.0)
     delay = np.full(len(land), throw.delay)
     pos, vel = _fly(launch, (land - without) / share, delay, throw.drag)
     # A ball is above that height, or rises to it, until it falls through it.
-    rise = np.maximum(vel[:, 2], 0.0) / GRAVITY
-    early, late = np.minimum(0.5 * rise, flight - delay), flight - delay
+    rise = xp.maximum(vel[:, 2], 0.0) / GRAVITY
+    early, late = xp.minimum(0.5 * rise, flight - delay), flight - delay
     for _ in range(_BISECTIONS):
         middle = 0.5 * (early + late)
         above = _fly(pos, vel, middle, throw.drag)[0][:, 2] > CATCH_HEIGHT
-        early, late = np.where(above, middle, early), np.where(above, late, middle)
+        early, late = xp.where(above, middle, early), xp.where(above, late, middle)
     return pos, vel, early
 
 
@@ -216,21 +254,21 @@ def earliest_throw(name: str) -> tuple[BallState, float]:
     return BallState(pos=pos, vel=vel), float(horizon[0])
 
 
-def _fly(pos, vel, time, drag: float, gravity: float = GRAVITY) -> tuple[np.ndarray, np.ndarray]:
+def _fly(pos, vel, time, drag: float, gravity: float = GRAVITY) -> tuple[Any, Any]:
     """Balls (B, 3) after `time` (B,) [s] with linear drag [1/s] (paper 000, eq. 9)."""
-    t = time[:, None]
+    xp, t = _module(vel), time[:, None]
     pull = np.array([0.0, 0.0, -gravity])
     if drag == 0.0:
         return pos + vel * t + 0.5 * pull * t**2, vel + pull * t
-    kept = -np.expm1(-drag * t) / drag
+    kept = -xp.expm1(-drag * t) / drag
     last = pull / drag  # the velocity at which drag carries the ball
-    return pos + (vel - last) * kept + last * t, last + (vel - last) * np.exp(-drag * t)
+    return pos + (vel - last) * kept + last * t, last + (vel - last) * xp.exp(-drag * t)
 
 
 # Lines and swings.
 
 
-def _lines(pos: np.ndarray, vel: np.ndarray) -> BallPath:
+def _lines(pos: Any, vel: Any) -> BallPath:
     """Targets that fly straight on from `pos` (B, N, 3) at `vel`."""
     return _balls(pos, vel, np.zeros(pos.shape), np.zeros(pos.shape[:2]))
 
@@ -239,36 +277,35 @@ def _harmonic(uniform: Any) -> HarmonicPath:
     """Two swings from nine numbers each."""
     u = uniform.reshape(len(uniform), 2, 9)
     drift = _between(u[..., :1], 1.0, 1.5) * _unit(2.0 * np.pi * u[..., 1])
-    near = _between(u[..., 2:3], 0.0, 1.5) * _unit(2.0 * np.pi * u[..., 3])
-    near[..., 2] = _between(u[..., 4], 2.0, 2.5)
-    swing = np.zeros_like(near)
-    swing[..., 2] = _between(u[..., 5], 0.6, 1.0)
+    xp, level = _module(u), _between(u[..., 2:3], 0.0, 1.5) * _unit(2.0 * np.pi * u[..., 3])
+    near = xp.concatenate([level[..., :2], _between(u[..., 4:5], 2.0, 2.5)], axis=-1)
+    swing = xp.concatenate([xp.zeros_like(u[..., :2]), _between(u[..., 5:6], 0.6, 1.0)], axis=-1)
     rate, phase = _between(u[..., 6], 1.5, 2.5), 2.0 * np.pi * u[..., 7]
     when = _between(u[..., 8:9], 2.0, 5.0)
     leaves: tuple[Any, ...] = (near - drift * when, drift, swing, rate, phase)
     return HarmonicPath(*leaves)
 
 
-def _triangle(uniform: np.ndarray) -> BallPath:
+def _triangle(uniform: Any) -> BallPath:
     """Three targets on the sides of an equilateral triangle, from seven numbers."""
-    u = uniform[:, :, None]
-    centre = np.concatenate([uniform[:, :2] - 0.5, _between(uniform[:, 2:3], 1.5, 2.5)], axis=1)
+    xp, u = _module(uniform), uniform[:, :, None]
+    centre = xp.concatenate([uniform[:, :2] - 0.5, _between(uniform[:, 2:3], 1.5, 2.5)], axis=1)
     corner = 2.0 * np.pi * (u[:, 3] + np.arange(3) / 3.0)
     radius, speed = _between(u[:, 4:5], 3.0, 4.0), _between(u[:, 5:6], 1.0, 1.5)
-    side = np.pi / 6.0 * np.where(u[:, 6] < 0.5, 1.0, -1.0)  # to the left or to the right
+    side = np.pi / 6.0 * xp.where(u[:, 6] < 0.5, 1.0, -1.0)  # to the left or to the right
     return _lines(centre[:, None] + radius * _unit(corner), -speed * _unit(corner + side))
 
 
-def _hexagon(uniform: np.ndarray) -> BallPath:
+def _hexagon(uniform: Any) -> BallPath:
     """Six targets in parallel on a hexagon, from eight numbers."""
-    u = uniform[:, :, None]
-    near = np.concatenate([uniform[:, :2] - 0.5, _between(uniform[:, 2:3], 1.5, 2.5)], axis=1)
+    xp, u = _module(uniform), uniform[:, :, None]
+    near = xp.concatenate([uniform[:, :2] - 0.5, _between(uniform[:, 2:3], 1.5, 2.5)], axis=1)
     corner = 2.0 * np.pi * (u[:, 3] + np.arange(6) / 6.0)
     radius, speed = _between(u[:, 4:5], 1.0, 1.5), _between(u[:, 5:6], 1.0, 1.5)
     vel = speed * _unit(2.0 * np.pi * u[:, 6])[:, 0:1]
     when = _between(u[:, 7:8], 4.0, 6.0)
     pos = near[:, None] + radius * _unit(corner) - vel * when
-    return _lines(pos, np.broadcast_to(vel, pos.shape))
+    return _lines(pos, xp.broadcast_to(vel, pos.shape))
 
 
 # Suite -> how many numbers a case takes, and what makes targets of them.

@@ -1,0 +1,130 @@
+"""When targets can be caught, by a rough estimate of what the quadrotor can reach.
+
+The estimate sees a point that accelerates evenly to its greatest speed, and a target that may
+be caught while it is high enough and does not come from below. It serves to rank orders and to
+guess times; the planner then optimises the times together with the trajectory.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+from planner_jax.ball.flight import BallState
+from planner_jax.task.catch.case import CatchCase, CatchChoice
+
+GRID = 64  # times at which every target is looked at
+_ACCELERATION = 7.0  # [m/s^2], sustained, of the estimate
+_TURNING = 0.2  # [s] to begin to move
+_INSTANT = 0.05  # [s], between two catches at least
+_STEEPEST = -0.2  # least upward part of the way back along the target's path
+
+
+@struct.dataclass
+class Timetable:
+    """Where a target is, when, and whether it may be caught there; one, or N with an axis more."""
+
+    times: Array  # (K,) [s]
+    places: Array  # (K, 3) [m], of the quadrotor
+    penalty: Array  # (K,) [m], above zero where a catch is hardly possible
+
+
+def sampled(case: CatchCase) -> tuple[Array, BallState, Array]:
+    """Times (N, K) up to the horizon, the targets' states and their speeds (N, K) then."""
+    shares = jnp.asarray(np.arange(1, GRID + 1) / GRID, case.gravity.dtype)
+    times = case.horizon[:, None] * shares
+    states = jax.vmap(lambda target, at: jax.vmap(target.at)(at))(case.targets, times)
+    speed = jnp.sqrt(jnp.maximum(jnp.sum(states.vel**2, axis=-1), 1e-6))
+    return times, states, speed
+
+
+def timetable(case: CatchCase) -> Timetable:
+    """When and where each of the N targets of one case may be caught."""
+    net, limits = case.net, case.limits
+    times, states, speed = sampled(case)
+    up = jnp.array([0.0, 0.0, 1.0], times.dtype)
+    from_below = jnp.maximum(states.vel[..., 2] / speed + _STEEPEST, 0.0)
+    places = states.pos - net.height * up
+    low = jnp.maximum(limits.min_height + 0.1 - places[..., 2], 0.0)
+    return Timetable(times=times, places=places, penalty=10.0 * from_below + 10.0 * low)
+
+
+def arrival(
+    table: Timetable, begin: Array, place: Array, speed: Array
+) -> tuple[Array, Array, Array]:
+    """Earliest time () [s], place (3,) and shortfall () [m] of the catch of one target.
+
+    Args:
+        table: of this target.
+        begin: () [s], when the quadrotor leaves.
+        place: (3,) [m], from where.
+        speed: () [m/s], its greatest.
+    """
+    times, places, penalty = table.times, table.places, table.penalty
+    distance = jnp.sqrt(jnp.maximum(jnp.sum((places - place) ** 2, axis=-1), 1e-12))
+    span = jnp.maximum(times - begin - _TURNING, 0.0)
+    rise = speed / _ACCELERATION
+    reach = jnp.where(span < rise, 0.5 * _ACCELERATION * span**2, speed * span - 0.5 * speed * rise)
+    late = jnp.where(times > begin, 0.0, 100.0)
+    shortfall = jnp.maximum(distance - reach, 0.0) + penalty + late
+    possible = shortfall <= 0.0
+    first = jnp.where(jnp.any(possible), jnp.argmax(possible), jnp.argmin(shortfall))
+    return times[first], places[first], shortfall[first]
+
+
+def follow(case: CatchCase, table: Timetable, order: Array) -> tuple[CatchChoice, Array]:
+    """Estimated times of one order (N,), present targets moved to the front.
+
+    Also by how much () [m] the targets stay out of the estimate's reach.
+    """
+    order = order[jnp.argsort(~case.present[order], stable=True)]
+
+    def advance(state: tuple, target: Array) -> tuple[tuple, tuple[Array, Array]]:
+        begin, place = state
+        own = jax.tree.map(lambda leaf: leaf[target], table)
+        found = arrival(own, begin, place, _speed(case))
+        time, there = _caught(case.present[target], begin, place, *found[:2])
+        return (time, there), (time, jnp.where(case.present[target], found[2], 0.0))
+
+    start = (jnp.zeros_like(case.gravity), case.head_state[0])
+    _, (times, shortfalls) = jax.lax.scan(advance, start, order)
+    return CatchChoice(order=order, times=times), jnp.sum(shortfalls)
+
+
+def earliest_next(case: CatchCase, table: Timetable, handicap: Array) -> CatchChoice:
+    """Next is caught whatever can be caught earliest; absent targets come last, in any order.
+
+    Args:
+        case: one case.
+        table: its timetable.
+        handicap: (N,) [s], by how much later than it can be caught each target is taken to be.
+    """
+    speed = _speed(case)
+
+    def advance(state: tuple, _: None) -> tuple[tuple, tuple[Array, Array]]:
+        begin, place, left = state
+        arrive = jax.vmap(arrival, (0, None, None, None))
+        times, places, shortfalls = arrive(table, begin, place, speed)
+        rank = jnp.where(case.present, times + 10.0 * shortfalls + handicap, 1e9)
+        target = jnp.argmin(jnp.where(left, rank, jnp.inf)).astype(jnp.int32)
+        here = case.present[target]
+        time, there = _caught(here, begin, place, times[target], places[target])
+        return (time, there, left.at[target].set(False)), (target, time)
+
+    start = (jnp.zeros_like(case.gravity), case.head_state[0], jnp.ones(case.num_targets, bool))
+    _, (order, times) = jax.lax.scan(advance, start, length=case.num_targets)
+    return CatchChoice(order=order, times=times)
+
+
+def _speed(case: CatchCase) -> Array:
+    """The greatest speed () [m/s] of the estimate."""
+    return 0.9 * case.limits.speed
+
+
+def _caught(
+    here: Array, begin: Array, place: Array, time: Array, there: Array
+) -> tuple[Array, Array]:
+    """When () [s] and where (3,) the quadrotor goes on; an absent target takes but an instant."""
+    soonest = begin + _INSTANT
+    return jnp.where(here, jnp.maximum(time, soonest), soonest), jnp.where(here, there, place)
