@@ -1,4 +1,4 @@
-"""The command line: `planner-jax sweep|fly TASK`, `library`, `view`, `report`, `bench`, `doctor`.
+"""The command line: `planner-jax sweep|fly TASK`, `train`, `library`, `view`, `report`, `bench`.
 
 Tasks come from the registry, and the options of `sweep` and `fly` from the fields of a task's
 settings: nothing here knows a task.
@@ -27,6 +27,7 @@ from planner_jax.sweep.settings import SettingError
 
 _HELP = argparse.RawDescriptionHelpFormatter
 _FAILED, _BAD_ARGUMENT, _INTERRUPTED = 1, 2, 130
+_TRAIN = "planner_jax.policies.settings:TrainSettings"
 _THROUGHPUT = "planner_jax.benchmarks.throughput_settings:ThroughputSettings"
 
 
@@ -114,6 +115,8 @@ def _parser() -> _Parser:
                 # Settings are imported for the one task that is asked for.
                 fill = functools.partial(add, task)
                 tasks.add_parser(task.name, help=task.summary, fill=fill, **hidden)
+    words = "train a policy that decides about catches"
+    commands.add_parser("train", help=words, fill=_add_train, **hidden)
     library = commands.add_parser("library", help="motions that the block planner looks up")
     _add_library(library.add_subparsers(title="commands", required=True, metavar="command"))
     view = command("view", "play a run's flights in a browser", _view)
@@ -166,6 +169,30 @@ def _library(name: str, given: dict[str, Any]) -> None:
     from planner_jax.sweep.block import library
 
     getattr(library, name)(**given)
+
+
+def _add_train(parser: _Parser) -> None:
+    kind = pkgutil.resolve_name(_TRAIN)
+    parser.description = kind.DESCRIPTION
+    _add_settings(parser, kind)
+    parser.add("--out", metavar="DIR", help="folder of the run (default: runs/train)")
+    parser.set_defaults(command=_train)
+
+
+def _train(given: dict[str, Any]) -> None:
+    out = given.pop("out", "runs/train")
+    settings = pkgutil.resolve_name(_TRAIN)(**given)
+    require_backend()
+    _let_ctrl_c_stop()
+    keep_compiled_programs()
+    try:
+        from planner_jax.policies.training import train_as_asked
+    except ModuleNotFoundError as error:
+        raise MissingExtra(
+            f"train needs {error.name}: pip install 'planner-jax[policies]'", name=error.name
+        ) from None
+    train_as_asked(settings, out)
+    print(f"{Path(out) / 'policy.npz'}")
 
 
 def _add_throughput(parser: _Parser) -> None:

@@ -16,7 +16,7 @@ import dataclasses
 import functools
 import pkgutil
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from importlib import metadata
 from typing import Any
 
@@ -95,15 +95,12 @@ class Task:
         Raises:
             UnknownName: there is no planner of that name, or it needs a file or takes none.
         """
-        planner, _, file = name.partition(":")
-        require_name(self.all_planners(), "planner", planner)
+        planner, file = split_name(self.all_planners(), "planner", name, self.from_file)
         if planner in self.from_file and not file:
             raise UnknownName(
                 f"planner must name its file, as in {planner}:FILE, which "
                 f"`{self.from_file[planner]}` makes, got {name!r}"
             )
-        if planner not in self.from_file and planner != name:
-            raise UnknownName(f"planner {planner} takes no file, got {name!r}")
         return planner, file
 
     def make_planner(self, name: str, options: Mapping[str, Any]) -> Any:
@@ -136,6 +133,27 @@ def require_name(known: Mapping[str, Any], kind: str, name: str) -> None:
     """Raise `UnknownName` unless a name is known."""
     if name not in known:
         raise UnknownName(f"{kind} must be one of {', '.join(known)}, got {name!r}")
+
+
+def split_name(
+    known: Mapping[str, Any], kind: str, name: str, from_file: Collection[str] = ()
+) -> tuple[str, str]:
+    """A known name and the file behind it, as in "policy:FILE", or nothing.
+
+    Args:
+        known: names.
+        kind: what they are names of, for the message.
+        name: one of them, with ":" and a file behind it or without.
+        from_file: those that may have one.
+
+    Raises:
+        UnknownName: it is not known, or takes no file.
+    """
+    own, _, file = name.partition(":")
+    require_name(known, kind, own)
+    if own != name and own not in from_file:
+        raise UnknownName(f"{kind} {own} takes no file, got {name!r}")
+    return own, file
 
 
 def task_named(name: str) -> Task:

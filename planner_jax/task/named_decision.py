@@ -1,23 +1,27 @@
 """Decisions by name, for the words of every task whose planners decide first."""
 
 import pkgutil
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 from planner_jax.protocol import Decision
-from planner_jax.registry import require_name
+from planner_jax.registry import split_name
 
 
-def named_decision(names: Mapping[str, str], decide: str | Decision) -> Decision:
+def named_decision(
+    names: Mapping[str, str], decide: str | Decision, from_file: Collection[str] = ()
+) -> Decision:
     """The decision of a name, or the decision itself.
 
     Args:
         names: name -> "module:class", those of a task.
-        decide: one of these names, or a decision.
+        decide: one of these names, with ":" and a file behind it if it may be read from one; or a
+            decision.
+        from_file: the names that may have a file behind them.
 
     Raises:
-        ValueError: there is no decision of that name.
+        ValueError: there is no decision of that name, or it takes no file.
     """
     if not isinstance(decide, str):
         return decide
-    require_name(names, "decide", decide)
-    return pkgutil.resolve_name(names[decide])()
+    name, file = split_name(names, "decide", decide, from_file)
+    return pkgutil.resolve_name(names[name])(*filter(None, [file]))

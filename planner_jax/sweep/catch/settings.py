@@ -4,8 +4,9 @@ import dataclasses
 import math
 from typing import ClassVar
 
-from planner_jax.sweep.settings import SweepSettings, option, require, require_one_of
-from planner_jax.task.catch.card import DECISIONS
+from planner_jax.registry import UnknownName, split_name
+from planner_jax.sweep.settings import SettingError, SweepSettings, option, require, require_one_of
+from planner_jax.task.catch.card import DECISIONS, TRAINED
 
 NET_TESTS = ("plane", "ball")  # of `referee_catches`
 
@@ -17,7 +18,9 @@ class CatchSettings(SweepSettings):
     limit_scale: float = option(
         1.0, "F", "factor on the speed and body-rate limits and on the thrust's distance from hover"
     )
-    decide: str = option("best", "NAME", f"order and first times: {', '.join(DECISIONS)}")
+    decide: str = option(
+        "best", "NAME", f"order and first times: {', '.join(DECISIONS)}, policy:FILE"
+    )
     tolerance: float = option(
         1e-3, "R", "relative, of the referee; the published protocol has 0.05 with --net-test ball"
     )
@@ -38,6 +41,9 @@ class CatchSettings(SweepSettings):
         super().__post_init__()
         scale, tolerance = self.limit_scale, self.tolerance
         require(0.0 < scale < math.inf, "limit_scale", "finite and > 0", scale)
-        require_one_of(DECISIONS, "decide", self.decide)
+        try:
+            split_name(DECISIONS, "decide", self.decide, TRAINED)
+        except UnknownName as error:
+            raise SettingError(str(error)) from None
         require_one_of(NET_TESTS, "net_test", self.net_test)
         require(0.0 <= tolerance < math.inf, "tolerance", "finite and >= 0", tolerance)

@@ -21,6 +21,7 @@ _DECISIONS = {
     "best": "the most promising of all orders planned, the earliest last catch kept",
     "greedy": "next whatever can be caught earliest",
     "given": "the targets as they come, at even shares of the horizon",
+    "policy": "those of a network trained by reinforcement",
 }
 _NET_TESTS = {
     "plane": "5 mm from the net's plane and there within its radius",
@@ -127,7 +128,7 @@ class CatchSweep(Sweep):
             f"Cases: {settings['num']:,} of suite {settings['suite']}, seed {settings['seed']}. "
             "Suites of a name are of the paper's kind; the paper gives no ranges of its own.",
             f"Order and first times, decision {settings['decide']}: "
-            f"{_DECISIONS[settings['decide']]}.",
+            f"{_DECISIONS[settings['decide'].partition(':')[0]]}.",
             f"Limits: speed {limits['speed']:g} m/s, body rate {limits['body_rate']:g} rad/s, "
             f"thrust {limits['min_thrust'] / gravity:.3g} to {limits['max_thrust'] / gravity:.3g} "
             f"g, height {limits['min_height']:g} m; scale {settings['limit_scale']:g} on speed, "

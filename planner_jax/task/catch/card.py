@@ -39,7 +39,9 @@ DECISIONS = {
     "best": "planner_jax.task.catch.decide:Best",
     "greedy": "planner_jax.task.catch.decide:Greedy",
     "given": "planner_jax.task.catch.decide:Given",
+    "policy": "planner_jax.policies.policy:policy",
 }
+TRAINED = ("policy",)  # of these, those that may be read from a file, as "policy:FILE"
 
 TASK = Task(
     name="catch",

@@ -17,7 +17,7 @@ from planner_jax.task.catch.case import CatchCase, CatchChoice
 GRID = 64  # times at which every target is looked at
 _ACCELERATION = 7.0  # [m/s^2], sustained, of the estimate
 _TURNING = 0.2  # [s] to begin to move
-_INSTANT = 0.05  # [s], between two catches at least
+INSTANT = 0.05  # [s], between two catches at least
 _STEEPEST = -0.2  # least upward part of the way back along the target's path
 
 
@@ -35,19 +35,28 @@ def sampled(case: CatchCase) -> tuple[Array, BallState, Array]:
     shares = jnp.asarray(np.arange(1, GRID + 1) / GRID, case.gravity.dtype)
     times = case.horizon[:, None] * shares
     states = jax.vmap(lambda target, at: jax.vmap(target.at)(at))(case.targets, times)
-    speed = jnp.sqrt(jnp.maximum(jnp.sum(states.vel**2, axis=-1), 1e-6))
-    return times, states, speed
+    return times, states, _speed_of(states)
 
 
 def timetable(case: CatchCase) -> Timetable:
     """When and where each of the N targets of one case may be caught."""
+    times, states, _ = sampled(case)
+    places, penalty = _to_catch(case, states)
+    return Timetable(times=times, places=places, penalty=penalty)
+
+
+def _to_catch(case: CatchCase, states: BallState) -> tuple[Array, Array]:
+    """Where the quadrotor catches targets in states (..., 3), and the penalty (...) [m] there."""
     net, limits = case.net, case.limits
-    times, states, speed = sampled(case)
-    up = jnp.array([0.0, 0.0, 1.0], times.dtype)
-    from_below = jnp.maximum(states.vel[..., 2] / speed + _STEEPEST, 0.0)
+    up = jnp.array([0.0, 0.0, 1.0], states.pos.dtype)
+    from_below = jnp.maximum(states.vel[..., 2] / _speed_of(states) + _STEEPEST, 0.0)
     places = states.pos - net.height * up
     low = jnp.maximum(limits.min_height + 0.1 - places[..., 2], 0.0)
-    return Timetable(times=times, places=places, penalty=10.0 * from_below + 10.0 * low)
+    return places, 10.0 * from_below + 10.0 * low
+
+
+def _speed_of(states: BallState) -> Array:
+    return jnp.sqrt(jnp.maximum(jnp.sum(states.vel**2, axis=-1), 1e-6))
 
 
 def arrival(
@@ -62,15 +71,31 @@ def arrival(
         speed: () [m/s], its greatest.
     """
     times, places, penalty = table.times, table.places, table.penalty
-    distance = jnp.sqrt(jnp.maximum(jnp.sum((places - place) ** 2, axis=-1), 1e-12))
-    span = jnp.maximum(times - begin - _TURNING, 0.0)
+    late = jnp.where(times > begin, 0.0, 100.0)
+    short = _out_of_reach(places - place, times - begin, speed) + penalty + late
+    possible = short <= 0.0
+    first = jnp.where(jnp.any(possible), jnp.argmax(possible), jnp.argmin(short))
+    return times[first], places[first], short[first]
+
+
+def _out_of_reach(way: Array, span: Array, speed: Array) -> Array:
+    """By how much [m] a way (..., 3) is longer than what is flown in a span (...) [s]."""
+    distance = jnp.sqrt(jnp.maximum(jnp.sum(way**2, axis=-1), 1e-12))
+    span = jnp.maximum(span - _TURNING, 0.0)
     rise = speed / _ACCELERATION
     reach = jnp.where(span < rise, 0.5 * _ACCELERATION * span**2, speed * span - 0.5 * speed * rise)
-    late = jnp.where(times > begin, 0.0, 100.0)
-    shortfall = jnp.maximum(distance - reach, 0.0) + penalty + late
-    possible = shortfall <= 0.0
-    first = jnp.where(jnp.any(possible), jnp.argmax(possible), jnp.argmin(shortfall))
-    return times[first], places[first], shortfall[first]
+    return jnp.maximum(distance - reach, 0.0)
+
+
+def shortfall(case: CatchCase, choice: CatchChoice) -> Array:
+    """How far () [m], all in all, targets are out of the estimate's reach at chosen times."""
+    order, times = choice.order, choice.times
+    targets = jax.tree.map(lambda leaf: leaf[order], case.targets)
+    places, penalty = _to_catch(case, jax.vmap(lambda target, at: target.at(at))(targets, times))
+    before = jnp.concatenate([case.head_state[:1], places[:-1]])
+    span = jnp.diff(times, prepend=jnp.zeros_like(times[:1]))
+    short = _out_of_reach(places - before, span, top_speed(case)) + penalty
+    return jnp.sum(jnp.where(case.present[order], short, 0.0))
 
 
 def follow(case: CatchCase, table: Timetable, order: Array) -> tuple[CatchChoice, Array]:
@@ -83,7 +108,7 @@ def follow(case: CatchCase, table: Timetable, order: Array) -> tuple[CatchChoice
     def advance(state: tuple, target: Array) -> tuple[tuple, tuple[Array, Array]]:
         begin, place = state
         own = jax.tree.map(lambda leaf: leaf[target], table)
-        found = arrival(own, begin, place, _speed(case))
+        found = arrival(own, begin, place, top_speed(case))
         time, there = _caught(case.present[target], begin, place, *found[:2])
         return (time, there), (time, jnp.where(case.present[target], found[2], 0.0))
 
@@ -100,7 +125,7 @@ def earliest_next(case: CatchCase, table: Timetable, handicap: Array) -> CatchCh
         table: its timetable.
         handicap: (N,) [s], by how much later than it can be caught each target is taken to be.
     """
-    speed = _speed(case)
+    speed = top_speed(case)
 
     def advance(state: tuple, _: None) -> tuple[tuple, tuple[Array, Array]]:
         begin, place, left = state
@@ -117,7 +142,7 @@ def earliest_next(case: CatchCase, table: Timetable, handicap: Array) -> CatchCh
     return CatchChoice(order=order, times=times)
 
 
-def _speed(case: CatchCase) -> Array:
+def top_speed(case: CatchCase) -> Array:
     """The greatest speed () [m/s] of the estimate."""
     return 0.9 * case.limits.speed
 
@@ -126,5 +151,5 @@ def _caught(
     here: Array, begin: Array, place: Array, time: Array, there: Array
 ) -> tuple[Array, Array]:
     """When () [s] and where (3,) the quadrotor goes on; an absent target takes but an instant."""
-    soonest = begin + _INSTANT
+    soonest = begin + INSTANT
     return jnp.where(here, jnp.maximum(time, soonest), soonest), jnp.where(here, there, place)

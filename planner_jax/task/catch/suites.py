@@ -153,13 +153,11 @@ def draw_by_key(key: Array, num: int, suite: str) -> CatchCase:
     """
     uniform = jax.random.uniform(key, (num, _columns(suite)))
     targets, horizon = _targets(suite, uniform)
+    targets, horizon = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), (targets, horizon))
     one = draw(1, suite)
     cases = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (num, *leaf.shape[1:])), one)
-    return dataclasses.replace(
-        cases,
-        targets=jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), targets),
-        horizon=jnp.asarray(horizon, jnp.float32),
-    )
+    times = one.times / one.horizon[:, :1] * horizon[:, :1]
+    return dataclasses.replace(cases, targets=targets, horizon=horizon, times=times)
 
 
 def _columns(suite: str) -> int:

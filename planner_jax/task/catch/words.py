@@ -5,7 +5,7 @@ from typing import Any
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.protocol import Decision
 from planner_jax.referee.catch import CatchVerdict, referee_catches
-from planner_jax.task.catch.card import DECISIONS, TASK
+from planner_jax.task.catch.card import DECISIONS, TASK, TRAINED
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.task.judged import judged
@@ -25,7 +25,8 @@ def planner(
         name: one of these, or one that another package offers.
         decide: "best" plans the most promising of all orders and keeps the earliest last catch,
             "greedy" catches next what it can reach first, "given" takes order and times of the
-            cases; or a decision with settings, such as `Best(finalists=3)`.
+            cases, "policy" asks a network that was trained by reinforcement, or another one as
+            "policy:FILE"; or a decision with settings, such as `Best(finalists=3)`.
         **options: fields of that planner's dataclass, for example `rounds`.
 
     Returns:
@@ -33,10 +34,12 @@ def planner(
         The plans hold the order and the times that were decided.
 
     Raises:
-        ValueError: there is no planner or decision of that name.
+        ValueError: there is no planner or decision of that name, or its file cannot be read.
         TypeError: the planner has no such field.
     """
-    return DecidedPlanner(TASK.make_planner(name, options), named_decision(DECISIONS, decide))
+    return DecidedPlanner(
+        TASK.make_planner(name, options), named_decision(DECISIONS, decide, TRAINED)
+    )
 
 
 def judge(cases: CatchCase, plans: CatchPlan, **settings: Any) -> CatchVerdict:

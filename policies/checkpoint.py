@@ -1,0 +1,97 @@
+"""Files of trained policies: weights and what they are for, without pickle.
+
+A checkpoint is a NumPy archive: one array a weight, by its path in the network, and `about`, a
+line of JSON with the format's version, the network and its sizes, the features that it sees, and
+what it was trained on.
+"""
+
+import dataclasses
+import json
+import os
+import zipfile
+from importlib import resources
+from typing import Any
+
+import numpy as np
+from flax import traverse_util
+
+from planner_jax.policies.networks import NETWORKS
+from planner_jax.policies.observation import FEATURES
+from planner_jax.sweep.settings import SettingError
+
+FORMAT = 1
+_SHIPPED = "catch.npz"
+
+
+class CheckpointError(SettingError):
+    """A file is no checkpoint of a policy, or one of another version; one line."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Checkpoint:
+    """A trained policy."""
+
+    params: Any  # of the network, NumPy leaves
+    network: Any  # a module of `networks`
+    about: dict[str, Any]  # what it was trained on
+
+
+def save_checkpoint(
+    path: str | os.PathLike, params: Any, network: Any, about: dict[str, Any]
+) -> None:
+    """Write a checkpoint; it is there whole or not at all.
+
+    Args:
+        path: of the file.
+        params: of the network.
+        network: a module of `networks`.
+        about: what it was trained on, plain JSON.
+    """
+    (name,) = (name for name, kind in NETWORKS.items() if isinstance(network, kind))
+    sizes = {
+        field.name: getattr(network, field.name)
+        for field in dataclasses.fields(network)
+        if field.name not in ("parent", "name")
+    }
+    head = {"format": FORMAT, "features": FEATURES, "network": name, "sizes": sizes, **about}
+    flat = traverse_util.flatten_dict(params, sep="/")
+    arrays: Any = {key: np.asarray(leaf, np.float32) for key, leaf in flat.items()}
+    scratch = f"{os.fspath(path)}.{os.getpid()}"
+    with open(scratch, "wb") as file:
+        np.savez(file, about=np.array(json.dumps(head)), **arrays)
+    os.replace(scratch, path)
+
+
+def load_checkpoint(path: str | os.PathLike) -> Checkpoint:
+    """The policy in a file.
+
+    Raises:
+        CheckpointError: there is none, it is no checkpoint, or one of another version.
+    """
+    name = os.fspath(path)
+    try:
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
+            arrays = {key: archive[key] for key in archive.files}
+        about = json.loads(str(arrays.pop("about")))
+        found, network = about["format"], about["network"]
+    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+        raise CheckpointError(
+            f"checkpoint must be one that `planner-jax train` wrote, got {name!r} "
+            f"({type(error).__name__})"
+        ) from error
+    if found != FORMAT or about["features"] != FEATURES:
+        raise CheckpointError(
+            f"checkpoint must be of format {FORMAT} with {FEATURES} features of a target, got "
+            f"format {found} with {about['features']} in {name!r}"
+        )
+    if network not in NETWORKS:
+        known = ", ".join(NETWORKS)
+        raise CheckpointError(f"network must be one of {known}, got {network!r} in {name!r}")
+    params = traverse_util.unflatten_dict(arrays, sep="/")
+    return Checkpoint(params=params, network=NETWORKS[network](**about["sizes"]), about=about)
+
+
+def shipped_checkpoint() -> Checkpoint:
+    """The policy for catches that comes with the library."""
+    with resources.as_file(resources.files("planner_jax.policies") / _SHIPPED) as path:
+        return load_checkpoint(path)

@@ -1,0 +1,66 @@
+"""A learned decision about catches: `pj.catch.planner(decide="policy")`."""
+
+import functools
+import os
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from planner_jax.policies.checkpoint import Checkpoint, load_checkpoint, shipped_checkpoint
+from planner_jax.policies.networks import LEAST_STD
+from planner_jax.policies.observation import PER_TARGET, choice_of, observe
+from planner_jax.task.catch.case import CatchCase, CatchChoice
+from planner_jax.task.catch.decide import CatchDecision
+from planner_jax.task.catch.estimate import timetable
+
+
+@struct.dataclass
+class Policy(CatchDecision):
+    """Order and times by a network; its weights are leaves.
+
+    Of several proposals the first is the network's mean, and the others are drawn around it, the
+    same ones for every case; the planner plans them all and keeps the earliest.
+    """
+
+    params: Any  # of the network
+    network: Any = struct.field(pytree_node=False)
+    proposals: int = struct.field(pytree_node=False, default=1)
+    spread: float = struct.field(pytree_node=False, default=1.0)  # factor on deviations
+
+    def check(self, cases: CatchCase) -> None:
+        """Raise `ValueError` where there are more targets than the network takes."""
+        most = getattr(self.network, "size", None)
+        if most is not None and cases.num_targets > most:
+            raise ValueError(
+                f"this policy was trained for up to {most} targets and takes no more, got "
+                f"{cases.num_targets}"
+            )
+
+    def propose(self, case: CatchCase) -> CatchChoice:
+        """The proposals for one case, leaves (K, N)."""
+        table = timetable(case)
+        numbers = self.network.apply(self.params, observe(case, table))
+        mean, spread = numbers[:, :PER_TARGET], numbers[:, PER_TARGET:]
+        deviation = jax.nn.softplus(spread) + LEAST_STD
+        shape = (self.proposals, case.num_targets, PER_TARGET)
+        noise = np.random.default_rng(0).normal(size=shape)
+        noise[0] = 0.0
+        actions = jnp.tanh(mean + self.spread * deviation * jnp.asarray(noise, mean.dtype))
+        return jax.vmap(functools.partial(choice_of, case, table))(actions)
+
+
+def policy(file: str | os.PathLike | None = None, **options: Any) -> Policy:
+    """The policy of a checkpoint.
+
+    Args:
+        file: that `planner-jax train` wrote; the one that is shipped if not given.
+        **options: `proposals` and `spread` of `Policy`.
+
+    Raises:
+        CheckpointError: it is no checkpoint of a policy, or of another version; one line.
+    """
+    found: Checkpoint = shipped_checkpoint() if file is None else load_checkpoint(file)
+    return Policy(params=found.params, network=found.network, **options)

@@ -1,0 +1,102 @@
+"""What `planner-jax train` is asked to do; imports no JAX."""
+
+import dataclasses
+import math
+from typing import Any, ClassVar
+
+from planner_jax.sweep.settings import SettingError, option, require
+from planner_jax.task.catch.card import SUITES
+
+NETWORK_NAMES = ("attention", "mlp")
+_PAPER = ("parabola1", "parabola2", "harmonic2", "triangle3", "hexagon6")
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainSettings:
+    """The arguments of a training.
+
+    Raises:
+        SettingError: a value breaks its rule.
+    """
+
+    suite: str = option(",".join(_PAPER), "A,B", "whose cases are decided on, one or more")
+    network: str = option("attention", "NAME", "attention, for any number of targets, or mlp")
+    decisions: tuple[float, ...] = option(
+        (2e6, 4e6, 4e6, 4e6), "N", "of each part, after which the run may be interrupted"
+    )
+    estimated: int = option(0, "P", "parts, the first ones, in which the estimate judges")
+    iterations: tuple[int, ...] = option(
+        (), "K", "of the planner, one a suite (default: 25 for up to three targets, else 80)"
+    )
+    last: float = option(5.0, "W", "weight of how early the last catch is")
+    ratio: float = option(5.0, "W", "weight of how far decided times are from the optimised ones")
+    solved: float = option(1.0, "W", "weight of a case that is solved")
+    lessons: int = option(0, "N", "cases of each suite whose best decisions are imitated first")
+    begin: str | None = option(None, "FILE", "a checkpoint by whose weights it begins")
+    kept: float = option(0.0, "F", "share of these weights in those that it ends with")
+    lanes: int | None = option(None, "B", "decided at once (default: 8190, 510 on a CPU)")
+    judged: int = option(256, "N", "cases of each suite by which it is watched")
+    seed: int = option(0, "K", "of weights and cases")
+
+    DESCRIPTION: ClassVar[str] = (
+        "Train a policy that decides when and in what order to catch, by Brax's PPO with the\n"
+        "planner in its environment. The same command goes on with a run that was interrupted."
+    )
+
+    def __post_init__(self) -> None:
+        for suite in self.suites:
+            known = ", ".join(SUITES)
+            require(suite in SUITES, "suite", f"one or more of {known}", repr(suite))
+        require(self.network in NETWORK_NAMES, "network", " or ".join(NETWORK_NAMES), self.network)
+        require(min(self.decisions) >= 1, "decisions", ">= 1 in each part", min(self.decisions))
+        require(0 <= self.estimated <= len(self.decisions), "estimated", ">= 0", self.estimated)
+        if self.iterations and len(self.iterations) != len(self.suites):
+            raise SettingError(
+                f"iterations must be {len(self.suites)} numbers, one a suite, got "
+                f"{len(self.iterations)}"
+            )
+        for number in self.iterations:
+            require(number >= 1, "iterations", ">= 1", number)
+        for name in ("last", "ratio", "solved"):
+            value = getattr(self, name)
+            require(0.0 <= value < math.inf, name, "finite and >= 0", value)
+        require(0.0 <= self.kept <= 1.0, "kept", "from 0 to 1", self.kept)
+        require(self.kept == 0.0 or self.begin is not None, "kept", "left out without begin", "it")
+        for name in ("lessons", "judged", "seed"):
+            require(getattr(self, name) >= 0, name, ">= 0", getattr(self, name))
+        require(self.lanes is None or self.lanes >= 60, "lanes", ">= 60", self.lanes)
+
+    @property
+    def suites(self) -> tuple[str, ...]:
+        """Names of the suites."""
+        return tuple(self.suite.split(","))
+
+    def training(self, lanes: int) -> dict[str, Any]:
+        """Arguments of `Training`, but for its parts.
+
+        Args:
+            lanes: at most.
+        """
+        step = len(self.suites) * 6  # one share a suite, and even minibatches
+        return {
+            "suites": self.suites,
+            "network": self.network,
+            "seed": self.seed,
+            "lanes": lanes // step * step,
+            "minibatches": 6,
+            "lessons": self.lessons,
+            "weights": (
+                *(("solved", self.solved), ("last", self.last)),
+                *(("ratio", -self.ratio), ("violation", -0.5)),
+            ),
+            "begin": self.begin,
+            "kept": self.kept,
+            "judged": self.judged,
+        }
+
+    def iterations_of(self, part: int) -> tuple[int, ...]:
+        """Of the planner in a part, one a suite; none where the estimate judges."""
+        if part < self.estimated:
+            return ()
+        own = tuple(25 if SUITES[suite].num_targets <= 3 else 80 for suite in self.suites)
+        return tuple(self.iterations) or own

@@ -1,0 +1,277 @@
+"""Training by Brax's PPO (paper 000, eqs 5 and 7): in parts, so that it can go on.
+
+A run is a row of parts, each one call of `brax.training.agents.ppo.train` from the weights of the
+last: imitation first if asked for, then rewards by the estimate, then by the planner. What a part
+leaves is kept by Orbax before the next one begins, and the seed of a part follows from the run's
+and its number: a run that was interrupted goes on to the same weights, bit for bit. Adam's
+moments are begun anew with each part, since Brax does not hand them out.
+"""
+
+import dataclasses
+import functools
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import orbax.checkpoint as orbax
+from brax.training import networks as brax_networks
+from brax.training.acme import running_statistics, specs
+from brax.training.agents.ppo import networks as ppo_networks
+from brax.training.agents.ppo import train as ppo
+from brax.training.distribution import NormalTanhDistribution
+from jax import Array
+
+from planner_jax.planning.decided import DecidedPlanner
+from planner_jax.planning.plan import plan
+from planner_jax.policies import brax_compat
+from planner_jax.policies.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
+from planner_jax.policies.environment import WEIGHTS, CatchEnv
+from planner_jax.policies.imitation import imitated, lessons
+from planner_jax.policies.networks import LEAST_STD, NETWORKS, Value
+from planner_jax.policies.observation import FEATURES, PER_TARGET
+from planner_jax.policies.policy import Policy
+from planner_jax.policies.settings import TrainSettings
+from planner_jax.protocol import solved
+from planner_jax.sweep.settings import SettingError
+from planner_jax.task.catch.decide import optimal_time_ratio
+from planner_jax.task.catch.exact import ExactCatch
+from planner_jax.task.catch.suites import draw
+
+_JUDGED_SEED = 4242  # of the cases by which a run is watched; no figure of the results is of them
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """One call of PPO."""
+
+    steps: int  # decisions
+    iterations: tuple[int, ...] = ()  # of the planner, one a suite; none: the estimate judges
+    learning_rate: float = 1e-4  # to begin with; then as far as the divergence allows
+
+
+@dataclasses.dataclass(frozen=True)
+class Training:
+    """What is trained, on what and for how long."""
+
+    suites: tuple[str, ...]
+    parts: tuple[Part, ...]
+    network: str = "attention"
+    seed: int = 0
+    lanes: int = 8190  # decided at once; a multiple of the number of suites
+    updates: int = 4  # of all data
+    minibatches: int = 6
+    lessons: int = 0  # cases of each suite by whose best decisions it begins; 0: as `Greedy`
+    lesson_steps: int = 3000
+    divergence: float = 0.01  # wanted of an update, by which the learning rate is set
+    entropy: float = 1e-4
+    weights: tuple[tuple[str, float], ...] = tuple(WEIGHTS.items())
+    begin: str | None = None  # a checkpoint by whose weights it begins
+    kept: float = 0.0  # share of these in the weights that it ends with
+    judged: int = 256  # cases of each suite by which it is watched; 0: it is not
+
+
+def train(training: Training, out: str | os.PathLike, say: Callable[[str], None] = print) -> Policy:
+    """Train a policy, or go on where an interrupted run of the same folder and settings ended.
+
+    Args:
+        training: what is asked for.
+        out: folder of the run: `training.json`, `parts/`, `progress.json`, and `policy.npz` in the
+            end.
+        say: is told of every part.
+
+    Returns:
+        The policy after the last part.
+
+    Raises:
+        SettingError: the folder is that of a run with other settings.
+        CheckpointError: the one to begin with cannot be read, or is of another network.
+    """
+    brax_compat.install()
+    folder = Path(out)
+    _require_same(folder, training)
+    network = NETWORKS[training.network]()
+    keeper = orbax.StandardCheckpointer()
+    params = _first_params(training, network)
+    rows: list[dict[str, Any]] = []
+    for number, part in enumerate(training.parts):
+        place = (folder / "parts" / f"{number:03d}").absolute()
+        if place.exists():  # Orbax gives it its name when all is written
+            params = jax.device_get(keeper.restore(place, params))
+            rows = json.loads((folder / "progress.json").read_text())[: number + 1]
+            continue
+        if number == 0 and training.lessons:
+            params = _begun_by_imitation(training, network, params)
+        params = _by_ppo(training, part, number, network, params)
+        row = {"part": number, "steps": part.steps}
+        if training.judged:
+            row |= judge_policy(training, network, params[1])
+        rows = [*rows, row]
+        _write(folder / "progress.json", json.dumps(rows, indent=1))
+        keeper.save(place, params)
+        keeper.wait_until_finished()
+        say(_sentence(row))
+    found = params[1]
+    if training.kept:
+        share, first = training.kept, _first_params(training, network)[1]
+        found = jax.tree.map(lambda a, b: share * a + (1.0 - share) * b, first, found)
+    about = {"suites": list(training.suites), "seed": training.seed}
+    save_checkpoint(folder / "policy.npz", found, network, about)
+    return Policy(params=found, network=network)
+
+
+def train_as_asked(settings: TrainSettings, out: str | os.PathLike) -> Policy:
+    """The training of `planner-jax train`; arguments and errors of `train`."""
+    lanes = settings.lanes or (510 if jax.default_backend() == "cpu" else 8190)
+    parts = tuple(
+        Part(int(steps), settings.iterations_of(number))
+        for number, steps in enumerate(settings.decisions)
+    )
+    return train(Training(parts=parts, **settings.training(lanes)), out)
+
+
+def judge_policy(training: Training, network: Any, params: Any) -> dict[str, Any]:
+    """What a policy's decisions are worth, by suite: success, last catch and ratio."""
+    decided = DecidedPlanner(ExactCatch(), Policy(params=params, network=network))
+    figures = {}
+    for suite in training.suites:
+        cases: Any = jax.tree.map(np.asarray, draw(training.judged, suite, _JUDGED_SEED))
+        plans = plan(decided, cases)
+        good = solved(plans)
+        figures[suite] = {
+            "success": float(good.mean()),
+            "last": float(plans.times[good, -1].mean()) if good.any() else None,
+            "ratio": float(optimal_time_ratio(cases, plans)[good].mean()) if good.any() else None,
+            "iterations": float(plans.iterations[good].mean()) if good.any() else None,
+        }
+    return figures
+
+
+def _sentence(row: dict[str, Any]) -> str:
+    suites = {name: found for name, found in row.items() if isinstance(found, dict)}
+    words = [
+        f"{name}: {100 * found['success']:.1f} % solved"
+        + (
+            f", last catch {found['last']:.3f} s, ratio {found['ratio']:.3f}"
+            if found["last"]
+            else ""
+        )
+        for name, found in suites.items()
+    ]
+    return f"part {row['part']}, {row['steps']} decisions; " + "; ".join(words)
+
+
+def _require_same(folder: Path, training: Training) -> None:
+    """Write down what is trained, or raise `ValueError` if the folder says otherwise."""
+    wanted = json.loads(json.dumps(dataclasses.asdict(training)))
+    place = folder / "training.json"
+    if place.exists():
+        found = json.loads(place.read_text())
+        for name, value in wanted.items():
+            if found.get(name) != value:
+                raise SettingError(
+                    f"{name} must be {found.get(name)}, as in the run of {str(folder)!r}, "
+                    f"got {value}"
+                )
+        return
+    (folder / "parts").mkdir(parents=True, exist_ok=True)
+    _write(place, json.dumps(wanted, indent=1))
+
+
+def _write(path: Path, text: str) -> None:
+    scratch = path.with_name(f"{path.name}.{os.getpid()}")
+    scratch.write_text(text + "\n")
+    os.replace(scratch, path)
+
+
+def _first_params(training: Training, network: Any) -> Any:
+    """Normaliser, which is not used, and parameters of policy and value."""
+    env = _environment(training, training.parts[0])
+    one, other = jax.random.split(jax.random.key(training.seed))
+    seen = jnp.zeros((1, env.size, FEATURES))
+    size = specs.Array((env.observation_size,), jnp.dtype("float32"))
+    normaliser = running_statistics.init_state(size)
+    own = network.init(one, seen)
+    if training.begin is not None:
+        given = load_checkpoint(training.begin)
+        if given.network != network:
+            names = type(network).__name__, type(given.network).__name__
+            raise CheckpointError("begin must hold the weights of {}, got {}".format(*names))
+        own = given.params
+    return jax.device_get((normaliser, own, Value().init(other, seen)))
+
+
+def _begun_by_imitation(training: Training, network: Any, params: Any) -> Any:
+    env = _environment(training, training.parts[0])
+    some = lessons(training.suites, training.lessons, 1_000_003 + training.seed, env.size)
+    key = jax.random.fold_in(jax.random.key(training.seed), 1)
+    learned, _ = imitated(network, some, key, training.lesson_steps)
+    return (params[0], learned, params[2])
+
+
+def _environment(training: Training, part: Part) -> CatchEnv:
+    iterations = part.iterations or (0,) * len(training.suites)
+    return CatchEnv(training.suites, iterations, dict(training.weights))
+
+
+def _by_ppo(training: Training, part: Part, number: int, network: Any, params: Any) -> Any:
+    """Parameters after one part, NumPy leaves."""
+    env = _environment(training, part)
+    _, found, _ = ppo.train(
+        environment=env,
+        num_timesteps=part.steps,
+        wrap_env=False,
+        num_envs=training.lanes,
+        episode_length=1,
+        learning_rate=part.learning_rate,
+        learning_rate_schedule="ADAPTIVE_KL",
+        learning_rate_schedule_max_lr=1e-3,
+        desired_kl=training.divergence,
+        entropy_cost=training.entropy,
+        discounting=0.0,
+        unroll_length=1,
+        batch_size=training.lanes // training.minibatches,
+        num_minibatches=training.minibatches,
+        num_updates_per_batch=training.updates,
+        clipping_epsilon=0.2,
+        max_grad_norm=1.0,
+        network_factory=functools.partial(_networks, network, env.size),
+        seed=training.seed * 1000 + number,
+        restore_params=params,
+        run_evals=False,
+        num_eval_envs=len(training.suites),  # Brax makes them even so
+    )
+    return jax.device_get(found)
+
+
+def _networks(network: Any, size: int, *_: Any, **__: Any) -> ppo_networks.PPONetworks:
+    """Policy and value as Brax has them, on observations that are flat."""
+    value = Value()
+
+    def seen(flat: Array) -> Array:
+        return flat.reshape(*flat.shape[:-1], size, FEATURES)
+
+    def numbers(_: Any, params: Any, flat: Array) -> Array:
+        found = network.apply(params, seen(flat))
+        # What is decided about absent targets does not count, and is no surprise.
+        found = jnp.where(seen(flat)[..., -1:] > 0.5, found, 0.0)
+        means, spreads = found[..., :PER_TARGET], found[..., PER_TARGET:]
+        shape = (*flat.shape[:-1], -1)
+        return jnp.concatenate([means.reshape(shape), spreads.reshape(shape)], axis=-1)
+
+    one = jnp.zeros((1, size, FEATURES))
+    kind: Any = ppo_networks.PPONetworks
+    return kind(
+        policy_network=brax_networks.FeedForwardNetwork(
+            init=lambda key: network.init(key, one), apply=numbers
+        ),
+        value_network=brax_networks.FeedForwardNetwork(
+            init=lambda key: value.init(key, one),
+            apply=lambda _, params, flat: value.apply(params, seen(flat)),
+        ),
+        parametric_action_distribution=NormalTanhDistribution(size * PER_TARGET, min_std=LEAST_STD),
+    )

@@ -1,0 +1,245 @@
+"""A learned decision about catches: valid whatever its weights, and trained bit for bit."""
+
+import dataclasses
+import json
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import traverse_util
+
+import planner_jax as pj
+from planner_jax.cli import main
+from planner_jax.planning.decided import first_choice
+from planner_jax.policies.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
+from planner_jax.policies.networks import NETWORKS
+from planner_jax.policies.observation import FEATURES, PER_TARGET, choice_of, observe
+from planner_jax.policies.policy import Policy, policy
+from planner_jax.sweep.settings import SettingError
+from planner_jax.task.catch.estimate import INSTANT, shortfall, timetable
+from planner_jax.task.catch.suites import draw_by_key
+
+NUM = 16
+
+
+def cases_of(suite: str = "triangle3", **how: Any) -> Any:
+    return jax.tree.map(np.asarray, pj.catch.draw(NUM, suite, 5, **how))
+
+
+@pytest.fixture(scope="module")
+def fresh() -> Any:
+    """Weights of every network before any training."""
+    seen = jnp.zeros((1, 6, FEATURES))
+    return {name: kind().init(jax.random.key(0), seen) for name, kind in NETWORKS.items()}
+
+
+@pytest.mark.parametrize("network", NETWORKS)
+def test_an_untrained_policy_decides_as_greedy_does(network, fresh):
+    cases = cases_of()
+    untrained = first_choice(Policy(fresh[network], NETWORKS[network]()), cases)
+    greedy = first_choice(pj.catch.Greedy(), cases)
+    np.testing.assert_array_equal(untrained.order, greedy.order)
+    np.testing.assert_allclose(untrained.times, greedy.times, rtol=1e-6)
+
+
+def test_every_action_is_an_order_and_times_that_rise():
+    """Present targets first, none after its horizon but for the instants between catches."""
+    cases = cases_of(num_targets=6)
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (NUM, 6, PER_TARGET))
+    tables = jax.jit(jax.vmap(timetable))(cases)
+    choices = jax.jit(jax.vmap(choice_of))(cases, tables, jnp.asarray(actions, jnp.float32))
+    order, times = np.asarray(choices.order), np.asarray(choices.times)
+    np.testing.assert_array_equal(np.sort(order, axis=1), np.tile(np.arange(6), (NUM, 1)))
+    assert (np.diff(times, axis=1) >= INSTANT - 1e-5).all() and (times > 0.0).all()
+    assert (order[:, :3] < 3).all()
+    assert (times[:, :3] <= cases.horizon[:, :1] + 3 * INSTANT).all()
+
+
+def test_greater_handicaps_put_a_target_last():
+    cases = cases_of()
+    action = np.zeros((NUM, 3, PER_TARGET), np.float32)
+    action[:, 1, 0] = 1.0
+    tables = jax.jit(jax.vmap(timetable))(cases)
+    choices = jax.jit(jax.vmap(choice_of))(cases, tables, jnp.asarray(action))
+    assert (np.asarray(choices.order)[:, -1] == 1).mean() > 0.9
+
+
+def test_attention_does_not_see_the_order_of_targets_or_absent_ones(fresh):
+    """The same numbers for targets that are listed otherwise, and with room for more."""
+    network = NETWORKS["attention"]()
+    params = _moved(fresh["attention"])
+    cases = cases_of("hexagon6")
+    seen = jax.jit(jax.vmap(lambda case: observe(case, timetable(case))))(cases)
+    apply = jax.jit(network.apply)
+    numbers = np.asarray(apply(params, seen))
+    assert np.ptp(numbers[..., 0]) > 1e-3
+    mixed = np.random.default_rng(1).permutation(6)
+    np.testing.assert_allclose(apply(params, seen[:, mixed]), numbers[:, mixed], atol=1e-5)
+    more = jnp.pad(seen, ((0, 0), (0, 2), (0, 0)))
+    np.testing.assert_allclose(apply(params, more)[:, :6], numbers, atol=1e-5)
+
+
+def _moved(params: Any) -> Any:
+    """Weights with noise, so that the last layer is not zero."""
+    rng = np.random.default_rng(2)
+    add = lambda leaf: leaf + 0.1 * rng.normal(size=leaf.shape).astype(np.float32)  # noqa: E731
+    return jax.tree.map(add, params)
+
+
+def test_the_shipped_policy_is_solved_and_confirmed_by_the_referee():
+    cases = cases_of()
+    plans = pj.plan(pj.catch.planner(decide="policy"), cases)
+    assert pj.catch.judge(cases, plans).success.all()
+
+
+def test_a_lane_of_nan_spoils_no_other():
+    cases = cases_of()
+    planner = pj.catch.planner(decide="policy")
+    whole = pj.plan(planner, cases)
+    head = np.array(cases.head_state)
+    head[3] = np.nan
+    plans = pj.plan(planner, dataclasses.replace(cases, head_state=head))
+    assert plans.status[3] == pj.Status.NON_FINITE
+    others = np.arange(NUM) != 3
+    np.testing.assert_array_equal(plans.times[others], whole.times[others])
+
+
+def test_of_several_proposals_the_earliest_stays():
+    cases = cases_of()
+    one = pj.plan(pj.catch.planner(decide=policy()), cases)
+    some = pj.plan(pj.catch.planner(decide=policy(proposals=3)), cases)
+    assert pj.solved(some).all()
+    assert (some.times[:, -1] <= 1.001 * one.times[:, -1]).all()
+
+
+def test_a_checkpoint_gives_back_what_was_saved(tmp_path, fresh):
+    for name, params in fresh.items():
+        path = tmp_path / name
+        save_checkpoint(path, params, NETWORKS[name](), {"suites": ["triangle3"]})
+        found = load_checkpoint(path)
+        assert found.network == NETWORKS[name]() and found.about["suites"] == ["triangle3"]
+        for key, leaf in traverse_util.flatten_dict(found.params, sep="/").items():
+            np.testing.assert_array_equal(leaf, traverse_util.flatten_dict(params, sep="/")[key])
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(fresh)
+
+
+def test_a_file_that_is_no_checkpoint_is_named(tmp_path, fresh):
+    missing, torn, other = tmp_path / "none", tmp_path / "torn", tmp_path / "other"
+    save_checkpoint(torn, fresh["mlp"], NETWORKS["mlp"](), {})
+    torn.write_bytes(torn.read_bytes()[:-100])
+    save_checkpoint(other, fresh["mlp"], NETWORKS["mlp"](), {"format": 99})
+    for path, words in ((missing, "none"), (torn, "torn"), (other, "format 99")):
+        with pytest.raises(CheckpointError, match=words):
+            load_checkpoint(path)
+
+
+def test_more_targets_than_a_network_takes_are_refused(fresh):
+    few = Policy(fresh["mlp"], NETWORKS["mlp"]())
+    with pytest.raises(ValueError, match="up to 6 targets and takes no more, got 7"):
+        pj.plan(pj.catch.planner(decide=few), cases_of(num_targets=7))
+
+
+def test_the_command_line_names_a_decision_that_takes_no_file(capsys, tmp_path):
+    assert main(["sweep", "catch", "--decide", "greedy:x", "--out", str(tmp_path / "run")]) == 2
+    assert "decide greedy takes no file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "given, says",
+    [
+        (["--suite", "triangle9"], "--suite must be one or more of throws"),
+        (["--network", "deep"], "--network must be attention or mlp, got deep"),
+        (["--iterations", "8"], "--iterations must be 5 numbers, one a suite, got 1"),
+        (["--kept", "0.5"], "--kept must be left out without begin"),
+        (["--suite", "triangle3", "--begin", "nowhere.npz"], "that `planner-jax train` wrote"),
+    ],
+)
+def test_bad_settings_of_a_training_are_a_line(given, says, capsys, tmp_path):
+    assert main(["train", *given, "--out", str(tmp_path / "run")]) == 2
+    (line,) = [x for x in capsys.readouterr().err.splitlines() if "warp" not in x]
+    assert says in line
+
+
+@pytest.mark.parametrize("suite", ["parabola2", "harmonic2", "hexagon6"])
+def test_cases_drawn_by_a_key_are_of_the_suites_distribution(suite):
+    """Means and deviations of where targets are, and of the horizon, are those of `draw`."""
+    by_key = jax.jit(draw_by_key, static_argnums=(1, 2))(jax.random.key(1), 4000, suite)
+    drawn = pj.catch.draw(4000, suite, 3)
+    for a, b in zip(jax.tree.leaves(by_key), jax.tree.leaves(drawn), strict=True):
+        a, b = np.asarray(a, float), np.asarray(b, float)
+        spread = b.std(axis=0) + 1e-6
+        assert (np.abs(a.mean(axis=0) - b.mean(axis=0)) < 0.09 * spread + 1e-5).all()
+        assert (np.abs(a.std(axis=0) - b.std(axis=0)) < 0.09 * spread + 1e-5).all()
+
+
+def test_what_greedy_estimates_is_within_reach_and_what_comes_too_soon_is_not():
+    cases = cases_of()
+    choice = first_choice(pj.catch.Greedy(), cases)
+    far = jax.jit(jax.vmap(shortfall))
+    assert (np.asarray(far(cases, choice)) <= 1e-3).mean() > 0.9
+    soon = dataclasses.replace(choice, times=0.3 * choice.times)
+    assert (np.asarray(far(cases, soon)) > 0.1).all()
+
+
+def test_a_reward_pays_early_catches_only_where_they_are_made():
+    environment = pytest.importorskip("planner_jax.policies.environment", exc_type=ImportError)
+    terms = {
+        "solved": jnp.array([1.0, 0.0]),
+        "last": jnp.array([0.1, 0.9]),
+        "ratio": jnp.array([0.05, 0.0]),
+        "violation": jnp.array([0.0, 1.0]),
+    }
+    reward = environment.rewarded(terms, environment.WEIGHTS)
+    np.testing.assert_allclose(reward, [1.0 + 0.5 - 0.1, -0.5])
+
+
+@pytest.mark.slow
+def test_training_learns_and_goes_on_bit_for_bit_where_it_was_interrupted(tmp_path, monkeypatch):
+    """By the estimate, from a policy that catches too soon: feasible decisions become common."""
+    from planner_jax.policies import training
+
+    suites, size = ("triangle3",), 3
+    network = NETWORKS["mlp"]()
+    params: Any = network.init(jax.random.key(0), jnp.zeros((1, size, FEATURES)))
+    params = jax.tree.map(np.array, params)
+    params["params"]["Dense_3"]["bias"][1] = -1.5  # times are a third too early
+    save_checkpoint(tmp_path / "hasty", params, network, {})
+    one = training.Part(steps=40_000, learning_rate=1e-3)
+    asked = training.Training(
+        suites,
+        (one, one),
+        network="mlp",
+        lanes=500,
+        minibatches=5,
+        judged=0,
+        divergence=0.05,
+        begin=str(tmp_path / "hasty"),
+    )
+    whole = training.train(asked, tmp_path / "whole", say=lambda line: None)
+    plain = training._by_ppo
+
+    def stop(asked: Any, part: Any, number: int, *others: Any) -> Any:
+        if number:
+            raise KeyboardInterrupt
+        return plain(asked, part, number, *others)
+
+    monkeypatch.setattr(training, "_by_ppo", stop)
+    with pytest.raises(KeyboardInterrupt):
+        training.train(asked, tmp_path / "cut", say=lambda line: None)
+    monkeypatch.setattr(training, "_by_ppo", plain)
+    again = training.train(asked, tmp_path / "cut", say=lambda line: None)
+    for a, b in zip(jax.tree.leaves(whole.params), jax.tree.leaves(again.params), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert len(json.loads((tmp_path / "cut" / "progress.json").read_text())) == 2
+    with pytest.raises(SettingError, match="seed must be 0"):
+        training.train(dataclasses.replace(asked, seed=1), tmp_path / "cut")
+
+    def feasible(found: Policy) -> float:
+        cases = draw_by_key(jax.random.key(9), 500, "triangle3")
+        far = jax.vmap(shortfall)(cases, first_choice(found, cases))
+        return float((np.asarray(far) <= 0.0).mean())
+
+    assert feasible(Policy(params, network)) < 0.05
+    assert feasible(whole) >= 0.5
