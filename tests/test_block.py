@@ -125,10 +125,15 @@ def test_clearances_change_with_the_joints_as_their_slopes_say(float64):
     arm, scene = jax.tree.map(jnp.asarray, (irb1600(), paper_scene()))
     rng = np.random.default_rng(1)
     angles = jnp.asarray(rng.uniform(arm.lower, arm.upper, (20, 6)))
-    each = jax.jacfwd(lambda angles: clearances(arm, scene, angles[None])[:, 0])
-    expected = jnp.moveaxis(jax.vmap(each)(angles), 0, -1)
-    found = clearance_slopes(arm, scene, angles)
-    assert found.shape == expected.shape == (clearances(arm, scene, angles).shape[0], 6, 20)
+
+    @jax.jit
+    def both(angles):
+        each = jax.jacfwd(lambda angles: clearances(arm, scene, angles[None])[:, 0])
+        expected = jnp.moveaxis(jax.vmap(each)(angles), 0, -1)
+        return clearances(arm, scene, angles), clearance_slopes(arm, scene, angles), expected
+
+    values, found, expected = both(angles)
+    assert found.shape == expected.shape == (values.shape[0], 6, 20)
     np.testing.assert_allclose(found, expected, atol=1e-9)
 
 

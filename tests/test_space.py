@@ -177,7 +177,7 @@ def test_an_approach_has_the_slope_by_a_turn_and_a_move_of_the_first_body(name, 
         expected = jax.grad(at)(jnp.zeros(6))
         return expected, jnp.concatenate([jnp.stack(line.moment), jnp.stack(line.direction)])
 
-    expected, found = jax.vmap(slopes)(tuple(first), tuple(others))
+    expected, found = jax.jit(jax.vmap(slopes))(tuple(first), tuple(others))
     np.testing.assert_allclose(found, expected, atol=1e-9)
     assert np.abs(found[:, :3]).max() > 0.1
 
