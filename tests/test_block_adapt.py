@@ -77,6 +77,7 @@ def test_the_cells_around_a_point_are_the_nearest_of_its_face():
     assert not at(np.array([0.0, 1.0, 0.9]))[0][2]
 
 
+@pytest.mark.slow
 def test_warped_motions_end_where_the_ball_is_and_open_ones_keep_their_limits():
     """For another ball than that of the stored motions; limits at knots are exact."""
     own = planner(has_pole=False)
@@ -103,6 +104,7 @@ def test_warped_motions_end_where_the_ball_is_and_open_ones_keep_their_limits():
     assert (np.asarray(joints)[np.asarray(warped.is_open)] <= -ONLINE.slack + 1e-5).all()
 
 
+@pytest.mark.slow
 def test_a_stored_motion_for_the_very_ball_is_not_warped():
     """Then the plan is one of the stored straight motions, in the time that there is."""
     own = planner(has_pole=False)

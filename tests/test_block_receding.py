@@ -62,6 +62,7 @@ def test_with_exact_fits_deciding_again_changes_nothing(cases):
     assert (second.success >= first.success)[had].all() and first.success[had].any()
 
 
+@pytest.mark.slow
 def test_what_is_put_together_is_one_motion_of_rates_within_their_limits(cases):
     done = decide(SMALL, cases, eye(std=0.02), [0.15, 0.25, 0.35, 0.45], aims=AIMS)
     verdict, solved = accepted(done)

@@ -44,6 +44,7 @@ def test_a_sequence_is_the_same_wherever_a_batch_begins():
     np.testing.assert_array_equal(pj.lane(many, 4).balls.ball.pos, one.balls.ball.pos[0])
 
 
+@pytest.mark.slow
 def test_a_sequence_of_one_is_a_single_ball():
     sequences = drawn(balls=1, delay=0.1)
     planned = pj.block.plan_in_turn(SMALL, sequences)
@@ -74,6 +75,7 @@ def test_each_ball_starts_where_the_motion_to_the_last_one_ends(planned):
     np.testing.assert_array_equal(pj.block.judge_in_turn(planned).success, met)
 
 
+@pytest.mark.slow
 def test_sequences_of_a_batch_are_those_planned_alone(planned):
     sequences = drawn()
     for k in (0, 5):
@@ -82,6 +84,7 @@ def test_sequences_of_a_batch_are_those_planned_alone(planned):
         np.testing.assert_allclose(one.begins[0], planned.begins[k], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_an_arm_reconsiders_only_when_it_knows_of_the_next_ball(planned):
     """More balls are met than without, and by motions that were the same until then."""
     sequences = drawn()
@@ -109,7 +112,7 @@ def test_a_ball_that_flies_past_is_let_through(planned):
     assert pj.solved(passed.plans)[:, 2].mean() > 0.5
 
 
-@pytest.mark.parametrize("returns", [True, False])
+@pytest.mark.parametrize("returns", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_an_arm_without_a_ball_goes_home_or_stops(returns):
     """And is judged while it does; the second ball comes five seconds later."""
     sequences = drawn(balls=2, apart=5.0)

@@ -87,6 +87,7 @@ def test_absent_targets_have_no_flight_and_the_plan_stays_at_the_last_catch(plan
     np.testing.assert_allclose(evaluate(one.trajectory, one.times[0] + 1.0), at_catch, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_one_throw_planned_alone_equals_its_lane_in_a_batch_for_more_targets(cases, plans):
     wide = lane_of(cases, 0)
     first = lambda leaf: leaf[:1]  # noqa: E731

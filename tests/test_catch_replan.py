@@ -73,6 +73,7 @@ def assert_same_way(old, new, elapsed, until, atol):
         )
 
 
+@pytest.mark.slow
 def test_an_unchanged_target_and_no_time_give_the_plan_back(throws):
     cases, plans = throws
     again = plan(AS_IT_IS, AS_IT_IS.begin(cases, plans, np.zeros(6), targets=cases.targets))
@@ -97,6 +98,7 @@ def test_a_later_plan_begins_where_the_quadrotor_is_and_catches_the_target_that_
     assert np.abs(again.times - (plans.times - elapsed[:, None])).max() < 0.05
 
 
+@pytest.mark.slow
 def test_a_batch_is_its_cases(throws):
     cases, plans = throws
     elapsed = np.array([0.1, 0.2, 0.3, 0.4, 0.5, 5.0], np.float32)
@@ -131,6 +133,7 @@ def test_with_too_little_time_left_the_previous_plan_is_kept(throws):
         assert_same_way(old, new, elapsed[k], left[k], 1e-3)
 
 
+@pytest.mark.slow
 def test_what_is_left_of_a_plan_can_be_cut_anywhere(throws):
     cases, plans = throws
     keeping = dataclasses.replace(AS_IT_IS, shortest=10.0)

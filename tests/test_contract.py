@@ -201,10 +201,12 @@ ENTRIES = {
     "library": Entry(LibraryPlanner(library(1)), places, "goal"),
     "NumPy": Entry(NumpyPlanner(), places, "goal"),
 }
-# They share their solver with others, and take as long to compile.
+# They share their solver with others and take as long to compile, or by default they are planned
+# with, also where lanes are NaN or cannot be solved, in the modules of their tasks.
 LIKE_OTHERS = (
-    *("hit bat", "hit bat-lite", "catch catch"),
-    *("intercept lattice", "intercept em", "intercept constant", "block brisk"),
+    *("hit bat", "hit bat-lite", "hit juggle", "catch exact", "catch catch"),
+    *("intercept lattice", "intercept em", "intercept constant"),
+    *("block online", "block brisk", "block direct", "block insat"),
 )
 
 
@@ -222,9 +224,8 @@ def entries(*, on_host=True, slow=()):
 
 every, pure = entries(slow=LIKE_OTHERS), entries(on_host=False, slow=LIKE_OTHERS)
 # By default these claims about one case are those of test_exact and test_decide, of programs that
-# they share with others. Of blocks, the others compile programs of batches alone.
-BLOCKS = ("block online", "block direct")
-OF_THEIR_OWN = ("hit exact", "catch exact", *BLOCKS)
+# they share with others.
+OF_THEIR_OWN = ("hit exact", "intercept spacetime")
 
 
 def inside(planner):
@@ -297,7 +298,7 @@ def test_every_status_is_a_status_and_solved_says_which_are_good(entry):
         assert not good[k] or plans.violation[k] <= 5e-4
 
 
-@entries(on_host=False, slow=(*LIKE_OTHERS, *BLOCKS))
+@entries(on_host=False, slow=(*LIKE_OTHERS, "intercept spacetime"))
 def test_every_matrix_product_asks_for_full_precision(entry, monkeypatch):
     monkeypatch.setattr(one_by_one, "has_only_cpu", lambda: False)  # also in what is for a GPU
     planner, case = inside(entry.planner), pj.lane(entry.batch, 0)
@@ -330,7 +331,7 @@ def traces(monkeypatch):
     return count
 
 
-@entries(on_host=False, slow=(*LIKE_OTHERS, *BLOCKS, "catch mpp"))
+@entries(on_host=False, slow=(*LIKE_OTHERS, "catch mpp"))
 def test_a_second_batch_of_the_same_bucket_is_not_traced_again(entry, traces):
     assert entry.plans is not None  # planned once
     found = traces(inside(entry.planner))
@@ -365,13 +366,17 @@ def test_what_comes_back_is_of_the_kind_of_array_that_was_given(entry):
     assert_close(resident, entry.plans)
 
 
-@entries(on_host=False, slow=(*LIKE_OTHERS, *OF_THEIR_OWN, "catch mpp", "intercept spacetime"))
+@entries(on_host=False, slow=(*LIKE_OTHERS, *OF_THEIR_OWN, "catch mpp"))
 def test_solve_inside_a_compiled_function_is_plan(entry):
     assert_close(jax.jit(pj.solve)(entry.planner, entry.batch), entry.plans)
 
 
 @pytest.mark.parametrize(
-    "name", ["library", "hit juggle", pytest.param("catch mpp", marks=pytest.mark.slow)]
+    "name",
+    [
+        "library",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("hit juggle", "catch mpp")),
+    ],
 )
 def test_solve_takes_one_case_and_any_transformation_but_a_derivative(name):
     entry = ENTRIES[name]
@@ -408,7 +413,7 @@ def test_a_derivative_is_refused_with_the_names_of_what_has_one(entry, call):
     assert "\n" not in str(caught.value)
 
 
-@entries(slow=(*LIKE_OTHERS, "catch exact", "intercept spacetime"))
+@entries(slow=(*LIKE_OTHERS, "intercept spacetime"))
 def test_a_gradient_is_there_where_it_is_promised_and_refused_elsewhere(entry):
     planner = inside(entry.planner)
     searches_first = hasattr(planner, "smooth_near")  # plans are then settled anew

@@ -200,7 +200,9 @@ def test_what_comes_back_is_of_the_kind_that_was_given(decide, array, kind, pair
     assert all(isinstance(leaf, kind) for leaf in jax.tree.leaves(found))
 
 
-@pytest.mark.parametrize("decide", [Best(), Greedy()], ids=["best", "greedy"])
+@pytest.mark.parametrize(
+    "decide", [Best(), pytest.param(Greedy(), marks=pytest.mark.slow)], ids=["best", "greedy"]
+)
 def test_one_case_alone_is_decided_on_and_planned_as_in_its_batch(decide, pairs):
     alone, together = plan(by(decide), pj.lane(pairs, 1)), plan(by(decide), pairs)
     assert alone.order.tolist() == together.order[1].tolist()

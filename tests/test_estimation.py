@@ -246,6 +246,7 @@ def test_prediction_error_grows_with_the_horizon_and_stays_finite():
     assert errors[-1] < 0.25
 
 
+@pytest.mark.slow
 @float64
 def test_filter_gradient_is_finite_from_rest_and_matches_finite_differences():
     """With respect to the model and the observations, the first of which are missing."""

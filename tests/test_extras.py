@@ -138,6 +138,7 @@ def test_a_case_gives_its_extras_the_shape_of_the_batch():
         for_batch((many,), (), jnp.float32)
 
 
+@pytest.mark.slow
 def test_a_blocked_way_is_planned_around_and_the_referee_says_which_was_not(
     hits, free, blocked, around
 ):

@@ -237,6 +237,7 @@ def early():
 HALF = [[3.9, -0.5], [4.1, -0.5], [4.1, 5.5], [3.9, 5.5]]
 
 
+@pytest.mark.slow
 def test_an_early_meeting_is_at_most_as_late_as_the_straight_line_takes(early):
     cases, plans = early
     verdict = pj.intercept.judge(cases, plans)
@@ -251,6 +252,7 @@ def test_an_early_meeting_is_at_most_as_late_as_the_straight_line_takes(early):
     np.testing.assert_array_equal(plans.cost[:2], plans.time[:2])
 
 
+@pytest.mark.slow
 def test_a_plan_goes_on_as_it_was_for_a_target_as_before(planned):
     cases, plans = planned
     good = np.flatnonzero(pj.solved(plans))

@@ -106,6 +106,7 @@ def test_a_gate_is_passed_before_it_closes_and_not_after(rules):
     assert earliest_bound(gate(0.1))[0] and not earliest_bound(gate(1.0))[0]
 
 
+@pytest.mark.slow
 def test_a_gap_narrower_than_the_body_is_passed_by_no_one_and_a_tight_one_by_the_inner_disc():
     def gap(width):
         walls = [box(3.0, 0.0, 3.2, 4.0 - width / 2), box(3.0, 4.0 + width / 2, 3.2, 8.0)]
@@ -170,6 +171,7 @@ def test_a_way_leads_from_the_start_to_the_target_within_the_limits_and_touches_
         assert distance(one, middle, time).min() > 0.125 - CELL / 4
 
 
+@pytest.mark.slow
 def test_the_bound_is_no_later_than_the_inner_disc_and_that_no_later_than_the_whole_body(drawn):
     at_end, earliest = search(drawn[2])
     assert earliest == sorted(earliest) and at_end == [True] * 3
@@ -188,7 +190,9 @@ def test_a_car_gets_away_from_a_wall_ahead_if_it_can_still_turn(ahead, gets_away
     assert departs(one, far=0.8, until=2.0) == gets_away
 
 
-@pytest.mark.parametrize(("ahead", "lives"), [(0.05, False), (0.5, True)])
+@pytest.mark.parametrize(
+    ("ahead", "lives"), [(0.05, False), pytest.param(0.5, True, marks=pytest.mark.slow)]
+)
 def test_of_a_target_nearby_it_is_enough_to_touch_nothing(ahead, lives):
     # The car sets out at a speed at which it takes 0.125 m to stand.
     front = START[0] + MIDDLE + 0.2

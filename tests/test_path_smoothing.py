@@ -161,6 +161,7 @@ def test_the_spline_of_an_arc_is_that_arc(float64):
     assert length == pytest.approx(2.0, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_smooth_paths_have_their_ends_and_keep_clear_within_the_curvature(batch):
     (given, _, _), found = batch
     assert found.is_smooth.all() and (found.share > 0.0).any()

@@ -132,6 +132,7 @@ def test_a_square_that_crosses_a_straight_path_blocks_it_just_as_long_as_they_ov
     assert (begin[0, ~meets] >= finish[0, ~meets]).all()
 
 
+@pytest.mark.slow
 def test_a_path_that_comes_back_is_blocked_in_two_runs():
     loop = along(np.zeros(3, np.float32), np.float32(5.0), np.full(129, 0.4 * np.pi, np.float32))
     movers = obstacles([SQUARE], [0.0, 1e-3])  # stays at its beginning, which is its end
@@ -197,6 +198,7 @@ drive = jax.jit(lambda case, path: STEP.drive(case, path, STEP.problem(case, pat
 STEP = SpeedStep()
 
 
+@pytest.mark.slow
 def test_without_movers_a_straight_way_costs_what_the_least_acceleration_does():
     case = scene((6.0, 4.0))
     plan = drive(case, STRAIGHT)
@@ -209,6 +211,7 @@ def test_without_movers_a_straight_way_costs_what_the_least_acceleration_does():
     assert far.cost == pytest.approx(3.0 * (5.05 - 3.0) ** 2 / 6.0**3, rel=0.06)
 
 
+@pytest.mark.slow
 def test_a_drive_follows_its_path_and_ends_where_it_ends():
     movers = [SQUARE + [3.0, 2.0]]
     end = np.asarray(BENT.pos[-1]) + 0.15 * np.array(

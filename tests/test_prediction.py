@@ -248,6 +248,7 @@ def test_the_kernel_gives_the_same_table():
     np.testing.assert_allclose(found[1], table.vel, rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_kernel_gives_the_same_derivatives_of_the_table():
     """By velocity and drag, in that order."""
     random = np.random.default_rng(6)

@@ -48,6 +48,7 @@ def test_no_time_and_a_target_as_before_give_back_the_motion_of_a_catch(catches)
     assert_same_motion(again, plans, plans.times[:, 0], 1e-3)
 
 
+@pytest.mark.slow
 def test_no_time_and_a_ball_as_before_give_back_the_motion_of_a_hit(hits):
     """The search begins on the smoothest way to the stroke, and comes back to the plan's."""
     cases, plans, news = hits

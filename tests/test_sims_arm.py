@@ -96,6 +96,7 @@ def ideal():
     return carried_out()
 
 
+@pytest.mark.slow
 def test_the_arm_holds_its_home_against_gravity_without_drift(ideal):
     _, flown = ideal
     assert np.abs(flown.angles[0] - HOME).max() < 1e-5

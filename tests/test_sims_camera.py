@@ -68,6 +68,7 @@ def test_a_ball_behind_the_pole_or_out_of_view_is_not_seen(scene):
         assert found.pixels == 0 and np.isnan(found.place).all()
 
 
+@pytest.mark.slow
 def test_a_flight_through_images_is_found_as_well_as_it_is_believed(scene):
     cases = pj.block.draw(1, "short", seed=1)
     ball = jax.tree.map(lambda leaf: leaf[0], cases.ball)

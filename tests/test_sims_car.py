@@ -124,6 +124,7 @@ def forces_of(vehicle, vel, steering):
     return tyre_forces(vehicle, jnp.zeros(3), vel, steering, jnp.zeros(()), 0.005)
 
 
+@pytest.mark.slow
 def test_a_straight_plan_without_noise_is_tracked_within_a_centimetre(exactly):
     drives, _ = exactly
     assert drives.worst_tracking[0] < 0.01

@@ -129,6 +129,7 @@ def tracked():
     return jax.device_get(jax.jit(jax.vmap(one))(jnp.array([0.0, 1.0])))
 
 
+@pytest.mark.slow
 def test_a_planned_trajectory_is_tracked_within_two_centimetres(tracked):
     assert tracked[0][0].max() < 0.02
 

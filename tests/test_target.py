@@ -120,6 +120,7 @@ class Corkscrew:
         )
 
 
+@pytest.mark.slow
 def test_a_path_of_a_users_own_class_is_caught():
     leaves = [[0.8, -0.5, 4.5]], [0.4], [2.5], [2.5]
     targets = Corkscrew(*(np.asarray(leaf, np.float32) for leaf in leaves))
