@@ -144,7 +144,10 @@ def asked(mode):
     }[mode]
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize(
+    "mode",
+    [pytest.param(mode, marks=[pytest.mark.slow] if mode in MODES[3:] else []) for mode in MODES],
+)
 def test_the_kernel_gives_the_same_numbers(mode):
     args = cases()
     if mode == "curvature":

@@ -166,7 +166,7 @@ def test_costs_without_rounds_are_compared_with_those_of_the_tasks_yardstick():
 def test_a_yardstick_for_cases_of_another_class_is_none():
     """As are a car's group of targets, and an interception that is planned again."""
     cases = pj.hit.draw(2)
-    plans = pj.plan(pj.hit.planner("bat-lite"), cases)
+    plans = pj.plan(pj.hit.planner("bat"), cases)  # as test_baselines does
     assert cost_gaps(Half(), cases, plans, card=registry.task_named("intercept")) is None
 
 

@@ -27,6 +27,8 @@ from planner_jax.trajectory.polynomial import evaluate
 SMALL = OnlineBlock(
     pieces=6, points=10, searches=(Search(straight=12, tries=3, solver=LevenbergConfig(8)),)
 )
+# Without least squares, which take most of the compilation.
+STRAIGHT = dataclasses.replace(SMALL, searches=(Search(straight=60, tries=0),))
 
 
 def thrown(**options):
@@ -121,6 +123,7 @@ def test_the_arm_is_clear_at_home_and_not_when_it_reaches_into_the_pole():
     assert at(ahead, dataclasses.replace(scene, has_pole=jnp.asarray(False))).min() > 0.0
 
 
+@pytest.mark.slow
 def test_clearances_change_with_the_joints_as_their_slopes_say(float64):
     arm, scene = jax.tree.map(jnp.asarray, (irb1600(), paper_scene()))
     rng = np.random.default_rng(1)
@@ -239,17 +242,17 @@ def test_plans_of_a_batch_say_what_became_of_each_ball():
 def test_brisk_motions_end_before_the_ball_is_there():
     """As quick as one limit allows, if the arm has to stand in the end, and so the referee says."""
     cases = jax.tree.map(np.array, pj.block.draw(8, seed=8))
-    cases.ends_at_rest[5] = False
-    plans, quick = (pj.plan(dataclasses.replace(SMALL, brisk=b), cases) for b in (False, True))
+    cases.ends_at_rest[4] = False
+    plans, quick = (pj.plan(dataclasses.replace(STRAIGHT, brisk=b), cases) for b in (False, True))
     some = pj.solved(quick)
     np.testing.assert_array_equal(some, pj.solved(plans))
-    assert some.sum() >= 4 and some[5]
+    assert some.sum() >= 4 and some[4]
     verdict: Any = pj.block.judge(cases, quick)
     assert verdict.success[some].all()
     durations = quick.motion.durations.sum(axis=1)
     np.testing.assert_allclose(quick.cost[some], durations[some], rtol=1e-5)
-    np.testing.assert_allclose(durations[5], quick.contact_time[5], rtol=1e-5)
-    rests = some & (np.arange(8) != 5)
+    np.testing.assert_allclose(durations[4], quick.contact_time[4], rtol=1e-5)
+    rests = some & (np.arange(8) != 4)
     assert np.all(durations[rests] < quick.contact_time[rests])
     assert np.all(durations[rests] < plans.motion.durations.sum(axis=1)[rests])
     rates = np.abs(quick.motion.coeffs[:, :, 1]) / cases.limits.velocity[:, None]

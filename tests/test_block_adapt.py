@@ -118,7 +118,9 @@ def test_a_stored_motion_for_the_very_ball_is_not_warped():
     assert np.min(warped.promise) < 0.1
 
 
-def test_statuses_of_a_batch_say_why_and_single_plans_are_the_same():
+@pytest.fixture(scope="module")
+def planned():
+    """A planner, balls of which three can be blocked, and their plans."""
     own = planner(has_pole=False)
     rng = np.random.default_rng(2)
     num = 8
@@ -133,20 +135,31 @@ def test_statuses_of_a_batch_say_why_and_single_plans_are_the_same():
     cases.angles[3, 2] += 1e-2  # not at home
     cases.limits.velocity[4] *= 0.5  # other limits
     cases.rates[5, 0] = 0.1  # not at rest
-    plans = pj.plan(own, cases)
+    return own, cases, pj.plan(own, cases)
+
+
+GOOD = [0, 6, 7]
+
+
+def test_statuses_of_a_batch_say_why_and_the_referee_confirms_what_is_solved(planned):
+    _, cases, plans = planned
     S = pj.Status
     assert plans.status[1] == S.OUT_OF_REACH and not pj.solved(plans)[2]
     assert [S(int(s)) for s in plans.status[3:6]] == [S.BLOCKED] * 3
-    good = [0, 6, 7]
     verdict: Any = pj.block.judge(cases, plans)
-    assert pj.solved(plans)[good].all() and verdict.success[good].all()
+    assert pj.solved(plans)[GOOD].all() and verdict.success[GOOD].all()
+
+
+@pytest.mark.slow
+def test_balls_one_by_one_are_planned_as_in_a_batch(planned):
+    own, cases, plans = planned
     one = BallByBall(own, pj.lane(cases, 0))
-    for k in good:
+    for k in GOOD:
         plan = one.plan(cases.ball.pos[k], cases.ball.vel[k])
         assert pj.Status(int(plan.status)) == plans.status[k]
         np.testing.assert_allclose(plan.contact_time, plans.contact_time[k], atol=1e-5)
         np.testing.assert_allclose(plan.motion.coeffs, plans.motion.coeffs[k], atol=1e-3)
-    assert one.plan(cases.ball.pos[1], cases.ball.vel[1]).status == S.OUT_OF_REACH
+    assert one.plan(cases.ball.pos[1], cases.ball.vel[1]).status == pj.Status.OUT_OF_REACH
 
 
 def test_what_is_wrong_with_a_file_or_with_cases_is_named(tmp_path):

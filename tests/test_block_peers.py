@@ -114,6 +114,7 @@ def test_direct_is_confirmed_by_the_referee_and_says_what_became_of_each_ball():
     assert (late.status[[0, 3, 4, 5]] == pj.Status.INFEASIBLE).all()
 
 
+@pytest.mark.slow
 def test_edges_are_free_where_all_of_their_samples_are():
     case = pj.lane(jax.tree.map(np.asarray, pj.block.draw(1, seed=8)), 0)
     free = FreeSpace(case, 0.003)

@@ -49,6 +49,7 @@ def test_a_perfect_camera_gives_the_plans_of_no_camera(cases):
     np.testing.assert_allclose(ours, theirs, atol=1e-2)
 
 
+@pytest.mark.slow
 def test_with_exact_fits_deciding_again_changes_nothing(cases):
     """A motion that meets the ball goes on; what had none may still get one."""
     once, again = (
@@ -82,6 +83,7 @@ def test_a_ball_that_is_never_seen_leaves_the_arm_at_home(cases):
     assert not done.plans.motion.durations.any()
 
 
+@pytest.mark.slow
 def test_replanning_goes_on_from_the_motion_for_the_ball_as_it_is_now_known(cases):
     plans = pj.plan(SMALL, cases)
     solved = pj.solved(plans)
@@ -108,6 +110,7 @@ def test_a_motion_that_begins_late_is_met_later_or_not_in_time(cases):
     assert not np.isin(verdict.failed_limit[solved], ("start", "continuity", "velocity")).any()
 
 
+@pytest.mark.slow
 def test_the_noise_of_a_throw_can_be_its_own_in_any_batch(cases):
     seeds = np.arange(6, dtype=np.uint32)
     every = decide(SMALL, cases, eye(std=0.02), [0.2], seed=seeds, aims=AIMS[:1])
