@@ -21,11 +21,10 @@ from planner_jax.task.catch.decide import (
     Best,
     Given,
     Greedy,
-    _follow,
-    _timetable,
     closest_approach,
     optimal_time_ratio,
 )
+from planner_jax.task.catch.estimate import follow, timetable
 from planner_jax.task.catch.exact import ExactCatch
 from planner_jax.task.catch.suites import draw
 
@@ -51,7 +50,7 @@ def best(case):
 @jax.vmap
 def estimate(case, order):
     """By how much the targets stay out of reach when they are caught in that order, ()."""
-    return _follow(case, _timetable(case), order)[1]
+    return follow(case, timetable(case), order)[1]
 
 
 def shortfall(cases, choices):
@@ -271,7 +270,8 @@ def test_the_time_ratio_is_that_of_the_present_targets(pairs):
 
 
 def test_an_unknown_decision_is_refused(pairs):
-    with pytest.raises(ValueError, match="decide must be one of best, greedy, given, got 'worst'"):
+    known = "best, greedy, given, policy"
+    with pytest.raises(ValueError, match=f"decide must be one of {known}, got 'worst'"):
         pj.catch.planner(decide="worst")
 
 

@@ -243,3 +243,17 @@ def test_training_learns_and_goes_on_bit_for_bit_where_it_was_interrupted(tmp_pa
 
     assert feasible(Policy(params, network)) < 0.05
     assert feasible(whole) >= 0.5
+
+
+def test_a_sweep_says_which_policy_decided(tmp_path):
+    """By its network's sizes and number of weights, from a file as well."""
+    path = tmp_path / "mine.npz"
+    save_checkpoint(path, policy().params, policy().network, {})
+    arguments = ["sweep", "catch", "--suite", "triangle3", "--num", str(NUM), "--batch", str(NUM)]
+    assert main([*arguments, "--decide", f"policy:{path}", "--out", str(tmp_path / "run")]) == 0
+    manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
+    said = manifest["planner"]["decision"]
+    assert said["class"] == "Policy" and said["network"]["layers"] == 2
+    weights = jax.tree.leaves(policy().params)
+    assert said["params"]["weights"] == sum(leaf.size for leaf in weights)
+    assert manifest["summary"]["success_rate"] == 1.0

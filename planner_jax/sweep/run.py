@@ -6,6 +6,8 @@ import os
 import sys
 from typing import Any
 
+import jax
+import numpy as np
 import pyarrow as pa
 
 from planner_jax.registry import Task
@@ -186,13 +188,23 @@ def _first_manifest(run: SweepRun, cases: Any) -> dict[str, Any]:
     }
 
 
+_OF_NETWORKS = ("parent", "name")  # fields of a Flax module that are none of its sizes
+
+
 def _settings_of_planner(planner: Any) -> dict[str, Any]:
-    """Sizes and switches of a planner, for the manifest; of arrays, their shapes."""
+    """Sizes and switches of a planner, for the manifest; of arrays, their shapes.
+
+    Of a network's weights it is how many there are.
+    """
     found = {}
     for field in dataclasses.fields(planner) if dataclasses.is_dataclass(planner) else ():
         value = getattr(planner, field.name)
+        if field.name in _OF_NETWORKS and hasattr(planner, "apply"):
+            continue
         if dataclasses.is_dataclass(value):
             value = {"class": type(value).__name__, **_settings_of_planner(value)}
+        elif isinstance(value, dict):
+            value = {"weights": sum(np.size(leaf) for leaf in jax.tree.leaves(value))}
         elif hasattr(value, "shape"):
             value = {"shape": list(value.shape)}
         elif isinstance(value, tuple):
