@@ -1,0 +1,109 @@
+"""Table III of paper 000 by decision: what order and times are worth, and what they cost.
+
+    python -m benchmarks.catch_decisions [--suites triangle3,hexagon6] [--num 1000] [--seed 777]
+        [--policy FILE] [--timed 200] [--out DIR]
+
+The planner is `exact`, and every plan is refereed. Decisions: `best` plans the six most promising
+of all orders, `greedy` one; `policy` is the shipped one or that of --policy, by its mean, and by
+six proposals of which the earliest stays. Last catches are means of what the referee accepts. The
+optimal time ratio (OTR) is that of the decision's own times; "at 25" has the planner stop after 25
+iterations of one start. A decision is timed alone, for one case at a time from NumPy arrays to
+order and times, compiled before. No policy was trained on the seed, which is not that of `draw`'s
+default either.
+"""
+
+import argparse
+import time
+from typing import Any
+
+import jax
+import numpy as np
+
+import planner_jax as pj
+from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
+from planner_jax.optimise.lbfgs import LbfgsConfig
+from planner_jax.optimise.problem import Round
+from planner_jax.planning.decided import DecidedPlanner
+from planner_jax.policies.policy import policy
+from planner_jax.sweep.settings import SettingError
+from planner_jax.task.catch.card import SUITES
+from planner_jax.task.catch.exact import ExactCatch
+
+OF_PAPER = [name for name, suite in SUITES.items() if name not in ("throws", "hard")]
+SHORT = ExactCatch(rounds=(Round(starts=1, solver=LbfgsConfig(max_steps=25)),))
+
+
+def decision_time(decision: Any, cases: Any, num: int) -> float:
+    """Median seconds of a decision about one case."""
+    cpu = jax.local_devices(backend="cpu")[0]
+    lanes = [pj.lane(cases, k % cases.batch_shape[0]) for k in range(num)]
+    with jax.default_device(cpu):
+        decide = jax.jit(decision.propose).lower(lanes[0]).compile()
+        seconds = []
+        for case in lanes:
+            began = time.perf_counter()
+            jax.device_get(decide(case))
+            seconds.append(time.perf_counter() - began)
+    return float(np.median(seconds))
+
+
+def run_row(bench: Bench, suite: str, name: str, decision: Any, options: Any) -> dict[str, Any]:
+    """The figures of one decision on one suite, counted."""
+    cases: Any = jax.tree.map(np.asarray, pj.catch.draw(options.num, suite, options.seed))
+    plans = pj.plan(DecidedPlanner(ExactCatch(), decision), cases)
+    success = pj.catch.judge(cases, plans).success
+    short = pj.plan(DecidedPlanner(SHORT, decision), cases)
+    bench.count(success)
+    return {
+        "suite": suite,
+        "decide": name,
+        "success": success.mean(),
+        "last": plans.times[success, -1].mean() if success.any() else None,
+        "ratio": pj.catch.optimal_time_ratio(cases, plans)[success].mean(),
+        "at_25": pj.catch.judge(cases, short).success.mean(),
+        "decision_ms": 1e3 * decision_time(decision, cases, options.timed),
+    }
+
+
+def measure(bench: Bench, suites: list[str], options: argparse.Namespace) -> None:
+    """All rows."""
+    decisions = {
+        "best": pj.catch.Best(),
+        "greedy": pj.catch.Greedy(),
+        "policy": policy(options.policy),
+        "policy, 6": policy(options.policy, proposals=6),
+    }
+    bench.say(
+        f"{options.num} cases each, seed {options.seed}, {jax.devices()[0]}",
+        "| suite | decision | success | last catch | of best's | OTR | at 25 | decision |",
+        "|---|---|---|---|---|---|---|---|",
+    )
+    for suite in suites:
+        best = None
+        for name, decision in decisions.items():
+            row = run_row(bench, suite, name, decision, options)
+            best = best or row["last"]
+            bench.row(**row)
+            bench.say(
+                f"| {suite} | {name} | {100 * row['success']:.1f} % | {row['last']:.3f} s "
+                f"| {row['last'] / best:.3f} | {row['ratio']:.3f} | {100 * row['at_25']:.1f} % "
+                f"| {row['decision_ms']:.3f} ms |"
+            )
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argument_parser("catch_decisions", __doc__, num=1000, seed=777, timed=200)
+    parser.add_argument("--suites", default=",".join(OF_PAPER), help="comma-separated")
+    parser.add_argument("--policy", metavar="FILE", help="default: the one that is shipped")
+    options = parser.parse_args()
+    suites = chosen(parser, "--suites", options.suites, SUITES)
+    with begin(parser, options) as bench:
+        try:
+            measure(bench, suites, options)
+        except SettingError as error:
+            parser.error(str(error))
+
+
+if __name__ == "__main__":
+    main()
