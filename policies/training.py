@@ -162,7 +162,7 @@ def _sentence(row: dict[str, Any]) -> str:
         )
         for name, found in suites.items()
     ]
-    return f"part {row['part']}, {row['steps']} decisions; " + "; ".join(words)
+    return "; ".join([f"part {row['part']}, {row['steps']} decisions", *words])
 
 
 def _require_same(folder: Path, training: Training) -> None:
