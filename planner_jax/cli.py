@@ -1,4 +1,4 @@
-"""The command line: `planner-jax sweep|fly TASK`, `train`, `library`, `view`, `report`, `bench`.
+"""The command line: `planner-jax` with `sweep`, `fly`, `train`, `library`, `view`, `bench`, ...
 
 Tasks come from the registry, and the options of `sweep` and `fly` from the fields of a task's
 settings: nothing here knows a task.

@@ -19,7 +19,8 @@ from planner_jax.planning.plan import plan
 from planner_jax.policies.observation import FEATURES, HANDICAP, STRETCH, observe
 from planner_jax.protocol import solved
 from planner_jax.task.catch.case import CatchCase
-from planner_jax.task.catch.estimate import arrival, follow, timetable, top_speed
+from planner_jax.task.catch.chain import targets_at
+from planner_jax.task.catch.estimate import arrivals, follow, timetable, top_speed
 from planner_jax.task.catch.suites import draw
 from planner_jax.task.catch.words import planner
 
@@ -68,13 +69,12 @@ def _lessons_of(cases: CatchCase, orders: Array, times: Array, size: int) -> Les
 def _lesson(case: CatchCase, order: Array, times: Array, size: int) -> Lessons:
     table, num = timetable(case), case.num_targets
     targets = jax.tree.map(lambda leaf: leaf[order], case.targets)
-    caught = jax.vmap(lambda target, at: target.at(at))(targets, times).pos
+    caught = targets_at(targets, times).pos
     begins = jnp.concatenate([jnp.zeros_like(times[:1]), times[:-1]])
     places = jnp.concatenate([case.head_state[:1], caught[:-1]])
 
     def ranked(step: Array, begin: Array, place: Array) -> Array:
-        arrive = jax.vmap(arrival, (0, None, None, None))
-        at, _, short = arrive(table, begin, place, top_speed(case))
+        at, _, short = arrivals(table, begin, place, top_speed(case))
         left = jnp.ones(num, bool).at[order].set(jnp.arange(num) >= step)
         return jnp.where(left, jnp.minimum(at + 10.0 * short, 1e3), jnp.inf)
 

@@ -7,13 +7,13 @@ time. Without either the decision is that of `Greedy`; every action is a valid o
 times that rise.
 """
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
 from planner_jax.task.catch.case import CatchCase, CatchChoice
-from planner_jax.task.catch.estimate import INSTANT, Timetable, arrival, earliest_next, top_speed
+from planner_jax.task.catch.chain import targets_at
+from planner_jax.task.catch.estimate import INSTANT, Timetable, arrivals, earliest_next, top_speed
 
 HANDICAP = 4.0  # [s], greatest
 STRETCH = 0.5  # greatest logarithm of a time over the estimated one
@@ -29,11 +29,10 @@ def observe(case: CatchCase, table: Timetable) -> Array:
     """
     num = case.num_targets
     place, velocity = case.head_state[0], case.head_state[1]
-    now = jax.vmap(lambda target: target.at(jnp.zeros_like(case.gravity)))(case.targets)
+    now = targets_at(case.targets, jnp.zeros_like(case.horizon))
     every = table.times.shape[1] // _SHARES
     path = (table.places[:, every - 1 :: every] - place).reshape(num, -1) / 4.0
-    arrive = jax.vmap(arrival, (0, None, None, None))
-    time, _, shortfall = arrive(table, jnp.zeros_like(case.gravity), place, top_speed(case))
+    time, _, shortfall = arrivals(table, jnp.zeros_like(case.gravity), place, top_speed(case))
     others = jnp.sum(case.present) - 1.0
     columns = [
         (now.pos - place) / 4.0,

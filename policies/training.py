@@ -37,6 +37,7 @@ from planner_jax.policies.observation import FEATURES, PER_TARGET
 from planner_jax.policies.policy import Policy
 from planner_jax.policies.settings import TrainSettings
 from planner_jax.protocol import solved
+from planner_jax.sweep.run_folder import RunFolder
 from planner_jax.sweep.settings import SettingError
 from planner_jax.task.catch.decide import optimal_time_ratio
 from planner_jax.task.catch.exact import ExactCatch
@@ -93,10 +94,10 @@ def train(training: Training, out: str | os.PathLike, say: Callable[[str], None]
     """
     brax_compat.install()
     folder = Path(out)
-    _require_same(folder, training)
     network = NETWORKS[training.network]()
     keeper = orbax.StandardCheckpointer()
-    params = _first_params(training, network)
+    params = _first_params(training, network)  # before anything is written
+    _require_same(folder, training)
     rows: list[dict[str, Any]] = []
     for number, part in enumerate(training.parts):
         place = (folder / "parts" / f"{number:03d}").absolute()
@@ -111,7 +112,7 @@ def train(training: Training, out: str | os.PathLike, say: Callable[[str], None]
         if training.judged:
             row |= judge_policy(training, network, params[1])
         rows = [*rows, row]
-        _write(folder / "progress.json", json.dumps(rows, indent=1))
+        RunFolder(folder).write_text("progress.json", json.dumps(rows, indent=1) + "\n")
         keeper.save(place, params)
         keeper.wait_until_finished()
         say(_sentence(row))
@@ -166,7 +167,7 @@ def _sentence(row: dict[str, Any]) -> str:
 
 
 def _require_same(folder: Path, training: Training) -> None:
-    """Write down what is trained, or raise `ValueError` if the folder says otherwise."""
+    """Write down what is trained, or raise `SettingError` if the folder says otherwise."""
     wanted = json.loads(json.dumps(dataclasses.asdict(training)))
     place = folder / "training.json"
     if place.exists():
@@ -179,13 +180,7 @@ def _require_same(folder: Path, training: Training) -> None:
                 )
         return
     (folder / "parts").mkdir(parents=True, exist_ok=True)
-    _write(place, json.dumps(wanted, indent=1))
-
-
-def _write(path: Path, text: str) -> None:
-    scratch = path.with_name(f"{path.name}.{os.getpid()}")
-    scratch.write_text(text + "\n")
-    os.replace(scratch, path)
+    RunFolder(folder).write_text(place.name, json.dumps(wanted, indent=1) + "\n")
 
 
 def _first_params(training: Training, network: Any) -> Any:

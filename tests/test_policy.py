@@ -160,6 +160,7 @@ def test_bad_settings_of_a_training_are_a_line(given, says, capsys, tmp_path):
     assert main(["train", *given, "--out", str(tmp_path / "run")]) == 2
     (line,) = [x for x in capsys.readouterr().err.splitlines() if "warp" not in x]
     assert says in line
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize("suite", ["parabola2", "harmonic2", "hexagon6"])

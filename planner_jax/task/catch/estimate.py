@@ -13,6 +13,7 @@ from jax import Array
 
 from planner_jax.ball.flight import BallState
 from planner_jax.task.catch.case import CatchCase, CatchChoice
+from planner_jax.task.catch.chain import targets_at
 
 GRID = 64  # times at which every target is looked at
 _ACCELERATION = 7.0  # [m/s^2], sustained, of the estimate
@@ -78,6 +79,10 @@ def arrival(
     return times[first], places[first], short[first]
 
 
+# The same of N targets, whose timetable has an axis more.
+arrivals = jax.vmap(arrival, (0, None, None, None))
+
+
 def _out_of_reach(way: Array, span: Array, speed: Array) -> Array:
     """By how much [m] a way (..., 3) is longer than what is flown in a span (...) [s]."""
     distance = jnp.sqrt(jnp.maximum(jnp.sum(way**2, axis=-1), 1e-12))
@@ -91,7 +96,7 @@ def shortfall(case: CatchCase, choice: CatchChoice) -> Array:
     """How far () [m], all in all, targets are out of the estimate's reach at chosen times."""
     order, times = choice.order, choice.times
     targets = jax.tree.map(lambda leaf: leaf[order], case.targets)
-    places, penalty = _to_catch(case, jax.vmap(lambda target, at: target.at(at))(targets, times))
+    places, penalty = _to_catch(case, targets_at(targets, times))
     before = jnp.concatenate([case.head_state[:1], places[:-1]])
     span = jnp.diff(times, prepend=jnp.zeros_like(times[:1]))
     short = _out_of_reach(places - before, span, top_speed(case)) + penalty
@@ -129,8 +134,7 @@ def earliest_next(case: CatchCase, table: Timetable, handicap: Array) -> CatchCh
 
     def advance(state: tuple, _: None) -> tuple[tuple, tuple[Array, Array]]:
         begin, place, left = state
-        arrive = jax.vmap(arrival, (0, None, None, None))
-        times, places, shortfalls = arrive(table, begin, place, speed)
+        times, places, shortfalls = arrivals(table, begin, place, speed)
         rank = jnp.where(case.present, times + 10.0 * shortfalls + handicap, 1e9)
         target = jnp.argmin(jnp.where(left, rank, jnp.inf)).astype(jnp.int32)
         here = case.present[target]
