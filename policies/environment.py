@@ -19,6 +19,7 @@ from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.multistart import solve_batch
 from planner_jax.optimise.problem import Round
 from planner_jax.policies.observation import FEATURES, PER_TARGET, choice_of, observe
+from planner_jax.policies.settings import WEIGHTS
 from planner_jax.protocol import is_solved
 from planner_jax.task.catch.card import SUITES
 from planner_jax.task.catch.case import CatchCase
@@ -26,9 +27,9 @@ from planner_jax.task.catch.estimate import earliest_next, shortfall, timetable
 from planner_jax.task.catch.exact import ExactCatch
 from planner_jax.task.catch.suites import draw_by_key
 
-# What the terms of a reward count; `last` and `ratio` only of solved cases, and `violation` only
-# of others, lest a policy be paid for early catches that it does not make.
-WEIGHTS = {"solved": 1.0, "last": 5.0, "ratio": -2.0, "violation": -0.5}
+# Terms of a reward that count only of cases that are solved, lest a policy be paid for early
+# catches that it does not make; `violation` counts only of others.
+_GATED = ("solved", "last", "ratio", "caught")
 
 
 class CatchEnv(Env):
@@ -37,7 +38,8 @@ class CatchEnv(Env):
     Args:
         suites: whose cases are drawn.
         iterations: of the planner, one number a suite; zero has the estimate judge instead.
-        weights: of the terms, by name as in `WEIGHTS`.
+            Suites whose cases are alike in shape, and which are planned alike, are planned in one.
+        weights: of the terms of `judged`, by name.
     """
 
     def __init__(
@@ -74,12 +76,8 @@ class CatchEnv(Env):
         """What became of the actions (B, size * PER_TARGET), and the next cases."""
         key, own = jax.random.split(state.info["key"])
         num = action.shape[0]
-        share = num // len(self.suites)
-        parts = []
-        for k, cases in enumerate(state.info["cases"]):
-            some = action[k * share : (k + 1) * share].reshape(share, self.size, PER_TARGET)
-            parts.append(judged(cases, some[:, : cases.num_targets], self.iterations[k]))
-        terms = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+        actions = action.reshape(len(self.suites), -1, self.size, PER_TARGET)
+        terms = self._judged(state.info["cases"], actions)
         reward = rewarded(terms, self.weights)
         cases, one = self._drawn(own, num), jnp.ones(num)
         steps = {"sum_reward": reward, "length": one}
@@ -91,6 +89,24 @@ class CatchEnv(Env):
             "episode_metrics": {**steps, **terms},
         }
         return state.replace(obs=self._seen(cases), reward=reward, done=one, info=info)
+
+    def _judged(self, cases: tuple[CatchCase, ...], actions: Array) -> dict[str, Array]:
+        """The raw terms (B,) of actions (S, B / S, size, PER_TARGET) on the cases of S suites."""
+        alike: dict[Any, list[int]] = {}
+        for k, some in enumerate(cases):
+            key = (*map(jnp.shape, jax.tree.leaves(some)), jax.tree.structure(some))
+            alike.setdefault((self.iterations[k], *key), []).append(k)
+        parts: dict[int, dict[str, Array]] = {}
+        for (iterations, *_), places in alike.items():
+            together = jax.tree.map(lambda *x: jnp.concatenate(x), *(cases[k] for k in places))
+            acts = jnp.concatenate([actions[k, :, : together.num_targets] for k in places])
+            terms = judged(together, acts, iterations)
+            for place, k in enumerate(places):
+                share = actions.shape[1]
+                own = slice(place * share, (place + 1) * share)
+                parts[k] = {name: term[own] for name, term in terms.items()}
+        in_order = [parts[k] for k in range(len(cases))]
+        return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *in_order)
 
     def _drawn(self, key: Array, num: int) -> tuple[CatchCase, ...]:
         share = num // len(self.suites)
@@ -134,25 +150,38 @@ def judged(cases: CatchCase, actions: Array, iterations: int) -> dict[str, Array
 
     Returns:
         solved: 1 or 0.
-        last: how much earlier the last catch is than the estimate of `Greedy`, relative.
+        last: how much earlier the last catch is than the estimate of `Greedy`, relative; zero
+            where targets are optional.
+        caught: how many more targets are taken than by `Greedy`, relative; zero but there.
         ratio: the optimal time ratio (paper 000, eq. 29); zero by the estimate.
         violation: of the plan, 2 at most; by the estimate log(1 + metres out of reach).
     """
     tables = jax.vmap(timetable)(cases)
     choices = jax.vmap(choice_of)(cases, tables, actions)
     nothing = jnp.zeros_like(cases.horizon)
-    greedy = jax.vmap(earliest_next)(cases, tables, nothing).times[:, -1]
+    greedy = jax.vmap(earliest_next)(cases, tables, nothing)
     if iterations:
         found = solve_batch(ExactCatch(), _attempt(iterations), cases.decided(choices))
         solved, times = is_solved(found.status), found.times
         off = jnp.abs(times - choices.times) / jnp.maximum(times, 1e-3)
-        violation, ratio = found.violation, jnp.mean(off, axis=1)
+        taken = jnp.take_along_axis(choices.taken, choices.order, axis=1)
+        number = jnp.maximum(jnp.sum(taken, axis=1), 1)
+        violation, ratio = found.violation, jnp.sum(jnp.where(taken, off, 0.0), axis=1) / number
     else:
-        far = jax.vmap(shortfall)(cases, choices)
+        far = jax.vmap(shortfall)(cases.decided(choices), choices)
         solved, times = far <= 0.0, choices.times
         violation, ratio = jnp.log1p(far), jnp.zeros_like(far)
-    last = (greedy - times[:, -1]) / greedy
-    terms = {"solved": solved, "last": last, "ratio": ratio, "violation": violation}
+    last, caught = (greedy.times - times)[:, -1] / greedy.times[:, -1], jnp.zeros(len(times))
+    if cases.optional:
+        taken, reference = (jnp.sum(choice.taken, axis=1) for choice in (choices, greedy))
+        last, caught = caught, (taken - reference) / jnp.maximum(reference, 1)
+    terms = {
+        "solved": solved,
+        "last": last,
+        "ratio": ratio,
+        "caught": caught,
+        "violation": violation,
+    }
     # A lane that overflows is a bad one, and no more.
     return {
         name: jnp.clip(jnp.nan_to_num(jnp.asarray(term, jnp.float32), nan=2.0), -2.0, 2.0)
@@ -167,6 +196,6 @@ def _attempt(iterations: int) -> Round:
 
 def rewarded(terms: Mapping[str, Array], weights: Mapping[str, float]) -> Array:
     """The reward (B,) of raw terms: what a solved case is worth, or what an unsolved one costs."""
-    good = sum(weights[name] * terms[name] for name in ("solved", "last", "ratio"))
+    good = sum(weights[name] * terms[name] for name in _GATED)
     bad = weights["violation"] * terms["violation"]
     return jnp.where(terms["solved"] > 0.5, good, bad)

@@ -7,6 +7,8 @@ time. Without either the decision is that of `Greedy`; every action is a valid o
 times that rise.
 """
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -48,14 +50,25 @@ def observe(case: CatchCase, table: Timetable) -> Array:
     return jnp.where(case.present[:, None], seen, 0.0).astype(case.gravity.dtype)
 
 
+def turned(seen: Array, angle: Array) -> Array:
+    """What is seen (..., N, FEATURES) after a turn () [rad] of the world about a vertical axis."""
+    cosine, sine = jnp.cos(angle), jnp.sin(angle)
+    parts = jnp.split(seen, [9, 10, 10 + 3 * _SHARES], axis=-1)
+    for k in (0, 2):  # the vectors
+        x, y, z = jnp.moveaxis(parts[k].reshape(*seen.shape[:-1], -1, 3), -1, 0)
+        level = (cosine * x - sine * y, sine * x + cosine * y)
+        parts[k] = jnp.stack([*level, z], axis=-1).reshape(parts[k].shape)
+    return jnp.concatenate(parts, axis=-1)
+
+
 def choice_of(case: CatchCase, table: Timetable, action: Array) -> CatchChoice:
     """Order and times of one case by an action (N, PER_TARGET) of numbers from -1 to 1."""
     action = jnp.where(case.present[:, None], action, 0.0)
     choice = earliest_next(case, table, HANDICAP * action[:, 0])
     times = choice.times * jnp.exp(STRETCH * action[choice.order, 1])
-    present = case.present[choice.order]
-    times = jnp.where(present, jnp.minimum(times, case.horizon[choice.order]), times)
+    taken = choice.taken[choice.order]
+    times = jnp.where(taken, jnp.minimum(times, case.horizon[choice.order]), times)
     # Rising, by an instant at least.
     steps = jnp.asarray(INSTANT * np.arange(times.size), times.dtype)
     rising = lax.cummax(times - steps) + steps
-    return CatchChoice(order=choice.order, times=rising)
+    return dataclasses.replace(choice, times=rising)

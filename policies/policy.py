@@ -13,7 +13,7 @@ from planner_jax.policies.checkpoint import Checkpoint, load_checkpoint, shipped
 from planner_jax.policies.networks import LEAST_STD
 from planner_jax.policies.observation import PER_TARGET, choice_of, observe
 from planner_jax.task.catch.case import CatchCase, CatchChoice
-from planner_jax.task.catch.decide import CatchDecision
+from planner_jax.task.catch.decide import CatchDecision, in_several_lengths
 from planner_jax.task.catch.estimate import timetable
 
 
@@ -40,7 +40,7 @@ class Policy(CatchDecision):
             )
 
     def propose(self, case: CatchCase) -> CatchChoice:
-        """The proposals for one case, leaves (K, N)."""
+        """The proposals for one case, leaves (K, N), or more if targets are optional."""
         table = timetable(case)
         numbers = self.network.apply(self.params, observe(case, table))
         mean, spread = numbers[:, :PER_TARGET], numbers[:, PER_TARGET:]
@@ -49,7 +49,8 @@ class Policy(CatchDecision):
         noise = np.random.default_rng(0).normal(size=shape)
         noise[0] = 0.0
         actions = jnp.tanh(mean + self.spread * deviation * jnp.asarray(noise, mean.dtype))
-        return jax.vmap(functools.partial(choice_of, case, table))(actions)
+        choices = jax.vmap(functools.partial(choice_of, case, table))(actions)
+        return in_several_lengths(case, choices)
 
 
 def policy(file: str | os.PathLike | None = None, **options: Any) -> Policy:

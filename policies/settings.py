@@ -8,6 +8,8 @@ from planner_jax.sweep.settings import SettingError, option, require
 from planner_jax.task.catch.card import SUITES
 
 NETWORK_NAMES = ("attention", "mlp")
+# Of the terms of a reward, see `environment.judged`.
+WEIGHTS = {"solved": 1.0, "last": 5.0, "ratio": -5.0, "caught": 5.0, "violation": -0.5}
 _PAPER = ("parabola1", "parabola2", "harmonic2", "triangle3", "hexagon6")
 
 
@@ -26,11 +28,17 @@ class TrainSettings:
     )
     estimated: int = option(0, "P", "parts, the first ones, in which the estimate judges")
     iterations: tuple[int, ...] = option(
-        (), "K", "of the planner, one a suite (default: 25 for up to three targets, else 80)"
+        (),
+        "K",
+        "of the planner, one a suite; 0: the estimate judges, as it does optional targets "
+        "(default: else 25 for up to three targets, and 80)",
     )
-    last: float = option(5.0, "W", "weight of how early the last catch is")
-    ratio: float = option(5.0, "W", "weight of how far decided times are from the optimised ones")
-    solved: float = option(1.0, "W", "weight of a case that is solved")
+    last: float = option(WEIGHTS["last"], "W", "weight of how early the last catch is")
+    ratio: float = option(
+        -WEIGHTS["ratio"], "W", "weight of how far decided times are from the optimised ones"
+    )
+    solved: float = option(WEIGHTS["solved"], "W", "weight of a case that is solved")
+    caught: float = option(WEIGHTS["caught"], "W", "weight of optional targets that are taken")
     lessons: int = option(0, "N", "cases of each suite whose best decisions are imitated first")
     begin: str | None = option(None, "FILE", "a checkpoint by whose weights it begins")
     kept: float = option(0.0, "F", "share of these weights in those that it ends with")
@@ -56,8 +64,8 @@ class TrainSettings:
                 f"{len(self.iterations)}"
             )
         for number in self.iterations:
-            require(number >= 1, "iterations", ">= 1", number)
-        for name in ("last", "ratio", "solved"):
+            require(number >= 0, "iterations", ">= 0", number)
+        for name in ("last", "ratio", "solved", "caught"):
             value = getattr(self, name)
             require(0.0 <= value < math.inf, name, "finite and >= 0", value)
         require(0.0 <= self.kept <= 1.0, "kept", "from 0 to 1", self.kept)
@@ -85,9 +93,14 @@ class TrainSettings:
             "lanes": lanes // step * step,
             "minibatches": 6,
             "lessons": self.lessons,
-            "weights": (
-                *(("solved", self.solved), ("last", self.last)),
-                *(("ratio", -self.ratio), ("violation", -0.5)),
+            "weights": tuple(
+                {
+                    **WEIGHTS,
+                    "solved": self.solved,
+                    "last": self.last,
+                    "ratio": -self.ratio,
+                    "caught": self.caught,
+                }.items()
             ),
             "begin": self.begin,
             "kept": self.kept,
@@ -98,5 +111,10 @@ class TrainSettings:
         """Of the planner in a part, one a suite; none where the estimate judges."""
         if part < self.estimated:
             return ()
-        own = tuple(25 if SUITES[suite].num_targets <= 3 else 80 for suite in self.suites)
-        return tuple(self.iterations) or own
+
+        def usual(suite: str) -> int:
+            if SUITES[suite].optional:
+                return 0
+            return 25 if SUITES[suite].num_targets <= 3 else 80
+
+        return tuple(self.iterations) or tuple(map(usual, self.suites))

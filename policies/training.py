@@ -30,12 +30,12 @@ from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.planning.plan import plan
 from planner_jax.policies import brax_compat
 from planner_jax.policies.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
-from planner_jax.policies.environment import WEIGHTS, CatchEnv
+from planner_jax.policies.environment import CatchEnv
 from planner_jax.policies.imitation import imitated, lessons
 from planner_jax.policies.networks import LEAST_STD, NETWORKS, Value
 from planner_jax.policies.observation import FEATURES, PER_TARGET
 from planner_jax.policies.policy import Policy
-from planner_jax.policies.settings import TrainSettings
+from planner_jax.policies.settings import WEIGHTS, TrainSettings
 from planner_jax.protocol import solved
 from planner_jax.sweep.run_folder import RunFolder
 from planner_jax.sweep.settings import SettingError
@@ -204,7 +204,7 @@ def _begun_by_imitation(training: Training, network: Any, params: Any) -> Any:
     env = _environment(training, training.parts[0])
     some = lessons(training.suites, training.lessons, 1_000_003 + training.seed, env.size)
     key = jax.random.fold_in(jax.random.key(training.seed), 1)
-    learned, _ = imitated(network, some, key, training.lesson_steps)
+    learned, _ = imitated(network, some, key, training.lesson_steps, params[1])
     return (params[0], learned, params[2])
 
 

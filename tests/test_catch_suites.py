@@ -169,6 +169,39 @@ def test_lines_are_a_triangle_at_angles_of_120_degrees_and_a_hexagon_in_parallel
             assert (middle.max(axis=-1).min(axis=-1) <= 0.5 + 0.08).all()
 
 
+@float64
+@pytest.mark.parametrize(("name", "first", "spread"), [("rush3", 2.35, 0.5), ("rush6", 3.8, 0.6)])
+def test_targets_of_a_rush_are_due_one_after_the_other_in_any_order(name, first, spread):
+    cases = drawn(name, 512)
+    due = np.asarray(cases.horizon)
+    in_order, each = np.sort(due, axis=1), np.argsort(due, axis=1)
+    middle = first + 0.9 * np.arange(due.shape[1])
+    assert (np.abs(in_order - middle) <= 0.5 * spread + 1e-9).all()
+    assert np.abs(in_order - middle).max() > 0.45 * spread
+    # Every target comes first as often as any other.
+    share = np.bincount(each[:, 0]) / len(due)
+    np.testing.assert_allclose(share, 1.0 / due.shape[1], atol=0.08)
+    start = states(cases.targets, until_horizon(cases))
+    assert away(start.pos).max() <= VOLUMES["triangle3" if name == "rush3" else "hexagon6"][0]
+    assert not cases.optional
+
+
+@float64
+@pytest.mark.parametrize("name", ["swarm8", "swarm12"])
+def test_balls_of_a_swarm_sink_all_around_and_may_be_left(name):
+    cases = drawn(name)
+    assert cases.optional
+    ball = states(cases.targets, until_horizon(cases))
+    pos, vel = np.asarray(ball.pos), np.asarray(ball.vel)
+    np.testing.assert_allclose(pos[..., -1, 2], CATCH_HEIGHT, atol=1e-9)
+    assert 2.0 <= pos[..., 0, 2].min() and pos[..., 0, 2].max() <= 6.0
+    assert 5.5 < away(pos[..., 0, :]).max() <= 6.0
+    assert 0.4 <= -vel[..., 2].max() and -vel[..., 2].min() <= 2.0
+    assert 0.25 < away(vel).max() <= 0.3
+    angle = np.arctan2(pos[..., 0, 1], pos[..., 0, 0])
+    assert np.histogram(angle, bins=4, range=(-np.pi, np.pi))[0].min() > 0.15 * angle.size
+
+
 @pytest.mark.parametrize("name", ["hard", "harmonic2", "hexagon6"])
 def test_padding_leaves_the_present_targets_alone(name):
     plain, padded = draw(5, name, 2), draw(5, name, 2, num_targets=8)
@@ -187,7 +220,7 @@ def test_padding_leaves_the_present_targets_alone(name):
 @pytest.mark.parametrize(
     ("arguments", "options", "says"),
     [
-        ((3, "throw"), {}, "suite must be one of throws, hard, .*, hexagon6, got 'throw'"),
+        ((3, "throw"), {}, "suite must be one of throws, hard, .*, swarm12, got 'throw'"),
         ((0, "throws"), {}, "num must be >= 1, got 0"),
         ((3, "throws", -1), {}, "seed must be >= 0, got -1"),
         ((3, "throws", 0), {"first": -1}, "first must be >= 0, got -1"),

@@ -17,10 +17,13 @@ from planner_jax.planning.decided import DecidedPlanner, first_choice
 from planner_jax.planning.plan import plan
 from planner_jax.protocol import Status, is_solved
 from planner_jax.referee.catch import referee_catches
+from planner_jax.task.catch.beam import beam
 from planner_jax.task.catch.decide import (
+    LENGTHS,
     Best,
     Given,
     Greedy,
+    Random,
     closest_approach,
     optimal_time_ratio,
 )
@@ -270,7 +273,7 @@ def test_the_time_ratio_is_that_of_the_present_targets(pairs):
 
 
 def test_an_unknown_decision_is_refused(pairs):
-    known = "best, greedy, given, policy"
+    known = "best, greedy, random, given, policy"
     with pytest.raises(ValueError, match=f"decide must be one of {known}, got 'worst'"):
         pj.catch.planner(decide="worst")
 
@@ -302,3 +305,92 @@ def test_a_target_out_of_reach_is_named_and_its_neighbours_are_not(array, kind, 
     assert plans.status[2] == Status.OUT_OF_REACH
     assert Status(plans.status[2]).message.startswith("a target never comes within reach")
     assert (np.delete(plans.status, 2) != Status.OUT_OF_REACH).all()
+
+
+@pytest.fixture(scope="module")
+def swarm():
+    """Eight balls that may be left, NumPy leaves."""
+    return jax.tree.map(np.asarray, draw(NUM, "swarm8", 2))
+
+
+@pytest.fixture(scope="module")
+def caught(swarm):
+    """Plans of what `Greedy` takes of them."""
+    return plan(by(Greedy()), swarm)
+
+
+@jax.jit
+@jax.vmap
+def beams(case):
+    """The orders (64, N) of the bounded search."""
+    return beam(case, timetable(case), 64)
+
+
+def test_of_three_targets_the_bounded_search_finds_what_all_orders_hold(triangles):
+    found, all_orders = beams(triangles), best(triangles)
+    top = [jax.tree.map(lambda leaf: leaf[:, 0], choices) for choices in (found, all_orders)]
+    first, second = (rank(triangles, choice) for choice in top)
+    np.testing.assert_allclose(first, second, rtol=1e-5)
+
+
+def test_greedy_leaves_optional_targets_that_it_can_no_longer_reach(pairs):
+    optional = dataclasses.replace(pairs, optional=True)
+    found = greedy(optional)
+    assert found.taken.tolist() == [[True, True], [True, False]] + 3 * [[False, True]]
+    np.testing.assert_array_equal(found.order[2:, 0], 1)
+    assert greedy(pairs).taken.all()
+
+
+def test_an_order_of_optional_targets_is_proposed_in_several_lengths(swarm):
+    found = jax.jit(jax.vmap(Greedy().propose))(swarm)
+    assert found.taken.shape == (NUM, LENGTHS, 8)
+    number = np.asarray(found.taken.sum(axis=2))
+    np.testing.assert_array_equal(number, np.maximum(number[:, :1] - np.arange(LENGTHS), 0))
+    ranked = np.take_along_axis(np.asarray(found.taken), np.asarray(found.order), axis=2)
+    assert (np.diff(ranked.astype(int), axis=2) <= 0).all(), "those that are taken come first"
+
+
+def test_what_is_taken_of_a_swarm_is_caught_and_counted(swarm, caught):
+    verdict = referee_catches(swarm, caught)
+    solved = np.asarray(is_solved(caught.status))
+    assert solved.mean() > 0.5
+    assert verdict.success[solved].all()
+    np.testing.assert_array_equal(verdict.num_caught[solved], caught.num_taken[solved])
+    all_of_them = referee_catches(dataclasses.replace(swarm, optional=False), caught)
+    assert not all_of_them.success.any() and set(all_of_them.failed_limit) == {"catch time"}
+    taken = caught.choice.taken
+    np.testing.assert_array_equal(np.asarray(taken).sum(axis=1), caught.num_taken)
+
+
+def test_a_claimed_catch_of_an_optional_target_has_to_hold(swarm, caught):
+    """With a ball that is elsewhere a plan is no success, and one catch fewer is counted."""
+    moved = np.array(swarm.targets.ball.pos)
+    moved[np.arange(NUM), caught.order[:, 0]] += 1.0
+    ball = dataclasses.replace(swarm.targets.ball, pos=moved)
+    targets = dataclasses.replace(swarm.targets, ball=ball)
+    verdict = referee_catches(dataclasses.replace(swarm, targets=targets), caught)
+    assert not verdict.success.any()
+    assert (verdict.num_caught < caught.num_taken).all()
+
+
+def test_a_search_takes_more_of_a_swarm_than_greed(swarm):
+    """By the estimate; and the most of what was planned is what stays."""
+    found = beams(swarm)
+    number = np.asarray(found.taken.sum(axis=2))
+    assert (number == number[:, :1]).all()
+    assert number[:, 0].mean() > np.asarray(greedy(swarm).taken.sum(axis=1)).mean()
+    times = np.asarray(found.times)
+    assert (np.diff(times, axis=2) > 0.0).all()
+    decided = swarm.decided(jax.tree.map(lambda leaf: leaf[:, 0], found))
+    plans = plan(by(Given()), decided)
+    kept = Best().rank(plans)
+    fewer = Best().rank(dataclasses.replace(plans, times=np.maximum(plans.times, 0) * 0.0))
+    assert (kept < fewer).all()
+
+
+def test_random_orders_are_permutations_and_the_same_for_equal_cases(triangles):
+    choices = [jax.jit(jax.vmap(Random(seed).propose))(triangles) for seed in (0, 0, 1)]
+    orders = [np.asarray(choice.order)[:, 0] for choice in choices]
+    np.testing.assert_array_equal(np.sort(orders[0], axis=1), np.tile(np.arange(3), (NUM, 1)))
+    np.testing.assert_array_equal(orders[0], orders[1])
+    assert (orders[0] != orders[2]).any() and len(np.unique(orders[0], axis=0)) > 1

@@ -17,6 +17,7 @@ from planner_jax.policies.checkpoint import CheckpointError, load_checkpoint, sa
 from planner_jax.policies.networks import NETWORKS
 from planner_jax.policies.observation import FEATURES, PER_TARGET, choice_of, observe
 from planner_jax.policies.policy import Policy, policy
+from planner_jax.policies.settings import WEIGHTS
 from planner_jax.sweep.settings import SettingError
 from planner_jax.task.catch.estimate import INSTANT, shortfall, timetable
 from planner_jax.task.catch.suites import draw_by_key
@@ -190,10 +191,11 @@ def test_a_reward_pays_early_catches_only_where_they_are_made():
         "solved": jnp.array([1.0, 0.0]),
         "last": jnp.array([0.1, 0.9]),
         "ratio": jnp.array([0.05, 0.0]),
+        "caught": jnp.array([0.0, 0.5]),
         "violation": jnp.array([0.0, 1.0]),
     }
-    reward = environment.rewarded(terms, environment.WEIGHTS)
-    np.testing.assert_allclose(reward, [1.0 + 0.5 - 0.1, -0.5])
+    reward = environment.rewarded(terms, WEIGHTS)
+    np.testing.assert_allclose(reward, [1.0 + 0.5 - 0.25, -0.5])
 
 
 @pytest.mark.slow

@@ -39,8 +39,8 @@ from planner_jax.referee.verdict import Verdict
 # named after its first failure.
 _SENTENCES = {
     "not finite": "the plan or its case is not finite",
-    "order": "{excess:.0f} wrong, the first at {time:.3f} s; every present target must have one "
-    "place, before the absent ones",
+    "order": "{excess:.0f} wrong, the first at {time:.3f} s; every target that is caught must have "
+    "one place, before the others",
     "catch time": "off by {excess:.3g} s at {time:.3f} s; catches must be at rising positive "
     "times, where their pieces end, and not after the target's horizon",
     "head state": "the trajectory starts {excess:.3g} m off the head state",
@@ -114,6 +114,8 @@ def referee_catches(
     Catch i (i = 0, 1, ... in the plan's order) is the end of piece (i + 1) M - 1. Pieces after
     the last present target that have no duration are not looked at, and neither is anything
     that belongs to an absent target; with a duration they are flown, and judged like the rest.
+    Where targets are optional a plan catches as many as it has pieces for: each of these catches
+    is judged, and `num_caught` says how many hold.
     Speed, thrust, body rate and height are sampled at both ends and inside of every piece and
     their peaks searched on the polynomial itself. Errors at time 0 and between pieces count as
     displacement (`referee.quadrotor.joint_errors`). A lane without targets has nothing to fail.
@@ -128,7 +130,8 @@ def referee_catches(
 
     Args:
         cases: object with the fields of `CatchCase`, leaves with leading axis B; those
-            of `targets` with (B, N). Its order and times are not read.
+            of `targets` with (B, N). Its order and times are not read, and without `optional`
+            all present targets are to be caught.
         plans: object with the fields of `CatchPlan`, leaves with leading axis B; coefficients
             (B, N * M, D + 1, 3), durations (B, N * M).
         target_states: for targets of any other class:
@@ -159,6 +162,7 @@ def referee_catches(
     if net_test not in ("plane", "ball"):
         raise ValueError(f'net_test must be "plane" or "ball", got {net_test!r}')
     leaves = _leaves(cases, plans)
+    optional = bool(getattr(cases, "optional", False))
     shape = leaves["present"].shape
     # A broken lane is told by its verdict, not by a warning.
     with np.errstate(all="ignore"):
@@ -176,6 +180,7 @@ def referee_catches(
         extras=getattr(cases, "extras", ()),
         intervals=intervals_of(samples, leaves["durations"].shape[1] // shape[1]),
         net_test=net_test,
+        optional=optional,
         tolerances={
             "relative": tolerance,
             "contact": contact_tolerance,
@@ -323,15 +328,22 @@ def _table_states(pos, vel, resolution, times) -> tuple[np.ndarray, np.ndarray]:
     return read(pos) + (times - inside)[..., None] * at, at
 
 
-def _judge(case: dict, extras: tuple, intervals: int, net_test: str, tolerances: dict) -> dict:
+def _judge(
+    case: dict, extras: tuple, intervals: int, net_test: str, optional: bool, tolerances: dict
+) -> dict:
     """The fields of `CatchVerdict` for one chunk of lanes."""
     durations, present = case["durations"], case["present"] != 0.0
     num = present.shape[1]
     ends = _ends(durations, num)
-    due = np.arange(num) < present.sum(axis=1, keepdims=True)
-    flown = np.repeat(due, durations.shape[1] // num, axis=1) | (durations != 0.0)
+    each = durations.shape[1] // num
+    number = present.sum(axis=1, keepdims=True)
+    if optional:
+        planned = (durations.reshape(len(durations), num, each) != 0.0).any(axis=2)
+        number = np.minimum(planned.cumprod(axis=1).sum(axis=1, keepdims=True), number)
+    due = np.arange(num) < number
+    flown = np.repeat(due, each, axis=1) | (durations != 0.0)
     pieces = pieces_of(case["coeffs"], durations, flown)
-    right, target = _places(case["order"], present, due)
+    right, target = _places(case["order"], present, due, optional)
     lanes = np.arange(len(due))
     wrong = (~right).sum(axis=1).astype(np.float64)
     order_test = (wrong > 0.0, wrong, ends[lanes, right.argmin(axis=1)])
@@ -365,11 +377,13 @@ def _judge(case: dict, extras: tuple, intervals: int, net_test: str, tolerances:
     return verdict | motion | measured | {"caught": caught, "num_caught": caught.sum(axis=1)}
 
 
-def _places(order: np.ndarray, present: np.ndarray, due: np.ndarray) -> tuple:
+def _places(
+    order: np.ndarray, present: np.ndarray, due: np.ndarray, optional: bool
+) -> tuple[np.ndarray, np.ndarray]:
     """Places (B, N) of the order that are right, and the target that each one names.
 
-    The first places, those that are due, name present targets, the others absent ones, and
-    none names a target that has been named before.
+    The first places, those that are due, name present targets, the others absent ones (or any
+    that are left where targets are optional), and none names a target that has been named before.
     """
     num = due.shape[1]
     order = np.nan_to_num(order, nan=-1.0)
@@ -378,7 +392,8 @@ def _places(order: np.ndarray, present: np.ndarray, due: np.ndarray) -> tuple:
     same = (target[:, :, None] == target[:, None, :]) & named[:, None, :]
     repeated = np.tril(same, -1).any(axis=2)
     kind = present[np.arange(len(due))[:, None], target]
-    return named & (kind == due) & ~repeated, target
+    fits = kind | ~due if optional else kind == due
+    return named & fits & ~repeated, target
 
 
 def _judge_catches(case, pieces, held, ends, net_test: str, tolerances: dict) -> tuple[dict, dict]:

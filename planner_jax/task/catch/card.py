@@ -18,6 +18,7 @@ class Suite:
     success: float | None = None
     time_ratio: float | None = None
     mpp_success: float | None = None
+    optional: bool = False  # whether targets may be left: there are more than can be caught
 
 
 # The ranges are those of `planner_jax.task.catch.suites`.
@@ -33,11 +34,18 @@ SUITES = {
     "harmonic2": Suite(2, 7.0, "Two targets that swing in height and drift across.", 84.7, 0.234),
     "triangle3": Suite(3, 6.0, "Three targets along the sides of a triangle.", 99.7, 0.126),
     "hexagon6": Suite(6, 10.0, "Six targets in parallel, on a hexagon.", 76.3, 0.458),
+    "rush3": Suite(3, 4.4, "Three targets of `triangle3`, each with a deadline of its own."),
+    "rush6": Suite(6, 8.6, "Six targets of `hexagon6`, each with a deadline of its own."),
+    "swarm8": Suite(8, 13.9, "Eight balls that sink all around: as many as can be.", optional=True),
+    "swarm12": Suite(
+        12, 13.9, "Twelve balls that sink all around: as many as can be.", optional=True
+    ),
 }
 
 DECISIONS = {
     "best": "planner_jax.task.catch.decide:Best",
     "greedy": "planner_jax.task.catch.decide:Greedy",
+    "random": "planner_jax.task.catch.decide:Random",
     "given": "planner_jax.task.catch.decide:Given",
     "policy": "planner_jax.policies.policy:policy",
 }

@@ -51,8 +51,9 @@ class Net:
 class CatchChoice:
     """What a decision settles of a catch."""
 
-    order: Array  # (N,) int32, a permutation, present targets first
+    order: Array  # (N,) int32, a permutation, the targets that are taken first
     times: Array  # (N,) [s], rising, when to catch in that order, before any optimisation
+    taken: Array  # (N,) bool, of the targets as the case has them; the others are left
 
 
 @struct.dataclass
@@ -73,6 +74,7 @@ class CatchCase:
     net: Net
     limits: CatchLimits
     extras: tuple[Any, ...] = ()  # limits and costs of the user's own, see `cost.extras`
+    optional: bool = struct.field(pytree_node=False, default=False)  # targets may be left
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -85,8 +87,9 @@ class CatchCase:
         return np.shape(self.present)[-1]
 
     def decided(self, choice: CatchChoice) -> "CatchCase":
-        """The case, or the batch, with an order and times."""
-        return dataclasses.replace(self, order=choice.order, times=choice.times)
+        """The case, or the batch, with an order and times, without the targets that are left."""
+        present = self.present & choice.taken
+        return dataclasses.replace(self, order=choice.order, times=choice.times, present=present)
 
 
 def case(
@@ -105,6 +108,7 @@ def case(
     body_rate=5.0,
     min_height=0.25,
     extras: Sequence[Extra] = (),
+    optional: bool = False,
     dtype=jnp.float32,
 ) -> CatchCase:
     """A catch, or a batch of them, with the setting of paper 000.
@@ -130,6 +134,7 @@ def case(
         min_height: [m].
         extras: such as `pj.KeepOut`, each for one case, which all of them get, or with the
             batch's axes on every leaf.
+        optional: whether targets may be left: as many as can be are to be caught, not all.
         dtype: of every floating leaf.
     """
     shape = np.shape(horizon)
@@ -159,4 +164,5 @@ def case(
             min_height=leaf(min_height),
         ),
         extras=for_batch(extras, batch, dtype),
+        optional=optional,
     )

@@ -1,4 +1,8 @@
-"""When and in what order to catch: by estimated arrival, or the best of all orders."""
+"""When and in what order to catch: by estimated arrival, or the best of all orders.
+
+Where targets are optional a decision also settles which are left, and every order is proposed
+in several lengths: the planner keeps the plan that catches most.
+"""
 
 import dataclasses
 import functools
@@ -7,12 +11,16 @@ import itertools
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 
 from planner_jax.protocol import Status, is_unsolved
+from planner_jax.task.catch.beam import beam
 from planner_jax.task.catch.case import CatchCase, CatchChoice
 from planner_jax.task.catch.estimate import GRID, earliest_next, follow, sampled, timetable
 from planner_jax.task.catch.plan import CatchPlan
+
+LENGTHS = 3  # in which an order of optional targets is proposed
+MOST_PERMUTED = 6  # targets, of which all orders are looked at
 
 
 def closest_approach(cases: CatchCase) -> Array:
@@ -44,15 +52,36 @@ def _closest_approach(case: CatchCase) -> Array:
 _closest_approaches = jax.jit(jax.vmap(_closest_approach))
 
 
+def in_several_lengths(case: CatchCase, choices: CatchChoice) -> CatchChoice:
+    """Choices (K, N) as they are, or (K * LENGTHS, N) where targets are optional.
+
+    Each is then also proposed without its last catch, its last two, ...: whether the last ones
+    can be reached is more than an estimate knows.
+    """
+    if not case.optional:
+        return choices
+
+    def of_choice(choice: CatchChoice) -> CatchChoice:
+        place = jnp.argsort(choice.order)
+        number = jnp.sum(choice.taken) - np.arange(LENGTHS)
+        taken = choice.taken & (place < number[:, None])
+        whole = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (LENGTHS, *leaf.shape)), choice)
+        return dataclasses.replace(whole, taken=taken)
+
+    several = jax.vmap(of_choice)(choices)
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), several)
+
+
 def optimal_time_ratio(cases: CatchCase, plans: CatchPlan) -> np.ndarray:
-    """Mean of |T_o - T_p| / T_o over the targets of every case, (B,) (paper 000, eq. 29).
+    """Mean of |T_o - T_p| / T_o over the targets that are caught, (B,) (paper 000, eq. 29).
 
     Args:
         cases: a batch.
         plans: of them, with the times T_p that were decided and the optimised ones T_o.
     """
     decided_times, optimised = np.asarray(plans.decided_times), np.asarray(plans.times)
-    present = np.take_along_axis(np.asarray(cases.present), np.asarray(plans.order), axis=1)
+    present = np.asarray(cases.present & plans.choice.taken)
+    present = np.take_along_axis(present, np.asarray(plans.order), axis=1)
     with np.errstate(all="ignore"):
         ratio = np.where(present, np.abs(optimised - decided_times) / optimised, 0.0)
         return ratio.sum(axis=1) / present.sum(axis=1)
@@ -65,8 +94,8 @@ class CatchDecision:
         """Any batch will do."""
 
     def rank(self, plans: CatchPlan) -> Array:
-        """The time of the last catch [s], one a plan."""
-        return plans.times[..., -1]
+        """The time of the last catch [s], one a plan; far later for any target that is left."""
+        return plans.times[..., -1] + 100.0 * (plans.times.shape[-1] - plans.num_taken)
 
     def explain(self, case: CatchCase, status: Array) -> Array:
         """OUT_OF_REACH for an unsolved case with a target that `closest_approach` rules out."""
@@ -80,19 +109,26 @@ class Best(CatchDecision):
     """The most promising of all orders are planned, and the earliest last catch is kept.
 
     All N! orders are estimated. Those with the least shortfall, then the earliest last catch,
-    are the finalists.
+    are the finalists. Beyond six targets, and where they are optional, the orders are those that
+    a beam search finds.
     """
 
     finalists: int = 6  # orders that are planned
+    width: int = 64  # of the beam
 
     def __post_init__(self) -> None:
         if self.finalists < 1:
             raise ValueError(f"finalists must be >= 1, got {self.finalists}")
+        if self.width < self.finalists:
+            raise ValueError(f"width must be >= {self.finalists} finalists, got {self.width}")
 
     def propose(self, case: CatchCase) -> CatchChoice:
         """The finalists of one case, leaves (F, N)."""
-        orders = jnp.asarray(list(itertools.permutations(range(case.num_targets))), jnp.int32)
         table = timetable(case)
+        if case.optional or case.num_targets > MOST_PERMUTED:
+            found = beam(case, table, self.width)
+            return in_several_lengths(case, jax.tree.map(lambda x: x[: self.finalists], found))
+        orders = jnp.asarray(list(itertools.permutations(range(case.num_targets))), jnp.int32)
         choices, shortfall = jax.vmap(functools.partial(follow, case, table))(orders)
         rank = choices.times[:, -1] + 10.0 * shortfall
         chosen = jnp.argsort(rank)[: min(self.finalists, len(orders))]
@@ -105,9 +141,26 @@ class Greedy(CatchDecision):
     """Next is caught whatever can be caught earliest."""
 
     def propose(self, case: CatchCase) -> CatchChoice:
-        """The one choice for one case, leaves (1, N)."""
+        """The one choice for one case, leaves (1, N), or (LENGTHS, N) if targets are optional."""
         choice = earliest_next(case, timetable(case), jnp.zeros_like(case.horizon))
-        return jax.tree.map(lambda leaf: leaf[None], choice)
+        return in_several_lengths(case, jax.tree.map(lambda leaf: leaf[None], choice))
+
+
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class Random(CatchDecision):
+    """Next is any target that can be caught, as early as it can be; the same for equal cases."""
+
+    seed: int = 0
+
+    def propose(self, case: CatchCase) -> CatchChoice:
+        """The one choice for one case, leaves (1, N), or (LENGTHS, N) if targets are optional."""
+        table = timetable(case)
+        own = lax.bitcast_convert_type(jnp.sum(table.places).astype(jnp.float32), jnp.uint32)
+        key = jax.random.fold_in(jax.random.key(self.seed), own)
+        handicap = 1e3 * jax.random.uniform(key, case.horizon.shape, case.horizon.dtype)
+        choice = earliest_next(case, table, handicap)
+        return in_several_lengths(case, jax.tree.map(lambda leaf: leaf[None], choice))
 
 
 @jax.tree_util.register_static
@@ -127,4 +180,4 @@ class Given(CatchDecision):
 
     def propose(self, case: CatchCase) -> CatchChoice:
         """The one choice of one case, leaves (1, N)."""
-        return CatchChoice(order=case.order[None], times=case.times[None])
+        return CatchChoice(order=case.order[None], times=case.times[None], taken=case.present[None])

@@ -20,6 +20,9 @@ _ACCELERATION = 7.0  # [m/s^2], sustained, of the estimate
 _TURNING = 0.2  # [s] to begin to move
 INSTANT = 0.05  # [s], between two catches at least
 _STEEPEST = -0.2  # least upward part of the way back along the target's path
+# [m], by which an optional target may be out of the estimate's reach and is still tried: plans go
+# a little farther than the estimate.
+_TRIED = 0.8
 
 
 @struct.dataclass
@@ -93,13 +96,18 @@ def _out_of_reach(way: Array, span: Array, speed: Array) -> Array:
 
 
 def shortfall(case: CatchCase, choice: CatchChoice) -> Array:
-    """How far () [m], all in all, targets are out of the estimate's reach at chosen times."""
+    """How far () [m], all in all, targets are out of the estimate's reach at chosen times.
+
+    The case is one as it was decided: what it leaves does not count, and neither does, of optional
+    targets, what is tried even so.
+    """
     order, times = choice.order, choice.times
     targets = jax.tree.map(lambda leaf: leaf[order], case.targets)
     places, penalty = _to_catch(case, targets_at(targets, times))
     before = jnp.concatenate([case.head_state[:1], places[:-1]])
     span = jnp.diff(times, prepend=jnp.zeros_like(times[:1]))
     short = _out_of_reach(places - before, span, top_speed(case)) + penalty
+    short = jnp.maximum(short - _TRIED, 0.0) if case.optional else short
     return jnp.sum(jnp.where(case.present[order], short, 0.0))
 
 
@@ -119,11 +127,13 @@ def follow(case: CatchCase, table: Timetable, order: Array) -> tuple[CatchChoice
 
     start = (jnp.zeros_like(case.gravity), case.head_state[0])
     _, (times, shortfalls) = jax.lax.scan(advance, start, order)
-    return CatchChoice(order=order, times=times), jnp.sum(shortfalls)
+    return CatchChoice(order=order, times=times, taken=case.present), jnp.sum(shortfalls)
 
 
 def earliest_next(case: CatchCase, table: Timetable, handicap: Array) -> CatchChoice:
     """Next is caught whatever can be caught earliest; absent targets come last, in any order.
+
+    Where targets are optional those that can no longer be reached are left, and come last too.
 
     Args:
         case: one case.
@@ -135,15 +145,26 @@ def earliest_next(case: CatchCase, table: Timetable, handicap: Array) -> CatchCh
     def advance(state: tuple, _: None) -> tuple[tuple, tuple[Array, Array]]:
         begin, place, left = state
         times, places, shortfalls = arrivals(table, begin, place, speed)
-        rank = jnp.where(case.present, times + 10.0 * shortfalls + handicap, 1e9)
+        possible = takeable(case, shortfalls)
+        rank = jnp.where(possible, later_by_shortfall(times, shortfalls) + handicap, 1e9)
         target = jnp.argmin(jnp.where(left, rank, jnp.inf)).astype(jnp.int32)
-        here = case.present[target]
+        here = possible[target]
         time, there = _caught(here, begin, place, times[target], places[target])
-        return (time, there, left.at[target].set(False)), (target, time)
+        return (time, there, left.at[target].set(False)), (target, time, here)
 
     start = (jnp.zeros_like(case.gravity), case.head_state[0], jnp.ones(case.num_targets, bool))
-    _, (order, times) = jax.lax.scan(advance, start, length=case.num_targets)
-    return CatchChoice(order=order, times=times)
+    _, (order, times, here) = jax.lax.scan(advance, start, length=case.num_targets)
+    return CatchChoice(order=order, times=times, taken=jnp.zeros_like(here).at[order].set(here))
+
+
+def later_by_shortfall(times: Array, shortfalls: Array) -> Array:
+    """Times [s] by which catches are ranked: what is out of reach [m] counts as late."""
+    return times + 10.0 * shortfalls
+
+
+def takeable(case: CatchCase, shortfalls: Array) -> Array:
+    """Which targets (N,) may be the next, of which `arrivals` tells the shortfalls (N,) [m]."""
+    return case.present & (shortfalls <= _TRIED) if case.optional else case.present
 
 
 def top_speed(case: CatchCase) -> Array:

@@ -42,12 +42,28 @@ height of 1 to 3.5 m, and no farther away than `reach` while it may be caught.
 - hexagon6: six targets 1 to 1.5 m from the centre of a level hexagon, all at one velocity; the
   centre is up to 0.5 m from the axis on either of e1, e2 after 4 to 6 s.
 
-The targets of the last two fly level. Three velocities 120 degrees apart, as the paper has
-them, lie in one plane, and in the level one no target sinks, which would ease its catch: the
+The targets of triangle3 and hexagon6 fly level. Three velocities 120 degrees apart, as the paper
+has them, lie in one plane, and in the level one no target sinks, which would ease its catch: the
 net must lean over by 60 degrees at least, 90 less theta_safe, at every catch.
+
+Rushes. The targets of `triangle3` and `hexagon6`, each of which may be caught until a moment of
+its own: in a random order the first until `first`, each other one `after` later, and every one up
+to half of `spread` sooner or later. What can be caught first is often not what has to be.
+
+| suite | targets of | first [s] | after [s] | spread [s] |
+|---|---|---|---|---|
+| rush3 | triangle3 | 2.35 | 0.9 | 0.5 |
+| rush6 | hexagon6 | 3.8 | 0.9 | 0.6 |
+
+Swarms. Light balls that sink at a constant speed, more of them than can be caught: any may be
+left, and the score is how many are caught. Each begins within 6 m of the vertical axis through
+the origin, at a height of 2 to 6 m, sinks at 0.4 to 2 m/s, drifts at up to 0.3 m/s, and may be
+caught until it falls through 0.45 m. `swarm8` and `swarm12` have as many as their names say.
+Where balls may be caught for long, what can be caught next is far from what should be.
 """
 
 import dataclasses
+import functools
 import zlib
 from collections.abc import Callable
 from typing import Any
@@ -138,6 +154,7 @@ def draw(
         horizon[:, place],
         present=np.arange(size) < own,
         gravity=np.full(num, GRAVITY),
+        optional=SUITES[suite].optional,
         dtype=dtype,
     )
     return dataclasses.replace(cases, limits=cases.limits.scaled(limit_scale, cases.gravity))
@@ -176,8 +193,7 @@ def _targets(suite: str, uniform: Any) -> tuple[Any, Any]:
     throws = _THROWS.get(suite)
     if throws:
         return _throws(uniform, throws)
-    targets = _PATHS[suite][1](uniform)
-    return targets, np.full((len(uniform), SUITES[suite].num_targets), SUITES[suite].horizon)
+    return _PATHS[suite][1](uniform)
 
 
 def _module(array: Any) -> Any:
@@ -271,7 +287,7 @@ def _lines(pos: Any, vel: Any) -> BallPath:
     return _balls(pos, vel, np.zeros(pos.shape), np.zeros(pos.shape[:2]))
 
 
-def _harmonic(uniform: Any) -> HarmonicPath:
+def _harmonic(uniform: Any) -> tuple[HarmonicPath, Any]:
     """Two swings from nine numbers each."""
     u = uniform.reshape(len(uniform), 2, 9)
     drift = _between(u[..., :1], 1.0, 1.5) * _unit(2.0 * np.pi * u[..., 1])
@@ -281,20 +297,21 @@ def _harmonic(uniform: Any) -> HarmonicPath:
     rate, phase = _between(u[..., 6], 1.5, 2.5), 2.0 * np.pi * u[..., 7]
     when = _between(u[..., 8:9], 2.0, 5.0)
     leaves: tuple[Any, ...] = (near - drift * when, drift, swing, rate, phase)
-    return HarmonicPath(*leaves)
+    return HarmonicPath(*leaves), np.full(when.shape[:2], SUITES["harmonic2"].horizon)
 
 
-def _triangle(uniform: Any) -> BallPath:
+def _triangle(uniform: Any) -> tuple[BallPath, Any]:
     """Three targets on the sides of an equilateral triangle, from seven numbers."""
     xp, u = _module(uniform), uniform[:, :, None]
     centre = xp.concatenate([uniform[:, :2] - 0.5, _between(uniform[:, 2:3], 1.5, 2.5)], axis=1)
     corner = 2.0 * np.pi * (u[:, 3] + np.arange(3) / 3.0)
     radius, speed = _between(u[:, 4:5], 3.0, 4.0), _between(u[:, 5:6], 1.0, 1.5)
     side = np.pi / 6.0 * xp.where(u[:, 6] < 0.5, 1.0, -1.0)  # to the left or to the right
-    return _lines(centre[:, None] + radius * _unit(corner), -speed * _unit(corner + side))
+    targets = _lines(centre[:, None] + radius * _unit(corner), -speed * _unit(corner + side))
+    return targets, np.full(corner.shape, SUITES["triangle3"].horizon)
 
 
-def _hexagon(uniform: Any) -> BallPath:
+def _hexagon(uniform: Any) -> tuple[BallPath, Any]:
     """Six targets in parallel on a hexagon, from eight numbers."""
     xp, u = _module(uniform), uniform[:, :, None]
     near = xp.concatenate([uniform[:, :2] - 0.5, _between(uniform[:, 2:3], 1.5, 2.5)], axis=1)
@@ -303,12 +320,43 @@ def _hexagon(uniform: Any) -> BallPath:
     vel = speed * _unit(2.0 * np.pi * u[:, 6])[:, 0:1]
     when = _between(u[:, 7:8], 4.0, 6.0)
     pos = near[:, None] + radius * _unit(corner) - vel * when
-    return _lines(pos, xp.broadcast_to(vel, pos.shape))
+    targets = _lines(pos, xp.broadcast_to(vel, pos.shape))
+    return targets, np.full(corner.shape, SUITES["hexagon6"].horizon)
 
 
-# Suite -> how many numbers a case takes, and what makes targets of them.
+def _rush(
+    uniform: Any, *, of: Callable, num: int, first: float, after: float, spread: float
+) -> tuple[BallPath, Any]:
+    """Targets of another suite with horizons of their own, from two numbers more for each."""
+    xp, own = _module(uniform), uniform[:, : -2 * num]
+    order = xp.argsort(uniform[:, -2 * num : -num], axis=1)
+    return of(own)[0], first + after * order + spread * (uniform[:, -num:] - 0.5)
+
+
+def _swarm(uniform: Any, *, num: int) -> tuple[BallPath, Any]:
+    """Balls that sink all around, from six numbers each."""
+    xp, u = _module(uniform), uniform.reshape(len(uniform), num, 6)
+    height, sinking = _between(u[..., 2:3], 2.0, 6.0), _between(u[..., 3:4], 0.4, 2.0)
+    level = 6.0 * xp.sqrt(u[..., 1:2]) * _unit(2.0 * np.pi * u[..., 0])
+    drift = _between(u[..., 4:5], 0.0, 0.3) * _unit(2.0 * np.pi * u[..., 5])
+    pos = xp.concatenate([level[..., :2], height], axis=-1)
+    vel = xp.concatenate([drift[..., :2], -sinking], axis=-1)
+    return _lines(pos, vel), ((height - CATCH_HEIGHT) / sinking)[..., 0]
+
+
+# Suite -> how many numbers a case takes, and what makes targets and horizons of them.
 _PATHS: dict[str, tuple[int, Callable]] = {
     "harmonic2": (18, _harmonic),
     "triangle3": (7, _triangle),
     "hexagon6": (8, _hexagon),
+    "rush3": (
+        7 + 6,
+        functools.partial(_rush, of=_triangle, num=3, first=2.35, after=0.9, spread=0.5),
+    ),
+    "rush6": (
+        8 + 12,
+        functools.partial(_rush, of=_hexagon, num=6, first=3.8, after=0.9, spread=0.6),
+    ),
+    "swarm8": (8 * 6, functools.partial(_swarm, num=8)),
+    "swarm12": (12 * 6, functools.partial(_swarm, num=12)),
 }
