@@ -142,7 +142,7 @@ def earliest_next(case: CatchCase, table: Timetable, handicap: Array) -> CatchCh
     """
     speed = top_speed(case)
 
-    def advance(state: tuple, _: None) -> tuple[tuple, tuple[Array, Array]]:
+    def advance(state: tuple, _: None) -> tuple[tuple, tuple[Array, Array, Array]]:
         begin, place, left = state
         times, places, shortfalls = arrivals(table, begin, place, speed)
         possible = takeable(case, shortfalls)
