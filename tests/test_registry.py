@@ -110,7 +110,7 @@ def test_unknown_names_are_told_in_one_line_which_there_are():
     )
     assert_one_line(
         lambda: pj.catch.planner(decide="late"),
-        "^decide must be one of best, greedy, given, policy, got 'late'$",
+        "^decide must be one of best, greedy, random, given, policy, got 'late'$",
     )
     assert_one_line(
         lambda: pj.hit.draw(1, "S.7"), r"^suite must be one of court, S\.1, .*, got 'S\.7'$"

@@ -20,6 +20,7 @@ _SOLVED = ("CONVERGED", "FEASIBLE")
 _DECISIONS = {
     "best": "the most promising of all orders planned, the earliest last catch kept",
     "greedy": "next whatever can be caught earliest",
+    "random": "next any that can be caught",
     "given": "the targets as they come, at even shares of the horizon",
     "policy": "those of a network trained by reinforcement",
 }
