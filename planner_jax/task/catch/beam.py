@@ -79,7 +79,7 @@ def beam(case: CatchCase, table: Timetable, width: int) -> CatchChoice:
         position=jnp.full((width, num), num, jnp.int32),
         times=jnp.zeros((width, num), case.gravity.dtype),
     )
-    _, depths = lax.scan(advance, begin, np.arange(num))
+    _, depths = lax.scan(advance, begin, jnp.arange(num))
     depths = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), begin, depths)
     most = jnp.sum(jnp.any(jnp.isfinite(depths.rank[1:]), axis=1))
     found = jax.tree.map(lambda leaf: leaf[most], depths)
