@@ -8,18 +8,21 @@ import math
 import pkgutil
 from typing import Any, ClassVar
 
-from planner_jax.registry import Task, UnknownName, all_tasks
+from planner_jax.registry import Task, UnknownName, all_tasks, split_name
 from planner_jax.sims.noise import NOISES, PLANE_NOISES, PlaneSensing, Sensing, require_whole
 from planner_jax.sims.robots.arm.drives import ENCODERS, TORQUES, Drives
 from planner_jax.sweep.block.settings import REGIMES
 from planner_jax.sweep.settings import SettingError, option, require, require_one_of
 from planner_jax.task.block.card import TASK as BLOCK
+from planner_jax.task.catch.card import DECISIONS, TRAINED
 from planner_jax.task.catch.card import TASK as CATCH
 from planner_jax.task.hit.card import TASK as HIT
 from planner_jax.task.intercept.card import GROUPS
 from planner_jax.task.intercept.card import TASK as INTERCEPT
 
 _REPLAN = "plans a second, 0 for the first only (default: {} with {}, 0 with other planners)"
+# Flights have no order or times of their own to be given.
+_FLOWN_DECISIONS = {name: where for name, where in DECISIONS.items() if name != "given"}
 INTERVAL = 0.8  # [s], from throw to throw (paper 000, Fig. 1)
 
 
@@ -128,6 +131,14 @@ class CatchFly(BallFly):
     replan: float | None = option(None, "HZ", _REPLAN.format(100, "exact"))
     planner: str = option("exact", "NAME", "of plans from scratch")
     balls: int = option(1, "N", f"thrown {INTERVAL:g} s apart")
+    decide: str = option(
+        "greedy", "NAME", f"order and first times: {', '.join(_FLOWN_DECISIONS)}, policy:FILE"
+    )
+    redecide: float | None = option(
+        None,
+        "HZ",
+        "rate at which order and times are decided anew, 0 for never (default: that of --replan)",
+    )
 
     TASK: ClassVar[Task] = CATCH
     FLIGHT: ClassVar[str] = "planner_jax.sims.tasks.catch:CatchFlight"
@@ -136,12 +147,36 @@ class CatchFly(BallFly):
     def __post_init__(self) -> None:
         super().__post_init__()
         require(self.balls >= 1, "balls", ">= 1", self.balls)
+        try:
+            split_name(_FLOWN_DECISIONS, "decide", self.decide, TRAINED)
+        except UnknownName as error:
+            raise SettingError(str(error)) from None
+
+    @property
+    def redecide_rate(self) -> float:
+        """[Hz] of deciding anew."""
+        return self.rate if self.redecide is None else self.redecide
+
+    def flight(self) -> Any:
+        """As for every task.
+
+        Raises:
+            SettingError: the policy's file cannot be read.
+        """
+        from planner_jax.task.named_decision import named_decision
+
+        named_decision(DECISIONS, self.decide, TRAINED)
+        return super().flight()
 
     def check_rate(self) -> None:
         """Raise `ValueError` unless a plan also begins whenever a ball comes into sight."""
         super().check_rate()
         if self.balls > 1:
             require_interval(NOISES[self.noise], self.rate)
+        if self.redecide:
+            rule = f"0 or a divisor of the {self.rate:g} Hz at which plans are made anew"
+            require(0.0 < self.redecide <= self.rate, "redecide", rule, self.redecide)
+            require_whole(self.rate / self.redecide, "redecide", rule, self.redecide)
 
 
 @dataclasses.dataclass(frozen=True)

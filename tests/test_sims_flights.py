@@ -1,6 +1,8 @@
 """Whole flights in closed loop: what is planned is flown, and noise is borne."""
 
 import dataclasses
+from types import SimpleNamespace
+from typing import Any
 
 import jax
 import numpy as np
@@ -9,7 +11,13 @@ import pytest
 from planner_jax.protocol import is_unsolved
 from planner_jax.sims.loop import Loop
 from planner_jax.sims.noise import NOISES
-from planner_jax.sims.tasks.catch import CATCH_WORLD, fly_catches, planned_ahead, throws
+from planner_jax.sims.tasks.catch import (
+    CATCH_WORLD,
+    fly_catches,
+    is_better,
+    planned_ahead,
+    throws,
+)
 from planner_jax.sims.tasks.hit import HIT_WORLD, fly_hits, volleys
 from planner_jax.task import catch
 from planner_jax.task.hit.card import REAL_SCENARIOS
@@ -147,6 +155,37 @@ def test_a_second_ball_is_caught_after_the_first():
     world = dataclasses.replace(CATCH_WORLD, num_balls=2)
     flights = fly_catches(Loop(world, NOISES["lab"], replan=100.0), throws(4, 2, drag_error=0.15))
     assert flights.caught.sum() >= 7
+
+
+@pytest.mark.slow
+def test_balls_that_would_be_missed_are_caught_by_deciding_anew():
+    """Plans that only go on from the one that is flown miss a ball in each of these flights."""
+    world = dataclasses.replace(CATCH_WORLD, num_balls=3)
+    missed = throws(200, 3, seed=102, drag_error=0.15)[[58, 62, 71, 73, 92, 131, 143, 188]]
+    flights = fly_catches(Loop(world, NOISES["lab"], replan=100.0), missed, seed=102)
+    assert flights.success.sum() >= 6
+
+
+@pytest.mark.parametrize(
+    ("fresh", "warm", "preferred"),
+    [
+        ((0.3, 1.0), (0.0, 9.0), False),  # one that keeps the limits is not given up
+        ((0.0, 9.0), (0.3, 1.0), True),
+        ((0.3, 1.0), (0.4, 1.0), True),
+        ((0.4, 1.0), (0.3, 1.0), False),
+        ((0.0, 1.0), (0.0, 2.0), True),
+        ((0.0, 0.99), (0.0, 1.0), False),  # too little to change the way for
+        ((np.nan, 1.0), (0.9, 1.0), False),
+        ((0.9, 1.0), (np.nan, 1.0), True),
+    ],
+)
+def test_a_plan_from_scratch_is_flown_where_it_keeps_limits_better_or_costs_less(
+    fresh, warm, preferred
+):
+    """Pairs of the greatest relative excess over a limit and of the cost."""
+    plan: Any = SimpleNamespace
+    first, second = (plan(violation=v, cost=c) for v, c in (fresh, warm))
+    assert bool(is_better(first, second)) == preferred
 
 
 @pytest.mark.slow

@@ -41,6 +41,19 @@ from tests.recordings import recording
         ),
         (lambda: CatchFly(balls=0), "balls must be >= 1, got 0"),
         (
+            lambda: CatchFly(decide="given"),
+            "decide must be one of best, greedy, policy, got 'given'",
+        ),
+        (lambda: CatchFly(decide="best:file"), "decide best takes no file, got 'best:file'"),
+        (
+            lambda: CatchFly(redecide=40.0),
+            "redecide must be 0 or a divisor of the 100 Hz at which plans are made anew, got 40",
+        ),
+        (
+            lambda: CatchFly(planner="mpp", redecide=100.0),
+            "redecide must be 0 or a divisor of the 0 Hz at which plans are made anew, got 100.0",
+        ),
+        (
             lambda: HitFly(planner="juggle", replan=50.0),
             "replan must be 0 for other planners, got 50.0",
         ),
@@ -57,16 +70,25 @@ def test_settings_that_break_a_rule_are_refused_in_one_line(build, message):
     assert str(error.value) == message
 
 
+def test_order_and_times_are_decided_anew_with_every_plan_unless_asked_otherwise():
+    assert CatchFly().redecide_rate == CatchFly().rate == 100.0
+    assert CatchFly(replan=50.0).redecide_rate == 50.0
+    assert CatchFly(redecide=0.0).redecide_rate == 0.0
+    assert CatchFly(planner="mpp").redecide_rate == 0.0  # whose plans are not made anew
+
+
 def test_the_command_says_what_is_wrong_and_writes_nothing(tmp_path, capsys):
     out = tmp_path / "run"
     assert main(["fly", "catch", "--noise", "loud", "--out", str(out)]) == 2
     assert main(["fly", "hit", "--video", "film.avi", "--out", str(out)]) == 2
     assert main(["fly", "hit", "--record", "0", "--out", str(out)]) == 2
+    assert main(["fly", "catch", "--decide", "policy:gone.npz", "--out", str(out)]) == 2
     lines = capsys.readouterr().err.splitlines()
     said = [line for line in lines if line.startswith("planner-jax: error:")]
     assert "--noise must be one of none, lab, harsh" in said[0]
     assert "--video must end in .gif or .mp4" in said[1]
     assert "--record must be >= 1 and <= 256, got 0" in said[2]
+    assert "checkpoint must be one that `planner-jax train` wrote, got 'gone.npz'" in said[3]
     assert not out.exists()
 
 

@@ -18,6 +18,8 @@ from jax import Array
 
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.prediction import PathTable, predict_path
+from planner_jax.optimise.lbfgs import LbfgsConfig
+from planner_jax.optimise.problem import Round
 from planner_jax.planning.plan import plan as plan_all
 from planner_jax.planning.replan import Replanning
 from planner_jax.protocol import AnyPlanner, is_unsolved
@@ -38,6 +40,7 @@ from planner_jax.sims.scoring import passage
 from planner_jax.sims.settings import INTERVAL, CatchFly, require_interval
 from planner_jax.sims.task import BallFlightTask, FlightCases, Flights
 from planner_jax.sweep.columns import BOOL, Column, list_of
+from planner_jax.task.catch.card import DECISIONS, TRAINED
 from planner_jax.task.catch.case import GRAVITY, NET_HEIGHT, NET_RADIUS, START, CatchCase
 from planner_jax.task.catch.case import case as catch_case
 from planner_jax.task.catch.plan import CatchPlan
@@ -45,6 +48,7 @@ from planner_jax.task.catch.replan import ReplanCatch
 from planner_jax.task.catch.suites import LAUNCH, draw, earliest_throw
 from planner_jax.task.catch.words import planner as catch_planner
 from planner_jax.task.hit.case import DRAG  # of the published serves; paper 000 gives none
+from planner_jax.task.named_decision import named_decision
 
 CATCH_WORLD = World(Quadrotor(Tool("net", NET_HEIGHT, NET_RADIUS)), GRAVITY, mouth=LAUNCH)
 SEEN = 0.3  # [s], a throw's flight before it is planned for: 2 m and more (paper 000, VII-A)
@@ -54,12 +58,15 @@ _AIM_RADIUS = 0.05  # [m], of the net that plans are made for; the rest is left 
 # control little; the first catch stays away from them, so that the next can begin within bounds.
 # Where nothing else is left, plans go as far as the shared protocol admits.
 _FIRST, _BEHIND, _WIDEST = (0.5, 3.0), (0.4, 4.5), (0.3, 5.0)
+_KEPT = 0.01  # relative excess up to which limits count as kept by a plan of the loop
+_CHEAPER = 0.95  # share of the cost below which a plan from scratch replaces one that keeps them
+_INSTANT = 1e-3  # [s], shorter than any look
 _AFTER = 0.05  # [s] flown after the last ball has come down to where it may be caught
 
 
 @dataclasses.dataclass(frozen=True)
 class CatchPilot:
-    """Plans catches anew from the plan that is flown."""
+    """Plans catches anew from the plan that is flown, and from order and times decided anew."""
 
     # Later than 0.2 s before a catch a new plan shakes more than the news of the ball is worth.
     planner: ReplanCatch = ReplanCatch(shortest=0.2)
@@ -69,6 +76,13 @@ class CatchPilot:
     # way to catches that will be planned from scratch later, and keeping the old plan would miss
     # the ball that comes first.
     excess: tuple[float, float] = (0.1, 1.0)
+    # The name of a decision about catches, or "policy:FILE"; "given" keeps order and times of the
+    # plan that is flown, and only its way is searched for from scratch.
+    decide: str = "greedy"
+    redecide: float = (
+        100.0  # [Hz], of deciding anew, a divisor of the rate of planning; 0 for never
+    )
+    search: Round = Round(starts=1, solver=LbfgsConfig(max_steps=25))  # of what is decided anew
     passage = staticmethod(passage)
 
     def times(self, plan: CatchPlan) -> Array:
@@ -78,7 +92,12 @@ class CatchPilot:
     def plan_anew(
         self, case: CatchCase, plan: CatchPlan, outlook: Outlook
     ) -> tuple[CatchPlan, Array]:
-        """One short round of the re-planner, and whether its plan is good enough."""
+        """The better of two plans, and whether it is good enough.
+
+        One comes from the plan that is flown by a short round of the re-planner. The other one is
+        planned from scratch, at the order and times that are decided for this moment; it is taken
+        where it breaks the limits less, or keeps them at a cost that is clearly lower.
+        """
         made = plan.times <= outlook.elapsed
         first = jnp.argsort(made, stable=True)  # what is still to be caught
         order, times = plan.order[first], plan.times[first] - outlook.elapsed
@@ -94,9 +113,29 @@ class CatchPilot:
         )
         task = Replanning(case=left, previous=plan, elapsed=outlook.elapsed)
         found = self.planner.solve(task, self.planner.rounds[0])
+        if self.redecide > 0.0:
+            fresh = self._decided_anew(left)
+            since = jnp.mod(outlook.time + _INSTANT, 1.0 / self.redecide)  # the last time was due
+            take = (since < 2.0 * _INSTANT) & (fresh.times[0] >= self.planner.shortest)
+            take &= is_better(fresh, found)
+            found = jax.tree.map(lambda new, old: jnp.where(take, new, old), fresh, found)
         good = outlook.present[order[0]] & (times[0] >= self.planner.shortest)
         excess = jnp.where(jnp.sum(outlook.present) > 1, self.excess[1], self.excess[0])
         return found, good & (found.violation <= jnp.maximum(excess, plan.violation))
+
+    def _decided_anew(self, left: CatchCase) -> CatchPlan:
+        """A plan from scratch of what is left, with the decision's first choice."""
+        choices = named_decision(DECISIONS, self.decide, TRAINED).propose(left)
+        choice = jax.tree.map(lambda leaf: leaf[0], choices)
+        return self.planner.planner.solve(left.decided(choice), self.search)
+
+
+def is_better(fresh: CatchPlan, warm: CatchPlan) -> Array:
+    """Whether () bool a plan from scratch is to be preferred to one from the plan that is flown."""
+    keeps = warm.violation <= _KEPT
+    cheaper = (fresh.violation <= _KEPT) & (fresh.cost < _CHEAPER * warm.cost)
+    nearer = jnp.isfinite(fresh.violation) & ~(warm.violation <= fresh.violation)
+    return jnp.isfinite(fresh.cost) & jnp.where(keeps, cheaper, nearer)
 
 
 def tables(balls: BallState, drag: Array, horizon: Array, gravity: Array) -> PathTable:
@@ -421,8 +460,18 @@ class CatchFlight(BallFlightTask):
 
     def fly(self, cases: Throws, record: bool) -> CatchFlights:
         """Flights of some throws."""
-        planner = catch_planner(self.settings.planner, decide="greedy")
-        return fly_catches(self.loop(record), cases, self.settings.seed, planner=planner)
+        settings = self.settings
+        return fly_catches(
+            self.loop(record),
+            cases,
+            settings.seed,
+            planner=catch_planner(settings.planner, decide=settings.decide),
+            pilot=CatchPilot(decide=settings.decide, redecide=settings.redecide_rate),
+        )
+
+    def parameters(self) -> dict[str, Any]:
+        """Those of the closed loop, and the rate of deciding anew."""
+        return {**super().parameters(), "redecide": self.settings.redecide_rate}
 
     def launches(self, cases: Throws, flown: Flown) -> Launches:
         """The throws; no ball comes back."""
