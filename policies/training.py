@@ -32,7 +32,12 @@ from jax import Array
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.planning.plan import plan
 from planner_jax.policies import brax_compat
-from planner_jax.policies.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
+from planner_jax.policies.checkpoint import (
+    CheckpointError,
+    load_checkpoint,
+    name_and_sizes,
+    save_checkpoint,
+)
 from planner_jax.policies.curves import draw_curves
 from planner_jax.policies.environment import WEIGHTS, CatchEnv
 from planner_jax.policies.imitation import imitated, lessons
@@ -201,10 +206,16 @@ def _first_params(training: Training, network: Any) -> Any:
     if training.begin is not None:
         given = load_checkpoint(training.begin)
         if given.network != network:
-            names = type(network).__name__, type(given.network).__name__
-            raise CheckpointError("begin must hold the weights of {}, got {}".format(*names))
+            raise CheckpointError(
+                f"begin must hold the weights of {_words(network)}, got {_words(given.network)}"
+            )
         own = given.params
     return jax.device_get((normaliser, own, jax.jit(Value().init)(other, seen)))
+
+
+def _words(network: Any) -> str:
+    name, sizes = name_and_sizes(network)
+    return f"{name} ({', '.join(f'{field} {size}' for field, size in sizes.items())})"
 
 
 def _begun_by_imitation(training: Training, network: Any, params: Any) -> Any:
