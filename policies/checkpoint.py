@@ -21,6 +21,7 @@ from planner_jax.sweep.settings import SettingError
 
 FORMAT = 1
 _SHIPPED = "catch.npz"
+_OF_FLAX = ("parent", "name")  # fields of every module
 
 
 class CheckpointError(SettingError):
@@ -47,12 +48,7 @@ def save_checkpoint(
         network: a module of `networks`.
         about: what it was trained on, plain JSON.
     """
-    (name,) = (name for name, kind in NETWORKS.items() if isinstance(network, kind))
-    sizes = {
-        field.name: getattr(network, field.name)
-        for field in dataclasses.fields(network)
-        if field.name not in ("parent", "name")
-    }
+    name, sizes = name_and_sizes(network)
     head = {"format": FORMAT, "features": FEATURES, "network": name, "sizes": sizes, **about}
     flat = traverse_util.flatten_dict(params, sep="/")
     arrays: Any = {key: np.asarray(leaf, np.float32) for key, leaf in flat.items()}
@@ -60,6 +56,13 @@ def save_checkpoint(
     with open(scratch, "wb") as file:
         np.savez(file, about=np.array(json.dumps(head)), **arrays)
     os.replace(scratch, path)
+
+
+def name_and_sizes(network: Any) -> tuple[str, dict[str, int]]:
+    """What a network is called, and the fields that shape it."""
+    (name,) = (name for name, kind in NETWORKS.items() if isinstance(network, kind))
+    fields = (field.name for field in dataclasses.fields(network))
+    return name, {field: getattr(network, field) for field in fields if field not in _OF_FLAX}
 
 
 def load_checkpoint(path: str | os.PathLike) -> Checkpoint:
@@ -87,8 +90,15 @@ def load_checkpoint(path: str | os.PathLike) -> Checkpoint:
     if network not in NETWORKS:
         known = ", ".join(NETWORKS)
         raise CheckpointError(f"network must be one of {known}, got {network!r} in {name!r}")
+    kind, sizes = NETWORKS[network], about.get("sizes", {})
+    known = [field.name for field in dataclasses.fields(kind) if field.name not in _OF_FLAX]
+    if not set(sizes) <= set(known):
+        raise CheckpointError(
+            f"sizes of network {network!r} must be among {', '.join(known)}, "
+            f"got {', '.join(sizes)} in {name!r}"
+        )
     params = traverse_util.unflatten_dict(arrays, sep="/")
-    return Checkpoint(params=params, network=NETWORKS[network](**about["sizes"]), about=about)
+    return Checkpoint(params=params, network=kind(**sizes), about=about)
 
 
 def shipped_checkpoint() -> Checkpoint:

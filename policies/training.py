@@ -4,14 +4,17 @@ A run is a row of parts, each one call of `brax.training.agents.ppo.train` from 
 last: imitation first if asked for, then rewards by the estimate, then by the planner. What a part
 leaves is kept by Orbax before the next one begins, and the seed of a part follows from the run's
 and its number: a run that was interrupted goes on to the same weights, bit for bit. Adam's
-moments are begun anew with each part, since Brax does not hand them out.
+moments are begun anew with each part, since Brax does not hand them out. `progress` says how a run
+is watched, and `curves` draws it.
 """
 
 import dataclasses
 import functools
 import json
+import math
 import os
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -29,12 +32,19 @@ from jax import Array
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.planning.plan import plan
 from planner_jax.policies import brax_compat
-from planner_jax.policies.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
+from planner_jax.policies.checkpoint import (
+    CheckpointError,
+    load_checkpoint,
+    name_and_sizes,
+    save_checkpoint,
+)
+from planner_jax.policies.curves import draw_curves
 from planner_jax.policies.environment import CatchEnv
 from planner_jax.policies.imitation import imitated, lessons
 from planner_jax.policies.networks import LEAST_STD, NETWORKS, Value
 from planner_jax.policies.observation import FEATURES, PER_TARGET
 from planner_jax.policies.policy import Policy
+from planner_jax.policies.progress import Progress, reported_terms
 from planner_jax.policies.settings import WEIGHTS, TrainSettings
 from planner_jax.protocol import solved
 from planner_jax.sweep.run_folder import RunFolder
@@ -43,6 +53,7 @@ from planner_jax.task.catch.decide import optimal_time_ratio
 from planner_jax.task.catch.exact import ExactCatch
 from planner_jax.task.catch.suites import draw
 
+_ROWS = 50  # of a part's curve, at most
 _JUDGED_SEED = 4242  # of the cases by which a run is watched; no figure of the results is of them
 
 
@@ -76,14 +87,14 @@ class Training:
     judged: int = 256  # cases of each suite by which it is watched; 0: it is not
 
 
-def train(training: Training, out: str | os.PathLike, say: Callable[[str], None] = print) -> Policy:
+def train(training: Training, out: str | os.PathLike, *, progress: bool = True) -> Policy:
     """Train a policy, or go on where an interrupted run of the same folder and settings ended.
 
     Args:
         training: what is asked for.
-        out: folder of the run: `training.json`, `parts/`, `progress.json`, and `policy.npz` in the
-            end.
-        say: is told of every part.
+        out: folder of the run: `training.json`, `parts/`, `progress.jsonl`, `tensorboard/`,
+            `curves.png` after each part, and `policy.npz` in the end.
+        progress: show a bar, and a line on every part, on the standard error stream.
 
     Returns:
         The policy after the last part.
@@ -98,24 +109,30 @@ def train(training: Training, out: str | os.PathLike, say: Callable[[str], None]
     keeper = orbax.StandardCheckpointer()
     params = _first_params(training, network)  # before anything is written
     _require_same(folder, training)
-    rows: list[dict[str, Any]] = []
+    told, begun = Progress(folder, progress), 0
     for number, part in enumerate(training.parts):
         place = (folder / "parts" / f"{number:03d}").absolute()
+        decisions = math.prod(_rows_and_updates(part, training.lanes)) * training.lanes
         if place.exists():  # Orbax gives it its name when all is written
             params = jax.device_get(keeper.restore(place, params))
-            rows = json.loads((folder / "progress.json").read_text())[: number + 1]
+            begun += decisions
             continue
         if number == 0 and training.lessons:
             params = _begun_by_imitation(training, network, params)
-        params = _by_ppo(training, part, number, network, params)
-        row = {"part": number, "steps": part.steps}
+        title = f"part {number + 1} of {len(training.parts)}"
+        with told.part(number, title, begun, decisions) as tell:
+            if number == 0 and training.judged:
+                told.judge(number, 0, judge_policy(training, network, params[1]))
+            params = _by_ppo(training, part, number, network, params, tell)
+        begun += decisions
         if training.judged:
-            row |= judge_policy(training, network, params[1])
-        rows = [*rows, row]
-        RunFolder(folder).write_text("progress.json", json.dumps(rows, indent=1) + "\n")
+            suites = judge_policy(training, network, params[1])
+            told.judge(number, begun, suites)
+            if progress:
+                print(f"{title}: {_sentence(suites)}", file=sys.stderr)
+        draw_curves([folder], folder / "curves.png")
         keeper.save(place, params)
         keeper.wait_until_finished()
-        say(_sentence(row))
     found = params[1]
     if training.kept:
         share, first = training.kept, _first_params(training, network)[1]
@@ -152,18 +169,13 @@ def judge_policy(training: Training, network: Any, params: Any) -> dict[str, Any
     return figures
 
 
-def _sentence(row: dict[str, Any]) -> str:
-    suites = {name: found for name, found in row.items() if isinstance(found, dict)}
-    words = [
-        f"{name}: {100 * found['success']:.1f} % solved"
-        + (
-            f", last catch {found['last']:.3f} s, ratio {found['ratio']:.3f}"
-            if found["last"]
-            else ""
-        )
-        for name, found in suites.items()
-    ]
-    return "; ".join([f"part {row['part']}, {row['steps']} decisions", *words])
+def _sentence(suites: Mapping[str, Any]) -> str:
+    words = []
+    for name, found in suites.items():
+        words.append(f"{name} {100.0 * found['success']:.1f} % solved")
+        if found["last"] is not None:
+            words[-1] += f", last catch {found['last']:.3f} s, ratio {found['ratio']:.3f}"
+    return "; ".join(words)
 
 
 def _require_same(folder: Path, training: Training) -> None:
@@ -190,14 +202,20 @@ def _first_params(training: Training, network: Any) -> Any:
     seen = jnp.zeros((1, env.size, FEATURES))
     size = specs.Array((env.observation_size,), jnp.dtype("float32"))
     normaliser = running_statistics.init_state(size)
-    own = network.init(one, seen)
+    own = jax.jit(network.init)(one, seen)
     if training.begin is not None:
         given = load_checkpoint(training.begin)
         if given.network != network:
-            names = type(network).__name__, type(given.network).__name__
-            raise CheckpointError("begin must hold the weights of {}, got {}".format(*names))
+            raise CheckpointError(
+                f"begin must hold the weights of {_words(network)}, got {_words(given.network)}"
+            )
         own = given.params
-    return jax.device_get((normaliser, own, Value().init(other, seen)))
+    return jax.device_get((normaliser, own, jax.jit(Value().init)(other, seen)))
+
+
+def _words(network: Any) -> str:
+    name, sizes = name_and_sizes(network)
+    return f"{name} ({', '.join(f'{field} {size}' for field, size in sizes.items())})"
 
 
 def _begun_by_imitation(training: Training, network: Any, params: Any) -> Any:
@@ -213,12 +231,36 @@ def _environment(training: Training, part: Part) -> CatchEnv:
     return CatchEnv(training.suites, iterations, dict(training.weights))
 
 
-def _by_ppo(training: Training, part: Part, number: int, network: Any, params: Any) -> Any:
-    """Parameters after one part, NumPy leaves."""
+def _rows_and_updates(part: Part, lanes: int) -> tuple[int, int]:
+    """How many rows the curve of a part has, and updates each of them."""
+    wanted = math.ceil(part.steps / lanes)
+    each = math.ceil(wanted / _ROWS)
+    return math.ceil(wanted / each), each
+
+
+def _by_ppo(
+    training: Training,
+    part: Part,
+    number: int,
+    network: Any,
+    params: Any,
+    tell: Callable[[int, Mapping[str, Any]], None],
+) -> Any:
+    """Parameters after one part, NumPy leaves.
+
+    Args:
+        training: of the part.
+        part: what is asked for.
+        number: of the part, by which its seed is made.
+        network: of the policy.
+        params: before the part.
+        tell: called with decisions of the part and their metrics, once a row of the curve.
+    """
     env = _environment(training, part)
-    _, found, _ = ppo.train(
+    rows, each = _rows_and_updates(part, training.lanes)
+    how: dict[str, Any] = dict(
         environment=env,
-        num_timesteps=part.steps,
+        num_timesteps=rows * each * training.lanes,
         wrap_env=False,
         num_envs=training.lanes,
         episode_length=1,
@@ -238,8 +280,12 @@ def _by_ppo(training: Training, part: Part, number: int, network: Any, params: A
         seed=training.seed * 1000 + number,
         restore_params=params,
         run_evals=False,
+        num_evals=rows + 1,  # the first one before all training
         num_eval_envs=len(training.suites),  # Brax makes them even so
+        progress_fn=tell,
     )
+    with reported_terms():
+        _, found, _ = ppo.train(**how)
     return jax.device_get(found)
 
 

@@ -18,7 +18,6 @@ from planner_jax.policies.networks import NETWORKS
 from planner_jax.policies.observation import FEATURES, PER_TARGET, choice_of, observe
 from planner_jax.policies.policy import Policy, policy
 from planner_jax.policies.settings import WEIGHTS
-from planner_jax.sweep.settings import SettingError
 from planner_jax.task.catch.estimate import INSTANT, shortfall, timetable
 from planner_jax.task.catch.suites import draw_by_key
 
@@ -127,11 +126,13 @@ def test_a_checkpoint_gives_back_what_was_saved(tmp_path, fresh):
 
 
 def test_a_file_that_is_no_checkpoint_is_named(tmp_path, fresh):
-    missing, torn, other = tmp_path / "none", tmp_path / "torn", tmp_path / "other"
+    missing, torn, other, odd = (tmp_path / name for name in ("none", "torn", "other", "odd"))
     save_checkpoint(torn, fresh["mlp"], NETWORKS["mlp"](), {})
     torn.write_bytes(torn.read_bytes()[:-100])
     save_checkpoint(other, fresh["mlp"], NETWORKS["mlp"](), {"format": 99})
-    for path, words in ((missing, "none"), (torn, "torn"), (other, "format 99")):
+    save_checkpoint(odd, fresh["mlp"], NETWORKS["mlp"](), {"sizes": {"depth": 9}})
+    says = {missing: "none", torn: "torn", other: "format 99", odd: "'mlp'.* got depth"}
+    for path, words in says.items():
         with pytest.raises(CheckpointError, match=words):
             load_checkpoint(path)
 
@@ -196,56 +197,6 @@ def test_a_reward_pays_early_catches_only_where_they_are_made():
     }
     reward = environment.rewarded(terms, WEIGHTS)
     np.testing.assert_allclose(reward, [1.0 + 0.5 - 0.25, -0.5])
-
-
-@pytest.mark.slow
-def test_training_learns_and_goes_on_bit_for_bit_where_it_was_interrupted(tmp_path, monkeypatch):
-    """By the estimate, from a policy that catches too soon: feasible decisions become common."""
-    from planner_jax.policies import training
-
-    suites, size = ("triangle3",), 3
-    network = NETWORKS["mlp"]()
-    params: Any = network.init(jax.random.key(0), jnp.zeros((1, size, FEATURES)))
-    params = jax.tree.map(np.array, params)
-    params["params"]["Dense_3"]["bias"][1] = -1.5  # times are a third too early
-    save_checkpoint(tmp_path / "hasty", params, network, {})
-    one = training.Part(steps=40_000, learning_rate=1e-3)
-    asked = training.Training(
-        suites,
-        (one, one),
-        network="mlp",
-        lanes=500,
-        minibatches=5,
-        judged=0,
-        divergence=0.05,
-        begin=str(tmp_path / "hasty"),
-    )
-    whole = training.train(asked, tmp_path / "whole", say=lambda line: None)
-    plain = training._by_ppo
-
-    def stop(asked: Any, part: Any, number: int, *others: Any) -> Any:
-        if number:
-            raise KeyboardInterrupt
-        return plain(asked, part, number, *others)
-
-    monkeypatch.setattr(training, "_by_ppo", stop)
-    with pytest.raises(KeyboardInterrupt):
-        training.train(asked, tmp_path / "cut", say=lambda line: None)
-    monkeypatch.setattr(training, "_by_ppo", plain)
-    again = training.train(asked, tmp_path / "cut", say=lambda line: None)
-    for a, b in zip(jax.tree.leaves(whole.params), jax.tree.leaves(again.params), strict=True):
-        np.testing.assert_array_equal(a, b)
-    assert len(json.loads((tmp_path / "cut" / "progress.json").read_text())) == 2
-    with pytest.raises(SettingError, match="seed must be 0"):
-        training.train(dataclasses.replace(asked, seed=1), tmp_path / "cut")
-
-    def feasible(found: Policy) -> float:
-        cases = draw_by_key(jax.random.key(9), 500, "triangle3")
-        far = jax.vmap(shortfall)(cases, first_choice(found, cases))
-        return float((np.asarray(far) <= 0.0).mean())
-
-    assert feasible(Policy(params, network)) < 0.05
-    assert feasible(whole) >= 0.5
 
 
 def test_a_sweep_says_which_policy_decided(tmp_path):

@@ -42,7 +42,7 @@ from tests.recordings import recording
         (lambda: CatchFly(balls=0), "balls must be >= 1, got 0"),
         (
             lambda: CatchFly(decide="given"),
-            "decide must be one of best, greedy, policy, got 'given'",
+            "decide must be one of best, greedy, random, policy, got 'given'",
         ),
         (lambda: CatchFly(decide="best:file"), "decide best takes no file, got 'best:file'"),
         (

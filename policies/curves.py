@@ -1,0 +1,144 @@
+"""How trainings went: a picture of one run, or of several with their mean and spread.
+
+    python -m planner_jax.policies.curves RUN [RUN ...] [--out curves.png]
+
+Several runs are to differ in their seed only. A line is then their mean and the band around it one
+standard deviation to each side, as far as all of them have come.
+"""
+
+import argparse
+import json
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from planner_jax.policies.progress import read_rows
+from planner_jax.sweep.figures import style
+from planner_jax.sweep.settings import SettingError
+
+_TERMS = {
+    "reward": ("Reward", "mean", 1.0),
+    "solved": ("Solved in training", "share [%]", 100.0),
+    "last": ("Last catch, solved cases", "earlier than greedy's [%]", 100.0),
+    "ratio": ("Optimal time ratio", "mean of solved cases", 1.0),
+    "violation": ("Violation", "mean of other cases", 1.0),
+}
+_COLOURS = (style.BLUE, style.ORANGE, style.GREEN, style.PURPLE, style.SKY, style.GREY)
+Rows = list[dict[str, Any]]
+
+
+def draw_curves(folders: Sequence[str | os.PathLike], path: str | os.PathLike) -> None:
+    """Draw the curves of runs, and write the picture whole.
+
+    Args:
+        folders: of trainings, at least one.
+        path: of the picture, a PNG.
+
+    Raises:
+        SettingError: a folder is no training's, or they differ in more than their seed.
+    """
+    _require_alike([Path(folder) for folder in folders])
+    runs = [read_rows(Path(folder)) for folder in folders]
+    place = Path(path)
+    scratch = place.with_name(f".{place.stem}.tmp.png")
+    style.draw(scratch, curves_figure, (13.0, 6.0), runs)
+    os.replace(scratch, place)
+
+
+def curves_figure(figure: Figure, runs: Sequence[Rows]) -> None:
+    """Reward and raw terms over decisions; by suite what the policy was worth after every part."""
+    told = [[row for row in rows if "reward" in row] for rows in runs]
+    judged = [[row for row in rows if "suites" in row] for rows in runs]
+    worth = all(judged)
+    panels = list(figure.subplots(2, 4 if worth else 3, sharex=True).flat)
+    shown = len(_TERMS) + 3 * worth
+    for axes in panels[shown:]:
+        axes.remove()
+    for axes, (name, (title, unit, scale)) in zip(panels, _TERMS.items(), strict=False):
+        _line(axes, told, lambda row, name=name: row[name], scale, color=style.BLUE)
+        style.label(axes, "decisions", unit, title)
+    if worth:
+        _draw_worth(panels[len(_TERMS) :], judged)
+    ends = [row["decisions"] for row in judged[0]][1:-1]
+    for axes in panels[:shown]:
+        axes.ticklabel_format(axis="x", style="sci", scilimits=(0, 3))
+        axes.tick_params(labelbottom=True)
+        for end in ends:
+            axes.axvline(end, color=style.PALE, linewidth=1.0)
+
+
+def _draw_worth(panels: Sequence[Axes], judged: Sequence[Rows]) -> None:
+    """Success, last catch beside that in the beginning, and optimal time ratio, a line a suite."""
+
+    def of(suite: str, name: str) -> Any:
+        return lambda row: row["suites"][suite][name]
+
+    for k, suite in enumerate(judged[0][0]["suites"]):
+        look: Any = {"color": _COLOURS[k % len(_COLOURS)], "label": suite, "marker": "."}
+        _line(panels[0], judged, of(suite, "success"), 100.0, **look)
+        _line(panels[1], judged, of(suite, "last"), 100.0, relative=True, **look)
+        _line(panels[2], judged, of(suite, "ratio"), **look)
+    style.label(panels[0], "decisions", "share [%]", "Success, by suite")
+    style.label(panels[1], "decisions", "of that in the beginning [%]", "Last catch, by suite")
+    style.label(panels[2], "decisions", "mean of solved cases", "Optimal time ratio, by suite")
+    panels[0].legend(fontsize=8.0)
+
+
+def _line(
+    axes: Axes,
+    runs: Sequence[Rows],
+    value: Callable[[dict[str, Any]], float | None],
+    scale: float = 1.0,
+    relative: bool = False,
+    **look: Any,
+) -> None:
+    """A value over decisions, or relative to the first one: the mean of runs and their spread."""
+    num = min(len(rows) for rows in runs)
+    values = scale * np.array([[value(row) for row in rows[:num]] for rows in runs], float)
+    if relative:
+        values *= scale / values[:, :1]
+    at, mean = [row["decisions"] for row in runs[0][:num]], values.mean(axis=0)
+    axes.plot(at, mean, linewidth=1.6, **look)
+    if len(runs) > 1:
+        spread = values.std(axis=0)
+        band: Any = {"color": look["color"], "alpha": 0.2, "linewidth": 0.0}
+        axes.fill_between(at, mean - spread, mean + spread, **band)
+
+
+def _require_alike(folders: Sequence[Path]) -> None:
+    first: dict[str, Any] = {}
+    for folder in folders:
+        try:
+            asked = json.loads((folder / "training.json").read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise SettingError(
+                f"run must be the folder of a training, with its training.json, got {str(folder)!r}"
+            ) from error
+        first = first or asked
+        for name in (name for name in first if name != "seed" and asked.get(name) != first[name]):
+            raise SettingError(
+                f"run must be of the same {name} as {str(folders[0])!r}, {first[name]}, "
+                f"got {asked.get(name)} in {str(folder)!r}"
+            )
+
+
+def main() -> None:
+    """Draw the picture of the runs that are named."""
+    parser = argparse.ArgumentParser("python -m planner_jax.policies.curves", description=__doc__)
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.add_argument("runs", metavar="RUN", nargs="+", type=Path, help="folder of a training")
+    parser.add_argument("--out", type=Path, default=Path("curves.png"), help="of the picture")
+    options = parser.parse_args()
+    try:
+        draw_curves(options.runs, options.out)
+    except SettingError as error:
+        parser.error(str(error))
+
+
+if __name__ == "__main__":
+    main()

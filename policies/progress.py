@@ -1,0 +1,149 @@
+"""How a training is watched: rows of the run folder, a bar, and event files of TensorBoard.
+
+Every row of `progress.jsonl` has `part` and `decisions`, of all parts until then. Rows of the curve
+have the means of the decisions since the last one: `reward`, `solved`, of solved cases `last` and
+`ratio`, of others `violation`, as `environment.judged` has them, beside `per_second` decisions and
+what PPO did: `divergence` of an update, `learning_rate`, and `spread`, the standard deviation of
+actions. Rows with `suites` say what the policy's decisions were worth then, planned in full.
+"""
+
+import contextlib
+import json
+import os
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+from brax.training.agents.ppo import losses
+from tensorboardX import SummaryWriter
+from tqdm import tqdm
+
+from planner_jax.sweep.run_folder import RunFolder
+from planner_jax.sweep.settings import SettingError
+
+FILE = "progress.jsonl"
+_EVENTS = "tensorboard"
+
+
+@contextlib.contextmanager
+def reported_terms() -> Iterator[None]:
+    """Have Brax's PPO report reward and raw terms, as means of all decisions, with its metrics.
+
+    Brax itself reports them by calls from the compiled program to the host. It does so of 100
+    lanes only, and JAX keeps no program with such calls in its cache.
+    """
+    plain = losses.compute_ppo_loss
+
+    def reporting(params: Any, normaliser: Any, data: Any, *others: Any, **how: Any) -> Any:
+        loss, metrics = plain(params, normaliser, data, *others, **how)
+        terms = data.extras["state_extras"]["episode_metrics"]
+        good = terms["solved"]
+        means = {
+            "reward": jnp.mean(data.reward),
+            "solved": jnp.mean(good),
+            "last": jnp.mean(good * terms["last"]),
+            "ratio": jnp.mean(good * terms["ratio"]),
+            "violation": jnp.mean((1.0 - good) * terms["violation"]),
+        }
+        return loss, {**metrics, **means}
+
+    losses.compute_ppo_loss = reporting
+    try:
+        yield
+    finally:
+        losses.compute_ppo_loss = plain
+
+
+def _row_of(metrics: Mapping[str, Any]) -> dict[str, float | None]:
+    """A row of the curve from Brax's metrics with `reported_terms`."""
+    found = {name.removeprefix("training/"): float(value) for name, value in metrics.items()}
+    solved, others = found["solved"], 1.0 - found["solved"]
+    return {
+        "per_second": round(found["sps"], 1),
+        "reward": found["reward"],
+        "solved": solved,
+        "last": found["last"] / solved if solved > 0.0 else None,
+        "ratio": found["ratio"] / solved if solved > 0.0 else None,
+        "violation": found["violation"] / others if others > 0.0 else None,
+        "divergence": found["kl_mean"],
+        "learning_rate": found["learning_rate"],
+        "spread": found["policy_dist_mean_std"],
+    }
+
+
+class Progress:
+    """The rows of a run.
+
+    The file is replaced as a whole with every row, and read again where a run goes on.
+
+    Args:
+        folder: of the run.
+        show: a bar on the standard error stream.
+    """
+
+    def __init__(self, folder: Path, show: bool):
+        self.rows = read_rows(folder) if (folder / FILE).exists() else []
+        self._folder, self._show = folder, show
+
+    @contextlib.contextmanager
+    def part(
+        self, number: int, title: str, begun: int, decisions: int
+    ) -> Iterator[Callable[[int, Mapping[str, Any]], None]]:
+        """What Brax is to call with decisions of a part and its metrics, while the part trains.
+
+        What an interrupted run left of the part, or of later ones, is forgotten.
+
+        Args:
+            number: of the part.
+            title: of the bar.
+            begun: decisions before the part.
+            decisions: of the part.
+        """
+        self.rows = [row for row in self.rows if row["part"] < number]
+        place, suffix = self._folder / _EVENTS, f".part-{number:03d}"
+        for left in place.glob(f"*{suffix}"):
+            left.unlink()
+        how: dict[str, Any] = {"unit": " decisions", "unit_scale": True}
+        with (
+            SummaryWriter(os.fspath(place), filename_suffix=suffix) as events,
+            tqdm(total=decisions, desc=title, disable=not self._show, **how) as bar,
+        ):
+
+            def tell(done: int, metrics: Mapping[str, Any]) -> None:
+                row = _row_of(metrics)
+                self.add(number, begun + done, row)
+                for name, value in row.items():
+                    if value is not None:
+                        events.add_scalar(f"training/{name}", value, begun + done)
+                events.flush()
+                shown = f"reward {row['reward']:.3f}, solved {100.0 * (row['solved'] or 0.0):.1f} %"
+                bar.set_postfix_str(shown, refresh=False)
+                bar.update(done - bar.n)
+
+            yield tell
+
+    def judge(self, number: int, decisions: int, suites: Mapping[str, Any]) -> None:
+        """Add what a policy's decisions are worth, by suite, as in `training.judge_policy`."""
+        self.add(number, decisions, {"suites": suites})
+
+    def add(self, number: int, decisions: int, row: Mapping[str, Any]) -> None:
+        """Add a row to the file."""
+        self.rows.append({"part": number, "decisions": decisions, **row})
+        text = "".join(json.dumps(row) + "\n" for row in self.rows)
+        RunFolder(self._folder).write_text(FILE, text)
+
+
+def read_rows(folder: Path) -> list[dict[str, Any]]:
+    """The rows of a run, in the order of their decisions.
+
+    Raises:
+        SettingError: the folder is not that of a training.
+    """
+    try:
+        lines = (folder / FILE).read_text(encoding="utf-8").splitlines()
+        return [json.loads(line) for line in lines]
+    except (OSError, ValueError) as error:
+        raise SettingError(
+            f"run must be the folder of a training, with its {FILE}, got {str(folder)!r}"
+        ) from error

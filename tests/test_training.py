@@ -1,0 +1,180 @@
+"""A training learns, can be watched, and goes on bit for bit where it was interrupted."""
+
+import dataclasses
+import json
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from planner_jax.cli import main
+from planner_jax.planning.decided import first_choice
+from planner_jax.policies.checkpoint import save_checkpoint
+from planner_jax.policies.curves import draw_curves
+from planner_jax.policies.networks import NETWORKS, Mlp
+from planner_jax.policies.observation import FEATURES
+from planner_jax.policies.policy import Policy
+from planner_jax.policies.progress import FILE, read_rows
+from planner_jax.sweep.settings import SettingError
+from planner_jax.task.catch.estimate import shortfall
+from planner_jax.task.catch.suites import draw_by_key
+
+training = pytest.importorskip("planner_jax.policies.training", exc_type=ImportError)
+SUITE, LANES, ROWS = "triangle3", 250, 50
+PART = training.Part(steps=ROWS * LANES, learning_rate=1e-3)
+
+
+@pytest.fixture(scope="module")
+def hasty() -> Policy:
+    """A policy whose times are a quarter too early."""
+    network = Mlp()
+    params: Any = network.init(jax.random.key(0), jnp.zeros((1, 3, FEATURES)))
+    params = jax.tree.map(np.array, params)
+    params["params"]["Dense_3"]["bias"][1] = -0.6
+    return Policy(params, network)
+
+
+@pytest.fixture(scope="module")
+def asked(hasty, tmp_path_factory) -> Any:
+    """A training by the estimate that begins with it."""
+    path = tmp_path_factory.mktemp("hasty") / "hasty.npz"
+    save_checkpoint(path, hasty.params, hasty.network, {})
+    return training.Training(
+        (SUITE,),
+        (PART,),
+        network="mlp",
+        lanes=LANES,
+        minibatches=5,
+        judged=0,
+        divergence=0.05,
+        begin=str(path),
+    )
+
+
+@pytest.fixture(scope="module")
+def trained(asked, tmp_path_factory) -> Any:
+    """The policy and folder of that training."""
+    out = tmp_path_factory.mktemp("trained")
+    return training.train(asked, out, progress=False), out
+
+
+def feasible(found: Policy) -> float:
+    """The share of decisions that the estimate has within reach."""
+    cases = draw_by_key(jax.random.key(9), 500, SUITE)
+    far = jax.jit(jax.vmap(shortfall))(cases, first_choice(found, cases))
+    return float((np.asarray(far) <= 0.0).mean())
+
+
+def test_training_makes_feasible_decisions_common(hasty, trained):
+    assert feasible(hasty) < 0.05
+    assert feasible(trained[0]) >= 0.5
+
+
+def test_a_training_leaves_its_curve(trained):
+    """As rows, as a picture and for TensorBoard; terms of solved cases are absent without any."""
+    _, out = trained
+    rows = read_rows(out)
+    assert [row["decisions"] for row in rows] == [LANES * (k + 1) for k in range(ROWS)]
+    assert rows[-1]["reward"] > rows[0]["reward"] + 0.5
+    assert rows[-1]["solved"] > 0.3 and rows[-1]["last"] < 0.0 and rows[-1]["violation"] > 0.0
+    assert all((row["last"] is None) == (row["solved"] == 0.0) for row in rows)
+    assert (out / "curves.png").stat().st_size > 10_000
+    (events,) = (out / "tensorboard").iterdir()
+    assert events.stat().st_size > ROWS * 100
+    assert not [path for path in out.iterdir() if "tmp" in path.name]
+
+
+def test_curves_of_several_seeds_are_drawn_together_and_of_other_settings_are_not(
+    trained, tmp_path
+):
+    _, out = trained
+    other = tmp_path / "other"
+    other.mkdir()
+    asked = json.loads((out / "training.json").read_text())
+    (other / FILE).write_text("".join((out / FILE).read_text().splitlines(True)[:-3]))
+    (other / "training.json").write_text(json.dumps({**asked, "seed": 1}))
+    draw_curves([out, other], tmp_path / "both.png")
+    assert (tmp_path / "both.png").stat().st_size > 10_000
+    (other / "training.json").write_text(json.dumps({**asked, "lanes": 7}))
+    with pytest.raises(SettingError, match=f"same lanes as .*, {LANES}, got 7"):
+        draw_curves([out, other], tmp_path / "both.png")
+    with pytest.raises(SettingError, match="run must be the folder of a training"):
+        draw_curves([tmp_path], tmp_path / "both.png")
+
+
+def test_a_run_of_other_settings_is_not_gone_on_with(asked, trained):
+    with pytest.raises(SettingError, match="seed must be 0, as in the run of .*, got 1"):
+        training.train(dataclasses.replace(asked, seed=1), trained[1])
+
+
+@pytest.mark.slow
+def test_training_goes_on_bit_for_bit_where_it_was_interrupted(asked, tmp_path, monkeypatch):
+    """In the middle of its second part, of which a torn checkpoint was left."""
+    asked = dataclasses.replace(asked, parts=(PART, PART))
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    one = training.train(asked, whole, progress=False)
+    plain = training._by_ppo
+
+    def stopping(asked: Any, part: Any, number: int, *others: Any) -> Any:
+        *others, tell = others
+
+        def told(decisions: int, metrics: Any) -> None:
+            tell(decisions, metrics)
+            if number == 1 and decisions > PART.steps // 2:
+                raise KeyboardInterrupt
+
+        return plain(asked, part, number, *others, told)
+
+    monkeypatch.setattr(training, "_by_ppo", stopping)
+    with pytest.raises(KeyboardInterrupt):
+        training.train(asked, cut, progress=False)
+    monkeypatch.setattr(training, "_by_ppo", plain)
+    assert ROWS < len(read_rows(cut)) < 2 * ROWS
+    (cut / "parts" / "001.orbax-checkpoint-tmp-0").mkdir()
+    again = training.train(asked, cut, progress=False)
+    for a, b in zip(jax.tree.leaves(one.params), jax.tree.leaves(again.params), strict=True):
+        np.testing.assert_array_equal(a, b)
+    kept = [
+        [{name: row[name] for name in row if name != "per_second"} for row in read_rows(folder)]
+        for folder in (whole, cut)
+    ]
+    assert kept[0] == kept[1] and len(kept[0]) == 2 * ROWS
+    assert len(list((cut / "tensorboard").iterdir())) == 2
+
+
+@pytest.mark.parametrize(
+    "network, begun, says",
+    [
+        ("attention", Mlp(), "weights of attention (width 64, heads 4, layers 2), got mlp (size 6"),
+        ("mlp", Mlp(width=8), "weights of mlp (size 6, width 64), got mlp (size 6, width 8)"),
+    ],
+)
+def test_weights_of_another_network_or_size_are_refused(network, begun, says, capsys, tmp_path):
+    path, out = tmp_path / "other.npz", tmp_path / "run"
+    params = begun.init(jax.random.key(0), jnp.zeros((1, 3, FEATURES)))
+    save_checkpoint(path, params, begun, {})
+    given = ["--suite", SUITE, "--network", network, "--begin", str(path), "--out", str(out)]
+    assert main(["train", *given]) == 2
+    assert f"--begin must hold the {says}" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_a_training_without_brax_names_the_extra(capsys, tmp_path, monkeypatch):
+    import sys
+
+    monkeypatch.delitem(sys.modules, "planner_jax.policies.training")
+    monkeypatch.setitem(sys.modules, "planner_jax.policies.brax_compat", None)
+    monkeypatch.setitem(sys.modules, "brax.training", None)
+    monkeypatch.setitem(sys.modules, "brax", None)
+    assert main(["train", "--out", str(tmp_path / "run")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "train needs brax" in line and "pip install 'planner-jax[policies]'" in line
+    assert not (tmp_path / "run").exists()
+
+
+def test_every_network_is_named_in_settings():
+    from planner_jax.policies.settings import NETWORK_NAMES
+
+    assert tuple(NETWORKS) == NETWORK_NAMES
