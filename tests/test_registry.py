@@ -116,7 +116,7 @@ def test_unknown_names_are_told_in_one_line_which_there_are():
         lambda: pj.hit.draw(1, "S.7"), r"^suite must be one of court, S\.1, .*, got 'S\.7'$"
     )
     assert_one_line(
-        lambda: pj.catch.draw(1, "rain"), "^suite must be one of throws, .*, hexagon6, got 'rain'$"
+        lambda: pj.catch.draw(1, "rain"), "^suite must be one of throws, .*, swarm12, got 'rain'$"
     )
     assert issubclass(UnknownName, ValueError)
 
