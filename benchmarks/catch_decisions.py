@@ -5,13 +5,12 @@
 
 The planner is `exact`, and every plan is refereed. Decisions: `best` plans the six most promising
 of all orders, `greedy` one, `random` any; `policy` is the shipped one or that of --policy, by its
-mean, and by
-six proposals of which the earliest stays. Of suites whose targets may be left, "caught" is what
-counts: targets a case, of successes. Last catches are means of what the referee accepts. The
-optimal time ratio (OTR) is that of the decision's own times; "at 25" has the planner stop after 25
-iterations of one start. A decision is timed alone, for one case at a time from NumPy arrays to
-order and times, compiled before. No policy was trained on the seed, which is not that of `draw`'s
-default either.
+mean, and by six proposals of which the earliest stays. Of suites whose targets may be left,
+"caught" is what counts: targets a case, of successes. Last catches are means of what the referee
+accepts. The optimal time ratio (OTR) is that of the decision's own times; "at 25" has the planner
+stop after 25 iterations of one start. A decision is timed alone, for one case at a time from NumPy
+arrays to order and times, compiled before. No policy was trained on the seed, which is not that of
+`draw`'s default either.
 """
 
 import argparse
