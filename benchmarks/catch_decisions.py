@@ -104,7 +104,9 @@ def main() -> None:
     """Print the table."""
     parser = argument_parser("catch_decisions", __doc__, num=1000, seed=777, timed=200)
     parser.add_argument("--suites", default=",".join(OF_PAPER), help="comma-separated")
-    parser.add_argument("--policy", metavar="FILE", help="default: the one that is shipped")
+    parser.add_argument(
+        "--policy", metavar="FILE", default="catch", help="or one that is shipped (default: catch)"
+    )
     options = parser.parse_args()
     suites = chosen(parser, "--suites", options.suites, SUITES)
     with begin(parser, options) as bench:

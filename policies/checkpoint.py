@@ -20,7 +20,7 @@ from planner_jax.policies.observation import FEATURES
 from planner_jax.sweep.settings import SettingError
 
 FORMAT = 1
-_SHIPPED = "catch.npz"
+SHIPPED = ("catch", "rush6")  # one for eight suites, and one for `rush6` alone
 _OF_FLAX = ("parent", "name")  # fields of every module
 
 
@@ -101,7 +101,7 @@ def load_checkpoint(path: str | os.PathLike) -> Checkpoint:
     return Checkpoint(params=params, network=kind(**sizes), about=about)
 
 
-def shipped_checkpoint() -> Checkpoint:
-    """The policy for catches that comes with the library."""
-    with resources.as_file(resources.files("planner_jax.policies") / _SHIPPED) as path:
+def shipped_checkpoint(name: str) -> Checkpoint:
+    """A policy that comes with the library, one of `SHIPPED`."""
+    with resources.as_file(resources.files("planner_jax.policies") / f"{name}.npz") as path:
         return load_checkpoint(path)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from planner_jax.policies.checkpoint import Checkpoint, load_checkpoint, shipped_checkpoint
+from planner_jax.policies.checkpoint import SHIPPED, load_checkpoint, shipped_checkpoint
 from planner_jax.policies.networks import LEAST_STD
 from planner_jax.policies.observation import PER_TARGET, choice_of, observe
 from planner_jax.task.catch.case import CatchCase, CatchChoice
@@ -53,15 +53,16 @@ class Policy(CatchDecision):
         return in_several_lengths(case, choices)
 
 
-def policy(file: str | os.PathLike | None = None, **options: Any) -> Policy:
+def policy(file: str | os.PathLike = "catch", **options: Any) -> Policy:
     """The policy of a checkpoint.
 
     Args:
-        file: that `planner-jax train` wrote; the one that is shipped if not given.
+        file: that `planner-jax train` wrote, or the name of one that is shipped: "catch", which
+            was trained on suites of one to twelve targets, or "rush6", on that suite alone.
         **options: `proposals` and `spread` of `Policy`.
 
     Raises:
         CheckpointError: it is no checkpoint of a policy, or of another version; one line.
     """
-    found: Checkpoint = shipped_checkpoint() if file is None else load_checkpoint(file)
+    found = shipped_checkpoint(os.fspath(file)) if file in SHIPPED else load_checkpoint(file)
     return Policy(params=found.params, network=found.network, **options)

@@ -94,6 +94,18 @@ def test_the_shipped_policy_is_solved_and_confirmed_by_the_referee():
     assert pj.catch.judge(cases, plans).success.all()
 
 
+def test_the_policy_of_hurried_targets_keeps_more_deadlines_than_greedy():
+    """That is, its times lie before the horizons; the name is that of a shipped policy."""
+    cases = jax.tree.map(np.asarray, pj.catch.draw(128, "rush6", 5))
+    named = pj.catch.planner(decide="policy:rush6").decision
+    kept = {}
+    for name, decision in (("greedy", pj.catch.Greedy()), ("rush6", named)):
+        choice = first_choice(decision, cases)
+        left = np.take_along_axis(cases.horizon, np.asarray(choice.order), 1) - choice.times
+        kept[name] = float((left >= 0.0).all(axis=1).mean())
+    assert kept["rush6"] >= kept["greedy"] + 0.2, kept
+
+
 def test_a_lane_of_nan_spoils_no_other():
     cases = cases_of()
     planner = pj.catch.planner(decide="policy")

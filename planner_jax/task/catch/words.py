@@ -25,8 +25,9 @@ def planner(
         name: one of these, or one that another package offers.
         decide: "best" plans the most promising of all orders and keeps the earliest last catch,
             "greedy" catches next what it can reach first, "given" takes order and times of the
-            cases, "policy" asks a network that was trained by reinforcement, or another one as
-            "policy:FILE"; or a decision with settings, such as `Best(finalists=3)`.
+            cases, "policy" asks a network that was trained by reinforcement; "policy:rush6"
+            asks one that was trained on that suite alone, and "policy:FILE" one of your own; or
+            a decision with settings, such as `Best(finalists=3)`.
         **options: fields of that planner's dataclass, for example `rounds`.
 
     Returns:

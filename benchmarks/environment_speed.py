@@ -1,0 +1,71 @@
+"""How many decisions a second the training environment plans.
+
+    python -m benchmarks.environment_speed [--suite triangle3] [--iterations 25] [--lanes 16384]
+        [--steps 20] [--out DIR]
+
+A step is that of `CatchEnv`: an action for each lane, the plan that follows from it, its reward,
+the next cases and what is seen of them. Actions are random, a tenth of their range wide, as those
+of a policy that learns are. The time is that of --steps steps in one compiled loop, the best of
+three, after one that compiles; beside it the share of plans that succeed within the iterations,
+by the planner's own check, since a step leaves no plans for the referee.
+"""
+
+import argparse
+import time
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from planner_jax.benchmarks.run import Bench, argument_parser, begin
+from planner_jax.policies.environment import CatchEnv
+from planner_jax.task.catch.card import SUITES
+
+
+def measure(bench: Bench, options: argparse.Namespace) -> None:
+    """The row."""
+    env = CatchEnv((options.suite,), (options.iterations,))
+    keys = jax.random.split(jax.random.key_data(jax.random.key(options.seed)), options.lanes)
+
+    def one(state: Any, key: Any) -> tuple[Any, Any]:
+        action = 0.1 * jax.random.normal(key, (options.lanes, env.action_size))
+        state = env.step(state, jnp.clip(action, -1.0, 1.0))
+        return state, jnp.mean(state.info["episode_metrics"]["solved"])
+
+    @jax.jit
+    def steps(state: Any, key: Any) -> tuple[Any, Any]:
+        return jax.lax.scan(one, state, jax.random.split(key, options.steps))
+
+    state = jax.jit(env.reset)(keys)
+    began = time.perf_counter()
+    compiled = steps.lower(state, jax.random.key(1)).compile()
+    compiling = time.perf_counter() - began
+    seconds = []
+    for turn in range(4):
+        began = time.perf_counter()
+        state, solved = jax.block_until_ready(compiled(state, jax.random.key(turn)))
+        seconds.append(time.perf_counter() - began)
+    speed = options.steps * options.lanes / min(seconds[1:])
+    share = float(solved.mean())
+    bench.row(suite=options.suite, per_second=speed, solved=share, compiling=compiling)
+    bench.note(per_second=speed, solved=share)
+    bench.say(
+        f"{options.suite}, {options.iterations} iterations, {options.lanes:,} lanes, "
+        f"{jax.devices()[0].device_kind}: {speed:,.0f} steps/s, {100.0 * share:.1f} % of plans "
+        f"solved; compiled in {compiling:.1f} s"
+    )
+
+
+def main() -> None:
+    """Print the speed."""
+    parser = argument_parser(
+        "environment_speed", __doc__, iterations=25, lanes=16_384, steps=20, seed=0
+    )
+    parser.add_argument("--suite", default="triangle3", choices=SUITES, help="default: triangle3")
+    options = parser.parse_args()
+    with begin(parser, options) as bench:
+        measure(bench, options)
+
+
+if __name__ == "__main__":
+    main()

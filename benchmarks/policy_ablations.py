@@ -1,0 +1,128 @@
+"""What a policy's training owes to its parts: one left out at a time, over several seeds.
+
+    python -m benchmarks.policy_ablations [--suite triangle3] [--decisions 1500000] [--seeds 3]
+        [--variants whole,mlp,...] [--num 1000] [--seed 777] [--out DIR]
+
+"whole" is a training as `planner-jax train` makes it: the network of attention, every decision
+planned, rewards for success, early last catches and times that hold. Of the others each differs
+in one thing: "mlp" in its network; "estimate" has decisions judged by the estimate, without a
+planner; "no last" and "no ratio" lack a term of the reward; "imitation" begins with decisions
+learned from `best`. "small" is of the size that the paper names (IV-B): its network, 100
+environments, and a tenth of the decisions, which already takes longer. What is trained decides
+about cases of a seed that it was not trained on; every plan is by `exact` and refereed, last
+catches and optimal time ratios (OTR) are of what the referee accepts. The spread is that of the
+seeds, as least and largest. Seconds are those of training, compilation included.
+"""
+
+import argparse
+import dataclasses
+import tempfile
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+import planner_jax as pj
+from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin, chosen
+from planner_jax.planning.decided import DecidedPlanner
+from planner_jax.policies.settings import WEIGHTS
+from planner_jax.policies.training import Part, Training, train
+from planner_jax.task.catch.card import SUITES
+from planner_jax.task.catch.exact import ExactCatch
+
+ITERATIONS = 25  # of the planner in training
+VARIANTS: dict[str, dict[str, Any]] = {
+    "whole": {},
+    "mlp": {"network": "mlp"},
+    "estimate": {"iterations": 0},
+    "no last": {"weights": {"last": 0.0}},
+    "no ratio": {"weights": {"ratio": 0.0}},
+    "imitation": {"lessons": 2000},
+    "small": {"network": "mlp", "lanes": 100, "minibatches": 4, "share": 0.1},
+}
+FIGURES = ("success", "last", "ratio", "seconds")
+
+
+def asked(
+    suite: str,
+    decisions: int,
+    seed: int,
+    *,
+    iterations: int = ITERATIONS,
+    share: float = 1.0,
+    weights: Mapping[str, float] | None = None,
+    **others: Any,
+) -> Training:
+    """The training of a variant."""
+    part = Part(steps=int(share * decisions), iterations=(iterations,))
+    terms = tuple({**WEIGHTS, **(weights or {})}.items())
+    usual = Training(suites=(suite,), parts=(part,), seed=seed, weights=terms, judged=0)
+    return dataclasses.replace(usual, **others)
+
+
+def figures_of(bench: Bench, decision: Any, options: argparse.Namespace) -> dict[str, float]:
+    """Success, mean last catch [s] and optimal time ratio of a decision's plans, counted."""
+    cases: Any = jax.tree.map(np.asarray, pj.catch.draw(options.num, options.suite, options.seed))
+    plans = pj.plan(DecidedPlanner(ExactCatch(), decision), cases)
+    good = pj.catch.judge(cases, plans).success
+    bench.count(good)
+    return {
+        "success": 100.0 * good.mean(),
+        "last": plans.times[good, -1].mean() if good.any() else np.nan,
+        "ratio": pj.catch.optimal_time_ratio(cases, plans)[good].mean() if good.any() else np.nan,
+    }
+
+
+def measure(bench: Bench, variants: list[str], options: argparse.Namespace) -> None:
+    """All rows."""
+    bench.say(
+        f"{options.suite}, {options.decisions:,} decisions, {options.seeds} seeds, judged on "
+        f"{options.num} cases of seed {options.seed}, {jax.devices()[0]}",
+        "| variant | refereed | last catch | OTR | training |",
+        "|---|---|---|---|---|",
+    )
+    for name in ("best", "greedy"):
+        decision = pj.catch.Best() if name == "best" else pj.catch.Greedy()
+        one = figures_of(bench, decision, options)
+        bench.row(variant=name, **one)
+        bench.say(
+            f"| `{name}`, not trained | {one['success']:.1f} % | {one['last']:.3f} s "
+            f"| {one['ratio']:.3f} | |"
+        )
+    for name in variants:
+        rows = []
+        for seed in range(options.seeds):
+            training = asked(options.suite, options.decisions, seed, **VARIANTS[name])
+            began = time.perf_counter()
+            with tempfile.TemporaryDirectory() as scratch:
+                found = train(training, scratch, progress=False)
+            seconds = time.perf_counter() - began
+            rows.append({**figures_of(bench, found, options), "seconds": seconds})
+            bench.row(variant=name, seed=seed, **rows[-1])
+        least, largest = (
+            {key: choose(row[key] for row in rows) for key in FIGURES} for choose in (min, max)
+        )
+        bench.say(
+            f"| {name} | {least['success']:.1f} to {largest['success']:.1f} % "
+            f"| {least['last']:.3f} to {largest['last']:.3f} s "
+            f"| {least['ratio']:.3f} to {largest['ratio']:.3f} "
+            f"| {least['seconds']:.0f} to {largest['seconds']:.0f} s |"
+        )
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argument_parser("policy_ablations", __doc__, num=1000, seed=777, seeds=3)
+    parser.add_argument("--suite", default="triangle3", choices=SUITES, help="default: triangle3")
+    parser.add_argument("--decisions", type=at_least(1000), default=1_500_000, metavar="N")
+    parser.add_argument("--variants", default=",".join(VARIANTS), help="comma-separated")
+    options = parser.parse_args()
+    variants = chosen(parser, "--variants", options.variants, VARIANTS)
+    with begin(parser, options) as bench:
+        measure(bench, variants, options)
+
+
+if __name__ == "__main__":
+    main()
