@@ -19,7 +19,7 @@ from planner_jax.policies.networks import NETWORKS
 from planner_jax.policies.observation import FEATURES
 from planner_jax.sweep.settings import SettingError
 
-FORMAT = 1
+FORMAT = 2
 SHIPPED = ("catch", "rush6")  # one for eight suites, and one for `rush6` alone
 _OF_FLAX = ("parent", "name")  # fields of every module
 

@@ -21,10 +21,8 @@ _FIRST_STD = 0.15
 def _head(features: Array) -> Array:
     """The last layer: no handicap, no stretch, and a standard deviation to begin with."""
     raw = float(np.log(np.expm1(_FIRST_STD - LEAST_STD)))
-    means = nn.Dense(PER_TARGET, kernel_init=nn.initializers.zeros)(features)
-    bias = nn.initializers.constant(raw)
-    spreads = nn.Dense(PER_TARGET, kernel_init=nn.initializers.zeros, bias_init=bias)(features)
-    return jnp.concatenate([means, spreads], axis=-1)
+    first = lambda *_: jnp.repeat(jnp.array([0.0, raw]), PER_TARGET)  # noqa: E731
+    return nn.Dense(2 * PER_TARGET, kernel_init=nn.initializers.zeros, bias_init=first)(features)
 
 
 class Mlp(nn.Module):
@@ -88,11 +86,24 @@ def _attended(module: Any, seen: Array) -> Array:
     mask = (present[..., None, :] | jnp.eye(seen.shape[-2], dtype=bool))[..., None, :, :]
     hidden = nn.Dense(module.width)(seen)
     for _ in range(module.layers):
-        norm = nn.LayerNorm()(hidden)
-        hidden += nn.MultiHeadDotProductAttention(module.heads)(norm, norm, mask=mask)
+        hidden += _looked(module, nn.LayerNorm()(hidden), mask)
         wide = nn.relu(nn.Dense(2 * module.width)(nn.LayerNorm()(hidden)))
         hidden += nn.Dense(module.width)(wide)
     return nn.LayerNorm()(hidden)
+
+
+def _looked(module: Any, hidden: Array, mask: Array) -> Array:
+    """What targets (..., N, width) see where the mask (..., 1, N, N) lets them look.
+
+    Questions, keys and values come from one product: with few targets the number of products is
+    what takes the time.
+    """
+    width, heads = module.width, module.heads
+    every = nn.Dense(3 * width)(hidden).reshape(*hidden.shape[:-1], 3, heads, width // heads)
+    asked, keys, values = (every[..., k, :, :] for k in range(3))
+    weights = nn.dot_product_attention_weights(asked, keys, mask=mask)
+    mixed = jnp.einsum("...hqk,...khd->...qhd", weights, values)
+    return nn.Dense(width)(mixed.reshape(hidden.shape))
 
 
 NETWORKS = {"attention": Attention, "mlp": Mlp}

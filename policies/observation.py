@@ -33,7 +33,7 @@ def observe(case: CatchCase, table: Timetable) -> Array:
     place, velocity = case.head_state[0], case.head_state[1]
     now = targets_at(case.targets, jnp.zeros_like(case.horizon))
     every = table.times.shape[1] // _SHARES
-    path = (table.places[:, every - 1 :: every] - place).reshape(num, -1) / 4.0
+    path = (table.places[..., every - 1 :: every].mT - place).reshape(num, -1) / 4.0
     time, _, shortfall = arrivals(table, jnp.zeros_like(case.gravity), place, top_speed(case))
     others = jnp.sum(case.present) - 1.0
     columns = [

@@ -65,4 +65,5 @@ def policy(file: str | os.PathLike = "catch", **options: Any) -> Policy:
         CheckpointError: it is no checkpoint of a policy, or of another version; one line.
     """
     found = shipped_checkpoint(os.fspath(file)) if file in SHIPPED else load_checkpoint(file)
-    return Policy(params=found.params, network=found.network, **options)
+    params = jax.tree.map(jnp.asarray, found.params)  # sent to the device once, not each time
+    return Policy(params=params, network=found.network, **options)

@@ -10,6 +10,7 @@ from jax import Array, lax
 from jax.core import Tracer
 
 from planner_jax.planning.batch import better_of, merged
+from planner_jax.planning.packed import call_packed
 from planner_jax.protocol import Attempt, Case, Decision, Drive, Plan, is_solved, is_unsolved
 
 CaseT = TypeVar("CaseT", bound=Case)
@@ -53,7 +54,7 @@ class DecidedPlanner(Generic[CaseT, PlanT]):
         is_resident = all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(cases))
         if not drive.is_pure:
             self.decision.check(cases)
-        choices = _proposals(self.decision, cases)
+        choices = self._proposed(drive, cases)
         if len(choices) == 1:
             decided = cases.decided(choices[0] if is_resident else jax.device_get(choices[0]))
             plans, unsolved = drive(self.planner, decided)
@@ -70,6 +71,12 @@ class DecidedPlanner(Generic[CaseT, PlanT]):
         status = _explained(self.decision, decided, plans.status)
         on_devices = isinstance(plans.status, jax.Array)
         return plans.replace(status=status if on_devices else np.asarray(status))
+
+    def _proposed(self, drive: Drive, cases: Any) -> list[Any]:
+        """The first choice of one case or of each of a batch, the second, ..."""
+        if drive.is_pure or cases.batch_shape != ():
+            return _proposals(self.decision, cases)
+        return _each(call_packed(_propose, None, self.decision, cases))
 
     def _best_choice(self, drive: Drive, cases: Any, choices: Any) -> tuple[Any, Any]:
         """The cases as decided and their plans, after all choices have been planned together."""
@@ -108,13 +115,21 @@ class DecidedPlanner(Generic[CaseT, PlanT]):
         return merged(plans, drive(self.planner, some, [attempt])[0], lanes)
 
 
+def _propose(_: None, decision: Any, case: Any) -> Any:
+    return decision.propose(case)
+
+
+def _each(choices: Any) -> list[Any]:
+    """Choices (F, ...) one by one."""
+    num = jax.tree.leaves(choices)[0].shape[0]
+    return [jax.tree.map(lambda leaf: leaf[k], choices) for k in range(num)]  # noqa: B023
+
+
 @jax.jit
 def _proposals(decision: Any, cases: Any) -> list[Any]:
     """The first choice of one case or of each of a batch, the second, ..."""
     if cases.batch_shape == ():
-        choices = decision.propose(cases)
-        num = jax.tree.leaves(choices)[0].shape[0]
-        return [jax.tree.map(lambda leaf: leaf[k], choices) for k in range(num)]  # noqa: B023
+        return _each(decision.propose(cases))
     choices = jax.vmap(decision.propose)(cases)
     num = jax.tree.leaves(choices)[0].shape[1]
     return [jax.tree.map(lambda leaf: leaf[:, k], choices) for k in range(num)]  # noqa: B023

@@ -16,7 +16,14 @@ from jax import Array, lax
 from planner_jax.protocol import Status, is_unsolved
 from planner_jax.task.catch.beam import beam
 from planner_jax.task.catch.case import CatchCase, CatchChoice
-from planner_jax.task.catch.estimate import GRID, earliest_next, follow, sampled, timetable
+from planner_jax.task.catch.estimate import (
+    GRID,
+    earliest_next,
+    follow,
+    length,
+    sampled,
+    timetable,
+)
 from planner_jax.task.catch.plan import CatchPlan
 
 LENGTHS = 3  # in which an order of optional targets is proposed
@@ -39,12 +46,11 @@ def _closest_approach(case: CatchCase) -> Array:
     """`closest_approach` of one case."""
     net, limits = case.net, case.limits
     times, states, speed = sampled(case)
-    offset = states.pos - case.head_state[0]
-    distance = jnp.sqrt(jnp.maximum(jnp.sum(offset**2, axis=-1), 1e-12))
+    distance = length(states.pos - case.head_state[0][:, None])
     # The target moves on between two of the times.
     slack = net.height + net.radius + (speed + limits.speed) * case.horizon[:, None] / GRID
     far = distance - limits.speed * times - slack
-    low = limits.min_height - states.pos[..., 2] - slack
+    low = limits.min_height - states.pos[:, 2] - slack
     gap = jnp.min(jnp.maximum(jnp.maximum(far, low), 0.0), axis=1)
     return jnp.where(case.present, gap, 0.0)
 

@@ -12,6 +12,7 @@ from flax import struct
 from jax import Array
 
 from planner_jax.ball.flight import BallState
+from planner_jax.lanes import over_lanes
 from planner_jax.task.catch.case import CatchCase, CatchChoice
 from planner_jax.task.catch.chain import targets_at
 
@@ -30,37 +31,47 @@ class Timetable:
     """Where a target is, when, and whether it may be caught there; one, or N with an axis more."""
 
     times: Array  # (K,) [s]
-    places: Array  # (K, 3) [m], of the quadrotor
+    places: Array  # (3, K) [m], of the quadrotor
     penalty: Array  # (K,) [m], above zero where a catch is hardly possible
 
 
 def sampled(case: CatchCase) -> tuple[Array, BallState, Array]:
-    """Times (N, K) up to the horizon, the targets' states and their speeds (N, K) then."""
+    """Times (N, K) up to the horizon, the targets' states (N, 3, K) and speeds (N, K) then.
+
+    The times come last: a CPU computes with many of them at once.
+    """
     shares = jnp.asarray(np.arange(1, GRID + 1) / GRID, case.gravity.dtype)
     times = case.horizon[:, None] * shares
-    states = jax.vmap(lambda target, at: jax.vmap(target.at)(at))(case.targets, times)
-    return times, states, _speed_of(states)
+    states = jax.vmap(lambda target, at: over_lanes(target.at)(at))(case.targets, times)
+    return times, states, length(states.vel)
 
 
 def timetable(case: CatchCase) -> Timetable:
     """When and where each of the N targets of one case may be caught."""
-    times, states, _ = sampled(case)
-    places, penalty = _to_catch(case, states)
+    times, states, speed = sampled(case)
+    places, penalty = _to_catch(case, states, speed)
     return Timetable(times=times, places=places, penalty=penalty)
 
 
-def _to_catch(case: CatchCase, states: BallState) -> tuple[Array, Array]:
-    """Where the quadrotor catches targets in states (..., 3), and the penalty (...) [m] there."""
+def _to_catch(case: CatchCase, states: BallState, speed: Array) -> tuple[Array, Array]:
+    """Where the quadrotor catches N targets, and the penalty (N, K) [m] there.
+
+    Args:
+        case: one case.
+        states: of the targets, (N, 3, K).
+        speed: (N, K) [m/s], theirs.
+    """
     net, limits = case.net, case.limits
-    up = jnp.array([0.0, 0.0, 1.0], states.pos.dtype)
-    from_below = jnp.maximum(states.vel[..., 2] / _speed_of(states) + _STEEPEST, 0.0)
-    places = states.pos - net.height * up
-    low = jnp.maximum(limits.min_height + 0.1 - places[..., 2], 0.0)
+    from_below = jnp.maximum(states.vel[:, 2] / speed + _STEEPEST, 0.0)
+    places = states.pos - net.height * jnp.asarray([[0.0], [0.0], [1.0]], states.pos.dtype)
+    low = jnp.maximum(limits.min_height + 0.1 - places[:, 2], 0.0)
     return places, 10.0 * from_below + 10.0 * low
 
 
-def _speed_of(states: BallState) -> Array:
-    return jnp.sqrt(jnp.maximum(jnp.sum(states.vel**2, axis=-1), 1e-6))
+def length(vectors: Array) -> Array:
+    """Lengths (..., K) of vectors (..., 3, K), never zero."""
+    x, y, z = vectors[..., 0, :], vectors[..., 1, :], vectors[..., 2, :]
+    return jnp.sqrt(jnp.maximum(x * x + y * y + z * z, 1e-12))
 
 
 def arrival(
@@ -76,10 +87,10 @@ def arrival(
     """
     times, places, penalty = table.times, table.places, table.penalty
     late = jnp.where(times > begin, 0.0, 100.0)
-    short = _out_of_reach(places - place, times - begin, speed) + penalty + late
-    possible = short <= 0.0
-    first = jnp.where(jnp.any(possible), jnp.argmax(possible), jnp.argmin(short))
-    return times[first], places[first], short[first]
+    short = _out_of_reach(places - place[:, None], times - begin, speed) + penalty + late
+    # The first time at which nothing is short, or else that at which least is.
+    first = jnp.argmin(jnp.where(short <= 0.0, np.arange(-short.size, 0.0), short))
+    return times[first], places[:, first], short[first]
 
 
 # The same of N targets, whose timetable has an axis more.
@@ -87,12 +98,11 @@ arrivals = jax.vmap(arrival, (0, None, None, None))
 
 
 def _out_of_reach(way: Array, span: Array, speed: Array) -> Array:
-    """By how much [m] a way (..., 3) is longer than what is flown in a span (...) [s]."""
-    distance = jnp.sqrt(jnp.maximum(jnp.sum(way**2, axis=-1), 1e-12))
+    """By how much (..., K) [m] ways (..., 3, K) are longer than what is flown in spans [s]."""
     span = jnp.maximum(span - _TURNING, 0.0)
     rise = speed / _ACCELERATION
     reach = jnp.where(span < rise, 0.5 * _ACCELERATION * span**2, speed * span - 0.5 * speed * rise)
-    return jnp.maximum(distance - reach, 0.0)
+    return jnp.maximum(length(way) - reach, 0.0)
 
 
 def shortfall(case: CatchCase, choice: CatchChoice) -> Array:
@@ -103,11 +113,12 @@ def shortfall(case: CatchCase, choice: CatchChoice) -> Array:
     """
     order, times = choice.order, choice.times
     targets = jax.tree.map(lambda leaf: leaf[order], case.targets)
-    places, penalty = _to_catch(case, targets_at(targets, times))
-    before = jnp.concatenate([case.head_state[:1], places[:-1]])
+    states = jax.tree.map(lambda leaf: leaf[..., None], targets_at(targets, times))
+    places, penalty = _to_catch(case, states, length(states.vel))
+    before = jnp.concatenate([case.head_state[None, :1].mT, places[:-1]])
     span = jnp.diff(times, prepend=jnp.zeros_like(times[:1]))
-    short = _out_of_reach(places - before, span, top_speed(case)) + penalty
-    short = jnp.maximum(short - _TRIED, 0.0) if case.optional else short
+    short = _out_of_reach(places - before, span[:, None], top_speed(case)) + penalty
+    short = (jnp.maximum(short - _TRIED, 0.0) if case.optional else short)[:, 0]
     return jnp.sum(jnp.where(case.present[order], short, 0.0))
 
 

@@ -1,0 +1,98 @@
+"""Compiled functions of one case, which is sent as one vector and answered by one.
+
+Each array that crosses into or out of a compiled program costs some microseconds, which for a
+decision or a plan of one case would add up to a good part of the time.
+"""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable, Hashable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+_Layout = tuple[tuple[tuple[int, ...], Any], ...]  # shapes and dtypes of a tree's leaves
+
+
+def call_packed(function: Callable, static: Hashable, own: Any, case: Any) -> Any:
+    """What `function(static, own, case)` returns, with NumPy leaves.
+
+    Args:
+        function: pure; compiled once for each of what is static and for each layout of the rest.
+        static: what shapes the program.
+        own: a pytree that stays where it is, such as a planner.
+        case: a pytree with NumPy leaves, one of them floating at least.
+    """
+    leaves, tree = jax.tree.flatten(case)
+    arrays = [np.asarray(leaf) for leaf in leaves]
+    kept, own_tree = jax.tree.flatten(own)
+    program = _program(function, static, own_tree, _layout(kept), tree, _layout(arrays))
+    vector = np.concatenate(
+        [array.ravel() for array in arrays], dtype=program.dtype, casting="unsafe"
+    )
+    packed = np.asarray(program.run(kept, vector))
+    return jax.tree.unflatten(
+        program.tree,
+        [
+            packed[where].reshape(shape).astype(dtype, copy=False)
+            for where, shape, dtype in program.fields
+        ],
+    )
+
+
+def _layout(leaves: Sequence[Any]) -> _Layout:
+    return tuple([(np.shape(leaf), leaf.dtype) for leaf in leaves])
+
+
+@dataclasses.dataclass(frozen=True)
+class _Program:
+    """A compiled function, from what stays and a vector to a vector."""
+
+    run: Callable[[list[Any], np.ndarray], jax.Array]
+    dtype: np.dtype  # of both vectors
+    tree: Any  # of the result
+    fields: list[tuple[slice, tuple[int, ...], Any]]  # where the leaves of the result lie
+
+
+@functools.cache
+def _program(
+    function: Callable,
+    static: Hashable,
+    own_tree: Any,
+    own: _Layout,
+    tree: Any,
+    layout: _Layout,
+) -> _Program:
+    """The program for trees of these shapes and dtypes."""
+    floating = [kind for _, kind in layout if np.issubdtype(kind, np.floating)]
+    dtype = jax.dtypes.canonicalize_dtype(np.result_type(*floating))
+    ends = np.cumsum([math.prod(shape) for shape, _ in layout])
+
+    def unpacked(kept: list[Any], vector: jax.Array) -> Any:
+        pieces = jnp.split(vector, ends[:-1])
+        shaped = [
+            piece.reshape(shape).astype(kind)
+            for piece, (shape, kind) in zip(pieces, layout, strict=True)
+        ]
+        given = jax.tree.unflatten(own_tree, kept)
+        return function(static, given, jax.tree.unflatten(tree, shaped))
+
+    def packed(kept: list[Any], vector: jax.Array) -> jax.Array:
+        leaves = jax.tree.leaves(unpacked(kept, vector))
+        return jnp.concatenate([leaf.ravel().astype(dtype) for leaf in leaves])
+
+    shapes = jax.eval_shape(
+        unpacked,
+        [jax.ShapeDtypeStruct(shape, kind) for shape, kind in own],
+        jax.ShapeDtypeStruct((int(ends[-1]),), dtype),
+    )
+    leaves, result = jax.tree.flatten(shapes)
+    stops = np.cumsum([leaf.size for leaf in leaves]).tolist()
+    fields = [
+        (slice(stop - leaf.size, stop), leaf.shape, leaf.dtype)
+        for stop, leaf in zip(stops, leaves, strict=True)
+    ]
+    return _Program(jax.jit(packed), dtype, result, fields)
