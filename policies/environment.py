@@ -12,6 +12,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from brax.envs.base import Env, State
 from jax import Array
 
@@ -22,7 +23,8 @@ from planner_jax.policies.observation import FEATURES, PER_TARGET, choice_of, ob
 from planner_jax.policies.settings import WEIGHTS
 from planner_jax.protocol import is_solved
 from planner_jax.task.catch.card import SUITES
-from planner_jax.task.catch.case import CatchCase
+from planner_jax.task.catch.case import CatchCase, CatchChoice
+from planner_jax.task.catch.decide import in_several_lengths
 from planner_jax.task.catch.estimate import earliest_next, shortfall, timetable
 from planner_jax.task.catch.exact import ExactCatch
 from planner_jax.task.catch.suites import draw_by_key
@@ -39,17 +41,20 @@ class CatchEnv(Env):
         suites: whose cases are drawn.
         iterations: of the planner, one number a suite; zero has the estimate judge instead.
             Suites whose cases are alike in shape, and which are planned alike, are planned in one.
-        weights: of the terms of `judged`, by name.
+        weights: of the terms of `judged`, by name, each one number or one a suite.
     """
 
     def __init__(
         self,
         suites: tuple[str, ...],
         iterations: tuple[int, ...],
-        weights: Mapping[str, float] = WEIGHTS,
+        weights: Mapping[str, float | tuple[float, ...]] = WEIGHTS,
     ):
         self.suites, self.iterations = tuple(suites), tuple(iterations)
-        self.weights = dict(weights)
+        self.weights = {
+            name: np.broadcast_to(np.asarray(value, np.float32), len(self.suites))
+            for name, value in weights.items()
+        }
         self.size = max(SUITES[suite].num_targets for suite in suites)
 
     def reset(self, rng: Array) -> State:
@@ -78,7 +83,8 @@ class CatchEnv(Env):
         num = action.shape[0]
         actions = action.reshape(len(self.suites), -1, self.size, PER_TARGET)
         terms = self._judged(state.info["cases"], actions)
-        reward = rewarded(terms, self.weights)
+        share = num // len(self.suites)
+        reward = rewarded(terms, {k: np.repeat(one, share) for k, one in self.weights.items()})
         cases, one = self._drawn(own, num), jnp.ones(num)
         steps = {"sum_reward": reward, "length": one}
         info = {
@@ -161,7 +167,7 @@ def judged(cases: CatchCase, actions: Array, iterations: int) -> dict[str, Array
     nothing = jnp.zeros_like(cases.horizon)
     greedy = jax.vmap(earliest_next)(cases, tables, nothing)
     if iterations:
-        found = solve_batch(ExactCatch(), _attempt(iterations), cases.decided(choices))
+        choices, found = _planned(cases, choices, iterations)
         solved, times = is_solved(found.status), found.times
         off = jnp.abs(times - choices.times) / jnp.maximum(times, 1e-3)
         taken = jnp.take_along_axis(choices.taken, choices.order, axis=1)
@@ -189,13 +195,33 @@ def judged(cases: CatchCase, actions: Array, iterations: int) -> dict[str, Array
     }
 
 
+def _planned(cases: CatchCase, choices: CatchChoice, iterations: int) -> tuple[CatchChoice, Any]:
+    """Choices (B, N) and their plans; where targets are optional, in the length that is best."""
+    if not cases.optional:
+        return choices, solve_batch(ExactCatch(), _attempt(iterations), cases.decided(choices))
+    several = jax.vmap(in_several_lengths)(cases, jax.tree.map(lambda x: x[:, None], choices))
+    num = several.times.shape[1]
+    flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), several)
+    tried = jax.tree.map(lambda leaf: jnp.repeat(leaf, num, axis=0), cases).decided(flat)
+    found = solve_batch(ExactCatch(), _attempt(iterations), tried)
+    each = jax.tree.map(lambda leaf: leaf.reshape(-1, num, *leaf.shape[1:]), (flat, found))
+    # The first that is solved is the longest.
+    best = jnp.argmax(is_solved(each[1].status), axis=1)
+    return jax.tree.map(lambda leaf: leaf[jnp.arange(len(best)), best], each)
+
+
 @functools.cache
 def _attempt(iterations: int) -> Round:
     return Round(starts=1, solver=LbfgsConfig(max_steps=iterations))
 
 
-def rewarded(terms: Mapping[str, Array], weights: Mapping[str, float]) -> Array:
-    """The reward (B,) of raw terms: what a solved case is worth, or what an unsolved one costs."""
+def rewarded(terms: Mapping[str, Array], weights: Mapping[str, Any]) -> Array:
+    """The reward (B,) of raw terms: what a solved case is worth, or what an unsolved one costs.
+
+    Args:
+        terms: of `judged`.
+        weights: of each, () or (B,).
+    """
     good = sum(weights[name] * terms[name] for name in _GATED)
     bad = weights["violation"] * terms["violation"]
     return jnp.where(terms["solved"] > 0.5, good, bad)

@@ -13,6 +13,11 @@ WEIGHTS = {"solved": 1.0, "last": 5.0, "ratio": -5.0, "caught": 5.0, "violation"
 _PAPER = ("parabola1", "parabola2", "harmonic2", "triangle3", "hexagon6")
 
 
+def _each(values: tuple[float, ...]) -> float | tuple[float, ...]:
+    """One number, or one a suite."""
+    return values if len(values) > 1 else values[0]
+
+
 @dataclasses.dataclass(frozen=True)
 class TrainSettings:
     """The arguments of a training.
@@ -30,15 +35,23 @@ class TrainSettings:
     iterations: tuple[int, ...] = option(
         (),
         "K",
-        "of the planner, one a suite; 0: the estimate judges, as it does optional targets "
-        "(default: else 25 for up to three targets, and 80)",
+        "of the planner, one a suite; 0: the estimate judges, as it does optional targets by "
+        "default (default: else 25 for up to three targets, and 80)",
     )
-    last: float = option(WEIGHTS["last"], "W", "weight of how early the last catch is")
-    ratio: float = option(
-        -WEIGHTS["ratio"], "W", "weight of how far decided times are from the optimised ones"
+    last: tuple[float, ...] = option(
+        (WEIGHTS["last"],), "W", "weight of how early the last catch is, one or one a suite"
     )
-    solved: float = option(WEIGHTS["solved"], "W", "weight of a case that is solved")
-    caught: float = option(WEIGHTS["caught"], "W", "weight of optional targets that are taken")
+    ratio: tuple[float, ...] = option(
+        (-WEIGHTS["ratio"],),
+        "W",
+        "weight of how far decided times are from the optimised ones, one or one a suite",
+    )
+    solved: tuple[float, ...] = option(
+        (WEIGHTS["solved"],), "W", "weight of a case that is solved, one or one a suite"
+    )
+    caught: tuple[float, ...] = option(
+        (WEIGHTS["caught"],), "W", "weight of optional targets that are taken, one or one a suite"
+    )
     lessons: int = option(0, "N", "cases of each suite whose best decisions are imitated first")
     begin: str | None = option(None, "FILE", "a checkpoint by whose weights it begins")
     kept: float = option(0.0, "F", "share of these weights in those that it ends with")
@@ -66,8 +79,14 @@ class TrainSettings:
         for number in self.iterations:
             require(number >= 0, "iterations", ">= 0", number)
         for name in ("last", "ratio", "solved", "caught"):
-            value = getattr(self, name)
-            require(0.0 <= value < math.inf, name, "finite and >= 0", value)
+            values = getattr(self, name)
+            if len(values) not in (1, len(self.suites)):
+                raise SettingError(
+                    f"{name} must be one number, or one for each of {len(self.suites)} suites, "
+                    f"got {len(values)}"
+                )
+            for value in values:
+                require(0.0 <= value < math.inf, name, "finite and >= 0", value)
         require(0.0 <= self.kept <= 1.0, "kept", "from 0 to 1", self.kept)
         require(self.kept == 0.0 or self.begin is not None, "kept", "left out without begin", "it")
         for name in ("lessons", "judged", "seed"):
@@ -95,11 +114,11 @@ class TrainSettings:
             "lessons": self.lessons,
             "weights": tuple(
                 {
-                    **WEIGHTS,
-                    "solved": self.solved,
-                    "last": self.last,
-                    "ratio": -self.ratio,
-                    "caught": self.caught,
+                    "solved": _each(self.solved),
+                    "last": _each(self.last),
+                    "ratio": _each(tuple(-value for value in self.ratio)),
+                    "caught": _each(self.caught),
+                    "violation": WEIGHTS["violation"],
                 }.items()
             ),
             "begin": self.begin,

@@ -81,7 +81,8 @@ class Training:
     lesson_steps: int = 3000
     divergence: float = 0.01  # wanted of an update, by which the learning rate is set
     entropy: float = 1e-4
-    weights: tuple[tuple[str, float], ...] = tuple(WEIGHTS.items())
+    # Of each term, one or one a suite.
+    weights: tuple[tuple[str, float | tuple[float, ...]], ...] = tuple(WEIGHTS.items())
     begin: str | None = None  # a checkpoint by whose weights it begins
     kept: float = 0.0  # share of these in the weights that it ends with
     judged: int = 256  # cases of each suite by which it is watched; 0: it is not

@@ -62,6 +62,26 @@ def facing_cosine(axis: Array, vel: Array) -> tuple[Array, Array]:
     return -jnp.sum(axis * vel, axis=1) / speed, moving
 
 
+def nearest_upright(vel: Array, lean: Array) -> Array:
+    """The net's axes (N, 3) nearest to upright that lean so far from the targets' way back.
+
+    Targets that rise are taken to fly level.
+
+    Args:
+        vel: (N, 3) [m/s], of the targets.
+        lean: () [rad], from 0 to a quarter turn.
+    """
+    back = jnp.concatenate([-vel[:, :2], jnp.maximum(-vel[:, 2:], 0.0)], axis=1)
+    back /= jnp.sqrt(jnp.maximum(jnp.sum(back**2, axis=1, keepdims=True), 1e-6))
+    level = jnp.sqrt(jnp.maximum(jnp.sum(back[:, :2] ** 2, axis=1, keepdims=True), 1e-6))
+    cosine, sine, rise = jnp.cos(lean), jnp.sin(lean), back[:, 2:]
+    # The way back, turned by the lean towards upright.
+    turned = jnp.concatenate(
+        [(cosine - sine * rise / level) * back[:, :2], cosine * rise + sine * level], axis=1
+    )
+    return jnp.where(rise >= cosine, jnp.array([0.0, 0.0, 1.0], vel.dtype), turned)
+
+
 @struct.dataclass
 class Chain:
     """Boundary rows, offsets and mean piece durations of N segments."""

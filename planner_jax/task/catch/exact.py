@@ -36,6 +36,7 @@ from planner_jax.task.catch.chain import (
     chain_rows,
     chain_trajectory,
     facing_cosine,
+    nearest_upright,
     ordered_context,
     targets_at,
 )
@@ -54,9 +55,20 @@ _RIM = 0.9  # share of the net's radius that a planned catch may use
 _ENCODED_RIM = 0.99  # share of that which a point made by `encode` may use
 
 
-# Starting points, best first: factor on the guessed times, share of the mean velocity of the
-# way to a catch that is kept there.
-_GUESSES = np.array([(1.0, 0.5), (1.0, 1.0), (1.15, 0.3), (1.3, 0.0), (0.9, 1.0), (1.5, 0.2)])
+# Starting points, best first: factor on the guessed times, then twice two numbers, for a catch on
+# the way and for the last one: the share of the mean velocity of the way there that is kept, and
+# the thrust over the weight. Optimal plans sink through their catches and brake at the last one.
+_GUESSES = np.array(
+    [
+        (1.0, 0.5, 0.8, 0.5, 1.15),
+        (1.0, 1.0, 1.0, 1.0, 1.4),
+        (1.15, 0.3, 0.3, 0.5, 1.15),
+        (1.3, 0.0, 0.0, 0.8, 1.15),
+        (0.9, 1.0, 1.0, 0.5, 1.15),
+        (1.5, 0.2, 0.2, 1.0, 1.0),
+    ]
+)
+_LEAN = 0.95  # of the angle that the net may have to the ball's way, what a guess makes use of
 
 
 # Gravity, limits and extras of a case.
@@ -152,19 +164,23 @@ class ExactCatch(OptimisedPlanner):
         )
 
     def _guess(self, context: CatchContext, guess: Array) -> Array:
-        """The point (n,) of later times and a share of the way's velocity at the catches."""
+        """The point (n,) of later times, velocities and thrusts, a row of `_GUESSES`."""
         case = context.case
+        factor, *of_catches = guess
         begin = jnp.zeros_like(context.times[:1])
-        times = context.times * guess[0]
+        times = context.times * factor
         durations = jnp.maximum(jnp.diff(times, prepend=begin), 0.05)
         ball = targets_at(context.targets, times)
-        speed = jnp.sqrt(jnp.maximum(jnp.sum(ball.vel**2, axis=1, keepdims=True), 1e-6))
-        # Straight against the ball, but at most 60 degrees from upright.
-        facing = -ball.vel / speed + 0.3 * jnp.array([0.0, 0.0, 1.0])
-        upright = jnp.maximum(facing[:, 2:], 0.5)
-        acc = case.gravity * facing / upright * jnp.array([1.0, 1.0, 0.0])
         before = jnp.concatenate([case.head_state[None, 0], ball.pos[:-1]])
-        vel = guess[1] * (ball.pos - before) / durations[:, None]
+        is_last = jnp.arange(times.size) == jnp.sum(context.active) - 1
+        kept, thrust = (
+            jnp.where(is_last, last, on_the_way)[:, None]
+            for on_the_way, last in (of_catches[:2], of_catches[2:])
+        )
+        vel = kept * (ball.pos - before) / durations[:, None]
+        up = jnp.array([0.0, 0.0, 1.0], times.dtype)
+        lean = _LEAN * case.net.max_angle
+        acc = case.gravity * (thrust * nearest_upright(ball.vel, lean) - up)
         natural = jnp.concatenate(
             [
                 jnp.zeros((times.size, self.num_offsets)),
