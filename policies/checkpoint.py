@@ -101,6 +101,11 @@ def load_checkpoint(path: str | os.PathLike) -> Checkpoint:
     return Checkpoint(params=params, network=kind(**sizes), about=about)
 
 
+def checkpoint_of(file: str | os.PathLike) -> Checkpoint:
+    """The policy in a file, or one of `SHIPPED` by its name; errors as `load_checkpoint`."""
+    return shipped_checkpoint(os.fspath(file)) if file in SHIPPED else load_checkpoint(file)
+
+
 def shipped_checkpoint(name: str) -> Checkpoint:
     """A policy that comes with the library, one of `SHIPPED`."""
     with resources.as_file(resources.files("planner_jax.policies") / f"{name}.npz") as path:
