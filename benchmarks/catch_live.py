@@ -27,6 +27,7 @@ import planner_jax as pj
 from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.policies.policy import policy
+from planner_jax.referee.catch import CatchVerdict
 from planner_jax.sweep.settings import SettingError
 from planner_jax.task.catch.appearing import SPAN, draw_appearing, states_of
 from planner_jax.task.catch.decide import Random
@@ -48,19 +49,17 @@ def decision_of(name: str, file: str) -> Any:
     return known[name]
 
 
-def known_from_the_start(cases: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Success, number caught and last catch [s] (B,) of one plan that knows all targets."""
+def known_from_the_start(cases: Any) -> tuple[CatchVerdict, np.ndarray]:
+    """The verdict on, and the last catch [s] (B,) of, one plan that knows all targets."""
     cases = jax.tree.map(np.asarray, cases)
     plans: Any = pj.plan(DecidedPlanner(pj.catch.ExactCatch(), LONG), cases)
-    verdict = pj.catch.judge(cases, plans, target_states=states_of)
-    return verdict.success, verdict.num_caught, plans.times[:, -1]
+    return pj.catch.judge(cases, plans, target_states=states_of), plans.times[:, -1]
 
 
-def played(cases: Any, decision: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def played(cases: Any, decision: Any) -> tuple[CatchVerdict, np.ndarray]:
     """The same of flights in which targets appear."""
     flown = fly_live(cases, decision)
-    verdict = judge_live(flown)
-    return verdict.success, verdict.num_caught, np.asarray(flown.plans.times)[:, -1]
+    return judge_live(flown), np.asarray(flown.plans.times)[:, -1]
 
 
 def run_span(bench: Bench, span: float, names: list[str], options: argparse.Namespace) -> None:
@@ -70,18 +69,20 @@ def run_span(bench: Bench, span: float, names: list[str], options: argparse.Name
     for name in ("known", *names):
         began = time.perf_counter()
         if name == "known":
-            success, number, last = known_from_the_start(cases)
+            verdict, last = known_from_the_start(cases)
         else:
-            success, number, last = played(cases, decision_of(name, options.policy))
-            bench.count(success)
+            verdict, last = played(cases, decision_of(name, options.policy))
+            bench.count(verdict.success)
         seconds = time.perf_counter() - began
-        caught = number * success
+        caught = verdict.num_caught * verdict.success
+        fails = [str(limit) for limit in verdict.failed_limit[~verdict.success]]
         most = np.maximum(most, caught)
         some = caught > 0
         row = {
             "span": span,
             "decide": name,
-            "success": success.mean(),
+            "success": verdict.success.mean(),
+            "fails": {limit: fails.count(limit) for limit in sorted(set(fails))},
             "caught": caught.mean(),
             "last": last[some].mean() if some.any() else None,
             "seconds": seconds,
