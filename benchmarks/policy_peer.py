@@ -6,13 +6,13 @@
 Needs `pip install stable-baselines3`, in an environment without the extra `gpu`: PyTorch asks for
 other CUDA libraries than those that are pinned for JAX, so no extra holds it.
 
-Both train the paper's network, two hidden layers of 64 with ReLU, in 100 environments at once, with
-as many decisions, the same rewards, and four passes over every 100 decisions in four parts. "sb3" has
-a Gaussian whose actions are cut off at -1 and 1, its own scaling of advantages, a network of the
-same size for the value, and a learning rate of 3e-4; "brax" is the training of this library, whose
-learning rate follows the divergence. What is trained decides about cases of a seed that it was not
-trained on, by its mean; every plan is by `exact` and refereed. Figures are the least and the largest
-of the seeds. Seconds are those of training, compilation included.
+Both train the paper's network, two hidden layers of 64 with ReLU, in 100 environments at once,
+with as many decisions, the same rewards, and four passes over every 100 decisions in four parts.
+"sb3" has a Gaussian whose actions are cut off at -1 and 1, its own scaling of advantages, a network
+of the same size for the value, and a learning rate of 3e-4; "brax" is the training of this library,
+whose learning rate follows the divergence. What is trained decides about cases of a seed that it
+was not trained on, by its mean; every plan is by `exact` and refereed. Figures are the least and
+the largest of the seeds. Seconds are those of training, compilation included.
 """
 
 import argparse

@@ -7,11 +7,14 @@ from flax import struct
 from jax import Array
 
 from planner_jax.cost.quadrotor import body_rate_excess, ground_excess, speed_excess, thrust_excess
+from planner_jax.protocol import FEASIBILITY_TOLERANCE
 from planner_jax.task.catch.case import CatchLimits
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, sample_pieces
 
 _DURATIONS = np.geomspace(0.2, 4.0, 24)  # [s], of the ways to rest that are tried
-_NODES = 40  # at which each is held against the limits
+_NODES = 120  # at which each is held against the limits
+# By how much a square may be above that of its limit: plans may end so far above.
+_ABOVE = 2.0 * FEASIBILITY_TOLERANCE
 # Velocity, acceleration and jerk of the powers 4 to 6 after a unit of time.
 _AT_END = np.array([[4.0, 5.0, 6.0], [12.0, 20.0, 30.0], [24.0, 60.0, 120.0]])
 
@@ -48,16 +51,15 @@ def braking(state: Array, gravity: Array, limits: CatchLimits) -> Braking:
         zero = jnp.zeros_like(high[:1])
         coeffs = jnp.concatenate([low, high, zero])
         motion = sample_pieces(PiecewisePolynomial(coeffs[None], t[None]), _NODES)
-        excess = (
+        squared = (
             speed_excess(motion.vel, limits),
             body_rate_excess(motion.acc, motion.jerk, gravity, limits),
             *thrust_excess(motion.acc, gravity, limits.min_thrust, limits.max_thrust),
-            ground_excess(motion.height, limits),
         )
-        return coeffs, jnp.max(jnp.stack(excess))
+        high_enough = jnp.max(ground_excess(motion.height, limits)) <= 0.0
+        return coeffs, (jnp.max(jnp.stack(squared)) <= _ABOVE) & high_enough
 
     durations = jnp.asarray(_DURATIONS, state.dtype)
-    coeffs, worst = jax.vmap(to_rest)(durations)
-    kept = worst <= 0.0
+    coeffs, kept = jax.vmap(to_rest)(durations)
     first = jnp.argmax(kept)
     return Braking(coeffs=coeffs[first], duration=durations[first], possible=jnp.any(kept))
