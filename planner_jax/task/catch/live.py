@@ -12,7 +12,6 @@ all cases at once, each of which goes on to its own next event.
 """
 
 import dataclasses
-import math
 from typing import Any
 
 import jax
@@ -27,17 +26,13 @@ from planner_jax.task.catch.braking import Braking, braking
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.exact import ExactCatch
 from planner_jax.task.catch.plan import CatchPlan
-from planner_jax.trajectory.polynomial import PiecewisePolynomial, states_at
+from planner_jax.trajectory.polynomial import PiecewisePolynomial, shift_basis, states_at
 
 CHUNKS = (16, 64)  # cases that are decided in one compiled call
 _SIZE = 8  # coefficients of a piece
 _REST = 1e4  # [s], for which the quadrotor waits at the end of its way, if nothing appears
 _SOONER = 1e-3  # [s], by which as many catches have to be over sooner
 _LEAST = 1e-6  # [s], of a piece; a shorter one is left out
-# The Taylor coefficients of a polynomial of degree 7 elsewhere: C(j, i) t^(j - i).
-_PLACES = np.arange(_SIZE)
-_BINOMIALS = np.array([[math.comb(j, i) for j in _PLACES] for i in _PLACES], float)
-_SHIFTS = np.maximum(_PLACES - _PLACES[:, None], 0)
 
 
 def _path(coeffs: Any, durations: Any) -> PiecewisePolynomial:
@@ -228,7 +223,7 @@ def _course_of(plans: CatchPlan, ways: Braking, now: np.ndarray) -> _Course:
     durations = np.asarray(plans.trajectory.durations, np.float64)
     way, time = ways.coeffs.astype(np.float64), ways.duration.astype(np.float64)
     rest = np.zeros_like(way)
-    rest[:, 0] = (way * time[:, None, None] ** _PLACES[:, None]).sum(axis=1)
+    rest[:, 0] = (way * time[:, None, None] ** np.arange(_SIZE)[:, None]).sum(axis=1)
     size = plans.order.shape[1]
     ends = durations.cumsum(axis=1)[:, durations.shape[1] // size - 1 :: durations.shape[1] // size]
     planned = np.diff(ends, prepend=0.0, axis=1) > 0.0
@@ -243,7 +238,8 @@ def _course_of(plans: CatchPlan, ways: Braking, now: np.ndarray) -> _Course:
 
 def _moved(coeffs: np.ndarray, by: np.ndarray) -> np.ndarray:
     """Coefficients (..., 8, 3) of the same polynomials for a time that begins later, by (...)."""
-    matrix = _BINOMIALS * by[..., None, None] ** _SHIFTS
+    factors, powers = shift_basis(_SIZE)
+    matrix = factors * by[..., None, None] ** powers
     return np.einsum("...ij,...jk->...ik", matrix, coeffs)
 
 
