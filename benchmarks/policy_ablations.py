@@ -62,9 +62,11 @@ def asked(
     return dataclasses.replace(usual, **others)
 
 
-def figures_of(bench: Bench, decision: Any, options: argparse.Namespace) -> dict[str, float]:
+def figures_of(
+    bench: Bench, decision: Any, suite: str, options: argparse.Namespace
+) -> dict[str, float]:
     """Success, mean last catch [s] and optimal time ratio of a decision's plans, counted."""
-    cases: Any = jax.tree.map(np.asarray, pj.catch.draw(options.num, options.suite, options.seed))
+    cases: Any = jax.tree.map(np.asarray, pj.catch.draw(options.num, suite, options.seed))
     plans = pj.plan(DecidedPlanner(ExactCatch(), decision), cases)
     good = pj.catch.judge(cases, plans).success
     bench.count(good)
@@ -85,7 +87,7 @@ def measure(bench: Bench, variants: list[str], options: argparse.Namespace) -> N
     )
     for name in ("best", "greedy"):
         decision = pj.catch.Best() if name == "best" else pj.catch.Greedy()
-        one = figures_of(bench, decision, options)
+        one = figures_of(bench, decision, options.suite, options)
         bench.row(variant=name, **one)
         bench.say(
             f"| `{name}`, not trained | {one['success']:.1f} % | {one['last']:.3f} s "
@@ -99,7 +101,7 @@ def measure(bench: Bench, variants: list[str], options: argparse.Namespace) -> N
             with tempfile.TemporaryDirectory() as scratch:
                 found = train(training, scratch, progress=False)
             seconds = time.perf_counter() - began
-            rows.append({**figures_of(bench, found, options), "seconds": seconds})
+            rows.append({**figures_of(bench, found, options.suite, options), "seconds": seconds})
             bench.row(variant=name, seed=seed, **rows[-1])
         least, largest = (
             {key: choose(row[key] for row in rows) for key in FIGURES} for choose in (min, max)

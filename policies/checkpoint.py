@@ -20,7 +20,7 @@ from planner_jax.policies.observation import FEATURES
 from planner_jax.sweep.settings import SettingError
 
 FORMAT = 2
-SHIPPED = ("catch", "rush6")  # one for eight suites, and one for `rush6` alone
+SHIPPED = ("catch", "rush6", "swarm12")  # one for eight suites, and two for one suite alone
 _OF_FLAX = ("parent", "name")  # fields of every module
 
 
@@ -99,6 +99,11 @@ def load_checkpoint(path: str | os.PathLike) -> Checkpoint:
         )
     params = traverse_util.unflatten_dict(arrays, sep="/")
     return Checkpoint(params=params, network=kind(**sizes), about=about)
+
+
+def checkpoint_of(file: str | os.PathLike) -> Checkpoint:
+    """The policy in a file, or one of `SHIPPED` by its name; errors as `load_checkpoint`."""
+    return shipped_checkpoint(os.fspath(file)) if file in SHIPPED else load_checkpoint(file)
 
 
 def shipped_checkpoint(name: str) -> Checkpoint:

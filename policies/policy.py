@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from planner_jax.policies.checkpoint import SHIPPED, load_checkpoint, shipped_checkpoint
+from planner_jax.policies.checkpoint import checkpoint_of
 from planner_jax.policies.networks import LEAST_STD
-from planner_jax.policies.observation import PER_TARGET, choice_of, observe
+from planner_jax.policies.observation import PER_TARGET, STRETCH, choice_of, observe
 from planner_jax.task.catch.case import CatchCase, CatchChoice
 from planner_jax.task.catch.decide import CatchDecision, in_several_lengths
 from planner_jax.task.catch.estimate import timetable
@@ -29,6 +29,8 @@ class Policy(CatchDecision):
     network: Any = struct.field(pytree_node=False)
     proposals: int = struct.field(pytree_node=False, default=1)
     spread: float = struct.field(pytree_node=False, default=1.0)  # factor on deviations
+    # Factor on the times: above one a plan needs fewer iterations, and its last catch is later.
+    stretch: float = struct.field(pytree_node=False, default=1.0)
 
     def check(self, cases: CatchCase) -> None:
         """Raise `ValueError` where there are more targets than the network takes."""
@@ -49,6 +51,8 @@ class Policy(CatchDecision):
         noise = np.random.default_rng(0).normal(size=shape)
         noise[0] = 0.0
         actions = jnp.tanh(mean + self.spread * deviation * jnp.asarray(noise, mean.dtype))
+        later = np.array([0.0, np.log(self.stretch) / STRETCH], mean.dtype)
+        actions = jnp.clip(actions + later, -1.0, 1.0)
         choices = jax.vmap(functools.partial(choice_of, case, table))(actions)
         return in_several_lengths(case, choices)
 
@@ -58,12 +62,13 @@ def policy(file: str | os.PathLike = "catch", **options: Any) -> Policy:
 
     Args:
         file: that `planner-jax train` wrote, or the name of one that is shipped: "catch", which
-            was trained on suites of one to twelve targets, or "rush6", on that suite alone.
-        **options: `proposals` and `spread` of `Policy`.
+            was trained on suites of one to twelve targets, or "rush6" or "swarm12", on that suite
+            alone.
+        **options: `proposals`, `spread` and `stretch` of `Policy`.
 
     Raises:
         CheckpointError: it is no checkpoint of a policy, or of another version; one line.
     """
-    found = shipped_checkpoint(os.fspath(file)) if file in SHIPPED else load_checkpoint(file)
+    found = checkpoint_of(file)
     params = jax.tree.map(jnp.asarray, found.params)  # sent to the device once, not each time
     return Policy(params=params, network=found.network, **options)

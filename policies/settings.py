@@ -53,7 +53,11 @@ class TrainSettings:
         (WEIGHTS["caught"],), "W", "weight of optional targets that are taken, one or one a suite"
     )
     lessons: int = option(0, "N", "cases of each suite whose best decisions are imitated first")
-    begin: str | None = option(None, "FILE", "a checkpoint by whose weights it begins")
+    begin: str | None = option(
+        None,
+        "FILE",
+        "a checkpoint by whose weights it begins, or the name of one that is shipped: catch, rush6",
+    )
     kept: float = option(0.0, "F", "share of these weights in those that it ends with")
     lanes: int | None = option(None, "B", "decided at once (default: 8190, 510 on a CPU)")
     judged: int = option(256, "N", "cases of each suite by which it is watched")

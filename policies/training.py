@@ -34,7 +34,7 @@ from planner_jax.planning.plan import plan
 from planner_jax.policies import brax_compat
 from planner_jax.policies.checkpoint import (
     CheckpointError,
-    load_checkpoint,
+    checkpoint_of,
     name_and_sizes,
     save_checkpoint,
 )
@@ -83,7 +83,7 @@ class Training:
     entropy: float = 1e-4
     # Of each term, one or one a suite.
     weights: tuple[tuple[str, float | tuple[float, ...]], ...] = tuple(WEIGHTS.items())
-    begin: str | None = None  # a checkpoint by whose weights it begins
+    begin: str | None = None  # a checkpoint by whose weights it begins, or a shipped one's name
     kept: float = 0.0  # share of these in the weights that it ends with
     judged: int = 256  # cases of each suite by which it is watched; 0: it is not
 
@@ -205,7 +205,7 @@ def _first_params(training: Training, network: Any) -> Any:
     normaliser = running_statistics.init_state(size)
     own = jax.jit(network.init)(one, seen)
     if training.begin is not None:
-        given = load_checkpoint(training.begin)
+        given = checkpoint_of(training.begin)
         if given.network != network:
             raise CheckpointError(
                 f"begin must hold the weights of {_words(network)}, got {_words(given.network)}"

@@ -11,7 +11,7 @@ from planner_jax.task.catch.suites import CATCH_HEIGHT, LAUNCH, draw, earliest_t
 
 NUM = 64
 THROWS = ("throws", "hard", "parabola1", "parabola2")
-LINES = ("triangle3", "hexagon6")
+PARALLEL = ("square4", "pentagon5", "hexagon6", "heptagon7")
 # Half sides of the landing rectangle, flight times [s], seconds from launch to planning.
 RANGES = {
     "throws": [((1.0, 0.4), (1.4, 1.78), 0.3)],
@@ -23,7 +23,7 @@ RANGES = {
 VOLUMES = {
     "harmonic2": (9.0, (1.0, 3.5)),
     "triangle3": (7.3, (1.5, 2.5)),
-    "hexagon6": (11.3, (1.5, 2.5)),
+    **{name: (11.3, (1.5, 2.5)) for name in PARALLEL},
 }
 
 float64 = pytest.mark.usefixtures("float64")
@@ -63,9 +63,11 @@ def test_a_seed_always_gives_the_same_cases_and_fewer_of_them_are_the_first(name
 
 
 def test_a_suite_is_a_matter_of_its_name_and_the_seed_alone():
-    """One number of two suites: a change here is a change of published cases."""
+    """Some numbers of three suites: a change here is a change of published cases."""
     np.testing.assert_allclose(draw(1, "throws").targets.ball.vel[0, 0, 1], -0.10602945, rtol=1e-5)
     np.testing.assert_allclose(draw(1, "hexagon6").targets.ball.pos[0, 0, 2], 2.3829162, rtol=1e-5)
+    heptagon = draw(1, "heptagon7").targets.ball.pos[0, 0]
+    np.testing.assert_allclose(heptagon, [-1.8125371, 7.8405933, 2.0519066], rtol=1e-5)
     assert (draw(1, "throws").targets.ball.vel != draw(1, "hard").targets.ball.vel).all()
 
 
@@ -143,8 +145,8 @@ def test_swings_are_near_in_time():
 
 
 @float64
-def test_lines_are_a_triangle_at_angles_of_120_degrees_and_a_hexagon_in_parallel():
-    for name in LINES:
+def test_lines_are_a_triangle_at_angles_of_120_degrees_and_polygons_in_parallel():
+    for name in ("triangle3", *PARALLEL):
         cases = drawn(name)
         assert isinstance(cases.targets, BallPath)
         assert not (cases.targets.drag.any() or cases.targets.gravity.any())

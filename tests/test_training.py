@@ -161,6 +161,12 @@ def test_weights_of_another_network_or_size_are_refused(network, begun, says, ca
     assert not out.exists()
 
 
+def test_a_shipped_policy_to_begin_with_is_known_by_its_name(capsys, tmp_path):
+    given = ["--suite", SUITE, "--network", "mlp", "--begin", "rush6"]
+    assert main(["train", *given, "--out", str(tmp_path / "run")]) == 2
+    assert "weights of mlp (size 6, width 64), got attention (width 64" in capsys.readouterr().err
+
+
 def test_a_training_without_brax_names_the_extra(capsys, tmp_path, monkeypatch):
     import sys
 

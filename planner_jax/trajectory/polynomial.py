@@ -1,6 +1,7 @@
 """Piecewise polynomials in time: the one form in which every planner returns a trajectory."""
 
 import functools
+import math
 from typing import Any
 
 import jax.numpy as jnp
@@ -135,3 +136,14 @@ def state_basis(size: int) -> tuple[np.ndarray, np.ndarray]:
     """Factors and powers (4, size) of t in position to jerk of a polynomial's coefficients."""
     factors = np.stack([derivative_factors(size - 1, order) for order in range(4)])
     return factors, np.maximum(np.arange(size) - np.arange(4)[:, None], 0)
+
+
+@functools.cache
+def shift_basis(size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Factors and powers (size, size) of t in the coefficients of a polynomial that begins t later.
+
+    They are the binomials of its Taylor series, C(j, i) t^(j - i) for coefficient i from j.
+    """
+    places = np.arange(size)
+    factors = np.array([[math.comb(j, i) for j in places] for i in places])
+    return factors, np.maximum(places - places[:, None], 0)

@@ -6,7 +6,6 @@ from scratch stays for the first look and for surprises.
 """
 
 import dataclasses
-import math
 from typing import Any
 
 import jax
@@ -24,17 +23,19 @@ from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.chain import CatchContext, targets_at
 from planner_jax.task.catch.exact import ExactCatch
 from planner_jax.task.catch.plan import CatchPlan
-from planner_jax.trajectory.polynomial import PiecewisePolynomial, state_basis, states_at
+from planner_jax.trajectory.polynomial import (
+    PiecewisePolynomial,
+    shift_basis,
+    state_basis,
+    states_at,
+)
 from planner_jax.trajectory.proportional_minco import boundary_rows
 
 _ORDERS = 4  # position to jerk
 _LATEST = 0.05  # [s], by how much a guessed catch may move for a target that moved
 _SHORTEST = 0.01  # [s], least duration of a guessed segment
 _CLOSING = 0.1  # [m/s], slower than this a target is not awaited at the net's plane
-# The Taylor coefficients of a polynomial of degree 7 elsewhere: C(j, i) t^(j - i).
-_PLACES = np.arange(2 * _ORDERS)
-_BINOMIALS = np.array([[math.comb(j, i) for j in _PLACES] for i in _PLACES])
-_SHIFTS = np.maximum(_PLACES - _PLACES[:, None], 0)
+_BINOMIALS, _SHIFTS = shift_basis(2 * _ORDERS)
 _TRIALS = (1.0, 0.2, 0.04)  # step lengths: the first direction, without curvature, is too long
 
 

@@ -32,6 +32,7 @@ height of 1 to 3.5 m, and no farther away than `reach` while it may be caught.
 | harmonic2 | level 1 to 1.5, sinking up to 2.5 | 1 to 3.5 | 7 | 9 |
 | triangle3 | level 1 to 1.5 | 1.5 to 2.5 | 6 | 7.3 |
 | hexagon6 | level 1 to 1.5 | 1.5 to 2.5 | 10 | 11.3 |
+| square4, pentagon5, heptagon7 | as hexagon6 | | | |
 
 - harmonic2: height 2 to 2.5 m plus a swing of 0.6 to 1 m at 1.5 to 2.5 rad/s, any phase; each
   target drifts in a direction of its own, and after 2 to 5 s is within 1.5 m of the axis.
@@ -41,10 +42,12 @@ height of 1 to 3.5 m, and no farther away than `reach` while it may be caught.
   are closest to each other, 1.5 to 2 m from the centre, after 1.7 to 3.5 s.
 - hexagon6: six targets 1 to 1.5 m from the centre of a level hexagon, all at one velocity; the
   centre is up to 0.5 m from the axis on either of e1, e2 after 4 to 6 s.
+- square4, pentagon5, heptagon7: the same with four, five and seven targets at the corners of a
+  regular polygon.
 
-The targets of triangle3 and hexagon6 fly level. Three velocities 120 degrees apart, as the paper
-has them, lie in one plane, and in the level one no target sinks, which would ease its catch: the
-net must lean over by 60 degrees at least, 90 less theta_safe, at every catch.
+The targets of triangle3, hexagon6 and the other polygons fly level. Three velocities 120 degrees
+apart, as the paper has them, lie in one plane, and in the level one no target sinks, which would
+ease its catch: the net must lean over by 60 degrees at least, 90 less theta_safe, at every catch.
 
 Rushes. The targets of `triangle3` and `hexagon6`, each of which may be caught until a moment of
 its own: in a random order the first until `first`, each other one `after` later, and every one up
@@ -81,6 +84,7 @@ from planner_jax.task.catch.case import GRAVITY, CatchCase, case
 LAUNCH = (4.0, 0.0, 0.8)  # [m], of every throw
 CATCH_HEIGHT = 0.45  # [m], least height of a thrown ball at its catch
 _BISECTIONS = 60
+_PARALLEL = SUITES["hexagon6"].horizon  # [s], of all targets that fly in parallel
 
 
 @dataclasses.dataclass(frozen=True)
@@ -311,17 +315,17 @@ def _triangle(uniform: Any) -> tuple[BallPath, Any]:
     return targets, np.full(corner.shape, SUITES["triangle3"].horizon)
 
 
-def _hexagon(uniform: Any) -> tuple[BallPath, Any]:
-    """Six targets in parallel on a hexagon, from eight numbers."""
+def _polygon(uniform: Any, *, num: int) -> tuple[BallPath, Any]:
+    """Targets in parallel at the corners of a regular polygon, from eight numbers."""
     xp, u = _module(uniform), uniform[:, :, None]
     near = xp.concatenate([uniform[:, :2] - 0.5, _between(uniform[:, 2:3], 1.5, 2.5)], axis=1)
-    corner = 2.0 * np.pi * (u[:, 3] + np.arange(6) / 6.0)
+    corner = 2.0 * np.pi * (u[:, 3] + np.arange(num) / num)
     radius, speed = _between(u[:, 4:5], 1.0, 1.5), _between(u[:, 5:6], 1.0, 1.5)
     vel = speed * _unit(2.0 * np.pi * u[:, 6])[:, 0:1]
     when = _between(u[:, 7:8], 4.0, 6.0)
     pos = near[:, None] + radius * _unit(corner) - vel * when
     targets = _lines(pos, xp.broadcast_to(vel, pos.shape))
-    return targets, np.full(corner.shape, SUITES["hexagon6"].horizon)
+    return targets, np.full(corner.shape, _PARALLEL)
 
 
 def _rush(
@@ -344,11 +348,16 @@ def _swarm(uniform: Any, *, num: int) -> tuple[BallPath, Any]:
     return _lines(pos, vel), ((height - CATCH_HEIGHT) / sinking)[..., 0]
 
 
+_hexagon = functools.partial(_polygon, num=6)
+
 # Suite -> how many numbers a case takes, and what makes targets and horizons of them.
 _PATHS: dict[str, tuple[int, Callable]] = {
     "harmonic2": (18, _harmonic),
     "triangle3": (7, _triangle),
     "hexagon6": (8, _hexagon),
+    "square4": (8, functools.partial(_polygon, num=4)),
+    "pentagon5": (8, functools.partial(_polygon, num=5)),
+    "heptagon7": (8, functools.partial(_polygon, num=7)),
     "rush3": (
         7 + 6,
         functools.partial(_rush, of=_triangle, num=3, first=2.35, after=0.9, spread=0.5),

@@ -1,0 +1,195 @@
+"""Another PPO on the same environment: that of Stable-Baselines3 beside this library's training.
+
+    python -m benchmarks.policy_peer [--suite triangle3] [--decisions 150000] [--seeds 3]
+        [--num 1000] [--seed 777] [--out DIR]
+
+Needs `pip install stable-baselines3`, in an environment without the extra `gpu`: PyTorch asks for
+other CUDA libraries than those that are pinned for JAX, so no extra holds it.
+
+Both train the paper's network, two hidden layers of 64 with ReLU, in 100 environments at once,
+with as many decisions, the same rewards, and four passes over every 100 decisions in four parts.
+"sb3" has a Gaussian whose actions are cut off at -1 and 1, its own scaling of advantages, a network
+of the same size for the value, and a learning rate of 3e-4; "brax" is the training of this library,
+whose learning rate follows the divergence. What is trained decides about cases of a seed that it
+was not trained on, by its mean; every plan is by `exact` and refereed. Figures are the least and
+the largest of the seeds. Seconds are those of training, compilation included.
+"""
+
+import argparse
+import importlib
+import tempfile
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+import planner_jax as pj
+from planner_jax.benchmarks.policy_ablations import FIGURES, ITERATIONS, asked, figures_of
+from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin
+from planner_jax.policies.environment import CatchEnv
+from planner_jax.policies.observation import PER_TARGET, choice_of, observe
+from planner_jax.policies.training import train
+from planner_jax.task.catch.card import SUITES
+from planner_jax.task.catch.case import CatchCase, CatchChoice
+from planner_jax.task.catch.decide import CatchDecision, in_several_lengths
+from planner_jax.task.catch.estimate import timetable
+
+torch: Any = importlib.import_module("torch")
+spaces: Any = importlib.import_module("gymnasium.spaces")
+sb3: Any = importlib.import_module("stable_baselines3")
+vec_env: Any = importlib.import_module("stable_baselines3.common.vec_env")
+
+LANES, MINIBATCHES, PASSES = 100, 4, 4
+FIRST_STD = 0.15
+
+
+class CatchVecEnv(vec_env.VecEnv):
+    """`CatchEnv`, which is batched itself, as Stable-Baselines3 asks for environments."""
+
+    def __init__(self, suite: str, iterations: int, seed: int):
+        self.env = CatchEnv((suite,), (iterations,))
+        seen = spaces.Box(-np.inf, np.inf, (self.env.observation_size,), np.float32)
+        super().__init__(LANES, seen, spaces.Box(-1.0, 1.0, (self.env.action_size,), np.float32))
+        self._keys = jax.random.split(jax.random.key(seed), LANES)
+        self._reset, self._step = jax.jit(self.env.reset), jax.jit(self.env.step)
+
+    def reset(self) -> np.ndarray:
+        """Observations (LANES, F) of new cases."""
+        self._state = self._reset(self._keys)
+        return np.array(self._state.obs)
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Decide about all cases."""
+        self._state = self._step(self._state, jnp.asarray(actions, jnp.float32))
+
+    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """The next cases, rewards, that every episode has ended, and nothing else."""
+        seen, reward = np.array(self._state.obs), np.array(self._state.reward)
+        return seen, reward, np.ones(LANES, bool), [{} for _ in range(LANES)]
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """An attribute of the environment, once a lane."""
+        return [getattr(self.env, attr_name, None)] * LANES
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Nothing is set."""
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> Any:
+        """Nothing is called."""
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        """No lane is."""
+        return [False] * LANES
+
+
+@struct.dataclass
+class PeerPolicy(CatchDecision):
+    """The mean of a network that Stable-Baselines3 trained, as a decision."""
+
+    layers: Sequence[tuple[Any, Any]]  # weights and biases, the last one without ReLU behind it
+
+    def propose(self, case: CatchCase) -> CatchChoice:
+        """The one choice for one case, leaves (1, N)."""
+        table = timetable(case)
+        hidden = observe(case, table).ravel()
+        *inner, (weights, bias) = self.layers
+        for own, shift in inner:
+            hidden = jax.nn.relu(_affine(own, shift, hidden))
+        action = jnp.clip(_affine(weights, bias, hidden), -1.0, 1.0)
+        choice = choice_of(case, table, action.reshape(-1, PER_TARGET))
+        return in_several_lengths(case, jax.tree.map(lambda leaf: leaf[None], choice))
+
+
+def _affine(weights: Any, bias: Any, hidden: jax.Array) -> jax.Array:
+    return jnp.matmul(weights, hidden, precision=jax.lax.Precision.HIGHEST) + bias
+
+
+def train_peer(suite: str, decisions: int, seed: int) -> PeerPolicy:
+    """What Stable-Baselines3 makes of a suite."""
+    network = {
+        "net_arch": [64, 64],
+        "activation_fn": torch.nn.ReLU,
+        "log_std_init": float(np.log(FIRST_STD)),
+    }
+    model = sb3.PPO(
+        "MlpPolicy",
+        CatchVecEnv(suite, ITERATIONS, seed),
+        learning_rate=3e-4,
+        n_steps=1,
+        batch_size=LANES // MINIBATCHES,
+        n_epochs=PASSES,
+        gamma=0.0,
+        ent_coef=1e-4,
+        policy_kwargs=network,
+        seed=seed,
+        device="cpu",
+    )
+    model.learn(decisions)
+    linear = [*model.policy.mlp_extractor.policy_net, model.policy.action_net]
+    layers = [layer for layer in linear if isinstance(layer, torch.nn.Linear)]
+    return PeerPolicy(
+        [(x.weight.detach().numpy().copy(), x.bias.detach().numpy().copy()) for x in layers]
+    )
+
+
+def train_own(suite: str, decisions: int, seed: int) -> Any:
+    """What this library makes of it."""
+    training = asked(
+        suite, decisions, seed, network="mlp", lanes=LANES, minibatches=MINIBATCHES, updates=PASSES
+    )
+    with tempfile.TemporaryDirectory() as scratch:
+        return train(training, scratch, progress=False)
+
+
+def measure(bench: Bench, options: argparse.Namespace) -> None:
+    """All rows."""
+    bench.say(
+        f"{options.suite}, {options.decisions:,} decisions, {options.seeds} seeds, judged on "
+        f"{options.num} cases of seed {options.seed}, {jax.devices()[0]}",
+        "| training | refereed | last catch | OTR | seconds |",
+        "|---|---|---|---|---|",
+    )
+    greedy = figures_of(bench, pj.catch.Greedy(), options.suite, options)
+    bench.row(training="none", **greedy)
+    bench.say(
+        f"| none: `greedy` | {greedy['success']:.1f} % | {greedy['last']:.3f} s "
+        f"| {greedy['ratio']:.3f} | |"
+    )
+    for name, trained in (("sb3", train_peer), ("brax", train_own)):
+        rows = []
+        for seed in range(options.seeds):
+            began = time.perf_counter()
+            found = trained(options.suite, options.decisions, seed)
+            seconds = time.perf_counter() - began
+            rows.append({**figures_of(bench, found, options.suite, options), "seconds": seconds})
+            bench.row(training=name, seed=seed, **rows[-1])
+        least, largest = (
+            {key: choose(row[key] for row in rows) for key in FIGURES} for choose in (min, max)
+        )
+        bench.say(
+            f"| {name} | {least['success']:.1f} to {largest['success']:.1f} % "
+            f"| {least['last']:.3f} to {largest['last']:.3f} s "
+            f"| {least['ratio']:.3f} to {largest['ratio']:.3f} "
+            f"| {least['seconds']:.0f} to {largest['seconds']:.0f} |"
+        )
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argument_parser("policy_peer", __doc__, num=1000, seed=777, seeds=3)
+    parser.add_argument("--suite", default="triangle3", choices=SUITES, help="default: triangle3")
+    parser.add_argument("--decisions", type=at_least(1000), default=150_000, metavar="N")
+    options = parser.parse_args()
+    with begin(parser, options) as bench:
+        measure(bench, options)
+
+
+if __name__ == "__main__":
+    main()
