@@ -24,6 +24,7 @@ from flax import struct
 from jax import Array
 
 from planner_jax.plan_files import load_arrays, save_arrays
+from planner_jax.rules import has_rules, is_sound
 
 
 class Status(enum.IntEnum):
@@ -37,6 +38,7 @@ class Status(enum.IntEnum):
     OUT_OF_REACH = 5
     NO_PATH = 6
     BLOCKED = 7
+    BAD_INPUT = 8
 
     @property
     def message(self) -> str:
@@ -54,10 +56,11 @@ _MESSAGES = {
     Status.FEASIBLE: "every limit holds; more iterations may lower the cost",
     Status.INFEASIBLE: "stationary with a limit exceeded; try more starts, or relax the limit",
     Status.MAX_STEPS: "out of iterations with a limit exceeded; allow more iterations or starts",
-    Status.NON_FINITE: "the case or its cost is not finite; check the case for NaN",
+    Status.NON_FINITE: "the cost of the plan is not finite; bring the case's numbers nearer to one",
     Status.OUT_OF_REACH: "a target never comes within reach; `closest_approach` says by how much",
     Status.NO_PATH: "no way was found through the obstacles in time; allow more time",
     Status.BLOCKED: "the start or the goal lies in an obstacle or off the map; move it",
+    Status.BAD_INPUT: "a number of the case is absurd; `pj.require_sound(cases)` names it",
 }
 
 
@@ -274,3 +277,17 @@ def lane(tree: Tree, k: Any) -> Tree:
 def solved(plans: Plan) -> np.ndarray:
     """Whether each plan meets every limit that its planner looked at, bool; see `Status`."""
     return np.asarray(is_solved(plans.status))
+
+
+def marked(plans: PlanT, cases: Any) -> PlanT:
+    """The plans, with the status `BAD_INPUT` where a number of the case breaks its rule; pure.
+
+    Args:
+        plans: one plan, or a batch.
+        cases: of them; those of a class without `rules` are left as they are.
+    """
+    if not has_rules(cases):
+        return plans
+    xp: Any = jnp if isinstance(plans.status, jax.Array) else np
+    status = xp.where(is_sound(cases), plans.status, Status.BAD_INPUT).astype(np.int32)
+    return dataclasses.replace(plans, status=status)  # type: ignore[type-var]

@@ -13,7 +13,8 @@ from jax.experimental import multihost_utils
 
 from planner_jax.planning.batch import better_of, plan_batch, plan_on_host, solve_cases
 from planner_jax.planning.single import plan_single
-from planner_jax.protocol import AnyPlanner, Attempt, Case, Plan, is_unsolved
+from planner_jax.protocol import AnyPlanner, Attempt, Case, Plan, Status, is_unsolved
+from planner_jax.rules import require_sound
 
 CaseT = TypeVar("CaseT", bound=Case)
 PlanT = TypeVar("PlanT", bound=Plan)
@@ -57,21 +58,35 @@ def plan(
     any_planner: Any = planner
     alone = cases.batch_shape == ()
     if alone and hasattr(any_planner, "solve"):
-        return plan_single(any_planner, any_planner.attempts, cases)
+        return _named_if_bad(plan_single(any_planner, any_planner.attempts, cases), cases)
     if chunk is not None and chunk < 1:
         raise ValueError(f"chunk must be >= 1, got {chunk}")
     if devices is not None and not len(devices):
         raise ValueError("devices must be at least one, got none")
     if not alone:
         require_batch(cases)
+    if not _is_resident(cases) and not alone:
+        require_sound(cases)
     drive = _Drive(chunk, devices)
     if hasattr(any_planner, "plan_by"):
         plans = any_planner.plan_by(drive, cases)
     else:
         plans, _ = drive(planner, cases)
-    if not alone and _is_resident(cases) and not _is_resident(plans):
+    if alone:
+        return _named_if_bad(plans, cases)
+    if _is_resident(cases) and not _is_resident(plans):
         plans = jax.device_put(plans, devices[0] if devices else None)
     return plans
+
+
+def _named_if_bad(plan: PlanT, case: Any) -> PlanT:
+    """The plan of one case; raises `CaseError` for one on the host that breaks a rule.
+
+    It is looked at afterwards, as that costs nothing where all is well.
+    """
+    if plan.status == Status.BAD_INPUT and not _is_resident(case):
+        require_sound(case)
+    return plan
 
 
 def _is_resident(tree: Any) -> bool:

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from planner_jax.planning.batch import solve_cases
 from planner_jax.protocol import Attempt, Planner, is_solved, is_unsolved
 
 _Layout = tuple[tuple[tuple[int, ...], Any], ...]  # shapes and dtypes of a tree's leaves
@@ -80,7 +81,7 @@ def _packed_solver(
             for piece, (shape, kind) in zip(pieces, layout, strict=True)
         ]
         planner = jax.tree.unflatten(planner_tree, own)
-        return planner.solve(jax.tree.unflatten(treedef, shaped), attempt)
+        return solve_cases(planner, jax.tree.unflatten(treedef, shaped), attempt)
 
     def packed(own: list[Any], vector: jax.Array) -> jax.Array:
         leaves = jax.tree.leaves(unpacked(own, vector))

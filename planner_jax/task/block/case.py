@@ -1,6 +1,6 @@
 """One thrown ball, and the arm that is to block it."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,8 @@ from planner_jax.ball.flight import BallState
 from planner_jax.registry import require_name
 from planner_jax.robot.arm import REGIMES, Arm, ArmLimits
 from planner_jax.robot.arm_mjcf import irb1600
+from planner_jax.rules import Table, require_sound
+from planner_jax.task.block.rules import RULES
 from planner_jax.task.block.scene import Scene, paper_scene
 
 # How exactly a ball is to be met: greatest distance from the middle of the shield [m], and greatest
@@ -27,6 +29,8 @@ class BlockCase:
 
     Robot base frame, z up, SI units. Times count from the moment at which the ball is first seen.
     """
+
+    rules: ClassVar[Table] = RULES
 
     ball: BallState  # when it is first seen; it falls freely
     gravity: Array  # () [m/s^2], magnitude
@@ -113,7 +117,7 @@ def case(
 
     chosen = REGIMES[regime]
     offset, tilt = ANYWHERE if anywhere else WIDE if wide else STRICT
-    return BlockCase(
+    made = BlockCase(
         ball=BallState(pos=leaf(ball_pos, 3), vel=leaf(ball_vel, 3)),
         gravity=leaf(gravity),
         delay=leaf(delay),
@@ -126,3 +130,5 @@ def case(
         tilt=leaf(tilt),
         scene=shared(paper_scene() if scene is None else scene),
     )
+    require_sound(made)
+    return made

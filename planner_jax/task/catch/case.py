@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +11,8 @@ from jax import Array
 
 from planner_jax.ball.target import TargetPath
 from planner_jax.cost.extras import Extra, for_batch
+from planner_jax.rules import Table, require_sound
+from planner_jax.task.catch.rules import RULES
 
 GRAVITY = 9.81  # [m/s^2]
 START = (0.0, 0.0, 1.0)  # [m], where the quadrotor hovers
@@ -63,6 +65,8 @@ class CatchCase:
     Times count from the moment at which planning begins. The N targets are caught in the
     order `order`, which a decision fills in together with `times`.
     """
+
+    rules: ClassVar[Table] = RULES
 
     targets: TargetPath  # leaves with a leading axis N
     present: Array  # (N,) bool, in the same order as `targets`; which of the N there are
@@ -147,7 +151,7 @@ def case(
     head = np.zeros(batch + (4, 3))
     head[..., 0, :] = start
     shares = np.arange(1, num + 1) / (num + 1.0)
-    return CatchCase(
+    made = CatchCase(
         targets=targets,
         present=jnp.asarray(np.broadcast_to(present, shape), bool),
         horizon=leaf(horizon, num),
@@ -166,3 +170,5 @@ def case(
         extras=for_batch(extras, batch, dtype),
         optional=optional,
     )
+    require_sound(made)
+    return made

@@ -1,7 +1,7 @@
 """One volley to plan: the incoming ball, the hovering quadrotor, the target and the limits."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +11,9 @@ from jax import Array
 from planner_jax.ball.flight import BallState
 from planner_jax.cost.extras import Extra, for_batch
 from planner_jax.robot.quadrotor import QuadrotorLimits
+from planner_jax.rules import Table, require_sound
 from planner_jax.task.hit.card import START
+from planner_jax.task.hit.rules import RULES
 
 # Fit to the published landing points; the residual is 1 cm.
 DRAG = 0.0616  # K_D [1/m]
@@ -34,6 +36,8 @@ class HitCase:
 
     Times count from the moment at which planning begins.
     """
+
+    rules: ClassVar[Table] = RULES
 
     ball: BallState  # at time 0
     head_state: Array  # (4, 3) position, velocity, acceleration, jerk of the quadrotor at time 0
@@ -104,7 +108,7 @@ def case(
 
     head = np.zeros(batch + (4, 3))
     head[..., 0, :] = start
-    return HitCase(
+    made = HitCase(
         ball=BallState(pos=leaf(serve_pos, 3), vel=leaf(serve_vel, 3)),
         head_state=jnp.asarray(head, dtype),
         target=leaf(target, 3),
@@ -125,3 +129,5 @@ def case(
         ),
         extras=for_batch(extras, batch, dtype),
     )
+    require_sound(made)
+    return made

@@ -1,7 +1,7 @@
 """One interception: a car, its target, and what stands or moves in its way."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,8 @@ from jax import Array
 from planner_jax.plane.obstacles import Obstacles, obstacles
 from planner_jax.plane.target import PlanePath
 from planner_jax.robot.car import CarBody, CarLimits
+from planner_jax.rules import Table, require_sound
+from planner_jax.task.intercept.rules import RULES
 
 
 @struct.dataclass
@@ -21,6 +23,8 @@ class InterceptCase:
     World frame in the plane, SI units. Times count from the moment at which the car sets out.
     The middle of the car's body meets the target.
     """
+
+    rules: ClassVar[Table] = RULES
 
     start: Array  # (3,) x [m], y [m] of the rear axle's middle and heading [rad] at time 0
     speed: Array  # () [m/s], at time 0
@@ -133,7 +137,7 @@ def case(
                 f"{np.shape(path)}"
             )
     free = end_heading is None
-    return InterceptCase(
+    made = InterceptCase(
         start=leaf(start, 3),
         speed=leaf(initial_speed),
         curvature=leaf(initial_curvature),
@@ -160,6 +164,8 @@ def case(
             steering_rate=leaf(steering_rate),
         ),
     )
+    require_sound(made)
+    return made
 
 
 def _for_batch(given: Any, velocities: Any, batch: tuple[int, ...], dtype: Any) -> Obstacles:
