@@ -190,7 +190,9 @@ def is_sound(cases: Any) -> Any:
 def _ruled(cases: Any) -> Iterator[_Ruled]:
     """All rules of the arrays of a case, that of being finite first."""
     parts = list(_parts(cases))
-    tables = [(place + field.name, field, part) for place, part in parts for field in type(part).rules]
+    tables = [
+        (place + field.name, field, part) for place, part in parts for field in type(part).rules
+    ]
     free = {name for name, field, _ in tables if field.rule.infinite}
     whole: list[str] = []  # places of parts whose numbers have been gone through
     for place, part in parts:

@@ -227,10 +227,10 @@ def test_statuses_say_why_a_stored_motion_will_not_do():
     cases = jax.tree.map(np.array, cases)
     cases.limits.velocity[8] *= 0.5
     S = pj.Status
-    plans = pj.plan(LibraryBlock(library), cases)
+    plans = jax.device_get(pj.plan(LibraryBlock(library), jax.tree.map(jnp.asarray, cases)))
     assert [S(int(s)) for s in plans.status] == [
         *(S.CONVERGED, S.INFEASIBLE, S.INFEASIBLE, S.OUT_OF_REACH, S.OUT_OF_REACH),
-        *(S.OUT_OF_REACH, S.NON_FINITE, S.BLOCKED, S.BLOCKED),
+        *(S.OUT_OF_REACH, S.BAD_INPUT, S.BLOCKED, S.BLOCKED),
     ]
     strict = pj.block.case(*good)
     assert pj.plan(LibraryBlock(library), strict).status == S.INFEASIBLE

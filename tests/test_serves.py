@@ -9,6 +9,7 @@ from closed_forms import region_of
 
 import planner_jax as pj
 from planner_jax.ball import flight
+from planner_jax.rules import CaseError
 from planner_jax.task.hit import court
 from planner_jax.task.hit.case import DRAG, GRAVITY
 from planner_jax.task.hit.serves import (
@@ -23,7 +24,6 @@ from planner_jax.task.hit.serves import (
     to_cases,
 )
 from planner_jax.task.hit.validate import (
-    CaseError,
     ServeError,
     check_cases,
     fly,

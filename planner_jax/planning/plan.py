@@ -1,7 +1,7 @@
 """`plan`: one call for one case or a million, on one device or all of them; and `solve`, pure."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, TypeVar
 
 import jax
@@ -47,22 +47,24 @@ def plan(
         Inside a compiled function of the caller's own it is `solve`.
 
     Raises:
-        ValueError: the leaves have not one batch axis or none, or of different lengths, the
-            batch is empty, `chunk` < 1, or there are no `devices`.
-        TypeError: the cases are of another task than the planner; or within a transformation of
-            JAX that the planner does not allow, see `solve`.
+        CaseError: a number of a case in NumPy arrays is absurd, such as NaN or a negative limit;
+            one line with the field, the rule, the value and the first lane. In jax arrays such a
+            lane has the status `BAD_INPUT` instead, and inside of compiled functions, too.
+        ValueError: the leaves have not one batch axis or none, or of different lengths or other
+            shapes, the batch is empty, `chunk` < 1, or the `devices` are none or not different.
+        TypeError: the cases are of another task than the planner, or their numbers of another
+            kind; or within a transformation of JAX that the planner does not allow, see `solve`.
     """
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((planner, cases))):
         return solve(planner, cases)
     _require_fit(planner, cases)
+    if chunk is not None or devices is not None:
+        _require_layout(chunk, devices)
+    _require_own_precision(cases)
     any_planner: Any = planner
     alone = cases.batch_shape == ()
     if alone and hasattr(any_planner, "solve"):
         return _named_if_bad(plan_single(any_planner, any_planner.attempts, cases), cases)
-    if chunk is not None and chunk < 1:
-        raise ValueError(f"chunk must be >= 1, got {chunk}")
-    if devices is not None and not len(devices):
-        raise ValueError("devices must be at least one, got none")
     if not alone:
         require_batch(cases)
     if not _is_resident(cases) and not alone:
@@ -87,6 +89,32 @@ def _named_if_bad(plan: PlanT, case: Any) -> PlanT:
     if plan.status == Status.BAD_INPUT and not _is_resident(case):
         require_sound(case)
     return plan
+
+
+def _require_layout(chunk: Any, devices: Any) -> None:
+    """Raise unless a chunk is a number of cases, and devices are some that differ."""
+    if chunk is not None:
+        if isinstance(chunk, bool) or not isinstance(chunk, int | np.integer):
+            raise TypeError(f"chunk must be a whole number, got {chunk!r:.60}")
+        if chunk < 1:
+            raise ValueError(f"chunk must be >= 1, got {chunk}")
+    if devices is not None:
+        if not isinstance(devices, Iterable) or not all(
+            isinstance(device, jax.Device) for device in devices
+        ):
+            raise TypeError(f"devices must be a sequence of jax.Device, got {devices!r:.60}")
+        if not len(devices):
+            raise ValueError("devices must be at least one, got none")
+        if len(set(devices)) < len(devices):
+            raise ValueError(f"devices must differ, got {', '.join(map(str, devices))}")
+
+
+def _require_own_precision(cases: Any) -> None:
+    """Raise `TypeError` for NumPy arrays in float64 while JAX computes in float32."""
+    if not jax.config.jax_enable_x64 and any(  # type: ignore[attr-defined]
+        isinstance(leaf, np.ndarray) and leaf.dtype == np.float64 for leaf in jax.tree.leaves(cases)
+    ):
+        raise TypeError("cases must be in float32 unless jax_enable_x64 is set, got float64")
 
 
 def _is_resident(tree: Any) -> bool:
@@ -192,7 +220,11 @@ def _require_pure(planner: Any) -> None:
 
 
 def _require_fit(planner: Any, cases: Any) -> None:
-    """Raise `TypeError` unless the planner is a pytree and the cases are of its class."""
+    """Raise `TypeError` unless the planner is one, a pytree, and the cases are of its class."""
+    if not any(hasattr(planner, way) for way in ("solve", "solve_on_host", "plan_by")):
+        raise TypeError(
+            f"planner must be one, such as pj.hit.planner(), got a {type(planner).__name__}"
+        )
     if jax.tree_util.all_leaves([planner]) and not hasattr(planner, "solve_on_host"):
         raise TypeError(
             f"{type(planner).__name__} must be a pytree: put @jax.tree_util.register_static over "
@@ -204,6 +236,10 @@ def _require_fit(planner: Any, cases: Any) -> None:
             f"{type(planner).__name__} plans cases of the class {kind.__name__}, got "
             f"{type(cases).__name__}"
         )
+    if not hasattr(cases, "batch_shape"):
+        raise TypeError(f"cases must be a case or a batch, got a {type(cases).__name__}")
+    if not getattr(planner, "attempts", True):
+        raise ValueError(f"{type(planner).__name__} must have at least one attempt, got none")
 
 
 def require_batch(cases: Case) -> int:

@@ -20,6 +20,16 @@ RULES: Table = (
     Field("tolerance", (), POSITIVE),
     Field("end_heading", ()),
     Field("heading_tolerance", (), POSITIVE),
+    *(
+        Field(f"{group}.{name}", (letter, *shape), kind=kind)
+        for group, letter in (("walls", "W"), ("movers", "M"))
+        for name, shape, kind in (
+            ("centre", (2,), np.floating),
+            ("corners", (f"corners of {group}", 2), np.floating),
+            ("velocity", (2,), np.floating),
+            ("present", (), np.bool_),
+        )
+    ),
     Field("lower", (2,), below("upper")),
     Field("upper", (2,)),
     Field("body.length", (), POSITIVE),
