@@ -165,7 +165,7 @@ def test_a_plan_is_sampled_at_a_rate_up_to_its_end(planned):
     assert np.linalg.norm(middle - plans.meeting[k]) <= 0.05
     batch = plans.sample(10.0)
     assert batch.pos.shape == (12, 101, 2)
-    with pytest.raises(ValueError, match="rate must be > 0"):
+    with pytest.raises(ValueError, match="rate must be finite and > 0"):
         plans.sample(0.0)
 
 

@@ -43,9 +43,8 @@ def sampled_at_rate(
         leaves, ends = jax.tree.map(lambda leaf: leaf[None], (leaves, ends))
     last = np.nanmax(ends, initial=0.0)
     if last * rate * ends.size > _MOST:
-        rule = (
-            f"at most {_MOST / (last * ends.size):.3g} for {ends.size} plans of up to {last:.3g} s"
-        )
+        most = _MOST / (last * ends.size)
+        rule = f"at most {most:.3g} for {ends.size} plans of up to {last:.3g} s"
         raise ValueError(f"rate must be {rule}, got {rate:g}")
     times = np.arange(int(last * rate * (1.0 + 1e-6)) + 1) / rate
     setpoints = jax.tree.map(np.array, dict(sample(leaves, times.astype(ends.dtype))))
