@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from planner_jax.compile_cache import keep_compiled_programs
+from planner_jax.digits import written_number, written_whole
 from planner_jax.registry import MissingExtra, Task, UnknownName, all_tasks
 from planner_jax.sweep.environment import installed_version, require_backend
 from planner_jax.sweep.settings import SettingError
@@ -53,6 +54,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except OSError as error:
         _fail(str(error))
         return _FAILED
+    except MemoryError:
+        _fail("the machine has not memory enough: ask for a smaller num or batch")
+        return _FAILED
 
 
 _ARGUMENTS: set[str] = set()  # names of all arguments, as they are written in Python
@@ -84,7 +88,23 @@ class _Parser(argparse.ArgumentParser):
         _ARGUMENTS.add(self.add_argument(flag, **how).dest)
 
     def error(self, message: str) -> NoReturn:
-        sys.exit(_fail(message.removeprefix("argument ")))
+        sys.exit(_fail(message.removeprefix("argument ").replace(": must be", " must be", 1)))
+
+
+def _written(read: Callable[[str], Any]) -> Callable[[str], Any]:
+    """What makes a number of an option's word, by a function that raises `ValueError`."""
+
+    def of(word: str) -> Any:
+        try:
+            return read(word)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+
+    return of
+
+
+_whole, _number = _written(written_whole), _written(written_number)
+_NUMBERS: dict[Any, Callable[[str], Any]] = {int: _whole, float: _number}
 
 
 def _parser() -> _Parser:
@@ -123,7 +143,7 @@ def _parser() -> _Parser:
     view.add_argument("run", metavar="RUN", help="folder of a run of flights")
     view.add("--host", default="localhost", help="where to serve (default: localhost)")
     free = "0 takes a free one (default: 8080)"
-    view.add("--port", type=int, default=8080, metavar="N", help=free)
+    view.add("--port", type=_whole, default=8080, metavar="N", help=free)
     report = command("report", "write table, figures and page of a run anew", _report)
     report.add_argument("run", metavar="RUN", help="folder of a finished run")
     bench = commands.add_parser("bench", help="measure this machine")
@@ -150,15 +170,15 @@ def _add_library(commands: Any) -> None:
     build.add("--no-pole", dest="pole", action="store_false", help="the scene without its pole")
     build.add("--arm", metavar="FILE", help="an MJCF file (default: the IRB 1600)")
     angles = "six angles [rad] where the arm waits, or six for each of several homes"
-    build.add("--home", type=float, nargs="+", metavar="Q", help=angles)
+    build.add("--home", type=_number, nargs="+", metavar="Q", help=angles)
     show = command("show", "coverage, memory and hashes of a library")
     show.add("--map", metavar="FILE", help="write a picture of the coverage")
     check = command("check", "have the referee judge stored motions as answers to random balls")
-    check.add("--num", type=int, metavar="N", help="balls for each home (default: 2000)")
-    check.add("--seed", type=int, metavar="K", help="of the balls (default: 0)")
+    check.add("--num", type=_whole, metavar="N", help="balls for each home (default: 2000)")
+    check.add("--seed", type=_whole, metavar="K", help="of the balls (default: 0)")
     repair = command("repair", "plan anew what touches a pole that has moved")
     place = "where it stands now [m]"
-    repair.add("--pole", type=float, nargs=2, metavar="M", help=place, required=True)
+    repair.add("--pole", type=_number, nargs=2, metavar="M", help=place, required=True)
     repair.add("--out", metavar="FILE", help="of the new library", required=True)
     repair.add("--retry", action="store_true", help="pairs without a motion, too")
 
@@ -230,9 +250,9 @@ def _add_settings(parser: _Parser, kind: Any, task: Task | None = None) -> None:
 
 
 def _type_of(hint: Any) -> Callable[[str], Any]:
-    """What makes a value of a word: `int` or `float` where a field holds these, or nothing."""
+    """What makes a value of a word: a number where a field holds these, or nothing."""
     held = typing.get_args(hint) or (hint,)
-    return next((kind for kind in held if kind in (int, float)), str)
+    return next((_NUMBERS[kind] for kind in held if kind in _NUMBERS), str)
 
 
 def _add_sweep(task: Task, parser: _Parser) -> None:
@@ -257,7 +277,7 @@ def _add_fly(task: Task, parser: _Parser) -> None:
     kind = pkgutil.resolve_name(str(task.flight))
     _add_settings(parser, kind, task)
     kept = "flights kept look by look for `planner-jax view`, the first ones (default: 16)"
-    parser.add("--record", type=int, metavar="K", help=kept)
+    parser.add("--record", type=_whole, metavar="K", help=kept)
     film = (
         "film the first three of these into the run folder, .gif, or .mp4 where ffmpeg is "
         "installed (default name: flights.gif)"
@@ -278,6 +298,7 @@ def _sweep(task: Task, given: dict[str, Any]) -> None:
         raise SettingError("out must name the folder to resume, got nothing")
     settings = pkgutil.resolve_name(task.sweep)(**given).of(task)
     out = out or _run_folder(f"{task.name}-{task.split_planner(settings.planner)[0]}")
+    settings.require_room(out)
     _let_ctrl_c_stop()
     keep_compiled_programs()
     from planner_jax.sweep import run

@@ -11,15 +11,15 @@ _NUMBER = re.compile(r"[+-]?(([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|inf|na
 _LONGEST = 400  # characters; of more Python refuses to make a number
 
 
-def whole_number(text: str) -> int:
+def written_whole(text: str) -> int:
     """The whole number that is written; raises `ValueError`, one sentence without the name."""
     if len(text) > _LONGEST or not _WHOLE.fullmatch(text):
         raise ValueError(f"must be a whole number, got {text!r:.60}")
     return int(text)
 
 
-def number(text: str) -> float:
-    """The number that is written, also "inf" and "nan"; raises `ValueError` as `whole_number`."""
+def written_number(text: str) -> float:
+    """The number that is written, also "inf" and "nan"; raises `ValueError` as `written_whole`."""
     if len(text) > _LONGEST or not _NUMBER.fullmatch(text):
         raise ValueError(f"must be a number, got {text!r:.60}")
     return float(text)

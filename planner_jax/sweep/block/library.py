@@ -1,5 +1,6 @@
 """The command `planner-jax library`: builds, shows, checks and repairs libraries of blocks."""
 
+import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -51,6 +52,10 @@ def build_library(
         "six angles for each home",
         f"{len(home or ())} numbers",
     )
+    finite = home is None or all(map(math.isfinite, home))
+    require(finite, "home", "finite angles", " ".join(map(str, home or ())))
+    if Path(path).exists():
+        _loaded(path)  # lest a file of another kind be lost
     require_backend()
     try:
         body = irb1600() if arm is None else read_arm(arm)

@@ -70,8 +70,8 @@ def open_source(settings: HitSettings, batch: int) -> ServeSource:
         folder = None if settings.serves is None else read_serves(settings.serves)
     except ServeError as error:
         raise SettingError(str(error)) from error
-    fields = filled_in(settings, settings.DEFAULT_NUM if folder is None else len(folder), batch)
-    if folder is not None and fields["num"] > len(folder):
+    if folder is not None and (settings.num or 0) > len(folder):
         rule = f"num must be <= {len(folder)}, the serves that the folder holds"
-        raise SettingError(f"{rule}, got {fields['num']}")
+        raise SettingError(f"{rule}, got {settings.num}")
+    fields = filled_in(settings, settings.DEFAULT_NUM if folder is None else len(folder), batch)
     return ServeSource(**fields, folder=folder)

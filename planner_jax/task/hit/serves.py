@@ -16,6 +16,7 @@ from planner_jax.task.hit.card import START
 from planner_jax.task.hit.case import DRAG, GRAVITY, HitCase, case
 from planner_jax.task.hit.trial_files import read_trials
 from planner_jax.task.hit.validate import ServeError, fly, landing
+from planner_jax.task.scales import scale_problem
 
 # The law of the published serves, fitted to them. Position and velocity are uniform, and those
 # serves are kept that meet the following and land in the region asked for.
@@ -289,8 +290,8 @@ def to_cases(
     Raises:
         ServeError: an argument is out of its range.
     """
-    if not 0.0 < limit_scale < math.inf:
-        raise ServeError(f"limit_scale must be finite and > 0, got {limit_scale:g}")
+    if problem := scale_problem(limit_scale):
+        raise ServeError(problem)
     if isinstance(start, str):
         if start != "uniform":
             raise ServeError(f"start must be three numbers or 'uniform', got {start!r}")
