@@ -44,7 +44,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             warnings.showwarning = lambda told, *_, **__: print(
                 f"planner-jax: warning: {told}", file=sys.stderr
             )
-            options = vars(_parser().parse_args(arguments))
+            words = sys.argv[1:] if arguments is None else arguments
+            if any("\0" in word for word in words):
+                return _fail("arguments must hold no NUL")
+            options = vars(_parser().parse_args(words))
         return options.pop("command")(options) or 0
     except KeyboardInterrupt as stop:
         print(f"planner-jax: {str(stop) or 'interrupted'}", file=sys.stderr)
@@ -200,7 +203,7 @@ def _add_train(parser: _Parser) -> None:
 
 
 def _train(given: dict[str, Any]) -> None:
-    out = given.pop("out", "runs/train")
+    out = _out(given) or "runs/train"
     settings = pkgutil.resolve_name(_TRAIN)(**given)
     require_backend()
     _let_ctrl_c_stop()
@@ -287,13 +290,21 @@ def _add_fly(task: Task, parser: _Parser) -> None:
     parser.set_defaults(command=lambda given: _fly(task, kind, given))
 
 
+def _out(given: dict[str, Any]) -> str | None:
+    """The folder of the option `--out`, which is taken out of what was given."""
+    out = given.pop("out", None)
+    if out == "":
+        raise SettingError("out must name a folder, got ''")
+    return out
+
+
 def _run_folder(name: str) -> str:
     """The run folder of this name and moment."""
     return os.path.join("runs", f"{name}-{datetime.datetime.now():%Y%m%d-%H%M%S}")
 
 
 def _sweep(task: Task, given: dict[str, Any]) -> None:
-    resume, out = given.pop("resume", False), given.pop("out", None)
+    resume, out = given.pop("resume", False), _out(given)
     if resume and out is None:
         raise SettingError("out must name the folder to resume, got nothing")
     settings = pkgutil.resolve_name(task.sweep)(**given).of(task)
@@ -326,7 +337,7 @@ def _fly(task: Task, kind: type, given: dict[str, Any]) -> None:
     keep_compiled_programs()
     from planner_jax.sims.run import start_flights
 
-    out = given.pop("out", None) or _run_folder(f"fly-{task.name}")
+    out = _out(given) or _run_folder(f"fly-{task.name}")
     kept = {name: given.pop(name) for name in ("video", "record") if name in given}
     start_flights(kind(**given), out, **kept)
     _print_flights(Path(out))

@@ -153,6 +153,8 @@ def split_name(
     require_name(known, kind, own)
     if own != name and own not in from_file:
         raise UnknownName(f"{kind} {own} takes no file, got {name!r}")
+    if own != name and not file:
+        raise UnknownName(f"{kind} must name a file behind {own}:, got {name!r}")
     return own, file
 
 

@@ -78,7 +78,7 @@ def load_checkpoint(path: str | os.PathLike) -> Checkpoint:
             arrays = {key: archive[key] for key in archive.files}
         about = json.loads(str(arrays.pop("about")))
         found, network = about["format"], about["network"]
-    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
         raise CheckpointError(
             f"checkpoint must be one that `planner-jax train` wrote, got {name!r} "
             f"({type(error).__name__})"

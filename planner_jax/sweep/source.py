@@ -108,9 +108,11 @@ def filled_in(settings: SweepSettings, num: int, batch: int) -> dict[str, Any]:
     if num > _MOST_PARTS * batch:
         rule = f"at most {_MOST_PARTS * batch:,} with a batch of {batch}, of which each is a file"
         raise SettingError(f"num must be {rule}, got {num}")
-    asked = "num" if settings.batch is None or num < batch else "batch"
     try:
-        require_memory(asked, min(num, batch), settings.case_bytes)
+        if settings.batch is None:
+            require_memory("num", min(num, batch), settings.case_bytes)
+        else:
+            require_memory("batch", batch, settings.case_bytes)
     except ValueError as error:
         raise SettingError(str(error)) from None
     resolved = dataclasses.replace(settings, num=num, batch=batch)

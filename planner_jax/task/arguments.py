@@ -7,6 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from planner_jax.memory import require_memory
+
+_DRAWN_BYTES = 1_000  # of a case, as estimated
+
 
 def array_of(
     name: str, value: Any, batch: tuple[int, ...], shape: tuple[int, ...], dtype: Any
@@ -35,7 +39,8 @@ def array_of(
     if given.shape not in (shape, whole):
         rule = f"{shape}" if whole == shape else f"{shape} or {whole}"
         raise ValueError(f"{name} must have the shape {rule}, got {given.shape}")
-    return jnp.asarray(np.broadcast_to(given, whole), dtype)
+    with np.errstate(over="ignore"):  # what is too large is infinite, and refused as that
+        return jnp.asarray(np.broadcast_to(given, whole), dtype)
 
 
 def batch_of(name: str, vectors: Any, *shape: int) -> tuple[int, ...]:
@@ -66,3 +71,20 @@ def floating(dtype: Any) -> Any:
     if jax.dtypes.canonicalize_dtype(kind) != kind:
         raise TypeError(f"dtype must be float32 unless jax_enable_x64 is set, got {kind}")
     return kind
+
+
+def require_draw(num: Any, seed: Any, first: Any) -> None:
+    """Raise unless so many cases of a suite can be drawn from a seed, from a place on.
+
+    Raises:
+        TypeError: one of them is no whole number.
+        ValueError: one of them is too small, or `num` is more than memory holds.
+    """
+    for name, value, least in (("num", num, 1), ("seed", seed, 0), ("first", first, 0)):
+        if isinstance(value, bool) or not isinstance(value, int | np.integer):
+            raise TypeError(f"{name} must be a whole number, got {value!r:.60}")
+        if value < least:
+            raise ValueError(f"{name} must be >= {least}, got {value}")
+        if value >= 2**63:
+            raise ValueError(f"{name} must be < 2**63, got {value}")
+    require_memory("num", num, _DRAWN_BYTES)

@@ -15,6 +15,8 @@ from planner_jax.sweep.settings import (
 )
 from planner_jax.task.hit.card import START
 
+_FARTHEST = 1e6  # [m]
+
 
 @dataclasses.dataclass(frozen=True)
 class HitSettings(SweepSettings):
@@ -58,13 +60,13 @@ class HitSettings(SweepSettings):
 
 
 def _checked_start(start: Any) -> tuple[float, ...] | str:
-    rule = "three finite numbers with z > 0, or 'uniform'"
+    rule = f"three finite numbers with z > 0, none beyond {_FARTHEST:g}, or 'uniform'"
     if start in ("uniform", ["uniform"]):
         return "uniform"
     try:
         point = tuple(written_number(str(each)) for each in start)
     except (TypeError, ValueError):
         raise SettingError(f"start must be {rule}, got {start!r}") from None
-    sound = len(point) == 3 and all(map(math.isfinite, point)) and point[2] > 0.0
+    sound = len(point) == 3 and all(abs(x) <= _FARTHEST for x in point) and point[2] > 0.0
     require(sound, "start", rule, " ".join(f"{each:g}" for each in point))
     return point

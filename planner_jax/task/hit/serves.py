@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.interpolate import RectBivariateSpline
 
+from planner_jax.task.arguments import require_draw
 from planner_jax.task.hit import court
 from planner_jax.task.hit.card import START
 from planner_jax.task.hit.case import DRAG, GRAVITY, HitCase, case
@@ -116,9 +117,10 @@ def generate_serves(
         ServeError: an argument is out of its range.
     """
     names = court.SCENARIOS if scenarios is None else tuple(scenarios)
-    for name, value, least in (("num", num, 1), ("seed", seed, 0), ("first", first, 0)):
-        if value < least:
-            raise ServeError(f"{name} must be >= {least}, got {value}")
+    try:
+        require_draw(num, seed, first)
+    except ValueError as error:
+        raise ServeError(str(error)) from None
     unknown = [name for name in names if name not in court.SCENARIOS]
     if unknown or not names:
         rule = f"names out of {' '.join(court.SCENARIOS)}"
