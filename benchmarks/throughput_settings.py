@@ -8,6 +8,8 @@ from planner_jax.memory import require_memory
 from planner_jax.registry import task_named
 from planner_jax.sweep.settings import SettingError, SweepSettings, option, require
 
+_MOST = 100_000  # iterations, or calls: an hour and more
+
 
 @dataclasses.dataclass(frozen=True)
 class ThroughputSettings:
@@ -37,6 +39,7 @@ class ThroughputSettings:
         for name in ("devices", "iterations", "repeat"):
             value = getattr(self, name)
             require(value is None or value >= 1, name, ">= 1", value)
+            require(value is None or value <= _MOST, name, f"<= {_MOST}", value)
         require(len(self.batch) > 0, "batch", "one or more sizes", "none")
         require(min(self.batch) >= 1, "batch", ">= 1", min(self.batch))
         task = task_named(self.task)

@@ -58,7 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _fail(str(error))
         return _FAILED
     except MemoryError:
-        _fail("the machine has not memory enough: ask for a smaller num or batch")
+        _fail("the machine has not memory enough: ask for less at once")
         return _FAILED
 
 
@@ -371,11 +371,12 @@ def _let_ctrl_c_stop() -> None:
 
 
 def _throughput(given: dict[str, Any]) -> None:
+    out = _out(given)
     require_backend()
     keep_compiled_programs()
     from planner_jax.benchmarks.throughput import report
 
-    report(**given)
+    report(out=out, **given)
 
 
 def _report(options: dict[str, Any]) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 
 class CaseError(ValueError):
@@ -97,7 +98,8 @@ def require_sound(cases: Any) -> None:
     """Raise for the first rule that some lane of the cases breaks, in one line.
 
     Args:
-        cases: one case, or a batch, in arrays of any kind. Classes without `rules` pass.
+        cases: one case, or a batch, in arrays of any kind. Classes without `rules` pass; of traced
+            arrays, which have no values yet, only shape and kind are looked at.
 
     Raises:
         CaseError: a number breaks its rule; the line has the field, the rule, the value and the
@@ -106,6 +108,8 @@ def require_sound(cases: Any) -> None:
         TypeError: an array has not the kind of numbers of its field.
     """
     require_shapes(cases)
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(cases)):
+        return
     for ruled in _ruled(jax.tree.map(np.asarray, cases)):
         require_rule(ruled.name, ruled.value, ruled.holds(), ruled.rule.words, cases.batch_shape)
 

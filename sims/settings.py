@@ -35,6 +35,7 @@ _FLOWN_DECISIONS = {name: where for name, where in DECISIONS.items() if name != 
 _AT_ONCE = 4096  # flights, by default
 # As estimated, bytes of a flight that is simulated with others, and of the rows that it leaves.
 _FLIGHT_BYTES, _FLOWN_BYTES = 1_000_000, 4_000
+_FASTEST = 10_000.0  # [Hz]
 _MOST_BALLS = 12  # of one flight, as of the largest suite: every one makes the program longer
 INTERVAL = 0.8  # [s], from throw to throw (paper 000, Fig. 1)
 
@@ -92,6 +93,7 @@ class FlySettings:
             self.TASK.split_planner(self.planner)
         except UnknownName as error:
             raise SettingError(str(error)) from None
+        require(not self.rate > _FASTEST, "replan", f"<= {_FASTEST:g}", self.rate)
         again = self.rate > 0.0
         require(not again or self._is_first, "replan", "0 for other planners", self.rate)
         try:
@@ -245,6 +247,8 @@ class InterceptFly(FlySettings):
         # The car is after one target.
         suites = [name for name in INTERCEPT.all_suites() if name not in GROUPS]
         require_one_of(suites, "suite", self.suite)
+        require_moderate("latency", self.latency)
+        require_moderate("looks", self.looks, _FASTEST)
         require(self.planner != "group", "planner", "of single targets", self.planner)
         super().__post_init__()
 
@@ -307,8 +311,9 @@ class BlockFly(FlySettings):
         require_one_of(ENCODERS, "encoders", self.encoders)
         require_one_of(REGIMES, "regime", self.regime)
         require_one_of(BLOCK.suites, "suite", self.suite)
-        for name in ("sense", "allowed", "noise"):
+        for name in ("sense", "allowed", "noise", "lag", "latency"):
             require_moderate(name, getattr(self, name))
+        require(abs(self.mass_error) < 1.0, "mass_error", "> -1 and < 1", self.mass_error)
         require_frame_rate(self.frame_rate)
         own = self.planner.partition(":")[0] != "library"
         require(

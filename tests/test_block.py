@@ -266,8 +266,8 @@ def test_brisk_motions_end_before_the_ball_is_there():
     [
         ({"regime": "R9"}, "regime must be one of R1, R2, R3, got 'R9'"),
         ({"delay": -0.1}, "delay must be >= 0, got -0.1"),
-        ({"gravity": 0.0}, "gravity must be > 0, got 0.0"),
-        ({"angles": (0.0, 1.0)}, r"angles must end with 6 numbers, got the shape \(2,\)"),
+        ({"gravity": 0.0}, "gravity must be > 0, got 0"),
+        ({"angles": (0.0, 1.0)}, r"angles must have a shape that ends with \(6,\), got \(2,\)"),
     ],
 )
 def test_what_is_wrong_with_a_case_is_named(options, message):

@@ -110,7 +110,7 @@ def test_direct_is_confirmed_by_the_referee_and_says_what_became_of_each_ball():
     assert pj.solved(plans)[[0, 3, 4, 5]].all()
     np.testing.assert_allclose(verdict.execution_time[3:], plans.cost[3:], rtol=1e-5)
     cases.limits.acceleration[:] = 0.5
-    late = pj.plan(planner, cases)
+    late = jax.device_get(pj.plan(planner, jax.tree.map(jnp.asarray, cases)))
     assert (late.status[[0, 3, 4, 5]] == pj.Status.INFEASIBLE).all()
 
 

@@ -121,7 +121,7 @@ def test_a_throughput_is_measured_with_what_was_asked_for(capsys, elsewhere, mon
     monkeypatch.setattr("planner_jax.benchmarks.throughput.report", lambda **k: asked.update(k))
     code, _, err = run(capsys, "bench", "throughput", "--task", "catch", "--batch", "4", "8")
     assert (code, err) == (0, "")
-    assert asked == {"task": "catch", "batch": [4, 8]}
+    assert asked == {"task": "catch", "batch": [4, 8], "out": None}
 
 
 @pytest.mark.parametrize("command", [["sweep", "hit", "--num", "0"], ["bench", "throughput", "-x"]])
