@@ -142,6 +142,46 @@ class Case(Protocol):
         ...
 
 
+def require_size(name: str, value: Any, least: int = 1) -> None:
+    """Raise unless a setting is a whole number that is not too small.
+
+    Raises:
+        TypeError: it is no whole number.
+        ValueError: it is too small.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise TypeError(f"{name} must be a whole number, got {value!r:.60}")
+    if value < least:
+        raise ValueError(f"{name} must be >= {least}, got {value}")
+
+
+def require_settings(planner: Any) -> None:
+    """Raise unless every field of a planner, a dataclass, is of the kind that its default is.
+
+    Sizes are whole numbers of 1 or more, 0 only where that is the default; weights and times are
+    finite; attempts are one or more.
+
+    Raises:
+        TypeError: a field is of another kind.
+        ValueError: a field is too small, not finite, or has no attempt.
+    """
+    for field in dataclasses.fields(planner):
+        name, value, usual = field.name, getattr(planner, field.name), field.default
+        if isinstance(usual, int) and not isinstance(usual, bool):
+            require_size(name, value, min(usual, 1))
+        elif isinstance(usual, float):
+            if isinstance(value, str | bool) or np.ndim(value) != 0 or value is None:
+                raise TypeError(f"{name} must be a number, got {value!r:.60}")
+            if not np.isfinite(value):
+                raise ValueError(f"{name} must be finite, got {value}")
+        elif isinstance(usual, tuple) and usual and isinstance(usual[0], Attempt):
+            if not isinstance(value, tuple) or not all(isinstance(x, Attempt) for x in value):
+                kind = type(usual[0]).__name__
+                raise TypeError(f"{name} must be a tuple of {kind}, got {value!r:.60}")
+            if not value:
+                raise ValueError(f"{name} must have an entry, got none")
+
+
 @dataclasses.dataclass(frozen=True)
 class Attempt:
     """One try at the cases that earlier tries left unsolved; static under jit."""
@@ -149,8 +189,7 @@ class Attempt:
     starts: int = 1  # places that one case takes in a batch
 
     def __post_init__(self) -> None:
-        if self.starts < 1:
-            raise ValueError(f"starts must be >= 1, got {self.starts}")
+        require_size("starts", self.starts)
 
 
 CaseT = TypeVar("CaseT", contravariant=True)

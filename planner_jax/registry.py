@@ -149,6 +149,8 @@ def split_name(
     Raises:
         UnknownName: it is not known, or takes no file.
     """
+    if not isinstance(name, str):
+        raise UnknownName(f"{kind} must be a name, got {name!r:.60}")
     own, _, file = name.partition(":")
     require_name(known, kind, own)
     if own != name and own not in from_file:

@@ -1,7 +1,7 @@
 """`plan`: one call for one case or a million, on one device or all of them; and `solve`, pure."""
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any, TypeVar
 
 import jax
@@ -99,7 +99,7 @@ def _require_layout(chunk: Any, devices: Any) -> None:
         if chunk < 1:
             raise ValueError(f"chunk must be >= 1, got {chunk}")
     if devices is not None:
-        if not isinstance(devices, Iterable) or not all(
+        if not isinstance(devices, Sequence | np.ndarray) or not all(
             isinstance(device, jax.Device) for device in devices
         ):
             raise TypeError(f"devices must be a sequence of jax.Device, got {devices!r:.60}")

@@ -14,6 +14,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
+from planner_jax.protocol import require_settings
 from planner_jax.task.intercept.group import GroupChoice, GroupPlan, InterceptGroup
 
 _GRID = 128  # times at which every target is looked at
@@ -115,8 +116,7 @@ class Best(GroupDecision):
     finalists: int = 6  # orders that are planned
 
     def __post_init__(self) -> None:
-        if self.finalists < 1:
-            raise ValueError(f"finalists must be >= 1, got {self.finalists}")
+        require_settings(self)
 
     def propose(self, case: InterceptGroup) -> GroupChoice:
         """The finalists of one group, leaves (F, N)."""
