@@ -69,7 +69,7 @@ Table = tuple[Field, ...]
 
 
 @dataclasses.dataclass(frozen=True)
-class _Ruled:
+class Ruled:
     """One array of a case, and one rule that it has to keep."""
 
     name: str
@@ -110,7 +110,7 @@ def require_sound(cases: Any) -> None:
     require_shapes(cases)
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(cases)):
         return
-    for ruled in _ruled(jax.tree.map(np.asarray, cases)):
+    for ruled in all_ruled(jax.tree.map(np.asarray, cases)):
         require_rule(ruled.name, ruled.value, ruled.holds(), ruled.rule.words, cases.batch_shape)
 
 
@@ -185,13 +185,13 @@ def is_sound(cases: Any) -> Any:
     NumPy arrays give NumPy's, jax arrays jax's.
     """
     batch = cases.batch_shape
-    held = [ruled.holds() for ruled in _ruled(cases)]
+    held = [ruled.holds() for ruled in all_ruled(cases)]
     # Joined before they are reduced: one loop of a compiled program, not one for every array.
     xp: Any = jnp if any(isinstance(each, jax.Array) for each in held) else np
     return xp.concatenate([each.reshape(*batch, -1) for each in held], axis=-1).all(axis=-1)
 
 
-def _ruled(cases: Any) -> Iterator[_Ruled]:
+def all_ruled(cases: Any) -> Iterator[Ruled]:
     """All rules of the arrays of a case, that of being finite first."""
     parts = list(_parts(cases))
     tables = [
@@ -206,10 +206,10 @@ def _ruled(cases: Any) -> Iterator[_Ruled]:
         for path, leaf in jax.tree_util.tree_leaves_with_path(part):
             name = place + jax.tree_util.keystr(path, simple=True, separator=".")
             if name not in free and jnp.issubdtype(jnp.result_type(leaf), np.floating):
-                yield _Ruled(name, leaf, FINITE, part)
+                yield Ruled(name, leaf, FINITE, part)
     for name, field, part in tables:
         if field.rule is not FINITE:
-            yield _Ruled(name, named(part, field.name), field.rule, part)
+            yield Ruled(name, named(part, field.name), field.rule, part)
 
 
 def _parts(tree: Any, place: str = "") -> Iterator[tuple[str, Any]]:
