@@ -66,8 +66,9 @@ def require_disk(name: str, num: int, bytes_each: int, folder: str | os.PathLike
     """
     path = Path(folder).absolute()
     there = next((each for each in [path, *path.parents] if each.exists()), Path.cwd())
-    free = shutil.disk_usage(there).free
-    if num * bytes_each > free:
+    disk = shutil.disk_usage(there)
+    free = disk.free
+    if disk.total and num * bytes_each > free:  # some of the system's own folders have no disk
         raise ValueError(
             f"{name} must be at most {max(free // bytes_each, 1):,}, for which the disk has room "
             f"({shown(bytes_each)} each, {shown(free)} free), got {num}"

@@ -29,16 +29,17 @@ ALLOWED = {
     },
     "arithmetic": set(),
     "lanes": set(),
-    "plan_files": set(),
+    "plan_files": {"plain_files"},
     "rules": set(),
     "digits": set(),
     "memory": set(),
+    "plain_files": set(),
     "protocol": {"plan_files", "rules"},
     "registry": set(),
     "ball": {"arithmetic", "lanes", "rules"},
     "perception": {"ball"},
     "trajectory": {"arithmetic"},
-    "robot": {"arithmetic", "protocol", "trajectory"},
+    "robot": {"arithmetic", "plain_files", "protocol", "trajectory"},
     "plane": {"rules"},
     "space": set(),
     "cost": {"arithmetic", "lanes", "robot", "rules", "trajectory"},
@@ -48,14 +49,15 @@ ALLOWED = {
     "task": {
         *("ball", "cost", "lanes", "optimise", "planning", "protocol", "referee", "registry"),
         *("perception", "plane", "robot", "rules", "space", "trajectory"),
+        *("digits", "memory", "plain_files"),
     },
     "sweep": {
-        *("ball", "lanes", "perception", "plane"),
+        *("ball", "digits", "lanes", "memory", "perception", "plane"),
         *("planning", "protocol", "registry", "robot", "rules", "task"),
     },
     "compile_cache": set(),
     "doctor": {"compile_cache", "lanes", "planning", "protocol", "registry", "sweep"},
-    "cli": {"compile_cache", "doctor", "registry", "sweep"},
+    "cli": {"compile_cache", "digits", "doctor", "registry", "sweep"},
 }
 LIBRARY = ROOT / "planner_jax"
 # Stubs too: they say what a package attaches lazily.

@@ -122,8 +122,8 @@ def require_count(name: str, value: Any, least: int, *, none: bool = False) -> N
     """Raise `SettingError` unless a value is a whole number of at least `least`, or None if so."""
     if value is None and none:
         return
-    whole = isinstance(value, int) and not isinstance(value, bool)
-    require(whole, name, "a whole number", repr(value))
+    if not isinstance(value, int) or isinstance(value, bool):
+        raise SettingError(f"{name} must be a whole number, got {value!r}")
     require(value >= least, name, f">= {least}", value)
 
 
