@@ -50,7 +50,8 @@ def report(*, out: str | os.PathLike | None = None, **settings: Any) -> None:
         SettingError: the folder cannot be written, or a setting breaks a rule.
         UnknownName: as `measure` says.
     """
-    asked = ThroughputSettings(**settings)
+    asked, there = ThroughputSettings(**settings), len(jax.local_devices())
+    require((asked.devices or 1) <= there, "devices", f"<= {there}", asked.devices)
     with Bench("throughput", dataclasses.asdict(asked), out) as bench:
         measure(bench, asked)
 
@@ -65,7 +66,6 @@ def measure(bench: Bench, settings: ThroughputSettings) -> None:
     devices, iterations = settings.devices, settings.iterations
     suite, repeat = settings.suite, settings.repeat
     card, local = task_named(settings.task), jax.local_devices()
-    require(devices is None or devices <= len(local), "devices", f"<= {len(local)}", devices)
     used = local[: devices or len(local)]
     made = card.planner(settings.planner or next(iter(card.planners)), **card.bench)
     solver = made.planner if isinstance(made, DecidedPlanner) else made

@@ -1,10 +1,14 @@
 """What `planner-jax bench throughput` is asked to do; imports no JAX."""
 
 import dataclasses
+import pkgutil
 from typing import ClassVar
 
+from planner_jax.memory import require_memory
 from planner_jax.registry import task_named
-from planner_jax.sweep.settings import SweepSettings, option, require
+from planner_jax.sweep.settings import SettingError, SweepSettings, option, require
+
+_MOST = 100_000  # iterations, or calls: an hour and more
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,5 +39,13 @@ class ThroughputSettings:
         for name in ("devices", "iterations", "repeat"):
             value = getattr(self, name)
             require(value is None or value >= 1, name, ">= 1", value)
+            require(value is None or value <= _MOST, name, f"<= {_MOST}", value)
+        require(len(self.batch) > 0, "batch", "one or more sizes", "none")
         require(min(self.batch) >= 1, "batch", ">= 1", min(self.batch))
-        SweepSettings(self.planner, self.suite, seed=self.seed).of(task_named(self.task))
+        task = task_named(self.task)
+        kind: type[SweepSettings] = pkgutil.resolve_name(task.sweep)
+        asked = kind(planner=self.planner, suite=self.suite, seed=self.seed).of(task)
+        try:
+            require_memory("batch", max(self.batch), asked.case_bytes)
+        except ValueError as error:
+            raise SettingError(str(error)) from None

@@ -33,6 +33,8 @@ from .protocol import solved as solved
 from .referee.verdict import Verdict as Verdict
 from .registry import Task as Task
 from .registry import task_named as task_named
+from .rules import CaseError as CaseError
+from .rules import require_sound as require_sound
 from .task import block as block
 from .task import catch as catch
 from .task import hit as hit

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from planner_jax.compile_cache import keep_compiled_programs
+from planner_jax.digits import written_number, written_whole
 from planner_jax.registry import MissingExtra, Task, UnknownName, all_tasks
 from planner_jax.sweep.environment import installed_version, require_backend
 from planner_jax.sweep.settings import SettingError
@@ -43,7 +44,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             warnings.showwarning = lambda told, *_, **__: print(
                 f"planner-jax: warning: {told}", file=sys.stderr
             )
-            options = vars(_parser().parse_args(arguments))
+            words = sys.argv[1:] if arguments is None else arguments
+            if any("\0" in word for word in words):
+                return _fail("arguments must hold no NUL")
+            options = vars(_parser().parse_args(words))
         return options.pop("command")(options) or 0
     except KeyboardInterrupt as stop:
         print(f"planner-jax: {str(stop) or 'interrupted'}", file=sys.stderr)
@@ -52,6 +56,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _fail(str(error))
     except OSError as error:
         _fail(str(error))
+        return _FAILED
+    except MemoryError:
+        _fail("the machine has not memory enough: ask for less at once")
         return _FAILED
 
 
@@ -84,7 +91,23 @@ class _Parser(argparse.ArgumentParser):
         _ARGUMENTS.add(self.add_argument(flag, **how).dest)
 
     def error(self, message: str) -> NoReturn:
-        sys.exit(_fail(message.removeprefix("argument ")))
+        sys.exit(_fail(message.removeprefix("argument ").replace(": must be", " must be", 1)))
+
+
+def _written(read: Callable[[str], Any]) -> Callable[[str], Any]:
+    """What makes a number of an option's word, by a function that raises `ValueError`."""
+
+    def of(word: str) -> Any:
+        try:
+            return read(word)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+
+    return of
+
+
+_whole, _number = _written(written_whole), _written(written_number)
+_NUMBERS: dict[Any, Callable[[str], Any]] = {int: _whole, float: _number}
 
 
 def _parser() -> _Parser:
@@ -123,7 +146,7 @@ def _parser() -> _Parser:
     view.add_argument("run", metavar="RUN", help="folder of a run of flights")
     view.add("--host", default="localhost", help="where to serve (default: localhost)")
     free = "0 takes a free one (default: 8080)"
-    view.add("--port", type=int, default=8080, metavar="N", help=free)
+    view.add("--port", type=_whole, default=8080, metavar="N", help=free)
     report = command("report", "write table, figures and page of a run anew", _report)
     report.add_argument("run", metavar="RUN", help="folder of a finished run")
     bench = commands.add_parser("bench", help="measure this machine")
@@ -150,15 +173,15 @@ def _add_library(commands: Any) -> None:
     build.add("--no-pole", dest="pole", action="store_false", help="the scene without its pole")
     build.add("--arm", metavar="FILE", help="an MJCF file (default: the IRB 1600)")
     angles = "six angles [rad] where the arm waits, or six for each of several homes"
-    build.add("--home", type=float, nargs="+", metavar="Q", help=angles)
+    build.add("--home", type=_number, nargs="+", metavar="Q", help=angles)
     show = command("show", "coverage, memory and hashes of a library")
     show.add("--map", metavar="FILE", help="write a picture of the coverage")
     check = command("check", "have the referee judge stored motions as answers to random balls")
-    check.add("--num", type=int, metavar="N", help="balls for each home (default: 2000)")
-    check.add("--seed", type=int, metavar="K", help="of the balls (default: 0)")
+    check.add("--num", type=_whole, metavar="N", help="balls for each home (default: 2000)")
+    check.add("--seed", type=_whole, metavar="K", help="of the balls (default: 0)")
     repair = command("repair", "plan anew what touches a pole that has moved")
     place = "where it stands now [m]"
-    repair.add("--pole", type=float, nargs=2, metavar="M", help=place, required=True)
+    repair.add("--pole", type=_number, nargs=2, metavar="M", help=place, required=True)
     repair.add("--out", metavar="FILE", help="of the new library", required=True)
     repair.add("--retry", action="store_true", help="pairs without a motion, too")
 
@@ -180,7 +203,7 @@ def _add_train(parser: _Parser) -> None:
 
 
 def _train(given: dict[str, Any]) -> None:
-    out = given.pop("out", "runs/train")
+    out = _out(given) or "runs/train"
     settings = pkgutil.resolve_name(_TRAIN)(**given)
     require_backend()
     _let_ctrl_c_stop()
@@ -230,9 +253,9 @@ def _add_settings(parser: _Parser, kind: Any, task: Task | None = None) -> None:
 
 
 def _type_of(hint: Any) -> Callable[[str], Any]:
-    """What makes a value of a word: `int` or `float` where a field holds these, or nothing."""
+    """What makes a value of a word: a number where a field holds these, or nothing."""
     held = typing.get_args(hint) or (hint,)
-    return next((kind for kind in held if kind in (int, float)), str)
+    return next((_NUMBERS[kind] for kind in held if kind in _NUMBERS), str)
 
 
 def _add_sweep(task: Task, parser: _Parser) -> None:
@@ -257,7 +280,7 @@ def _add_fly(task: Task, parser: _Parser) -> None:
     kind = pkgutil.resolve_name(str(task.flight))
     _add_settings(parser, kind, task)
     kept = "flights kept look by look for `planner-jax view`, the first ones (default: 16)"
-    parser.add("--record", type=int, metavar="K", help=kept)
+    parser.add("--record", type=_whole, metavar="K", help=kept)
     film = (
         "film the first three of these into the run folder, .gif, or .mp4 where ffmpeg is "
         "installed (default name: flights.gif)"
@@ -267,17 +290,26 @@ def _add_fly(task: Task, parser: _Parser) -> None:
     parser.set_defaults(command=lambda given: _fly(task, kind, given))
 
 
+def _out(given: dict[str, Any]) -> str | None:
+    """The folder of the option `--out`, which is taken out of what was given."""
+    out = given.pop("out", None)
+    if out == "":
+        raise SettingError("out must name a folder, got ''")
+    return out
+
+
 def _run_folder(name: str) -> str:
     """The run folder of this name and moment."""
     return os.path.join("runs", f"{name}-{datetime.datetime.now():%Y%m%d-%H%M%S}")
 
 
 def _sweep(task: Task, given: dict[str, Any]) -> None:
-    resume, out = given.pop("resume", False), given.pop("out", None)
+    resume, out = given.pop("resume", False), _out(given)
     if resume and out is None:
         raise SettingError("out must name the folder to resume, got nothing")
     settings = pkgutil.resolve_name(task.sweep)(**given).of(task)
     out = out or _run_folder(f"{task.name}-{task.split_planner(settings.planner)[0]}")
+    settings.require_room(out)
     _let_ctrl_c_stop()
     keep_compiled_programs()
     from planner_jax.sweep import run
@@ -305,7 +337,7 @@ def _fly(task: Task, kind: type, given: dict[str, Any]) -> None:
     keep_compiled_programs()
     from planner_jax.sims.run import start_flights
 
-    out = given.pop("out", None) or _run_folder(f"fly-{task.name}")
+    out = _out(given) or _run_folder(f"fly-{task.name}")
     kept = {name: given.pop(name) for name in ("video", "record") if name in given}
     start_flights(kind(**given), out, **kept)
     _print_flights(Path(out))
@@ -339,11 +371,12 @@ def _let_ctrl_c_stop() -> None:
 
 
 def _throughput(given: dict[str, Any]) -> None:
+    out = _out(given)
     require_backend()
     keep_compiled_programs()
     from planner_jax.benchmarks.throughput import report
 
-    report(**given)
+    report(out=out, **given)
 
 
 def _report(options: dict[str, Any]) -> None:

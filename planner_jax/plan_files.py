@@ -9,6 +9,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from planner_jax.plain_files import open_plain
+
 VERSION = 1
 _HEADER = "header"
 Kind = TypeVar("Kind")
@@ -47,7 +49,7 @@ def load_arrays(path: str | os.PathLike, kind: type[Kind]) -> Kind:
     """
     try:
         # NumPy leaves open a broken file that it has opened itself.
-        with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
+        with open_plain(path) as raw, np.load(raw, allow_pickle=False) as file:
             arrays = dict(file)
         header = json.loads(str(arrays.pop(_HEADER)))
         version, name = header["version"], header["class"]

@@ -24,6 +24,7 @@ from flax import struct
 from jax import Array
 
 from planner_jax.plan_files import load_arrays, save_arrays
+from planner_jax.rules import has_rules, is_sound
 
 
 class Status(enum.IntEnum):
@@ -37,6 +38,7 @@ class Status(enum.IntEnum):
     OUT_OF_REACH = 5
     NO_PATH = 6
     BLOCKED = 7
+    BAD_INPUT = 8
 
     @property
     def message(self) -> str:
@@ -54,10 +56,11 @@ _MESSAGES = {
     Status.FEASIBLE: "every limit holds; more iterations may lower the cost",
     Status.INFEASIBLE: "stationary with a limit exceeded; try more starts, or relax the limit",
     Status.MAX_STEPS: "out of iterations with a limit exceeded; allow more iterations or starts",
-    Status.NON_FINITE: "the case or its cost is not finite; check the case for NaN",
+    Status.NON_FINITE: "the cost of the plan is not finite; bring the case's numbers nearer to one",
     Status.OUT_OF_REACH: "a target never comes within reach; `closest_approach` says by how much",
     Status.NO_PATH: "no way was found through the obstacles in time; allow more time",
     Status.BLOCKED: "the start or the goal lies in an obstacle or off the map; move it",
+    Status.BAD_INPUT: "a number of the case is absurd; `pj.require_sound(cases)` names it",
 }
 
 
@@ -139,6 +142,46 @@ class Case(Protocol):
         ...
 
 
+def require_size(name: str, value: Any, least: int = 1) -> None:
+    """Raise unless a setting is a whole number that is not too small.
+
+    Raises:
+        TypeError: it is no whole number.
+        ValueError: it is too small.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise TypeError(f"{name} must be a whole number, got {value!r:.60}")
+    if value < least:
+        raise ValueError(f"{name} must be >= {least}, got {value}")
+
+
+def require_settings(planner: Any) -> None:
+    """Raise unless every field of a planner, a dataclass, is of the kind that its default is.
+
+    Sizes are whole numbers of 1 or more, 0 only where that is the default; weights and times are
+    finite; attempts are one or more.
+
+    Raises:
+        TypeError: a field is of another kind.
+        ValueError: a field is too small, not finite, or has no attempt.
+    """
+    for field in dataclasses.fields(planner):
+        name, value, usual = field.name, getattr(planner, field.name), field.default
+        if isinstance(usual, int) and not isinstance(usual, bool):
+            require_size(name, value, min(usual, 1))
+        elif isinstance(usual, float):
+            if isinstance(value, str | bool) or np.ndim(value) != 0 or value is None:
+                raise TypeError(f"{name} must be a number, got {value!r:.60}")
+            if not np.isfinite(value):
+                raise ValueError(f"{name} must be finite, got {value}")
+        elif isinstance(usual, tuple) and usual and isinstance(usual[0], Attempt):
+            if not isinstance(value, tuple) or not all(isinstance(x, Attempt) for x in value):
+                kind = type(usual[0]).__name__
+                raise TypeError(f"{name} must be a tuple of {kind}, got {value!r:.60}")
+            if not value:
+                raise ValueError(f"{name} must have an entry, got none")
+
+
 @dataclasses.dataclass(frozen=True)
 class Attempt:
     """One try at the cases that earlier tries left unsolved; static under jit."""
@@ -146,8 +189,7 @@ class Attempt:
     starts: int = 1  # places that one case takes in a batch
 
     def __post_init__(self) -> None:
-        if self.starts < 1:
-            raise ValueError(f"starts must be >= 1, got {self.starts}")
+        require_size("starts", self.starts)
 
 
 CaseT = TypeVar("CaseT", contravariant=True)
@@ -274,3 +316,17 @@ def lane(tree: Tree, k: Any) -> Tree:
 def solved(plans: Plan) -> np.ndarray:
     """Whether each plan meets every limit that its planner looked at, bool; see `Status`."""
     return np.asarray(is_solved(plans.status))
+
+
+def marked(plans: PlanT, cases: Any) -> PlanT:
+    """The plans, with the status `BAD_INPUT` where a number of the case breaks its rule; pure.
+
+    Args:
+        plans: one plan, or a batch.
+        cases: of them; those of a class without `rules` are left as they are.
+    """
+    if not has_rules(cases):
+        return plans
+    xp: Any = jnp if isinstance(plans.status, jax.Array) else np
+    status = xp.where(is_sound(cases), plans.status, Status.BAD_INPUT).astype(np.int32)
+    return dataclasses.replace(plans, status=status)  # type: ignore[type-var]

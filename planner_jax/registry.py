@@ -149,10 +149,14 @@ def split_name(
     Raises:
         UnknownName: it is not known, or takes no file.
     """
+    if not isinstance(name, str):
+        raise UnknownName(f"{kind} must be a name, got {name!r:.60}")
     own, _, file = name.partition(":")
     require_name(known, kind, own)
     if own != name and own not in from_file:
         raise UnknownName(f"{kind} {own} takes no file, got {name!r}")
+    if own != name and not file:
+        raise UnknownName(f"{kind} must name a file behind {own}:, got {name!r}")
     return own, file
 
 

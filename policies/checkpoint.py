@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from flax import traverse_util
 
+from planner_jax.plain_files import open_plain
 from planner_jax.policies.networks import NETWORKS
 from planner_jax.policies.observation import FEATURES
 from planner_jax.sweep.settings import SettingError
@@ -73,11 +74,11 @@ def load_checkpoint(path: str | os.PathLike) -> Checkpoint:
     """
     name = os.fspath(path)
     try:
-        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
+        with open_plain(path) as file, np.load(file, allow_pickle=False) as archive:
             arrays = {key: archive[key] for key in archive.files}
         about = json.loads(str(arrays.pop("about")))
         found, network = about["format"], about["network"]
-    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
         raise CheckpointError(
             f"checkpoint must be one that `planner-jax train` wrote, got {name!r} "
             f"({type(error).__name__})"

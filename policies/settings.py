@@ -4,9 +4,12 @@ import dataclasses
 import math
 from typing import Any, ClassVar
 
-from planner_jax.sweep.settings import SettingError, option, require
+from planner_jax.memory import require_memory
+from planner_jax.sweep.settings import SettingError, option, require, require_count, require_seed
 from planner_jax.task.catch.card import SUITES
 
+_MOST_DECISIONS = 1e12
+_CASE_BYTES = 20_000  # of memory, as estimated, of a case that is decided with others
 NETWORK_NAMES = ("attention", "mlp")
 # Of the terms of a reward, see `environment.judged`.
 WEIGHTS = {"solved": 1.0, "last": 5.0, "ratio": -5.0, "caught": 5.0, "violation": -0.5}
@@ -73,7 +76,10 @@ class TrainSettings:
             known = ", ".join(SUITES)
             require(suite in SUITES, "suite", f"one or more of {known}", repr(suite))
         require(self.network in NETWORK_NAMES, "network", " or ".join(NETWORK_NAMES), self.network)
-        require(min(self.decisions) >= 1, "decisions", ">= 1 in each part", min(self.decisions))
+        require(len(self.decisions) > 0, "decisions", "a number for each part", "none")
+        for each in self.decisions:
+            rule = f"from 1 to {_MOST_DECISIONS:g} in each part"
+            require(1.0 <= each <= _MOST_DECISIONS, "decisions", rule, each)
         require(0 <= self.estimated <= len(self.decisions), "estimated", ">= 0", self.estimated)
         if self.iterations and len(self.iterations) != len(self.suites):
             raise SettingError(
@@ -93,9 +99,14 @@ class TrainSettings:
                 require(0.0 <= value < math.inf, name, "finite and >= 0", value)
         require(0.0 <= self.kept <= 1.0, "kept", "from 0 to 1", self.kept)
         require(self.kept == 0.0 or self.begin is not None, "kept", "left out without begin", "it")
-        for name in ("lessons", "judged", "seed"):
-            require(getattr(self, name) >= 0, name, ">= 0", getattr(self, name))
-        require(self.lanes is None or self.lanes >= 60, "lanes", ">= 60", self.lanes)
+        require_seed(self.seed)
+        for name, least in (("lessons", 0), ("judged", 0), ("lanes", 60)):
+            value = getattr(self, name)
+            require_count(name, value, least, none=True)
+            try:
+                require_memory(name, value or 0, _CASE_BYTES)
+            except ValueError as error:
+                raise SettingError(str(error)) from None
 
     @property
     def suites(self) -> tuple[str, ...]:

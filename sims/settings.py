@@ -8,21 +8,35 @@ import math
 import pkgutil
 from typing import Any, ClassVar
 
+from planner_jax.memory import require_memory
 from planner_jax.registry import Task, UnknownName, all_tasks, split_name
 from planner_jax.sims.noise import NOISES, PLANE_NOISES, PlaneSensing, Sensing, require_whole
 from planner_jax.sims.robots.arm.drives import ENCODERS, TORQUES, Drives
-from planner_jax.sweep.block.settings import REGIMES
-from planner_jax.sweep.settings import SettingError, option, require, require_one_of
+from planner_jax.sweep.block.settings import REGIMES, require_frame_rate, require_moderate
+from planner_jax.sweep.settings import (
+    SettingError,
+    option,
+    require,
+    require_count,
+    require_one_of,
+    require_seed,
+)
 from planner_jax.task.block.card import TASK as BLOCK
 from planner_jax.task.catch.card import DECISIONS, TRAINED
 from planner_jax.task.catch.card import TASK as CATCH
 from planner_jax.task.hit.card import TASK as HIT
 from planner_jax.task.intercept.card import GROUPS
 from planner_jax.task.intercept.card import TASK as INTERCEPT
+from planner_jax.task.scales import SCALES
 
 _REPLAN = "plans a second, 0 for the first only (default: {} with {}, 0 with other planners)"
 # Flights have no order or times of their own to be given.
 _FLOWN_DECISIONS = {name: where for name, where in DECISIONS.items() if name != "given"}
+_AT_ONCE = 4096  # flights, by default
+# As estimated, bytes of a flight that is simulated with others, and of the rows that it leaves.
+_FLIGHT_BYTES, _FLOWN_BYTES = 1_000_000, 4_000
+_FASTEST = 10_000.0  # [Hz]
+_MOST_BALLS = 12  # of one flight, as of the largest suite: every one makes the program longer
 INTERVAL = 0.8  # [s], from throw to throw (paper 000, Fig. 1)
 
 
@@ -71,17 +85,30 @@ class FlySettings:
     RATE: ClassVar[float]  # [Hz], of planning anew by default
 
     def __post_init__(self) -> None:
-        for name, least in (("num", 1), ("batch", 1), ("seed", 0)):
-            value = getattr(self, name)
-            require(value is None or value >= least, name, f">= {least}", value)
+        for name in ("num", "batch"):
+            require_count(name, getattr(self, name), 1, none=name == "batch")
+        require_seed(self.seed)
+        self.require_memory()
         try:
             self.TASK.split_planner(self.planner)
         except UnknownName as error:
             raise SettingError(str(error)) from None
+        require(not self.rate > _FASTEST, "replan", f"<= {_FASTEST:g}", self.rate)
         again = self.rate > 0.0
         require(not again or self._is_first, "replan", "0 for other planners", self.rate)
         try:
             self.check_rate()
+        except ValueError as error:
+            raise SettingError(str(error)) from None
+
+    def require_memory(self) -> None:
+        """Raise `SettingError` if the flights that are simulated at once do not fit into memory."""
+        try:
+            if self.batch is None:
+                require_memory("num", min(self.num, _AT_ONCE), _FLIGHT_BYTES)
+            else:
+                require_memory("batch", self.batch, _FLIGHT_BYTES)
+            require_memory("num", self.num, _FLOWN_BYTES)
         except ValueError as error:
             raise SettingError(str(error)) from None
 
@@ -130,7 +157,7 @@ class CatchFly(BallFly):
 
     replan: float | None = option(None, "HZ", _REPLAN.format(100, "exact"))
     planner: str = option("exact", "NAME", "of plans from scratch")
-    balls: int = option(1, "N", f"thrown {INTERVAL:g} s apart")
+    balls: int = option(1, "N", f"thrown {INTERVAL:g} s apart, {_MOST_BALLS} at most")
     decide: str = option(
         "greedy", "NAME", f"order and first times: {', '.join(_FLOWN_DECISIONS)}, policy:FILE"
     )
@@ -146,7 +173,8 @@ class CatchFly(BallFly):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(self.balls >= 1, "balls", ">= 1", self.balls)
+        require_count("balls", self.balls, 1)
+        require(self.balls <= _MOST_BALLS, "balls", f"<= {_MOST_BALLS}", self.balls)
         try:
             split_name(_FLOWN_DECISIONS, "decide", self.decide, TRAINED)
         except UnknownName as error:
@@ -219,6 +247,8 @@ class InterceptFly(FlySettings):
         # The car is after one target.
         suites = [name for name in INTERCEPT.all_suites() if name not in GROUPS]
         require_one_of(suites, "suite", self.suite)
+        require_moderate("latency", self.latency)
+        require_moderate("looks", self.looks, _FASTEST)
         require(self.planner != "group", "planner", "of single targets", self.planner)
         super().__post_init__()
 
@@ -281,15 +311,18 @@ class BlockFly(FlySettings):
         require_one_of(ENCODERS, "encoders", self.encoders)
         require_one_of(REGIMES, "regime", self.regime)
         require_one_of(BLOCK.suites, "suite", self.suite)
-        for name in ("sense", "allowed", "noise"):
-            value = getattr(self, name)
-            require(value is None or 0.0 <= value < math.inf, name, "finite and >= 0", value)
-        require(0.0 < self.frame_rate < math.inf, "frame_rate", "finite and > 0", self.frame_rate)
+        for name in ("sense", "allowed", "noise", "lag", "latency"):
+            require_moderate(name, getattr(self, name))
+        require(abs(self.mass_error) < 1.0, "mass_error", "> -1 and < 1", self.mass_error)
+        require_frame_rate(self.frame_rate)
         own = self.planner.partition(":")[0] != "library"
         require(
             own or not self.perception, "planner", "one that plans for the very ball", self.planner
         )
         require(0.0 < self.torque < math.inf, "torque", "finite and > 0", self.torque)
+        least, most = SCALES
+        rule = f"from {least:g} to {most:g}"
+        require(least <= self.torque <= most, "torque", rule, self.torque)
         super().__post_init__()
 
     @property

@@ -6,6 +6,8 @@ shown. The server plays whether or not a browser looks on.
 
 import errno
 import importlib
+import ipaddress
+import secrets
 import socket
 import threading
 import time
@@ -15,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from planner_jax.sims.film import BALL_COLOURS
+from planner_jax.sims.guard import guarded
 from planner_jax.sims.recording import Recording, frame
 from planner_jax.sims.scenery import GROUND_COLOUR, Part, machine_parts
 from planner_jax.sims.task import FlightTask
@@ -78,7 +81,7 @@ class Viewer:
     """A server that shows one flight of a recording at one time.
 
     Attributes:
-        url: of the page.
+        url: of the page; beyond this machine with the token that is asked for.
         flight: choice of the flight; its `value` is one of the task's titles.
         time: slider; its `value` [s] is the time that is shown.
         playing: check box.
@@ -105,12 +108,19 @@ class Viewer:
         address = free_address(host, port)
         self.task, self.world, self.recording = task, task.world(), recording
         self._titles = [task.title(recording, row) for row in range(len(recording))]
-        self._server = viser.ViserServer(address, port, label="planner-jax", verbose=False)
+        is_own = ipaddress.ip_address(address.partition("%")[0]).is_loopback
+        token = None if is_own else secrets.token_urlsafe(16)
+        with guarded({host, address}, token) as is_guarded:
+            self._server = viser.ViserServer(address, port, label="planner-jax", verbose=False)
+        if not is_guarded():
+            self._server.stop()
+            raise SettingError("the viewer cannot be guarded with this version of viser")
         bound = self._server.get_port()
         if port and bound != port:  # someone was faster
             self._server.stop()
             raise SettingError(f"port must be free, got {port}")
         self.url = f"http://{f'[{host}]' if ':' in host else host}:{bound}"
+        self.url += "" if token is None else f"/?token={token}"
         self._lock = threading.RLock()
         self._drawn: list[Any] = []
         self._scene, gui = self._server.scene, self._server.gui

@@ -56,8 +56,8 @@ def elsewhere(tmp_path, monkeypatch):
         (["--num", "-4"], ["--num must be >= 1", "got -4"]),
         (["--num", "ten"], ["--num", "ten"]),
         (["--batch", "0"], ["--batch must be >= 1", "got 0"]),
-        (["--limit-scale", "0"], ["--limit-scale must be finite and > 0", "got 0"]),
-        (["--limit-scale", "-1"], ["--limit-scale must be finite and > 0", "got -1"]),
+        (["--limit-scale", "0"], ["--limit-scale must be from 0.001 to 1000", "got 0"]),
+        (["--limit-scale", "-1"], ["--limit-scale must be from 0.001 to 1000", "got -1"]),
         (["--delay", "-0.5"], ["--delay must be finite and >= 0", "got -0.5"]),
         (["--delay", "3"], ["--delay must be shorter than each serve's flight", "got 3"]),
         (["--planner", "nobody"], ["--planner must be one of", "exact", "got 'nobody'"]),
@@ -84,7 +84,7 @@ def test_a_bad_argument_gets_one_line_and_leaves_nothing(capsys, elsewhere, argu
         (["--net-test", "box"], ["--net-test must be one of plane, ball", "got 'box'"]),
         (["--tolerance", "-1"], ["--tolerance must be finite and >= 0", "got -1"]),
         (["--num", "0"], ["--num must be >= 1", "got 0"]),
-        (["--limit-scale", "0"], ["--limit-scale must be finite and > 0", "got 0"]),
+        (["--limit-scale", "0"], ["--limit-scale must be from 0.001 to 1000", "got 0"]),
         (["--num", "1", "--out", "/proc/nowhere"], ["--out must be a folder that can be"]),
         (["--resume"], ["--out must name the folder to resume"]),
         (["--resume", "--out", "nowhere"], ["--out must be the folder of a run", "nowhere"]),
@@ -121,7 +121,7 @@ def test_a_throughput_is_measured_with_what_was_asked_for(capsys, elsewhere, mon
     monkeypatch.setattr("planner_jax.benchmarks.throughput.report", lambda **k: asked.update(k))
     code, _, err = run(capsys, "bench", "throughput", "--task", "catch", "--batch", "4", "8")
     assert (code, err) == (0, "")
-    assert asked == {"task": "catch", "batch": [4, 8]}
+    assert asked == {"task": "catch", "batch": [4, 8], "out": None}
 
 
 @pytest.mark.parametrize("command", [["sweep", "hit", "--num", "0"], ["bench", "throughput", "-x"]])

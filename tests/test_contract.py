@@ -20,6 +20,7 @@ from planner_jax.optimise.problem import Round
 from planner_jax.plane.reach import Lattice
 from planner_jax.planning import one_by_one
 from planner_jax.protocol import Attempt, HostPlanner, LanesPlanner, Plan, is_solved, outcome
+from planner_jax.rules import has_rules
 from planner_jax.task.block.library.planner import LibraryBlock
 from planner_jax.task.block.online import Search as BlockSearch
 from planner_jax.task.intercept.projection import Projection
@@ -271,9 +272,20 @@ def all_nan(tree, k):
 @every
 def test_a_nan_lane_says_so_and_leaves_its_neighbours_bits_alone(entry):
     broken = all_nan(with_nan(entry.batch, entry.broken, 1), 3)
-    found = pj.plan(entry.planner, broken)
-    assert list(found.status[[1, 3]]) == [pj.Status.NON_FINITE] * 2
+    found = pj.plan(entry.planner, jax.tree.map(jnp.asarray, broken))
+    status = pj.Status.BAD_INPUT if has_rules(broken) else pj.Status.NON_FINITE
+    assert list(found.status[np.array([1, 3])]) == [status] * 2
     assert_equal(found, entry.plans, [0, 2, 4, 5])
+
+
+@every
+def test_a_nan_lane_on_the_host_is_named(entry):
+    broken = with_nan(entry.batch, entry.broken, 1)
+    if has_rules(broken):
+        with pytest.raises(
+            pj.CaseError, match=f"^{entry.broken}.* must be finite, got nan in lane 1"
+        ):
+            pj.plan(entry.planner, broken)
 
 
 @entries(slow=(*LIKE_OTHERS, *OF_THEIR_OWN))

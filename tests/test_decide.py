@@ -282,9 +282,12 @@ def test_an_unknown_decision_is_refused(pairs):
 def test_a_given_order_that_is_no_permutation_is_refused(pairs, order):
     given = np.array([[0, 1], order, [1, 0], [0, 1], [1, 0]], np.int32)
     wrong = dataclasses.replace(pairs, order=given)
+    first = next(place for place in order if place not in (0, 1) or order.count(place) > 1)
+    with pytest.raises(pj.CaseError, match=f"^order must be a permutation, got {first} in lane 1$"):
+        plan(by(Given()), wrong)
     line = rf"order must be a permutation of 0\.\.1, got \[{order[0]}, {order[1]}\] in case 1"
     with pytest.raises(ValueError, match=line):
-        plan(by(Given()), wrong)
+        plan(by(Given()), jax.tree.map(jnp.asarray, wrong))
 
 
 def test_closest_approach_is_what_the_greatest_speed_leaves(pairs):

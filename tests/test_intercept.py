@@ -165,7 +165,7 @@ def test_a_plan_is_sampled_at_a_rate_up_to_its_end(planned):
     assert np.linalg.norm(middle - plans.meeting[k]) <= 0.05
     batch = plans.sample(10.0)
     assert batch.pos.shape == (12, 101, 2)
-    with pytest.raises(ValueError, match="rate must be > 0"):
+    with pytest.raises(ValueError, match="rate must be finite and > 0"):
         plans.sample(0.0)
 
 
@@ -184,13 +184,14 @@ def scene(target, walls=(), **settings):
     )
 
 
+NEAR = (6.0, 4.0)
 SCENES = {
     "a wall across": (scene((6.0, 4.0), [WALL]), pj.Status.NO_PATH),
     "start in a wall": (scene((6.0, 4.0), [WALL], start=(3.85, 4.0, 0.0)), pj.Status.BLOCKED),
     "goal in a wall": (scene((4.0, 4.0), [WALL]), pj.Status.BLOCKED),
     "off the map": (scene((8.5, 4.0)), pj.Status.BLOCKED),
     "too far for the time": (scene((7.8, 4.0), time=3.0), pj.Status.NO_PATH),
-    "NaN": (scene((np.nan, 4.0)), pj.Status.NON_FINITE),
+    "NaN": (dataclasses.replace(scene(NEAR), target=still(np.nan, 4.0)), pj.Status.BAD_INPUT),
     "north": (scene((5.0, 5.0), end_heading=0.5 * np.pi), pj.Status.CONVERGED),
     "west": (scene((5.0, 5.0), end_heading=np.pi), pj.Status.CONVERGED),
     "at rest": (scene((5.0, 5.0), initial_speed=0.0), pj.Status.CONVERGED),
@@ -202,7 +203,7 @@ SCENES = {
 def scenes():
     cases = [jax.tree.map(np.asarray, case) for case, _ in SCENES.values()]
     batch = jax.tree.map(lambda *leaves: np.stack(leaves), *cases)
-    return batch, pj.plan(PLANNER, batch)
+    return batch, jax.device_get(pj.plan(PLANNER, jax.tree.map(jnp.asarray, batch)))
 
 
 @pytest.mark.parametrize("name", SCENES)

@@ -268,6 +268,7 @@ def test_ways_on_either_side_of_a_wall_differ_by_a_turn_and_others_by_none():
 PLANNER = lattice(source=PathSource(drawn=6), searches=(Search(4, lattice=Lattice(layers=22)),))
 # As long as the map is wide, and parked across it or only just moving.
 BARRIER = [[3.9, -0.5], [4.1, -0.5], [4.1, 8.5], [3.9, 8.5]]
+NEAR = (6.0, 4.0)
 SCENES = {
     "free": (scene(), pj.Status.CONVERGED),
     "a mover crosses": (
@@ -279,7 +280,7 @@ SCENES = {
     "parked on the goal": (scene(movers=[SQUARE + [6.0, 4.0]]), pj.Status.BLOCKED),
     "parked on the start": (scene(movers=[SQUARE + [0.8, 4.0]]), pj.Status.BLOCKED),
     "too far for the time": (scene((7.8, 4.0), time=3.0), pj.Status.NO_PATH),
-    "NaN": (scene((np.nan, 4.0)), pj.Status.NON_FINITE),
+    "NaN": (dataclasses.replace(scene(NEAR), target=still(np.nan, 4.0)), pj.Status.BAD_INPUT),
 }
 
 
@@ -287,7 +288,7 @@ SCENES = {
 def scenes():
     cases = [jax.tree.map(np.asarray, case) for case, _ in SCENES.values()]
     batch = jax.tree.map(lambda *leaves: np.stack(leaves), *cases)
-    return batch, pj.plan(PLANNER, batch)
+    return batch, jax.device_get(pj.plan(PLANNER, jax.tree.map(jnp.asarray, batch)))
 
 
 @pytest.mark.parametrize("name", SCENES)

@@ -9,6 +9,7 @@ from closed_forms import region_of
 
 import planner_jax as pj
 from planner_jax.ball import flight
+from planner_jax.rules import CaseError
 from planner_jax.task.hit import court
 from planner_jax.task.hit.case import DRAG, GRAVITY
 from planner_jax.task.hit.serves import (
@@ -23,7 +24,6 @@ from planner_jax.task.hit.serves import (
     to_cases,
 )
 from planner_jax.task.hit.validate import (
-    CaseError,
     ServeError,
     check_cases,
     fly,
@@ -395,8 +395,8 @@ def test_uniform_starts_fill_the_half_court_and_belong_to_their_serve():
 @pytest.mark.parametrize(
     "arguments, says",
     [
-        ({"limit_scale": 0.0}, "limit_scale must be finite and > 0, got 0"),
-        ({"limit_scale": float("nan")}, "limit_scale must be finite and > 0, got nan"),
+        ({"limit_scale": 0.0}, "limit_scale must be from 0.001 to 1000, got 0"),
+        ({"limit_scale": float("nan")}, "limit_scale must be from 0.001 to 1000, got nan"),
         ({"start": "random"}, "start must be three numbers or 'uniform', got 'random'"),
         (
             {"start": (1.0, 2.0)},

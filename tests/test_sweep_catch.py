@@ -255,7 +255,7 @@ def test_the_published_protocol_reaches_the_referee_when_it_is_asked_for(monkeyp
         ({"planner": "juggle"}, "planner must be one of exact, .*, got 'juggle'"),
         ({"decide": "late"}, "decide must be one of best, greedy, random, .*, got 'late'"),
         ({"tolerance": float("nan")}, "tolerance must be finite and >= 0, got nan"),
-        ({"limit_scale": -1.0}, "limit_scale must be finite and > 0, got -1.0"),
+        ({"limit_scale": -1.0}, "limit_scale must be from 0.001 to 1000, got -1"),
         ({"num": 0}, "num must be >= 1, got 0"),
     ],
 )

@@ -6,6 +6,7 @@ and Keys' kernel (a = -1/2) reads it at any time with a continuous gradient.
 
 import functools
 from collections.abc import Callable
+from typing import ClassVar
 
 import chex
 import jax
@@ -18,11 +19,14 @@ from planner_jax.arithmetic import reciprocal
 from planner_jax.ball.flight import BallState, rk4_step
 from planner_jax.ball.prediction_kernel import table_kernel
 from planner_jax.lanes import with_kernel
+from planner_jax.rules import POSITIVE, Field, Table
 
 
 @struct.dataclass
 class PathTable:
     """States of a target at equal time steps. Node k is at time (k - 1) * resolution."""
+
+    rules: ClassVar[Table] = (Field("resolution", None, POSITIVE),)
 
     pos: Array  # (N, 3) [m]
     vel: Array  # (N, 3) [m/s]

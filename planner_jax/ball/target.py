@@ -4,13 +4,14 @@ A target path is a pytree with a method `at(time) -> BallState`, differentiable 
 every leaf. The ones here cover the papers' targets; a user's own class serves as well.
 """
 
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
 from planner_jax.ball.flight import BallState, linear_drag_flight
+from planner_jax.rules import NOT_NEGATIVE, Field, Table
 
 
 class TargetPath(Protocol):
@@ -28,6 +29,11 @@ class BallPath:
     Without drag it is a parabola, without drag and gravity a straight line: the targets of
     paper 000, Section VII-B a, c and d.
     """
+
+    rules: ClassVar[Table] = (
+        Field("drag", None, NOT_NEGATIVE),
+        Field("gravity", None, NOT_NEGATIVE),
+    )
 
     ball: BallState  # at time 0
     drag: Array  # (3,) K_i [1/s]

@@ -7,7 +7,7 @@ smaller than the way between two samples of a plan, some centimetres, may be mis
 """
 
 from collections.abc import Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
+from planner_jax.rules import NOT_NEGATIVE, POSITIVE, Field, Table, below
 from planner_jax.trajectory.polynomial import Motion
 
 
@@ -46,6 +47,8 @@ def _size(vector: Any) -> Any:
 class KeepOut:
     """A sphere that may not be entered."""
 
+    rules: ClassVar[Table] = (Field("radius", None, POSITIVE),)
+
     centre: Any  # (3,) [m]
     radius: Any  # () [m], > 0
 
@@ -57,6 +60,8 @@ class KeepOut:
 @struct.dataclass
 class Geofence:
     """A box that may not be left, its sides finite."""
+
+    rules: ClassVar[Table] = (Field("low", None, below("high")),)
 
     low: Any  # (3,) [m]
     high: Any  # (3,) [m]
@@ -74,6 +79,11 @@ class SpeedZone:
     There it is speed / (u^2 (3 - 2 u)), u falling from one to zero: continuous with its slope.
     """
 
+    rules: ClassVar[Table] = (
+        Field("radius", None, POSITIVE),
+        Field("speed", None, POSITIVE),
+    )
+
     centre: Any  # (3,) [m]
     radius: Any  # () [m], > 0
     speed: Any  # () [m/s], > 0
@@ -87,6 +97,11 @@ class SpeedZone:
 @struct.dataclass
 class Dislike:
     """A sphere that is better avoided."""
+
+    rules: ClassVar[Table] = (
+        Field("radius", None, POSITIVE),
+        Field("weight", None, NOT_NEGATIVE),
+    )
 
     centre: Any  # (3,) [m]
     radius: Any  # () [m], > 0

@@ -15,7 +15,7 @@ from jax import Array, lax
 
 from planner_jax.optimise.lbfgs import LbfgsConfig, Objective
 from planner_jax.optimise.multistart import minimise
-from planner_jax.protocol import status_of
+from planner_jax.protocol import marked, status_of
 
 
 @struct.dataclass
@@ -150,4 +150,5 @@ def optimal_plan(
 
     point, excess = lax.custom_root(jax.grad(cost), start, solve, tangent_solve, has_aux=True)
     plan = planner.decode(point, context).replace(cost=cost(point))
-    return plan.replace(status=status_of(plan.cost, plan.violation, excess <= 1e3))
+    plan = plan.replace(status=status_of(plan.cost, plan.violation, excess <= 1e3))
+    return marked(plan, case)

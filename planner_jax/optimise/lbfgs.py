@@ -19,6 +19,7 @@ from jax import Array
 
 from planner_jax.lanes import in_one_kernel, with_kernel
 from planner_jax.optimise.lbfgs_kernel import judged_pair, shortening, start_scale, turn_kernel
+from planner_jax.protocol import require_size
 
 
 @struct.dataclass
@@ -44,10 +45,11 @@ class LbfgsConfig:
     patience: int = 2  # iterations without a decrease before a lane is stationary
 
     def __post_init__(self) -> None:
-        if self.max_steps < 0:
-            raise ValueError(f"max_steps must be >= 0, got {self.max_steps}")
-        if self.memory < 1:
-            raise ValueError(f"memory must be >= 1, got {self.memory}")
+        for name, least in (("max_steps", 0), ("memory", 1), ("patience", 0)):
+            require_size(name, getattr(self, name), least)
+        for name in ("step_cap", "tolerance"):
+            if not 0.0 <= getattr(self, name) < jnp.inf:
+                raise ValueError(f"{name} must be finite and >= 0, got {getattr(self, name)}")
 
 
 @struct.dataclass

@@ -56,6 +56,8 @@ def obstacles(
             f"up to {most}: give more room"
         )
     speeds = np.broadcast_to(np.asarray(velocities, float), (len(checked), 2))
+    if not np.isfinite(speeds).all():
+        raise ValueError(f"velocities must be finite, got {velocities}")
     centre, velocity = np.zeros((num, 2)), np.zeros((num, 2))
     corners = np.zeros((num, size, 2))
     for k, polygon in enumerate(checked):

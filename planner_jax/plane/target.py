@@ -5,11 +5,13 @@ leaf. The ones here cover paper 003's targets and what is fitted to observations
 of a user's own serves as well. World frame in the plane, SI units.
 """
 
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import jax.numpy as jnp
 from flax import struct
 from jax import Array
+
+from planner_jax.rules import POSITIVE, Field, Table
 
 
 @struct.dataclass
@@ -80,6 +82,8 @@ class LaterPath:
 @struct.dataclass
 class SampledPath:
     """Places at equal times from 0 on, straight lines between them; it stays at the last one."""
+
+    rules: ClassVar[Table] = (Field("step", None, POSITIVE),)
 
     places: Array  # (S, 2) [m], S >= 2
     step: Array  # () [s], from one place to the next

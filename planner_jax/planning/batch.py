@@ -19,7 +19,16 @@ from jax import Array, lax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec, Sharding, SingleDeviceSharding
 
 from planner_jax.planning.one_by_one import OneByOne
-from planner_jax.protocol import Attempt, HostPlanner, LanesPlanner, Plan, is_solved, is_unsolved
+from planner_jax.protocol import (
+    Attempt,
+    HostPlanner,
+    LanesPlanner,
+    Plan,
+    is_solved,
+    is_unsolved,
+    marked,
+)
+from planner_jax.rules import require_shapes
 
 # Lanes of a device in one call. Few, because every one is a program of its own to compile.
 BUCKETS = (16, 128, 1024, 8192, 65536)
@@ -92,12 +101,19 @@ def plan_batch(
 
 
 def solve_cases(planner: Any, cases: Any, attempt: Attempt) -> Any:
-    """The plans of one case, or of a batch with a leading axis on every leaf; pure."""
+    """The plans of one case, or of a batch with a leading axis on every leaf; pure.
+
+    All that is planned in compiled programs is planned here: what breaks a rule of its case's
+    class is `BAD_INPUT`, whatever the planner makes of it.
+    """
+    require_shapes(cases)
     if cases.batch_shape == ():
-        return planner.solve(cases, attempt)
-    if isinstance(planner, LanesPlanner):
-        return planner.solve_lanes(cases, attempt)
-    return jax.vmap(lambda case: planner.solve(case, attempt))(cases)
+        plans = planner.solve(cases, attempt)
+    elif isinstance(planner, LanesPlanner):
+        plans = planner.solve_lanes(cases, attempt)
+    else:
+        plans = jax.vmap(lambda case: planner.solve(case, attempt))(cases)
+    return marked(plans, cases)
 
 
 def plan_on_host(planner: HostPlanner, attempts: Sequence[Attempt], cases: Any) -> tuple[Any, int]:
@@ -107,7 +123,7 @@ def plan_on_host(planner: HostPlanner, attempts: Sequence[Attempt], cases: Any) 
     plans, lanes = None, np.arange(_length(cases))
     for attempt in attempts:
         some = jax.tree.map(lambda leaf, lanes=lanes: leaf[lanes], cases)
-        later = planner.solve_on_host(some, attempt)
+        later = marked(planner.solve_on_host(some, attempt), some)
         plans = jax.tree.map(np.array, later) if plans is None else merged(plans, later, lanes)
         lanes = np.flatnonzero(is_unsolved(plans.status))
         if lanes.size == 0:

@@ -13,7 +13,8 @@ from jax.experimental import multihost_utils
 
 from planner_jax.planning.batch import better_of, plan_batch, plan_on_host, solve_cases
 from planner_jax.planning.single import plan_single
-from planner_jax.protocol import AnyPlanner, Attempt, Case, Plan, is_unsolved
+from planner_jax.protocol import AnyPlanner, Attempt, Case, Plan, Status, is_unsolved
+from planner_jax.rules import require_sound
 
 CaseT = TypeVar("CaseT", bound=Case)
 PlanT = TypeVar("PlanT", bound=Plan)
@@ -46,32 +47,78 @@ def plan(
         Inside a compiled function of the caller's own it is `solve`.
 
     Raises:
-        ValueError: the leaves have not one batch axis or none, or of different lengths, the
-            batch is empty, `chunk` < 1, or there are no `devices`.
-        TypeError: the cases are of another task than the planner; or within a transformation of
-            JAX that the planner does not allow, see `solve`.
+        CaseError: a number of a case in NumPy arrays is absurd, such as NaN or a negative limit;
+            one line with the field, the rule, the value and the first lane. In jax arrays such a
+            lane has the status `BAD_INPUT` instead, and inside of compiled functions, too.
+        ValueError: the leaves have not one batch axis or none, or of different lengths or other
+            shapes, the batch is empty, `chunk` < 1, or the `devices` are none or not different.
+        TypeError: the cases are of another task than the planner, or their numbers of another
+            kind; or within a transformation of JAX that the planner does not allow, see `solve`.
     """
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((planner, cases))):
         return solve(planner, cases)
     _require_fit(planner, cases)
+    if chunk is not None or devices is not None:
+        _require_layout(chunk, devices)
+    _require_own_precision(cases)
     any_planner: Any = planner
     alone = cases.batch_shape == ()
     if alone and hasattr(any_planner, "solve"):
-        return plan_single(any_planner, any_planner.attempts, cases)
-    if chunk is not None and chunk < 1:
-        raise ValueError(f"chunk must be >= 1, got {chunk}")
-    if devices is not None and not len(devices):
-        raise ValueError("devices must be at least one, got none")
+        return _named_if_bad(plan_single(any_planner, any_planner.attempts, cases), cases)
     if not alone:
         require_batch(cases)
+    if not _is_resident(cases) and not alone:
+        require_sound(cases)
     drive = _Drive(chunk, devices)
     if hasattr(any_planner, "plan_by"):
         plans = any_planner.plan_by(drive, cases)
     else:
         plans, _ = drive(planner, cases)
-    if not alone and _is_resident(cases) and not _is_resident(plans):
+    if alone:
+        return _named_if_bad(plans, cases)
+    if _is_resident(cases) and not _is_resident(plans):
         plans = jax.device_put(plans, devices[0] if devices else None)
     return plans
+
+
+def _named_if_bad(plan: PlanT, case: Any) -> PlanT:
+    """The plan of one case; raises `CaseError` for one on the host that breaks a rule.
+
+    It is looked at afterwards, as that costs nothing where all is well.
+    """
+    if plan.status == Status.BAD_INPUT and not _is_resident(case):
+        require_sound(case)
+    return plan
+
+
+def _require_layout(chunk: Any, devices: Any) -> None:
+    """Raise unless a chunk is a number of cases, and devices are some that differ."""
+    if chunk is not None:
+        if isinstance(chunk, bool) or not isinstance(chunk, int | np.integer):
+            raise TypeError(f"chunk must be a whole number, got {chunk!r:.60}")
+        if chunk < 1:
+            raise ValueError(f"chunk must be >= 1, got {chunk}")
+    if devices is not None:
+        if not isinstance(devices, Sequence | np.ndarray) or not all(
+            isinstance(device, jax.Device) for device in devices
+        ):
+            raise TypeError(f"devices must be a sequence of jax.Device, got {devices!r:.60}")
+        if not len(devices):
+            raise ValueError("devices must be at least one, got none")
+        if len(set(devices)) < len(devices):
+            raise ValueError(f"devices must differ, got {', '.join(map(str, devices))}")
+
+
+def _require_own_precision(cases: Any) -> None:
+    """Raise `TypeError` for cases in float64 while JAX computes in float32.
+
+    One array of several that NumPy has made in float64 is no such case.
+    """
+    if jax.config.jax_enable_x64:  # type: ignore[attr-defined]
+        return
+    kinds = (getattr(leaf, "dtype", None) for leaf in jax.tree.leaves(cases))
+    if all(kind == np.float64 for kind in kinds if kind is None or kind.kind == "f"):
+        raise TypeError("cases must be in float32 unless jax_enable_x64 is set, got float64")
 
 
 def _is_resident(tree: Any) -> bool:
@@ -177,7 +224,11 @@ def _require_pure(planner: Any) -> None:
 
 
 def _require_fit(planner: Any, cases: Any) -> None:
-    """Raise `TypeError` unless the planner is a pytree and the cases are of its class."""
+    """Raise `TypeError` unless the planner is one, a pytree, and the cases are of its class."""
+    if not any(hasattr(planner, way) for way in ("solve", "solve_on_host", "plan_by")):
+        raise TypeError(
+            f"planner must be one, such as pj.hit.planner(), got a {type(planner).__name__}"
+        )
     if jax.tree_util.all_leaves([planner]) and not hasattr(planner, "solve_on_host"):
         raise TypeError(
             f"{type(planner).__name__} must be a pytree: put @jax.tree_util.register_static over "
@@ -189,6 +240,10 @@ def _require_fit(planner: Any, cases: Any) -> None:
             f"{type(planner).__name__} plans cases of the class {kind.__name__}, got "
             f"{type(cases).__name__}"
         )
+    if not hasattr(cases, "batch_shape"):
+        raise TypeError(f"cases must be a case or a batch, got a {type(cases).__name__}")
+    if not getattr(planner, "attempts", True):
+        raise ValueError(f"{type(planner).__name__} must have at least one attempt, got none")
 
 
 def require_batch(cases: Case) -> int:

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
+from planner_jax.planning.batch import solve_cases
 from planner_jax.planning.packed import call_packed
 from planner_jax.protocol import Attempt, Planner, is_solved, is_unsolved
 
@@ -20,4 +21,4 @@ def plan_single(planner: Planner, attempts: Sequence[Attempt], case: Any) -> Any
 
 
 def _solved(attempt: Attempt, planner: Planner, case: Any) -> Any:
-    return planner.solve(case, attempt)
+    return solve_cases(planner, case, attempt)

@@ -13,12 +13,12 @@ import importlib.resources
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from planner_jax.plain_files import open_plain
 from planner_jax.robot.arm import Arm
 from planner_jax.robot.arm_ik import misfit
 
@@ -38,6 +38,11 @@ def irb1600() -> Arm:
     return read_arm((models / "irb1600.xml").read_text("utf-8"))
 
 
+def _text_of(path: str) -> str:
+    with open_plain(path) as file:
+        return file.read().decode("utf-8-sig")
+
+
 def read_arm(path_or_xml: str, *, dtype: Any = np.float32) -> Arm:
     """The arm of an MJCF file, or of MJCF text, with NumPy leaves.
 
@@ -54,10 +59,9 @@ def read_arm(path_or_xml: str, *, dtype: Any = np.float32) -> Arm:
         OSError: the file cannot be read.
     """
     is_text = path_or_xml.lstrip().startswith("<")
-    text = path_or_xml if is_text else Path(path_or_xml).read_text("utf-8")
     try:
-        root = ET.fromstring(text)
-    except ET.ParseError as error:
+        root = ET.fromstring(path_or_xml if is_text else _text_of(path_or_xml))
+    except (ET.ParseError, UnicodeDecodeError) as error:
         raise ValueError(f"MJCF must be well-formed XML: {error}") from None
     _only(root, {"model"}, {"compiler", "worldbody", "keyframe", *_AROUND})
     reader = _Reader(root)

@@ -7,6 +7,8 @@ import jax
 import numpy as np
 from jax import Array
 
+_MOST = 10**8  # setpoints of a batch
+
 
 def sampled_at_rate(
     rate: float,
@@ -28,15 +30,22 @@ def sampled_at_rate(
         setpoints: by name, (K, ...) of one plan, (B, K, ...) of a batch; NaN past each plan's end.
 
     Raises:
-        ValueError: the rate is not positive.
+        TypeError: the rate is no number.
+        ValueError: the rate is not positive, or there would be more than 1e8 setpoints.
     """
-    if not rate > 0.0:
-        raise ValueError(f"rate must be > 0, got {rate}")
+    if isinstance(rate, str) or np.ndim(rate) != 0:
+        raise TypeError(f"rate must be a number, got {rate!r:.60}")
+    if not 0.0 < rate < np.inf:
+        raise ValueError(f"rate must be finite and > 0, got {rate}")
     leaves, ends = jax.tree.map(np.asarray, (leaves, ends))
     is_one = ends.ndim == 0
     if is_one:
         leaves, ends = jax.tree.map(lambda leaf: leaf[None], (leaves, ends))
     last = np.nanmax(ends, initial=0.0)
+    if last * rate * ends.size > _MOST:
+        most = _MOST / (last * ends.size)
+        rule = f"at most {most:.3g} for {ends.size} plans of up to {last:.3g} s"
+        raise ValueError(f"rate must be {rule}, got {rate:g}")
     times = np.arange(int(last * rate * (1.0 + 1e-6)) + 1) / rate
     setpoints = jax.tree.map(np.array, dict(sample(leaves, times.astype(ends.dtype))))
     past = ~(times <= ends[:, None] * (1.0 + 1e-6))

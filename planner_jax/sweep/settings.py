@@ -5,10 +5,13 @@ JAX.
 """
 
 import dataclasses
+import os
 from collections.abc import Iterable
 from typing import Any, ClassVar, Self, TypeVar
 
+from planner_jax.memory import require_disk
 from planner_jax.registry import Task, UnknownName, require_name
+from planner_jax.task.scales import scale_problem
 
 AnySettings = TypeVar("AnySettings", bound="SweepSettings")
 
@@ -42,6 +45,9 @@ class SweepSettings:
 
     RUN: ClassVar[str] = "planner_jax.sweep.sweep:Sweep"  # what carries it out, "module:Class"
     DEFAULT_NUM: ClassVar[int] = 1000
+    # As estimated, bytes of memory for a case of a batch, and of the disk for a row.
+    CASE_BYTES: ClassVar[int] = 20_000
+    ROW_BYTES: ClassVar[int] = 1_000
     CPU_BATCH: ClassVar[int] = 1024
     GPU_BATCH: ClassVar[int] = 65536
     # Names of the settings that are options of the task's `planner`, `draw` and `judge`.
@@ -50,9 +56,9 @@ class SweepSettings:
     JUDGE: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
-        for name, least in (("num", 1), ("batch", 1), ("seed", 0)):
-            value = getattr(self, name)
-            require(value is None or value >= least, name, f">= {least}", value)
+        for name in ("num", "batch"):
+            require_count(name, getattr(self, name), 1, none=True)
+        require_seed(self.seed)
 
     def of(self, task: Task) -> Self:
         """The same with the names of the task's planner and suite filled in, or checked.
@@ -72,6 +78,22 @@ class SweepSettings:
         except UnknownName as error:
             raise SettingError(str(error)) from None
         return filled
+
+    @property
+    def case_bytes(self) -> int:
+        """Memory that a case of a batch takes while it is planned, judged and written."""
+        return self.CASE_BYTES
+
+    def require_room(self, out: str | os.PathLike) -> None:
+        """Raise `SettingError` if the rows that are asked for do not fit on the disk of a folder.
+
+        Args:
+            out: of the run.
+        """
+        try:
+            require_disk("num", self.num or self.DEFAULT_NUM, self.ROW_BYTES, out)
+        except ValueError as error:
+            raise SettingError(str(error)) from None
 
     def parameters(self) -> dict[str, Any]:
         """The settings as plain values for `manifest.json`; the class brings them back."""
@@ -94,6 +116,27 @@ def require(holds: bool, name: str, rule: str, value: Any) -> None:
     """Raise `SettingError` unless a rule on an argument holds."""
     if not holds:
         raise SettingError(f"{name} must be {rule}, got {value}")
+
+
+def require_count(name: str, value: Any, least: int, *, none: bool = False) -> None:
+    """Raise `SettingError` unless a value is a whole number of at least `least`, or None if so."""
+    if value is None and none:
+        return
+    if not isinstance(value, int) or isinstance(value, bool):
+        raise SettingError(f"{name} must be a whole number, got {value!r}")
+    require(value >= least, name, f">= {least}", value)
+
+
+def require_seed(value: Any) -> None:
+    """Raise `SettingError` unless the argument `seed` is one of all random generators."""
+    require_count("seed", value, 0)
+    require(value < 2**63, "seed", "< 2**63", value)
+
+
+def require_scale(value: float) -> None:
+    """Raise `SettingError` unless the argument `limit_scale` leaves limits of a machine."""
+    if problem := scale_problem(value):
+        raise SettingError(problem)
 
 
 def require_one_of(names: Iterable[str], name: str, value: str) -> None:

@@ -8,8 +8,11 @@ from typing import Any
 import jax
 import numpy as np
 
+from planner_jax.memory import require_memory
 from planner_jax.registry import Task
 from planner_jax.sweep.settings import SettingError, SweepSettings
+
+_MOST_PARTS = 10**6  # of a run: files in one folder
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,7 +100,20 @@ def filled_in(settings: SweepSettings, num: int, batch: int) -> dict[str, Any]:
         settings: of the sweep.
         num: cases, where the settings name no number.
         batch: cases a chunk, likewise.
+
+    Raises:
+        SettingError: the cases of a chunk do not fit into memory, or there are too many chunks.
     """
     num, batch = settings.num or num, settings.batch or batch
+    if num > _MOST_PARTS * batch:
+        rule = f"at most {_MOST_PARTS * batch:,} with a batch of {batch}, of which each is a file"
+        raise SettingError(f"num must be {rule}, got {num}")
+    try:
+        if settings.batch is None:
+            require_memory("num", min(num, batch), settings.case_bytes)
+        else:
+            require_memory("batch", batch, settings.case_bytes)
+    except ValueError as error:
+        raise SettingError(str(error)) from None
     resolved = dataclasses.replace(settings, num=num, batch=batch)
     return {"settings": resolved, "num": num, "batch": batch}

@@ -34,6 +34,11 @@ def judged(
     for name, tree, kind in zip(("cases", "plans"), (cases, plans), kinds, strict=True):
         if not isinstance(tree, kind):
             raise TypeError(f"{name} must be a {kind.__name__}, got a {type(tree).__name__}")
+    tolerance = settings.get("tolerance", 0.0)
+    if isinstance(tolerance, str) or np.ndim(tolerance) != 0:
+        raise TypeError(f"tolerance must be a number, got {tolerance!r:.60}")
+    if not 0.0 <= tolerance < np.inf:
+        raise ValueError(f"tolerance must be finite and >= 0, got {tolerance}")
     alone = cases.batch_shape == ()
     if alone:
         cases, plans = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (cases, plans))

@@ -20,8 +20,11 @@ def named_decision(
 
     Raises:
         ValueError: there is no decision of that name, or it takes no file.
+        TypeError: it is neither a name nor a decision.
     """
     if not isinstance(decide, str):
+        if isinstance(decide, type) or not hasattr(decide, "propose"):
+            raise TypeError(f"decide must be a name or a decision, got {decide!r:.60}")
         return decide
     name, file = split_name(names, "decide", decide, from_file)
     return pkgutil.resolve_name(names[name])(*filter(None, [file]))

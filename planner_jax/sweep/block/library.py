@@ -1,5 +1,6 @@
 """The command `planner-jax library`: builds, shows, checks and repairs libraries of blocks."""
 
+import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,11 +9,19 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from planner_jax.memory import require_memory
 from planner_jax.robot.arm import REGIMES
 from planner_jax.robot.arm_mjcf import irb1600, read_arm
+from planner_jax.sweep.block.settings import BlockSettings
 from planner_jax.sweep.environment import require_backend
 from planner_jax.sweep.figures import style
-from planner_jax.sweep.settings import SettingError, require, require_one_of
+from planner_jax.sweep.settings import (
+    SettingError,
+    require,
+    require_count,
+    require_one_of,
+    require_seed,
+)
 from planner_jax.task.block.library.build import build, repair
 from planner_jax.task.block.library.cells import LAYOUTS, Face
 from planner_jax.task.block.library.coverage import Coverage, check, coverage
@@ -51,6 +60,10 @@ def build_library(
         "six angles for each home",
         f"{len(home or ())} numbers",
     )
+    finite = home is None or all(map(math.isfinite, home))
+    require(finite, "home", "finite angles", " ".join(map(str, home or ())))
+    if Path(path).exists():
+        _loaded(path)  # lest a file of another kind be lost
     require_backend()
     try:
         body = irb1600() if arm is None else read_arm(arm)
@@ -95,8 +108,12 @@ def check_library(path: str, *, num: int = 2000, seed: int = 0) -> None:
         num: balls for each home.
         seed: of the balls.
     """
-    require(num >= 1, "num", ">= 1", num)
-    require(seed >= 0, "seed", ">= 0", seed)
+    require_count("num", num, 1)
+    require_seed(seed)
+    try:
+        require_memory("num", num, BlockSettings.CASE_BYTES)
+    except ValueError as error:
+        raise SettingError(str(error)) from None
     library = _loaded(path)
     require_backend()
     for home in range(len(library.table.homes)):

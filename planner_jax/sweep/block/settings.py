@@ -9,6 +9,23 @@ from planner_jax.sweep.settings import SweepSettings, option, require, require_o
 REGIMES = ("R1", "R2", "R3")  # of `planner_jax.robot.arm`, which imports JAX
 
 
+_LONGEST = 60.0  # [s], or [m] of noise: balls are there for a second or two
+_FASTEST = 1000.0  # [Hz]
+
+
+def require_moderate(name: str, value: float | None, most: float = _LONGEST) -> None:
+    """Raise `SettingError` unless a value is None, or not negative and no absurd one."""
+    if value is not None:
+        require(0.0 <= value < math.inf, name, "finite and >= 0", value)
+        require(value <= most, name, f"<= {most:g}", value)
+
+
+def require_frame_rate(value: float) -> None:
+    """Raise `SettingError` unless the argument `frame_rate` is that of a camera."""
+    require(0.0 < value < math.inf, "frame_rate", "finite and > 0", value)
+    require(1.0 <= value <= _FASTEST, "frame_rate", f"from 1 to {_FASTEST:g}", value)
+
+
 @dataclasses.dataclass(frozen=True)
 class BlockSettings(SweepSettings):
     """The arguments of a block sweep."""
@@ -55,16 +72,17 @@ class BlockSettings(SweepSettings):
 
     RUN: ClassVar[str] = "planner_jax.sweep.block.sweep:BlockSweep"
     DRAW: ClassVar[tuple[str, ...]] = ("regime", "wide", "anywhere", "delay")
+    CASE_BYTES: ClassVar[int] = 60_000
     CPU_BATCH: ClassVar[int] = 256  # some ms a case
     GPU_BATCH: ClassVar[int] = 4096
 
     def __post_init__(self) -> None:
         super().__post_init__()
         require_one_of(REGIMES, "regime", self.regime)
-        for name in ("delay", "count", "sense", "overhead", "refit", "wait", "noise"):
-            value = getattr(self, name)
-            require(value is None or 0.0 <= value < math.inf, name, "finite and >= 0", value)
-        require(0.0 < self.frame_rate < math.inf, "frame_rate", "finite and > 0", self.frame_rate)
+        for name in ("delay", "count", "sense", "overhead", "wait", "noise"):
+            require_moderate(name, getattr(self, name))
+        require_moderate("refit", self.refit, _FASTEST)
+        require_frame_rate(self.frame_rate)
         if self.perception:
             rule = "0 with perception, whose sense and overhead it is"
             require(self.delay == 0.0, "delay", rule, self.delay)

@@ -5,8 +5,15 @@ import math
 from typing import ClassVar
 
 from planner_jax.registry import UnknownName, split_name
-from planner_jax.sweep.settings import SettingError, SweepSettings, option, require, require_one_of
-from planner_jax.task.catch.card import DECISIONS, TRAINED
+from planner_jax.sweep.settings import (
+    SettingError,
+    SweepSettings,
+    option,
+    require,
+    require_one_of,
+    require_scale,
+)
+from planner_jax.task.catch.card import DECISIONS, SUITES, TRAINED
 
 NET_TESTS = ("plane", "ball")  # of `referee_catches`
 
@@ -39,11 +46,19 @@ class CatchSettings(SweepSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        scale, tolerance = self.limit_scale, self.tolerance
-        require(0.0 < scale < math.inf, "limit_scale", "finite and > 0", scale)
+        tolerance = self.tolerance
+        require_scale(self.limit_scale)
         try:
             split_name(DECISIONS, "decide", self.decide, TRAINED)
         except UnknownName as error:
             raise SettingError(str(error)) from None
         require_one_of(NET_TESTS, "net_test", self.net_test)
         require(0.0 <= tolerance < math.inf, "tolerance", "finite and >= 0", tolerance)
+
+    @property
+    def case_bytes(self) -> int:
+        """More where all orders of several targets are looked at."""
+        suite = SUITES.get(self.suite or next(iter(SUITES)))
+        all_orders = self.decide == "best" and suite is not None and not suite.optional
+        orders = math.factorial(min(suite.num_targets, 6)) if suite and all_orders else 1
+        return self.CASE_BYTES + 1_400 * orders

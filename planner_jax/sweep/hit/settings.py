@@ -5,8 +5,17 @@ import math
 import os
 from typing import Any, ClassVar
 
-from planner_jax.sweep.settings import SettingError, SweepSettings, option, require
+from planner_jax.digits import written_number
+from planner_jax.sweep.settings import (
+    SettingError,
+    SweepSettings,
+    option,
+    require,
+    require_scale,
+)
 from planner_jax.task.hit.card import START
+
+_FARTHEST = 1e6  # [m]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,12 +40,13 @@ class HitSettings(SweepSettings):
     DRAW: ClassVar[tuple[str, ...]] = ("start", "delay", "limit_scale")
     JUDGE: ClassVar[tuple[str, ...]] = ("drag_after_impact",)
     DEFAULT_NUM: ClassVar[int] = 9000
+    CASE_BYTES: ClassVar[int] = 12_000
+    ROW_BYTES: ClassVar[int] = 1_500
     CPU_BATCH: ClassVar[int] = 4608  # one block of the serve generator
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        scale = self.limit_scale
-        require(0.0 < scale < math.inf, "limit_scale", "finite and > 0", scale)
+        require_scale(self.limit_scale)
         require(0.0 <= self.delay < math.inf, "delay", "finite and >= 0", self.delay)
         truer = not self.drag_after_impact or self.planner in (None, "exact")
         require(truer, "drag_after_impact", "left out unless the planner is exact", self.planner)
@@ -50,13 +60,13 @@ class HitSettings(SweepSettings):
 
 
 def _checked_start(start: Any) -> tuple[float, ...] | str:
-    rule = "three finite numbers with z > 0, or 'uniform'"
+    rule = f"three finite numbers with z > 0, none beyond {_FARTHEST:g}, or 'uniform'"
     if start in ("uniform", ["uniform"]):
         return "uniform"
     try:
-        point = tuple(float(number) for number in start)
+        point = tuple(written_number(str(each)) for each in start)
     except (TypeError, ValueError):
         raise SettingError(f"start must be {rule}, got {start!r}") from None
-    sound = len(point) == 3 and all(map(math.isfinite, point)) and point[2] > 0.0
-    require(sound, "start", rule, " ".join(f"{number:g}" for number in point))
+    sound = len(point) == 3 and all(abs(x) <= _FARTHEST for x in point) and point[2] > 0.0
+    require(sound, "start", rule, " ".join(f"{each:g}" for each in point))
     return point

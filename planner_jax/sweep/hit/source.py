@@ -7,12 +7,13 @@ from typing import Any
 import jax
 import numpy as np
 
+from planner_jax.rules import CaseError
 from planner_jax.sweep.hit.settings import HitSettings
 from planner_jax.sweep.settings import SettingError, require_one_of
 from planner_jax.sweep.source import Chunk, Source, filled_in
 from planner_jax.task.hit.card import REAL_SCENARIOS, TASK
 from planner_jax.task.hit.serves import Serves, generate_serves, read_serves, to_cases
-from planner_jax.task.hit.validate import CaseError, ServeError, check_cases
+from planner_jax.task.hit.validate import ServeError, check_cases
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,8 +70,8 @@ def open_source(settings: HitSettings, batch: int) -> ServeSource:
         folder = None if settings.serves is None else read_serves(settings.serves)
     except ServeError as error:
         raise SettingError(str(error)) from error
-    fields = filled_in(settings, settings.DEFAULT_NUM if folder is None else len(folder), batch)
-    if folder is not None and fields["num"] > len(folder):
+    if folder is not None and (settings.num or 0) > len(folder):
         rule = f"num must be <= {len(folder)}, the serves that the folder holds"
-        raise SettingError(f"{rule}, got {fields['num']}")
+        raise SettingError(f"{rule}, got {settings.num}")
+    fields = filled_in(settings, settings.DEFAULT_NUM if folder is None else len(folder), batch)
     return ServeSource(**fields, folder=folder)

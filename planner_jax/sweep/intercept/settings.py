@@ -11,5 +11,6 @@ class InterceptSettings(SweepSettings):
     """The arguments of an intercept sweep."""
 
     RUN: ClassVar[str] = "planner_jax.sweep.intercept.sweep:InterceptSweep"
+    CASE_BYTES: ClassVar[int] = 100_000
     CPU_BATCH: ClassVar[int] = 256  # some ms a case
     GPU_BATCH: ClassVar[int] = 4096

@@ -10,6 +10,7 @@ import numpy as np
 from jax import Array
 
 from planner_jax.ball.flight import BallState
+from planner_jax.planning.batch import solve_cases
 from planner_jax.protocol import Attempt, is_solved
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.plan import BlockPlan
@@ -46,9 +47,8 @@ class BallByBall:
                 given = iter(large)
                 own = [next(given) if out else x for x, out in zip(leaves, is_large, strict=True)]
                 ball = BallState(pos=vector[:3], vel=vector[3:])
-                plan = jax.tree.unflatten(tree, own).solve(
-                    dataclasses.replace(case, ball=ball), attempt
-                )
+                known = dataclasses.replace(case, ball=ball)
+                plan = solve_cases(jax.tree.unflatten(tree, own), known, attempt)
                 flat = [jnp.ravel(leaf).astype(vector.dtype) for leaf in jax.tree.leaves(plan)]
                 return jnp.concatenate(flat)
 
@@ -57,7 +57,7 @@ class BallByBall:
         dtype = np.asarray(case.angles).dtype
         self._vector = np.zeros(6, dtype)
         shape = jax.ShapeDtypeStruct((6,), dtype)
-        plan = jax.eval_shape(lambda case: planner.solve(case, self.attempts[0]), case)
+        plan = jax.eval_shape(lambda case: solve_cases(planner, case, self.attempts[0]), case)
         self._fields, self._tree = jax.tree.flatten(plan)
         with jax.default_device(cpu):
             self._solvers = [

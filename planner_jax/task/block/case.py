@@ -1,6 +1,6 @@
 """One thrown ball, and the arm that is to block it."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,9 @@ from planner_jax.ball.flight import BallState
 from planner_jax.registry import require_name
 from planner_jax.robot.arm import REGIMES, Arm, ArmLimits
 from planner_jax.robot.arm_mjcf import irb1600
+from planner_jax.rules import Table, require_sound
+from planner_jax.task.arguments import array_of, batch_of, floating
+from planner_jax.task.block.rules import RULES
 from planner_jax.task.block.scene import Scene, paper_scene
 
 # How exactly a ball is to be met: greatest distance from the middle of the shield [m], and greatest
@@ -27,6 +30,8 @@ class BlockCase:
 
     Robot base frame, z up, SI units. Times count from the moment at which the ball is first seen.
     """
+
+    rules: ClassVar[Table] = RULES
 
     ball: BallState  # when it is first seen; it falls freely
     gravity: Array  # () [m/s^2], magnitude
@@ -83,25 +88,20 @@ def case(
         dtype: of every floating leaf.
 
     Raises:
-        ValueError: a number is out of its range, or there is no such regime; one line.
+        CaseError: a number breaks a rule, such as a gravity that is not positive; one line.
+        ValueError: an argument has another shape, or there is no such regime.
+        TypeError: an argument holds no numbers, or `dtype` is not that of floating ones.
     """
     require_name(REGIMES, "regime", regime)
     arm = irb1600() if arm is None else arm
     angles = arm.home if angles is None else angles
-    ball_pos, ball_vel, angles, rates = map(np.asarray, (ball_pos, ball_vel, angles, rates))
+    rates = np.zeros(6) + rates if np.ndim(rates) == 0 else rates
     vectors = {"ball_pos": (ball_pos, 3), "ball_vel": (ball_vel, 3), "angles": (angles, 6)}
-    for name, (value, size) in vectors.items():
-        if value.shape[-1:] != (size,):
-            raise ValueError(f"{name} must end with {size} numbers, got the shape {value.shape}")
-    if not np.all(np.asarray(delay) >= 0.0):
-        raise ValueError(f"delay must be >= 0, got {np.min(delay)}")
-    if not np.all(np.asarray(gravity) > 0.0):
-        raise ValueError(f"gravity must be > 0, got {np.min(gravity)}")
-    shapes = (value.shape[:-1] for value in (ball_pos, ball_vel, angles))
-    batch = np.broadcast_shapes(*shapes, np.shape(delay), np.shape(gravity))
+    shapes = [batch_of(name, *given) for name, given in vectors.items()]
+    batch, dtype = max([*shapes, np.shape(delay), np.shape(gravity)], key=len), floating(dtype)
 
-    def leaf(value: Any, *trailing: int) -> Array:
-        return jnp.asarray(np.broadcast_to(np.asarray(value), batch + trailing), dtype)
+    def leaf(name: str, value: Any, *trailing: int) -> Array:
+        return array_of(name, value, batch, trailing, dtype)
 
     def shared(tree: Any) -> Any:
         def one(value: Any) -> Array:
@@ -113,16 +113,18 @@ def case(
 
     chosen = REGIMES[regime]
     offset, tilt = ANYWHERE if anywhere else WIDE if wide else STRICT
-    return BlockCase(
-        ball=BallState(pos=leaf(ball_pos, 3), vel=leaf(ball_vel, 3)),
-        gravity=leaf(gravity),
-        delay=leaf(delay),
-        angles=leaf(angles, 6),
-        rates=leaf(rates, 6),
+    made = BlockCase(
+        ball=BallState(pos=leaf("ball_pos", ball_pos, 3), vel=leaf("ball_vel", ball_vel, 3)),
+        gravity=leaf("gravity", gravity),
+        delay=leaf("delay", delay),
+        angles=leaf("angles", angles, 6),
+        rates=leaf("rates", rates, 6),
         arm=shared(arm),
         limits=shared(chosen.limits),
         ends_at_rest=jnp.broadcast_to(jnp.asarray(chosen.ends_at_rest), batch),
-        offset=leaf(offset),
-        tilt=leaf(tilt),
+        offset=leaf("offset", offset),
+        tilt=leaf("tilt", tilt),
         scene=shared(paper_scene() if scene is None else scene),
     )
+    require_sound(made)
+    return made

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from planner_jax.registry import require_name
+from planner_jax.task.arguments import require_draw
 from planner_jax.task.block.card import SUITES, Suite
 from planner_jax.task.block.case import BlockCase, case
 from planner_jax.task.block.scene import (
@@ -70,9 +71,7 @@ def draw_cases(
         ValueError: an argument is out of its range; one line.
     """
     require_name(SUITES, "suite", suite)
-    for name, value, least in (("num", num, 1), ("seed", seed, 0), ("first", first, 0)):
-        if value < least:
-            raise ValueError(f"{name} must be >= {least}, got {value}")
+    require_draw(num, seed, first)
     own, tag = SUITES[suite], zlib.crc32(suite.encode())
     randoms = (np.random.default_rng([seed, first + k, tag]) for k in range(num))
     thrown = np.array([_throw(own, random) for random in randoms])

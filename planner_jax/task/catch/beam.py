@@ -1,5 +1,7 @@
 """A bounded search for orders of catching, by the estimate: for more targets than permutations."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +17,9 @@ from planner_jax.task.catch.estimate import (
     takeable,
     top_speed,
 )
+
+MOST_SEARCHED = 100  # targets
+_WORD = 24
 
 
 @struct.dataclass
@@ -33,16 +38,26 @@ def beam(case: CatchCase, table: Timetable, width: int) -> CatchChoice:
     """Orders of one case that take most targets, and of these the earliest, leaves (W, N).
 
     After each catch the W best beginnings go on, at most one for the same targets with the same
-    last one. Where fewer than W are found, the first one is repeated.
+    last one: a bounded search, which may miss the best order. Where fewer than W are found, the
+    first one is repeated.
 
     Args:
         case: one case.
         table: its timetable.
         width: W.
+
+    Raises:
+        ValueError: there are more than `MOST_SEARCHED` targets.
     """
     num, speed = case.num_targets, top_speed(case)
+    if num > MOST_SEARCHED:
+        raise ValueError(f"targets must be at most {MOST_SEARCHED} of a case, got {num}")
     from_all = jax.vmap(arrivals, (None, 0, 0, None))
-    bits = jnp.asarray(1 << np.arange(num), jnp.int32)
+    # Which targets are taken, in words of so many bits that 32 hold one and the last target, too.
+    words = np.arange(0, num, _WORD)
+    place = np.arange(num) - words[:, None]
+    inside = (place >= 0) & (place < _WORD)
+    bits = jnp.asarray(np.where(inside, 1 << np.clip(place, 0, _WORD - 1), 0), jnp.int32)
 
     def advance(now: _Partial, step: Array) -> tuple[_Partial, _Partial]:
         times, places, shortfalls = from_all(table, now.time, now.place, speed)
@@ -52,11 +67,13 @@ def beam(case: CatchCase, table: Timetable, width: int) -> CatchChoice:
         short = now.short[:, None] + shortfalls
         rank = later_by_shortfall(times, short)
         rank = jnp.where(possible & jnp.isfinite(now.rank)[:, None], rank, jnp.inf).ravel()
-        taken = jnp.sum(jnp.where(left, 0, bits), axis=1, keepdims=True)
-        state = ((taken | bits) * num + np.arange(num)).ravel()
+        taken = jnp.sum(jnp.where(left, 0, bits[:, None]), axis=2, keepdims=True)
+        *others, last = (taken | bits[:, None]).reshape(len(words), -1)
+        state = (*others, last * num + jnp.tile(np.arange(num), width))
         # Of equal states only the first one, in order of their ranks, goes on.
-        sorted_ = jnp.lexsort((rank, state))
-        again = jnp.diff(state[sorted_], prepend=-1) == 0
+        sorted_ = jnp.lexsort((rank, *state))
+        alike = [jnp.diff(word[sorted_], prepend=-1) == 0 for word in state]
+        again = functools.reduce(jnp.logical_and, alike)
         rank = jnp.where(jnp.zeros_like(again).at[sorted_].set(again), jnp.inf, rank)
         chosen = jnp.argsort(rank)[:width]
         row, target = chosen // num, chosen % num

@@ -2,8 +2,9 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -11,6 +12,9 @@ from jax import Array
 
 from planner_jax.ball.target import TargetPath
 from planner_jax.cost.extras import Extra, for_batch
+from planner_jax.rules import Table, require_sound
+from planner_jax.task.arguments import array_of, floating
+from planner_jax.task.catch.rules import RULES
 
 GRAVITY = 9.81  # [m/s^2]
 START = (0.0, 0.0, 1.0)  # [m], where the quadrotor hovers
@@ -63,6 +67,8 @@ class CatchCase:
     Times count from the moment at which planning begins. The N targets are caught in the
     order `order`, which a decision fills in together with `times`.
     """
+
+    rules: ClassVar[Table] = RULES
 
     targets: TargetPath  # leaves with a leading axis N
     present: Array  # (N,) bool, in the same order as `targets`; which of the N there are
@@ -136,33 +142,59 @@ def case(
             batch's axes on every leaf.
         optional: whether targets may be left: as many as can be are to be caught, not all.
         dtype: of every floating leaf.
+
+    Raises:
+        CaseError: a number breaks a rule, such as a limit that is not positive; one line.
+        ValueError: an argument has another shape.
+        TypeError: an argument holds no numbers, or `dtype` is not that of floating ones.
     """
-    shape = np.shape(horizon)
+    dtype, shape = floating(dtype), np.shape(horizon)
+    if not shape:
+        raise ValueError("horizon must have an entry for each target, got one number")
     batch, num = shape[:-1], shape[-1]
 
-    def leaf(value, *trailing: int) -> Array:
-        return jnp.asarray(np.broadcast_to(np.asarray(value), batch + trailing), dtype)
+    def leaf(name: str, value: Any, *trailing: int) -> Array:
+        return array_of(name, value, batch, trailing, dtype)
 
-    gravity = np.asarray(gravity)
+    for path in jax.tree.leaves(targets):
+        if np.shape(path)[: len(shape)] != shape:
+            raise ValueError(
+                f"targets must have leaves that begin with the shape {shape} of horizon, got "
+                f"{np.shape(path)}"
+            )
+    of_gravity, gravity = leaf("gravity", gravity), np.asarray(gravity)
     head = np.zeros(batch + (4, 3))
-    head[..., 0, :] = start
+    head[..., 0, :] = array_of("start", start, batch, (3,), float)
     shares = np.arange(1, num + 1) / (num + 1.0)
-    return CatchCase(
+    made = CatchCase(
         targets=targets,
-        present=jnp.asarray(np.broadcast_to(present, shape), bool),
-        horizon=leaf(horizon, num),
+        present=_present(present, shape),
+        horizon=leaf("horizon", horizon, num),
         order=jnp.asarray(np.broadcast_to(np.arange(num), shape), jnp.int32),
-        times=leaf(shares * np.asarray(horizon)[..., :1], num),
+        times=leaf("horizon", shares * np.asarray(horizon)[..., :1], num),
         head_state=jnp.asarray(head, dtype),
-        gravity=leaf(gravity),
-        net=Net(height=leaf(net_height), radius=leaf(net_radius), max_angle=leaf(max_angle)),
+        gravity=of_gravity,
+        net=Net(
+            height=leaf("net_height", net_height),
+            radius=leaf("net_radius", net_radius),
+            max_angle=leaf("max_angle", max_angle),
+        ),
         limits=CatchLimits(
-            speed=leaf(speed),
-            min_thrust=leaf(0.3 * gravity if min_thrust is None else min_thrust),
-            max_thrust=leaf(2.5 * gravity if max_thrust is None else max_thrust),
-            body_rate=leaf(body_rate),
-            min_height=leaf(min_height),
+            speed=leaf("speed", speed),
+            min_thrust=leaf("min_thrust", 0.3 * gravity if min_thrust is None else min_thrust),
+            max_thrust=leaf("max_thrust", 2.5 * gravity if max_thrust is None else max_thrust),
+            body_rate=leaf("body_rate", body_rate),
+            min_height=leaf("min_height", min_height),
         ),
         extras=for_batch(extras, batch, dtype),
         optional=optional,
     )
+    require_sound(made)
+    return made
+
+
+def _present(given: Any, shape: tuple[int, ...]) -> Array:
+    """Which targets there are, of the shape (..., N) of the horizon."""
+    if np.shape(given) not in ((), shape[-1:], shape):
+        raise ValueError(f"present must have the shape {shape}, got {np.shape(given)}")
+    return jnp.asarray(np.broadcast_to(given, shape), bool)

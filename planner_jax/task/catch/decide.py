@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from planner_jax.protocol import Status, is_unsolved
+from planner_jax.protocol import Status, is_unsolved, require_settings
 from planner_jax.task.catch.beam import beam
 from planner_jax.task.catch.case import CatchCase, CatchChoice
 from planner_jax.task.catch.estimate import (
@@ -116,15 +116,14 @@ class Best(CatchDecision):
 
     All N! orders are estimated. Those with the least shortfall, then the earliest last catch,
     are the finalists. Beyond six targets, and where they are optional, the orders are those that
-    a beam search finds.
+    a beam search of bounded width finds, which may miss the best one, of at most 100 targets.
     """
 
     finalists: int = 6  # orders that are planned
     width: int = 64  # of the beam
 
     def __post_init__(self) -> None:
-        if self.finalists < 1:
-            raise ValueError(f"finalists must be >= 1, got {self.finalists}")
+        require_settings(self)
         if self.width < self.finalists:
             raise ValueError(f"width must be >= {self.finalists} finalists, got {self.width}")
 

@@ -25,7 +25,7 @@ from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.problem import Round
 from planner_jax.optimise.scaling import shipped_scale
 from planner_jax.optimise.sensitivity import curvature_by_tangents
-from planner_jax.protocol import FEASIBILITY_TOLERANCE
+from planner_jax.protocol import FEASIBILITY_TOLERANCE, require_settings
 from planner_jax.robot.quadrotor import body_z, tangent_basis
 from planner_jax.task.catch.case import CatchCase, CatchLimits
 from planner_jax.task.catch.chain import (
@@ -129,12 +129,18 @@ class ExactCatch(OptimisedPlanner):
     scale: tuple[float, ...] = ()  # of one segment
 
     def __post_init__(self) -> None:
-        if len(self.proportions) < 2:
-            raise ValueError(f"proportions must be of >= 2 pieces, got {self.proportions}")
+        require_settings(self)
+        if len(self.proportions) < 2 or not all(0.0 < x < np.inf for x in self.proportions):
+            raise ValueError(
+                f"proportions must be of >= 2 pieces, finite and > 0, got {self.proportions}"
+            )
         if not self.scale:
             object.__setattr__(
                 self, "scale", shipped_scale(__package__, f"exact-{self.num_pieces}")
             )
+        if len(self.scale) != self.num_offsets + 12:
+            rule = f"of {self.num_offsets + 12} numbers"
+            raise ValueError(f"scale must be {rule}, got {len(self.scale)}")
 
     @property
     def num_offsets(self) -> int:

@@ -17,7 +17,7 @@ from planner_jax.cost.quadrotor import (
     speed_excess,
     thrust_excess,
 )
-from planner_jax.protocol import Attempt, outcome
+from planner_jax.protocol import Attempt, outcome, require_settings
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.chain import CatchContext, ordered_context, targets_at
 from planner_jax.task.catch.plan import CatchPlan
@@ -117,6 +117,7 @@ class MppCatch:
     time_nodes: int = 128  # intervals of a horizon in which a fall is looked for
 
     def __post_init__(self) -> None:
+        require_settings(self)
         if not 0.0 < self.height < 2.0:
             raise ValueError(f"height must be > 0 and < 2, got {self.height}")
         if not self.speeds or not self.thrusts:

@@ -14,6 +14,7 @@ from planner_jax.cost.quadrotor import ground_excess, speed_excess
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
 from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.problem import Round, Stage
+from planner_jax.protocol import require_settings
 from planner_jax.robot.quadrotor import body_rate_squared, body_z, net_thrust
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.chain import (
@@ -108,6 +109,7 @@ class PaperCatch(OptimisedPlanner):
     scale: tuple[float, ...] = ()  # of one segment; () for what served best
 
     def __post_init__(self) -> None:
+        require_settings(self)
         if self.num_pieces < 2:
             raise ValueError(f"num_pieces must be >= 2, got {self.num_pieces}")
         if not self.scale:

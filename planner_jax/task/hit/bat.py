@@ -17,6 +17,7 @@ from planner_jax.cost.quadrotor import motion_excess
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
 from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.problem import Round
+from planner_jax.protocol import require_settings
 from planner_jax.task.hit.baseline import largest_violation, make_impact
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.context import HitContext, Impact, prepare_hit
@@ -160,12 +161,16 @@ class BatHit(OptimisedPlanner):
     scale: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
+        require_settings(self)
         if self.num_pieces < 2:
             raise ValueError(f"num_pieces must be >= 2, got {self.num_pieces}")
         if not self.scale:
             place, time, speed, thrust = _UNITS
             terminal = (time, speed, speed, thrust, thrust)
             object.__setattr__(self, "scale", (place,) * self.num_offsets + terminal)
+        if len(self.scale) != self.num_offsets + 5:
+            rule = f"of {self.num_offsets + 5} numbers"
+            raise ValueError(f"scale must be {rule}, got {len(self.scale)}")
 
     @property
     def maps(self) -> ProportionalMinco:

@@ -1,7 +1,7 @@
 """One volley to plan: the incoming ball, the hovering quadrotor, the target and the limits."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +11,10 @@ from jax import Array
 from planner_jax.ball.flight import BallState
 from planner_jax.cost.extras import Extra, for_batch
 from planner_jax.robot.quadrotor import QuadrotorLimits
+from planner_jax.rules import Table, require_sound
+from planner_jax.task.arguments import array_of, batch_of, floating
 from planner_jax.task.hit.card import START
+from planner_jax.task.hit.rules import RULES
 
 # Fit to the published landing points; the residual is 1 cm.
 DRAG = 0.0616  # K_D [1/m]
@@ -34,6 +37,8 @@ class HitCase:
 
     Times count from the moment at which planning begins.
     """
+
+    rules: ClassVar[Table] = RULES
 
     ball: BallState  # at time 0
     head_state: Array  # (4, 3) position, velocity, acceleration, jerk of the quadrotor at time 0
@@ -96,32 +101,39 @@ def case(
 
     Returns:
         A `HitCase` whose leaves carry the batch shape of `serve_pos`.
-    """
-    batch = np.shape(serve_pos)[:-1]
 
-    def leaf(value, *shape: int) -> Array:
-        return jnp.asarray(np.broadcast_to(np.asarray(value), batch + shape), dtype)
+    Raises:
+        CaseError: a number breaks a rule, such as a limit that is not positive; one line.
+        ValueError: an argument has another shape.
+        TypeError: an argument holds no numbers, or `dtype` is not that of floating ones.
+    """
+    dtype, batch = floating(dtype), batch_of("serve_pos", serve_pos, 3)
+
+    def leaf(name: str, value: Any, *shape: int) -> Array:
+        return array_of(name, value, batch, shape, dtype)
 
     head = np.zeros(batch + (4, 3))
-    head[..., 0, :] = start
-    return HitCase(
-        ball=BallState(pos=leaf(serve_pos, 3), vel=leaf(serve_vel, 3)),
+    head[..., 0, :] = array_of("start", start, batch, (3,), float)
+    made = HitCase(
+        ball=BallState(pos=leaf("serve_pos", serve_pos, 3), vel=leaf("serve_vel", serve_vel, 3)),
         head_state=jnp.asarray(head, dtype),
-        target=leaf(target, 3),
-        drag=leaf(drag),
-        gravity=leaf(gravity),
-        restitution=leaf(restitution),
-        racket_height=leaf(racket_height),
+        target=leaf("target", target, 3),
+        drag=leaf("drag", drag),
+        gravity=leaf("gravity", gravity),
+        restitution=leaf("restitution", restitution),
+        racket_height=leaf("racket_height", racket_height),
         limits=QuadrotorLimits(
-            speed=leaf(speed),
-            acceleration=leaf(acceleration),
-            body_rate=leaf(body_rate),
-            min_height=leaf(min_height),
+            speed=leaf("speed", speed),
+            acceleration=leaf("acceleration", acceleration),
+            body_rate=leaf("body_rate", body_rate),
+            min_height=leaf("min_height", min_height),
         ),
         hit_limits=HitLimits(
-            hitting_speed=leaf(hitting_speed, 3),
-            min_apex=leaf(min_apex),
-            max_apex=leaf(max_apex),
+            hitting_speed=leaf("hitting_speed", hitting_speed, 3),
+            min_apex=leaf("min_apex", min_apex),
+            max_apex=leaf("max_apex", max_apex),
         ),
         extras=for_batch(extras, batch, dtype),
     )
+    require_sound(made)
+    return made

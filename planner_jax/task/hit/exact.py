@@ -33,6 +33,7 @@ from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
 from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.problem import Round
 from planner_jax.optimise.scaling import shipped_scale
+from planner_jax.protocol import require_settings
 from planner_jax.robot.quadrotor import QuadrotorLimits, tangent_basis
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.context import HitContext, Impact, prepare_hit
@@ -129,12 +130,18 @@ class ExactHit(OptimisedPlanner):
     scale: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if len(self.proportions) < 2:
-            raise ValueError(f"proportions must be of >= 2 pieces, got {self.proportions}")
+        require_settings(self)
+        if len(self.proportions) < 2 or not all(0.0 < x < np.inf for x in self.proportions):
+            raise ValueError(
+                f"proportions must be of >= 2 pieces, finite and > 0, got {self.proportions}"
+            )
         if not self.scale:
             object.__setattr__(
                 self, "scale", shipped_scale(__package__, f"exact-{self.num_pieces}")
             )
+        if len(self.scale) != self.num_offsets + 8:
+            rule = f"of {self.num_offsets + 8} numbers"
+            raise ValueError(f"scale must be {rule}, got {len(self.scale)}")
 
     @property
     def num_pieces(self) -> int:

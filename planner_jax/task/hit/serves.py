@@ -11,11 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.interpolate import RectBivariateSpline
 
+from planner_jax.task.arguments import require_draw
 from planner_jax.task.hit import court
 from planner_jax.task.hit.card import START
 from planner_jax.task.hit.case import DRAG, GRAVITY, HitCase, case
 from planner_jax.task.hit.trial_files import read_trials
 from planner_jax.task.hit.validate import ServeError, fly, landing
+from planner_jax.task.scales import scale_problem
 
 # The law of the published serves, fitted to them. Position and velocity are uniform, and those
 # serves are kept that meet the following and land in the region asked for.
@@ -115,9 +117,10 @@ def generate_serves(
         ServeError: an argument is out of its range.
     """
     names = court.SCENARIOS if scenarios is None else tuple(scenarios)
-    for name, value, least in (("num", num, 1), ("seed", seed, 0), ("first", first, 0)):
-        if value < least:
-            raise ServeError(f"{name} must be >= {least}, got {value}")
+    try:
+        require_draw(num, seed, first)
+    except ValueError as error:
+        raise ServeError(str(error)) from None
     unknown = [name for name in names if name not in court.SCENARIOS]
     if unknown or not names:
         rule = f"names out of {' '.join(court.SCENARIOS)}"
@@ -289,8 +292,8 @@ def to_cases(
     Raises:
         ServeError: an argument is out of its range.
     """
-    if not 0.0 < limit_scale < math.inf:
-        raise ServeError(f"limit_scale must be finite and > 0, got {limit_scale:g}")
+    if problem := scale_problem(limit_scale):
+        raise ServeError(problem)
     if isinstance(start, str):
         if start != "uniform":
             raise ServeError(f"start must be three numbers or 'uniform', got {start!r}")

@@ -8,6 +8,8 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
+from planner_jax.digits import written_number
+from planner_jax.plain_files import open_plain
 from planner_jax.task.hit import court
 from planner_jax.task.hit.case import DRAG, GRAVITY
 from planner_jax.task.hit.validate import ServeError, landing
@@ -78,7 +80,8 @@ def _trial_files(folder) -> dict[int, dict[str, Path]]:
 def _read_file(path: Path, problems: list[str]) -> _Table:
     """The table of one file, and a problem for each line that does not parse."""
     try:
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+        with open_plain(path) as file:
+            lines = file.read().decode("utf-8-sig", errors="replace").splitlines()
     except OSError as error:
         problems.append(f"{path.name}: file must be readable, got {error.strerror}")
         return {}
@@ -114,7 +117,7 @@ def _parse(line: str) -> tuple[list[float], bool]:
 def _vector(name: str, cell: str, size: int) -> list[float]:
     """The finite numbers of one blank-separated cell."""
     try:
-        vector = [float(number) for number in cell.split()]
+        vector = [written_number(word) for word in cell.split()]
     except ValueError:
         vector = []
     if len(vector) != size or not all(map(math.isfinite, vector)):

@@ -1,7 +1,7 @@
 """One interception: a car, its target, and what stands or moves in its way."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,9 @@ from jax import Array
 from planner_jax.plane.obstacles import Obstacles, obstacles
 from planner_jax.plane.target import PlanePath
 from planner_jax.robot.car import CarBody, CarLimits
+from planner_jax.rules import Table, require_sound
+from planner_jax.task.arguments import array_of, batch_of, floating
+from planner_jax.task.intercept.rules import RULES
 
 
 @struct.dataclass
@@ -21,6 +24,8 @@ class InterceptCase:
     World frame in the plane, SI units. Times count from the moment at which the car sets out.
     The middle of the car's body meets the target.
     """
+
+    rules: ClassVar[Table] = RULES
 
     start: Array  # (3,) x [m], y [m] of the rear axle's middle and heading [rad] at time 0
     speed: Array  # () [m/s], at time 0
@@ -103,29 +108,17 @@ def case(
         dtype: of every floating leaf.
 
     Raises:
-        ValueError: a time, a limit or a size is not positive, a polygon is not convex, or the
-            target's path has not the batch's shape; one line.
+        CaseError: a number breaks a rule, such as a limit that is not positive; one line.
+        ValueError: a polygon is not convex, or an argument or the target's path has another shape.
+        TypeError: an argument holds no numbers, or `dtype` is not that of floating ones.
     """
-    batch = np.broadcast_shapes(*(np.shape(each) for each in (time, initial_speed, tolerance)))
-    batch = np.broadcast_shapes(batch, np.shape(start)[:-1])
+    dtype, shapes = floating(dtype), [batch_of("start", start, 3)]
+    shapes += [np.shape(each) for each in (time, initial_speed, tolerance)]
+    batch = max(shapes, key=len)
 
-    def leaf(value: Any, *trailing: int) -> Array:
-        return jnp.asarray(np.broadcast_to(np.asarray(value), batch + trailing), dtype)
+    def leaf(name: str, value: Any, *trailing: int) -> Array:
+        return array_of(name, value, batch, trailing, dtype)
 
-    positive = {
-        "time": time,
-        "length": length,
-        "width": width,
-        "wheelbase": wheelbase,
-        "speed": speed,
-        "acceleration": acceleration,
-        "lateral_acceleration": lateral_acceleration,
-        "curvature": curvature,
-        "steering_rate": steering_rate,
-    }
-    for name, value in positive.items():
-        if not np.all(np.asarray(value) > 0.0):
-            raise ValueError(f"{name} must be > 0, got {np.min(value)}")
     for path in jax.tree.leaves(target):
         if np.shape(path)[: len(batch)] != batch:
             raise ValueError(
@@ -133,33 +126,35 @@ def case(
                 f"{np.shape(path)}"
             )
     free = end_heading is None
-    return InterceptCase(
-        start=leaf(start, 3),
-        speed=leaf(initial_speed),
-        curvature=leaf(initial_curvature),
+    made = InterceptCase(
+        start=leaf("start", start, 3),
+        speed=leaf("initial_speed", initial_speed),
+        curvature=leaf("initial_curvature", initial_curvature),
         target=target,
-        time=leaf(time),
-        tolerance=leaf(tolerance),
-        end_heading=leaf(0.0 if free else end_heading),
-        heading_tolerance=leaf(np.pi if free else heading_tolerance),
+        time=leaf("time", time),
+        tolerance=leaf("tolerance", tolerance),
+        end_heading=leaf("end_heading", 0.0 if free else end_heading),
+        heading_tolerance=leaf("heading_tolerance", np.pi if free else heading_tolerance),
         walls=_for_batch(walls, 0.0, batch, dtype),
         movers=_for_batch(movers, mover_velocities, batch, dtype),
-        lower=leaf(lower, 2),
-        upper=leaf(upper, 2),
+        lower=leaf("lower", lower, 2),
+        upper=leaf("upper", upper, 2),
         body=CarBody(
-            length=leaf(length),
-            width=leaf(width),
-            wheelbase=leaf(wheelbase),
-            rear_overhang=leaf(rear_overhang),
+            length=leaf("length", length),
+            width=leaf("width", width),
+            wheelbase=leaf("wheelbase", wheelbase),
+            rear_overhang=leaf("rear_overhang", rear_overhang),
         ),
         limits=CarLimits(
-            speed=leaf(speed),
-            acceleration=leaf(acceleration),
-            lateral_acceleration=leaf(lateral_acceleration),
-            curvature=leaf(curvature),
-            steering_rate=leaf(steering_rate),
+            speed=leaf("speed", speed),
+            acceleration=leaf("acceleration", acceleration),
+            lateral_acceleration=leaf("lateral_acceleration", lateral_acceleration),
+            curvature=leaf("curvature", curvature),
+            steering_rate=leaf("steering_rate", steering_rate),
         ),
     )
+    require_sound(made)
+    return made
 
 
 def _for_batch(given: Any, velocities: Any, batch: tuple[int, ...], dtype: Any) -> Obstacles:

@@ -4,7 +4,7 @@ Paper 003 meets one target and names groups as future work; what is here is this
 """
 
 import dataclasses
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -14,8 +14,10 @@ from jax import Array
 
 from planner_jax.plane.target import LaterPath, PlanePath
 from planner_jax.protocol import Plan
+from planner_jax.rules import Table
 from planner_jax.task.intercept.case import InterceptCase, case
 from planner_jax.task.intercept.plan import InterceptPlan
+from planner_jax.task.intercept.rules import OF_GROUP
 
 
 @struct.dataclass
@@ -41,6 +43,8 @@ class InterceptGroup:
     What goes for an `InterceptCase` goes for every target: the body's middle meets it, within the
     same tolerance and with the same heading if one is given.
     """
+
+    rules: ClassVar[Table] = OF_GROUP
 
     # Car, obstacles and map. Its `target` has leaves with a leading axis N, and all are to be met
     # until its `time`.

@@ -14,6 +14,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
+from planner_jax.protocol import require_settings
 from planner_jax.task.intercept.group import GroupChoice, GroupPlan, InterceptGroup
 
 _GRID = 128  # times at which every target is looked at
@@ -104,23 +105,29 @@ class GroupDecision:
         return status
 
 
+MOST_PERMUTED = 8  # targets of a group
+
+
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class Best(GroupDecision):
     """The most promising of all orders are planned, and the earliest last meeting is kept.
 
-    All N! orders are estimated, and those of the earliest last meeting are the finalists.
+    All N! orders are estimated, of at most 8 targets, and those of the earliest last meeting are
+    the finalists.
     """
 
     finalists: int = 6  # orders that are planned
 
     def __post_init__(self) -> None:
-        if self.finalists < 1:
-            raise ValueError(f"finalists must be >= 1, got {self.finalists}")
+        require_settings(self)
 
     def propose(self, case: InterceptGroup) -> GroupChoice:
         """The finalists of one group, leaves (F, N)."""
         num = case.num_targets
+        if num > MOST_PERMUTED:
+            rule = f"at most {MOST_PERMUTED}, of which all orders are looked at"
+            raise ValueError(f"targets must be {rule}, got {num}")
         orders = jnp.asarray(list(itertools.permutations(range(num))), jnp.int32)
         table = _timetable(case)
         rank = jax.vmap(functools.partial(_rank, case, table))(orders)

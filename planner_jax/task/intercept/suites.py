@@ -44,6 +44,7 @@ from planner_jax.plane.obstacles import Obstacles
 from planner_jax.plane.target import PlanePath, TurningPath
 from planner_jax.protocol import lane
 from planner_jax.registry import require_name
+from planner_jax.task.arguments import require_draw
 from planner_jax.task.intercept.arrival import earliest_arrival
 from planner_jax.task.intercept.card import SUITES, Suite
 from planner_jax.task.intercept.case import InterceptCase, case
@@ -101,9 +102,7 @@ def generators(suite: str, num: int, seed: int, first: int) -> list[np.random.Ge
     Raises:
         ValueError: an argument is out of its range; one line.
     """
-    for name, value, least in (("num", num, 1), ("seed", seed, 0), ("first", first, 0)):
-        if value < least:
-            raise ValueError(f"{name} must be >= {least}, got {value}")
+    require_draw(num, seed, first)
     tag = zlib.crc32(suite.encode())
     return [np.random.default_rng([seed, first + k, tag]) for k in range(num)]
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from planner_jax.plain_files import open_plain
 from planner_jax.robot.arm import Arm, ArmLimits
 from planner_jax.task.block.library.cells import Face, Layout
 from planner_jax.task.block.library.table import (
@@ -79,7 +80,7 @@ def load_library(path: str | os.PathLike) -> Library:
     """
     shown = repr(os.fspath(path))
     try:
-        with open(path, "rb") as file:
+        with open_plain(path) as file:
             first = file.readline(_LONGEST)
             second = file.readline(_LONGEST)
             size = os.fstat(file.fileno()).st_size

@@ -1,0 +1,108 @@
+"""Batches in which some cases are absurd: are these all marked, and do the others keep their bits?
+
+    python -m benchmarks.poisoned_batches [--num 20000] [--task hit] [--every 100] [--seed 0]
+        [--out DIR]
+
+Every hundredth case breaks a rule of its class, another rule and another bad value from one to the
+next: NaN, infinity, a number below or above what is allowed. Both batches, sound and poisoned, stay
+in jax arrays; a case of the poisoned one is marked if its status is BAD_INPUT.
+"""
+
+import argparse
+from collections.abc import Collection
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import planner_jax as pj
+from planner_jax.benchmarks.run import Bench, argument_parser, begin
+from planner_jax.planning.decided import DecidedPlanner
+from planner_jax.registry import all_tasks
+from planner_jax.rules import all_ruled
+
+REPLACED = ("order", "times")  # by a decision, which does not read what they hold
+BAD = (np.nan, np.inf, -np.inf, -1.0, 0.0, 1e6)
+
+
+def poisons(case: Any) -> list[tuple[str, float]]:
+    """Names of a case's arrays, and values that break a rule of theirs."""
+    found = []
+    for ruled in all_ruled(jax.tree.map(np.asarray, case)):
+        for value in BAD:
+            if ruled.value.dtype.kind == "f" or np.isfinite(value):
+                bad = np.full_like(ruled.value, value)
+                if bad.size and not ruled.rule.holds(bad, ruled.part).all():
+                    found.append((ruled.name, value))
+    return list(dict.fromkeys(found))
+
+
+def poisoned(cases: Any, lanes: np.ndarray, spared: Collection[str] = ()) -> Any:
+    """The batch in NumPy arrays, in which each of some lanes breaks the next rule.
+
+    Args:
+        cases: a batch.
+        lanes: those that are poisoned.
+        spared: names of arrays that are left as they are.
+    """
+    paths, tree = jax.tree_util.tree_flatten_with_path(cases)
+    leaves = {
+        jax.tree_util.keystr(path, simple=True, separator="."): np.array(leaf)
+        for path, leaf in paths
+    }
+    bad = [(name, value) for name, value in poisons(pj.lane(cases, 0)) if name not in spared]
+    for k, lane in enumerate(lanes):
+        name, value = bad[k % len(bad)]
+        leaves[name][lane] = value
+    return jax.tree.unflatten(tree, list(leaves.values()))
+
+
+def compare(task: Any, num: int, every: int, seed: int) -> dict[str, int]:
+    """How many lanes are poisoned, marked, sound, and sound with the bits of the sound batch."""
+    cases, planner = task.draw(num, seed=seed), task.planner(**task.bench)
+    lanes = np.arange(every // 2, num, every)
+    others = np.setdiff1d(np.arange(num), lanes)
+    spared = REPLACED if isinstance(planner, DecidedPlanner) else ()
+    broken = jax.tree.map(jnp.asarray, poisoned(cases, lanes, spared))
+    sound, found = jax.device_get((pj.plan(planner, cases), pj.plan(planner, broken)))
+    same = np.ones(num, bool)
+    for ours, theirs in zip(jax.tree.leaves(sound), jax.tree.leaves(found), strict=True):
+        alike = (ours == theirs) | ((ours != ours) & (theirs != theirs))
+        same &= alike.reshape(num, -1).all(axis=1)
+    return {
+        "poisoned": lanes.size,
+        "marked": int((found.status[lanes] == pj.Status.BAD_INPUT).sum()),
+        "others": others.size,
+        "unchanged": int(same[others].sum()),
+        "marked_others": int((found.status[others] == pj.Status.BAD_INPUT).sum()),
+        "solved_others": int(pj.solved(found)[others].sum()),
+    }
+
+
+def measure(bench: Bench, options: argparse.Namespace) -> None:
+    """The row."""
+    task = pj.task_named(options.task)
+    found = compare(task, options.num, options.every, options.seed)
+    bench.row(task=options.task, num=options.num, **found)
+    bench.note(**found)
+    bench.count(np.arange(found["others"]) < found["solved_others"])
+    bench.say(
+        f"{options.task}, {options.num:,} cases, {jax.devices()[0].device_kind}: "
+        f"{found['marked']:,} of {found['poisoned']:,} poisoned cases are marked; "
+        f"{found['unchanged']:,} of {found['others']:,} others have the same bits, "
+        f"{found['marked_others']:,} of them are marked"
+    )
+
+
+def main() -> None:
+    """Print both counts."""
+    parser = argument_parser("poisoned_batches", __doc__, num=20_000, every=100, seed=0)
+    parser.add_argument("--task", default="hit", choices=all_tasks(), help="default: hit")
+    options = parser.parse_args()
+    with begin(parser, options) as bench:
+        measure(bench, options)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,22 @@
+"""What the numbers of a hit must be."""
+
+from planner_jax.rules import NOT_NEGATIVE, POSITIVE, Field, Table, below, within
+
+RULES: Table = (
+    Field("ball.pos", (3,)),
+    Field("ball.vel", (3,)),
+    Field("head_state", (4, 3)),
+    Field("target", (3,)),
+    Field("drag", (), NOT_NEGATIVE),
+    Field("gravity", (), POSITIVE),
+    Field("restitution", (), within(0.0, 1.0, "in [0, 1]")),
+    Field("racket_height", ()),
+    Field("limits.speed", (), POSITIVE),
+    Field("limits.acceleration", (), POSITIVE),
+    Field("limits.body_rate", (), POSITIVE),
+    Field("limits.min_height", (), NOT_NEGATIVE),
+    Field("hit_limits.hitting_speed", (3,), POSITIVE),
+    Field("hit_limits.min_apex", (), NOT_NEGATIVE),
+    Field("hit_limits.min_apex", (), below("hit_limits.max_apex")),
+    Field("hit_limits.max_apex", ()),
+)

@@ -1,0 +1,84 @@
+"""Absurd cases in a batch: each is marked, and no other case loses a bit."""
+
+import jax
+import numpy as np
+import pytest
+
+import planner_jax as pj
+from planner_jax.benchmarks.poisoned_batches import compare, poisoned, poisons
+from planner_jax.rules import is_sound, named
+from planner_jax.task.catch.beam import MOST_SEARCHED
+
+TASKS = ("hit", "catch", "intercept", "block")
+# Of a kind that stays on the host, another batch would be drawn for every test.
+CASES = {name: jax.tree.map(np.asarray, pj.task_named(name).draw(3)) for name in TASKS}
+SOUND = jax.jit(is_sound)
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_a_table_names_arrays_of_its_case_and_every_rule_can_be_broken(name):
+    case = pj.lane(CASES[name], 0)
+    fields = [field.name for field in type(case).rules]
+    for field in fields:
+        named(case, field)
+    assert {place for place, _ in poisons(case)} >= {
+        field.name for field in type(case).rules if field.kind is np.floating
+    }
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_every_broken_rule_marks_its_lane_alone_in_both_forms(name):
+    cases = CASES[name]
+    bad = poisons(pj.lane(cases, 0))
+    whole = jax.tree.map(lambda leaf: np.repeat(leaf[:1], 2 * len(bad), axis=0), cases)
+    lanes = np.arange(0, 2 * len(bad), 2)
+    broken = poisoned(whole, lanes)
+    expected = np.arange(2 * len(bad)) % 2 == 1
+    np.testing.assert_array_equal(is_sound(broken), expected)
+    np.testing.assert_array_equal(SOUND(broken), expected)
+    assert is_sound(whole).all()
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_the_host_names_field_rule_value_and_lane(name):
+    cases = CASES[name]
+    for place, value in poisons(pj.lane(cases, 0))[::5]:
+        broken = jax.tree.map(np.array, cases)
+        leaf = named(broken, place.replace("extras.", "extras."))
+        leaf[1] = value
+        with pytest.raises(pj.CaseError) as caught:
+            pj.require_sound(broken)
+        line = str(caught.value)
+        assert "\n" not in line and line.endswith("in lane 1") and " must be " in line
+        assert line.startswith(place) or "<" in line
+
+
+def test_orders_of_forty_targets_differ_and_of_too_many_are_refused():
+    def crowd(num):
+        places = np.random.default_rng(0).uniform(-2.0, 2.0, (num, 3)).astype(np.float32) + 3.0
+        still = np.zeros((num, 3), np.float32)
+        path = pj.BallPath(pj.BallState(places, still), still, still[:, 0])
+        return pj.catch.case(path, np.full(num, 200.0))
+
+    choice = jax.jit(pj.catch.Best(width=8).propose)(crowd(40))
+    orders = np.asarray(choice.order).tolist()
+    assert all(sorted(order) == list(range(40)) for order in orders)
+    assert len(set(map(tuple, orders))) > 1 and np.asarray(choice.taken).all()
+    with pytest.raises(ValueError, match=f"^targets must be at most {MOST_SEARCHED} of a case"):
+        pj.catch.Best().propose(crowd(MOST_SEARCHED + 1))
+
+
+def test_groups_of_too_many_targets_are_refused():
+    still = np.ones((9, 2), np.float32)
+    group = pj.intercept.group(pj.TurningPath(still, 0.0 * still, still[:, 0]))
+    with pytest.raises(ValueError, match="^targets must be at most 8, of which all orders"):
+        pj.intercept.planner("group").decision.propose(group)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "num"), [("hit", 20_000), ("catch", 2_000)])
+def test_poisoned_lanes_are_marked_and_all_others_keep_their_bits(name, num):
+    found = compare(pj.task_named(name), num, 100, 1)
+    assert found["marked"] == found["poisoned"] == num // 100
+    assert found["marked_others"] == 0
+    assert found["unchanged"] == found["others"]
