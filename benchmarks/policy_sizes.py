@@ -28,7 +28,7 @@ from planner_jax.policies.training import train_as_asked
 from planner_jax.sweep.settings import SettingError
 
 SUITES = {"4": "square4", "5": "pentagon5", "7": "heptagon7"}
-REWARD: dict[str, Any] = {"solved": 5.0, "last": 10.0, "ratio": 14.0, "caught": 10.0}
+REWARD: dict[str, Any] = {"solved": (5.0,), "last": (10.0,), "ratio": (14.0,)}
 
 
 def trained(suite: str, options: argparse.Namespace) -> tuple[Policy, float]:
