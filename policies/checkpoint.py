@@ -21,7 +21,7 @@ from planner_jax.policies.observation import FEATURES
 from planner_jax.sweep.settings import SettingError
 
 FORMAT = 2
-SHIPPED = ("catch", "rush6", "swarm12")  # one for eight suites, and two for one suite alone
+SHIPPED = ("catch", "rush6")  # one for eight suites, and one for `rush6` alone
 _OF_FLAX = ("parent", "name")  # fields of every module
 
 

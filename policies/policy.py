@@ -62,8 +62,7 @@ def policy(file: str | os.PathLike = "catch", **options: Any) -> Policy:
 
     Args:
         file: that `planner-jax train` wrote, or the name of one that is shipped: "catch", which
-            was trained on suites of one to twelve targets, or "rush6" or "swarm12", on that suite
-            alone.
+            was trained on suites of one to twelve targets, or "rush6", on that suite alone.
         **options: `proposals`, `spread` and `stretch` of `Policy`.
 
     Raises:
