@@ -12,10 +12,8 @@ from planner_jax.memory import require_memory
 _DRAWN_BYTES = 1_000  # of a case, as estimated
 
 
-def array_of(
-    name: str, value: Any, batch: tuple[int, ...], shape: tuple[int, ...], dtype: Any
-) -> Array:
-    """A number or vector that all cases of a batch share, or one for each, as an array.
+def numbers_of(name: str, value: Any, batch: tuple[int, ...], shape: tuple[int, ...]) -> np.ndarray:
+    """A number or vector that all cases of a batch share, or one for each, batch + shape.
 
     Args:
         name: of the argument, for the message.
@@ -23,10 +21,6 @@ def array_of(
             stretched by accident.
         batch: () or (B,).
         shape: of one case.
-        dtype: of the array.
-
-    Returns:
-        A jax array batch + shape.
 
     Raises:
         ValueError: another shape.
@@ -39,8 +33,15 @@ def array_of(
     if given.shape not in (shape, whole):
         rule = f"{shape}" if whole == shape else f"{shape} or {whole}"
         raise ValueError(f"{name} must have the shape {rule}, got {given.shape}")
+    return np.broadcast_to(given, whole)
+
+
+def array_of(
+    name: str, value: Any, batch: tuple[int, ...], shape: tuple[int, ...], dtype: Any
+) -> Array:
+    """`numbers_of`, as a jax array of a type."""
     with np.errstate(over="ignore"):  # what is too large is infinite, and refused as that
-        return jnp.asarray(np.broadcast_to(given, whole), dtype)
+        return jnp.asarray(numbers_of(name, value, batch, shape), dtype)
 
 
 def batch_of(name: str, vectors: Any, *shape: int) -> tuple[int, ...]:

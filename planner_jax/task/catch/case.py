@@ -13,7 +13,7 @@ from jax import Array
 from planner_jax.ball.target import TargetPath
 from planner_jax.cost.extras import Extra, for_batch
 from planner_jax.rules import Table, require_sound
-from planner_jax.task.arguments import array_of, floating
+from planner_jax.task.arguments import array_of, floating, numbers_of
 from planner_jax.task.catch.rules import RULES
 
 GRAVITY = 9.81  # [m/s^2]
@@ -164,7 +164,7 @@ def case(
             )
     of_gravity, gravity = leaf("gravity", gravity), np.asarray(gravity)
     head = np.zeros(batch + (4, 3))
-    head[..., 0, :] = array_of("start", start, batch, (3,), float)
+    head[..., 0, :] = numbers_of("start", start, batch, (3,))
     shares = np.arange(1, num + 1) / (num + 1.0)
     made = CatchCase(
         targets=targets,

@@ -12,7 +12,7 @@ from planner_jax.ball.flight import BallState
 from planner_jax.cost.extras import Extra, for_batch
 from planner_jax.robot.quadrotor import QuadrotorLimits
 from planner_jax.rules import Table, require_sound
-from planner_jax.task.arguments import array_of, batch_of, floating
+from planner_jax.task.arguments import array_of, batch_of, floating, numbers_of
 from planner_jax.task.hit.card import START
 from planner_jax.task.hit.rules import RULES
 
@@ -113,7 +113,7 @@ def case(
         return array_of(name, value, batch, shape, dtype)
 
     head = np.zeros(batch + (4, 3))
-    head[..., 0, :] = array_of("start", start, batch, (3,), float)
+    head[..., 0, :] = numbers_of("start", start, batch, (3,))
     made = HitCase(
         ball=BallState(pos=leaf("serve_pos", serve_pos, 3), vel=leaf("serve_vel", serve_vel, 3)),
         head_state=jnp.asarray(head, dtype),
