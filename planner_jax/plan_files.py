@@ -9,6 +9,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from planner_jax.whole_files import replacing
+
 VERSION = 1
 _HEADER = "header"
 Kind = TypeVar("Kind")
@@ -33,10 +35,8 @@ def save_arrays(path: str | os.PathLike, tree: Any) -> None:
     for name, array in arrays.items():
         if array.dtype.hasobject:  # which NumPy would pickle
             raise TypeError(f"{name} must be an array of numbers, got {array.dtype}")
-    scratch = f"{os.fspath(path)}.tmp"
-    with open(scratch, "wb") as file:
+    with replacing(path) as scratch, open(scratch, "wb") as file:
         np.savez(file, **{_HEADER: np.array(header), **arrays})
-    os.replace(scratch, path)
 
 
 def load_arrays(path: str | os.PathLike, kind: type[Kind]) -> Kind:

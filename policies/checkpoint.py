@@ -18,6 +18,7 @@ from flax import traverse_util
 from planner_jax.policies.networks import NETWORKS
 from planner_jax.policies.observation import FEATURES
 from planner_jax.sweep.settings import SettingError
+from planner_jax.whole_files import replacing
 
 FORMAT = 1
 SHIPPED = ("catch", "rush6")  # one for eight suites, and one for `rush6` alone
@@ -52,10 +53,8 @@ def save_checkpoint(
     head = {"format": FORMAT, "features": FEATURES, "network": name, "sizes": sizes, **about}
     flat = traverse_util.flatten_dict(params, sep="/")
     arrays: Any = {key: np.asarray(leaf, np.float32) for key, leaf in flat.items()}
-    scratch = f"{os.fspath(path)}.{os.getpid()}"
-    with open(scratch, "wb") as file:
+    with replacing(path) as scratch, open(scratch, "wb") as file:
         np.savez(file, about=np.array(json.dumps(head)), **arrays)
-    os.replace(scratch, path)
 
 
 def name_and_sizes(network: Any) -> tuple[str, dict[str, int]]:

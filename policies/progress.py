@@ -4,7 +4,9 @@ Every row of `progress.jsonl` has `part` and `decisions`, of all parts until the
 have the means of the decisions since the last one: `reward`, `solved`, of solved cases `last` and
 `ratio`, of others `violation`, as `environment.judged` has them, beside `per_second` decisions and
 what PPO did: `divergence` of an update, `learning_rate`, and `spread`, the standard deviation of
-actions. Rows with `suites` say what the policy's decisions were worth then, planned in full.
+actions. Rows with `suites` say what the policy's decisions were worth then, planned in full. The
+last entry of a row is the `digest` of the others. `training.json` says what is trained, in which
+format, and by which code.
 """
 
 import contextlib
@@ -19,10 +21,22 @@ from brax.training.agents.ppo import losses
 from tensorboardX import SummaryWriter
 from tqdm import tqdm
 
+from planner_jax import stopping
+from planner_jax.sweep.manifest import is_count, is_number, require_format
+from planner_jax.sweep.plain_json import (
+    DIGEST,
+    JsonError,
+    parse_object,
+    read_object,
+    require_sealed,
+    sealed,
+)
 from planner_jax.sweep.run_folder import RunFolder
 from planner_jax.sweep.settings import SettingError
 
-FILE = "progress.jsonl"
+FILE, ASKED = "progress.jsonl", "training.json"
+# What every row of the curve has.
+_CURVE = {"per_second", "reward", "solved", "last", "ratio", "violation"}
 _EVENTS = "tensorboard"
 
 
@@ -111,6 +125,7 @@ class Progress:
         ):
 
             def tell(done: int, metrics: Mapping[str, Any]) -> None:
+                stopping.check()
                 row = _row_of(metrics)
                 self.add(number, begun + done, row)
                 for name, value in row.items():
@@ -130,20 +145,72 @@ class Progress:
     def add(self, number: int, decisions: int, row: Mapping[str, Any]) -> None:
         """Add a row to the file."""
         self.rows.append({"part": number, "decisions": decisions, **row})
-        text = "".join(json.dumps(row) + "\n" for row in self.rows)
+        text = "".join(json.dumps(sealed(row)) + "\n" for row in self.rows)
         RunFolder(self._folder).write_text(FILE, text)
 
 
 def read_rows(folder: Path) -> list[dict[str, Any]]:
-    """The rows of a run, in the order of their decisions.
+    """The rows of a run, in the order of their decisions; without their digests.
 
     Raises:
-        SettingError: the folder is not that of a training.
+        SettingError: the folder is not that of a training, or a row is not as it was written.
     """
+    shown = repr(str(folder))
     try:
-        lines = (folder / FILE).read_text(encoding="utf-8").splitlines()
-        return [json.loads(line) for line in lines]
-    except (OSError, ValueError) as error:
-        raise SettingError(
-            f"run must be the folder of a training, with its {FILE}, got {str(folder)!r}"
-        ) from error
+        lines = (folder / FILE).read_bytes().splitlines()
+    except OSError as error:
+        rule = f"the folder of a training, with its {FILE}"
+        raise SettingError(f"run must be {rule}, got {shown} ({error.strerror})") from None
+    rows = []
+    for number, line in enumerate(lines, 1):
+        try:
+            row = parse_object(line)
+            require_sealed(row)
+            if not _is_sound(row):
+                raise JsonError("is no row of a training")
+        except JsonError as error:
+            rule = f"a training whose {FILE} is whole"
+            why = f"{shown}, where line {number} {error}"
+            raise SettingError(f"run must be {rule}, got {why}") from None
+        del row[DIGEST]
+        rows.append(row)
+    return rows
+
+
+def _is_sound(row: dict[str, Any]) -> bool:
+    """Whether a row has what every row has, and numbers where numbers belong."""
+    named = row.get("suites", {})
+    figures = [*(named.values() if isinstance(named, dict) else [None]), row]
+    return (
+        all(is_count(row.get(name)) for name in ("part", "decisions"))
+        and ("suites" in row or _CURVE <= row.keys())
+        and all(isinstance(each, dict) for each in figures)
+        and all(
+            value is None or is_number(value)
+            for each in figures
+            for name, value in each.items()
+            if name not in ("suites", DIGEST)
+        )
+    )
+
+
+def read_asked(folder: Path) -> dict[str, Any]:
+    """What a training was asked for, of `training.json`.
+
+    Raises:
+        SettingError: the folder is not that of a training, or it is not as it was written.
+    """
+    path, shown = folder / ASKED, repr(str(folder))
+    try:
+        found = read_object(path)
+    except (OSError, JsonError) as error:
+        why = f" ({ASKED} {error})" if isinstance(error, JsonError) else ""
+        rule = f"the folder of a training, with its {ASKED}"
+        raise SettingError(f"run must be {rule}, got {shown}{why}") from None
+    require_format(found, "run", "a training", shown)
+    try:
+        require_sealed(found)
+    except JsonError as error:
+        rule = f"a training whose {ASKED} is whole"
+        raise SettingError(f"run must be {rule}, got {shown}, where it {error}") from None
+    return found

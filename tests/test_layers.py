@@ -28,7 +28,9 @@ ALLOWED = {
     },
     "arithmetic": set(),
     "lanes": set(),
-    "plan_files": set(),
+    "whole_files": set(),
+    "stopping": set(),
+    "plan_files": {"whole_files"},
     "protocol": {"plan_files"},
     "registry": set(),
     "ball": {"arithmetic", "lanes"},
@@ -43,15 +45,16 @@ ALLOWED = {
     "referee": set(),
     "task": {
         *("ball", "cost", "lanes", "optimise", "planning", "protocol", "referee", "registry"),
-        *("perception", "plane", "robot", "space", "trajectory"),
+        *("perception", "plane", "robot", "space", "trajectory", "whole_files"),
     },
     "sweep": {
         *("ball", "lanes", "perception", "plane"),
-        *("planning", "protocol", "registry", "robot", "task"),
+        *("planning", "protocol", "registry", "robot", "stopping", "task", "whole_files"),
     },
     "compile_cache": set(),
     "doctor": {"compile_cache", "lanes", "planning", "protocol", "registry", "sweep"},
-    "cli": {"compile_cache", "doctor", "registry", "sweep"},
+    "cli": {"compile_cache", "doctor", "registry", "stopping", "sweep"},
+    "__main__": {"cli", "stopping"},
 }
 LIBRARY = ROOT / "planner_jax"
 # Stubs too: they say what a package attaches lazily.

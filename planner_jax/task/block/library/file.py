@@ -25,6 +25,7 @@ from planner_jax.task.block.library.table import (
     pieces_of,
 )
 from planner_jax.task.block.scene import Box, Scene
+from planner_jax.whole_files import replacing
 
 VERSION = 1
 BUILD_VERSION = 1  # of how libraries are planned: parts of another one are not gone on with
@@ -62,13 +63,11 @@ def save_library(path: str | os.PathLike, library: Library) -> None:
         return f"{_MAGIC} {VERSION}\n{json.dumps(header)}\n".encode()
 
     begin = _up(len(text(1 << 40)))
-    scratch = f"{os.fspath(path)}.tmp"
-    with open(scratch, "wb") as file:
+    with replacing(path) as scratch, open(scratch, "wb") as file:
         lines = text(begin)
         file.write(lines[:-1] + b" " * (begin - len(lines)) + b"\n")
         for array in arrays.values():
             file.write(array.tobytes() + bytes(_up(array.nbytes) - array.nbytes))
-    os.replace(scratch, path)
 
 
 def load_library(path: str | os.PathLike) -> Library:
