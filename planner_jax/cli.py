@@ -53,10 +53,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _INTERRUPTED
     except (SettingError, UnknownName, MissingExtra) as error:
         return _fail(str(error))
+    except _NotWritten as error:
+        _fail(str(error))
+        return _FAILED
     except OSError as error:
         place = f"{error.filename}: " if error.filename else ""
         _fail(f"{place}{error.strerror or error}")
         return _FAILED
+
+
+class _NotWritten(Exception):
+    """The file system failed while a run was written; one line."""
 
 
 _ARGUMENTS: set[str] = set()  # names of all arguments, as they are written in Python
@@ -316,8 +323,9 @@ def _told_how_to_go_on(rest: Callable[[], str]) -> Iterator[None]:
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"interrupted; {rest()}") from None
     except OSError as error:
-        words = f"{error.strerror or error}; {rest()}"
-        raise OSError(error.errno, words, error.filename) from None
+        rule = "out must be a folder that can be written"
+        shown = f"{error.filename!r} ({error.strerror or error})"
+        raise _NotWritten(f"{rule}, got {shown}; {rest()}") from None
 
 
 def _print_sweep(manifest: dict[str, Any], out: Path) -> None:

@@ -27,6 +27,8 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
         os.replace(scratch, place)
         to_disk(place.parent)
     except OSError as error:
+        if error.filename not in (None, scratch, os.fspath(scratch)):
+            raise  # of another file that the block reads or writes
         raise OSError(error.errno, error.strerror or str(error), os.fspath(place)) from error
     finally:
         with contextlib.suppress(OSError):

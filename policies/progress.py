@@ -5,14 +5,15 @@ have the means of the decisions since the last one: `reward`, `solved`, of solve
 `ratio`, of others `violation`, as `environment.judged` has them, beside `per_second` decisions and
 what PPO did: `divergence` of an update, `learning_rate`, and `spread`, the standard deviation of
 actions. Rows with `suites` say what the policy's decisions were worth then, planned in full. The
-last entry of a row is the `digest` of the others. `training.json` says what is trained, in which
-format, and by which code.
+first line has the format, how many rows follow, and their digest. `training.json` says what is
+trained, in which format, and by which code.
 """
 
 import contextlib
+import hashlib
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +23,12 @@ from tensorboardX import SummaryWriter
 from tqdm import tqdm
 
 from planner_jax import stopping
-from planner_jax.sweep.manifest import is_count, is_number, require_format
+from planner_jax.sweep.manifest import is_count, is_number, require_format, to_write
 from planner_jax.sweep.plain_json import (
-    DIGEST,
     JsonError,
     parse_object,
     read_object,
     require_sealed,
-    sealed,
 )
 from planner_jax.sweep.run_folder import RunFolder
 from planner_jax.sweep.settings import SettingError
@@ -145,35 +144,41 @@ class Progress:
     def add(self, number: int, decisions: int, row: Mapping[str, Any]) -> None:
         """Add a row to the file."""
         self.rows.append({"part": number, "decisions": decisions, **row})
-        text = "".join(json.dumps(sealed(row)) + "\n" for row in self.rows)
-        RunFolder(self._folder).write_text(FILE, text)
+        RunFolder(self._folder).write_text(FILE, to_text(self.rows))
+
+
+def to_text(rows: Sequence[Mapping[str, Any]]) -> str:
+    """The contents of `progress.jsonl`."""
+    text = "".join(json.dumps(row) + "\n" for row in rows)
+    head = {"rows": len(rows), "sha256": hashlib.sha256(text.encode()).hexdigest()}
+    return json.dumps(to_write(head)) + "\n" + text
 
 
 def read_rows(folder: Path) -> list[dict[str, Any]]:
-    """The rows of a run, in the order of their decisions; without their digests.
+    """The rows of a run, in the order of their decisions.
 
     Raises:
         SettingError: the folder is not that of a training, or a row is not as it was written.
     """
     shown = repr(str(folder))
     try:
-        lines = (folder / FILE).read_bytes().splitlines()
+        text = (folder / FILE).read_bytes()
     except OSError as error:
         rule = f"the folder of a training, with its {FILE}"
         raise SettingError(f"run must be {rule}, got {shown} ({error.strerror})") from None
-    rows = []
-    for number, line in enumerate(lines, 1):
-        try:
-            row = parse_object(line)
-            require_sealed(row)
-            if not _is_sound(row):
-                raise JsonError("is no row of a training")
-        except JsonError as error:
-            rule = f"a training whose {FILE} is whole"
-            why = f"{shown}, where line {number} {error}"
-            raise SettingError(f"run must be {rule}, got {why}") from None
-        del row[DIGEST]
-        rows.append(row)
+    first, _, rest = text.partition(b"\n")
+    try:
+        head = parse_object(first)
+        require_format(head, "run", "a training", shown)
+        require_sealed(head)
+        if head.get("sha256") != hashlib.sha256(rest).hexdigest():
+            raise JsonError("has other rows than were written")
+        rows = [parse_object(line) for line in rest.splitlines()]
+        if len(rows) != head.get("rows") or not all(map(_is_sound, rows)):
+            raise JsonError("has rows that are none of a training")
+    except JsonError as error:
+        rule = f"a training whose {FILE} is whole"
+        raise SettingError(f"run must be {rule}, got {shown}, where it {error}") from None
     return rows
 
 
@@ -189,7 +194,7 @@ def _is_sound(row: dict[str, Any]) -> bool:
             value is None or is_number(value)
             for each in figures
             for name, value in each.items()
-            if name not in ("suites", DIGEST)
+            if name != "suites"
         )
     )
 

@@ -1,0 +1,14 @@
+"""One set of small runs for all modules of the folder."""
+
+import pytest
+
+from tests.faults.runs import make_runs, quick_sweeps
+
+
+@pytest.fixture(scope="package")
+def runs(tmp_path_factory):
+    """The runs of `make_runs`, and sweeps that are quick for as long as they are used."""
+    place = tmp_path_factory.mktemp("faults")
+    with quick_sweeps():
+        make_runs(place)
+        yield place
