@@ -3,8 +3,10 @@
 import dataclasses
 import json
 import os
+import struct
 import typing
 import zipfile
+import zlib
 from typing import Any, TypeVar
 
 import numpy as np
@@ -12,6 +14,11 @@ import numpy as np
 from planner_jax.whole_files import replacing
 
 VERSION = 1
+# What NumPy and the archive that it reads may raise of a damaged file.
+UNREADABLE = (
+    *(OSError, ValueError, KeyError, TypeError, EOFError, RuntimeError, MemoryError),
+    *(zipfile.BadZipFile, zlib.error, struct.error),
+)
 _HEADER = "header"
 Kind = TypeVar("Kind")
 
@@ -51,7 +58,7 @@ def load_arrays(path: str | os.PathLike, kind: type[Kind]) -> Kind:
             arrays = dict(file)
         header = json.loads(str(arrays.pop(_HEADER)))
         version, name = header["version"], header["class"]
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+    except UNREADABLE as error:
         if isinstance(error, FileNotFoundError):
             raise PlanFileError(f"path must be a file of plans, got {str(path)!r}") from None
         raise PlanFileError(

@@ -8,13 +8,13 @@ what it was trained on.
 import dataclasses
 import json
 import os
-import zipfile
 from importlib import resources
 from typing import Any
 
 import numpy as np
 from flax import traverse_util
 
+from planner_jax.plan_files import UNREADABLE
 from planner_jax.policies.networks import NETWORKS
 from planner_jax.policies.observation import FEATURES
 from planner_jax.sweep.settings import SettingError
@@ -76,7 +76,7 @@ def load_checkpoint(path: str | os.PathLike) -> Checkpoint:
             arrays = {key: archive[key] for key in archive.files}
         about = json.loads(str(arrays.pop("about")))
         found, network = about["format"], about["network"]
-    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+    except UNREADABLE as error:
         raise CheckpointError(
             f"checkpoint must be one that `planner-jax train` wrote, got {name!r} "
             f"({type(error).__name__})"
