@@ -33,6 +33,7 @@ class _State:
     def __init__(self) -> None:
         self.told: int | None = None  # number of the first signal
         self.patient = False
+        self.bar = False
         self.rest: Callable[[], str] = lambda: NOTHING
         self.leaving = threading.Lock()
 
@@ -56,21 +57,22 @@ def listen() -> None:
 
 
 @contextlib.contextmanager
-def under_way(rest: Callable[[], str], *, patient: bool = True) -> Iterator[None]:
+def under_way(rest: Callable[[], str], *, patient: bool = True, bar: bool = True) -> Iterator[None]:
     """Say within the block what a stop leaves; it may be left to the block for a while.
 
     Args:
         rest: called when the process is stopped; says what is left and how to go on with it, or
             `NOTHING`, where nothing has to be waited for.
         patient: whether the block calls `check`.
+        bar: whether it shows a bar, whose line is ended first.
     """
-    before = _STATE.patient, _STATE.rest
-    _STATE.patient, _STATE.rest = patient, rest
+    before = _STATE.patient, _STATE.bar, _STATE.rest
+    _STATE.patient, _STATE.bar, _STATE.rest = patient, bar, rest
     try:
         yield
     finally:
         if not is_told():
-            _STATE.patient, _STATE.rest = before
+            _STATE.patient, _STATE.bar, _STATE.rest = before
 
 
 def check() -> None:
@@ -90,7 +92,7 @@ def leave() -> NoReturn:
     if not _STATE.leaving.acquire(blocking=False):
         threading.Event().wait()  # another thread ends the process
     try:
-        end = "\n" if _STATE.patient else ""  # of a progress bar's line
+        end = "\n" if _STATE.bar else ""
         line = f"planner-jax: {_WORDS[signal.Signals(told)]}; {_STATE.rest()}\n"
         os.write(2, (end + line).encode(errors="replace"))
     finally:

@@ -95,7 +95,8 @@ def start_flights(
         "loop": flight.parameters(),
         "video": video,
     }
-    with folder.created(manifest), stopping.under_way(lambda: _dropped(folder), patient=False):
+    rest: dict[str, Any] = {"rest": lambda: _dropped(folder), "patient": False, "bar": False}
+    with folder.created(manifest), stopping.under_way(**rest):
         try:
             return _fly_into(folder, manifest, flight, cases, min(record, settings.num))
         except KeyboardInterrupt:

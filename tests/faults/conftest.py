@@ -1,8 +1,13 @@
 """One set of small runs for all modules of the folder."""
 
+from pathlib import Path
+
 import pytest
+from hypothesis.configuration import set_hypothesis_home_dir
 
 from tests.faults.runs import make_runs, quick_sweeps
+
+set_hypothesis_home_dir(Path(__file__).resolve().parents[2] / ".cache" / "hypothesis")
 
 
 @pytest.fixture(scope="package")
