@@ -180,7 +180,8 @@ def _library(name: str, given: dict[str, Any]) -> None:
 
     parts = Path(f"{given['path']}.parts")
     rest = functools.partial(_rest, parts, f"go on with: {_same_command()}", "what.json")
-    with stopping.under_way(rest, patient=False), _told_how_to_go_on(rest):
+    rule = "FILE must be one that can be written"
+    with stopping.under_way(rest, patient=False), _told_how_to_go_on(rest, rule):
         getattr(library, name)(**given)
 
 
@@ -316,14 +317,15 @@ def _rest(out: Path, again: str, sign: str = "manifest.json") -> str:
 
 
 @contextlib.contextmanager
-def _told_how_to_go_on(rest: Callable[[], str]) -> Iterator[None]:
+def _told_how_to_go_on(
+    rest: Callable[[], str], rule: str = "out must be a folder that can be written"
+) -> Iterator[None]:
     """Add `rest()` to the message of an interruption, and of a file system that fails."""
     try:
         yield
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"interrupted; {rest()}") from None
     except OSError as error:
-        rule = "out must be a folder that can be written"
         shown = f"{error.filename!r} ({error.strerror or error})"
         raise _NotWritten(f"{rule}, got {shown}; {rest()}") from None
 
@@ -342,7 +344,9 @@ def _fly(task: Task, kind: type, given: dict[str, Any]) -> None:
 
     out = given.pop("out", None) or _run_folder(f"fly-{task.name}")
     kept = {name: given.pop(name) for name in ("video", "record") if name in given}
-    start_flights(kind(**given), out, **kept)
+    settings = kind(**given)
+    with _told_how_to_go_on(lambda: "nothing is kept of these flights, fly again"):
+        start_flights(settings, out, **kept)
     _print_flights(Path(out))
 
 

@@ -99,8 +99,9 @@ def start_flights(
     with folder.created(manifest), stopping.under_way(**rest):
         try:
             return _fly_into(folder, manifest, flight, cases, min(record, settings.num))
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt(f"interrupted; {_dropped(folder)}") from None
+        except (KeyboardInterrupt, OSError):
+            _dropped(folder)
+            raise
 
 
 def _dropped(folder: RunFolder) -> str:

@@ -56,22 +56,23 @@ def require_free(folder: Path, name: str) -> None:
 
 def _locked(folder: Path, name: str) -> int:
     """A handle of the lock's file, which is locked."""
-    path, handle = folder / LOCK, -1
+    path = folder / LOCK
     try:
         while True:
             handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-            if not _lock(handle, fcntl.LOCK_EX):
-                raise SettingError(_taken(folder, name, handle))
-            if _is_at(handle, path):
-                return handle
-            os.close(handle)  # of an owner who has removed it meanwhile
+            try:
+                if not _lock(handle, fcntl.LOCK_EX):
+                    raise SettingError(_taken(folder, name, handle))
+                if _is_at(handle, path):  # not of an owner who has removed it meanwhile
+                    return handle
+            except BaseException:
+                os.close(handle)
+                raise
+            os.close(handle)
     except OSError as error:
         rule = "a folder that can be written and locked"
         shown = f"{str(folder)!r} ({error.strerror})"
         raise SettingError(f"{name} must be {rule}, got {shown}") from None
-    except SettingError:
-        os.close(handle)
-        raise
 
 
 def _lock(handle: int, kind: int) -> bool:
