@@ -13,7 +13,7 @@ SHORT = public_names cli solve decide referee_hit serves
 COMPILE = $(VENV)/bin/uv pip compile pyproject.toml --universal --python-version 3.11 \
 	--all-extras --no-annotate --quiet --custom-compile-command "make constraints"
 
-.PHONY: help demo test test-slow test-short test-wheel test-range test-lowest lint format docs bench \
+.PHONY: help demo test test-slow test-faults test-short test-wheel test-range test-lowest lint format docs bench \
 	constraints clean
 
 help:  ## this list
@@ -27,6 +27,9 @@ test: $(VENV)/.installed-test  ## the default tests
 
 test-slow: $(VENV)/.installed-test  ## the tests marked slow
 	$(PYTEST) -m "slow and not gpu"
+
+test-faults: $(VENV)/.installed-test  ## every fault in numbers: kills, twins, damage, full disks, signals; hours on 2 cores
+	$(VENV)/bin/python -m tests.faults --out build/faults.md
 
 test-wheel: $(VENV)/.installed-test  ## a wheel in an environment of its own: 1.3 GB, then removed
 	PLANNER_JAX_WHEEL=whole $(VENV)/bin/python -m pytest -m slow -o tmp_path_retention_policy=failed \

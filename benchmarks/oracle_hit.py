@@ -23,10 +23,10 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pyarrow.parquet as pq
 
 from planner_jax.benchmarks.hit_oracle.search import STARTS, Finding, find_hits, starting_points
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
+from planner_jax.sweep.parquet import read_rows
 from planner_jax.sweep.summary import wilson_interval
 from planner_jax.task.hit.serves import generate_serves, read_serves, to_cases
 from planner_jax.task.hit.validate import ServeError
@@ -37,7 +37,7 @@ VERDICTS = ("feasible", "infeasible", "undecided")
 
 def failed_indices(plans: Path) -> np.ndarray:
     """Indices of the serves whose plan did not succeed, from a sweep's `plans.parquet`."""
-    table = pq.read_table(plans, columns=["index", "success"])
+    table = read_rows(plans, ["index", "success"])
     return table["index"].to_numpy()[~table["success"].to_numpy()]
 
 

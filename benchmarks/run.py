@@ -7,6 +7,7 @@ median and the 90 % quantile of `cost_gaps`.
 """
 
 import argparse
+import contextlib
 import datetime
 import json
 import os
@@ -81,7 +82,8 @@ class Bench:
 
     def __enter__(self) -> Self:
         self._manifest |= environment()
-        self._folder.create(self._manifest)
+        self._owning = contextlib.ExitStack()
+        self._owning.enter_context(self._folder.created(self._manifest))
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: Any) -> None:
@@ -93,6 +95,7 @@ class Bench:
         self._folder.write_text("table.md", "\n".join(self._lines) + "\n")
         self._manifest |= {"state": "failed" if kind else "complete", "times": times}
         self._folder.write_manifest({**self._manifest, "summary": plain(summary)})
+        self._owning.close()
 
     def say(self, *lines: str) -> None:
         """Print lines, and keep them for table.md."""

@@ -5,21 +5,21 @@ settings: nothing here knows a task.
 """
 
 import argparse
+import contextlib
 import dataclasses
 import datetime
 import functools
 import os
 import pkgutil
 import shlex
-import signal
 import sys
-import threading
 import typing
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
+from planner_jax import stopping
 from planner_jax.compile_cache import keep_compiled_programs
 from planner_jax.digits import written_number, written_whole
 from planner_jax.registry import MissingExtra, Task, UnknownName, all_tasks
@@ -37,6 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Returns:
         The exit code: 0, 1 where the file system fails, 2 for a bad argument, 130 after Ctrl-C.
+        Where the process hears signals by `stopping.listen`, they end it.
     """
     try:
         with warnings.catch_warnings():  # of another package, such as a task that does not work
@@ -50,16 +51,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
             options = vars(_parser().parse_args(words))
         return options.pop("command")(options) or 0
     except KeyboardInterrupt as stop:
+        if stopping.is_told():
+            stopping.leave()
         print(f"planner-jax: {str(stop) or 'interrupted'}", file=sys.stderr)
         return _INTERRUPTED
     except (SettingError, UnknownName, MissingExtra) as error:
         return _fail(str(error))
-    except OSError as error:
+    except _NotWritten as error:
         _fail(str(error))
         return _FAILED
     except MemoryError:
         _fail("the machine has not memory enough: ask for less at once")
         return _FAILED
+    except OSError as error:
+        place = f"{error.filename}: " if error.filename else ""
+        _fail(f"{place}{error.strerror or error}")
+        return _FAILED
+
+
+class _NotWritten(Exception):
+    """The file system failed while a run was written; one line."""
 
 
 _ARGUMENTS: set[str] = set()  # names of all arguments, as they are written in Python
@@ -187,11 +198,14 @@ def _add_library(commands: Any) -> None:
 
 
 def _library(name: str, given: dict[str, Any]) -> None:
-    _let_ctrl_c_stop()
     keep_compiled_programs()
     from planner_jax.sweep.block import library
 
-    getattr(library, name)(**given)
+    parts = Path(f"{given['path']}.parts")
+    rest = functools.partial(_rest, parts, f"go on with: {_same_command()}", "what.json")
+    rule = "FILE must be one that can be written"
+    with stopping.under_way(rest, patient=False), _told_how_to_go_on(rest, rule):
+        getattr(library, name)(**given)
 
 
 def _add_train(parser: _Parser) -> None:
@@ -206,7 +220,6 @@ def _train(given: dict[str, Any]) -> None:
     out = _out(given) or "runs/train"
     settings = pkgutil.resolve_name(_TRAIN)(**given)
     require_backend()
-    _let_ctrl_c_stop()
     keep_compiled_programs()
     try:
         from planner_jax.policies.training import train_as_asked
@@ -214,7 +227,9 @@ def _train(given: dict[str, Any]) -> None:
         raise MissingExtra(
             f"train needs {error.name}: pip install 'planner-jax[policies]'", name=error.name
         ) from None
-    train_as_asked(settings, out)
+    rest = functools.partial(_rest, Path(out), f"go on with: {_same_command()}", "training.json")
+    with stopping.under_way(rest), _told_how_to_go_on(rest):
+        train_as_asked(settings, out)
     print(f"{Path(out) / 'policy.npz'}")
 
 
@@ -310,19 +325,41 @@ def _sweep(task: Task, given: dict[str, Any]) -> None:
     settings = pkgutil.resolve_name(task.sweep)(**given).of(task)
     out = out or _run_folder(f"{task.name}-{task.split_planner(settings.planner)[0]}")
     settings.require_room(out)
-    _let_ctrl_c_stop()
     keep_compiled_programs()
     from planner_jax.sweep import run
 
-    try:
+    again = f"planner-jax sweep {task.name} --resume --out {shlex.quote(str(out))}"
+    rest = functools.partial(_rest, Path(out), f"finish with: {again}")
+    with stopping.under_way(rest), _told_how_to_go_on(rest):
         if resume:
             manifest = run.resume_sweep(task, out, **given)
         else:
             manifest = run.start_sweep(task, settings, out)
-    except run.SweepInterrupted:
-        again = f"planner-jax sweep {task.name} --resume --out {shlex.quote(str(out))}"
-        raise run.SweepInterrupted(f"interrupted; finish with: {again}") from None
-    _print_sweep(manifest, Path(out))
+        _print_sweep(manifest, Path(out))
+
+
+def _same_command() -> str:
+    """The command of this process, as a shell takes it."""
+    return shlex.join(["planner-jax", *sys.argv[1:]])
+
+
+def _rest(out: Path, again: str, sign: str = "manifest.json") -> str:
+    """How to go on with a run that was stopped, where there is one yet, as that file says."""
+    return again if (out / sign).exists() else stopping.NOTHING
+
+
+@contextlib.contextmanager
+def _told_how_to_go_on(
+    rest: Callable[[], str], rule: str = "out must be a folder that can be written"
+) -> Iterator[None]:
+    """Add `rest()` to the message of an interruption, and of a file system that fails."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"interrupted; {rest()}") from None
+    except OSError as error:
+        shown = f"{error.filename!r} ({error.strerror or error})"
+        raise _NotWritten(f"{rule}, got {shown}; {rest()}") from None
 
 
 def _print_sweep(manifest: dict[str, Any], out: Path) -> None:
@@ -339,7 +376,9 @@ def _fly(task: Task, kind: type, given: dict[str, Any]) -> None:
 
     out = _out(given) or _run_folder(f"fly-{task.name}")
     kept = {name: given.pop(name) for name in ("video", "record") if name in given}
-    start_flights(kind(**given), out, **kept)
+    settings = kind(**given)
+    with _told_how_to_go_on(lambda: "nothing is kept of these flights, fly again"):
+        start_flights(settings, out, **kept)
     _print_flights(Path(out))
 
 
@@ -359,15 +398,8 @@ def _view(options: dict[str, Any]) -> None:
 
     _, flight, recording = read_flights(RunFolder(options["run"], name="RUN"))
     viewer = Viewer(flight, recording, options["host"], options["port"])
-    _let_ctrl_c_stop()
     print(f"Playing {len(recording)} flights at {viewer.url}; Ctrl-C stops.", flush=True)
     viewer.run()
-
-
-def _let_ctrl_c_stop() -> None:
-    """A shell starts background jobs deaf to SIGINT; here it is heard there too."""
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def _throughput(given: dict[str, Any]) -> None:
@@ -384,23 +416,22 @@ def _report(options: dict[str, Any]) -> None:
 
     folder = RunFolder(options["run"], name="RUN")
     manifest = folder.read_manifest()
-    if str(manifest["kind"]).startswith("fly "):
-        from planner_jax.sims.run import write_flight_report
+    with folder.resumed():
+        if str(manifest["kind"]).startswith("fly "):
+            from planner_jax.sims.run import require_sound, write_flight_report
 
-        write_flight_report(folder)
-        _print_flights(folder.path)
-    else:
-        from planner_jax.sweep.report import write_report
+            require_sound(folder)
+            write_flight_report(folder)
+            _print_flights(folder.path)
+        else:
+            from planner_jax.sweep.report import require_sound, write_report
 
-        write_report(folder)
-        _print_sweep(manifest, folder.path)
+            require_sound(folder)
+            write_report(folder)
+            _print_sweep(folder.read_manifest(), folder.path)
 
 
 def _doctor(options: dict[str, Any]) -> int:
     from planner_jax.doctor import report
 
     return 0 if report() else _FAILED
-
-
-if __name__ == "__main__":
-    sys.exit(main())

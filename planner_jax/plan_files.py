@@ -3,15 +3,23 @@
 import dataclasses
 import json
 import os
+import struct
 import typing
 import zipfile
+import zlib
 from typing import Any, TypeVar
 
 import numpy as np
 
 from planner_jax.plain_files import open_plain
+from planner_jax.whole_files import replacing
 
 VERSION = 1
+# What NumPy and the archive that it reads may raise of a damaged file.
+UNREADABLE = (
+    *(OSError, ValueError, KeyError, TypeError, EOFError, RuntimeError, MemoryError),
+    *(zipfile.BadZipFile, zlib.error, struct.error),
+)
 _HEADER = "header"
 Kind = TypeVar("Kind")
 
@@ -35,10 +43,8 @@ def save_arrays(path: str | os.PathLike, tree: Any) -> None:
     for name, array in arrays.items():
         if array.dtype.hasobject:  # which NumPy would pickle
             raise TypeError(f"{name} must be an array of numbers, got {array.dtype}")
-    scratch = f"{os.fspath(path)}.tmp"
-    with open(scratch, "wb") as file:
+    with replacing(path) as scratch, open(scratch, "wb") as file:
         np.savez(file, **{_HEADER: np.array(header), **arrays})
-    os.replace(scratch, path)
 
 
 def load_arrays(path: str | os.PathLike, kind: type[Kind]) -> Kind:
@@ -53,7 +59,7 @@ def load_arrays(path: str | os.PathLike, kind: type[Kind]) -> Kind:
             arrays = dict(file)
         header = json.loads(str(arrays.pop(_HEADER)))
         version, name = header["version"], header["class"]
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+    except UNREADABLE as error:
         if isinstance(error, FileNotFoundError):
             raise PlanFileError(f"path must be a file of plans, got {str(path)!r}") from None
         raise PlanFileError(

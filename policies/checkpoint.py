@@ -8,7 +8,6 @@ what it was trained on.
 import dataclasses
 import json
 import os
-import zipfile
 from importlib import resources
 from typing import Any
 
@@ -16,9 +15,11 @@ import numpy as np
 from flax import traverse_util
 
 from planner_jax.plain_files import open_plain
+from planner_jax.plan_files import UNREADABLE
 from planner_jax.policies.networks import NETWORKS
 from planner_jax.policies.observation import FEATURES
 from planner_jax.sweep.settings import SettingError
+from planner_jax.whole_files import replacing
 
 FORMAT = 2
 SHIPPED = ("catch", "rush6")  # one for eight suites, and one for `rush6` alone
@@ -53,10 +54,8 @@ def save_checkpoint(
     head = {"format": FORMAT, "features": FEATURES, "network": name, "sizes": sizes, **about}
     flat = traverse_util.flatten_dict(params, sep="/")
     arrays: Any = {key: np.asarray(leaf, np.float32) for key, leaf in flat.items()}
-    scratch = f"{os.fspath(path)}.{os.getpid()}"
-    with open(scratch, "wb") as file:
+    with replacing(path) as scratch, open(scratch, "wb") as file:
         np.savez(file, about=np.array(json.dumps(head)), **arrays)
-    os.replace(scratch, path)
 
 
 def name_and_sizes(network: Any) -> tuple[str, dict[str, int]]:
@@ -78,7 +77,7 @@ def load_checkpoint(path: str | os.PathLike) -> Checkpoint:
             arrays = {key: archive[key] for key in archive.files}
         about = json.loads(str(arrays.pop("about")))
         found, network = about["format"], about["network"]
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+    except UNREADABLE as error:
         raise CheckpointError(
             f"checkpoint must be one that `planner-jax train` wrote, got {name!r} "
             f"({type(error).__name__})"

@@ -7,7 +7,6 @@ standard deviation to each side, as far as all of them have come.
 """
 
 import argparse
-import json
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -17,7 +16,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from planner_jax.policies.progress import read_rows
+from planner_jax.policies.progress import read_asked, read_rows
 from planner_jax.sweep.figures import style
 from planner_jax.sweep.settings import SettingError
 
@@ -28,6 +27,7 @@ _TERMS = {
     "ratio": ("Optimal time ratio", "mean of solved cases", 1.0),
     "violation": ("Violation", "mean of other cases", 1.0),
 }
+_OF_RUN = ("digest", "code", "version")  # of what is asked, what runs may differ in, too
 _COLOURS = (style.BLUE, style.ORANGE, style.GREEN, style.PURPLE, style.SKY, style.GREY)
 Rows = list[dict[str, Any]]
 
@@ -44,10 +44,7 @@ def draw_curves(folders: Sequence[str | os.PathLike], path: str | os.PathLike) -
     """
     _require_alike([Path(folder) for folder in folders])
     runs = [read_rows(Path(folder)) for folder in folders]
-    place = Path(path)
-    scratch = place.with_name(f".{place.stem}.tmp.png")
-    style.draw(scratch, curves_figure, (13.0, 6.0), runs)
-    os.replace(scratch, place)
+    style.draw(Path(path), curves_figure, (13.0, 6.0), runs)
 
 
 def curves_figure(figure: Figure, runs: Sequence[Rows]) -> None:
@@ -113,12 +110,8 @@ def _line(
 def _require_alike(folders: Sequence[Path]) -> None:
     first: dict[str, Any] = {}
     for folder in folders:
-        try:
-            asked = json.loads((folder / "training.json").read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise SettingError(
-                f"run must be the folder of a training, with its training.json, got {str(folder)!r}"
-            ) from error
+        found = read_asked(folder)
+        asked = {name: value for name, value in found.items() if name not in _OF_RUN}
         first = first or asked
         for name in (name for name in first if name != "seed" and asked.get(name) != first[name]):
             raise SettingError(

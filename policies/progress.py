@@ -4,13 +4,16 @@ Every row of `progress.jsonl` has `part` and `decisions`, of all parts until the
 have the means of the decisions since the last one: `reward`, `solved`, of solved cases `last` and
 `ratio`, of others `violation`, as `environment.judged` has them, beside `per_second` decisions and
 what PPO did: `divergence` of an update, `learning_rate`, and `spread`, the standard deviation of
-actions. Rows with `suites` say what the policy's decisions were worth then, planned in full.
+actions. Rows with `suites` say what the policy's decisions were worth then, planned in full. The
+first line has the format, how many rows follow, and their digest. `training.json` says what is
+trained, in which format, and by which code.
 """
 
 import contextlib
+import hashlib
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +22,20 @@ from brax.training.agents.ppo import losses
 from tensorboardX import SummaryWriter
 from tqdm import tqdm
 
+from planner_jax import stopping
+from planner_jax.sweep.manifest import is_count, is_number, require_format, to_write
+from planner_jax.sweep.plain_json import (
+    JsonError,
+    parse_object,
+    read_object,
+    require_sealed,
+)
 from planner_jax.sweep.run_folder import RunFolder
 from planner_jax.sweep.settings import SettingError
 
-FILE = "progress.jsonl"
+FILE, ASKED = "progress.jsonl", "training.json"
+# What every row of the curve has.
+_CURVE = {"per_second", "reward", "solved", "last", "ratio", "violation"}
 _EVENTS = "tensorboard"
 
 
@@ -111,6 +124,7 @@ class Progress:
         ):
 
             def tell(done: int, metrics: Mapping[str, Any]) -> None:
+                stopping.check()
                 row = _row_of(metrics)
                 self.add(number, begun + done, row)
                 for name, value in row.items():
@@ -130,20 +144,78 @@ class Progress:
     def add(self, number: int, decisions: int, row: Mapping[str, Any]) -> None:
         """Add a row to the file."""
         self.rows.append({"part": number, "decisions": decisions, **row})
-        text = "".join(json.dumps(row) + "\n" for row in self.rows)
-        RunFolder(self._folder).write_text(FILE, text)
+        RunFolder(self._folder).write_text(FILE, to_text(self.rows))
+
+
+def to_text(rows: Sequence[Mapping[str, Any]]) -> str:
+    """The contents of `progress.jsonl`."""
+    text = "".join(json.dumps(row) + "\n" for row in rows)
+    head = {"rows": len(rows), "sha256": hashlib.sha256(text.encode()).hexdigest()}
+    return json.dumps(to_write(head)) + "\n" + text
 
 
 def read_rows(folder: Path) -> list[dict[str, Any]]:
     """The rows of a run, in the order of their decisions.
 
     Raises:
-        SettingError: the folder is not that of a training.
+        SettingError: the folder is not that of a training, or a row is not as it was written.
     """
+    shown = repr(str(folder))
     try:
-        lines = (folder / FILE).read_text(encoding="utf-8").splitlines()
-        return [json.loads(line) for line in lines]
-    except (OSError, ValueError) as error:
-        raise SettingError(
-            f"run must be the folder of a training, with its {FILE}, got {str(folder)!r}"
-        ) from error
+        text = (folder / FILE).read_bytes()
+    except OSError as error:
+        rule = f"the folder of a training, with its {FILE}"
+        raise SettingError(f"run must be {rule}, got {shown} ({error.strerror})") from None
+    first, _, rest = text.partition(b"\n")
+    try:
+        head = parse_object(first)
+        require_format(head, "run", "a training", shown)
+        require_sealed(head)
+        if head.get("sha256") != hashlib.sha256(rest).hexdigest():
+            raise JsonError("has other rows than were written")
+        rows = [parse_object(line) for line in rest.splitlines()]
+        if len(rows) != head.get("rows") or not all(map(_is_sound, rows)):
+            raise JsonError("has rows that are none of a training")
+    except JsonError as error:
+        rule = f"a training whose {FILE} is whole"
+        raise SettingError(f"run must be {rule}, got {shown}, where it {error}") from None
+    return rows
+
+
+def _is_sound(row: dict[str, Any]) -> bool:
+    """Whether a row has what every row has, and numbers where numbers belong."""
+    named = row.get("suites", {})
+    figures = [*(named.values() if isinstance(named, dict) else [None]), row]
+    return (
+        all(is_count(row.get(name)) for name in ("part", "decisions"))
+        and ("suites" in row or _CURVE <= row.keys())
+        and all(isinstance(each, dict) for each in figures)
+        and all(
+            value is None or is_number(value)
+            for each in figures
+            for name, value in each.items()
+            if name != "suites"
+        )
+    )
+
+
+def read_asked(folder: Path) -> dict[str, Any]:
+    """What a training was asked for, of `training.json`.
+
+    Raises:
+        SettingError: the folder is not that of a training, or it is not as it was written.
+    """
+    path, shown = folder / ASKED, repr(str(folder))
+    try:
+        found = read_object(path)
+    except (OSError, JsonError) as error:
+        why = f" ({ASKED} {error})" if isinstance(error, JsonError) else ""
+        rule = f"the folder of a training, with its {ASKED}"
+        raise SettingError(f"run must be {rule}, got {shown}{why}") from None
+    require_format(found, "run", "a training", shown)
+    try:
+        require_sealed(found)
+    except JsonError as error:
+        rule = f"a training whose {ASKED} is whole"
+        raise SettingError(f"run must be {rule}, got {shown}, where it {error}") from None
+    return found

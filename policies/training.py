@@ -21,7 +21,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import orbax.checkpoint as orbax
 from brax.training import networks as brax_networks
 from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import networks as ppo_networks
@@ -29,6 +28,7 @@ from brax.training.agents.ppo import train as ppo
 from brax.training.distribution import NormalTanhDistribution
 from jax import Array
 
+from planner_jax import stopping
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.planning.plan import plan
 from planner_jax.policies import brax_compat
@@ -41,12 +41,15 @@ from planner_jax.policies.checkpoint import (
 from planner_jax.policies.curves import draw_curves
 from planner_jax.policies.environment import CatchEnv
 from planner_jax.policies.imitation import imitated, lessons
+from planner_jax.policies.kept import KeptParts
 from planner_jax.policies.networks import LEAST_STD, NETWORKS, Value
 from planner_jax.policies.observation import FEATURES, PER_TARGET
 from planner_jax.policies.policy import Policy
-from planner_jax.policies.progress import Progress, reported_terms
+from planner_jax.policies.progress import ASKED, Progress, read_asked, reported_terms
 from planner_jax.policies.settings import WEIGHTS, TrainSettings
 from planner_jax.protocol import solved
+from planner_jax.sweep.environment import code_digest, installed_version
+from planner_jax.sweep.manifest import to_write
 from planner_jax.sweep.run_folder import RunFolder
 from planner_jax.sweep.settings import SettingError
 from planner_jax.task.catch.decide import optimal_time_ratio
@@ -101,21 +104,31 @@ def train(training: Training, out: str | os.PathLike, *, progress: bool = True) 
         The policy after the last part.
 
     Raises:
-        SettingError: the folder is that of a run with other settings.
+        SettingError: the folder is that of a run with other settings or of other code, or another
+            process writes it.
         CheckpointError: the one to begin with cannot be read, or is of another network.
     """
     brax_compat.install()
     folder = Path(out)
     network = NETWORKS[training.network]()
-    keeper = orbax.StandardCheckpointer()
     params = _first_params(training, network)  # before anything is written
-    _require_same(folder, training)
+    with RunFolder(folder).begun():
+        _require_same(folder, training)
+        return _train_parts(training, folder, network, params, progress)
+
+
+def _train_parts(
+    training: Training, folder: Path, network: Any, params: Any, progress: bool
+) -> Policy:
+    """All parts that have not been trained yet, from the parameters that the first begins with."""
+    keeper = KeptParts(folder / "parts")
     told, begun = Progress(folder, progress), 0
     for number, part in enumerate(training.parts):
-        place = (folder / "parts" / f"{number:03d}").absolute()
+        stopping.check()
         decisions = math.prod(_rows_and_updates(part, training.lanes)) * training.lanes
-        if place.exists():  # Orbax gives it its name when all is written
-            params = jax.device_get(keeper.restore(place, params))
+        kept = keeper.restored(number, params)
+        if kept is not None:
+            params = kept
             begun += decisions
             continue
         if number == 0 and training.lessons:
@@ -132,8 +145,7 @@ def train(training: Training, out: str | os.PathLike, *, progress: bool = True) 
             if progress:
                 print(f"{title}: {_sentence(suites)}", file=sys.stderr)
         draw_curves([folder], folder / "curves.png")
-        keeper.save(place, params)
-        keeper.wait_until_finished()
+        keeper.save(number, params)
     found = params[1]
     if training.kept:
         share, first = training.kept, _first_params(training, network)[1]
@@ -180,11 +192,12 @@ def _sentence(suites: Mapping[str, Any]) -> str:
 
 
 def _require_same(folder: Path, training: Training) -> None:
-    """Write down what is trained, or raise `SettingError` if the folder says otherwise."""
-    wanted = json.loads(json.dumps(dataclasses.asdict(training)))
-    place = folder / "training.json"
-    if place.exists():
-        found = json.loads(place.read_text())
+    """Write down what is trained and by what, or raise `SettingError` if the folder has others."""
+    asked = json.loads(json.dumps(dataclasses.asdict(training)))
+    maker = {"version": str(installed_version("planner-jax")), "code": code_digest()}
+    wanted = {**maker, **asked}
+    if (folder / ASKED).exists():
+        found = read_asked(folder)
         for name, value in wanted.items():
             if found.get(name) != value:
                 raise SettingError(
@@ -192,8 +205,7 @@ def _require_same(folder: Path, training: Training) -> None:
                     f"got {value}"
                 )
         return
-    (folder / "parts").mkdir(parents=True, exist_ok=True)
-    RunFolder(folder).write_text(place.name, json.dumps(wanted, indent=1) + "\n")
+    RunFolder(folder).write_text(ASKED, json.dumps(to_write(wanted), indent=1) + "\n")
 
 
 def _first_params(training: Training, network: Any) -> Any:

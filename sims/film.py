@@ -1,6 +1,5 @@
 """Pictures of a flight: what is to be met, robot, plan and ghost images, without a display."""
 
-import os
 import shutil
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from planner_jax.sims.robot import Solid, rotation
 from planner_jax.sims.scenery import FLAT, Part, Prism, machine_parts, outlines, part_solid
 from planner_jax.sims.task import FlightTask
 from planner_jax.sweep.figures.style import BLUE, GREEN, GREY, INK, ORANGE, PALE, PURPLE, RED, SKY
+from planner_jax.whole_files import replacing
 
 BALL_COLOURS = (ORANGE, PURPLE, GREEN)
 FORMATS = (".gif", ".mp4")
@@ -288,9 +288,5 @@ def film_flights(path: Path, task: FlightTask, recording: Recording, num: int) -
 def _write(path: Path, write: Any) -> None:
     """Let `write` fill a scratch file, and put it in place only once it is whole."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    scratch = path.with_name(f".{path.stem}.tmp{path.suffix}")
-    try:
+    with replacing(path) as scratch:
         write(scratch)
-        os.replace(scratch, path)
-    finally:
-        scratch.unlink(missing_ok=True)

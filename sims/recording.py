@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from planner_jax.ball.flight import BallState
 from planner_jax.sims.loop import Flown
 from planner_jax.sims.model import World
 from planner_jax.sims.robot import Robot
 from planner_jax.sweep.columns import BOOL, LIST, VECTOR, RefereedBatch, leaves_of, rows_of
+from planner_jax.sweep.parquet import read_rows
 from planner_jax.sweep.source import Chunk
 from planner_jax.task.hit.validate import fly, landing
 
@@ -214,8 +214,20 @@ def to_rows(recording: Recording) -> pa.Table:
 
 
 def read_recording(path: Path) -> Recording:
-    """The recording in a file that was made from `to_rows`."""
-    table = pq.read_table(path)
+    """The recording in a file that was made from `to_rows`.
+
+    Raises:
+        ValueError: columns are missing, or do not fit each other.
+        pa.ArrowException, OSError: it cannot be read.
+    """
+    table = read_rows(path)
+    wanted = {column.name: column.type for column in _COLUMNS}
+    found = dict(zip(table.column_names, table.schema.types, strict=True))
+    if found != wanted:
+        odd = sorted(name for name in wanted | found if found.get(name) != wanted.get(name))
+        raise ValueError(f"columns must be those of a recording, got others for {', '.join(odd)}")
+    if not len(table):
+        raise ValueError("flights must be one or more, got none")
     columns = {
         name: np.array(table[name].to_pylist(), None if name in ("index", "success") else float)
         for name in table.column_names

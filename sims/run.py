@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
+from planner_jax import stopping
 from planner_jax.sims.film import FilmError, draw_flight, film_flights, require_film
 from planner_jax.sims.recording import FILE, Recording, read_recording, to_rows
 from planner_jax.sims.settings import FlySettings, fly_settings
@@ -28,8 +28,10 @@ from planner_jax.sweep.columns import (
 )
 from planner_jax.sweep.columns import RefereedBatch as FlownBatch
 from planner_jax.sweep.environment import environment, require_backend
+from planner_jax.sweep.parquet import read_rows
+from planner_jax.sweep.report import require_counted
 from planner_jax.sweep.run_folder import RunFolder
-from planner_jax.sweep.settings import SettingError, require
+from planner_jax.sweep.settings import SettingError, require, settings_of_manifest
 from planner_jax.sweep.source import Chunk
 from planner_jax.sweep.summary import percent, wilson_interval
 from planner_jax.sweep.table import RateTable, own_cells, to_html, to_markdown
@@ -83,30 +85,50 @@ def start_flights(
     require_backend()
     flight = settings.flight()
     cases = flight.cases()
-    folder.create(
-        {
-            "kind": f"fly {settings.TASK.name}",
-            "state": "running",
-            "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-            **environment(),
-            "seed": settings.seed,
-            "parameters": dataclasses.asdict(settings),
-            "loop": flight.parameters(),
-            "video": video,
-        }
-    )
-    kept = min(record, settings.num)
+    manifest = {
+        "kind": f"fly {settings.TASK.name}",
+        "state": "running",
+        "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        **environment(),
+        "seed": settings.seed,
+        "parameters": dataclasses.asdict(settings),
+        "loop": flight.parameters(),
+        "video": video,
+    }
+    rest: dict[str, Any] = {"rest": lambda: _dropped(folder), "patient": False, "bar": False}
+    with folder.created(manifest), stopping.under_way(**rest):
+        try:
+            return _fly_into(folder, manifest, flight, cases, min(record, settings.num))
+        except (KeyboardInterrupt, OSError):
+            _dropped(folder)
+            raise
+
+
+def _dropped(folder: RunFolder) -> str:
+    """Remove what was written of flights that are not finished, and say so."""
+    try:
+        if folder.read_manifest()["state"] == "complete":
+            return f"the flights are finished: {folder.path}"
+    except SettingError:
+        pass
+    folder.discard()
+    return f"{stopping.NOTHING}: flights are kept when all of them are flown"
+
+
+def _fly_into(
+    folder: RunFolder, manifest: dict[str, Any], flight: FlightTask, cases: Any, kept: int
+) -> dict[str, Any]:
+    """Fly, and write everything; gives the manifest."""
     rows, times, flights = _fly_all(flight, cases, kept)
     folder.write_rows(folder.plans, rows)
     recording = flight.recording(cases, flights, np.arange(kept))
     folder.write_rows(folder.path / FILE, to_rows(recording))
-    if video is not None:
+    if video := manifest["video"]:
         film_flights(folder.path / video, flight, recording, min(_FILMED, kept))
     done = {"state": "complete", "summary": _summary(flight, rows), "times": times}
-    manifest = {**folder.read_manifest(), **done}
-    folder.write_manifest(manifest)
+    whole = folder.write_manifest({**manifest, **done})
     write_flight_report(folder)
-    return manifest
+    return whole
 
 
 def read_flights(folder: RunFolder) -> tuple[dict[str, Any], FlightTask, Recording]:
@@ -123,15 +145,25 @@ def read_flights(folder: RunFolder) -> tuple[dict[str, Any], FlightTask, Recordi
     if manifest["state"] != "complete" or not path.exists():
         rule = f"{folder.name} must be finished, with its {FILE}"
         raise SettingError(f"{rule}, got {str(folder.path)!r}; fly it again")
+    folder.require_whole(manifest, "fly it again")
+    settings = settings_of_manifest(fly_settings(task), manifest["parameters"], folder.name)
     try:
-        settings = fly_settings(task)(**manifest["parameters"])
         recording = read_recording(path)
-    except (pa.ArrowException, KeyError) as error:
-        raise SettingError(f"{folder.name} must have a whole {FILE}: {error}") from None
-    except TypeError as error:
-        rule = f"{folder.name} must be of this version, fly it again"
-        raise SettingError(f"{rule}: {error}") from None
+    except (pa.ArrowException, OSError, ValueError) as error:
+        why = " ".join(str(error).split())
+        raise SettingError(f"{folder.name} must have a whole {FILE}: {why}") from None
     return manifest, settings.flight(), recording
+
+
+def require_sound(folder: RunFolder) -> None:
+    """Raise `SettingError` unless the files of flights are whole, and their summary counts them."""
+    manifest, flight, _ = read_flights(folder)
+    try:
+        counted = _summary(flight, read_rows(folder.plans))
+    except (pa.ArrowException, OSError, KeyError) as error:
+        why = " ".join(str(error).split())
+        raise SettingError(f"{folder.name} must have whole rows: {why}; fly it again") from None
+    require_counted(folder, manifest["summary"], counted)
 
 
 def _fly_all(flight: FlightTask, cases: Any, shown: int) -> tuple[pa.Table, dict[str, Any], Any]:
@@ -219,7 +251,7 @@ def write_flight_report(folder: RunFolder) -> None:
     manifest, flight, recording = read_flights(folder)
     folder.figures.mkdir(exist_ok=True)
     draw_flight(folder.figures / "flight.png", flight, recording, 0)
-    rows = pq.read_table(folder.plans)
+    rows = read_rows(folder.plans)
     figures = ["flight.png", *flight.draw(folder.figures, rows)]
     more = flight.tables(rows)
     summary, video = manifest["summary"], manifest["video"]

@@ -29,7 +29,9 @@ ALLOWED = {
     },
     "arithmetic": set(),
     "lanes": set(),
-    "plan_files": {"plain_files"},
+    "whole_files": set(),
+    "stopping": set(),
+    "plan_files": {"plain_files", "whole_files"},
     "rules": set(),
     "digits": set(),
     "memory": set(),
@@ -49,15 +51,17 @@ ALLOWED = {
     "task": {
         *("ball", "cost", "lanes", "optimise", "planning", "protocol", "referee", "registry"),
         *("perception", "plane", "robot", "rules", "space", "trajectory"),
-        *("digits", "memory", "plain_files"),
+        *("digits", "memory", "plain_files", "whole_files"),
     },
     "sweep": {
         *("ball", "digits", "lanes", "memory", "perception", "plane"),
-        *("planning", "protocol", "registry", "robot", "rules", "task"),
+        *("planning", "protocol", "registry", "robot", "rules", "stopping", "task"),
+        *("whole_files",),
     },
     "compile_cache": set(),
     "doctor": {"compile_cache", "lanes", "planning", "protocol", "registry", "sweep"},
-    "cli": {"compile_cache", "digits", "doctor", "registry", "sweep"},
+    "cli": {"compile_cache", "digits", "doctor", "registry", "stopping", "sweep"},
+    "__main__": {"cli", "stopping"},
 }
 LIBRARY = ROOT / "planner_jax"
 # Stubs too: they say what a package attaches lazily.

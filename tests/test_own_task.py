@@ -42,7 +42,7 @@ def process(folder, *arguments, path=()):
     """A command in a folder, with the task and other folders where Python looks for packages."""
     others = [str(OWN_TASK), *map(str, path), os.environ.get("PYTHONPATH", "")]
     return subprocess.Popen(
-        [sys.executable, "-m", "planner_jax.cli", *arguments],
+        [sys.executable, "-m", "planner_jax", *arguments],
         cwd=folder,
         env={**os.environ, "PYTHONPATH": os.pathsep.join(others)},
         stdout=subprocess.PIPE,

@@ -183,8 +183,17 @@ def run_folder(tmp_path):
     """A folder like that of a run of flights."""
     folder = RunFolder(tmp_path / "run")
     settings = dataclasses.asdict(CatchFly())
-    folder.create({"kind": "fly catch", "state": "complete", "parameters": settings})
-    folder.write_rows(folder.path / FILE, to_rows(recording()))
+    manifest = {
+        **{"kind": "fly catch", "state": "complete", "parameters": settings, "seed": 0},
+        **{"device": {}, "loop": {}, "times": {"compile_seconds": 0.0, "wall_seconds": 1.0}},
+        "summary": {
+            **{"num": 1, "successes": 1, "success_rate": 1.0, "wilson_95": [0.2, 1.0]},
+            **{"tracking_rms_median": 0.0, "tracking_worst": 0.0},
+        },
+    }
+    with folder.begun():
+        folder.write_rows(folder.path / FILE, to_rows(recording()))
+        folder.write_manifest(manifest)
     return folder
 
 
@@ -197,17 +206,17 @@ def said(capsys, *arguments):
 def test_a_folder_without_flights_is_refused_in_one_line(run_folder, tmp_path, capsys):
     assert said(capsys, tmp_path / "no").startswith("RUN must be the folder of a run, with its m")
     manifest = run_folder.read_manifest()
-    run_folder.write_manifest({**manifest, "kind": "sweep hit"})
-    assert said(capsys, run_folder.path) == "RUN must be a run of flights, got a sweep hit\n"
+    run_folder.write_manifest({**manifest, "kind": "bench hit_rows"})
+    assert said(capsys, run_folder.path) == "RUN must be a run of flights, got a bench hit_rows\n"
     run_folder.write_manifest({**manifest, "state": "running"})
     assert said(capsys, run_folder.path).startswith("RUN must be finished, with its flights.parq")
     run_folder.write_manifest(manifest)
     settings = {**manifest["parameters"], "task": "catch"}
     run_folder.write_manifest({**manifest, "parameters": settings})
-    assert said(capsys, run_folder.path).startswith("RUN must be of this version, fly it again: ")
+    assert said(capsys, run_folder.path).startswith("RUN must be a run with settings of this ver")
     run_folder.write_manifest(manifest)
     (run_folder.path / FILE).write_bytes(b"half of it")
-    assert said(capsys, run_folder.path).startswith("RUN must have a whole flights.parquet: ")
+    assert said(capsys, run_folder.path).startswith("RUN must be a run whose flights.parquet is ")
 
 
 def test_a_missing_viser_is_named_with_its_remedy(run_folder, capsys, monkeypatch):

@@ -24,9 +24,10 @@ from planner_jax.sweep.hit.figures.motion import motion_figure
 from planner_jax.sweep.hit.settings import HitSettings
 from planner_jax.sweep.hit.source import open_source
 from planner_jax.sweep.hit.sweep import HitSweep
+from planner_jax.sweep.parquet import pick_rows
 from planner_jax.sweep.report import RunRows, write_report
 from planner_jax.sweep.run import SweepInterrupted, resume_sweep, start_sweep
-from planner_jax.sweep.run_folder import RunFolder, pick_rows
+from planner_jax.sweep.run_folder import RunFolder
 from planner_jax.sweep.settings import SettingError
 from planner_jax.sweep.summary import percent, wilson_interval
 from planner_jax.sweep.timing import CompileClock
@@ -208,8 +209,8 @@ def test_a_sweep_killed_while_writing_is_resumed_to_the_same_rows(
             start_sweep(TASK, SETTINGS, out, progress=False)
     folder = RunFolder(out)
     folder.write_manifest({**folder.read_manifest(), "state": "running"})
-    (out / "parts" / ".part-000002.parquet.tmp").write_bytes(b"half a part")
-    (out / ".plans.parquet.tmp").write_bytes(b"half a table")
+    (out / "parts" / ".4711.tmp.part-000002.parquet").write_bytes(b"half a part")
+    (out / ".4711.tmp.plans.parquet").write_bytes(b"half a table")
     resume_sweep(TASK, out, progress=False)
     assert (out / "plans.parquet").read_bytes() == (finished[0] / "plans.parquet").read_bytes()
     assert not list(out.rglob(".*"))

@@ -180,9 +180,8 @@ def test_a_run_is_resumed_as_what_it_is(finished, name, given, message):
 
 def test_cases_that_are_drawn_otherwise_are_not_mixed_into_a_run(finished, tmp_path, monkeypatch):
     out = tmp_path / "run"
-    out.mkdir()
-    manifest = {**finished[1], "state": "interrupted"}
-    (out / "manifest.json").write_text(json.dumps(manifest))
+    with RunFolder(out).begun():
+        RunFolder(out).write_manifest({**finished[1], "state": "interrupted"})
     real = pj.catch.draw
     monkeypatch.setattr(
         "planner_jax.task.catch.draw",

@@ -16,7 +16,8 @@ from planner_jax.policies.curves import draw_curves
 from planner_jax.policies.networks import NETWORKS, Mlp
 from planner_jax.policies.observation import FEATURES
 from planner_jax.policies.policy import Policy
-from planner_jax.policies.progress import FILE, read_rows
+from planner_jax.policies.progress import FILE, read_rows, to_text
+from planner_jax.sweep.plain_json import sealed
 from planner_jax.sweep.settings import SettingError
 from planner_jax.task.catch.estimate import shortfall
 from planner_jax.task.catch.suites import draw_by_key
@@ -93,11 +94,11 @@ def test_curves_of_several_seeds_are_drawn_together_and_of_other_settings_are_no
     other = tmp_path / "other"
     other.mkdir()
     asked = json.loads((out / "training.json").read_text())
-    (other / FILE).write_text("".join((out / FILE).read_text().splitlines(True)[:-3]))
-    (other / "training.json").write_text(json.dumps({**asked, "seed": 1}))
+    (other / FILE).write_text(to_text(read_rows(out)[:-3]))
+    (other / "training.json").write_text(json.dumps(sealed({**asked, "seed": 1})))
     draw_curves([out, other], tmp_path / "both.png")
     assert (tmp_path / "both.png").stat().st_size > 10_000
-    (other / "training.json").write_text(json.dumps({**asked, "lanes": 7}))
+    (other / "training.json").write_text(json.dumps(sealed({**asked, "lanes": 7})))
     with pytest.raises(SettingError, match=f"same lanes as .*, {LANES}, got 7"):
         draw_curves([out, other], tmp_path / "both.png")
     with pytest.raises(SettingError, match="run must be the folder of a training"):

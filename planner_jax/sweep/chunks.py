@@ -11,13 +11,16 @@ import numpy as np
 import pyarrow as pa
 from tqdm import tqdm
 
+from planner_jax import stopping
 from planner_jax.sweep.columns import RefereedBatch, rows_of
+from planner_jax.sweep.parts import Parts
 from planner_jax.sweep.run_folder import RunFolder
 from planner_jax.sweep.source import Chunk, Source
 from planner_jax.sweep.summary import percent
 from planner_jax.sweep.sweep import Sweep
 from planner_jax.sweep.timing import CompileClock, Stopwatch, timed, timed_warm
 
+_COUNTED = ("num", "successes")  # of every part
 _UNDER_WAY = 2  # chunks that are judged or written while the next is planned
 _MEASURED = {
     "compile_seconds": "JAX tracing, lowering, compiling or reading its cache, while chunks were "
@@ -40,6 +43,7 @@ class SweepRun:
     source: Source
     planner: Any
     folder: RunFolder
+    parts: Parts
 
 
 def plan_chunks(run: SweepRun, *, progress: bool) -> dict[str, Any]:
@@ -53,35 +57,41 @@ def plan_chunks(run: SweepRun, *, progress: bool) -> dict[str, Any]:
         Entries for the manifest: `summary`, `times`, and `example`, a case worth a figure.
     """
     source, folder = run.source, run.folder
-    there = [r for r in map(folder.part_record, range(source.num_chunks)) if r]
-    done, successes = (sum(record[name] for record in there) for name in ("num", "successes"))
+    records = run.parts.sound()
+    done, successes = (sum(each[name] for each in records.values()) for name in _COUNTED)
     if progress:
         print(f"Writing {folder.path}; the first chunk compiles.", file=sys.stderr)
     look: dict[str, Any] = {"unit": " plans", "desc": source.settings.planner}
     tally = run.sweep.tally(source.settings)
     with tqdm(total=source.num, initial=done, disable=not progress, **look) as bar:
-        for rows, record in _in_pipeline(run):
+        for chunk, rows, record in _in_pipeline(run, set(records)):
             tally.add(rows)
             if record is None:  # there already
                 continue
+            records[chunk] = record
             done, successes = done + record["num"], successes + record["successes"]
             bar.set_postfix_str(f"success {percent(successes, done)} %", refresh=False)
             bar.update(record["num"])
-    times = _times(run)
+    times = _times(run, records)
     summary = tally.summary()
     summary["plans_per_second_warm"] = round(times["warm_plans"] / times["warm_seconds"], 1)
     summary["compile_seconds"] = times["compile_seconds"]
     return {"summary": summary, "times": times, "example": tally.example}
 
 
-def _in_pipeline(run: SweepRun) -> Iterator[tuple[pa.Table, dict[str, Any] | None]]:
-    """Rows of every chunk in order, and the record of those that had no part.
+def _in_pipeline(
+    run: SweepRun, there: set[int]
+) -> Iterator[tuple[int, pa.Table, dict[str, Any] | None]]:
+    """Number and rows of every chunk in order, and the record of those that had no part.
 
     While one chunk is planned the next is drawn, the one before is judged, and the one before
     that is written.
+
+    Args:
+        run: the sweep.
+        there: numbers of the chunks that have a part.
     """
     folder, source, watch = run.folder, run.source, Stopwatch()
-    there = [folder.part_record(chunk) is not None for chunk in range(source.num_chunks)]
     pending: deque[Future] = deque()
     with (
         folder.joining_parts() as join,
@@ -93,20 +103,21 @@ def _in_pipeline(run: SweepRun) -> Iterator[tuple[pa.Table, dict[str, Any] | Non
         ThreadPoolExecutor(1) as drawer,
     ):
 
-        def write(judged: Future) -> tuple[pa.Table, dict[str, Any] | None]:
+        def write(judged: Future) -> tuple[int, pa.Table, dict[str, Any] | None]:
             chunk, rows, record = judged.result()
             joined = joiner.submit(join, rows)
             if record is not None:
-                folder.write_part(chunk, rows, record)
+                record = run.parts.write(chunk, rows, record)
             joined.result()
-            return rows, record
+            return chunk, rows, record
 
-        missing = [chunk for chunk, is_there in enumerate(there) if not is_there]
+        missing = (chunk for chunk in range(source.num_chunks) if chunk not in there)
         draws = (drawer.submit(source.chunk, chunk) for chunk in missing)
         following = next(draws, None)
-        for chunk, is_there in enumerate(there):
-            if is_there:
-                judged = judge.submit(lambda k=chunk: (k, folder.read_part(k), None))
+        for chunk in range(source.num_chunks):
+            stopping.check()
+            if chunk in there:
+                judged = judge.submit(lambda k=chunk: (k, run.parts.read(k), None))
             else:
                 drawn, following = following, next(draws, None)
                 assert drawn is not None
@@ -152,13 +163,11 @@ def _judge_chunk(
     return number, rows_of(run.sweep.columns(batch), batch, run.sweep.frame), record
 
 
-def _times(run: SweepRun) -> dict[str, Any]:
-    """The times of the manifest, from the records of the parts."""
+def _times(run: SweepRun, records: dict[int, dict[str, Any]]) -> dict[str, Any]:
+    """The times of the manifest, from the records of the parts by their numbers."""
     seconds = dict.fromkeys(_MEASURED, 0.0)
     warm_plans = 0
-    for chunk in range(run.source.num_chunks):
-        record = run.folder.part_record(chunk)
-        assert record is not None
+    for chunk, record in sorted(records.items()):
         for name in ("compile_seconds", "referee_seconds", "wall_seconds"):
             seconds[name] += record[name]
         if chunk == 0:

@@ -1,5 +1,7 @@
-"""Where a run took place: versions, commit, device."""
+"""Where a run took place: versions, code, commit, device."""
 
+import functools
+import hashlib
 import os
 import platform
 import subprocess
@@ -20,8 +22,24 @@ def installed_version(name: str) -> str | None:
         return None
 
 
+@functools.cache
+def code_digest() -> str:
+    """SHA-256 of the names and contents of all that is installed of the package.
+
+    Without benchmarks, which decide no row of a run.
+    """
+    digest = hashlib.sha256()
+    for place, folders, files in os.walk(_PACKAGE, followlinks=True):
+        folders[:] = sorted(set(folders) - {"__pycache__", "benchmarks"})
+        for name in sorted(name for name in files if not name.startswith(".")):
+            path = Path(place, name)
+            digest.update(f"{path.relative_to(_PACKAGE)}\0".encode())
+            digest.update(hashlib.sha256(path.read_bytes()).digest())
+    return digest.hexdigest()
+
+
 def environment() -> dict[str, Any]:
-    """Versions, git commit and device, for the manifest."""
+    """Versions, code, git commit and device, for the manifest."""
     import jax
 
     device = jax.devices()[0]
@@ -31,6 +49,7 @@ def environment() -> dict[str, Any]:
             "python": platform.python_version(),
             **{name: installed_version(name) for name in packages},
         },
+        "code": code_digest(),
         "git_commit": _git_commit(),
         "device": {
             "platform": device.platform,

@@ -1,18 +1,20 @@
 """Table, figures and page of a run, from nothing but its folder."""
 
 import dataclasses
+import math
+import shlex
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from planner_jax.sweep.figures.style import draw
 from planner_jax.sweep.page import to_page
-from planner_jax.sweep.run_folder import RunFolder, pick_rows
-from planner_jax.sweep.settings import SettingError
-from planner_jax.sweep.sweep import RunFigure, sweep_of_run
+from planner_jax.sweep.parquet import pick_rows, read_rows, row_groups
+from planner_jax.sweep.run_folder import RunFolder
+from planner_jax.sweep.settings import SettingError, settings_of_manifest
+from planner_jax.sweep.sweep import RunFigure, settings_of, sweep_of_run
 from planner_jax.sweep.table import headline, to_markdown
 
 PAGE = "index.html"
@@ -42,13 +44,67 @@ class RunRows:
         own = pick_rows(self.folder.plans, [self.manifest["example"]])[0]
         plans = [(self.manifest["parameters"]["planner"], own)]
         if self.folder.baselines.exists():
-            others = pq.read_table(self.folder.baselines).to_pylist()
+            others = read_rows(self.folder.baselines).to_pylist()
             plans += [(row["planner"], row) for row in others]
         return plans
 
     def columns(self, *names: str) -> pa.Table:
         """Some columns of all rows."""
-        return pq.read_table(self.folder.plans, columns=list(names))
+        return read_rows(self.folder.plans, names)
+
+
+def require_sound(folder: RunFolder) -> None:
+    """Raise `SettingError` unless a sweep's rows are whole, and its summary counts them."""
+    manifest = folder.read_manifest()
+    sweep = sweep_of_run(manifest, folder.name)
+    _require_finished(folder, manifest)
+    again = f"planner-jax {sweep.kind} --resume --out {shlex.quote(str(folder.path))}"
+    remedy = f"make it anew: {again}"
+    folder.require_whole(manifest, remedy)
+    kind = settings_of(sweep.task)
+    tally = sweep.tally(settings_of_manifest(kind, manifest["parameters"], folder.name))
+    try:
+        for _, rows in row_groups(folder.plans):
+            tally.add(rows)
+        counted = {**tally.summary(), "example": tally.example}
+    except (pa.ArrowException, KeyError, ZeroDivisionError) as error:
+        rule, why = "a run whose rows can be read", " ".join(str(error).split())
+        raise SettingError(f"{folder.name} must be {rule}, got {why}; {remedy}") from None
+    require_counted(folder, {**manifest["summary"], "example": manifest.get("example")}, counted)
+
+
+def require_counted(folder: RunFolder, told: dict[str, Any], counted: dict[str, Any]) -> None:
+    """Raise `SettingError` unless a manifest's summary says what its rows do.
+
+    Args:
+        folder: of the run.
+        told: the summary.
+        counted: the same of the rows; entries that are not of rows are missing.
+    """
+    for name, value in counted.items():
+        if not _agree(told.get(name), value):
+            rule = f"a run whose {name} is that of its rows, {value}"
+            raise SettingError(
+                f"{folder.name} must be {rule}, got {told.get(name)} in {str(folder.path)!r}"
+            )
+
+
+def _agree(one: Any, other: Any) -> bool:
+    """Whether two plain values are the same, but for the order in which numbers were added."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        return one.keys() == other.keys() and all(_agree(one[key], other[key]) for key in one)
+    if isinstance(one, list | tuple) and isinstance(other, list | tuple):
+        return len(one) == len(other) and all(map(_agree, one, other))
+    if isinstance(one, float) and isinstance(other, float):
+        return math.isclose(one, other, rel_tol=1e-4, abs_tol=1e-9) or one != one and other != other
+    return one == other
+
+
+def _require_finished(folder: RunFolder, manifest: dict[str, Any]) -> None:
+    if "summary" not in manifest or not folder.plans.exists():
+        raise SettingError(
+            f"{folder.name} must be finished, got {str(folder.path)!r}; resume it first"
+        )
 
 
 def write_report(folder: RunFolder) -> None:
@@ -62,10 +118,7 @@ def write_report(folder: RunFolder) -> None:
     """
     manifest = folder.read_manifest()
     sweep = sweep_of_run(manifest, folder.name)
-    if "summary" not in manifest or not folder.plans.exists():
-        raise SettingError(
-            f"{folder.name} must be finished, got {str(folder.path)!r}; resume it first"
-        )
+    _require_finished(folder, manifest)
     folder.figures.mkdir(exist_ok=True)
     failed = _failed_rows(folder)
     _draw(RunRows(folder, manifest, failed), sweep.figures)
@@ -96,12 +149,9 @@ def _draw(rows: RunRows, figures: Sequence[RunFigure]) -> None:
 
 def _failed_rows(folder: RunFolder) -> list[dict[str, Any]]:
     """The first failures, a few."""
-    failed, first = [], 0
-    with pq.ParquetFile(folder.plans) as file:
-        for group in range(file.num_row_groups):
-            success = file.read_row_group(group, columns=["success"])["success"]
-            failed += (first + np.flatnonzero(~np.asarray(success))).tolist()
-            first += len(success)
-            if len(failed) >= _FAILURES_SHOWN:
-                break
+    failed: list[int] = []
+    for first, rows in row_groups(folder.plans, ["success"]):
+        failed += (first + np.flatnonzero(~np.asarray(rows["success"]))).tolist()
+        if len(failed) >= _FAILURES_SHOWN:
+            break
     return pick_rows(folder.plans, failed[:_FAILURES_SHOWN])

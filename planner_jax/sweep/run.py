@@ -1,7 +1,7 @@
 """A sweep: cases in, refereed plans and a report out, in one run folder."""
 
+import contextlib
 import dataclasses
-import datetime
 import os
 import sys
 from typing import Any
@@ -10,10 +10,19 @@ import jax
 import numpy as np
 import pyarrow as pa
 
+from planner_jax import stopping
 from planner_jax.registry import Task
 from planner_jax.sweep.chunks import SweepRun, plan_chunks
 from planner_jax.sweep.columns import RefereedBatch, rows_of
-from planner_jax.sweep.environment import environment, require_backend
+from planner_jax.sweep.environment import require_backend
+from planner_jax.sweep.identity import (
+    IDENTITY,
+    begun_now,
+    identity_of,
+    require_same_maker,
+    settings_digest,
+)
+from planner_jax.sweep.parts import Parts
 from planner_jax.sweep.report import PAGE, draw_comparisons, rewrite_page, write_report
 from planner_jax.sweep.run_folder import RunFolder
 from planner_jax.sweep.settings import SettingError, SweepSettings, settings_to_resume
@@ -45,17 +54,36 @@ def start_sweep(
     """
     folder = RunFolder(out)
     folder.require_new()
-    run = _open(sweep_of(task), settings.of(task), folder)
-    cases = run.source.check()
-    run.sweep.require_fit(run.source.settings, run.planner, cases)
-    folder.create(_first_manifest(run, cases))
-    return _finish(run, progress)
+    sweep, settings = sweep_of(task), settings.of(task)
+    source = _source(sweep, settings)
+    planner = sweep.planner(settings)
+    cases = source.check()
+    sweep.require_fit(source.settings, planner, cases)
+    session, description = begun_now(), source.description()
+    identity = identity_of(source, description, session)
+    run = SweepRun(sweep, source, planner, folder, Parts(folder.parts, identity, source))
+    manifest = {
+        "kind": sweep.kind,
+        "state": "running",
+        **identity,
+        **session,
+        "seed": source.settings.seed,
+        "parameters": source.settings.parameters(),
+        **description,
+        "setting": sweep.setting(cases),
+        "planner": {"name": source.settings.planner, **_settings_of_planner(planner)},
+        "sessions": [session],
+    }
+    with folder.created(manifest):
+        return _finish(run, progress)
 
 
 def resume_sweep(
     task: Task, out: str | os.PathLike, *, progress: bool = True, **given: Any
 ) -> dict[str, Any]:
-    """Finish a sweep that was interrupted or killed; a finished one is left as it is.
+    """Finish a sweep that was interrupted or killed; a whole, finished one is left as it is.
+
+    Parts and rows that are missing, damaged or of another run are planned again.
 
     Args:
         task: that was swept.
@@ -71,28 +99,51 @@ def resume_sweep(
             run's, or the cases are not what they were.
         SweepInterrupted: on Ctrl-C; the folder can be resumed.
     """
-    folder = RunFolder(out)
+    folder, sweep = RunFolder(out), sweep_of(task)
+    _settings_of_run(folder, sweep, task, given)
+    with folder.resumed():
+        manifest, settings = _settings_of_run(folder, sweep, task, given)
+        damages = folder.damages(manifest)
+        if manifest["state"] == "complete" and not damages:
+            return manifest
+        session = begun_now()
+        require_same_maker(manifest, session)
+        source = _source(sweep, settings)
+        description = source.description()
+        for entry, known in description.items():
+            if known != manifest.get(entry):
+                raise SettingError(f"{entry} must be the same as when the run began")
+        if manifest["settings"] != settings_digest(source, description):
+            raise SettingError("out must be resumed with the files that its settings named then")
+        for name, why in damages.items():
+            print(f"planner-jax: {folder.path / name} is {why}; it is made anew", file=sys.stderr)
+        if folder.plans.name in damages:  # the parts are gone since there was a summary
+            manifest = {name: value for name, value in manifest.items() if name not in _FOUND}
+        sessions = [*manifest["sessions"], session]
+        folder.write_manifest({**manifest, "state": "running", "sessions": sessions})
+        parts = Parts(folder.parts, {name: manifest[name] for name in IDENTITY}, source)
+        return _finish(SweepRun(sweep, source, sweep.planner(settings), folder, parts), progress)
+
+
+# What a manifest has of the rows, once they are joined.
+_FOUND = ("summary", "times", "example", "files")
+
+
+def _settings_of_run(
+    folder: RunFolder, sweep: Sweep, task: Task, given: dict[str, Any]
+) -> tuple[dict[str, Any], SweepSettings]:
+    """Manifest and settings of a run that may be resumed with some settings named again."""
     manifest = folder.read_manifest()
-    sweep = sweep_of(task)
     if manifest["kind"] != sweep.kind:
         raise SettingError(
             f"out must be the folder of a {sweep.kind}, got one of a {manifest['kind']}"
         )
-    settings = settings_to_resume(settings_of(task), manifest["parameters"], given)
-    if manifest["state"] == "complete":
-        return manifest
-    run = _open(sweep, settings, folder)
-    for entry, known in run.source.description().items():
-        if known != manifest.get(entry):
-            raise SettingError(f"{entry} must be the same as when the run began")
-    sessions = [*manifest["sessions"], _session()]
-    folder.write_manifest({**manifest, "state": "running", "sessions": sessions})
-    return _finish(run, progress)
+    return manifest, settings_to_resume(settings_of(task), manifest["parameters"], given)
 
 
-def _open(sweep: Sweep, settings: SweepSettings, folder: RunFolder) -> SweepRun:
+def _source(sweep: Sweep, settings: SweepSettings) -> Source:
     batch = settings.CPU_BATCH if require_backend() == "cpu" else settings.GPU_BATCH
-    return SweepRun(sweep, sweep.open_source(settings, batch), sweep.planner(settings), folder)
+    return sweep.open_source(settings, batch)
 
 
 def _finish(run: SweepRun, progress: bool) -> dict[str, Any]:
@@ -108,6 +159,10 @@ def _finish(run: SweepRun, progress: bool) -> dict[str, Any]:
     except KeyboardInterrupt:
         _end(folder, "interrupted")
         raise SweepInterrupted(str(folder.path)) from None
+    except OSError:
+        with contextlib.suppress(OSError):  # it may be the disk that is full
+            _end(folder, "interrupted")
+        raise
 
 
 def _end(folder: RunFolder, state: str) -> dict[str, Any]:
@@ -115,10 +170,9 @@ def _end(folder: RunFolder, state: str) -> dict[str, Any]:
 
     The manifest comes last: a run that is killed in between is resumed, and its page made anew.
     """
-    manifest = {**folder.read_manifest(), "state": state}
+    manifest = folder.with_sums({**folder.read_manifest(), "state": state})
     rewrite_page(folder, manifest)
-    folder.write_manifest(manifest)
-    return manifest
+    return folder.write_manifest(manifest)
 
 
 def _plan(run: SweepRun, progress: bool) -> None:
@@ -159,33 +213,13 @@ def plan_baselines(sweep: Sweep, source: Source, planners: dict[str, Any], index
     """
     chunk, tables = source.cases(index, index + 1), []
     for name, planner in planners.items():
+        stopping.check()
         plans = sweep.plan(planner, chunk.cases)
         verdict = sweep.judge(chunk.cases, plans, source.settings)
         batch = RefereedBatch(chunk, plans, verdict)
         rows = rows_of(sweep.columns(batch), batch, sweep.frame)
         tables.append(rows.add_column(0, "planner", pa.array([name])))
     return pa.concat_tables(tables)
-
-
-def _session() -> dict[str, Any]:
-    """When a session began, and where."""
-    now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    return {"started": now, **environment()}
-
-
-def _first_manifest(run: SweepRun, cases: Any) -> dict[str, Any]:
-    settings, session = run.source.settings, _session()
-    return {
-        "kind": run.sweep.kind,
-        "state": "running",
-        **session,
-        "seed": settings.seed,
-        "parameters": settings.parameters(),
-        **run.source.description(),
-        "setting": run.sweep.setting(cases),
-        "planner": {"name": settings.planner, **_settings_of_planner(run.planner)},
-        "sessions": [session],
-    }
 
 
 _OF_NETWORKS = ("parent", "name")  # fields of a Flax module that are none of its sizes

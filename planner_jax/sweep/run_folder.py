@@ -1,25 +1,27 @@
 """The folder that a run writes: manifest, rows, table, figures and page.
 
 Everything appears whole: files are written beside their place and renamed into it, so that a
-run which was killed at any moment can be resumed.
+run which was killed at any moment can be resumed. One process writes at a time.
 """
 
 import contextlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from planner_jax.sweep import manifest as manifests
+from planner_jax.sweep.owner import LOCK, owned, require_free
+from planner_jax.sweep.parquet import ROW_GROUP, encoding, file_sum
 from planner_jax.sweep.settings import SettingError
+from planner_jax.whole_files import is_scratch, replacing
 
-_PART_RECORD = b"part"
-_ROW_GROUP = 2048  # rows, some 3 MB: little has to be read for one of them
-_MANIFEST_KEYS = {"kind", "state", "parameters"}
+_MANIFEST = "manifest.json"
 
 
 class RunFolder:
@@ -36,94 +38,150 @@ class RunFolder:
         self.plans = self.path / "plans.parquet"
         self.baselines = self.path / "baselines.parquet"
         self.figures = self.path / "figures"
-        self._manifest = self.path / "manifest.json"
-        self._parts = self.path / "parts"
+        self.parts = self.path / "parts"
+        self._manifest = self.path / _MANIFEST
         self._made: list[Path] = []
+        self._sums: dict[str, dict[str, int]] = {}  # of files written since the manifest was
 
     def require_new(self) -> None:
         """Raise `SettingError` unless a run may be written here; writes nothing."""
-        if self.path.is_dir() and any(self.path.iterdir()):
-            rule = "a new or empty folder"
-            if self._manifest.exists():
-                rule += ", or that of a run with resume"
-            raise SettingError(f"{self.name} must be {rule}, got {str(self.path)!r}")
-        ancestor = next(p for p in [self.path, *self.path.absolute().parents] if p.exists())
+        try:
+            require_free(self.path, self.name)
+            if self.path.is_dir() and not all(map(_is_left, self.path.iterdir())):
+                rule = "a new or empty folder"
+                if self._manifest.exists():
+                    rule += ", or that of a run with resume"
+                raise SettingError(f"{self.name} must be {rule}, got {str(self.path)!r}")
+            ancestor = next(p for p in [self.path, *self.path.absolute().parents] if p.exists())
+        except OSError as error:  # such as a name that is too long
+            raise SettingError(f"{self._unwritable()} ({error.strerror})") from None
         if not ancestor.is_dir() or not os.access(ancestor, os.W_OK | os.X_OK):
             raise SettingError(self._unwritable())
 
-    def create(self, manifest: dict[str, Any]) -> None:
-        """Make the folder with its first manifest.
+    @contextlib.contextmanager
+    def created(self, manifest: dict[str, Any]) -> Iterator[None]:
+        """Make the folder with its first manifest, and own it for the length of the block.
 
         Raises:
-            SettingError: the folder cannot be made.
+            SettingError: the folder cannot be made, or is not new any more.
         """
         self._made = [p for p in [self.path, *self.path.absolute().parents] if not p.exists()]
         try:
             self.path.mkdir(parents=True, exist_ok=True)
-            self.write_manifest(manifest)
         except OSError as error:
-            self.discard()
+            self._remove_made()
             raise SettingError(f"{self._unwritable()} ({error.strerror})") from None
+        with owned(self.path, self.name):
+            if not all(map(_is_left, self.path.iterdir())):  # another process was quicker
+                rule = "a new or empty folder"
+                raise SettingError(f"{self.name} must be {rule}, got {str(self.path)!r}")
+            self._remove_left()
+            try:
+                self.write_manifest(manifest)
+            except OSError as error:
+                self.discard()
+                raise SettingError(f"{self._unwritable()} ({error.strerror})") from None
+            yield
+
+    @contextlib.contextmanager
+    def begun(self) -> Iterator[None]:
+        """Make the folder if it is not there, and own it for the length of the block.
+
+        Raises:
+            SettingError: it cannot be made or written, or another process owns it.
+        """
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise SettingError(f"{self._unwritable()} ({error.strerror})") from None
+        with self.resumed():
+            yield
+
+    @contextlib.contextmanager
+    def resumed(self) -> Iterator[None]:
+        """Own the folder of a run for the length of the block.
+
+        Raises:
+            SettingError: another process does, or it cannot be written.
+        """
+        with owned(self.path, self.name):
+            self._remove_left()
+            yield
 
     def _unwritable(self) -> str:
         return f"{self.name} must be a folder that can be written, got {str(self.path)!r}"
 
     def discard(self) -> None:
-        """Undo `create` and the parts written since."""
-        self.remove_parts()
-        self._manifest.unlink(missing_ok=True)
+        """Remove all that was written since `created`, and the folders made for it."""
+        for path in self.path.iterdir() if self.path.is_dir() else ():
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink(missing_ok=True)
+        self._remove_made()
+
+    def _remove_made(self) -> None:
         for folder in self._made:
             try:
                 folder.rmdir()
             except OSError:
                 return
 
+    def _remove_left(self) -> None:
+        """Drop what a killed process was writing."""
+        for folder in (self.path, self.parts, self.figures):
+            for path in folder.iterdir() if folder.is_dir() else ():
+                if is_scratch(path):
+                    path.unlink(missing_ok=True)
+
     def read_manifest(self) -> dict[str, Any]:
         """The manifest.
 
         Raises:
-            SettingError: the folder is not that of a run.
+            SettingError: the folder is not that of a run, or its manifest is not sound.
         """
-        try:
-            manifest = json.loads(self._manifest.read_text(encoding="utf-8"))
-        except (OSError, ValueError):
-            manifest = None
-        if not isinstance(manifest, dict) or not _MANIFEST_KEYS <= manifest.keys():
-            raise SettingError(
-                f"{self.name} must be the folder of a run, with its manifest.json, "
-                f"got {str(self.path)!r}"
-            )
-        return manifest
+        return manifests.read_manifest(self._manifest, self.name)
 
-    def write_manifest(self, manifest: dict[str, Any]) -> None:
-        """Put a manifest in the place of the old one."""
-        text = json.dumps(manifest, indent=2, allow_nan=False)
-        self.write_text("manifest.json", text + "\n")
+    def write_manifest(self, manifest: dict[str, Any]) -> dict[str, Any]:
+        """Put a manifest, with the sums of files, in the place of the old one; as it is written."""
+        whole = self.with_sums(manifest)
+        self.write_text(_MANIFEST, json.dumps(whole, indent=2, allow_nan=False) + "\n")
+        return whole
+
+    def with_sums(self, manifest: dict[str, Any]) -> dict[str, Any]:
+        """A manifest as `write_manifest` writes it."""
+        sums = {**manifest.get("files", {}), **self._sums}
+        return manifests.to_write({**manifest, "files": sums} if sums else manifest)
 
     def write_text(self, name: str, text: str) -> None:
         """Write a file of the folder whole."""
-        with _replacing(self.path / name) as scratch:
+        with replacing(self.path / name) as scratch:
             scratch.write_text(text, encoding="utf-8")
 
-    def write_part(self, number: int, rows: pa.Table, record: dict[str, Any]) -> None:
-        """Write the rows of one chunk, and a record of how they came about."""
-        self._parts.mkdir(exist_ok=True)
-        metadata = {**(rows.schema.metadata or {}), _PART_RECORD: json.dumps(record).encode()}
-        self.write_rows(self._part(number), rows.replace_schema_metadata(metadata))
+    def damages(self, manifest: dict[str, Any]) -> dict[str, str]:
+        """What is wrong with the files whose sums a manifest holds: words by file, if any."""
+        found = {}
+        for name, wanted in manifest.get("files", {}).items():
+            try:
+                if file_sum(self.path / name) != wanted:
+                    found[name] = "damaged: its checksum is not that of its manifest"
+            except OSError as error:
+                found[name] = (
+                    "missing" if isinstance(error, FileNotFoundError) else str(error.strerror)
+                )
+        return found
 
-    def part_record(self, number: int) -> dict[str, Any] | None:
-        """The record of a part that is there; None for one that is not."""
-        try:
-            metadata = pq.read_schema(self._part(number)).metadata
-        except FileNotFoundError:
-            return None
-        return json.loads(metadata[_PART_RECORD])
+    def require_whole(self, manifest: dict[str, Any], remedy: str) -> None:
+        """Raise `SettingError` if a file of the run is missing or damaged.
 
-    def read_part(self, number: int) -> pa.Table:
-        """The rows of a part that is there."""
-        rows = pq.read_table(self._part(number))
-        kept = {key: value for key, value in rows.schema.metadata.items() if key != _PART_RECORD}
-        return rows.replace_schema_metadata(kept)
+        Args:
+            manifest: of the run.
+            remedy: what to do then, in words.
+        """
+        for name, why in self.damages(manifest).items():
+            rule = f"a run whose {name} is whole"
+            shown = f"{str(self.path)!r}, where it is {why}; {remedy}"
+            raise SettingError(f"{self.name} must be {rule}, got {shown}")
 
     @contextlib.contextmanager
     def joining_parts(self) -> Iterator[Callable[[pa.Table], None]]:
@@ -136,69 +194,28 @@ class RunFolder:
         def join(rows: pa.Table) -> None:
             nonlocal writer
             if writer is None:
-                writer = pq.ParquetWriter(scratch, rows.schema, **_encoding(rows.schema))
-            writer.write_table(rows, row_group_size=_ROW_GROUP)
+                writer = pq.ParquetWriter(scratch, rows.schema, **encoding(rows.schema))
+            writer.write_table(rows, row_group_size=ROW_GROUP)
 
-        with _replacing(self.plans) as scratch:
+        with replacing(self.plans) as scratch:
             try:
                 yield join
             finally:
                 if writer is not None:
                     writer.close()
+            self._sums[self.plans.name] = file_sum(scratch)
 
     def remove_parts(self) -> None:
         """Drop what `joining_parts` has joined."""
-        shutil.rmtree(self._parts, ignore_errors=True)
+        shutil.rmtree(self.parts, ignore_errors=True)
 
     def write_rows(self, path: Path, rows: pa.Table) -> None:
-        """Write a Parquet file whole."""
-        with _replacing(path) as scratch:
-            pq.write_table(rows, scratch, row_group_size=_ROW_GROUP, **_encoding(rows.schema))
-
-    def _part(self, number: int) -> Path:
-        return self._parts / f"part-{number:06d}.parquet"
+        """Write a Parquet file of the folder whole."""
+        with replacing(path) as scratch:
+            pq.write_table(rows, scratch, row_group_size=ROW_GROUP, **encoding(rows.schema))
+            self._sums[path.name] = file_sum(scratch)
 
 
-class _replacing:
-    """A scratch file that takes the place of `path` once its block has ended well."""
-
-    def __init__(self, path: Path):
-        self.path = path
-        self.scratch = path.with_name(f".{path.name}.tmp")
-
-    def __enter__(self) -> Path:
-        return self.scratch
-
-    def __exit__(self, kind: Any, *_: Any) -> None:
-        if kind is None:
-            os.replace(self.scratch, self.path)
-        else:
-            self.scratch.unlink(missing_ok=True)
-
-
-def _encoding(schema: pa.Schema) -> dict[str, Any]:
-    """Numbers hardly repeat: only text is worth a dictionary, and lists are not worth squeezing."""
-    text = [field.name for field in schema if pa.types.is_string(field.type)]
-    lists = {field.name for field in schema if pa.types.is_list(field.type)}
-    others = [field.name for field in schema if field.name not in lists]
-    return {
-        # Columns of lists have longer names in the file; what is not named is not squeezed.
-        "compression": dict.fromkeys(others, "snappy"),
-        "use_dictionary": text,
-        "write_statistics": others,
-    }
-
-
-def pick_rows(
-    path: Path, rows: Sequence[int], columns: Sequence[str] | None = None
-) -> list[dict[str, Any]]:
-    """Some rows of a Parquet file as dictionaries, in order; one row group in memory at a time."""
-    wanted, first, picked = sorted(set(rows)), 0, []
-    with pq.ParquetFile(path) as file:
-        for group in range(file.num_row_groups):
-            size = file.metadata.row_group(group).num_rows
-            local = [row - first for row in wanted if first <= row < first + size]
-            if local:
-                picked += file.read_row_group(group, columns=columns).take(local).to_pylist()
-            first += size
-    return picked
+def _is_left(path: Path) -> bool:
+    """Whether a file is what a process leaves that was killed before it had a manifest."""
+    return path.name == LOCK or is_scratch(path)

@@ -14,6 +14,7 @@ from planner_jax.registry import Task, UnknownName, require_name
 from planner_jax.task.scales import scale_problem
 
 AnySettings = TypeVar("AnySettings", bound="SweepSettings")
+KnownSettings = TypeVar("KnownSettings")
 
 
 class SettingError(ValueError):
@@ -156,11 +157,31 @@ def settings_to_resume(
         given: settings that the caller named; they must be the run's.
 
     Raises:
-        SettingError: a given value is not the run's.
+        SettingError: a given value is not the run's, or the run's are not such settings.
     """
-    settings = kind(**parameters)
+    settings = settings_of_manifest(kind, parameters, "out")
     asked = dataclasses.replace(settings, **given)
     for name in given:
         old, new = getattr(settings, name), getattr(asked, name)
         require(new == old, name, f"{old} as in the run that is resumed", new)
     return settings
+
+
+def settings_of_manifest(
+    kind: type[KnownSettings], parameters: dict[str, Any], name: str
+) -> KnownSettings:
+    """The settings of a run.
+
+    Args:
+        kind: class of the settings.
+        parameters: of the run's manifest.
+        name: of the caller's argument that holds the run's folder, for messages.
+
+    Raises:
+        SettingError: they are not such settings, as where another version wrote them.
+    """
+    try:
+        return kind(**parameters)
+    except (TypeError, ValueError) as error:
+        rule = "a run with settings of this version"
+        raise SettingError(f"{name} must be {rule}, got others: {error}") from None

@@ -9,6 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from planner_jax.whole_files import replacing
+
 BLUE, ORANGE, GREEN, RED = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 PURPLE, SKY, GREY, INK = "#CC79A7", "#56B4E9", "#8A8F98", "#24292F"
 PALE = "#C9CDD2"
@@ -51,7 +53,7 @@ _LOOK: dict[Any, Any] = {
 
 
 def draw(path: Path, figure: Callable[..., None], size: tuple[float, float], *data: Any) -> None:
-    """Draw one figure and write it as PNG.
+    """Draw one figure and write it whole, as PNG.
 
     Args:
         path: of the file.
@@ -63,7 +65,8 @@ def draw(path: Path, figure: Callable[..., None], size: tuple[float, float], *da
         canvas = Figure(figsize=size)
         FigureCanvasAgg(canvas)
         figure(canvas, *data)
-        canvas.savefig(path)
+        with replacing(path) as scratch:
+            canvas.savefig(scratch, format="png")
 
 
 def label(axes: Axes, x: str, y: str, title: str = "") -> None:

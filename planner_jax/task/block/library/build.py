@@ -36,6 +36,7 @@ from planner_jax.task.block.library.table import (
 from planner_jax.task.block.motion import angles_at
 from planner_jax.task.block.online import learned_starts
 from planner_jax.task.block.scene import Scene
+from planner_jax.whole_files import replacing
 
 # Learned starts that are tried where there is a motion already; all where there is none. In a
 # repair, what began with the old motion is as good mostly, and one more will do.
@@ -356,9 +357,8 @@ class _Parts:
 
     def write(self, number: int, rows: np.ndarray) -> None:
         path = self._folder / f"{number:05d}.npy"
-        with open(f"{path}.tmp", "wb") as file:
+        with replacing(path) as scratch, open(scratch, "wb") as file:
             np.save(file, rows, allow_pickle=False)
-        os.replace(f"{path}.tmp", path)
 
     def remove(self) -> None:
         if self._folder.exists():

@@ -26,6 +26,7 @@ from planner_jax.task.block.library.table import (
     pieces_of,
 )
 from planner_jax.task.block.scene import Box, Scene
+from planner_jax.whole_files import replacing
 
 VERSION = 1
 BUILD_VERSION = 1  # of how libraries are planned: parts of another one are not gone on with
@@ -63,13 +64,11 @@ def save_library(path: str | os.PathLike, library: Library) -> None:
         return f"{_MAGIC} {VERSION}\n{json.dumps(header)}\n".encode()
 
     begin = _up(len(text(1 << 40)))
-    scratch = f"{os.fspath(path)}.tmp"
-    with open(scratch, "wb") as file:
+    with replacing(path) as scratch, open(scratch, "wb") as file:
         lines = text(begin)
         file.write(lines[:-1] + b" " * (begin - len(lines)) + b"\n")
         for array in arrays.values():
             file.write(array.tobytes() + bytes(_up(array.nbytes) - array.nbytes))
-    os.replace(scratch, path)
 
 
 def load_library(path: str | os.PathLike) -> Library:
@@ -98,12 +97,33 @@ def load_library(path: str | os.PathLike) -> Library:
         )
     try:
         header = json.loads(second)
-    except ValueError:
+    except (ValueError, RecursionError):
         raise LibraryFileError(f"library must be a whole file, {shown} is cut off") from None
-    if size != header["size"]:
-        raise LibraryFileError(
-            f"library must be a whole file of {header['size']} bytes, got {size} in {shown}"
-        )
+    try:
+        if size != header["size"]:
+            raise LibraryFileError(
+                f"library must be a whole file of {header['size']} bytes, got {size} in {shown}"
+            )
+        library, rows = _library(path, header)
+    except (KeyError, TypeError, IndexError, AttributeError, OverflowError, OSError) as error:
+        raise _damaged(shown, error) from None
+    except ValueError as error:
+        raise error if isinstance(error, LibraryFileError) else _damaged(shown, error) from None
+    layout = library.table.layout
+    known, found = header["fingerprint"], fingerprint(library.setting)
+    if known != found or rows.shape[1] != layout.num_pairs or pieces_of(rows) < 1:
+        raise LibraryFileError(f"library must have the setting {known}, got {found} in {shown}")
+    return library
+
+
+def _damaged(shown: str, error: Exception) -> LibraryFileError:
+    return LibraryFileError(
+        f"library must be a whole file, {shown} has a damaged header ({type(error).__name__})"
+    )
+
+
+def _library(path: str | os.PathLike, header: dict[str, Any]) -> tuple[Library, np.ndarray]:
+    """The library that a header describes, and its rows, which are mapped."""
     arrays: dict[str, Any] = {
         name: np.memmap(path, kind, "r", place, tuple(shape))
         if shape
@@ -112,11 +132,8 @@ def load_library(path: str | os.PathLike) -> Library:
     }
     layout = Layout(*(tuple(_face(face) for face in header["layout"][s]) for s in _BOXES))
     rows = arrays.pop("rows")
-    library = library_of(rows, np.array(arrays.pop("homes")), layout, _setting(header, arrays))
-    known, found = header["fingerprint"], fingerprint(library.setting)
-    if known != found or rows.shape[1] != layout.num_pairs or pieces_of(rows) < 1:
-        raise LibraryFileError(f"library must have the setting {known}, got {found} in {shown}")
-    return library
+    homes = np.array(arrays.pop("homes"))
+    return library_of(rows, homes, layout, _setting(header, arrays)), rows
 
 
 _BOXES = ("outer", "inner")

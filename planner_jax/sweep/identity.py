@@ -1,0 +1,77 @@
+"""Which run a part is of, what made it and of which settings: a run is never a mixture."""
+
+import datetime
+import os
+import uuid
+from pathlib import Path
+from typing import Any
+
+from planner_jax.sweep.environment import environment
+from planner_jax.sweep.parquet import file_sum
+from planner_jax.sweep.plain_json import digest_of
+from planner_jax.sweep.settings import SettingError
+from planner_jax.sweep.source import Source
+
+IDENTITY = ("run", "version", "code", "settings")  # of a manifest, and of every part
+# What a row depends on besides the code: packages, and what is known of the devices.
+_PACKAGES = ("planner-jax", "jax", "jaxlib", "numpy", "scipy")
+_OF_DEVICES = ("platform", "kind", "count")
+
+
+def begun_now() -> dict[str, Any]:
+    """When a session begins, and where."""
+    now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    return {"started": now, **environment()}
+
+
+def identity_of(
+    source: Source, description: dict[str, Any], session: dict[str, Any]
+) -> dict[str, str]:
+    """What a new run is known by.
+
+    Args:
+        source: of its cases.
+        description: of the source.
+        session: the first one, as of `begun_now`.
+    """
+    return {
+        "run": uuid.uuid4().hex,
+        "version": str(session["versions"]["planner-jax"]),
+        "code": session["code"],
+        "settings": settings_digest(source, description),
+    }
+
+
+def settings_digest(source: Source, description: dict[str, Any]) -> str:
+    """Of all that decides the cases and what is asked of their plans, named files with it."""
+    parameters, files = source.settings.parameters(), {}
+    for name, value in parameters.items():
+        place = value.partition(":")[2] if isinstance(value, str) else ""
+        if os.path.isfile(place):  # as in library:FILE
+            files[name] = file_sum(Path(place))
+    return digest_of({"parameters": parameters, "source": description, "files": files})
+
+
+def require_same_maker(manifest: dict[str, Any], session: dict[str, Any]) -> None:
+    """Raise `SettingError` unless the rest of a run would be planned as it began.
+
+    Args:
+        manifest: of the run.
+        session: that would go on with it, as of `begun_now`.
+    """
+    known = [("versions", name, name) for name in _PACKAGES]
+    known += [("device", name, f"devices of {name}") for name in _OF_DEVICES]
+    for entry, name, what in known:
+        _require_same(what, manifest[entry].get(name), session[entry][name])
+    if manifest["code"] != session["code"]:
+        old, new = (
+            f"{each.get('git_commit') or 'unknown'} (files {str(each['code'])[:12]})"
+            for each in (manifest, session)
+        )
+        _require_same("planner-jax of commit", old, new)
+
+
+def _require_same(what: str, old: Any, new: Any) -> None:
+    if old != new:
+        rule = f"resumed by {what} {old}, as it began"
+        raise SettingError(f"out must be {rule}, got {new}; or begin anew in another folder")

@@ -1,0 +1,82 @@
+"""Parquet files of runs: with checksums of their pages, which are verified when they are read."""
+
+import zlib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+ROW_GROUP = 2048  # rows, some 3 MB: little has to be read for one of them
+_BLOCK = 1 << 20  # bytes
+
+
+def encoding(schema: pa.Schema) -> dict[str, Any]:
+    """How rows are written.
+
+    Numbers hardly repeat: only text is worth a dictionary, and lists are not worth squeezing.
+    """
+    text = [field.name for field in schema if pa.types.is_string(field.type)]
+    lists = {field.name for field in schema if pa.types.is_list(field.type)}
+    others = [field.name for field in schema if field.name not in lists]
+    return {
+        # Columns of lists have longer names in the file; what is not named is not squeezed.
+        "compression": dict.fromkeys(others, "snappy"),
+        "use_dictionary": text,
+        "write_statistics": others,
+        "write_page_checksum": True,
+    }
+
+
+def file_sum(path: Path) -> dict[str, int]:
+    """Size and CRC-32 of a file, by which its damage is known.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    size, found = 0, 0
+    with path.open("rb") as file:
+        while block := file.read(_BLOCK):
+            size, found = size + len(block), zlib.crc32(block, found)
+    return {"bytes": size, "crc32": found}
+
+
+def opened(source: Any) -> pq.ParquetFile:
+    """A Parquet file or its bytes; whoever reads a page of a wrong checksum is told.
+
+    Raises:
+        pa.ArrowException, OSError: it cannot be read.
+    """
+    return pq.ParquetFile(source, page_checksum_verification=True)
+
+
+def read_rows(path: Path, columns: Sequence[str] | None = None) -> pa.Table:
+    """Some columns, by default all, of all rows of a file."""
+    with opened(path) as file:
+        return file.read(columns=None if columns is None else list(columns))
+
+
+def row_groups(path: Path, columns: Sequence[str] | None = None) -> Iterator[tuple[int, pa.Table]]:
+    """The rows of a file, some at a time, each with the place of the first one."""
+    first = 0
+    with opened(path) as file:
+        for group in range(file.num_row_groups):
+            rows = file.read_row_group(group, columns=columns)
+            yield first, rows
+            first += rows.num_rows
+
+
+def pick_rows(
+    path: Path, rows: Sequence[int], columns: Sequence[str] | None = None
+) -> list[dict[str, Any]]:
+    """Some rows of a Parquet file as dictionaries, in order; one row group in memory at a time."""
+    wanted, first, picked = sorted(set(rows)), 0, []
+    with opened(path) as file:
+        for group in range(file.num_row_groups):
+            size = file.metadata.row_group(group).num_rows
+            local = [row - first for row in wanted if first <= row < first + size]
+            if local:
+                picked += file.read_row_group(group, columns=columns).take(local).to_pylist()
+            first += size
+    return picked

@@ -1,0 +1,119 @@
+"""The parts of a sweep: the rows of one chunk each, in `parts/` until all are joined.
+
+A part is checked, not trusted. Its name holds the checksum of the file; its metadata say of which
+run it is, made by what, of which settings, and which rows it holds. What does not agree is removed
+with a word on the standard error stream, and its cases are planned again.
+"""
+
+import dataclasses
+import json
+import sys
+import zlib
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from planner_jax.sweep.manifest import FORMAT, is_count, is_number
+from planner_jax.sweep.parquet import ROW_GROUP, encoding, opened
+from planner_jax.sweep.plain_json import JsonError, parse_object
+from planner_jax.sweep.source import Source
+from planner_jax.whole_files import replacing
+
+_RECORD = b"part"
+_SECONDS = ("plan_seconds", "compile_seconds", "referee_seconds", "wall_seconds")
+
+
+class PartError(ValueError):
+    """A file is not a part of the run; a few words that say why."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Parts:
+    """The parts of one run.
+
+    Args:
+        folder: that holds them, which need not exist.
+        identity: of the run, as its manifest has it: `run`, `settings` and `code`.
+        source: of the cases.
+    """
+
+    folder: Path
+    identity: dict[str, str]
+    source: Source
+
+    def write(self, number: int, rows: pa.Table, record: dict[str, Any]) -> dict[str, Any]:
+        """Write the rows of a chunk; gives the record of how they came about as it is kept."""
+        self.folder.mkdir(exist_ok=True)
+        record = {**self._own(number), **record}
+        metadata = {**(rows.schema.metadata or {}), _RECORD: json.dumps(record).encode()}
+        stream = pa.BufferOutputStream()
+        how = encoding(rows.schema)
+        pq.write_table(
+            rows.replace_schema_metadata(metadata), stream, row_group_size=ROW_GROUP, **how
+        )
+        content = stream.getvalue()
+        name = f"part-{number:06d}-{zlib.crc32(content):08x}.parquet"
+        with replacing(self.folder / name) as scratch:
+            scratch.write_bytes(content)
+        return record
+
+    def sound(self) -> dict[int, dict[str, Any]]:
+        """The records of the parts that are there, by their numbers; removes what is none."""
+        found: dict[int, dict[str, Any]] = {}
+        for path in sorted(self.folder.iterdir()) if self.folder.is_dir() else ():
+            try:
+                number, record = self._record(path)
+                if number in found:
+                    raise PartError("is there twice")
+                found[number] = record
+            except (PartError, JsonError) as error:
+                print(
+                    f"planner-jax: {path} {error}; what it held is planned again", file=sys.stderr
+                )
+                path.unlink()
+        return found
+
+    def read(self, number: int) -> pa.Table:
+        """The rows of a part that is sound."""
+        (path,) = self.folder.glob(f"part-{number:06d}-*.parquet")
+        with opened(path) as file:
+            rows = file.read()
+        kept = {key: value for key, value in rows.schema.metadata.items() if key != _RECORD}
+        return rows.replace_schema_metadata(kept)
+
+    def _own(self, number: int) -> dict[str, Any]:
+        """What a part must say of itself."""
+        first = number * self.source.batch
+        num = min(self.source.batch, self.source.num - first)
+        return {"format": FORMAT, **self.identity, "first": first, "num": num}
+
+    def _record(self, path: Path) -> tuple[int, dict[str, Any]]:
+        """Number and record of a part.
+
+        Raises:
+            PartError, JsonError: the file is none of this run, or damaged.
+        """
+        word, _, rest = path.stem.partition("-")
+        number, _, known = rest.partition("-")
+        if word != "part" or not number.isdecimal() or path.suffix != ".parquet":
+            raise PartError("is no part of a sweep")
+        content = path.read_bytes()
+        if f"{zlib.crc32(content):08x}" != known:
+            raise PartError("is damaged: its checksum is not that of its name")
+        try:
+            with opened(pa.BufferReader(content)) as file:
+                metadata, num_rows = file.schema_arrow.metadata or {}, file.metadata.num_rows
+        except (pa.ArrowException, OSError):
+            raise PartError("is not Parquet") from None
+        record = parse_object(metadata.get(_RECORD, b"{}"))
+        for name, wanted in self._own(int(number)).items():
+            if record.get(name) != wanted:
+                raise PartError(f"is of {name} {record.get(name)}, and not of {wanted}")
+        sound = is_count(record.get("successes")) and isinstance(record.get("warm"), bool)
+        if not sound or not all(is_number(record.get(name)) for name in _SECONDS):
+            raise PartError("has no whole record")
+        if num_rows != record["num"]:
+            raise PartError(f"has {num_rows} rows, and not {record['num']}")
+        return int(number), record

@@ -1,0 +1,82 @@
+"""What each part of a training leaves: parameters, kept by Orbax, with a digest beside them."""
+
+import hashlib
+import json
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import orbax.checkpoint as orbax
+
+from planner_jax.sweep.manifest import to_write
+from planner_jax.sweep.plain_json import JsonError, read_object, require_sealed
+from planner_jax.whole_files import replacing
+
+
+class KeptParts:
+    """The parameters after every part, a folder each and a file with their digest.
+
+    What does not agree with its digest is forgotten, with a word on the standard error stream.
+
+    Args:
+        folder: that holds them, which need not exist.
+    """
+
+    def __init__(self, folder: Path):
+        self._folder, self._keeper = folder, orbax.StandardCheckpointer()
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def save(self, number: int, params: Any) -> None:
+        """Keep the parameters after a part."""
+        place = self._place(number)
+        if place.exists():
+            shutil.rmtree(place)
+        self._keeper.save(place, params)
+        self._keeper.wait_until_finished()
+        text = json.dumps(to_write({"sha256": _digest(params)}))
+        with replacing(self._note(number)) as scratch:
+            scratch.write_text(text + "\n", encoding="utf-8")
+
+    def restored(self, number: int, like: Any) -> Any | None:
+        """The parameters after a part; None where there are none, or not those that were kept.
+
+        Args:
+            number: of the part.
+            like: parameters of the same shapes.
+        """
+        try:
+            note = read_object(self._note(number))
+            require_sealed(note)
+            found = jax.device_get(self._keeper.restore(self._place(number), like))
+            if _digest(found) == note["sha256"]:
+                return found
+            why = "its digest is another"
+        except FileNotFoundError:
+            return None
+        except JsonError as error:
+            why = f"its note {error}"
+        except Exception as error:  # of whatever kind Orbax and what it reads with may raise
+            why = type(error).__name__
+        place = self._place(number)
+        print(
+            f"planner-jax: {place} is damaged ({why}); the part is trained again", file=sys.stderr
+        )
+        return None
+
+    def _place(self, number: int) -> Path:
+        return (self._folder / f"{number:03d}").absolute()
+
+    def _note(self, number: int) -> Path:
+        return self._folder / f"{number:03d}.json"
+
+
+def _digest(params: Any) -> str:
+    digest = hashlib.sha256()
+    for leaf in jax.tree.leaves(params):
+        array = np.asarray(leaf)
+        digest.update(f"{array.dtype.str} {array.shape} ".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()

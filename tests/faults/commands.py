@@ -1,0 +1,76 @@
+"""Commands in this process and in others, and what may be said of how they end."""
+
+import contextlib
+import io
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+from planner_jax.cli import main
+
+
+class Ended(NamedTuple):
+    """How a command ended."""
+
+    code: int
+    out: str
+    err: str
+
+
+def run(*arguments: str | Path) -> Ended:
+    """A command in this process, which has no handlers of signals."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            code = main(list(map(str, arguments)))
+        except SystemExit as stop:
+            code = int(str(stop.code))
+    return Ended(code, out.getvalue(), err.getvalue())
+
+
+def start(
+    *arguments: str | Path, cwd: Path, cache: str | None = None, blocks: int | None = None
+) -> subprocess.Popen:
+    """A command in a process of its own.
+
+    Args:
+        *arguments: of `planner-jax`.
+        cwd: folder where it runs.
+        cache: folder of compiled programs; the usual one if not given.
+        blocks: of 1,024 bytes that a file may have at most.
+    """
+    cached = {"JAX_COMPILATION_CACHE_DIR": cache} if cache else {}
+    command = [sys.executable, "-m", "planner_jax", *map(str, arguments)]
+    if blocks is not None:
+        command = ["bash", "-c", f'ulimit -f {blocks}; exec "$@"', "limited", *command]
+    return subprocess.Popen(
+        command,
+        cwd=cwd,
+        env={**os.environ, **cached, "PYTHONFAULTHANDLER": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def finished(process: subprocess.Popen) -> Ended:
+    """Wait for the end of a process."""
+    out, err = process.communicate()
+    return Ended(process.returncode, out, err)
+
+
+def is_one_line(ended: Ended) -> bool:
+    """Whether a command that failed said so in one line of its own, and nothing else."""
+    said = ended.err.startswith("planner-jax: error: ") and ended.err.count("\n") == 1
+    return ended.code in (1, 2) and said and ended.out == ""
+
+
+def is_stopped(ended: Ended, number: int) -> bool:
+    """Whether a command was ended by a signal with its code and a line, without a traceback."""
+    words = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGHUP: "hung up"}
+    last = ended.err.rstrip("\n").rpartition("\n")[2]
+    said = last.startswith(f"planner-jax: {words[signal.Signals(number)]}; ")
+    return ended.code == 128 + number and said and "Traceback" not in ended.err

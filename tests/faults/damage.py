@@ -1,0 +1,83 @@
+"""Damage to files: bits that flip, ends that are cut, values that are swapped, depth."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+# What stands for a value that does not belong.
+ODD = (None, True, -1, 0, 10**400, 1.5, float("nan"), float("inf"), "", "x", [], {}, [[]], {"a": 1})
+
+
+def flip(content: bytes, random: Any) -> bytes:
+    """Some bits changed, anywhere."""
+    changed = bytearray(content)
+    for _ in range(random.choice((1, 1, 2, 64))):
+        place = random.randrange(len(changed))
+        changed[place] ^= 1 << random.randrange(8)
+    return bytes(changed)
+
+
+def cut(content: bytes, random: Any) -> bytes:
+    """The end missing, or all."""
+    return content[: random.choice((0, random.randrange(len(content)), len(content) - 1))]
+
+
+def overwrite(content: bytes, random: Any) -> bytes:
+    """A stretch of zeros, or of another place of the file."""
+    length = random.randrange(1, 65)
+    place, other = (random.randrange(len(content)) for _ in range(2))
+    stretch = random.choice((bytes(length), content[other : other + length]))
+    return content[:place] + stretch + content[place + len(stretch) :]
+
+
+def append(content: bytes, random: Any) -> bytes:
+    """Something behind the end."""
+    return content + random.choice((b"\0", b"{}", content))
+
+
+def nest(content: bytes, random: Any) -> bytes:
+    """Depth without an end."""
+    depth = random.choice((1_000, 100_000))
+    return random.choice((b"[", b'{"a":')) * depth
+
+
+def swap(content: bytes, random: Any) -> bytes:
+    """A value of a JSON object, however deep, that does not belong; or an entry is missing."""
+    lines = content.decode().splitlines()
+    if not _is_json(lines[0]):  # one object in the whole file
+        lines = [content.decode()]
+    line = random.randrange(len(lines))
+    tree = json.loads(lines[line])
+    at, places = tree, []
+    while isinstance(at, dict | list) and at:
+        keys = list(at) if isinstance(at, dict) else list(range(len(at)))
+        places.append((at, random.choice(keys)))
+        at = places[-1][0][places[-1][1]]
+    holder, key = random.choice(places)
+    if isinstance(holder, dict) and random.random() < 0.3:
+        del holder[key]
+    else:
+        holder[key] = random.choice(ODD)
+    lines[line] = json.dumps(tree)
+    return "\n".join(lines).encode()
+
+
+def _is_json(text: str) -> bool:
+    try:
+        json.loads(text)
+    except ValueError:
+        return False
+    return True
+
+
+ANY: tuple[Callable[[bytes, Any], bytes], ...] = (flip, cut, overwrite, append)
+OF_JSON = (*ANY, nest, swap)
+
+
+def damage(path: Path, random: Any) -> str:
+    """Damage a file; gives the name of the damage."""
+    kinds = OF_JSON if path.suffix in (".json", ".jsonl") else ANY
+    kind = random.choice(kinds)
+    path.write_bytes(kind(path.read_bytes(), random))
+    return kind.__name__

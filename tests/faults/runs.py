@@ -1,0 +1,223 @@
+"""Small runs to be damaged, made once a process, and what their readers may say of the damage."""
+
+import contextlib
+import dataclasses
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+import planner_jax as pj
+from planner_jax.plan_files import PlanFileError
+from planner_jax.planning.plan import plan
+from planner_jax.policies.progress import to_text
+from planner_jax.sims.recording import FILE, read_recording, to_rows
+from planner_jax.sims.settings import CatchFly
+from planner_jax.sweep.hit.settings import HitSettings
+from planner_jax.sweep.hit.sweep import HitSweep
+from planner_jax.sweep.manifest import to_write
+from planner_jax.sweep.run import SweepInterrupted, start_sweep
+from planner_jax.sweep.run_folder import RunFolder
+from planner_jax.sweep.settings import SettingError
+from planner_jax.task.hit.exact import ExactHit
+from planner_jax.task.hit.plan import HitPlan
+from tests.faults.commands import Ended, is_one_line, run
+from tests.faults.damage import damage
+from tests.recordings import recording
+from tests.sweeps import stop_after
+
+TASK = pj.task_named("hit")
+SETTINGS = HitSettings(num=40, batch=13, seed=3)  # by the program of tests/test_sweep.py
+IDENTICAL, REFUSED, MENDED = "identical", "refused", "mended"
+
+
+@contextlib.contextmanager
+def quick_sweeps() -> Iterator[pytest.MonkeyPatch]:
+    """Hits in one round, without figures and other planners, and nothing that is drawn."""
+    planner = ExactHit(rounds=ExactHit().rounds[:1])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(HitSweep, "planner", lambda *_: planner)
+        patch.setattr(HitSweep, "other_planners", lambda *_: {})
+        patch.setattr(HitSweep, "figures", ())
+        yield patch
+
+
+def make_runs(place: Path) -> None:
+    """A finished sweep, one with two of four parts, recorded flights, a training and plans."""
+    start_sweep(TASK, SETTINGS, place / "whole", progress=False)
+    with pytest.MonkeyPatch.context() as patch, contextlib.suppress(SweepInterrupted):
+        stop_after(patch, HitSweep, 3)
+        start_sweep(TASK, SETTINGS, place / "begun", progress=False)
+    make_flights(place / "flights")
+    make_training(place / "training")
+    cases = jax.tree.map(np.asarray, pj.hit.draw(3, seed=1))
+    (place / "plans").mkdir()
+    plan(HitSweep(TASK).planner(SETTINGS), cases, chunk=16).save(place / "plans" / "plans.npz")
+
+
+def make_flights(out: Path) -> None:
+    """A folder like that of a run of flights."""
+    manifest = {
+        **{"kind": "fly catch", "state": "complete", "seed": 0},
+        "parameters": dataclasses.asdict(CatchFly()),
+        **{"device": {}, "loop": {}, "times": {"compile_seconds": 0.0, "wall_seconds": 1.0}},
+        "summary": {
+            **{"num": 1, "successes": 1, "success_rate": 1.0, "wilson_95": [0.2, 1.0]},
+            **{"tracking_rms_median": 0.0, "tracking_worst": 0.0},
+        },
+    }
+    folder = RunFolder(out)
+    with folder.begun():
+        folder.write_rows(out / FILE, to_rows(recording()))
+        folder.write_manifest(manifest)
+
+
+def make_training(out: Path) -> None:
+    """A folder with what curves are drawn from."""
+    out.mkdir()
+    (out / "training.json").write_text(json.dumps(to_write({"suites": ["throws"], "seed": 0})))
+    names = ("per_second", "reward", "solved", "last", "ratio", "violation")
+    rows = [{"part": 0, "decisions": k, **{name: 0.5 + k for name in names}} for k in range(1, 4)]
+    (out / "progress.jsonl").write_text(to_text(rows))
+
+
+def verdict(place: Path, target: str, name: str, random: Any, scratch: Path) -> str:
+    """Damage a file of a copy of a run, read it, and say what came of it.
+
+    Args:
+        place: of the runs that `make_runs` made.
+        target: the run, and the reader behind a colon.
+        name: of the file, or a pattern of which one is taken.
+        random: that chooses the damage.
+        scratch: folder for the copy, new.
+
+    Returns:
+        `IDENTICAL`, `REFUSED` or `MENDED`.
+
+    Raises:
+        AssertionError: none of these; says what was damaged and how.
+    """
+    which, _, reader = target.partition(":")
+    shutil.copytree(place / which, scratch)
+    path = random.choice(sorted(scratch.glob(name)))
+    before = path.read_bytes()
+    how = damage(path, random)
+    try:
+        found = _READERS[reader](place, scratch)
+    except Exception as error:
+        raise AssertionError(f"{target}: {path.name} after {how}: {error!r}") from error
+    finally:
+        kept = path.read_bytes() if path.exists() else before
+        shutil.rmtree(scratch, ignore_errors=True)
+    assert found is not None, f"{target}: {path.name} after {how}, {len(kept)} bytes"
+    return found
+
+
+def _same_or_refused(ended: Ended, wanted: str) -> str | None:
+    if ended.code == 0:
+        return IDENTICAL if ended.out == wanted else None
+    return REFUSED if is_one_line(ended) else None
+
+
+def _report(place: Path, out: Path) -> str | None:
+    ended = run("report", out)
+    text = (place / "whole" / "table.md").read_text()
+    same = (out / "table.md").exists() and (out / "table.md").read_text() == text
+    return _same_or_refused(ended, ended.out if same and "plans/s" in ended.out else "")
+
+
+def _resume(place: Path, out: Path) -> str | None:
+    """The rows are those of the whole run, or the folder is refused."""
+    ended = run("sweep", "hit", "--resume", "--out", out)
+    if ended.code:
+        return REFUSED if is_one_line(ended) else None
+    rows = [(each / "plans.parquet").read_bytes() for each in (out, place / "whole")]
+    if rows[0] != rows[1] or "Traceback" in ended.err:
+        return None
+    return MENDED if "made anew" in ended.err or "planned again" in ended.err else IDENTICAL
+
+
+def _view(place: Path, out: Path) -> str | None:
+    """What the viewer is given, instead of the viewer."""
+    shown: list[Any] = []
+    with pytest.MonkeyPatch.context() as patch:
+        viewer = SimpleNamespace(Viewer=lambda _, found, *__: shown.append(found) or _Shut())
+        patch.setitem(__import__("sys").modules, "planner_jax.sims.view", viewer)
+        ended = run("view", out)
+    if ended.code:
+        return REFUSED if is_one_line(ended) else None
+    wanted = vars(read_recording(place / "flights" / FILE))
+    same = [
+        np.array_equal(getattr(shown[0], name), value, equal_nan=value.dtype.kind == "f")
+        for name, value in wanted.items()
+    ]
+    return IDENTICAL if all(same) else None
+
+
+class _Shut:
+    """A viewer that is closed at once."""
+
+    url = "nowhere"
+
+    def run(self) -> None:
+        """Return."""
+
+
+def _curves(place: Path, out: Path) -> str | None:
+    from planner_jax.policies import curves
+
+    drawn: list[Any] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(curves.style, "draw", lambda *data: drawn.append(data[-1]))
+        try:
+            curves.draw_curves([out], out / "curves.png")
+        except SettingError as error:
+            return REFUSED if "\n" not in str(error) else None
+        curves.draw_curves([place / "training"], out / "curves.png")
+    return IDENTICAL if drawn[0] == drawn[1] else None
+
+
+def _load(place: Path, out: Path) -> str | None:
+    wanted = HitPlan.load(place / "plans" / "plans.npz")
+    try:
+        found = HitPlan.load(out / "plans.npz")
+    except PlanFileError as error:
+        return REFUSED if "\n" not in str(error) else None
+    pairs = zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True)
+    same = all(np.array_equal(a, b, equal_nan=a.dtype.kind == "f") for a, b in pairs)
+    return IDENTICAL if same else None
+
+
+_READERS = {
+    "report": _report,
+    "resume": _resume,
+    "view": _view,
+    "curves": _curves,
+    "load": _load,
+}
+# What is damaged, and by whom it is read then: of a manifest, of parts, of rows, of flights, ...
+TARGETS = {
+    "manifest": [("whole:report", "manifest.json"), ("whole:resume", "manifest.json")],
+    "manifest of an interrupted run": [("begun:resume", "manifest.json")],
+    "parts": [("begun:resume", "parts/*.parquet")],
+    "plans.parquet": [("whole:report", "plans.parquet"), ("whole:resume", "plans.parquet")],
+    "flights": [("flights:view", FILE), ("flights:view", "manifest.json")],
+    "training": [("training:curves", "training.json"), ("training:curves", "progress.jsonl")],
+    "plans.npz": [("plans:load", "plans.npz")],
+}
+
+
+def copied(place: Path, which: str, under: Path) -> Path:
+    """A copy of a run in a folder."""
+    return Path(shutil.copytree(place / which, under / which))
+
+
+def rows_of(out: Path) -> bytes:
+    """The rows of a run as they are in its file."""
+    return (out / "plans.parquet").read_bytes()

@@ -1,0 +1,95 @@
+"""Damaged files are refused in one line, mended, or read as if they were whole."""
+
+import json
+import uuid
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from planner_jax.sweep.plain_json import read_object
+from planner_jax.sweep.run import resume_sweep
+from planner_jax.sweep.run_folder import RunFolder
+from planner_jax.sweep.settings import SettingError
+from tests.faults.commands import is_one_line, run
+from tests.faults.runs import TARGETS, TASK, copied, rows_of, verdict
+
+
+@pytest.mark.parametrize("what", TARGETS)
+@settings(
+    max_examples=12,
+    deadline=None,
+    derandomize=True,
+    database=None,
+    suppress_health_check=list(HealthCheck),
+)
+@given(random=st.randoms(use_true_random=False), choice=st.integers(0, 7))
+def test_damage_is_refused_in_one_line_or_mended_or_changes_nothing(runs, what, random, choice):
+    targets = TARGETS[what]
+    target, name = targets[choice % len(targets)]
+    verdict(runs, target, name, random, runs / uuid.uuid4().hex)
+
+
+def rewritten(out, **entries):
+    """The manifest with other entries, as if it had been written so."""
+    folder = RunFolder(out)
+    folder.write_manifest({**read_object(out / "manifest.json"), **entries})
+
+
+@pytest.mark.parametrize(
+    ("found", "told"),
+    [(2, "got format 2 in"), (0, "got format 0 in"), (None, "got one without a format in")],
+)
+def test_another_format_is_named_beside_the_one_that_is_understood(runs, tmp_path, found, told):
+    out = copied(runs, "whole", tmp_path)
+    manifest = {**read_object(out / "manifest.json"), "format": found}
+    (out / "manifest.json").write_text(json.dumps(manifest))
+    ended = run("report", out)
+    assert is_one_line(ended) and "RUN must be a run of format 1" in ended.err and told in ended.err
+
+
+def test_an_edited_manifest_is_refused(runs, tmp_path):
+    out = copied(runs, "begun", tmp_path)
+    text = (out / "manifest.json").read_text()
+    (out / "manifest.json").write_text(text.replace('"batch": 13', '"batch": 7'))
+    ended = run("sweep", "hit", "--resume", "--out", out)
+    assert is_one_line(ended) and "manifest.json is whole" in ended.err and "edited" in ended.err
+
+
+def test_a_summary_that_its_rows_do_not_have_is_refused(runs, tmp_path):
+    out = copied(runs, "whole", tmp_path)
+    summary = read_object(out / "manifest.json")["summary"]
+    rewritten(out, summary={**summary, "successes": summary["successes"] - 1})
+    ended = run("report", out)
+    assert is_one_line(ended) and "RUN must be a run whose successes is that of its" in ended.err
+
+
+def test_a_run_is_not_gone_on_with_by_other_versions_code_or_devices(runs, tmp_path):
+    out = copied(runs, "begun", tmp_path)
+    manifest = read_object(out / "manifest.json")
+    for entry, value, told in (
+        ("versions", {**manifest["versions"], "jax": "0.0.1"}, "jax 0.0.1, as it began, got 0."),
+        ("device", {**manifest["device"], "kind": "abacus"}, "devices of kind abacus, as it"),
+        ("code", "0" * 64, r"planner-jax of commit .* \(files 000000000000\), as it began, got"),
+    ):
+        rewritten(out, **{**manifest, entry: value})
+        with pytest.raises(SettingError, match=told):
+            resume_sweep(TASK, out, progress=False)
+
+
+@pytest.mark.parametrize("entry", ["run", "version"])
+def test_parts_of_another_run_or_version_are_planned_again(runs, tmp_path, entry):
+    out = copied(runs, "begun", tmp_path)
+    rewritten(out, **{entry: "another"})
+    ended = run("sweep", "hit", "--resume", "--out", out)
+    assert ended.code == 0 and ended.err.count(f"is of {entry} ") == 3
+    assert rows_of(out) == rows_of(runs / "whole")
+
+
+def test_a_part_in_the_place_of_another_is_planned_again(runs, tmp_path):
+    out = copied(runs, "begun", tmp_path)
+    first, *_ = sorted((out / "parts").iterdir())
+    first.rename(first.with_name(first.name.replace("000000", "000003")))
+    ended = run("sweep", "hit", "--resume", "--out", out)
+    assert ended.code == 0 and "is of first 0, and not of 39" in ended.err
+    assert rows_of(out) == rows_of(runs / "whole")

@@ -1,0 +1,92 @@
+"""Signals end a command with their own code and a line, whatever its threads are doing."""
+
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from tests.faults.commands import finished, is_stopped, start
+
+PREPARED = """
+import os, signal, sys, time
+from planner_jax import stopping
+stopping.listen()
+"""
+# What a command does then; `rest` is what it says of itself.
+READY = 'print("ready", flush=True)'
+NOTHING_UNDER_WAY = f"{READY}\ntime.sleep(30.0)"
+CHECKING = f"""
+with stopping.under_way(lambda: "go on with: this", bar=False):
+    {READY}
+    try:
+        while True:
+            time.sleep(0.01)
+            stopping.check()
+    except stopping.Stopped:
+        print("tidy", flush=True)
+        stopping.leave()
+"""
+BUSY = f"""
+stopping.GRACE = 0.3
+with stopping.under_way(lambda: "go on with: this", bar=False):
+    {READY}
+    time.sleep(30.0)
+"""
+NUMBERS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
+
+
+def stopped(script, *numbers, ignored=()):
+    """How a script ends that is sent signals when it is ready."""
+    before = "".join(f"import signal; signal.signal({int(n)}, signal.SIG_IGN)\n" for n in ignored)
+    process = subprocess.Popen(
+        [sys.executable, "-c", before + PREPARED + script],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None and process.stdout.readline() == "ready\n"
+    for number in numbers:
+        process.send_signal(number)
+        time.sleep(0.1)  # or the second is the first one still
+    return finished(process)
+
+
+@pytest.mark.parametrize("number", NUMBERS)
+@pytest.mark.parametrize(
+    ("script", "rest", "out"),
+    [
+        (NOTHING_UNDER_WAY, "there is nothing to resume", ""),
+        (CHECKING, "go on with: this", "tidy\n"),
+        (BUSY, "go on with: this", ""),
+    ],
+    ids=["nothing under way", "one that checks", "one that is busy"],
+)
+def test_a_signal_ends_a_command_with_its_code_and_a_line(number, script, rest, out):
+    ended = stopped(script, number)
+    assert is_stopped(ended, number) and ended.out == out
+    assert ended.err.count("\n") == 1 and ended.err.endswith(f"; {rest}\n")
+
+
+def test_a_second_signal_ends_a_busy_command_at_once():
+    busy = BUSY.replace("0.3", "60.0")
+    ended = stopped(busy, signal.SIGINT, signal.SIGINT, signal.SIGINT)
+    assert is_stopped(ended, signal.SIGINT)
+
+
+def test_nohup_is_respected_and_a_background_job_hears_ctrl_c():
+    ended = stopped(
+        NOTHING_UNDER_WAY, signal.SIGHUP, signal.SIGINT, ignored=[signal.SIGHUP, signal.SIGINT]
+    )
+    assert is_stopped(ended, signal.SIGINT)
+
+
+def test_a_command_that_imports_is_ended_without_a_traceback(tmp_path):
+    process = start("sweep", "hit", "--out", "run", cwd=tmp_path)
+    with pytest.raises(subprocess.TimeoutExpired):
+        process.wait(0.7)
+    process.send_signal(signal.SIGINT)
+    ended = finished(process)
+    assert is_stopped(ended, signal.SIGINT) and "there is nothing to resume" in ended.err
+    assert not list(tmp_path.iterdir())

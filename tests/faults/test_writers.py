@@ -1,0 +1,135 @@
+"""Runs that are killed, twins, and disks that fill up: nothing is lost, nothing is silent."""
+
+import contextlib
+import errno
+import os
+import resource
+import socket
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from planner_jax import whole_files
+from planner_jax.sweep.owner import LOCK, owned
+from planner_jax.sweep.run import resume_sweep, start_sweep
+from planner_jax.sweep.run_folder import RunFolder
+from planner_jax.sweep.settings import SettingError
+from tests.faults.commands import is_one_line, run
+from tests.faults.runs import SETTINGS, TASK, rows_of
+
+COMMAND = ("sweep", "hit", "--num", "40", "--batch", "13", "--seed", "3", "--out")
+
+
+class Killed(BaseException):
+    """Nothing that follows is done."""
+
+
+def failing(monkeypatch, number, error):
+    """Let the write of that number fail before its file has its name; tells how many there were."""
+    real, count = os.replace, [0]
+
+    def replace(*names):
+        count[0] += 1
+        if count[0] == number:
+            raise error
+        real(*names)
+
+    monkeypatch.setattr(whole_files.os, "replace", replace)
+    return count
+
+
+def test_a_sweep_killed_before_any_of_its_writes_is_resumed_to_the_same_rows(
+    runs, tmp_path, monkeypatch
+):
+    with monkeypatch.context() as patch:
+        count = failing(patch, 0, Killed())
+        start_sweep(TASK, SETTINGS, tmp_path / "counted", progress=False)
+    assert count[0] >= 9  # manifests, four parts, rows, table, page
+    for number in range(2, count[0] + 1):
+        out = tmp_path / str(number)
+        with monkeypatch.context() as patch:
+            failing(patch, number, Killed())
+            with pytest.raises(Killed):
+                start_sweep(TASK, SETTINGS, out, progress=False)
+        resume_sweep(TASK, out, progress=False)
+        assert rows_of(out) == rows_of(runs / "whole")
+        assert not list(out.rglob(".*"))
+
+
+def test_a_folder_without_its_first_manifest_is_new(runs, tmp_path, monkeypatch):
+    out = tmp_path / "run"
+    out.mkdir()
+    (out / LOCK).write_text("{")  # of a process that was killed
+    (out / ".4711.tmp.manifest.json").write_text("{")
+    start_sweep(TASK, SETTINGS, out, progress=False)
+    assert rows_of(out) == rows_of(runs / "whole") and not list(out.rglob(".*"))
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EACCES])
+def test_a_write_that_fails_names_file_and_option_and_how_to_go_on(
+    runs, tmp_path, monkeypatch, code
+):
+    out = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        failing(patch, 3, OSError(code, os.strerror(code)))
+        ended = run(*COMMAND, out)
+    assert ended.code == 1 and ended.out == ""
+    last = ended.err.splitlines()[-1]
+    assert last.startswith("planner-jax: error: --out must be a folder that can be written, got '")
+    assert f"{out}/parts/part-" in last and os.strerror(code) in last
+    assert last.endswith(f"; finish with: planner-jax sweep hit --resume --out {out}")
+    assert run("sweep", "hit", "--resume", "--out", out).code == 0
+    assert rows_of(out) == rows_of(runs / "whole")
+
+
+def test_files_that_may_not_grow_are_told_of(runs, tmp_path):
+    """As where the disk is full; the limit is between a part and all rows."""
+    out, before = tmp_path / "run", resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(rows_of(runs / "whole")) // 2, before[1]))
+    try:
+        ended = run(*COMMAND, out)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert ended.code == 1 and "plans.parquet' (" in ended.err.splitlines()[-1]
+    assert run("sweep", "hit", "--resume", "--out", out).code == 0
+    assert rows_of(out) == rows_of(runs / "whole")
+
+
+def test_a_name_that_is_too_long_is_refused_in_one_line(tmp_path):
+    ended = run(*COMMAND, tmp_path / ("x" * 300))
+    assert is_one_line(ended) and ended.code == 2
+    assert "--out must be a folder that can be written, got" in ended.err
+
+
+def test_the_second_writer_is_refused_and_told_of_the_first(runs, tmp_path):
+    out = tmp_path / "run"
+    with RunFolder(out).begun():
+        for arguments in (COMMAND, ("sweep", "hit", "--resume", "--out")):
+            (out / "manifest.json").write_bytes((runs / "whole" / "manifest.json").read_bytes())
+            (out / "plans.parquet").write_bytes(rows_of(runs / "whole"))
+            ended = run(*arguments, out)
+            assert is_one_line(ended) and ended.code == 2
+            assert "--out must be a folder that no other process writes, got" in ended.err
+            assert f"owned by process {os.getpid()} on {socket.gethostname()}, since " in ended.err
+        ended = run("report", out)
+        assert is_one_line(ended) and "RUN must be a folder that no other process" in ended.err
+    assert run("report", out).code == 0
+
+
+def test_of_many_that_begin_at_once_one_owns_the_folder(tmp_path):
+    """Threads are as strangers to the lock, since each opens its file anew."""
+    barrier, won = threading.Barrier(4), []
+
+    def hold(number):
+        barrier.wait()
+        with contextlib.suppress(SettingError), owned(tmp_path, "out"):
+            won.append(number)
+            barrier.wait()
+            return
+        barrier.wait()
+
+    for count in range(1, 11):
+        with ThreadPoolExecutor(4) as pool:
+            list(pool.map(hold, range(4)))
+        assert len(won) == count and not list(tmp_path.iterdir())
