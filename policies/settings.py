@@ -18,7 +18,7 @@ _PAPER = ("parabola1", "parabola2", "harmonic2", "triangle3", "hexagon6")
 
 def _each(values: tuple[float, ...]) -> float | tuple[float, ...]:
     """One number, or one a suite."""
-    return values if len(values) > 1 else values[0]
+    return values if len(values) > 1 else next(iter(values))
 
 
 @dataclasses.dataclass(frozen=True)
