@@ -8,9 +8,9 @@ of all orders, `greedy` one, `random` any; `policy` is the shipped one or that o
 mean, and by six proposals of which the earliest stays. Of suites whose targets may be left,
 "caught" is what counts: targets a case, of successes. Last catches are means of what the referee
 accepts. The optimal time ratio (OTR) is that of the decision's own times; "at 25" has the planner
-stop after 25 iterations of one start. A decision is timed alone, for one case at a time from NumPy
-arrays to order and times, compiled before. No policy was trained on the seed, which is not that of
-`draw`'s default either.
+stop after 25 iterations of one start. A decision is timed alone, compiled before, for one case at a
+time: from the case's numbers in one NumPy vector to order and times in another. No policy was
+trained on the seed, which is not that of `draw`'s default either.
 """
 
 import argparse
@@ -19,6 +19,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 import planner_jax as pj
 from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
@@ -37,15 +38,18 @@ SHORT = ExactCatch(rounds=(Round(starts=1, solver=LbfgsConfig(max_steps=25)),))
 
 
 def decision_time(decision: Any, cases: Any, num: int) -> float:
-    """Median seconds of a decision about one case."""
+    """Median seconds of a decision about one case, from one vector to one."""
     cpu = jax.local_devices(backend="cpu")[0]
     lanes = [pj.lane(cases, k % cases.batch_shape[0]) for k in range(num)]
     with jax.default_device(cpu):
-        decide = jax.jit(decision.propose).lower(lanes[0]).compile()
+        _, case_of = ravel_pytree(lanes[0])
+        decide = jax.jit(lambda vector: ravel_pytree(decision.propose(case_of(vector)))[0])
+        vectors = [np.asarray(ravel_pytree(case)[0]) for case in lanes]
+        np.asarray(decide(vectors[0]))
         seconds = []
-        for case in lanes:
+        for vector in vectors:
             began = time.perf_counter()
-            jax.device_get(decide(case))
+            np.asarray(decide(vector))
             seconds.append(time.perf_counter() - began)
     return float(np.median(seconds))
 

@@ -65,7 +65,8 @@ def require_disk(name: str, num: int, bytes_each: int, folder: str | os.PathLike
         folder: which may not be there yet.
     """
     path = Path(folder).absolute()
-    there = next((each for each in [path, *path.parents] if each.exists()), Path.cwd())
+    # A name that is too long for the disk is nowhere, and is told where the folder is made.
+    there = next((each for each in [path, *path.parents] if os.path.exists(each)), Path.cwd())
     disk = shutil.disk_usage(there)
     free = disk.free
     if disk.total and num * bytes_each > free:  # some of the system's own folders have no disk

@@ -19,6 +19,7 @@ from planner_jax.planning.decided import first_choice
 from planner_jax.planning.plan import plan
 from planner_jax.protocol import Plan, Status, is_solved
 from planner_jax.referee.catch import referee_catches
+from planner_jax.task.catch.chain import nearest_upright
 from planner_jax.task.catch.decide import Greedy
 from planner_jax.task.catch.exact import ExactCatch
 from planner_jax.task.catch.suites import draw
@@ -193,7 +194,9 @@ def test_all_products_of_the_objective_are_in_full_precision(cases):
 
 
 def test_sizes_that_make_no_sense_are_refused(cases):
-    with pytest.raises(ValueError, match=r"proportions must be of >= 2 pieces, got \(1.0,\)"):
+    with pytest.raises(
+        ValueError, match=r"proportions must be of >= 2 pieces, finite and > 0, got \(1.0,\)"
+    ):
         ExactCatch(proportions=(1.0,))
     with pytest.raises(ValueError, match="no measured scale for 'exact-5'"):
         ExactCatch(proportions=(1.0,) * 5)
@@ -261,3 +264,17 @@ def test_a_round_after_stages_solves_the_problem_of_its_own_settings():
     found = solved(2, SEARCH, settings=(("goal", -1.0),), goals=(5.0,))
     np.testing.assert_allclose(found.point, -1.0, atol=1e-3)
     assert found.status == Status.CONVERGED
+
+
+def test_axes_nearest_to_upright_lean_from_the_way_back_as_far_as_they_may():
+    """Of a target that falls steeply, flies level, is in between, rises, or rests."""
+    vel = jnp.array(
+        [[0.1, 0.0, -2.0], [2.0, 0.0, 0.0], [1.0, 1.0, -1.0], [0.0, 1.0, 3.0], [0.0] * 3]
+    )
+    axes = np.asarray(nearest_upright(vel, jnp.float32(0.5)))
+    np.testing.assert_allclose(np.linalg.norm(axes, axis=1), 1.0, rtol=1e-5)
+    np.testing.assert_allclose(axes[[0, 4]], [[0.0, 0.0, 1.0]] * 2, atol=1e-6)
+    np.testing.assert_allclose(axes[1], [-np.cos(0.5), 0.0, np.sin(0.5)], atol=1e-3)
+    back = -np.asarray(vel[2]) / np.sqrt(3.0)
+    assert np.arccos(axes[2] @ back) == pytest.approx(0.5, abs=1e-3)
+    np.testing.assert_allclose(axes[3], [0.0, -np.cos(0.5), np.sin(0.5)], atol=1e-3)

@@ -169,7 +169,9 @@ def test_objective_gradient_agrees_with_finite_differences(float64):
 
 
 def test_sizes_that_make_no_sense_are_refused(cases):
-    with pytest.raises(ValueError, match=r"proportions must be of >= 2 pieces, got \(1.0,\)"):
+    with pytest.raises(
+        ValueError, match=r"proportions must be of >= 2 pieces, finite and > 0, got \(1.0,\)"
+    ):
         ExactHit(proportions=(1.0,))
     with pytest.raises(ValueError, match="no measured scale for 'exact-5'"):
         ExactHit(proportions=(1.0,) * 5)

@@ -17,6 +17,7 @@ from planner_jax.task.catch.appearing import AppearingPath, draw_appearing, stat
 from planner_jax.task.catch.braking import braking
 from planner_jax.task.catch.live import fly_live, judge_live
 from planner_jax.task.catch.suites import draw
+from planner_jax.trajectory.polynomial import states_at
 
 PLANNER = pj.catch.ExactCatch(rounds=(Round(1, LbfgsConfig(max_steps=40)),))
 NUM = 6
@@ -85,8 +86,14 @@ def test_one_target_that_is_known_from_the_start_is_caught_as_an_ordinary_plan_h
     plans = pj.plan(DecidedPlanner(PLANNER, pj.catch.Greedy()), known)
     flown = fly(known)
     solved = pj.solved(plans) & (np.asarray(plans.num_taken) == 1)
-    assert solved.any()
-    np.testing.assert_allclose(flown.caught[solved, 0], plans.times[solved, 0], atol=1e-5)
+    taken = np.isfinite(flown.caught[:, 0])
+    assert taken.sum() >= NUM // 2 and not taken[~solved].any()
+    np.testing.assert_allclose(flown.caught[taken, 0], plans.times[taken, 0], atol=1e-5)
+    # What is not flown could not come to rest afterwards, or at the very limits.
+    at_catch = states_at(plans.trajectory, np.asarray(plans.times)[:, 0])
+    limits = jax.vmap(lambda limits, g: limits.scaled(0.98, g))(known.limits, known.gravity)
+    stops = np.asarray(jax.vmap(braking)(at_catch, known.gravity, limits).possible)
+    assert not stops[solved & ~taken].any()
     assert np.isinf(flown.caught[:, 1:]).all()
 
 

@@ -399,8 +399,8 @@ def test_balls_that_are_only_seen_are_blocked_from_the_command_line(tmp_path, ca
         (lambda: BlockFly(suite="hail"), "suite must be one of pole, open, short, got 'hail'"),
         (lambda: BlockFly(sense=-0.1), "sense must be finite and >= 0, got -0.1"),
         (lambda: BlockFly(torque=0.0), "torque must be finite and > 0, got 0.0"),
-        (lambda: BlockFly(latency=-1.0), "latency must be >= 0, got -1.0"),
-        (lambda: BlockFly(mass_error=-1.0), "mass_error must be > -1, got -1.0"),
+        (lambda: BlockFly(latency=-1.0), "latency must be finite and >= 0, got -1.0"),
+        (lambda: BlockFly(mass_error=-1.0), "mass_error must be > -1 and < 1, got -1.0"),
     ],
 )
 def test_settings_that_break_a_rule_are_refused_in_one_line(build, message):

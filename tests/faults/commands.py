@@ -56,9 +56,13 @@ def start(
     )
 
 
-def finished(process: subprocess.Popen) -> Ended:
-    """Wait for the end of a process."""
-    out, err = process.communicate()
+def finished(process: subprocess.Popen, within: float = 300.0) -> Ended:
+    """Wait for the end of a process; one that does not end within so many seconds is killed."""
+    try:
+        out, err = process.communicate(timeout=within)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        out, err = process.communicate()
     return Ended(process.returncode, out, err)
 
 

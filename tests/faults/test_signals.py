@@ -39,7 +39,11 @@ NUMBERS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 
 def stopped(script, *numbers, ignored=()):
     """How a script ends that is sent signals when it is ready."""
-    before = "".join(f"import signal; signal.signal({int(n)}, signal.SIG_IGN)\n" for n in ignored)
+    # The tests themselves may run under `nohup`, whose children inherit that SIGHUP is ignored.
+    heard = {number: "SIG_IGN" if number in ignored else "SIG_DFL" for number in NUMBERS}
+    before = "".join(
+        f"import signal; signal.signal({int(n)}, signal.{how})\n" for n, how in heard.items()
+    )
     process = subprocess.Popen(
         [sys.executable, "-c", before + PREPARED + script],
         stdout=subprocess.PIPE,

@@ -21,6 +21,8 @@ from planner_jax.trajectory.proportional_minco import (
     trajectory_energy,
 )
 
+_RESTING = 1e-3  # [m/s]: a target that is much slower has no way back
+
 
 @struct.dataclass
 class CatchContext:
@@ -65,13 +67,13 @@ def facing_cosine(axis: Array, vel: Array) -> tuple[Array, Array]:
 def nearest_upright(vel: Array, lean: Array) -> Array:
     """The net's axes (N, 3) nearest to upright that lean so far from the targets' way back.
 
-    Targets that rise are taken to fly level.
+    Targets that rise are taken to fly level, and of those at rest the axis is upright.
 
     Args:
         vel: (N, 3) [m/s], of the targets.
         lean: () [rad], from 0 to a quarter turn.
     """
-    back = jnp.concatenate([-vel[:, :2], jnp.maximum(-vel[:, 2:], 0.0)], axis=1)
+    back = jnp.concatenate([-vel[:, :2], jnp.maximum(-vel[:, 2:], 0.0) + _RESTING], axis=1)
     back /= jnp.sqrt(jnp.maximum(jnp.sum(back**2, axis=1, keepdims=True), 1e-6))
     level = jnp.sqrt(jnp.maximum(jnp.sum(back[:, :2] ** 2, axis=1, keepdims=True), 1e-6))
     cosine, sine, rise = jnp.cos(lean), jnp.sin(lean), back[:, 2:]
