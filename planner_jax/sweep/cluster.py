@@ -13,6 +13,7 @@ import itertools
 import logging
 import os
 import signal
+import socket
 import tempfile
 import threading
 from collections import deque
@@ -33,16 +34,16 @@ from planner_jax.sweep.settings import (
     SettingError,
     SweepSettings,
     WorkersFailed,
-    require_one_of,
+    require,
 )
 from planner_jax.sweep.sweep import sweep_of
 from planner_jax.sweep.timing import CompileClock
 
-_KINDS = ("ray",)  # of workers
 _ADDRESS = "RAY_ADDRESS"  # environment variable that names a cluster to join
 _HOST = "127.0.0.1"  # nothing else reaches a cluster that is begun here
 _RETRIES = 3  # of a chunk whose worker dies
 _AHEAD = 2  # chunks for each worker that are made or wait for their turn to be written
+_PATIENCE = 10.0  # seconds for a cluster to answer
 _LOOKS = 0.5  # seconds between looks whether the process was told to stop
 
 
@@ -64,7 +65,7 @@ def workers_of(kind: str | None) -> Iterator[Workers | None]:
     if kind is None:
         yield None
         return
-    require_one_of(_KINDS, "workers", kind)
+    require(kind == "ray", "workers", "ray", repr(kind))
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
     if not os.environ.get(_ADDRESS):
         # Ray takes an address that others can reach in the place of the machine's own, unless a
@@ -101,8 +102,10 @@ def _begin(ray: Any, folder: str) -> None:
     in_main = threading.current_thread() is threading.main_thread()
     handler = signal.getsignal(signal.SIGTERM)
     try:
+        if address:
+            _require_answer(address)
         ray.init(**how, log_to_driver=False, logging_level=logging.ERROR)
-    except (ConnectionError, OSError, ValueError, RuntimeError) as error:
+    except (OSError, ValueError, RuntimeError) as error:
         reason = (str(error) or type(error).__name__).splitlines()[0]
         if address:
             rule = "the address of a Ray cluster that answers"
@@ -111,6 +114,13 @@ def _begin(ray: Any, folder: str) -> None:
     finally:
         if in_main:  # Ray has put its own in the place of what this process does when it is told
             signal.signal(signal.SIGTERM, handler)
+
+
+def _require_answer(address: str) -> None:
+    """Raise `OSError` if nothing listens there; Ray itself would try for minutes."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if host and port.isdecimal():
+        socket.create_connection((host.strip("[]"), int(port)), timeout=_PATIENCE).close()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,17 +137,9 @@ class _Order:
 
 def _made(ray: Any, run: SweepRun, numbers: Iterable[int]) -> Generator[Making, None, None]:
     """Chunks of these numbers in their order, each once it is made."""
-    identity = run.parts.identity
-    order = ray.put(
-        _Order(
-            identity["run"],
-            run.sweep.task,
-            run.source.settings,
-            identity["settings"],
-            environment(),
-            jnp.result_type(float) == jnp.float64,
-        )
-    )
+    identity, x64 = run.parts.identity, jnp.result_type(float) == jnp.float64
+    asked = identity["run"], run.sweep.task, run.source.settings, identity["settings"]
+    order = ray.put(_Order(*asked, environment(), x64))
     task = ray.remote(num_cpus=1, max_retries=_RETRIES)(_make)
     ahead = _AHEAD * max(int(ray.cluster_resources().get("CPU", 1)), 1)
     waiting, under_way = iter(numbers), deque()

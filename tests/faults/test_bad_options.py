@@ -3,9 +3,9 @@
 import os
 
 import pytest
-from bad_options import ROWS
 
 from planner_jax.cli import main
+from tests.faults.bad_options import ROWS
 
 
 @pytest.fixture(scope="module")
