@@ -24,7 +24,7 @@ from planner_jax.compile_cache import keep_compiled_programs
 from planner_jax.digits import written_number, written_whole
 from planner_jax.registry import MissingExtra, Task, UnknownName, all_tasks
 from planner_jax.sweep.environment import installed_version, require_backend
-from planner_jax.sweep.settings import SettingError
+from planner_jax.sweep.settings import SettingError, WorkersFailed
 
 _HELP = argparse.RawDescriptionHelpFormatter
 _FAILED, _BAD_ARGUMENT, _INTERRUPTED = 1, 2, 130
@@ -36,8 +36,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command of these arguments, by default those of the process.
 
     Returns:
-        The exit code: 0, 1 where the file system fails, 2 for a bad argument, 130 after Ctrl-C.
-        Where the process hears signals by `stopping.listen`, they end it.
+        The exit code: 0, 1 where file system or workers fail, 2 for a bad argument, 130 after
+        Ctrl-C. Where the process hears signals by `stopping.listen`, they end it.
     """
     try:
         with warnings.catch_warnings():  # of another package, such as a task that does not work
@@ -57,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _INTERRUPTED
     except (SettingError, UnknownName, MissingExtra) as error:
         return _fail(str(error))
-    except _NotWritten as error:
+    except _NotFinished as error:
         _fail(str(error))
         return _FAILED
     except MemoryError:
@@ -69,8 +69,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _FAILED
 
 
-class _NotWritten(Exception):
-    """The file system failed while a run was written; one line."""
+class _NotFinished(Exception):
+    """The file system or workers failed while a run was under way; one line."""
 
 
 _ARGUMENTS: set[str] = set()  # names of all arguments, as they are written in Python
@@ -282,6 +282,8 @@ def _add_sweep(task: Task, parser: _Parser) -> None:
     where = f"run folder (default: runs/{task.name}-PLANNER-DATE-TIME)"
     parser.add("--out", metavar="DIR", help=where)
     parser.add("--resume", action="store_true", help="finish the interrupted run in --out")
+    where = "ray: chunks are made by a Ray cluster, that of RAY_ADDRESS or one of this machine"
+    parser.add("--workers", metavar="KIND", help=f"{where} (default: by this process)")
     parser.set_defaults(command=lambda given: _sweep(task, given))
 
 
@@ -319,7 +321,7 @@ def _run_folder(name: str) -> str:
 
 
 def _sweep(task: Task, given: dict[str, Any]) -> None:
-    resume, out = given.pop("resume", False), _out(given)
+    resume, workers, out = given.pop("resume", False), given.pop("workers", None), _out(given)
     if resume and out is None:
         raise SettingError("out must name the folder to resume, got nothing")
     settings = pkgutil.resolve_name(task.sweep)(**given).of(task)
@@ -332,9 +334,9 @@ def _sweep(task: Task, given: dict[str, Any]) -> None:
     rest = functools.partial(_rest, Path(out), f"finish with: {again}")
     with stopping.under_way(rest), _told_how_to_go_on(rest):
         if resume:
-            manifest = run.resume_sweep(task, out, **given)
+            manifest = run.resume_sweep(task, out, workers=workers, **given)
         else:
-            manifest = run.start_sweep(task, settings, out)
+            manifest = run.start_sweep(task, settings, out, workers=workers)
         _print_sweep(manifest, Path(out))
 
 
@@ -352,14 +354,16 @@ def _rest(out: Path, again: str, sign: str = "manifest.json") -> str:
 def _told_how_to_go_on(
     rest: Callable[[], str], rule: str = "out must be a folder that can be written"
 ) -> Iterator[None]:
-    """Add `rest()` to the message of an interruption, and of a file system that fails."""
+    """Add `rest()` to the message of an interruption, and of a file system or workers that fail."""
     try:
         yield
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"interrupted; {rest()}") from None
+    except WorkersFailed as error:
+        raise _NotFinished(f"{error}; {rest()}") from None
     except OSError as error:
         shown = f"{error.filename!r} ({error.strerror or error})"
-        raise _NotWritten(f"{rule}, got {shown}; {rest()}") from None
+        raise _NotFinished(f"{rule}, got {shown}; {rest()}") from None
 
 
 def _print_sweep(manifest: dict[str, Any], out: Path) -> None:

@@ -54,7 +54,7 @@ ALLOWED = {
         *("digits", "memory", "plain_files", "whole_files"),
     },
     "sweep": {
-        *("ball", "digits", "lanes", "memory", "perception", "plane"),
+        *("ball", "compile_cache", "digits", "lanes", "memory", "perception", "plane"),
         *("planning", "protocol", "registry", "robot", "rules", "stopping", "task"),
         *("whole_files",),
     },

@@ -1,9 +1,10 @@
 """The chunks of a sweep: drawn or read, planned, refereed, written and counted."""
 
+import contextlib
 import dataclasses
 import sys
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
@@ -28,7 +29,7 @@ _MEASURED = {
     "first_seconds": "planning the first chunk, with the compilation in it",
     "warm_seconds": "planning of chunks in which nothing was compiled, cases to plans on the "
     "host: decisions, ball tables, guesses and all rounds. Where these were less than half a "
-    "batch, the first chunk planned again",
+    "batch, the first chunk planned again. Seconds of workers are added up",
     "referee_seconds": "judging, while the next chunk is planned",
     "wall_seconds": "all chunks of all sessions with drawing, checking and writing; without "
     "imports and report",
@@ -36,14 +37,55 @@ _MEASURED = {
 
 
 @dataclasses.dataclass(frozen=True)
-class SweepRun:
-    """A sweep under way."""
+class _Planned:
+    """One chunk, not judged yet."""
+
+    chunk: Chunk
+    plans: Any
+    record: dict[str, Any]  # how long it took
+
+
+@dataclasses.dataclass(frozen=True)
+class Maker:
+    """What is needed to make the rows of chunks."""
 
     sweep: Sweep
     source: Source
     planner: Any
+
+    def planned(self, chunk: Chunk, clock: CompileClock) -> _Planned:
+        """A chunk's plans. What the clock has counted since its last lap is their compilation."""
+        plans, seconds, warm = timed(lambda: self.sweep.plan(self.planner, chunk.cases))
+        record = {"num": len(chunk), "plan_seconds": seconds, "warm": warm}
+        record["compile_seconds"] = clock.lap()
+        return _Planned(chunk, plans, record)
+
+    def judged(self, planned: _Planned) -> tuple[pa.Table, dict[str, Any]]:
+        """Rows and record of a chunk."""
+        watch = Stopwatch()
+        verdict = self.sweep.judge(planned.chunk.cases, planned.plans, self.source.settings)
+        record = {
+            **planned.record,
+            "referee_seconds": watch.lap(),
+            "successes": int(np.sum(verdict.success)),
+        }
+        batch = RefereedBatch(planned.chunk, planned.plans, verdict)
+        return rows_of(self.sweep.columns(batch), batch, self.sweep.frame), record
+
+
+# Waits for rows and record of a chunk that is being made; of one that was read, no record.
+Making = Callable[[], tuple[pa.Table, dict[str, Any] | None]]
+# Begin to make chunks of these numbers, and give them in their order.
+Workers = Callable[["SweepRun", Iterable[int]], Generator[Making, None, None]]
+
+
+@dataclasses.dataclass(frozen=True)
+class SweepRun(Maker):
+    """A sweep under way."""
+
     folder: RunFolder
     parts: Parts
+    workers: Workers | None = None  # None: chunks are made by this process
 
 
 def plan_chunks(run: SweepRun, *, progress: bool) -> dict[str, Any]:
@@ -95,7 +137,6 @@ def _in_pipeline(
     pending: deque[Future] = deque()
     with (
         folder.joining_parts() as join,
-        CompileClock() as clock,
         # Left in the opposite order: what has been planned is still judged, written and joined.
         ThreadPoolExecutor(1) as joiner,
         ThreadPoolExecutor(1) as writer,
@@ -103,64 +144,44 @@ def _in_pipeline(
         ThreadPoolExecutor(1) as drawer,
     ):
 
-        def write(judged: Future) -> tuple[int, pa.Table, dict[str, Any] | None]:
-            chunk, rows, record = judged.result()
+        def write(chunk: int, made: Making) -> tuple[int, pa.Table, dict[str, Any] | None]:
+            rows, record = made()
             joined = joiner.submit(join, rows)
             if record is not None:
+                record = {**record, "wall_seconds": watch.lap()}  # since the one before
                 record = run.parts.write(chunk, rows, record)
             joined.result()
             return chunk, rows, record
 
-        missing = (chunk for chunk in range(source.num_chunks) if chunk not in there)
-        draws = (drawer.submit(source.chunk, chunk) for chunk in missing)
-        following = next(draws, None)
-        for chunk in range(source.num_chunks):
-            stopping.check()
-            if chunk in there:
-                judged = judge.submit(lambda k=chunk: (k, run.parts.read(k), None))
-            else:
-                drawn, following = following, next(draws, None)
-                assert drawn is not None
-                planned = _plan_chunk(run, drawn.result(), clock)
-                judged = judge.submit(_judge_chunk, run, chunk, planned, watch)
-            pending.append(writer.submit(write, judged))
-            if len(pending) > _UNDER_WAY:
+        missing = [chunk for chunk in range(source.num_chunks) if chunk not in there]
+        if run.workers is None:
+            making = _made_here(run, missing, drawer, judge)
+        else:
+            making = run.workers(run, missing)
+        with contextlib.closing(making):
+            for chunk in range(source.num_chunks):
+                stopping.check()
+                if chunk in there:
+                    made = judge.submit(lambda k=chunk: (run.parts.read(k), None)).result
+                else:
+                    made = next(making)
+                pending.append(writer.submit(write, chunk, made))
+                if len(pending) > _UNDER_WAY:
+                    yield pending.popleft().result()
+            while pending:
                 yield pending.popleft().result()
-        while pending:
-            yield pending.popleft().result()
 
 
-@dataclasses.dataclass(frozen=True)
-class _Planned:
-    """One chunk, not judged yet."""
-
-    chunk: Chunk
-    plans: Any
-    record: dict[str, Any]  # how long it took
-
-
-def _plan_chunk(run: SweepRun, chunk: Chunk, clock: CompileClock) -> _Planned:
-    """One chunk's plans. What the clock has counted since the chunk before is its compilation."""
-    plans, seconds, warm = timed(lambda: run.sweep.plan(run.planner, chunk.cases))
-    record = {"num": len(chunk), "plan_seconds": seconds, "warm": warm}
-    record["compile_seconds"] = clock.lap()
-    return _Planned(chunk, plans, record)
-
-
-def _judge_chunk(
-    run: SweepRun, number: int, planned: _Planned, watch: Stopwatch
-) -> tuple[int, pa.Table, dict[str, Any]]:
-    """The chunk's number, its rows and its record, with the seconds since the one before."""
-    own = Stopwatch()
-    verdict = run.sweep.judge(planned.chunk.cases, planned.plans, run.source.settings)
-    record = {
-        **planned.record,
-        "referee_seconds": own.lap(),
-        "successes": int(np.sum(verdict.success)),
-        "wall_seconds": watch.lap(),
-    }
-    batch = RefereedBatch(planned.chunk, planned.plans, verdict)
-    return number, rows_of(run.sweep.columns(batch), batch, run.sweep.frame), record
+def _made_here(
+    run: SweepRun, numbers: Iterable[int], drawer: ThreadPoolExecutor, judge: ThreadPoolExecutor
+) -> Generator[Making, None, None]:
+    """Make chunks by this process: while one is planned, the next is drawn, the last is judged."""
+    with CompileClock() as clock:
+        draws = (drawer.submit(run.source.chunk, number) for number in numbers)
+        following = next(draws, None)
+        while following is not None:
+            drawn, following = following, next(draws, None)
+            yield judge.submit(run.judged, run.planned(drawn.result(), clock)).result
 
 
 def _times(run: SweepRun, records: dict[int, dict[str, Any]]) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 import datetime
 import os
 import uuid
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -59,19 +60,29 @@ def require_same_maker(manifest: dict[str, Any], session: dict[str, Any]) -> Non
         manifest: of the run.
         session: that would go on with it, as of `begun_now`.
     """
-    known = [("versions", name, name) for name in _PACKAGES]
-    known += [("device", name, f"devices of {name}") for name in _OF_DEVICES]
-    for entry, name, what in known:
-        _require_same(what, manifest[entry].get(name), session[entry][name])
-    if manifest["code"] != session["code"]:
-        old, new = (
-            f"{each.get('git_commit') or 'unknown'} (files {str(each['code'])[:12]})"
-            for each in (manifest, session)
-        )
-        _require_same("planner-jax of commit", old, new)
-
-
-def _require_same(what: str, old: Any, new: Any) -> None:
-    if old != new:
+    for what, old, new in differences(manifest, session):
         rule = f"resumed by {what} {old}, as it began"
         raise SettingError(f"out must be {rule}, got {new}; or begin anew in another folder")
+
+
+def differences(
+    known: Mapping[str, Any], found: Mapping[str, Any]
+) -> Iterator[tuple[str, Any, Any]]:
+    """What decides rows and is not the same in two environments: words, and its two values.
+
+    Args:
+        known: entries as of `environment`.
+        found: likewise.
+    """
+    looks = [("versions", name, name) for name in _PACKAGES]
+    looks += [("device", name, f"devices of {name}") for name in _OF_DEVICES]
+    for entry, name, what in looks:
+        old, new = known[entry].get(name), found[entry][name]
+        if old != new:
+            yield what, old, new
+    if known["code"] != found["code"]:
+        old, new = (
+            f"{each.get('git_commit') or 'unknown'} (files {str(each['code'])[:12]})"
+            for each in (known, found)
+        )
+        yield "planner-jax of commit", old, new

@@ -13,6 +13,7 @@ import pyarrow as pa
 from planner_jax import stopping
 from planner_jax.registry import Task
 from planner_jax.sweep.chunks import SweepRun, plan_chunks
+from planner_jax.sweep.cluster import workers_of
 from planner_jax.sweep.columns import RefereedBatch, rows_of
 from planner_jax.sweep.environment import require_backend
 from planner_jax.sweep.identity import (
@@ -25,7 +26,12 @@ from planner_jax.sweep.identity import (
 from planner_jax.sweep.parts import Parts
 from planner_jax.sweep.report import PAGE, draw_comparisons, rewrite_page, write_report
 from planner_jax.sweep.run_folder import RunFolder
-from planner_jax.sweep.settings import SettingError, SweepSettings, settings_to_resume
+from planner_jax.sweep.settings import (
+    SettingError,
+    SweepSettings,
+    WorkersFailed,
+    settings_to_resume,
+)
 from planner_jax.sweep.source import Source
 from planner_jax.sweep.sweep import Sweep, settings_of, sweep_of
 
@@ -35,7 +41,12 @@ class SweepInterrupted(KeyboardInterrupt):
 
 
 def start_sweep(
-    task: Task, settings: SweepSettings, out: str | os.PathLike, *, progress: bool = True
+    task: Task,
+    settings: SweepSettings,
+    out: str | os.PathLike,
+    *,
+    progress: bool = True,
+    workers: str | None = None,
 ) -> dict[str, Any]:
     """Plan and referee a sweep into a new folder.
 
@@ -44,6 +55,7 @@ def start_sweep(
         settings: of the sweep, of the task's class.
         out: folder, new or empty.
         progress: show a bar on the standard error stream.
+        workers: "ray", to have the chunks made by a Ray cluster; decides no row.
 
     Returns:
         The manifest of the finished run.
@@ -51,35 +63,42 @@ def start_sweep(
     Raises:
         SettingError: an argument or a case breaks a rule; nothing is left behind.
         SweepInterrupted: on Ctrl-C; the folder can be resumed.
+        WorkersFailed: workers could not make a chunk; the folder can be resumed.
     """
     folder = RunFolder(out)
     folder.require_new()
     sweep, settings = sweep_of(task), settings.of(task)
-    source = _source(sweep, settings)
-    planner = sweep.planner(settings)
-    cases = source.check()
-    sweep.require_fit(source.settings, planner, cases)
-    session, description = begun_now(), source.description()
-    identity = identity_of(source, description, session)
-    run = SweepRun(sweep, source, planner, folder, Parts(folder.parts, identity, source))
-    manifest = {
-        "kind": sweep.kind,
-        "state": "running",
-        **identity,
-        **session,
-        "seed": source.settings.seed,
-        "parameters": source.settings.parameters(),
-        **description,
-        "setting": sweep.setting(cases),
-        "planner": {"name": source.settings.planner, **_settings_of_planner(planner)},
-        "sessions": [session],
-    }
-    with folder.created(manifest):
-        return _finish(run, progress)
+    with workers_of(workers) as others:
+        source = _source(sweep, settings)
+        planner = sweep.planner(settings)
+        cases = source.check()
+        sweep.require_fit(source.settings, planner, cases)
+        session, description = begun_now(), source.description()
+        identity = identity_of(source, description, session)
+        parts = Parts(folder.parts, identity, source)
+        manifest = {
+            "kind": sweep.kind,
+            "state": "running",
+            **identity,
+            **session,
+            "seed": source.settings.seed,
+            "parameters": source.settings.parameters(),
+            **description,
+            "setting": sweep.setting(cases),
+            "planner": {"name": source.settings.planner, **_settings_of_planner(planner)},
+            "sessions": [_with_workers(session, workers)],
+        }
+        with folder.created(manifest):
+            return _finish(SweepRun(sweep, source, planner, folder, parts, others), progress)
 
 
 def resume_sweep(
-    task: Task, out: str | os.PathLike, *, progress: bool = True, **given: Any
+    task: Task,
+    out: str | os.PathLike,
+    *,
+    progress: bool = True,
+    workers: str | None = None,
+    **given: Any,
 ) -> dict[str, Any]:
     """Finish a sweep that was interrupted or killed; a whole, finished one is left as it is.
 
@@ -89,6 +108,7 @@ def resume_sweep(
         task: that was swept.
         out: its folder.
         progress: show a bar on the standard error stream.
+        workers: as of `start_sweep`, whoever made the chunks that are there.
         **given: settings named again; they must be those of the run.
 
     Returns:
@@ -98,10 +118,11 @@ def resume_sweep(
         SettingError: the folder is not that of such a sweep, a given setting is not the
             run's, or the cases are not what they were.
         SweepInterrupted: on Ctrl-C; the folder can be resumed.
+        WorkersFailed: workers could not make a chunk; the folder can be resumed.
     """
     folder, sweep = RunFolder(out), sweep_of(task)
     _settings_of_run(folder, sweep, task, given)
-    with folder.resumed():
+    with workers_of(workers) as others, folder.resumed():
         manifest, settings = _settings_of_run(folder, sweep, task, given)
         damages = folder.damages(manifest)
         if manifest["state"] == "complete" and not damages:
@@ -119,14 +140,20 @@ def resume_sweep(
             print(f"planner-jax: {folder.path / name} is {why}; it is made anew", file=sys.stderr)
         if folder.plans.name in damages:  # the parts are gone since there was a summary
             manifest = {name: value for name, value in manifest.items() if name not in _FOUND}
-        sessions = [*manifest["sessions"], session]
+        sessions = [*manifest["sessions"], _with_workers(session, workers)]
         folder.write_manifest({**manifest, "state": "running", "sessions": sessions})
         parts = Parts(folder.parts, {name: manifest[name] for name in IDENTITY}, source)
-        return _finish(SweepRun(sweep, source, sweep.planner(settings), folder, parts), progress)
+        planner = sweep.planner(settings)
+        return _finish(SweepRun(sweep, source, planner, folder, parts, others), progress)
 
 
 # What a manifest has of the rows, once they are joined.
 _FOUND = ("summary", "times", "example", "files")
+
+
+def _with_workers(session: dict[str, Any], workers: str | None) -> dict[str, Any]:
+    """A session, and who made its chunks unless it was its own process."""
+    return session if workers is None else {**session, "workers": workers}
 
 
 def _settings_of_run(
@@ -159,6 +186,9 @@ def _finish(run: SweepRun, progress: bool) -> dict[str, Any]:
     except KeyboardInterrupt:
         _end(folder, "interrupted")
         raise SweepInterrupted(str(folder.path)) from None
+    except WorkersFailed:
+        _end(folder, "interrupted")
+        raise
     except OSError:
         with contextlib.suppress(OSError):  # it may be the disk that is full
             _end(folder, "interrupted")

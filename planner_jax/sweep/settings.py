@@ -21,6 +21,10 @@ class SettingError(ValueError):
     """An argument of a run breaks a rule; one line that begins with the argument's name."""
 
 
+class WorkersFailed(RuntimeError):
+    """Workers could not make a chunk of a run, which can be resumed; one line."""
+
+
 def option(default: Any, metavar: str, words: str) -> Any:
     """A field of settings with what the command line says of it; no `metavar` for a switch."""
     return dataclasses.field(default=default, metadata={"metavar": metavar, "help": words})

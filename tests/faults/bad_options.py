@@ -29,6 +29,7 @@ def _rows() -> list:
         rows += _of(f"sweep {task}", "--planner", ("", ":", "nobody", "é", "exact:file"))
         rows += _of(f"sweep {task}", "--suite", ("", "nowhere", "court\nx"))
         rows += _of(f"sweep {task} --num 1", "--out", ("", "pipe", "/dev/null", "junk/below"))
+        rows += _of(f"sweep {task} --num 1", "--workers", ("", "2", "Ray"), "must be ray")
         rows += _of(f"sweep {task} --resume", "--out", ("pipe", "folder", "gone"))
         rows += [((*f"sweep {task}".split(), "stray"), ("unrecognized", "stray"))]
         rows += _of(f"fly {task}", "--planner", ("", "nobody", "exact:file"))

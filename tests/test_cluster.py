@@ -1,0 +1,259 @@
+"""Sweeps whose chunks are made by a Ray cluster: a stand-in for Ray, and Ray itself (slow)."""
+
+import contextlib
+import dataclasses
+import itertools
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from sweeps import stop_after
+
+import planner_jax as pj
+from planner_jax.cli import main
+from planner_jax.registry import MissingExtra
+from planner_jax.sweep import cluster, run
+from planner_jax.sweep.hit.settings import HitSettings
+from planner_jax.sweep.hit.sweep import HitSweep
+from planner_jax.sweep.run import SweepInterrupted, resume_sweep, start_sweep
+from planner_jax.sweep.run_folder import RunFolder
+from planner_jax.sweep.settings import SettingError, WorkersFailed
+
+TASK = pj.task_named("hit")
+NUM, BATCH = 64, 13  # five chunks
+SETTINGS = HitSettings(num=NUM, batch=BATCH, planner="juggle", seed=3)
+OPTIONS = f"--num {NUM} --batch {BATCH} --planner juggle --seed 3".split()
+
+
+class RayError(Exception):
+    """As Ray's, where a worker has died too often."""
+
+
+class RayTaskError(RayError):
+    """As Ray's, where a task has raised."""
+
+    def __init__(self, cause):
+        super().__init__("a long traceback\nof many lines")
+        self.cause = cause
+
+
+class StandIn:
+    """What a sweep asks of Ray, in this process: the task that was asked for last is done first.
+
+    Workers die so often in the chunks of `deaths`, before the task is done.
+    """
+
+    exceptions = SimpleNamespace(RayError=RayError, RayTaskError=RayTaskError)
+
+    def __init__(self):
+        self.deaths, self.done, self.begun, self.ended, self.retries = {}, [], [], 0, None
+        self._waiting, self._found = {}, {}
+
+    def init(self, **how):
+        self.begun.append(how)
+
+    def shutdown(self):
+        self.ended += 1
+
+    def cluster_resources(self):
+        return {"CPU": 2.0}
+
+    def put(self, value):
+        return value
+
+    def remote(self, *, num_cpus, max_retries):
+        assert num_cpus == 1
+        self.retries = max_retries
+
+        def task_of(function):
+            def remote(order, number):
+                self._waiting[number] = (function, order)
+                return number
+
+            return SimpleNamespace(remote=remote)
+
+        return task_of
+
+    def wait(self, asked, timeout):
+        assert timeout > 0.0
+        while self._waiting:
+            number = next(reversed(self._waiting))
+            self._found[number] = self._outcome(number, *self._waiting.pop(number))
+        return asked, []
+
+    def _outcome(self, number, function, order):
+        if self.deaths.get(number, 0) > self.retries:
+            return RayError("a worker died\nas did others")
+        self.done.append(number)
+        try:
+            return function(order, number)
+        except Exception as error:
+            return RayTaskError(error)
+
+    def get(self, number):
+        found = self._found.pop(number)
+        if isinstance(found, Exception):
+            raise found
+        return found
+
+
+@pytest.fixture(autouse=True)
+def ray(monkeypatch, request):
+    """The stand-in; Ray itself in slow tests. No report."""
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    for name in ("NPROC", "RAY_USAGE_STATS_ENABLED", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"):
+        monkeypatch.setenv(name, "1")  # to be put back
+    monkeypatch.setattr(run, "write_report", lambda folder: None)
+    monkeypatch.setattr(HitSweep, "other_planners", lambda *_: {})
+    cluster._maker_of.cache_clear()
+    if request.node.get_closest_marker("slow"):
+        return None
+    stand_in = StandIn()
+    monkeypatch.setitem(sys.modules, "ray", stand_in)
+    return stand_in
+
+
+def rows_of(out):
+    return (out / "plans.parquet").read_bytes()
+
+
+def test_rows_are_those_of_a_plain_run_in_whatever_order_they_are_made(finished, tmp_path, ray):
+    out = tmp_path / "run"
+    manifest = start_sweep(TASK, SETTINGS, out, progress=False, workers="ray")
+    assert ray.done == [3, 2, 1, 0, 4]  # two for each worker at first
+    assert rows_of(out) == rows_of(finished[0])
+    assert manifest["settings"] == finished[1]["settings"]
+    assert manifest["sessions"][0]["workers"] == "ray"
+    assert manifest["summary"]["successes"] == finished[1]["summary"]["successes"]
+    assert ray.ended == 1
+
+
+def test_a_cluster_that_is_begun_is_of_this_machine_alone_and_tells_nobody(tmp_path, ray):
+    start_sweep(TASK, SETTINGS, tmp_path / "run", progress=False, workers="ray")
+    (how,) = ray.begun
+    assert how["address"] == "local" and how["_node_ip_address"] == "127.0.0.1"
+    assert how["include_dashboard"] is False
+    assert how["num_cpus"] == len(os.sched_getaffinity(0))
+    assert not os.path.exists(how["_temp_dir"])
+    assert os.environ["RAY_USAGE_STATS_ENABLED"] == "0"
+
+
+def test_a_cluster_with_an_address_is_joined(monkeypatch, tmp_path, ray):
+    monkeypatch.setenv("RAY_ADDRESS", "auto")
+    start_sweep(TASK, SETTINGS, tmp_path / "run", progress=False, workers="ray")
+    (how,) = ray.begun
+    assert how["address"] == "auto" and "num_cpus" not in how and ray.ended == 1
+
+
+def test_an_address_at_which_nothing_answers_is_named(monkeypatch, tmp_path, ray):
+    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
+    with pytest.raises(SettingError, match="RAY_ADDRESS must be .* got '127.0.0.1:1'"):
+        start_sweep(TASK, SETTINGS, tmp_path / "run", progress=False, workers="ray")
+    assert not (tmp_path / "run").exists() and not ray.begun
+
+
+def test_a_worker_that_dies_costs_nothing_but_time(finished, tmp_path, ray):
+    ray.deaths = {1: 1, 4: 2}
+    out = tmp_path / "run"
+    start_sweep(TASK, SETTINGS, out, progress=False, workers="ray")
+    assert rows_of(out) == rows_of(finished[0])
+
+
+def test_a_chunk_in_which_every_worker_dies_leaves_a_run_that_can_be_finished(
+    finished, tmp_path, ray, capsys
+):
+    ray.deaths, out = {2: 99}, tmp_path / "run"
+    assert main(["sweep", "hit", *OPTIONS, "--workers", "ray", "--out", str(out)]) == 1
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert "--workers must live" in said and "chunk 2 in 4 tries (a worker died)" in said
+    assert f"finish with: planner-jax sweep hit --resume --out {out}" in said
+    assert RunFolder(out).read_manifest()["state"] == "interrupted" and ray.ended == 1
+    resume_sweep(TASK, out, progress=False)
+    assert rows_of(out) == rows_of(finished[0])
+
+
+def test_a_run_begun_alone_is_finished_by_workers(finished, tmp_path, monkeypatch, ray):
+    out = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        stop_after(patch, HitSweep, 2)
+        with pytest.raises(SweepInterrupted):
+            start_sweep(TASK, SETTINGS, out, progress=False)
+    manifest = resume_sweep(TASK, out, progress=False, workers="ray", num=NUM)
+    assert sorted(ray.done) == [2, 3, 4]  # what was there is not made again
+    assert rows_of(out) == rows_of(finished[0])
+    assert [session.get("workers") for session in manifest["sessions"]] == [None, "ray"]
+
+
+@pytest.mark.parametrize("entry", ["code", "settings"])
+def test_a_worker_that_would_make_other_rows_is_refused(tmp_path, monkeypatch, ray, entry):
+    out = tmp_path / "run"
+    if entry == "code":
+        asked_by = cluster.environment()
+        others = itertools.repeat({**asked_by, "code": "0" * 64})
+        found = itertools.chain([asked_by], others)
+        monkeypatch.setattr(cluster, "environment", lambda: next(found))
+    else:
+        monkeypatch.setattr(cluster, "settings_digest", lambda *_: "0" * 64)
+    with pytest.raises(WorkersFailed, match="workers must (be of planner-jax of|have the files)"):
+        start_sweep(TASK, SETTINGS, out, progress=False, workers="ray")
+    assert RunFolder(out).read_manifest()["state"] == "interrupted"
+
+
+def test_a_serve_drawn_late_by_a_worker_that_breaks_a_rule_leaves_nothing_behind(tmp_path, ray):
+    late = HitSettings(num=40, batch=4, planner="juggle", delay=1.56, seed=0)
+    with pytest.raises(SettingError, match="delay must be"):
+        start_sweep(TASK, late, tmp_path / "run", progress=False, workers="ray")
+    assert not (tmp_path / "run").exists() and ray.ended == 1
+
+
+def test_without_ray_the_extra_is_named_in_one_line(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    out = tmp_path / "run"
+    assert main(["sweep", "hit", *OPTIONS, "--workers", "ray", "--out", str(out)]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "pip install 'planner-jax[cluster]'" in said
+    with pytest.raises(MissingExtra, match="workers needs ray"):
+        start_sweep(TASK, SETTINGS, out, progress=False, workers="ray")
+    assert not out.exists()
+
+
+def pids_of(parent, name):
+    """Processes of a parent whose programs have a name that begins so."""
+    found = []
+    for process in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):  # it has ended meanwhile
+            told = (process / "stat").read_text().rpartition(")")[2].split()
+            program = (process / "cmdline").read_text().partition("\0")[0]
+            if int(told[1]) == parent and os.path.basename(program).startswith(name):
+                found.append(int(process.name))
+    return found
+
+
+@pytest.mark.slow
+def test_a_run_with_a_real_cluster_survives_the_death_of_a_worker(tmp_path):
+    """One that is killed with the first part; the sweep ends by itself, and so does its cluster."""
+    pytest.importorskip("ray")
+    plain, out = tmp_path / "plain", tmp_path / "run"
+    start_sweep(TASK, dataclasses.replace(SETTINGS, batch=2), plain, progress=False)
+    options = [*OPTIONS, "--batch", "2", "--workers", "ray", "--out", str(out)]
+    command = [sys.executable, "-m", "planner_jax", "sweep", "hit", *options]
+    pipes: dict = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    with subprocess.Popen(command, **pipes) as sweep:
+        until = time.monotonic() + 120.0
+        raylets, killed = [], False
+        while sweep.poll() is None and not killed and time.monotonic() < until:
+            time.sleep(0.02)
+            raylets = raylets or pids_of(sweep.pid, "raylet")
+            if list(out.glob("parts/part-*")):
+                for pid in pids_of(raylets[0], "ray::_make")[:1]:
+                    os.kill(pid, signal.SIGKILL)
+                    killed = True
+        said, _ = sweep.communicate(timeout=120.0)
+    assert killed and sweep.returncode == 0, said
+    assert rows_of(out) == rows_of(plain)
+    assert not any(os.path.exists(f"/proc/{pid}") for pid in raylets)
