@@ -50,7 +50,9 @@ from planner_jax.trajectory.proportional_minco import (
 )
 
 _ORDER = 4  # minimum snap
-_DECODE_NODES = 40  # body rates peak sharply where the thrust is small
+# At which a piece is looked at in the end, of one catch and of several: body rates peak sharply
+# where the thrust is small, as it is between catches.
+_DECODE_NODES = (40, 80)
 _RIM = 0.9  # share of the net's radius that a planned catch may use
 _ENCODED_RIM = 0.99  # share of that which a point made by `encode` may use
 
@@ -372,10 +374,11 @@ class ExactCatch(OptimisedPlanner):
         return jnp.concatenate([part.ravel() for part in parts])
 
     def decode(self, point: Array, context: CatchContext) -> CatchPlan:
-        """The plan at a point, its violation looked for at 40 nodes a piece."""
+        """The plan at a point, its violation looked for at `_DECODE_NODES` a piece."""
         chain, catch = self._unpack(point, context)
+        nodes = _DECODE_NODES[context.times.size > 1]
         greatest = greatest_along(
-            self._along(_DECODE_NODES, context.case.extras),
+            self._along(nodes, context.case.extras),
             chain.columns,
             chain.piece_durations,
             (context.case.gravity, context.case.limits, context.case.extras),
