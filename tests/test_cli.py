@@ -208,8 +208,8 @@ def test_ctrl_c_says_how_to_resume(capsys, elsewhere, monkeypatch):
 def test_a_sweep_prints_rate_and_speed_together(capsys, elsewhere, monkeypatch):
     asked = {}
 
-    def sweep(task, settings, out):
-        asked.update(task=task.name, settings=settings, out=out)
+    def sweep(task, settings, out, workers):
+        asked.update(task=task.name, settings=settings, out=out, workers=workers)
         return {
             "kind": "sweep hit",
             "parameters": {"planner": "exact"},
@@ -231,6 +231,7 @@ def test_a_sweep_prints_rate_and_speed_together(capsys, elsewhere, monkeypatch):
     assert code == 0 and err == ""
     assert "90.00 % success, 9 of 10" in out and "4,000 plans/s warm" in out
     assert asked["out"].startswith("runs/hit-exact-") and asked["out"] in out
+    assert asked["workers"] is None
     settings = asked["settings"]
     assert (asked["task"], settings.planner) == ("hit", "exact")
     assert (settings.start, settings.delay, settings.seed) == ("uniform", 0.3, 5)

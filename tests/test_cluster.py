@@ -1,7 +1,6 @@
 """Sweeps whose chunks are made by a Ray cluster: a stand-in for Ray, and Ray itself (slow)."""
 
 import contextlib
-import dataclasses
 import itertools
 import os
 import signal
@@ -12,7 +11,6 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from sweeps import stop_after
 
 import planner_jax as pj
 from planner_jax.cli import main
@@ -23,11 +21,13 @@ from planner_jax.sweep.hit.sweep import HitSweep
 from planner_jax.sweep.run import SweepInterrupted, resume_sweep, start_sweep
 from planner_jax.sweep.run_folder import RunFolder
 from planner_jax.sweep.settings import SettingError, WorkersFailed
+from tests.faults.runs import quick_sweeps
+from tests.sweeps import stop_after
 
 TASK = pj.task_named("hit")
 NUM, BATCH = 64, 13  # five chunks
-SETTINGS = HitSettings(num=NUM, batch=BATCH, planner="juggle", seed=3)
-OPTIONS = f"--num {NUM} --batch {BATCH} --planner juggle --seed 3".split()
+SETTINGS = HitSettings(num=NUM, batch=BATCH, seed=3)
+COMMAND = f"sweep hit --num {NUM} --batch {BATCH} --seed 3".split()
 
 
 class RayError(Exception):
@@ -102,6 +102,13 @@ class StandIn:
         return found
 
 
+@pytest.fixture(autouse=True, scope="module")
+def quick():
+    """Sweeps of this process plan in one round and have no figures."""
+    with quick_sweeps():
+        yield
+
+
 @pytest.fixture(autouse=True)
 def ray(monkeypatch, request):
     """The stand-in; Ray itself in slow tests. No report."""
@@ -109,7 +116,6 @@ def ray(monkeypatch, request):
     for name in ("NPROC", "RAY_USAGE_STATS_ENABLED", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"):
         monkeypatch.setenv(name, "1")  # to be put back
     monkeypatch.setattr(run, "write_report", lambda folder: None)
-    monkeypatch.setattr(HitSweep, "other_planners", lambda *_: {})
     cluster._maker_of.cache_clear()
     if request.node.get_closest_marker("slow"):
         return None
@@ -168,7 +174,7 @@ def test_a_chunk_in_which_every_worker_dies_leaves_a_run_that_can_be_finished(
     finished, tmp_path, ray, capsys
 ):
     ray.deaths, out = {2: 99}, tmp_path / "run"
-    assert main(["sweep", "hit", *OPTIONS, "--workers", "ray", "--out", str(out)]) == 1
+    assert main([*COMMAND, "--workers", "ray", "--out", str(out)]) == 1
     said = capsys.readouterr().err.splitlines()[-1]
     assert "--workers must live" in said and "chunk 2 in 4 tries (a worker died)" in said
     assert f"finish with: planner-jax sweep hit --resume --out {out}" in said
@@ -205,7 +211,7 @@ def test_a_worker_that_would_make_other_rows_is_refused(tmp_path, monkeypatch, r
 
 
 def test_a_serve_drawn_late_by_a_worker_that_breaks_a_rule_leaves_nothing_behind(tmp_path, ray):
-    late = HitSettings(num=40, batch=4, planner="juggle", delay=1.56, seed=0)
+    late = HitSettings(num=40, batch=4, delay=1.56, seed=0)
     with pytest.raises(SettingError, match="delay must be"):
         start_sweep(TASK, late, tmp_path / "run", progress=False, workers="ray")
     assert not (tmp_path / "run").exists() and ray.ended == 1
@@ -214,7 +220,7 @@ def test_a_serve_drawn_late_by_a_worker_that_breaks_a_rule_leaves_nothing_behind
 def test_without_ray_the_extra_is_named_in_one_line(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "ray", None)
     out = tmp_path / "run"
-    assert main(["sweep", "hit", *OPTIONS, "--workers", "ray", "--out", str(out)]) == 2
+    assert main([*COMMAND, "--workers", "ray", "--out", str(out)]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and "pip install 'planner-jax[cluster]'" in said
     with pytest.raises(MissingExtra, match="workers needs ray"):
@@ -239,11 +245,11 @@ def test_a_run_with_a_real_cluster_survives_the_death_of_a_worker(tmp_path):
     """One that is killed with the first part; the sweep ends by itself, and so does its cluster."""
     pytest.importorskip("ray")
     plain, out = tmp_path / "plain", tmp_path / "run"
-    start_sweep(TASK, dataclasses.replace(SETTINGS, batch=2), plain, progress=False)
-    options = [*OPTIONS, "--batch", "2", "--workers", "ray", "--out", str(out)]
+    options = "--num 64 --batch 2 --planner juggle --out".split()
     command = [sys.executable, "-m", "planner_jax", "sweep", "hit", *options]
+    subprocess.run([*command, str(plain)], check=True, capture_output=True)
     pipes: dict = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    with subprocess.Popen(command, **pipes) as sweep:
+    with subprocess.Popen([*command, str(out), "--workers", "ray"], **pipes) as sweep:
         until = time.monotonic() + 120.0
         raylets, killed = [], False
         while sweep.poll() is None and not killed and time.monotonic() < until:
