@@ -59,15 +59,16 @@ _ENCODED_RIM = 0.99  # share of that which a point made by `encode` may use
 
 # Starting points, best first: factor on the guessed times, then twice two numbers, for a catch on
 # the way and for the last one: the share of the mean velocity of the way there that is kept, and
-# the thrust over the weight. Optimal plans sink through their catches and brake at the last one.
+# the thrust, from -1 for the least that is allowed over 0 for the weight to 1 for the greatest.
+# Optimal plans sink through their catches and brake at the last one.
 _GUESSES = np.array(
     [
-        (1.0, 0.5, 0.8, 0.5, 1.15),
-        (1.0, 1.0, 1.0, 1.0, 1.4),
-        (1.15, 0.3, 0.3, 0.5, 1.15),
-        (1.3, 0.0, 0.0, 0.8, 1.15),
-        (0.9, 1.0, 1.0, 0.5, 1.15),
-        (1.5, 0.2, 0.2, 1.0, 1.0),
+        (1.0, 0.5, 0.8, -5.0 / 7.0, 0.1),
+        (1.0, 1.0, 1.0, 0.0, 4.0 / 15.0),
+        (1.15, 0.3, 0.3, -5.0 / 7.0, 0.1),
+        (1.3, 0.0, 0.0, -2.0 / 7.0, 0.1),
+        (0.9, 1.0, 1.0, -5.0 / 7.0, 0.1),
+        (1.5, 0.2, 0.2, 0.0, 0.0),
     ]
 )
 _LEAN = 0.95  # of the angle that the net may have to the ball's way, what a guess makes use of
@@ -181,14 +182,16 @@ class ExactCatch(OptimisedPlanner):
         ball = targets_at(context.targets, times)
         before = jnp.concatenate([case.head_state[None, 0], ball.pos[:-1]])
         is_last = jnp.arange(times.size) == jnp.sum(context.active) - 1
-        kept, thrust = (
+        kept, lift = (
             jnp.where(is_last, last, on_the_way)[:, None]
             for on_the_way, last in (of_catches[:2], of_catches[2:])
         )
+        less, more = case.gravity - case.limits.min_thrust, case.limits.max_thrust - case.gravity
+        thrust = case.gravity + lift * jnp.where(lift < 0.0, less, more)
         vel = kept * (ball.pos - before) / durations[:, None]
         up = jnp.array([0.0, 0.0, 1.0], times.dtype)
         lean = _LEAN * case.net.max_angle
-        acc = case.gravity * (thrust * nearest_upright(ball.vel, lean) - up)
+        acc = thrust * nearest_upright(ball.vel, lean) - case.gravity * up
         natural = jnp.concatenate(
             [
                 jnp.zeros((times.size, self.num_offsets)),
