@@ -20,6 +20,7 @@ from planner_jax.ball.flight import BallState
 from planner_jax.ball.prediction import PathTable, predict_path
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
+from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.planning.plan import plan as plan_all
 from planner_jax.planning.replan import Replanning
 from planner_jax.protocol import AnyPlanner, is_unsolved
@@ -43,6 +44,7 @@ from planner_jax.sweep.columns import BOOL, Column, list_of
 from planner_jax.task.catch.card import DECISIONS, TRAINED
 from planner_jax.task.catch.case import GRAVITY, NET_HEIGHT, NET_RADIUS, START, CatchCase
 from planner_jax.task.catch.case import case as catch_case
+from planner_jax.task.catch.exact import ExactCatch
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.task.catch.replan import ReplanCatch
 from planner_jax.task.catch.suites import LAUNCH, draw, earliest_throw
@@ -64,12 +66,25 @@ _INSTANT = 1e-3  # [s], shorter than any look
 _AFTER = 0.05  # [s] flown after the last ball has come down to where it may be caught
 
 
+_LIFT = 0.1  # of guesses in flight, at every catch: a little more thrust than the weight
+
+
+def _steadier(
+    planner: AnyPlanner[CatchCase, CatchPlan],
+) -> AnyPlanner[CatchCase, CatchPlan]:
+    """The planner with guesses for flights, where it is `exact` behind a decision."""
+    if isinstance(planner, DecidedPlanner) and isinstance(planner.planner, ExactCatch):
+        own = dataclasses.replace(planner.planner, lift=_LIFT)
+        return dataclasses.replace(planner, planner=own)
+    return planner
+
+
 @dataclasses.dataclass(frozen=True)
 class CatchPilot:
     """Plans catches anew from the plan that is flown, and from order and times decided anew."""
 
     # Later than 0.2 s before a catch a new plan shakes more than the news of the ball is worth.
-    planner: ReplanCatch = ReplanCatch(shortest=0.2)
+    planner: ReplanCatch = ReplanCatch(ExactCatch(lift=_LIFT), shortest=0.2)
     # A new plan may break a limit by this share of the limit and is still flown; one that breaks
     # it by more is flown only if the old plan breaks its limits by as much. The first share holds
     # for the last catch, the second while several are left: then most of the excess lies on the
@@ -345,6 +360,7 @@ def fly_catches(
     if num_balls > 1:
         require_interval(loop.sensing, loop.replan)
     planner, pilot = planner or catch_planner(decide="greedy"), pilot or CatchPilot()
+    planner = _steadier(planner)
     drag = jnp.asarray(cases.drag)
     balls, guess = jax.tree.map(jnp.asarray, (cases.balls, cases.believed))
     keys = flight_keys(seed, cases.index)

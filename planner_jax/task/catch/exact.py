@@ -129,6 +129,9 @@ class ExactCatch(OptimisedPlanner):
         Round(starts=1, solver=LbfgsConfig(max_steps=80)),
         Round(starts=6, solver=LbfgsConfig(max_steps=200)),
     )
+    # Of the first guess, the thrust at catches on the way, as in `_GUESSES`. Near the least that is
+    # allowed catches are soonest; more leaves control a margin in flight.
+    lift: float = _GUESSES[0, 3].item()
     scale: tuple[float, ...] = ()  # of one segment
 
     def __post_init__(self) -> None:
@@ -168,9 +171,10 @@ class ExactCatch(OptimisedPlanner):
         """Smooth trajectories that face the balls, at and after the guessed times, (num, n)."""
         if num > len(_GUESSES):
             raise ValueError(f"starts must be <= {len(_GUESSES)}, got {num}")
-        return jax.vmap(lambda guess: self._guess(context, guess))(
-            jnp.asarray(_GUESSES[:num], context.times.dtype)
-        )
+        rows = _GUESSES[:num].copy()
+        rows[0, 3] = self.lift
+        rows = jnp.asarray(rows, context.times.dtype)
+        return jax.vmap(lambda guess: self._guess(context, guess))(rows)
 
     def _guess(self, context: CatchContext, guess: Array) -> Array:
         """The point (n,) of later times, velocities and thrusts, a row of `_GUESSES`."""
