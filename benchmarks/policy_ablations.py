@@ -18,7 +18,7 @@ import argparse
 import dataclasses
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -27,6 +27,7 @@ import numpy as np
 import planner_jax as pj
 from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin, chosen
 from planner_jax.planning.decided import DecidedPlanner
+from planner_jax.policies.policy import Policy
 from planner_jax.policies.settings import WEIGHTS
 from planner_jax.policies.training import Part, Training, train
 from planner_jax.task.catch.card import SUITES
@@ -94,24 +95,52 @@ def measure(bench: Bench, variants: list[str], options: argparse.Namespace) -> N
             f"| {one['ratio']:.3f} | |"
         )
     for name in variants:
-        rows = []
-        for seed in range(options.seeds):
-            training = asked(options.suite, options.decisions, seed, **VARIANTS[name])
-            began = time.perf_counter()
-            with tempfile.TemporaryDirectory() as scratch:
-                found = train(training, scratch, progress=False)
-            seconds = time.perf_counter() - began
-            rows.append({**figures_of(bench, found, options.suite, options), "seconds": seconds})
-            bench.row(variant=name, seed=seed, **rows[-1])
-        least, largest = (
-            {key: choose(row[key] for row in rows) for key in FIGURES} for choose in (min, max)
+        over_seeds(
+            bench,
+            {"variant": name},
+            lambda seed, name=name: trained(
+                asked(options.suite, options.decisions, seed, **VARIANTS[name])
+            ),
+            options,
         )
-        bench.say(
-            f"| {name} | {least['success']:.1f} to {largest['success']:.1f} % "
-            f"| {least['last']:.3f} to {largest['last']:.3f} s "
-            f"| {least['ratio']:.3f} to {largest['ratio']:.3f} "
-            f"| {least['seconds']:.0f} to {largest['seconds']:.0f} s |"
-        )
+
+
+def trained(training: Training) -> Policy:
+    """The policy of a training whose folder is not kept."""
+    with tempfile.TemporaryDirectory() as scratch:
+        return train(training, scratch, progress=False)
+
+
+def over_seeds(
+    bench: Bench,
+    named: Mapping[str, str],
+    train_by: Callable[[int], Any],
+    options: argparse.Namespace,
+) -> None:
+    """The rows of a training by every seed, and the line of their least and largest figures.
+
+    Args:
+        bench: to which they are added.
+        named: what the training is called, under the heading of its column.
+        train_by: the decision that comes of a seed.
+        options: `suite` and `seeds`, and those of `figures_of`.
+    """
+    rows = []
+    for seed in range(options.seeds):
+        began = time.perf_counter()
+        found = train_by(seed)
+        seconds = time.perf_counter() - began
+        rows.append({**figures_of(bench, found, options.suite, options), "seconds": seconds})
+        bench.row(**named, seed=seed, **rows[-1])
+    least, largest = (
+        {key: choose(row[key] for row in rows) for key in FIGURES} for choose in (min, max)
+    )
+    bench.say(
+        f"| {', '.join(named.values())} | {least['success']:.1f} to {largest['success']:.1f} % "
+        f"| {least['last']:.3f} to {largest['last']:.3f} s "
+        f"| {least['ratio']:.3f} to {largest['ratio']:.3f} "
+        f"| {least['seconds']:.0f} to {largest['seconds']:.0f} s |"
+    )
 
 
 def main() -> None:

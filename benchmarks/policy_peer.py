@@ -16,9 +16,8 @@ the largest of the seeds. Seconds are those of training, compilation included.
 """
 
 import argparse
+import functools
 import importlib
-import tempfile
-import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -28,11 +27,16 @@ import numpy as np
 from flax import struct
 
 import planner_jax as pj
-from planner_jax.benchmarks.policy_ablations import FIGURES, ITERATIONS, asked, figures_of
+from planner_jax.benchmarks.policy_ablations import (
+    ITERATIONS,
+    asked,
+    figures_of,
+    over_seeds,
+    trained,
+)
 from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin
 from planner_jax.policies.environment import CatchEnv
 from planner_jax.policies.observation import PER_TARGET, choice_of, observe
-from planner_jax.policies.training import train
 from planner_jax.task.catch.card import SUITES
 from planner_jax.task.catch.case import CatchCase, CatchChoice
 from planner_jax.task.catch.decide import CatchDecision, in_several_lengths
@@ -141,11 +145,17 @@ def train_peer(suite: str, decisions: int, seed: int) -> PeerPolicy:
 
 def train_own(suite: str, decisions: int, seed: int) -> Any:
     """What this library makes of it."""
-    training = asked(
-        suite, decisions, seed, network="mlp", lanes=LANES, minibatches=MINIBATCHES, updates=PASSES
+    return trained(
+        asked(
+            suite,
+            decisions,
+            seed,
+            network="mlp",
+            lanes=LANES,
+            minibatches=MINIBATCHES,
+            updates=PASSES,
+        )
     )
-    with tempfile.TemporaryDirectory() as scratch:
-        return train(training, scratch, progress=False)
 
 
 def measure(bench: Bench, options: argparse.Namespace) -> None:
@@ -153,7 +163,7 @@ def measure(bench: Bench, options: argparse.Namespace) -> None:
     bench.say(
         f"{options.suite}, {options.decisions:,} decisions, {options.seeds} seeds, judged on "
         f"{options.num} cases of seed {options.seed}, {jax.devices()[0]}",
-        "| training | refereed | last catch | OTR | seconds |",
+        "| training | refereed | last catch | OTR | time |",
         "|---|---|---|---|---|",
     )
     greedy = figures_of(bench, pj.catch.Greedy(), options.suite, options)
@@ -162,23 +172,9 @@ def measure(bench: Bench, options: argparse.Namespace) -> None:
         f"| none: `greedy` | {greedy['success']:.1f} % | {greedy['last']:.3f} s "
         f"| {greedy['ratio']:.3f} | |"
     )
-    for name, trained in (("sb3", train_peer), ("brax", train_own)):
-        rows = []
-        for seed in range(options.seeds):
-            began = time.perf_counter()
-            found = trained(options.suite, options.decisions, seed)
-            seconds = time.perf_counter() - began
-            rows.append({**figures_of(bench, found, options.suite, options), "seconds": seconds})
-            bench.row(training=name, seed=seed, **rows[-1])
-        least, largest = (
-            {key: choose(row[key] for row in rows) for key in FIGURES} for choose in (min, max)
-        )
-        bench.say(
-            f"| {name} | {least['success']:.1f} to {largest['success']:.1f} % "
-            f"| {least['last']:.3f} to {largest['last']:.3f} s "
-            f"| {least['ratio']:.3f} to {largest['ratio']:.3f} "
-            f"| {least['seconds']:.0f} to {largest['seconds']:.0f} |"
-        )
+    for name, train_by in (("sb3", train_peer), ("brax", train_own)):
+        of_seed = functools.partial(train_by, options.suite, options.decisions)
+        over_seeds(bench, {"training": name}, of_seed, options)
 
 
 def main() -> None:

@@ -23,13 +23,14 @@ from tensorboardX import SummaryWriter
 from tqdm import tqdm
 
 from planner_jax import stopping
-from planner_jax.sweep.manifest import is_count, is_number, require_format, to_write
-from planner_jax.sweep.plain_json import (
-    JsonError,
-    parse_object,
-    read_object,
-    require_sealed,
+from planner_jax.sweep.manifest import (
+    is_count,
+    is_number,
+    read_sealed,
+    require_format,
+    to_write,
 )
+from planner_jax.sweep.plain_json import JsonError, parse_object, require_sealed
 from planner_jax.sweep.run_folder import RunFolder
 from planner_jax.sweep.settings import SettingError
 
@@ -205,17 +206,4 @@ def read_asked(folder: Path) -> dict[str, Any]:
     Raises:
         SettingError: the folder is not that of a training, or it is not as it was written.
     """
-    path, shown = folder / ASKED, repr(str(folder))
-    try:
-        found = read_object(path)
-    except (OSError, JsonError) as error:
-        why = f" ({ASKED} {error})" if isinstance(error, JsonError) else ""
-        rule = f"the folder of a training, with its {ASKED}"
-        raise SettingError(f"run must be {rule}, got {shown}{why}") from None
-    require_format(found, "run", "a training", shown)
-    try:
-        require_sealed(found)
-    except JsonError as error:
-        rule = f"a training whose {ASKED} is whole"
-        raise SettingError(f"run must be {rule}, got {shown}, where it {error}") from None
-    return found
+    return read_sealed(folder / ASKED, "run", "a training")

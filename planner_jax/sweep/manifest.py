@@ -111,21 +111,36 @@ def read_manifest(path: Path, name: str) -> dict[str, Any]:
     Raises:
         SettingError: there is none, it is of another format, or it is not as it was written.
     """
+    manifest = read_sealed(path, name, "a run")
+    _require_sound(manifest, name, f"{path.name} of {str(path.parent)!r}")
+    return manifest
+
+
+def read_sealed(path: Path, name: str, what: str) -> dict[str, Any]:
+    """The entries of a file of a folder, as `to_write` has them.
+
+    Args:
+        path: of the file.
+        name: of the caller's argument that holds the folder, for messages.
+        what: the folder is of, in words.
+
+    Raises:
+        SettingError: there is none, it is of another format, or it is not as it was written.
+    """
     shown = repr(str(path.parent))
     try:
-        manifest = read_object(path)
+        entries = read_object(path)
     except (OSError, JsonError) as error:
         why = f" ({path.name} {error})" if isinstance(error, JsonError) else ""
-        rule = f"the folder of a run, with its {path.name}"
+        rule = f"the folder of {what}, with its {path.name}"
         raise SettingError(f"{name} must be {rule}, got {shown}{why}") from None
-    require_format(manifest, name, "a run", shown)
+    require_format(entries, name, what, shown)
     try:
-        require_sealed(manifest)
+        require_sealed(entries)
     except JsonError as error:
-        rule = f"a run whose {path.name} is whole"
+        rule = f"{what} whose {path.name} is whole"
         raise SettingError(f"{name} must be {rule}, got {shown}, where it {error}") from None
-    _require_sound(manifest, name, f"{path.name} of {shown}")
-    return manifest
+    return entries
 
 
 def require_format(entries: Mapping[str, Any], name: str, what: str, shown: str) -> None:

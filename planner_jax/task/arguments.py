@@ -57,6 +57,22 @@ def batch_of(name: str, vectors: Any, *shape: int) -> tuple[int, ...]:
     return given[: len(given) - len(shape)]
 
 
+def require_beginning(name: str, tree: Any, shape: tuple[int, ...], words: str) -> None:
+    """Raise `ValueError` unless every leaf of an argument begins with a shape.
+
+    Args:
+        name: of the argument, for the message.
+        tree: the argument, a pytree.
+        shape: with which the shapes of its leaves begin.
+        words: for that shape, for the message.
+    """
+    for leaf in jax.tree.leaves(tree):
+        if np.shape(leaf)[: len(shape)] != shape:
+            raise ValueError(
+                f"{name} must have leaves that begin with {words}, got {np.shape(leaf)}"
+            )
+
+
 def floating(dtype: Any) -> Any:
     """A type of floating-point numbers that JAX has switched on.
 

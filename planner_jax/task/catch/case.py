@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -13,7 +12,7 @@ from jax import Array
 from planner_jax.ball.target import TargetPath
 from planner_jax.cost.extras import Extra, for_batch
 from planner_jax.rules import Table, require_sound
-from planner_jax.task.arguments import array_of, floating, numbers_of
+from planner_jax.task.arguments import array_of, floating, numbers_of, require_beginning
 from planner_jax.task.catch.rules import RULES
 
 GRAVITY = 9.81  # [m/s^2]
@@ -156,12 +155,7 @@ def case(
     def leaf(name: str, value: Any, *trailing: int) -> Array:
         return array_of(name, value, batch, trailing, dtype)
 
-    for path in jax.tree.leaves(targets):
-        if np.shape(path)[: len(shape)] != shape:
-            raise ValueError(
-                f"targets must have leaves that begin with the shape {shape} of horizon, got "
-                f"{np.shape(path)}"
-            )
+    require_beginning("targets", targets, shape, f"the shape {shape} of horizon")
     of_gravity, gravity = leaf("gravity", gravity), np.asarray(gravity)
     head = np.zeros(batch + (4, 3))
     head[..., 0, :] = numbers_of("start", start, batch, (3,))

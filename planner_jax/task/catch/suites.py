@@ -78,6 +78,7 @@ from jax import Array
 
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath, HarmonicPath
+from planner_jax.task.arguments import require_draw
 from planner_jax.task.catch.card import SUITES, TASK
 from planner_jax.task.catch.case import GRAVITY, CatchCase, case
 
@@ -137,9 +138,7 @@ def draw(
         ValueError: an argument is out of its range.
     """
     suite = suite or "throws"
-    for name, value, least in (("num", num, 1), ("seed", seed, 0), ("first", first, 0)):
-        if value < least:
-            raise ValueError(f"{name} must be >= {least}, got {value}")
+    require_draw(num, seed, first)
     if suite not in SUITES:
         return TASK.other_suite(suite)(num, seed, first)
     own = SUITES[suite].num_targets

@@ -13,7 +13,7 @@ from planner_jax.plane.obstacles import Obstacles, obstacles
 from planner_jax.plane.target import PlanePath
 from planner_jax.robot.car import CarBody, CarLimits
 from planner_jax.rules import Table, require_sound
-from planner_jax.task.arguments import array_of, batch_of, floating
+from planner_jax.task.arguments import array_of, batch_of, floating, require_beginning
 from planner_jax.task.intercept.rules import RULES
 
 
@@ -119,12 +119,7 @@ def case(
     def leaf(name: str, value: Any, *trailing: int) -> Array:
         return array_of(name, value, batch, trailing, dtype)
 
-    for path in jax.tree.leaves(target):
-        if np.shape(path)[: len(batch)] != batch:
-            raise ValueError(
-                f"target must have leaves that begin with the batch shape {batch}, got "
-                f"{np.shape(path)}"
-            )
+    require_beginning("target", target, batch, f"the batch shape {batch}")
     free = end_heading is None
     made = InterceptCase(
         start=leaf("start", start, 3),
