@@ -311,7 +311,9 @@ def test_what_is_claimed_of_drawn_cases_the_referee_confirms(scenes):
 @pytest.mark.slow
 def test_the_paper_s_planner_searches_smooths_and_drives(scenes):
     pytest.importorskip("numba", reason="the extra `baselines` is not installed")
-    plans = pj.plan(pj.intercept.planner("paper"), scenes[0])
+    plans = jax.device_get(
+        pj.plan(pj.intercept.planner("paper"), jax.tree.map(jnp.asarray, scenes[0]))
+    )
     expected = [status for _, status in SCENES.values()]
     assert plans.status.tolist() == expected
     verdict = pj.intercept.judge(scenes[0], plans)

@@ -2,9 +2,9 @@
 
 At such an event the decision is asked about the targets that have appeared, are not caught and may
 still be caught, from the state in which the quadrotor then is on its plan; the planner plans what
-it says. The new plan is flown from there on if it is solved, if the quadrotor can come to rest at
-its end, and if it catches more than what is left of the plan that is flown, or as many sooner.
-After the last planned catch the quadrotor brakes, and waits where it is at rest.
+it says. Of the new plan as many catches are kept as the quadrotor can come to rest after, and it is
+flown from there on if it is solved and if these are more than what is left of the plan that is
+flown, or as many sooner. After the last of them the quadrotor brakes, and waits where it is at rest.
 
 What was flown is put together to one plan of the whole case, and the referee judges that: all of
 its limits, every joint, and the net at each catch. Bookkeeping is done in NumPy on the host, for
@@ -159,7 +159,7 @@ def _decide(
     num, num_before = (np.isfinite(times).sum(axis=1) for times in (new.times, before))
     last, last_before = (_latest(times) for times in (new.times, before))
     better = (num > num_before) | ((num == num_before) & (last < last_before - _SOONER))
-    taken = better & is_solved(plans.status) & ways.possible
+    taken = better & is_solved(plans.status)
     chosen = _Course(**{f.name: getattr(new, f.name)[taken] for f in dataclasses.fields(new)})
     course.replace(lanes[taken], chosen)
     return plans.status
@@ -196,37 +196,44 @@ def _as_known(cases: Any, states: np.ndarray, now: np.ndarray, left: np.ndarray)
 
 
 def _planned(decided: DecidedPlanner, asked: CatchCase, lanes: np.ndarray) -> tuple[Any, Any]:
-    """Plans of some lanes (L,), up to a chunk, and their ways to rest; NumPy leaves."""
+    """Plans of some lanes (L,), up to a chunk, and the ways to rest (L, N) after their catches."""
     chunk = next(chunk for chunk in CHUNKS if lanes.size <= chunk)
     filled = np.append(lanes, np.full(chunk - lanes.size, lanes[0]))
-    plans = plan(decided, jax.tree.map(lambda leaf: leaf[filled], asked))
+    plans: Any = plan(decided, jax.tree.map(lambda leaf: leaf[filled], asked))
     limits = jax.tree.map(lambda leaf: leaf[filled], asked.limits)
-    ways = jax.device_get(_brakings(_end_states(plans.trajectory), plans.gravity, limits))
+    ways = jax.device_get(_brakings(_leg_ends(plans), plans.gravity, limits))
     return jax.tree.map(lambda leaf: np.asarray(leaf)[: lanes.size], (plans, ways))
 
 
-_brakings = jax.jit(jax.vmap(braking))
+_brakings = jax.jit(jax.vmap(jax.vmap(braking, in_axes=(0, None, None))))
 
 
-def _end_states(path: PiecewisePolynomial) -> np.ndarray:
-    """Position to jerk (L, 4, 3) at the end of the last piece that is flown."""
-    durations = np.asarray(path.durations)
-    last = durations.shape[1] - 1 - (durations[:, ::-1] > 0.0).argmax(axis=1)
-    lanes = np.arange(last.size)
-    coeffs, spans = np.asarray(path.coeffs)[lanes, last], durations[lanes, last]
-    return states_at(_path(coeffs[:, None], spans[:, None]), spans).astype(coeffs.dtype)
+def _leg_ends(plans: CatchPlan) -> np.ndarray:
+    """Position to jerk (L, N, 4, 3) at the catches."""
+    batch, size = plans.order.shape
+    coeffs, durations = (np.asarray(leaf) for leaf in jax.tree.leaves(plans.trajectory))
+    last = durations.shape[1] // size - 1
+    ends = coeffs.reshape(batch * size, -1, _SIZE, 3)[:, last:]
+    spans = durations.reshape(batch * size, -1)[:, last:]
+    states = states_at(_path(ends, spans), spans[:, 0]).astype(coeffs.dtype)
+    return states.reshape(batch, size, 4, 3)
 
 
 def _course_of(plans: CatchPlan, ways: Braking, now: np.ndarray) -> _Course:
-    """Courses of plans (L, ...) that begin now (L,), with their ways to rest."""
+    """Courses of plans (L, ...) that begin now (L,), up to the last catch with a way to rest."""
     coeffs = np.asarray(plans.trajectory.coeffs, np.float64)
-    durations = np.asarray(plans.trajectory.durations, np.float64)
-    way, time = ways.coeffs.astype(np.float64), ways.duration.astype(np.float64)
+    batch, size = plans.order.shape
+    legs = np.asarray(plans.trajectory.durations, np.float64).reshape(batch, size, -1)
+    planned = legs.sum(axis=2) > 0.0
+    after = planned & ways.possible
+    last = np.where(after.any(axis=1), size - 1 - after[:, ::-1].argmax(axis=1), -1)
+    planned &= np.arange(size) <= last[:, None]
+    legs = np.where(planned[:, :, None], legs, 0.0)
+    ends, durations = legs.sum(axis=2).cumsum(axis=1), legs.reshape(batch, -1)
+    lanes = np.arange(batch)
+    way, time = (leaf[lanes, last].astype(np.float64) for leaf in (ways.coeffs, ways.duration))
     rest = np.zeros_like(way)
     rest[:, 0] = (way * time[:, None, None] ** np.arange(_SIZE)[:, None]).sum(axis=1)
-    size = plans.order.shape[1]
-    ends = durations.cumsum(axis=1)[:, durations.shape[1] // size - 1 :: durations.shape[1] // size]
-    planned = np.diff(ends, prepend=0.0, axis=1) > 0.0
     return _Course(
         began=now.copy(),
         coeffs=np.concatenate([coeffs, way[:, None], rest[:, None]], axis=1),
