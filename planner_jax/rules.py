@@ -57,7 +57,10 @@ PERMUTATION = Rule("a permutation", _is_own_place)
 
 @dataclasses.dataclass(frozen=True)
 class Field:
-    """One array of a case: its name, its shape in one case, its rule, and its kind of numbers."""
+    """One array of a case: its name, its shape in one case, its rule, and its kind of numbers.
+
+    Where the case has None for it, or for what it is part of, nothing is asked.
+    """
 
     name: str  # joined by dots, as in "limits.speed"
     shape: tuple[int | str, ...] | None = ()  # a letter is one size wherever it is; None: any shape
@@ -85,7 +88,7 @@ class Ruled:
 def named(tree: Any, name: str) -> Any:
     """What stands at a place that is named with dots, such as "limits.speed"."""
     for each in name.split("."):
-        tree = getattr(tree, each)
+        tree = None if tree is None else getattr(tree, each)
     return tree
 
 
@@ -152,6 +155,8 @@ def require_shapes(cases: Any) -> None:
         batch = getattr(part, "batch_shape", ())
         for field in type(part).rules:
             value, name = named(part, field.name), place + field.name
+            if value is None:
+                continue
             kind = jnp.result_type(value)
             if not jnp.issubdtype(kind, field.kind):
                 wanted = _KINDS[field.kind]
@@ -208,8 +213,9 @@ def all_ruled(cases: Any) -> Iterator[Ruled]:
             if name not in free and jnp.issubdtype(jnp.result_type(leaf), np.floating):
                 yield Ruled(name, leaf, FINITE, part)
     for name, field, part in tables:
-        if field.rule is not FINITE:
-            yield Ruled(name, named(part, field.name), field.rule, part)
+        value = named(part, field.name)
+        if field.rule is not FINITE and value is not None:
+            yield Ruled(name, value, field.rule, part)
 
 
 def _parts(tree: Any, place: str = "") -> Iterator[tuple[str, Any]]:

@@ -38,7 +38,12 @@ def cases(num=LANES, dtype=np.float32):
     columns = random.standard_normal((num, SEGMENTS, 5, 3)) * 0.7
     durations = random.uniform(0.2, 0.5, (num, SEGMENTS))
     limit = lambda low, high: random.uniform(low, high, num).astype(dtype)  # noqa: E731
-    limits = QuadrotorLimits(limit(2, 9), limit(5, 15), limit(3, 8), limit(-1, 1))
+    limits = QuadrotorLimits(
+        speed=limit(2, 9),
+        acceleration=limit(5, 15),
+        body_rate=limit(3, 8),
+        min_height=limit(-1, 1),
+    )
     return columns.astype(dtype), durations.astype(dtype), (limit(9, 10), limits)
 
 

@@ -14,7 +14,8 @@ from verdicts import assert_same
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath
 from planner_jax.referee.catch import LIMITS, CatchVerdict, referee_catches
-from planner_jax.task.catch.case import CatchCase, CatchLimits, Net
+from planner_jax.robot.quadrotor import QuadrotorLimits
+from planner_jax.task.catch.case import CatchCase, Net
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
@@ -540,7 +541,7 @@ def test_float32_structs_of_the_planner_are_taken_as_they_are():
         head_state=plain.head_state,
         gravity=plain.gravity,
         net=Net(**vars(plain.net)),
-        limits=CatchLimits(**vars(plain.limits)),
+        limits=QuadrotorLimits(**vars(plain.limits)),
     )
     plan = CatchPlan(
         trajectory=PiecewisePolynomial(coeffs=leaves["coeffs"], durations=leaves["durations"]),

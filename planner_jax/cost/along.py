@@ -45,16 +45,18 @@ class Along:
     hinge_width: float
     # Of a case's extras. They look at the whole position, and are not made for a kernel.
     rate: Rate | None = None
+    orders: int = 4  # of the motion that the excess takes: 5 with the snap
 
     def key(self) -> tuple:
         """All of it in numbers and names."""
         code = self.excess.__module__, getattr(self.excess, "__qualname__", "")
         shape = self.maps.order, tuple(self.maps.proportions.tolist()), self.nodes
-        return *shape, *code, self.margins, self.hinge_width, self.rate is None
+        return *shape, *code, self.margins, self.hinge_width, self.rate is None, self.orders
 
     def matrices(self) -> np.ndarray:
-        """Position to jerk at the samples, in time over h, from the columns: (K, 4, C)."""
-        return np.stack([self.maps.sample_matrix(self.nodes, d) for d in range(4)], axis=1)
+        """Position to jerk or snap at the samples, in time over h, from the columns: (K, 4, C)."""
+        each = [self.maps.sample_matrix(self.nodes, d) for d in range(self.orders)]
+        return np.stack(each, axis=1)
 
     def weights(self) -> np.ndarray:
         """Of the samples, (K,); times the mean duration of a piece [s]."""
@@ -137,7 +139,7 @@ def _greatest_of_segments(
     """Greatest excess over every limit: E arrays (N,)."""
 
     def of_segment(columns: Array, duration: Array) -> tuple[Array, ...]:
-        motion = sample_motion(along.maps, along.nodes, columns, duration)
+        motion = sample_motion(along.maps, along.nodes, columns, duration, along.orders)
         return tuple(jnp.max(excess) for excess in along.excess(motion, parameters))
 
     return jax.vmap(of_segment)(columns, durations)
@@ -197,7 +199,7 @@ def _of_segment(
     """Penalty and greatest excess of one segment."""
     weights = jnp.asarray(along.weights(), columns.dtype)
     margins = jnp.asarray(np.array(along.margins)[:, None], columns.dtype)
-    motion = sample_motion(along.maps, along.nodes, columns, duration)
+    motion = sample_motion(along.maps, along.nodes, columns, duration, along.orders)
     excess = jnp.stack(along.excess(motion, parameters))
     hinges = smoothed_hinge(excess + margins, along.hinge_width)
     penalty = duration * jnp.sum(hinges * weights)

@@ -6,33 +6,19 @@ the quantity to its limit, less one. Vectors may come as tuples of their compone
 kernel has them.
 """
 
-from typing import Protocol
+import enum
 
 import jax.numpy as jnp
 from jax import Array
 
 from planner_jax.arithmetic import Components, components, reciprocal
-from planner_jax.robot.quadrotor import QuadrotorLimits, body_rate_squared
+from planner_jax.robot.quadrotor import (
+    QuadrotorLimits,
+    RotorLimits,
+    body_rate_squared,
+    rotor_thrusts,
+)
 from planner_jax.trajectory.polynomial import Motion
-
-
-class FlightLimits(Protocol):
-    """Limits that every quadrotor task has."""
-
-    @property
-    def speed(self) -> Array:
-        """() [m/s]."""
-        ...
-
-    @property
-    def body_rate(self) -> Array:
-        """() [rad/s]."""
-        ...
-
-    @property
-    def min_height(self) -> Array:
-        """() [m]."""
-        ...
 
 
 def _size_squared(vector: Components) -> Array:
@@ -41,25 +27,30 @@ def _size_squared(vector: Components) -> Array:
     return x * x + y * y + z * z
 
 
-def speed_excess(vel: Components, limits: FlightLimits) -> Array:
+def speed_excess(vel: Components, limits: QuadrotorLimits) -> Array:
     """|v|^2 / v_max^2 - 1 for velocities (..., 3) [m/s] (paper 002, eq. 18a)."""
     return _size_squared(vel) * reciprocal(limits.speed) ** 2 - 1.0
 
 
 def acceleration_excess(acc: Components, limits: QuadrotorLimits) -> Array:
-    """|a|^2 / a_max^2 - 1 for accelerations (..., 3) [m/s^2] (paper 002, eq. 18a)."""
+    """|a|^2 / a_max^2 - 1 for accelerations (..., 3) [m/s^2] (paper 002, eq. 18a).
+
+    Without such a limit it is -1.
+    """
+    if limits.acceleration is None:
+        return 0.0 * components(acc)[0] - 1.0
     return _size_squared(acc) * reciprocal(limits.acceleration) ** 2 - 1.0
 
 
 def body_rate_excess(
-    acc: Components, jerk: Components, gravity: Array, limits: FlightLimits
+    acc: Components, jerk: Components, gravity: Array, limits: QuadrotorLimits
 ) -> Array:
     """|omega|^2 / omega_max^2 - 1 by flatness (paper 002, eq. 18a)."""
     rate_squared = body_rate_squared(acc, jerk, gravity)
     return rate_squared * reciprocal(limits.body_rate) ** 2 - 1.0
 
 
-def ground_excess(height: Array, limits: FlightLimits) -> Array:
+def ground_excess(height: Array, limits: QuadrotorLimits) -> Array:
     """z_min - z [m] for heights (...) [m] (paper 000, eq. 28, without its squares).
 
     The squares of the print change sign below ground.
@@ -70,13 +61,73 @@ def ground_excess(height: Array, limits: FlightLimits) -> Array:
 def motion_excess(
     motion: Motion, gravity: Array, limits: QuadrotorLimits
 ) -> tuple[Array, Array, Array, Array]:
-    """All four limits along samples of a motion, each (N,): speed, acceleration, rate, ground."""
+    """Paper 002's limits, each (N,): speed, acceleration, body rate, ground (eq. 18a)."""
     return (
         speed_excess(motion.vel, limits),
         acceleration_excess(motion.acc, limits),
         body_rate_excess(motion.acc, motion.jerk, gravity, limits),
         ground_excess(motion.height, limits),
     )
+
+
+def flight_excess(motion: Motion, gravity: Array, limits: QuadrotorLimits) -> tuple[Array, ...]:
+    """Excess (N,) over each of the limits that there are, in the order of `flight_measures`."""
+    found = [speed_excess(motion.vel, limits)]
+    if limits.acceleration is not None:
+        found.append(acceleration_excess(motion.acc, limits))
+    found.append(body_rate_excess(motion.acc, motion.jerk, gravity, limits))
+    if limits.max_thrust is not None:
+        found += thrust_excess(motion.acc, gravity, *limits.thrust_bounds)
+    found.append(ground_excess(motion.height, limits))
+    if limits.rotors is not None:
+        found += rotor_excess(motion, gravity, limits.rotors)
+    return tuple(found)
+
+
+class Measure(enum.Enum):
+    """What an excess is in the terms of the quantity q and its limit, and what it is of."""
+
+    ABOVE = "q^2 / most^2 - 1"
+    BELOW = "1 - q^2 / least^2"
+    PLAIN = "q / limit - 1, or the difference in its unit"
+
+    @property
+    def factor(self) -> float:
+        """By which a small relative excess shows in it."""
+        return 1.0 if self is Measure.PLAIN else 2.0
+
+    def relative(self, excess: Array) -> Array:
+        """The relative excess of the quantity."""
+        if self is Measure.ABOVE:
+            return jnp.sqrt(jnp.maximum(excess + 1.0, 0.0)) - 1.0
+        if self is Measure.BELOW:
+            return 1.0 - jnp.sqrt(jnp.maximum(1.0 - excess, 0.0))
+        return excess
+
+
+def flight_measures(limits: QuadrotorLimits) -> tuple[Measure, ...]:
+    """What the excesses of `flight_excess` are."""
+    found = [Measure.ABOVE]
+    if limits.acceleration is not None:
+        found.append(Measure.ABOVE)
+    found.append(Measure.ABOVE)
+    if limits.max_thrust is not None:
+        found += [Measure.BELOW, Measure.ABOVE]
+    found.append(Measure.PLAIN)
+    if limits.rotors is not None:
+        found += [Measure.PLAIN] * 8
+    return tuple(found)
+
+
+def rotor_excess(motion: Motion, gravity: Array, rotors: RotorLimits) -> tuple[Array, ...]:
+    """Excess (N,) of each rotor's thrust over the greatest, then below the least, eight in all.
+
+    Relative to the greatest thrust of a rotor.
+    """
+    thrusts = rotor_thrusts(motion.acc, motion.jerk, motion.snap, gravity, rotors)
+    unit = reciprocal(rotors.max_thrust)
+    above = tuple(thrust * unit - 1.0 for thrust in thrusts)
+    return (*above, *((rotors.min_thrust - thrust) * unit for thrust in thrusts))
 
 
 def relative(squared_excess: Array) -> Array:

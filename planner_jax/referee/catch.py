@@ -31,6 +31,7 @@ from planner_jax.referee.quadrotor import (
     checked_coeffs,
     intervals_of,
     judge_motion,
+    limit_leaves,
     pieces_of,
 )
 from planner_jax.referee.verdict import Verdict
@@ -49,6 +50,9 @@ _SENTENCES = {
     "thrust low": "{excess:.2%} below the least thrust at {time:.3f} s",
     "thrust high": "{excess:.2%} above the greatest thrust at {time:.3f} s",
     "body rate": "{excess:.2%} above its limit at {time:.3f} s",
+    "acceleration": "{excess:.2%} above its limit at {time:.3f} s",
+    "rotor low": "a rotor's thrust is {excess:.2%} of the greatest below the least at {time:.3f} s",
+    "rotor high": "{excess:.2%} above the greatest thrust of a rotor at {time:.3f} s",
     "ground": "{excess:.2%} below the least height at {time:.3f} s",
     "extra": "{excess:.2%} beyond extras[{worst_extra}] of the case at {time:.3f} s",
     "net": "the target is {excess:.2%} outside the hoop's radius at {time:.3f} s",
@@ -75,10 +79,14 @@ class CatchVerdict(Verdict):
     UNBOUNDED = _UNBOUNDED
 
     max_speed: np.ndarray  # (B,) [m/s]
+    max_acceleration: np.ndarray  # (B,) [m/s^2]
     max_body_rate: np.ndarray  # (B,) [rad/s], infinite where the attitude is not defined
     min_thrust: np.ndarray  # (B,) [m/s^2], per unit mass
     max_thrust: np.ndarray  # (B,) [m/s^2], per unit mass
     min_height: np.ndarray  # (B,) [m]
+    # (B,) [N], of one rotor; NaN where the case has no limits of rotors.
+    min_rotor_thrust: np.ndarray
+    max_rotor_thrust: np.ndarray
     net_distance: np.ndarray  # (B, N) [m], from the net's centre to the target at the catch
     net_offset: np.ndarray  # (B, N) [m], its part along z_d: the target above the hoop's plane
     angle: np.ndarray  # (B, N) [rad], net's axis to target's way back; NaN for one at rest too
@@ -192,7 +200,7 @@ def referee_catches(
 
 def _leaves(cases, plans) -> dict[str, np.ndarray]:
     """Every array that the referee reads but those of the targets, by name, its shape checked."""
-    limits, net, path = cases.limits, cases.net, plans.trajectory
+    net, path = cases.net, plans.trajectory
     coeffs, present = checked_coeffs(path.coeffs), np.asarray(cases.present)
     batch, pieces = coeffs.shape[:1], coeffs.shape[1]
     if present.ndim != 2 or present.shape[:1] != batch or 0 in present.shape[1:]:
@@ -210,11 +218,7 @@ def _leaves(cases, plans) -> dict[str, np.ndarray]:
         "net.height": (net.height, ()),
         "net.radius": (net.radius, ()),
         "net.max_angle": (net.max_angle, ()),
-        "limits.speed": (limits.speed, ()),
-        "limits.min_thrust": (limits.min_thrust, ()),
-        "limits.max_thrust": (limits.max_thrust, ()),
-        "limits.body_rate": (limits.body_rate, ()),
-        "limits.min_height": (limits.min_height, ()),
+        **limit_leaves(cases.limits),
     }
     leaves = {"lane": np.arange(len(coeffs)), "coeffs": coeffs, "present": present}
     for name, (value, shape) in trailing.items():
@@ -360,7 +364,6 @@ def _judge(
     motion, tests = judge_motion(
         pieces, case, extras, intervals, tolerances["relative"], tolerances["continuity"]
     )
-    del motion["max_acceleration"]  # it has no limit: the thrust has
     flying = flown.any(axis=1)
     tests = {
         name: (failed & flying, np.where(flying, excess, 0.0), time)

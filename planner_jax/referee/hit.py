@@ -28,6 +28,7 @@ from planner_jax.referee.quadrotor import (
     checked_coeffs,
     intervals_of,
     judge_motion,
+    limit_leaves,
     pieces_of,
 )
 from planner_jax.referee.verdict import Verdict
@@ -43,6 +44,10 @@ _SENTENCES = {
     "speed": "{excess:.2%} above its limit at {time:.3f} s",
     "acceleration": "{excess:.2%} above its limit at {time:.3f} s",
     "body rate": "{excess:.2%} above its limit at {time:.3f} s",
+    "thrust low": "{excess:.2%} below the least thrust at {time:.3f} s",
+    "thrust high": "{excess:.2%} above the greatest thrust at {time:.3f} s",
+    "rotor low": "a rotor's thrust is {excess:.2%} of the greatest below the least at {time:.3f} s",
+    "rotor high": "{excess:.2%} above the greatest thrust of a rotor at {time:.3f} s",
     "ground": "{excess:.2%} below the least height at {time:.3f} s",
     "extra": "{excess:.2%} beyond extras[{worst_extra}] of the case at {time:.3f} s",
     "hitting speed x": "{excess:.2%} above its limit at {time:.3f} s",
@@ -79,6 +84,9 @@ class HitVerdict(Verdict):
     min_height: np.ndarray  # (B,) [m]
     min_thrust: np.ndarray  # (B,) [m/s^2], per unit mass
     max_thrust: np.ndarray  # (B,) [m/s^2], per unit mass
+    # (B,) [N], of one rotor; NaN where the case has no limits of rotors.
+    min_rotor_thrust: np.ndarray
+    max_rotor_thrust: np.ndarray
     hitting_velocity: np.ndarray  # (B, 3) [m/s], of the quadrotor at the impact
     apex: np.ndarray  # (B,) [m], of the ball after the impact
     landing_point: np.ndarray  # (B, 3) [m], NaN where the ball does not come down to the target
@@ -157,8 +165,7 @@ def referee_hits(
 
 def _leaves(cases, plans) -> dict[str, np.ndarray]:
     """Every array that the referee reads, by name, its shape checked."""
-    limits, stroke_limits = cases.limits, cases.hit_limits
-    path = plans.trajectory
+    stroke_limits, path = cases.hit_limits, plans.trajectory
     coeffs = checked_coeffs(path.coeffs)
     trailing = {
         "durations": (path.durations, coeffs.shape[1:2]),
@@ -171,10 +178,7 @@ def _leaves(cases, plans) -> dict[str, np.ndarray]:
         "gravity": (cases.gravity, ()),
         "restitution": (cases.restitution, ()),
         "racket_height": (cases.racket_height, ()),
-        "limits.speed": (limits.speed, ()),
-        "limits.acceleration": (limits.acceleration, ()),
-        "limits.body_rate": (limits.body_rate, ()),
-        "limits.min_height": (limits.min_height, ()),
+        **limit_leaves(cases.limits),
         "hit_limits.hitting_speed": (stroke_limits.hitting_speed, (3,)),
         "hit_limits.min_apex": (stroke_limits.min_apex, ()),
         "hit_limits.max_apex": (stroke_limits.max_apex, ()),

@@ -93,9 +93,11 @@ def first_failures(tests: dict, limits: tuple[str, ...], finite: np.ndarray) -> 
 
     Args:
         tests: name -> failed, excess, time, each (B,).
-        limits: the names in the order in which they are tested, after "not finite".
+        limits: the names in the order in which they are tested, after "not finite"; those without
+            a test are passed over.
         finite: (B,) bool, lanes whose inputs are.
     """
+    limits = (limits[0], *(name for name in limits[1:] if name in tests))
     failed = np.stack([tests[name][0] for name in limits[1:]], axis=1)
     excess = np.stack([tests[name][1] for name in limits[1:]], axis=1)
     time = np.stack([tests[name][2] for name in limits[1:]], axis=1)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from planner_jax.referee.judging import above, cut, derivative, flat
+from planner_jax.referee.rotors import rotor_thrusts
 
 # Jumps of derivatives count as displacement over one piece, or over this time [s] if longer.
 SHORTEST_PIECE = 0.1
@@ -82,6 +83,51 @@ def checked_coeffs(value) -> np.ndarray:
     if coeffs.ndim != 4 or coeffs.shape[-1] != 3 or 0 in coeffs.shape[1:]:
         raise ValueError(f"coeffs must be (B, M, D + 1, 3), got {coeffs.shape}")
     return coeffs
+
+
+def limit_leaves(limits: Any) -> dict[str, tuple[Any, tuple[int, ...]]]:
+    """The limits that there are, by name, each with its shape in one case."""
+    names = ("speed", "acceleration", "body_rate", "min_thrust", "max_thrust", "min_height")
+    found: dict[str, Any] = {f"limits.{name}": (getattr(limits, name, None), ()) for name in names}
+    if (rotors := getattr(limits, "rotors", None)) is not None:
+        of_rotors: dict[str, Any] = {"mass": (), "inertia": (3,), "mixer": (4, 4)}
+        of_rotors |= {"min_thrust": (), "max_thrust": ()}
+        for name, shape in of_rotors.items():
+            found[f"limits.rotors.{name}"] = getattr(rotors, name), shape
+    return {name: leaf for name, leaf in found.items() if leaf[0] is not None}
+
+
+def _judge_rotors(pieces: Pieces, case: dict, u: np.ndarray, relative: float) -> tuple[dict, dict]:
+    """Least and greatest thrust (B,) [N] that a rotor has at the samples u (S,), and the tests."""
+    parts = [
+        _rotor_range(pieces.of(lanes), {name: leaf[lanes] for name, leaf in case.items()}, u)
+        for lanes in cut(len(pieces.durations), max(_PRODUCT // (pieces.flown[0].size * u.size), 1))
+    ]
+    least, least_time, most, most_time = (
+        np.concatenate(found) for found in zip(*parts, strict=True)
+    )
+    low, high = case["limits.rotors.min_thrust"], case["limits.rotors.max_thrust"]
+    # Both are relative to the greatest thrust: the least is zero for most rotors.
+    below, beyond = (low - least) / high, most / high - 1.0
+    tests = {
+        "rotor low": (~(below <= relative), below, least_time),
+        "rotor high": (~(beyond <= relative), beyond, most_time),
+    }
+    return {"min_rotor_thrust": least, "max_rotor_thrust": most}, tests
+
+
+def _rotor_range(pieces: Pieces, case: dict, u: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Least thrust (B,) [N] of a rotor and its time, and the greatest and its time."""
+    times = pieces.durations[:, :, None] * u
+    body = (case[f"limits.rotors.{name}"] for name in ("mass", "inertia", "mixer"))
+    thrusts = rotor_thrusts(pieces.coeffs, times, case["gravity"], *body)
+    lanes, at = np.arange(len(thrusts)), (times + pieces.starts[:, :, None]).reshape(len(times), -1)
+    found = []
+    for rows, sign in ((thrusts.min(axis=-1), 1.0), (thrusts.max(axis=-1), -1.0)):
+        signed = np.where(np.isnan(rows), -np.inf, sign * rows).reshape(len(rows), -1)
+        place = signed.argmin(axis=1)
+        found += [sign * signed[lanes, place], at[lanes, place]]
+    return tuple(found)
 
 
 def _motion(pieces: Pieces, u: np.ndarray) -> list:
@@ -317,9 +363,8 @@ def judge_motion(
 
     Args:
         pieces: of B lanes.
-        case: leaves with leading axis B: "head_state", "gravity" and "limits.<name>"; of
-            speed, acceleration, body rate, least and greatest thrust those are tested that
-            have a limit, and the least height; and "lane" among all cases.
+        case: leaves with leading axis B: "head_state", "gravity", "lane" among all cases, and
+            the limits of `limit_leaves`, which are those that are tested.
         extras: of all cases.
         intervals: between the samples of one piece.
         relative: tolerance of every limit.
@@ -359,4 +404,10 @@ def judge_motion(
         if limit is not None:
             value = sign * measured[field]
             tests[name] = above(value, sign * limit, relative, found[peak][1])
+    if "limits.rotors.mass" in case:
+        of_rotors, rotor_tests = _judge_rotors(pieces, case, u, relative)
+        measured, tests = measured | of_rotors, tests | rotor_tests
+    else:
+        unknown = np.full(len(head), np.nan)
+        measured |= {"min_rotor_thrust": unknown, "max_rotor_thrust": unknown}
     return measured, tests

@@ -6,7 +6,9 @@ held at zero, the Hopf fibration gives the body rates from tau and the jerk alon
 """
 
 import dataclasses
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array
@@ -15,22 +17,48 @@ from planner_jax.arithmetic import Components, at_least, components, inverse_sqr
 
 
 @struct.dataclass
+class RotorLimits:
+    """What every rotor can do, and what it has to carry."""
+
+    mass: Array  # () [kg]
+    inertia: Array  # (3,) [kg m^2], principal, about the body's axes
+    mixer: Array  # (4, 4), from total thrust [N] and torque [N m] to the rotors' thrusts [N]
+    min_thrust: Array  # () [N], of a rotor
+    max_thrust: Array  # () [N], of a rotor
+
+
+@struct.dataclass
 class QuadrotorLimits:
-    """What the quadrotor may not exceed."""
+    """What the quadrotor may not exceed; there is no limit where None stands.
+
+    Another number compiles nothing anew, one in the place of None does.
+    """
 
     speed: Array  # () [m/s]
-    acceleration: Array  # () [m/s^2]
-    body_rate: Array  # () [rad/s]
+    body_rate: Array  # () [rad/s], with the yaw part of the Hopf fibration
     min_height: Array  # () [m], of the propeller plane
+    acceleration: Array | None = None  # () [m/s^2]
+    min_thrust: Array | None = None  # () [m/s^2], per unit mass; there if `max_thrust` is
+    max_thrust: Array | None = None  # () [m/s^2], per unit mass
+    rotors: RotorLimits | None = None
 
-    def scaled(self, factor: float) -> "QuadrotorLimits":
-        """Speed, acceleration and body-rate limits times `factor`; the ground stays."""
-        return dataclasses.replace(
-            self,
-            speed=self.speed * factor,
-            acceleration=self.acceleration * factor,
-            body_rate=self.body_rate * factor,
-        )
+    @property
+    def thrust_bounds(self) -> tuple[Array, Array]:
+        """Least and greatest thrust [m/s^2]; zero and infinite where there is no limit."""
+        none = jnp.zeros_like(self.speed)
+        least = none if self.min_thrust is None else self.min_thrust
+        return least, none + jnp.inf if self.max_thrust is None else self.max_thrust
+
+    def scaled(self, factor: float, gravity: Array) -> "QuadrotorLimits":
+        """Speed, acceleration, body rate and the thrust's distance from hover times `factor`."""
+        scaled = {name: factor * getattr(self, name) for name in ("speed", "body_rate")}
+        if self.acceleration is not None:
+            scaled["acceleration"] = factor * self.acceleration
+        if self.min_thrust is not None and self.max_thrust is not None:
+            least = jnp.maximum(gravity + factor * (self.min_thrust - gravity), 0.0)
+            scaled["min_thrust"] = least
+            scaled["max_thrust"] = gravity + factor * (self.max_thrust - gravity)
+        return dataclasses.replace(self, **scaled)
 
 
 def net_thrust(acc: Array, gravity: Array) -> Array:
@@ -76,6 +104,55 @@ def body_rate_squared(acc: Components, jerk: Components, gravity: Array) -> Arra
     twist = (ty * jx - tx * jy) * inverse_size
     twist = twist * reciprocal(at_least(size_squared * inverse_size + tz, 1e-2))
     return tilt_squared + twist * twist
+
+
+def body_rate(acc: Components, jerk: Components, gravity: Array) -> tuple[Array, Array, Array]:
+    """Body rate of the Hopf fibration at zero heading [rad/s], body frame, its components (...).
+
+    Args:
+        acc: (..., 3) [m/s^2].
+        jerk: (..., 3) [m/s^3].
+        gravity: () [m/s^2].
+    """
+    tx, ty, az = components(acc)
+    tz = az + gravity
+    jx, jy, jz = components(jerk)
+    inverse_size = inverse_sqrt(at_least(tx * tx + ty * ty + tz * tz, 1e-4))
+    x, y, z = tx * inverse_size, ty * inverse_size, tz * inverse_size
+    along = x * jx + y * jy + z * jz
+    dx, dy, dz = ((j - along * n) * inverse_size for j, n in ((jx, x), (jy, y), (jz, z)))
+    k = reciprocal(at_least(1.0 + z, 1e-2))
+    # The body's x axis is (1 - k x^2, -k x y, -x), its y axis (-k x y, 1 - k y^2, -y).
+    sway = k * (x * dx + y * dy)
+    return -(dy - y * sway - y * dz), dx - x * sway - x * dz, (y * dx - x * dy) * k
+
+
+def rotor_thrusts(
+    acc: Components, jerk: Components, snap: Components, gravity: Array, rotors: RotorLimits
+) -> tuple[Array, ...]:
+    """Thrust of each of the four rotors that a motion at zero heading takes [N], (...) each.
+
+    Args:
+        acc: (..., 3) [m/s^2].
+        jerk: (..., 3) [m/s^3].
+        snap: (..., 3) [m/s^4].
+        gravity: () [m/s^2].
+        rotors: and the body that they carry.
+    """
+    a, j, s = (tuple(components(each)) for each in (acc, jerk, snap))
+    turn: Any = lambda acc, jerk: body_rate(acc, jerk, gravity)  # noqa: E731
+    rate, turning = jax.jvp(turn, (a, j), (j, s))
+    x, y, z = a
+    thrust = rotors.mass * jnp.sqrt(at_least(x * x + y * y + (z + gravity) ** 2, 1e-4))
+    about_x, about_y, about_z = (rotors.inertia[..., k] for k in range(3))
+    roll = about_x * turning[0] + (about_z - about_y) * rate[1] * rate[2]
+    pitch = about_y * turning[1] + (about_x - about_z) * rate[2] * rate[0]
+    yaw = about_z * turning[2] + (about_y - about_x) * rate[0] * rate[1]
+    rows = (rotors.mixer[..., i, :] for i in range(4))
+    return tuple(
+        row[..., 0] * thrust + row[..., 1] * roll + row[..., 2] * pitch + row[..., 3] * yaw
+        for row in rows
+    )
 
 
 def tangent_basis(normal: Array) -> tuple[Array, Array]:

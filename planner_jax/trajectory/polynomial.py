@@ -31,6 +31,7 @@ class Motion:
     acc: Array  # (N, 3) [m/s^2]
     jerk: Array  # (N, 3) [m/s^3]
     pos: Any = None  # (N, 3) [m]
+    snap: Any = None  # (N, 3) [m/s^4], where it is asked for
 
 
 def derivative_factors(degree: int, order: int) -> np.ndarray:
@@ -106,7 +107,8 @@ def sample_pieces(trajectory: PiecewisePolynomial, nodes: int) -> Motion:
         return value.reshape(-1, 3)
 
     pos = sample(0)
-    return Motion(height=pos[:, 2], vel=sample(1), acc=sample(2), jerk=sample(3), pos=pos)
+    vel, acc, jerk, snap = (sample(order) for order in (1, 2, 3, 4))
+    return Motion(height=pos[:, 2], vel=vel, acc=acc, jerk=jerk, pos=pos, snap=snap)
 
 
 def states_at(trajectory: PiecewisePolynomial, times: np.ndarray) -> np.ndarray:

@@ -152,7 +152,7 @@ def boundary_rows(head_state: Array, tail_state: Array, piece_duration: Array) -
 
 
 def sample_motion(
-    maps: ProportionalMinco, nodes: int, columns: Array, piece_duration: Array
+    maps: ProportionalMinco, nodes: int, columns: Array, piece_duration: Array, orders: int = 4
 ) -> Motion:
     """Position, velocity, acceleration and jerk at `nodes` intervals a piece.
 
@@ -161,19 +161,22 @@ def sample_motion(
         nodes: intervals a piece; N = M nodes + 1 samples, ends shared.
         columns: (2s + M - 1, 3) boundary rows and whitened offsets y.
         piece_duration: () h = T / M [s].
+        orders: 5 for the snap as well.
     """
     # One product for everything: on a CPU each product, division and sum of its own costs more
     # than its arithmetic. The matrix comes first, so that a batch adds columns.
-    matrices = np.stack([maps.sample_matrix(nodes, d) for d in range(4)])
+    matrices = np.stack([maps.sample_matrix(nodes, d) for d in range(orders)])
     unit = jnp.matmul(
         jnp.asarray(matrices.reshape(-1, matrices.shape[-1]), columns.dtype),
         columns,
         precision=lax.Precision.HIGHEST,
-    ).reshape(4, -1, 3)
+    ).reshape(orders, -1, 3)
     rate = reciprocal(piece_duration)
-    rates = jnp.stack([jnp.ones_like(rate), rate, rate * rate, rate * rate * rate])
-    pos, vel, acc, jerk = unit * rates[:, None, None]
-    return Motion(height=pos[:, 2], vel=vel, acc=acc, jerk=jerk, pos=pos)
+    rates = [jnp.ones_like(rate), rate, rate * rate, rate * rate * rate]
+    rates = jnp.stack([*rates, rates[2] * rates[2]][:orders])
+    pos, vel, acc, jerk, *snap = unit * rates[:, None, None]
+    parts: Any = {"snap": snap[0]} if snap else {}
+    return Motion(height=pos[:, 2], vel=vel, acc=acc, jerk=jerk, pos=pos, **parts)
 
 
 def trajectory_energy(maps: ProportionalMinco, rows: Array, offsets: Array, piece_duration: Array):

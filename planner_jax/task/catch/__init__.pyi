@@ -1,6 +1,5 @@
 from .case import CatchCase as CatchCase
 from .case import CatchChoice as CatchChoice
-from .case import CatchLimits as CatchLimits
 from .case import Net as Net
 from .case import case as case
 from .decide import Best as Best

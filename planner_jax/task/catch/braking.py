@@ -6,15 +6,13 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.cost.quadrotor import body_rate_excess, ground_excess, speed_excess, thrust_excess
+from planner_jax.cost.quadrotor import flight_excess, flight_measures
 from planner_jax.protocol import FEASIBILITY_TOLERANCE
-from planner_jax.task.catch.case import CatchLimits
+from planner_jax.robot.quadrotor import QuadrotorLimits
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, sample_pieces
 
 _DURATIONS = np.geomspace(0.2, 4.0, 24)  # [s], of the ways to rest that are tried
 _NODES = 120  # at which each is held against the limits
-# By how much a square may be above that of its limit: plans may end so far above.
-_ABOVE = 2.0 * FEASIBILITY_TOLERANCE
 # Velocity, acceleration and jerk of the powers 4 to 6 after a unit of time.
 _AT_END = np.array([[4.0, 5.0, 6.0], [12.0, 20.0, 30.0], [24.0, 60.0, 120.0]])
 
@@ -28,7 +26,7 @@ class Braking:
     possible: Array  # () bool, whether it keeps all limits
 
 
-def braking(state: Array, gravity: Array, limits: CatchLimits) -> Braking:
+def braking(state: Array, gravity: Array, limits: QuadrotorLimits) -> Braking:
     """The way to rest that is soonest over, of those with least snap for their duration; pure.
 
     Where the quadrotor comes to rest is free, so each is of degree six. Where none of the durations
@@ -51,13 +49,10 @@ def braking(state: Array, gravity: Array, limits: CatchLimits) -> Braking:
         zero = jnp.zeros_like(high[:1])
         coeffs = jnp.concatenate([low, high, zero])
         motion = sample_pieces(PiecewisePolynomial(coeffs[None], t[None]), _NODES)
-        squared = (
-            speed_excess(motion.vel, limits),
-            body_rate_excess(motion.acc, motion.jerk, gravity, limits),
-            *thrust_excess(motion.acc, gravity, limits.min_thrust, limits.max_thrust),
-        )
-        high_enough = jnp.max(ground_excess(motion.height, limits)) <= 0.0
-        return coeffs, (jnp.max(jnp.stack(squared)) <= _ABOVE) & high_enough
+        excess = flight_excess(motion, gravity, limits)
+        measures = flight_measures(limits)
+        relative = [of.relative(each) for of, each in zip(measures, excess, strict=True)]
+        return coeffs, jnp.max(jnp.stack(relative)) <= FEASIBILITY_TOLERANCE
 
     durations = jnp.asarray(_DURATIONS, state.dtype)
     coeffs, kept = jax.vmap(to_rest)(durations)

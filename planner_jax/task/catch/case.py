@@ -11,34 +11,17 @@ from jax import Array
 
 from planner_jax.ball.target import TargetPath
 from planner_jax.cost.extras import Extra, for_batch
+from planner_jax.robot.quadrotor import QuadrotorLimits
+from planner_jax.robot.quadrotor_model import NET, QuadrotorModel
+from planner_jax.robot.quadrotor_models import PAPER_CATCHER
 from planner_jax.rules import Table, require_sound
 from planner_jax.task.arguments import array_of, floating, numbers_of, require_beginning
 from planner_jax.task.catch.rules import RULES
+from planner_jax.task.flight import limits_of, require_tool
 
 GRAVITY = 9.81  # [m/s^2]
 START = (0.0, 0.0, 1.0)  # [m], where the quadrotor hovers
-NET_HEIGHT, NET_RADIUS = 0.2, 0.125  # [m], of the hoop (paper 000, Fig. 6)
-
-
-@struct.dataclass
-class CatchLimits:
-    """What the quadrotor may not exceed (paper 000, eq. 3d-e)."""
-
-    speed: Array  # () [m/s]
-    min_thrust: Array  # () [m/s^2], per unit mass
-    max_thrust: Array  # () [m/s^2], per unit mass
-    body_rate: Array  # () [rad/s], with the yaw part of the Hopf fibration
-    min_height: Array  # () [m], of the propeller plane
-
-    def scaled(self, factor: float, gravity: Array) -> "CatchLimits":
-        """Speed, body rate and the thrust's distance from hover times `factor`."""
-        return dataclasses.replace(
-            self,
-            speed=factor * self.speed,
-            body_rate=factor * self.body_rate,
-            min_thrust=jnp.maximum(gravity + factor * (self.min_thrust - gravity), 0.0),
-            max_thrust=gravity + factor * (self.max_thrust - gravity),
-        )
+NET_HEIGHT, NET_RADIUS = PAPER_CATCHER.tool.height, PAPER_CATCHER.tool.radius  # [m]
 
 
 @struct.dataclass
@@ -77,7 +60,7 @@ class CatchCase:
     head_state: Array  # (4, 3) position, velocity, acceleration, jerk of the quadrotor at time 0
     gravity: Array  # () [m/s^2], magnitude
     net: Net
-    limits: CatchLimits
+    limits: QuadrotorLimits  # with a least and a greatest thrust (paper 000, eq. 3d-e)
     extras: tuple[Any, ...] = ()  # limits and costs of the user's own, see `cost.extras`
     optional: bool = struct.field(pytree_node=False, default=False)  # targets may be left
 
@@ -102,16 +85,17 @@ def case(
     horizon,
     *,
     present: Any = True,
+    robot: QuadrotorModel = PAPER_CATCHER,
     start=START,
     gravity: Any = GRAVITY,
-    net_height=NET_HEIGHT,
-    net_radius=NET_RADIUS,
-    max_angle=np.pi / 6.0,
-    speed=5.0,
+    net_height=None,
+    net_radius=None,
+    max_angle=None,
+    speed=None,
     min_thrust=None,
     max_thrust=None,
-    body_rate=5.0,
-    min_height=0.25,
+    body_rate=None,
+    min_height=None,
     extras: Sequence[Extra] = (),
     optional: bool = False,
     dtype=jnp.float32,
@@ -127,14 +111,15 @@ def case(
         targets: a path pytree whose leaves have leading axes (..., N).
         horizon: (..., N) [s], until when each target may be caught.
         present: (..., N) bool.
+        robot: with a net; what is not given below is the robot's.
         start: (3,) or (..., 3) [m], hover position of the quadrotor.
         gravity: [m/s^2]. This and all that follow may be one value or one a case.
         net_height: l [m].
         net_radius: [m].
         max_angle: theta_safe [rad].
         speed: [m/s].
-        min_thrust: [m/s^2]; 0.3 g if not given.
-        max_thrust: [m/s^2]; 2.5 g if not given.
+        min_thrust: [m/s^2].
+        max_thrust: [m/s^2].
         body_rate: [rad/s].
         min_height: [m].
         extras: such as `pj.KeepOut`, each for one case, which all of them get, or with the
@@ -156,7 +141,7 @@ def case(
         return array_of(name, value, batch, trailing, dtype)
 
     require_beginning("targets", targets, shape, f"the shape {shape} of horizon")
-    of_gravity, gravity = leaf("gravity", gravity), np.asarray(gravity)
+    tool = require_tool(robot, NET)
     head = np.zeros(batch + (4, 3))
     head[..., 0, :] = numbers_of("start", start, batch, (3,))
     shares = np.arange(1, num + 1) / (num + 1.0)
@@ -167,18 +152,20 @@ def case(
         order=jnp.asarray(np.broadcast_to(np.arange(num), shape), jnp.int32),
         times=leaf("horizon", shares * np.asarray(horizon)[..., :1], num),
         head_state=jnp.asarray(head, dtype),
-        gravity=of_gravity,
+        gravity=leaf("gravity", gravity),
         net=Net(
-            height=leaf("net_height", net_height),
-            radius=leaf("net_radius", net_radius),
-            max_angle=leaf("max_angle", max_angle),
+            height=leaf("net_height", tool.height if net_height is None else net_height),
+            radius=leaf("net_radius", tool.radius if net_radius is None else net_radius),
+            max_angle=leaf("max_angle", tool.max_angle if max_angle is None else max_angle),
         ),
-        limits=CatchLimits(
-            speed=leaf("speed", speed),
-            min_thrust=leaf("min_thrust", 0.3 * gravity if min_thrust is None else min_thrust),
-            max_thrust=leaf("max_thrust", 2.5 * gravity if max_thrust is None else max_thrust),
-            body_rate=leaf("body_rate", body_rate),
-            min_height=leaf("min_height", min_height),
+        limits=limits_of(
+            robot,
+            leaf,
+            speed=speed,
+            min_thrust=min_thrust,
+            max_thrust=max_thrust,
+            body_rate=body_rate,
+            min_height=min_height,
         ),
         extras=for_batch(extras, batch, dtype),
         optional=optional,

@@ -5,6 +5,8 @@ targets that are not there are computed like the others, so that one compiled sh
 number of targets, and count nothing.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -110,9 +112,9 @@ def chain_rows(head_state: Array, tail_states: Array, piece_durations: Array) ->
     return jax.vmap(boundary_rows)(heads, tail_states, piece_durations)
 
 
-def chain_motion(maps: ProportionalMinco, nodes: int, chain: Chain) -> Motion:
-    """Samples of every segment, leaves with a leading axis N."""
-    sample = lambda *segment: sample_motion(maps, nodes, *segment)  # noqa: E731
+def chain_motion(maps: ProportionalMinco, nodes: int, chain: Chain, orders: int = 4) -> Motion:
+    """Samples of every segment, with the snap at 5 orders; leaves with a leading axis N."""
+    sample = functools.partial(sample_motion, maps, nodes, orders=orders)
     return jax.vmap(sample)(chain.columns, chain.piece_durations)
 
 

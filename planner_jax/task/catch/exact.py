@@ -18,7 +18,7 @@ from jax import Array
 from planner_jax.cost.along import Along, greatest_along, integrate_along
 from planner_jax.cost.extras import extra_excess, extra_rate, num_limits
 from planner_jax.cost.penalty import smoothed_hinge
-from planner_jax.cost.quadrotor import body_rate_excess, ground_excess, speed_excess, thrust_excess
+from planner_jax.cost.quadrotor import flight_excess, flight_measures
 from planner_jax.lanes import in_one_kernel
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
 from planner_jax.optimise.planner import OptimisedPlanner, pending
@@ -26,8 +26,8 @@ from planner_jax.optimise.problem import Round
 from planner_jax.optimise.scaling import shipped_scale
 from planner_jax.optimise.sensitivity import curvature_by_tangents
 from planner_jax.protocol import FEASIBILITY_TOLERANCE, require_settings
-from planner_jax.robot.quadrotor import body_z, tangent_basis
-from planner_jax.task.catch.case import CatchCase, CatchLimits
+from planner_jax.robot.quadrotor import QuadrotorLimits, body_z, tangent_basis
+from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.chain import (
     CatchContext,
     Chain,
@@ -75,19 +75,13 @@ _LEAN = 0.95  # of the angle that the net may have to the ball's way, what a gue
 
 
 # Gravity, limits and extras of a case.
-_Given = tuple[Array, CatchLimits, tuple[Any, ...]]
+_Given = tuple[Array, QuadrotorLimits, tuple[Any, ...]]
 
 
 def _limits_along(motion: Motion, given: _Given) -> tuple[Array, ...]:
-    """Speed, body rate, weak and strong thrust, ground, and the extra limits."""
+    """Those of flight, and the extra ones."""
     gravity, limits, extras = given
-    return (
-        speed_excess(motion.vel, limits),
-        body_rate_excess(motion.acc, motion.jerk, gravity, limits),
-        *thrust_excess(motion.acc, gravity, limits.min_thrust, limits.max_thrust),
-        ground_excess(motion.height, limits),
-        *extra_excess(motion, extras),
-    )
+    return (*flight_excess(motion, gravity, limits), *extra_excess(motion, extras))
 
 
 @struct.dataclass
@@ -190,7 +184,8 @@ class ExactCatch(OptimisedPlanner):
             jnp.where(is_last, last, on_the_way)[:, None]
             for on_the_way, last in (of_catches[:2], of_catches[2:])
         )
-        less, more = case.gravity - case.limits.min_thrust, case.limits.max_thrust - case.gravity
+        least, most = case.limits.thrust_bounds
+        less, more = case.gravity - least, most - case.gravity
         thrust = case.gravity + lift * jnp.where(lift < 0.0, less, more)
         vel = kept * (ball.pos - before) / durations[:, None]
         up = jnp.array([0.0, 0.0, 1.0], times.dtype)
@@ -287,12 +282,14 @@ class ExactCatch(OptimisedPlanner):
         late = catch.times / context.horizon - 1.0 + FEASIBILITY_TOLERANCE
         return jnp.where(context.active, jnp.stack([catch.angle_excess, late]), -1.0)
 
-    def _along(self, nodes: int, extras: tuple[Any, ...]) -> Along:
+    def _along(self, nodes: int, case: CatchCase) -> Along:
         """Penalties along the way: squares carry twice the relative margin."""
-        factors = (2.0, 2.0, 2.0, 2.0, 1.0) + (1.0,) * num_limits(extras)
+        factors = [measure.factor for measure in flight_measures(case.limits)]
+        factors += [1.0] * num_limits(case.extras)
         margins = tuple(self.margin * factor for factor in factors)
-        rate = extra_rate if extras else None
-        return Along(self.maps, nodes, _limits_along, margins, self.hinge_width, rate)
+        rate = extra_rate if case.extras else None
+        orders = 4 if case.limits.rotors is None else 5
+        return Along(self.maps, nodes, _limits_along, margins, self.hinge_width, rate, orders)
 
     def objective(self, point: Array, context: CatchContext) -> Evaluation:
         """Cost, and the largest excess at the penalty nodes (squares over squares)."""
@@ -300,7 +297,7 @@ class ExactCatch(OptimisedPlanner):
         ends = in_one_kernel(ExactCatch.ends, self)
         rows, durations, core, at_catches = ends(natural, context)
         penalties, worst = integrate_along(
-            self._along(self.nodes, context.case.extras),
+            self._along(self.nodes, context.case),
             jnp.concatenate([rows, offsets], axis=1),
             durations,
             (context.case.gravity, context.case.limits, context.case.extras),
@@ -362,10 +359,10 @@ class ExactCatch(OptimisedPlanner):
         The smoothed hinge bends at most with 3 / (2 hinge_width); the residuals bend alike.
         """
         chain, catch = self._unpack(point, context)
-        along = self._along(self.nodes, context.case.extras)
+        along = self._along(self.nodes, context.case)
         bend = jnp.sqrt(1.5 / self.hinge_width)
         margins = jnp.asarray(along.margins, point.dtype)[:, None, None]
-        motion, case = chain_motion(self.maps, self.nodes, chain), context.case
+        motion, case = chain_motion(self.maps, self.nodes, chain, along.orders), context.case
         excess = jnp.stack(_limits_along(motion, (case.gravity, case.limits, case.extras)))
         excess = jnp.where(context.active[:, None], excess, -1.0)
         inside = jnp.maximum(excess + margins, 0.0)
@@ -385,20 +382,16 @@ class ExactCatch(OptimisedPlanner):
         chain, catch = self._unpack(point, context)
         nodes = _DECODE_NODES[context.times.size > 1]
         greatest = greatest_along(
-            self._along(nodes, context.case.extras),
+            self._along(nodes, context.case),
             chain.columns,
             chain.piece_durations,
             (context.case.gravity, context.case.limits, context.case.extras),
         )
-        speed, rate, weak, strong, ground, *others = (
-            jnp.max(jnp.where(context.active, excess, -1.0)) for excess in greatest
-        )
-        at_catch = self._at_catch(catch, context)
-        squared = jnp.maximum(jnp.maximum(speed, rate), strong)
-        plain = functools.reduce(jnp.maximum, others, jnp.maximum(ground, jnp.max(at_catch)))
-        weak = 1.0 - jnp.sqrt(jnp.maximum(1.0 - weak, 0.0))
-        ratio = jnp.sqrt(jnp.maximum(squared + 1.0, 0.0)) - 1.0
-        violation = jnp.maximum(jnp.maximum(ratio, weak), plain)
+        excess = [jnp.max(jnp.where(context.active, each, -1.0)) for each in greatest]
+        measures = flight_measures(context.case.limits)
+        relative = [of.relative(each) for of, each in zip(measures, excess, strict=False)]
+        others = [*excess[len(measures) :], jnp.max(self._at_catch(catch, context))]
+        violation = functools.reduce(jnp.maximum, [*relative, *others])
         return CatchPlan(
             trajectory=chain_trajectory(self.maps, chain, context.active),
             gravity=context.case.gravity,

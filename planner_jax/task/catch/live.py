@@ -2,9 +2,10 @@
 
 At such an event the decision is asked about the targets that have appeared, are not caught and may
 still be caught, from the state in which the quadrotor then is on its plan; the planner plans what
-it says. Of the new plan as many catches are kept as the quadrotor can come to rest after, and it is
-flown from there on if it is solved and if these are more than what is left of the plan that is
-flown, or as many sooner. After the last of them the quadrotor brakes, and waits where it is at rest.
+it says. Of the new plan those catches are kept after which the quadrotor can come to rest. It is
+flown from there on if it is solved, and if they are more than what is left of the plan that is
+flown, or as many sooner. After the last of them the quadrotor brakes, and waits where it is at
+rest.
 
 What was flown is put together to one plan of the whole case, and the referee judges that: all of
 its limits, every joint, and the net at each catch. Bookkeeping is done in NumPy on the host, for

@@ -214,7 +214,7 @@ class MppCatch:
         """Largest excess of one segment, relative, that of the ground in metres, ()."""
         limits = case.limits
         motion = sample_pieces(segment, self.nodes)
-        weak, strong = thrust_excess(motion.acc, case.gravity, limits.min_thrust, limits.max_thrust)
+        weak, strong = thrust_excess(motion.acc, case.gravity, *limits.thrust_bounds)
         squared = [
             speed_excess(motion.vel, limits),
             body_rate_excess(motion.acc, motion.jerk, case.gravity, limits),

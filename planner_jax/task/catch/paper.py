@@ -206,8 +206,8 @@ class PaperCatch(OptimisedPlanner):
         thrust = jnp.sqrt(
             jnp.maximum(jnp.sum(net_thrust(motion.acc, case.gravity) ** 2, axis=-1), 1e-6)
         )
-        middle = 0.5 * (limits.max_thrust + limits.min_thrust)
-        half = 0.5 * (limits.max_thrust - limits.min_thrust)
+        least, most = limits.thrust_bounds
+        middle, half = 0.5 * (most + least), 0.5 * (most - least)
         rate = body_rate_squared(motion.acc, motion.jerk, case.gravity)
         along = jnp.stack(
             [
@@ -241,7 +241,8 @@ class PaperCatch(OptimisedPlanner):
         """The plan at a point, its violation that of the protocol's samples."""
         along, _, chain, catch = self._terms(point, context)
         limits, net = context.case.limits, context.case.net
-        half = 0.5 * (limits.max_thrust - limits.min_thrust)
+        least, most = limits.thrust_bounds
+        half = 0.5 * (most - least)
         units = jnp.stack([limits.speed**2, limits.body_rate**2, half**2, limits.min_height])
         relative = jnp.max(along / units[:, None, None], axis=2)  # (4, N)
         relative = jnp.concatenate(

@@ -5,15 +5,14 @@ from typing import Any
 import numpy as np
 
 from planner_jax.rules import (
-    NOT_NEGATIVE,
     PERMUTATION,
     POSITIVE,
     Field,
     Rule,
     Table,
-    below,
     within,
 )
+from planner_jax.task.flight_rules import FLIGHT_RULES
 
 
 def _lies_ahead(horizon: Any, case: Any) -> Any:
@@ -30,10 +29,6 @@ RULES: Table = (
     Field("net.height", ()),
     Field("net.radius", (), POSITIVE),
     Field("net.max_angle", (), within(0.0, np.pi, "in [0, pi]")),
-    Field("limits.speed", (), POSITIVE),
-    Field("limits.min_thrust", (), NOT_NEGATIVE),
-    Field("limits.min_thrust", (), below("limits.max_thrust")),
-    Field("limits.max_thrust", ()),
-    Field("limits.body_rate", (), POSITIVE),
+    *FLIGHT_RULES,
     Field("limits.min_height", ()),
 )

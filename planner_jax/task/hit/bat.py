@@ -275,7 +275,8 @@ class BatHit(OptimisedPlanner):
         limits = case.limits
         along = jnp.stack(motion_excess(motion, case.gravity, limits))
         one = jnp.ones_like(limits.speed)
-        unit = jnp.stack([limits.speed**2, limits.acceleration**2, limits.body_rate**2, one])
+        acceleration = one if limits.acceleration is None else limits.acceleration
+        unit = jnp.stack([limits.speed**2, acceleration**2, limits.body_rate**2, one])
         hinges = smoothed_hinge(along * unit[:, None], self.hinge_width)
         weights = joined_trapezoid_weights(self.nodes, self.maps.proportions)
         weights = jnp.asarray(weights, along.dtype)

@@ -11,15 +11,18 @@ from jax import Array
 from planner_jax.ball.flight import BallState
 from planner_jax.cost.extras import Extra, for_batch
 from planner_jax.robot.quadrotor import QuadrotorLimits
+from planner_jax.robot.quadrotor_model import RACKET, QuadrotorModel
+from planner_jax.robot.quadrotor_models import PAPER_HITTER
 from planner_jax.rules import Table, require_sound
 from planner_jax.task.arguments import array_of, batch_of, floating, numbers_of
+from planner_jax.task.flight import limits_of, require_tool
 from planner_jax.task.hit.card import START
 from planner_jax.task.hit.rules import RULES
 
 # Fit to the published landing points; the residual is 1 cm.
 DRAG = 0.0616  # K_D [1/m]
 GRAVITY = 9.8  # [m/s^2]
-RACKET_HEIGHT = 0.06  # [m], racket centre above the propeller plane (paper 002, Fig. 2)
+RACKET_HEIGHT = PAPER_HITTER.tool.height  # [m], racket centre above the propeller plane
 
 
 @struct.dataclass
@@ -62,15 +65,18 @@ def case(
     serve_vel,
     target,
     *,
+    robot: QuadrotorModel = PAPER_HITTER,
     start=START,
     drag=DRAG,
     gravity=GRAVITY,
-    restitution=0.7,
-    racket_height=RACKET_HEIGHT,
-    speed=5.0,
-    acceleration=15.0,
-    body_rate=5.0,
-    min_height=0.25,
+    restitution=None,
+    racket_height=None,
+    speed=None,
+    acceleration=None,
+    min_thrust=None,
+    max_thrust=None,
+    body_rate=None,
+    min_height=None,
     hitting_speed=(4.0, 3.0, 4.0),
     min_apex=2.2,
     max_apex=6.2,
@@ -83,6 +89,7 @@ def case(
         serve_pos: (..., 3) [m], ball when planning begins.
         serve_vel: (..., 3) [m/s].
         target: (..., 3) [m].
+        robot: with a racket; what is not given below is the robot's.
         start: (3,) or (..., 3) [m], hover position of the quadrotor.
         drag: K_D [1/m]. This and all that follow may be one value or one a case.
         gravity: [m/s^2].
@@ -90,6 +97,8 @@ def case(
         racket_height: [m].
         speed: [m/s].
         acceleration: [m/s^2].
+        min_thrust: [m/s^2], per unit mass.
+        max_thrust: [m/s^2], per unit mass.
         body_rate: [rad/s].
         min_height: [m].
         hitting_speed: (3,) [m/s], per axis.
@@ -108,6 +117,7 @@ def case(
         TypeError: an argument holds no numbers, or `dtype` is not that of floating ones.
     """
     dtype, batch = floating(dtype), batch_of("serve_pos", serve_pos, 3)
+    tool = require_tool(robot, RACKET)
 
     def leaf(name: str, value: Any, *shape: int) -> Array:
         return array_of(name, value, batch, shape, dtype)
@@ -120,13 +130,19 @@ def case(
         target=leaf("target", target, 3),
         drag=leaf("drag", drag),
         gravity=leaf("gravity", gravity),
-        restitution=leaf("restitution", restitution),
-        racket_height=leaf("racket_height", racket_height),
-        limits=QuadrotorLimits(
-            speed=leaf("speed", speed),
-            acceleration=leaf("acceleration", acceleration),
-            body_rate=leaf("body_rate", body_rate),
-            min_height=leaf("min_height", min_height),
+        restitution=leaf("restitution", tool.restitution if restitution is None else restitution),
+        racket_height=leaf(
+            "racket_height", tool.height if racket_height is None else racket_height
+        ),
+        limits=limits_of(
+            robot,
+            leaf,
+            speed=speed,
+            acceleration=acceleration,
+            min_thrust=min_thrust,
+            max_thrust=max_thrust,
+            body_rate=body_rate,
+            min_height=min_height,
         ),
         hit_limits=HitLimits(
             hitting_speed=leaf("hitting_speed", hitting_speed, 3),

@@ -27,7 +27,7 @@ from planner_jax.cost.along import Along, greatest_along, integrate_along
 from planner_jax.cost.contact import apex_excess, hitting_speed_excess
 from planner_jax.cost.extras import extra_excess, extra_rate, num_limits
 from planner_jax.cost.penalty import smoothed_hinge
-from planner_jax.cost.quadrotor import motion_excess
+from planner_jax.cost.quadrotor import Measure, flight_excess, flight_measures
 from planner_jax.lanes import in_one_kernel
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
 from planner_jax.optimise.planner import OptimisedPlanner, pending
@@ -59,9 +59,9 @@ _Given = tuple[Array, QuadrotorLimits, tuple[Any, ...]]
 
 
 def _limits_along(motion: Motion, given: _Given) -> tuple[Array, ...]:
-    """Speed, acceleration, body rate, ground, and the extra limits."""
+    """Those of flight, and the extra ones."""
     gravity, limits, extras = given
-    return (*motion_excess(motion, gravity, limits), *extra_excess(motion, extras))
+    return (*flight_excess(motion, gravity, limits), *extra_excess(motion, extras))
 
 
 # Starting points, best first: impact time over landing time, flight time afterwards [s],
@@ -238,19 +238,21 @@ class ExactHit(OptimisedPlanner):
             ]
         )
 
-    def _along(self, nodes: int, extras: tuple[Any, ...]) -> Along:
+    def _along(self, nodes: int, case: HitCase) -> Along:
         """Penalties along the way: squares carry twice the relative margin."""
-        factors = (2.0, 2.0, 2.0, 1.0) + (1.0,) * num_limits(extras)
+        factors = [measure.factor for measure in flight_measures(case.limits)]
+        factors += [1.0] * num_limits(case.extras)
         margins = tuple(self.margin * factor for factor in factors)
-        rate = extra_rate if extras else None
-        return Along(self.maps, nodes, _limits_along, margins, self.hinge_width, rate)
+        rate = extra_rate if case.extras else None
+        orders = 4 if case.limits.rotors is None else 5
+        return Along(self.maps, nodes, _limits_along, margins, self.hinge_width, rate, orders)
 
     def objective(self, point: Array, context: HitContext) -> Evaluation:
         """Cost, and the largest excess at the penalty nodes (squares over squares)."""
         offsets, natural = self._split(point)
         rows, duration, core, at_impact = in_one_kernel(ExactHit.ends, self)(natural, context)
         penalties, worst = integrate_along(
-            self._along(self.nodes, context.case.extras),
+            self._along(self.nodes, context.case),
             jnp.concatenate([rows, offsets])[None],
             duration[None],
             (context.case.gravity, context.case.limits, context.case.extras),
@@ -349,8 +351,9 @@ class ExactHit(OptimisedPlanner):
         The smoothed hinge bends at most with 3 / (2 hinge_width); the residuals bend alike.
         """
         offsets, rows, duration, impact = self._unpack(point, context)
-        along = self._along(self.nodes, context.case.extras)
-        motion = sample_motion(self.maps, self.nodes, jnp.concatenate([rows, offsets]), duration)
+        along = self._along(self.nodes, context.case)
+        columns = jnp.concatenate([rows, offsets])
+        motion = sample_motion(self.maps, self.nodes, columns, duration, along.orders)
         given = (context.case.gravity, context.case.limits, context.case.extras)
         excess = jnp.stack(_limits_along(motion, given))
         at_impact = self._at_impact(impact, context)
@@ -365,16 +368,18 @@ class ExactHit(OptimisedPlanner):
     def decode(self, point: Array, context: HitContext) -> HitPlan:
         """The plan at a point, its violation looked for at 16 nodes a piece."""
         offsets, rows, duration, impact = self._unpack(point, context)
-        speed, acceleration, rate, *others = greatest_along(
-            self._along(_DECODE_NODES, context.case.extras),
+        greatest = greatest_along(
+            self._along(_DECODE_NODES, context.case),
             jnp.concatenate([rows, offsets])[None],
             duration[None],
             (context.case.gravity, context.case.limits, context.case.extras),
         )
         at_impact = self._at_impact(impact, context)
-        squared = jnp.concatenate([speed, acceleration, rate, at_impact[2:]])
-        plain = jnp.concatenate([*others, at_impact[:2]])
-        violation = jnp.maximum(jnp.max(jnp.sqrt(squared + 1.0) - 1.0), jnp.max(plain))
+        measures = flight_measures(context.case.limits)
+        along = [of.relative(excess) for of, excess in zip(measures, greatest, strict=False)]
+        hitting_speed = Measure.ABOVE.relative(at_impact[2:])
+        plain = [*greatest[len(measures) :], at_impact[:2]]
+        violation = jnp.max(jnp.concatenate([*along, hitting_speed, *plain]))
         return HitPlan(
             trajectory=proportional_trajectory(self.maps, rows, offsets, duration),
             gravity=context.case.gravity,

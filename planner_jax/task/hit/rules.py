@@ -1,6 +1,7 @@
 """What the numbers of a hit must be."""
 
 from planner_jax.rules import NOT_NEGATIVE, POSITIVE, Field, Table, below, within
+from planner_jax.task.flight_rules import FLIGHT_RULES
 
 RULES: Table = (
     Field("ball.pos", (3,)),
@@ -11,9 +12,7 @@ RULES: Table = (
     Field("gravity", (), POSITIVE),
     Field("restitution", (), within(0.0, 1.0, "in [0, 1]")),
     Field("racket_height", ()),
-    Field("limits.speed", (), POSITIVE),
-    Field("limits.acceleration", (), POSITIVE),
-    Field("limits.body_rate", (), POSITIVE),
+    *FLIGHT_RULES,
     Field("limits.min_height", (), NOT_NEGATIVE),
     Field("hit_limits.hitting_speed", (3,), POSITIVE),
     Field("hit_limits.min_apex", (), NOT_NEGATIVE),

@@ -314,4 +314,4 @@ def to_cases(
         gravity=GRAVITY,
         dtype=dtype,
     )
-    return dataclasses.replace(cases, limits=cases.limits.scaled(limit_scale))
+    return dataclasses.replace(cases, limits=cases.limits.scaled(limit_scale, cases.gravity))

@@ -1,0 +1,78 @@
+"""What a quadrotor's rotors have to do along a trajectory, in float64, for the referee.
+
+The attitude comes from the thrust (the Hopf fibration at zero heading), its rate from the cross
+product of thrust and jerk, and the angular acceleration from rates a moment apart: nothing is
+shared with the planners, who take it from the snap.
+"""
+
+import numpy as np
+
+_MOMENT = 1e-5  # [s]
+
+
+def rotor_thrusts(
+    coeffs: np.ndarray,
+    times: np.ndarray,
+    gravity: np.ndarray,
+    mass: np.ndarray,
+    inertia: np.ndarray,
+    mixer: np.ndarray,
+) -> np.ndarray:
+    """Thrust of each rotor [N] (B, M, S, 4); not finite where there is no attitude.
+
+    Args:
+        coeffs: (3, B, M, D + 1), rising powers of the time [s] since each piece's start.
+        times: (B, M, S) [s] since that.
+        gravity: (B,) [m/s^2].
+        mass: (B,) [kg].
+        inertia: (B, 3) [kg m^2], principal, about the body's axes.
+        mixer: (B, 4, 4), from thrust [N] and torque [N m] to the rotors' thrusts [N].
+    """
+    pull, rate = _pull_and_rate(coeffs, times, gravity)
+    before, after = (
+        _pull_and_rate(coeffs, times + step, gravity)[1] for step in (-_MOMENT, _MOMENT)
+    )
+    # A rate that the body sees and one that the world sees change alike.
+    change = (after - before) / (2.0 * _MOMENT)
+    axes = _body_axes(pull)
+    own = np.einsum("...ij,...i->...j", axes, rate)
+    turning = np.einsum("...ij,...i->...j", axes, change)
+    inertia = inertia[:, None, None]
+    torque = inertia * turning + np.cross(own, inertia * own)
+    thrust = mass[:, None, None, None] * np.linalg.norm(pull, axis=-1)[..., None]
+    wrench = np.concatenate([thrust, torque], axis=-1)
+    return np.einsum("bik,bmsk->bmsi", mixer, wrench)
+
+
+def _pull_and_rate(
+    coeffs: np.ndarray, times: np.ndarray, gravity: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Thrust per unit mass [m/s^2] and angular velocity [rad/s], world frame, (B, M, S, 3)."""
+    powers = np.arange(coeffs.shape[-1])
+    twice, thrice = powers * (powers - 1.0), powers * (powers - 1.0) * (powers - 2.0)
+    acc = _at(coeffs * twice, times, 2)
+    jerk = _at(coeffs * thrice, times, 3)
+    pull = acc.copy()
+    pull[..., 2] += gravity[:, None, None]
+    size = np.linalg.norm(pull, axis=-1)
+    across = np.cross(pull, jerk)
+    # Across the thrust it turns by tau x jerk / |tau|^2; about it as zero heading asks.
+    about = -across[..., 2] / (size * (size + pull[..., 2]))
+    return pull, (across / size[..., None] + about[..., None] * pull) / size[..., None]
+
+
+def _at(coeffs: np.ndarray, times: np.ndarray, order: int) -> np.ndarray:
+    """Polynomials (3, B, M, D + 1), whose first `order` powers are gone, at times: (B, M, S, 3)."""
+    value = np.zeros((3, *times.shape))
+    for k in range(coeffs.shape[-1] - 1, order - 1, -1):
+        value = value * times + coeffs[..., k, None]
+    return np.moveaxis(value, 0, -1)
+
+
+def _body_axes(pull: np.ndarray) -> np.ndarray:
+    """Rotation (..., 3, 3), body to world: the shortest turn from upright to a thrust (..., 3)."""
+    up = pull / np.linalg.norm(pull, axis=-1, keepdims=True)
+    x, y, z = np.moveaxis(up, -1, 0)
+    k = 1.0 / (1.0 + z)
+    rows = [[1.0 - k * x * x, -k * x * y, x], [-k * x * y, 1.0 - k * y * y, y], [-x, -y, z]]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)

@@ -1,0 +1,181 @@
+"""A quadrotor in one object: body, rotors, tool and limits, for planner, referee and simulation.
+
+Body frame: x forward, y left, z along the thrust; the origin is the centre of mass, in the plane of
+the propellers. SI units. Nothing here imports JAX.
+"""
+
+import dataclasses
+import math
+
+import numpy as np
+
+GRAVITY = 9.81  # [m/s^2], by which a model is asked whether it can hover
+
+NET, RACKET = "net", "racket"
+
+
+@dataclasses.dataclass(frozen=True)
+class Tool:
+    """What meets the ball: a disc across the thrust, the hoop of a net or a racket."""
+
+    kind: str  # "net" or "racket"
+    height: float  # [m], of the disc's centre above the propeller plane
+    radius: float  # [m]
+    restitution: float = 0.7  # beta of a racket
+    max_angle: float = math.pi / 6.0  # theta_safe [rad], between a net's axis and the ball's way
+
+    def __post_init__(self) -> None:
+        if self.kind not in (NET, RACKET):
+            raise ValueError(f"tool.kind must be {NET} or {RACKET}, got {self.kind!r}")
+        _require("tool.radius", self.radius, above=0.0)
+        _require("tool.height", self.height)
+        _require("tool.restitution", self.restitution, least=0.0, most=1.0)
+        _require("tool.max_angle", self.max_angle, least=0.0, most=math.pi)
+
+
+@dataclasses.dataclass(frozen=True)
+class Rotors:
+    """Four rotors, each of which turns against its neighbours."""
+
+    places: tuple[tuple[float, float], ...]  # (4, 2) [m], x and y, counter-clockwise
+    max_thrust: float  # [N], of one
+    min_thrust: float = 0.0  # [N], of one
+    torque_ratio: float = 0.016  # [m], drag torque of a rotor over its thrust
+    lag: float = 0.02  # [s], time constant of its thrust
+    radius: float = 0.06  # [m], of a propeller, to be looked at
+
+    def __post_init__(self) -> None:
+        if np.shape(self.places) != (4, 2):
+            raise ValueError(f"rotors.places must be 4 of 2 numbers, got {self.places}")
+        if not np.isfinite(self.places).all():
+            raise ValueError(f"rotors.places must be finite, got {self.places}")
+        _require("rotors.min_thrust", self.min_thrust, least=0.0)
+        _require("rotors.max_thrust", self.max_thrust, above=self.min_thrust)
+        for name in ("torque_ratio", "lag", "radius"):
+            _require(f"rotors.{name}", getattr(self, name), above=0.0)
+        if abs(np.linalg.det(self.allocation)) < 1e-12:
+            raise ValueError(f"rotors.places must let them turn the body, got {self.places}")
+
+    @property
+    def positions(self) -> np.ndarray:
+        """Centres (4, 3) [m], body frame."""
+        return np.pad(np.asarray(self.places, float), ((0, 0), (0, 1)))
+
+    @property
+    def torque_arms(self) -> np.ndarray:
+        """Torque about body z that each rotor's drag makes of its thrust (4,) [m]."""
+        return self.torque_ratio * np.array([1.0, -1.0, 1.0, -1.0])
+
+    @property
+    def allocation(self) -> np.ndarray:
+        """The matrix (4, 4) from rotor thrusts [N] to total thrust [N] and torque [N m]."""
+        x, y = np.asarray(self.places, float).T
+        return np.stack([np.ones(4), y, -x, self.torque_arms])
+
+    @property
+    def mixer(self) -> np.ndarray:
+        """The matrix (4, 4) from total thrust [N] and torque [N m] to rotor thrusts [N]."""
+        return np.linalg.inv(self.allocation)
+
+
+def cross(diagonal: float) -> tuple[tuple[float, float], ...]:
+    """Places of four rotors at 45, 135, 225 and 315 degrees, by the distance of opposite ones."""
+    half = 0.5 * diagonal * math.sqrt(0.5)
+    return ((half, half), (-half, half), (-half, -half), (half, -half))
+
+
+@dataclasses.dataclass(frozen=True)
+class FlightLimits:
+    """What plans may not exceed; None where there is no such limit."""
+
+    speed: float  # [m/s]
+    body_rate: float  # [rad/s], with the yaw part of the Hopf fibration
+    min_height: float = 0.25  # [m], of the propeller plane
+    acceleration: float | None = None  # [m/s^2]
+    thrust: tuple[float, float] | None = None  # [m/s^2], least and greatest, per unit mass
+    # Share of a rotor's range of thrusts that plans use, the rest is left for control; None: plans
+    # are not asked what the rotors do.
+    rotor_share: float | None = 0.9
+
+    def __post_init__(self) -> None:
+        _require("limits.speed", self.speed, above=0.0)
+        _require("limits.body_rate", self.body_rate, above=0.0)
+        _require("limits.min_height", self.min_height, least=0.0)
+        if self.acceleration is not None:
+            _require("limits.acceleration", self.acceleration, above=0.0)
+        if self.thrust is not None:
+            least, most = self.thrust
+            _require("limits.thrust, the least,", least, least=0.0)
+            _require("limits.thrust, the greatest,", most, above=least)
+        if self.rotor_share is not None:
+            _require("limits.rotor_share", self.rotor_share, above=0.0, most=1.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class QuadrotorModel:
+    """A quadrotor; hashable, static under jit.
+
+    Raises:
+        ValueError: a number breaks its rule, or the rotors cannot hold the body in hover; one line.
+    """
+
+    name: str
+    mass: float  # [kg]
+    inertia: tuple[float, float, float]  # [kg m^2], principal, about the body's axes
+    rotors: Rotors
+    tool: Tool
+    limits: FlightLimits
+    source: str = ""  # of the figures
+
+    def __post_init__(self) -> None:
+        _require("mass", self.mass, above=0.0)
+        if np.shape(self.inertia) != (3,):
+            raise ValueError(f"inertia must be 3 numbers, got {self.inertia}")
+        for axis in self.inertia:
+            _require("inertia", axis, above=0.0)
+        weight, most = self.mass * GRAVITY, 4.0 * self.rotors.max_thrust
+        if not most > weight:
+            raise ValueError(
+                f"4 x rotors.max_thrust must be > the weight of {weight:.3g} N, got {most:.3g} N"
+            )
+        thrust = self.limits.thrust
+        if thrust is not None and not thrust[0] < GRAVITY < thrust[1]:
+            raise ValueError(
+                f"limits.thrust must include the weight of {GRAVITY} m/s^2, got {thrust}"
+            )
+
+    @property
+    def rotor_range(self) -> tuple[float, float] | None:
+        """Least and greatest thrust of a rotor [N] that plans may ask for; None: any."""
+        share = self.limits.rotor_share
+        if share is None:
+            return None
+        least, most = self.rotors.min_thrust, self.rotors.max_thrust
+        spare = 0.5 * (1.0 - share) * (most - least)
+        return least + spare, most - spare
+
+
+def _require(
+    name: str,
+    value: float,
+    *,
+    above: float = -math.inf,
+    least: float = -math.inf,
+    most: float = math.inf,
+) -> None:
+    """Raise `ValueError` unless a number is finite and within bounds."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+        raise ValueError(f"{name} must be a number, got {value!r:.60}")
+    if math.isfinite(value) and value > above and least <= value <= most:
+        return
+    if above > -math.inf and most < math.inf:
+        rule = f"in ({above:g}, {most:g}]"
+    elif above > -math.inf:
+        rule = f"> {above:g}"
+    elif most < math.inf:
+        rule = f"in [{least:g}, {most:g}]"
+    elif least > -math.inf:
+        rule = f">= {least:g}"
+    else:
+        rule = "finite"
+    raise ValueError(f"{name} must be {rule}, got {value:g}")

@@ -1,0 +1,70 @@
+"""What the cases of all quadrotor tasks take from the robot."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from jax import Array
+
+from planner_jax.robot.quadrotor import QuadrotorLimits, RotorLimits
+from planner_jax.robot.quadrotor_model import NET, QuadrotorModel, Tool
+
+
+def require_tool(robot: Any, kind: str) -> Tool:
+    """The tool of a robot.
+
+    Raises:
+        TypeError: the robot is no `QuadrotorModel`.
+        ValueError: it carries another tool than one of this kind.
+    """
+    if not isinstance(robot, QuadrotorModel):
+        raise TypeError(f"robot must be a QuadrotorModel, got {robot!r:.60}")
+    if robot.tool.kind != kind:
+        raise ValueError(f"robot must carry a {kind}, got {robot.name!r} with a {robot.tool.kind}")
+    return robot.tool
+
+
+def limits_of(robot: QuadrotorModel, leaf: Callable[..., Array], **given: Any) -> QuadrotorLimits:
+    """The limits of a case, a robot's where they are not given.
+
+    A robot with a net has a least and a greatest thrust, those of its rotors if it says no other.
+
+    Args:
+        robot: whose limits.
+        leaf: of a name, a value and its shape in one case the array of the case.
+        **given: values by their names in `QuadrotorLimits`; None for the robot's.
+    """
+    own = robot.limits
+    least, most = own.thrust or (None, None)
+    if own.thrust is None and robot.tool.kind == NET:
+        low, high = robot.rotor_range or (robot.rotors.min_thrust, robot.rotors.max_thrust)
+        least, most = 4.0 * low / robot.mass, 4.0 * high / robot.mass
+    known = {
+        "speed": own.speed,
+        "body_rate": own.body_rate,
+        "min_height": own.min_height,
+        "acceleration": own.acceleration,
+        "min_thrust": least,
+        "max_thrust": most,
+    }
+    values = {**known, **{name: value for name, value in given.items() if value is not None}}
+    # One bound alone leaves the other side open.
+    if values["max_thrust"] is None and values["min_thrust"] is not None:
+        values["max_thrust"] = np.inf
+    if values["min_thrust"] is None and values["max_thrust"] is not None:
+        values["min_thrust"] = 0.0
+    arrays = {name: leaf(name, value) for name, value in values.items() if value is not None}
+    return QuadrotorLimits(**arrays, rotors=_rotors_of(robot, leaf))
+
+
+def _rotors_of(robot: QuadrotorModel, leaf: Callable[..., Array]) -> RotorLimits | None:
+    if robot.rotor_range is None:
+        return None
+    least, most = robot.rotor_range
+    return RotorLimits(
+        mass=leaf("robot.mass", robot.mass),
+        inertia=leaf("robot.inertia", robot.inertia, 3),
+        mixer=leaf("robot.rotors", robot.rotors.mixer, 4, 4),
+        min_thrust=leaf("robot.rotors.min_thrust", least),
+        max_thrust=leaf("robot.rotors.max_thrust", most),
+    )

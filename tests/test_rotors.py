@@ -1,0 +1,183 @@
+"""What rotors have to do along a motion: closed forms, and two derivations of which each is alone.
+
+The planners' comes from the snap, the referee's from angular velocities a moment apart.
+"""
+
+import dataclasses
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+import pytest
+
+import planner_jax as pj
+from planner_jax.referee.rotors import rotor_thrusts as judged_thrusts
+from planner_jax.robot.quadrotor import RotorLimits, body_rate, flat_attitude, rotor_thrusts
+from planner_jax.robot.quadrotor_model import (
+    NET,
+    RACKET,
+    FlightLimits,
+    QuadrotorModel,
+    Rotors,
+    Tool,
+)
+
+GRAVITY = 9.81
+MODEL = QuadrotorModel(
+    name="small",
+    mass=0.8,
+    inertia=(0.003, 0.004, 0.006),
+    rotors=Rotors(((0.1, 0.08), (-0.09, 0.1), (-0.1, -0.09), (0.11, -0.1)), max_thrust=4.5),
+    tool=Tool(RACKET, 0.07, 0.1),
+    limits=FlightLimits(speed=6.0, body_rate=6.0, thrust=(0.2 * GRAVITY, 1.9 * GRAVITY)),
+)
+ROTORS = RotorLimits(
+    mass=np.array(MODEL.mass),
+    inertia=np.array(MODEL.inertia),
+    mixer=MODEL.rotors.mixer,
+    min_thrust=np.array(0.0),
+    max_thrust=np.array(4.5),
+)
+
+float64 = pytest.mark.usefixtures("float64")
+
+
+@float64
+def test_in_hover_the_rotors_carry_the_weight_without_a_torque():
+    still = np.zeros(3)
+    found = np.array(rotor_thrusts(still, still, still, GRAVITY, ROTORS))
+    wrench = MODEL.rotors.allocation @ found
+    np.testing.assert_allclose(wrench, [MODEL.mass * GRAVITY, 0.0, 0.0, 0.0], atol=1e-12)
+
+
+@float64
+def test_in_a_plane_the_torque_is_the_inertia_times_the_angle_s_second_derivative():
+    x = np.polynomial.Polynomial([0.0, 2.0, -1.0, 3.0, 0.5])  # acceleration along x
+    time, step = 0.4, 1e-4
+    angle = lambda t: np.arctan2(x(t), GRAVITY)  # noqa: E731
+    bend = (angle(time + step) - 2.0 * angle(time) + angle(time - step)) / step**2
+    motion = [np.array([x.deriv(k)(time) if k else x(time), 0.0, 0.0]) for k in range(3)]
+    wrench = MODEL.rotors.allocation @ np.array(rotor_thrusts(*motion, GRAVITY, ROTORS))
+    thrust = MODEL.mass * np.hypot(x(time), GRAVITY)
+    torque = [0.0, MODEL.inertia[1] * bend, 0.0]
+    np.testing.assert_allclose(wrench, [thrust, *torque], atol=1e-6)
+
+
+def pieces(seed):
+    """Coefficients (3, B, M, 8) that tilt and turn, and times (B, M, S) [s]."""
+    random = np.random.default_rng(seed)
+    coeffs = random.normal(size=(3, 4, 2, 8)) * np.array([1, 1, 2, 2, 1, 1, 0.5, 0.5])
+    return coeffs, np.broadcast_to(np.linspace(0.0, 0.8, 9), (4, 2, 9))
+
+
+@float64
+def test_planner_and_referee_find_the_same_thrusts():
+    coeffs, times = pieces(0)
+    batch = np.ones(4)
+    mixer = np.broadcast_to(ROTORS.mixer, (4, 4, 4))
+    body = batch * MODEL.mass, batch[:, None] * ROTORS.inertia, mixer
+    found = judged_thrusts(coeffs, times, batch * GRAVITY, *body)
+    for lane, piece, sample in np.ndindex(4, 2, 9):
+        one = np.moveaxis(coeffs[:, lane, piece], 0, 1)
+        motion = [
+            np.polynomial.polynomial.polyval(
+                times[lane, piece, sample], np.polynomial.polynomial.polyder(one, order)
+            )
+            for order in (2, 3, 4)
+        ]
+        planned = np.array(rotor_thrusts(*motion, GRAVITY, ROTORS))
+        np.testing.assert_allclose(found[lane, piece, sample], planned, rtol=1e-6, atol=1e-6)
+
+
+@float64
+def test_the_body_rate_is_that_of_the_attitude():
+    random = np.random.default_rng(1)
+    for acc, jerk in random.normal(size=(20, 2, 3)) * 6.0:
+        np.testing.assert_allclose(
+            np.array(body_rate(acc, jerk, GRAVITY)), flat_attitude(acc, jerk, GRAVITY)[1]
+        )
+
+
+@pytest.fixture(scope="module")
+def hits():
+    """Hits of a robot whose rotors are just strong enough, and their plans."""
+    weak = dataclasses.replace(MODEL.rotors, max_thrust=3.4)
+    robot = dataclasses.replace(MODEL, rotors=weak)
+    drawn = pj.hit.draw(64, seed=2)
+    cases = pj.hit.case(drawn.ball.pos, drawn.ball.vel, drawn.target, robot=robot)
+    cases = jax.tree.map(np.asarray, cases)
+    return cases, pj.plan(pj.hit.planner("exact"), cases)
+
+
+def test_plans_keep_to_what_the_rotors_can_do(hits):
+    cases, plans = hits
+    verdict = pj.hit.judge(cases, plans)
+    np.testing.assert_array_equal(verdict.success, pj.solved(plans))
+    assert verdict.success.mean() > 0.9
+    least, most = cases.limits.rotors.min_thrust, cases.limits.rotors.max_thrust
+    kept = verdict.success
+    assert (verdict.max_rotor_thrust[kept] <= most[kept] * 1.001).all()
+    assert (verdict.min_rotor_thrust[kept] >= (least - 0.001 * most)[kept]).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "bound"), [("rotor high", "max_thrust"), ("rotor low", "min_thrust")]
+)
+def test_a_rotor_beyond_its_bound_fails_by_name(hits, name, bound):
+    cases, plans = hits
+    verdict = pj.hit.judge(cases, plans)
+    at = {
+        "max_thrust": verdict.max_rotor_thrust - 0.1,
+        "min_thrust": verdict.min_rotor_thrust + 0.1,
+    }
+    rotors = dataclasses.replace(cases.limits.rotors, **{bound: at[bound].astype(np.float32)})
+    tight = dataclasses.replace(cases, limits=dataclasses.replace(cases.limits, rotors=rotors))
+    found = pj.hit.judge(tight, plans)
+    assert (found.failed_limit[verdict.success] == name).all(), found.failed_limit
+    of_most = 0.1 / np.asarray(rotors.max_thrust)
+    np.testing.assert_allclose(
+        found.failed_excess[verdict.success], of_most[verdict.success], rtol=1e-2
+    )
+
+
+# Robots
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"mass": 2.0}, "4 x rotors.max_thrust must be > the weight of 19.6 N, got 18 N"),
+        ({"mass": -1.0}, "mass must be > 0, got -1"),
+        ({"inertia": (0.1, 0.0, 0.1)}, "inertia must be > 0, got 0"),
+        ({"inertia": (0.1, 0.1)}, r"inertia must be 3 numbers, got \(0.1, 0.1\)"),
+    ],
+)
+def test_a_robot_that_cannot_be_is_refused_in_one_line(changed, message):
+    with pytest.raises(ValueError, match=f"^{message}$"):
+        dataclasses.replace(MODEL, **changed)
+
+
+def test_rotors_in_one_line_cannot_turn_the_body():
+    with pytest.raises(ValueError, match="^rotors.places must let them turn the body"):
+        Rotors(((0.1, 0.0), (0.05, 0.0), (-0.05, 0.0), (-0.1, 0.0)), max_thrust=4.0)
+
+
+def test_a_net_does_not_hit_and_a_name_is_no_robot():
+    where = np.zeros((3,)), np.ones((3,)), np.zeros((3,))
+    net = dataclasses.replace(MODEL, tool=Tool(NET, 0.2, 0.1))
+    with pytest.raises(ValueError, match="^robot must carry a racket, got 'small' with a net$"):
+        pj.hit.case(*where, robot=net)
+    with pytest.raises(TypeError, match="^robot must be a QuadrotorModel, got 'small'$"):
+        pj.hit.case(*where, robot="small")  # type: ignore[arg-type]
+
+
+def test_a_robot_s_limits_are_those_of_the_case_where_none_are_given():
+    case = pj.hit.case(np.zeros(3), np.ones(3), np.zeros(3), robot=MODEL, speed=3.0)
+    assert case.limits.speed == np.float32(3.0) and case.limits.body_rate == np.float32(6.0)
+    assert case.limits.acceleration is None
+    assert case.limits.max_thrust == np.float32(1.9 * GRAVITY)
+    assert case.racket_height == np.float32(0.07)
+    net = dataclasses.replace(MODEL, tool=Tool(NET, 0.2, 0.1), limits=FlightLimits(5.0, 5.0))
+    of_ball = SimpleNamespace(**vars(pj.catch.draw(1)))
+    catch = pj.catch.case(of_ball.targets, of_ball.horizon, robot=net)
+    np.testing.assert_allclose(catch.limits.max_thrust, 4 * 0.95 * 4.5 / 0.8, rtol=1e-6)
