@@ -35,6 +35,7 @@ def export(plan: Plan, *, to: str, out: str | os.PathLike, rate: float | None = 
         UnknownName: there is no such format.
         ExportError: an argument breaks a rule; one line.
         MissingExtra: a package that the format needs is not installed.
+        OSError: the file system fails; its `filename` is the path.
     """
     form = format_named(to)
     _require_robot(plan, to, form)
@@ -44,11 +45,8 @@ def export(plan: Plan, *, to: str, out: str | os.PathLike, rate: float | None = 
         rate = DEFAULT_RATE if rate is None else rate
     elif rate is not None:
         raise ExportError(f"rate must not be given for {to}, which takes polynomials, got {rate}")
-    try:
-        with replacing(path) as scratch, open(scratch, "wb") as file:
-            write(plan, rate, file)
-    except OSError as error:
-        raise ExportError(_unwritable(path, error)) from None
+    with replacing(path) as scratch, open(scratch, "wb") as file:
+        write(plan, rate, file)
     return path
 
 
@@ -95,18 +93,8 @@ def _new_file(out: str | os.PathLike, to: str, form: Format) -> Path:
     if path.suffix not in form.writers:
         endings = " or ".join(form.writers)
         raise ExportError(f"out must end in {endings} for {to}, got {str(out)!r}")
-    try:
-        exists = os.path.lexists(path)
-        folder = path.parent.is_dir()
-    except (OSError, ValueError) as error:  # such as a name that holds a NUL
-        raise ExportError(_unwritable(path, error)) from None
-    if exists:
+    if os.path.lexists(path):
         raise ExportError(f"out must be a new file, got {str(path)!r}")
-    if not folder:
-        raise ExportError(f"out must be in a folder that exists, got {str(path)!r}")
+    if not path.parent.is_dir() or not os.access(path.parent, os.W_OK | os.X_OK):
+        raise ExportError(f"out must be in a folder that can be written, got {str(path)!r}")
     return path
-
-
-def _unwritable(path: Path, error: Exception) -> str:
-    why = getattr(error, "strerror", None) or error
-    return f"out must be a file that can be written, got {str(path)!r} ({why})"
