@@ -1,6 +1,10 @@
-"""Plans that nobody has to make, one of each robot."""
+"""Plans that nobody has to make, one of each robot, and files of plans as they are read."""
+
+import io
 
 import numpy as np
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 
 import planner_jax as pj
 from planner_jax.robot.arm_plan import ArmPlan
@@ -46,3 +50,26 @@ def arm():
 
 
 PLANS = {"quadrotor": quadrotor(), "car": car(), "arm": arm()}
+
+
+def table(path):
+    """Header, and rows in float64, of a file of comma-separated values."""
+    header, *rows = path.read_text().splitlines()
+    return header.split(","), np.array([row.split(",") for row in rows], float)
+
+
+def bag(path):
+    """Profile of an MCAP file, and schema, channel, record and message of each message."""
+    reader = make_reader(io.BytesIO(path.read_bytes()), decoder_factories=[DecoderFactory()])
+    return reader.get_header().profile, list(reader.iter_decoded_messages())
+
+
+def matrices(quat_wxyz):
+    """Body to world (K, 3, 3) of unit quaternions (K, 4), by the book."""
+    w, x, y, z = np.asarray(quat_wxyz, float).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)

@@ -1,27 +1,17 @@
-"""Plans in the formats of controllers, each read back by the library of those who wrote it."""
+"""Plans as tables, ROS 2's bags and Crazyflie's pieces, each as its own library reads them."""
 
-import io
-import socket
-import struct
 import sys
-import threading
-import time
 import types
 
 import jax
 import numpy as np
 import pytest
 from cflib.crazyflie.mem.trajectory_memory import Poly4D
-from flown_plans import PLANS, arm, car, quadrotor
-from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
-from pymavlink import mavutil
-from pymavlink.dialects.v20 import common
+from flown_plans import PLANS, arm, bag, car, matrices, quadrotor, table
 
 import planner_jax as pj
-from planner_jax.export import csv_rows, frames, ros2
+from planner_jax.export import csv_rows, ros2
 from planner_jax.export.crazyflie import poly4d
-from planner_jax.export.px4 import trajectory_setpoints
 from planner_jax.export.setpoints import MOST, ExportError, setpoints_of
 from planner_jax.export.words import stream
 from planner_jax.registry import MissingExtra, UnknownName
@@ -29,83 +19,8 @@ from planner_jax.registry import MissingExtra, UnknownName
 RATE = 50.0
 
 
-def table(path):
-    """Header, and rows in float64, of a file of comma-separated values."""
-    header, *rows = path.read_text().splitlines()
-    return header.split(","), np.array([row.split(",") for row in rows], float)
-
-
-def messages(path):
-    """Profile of an MCAP file, and schema, channel, record and message of each message."""
-    reader = make_reader(io.BytesIO(path.read_bytes()), decoder_factories=[DecoderFactory()])
-    return reader.get_header().profile, list(reader.iter_decoded_messages())
-
-
-def matrices(quat_wxyz):
-    """Body to world (K, 3, 3) of unit quaternions (K, 4), by the book."""
-    w, x, y, z = np.asarray(quat_wxyz, float).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), -1, 0)
-
-
 def xyz(vector):
     return [vector.x, vector.y, vector.z]
-
-
-# Frames.
-
-
-@pytest.mark.parametrize(
-    ("enu", "ned"),
-    [
-        ([1.0, 0.0, 0.0], [0.0, 1.0, 0.0]),  # east is y
-        ([0.0, 1.0, 0.0], [1.0, 0.0, 0.0]),  # north is x
-        ([0.0, 0.0, 1.0], [0.0, 0.0, -1.0]),  # up is negative z
-        ([1.0, 2.0, 3.0], [2.0, 1.0, -3.0]),
-    ],
-)
-def test_a_direction_of_ours_in_north_east_down(enu, ned):
-    np.testing.assert_array_equal(frames.to_ned(np.array(enu)), ned)
-    np.testing.assert_array_equal(frames.to_ned(np.array(ned)), enu)
-
-
-def test_there_and_back_again_no_bit_has_changed_and_the_frame_is_right_handed():
-    a, b = np.random.default_rng(0).normal(size=(2, 50, 3)).astype(np.float32)
-    back = frames.to_ned(frames.to_ned(a))
-    assert back.dtype == np.float32 and (back == a).all()
-    crossed = np.cross(frames.to_ned(a), frames.to_ned(b))
-    np.testing.assert_allclose(crossed, frames.to_ned(np.cross(a, b)), rtol=1e-5, atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("ours", "theirs"), [(0.0, 90.0), (90.0, 0.0), (180.0, -90.0), (45.0, 45.0), (-60.0, 150.0)]
-)
-def test_a_nose_to_the_east_is_90_degrees_to_the_right_of_north(ours, theirs):
-    for one, other in ((ours, theirs), (theirs, ours)):
-        off = frames.to_ned_yaw(np.radians(one)) - np.radians(other)
-        assert np.cos(off) == pytest.approx(1.0, abs=1e-12)
-
-
-def test_yaw_and_its_rate_are_those_of_the_nose_seen_from_above():
-    found = quadrotor().sample(4000.0)
-    yaw, rate = frames.yaw_of(found.quat_wxyz, found.body_rate)
-    nose = matrices(found.quat_wxyz)[:, :, 0]
-    np.testing.assert_allclose(yaw, np.arctan2(nose[:, 1], nose[:, 0]), atol=1e-6)
-    first = slice(1, 700)  # within the first piece
-    differences = (yaw[2:] - yaw[:-2]) * 2000.0
-    assert np.abs(rate[first]).max() > 0.1
-    np.testing.assert_allclose(differences[:699], rate[first], atol=0.05)
-
-
-def test_a_nose_that_points_straight_up_has_no_yaw():
-    up = np.array([[np.sqrt(0.5), 0.0, -np.sqrt(0.5), 0.0]])
-    assert frames.rotated(up, np.array([1.0, 0.0, 0.0]))[0, 2] == pytest.approx(1.0)
-    yaw, rate = frames.yaw_of(np.array([[1.0, 0.0, 0.0, 0.0]]), np.array([[0.3, 0.2, -0.7]]))
-    assert (yaw, rate) == (0.0, -0.7)
 
 
 # Tables of text.
@@ -135,7 +50,7 @@ def test_the_rate_is_100_unless_given(tmp_path):
 
 @pytest.mark.parametrize("robot", PLANS)
 def test_a_bag_holds_one_trajectory_as_rosbag2_has_them(tmp_path, robot):
-    profile, [(schema, channel, record, message)] = messages(
+    profile, [(schema, channel, record, message)] = bag(
         pj.export(PLANS[robot], to="ros2", out=tmp_path / "a.mcap", rate=RATE)
     )
     kind = "JointTrajectory" if robot == "arm" else "MultiDOFJointTrajectory"
@@ -150,7 +65,7 @@ def test_a_bag_holds_one_trajectory_as_rosbag2_has_them(tmp_path, robot):
 def test_a_quadrotor_in_a_bag_is_as_it_is_sampled_and_turns_in_the_world(tmp_path):
     plan = quadrotor()
     path = pj.export(plan, to="ros2", out=tmp_path / "a.mcap", rate=RATE)
-    points, found = messages(path)[1][0][3].points, setpoints_of(plan, RATE)
+    points, found = bag(path)[1][0][3].points, setpoints_of(plan, RATE)
     for name, of_point, wanted in [
         ("position", lambda p: xyz(p.transforms[0].translation), found.pos),
         ("velocity", lambda p: xyz(p.velocities[0].linear), found.vel),
@@ -166,7 +81,7 @@ def test_a_quadrotor_in_a_bag_is_as_it_is_sampled_and_turns_in_the_world(tmp_pat
 
 def test_a_car_in_a_bag_moves_in_the_plane_along_its_heading(tmp_path):
     path = pj.export(car(), to="ros2", out=tmp_path / "a.mcap", rate=1000.0)
-    points, found = messages(path)[1][0][3].points, setpoints_of(car(), 1000.0)
+    points, found = bag(path)[1][0][3].points, setpoints_of(car(), 1000.0)
     places = np.array([xyz(p.transforms[0].translation) for p in points])
     velocity = np.array([xyz(p.velocities[0].linear) for p in points])
     acceleration = np.array([xyz(p.accelerations[0].linear) for p in points])
@@ -187,7 +102,7 @@ def test_a_car_in_a_bag_moves_in_the_plane_along_its_heading(tmp_path):
 
 def test_an_arm_in_a_bag_has_its_six_joints_as_they_are_sampled(tmp_path):
     path = pj.export(arm(), to="ros2", out=tmp_path / "a.mcap", rate=RATE)
-    message, found = messages(path)[1][0][3], setpoints_of(arm(), RATE)
+    message, found = bag(path)[1][0][3], setpoints_of(arm(), RATE)
     assert message.joint_names == [f"joint_{k}" for k in range(1, 7)]
     for name, wanted in [
         ("positions", found.angles),
@@ -222,122 +137,6 @@ def test_where_ros_is_installed_a_plan_is_an_object_of_its_classes(monkeypatch, 
 def test_without_ros_a_message_says_what_is_missing():
     with pytest.raises(MissingExtra, match="^trajectory_message needs trajectory_msgs of ROS 2"):
         ros2.trajectory_message(arm())
-
-
-# PX4.
-
-
-def test_setpoints_of_px4_are_those_of_the_plan_in_north_east_down():
-    plan = quadrotor()
-    fields, found = trajectory_setpoints(plan, RATE), setpoints_of(plan, RATE)
-    np.testing.assert_array_equal(fields["position"], found.pos[:, [1, 0, 2]] * [1, 1, -1])
-    for name, wanted in [("velocity", "vel"), ("acceleration", "acc"), ("jerk", "jerk")]:
-        np.testing.assert_array_equal(fields[name], frames.to_ned(getattr(found, wanted)))
-    np.testing.assert_array_equal(fields["timestamp"], np.round(1e6 * found.time))
-    nose = matrices(found.quat_wxyz)[:, :, 0]
-    np.testing.assert_allclose(fields["yaw"], np.arctan2(nose[:, 0], nose[:, 1]), atol=1e-5)
-    assert all(values.dtype == np.float32 for values in list(fields.values())[1:])
-
-
-def test_a_table_of_px4_has_the_columns_of_its_message(tmp_path):
-    header, rows = table(pj.export(quadrotor(), to="px4", out=tmp_path / "a.csv", rate=RATE))
-    fields = trajectory_setpoints(quadrotor(), RATE)
-    assert header[:5] == ["timestamp", "position[0]", "position[1]", "position[2]", "velocity[0]"]
-    assert header[-2:] == ["yaw", "yawspeed"] and len(header) == 15
-    wanted = np.hstack([np.reshape(values, (len(rows), -1)) for values in fields.values()])
-    np.testing.assert_array_equal(rows.astype(np.float32), wanted.astype(np.float32))
-
-
-def test_a_bag_of_px4_has_a_message_a_setpoint(tmp_path):
-    path = pj.export(quadrotor(), to="px4", out=tmp_path / "a.mcap", rate=RATE)
-    profile, found = messages(path)
-    fields = trajectory_setpoints(quadrotor(), RATE)
-    assert profile == "ros2" and found[0][0].name == "px4_msgs/msg/TrajectorySetpoint"
-    assert found[0][1].topic == "/fmu/in/trajectory_setpoint"
-    for name, values in fields.items():
-        read = np.array([getattr(message, name) for *_, message in found])
-        np.testing.assert_array_equal(read.astype(values.dtype), values, err_msg=name)
-    np.testing.assert_array_equal(
-        [record.log_time for _, _, record, _ in found], 1000 * fields["timestamp"]
-    )
-
-
-def assert_are_setpoints(read, fields):
-    """Whether MAVLink messages are the setpoints of a plan, all that is in them to be heeded."""
-    assert len(read) == len(fields["timestamp"])
-    for names, field in [
-        (("x", "y", "z"), "position"),
-        (("vx", "vy", "vz"), "velocity"),
-        (("afx", "afy", "afz"), "acceleration"),
-        (("yaw",), "yaw"),
-        (("yaw_rate",), "yawspeed"),
-    ]:
-        found = np.array([[getattr(message, name) for name in names] for message in read])
-        np.testing.assert_array_equal(
-            found.astype(np.float32).reshape(fields[field].shape), fields[field]
-        )
-    assert {message.get_type() for message in read} == {"SET_POSITION_TARGET_LOCAL_NED"}
-    assert {(m.coordinate_frame, m.type_mask) for m in read} == {(common.MAV_FRAME_LOCAL_NED, 0)}
-    stamps = [message.time_boot_ms for message in read]
-    np.testing.assert_allclose(stamps, 1e-3 * fields["timestamp"].astype(float), atol=0.51)
-    assert [message.get_seq() for message in read] == [k % 256 for k in range(len(read))]
-
-
-@pytest.mark.parametrize("rate", [RATE, 1000.0])
-def test_a_telemetry_log_is_read_by_pymavlink(tmp_path, rate):
-    path = pj.export(quadrotor(), to="px4", out=tmp_path / "a.tlog", rate=rate)
-    fields = trajectory_setpoints(quadrotor(), rate)
-    log = mavutil.mavlink_connection(str(path), dialect="common")
-    read = []
-    while (message := log.recv_msg()) is not None:
-        read.append(message)
-    log.close()
-    assert_are_setpoints(read, fields)
-    stamps = [message._timestamp for message in read]
-    np.testing.assert_allclose(stamps, 1e-6 * fields["timestamp"].astype(float), atol=1e-9)
-    assert struct.unpack(">Q", path.read_bytes()[:8]) == (0,)
-
-
-def test_a_stream_arrives_in_real_time_and_is_decoded():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ear:
-        ear.bind(("127.0.0.1", 0))
-        ear.settimeout(5.0)
-        port = ear.getsockname()[1]
-        sent = []
-        sender = threading.Thread(
-            target=lambda: sent.append(stream(quadrotor(), to="px4", udp=port, rate=RATE))
-        )
-        fields = trajectory_setpoints(quadrotor(), RATE)
-        sender.start()
-        packets, came = [], []
-        for _ in fields["timestamp"]:
-            packets.append(ear.recv(300))
-            came.append(time.monotonic())
-        sender.join()
-    assert sent == [len(packets)]
-    decoder = common.MAVLink(None)
-    assert_are_setpoints([decoder.parse_buffer(packet)[0] for packet in packets], fields)
-    took, wanted = came[-1] - came[0], 1e-6 * float(fields["timestamp"][-1])
-    assert wanted - 0.02 < took < wanted + 1.0
-
-
-@pytest.mark.parametrize("port", [0, -1, 65536, "14540", True, None])
-def test_a_port_is_one_that_there_is(port):
-    with pytest.raises(ExportError, match="^udp must be a port from 1 to 65535, got"):
-        stream(quadrotor(), to="px4", udp=port)
-
-
-def test_a_port_on_which_nobody_listens_is_refused():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
-        taken.bind(("127.0.0.1", 0))
-        port = taken.getsockname()[1]
-    with pytest.raises(ExportError, match=f"^udp must be .* listens, got {port}$"):
-        stream(quadrotor(), to="px4", udp=port)
-
-
-def test_only_px4_is_streamed():
-    with pytest.raises(ExportError, match="^udp must not be given for csv, only for px4, got 9$"):
-        stream(quadrotor(), to="csv", udp=9)
 
 
 # Crazyflie.
