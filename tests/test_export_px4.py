@@ -156,8 +156,8 @@ def test_a_stream_arrives_in_real_time_and_is_decoded():
             target=lambda: sent.append(stream(quadrotor(), to="px4", udp=port, rate=RATE))
         )
         fields = trajectory_setpoints(quadrotor(), RATE)
+        packets, came, began = [], [], time.monotonic()
         sender.start()
-        packets, came = [], []
         for _ in fields["timestamp"]:
             packets.append(ear.recv(300))
             came.append(time.monotonic())
@@ -165,8 +165,8 @@ def test_a_stream_arrives_in_real_time_and_is_decoded():
     assert sent == [len(packets)]
     decoder = common.MAVLink(None)
     assert_are_setpoints([decoder.parse_buffer(packet)[0] for packet in packets], fields)
-    took, wanted = came[-1] - came[0], 1e-6 * float(fields["timestamp"][-1])
-    assert wanted - 0.02 < took < wanted + 1.0
+    late = np.array(came) - began - 1e-6 * fields["timestamp"].astype(float)
+    assert (late >= 0.0).all() and late.min() < 1.0, "none is early, however busy the machine is"
 
 
 @pytest.mark.parametrize("port", [0, -1, 65536, "14540", True, None])
