@@ -26,9 +26,9 @@ def packets(plan: QuadrotorPlan, rate: float) -> Iterator[tuple[int, bytes]]:
     Raises:
         ExportError: the plan may not leave, or the rate is absurd.
     """
-    if isinstance(rate, int | float) and rate > FASTEST:
-        raise ExportError(f"rate must be at most {FASTEST:g} for MAVLink, got {rate:g}")
     fields = trajectory_setpoints(plan, rate)
+    if rate > FASTEST:
+        raise ExportError(f"rate must be at most {FASTEST:g} for MAVLink, got {rate:g}")
     sender = common.MAVLink(None, srcSystem=_SENDER)
     for stamp, position, velocity, acceleration, _, yaw, yawspeed in zip(
         *(values.tolist() for values in fields.values()), strict=True
