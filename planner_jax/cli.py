@@ -1,4 +1,4 @@
-"""The command line: `planner-jax` with `sweep`, `fly`, `train`, `library`, `view`, `bench`, ...
+"""The command line: `planner-jax` with `sweep`, `fly`, `train`, `library`, `view`, `export`, ...
 
 Tasks come from the registry, and the options of `sweep` and `fly` from the fields of a task's
 settings: nothing here knows a task.
@@ -160,6 +160,8 @@ def _parser() -> _Parser:
     view.add("--port", type=_whole, default=8080, metavar="N", help=free)
     report = command("report", "write table, figures and page of a run anew", _report)
     report.add_argument("run", metavar="RUN", help="folder of a finished run")
+    words = "write a plan for a controller, or send it in real time"
+    commands.add_parser("export", help=words, fill=_add_export, **hidden)
     bench = commands.add_parser("bench", help="measure this machine")
     kinds = bench.add_subparsers(title="benchmarks", required=True, metavar="benchmark")
     words = "plans a second, with success and cost"
@@ -231,6 +233,65 @@ def _train(given: dict[str, Any]) -> None:
     with stopping.under_way(rest), _told_how_to_go_on(rest):
         train_as_asked(settings, out)
     print(f"{Path(out) / 'policy.npz'}")
+
+
+def _add_export(parser: _Parser) -> None:
+    from planner_jax.export.formats import FORMATS
+
+    parser.description = (
+        "One plan of a sweep, or of a file that plan.save wrote, in a format that controllers read."
+    )
+    parser.add_argument("plans", metavar="RUN", help="folder of a sweep, or a file of plans")
+    rows = "of the plan, from 0; left out for a file that holds one plan"
+    parser.add("--row", type=_whole, metavar="K", help=rows)
+    formats = "; ".join(f"{name}: {form.summary}" for name, form in FORMATS.items())
+    parser.add("--to", metavar="FORMAT", required=True, help=formats)
+    parser.add("--rate", type=_number, metavar="HZ", help="setpoints a second (default: 100)")
+    endings = "; ".join(f"{name}: {', '.join(form.writers)}" for name, form in FORMATS.items())
+    name = "default: RUN-K-FORMAT with the first ending"
+    parser.add("--out", metavar="FILE", help=f"new file; its ending says which ({endings}; {name})")
+    port = "of this machine, to which px4 is sent in real time over UDP in the place of a file"
+    parser.add("--udp", type=_whole, metavar="PORT", help=port)
+    parser.set_defaults(command=_export)
+
+
+def _export(given: dict[str, Any]) -> None:
+    from planner_jax.export import words
+    from planner_jax.export.setpoints import ExportError
+    from planner_jax.plan_files import PlanFileError
+
+    source, row = given.pop("plans"), given.pop("row", None)
+    out, udp = _out(given, "file"), given.pop("udp", None)
+    if out is not None and udp is not None:
+        raise SettingError(f"udp must not be given with --out, got {udp}")
+    try:
+        out = out or words.default_name(source, row, given["to"])
+        plan, against = _plan_of(source, row)
+        if udp is None:
+            told = str(words.export(plan, out=out, **given))
+        else:
+            told = f"{words.stream(plan, udp=udp, **given)} setpoints sent"
+    except PlanFileError as error:
+        raise SettingError(f"RUN{str(error).removeprefix('path')}") from None
+    except ExportError as error:
+        raise SettingError(str(error)) from None
+    if against:
+        print(f"planner-jax: warning: row {row} fails the referee: {against}", file=sys.stderr)
+    print(told)
+
+
+def _plan_of(source: str, row: int | None) -> tuple[Any, str]:
+    """The plan of a row of a sweep or of a file, and what the referee says against it, if known."""
+    if os.path.isdir(source):
+        from planner_jax.sweep.planned import planned_row
+        from planner_jax.sweep.run_folder import RunFolder
+
+        return planned_row(RunFolder(source, name="RUN"), row)
+    from planner_jax.export.saved import saved_plan
+
+    if not os.path.exists(source):
+        raise SettingError(f"RUN must be the folder of a sweep or a file of plans, got {source!r}")
+    return saved_plan(source, row), ""
 
 
 def _add_throughput(parser: _Parser) -> None:
@@ -307,11 +368,11 @@ def _add_fly(task: Task, parser: _Parser) -> None:
     parser.set_defaults(command=lambda given: _fly(task, kind, given))
 
 
-def _out(given: dict[str, Any]) -> str | None:
-    """The folder of the option `--out`, which is taken out of what was given."""
+def _out(given: dict[str, Any], kind: str = "folder") -> str | None:
+    """The folder, or file, of the option `--out`, which is taken out of what was given."""
     out = given.pop("out", None)
     if out == "":
-        raise SettingError("out must name a folder, got ''")
+        raise SettingError(f"out must name a {kind}, got ''")
     return out
 
 

@@ -1,5 +1,6 @@
 """Dataclasses of arrays as NumPy's .npz files: names of the fields, a version, and no pickle."""
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -7,6 +8,7 @@ import struct
 import typing
 import zipfile
 import zlib
+from collections.abc import Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -53,18 +55,7 @@ def load_arrays(path: str | os.PathLike, kind: type[Kind]) -> Kind:
     Raises:
         PlanFileError: the file is something else, of another class or of another version.
     """
-    try:
-        # NumPy leaves open a broken file that it has opened itself.
-        with open_plain(path) as raw, np.load(raw, allow_pickle=False) as file:
-            arrays = dict(file)
-        header = json.loads(str(arrays.pop(_HEADER)))
-        version, name = header["version"], header["class"]
-    except UNREADABLE as error:
-        if isinstance(error, FileNotFoundError):
-            raise PlanFileError(f"path must be a file of plans, got {str(path)!r}") from None
-        raise PlanFileError(
-            f"path must be a whole file of plans, got {str(path)!r} ({type(error).__name__})"
-        ) from None
+    version, name, arrays = _read(path)
     if version != VERSION or name != kind.__name__:
         raise PlanFileError(
             f"path must be a file of {kind.__name__} of version {VERSION}, got {name} of version "
@@ -77,6 +68,47 @@ def load_arrays(path: str | os.PathLike, kind: type[Kind]) -> Kind:
     if arrays:
         raise PlanFileError(f"path must not hold {', '.join(arrays)}, got {str(path)!r}")
     return tree
+
+
+def load_fitting(path: str | os.PathLike, kinds: Sequence[type[Kind]]) -> Kind:
+    """What `save_arrays` wrote, as the first of some classes all of whose fields the file has.
+
+    A class that was derived from one of them is read as that one, without its own fields.
+
+    Raises:
+        PlanFileError: the file is something else, of none of the classes or of another version.
+    """
+    version, name, arrays = _read(path)
+    if version == VERSION:
+        for kind in kinds:
+            with contextlib.suppress(KeyError):
+                return _tree(kind, "", dict(arrays))
+    names = " or ".join(kind.__name__ for kind in kinds)
+    raise PlanFileError(
+        f"path must be a file of {names} of version {VERSION}, got {name} of version {version} in "
+        f"{str(path)!r}"
+    )
+
+
+def _read(path: str | os.PathLike) -> tuple[Any, Any, dict[str, np.ndarray]]:
+    """Version and name of the class in a file, and its arrays.
+
+    Raises:
+        PlanFileError: the file is something else.
+    """
+    try:
+        # NumPy leaves open a broken file that it has opened itself.
+        with open_plain(path) as raw, np.load(raw, allow_pickle=False) as file:
+            arrays = dict(file)
+        header = json.loads(str(arrays.pop(_HEADER)))
+        version, name = header["version"], header["class"]
+    except UNREADABLE as error:
+        if isinstance(error, FileNotFoundError):
+            raise PlanFileError(f"path must be a file of plans, got {str(path)!r}") from None
+        raise PlanFileError(
+            f"path must be a whole file of plans, got {str(path)!r} ({type(error).__name__})"
+        ) from None
+    return version, name, arrays
 
 
 def named_leaves(tree: Any, prefix: str = "") -> dict[str, Any]:

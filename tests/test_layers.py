@@ -17,6 +17,7 @@ ALLOWED = {
             "ball",
             "compile_cache",
             "cost",
+            "export",
             "optimise",
             "plane",
             "planning",
@@ -47,6 +48,7 @@ ALLOWED = {
     "cost": {"arithmetic", "lanes", "robot", "rules", "trajectory"},
     "optimise": {"lanes", "protocol"},
     "planning": {"optimise", "protocol", "rules"},
+    "export": {"plan_files", "protocol", "registry", "robot", "trajectory", "whole_files"},
     "referee": set(),
     "task": {
         *("ball", "cost", "lanes", "optimise", "planning", "protocol", "referee", "registry"),
@@ -56,11 +58,14 @@ ALLOWED = {
     "sweep": {
         *("ball", "compile_cache", "digits", "lanes", "memory", "perception", "plane"),
         *("planning", "protocol", "registry", "robot", "rules", "stopping", "task"),
-        *("whole_files",),
+        *("trajectory", "whole_files"),
     },
     "compile_cache": set(),
     "doctor": {"compile_cache", "lanes", "planning", "protocol", "registry", "sweep"},
-    "cli": {"compile_cache", "digits", "doctor", "registry", "stopping", "sweep"},
+    "cli": {
+        *("compile_cache", "digits", "doctor", "export", "plan_files", "registry", "stopping"),
+        "sweep",
+    },
     "__main__": {"cli", "stopping"},
 }
 LIBRARY = ROOT / "planner_jax"

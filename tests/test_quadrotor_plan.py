@@ -10,7 +10,7 @@ import planner_jax as pj
 from planner_jax.robot.quadrotor_plan import QuadrotorPlan
 
 GRAVITY = 9.81
-FIELDS = ("pos", "vel", "acc", "quat_wxyz", "body_rate", "thrust")
+FIELDS = ("pos", "vel", "acc", "jerk", "quat_wxyz", "body_rate", "thrust")
 
 
 def made(coeffs, durations):
@@ -62,7 +62,7 @@ def test_a_hover_is_upright_at_rest_and_carries_its_weight():
     np.testing.assert_allclose(found.pos, np.tile([1.0, -2.0, 1.5], (51, 1)))
     np.testing.assert_allclose(found.quat_wxyz, np.tile([1.0, 0.0, 0.0, 0.0], (51, 1)), atol=1e-7)
     np.testing.assert_allclose(found.thrust, GRAVITY, rtol=1e-6)
-    for name in ("vel", "acc", "body_rate"):
+    for name in ("vel", "acc", "jerk", "body_rate"):
         np.testing.assert_array_equal(getattr(found, name), np.zeros((51, 3)))
 
 
@@ -72,6 +72,7 @@ def test_derivatives_and_attitude_are_those_of_the_flown_path(float64):
     differences = lambda x: (x[2:] - x[:-2]) * (0.5 * rate)  # noqa: E731
     np.testing.assert_allclose(differences(found.pos), found.vel[1:-1], atol=1e-4)
     np.testing.assert_allclose(differences(found.vel), found.acc[1:-1], atol=1e-4)
+    np.testing.assert_allclose(differences(found.acc), found.jerk[1:-1], atol=1e-4)
     np.testing.assert_allclose(np.linalg.norm(found.quat_wxyz, axis=1), 1.0, rtol=1e-12)
     turned = rotation(found.quat_wxyz)
     pull = found.acc + np.array([0.0, 0.0, GRAVITY])

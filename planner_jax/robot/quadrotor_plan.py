@@ -25,6 +25,7 @@ class QuadrotorSetpoints:
     pos: np.ndarray  # (K, 3) [m], of the propeller plane's centre
     vel: np.ndarray  # (K, 3) [m/s]
     acc: np.ndarray  # (K, 3) [m/s^2]
+    jerk: np.ndarray  # (K, 3) [m/s^3]
     quat_wxyz: np.ndarray  # (K, 4), body to world, at zero heading of the Hopf fibration
     body_rate: np.ndarray  # (K, 3) [rad/s], body frame
     thrust: np.ndarray  # (K,) [m/s^2], per unit mass
@@ -63,6 +64,7 @@ def _sampled(path: PiecewisePolynomial, gravity: Array, time: Array) -> dict[str
             "pos": pos,
             "vel": vel,
             "acc": acc,
+            "jerk": jerk,
             "quat_wxyz": tilt_quaternion(body_z(acc, gravity)),
             "body_rate": flat_attitude(acc, jerk, gravity)[1],
             "thrust": jnp.sqrt(jnp.sum(net_thrust(acc, gravity) ** 2)),

@@ -57,7 +57,7 @@ def require_sound(folder: RunFolder) -> None:
     """Raise `SettingError` unless a sweep's rows are whole, and its summary counts them."""
     manifest = folder.read_manifest()
     sweep = sweep_of_run(manifest, folder.name)
-    _require_finished(folder, manifest)
+    folder.require_finished(manifest)
     again = f"planner-jax {sweep.kind} --resume --out {shlex.quote(str(folder.path))}"
     remedy = f"make it anew: {again}"
     folder.require_whole(manifest, remedy)
@@ -100,13 +100,6 @@ def _agree(one: Any, other: Any) -> bool:
     return one == other
 
 
-def _require_finished(folder: RunFolder, manifest: dict[str, Any]) -> None:
-    if "summary" not in manifest or not folder.plans.exists():
-        raise SettingError(
-            f"{folder.name} must be finished, got {str(folder.path)!r}; resume it first"
-        )
-
-
 def write_report(folder: RunFolder) -> None:
     """Write `table.md`, `figures/` and `index.html` of a run anew.
 
@@ -118,7 +111,7 @@ def write_report(folder: RunFolder) -> None:
     """
     manifest = folder.read_manifest()
     sweep = sweep_of_run(manifest, folder.name)
-    _require_finished(folder, manifest)
+    folder.require_finished(manifest)
     folder.figures.mkdir(exist_ok=True)
     failed = _failed_rows(folder)
     _draw(RunRows(folder, manifest, failed), sweep.figures)

@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from planner_jax.planning.plan import plan
+from planner_jax.protocol import Plan
 from planner_jax.registry import MissingExtra, Task, UnknownName, task_named
 from planner_jax.sweep.columns import Column, RefereedBatch, leaf_columns
 from planner_jax.sweep.figures.outcomes import outcomes_figure
@@ -113,6 +114,18 @@ class Sweep:
     def setting(self, cases: Any) -> dict[str, Any]:
         """Physics and limits that all cases have in common, for the manifest."""
         return {}
+
+    def plan_of_row(self, row: dict[str, Any], setting: dict[str, Any]) -> Plan | None:
+        """The plan of a row of `plans.parquet` as its robot's class, such as `QuadrotorPlan`.
+
+        Args:
+            row: of the run.
+            setting: of its manifest.
+
+        Returns:
+            The plan; None where rows of the task are not read back.
+        """
+        return None
 
     def tally(self, settings: Any) -> Tally:
         """An empty count of rows."""

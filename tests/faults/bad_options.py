@@ -88,6 +88,12 @@ def _rows() -> list:
     rows += [
         ((command, name), ("RUN must be",)) for command in ("report", "view") for name in FILES
     ]
+    rows += [(("export", name, "--row", "0", "--to", "csv"), ("RUN must be",)) for name in FILES]
+    rows += _of("export junk --row 0", "--to", ("", "cvs", "px4\nx"), "must be one of csv")
+    rows += _of("export junk --to csv", "--row", NOT_WHOLE)
+    rows += _of("export junk --to csv", "--rate", NOT_NUMBERS)
+    rows += _of("export junk --to px4", "--udp", NOT_WHOLE)
+    rows += _of("export junk --to csv", "--out", ("",))
     rows += _of("library build new", "--home", ("x", "1"))
     rows += [
         (("library", "build", "new", "--home", *["nan"] * 6), ("--home", "finite")),

@@ -6,10 +6,12 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from planner_jax.robot.arm_plan import ArmPlan
 from planner_jax.sweep.block.columns import COLUMNS, FRAME, SEEN_COLUMNS, TIMED_COLUMNS
 from planner_jax.sweep.block.pipeline import CountedPlanner, SeeingArms, SeenPlan, TimedPlan
 from planner_jax.sweep.block.settings import BlockSettings
 from planner_jax.sweep.columns import Column, RefereedBatch
+from planner_jax.sweep.row_plans import arm_plan
 from planner_jax.sweep.settings import SettingError, require
 from planner_jax.sweep.summary import Tally
 from planner_jax.sweep.sweep import Sweep
@@ -101,6 +103,10 @@ class BlockSweep(Sweep):
         if isinstance(planner, SeeingArms | CountedPlanner):
             return planner.plans(cases)
         return super().plan(planner, cases)
+
+    def plan_of_row(self, row: dict[str, Any], setting: dict[str, Any]) -> ArmPlan:
+        """The plan of a row; it begins when the arm may start, at the row's `delay`."""
+        return arm_plan(row)
 
     def tally(self, settings: BlockSettings) -> BlockTally:
         """An empty count of rows."""

@@ -5,12 +5,14 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from planner_jax.robot.quadrotor_plan import QuadrotorPlan
 from planner_jax.sweep.catch.columns import COLUMNS, FRAME
 from planner_jax.sweep.catch.figures.flight import flight_figure
 from planner_jax.sweep.catch.figures.motion import motion_figure
 from planner_jax.sweep.catch.figures.outcomes import outcomes_figure
 from planner_jax.sweep.catch.settings import CatchSettings
 from planner_jax.sweep.figures.motion import CAPTION as MOTION
+from planner_jax.sweep.row_plans import quadrotor_plan
 from planner_jax.sweep.summary import Tally
 from planner_jax.sweep.sweep import RunFigure, Sweep, first_values
 from planner_jax.sweep.table import RateTable, own_cells
@@ -89,6 +91,10 @@ class CatchSweep(Sweep):
         """Physics and limits that all cases have in common, for the manifest."""
         net = first_values(cases.net, ["height", "radius", "max_angle"], "net_")
         return {**first_values(cases, ["gravity"]), **net, **first_values(cases.limits)}
+
+    def plan_of_row(self, row: dict[str, Any], setting: dict[str, Any]) -> QuadrotorPlan:
+        """The plan of a row, without its order and times of catches."""
+        return quadrotor_plan(row, setting)
 
     def tally(self, settings: CatchSettings) -> CatchTally:
         """An empty count of rows."""

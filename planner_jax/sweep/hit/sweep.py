@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from planner_jax.robot.quadrotor_plan import QuadrotorPlan
 from planner_jax.sweep.figures.motion import CAPTION as MOTION
 from planner_jax.sweep.hit.columns import COLUMNS, FRAME, published_column
 from planner_jax.sweep.hit.figures.court import court_figure
@@ -13,6 +14,7 @@ from planner_jax.sweep.hit.figures.motion import motion_figure
 from planner_jax.sweep.hit.figures.rates import compared_with, rates_figure
 from planner_jax.sweep.hit.settings import HitSettings
 from planner_jax.sweep.hit.source import ServeSource, open_source
+from planner_jax.sweep.row_plans import quadrotor_plan
 from planner_jax.sweep.summary import Tally
 from planner_jax.sweep.sweep import RunFigure, Sweep, first_values
 from planner_jax.sweep.table import RateTable, own_cells
@@ -98,6 +100,10 @@ class HitSweep(Sweep):
         """Physics and limits that all cases have in common, for the manifest."""
         setting = first_values(cases, ["drag", "gravity", "restitution", "racket_height"])
         return setting | first_values(cases.limits) | first_values(cases.hit_limits)
+
+    def plan_of_row(self, row: dict[str, Any], setting: dict[str, Any]) -> QuadrotorPlan:
+        """The plan of a row, without its stroke."""
+        return quadrotor_plan(row, setting)
 
     def tally(self, settings: HitSettings) -> HitTally:
         """An empty count of rows."""

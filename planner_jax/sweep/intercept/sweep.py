@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from planner_jax.robot.car import CarPlan
 from planner_jax.sweep.figures.motion import CAPTION as MOTION
 from planner_jax.sweep.figures.outcomes import outcomes_figure
 from planner_jax.sweep.intercept.columns import COLUMNS, FRAME
@@ -13,6 +14,7 @@ from planner_jax.sweep.intercept.figures.plane import plane_figure
 from planner_jax.sweep.intercept.figures.reach import reach_figure
 from planner_jax.sweep.intercept.figures.station_time import station_time_figure
 from planner_jax.sweep.intercept.settings import InterceptSettings
+from planner_jax.sweep.row_plans import car_plan
 from planner_jax.sweep.settings import require
 from planner_jax.sweep.summary import Tally
 from planner_jax.sweep.sweep import RunFigure, Sweep, first_values
@@ -86,6 +88,10 @@ class InterceptSweep(Sweep):
         """Map, body and limits that all cases have in common, for the manifest."""
         bounds = first_values(cases, ["lower", "upper"])
         return bounds | first_values(cases.body, prefix="body_") | first_values(cases.limits)
+
+    def plan_of_row(self, row: dict[str, Any], setting: dict[str, Any]) -> CarPlan:
+        """The plan of a row, without the place of the meeting."""
+        return car_plan(row)
 
     def tally(self, settings: InterceptSettings) -> InterceptTally:
         """An empty count of rows."""

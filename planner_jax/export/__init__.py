@@ -1,0 +1,1 @@
+"""Plans for controllers: setpoints and polynomials in the formats that flight stacks read."""

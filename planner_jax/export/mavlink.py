@@ -1,0 +1,81 @@
+"""Setpoints as MAVLink messages SET_POSITION_TARGET_LOCAL_NED: in a log, or sent in real time."""
+
+import socket
+import struct
+import time
+from collections.abc import Iterator
+from typing import BinaryIO
+
+from pymavlink.dialects.v20 import common
+
+from planner_jax.export.px4 import trajectory_setpoints
+from planner_jax.export.setpoints import DEFAULT_RATE, ExportError
+from planner_jax.robot.quadrotor_plan import QuadrotorPlan
+
+FASTEST = 1000.0  # [Hz], as the messages count milliseconds
+_VEHICLE, _AUTOPILOT = 1, 1  # system and component that is meant
+_SENDER = 255  # the system of ground stations
+_NO_FIELD_IGNORED = 0
+
+
+def packets(plan: QuadrotorPlan, rate: float) -> Iterator[tuple[int, bytes]]:
+    """When each message is due [us] since the plan began, and the MAVLink 2 packet.
+
+    Position, velocity, acceleration, yaw and its rate are all set; see `trajectory_setpoints`.
+
+    Raises:
+        ExportError: the plan may not leave, or the rate is absurd.
+    """
+    fields = trajectory_setpoints(plan, rate)
+    if rate > FASTEST:
+        raise ExportError(f"rate must be at most {FASTEST:g} for MAVLink, got {rate:g}")
+    sender = common.MAVLink(None, srcSystem=_SENDER)
+    for stamp, position, velocity, acceleration, _, yaw, yawspeed in zip(
+        *(values.tolist() for values in fields.values()), strict=True
+    ):
+        message = sender.set_position_target_local_ned_encode(
+            round(stamp / 1000),
+            _VEHICLE,
+            _AUTOPILOT,
+            common.MAV_FRAME_LOCAL_NED,
+            _NO_FIELD_IGNORED,
+            *(*position, *velocity, *acceleration, yaw, yawspeed),
+        )
+        yield stamp, bytes(message.pack(sender))
+        sender.seq = (sender.seq + 1) % 256
+
+
+def write_tlog(plan: QuadrotorPlan, rate: float, file: BinaryIO) -> None:
+    """Write the packets as a telemetry log: each behind its time [us], eight bytes, big-endian.
+
+    Times count from the beginning of the plan.
+    """
+    for stamp, packet in packets(plan, rate):
+        file.write(struct.pack(">Q", stamp) + packet)
+
+
+def stream(plan: QuadrotorPlan, port: int, rate: float = DEFAULT_RATE) -> int:
+    """Send the packets to a UDP port of this machine, each when it is due; returns how many.
+
+    Args:
+        plan: one, solved.
+        port: on which the autopilot, or its simulation, listens.
+        rate: [Hz].
+
+    Raises:
+        ExportError: the plan may not leave, the rate is absurd, or nobody listens on the port.
+    """
+    if isinstance(port, bool) or not isinstance(port, int) or not 0 < port < 2**16:
+        raise ExportError(f"udp must be a port from 1 to {2**16 - 1}, got {port!r:.60}")
+    ready = list(packets(plan, rate))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+        out.connect(("127.0.0.1", port))
+        began = time.monotonic()
+        for stamp, packet in ready:
+            time.sleep(max(0.0, began + 1e-6 * stamp - time.monotonic()))
+            try:
+                out.send(packet)
+            except ConnectionRefusedError:
+                rule = "a port on which a program of this machine listens"
+                raise ExportError(f"udp must be {rule}, got {port}") from None
+    return len(ready)

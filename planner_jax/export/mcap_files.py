@@ -1,0 +1,56 @@
+"""MCAP files as rosbag2 writes and plays them: profile ros2, schemas ros2msg, messages CDR.
+
+Times of messages count from the beginning of the plan.
+"""
+
+from typing import BinaryIO
+
+import numpy as np
+from mcap_ros2.writer import Writer
+
+from planner_jax.export import px4, ros2
+from planner_jax.protocol import Plan
+from planner_jax.robot.quadrotor_plan import QuadrotorPlan
+
+SETPOINT, SETPOINT_TOPIC = "px4_msgs/TrajectorySetpoint", "/fmu/in/trajectory_setpoint"
+_TYPES = {
+    **ros2.TYPES,
+    SETPOINT: "uint64 timestamp\nfloat32[3] position\nfloat32[3] velocity\n"
+    "float32[3] acceleration\nfloat32[3] jerk\nfloat32 yaw\nfloat32 yawspeed",
+}
+
+
+def write_trajectory(plan: Plan, rate: float, file: BinaryIO) -> None:
+    """Write a plan as one message of `trajectory_msgs`; see `ros2.trajectory`."""
+    kind, fields = ros2.trajectory(plan, rate)
+    with Writer(file) as writer:
+        schema = writer.register_msgdef(_full_name(kind), _definition(kind))
+        writer.write_message(ros2.TOPICS[kind], schema, fields, log_time=0)
+
+
+def write_setpoints(plan: QuadrotorPlan, rate: float, file: BinaryIO) -> None:
+    """Write a plan as messages `px4_msgs/TrajectorySetpoint`; see `px4.trajectory_setpoints`."""
+    fields = px4.trajectory_setpoints(plan, rate)
+    with Writer(file) as writer:
+        schema = writer.register_msgdef(_full_name(SETPOINT), _definition(SETPOINT))
+        for k, row in enumerate(zip(*map(np.ndarray.tolist, fields.values()), strict=True)):
+            message = dict(zip(fields, row, strict=True))
+            stamp = 1000 * message["timestamp"]
+            writer.write_message(SETPOINT_TOPIC, schema, message, log_time=stamp, sequence=k)
+
+
+def _full_name(kind: str) -> str:
+    return kind.replace("/", "/msg/")
+
+
+def _definition(kind: str) -> str:
+    """The fields of a type, and behind them those of all types that it consists of."""
+    needed, place = [kind], 0
+    while place < len(needed):
+        inner = (line.split()[0].removesuffix("[]") for line in _TYPES[needed[place]].splitlines())
+        needed += [each for each in dict.fromkeys(inner) if each in _TYPES and each not in needed]
+        place += 1
+    rule = "\n" + 80 * "=" + "\n"
+    return (
+        rule.join([_TYPES[kind], *(f"MSG: {each}\n{_TYPES[each]}" for each in needed[1:])]) + "\n"
+    )

@@ -1,0 +1,49 @@
+"""Setpoints as PX4 takes them: the fields of its message TrajectorySetpoint, in NED."""
+
+from typing import BinaryIO
+
+import numpy as np
+
+from planner_jax.export.csv_rows import write_table
+from planner_jax.export.frames import to_ned, to_ned_yaw, yaw_of
+from planner_jax.export.setpoints import setpoints_of
+from planner_jax.robot.quadrotor_plan import QuadrotorPlan, QuadrotorSetpoints
+
+_VECTORS = ("position", "velocity", "acceleration", "jerk")
+
+
+def trajectory_setpoints(plan: QuadrotorPlan, rate: float) -> dict[str, np.ndarray]:
+    """The fields of K messages `px4_msgs/TrajectorySetpoint` by name; local NED frame.
+
+    Args:
+        plan: one, solved.
+        rate: [Hz].
+
+    Returns:
+        timestamp: (K,) uint64 [us], since the plan began.
+        position, velocity, acceleration, jerk: (K, 3) float32 [m], [m/s], [m/s^2], [m/s^3]. The
+            acceleration is that of the motion: PX4 adds gravity itself.
+        yaw: (K,) float32 [rad], of the plan's attitude, clockwise from north, in [-pi, pi].
+        yawspeed: (K,) float32 [rad/s], its rate.
+    """
+    found = setpoints_of(plan, rate)
+    assert isinstance(found, QuadrotorSetpoints)
+    yaw, yaw_rate = yaw_of(found.quat_wxyz, found.body_rate)
+    vectors = zip(_VECTORS, (found.pos, found.vel, found.acc, found.jerk), strict=True)
+    return {
+        "timestamp": np.round(found.time * 1e6).astype(np.uint64),
+        **{name: to_ned(np.asarray(vector, np.float32)) for name, vector in vectors},
+        "yaw": to_ned_yaw(yaw).astype(np.float32),
+        "yawspeed": (-yaw_rate).astype(np.float32),
+    }
+
+
+def write_csv(plan: QuadrotorPlan, rate: float, file: BinaryIO) -> None:
+    """Write the messages as rows, columns named as PX4's own tools name them."""
+    fields = trajectory_setpoints(plan, rate)
+    header = [
+        f"{name}[{axis}]" if values.ndim == 2 else name
+        for name, values in fields.items()
+        for axis in range(values[0].size)
+    ]
+    write_table(file, header, list(fields.values()))

@@ -1,0 +1,50 @@
+"""The plan of one row of a finished sweep."""
+
+import shlex
+from typing import NamedTuple
+
+import pyarrow as pa
+
+from planner_jax.protocol import Plan
+from planner_jax.sweep.parquet import pick_rows
+from planner_jax.sweep.run_folder import RunFolder
+from planner_jax.sweep.settings import SettingError
+from planner_jax.sweep.sweep import sweep_of_run
+
+
+class PlannedRow(NamedTuple):
+    """A plan, bit for bit as in the file, and what the referee says against it."""
+
+    plan: Plan  # of its robot's class, such as `QuadrotorPlan`
+    sentence: str  # "" where it passes
+
+
+def planned_row(folder: RunFolder, row: int | None) -> PlannedRow:
+    """The plan of a row, whatever became of it.
+
+    Args:
+        folder: of the run.
+        row: its place, from 0.
+
+    Raises:
+        SettingError: the folder is not that of a whole, finished sweep, or there is no such row.
+    """
+    manifest = folder.read_manifest()
+    sweep = sweep_of_run(manifest, folder.name)
+    folder.require_finished(manifest)
+    last = manifest["summary"]["num"] - 1
+    if row is None or not 0 <= row <= last:
+        shown = "nothing" if row is None else row
+        raise SettingError(f"row must be from 0 to {last}, got {shown}")
+    remedy = f"planner-jax {sweep.kind} --resume --out {shlex.quote(str(folder.path))}"
+    folder.require_whole(manifest, f"make it anew: {remedy}")
+    try:
+        (found,) = pick_rows(folder.plans, [row])
+        plan = sweep.plan_of_row(found, manifest.get("setting", {}))
+    except (pa.ArrowException, KeyError, TypeError, ValueError) as error:
+        rule, why = "a run whose rows can be read", " ".join(str(error).split())
+        raise SettingError(f"{folder.name} must be {rule}, got {why}") from None
+    if plan is None:
+        rule = "a sweep of a task whose rows are read back as plans"
+        raise SettingError(f"{folder.name} must be {rule}, got a {sweep.kind}")
+    return PlannedRow(plan, found["sentence"])

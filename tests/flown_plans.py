@@ -1,0 +1,75 @@
+"""Plans that nobody has to make, one of each robot, and files of plans as they are read."""
+
+import io
+
+import numpy as np
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+import planner_jax as pj
+from planner_jax.robot.arm_plan import ArmPlan
+from planner_jax.robot.car import CarPlan
+from planner_jax.robot.quadrotor_plan import QuadrotorPlan
+
+FLOAT = np.float32
+SOLVED = {
+    "cost": FLOAT(2.5),
+    "violation": FLOAT(-0.25),
+    "iterations": np.int32(7),
+    "status": np.int32(pj.Status.CONVERGED),
+}
+
+
+def pieces(num, powers, axes, seed=0, duration=0.2):
+    """A smooth curve in so many pieces, which do not join."""
+    draw = np.random.default_rng(seed)
+    coeffs = 6.0 * draw.normal(size=(num, powers, axes)) / 2.0 ** np.arange(powers)[:, None]
+    durations = np.full(num, duration) + 0.01 * np.arange(num)
+    return pj.PiecewisePolynomial(coeffs=coeffs.astype(FLOAT), durations=durations.astype(FLOAT))
+
+
+def quadrotor(num=2, powers=8, seed=0):
+    return QuadrotorPlan(
+        **SOLVED, trajectory=pieces(num, powers, 3, seed), gravity=np.asarray(9.81, FLOAT)
+    )
+
+
+def car():
+    knots = np.arange(5, dtype=FLOAT)
+    return CarPlan(
+        **SOLVED,
+        start=np.array([1.0, -2.0, 0.5], FLOAT),
+        time=np.asarray(0.4, FLOAT),
+        speed=2.0 + 0.25 * knots,
+        curvature=FLOAT(0.1) * knots - FLOAT(0.2),
+    )
+
+
+def arm():
+    return ArmPlan(**SOLVED, motion=pieces(2, 4, 6, seed=1))
+
+
+PLANS = {"quadrotor": quadrotor(), "car": car(), "arm": arm()}
+
+
+def table(path):
+    """Header, and rows in float64, of a file of comma-separated values."""
+    header, *rows = path.read_text().splitlines()
+    return header.split(","), np.array([row.split(",") for row in rows], float)
+
+
+def bag(path):
+    """Profile of an MCAP file, and schema, channel, record and message of each message."""
+    reader = make_reader(io.BytesIO(path.read_bytes()), decoder_factories=[DecoderFactory()])
+    return reader.get_header().profile, list(reader.iter_decoded_messages())
+
+
+def matrices(quat_wxyz):
+    """Body to world (K, 3, 3) of unit quaternions (K, 4), by the book."""
+    w, x, y, z = np.asarray(quat_wxyz, float).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)

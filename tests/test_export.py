@@ -1,0 +1,320 @@
+"""Plans as tables, ROS 2's bags and Crazyflie's pieces, each as its own library reads them."""
+
+import sys
+import types
+
+import jax
+import numpy as np
+import pytest
+from cflib.crazyflie.mem.trajectory_memory import Poly4D
+from flown_plans import PLANS, arm, bag, car, matrices, quadrotor, table
+
+import planner_jax as pj
+from planner_jax.export import csv_rows, ros2
+from planner_jax.export.crazyflie import poly4d
+from planner_jax.export.setpoints import MOST, ExportError, setpoints_of
+from planner_jax.export.words import stream
+from planner_jax.registry import MissingExtra, UnknownName
+
+RATE = 50.0
+
+
+def xyz(vector):
+    return [vector.x, vector.y, vector.z]
+
+
+# Tables of text.
+
+
+@pytest.mark.parametrize("robot", PLANS)
+def test_a_table_has_names_units_and_every_number_bit_for_bit(tmp_path, robot):
+    plan = PLANS[robot]
+    header, rows = table(pj.export(plan, to="csv", out=tmp_path / "a.csv", rate=RATE))
+    found = setpoints_of(plan, RATE)
+    blocks = [np.asarray(leaf).reshape(len(rows), -1) for leaf in vars(found).values()]
+    np.testing.assert_array_equal(rows[:, 0], found.time)
+    np.testing.assert_array_equal(rows[:, 1:].astype(np.float32), np.hstack(blocks[1:]))
+    assert len(header) == rows.shape[1] and all(name.endswith("]") for name in header)
+    assert header[0] == "time [s]"
+    last = {"quadrotor": "thrust [m/s^2]", "car": "yaw_rate [rad/s]", "arm": "ddq6 [rad/s^2]"}
+    assert header[-1] == last[robot]
+
+
+def test_the_rate_is_100_unless_given(tmp_path):
+    _, rows = table(pj.export(quadrotor(), to="csv", out=tmp_path / "a.csv"))
+    np.testing.assert_allclose(np.diff(rows[:, 0]), 0.01)
+
+
+# ROS 2.
+
+
+@pytest.mark.parametrize("robot", PLANS)
+def test_a_bag_holds_one_trajectory_as_rosbag2_has_them(tmp_path, robot):
+    profile, [(schema, channel, record, message)] = bag(
+        pj.export(PLANS[robot], to="ros2", out=tmp_path / "a.mcap", rate=RATE)
+    )
+    kind = "JointTrajectory" if robot == "arm" else "MultiDOFJointTrajectory"
+    assert (profile, schema.encoding, channel.message_encoding) == ("ros2", "ros2msg", "cdr")
+    assert schema.name == f"trajectory_msgs/msg/{kind}" and record.log_time == 0
+    found = setpoints_of(PLANS[robot], RATE)
+    stamps = [point.time_from_start for point in message.points]
+    np.testing.assert_allclose([t.sec + 1e-9 * t.nanosec for t in stamps], found.time, atol=1e-9)
+    assert message.header.frame_id == "world"
+
+
+def test_a_quadrotor_in_a_bag_is_as_it_is_sampled_and_turns_in_the_world(tmp_path):
+    plan = quadrotor()
+    path = pj.export(plan, to="ros2", out=tmp_path / "a.mcap", rate=RATE)
+    points, found = bag(path)[1][0][3].points, setpoints_of(plan, RATE)
+    for name, of_point, wanted in [
+        ("position", lambda p: xyz(p.transforms[0].translation), found.pos),
+        ("velocity", lambda p: xyz(p.velocities[0].linear), found.vel),
+        ("acceleration", lambda p: xyz(p.accelerations[0].linear), found.acc),
+        ("x, y, z", lambda p: xyz(p.transforms[0].rotation), found.quat_wxyz[:, 1:]),
+        ("w", lambda p: p.transforms[0].rotation.w, found.quat_wxyz[:, 0]),
+    ]:
+        np.testing.assert_array_equal([of_point(p) for p in points], wanted, err_msg=name)
+    spin = np.einsum("kij,kj->ki", matrices(found.quat_wxyz), found.body_rate)
+    assert np.abs(spin - found.body_rate).max() > 0.01
+    np.testing.assert_allclose([xyz(p.velocities[0].angular) for p in points], spin, atol=1e-6)
+
+
+def test_a_car_in_a_bag_moves_in_the_plane_along_its_heading(tmp_path):
+    path = pj.export(car(), to="ros2", out=tmp_path / "a.mcap", rate=1000.0)
+    points, found = bag(path)[1][0][3].points, setpoints_of(car(), 1000.0)
+    places = np.array([xyz(p.transforms[0].translation) for p in points])
+    velocity = np.array([xyz(p.velocities[0].linear) for p in points])
+    acceleration = np.array([xyz(p.accelerations[0].linear) for p in points])
+    np.testing.assert_array_equal(places[:, :2], found.pos)
+    assert not places[:, 2].any() and not velocity[:, 2].any()
+    moved = (places[2:] - places[:-2]) * 500.0
+    np.testing.assert_allclose(moved, velocity[1:-1], atol=3e-3)
+    inner = np.array([not np.isclose(t % 0.1, [0.0, 0.1], atol=2e-3).any() for t in found.time])
+    gained = (velocity[2:] - velocity[:-2]) * 500.0
+    np.testing.assert_allclose(
+        gained[inner[1:-1]], acceleration[inner][: inner[1:-1].sum()], atol=3e-2
+    )
+    turned = matrices([[q.w, q.x, q.y, q.z] for q in (p.transforms[0].rotation for p in points)])
+    np.testing.assert_allclose(turned[:, 0, 0], np.cos(found.heading), atol=1e-6)
+    np.testing.assert_allclose(turned[:, 1, 0], np.sin(found.heading), atol=1e-6)
+    np.testing.assert_array_equal([p.velocities[0].angular.z for p in points], found.yaw_rate)
+
+
+def test_an_arm_in_a_bag_has_its_six_joints_as_they_are_sampled(tmp_path):
+    path = pj.export(arm(), to="ros2", out=tmp_path / "a.mcap", rate=RATE)
+    message, found = bag(path)[1][0][3], setpoints_of(arm(), RATE)
+    assert message.joint_names == [f"joint_{k}" for k in range(1, 7)]
+    for name, wanted in [
+        ("positions", found.angles),
+        ("velocities", found.rates),
+        ("accelerations", found.accelerations),
+    ]:
+        np.testing.assert_array_equal([getattr(p, name) for p in message.points], wanted)
+    assert not any(p.effort for p in message.points)
+
+
+@pytest.mark.parametrize("robot", ["car", "arm"])
+def test_where_ros_is_installed_a_plan_is_an_object_of_its_classes(monkeypatch, robot):
+    """Stand-ins of its classes, that have the fields of the message definitions and no others."""
+    for kind, definition in ros2.TYPES.items():
+        package, name = kind.split("/")
+        slots = [line.split()[1] for line in definition.splitlines()]
+        home = types.ModuleType(f"{package}.msg") if f"{package}.msg" not in sys.modules else None
+        if home is not None:
+            monkeypatch.setitem(sys.modules, package, types.ModuleType(package))
+            monkeypatch.setitem(sys.modules, f"{package}.msg", home)
+        setattr(sys.modules[f"{package}.msg"], name, type(name, (), {"__slots__": slots}))
+    made = ros2.trajectory_message(PLANS[robot], RATE)
+    kind, plain = ros2.trajectory(PLANS[robot], RATE)
+    assert type(made).__name__ == kind.split("/")[1]
+    assert len(made.points) == len(plain["points"]) and made.joint_names == plain["joint_names"]
+    assert type(made.points[-1].time_from_start).__name__ == "Duration"
+    assert (
+        made.points[-1].time_from_start.nanosec == plain["points"][-1]["time_from_start"]["nanosec"]
+    )
+
+
+def test_without_ros_a_message_says_what_is_missing():
+    with pytest.raises(MissingExtra, match="^trajectory_message needs trajectory_msgs of ROS 2"):
+        ros2.trajectory_message(arm())
+
+
+# Crazyflie.
+
+
+@pytest.mark.parametrize("powers", [6, 8])
+def test_pieces_are_packed_as_by_the_crazyflies_own_library(tmp_path, powers):
+    plan = quadrotor(num=5, powers=powers)
+    header, rows = table(pj.export(plan, to="crazyflie", out=tmp_path / "a.csv"))
+    rows = rows.astype(np.float32)
+    assert header[:3] == ["duration", "x^0", "x^1"] and header[9] == "y^0" and len(header) == 33
+    np.testing.assert_array_equal(rows, poly4d(plan))
+    packed = b""
+    for duration, *coeffs in rows.tolist():
+        axes = [Poly4D.Poly(coeffs[8 * k : 8 * k + 8]) for k in range(4)]
+        packed += Poly4D(duration, *axes).pack()
+    path = pj.export(plan, to="crazyflie", out=tmp_path / "a.bin")
+    assert path.read_bytes() == packed and len(packed) == 5 * 132
+
+
+def test_pieces_are_the_trajectory_itself():
+    plan = quadrotor(num=3)
+    rows, begins = poly4d(plan).astype(float), 0.0
+    for row in rows:
+        time = begins + 0.5 * row[0]
+        place = [
+            np.polynomial.polynomial.polyval(0.5 * row[0], row[1 + 8 * k : 9 + 8 * k])
+            for k in range(3)
+        ]
+        np.testing.assert_allclose(place, pj.evaluate(plan.trajectory, time), rtol=1e-5, atol=1e-6)
+        begins += row[0]
+    assert not rows[:, 25:].any(), "yaw"
+
+
+def test_pieces_that_take_no_time_are_left_out():
+    plan = quadrotor(num=3)
+    still = plan.trajectory.replace(durations=plan.trajectory.durations * np.float32([1, 0, 1]))
+    np.testing.assert_array_equal(poly4d(plan.replace(trajectory=still)), poly4d(plan)[[0, 2]])
+
+
+def test_a_higher_degree_and_more_pieces_than_fit_are_refused():
+    assert len(poly4d(quadrotor(num=31))) == 31
+    with pytest.raises(ExportError, match="^plan must have at most 31 pieces, .* got 32$"):
+        poly4d(quadrotor(num=32))
+    with pytest.raises(ExportError, match="^plan must be of degree 7 or less for this, got 9$"):
+        poly4d(quadrotor(powers=10))
+    high = quadrotor(powers=10)
+    nought = high.trajectory.coeffs * (np.arange(10)[:, None] < 8)
+    assert poly4d(high.replace(trajectory=high.trajectory.replace(coeffs=nought))).shape == (2, 33)
+    large = high.trajectory.replace(coeffs=1e300 * np.ones((2, 8, 3)))
+    with pytest.raises(ExportError, match="^plan must have numbers that float32 holds"):
+        poly4d(high.replace(trajectory=large))
+
+
+# What may not leave.
+
+
+def exported(tmp_path, plan=None, name="a.csv", **how):
+    return pj.export(plan or quadrotor(), out=tmp_path / name, **{"to": "csv", **how})
+
+
+@pytest.mark.parametrize("status", [pj.Status.INFEASIBLE, pj.Status.NON_FINITE, pj.Status.NO_PATH])
+def test_a_plan_that_is_not_solved_is_refused_by_its_status(tmp_path, status):
+    plan = quadrotor().replace(status=np.int32(status))
+    for to in ("csv", "crazyflie"):
+        with pytest.raises(
+            ExportError, match=f"^plan must be solved, got the status {status.name}: "
+        ):
+            exported(tmp_path, plan, to=to)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_batch_another_class_and_a_plan_that_is_not_whole_are_refused(tmp_path):
+    batch = jax.tree.map(lambda leaf: np.stack([leaf] * 3), quadrotor())
+    with pytest.raises(ExportError, match=r"^plan must be one, as pj.lane\(plans, k\) gives, got"):
+        exported(tmp_path, batch)
+    with pytest.raises(ExportError, match=r"^plan must be that of a robot .* got a PiecewisePoly"):
+        exported(tmp_path, quadrotor().trajectory)
+    shorter = quadrotor().replace(trajectory=quadrotor().trajectory.replace(durations=np.ones(3)))
+    with pytest.raises(
+        ExportError, match=r"^plan must have trajectory.durations of the shape \(2\)"
+    ):
+        exported(tmp_path, shorter)
+    lost = jax.tree.map(lambda leaf: np.full_like(leaf, np.nan), quadrotor().trajectory.coeffs)
+    gone = quadrotor().replace(trajectory=quadrotor().trajectory.replace(coeffs=lost))
+    for to in ("csv", "crazyflie"):
+        with pytest.raises(ExportError, match="^plan must be finite, got"):
+            exported(tmp_path, gone, to=to)
+    still = jax.tree.map(np.zeros_like, quadrotor().trajectory)
+    with pytest.raises(ExportError, match="^plan must take some time, got 0 s$"):
+        exported(tmp_path, quadrotor().replace(trajectory=still))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("rate", [0.0, -5.0, np.nan, np.inf, 1.0, 1e7, "fast", [100.0], True])
+def test_an_absurd_rate_is_refused(tmp_path, rate):
+    rule = (
+        "a number" if np.ndim(rate) or isinstance(rate, str | bool) else r"from 2.439 to 2.439e\+05"
+    )
+    with pytest.raises(ExportError, match=f"^rate must be {rule}"):
+        exported(tmp_path, rate=rate)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_bounds_of_a_rate_are_two_setpoints_and_very_many():
+    end = 0.41
+    assert len(setpoints_of(quadrotor(), 1.0 / end).time) == 2
+    assert len(setpoints_of(quadrotor(), (MOST - 2) / end).time) <= MOST
+    with pytest.raises(ExportError, match="^rate must be at most 1000 for MAVLink, got 1001$"):
+        stream(quadrotor(), to="px4", udp=9, rate=1001)
+
+
+@pytest.mark.parametrize(("robot", "to"), [("car", "px4"), ("arm", "px4"), ("arm", "crazyflie")])
+def test_a_format_that_cannot_carry_the_robot_says_so(tmp_path, robot, to):
+    article = "an arm" if robot == "arm" else "a car"
+    says = f"^to must be a format for plans of {article}, got '{to}', which is for quadrotor$"
+    with pytest.raises(ExportError, match=says):
+        exported(tmp_path, PLANS[robot], to=to)
+
+
+def test_an_unknown_format_is_listed_with_the_one_that_is_most_alike(tmp_path):
+    with pytest.raises(
+        UnknownName,
+        match="^to must be one of csv, ros2, px4, crazyflie, got 'ros'; did you mean 'ros2'",
+    ):
+        exported(tmp_path, to="ros")
+    with pytest.raises(UnknownName, match="got 'step'$"):
+        exported(tmp_path, to="step")
+
+
+def test_a_file_is_new_whole_and_has_an_ending_of_its_format(tmp_path):
+    path = exported(tmp_path)
+    before = path.read_bytes()
+    for name, says in [
+        ("a.csv", "out must be a new file, got"),
+        ("a.txt", "out must end in .csv for csv, got"),
+        ("no/a.csv", "out must be in a folder that can be written, got"),
+        ("a.csv/b.csv", "out must be in a folder that can be written, got"),
+    ]:
+        with pytest.raises(ExportError, match=f"^{says}"):
+            exported(tmp_path, name=name)
+    with pytest.raises(ExportError, match="^out must end in .tlog or .mcap or .csv for px4, got"):
+        exported(tmp_path, to="px4", name="b.bin")
+    with pytest.raises(
+        ExportError, match="^rate must not be given for crazyflie, which takes poly"
+    ):
+        exported(tmp_path, to="crazyflie", name="b.csv", rate=100.0)
+    assert [each.name for each in tmp_path.iterdir()] == ["a.csv"] and path.read_bytes() == before
+
+
+def test_what_fails_while_it_is_written_leaves_nothing(tmp_path, monkeypatch):
+    def fails(plan, rate, file):
+        file.write(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(csv_rows, "write", fails)
+    with pytest.raises(OSError, match="No space left on device") as caught:
+        exported(tmp_path)
+    assert caught.value.filename == str(tmp_path / "a.csv")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("package", "module", "name", "to"),
+    [
+        ("mcap_ros2", "mcap_files", "a.mcap", "ros2"),
+        ("mcap_ros2", "mcap_files", "a.mcap", "px4"),
+        ("pymavlink", "mavlink", "a.tlog", "px4"),
+    ],
+)
+def test_a_missing_package_is_named_with_its_extra(
+    tmp_path, monkeypatch, package, module, name, to
+):
+    for each in [each for each in sys.modules if each.split(".")[0] == package]:
+        monkeypatch.delitem(sys.modules, each)
+    monkeypatch.delitem(sys.modules, f"planner_jax.export.{module}", raising=False)
+    monkeypatch.setitem(sys.modules, package, None)
+    says = rf"^export to \.\w+ needs {package}.*: pip install 'planner-jax\[export\]'$"
+    with pytest.raises(MissingExtra, match=says):
+        exported(tmp_path, to=to, name=name)
+    assert not list(tmp_path.iterdir())

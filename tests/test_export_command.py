@@ -1,0 +1,270 @@
+"""Plans of runs and of saved files, and the command that exports them."""
+
+import socket
+import threading
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+import pytest
+from flown_plans import PLANS, quadrotor
+
+import planner_jax as pj
+from planner_jax.cli import main
+from planner_jax.export.saved import saved_plan
+from planner_jax.plan_files import PlanFileError, load_fitting
+from planner_jax.robot.car import CarPlan
+from planner_jax.robot.quadrotor_plan import QuadrotorPlan
+from planner_jax.sweep import columns as known
+from planner_jax.sweep.block.columns import COLUMNS as BLOCK
+from planner_jax.sweep.catch.columns import COLUMNS as CATCH
+from planner_jax.sweep.hit.columns import COLUMNS as HIT
+from planner_jax.sweep.intercept.columns import COLUMNS as INTERCEPT
+from planner_jax.sweep.planned import planned_row
+from planner_jax.sweep.run_folder import RunFolder
+from planner_jax.sweep.settings import SettingError
+from planner_jax.sweep.source import Chunk
+from planner_jax.task.hit.plan import HitPlan
+
+NUM = 3
+TASKS = {
+    "hit": ("quadrotor", HIT),
+    "catch": ("quadrotor", CATCH),
+    "intercept": ("car", INTERCEPT),
+    "block": ("arm", BLOCK),
+}
+READ = ("index", "success", "sentence", "cost", "violation", "iterations", "status")
+READ += ("durations", "coeffs", "meeting_time", "start", "speed", "curvature")
+READ += ("motion_coeffs", "motion_durations")
+
+
+def batch(robot):
+    """Three plans that differ, the last of them not solved."""
+    plans = jax.tree.map(
+        lambda leaf: np.stack([leaf, leaf * 0.75, leaf * 0.5]).astype(leaf.dtype), PLANS[robot]
+    )
+    if robot == "quadrotor":  # all under the gravity of their run
+        plans = plans.replace(gravity=np.full(NUM, 9.81, np.float32))
+    return plans.replace(status=np.array([0, 1, 2], np.int32))
+
+
+def written_run(folder, task="hit", *, finished=True):
+    """A run with the columns from which a plan is made, of plans that nobody has to make."""
+    robot, columns = TASKS[task]
+    plans = batch(robot)
+    rows = known.rows_of(
+        [column for column in columns if column.name in READ and column.name != "start"]
+        + [column for column in columns if column.name == "start" and robot == "car"],
+        known.RefereedBatch(
+            Chunk(np.arange(NUM), SimpleNamespace(start=getattr(plans, "start", None))),
+            plans,
+            SimpleNamespace(
+                success=np.array([True, False, False]), sentence=lambda k: f"plan {k} is too fast"
+            ),
+        ),
+        "world",
+    )
+    manifest = {
+        "kind": f"sweep {task}",
+        "state": "running",
+        "parameters": {},
+        **{name: "" for name in ("run", "settings")},
+        **{name: {} for name in ("versions", "device")},
+        "sessions": [],
+        "setting": {"gravity": 9.81},
+    }
+    run = RunFolder(folder, name="RUN")
+    with run.created(manifest):
+        if finished:
+            summary = {"num": NUM, "successes": 1, "success_rate": 1 / 3, "wilson_95": [0.0, 1.0]}
+            summary |= {"plans_per_second_warm": 0.0, "status_counts": {}, "failed_limits": {}}
+            seconds = {f"{name}_seconds": 0.0 for name in ("compile", "referee", "wall")}
+            run.write_rows(run.plans, rows)
+            run.write_manifest(
+                {**manifest, "state": "complete", "summary": summary, "times": seconds, "files": {}}
+            )
+    return run
+
+
+def assert_same(one, other):
+    for ours, theirs in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        assert ours.dtype == theirs.dtype
+        np.testing.assert_array_equal(ours, theirs)
+
+
+# Rows of runs.
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_a_row_is_read_back_bit_for_bit_with_what_the_referee_says(tmp_path, task):
+    run, plans = written_run(tmp_path / "run", task), batch(TASKS[task][0])
+    for row in range(NUM):
+        plan, sentence = planned_row(run, row)
+        assert_same(plan, pj.lane(plans, row))
+        assert sentence == ("" if row == 0 else f"plan {row} is too fast")
+
+
+@pytest.mark.parametrize("row", [-1, 3, None])
+def test_a_row_that_is_not_there(tmp_path, row):
+    shown = "nothing" if row is None else row
+    with pytest.raises(SettingError, match=f"^row must be from 0 to 2, got {shown}$"):
+        planned_row(written_run(tmp_path / "run"), row)
+
+
+def test_a_run_that_is_not_finished_or_damaged_or_of_flights(tmp_path):
+    with pytest.raises(SettingError, match="^RUN must be finished, got .*; resume it first$"):
+        planned_row(written_run(tmp_path / "half", finished=False), 0)
+    run = written_run(tmp_path / "damaged")
+    content = bytearray(run.plans.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    run.plans.write_bytes(content)
+    with pytest.raises(SettingError, match="^RUN must be a run whose plans.parquet is whole, got"):
+        planned_row(run, 0)
+    flown = RunFolder(tmp_path / "flown", name="RUN")
+    manifest = {"kind": "fly hit", "state": "running", "parameters": {}}
+    with flown.created({**manifest, "seed": 0, "device": {}, "loop": {}}):
+        pass
+    with pytest.raises(SettingError, match="^RUN must be the folder of a sweep, got a fly hit$"):
+        planned_row(flown, 0)
+
+
+# Saved files.
+
+
+@pytest.mark.parametrize("robot", PLANS)
+def test_a_saved_batch_is_read_as_what_its_robot_knows(tmp_path, robot):
+    plans = batch(robot)
+    plans.save(tmp_path / "a.npz")
+    for row in range(NUM):
+        plan = saved_plan(tmp_path / "a.npz", row)
+        assert type(plan) is type(plans)
+        assert_same(plan, pj.lane(plans, row))
+
+
+def test_what_a_task_adds_to_a_saved_plan_is_left_out(tmp_path):
+    vector, number = np.zeros(3, np.float32), np.float32(0.0)
+    stroke = pj.hit.Stroke(number, vector, vector, vector, vector, number)
+    plan = quadrotor()
+    HitPlan(**vars(plan), stroke=stroke).save(tmp_path / "a.npz")
+    read = saved_plan(tmp_path / "a.npz")
+    assert type(read) is QuadrotorPlan
+    assert_same(read, plan)
+
+
+def test_a_saved_file_of_something_else_is_named(tmp_path):
+    plan = quadrotor()
+    pj.Plan(plan.cost, plan.violation, plan.iterations, plan.status).save(tmp_path / "a.npz")
+    says = "^path must be a file of QuadrotorPlan or CarPlan of version 1, got Plan of version 1 in"
+    with pytest.raises(PlanFileError, match=says):
+        load_fitting(tmp_path / "a.npz", [QuadrotorPlan, CarPlan])
+
+
+def test_a_saved_batch_of_unequal_leaves_is_refused(tmp_path):
+    batch("quadrotor").replace(gravity=np.ones(2, np.float32)).save(tmp_path / "a.npz")
+    with pytest.raises(PlanFileError, match="^path must hold as much of every plan, got"):
+        saved_plan(tmp_path / "a.npz", 1)
+
+
+# The command.
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """A working folder with a run, a saved batch and a saved plan."""
+    monkeypatch.chdir(tmp_path)
+    written_run(tmp_path / "run")
+    written_run(tmp_path / "arms", "block")
+    batch("quadrotor").save("three.npz")
+    quadrotor().save("one.npz")
+    return tmp_path
+
+
+def said(capsys, words):
+    """Exit code and what went to the two streams."""
+    try:
+        code = main(["export", *words.split()])
+    except SystemExit as stop:
+        code = stop.code
+    return code, *capsys.readouterr()
+
+
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        ("run --row 0 --to csv", "run-0-csv.csv"),
+        ("run --row 0 --to px4 --rate 50", "run-0-px4.tlog"),
+        ("run --row 0 --to crazyflie --out b.bin", "b.bin"),
+        ("arms --row 0 --to ros2", "arms-0-ros2.mcap"),
+        ("three.npz --row 1 --to csv", "three-1-csv.csv"),
+        ("one.npz --to csv --out a.csv", "a.csv"),
+    ],
+)
+def test_a_plan_is_written_and_its_file_is_told(capsys, here, words, name):
+    before = set(here.iterdir())
+    assert said(capsys, words) == (0, f"{name}\n", "")
+    assert {path.name for path in set(here.iterdir()) - before} == {name}
+    assert (here / name).stat().st_size > 0
+
+
+def test_a_row_is_written_as_pj_export_writes_its_plan(capsys, here):
+    assert said(capsys, "run --row 0 --to px4 --out a.csv --rate 25")[0] == 0
+    pj.export(pj.lane(batch("quadrotor"), 0), to="px4", out="b.csv", rate=25.0)
+    assert (here / "a.csv").read_bytes() == (here / "b.csv").read_bytes()
+
+
+def test_a_plan_that_the_referee_fails_is_written_with_a_warning(capsys, here):
+    warning = "planner-jax: warning: row 1 fails the referee: plan 1 is too fast\n"
+    assert said(capsys, "run --row 1 --to csv") == (0, "run-1-csv.csv\n", warning)
+
+
+def test_setpoints_are_sent_to_a_port(capsys, here):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ear:
+        ear.bind(("127.0.0.1", 0))
+        ear.settimeout(5.0)
+        packets = []
+        hear = threading.Thread(target=lambda: packets.extend(ear.recv(300) for _ in range(21)))
+        hear.start()
+        told = said(capsys, f"run --row 0 --to px4 --udp {ear.getsockname()[1]} --rate 50")
+        hear.join()
+    assert told == (0, "21 setpoints sent\n", "") and len(packets) == 21
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ("run --row 0", "the following arguments are required: --to"),
+        ("run --row 0 --to cvs", "--to must be one of csv, ros2, px4, crazyflie, got 'cvs'; did"),
+        ("run --row 3 --to csv", "--row must be from 0 to 2, got 3"),
+        ("run --to csv", "--row must be from 0 to 2, got nothing"),
+        ("run --row 2 --to csv", "plan must be solved, got the status INFEASIBLE: stationary with"),
+        ("arms --row 0 --to px4", "--to must be a format for plans of an arm, got 'px4'"),
+        ("run --row 0 --to csv --rate 1e9", "--rate must be from "),
+        ("run --row 0 --to csv --rate 0", "--rate must be from "),
+        ("run --row 0 --to crazyflie --rate 9", "--rate must not be given for crazyflie"),
+        ("run --row 0 --to csv --out one.npz", "--out must end in .csv for csv, got 'one.npz'"),
+        ("run --row 0 --to csv --out no/a.csv", "--out must be in a folder that can be written"),
+        ("run --row 0 --to px4 --udp 0", "--udp must be a port from 1 to 65535, got 0"),
+        ("run --row 0 --to csv --udp 9", "--udp must not be given for csv, only for px4, got 9"),
+        ("run --row 0 --to px4 --udp 9 --out a.tlog", "--udp must not be given with --out, got 9"),
+        ("one.npz --row 0 --to csv", "--row must not be given for a file of one plan, got 0"),
+        ("three.npz --row 3 --to csv", "--row must be from 0 to 2, got 3"),
+        ("gone --to csv", "RUN must be the folder of a sweep or a file of plans, got 'gone'"),
+        (". --row 0 --to csv", "RUN must be the folder of a run, with its manifest.json"),
+        ("run/manifest.json --to csv", "RUN must be a whole file of plans, got"),
+    ],
+)
+def test_what_cannot_be_exported_is_refused_in_one_line_and_leaves_nothing(
+    capsys, here, words, says
+):
+    before = sorted(here.rglob("*"))
+    code, out, err = said(capsys, words)
+    assert (code, out) == (2, "")
+    assert err.startswith(f"planner-jax: error: {says}") and err.count("\n") == 1
+    assert sorted(here.rglob("*")) == before
+
+
+def test_a_file_that_is_there_stays_as_it_is(capsys, here):
+    (here / "a.csv").write_text("mine")
+    code, _, err = said(capsys, "run --row 0 --to csv --out a.csv")
+    assert code == 2 and "--out must be a new file, got 'a.csv'" in err
+    assert (here / "a.csv").read_text() == "mine"

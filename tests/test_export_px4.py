@@ -1,0 +1,188 @@
+"""Plans in north-east-down: frames, signs, and what PX4 is told, read back by pymavlink."""
+
+import socket
+import struct
+import threading
+import time
+
+import numpy as np
+import pytest
+from flown_plans import bag, matrices, quadrotor, table
+from pymavlink import mavutil
+from pymavlink.dialects.v20 import common
+
+import planner_jax as pj
+from planner_jax.export import frames
+from planner_jax.export.px4 import trajectory_setpoints
+from planner_jax.export.setpoints import ExportError, setpoints_of
+from planner_jax.export.words import stream
+
+RATE = 50.0
+
+
+# Frames.
+
+
+@pytest.mark.parametrize(
+    ("enu", "ned"),
+    [
+        ([1.0, 0.0, 0.0], [0.0, 1.0, 0.0]),  # east is y
+        ([0.0, 1.0, 0.0], [1.0, 0.0, 0.0]),  # north is x
+        ([0.0, 0.0, 1.0], [0.0, 0.0, -1.0]),  # up is negative z
+        ([1.0, 2.0, 3.0], [2.0, 1.0, -3.0]),
+    ],
+)
+def test_a_direction_of_ours_in_north_east_down(enu, ned):
+    np.testing.assert_array_equal(frames.to_ned(np.array(enu)), ned)
+    np.testing.assert_array_equal(frames.to_ned(np.array(ned)), enu)
+
+
+def test_there_and_back_again_no_bit_has_changed_and_the_frame_is_right_handed():
+    a, b = np.random.default_rng(0).normal(size=(2, 50, 3)).astype(np.float32)
+    back = frames.to_ned(frames.to_ned(a))
+    assert back.dtype == np.float32 and (back == a).all()
+    crossed = np.cross(frames.to_ned(a), frames.to_ned(b))
+    np.testing.assert_allclose(crossed, frames.to_ned(np.cross(a, b)), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs"), [(0.0, 90.0), (90.0, 0.0), (180.0, -90.0), (45.0, 45.0), (-60.0, 150.0)]
+)
+def test_a_nose_to_the_east_is_90_degrees_to_the_right_of_north(ours, theirs):
+    for one, other in ((ours, theirs), (theirs, ours)):
+        off = frames.to_ned_yaw(np.radians(one)) - np.radians(other)
+        assert np.cos(off) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_yaw_and_its_rate_are_those_of_the_nose_seen_from_above():
+    found = quadrotor().sample(4000.0)
+    yaw, rate = frames.yaw_of(found.quat_wxyz, found.body_rate)
+    nose = matrices(found.quat_wxyz)[:, :, 0]
+    np.testing.assert_allclose(yaw, np.arctan2(nose[:, 1], nose[:, 0]), atol=1e-6)
+    first = slice(1, 700)  # within the first piece
+    differences = (yaw[2:] - yaw[:-2]) * 2000.0
+    assert np.abs(rate[first]).max() > 0.1
+    np.testing.assert_allclose(differences[:699], rate[first], atol=0.05)
+
+
+def test_a_nose_that_points_straight_up_has_no_yaw():
+    up = np.array([[np.sqrt(0.5), 0.0, -np.sqrt(0.5), 0.0]])
+    assert frames.rotated(up, np.array([1.0, 0.0, 0.0]))[0, 2] == pytest.approx(1.0)
+    yaw, rate = frames.yaw_of(np.array([[1.0, 0.0, 0.0, 0.0]]), np.array([[0.3, 0.2, -0.7]]))
+    assert (yaw, rate) == (0.0, -0.7)
+
+
+# PX4.
+
+
+def test_setpoints_of_px4_are_those_of_the_plan_in_north_east_down():
+    plan = quadrotor()
+    fields, found = trajectory_setpoints(plan, RATE), setpoints_of(plan, RATE)
+    np.testing.assert_array_equal(fields["position"], found.pos[:, [1, 0, 2]] * [1, 1, -1])
+    for name, wanted in [("velocity", "vel"), ("acceleration", "acc"), ("jerk", "jerk")]:
+        np.testing.assert_array_equal(fields[name], frames.to_ned(getattr(found, wanted)))
+    np.testing.assert_array_equal(fields["timestamp"], np.round(1e6 * found.time))
+    nose = matrices(found.quat_wxyz)[:, :, 0]
+    np.testing.assert_allclose(fields["yaw"], np.arctan2(nose[:, 0], nose[:, 1]), atol=1e-5)
+    assert all(values.dtype == np.float32 for values in list(fields.values())[1:])
+
+
+def test_a_table_of_px4_has_the_columns_of_its_message(tmp_path):
+    header, rows = table(pj.export(quadrotor(), to="px4", out=tmp_path / "a.csv", rate=RATE))
+    fields = trajectory_setpoints(quadrotor(), RATE)
+    assert header[:5] == ["timestamp", "position[0]", "position[1]", "position[2]", "velocity[0]"]
+    assert header[-2:] == ["yaw", "yawspeed"] and len(header) == 15
+    wanted = np.hstack([np.reshape(values, (len(rows), -1)) for values in fields.values()])
+    np.testing.assert_array_equal(rows.astype(np.float32), wanted.astype(np.float32))
+
+
+def test_a_bag_of_px4_has_a_message_a_setpoint(tmp_path):
+    path = pj.export(quadrotor(), to="px4", out=tmp_path / "a.mcap", rate=RATE)
+    profile, found = bag(path)
+    fields = trajectory_setpoints(quadrotor(), RATE)
+    assert profile == "ros2" and found[0][0].name == "px4_msgs/msg/TrajectorySetpoint"
+    assert found[0][1].topic == "/fmu/in/trajectory_setpoint"
+    for name, values in fields.items():
+        read = np.array([getattr(message, name) for *_, message in found])
+        np.testing.assert_array_equal(read.astype(values.dtype), values, err_msg=name)
+    np.testing.assert_array_equal(
+        [record.log_time for _, _, record, _ in found], 1000 * fields["timestamp"]
+    )
+
+
+def assert_are_setpoints(read, fields):
+    """Whether MAVLink messages are the setpoints of a plan, all that is in them to be heeded."""
+    assert len(read) == len(fields["timestamp"])
+    for names, field in [
+        (("x", "y", "z"), "position"),
+        (("vx", "vy", "vz"), "velocity"),
+        (("afx", "afy", "afz"), "acceleration"),
+        (("yaw",), "yaw"),
+        (("yaw_rate",), "yawspeed"),
+    ]:
+        found = np.array([[getattr(message, name) for name in names] for message in read])
+        np.testing.assert_array_equal(
+            found.astype(np.float32).reshape(fields[field].shape), fields[field]
+        )
+    assert {message.get_type() for message in read} == {"SET_POSITION_TARGET_LOCAL_NED"}
+    assert {(m.coordinate_frame, m.type_mask) for m in read} == {(common.MAV_FRAME_LOCAL_NED, 0)}
+    stamps = [message.time_boot_ms for message in read]
+    np.testing.assert_allclose(stamps, 1e-3 * fields["timestamp"].astype(float), atol=0.51)
+    assert [message.get_seq() for message in read] == [k % 256 for k in range(len(read))]
+
+
+@pytest.mark.parametrize("rate", [RATE, 1000.0])
+def test_a_telemetry_log_is_read_by_pymavlink(tmp_path, rate):
+    path = pj.export(quadrotor(), to="px4", out=tmp_path / "a.tlog", rate=rate)
+    fields = trajectory_setpoints(quadrotor(), rate)
+    log = mavutil.mavlink_connection(str(path), dialect="common")
+    read = []
+    while (message := log.recv_msg()) is not None:
+        read.append(message)
+    log.close()
+    assert_are_setpoints(read, fields)
+    stamps = [message._timestamp for message in read]
+    np.testing.assert_allclose(stamps, 1e-6 * fields["timestamp"].astype(float), atol=1e-9)
+    assert struct.unpack(">Q", path.read_bytes()[:8]) == (0,)
+
+
+def test_a_stream_arrives_in_real_time_and_is_decoded():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ear:
+        ear.bind(("127.0.0.1", 0))
+        ear.settimeout(5.0)
+        port = ear.getsockname()[1]
+        sent = []
+        sender = threading.Thread(
+            target=lambda: sent.append(stream(quadrotor(), to="px4", udp=port, rate=RATE))
+        )
+        fields = trajectory_setpoints(quadrotor(), RATE)
+        packets, came, began = [], [], time.monotonic()
+        sender.start()
+        for _ in fields["timestamp"]:
+            packets.append(ear.recv(300))
+            came.append(time.monotonic())
+        sender.join()
+    assert sent == [len(packets)]
+    decoder = common.MAVLink(None)
+    assert_are_setpoints([decoder.parse_buffer(packet)[0] for packet in packets], fields)
+    late = np.array(came) - began - 1e-6 * fields["timestamp"].astype(float)
+    assert (late >= 0.0).all() and late.min() < 1.0, "none is early, however busy the machine is"
+
+
+@pytest.mark.parametrize("port", [0, -1, 65536, "14540", True, None])
+def test_a_port_is_one_that_there_is(port):
+    with pytest.raises(ExportError, match="^udp must be a port from 1 to 65535, got"):
+        stream(quadrotor(), to="px4", udp=port)
+
+
+def test_a_port_on_which_nobody_listens_is_refused():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        port = taken.getsockname()[1]
+    with pytest.raises(ExportError, match=f"^udp must be .* listens, got {port}$"):
+        stream(quadrotor(), to="px4", udp=port)
+
+
+def test_only_px4_is_streamed():
+    with pytest.raises(ExportError, match="^udp must not be given for csv, only for px4, got 9$"):
+        stream(quadrotor(), to="csv", udp=9)
