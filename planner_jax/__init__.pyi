@@ -9,6 +9,8 @@ from .cost.extras import Dislike as Dislike
 from .cost.extras import Geofence as Geofence
 from .cost.extras import KeepOut as KeepOut
 from .cost.extras import SpeedZone as SpeedZone
+from .ending.ended import EndedPlanner as EndedPlanner
+from .ending.planner import RestPlanner as RestPlanner
 from .export.words import export as export
 from .optimise.implicit import optimal_plan as optimal_plan
 from .optimise.lbfgs import Evaluation as Evaluation

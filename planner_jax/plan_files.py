@@ -112,12 +112,14 @@ def _read(path: str | os.PathLike) -> tuple[Any, Any, dict[str, np.ndarray]]:
 
 
 def named_leaves(tree: Any, prefix: str = "") -> dict[str, Any]:
-    """The arrays of a dataclass by their names, joined by dots; without what is static."""
+    """The arrays of a dataclass by their names, joined by dots; without what is static or None."""
     named = {}
     for field in dataclasses.fields(tree):
         if field.metadata.get("pytree_node", True):
             value = getattr(tree, field.name)
             place = prefix + field.name
+            if value is None:
+                continue
             inner = dataclasses.is_dataclass(value)
             named |= named_leaves(value, f"{place}.") if inner else {place: value}
     return named
@@ -129,6 +131,11 @@ def _tree(kind: Any, prefix: str, arrays: dict[str, np.ndarray]) -> Any:
     values = {}
     for field in dataclasses.fields(kind):
         inner, place = types[field.name], prefix + field.name
+        if type(None) in typing.get_args(inner):
+            inner = next(each for each in typing.get_args(inner) if each is not type(None))
+            if not any(f"{name}.".startswith(f"{place}.") for name in arrays):
+                values[field.name] = None
+                continue
         if isinstance(inner, type) and dataclasses.is_dataclass(inner):
             values[field.name] = _tree(inner, f"{place}.", arrays)
         else:

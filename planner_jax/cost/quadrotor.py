@@ -7,11 +7,13 @@ kernel has them.
 """
 
 import enum
+from typing import Any
 
 import jax.numpy as jnp
 from jax import Array
 
 from planner_jax.arithmetic import Components, components, reciprocal
+from planner_jax.cost.extras import extra_excess
 from planner_jax.robot.quadrotor import (
     QuadrotorLimits,
     RotorLimits,
@@ -82,6 +84,19 @@ def flight_excess(motion: Motion, gravity: Array, limits: QuadrotorLimits) -> tu
     if limits.rotors is not None:
         found += rotor_excess(motion, gravity, limits.rotors)
     return tuple(found)
+
+
+def limits_along(
+    motion: Motion, given: tuple[Array, QuadrotorLimits, tuple[Any, ...]]
+) -> tuple[Array, ...]:
+    """Excess (N,) over the limits of flight and then over the extra ones, for `cost.along`.
+
+    Args:
+        motion: samples of a trajectory.
+        given: gravity, limits and extras of a case.
+    """
+    gravity, limits, extras = given
+    return (*flight_excess(motion, gravity, limits), *extra_excess(motion, extras))
 
 
 class Measure(enum.Enum):

@@ -29,10 +29,13 @@ from planner_jax.referee.judging import (
 from planner_jax.referee.quadrotor import (
     check_sampling,
     checked_coeffs,
+    ending_leaves,
     intervals_of,
     judge_motion,
+    judge_rest,
     limit_leaves,
     pieces_of,
+    with_ending,
 )
 from planner_jax.referee.verdict import Verdict
 
@@ -55,6 +58,7 @@ _SENTENCES = {
     "rotor high": "{excess:.2%} above the greatest thrust of a rotor at {time:.3f} s",
     "ground": "{excess:.2%} below the least height at {time:.3f} s",
     "extra": "{excess:.2%} beyond extras[{worst_extra}] of the case at {time:.3f} s",
+    "ending": "the way to rest ends with what makes {excess:.3g} m of displacement",
     "net": "the target is {excess:.2%} outside the hoop's radius at {time:.3f} s",
     "net plane": "the target is {excess:.3g} m off the hoop's plane at {time:.3f} s",
     "angle": "{excess:.2%} above its limit between the net's axis and the target's way back at "
@@ -221,6 +225,7 @@ def _leaves(cases, plans) -> dict[str, np.ndarray]:
         **limit_leaves(cases.limits),
     }
     leaves = {"lane": np.arange(len(coeffs)), "coeffs": coeffs, "present": present}
+    leaves |= ending_leaves(plans, batch)
     for name, (value, shape) in trailing.items():
         leaves[name] = checked_leaf(name, value, batch + shape)
     return leaves
@@ -361,10 +366,12 @@ def _judge(
         "target pos": np.where(held[..., None], case["target pos"], 0.0),
         "target vel": np.where(held[..., None], case["target vel"], 0.0),
     }
+    whole = with_ending(pieces, case)
     motion, tests = judge_motion(
-        pieces, case, extras, intervals, tolerances["relative"], tolerances["continuity"]
+        whole, case, extras, intervals, tolerances["relative"], tolerances["continuity"]
     )
-    flying = flown.any(axis=1)
+    tests |= judge_rest(case, whole, tolerances["continuity"])
+    flying = whole.flown.any(axis=1)
     tests = {
         name: (failed & flying, np.where(flying, excess, 0.0), time)
         for name, (failed, excess, time) in tests.items()

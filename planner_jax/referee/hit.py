@@ -26,10 +26,13 @@ from planner_jax.referee.judging import (
 from planner_jax.referee.quadrotor import (
     check_sampling,
     checked_coeffs,
+    ending_leaves,
     intervals_of,
     judge_motion,
+    judge_rest,
     limit_leaves,
     pieces_of,
+    with_ending,
 )
 from planner_jax.referee.verdict import Verdict
 
@@ -50,6 +53,7 @@ _SENTENCES = {
     "rotor high": "{excess:.2%} above the greatest thrust of a rotor at {time:.3f} s",
     "ground": "{excess:.2%} below the least height at {time:.3f} s",
     "extra": "{excess:.2%} beyond extras[{worst_extra}] of the case at {time:.3f} s",
+    "ending": "the way to rest ends with what makes {excess:.3g} m of displacement",
     "hitting speed x": "{excess:.2%} above its limit at {time:.3f} s",
     "hitting speed y": "{excess:.2%} above its limit at {time:.3f} s",
     "hitting speed z": "{excess:.2%} above its limit at {time:.3f} s",
@@ -184,6 +188,7 @@ def _leaves(cases, plans) -> dict[str, np.ndarray]:
         "hit_limits.max_apex": (stroke_limits.max_apex, ()),
     }
     leaves = {"lane": np.arange(len(coeffs)), "coeffs": coeffs}
+    leaves |= ending_leaves(plans, coeffs.shape[:1])
     for name, (value, shape) in trailing.items():
         leaves[name] = checked_leaf(name, value, coeffs.shape[:1] + shape)
     return leaves
@@ -193,11 +198,12 @@ def _judge(
     case: dict, extras: tuple, intervals: int, drag_after_impact: bool, tolerances: dict
 ) -> dict:
     """The fields of `HitVerdict` for one chunk of lanes."""
-    pieces = pieces_of(case["coeffs"], case["durations"])
+    pieces = with_ending(pieces_of(case["coeffs"], case["durations"]), case)
     measured, tests = judge_motion(
         pieces, case, extras, intervals, tolerances["relative"], tolerances["continuity"]
     )
     at_impact, impact_tests = _judge_impact(case, drag_after_impact, tolerances)
+    tests |= judge_rest(case, pieces, tolerances["continuity"])
     return first_failures(tests | impact_tests, LIMITS, finite_lanes(case)) | measured | at_impact
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from planner_jax.referee.judging import above, cut, derivative, flat
+from planner_jax.referee.judging import above, checked_leaf, cut, derivative, flat
 from planner_jax.referee.rotors import rotor_thrusts
 
 # Jumps of derivatives count as displacement over one piece, or over this time [s] if longer.
@@ -62,6 +62,62 @@ def pieces_of(coeffs: np.ndarray, durations: np.ndarray, flown: np.ndarray | Non
         coeffs = coeffs[:, lanes, last]
         durations, starts = durations[lanes, last], starts[lanes, last]
     return Pieces(np.ascontiguousarray(coeffs), durations, starts, flown)
+
+
+def ending_leaves(plans: Any, batch: tuple[int, ...]) -> dict[str, np.ndarray]:
+    """The way to rest of plans, by name, its shape checked; none where they have none."""
+    ending = getattr(plans, "ending", None)
+    if ending is None:
+        return {}
+    coeffs = checked_coeffs(ending.coeffs)
+    durations = checked_leaf("ending.durations", ending.durations, (*batch, coeffs.shape[1]))
+    checked_leaf("ending.coeffs", coeffs, (*batch, *coeffs.shape[1:]))
+    return {"ending.coeffs": coeffs, "ending.durations": durations}
+
+
+def with_ending(pieces: Pieces, case: dict) -> Pieces:
+    """The pieces of trajectories with those of their ways to rest, if there are any."""
+    if "ending.coeffs" not in case:
+        return pieces
+    durations = case["ending.durations"]
+    size = max(pieces.coeffs.shape[-1], case["ending.coeffs"].shape[2])
+
+    def wide(coeffs: np.ndarray) -> np.ndarray:
+        return np.pad(coeffs, [(0, 0)] * 3 + [(0, size - coeffs.shape[-1])])
+
+    begin = np.where(pieces.flown, pieces.starts + pieces.durations, 0.0).max(axis=1)
+    starts = begin[:, None] + durations.cumsum(axis=1) - durations
+    return Pieces(
+        np.concatenate(
+            [wide(pieces.coeffs), wide(np.moveaxis(case["ending.coeffs"], -1, 0))], axis=2
+        ),
+        np.concatenate([pieces.durations, durations], axis=1),
+        np.concatenate([pieces.starts, starts], axis=1),
+        np.concatenate([pieces.flown, np.ones(durations.shape, bool)], axis=1),
+    )
+
+
+def judge_rest(case: dict, pieces: Pieces, continuity: float) -> dict:
+    """The test of ways to rest, by name; none where there are none.
+
+    Velocity, acceleration and jerk at the end count as displacement, as those between pieces do.
+    """
+    if "ending.coeffs" not in case:
+        return {}
+    durations = case["ending.durations"]
+    last = np.moveaxis(case["ending.coeffs"][:, -1], 0, -1)
+    period = np.maximum(durations.mean(axis=1), SHORTEST_PIECE)
+    moved = np.stack(
+        [
+            np.linalg.norm(derivative(last, durations[:, -1], order), axis=0)
+            * (period**order / math.factorial(order))
+            for order in (1, 2, 3)
+        ]
+    ).max(axis=0)
+    scale = np.maximum(np.abs(pieces.coeffs[..., 0]).max(axis=(0, 2)), 1.0)
+    late = (durations <= 0.0).any(axis=1)
+    failed = ~(moved <= continuity * scale) | late
+    return {"ending": (failed, moved, pieces.starts[:, -1] + pieces.durations[:, -1])}
 
 
 def check_sampling(samples: int, chunk: int) -> None:

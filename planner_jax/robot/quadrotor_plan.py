@@ -11,7 +11,7 @@ from jax import Array
 from planner_jax.protocol import Plan
 from planner_jax.robot.quadrotor import body_z, flat_attitude, net_thrust, tilt_quaternion
 from planner_jax.robot.setpoints import sampled_at_rate
-from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
+from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, joined
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,20 +35,28 @@ class QuadrotorSetpoints:
 class QuadrotorPlan(Plan):
     """A plan with the trajectory of a quadrotor's propeller plane."""
 
-    trajectory: PiecewisePolynomial
+    trajectory: PiecewisePolynomial  # up to the last contact
     gravity: Array  # () [m/s^2], magnitude, for which it was planned
+    # From there on to rest, where it was asked for.
+    ending: PiecewisePolynomial | None = struct.field(default=None, kw_only=True)
+
+    @property
+    def whole(self) -> PiecewisePolynomial:
+        """The trajectory and the ending in one, of a plan or of a batch."""
+        return self.trajectory if self.ending is None else joined(self.trajectory, self.ending)
 
     def sample(self, rate: float) -> QuadrotorSetpoints:
-        """The plan, or the batch, at a rate [Hz], from its beginning up to its end.
+        """The plan, or the batch, at a rate [Hz], from its beginning up to its end, at rest or not.
 
         Raises:
             ValueError: the rate is not positive.
         """
-        ends = np.sum(np.asarray(self.trajectory.durations), axis=-1)
+        path = jax.tree.map(np.asarray, self.whole)
+        ends = np.sum(path.durations, axis=-1)
         time, setpoints = sampled_at_rate(
             rate,
             ends,
-            (self.trajectory, self.gravity),
+            (path, self.gravity),
             lambda leaves, time: _sampled(*leaves, time),
         )
         return QuadrotorSetpoints(time=time, **setpoints)

@@ -111,6 +111,19 @@ def sample_pieces(trajectory: PiecewisePolynomial, nodes: int) -> Motion:
     return Motion(height=pos[:, 2], vel=vel, acc=acc, jerk=jerk, pos=pos, snap=snap)
 
 
+def joined(first: PiecewisePolynomial, then: PiecewisePolynomial) -> PiecewisePolynomial:
+    """Two trajectories, or batches of them, one behind the other."""
+    size = max(first.coeffs.shape[-2], then.coeffs.shape[-2])
+
+    def wide(coeffs: Array) -> Array:
+        missing = size - coeffs.shape[-2]
+        return jnp.pad(coeffs, [(0, 0)] * (coeffs.ndim - 2) + [(0, missing), (0, 0)])
+
+    coeffs = jnp.concatenate([wide(first.coeffs), wide(then.coeffs)], axis=-3)
+    durations = jnp.concatenate([first.durations, then.durations], axis=-1)
+    return PiecewisePolynomial(coeffs=coeffs, durations=durations)
+
+
 def states_at(trajectory: PiecewisePolynomial, times: np.ndarray) -> np.ndarray:
     """Position to jerk of one trajectory, or of a batch, each at its own time; on the host.
 

@@ -16,9 +16,9 @@ from flax import struct
 from jax import Array
 
 from planner_jax.cost.along import Along, greatest_along, integrate_along
-from planner_jax.cost.extras import extra_excess, extra_rate, num_limits
+from planner_jax.cost.extras import extra_rate, num_limits
 from planner_jax.cost.penalty import smoothed_hinge
-from planner_jax.cost.quadrotor import flight_excess, flight_measures
+from planner_jax.cost.quadrotor import flight_measures, limits_along
 from planner_jax.lanes import in_one_kernel
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
 from planner_jax.optimise.planner import OptimisedPlanner, pending
@@ -26,7 +26,7 @@ from planner_jax.optimise.problem import Round
 from planner_jax.optimise.scaling import shipped_scale
 from planner_jax.optimise.sensitivity import curvature_by_tangents
 from planner_jax.protocol import FEASIBILITY_TOLERANCE, require_settings
-from planner_jax.robot.quadrotor import QuadrotorLimits, body_z, tangent_basis
+from planner_jax.robot.quadrotor import body_z, tangent_basis
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.chain import (
     CatchContext,
@@ -41,7 +41,6 @@ from planner_jax.task.catch.chain import (
     targets_at,
 )
 from planner_jax.task.catch.plan import CatchPlan
-from planner_jax.trajectory.polynomial import Motion
 from planner_jax.trajectory.proportional_minco import (
     ProportionalMinco,
     boundary_energy,
@@ -72,16 +71,6 @@ _GUESSES = np.array(
     ]
 )
 _LEAN = 0.95  # of the angle that the net may have to the ball's way, what a guess makes use of
-
-
-# Gravity, limits and extras of a case.
-_Given = tuple[Array, QuadrotorLimits, tuple[Any, ...]]
-
-
-def _limits_along(motion: Motion, given: _Given) -> tuple[Array, ...]:
-    """Those of flight, and the extra ones."""
-    gravity, limits, extras = given
-    return (*flight_excess(motion, gravity, limits), *extra_excess(motion, extras))
 
 
 @struct.dataclass
@@ -289,7 +278,7 @@ class ExactCatch(OptimisedPlanner):
         margins = tuple(self.margin * factor for factor in factors)
         rate = extra_rate if case.extras else None
         orders = 4 if case.limits.rotors is None else 5
-        return Along(self.maps, nodes, _limits_along, margins, self.hinge_width, rate, orders)
+        return Along(self.maps, nodes, limits_along, margins, self.hinge_width, rate, orders)
 
     def objective(self, point: Array, context: CatchContext) -> Evaluation:
         """Cost, and the largest excess at the penalty nodes (squares over squares)."""
@@ -363,7 +352,7 @@ class ExactCatch(OptimisedPlanner):
         bend = jnp.sqrt(1.5 / self.hinge_width)
         margins = jnp.asarray(along.margins, point.dtype)[:, None, None]
         motion, case = chain_motion(self.maps, self.nodes, chain, along.orders), context.case
-        excess = jnp.stack(_limits_along(motion, (case.gravity, case.limits, case.extras)))
+        excess = jnp.stack(limits_along(motion, (case.gravity, case.limits, case.extras)))
         excess = jnp.where(context.active[:, None], excess, -1.0)
         inside = jnp.maximum(excess + margins, 0.0)
         weights = jnp.asarray(along.weights(), point.dtype)

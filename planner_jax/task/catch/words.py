@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from planner_jax.ending.ended import ended
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.protocol import Decision
 from planner_jax.referee.catch import CatchVerdict, referee_catches
@@ -13,8 +14,12 @@ from planner_jax.task.named_decision import named_decision
 
 
 def planner(
-    name: str = "exact", *, decide: str | Decision = "best", **options: Any
-) -> DecidedPlanner[CatchCase, CatchPlan]:
+    name: str = "exact",
+    *,
+    decide: str | Decision = "best",
+    ending: str | None = None,
+    **options: Any,
+) -> Any:
     """The catch planner of a name, behind a decision about order and times.
 
     * `exact`: the ball is in the net by construction; the one to use.
@@ -28,19 +33,22 @@ def planner(
             cases, "policy" asks a network that was trained by reinforcement; "policy:rush6"
             asks one that was trained on that suite alone, and "policy:FILE" one of your own; or
             a decision with settings, such as `Best(finalists=3)`.
+        ending: what is flown behind the last contact, within all limits: "brake" to rest where that
+            is cheapest, "home" for the way back to where the case begins; by default the plan ends
+            at the contact.
         **options: fields of that planner's dataclass, for example `rounds`.
 
     Returns:
-        A planner for `pj.plan`; its `planner` is an `ExactCatch`, `PaperCatch` or `MppCatch`.
-        The plans hold the order and the times that were decided.
+        A planner for `pj.plan`; its `planner` is an `ExactCatch`, `PaperCatch` or `MppCatch`, or
+        with an ending a planner that has such a one. The plans hold the order and the times that
+        were decided.
 
     Raises:
         ValueError: there is no planner or decision of that name, or its file cannot be read.
         TypeError: the planner has no such field.
     """
-    return DecidedPlanner(
-        TASK.make_planner(name, options), named_decision(DECISIONS, decide, TRAINED)
-    )
+    decision = named_decision(DECISIONS, decide, TRAINED)
+    return ended(DecidedPlanner(TASK.make_planner(name, options), decision), ending)
 
 
 def judge(cases: CatchCase, plans: CatchPlan, **settings: Any) -> CatchVerdict:

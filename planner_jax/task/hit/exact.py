@@ -25,20 +25,19 @@ from planner_jax.ball.impact import required_impact
 from planner_jax.ball.prediction import target_at
 from planner_jax.cost.along import Along, greatest_along, integrate_along
 from planner_jax.cost.contact import apex_excess, hitting_speed_excess
-from planner_jax.cost.extras import extra_excess, extra_rate, num_limits
+from planner_jax.cost.extras import extra_rate, num_limits
 from planner_jax.cost.penalty import smoothed_hinge
-from planner_jax.cost.quadrotor import Measure, flight_excess, flight_measures
+from planner_jax.cost.quadrotor import Measure, flight_measures, limits_along
 from planner_jax.lanes import in_one_kernel
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
 from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.problem import Round
 from planner_jax.optimise.scaling import shipped_scale
 from planner_jax.protocol import require_settings
-from planner_jax.robot.quadrotor import QuadrotorLimits, tangent_basis
+from planner_jax.robot.quadrotor import tangent_basis
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.context import HitContext, Impact, prepare_hit
 from planner_jax.task.hit.plan import HitPlan, Stroke
-from planner_jax.trajectory.polynomial import Motion
 from planner_jax.trajectory.proportional_minco import (
     ProportionalMinco,
     boundary_energy,
@@ -52,16 +51,6 @@ from planner_jax.trajectory.proportional_minco import (
 
 _ORDER = 4  # minimum snap
 _DECODE_NODES = 16  # intervals a piece at which a finished plan is looked at
-
-
-# Gravity, limits and extras of a case.
-_Given = tuple[Array, QuadrotorLimits, tuple[Any, ...]]
-
-
-def _limits_along(motion: Motion, given: _Given) -> tuple[Array, ...]:
-    """Those of flight, and the extra ones."""
-    gravity, limits, extras = given
-    return (*flight_excess(motion, gravity, limits), *extra_excess(motion, extras))
 
 
 # Starting points, best first: impact time over landing time, flight time afterwards [s],
@@ -245,7 +234,7 @@ class ExactHit(OptimisedPlanner):
         margins = tuple(self.margin * factor for factor in factors)
         rate = extra_rate if case.extras else None
         orders = 4 if case.limits.rotors is None else 5
-        return Along(self.maps, nodes, _limits_along, margins, self.hinge_width, rate, orders)
+        return Along(self.maps, nodes, limits_along, margins, self.hinge_width, rate, orders)
 
     def objective(self, point: Array, context: HitContext) -> Evaluation:
         """Cost, and the largest excess at the penalty nodes (squares over squares)."""
@@ -355,7 +344,7 @@ class ExactHit(OptimisedPlanner):
         columns = jnp.concatenate([rows, offsets])
         motion = sample_motion(self.maps, self.nodes, columns, duration, along.orders)
         given = (context.case.gravity, context.case.limits, context.case.extras)
-        excess = jnp.stack(_limits_along(motion, given))
+        excess = jnp.stack(limits_along(motion, given))
         at_impact = self._at_impact(impact, context)
         bend = jnp.sqrt(1.5 / self.hinge_width)
         inside = jnp.maximum(excess + jnp.asarray(along.margins, point.dtype)[:, None], 0.0)

@@ -5,6 +5,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
+from planner_jax.ending.ended import ended
 from planner_jax.protocol import AnyPlanner
 from planner_jax.referee.hit import HitVerdict, referee_hits
 from planner_jax.task.hit.card import REAL_SCENARIOS, START, TASK
@@ -50,7 +51,9 @@ def draw(
     )
 
 
-def planner(name: str = "exact", **options: Any) -> AnyPlanner[HitCase, HitPlan]:
+def planner(
+    name: str = "exact", *, ending: str | None = None, **options: Any
+) -> AnyPlanner[HitCase, HitPlan]:
     """The hit planner of a name, with some of its fields set.
 
     * `exact`: contact, impact and landing hold by construction; the one to use.
@@ -60,16 +63,20 @@ def planner(name: str = "exact", **options: Any) -> AnyPlanner[HitCase, HitPlan]
 
     Args:
         name: one of these, or one that another package offers.
+        ending: what is flown behind the last contact, within all limits: "brake" to rest where that
+            is cheapest, "home" for the way back to where the case begins; by default the plan ends
+            at the contact.
         **options: fields of that planner's dataclass, for example `rounds`.
 
     Returns:
-        `ExactHit`, `BatHit` (`bat` and `bat-lite`) or `JuggleHit`, for `pj.plan`.
+        `ExactHit`, `BatHit` (`bat` and `bat-lite`) or `JuggleHit`, for `pj.plan`; with an ending a
+        planner whose `planner` is one of these.
 
     Raises:
         ValueError: there is no planner of that name.
         TypeError: the planner has no such field.
     """
-    return TASK.make_planner(name, options)
+    return ended(TASK.make_planner(name, options), ending)
 
 
 def judge(cases: HitCase, plans: HitPlan, **settings: Any) -> HitVerdict:

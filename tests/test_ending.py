@@ -1,0 +1,121 @@
+"""What is flown behind the last contact: to rest, within all limits, and judged like the rest."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+import planner_jax as pj
+from planner_jax.ending.case import EndingCase, end_state
+from planner_jax.ending.planner import RestPlanner
+from planner_jax.robot.quadrotor import QuadrotorLimits
+from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, total_duration
+
+NUM = 8
+
+
+@pytest.fixture(scope="module")
+def hits():
+    return jax.tree.map(np.asarray, pj.hit.draw(NUM, seed=4))
+
+
+@pytest.fixture(scope="module")
+def braked(hits):
+    return pj.plan(pj.hit.planner("exact", ending="brake"), hits)
+
+
+def states(path, time=None):
+    """Position to jerk (4, 3) of one trajectory at a time, or at its end."""
+    time = total_duration(path) if time is None else time
+    return np.stack([evaluate(path, time, order) for order in range(4)])
+
+
+def test_a_hit_comes_to_rest_where_its_trajectory_left_off(hits, braked):
+    assert pj.solved(braked).all()
+    assert pj.hit.judge(hits, braked).success.all()
+    for k in range(NUM):
+        plan = pj.lane(braked, k)
+        np.testing.assert_allclose(
+            states(plan.ending, 0.0), np.asarray(end_state(plan.trajectory)), atol=5e-3
+        )
+        np.testing.assert_allclose(states(plan.ending)[1:], 0.0, atol=2e-2)
+
+
+def test_the_contact_is_where_it_was_without_an_ending(hits, braked):
+    plain = pj.plan(pj.hit.planner("exact"), hits)
+    np.testing.assert_allclose(braked.stroke.time, plain.stroke.time, rtol=1e-6)
+    np.testing.assert_array_equal(braked.trajectory.durations, plain.trajectory.durations)
+
+
+def test_setpoints_go_on_until_the_quadrotor_rests(braked):
+    plan = pj.lane(braked, 0)
+    setpoints = plan.sample(100.0)
+    assert setpoints.time[-1] > plan.stroke.time + 0.2
+    np.testing.assert_allclose(setpoints.vel[-1], 0.0, atol=0.1)
+
+
+def test_a_plan_with_an_ending_is_saved_and_read(tmp_path, braked):
+    braked.save(tmp_path / "plans.npz")
+    read = pj.hit.HitPlan.load(tmp_path / "plans.npz")
+    jax.tree.map(np.testing.assert_array_equal, read, braked)
+
+
+def test_an_ending_that_does_not_rest_fails_by_name(hits, braked):
+    path = braked.ending
+    moving = PiecewisePolynomial(coeffs=path.coeffs, durations=path.durations.copy())
+    moving.durations[:, -1] *= 0.5
+    verdict = pj.hit.judge(hits, dataclasses.replace(braked, ending=moving))
+    assert (verdict.failed_limit == "ending").all()
+    assert "way to rest" in verdict.sentence(0)
+
+
+def test_limits_hold_behind_the_contact_too(hits, braked):
+    least = 0.5 * pj.hit.judge(hits, braked).max_speed.astype(np.float32)
+    slow = dataclasses.replace(hits, limits=dataclasses.replace(hits.limits, speed=least))
+    still = jax.tree.map(np.array, braked)
+    still.trajectory.coeffs[:, :, 1:] = 0.0  # it hovers, and the ending alone moves
+    verdict = pj.hit.judge(slow, still)
+    ends = still.trajectory.durations.sum(axis=1)
+    assert (verdict.max_speed > least).any()
+    assert set(verdict.failed_limit) <= {"continuity", "head state", "speed"}, ends
+
+
+@pytest.mark.parametrize("to", ["brake", "home"])
+def test_from_a_fast_flight_it_comes_to_rest_where_it_should(to):
+    head = np.zeros((NUM, 4, 3), np.float32)
+    head[:, 0, 2] = 1.5
+    head[:, 1] = np.random.default_rng(0).uniform(-2.0, 2.0, (NUM, 3))
+    ones = np.ones(NUM, np.float32)
+    limits = QuadrotorLimits(
+        speed=5 * ones,
+        body_rate=5 * ones,
+        min_height=0.25 * ones,
+        min_thrust=3 * ones,
+        max_thrust=24 * ones,
+    )
+    home = np.tile(np.float32([1.0, 0.0, 1.0]), (NUM, 1))
+    case = EndingCase(head_state=head, home=home, gravity=9.81 * ones, limits=limits)
+    plans = pj.plan(RestPlanner(to=to), case)
+    assert pj.solved(plans).all()
+    ends = np.stack([states(pj.lane(plans.trajectory, k))[0] for k in range(NUM)])
+    if to == "home":
+        np.testing.assert_allclose(ends, home, atol=1e-3)
+    else:
+        assert (ends[:, 2] >= 0.25).all() and not np.allclose(ends, home, atol=0.1)
+
+
+@pytest.mark.slow
+def test_catches_that_end_too_fast_for_the_limits_are_planned_slower():
+    cases = jax.tree.map(np.asarray, pj.catch.draw(24, "triangle3", 3))
+    plans = pj.plan(pj.catch.planner("exact", decide="greedy", ending="brake"), cases)
+    verdict = pj.catch.judge(cases, plans)
+    np.testing.assert_array_equal(verdict.success, pj.solved(plans))
+    assert verdict.success.all(), verdict.failed_limit
+
+
+def test_another_ending_is_refused_in_one_line():
+    with pytest.raises(ValueError, match="^ending must be one of brake, home, got 'land'$"):
+        pj.hit.planner("exact", ending="land")
+    with pytest.raises(ValueError, match="^to must be one of brake, home, got 'land'$"):
+        RestPlanner(to="land")
