@@ -58,7 +58,7 @@ ALLOWED = {
     "sweep": {
         *("ball", "compile_cache", "digits", "lanes", "memory", "perception", "plane"),
         *("planning", "protocol", "registry", "robot", "rules", "stopping", "task"),
-        *("whole_files",),
+        *("plain_files", "whole_files"),
     },
     "compile_cache": set(),
     "doctor": {"compile_cache", "lanes", "planning", "protocol", "registry", "sweep"},

@@ -136,13 +136,14 @@ def resume_sweep(
                 raise SettingError(f"{entry} must be the same as when the run began")
         if manifest["settings"] != settings_digest(source, description):
             raise SettingError("out must be resumed with the files that its settings named then")
+        parts = Parts(folder.parts, {name: manifest[name] for name in IDENTITY}, source)
+        parts.require_plain(folder.name)
         for name, why in damages.items():
             print(f"planner-jax: {folder.path / name} is {why}; it is made anew", file=sys.stderr)
         if folder.plans.name in damages:  # the parts are gone since there was a summary
             manifest = {name: value for name, value in manifest.items() if name not in _FOUND}
         sessions = [*manifest["sessions"], _with_workers(session, workers)]
         folder.write_manifest({**manifest, "state": "running", "sessions": sessions})
-        parts = Parts(folder.parts, {name: manifest[name] for name in IDENTITY}, source)
         planner = sweep.planner(settings)
         return _finish(SweepRun(sweep, source, planner, folder, parts, others), progress)
 
