@@ -177,8 +177,8 @@ def require_path(name: str, path: Any, axes: tuple[int, ...], dimensions: int) -
     try:
         found = _shape_of_positions(tree, layout, len(axes))
     except (TypeError, ValueError, IndexError, AttributeError) as error:
-        why = told(f"{type(error).__name__}: {error}")
-        raise TypeError(f"{name} must give positions at a time, got {why}") from error
+        found = f"a {type(path).__name__} that raises {type(error).__name__}"
+        raise TypeError(f"{name} must be a path with the axes {axes}, got {found}") from error
     if found != (*axes, dimensions):
         rule = f"the shape {(*axes, dimensions)}"
         raise ValueError(f"{name} must give positions of {rule}, got {found}")

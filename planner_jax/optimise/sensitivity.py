@@ -22,7 +22,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.checks import require_scalar, require_size, told
+from planner_jax.checks import numeric, require_size, told
 from planner_jax.lanes import with_kernel
 from planner_jax.optimise.inverse_kernel import inverse_kernel
 from planner_jax.optimise.planner import OptimisedPlanner, pending
@@ -200,7 +200,10 @@ def gradient_at(
     def value_of(x: Array, smooth: list) -> Array:
         plan = planner.decode(x, context_of(smooth))
         value = number(plan.replace(cost=cost(x, smooth)))
-        require_scalar("of", value)
+        if numeric(value) is None:
+            raise TypeError(f"of must be one number, got {told(value)}")
+        if value.shape:
+            raise ValueError(f"of must be one number, got shape {value.shape}")
         return value
 
     value, (along_point, by_context) = jax.value_and_grad(value_of, argnums=(0, 1))(point, smooth)

@@ -103,7 +103,7 @@ def plan_chunks(run: SweepRun, *, progress: bool) -> dict[str, Any]:
     records = {number: part.record for number, part in there.items()}
     done, successes = (sum(each[name] for each in records.values()) for name in _COUNTED)
     if progress:
-        print(f"Writing {folder.path}; the first chunk compiles.", file=sys.stderr)
+        print(f"Writing {folder.shown}; the first chunk compiles.", file=sys.stderr)
     look: dict[str, Any] = {"unit": " plans", "desc": source.settings.planner}
     tally = run.sweep.tally(source.settings)
     with tqdm(total=source.num, initial=done, disable=not progress, **look) as bar:

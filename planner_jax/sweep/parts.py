@@ -19,6 +19,7 @@ from planner_jax.plain_files import open_plain
 from planner_jax.sweep.manifest import FORMAT, is_count, is_number
 from planner_jax.sweep.parquet import ROW_GROUP, encoding, opened
 from planner_jax.sweep.plain_json import JsonError, parse_object
+from planner_jax.sweep.run_folder import RunFolder
 from planner_jax.sweep.settings import SettingError
 from planner_jax.sweep.source import Source
 from planner_jax.whole_files import replacing
@@ -52,14 +53,19 @@ class Parts:
     """The parts of one run.
 
     Args:
-        folder: that holds them, which need not exist.
+        run: folder of the run, in whose `parts` they lie.
         identity: of the run, as its manifest has it: `run`, `settings` and `code`.
         source: of the cases.
     """
 
-    folder: Path
+    run: RunFolder
     identity: dict[str, str]
     source: Source
+
+    @property
+    def folder(self) -> Path:
+        """Where they lie; it need not exist."""
+        return self.run.parts
 
     def write(self, number: int, rows: pa.Table, record: dict[str, Any]) -> dict[str, Any]:
         """Write the rows of a chunk; gives the record of how they came about as it is kept."""
@@ -75,6 +81,7 @@ class Parts:
         name = f"part-{number:06d}-{zlib.crc32(content):08x}.parquet"
         with replacing(self.folder / name) as scratch:
             scratch.write_bytes(content)
+        self.run.sent(self.folder / name)
         return record
 
     def sound(self) -> dict[int, Part]:
@@ -93,7 +100,7 @@ class Parts:
                 print(
                     f"planner-jax: {path} {error}; what it held is planned again", file=sys.stderr
                 )
-                path.unlink()
+                self.run.dropped(path)
         return found
 
     def require_plain(self, name: str) -> None:
