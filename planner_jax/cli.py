@@ -24,7 +24,7 @@ from planner_jax.compile_cache import keep_compiled_programs
 from planner_jax.digits import written_number, written_whole
 from planner_jax.registry import MissingExtra, Task, UnknownName, all_tasks
 from planner_jax.sweep.environment import installed_version, require_backend
-from planner_jax.sweep.settings import SettingError, WorkersFailed
+from planner_jax.sweep.settings import SettingError, WorkersFailed, is_address
 
 _HELP = argparse.RawDescriptionHelpFormatter
 _FAILED, _BAD_ARGUMENT, _INTERRUPTED = 1, 2, 130
@@ -368,11 +368,19 @@ def _add_fly(task: Task, parser: _Parser) -> None:
     parser.set_defaults(command=lambda given: _fly(task, kind, given))
 
 
-def _out(given: dict[str, Any], kind: str = "folder") -> str | None:
-    """The folder, or file, of the option `--out`, which is taken out of what was given."""
+def _out(given: dict[str, Any], kind: str = "folder", *, stored: bool = False) -> str | None:
+    """The folder, or file, of the option `--out`, which is taken out of what was given.
+
+    Args:
+        given: options.
+        kind: what it is.
+        stored: whether it may be an address in an object store.
+    """
     out = given.pop("out", None)
     if out == "":
         raise SettingError(f"out must name a {kind}, got ''")
+    if out and not stored and is_address(out):
+        raise SettingError(f"out must be a {kind} of this machine, got {out!r}")
     return out
 
 
@@ -382,7 +390,11 @@ def _run_folder(name: str) -> str:
 
 
 def _sweep(task: Task, given: dict[str, Any]) -> None:
-    resume, workers, out = given.pop("resume", False), given.pop("workers", None), _out(given)
+    resume, workers, out = (
+        given.pop("resume", False),
+        given.pop("workers", None),
+        _out(given, stored=True),
+    )
     if resume and out is None:
         raise SettingError("out must name the folder to resume, got nothing")
     settings = pkgutil.resolve_name(task.sweep)(**given).of(task)
@@ -390,15 +402,19 @@ def _sweep(task: Task, given: dict[str, Any]) -> None:
     settings.require_room(out)
     keep_compiled_programs()
     from planner_jax.sweep import run
+    from planner_jax.sweep.stored_run import has_begun
 
     again = f"planner-jax sweep {task.name} --resume --out {shlex.quote(str(out))}"
-    rest = functools.partial(_rest, Path(out), f"finish with: {again}")
+
+    def rest() -> str:
+        return f"finish with: {again}" if has_begun(out) else stopping.NOTHING
+
     with stopping.under_way(rest), _told_how_to_go_on(rest):
         if resume:
             manifest = run.resume_sweep(task, out, workers=workers, **given)
         else:
             manifest = run.start_sweep(task, settings, out, workers=workers)
-        _print_sweep(manifest, Path(out))
+        _print_sweep(manifest, out)
 
 
 def _same_command() -> str:
@@ -427,12 +443,12 @@ def _told_how_to_go_on(
         raise _NotFinished(f"{rule}, got {shown}; {rest()}") from None
 
 
-def _print_sweep(manifest: dict[str, Any], out: Path) -> None:
+def _print_sweep(manifest: dict[str, Any], out: str) -> None:
     from planner_jax.sweep.sweep import sweep_of_run
     from planner_jax.sweep.table import headline
 
     print("\n".join(headline(manifest, sweep_of_run(manifest).findings(manifest))))
-    print(f"Look at {out / 'index.html'}")
+    print(f"Look at {os.path.join(out, 'index.html')}")
 
 
 def _fly(task: Task, kind: type, given: dict[str, Any]) -> None:
@@ -477,9 +493,9 @@ def _throughput(given: dict[str, Any]) -> None:
 
 
 def _report(options: dict[str, Any]) -> None:
-    from planner_jax.sweep.run_folder import RunFolder
+    from planner_jax.sweep.stored_run import run_folder
 
-    folder = RunFolder(options["run"], name="RUN")
+    folder = run_folder(options["run"], "RUN")
     manifest = folder.read_manifest()
     with folder.resumed():
         if str(manifest["kind"]).startswith("fly "):
@@ -493,7 +509,7 @@ def _report(options: dict[str, Any]) -> None:
 
             require_sound(folder)
             write_report(folder)
-            _print_sweep(folder.read_manifest(), folder.path)
+            _print_sweep(folder.read_manifest(), folder.shown)
 
 
 def _doctor(options: dict[str, Any]) -> int:

@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from planner_jax.checks import require_path_name
 from planner_jax.plain_files import open_plain
 from planner_jax.whole_files import replacing
 
@@ -38,12 +39,13 @@ def save_arrays(path: str | os.PathLike, tree: Any) -> None:
         tree: the dataclass.
 
     Raises:
-        TypeError: a leaf is not an array of numbers.
+        TypeError: a leaf is not an array of numbers, or the path is none.
     """
+    require_path_name("path", path)
     header = json.dumps({"version": VERSION, "class": type(tree).__name__})
     arrays: dict[str, Any] = {name: np.asarray(leaf) for name, leaf in named_leaves(tree).items()}
     for name, array in arrays.items():
-        if array.dtype.hasobject:  # which NumPy would pickle
+        if array.dtype.kind in "OSU":  # objects NumPy would pickle
             raise TypeError(f"{name} must be an array of numbers, got {array.dtype}")
     with replacing(path) as scratch, open(scratch, "wb") as file:
         np.savez(file, **{_HEADER: np.array(header), **arrays})
@@ -54,7 +56,9 @@ def load_arrays(path: str | os.PathLike, kind: type[Kind]) -> Kind:
 
     Raises:
         PlanFileError: the file is something else, of another class or of another version.
+        TypeError: the path is none.
     """
+    require_path_name("path", path)
     version, name, arrays = _read(path)
     if version != VERSION or name != kind.__name__:
         raise PlanFileError(

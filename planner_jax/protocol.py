@@ -23,6 +23,14 @@ import numpy as np
 from flax import struct
 from jax import Array
 
+from planner_jax.checks import (
+    numeric,
+    require_kind,
+    require_number,
+    require_size,
+    require_switch,
+    told,
+)
 from planner_jax.plan_files import load_arrays, save_arrays
 from planner_jax.rules import has_rules, is_sound
 
@@ -142,24 +150,11 @@ class Case(Protocol):
         ...
 
 
-def require_size(name: str, value: Any, least: int = 1) -> None:
-    """Raise unless a setting is a whole number that is not too small.
-
-    Raises:
-        TypeError: it is no whole number.
-        ValueError: it is too small.
-    """
-    if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise TypeError(f"{name} must be a whole number, got {value!r:.60}")
-    if value < least:
-        raise ValueError(f"{name} must be >= {least}, got {value}")
-
-
 def require_settings(planner: Any) -> None:
     """Raise unless every field of a planner, a dataclass, is of the kind that its default is.
 
     Sizes are whole numbers of 1 or more, 0 only where that is the default; weights and times are
-    finite; attempts are one or more.
+    finite, and not negative where the default is not; attempts are one or more.
 
     Raises:
         TypeError: a field is of another kind.
@@ -167,19 +162,34 @@ def require_settings(planner: Any) -> None:
     """
     for field in dataclasses.fields(planner):
         name, value, usual = field.name, getattr(planner, field.name), field.default
-        if isinstance(usual, int) and not isinstance(usual, bool):
+        if isinstance(usual, bool):
+            require_switch(name, value)
+        elif isinstance(usual, int):
             require_size(name, value, min(usual, 1))
+        elif isinstance(usual, float) and usual >= 0.0:
+            require_number(name, value, "finite and >= 0", lambda x: x >= 0.0)
         elif isinstance(usual, float):
-            if isinstance(value, str | bool) or np.ndim(value) != 0 or value is None:
-                raise TypeError(f"{name} must be a number, got {value!r:.60}")
-            if not np.isfinite(value):
-                raise ValueError(f"{name} must be finite, got {value}")
+            require_number(name, value)
         elif isinstance(usual, tuple) and usual and isinstance(usual[0], Attempt):
-            if not isinstance(value, tuple) or not all(isinstance(x, Attempt) for x in value):
-                kind = type(usual[0]).__name__
-                raise TypeError(f"{name} must be a tuple of {kind}, got {value!r:.60}")
-            if not value:
-                raise ValueError(f"{name} must have an entry, got none")
+            require_attempts(name, value, type(usual[0]))
+        elif isinstance(usual, tuple):
+            if not isinstance(value, tuple) or any(numeric(x) is None for x in value):
+                raise TypeError(f"{name} must be a tuple of numbers, got {told(value)}")
+        elif dataclasses.is_dataclass(usual):
+            require_kind(name, value, type(usual))
+
+
+def require_attempts(name: str, value: Any, kind: type) -> None:
+    """Raise unless a setting is a tuple of attempts of a class, one or more.
+
+    Raises:
+        TypeError: it is something else.
+        ValueError: it has none.
+    """
+    if not isinstance(value, tuple) or not all(isinstance(each, kind) for each in value):
+        raise TypeError(f"{name} must be a tuple of {kind.__name__}, got {told(value)}")
+    if not value:
+        raise ValueError(f"{name} must have an entry, got none")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -314,7 +324,12 @@ def lane(tree: Tree, k: Any) -> Tree:
 
 
 def solved(plans: Plan) -> np.ndarray:
-    """Whether each plan meets every limit that its planner looked at, bool; see `Status`."""
+    """Whether each plan meets every limit that its planner looked at, bool; see `Status`.
+
+    Raises:
+        TypeError: these are no plans.
+    """
+    require_kind("plans", plans, Plan)
     return np.asarray(is_solved(plans.status))
 
 

@@ -131,8 +131,21 @@ class Task:
 
 def require_name(known: Mapping[str, Any], kind: str, name: str) -> None:
     """Raise `UnknownName` unless a name is known."""
+    if not isinstance(name, str):
+        raise UnknownName(f"{kind} must be a name, got {name!r:.60}")
     if name not in known:
         raise UnknownName(f"{kind} must be one of {', '.join(known)}, got {name!r}")
+
+
+def suite_named(name: Any, default: str) -> str:
+    """The name of a suite, or the default where none is given.
+
+    Raises:
+        UnknownName: it is no name.
+    """
+    if name is not None and not isinstance(name, str):
+        raise UnknownName(f"suite must be a name, got {name!r:.60}")
+    return name or default
 
 
 def split_name(
@@ -149,9 +162,7 @@ def split_name(
     Raises:
         UnknownName: it is not known, or takes no file.
     """
-    if not isinstance(name, str):
-        raise UnknownName(f"{kind} must be a name, got {name!r:.60}")
-    own, _, file = name.partition(":")
+    own, _, file = name.partition(":") if isinstance(name, str) else (name, "", "")
     require_name(known, kind, own)
     if own != name and own not in from_file:
         raise UnknownName(f"{kind} {own} takes no file, got {name!r}")

@@ -110,6 +110,8 @@ def require_sound(cases: Any) -> None:
         ValueError: an array has not the shape of its field.
         TypeError: an array has not the kind of numbers of its field.
     """
+    if isinstance(cases, type) or not hasattr(cases, "batch_shape"):
+        raise TypeError(f"cases must be a case or a batch, got a {type(cases).__name__}")
     require_shapes(cases)
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(cases)):
         return
@@ -153,14 +155,19 @@ def require_shapes(cases: Any) -> None:
     for place, part in _parts(cases):
         sizes: dict[str, int] = {}
         batch = getattr(part, "batch_shape", ())
+        for each in dataclasses.fields(part):
+            if getattr(part, each.name) is None and each.default is not None:
+                raise TypeError(f"{place}{each.name} must be given, got None")
         for field in type(part).rules:
             value, name = named(part, field.name), place + field.name
             if value is None:
                 continue
-            kind = jnp.result_type(value)
+            kind = np.asarray(value).dtype if isinstance(value, _PLAIN) else jnp.result_type(value)
             if not jnp.issubdtype(kind, field.kind):
                 wanted = _KINDS[field.kind]
                 raise TypeError(f"{name} must be {wanted}, got an array of {kind}")
+            if kind == np.float16:
+                raise TypeError(f"{name} must be in float32 or float64, got an array of {kind}")
             if field.shape is None:
                 continue
             shape = np.shape(value)
@@ -177,6 +184,7 @@ def require_shapes(cases: Any) -> None:
                 raise ValueError(f"{name} must have the shape ({wanted}), got {shape}")
 
 
+_PLAIN = (np.ndarray, str, bytes)  # of which NumPy knows the kind, numbers or not
 _KINDS = {
     np.floating: "floating-point numbers",
     np.integer: "whole numbers",

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from flax import traverse_util
 
+from planner_jax.checks import require_path_name
 from planner_jax.plain_files import open_plain
 from planner_jax.plan_files import UNREADABLE
 from planner_jax.policies.networks import NETWORKS
@@ -71,6 +72,7 @@ def load_checkpoint(path: str | os.PathLike) -> Checkpoint:
     Raises:
         CheckpointError: there is none, it is no checkpoint, or one of another version.
     """
+    require_path_name("checkpoint", path)
     name = os.fspath(path)
     try:
         with open_plain(path) as file, np.load(file, allow_pickle=False) as archive:

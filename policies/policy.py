@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from planner_jax.checks import require_number, require_size, told
 from planner_jax.policies.checkpoint import checkpoint_of
 from planner_jax.policies.networks import LEAST_STD
 from planner_jax.policies.observation import PER_TARGET, STRETCH, choice_of, observe
@@ -31,6 +32,13 @@ class Policy(CatchDecision):
     spread: float = struct.field(pytree_node=False, default=1.0)  # factor on deviations
     # Factor on the times: above one a plan needs fewer iterations, and its last catch is later.
     stretch: float = struct.field(pytree_node=False, default=1.0)
+
+    def __post_init__(self) -> None:
+        require_size("proposals", self.proposals)
+        require_number("spread", self.spread, "finite and >= 0", lambda x: x >= 0.0)
+        require_number("stretch", self.stretch, "finite and > 0", lambda x: x > 0.0)
+        if not callable(getattr(self.network, "apply", None)):
+            raise TypeError(f"network must be a Flax module, got {told(self.network)}")
 
     def check(self, cases: CatchCase) -> None:
         """Raise `ValueError` where there are more targets than the network takes."""
@@ -66,6 +74,8 @@ def policy(file: str | os.PathLike = "catch", **options: Any) -> Policy:
         **options: `proposals`, `spread` and `stretch` of `Policy`.
 
     Raises:
+        TypeError: an option is of another kind.
+        ValueError: there is no proposal, or an option is negative, zero or not finite.
         CheckpointError: it is no checkpoint of a policy, or of another version; one line.
     """
     found = checkpoint_of(file)

@@ -23,6 +23,7 @@ from tensorboardX import SummaryWriter
 from tqdm import tqdm
 
 from planner_jax import stopping
+from planner_jax.plain_files import open_plain
 from planner_jax.sweep.manifest import (
     is_count,
     is_number,
@@ -163,7 +164,8 @@ def read_rows(folder: Path) -> list[dict[str, Any]]:
     """
     shown = repr(str(folder))
     try:
-        text = (folder / FILE).read_bytes()
+        with open_plain(folder / FILE) as file:
+            text = file.read()
     except OSError as error:
         rule = f"the folder of a training, with its {FILE}"
         raise SettingError(f"run must be {rule}, got {shown} ({error.strerror})") from None

@@ -308,7 +308,7 @@ def test_a_time_of_meeting_that_is_not_known_is_refused():
     [
         ({"time": 0.0}, "time must be > 0"),
         ({"curvature": -1.0}, "curvature must be > 0"),
-        ({"time": np.ones(3)}, r"target must have leaves that begin with the batch shape \(3,\)"),
+        ({"time": np.ones(3)}, r"target must have leaves that begin with the shape \(3,\)"),
     ],
 )
 def test_bad_input_is_refused_in_one_line(settings, message):

@@ -102,14 +102,16 @@ def test_a_new_drag_is_believed(hits):
 def test_a_planner_that_cannot_plan_again_names_one_that_can(hits, name):
     cases, plans, news = hits
     planner = pj.hit.planner(name)
-    says = f"^{type(planner).__name__} cannot plan again: use the planner exact$"
+    says = f"^{type(planner).__name__} cannot plan again: use hits' and catches' exact, "
     with pytest.raises(TypeError, match=says):
         pj.replan(planner, cases, plans, 0.0, **news)
 
 
 def test_a_decision_about_a_planner_that_cannot_plan_again_is_no_way_around(catches):
     cases, plans, news = catches
-    with pytest.raises(TypeError, match="^MppCatch cannot plan again: use the planner exact$"):
+    with pytest.raises(
+        TypeError, match="^MppCatch cannot plan again: use hits' and catches' exact, "
+    ):
         pj.replan(pj.catch.planner("mpp"), cases, plans, 0.0, **news)
 
 

@@ -6,13 +6,13 @@ World frame, z up, SI units. Everything here is written for one ball; `jax.vmap`
 import math
 from typing import Any, TypeVar
 
-import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
 from planner_jax.arithmetic import components
+from planner_jax.checks import require_kind, require_number, require_size, shape_of
 
 Vector = TypeVar("Vector", Array, tuple[Array, Array, Array])
 
@@ -23,6 +23,20 @@ class BallState:
 
     pos: Array  # (3,) [m]
     vel: Array  # (3,) [m/s]
+
+
+def require_ball(ball: Any) -> None:
+    """Raise unless an argument `ball` is one ball.
+
+    Raises:
+        TypeError: it is none, or holds no numbers.
+        ValueError: its vectors have another shape.
+    """
+    require_kind("ball", ball, BallState)
+    for name in ("pos", "vel"):
+        shape = shape_of(f"ball.{name}", getattr(ball, name))
+        if shape != (3,):
+            raise ValueError(f"ball.{name} must have the shape (3,), got {shape}")
 
 
 def gravity_vector(gravity: Array) -> Array:
@@ -92,7 +106,11 @@ def fly(
         final: the ball at the end.
         path: the ball after each step, leaves (num_steps, 3).
     """
-    chex.assert_shape([ball.pos, ball.vel], (3,))
+    require_ball(ball)
+    require_number("duration", duration)
+    require_number("drag", drag)
+    require_number("gravity", gravity)
+    require_size("num_steps", num_steps)
     step = jnp.asarray(duration, ball.pos.dtype) / num_steps
 
     def advance(state: BallState, _: None) -> tuple[BallState, BallState]:

@@ -8,7 +8,6 @@ import functools
 from collections.abc import Callable
 from typing import ClassVar
 
-import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -16,10 +15,13 @@ from jax import Array
 from jax.custom_derivatives import SymbolicZero
 
 from planner_jax.arithmetic import reciprocal
-from planner_jax.ball.flight import BallState, rk4_step
+from planner_jax.ball.flight import BallState, require_ball, rk4_step
 from planner_jax.ball.prediction_kernel import table_kernel
+from planner_jax.checks import require_kind, require_number, require_scalar, require_size
 from planner_jax.lanes import with_kernel
 from planner_jax.rules import POSITIVE, Field, Table
+
+LEAST_NODES = 5  # of a table
 
 
 @struct.dataclass
@@ -49,9 +51,16 @@ def predict_path(
         gravity: () [m/s^2], magnitude.
         num_nodes: N >= 5. One node lies before time 0 and one past the horizon, because the
             kernel reads two nodes on each side.
+
+    Raises:
+        ValueError: an argument has another shape or, unless it is a jax array, is out of its range.
+        TypeError: an argument is of another kind.
     """
-    if num_nodes < 5:
-        raise ValueError(f"num_nodes must be >= 5, got {num_nodes}")
+    require_size("num_nodes", num_nodes, LEAST_NODES)
+    require_ball(ball)
+    require_number("horizon", horizon, "finite and > 0", lambda x: x > 0.0)
+    require_number("drag", drag, "finite and >= 0", lambda x: x >= 0.0)
+    require_number("gravity", gravity)
     resolution = horizon / (num_nodes - 3)
     pos, vel = _integrated(num_nodes)(ball.pos, ball.vel, resolution, drag, gravity)
     return PathTable(pos=pos, vel=vel, resolution=resolution)
@@ -136,7 +145,8 @@ def target_at(table: PathTable, time: Array) -> BallState:
         table: N nodes.
         time: () [s].
     """
-    chex.assert_rank(time, 0)
+    require_kind("table", table, PathTable)
+    require_scalar("time", time)
     inside = jax.lax.clamp(jnp.zeros_like(time), time, horizon_of(table))
     position = inside * reciprocal(table.resolution)
     index = jnp.clip(jnp.floor(position), 0, table.pos.shape[0] - 4)

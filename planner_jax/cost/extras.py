@@ -15,6 +15,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
+from planner_jax.checks import told
 from planner_jax.rules import NOT_NEGATIVE, POSITIVE, Field, Table, below
 from planner_jax.trajectory.polynomial import Motion
 
@@ -117,8 +118,11 @@ def for_batch(extras: Sequence[Extra], batch: tuple[int, ...], dtype: Any) -> tu
     """Extras whose leaves have a dtype and the axes of a batch, () or (B,), in front.
 
     Raises:
+        TypeError: they are no sequence.
         ValueError: an extra is not for one case, and not all of its leaves have these axes.
     """
+    if not isinstance(extras, Sequence) or isinstance(extras, str):
+        raise TypeError(f"extras must be a sequence of limits and costs, got {told(extras)}")
 
     def spread(extra: Any) -> Any:
         extra = jax.tree.map(np.asarray, extra, is_leaf=lambda x: isinstance(x, tuple | list))

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array, lax
 
+from planner_jax.checks import require_kind, require_size
 from planner_jax.optimise.lbfgs import LbfgsConfig, Objective
 from planner_jax.optimise.multistart import minimise
 from planner_jax.protocol import marked, status_of
@@ -116,8 +117,16 @@ def optimal_plan(
         breaks a limit, and its gradients mean nothing.
 
     Raises:
-        ValueError: the case is a batch.
+        TypeError: the planner does not minimise, or the case is of another task.
+        ValueError: the case is a batch, or `newton_steps` < 0.
     """
+    kind = getattr(planner, "case_type", None)
+    if not hasattr(case, "batch_shape") or not isinstance(case, kind or object):
+        wanted = kind.__name__ if kind else "case"
+        raise TypeError(f"case must be a {wanted}, got a {type(case).__name__}")
+    require_size("newton_steps", newton_steps, 0)
+    if solver is not None:
+        require_kind("solver", solver, LbfgsConfig)
     if case.batch_shape != ():
         raise ValueError(
             f"case must be one case, got batch shape {case.batch_shape}; for batches "
@@ -125,6 +134,8 @@ def optimal_plan(
         )
     if hasattr(planner, "smooth"):
         planner, case = planner.smooth(case)
+    if not hasattr(planner, "objective"):
+        raise TypeError(f"planner must be one that minimises, got a {type(planner).__name__}")
     solver = solver or LbfgsConfig(max_steps=200, tolerance=1e-7, patience=6)
     context = planner.prepare(case)
     start = lax.stop_gradient(planner.guesses(context, 1)[0])

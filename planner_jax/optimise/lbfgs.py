@@ -17,9 +17,9 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
+from planner_jax.checks import numeric, require_number, require_size, told
 from planner_jax.lanes import in_one_kernel, with_kernel
 from planner_jax.optimise.lbfgs_kernel import judged_pair, shortening, start_scale, turn_kernel
-from planner_jax.protocol import require_size
 
 
 @struct.dataclass
@@ -48,8 +48,12 @@ class LbfgsConfig:
         for name, least in (("max_steps", 0), ("memory", 1), ("patience", 0)):
             require_size(name, getattr(self, name), least)
         for name in ("step_cap", "tolerance"):
-            if not 0.0 <= getattr(self, name) < jnp.inf:
-                raise ValueError(f"{name} must be finite and >= 0, got {getattr(self, name)}")
+            require_number(name, getattr(self, name), "finite and >= 0", lambda x: x >= 0.0)
+        steps = self.trial_steps
+        if not isinstance(steps, tuple) or any(numeric(each) is None for each in steps):
+            raise TypeError(f"trial_steps must be a tuple of numbers, got {told(steps)}")
+        if not steps or not all(0.0 < each < jnp.inf for each in steps):
+            raise ValueError(f"trial_steps must be finite and > 0, one or more, got {steps}")
 
 
 @struct.dataclass

@@ -5,6 +5,7 @@ from typing import Any, Protocol
 
 from jax import Array
 
+from planner_jax.checks import require_kind
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
 from planner_jax.protocol import Attempt
 
@@ -26,6 +27,10 @@ class Round(Attempt):
     solver: LbfgsConfig = LbfgsConfig()
     settings: Settings = ()  # of the planner, that differ in this round
     stages: tuple[Stage, ...] = ()  # before it, from easy to hard
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_kind("solver", self.solver, LbfgsConfig)
 
 
 class Problem(Protocol):

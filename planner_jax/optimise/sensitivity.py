@@ -22,6 +22,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
+from planner_jax.checks import numeric, require_size, told
 from planner_jax.lanes import with_kernel
 from planner_jax.optimise.inverse_kernel import inverse_kernel
 from planner_jax.optimise.planner import OptimisedPlanner, pending
@@ -101,11 +102,12 @@ class Differentiated(OptimisedPlanner):
     curvature: str = struct.field(pytree_node=False, default="core")
 
     def __post_init__(self) -> None:
-        if self.curvature not in _CURVATURES:
+        if not isinstance(self.curvature, str) or self.curvature not in _CURVATURES:
             known = ", ".join(_CURVATURES)
             raise ValueError(f"curvature must be one of {known}, got {self.curvature!r}")
-        if self.steps < 0:
-            raise ValueError(f"steps must be >= 0, got {self.steps}")
+        require_size("steps", self.steps, 0)
+        if not callable(self.quantity) and not isinstance(self.quantity, str):
+            raise TypeError(f"of must be a name or a function of a plan, got {told(self.quantity)}")
         if not self.by:
             raise ValueError("by must name something in the case, got nothing")
 
@@ -198,6 +200,8 @@ def gradient_at(
     def value_of(x: Array, smooth: list) -> Array:
         plan = planner.decode(x, context_of(smooth))
         value = number(plan.replace(cost=cost(x, smooth)))
+        if numeric(value) is None:
+            raise TypeError(f"of must be one number, got {told(value)}")
         if value.shape:
             raise ValueError(f"of must be one number, got shape {value.shape}")
         return value
@@ -354,6 +358,8 @@ def part_of(tree: Any, name: str) -> Any:
 
 
 def _found(tree: Any, name: str, argument: str) -> Any:
+    if not isinstance(name, str):
+        raise TypeError(f"{argument} must be a name or some, got {told(name)}")
     part = tree
     for field in name.split("."):
         known = _members(part)

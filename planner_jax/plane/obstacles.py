@@ -8,6 +8,8 @@ import numpy as np
 from flax import struct
 from jax import Array
 
+from planner_jax.checks import floating, numeric, require_size, told
+
 
 @struct.dataclass
 class Obstacles:
@@ -44,20 +46,30 @@ def obstacles(
         dtype: of every floating leaf.
 
     Raises:
+        TypeError: an argument is of another kind.
         ValueError: a polygon is empty or not convex, or there are more than there is room for;
             one line that says which, and for one that is not convex what parts would do.
     """
+    dtype = floating(dtype)
+    if isinstance(polygons, str) or not isinstance(polygons, Sequence | np.ndarray):
+        raise TypeError(f"polygons must be a sequence of corners (V, 2), got {told(polygons)}")
     checked = [_checked(k, corners) for k, corners in enumerate(polygons)]
     most = max((len(each) for each in checked), default=3)
-    num, size = room or (max(len(checked), 1), most)
+    num, size = _room(room) or (max(len(checked), 1), most)
     if len(checked) > num or most > size:
         raise ValueError(
             f"polygons must be at most {num} of at most {size} corners, got {len(checked)} of "
             f"up to {most}: give more room"
         )
-    speeds = np.broadcast_to(np.asarray(velocities, float), (len(checked), 2))
-    if not np.isfinite(speeds).all():
-        raise ValueError(f"velocities must be finite, got {velocities}")
+    given = numeric(velocities)
+    if given is None:
+        raise TypeError(f"velocities must be numbers, got {told(velocities)}")
+    if given.shape not in ((), (2,), (len(checked), 2)):
+        rule = f"the shape (2,) or ({len(checked)}, 2)"
+        raise ValueError(f"velocities must have {rule}, got {given.shape}")
+    if not np.isfinite(given).all():
+        raise ValueError(f"velocities must be finite, got {told(velocities)}")
+    speeds = np.broadcast_to(np.asarray(given, float), (len(checked), 2))
     centre, velocity = np.zeros((num, 2)), np.zeros((num, 2))
     corners = np.zeros((num, size, 2))
     for k, polygon in enumerate(checked):
@@ -71,8 +83,21 @@ def obstacles(
     )
 
 
+def _room(given: Any) -> tuple[int, int] | None:
+    """How many obstacles and corners arrays hold; raises unless these are two sizes, or None."""
+    if given is None:
+        return None
+    if not isinstance(given, tuple | list) or len(given) != 2:
+        raise TypeError(f"room must be two whole numbers, got {told(given)}")
+    for value in given:
+        require_size("room", value)
+    return given[0], given[1]
+
+
 def _checked(k: int, corners: Any) -> np.ndarray:
-    """Corners counter-clockwise; raises `ValueError` unless they are those of a convex polygon."""
+    """Corners counter-clockwise; raises unless they are those of a convex polygon."""
+    if numeric(corners) is None:
+        raise TypeError(f"polygon {k} must have corners of numbers, got {told(corners)}")
     polygon = np.asarray(corners, float)
     if polygon.ndim != 2 or polygon.shape[1:] != (2,) or len(polygon) < 3:
         raise ValueError(f"polygon {k} must have corners (V, 2), V >= 3, got {polygon.shape}")

@@ -7,10 +7,11 @@ from typing import Any, Generic, TypeVar
 from flax import struct
 from jax import Array
 
+from planner_jax.checks import require_kind, told
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.sensitivity import Differentiated, Quantity, part_of
 from planner_jax.planning.decided import DecidedPlanner
-from planner_jax.planning.plan import plan
+from planner_jax.planning.plan import plan, require_fit
 from planner_jax.protocol import Plan
 
 PlanT = TypeVar("PlanT", bound=Plan)
@@ -69,9 +70,15 @@ def gradient(
         devices: as for `plan`.
 
     Raises:
-        TypeError: the planner does not minimise.
+        TypeError: the planner does not minimise, the cases are of another task, or an argument is
+            of another kind.
         ValueError: a name is not of the plan or the case, `steps` < 0, or `curvature` is unknown.
     """
+    require_fit(planner, cases)
+    if not isinstance(by, str | Sequence):
+        raise TypeError(f"by must be a name or some, got {told(by)}")
+    if solver is not None:
+        require_kind("solver", solver, LbfgsConfig)
     by = (by,) if isinstance(by, str) else tuple(by)
     for name in by:
         part_of(cases, name)

@@ -74,7 +74,7 @@ def _program(
     def unpacked(kept: list[Any], vector: jax.Array) -> Any:
         pieces = jnp.split(vector, ends[:-1])
         shaped = [
-            piece.reshape(shape).astype(kind)
+            piece.reshape(shape).astype(jax.dtypes.canonicalize_dtype(kind))
             for piece, (shape, kind) in zip(pieces, layout, strict=True)
         ]
         given = jax.tree.unflatten(own_tree, kept)

@@ -11,10 +11,11 @@ from jax import lax
 from jax.core import Tracer
 from jax.experimental import multihost_utils
 
+from planner_jax.checks import require_size
 from planner_jax.planning.batch import better_of, plan_batch, plan_on_host, solve_cases
 from planner_jax.planning.single import plan_single
 from planner_jax.protocol import AnyPlanner, Attempt, Case, Plan, Status, is_unsolved
-from planner_jax.rules import require_sound
+from planner_jax.rules import require_shapes, require_sound
 
 CaseT = TypeVar("CaseT", bound=Case)
 PlanT = TypeVar("PlanT", bound=Plan)
@@ -57,7 +58,7 @@ def plan(
     """
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((planner, cases))):
         return solve(planner, cases)
-    _require_fit(planner, cases)
+    require_fit(planner, cases)
     if chunk is not None or devices is not None:
         _require_layout(chunk, devices)
     _require_own_precision(cases)
@@ -94,10 +95,7 @@ def _named_if_bad(plan: PlanT, case: Any) -> PlanT:
 def _require_layout(chunk: Any, devices: Any) -> None:
     """Raise unless a chunk is a number of cases, and devices are some that differ."""
     if chunk is not None:
-        if isinstance(chunk, bool) or not isinstance(chunk, int | np.integer):
-            raise TypeError(f"chunk must be a whole number, got {chunk!r:.60}")
-        if chunk < 1:
-            raise ValueError(f"chunk must be >= 1, got {chunk}")
+        require_size("chunk", chunk)
     if devices is not None:
         if not isinstance(devices, Sequence | np.ndarray) or not all(
             isinstance(device, jax.Device) for device in devices
@@ -167,8 +165,9 @@ def solve(planner: AnyPlanner[CaseT, PlanT], cases: CaseT) -> PlanT:
         TypeError: the planner works on the host, or the result is differentiated: the way of a
             solver is no derivative of the optimum.
     """
-    _require_fit(planner, cases)
+    require_fit(planner, cases)
     _require_pure(planner)
+    require_shapes(cases)
     if cases.batch_shape == () and hasattr(planner, "plan_by"):
         plans = solve(planner, jax.tree.map(lambda leaf: leaf[None], cases))
         return jax.tree.map(lambda leaf: leaf[0], plans)
@@ -223,12 +222,9 @@ def _require_pure(planner: Any) -> None:
         )
 
 
-def _require_fit(planner: Any, cases: Any) -> None:
+def require_fit(planner: Any, cases: Any) -> None:
     """Raise `TypeError` unless the planner is one, a pytree, and the cases are of its class."""
-    if not any(hasattr(planner, way) for way in ("solve", "solve_on_host", "plan_by")):
-        raise TypeError(
-            f"planner must be one, such as pj.hit.planner(), got a {type(planner).__name__}"
-        )
+    require_planner(planner)
     if jax.tree_util.all_leaves([planner]) and not hasattr(planner, "solve_on_host"):
         raise TypeError(
             f"{type(planner).__name__} must be a pytree: put @jax.tree_util.register_static over "
@@ -244,6 +240,14 @@ def _require_fit(planner: Any, cases: Any) -> None:
         raise TypeError(f"cases must be a case or a batch, got a {type(cases).__name__}")
     if not getattr(planner, "attempts", True):
         raise ValueError(f"{type(planner).__name__} must have at least one attempt, got none")
+
+
+def require_planner(planner: Any) -> None:
+    """Raise `TypeError` unless the planner is one."""
+    is_class, ways = isinstance(planner, type), ("solve", "solve_on_host", "plan_by")
+    if is_class or not any(hasattr(planner, way) for way in ways):
+        found = f"the class {planner.__name__}" if is_class else f"a {type(planner).__name__}"
+        raise TypeError(f"planner must be one, such as pj.hit.planner(), got {found}")
 
 
 def require_batch(cases: Case) -> int:
@@ -274,6 +278,7 @@ def plan_across_processes(
     Raises:
         ValueError: as for `plan`, or the batch has fewer cases than there are processes.
     """
+    require_fit(planner, cases)
     num = require_batch(cases)
     processes, mine = jax.process_count(), jax.process_index()
     if num < processes:

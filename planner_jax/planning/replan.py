@@ -7,7 +7,8 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.planning.plan import plan
+from planner_jax.checks import numbers_of, require_kind, told
+from planner_jax.planning.plan import plan, require_planner
 from planner_jax.protocol import Case, Plan
 
 CaseT = TypeVar("CaseT", bound=Case)
@@ -36,19 +37,39 @@ def moment_of(cases: Case, elapsed: Any) -> np.ndarray:
         elapsed: () or (B,) [s], since the plans began, >= 0.
 
     Raises:
-        ValueError: a negative time.
+        TypeError: it is no time.
+        ValueError: it is negative or not finite, or of another shape.
     """
     dtypes = (np.asarray(leaf).dtype for leaf in jax.tree.leaves(cases))
     dtype = next(dtype for dtype in dtypes if np.issubdtype(dtype, np.floating))
-    elapsed = np.broadcast_to(np.asarray(elapsed, dtype), cases.batch_shape)
+    elapsed = numbers_of("elapsed", elapsed, cases.batch_shape, ()).astype(dtype)
     if not np.all(elapsed >= 0.0):
         raise ValueError(f"elapsed must be >= 0, got {np.min(elapsed)}")
+    if not np.all(elapsed < np.inf):
+        raise ValueError(f"elapsed must be finite, got {np.max(elapsed)}")
     return elapsed
 
 
-def given_or_own(given: Any, own: Any, dtype: Any) -> np.ndarray:
-    """What is known of a state, in the shape of a plan's own, which counts where it is None."""
-    return np.broadcast_to(np.asarray(own if given is None else given, dtype), np.shape(own))
+def given_or_own(name: str, given: Any, own: Any, elapsed: np.ndarray) -> np.ndarray:
+    """What is known of a state, in the shape of a plan's own.
+
+    Args:
+        name: of the argument, for messages.
+        given: one state, or one a case; the plan's own counts where it is None.
+        own: one a case, or one state of one case.
+        elapsed: as of `moment_of`, in whose type of numbers it is.
+
+    Raises:
+        TypeError: no numbers.
+        ValueError: another shape, or not finite.
+    """
+    if given is None:
+        return np.asarray(own, elapsed.dtype)
+    batch = elapsed.shape
+    found = numbers_of(name, given, batch, np.shape(own)[len(batch) :]).astype(elapsed.dtype)
+    if not np.isfinite(found).all():
+        raise ValueError(f"{name} must be finite, got {told(given)}")
+    return found
 
 
 def replan(planner: Any, cases: Any, previous: PlanT, elapsed: Any, **news: Any) -> PlanT:
@@ -69,10 +90,21 @@ def replan(planner: Any, cases: Any, previous: PlanT, elapsed: Any, **news: Any)
         The plans; their times count from now.
 
     Raises:
-        TypeError: the planner has no re-planner, or the news are of another task.
-        ValueError: `elapsed` is negative.
+        TypeError: the planner has no re-planner, or cases, plans or news are of another task.
+        ValueError: `elapsed` is negative, or plans or news are not one for each case.
     """
+    require_planner(planner)
     again = planner.replanner() if hasattr(planner, "replanner") else planner
     if not hasattr(again, "begin"):
-        raise TypeError(f"{type(again).__name__} cannot plan again: use the planner exact")
+        raise TypeError(
+            f"{type(again).__name__} cannot plan again: use hits' and catches' exact, intercepts' "
+            "spacetime, or ReplanBlock"
+        )
+    require_kind("cases", cases, getattr(getattr(again, "planner", None), "case_type", object))
+    require_kind("previous", previous, getattr(again, "plan_type", Plan))
+    if np.shape(previous.status) != cases.batch_shape:
+        raise ValueError(
+            f"previous must have the batch shape of the cases, {cases.batch_shape}, got "
+            f"{np.shape(previous.status)}"
+        )
     return plan(again, again.begin(cases, previous, elapsed, **news))

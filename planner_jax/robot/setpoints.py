@@ -7,6 +7,8 @@ import jax
 import numpy as np
 from jax import Array
 
+from planner_jax.checks import require_number
+
 _MOST = 10**8  # setpoints of a batch
 
 
@@ -33,10 +35,7 @@ def sampled_at_rate(
         TypeError: the rate is no number.
         ValueError: the rate is not positive, or there would be more than 1e8 setpoints.
     """
-    if isinstance(rate, str) or np.ndim(rate) != 0:
-        raise TypeError(f"rate must be a number, got {rate!r:.60}")
-    if not 0.0 < rate < np.inf:
-        raise ValueError(f"rate must be finite and > 0, got {rate}")
+    require_number("rate", rate, "finite and > 0", lambda x: x > 0.0)
     leaves, ends = jax.tree.map(np.asarray, (leaves, ends))
     is_one = ends.ndim == 0
     if is_one:

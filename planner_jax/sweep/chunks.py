@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from planner_jax import stopping
 from planner_jax.sweep.columns import RefereedBatch, rows_of
-from planner_jax.sweep.parts import Parts
+from planner_jax.sweep.parts import Part, Parts
 from planner_jax.sweep.run_folder import RunFolder
 from planner_jax.sweep.source import Chunk, Source
 from planner_jax.sweep.summary import percent
@@ -99,14 +99,15 @@ def plan_chunks(run: SweepRun, *, progress: bool) -> dict[str, Any]:
         Entries for the manifest: `summary`, `times`, and `example`, a case worth a figure.
     """
     source, folder = run.source, run.folder
-    records = run.parts.sound()
+    there = run.parts.sound()
+    records = {number: part.record for number, part in there.items()}
     done, successes = (sum(each[name] for each in records.values()) for name in _COUNTED)
     if progress:
-        print(f"Writing {folder.path}; the first chunk compiles.", file=sys.stderr)
+        print(f"Writing {folder.shown}; the first chunk compiles.", file=sys.stderr)
     look: dict[str, Any] = {"unit": " plans", "desc": source.settings.planner}
     tally = run.sweep.tally(source.settings)
     with tqdm(total=source.num, initial=done, disable=not progress, **look) as bar:
-        for chunk, rows, record in _in_pipeline(run, set(records)):
+        for chunk, rows, record in _in_pipeline(run, there):
             tally.add(rows)
             if record is None:  # there already
                 continue
@@ -122,7 +123,7 @@ def plan_chunks(run: SweepRun, *, progress: bool) -> dict[str, Any]:
 
 
 def _in_pipeline(
-    run: SweepRun, there: set[int]
+    run: SweepRun, there: dict[int, Part]
 ) -> Iterator[tuple[int, pa.Table, dict[str, Any] | None]]:
     """Number and rows of every chunk in order, and the record of those that had no part.
 
@@ -131,7 +132,7 @@ def _in_pipeline(
 
     Args:
         run: the sweep.
-        there: numbers of the chunks that have a part.
+        there: the parts that there are, by the numbers of their chunks.
     """
     folder, source, watch = run.folder, run.source, Stopwatch()
     pending: deque[Future] = deque()
@@ -162,7 +163,7 @@ def _in_pipeline(
             for chunk in range(source.num_chunks):
                 stopping.check()
                 if chunk in there:
-                    made = judge.submit(lambda k=chunk: (run.parts.read(k), None)).result
+                    made = judge.submit(lambda part=there[chunk]: (part.read(), None)).result
                 else:
                     made = next(making)
                 pending.append(writer.submit(write, chunk, made))

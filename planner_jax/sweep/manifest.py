@@ -101,33 +101,35 @@ def to_write(entries: Mapping[str, Any]) -> dict[str, Any]:
     return sealed({"format": FORMAT, **entries})
 
 
-def read_manifest(path: Path, name: str) -> dict[str, Any]:
+def read_manifest(path: Path, name: str, folder: str) -> dict[str, Any]:
     """The manifest of a run.
 
     Args:
         path: of the file `manifest.json`.
         name: of the caller's argument that holds the folder, for messages.
+        folder: as the caller has it, likewise.
 
     Raises:
         SettingError: there is none, it is of another format, or it is not as it was written.
     """
-    manifest = read_sealed(path, name, "a run")
-    _require_sound(manifest, name, f"{path.name} of {str(path.parent)!r}")
+    manifest = read_sealed(path, name, "a run", folder)
+    _require_sound(manifest, name, f"{path.name} of {folder!r}")
     return manifest
 
 
-def read_sealed(path: Path, name: str, what: str) -> dict[str, Any]:
+def read_sealed(path: Path, name: str, what: str, folder: str | None = None) -> dict[str, Any]:
     """The entries of a file of a folder, as `to_write` has them.
 
     Args:
         path: of the file.
         name: of the caller's argument that holds the folder, for messages.
         what: the folder is of, in words.
+        folder: as the caller has it, where that is not the path of the file's own.
 
     Raises:
         SettingError: there is none, it is of another format, or it is not as it was written.
     """
-    shown = repr(str(path.parent))
+    shown = repr(str(path.parent) if folder is None else folder)
     try:
         entries = read_object(path)
     except (OSError, JsonError) as error:

@@ -44,7 +44,7 @@ def owned(folder: Path, name: str) -> Iterator[None]:
 def require_free(folder: Path, name: str) -> None:
     """Raise `SettingError` if a process owns a folder; writes nothing."""
     try:
-        handle = os.open(folder / LOCK, os.O_RDONLY)
+        handle = os.open(folder / LOCK, os.O_RDONLY | os.O_NONBLOCK)  # it may be a pipe
     except OSError:
         return
     try:

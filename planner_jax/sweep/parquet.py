@@ -8,6 +8,8 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from planner_jax.plain_files import open_plain
+
 ROW_GROUP = 2048  # rows, some 3 MB: little has to be read for one of them
 _BLOCK = 1 << 20  # bytes
 
@@ -36,7 +38,7 @@ def file_sum(path: Path) -> dict[str, int]:
         OSError: it cannot be read.
     """
     size, found = 0, 0
-    with path.open("rb") as file:
+    with open_plain(path) as file:
         while block := file.read(_BLOCK):
             size, found = size + len(block), zlib.crc32(block, found)
     return {"bytes": size, "crc32": found}
@@ -48,6 +50,8 @@ def opened(source: Any) -> pq.ParquetFile:
     Raises:
         pa.ArrowException, OSError: it cannot be read.
     """
+    if isinstance(source, Path):
+        open_plain(source).close()
     return pq.ParquetFile(source, page_checksum_verification=True)
 
 

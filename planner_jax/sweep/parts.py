@@ -15,13 +15,17 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from planner_jax.plain_files import open_plain
 from planner_jax.sweep.manifest import FORMAT, is_count, is_number
 from planner_jax.sweep.parquet import ROW_GROUP, encoding, opened
 from planner_jax.sweep.plain_json import JsonError, parse_object
+from planner_jax.sweep.run_folder import RunFolder
+from planner_jax.sweep.settings import SettingError
 from planner_jax.sweep.source import Source
 from planner_jax.whole_files import replacing
 
 _RECORD = b"part"
+_DIGITS = 12  # of a part's number, at most
 _SECONDS = ("plan_seconds", "compile_seconds", "referee_seconds", "wall_seconds")
 
 
@@ -30,18 +34,38 @@ class PartError(ValueError):
 
 
 @dataclasses.dataclass(frozen=True)
+class Part:
+    """A part that is sound."""
+
+    path: Path
+    record: dict[str, Any]  # how its rows came about
+
+    def read(self) -> pa.Table:
+        """Its rows."""
+        with opened(self.path) as file:
+            rows = file.read()
+        kept = {key: value for key, value in rows.schema.metadata.items() if key != _RECORD}
+        return rows.replace_schema_metadata(kept)
+
+
+@dataclasses.dataclass(frozen=True)
 class Parts:
     """The parts of one run.
 
     Args:
-        folder: that holds them, which need not exist.
+        run: folder of the run, in whose `parts` they lie.
         identity: of the run, as its manifest has it: `run`, `settings` and `code`.
         source: of the cases.
     """
 
-    folder: Path
+    run: RunFolder
     identity: dict[str, str]
     source: Source
+
+    @property
+    def folder(self) -> Path:
+        """Where they lie; it need not exist."""
+        return self.run.parts
 
     def write(self, number: int, rows: pa.Table, record: dict[str, Any]) -> dict[str, Any]:
         """Write the rows of a chunk; gives the record of how they came about as it is kept."""
@@ -57,31 +81,38 @@ class Parts:
         name = f"part-{number:06d}-{zlib.crc32(content):08x}.parquet"
         with replacing(self.folder / name) as scratch:
             scratch.write_bytes(content)
+        self.run.sent(self.folder / name)
         return record
 
-    def sound(self) -> dict[int, dict[str, Any]]:
-        """The records of the parts that are there, by their numbers; removes what is none."""
-        found: dict[int, dict[str, Any]] = {}
+    def sound(self) -> dict[int, Part]:
+        """The parts that are there, by their numbers; removes what is none.
+
+        The folder is looked through once, whatever parts there could be.
+        """
+        found: dict[int, Part] = {}
         for path in sorted(self.folder.iterdir()) if self.folder.is_dir() else ():
             try:
                 number, record = self._record(path)
                 if number in found:
                     raise PartError("is there twice")
-                found[number] = record
+                found[number] = Part(path, record)
             except (PartError, JsonError) as error:
                 print(
                     f"planner-jax: {path} {error}; what it held is planned again", file=sys.stderr
                 )
-                path.unlink()
+                self.run.dropped(path)
         return found
 
-    def read(self, number: int) -> pa.Table:
-        """The rows of a part that is sound."""
-        (path,) = self.folder.glob(f"part-{number:06d}-*.parquet")
-        with opened(path) as file:
-            rows = file.read()
-        kept = {key: value for key, value in rows.schema.metadata.items() if key != _RECORD}
-        return rows.replace_schema_metadata(kept)
+    def require_plain(self, name: str) -> None:
+        """Raise `SettingError` if a pipe, a device or a folder stands in the place of a part.
+
+        Args:
+            name: of the caller's argument that holds the run's folder, for the message.
+        """
+        for path in sorted(self.folder.iterdir()) if self.folder.is_dir() else ():
+            if not path.is_file():
+                rule = "a run whose parts are plain files"
+                raise SettingError(f"{name} must be {rule}, got {str(path)!r}, which is none")
 
     def _own(self, number: int) -> dict[str, Any]:
         """What a part must say of itself."""
@@ -97,9 +128,13 @@ class Parts:
         """
         word, _, rest = path.stem.partition("-")
         number, _, known = rest.partition("-")
-        if word != "part" or not number.isdecimal() or path.suffix != ".parquet":
+        counts = number.isascii() and number.isdecimal() and len(number) <= _DIGITS
+        if word != "part" or not counts or path.suffix != ".parquet":
             raise PartError("is no part of a sweep")
-        content = path.read_bytes()
+        if int(number) >= self.source.num_chunks:
+            raise PartError(f"is beyond the {self.source.num_chunks} parts of the run")
+        with open_plain(path) as file:
+            content = file.read()
         if f"{zlib.crc32(content):08x}" != known:
             raise PartError("is damaged: its checksum is not that of its name")
         try:

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from planner_jax.plain_files import open_plain
+
 DIGEST = "digest"  # the entry that says what the others were when they were written
 _LARGEST = 1 << 26  # bytes
 
@@ -19,9 +21,9 @@ def read_object(path: Path) -> dict[str, Any]:
 
     Raises:
         JsonError: there is none; not JSON, or too large.
-        OSError: there is no such file, or it cannot be read.
+        OSError: there is no such file, it is no plain one, or it cannot be read.
     """
-    with path.open("rb") as file:
+    with open_plain(path) as file:
         text = file.read(_LARGEST + 1)
     if len(text) > _LARGEST:
         raise JsonError(f"is larger than {_LARGEST} bytes")

@@ -58,7 +58,7 @@ def require_sound(folder: RunFolder) -> None:
     manifest = folder.read_manifest()
     sweep = sweep_of_run(manifest, folder.name)
     folder.require_finished(manifest)
-    again = f"planner-jax {sweep.kind} --resume --out {shlex.quote(str(folder.path))}"
+    again = f"planner-jax {sweep.kind} --resume --out {shlex.quote(folder.shown)}"
     remedy = f"make it anew: {again}"
     folder.require_whole(manifest, remedy)
     kind = settings_of(sweep.task)
@@ -85,7 +85,7 @@ def require_counted(folder: RunFolder, told: dict[str, Any], counted: dict[str, 
         if not _agree(told.get(name), value):
             rule = f"a run whose {name} is that of its rows, {value}"
             raise SettingError(
-                f"{folder.name} must be {rule}, got {told.get(name)} in {str(folder.path)!r}"
+                f"{folder.name} must be {rule}, got {told.get(name)} in {folder.shown!r}"
             )
 
 
@@ -137,7 +137,9 @@ def draw_comparisons(folder: RunFolder) -> None:
 
 def _draw(rows: RunRows, figures: Sequence[RunFigure]) -> None:
     for figure in figures:
-        draw(rows.folder.figures / figure.name, figure.draw, figure.size, rows)
+        path = rows.folder.figures / figure.name
+        draw(path, figure.draw, figure.size, rows)
+        rows.folder.sent(path)
 
 
 def _failed_rows(folder: RunFolder) -> list[dict[str, Any]]:

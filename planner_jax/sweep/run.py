@@ -33,6 +33,7 @@ from planner_jax.sweep.settings import (
     settings_to_resume,
 )
 from planner_jax.sweep.source import Source
+from planner_jax.sweep.stored_run import run_folder
 from planner_jax.sweep.sweep import Sweep, settings_of, sweep_of
 
 
@@ -53,7 +54,7 @@ def start_sweep(
     Args:
         task: that is swept.
         settings: of the sweep, of the task's class.
-        out: folder, new or empty.
+        out: folder, new or empty; or an address s3://BUCKET/PATH below which nothing lies.
         progress: show a bar on the standard error stream.
         workers: "ray", to have the chunks made by a Ray cluster; decides no row.
 
@@ -64,8 +65,9 @@ def start_sweep(
         SettingError: an argument or a case breaks a rule; nothing is left behind.
         SweepInterrupted: on Ctrl-C; the folder can be resumed.
         WorkersFailed: workers could not make a chunk; the folder can be resumed.
+        OSError: the disk or the store fails; the folder can be resumed.
     """
-    folder = RunFolder(out)
+    folder = run_folder(out)
     folder.require_new()
     sweep, settings = sweep_of(task), settings.of(task)
     with workers_of(workers) as others:
@@ -75,7 +77,7 @@ def start_sweep(
         sweep.require_fit(source.settings, planner, cases)
         session, description = begun_now(), source.description()
         identity = identity_of(source, description, session)
-        parts = Parts(folder.parts, identity, source)
+        parts = Parts(folder, identity, source)
         manifest = {
             "kind": sweep.kind,
             "state": "running",
@@ -120,7 +122,7 @@ def resume_sweep(
         SweepInterrupted: on Ctrl-C; the folder can be resumed.
         WorkersFailed: workers could not make a chunk; the folder can be resumed.
     """
-    folder, sweep = RunFolder(out), sweep_of(task)
+    folder, sweep = run_folder(out), sweep_of(task)
     _settings_of_run(folder, sweep, task, given)
     with workers_of(workers) as others, folder.resumed():
         manifest, settings = _settings_of_run(folder, sweep, task, given)
@@ -136,13 +138,14 @@ def resume_sweep(
                 raise SettingError(f"{entry} must be the same as when the run began")
         if manifest["settings"] != settings_digest(source, description):
             raise SettingError("out must be resumed with the files that its settings named then")
+        parts = Parts(folder, {name: manifest[name] for name in IDENTITY}, source)
+        parts.require_plain(folder.name)
         for name, why in damages.items():
-            print(f"planner-jax: {folder.path / name} is {why}; it is made anew", file=sys.stderr)
+            print(f"planner-jax: {folder.shown}/{name} is {why}; it is made anew", file=sys.stderr)
         if folder.plans.name in damages:  # the parts are gone since there was a summary
             manifest = {name: value for name, value in manifest.items() if name not in _FOUND}
         sessions = [*manifest["sessions"], _with_workers(session, workers)]
         folder.write_manifest({**manifest, "state": "running", "sessions": sessions})
-        parts = Parts(folder.parts, {name: manifest[name] for name in IDENTITY}, source)
         planner = sweep.planner(settings)
         return _finish(SweepRun(sweep, source, planner, folder, parts, others), progress)
 
@@ -185,7 +188,7 @@ def _finish(run: SweepRun, progress: bool) -> dict[str, Any]:
         return _end(folder, "complete")
     except KeyboardInterrupt:
         _end(folder, "interrupted")
-        raise SweepInterrupted(str(folder.path)) from None
+        raise SweepInterrupted(folder.shown) from None
     except WorkersFailed:
         _end(folder, "interrupted")
         raise
@@ -220,7 +223,7 @@ def _add_baselines(run: SweepRun, progress: bool) -> None:
     """Plan one case with the other planners too, and show them beside the run's plan."""
     others = run.sweep.other_planners(run.source.settings)
     if progress and others:
-        page = run.folder.path / PAGE
+        page = f"{run.folder.shown}/{PAGE}"
         print(f"First figures: {page}. Now one case with the other planners.", file=sys.stderr)
     if others:
         example = run.folder.read_manifest()["example"]

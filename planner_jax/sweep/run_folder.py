@@ -21,7 +21,7 @@ from planner_jax.sweep.parquet import ROW_GROUP, encoding, file_sum
 from planner_jax.sweep.settings import SettingError
 from planner_jax.whole_files import is_scratch, replacing
 
-_MANIFEST = "manifest.json"
+MANIFEST = "manifest.json"
 
 
 class RunFolder:
@@ -35,11 +35,12 @@ class RunFolder:
     def __init__(self, path: str | os.PathLike, name: str = "out"):
         self.name = name
         self.path = Path(path)
+        self.shown = str(path)  # in messages
         self.plans = self.path / "plans.parquet"
         self.baselines = self.path / "baselines.parquet"
         self.figures = self.path / "figures"
         self.parts = self.path / "parts"
-        self._manifest = self.path / _MANIFEST
+        self._manifest = self.path / MANIFEST
         self._made: list[Path] = []
         self._sums: dict[str, dict[str, int]] = {}  # of files written since the manifest was
 
@@ -51,7 +52,7 @@ class RunFolder:
                 rule = "a new or empty folder"
                 if self._manifest.exists():
                     rule += ", or that of a run with resume"
-                raise SettingError(f"{self.name} must be {rule}, got {str(self.path)!r}")
+                raise SettingError(f"{self.name} must be {rule}, got {self.shown!r}")
             ancestor = next(p for p in [self.path, *self.path.absolute().parents] if p.exists())
         except OSError as error:  # such as a name that is too long
             raise SettingError(f"{self._unwritable()} ({error.strerror})") from None
@@ -71,10 +72,10 @@ class RunFolder:
         except OSError as error:
             self._remove_made()
             raise SettingError(f"{self._unwritable()} ({error.strerror})") from None
-        with owned(self.path, self.name):
+        with self._owned():
             if not all(map(_is_left, self.path.iterdir())):  # another process was quicker
                 rule = "a new or empty folder"
-                raise SettingError(f"{self.name} must be {rule}, got {str(self.path)!r}")
+                raise SettingError(f"{self.name} must be {rule}, got {self.shown!r}")
             self._remove_left()
             try:
                 self.write_manifest(manifest)
@@ -104,12 +105,23 @@ class RunFolder:
         Raises:
             SettingError: another process does, or it cannot be written.
         """
-        with owned(self.path, self.name):
+        with self._owned():
             self._remove_left()
             yield
 
+    def sent(self, path: Path) -> None:
+        """What is done once a file of the folder is whole; here nothing."""
+
+    def dropped(self, path: Path) -> None:
+        """Remove a file of the folder."""
+        path.unlink(missing_ok=True)
+
+    def _owned(self) -> contextlib.AbstractContextManager[None]:
+        """Owns the folder for the length of a block."""
+        return owned(self.path, self.name)
+
     def _unwritable(self) -> str:
-        return f"{self.name} must be a folder that can be written, got {str(self.path)!r}"
+        return f"{self.name} must be a folder that can be written, got {self.shown!r}"
 
     def discard(self) -> None:
         """Remove all that was written since `created`, and the folders made for it."""
@@ -140,12 +152,12 @@ class RunFolder:
         Raises:
             SettingError: the folder is not that of a run, or its manifest is not sound.
         """
-        return manifests.read_manifest(self._manifest, self.name)
+        return manifests.read_manifest(self._manifest, self.name, self.shown)
 
     def write_manifest(self, manifest: dict[str, Any]) -> dict[str, Any]:
         """Put a manifest, with the sums of files, in the place of the old one; as it is written."""
         whole = self.with_sums(manifest)
-        self.write_text(_MANIFEST, json.dumps(whole, indent=2, allow_nan=False) + "\n")
+        self.write_text(MANIFEST, json.dumps(whole, indent=2, allow_nan=False) + "\n")
         return whole
 
     def with_sums(self, manifest: dict[str, Any]) -> dict[str, Any]:
@@ -157,6 +169,7 @@ class RunFolder:
         """Write a file of the folder whole."""
         with replacing(self.path / name) as scratch:
             scratch.write_text(text, encoding="utf-8")
+        self.sent(self.path / name)
 
     def damages(self, manifest: dict[str, Any]) -> dict[str, str]:
         """What is wrong with the files whose sums a manifest holds: words by file, if any."""
@@ -186,7 +199,7 @@ class RunFolder:
         """
         for name, why in self.damages(manifest).items():
             rule = f"a run whose {name} is whole"
-            shown = f"{str(self.path)!r}, where it is {why}; {remedy}"
+            shown = f"{self.shown!r}, where it is {why}; {remedy}"
             raise SettingError(f"{self.name} must be {rule}, got {shown}")
 
     @contextlib.contextmanager
@@ -210,6 +223,7 @@ class RunFolder:
                 if writer is not None:
                     writer.close()
             self._sums[self.plans.name] = file_sum(scratch)
+        self.sent(self.plans)
 
     def remove_parts(self) -> None:
         """Drop what `joining_parts` has joined."""
@@ -220,6 +234,7 @@ class RunFolder:
         with replacing(path) as scratch:
             pq.write_table(rows, scratch, row_group_size=ROW_GROUP, **encoding(rows.schema))
             self._sums[path.name] = file_sum(scratch)
+        self.sent(path)
 
 
 def _is_left(path: Path) -> bool:

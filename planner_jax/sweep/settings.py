@@ -6,6 +6,7 @@ JAX.
 
 import dataclasses
 import os
+import tempfile
 from collections.abc import Iterable
 from typing import Any, ClassVar, Self, TypeVar
 
@@ -13,8 +14,14 @@ from planner_jax.memory import require_disk
 from planner_jax.registry import Task, UnknownName, require_name
 from planner_jax.task.scales import scale_problem
 
+SCHEME = "s3://"  # of addresses in object stores
 AnySettings = TypeVar("AnySettings", bound="SweepSettings")
 KnownSettings = TypeVar("KnownSettings")
+
+
+def is_address(out: Any) -> bool:
+    """Whether an argument for a folder names one in an object store."""
+    return isinstance(out, str) and out.startswith(SCHEME)
 
 
 class SettingError(ValueError):
@@ -95,6 +102,8 @@ class SweepSettings:
         Args:
             out: of the run.
         """
+        if is_address(out):
+            out = tempfile.gettempdir()  # where the files are made
         try:
             require_disk("num", self.num or self.DEFAULT_NUM, self.ROW_BYTES, out)
         except ValueError as error:

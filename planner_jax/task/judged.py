@@ -1,11 +1,13 @@
 """The way from cases and plans of any kind of arrays to a referee, which takes NumPy batches."""
 
+import inspect
 from collections.abc import Callable
 from typing import Any, TypeVar
 
 import jax
 import numpy as np
 
+from planner_jax.checks import numeric, require_number, require_size, require_switch, told
 from planner_jax.protocol import Case, Plan, lane
 
 VerdictT = TypeVar("VerdictT")
@@ -28,19 +30,45 @@ def judged(
         settings: keyword arguments of the referee.
 
     Raises:
-        TypeError: cases or plans are of another class.
-        ValueError: as the referee says.
+        TypeError: cases or plans are of another class, or a setting is none of the referee's or
+            of another kind.
+        ValueError: shapes that do not fit, or as the referee says.
     """
     for name, tree, kind in zip(("cases", "plans"), (cases, plans), kinds, strict=True):
         if not isinstance(tree, kind):
             raise TypeError(f"{name} must be a {kind.__name__}, got a {type(tree).__name__}")
-    tolerance = settings.get("tolerance", 0.0)
-    if isinstance(tolerance, str) or np.ndim(tolerance) != 0:
-        raise TypeError(f"tolerance must be a number, got {tolerance!r:.60}")
-    if not 0.0 <= tolerance < np.inf:
-        raise ValueError(f"tolerance must be finite and >= 0, got {tolerance}")
+    require_settings(referee, settings)
+    for leaf in jax.tree.leaves((cases, plans)):
+        if numeric(leaf) is None:
+            raise TypeError(f"cases and plans must hold numbers, got {told(leaf)}")
+    num = np.shape(plans.status)
+    if num != cases.batch_shape:
+        raise ValueError(
+            f"plans must have the batch shape of the cases, {cases.batch_shape}, got {num}"
+        )
     alone = cases.batch_shape == ()
     if alone:
         cases, plans = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (cases, plans))
     verdict = referee(cases, plans, **settings)
     return lane(verdict, 0) if alone else verdict
+
+
+def require_settings(referee: Callable[..., Any], settings: dict[str, Any]) -> None:
+    """Raise unless settings are a referee's, each of the kind that its default is.
+
+    Those that a referee hands on to another are looked at for that one.
+    """
+    known = inspect.signature(referee).parameters
+    hands_on = any(each.kind is each.VAR_KEYWORD for each in known.values())
+    for name, value in settings.items():
+        if name not in known and hands_on:
+            continue
+        if name not in known:
+            raise TypeError(f"{name} must be a setting of the referee's, got {told(value)}")
+        usual = known[name].default
+        if isinstance(usual, bool):
+            require_switch(name, value)
+        elif isinstance(usual, int):
+            require_size(name, value)
+        elif isinstance(usual, float):
+            require_number(name, value, "finite and >= 0", lambda x: x >= 0.0)

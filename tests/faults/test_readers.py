@@ -1,6 +1,7 @@
 """Damaged files are refused in one line, mended, or read as if they were whole."""
 
 import json
+import os
 import uuid
 
 import pytest
@@ -93,3 +94,48 @@ def test_a_part_in_the_place_of_another_is_planned_again(runs, tmp_path):
     ended = run("sweep", "hit", "--resume", "--out", out)
     assert ended.code == 0 and "is of first 0, and not of 39" in ended.err
     assert rows_of(out) == rows_of(runs / "whole")
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device", "folder"])
+@pytest.mark.parametrize(
+    ("run_of", "name", "command"),
+    [
+        ("begun", "manifest.json", ("sweep", "hit", "--resume", "--out")),
+        ("begun", "parts/part-*.parquet", ("sweep", "hit", "--resume", "--out")),
+        ("whole", "manifest.json", ("report",)),
+        ("whole", "plans.parquet", ("report",)),
+        ("flights", "flights.parquet", ("view",)),
+        ("flights", "manifest.json", ("view",)),
+    ],
+)
+def test_what_is_no_plain_file_is_refused_without_waiting(
+    runs, tmp_path, kind, run_of, name, command
+):
+    out = copied(runs, run_of, tmp_path)
+    path = sorted(out.glob(name))[0]
+    path.unlink()
+    if kind == "device":
+        path.symlink_to("/dev/zero")
+    else:
+        (os.mkfifo if kind == "pipe" else os.mkdir)(path)
+    kept = sorted(out.rglob("*"))
+    ended = run(*command, out)
+    assert is_one_line(ended) and ended.code == 2, ended
+    assert sorted(out.rglob("*")) == kept
+
+
+def test_a_folder_with_a_pipe_in_the_place_of_the_lock_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / ".lock")
+    RunFolder(tmp_path).require_new()
+
+
+def test_parts_are_looked_for_where_they_are_and_never_beyond_the_run(runs, tmp_path):
+    out = copied(runs, "begun", tmp_path)
+    part = sorted((out / "parts").iterdir())[0]
+    names = ("part-999999-00000000.parquet", f"part-{'9' * 200}-00000000.parquet")
+    for name in (*names, f"part-0-{part.stem.rpartition('-')[2]}.parquet"):
+        (out / "parts" / name).write_bytes(part.read_bytes())
+    ended = run("sweep", "hit", "--resume", "--out", out)
+    assert ended.code == 0 and ended.err.count("planned again") == 3
+    assert "is beyond the 4 parts of the run" in ended.err and "is there twice" in ended.err
+    assert (out / "plans.parquet").read_bytes() == (runs / "whole" / "plans.parquet").read_bytes()

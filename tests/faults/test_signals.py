@@ -1,5 +1,6 @@
 """Signals end a command with their own code and a line, whatever its threads are doing."""
 
+import importlib.util
 import signal
 import subprocess
 import sys
@@ -8,6 +9,7 @@ import time
 import pytest
 
 from tests.faults.commands import finished, is_stopped, start
+from tests.faults.runs import make_flights
 
 PREPARED = """
 import os, signal, sys, time
@@ -94,3 +96,20 @@ def test_a_command_that_imports_is_ended_without_a_traceback(tmp_path):
     ended = finished(process)
     assert is_stopped(ended, signal.SIGINT) and "there is nothing to resume" in ended.err
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(
+    importlib.util.find_spec("viser") is None,
+    reason="viser is not installed; it comes with the extra view",
+)
+@pytest.mark.slow
+@pytest.mark.parametrize("number", NUMBERS)
+def test_a_viewer_is_ended_with_its_code_and_a_line(tmp_path, number):
+    make_flights(tmp_path / "flights")
+    process = start("view", "flights", "--port", "0", cwd=tmp_path)
+    assert process.stdout is not None
+    while not process.stdout.readline().startswith("Playing 1 flights"):
+        assert process.poll() is None
+    process.send_signal(number)
+    ended = finished(process, within=20.0)
+    assert is_stopped(ended, number) and "there is nothing to resume" in ended.err

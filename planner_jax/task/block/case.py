@@ -9,11 +9,12 @@ from flax import struct
 from jax import Array
 
 from planner_jax.ball.flight import BallState
+from planner_jax.checks import floating, require_kind, require_switch, shape_of
 from planner_jax.registry import require_name
 from planner_jax.robot.arm import REGIMES, Arm, ArmLimits
 from planner_jax.robot.arm_mjcf import irb1600
 from planner_jax.rules import Table, require_sound
-from planner_jax.task.arguments import array_of, batch_of, floating
+from planner_jax.task.arguments import array_of, batch_of
 from planner_jax.task.block.rules import RULES
 from planner_jax.task.block.scene import Scene, paper_scene
 
@@ -93,12 +94,18 @@ def case(
         TypeError: an argument holds no numbers, or `dtype` is not that of floating ones.
     """
     require_name(REGIMES, "regime", regime)
+    require_switch("wide", wide)
+    require_switch("anywhere", anywhere)
+    scene = paper_scene() if scene is None else scene
+    require_kind("scene", scene, Scene)
     arm = irb1600() if arm is None else arm
+    require_kind("arm", arm, Arm)
     angles = arm.home if angles is None else angles
-    rates = np.zeros(6) + rates if np.ndim(rates) == 0 else rates
+    rates = np.full(6, rates) if shape_of("rates", rates) == () else rates
     vectors = {"ball_pos": (ball_pos, 3), "ball_vel": (ball_vel, 3), "angles": (angles, 6)}
     shapes = [batch_of(name, *given) for name, given in vectors.items()]
-    batch, dtype = max([*shapes, np.shape(delay), np.shape(gravity)], key=len), floating(dtype)
+    shapes += [shape_of("delay", delay), shape_of("gravity", gravity)]
+    batch, dtype = max(shapes, key=len), floating(dtype)
 
     def leaf(name: str, value: Any, *trailing: int) -> Array:
         return array_of(name, value, batch, trailing, dtype)
@@ -124,7 +131,7 @@ def case(
         ends_at_rest=jnp.broadcast_to(jnp.asarray(chosen.ends_at_rest), batch),
         offset=leaf("offset", offset),
         tilt=leaf("tilt", tilt),
-        scene=shared(paper_scene() if scene is None else scene),
+        scene=shared(scene),
     )
     require_sound(made)
     return made

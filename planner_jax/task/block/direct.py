@@ -15,7 +15,7 @@ from jax import Array
 
 from planner_jax.planning.batch import first_solved
 from planner_jax.planning.one_by_one import OneByOne
-from planner_jax.protocol import Attempt, status_of
+from planner_jax.protocol import Attempt, require_settings, status_of
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import least_clearances
 from planner_jax.task.block.end_poses import EndPoses, end_poses, flight_of
@@ -57,6 +57,9 @@ class DirectBlock(OneByOne):
     tries: int = 384  # end poses whose motions are looked at, the soonest first
     samples: int = 96  # of a motion, where distances are looked at
     margin: float = 0.003  # [m], kept from everything
+
+    def __post_init__(self) -> None:
+        require_settings(self)
 
     def solve(self, case: BlockCase, attempt: Attempt) -> BlockPlan:
         """The plan of one case."""

@@ -31,7 +31,13 @@ from planner_jax.optimise.levenberg import (
 )
 from planner_jax.planning.batch import better_of, first_solved
 from planner_jax.planning.one_by_one import OneByOne
-from planner_jax.protocol import FEASIBILITY_TOLERANCE, Attempt, is_solved, status_of
+from planner_jax.protocol import (
+    FEASIBILITY_TOLERANCE,
+    Attempt,
+    is_solved,
+    require_settings,
+    status_of,
+)
 from planner_jax.robot.arm import product, shield_jacobian, shield_pose
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import (
@@ -140,6 +146,9 @@ class OnlineBlock(OneByOne):
     brisk: bool = False
     weights: Weights = Weights()
     searches: tuple[Search, ...] = _SEARCHES
+
+    def __post_init__(self) -> None:
+        require_settings(self)
 
     @property
     def attempts(self) -> tuple[Search, ...]:

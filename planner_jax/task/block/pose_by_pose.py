@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from planner_jax.protocol import Attempt, Status, lane
+from planner_jax.protocol import Attempt, Status, lane, require_settings
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.direct import poses_in_time
 from planner_jax.task.block.free_space import FreeSpace
@@ -68,6 +68,7 @@ class PoseByPose(abc.ABC):
     margin: float = 0.003  # [m], kept from everything
 
     def __post_init__(self) -> None:
+        require_settings(self)
         if not (self.budget > 0.0 and self.longest > 0.0):
             raise ValueError(
                 f"budget and longest must be > 0, got {self.budget:g} and {self.longest:g}"

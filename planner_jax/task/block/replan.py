@@ -14,6 +14,7 @@ import numpy as np
 from jax import Array
 
 from planner_jax.ball.flight import BallState, drag_free_flight
+from planner_jax.checks import require_beginning, require_kind
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.planning.batch import better_of, merged
 from planner_jax.planning.one_by_one import OneByOne
@@ -82,6 +83,7 @@ class ReplanBlock:
     """
 
     case_type: ClassVar[type] = Replanning
+    plan_type: ClassVar[type] = BlockPlan
     warm: WarmBlock = WarmBlock()
     planner: OnlineBlock = OnlineBlock()  # for what the warm start does not solve
 
@@ -109,11 +111,14 @@ class ReplanBlock:
         Raises:
             ValueError: a negative time.
         """
-        elapsed = moment_of(cases, elapsed)
+        elapsed, batch = moment_of(cases, elapsed), cases.batch_shape
+        if ball is not None:
+            require_kind("ball", ball, BallState)
+            require_beginning("ball", ball, batch, f"the batch shape {batch}")
         own = (_states if cases.batch_shape else _state)(cases, previous, elapsed)
         angles, rates = (
-            given_or_own(given, mine, elapsed.dtype)
-            for given, mine in zip((angles, rates), own, strict=True)
+            given_or_own(name, given, mine, elapsed)
+            for name, given, mine in zip(("angles", "rates"), (angles, rates), own, strict=True)
         )
         left = dataclasses.replace(
             cases,

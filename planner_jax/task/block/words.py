@@ -6,6 +6,7 @@ import jax.numpy as jnp
 
 from planner_jax.protocol import AnyPlanner
 from planner_jax.referee.block import BlockVerdict, referee_blocks
+from planner_jax.registry import suite_named
 from planner_jax.task.block.card import SUITES, TASK
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.plan import BlockPlan
@@ -41,7 +42,7 @@ def draw(
     Raises:
         ValueError: an argument is out of its range, or there is no such suite.
     """
-    suite = suite or "pole"
+    suite = suite_named(suite, "pole")
     if suite not in SUITES:
         return TASK.other_suite(suite)(num, seed, first)
     return draw_cases(

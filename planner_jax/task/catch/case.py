@@ -10,12 +10,13 @@ from flax import struct
 from jax import Array
 
 from planner_jax.ball.target import TargetPath
+from planner_jax.checks import floating, numbers_of, require_path, require_switch, shape_of, told
 from planner_jax.cost.extras import Extra, for_batch
 from planner_jax.robot.quadrotor import QuadrotorLimits
 from planner_jax.robot.quadrotor_model import NET, QuadrotorModel
 from planner_jax.robot.quadrotor_models import PAPER_CATCHER
 from planner_jax.rules import Table, require_sound
-from planner_jax.task.arguments import array_of, floating, numbers_of, require_beginning
+from planner_jax.task.arguments import array_of
 from planner_jax.task.catch.rules import RULES
 from planner_jax.task.flight import limits_of, require_tool
 
@@ -132,15 +133,17 @@ def case(
         ValueError: an argument has another shape.
         TypeError: an argument holds no numbers, or `dtype` is not that of floating ones.
     """
-    dtype, shape = floating(dtype), np.shape(horizon)
-    if not shape:
-        raise ValueError("horizon must have an entry for each target, got one number")
+    dtype, shape = floating(dtype), shape_of("horizon", horizon)
+    if not shape or not shape[-1]:
+        found = "none" if shape else "one number"
+        raise ValueError(f"horizon must have an entry for each target, got {found}")
+    require_switch("optional", optional)
     batch, num = shape[:-1], shape[-1]
 
     def leaf(name: str, value: Any, *trailing: int) -> Array:
         return array_of(name, value, batch, trailing, dtype)
 
-    require_beginning("targets", targets, shape, f"the shape {shape} of horizon")
+    require_path("targets", targets, shape, 3)
     tool = require_tool(robot, NET)
     head = np.zeros(batch + (4, 3))
     head[..., 0, :] = numbers_of("start", start, batch, (3,))
@@ -176,6 +179,9 @@ def case(
 
 def _present(given: Any, shape: tuple[int, ...]) -> Array:
     """Which targets there are, of the shape (..., N) of the horizon."""
-    if np.shape(given) not in ((), shape[-1:], shape):
-        raise ValueError(f"present must have the shape {shape}, got {np.shape(given)}")
-    return jnp.asarray(np.broadcast_to(given, shape), bool)
+    found = np.asarray(given)
+    if found.dtype != np.bool_:
+        raise TypeError(f"present must be True or False of each target, got {told(given)}")
+    if found.shape not in ((), shape[-1:], shape):
+        raise ValueError(f"present must have the shape {shape}, got {found.shape}")
+    return jnp.asarray(np.broadcast_to(found, shape), bool)

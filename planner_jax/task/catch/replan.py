@@ -14,6 +14,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
+from planner_jax.checks import require_path
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.problem import Round
@@ -69,6 +70,7 @@ class ReplanCatch(OptimisedPlanner):
     """
 
     case_type = Replanning
+    plan_type = CatchPlan
     planner: ExactCatch = ExactCatch()
     rounds: tuple[Round, ...] = (
         Round(starts=1, solver=LbfgsConfig(max_steps=1, memory=1, trial_steps=_TRIALS)),
@@ -102,8 +104,9 @@ class ReplanCatch(OptimisedPlanner):
             ValueError: a negative time.
         """
         elapsed = moment_of(cases, elapsed)
+        require_path("targets", targets, np.shape(cases.present), 3)
         own = states_at(previous.trajectory, elapsed)
-        head_state = given_or_own(head_state, own, elapsed.dtype)
+        head_state = given_or_own("head_state", head_state, own, elapsed)
         since = elapsed[..., None]
         order, times = np.asarray(previous.order), np.asarray(previous.times)
         present, horizon = np.asarray(cases.present), np.asarray(cases.horizon)

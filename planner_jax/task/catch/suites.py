@@ -78,9 +78,12 @@ from jax import Array
 
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath, HarmonicPath
+from planner_jax.checks import floating, require_scalar
+from planner_jax.registry import suite_named
 from planner_jax.task.arguments import require_draw
 from planner_jax.task.catch.card import SUITES, TASK
 from planner_jax.task.catch.case import GRAVITY, CatchCase, case
+from planner_jax.task.scales import scale_problem
 
 LAUNCH = (4.0, 0.0, 0.8)  # [m], of every throw
 CATCH_HEIGHT = 0.45  # [m], least height of a thrown ball at its catch
@@ -137,8 +140,12 @@ def draw(
     Raises:
         ValueError: an argument is out of its range.
     """
-    suite = suite or "throws"
+    suite = suite_named(suite, "throws")
     require_draw(num, seed, first)
+    dtype = floating(dtype)
+    require_scalar("limit_scale", limit_scale)
+    if problem := scale_problem(limit_scale):
+        raise ValueError(problem)
     if suite not in SUITES:
         return TASK.other_suite(suite)(num, seed, first)
     own = SUITES[suite].num_targets

@@ -22,7 +22,8 @@ from planner_jax.ball.flight import (
     gravity_vector,
 )
 from planner_jax.ball.impact import required_impact
-from planner_jax.ball.prediction import target_at
+from planner_jax.ball.prediction import LEAST_NODES, target_at
+from planner_jax.checks import require_size
 from planner_jax.cost.along import Along, greatest_along, integrate_along
 from planner_jax.cost.contact import apex_excess, hitting_speed_excess
 from planner_jax.cost.extras import extra_rate, num_limits
@@ -120,6 +121,7 @@ class ExactHit(OptimisedPlanner):
 
     def __post_init__(self) -> None:
         require_settings(self)
+        require_size("num_table_nodes", self.num_table_nodes, LEAST_NODES)
         if len(self.proportions) < 2 or not all(0.0 < x < np.inf for x in self.proportions):
             raise ValueError(
                 f"proportions must be of >= 2 pieces, finite and > 0, got {self.proportions}"

@@ -10,7 +10,7 @@ from jax import Array, lax
 from planner_jax.ball.impact import required_impact
 from planner_jax.ball.prediction import PathTable, target_at
 from planner_jax.cost.quadrotor import motion_excess
-from planner_jax.protocol import Attempt, outcome
+from planner_jax.protocol import Attempt, outcome, require_settings
 from planner_jax.task.hit.baseline import largest_violation, make_impact
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.context import HitContext, Impact, prepare_hit
@@ -88,6 +88,9 @@ class JuggleHit:
     ease: float = 0.02  # [s], in which the jerk reaches that of the primitive
     nodes: int = 60  # intervals a piece in which limits are looked at
     num_table_nodes: int = 48
+
+    def __post_init__(self) -> None:
+        require_settings(self)
 
     def solve(self, case: HitCase, attempt: Attempt) -> HitPlan:
         """The primitive to the stroke; no variable is left to decide on.

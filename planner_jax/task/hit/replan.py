@@ -15,6 +15,7 @@ from flax import struct
 from jax import Array
 
 from planner_jax.ball.flight import BallState
+from planner_jax.checks import require_beginning, require_kind
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.problem import Round
@@ -47,6 +48,7 @@ class ReplanHit(OptimisedPlanner):
     """
 
     case_type = Replanning
+    plan_type = HitPlan
     planner: ExactHit = ExactHit()
     rounds: tuple[Round, ...] = (
         Round(starts=1, solver=LbfgsConfig(max_steps=4, trial_steps=_TRIALS)),
@@ -79,8 +81,10 @@ class ReplanHit(OptimisedPlanner):
         """
         elapsed = moment_of(cases, elapsed)
         own = states_at(previous.trajectory, elapsed)
-        head_state = given_or_own(head_state, own, elapsed.dtype)
-        drag = cases.drag if drag is None else drag
+        head_state = given_or_own("head_state", head_state, own, elapsed)
+        drag = given_or_own("drag", drag, cases.drag, elapsed)
+        require_kind("ball", ball, BallState)
+        require_beginning("ball", ball, cases.batch_shape, f"the batch shape {cases.batch_shape}")
         now = dataclasses.replace(cases, ball=ball, drag=drag, head_state=head_state)
         return Replanning(case=now, previous=previous, elapsed=elapsed)
 

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.interpolate import RectBivariateSpline
 
+from planner_jax.checks import numeric, require_scalar, told
 from planner_jax.task.arguments import require_draw
 from planner_jax.task.hit import court
 from planner_jax.task.hit.card import START
@@ -292,6 +293,8 @@ def to_cases(
     Raises:
         ServeError: an argument is out of its range.
     """
+    require_scalar("limit_scale", limit_scale)
+    require_scalar("delay", delay)
     if problem := scale_problem(limit_scale):
         raise ServeError(problem)
     if isinstance(start, str):
@@ -301,9 +304,9 @@ def to_cases(
             raise ServeError(f"seed must be >= 0, got {seed}")
         head = uniform_starts(serves.index, seed)
     else:
-        head = np.asarray(start, float)
-        if head.shape != (3,) or not np.isfinite(head).all():
-            raise ServeError(f"start must be three finite numbers or 'uniform', got {start}")
+        head = numeric(start)
+        if head is None or head.shape != (3,) or not np.isfinite(head).all():
+            raise ServeError(f"start must be three finite numbers or 'uniform', got {told(start)}")
     late = advance(serves, delay) if delay != 0.0 else serves
     cases = case(
         late.position,

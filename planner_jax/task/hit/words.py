@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from planner_jax.ending.ended import ended
 from planner_jax.protocol import AnyPlanner
 from planner_jax.referee.hit import HitVerdict, referee_hits
+from planner_jax.registry import suite_named
 from planner_jax.task.hit.card import REAL_SCENARIOS, START, TASK
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.plan import HitPlan
@@ -42,7 +43,7 @@ def draw(
     Raises:
         ValueError: an argument is out of its range, or there is no such suite.
     """
-    suite = suite or "court"
+    suite = suite_named(suite, "court")
     if suite not in TASK.suites:
         return TASK.other_suite(suite)(num, seed, first)
     serves = generate_serves(num, seed, REAL_SCENARIOS.get(suite), first=first)

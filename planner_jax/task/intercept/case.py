@@ -9,11 +9,12 @@ import numpy as np
 from flax import struct
 from jax import Array
 
+from planner_jax.checks import floating, require_path, shape_of
 from planner_jax.plane.obstacles import Obstacles, obstacles
 from planner_jax.plane.target import PlanePath
 from planner_jax.robot.car import CarBody, CarLimits
 from planner_jax.rules import Table, require_sound
-from planner_jax.task.arguments import array_of, batch_of, floating, require_beginning
+from planner_jax.task.arguments import array_of, batch_of
 from planner_jax.task.intercept.rules import RULES
 
 
@@ -113,14 +114,16 @@ def case(
         TypeError: an argument holds no numbers, or `dtype` is not that of floating ones.
     """
     dtype, shapes = floating(dtype), [batch_of("start", start, 3)]
-    shapes += [np.shape(each) for each in (time, initial_speed, tolerance)]
+    own = {"time": time, "initial_speed": initial_speed, "tolerance": tolerance}
+    shapes += [shape_of(name, value) for name, value in own.items()]
     batch = max(shapes, key=len)
 
     def leaf(name: str, value: Any, *trailing: int) -> Array:
         return array_of(name, value, batch, trailing, dtype)
 
-    require_beginning("target", target, batch, f"the batch shape {batch}")
+    require_path("target", target, batch, 2)
     free = end_heading is None
+    around = leaf("heading_tolerance", heading_tolerance)
     made = InterceptCase(
         start=leaf("start", start, 3),
         speed=leaf("initial_speed", initial_speed),
@@ -129,9 +132,9 @@ def case(
         time=leaf("time", time),
         tolerance=leaf("tolerance", tolerance),
         end_heading=leaf("end_heading", 0.0 if free else end_heading),
-        heading_tolerance=leaf("heading_tolerance", np.pi if free else heading_tolerance),
-        walls=_for_batch(walls, 0.0, batch, dtype),
-        movers=_for_batch(movers, mover_velocities, batch, dtype),
+        heading_tolerance=jnp.full_like(around, np.pi) if free else around,
+        walls=_for_batch("walls", walls, 0.0, batch, dtype),
+        movers=_for_batch("movers", movers, mover_velocities, batch, dtype),
         lower=leaf("lower", lower, 2),
         upper=leaf("upper", upper, 2),
         body=CarBody(
@@ -152,9 +155,21 @@ def case(
     return made
 
 
-def _for_batch(given: Any, velocities: Any, batch: tuple[int, ...], dtype: Any) -> Obstacles:
-    """Obstacles with the batch's axes on every leaf."""
+def _for_batch(
+    name: str, given: Any, velocities: Any, batch: tuple[int, ...], dtype: Any
+) -> Obstacles:
+    """Obstacles with the batch's axes on every leaf.
+
+    Raises:
+        TypeError, ValueError: the polygons or their velocities break a rule; with the name of the
+            argument that holds them.
+    """
     if isinstance(given, Obstacles):
         return given
-    one = obstacles(given, velocities, dtype=dtype)
+    try:
+        one = obstacles(given, velocities, dtype=dtype)
+    except (TypeError, ValueError) as error:
+        of_speed = str(error).startswith("velocities")
+        begins = f"{name.removesuffix('s')}_" if of_speed else f"{name} must be polygons: "
+        raise type(error)(f"{begins}{error}") from None
     return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, batch + leaf.shape), one)

@@ -12,6 +12,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
+from planner_jax.checks import require_path, told
 from planner_jax.plane.target import LaterPath, PlanePath
 from planner_jax.protocol import Plan
 from planner_jax.rules import Table
@@ -123,12 +124,24 @@ def group(
 
     Raises:
         ValueError: as for `case`.
+        TypeError: likewise.
     """
-    shared = case(targets, time, **settings)
-    batch = shared.batch_shape
-    num = np.shape(jax.tree.leaves(targets)[0])[len(batch)]
+    given = [settings.get(name, 0.0) for name in ("initial_speed", "tolerance")]
+    shapes = [np.shape(time), np.shape(settings.get("start", 0.0))[:-1], *map(np.shape, given)]
+    axis, leaves = len(max(shapes, key=len)), jax.tree.leaves(targets)
+    if not leaves or any(np.ndim(leaf) <= axis for leaf in leaves):
+        raise ValueError(
+            f"targets must be paths with {axis + 1} axes in front, got {told(targets)}"
+        )
+    one = jax.tree.map(lambda leaf: np.asarray(leaf).take(0, axis), targets)
+    shared = case(one, time, **settings)
+    batch, num = shared.batch_shape, np.shape(leaves[0])[axis]
+    require_path("targets", targets, (*batch, num), 2)
+    there = np.asarray(present)
+    if there.dtype != np.bool_ or there.shape not in ((), (num,), (*batch, num)):
+        raise ValueError(f"present must be True or False of {num} targets, got {told(present)}")
     return InterceptGroup(
-        shared=shared,
-        present=jnp.asarray(np.broadcast_to(present, (*batch, num)), bool),
+        shared=dataclasses.replace(shared, target=targets),
+        present=jnp.asarray(np.broadcast_to(there, (*batch, num))),
         order=jnp.asarray(np.broadcast_to(np.arange(num), (*batch, num)), jnp.int32),
     )

@@ -13,6 +13,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from planner_jax.checks import floating
 from planner_jax.registry import require_name
 from planner_jax.task.intercept.card import GROUPS
 from planner_jax.task.intercept.group import InterceptGroup
@@ -45,7 +46,7 @@ def draw_groups(
         ValueError: an argument is out of its range; one line.
     """
     require_name(GROUPS, "suite", suite)
-    own, randoms = GROUPS[suite], generators(suite, num, seed, first)
+    own, randoms, dtype = GROUPS[suite], generators(suite, num, seed, first), floating(dtype)
     drawn, _, _ = accepted_draws(own, randoms)
     fewest, most = own.num_targets
     count = np.array([random.integers(fewest, most + 1) for random in randoms])

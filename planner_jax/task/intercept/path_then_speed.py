@@ -11,9 +11,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from planner_jax.checks import require_size
 from planner_jax.plane.station_time import StationTimeProblem, reference_line
 from planner_jax.planning.one_by_one import OneByOne
-from planner_jax.protocol import Status, is_solved
+from planner_jax.protocol import Status, is_solved, require_settings
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.checked import checked_plan, explained
 from planner_jax.task.intercept.path import Path
@@ -105,6 +106,11 @@ class PathThenSpeed(OneByOne):
     # least acceleration; None: all.
     tries: int | None = None
     searches: tuple[Search, ...] = (Search(8),)
+
+    def __post_init__(self) -> None:
+        require_settings(self)
+        if self.tries is not None:
+            require_size("tries", self.tries)
 
     @property
     def attempts(self) -> tuple[Search, ...]:

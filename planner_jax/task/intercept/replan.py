@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from planner_jax.checks import require_beginning, require_kind, require_path
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.plane.obstacles import Obstacles
 from planner_jax.plane.target import PlanePath
@@ -47,6 +48,7 @@ class ReplanIntercept(OneByOne):
     """
 
     case_type: ClassVar[type] = Replanning
+    plan_type: ClassVar[type] = InterceptPlan
     planner: SpacetimeIntercept = SpacetimeIntercept()
     warm: Warm = Warm()
     shortest: float = 0.1  # [s]
@@ -84,11 +86,17 @@ class ReplanIntercept(OneByOne):
         Raises:
             ValueError: a negative time.
         """
-        elapsed = moment_of(cases, elapsed)
+        elapsed, batch = moment_of(cases, elapsed), cases.batch_shape
+        require_path("target", target, batch, 2)
+        if movers is not None:
+            require_kind("movers", movers, Obstacles)
+            require_beginning("movers", movers, batch, f"the batch shape {batch}")
         own = (_states if cases.batch_shape else _state)(previous, elapsed)
         start, speed, curvature = (
-            given_or_own(given, mine, elapsed.dtype)
-            for given, mine in zip((start, speed, curvature), own, strict=True)
+            given_or_own(name, given, mine, elapsed)
+            for name, given, mine in zip(
+                ("start", "speed", "curvature"), (start, speed, curvature), own, strict=True
+            )
         )
         limits = cases.limits
         speed = np.clip(speed, 0.0, limits.speed)

@@ -25,7 +25,7 @@ from planner_jax.optimise.levenberg import (
 from planner_jax.plane import reach
 from planner_jax.plane.distance_field import DistanceField, distance_field
 from planner_jax.planning.one_by_one import OneByOne
-from planner_jax.protocol import Status, is_solved, require_settings
+from planner_jax.protocol import Status, is_solved, require_attempts, require_settings
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.checked import checked_plan, explained, straight_on
 from planner_jax.task.intercept.motion import Quadratic, by_unknowns, motion
@@ -110,6 +110,8 @@ class SpacetimeIntercept(OneByOne):
 
     def __post_init__(self) -> None:
         require_settings(self)
+        if self.searches is not None:
+            require_attempts("searches", self.searches, Search)
         if self.meet not in ("given", "early", "least"):
             raise ValueError(f"meet must be given, early or least, got {self.meet!r}")
 

@@ -40,6 +40,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from planner_jax.checks import floating
 from planner_jax.plane.obstacles import Obstacles
 from planner_jax.plane.target import PlanePath, TurningPath
 from planner_jax.protocol import lane
@@ -91,7 +92,7 @@ def draw_cases(
 def drawn(suite: str, num: int, seed: int, first: int = 0, *, dtype: Any = jnp.float32) -> Drawn:
     """The same cases, and how many draws of each were rejected, and why; see `draw_cases`."""
     require_name(SUITES, "suite", suite)
-    own, randoms = SUITES[suite], generators(suite, num, seed, first)
+    own, randoms, dtype = SUITES[suite], generators(suite, num, seed, first), floating(dtype)
     accepted, draws, rejected = accepted_draws(own, randoms)
     return Drawn(cases=cases_of(accepted, dtype), draws=draws, rejected=rejected)
 

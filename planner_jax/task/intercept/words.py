@@ -6,18 +6,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from planner_jax.checks import require_kind, require_path
 from planner_jax.plane.target import PlanePath
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.protocol import AnyPlanner
 from planner_jax.referee.intercept import InterceptVerdict, referee_intercepts
 from planner_jax.referee.intercept_group import referee_groups
+from planner_jax.registry import suite_named
 from planner_jax.task.intercept.card import DECISIONS, GROUPS, SUITES, TASK
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.group import GroupPlan, InterceptGroup
 from planner_jax.task.intercept.group_suites import draw_groups
 from planner_jax.task.intercept.plan import InterceptPlan
 from planner_jax.task.intercept.suites import draw_cases
-from planner_jax.task.judged import judged
+from planner_jax.task.judged import judged, require_settings
 from planner_jax.task.named_decision import named_decision
 
 
@@ -42,7 +44,7 @@ def draw(
     Raises:
         ValueError: an argument is out of its range, or there is no such suite.
     """
-    suite = suite or "easy"
+    suite = suite_named(suite, "easy")
     if suite in GROUPS:
         return draw_groups(suite, num, seed, first, dtype=dtype)
     if suite not in SUITES:
@@ -108,11 +110,15 @@ def judge(
         ValueError: shapes that do not fit, or a setting out of its range.
     """
     if isinstance(cases, InterceptGroup):
+        require_settings(referee_intercepts, settings)
         settings = {"target_positions": positions, **settings}
         return judged(referee_groups, cases, plans, (InterceptGroup, GroupPlan), settings)
-    if cases.batch_shape == () and settings.get("truth") is not None:
-        one = jax.tree.map(lambda leaf: np.asarray(leaf)[None], settings["truth"])
-        settings = {**settings, "truth": one}
+    require_kind("cases", cases, InterceptCase)
+    if (truth := settings.get("truth")) is not None:
+        require_path("truth", truth, cases.batch_shape, 2)
+        if cases.batch_shape == ():
+            one = jax.tree.map(lambda leaf: np.asarray(leaf)[None], truth)
+            settings = {**settings, "truth": one}
     settings = {"target_positions": positions, **settings}
     return judged(referee_intercepts, cases, plans, (InterceptCase, InterceptPlan), settings)
 

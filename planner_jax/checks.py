@@ -1,0 +1,194 @@
+"""What single arguments must be: a number, a whole number, a switch, an array, one of a class.
+
+Each check raises one line, `NAME must be RULE, got VALUE`: `TypeError` for another kind of value,
+`ValueError` for one that breaks the rule.
+"""
+
+import functools
+import os
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+
+def told(value: Any) -> str:
+    """A value in one short line, for a message."""
+    return " ".join(f"{value!r}".split())[:60]
+
+
+def require_size(name: str, value: Any, least: int = 1) -> None:
+    """Raise unless an argument is a whole number that is not too small."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise TypeError(f"{name} must be a whole number, got {told(value)}")
+    if value < least:
+        raise ValueError(f"{name} must be >= {least}, got {value}")
+
+
+def require_number(
+    name: str,
+    value: Any,
+    words: str = "finite",
+    holds: Callable[[Any], Any] = lambda value: True,
+) -> None:
+    """Raise unless an argument is one finite number that keeps a rule.
+
+    Args:
+        name: of the argument.
+        value: it may be an array of no axes. Of what is traced, and of jax arrays, which may lie
+            on another device, only shape and kind are looked at.
+        words: of the rule, the finiteness included.
+        holds: whether a finite number keeps the rule.
+    """
+    require_scalar(name, value)
+    if not isinstance(value, jax.Array) and not (np.isfinite(value) and holds(value)):
+        raise ValueError(f"{name} must be {words}, got {value}")
+
+
+def require_scalar(name: str, value: Any) -> None:
+    """Raise `TypeError` unless an argument is one number, finite or not."""
+    number = numeric(value)
+    if number is None or number.shape or number.dtype == np.bool_:
+        raise TypeError(f"{name} must be a number, got {told(value)}")
+
+
+def require_switch(name: str, value: Any) -> None:
+    """Raise `TypeError` unless an argument is true or false."""
+    if not isinstance(value, bool | np.bool_):
+        raise TypeError(f"{name} must be True or False, got {told(value)}")
+
+
+def require_kind(name: str, value: Any, kind: type) -> None:
+    """Raise `TypeError` unless an argument is of a class."""
+    if not isinstance(value, kind):
+        raise TypeError(f"{name} must be a {kind.__name__}, got a {type(value).__name__}")
+
+
+def require_path_name(name: str, value: Any) -> None:
+    """Raise `TypeError` unless an argument may be the path of a file."""
+    if not isinstance(value, str | os.PathLike):
+        raise TypeError(f"{name} must be the path of a file, got {told(value)}")
+
+
+def numeric(value: Any) -> Any:
+    """Real numbers as an array, NumPy's unless it is traced or one of jax; None of all else."""
+    try:
+        array = value if isinstance(value, Tracer | jax.Array) else np.asarray(value)
+    except ValueError:  # rows of different lengths
+        return None
+    if array.dtype.kind in "biuf" or jnp.issubdtype(array.dtype, jnp.floating):
+        return array
+    return None
+
+
+def numbers_of(name: str, value: Any, batch: tuple[int, ...], shape: tuple[int, ...]) -> np.ndarray:
+    """A number or vector that all cases of a batch share, or one for each, batch + shape.
+
+    Args:
+        name: of the argument, for the message.
+        value: of the shape, or with the batch's axes in front; no other shape, lest an axis be
+            stretched by accident.
+        batch: () or (B,).
+        shape: of one case.
+
+    Raises:
+        ValueError: another shape.
+        TypeError: no numbers.
+    """
+    given = numeric(value)
+    if given is None:
+        raise TypeError(f"{name} must be numbers, got {told(value)}")
+    given, whole = np.asarray(given), (*batch, *shape)
+    if given.shape not in (shape, whole):
+        rule = f"{shape}" if whole == shape else f"{shape} or {whole}"
+        raise ValueError(f"{name} must have the shape {rule}, got {given.shape}")
+    return np.broadcast_to(given, whole)
+
+
+def shape_of(name: str, value: Any) -> tuple[int, ...]:
+    """The shape of an argument that holds numbers; raises `TypeError` where it does not."""
+    given = numeric(value)
+    if given is None:
+        raise TypeError(f"{name} must be numbers, got {told(value)}")
+    return given.shape
+
+
+def floating(dtype: Any) -> Any:
+    """A type of floating-point numbers that JAX has switched on.
+
+    Raises:
+        TypeError: another type, or float64 while JAX computes in float32.
+    """
+    try:
+        kind = np.dtype(dtype)
+    except TypeError:
+        kind = None
+    if kind is None or not jnp.issubdtype(kind, np.floating):
+        raise TypeError(f"dtype must be a type of floating-point numbers, got {told(dtype)}")
+    if jax.dtypes.canonicalize_dtype(kind) != kind:
+        raise TypeError(f"dtype must be float32 unless jax_enable_x64 is set, got {kind}")
+    return kind
+
+
+def require_beginning(name: str, tree: Any, shape: tuple[int, ...], words: str) -> None:
+    """Raise unless every leaf of an argument begins with a shape, and there is one.
+
+    Args:
+        name: of the argument, for the message.
+        tree: the argument, a pytree of arrays.
+        shape: with which the shapes of its leaves begin.
+        words: for that shape, for the message.
+
+    Raises:
+        TypeError: there is no leaf, or one that is no array of numbers.
+        ValueError: a leaf begins with another shape.
+    """
+    leaves = jax.tree.leaves(tree)
+    if not leaves or any(numeric(leaf) is None for leaf in leaves):
+        raise TypeError(f"{name} must hold arrays of numbers, got {told(tree)}")
+    for leaf in leaves:
+        if np.shape(leaf)[: len(shape)] != shape:
+            raise ValueError(
+                f"{name} must have leaves that begin with {words}, got {np.shape(leaf)}"
+            )
+
+
+def require_path(name: str, path: Any, axes: tuple[int, ...], dimensions: int) -> None:
+    """Raise unless an argument is a target's path, or an array of them.
+
+    Args:
+        name: of the argument, for the message.
+        path: a pytree with a method `at(time)`.
+        axes: that its leaves have in front of those of one path.
+        dimensions: of the positions, 2 or 3.
+
+    Raises:
+        TypeError: it has no such method, or no positions come of it.
+        ValueError: it has other axes.
+    """
+    if isinstance(path, type) or not callable(getattr(path, "at", None)):
+        raise TypeError(f"{name} must be a path, with a method at(time), got {told(path)}")
+    require_beginning(name, path, axes, f"the shape {axes}")
+    leaves, tree = jax.tree.flatten(path)
+    layout = tuple((np.shape(leaf), numeric(leaf).dtype) for leaf in leaves)
+    try:
+        found = _shape_of_positions(tree, layout, len(axes))
+    except (TypeError, ValueError, IndexError, AttributeError) as error:
+        found = f"a {type(path).__name__} that raises {type(error).__name__}"
+        raise TypeError(f"{name} must be a path with the axes {axes}, got {found}") from error
+    if found != (*axes, dimensions):
+        rule = f"the shape {(*axes, dimensions)}"
+        raise ValueError(f"{name} must give positions of {rule}, got {found}")
+
+
+@functools.lru_cache(maxsize=256)
+def _shape_of_positions(tree: Any, layout: tuple, num_axes: int) -> tuple[int, ...]:
+    """The shape of what paths say at a time; kept, since it takes a millisecond to find out."""
+    at: Callable[[Any, Any], Any] = lambda one, time: one.at(time).pos  # noqa: E731
+    for _ in range(num_axes):
+        at = jax.vmap(at, in_axes=(0, None))
+    path = jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(*each) for each in layout])
+    return jax.eval_shape(at, path, jax.ShapeDtypeStruct((), np.float32)).shape

@@ -1,0 +1,143 @@
+"""Every bad call of the library is refused in one line, before anything is compiled."""
+
+import dataclasses
+import os
+
+import jax
+import numpy as np
+import pytest
+
+import planner_jax as pj
+from planner_jax.policies.policy import Policy, policy
+from planner_jax.rules import named
+from planner_jax.task.block.plan import BlockPlan
+from planner_jax.task.block.replan import ReplanBlock
+from planner_jax.task.catch.decide import Best
+from planner_jax.task.catch.plan import CatchPlan
+from planner_jax.task.hit.plan import HitPlan, Stroke
+from planner_jax.task.intercept.plan import InterceptPlan
+from tests.faults.bad_calls import ROWS
+
+
+def host(tree):
+    """NumPy leaves."""
+    return jax.tree.map(np.asarray, tree)
+
+
+def zeros(*shape):
+    """One array of two plans."""
+    return np.zeros((2, *shape), np.float32)
+
+
+def pieces(num, degree, dimensions):
+    """Motions of a tenth of a second a piece that stay where they are."""
+    return pj.PiecewisePolynomial(zeros(num, degree + 1, dimensions), zeros(num) + np.float32(0.1))
+
+
+def made_up_plans():
+    """Plans of every task, two each, of the shapes that planners make: nothing is compiled."""
+    whole = np.zeros(2, np.int32)
+    of_all = {"cost": zeros(), "violation": zeros(), "iterations": whole, "status": whole}
+    flown = {**of_all, "gravity": zeros() + np.float32(9.8)}
+    vectors = ("ball_pos", "ball_vel", "ball_vel_after", "normal")
+    stroke = Stroke(zeros(), *(zeros(3) for _ in vectors), zeros())
+    order, times = np.zeros((2, 1), np.int32), {"decided_times": zeros(1), "times": zeros(1)}
+    driven = {"start": zeros(3), "time": zeros() + 1, "speed": zeros(33), "curvature": zeros(33)}
+    return {
+        "hit_plans": HitPlan(**flown, trajectory=pieces(12, 7, 3), stroke=stroke),
+        "catch_plans": CatchPlan(**flown, trajectory=pieces(6, 7, 3), order=order, **times),
+        "drive_plans": InterceptPlan(**of_all, **driven, meeting=zeros(2)),
+        "block_plans": BlockPlan(**of_all, motion=pieces(10, 2, 6), contact_time=zeros()),
+    }
+
+
+def having(tree, name, value):
+    """A case with something else in a place that is named with dots."""
+    first, _, rest = name.partition(".")
+    inner = having(getattr(tree, first), rest, value) if rest else value
+    return dataclasses.replace(tree, **{first: inner})
+
+
+def filled(tree, name, value):
+    """A case with one number all over a place."""
+    return having(tree, name, np.full_like(named(tree, name), value))
+
+
+def first(num, plans):
+    """So many plans, the last one repeated."""
+    return jax.tree.map(lambda leaf: np.resize(leaf, (num, *leaf.shape[1:])), plans)
+
+
+def lane0(tree):
+    """One of a batch."""
+    return pj.lane(tree, 0)
+
+
+def ball_path(num):
+    """Paths of so many balls."""
+    vectors = np.zeros((num, 3), np.float32)
+    return pj.BallPath(pj.BallState(vectors, vectors), vectors, vectors[:, 0])
+
+
+def turning(num):
+    """Paths of so many targets in the plane."""
+    vectors = np.zeros((num, 2), np.float32)
+    return pj.TurningPath(vectors, vectors, vectors[:, 0])
+
+
+@pytest.fixture(scope="module")
+def given(tmp_path_factory):
+    """What the calls of the list name, in a folder with something of every kind."""
+    folder = tmp_path_factory.mktemp("calls")
+    os.mkfifo(folder / "pipe")
+    (folder / "empty").touch()
+    (folder / "junk").write_bytes(b"\xff\x00junk" * 100)
+    exact, catcher = pj.hit.planner(), pj.catch.planner(decide="given")
+    driver, blocker = pj.intercept.planner(), pj.block.planner()
+    hits, catches, drives, blocks = (
+        host(task.draw(2)) for task in (pj.hit, pj.catch, pj.intercept, pj.block)
+    )
+    square = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
+    ball = pj.lane(hits.ball, 0)
+
+    def saved(plans):
+        plans.save(folder / "saved.npz")
+        return folder / "saved.npz"
+
+    names = {
+        **{"pj": pj, "np": np, "jax": jax, "nan": np.nan, "inf": np.inf},
+        **{"dataclasses": dataclasses, "Best": Best, "Policy": Policy, "policy": policy},
+        "ReplanBlock": ReplanBlock,
+        **{"HitPlan": HitPlan, "CatchPlan": CatchPlan},
+        **{"having": having, "filled": filled, "first": first, "lane0": lane0, "saved": saved},
+        **{"ball_path": ball_path, "turning": turning, "SQUARE": square},
+        **{"exact": exact, "catcher": catcher, "driver": driver, "blocker": blocker},
+        **{"hits": hits, "catches": catches, "drives": drives, "blocks": blocks},
+        "hit": pj.lane(hits, 0),
+        **made_up_plans(),
+        "two_walls": jax.tree.map(lambda leaf: np.stack([leaf] * 2), host(pj.obstacles([square]))),
+        "HIT": {"serve_pos": (0, 5, 1), "serve_vel": (0, -5, 4), "target": (0, 4, 0)},
+        "HITS": {name: np.ones((2, 3)) for name in ("serve_pos", "serve_vel", "target")},
+        "CATCH": {"targets": ball_path(2), "horizon": (2.0, 2.0)},
+        "INTERCEPT": {"target": pj.lane(turning(1), 0)},
+        "BLOCK": {"ball_pos": (4, 0, 1), "ball_vel": (-8, 0, 2)},
+        "PATH": {"ball": ball, "horizon": 1.0, "drag": 0.06, "gravity": 9.8, "num_nodes": 8},
+        "FLY": {"ball": ball, "duration": 1.0, "drag": 0.06, "gravity": 9.8, "num_steps": 8},
+        "table": pj.predict_path(ball, 1.0, 0.06, 9.8, num_nodes=8),
+    }
+    return folder, names
+
+
+def test_the_list_is_long():
+    assert len(set(ROWS)) == len(ROWS) >= 1000
+
+
+@pytest.mark.parametrize(("call", "words"), ROWS, ids=[call for call, _ in ROWS])
+def test_it_is_refused_in_one_line(monkeypatch, given, call, words):
+    folder, names = given
+    monkeypatch.chdir(folder)
+    with pytest.raises((TypeError, ValueError)) as caught:
+        eval(call, dict(names))
+    said, last = str(caught.value), caught.traceback[-1].path
+    assert said.startswith(words) and said and "\n" not in said
+    assert "site-packages" not in str(last), f"{said}, from {last}"
