@@ -13,6 +13,7 @@ from planner_jax.sims.loop import Loop
 from planner_jax.sims.noise import NOISES
 from planner_jax.sims.tasks.catch import (
     CATCH_WORLD,
+    bounds,
     fly_catches,
     is_better,
     planned_ahead,
@@ -80,8 +81,9 @@ def test_a_plan_that_is_given_is_the_one_that_is_flown(catches):
 
 def with_tool(world, **changes):
     """The world, its robot's tool changed."""
-    robot = dataclasses.replace(world.robot, tool=dataclasses.replace(world.robot.tool, **changes))
-    return dataclasses.replace(world, robot=robot)
+    tool = dataclasses.replace(world.robot.tool, **changes)
+    model = dataclasses.replace(world.robot.model, tool=tool)
+    return dataclasses.replace(world, robot=dataclasses.replace(world.robot, model=model))
 
 
 MOON = {"gravity": 1.62}
@@ -127,7 +129,8 @@ def test_a_ball_is_planned_for_alone_where_no_plan_of_the_next_one_is_possible()
     both = dataclasses.replace(suite, present=np.ones((2, 2), bool))
     # The second lane's next ball is to be caught at once.
     both = dataclasses.replace(both, horizon=both.horizon * np.array([[1.0, 2.0], [1.0, 0.02]]))
-    known, plans = planned_ahead(catch.planner(decide="greedy"), both, 0)
+    widest = bounds(Loop(CATCH_WORLD), (0.0, 1.0))
+    known, plans = planned_ahead(catch.planner(decide="greedy"), both, 0, widest)
     assert not known.present[1, 1] and known.present[1, 0]
     assert not is_unsolved(plans.status).any()
 

@@ -36,9 +36,8 @@ def limits_of(robot: QuadrotorModel, leaf: Callable[..., Array], **given: Any) -
     """
     own = robot.limits
     least, most = own.thrust or (None, None)
-    if own.thrust is None and robot.tool.kind == NET:
-        low, high = robot.rotor_range or (robot.rotors.min_thrust, robot.rotors.max_thrust)
-        least, most = 4.0 * low / robot.mass, 4.0 * high / robot.mass
+    if robot.tool.kind == NET:
+        least, most = robot.thrust_bounds
     known = {
         "speed": own.speed,
         "body_rate": own.body_rate,

@@ -18,11 +18,11 @@ from planner_jax.optimise.problem import Round
 from planner_jax.planning.plan import plan as plan_all
 from planner_jax.planning.replan import Replanning
 from planner_jax.protocol import AnyPlanner
+from planner_jax.robot.quadrotor_models import PAPER_HITTER
 from planner_jax.sims.launch import flight_keys, launched, ready, require_plan, require_world
 from planner_jax.sims.loop import FlightState, Flown, Loop, Outlook, expected, flown, fly_leg
 from planner_jax.sims.model import World
 from planner_jax.sims.recording import Launches
-from planner_jax.sims.robot import Tool
 from planner_jax.sims.robots.quadrotor.robot import Quadrotor
 from planner_jax.sims.scenery import Part
 from planner_jax.sims.scoring import Contact, passage
@@ -32,7 +32,7 @@ from planner_jax.sweep.columns import BOOL, NUMBER, VECTOR, Column
 from planner_jax.sweep.summary import percent
 from planner_jax.task.hit import court
 from planner_jax.task.hit.card import REAL_SCENARIOS
-from planner_jax.task.hit.case import GRAVITY, RACKET_HEIGHT, HitCase
+from planner_jax.task.hit.case import GRAVITY, HitCase
 from planner_jax.task.hit.exact import ExactHit
 from planner_jax.task.hit.plan import HitPlan
 from planner_jax.task.hit.replan import ReplanHit
@@ -72,7 +72,7 @@ def court_parts() -> list[Part]:
 
 
 HIT_WORLD = World(
-    Quadrotor(Tool("racket", RACKET_HEIGHT, radius=0.11)),  # paper 002, Fig. 2
+    Quadrotor(PAPER_HITTER),
     GRAVITY,
     scenery=tuple(court_parts()),
     # Serves come from anywhere in a region: the middle of the far one.
