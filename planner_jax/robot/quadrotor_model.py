@@ -159,6 +159,9 @@ class QuadrotorModel:
                 f"limits.thrust must include the weight of {GRAVITY} m/s^2, got {thrust}"
             )
 
+    def __str__(self) -> str:
+        return repr(self.name)
+
     @property
     def thrust_bounds(self) -> tuple[float, float]:
         """Least and greatest thrust per unit mass [m/s^2], those of its rotors if none are said."""

@@ -24,6 +24,12 @@ def require_tool(robot: Any, kind: str) -> Tool:
     return robot.tool
 
 
+def require_own_robot(robot: Any, usual: QuadrotorModel, suite: str) -> None:
+    """Raise `ValueError` if a robot is named for a suite of another package, which has its own."""
+    if robot != usual:
+        raise ValueError(f"robot must be left out with suite {suite!r}, which has its own")
+
+
 def limits_of(robot: QuadrotorModel, leaf: Callable[..., Array], **given: Any) -> QuadrotorLimits:
     """The limits of a case, a robot's where they are not given.
 

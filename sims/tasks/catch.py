@@ -24,6 +24,7 @@ from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.planning.plan import plan as plan_all
 from planner_jax.planning.replan import Replanning
 from planner_jax.protocol import AnyPlanner, is_unsolved
+from planner_jax.robot.quadrotor_model import QuadrotorModel
 from planner_jax.robot.quadrotor_models import PAPER_CATCHER
 from planner_jax.sims.launch import (
     awaited,
@@ -175,7 +176,13 @@ class Throws(FlightCases):
 
 
 def throws(
-    num: int, num_balls: int = 1, seed: int = 0, *, drag: float = DRAG, drag_error: float = 0.0
+    num: int,
+    num_balls: int = 1,
+    seed: int = 0,
+    *,
+    drag: float = DRAG,
+    drag_error: float = 0.0,
+    robot: QuadrotorModel = PAPER_CATCHER,
 ) -> Throws:
     """Balls of the suite `throws`, which from there on fly with quadratic drag.
 
@@ -185,12 +192,13 @@ def throws(
         seed: >= 0, of the throws and of the signs of the drag's errors.
         drag: K_D [1/m], the true one.
         drag_error: relative error of what is believed of it, either way.
+        robot: with a net.
     """
     if num_balls < 1:
         raise ValueError(f"num_balls must be >= 1, got {num_balls}")
     if not 0.0 <= drag_error < 1.0:
         raise ValueError(f"drag_error must be >= 0 and < 1, got {drag_error}")
-    suite = jax.tree.map(np.asarray, draw(num * num_balls, "throws", seed))
+    suite = jax.tree.map(np.asarray, draw(num * num_balls, "throws", seed, robot=robot))
     shaped = lambda leaf: leaf[:, 0].reshape(num, num_balls, *leaf.shape[2:])  # noqa: E731
     first = lambda leaf: leaf[::num_balls]  # noqa: E731
     true = np.full((num, num_balls), drag, np.float32)
@@ -407,7 +415,7 @@ def planned_ahead(
     planner: AnyPlanner[CatchCase, CatchPlan],
     known: CatchCase,
     ball: int,
-    widest: dict[str, float],
+    widest: dict[str, Any],
 ) -> tuple[CatchCase, CatchPlan]:
     """Plans from scratch that catch a ball and, where that is possible too, the next one.
 
@@ -446,7 +454,7 @@ def planned_ahead(
     return cases, plans
 
 
-def within(cases: CatchCase, limits: dict[str, float] | None) -> CatchCase:
+def within(cases: CatchCase, limits: dict[str, Any] | None) -> CatchCase:
     """Cases with NumPy leaves with other limits, as `bounds` has them."""
     if limits is None:
         return cases
@@ -456,7 +464,7 @@ def within(cases: CatchCase, limits: dict[str, float] | None) -> CatchCase:
     return dataclasses.replace(cases, limits=dataclasses.replace(cases.limits, **leaves))
 
 
-def bounds(loop: Loop, distance: tuple[float, float]) -> dict[str, float]:
+def bounds(loop: Loop, distance: tuple[float, float]) -> dict[str, Any]:
     """Least thrust [m/s^2] and greatest body rate [rad/s] of plans, as `_FIRST` has them."""
     model, gravity = loop.world.carrier.model, loop.world.gravity
     least, _ = model.thrust_bounds
@@ -479,12 +487,24 @@ class CatchFlight(BallFlightTask):
 
     def world(self) -> World:
         """The simulated world, with as many balls as are thrown."""
-        return dataclasses.replace(CATCH_WORLD, num_balls=self.settings.balls)
+        robot = Quadrotor(self.robot)
+        return dataclasses.replace(CATCH_WORLD, robot=robot, num_balls=self.settings.balls)
+
+    @property
+    def robot(self) -> QuadrotorModel:
+        """Which quadrotor flies."""
+        return self.settings.robot or PAPER_CATCHER
 
     def cases(self) -> Throws:
         """All throws of the run."""
         settings = self.settings
-        return throws(settings.num, settings.balls, settings.seed, drag_error=settings.drag_error)
+        return throws(
+            settings.num,
+            settings.balls,
+            settings.seed,
+            drag_error=settings.drag_error,
+            robot=self.robot,
+        )
 
     def fly(self, cases: Throws, record: bool) -> CatchFlights:
         """Flights of some throws."""

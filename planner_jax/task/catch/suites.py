@@ -78,9 +78,12 @@ from jax import Array
 
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath, HarmonicPath
+from planner_jax.robot.quadrotor_model import QuadrotorModel
+from planner_jax.robot.quadrotor_models import PAPER_CATCHER
 from planner_jax.task.arguments import require_draw
 from planner_jax.task.catch.card import SUITES, TASK
 from planner_jax.task.catch.case import GRAVITY, CatchCase, case
+from planner_jax.task.flight import require_own_robot
 
 LAUNCH = (4.0, 0.0, 0.8)  # [m], of every throw
 CATCH_HEIGHT = 0.45  # [m], least height of a thrown ball at its catch
@@ -116,6 +119,7 @@ def draw(
     *,
     first: int = 0,
     limit_scale: float = 1.0,
+    robot: QuadrotorModel = PAPER_CATCHER,
     num_targets: int | None = None,
     dtype: Any = jnp.float32,
 ) -> CatchCase:
@@ -130,6 +134,7 @@ def draw(
         first: place of the first one, >= 0.
         limit_scale: factor on the limits of speed and body rate, and on how far the thrust may
             be from that of hover.
+        robot: with a net; suites of other packages have their own.
         num_targets: N, how many targets the shape holds, at least the suite's own; those
             beyond these are absent, and copies of the first.
         dtype: of every floating leaf.
@@ -140,6 +145,7 @@ def draw(
     suite = suite or "throws"
     require_draw(num, seed, first)
     if suite not in SUITES:
+        require_own_robot(robot, PAPER_CATCHER, suite)
         return TASK.other_suite(suite)(num, seed, first)
     own = SUITES[suite].num_targets
     size = own if num_targets is None else num_targets
@@ -156,6 +162,7 @@ def draw(
         jax.tree.map(lambda leaf: jnp.asarray(leaf[:, place], dtype), targets),
         horizon[:, place],
         present=np.arange(size) < own,
+        robot=robot,
         gravity=np.full(num, GRAVITY),
         optional=SUITES[suite].optional,
         dtype=dtype,

@@ -11,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.interpolate import RectBivariateSpline
 
+from planner_jax.robot.quadrotor_model import QuadrotorModel
+from planner_jax.robot.quadrotor_models import PAPER_HITTER
 from planner_jax.task.arguments import require_draw
 from planner_jax.task.hit import court
 from planner_jax.task.hit.card import START
@@ -276,6 +278,7 @@ def to_cases(
     seed: int = 0,
     delay: float = 0.0,
     limit_scale: float = 1.0,
+    robot: QuadrotorModel = PAPER_HITTER,
     dtype=jnp.float32,
 ) -> HitCase:
     """One batch of cases, with the setting of paper 002, from serves.
@@ -287,6 +290,7 @@ def to_cases(
         delay: [s] from the serve to the moment at which planning begins.
         limit_scale: factor on the speed, acceleration and body-rate limits; those of the
             stroke stay.
+        robot: with a racket.
         dtype: of every leaf.
 
     Raises:
@@ -309,6 +313,7 @@ def to_cases(
         late.position,
         late.velocity,
         late.target,
+        robot=robot,
         start=head,
         drag=DRAG,
         gravity=GRAVITY,

@@ -52,8 +52,8 @@ class Quadrotor:
         )
         motors = "".join(
             f'<general site="rotor{i}" gear="0 0 1 0 0 {xml_numbers(torque)}" ctrllimited="true" '
-            f'ctrlrange="{xml_numbers(rotors.min_thrust, rotors.max_thrust)}" dyntype="filterexact" '
-            f'dynprm="{xml_numbers(rotors.lag)}"/>'
+            f'ctrlrange="{xml_numbers(rotors.min_thrust, rotors.max_thrust)}" '
+            f'dyntype="filterexact" dynprm="{xml_numbers(rotors.lag)}"/>'
             for i, torque in enumerate(rotors.torque_arms)
         )
         body = (
