@@ -450,12 +450,12 @@ def _print_sweep(manifest: dict[str, Any], out: Path) -> None:
 
 
 def _fly(task: Task, kind: type, given: dict[str, Any]) -> None:
-    keep_compiled_programs()
-    from planner_jax.sims.run import start_flights
-
     out = _out(given) or _run_folder(f"fly-{task.name}")
     kept = {name: given.pop(name) for name in ("video", "record") if name in given}
     settings = kind(**given)
+    keep_compiled_programs()
+    from planner_jax.sims.run import start_flights
+
     with _told_how_to_go_on(lambda: "nothing is kept of these flights, fly again"):
         start_flights(settings, out, **kept)
     _print_flights(Path(out))

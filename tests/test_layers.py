@@ -64,8 +64,8 @@ ALLOWED = {
     "compile_cache": set(),
     "doctor": {"compile_cache", "lanes", "planning", "protocol", "registry", "sweep"},
     "cli": {
-        *("compile_cache", "digits", "doctor", "export", "plan_files", "registry", "stopping"),
-        "sweep",
+        *("compile_cache", "digits", "doctor", "export", "plan_files", "registry", "robot"),
+        *("stopping", "sweep"),
     },
     "__main__": {"cli", "stopping"},
 }

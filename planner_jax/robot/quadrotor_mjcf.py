@@ -87,7 +87,7 @@ def _rotor(
         raise RobotError(f"{path}: actuator {name} must have a fixed gain and no bias")
     if not model.actuator_ctrllimited[k]:
         raise RobotError(f"{path}: actuator {name} must have a ctrlrange")
-    filters = (mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT)
+    filters = (int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT))
     lag = float(model.actuator_dynprm[k, 0]) if model.actuator_dyntype[k] in filters else None
     force = push[2] * model.actuator_gainprm[k, 0] * model.actuator_ctrlrange[k]
     place = (turn.T @ (data.site_xpos[site] - centre))[:2]
