@@ -17,6 +17,9 @@ from planner_jax.registry import UnknownName
 from planner_jax.robot.quadrotor_file import RobotError, as_yaml, model_of
 from planner_jax.robot.quadrotor_models import MODELS
 from planner_jax.robot.quantities import UNITS, QuantityError, numbers_in
+from planner_jax.sims.settings import HitFly
+from planner_jax.sweep.hit.settings import HitSettings
+from planner_jax.sweep.settings import SettingError, settings_to_resume
 
 DATA = Path(__file__).parent / "data"
 MINE = DATA / "my_quadrotor.yaml"
@@ -333,3 +336,43 @@ def test_a_robot_that_does_not_fit_is_refused_before_anything_is_made(
     told = capsys.readouterr().err
     assert re.match(f"planner-jax: error: {rule}", told) and told.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["bad.yaml"]
+
+
+# Runs
+
+
+@pytest.mark.parametrize("kind", [HitSettings, HitFly])
+def test_a_run_holds_the_whole_robot_whatever_becomes_of_its_file(kind):
+    settings = kind(robot=str(MINE))
+    assert settings.robot == pj.read_robot(MINE)
+    written = json.loads(json.dumps(dataclasses.asdict(settings)))
+    assert written["robot"]["rotors"]["max_thrust"] == 4.5
+    assert kind(**written) == settings
+
+
+def test_a_run_is_not_resumed_with_another_robot(tmp_path):
+    (tmp_path / "other.yaml").write_text(changed(rotors__lag="20 ms"))
+    parameters = json.loads(json.dumps(HitSettings(robot=str(MINE)).parameters()))
+    again = settings_to_resume(HitSettings, parameters, {"robot": str(MINE)})
+    assert again.robot == pj.read_robot(MINE)
+    rule = "robot.rotors.lag must be 0.03 as in the run that is resumed, got 0.02"
+    with pytest.raises(SettingError, match=f"^{rule}$"):
+        settings_to_resume(HitSettings, parameters, {"robot": str(tmp_path / "other.yaml")})
+    old = {**parameters, "robot": None}
+    with pytest.raises(SettingError, match="^robot must be None as .*, got 'x500'$"):
+        settings_to_resume(HitSettings, old, {"robot": "x500"})
+
+
+def test_an_old_run_without_a_robot_is_one_of_the_paper_s():
+    parameters = HitSettings().parameters()
+    del parameters["robot"]
+    assert HitSettings(**parameters).robot is None
+    assert "robot" not in HitSettings().draw_options()
+
+
+def test_draws_are_of_the_robot():
+    cases = pj.hit.draw(2, robot=pj.read_robot(MINE))
+    np.testing.assert_allclose(cases.limits.rotors.max_thrust, 0.95 * 4.5)
+    throws = pj.catch.draw(2, robot=pj.robot("x500-net"))
+    np.testing.assert_allclose(throws.net.radius, 0.2)
+    np.testing.assert_allclose(throws.limits.max_thrust, 4.0 * 0.95 * 8.549 / 2.064, rtol=1e-6)

@@ -1,6 +1,7 @@
 """Whole flights in closed loop: what is planned is flown, and noise is borne."""
 
 import dataclasses
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -8,9 +9,11 @@ import jax
 import numpy as np
 import pytest
 
+import planner_jax as pj
 from planner_jax.protocol import is_unsolved
 from planner_jax.sims.loop import Loop
 from planner_jax.sims.noise import NOISES
+from planner_jax.sims.robots.quadrotor.robot import Quadrotor
 from planner_jax.sims.tasks.catch import (
     CATCH_WORLD,
     bounds,
@@ -197,3 +200,22 @@ def test_a_hit_that_is_planned_anew_lands_on_the_target():
     assert exact.miss.max() < 0.05
     noisy = fly_hits(Loop(HIT_WORLD, NOISES["lab"], replan=50.0), volleys(4, REAL_SCENARIOS["S.4"]))
     assert noisy.miss.max() < 0.5
+
+
+@pytest.mark.slow
+def test_a_robot_of_its_own_is_hit_with_where_it_was_planned():
+    robot = pj.read_robot(Path(__file__).parent / "data" / "my_quadrotor.yaml")
+    world = dataclasses.replace(HIT_WORLD, robot=Quadrotor(robot))
+    served = volleys(4, REAL_SCENARIOS["S.1"], seed=1, robot=robot)
+    flights = fly_hits(Loop(world), served)
+    assert flights.flown.tracking[:, 1].max() < 0.02
+    assert (flights.miss < 0.5).all()
+
+
+@pytest.mark.slow
+def test_a_heavy_robot_with_a_large_net_catches():
+    robot = pj.robot("x500-net")
+    world = dataclasses.replace(CATCH_WORLD, robot=Quadrotor(robot))
+    flights = fly_catches(Loop(world), throws(4, seed=1, robot=robot))
+    assert flights.flown.tracking[:, 1].max() < 0.05
+    assert flights.caught.mean() >= 0.75

@@ -12,6 +12,7 @@ import pytest
 
 from planner_jax.ball.flight import BallState, fly
 from planner_jax.robot.quadrotor import flat_attitude
+from planner_jax.robot.quadrotor_model import FlightLimits
 from planner_jax.sims.launch import awaited, ready, require_plan, require_world
 from planner_jax.sims.loop import Loop, expected
 from planner_jax.sims.model import (
@@ -26,6 +27,7 @@ from planner_jax.sims.noise import NOISES, Sensing
 from planner_jax.sims.robots.quadrotor.allocation import rotor_thrusts
 from planner_jax.sims.robots.quadrotor.control import rotation_error
 from planner_jax.sims.robots.quadrotor.reference import with_rest
+from planner_jax.sims.robots.quadrotor.robot import Quadrotor
 from planner_jax.sims.scenery import machine_parts, outlines
 from planner_jax.sims.scoring import Moment, nearest, no_contact, passage
 from planner_jax.sims.sensing import (
@@ -36,7 +38,7 @@ from planner_jax.sims.sensing import (
     predicted,
     with_drag,
 )
-from planner_jax.sims.tasks.catch import CATCH_WORLD
+from planner_jax.sims.tasks.catch import _BEHIND, _FIRST, _WIDEST, CATCH_WORLD, bounds
 from planner_jax.sims.tasks.hit import HIT_WORLD, court_parts
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
@@ -95,6 +97,21 @@ def test_at_rest_the_rotors_carry_the_robot_without_turning_it(rotors):
     lift = robot.at_rest(jnp.zeros(3), 9.81)[2]
     wrench = rotors.allocation @ np.asarray(lift)
     np.testing.assert_allclose(wrench, [model.mass * 9.81, 0.0, 0.0, 0.0], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("distance", "thrust", "rate"), [(_FIRST, 0.5, 3.0), (_BEHIND, 0.4, 4.5), (_WIDEST, 0.3, 5.0)]
+)
+def test_plans_in_flight_stay_within_the_limits_of_the_robot(distance, thrust, rate):
+    found = bounds(Loop(CATCH_WORLD), distance)
+    np.testing.assert_allclose(list(found.values()), [thrust * 9.81, rate])
+    model = dataclasses.replace(
+        CATCH_WORLD.robot.model, limits=FlightLimits(speed=5.0, body_rate=8.0, thrust=(6.0, 14.0))
+    )
+    world = dataclasses.replace(CATCH_WORLD, robot=Quadrotor(model))
+    own = bounds(Loop(world), distance)
+    assert 6.0 <= own["min_thrust"] < 9.81 and own["body_rate"] <= 8.0
+    np.testing.assert_allclose(own["body_rate"], 8.0 * rate / 5.0)
 
 
 def test_the_flat_body_rate_is_that_of_the_flat_attitude():
