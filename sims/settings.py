@@ -10,7 +10,6 @@ from typing import Any, ClassVar
 
 from planner_jax.memory import require_memory
 from planner_jax.registry import Task, UnknownName, all_tasks, split_name
-from planner_jax.robot.quadrotor_model import NET, RACKET, QuadrotorModel
 from planner_jax.sims.noise import NOISES, PLANE_NOISES, PlaneSensing, Sensing, require_whole
 from planner_jax.sims.robots.arm.drives import ENCODERS, TORQUES, Drives
 from planner_jax.sweep.block.settings import REGIMES, require_frame_rate, require_moderate
@@ -169,7 +168,7 @@ class CatchFly(BallFly):
         "rate at which order and times are decided anew, 0 for never (default: that of --replan)",
     )
 
-    robot: QuadrotorModel | None = robot_option("paper-catcher")
+    robot: Any = robot_option("paper-catcher")
 
     TASK: ClassVar[Task] = CATCH
     FLIGHT: ClassVar[str] = "planner_jax.sims.tasks.catch:CatchFlight"
@@ -177,7 +176,7 @@ class CatchFly(BallFly):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "robot", checked_robot(self.robot, NET))
+        object.__setattr__(self, "robot", checked_robot(self.robot, "net"))
         require_count("balls", self.balls, 1)
         require(self.balls <= _MOST_BALLS, "balls", f"<= {_MOST_BALLS}", self.balls)
         try:
@@ -220,7 +219,7 @@ class HitFly(BallFly):
     planner: str = option("exact", "NAME", "of plans from scratch")
     suite: str = option("S.1", "NAME", "of serves")
 
-    robot: QuadrotorModel | None = robot_option("paper-hitter")
+    robot: Any = robot_option("paper-hitter")
 
     TASK: ClassVar[Task] = HIT
     FLIGHT: ClassVar[str] = "planner_jax.sims.tasks.hit:HitFlight"
@@ -228,7 +227,7 @@ class HitFly(BallFly):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "robot", checked_robot(self.robot, RACKET))
+        object.__setattr__(self, "robot", checked_robot(self.robot, "racket"))
         require_one_of(HIT.suites, "suite", self.suite)
 
 

@@ -1,33 +1,40 @@
-"""The robot of a run: a ready one, or that of a file; the manifest holds all of it."""
+"""The robot of a run: a ready one, or that of a file; the manifest holds all of it.
+
+Robots are imported where one is named, so that a command's help needs no NumPy.
+"""
 
 from collections.abc import Mapping
 from typing import Any
 
 from planner_jax.registry import UnknownName
-from planner_jax.robot.quadrotor_file import RobotError, model_of
-from planner_jax.robot.quadrotor_model import QuadrotorModel
-from planner_jax.robot.quadrotor_models import robot_named
 from planner_jax.sweep.settings import SettingError, option
 
 
 def robot_option(usual: str) -> Any:
-    """The field of settings `robot`, None for the usual robot of the task."""
+    """The field of settings `robot`, a `QuadrotorModel`, or None for the usual one of the task."""
     words = f"as `planner-jax robots` lists them, or a file .yaml, .yml, .xml (default: {usual})"
     return option(None, "NAME", words)
 
 
-def checked_robot(given: Any, tool: str) -> QuadrotorModel | None:
+def checked_robot(given: Any, tool: str) -> Any:
     """The robot that a setting names.
 
     Args:
         given: a name or a file, a robot, its fields as a manifest has them, or None.
-        tool: the kind that it has to carry.
+        tool: the kind that it has to carry, "net" or "racket".
+
+    Returns:
+        The `QuadrotorModel`, or None.
 
     Raises:
         SettingError: there is no such robot, its file is not sound, or it carries something else.
     """
     if given is None:
         return None
+    from planner_jax.robot.quadrotor_file import RobotError, model_of
+    from planner_jax.robot.quadrotor_model import QuadrotorModel
+    from planner_jax.robot.quadrotor_models import robot_named
+
     try:
         found = model_of(given) if isinstance(given, Mapping) else given
         found = robot_named(found) if isinstance(found, str) else found

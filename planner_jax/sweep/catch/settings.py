@@ -2,10 +2,9 @@
 
 import dataclasses
 import math
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from planner_jax.registry import UnknownName, split_name
-from planner_jax.robot.quadrotor_model import NET, QuadrotorModel
 from planner_jax.sweep.robots import checked_robot, robot_option
 from planner_jax.sweep.settings import (
     SettingError,
@@ -40,7 +39,7 @@ class CatchSettings(SweepSettings):
         "or all around its centre",
     )
 
-    robot: QuadrotorModel | None = robot_option("paper-catcher")
+    robot: Any = robot_option("paper-catcher")
 
     RUN: ClassVar[str] = "planner_jax.sweep.catch.sweep:CatchSweep"
     PLANNER: ClassVar[tuple[str, ...]] = ("decide",)
@@ -52,7 +51,7 @@ class CatchSettings(SweepSettings):
         super().__post_init__()
         tolerance = self.tolerance
         require_scale(self.limit_scale)
-        object.__setattr__(self, "robot", checked_robot(self.robot, NET))
+        object.__setattr__(self, "robot", checked_robot(self.robot, "net"))
         try:
             split_name(DECISIONS, "decide", self.decide, TRAINED)
         except UnknownName as error:
