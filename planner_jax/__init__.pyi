@@ -38,10 +38,12 @@ from .registry import Task as Task
 from .registry import task_named as task_named
 from .robot.quadrotor import QuadrotorLimits as QuadrotorLimits
 from .robot.quadrotor import RotorLimits as RotorLimits
+from .robot.quadrotor_file import read_robot as read_robot
 from .robot.quadrotor_model import FlightLimits as FlightLimits
 from .robot.quadrotor_model import QuadrotorModel as QuadrotorModel
 from .robot.quadrotor_model import Rotors as Rotors
 from .robot.quadrotor_model import Tool as Tool
+from .robot.quadrotor_models import robot as robot
 from .rules import CaseError as CaseError
 from .rules import require_sound as require_sound
 from .task import block as block

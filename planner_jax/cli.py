@@ -160,6 +160,9 @@ def _parser() -> _Parser:
     view.add("--port", type=_whole, default=8080, metavar="N", help=free)
     report = command("report", "write table, figures and page of a run anew", _report)
     report.add_argument("run", metavar="RUN", help="folder of a finished run")
+    words = "ready robots with their main figures, or one of them as a YAML file to begin from"
+    robots = command("robots", words, _robots)
+    robots.add_argument("robot", metavar="NAME", nargs="?", help="one of them, or a file")
     words = "write a plan for a controller, or send it in real time"
     commands.add_parser("export", help=words, fill=_add_export, **hidden)
     bench = commands.add_parser("bench", help="measure this machine")
@@ -168,6 +171,17 @@ def _parser() -> _Parser:
     kinds.add_parser("throughput", help=words, fill=_add_throughput, **hidden)
     command("doctor", "versions, devices, precision, cache and a timed plan", _doctor)
     return parser
+
+
+def _robots(options: dict[str, Any]) -> None:
+    from planner_jax.robot.quadrotor_file import RobotError, as_yaml
+    from planner_jax.robot.quadrotor_models import listing, robot_named
+
+    name = options["robot"]
+    try:
+        print(listing() if name is None else as_yaml(robot_named(name)), end="")
+    except RobotError as error:
+        raise SettingError(f"NAME must be a sound robot: {error}") from None
 
 
 def _add_library(commands: Any) -> None:
@@ -452,12 +466,12 @@ def _print_sweep(manifest: dict[str, Any], out: str) -> None:
 
 
 def _fly(task: Task, kind: type, given: dict[str, Any]) -> None:
-    keep_compiled_programs()
-    from planner_jax.sims.run import start_flights
-
     out = _out(given) or _run_folder(f"fly-{task.name}")
     kept = {name: given.pop(name) for name in ("video", "record") if name in given}
     settings = kind(**given)
+    keep_compiled_programs()
+    from planner_jax.sims.run import start_flights
+
     with _told_how_to_go_on(lambda: "nothing is kept of these flights, fly again"):
         start_flights(settings, out, **kept)
     _print_flights(Path(out))

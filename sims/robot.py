@@ -5,7 +5,6 @@ tool, `robots/car/robot.py` and `robots/arm/robot.py` are two without. Its part 
 comes first in `qpos` and `qvel`, before that of the balls; all of `act` is its own.
 """
 
-import dataclasses
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import jax.numpy as jnp
@@ -13,18 +12,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-
-@dataclasses.dataclass(frozen=True)
-class Tool:
-    """What meets the ball: a disc that is the hoop of a net, or a racket."""
-
-    kind: str  # "net" or "racket"
-    height: float  # [m], of the disc's centre above the origin of the body that carries it
-    radius: float  # [m]
-
-    def __post_init__(self) -> None:
-        if self.kind not in ("net", "racket"):
-            raise ValueError(f"kind must be net or racket, got {self.kind!r}")
+from planner_jax.robot.quadrotor_model import QuadrotorModel, Tool
 
 
 @struct.dataclass
@@ -128,6 +116,11 @@ class Robot(Protocol):
 
 class ToolRobot(Robot, Protocol):
     """A robot that meets balls with a tool."""
+
+    @property
+    def model(self) -> QuadrotorModel:
+        """What plans are made for."""
+        ...
 
     @property
     def tool(self) -> Tool:

@@ -13,6 +13,7 @@ from planner_jax.registry import Task, UnknownName, all_tasks, split_name
 from planner_jax.sims.noise import NOISES, PLANE_NOISES, PlaneSensing, Sensing, require_whole
 from planner_jax.sims.robots.arm.drives import ENCODERS, TORQUES, Drives
 from planner_jax.sweep.block.settings import REGIMES, require_frame_rate, require_moderate
+from planner_jax.sweep.robots import checked_robot, robot_option
 from planner_jax.sweep.settings import (
     SettingError,
     option,
@@ -167,12 +168,15 @@ class CatchFly(BallFly):
         "rate at which order and times are decided anew, 0 for never (default: that of --replan)",
     )
 
+    robot: Any = robot_option("paper-catcher")
+
     TASK: ClassVar[Task] = CATCH
     FLIGHT: ClassVar[str] = "planner_jax.sims.tasks.catch:CatchFlight"
     RATE: ClassVar[float] = 100.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        object.__setattr__(self, "robot", checked_robot(self.robot, "net"))
         require_count("balls", self.balls, 1)
         require(self.balls <= _MOST_BALLS, "balls", f"<= {_MOST_BALLS}", self.balls)
         try:
@@ -215,12 +219,15 @@ class HitFly(BallFly):
     planner: str = option("exact", "NAME", "of plans from scratch")
     suite: str = option("S.1", "NAME", "of serves")
 
+    robot: Any = robot_option("paper-hitter")
+
     TASK: ClassVar[Task] = HIT
     FLIGHT: ClassVar[str] = "planner_jax.sims.tasks.hit:HitFlight"
     RATE: ClassVar[float] = 50.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        object.__setattr__(self, "robot", checked_robot(self.robot, "racket"))
         require_one_of(HIT.suites, "suite", self.suite)
 
 

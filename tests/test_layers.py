@@ -24,6 +24,7 @@ ALLOWED = {
             "protocol",
             "referee",
             "registry",
+            "robot",
             "rules",
         ),
         *("task", "trajectory"),
@@ -43,7 +44,7 @@ ALLOWED = {
     "ball": {"arithmetic", "checks", "lanes", "rules"},
     "perception": {"ball"},
     "trajectory": {"arithmetic"},
-    "robot": {"arithmetic", "checks", "plain_files", "protocol", "trajectory"},
+    "robot": {"arithmetic", "checks", "plain_files", "protocol", "registry", "trajectory"},
     "plane": {"checks", "rules"},
     "space": set(),
     "cost": {"arithmetic", "checks", "lanes", "robot", "rules", "trajectory"},
@@ -68,8 +69,8 @@ ALLOWED = {
     "compile_cache": set(),
     "doctor": {"compile_cache", "lanes", "planning", "protocol", "registry", "sweep"},
     "cli": {
-        *("compile_cache", "digits", "doctor", "export", "plan_files", "registry", "stopping"),
-        "sweep",
+        *("compile_cache", "digits", "doctor", "export", "plan_files", "registry", "robot"),
+        *("stopping", "sweep"),
     },
     "__main__": {"cli", "stopping"},
 }

@@ -1,6 +1,7 @@
 """Whole flights in closed loop: what is planned is flown, and noise is borne."""
 
 import dataclasses
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -8,11 +9,14 @@ import jax
 import numpy as np
 import pytest
 
+import planner_jax as pj
 from planner_jax.protocol import is_unsolved
 from planner_jax.sims.loop import Loop
 from planner_jax.sims.noise import NOISES
+from planner_jax.sims.robots.quadrotor.robot import Quadrotor
 from planner_jax.sims.tasks.catch import (
     CATCH_WORLD,
+    bounds,
     fly_catches,
     is_better,
     planned_ahead,
@@ -80,8 +84,9 @@ def test_a_plan_that_is_given_is_the_one_that_is_flown(catches):
 
 def with_tool(world, **changes):
     """The world, its robot's tool changed."""
-    robot = dataclasses.replace(world.robot, tool=dataclasses.replace(world.robot.tool, **changes))
-    return dataclasses.replace(world, robot=robot)
+    tool = dataclasses.replace(world.robot.tool, **changes)
+    model = dataclasses.replace(world.robot.model, tool=tool)
+    return dataclasses.replace(world, robot=dataclasses.replace(world.robot, model=model))
 
 
 MOON = {"gravity": 1.62}
@@ -127,7 +132,8 @@ def test_a_ball_is_planned_for_alone_where_no_plan_of_the_next_one_is_possible()
     both = dataclasses.replace(suite, present=np.ones((2, 2), bool))
     # The second lane's next ball is to be caught at once.
     both = dataclasses.replace(both, horizon=both.horizon * np.array([[1.0, 2.0], [1.0, 0.02]]))
-    known, plans = planned_ahead(catch.planner(decide="greedy"), both, 0)
+    widest = bounds(Loop(CATCH_WORLD), (0.0, 1.0))
+    known, plans = planned_ahead(catch.planner(decide="greedy"), both, 0, widest)
     assert not known.present[1, 1] and known.present[1, 0]
     assert not is_unsolved(plans.status).any()
 
@@ -194,3 +200,22 @@ def test_a_hit_that_is_planned_anew_lands_on_the_target():
     assert exact.miss.max() < 0.05
     noisy = fly_hits(Loop(HIT_WORLD, NOISES["lab"], replan=50.0), volleys(4, REAL_SCENARIOS["S.4"]))
     assert noisy.miss.max() < 0.5
+
+
+@pytest.mark.slow
+def test_a_robot_of_its_own_is_hit_with_where_it_was_planned():
+    robot = pj.read_robot(Path(__file__).parent / "data" / "my_quadrotor.yaml")
+    world = dataclasses.replace(HIT_WORLD, robot=Quadrotor(robot))
+    served = volleys(4, REAL_SCENARIOS["S.1"], seed=1, robot=robot)
+    flights = fly_hits(Loop(world), served)
+    assert flights.flown.tracking[:, 1].max() < 0.02
+    assert (flights.miss < 0.5).all()
+
+
+@pytest.mark.slow
+def test_a_heavy_robot_with_a_large_net_catches():
+    robot = pj.robot("x500-net")
+    world = dataclasses.replace(CATCH_WORLD, robot=Quadrotor(robot))
+    flights = fly_catches(Loop(world), throws(4, seed=1, robot=robot))
+    assert flights.flown.tracking[:, 1].max() < 0.05
+    assert flights.caught.mean() >= 0.75

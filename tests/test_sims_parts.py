@@ -12,6 +12,7 @@ import pytest
 
 from planner_jax.ball.flight import BallState, fly
 from planner_jax.robot.quadrotor import flat_attitude
+from planner_jax.robot.quadrotor_model import FlightLimits
 from planner_jax.sims.launch import awaited, ready, require_plan, require_world
 from planner_jax.sims.loop import Loop, expected
 from planner_jax.sims.model import (
@@ -23,9 +24,10 @@ from planner_jax.sims.model import (
     step,
 )
 from planner_jax.sims.noise import NOISES, Sensing
+from planner_jax.sims.robots.quadrotor.allocation import rotor_thrusts
 from planner_jax.sims.robots.quadrotor.control import rotation_error
 from planner_jax.sims.robots.quadrotor.reference import with_rest
-from planner_jax.sims.robots.quadrotor.vehicle import Vehicle, allocation, rotor_thrusts
+from planner_jax.sims.robots.quadrotor.robot import Quadrotor
 from planner_jax.sims.scenery import machine_parts, outlines
 from planner_jax.sims.scoring import Moment, nearest, no_contact, passage
 from planner_jax.sims.sensing import (
@@ -36,7 +38,7 @@ from planner_jax.sims.sensing import (
     predicted,
     with_drag,
 )
-from planner_jax.sims.tasks.catch import CATCH_WORLD
+from planner_jax.sims.tasks.catch import _BEHIND, _FIRST, _WIDEST, CATCH_WORLD, bounds
 from planner_jax.sims.tasks.hit import HIT_WORLD, court_parts
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
@@ -44,25 +46,72 @@ NET = CATCH_WORLD.robot.tool
 GRAVITY = jnp.float32(9.81)
 
 
-def test_rotor_thrusts_are_the_inverse_of_the_allocation():
-    thrust, torque = jnp.float32(12.0), jnp.array([0.2, -0.1, 0.02])
-    rotors = rotor_thrusts(Vehicle(), thrust, torque)
-    np.testing.assert_allclose(allocation(Vehicle()) @ rotors, [12.0, 0.2, -0.1, 0.02], atol=1e-5)
+ROTORS = CATCH_WORLD.robot.model.rotors
+LOPSIDED = dataclasses.replace(
+    ROTORS, places=((0.14, 0.08), (-0.09, 0.13), (-0.12, -0.09), (0.11, -0.1)), min_thrust=0.3
+)
+SPARE = 1.0
+rotors_of_either = pytest.mark.parametrize("rotors", [ROTORS, LOPSIDED], ids=["cross", "lopsided"])
 
 
-def test_saturated_rotors_keep_roll_and_pitch_and_let_yaw_go_first():
-    rotors = rotor_thrusts(Vehicle(), jnp.float32(12.0), jnp.array([0.2, -0.1, 5.0]))
-    assert rotors.min() >= 0.0 and rotors.max() <= Vehicle().max_rotor_thrust
-    np.testing.assert_allclose((allocation(Vehicle()) @ rotors)[:3], [12.0, 0.2, -0.1], atol=1e-5)
-    weak = rotor_thrusts(Vehicle(), jnp.float32(0.5), jnp.array([0.4, 0.0, 0.0]))
-    np.testing.assert_allclose((allocation(Vehicle()) @ weak)[1:], [0.4, 0.0, 0.0], atol=1e-5)
+def thrusts(rotors, thrust, torque):
+    return np.asarray(rotor_thrusts(rotors, jnp.float32(thrust), jnp.float32(torque), SPARE))
+
+
+def test_the_papers_rotors_stand_crosswise_and_turn_against_their_neighbours():
+    np.testing.assert_allclose(np.hypot(*ROTORS.positions[:, :2].T), 0.165)
+    angles = np.degrees(np.arctan2(ROTORS.positions[:, 1], ROTORS.positions[:, 0]))
+    np.testing.assert_allclose(angles, [45.0, 135.0, -135.0, -45.0])
+    np.testing.assert_allclose(ROTORS.allocation[3], [0.016, -0.016, 0.016, -0.016])
+    assert (ROTORS.max_thrust, ROTORS.lag) == (11.8, 0.02)
+    np.testing.assert_allclose(CATCH_WORLD.robot.gains.spare * ROTORS.max_thrust, 1.0)
+
+
+@rotors_of_either
+def test_rotor_thrusts_are_the_inverse_of_the_allocation(rotors):
+    found = thrusts(rotors, 12.0, [0.2, -0.1, 0.02])
+    np.testing.assert_allclose(rotors.allocation @ found, [12.0, 0.2, -0.1, 0.02], atol=1e-5)
+
+
+@rotors_of_either
+def test_saturated_rotors_keep_roll_and_pitch_and_let_yaw_go_first(rotors):
+    found = thrusts(rotors, 12.0, [0.2, -0.1, 5.0])
+    assert found.min() > rotors.min_thrust - 1e-6 and found.max() <= rotors.max_thrust
+    np.testing.assert_allclose((rotors.allocation @ found)[:3], [12.0, 0.2, -0.1], atol=1e-5)
+    weak = thrusts(rotors, 0.5, [0.2, 0.0, 0.0])
+    np.testing.assert_allclose((rotors.allocation @ weak)[1:], [0.2, 0.0, 0.0], atol=1e-5)
+    assert weak.min() > rotors.min_thrust - 1e-6
 
 
 def test_a_torque_raises_a_weak_thrust_no_further_than_is_spared_for_it():
-    rotors = rotor_thrusts(Vehicle(), jnp.float32(1.0), jnp.array([2.0, 0.0, 0.0]))
-    thrust, roll = (allocation(Vehicle()) @ rotors)[:2]
+    found = thrusts(ROTORS, 1.0, [2.0, 0.0, 0.0])
+    thrust, roll = (ROTORS.allocation @ found)[:2]
     assert 0.0 < roll < 2.0
-    np.testing.assert_allclose(thrust, 1.0 + 4.0 * Vehicle().spare_thrust, rtol=1e-5)
+    np.testing.assert_allclose(thrust, 1.0 + 4.0 * SPARE, rtol=1e-5)
+
+
+@rotors_of_either
+def test_at_rest_the_rotors_carry_the_robot_without_turning_it(rotors):
+    model = dataclasses.replace(CATCH_WORLD.robot.model, rotors=rotors)
+    robot = dataclasses.replace(CATCH_WORLD.robot, model=model)
+    lift = robot.at_rest(jnp.zeros(3), 9.81)[2]
+    wrench = rotors.allocation @ np.asarray(lift)
+    np.testing.assert_allclose(wrench, [model.mass * 9.81, 0.0, 0.0, 0.0], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("distance", "thrust", "rate"), [(_FIRST, 0.5, 3.0), (_BEHIND, 0.4, 4.5), (_WIDEST, 0.3, 5.0)]
+)
+def test_plans_in_flight_stay_within_the_limits_of_the_robot(distance, thrust, rate):
+    found = bounds(Loop(CATCH_WORLD), distance)
+    np.testing.assert_allclose(list(found.values()), [thrust * 9.81, rate])
+    model = dataclasses.replace(
+        CATCH_WORLD.robot.model, limits=FlightLimits(speed=5.0, body_rate=8.0, thrust=(6.0, 14.0))
+    )
+    world = dataclasses.replace(CATCH_WORLD, robot=Quadrotor(model))
+    own = bounds(Loop(world), distance)
+    assert 6.0 <= own["min_thrust"] < 9.81 and own["body_rate"] <= 8.0
+    np.testing.assert_allclose(own["body_rate"], 8.0 * rate / 5.0)
 
 
 def test_the_flat_body_rate_is_that_of_the_flat_attitude():

@@ -77,6 +77,11 @@ class Rotors:
         """The matrix (4, 4) from total thrust [N] and torque [N m] to rotor thrusts [N]."""
         return np.linalg.inv(self.allocation)
 
+    @property
+    def shares(self) -> np.ndarray:
+        """The part (4,) of a total thrust that each rotor has where they do not turn the body."""
+        return self.mixer[:, 0]
+
 
 def cross(diagonal: float) -> tuple[tuple[float, float], ...]:
     """Places of four rotors at 45, 135, 225 and 315 degrees, by the distance of opposite ones."""
@@ -133,16 +138,37 @@ class QuadrotorModel:
             raise ValueError(f"inertia must be 3 numbers, got {self.inertia}")
         for axis in self.inertia:
             _require("inertia", axis, above=0.0)
+        if not 2.0 * max(self.inertia) <= sum(self.inertia) * (1.0 + 1e-9):
+            raise ValueError(
+                f"inertia must be of a body, none above the other two together, got {self.inertia}"
+            )
         weight, most = self.mass * GRAVITY, 4.0 * self.rotors.max_thrust
         if not most > weight:
             raise ValueError(
                 f"4 x rotors.max_thrust must be > the weight of {weight:.3g} N, got {most:.3g} N"
+            )
+        lift = weight * self.rotors.shares
+        if not np.all((lift > self.rotors.min_thrust) & (lift < self.rotors.max_thrust)):
+            shown = " ".join(f"{each:.3g}" for each in lift)
+            raise ValueError(
+                f"rotors.places must let each rotor carry its part of the weight, got {shown} N"
             )
         thrust = self.limits.thrust
         if thrust is not None and not thrust[0] < GRAVITY < thrust[1]:
             raise ValueError(
                 f"limits.thrust must include the weight of {GRAVITY} m/s^2, got {thrust}"
             )
+
+    def __str__(self) -> str:
+        return repr(self.name)
+
+    @property
+    def thrust_bounds(self) -> tuple[float, float]:
+        """Least and greatest thrust per unit mass [m/s^2], those of its rotors if none are said."""
+        if self.limits.thrust is not None:
+            return self.limits.thrust
+        low, high = self.rotor_range or (self.rotors.min_thrust, self.rotors.max_thrust)
+        return 4.0 * low / self.mass, 4.0 * high / self.mass
 
     @property
     def rotor_range(self) -> tuple[float, float] | None:

@@ -18,6 +18,8 @@ MOTION = leaves_of(
     ("min_height", "m", "of the propeller plane"),
     ("min_thrust", "m/s^2", "per unit mass"),
     ("max_thrust", "m/s^2", "per unit mass"),
+    ("min_rotor_thrust", "N", "of any rotor; NaN where plans are not asked what the rotors do"),
+    ("max_rotor_thrust", "N", "likewise"),
     ("continuity_error", "m", "worst jump between pieces"),
     ("head_error", "m", "of the state at time 0"),
 )

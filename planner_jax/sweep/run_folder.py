@@ -188,7 +188,7 @@ class RunFolder:
         """Raise `SettingError` unless a sweep has its summary and all its rows."""
         if "summary" not in manifest or not self.plans.exists():
             rule = f"{self.name} must be finished"
-            raise SettingError(f"{rule}, got {str(self.path)!r}; resume it first")
+            raise SettingError(f"{rule}, got {self.shown!r}; resume it first")
 
     def require_whole(self, manifest: dict[str, Any], remedy: str) -> None:
         """Raise `SettingError` if a file of the run is missing or damaged.

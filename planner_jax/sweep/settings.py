@@ -118,8 +118,8 @@ class SweepSettings:
         return {name: getattr(self, name) for name in self.PLANNER}
 
     def draw_options(self) -> dict[str, Any]:
-        """Options of the task's `draw` that these settings decide."""
-        return {name: getattr(self, name) for name in self.DRAW}
+        """Options of the task's `draw` that these settings decide; None is left to it."""
+        return {name: value for name in self.DRAW if (value := getattr(self, name)) is not None}
 
     def judge_options(self) -> dict[str, Any]:
         """Options of the task's `judge` that these settings decide."""
@@ -175,8 +175,8 @@ def settings_to_resume(
     settings = settings_of_manifest(kind, parameters, "out")
     asked = dataclasses.replace(settings, **given)
     for name in given:
-        old, new = getattr(settings, name), getattr(asked, name)
-        require(new == old, name, f"{old} as in the run that is resumed", new)
+        part, old, new = _difference(name, getattr(settings, name), getattr(asked, name))
+        require(new == old, part, f"{old} as in the run that is resumed", new)
     return settings
 
 
@@ -198,3 +198,13 @@ def settings_of_manifest(
     except (TypeError, ValueError) as error:
         rule = "a run with settings of this version"
         raise SettingError(f"{name} must be {rule}, got others: {error}") from None
+
+
+def _difference(name: str, old: Any, new: Any) -> tuple[str, Any, Any]:
+    """Where two settings of a name differ: the name of the first part that does, and its values."""
+    if dataclasses.is_dataclass(old) and type(old) is type(new):
+        for field in dataclasses.fields(old):
+            mine, other = getattr(old, field.name), getattr(new, field.name)
+            if mine != other:
+                return _difference(f"{name}.{field.name}", mine, other)
+    return name, old, new

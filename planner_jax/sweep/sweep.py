@@ -194,8 +194,14 @@ def sweep_of_run(manifest: dict[str, Any], name: str = "out") -> Sweep:
 def first_values(tree: Any, names: Sequence[str] = (), prefix: str = "") -> dict[str, Any]:
     """Leaves of the first case as plain numbers, to six digits so that float32 does not show.
 
-    Without `names` these are all fields of the tree.
+    Without `names` these are all fields of the tree. Those that are not there, and those that hold
+    fields of their own, are left out.
     """
     names = names or [field.name for field in dataclasses.fields(tree)]
-    leaves = {prefix + name: np.asarray(getattr(tree, name), float)[0] for name in names}
+    known = {name: getattr(tree, name) for name in names}
+    leaves = {
+        prefix + name: np.asarray(value, float)[0]
+        for name, value in known.items()
+        if value is not None and not dataclasses.is_dataclass(value)
+    }
     return {name: leaf.round(6).tolist() for name, leaf in leaves.items()}

@@ -24,6 +24,12 @@ def require_tool(robot: Any, kind: str) -> Tool:
     return robot.tool
 
 
+def require_own_robot(robot: Any, usual: QuadrotorModel, suite: str) -> None:
+    """Raise `ValueError` if a robot is named for a suite of another package, which has its own."""
+    if robot != usual:
+        raise ValueError(f"robot must be left out with suite {suite!r}, which has its own")
+
+
 def limits_of(robot: QuadrotorModel, leaf: Callable[..., Array], **given: Any) -> QuadrotorLimits:
     """The limits of a case, a robot's where they are not given.
 
@@ -36,9 +42,8 @@ def limits_of(robot: QuadrotorModel, leaf: Callable[..., Array], **given: Any) -
     """
     own = robot.limits
     least, most = own.thrust or (None, None)
-    if own.thrust is None and robot.tool.kind == NET:
-        low, high = robot.rotor_range or (robot.rotors.min_thrust, robot.rotors.max_thrust)
-        least, most = 4.0 * low / robot.mass, 4.0 * high / robot.mass
+    if robot.tool.kind == NET:
+        least, most = robot.thrust_bounds
     known = {
         "speed": own.speed,
         "body_rate": own.body_rate,

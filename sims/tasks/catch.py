@@ -24,6 +24,8 @@ from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.planning.plan import plan as plan_all
 from planner_jax.planning.replan import Replanning
 from planner_jax.protocol import AnyPlanner, is_unsolved
+from planner_jax.robot.quadrotor_model import QuadrotorModel
+from planner_jax.robot.quadrotor_models import PAPER_CATCHER
 from planner_jax.sims.launch import (
     awaited,
     flight_keys,
@@ -35,14 +37,13 @@ from planner_jax.sims.launch import (
 from planner_jax.sims.loop import FlightState, Flown, Loop, Outlook, expected, flown, fly_leg
 from planner_jax.sims.model import World
 from planner_jax.sims.recording import Launches
-from planner_jax.sims.robot import Tool
 from planner_jax.sims.robots.quadrotor.robot import Quadrotor
 from planner_jax.sims.scoring import passage
 from planner_jax.sims.settings import INTERVAL, CatchFly, require_interval
 from planner_jax.sims.task import BallFlightTask, FlightCases, Flights
 from planner_jax.sweep.columns import BOOL, Column, list_of
 from planner_jax.task.catch.card import DECISIONS, TRAINED
-from planner_jax.task.catch.case import GRAVITY, NET_HEIGHT, NET_RADIUS, START, CatchCase
+from planner_jax.task.catch.case import GRAVITY, START, CatchCase
 from planner_jax.task.catch.case import case as catch_case
 from planner_jax.task.catch.exact import ExactCatch
 from planner_jax.task.catch.plan import CatchPlan
@@ -52,14 +53,15 @@ from planner_jax.task.catch.words import planner as catch_planner
 from planner_jax.task.hit.case import DRAG  # of the published serves; paper 000 gives none
 from planner_jax.task.named_decision import named_decision
 
-CATCH_WORLD = World(Quadrotor(Tool("net", NET_HEIGHT, NET_RADIUS)), GRAVITY, mouth=LAUNCH)
+CATCH_WORLD = World(Quadrotor(PAPER_CATCHER), GRAVITY, mouth=LAUNCH)
 SEEN = 0.3  # [s], a throw's flight before it is planned for: 2 m and more (paper 000, VII-A)
 _TABLE_NODES = 36
-_AIM_RADIUS = 0.05  # [m], of the net that plans are made for; the rest is left for errors
-# Least thrust [g] and greatest body rate [rad/s] of plans. A weak thrust and a fast turn leave
-# control little; the first catch stays away from them, so that the next can begin within bounds.
-# Where nothing else is left, plans go as far as the shared protocol admits.
-_FIRST, _BEHIND, _WIDEST = (0.5, 3.0), (0.4, 4.5), (0.3, 5.0)
+_AIM = 0.4  # share of the net's radius that plans are made for; the rest is left for errors
+# How far plans stay from the robot's least thrust, of the way from there to hover, and their share
+# of its body rate. A weak thrust and a fast turn leave control little; the first catch stays away
+# from them, so that the next can begin within bounds. Where nothing else is left, plans go as far
+# as the robot does.
+_FIRST, _BEHIND, _WIDEST = (2.0 / 7.0, 0.6), (1.0 / 7.0, 0.9), (0.0, 1.0)
 _KEPT = 0.01  # relative excess up to which limits count as kept by a plan of the loop
 _CHEAPER = 0.95  # share of the cost below which a plan from scratch replaces one that keeps them
 _INSTANT = 1e-3  # [s], shorter than any look
@@ -174,7 +176,13 @@ class Throws(FlightCases):
 
 
 def throws(
-    num: int, num_balls: int = 1, seed: int = 0, *, drag: float = DRAG, drag_error: float = 0.0
+    num: int,
+    num_balls: int = 1,
+    seed: int = 0,
+    *,
+    drag: float = DRAG,
+    drag_error: float = 0.0,
+    robot: QuadrotorModel = PAPER_CATCHER,
 ) -> Throws:
     """Balls of the suite `throws`, which from there on fly with quadratic drag.
 
@@ -184,12 +192,13 @@ def throws(
         seed: >= 0, of the throws and of the signs of the drag's errors.
         drag: K_D [1/m], the true one.
         drag_error: relative error of what is believed of it, either way.
+        robot: with a net.
     """
     if num_balls < 1:
         raise ValueError(f"num_balls must be >= 1, got {num_balls}")
     if not 0.0 <= drag_error < 1.0:
         raise ValueError(f"drag_error must be >= 0 and < 1, got {drag_error}")
-    suite = jax.tree.map(np.asarray, draw(num * num_balls, "throws", seed))
+    suite = jax.tree.map(np.asarray, draw(num * num_balls, "throws", seed, robot=robot))
     shaped = lambda leaf: leaf[:, 0].reshape(num, num_balls, *leaf.shape[2:])  # noqa: E731
     first = lambda leaf: leaf[::num_balls]  # noqa: E731
     true = np.full((num, num_balls), drag, np.float32)
@@ -234,16 +243,14 @@ def believed(loop: Loop, flights: FlightState, new: Array, horizon: Array) -> Ca
         horizon: (B, N) [s] from now, until when each may be caught.
     """
     unknown: Any = None
-    least_thrust, body_rate = _FIRST if flights.plan is None else _BEHIND
     robot = loop.world.carrier
     empty = catch_case(
         unknown,
         np.zeros(horizon.shape),
+        robot=robot.model,
         gravity=loop.world.gravity,
-        net_height=robot.tool.height,
-        net_radius=_AIM_RADIUS,
-        min_thrust=least_thrust * loop.world.gravity,
-        body_rate=body_rate,
+        net_radius=_AIM * robot.tool.radius,
+        **bounds(loop, _FIRST if flights.plan is None else _BEHIND),
     )
 
     def one(case: CatchCase, flight: FlightState, horizon: Array) -> CatchCase:
@@ -387,7 +394,7 @@ def fly_catches(
         else:
             known = jax.tree.map(np.asarray, known)
             began = time.perf_counter()
-            known, found = planned_ahead(planner, known, ball)
+            known, found = planned_ahead(planner, known, ball, bounds(loop, _WIDEST))
             planning += time.perf_counter() - began
         first = found if first is None else first
         begun = jax.tree.map(jnp.asarray, found)
@@ -405,7 +412,10 @@ def fly_catches(
 
 
 def planned_ahead(
-    planner: AnyPlanner[CatchCase, CatchPlan], known: CatchCase, ball: int
+    planner: AnyPlanner[CatchCase, CatchPlan],
+    known: CatchCase,
+    ball: int,
+    widest: dict[str, Any],
 ) -> tuple[CatchCase, CatchPlan]:
     """Plans from scratch that catch a ball and, where that is possible too, the next one.
 
@@ -416,6 +426,7 @@ def planned_ahead(
         planner: of catches, which also decides about their order.
         known: of both balls, or of the last one, a batch with NumPy leaves.
         ball: its place among the targets.
+        widest: limits, as `bounds` has them.
 
     Returns:
         The cases and their plans; `present` says which catches each has.
@@ -423,7 +434,7 @@ def planned_ahead(
     alone = np.arange(known.num_targets) == ball
     cases, plans = known, plan_all(planner, known)
     last = ball == known.num_targets - 1
-    for limits in (_WIDEST,) if last else (None, _WIDEST):
+    for limits in (widest,) if last else (None, widest):
         lanes = np.flatnonzero(is_unsolved(np.asarray(plans.status)))
         if not lanes.size:
             break
@@ -443,16 +454,25 @@ def planned_ahead(
     return cases, plans
 
 
-def within(cases: CatchCase, limits: tuple[float, float] | None) -> CatchCase:
-    """Cases with NumPy leaves with another least thrust [g] and greatest body rate [rad/s]."""
+def within(cases: CatchCase, limits: dict[str, Any] | None) -> CatchCase:
+    """Cases with NumPy leaves with other limits, as `bounds` has them."""
     if limits is None:
         return cases
-    thrust, rate = limits
-    gravity, old = cases.gravity, cases.limits
-    new = dataclasses.replace(
-        old, min_thrust=thrust * gravity, body_rate=np.full_like(old.body_rate, rate)
-    )
-    return dataclasses.replace(cases, limits=new)
+    leaves = {
+        name: np.full_like(getattr(cases.limits, name), value) for name, value in limits.items()
+    }
+    return dataclasses.replace(cases, limits=dataclasses.replace(cases.limits, **leaves))
+
+
+def bounds(loop: Loop, distance: tuple[float, float]) -> dict[str, Any]:
+    """Least thrust [m/s^2] and greatest body rate [rad/s] of plans, as `_FIRST` has them."""
+    model, gravity = loop.world.carrier.model, loop.world.gravity
+    least, _ = model.thrust_bounds
+    above, share = distance
+    return {
+        "min_thrust": least + above * (gravity - least),
+        "body_rate": share * model.limits.body_rate,
+    }
 
 
 class CatchFlight(BallFlightTask):
@@ -467,12 +487,24 @@ class CatchFlight(BallFlightTask):
 
     def world(self) -> World:
         """The simulated world, with as many balls as are thrown."""
-        return dataclasses.replace(CATCH_WORLD, num_balls=self.settings.balls)
+        robot = Quadrotor(self.robot)
+        return dataclasses.replace(CATCH_WORLD, robot=robot, num_balls=self.settings.balls)
+
+    @property
+    def robot(self) -> QuadrotorModel:
+        """Which quadrotor flies."""
+        return self.settings.robot or PAPER_CATCHER
 
     def cases(self) -> Throws:
         """All throws of the run."""
         settings = self.settings
-        return throws(settings.num, settings.balls, settings.seed, drag_error=settings.drag_error)
+        return throws(
+            settings.num,
+            settings.balls,
+            settings.seed,
+            drag_error=settings.drag_error,
+            robot=self.robot,
+        )
 
     def fly(self, cases: Throws, record: bool) -> CatchFlights:
         """Flights of some throws."""

@@ -18,11 +18,12 @@ from planner_jax.optimise.problem import Round
 from planner_jax.planning.plan import plan as plan_all
 from planner_jax.planning.replan import Replanning
 from planner_jax.protocol import AnyPlanner
+from planner_jax.robot.quadrotor_model import QuadrotorModel
+from planner_jax.robot.quadrotor_models import PAPER_HITTER
 from planner_jax.sims.launch import flight_keys, launched, ready, require_plan, require_world
 from planner_jax.sims.loop import FlightState, Flown, Loop, Outlook, expected, flown, fly_leg
 from planner_jax.sims.model import World
 from planner_jax.sims.recording import Launches
-from planner_jax.sims.robot import Tool
 from planner_jax.sims.robots.quadrotor.robot import Quadrotor
 from planner_jax.sims.scenery import Part
 from planner_jax.sims.scoring import Contact, passage
@@ -32,7 +33,7 @@ from planner_jax.sweep.columns import BOOL, NUMBER, VECTOR, Column
 from planner_jax.sweep.summary import percent
 from planner_jax.task.hit import court
 from planner_jax.task.hit.card import REAL_SCENARIOS
-from planner_jax.task.hit.case import GRAVITY, RACKET_HEIGHT, HitCase
+from planner_jax.task.hit.case import GRAVITY, HitCase
 from planner_jax.task.hit.exact import ExactHit
 from planner_jax.task.hit.plan import HitPlan
 from planner_jax.task.hit.replan import ReplanHit
@@ -72,7 +73,7 @@ def court_parts() -> list[Part]:
 
 
 HIT_WORLD = World(
-    Quadrotor(Tool("racket", RACKET_HEIGHT, radius=0.11)),  # paper 002, Fig. 2
+    Quadrotor(PAPER_HITTER),
     GRAVITY,
     scenery=tuple(court_parts()),
     # Serves come from anywhere in a region: the middle of the far one.
@@ -134,7 +135,12 @@ class Volleys(FlightCases):
 
 
 def volleys(
-    num: int, names: tuple[str, ...] | None = None, seed: int = 0, *, drag_error: float = 0.0
+    num: int,
+    names: tuple[str, ...] | None = None,
+    seed: int = 0,
+    *,
+    drag_error: float = 0.0,
+    robot: QuadrotorModel = PAPER_HITTER,
 ) -> Volleys:
     """Drawn serves, seen for `SEEN` seconds.
 
@@ -143,10 +149,11 @@ def volleys(
         names: out of `court.SCENARIOS`; all of them by default.
         seed: >= 0, of the serves and of the signs of the drag's errors.
         drag_error: relative error of what is believed of K_D, either way.
+        robot: with a racket.
     """
     if not 0.0 <= drag_error < 1.0:
         raise ValueError(f"drag_error must be >= 0 and < 1, got {drag_error}")
-    cases = to_cases(generate_serves(num, seed, names), delay=SEEN)
+    cases = to_cases(generate_serves(num, seed, names), delay=SEEN, robot=robot)
     sign = np.random.default_rng([seed, 1]).choice([-1.0, 1.0], num)
     true = np.asarray(cases.drag)
     believed = (true * (1.0 + drag_error * sign)).astype(np.float32)
@@ -254,13 +261,24 @@ class HitFlight(BallFlightTask):
 
     def world(self) -> World:
         """The simulated world with the court."""
-        return HIT_WORLD
+        return dataclasses.replace(HIT_WORLD, robot=Quadrotor(self.robot))
+
+    @property
+    def robot(self) -> QuadrotorModel:
+        """Which quadrotor flies."""
+        return self.settings.robot or PAPER_HITTER
 
     def cases(self) -> Volleys:
         """All serves of the run."""
         settings = self.settings
         regions = REAL_SCENARIOS.get(settings.suite)
-        return volleys(settings.num, regions, settings.seed, drag_error=settings.drag_error)
+        return volleys(
+            settings.num,
+            regions,
+            settings.seed,
+            drag_error=settings.drag_error,
+            robot=self.robot,
+        )
 
     def fly(self, cases: Volleys, record: bool) -> HitFlights:
         """Flights of some serves."""

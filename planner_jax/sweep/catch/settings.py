@@ -2,9 +2,10 @@
 
 import dataclasses
 import math
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from planner_jax.registry import UnknownName, split_name
+from planner_jax.sweep.robots import checked_robot, robot_option
 from planner_jax.sweep.settings import (
     SettingError,
     SweepSettings,
@@ -38,9 +39,11 @@ class CatchSettings(SweepSettings):
         "or all around its centre",
     )
 
+    robot: Any = robot_option("paper-catcher")
+
     RUN: ClassVar[str] = "planner_jax.sweep.catch.sweep:CatchSweep"
     PLANNER: ClassVar[tuple[str, ...]] = ("decide",)
-    DRAW: ClassVar[tuple[str, ...]] = ("limit_scale",)
+    DRAW: ClassVar[tuple[str, ...]] = ("limit_scale", "robot")
     JUDGE: ClassVar[tuple[str, ...]] = ("tolerance", "net_test")
     GPU_BATCH: ClassVar[int] = 8192  # all orders of six targets at once: 1 MB a case
 
@@ -48,6 +51,7 @@ class CatchSettings(SweepSettings):
         super().__post_init__()
         tolerance = self.tolerance
         require_scale(self.limit_scale)
+        object.__setattr__(self, "robot", checked_robot(self.robot, "net"))
         try:
             split_name(DECISIONS, "decide", self.decide, TRAINED)
         except UnknownName as error:

@@ -167,7 +167,9 @@ def _draw_thrust_limits(axes: Axes, setting: dict[str, Any]) -> None:
         axes.axhline(setting["min_thrust"], **DASHED)
         axes.axhspan(0.0, setting["min_thrust"], **FORBIDDEN)
         return
-    most = setting["acceleration"]
+    most = setting.get("acceleration")
+    if most is None:  # of a robot whose rotors are the only limit
+        return
     bound = gravity + most
     axes.set_ylim(0.0, min(max(axes.get_ylim()[1], 1.1 * bound), 3.0 * most))
     axes.axhline(bound, **{**DASHED, "color": style.GREY})

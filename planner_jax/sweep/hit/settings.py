@@ -6,6 +6,7 @@ import os
 from typing import Any, ClassVar
 
 from planner_jax.digits import written_number
+from planner_jax.sweep.robots import checked_robot, robot_option
 from planner_jax.sweep.settings import (
     SettingError,
     SweepSettings,
@@ -36,8 +37,10 @@ class HitSettings(SweepSettings):
         False, "", "plan and judge the returned ball with drag too (exact only)"
     )
 
+    robot: Any = robot_option("paper-hitter")
+
     RUN: ClassVar[str] = "planner_jax.sweep.hit.sweep:HitSweep"
-    DRAW: ClassVar[tuple[str, ...]] = ("start", "delay", "limit_scale")
+    DRAW: ClassVar[tuple[str, ...]] = ("start", "delay", "limit_scale", "robot")
     JUDGE: ClassVar[tuple[str, ...]] = ("drag_after_impact",)
     DEFAULT_NUM: ClassVar[int] = 9000
     CASE_BYTES: ClassVar[int] = 12_000
@@ -51,6 +54,7 @@ class HitSettings(SweepSettings):
         truer = not self.drag_after_impact or self.planner in (None, "exact")
         require(truer, "drag_after_impact", "left out unless the planner is exact", self.planner)
         object.__setattr__(self, "start", _checked_start(self.start))
+        object.__setattr__(self, "robot", checked_robot(self.robot, "racket"))
         if self.serves is not None:
             object.__setattr__(self, "serves", os.path.abspath(self.serves))
 

@@ -14,6 +14,7 @@ from planner_jax.sweep.hit.figures.motion import motion_figure
 from planner_jax.sweep.hit.figures.rates import compared_with, rates_figure
 from planner_jax.sweep.hit.settings import HitSettings
 from planner_jax.sweep.hit.source import ServeSource, open_source
+from planner_jax.sweep.robots import robot_remark
 from planner_jax.sweep.row_plans import quadrotor_plan
 from planner_jax.sweep.summary import Tally
 from planner_jax.sweep.sweep import RunFigure, Sweep, first_values
@@ -147,6 +148,7 @@ class HitSweep(Sweep):
         if _knows_same_serves(summary, other):
             same = '"Same serves" are the published outcomes of this run\'s cases, where known. '
         return [
+            *robot_remark(settings),
             f"Serves: {summary['num']:,} {origin}; {manifest['serves']['distinct']:,} distinct "
             "balls (cases may share a ball and differ in the target).",
             f"Hover start {start}; planning begins {settings['delay']:g} s after the serve; speed, "

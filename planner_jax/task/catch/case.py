@@ -22,7 +22,6 @@ from planner_jax.task.flight import limits_of, require_tool
 
 GRAVITY = 9.81  # [m/s^2]
 START = (0.0, 0.0, 1.0)  # [m], where the quadrotor hovers
-NET_HEIGHT, NET_RADIUS = PAPER_CATCHER.tool.height, PAPER_CATCHER.tool.radius  # [m]
 
 
 @struct.dataclass

@@ -80,9 +80,12 @@ from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath, HarmonicPath
 from planner_jax.checks import floating, require_scalar
 from planner_jax.registry import suite_named
+from planner_jax.robot.quadrotor_model import QuadrotorModel
+from planner_jax.robot.quadrotor_models import PAPER_CATCHER
 from planner_jax.task.arguments import require_draw
 from planner_jax.task.catch.card import SUITES, TASK
 from planner_jax.task.catch.case import GRAVITY, CatchCase, case
+from planner_jax.task.flight import require_own_robot
 from planner_jax.task.scales import scale_problem
 
 LAUNCH = (4.0, 0.0, 0.8)  # [m], of every throw
@@ -119,6 +122,7 @@ def draw(
     *,
     first: int = 0,
     limit_scale: float = 1.0,
+    robot: QuadrotorModel = PAPER_CATCHER,
     num_targets: int | None = None,
     dtype: Any = jnp.float32,
 ) -> CatchCase:
@@ -133,6 +137,7 @@ def draw(
         first: place of the first one, >= 0.
         limit_scale: factor on the limits of speed and body rate, and on how far the thrust may
             be from that of hover.
+        robot: with a net; suites of other packages have their own.
         num_targets: N, how many targets the shape holds, at least the suite's own; those
             beyond these are absent, and copies of the first.
         dtype: of every floating leaf.
@@ -147,6 +152,7 @@ def draw(
     if problem := scale_problem(limit_scale):
         raise ValueError(problem)
     if suite not in SUITES:
+        require_own_robot(robot, PAPER_CATCHER, suite)
         return TASK.other_suite(suite)(num, seed, first)
     own = SUITES[suite].num_targets
     size = own if num_targets is None else num_targets
@@ -163,6 +169,7 @@ def draw(
         jax.tree.map(lambda leaf: jnp.asarray(leaf[:, place], dtype), targets),
         horizon[:, place],
         present=np.arange(size) < own,
+        robot=robot,
         gravity=np.full(num, GRAVITY),
         optional=SUITES[suite].optional,
         dtype=dtype,

@@ -23,7 +23,6 @@ from planner_jax.task.hit.rules import RULES
 # Fit to the published landing points; the residual is 1 cm.
 DRAG = 0.0616  # K_D [1/m]
 GRAVITY = 9.8  # [m/s^2]
-RACKET_HEIGHT = PAPER_HITTER.tool.height  # [m], racket centre above the propeller plane
 
 
 @struct.dataclass

@@ -12,6 +12,8 @@ import numpy as np
 from scipy.interpolate import RectBivariateSpline
 
 from planner_jax.checks import numeric, require_scalar, told
+from planner_jax.robot.quadrotor_model import QuadrotorModel
+from planner_jax.robot.quadrotor_models import PAPER_HITTER
 from planner_jax.task.arguments import require_draw
 from planner_jax.task.hit import court
 from planner_jax.task.hit.card import START
@@ -277,6 +279,7 @@ def to_cases(
     seed: int = 0,
     delay: float = 0.0,
     limit_scale: float = 1.0,
+    robot: QuadrotorModel = PAPER_HITTER,
     dtype=jnp.float32,
 ) -> HitCase:
     """One batch of cases, with the setting of paper 002, from serves.
@@ -288,6 +291,7 @@ def to_cases(
         delay: [s] from the serve to the moment at which planning begins.
         limit_scale: factor on the speed, acceleration and body-rate limits; those of the
             stroke stay.
+        robot: with a racket.
         dtype: of every leaf.
 
     Raises:
@@ -312,6 +316,7 @@ def to_cases(
         late.position,
         late.velocity,
         late.target,
+        robot=robot,
         start=head,
         drag=DRAG,
         gravity=GRAVITY,

@@ -9,6 +9,9 @@ from planner_jax.ending.ended import ended
 from planner_jax.protocol import AnyPlanner
 from planner_jax.referee.hit import HitVerdict, referee_hits
 from planner_jax.registry import suite_named
+from planner_jax.robot.quadrotor_model import QuadrotorModel
+from planner_jax.robot.quadrotor_models import PAPER_HITTER
+from planner_jax.task.flight import require_own_robot
 from planner_jax.task.hit.card import REAL_SCENARIOS, START, TASK
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.plan import HitPlan
@@ -25,6 +28,7 @@ def draw(
     start: Sequence[float] | str = START,
     delay: float = 0.0,
     limit_scale: float = 1.0,
+    robot: QuadrotorModel = PAPER_HITTER,
     dtype: Any = jnp.float32,
 ) -> HitCase:
     """Drawn serves as a batch of cases; see `generate_serves` and `to_cases`.
@@ -38,6 +42,7 @@ def draw(
         start: (3,) [m], hover position of the quadrotor; or "uniform" over the half court.
         delay: [s] from the serve to the moment at which planning begins.
         limit_scale: factor on the speed, acceleration and body-rate limits.
+        robot: with a racket; suites of other packages have their own.
         dtype: of every leaf.
 
     Raises:
@@ -45,10 +50,17 @@ def draw(
     """
     suite = suite_named(suite, "court")
     if suite not in TASK.suites:
+        require_own_robot(robot, PAPER_HITTER, suite)
         return TASK.other_suite(suite)(num, seed, first)
     serves = generate_serves(num, seed, REAL_SCENARIOS.get(suite), first=first)
     return to_cases(
-        serves, start=start, seed=seed, delay=delay, limit_scale=limit_scale, dtype=dtype
+        serves,
+        start=start,
+        seed=seed,
+        delay=delay,
+        limit_scale=limit_scale,
+        robot=robot,
+        dtype=dtype,
     )
 
 

@@ -16,10 +16,11 @@ from flax import struct
 from jax import Array, lax
 
 from planner_jax.robot.quadrotor import flat_attitude, net_thrust
+from planner_jax.robot.quadrotor_model import QuadrotorModel
 from planner_jax.sims.model import World
 from planner_jax.sims.robot import rotation
+from planner_jax.sims.robots.quadrotor.allocation import rotor_thrusts
 from planner_jax.sims.robots.quadrotor.reference import Reference
-from planner_jax.sims.robots.quadrotor.vehicle import Vehicle, rotor_thrusts
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,6 +34,9 @@ class Gains:
     rate: float = 25.0  # [1/s]
     share: float = 0.5  # of the plan's thrust, largest correction of it
     correction: float = 6.0  # [rad/s], largest body rate against an attitude's error
+    # By which a rotor's thrust may be raised to make room for a torque, of its greatest: 1 N of the
+    # papers' quadrotors.
+    spare: float = 1.0 / 11.8
 
 
 @struct.dataclass
@@ -58,14 +62,14 @@ def rotation_error(R: Array, R_wanted: Array) -> Array:
 
 
 def control(
-    state: RobotState, reference: Reference, vehicle: Vehicle, gains: Gains, world: World
+    state: RobotState, reference: Reference, model: QuadrotorModel, gains: Gains, world: World
 ) -> Array:
     """Rotor thrusts (4,) [N] that track a reference; pure, for one quadrotor.
 
     Args:
         state: of the quadrotor, as it is estimated.
         reference: to be tracked.
-        vehicle: what the quadrotor is made of.
+        model: what the quadrotor is made of.
         gains: of the cascade.
         world: whose gravity and time step count.
     """
@@ -82,15 +86,16 @@ def control(
     jerk = reference.jerk + gains.position * faster
     R_wanted, rate_wanted = flat_attitude(acc, jerk, gravity)
     pull = net_thrust(acc, gravity)
-    thrust = vehicle.mass * (jnp.sum(pull * R[:, 2]) + reference.thrust_lead)
+    thrust = model.mass * (jnp.sum(pull * R[:, 2]) + reference.thrust_lead)
     stiffness = jnp.array([gains.attitude, gains.attitude, gains.heading], acc.dtype)
     highest = lax.Precision.HIGHEST
     turn = jnp.matmul(R.T, jnp.matmul(R_wanted, rate_wanted, precision=highest), precision=highest)
     # Unbounded, a large error would ask for a rate that saturated rotors cannot stop in time.
     back = jnp.clip(stiffness * rotation_error(R, R_wanted), -gains.correction, gains.correction)
     rate = turn - half * reference.angular_acc + back
-    inertia = jnp.asarray(vehicle.inertia, acc.dtype)
+    inertia = jnp.asarray(model.inertia, acc.dtype)
     angular_acc = reference.angular_acc + reference.torque_lead
     angular_acc += gains.rate * (rate - state.rate)
     torque = inertia * angular_acc + jnp.cross(state.rate, inertia * state.rate)
-    return rotor_thrusts(vehicle, jnp.maximum(thrust, 0.0), torque)
+    spare = gains.spare * model.rotors.max_thrust
+    return rotor_thrusts(model.rotors, jnp.maximum(thrust, 0.0), torque, spare)

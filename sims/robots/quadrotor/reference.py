@@ -10,7 +10,6 @@ from jax import Array, lax
 
 from planner_jax.robot.quadrotor import flat_attitude, net_thrust
 from planner_jax.sims.model import World
-from planner_jax.sims.robots.quadrotor.vehicle import Vehicle
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 _BRAKING = 0.8  # [s] from the end of a plan to rest
@@ -66,13 +65,13 @@ def with_rest(trajectory: PiecewisePolynomial) -> PiecewisePolynomial:
 
 
 def reference_at(
-    trajectory: PiecewisePolynomial, time: Array, vehicle: Vehicle, world: World
+    trajectory: PiecewisePolynomial, time: Array, lag: float, world: World
 ) -> Reference:
-    """The plan at a time () [s] since its start, with what the rotors need to know ahead."""
+    """The plan at a time () [s] since its start, with what rotors of a lag [s] are asked ahead."""
     gravity = jnp.asarray(world.gravity, time.dtype)
     order = lambda k, at: evaluate(trajectory, at, k)  # noqa: E731
     pos, vel, acc, jerk = (order(k, time) for k in range(4))
-    lag, step = vehicle.rotor_lag, 2.0 * world.timestep
+    step = 2.0 * world.timestep
     # What is asked for now is taken up by the next step, and its force counts around that step's
     # beginning: MuJoCo's Euler is a leapfrog. In between it rises by itself, on average half way.
     ahead = time + 0.5 * world.timestep

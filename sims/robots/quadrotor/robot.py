@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from planner_jax.robot.quadrotor_model import NET, RACKET, QuadrotorModel, Tool
 from planner_jax.sims.model import BALL_RADIUS, World
-from planner_jax.sims.robot import Physics, Shape, Tool, rotation
+from planner_jax.sims.robot import Physics, Shape, rotation
 from planner_jax.sims.robots.quadrotor.control import Gains, RobotState, control
 from planner_jax.sims.robots.quadrotor.reference import Reference, reference_at, with_rest
-from planner_jax.sims.robots.quadrotor.vehicle import Vehicle, rotor_positions, rotor_torques
 from planner_jax.sims.scenery import LOOK, xml_numbers
 from planner_jax.trajectory.polynomial import evaluate, total_duration
 
@@ -27,8 +27,7 @@ _SEGMENTS = 12  # capsules of the hoop
 class Quadrotor:
     """A quadrotor with a tool; static under jit."""
 
-    tool: Tool
-    vehicle: Vehicle = Vehicle()
+    model: QuadrotorModel
     gains: Gains = Gains()
 
     WORDS: ClassVar[str] = "rotors with lag, body-rate, attitude and position control"
@@ -36,39 +35,43 @@ class Quadrotor:
     num_vel: ClassVar[int] = 6
     noise_shape: ClassVar[tuple[int, ...]] = (4, 3)
 
+    @property
+    def tool(self) -> Tool:
+        """What it meets balls with."""
+        return self.model.tool
+
     def mjcf(self) -> tuple[str, str]:
         """Body with rotors and tool, and the motors."""
-        vehicle = self.vehicle
-        places = rotor_positions(vehicle)
-        rotors = "".join(
+        model, rotors = self.model, self.model.rotors
+        discs = "".join(
             f'<site name="rotor{i}" pos="{xml_numbers(*place)}"/>'
-            f'<geom type="cylinder" size="{vehicle.rotor_radius:g} .003" '
+            f'<geom type="cylinder" size="{rotors.radius:g} .003" '
             f'pos="{xml_numbers(*place)}" rgba=".2 .2 .2 .6" {LOOK}/>'
             f'<geom type="capsule" size=".008" fromto="0 0 0 {xml_numbers(*place)}" {LOOK}/>'
-            for i, place in enumerate(places)
+            for i, place in enumerate(rotors.positions)
         )
         motors = "".join(
             f'<general site="rotor{i}" gear="0 0 1 0 0 {xml_numbers(torque)}" ctrllimited="true" '
-            f'ctrlrange="0 {xml_numbers(vehicle.max_rotor_thrust)}" dyntype="filterexact" '
-            f'dynprm="{xml_numbers(vehicle.rotor_lag)}"/>'
-            for i, torque in enumerate(rotor_torques(vehicle))
+            f'ctrlrange="{xml_numbers(rotors.min_thrust, rotors.max_thrust)}" '
+            f'dyntype="filterexact" dynprm="{xml_numbers(rotors.lag)}"/>'
+            for i, torque in enumerate(rotors.torque_arms)
         )
         body = (
             '<body name="quadrotor"><freejoint/><inertial pos="0 0 0" '
-            f'mass="{vehicle.mass}" diaginertia="{xml_numbers(*vehicle.inertia)}"/>'
-            f"{rotors}{self._tool_xml()}</body>"
+            f'mass="{model.mass}" diaginertia="{xml_numbers(*model.inertia)}"/>'
+            f"{discs}{self._tool_xml()}</body>"
         )
         return body, motors
 
     def _tool_xml(self) -> str:
         """The hoop as a ring of capsules over a plate, or the racket as a plate."""
         tool = self.tool
-        low = tool.height - BALL_RADIUS * (1.0 if tool.kind == "racket" else 3.0)
+        low = tool.height - BALL_RADIUS * (1.0 if tool.kind == RACKET else 3.0)
         plate = (
             f'<geom type="cylinder" size="{xml_numbers(tool.radius)} .002" '
             f'pos="0 0 {xml_numbers(low)}" rgba=".3 .5 .9 .5" {LOOK}/>'
         )
-        if tool.kind == "racket":
+        if tool.kind == RACKET:
             return plate
         rim = _circle(np.array([0.0, 0.0, tool.height]), tool.radius, _SEGMENTS)
         ring = "".join(
@@ -81,11 +84,11 @@ class Quadrotor:
     def at_rest(self, place: Array, gravity: float) -> tuple[Array, Array, Array]:
         """Hover at a place (3,) [m], with the rotors at their speed: `qpos`, `qvel`, `act`."""
         upright = jnp.array([1.0, 0.0, 0.0, 0.0], place.dtype)
-        lift = self.vehicle.mass * gravity / 4.0
+        lift = self.model.mass * gravity * self.model.rotors.shares
         return (
             jnp.concatenate([place, upright]),
             jnp.zeros(self.num_vel, place.dtype),
-            jnp.full(4, lift, place.dtype),
+            jnp.asarray(lift, place.dtype),
         )
 
     def drive(self, physics: Physics, command: Array, timestep: float) -> tuple[Array, Array]:
@@ -130,17 +133,19 @@ class Quadrotor:
     def references(self, plan: Any, times: Array, world: World) -> Reference:
         """What is tracked (K,) [s] after a plan's begin, or at its end; leaves (K, ...)."""
         path = with_rest(plan.trajectory)
-        times = jnp.minimum(times, total_duration(path) - 2.0 * self.vehicle.rotor_lag)
-        return jax.vmap(lambda time: reference_at(path, time, self.vehicle, world))(times)
+        lag = self.model.rotors.lag
+        times = jnp.minimum(times, total_duration(path) - 2.0 * lag)
+        return jax.vmap(lambda time: reference_at(path, time, lag, world))(times)
 
     def command(self, state: RobotState, reference: Reference, world: World) -> Array:
         """Rotor thrusts (4,) [N]."""
-        return control(state, reference, self.vehicle, self.gains, world)
+        return control(state, reference, self.model, self.gains, world)
 
     def shapes(self) -> list[Shape]:
         """Arms, stick, rotors and tool, which are one rigid part."""
-        arms, top = rotor_positions(self.vehicle), np.array([0.0, 0.0, self.tool.height])
-        discs = [(arm, self.vehicle.rotor_radius) for arm in arms] + [(top, self.tool.radius)]
+        rotors = self.model.rotors
+        arms, top = rotors.positions, np.array([0.0, 0.0, self.tool.height])
+        discs = [(arm, rotors.radius) for arm in arms] + [(top, self.tool.radius)]
         rims = [_circle(centre, radius, 24) for centre, radius in discs]
         lines = [arms[[0, 2]], arms[[1, 3]], np.stack([0.0 * top, top]), *rims]
         return [Shape(lines, discs, tool=True)]
@@ -155,7 +160,7 @@ class Quadrotor:
 
     def held_ball(self, pose: np.ndarray) -> np.ndarray:
         """Centre (3,) [m] of a ball that lies in the net; NaN with a racket."""
-        up = self.tool.height - BALL_RADIUS if self.tool.kind == "net" else np.nan
+        up = self.tool.height - BALL_RADIUS if self.tool.kind == NET else np.nan
         return pose[:3] + up * rotation(pose[3:7], np)[:, 2]
 
 

@@ -1,0 +1,81 @@
+"""Robots beside each other: what passes the referee, and what a look at the rotors costs.
+
+    python -m benchmarks.robot_rows [--robots NAME|FILE ...] [--num 2048] [--repeats 5] [--out DIR]
+
+Every robot is planned for twice, with the limits of its rotors and without (`rotor_share` null), in
+turns, so that what else the machine does meets both. Rackets hit the serves of the suite court,
+nets catch the throws of parabola2. Plans without these limits are judged without them, too.
+"""
+
+import dataclasses
+import time
+from typing import Any
+
+import jax
+import numpy as np
+
+import planner_jax as pj
+from planner_jax.benchmarks.run import argument_parser, begin
+from planner_jax.robot.quadrotor_model import NET, QuadrotorModel
+from planner_jax.robot.quadrotor_models import MODELS, robot_named
+
+SHARE = 0.9  # of a rotor's range, of robots that do not look at their rotors otherwise
+
+
+def of_both_kinds(robot: QuadrotorModel) -> dict[str, QuadrotorModel]:
+    """The robot without and with limits of its rotors."""
+    share = robot.limits.rotor_share or SHARE
+
+    def with_share(share: float | None) -> QuadrotorModel:
+        limits = dataclasses.replace(robot.limits, rotor_share=share)
+        return dataclasses.replace(robot, limits=limits)
+
+    return {"without": with_share(None), "with": with_share(share)}
+
+
+def measured(robot: QuadrotorModel, num: int, repeats: int) -> dict[str, Any]:
+    """Success (num,) and plans a second, of the clock and of the processor, without and with.
+
+    The first plans compile and are not counted; a speed is the best of the others.
+    """
+    task, suite = (pj.catch, "parabola2") if robot.tool.kind == NET else (pj.hit, "court")
+    planner, found = task.planner(), {}
+    for repeat in range(repeats + 1):
+        for name, one in of_both_kinds(robot).items():
+            cases = jax.tree.map(np.asarray, task.draw(num, suite, seed=3, robot=one))
+            clock, busy = time.perf_counter(), time.process_time()
+            plans = jax.block_until_ready(pj.plan(planner, cases))
+            seconds = np.array([time.perf_counter() - clock, time.process_time() - busy])
+            if repeat == 0:
+                success = np.asarray(task.judge(cases, plans).success)
+                found[name] = (success, np.zeros(2))
+            else:
+                found[name] = (found[name][0], np.maximum(found[name][1], num / seconds))
+    return found
+
+
+def main() -> None:
+    parser = argument_parser("robot_rows", __doc__, num=2048, repeats=5)
+    parser.add_argument("--robots", nargs="+", metavar="NAME|FILE", default=list(MODELS))
+    options = parser.parse_args()
+    try:
+        robots = [robot_named(word) for word in options.robots]
+    except ValueError as error:
+        parser.error(f"argument --robots: {error}")
+    with begin(parser, options) as bench:
+        bench.say(
+            "| robot | rotors | success % | plans/s, clock | plans/s, processor |",
+            "|---|---|---|---|---|",
+        )
+        for robot in robots:
+            for name, (success, speed) in measured(robot, options.num, options.repeats).items():
+                bench.say(
+                    f"| {robot.name} | {name} | {100 * success.mean():.2f} "
+                    f"| {speed[0]:,.0f} | {speed[1]:,.0f} |"
+                )
+                bench.row(robot=robot.name, rotors=name, success=success.mean(), speed=speed)
+                bench.count(success)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,378 @@
+"""Robots from files: units, MJCF, ready ones, the way back, and what is refused in one line."""
+
+import copy
+import dataclasses
+import json
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+import planner_jax as pj
+from planner_jax.cli import main
+from planner_jax.registry import UnknownName
+from planner_jax.robot.quadrotor_file import RobotError, as_yaml, model_of
+from planner_jax.robot.quadrotor_models import MODELS
+from planner_jax.robot.quantities import UNITS, QuantityError, numbers_in
+from planner_jax.sims.settings import HitFly
+from planner_jax.sweep.hit.settings import HitSettings
+from planner_jax.sweep.settings import SettingError, settings_to_resume
+
+DATA = Path(__file__).parent / "data"
+MINE = DATA / "my_quadrotor.yaml"
+GRAVITY = 9.80665
+FIELDS = yaml.safe_load(MINE.read_text())
+TOOL = pj.Tool("net", 0.15, 0.1)
+LIMITS = pj.FlightLimits(speed=5.0, body_rate=5.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "kind", "found"),
+    [
+        ("800 g", "mass", 0.8),
+        ("33 g", "mass", 0.033),
+        (0.8, "mass", 0.8),
+        ("8e-1", "mass", 0.8),
+        ("30ms", "time", 0.03),
+        ("250 mm", "length", 0.25),
+        ("18 km/h", "speed", 5.0),
+        ("344 deg/s", "rate", math.radians(344.0)),
+        ("2 g", "acceleration", 2.0 * GRAVITY),
+        ("500 gf", "force", 0.5 * GRAVITY),
+        ("90 %", "share", 0.9),
+        ("30 deg", "angle", math.pi / 6.0),
+    ],
+)
+def test_a_quantity_is_what_it_is_in_si_units(text, kind, found):
+    np.testing.assert_allclose(numbers_in(text, kind, 1), (found,), rtol=1e-15)
+
+
+@pytest.mark.parametrize("kind", UNITS)
+def test_the_first_unit_of_a_kind_is_that_of_si(kind):
+    assert next(iter(UNITS[kind].values())) == 1
+
+
+def test_several_numbers_share_their_unit():
+    assert numbers_in("3 3 5 g m^2", "inertia", 3) == (0.003, 0.003, 0.005)
+    assert numbers_in("1 2 kg cm^2", "inertia", 2) == (1e-4, 2e-4)
+    assert numbers_in(["1 m", "2 cm"], "length", 2) == (1.0, 0.02)
+    low, high = numbers_in("0.2 to 1.9 g", "acceleration", 2, span=True)
+    np.testing.assert_allclose((low, high), (0.2 * GRAVITY, 1.9 * GRAVITY), rtol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("text", "rule"),
+    [
+        ("800 gg", "must be in kg, g, got '800 gg'; did you mean g?"),
+        ("3 m", "must be in kg, g, got '3 m'"),
+        ("heavy", "must be in kg, g, got 'heavy'"),
+        ("1 2 kg", "must be a number in kg, g, got '1 2 kg'"),
+        ("1.2.3 kg", "must be in kg, g, got '1.2.3 kg'; did you mean kg?"),
+        ("1 to 2 kg", "must be in kg, g, got '1 to 2 kg'"),
+        ("1e999 kg", "must be finite, got '1e999 kg'"),
+        (math.nan, "must be finite, got nan"),
+        (True, "must be in kg, g, got True"),
+        (None, "must be in kg, g, got None"),
+    ],
+)
+def test_what_is_no_mass_is_refused_with_the_units_there_are(text, rule):
+    with pytest.raises(QuantityError, match=f"^{re.escape(rule)}$"):
+        numbers_in(text, "mass", 1)
+
+
+# YAML
+
+
+def test_a_robot_s_file_is_read_in_si_units():
+    robot = pj.read_robot(MINE)
+    assert (robot.name, robot.mass, robot.inertia) == ("my-quadrotor", 0.8, (0.003, 0.003, 0.005))
+    np.testing.assert_allclose(np.hypot(*robot.rotors.positions[:, :2].T), 0.125)
+    assert (robot.rotors.max_thrust, robot.rotors.lag) == (4.5, 0.03)
+    assert robot.tool == pj.Tool("racket", 0.06, 0.11, restitution=0.7)
+    np.testing.assert_allclose(robot.limits.thrust, (0.2 * GRAVITY, 1.9 * GRAVITY))
+    assert hash(robot) == hash(pj.read_robot(MINE))
+
+
+def test_keywords_go_before_the_file():
+    robot = pj.read_robot(MINE, mass="900 g", tool=TOOL, rotors={"lag": "20 ms"})
+    assert (robot.mass, robot.tool, robot.rotors.lag) == (0.9, TOOL, 0.02)
+    assert robot.rotors.max_thrust == 4.5
+
+
+@pytest.mark.parametrize("robot", [*MODELS.values(), pj.read_robot(MINE)], ids=lambda r: r.name)
+def test_a_robot_is_the_same_after_yaml_and_after_a_manifest(robot, tmp_path):
+    place = tmp_path / "robot.yaml"
+    place.write_text(as_yaml(robot))
+    assert pj.read_robot(place) == robot
+    assert as_yaml(pj.read_robot(place)) == place.read_text()
+    assert model_of(json.loads(json.dumps(dataclasses.asdict(robot)))) == robot
+
+
+def test_places_of_rotors_may_be_said_in_several_ways(tmp_path):
+    shown = "[[0.1, 0.08], [-0.1, 0.08], [-0.1, -0.08], [0.1, -0.08]]"
+    ways = (shown, shown.replace("[0.1, 0.08]", "100 80 mm"), "10 8 -10 8 -10 -8 10 -8 cm")
+    for k, way in enumerate(ways):
+        rotors = {"max_thrust": "4.5 N", "places": yaml.safe_load(way)}
+        (tmp_path / f"{k}.yaml").write_text(yaml.safe_dump({**FIELDS, "rotors": rotors}))
+        robot = pj.read_robot(tmp_path / f"{k}.yaml")
+        assert robot.rotors.places == ((0.1, 0.08), (-0.1, 0.08), (-0.1, -0.08), (0.1, -0.08))
+
+
+def changed(**fields):
+    """The fields of a file, some of them others; None takes one away."""
+    found = copy.deepcopy(FIELDS)
+    for name, value in fields.items():
+        part, _, field = name.rpartition("__")
+        at = found[part] if part else found
+        at[field] = value
+        if value is None:
+            del at[field]
+    return yaml.safe_dump(found)
+
+
+@pytest.mark.parametrize(
+    ("text", "rule"),
+    [
+        (changed(mass="800 gg"), "mass must be in kg, g, got '800 gg'; did you mean g?"),
+        (changed(mass="-1 kg"), "mass must be > 0, got -1"),
+        (changed(mass=None), "mass must be given, got nothing"),
+        (changed(tool=None), "tool must be given, got nothing"),
+        (changed(tool="net"), "tool must be fields with values, got 'net'"),
+        (changed(tool__radius=None), "tool.radius must be given, got nothing"),
+        (
+            changed(tool__kind="rackett"),
+            "tool.kind must be net or racket, got 'rackett'; did you mean racket?",
+        ),
+        (changed(tool__kind=3), "tool.kind must be text, got 3"),
+        (
+            changed(masss="1 kg"),
+            "field must be one of name, source, mass, inertia, rotors, tool, limits, "
+            "got 'masss'; did you mean mass?",
+        ),
+        (
+            changed(tool__size="1 m"),
+            "tool field must be one of kind, height, radius, restitution, max_angle, got 'size'",
+        ),
+        (
+            changed(rotors__places="1 m"),
+            "rotors.places must be 8 numbers in m, cm, mm, got '1 m'",
+        ),
+        (changed(rotors__diagonal=None), "rotors.places or diagonal must be given, got nothing"),
+        (
+            changed(rotors__places=[[k, 1] for k in range(4)]),
+            "rotors must have diagonal or places, not both",
+        ),
+        (
+            changed(rotors__max_thrust="1 N"),
+            "4 x rotors.max_thrust must be > the weight of 7.85 N, got 4 N",
+        ),
+        (
+            changed(limits__body_rate="3 deg"),
+            "limits.body_rate must be in rad/s, deg/s, got '3 deg'; did you mean deg/s?",
+        ),
+        (changed(limits__speed="~"), "limits.speed must be in m/s, cm/s, km/h, got '~'"),
+        (
+            changed(inertia="1 1 9 g m^2"),
+            "inertia must be of a body, none above the other two together, "
+            "got (0.001, 0.001, 0.009)",
+        ),
+        (changed(model="my.urdf"), "model must name an MJCF file, .xml, got 'my.urdf'"),
+        ("- 1", "must be fields with values, got [1]"),
+        ("", "must be fields with values, got None"),
+    ],
+)
+def test_what_breaks_a_rule_is_named_in_one_line_with_its_file(text, rule, tmp_path):
+    place = tmp_path / "mine.yaml"
+    place.write_text(text)
+    with pytest.raises(RobotError, match=f"^{re.escape(f'{place}: {rule}')}$"):
+        pj.read_robot(place)
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("mass: [", "expected the node content"),
+        ("mass: 1\nmass: 2", "mass only once"),
+        ("a: &b [1]\nc: *b", r"no \*reference"),
+        ("mass: " + "[" * 2000, "recursion"),
+        ("\x00", "unacceptable character"),
+    ],
+)
+def test_what_is_no_plain_yaml_is_refused_in_one_line(text, problem, tmp_path):
+    place = tmp_path / "mine.yaml"
+    place.write_text(text)
+    with pytest.raises(RobotError, match=f"mine.yaml: must be YAML, .*{problem}") as error:
+        pj.read_robot(place)
+    assert "\n" not in str(error.value)
+
+
+def test_a_file_of_another_kind_is_refused():
+    with pytest.raises(RobotError, match="^path must end in .yaml, .yml, .xml, got 'robot.urdf'$"):
+        pj.read_robot("robot.urdf")
+
+
+# MJCF
+
+
+def test_mjcf_gives_body_and_rotors_about_the_centre_of_mass():
+    robot = pj.read_robot(DATA / "quadrotor_of_mjcf.yaml")
+    assert (robot.name, robot.tool) == ("quadrotor_of_mjcf", TOOL)
+    np.testing.assert_allclose(robot.mass, 0.8)
+    # Frame and battery lie 3 cm apart, one above the other; the battery is a box.
+    apart = 0.7 * 0.1 / 0.8 * 0.03**2
+    box = 0.1 / 3.0 * (np.array([0.03, 0.015, 0.01]) ** 2 @ (1 - np.eye(3)))
+    np.testing.assert_allclose(robot.inertia, [0.003, 0.003, 0.005] + box + [apart, apart, 0.0])
+    places = [[0.1, 0.1], [-0.1, 0.1], [-0.1, -0.1], [0.1, -0.1]]
+    np.testing.assert_allclose(robot.rotors.places, places, atol=1e-12)
+    rotors = robot.rotors
+    found = (rotors.min_thrust, rotors.max_thrust, rotors.torque_ratio, rotors.lag)
+    np.testing.assert_allclose(found, (0.2, 4.5, 0.02, 0.03))
+
+
+def test_mjcf_alone_takes_tool_and_limits_from_keywords():
+    robot = pj.read_robot(DATA / "quadrotor.xml", tool=TOOL, limits=LIMITS, name="other")
+    beside = pj.read_robot(DATA / "quadrotor_of_mjcf.yaml", name="other")
+    assert robot == beside
+    with pytest.raises(RobotError, match="quadrotor.xml: tool must be given, got nothing$"):
+        pj.read_robot(DATA / "quadrotor.xml", limits=LIMITS)
+
+
+XML = (DATA / "quadrotor.xml").read_text()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "rule"),
+    [
+        (r"<actuator>.*</actuator>", "", "the model must have 4 actuators, all on sites, got 0, 0"),
+        ("<freejoint/>", "", "the model must have one free joint, got 0"),
+        (
+            'name="1" site="front_right" gear="0 0 2 0 0 -0.04"',
+            'name="1" site="front_right" gear="0 0 2 0 0 0.04"',
+            "gear of neighbouring rotors must turn one against the other, got 0.02 -0.02 0.02 0.02",
+        ),
+        (
+            'name="2" site="back_left" gear="0 0 2',
+            'name="2" site="back_left" gear="2 0 0',
+            "gear of actuator 2 must push along z, got 2 0 0 0 0 -0.04",
+        ),
+        ("0.1 2.25", "0.1 2.5", "ctrlrange must be the same for all rotors"),
+        ('ctrllimited="true"', 'ctrllimited="false"', "actuator 1 must have a ctrlrange"),
+        ("0.1 2.25", "-1 2.25", "ctrlrange must be the same for all rotors"),
+        ("<general", '<general biastype="affine" biasprm="1 0 0"', "actuator 1 must have a fixed"),
+        ("</mujoco>", "", "must be MJCF, "),
+        (
+            'diaginertia="0.003 0.003 0.005"',
+            'fullinertia="0.003 0.003 0.005 0.001 0 0"',
+            "inertia must be along the body's axes, got a product of 0.001 kg m^2",
+        ),
+    ],
+)
+def test_mjcf_of_something_else_is_refused_in_one_line(old, new, rule, tmp_path):
+    text = re.sub(old, new, XML, count=1, flags=re.DOTALL)
+    assert text != XML
+    place = tmp_path / "mine.xml"
+    place.write_text(text)
+    with pytest.raises(RobotError, match=re.escape(f"mine.xml: {rule}")) as error:
+        pj.read_robot(place, tool=TOOL, limits=LIMITS)
+    assert "\n" not in str(error.value)
+
+
+def test_a_lag_that_mjcf_does_not_have_has_to_be_said(tmp_path):
+    place = tmp_path / "mine.xml"
+    place.write_text(XML.replace('dyntype="filterexact" dynprm="0.03"', ""))
+    with pytest.raises(RobotError, match="mine.xml: rotors.lag must be in s, ms, got None$"):
+        pj.read_robot(place, tool=TOOL, limits=LIMITS)
+    robot = pj.read_robot(place, tool=TOOL, limits=LIMITS, rotors={"lag": "25 ms"})
+    assert robot.rotors.lag == 0.025
+
+
+# Names
+
+
+def test_an_unknown_robot_is_told_with_the_nearest_name():
+    with pytest.raises(UnknownName, match="^robot must be one of paper-catcher, .*mean x500-net?"):
+        pj.robot("x50-net")
+    assert all(f"`{name}`" in (pj.robot.__doc__ or "") for name in MODELS)
+
+
+@pytest.mark.parametrize("robot", MODELS.values(), ids=MODELS)
+def test_a_ready_robot_says_where_its_figures_are_from(robot):
+    assert "assumed" in robot.source and len(robot.source) > 40
+
+
+def test_the_command_lists_robots_and_prints_one_to_begin_from(capsys, tmp_path):
+    assert main(["robots"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines[1:]] == list(MODELS)
+    assert main(["robots", "x500"]) == 0
+    (tmp_path / "my.yaml").write_text(capsys.readouterr().out)
+    assert pj.read_robot(tmp_path / "my.yaml") == pj.robot("x500")
+
+
+@pytest.mark.parametrize(
+    ("words", "rule"),
+    [
+        (["robots", "crazyfly"], "robot must be one of paper-catcher, .*did you mean crazyflie"),
+        (["sweep", "hit", "--robot", "crazyfly"], "--robot must be one of paper-catcher"),
+        (["sweep", "hit", "--robot", "crazyflie"], "--robot must carry a racket, got 'crazyflie'"),
+        (["sweep", "catch", "--robot", "x500"], "--robot must carry a net, got 'x500' with a rac"),
+        (["fly", "hit", "--robot", "x500-net"], "--robot must carry a racket, got 'x500-net'"),
+        (
+            ["fly", "catch", "--robot", "no.yaml"],
+            r"--robot must be a file that can be read, got",
+        ),
+        (["fly", "catch", "--robot", "BAD"], "--robot must be a sound one: .*bad.yaml: mass must"),
+    ],
+)
+def test_a_robot_that_does_not_fit_is_refused_before_anything_is_made(
+    words, rule, capsys, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "bad.yaml").write_text(changed(mass="800 gg"))
+    assert main([word.replace("BAD", "bad.yaml") for word in words]) == 2
+    told = capsys.readouterr().err
+    assert re.match(f"planner-jax: error: {rule}", told) and told.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["bad.yaml"]
+
+
+# Runs
+
+
+@pytest.mark.parametrize("kind", [HitSettings, HitFly])
+def test_a_run_holds_the_whole_robot_whatever_becomes_of_its_file(kind):
+    settings = kind(robot=str(MINE))
+    assert settings.robot == pj.read_robot(MINE)
+    written = json.loads(json.dumps(dataclasses.asdict(settings)))
+    assert written["robot"]["rotors"]["max_thrust"] == 4.5
+    assert kind(**written) == settings
+
+
+def test_a_run_is_not_resumed_with_another_robot(tmp_path):
+    (tmp_path / "other.yaml").write_text(changed(rotors__lag="20 ms"))
+    parameters = json.loads(json.dumps(HitSettings(robot=str(MINE)).parameters()))
+    again = settings_to_resume(HitSettings, parameters, {"robot": str(MINE)})
+    assert again.robot == pj.read_robot(MINE)
+    rule = "robot.rotors.lag must be 0.03 as in the run that is resumed, got 0.02"
+    with pytest.raises(SettingError, match=f"^{rule}$"):
+        settings_to_resume(HitSettings, parameters, {"robot": str(tmp_path / "other.yaml")})
+    old = {**parameters, "robot": None}
+    with pytest.raises(SettingError, match="^robot must be None as .*, got 'x500'$"):
+        settings_to_resume(HitSettings, old, {"robot": "x500"})
+
+
+def test_an_old_run_without_a_robot_is_one_of_the_paper_s():
+    parameters = HitSettings().parameters()
+    del parameters["robot"]
+    assert HitSettings(**parameters).robot is None
+    assert "robot" not in HitSettings().draw_options()
+
+
+def test_draws_are_of_the_robot():
+    cases = pj.hit.draw(2, robot=pj.read_robot(MINE))
+    np.testing.assert_allclose(cases.limits.rotors.max_thrust, 0.95 * 4.5)
+    throws = pj.catch.draw(2, robot=pj.robot("x500-net"))
+    np.testing.assert_allclose(throws.net.radius, 0.2)
+    np.testing.assert_allclose(throws.limits.max_thrust, 4.0 * 0.95 * 8.549 / 2.064, rtol=1e-6)
