@@ -58,8 +58,9 @@ _TABLE_NODES = 36
 _AIM_RADIUS = 0.05  # [m], of the net that plans are made for; the rest is left for errors
 # Least thrust [g] and greatest body rate [rad/s] of plans. A weak thrust and a fast turn leave
 # control little; the first catch stays away from them, so that the next can begin within bounds.
-# Where nothing else is left, plans go as far as the shared protocol admits.
-_FIRST, _BEHIND, _WIDEST = (0.5, 3.0), (0.4, 4.5), (0.3, 5.0)
+# Plans of later catches begin with the second limits. Where no plan keeps them, the next ones
+# count; the last are as wide as the shared protocol admits.
+_LIMITS = ((0.5, 3.0), (0.4, 4.5), (0.3, 5.0))
 _KEPT = 0.01  # relative excess up to which limits count as kept by a plan of the loop
 _CHEAPER = 0.95  # share of the cost below which a plan from scratch replaces one that keeps them
 _INSTANT = 1e-3  # [s], shorter than any look
@@ -234,7 +235,7 @@ def believed(loop: Loop, flights: FlightState, new: Array, horizon: Array) -> Ca
         horizon: (B, N) [s] from now, until when each may be caught.
     """
     unknown: Any = None
-    least_thrust, body_rate = _FIRST if flights.plan is None else _BEHIND
+    least_thrust, body_rate = _LIMITS[0 if flights.plan is None else 1]
     robot = loop.world.carrier
     empty = catch_case(
         unknown,
@@ -409,8 +410,10 @@ def planned_ahead(
 ) -> tuple[CatchCase, CatchPlan]:
     """Plans from scratch that catch a ball and, where that is possible too, the next one.
 
-    Where no plan of both is found the ball is planned for alone, and where that fails as well,
-    within the widest limits. If nothing is solved, the plan that breaks its limits least is left.
+    Where no plan of both is found within the limits, both are planned for within wider ones:
+    what catches the ball alone leaves the quadrotor where the next may be out of reach. Where that
+    fails as well, the ball is planned for alone. If nothing is solved, the plan of it that breaks
+    its limits least is left.
 
     Args:
         planner: of catches, which also decides about their order.
@@ -421,16 +424,21 @@ def planned_ahead(
         The cases and their plans; `present` says which catches each has.
     """
     alone = np.arange(known.num_targets) == ball
+    both = np.ones_like(alone)
+    wider = _LIMITS[1 if ball == 0 else 2 :]
+    tries = [(both, limits) for limits in wider]
+    if ball < known.num_targets - 1:
+        tries += [(alone, limits) for limits in (None, *wider)]
     cases, plans = known, plan_all(planner, known)
-    last = ball == known.num_targets - 1
-    for limits in (_WIDEST,) if last else (None, _WIDEST):
+    for balls, limits in tries:
         lanes = np.flatnonzero(is_unsolved(np.asarray(plans.status)))
         if not lanes.size:
             break
-        part = jax.tree.map(lambda leaf, lanes=lanes: np.asarray(leaf)[lanes], cases)
-        before = np.where((part.present == alone).all(axis=1), plans.violation[lanes], np.inf)
-        part = within(dataclasses.replace(part, present=part.present & alone), limits)
+        part = jax.tree.map(lambda leaf, lanes=lanes: np.asarray(leaf)[lanes], known)
+        part = within(dataclasses.replace(part, present=part.present & balls), limits)
         found = plan_all(planner, part)
+        same = (part.present == cases.present[lanes]).all(axis=1)
+        before = np.where(same, plans.violation[lanes], np.inf)
         better = ~is_unsolved(np.asarray(found.status)) | (found.violation < before)
         to, chosen = lanes[better], np.flatnonzero(better)
 
