@@ -17,6 +17,7 @@ from planner_jax.sims.tasks.catch import (
     is_better,
     planned_ahead,
     throws,
+    within,
 )
 from planner_jax.sims.tasks.hit import HIT_WORLD, fly_hits, volleys
 from planner_jax.task import catch
@@ -130,6 +131,17 @@ def test_a_ball_is_planned_for_alone_where_no_plan_of_the_next_one_is_possible()
     known, plans = planned_ahead(catch.planner(decide="greedy"), both, 0)
     assert not known.present[1, 1] and known.present[1, 0]
     assert not is_unsolved(plans.status).any()
+
+
+@pytest.mark.slow
+def test_the_next_ball_is_not_given_up_where_wider_limits_admit_both():
+    """A first catch that forgets the next ball leaves it out of reach, and control is lost."""
+    suite = jax.tree.map(lambda leaf: np.asarray(leaf)[:2], catch.draw(4, "parabola2", seed=4))
+    narrow = within(suite, (1.0, 1.0))  # the first lane's balls need a weaker thrust
+    known, plans = planned_ahead(catch.planner(decide="greedy"), narrow, 0)
+    assert known.present.all() and not is_unsolved(plans.status).any()
+    least = known.limits.min_thrust
+    assert least[0] < narrow.limits.min_thrust[0] and least[1] == narrow.limits.min_thrust[1]
 
 
 @pytest.mark.slow

@@ -23,7 +23,7 @@ from planner_jax.sims.model import (
     step,
 )
 from planner_jax.sims.noise import NOISES, Sensing
-from planner_jax.sims.robots.quadrotor.control import rotation_error
+from planner_jax.sims.robots.quadrotor.control import Gains, rotation_error
 from planner_jax.sims.robots.quadrotor.reference import with_rest
 from planner_jax.sims.robots.quadrotor.vehicle import Vehicle, allocation, rotor_thrusts
 from planner_jax.sims.scenery import machine_parts, outlines
@@ -56,6 +56,15 @@ def test_saturated_rotors_keep_roll_and_pitch_and_let_yaw_go_first():
     np.testing.assert_allclose((allocation(Vehicle()) @ rotors)[:3], [12.0, 0.2, -0.1], atol=1e-5)
     weak = rotor_thrusts(Vehicle(), jnp.float32(0.5), jnp.array([0.4, 0.0, 0.0]))
     np.testing.assert_allclose((allocation(Vehicle()) @ weak)[1:], [0.4, 0.0, 0.0], atol=1e-5)
+
+
+def test_every_mode_of_the_cascade_is_damped_by_half_in_spite_of_the_lag_of_the_rotors():
+    """Sideways from hover: the lag, the rate, attitude, velocity and position, in that order."""
+    gains, lag = Gains(), Vehicle().rotor_lag
+    turn, pull = gains.attitude * gains.velocity, gains.attitude * gains.position
+    inner = [gains.attitude, gains.position + turn, pull]
+    modes = np.roots([lag, 1.0, gains.rate, *(gains.rate * x for x in inner)])
+    assert (-modes.real / np.abs(modes)).min() > 0.5
 
 
 def test_a_torque_raises_a_weak_thrust_no_further_than_is_spared_for_it():
