@@ -15,12 +15,14 @@ from planner_jax.sims.loop import Loop
 from planner_jax.sims.noise import NOISES
 from planner_jax.sims.robots.quadrotor.robot import Quadrotor
 from planner_jax.sims.tasks.catch import (
+    _LIMITS,
     CATCH_WORLD,
     bounds,
     fly_catches,
     is_better,
     planned_ahead,
     throws,
+    within,
 )
 from planner_jax.sims.tasks.hit import HIT_WORLD, fly_hits, volleys
 from planner_jax.task import catch
@@ -126,16 +128,31 @@ def test_cases_out_of_range_are_refused(build, message):
     assert str(error.value) == message
 
 
+WIDER = [bounds(Loop(CATCH_WORLD), distance) for distance in _LIMITS]
+
+
 @pytest.mark.slow
 def test_a_ball_is_planned_for_alone_where_no_plan_of_the_next_one_is_possible():
     suite = jax.tree.map(np.asarray, catch.draw(2, "throws", seed=4, num_targets=2))
     both = dataclasses.replace(suite, present=np.ones((2, 2), bool))
     # The second lane's next ball is to be caught at once.
     both = dataclasses.replace(both, horizon=both.horizon * np.array([[1.0, 2.0], [1.0, 0.02]]))
-    widest = bounds(Loop(CATCH_WORLD), (0.0, 1.0))
-    known, plans = planned_ahead(catch.planner(decide="greedy"), both, 0, widest)
+    known, plans = planned_ahead(catch.planner(decide="greedy"), both, 0, WIDER)
     assert not known.present[1, 1] and known.present[1, 0]
     assert not is_unsolved(plans.status).any()
+
+
+@pytest.mark.slow
+def test_the_next_ball_is_not_given_up_where_wider_limits_admit_both():
+    """A first catch that forgets the next ball leaves it out of reach, and control is lost."""
+    suite = jax.tree.map(lambda leaf: np.asarray(leaf)[:2], catch.draw(4, "parabola2", seed=4))
+    narrow = within(
+        suite, {"min_thrust": 9.81, "body_rate": 1.0}
+    )  # the first lane's balls need a weaker thrust
+    known, plans = planned_ahead(catch.planner(decide="greedy"), narrow, 0, WIDER)
+    assert known.present.all() and not is_unsolved(plans.status).any()
+    least = known.limits.min_thrust
+    assert least[0] < narrow.limits.min_thrust[0] and least[1] == narrow.limits.min_thrust[1]
 
 
 @pytest.mark.slow

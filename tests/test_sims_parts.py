@@ -25,7 +25,7 @@ from planner_jax.sims.model import (
 )
 from planner_jax.sims.noise import NOISES, Sensing
 from planner_jax.sims.robots.quadrotor.allocation import rotor_thrusts
-from planner_jax.sims.robots.quadrotor.control import rotation_error
+from planner_jax.sims.robots.quadrotor.control import Gains, rotation_error
 from planner_jax.sims.robots.quadrotor.reference import with_rest
 from planner_jax.sims.robots.quadrotor.robot import Quadrotor
 from planner_jax.sims.scenery import machine_parts, outlines
@@ -38,7 +38,7 @@ from planner_jax.sims.sensing import (
     predicted,
     with_drag,
 )
-from planner_jax.sims.tasks.catch import _BEHIND, _FIRST, _WIDEST, CATCH_WORLD, bounds
+from planner_jax.sims.tasks.catch import _LIMITS, CATCH_WORLD, bounds
 from planner_jax.sims.tasks.hit import HIT_WORLD, court_parts
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
@@ -83,6 +83,15 @@ def test_saturated_rotors_keep_roll_and_pitch_and_let_yaw_go_first(rotors):
     assert weak.min() > rotors.min_thrust - 1e-6
 
 
+def test_every_mode_of_the_cascade_is_damped_by_half_in_spite_of_the_lag_of_the_rotors():
+    """Sideways from hover: the lag, the rate, attitude, velocity and position, in that order."""
+    gains, lag = Gains(), ROTORS.lag
+    turn, pull = gains.attitude * gains.velocity, gains.attitude * gains.position
+    inner = [gains.attitude, gains.position + turn, pull]
+    modes = np.roots([lag, 1.0, gains.rate, *(gains.rate * x for x in inner)])
+    assert (-modes.real / np.abs(modes)).min() > 0.5
+
+
 def test_a_torque_raises_a_weak_thrust_no_further_than_is_spared_for_it():
     found = thrusts(ROTORS, 1.0, [2.0, 0.0, 0.0])
     thrust, roll = (ROTORS.allocation @ found)[:2]
@@ -100,7 +109,8 @@ def test_at_rest_the_rotors_carry_the_robot_without_turning_it(rotors):
 
 
 @pytest.mark.parametrize(
-    ("distance", "thrust", "rate"), [(_FIRST, 0.5, 3.0), (_BEHIND, 0.4, 4.5), (_WIDEST, 0.3, 5.0)]
+    ("distance", "thrust", "rate"),
+    [(_LIMITS[0], 0.5, 3.0), (_LIMITS[1], 0.4, 4.5), (_LIMITS[2], 0.3, 5.0)],
 )
 def test_plans_in_flight_stay_within_the_limits_of_the_robot(distance, thrust, rate):
     found = bounds(Loop(CATCH_WORLD), distance)

@@ -9,6 +9,7 @@ leaves the least time, and is planned anew once it is seen.
 import dataclasses
 import functools
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -59,9 +60,9 @@ _TABLE_NODES = 36
 _AIM = 0.4  # share of the net's radius that plans are made for; the rest is left for errors
 # How far plans stay from the robot's least thrust, of the way from there to hover, and their share
 # of its body rate. A weak thrust and a fast turn leave control little; the first catch stays away
-# from them, so that the next can begin within bounds. Where nothing else is left, plans go as far
-# as the robot does.
-_FIRST, _BEHIND, _WIDEST = (2.0 / 7.0, 0.6), (1.0 / 7.0, 0.9), (0.0, 1.0)
+# from them, so that the next can begin within bounds. Plans of later catches begin with the second
+# limits. Where no plan keeps them, the next ones count; the last are as wide as the robot's own.
+_LIMITS = ((2.0 / 7.0, 0.6), (1.0 / 7.0, 0.9), (0.0, 1.0))
 _KEPT = 0.01  # relative excess up to which limits count as kept by a plan of the loop
 _CHEAPER = 0.95  # share of the cost below which a plan from scratch replaces one that keeps them
 _INSTANT = 1e-3  # [s], shorter than any look
@@ -250,7 +251,7 @@ def believed(loop: Loop, flights: FlightState, new: Array, horizon: Array) -> Ca
         robot=robot.model,
         gravity=loop.world.gravity,
         net_radius=_AIM * robot.tool.radius,
-        **bounds(loop, _FIRST if flights.plan is None else _BEHIND),
+        **bounds(loop, _LIMITS[0 if flights.plan is None else 1]),
     )
 
     def one(case: CatchCase, flight: FlightState, horizon: Array) -> CatchCase:
@@ -394,7 +395,8 @@ def fly_catches(
         else:
             known = jax.tree.map(np.asarray, known)
             began = time.perf_counter()
-            known, found = planned_ahead(planner, known, ball, bounds(loop, _WIDEST))
+            limits = [bounds(loop, each) for each in _LIMITS]
+            known, found = planned_ahead(planner, known, ball, limits)
             planning += time.perf_counter() - began
         first = found if first is None else first
         begun = jax.tree.map(jnp.asarray, found)
@@ -415,33 +417,41 @@ def planned_ahead(
     planner: AnyPlanner[CatchCase, CatchPlan],
     known: CatchCase,
     ball: int,
-    widest: dict[str, Any],
+    limits: Sequence[dict[str, Any]],
 ) -> tuple[CatchCase, CatchPlan]:
     """Plans from scratch that catch a ball and, where that is possible too, the next one.
 
-    Where no plan of both is found the ball is planned for alone, and where that fails as well,
-    within the widest limits. If nothing is solved, the plan that breaks its limits least is left.
+    Where no plan of both is found within the limits, both are planned for within wider ones:
+    what catches the ball alone leaves the quadrotor where the next may be out of reach. Where that
+    fails as well, the ball is planned for alone. If nothing is solved, the plan of it that breaks
+    its limits least is left.
 
     Args:
         planner: of catches, which also decides about their order.
         known: of both balls, or of the last one, a batch with NumPy leaves.
         ball: its place among the targets.
-        widest: limits, as `bounds` has them.
+        limits: ever wider ones, as `bounds` has them, of which the first are those of `known` for
+            the first ball and the second those for the others.
 
     Returns:
         The cases and their plans; `present` says which catches each has.
     """
     alone = np.arange(known.num_targets) == ball
+    both = np.ones_like(alone)
+    wider = limits[1 if ball == 0 else 2 :]
+    tries: list[tuple[np.ndarray, dict[str, Any] | None]] = [(both, each) for each in wider]
+    if ball < known.num_targets - 1:
+        tries += [(alone, each) for each in (None, *wider)]
     cases, plans = known, plan_all(planner, known)
-    last = ball == known.num_targets - 1
-    for limits in (widest,) if last else (None, widest):
+    for balls, wide in tries:
         lanes = np.flatnonzero(is_unsolved(np.asarray(plans.status)))
         if not lanes.size:
             break
-        part = jax.tree.map(lambda leaf, lanes=lanes: np.asarray(leaf)[lanes], cases)
-        before = np.where((part.present == alone).all(axis=1), plans.violation[lanes], np.inf)
-        part = within(dataclasses.replace(part, present=part.present & alone), limits)
+        part = jax.tree.map(lambda leaf, lanes=lanes: np.asarray(leaf)[lanes], known)
+        part = within(dataclasses.replace(part, present=part.present & balls), wide)
         found = plan_all(planner, part)
+        same = (part.present == cases.present[lanes]).all(axis=1)
+        before = np.where(same, plans.violation[lanes], np.inf)
         better = ~is_unsolved(np.asarray(found.status)) | (found.violation < before)
         to, chosen = lanes[better], np.flatnonzero(better)
 
@@ -465,7 +475,7 @@ def within(cases: CatchCase, limits: dict[str, Any] | None) -> CatchCase:
 
 
 def bounds(loop: Loop, distance: tuple[float, float]) -> dict[str, Any]:
-    """Least thrust [m/s^2] and greatest body rate [rad/s] of plans, as `_FIRST` has them."""
+    """Least thrust [m/s^2] and greatest body rate [rad/s] of plans, as `_LIMITS` has them."""
     model, gravity = loop.world.carrier.model, loop.world.gravity
     least, _ = model.thrust_bounds
     above, share = distance
