@@ -91,9 +91,8 @@ class LivePlanner:
         gravity = float(stroke.case.gravity)
         self._sight = Sight(stroke.flight, stroke.drag, gravity, noise)
         self._worker = concurrent.futures.ThreadPoolExecutor(1, "planning")
-        self.report = Report(deadline)
+        self.report, self._arrivals = Report(deadline), Arrivals()
         self._forget()
-        self._arrivals = Arrivals()
 
     def _forget(self) -> None:
         """Know nothing of robot and ball."""
@@ -185,7 +184,7 @@ class LivePlanner:
         self._flight, self._job = self._resting(state.astype(np.float32), due), None
         return Fault.NONE
 
-    def _resting(self, state: np.ndarray, began: float) -> _Flight:
+    def _resting(self, state: Any, began: float) -> _Flight:
         case = self.stroke.case
         stop = Stop(state, case.gravity, case.limits)
         return _Flight(call_packed(to_rest, self.stroke.pieces, None, stop), began)
@@ -200,7 +199,8 @@ class LivePlanner:
         self.report.counts["balls"] += self._sight.number != before
         self._collect(due)
         if ball is not None and self._job is None and self._is_worth_planning(packet.ball, due):
-            found = self._worker.submit(self._search, ball, self._flight, packet.ball, due)
+            flight: Any = self._flight
+            found = self._worker.submit(self._search, ball, flight, packet.ball, due)
             self._job = _Job(found, due, packet.ball)
         if self._job is not None:
             left = self.deadline - _RESERVE - (time.perf_counter() - received)
@@ -274,5 +274,6 @@ class LivePlanner:
 
     def _due(self, flight: _Flight, due: float) -> np.ndarray:
         """The setpoints (K, 20) from a time on."""
-        elapsed, period = (np.float32(x) for x in (due - flight.began, self._period))
+        elapsed: Any = np.float32(due - flight.began)
+        period: Any = np.float32(self._period)
         return call_packed(setpoints, self._num, None, Due(flight.course, elapsed, period))

@@ -77,7 +77,7 @@ class Sight:
 
     def forget(self) -> None:
         """Expect another ball."""
-        self._belief: EkfState | None = None
+        self._belief: Any = None  # an `EkfState` with NumPy leaves
         self.number: int | None = None
         self.spread = np.inf  # [m/s], of the velocity
         self._time = -np.inf
@@ -114,14 +114,14 @@ class Sight:
         return seen.ball, Fault.NONE
 
     def _look(self, observation: tuple[float, ...], since: float, ahead: float) -> Seen:
-        numbers = [np.asarray(x, np.float32) for x in (since, observation, max(ahead, 0.0))]
+        given: Any = (since, observation, max(ahead, 0.0))
+        numbers: Any = [np.asarray(x, np.float32) for x in given]
         return call_packed(_looked, self._flight, self._model, Look(self._belief, *numbers))
 
     def _begin(self, number: int, observation: tuple[float, ...], measured: float) -> None:
         stds = [self._noise] * 3 + [_SPREAD] * 3
-        self._belief = EkfState(
-            mean=np.array([*observation, 0.0, 0.0, 0.0], np.float32),
-            covariance=np.diag(np.square(stds)).astype(np.float32),
-        )
+        mean: Any = np.array([*observation, 0.0, 0.0, 0.0], np.float32)
+        covariance: Any = np.diag(np.square(stds)).astype(np.float32)
+        self._belief = EkfState(mean=mean, covariance=covariance)
         self.number, self._time, self.spread = number, measured, np.inf
         self._looks, self._outliers = 1, 0

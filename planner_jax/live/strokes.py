@@ -116,12 +116,8 @@ class CatchStroke:
     """
 
     def __init__(self, robot: QuadrotorModel = PAPER_CATCHER, *, drag: float = CATCH_DRAG) -> None:
-        zero = np.zeros((1, 3), np.float32)
-        path = BallPath(
-            BallState(zero, zero),
-            np.full((1, 3), drag, np.float32),
-            np.full(1, CATCH_GRAVITY, np.float32),
-        )
+        zero, drags = jnp.zeros((1, 3)), jnp.full((1, 3), drag, jnp.float32)
+        path = BallPath(BallState(zero, zero), drags, jnp.full(1, CATCH_GRAVITY, jnp.float32))
         self.case = _on_host(catch_case(path, np.ones(1, np.float32), robot=robot))
         self.flight, self.drag, self.gravity = linear_drag_flight, np.full(3, drag), CATCH_GRAVITY
         self.shortest = 0.15
