@@ -44,11 +44,10 @@ def paths(task: str, rate: float) -> np.ndarray:
     steps = int(SECONDS * rate)
     if task == "hit":
         cases = pj.hit.draw(NUM)
-        of_one = lambda ball, drag, gravity: (
-            fly(  # noqa: E731
-                ball, jnp.asarray(SECONDS), drag, gravity, num_steps=steps
-            )[1].pos
-        )
+
+        def of_one(ball, drag, gravity):
+            return fly(ball, jnp.asarray(SECONDS), drag, gravity, num_steps=steps)[1].pos
+
         flown = jax.jit(jax.vmap(of_one))(cases.ball, cases.drag, cases.gravity)
     else:
         targets = jax.tree.map(lambda leaf: leaf[:, 0], pj.catch.draw(NUM).targets)
@@ -99,11 +98,11 @@ class Soak:
         self.lost = self.late = self.repeated = self.missed = self.by_host = self.silent = 0
         self.thrown = self.met = 0
 
-    def send(self, kind: int, values: tuple, ball: int) -> Any:
+    def send(self, kind: int, measured: float, values: tuple, ball: int) -> Any:
         """The answer to a packet, None where none comes or it was not sent in time."""
         self._sequence = (self._sequence + 1) % 2**32
         sent = time.monotonic()
-        data = request(kind, self._sequence, sent, sent, values, ball)
+        data = request(kind, self._sequence, sent, measured, values, ball)
         fate = self._random.random() * 300.0 / max(self.options.bad, 1e-9)
         if fate < 1.0:
             self.lost += 1
@@ -141,15 +140,16 @@ class Soak:
         period, wanted, contact = 1.0 / self.options.rate, None, np.inf
         began = time.monotonic()
         for k, place in enumerate(path):
-            time.sleep(max(0.0, began + k * period - time.monotonic()))
+            now = began + k * period
+            time.sleep(max(0.0, now - time.monotonic()))
             while self._later and self._later[0][0] < time.monotonic():
                 self._socket.send(heapq.heappop(self._later)[2])
             state = np.zeros((3, 3)) if wanted is None else wanted
             if wanted is None:
                 state[0] = start
-            answer = self.send(ROBOT, tuple(state.ravel()), ball)
+            answer = self.send(ROBOT, time.monotonic(), tuple(state.ravel()), ball)
             seen = place + self._random.normal(0.0, NOISE, 3)
-            answer = self.send(BALL, tuple(seen), ball) or answer
+            answer = self.send(BALL, now, tuple(seen), ball) or answer
             if answer is None or not len(answer.setpoints):
                 continue
             wanted = answer.setpoints[0, :9].astype(float).reshape(3, 3)
@@ -210,8 +210,8 @@ def main() -> None:
             f"{1e3 * soak.trips.longest:.1f} ms; {soak.missed} took longer than "
             f"{1e3 * options.deadline:g} ms, {soak.by_host} of these while the host kept a thread "
             f"that sleeps from running; {soak.silent} without an answer",
-            f"lost {soak.lost}, late {soak.late}, repeated {soak.repeated}; the host kept the thread "
-            f"from running {soak.naps.num} times for more than {1e3 * GAP:g} ms, at most "
+            f"lost {soak.lost}, late {soak.late}, repeated {soak.repeated}; the host kept the "
+            f"thread from running {soak.naps.num} times for more than {1e3 * GAP:g} ms, at most "
             f"{1e3 * soak.naps.longest:.1f} ms",
             "the server's own report:",
             told.strip(),

@@ -27,7 +27,7 @@ ALLOWED = {
             "registry",
             "rules",
         ),
-        *("task", "trajectory"),
+        *("robot", "task", "trajectory"),
     },
     "arithmetic": set(),
     "lanes": set(),

@@ -2,6 +2,7 @@
 
 import socket
 import time
+from typing import Any, Self
 
 from planner_jax.live.packets import BALL, LONGEST, ROBOT, Answer, read_answer, request
 from planner_jax.live.server import HOST
@@ -9,7 +10,7 @@ from planner_jax.live.settings import PORT
 
 
 class Client:
-    """Sends what was measured, and waits for the setpoints.
+    """Sends what was measured, and waits for the setpoints; its socket is closed with its block.
 
     Args:
         port: of the loop.
@@ -57,6 +58,8 @@ class Client:
             pass
         return None
 
-    def close(self) -> None:
-        """Give the socket back."""
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: Any) -> None:
         self._socket.close()

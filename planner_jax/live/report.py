@@ -68,7 +68,7 @@ class Report:
         """No longer listen to what is compiled."""
         jax.monitoring.unregister_event_duration_listener(self._heard)
 
-    def _heard(self, event: str, duration: float, **_: Any) -> None:
+    def _heard(self, event: str, duration_secs: float, **_: str | int) -> None:
         self.compiled += event.startswith(_COMPILING)
 
     def figures(self) -> dict[str, Any]:
