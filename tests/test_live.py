@@ -235,12 +235,13 @@ def test_a_signal_ends_it_with_the_report(number):
 
 @pytest.mark.slow
 def test_hits_are_planned_too():
-    planner = LivePlanner(HitStroke(), deadline=30.0)
-    planner.warm_up()
     cases = pj.hit.draw(1)
     of_one = jax.jit(lambda ball: pj.fly(ball, 1.5, 0.0616, 9.8, num_steps=150)[1].pos)
     served = np.asarray(of_one(pj.lane(cases.ball, 0)), float)
-    throw = Throw(planner, served, 1, home=np.asarray(cases.head_state[0, 0], float))
+    home = np.asarray(cases.head_state[0, 0], float)
+    planner = LivePlanner(HitStroke(), deadline=30.0)
+    planner.warm_up()
+    throw = Throw(planner, served, 1, home=home)
     answers = throw.fly(40)
     planner.close()
     assert answers[-1].motion is Motion.PLAN and planner.report.compiled == 0
