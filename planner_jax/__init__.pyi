@@ -1,3 +1,4 @@
+from . import live as live
 from .ball.flight import BallState as BallState
 from .ball.flight import fly as fly
 from .ball.prediction import predict_path as predict_path

@@ -1,4 +1,4 @@
-"""The command line: `planner-jax` with `sweep`, `fly`, `train`, `library`, `view`, `export`, ...
+"""The command line: `planner-jax` with `sweep`, `fly`, `serve`, `train`, `library`, `view`, ...
 
 Tasks come from the registry, and the options of `sweep` and `fly` from the fields of a task's
 settings: nothing here knows a task.
@@ -9,10 +9,12 @@ import contextlib
 import dataclasses
 import datetime
 import functools
+import math
 import os
 import pkgutil
 import shlex
 import sys
+import time
 import typing
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -22,7 +24,8 @@ from typing import Any, NoReturn
 from planner_jax import stopping
 from planner_jax.compile_cache import keep_compiled_programs
 from planner_jax.digits import written_number, written_whole
-from planner_jax.registry import MissingExtra, Task, UnknownName, all_tasks
+from planner_jax.live.settings import SERVED
+from planner_jax.registry import MissingExtra, Task, UnknownName, all_tasks, task_named
 from planner_jax.sweep.environment import installed_version, require_backend
 from planner_jax.sweep.settings import SettingError, WorkersFailed, is_address
 
@@ -163,6 +166,12 @@ def _parser() -> _Parser:
     words = "ready robots with their main figures, or one of them as a YAML file to begin from"
     robots = command("robots", words, _robots)
     robots.add_argument("robot", metavar="NAME", nargs="?", help="one of them, or a file")
+    words = "plan live for one robot: what it sees in, setpoints out, over UDP"
+    serve = commands.add_parser("serve", help=words)
+    served = serve.add_subparsers(title="tasks", required=True, metavar="task")
+    for name, kind in SERVED.items():
+        fill = functools.partial(_add_serve, kind)
+        served.add_parser(name, help=task_named(name).summary, fill=fill, **hidden)
     words = "write a plan for a controller, or send it in real time"
     commands.add_parser("export", help=words, fill=_add_export, **hidden)
     bench = commands.add_parser("bench", help="measure this machine")
@@ -306,6 +315,35 @@ def _plan_of(source: str, row: int | None) -> tuple[Any, str]:
     if not os.path.exists(source):
         raise SettingError(f"RUN must be the folder of a sweep or a file of plans, got {source!r}")
     return saved_plan(source, row), ""
+
+
+def _add_serve(kind: type, parser: _Parser) -> None:
+    parser.description = (
+        "Takes what is seen of a ball and of the robot as packets of UDP on localhost, plans as\n"
+        "soon as the ball is known, and answers every packet with the setpoints that are due."
+    )
+    _add_settings(parser, kind)
+    parser.set_defaults(command=lambda given: _serve(kind(**given)))
+
+
+def _serve(settings: Any) -> None:
+    require_backend()
+    keep_compiled_programs()
+    from planner_jax.live.planner import LivePlanner
+    from planner_jax.live.server import Server
+
+    names = ("rate", "horizon", "deadline", "noise")
+    options = {name: getattr(settings, name) for name in names}
+    server = Server(LivePlanner(settings.stroke(), **options), settings.port)
+    server.warm_up()
+    report = server.planner.report
+    rest = lambda: f"{report.counts['answered']:,} packets answered"  # noqa: E731
+    with stopping.under_way(rest, bar=False), contextlib.closing(server):
+        print(f"Answering on 127.0.0.1:{server.port}; Ctrl-C stops.", flush=True)
+        ends = time.monotonic() + (settings.seconds or math.inf)
+        server.run(lambda: not stopping.is_told() and time.monotonic() < ends)
+        print("\n".join(report.lines() if settings.report else [report.headline()]), flush=True)
+        stopping.check()
 
 
 def _add_throughput(parser: _Parser) -> None:

@@ -83,3 +83,12 @@ def shown(size: float) -> str:
             return f"{size:.3g} {unit}"
         size /= 1e3
     return f"{size:.3g} TB"
+
+
+def resident_memory() -> int | None:
+    """Bytes that this process holds in memory now, or None where the system does not tell."""
+    try:
+        pages = Path("/proc/self/statm").read_text(encoding="ascii").split()[1]
+    except OSError:
+        return None
+    return int(pages) * os.sysconf("SC_PAGE_SIZE")

@@ -99,7 +99,7 @@ def status_of(cost: Array, violation: Array, stationary: Array | bool) -> Array:
     return jnp.where(finite, status, Status.NON_FINITE).astype(jnp.int32)
 
 
-def outcome(cost: Array, violation: Array, *, stationary: Array | bool = True) -> dict[str, Array]:
+def outcome(cost: Array, violation: Array, *, stationary: Array | bool = True) -> dict[str, Any]:
     """The fields that every `Plan` has, of a planner that does not iterate.
 
     Args:

@@ -18,6 +18,7 @@ ALLOWED = {
             "compile_cache",
             "cost",
             "export",
+            "live",
             "optimise",
             "plane",
             "planning",
@@ -27,7 +28,7 @@ ALLOWED = {
             "robot",
             "rules",
         ),
-        *("task", "trajectory"),
+        *("robot", "task", "trajectory"),
     },
     "arithmetic": set(),
     "lanes": set(),
@@ -61,6 +62,10 @@ ALLOWED = {
         *("perception", "plane", "robot", "rules", "space", "trajectory"),
         *("digits", "memory", "plain_files", "whole_files"),
     },
+    "live": {
+        *("ball", "memory", "optimise", "planning", "protocol", "robot", "sweep", "task"),
+        "trajectory",
+    },
     "sweep": {
         *("ball", "compile_cache", "digits", "lanes", "memory", "perception", "plane"),
         *("planning", "protocol", "registry", "robot", "rules", "stopping", "task"),
@@ -69,7 +74,8 @@ ALLOWED = {
     "compile_cache": set(),
     "doctor": {"compile_cache", "lanes", "planning", "protocol", "registry", "sweep"},
     "cli": {
-        *("compile_cache", "digits", "doctor", "export", "plan_files", "registry", "robot"),
+        *("compile_cache", "digits", "doctor", "export", "live", "plan_files", "registry"),
+        "robot",
         *("stopping", "sweep"),
     },
     "__main__": {"cli", "stopping"},

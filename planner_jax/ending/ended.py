@@ -92,7 +92,7 @@ class EndedPlanner(Generic[CaseT, PlanT]):
 
 def ending_cases(cases: Any, plans: Any) -> EndingCase:
     """What is left to plan behind plans (B,) of a quadrotor's cases (B,): leaves of their kind."""
-    states = _end_states(plans.trajectory)
+    states: Any = _end_states(plans.trajectory)
     if isinstance(plans.status, np.ndarray):
         states = np.asarray(states)
     return EndingCase(

@@ -14,7 +14,7 @@ from planner_jax.optimise.problem import Round, Settings
 _LONG = LbfgsConfig(max_steps=300, tolerance=1e-7, patience=6)
 
 
-def pending(violation: Array) -> dict[str, Array]:
+def pending(violation: Array) -> dict[str, Any]:
     """The fields that every `Plan` has, before the solver fills in all but the violation."""
     zero = jnp.zeros((), jnp.int32)
     return {

@@ -34,11 +34,12 @@ def call_packed(function: Callable, static: Hashable, own: Any, case: Any) -> An
         [array.ravel() for array in arrays], dtype=program.dtype, casting="unsafe"
     )
     packed = np.asarray(program.run(kept, vector))
+    result = program.results[0]
     return jax.tree.unflatten(
-        program.tree,
+        result.tree,
         [
             packed[where].reshape(shape).astype(dtype, copy=False)
-            for where, shape, dtype in program.fields
+            for where, shape, dtype in result.fields
         ],
     )
 
@@ -48,13 +49,20 @@ def _layout(leaves: Sequence[Any]) -> _Layout:
 
 
 @dataclasses.dataclass(frozen=True)
+class _Result:
+    """What lies where in a vector."""
+
+    tree: Any
+    fields: list[tuple[slice, tuple[int, ...], Any]]  # of the leaves
+
+
+@dataclasses.dataclass(frozen=True)
 class _Program:
     """A compiled function, from what stays and a vector to a vector."""
 
     run: Callable[[list[Any], np.ndarray], jax.Array]
     dtype: np.dtype  # of both vectors
-    tree: Any  # of the result
-    fields: list[tuple[slice, tuple[int, ...], Any]]  # where the leaves of the result lie
+    results: list[_Result]  # one, which is found out where the function is traced
 
 
 @functools.cache
@@ -80,19 +88,16 @@ def _program(
         given = jax.tree.unflatten(own_tree, kept)
         return function(static, given, jax.tree.unflatten(tree, shaped))
 
+    results: list[_Result] = []
+
     def packed(kept: list[Any], vector: jax.Array) -> jax.Array:
-        leaves = jax.tree.leaves(unpacked(kept, vector))
+        leaves, result = jax.tree.flatten(unpacked(kept, vector))
+        stops = np.cumsum([leaf.size for leaf in leaves]).tolist()
+        fields = [
+            (slice(stop - leaf.size, stop), leaf.shape, leaf.dtype)
+            for stop, leaf in zip(stops, leaves, strict=True)
+        ]
+        results[:] = [_Result(result, fields)]
         return jnp.concatenate([leaf.ravel().astype(dtype) for leaf in leaves])
 
-    shapes = jax.eval_shape(
-        unpacked,
-        [jax.ShapeDtypeStruct(shape, kind) for shape, kind in own],
-        jax.ShapeDtypeStruct((int(ends[-1]),), dtype),
-    )
-    leaves, result = jax.tree.flatten(shapes)
-    stops = np.cumsum([leaf.size for leaf in leaves]).tolist()
-    fields = [
-        (slice(stop - leaf.size, stop), leaf.shape, leaf.dtype)
-        for stop, leaf in zip(stops, leaves, strict=True)
-    ]
-    return _Program(jax.jit(packed), dtype, result, fields)
+    return _Program(jax.jit(packed), dtype, results)

@@ -65,18 +65,19 @@ class QuadrotorPlan(Plan):
 @jax.jit
 def _sampled(path: PiecewisePolynomial, gravity: Array, time: Array) -> dict[str, Array]:
     """The setpoints of plans with leaves (B, ...) at times (K,)."""
-
-    def at(path: PiecewisePolynomial, gravity: Array, time: Array) -> dict[str, Array]:
-        pos, vel, acc, jerk = (evaluate(path, time, order) for order in range(4))
-        return {
-            "pos": pos,
-            "vel": vel,
-            "acc": acc,
-            "jerk": jerk,
-            "quat_wxyz": tilt_quaternion(body_z(acc, gravity)),
-            "body_rate": flat_attitude(acc, jerk, gravity)[1],
-            "thrust": jnp.sqrt(jnp.sum(net_thrust(acc, gravity) ** 2)),
-        }
-
-    of_plan = jax.vmap(at, in_axes=(None, None, 0))
+    of_plan = jax.vmap(setpoint_at, in_axes=(None, None, 0))
     return jax.vmap(of_plan, in_axes=(0, 0, None))(path, gravity, time)
+
+
+def setpoint_at(path: PiecewisePolynomial, gravity: Array, time: Array) -> dict[str, Array]:
+    """One setpoint of one trajectory at a time () [s]: what `QuadrotorSetpoints` has but that."""
+    pos, vel, acc, jerk = (evaluate(path, time, order) for order in range(4))
+    return {
+        "pos": pos,
+        "vel": vel,
+        "acc": acc,
+        "jerk": jerk,
+        "quat_wxyz": tilt_quaternion(body_z(acc, gravity)),
+        "body_rate": flat_attitude(acc, jerk, gravity)[1],
+        "thrust": jnp.sqrt(jnp.sum(net_thrust(acc, gravity) ** 2)),
+    }

@@ -94,6 +94,17 @@ def _rows() -> list:
     rows += _of("export junk --to csv", "--rate", NOT_NUMBERS)
     rows += _of("export junk --to px4", "--udp", NOT_WHOLE)
     rows += _of("export junk --to csv", "--out", ("",))
+    for task in ("hit", "catch"):
+        rows += _of(f"serve {task}", "--port", ("-1", "65536", "1" + "0" * 15, *NOT_WHOLE))
+        rows += _of(f"serve {task}", "--rate", ("0", "1e300", "nan", *NOT_NUMBERS))
+        rows += _of(f"serve {task}", "--deadline", ("0", "10", "nan", "inf", "-1", "x"))
+        rows += _of(f"serve {task}", "--horizon", ("0", "18", "1.5", "x"))
+        rows += _of(f"serve {task}", "--noise", ("0", "9", "nan"))
+        rows += _of(f"serve {task}", "--drag", ("-1", "nan", "99"))
+        rows += _of(f"serve {task}", "--seconds", ("0", "-1", "nan", "inf"))
+    rows += [
+        (("serve", "hit", "--target", *place.split()), ("--target",)) for place in ("1 2", "x")
+    ]
     rows += _of("library build new", "--home", ("x", "1"))
     rows += [
         (("library", "build", "new", "--home", *["nan"] * 6), ("--home", "finite")),
@@ -129,7 +140,16 @@ def _rows() -> list:
     rows += _of("train", "--network", ("x",)) + _of("train", "--last", ("nan", "-1"))
     rows += _of("train", "--iterations", ("-1", "1")) + _of("train", "--estimated", ("-1", "9"))
     rows += _of("view folder", "--port", ("x", "1_0", "", "٣"))
-    for words in ((), ("sweep",), ("fly",), ("library",), ("bench",), ("nobody",), ("doctor", "x")):
+    for words in (
+        (),
+        ("sweep",),
+        ("fly",),
+        ("serve",),
+        ("library",),
+        ("bench",),
+        ("nobody",),
+        ("doctor", "x"),
+    ):
         rows.append((words, ()))
     return rows
 

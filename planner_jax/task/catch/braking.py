@@ -30,7 +30,8 @@ def braking(state: Array, gravity: Array, limits: QuadrotorLimits) -> Braking:
     """The way to rest that is soonest over, of those with least snap for their duration; pure.
 
     Where the quadrotor comes to rest is free, so each is of degree six. Where none of the durations
-    that are tried keeps the limits, `possible` says so.
+    that are tried keeps the limits, `possible` says so, and the way is that which exceeds them
+    least.
 
     Args:
         state: (4, 3), position to jerk.
@@ -52,9 +53,10 @@ def braking(state: Array, gravity: Array, limits: QuadrotorLimits) -> Braking:
         excess = flight_excess(motion, gravity, limits)
         measures = flight_measures(limits)
         relative = [of.relative(each) for of, each in zip(measures, excess, strict=True)]
-        return coeffs, jnp.max(jnp.stack(relative)) <= FEASIBILITY_TOLERANCE
+        return coeffs, jnp.max(jnp.stack(relative))
 
     durations = jnp.asarray(_DURATIONS, state.dtype)
-    coeffs, kept = jax.vmap(to_rest)(durations)
-    first = jnp.argmax(kept)
+    coeffs, worst = jax.vmap(to_rest)(durations)
+    kept = worst <= FEASIBILITY_TOLERANCE
+    first = jnp.where(jnp.any(kept), jnp.argmax(kept), jnp.argmin(worst))
     return Braking(coeffs=coeffs[first], duration=durations[first], possible=jnp.any(kept))

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from planner_jax.ending.ended import ended
+from planner_jax.ending.ended import EndedPlanner, ended
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.protocol import Decision
 from planner_jax.referee.catch import CatchVerdict, referee_catches
@@ -19,7 +19,7 @@ def planner(
     decide: str | Decision = "best",
     ending: str | None = None,
     **options: Any,
-) -> Any:
+) -> DecidedPlanner[CatchCase, CatchPlan] | EndedPlanner[CatchCase, CatchPlan]:
     """The catch planner of a name, behind a decision about order and times.
 
     * `exact`: the ball is in the net by construction; the one to use.

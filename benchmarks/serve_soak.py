@@ -1,0 +1,231 @@
+"""The live loop under throws one after another, with packets lost, late and repeated.
+
+    python -m benchmarks.serve_soak [--task catch] [--minutes 1] [--rate 100] [--bad 2]
+        [--deadline 0.01] [--server-core N] [--out DIR]
+
+Starts `planner-jax serve TASK --report` as a process of its own, and sends it balls of the task's
+suite as they fly, with noise on their places, and the state of a robot that is where the last
+answer has it. Of the packets as many per cent as --bad says are lost, come 30 ms late, or are sent
+twice, a third each. A round trip that takes longer than the deadline is a miss. A thread that only
+sleeps notes when the host has not let it run: misses within such a gap are the host's. At the end
+stand misses, times, and the server's own report with its memory at the start and at the end. The
+success of the summary is the share of the balls that a plan was flown for to its end.
+"""
+
+import heapq
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import planner_jax as pj
+from planner_jax.ball.flight import fly
+from planner_jax.benchmarks.run import argument_parser, begin
+from planner_jax.live.client import HOST
+from planner_jax.live.packets import BALL, LONGEST, ROBOT, Motion, read_answer, request
+from planner_jax.live.report import Latencies
+
+NUM = 200  # balls that are drawn, and thrown again and again
+SECONDS = 1.6  # of a throw
+NOISE = 0.005  # [m]
+LATE = 0.03  # [s]
+NAP, GAP = 0.001, 0.004  # [s], of the thread that sleeps, and what it notes
+
+
+def paths(task: str, rate: float) -> np.ndarray:
+    """Places (NUM, K, 3) [m] of balls at the rate."""
+    steps = int(SECONDS * rate)
+    if task == "hit":
+        cases = pj.hit.draw(NUM)
+
+        def of_one(ball, drag, gravity):
+            return fly(ball, jnp.asarray(SECONDS), drag, gravity, num_steps=steps)[1].pos
+
+        flown = jax.jit(jax.vmap(of_one))(cases.ball, cases.drag, cases.gravity)
+    else:
+        targets = jax.tree.map(lambda leaf: leaf[:, 0], pj.catch.draw(NUM).targets)
+        times = jnp.arange(1, steps + 1) / rate
+        flown = jax.jit(jax.vmap(lambda path: jax.vmap(lambda t: path.at(t).pos)(times)))(targets)
+    return np.asarray(flown, float)
+
+
+class Naps:
+    """Notes when a thread that asks for little was kept from running."""
+
+    def __init__(self) -> None:
+        self.gaps: list[tuple[float, float]] = []  # begin and end [s], the latest ones
+        self.num, self.longest, self._on = 0, 0.0, True
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        before = time.monotonic()
+        while self._on:
+            time.sleep(NAP)
+            now = time.monotonic()
+            if now - before - NAP > GAP:
+                self.num, self.longest = self.num + 1, max(self.longest, now - before - NAP)
+                self.gaps = [*self.gaps[-99:], (before, now)]
+            before = now
+
+    def cover(self, begin: float, end: float) -> bool:
+        """Whether there was a gap between two times [s]."""
+        return any(a < end and b > begin for a, b in self.gaps)
+
+    def end(self) -> None:
+        """Note no more."""
+        self._on = False
+        self._thread.join()
+
+
+class Soak:
+    """Throws balls at a server and counts what comes back."""
+
+    def __init__(self, port: int, options: Any) -> None:
+        self.options, self.naps, self.trips = options, Naps(), Latencies()
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.connect((HOST, port))
+        self._random = np.random.default_rng(options.seed)
+        self._sequence = self._tie = 0
+        self._later: list[tuple[float, int, bytes]] = []
+        self.lost = self.late = self.repeated = self.missed = self.by_host = self.silent = 0
+        self.thrown = self.met = 0
+
+    def send(self, kind: int, measured: float, values: tuple, ball: int) -> Any:
+        """The answer to a packet, None where none comes or it was not sent in time."""
+        self._sequence = (self._sequence + 1) % 2**32
+        sent = time.monotonic()
+        data = request(kind, self._sequence, sent, measured, values, ball)
+        fate = self._random.random() * 300.0 / max(self.options.bad, 1e-9)
+        if fate < 1.0:
+            self.lost += 1
+            return None
+        if fate < 2.0:
+            self.late, self._tie = self.late + 1, self._tie + 1
+            heapq.heappush(self._later, (sent + LATE, self._tie, data))
+            return None
+        if fate < 3.0:
+            self.repeated += 1
+            self._socket.send(data)
+        self._socket.send(data)
+        return self._answer(sent)
+
+    def _answer(self, sent: float) -> Any:
+        while (left := sent + 0.25 - time.monotonic()) > 0.0:
+            self._socket.settimeout(left)
+            try:
+                answer = read_answer(self._socket.recv(LONGEST))
+            except TimeoutError:
+                break
+            if answer is not None and answer.sequence == self._sequence:
+                taken = time.monotonic() - sent
+                self.trips.add(taken)
+                if taken > self.options.deadline:
+                    self.missed += 1
+                    self.by_host += self.naps.cover(sent, sent + taken)
+                return answer
+        self.silent += 1
+        return None
+
+    def throw(self, path: np.ndarray, start: np.ndarray, ball: int) -> None:
+        """One ball from its first sight to its contact, the robot in hover at first."""
+        self.thrown += 1
+        period, wanted, contact = 1.0 / self.options.rate, None, np.inf
+        began = time.monotonic()
+        for k, place in enumerate(path):
+            now = began + k * period
+            time.sleep(max(0.0, now - time.monotonic()))
+            while self._later and self._later[0][0] < time.monotonic():
+                self._socket.send(heapq.heappop(self._later)[2])
+            state = np.zeros((3, 3)) if wanted is None else wanted
+            if wanted is None:
+                state[0] = start
+            answer = self.send(ROBOT, time.monotonic(), tuple(state.ravel()), ball)
+            seen = place + self._random.normal(0.0, NOISE, 3)
+            answer = self.send(BALL, now, tuple(seen), ball) or answer
+            if answer is None or not len(answer.setpoints):
+                continue
+            wanted = answer.setpoints[0, :9].astype(float).reshape(3, 3)
+            contact = answer.contact if answer.motion is Motion.PLAN else contact
+            if time.monotonic() > contact:
+                self.met += 1
+                break
+
+    def end(self) -> None:
+        """Give the socket back."""
+        self.naps.end()
+        self._socket.close()
+
+
+def started(options: Any) -> tuple[subprocess.Popen, int, float]:
+    """The server's process, its port, and after how many seconds it answers."""
+    words = [sys.executable, "-m", "planner_jax", "serve", options.task, "--port", "0", "--report"]
+    words += ["--deadline", str(options.deadline)]
+    if options.server_core is not None:
+        words = ["taskset", "-c", str(options.server_core), *words]
+    began = time.perf_counter()
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    line = process.stdout.readline()
+    if "Answering" not in line:
+        raise SystemExit(process.communicate()[1])
+    port = int(line.split(":")[1].split(";")[0])
+    return process, port, time.perf_counter() - began
+
+
+def main() -> None:
+    """Soak, and report."""
+    parser = argument_parser("serve_soak", __doc__, seed=0)
+    parser.add_argument("--task", choices=("hit", "catch"), default="catch", help="default: catch")
+    parser.add_argument("--minutes", type=float, default=1.0, help="default: 1")
+    parser.add_argument("--rate", type=float, default=100.0, help="looks a second [Hz]")
+    parser.add_argument("--bad", type=float, default=2.0, help="per cent of packets (default: 2)")
+    parser.add_argument("--deadline", type=float, default=0.01, help="[s] (default: 0.01)")
+    parser.add_argument("--server-core", type=int, help="core that the server is bound to")
+    options = parser.parse_args()
+    with begin(parser, options) as bench:
+        balls = paths(options.task, options.rate)
+        case = pj.hit.draw(1) if options.task == "hit" else pj.catch.draw(1)
+        start = np.asarray(case.head_state[0, 0], float)
+        process, port, seconds = started(options)
+        soak = Soak(port, options)
+        ends = time.monotonic() + 60.0 * options.minutes
+        while time.monotonic() < ends:
+            soak.throw(balls[soak.thrown % NUM], start, soak.thrown % 2**16)
+        soak.end()
+        process.send_signal(signal.SIGINT)
+        told, _ = process.communicate(timeout=30.0)
+        trips = [1e3 * soak.trips.quantile(share) for share in (0.5, 0.99)]
+        bench.say(
+            f"{options.task}, {options.minutes:g} min at {options.rate:g} looks/s: answers "
+            f"{seconds:.1f} s after the start; {soak.thrown} balls, {soak.met} met by a plan",
+            f"{soak.trips.num:,} round trips: p50 {trips[0]:.2f} ms, p99 {trips[1]:.2f} ms, max "
+            f"{1e3 * soak.trips.longest:.1f} ms; {soak.missed} took longer than "
+            f"{1e3 * options.deadline:g} ms, {soak.by_host} of these while the host kept a thread "
+            f"that sleeps from running; {soak.silent} without an answer",
+            f"lost {soak.lost}, late {soak.late}, repeated {soak.repeated}; the host kept the "
+            f"thread from running {soak.naps.num} times for more than {1e3 * GAP:g} ms, at most "
+            f"{1e3 * soak.naps.longest:.1f} ms",
+            "the server's own report:",
+            told.strip(),
+        )
+        bench.count(np.arange(soak.thrown) < soak.met)
+        bench.note(
+            p50_ms=trips[0],
+            p99_ms=trips[1],
+            trips=soak.trips.num,
+            missed=soak.missed,
+            missed_by_host=soak.by_host,
+            start_seconds=seconds,
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,94 @@
+"""The socket of a live loop: UDP on localhost, one process, one robot."""
+
+import contextlib
+import gc
+import socket
+import sys
+import time
+from collections.abc import Callable, Iterator
+
+from planner_jax.live.packets import LONGEST
+from planner_jax.live.planner import LivePlanner
+
+HOST = "127.0.0.1"
+_LISTENED = 0.25  # [s], without a packet, after which is asked whether to stop
+_TIDIED = 1.0  # [s], between two looks for garbage, which are made behind an answer
+_SWITCH = 5e-4  # [s], for which a thread may keep others waiting
+
+
+class Server:
+    """Answers packets until it is told to stop.
+
+    Args:
+        planner: that answers.
+        port: 0 takes a free one.
+
+    Raises:
+        OSError: the port cannot be had; its `filename` names the port.
+    """
+
+    def __init__(self, planner: LivePlanner, port: int) -> None:
+        self.planner = planner
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._socket.bind((HOST, port))
+        except OSError as error:
+            self._socket.close()
+            raise OSError(error.errno, error.strerror, f"port {port}") from None
+        self.port: int = self._socket.getsockname()[1]
+
+    def warm_up(self) -> None:
+        """Have all compiled, and drop what has come by then."""
+        self.planner.warm_up()
+        self._socket.setblocking(False)
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                self._socket.recv(LONGEST)
+        self._socket.settimeout(_LISTENED)
+
+    def run(self, goes_on: Callable[[], bool]) -> None:
+        """Answer while `goes_on()`, which is asked after every packet, and where none come."""
+        with _undisturbed():
+            tidied = time.perf_counter()
+            while goes_on():
+                try:
+                    data, sender = self._socket.recvfrom(LONGEST)
+                except TimeoutError:
+                    continue
+                self._answer(data, sender, time.perf_counter())
+                if time.perf_counter() - tidied > _TIDIED:
+                    gc.collect()
+                    tidied = time.perf_counter()
+
+    def _answer(self, data: bytes, sender: tuple[str, int], received: float) -> None:
+        answer = self.planner.answer(data, sender, received)
+        if answer is None:
+            return
+        try:
+            self._socket.sendto(answer, sender)
+        except OSError:
+            self.planner.report.counts["unsent"] += 1
+            return
+        self.planner.sent(data, received)
+
+    def close(self) -> None:
+        """Give the port back, and end the planner's thread."""
+        self._socket.close()
+        self.planner.close()
+
+
+@contextlib.contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Neither garbage collection nor another thread gets in the way of an answer."""
+    was_on, before = gc.isenabled(), sys.getswitchinterval()
+    gc.collect()
+    gc.freeze()  # what is there now is not looked at again
+    gc.disable()
+    sys.setswitchinterval(_SWITCH)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(before)
+        gc.unfreeze()
+        if was_on:
+            gc.enable()

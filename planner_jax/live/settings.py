@@ -1,0 +1,81 @@
+"""What `planner-jax serve` is asked to do, checked before anything is compiled; imports no JAX."""
+
+import dataclasses
+from typing import Any
+
+from planner_jax.sweep.settings import option, require, require_count
+
+PORT = 5560
+
+
+@dataclasses.dataclass(frozen=True)
+class ServeSettings:
+    """The options that all tasks have.
+
+    Raises:
+        SettingError: a value breaks its rule.
+    """
+
+    port: int = option(PORT, "N", "UDP port of this machine, 0 takes a free one")
+    rate: float = option(100.0, "HZ", "of the setpoints in an answer")
+    horizon: int = option(10, "K", "setpoints in an answer")
+    deadline: float = option(0.01, "S", "from a packet to its answer [s]")
+    noise: float = option(0.005, "M", "standard deviation of an observed coordinate [m]")
+    seconds: float | None = option(None, "S", "end after this time (default: never)")
+    report: bool = option(False, "", "tell counts, times and memory at the end")
+
+    def __post_init__(self) -> None:
+        require_count("port", self.port, 0)
+        require(self.port < 2**16, "port", f"at most {2**16 - 1}", self.port)
+        require(1.0 <= self.rate <= 1000.0, "rate", "from 1 to 1000", self.rate)
+        require_count("horizon", self.horizon, 1)
+        require(self.horizon <= 17, "horizon", "at most 17", self.horizon)
+        require(0.002 <= self.deadline <= 1.0, "deadline", "from 0.002 to 1", self.deadline)
+        require(0.001 <= self.noise <= 0.5, "noise", "from 0.001 to 0.5", self.noise)
+        if self.seconds is not None:
+            require(0.0 < self.seconds <= 1e7, "seconds", "> 0 and at most 1e7", self.seconds)
+
+    def stroke(self) -> Any:
+        """What is planned."""
+        raise NotImplementedError
+
+
+@dataclasses.dataclass(frozen=True)
+class HitServe(ServeSettings):
+    """Those of hits."""
+
+    target: tuple[float, ...] = option((3.0, 0.0, 0.0), "M", "where the ball is to land")
+    drag: float = option(0.0616, "K", "K_D of the ball [1/m]")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(len(self.target) == 3, "target", "3 numbers", len(self.target))
+        for place in self.target:
+            require(abs(place) <= 100.0, "target", "within 100 m", place)
+        require(0.0 <= self.drag <= 1.0, "drag", "from 0 to 1", self.drag)
+
+    def stroke(self) -> Any:
+        """A hit to the target."""
+        from planner_jax.live.strokes import HitStroke
+
+        return HitStroke(target=self.target, drag=self.drag)
+
+
+@dataclasses.dataclass(frozen=True)
+class CatchServe(ServeSettings):
+    """Those of catches."""
+
+    drag: float = option(0.5, "K", "of the ball [1/s]")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(0.0 <= self.drag <= 10.0, "drag", "from 0 to 10", self.drag)
+
+    def stroke(self) -> Any:
+        """A catch."""
+        from planner_jax.live.strokes import CatchStroke
+
+        return CatchStroke(drag=self.drag)
+
+
+SERVED: dict[str, type[ServeSettings]] = {"hit": HitServe, "catch": CatchServe}

@@ -1,0 +1,184 @@
+"""What is planned in a live loop: one hit, or one catch, of the ball that is seen.
+
+Each plan is made together with the way to rest behind it, in one compiled call. Of every search
+there is one round alone, since the next look begins where it ended.
+"""
+
+import dataclasses
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from planner_jax.ball.estimation import Flight
+from planner_jax.ball.flight import BallState, linear_drag_flight, rk4_step
+from planner_jax.ball.target import BallPath
+from planner_jax.live.course import Course, with_rest
+from planner_jax.optimise.lbfgs import LbfgsConfig
+from planner_jax.optimise.problem import Round
+from planner_jax.planning.batch import solve_cases
+from planner_jax.planning.packed import call_packed
+from planner_jax.robot.quadrotor_model import QuadrotorModel
+from planner_jax.robot.quadrotor_models import PAPER_CATCHER, PAPER_HITTER
+from planner_jax.task.catch.case import GRAVITY as CATCH_GRAVITY
+from planner_jax.task.catch.case import CatchCase
+from planner_jax.task.catch.case import case as catch_case
+from planner_jax.task.catch.decide import Greedy
+from planner_jax.task.catch.exact import ExactCatch
+from planner_jax.task.catch.replan import ReplanCatch
+from planner_jax.task.hit.case import DRAG as HIT_DRAG
+from planner_jax.task.hit.case import GRAVITY as HIT_GRAVITY
+from planner_jax.task.hit.case import case as hit_case
+from planner_jax.task.hit.exact import ExactHit
+from planner_jax.task.hit.replan import ReplanHit
+
+CATCH_DRAG = 0.5  # [1/s], of the suite `throws`
+TARGET = (3.0, 0.0, 0.0)  # [m], where a hit ball is to land
+_BISECTIONS = 24
+_LONGEST = 4.0  # [s], until when a ball is waited for
+_TRIALS = (1.0, 0.2, 0.04)  # step lengths, as of the re-planners
+_AGAIN = Round(starts=1, solver=LbfgsConfig(max_steps=8, trial_steps=_TRIALS))
+
+
+class Stroke(Protocol):
+    """What a live loop asks of a task."""
+
+    case: Any  # NumPy leaves: robot, limits, and whatever does not change
+    flight: Flight
+    drag: Any
+    shortest: float  # [s], least time to the contact that is planned anew
+    pieces: int  # of a plan's trajectory
+
+    def first(self, ball: BallState, head_state: np.ndarray) -> tuple[Any, Any, Course]:
+        """The case, its plan from scratch, and the course of that; NumPy leaves."""
+        ...
+
+    def again(
+        self, case: Any, plan: Any, elapsed: float, ball: BallState
+    ) -> tuple[Any, Any, Course]:
+        """The same, planned anew some time [s] into a plan; times count from now."""
+        ...
+
+    def contact(self, plan: Any) -> float:
+        """When a plan meets the ball [s]."""
+        ...
+
+
+def _on_host(case: Any) -> Any:
+    return jax.tree.map(lambda leaf: np.asarray(leaf), case)
+
+
+class HitStroke:
+    """One hit of the ball to a target.
+
+    Args:
+        robot: with a racket.
+        target: (3,) [m].
+        drag: K_D [1/m] of the ball.
+    """
+
+    def __init__(
+        self, robot: QuadrotorModel = PAPER_HITTER, *, target: Any = TARGET, drag: float = HIT_DRAG
+    ) -> None:
+        far = (6.0, 0.0, 2.0)
+        self.case = _on_host(hit_case(far, (-1.0, 0.0, 0.0), target, robot=robot, drag=drag))
+        self.flight, self.drag, self.gravity = rk4_step, drag, HIT_GRAVITY
+        self.shortest = 0.2
+        self._planner = ExactHit(drag_after_impact=True)
+        self._again = ReplanHit(self._planner, rounds=(_AGAIN,))
+        self.pieces = self._planner.num_pieces
+
+    def first(self, ball: BallState, head_state: np.ndarray) -> tuple[Any, Any, Course]:
+        """See `Stroke`."""
+        case = dataclasses.replace(self.case, ball=ball, head_state=head_state)
+        return (case, *call_packed(_planned, self._planner.rounds[1], self._planner, case))
+
+    def again(
+        self, case: Any, plan: Any, elapsed: float, ball: BallState
+    ) -> tuple[Any, Any, Course]:
+        """See `Stroke`."""
+        left = self._again.begin(case, plan, elapsed, ball=ball)
+        return (left.case, *call_packed(_planned_again, _AGAIN, self._again, left))
+
+    def contact(self, plan: Any) -> float:
+        """See `Stroke`."""
+        return float(plan.stroke.time)
+
+
+class CatchStroke:
+    """One catch of the ball, which may be caught until it is too low for the net.
+
+    Args:
+        robot: with a net.
+        drag: K_i [1/s] of the ball, the same along all axes.
+    """
+
+    def __init__(self, robot: QuadrotorModel = PAPER_CATCHER, *, drag: float = CATCH_DRAG) -> None:
+        zero, drags = jnp.zeros((1, 3)), jnp.full((1, 3), drag, jnp.float32)
+        path = BallPath(BallState(zero, zero), drags, jnp.full(1, CATCH_GRAVITY, jnp.float32))
+        self.case = _on_host(catch_case(path, np.ones(1, np.float32), robot=robot))
+        self.flight, self.drag, self.gravity = linear_drag_flight, np.full(3, drag), CATCH_GRAVITY
+        self.shortest = 0.15
+        self._planner = ExactCatch()
+        self._again = ReplanCatch(self._planner, rounds=(_AGAIN,))
+        self.pieces = self._planner.num_pieces
+
+    def first(self, ball: BallState, head_state: np.ndarray) -> tuple[Any, Any, Course]:
+        """See `Stroke`."""
+        case = dataclasses.replace(self.case, targets=self._path(ball), head_state=head_state)
+        return (case, *call_packed(_decided, self._planner.rounds[1], self._planner, case))
+
+    def again(
+        self, case: Any, plan: Any, elapsed: float, ball: BallState
+    ) -> tuple[Any, Any, Course]:
+        """See `Stroke`."""
+        left = self._again.begin(case, plan, elapsed, targets=self._path(ball))
+        return (left.case, *call_packed(_caught_again, _AGAIN, self._again, left))
+
+    def contact(self, plan: Any) -> float:
+        """See `Stroke`."""
+        return float(plan.times[0])
+
+    def _path(self, ball: BallState) -> BallPath:
+        one = BallState(pos=ball.pos[None], vel=ball.vel[None])
+        return dataclasses.replace(self.case.targets, ball=one)
+
+
+def _planned(attempt: Round, planner: Any, case: Any) -> tuple[Any, Course]:
+    plan = solve_cases(planner, case, attempt)
+    return plan, with_rest(plan.trajectory, case.gravity, case.limits)
+
+
+def _planned_again(attempt: Round, planner: Any, task: Any) -> tuple[Any, Course]:
+    plan = solve_cases(planner, task, attempt)
+    return plan, with_rest(plan.trajectory, task.case.gravity, task.case.limits)
+
+
+def _decided(attempt: Round, planner: ExactCatch, case: CatchCase) -> tuple[Any, Course]:
+    """As `_planned`, at the time at which the ball can first be caught."""
+    case = dataclasses.replace(case, horizon=_time_left(case))
+    choice = jax.tree.map(lambda leaf: leaf[0], Greedy().propose(case))
+    return _planned(attempt, planner, case.decided(choice))
+
+
+def _caught_again(attempt: Round, planner: ReplanCatch, task: Any) -> tuple[Any, Course]:
+    case = dataclasses.replace(task.case, horizon=_time_left(task.case))
+    return _planned_again(attempt, planner, dataclasses.replace(task, case=case))
+
+
+def _time_left(case: CatchCase) -> Array:
+    """When the ball falls below what an upright net reaches (1,) [s]; 0 if it is there."""
+    height = case.limits.min_height + case.net.height
+    path = jax.tree.map(lambda leaf: leaf[0], case.targets)
+    # Before its apex a ball may be below that height.
+    start = jnp.maximum(path.ball.vel[2], 0.0) / path.gravity
+
+    def halved(_: Any, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
+        middle = 0.5 * (bounds[0] + bounds[1])
+        above = path.at(middle).pos[2] > height
+        return jnp.where(above, middle, bounds[0]), jnp.where(above, bounds[1], middle)
+
+    low, _ = lax.fori_loop(0, _BISECTIONS, halved, (start, jnp.full_like(start, _LONGEST)))
+    return jnp.where(path.at(start).pos[2] > height, low, 0.0)[None]

@@ -1,0 +1,247 @@
+"""The live loop: from looks at a ball to setpoints, whatever else comes."""
+
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import planner_jax as pj
+from planner_jax.cli import main
+from planner_jax.live.packets import BALL, ROBOT, Fault, Motion, read_answer, request
+from planner_jax.live.planner import LivePlanner
+from planner_jax.live.server import Server
+from planner_jax.live.strokes import CATCH_DRAG, CatchStroke, HitStroke
+
+HOME, STEP = np.array([0.0, 0.0, 1.0]), 0.01
+PAGE = Path(__file__).parents[1] / "docs" / "live.md"
+
+
+@pytest.fixture(scope="module")
+def path():
+    """Places (150, 3) [m] of a thrown ball, a look each."""
+    ball = pj.BallState(jnp.array([3.0, 0.1, 1.7]), jnp.array([-2.9, 0.0, 4.4]))
+    thrown = pj.BallPath(ball, jnp.full(3, CATCH_DRAG), jnp.asarray(9.81))
+    return np.asarray(jax.jit(jax.vmap(thrown.at))(STEP * jnp.arange(150)).pos, float)
+
+
+@pytest.fixture(scope="module")
+def warm():
+    """A planner that has compiled all it calls; a deadline that no busy machine misses."""
+    planner = LivePlanner(CatchStroke(), deadline=30.0)
+    planner.warm_up()
+    yield planner
+    planner.close()
+
+
+class Throw:
+    """One throw by a sender of its own clock; the robot is where the last answer had it."""
+
+    def __init__(self, planner, path, number, disturb=lambda look, data: [data], home=HOME):
+        self.planner, self.path, self.number = planner, path, number
+        self.disturb, self.home = disturb, home
+        planner._forget()
+        self.answers, self.sequence = [], 0
+        # Answers are handed over at once: the senders' clock is ours, the packets' times run on.
+        self.now = time.perf_counter()
+        planner._arrivals.__init__()
+
+    def send(self, data):
+        answer = self.planner.answer(data, "sender", self.now)
+        found = None if answer is None else read_answer(answer)
+        if found is not None:
+            self.planner.sent(data, time.perf_counter())
+            self.answers.append(found)
+        return found
+
+    def packet(self, kind, values):
+        self.sequence += 1
+        return request(kind, self.sequence, self.now, self.now, tuple(values), self.number)
+
+    def fly(self, looks):
+        wanted = np.stack([self.home, 0.0 * HOME, 0.0 * HOME])
+        random = np.random.default_rng(0)
+        for look in range(looks):
+            self.now += STEP
+            self.send(self.packet(ROBOT, wanted.ravel()))
+            seen = self.path[look] + random.normal(0.0, 0.003, 3)
+            for data in self.disturb(look, self.packet(BALL, seen)):
+                self.send(data)
+            wanted = self.answers[-1].setpoints[0, :9].astype(float).reshape(3, 3)
+        return self.answers
+
+
+def balls_of(answers):
+    """The answers to looks."""
+    return answers[1::2]
+
+
+def test_a_throw_is_caught_along_a_smooth_course_and_nothing_is_compiled(warm, path):
+    before = warm.report.compiled
+    throw = Throw(warm, path, 1)
+    answers = balls_of(throw.fly(140))
+    assert warm.report.compiled == before
+    motions = [answer.motion for answer in answers]
+    first, last = motions.index(Motion.PLAN), 139 - motions[::-1].index(Motion.PLAN)
+    assert 2 <= first <= 12 and set(motions[first : last + 1]) == {Motion.PLAN}
+    assert set(motions[last + 1 :]) == {Motion.SAFE}  # and never planned for again
+    contact, look = answers[last].contact, np.arange(140) * STEP + answers[0].begin
+    ball = np.array([np.interp(contact, look, path[:140, k]) for k in range(3)])
+    at = np.argmin(np.abs(look - contact))
+    wanted, thrust = answers[at].column("pos")[0], answers[at].column("acc")[0] + [0, 0, 9.81]
+    net = wanted + 0.2 * thrust / np.linalg.norm(thrust)
+    assert np.linalg.norm(net - ball) < 0.125 + 0.06  # the net's radius, and a look's way
+    places = np.array([answer.column("pos")[0] for answer in answers])
+    speeds = np.array([answer.column("vel")[0] for answer in answers])
+    jumps = np.diff(places, axis=0) - 0.5 * STEP * (speeds[1:] + speeds[:-1])
+    assert np.abs(jumps).max() < 0.01
+    assert np.linalg.norm(speeds[-1]) < 0.3  # at rest, or nearly
+
+
+def test_setpoints_agree_with_each_other(warm, path):
+    answer = balls_of(Throw(warm, path, 2).fly(40))[-1]
+    pos, vel = answer.column("pos"), answer.column("vel")
+    assert answer.motion is Motion.PLAN and pos.shape == (10, 3)
+    assert answer.period == pytest.approx(STEP)
+    middle = 0.5 * STEP * (vel[1:] + vel[:-1])
+    np.testing.assert_allclose(np.diff(pos, axis=0), middle, atol=2e-4)
+    np.testing.assert_allclose(np.linalg.norm(answer.column("quat_wxyz"), axis=1), 1.0, atol=1e-5)
+    push = answer.column("acc") + [0.0, 0.0, 9.81]
+    np.testing.assert_allclose(
+        answer.column("thrust")[:, 0], np.linalg.norm(push, axis=1), rtol=1e-5
+    )
+
+
+def test_before_the_robot_is_known_there_are_no_setpoints_and_then_it_comes_to_rest(warm, path):
+    throw = Throw(warm, path, 3)
+    first = throw.send(throw.packet(BALL, path[0]))
+    assert first.motion is Motion.NONE and not len(first.setpoints)
+    moving = [*HOME, 2.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+    answer = throw.send(throw.packet(ROBOT, moving))
+    assert answer.motion is Motion.SAFE
+    np.testing.assert_allclose(answer.column("vel")[0], [2.0, 0.0, 0.0], atol=1e-5)
+    throw.now += 0.9
+    state = throw.answers[-1].column("pos")[-1]
+    throw.now += 3.5
+    rest = throw.send(throw.packet(BALL, path[0]))
+    assert not rest.column("vel").any() and (rest.column("thrust") == np.float32(9.81)).all()
+    assert rest.column("pos")[0, 0] > state[0]
+
+
+def test_bad_packets_are_counted_by_name_and_spoil_nothing(warm, path):
+    nan, far = (np.nan, 0.0, 0.0), (3.0, 3.0, 9.0)
+
+    def disturbed(look, data):
+        """A packet with others around it, each bad in its own way."""
+        throw.sequence += 4
+        n, now = throw.sequence - 3, throw.now
+        ways = [
+            [data, data],
+            [data, data[:-3]],
+            [b"junk", data],
+            [request(BALL, n, now, now, nan, 4), data],
+            [data, request(BALL, n, now, now, far, 4)],
+            [request(BALL, n, 1e300, 1e300, far, 4), data],
+            [data[:5] + b"\x63" + data[6:], data],
+        ]
+        return ways[look % len(ways)]
+
+    clean = balls_of(Throw(warm, path, 4).fly(60))[-1]
+    before = warm.report.faults.copy()
+    throw = Throw(warm, path, 4, disturbed)
+    answers = throw.fly(60)
+    spoiled = [answer for answer in answers if answer.motion is Motion.PLAN][-1]
+    names = {fault for fault, num in (warm.report.faults - before).items() if num}
+    wanted = {Fault.DUPLICATE, Fault.CUT, Fault.STRANGE, Fault.NOT_FINITE, Fault.OTHER_CLOCK}
+    assert names >= {*wanted, Fault.UNKNOWN_KIND}
+    assert all(np.isfinite(answer.setpoints).all() for answer in answers)
+    offset = spoiled.begin - clean.begin
+    assert abs(spoiled.contact - offset - clean.contact) < 0.05
+
+
+def test_a_robot_that_is_off_its_course_is_brought_to_rest_from_where_it_is(warm, path):
+    throw = Throw(warm, path, 5)
+    throw.fly(30)
+    before = warm.report.counts["astray"]
+    throw.now += STEP
+    answer = throw.send(throw.packet(ROBOT, [5.0, 5.0, 2.0, *[0.0] * 6]))
+    assert warm.report.counts["astray"] == before + 1
+    assert answer.motion is Motion.SAFE
+    np.testing.assert_allclose(answer.column("pos")[0], [5.0, 5.0, 2.0], atol=1e-5)
+
+
+def test_what_takes_too_long_is_answered_from_the_last_good_plan(warm, path, monkeypatch):
+    goes_on = threading.Event()
+    throw, again = Throw(warm, path, 6), warm.stroke.again
+    throw.fly(20)
+    monkeypatch.setattr(warm, "deadline", 0.002)
+    monkeypatch.setattr(warm.stroke, "again", lambda *a: (goes_on.wait(), again(*a))[1])
+    before = warm.report.counts["busy"]
+    throw.now += STEP
+    answer = throw.send(throw.packet(BALL, path[20]))
+    assert answer.motion is Motion.PLAN and warm.report.counts["busy"] == before + 1
+    goes_on.set()
+    warm._job.found.result()
+
+
+def test_the_client_of_the_page_prints_setpoints(warm, capsys):
+    server = Server(warm, 0)
+    warm._forget()
+    warm._arrivals.__init__()
+    server._socket.settimeout(0.05)
+    running = threading.Event()
+    thread = threading.Thread(target=server.run, args=(lambda: not running.is_set(),))
+    thread.start()
+    blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    script = next(block for block in blocks if "Client(" in block)
+    assert script.count("\n") <= 20
+    try:
+        exec(script.replace("Client()", f"Client({server.port}, timeout=5.0)"), {})
+    finally:
+        running.set()
+        thread.join()
+        server._socket.close()
+    assert "PLAN" in capsys.readouterr().out
+
+
+def test_a_port_that_is_taken_ends_the_command_with_a_line(warm, capsys):
+    server = Server(warm, 0)
+    try:
+        assert main(["serve", "catch", "--port", str(server.port)]) == 1
+    finally:
+        server._socket.close()
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and f"port {server.port}: Address already in use" in said
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_with_the_report(number):
+    words = [sys.executable, "-m", "planner_jax", "serve", "catch", "--port", "0", "--report"]
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None and "Answering" in process.stdout.readline()
+    process.send_signal(number)
+    out, err = process.communicate(timeout=30.0)
+    assert process.returncode == 128 + number and "0 packets answered" in err
+    assert "compiled after the start: 0" in out
+
+
+@pytest.mark.slow
+def test_hits_are_planned_too():
+    cases = pj.hit.draw(1)
+    of_one = jax.jit(lambda ball: pj.fly(ball, 1.5, 0.0616, 9.8, num_steps=150)[1].pos)
+    served = np.asarray(of_one(pj.lane(cases.ball, 0)), float)
+    home = np.asarray(cases.head_state[0, 0], float)
+    planner = LivePlanner(HitStroke(), deadline=30.0)
+    planner.warm_up()
+    throw = Throw(planner, served, 1, home=home)
+    answers = throw.fly(40)
+    planner.close()
+    assert answers[-1].motion is Motion.PLAN and planner.report.compiled == 0

@@ -1,0 +1,152 @@
+"""Packets of a live loop, and which of them count."""
+
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from planner_jax.live.arrivals import Arrivals
+from planner_jax.live.packets import (
+    BALL,
+    ROBOT,
+    WIDTH,
+    Fault,
+    Motion,
+    Packet,
+    answer,
+    read_answer,
+    read_request,
+    request,
+)
+from planner_jax.live.report import Latencies
+
+BALL_SEEN = request(BALL, 7, 5.0, 4.99, (1.0, 2.0, 3.0), 4)
+
+
+def test_a_request_comes_back_as_it_was_packed():
+    packet = Packet(BALL, 4, 7, 5.0, 4.99, (1.0, 2.0, 3.0))
+    assert read_request(BALL_SEEN) == packet
+    state = tuple(map(float, range(9)))
+    assert read_request(request(ROBOT, 1, 2.0, 2.0, state)) == Packet(ROBOT, 0, 1, 2.0, 2.0, state)
+
+
+def test_the_layout_is_that_of_the_documentation():
+    head = struct.unpack("<4sBBHId", BALL_SEEN[:20])
+    assert head == (b"PJLV", 1, BALL, 4, 7, 5.0)
+    assert struct.unpack("<d3d", BALL_SEEN[20:]) == (4.99, 1.0, 2.0, 3.0)
+
+
+def test_an_answer_comes_back_as_it_was_packed():
+    packet = read_request(BALL_SEEN)
+    rows = np.arange(2 * WIDTH, dtype=np.float32).reshape(2, WIDTH)
+    assert isinstance(packet, Packet)
+    found = read_answer(answer(packet, Fault.OUTLIER, Motion.PLAN, (5.0, 0.01, 5.5), rows))
+    assert found is not None
+    assert (found.sequence, found.sent, found.motion) == (7, 5.0, Motion.PLAN)
+    assert (found.fault, found.begin, found.period, found.contact) == (11, 5.0, 0.01, 5.5)
+    np.testing.assert_array_equal(found.setpoints, rows)
+    np.testing.assert_array_equal(found.column("quat_wxyz"), rows[:, 12:16])
+
+
+@pytest.mark.parametrize(
+    ("data", "fault"),
+    [
+        (b"", Fault.STRANGE),
+        (b"GET / HTTP/1.1", Fault.STRANGE),
+        (b"PJLV", Fault.CUT),
+        (BALL_SEEN[:-1], Fault.CUT),
+        (BALL_SEEN + b"\0", Fault.CUT),
+        (BALL_SEEN[:4] + b"\2" + BALL_SEEN[5:], Fault.OTHER_VERSION),
+        (BALL_SEEN[:5] + b"\x63" + BALL_SEEN[6:], Fault.UNKNOWN_KIND),
+    ],
+)
+def test_what_cannot_be_read_has_a_name(data, fault):
+    assert read_request(data) is fault
+
+
+@pytest.mark.parametrize(
+    ("sent", "measured", "values", "fault"),
+    [
+        (5.0, 5.0, (np.nan, 0.0, 0.0), Fault.NOT_FINITE),
+        (np.inf, 5.0, (0.0, 0.0, 0.0), Fault.NOT_FINITE),
+        (5.0, np.nan, (0.0, 0.0, 0.0), Fault.NOT_FINITE),
+        (5.0, 5.0, (1e9, 0.0, 0.0), Fault.ABSURD),
+        (5.0, 6.0, (0.0, 0.0, 0.0), Fault.ABSURD),  # measured after it was sent
+        (5.0, 1.0, (0.0, 0.0, 0.0), Fault.ABSURD),  # seconds ago
+    ],
+)
+def test_numbers_that_are_not_used_have_a_name(sent, measured, values, fault):
+    packet = read_request(request(BALL, 1, sent, measured, values))
+    assert isinstance(packet, Packet) and packet.fault is fault
+
+
+@given(st.binary(max_size=120))
+def test_no_bytes_crash_it(data):
+    for prefix in (b"", b"PJLV", b"PJLV\1\1", BALL_SEEN[:20]):
+        found = read_request(prefix + data)
+        assert isinstance(found, Fault | Packet)
+        read_answer(prefix + data)
+
+
+# Which packets count.
+
+
+def packet(sequence, sent):
+    return Packet(BALL, 0, sequence, sent, sent, (0.0, 0.0, 0.0))
+
+
+def faults(marks):
+    """The faults of packets of one sender, by sequence number, time sent and time of arrival."""
+    arrivals = Arrivals()
+    found = [arrivals.fault(packet(n, sent), "a", now)[0] for n, sent, now in marks]
+    return found, arrivals
+
+
+def test_packets_in_order_count_and_others_do_not():
+    marks = [(1, 1.0, 9.0), (3, 1.02, 9.02), (2, 1.01, 9.03), (3, 1.02, 9.03), (4, 1.03, 9.04)]
+    found, arrivals = faults(marks)
+    assert found == [0, 0, Fault.OUT_OF_ORDER, Fault.DUPLICATE, 0]
+    assert arrivals.newest == 1.03
+
+
+def test_a_sender_may_begin_to_count_anew():
+    found, _ = faults([(900, 1.0, 9.0), (1, 1.5, 9.5), (2, 1.6, 9.6)])
+    assert found == [0, 0, 0]
+
+
+def test_a_late_packet_is_known_by_its_time():
+    arrivals = Arrivals()
+    arrivals.fault(packet(1, 1.0), "a", 9.0)
+    arrivals.fault(packet(2, 1.1), "a", 9.15)
+    assert arrivals.was_late
+    arrivals.fault(packet(3, 1.2), "a", 9.201)
+    assert not arrivals.was_late
+
+
+def test_one_packet_of_another_clock_changes_nothing_and_several_set_it_anew():
+    arrivals = Arrivals()
+    assert arrivals.fault(packet(1, 1.0), "a", 9.0) == (Fault.NONE, False)
+    assert arrivals.fault(packet(2, 1e300), "b", 9.0) == (Fault.OTHER_CLOCK, False)
+    assert arrivals.fault(packet(2, 1.01), "a", 9.01) == (Fault.NONE, False)
+    found = [arrivals.fault(packet(n, 500.0 + n), "a", 10.0 + n) for n in range(6)]
+    assert found[:4] == [(Fault.OTHER_CLOCK, False)] * 4
+    assert found[4:] == [(Fault.NONE, True), (Fault.NONE, False)]
+    assert arrivals.newest == 505.0
+
+
+def test_senders_without_end_take_no_memory_without_end():
+    arrivals = Arrivals()
+    for k in range(500):
+        arrivals.fault(packet(1, 1.0 + 1e-3 * k), k, 9.0 + 1e-3 * k)
+    assert len(arrivals._senders) <= 32
+
+
+def test_quantiles_of_times_are_right_to_a_per_cent():
+    times, taken = Latencies(), np.random.default_rng(0).lognormal(-7.0, 1.0, 2000)
+    for each in taken:
+        times.add(each)
+    for share in (0.5, 0.99):
+        assert times.quantile(share) == pytest.approx(np.quantile(taken, share), rel=0.02)
+    assert times.longest == taken.max() and np.isnan(Latencies().quantile(0.5))
