@@ -23,7 +23,7 @@ from planner_jax.optimise.problem import Round
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.planning.plan import plan as plan_all
 from planner_jax.planning.replan import Replanning
-from planner_jax.protocol import AnyPlanner, is_unsolved
+from planner_jax.protocol import AnyPlanner, is_solved
 from planner_jax.sims.launch import (
     awaited,
     flight_keys,
@@ -424,14 +424,14 @@ def planned_ahead(
     cases, plans = known, plan_all(planner, known)
     last = ball == known.num_targets - 1
     for limits in (_WIDEST,) if last else (None, _WIDEST):
-        lanes = np.flatnonzero(is_unsolved(np.asarray(plans.status)))
+        lanes = np.flatnonzero(~is_solved(np.asarray(plans.status)))
         if not lanes.size:
             break
         part = jax.tree.map(lambda leaf, lanes=lanes: np.asarray(leaf)[lanes], cases)
         before = np.where((part.present == alone).all(axis=1), plans.violation[lanes], np.inf)
         part = within(dataclasses.replace(part, present=part.present & alone), limits)
         found = plan_all(planner, part)
-        better = ~is_unsolved(np.asarray(found.status)) | (found.violation < before)
+        better = is_solved(np.asarray(found.status)) | (found.violation < before)
         to, chosen = lanes[better], np.flatnonzero(better)
 
         def merged(old: Any, new: Any, to: np.ndarray = to, chosen: np.ndarray = chosen) -> Any:
