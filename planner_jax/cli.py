@@ -25,6 +25,7 @@ from planner_jax.digits import written_number, written_whole
 from planner_jax.registry import MissingExtra, Task, UnknownName, all_tasks
 from planner_jax.sweep.environment import installed_version, require_backend
 from planner_jax.sweep.settings import SettingError, WorkersFailed
+from planner_jax.whole_files import new_file_problem, replacing
 
 _HELP = argparse.RawDescriptionHelpFormatter
 _FAILED, _BAD_ARGUMENT, _INTERRUPTED = 1, 2, 130
@@ -160,6 +161,11 @@ def _parser() -> _Parser:
     view.add("--port", type=_whole, default=8080, metavar="N", help=free)
     report = command("report", "write table, figures and page of a run anew", _report)
     report.add_argument("run", metavar="RUN", help="folder of a finished run")
+    words = "set runs side by side, and say which cases tell them apart"
+    compare = command("compare", words, _compare)
+    compare.add_argument("runs", nargs="+", metavar="RUN", help="folders of finished sweeps")
+    compare.add("--all", action="store_true", help="list all cases that differ, not ten")
+    compare.add("--out", metavar="FILE", help="new file, .csv, for the same as a table")
     words = "write a plan for a controller, or send it in real time"
     commands.add_parser("export", help=words, fill=_add_export, **hidden)
     bench = commands.add_parser("bench", help="measure this machine")
@@ -494,6 +500,28 @@ def _report(options: dict[str, Any]) -> None:
             require_sound(folder)
             write_report(folder)
             _print_sweep(folder.read_manifest(), folder.path)
+
+
+def _compare(options: dict[str, Any]) -> None:
+    from planner_jax.sweep import compare
+
+    out = _out(options, "file")
+    if out is not None:
+        _require_new_file(out, ".csv")
+    runs = [compare.read_run(path) for path in options["runs"]]
+    compare.require_comparable(runs)
+    print("\n".join(compare.described(runs, None if options["all"] else 10)))
+    if out is not None:
+        with replacing(out) as scratch:
+            scratch.write_text(compare.as_csv(runs), encoding="utf-8")
+
+
+def _require_new_file(out: str, ending: str) -> None:
+    """Raise `SettingError` unless a path of the option `--out` is that of a file to be made."""
+    if not out.endswith(ending):
+        raise SettingError(f"out must end in {ending}, got {out!r}")
+    if problem := new_file_problem(out):
+        raise SettingError(f"out must be {problem}, got {out!r}")
 
 
 def _doctor(options: dict[str, Any]) -> int:

@@ -64,7 +64,7 @@ ALLOWED = {
     "doctor": {"compile_cache", "lanes", "planning", "protocol", "registry", "sweep"},
     "cli": {
         *("compile_cache", "digits", "doctor", "export", "plan_files", "registry", "stopping"),
-        "sweep",
+        *("sweep", "whole_files"),
     },
     "__main__": {"cli", "stopping"},
 }

@@ -135,6 +135,7 @@ def test_the_wheel_owns_one_name_among_the_packages(installed):
         ("sweep hit --num 64 --out hits", "plans pass the referee"),
         ("sweep catch --num 64 --out catches", "plans pass the referee"),
         ("report hits", "plans pass the referee"),
+        ("compare hits hits", "McNemar"),
         ("export hits --row 0 --to px4 --out hit.csv", "hit.csv"),
         ("fly catch --num 8 --out flights", "planner-jax view flights"),
         ("report flights", "planner-jax view flights"),

@@ -89,6 +89,8 @@ def _rows() -> list:
         ((command, name), ("RUN must be",)) for command in ("report", "view") for name in FILES
     ]
     rows += [(("export", name, "--row", "0", "--to", "csv"), ("RUN must be",)) for name in FILES]
+    rows += [(("compare", name, name), ("RUN must be",)) for name in FILES]
+    rows += _of("compare junk junk", "--out", ("", "x.txt"), "must")
     rows += _of("export junk --row 0", "--to", ("", "cvs", "px4\nx"), "must be one of csv")
     rows += _of("export junk --to csv", "--row", NOT_WHOLE)
     rows += _of("export junk --to csv", "--rate", NOT_NUMBERS)
@@ -129,6 +131,7 @@ def _rows() -> list:
     rows += _of("train", "--network", ("x",)) + _of("train", "--last", ("nan", "-1"))
     rows += _of("train", "--iterations", ("-1", "1")) + _of("train", "--estimated", ("-1", "9"))
     rows += _of("view folder", "--port", ("x", "1_0", "", "٣"))
+    rows.append((("compare",), ("RUN",)))
     for words in ((), ("sweep",), ("fly",), ("library",), ("bench",), ("nobody",), ("doctor", "x")):
         rows.append((words, ()))
     return rows
