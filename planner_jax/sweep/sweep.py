@@ -194,8 +194,14 @@ def sweep_of_run(manifest: dict[str, Any], name: str = "out") -> Sweep:
 def first_values(tree: Any, names: Sequence[str] = (), prefix: str = "") -> dict[str, Any]:
     """Leaves of the first case as plain numbers, to six digits so that float32 does not show.
 
-    Without `names` these are all fields of the tree.
+    Without `names` these are all fields of the tree; None has no entry, and what a field itself
+    has of fields stands behind its name.
     """
-    names = names or [field.name for field in dataclasses.fields(tree)]
-    leaves = {prefix + name: np.asarray(getattr(tree, name), float)[0] for name in names}
-    return {name: leaf.round(6).tolist() for name, leaf in leaves.items()}
+    found: dict[str, Any] = {}
+    for name in names or [field.name for field in dataclasses.fields(tree)]:
+        value = getattr(tree, name)
+        if dataclasses.is_dataclass(value):
+            found |= first_values(value, prefix=f"{prefix}{name}_")
+        elif value is not None:
+            found[prefix + name] = np.asarray(value, float)[0].round(6).tolist()
+    return found
