@@ -137,6 +137,7 @@ def test_the_wheel_owns_one_name_among_the_packages(installed):
         ("report hits", "plans pass the referee"),
         ("compare hits hits", "McNemar"),
         ("export hits --row 0 --to px4 --out hit.csv", "hit.csv"),
+        ("plan hit --pos 4 0.3 1.2 --vel -7 0.2 6 --target 4 0 0 --out one", "setpoints.csv"),
         ("fly catch --num 8 --out flights", "planner-jax view flights"),
         ("report flights", "planner-jax view flights"),
         ("bench throughput --batch 64 --repeat 1", "| 64 |"),
