@@ -18,7 +18,9 @@ class SampledMotion:
     jerk: np.ndarray  # (N, 3) [m/s^3]
 
 
-def sample_motion(coeffs: Sequence[float], durations: Sequence[float], num: int) -> SampledMotion:
+def sample_motion(
+    coeffs: Sequence[float] | np.ndarray, durations: Sequence[float] | np.ndarray, num: int
+) -> SampledMotion:
     """A trajectory as `plans.parquet` holds it, at even times.
 
     Args:
