@@ -12,6 +12,7 @@ import functools
 import math
 import os
 import pkgutil
+import re
 import shlex
 import sys
 import time
@@ -28,6 +29,7 @@ from planner_jax.live.settings import SERVED
 from planner_jax.registry import MissingExtra, Task, UnknownName, all_tasks, task_named
 from planner_jax.sweep.environment import installed_version, require_backend
 from planner_jax.sweep.settings import SettingError, WorkersFailed, is_address
+from planner_jax.whole_files import new_file_problem, replacing
 
 _HELP = argparse.RawDescriptionHelpFormatter
 _FAILED, _BAD_ARGUMENT, _INTERRUPTED = 1, 2, 130
@@ -95,6 +97,8 @@ class _Parser(argparse.ArgumentParser):
         shape = functools.partial(_HELP, max_help_position=28, width=100)
         super().__init__(**{"formatter_class": shape, "allow_abbrev": False, **look})
         self._fill = fill
+        # What is a number and no option: argparse's own pattern knows no exponents, before 3.14.
+        self._negative_number_matcher = re.compile(r"-\.?[0-9]")
 
     def parse_known_args(self, *arguments: Any, **how: Any) -> Any:
         self._fill(self)
@@ -142,13 +146,14 @@ def _parser() -> _Parser:
 
     hidden: Any = {"argument_default": argparse.SUPPRESS}
     for name, words, add in (
+        ("plan", "plan and referee one case that is given in a few numbers", _add_plan),
         ("sweep", "plan and referee many cases of a task", _add_sweep),
         ("fly", "fly many cases of a task in closed loop", _add_fly),
     ):
         among = commands.add_parser(name, help=words)
         tasks = among.add_subparsers(title="tasks", required=True, metavar="task")
         for task in all_tasks().values():
-            if name == "sweep" or task.flight is not None:
+            if {"sweep": task.sweep, "fly": task.flight, "plan": task.single}[name] is not None:
                 # Settings are imported for the one task that is asked for.
                 fill = functools.partial(add, task)
                 tasks.add_parser(task.name, help=task.summary, fill=fill, **hidden)
@@ -172,6 +177,11 @@ def _parser() -> _Parser:
     for name, kind in SERVED.items():
         fill = functools.partial(_add_serve, kind)
         served.add_parser(name, help=task_named(name).summary, fill=fill, **hidden)
+    words = "set runs side by side, and say which cases tell them apart"
+    compare = command("compare", words, _compare)
+    compare.add_argument("runs", nargs="+", metavar="RUN", help="folders of finished sweeps")
+    compare.add("--all", action="store_true", help="list all cases that differ, not ten")
+    compare.add("--out", metavar="FILE", help="new file, .csv, for the same as a table")
     words = "write a plan for a controller, or send it in real time"
     commands.add_parser("export", help=words, fill=_add_export, **hidden)
     bench = commands.add_parser("bench", help="measure this machine")
@@ -370,20 +380,33 @@ def _add_settings(parser: _Parser, kind: Any, task: Task | None = None) -> None:
         default = defaults.get(field.name) if default is None else default
         how: dict[str, Any] = {"action": "store_true"}
         if not isinstance(default, bool):
-            if default is not None and "(default:" not in words:
+            if default not in (None, (), dataclasses.MISSING) and "(default:" not in words:
                 shown = (
                     " ".join(f"{x:g}" for x in default) if isinstance(default, tuple) else default
                 )
                 words += f" (default: {shown})"
             how = {"type": _type_of(hints[field.name]), "metavar": field.metadata["metavar"]}
             how |= {"nargs": "+"} if isinstance(default, tuple) else {}
+            how |= _of_several(field)
         parser.add(f"--{field.name.replace('_', '-')}", help=words, **how)
+
+
+def _of_several(field: dataclasses.Field) -> dict[str, Any]:
+    """How an option is read that has to be given, has as many numbers as names, or is repeated."""
+    names = field.metadata["metavar"].split()
+    how: dict[str, Any] = {"required": True} if field.default is dataclasses.MISSING else {}
+    if len(names) > 1:
+        how |= {"metavar": tuple(names), "nargs": len(names)}
+        how |= {"action": "append"} if field.default == () else {}
+    return how
 
 
 def _type_of(hint: Any) -> Callable[[str], Any]:
     """What makes a value of a word: a number where a field holds these, or nothing."""
     held = typing.get_args(hint) or (hint,)
-    return next((_NUMBERS[kind] for kind in held if kind in _NUMBERS), str)
+    found = [_NUMBERS[kind] for kind in held if kind in _NUMBERS]
+    found += [kind for kind in map(_type_of, filter(typing.get_args, held)) if kind is not str]
+    return next(iter(found), str)
 
 
 def _add_sweep(task: Task, parser: _Parser) -> None:
@@ -398,6 +421,60 @@ def _add_sweep(task: Task, parser: _Parser) -> None:
     where = "ray: chunks are made by a Ray cluster, that of RAY_ADDRESS or one of this machine"
     parser.add("--workers", metavar="KIND", help=f"{where} (default: by this process)")
     parser.set_defaults(command=lambda given: _sweep(task, given))
+
+
+def _add_plan(task: Task, parser: _Parser) -> None:
+    parser.description = (
+        f"One case, {task.summary}: planned, and the plan judged by a referee.\n"
+        "Says when and where the contact is, and how close the plan comes to each limit."
+    )
+    _add_settings(parser, pkgutil.resolve_name(str(task.single)), task)
+    parser.add("--rate", type=_number, metavar="HZ", help="setpoints a second (default: 100)")
+    parser.add("--out", metavar="DIR", help="new folder for plan, setpoints and pictures")
+    parser.set_defaults(command=lambda given: _plan(task, given))
+
+
+def _plan(task: Task, given: dict[str, Any]) -> int:
+    out, rate = _out(given), given.pop("rate", None)
+    settings = pkgutil.resolve_name(str(task.single))(**given).of(task)
+    if rate is not None and out is None:
+        raise SettingError(f"rate must be left out without --out, got {rate:g}")
+    if out is not None and (problem := new_file_problem(out)):
+        raise SettingError(f"out must be {problem.replace('file', 'folder')}, got {out!r}")
+    require_backend()
+    keep_compiled_programs()
+    single = pkgutil.resolve_name(settings.RUN)(task, settings)
+    answer = single.answer()
+    if rate is not None and answer.success:
+        _require_rate(answer.plan, rate)
+    print("\n".join(single.described(answer)))
+    if out is not None:
+        _write_answer(task, settings.planner, answer, Path(out), rate)
+    return 0 if answer.success else _FAILED
+
+
+def _require_rate(plan: Any, rate: float) -> None:
+    """Raise `SettingError` unless a plan can be sampled at a rate [Hz]."""
+    from planner_jax.export.setpoints import ExportError, setpoints_of
+
+    try:
+        setpoints_of(plan, rate)
+    except ExportError as error:
+        raise SettingError(str(error)) from None
+
+
+def _write_answer(task: Task, planner: str, answer: Any, out: Path, rate: float | None) -> None:
+    """Write a new folder: the plan, its setpoints where the referee lets it pass, and pictures."""
+    from planner_jax.export.words import export
+    from planner_jax.sweep.single_pictures import write_pictures
+
+    out.mkdir()
+    written = [out / "plan.npz"]
+    answer.plan.save(written[0])
+    if answer.success:
+        written.append(export(answer.plan, to="csv", out=out / "setpoints.csv", rate=rate))
+    written += write_pictures(task, planner, answer, out)
+    print("\n" + "\n".join(map(str, written)))
 
 
 def _add_fly(task: Task, parser: _Parser) -> None:
@@ -562,6 +639,28 @@ def _report(options: dict[str, Any]) -> None:
             require_sound(folder)
             write_report(folder)
             _print_sweep(folder.read_manifest(), folder.shown)
+
+
+def _compare(options: dict[str, Any]) -> None:
+    from planner_jax.sweep import compare
+
+    out = _out(options, "file")
+    if out is not None:
+        _require_new_file(out, ".csv")
+    runs = [compare.read_run(path) for path in options["runs"]]
+    compare.require_comparable(runs)
+    print("\n".join(compare.described(runs, None if options["all"] else 10)))
+    if out is not None:
+        with replacing(out) as scratch:
+            scratch.write_text(compare.as_csv(runs), encoding="utf-8")
+
+
+def _require_new_file(out: str, ending: str) -> None:
+    """Raise `SettingError` unless a path of the option `--out` is that of a file to be made."""
+    if not out.endswith(ending):
+        raise SettingError(f"out must end in {ending}, got {out!r}")
+    if problem := new_file_problem(out):
+        raise SettingError(f"out must be {problem}, got {out!r}")
 
 
 def _doctor(options: dict[str, Any]) -> int:

@@ -47,6 +47,7 @@ class Status(enum.IntEnum):
     NO_PATH = 6
     BLOCKED = 7
     BAD_INPUT = 8
+    TOO_FAR = 9
 
     @property
     def message(self) -> str:
@@ -69,6 +70,8 @@ _MESSAGES = {
     Status.NO_PATH: "no way was found through the obstacles in time; allow more time",
     Status.BLOCKED: "the start or the goal lies in an obstacle or off the map; move it",
     Status.BAD_INPUT: "a number of the case is absurd; `pj.require_sound(cases)` names it",
+    Status.TOO_FAR: "no plan exists: at no time is a target where the robot can be by then; allow "
+    "more speed or acceleration, or start nearer",
 }
 
 

@@ -51,6 +51,8 @@ class Task:
     # Classes of the settings of its sweeps, and of its flights in `sims`; they name what runs them.
     sweep: str = "planner_jax.sweep.settings:SweepSettings"
     flight: str | None = None
+    # Class of the settings of one case that is asked for in a few numbers; they name what answers.
+    single: str | None = None
     # Options of `planner` where its speed is measured.
     bench: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     contact: str | None = None  # place in a plan of its times of contact, such as "stroke.time"

@@ -35,6 +35,16 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
             scratch.unlink()
 
 
+def new_file_problem(path: str | os.PathLike) -> str:
+    """What a path must be, in words, if no new file can be made there; "" if one can."""
+    place = Path(path)
+    if os.path.lexists(place):
+        return "a new file"
+    if not place.parent.is_dir() or not os.access(place.parent, os.W_OK | os.X_OK):
+        return "in a folder that can be written"
+    return ""
+
+
 def to_disk(path: Path) -> None:
     """Wait until a file, or the names in a folder, would outlast a loss of power."""
     handle = os.open(path, os.O_RDONLY)

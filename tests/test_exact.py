@@ -98,7 +98,7 @@ def test_an_impossible_lane_says_so_and_stays_finite(cases):
     crippled_lane = np.arange(NUM) == 1
     limits = jax.tree.map(lambda a, b: np.where(crippled_lane, b, a), cases.limits, crippled)
     found = plan(FIRST_ROUND, cases.replace(limits=limits))
-    assert found.status[1] in (Status.INFEASIBLE, Status.MAX_STEPS)
+    assert found.status[1] == Status.TOO_FAR
     assert found.violation[1] > 0.0
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
     assert is_solved(np.delete(found.status, 1)).all()

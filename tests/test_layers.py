@@ -75,8 +75,7 @@ ALLOWED = {
     "doctor": {"compile_cache", "lanes", "planning", "protocol", "registry", "sweep"},
     "cli": {
         *("compile_cache", "digits", "doctor", "export", "live", "plan_files", "registry"),
-        "robot",
-        *("stopping", "sweep"),
+        *("robot", "stopping", "sweep", "whole_files"),
     },
     "__main__": {"cli", "stopping"},
 }

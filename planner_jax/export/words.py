@@ -6,7 +6,7 @@ from pathlib import Path
 from planner_jax.export.formats import Format, format_named, required
 from planner_jax.export.setpoints import DEFAULT_RATE, ExportError, robot_of
 from planner_jax.protocol import Plan
-from planner_jax.whole_files import replacing
+from planner_jax.whole_files import new_file_problem, replacing
 
 
 def export(plan: Plan, *, to: str, out: str | os.PathLike, rate: float | None = None) -> Path:
@@ -93,8 +93,6 @@ def _new_file(out: str | os.PathLike, to: str, form: Format) -> Path:
     if path.suffix not in form.writers:
         endings = " or ".join(form.writers)
         raise ExportError(f"out must end in {endings} for {to}, got {str(out)!r}")
-    if os.path.lexists(path):
-        raise ExportError(f"out must be a new file, got {str(path)!r}")
-    if not path.parent.is_dir() or not os.access(path.parent, os.W_OK | os.X_OK):
-        raise ExportError(f"out must be in a folder that can be written, got {str(path)!r}")
+    if problem := new_file_problem(path):
+        raise ExportError(f"out must be {problem}, got {str(path)!r}")
     return path

@@ -14,7 +14,7 @@ from planner_jax.lanes import over_lanes
 from planner_jax.optimise import lbfgs
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig, LbfgsState, Objective
 from planner_jax.optimise.problem import Problem, Round
-from planner_jax.protocol import FEASIBILITY_TOLERANCE, status_of
+from planner_jax.protocol import FEASIBILITY_TOLERANCE, Status, is_unsolved, status_of
 
 # So few iterations are counted, so that a GPU need not tell the host whether to go on.
 _COUNTED = 16
@@ -162,6 +162,8 @@ def _plan_at(planner: Problem, optimum: Optimum, context: Any) -> Any:
     plan = planner.decode(optimum.point, context)
     cost = optimum.evaluation.cost
     status = status_of(cost, plan.violation, optimum.stationary)
+    hopeless = is_unsolved(status) & planner.rules_out(context)
+    status = jnp.where(hopeless, jnp.int32(Status.TOO_FAR), status)
     return plan.replace(cost=cost, iterations=optimum.iterations, status=status)
 
 

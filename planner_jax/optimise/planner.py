@@ -55,6 +55,10 @@ class OptimisedPlanner(abc.ABC):
         The solver fills in `cost`, `iterations` and `status`; until then they are `pending`.
         """
 
+    def rules_out(self, context: Any) -> Array:
+        """Whether no plan can exist, by a bound that none can beat, () bool; never, by default."""
+        return jnp.zeros((), bool)
+
     @property
     def attempts(self) -> tuple[Round, ...]:
         """The rounds."""

@@ -58,6 +58,13 @@ class Problem(Protocol):
         """
         ...
 
+    def rules_out(self, context: Any) -> Array:
+        """Whether no plan can exist, by a bound that none can beat, () bool.
+
+        Such a case has the status `TOO_FAR` unless it is solved, and no further attempt is made.
+        """
+        ...
+
     def changed(self, settings: Settings) -> "Problem":
         """The problem with some of the planner's fields set anew; plans keep their shape."""
         ...

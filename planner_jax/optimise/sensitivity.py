@@ -132,6 +132,10 @@ class Differentiated(OptimisedPlanner):
         """That of the planner."""
         return self.planner.objective(point, context.inner)
 
+    def rules_out(self, context: _Context) -> Array:
+        """As the planner does."""
+        return self.planner.rules_out(context.inner)
+
     def decode(self, point: Array, context: _Context) -> DifferentiatedPlan:
         """The planner's plan, and the gradient there."""
         plan = self.planner.decode(point, context.inner)

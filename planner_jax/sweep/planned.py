@@ -1,7 +1,7 @@
-"""The plan of one row of a finished sweep."""
+"""Finished sweeps as other commands read them, and the plan of one row."""
 
 import shlex
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pyarrow as pa
 
@@ -9,7 +9,7 @@ from planner_jax.protocol import Plan
 from planner_jax.sweep.parquet import pick_rows
 from planner_jax.sweep.run_folder import RunFolder
 from planner_jax.sweep.settings import SettingError
-from planner_jax.sweep.sweep import sweep_of_run
+from planner_jax.sweep.sweep import Sweep, sweep_of_run
 
 
 class PlannedRow(NamedTuple):
@@ -17,6 +17,20 @@ class PlannedRow(NamedTuple):
 
     plan: Plan  # of its robot's class, such as `QuadrotorPlan`
     sentence: str  # "" where it passes
+
+
+def finished_sweep(folder: RunFolder) -> tuple[dict[str, Any], Sweep]:
+    """The manifest and the sweep of a folder.
+
+    Raises:
+        SettingError: the folder is not that of a whole, finished sweep.
+    """
+    manifest = folder.read_manifest()
+    sweep = sweep_of_run(manifest, folder.name)
+    folder.require_finished(manifest)
+    remedy = f"planner-jax {sweep.kind} --resume --out {shlex.quote(str(folder.path))}"
+    folder.require_whole(manifest, f"make it anew: {remedy}")
+    return manifest, sweep
 
 
 def planned_row(folder: RunFolder, row: int | None) -> PlannedRow:
@@ -29,15 +43,11 @@ def planned_row(folder: RunFolder, row: int | None) -> PlannedRow:
     Raises:
         SettingError: the folder is not that of a whole, finished sweep, or there is no such row.
     """
-    manifest = folder.read_manifest()
-    sweep = sweep_of_run(manifest, folder.name)
-    folder.require_finished(manifest)
+    manifest, sweep = finished_sweep(folder)
     last = manifest["summary"]["num"] - 1
     if row is None or not 0 <= row <= last:
         shown = "nothing" if row is None else row
         raise SettingError(f"row must be from 0 to {last}, got {shown}")
-    remedy = f"planner-jax {sweep.kind} --resume --out {shlex.quote(str(folder.path))}"
-    folder.require_whole(manifest, f"make it anew: {remedy}")
     try:
         (found,) = pick_rows(folder.plans, [row])
         plan = sweep.plan_of_row(found, manifest.get("setting", {}))

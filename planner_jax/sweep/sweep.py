@@ -48,6 +48,7 @@ class Sweep:
             outcomes_figure,
         ),
     )
+    single_figures: ClassVar[Sequence[RunFigure]] = ()  # of one case that was asked for alone
     failure_words: ClassVar[Mapping[str, str]] = {  # heading -> column that is shown of a failure
         "case": "index",
         "solver's status": "status",
@@ -65,6 +66,10 @@ class Sweep:
     def columns(self, batch: RefereedBatch) -> Sequence[Column]:
         """The columns of `plans.parquet`: the task's own, or every leaf of case, plan, verdict."""
         return self.own_columns or leaf_columns(batch)
+
+    def single_columns(self) -> Sequence[Column]:
+        """Those that a case which is of no run has, too."""
+        return self.own_columns
 
     def planner(self, settings: Any) -> Any:
         """The planner of a run."""

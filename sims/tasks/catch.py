@@ -24,7 +24,7 @@ from planner_jax.optimise.problem import Round
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.planning.plan import plan as plan_all
 from planner_jax.planning.replan import Replanning
-from planner_jax.protocol import AnyPlanner, is_unsolved
+from planner_jax.protocol import AnyPlanner, is_solved
 from planner_jax.robot.quadrotor_model import QuadrotorModel
 from planner_jax.robot.quadrotor_models import PAPER_CATCHER
 from planner_jax.sims.launch import (
@@ -444,7 +444,7 @@ def planned_ahead(
         tries += [(alone, each) for each in (None, *wider)]
     cases, plans = known, plan_all(planner, known)
     for balls, wide in tries:
-        lanes = np.flatnonzero(is_unsolved(np.asarray(plans.status)))
+        lanes = np.flatnonzero(~is_solved(np.asarray(plans.status)))
         if not lanes.size:
             break
         part = jax.tree.map(lambda leaf, lanes=lanes: np.asarray(leaf)[lanes], known)
@@ -452,7 +452,7 @@ def planned_ahead(
         found = plan_all(planner, part)
         same = (part.present == cases.present[lanes]).all(axis=1)
         before = np.where(same, plans.violation[lanes], np.inf)
-        better = ~is_unsolved(np.asarray(found.status)) | (found.violation < before)
+        better = is_solved(np.asarray(found.status)) | (found.violation < before)
         to, chosen = lanes[better], np.flatnonzero(better)
 
         def merged(old: Any, new: Any, to: np.ndarray = to, chosen: np.ndarray = chosen) -> Any:

@@ -89,6 +89,25 @@ def _rows() -> list:
         ((command, name), ("RUN must be",)) for command in ("report", "view") for name in FILES
     ]
     rows += [(("export", name, "--row", "0", "--to", "csv"), ("RUN must be",)) for name in FILES]
+    hit = "plan hit --vel -3 0.2 4 --target 4 0 0"
+    catch = "plan catch --pos 3 0 1 --vel -3 0.2 4"
+    for point in ("1 2", "1 2 3 4", "x 0 1", "1 -nan 2", "nan 0 1", "0 inf 1", "1_0 0 1", "-1e3"):
+        rows.append(((*hit.split(), "--pos", *point.split()), ()))
+    rows += _of(f"{hit} --pos 4 0 1", "--planner", ("", "nobody"), "must be one of")
+    for option in ("--speed", "--body-rate", "--acceleration", "--min-height", "--gravity"):
+        rows += _of(f"{hit} --pos 4 0 1", option, ("nan", "inf", *NOT_NUMBERS))
+    rows += _of(f"{hit} --pos 4 0 1", "--out", ("", "folder", "pipe", "junk/below"), "must")
+    rows += _of(f"{hit} --pos 4 0 1 --out new", "--rate", NOT_NUMBERS)
+    rows += _of(catch, "--horizon", ("nan", "inf", *NOT_NUMBERS))
+    rows += _of(f"{catch} --horizon 1", "--decide", ("", "later", "best:x"))
+    rows += [
+        ((*hit.split(),), ("--pos",)),
+        ((*catch.split(),), ("--horizon",)),
+        (("plan", "catch", "--horizon", "1", "--ball", "1", "2", "3"), ("--ball",)),
+        (("plan", "block"), ("block",)),
+    ]
+    rows += [(("compare", name, name), ("RUN must be",)) for name in FILES]
+    rows += _of("compare junk junk", "--out", ("", "x.txt"), "must")
     rows += _of("export junk --row 0", "--to", ("", "cvs", "px4\nx"), "must be one of csv")
     rows += _of("export junk --to csv", "--row", NOT_WHOLE)
     rows += _of("export junk --to csv", "--rate", NOT_NUMBERS)
@@ -140,17 +159,9 @@ def _rows() -> list:
     rows += _of("train", "--network", ("x",)) + _of("train", "--last", ("nan", "-1"))
     rows += _of("train", "--iterations", ("-1", "1")) + _of("train", "--estimated", ("-1", "9"))
     rows += _of("view folder", "--port", ("x", "1_0", "", "٣"))
-    for words in (
-        (),
-        ("sweep",),
-        ("fly",),
-        ("serve",),
-        ("library",),
-        ("bench",),
-        ("nobody",),
-        ("doctor", "x"),
-    ):
-        rows.append((words, ()))
+    rows.append((("compare",), ("RUN",)))
+    for words in ("", "plan", "sweep", "fly", "serve", "library", "bench", "nobody", "doctor x"):
+        rows.append((tuple(words.split()), ()))
     return rows
 
 

@@ -8,7 +8,7 @@ import pyarrow as pa
 from planner_jax.robot.quadrotor_plan import QuadrotorPlan
 from planner_jax.sweep.catch.columns import COLUMNS, FRAME
 from planner_jax.sweep.catch.figures.flight import flight_figure
-from planner_jax.sweep.catch.figures.motion import motion_figure
+from planner_jax.sweep.catch.figures.motion import motion_figure, plan_figure
 from planner_jax.sweep.catch.figures.outcomes import outcomes_figure
 from planner_jax.sweep.catch.settings import CatchSettings
 from planner_jax.sweep.figures.motion import CAPTION as MOTION
@@ -85,6 +85,16 @@ class CatchSweep(Sweep):
             "name, and the times of the catches that hold.",
             (13.0, 4.4),
             outcomes_figure,
+        ),
+    )
+
+    single_figures = (
+        figures[0],
+        RunFigure(
+            "motion.png",
+            "The plan along its time against the limits.",
+            (13.0, 6.8),
+            lambda figure, run: plan_figure(figure, run, "as asked for"),
         ),
     )
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath, HarmonicPath
-from planner_jax.sweep.figures.motion import SampledMotion, net_thrust
+from planner_jax.sweep.sampled_motion import SampledMotion, net_thrust
 
 
 def target_paths(row: dict[str, Any]) -> BallPath | HarmonicPath:

@@ -67,3 +67,10 @@ COLUMNS = [
     *TRAJECTORY,
     *(_published(*place) for place in enumerate(court.PLANNERS)),
 ]
+
+_ORIGIN = ("scenario", "file", "line", "serve_pos", "serve_vel", "target")
+# Of a case that is no serve of the court.
+SINGLE_COLUMNS = [
+    *(c for c in COLUMNS if c.name not in _ORIGIN and not c.name.startswith("published_")),
+    *leaves_of("cases", ("target", "m", "wanted landing point", VECTOR)),
+]

@@ -7,10 +7,12 @@ import numpy as np
 import pyarrow as pa
 
 from planner_jax.robot.quadrotor_plan import QuadrotorPlan
+from planner_jax.sweep.columns import Column
 from planner_jax.sweep.figures.motion import CAPTION as MOTION
-from planner_jax.sweep.hit.columns import COLUMNS, FRAME, published_column
+from planner_jax.sweep.hit.columns import COLUMNS, FRAME, SINGLE_COLUMNS, published_column
 from planner_jax.sweep.hit.figures.court import court_figure
-from planner_jax.sweep.hit.figures.motion import motion_figure
+from planner_jax.sweep.hit.figures.motion import motion_figure, plan_figure
+from planner_jax.sweep.hit.figures.path import path_figure
 from planner_jax.sweep.hit.figures.rates import compared_with, rates_figure
 from planner_jax.sweep.hit.settings import HitSettings
 from planner_jax.sweep.hit.source import ServeSource, open_source
@@ -91,7 +93,20 @@ class HitSweep(Sweep):
             rates_figure,
         ),
     )
+    single_figures = (
+        RunFigure("path.png", "Ball and quadrotor in space.", (11.0, 8.0), path_figure),
+        RunFigure(
+            "motion.png",
+            "The plan along its time against the limits.",
+            (13.0, 6.8),
+            lambda figure, run: plan_figure(figure, run, "as asked for"),
+        ),
+    )
     failure_words = {"case": "index", "scenario": "scenario", **Sweep.failure_words}
+
+    def single_columns(self) -> list[Column]:
+        """Without those of a serve's origin."""
+        return SINGLE_COLUMNS
 
     def open_source(self, settings: HitSettings, batch: int) -> ServeSource:
         """The source of a sweep's serves."""

@@ -41,6 +41,7 @@ from planner_jax.task.catch.chain import (
     targets_at,
 )
 from planner_jax.task.catch.plan import CatchPlan
+from planner_jax.task.catch.reach import is_too_far
 from planner_jax.trajectory.proportional_minco import (
     ProportionalMinco,
     boundary_energy,
@@ -365,6 +366,10 @@ class ExactCatch(OptimisedPlanner):
         late = jnp.sqrt(2.0 * self.time_weight * spent)
         parts = (bend * inside, bend * at_catch, smooth, late)
         return jnp.concatenate([part.ravel() for part in parts])
+
+    def rules_out(self, context: CatchContext) -> Array:
+        """Whether a target is never within reach."""
+        return is_too_far(context)
 
     def decode(self, point: Array, context: CatchContext) -> CatchPlan:
         """The plan at a point, its violation looked for at `_DECODE_NODES` a piece."""

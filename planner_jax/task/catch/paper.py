@@ -29,6 +29,7 @@ from planner_jax.task.catch.chain import (
     targets_at,
 )
 from planner_jax.task.catch.plan import CatchPlan
+from planner_jax.task.catch.reach import is_too_far
 from planner_jax.trajectory.minimum_jerk import minimum_jerk
 from planner_jax.trajectory.polynomial import evaluate
 from planner_jax.trajectory.proportional_minco import (
@@ -236,6 +237,10 @@ class PaperCatch(OptimisedPlanner):
     def _weights(self) -> np.ndarray:
         """Weights of the four limits along the way."""
         return np.array([self.limit_weight] * 3 + [self.ground_weight])[:, None, None]
+
+    def rules_out(self, context: CatchContext) -> Array:
+        """Whether a target is never within reach."""
+        return is_too_far(context)
 
     def decode(self, point: Array, context: CatchContext) -> CatchPlan:
         """The plan at a point, its violation that of the protocol's samples."""

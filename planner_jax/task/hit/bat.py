@@ -23,6 +23,7 @@ from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.context import HitContext, Impact, prepare_hit
 from planner_jax.task.hit.decoupled import aim_at_angle, decoupled_hit
 from planner_jax.task.hit.plan import HitPlan
+from planner_jax.task.hit.reach import is_too_far
 from planner_jax.trajectory.minimum_jerk import minimum_jerk
 from planner_jax.trajectory.polynomial import Motion, evaluate
 from planner_jax.trajectory.proportional_minco import (
@@ -294,6 +295,10 @@ class BatHit(OptimisedPlanner):
             + self._terminal_penalty(impact, defect, context.case)
         )
         return Evaluation(cost=cost / _COST_UNIT, violation=jnp.zeros_like(cost))
+
+    def rules_out(self, context: HitContext) -> Array:
+        """Whether the ball is never within reach."""
+        return is_too_far(context)
 
     def decode(self, point: Array, context: HitContext) -> HitPlan:
         """The plan at a point, its violation looked for at 24 nodes a piece."""

@@ -39,6 +39,7 @@ from planner_jax.robot.quadrotor import tangent_basis
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.context import HitContext, Impact, prepare_hit
 from planner_jax.task.hit.plan import HitPlan, Stroke
+from planner_jax.task.hit.reach import is_too_far
 from planner_jax.trajectory.proportional_minco import (
     ProportionalMinco,
     boundary_energy,
@@ -355,6 +356,10 @@ class ExactHit(OptimisedPlanner):
         energy_unit = jnp.sqrt(self.energy_weight / duration ** (2 * _ORDER - 1))
         smooth = energy_unit * np.sqrt(self.maps.offset_energy) * offsets
         return jnp.concatenate([bend * inside.ravel(), bend * impact_part, smooth.ravel()])
+
+    def rules_out(self, context: HitContext) -> Array:
+        """Whether the ball is never within reach."""
+        return is_too_far(context)
 
     def decode(self, point: Array, context: HitContext) -> HitPlan:
         """The plan at a point, its violation looked for at 16 nodes a piece."""

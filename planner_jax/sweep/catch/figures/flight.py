@@ -9,8 +9,8 @@ from matplotlib.lines import Line2D
 
 from planner_jax.sweep.catch.targets import SampledCatch, sampled_catch
 from planner_jax.sweep.figures import style
-from planner_jax.sweep.figures.motion import sample_motion
 from planner_jax.sweep.report import RunRows
+from planner_jax.sweep.sampled_motion import sample_motion
 
 _SAMPLES = 1601
 _ROTORS = 0.165  # [m], half the diagonal between the paper's propellers

@@ -11,14 +11,18 @@ from planner_jax.sweep.figures import style
 from planner_jax.sweep.figures.motion import DASHED, Drawn, quadrotor_figure
 from planner_jax.sweep.report import RunRows
 
+_PANELS = ("speed", "body_rate", "thrust", "jerk")
 _LEAST_DISTANCE = 1e-3  # [m], of the logarithmic axis
 
 
 def motion_figure(figure: Figure, run: RunRows) -> None:
     """Net distance, speed, body rate, thrust and jerk of plans for the same case."""
-    panels = ("speed", "body_rate", "thrust", "jerk")
-    suite = f"suite {run.manifest['parameters']['suite']}"
-    quadrotor_figure(figure, run, panels, _draw_distances, _word, suite)
+    plan_figure(figure, run, f"suite {run.manifest['parameters']['suite']}")
+
+
+def plan_figure(figure: Figure, run: RunRows, which: str) -> None:
+    """The same, with words of what the case is of."""
+    quadrotor_figure(figure, run, _PANELS, _draw_distances, _word, which)
 
 
 def _draw_distances(axes: Axes, setting: dict[str, Any], plans: list[Drawn]) -> None:

@@ -9,8 +9,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 
 from planner_jax.sweep.figures import style
-from planner_jax.sweep.figures.motion import sample_motion
 from planner_jax.sweep.report import RunRows
+from planner_jax.sweep.sampled_motion import sample_motion
 from planner_jax.task.hit import court
 from planner_jax.task.hit.validate import fly, landing
 
@@ -28,7 +28,7 @@ def court_figure(figure: Figure, run: RunRows) -> None:
     across = court.HALF_LENGTH + 0.6
     for axes, second, limits in ((above, 1, (-aside, aside)), (side, 2, (-0.25, top))):
         for row in rows:
-            _draw_case(axes, row, second, setting, drag_after)
+            draw_case(axes, row, second, setting, drag_after)
         axes.set(aspect="equal", xlim=(-across, across), ylim=limits)
     _draw_floor(above)
     side.axhline(0.0, color=style.GREY, linewidth=1.5)
@@ -62,7 +62,7 @@ def ball_path(
     return time, fly(np.tile(pos, again), np.tile(vel, again), time, drag, gravity)[0]
 
 
-def _draw_case(
+def draw_case(
     axes: Axes, row: dict[str, Any], second: int, setting: dict[str, Any], drag_after: bool
 ) -> None:
     """Serve, trajectory and returned ball of one case in the plane of x and a second axis."""

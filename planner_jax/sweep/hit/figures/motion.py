@@ -17,8 +17,12 @@ _PANELS = ("speed", "acceleration", "body_rate", "thrust")
 
 def motion_figure(figure: Figure, run: RunRows) -> None:
     """Height, speed, acceleration, body rate and thrust of plans for the same serve."""
-    scenario = run.same_case()[0][1]["scenario"]
-    quadrotor_figure(figure, run, _PANELS, _draw_heights, _word, f"scenario {scenario}")
+    plan_figure(figure, run, f"scenario {run.same_case()[0][1]['scenario']}")
+
+
+def plan_figure(figure: Figure, run: RunRows, which: str) -> None:
+    """The same, with words of what the case is of."""
+    quadrotor_figure(figure, run, _PANELS, _draw_heights, _word, which)
 
 
 def _word(row: dict[str, Any]) -> str:

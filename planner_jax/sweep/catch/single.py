@@ -1,0 +1,70 @@
+"""One catch of one ball or several that was asked for in a few numbers."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from planner_jax.ball.flight import BallState
+from planner_jax.ball.target import BallPath
+from planner_jax.sweep.single import Answer, Margin, Single
+from planner_jax.task.catch.case import GRAVITY
+
+
+class SingleCatch(Single):
+    """A quadrotor that catches one ball, or several one after another."""
+
+    NAMES = {
+        **Single.NAMES,
+        **{f"net.{name}": f"net_{name}" for name in ("height", "radius")},
+    }
+
+    def case(self) -> Any:
+        """The case."""
+        given = self.settings
+        pos, vel = (jnp.asarray(part, jnp.float32) for part in zip(*given.balls, strict=True))
+        num = pos.shape[0]
+        pull = GRAVITY if given.gravity is None else given.gravity
+        path = BallPath(
+            ball=BallState(pos, vel),
+            drag=jnp.full((num, 3), given.drag or 0.0, jnp.float32),
+            gravity=jnp.full(num, pull, jnp.float32),
+        )
+        return self.task.case(path, np.full(num, given.horizon), **given.case_options())
+
+    def contact(self, answer: Answer) -> list[str]:
+        """Of every ball with the net."""
+        lines = []
+        targets = answer.case.targets
+        for place, (target, time) in enumerate(
+            zip(np.asarray(answer.plan.order), np.asarray(answer.verdict.catch_times), strict=True)
+        ):
+            ball = BallPath(
+                ball=BallState(targets.ball.pos[target], targets.ball.vel[target]),
+                drag=targets.drag[target],
+                gravity=targets.gravity[target],
+            ).at(jnp.asarray(time, jnp.float32))
+            x, y, z = np.asarray(ball.pos)
+            which = f"Ball {target + 1} caught" if len(targets.gravity) > 1 else "Caught"
+            off = 1e3 * float(answer.verdict.net_distance[place])
+            lines.append(
+                f"{which} at {time:.3f} s at ({x:.3f}, {y:.3f}, {z:.3f}) m, flying at "
+                f"{float(np.linalg.norm(ball.vel)):.2f} m/s, {off:.1f} mm from the net's centre."
+            )
+        return lines
+
+    def own_margins(self, answer: Answer) -> list[Margin]:
+        """Of the net, of its angle, and of the horizon; the catch that is closest to each."""
+        net, verdict = answer.case.net, answer.verdict
+        times = np.asarray(verdict.catch_times)
+        horizons = np.asarray(answer.case.horizon)[np.asarray(answer.plan.order)]
+        looks = [
+            ("net's centre to ball [m]", np.asarray(verdict.net_distance), float(net.radius)),
+            ("angle of the net [rad]", np.asarray(verdict.angle), float(net.max_angle)),
+            ("time of the catch [s]", times, float(horizons[0])),
+        ]
+        found = []
+        for words, values, allowed in looks:
+            at = int(np.argmax(np.nan_to_num(values, nan=-np.inf)))
+            found.append(Margin(words, float(values[at]), allowed, float(times[at])))
+        return found

@@ -1,0 +1,45 @@
+"""One hit that was asked for in a few numbers."""
+
+from typing import Any
+
+import numpy as np
+
+from planner_jax.sweep.single import Answer, Margin, Single
+
+
+class SingleHit(Single):
+    """A quadrotor that returns one ball."""
+
+    NAMES = {**Single.NAMES, "ball.pos": "pos", "ball.vel": "vel"}
+
+    def case(self) -> Any:
+        """The case."""
+        given = self.settings
+        return self.task.case(given.pos, given.vel, given.target, **given.case_options())
+
+    def contact(self, answer: Answer) -> list[str]:
+        """Of ball and racket, and of the landing."""
+        stroke = answer.plan.stroke
+        x, y, z = np.asarray(stroke.ball_pos)
+        before, after = (
+            float(np.linalg.norm(vel)) for vel in (stroke.ball_vel, stroke.ball_vel_after)
+        )
+        lands = float(stroke.time + stroke.flight_time)
+        return [
+            f"Hit at {float(stroke.time):.3f} s at ({x:.3f}, {y:.3f}, {z:.3f}) m: the ball comes "
+            f"at {before:.2f} m/s, leaves at {after:.2f} m/s, and lands at {lands:.3f} s."
+        ]
+
+    def own_margins(self, answer: Answer) -> list[Margin]:
+        """Of the speed at the impact and of the apex."""
+        limits, verdict = answer.case.hit_limits, answer.verdict
+        end = float(np.sum(answer.plan.trajectory.durations))
+        speeds = np.abs(np.asarray(verdict.hitting_velocity))
+        found = [
+            Margin(f"hitting speed {axis} [m/s]", float(speed), float(most), end)
+            for axis, speed, most in zip("xyz", speeds, limits.hitting_speed, strict=True)
+        ]
+        apex, rise = float(verdict.apex), float(answer.plan.stroke.ball_vel_after[2])
+        at = end + max(rise, 0.0) / float(answer.case.gravity)
+        found.append(Margin("apex, least [m]", apex, float(limits.min_apex), at, least=True))
+        return [*found, Margin("apex, greatest [m]", apex, float(limits.max_apex), at)]

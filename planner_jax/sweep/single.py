@@ -1,0 +1,165 @@
+"""One case that was asked for in a few numbers: its plan, the referee's word, what limits leave."""
+
+import abc
+import dataclasses
+import re
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import jax
+import numpy as np
+
+from planner_jax.planning.plan import plan
+from planner_jax.protocol import Status
+from planner_jax.registry import Task
+from planner_jax.rules import CaseError
+from planner_jax.sweep.sampled_motion import SampledMotion, body_rate, net_thrust, sample_motion
+from planner_jax.sweep.settings import SettingError
+
+_SAMPLES = 4001  # of a plan
+_PLACES = re.compile(r"\b(?:[a-z_]+\.)+(?=[a-z_])")  # before the name of a field
+
+# Limits of the flight that are bounds from above: name, unit, size at every time.
+_ABOVE = {
+    "speed": ("m/s", lambda motion, gravity: np.linalg.norm(motion.vel, axis=1)),
+    "acceleration": ("m/s^2", lambda motion, gravity: np.linalg.norm(motion.acc, axis=1)),
+    "body_rate": ("rad/s", body_rate),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Margin:
+    """How close a plan comes to one limit."""
+
+    limit: str  # in words, with its unit
+    reached: float
+    allowed: float
+    time: float  # [s], when it is closest
+    least: bool = False  # whether the limit is a bound from below
+
+    @property
+    def share(self) -> float:
+        """Of the limit that is used; above one where it is exceeded, infinite where altogether."""
+        part, whole = (self.allowed, self.reached) if self.least else (self.reached, self.allowed)
+        if whole > 0.0:
+            return max(part, 0.0) / whole
+        return 0.0 if part <= whole else np.inf
+
+
+@dataclasses.dataclass(frozen=True)
+class Answer:
+    """A case, its plan and the verdict on it."""
+
+    case: Any
+    plan: Any
+    verdict: Any
+
+    @property
+    def success(self) -> bool:
+        """The referee's word."""
+        return bool(self.verdict.success)
+
+
+class Single(abc.ABC):
+    """The single cases of one task.
+
+    Args:
+        task: of the cases.
+        settings: of the case, of the task's class, their planner filled in.
+    """
+
+    # Names of a case's fields, where they are not those of the settings behind their last dot.
+    NAMES: ClassVar[dict[str, str]] = {"head_state": "start"}
+
+    def __init__(self, task: Task, settings: Any):
+        self.task, self.settings = task, settings
+
+    @abc.abstractmethod
+    def case(self) -> Any:
+        """The case; NumPy leaves."""
+
+    @abc.abstractmethod
+    def contact(self, answer: Answer) -> list[str]:
+        """When and where the contact is, a sentence each."""
+
+    @abc.abstractmethod
+    def own_margins(self, answer: Answer) -> list[Margin]:
+        """Of the limits that quadrotors of other tasks do not have."""
+
+    def answer(self) -> Answer:
+        """The plan, and the referee's verdict on it.
+
+        Raises:
+            SettingError: a number of the case breaks a rule.
+        """
+        try:
+            case = jax.tree.map(np.asarray, self.case())
+            planner = self.task.planner(self.settings.planner, **self.settings.planner_options())
+            found = plan(planner, case)
+        except CaseError as error:
+            raise SettingError(self._renamed(str(error))) from None
+        return Answer(case, found, self.task.judge(case, found))
+
+    def _renamed(self, message: str) -> str:
+        """The message about a field of the case, with the name of the setting."""
+        name, _, rest = message.partition(" ")
+        own = self.NAMES.get(name, name.rpartition(".")[2])
+        return f"{own} {_PLACES.sub('', rest)}"
+
+    def described(self, answer: Answer) -> list[str]:
+        """The answer as lines of text."""
+        status = Status(int(answer.plan.status))
+        sentence = answer.verdict.sentence()
+        told = f"Planner {self.settings.planner}: {status.name}, {status.message}."
+        if answer.success:
+            lines = [*self.contact(answer), told, f"Referee: {sentence}."]
+        else:
+            lines = ["No plan that keeps every limit was found.", told]
+            lines.append(f"Referee on the best that was found: {sentence}.")
+        return [*lines, "", *_table(self.margins(answer))]
+
+    def margins(self, answer: Answer) -> list[Margin]:
+        """How close the plan comes to each limit that the case has."""
+        return [*_of_flight(answer, sampled(answer.plan)), *self.own_margins(answer)]
+
+
+def sampled(found: Any) -> SampledMotion:
+    """One plan of a quadrotor, at even times."""
+    path = found.trajectory
+    coeffs, durations = np.asarray(path.coeffs), np.asarray(path.durations)
+    there = durations > 0.0
+    return sample_motion(coeffs[there].ravel(), durations[there], _SAMPLES)
+
+
+def _of_flight(answer: Answer, motion: SampledMotion) -> list[Margin]:
+    limits, gravity = answer.case.limits, float(answer.case.gravity)
+
+    def closest(words: str, values: np.ndarray, allowed: Any, *, least: bool = False) -> Margin:
+        values = np.nan_to_num(values, nan=np.inf)  # without an attitude no limit is kept
+        at = int(np.argmin(values) if least else np.argmax(values))
+        return Margin(words, float(values[at]), float(allowed), float(motion.time[at]), least)
+
+    found = [
+        closest(f"{name.replace('_', ' ')} [{unit}]", size(motion, gravity), getattr(limits, name))
+        for name, (unit, size) in _ABOVE.items()
+        if getattr(limits, name) is not None
+    ]
+    if limits.max_thrust is not None:
+        thrust = np.linalg.norm(net_thrust(motion, gravity), axis=1)
+        found.append(closest("thrust, least [m/s^2]", thrust, limits.min_thrust, least=True))
+        found.append(closest("thrust, greatest [m/s^2]", thrust, limits.max_thrust))
+    height = closest("height, least [m]", motion.pos[:, 2], limits.min_height, least=True)
+    return [*found, height]
+
+
+def _table(margins: Sequence[Margin]) -> list[str]:
+    """A line a limit."""
+    rows = [("limit", "reached", "allowed", "share", "at [s]")]
+    for margin in margins:
+        share = f"{100.0 * margin.share:.1f} %" if np.isfinite(margin.share) else "exceeded"
+        numbers = (f"{margin.reached:.4g}", f"{margin.allowed:.4g}", share, f"{margin.time:.3f}")
+        rows.append((margin.limit, *numbers))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows
+    ]

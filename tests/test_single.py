@@ -1,0 +1,134 @@
+"""One case in a few numbers: the command `plan`, its words, its table, its files and refusals."""
+
+import csv
+
+import numpy as np
+import pytest
+
+import planner_jax as pj
+from planner_jax.cli import main
+from planner_jax.sweep.catch.single import SingleCatch
+from planner_jax.sweep.catch.single_settings import SingleCatchSettings
+from planner_jax.sweep.hit.single import SingleHit
+from planner_jax.sweep.hit.single_settings import SingleHitSettings
+from planner_jax.sweep.single import Margin
+from planner_jax.task.hit.plan import HitPlan
+
+HIT = "--pos 4 0.3 1.2 --vel -7 -1e-1 6 --target 4 0 0"
+CATCH = "--pos 3 0 1 --vel -3 0.3 5 --horizon 1.1"
+
+
+@pytest.fixture(scope="module")
+def hit():
+    task = pj.task_named("hit")
+    numbers = {"pos": (4.0, 0.3, 1.2), "vel": (-7.0, -0.1, 6.0), "target": (4.0, 0.0, 0.0)}
+    single = SingleHit(task, SingleHitSettings(**numbers).of(task))
+    return single, single.answer()
+
+
+@pytest.fixture(scope="module")
+def catch():
+    task = pj.task_named("catch")
+    ball = {"pos": (3.0, 0.0, 1.0), "vel": (-3.0, 0.3, 5.0), "horizon": 1.1}
+    single = SingleCatch(task, SingleCatchSettings(**ball).of(task))
+    return single, single.answer()
+
+
+def test_a_hit_is_told_with_its_time_and_place(hit):
+    single, answer = hit
+    first, planner, referee = single.described(answer)[:3]
+    stroke = answer.plan.stroke
+    assert first.startswith(f"Hit at {float(stroke.time):.3f} s at ({stroke.ball_pos[0]:.3f}, ")
+    assert planner.startswith("Planner exact: ") and "every limit holds" in planner
+    assert referee.startswith("Referee: success: the ball lands ")
+
+
+def test_a_catch_is_told_with_its_time_and_place(catch):
+    single, answer = catch
+    ball = answer.case.targets.ball
+    time = float(answer.plan.times[0])
+    fallen = ball.pos[0] + time * ball.vel[0] - np.array([0.0, 0.0, 0.5 * 9.81 * time**2])
+    assert f"Caught at {time:.3f} s at ({fallen[0]:.3f}, " in single.described(answer)[0]
+    assert f", {fallen[2]:.3f}) m, " in single.described(answer)[0]
+
+
+@pytest.mark.parametrize("which", ["hit", "catch"])
+def test_the_table_agrees_with_the_referee_and_says_when(which, request):
+    single, answer = request.getfixturevalue(which)
+    found = {margin.limit.split(" [")[0]: margin for margin in single.margins(answer)}
+    verdict, end = answer.verdict, float(np.sum(answer.plan.trajectory.durations))
+    for name, value in {
+        "speed": verdict.max_speed,
+        "body rate": verdict.max_body_rate,
+        "height, least": verdict.min_height,
+        **({"acceleration": verdict.max_acceleration} if which == "hit" else {}),
+        **({"thrust, least": verdict.min_thrust} if which == "catch" else {}),
+    }.items():
+        assert found[name].reached == pytest.approx(float(value), rel=1e-3, abs=1e-3)
+        assert 0.0 <= found[name].time <= end + 1e-6
+    assert answer.success and all(0.0 <= margin.share <= 1.001 for margin in found.values())
+
+
+def test_shares_of_bounds_from_either_side():
+    assert Margin("speed", 4.0, 5.0, 0.0).share == pytest.approx(0.8)
+    assert Margin("height", 0.5, 0.25, 0.0, least=True).share == pytest.approx(0.5)
+    assert Margin("height", 0.2, 0.25, 0.0, least=True).share == pytest.approx(1.25)
+    assert Margin("height", -0.2, 0.25, 0.0, least=True).share == np.inf
+    assert Margin("height", 0.0, 0.0, 0.0, least=True).share == 0.0
+
+
+def test_the_command_writes_plan_setpoints_and_pictures(hit, tmp_path, capsys):
+    out = tmp_path / "out"
+    command = ["plan", "hit", *HIT.split(), "--rate", "50", "--out", str(out)]
+    assert main(command) == 0
+    names = {path.name for path in out.iterdir()}
+    assert names == {"plan.npz", "setpoints.csv", "path.png", "motion.png"}
+    told = capsys.readouterr().out
+    assert all(str(out / name) in told for name in names)
+    kept = HitPlan.load(out / "plan.npz")
+    np.testing.assert_array_equal(kept.stroke.time, hit[1].plan.stroke.time)
+    rows = list(csv.reader((out / "setpoints.csv").read_text().splitlines()))
+    assert float(rows[2][0]) == pytest.approx(0.02)
+    assert main(command) == 2
+    assert "--out must be a new folder, got" in capsys.readouterr().err
+
+
+def test_a_ball_that_flies_away_is_told_so_with_the_limit_that_fails(capsys):
+    away = "--pos -2 0 2 --vel -14 0 6 --target 4 0 0"
+    assert main(["plan", "hit", *away.split()]) == 1
+    told = capsys.readouterr()
+    assert "TOO_FAR, no plan exists" in told.out
+    assert "Referee on the best that was found: " in told.out and "above its limit" in told.out
+    assert not told.err
+
+
+@pytest.mark.slow
+def test_several_balls_are_caught_one_after_another(capsys):
+    balls = "--ball 3 0 1 -3 0.3 5 --ball 3.5 1 1 -2.5 0 7 --horizon 1.6"
+    assert main(["plan", "catch", *balls.split(), "--decide", "greedy"]) == 0
+    told = capsys.readouterr().out
+    assert "Ball 1 caught at " in told and "Ball 2 caught at " in told
+
+
+@pytest.mark.parametrize(
+    ("command", "told"),
+    [
+        (f"hit {HIT} --speed -1", "--speed must be > 0, got -1"),
+        (f"hit {HIT} --min-thrust 9 --max-thrust 3", "--min-thrust must be < max_thrust, got 9"),
+        (f"hit {HIT} --min-apex 9", "--min-apex must be < max_apex, got 9"),
+        (f"hit {HIT} --restitution 2", "--restitution must be in [0, 1], got 2"),
+        (f"hit {HIT} --gravity 0", "--gravity must be > 0, got 0"),
+        (f"hit {HIT} --pos 1e300 0 1", "--pos must be finite, got inf"),
+        (f"hit {HIT} --rate 5", "--rate must be left out without --out, got 5"),
+        (f"catch {CATCH} --net-radius -1", "--net-radius must be > 0, got -1"),
+        (f"catch {CATCH} --max-angle 9", "--max-angle must be in [0, pi], got 9"),
+        (f"catch {CATCH} --drag -1", "--drag must be >= 0, got -1"),
+        ("catch --pos 3 0 1 --vel 1 2 3 --horizon -1", "--horizon must be > 0 of a target"),
+        ("catch --pos 3 0 1 --horizon 1", "--vel must be given, or --ball, got nothing"),
+        (f"catch {CATCH} --ball 1 2 3 4 5 6", "--pos must be left out beside --ball, got both"),
+    ],
+)
+def test_a_number_that_breaks_a_rule_is_refused_by_its_option(command, told, capsys):
+    assert main(["plan", *command.split()]) == 2
+    line = capsys.readouterr().err
+    assert told in line and line.count("\n") == 1
