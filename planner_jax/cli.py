@@ -404,9 +404,10 @@ def _of_several(field: dataclasses.Field) -> dict[str, Any]:
 def _type_of(hint: Any) -> Callable[[str], Any]:
     """What makes a value of a word: a number where a field holds these, or nothing."""
     held = typing.get_args(hint) or (hint,)
-    found = [_NUMBERS[kind] for kind in held if kind in _NUMBERS]
-    found += [kind for kind in map(_type_of, filter(typing.get_args, held)) if kind is not str]
-    return next(iter(found), str)
+    if str in held:  # beside numbers, as where "uniform" may stand for three of them
+        return str
+    inner = [_type_of(kind) for kind in held if typing.get_args(kind)]
+    return next((_NUMBERS[kind] for kind in held if kind in _NUMBERS), next(iter(inner), str))
 
 
 def _add_sweep(task: Task, parser: _Parser) -> None:
