@@ -61,6 +61,7 @@ _AIM_RADIUS = 0.05  # [m], of the net that plans are made for; the rest is left 
 # Plans of later catches begin with the second limits. Where no plan keeps them, the next ones
 # count; the last are as wide as the shared protocol admits.
 _LIMITS = ((0.5, 3.0), (0.4, 4.5), (0.3, 5.0))
+_BORNE = 0.1  # share of a limit by which a plan may break it and is still flown
 _KEPT = 0.01  # relative excess up to which limits count as kept by a plan of the loop
 _CHEAPER = 0.95  # share of the cost below which a plan from scratch replaces one that keeps them
 _INSTANT = 1e-3  # [s], shorter than any look
@@ -86,12 +87,12 @@ class CatchPilot:
 
     # Later than 0.2 s before a catch a new plan shakes more than the news of the ball is worth.
     planner: ReplanCatch = ReplanCatch(ExactCatch(lift=_LIFT), shortest=0.2)
-    # A new plan may break a limit by this share of the limit and is still flown; one that breaks
-    # it by more is flown only if the old plan breaks its limits by as much. The first share holds
-    # for the last catch, the second while several are left: then most of the excess lies on the
+    # By which share of a limit a new plan may break it and is still flown; one that breaks it by
+    # more is flown only if the old plan breaks its limits by as much. The first share holds for
+    # the last catch, the second while several are left: then most of the excess lies on the
     # way to catches that will be planned from scratch later, and keeping the old plan would miss
     # the ball that comes first.
-    excess: tuple[float, float] = (0.1, 1.0)
+    excess: tuple[float, float] = (_BORNE, 1.0)
     # The name of a decision about catches, or "policy:FILE"; "given" keeps order and times of the
     # plan that is flown, and only its way is searched for from scratch.
     decide: str = "greedy"
@@ -412,8 +413,8 @@ def planned_ahead(
 
     Where no plan of both is found within the limits, both are planned for within wider ones:
     what catches the ball alone leaves the quadrotor where the next may be out of reach. Where that
-    fails as well, the ball is planned for alone. If nothing is solved, the plan of it that breaks
-    its limits least is left.
+    breaks a limit by more than is flown in the loop, the ball is planned for alone, and if nothing
+    is solved, the plan of it that breaks its limits least is left.
 
     Args:
         planner: of catches, which also decides about their order.
@@ -431,14 +432,17 @@ def planned_ahead(
         tries += [(alone, limits) for limits in (None, *wider)]
     cases, plans = known, plan_all(planner, known)
     for balls, limits in tries:
-        lanes = np.flatnonzero(is_unsolved(np.asarray(plans.status)))
+        tried = known.present & balls
+        same = (tried == cases.present).all(axis=1)
+        unsolved = is_unsolved(np.asarray(plans.status))
+        lanes = np.flatnonzero(unsolved & (same | ~(plans.violation <= _BORNE)))
         if not lanes.size:
-            break
-        part = jax.tree.map(lambda leaf, lanes=lanes: np.asarray(leaf)[lanes], known)
-        part = within(dataclasses.replace(part, present=part.present & balls), limits)
+            continue
+        part = dataclasses.replace(known, present=tried)
+        part = jax.tree.map(lambda leaf, lanes=lanes: np.asarray(leaf)[lanes], part)
+        part = within(part, limits)
         found = plan_all(planner, part)
-        same = (part.present == cases.present[lanes]).all(axis=1)
-        before = np.where(same, plans.violation[lanes], np.inf)
+        before = np.where(same, plans.violation, np.inf)[lanes]
         better = ~is_unsolved(np.asarray(found.status)) | (found.violation < before)
         to, chosen = lanes[better], np.flatnonzero(better)
 
