@@ -44,7 +44,7 @@ from .robot.quadrotor_model import FlightLimits as FlightLimits
 from .robot.quadrotor_model import QuadrotorModel as QuadrotorModel
 from .robot.quadrotor_model import Rotors as Rotors
 from .robot.quadrotor_model import Tool as Tool
-from .robot.quadrotor_models import robot as robot
+from .robot.quadrotor_models import robot_named as robot_named
 from .rules import CaseError as CaseError
 from .rules import require_sound as require_sound
 from .task import block as block

@@ -122,7 +122,7 @@ def named_leaves(tree: Any, prefix: str = "") -> dict[str, Any]:
         if field.metadata.get("pytree_node", True):
             value = getattr(tree, field.name)
             place = prefix + field.name
-            if value is None:
+            if value is None and field.default is None:
                 continue
             inner = dataclasses.is_dataclass(value)
             named |= named_leaves(value, f"{place}.") if inner else {place: value}

@@ -294,7 +294,7 @@ def test_a_lag_that_mjcf_does_not_have_has_to_be_said(tmp_path):
 
 def test_an_unknown_robot_is_told_with_the_nearest_name():
     with pytest.raises(UnknownName, match="^robot must be one of paper-catcher, .*mean x500-net?"):
-        pj.robot("x50-net")
+        pj.robot_named("x50-net")
     assert all(f"`{name}`" in (pj.robot.__doc__ or "") for name in MODELS)
 
 
@@ -309,7 +309,7 @@ def test_the_command_lists_robots_and_prints_one_to_begin_from(capsys, tmp_path)
     assert [line.split()[0] for line in lines[1:]] == list(MODELS)
     assert main(["robots", "x500"]) == 0
     (tmp_path / "my.yaml").write_text(capsys.readouterr().out)
-    assert pj.read_robot(tmp_path / "my.yaml") == pj.robot("x500")
+    assert pj.read_robot(tmp_path / "my.yaml") == pj.robot_named("x500")
 
 
 @pytest.mark.parametrize(
@@ -373,6 +373,6 @@ def test_an_old_run_without_a_robot_is_one_of_the_paper_s():
 def test_draws_are_of_the_robot():
     cases = pj.hit.draw(2, robot=pj.read_robot(MINE))
     np.testing.assert_allclose(cases.limits.rotors.max_thrust, 0.95 * 4.5)
-    throws = pj.catch.draw(2, robot=pj.robot("x500-net"))
+    throws = pj.catch.draw(2, robot=pj.robot_named("x500-net"))
     np.testing.assert_allclose(throws.net.radius, 0.2)
     np.testing.assert_allclose(throws.limits.max_thrust, 4.0 * 0.95 * 8.549 / 2.064, rtol=1e-6)

@@ -116,7 +116,7 @@ MODELS = {
 }
 
 
-def robot(name: str) -> QuadrotorModel:
+def ready_robot(name: str) -> QuadrotorModel:
     """The ready quadrotor of a name.
 
     There are `paper-catcher`, `paper-hitter`, `crazyflie`, `racer`, `racer-net`, `x500` and
@@ -140,7 +140,7 @@ def robot_named(word: str) -> QuadrotorModel:
         MissingExtra: the file needs MuJoCo, which is not installed.
     """
     if not word.lower().endswith(ENDINGS):
-        return robot(word)
+        return ready_robot(word)
     try:
         return read_robot(word)
     except OSError as error:

@@ -19,6 +19,7 @@ from jax import Array
 
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.prediction import PathTable, predict_path
+from planner_jax.ball.target import BallPath
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
 from planner_jax.planning.decided import DecidedPlanner
@@ -63,6 +64,7 @@ _AIM = 0.4  # share of the net's radius that plans are made for; the rest is lef
 # from them, so that the next can begin within bounds. Plans of later catches begin with the second
 # limits. Where no plan keeps them, the next ones count; the last are as wide as the robot's own.
 _LIMITS = ((2.0 / 7.0, 0.6), (1.0 / 7.0, 0.9), (0.0, 1.0))
+_BORNE = 0.1  # share of a limit by which a plan may break it and is still flown
 _KEPT = 0.01  # relative excess up to which limits count as kept by a plan of the loop
 _CHEAPER = 0.95  # share of the cost below which a plan from scratch replaces one that keeps them
 _INSTANT = 1e-3  # [s], shorter than any look
@@ -88,12 +90,12 @@ class CatchPilot:
 
     # Later than 0.2 s before a catch a new plan shakes more than the news of the ball is worth.
     planner: ReplanCatch = ReplanCatch(ExactCatch(lift=_LIFT), shortest=0.2)
-    # A new plan may break a limit by this share of the limit and is still flown; one that breaks
-    # it by more is flown only if the old plan breaks its limits by as much. The first share holds
-    # for the last catch, the second while several are left: then most of the excess lies on the
+    # By which share of a limit a new plan may break it and is still flown; one that breaks it by
+    # more is flown only if the old plan breaks its limits by as much. The first share holds for
+    # the last catch, the second while several are left: then most of the excess lies on the
     # way to catches that will be planned from scratch later, and keeping the old plan would miss
     # the ball that comes first.
-    excess: tuple[float, float] = (0.1, 1.0)
+    excess: tuple[float, float] = (_BORNE, 1.0)
     # The name of a decision about catches, or "policy:FILE"; "given" keeps order and times of the
     # plan that is flown, and only its way is searched for from scratch.
     decide: str = "greedy"
@@ -243,10 +245,12 @@ def believed(loop: Loop, flights: FlightState, new: Array, horizon: Array) -> Ca
         new: (N,) bool, the balls that are to be planned.
         horizon: (B, N) [s] from now, until when each may be caught.
     """
-    unknown: Any = None
     robot = loop.world.carrier
+    # Their targets are those that are seen, filled in below.
+    zeros = jnp.zeros((*horizon.shape, 3), horizon.dtype)
+    nowhere = BallPath(BallState(zeros, zeros), drag=zeros, gravity=zeros[..., 0])
     empty = catch_case(
-        unknown,
+        nowhere,
         np.zeros(horizon.shape),
         robot=robot.model,
         gravity=loop.world.gravity,
@@ -423,8 +427,8 @@ def planned_ahead(
 
     Where no plan of both is found within the limits, both are planned for within wider ones:
     what catches the ball alone leaves the quadrotor where the next may be out of reach. Where that
-    fails as well, the ball is planned for alone. If nothing is solved, the plan of it that breaks
-    its limits least is left.
+    breaks a limit by more than is flown in the loop, the ball is planned for alone, and if nothing
+    is solved, the plan of it that breaks its limits least is left.
 
     Args:
         planner: of catches, which also decides about their order.
@@ -444,14 +448,17 @@ def planned_ahead(
         tries += [(alone, each) for each in (None, *wider)]
     cases, plans = known, plan_all(planner, known)
     for balls, wide in tries:
-        lanes = np.flatnonzero(~is_solved(np.asarray(plans.status)))
+        tried = known.present & balls
+        same = (tried == cases.present).all(axis=1)
+        unsolved = ~is_solved(np.asarray(plans.status))
+        lanes = np.flatnonzero(unsolved & (same | ~(plans.violation <= _BORNE)))
         if not lanes.size:
-            break
-        part = jax.tree.map(lambda leaf, lanes=lanes: np.asarray(leaf)[lanes], known)
-        part = within(dataclasses.replace(part, present=part.present & balls), wide)
+            continue
+        part = dataclasses.replace(known, present=tried)
+        part = jax.tree.map(lambda leaf, lanes=lanes: np.asarray(leaf)[lanes], part)
+        part = within(part, wide)
         found = plan_all(planner, part)
-        same = (part.present == cases.present[lanes]).all(axis=1)
-        before = np.where(same, plans.violation[lanes], np.inf)
+        before = np.where(same, plans.violation, np.inf)[lanes]
         better = is_solved(np.asarray(found.status)) | (found.violation < before)
         to, chosen = lanes[better], np.flatnonzero(better)
 
