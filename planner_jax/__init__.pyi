@@ -8,6 +8,8 @@ from .compile_cache import keep_compiled_programs as keep_compiled_programs
 from .cost.extras import Dislike as Dislike
 from .cost.extras import Geofence as Geofence
 from .cost.extras import KeepOut as KeepOut
+from .cost.extras import KeepOutBox as KeepOutBox
+from .cost.extras import Plane as Plane
 from .cost.extras import SpeedZone as SpeedZone
 from .export.words import export as export
 from .optimise.implicit import optimal_plan as optimal_plan
