@@ -2,6 +2,7 @@ from .ball.flight import BallState as BallState
 from .ball.flight import fly as fly
 from .ball.prediction import predict_path as predict_path
 from .ball.prediction import target_at as target_at
+from .ball.table import table_path as table_path
 from .ball.target import BallPath as BallPath
 from .ball.target import HarmonicPath as HarmonicPath
 from .compile_cache import keep_compiled_programs as keep_compiled_programs

@@ -7,6 +7,7 @@ from planner_jax.protocol import Decision
 from planner_jax.referee.catch import CatchVerdict, referee_catches
 from planner_jax.task.catch.card import DECISIONS, TASK, TRAINED
 from planner_jax.task.catch.case import CatchCase
+from planner_jax.task.catch.own_targets import is_own, states_by_class
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.task.judged import judged
 from planner_jax.task.named_decision import named_decision
@@ -46,6 +47,9 @@ def planner(
 def judge(cases: CatchCase, plans: CatchPlan, **settings: Any) -> CatchVerdict:
     """What the referee says of one plan or of a batch: the physics alone decides.
 
+    Targets of the library's classes are followed by the referee itself. Those of a class of one's
+    own are where its `at` says in float64; their velocity is the central difference over 2e-4 s.
+
     Args:
         cases: one case, or a batch.
         plans: of them.
@@ -59,4 +63,6 @@ def judge(cases: CatchCase, plans: CatchPlan, **settings: Any) -> CatchVerdict:
         TypeError: the cases or plans are not catches.
         ValueError: shapes that do not fit, or a setting out of its range.
     """
+    if isinstance(cases, CatchCase) and is_own(cases.targets):
+        settings = {"target_states": states_by_class, **settings}
     return judged(referee_catches, cases, plans, (CatchCase, CatchPlan), settings)
