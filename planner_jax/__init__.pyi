@@ -28,6 +28,7 @@ from .planning.plan import plan as plan
 from .planning.plan import plan_across_processes as plan_across_processes
 from .planning.plan import solve as solve
 from .planning.replan import replan as replan
+from .planning.watch import Progress as Progress
 from .protocol import Attempt as Attempt
 from .protocol import Plan as Plan
 from .protocol import Status as Status

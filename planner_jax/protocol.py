@@ -39,6 +39,7 @@ class Status(enum.IntEnum):
     NO_PATH = 6
     BLOCKED = 7
     BAD_INPUT = 8
+    OUT_OF_TIME = 9
 
     @property
     def message(self) -> str:
@@ -61,6 +62,7 @@ _MESSAGES = {
     Status.NO_PATH: "no way was found through the obstacles in time; allow more time",
     Status.BLOCKED: "the start or the goal lies in an obstacle or off the map; move it",
     Status.BAD_INPUT: "a number of the case is absurd; `pj.require_sound(cases)` names it",
+    Status.OUT_OF_TIME: "a limit is exceeded, and `time_limit` ended the search; allow more time",
 }
 
 
@@ -243,6 +245,11 @@ class Drive(Protocol):
         """Whether this happens inside a compiled program, where nothing is a number yet."""
         ...
 
+    @property
+    def is_over(self) -> bool:
+        """Whether the caller's time has passed, so that no more is to be begun."""
+        ...
+
     def __call__(
         self, planner: Any, cases: Any, attempts: Sequence[Attempt] | None = None
     ) -> tuple[Any, Any]:
@@ -298,6 +305,13 @@ class Decision(Protocol):
 
 
 Tree = TypeVar("Tree")
+
+
+def out_of_time(plans: PlanT, left: Any) -> PlanT:
+    """The plans, with the status `OUT_OF_TIME` where one is left unsolved."""
+    xp: Any = jnp if isinstance(plans.status, jax.Array) else np
+    status = xp.where(left, Status.OUT_OF_TIME, plans.status).astype(np.int32)
+    return dataclasses.replace(plans, status=status)  # type: ignore[type-var]
 
 
 def lane(tree: Tree, k: Any) -> Tree:
