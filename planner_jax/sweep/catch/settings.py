@@ -10,10 +10,12 @@ from planner_jax.sweep.settings import (
     SweepSettings,
     option,
     require,
+    require_effort,
     require_one_of,
     require_scale,
 )
 from planner_jax.task.catch.card import DECISIONS, SUITES, TRAINED
+from planner_jax.task.efforts import EFFORTS
 
 NET_TESTS = ("plane", "ball")  # of `referee_catches`
 
@@ -38,8 +40,10 @@ class CatchSettings(SweepSettings):
         "or all around its centre",
     )
 
+    effort: str = option("feasible", "NAME", f"of the planner: {', '.join(EFFORTS)}")
+
     RUN: ClassVar[str] = "planner_jax.sweep.catch.sweep:CatchSweep"
-    PLANNER: ClassVar[tuple[str, ...]] = ("decide",)
+    PLANNER: ClassVar[tuple[str, ...]] = ("decide", "effort")
     DRAW: ClassVar[tuple[str, ...]] = ("limit_scale",)
     JUDGE: ClassVar[tuple[str, ...]] = ("tolerance", "net_test")
     GPU_BATCH: ClassVar[int] = 8192  # all orders of six targets at once: 1 MB a case
@@ -48,6 +52,7 @@ class CatchSettings(SweepSettings):
         super().__post_init__()
         tolerance = self.tolerance
         require_scale(self.limit_scale)
+        require_effort(self.effort, self.planner, "mpp")
         try:
             split_name(DECISIONS, "decide", self.decide, TRAINED)
         except UnknownName as error:

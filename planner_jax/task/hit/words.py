@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from planner_jax.protocol import AnyPlanner
 from planner_jax.referee.hit import HitVerdict, referee_hits
+from planner_jax.task.efforts import with_effort
 from planner_jax.task.hit.card import REAL_SCENARIOS, START, TASK
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.plan import HitPlan
@@ -50,7 +51,9 @@ def draw(
     )
 
 
-def planner(name: str = "exact", **options: Any) -> AnyPlanner[HitCase, HitPlan]:
+def planner(
+    name: str = "exact", *, effort: str = "feasible", **options: Any
+) -> AnyPlanner[HitCase, HitPlan]:
     """The hit planner of a name, with some of its fields set.
 
     * `exact`: contact, impact and landing hold by construction; the one to use.
@@ -60,16 +63,20 @@ def planner(name: str = "exact", **options: Any) -> AnyPlanner[HitCase, HitPlan]
 
     Args:
         name: one of these, or one that another package offers.
+        effort: "feasible" is done with a case as soon as every limit holds; "good" and "best"
+            search on for less cost. Of 1,000 hits of `court` it is above that of a very long
+            search by 469, 0.00 and 0.00 % (median), 2,467, 0.05 and 0.00 % (90 % quantile), in
+            0.05, 3.6 and 21 s on two CPU cores that had other work.
         **options: fields of that planner's dataclass, for example `rounds`.
 
     Returns:
         `ExactHit`, `BatHit` (`bat` and `bat-lite`) or `JuggleHit`, for `pj.plan`.
 
     Raises:
-        ValueError: there is no planner of that name.
+        ValueError: there is no planner of that name, or it has no such effort.
         TypeError: the planner has no such field.
     """
-    return TASK.make_planner(name, options)
+    return with_effort(TASK.make_planner(name, options), effort)
 
 
 def judge(cases: HitCase, plans: HitPlan, **settings: Any) -> HitVerdict:
