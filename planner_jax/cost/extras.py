@@ -146,8 +146,14 @@ def for_batch(extras: Sequence[Extra], batch: tuple[int, ...], dtype: Any) -> tu
     """Extras whose leaves have a dtype and the axes of a batch, () or (B,), in front.
 
     Raises:
+        TypeError: they are no sequence, or one of them is no extra.
         ValueError: an extra is not for one case, and not all of its leaves have these axes.
     """
+    if not isinstance(extras, Sequence):
+        raise TypeError(f"extras must be a sequence, such as (extra,), got {extras!r:.60}")
+    for extra in extras:
+        if not isinstance(extra, ExtraLimit | ExtraCost):
+            raise TypeError(f"extras must have a method excess or cost, got {extra!r:.60}")
 
     def spread(extra: Any) -> Any:
         extra = jax.tree.map(np.asarray, extra, is_leaf=lambda x: isinstance(x, tuple | list))
