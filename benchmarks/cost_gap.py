@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.planning.plan import plan
@@ -13,6 +14,9 @@ from planner_jax.protocol import solved
 from planner_jax.registry import Task
 
 COMPARED = 1024  # plans of a batch that are looked at, at most
+# Beside which even plans are looked at whose own search is long.
+VERY_LONG = LbfgsConfig(max_steps=3000, memory=12, tolerance=1e-9, patience=30)
+_LONGEST = 100  # iterations of a first round for which a long search is yardstick enough
 
 
 def cost_gaps(
@@ -22,6 +26,7 @@ def cost_gaps(
     devices: Sequence[Any] | None = None,
     *,
     card: Task | None = None,
+    solver: LbfgsConfig | None = None,
 ) -> np.ndarray | None:
     """By how much plans cost more than those of a longer search.
 
@@ -34,6 +39,8 @@ def cost_gaps(
         plans: of them.
         devices: as for `plan`.
         card: of the planner's task, for its yardstick.
+        solver: of the longer search; by default a long one, and `VERY_LONG` where the planner's own
+            first round is longer than most.
 
     Returns:
         (K,), relative, of the cases that both solve: 0.33 is 33 %. None where the planner has no
@@ -42,7 +49,7 @@ def cost_gaps(
     cases, plans = jax.tree.map(lambda leaf: np.asarray(leaf[:COMPARED]), (cases, plans))
     if isinstance(planner, DecidedPlanner):
         cases, planner = cases.decided(plans.choice), planner.planner
-    longer = _longer(planner, cases, card)
+    longer = _longer(planner, cases, card, solver)
     if longer is None:
         return None
     best = plan(longer, cases, devices=devices)
@@ -50,10 +57,12 @@ def cost_gaps(
     return plans.cost[both] / best.cost[both] - 1.0
 
 
-def _longer(planner: Any, cases: Any, card: Task | None) -> Any:
+def _longer(planner: Any, cases: Any, card: Task | None, solver: LbfgsConfig | None) -> Any:
     """The planner with whose costs those of a planner are compared, None if there is none."""
     if isinstance(planner, OptimisedPlanner):
-        return planner.with_solver()
+        if solver is None and planner.rounds[0].solver.max_steps > _LONGEST:
+            solver = VERY_LONG
+        return planner.with_solver() if solver is None else planner.with_solver(solver)
     if card is None or card.yardstick is None:
         return None
     yardstick = card.planner(card.yardstick)

@@ -6,7 +6,8 @@ from typing import ClassVar
 
 from planner_jax.memory import require_memory
 from planner_jax.registry import task_named
-from planner_jax.sweep.settings import SettingError, SweepSettings, option, require
+from planner_jax.sweep.settings import SettingError, SweepSettings, option, require, require_one_of
+from planner_jax.task.efforts import EFFORTS
 
 _MOST = 100_000  # iterations, or calls: an hour and more
 
@@ -26,6 +27,9 @@ class ThroughputSettings:
     batch: tuple[int, ...] = option((1024, 8192), "B", "plans in one call, one or more sizes")
     devices: int | None = option(None, "N", "how many share a batch (default: all)")
     iterations: int | None = option(None, "K", "of the first round (default: the planner's own)")
+    effort: str | None = option(
+        None, "NAME", f"of the planner of hits or catches: {', '.join(EFFORTS)}"
+    )
     repeat: int = option(5, "R", "timed calls")
     seed: int = option(0, "K", "of the cases")
     agree: bool = option(False, "", "compare the first lanes with those of a CPU, too")
@@ -40,6 +44,10 @@ class ThroughputSettings:
             value = getattr(self, name)
             require(value is None or value >= 1, name, ">= 1", value)
             require(value is None or value <= _MOST, name, f"<= {_MOST}", value)
+        if self.effort is not None:
+            require_one_of(EFFORTS, "effort", self.effort)
+            has_effort = self.task in ("hit", "catch")
+            require(has_effort, "effort", f"left out for the task {self.task}", self.effort)
         require(len(self.batch) > 0, "batch", "one or more sizes", "none")
         require(min(self.batch) >= 1, "batch", ">= 1", min(self.batch))
         task = task_named(self.task)

@@ -16,12 +16,13 @@ Every task, `hit`, `catch`, `intercept` and those of other packages (`task_named
 * `lane`, `solved`, `Status`: reading plans; a plan has `sample`, `save` and `load`
 * `export`: one plan into a file for a controller
 
-Limits and costs of one's own along the way, a case's `extras`: `KeepOut`, `Geofence`, `SpeedZone`,
-`Dislike`, or any class with their methods. Where targets are: `BallState`, `fly`, `BallPath`,
-`HarmonicPath`, `predict_path`, `target_at`; in the plane `TurningPath`, `PolynomialPath`, and what
-is in a car's way, `Obstacles`, made by `obstacles`. What a trajectory does: `PiecewisePolynomial`,
-`evaluate`. For planners and tasks of one's own: `Plan`, `Attempt`, `outcome`, `OptimisedPlanner`,
-`pending`, `Round`, `LbfgsConfig`, `Evaluation`, `Verdict`, `Task`.
+Limits and costs of one's own along the way, a case's `extras`: `KeepOut`, `KeepOutBox`, `Plane`,
+`Geofence`, `SpeedZone`, `Dislike`, or any class with their methods. Where targets are:
+`BallState`, `fly`, `BallPath`, `HarmonicPath`, `table_path`, `predict_path`, `target_at`; in the
+plane `TurningPath`, `PolynomialPath`, and what is in a car's way, `Obstacles`, made by `obstacles`.
+What a trajectory does: `PiecewisePolynomial`, `evaluate`. For planners and tasks of one's own:
+`Plan`, `Attempt`, `outcome`, `OptimisedPlanner`, `pending`, `Round`, `LbfgsConfig`, `Evaluation`,
+`Verdict`, `Task`.
 
 Everything is imported on first use, so that `import planner_jax` itself is quick.
 """

@@ -3,12 +3,15 @@ from .ball.flight import BallState as BallState
 from .ball.flight import fly as fly
 from .ball.prediction import predict_path as predict_path
 from .ball.prediction import target_at as target_at
+from .ball.table import table_path as table_path
 from .ball.target import BallPath as BallPath
 from .ball.target import HarmonicPath as HarmonicPath
 from .compile_cache import keep_compiled_programs as keep_compiled_programs
 from .cost.extras import Dislike as Dislike
 from .cost.extras import Geofence as Geofence
 from .cost.extras import KeepOut as KeepOut
+from .cost.extras import KeepOutBox as KeepOutBox
+from .cost.extras import Plane as Plane
 from .cost.extras import SpeedZone as SpeedZone
 from .ending.ended import EndedPlanner as EndedPlanner
 from .ending.planner import RestPlanner as RestPlanner
@@ -28,6 +31,7 @@ from .planning.plan import plan as plan
 from .planning.plan import plan_across_processes as plan_across_processes
 from .planning.plan import solve as solve
 from .planning.replan import replan as replan
+from .planning.watch import Progress as Progress
 from .protocol import Attempt as Attempt
 from .protocol import Plan as Plan
 from .protocol import Status as Status

@@ -26,7 +26,14 @@ from planner_jax import stopping
 from planner_jax.compile_cache import keep_compiled_programs
 from planner_jax.digits import written_number, written_whole
 from planner_jax.live.settings import SERVED
-from planner_jax.registry import MissingExtra, Task, UnknownName, all_tasks, task_named
+from planner_jax.registry import (
+    MissingExtra,
+    Task,
+    UnknownName,
+    all_tasks,
+    install_line,
+    task_named,
+)
 from planner_jax.sweep.environment import installed_version, require_backend
 from planner_jax.sweep.settings import SettingError, WorkersFailed, is_address
 from planner_jax.whole_files import new_file_problem, replacing
@@ -260,7 +267,7 @@ def _train(given: dict[str, Any]) -> None:
         from planner_jax.policies.training import train_as_asked
     except ModuleNotFoundError as error:
         raise MissingExtra(
-            f"train needs {error.name}: pip install 'planner-jax[policies]'", name=error.name
+            f"train needs {error.name}: {install_line('policies')}", name=error.name
         ) from None
     rest = functools.partial(_rest, Path(out), f"go on with: {_same_command()}", "training.json")
     with stopping.under_way(rest), _told_how_to_go_on(rest):

@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 
 from planner_jax.compile_cache import keep_compiled_programs
+from planner_jax.registry import install_line
 from planner_jax.sweep.environment import environment, require_backend
 
 _BATCH = 1024  # hits that are planned and refereed
@@ -52,7 +53,7 @@ def _devices() -> Finding:
     if memory:
         text += f", {memory / 2**30:.0f} GiB for JAX each"
     if devices[0].platform == "cpu" and os.path.exists("/dev/nvidia0"):
-        hint = "; there is an NVIDIA GPU that JAX does not use: pip install 'planner-jax[gpu]'"
+        hint = f"; there is an NVIDIA GPU that JAX does not use: {install_line('gpu')}"
         return Finding("devices", text + hint, good=False)
     return Finding("devices", text)
 

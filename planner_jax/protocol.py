@@ -48,6 +48,7 @@ class Status(enum.IntEnum):
     BLOCKED = 7
     BAD_INPUT = 8
     TOO_FAR = 9
+    OUT_OF_TIME = 10
 
     @property
     def message(self) -> str:
@@ -72,6 +73,7 @@ _MESSAGES = {
     Status.BAD_INPUT: "a number of the case is absurd; `pj.require_sound(cases)` names it",
     Status.TOO_FAR: "no plan exists: at no time is a target where the robot can be by then; allow "
     "more speed or acceleration, or start nearer",
+    Status.OUT_OF_TIME: "a limit is exceeded, and `time_limit` ended the search; allow more time",
 }
 
 
@@ -256,6 +258,11 @@ class Drive(Protocol):
         """Whether this happens inside a compiled program, where nothing is a number yet."""
         ...
 
+    @property
+    def is_over(self) -> bool:
+        """Whether the caller's time has passed, so that no more is to be begun."""
+        ...
+
     def __call__(
         self, planner: Any, cases: Any, attempts: Sequence[Attempt] | None = None
     ) -> tuple[Any, Any]:
@@ -311,6 +318,13 @@ class Decision(Protocol):
 
 
 Tree = TypeVar("Tree")
+
+
+def out_of_time(plans: PlanT, left: Any) -> PlanT:
+    """The plans, with the status `OUT_OF_TIME` where one is left unsolved."""
+    xp: Any = jnp if isinstance(plans.status, jax.Array) else np
+    status = xp.where(left, Status.OUT_OF_TIME, plans.status).astype(np.int32)
+    return dataclasses.replace(plans, status=status)  # type: ignore[type-var]
 
 
 def lane(tree: Tree, k: Any) -> Tree:

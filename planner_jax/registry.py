@@ -18,6 +18,7 @@ import pkgutil
 import warnings
 from collections.abc import Callable, Collection, Mapping
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 _GROUP = "planner_jax"
@@ -32,6 +33,13 @@ class UnknownName(ValueError):
 
 class MissingExtra(ModuleNotFoundError):
     """A planner needs a package that is not installed; one line that says how to install it."""
+
+
+def install_line(extra: str) -> str:
+    """What installs the packages of an extra: into a checkout, or beside an installed wheel."""
+    if (Path(__file__).parents[1] / "pyproject.toml").is_file():
+        return f"pip install -c constraints.txt -e '.[{extra}]'"
+    return f"pip install 'planner-jax[{extra}]'"
 
 
 @dataclasses.dataclass(frozen=True)

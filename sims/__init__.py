@@ -2,7 +2,8 @@
 
 import importlib.util
 
+from planner_jax.registry import install_line
 from planner_jax.sweep.settings import SettingError
 
 if not all(importlib.util.find_spec(name) for name in ("mujoco", "mujoco.mjx")):
-    raise SettingError("flights need MuJoCo and MJX: pip install 'planner-jax[sims]'")
+    raise SettingError(f"flights need MuJoCo and MJX: {install_line('sims')}")

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from planner_jax.registry import install_line
 from planner_jax.sims.film import BALL_COLOURS
 from planner_jax.sims.guard import guarded
 from planner_jax.sims.recording import Recording, frame
@@ -72,9 +73,7 @@ def _viser() -> Any:
     try:
         return importlib.import_module("viser")
     except ModuleNotFoundError:
-        raise SettingError(
-            "the viewer needs the package viser: pip install 'planner-jax[view]'"
-        ) from None
+        raise SettingError(f"the viewer needs the package viser: {install_line('view')}") from None
 
 
 class Viewer:

@@ -32,15 +32,30 @@ class Gentle:
 
 
 def having(
-    cases, centre=FAR, radius: Any = 1.0, disliked=FAR, weight=0.0, acceleration: Any = 99.0
+    cases,
+    centre=FAR,
+    radius: Any = 1.0,
+    disliked=FAR,
+    weight=0.0,
+    acceleration: Any = 99.0,
+    low=FAR,
+    size: Any = 1.0,
+    point=-FAR,
+    normal=(0.0, 0.0, 1.0),
 ):
-    """Cases with three extras, which change nothing unless told: all of one compiled program."""
+    """Cases with five extras, which change nothing unless told: all of one compiled program."""
     batch = cases.batch_shape
     full = lambda value: np.broadcast_to(np.asarray(value, np.float32), batch)  # noqa: E731
+
+    def vectors(value):
+        return np.broadcast_to(np.asarray(value, np.float32), (NUM, 3))[: batch[0]]
+
     zones = (
-        pj.KeepOut(np.asarray(centre[: batch[0]], np.float32), full(radius)),
-        pj.Dislike(np.asarray(disliked[: batch[0]], np.float32), full(0.4), full(weight)),
+        pj.KeepOut(vectors(centre), full(radius)),
+        pj.Dislike(vectors(disliked), full(0.4), full(weight)),
         Gentle(full(acceleration)),
+        pj.KeepOutBox(vectors(low), vectors(low + size)),
+        pj.Plane(vectors(point), vectors(normal)),
     )
     return cases.replace(extras=zones)
 
@@ -93,6 +108,12 @@ def test_excess_and_cost_have_their_closed_forms():
     vel = np.array([[3.0, 0.0, 4.0], [0.0, 5.0, 0.0], [0.0, 0.0, 5.0]])
     found = pj.KeepOut(AT, 2.0).excess(pos, vel, vel)
     np.testing.assert_allclose(found, [0.75, -1.5, -0.125], atol=1e-9)
+    # Half a metre outside, half way in, and on a face; the shortest side is of 4 m.
+    box = pj.KeepOutBox(np.array([-2.0, -2.0, 0.0]), np.array([2.0, 3.0, 4.0]))
+    where = np.array([[0.0, 3.5, 2.0], [1.0, 0.5, 2.0], [0.0, 0.5, 0.0]])
+    np.testing.assert_allclose(box.excess(where, vel, vel), [-0.25, 0.5, 0.0], atol=1e-12)
+    wall = pj.Plane(np.array([0.0, 2.0, 7.0]), np.array([0.0, -3.0, 0.0]))
+    np.testing.assert_allclose(wall.excess(pos, vel, vel), [-2.0, 1.0, -2.0], atol=1e-12)
     found = pj.Geofence(np.array([-1.0, -1.0, 0.0]), np.full(3, 3.5)).excess(pos, vel, vel)
     np.testing.assert_allclose(found, [0.0, 0.5, -1.0], atol=1e-12)
     # Inside, beyond 1.25 radii, and half way between, where u = 1/2 and the limit is twice as high.
@@ -106,6 +127,8 @@ def test_excess_and_cost_have_their_closed_forms():
     [
         pj.KeepOut(AT, 2.0),
         pj.Geofence(AT - 1.0, AT + 0.5),
+        pj.KeepOutBox(AT - 1.0, AT + np.array([0.5, 2.0, 0.9])),
+        pj.Plane(AT + 0.1, np.array([1.0, -2.0, 0.5])),
         pj.SpeedZone(AT, 0.8, 2.0),
         pj.Dislike(AT, 2.0, 1.0),
     ],
@@ -192,6 +215,35 @@ def test_another_value_compiles_nothing_anew(hits, around):
     assert TRACES.count(False) == traced
 
 
+def test_boxes_and_planes_are_planned_around_and_judged(hits, free, middle):
+    """Boxes that reach 3 cm over the middle of two ways; planes across the two others."""
+    sides = np.array([0.5, 0.4, 0.6])
+    reach = sides * [0.5, 1.0, 0.5] - [0.0, 0.03, 0.0]
+    low = np.where(np.arange(NUM)[:, None] < 2, middle - reach, FAR)
+    first, last = (np.array([way(free, k)[place] for k in range(NUM)]) for place in (0, -1))
+    across = np.cross(last - first, [0.0, 0.0, 1.0])
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    # Of a straight line from start to end, the side on which the middle of the way is not.
+    side = np.sign(((middle - first) * across).sum(1, keepdims=True))
+    depth = np.abs(((middle - first) * across).sum(1, keepdims=True))
+    point = np.where(np.arange(NUM)[:, None] < 2, -FAR, first + 0.5 * depth * side * across)
+    normal = np.where(np.arange(NUM)[:, None] < 2, [0.0, 0.0, 1.0], -2.0 * side * across)
+    cases = having(hits, low=low, size=sides, point=point, normal=normal)
+    verdict = pj.hit.judge(cases, free)
+    assert (verdict.failed_limit == "extra").all() and list(verdict.worst_extra) == [3, 3, 4, 4]
+    verdict = pj.hit.judge(cases, pj.plan(HIT, cases))
+    assert verdict.success.all(), [verdict.sentence(k) for k in range(NUM)]
+
+
+def test_a_box_inside_out_and_a_plane_without_a_direction_are_refused(hits):
+    for changed, words in (
+        (dict(size=np.array([1.0, -1.0, 1.0])), r"extras.3.low must be < extras.3.high|low must"),
+        (dict(normal=(0.0, 0.0, 0.0)), "extras.4.normal must be other than zero, got 0 in lane 0"),
+    ):
+        with pytest.raises(pj.CaseError, match=words):
+            pj.require_sound(having(hits, **changed))
+
+
 def test_a_class_of_ones_own_is_planned_with_and_judged(hits, free):
     samples = pj.lane(free, 0).sample(200.0)
     taken = np.linalg.norm(samples.acc[:, :2], axis=1).max()
@@ -252,5 +304,5 @@ def test_the_gradient_by_a_radius_is_that_of_plans_made_anew(hits, float64):
 
 
 def test_a_place_in_the_extras_that_is_not_there_is_named(blocked):
-    with pytest.raises(ValueError, match=r"'extras.3.radius': tuple has 0, 1, 2"):
-        pj.gradient(HIT, blocked, of="cost", by="extras.3.radius")
+    with pytest.raises(ValueError, match=r"'extras.5.radius': tuple has 0, 1, 2, 3, 4"):
+        pj.gradient(HIT, blocked, of="cost", by="extras.5.radius")

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import planner_jax as pj
+from planner_jax import registry
 from planner_jax.registry import Task, UnknownName, all_tasks, task_named
 from planner_jax.task.catch.suites import draw as draw_catches
 
@@ -214,3 +215,11 @@ def test_names_are_listed_without_jax():
         "sys.exit('jax' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_a_missing_extra_is_installed_from_the_checkout_or_else_from_the_index(
+    monkeypatch, tmp_path
+):
+    assert registry.install_line("view") == "pip install -c constraints.txt -e '.[view]'"
+    monkeypatch.setattr(registry, "__file__", str(tmp_path / "planner_jax" / "registry.py"))
+    assert registry.install_line("view") == "pip install 'planner-jax[view]'"

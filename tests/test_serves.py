@@ -443,6 +443,25 @@ def test_a_setting_out_of_range_is_named(setting, says):
     assert str(caught.value) == says
 
 
+@pytest.mark.parametrize(
+    "change, error, says",
+    [
+        ({"serve_pos": np.ones(2)}, ValueError, "serve_pos must have a shape that ends with (3,)"),
+        ({"serve_vel": np.ones(2)}, ValueError, "serve_vel must have the shape (3,), got (2,)"),
+        ({"drag": np.ones(4)}, ValueError, "drag must have the shape (), got (4,)"),
+        ({"serve_pos": [2.0, 0.0, -1.0]}, CaseError, "serve_pos must be at a height >= 0 m"),
+        ({"dtype": np.float64}, TypeError, "dtype must be float32 unless jax_enable_x64 is set"),
+        ({"extras": pj.KeepOut(0.0, 1.0)}, TypeError, "extras must be a sequence, such as"),
+        ({"extras": (3,)}, TypeError, "extras must have a method excess or cost, got 3"),
+    ],
+)
+def test_a_malformed_argument_is_named_in_one_line(change, error, says):
+    given = dict(zip(("serve_pos", "serve_vel", "target"), SERVE, strict=True))
+    with pytest.raises(error) as caught:
+        pj.hit.case(**given | change)
+    assert str(caught.value).startswith(says) and "\n" not in str(caught.value)
+
+
 def test_the_first_bad_lane_is_named_and_the_others_counted():
     batch = [np.tile(part, (6, 1)) for part in SERVE]
     with pytest.raises(
@@ -457,5 +476,5 @@ def test_the_first_bad_lane_is_named_and_the_others_counted():
     with pytest.raises(CaseError, match="^ball.pos must be finite, got nan in lane 1$"):
         check_cases(pj.hit.case(*batch))
     batch[0][1] = [2.0, 0.0, -1.0]
-    with pytest.raises(CaseError, match="^height of ball.pos must be > 0, got -1 in lane 1$"):
+    with pytest.raises(CaseError, match="^serve_pos must be at a height >= 0 m, got -1 in lane 1$"):
         check_cases(pj.hit.case(*batch))

@@ -15,6 +15,7 @@ import pytest
 
 from planner_jax.ball.flight import BallState
 from planner_jax.cli import main
+from planner_jax.registry import install_line
 from planner_jax.sims import view
 from planner_jax.sims.loop import Flown, Record
 from planner_jax.sims.model import BALL_RADIUS
@@ -221,7 +222,7 @@ def test_a_folder_without_flights_is_refused_in_one_line(run_folder, tmp_path, c
 
 def test_a_missing_viser_is_named_with_its_remedy(run_folder, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    expected = "the viewer needs the package viser: pip install 'planner-jax[view]'\n"
+    expected = f"the viewer needs the package viser: {install_line('view')}\n"
     assert said(capsys, run_folder.path) == expected
 
 

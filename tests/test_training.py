@@ -17,6 +17,7 @@ from planner_jax.policies.networks import NETWORKS, Mlp
 from planner_jax.policies.observation import FEATURES
 from planner_jax.policies.policy import Policy
 from planner_jax.policies.progress import FILE, read_rows, to_text
+from planner_jax.registry import install_line
 from planner_jax.sweep.plain_json import sealed
 from planner_jax.sweep.settings import SettingError
 from planner_jax.task.catch.estimate import shortfall
@@ -177,7 +178,7 @@ def test_a_training_without_brax_names_the_extra(capsys, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "brax", None)
     assert main(["train", "--out", str(tmp_path / "run")]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert "train needs brax" in line and "pip install 'planner-jax[policies]'" in line
+    assert "train needs brax" in line and install_line("policies") in line
     assert not (tmp_path / "run").exists()
 
 

@@ -1,11 +1,13 @@
 """Paths of targets: anything that says where it is, and how fast, at a time.
 
-A target path is a pytree with a method `at(time) -> BallState`, differentiable in time and in
-every leaf. The ones here cover the papers' targets; a user's own class serves as well.
+A target path is a pytree with a method `at(time)`, differentiable in time and in every leaf, that
+gives a `BallState`, or the position alone. The ones here cover the papers' targets; a user's own
+class serves as well.
 """
 
-from typing import ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
 
+import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array
@@ -17,9 +19,21 @@ from planner_jax.rules import NOT_NEGATIVE, Field, Table
 class TargetPath(Protocol):
     """What a planner needs to know about a target."""
 
-    def at(self, time: Array) -> BallState:
-        """Position [m] and velocity [m/s] at one time () [s]."""
+    def at(self, time: Array) -> BallState | Array:
+        """Position (3,) [m], or position and velocity [m/s], at one time () [s]."""
         ...
+
+
+def state_at(path: TargetPath, time: Array) -> BallState:
+    """Position and velocity of a target at one time () [s].
+
+    Where its class says only the position, the velocity is the derivative by the time.
+    """
+    state: Any = path.at(time)
+    if hasattr(state, "vel"):
+        return state
+    pos, vel = jax.jvp(path.at, (time,), (jnp.ones_like(time),))
+    return BallState(pos=pos, vel=vel)
 
 
 @struct.dataclass

@@ -16,7 +16,7 @@ from flax import struct
 from jax import Array
 
 from planner_jax.checks import told
-from planner_jax.rules import NOT_NEGATIVE, POSITIVE, Field, Table, below
+from planner_jax.rules import NOT_NEGATIVE, NOT_ZERO, POSITIVE, Field, Table, below
 from planner_jax.trajectory.polynomial import Motion
 
 
@@ -56,6 +56,35 @@ class KeepOut:
     def excess(self, pos: Any, vel: Any, acc: Any) -> Any:
         """Depth over radius."""
         return 1.0 - _size(pos - self.centre) / self.radius
+
+
+@struct.dataclass
+class KeepOutBox:
+    """A box along the world's axes that may not be entered, its sides finite."""
+
+    rules: ClassVar[Table] = (Field("low", None, below("high")),)
+
+    low: Any  # (3,) [m]
+    high: Any  # (3,) [m]
+
+    def excess(self, pos: Any, vel: Any, acc: Any) -> Any:
+        """Depth under the nearest face, over half of the shortest side."""
+        half = 0.5 * (self.high - self.low)
+        return (half - abs(pos - self.low - half)).min(-1) / half.min(-1)
+
+
+@struct.dataclass
+class Plane:
+    """A plane of which only the side that its normal points to may be used: a wall, a ceiling."""
+
+    rules: ClassVar[Table] = (Field("normal", None, NOT_ZERO),)
+
+    point: Any  # (3,) [m], anywhere on the plane
+    normal: Any  # (3,), of any length
+
+    def excess(self, pos: Any, vel: Any, acc: Any) -> Any:
+        """Metres beyond the plane."""
+        return ((self.point - pos) * self.normal).sum(-1) / (self.normal**2).sum(-1) ** 0.5
 
 
 @struct.dataclass
@@ -118,11 +147,14 @@ def for_batch(extras: Sequence[Extra], batch: tuple[int, ...], dtype: Any) -> tu
     """Extras whose leaves have a dtype and the axes of a batch, () or (B,), in front.
 
     Raises:
-        TypeError: they are no sequence.
+        TypeError: they are no sequence, or one of them is no extra.
         ValueError: an extra is not for one case, and not all of its leaves have these axes.
     """
     if not isinstance(extras, Sequence) or isinstance(extras, str):
         raise TypeError(f"extras must be a sequence of limits and costs, got {told(extras)}")
+    for extra in extras:
+        if not isinstance(extra, ExtraLimit | ExtraCost):
+            raise TypeError(f"extras must have a method excess or cost, got {told(extra)}")
 
     def spread(extra: Any) -> Any:
         extra = jax.tree.map(np.asarray, extra, is_leaf=lambda x: isinstance(x, tuple | list))

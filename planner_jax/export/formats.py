@@ -9,7 +9,7 @@ import pkgutil
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from planner_jax.registry import MissingExtra, UnknownName, require_name
+from planner_jax.registry import MissingExtra, UnknownName, install_line, require_name
 
 EXTRA = "export"
 
@@ -91,5 +91,5 @@ def required(place: str, purpose: str) -> Any:
         return pkgutil.resolve_name(place)
     except ModuleNotFoundError as error:
         raise MissingExtra(
-            f"{purpose} needs {error.name}: pip install 'planner-jax[{EXTRA}]'", name=error.name
+            f"{purpose} needs {error.name}: {install_line(EXTRA)}", name=error.name
         ) from None

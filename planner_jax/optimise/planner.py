@@ -12,6 +12,10 @@ from planner_jax.optimise.multistart import solve_batch, solve_round
 from planner_jax.optimise.problem import Round, Settings
 
 _LONG = LbfgsConfig(max_steps=300, tolerance=1e-7, patience=6)
+# Of the first round, by effort.
+_GOOD = LbfgsConfig(max_steps=200, tolerance=1e-6, patience=5)
+_BEST = LbfgsConfig(max_steps=1000, memory=12, tolerance=1e-7, patience=6)
+_EFFORTS = {"good": _GOOD, "best": _BEST}
 
 
 def pending(violation: Array) -> dict[str, Any]:
@@ -79,3 +83,14 @@ class OptimisedPlanner(abc.ABC):
     def with_solver(self, solver: LbfgsConfig = _LONG) -> Self:
         """The planner with one search from the first guess instead of its rounds, a long one."""
         return self.changed((("rounds", (Round(solver=solver),)),))
+
+    def with_effort(self, effort: str) -> Self:
+        """The planner with another first round, which searches on after every limit holds.
+
+        Args:
+            effort: "good" for up to 200 iterations, "best" for up to 1,000. The rounds behind it,
+                for what it leaves unsolved, stay as they are.
+        """
+        first, *others = self.rounds
+        longer = dataclasses.replace(first, solver=_EFFORTS[effort])
+        return self.changed((("rounds", (longer, *others)),))

@@ -19,6 +19,7 @@ from jax import Array, lax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec, Sharding, SingleDeviceSharding
 
 from planner_jax.planning.one_by_one import OneByOne
+from planner_jax.planning.watch import Watch
 from planner_jax.protocol import (
     Attempt,
     HostPlanner,
@@ -27,6 +28,7 @@ from planner_jax.protocol import (
     is_solved,
     is_unsolved,
     marked,
+    out_of_time,
 )
 from planner_jax.rules import require_shapes
 
@@ -71,6 +73,7 @@ def plan_batch(
     cases: Any,
     chunk: int | None,
     devices: Sequence[Any] | None,
+    watch: Watch,
 ) -> tuple[Any, Any]:
     """Attempts at B cases, each at the lanes that are still unsolved.
 
@@ -80,6 +83,7 @@ def plan_batch(
         cases: a leading axis of B on every leaf.
         chunk: lanes a device solves in one call; None for what suits it.
         devices: that share the work; None for all local ones.
+        watch: after whose end no attempt but the first is begun.
 
     Returns:
         plans: with NumPy leaves, or where all leaves of the cases are jax arrays, with
@@ -95,8 +99,8 @@ def plan_batch(
     # One CPU's memory is the host's: there a thread for each core plans chunks, and they are cut
     # and joined without programs, which would be compiled for every new size.
     if resident and (in_one_call or not _is_one_cpu(mesh)):
-        return _plan_resident(planner, attempts, cases, chunk, mesh)
-    plans, unsolved = _plan_from_host(planner, attempts, cases, chunk, mesh)
+        return _plan_resident(planner, attempts, cases, chunk, mesh, watch)
+    plans, unsolved = _plan_from_host(planner, attempts, cases, chunk, mesh, watch)
     return (jax.device_put(plans, _sharding(mesh)) if resident else plans), unsolved
 
 
@@ -116,15 +120,22 @@ def solve_cases(planner: Any, cases: Any, attempt: Attempt) -> Any:
     return marked(plans, cases)
 
 
-def plan_on_host(planner: HostPlanner, attempts: Sequence[Attempt], cases: Any) -> tuple[Any, int]:
+def plan_on_host(
+    planner: HostPlanner, attempts: Sequence[Attempt], cases: Any, watch: Watch
+) -> tuple[Any, int]:
     """As `plan_batch`, by a planner that works on the host; NumPy leaves. One case will do, too."""
     alone = cases.batch_shape == ()
     cases = jax.tree.map(lambda leaf: np.asarray(leaf)[None] if alone else np.asarray(leaf), cases)
     plans, lanes = None, np.arange(_length(cases))
     for attempt in attempts:
+        if plans is not None and watch.is_over:
+            plans = out_of_time(plans, is_unsolved(plans.status))
+            break
+        watch.tell(planner, attempt, 0, lanes.size)
         some = jax.tree.map(lambda leaf, lanes=lanes: leaf[lanes], cases)
         later = marked(planner.solve_on_host(some, attempt), some)
         plans = jax.tree.map(np.array, later) if plans is None else merged(plans, later, lanes)
+        watch.tell(planner, attempt, lanes.size, lanes.size)
         lanes = np.flatnonzero(is_unsolved(plans.status))
         if lanes.size == 0:
             break
@@ -132,15 +143,24 @@ def plan_on_host(planner: HostPlanner, attempts: Sequence[Attempt], cases: Any) 
 
 
 def _plan_from_host(
-    planner: Any, attempts: Sequence[Attempt], cases: Any, chunk: int | None, mesh: Mesh
+    planner: Any,
+    attempts: Sequence[Attempt],
+    cases: Any,
+    chunk: int | None,
+    mesh: Mesh,
+    watch: Watch,
 ) -> tuple[Any, int]:
     """As `plan_batch`, of cases in NumPy arrays."""
     cases = jax.tree.map(np.asarray, cases)
     lanes = np.arange(_length(cases))
     plans: Any = None
     for attempt in attempts:
+        if plans is not None and watch.is_over:
+            plans = out_of_time(plans, is_unsolved(plans.status))
+            break
         calls = _calls(lanes, _sizes(planner, attempt, chunk, mesh), mesh)
-        found = _solved_from_host(planner, attempt, cases, [call for call, _ in calls], mesh)
+        may_end = plans is not None
+        found = _solved_from_host(planner, attempt, cases, calls, mesh, watch, may_end)
         if plans is None:
             trimmed = [
                 jax.tree.map(lambda leaf, n=num: np.asarray(leaf)[:n], part)
@@ -148,8 +168,14 @@ def _plan_from_host(
             ]
             plans = jax.tree.map(lambda *leaves: np.concatenate(leaves), *trimmed)
         else:
+            untried = np.zeros(len(plans.status), bool)
             for (call, num), later in zip(calls, found, strict=True):
-                plans = merged(plans, later, call[:num])
+                if later is None:
+                    untried[call[:num]] = True
+                else:
+                    plans = merged(plans, later, call[:num])
+            if untried.any():
+                plans = out_of_time(plans, untried)
         lanes = np.flatnonzero(is_unsolved(plans.status))
         if lanes.size == 0:
             break
@@ -157,7 +183,12 @@ def _plan_from_host(
 
 
 def _plan_resident(
-    planner: Any, attempts: Sequence[Attempt], cases: Any, chunk: int | None, mesh: Mesh
+    planner: Any,
+    attempts: Sequence[Attempt],
+    cases: Any,
+    chunk: int | None,
+    mesh: Mesh,
+    watch: Watch,
 ) -> tuple[Any, Array]:
     """As `plan_batch`, of cases in jax arrays; only how many are unsolved comes to the host.
 
@@ -169,12 +200,17 @@ def _plan_resident(
     cases = _placed(cases, mesh)
     first, *others = attempts
     sizes = _sizes(planner, first, chunk, mesh)
+    watch.tell(planner, first, 0, num)
     plans, unsolved = _first_plans(planner, first, cases, sizes, mesh)
     for attempt in others:
         unsolved.copy_to_host_async()  # on its way as soon as it is known
         most = np.asarray(unsolved).max()  # of the devices
         if most == 0:
             break
+        if watch.is_over:
+            plans = out_of_time(plans, is_unsolved(plans.status))
+            break
+        watch.tell(planner, attempt, 0, np.asarray(unsolved).sum())
         sizes, before = _sizes(planner, attempt, chunk, mesh), plans.status
         for begin, size in sizes.cuts(most):
             part, lanes = _cut_unsolved(mesh, size, cases, before, _number(mesh, begin))
@@ -277,28 +313,64 @@ def _placed(tree: Any, mesh: Mesh) -> Any:
 
 
 def _solved_from_host(
-    planner: Any, attempt: Attempt, cases: Any, calls: list[np.ndarray], mesh: Mesh
+    planner: Any,
+    attempt: Attempt,
+    cases: Any,
+    calls: list[tuple[np.ndarray, int]],
+    mesh: Mesh,
+    watch: Watch,
+    may_end: bool,
 ) -> list[Any]:
-    """One attempt at the lanes of every call; on one CPU device with a thread for each core.
+    """One attempt at the lanes of every call.
+
+    Where it may end early, there is None for the calls that were not begun in time.
+    """
+    found, tried, cases_left = [], 0, sum(num for _, num in calls)
+    watch.tell(planner, attempt, tried, cases_left)
+    each = _each_from_host(planner, attempt, cases, calls, mesh, watch, may_end)
+    for one, (_, num) in zip(each, calls, strict=True):
+        found.append(one)
+        if one is not None:
+            tried += num
+            watch.tell(planner, attempt, tried, cases_left)
+    return found
+
+
+def _each_from_host(
+    planner: Any,
+    attempt: Attempt,
+    cases: Any,
+    calls: list[tuple[np.ndarray, int]],
+    mesh: Mesh,
+    watch: Watch,
+    may_end: bool,
+) -> Iterator[Any]:
+    """As `_solved_from_host`, call by call; on one CPU device with a thread for each core.
 
     One thread more hands over the next call while the others compute.
     """
     threads = min(len(calls), (os.cpu_count() or 1) + 1) if _is_one_cpu(mesh) else 1
     placed = _sharding(mesh)
 
-    def solve(lanes: np.ndarray) -> Any:
+    def solve(call: tuple[np.ndarray, int]) -> Any:
+        if may_end and watch.is_over:
+            return None
+        lanes, _ = call
         part = jax.device_put(jax.tree.map(lambda leaf: leaf[lanes], cases), placed)
         found, _ = _solve(planner, attempt, mesh, part)
-        return jax.block_until_ready(found) if threads > 1 else found
+        return jax.block_until_ready(found) if threads > 1 or watch.waits else found
 
     if threads == 1:  # calls return before they are done, so that the next is under way
-        return [solve(lanes) for lanes in calls]
+        yield from map(solve, calls) if watch.waits else [solve(call) for call in calls]
+        return
     # A first call compiles, once for all threads; what is compiled is found by all.
-    program = _program(planner, attempt, calls[0].size, cases)
+    program = _program(planner, attempt, calls[0][0].size, cases)
     alone = [] if program in _COMPILED else [solve(calls[0])]
     _COMPILED.add(program)
     with ThreadPoolExecutor(threads) as pool:
-        return [*alone, *pool.map(solve, calls[len(alone) :])]
+        later = pool.map(solve, calls[len(alone) :])
+        yield from alone
+        yield from later
 
 
 _COMPILED: set[Hashable] = set()  # what `_program` names of the programs that threads have called

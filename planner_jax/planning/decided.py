@@ -11,7 +11,16 @@ from jax.core import Tracer
 
 from planner_jax.planning.batch import better_of, merged
 from planner_jax.planning.packed import call_packed
-from planner_jax.protocol import Attempt, Case, Decision, Drive, Plan, is_solved, is_unsolved
+from planner_jax.protocol import (
+    Attempt,
+    Case,
+    Decision,
+    Drive,
+    Plan,
+    is_solved,
+    is_unsolved,
+    out_of_time,
+)
 
 CaseT = TypeVar("CaseT", bound=Case)
 PlanT = TypeVar("PlanT", bound=Plan)
@@ -111,6 +120,8 @@ class DecidedPlanner(Generic[CaseT, PlanT]):
         lanes = np.flatnonzero(left)
         if not lanes.size:
             return plans
+        if drive.is_over:
+            return out_of_time(plans, left)
         some = jax.tree.map(lambda leaf: leaf[lanes], cases)
         return merged(plans, drive(self.planner, some, [attempt])[0], lanes)
 

@@ -1,7 +1,7 @@
 """`plan`: one call for one case or a million, on one device or all of them; and `solve`, pure."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import jax
@@ -14,6 +14,7 @@ from jax.experimental import multihost_utils
 from planner_jax.checks import require_size
 from planner_jax.planning.batch import better_of, plan_batch, plan_on_host, solve_cases
 from planner_jax.planning.single import plan_single
+from planner_jax.planning.watch import Progress, Watch
 from planner_jax.protocol import AnyPlanner, Attempt, Case, Plan, Status, is_unsolved
 from planner_jax.rules import require_shapes, require_sound
 
@@ -27,6 +28,8 @@ def plan(
     *,
     chunk: int | None = None,
     devices: Sequence[Any] | None = None,
+    time_limit: float | None = None,
+    progress: Callable[[Progress], Any] | None = None,
 ) -> PlanT:
     """Plan one case, or a batch of them with a leading axis on every leaf.
 
@@ -36,6 +39,11 @@ def plan(
         cases: a pytree; a batch has one more axis than a single case.
         chunk: cases that a device solves in one compiled call. The default suits the device.
         devices: that share a batch. By default all local ones, `jax.local_devices()`.
+        time_limit: [s], compiling included, after which nothing more is begun but the first
+            attempt; what is under way is finished. A case that is unsolved and has not been through
+            all attempts by then has the status `OUT_OF_TIME`, others the bits that they would have.
+        progress: told of every attempt as it begins, as chunks of it are done, and as it ends; as
+            `print`, which writes a line of a `Progress`.
 
     Returns:
         The planner's plans with the batch shape of the cases. The leaves are NumPy arrays;
@@ -52,11 +60,15 @@ def plan(
             one line with the field, the rule, the value and the first lane. In jax arrays such a
             lane has the status `BAD_INPUT` instead, and inside of compiled functions, too.
         ValueError: the leaves have not one batch axis or none, or of different lengths or other
-            shapes, the batch is empty, `chunk` < 1, or the `devices` are none or not different.
+            shapes, the batch is empty, `chunk` < 1, the `devices` are none or not different, or
+            the `time_limit` is negative.
         TypeError: the cases are of another task than the planner, or their numbers of another
             kind; or within a transformation of JAX that the planner does not allow, see `solve`.
     """
+    watch = Watch(time_limit, progress)
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((planner, cases))):
+        if watch.waits:
+            raise TypeError("time_limit and progress must be left out inside of compiled functions")
         return solve(planner, cases)
     require_fit(planner, cases)
     if chunk is not None or devices is not None:
@@ -65,12 +77,12 @@ def plan(
     any_planner: Any = planner
     alone = cases.batch_shape == ()
     if alone and hasattr(any_planner, "solve"):
-        return _named_if_bad(plan_single(any_planner, any_planner.attempts, cases), cases)
+        return _named_if_bad(plan_single(any_planner, any_planner.attempts, cases, watch), cases)
     if not alone:
         require_batch(cases)
     if not _is_resident(cases) and not alone:
         require_sound(cases)
-    drive = _Drive(chunk, devices)
+    drive = _Drive(chunk, devices, watch)
     if hasattr(any_planner, "plan_by"):
         plans = any_planner.plan_by(drive, cases)
     else:
@@ -130,7 +142,13 @@ class _Drive:
 
     chunk: int | None
     devices: Sequence[Any] | None
+    watch: Watch
     is_pure = False
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the caller's time has passed."""
+        return self.watch.is_over
 
     def __call__(
         self, planner: Any, cases: Any, attempts: Sequence[Attempt] | None = None
@@ -141,11 +159,11 @@ class _Drive:
             return plans, is_unsolved(plans.status)
         tried: Sequence[Attempt] = attempts or planner.attempts
         if hasattr(planner, "solve_on_host"):
-            return plan_on_host(planner, tried, cases)
+            return plan_on_host(planner, tried, cases, self.watch)
         if cases.batch_shape == ():
-            one = plan_single(planner, tried, cases)
+            one = plan_single(planner, tried, cases, self.watch)
             return one, is_unsolved(one.status)
-        return plan_batch(planner, tried, cases, self.chunk, self.devices)
+        return plan_batch(planner, tried, cases, self.chunk, self.devices, self.watch)
 
 
 def solve(planner: AnyPlanner[CaseT, PlanT], cases: CaseT) -> PlanT:
@@ -191,6 +209,7 @@ class _DrivePurely:
     """Carries out planners inside a compiled function."""
 
     is_pure = True
+    is_over = False
 
     def __call__(
         self, planner: Any, cases: Any, attempts: Sequence[Attempt] | None = None

@@ -26,7 +26,7 @@ import pyarrow as pa
 
 from planner_jax import stopping
 from planner_jax.compile_cache import keep_compiled_programs
-from planner_jax.registry import MissingExtra, Task
+from planner_jax.registry import MissingExtra, Task, install_line
 from planner_jax.sweep.chunks import Maker, Making, SweepRun, Workers
 from planner_jax.sweep.environment import environment
 from planner_jax.sweep.identity import differences, settings_digest
@@ -75,7 +75,7 @@ def workers_of(kind: str | None) -> Iterator[Workers | None]:
         import ray
     except ModuleNotFoundError as error:
         raise MissingExtra(
-            f"workers needs {error.name}: pip install 'planner-jax[cluster]'", name=error.name
+            f"workers needs {error.name}: {install_line('cluster')}", name=error.name
         ) from None
     with tempfile.TemporaryDirectory(
         prefix="ray-", dir="/tmp", ignore_cleanup_errors=True

@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Self, TypeVar
 
 from planner_jax.memory import require_disk
 from planner_jax.registry import Task, UnknownName, require_name
+from planner_jax.task.efforts import EFFORTS
 from planner_jax.task.scales import scale_problem
 
 SCHEME = "s3://"  # of addresses in object stores
@@ -151,6 +152,19 @@ def require_scale(value: float) -> None:
     """Raise `SettingError` unless the argument `limit_scale` leaves limits of a machine."""
     if problem := scale_problem(value):
         raise SettingError(problem)
+
+
+def require_effort(value: str, planner: str | None, without: str) -> None:
+    """Raise `SettingError` unless the argument `effort` is one, and of a planner that has it.
+
+    Args:
+        value: of the argument.
+        planner: the sweep's.
+        without: the task's planner that minimises nothing.
+    """
+    require_one_of(EFFORTS, "effort", value)
+    rule = f"left out for the planner {without}, which minimises nothing"
+    require(value == EFFORTS[0] or planner != without, "effort", rule, value)
 
 
 def require_one_of(names: Iterable[str], name: str, value: str) -> None:

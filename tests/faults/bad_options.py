@@ -41,6 +41,7 @@ def _rows() -> list:
         scales = ("0", "-1", "1e-300", "1e300", "nan", "inf")
         rows += _of(f"sweep {task}", "--limit-scale", scales, "from 0.001 to 1000")
         rows += _of(f"sweep {task}", "--limit-scale", NOT_NUMBERS)
+        rows += _of(f"sweep {task}", "--effort", ("", "Best", "more"), "must be one of feasible")
         rows += _of(f"fly {task}", "--noise", ("x", ""))
         rows += _of(f"fly {task}", "--drag-error", ("nan", "1", "-0.1", "x"))
     rows += _of("sweep hit", "--delay", ("nan", "inf", "-1", "1e300", "3", *NOT_NUMBERS))

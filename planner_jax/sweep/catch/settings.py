@@ -11,10 +11,12 @@ from planner_jax.sweep.settings import (
     SweepSettings,
     option,
     require,
+    require_effort,
     require_one_of,
     require_scale,
 )
 from planner_jax.task.catch.card import DECISIONS, SUITES, TRAINED
+from planner_jax.task.efforts import EFFORTS
 
 NET_TESTS = ("plane", "ball")  # of `referee_catches`
 
@@ -40,9 +42,10 @@ class CatchSettings(SweepSettings):
     )
 
     robot: Any = robot_option("paper-catcher")
+    effort: str = option("feasible", "NAME", f"of the planner: {', '.join(EFFORTS)}")
 
     RUN: ClassVar[str] = "planner_jax.sweep.catch.sweep:CatchSweep"
-    PLANNER: ClassVar[tuple[str, ...]] = ("decide",)
+    PLANNER: ClassVar[tuple[str, ...]] = ("decide", "effort")
     DRAW: ClassVar[tuple[str, ...]] = ("limit_scale", "robot")
     JUDGE: ClassVar[tuple[str, ...]] = ("tolerance", "net_test")
     GPU_BATCH: ClassVar[int] = 8192  # all orders of six targets at once: 1 MB a case
@@ -52,6 +55,7 @@ class CatchSettings(SweepSettings):
         tolerance = self.tolerance
         require_scale(self.limit_scale)
         object.__setattr__(self, "robot", checked_robot(self.robot, "net"))
+        require_effort(self.effort, self.planner, "mpp")
         try:
             split_name(DECISIONS, "decide", self.decide, TRAINED)
         except UnknownName as error:

@@ -12,8 +12,10 @@ from planner_jax.sweep.settings import (
     SweepSettings,
     option,
     require,
+    require_effort,
     require_scale,
 )
+from planner_jax.task.efforts import EFFORTS
 from planner_jax.task.hit.card import START
 
 _FARTHEST = 1e6  # [m]
@@ -38,6 +40,7 @@ class HitSettings(SweepSettings):
     )
 
     robot: Any = robot_option("paper-hitter")
+    effort: str = option("feasible", "NAME", f"of the planner: {', '.join(EFFORTS)}")
 
     RUN: ClassVar[str] = "planner_jax.sweep.hit.sweep:HitSweep"
     DRAW: ClassVar[tuple[str, ...]] = ("start", "delay", "limit_scale", "robot")
@@ -50,6 +53,7 @@ class HitSettings(SweepSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_scale(self.limit_scale)
+        require_effort(self.effort, self.planner, "juggle")
         require(0.0 <= self.delay < math.inf, "delay", "finite and >= 0", self.delay)
         truer = not self.drag_after_impact or self.planner in (None, "exact")
         require(truer, "drag_after_impact", "left out unless the planner is exact", self.planner)
@@ -60,7 +64,8 @@ class HitSettings(SweepSettings):
 
     def planner_options(self) -> dict[str, Any]:
         """Fields of the planner's dataclass that these settings decide."""
-        return {"drag_after_impact": True} if self.drag_after_impact else {}
+        truer = {"drag_after_impact": True} if self.drag_after_impact else {}
+        return {"effort": self.effort, **truer}
 
 
 def _checked_start(start: Any) -> tuple[float, ...] | str:

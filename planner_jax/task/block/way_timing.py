@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from planner_jax.registry import MissingExtra
+from planner_jax.registry import MissingExtra, install_line
 
-INSTALL = "rrt-connect and epase need {name}: pip install 'planner-jax[arm-peers]'"
+INSTALL = f"rrt-connect and epase need {{name}}: {install_line('arm-peers')}"
 PIECES = 128  # of a timed motion, at most
 DEGREE = 6  # a cubic of a quadratic
 _INSIDE = np.array([0.0, 0.25, 0.5, 0.75, 1.0])  # shares of pieces, where limits are looked at

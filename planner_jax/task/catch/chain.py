@@ -13,6 +13,7 @@ from flax import struct
 from jax import Array
 
 from planner_jax.ball.flight import BallState
+from planner_jax.ball.target import state_at
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.trajectory.polynomial import Motion, PiecewisePolynomial
 from planner_jax.trajectory.proportional_minco import (
@@ -50,7 +51,7 @@ def ordered_context(case: CatchCase) -> CatchContext:
 
 def targets_at(targets, times: Array) -> BallState:
     """Where each of N targets is at its own time (N,), leaves (N, 3)."""
-    return jax.vmap(lambda target, time: target.at(time))(targets, times)
+    return jax.vmap(state_at)(targets, times)
 
 
 def facing_cosine(axis: Array, vel: Array) -> tuple[Array, Array]:

@@ -106,7 +106,8 @@ class CatchDecision:
     def explain(self, case: CatchCase, status: Array) -> Array:
         """OUT_OF_REACH for an unsolved case with a target that `closest_approach` rules out."""
         away = jnp.max(_closest_approach(case)) > 0.0
-        return jnp.where(is_unsolved(status) & away, jnp.int32(Status.OUT_OF_REACH), status)
+        unsolved = is_unsolved(status) | (status == Status.OUT_OF_TIME)
+        return jnp.where(unsolved & away, jnp.int32(Status.OUT_OF_REACH), status)
 
 
 @jax.tree_util.register_static

@@ -5,6 +5,8 @@ be caught while it is high enough and does not come from below. It serves to ran
 guess times; the planner then optimises the times together with the trajectory.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +14,7 @@ from flax import struct
 from jax import Array
 
 from planner_jax.ball.flight import BallState
+from planner_jax.ball.target import state_at
 from planner_jax.lanes import over_lanes
 from planner_jax.task.catch.case import CatchCase, CatchChoice
 from planner_jax.task.catch.chain import targets_at
@@ -42,7 +45,8 @@ def sampled(case: CatchCase) -> tuple[Array, BallState, Array]:
     """
     shares = jnp.asarray(np.arange(1, GRID + 1) / GRID, case.gravity.dtype)
     times = case.horizon[:, None] * shares
-    states = jax.vmap(lambda target, at: over_lanes(target.at)(at))(case.targets, times)
+    along = lambda target, at: over_lanes(functools.partial(state_at, target))(at)  # noqa: E731
+    states = jax.vmap(along)(case.targets, times)
     return times, states, length(states.vel)
 
 

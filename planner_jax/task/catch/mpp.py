@@ -10,6 +10,7 @@ from flax import struct
 from jax import Array, lax
 
 from planner_jax.ball.flight import BallState, gravity_vector
+from planner_jax.ball.target import state_at
 from planner_jax.cost.quadrotor import (
     body_rate_excess,
     ground_excess,
@@ -60,7 +61,7 @@ def falling_time(target, height: Array, horizon: Array, nodes: int) -> tuple[Arr
     """
 
     def above(time: Array) -> Array:
-        return target.at(time).pos[2] > height
+        return state_at(target, time).pos[2] > height
 
     times = horizon * jnp.asarray(np.arange(nodes + 1) / nodes, horizon.dtype)
     high = jax.vmap(above)(times)

@@ -8,7 +8,9 @@ from planner_jax.protocol import Decision
 from planner_jax.referee.catch import CatchVerdict, referee_catches
 from planner_jax.task.catch.card import DECISIONS, TASK, TRAINED
 from planner_jax.task.catch.case import CatchCase
+from planner_jax.task.catch.own_targets import is_own, states_by_class
 from planner_jax.task.catch.plan import CatchPlan
+from planner_jax.task.efforts import with_effort
 from planner_jax.task.judged import judged
 from planner_jax.task.named_decision import named_decision
 
@@ -17,6 +19,7 @@ def planner(
     name: str = "exact",
     *,
     decide: str | Decision = "best",
+    effort: str = "feasible",
     ending: str | None = None,
     **options: Any,
 ) -> DecidedPlanner[CatchCase, CatchPlan] | EndedPlanner[CatchCase, CatchPlan]:
@@ -36,6 +39,10 @@ def planner(
         ending: what is flown behind the last contact, within all limits: "brake" to rest where that
             is cheapest, "home" for the way back to where the case begins; by default the plan ends
             at the contact.
+        effort: "feasible" is done with a case as soon as every limit holds; "good" and "best"
+            search on for less cost. Of 1,000 `throws` it is above that of a very long search by
+            38, 0.06 and 0.00 % (median), 76, 1.5 and 0.00 % (90 % quantile); of two balls,
+            `parabola2`, by 95, 11 and 0.00 %, and 182, 17 and 0.02 %.
         **options: fields of that planner's dataclass, for example `rounds`.
 
     Returns:
@@ -44,15 +51,20 @@ def planner(
         were decided.
 
     Raises:
-        ValueError: there is no planner or decision of that name, or its file cannot be read.
+        ValueError: there is no planner or decision of that name, the planner has no such effort,
+            or a file cannot be read.
         TypeError: the planner has no such field.
     """
     decision = named_decision(DECISIONS, decide, TRAINED)
-    return ended(DecidedPlanner(TASK.make_planner(name, options), decision), ending)
+    own = with_effort(TASK.make_planner(name, options), effort)
+    return ended(DecidedPlanner(own, decision), ending)
 
 
 def judge(cases: CatchCase, plans: CatchPlan, **settings: Any) -> CatchVerdict:
     """What the referee says of one plan or of a batch: the physics alone decides.
+
+    Targets of the library's classes are followed by the referee itself. Those of a class of one's
+    own are where its `at` says in float64; their velocity is the central difference over 2e-4 s.
 
     Args:
         cases: one case, or a batch.
@@ -67,4 +79,6 @@ def judge(cases: CatchCase, plans: CatchPlan, **settings: Any) -> CatchVerdict:
         TypeError: the cases or plans are not catches.
         ValueError: shapes that do not fit, or a setting out of its range.
     """
+    if isinstance(cases, CatchCase) and is_own(cases.targets):
+        settings = {"target_states": states_by_class, **settings}
     return judged(referee_catches, cases, plans, (CatchCase, CatchPlan), settings)

@@ -14,7 +14,7 @@ from planner_jax.cost.extras import Extra, for_batch
 from planner_jax.robot.quadrotor import QuadrotorLimits
 from planner_jax.robot.quadrotor_model import RACKET, QuadrotorModel
 from planner_jax.robot.quadrotor_models import PAPER_HITTER
-from planner_jax.rules import Table, require_sound
+from planner_jax.rules import Table, require_rule, require_sound
 from planner_jax.task.arguments import array_of, batch_of
 from planner_jax.task.flight import limits_of, require_tool
 from planner_jax.task.hit.card import START
@@ -86,7 +86,7 @@ def case(
     """A hit, or a batch of them, with the setting of paper 002, Section VI-A.
 
     Args:
-        serve_pos: (..., 3) [m], ball when planning begins.
+        serve_pos: (..., 3) [m], ball when planning begins, above the ground at z = 0.
         serve_vel: (..., 3) [m/s].
         target: (..., 3) [m].
         robot: with a racket; what is not given below is the robot's.
@@ -152,4 +152,6 @@ def case(
         extras=for_batch(extras, batch, dtype),
     )
     require_sound(made)
+    height = np.asarray(made.ball.pos)[..., 2]
+    require_rule("serve_pos", height, height >= 0.0, "at a height >= 0 m", batch)
     return made

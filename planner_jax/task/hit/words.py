@@ -11,6 +11,7 @@ from planner_jax.referee.hit import HitVerdict, referee_hits
 from planner_jax.registry import suite_named
 from planner_jax.robot.quadrotor_model import QuadrotorModel
 from planner_jax.robot.quadrotor_models import PAPER_HITTER
+from planner_jax.task.efforts import with_effort
 from planner_jax.task.flight import require_own_robot
 from planner_jax.task.hit.card import REAL_SCENARIOS, START, TASK
 from planner_jax.task.hit.case import HitCase
@@ -65,7 +66,7 @@ def draw(
 
 
 def planner(
-    name: str = "exact", *, ending: str | None = None, **options: Any
+    name: str = "exact", *, effort: str = "feasible", ending: str | None = None, **options: Any
 ) -> AnyPlanner[HitCase, HitPlan]:
     """The hit planner of a name, with some of its fields set.
 
@@ -79,6 +80,10 @@ def planner(
         ending: what is flown behind the last contact, within all limits: "brake" to rest where that
             is cheapest, "home" for the way back to where the case begins; by default the plan ends
             at the contact.
+        effort: "feasible" is done with a case as soon as every limit holds; "good" and "best"
+            search on for less cost. Of 1,000 hits of `court` it is above that of a very long
+            search by 469, 0.00 and 0.00 % (median), 2,467, 0.05 and 0.00 % (90 % quantile), in
+            0.05, 3.6 and 21 s on two CPU cores that had other work.
         **options: fields of that planner's dataclass, for example `rounds`.
 
     Returns:
@@ -86,10 +91,10 @@ def planner(
         planner whose `planner` is one of these.
 
     Raises:
-        ValueError: there is no planner of that name.
+        ValueError: there is no planner of that name, or it has no such effort.
         TypeError: the planner has no such field.
     """
-    return ended(TASK.make_planner(name, options), ending)
+    return ended(with_effort(TASK.make_planner(name, options), effort), ending)
 
 
 def judge(cases: HitCase, plans: HitPlan, **settings: Any) -> HitVerdict:

@@ -1,0 +1,81 @@
+"""What a planner's effort buys: the cost above that of a very long search, and the time.
+
+    python -m benchmarks.efforts [--num 1000] [--seed 0] [--repeat 3] [--out DIR]
+
+Hits of the suite `court`, and catches of one and of two balls in the greedy order, by `exact`. The
+very long search, of up to 3,000 iterations, begins at the same guess. The time is the fastest call,
+warm; beside it stand the plans that the referee accepts.
+"""
+
+import argparse
+import time
+from typing import Any
+
+import jax
+import numpy as np
+
+import planner_jax as pj
+from planner_jax.benchmarks.cost_gap import VERY_LONG, cost_gaps, gap_figures
+from planner_jax.benchmarks.run import Bench, argument_parser, begin
+from planner_jax.task.efforts import EFFORTS
+
+SUITES = (("hit", "court"), ("catch", "throws"), ("catch", "parabola2"))
+
+
+def measure(bench: Bench, options: argparse.Namespace) -> None:
+    """A row an effort and suite."""
+    bench.say(
+        f"{options.num:,} cases, {jax.devices()[0].device_kind}, jax {jax.__version__}",
+        "| task | suite | effort | refereed | cost above a very long search's (median, p90) | "
+        "fastest [s] |",
+        "|---|---|---|---|---|---|",
+    )
+    accepted, gaps = [], []
+    for name, suite in SUITES:
+        task = pj.task_named(name)
+        cases: Any = jax.tree.map(np.asarray, task.draw(options.num, suite, options.seed))
+        for effort in EFFORTS:
+            planner = task.planner("exact", effort=effort, **task.bench)
+            plans, seconds = _fastest(planner, cases, options.repeat)
+            success = task.judge(cases, plans).success
+            gap = cost_gaps(planner, cases, plans, card=task, solver=VERY_LONG)
+            accepted.append(success)
+            gaps.append(gap)
+            figures = gap_figures(gap)
+            bench.row(
+                task=name,
+                suite=suite,
+                effort=effort,
+                success_rate=success.mean(),
+                seconds=seconds,
+                **figures,
+            )
+            above = ", ".join(f"{100.0 * (each or 0.0):.2f} %" for each in figures.values())
+            bench.say(
+                f"| {name} | {suite} | {effort} | {100.0 * success.mean():.1f} % | {above} | "
+                f"{seconds:.2f} |"
+            )
+    bench.count(np.concatenate(accepted))
+    bench.note(**gap_figures(*gaps))
+
+
+def _fastest(planner: Any, cases: Any, repeat: int) -> tuple[Any, float]:
+    """Plans, and how long the fastest of some calls took, warm [s]."""
+    plans, seconds = pj.plan(planner, cases), []
+    for _ in range(repeat):
+        began = time.perf_counter()
+        plans = pj.plan(planner, cases)
+        seconds.append(time.perf_counter() - began)
+    return plans, min(seconds)
+
+
+def main() -> None:
+    """Print the rows."""
+    parser = argument_parser("efforts", __doc__, num=1000, seed=0, repeat=3)
+    options = parser.parse_args()
+    with begin(parser, options) as bench:
+        measure(bench, options)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,31 @@
+"""How much a planner is asked to do: which rounds that makes, and who has no such choice."""
+
+import pytest
+
+import planner_jax as pj
+from planner_jax.sweep.catch.settings import CatchSettings
+from planner_jax.sweep.hit.settings import HitSettings
+from planner_jax.sweep.settings import SettingError
+
+
+@pytest.mark.parametrize("task", [pj.hit, pj.catch], ids=["hit", "catch"])
+def test_more_effort_is_a_longer_first_round_and_the_default_is_the_planner_itself(task):
+    own = task.planner("exact")
+    assert task.planner("exact", effort="feasible") == own
+    inside = lambda planner: getattr(planner, "planner", planner)  # noqa: E731
+    rounds = [inside(task.planner("exact", effort=x)).rounds for x in ("feasible", "good", "best")]
+    assert len({each[1:] for each in rounds}) == 1
+    steps = [each[0].solver.max_steps for each in rounds]
+    assert steps == sorted(set(steps)) and steps[0] == inside(own).rounds[0].solver.max_steps
+
+
+def test_an_effort_that_is_none_and_planners_without_one_are_named():
+    with pytest.raises(ValueError, match="effort must be one of feasible, good, best, got 'more'"):
+        pj.hit.planner("exact", effort="more")
+    for task, name in ((pj.hit, "juggle"), (pj.catch, "mpp")):
+        with pytest.raises(ValueError, match="effort must be feasible for a .*, which minimises"):
+            task.planner(name, effort="good")
+    for kind, name in ((HitSettings, "juggle"), (CatchSettings, "mpp")):
+        with pytest.raises(SettingError, match=f"effort must be left out for the planner {name}"):
+            kind(planner=name, effort="good")
+        assert kind(effort="good").planner_options()["effort"] == "good"

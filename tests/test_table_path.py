@@ -1,0 +1,157 @@
+"""Targets of a user's own: paths through a table, and classes that only say where they are."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import struct
+from jax import Array
+from scipy.interpolate import CubicHermiteSpline, CubicSpline
+
+import planner_jax as pj
+from planner_jax.ball.flight import BallState
+from planner_jax.optimise.planner import pending
+from planner_jax.task.catch.plan import CatchPlan
+from planner_jax.trajectory.polynomial import PiecewisePolynomial
+from tests.derivatives import assert_gradient_matches_differences
+
+HORIZON = 2.0
+
+
+def swing(times, order=0):
+    """Positions (K, 3) of a smooth target, or their derivatives."""
+    phase = np.array([0.0, 0.7, 1.9]) + 0.5 * order * np.pi
+    return 1.3**order * np.sin(1.3 * np.asarray(times)[:, None] + phase)
+
+
+def uneven(num):
+    """Times from before 0 to the horizon, every other step half as long."""
+    steps = np.where(np.arange(num - 1) % 2, 1.0, 2.0)
+    return np.append(0.0, np.cumsum(steps)) / steps.sum() * (HORIZON + 0.1) - 0.1
+
+
+def states(table, at):
+    return jax.jit(jax.vmap(table.at))(jnp.asarray(at))
+
+
+@pytest.mark.parametrize("given", [False, True], ids=["positions", "with velocities"])
+def test_the_table_is_the_spline_to_within_its_error(given, float64):
+    times, at = uneven(17), np.linspace(0.0, HORIZON, 301)
+    values = [swing(times)] + [swing(times, 1)] * given
+    spline = CubicHermiteSpline(times, *values) if given else CubicSpline(times, *values)
+    for error in (1e-3, 1e-5):
+        table = pj.table_path(times, *values, error=error, dtype=jnp.float64)
+        found = states(table, at)
+        assert np.abs(found.pos - spline(at)).max() <= error
+        assert np.abs(found.vel - spline(at, 1)).max() <= 10.0 * error
+
+
+def test_errors_fall_with_the_fourth_and_third_power_of_the_step(float64):
+    at = np.linspace(0.0, HORIZON, 301)
+    errors = []
+    for num in (9, 17, 33):
+        found = states(pj.table_path(uneven(num), swing(uneven(num)), nodes=4000, dtype=float), at)
+        errors.append(
+            [np.abs(x - swing(at, k)).max() for k, x in enumerate((found.pos, found.vel))]
+        )
+    orders = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
+    assert (orders[:, 0] > 3.5).all() and (orders[:, 1] > 2.5).all(), orders
+
+
+def test_axes_in_front_are_those_of_the_leaves_and_a_case_takes_them():
+    times = np.linspace(0.0, HORIZON, 12)
+    positions = swing(times) + np.arange(6.0).reshape(2, 3, 1, 1) + [0.0, 0.0, 3.0]
+    table = pj.table_path(times, positions)
+    assert table.pos.shape[:2] == table.resolution.shape == (2, 3)
+    cases = pj.catch.case(table, np.full((2, 3), HORIZON))
+    assert cases.batch_shape == (2,) and cases.num_targets == 3
+
+
+def test_the_path_is_differentiated_by_its_positions(float64):
+    times = uneven(8)
+
+    def value(positions):
+        table = pj.table_path(times, positions, nodes=24, dtype=jnp.float64)
+        state = table.at(jnp.asarray(0.77))
+        return jnp.sum(jnp.sin(state.pos) + jnp.cos(state.vel))
+
+    assert_gradient_matches_differences(value, swing(times), step=1e-6, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (dict(times=[0.0, 0.5, 0.5, 1.0]), "times must be finite and rise, got a step of 0 s"),
+        (dict(times=[0.1, 0.5, 0.7, 1.0]), "times must begin at 0, .* got 0.1 to 1 s"),
+        (dict(times=np.zeros((2, 4))), r"times must have the shape \(K,\) .* got \(2, 4\)"),
+        (dict(positions=np.zeros((3, 3))), r"positions must have .* 4, 3\), got \(3, 3\)"),
+        (dict(positions=np.full((4, 3), np.nan)), "positions must be finite, got nan"),
+        (dict(velocities=np.zeros((2, 4, 3))), r"velocities must have .* got \(2, 4, 3\)"),
+        (dict(nodes=4), "nodes must be >= 5, got 4"),
+        (dict(error=0.0), "error must be finite and > 0, got 0.0"),
+        (dict(positions=1e9 * np.eye(4)[:, :3]), "error must be >= .* got 0.001"),
+    ],
+)
+def test_a_malformed_table_is_refused_in_one_line(change, words):
+    table = dict(times=[0.0, 0.2, 0.6, 1.0], positions=np.zeros((4, 3)))
+    with pytest.raises(ValueError, match=f"^{words}"):
+        pj.table_path(**table | change)
+
+
+@struct.dataclass
+class Falling:
+    """A parabola, of which the class says only where it is."""
+
+    start: BallState
+    gravity: Array  # () [m/s^2]
+
+    def at(self, time):
+        fall = jnp.array([0.0, 0.0, -0.5]) * self.gravity * time**2
+        return self.start.pos + self.start.vel * time + fall
+
+
+@struct.dataclass
+class Lying(Falling):
+    """The same, with a velocity that is wrong."""
+
+    def at(self, time):
+        return BallState(super().at(time), jnp.zeros(3))
+
+
+@pytest.mark.parametrize("own", [Falling, Lying])
+def test_the_referee_asks_a_class_of_ones_own_where_it_is_and_not_how_fast(own):
+    """Of any motion what is measured at the catches is as with the library's own class."""
+    rng = np.random.default_rng(3)
+    start = BallState(rng.normal(size=(2, 2, 3)), rng.normal(size=(2, 2, 3)))
+    gravity = np.full((2, 2), 9.81)
+    known = pj.BallPath(start, np.zeros((2, 2, 3)), gravity)
+    cases = jax.tree.map(np.asarray, pj.catch.case(known, np.full((2, 2), 1.5)))
+    zero = np.zeros(2, np.float32)
+    plans = CatchPlan(
+        trajectory=PiecewisePolynomial(rng.normal(size=(2, 4, 8, 3)), np.full((2, 4), 0.3)),
+        gravity=cases.gravity,
+        order=np.array([[0, 1], [1, 0]]),
+        decided_times=np.zeros((2, 2)),
+        times=np.array([[0.6, 1.2]] * 2),
+        **pending(zero),  # type: ignore[arg-type]
+    )
+    exact = pj.catch.judge(cases.replace(targets=known), plans)
+    found = pj.catch.judge(cases.replace(targets=own(start, gravity)), plans)
+    np.testing.assert_allclose(found.net_distance, exact.net_distance, rtol=1e-9)
+    np.testing.assert_allclose(found.angle, exact.angle, atol=1e-7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["table", "own"])
+def test_targets_of_ones_own_are_caught_and_judged(kind):
+    start = BallState(np.float32([[1.5, 0.3, 2.5]]), np.float32([[-1.2, 0.1, 2.0]]))
+    own = Falling(start, np.full(1, 9.81, np.float32))
+    times = np.linspace(-0.1, 1.2, 40)[:, None]
+    thrown = start.pos + start.vel * times + np.array([0.0, 0.0, -4.905]) * times**2
+    targets = own if kind == "own" else pj.table_path(times[:, 0], thrown[None])
+    case = pj.catch.case(targets, np.ones(1))
+    found = pj.plan(pj.catch.planner("exact"), case)
+    verdict = pj.catch.judge(case, found)
+    assert verdict.success, verdict.sentence()
+    truth = pj.catch.judge(case.replace(targets=own), found)
+    np.testing.assert_allclose(truth.net_distance, verdict.net_distance, atol=1e-3)

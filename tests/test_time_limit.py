@@ -1,0 +1,155 @@
+"""How long planning may take, and what it says meanwhile: the clock moves with every report."""
+
+import dataclasses
+import types
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import struct
+from jax import Array
+
+import planner_jax as pj
+from planner_jax.planning import watch
+from planner_jax.planning.decided import DecidedPlanner
+
+
+@struct.dataclass
+class Task:
+    """Solved by the round of this number."""
+
+    number: Array  # ()
+
+    @property
+    def batch_shape(self):
+        return np.shape(self.number)
+
+    def decided(self, choice):
+        return self.replace(number=self.number + choice)
+
+
+@dataclasses.dataclass(frozen=True)
+class Try(pj.Attempt):
+    number: int = 1
+
+
+def outcome_of(task, attempt):
+    excess = task.number - attempt.number
+    return pj.Plan(**pj.outcome(1.0 * task.number, excess, stationary=False))
+
+
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class Rounds:
+    attempts: tuple = (Try(number=1), Try(number=2), Try(number=3))
+
+    def solve(self, case, attempt):
+        return outcome_of(case, attempt)
+
+
+class OnHost:
+    attempts = Rounds().attempts
+
+    def solve_on_host(self, cases, attempt):
+        return jax.tree.map(np.asarray, jax.vmap(lambda case: outcome_of(case, attempt))(cases))
+
+
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class TwoWays:
+    """A decision between two choices, neither of which is better."""
+
+    def check(self, cases):
+        pass
+
+    def propose(self, case):
+        return jnp.zeros(2)
+
+    def rank(self, plans):
+        return plans.cost
+
+    def explain(self, case, status):
+        return status
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock, and a `progress` that notes what it is told and moves it on by a second."""
+    now = [0.0]
+    monkeypatch.setattr(watch, "time", types.SimpleNamespace(monotonic=lambda: now[0]))
+    told = []
+
+    def progress(report):
+        told.append(report)
+        now[0] += 1.0
+
+    return types.SimpleNamespace(told=told, progress=progress)
+
+
+NUMBERS = np.array([1.0, 3.0, 0.5, 2.0, 9.0], np.float32)
+
+
+@pytest.mark.parametrize(
+    "planner, arrays",
+    [
+        (Rounds(), np),
+        (Rounds(), jnp),
+        (OnHost(), np),
+        (DecidedPlanner(Rounds(Rounds().attempts[:2]), TwoWays()), np),
+    ],
+    ids=["NumPy arrays", "jax arrays", "on the host", "two choices"],
+)
+def test_no_round_begins_after_its_time_and_what_is_solved_keeps_its_bits(planner, arrays, clock):
+    cases = Task(arrays.asarray(NUMBERS))
+    free = pj.plan(planner, cases)
+    assert free.status[3] == pj.Status.FEASIBLE and free.status[4] == pj.Status.MAX_STEPS
+    found = pj.plan(planner, cases, time_limit=1.0, progress=clock.progress)
+    late = NUMBERS > 1.0
+    assert (np.asarray(found.status)[late] == pj.Status.OUT_OF_TIME).all()
+    for ours, theirs in zip(jax.tree.leaves(found), jax.tree.leaves(free), strict=True):
+        np.testing.assert_array_equal(np.asarray(ours)[~late], np.asarray(theirs)[~late])
+
+
+def test_one_case_stops_too(clock):
+    found = pj.plan(Rounds(), Task(np.float32(3.0)), time_limit=1.0, progress=clock.progress)
+    assert found.status == pj.Status.OUT_OF_TIME
+    assert pj.plan(Rounds(), Task(np.float32(3.0)), time_limit=99.0).status == pj.Status.FEASIBLE
+
+
+def test_chunks_of_a_round_are_not_begun_after_the_time(clock):
+    """The second round is reported to begin at 3 s, which takes until 4 s."""
+    numbers = np.full(32, 2.0, np.float32)
+    found = pj.plan(Rounds(), Task(numbers), chunk=16, time_limit=3.5, progress=clock.progress)
+    assert (found.status == pj.Status.OUT_OF_TIME).all()
+    last = clock.told[-1]
+    assert (last.round, last.tried, last.cases) == (2, 0, 32)
+
+
+def test_all_attempts_are_reported_and_a_report_is_a_line(clock):
+    pj.plan(Rounds(), Task(NUMBERS), progress=clock.progress)
+    assert [(one.round, one.tried, one.cases) for one in clock.told] == [
+        *((1, 0, 5), (1, 5, 5)),
+        *((2, 0, 3), (2, 3, 3)),
+        *((3, 0, 2), (3, 2, 2)),
+    ]
+    assert str(clock.told[3]) == "round 2 of at most 3: 3 of 3 cases tried, after 3.0 s"
+
+
+@pytest.mark.parametrize(
+    "options, error, words",
+    [
+        (dict(time_limit=-1.0), ValueError, "time_limit must be >= 0 s, got -1.0"),
+        (dict(time_limit=float("nan")), ValueError, "time_limit must be >= 0 s, got nan"),
+        (dict(time_limit="1"), TypeError, "time_limit must be a number, got '1'"),
+        (dict(progress=3), TypeError, "progress must be callable, such as print, got 3"),
+    ],
+)
+def test_malformed_options_are_refused_in_one_line(options, error, words):
+    with pytest.raises(error, match=words):
+        pj.plan(Rounds(), Task(NUMBERS), **options)
+
+
+def test_a_compiled_function_has_no_clock():
+    with pytest.raises(TypeError, match="time_limit and progress must be left out inside"):
+        jax.jit(lambda cases: pj.plan(Rounds(), cases, time_limit=1.0))(Task(NUMBERS))
