@@ -175,7 +175,7 @@ def require_path(name: str, path: Any, axes: tuple[int, ...], dimensions: int) -
     leaves, tree = jax.tree.flatten(path)
     layout = tuple((np.shape(leaf), numeric(leaf).dtype) for leaf in leaves)
     try:
-        found = _shape_of_positions(tree, layout, len(axes))
+        found = _shape_of_positions(tree, layout, axes)
     except (TypeError, ValueError, IndexError, AttributeError) as error:
         found = f"a {type(path).__name__} that raises {type(error).__name__}"
         raise TypeError(f"{name} must be a path with the axes {axes}, got {found}") from error
@@ -185,10 +185,11 @@ def require_path(name: str, path: Any, axes: tuple[int, ...], dimensions: int) -
 
 
 @functools.lru_cache(maxsize=256)
-def _shape_of_positions(tree: Any, layout: tuple, num_axes: int) -> tuple[int, ...]:
+def _shape_of_positions(tree: Any, layout: tuple, axes: tuple[int, ...]) -> tuple[int, ...]:
     """The shape of what paths say at a time; kept, since it takes a millisecond to find out."""
-    at: Callable[[Any, Any], Any] = lambda one, time: one.at(time).pos  # noqa: E731
-    for _ in range(num_axes):
-        at = jax.vmap(at, in_axes=(0, None))
+    # A path may say its position alone.
+    at: Any = lambda one, time: getattr(found := one.at(time), "pos", found)  # noqa: E731
+    for _ in axes:
+        at = jax.vmap(at)
     path = jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(*each) for each in layout])
-    return jax.eval_shape(at, path, jax.ShapeDtypeStruct((), np.float32)).shape
+    return jax.eval_shape(at, path, jax.ShapeDtypeStruct(axes, np.float32)).shape

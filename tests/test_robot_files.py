@@ -15,7 +15,7 @@ import planner_jax as pj
 from planner_jax.cli import main
 from planner_jax.registry import UnknownName
 from planner_jax.robot.quadrotor_file import RobotError, as_yaml, model_of
-from planner_jax.robot.quadrotor_models import MODELS
+from planner_jax.robot.quadrotor_models import MODELS, ready_robot
 from planner_jax.robot.quantities import UNITS, QuantityError, numbers_in
 from planner_jax.sims.settings import HitFly
 from planner_jax.sweep.hit.settings import HitSettings
@@ -295,7 +295,7 @@ def test_a_lag_that_mjcf_does_not_have_has_to_be_said(tmp_path):
 def test_an_unknown_robot_is_told_with_the_nearest_name():
     with pytest.raises(UnknownName, match="^robot must be one of paper-catcher, .*mean x500-net?"):
         pj.robot_named("x50-net")
-    assert all(f"`{name}`" in (pj.robot.__doc__ or "") for name in MODELS)
+    assert all(f"`{name}`" in (ready_robot.__doc__ or "") for name in MODELS)
 
 
 @pytest.mark.parametrize("robot", MODELS.values(), ids=MODELS)

@@ -133,7 +133,7 @@ def test_the_referee_asks_a_class_of_ones_own_where_it_is_and_not_how_fast(own):
         order=np.array([[0, 1], [1, 0]]),
         decided_times=np.zeros((2, 2)),
         times=np.array([[0.6, 1.2]] * 2),
-        **pending(zero),  # type: ignore[arg-type]
+        **pending(zero) | {"status": zero.astype(int), "iterations": zero.astype(int)},
     )
     exact = pj.catch.judge(cases.replace(targets=known), plans)
     found = pj.catch.judge(cases.replace(targets=own(start, gravity)), plans)

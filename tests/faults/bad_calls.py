@@ -29,11 +29,12 @@ def _cases() -> list[tuple[str, str]]:
     rows += _of(hit, "target", "(0, 0, -inf)", "(1e60, 0, 0)", words="target must be finite, got")
     rows += _of(hit, "start", "'uniform'", "None", "(1, 2)", "1.0", "np.zeros((2, 3))")
     rows += _of(hit, "start", "(nan, 0, 1)", words="head_state must be finite, got nan")
-    numbers = ("'x'", "None", "(1, 2)", "1j", "[[1.0]]", "b'1'", "object()")
+    numbers = ("'x'", "(1, 2)", "1j", "[[1.0]]", "b'1'", "object()")
     for name in ("drag", "gravity", "restitution", "racket_height"):
         rows += _of(hit, name, *numbers, "nan")
+    rows += _of(hit, "drag", "None") + _of(hit, "gravity", "None")
     for name in ("min_apex", "max_apex"):
-        rows += _of(hit, name, *numbers)
+        rows += _of(hit, name, *numbers, "None")
         rows += _of(hit, name, "nan", words=f"hit_limits.{name} must be finite, got nan")
     for name in ("speed", "acceleration", "body_rate", "min_height"):
         rows += _of(hit, name, *numbers)
@@ -65,8 +66,9 @@ def _cases() -> list[tuple[str, str]]:
     rows += _of(catch, "targets", "turning(2)", "hits.ball", "pj.lane(ball_path(2), 0)")
     rows += _of(catch, "targets", "pj.BallPath", "lambda t: t", "[ball_path(2)]")
     rows += _of(catch, "present", "(True,)", "'x'", "None", "(0.5, 1.0)", "(2, 1)", "('a', 'b')")
+    rows += _of(catch, "gravity", "None")
     for name in ("gravity", "net_height", "net_radius", "max_angle", "speed", "body_rate"):
-        rows += _of(catch, name, "'x'", "None", "(1, 2)", "1j", "[[1.0]]")
+        rows += _of(catch, name, "'x'", "(1, 2)", "1j", "[[1.0]]")
     rows += _of(catch, "min_thrust", "'x'", "(1, 2)", "1j")
     rows += _of(catch, "gravity", "0", "nan")
     rows += _of(catch, "net_radius", "0", "nan", words="net.radius must be")
