@@ -1,7 +1,7 @@
 """What leaves of a plan: its setpoints, or its polynomials. Every format is made of these alone.
 
-`setpoints_of` and `pieces_of` are where a plan is taken as it is, up to its end. Whatever is to be
-flown behind that end belongs here, so that all formats have it.
+`setpoints_of` and `pieces_of` are where a plan is taken as it is, up to its end: that of its ending
+where it was planned with one.
 """
 
 import dataclasses
@@ -42,7 +42,7 @@ ROBOTS = (
         "quadrotor",
         QuadrotorPlan,
         {"trajectory.coeffs": ("M", "D", 3), "trajectory.durations": ("M",), "gravity": ()},
-        lambda plan: np.sum(np.asarray(plan.trajectory.durations)),
+        lambda plan: np.sum(np.asarray(plan.whole.durations)),
     ),
     Robot(
         "car",
@@ -129,8 +129,9 @@ def pieces_of(plan: QuadrotorPlan) -> PiecewisePolynomial:
         ExportError: the plan may not leave, see `robot_of`, or is not finite.
     """
     robot_of(plan)
-    coeffs: Any = np.asarray(plan.trajectory.coeffs)
-    durations: Any = np.asarray(plan.trajectory.durations)
+    path = plan.whole
+    coeffs: Any = np.asarray(path.coeffs)
+    durations: Any = np.asarray(path.durations)
     taken = durations != 0.0
     if not (np.isfinite(coeffs[taken]).all() and (durations[taken] > 0.0).all()):
         raise ExportError("plan must be finite, got a trajectory that is not")
