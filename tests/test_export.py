@@ -1,5 +1,6 @@
 """Plans as tables, ROS 2's bags and Crazyflie's pieces, each as its own library reads them."""
 
+import re
 import sys
 import types
 
@@ -14,7 +15,7 @@ from planner_jax.export import csv_rows, ros2
 from planner_jax.export.crazyflie import poly4d
 from planner_jax.export.setpoints import MOST, ExportError, setpoints_of
 from planner_jax.export.words import stream
-from planner_jax.registry import MissingExtra, UnknownName
+from planner_jax.registry import MissingExtra, UnknownName, install_line
 
 RATE = 50.0
 
@@ -314,7 +315,7 @@ def test_a_missing_package_is_named_with_its_extra(
         monkeypatch.delitem(sys.modules, each)
     monkeypatch.delitem(sys.modules, f"planner_jax.export.{module}", raising=False)
     monkeypatch.setitem(sys.modules, package, None)
-    says = rf"^export to \.\w+ needs {package}.*: pip install 'planner-jax\[export\]'$"
+    says = rf"^export to \.\w+ needs {package}.*: {re.escape(install_line('export'))}$"
     with pytest.raises(MissingExtra, match=says):
         exported(tmp_path, to=to, name=name)
     assert not list(tmp_path.iterdir())
