@@ -451,7 +451,11 @@ def test_a_setting_out_of_range_is_named(setting, says):
         ({"drag": np.ones(4)}, ValueError, "drag must have the shape (), got (4,)"),
         ({"serve_pos": [2.0, 0.0, -1.0]}, CaseError, "serve_pos must be at a height >= 0 m"),
         ({"dtype": np.float64}, TypeError, "dtype must be float32 unless jax_enable_x64 is set"),
-        ({"extras": pj.KeepOut(0.0, 1.0)}, TypeError, "extras must be a sequence of limits and costs"),
+        (
+            {"extras": pj.KeepOut(0.0, 1.0)},
+            TypeError,
+            "extras must be a sequence of limits and costs",
+        ),
         ({"extras": (3,)}, TypeError, "extras must have a method excess or cost, got 3"),
     ],
 )
