@@ -85,7 +85,7 @@ class _NotFinished(Exception):
     """The file system or workers failed while a run was under way; one line."""
 
 
-_ARGUMENTS: set[str] = set()  # names of all arguments, as they are written in Python
+_ARGUMENTS: set[str] = set()  # names of all options, as they are written in Python
 
 
 def _fail(message: str) -> int:
@@ -136,6 +136,7 @@ _NUMBERS: dict[Any, Callable[[str], Any]] = {int: _whole, float: _number}
 
 
 def _parser() -> _Parser:
+    _ARGUMENTS.clear()  # of an earlier command in this process
     parser = _Parser(
         prog="planner-jax",
         description="Plan for robots that meet flying objects, thousands of cases at once.",

@@ -72,13 +72,13 @@ def test_solved_is_read_from_the_status():
     blank = np.zeros(status.shape)
     plans = pj.Plan(cost=blank, violation=blank, iterations=blank, status=status)
     good = pj.solved(plans)
-    assert good.tolist() == [True, True] + 8 * [False]
+    assert good.tolist() == [True, True] + 9 * [False]
     assert isinstance(good, np.ndarray) and good.dtype == bool
     resident = pj.solved(jax.tree.map(jnp.asarray, plans))
     assert isinstance(resident, np.ndarray) and resident.tolist() == good.tolist()
     assert pj.solved(pj.lane(plans, 1)) and not pj.solved(pj.lane(plans, 4))
     # What is broken, blocked, without a way or too far is neither solved nor worth another attempt.
-    assert is_unsolved(status).tolist() == [False, False, True, True, False, True, *4 * [False]]
+    assert is_unsolved(status).tolist() == [False, False, True, True, False, True, *5 * [False]]
 
 
 # Verdicts.

@@ -65,7 +65,8 @@ class HitSettings(SweepSettings):
     def planner_options(self) -> dict[str, Any]:
         """Fields of the planner's dataclass that these settings decide."""
         truer = {"drag_after_impact": True} if self.drag_after_impact else {}
-        return {"effort": self.effort, **truer}
+        more = {} if self.effort == EFFORTS[0] else {"effort": self.effort}
+        return more | truer
 
 
 def _checked_start(start: Any) -> tuple[float, ...] | str:
