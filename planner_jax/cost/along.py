@@ -54,7 +54,7 @@ class Along:
         return *shape, *code, self.margins, self.hinge_width, self.rate is None, self.orders
 
     def matrices(self) -> np.ndarray:
-        """Position to jerk or snap at the samples, in time over h, from the columns: (K, 4, C)."""
+        """Position and derivatives at the samples, in time over h, from columns: (K, orders, C)."""
         each = [self.maps.sample_matrix(self.nodes, d) for d in range(self.orders)]
         return np.stack(each, axis=1)
 

@@ -6,14 +6,17 @@ the quantity to its limit, less one. Vectors may come as tuples of their compone
 kernel has them.
 """
 
+import dataclasses
 import enum
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax.numpy as jnp
 from jax import Array
 
 from planner_jax.arithmetic import Components, components, reciprocal
-from planner_jax.cost.extras import extra_excess
+from planner_jax.cost.along import Along
+from planner_jax.cost.extras import extra_excess, extra_rate, num_limits
 from planner_jax.robot.quadrotor import (
     QuadrotorLimits,
     RotorLimits,
@@ -21,6 +24,7 @@ from planner_jax.robot.quadrotor import (
     rotor_thrusts,
 )
 from planner_jax.trajectory.polynomial import Motion
+from planner_jax.trajectory.proportional_minco import ProportionalMinco
 
 
 def _size_squared(vector: Components) -> Array:
@@ -72,20 +76,6 @@ def motion_excess(
     )
 
 
-def flight_excess(motion: Motion, gravity: Array, limits: QuadrotorLimits) -> tuple[Array, ...]:
-    """Excess (N,) over each of the limits that there are, in the order of `flight_measures`."""
-    found = [speed_excess(motion.vel, limits)]
-    if limits.acceleration is not None:
-        found.append(acceleration_excess(motion.acc, limits))
-    found.append(body_rate_excess(motion.acc, motion.jerk, gravity, limits))
-    if limits.max_thrust is not None:
-        found += thrust_excess(motion.acc, gravity, *limits.thrust_bounds)
-    found.append(ground_excess(motion.height, limits))
-    if limits.rotors is not None:
-        found += rotor_excess(motion, gravity, limits.rotors)
-    return tuple(found)
-
-
 def limits_along(
     motion: Motion, given: tuple[Array, QuadrotorLimits, tuple[Any, ...]]
 ) -> tuple[Array, ...]:
@@ -97,41 +87,6 @@ def limits_along(
     """
     gravity, limits, extras = given
     return (*flight_excess(motion, gravity, limits), *extra_excess(motion, extras))
-
-
-class Measure(enum.Enum):
-    """What an excess is in the terms of the quantity q and its limit, and what it is of."""
-
-    ABOVE = "q^2 / most^2 - 1"
-    BELOW = "1 - q^2 / least^2"
-    PLAIN = "q / limit - 1, or the difference in its unit"
-
-    @property
-    def factor(self) -> float:
-        """By which a small relative excess shows in it."""
-        return 1.0 if self is Measure.PLAIN else 2.0
-
-    def relative(self, excess: Array) -> Array:
-        """The relative excess of the quantity."""
-        if self is Measure.ABOVE:
-            return jnp.sqrt(jnp.maximum(excess + 1.0, 0.0)) - 1.0
-        if self is Measure.BELOW:
-            return 1.0 - jnp.sqrt(jnp.maximum(1.0 - excess, 0.0))
-        return excess
-
-
-def flight_measures(limits: QuadrotorLimits) -> tuple[Measure, ...]:
-    """What the excesses of `flight_excess` are."""
-    found = [Measure.ABOVE]
-    if limits.acceleration is not None:
-        found.append(Measure.ABOVE)
-    found.append(Measure.ABOVE)
-    if limits.max_thrust is not None:
-        found += [Measure.BELOW, Measure.ABOVE]
-    found.append(Measure.PLAIN)
-    if limits.rotors is not None:
-        found += [Measure.PLAIN] * 8
-    return tuple(found)
 
 
 def rotor_excess(motion: Motion, gravity: Array, rotors: RotorLimits) -> tuple[Array, ...]:
@@ -164,3 +119,107 @@ def thrust_excess(
     x, y, z = components(acc)
     squared = _size_squared((x, y, z + gravity))
     return 1.0 - squared * reciprocal(least) ** 2, squared * reciprocal(most) ** 2 - 1.0
+
+
+class Measure(enum.Enum):
+    """What an excess is in the terms of the quantity q and its limit, and what it is of."""
+
+    ABOVE = "q^2 / most^2 - 1"
+    BELOW = "1 - q^2 / least^2"
+    PLAIN = "q / limit - 1, or the difference in its unit"
+
+    @property
+    def factor(self) -> float:
+        """By which a small relative excess shows in it."""
+        return 1.0 if self is Measure.PLAIN else 2.0
+
+    def relative(self, excess: Array) -> Array:
+        """The relative excess of the quantity."""
+        if self is Measure.ABOVE:
+            return relative(excess)
+        if self is Measure.BELOW:
+            return 1.0 - jnp.sqrt(jnp.maximum(1.0 - excess, 0.0))
+        return excess
+
+
+@dataclasses.dataclass(frozen=True)
+class _Kind:
+    """Limits that are there together, or not."""
+
+    field: str  # of `QuadrotorLimits`, None where they are not there
+    measures: tuple[Measure, ...]  # one for each excess
+    excess: Callable[[Motion, Array, Any], tuple[Array, ...]]  # of motion, gravity and limits
+
+
+_KINDS = (
+    _Kind("speed", (Measure.ABOVE,), lambda motion, gravity, own: (speed_excess(motion.vel, own),)),
+    _Kind(
+        "acceleration",
+        (Measure.ABOVE,),
+        lambda motion, gravity, own: (acceleration_excess(motion.acc, own),),
+    ),
+    _Kind(
+        "body_rate",
+        (Measure.ABOVE,),
+        lambda motion, gravity, own: (body_rate_excess(motion.acc, motion.jerk, gravity, own),),
+    ),
+    _Kind(
+        "max_thrust",
+        (Measure.BELOW, Measure.ABOVE),
+        lambda motion, gravity, own: thrust_excess(motion.acc, gravity, *own.thrust_bounds),
+    ),
+    _Kind(
+        "min_height",
+        (Measure.PLAIN,),
+        lambda motion, gravity, own: (ground_excess(motion.height, own),),
+    ),
+    _Kind(
+        "rotors",
+        (Measure.PLAIN,) * 8,
+        lambda motion, gravity, own: rotor_excess(motion, gravity, own.rotors),
+    ),
+)
+
+
+def _kinds(limits: QuadrotorLimits) -> list[_Kind]:
+    """Those that there are."""
+    return [kind for kind in _KINDS if getattr(limits, kind.field) is not None]
+
+
+def flight_excess(motion: Motion, gravity: Array, limits: QuadrotorLimits) -> tuple[Array, ...]:
+    """Excess (N,) over each of the limits that there are, in the order of `flight_measures`."""
+    return tuple(
+        excess for kind in _kinds(limits) for excess in kind.excess(motion, gravity, limits)
+    )
+
+
+def flight_measures(limits: QuadrotorLimits) -> tuple[Measure, ...]:
+    """What the excesses of `flight_excess` are."""
+    return tuple(measure for kind in _kinds(limits) for measure in kind.measures)
+
+
+def relative_excess(limits: QuadrotorLimits, excess: Sequence[Array]) -> list[Array]:
+    """Relative excesses, of those of `limits_along`; what belongs to extras is relative already."""
+    measures = flight_measures(limits)
+    own = [of.relative(each) for of, each in zip(measures, excess, strict=False)]
+    return [*own, *excess[len(measures) :]]
+
+
+def flight_along(
+    maps: ProportionalMinco, nodes: int, case: Any, margin: float, hinge_width: float
+) -> Along:
+    """Penalties of all limits of a flight along its way; squares carry twice the relative margin.
+
+    Args:
+        maps: of the trajectory.
+        nodes: intervals a piece.
+        case: with `limits` and `extras`, whose arrays are not looked at.
+        margin: relative, at which penalties begin inside a limit.
+        hinge_width: of the smoothed hinges.
+    """
+    factors = [measure.factor for measure in flight_measures(case.limits)]
+    factors += [1.0] * num_limits(case.extras)
+    margins = tuple(margin * factor for factor in factors)
+    rate = extra_rate if case.extras else None
+    orders = 4 if case.limits.rotors is None else 5
+    return Along(maps, nodes, limits_along, margins, hinge_width, rate, orders)

@@ -7,11 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jax import lax
 
 from planner_jax.ending.case import EndingCase, end_state
 from planner_jax.ending.planner import ENDINGS, RestPlanner
-from planner_jax.planning.batch import better_of, merged
+from planner_jax.planning.decided import planned_again
 from planner_jax.protocol import Case, Drive, Plan, Status, is_solved
 
 CaseT = TypeVar("CaseT", bound=Case)
@@ -49,22 +48,12 @@ class EndedPlanner(Generic[CaseT, PlanT]):
         if not drive.is_pure:
             cases = jax.tree.map(np.asarray, cases)
         plans, left = self._ended(drive, cases, 1.0)
-        for factor in _SLOWER:
-            if drive.is_pure:
-
-                def again(plans: Any, factor: float = factor, left: Any = left) -> Any:
-                    return better_of(plans, self._ended(drive, cases, factor)[0], left)
-
-                plans = lax.cond(jnp.any(left), again, lambda plans: plans, plans)
-                left &= ~is_solved(plans.status)
-                continue
-            lanes = np.flatnonzero(left)
-            if not lanes.size:
-                break
-            some = jax.tree.map(lambda leaf, lanes=lanes: leaf[lanes], cases)
+        if not drive.is_pure:
             plans = jax.tree.map(np.array, plans)
-            plans = merged(plans, self._ended(drive, some, factor)[0], lanes)
-            left &= ~is_solved(plans.status)
+        for factor in _SLOWER:
+            slower = lambda some, factor=factor: self._ended(drive, some, factor)[0]  # noqa: E731
+            plans = planned_again(drive, slower, cases, plans, left)
+            left = left & ~is_solved(plans.status)
         return plans
 
     def _ended(self, drive: Drive, cases: Any, factor: float) -> tuple[Any, Any]:

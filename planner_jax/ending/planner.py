@@ -9,8 +9,7 @@ import numpy as np
 from jax import Array
 
 from planner_jax.cost.along import Along, greatest_along, integrate_along
-from planner_jax.cost.extras import extra_rate, num_limits
-from planner_jax.cost.quadrotor import flight_measures, limits_along
+from planner_jax.cost.quadrotor import flight_along, limits_along, relative_excess
 from planner_jax.ending.case import EndingCase, EndingPlan
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
 from planner_jax.optimise.planner import OptimisedPlanner, pending
@@ -127,13 +126,8 @@ class RestPlanner(OptimisedPlanner):
         return offsets, boundary_rows(context.head_state, tail, duration), duration
 
     def _along(self, nodes: int, case: EndingCase) -> Along:
-        """Penalties along the way: squares carry twice the relative margin."""
-        factors = [measure.factor for measure in flight_measures(case.limits)]
-        factors += [1.0] * num_limits(case.extras)
-        margins = tuple(self.margin * factor for factor in factors)
-        rate = extra_rate if case.extras else None
-        orders = 4 if case.limits.rotors is None else 5
-        return Along(self.maps, nodes, limits_along, margins, self.hinge_width, rate, orders)
+        """Penalties along the way."""
+        return flight_along(self.maps, nodes, case, self.margin, self.hinge_width)
 
     def objective(self, point: Array, context: EndingCase) -> Evaluation:
         """Cost, and the largest excess at the penalty nodes."""
@@ -176,9 +170,7 @@ class RestPlanner(OptimisedPlanner):
             duration[None],
             (context.gravity, context.limits, context.extras),
         )
-        measures = flight_measures(context.limits)
-        relative = [of.relative(each) for of, each in zip(measures, greatest, strict=False)]
-        violation = functools.reduce(jnp.maximum, [*relative, *greatest[len(measures) :]])[0]
+        violation = functools.reduce(jnp.maximum, relative_excess(context.limits, greatest))[0]
         return EndingPlan(
             trajectory=proportional_trajectory(self.maps, rows, offsets, duration),
             gravity=context.gravity,

@@ -1,5 +1,6 @@
 """A planner that first has a decision taken: in what order, when, which of several."""
 
+from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
 import jax
@@ -12,7 +13,6 @@ from jax.core import Tracer
 from planner_jax.planning.batch import better_of, merged
 from planner_jax.planning.packed import call_packed
 from planner_jax.protocol import (
-    Attempt,
     Case,
     Decision,
     Drive,
@@ -101,29 +101,36 @@ class DecidedPlanner(Generic[CaseT, PlanT]):
         if others:
             has_plan = of_case(is_solved(plans.status)).any(axis=0)
             left = is_unsolved(plans.status) & ~xp.tile(has_plan, num)
-            plans = self._with_attempt(drive, last, together, plans, left)
+            once_more = lambda some: drive(self.planner, some, [last])[0]  # noqa: E731
+            plans = planned_again(drive, once_more, together, plans, left)
         plans, together = jax.tree.map(lambda x: of_case(xp.asarray(x)), (plans, together))
         worse = 1e6 + xp.nan_to_num(plans.violation, nan=1e9)
         rank = xp.where(is_solved(plans.status), self.decision.rank(plans), worse)
         chosen, lanes = rank.argmin(axis=0), np.arange(rank.shape[1])
         return jax.tree.map(lambda leaf: leaf[chosen, lanes], (together, plans))
 
-    def _with_attempt(
-        self, drive: Drive, attempt: Attempt, cases: Any, plans: Any, left: Any
-    ) -> Any:
-        """The plans after one more attempt at the cases that are left, (B,) bool."""
-        if drive.is_pure:
-            again = lambda plans: better_of(  # noqa: E731
-                plans, drive(self.planner, cases, [attempt])[0], left
-            )
-            return lax.cond(jnp.any(left), again, lambda plans: plans, plans)
-        lanes = np.flatnonzero(left)
-        if not lanes.size:
-            return plans
-        if drive.is_over:
-            return out_of_time(plans, left)
-        some = jax.tree.map(lambda leaf: leaf[lanes], cases)
-        return merged(plans, drive(self.planner, some, [attempt])[0], lanes)
+
+def planned_again(
+    drive: Drive, plan_of: Callable[[Any], Any], cases: Any, plans: Any, left: Any
+) -> Any:
+    """The plans (B,) after one more try at the cases that are left.
+
+    Args:
+        drive: whose kind of arrays the plans are; where its time is over, nothing more is tried.
+        plan_of: makes plans of a batch of the cases.
+        cases: (B,).
+        plans: of them; those that come from the host are changed in place.
+        left: (B,) bool.
+    """
+    if drive.is_pure:
+        again = lambda plans: better_of(plans, plan_of(cases), left)  # noqa: E731
+        return lax.cond(jnp.any(left), again, lambda plans: plans, plans)
+    lanes = np.flatnonzero(left)
+    if not lanes.size:
+        return plans
+    if drive.is_over:
+        return out_of_time(plans, left)
+    return merged(plans, plan_of(jax.tree.map(lambda leaf: leaf[lanes], cases)), lanes)
 
 
 def _propose(_: None, decision: Any, case: Any) -> Any:

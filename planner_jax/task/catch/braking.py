@@ -6,7 +6,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.cost.quadrotor import flight_excess, flight_measures
+from planner_jax.cost.quadrotor import flight_excess, relative_excess
 from planner_jax.protocol import FEASIBILITY_TOLERANCE
 from planner_jax.robot.quadrotor import QuadrotorLimits
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, sample_pieces
@@ -51,9 +51,7 @@ def braking(state: Array, gravity: Array, limits: QuadrotorLimits) -> Braking:
         coeffs = jnp.concatenate([low, high, zero])
         motion = sample_pieces(PiecewisePolynomial(coeffs[None], t[None]), _NODES)
         excess = flight_excess(motion, gravity, limits)
-        measures = flight_measures(limits)
-        relative = [of.relative(each) for of, each in zip(measures, excess, strict=True)]
-        return coeffs, jnp.max(jnp.stack(relative))
+        return coeffs, jnp.max(jnp.stack(relative_excess(limits, excess)))
 
     durations = jnp.asarray(_DURATIONS, state.dtype)
     coeffs, worst = jax.vmap(to_rest)(durations)

@@ -16,9 +16,8 @@ from flax import struct
 from jax import Array
 
 from planner_jax.cost.along import Along, greatest_along, integrate_along
-from planner_jax.cost.extras import extra_rate, num_limits
 from planner_jax.cost.penalty import smoothed_hinge
-from planner_jax.cost.quadrotor import flight_measures, limits_along
+from planner_jax.cost.quadrotor import flight_along, limits_along, relative_excess
 from planner_jax.lanes import in_one_kernel
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
 from planner_jax.optimise.planner import OptimisedPlanner, pending
@@ -273,13 +272,8 @@ class ExactCatch(OptimisedPlanner):
         return jnp.where(context.active, jnp.stack([catch.angle_excess, late]), -1.0)
 
     def _along(self, nodes: int, case: CatchCase) -> Along:
-        """Penalties along the way: squares carry twice the relative margin."""
-        factors = [measure.factor for measure in flight_measures(case.limits)]
-        factors += [1.0] * num_limits(case.extras)
-        margins = tuple(self.margin * factor for factor in factors)
-        rate = extra_rate if case.extras else None
-        orders = 4 if case.limits.rotors is None else 5
-        return Along(self.maps, nodes, limits_along, margins, self.hinge_width, rate, orders)
+        """Penalties along the way."""
+        return flight_along(self.maps, nodes, case, self.margin, self.hinge_width)
 
     def objective(self, point: Array, context: CatchContext) -> Evaluation:
         """Cost, and the largest excess at the penalty nodes (squares over squares)."""
@@ -382,10 +376,9 @@ class ExactCatch(OptimisedPlanner):
             (context.case.gravity, context.case.limits, context.case.extras),
         )
         excess = [jnp.max(jnp.where(context.active, each, -1.0)) for each in greatest]
-        measures = flight_measures(context.case.limits)
-        relative = [of.relative(each) for of, each in zip(measures, excess, strict=False)]
-        others = [*excess[len(measures) :], jnp.max(self._at_catch(catch, context))]
-        violation = functools.reduce(jnp.maximum, [*relative, *others])
+        along = relative_excess(context.case.limits, excess)
+        at_catch = jnp.max(self._at_catch(catch, context))
+        violation = functools.reduce(jnp.maximum, [*along, at_catch])
         return CatchPlan(
             trajectory=chain_trajectory(self.maps, chain, context.active),
             gravity=context.case.gravity,

@@ -26,9 +26,8 @@ from planner_jax.ball.prediction import LEAST_NODES, target_at
 from planner_jax.checks import require_size
 from planner_jax.cost.along import Along, greatest_along, integrate_along
 from planner_jax.cost.contact import apex_excess, hitting_speed_excess
-from planner_jax.cost.extras import extra_rate, num_limits
 from planner_jax.cost.penalty import smoothed_hinge
-from planner_jax.cost.quadrotor import Measure, flight_measures, limits_along
+from planner_jax.cost.quadrotor import Measure, flight_along, limits_along, relative_excess
 from planner_jax.lanes import in_one_kernel
 from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
 from planner_jax.optimise.planner import OptimisedPlanner, pending
@@ -231,13 +230,8 @@ class ExactHit(OptimisedPlanner):
         )
 
     def _along(self, nodes: int, case: HitCase) -> Along:
-        """Penalties along the way: squares carry twice the relative margin."""
-        factors = [measure.factor for measure in flight_measures(case.limits)]
-        factors += [1.0] * num_limits(case.extras)
-        margins = tuple(self.margin * factor for factor in factors)
-        rate = extra_rate if case.extras else None
-        orders = 4 if case.limits.rotors is None else 5
-        return Along(self.maps, nodes, limits_along, margins, self.hinge_width, rate, orders)
+        """Penalties along the way."""
+        return flight_along(self.maps, nodes, case, self.margin, self.hinge_width)
 
     def objective(self, point: Array, context: HitContext) -> Evaluation:
         """Cost, and the largest excess at the penalty nodes (squares over squares)."""
@@ -371,11 +365,9 @@ class ExactHit(OptimisedPlanner):
             (context.case.gravity, context.case.limits, context.case.extras),
         )
         at_impact = self._at_impact(impact, context)
-        measures = flight_measures(context.case.limits)
-        along = [of.relative(excess) for of, excess in zip(measures, greatest, strict=False)]
+        along = relative_excess(context.case.limits, greatest)
         hitting_speed = Measure.ABOVE.relative(at_impact[2:])
-        plain = [*greatest[len(measures) :], at_impact[:2]]
-        violation = jnp.max(jnp.concatenate([*along, hitting_speed, *plain]))
+        violation = jnp.max(jnp.concatenate([*along, hitting_speed, at_impact[:2]]))
         return HitPlan(
             trajectory=proportional_trajectory(self.maps, rows, offsets, duration),
             gravity=context.case.gravity,
