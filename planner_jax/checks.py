@@ -61,10 +61,11 @@ def require_switch(name: str, value: Any) -> None:
         raise TypeError(f"{name} must be True or False, got {told(value)}")
 
 
-def require_kind(name: str, value: Any, kind: type) -> None:
-    """Raise `TypeError` unless an argument is of a class."""
-    if not isinstance(value, kind):
-        raise TypeError(f"{name} must be a {kind.__name__}, got a {type(value).__name__}")
+def require_kind(name: str, value: Any, *kinds: type) -> None:
+    """Raise `TypeError` unless an argument is of a class, or of one of some."""
+    if not isinstance(value, kinds):
+        known = " or a ".join(kind.__name__ for kind in kinds)
+        raise TypeError(f"{name} must be a {known}, got a {type(value).__name__}")
 
 
 def require_path_name(name: str, value: Any) -> None:

@@ -9,7 +9,8 @@ import pytest
 import scipy.optimize
 
 from planner_jax.optimise import lbfgs
-from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
+from planner_jax.optimise.evaluation import Evaluation
+from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.lbfgs_kernel import turn_kernel
 from planner_jax.optimise.multistart import minimise
 from planner_jax.protocol import Status, status_of

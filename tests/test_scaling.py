@@ -7,7 +7,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.optimise.lbfgs import Evaluation
+from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.scaling import curvature_diagonal, measure_scale
 
 

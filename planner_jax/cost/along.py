@@ -46,6 +46,14 @@ class Along:
     # Of a case's extras. They look at the whole position, and are not made for a kernel.
     rate: Rate | None = None
     orders: int = 4  # of the motion that the excess takes: 5 with the snap
+    # Places (order, axis) of the motion that limits look at together, for `along_curvature`: in
+    # those of different groups the penalties are a sum. By default everything together.
+    groups: tuple[tuple[tuple[int, int], ...], ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.groups:
+            every = tuple((order, axis) for order in range(self.orders) for axis in range(3))
+            object.__setattr__(self, "groups", (every,))
 
     def key(self) -> tuple:
         """All of it in numbers and names."""

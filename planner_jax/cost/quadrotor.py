@@ -149,34 +149,45 @@ class _Kind:
     field: str  # of `QuadrotorLimits`, None where they are not there
     measures: tuple[Measure, ...]  # one for each excess
     excess: Callable[[Motion, Array, Any], tuple[Array, ...]]  # of motion, gravity and limits
+    orders: tuple[int, ...]  # of the motion, that they look at
 
 
 _KINDS = (
-    _Kind("speed", (Measure.ABOVE,), lambda motion, gravity, own: (speed_excess(motion.vel, own),)),
+    _Kind(
+        "speed",
+        (Measure.ABOVE,),
+        lambda motion, gravity, own: (speed_excess(motion.vel, own),),
+        (1,),
+    ),
     _Kind(
         "acceleration",
         (Measure.ABOVE,),
         lambda motion, gravity, own: (acceleration_excess(motion.acc, own),),
+        (2,),
     ),
     _Kind(
         "body_rate",
         (Measure.ABOVE,),
         lambda motion, gravity, own: (body_rate_excess(motion.acc, motion.jerk, gravity, own),),
+        (2, 3),
     ),
     _Kind(
         "max_thrust",
         (Measure.BELOW, Measure.ABOVE),
         lambda motion, gravity, own: thrust_excess(motion.acc, gravity, *own.thrust_bounds),
+        (2,),
     ),
     _Kind(
         "min_height",
         (Measure.PLAIN,),
         lambda motion, gravity, own: (ground_excess(motion.height, own),),
+        (0,),
     ),
     _Kind(
         "rotors",
         (Measure.PLAIN,) * 8,
         lambda motion, gravity, own: rotor_excess(motion, gravity, own.rotors),
+        (2, 3, 4),
     ),
 )
 
@@ -222,4 +233,17 @@ def flight_along(
     margins = tuple(margin * factor for factor in factors)
     rate = extra_rate if case.extras else None
     orders = 4 if case.limits.rotors is None else 5
-    return Along(maps, nodes, limits_along, margins, hinge_width, rate, orders)
+    groups = () if case.extras else _groups(case.limits)
+    return Along(maps, nodes, limits_along, margins, hinge_width, rate, orders, groups)
+
+
+def _groups(limits: QuadrotorLimits) -> tuple[tuple[tuple[int, int], ...], ...]:
+    """Places (order, axis) of the motion that limits look at together; of positions, the height."""
+    together: list[set[int]] = []
+    for kind in _kinds(limits):
+        joined = set(kind.orders).union(*(each for each in together if each & set(kind.orders)))
+        together = [each for each in together if not each & joined] + [joined]
+    axes = lambda order: (2,) if order == 0 else (0, 1, 2)  # noqa: E731
+    return tuple(
+        tuple((order, axis) for order in sorted(each) for axis in axes(order)) for each in together
+    )

@@ -11,7 +11,8 @@ from jax import Array
 from planner_jax.cost.along import Along, greatest_along, integrate_along
 from planner_jax.cost.quadrotor import flight_along, limits_along, relative_excess
 from planner_jax.ending.case import EndingCase, EndingPlan
-from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
+from planner_jax.optimise.evaluation import Evaluation
+from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.problem import Round
 from planner_jax.optimise.scaling import shipped_scale

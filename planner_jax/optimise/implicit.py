@@ -14,7 +14,8 @@ from flax import struct
 from jax import Array, lax
 
 from planner_jax.checks import require_kind, require_size
-from planner_jax.optimise.lbfgs import LbfgsConfig, Objective
+from planner_jax.optimise.evaluation import Objective
+from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.multistart import minimise
 from planner_jax.protocol import marked, status_of
 

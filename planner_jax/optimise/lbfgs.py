@@ -19,18 +19,8 @@ from jax import Array
 
 from planner_jax.checks import numeric, require_number, require_size, told
 from planner_jax.lanes import in_one_kernel, with_kernel
+from planner_jax.optimise.evaluation import Evaluation, Objective, better
 from planner_jax.optimise.lbfgs_kernel import judged_pair, shortening, start_scale, turn_kernel
-
-
-@struct.dataclass
-class Evaluation:
-    """An objective at one point."""
-
-    cost: Array  # (), what is minimised
-    violation: Array  # (), largest relative excess over a limit; <= 0 is feasible
-
-
-Objective = Callable[[Array], Evaluation]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,14 +75,6 @@ class LbfgsState:
     memory: Memory
     best_point: Array  # (n,)
     numbers: LbfgsNumbers
-
-
-def _better(a: Evaluation, b: Evaluation) -> Array:
-    """Whether a beats b: feasible before infeasible, then cost, or violation if neither is."""
-    both = (a.violation <= 0.0) & (b.violation <= 0.0)
-    by_cost = a.cost < b.cost
-    by_violation = jnp.maximum(a.violation, 0.0) < jnp.maximum(b.violation, 0.0)
-    return jnp.where(both, by_cost, by_violation) | ~jnp.isfinite(b.cost)
 
 
 def init(point: Array, config: LbfgsConfig) -> LbfgsState:
@@ -199,7 +181,12 @@ def step(objective: Objective, state: LbfgsState, config: LbfgsConfig) -> LbfgsS
 
 def is_unfinished(numbers: LbfgsNumbers, config: LbfgsConfig) -> Array:
     """Whether a lane has iterations left and is not stationary, () bool."""
-    return (numbers.iteration < config.max_steps) & (numbers.stalled < config.patience)
+    return (numbers.iteration < config.max_steps) & ~is_stationary(numbers, config)
+
+
+def is_stationary(numbers: LbfgsNumbers, config: LbfgsConfig) -> Array:
+    """Whether so many iterations brought no decrease that none is hoped for, () bool."""
+    return numbers.stalled >= config.patience
 
 
 @struct.dataclass
@@ -225,10 +212,10 @@ def _chosen(
     decreased = of_chosen(costs) < here.cost
     there = jax.tree.map(lambda new, old: jnp.where(decreased, of_chosen(new), old), trials, here)
     best = jax.tree.map(lambda a, b: jnp.where(numbers.iteration == 0, a, b), here, numbers.best)
-    better = _better(there, best)
+    is_better = better(there, best)
     progress = here.cost - there.cost > config.tolerance * jnp.abs(here.cost)
     after = LbfgsNumbers(
-        best=jax.tree.map(lambda a, b: jnp.where(better, a, b), there, best),
+        best=jax.tree.map(lambda a, b: jnp.where(is_better, a, b), there, best),
         # Without a decrease the lane next looks nearer.
         reach=jnp.where(decreased, 1.0, 0.05 * numbers.reach),
         iteration=numbers.iteration + 1,
@@ -238,6 +225,6 @@ def _chosen(
     return _Choice(
         numbers=jax.tree.map(lambda new, old: jnp.where(going, new, old), after, numbers),
         length=jnp.where(decreased, of_chosen(lengths), 0.0),
-        better=better & going,
+        better=is_better & going,
         going=going,
     )

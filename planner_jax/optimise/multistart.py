@@ -2,7 +2,9 @@
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable
+from types import ModuleType
 from typing import Any
 
 import jax
@@ -11,9 +13,10 @@ from flax import struct
 from jax import Array, lax
 
 from planner_jax.lanes import over_lanes
-from planner_jax.optimise import lbfgs
-from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig, LbfgsState, Objective
-from planner_jax.optimise.problem import Problem, Round
+from planner_jax.optimise import lbfgs, newton
+from planner_jax.optimise.evaluation import Evaluation, Objective
+from planner_jax.optimise.newton import Curvature, Curved, NewtonConfig, by_products
+from planner_jax.optimise.problem import Problem, Round, Solver
 from planner_jax.protocol import FEASIBILITY_TOLERANCE, Status, is_unsolved, status_of
 
 # So few iterations are counted, so that a GPU need not tell the host whether to go on.
@@ -30,20 +33,34 @@ class Optimum:
     stationary: Array  # () bool
 
 
-def minimise(objective: Objective, start: Array, config: LbfgsConfig) -> Optimum:
-    """Minimise from one start until stationary or out of iterations."""
+def minimise(
+    objective: Objective, start: Array, config: Solver, curved: Curved | None = None
+) -> Optimum:
+    """Minimise from one start until stationary or out of iterations.
+
+    Args:
+        objective: of a point (n,).
+        start: (n,).
+        config: the method's sizes and switches, static.
+        curved: what `NewtonConfig` takes, where there is a quicker one than products of its own.
+    """
     if config.max_steps == 0:
         return _optimum_at(start, objective(start), config)
+    config = _with_stragglers(config)
     state = lax.while_loop(
-        lambda s: lbfgs.is_unfinished(s.numbers, config),
-        lambda s: lbfgs.step(objective, s, config),
-        lbfgs.init(start, config),
+        lambda s: _method(config).is_unfinished(s.numbers, config),
+        lambda s: _step(objective, curved, s, config),
+        _method(config).init(start, config),
     )
     return _optimum_of(state, config)
 
 
 def minimise_lanes(
-    objective: Callable[[Array, Any], Evaluation], starts: Array, contexts: Any, config: LbfgsConfig
+    objective: Callable[[Array, Any], Evaluation],
+    starts: Array,
+    contexts: Any,
+    config: Solver,
+    curved: Callable[[Array, Any], Curvature] | None = None,
 ) -> Optimum:
     """`minimise` on many lanes, each with its own start and context.
 
@@ -51,7 +68,8 @@ def minimise_lanes(
         objective: of one point (n,) and one context.
         starts: (n, B).
         contexts: a pytree, the lanes last on every leaf.
-        config: sizes and switches, static.
+        config: the method's sizes and switches, static.
+        curved: as for `minimise`, of one point and one context.
 
     Returns:
         The optima, with the lanes last on every leaf.
@@ -60,32 +78,60 @@ def minimise_lanes(
         evaluate = lambda x, context: _optimum_at(x, objective(x, context), config)  # noqa: E731
         return over_lanes(evaluate)(starts, contexts)
 
-    @over_lanes
-    def step(state: LbfgsState, context: Any) -> LbfgsState:
-        return lbfgs.step(lambda x: objective(x, context), state, config)
+    def searched(state: Any, contexts: Any, config: Solver, steps: int) -> Any:
+        @over_lanes
+        def step(state: Any, context: Any) -> Any:
+            of_point = None if curved is None else lambda x: curved(x, context)
+            return _step(lambda x: objective(x, context), of_point, state, config)
 
-    state = over_lanes(lambda start: lbfgs.init(start, config))(starts)
-    if config.max_steps <= _COUNTED:
-        state = lax.fori_loop(0, config.max_steps, lambda _, s: step(s, contexts), state)
-    else:
-        state = lax.while_loop(
-            lambda s: jnp.any(lbfgs.is_unfinished(s.numbers, config)),
+        if steps <= _COUNTED:
+            return lax.fori_loop(0, steps, lambda _, s: step(s, contexts), state)
+        return lax.while_loop(
+            lambda s: jnp.any(_method(config).is_unfinished(s.numbers, config)),
             lambda s: step(s, contexts),
             state,
         )
+
+    state = over_lanes(lambda start: _method(config).init(start, config))(starts)
+    state = searched(state, contexts, config, config.max_steps)
+    for share, steps in config.stragglers if isinstance(config, NewtonConfig) else ():
+        config = dataclasses.replace(config, max_steps=config.max_steps + steps)
+        lanes = newton.most_to_gain(state.numbers, math.ceil(share * starts.shape[-1]))
+        some = jax.tree.map(lambda leaf, lanes=lanes: leaf[..., lanes], (state, contexts))
+        later = searched(*some, config, steps)
+        place = lambda old, new, lanes=lanes: old.at[..., lanes].set(new)  # noqa: E731
+        state = jax.tree.map(place, state, later)
     return _optimum_of(state, config)
 
 
-def _optimum_of(state: LbfgsState, config: LbfgsConfig) -> Optimum:
+def _method(config: Solver) -> ModuleType:
+    return newton if isinstance(config, NewtonConfig) else lbfgs
+
+
+def _step(objective: Objective, curved: Curved | None, state: Any, config: Solver) -> Any:
+    if isinstance(config, NewtonConfig):
+        return newton.step(objective, curved or by_products(objective), state, config)
+    return lbfgs.step(objective, state, config)
+
+
+def _with_stragglers(config: Solver) -> Solver:
+    """The iterations of the lanes that have most to gain."""
+    if not isinstance(config, NewtonConfig):
+        return config
+    steps = config.max_steps + sum(steps for _, steps in config.stragglers)
+    return dataclasses.replace(config, max_steps=steps, stragglers=())
+
+
+def _optimum_of(state: Any, config: Solver) -> Optimum:
     return Optimum(
         point=state.best_point,
         evaluation=state.numbers.best,
         iterations=state.numbers.iteration,
-        stationary=state.numbers.stalled >= config.patience,
+        stationary=_method(config).is_stationary(state.numbers, config),
     )
 
 
-def _optimum_at(point: Array, evaluation: Evaluation, config: LbfgsConfig) -> Optimum:
+def _optimum_at(point: Array, evaluation: Evaluation, config: Solver) -> Optimum:
     """The start itself."""
     stationary = jnp.full((), config.patience == 0)
     return Optimum(point, evaluation, jnp.zeros((), jnp.int32), stationary)
@@ -110,7 +156,12 @@ def solve_round(planner: Problem, attempt: Round, case: Any) -> Any:
     def from_start(start: Array) -> Any:
         iterations = jnp.zeros((), jnp.int32)
         for stage, config in zip(planners, configs, strict=True):
-            optimum = minimise(lambda x: stage.objective(x, context), start, config)  # noqa: B023
+            optimum = minimise(
+                lambda x: stage.objective(x, context),  # noqa: B023
+                start,
+                config,
+                lambda x: stage.curved(x, context),  # noqa: B023
+            )
             start, iterations = optimum.point, iterations + optimum.iterations
         return _plan_at(planners[-1], dataclasses.replace(optimum, iterations=iterations), context)
 
@@ -139,7 +190,7 @@ def solve_batch(planner: Problem, attempt: Round, cases: Any) -> Any:
         contexts = jax.tree.map(lambda x: jnp.repeat(x, attempt.starts, axis=-1), contexts)
     iterations = jnp.zeros(points.shape[1:], jnp.int32)
     for stage, config in zip(planners, configs, strict=True):
-        optimum = minimise_lanes(stage.objective, points, contexts, config)
+        optimum = minimise_lanes(stage.objective, points, contexts, config, stage.curved)
         points, iterations = optimum.point, iterations + optimum.iterations
     optimum = dataclasses.replace(optimum, iterations=iterations)
     plans = over_lanes(functools.partial(_plan_at, planners[-1]))(optimum, contexts)
@@ -150,7 +201,7 @@ def solve_batch(planner: Problem, attempt: Round, cases: Any) -> Any:
     return jax.vmap(_best)(jax.tree.map(split, plans))
 
 
-def _stages(planner: Problem, attempt: Round) -> tuple[list[Problem], list[LbfgsConfig]]:
+def _stages(planner: Problem, attempt: Round) -> tuple[list[Problem], list[Solver]]:
     """The problems to be solved one after another; the last is the one that counts."""
     planners = [planner.changed(stage.settings) for stage in attempt.stages]
     configs = [stage.solver for stage in attempt.stages]

@@ -7,7 +7,9 @@ from typing import Any, ClassVar, Self
 import jax.numpy as jnp
 from jax import Array
 
-from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
+from planner_jax.optimise.evaluation import Evaluation
+from planner_jax.optimise.lbfgs import LbfgsConfig
+from planner_jax.optimise.newton import Curvature, by_products
 from planner_jax.optimise.multistart import solve_batch, solve_round
 from planner_jax.optimise.problem import Round, Settings
 
@@ -51,6 +53,13 @@ class OptimisedPlanner(abc.ABC):
     @abc.abstractmethod
     def objective(self, point: Array, context: Any) -> Evaluation:
         """Cost and largest violation at a point (n,)."""
+
+    def curved(self, point: Array, context: Any) -> Curvature:
+        """Evaluation at a point (n,), gradient (n,), and the Hessian's products, for `NewtonConfig`.
+
+        By default each product is a derivative of the gradient.
+        """
+        return by_products(lambda x: self.objective(x, context))(point)
 
     @abc.abstractmethod
     def decode(self, point: Array, context: Any) -> Any:

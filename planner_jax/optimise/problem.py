@@ -6,9 +6,12 @@ from typing import Any, Protocol
 from jax import Array
 
 from planner_jax.checks import require_kind
-from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
+from planner_jax.optimise.evaluation import Evaluation
+from planner_jax.optimise.lbfgs import LbfgsConfig
+from planner_jax.optimise.newton import Curvature, NewtonConfig
 from planner_jax.protocol import Attempt
 
+Solver = LbfgsConfig | NewtonConfig
 Settings = tuple[tuple[str, Any], ...]  # fields of a planner, and the values they take
 
 
@@ -16,7 +19,7 @@ Settings = tuple[tuple[str, Any], ...]  # fields of a planner, and the values th
 class Stage:
     """An easier problem, the end of which is where the next one begins."""
 
-    solver: LbfgsConfig
+    solver: Solver
     settings: Settings = ()
 
 
@@ -24,13 +27,13 @@ class Stage:
 class Round(Attempt):
     """An attempt of a planner that minimises: so many starts and iterations."""
 
-    solver: LbfgsConfig = LbfgsConfig()
+    solver: Solver = LbfgsConfig()
     settings: Settings = ()  # of the planner, that differ in this round
     stages: tuple[Stage, ...] = ()  # before it, from easy to hard
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_kind("solver", self.solver, LbfgsConfig)
+        require_kind("solver", self.solver, LbfgsConfig, NewtonConfig)
 
 
 class Problem(Protocol):
@@ -49,6 +52,10 @@ class Problem(Protocol):
 
     def objective(self, point: Array, context: Any) -> Evaluation:
         """Cost and largest violation at a point (n,)."""
+        ...
+
+    def curved(self, point: Array, context: Any) -> Curvature:
+        """Evaluation at a point (n,), gradient, and the Hessian's products, for Newton's method."""
         ...
 
     def decode(self, point: Array, context: Any) -> Any:

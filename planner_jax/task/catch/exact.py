@@ -19,7 +19,9 @@ from planner_jax.cost.along import Along, greatest_along, integrate_along
 from planner_jax.cost.penalty import smoothed_hinge
 from planner_jax.cost.quadrotor import flight_along, limits_along, relative_excess
 from planner_jax.lanes import in_one_kernel
-from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
+from planner_jax.optimise.evaluation import Evaluation
+from planner_jax.optimise.lbfgs import LbfgsConfig
+from planner_jax.optimise.learned_start import StartNetwork, cheaper_start, shipped_network
 from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.problem import Round
 from planner_jax.optimise.scaling import shipped_scale
@@ -49,9 +51,11 @@ from planner_jax.trajectory.proportional_minco import (
 )
 
 _ORDER = 4  # minimum snap
+_PROPORTIONS = (0.3,) + (1.0,) * 5
 # At which a piece is looked at in the end, of one catch and of several: body rates peak sharply
 # where the thrust is small, as it is between catches.
 _DECODE_NODES = (40, 80)
+_SEEN = (-0.1, 0.1)  # [s] from the decided time, at which a learned start looks at the ball
 _RIM = 0.9  # share of the net's radius that a planned catch may use
 _ENCODED_RIM = 0.99  # share of that which a point made by `encode` may use
 
@@ -71,6 +75,32 @@ _GUESSES = np.array(
     ]
 )
 _LEAN = 0.95  # of the angle that the net may have to the ball's way, what a guess makes use of
+
+
+def start_features(context: CatchContext) -> Array:
+    """What a learned start of a single catch is made from, (F,): ball, quadrotor and limits."""
+    case, net = context.case, context.case.net
+    head, limits, time = case.head_state, case.limits, context.times[0]
+    seen = [targets_at(context.targets, context.times[:1] + late) for late in _SEEN]
+    least, most = limits.thrust_bounds
+    numbers = (
+        *(part for ball in seen for part in (ball.pos[0] - head[0], ball.vel[0])),
+        head[1],
+        0.2 * head[2],
+        0.02 * head[3],
+        jnp.stack(
+            [
+                time,
+                context.horizon[0] - time,
+                head[0, 2] - limits.min_height,
+                *map(jnp.log, (limits.speed, most, least, limits.body_rate, case.gravity)),
+                net.height,
+                net.radius,
+                net.max_angle,
+            ]
+        ),
+    )
+    return jnp.concatenate(numbers)
 
 
 @struct.dataclass
@@ -99,7 +129,7 @@ class ExactCatch(OptimisedPlanner):
     """
 
     case_type = CatchCase
-    proportions: tuple[float, ...] = (0.3,) + (1.0,) * 5  # relative durations of the pieces
+    proportions: tuple[float, ...] = _PROPORTIONS  # relative durations of the pieces
     nodes: int = 8  # penalty intervals a piece
     time_weight: float = 0.005
     energy_weight: float = 3e-8
@@ -116,6 +146,7 @@ class ExactCatch(OptimisedPlanner):
     # allowed catches are soonest; more leaves control a margin in flight.
     lift: float = _GUESSES[0, 3].item()
     scale: tuple[float, ...] = ()  # of one segment
+    learned: bool = True  # whether a network makes the first guess of a single catch
 
     def __post_init__(self) -> None:
         require_settings(self)
@@ -142,6 +173,15 @@ class ExactCatch(OptimisedPlanner):
         return len(self.proportions)
 
     @property
+    def _network(self) -> StartNetwork | None:
+        """That makes the first guess; there is one for the shipped sizes."""
+        name = f"exact-{self.num_pieces}"
+        is_shipped = self.proportions == _PROPORTIONS and self.scale == shipped_scale(
+            __package__, name
+        )
+        return shipped_network(__package__, name) if self.learned and is_shipped else None
+
+    @property
     def maps(self) -> ProportionalMinco:
         """Constant maps from boundary and offsets to one segment."""
         return proportional_minco(_ORDER, self.proportions)
@@ -157,7 +197,13 @@ class ExactCatch(OptimisedPlanner):
         rows = _GUESSES[:num].copy()
         rows[0, 3] = self.lift
         rows = jnp.asarray(rows, context.times.dtype)
-        return jax.vmap(lambda guess: self._guess(context, guess))(rows)
+        points = jax.vmap(lambda guess: self._guess(context, guess))(rows)
+        network = self._network
+        if network is None or context.times.size > 1:
+            return points
+        change = network(start_features(context))
+        cost = lambda point: self.objective(point, context).cost  # noqa: E731
+        return points.at[0].set(cheaper_start(cost, points[0], change))
 
     def _guess(self, context: CatchContext, guess: Array) -> Array:
         """The point (n,) of later times, velocities and thrusts, a row of `_GUESSES`."""

@@ -11,7 +11,8 @@ from jax import Array
 
 from planner_jax.cost.penalty import joined_trapezoid_weights, smoothed_hinge, steep_hinge
 from planner_jax.cost.quadrotor import ground_excess, speed_excess
-from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
+from planner_jax.optimise.evaluation import Evaluation
+from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.problem import Round, Stage
 from planner_jax.protocol import require_settings

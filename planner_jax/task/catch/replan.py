@@ -15,7 +15,8 @@ from flax import struct
 from jax import Array
 
 from planner_jax.checks import require_path
-from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
+from planner_jax.optimise.evaluation import Evaluation
+from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.problem import Round
 from planner_jax.planning.replan import Replanning, given_or_own, moment_of

@@ -14,7 +14,8 @@ from planner_jax.ball.impact import required_impact
 from planner_jax.ball.prediction import target_at
 from planner_jax.cost.penalty import joined_trapezoid_weights, smoothed_hinge
 from planner_jax.cost.quadrotor import motion_excess
-from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
+from planner_jax.optimise.evaluation import Evaluation
+from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.problem import Round
 from planner_jax.protocol import require_settings

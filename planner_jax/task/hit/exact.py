@@ -25,11 +25,15 @@ from planner_jax.ball.impact import required_impact
 from planner_jax.ball.prediction import LEAST_NODES, target_at
 from planner_jax.checks import require_size
 from planner_jax.cost.along import Along, greatest_along, integrate_along
+from planner_jax.cost.along_curvature import curvature_along
 from planner_jax.cost.contact import apex_excess, hitting_speed_excess
 from planner_jax.cost.penalty import smoothed_hinge
 from planner_jax.cost.quadrotor import Measure, flight_along, limits_along, relative_excess
 from planner_jax.lanes import in_one_kernel
-from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
+from planner_jax.optimise.evaluation import Evaluation
+from planner_jax.optimise.lbfgs import LbfgsConfig
+from planner_jax.optimise.learned_start import StartNetwork, cheaper_start, shipped_network
+from planner_jax.optimise.newton import Curvature
 from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.problem import Round
 from planner_jax.optimise.scaling import shipped_scale
@@ -51,6 +55,8 @@ from planner_jax.trajectory.proportional_minco import (
 )
 
 _ORDER = 4  # minimum snap
+_PROPORTIONS = (0.2, 0.5) + (1.0,) * 10
+_SEEN = (0.5, 0.75, 0.95)  # of the landing time, at which a learned start looks at the ball
 _DECODE_NODES = 16  # intervals a piece at which a finished plan is looked at
 
 
@@ -74,6 +80,35 @@ _GUESSES = np.array(
 )
 
 
+def start_features(context: HitContext) -> Array:
+    """What a learned start is made from, (F,): ball, target, quadrotor and limits."""
+    case, lands = context.case, context.landing_time
+    head, limits, stroke = case.head_state, case.limits, case.hit_limits
+    seen = [target_at(context.path, share * lands) for share in _SEEN]
+    acceleration = limits.max_thrust if limits.acceleration is None else limits.acceleration
+    numbers = (
+        *(part for ball in seen for part in (ball.pos - head[0], ball.vel)),
+        case.target - head[0],
+        head[1],
+        0.2 * head[2],
+        0.02 * head[3],
+        jnp.log(stroke.hitting_speed),
+        jnp.stack(
+            [
+                lands,
+                head[0, 2] - limits.min_height,
+                *map(jnp.log, (limits.speed, acceleration, limits.body_rate, case.gravity)),
+                case.restitution,
+                case.racket_height,
+                case.drag,
+                stroke.min_apex,
+                stroke.max_apex,
+            ]
+        ),
+    )
+    return jnp.concatenate(numbers)
+
+
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class ExactHit(OptimisedPlanner):
@@ -93,7 +128,7 @@ class ExactHit(OptimisedPlanner):
     case_type = HitCase
     # Relative durations of the pieces. The first are short, because a hovering quadrotor has
     # to begin to turn at once and its jerk is continuous.
-    proportions: tuple[float, ...] = (0.2, 0.5) + (1.0,) * 10
+    proportions: tuple[float, ...] = _PROPORTIONS
     nodes: int = 4  # penalty intervals a piece
     num_table_nodes: int = 36
     drag_after_impact: bool = False
@@ -104,20 +139,26 @@ class ExactHit(OptimisedPlanner):
     # The first two solve what is easy. Where limits bind all along the way, energy is worth
     # nothing any more and the margin has to give: the others look for any feasible plan.
     rounds: tuple[Round, ...] = (
-        Round(starts=1, solver=LbfgsConfig(max_steps=7)),
+        Round(starts=1, solver=LbfgsConfig(max_steps=3)),
         Round(starts=1, solver=LbfgsConfig(max_steps=60)),
         Round(
             starts=8,
             solver=LbfgsConfig(max_steps=80),
-            settings=(("energy_weight", 1e-10), ("margin", 0.015)),
+            settings=(("energy_weight", 1e-10), ("margin", 0.015), ("learned", False)),
         ),
         Round(
             starts=12,
             solver=LbfgsConfig(max_steps=400, memory=12, tolerance=1e-6, patience=5),
-            settings=(("energy_weight", 1e-11), ("margin", 0.01), ("nodes", 6)),
+            settings=(
+                ("energy_weight", 1e-11),
+                ("margin", 0.01),
+                ("nodes", 6),
+                ("learned", False),
+            ),
         ),
     )
     scale: tuple[float, ...] = ()
+    learned: bool = True  # whether a network makes the first guess, where there is one
 
     def __post_init__(self) -> None:
         require_settings(self)
@@ -138,6 +179,15 @@ class ExactHit(OptimisedPlanner):
     def num_pieces(self) -> int:
         """M."""
         return len(self.proportions)
+
+    @property
+    def _network(self) -> StartNetwork | None:
+        """That makes the first guess; there is one for the shipped sizes."""
+        name = f"exact-{self.num_pieces}"
+        is_shipped = self.proportions == _PROPORTIONS and self.scale == shipped_scale(
+            __package__, name
+        )
+        return shipped_network(__package__, name) if self.learned and is_shipped else None
 
     @property
     def maps(self) -> ProportionalMinco:
@@ -167,7 +217,13 @@ class ExactHit(OptimisedPlanner):
             axis=1,
         )
         natural = jnp.pad(times, ((0, 0), (self.num_offsets, 5)))
-        return natural / jnp.asarray(self.scale, natural.dtype)
+        points = natural / jnp.asarray(self.scale, natural.dtype)
+        network = self._network
+        if network is None:
+            return points
+        change = network(start_features(context))
+        cost = lambda point: self.objective(point, context).cost  # noqa: E731
+        return points.at[0].set(cheaper_start(cost, points[0], change))
 
     def impact(self, natural: Array, context: HitContext) -> Impact:
         """The impact that the variables after the waypoint offsets describe.
@@ -265,6 +321,61 @@ class ExactHit(OptimisedPlanner):
         at_impact = self._at_impact(impact, context)
         energy = self.energy_weight * boundary_energy(self.maps, rows, duration)
         return rows, duration, self._hinges(at_impact) + energy, jnp.max(at_impact)
+
+    def curved(self, point: Array, context: HitContext) -> Curvature:
+        """Evaluation, gradient, and products with the Hessian, which is made as a whole."""
+        offsets, natural = self._split(point)
+        scale = jnp.asarray(self.scale, point.dtype)
+        own_scale, offset_scale = (
+            scale[self.num_offsets :],
+            scale[: self.num_offsets].reshape(-1, 3),
+        )
+        rows, duration, core, at_impact = in_one_kernel(ExactHit.ends, self)(natural, context)
+        num_given = _ORDER  # rows of the head state
+        along = curvature_along(
+            self._along(self.nodes, context.case),
+            jnp.concatenate([rows, offsets]),
+            duration,
+            (context.case.gravity, context.case.limits, context.case.extras),
+            num_given,
+        )
+        by_tail, by_offsets = along.by_columns[:_ORDER], along.by_columns[_ORDER:]
+
+        def pulled(natural: Array) -> tuple[Array, Array]:
+            rows, _, core, _ = self.ends(natural, context)
+            tail = rows[_ORDER:]
+            return jnp.sum(by_tail * tail) + core, tail
+
+        def slope(natural: Array) -> tuple[Array, Array]:
+            return jax.grad(pulled, has_aux=True)(natural)
+
+        unit = jnp.asarray(np.eye(own_scale.size), point.dtype)
+        tangent = lambda unit: jax.jvp(slope, (natural,), (unit,))  # noqa: E731
+        (by_natural, _), (within, tails) = jax.vmap(tangent, out_axes=((None, None), 0))(unit)
+        # (8, 8), (8, 4, 3): Hessian of what is pulled back, and how the rows move.
+        energy = self.energy_weight * offset_energy(self.maps, offsets, duration)
+        power = 2 * _ORDER - 1
+        bend = 2.0 * self.energy_weight * self.maps.offset_energy / duration**power
+        by_offsets = (by_offsets + bend * offsets) * offset_scale
+        by_natural = by_natural.at[0].add(along.by_theta - power * energy)
+        theta_theta = along.theta_theta + power**2 * energy
+
+        def product(direction: Array) -> Array:
+            step, move = self._split(direction)
+            columns = jnp.concatenate([jnp.tensordot(move, tails, 1), step])
+            image = jnp.tensordot(along.columns_columns, columns, 2)
+            image = image + along.columns_theta * move[0]
+            theta = jnp.sum(along.columns_theta * columns) + theta_theta * move[0]
+            theta = theta - power * bend * jnp.sum(offsets * step)
+            own = jnp.tensordot(tails, image[:_ORDER], 2) + within @ move
+            own = own.at[0].add(theta)
+            outer = image[_ORDER:] + bend * step
+            outer = outer - power * bend * offsets * move[0]
+            return jnp.concatenate([(outer * offset_scale).ravel(), own * own_scale])
+
+        violation = jnp.maximum(along.worst, at_impact) + 0.004
+        evaluation = Evaluation(cost=along.penalty + core + energy, violation=violation)
+        return evaluation, jnp.concatenate([by_offsets.ravel(), by_natural * own_scale]), product
 
     def _hinges(self, at_impact: Array) -> Array:
         hinges = smoothed_hinge(at_impact + self.margin, self.hinge_width)

@@ -15,7 +15,8 @@ import numpy as np
 from flax import struct
 from jax import Array, lax
 
-from planner_jax.optimise.lbfgs import Evaluation, LbfgsConfig
+from planner_jax.optimise.evaluation import Evaluation
+from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.levenberg import LevenbergConfig, Model, least_squares
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.problem import Round

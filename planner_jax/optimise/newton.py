@@ -1,0 +1,283 @@
+"""Newton's method for small smooth problems, many at once.
+
+Each iteration builds a subspace of a few vectors from the gradient by products with the Hessian
+(Lanczos 1950), in which the Hessian is tridiagonal. Where it bends downward there, it is shifted
+until it does not, as in trust-region methods (More and Sorensen 1983; in such a subspace Gould,
+Lucidi, Roma and Toint 1999). Steps of several dampings, which cost a few operations each, are tried
+at once, because under `vmap` a search for the right one would run to the slowest lane. As in
+`optimise.lbfgs` feasibility is watched beside the cost, and the best feasible iterate comes back.
+
+A few vectors are enough since the variables are scaled: the curvature of most is one.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import Array
+
+from planner_jax.checks import numeric, require_number, require_size, told
+from planner_jax.optimise.evaluation import Evaluation, Objective, better
+
+# Evaluation at a point (n,), gradient (n,), and the product of the Hessian with a direction (n,).
+Curvature = tuple[Evaluation, Array, Callable[[Array], Array]]
+Curved = Callable[[Array], Curvature]
+
+_HALVINGS = 14  # of the interval in which the least eigenvalue is looked for
+_LEAST = 1e-7  # of a pivot, beside the greatest number of its matrix
+
+
+@dataclasses.dataclass(frozen=True)
+class NewtonConfig:
+    """Sizes and switches of the solver: hashable, so static under jit."""
+
+    max_steps: int = 6
+    subspace: int = 8  # vectors
+    damping: float = 1e-3  # at first
+    trial_dampings: tuple[float, ...] = (0.01, 0.1, 1.0, 10.0)  # times a lane's own, tried at once
+    ease: float = 0.5  # of the damping, after a step that is kept
+    tighten: float = 16.0  # of the damping, where no trial lowers the cost
+    step_cap: float = 3.0  # largest Euclidean length of a step
+    tolerance: float = 1e-4  # decrease that is expected, relative to the cost, that counts as none
+    patience: int = 3  # iterations without a decrease before a lane is stationary
+    # Shares of the lanes that go on, those with most to gain, and their iterations.
+    stragglers: tuple[tuple[float, int], ...] = ()
+
+    def __post_init__(self) -> None:
+        for name, least in (("max_steps", 0), ("subspace", 1), ("patience", 0)):
+            require_size(name, getattr(self, name), least)
+        for name in ("damping", "ease", "tighten", "step_cap", "tolerance"):
+            require_number(name, getattr(self, name), "finite and >= 0", lambda x: x >= 0.0)
+        trials = self.trial_dampings
+        if not isinstance(trials, tuple) or any(numeric(each) is None for each in trials):
+            raise TypeError(f"trial_dampings must be a tuple of numbers, got {told(trials)}")
+        if not trials or not all(0.0 <= each < jnp.inf for each in trials):
+            raise ValueError(f"trial_dampings must be finite and >= 0, one or more, got {trials}")
+
+
+@struct.dataclass
+class NewtonNumbers:
+    """What one lane carries from iteration to iteration beside its points."""
+
+    best: Evaluation  # at the best point; not finite before the first iteration
+    damping: Array  # ()
+    expected: Array  # (), decrease that the last iteration expected, relative to the cost
+    iteration: Array  # () int32
+    stalled: Array  # () int32, iterations in a row without a decrease
+
+
+@struct.dataclass
+class NewtonState:
+    """What one lane carries from iteration to iteration."""
+
+    point: Array  # (n,)
+    best_point: Array  # (n,)
+    numbers: NewtonNumbers
+
+
+def by_products(objective: Objective) -> Curved:
+    """The second derivatives of any objective, a tangent of its gradient for each product."""
+
+    def curved(point: Array) -> Curvature:
+        def slope(at: Array) -> tuple[Array, Evaluation]:
+            def cost(x: Array) -> tuple[Array, Evaluation]:
+                evaluation = objective(x)
+                return evaluation.cost, evaluation
+
+            by, evaluation = jax.grad(cost, has_aux=True)(at)
+            return by, evaluation
+
+        gradient, product, evaluation = jax.linearize(slope, point, has_aux=True)
+        return evaluation, gradient, product
+
+    return curved
+
+
+def init(point: Array, config: NewtonConfig) -> NewtonState:
+    """State before the first iteration; nothing is evaluated."""
+    unknown = jnp.full((), jnp.inf, point.dtype)
+    return NewtonState(
+        point=point,
+        best_point=point,
+        numbers=NewtonNumbers(
+            best=Evaluation(unknown, unknown),
+            damping=jnp.full((), config.damping, point.dtype),
+            expected=unknown,
+            iteration=jnp.zeros((), jnp.int32),
+            stalled=jnp.zeros((), jnp.int32),
+        ),
+    )
+
+
+def is_unfinished(numbers: NewtonNumbers, config: NewtonConfig) -> Array:
+    """Whether a lane has iterations left and is not stationary, () bool."""
+    return (numbers.iteration < config.max_steps) & ~is_stationary(numbers, config)
+
+
+def is_stationary(numbers: NewtonNumbers, config: NewtonConfig) -> Array:
+    """Whether nothing more is to be gained, () bool."""
+    return (numbers.expected <= config.tolerance) | (numbers.stalled >= config.patience)
+
+
+def most_to_gain(numbers: NewtonNumbers, num: int) -> Array:
+    """The lanes (num,) of a batch whose last iterations expected the greatest decreases."""
+    expected = jnp.where(jnp.isnan(numbers.expected), jnp.inf, numbers.expected)
+    return jnp.argsort(-expected)[:num]
+
+
+def step(
+    objective: Objective, curved: Curved, state: NewtonState, config: NewtonConfig
+) -> NewtonState:
+    """One iteration: gradient, subspace, steps of all dampings at once, the lowest kept.
+
+    A finished lane stands still.
+    """
+    here, gradient, product = curved(state.point)
+    dampings = state.numbers.damping * jnp.asarray(config.trial_dampings, gradient.dtype)
+    steps, decrease = damped_steps(gradient, product, dampings, config)
+    trials = jax.vmap(lambda step: objective(state.point + step))(steps)
+    numbers, chosen, is_better, going = _chosen(
+        config, state.numbers, here, dampings, trials, decrease
+    )
+    point = state.point + jnp.where(going, chosen @ steps, 0.0)
+    return NewtonState(
+        point=point,
+        best_point=jnp.where(is_better, point, state.best_point),
+        numbers=numbers,
+    )
+
+
+def damped_steps(
+    gradient: Array, product: Callable[[Array], Array], dampings: Array, config: NewtonConfig
+) -> tuple[Array, Array]:
+    """Newton steps within the subspace, of every damping.
+
+    Args:
+        gradient: (n,).
+        product: of the Hessian with a direction.
+        dampings: (k,), added to the Hessian's diagonal.
+        config: sizes and switches, static.
+
+    Returns:
+        steps: (k, n), none longer than the step cap.
+        decrease: (), of the cost that the step without damping promises.
+    """
+    size = jnp.sqrt(jnp.sum(gradient**2))
+    vectors, diagonal, beside = _lanczos(gradient, size, product, config.subspace)
+    lowest = _least_eigenvalue(diagonal, beside)
+    shift = jnp.maximum(-lowest, 0.0)
+    solve = lambda damping: _tridiagonal_solve(diagonal, beside, shift + damping)  # noqa: E731
+    inside = size * jax.vmap(solve)(dampings)  # (k, m)
+    steps = -inside @ vectors
+    lengths = jnp.sqrt(jnp.sum(steps**2, axis=1, keepdims=True))
+    steps = steps * jnp.minimum(1.0, config.step_cap / jnp.maximum(lengths, 1e-20))
+    promised = 0.5 * size**2 * solve(jnp.zeros_like(size))[0]
+    return jnp.where(jnp.isfinite(steps), steps, 0.0), promised
+
+
+def _lanczos(
+    gradient: Array, size: Array, product: Callable[[Array], Array], num: int
+) -> tuple[Array, list[Array], list[Array]]:
+    """Orthonormal vectors (m, n) of the subspace, and the Hessian there.
+
+    Returns its diagonal, m numbers, and what stands beside it, m - 1 numbers.
+    """
+    num = min(num, gradient.size)
+    first = gradient / jnp.maximum(size, 1e-30)
+    vectors = jnp.zeros((num, gradient.size), gradient.dtype).at[0].set(first)
+    vector, diagonal, beside = first, [], []
+    for k in range(num):
+        image = product(vector)
+        diagonal.append(jnp.sum(vector * image))
+        if k + 1 == num:
+            break
+        # Against all that went before, since rounding would bring them back.
+        image = image - (vectors @ image) @ vectors
+        length = jnp.sqrt(jnp.sum(image**2))
+        # An invariant subspace ends here: what follows is a vector of zeros.
+        is_new = length > 1e-6 * jnp.abs(diagonal[-1])
+        vector = jnp.where(is_new, image / jnp.where(is_new, length, 1.0), 0.0)
+        beside.append(jnp.where(is_new, length, 0.0))
+        vectors = vectors.at[k + 1].set(vector)
+    return vectors, diagonal, beside
+
+
+def _pivots(diagonal: list[Array], beside: list[Array], shift: Array) -> list[Array]:
+    """Of the tridiagonal matrix with a number added to its diagonal; none is zero."""
+    scale = functools.reduce(jnp.maximum, [jnp.abs(each) for each in (*diagonal, *beside)])
+    least = _LEAST * scale + 1e-30
+    found = []
+    for k, entry in enumerate(diagonal):
+        pivot = entry + shift
+        if k:
+            pivot = pivot - beside[k - 1] ** 2 / found[-1]
+        found.append(jnp.where(jnp.abs(pivot) < least, least, pivot))
+    return found
+
+
+def _least_eigenvalue(diagonal: list[Array], beside: list[Array]) -> Array:
+    """Of the tridiagonal matrix, from below, by the signs of pivots (Sturm)."""
+    around = [*(jnp.abs(each) for each in beside)]
+    zero = jnp.zeros_like(diagonal[0])
+    reach = [
+        (around[k - 1] if k else zero) + (around[k] if k < len(around) else zero)
+        for k in range(len(diagonal))
+    ]
+    low = functools.reduce(jnp.minimum, [d - r for d, r in zip(diagonal, reach, strict=True)])
+    high = functools.reduce(jnp.minimum, diagonal)
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        pivots = _pivots(diagonal, beside, -middle)
+        is_below = functools.reduce(jnp.logical_or, [pivot < 0.0 for pivot in pivots])
+        low, high = jnp.where(is_below, low, middle), jnp.where(is_below, middle, high)
+    return low
+
+
+def _tridiagonal_solve(diagonal: list[Array], beside: list[Array], shift: Array) -> Array:
+    """Solution (m,) of the shifted tridiagonal system, the first unit vector on its right."""
+    pivots = _pivots(diagonal, beside, shift)
+    right = [jnp.ones_like(pivots[0])]
+    for k in range(1, len(pivots)):
+        right.append(-beside[k - 1] / pivots[k - 1] * right[-1])
+    found = [right[-1] / pivots[-1]]
+    for k in reversed(range(len(pivots) - 1)):
+        found.append((right[k] - beside[k] * found[-1]) / pivots[k])
+    return jnp.stack(found[::-1])
+
+
+def _chosen(
+    config: NewtonConfig,
+    numbers: NewtonNumbers,
+    here: Evaluation,
+    dampings: Array,
+    trials: Evaluation,
+    decrease: Array,
+) -> tuple[NewtonNumbers, Array, Array, Array]:
+    """What an iteration comes to: numbers, shares of the trials, if it is best, if it counts."""
+    costs = jnp.where(jnp.isfinite(trials.cost), trials.cost, jnp.inf)
+    is_chosen = jnp.arange(costs.size) == jnp.argmin(costs)
+
+    def of_chosen(values: Array) -> Array:  # without a gather, which would need a loop of its own
+        return jnp.sum(jnp.where(is_chosen, values, 0.0))
+
+    decreased = of_chosen(costs) < here.cost
+    there = jax.tree.map(lambda new, old: jnp.where(decreased, of_chosen(new), old), trials, here)
+    best = jax.tree.map(lambda a, b: jnp.where(numbers.iteration == 0, a, b), here, numbers.best)
+    is_better = better(there, best)
+    damping = jnp.where(
+        decreased, of_chosen(dampings) * config.ease, numbers.damping * config.tighten
+    )
+    after = NewtonNumbers(
+        best=jax.tree.map(lambda a, b: jnp.where(is_better, a, b), there, best),
+        damping=jnp.clip(damping, 1e-8, 1e8),
+        expected=decrease / jnp.maximum(jnp.abs(here.cost), 1e-30),
+        iteration=numbers.iteration + 1,
+        stalled=jnp.where(decreased, 0, numbers.stalled + 1),
+    )
+    going = is_unfinished(numbers, config)
+    after = jax.tree.map(lambda new, old: jnp.where(going, new, old), after, numbers)
+    shares = jnp.where(is_chosen & decreased, 1.0, 0.0)
+    return after, shares, is_better & going, going
