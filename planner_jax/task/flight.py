@@ -8,6 +8,16 @@ from jax import Array
 
 from planner_jax.robot.quadrotor import QuadrotorLimits, RotorLimits
 from planner_jax.robot.quadrotor_model import NET, QuadrotorModel, Tool
+from planner_jax.rules import require_rule
+
+# Fields of a case, by which its rules know them, that are arguments of what makes it.
+ARGUMENTS = {
+    "head_state": "start",
+    **{
+        f"limits.{name}": name
+        for name in ("speed", "acceleration", "body_rate", "min_thrust", "max_thrust", "min_height")
+    },
+}
 
 
 def require_tool(robot: Any, kind: str) -> Tool:
@@ -18,10 +28,18 @@ def require_tool(robot: Any, kind: str) -> Tool:
         ValueError: it carries another tool than one of this kind.
     """
     if not isinstance(robot, QuadrotorModel):
-        raise TypeError(f"robot must be a QuadrotorModel, got {robot!r:.60}")
+        rule = "a QuadrotorModel, such as pj.robot_named('x500') or pj.read_robot('my.yaml')"
+        raise TypeError(f"robot must be {rule}, got {robot!r:.60}")
     if robot.tool.kind != kind:
         raise ValueError(f"robot must carry a {kind}, got {robot.name!r} with a {robot.tool.kind}")
     return robot.tool
+
+
+def require_start(cases: Any) -> None:
+    """Raise `CaseError` if a quadrotor begins below its least height, which no plan may do."""
+    height, least = (np.asarray(x) for x in (cases.head_state[..., 0, 2], cases.limits.min_height))
+    words = "at a height >= min_height"
+    require_rule("start", height, height >= least, words, cases.batch_shape)
 
 
 def require_own_robot(robot: Any, usual: QuadrotorModel, suite: str) -> None:
