@@ -20,6 +20,13 @@ def told(value: Any) -> str:
     return " ".join(f"{value!r}".split())[:60]
 
 
+def shapes_told(tree: Any) -> str:
+    """Names and shapes of the leaves of a pytree in one line, for a message."""
+    parts = jax.tree_util.tree_leaves_with_path(tree)
+    names = (jax.tree_util.keystr(place, simple=True, separator=".") for place, _ in parts)
+    return ", ".join(f"{n} {np.shape(leaf)}" for n, (_, leaf) in zip(names, parts, strict=True))
+
+
 def require_size(name: str, value: Any, least: int = 1) -> None:
     """Raise unless an argument is a whole number that is not too small."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
@@ -157,7 +164,9 @@ def require_beginning(name: str, tree: Any, shape: tuple[int, ...], words: str) 
             )
 
 
-def require_path(name: str, path: Any, axes: tuple[int, ...], dimensions: int) -> None:
+def require_path(
+    name: str, path: Any, axes: tuple[int, ...], dimensions: int, whose: str = ""
+) -> None:
     """Raise unless an argument is a target's path, or an array of them.
 
     Args:
@@ -165,6 +174,7 @@ def require_path(name: str, path: Any, axes: tuple[int, ...], dimensions: int) -
         path: a pytree with a method `at(time)`.
         axes: that its leaves have in front of those of one path.
         dimensions: of the positions, 2 or 3.
+        whose: the argument that has decided about the axes, for the message.
 
     Raises:
         TypeError: it has no such method, or no positions come of it.
@@ -172,14 +182,16 @@ def require_path(name: str, path: Any, axes: tuple[int, ...], dimensions: int) -
     """
     if isinstance(path, type) or not callable(getattr(path, "at", None)):
         raise TypeError(f"{name} must be a path, with a method at(time), got {told(path)}")
-    require_beginning(name, path, axes, f"the shape {axes}")
+    of = f" of {whose}" if whose else ""
+    require_beginning(name, path, axes, f"the shape {axes}{of}")
     leaves, tree = jax.tree.flatten(path)
     layout = tuple((np.shape(leaf), numeric(leaf).dtype) for leaf in leaves)
     try:
         found = _shape_of_positions(tree, layout, axes)
     except (TypeError, ValueError, IndexError, AttributeError) as error:
-        found = f"a {type(path).__name__} that raises {type(error).__name__}"
-        raise TypeError(f"{name} must be a path with the axes {axes}, got {found}") from error
+        rule = f"a path of which at(time) gives a position, with the axes {axes}{of}"
+        found = f"a {type(path).__name__} with {shapes_told(path)}"
+        raise TypeError(f"{name} must be {rule}, got {found}") from error
     if found != (*axes, dimensions):
         rule = f"the shape {(*axes, dimensions)}"
         raise ValueError(f"{name} must give positions of {rule}, got {found}")

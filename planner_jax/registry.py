@@ -122,9 +122,17 @@ class Task:
 
         Raises:
             UnknownName: there is no planner of that name, or it needs a file or takes none.
+            TypeError: the planner has no such option.
         """
         planner, file = self.split_planner(name)
-        return _resolved(self.all_planners()[planner])(*filter(None, [file]), **options)
+        maker = _resolved(self.all_planners()[planner])
+        if isinstance(maker, type) and dataclasses.is_dataclass(maker):
+            known = [field.name for field in dataclasses.fields(maker) if field.init]
+            for option in options:
+                if option not in known:
+                    rule = f"one of {', '.join(known)}" if known else "left out"
+                    raise TypeError(f"option of planner {planner} must be {rule}, got {option!r}")
+        return maker(*filter(None, [file]), **options)
 
     def other_suite(self, name: str) -> Callable[..., Any]:
         """What draws a suite of another package: `draw(num, seed, first)`.

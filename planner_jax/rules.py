@@ -7,7 +7,8 @@ by lane, of which `planner_jax.planning` makes the status `BAD_INPUT`.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import jax
@@ -101,12 +102,13 @@ def has_rules(cases: Any) -> bool:
     return any(True for _ in _parts(cases))
 
 
-def require_sound(cases: Any) -> None:
+def require_sound(cases: Any, names: Mapping[str, str] | None = None) -> None:
     """Raise for the first rule that some lane of the cases breaks, in one line.
 
     Args:
         cases: one case, or a batch, in arrays of any kind. Classes without `rules` pass; of traced
             arrays, which have no values yet, only shape and kind are looked at.
+        names: of fields, as the caller knows them: of the arguments that they were made of.
 
     Raises:
         CaseError: a number breaks its rule; the line has the field, the rule, the value and the
@@ -120,7 +122,11 @@ def require_sound(cases: Any) -> None:
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(cases)):
         return
     for ruled in all_ruled(jax.tree.map(np.asarray, cases)):
-        require_rule(ruled.name, ruled.value, ruled.holds(), ruled.rule.words, cases.batch_shape)
+        name, words = ruled.name, ruled.rule.words
+        for field, argument in (names or {}).items():
+            name = argument if name == field else name
+            words = words.replace(field, argument)
+        require_rule(name, ruled.value, ruled.holds(), words, cases.batch_shape)
 
 
 def require_rule(name: str, value: Any, holds: Any, words: str, batch: tuple[int, ...]) -> None:
@@ -158,7 +164,7 @@ def require_shapes(cases: Any) -> None:
     """
     for place, part in _parts(cases):
         sizes: dict[str, int] = {}
-        batch = getattr(part, "batch_shape", ())
+        batch = _usual_batch(part)
         for each in dataclasses.fields(part):
             if getattr(part, each.name) is None and each.default is not None:
                 raise TypeError(f"{place}{each.name} must be given, got None")
@@ -184,8 +190,21 @@ def require_shapes(cases: Any) -> None:
             else:
                 known = [sizes.get(want, want) for want in field.shape]  # type: ignore[arg-type]
             if shape != (*batch, *known):
-                wanted = ", ".join(map(str, (*batch, *known)))
-                raise ValueError(f"{name} must have the shape ({wanted}), got {shape}")
+                wanted = ", ".join(map(str, whole := (*batch, *known)))
+                comma = "," if len(whole) == 1 else ""
+                raise ValueError(f"{name} must have the shape ({wanted}{comma}), got {shape}")
+
+
+def _usual_batch(part: Any) -> tuple[int, ...]:
+    """The axes that most arrays of a part have in front of those of one case.
+
+    So the one array that is of another batch is named, whichever it is.
+    """
+    fronts: Counter[tuple[int, ...]] = Counter()
+    for name, size in {field.name: field.shape for field in type(part).rules}.items():
+        if size is not None and (value := named(part, name)) is not None:
+            fronts[np.shape(value)[: max(np.ndim(value) - len(size), 0)]] += 1
+    return fronts.most_common(1)[0][0] if fronts else ()
 
 
 _PLAIN = (np.ndarray, str, bytes)  # of which NumPy knows the kind, numbers or not

@@ -155,9 +155,9 @@ def test_a_case_gives_its_extras_the_shape_of_the_batch():
     cases = pj.hit.case(pos, vel, target, extras=(one, many))
     assert [leaf.shape for leaf in jax.tree.leaves(cases.extras)] == [(3, 3), (3, 3), (3, 3), (3,)]
     assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(cases.extras))
-    with pytest.raises(ValueError, match="for one case or have axes"):
+    with pytest.raises(ValueError, match="for one case, or have the axes"):
         pj.hit.case(pos, vel, target, extras=(pj.KeepOut(np.ones(3), np.ones(2)),))
-    with pytest.raises(ValueError, match="for one case or have axes"):
+    with pytest.raises(ValueError, match="for one case, got a KeepOut"):
         for_batch((many,), (), jnp.float32)
 
 

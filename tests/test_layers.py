@@ -47,7 +47,7 @@ ALLOWED = {
     "perception": {"ball"},
     "trajectory": {"arithmetic"},
     "robot": {"arithmetic", "checks", "plain_files", "protocol", "registry", "trajectory"},
-    "plane": {"checks", "rules"},
+    "plane": {"checks", "registry", "rules"},
     "space": set(),
     "cost": {"arithmetic", "checks", "lanes", "robot", "rules", "trajectory"},
     "optimise": {"checks", "lanes", "protocol"},

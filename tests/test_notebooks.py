@@ -20,3 +20,11 @@ def test_notebook_runs(path, tmp_path):
         output.get("text", "") for cell in notebook.cells for output in cell.get("outputs", [])
     )
     assert "confirmed" in printed
+
+
+def test_from_a_measured_ball_to_setpoints_are_six_lines():
+    path = next(path for path in NOTEBOOKS if path.stem == "08_your_robot")
+    cells = nbformat.read(path, as_version=4).cells
+    (way,) = [cell.source for cell in cells if "six-lines" in cell.metadata.get("tags", [])]
+    assert "loadtxt" in way and 'to="csv"' in way
+    assert len([line for line in way.splitlines() if line.strip()]) <= 6

@@ -426,15 +426,15 @@ SERVE = ([2.0, 0.0, 2.0], [-4.0, 0.0, 7.0], [4.0, 0.0, 0.0])
 @pytest.mark.parametrize(
     "setting, says",
     [
-        ({"speed": -5.0}, "limits.speed must be > 0, got -5"),
-        ({"acceleration": 0.0}, "limits.acceleration must be > 0, got 0"),
-        ({"body_rate": float("nan")}, "limits.body_rate must be finite, got nan"),
-        ({"min_height": -0.1}, "limits.min_height must be >= 0, got -0.1"),
-        ({"hitting_speed": (4.0, -3.0, 4.0)}, "hit_limits.hitting_speed must be > 0, got -3"),
+        ({"speed": -5.0}, "speed must be > 0, got -5"),
+        ({"acceleration": 0.0}, "acceleration must be > 0, got 0"),
+        ({"body_rate": float("nan")}, "body_rate must be finite, got nan"),
+        ({"min_height": -0.1}, "min_height must be >= 0, got -0.1"),
+        ({"hitting_speed": (4.0, -3.0, 4.0)}, "hitting_speed must be > 0, got -3"),
         ({"gravity": 0.0}, "gravity must be > 0, got 0"),
         ({"drag": -0.1}, "drag must be >= 0, got -0.1"),
         ({"restitution": 1.2}, "restitution must be in [0, 1], got 1.2"),
-        ({"min_apex": 7.0}, "hit_limits.min_apex must be < hit_limits.max_apex, got 7"),
+        ({"min_apex": 7.0}, "min_apex must be < max_apex, got 7"),
     ],
 )
 def test_a_setting_out_of_range_is_named(setting, says):
@@ -477,7 +477,7 @@ def test_the_first_bad_lane_is_named_and_the_others_counted():
     with pytest.raises(CaseError, match=message):
         check_cases(pj.hit.case(*batch))
     batch[0][1, 1] = np.nan
-    with pytest.raises(CaseError, match="^ball.pos must be finite, got nan in lane 1$"):
+    with pytest.raises(CaseError, match="^serve_pos must be finite, got nan in lane 1$"):
         check_cases(pj.hit.case(*batch))
     batch[0][1] = [2.0, 0.0, -1.0]
     with pytest.raises(CaseError, match="^serve_pos must be at a height >= 0 m, got -1 in lane 1$"):

@@ -144,3 +144,10 @@ def test_a_path_of_a_users_own_class_is_caught():
     one = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (case, found))
     verdict = referee_catches(*one, target_states=flown)
     assert verdict.success.all(), verdict.sentence(0)
+
+
+def test_a_case_is_made_inside_of_a_compiled_function():
+    ball = BallState(jnp.zeros((1, 3)), jnp.zeros((1, 3)))
+    path = BallPath(ball, drag=jnp.zeros((1, 3)), gravity=jnp.full(1, 9.81))
+    made = jax.jit(lambda speed: pj.catch.case(path, np.ones(1), speed=3.0).limits.speed * speed)
+    assert made(2.0) == 6.0

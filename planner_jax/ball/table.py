@@ -9,6 +9,7 @@ from jax.core import Tracer
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from planner_jax.ball.prediction import PathTable, convolution_weights
+from planner_jax.checks import floating, require_number, require_size, shape_of
 
 MOST_NODES = 4096  # that are chosen for a path
 _CHECKED = (0.2, 0.5, 0.8)  # shares of the way between two nodes, where errors are looked for
@@ -49,8 +50,9 @@ def table_path(
     Raises:
         ValueError: the times do not rise or leave out time 0, a shape does not fit, or the path
             needs more than `MOST_NODES`.
+        TypeError: an argument holds no numbers, or `dtype` is not that of floating ones.
     """
-    times = _checked_times(times)
+    dtype, times = floating(dtype), _checked_times(times)
     given = [("positions", positions), ("velocities", velocities)]
     values = [_checked(name, value, times.size) for name, value in given if value is not None]
     if len(values) == 2 and np.shape(values[0]) != np.shape(values[1]):
@@ -60,8 +62,7 @@ def table_path(
         )
     if nodes is None:
         nodes = _fewest_nodes(times, values, error)
-    elif nodes < 5:
-        raise ValueError(f"nodes must be >= 5, got {nodes}")
+    require_size("nodes", nodes, 5)
     resolution = times[-1] / (nodes - 3)
     at = (np.arange(nodes) - 1) * resolution
     pos, vel = (jnp.asarray(_read(times, values, at, order), dtype) for order in (0, 1))
@@ -71,9 +72,10 @@ def table_path(
 def _checked_times(times: Any) -> np.ndarray:
     if isinstance(times, Tracer):
         raise ValueError("times must be known when a program is compiled, got traced ones")
+    shape = shape_of("times", times)
+    if len(shape) != 1 or shape[0] < 2:
+        raise ValueError(f"times must have the shape (K,) with K >= 2, got {shape}")
     times = np.asarray(times, np.float64)
-    if times.ndim != 1 or times.size < 2:
-        raise ValueError(f"times must have the shape (K,) with K >= 2, got {times.shape}")
     steps = np.diff(times)
     if not np.isfinite(times).all() or not (steps > 0.0).all():
         raise ValueError(f"times must be finite and rise, got a step of {steps.min():g} s")
@@ -87,7 +89,7 @@ def _checked_times(times: Any) -> np.ndarray:
 
 def _checked(name: str, value: Any, num: int) -> Any:
     """Values (..., K, 3), in float64 if they are not traced."""
-    if np.shape(value)[-2:] != (num, 3):
+    if shape_of(name, value)[-2:] != (num, 3):
         raise ValueError(f"{name} must have the shape (..., {num}, 3), got {np.shape(value)}")
     if isinstance(value, Tracer):
         return value
@@ -119,8 +121,7 @@ def _fewest_nodes(times: np.ndarray, values: list[Any], error: float) -> int:
     """A power of two of nodes with which the table is as near to the spline as it has to be."""
     if any(isinstance(value, Tracer) for value in values):
         raise ValueError("nodes must be given where positions are traced, got none")
-    if not 0.0 < error < np.inf:
-        raise ValueError(f"error must be finite and > 0, got {error}")
+    require_number("error", error, "finite and > 0", lambda value: value > 0.0)
     nodes, worst = 16, np.inf
     while nodes <= MOST_NODES:
         resolution = times[-1] / (nodes - 3)

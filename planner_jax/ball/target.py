@@ -45,8 +45,10 @@ class BallPath:
     """
 
     rules: ClassVar[Table] = (
-        Field("drag", None, NOT_NEGATIVE),
-        Field("gravity", None, NOT_NEGATIVE),
+        Field("ball.pos", (3,)),
+        Field("ball.vel", (3,)),
+        Field("drag", (3,), NOT_NEGATIVE),
+        Field("gravity", (), NOT_NEGATIVE),
     )
 
     ball: BallState  # at time 0
@@ -61,6 +63,11 @@ class BallPath:
 @struct.dataclass
 class HarmonicPath:
     """A target that drifts and swings: p_0 + v t + A sin(w t + phi) (paper 000, VII-B b)."""
+
+    rules: ClassVar[Table] = (
+        *(Field(name, (3,)) for name in ("pos", "vel", "amplitude")),
+        *(Field(name, ()) for name in ("rate", "phase")),
+    )
 
     pos: Array  # (3,) [m]
     vel: Array  # (3,) [m/s], of the drift

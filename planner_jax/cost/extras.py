@@ -15,7 +15,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.checks import told
+from planner_jax.checks import shapes_told, told
 from planner_jax.rules import NOT_NEGATIVE, NOT_ZERO, POSITIVE, Field, Table, below
 from planner_jax.trajectory.polynomial import Motion
 
@@ -153,10 +153,10 @@ def for_batch(extras: Sequence[Extra], batch: tuple[int, ...], dtype: Any) -> tu
     if not isinstance(extras, Sequence) or isinstance(extras, str):
         raise TypeError(f"extras must be a sequence of limits and costs, got {told(extras)}")
     for extra in extras:
-        if not isinstance(extra, ExtraLimit | ExtraCost):
+        if isinstance(extra, type) or not isinstance(extra, ExtraLimit | ExtraCost):
             raise TypeError(f"extras must have a method excess or cost, got {told(extra)}")
 
-    def spread(extra: Any) -> Any:
+    def spread(place: int, extra: Any) -> Any:
         extra = jax.tree.map(np.asarray, extra, is_leaf=lambda x: isinstance(x, tuple | list))
         shapes = [leaf.shape for leaf in jax.tree.leaves(extra)]
         sample = np.ones((2 + max((0, *batch, *sum(shapes, ()))), 3))  # longer than any leaf
@@ -166,11 +166,13 @@ def for_batch(extras: Sequence[Extra], batch: tuple[int, ...], dtype: Any) -> tu
         except (ValueError, TypeError):
             alike = False
         if not alike and (not batch or any(shape[: len(batch)] != batch for shape in shapes)):
-            raise ValueError(f"extras must be for one case or have axes {batch}, got {extra}")
+            rule = f"for one case, or have the axes {batch} in front" if batch else "for one case"
+            found = f"a {type(extra).__name__} with {shapes_told(extra)}"
+            raise ValueError(f"extras.{place} must be {rule}, got {found}")
         lead = batch if alike else ()
         return jax.tree.map(lambda x: jnp.asarray(np.broadcast_to(x, lead + x.shape), dtype), extra)
 
-    return tuple(map(spread, extras))
+    return tuple(spread(place, extra) for place, extra in enumerate(extras))
 
 
 def num_limits(extras: tuple[Any, ...]) -> int:

@@ -17,6 +17,7 @@ from typing import Any, Literal
 import numpy as np
 
 from planner_jax.plane.obstacles import Obstacles
+from planner_jax.registry import MissingExtra, install_line
 
 _DISCS = 3  # that cover the body
 HEURISTICS = ("dubins", "grid", "both")
@@ -154,8 +155,8 @@ def _kernels() -> Any:
     except ModuleNotFoundError as error:
         if error.name != "numba":
             raise
-        raise ModuleNotFoundError(
-            "Hybrid A* and the planner paper need numba: pip install 'planner-jax[baselines]'",
+        raise MissingExtra(
+            f"Hybrid A* and the planner paper need numba: {install_line('baselines')}",
             name="numba",
         ) from None
 

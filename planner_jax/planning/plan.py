@@ -16,7 +16,7 @@ from planner_jax.planning.batch import better_of, plan_batch, plan_on_host, solv
 from planner_jax.planning.single import plan_single
 from planner_jax.planning.watch import Progress, Watch
 from planner_jax.protocol import AnyPlanner, Attempt, Case, Plan, Status, is_unsolved
-from planner_jax.rules import require_shapes, require_sound
+from planner_jax.rules import has_rules, require_shapes, require_sound
 
 CaseT = TypeVar("CaseT", bound=Case)
 PlanT = TypeVar("PlanT", bound=Plan)
@@ -276,6 +276,8 @@ def require_batch(cases: Case) -> int:
         raise ValueError(f"cases must be a batch of at least one, got batch shape {batch}")
     for path, leaf in jax.tree_util.tree_leaves_with_path(cases):
         if np.shape(leaf)[:1] != batch:
+            if has_rules(cases):
+                require_shapes(cases)  # which names the one array that is of another batch
             name = jax.tree_util.keystr(path)
             raise ValueError(f"cases{name} must have {batch[0]} lanes, got shape {np.shape(leaf)}")
     return batch[0]

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from planner_jax.registry import MissingExtra
+from planner_jax.registry import MissingExtra, install_line
 from planner_jax.robot.quadrotor_file import RobotError
 
 _SKEW = 0.02  # of the greatest moment of inertia, what may lie off the body's axes
@@ -26,7 +26,7 @@ def described_by(path: Path) -> dict[str, Any]:
         import mujoco
     except ModuleNotFoundError as error:
         raise MissingExtra(
-            f"{path.name} needs {error.name}: pip install 'planner-jax[sims]'", name=error.name
+            f"{path.name} needs {error.name}: {install_line('sims')}", name=error.name
         ) from None
     try:
         model = mujoco.MjModel.from_xml_path(str(path))  # type: ignore[attr-defined]
@@ -53,8 +53,8 @@ def described_by(path: Path) -> dict[str, Any]:
     ]
     if model.nu != 4 or len(rotors) != 4:
         raise RobotError(
-            f"{path}: the model must have 4 actuators, all on sites, "
-            f"got {model.nu}, {len(rotors)} of them on sites"
+            f"{path}: the model must have 4 actuators, all on sites, got "
+            + (f"{model.nu}, {len(rotors)} of them on sites" if model.nu else "none")
         )
     return {"mass": mass, "inertia": np.diag(inertia).tolist(), "rotors": _rotors(path, rotors)}
 

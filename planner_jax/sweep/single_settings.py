@@ -8,6 +8,7 @@ import math
 from typing import Any, ClassVar
 
 from planner_jax.registry import Task, UnknownName
+from planner_jax.sweep.robots import checked_robot, robot_option
 from planner_jax.sweep.settings import SettingError, option, require
 
 _OWN = "(default: the robot's)"
@@ -31,12 +32,15 @@ class SingleSettings:
     max_thrust: float | None = option(None, "A", f"greatest thrust over mass [m/s^2] {_OWN}")
     min_height: float | None = option(None, "Z", f"least height [m] {_OWN}")
     gravity: float | None = option(None, "G", "magnitude [m/s^2] (default: the task's)")
+    robot: Any = robot_option("the task's")
 
     RUN: ClassVar[str]  # what answers, "module:Class"
     PLANNER: ClassVar[tuple[str, ...]] = ()  # names of the settings that are the planner's options
     ELSEWHERE: ClassVar[tuple[str, ...]] = ()  # of those that are no argument of the task's `case`
+    TOOL: ClassVar[str]  # that the robot has to carry, "net" or "racket"
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "robot", checked_robot(self.robot, self.TOOL))
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if isinstance(value, list):  # as a parser has it

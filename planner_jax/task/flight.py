@@ -5,9 +5,20 @@ from typing import Any
 
 import numpy as np
 from jax import Array
+from jax.core import Tracer
 
 from planner_jax.robot.quadrotor import QuadrotorLimits, RotorLimits
 from planner_jax.robot.quadrotor_model import NET, QuadrotorModel, Tool
+from planner_jax.rules import require_rule
+
+# Fields of a case, by which its rules know them, that are arguments of what makes it.
+ARGUMENTS = {
+    "head_state": "start",
+    **{
+        f"limits.{name}": name
+        for name in ("speed", "acceleration", "body_rate", "min_thrust", "max_thrust", "min_height")
+    },
+}
 
 
 def require_tool(robot: Any, kind: str) -> Tool:
@@ -18,10 +29,23 @@ def require_tool(robot: Any, kind: str) -> Tool:
         ValueError: it carries another tool than one of this kind.
     """
     if not isinstance(robot, QuadrotorModel):
-        raise TypeError(f"robot must be a QuadrotorModel, got {robot!r:.60}")
+        rule = "a QuadrotorModel, such as pj.robot_named('x500') or pj.read_robot('my.yaml')"
+        raise TypeError(f"robot must be {rule}, got {robot!r:.60}")
     if robot.tool.kind != kind:
         raise ValueError(f"robot must carry a {kind}, got {robot.name!r} with a {robot.tool.kind}")
     return robot.tool
+
+
+def require_start(cases: Any) -> None:
+    """Raise `CaseError` if a quadrotor begins below its least height, which no plan may do.
+
+    Of traced arrays, which have no values yet, nothing is asked.
+    """
+    given = cases.head_state[..., 0, 2], cases.limits.min_height
+    if any(isinstance(each, Tracer) for each in given):
+        return
+    height, least = map(np.asarray, given)
+    require_rule("start", height, height >= least, "at a height >= min_height", cases.batch_shape)
 
 
 def require_own_robot(robot: Any, usual: QuadrotorModel, suite: str) -> None:

@@ -24,28 +24,34 @@ def _cases() -> list[tuple[str, str]]:
     for name in ("serve_pos", "serve_vel", "target"):
         rows += _of(hit, name, "'abc'", "None", "5.0", "[]", "(1, 2)", "((1, 2), (3, 4))")
         rows += _of(hit, name, "(1j, 0, 1)", "['1', '2', '3']", "object()", "{}", "((1, 2), (3,))")
-    rows += _of(hit, "serve_pos", "(nan, 0, 1)", words="ball.pos must be finite, got nan")
-    rows += _of(hit, "serve_vel", "(0, inf, 1)", words="ball.vel must be finite, got inf")
+    rows += _of(hit, "serve_pos", "(nan, 0, 1)", words="serve_pos must be finite, got nan")
+    rows += _of(hit, "serve_vel", "(0, inf, 1)", words="serve_vel must be finite, got inf")
     rows += _of(hit, "target", "(0, 0, -inf)", "(1e60, 0, 0)", words="target must be finite, got")
     rows += _of(hit, "start", "'uniform'", "None", "(1, 2)", "1.0", "np.zeros((2, 3))")
-    rows += _of(hit, "start", "(nan, 0, 1)", words="head_state must be finite, got nan")
+    rows += _of(hit, "start", "(nan, 0, 1)", "(0, 0, 0.2)")
     numbers = ("'x'", "(1, 2)", "1j", "[[1.0]]", "b'1'", "object()")
     for name in ("drag", "gravity", "restitution", "racket_height"):
         rows += _of(hit, name, *numbers, "nan")
     rows += _of(hit, "drag", "None") + _of(hit, "gravity", "None")
     for name in ("min_apex", "max_apex"):
         rows += _of(hit, name, *numbers, "None")
-        rows += _of(hit, name, "nan", words=f"hit_limits.{name} must be finite, got nan")
+        rows += _of(hit, name, "nan", words=f"{name} must be finite, got nan")
     for name in ("speed", "acceleration", "body_rate", "min_height"):
         rows += _of(hit, name, *numbers)
-        rows += _of(hit, name, "-1", "nan", "inf", words=f"limits.{name} must be")
+        rows += _of(hit, name, "-1", "nan", "inf")
     rows += _of(hit, "drag", "-1e-9", "inf") + _of(hit, "gravity", "0", "-9.8")
     rows += _of(hit, "restitution", "1.01", "-0.1")
     rows += _of(hit, "hitting_speed", "4.0", "(4, 3)", "None")
-    rows += _of(hit, "hitting_speed", "(4, 0, 4)", words="hit_limits.hitting_speed must be > 0")
-    rows += _of(hit, "min_apex", "7.0", words="hit_limits.min_apex must be < hit_limits.max_apex")
+    rows += _of(hit, "hitting_speed", "(4, 0, 4)", words="hitting_speed must be > 0")
+    rows += _of(hit, "min_apex", "7.0", words="min_apex must be < max_apex")
     rows += _of(hit, "extras", "None", "5", "(5,)", "('x',)", "(pj.KeepOut,)")
-    rows += _of(hit, "extras", "pj.KeepOut((0, 0, 1), 1.0)", "(pj.KeepOut((0, 0), 1.0),)")
+    rows += _of(hit, "extras", "pj.KeepOut((0, 0, 1), 1.0)")
+    rows += _of(
+        hit,
+        "extras",
+        "(pj.KeepOut((0, 0), 1.0),)",
+        words="extras.0 must be for one case, got a KeepOut with centre (2,), radius ()",
+    )
     rows += _of(
         hit, "extras", "(pj.KeepOut((0, 0, 1), -1.0),)", words="extras.0.radius must be > 0"
     )
@@ -65,15 +71,28 @@ def _cases() -> list[tuple[str, str]]:
     rows += _of(catch, "targets", "None", "5", "'x'", "HIT", "ball_path(3)", "pj.hit", "()")
     rows += _of(catch, "targets", "turning(2)", "hits.ball", "pj.lane(ball_path(2), 0)")
     rows += _of(catch, "targets", "pj.BallPath", "lambda t: t", "[ball_path(2)]")
+    rows += _of(
+        catch,
+        "targets",
+        "having(ball_path(2), 'drag', np.zeros(2))",
+        words="targets.drag must have the shape (2, 3), got (2,)",
+    )
+    rows += _of(
+        catch,
+        "targets",
+        "having(ball_path(2), 'ball.pos', np.zeros((2, 2)))",
+        words="targets must be a path of which at(time) gives a position, with the axes (2,) of ",
+    )
+    rows += _of(catch, "start", "(0, 0, 0.2)")
     rows += _of(catch, "present", "(True,)", "'x'", "None", "(0.5, 1.0)", "(2, 1)", "('a', 'b')")
     rows += _of(catch, "gravity", "None")
     for name in ("gravity", "net_height", "net_radius", "max_angle", "speed", "body_rate"):
         rows += _of(catch, name, "'x'", "(1, 2)", "1j", "[[1.0]]")
     rows += _of(catch, "min_thrust", "'x'", "(1, 2)", "1j")
     rows += _of(catch, "gravity", "0", "nan")
-    rows += _of(catch, "net_radius", "0", "nan", words="net.radius must be")
-    rows += _of(catch, "max_angle", "4", "-1", words="net.max_angle must be in [0, pi]")
-    rows += _of(catch, "min_thrust", "30.0", words="limits.min_thrust must be < limits.max_thrust")
+    rows += _of(catch, "net_radius", "0", "nan")
+    rows += _of(catch, "max_angle", "4", "-1", words="max_angle must be in [0, pi]")
+    rows += _of(catch, "min_thrust", "30.0", words="min_thrust must be < max_thrust")
     rows += _of(catch, "optional", "'yes'", "None", "1.0", "np.array([True, False])")
     rows += _of(catch, "extras", "None", "(5,)") + _of(catch, "start", "(0, 0)", "'x'")
     rows += _of(catch, "dtype", "int", "np.float64")
@@ -209,7 +228,12 @@ def _planners() -> list[tuple[str, str]]:
 
 
 def _plans() -> list[tuple[str, str]]:
-    rows = []
+    rows = _of("pj.table_path(**{**TABLE, **dict(@)})", "times", "'x'", "(0, 1, 1)", "((0, 1),)")
+    rows += _of("pj.table_path(**{**TABLE, **dict(@)})", "positions", "'x'", "np.zeros((3, 2))")
+    rows += _of("pj.table_path(**{**TABLE, **dict(@)})", "nodes", "'x'", "5.5", "4")
+    rows += _of("pj.table_path(**{**TABLE, **dict(@)})", "error", "'x'", "0", "nan")
+    rows += _of("pj.table_path(**{**TABLE, **dict(@)})", "dtype", "int", "np.float64")
+    rows += [("pj.hit.planner(round=3)", "option of planner exact must be one of ")]
     for call in ("plan", "solve"):
         for planner in ("None", "5", "'exact'", "pj.hit", "pj.hit.planner", "hits", "type(exact)"):
             rows.append((f"pj.{call}({planner}, hits)", "planner must be one, such as"))
@@ -218,15 +242,22 @@ def _plans() -> list[tuple[str, str]]:
         rows.append((f"pj.{call}(catcher, hits)", "DecidedPlanner plans cases of the class Catch"))
         rows.append((f"pj.{call}(driver, blocks)", "SpacetimeIntercept plans cases of the class"))
         rows.append((f"pj.{call}(blocker, drives)", "OnlineBlock plans cases of the class"))
-        begins = {"plan": ("cases.ball.pos must have 3 lanes", "cases.target must have 2 lanes")}
-        of_drag, of_target = begins.get(call, ("ball.pos must have", "target must have the shape"))
         whole = f"pj.{call}(exact, having(hits, '@', np.zeros"
         rows += [
-            (whole.replace("@", "drag") + "(3, np.float32)))", of_drag),
-            (f"pj.{call}(exact, having(hits, 'drag', 0.1))", "ball.pos must have the shape (3)"),
+            (
+                whole.replace("@", "drag") + "(3, np.float32)))",
+                "drag must have the shape (2,), got (3,)",
+            ),
+            (
+                f"pj.{call}(exact, having(hits, 'drag', 0.1))",
+                "drag must have the shape (2,), got ()",
+            ),
             (whole.replace("@", "head_state") + "((2, 3, 4), np.float32)))", "head_state must"),
             (whole.replace("@", "gravity") + "((2, 1), np.float32)))", "gravity must have the"),
-            (whole.replace("@", "target") + "((1, 3), np.float32)))", of_target),
+            (
+                whole.replace("@", "target") + "((1, 3), np.float32)))",
+                "target must have the shape (2, 3)",
+            ),
         ]
         rows += [
             (f"pj.{call}(exact, having(hits, 'target', {value}))", "target must")

@@ -119,6 +119,7 @@ def given(tmp_path_factory):
         "HIT": {"serve_pos": (0, 5, 1), "serve_vel": (0, -5, 4), "target": (0, 4, 0)},
         "HITS": {name: np.ones((2, 3)) for name in ("serve_pos", "serve_vel", "target")},
         "CATCH": {"targets": ball_path(2), "horizon": (2.0, 2.0)},
+        "TABLE": {"times": (0.0, 0.5, 1.0), "positions": np.eye(3)},
         "INTERCEPT": {"target": pj.lane(turning(1), 0)},
         "BLOCK": {"ball_pos": (4, 0, 1), "ball_vel": (-8, 0, 2)},
         "PATH": {"ball": ball, "horizon": 1.0, "drag": 0.06, "gravity": 9.8, "num_nodes": 8},

@@ -29,6 +29,7 @@ class SingleCatchSettings(SingleSettings):
     )
     decide: str = option("best", "NAME", f"order and first times: {', '.join(DECISIONS)}")
 
+    TOOL: ClassVar[str] = "net"
     RUN: ClassVar[str] = "planner_jax.sweep.catch.single:SingleCatch"
     PLANNER: ClassVar[tuple[str, ...]] = ("decide",)
     ELSEWHERE: ClassVar[tuple[str, ...]] = ("pos", "vel", "ball", "horizon", "drag")

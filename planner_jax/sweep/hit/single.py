@@ -10,7 +10,10 @@ from planner_jax.sweep.single import Answer, Margin, Single
 class SingleHit(Single):
     """A quadrotor that returns one ball."""
 
-    NAMES = {**Single.NAMES, "ball.pos": "pos", "ball.vel": "vel"}
+    NAMES = {
+        **Single.NAMES,
+        **{f"{of}{x}": x for of in ("ball.", "serve_") for x in ("pos", "vel")},
+    }
 
     def case(self) -> Any:
         """The case."""

@@ -23,5 +23,6 @@ class SingleHitSettings(SingleSettings):
     restitution: float | None = option(None, "B", "of the racket (default: the robot's)")
     drag: float | None = option(None, "K", "of the ball, quadratic [1/m] (default: 0.0616)")
 
+    TOOL: ClassVar[str] = "racket"
     RUN: ClassVar[str] = "planner_jax.sweep.hit.single:SingleHit"
     ELSEWHERE: ClassVar[tuple[str, ...]] = ("pos", "vel", "target")

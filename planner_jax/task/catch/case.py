@@ -18,10 +18,15 @@ from planner_jax.robot.quadrotor_models import PAPER_CATCHER
 from planner_jax.rules import Table, require_sound
 from planner_jax.task.arguments import array_of
 from planner_jax.task.catch.rules import RULES
-from planner_jax.task.flight import limits_of, require_tool
+from planner_jax.task.flight import ARGUMENTS, limits_of, require_start, require_tool
 
 GRAVITY = 9.81  # [m/s^2]
 START = (0.0, 0.0, 1.0)  # [m], where the quadrotor hovers
+_ARGUMENTS = {
+    **ARGUMENTS,
+    **{f"net.{name}": f"net_{name}" for name in ("height", "radius")},
+    "net.max_angle": "max_angle",
+}
 
 
 @struct.dataclass
@@ -142,7 +147,7 @@ def case(
     def leaf(name: str, value: Any, *trailing: int) -> Array:
         return array_of(name, value, batch, trailing, dtype)
 
-    require_path("targets", targets, shape, 3)
+    require_path("targets", targets, shape, 3, "horizon")
     tool = require_tool(robot, NET)
     head = np.zeros(batch + (4, 3))
     head[..., 0, :] = numbers_of("start", start, batch, (3,))
@@ -172,7 +177,8 @@ def case(
         extras=for_batch(extras, batch, dtype),
         optional=optional,
     )
-    require_sound(made)
+    require_sound(made, _ARGUMENTS)
+    require_start(made)
     return made
 
 

@@ -16,13 +16,18 @@ from planner_jax.robot.quadrotor_model import RACKET, QuadrotorModel
 from planner_jax.robot.quadrotor_models import PAPER_HITTER
 from planner_jax.rules import Table, require_rule, require_sound
 from planner_jax.task.arguments import array_of, batch_of
-from planner_jax.task.flight import limits_of, require_tool
+from planner_jax.task.flight import ARGUMENTS, limits_of, require_start, require_tool
 from planner_jax.task.hit.card import START
 from planner_jax.task.hit.rules import RULES
 
 # Fit to the published landing points; the residual is 1 cm.
 DRAG = 0.0616  # K_D [1/m]
 GRAVITY = 9.8  # [m/s^2]
+_ARGUMENTS = {
+    **ARGUMENTS,
+    **{f"ball.{name}": f"serve_{name}" for name in ("pos", "vel")},
+    **{f"hit_limits.{name}": name for name in ("hitting_speed", "min_apex", "max_apex")},
+}
 
 
 @struct.dataclass
@@ -151,7 +156,8 @@ def case(
         ),
         extras=for_batch(extras, batch, dtype),
     )
-    require_sound(made)
+    require_sound(made, _ARGUMENTS)
+    require_start(made)
     height = np.asarray(made.ball.pos)[..., 2]
     require_rule("serve_pos", height, height >= 0.0, "at a height >= 0 m", batch)
     return made
