@@ -68,7 +68,7 @@ ALLOWED = {
         "trajectory",
     },
     "sweep": {
-        *("ball", "compile_cache", "digits", "lanes", "memory", "perception", "plane"),
+        *("ball", "compile_cache", "digits", "ending", "lanes", "memory", "perception", "plane"),
         *("planning", "protocol", "registry", "robot", "rules", "stopping", "task"),
         *("plain_files", "trajectory", "whole_files"),
     },

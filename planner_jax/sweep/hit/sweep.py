@@ -16,6 +16,7 @@ from planner_jax.sweep.hit.figures.path import path_figure
 from planner_jax.sweep.hit.figures.rates import compared_with, rates_figure
 from planner_jax.sweep.hit.settings import HitSettings
 from planner_jax.sweep.hit.source import ServeSource, open_source
+from planner_jax.sweep.quadrotor import ending_remark
 from planner_jax.sweep.robots import robot_remark
 from planner_jax.sweep.row_plans import quadrotor_plan
 from planner_jax.sweep.summary import Tally
@@ -164,6 +165,7 @@ class HitSweep(Sweep):
             same = '"Same serves" are the published outcomes of this run\'s cases, where known. '
         return [
             *robot_remark(settings),
+            *ending_remark(settings),
             f"Serves: {summary['num']:,} {origin}; {manifest['serves']['distinct']:,} distinct "
             "balls (cases may share a ball and differ in the target).",
             f"Hover start {start}; planning begins {settings['delay']:g} s after the serve; speed, "
