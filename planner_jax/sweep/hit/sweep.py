@@ -115,7 +115,8 @@ class HitSweep(Sweep):
 
     def setting(self, cases: Any) -> dict[str, Any]:
         """Physics and limits that all cases have in common, for the manifest."""
-        setting = first_values(cases, ["drag", "gravity", "restitution", "racket_height"])
+        names = ("drag", "gravity", "restitution", "racket_height", "racket_radius")
+        setting = first_values(cases, names)
         return setting | first_values(cases.limits) | first_values(cases.hit_limits)
 
     def plan_of_row(self, row: dict[str, Any], setting: dict[str, Any]) -> QuadrotorPlan:
