@@ -70,10 +70,19 @@ def test_without_its_case_a_plan_is_refused_in_one_line(here):
     assert not list(here.iterdir())
 
 
+def test_the_case_of_another_plan_and_a_batch_of_cases_are_refused(hit, here):
+    case, plan = hit
+    with pytest.raises(ExportError, match="^case must be that of the plan, got InterceptCase$"):
+        pj.export(plan, to="csv", out="a.csv", case=driving()[0])
+    many = jax.tree.map(lambda leaf: leaf[None], case)
+    with pytest.raises(ExportError, match=r"^case must be one, .* got a batch of shape \(1,\)$"):
+        pj.export(plan, to="csv", out="a.csv", case=many)
+
+
 def test_where_no_way_to_rest_keeps_the_limits_nothing_is_written(hit, here):
     case, plan = hit
     slow = dataclasses.replace(case.limits, speed=np.float32(0.1))
-    says = "^ending must be left out .* keeps every limit, got 'brake' .speed: .* above its limit"
+    says = "^ending must be none .* keeps every limit, got 'brake' .speed: .* above its limit"
     with pytest.raises(ExportError, match=says):
         pj.export(plan, to="csv", out="a.csv", case=dataclasses.replace(case, limits=slow))
     assert not list(here.iterdir())
@@ -171,8 +180,13 @@ def test_a_car_steers_past_what_stands_in_its_way_and_says_where_it_cannot():
     case, plan = driving(box(2.4, 3.0, 3.0, 5.0))
     with pytest.raises(NoEnding, match=r"^wall: the body is .* inside walls\[0\]"):
         with_ending(case, plan, "brake")
-    with pytest.raises(NoEnding, match="^only quadrotors fly home$"):
-        with_ending(case, plan, "home")
+
+
+def test_only_quadrotors_go_home(here):
+    case, plan = driving()
+    with pytest.raises(ExportError, match="^ending must be brake, as only quadrotors go home, got"):
+        pj.export(plan, to="csv", out="a.csv", case=case, ending="home")
+    assert not list(here.iterdir())
 
 
 def test_movers_are_where_they_are_behind_the_meeting():

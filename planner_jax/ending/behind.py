@@ -45,11 +45,12 @@ def with_ending(case: Any, found: Plan, to: str) -> Plan:
 
     Raises:
         NoEnding: there is none that the referee lets pass.
+        ValueError: only quadrotors go home.
     """
     if isinstance(found, QuadrotorPlan):
         return _quadrotor(case, found, to)
     if to != "brake":
-        raise NoEnding("only quadrotors fly home")
+        raise ValueError(f"to must be brake, as only quadrotors go home, got {to!r}")
     if isinstance(found, CarPlan):
         return braked_car(case, found)
     if isinstance(found, ArmPlan):
