@@ -25,6 +25,7 @@ from typing import Any, NoReturn
 from planner_jax import stopping
 from planner_jax.compile_cache import keep_compiled_programs
 from planner_jax.digits import written_number, written_whole
+from planner_jax.ending.names import CHOICES
 from planner_jax.live.settings import SERVED
 from planner_jax.registry import (
     MissingExtra,
@@ -35,7 +36,13 @@ from planner_jax.registry import (
     task_named,
 )
 from planner_jax.sweep.environment import installed_version, require_backend
-from planner_jax.sweep.settings import SettingError, WorkersFailed, is_address
+from planner_jax.sweep.settings import (
+    SettingError,
+    WorkersFailed,
+    ending_options,
+    is_address,
+    require_ending,
+)
 from planner_jax.whole_files import new_file_problem, replacing
 
 _HELP = argparse.RawDescriptionHelpFormatter
@@ -293,21 +300,28 @@ def _add_export(parser: _Parser) -> None:
     parser.add("--out", metavar="FILE", help=f"new file; its ending says which ({endings}; {name})")
     port = "of this machine, to which px4 is sent in real time over UDP in the place of a file"
     parser.add("--udp", type=_whole, metavar="PORT", help=port)
+    rest = "how a plan comes to rest behind its end, where it does not do so itself"
+    parser.add("--ending", metavar="NAME", help=f"{rest}: {', '.join(CHOICES)} (default: brake)")
     parser.set_defaults(command=_export)
 
 
 def _export(given: dict[str, Any]) -> None:
     from planner_jax.export import words
+    from planner_jax.export.rested import lacks_ending
     from planner_jax.export.setpoints import ExportError
     from planner_jax.plan_files import PlanFileError
 
     source, row = given.pop("plans"), given.pop("row", None)
     out, udp = _out(given, "file"), given.pop("udp", None)
+    require_ending(name := given.pop("ending", "brake"))
+    ending = ending_options(name).get("ending")
     if out is not None and udp is not None:
         raise SettingError(f"udp must not be given with --out, got {udp}")
     try:
         out = out or words.default_name(source, row, given["to"])
         plan, against = _plan_of(source, row)
+        lacks = ending is not None and lacks_ending(plan)
+        given |= {"ending": ending, "case": _case_of(source, row, name) if lacks else None}
         if udp is None:
             told = str(words.export(plan, out=out, **given))
         else:
@@ -318,6 +332,9 @@ def _export(given: dict[str, Any]) -> None:
         raise SettingError(str(error)) from None
     if against:
         print(f"planner-jax: warning: row {row} fails the referee: {against}", file=sys.stderr)
+    if lacks:
+        rest = f"row {row} goes on to rest behind its end ({name}), within the limits of its case"
+        print(f"planner-jax: {rest}; --ending none leaves that out", file=sys.stderr)
     print(told)
 
 
@@ -333,6 +350,18 @@ def _plan_of(source: str, row: int | None) -> tuple[Any, str]:
     if not os.path.exists(source):
         raise SettingError(f"RUN must be the folder of a sweep or a file of plans, got {source!r}")
     return saved_plan(source, row), ""
+
+
+def _case_of(source: str, row: Any, ending: str) -> Any:
+    """The case of a row of a sweep, whose limits a way to rest has to keep."""
+    if not os.path.isdir(source):
+        rule = "none for plans of a file that do not come to rest, as it does not hold their limits"
+        raise SettingError(f"ending must be {rule}, got {ending}")
+    from planner_jax.sweep.planned import case_of_row
+    from planner_jax.sweep.run_folder import RunFolder
+
+    keep_compiled_programs()
+    return case_of_row(RunFolder(source, name="RUN"), row)
 
 
 def _add_serve(kind: type, parser: _Parser) -> None:
@@ -481,7 +510,9 @@ def _write_answer(task: Task, planner: str, answer: Any, out: Path, rate: float 
     written = [out / "plan.npz"]
     answer.plan.save(written[0])
     if answer.success:
-        written.append(export(answer.plan, to="csv", out=out / "setpoints.csv", rate=rate))
+        ending = None if answer.plan.ending is None else "brake"  # one of its own stays
+        how = {"rate": rate, "ending": ending}
+        written.append(export(answer.plan, to="csv", out=out / "setpoints.csv", **how))
     written += write_pictures(task, planner, answer, out)
     print("\n" + "\n".join(map(str, written)))
 

@@ -10,6 +10,15 @@ import planner_jax as pj
 from planner_jax.ending.case import EndingCase, end_state
 from planner_jax.ending.planner import RestPlanner
 from planner_jax.robot.quadrotor import QuadrotorLimits
+from planner_jax.sweep import run
+from planner_jax.sweep.catch.settings import CatchSettings
+from planner_jax.sweep.hit.settings import HitSettings
+from planner_jax.sweep.hit.sweep import HitSweep
+from planner_jax.sweep.planned import planned_row
+from planner_jax.sweep.quadrotor import ending_remark
+from planner_jax.sweep.run_folder import RunFolder
+from planner_jax.sweep.settings import SettingError
+from planner_jax.sweep.single import sampled
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, total_duration
 
 NUM = 8
@@ -112,6 +121,53 @@ def test_catches_that_end_too_fast_for_the_limits_are_planned_slower():
     verdict = pj.catch.judge(cases, plans)
     np.testing.assert_array_equal(verdict.success, pj.solved(plans))
     assert verdict.success.all(), verdict.failed_limit
+
+
+# Sweeps.
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory):
+    """The folder of a sweep with ways to rest, and its manifest; nothing is drawn."""
+    out = tmp_path_factory.mktemp("runs") / "braked"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run, "write_report", lambda folder: None)
+        patch.setattr(HitSweep, "other_planners", lambda *_: {})
+        settings = HitSettings(num=NUM, seed=4, ending="brake")
+        return out, run.start_sweep(pj.task_named("hit"), settings, out, progress=False)
+
+
+def test_rows_of_a_sweep_have_the_way_to_rest_that_was_judged(swept, braked):
+    out, manifest = swept
+    assert manifest["parameters"]["ending"] == "brake"
+    assert manifest["summary"]["successes"] == NUM
+    for row in range(NUM):
+        found, sentence = planned_row(RunFolder(out), row)
+        whole = pj.lane(braked, row).whole
+        np.testing.assert_allclose(total_duration(found.whole), total_duration(whole), rtol=1e-3)
+        np.testing.assert_allclose(states(found.ending)[1:], 0.0, atol=2e-2)
+        assert not sentence
+    assert "to rest where that is cheapest" in ending_remark(manifest["parameters"])[0]
+    assert not ending_remark({}) and not ending_remark({"ending": "none"})
+
+
+def test_a_sweep_is_resumed_with_its_ending_alone(swept):
+    out, _ = swept
+    with pytest.raises(SettingError, match="^ending must be brake as in the run that is resumed"):
+        run.resume_sweep(pj.task_named("hit"), out, progress=False, ending="home")
+
+
+def test_the_limits_of_one_case_are_looked_at_behind_the_contact_too(braked):
+    plan = pj.lane(braked, 0)
+    assert sampled(plan).time[-1] > plan.stroke.time + 0.2
+
+
+@pytest.mark.parametrize("settings", [HitSettings, CatchSettings])
+def test_settings_refuse_another_ending_and_leave_none_to_the_planner(settings):
+    with pytest.raises(SettingError, match="^ending must be one of none, brake, home, got 'land'"):
+        settings(ending="land")
+    assert "ending" not in settings().planner_options()
+    assert settings(ending="home").planner_options()["ending"] == "home"
 
 
 def test_another_ending_is_refused_in_one_line():

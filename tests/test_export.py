@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 from cflib.crazyflie.mem.trajectory_memory import Poly4D
-from flown_plans import PLANS, arm, bag, car, matrices, quadrotor, table
+from flown_plans import PLANS, arm, as_it_is, bag, car, matrices, quadrotor, table
 
 import planner_jax as pj
 from planner_jax.export import csv_rows, ros2
@@ -30,7 +30,7 @@ def xyz(vector):
 @pytest.mark.parametrize("robot", PLANS)
 def test_a_table_has_names_units_and_every_number_bit_for_bit(tmp_path, robot):
     plan = PLANS[robot]
-    header, rows = table(pj.export(plan, to="csv", out=tmp_path / "a.csv", rate=RATE))
+    header, rows = table(as_it_is(plan, to="csv", out=tmp_path / "a.csv", rate=RATE))
     found = setpoints_of(plan, RATE)
     blocks = [np.asarray(leaf).reshape(len(rows), -1) for leaf in vars(found).values()]
     np.testing.assert_array_equal(rows[:, 0], found.time)
@@ -42,7 +42,7 @@ def test_a_table_has_names_units_and_every_number_bit_for_bit(tmp_path, robot):
 
 
 def test_the_rate_is_100_unless_given(tmp_path):
-    _, rows = table(pj.export(quadrotor(), to="csv", out=tmp_path / "a.csv"))
+    _, rows = table(as_it_is(quadrotor(), to="csv", out=tmp_path / "a.csv"))
     np.testing.assert_allclose(np.diff(rows[:, 0]), 0.01)
 
 
@@ -52,7 +52,7 @@ def test_the_rate_is_100_unless_given(tmp_path):
 @pytest.mark.parametrize("robot", PLANS)
 def test_a_bag_holds_one_trajectory_as_rosbag2_has_them(tmp_path, robot):
     profile, [(schema, channel, record, message)] = bag(
-        pj.export(PLANS[robot], to="ros2", out=tmp_path / "a.mcap", rate=RATE)
+        as_it_is(PLANS[robot], to="ros2", out=tmp_path / "a.mcap", rate=RATE)
     )
     kind = "JointTrajectory" if robot == "arm" else "MultiDOFJointTrajectory"
     assert (profile, schema.encoding, channel.message_encoding) == ("ros2", "ros2msg", "cdr")
@@ -65,7 +65,7 @@ def test_a_bag_holds_one_trajectory_as_rosbag2_has_them(tmp_path, robot):
 
 def test_a_quadrotor_in_a_bag_is_as_it_is_sampled_and_turns_in_the_world(tmp_path):
     plan = quadrotor()
-    path = pj.export(plan, to="ros2", out=tmp_path / "a.mcap", rate=RATE)
+    path = as_it_is(plan, to="ros2", out=tmp_path / "a.mcap", rate=RATE)
     points, found = bag(path)[1][0][3].points, setpoints_of(plan, RATE)
     for name, of_point, wanted in [
         ("position", lambda p: xyz(p.transforms[0].translation), found.pos),
@@ -81,7 +81,7 @@ def test_a_quadrotor_in_a_bag_is_as_it_is_sampled_and_turns_in_the_world(tmp_pat
 
 
 def test_a_car_in_a_bag_moves_in_the_plane_along_its_heading(tmp_path):
-    path = pj.export(car(), to="ros2", out=tmp_path / "a.mcap", rate=1000.0)
+    path = as_it_is(car(), to="ros2", out=tmp_path / "a.mcap", rate=1000.0)
     points, found = bag(path)[1][0][3].points, setpoints_of(car(), 1000.0)
     places = np.array([xyz(p.transforms[0].translation) for p in points])
     velocity = np.array([xyz(p.velocities[0].linear) for p in points])
@@ -102,7 +102,7 @@ def test_a_car_in_a_bag_moves_in_the_plane_along_its_heading(tmp_path):
 
 
 def test_an_arm_in_a_bag_has_its_six_joints_as_they_are_sampled(tmp_path):
-    path = pj.export(arm(), to="ros2", out=tmp_path / "a.mcap", rate=RATE)
+    path = as_it_is(arm(), to="ros2", out=tmp_path / "a.mcap", rate=RATE)
     message, found = bag(path)[1][0][3], setpoints_of(arm(), RATE)
     assert message.joint_names == [f"joint_{k}" for k in range(1, 7)]
     for name, wanted in [
@@ -146,7 +146,7 @@ def test_without_ros_a_message_says_what_is_missing():
 @pytest.mark.parametrize("powers", [6, 8])
 def test_pieces_are_packed_as_by_the_crazyflies_own_library(tmp_path, powers):
     plan = quadrotor(num=5, powers=powers)
-    header, rows = table(pj.export(plan, to="crazyflie", out=tmp_path / "a.csv"))
+    header, rows = table(as_it_is(plan, to="crazyflie", out=tmp_path / "a.csv"))
     rows = rows.astype(np.float32)
     assert header[:3] == ["duration", "x^0", "x^1"] and header[9] == "y^0" and len(header) == 33
     np.testing.assert_array_equal(rows, poly4d(plan))
@@ -154,7 +154,7 @@ def test_pieces_are_packed_as_by_the_crazyflies_own_library(tmp_path, powers):
     for duration, *coeffs in rows.tolist():
         axes = [Poly4D.Poly(coeffs[8 * k : 8 * k + 8]) for k in range(4)]
         packed += Poly4D(duration, *axes).pack()
-    path = pj.export(plan, to="crazyflie", out=tmp_path / "a.bin")
+    path = as_it_is(plan, to="crazyflie", out=tmp_path / "a.bin")
     assert path.read_bytes() == packed and len(packed) == 5 * 132
 
 
@@ -196,7 +196,7 @@ def test_a_higher_degree_and_more_pieces_than_fit_are_refused():
 
 
 def exported(tmp_path, plan=None, name="a.csv", **how):
-    return pj.export(plan or quadrotor(), out=tmp_path / name, **{"to": "csv", **how})
+    return as_it_is(plan or quadrotor(), out=tmp_path / name, **{"to": "csv", **how})
 
 
 @pytest.mark.parametrize("status", [pj.Status.INFEASIBLE, pj.Status.NON_FINITE, pj.Status.NO_PATH])
@@ -247,7 +247,7 @@ def test_the_bounds_of_a_rate_are_two_setpoints_and_very_many():
     assert len(setpoints_of(quadrotor(), 1.0 / end).time) == 2
     assert len(setpoints_of(quadrotor(), (MOST - 2) / end).time) <= MOST
     with pytest.raises(ExportError, match="^rate must be at most 1000 for MAVLink, got 1001$"):
-        stream(quadrotor(), to="px4", udp=9, rate=1001)
+        stream(quadrotor(), ending=None, to="px4", udp=9, rate=1001)
 
 
 @pytest.mark.parametrize(("robot", "to"), [("car", "px4"), ("arm", "px4"), ("arm", "crazyflie")])

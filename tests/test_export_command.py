@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
-from flown_plans import PLANS, quadrotor
+from flown_plans import PLANS, as_it_is, quadrotor
 
 import planner_jax as pj
 from planner_jax.cli import main
@@ -179,10 +179,10 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-def said(capsys, words):
-    """Exit code and what went to the two streams."""
+def said(capsys, words, ending="none"):
+    """Exit code and what went to the two streams; by default of plans as they are."""
     try:
-        code = main(["export", *words.split()])
+        code = main(["export", *words.split(), *(["--ending", ending] if ending else [])])
     except SystemExit as stop:
         code = stop.code
     return code, *capsys.readouterr()
@@ -208,7 +208,7 @@ def test_a_plan_is_written_and_its_file_is_told(capsys, here, words, name):
 
 def test_a_row_is_written_as_pj_export_writes_its_plan(capsys, here):
     assert said(capsys, "run --row 0 --to px4 --out a.csv --rate 25")[0] == 0
-    pj.export(pj.lane(batch("quadrotor"), 0), to="px4", out="b.csv", rate=25.0)
+    as_it_is(pj.lane(batch("quadrotor"), 0), to="px4", out="b.csv", rate=25.0)
     assert (here / "a.csv").read_bytes() == (here / "b.csv").read_bytes()
 
 

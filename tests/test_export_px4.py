@@ -7,11 +7,10 @@ import time
 
 import numpy as np
 import pytest
-from flown_plans import bag, matrices, quadrotor, table
+from flown_plans import as_it_is, bag, matrices, quadrotor, table
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import common
 
-import planner_jax as pj
 from planner_jax.export import frames
 from planner_jax.export.px4 import trajectory_setpoints
 from planner_jax.export.setpoints import ExportError, setpoints_of
@@ -88,7 +87,7 @@ def test_setpoints_of_px4_are_those_of_the_plan_in_north_east_down():
 
 
 def test_a_table_of_px4_has_the_columns_of_its_message(tmp_path):
-    header, rows = table(pj.export(quadrotor(), to="px4", out=tmp_path / "a.csv", rate=RATE))
+    header, rows = table(as_it_is(quadrotor(), to="px4", out=tmp_path / "a.csv", rate=RATE))
     fields = trajectory_setpoints(quadrotor(), RATE)
     assert header[:5] == ["timestamp", "position[0]", "position[1]", "position[2]", "velocity[0]"]
     assert header[-2:] == ["yaw", "yawspeed"] and len(header) == 15
@@ -97,7 +96,7 @@ def test_a_table_of_px4_has_the_columns_of_its_message(tmp_path):
 
 
 def test_a_bag_of_px4_has_a_message_a_setpoint(tmp_path):
-    path = pj.export(quadrotor(), to="px4", out=tmp_path / "a.mcap", rate=RATE)
+    path = as_it_is(quadrotor(), to="px4", out=tmp_path / "a.mcap", rate=RATE)
     profile, found = bag(path)
     fields = trajectory_setpoints(quadrotor(), RATE)
     assert profile == "ros2" and found[0][0].name == "px4_msgs/msg/TrajectorySetpoint"
@@ -133,7 +132,7 @@ def assert_are_setpoints(read, fields):
 
 @pytest.mark.parametrize("rate", [RATE, 1000.0])
 def test_a_telemetry_log_is_read_by_pymavlink(tmp_path, rate):
-    path = pj.export(quadrotor(), to="px4", out=tmp_path / "a.tlog", rate=rate)
+    path = as_it_is(quadrotor(), to="px4", out=tmp_path / "a.tlog", rate=rate)
     fields = trajectory_setpoints(quadrotor(), rate)
     log = mavutil.mavlink_connection(str(path), dialect="common")
     read = []
@@ -153,7 +152,9 @@ def test_a_stream_arrives_in_real_time_and_is_decoded():
         port = ear.getsockname()[1]
         sent = []
         sender = threading.Thread(
-            target=lambda: sent.append(stream(quadrotor(), to="px4", udp=port, rate=RATE))
+            target=lambda: sent.append(
+                stream(quadrotor(), ending=None, to="px4", udp=port, rate=RATE)
+            )
         )
         fields = trajectory_setpoints(quadrotor(), RATE)
         packets, came, began = [], [], time.monotonic()
@@ -172,7 +173,7 @@ def test_a_stream_arrives_in_real_time_and_is_decoded():
 @pytest.mark.parametrize("port", [0, -1, 65536, "14540", True, None])
 def test_a_port_is_one_that_there_is(port):
     with pytest.raises(ExportError, match="^udp must be a port from 1 to 65535, got"):
-        stream(quadrotor(), to="px4", udp=port)
+        stream(quadrotor(), ending=None, to="px4", udp=port)
 
 
 def test_a_port_on_which_nobody_listens_is_refused():
@@ -180,9 +181,9 @@ def test_a_port_on_which_nobody_listens_is_refused():
         taken.bind(("127.0.0.1", 0))
         port = taken.getsockname()[1]
     with pytest.raises(ExportError, match=f"^udp must be .* listens, got {port}$"):
-        stream(quadrotor(), to="px4", udp=port)
+        stream(quadrotor(), ending=None, to="px4", udp=port)
 
 
 def test_only_px4_is_streamed():
     with pytest.raises(ExportError, match="^udp must not be given for csv, only for px4, got 9$"):
-        stream(quadrotor(), to="csv", udp=9)
+        stream(quadrotor(), ending=None, to="csv", udp=9)

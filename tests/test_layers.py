@@ -53,9 +53,11 @@ ALLOWED = {
     "optimise": {"checks", "lanes", "protocol"},
     "planning": {"checks", "optimise", "protocol", "rules"},
     "ending": {
-        *("cost", "optimise", "planning", "protocol", "robot", "rules", "trajectory"),
+        *("cost", "optimise", "planning", "protocol", "referee", "robot", "rules", "trajectory"),
     },
-    "export": {"plan_files", "protocol", "registry", "robot", "trajectory", "whole_files"},
+    "export": {
+        *("ending", "plan_files", "protocol", "registry", "robot", "trajectory", "whole_files"),
+    },
     "referee": set(),
     "task": {
         *("ball", "checks", "cost", "ending", "lanes", "optimise", "planning", "protocol"),
@@ -68,14 +70,15 @@ ALLOWED = {
         "trajectory",
     },
     "sweep": {
-        *("ball", "compile_cache", "digits", "lanes", "memory", "perception", "plane"),
+        *("ball", "compile_cache", "digits", "ending", "lanes", "memory", "perception", "plane"),
         *("planning", "protocol", "registry", "robot", "rules", "stopping", "task"),
         *("plain_files", "trajectory", "whole_files"),
     },
     "compile_cache": set(),
     "doctor": {"compile_cache", "lanes", "planning", "protocol", "registry", "sweep"},
     "cli": {
-        *("compile_cache", "digits", "doctor", "export", "live", "plan_files", "registry"),
+        *("compile_cache", "digits", "doctor", "ending", "export", "live", "plan_files"),
+        "registry",
         *("robot", "stopping", "sweep", "whole_files"),
     },
     "__main__": {"cli", "stopping"},

@@ -511,6 +511,34 @@ def test_an_infinite_limit_is_no_limit():
     assert judge(leaves).success[0]
 
 
+@pytest.mark.parametrize(
+    ("radius", "off", "passes"),
+    [(None, 0.03, True), (0.11, 0.03, True), (0.11, 0.095, True), (0.11, 0.105, False)],
+)
+def test_a_racket_is_met_within_its_radius_less_a_margin(radius, off, passes):
+    """However large the tolerance of the contact; a tenth of the radius is left at the rim."""
+    leaves = volley()
+    after = leaves["target"][0] - CONTACT
+    aside = np.array([-after[1], after[0], 0.0]) / np.hypot(*after[:2])
+    normal_free = off * aside  # across the way back, so that apex and target stay as they were
+    leaves["ball.pos"] = leaves["ball.pos"] + normal_free
+    leaves["target"] = leaves["target"] + normal_free
+    if radius is not None:
+        leaves["racket_radius"] = np.array([radius])
+    verdict = judge(leaves, contact_tolerance=0.2)
+    assert verdict.contact_error[0] == pytest.approx(off, rel=1e-3)
+    assert verdict.failed_limit[0] == ("" if passes else "contact")
+    assert judge(leaves).failed_limit[0] == "contact"  # 5 mm unless more is said
+
+
+def test_a_small_racket_tightens_the_usual_tolerance():
+    leaves = volley()
+    leaves["ball.pos"] = leaves["ball.pos"] + [0.0, 0.0, 0.003]
+    assert judge(leaves).success[0]
+    leaves["racket_radius"] = np.array([0.003])
+    assert judge(leaves).failed_limit[0] == "contact"
+
+
 def test_float32_structs_of_the_planner_are_taken_as_they_are():
     leaves = {name: jnp.float32(leaf) for name, leaf in stack(volley(), volley()).items()}
     plain, _ = objects(leaves)

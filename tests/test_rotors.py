@@ -177,6 +177,9 @@ def test_a_robot_s_limits_are_those_of_the_case_where_none_are_given():
     assert case.limits.acceleration is None
     assert case.limits.max_thrust == np.float32(1.9 * GRAVITY)
     assert case.racket_height == np.float32(0.07)
+    assert case.racket_radius == np.float32(MODEL.tool.radius)
+    own = pj.hit.case(np.zeros(3), np.ones(3), np.zeros(3), robot=MODEL, racket_radius=0.2)
+    assert own.racket_radius == np.float32(0.2)
     net = dataclasses.replace(MODEL, tool=Tool(NET, 0.2, 0.1), limits=FlightLimits(5.0, 5.0))
     of_ball = SimpleNamespace(**vars(pj.catch.draw(1)))
     catch = pj.catch.case(of_ball.targets, of_ball.horizon, robot=net)

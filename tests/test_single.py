@@ -56,7 +56,7 @@ def test_a_catch_is_told_with_its_time_and_place(catch):
 def test_the_table_agrees_with_the_referee_and_says_when(which, request):
     single, answer = request.getfixturevalue(which)
     found = {margin.limit.split(" [")[0]: margin for margin in single.margins(answer)}
-    verdict, end = answer.verdict, float(np.sum(answer.plan.trajectory.durations))
+    verdict, end = answer.verdict, float(np.sum(answer.plan.whole.durations))
     for name, value in {
         "speed": verdict.max_speed,
         "body rate": verdict.max_body_rate,

@@ -9,7 +9,8 @@ import numpy as np
 from flax import struct
 
 from planner_jax.ending.case import EndingCase, end_state
-from planner_jax.ending.planner import ENDINGS, RestPlanner
+from planner_jax.ending.names import ending_problem
+from planner_jax.ending.planner import RestPlanner
 from planner_jax.planning.decided import planned_again
 from planner_jax.protocol import Case, Drive, Plan, Status, is_solved
 
@@ -109,6 +110,6 @@ def ended(planner: Any, ending: str | None) -> Any:
     """
     if ending is None:
         return planner
-    if ending not in ENDINGS:
-        raise ValueError(f"ending must be one of {', '.join(ENDINGS)}, got {ending!r:.60}")
+    if problem := ending_problem(ending):
+        raise ValueError(problem)
     return EndedPlanner(planner, RestPlanner(to=ending))

@@ -11,6 +11,7 @@ from jax import Array
 from planner_jax.cost.along import Along, greatest_along, integrate_along
 from planner_jax.cost.quadrotor import flight_along, limits_along, relative_excess
 from planner_jax.ending.case import EndingCase, EndingPlan
+from planner_jax.ending.names import ENDINGS
 from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.planner import OptimisedPlanner, pending
@@ -27,7 +28,6 @@ from planner_jax.trajectory.proportional_minco import (
     sample_motion,
 )
 
-ENDINGS = ("brake", "home")
 _ORDER = 4  # minimum snap
 _DECODE_NODES = 40  # intervals a piece at which a finished plan is looked at
 _ABOVE_GROUND = 0.2  # [m], of a guessed place of rest

@@ -2,14 +2,24 @@
 
 import os
 from pathlib import Path
+from typing import Any
 
 from planner_jax.export.formats import Format, format_named, required
+from planner_jax.export.rested import rested
 from planner_jax.export.setpoints import DEFAULT_RATE, ExportError, robot_of
 from planner_jax.protocol import Plan
 from planner_jax.whole_files import new_file_problem, replacing
 
 
-def export(plan: Plan, *, to: str, out: str | os.PathLike, rate: float | None = None) -> Path:
+def export(
+    plan: Plan,
+    *,
+    to: str,
+    out: str | os.PathLike,
+    rate: float | None = None,
+    ending: str | None = "brake",
+    case: Any = None,
+) -> Path:
     """Write one plan for a controller, into a new file that appears whole or not at all.
 
     | `to` | file | what it holds | frame |
@@ -27,6 +37,9 @@ def export(plan: Plan, *, to: str, out: str | os.PathLike, rate: float | None = 
         to: the format.
         out: the file, whose ending says which kind of the format it is. It must not exist.
         rate: setpoints a second [Hz], 100 unless given; none for `crazyflie`.
+        ending: how the plan comes to rest behind its last contact, unless it does so already:
+            "brake" where that is cheapest, "home" where the case begins; None leaves that out.
+        case: of the plan, whose limits such a way to rest keeps.
 
     Returns:
         The path of the file.
@@ -45,12 +58,21 @@ def export(plan: Plan, *, to: str, out: str | os.PathLike, rate: float | None = 
         rate = DEFAULT_RATE if rate is None else rate
     elif rate is not None:
         raise ExportError(f"rate must not be given for {to}, which takes polynomials, got {rate}")
+    plan = rested(plan, ending, case)
     with replacing(path) as scratch, open(scratch, "wb") as file:
         write(plan, rate, file)
     return path
 
 
-def stream(plan: Plan, *, to: str, udp: int, rate: float | None = None) -> int:
+def stream(
+    plan: Plan,
+    *,
+    to: str,
+    udp: int,
+    rate: float | None = None,
+    ending: str | None = "brake",
+    case: Any = None,
+) -> int:
     """Send one plan to a UDP port of this machine, in real time; returns the number of messages.
 
     Args:
@@ -58,6 +80,8 @@ def stream(plan: Plan, *, to: str, udp: int, rate: float | None = None) -> int:
         to: "px4", the one format for this.
         udp: the port.
         rate: messages a second [Hz], 100 unless given.
+        ending: as of `export`.
+        case: likewise.
 
     Raises:
         UnknownName: there is no such format.
@@ -69,7 +93,7 @@ def stream(plan: Plan, *, to: str, udp: int, rate: float | None = None) -> int:
         raise ExportError(f"udp must not be given for {to}, only for px4, got {udp}")
     _require_robot(plan, to, form)
     send = required("planner_jax.export.mavlink:stream", "export over UDP")
-    return send(plan, udp, DEFAULT_RATE if rate is None else rate)
+    return send(rested(plan, ending, case), udp, DEFAULT_RATE if rate is None else rate)
 
 
 def default_name(source: str | os.PathLike, row: int | None, to: str) -> str:

@@ -73,6 +73,8 @@ LIMITS = tuple(_SENTENCES)
 _INCOMING_STEPS = 60
 _OUTGOING_STEP = 0.01
 _LONGEST_FLIGHT = 20.0
+# Share of the racket's radius within which the ball has to meet it; the rest is margin.
+RIM = 0.9
 
 
 @dataclasses.dataclass(frozen=True)
@@ -136,7 +138,8 @@ def referee_hits(
         drag_after_impact: let the drag act on the returned ball too.
         tolerance: relative, of every limit of the case.
         landing_tolerance: [m], horizontal distance of the landing from the target.
-        contact_tolerance: [m], distance of the racket centre from the ball at the impact.
+        contact_tolerance: [m], distance of the racket centre from the ball at the impact. Where the
+            case says the racket's radius, it is at most `RIM` of that, however large the tolerance.
         continuity_tolerance: times the largest coordinate [m] at the piece ends (at least
             1 m), allowed displacement of head state and joints.
         samples: fewest samples of a trajectory, >= 200.
@@ -170,6 +173,7 @@ def referee_hits(
 def _leaves(cases, plans) -> dict[str, np.ndarray]:
     """Every array that the referee reads, by name, its shape checked."""
     stroke_limits, path = cases.hit_limits, plans.trajectory
+    radius = getattr(cases, "racket_radius", None)
     coeffs = checked_coeffs(path.coeffs)
     trailing = {
         "durations": (path.durations, coeffs.shape[1:2]),
@@ -182,6 +186,7 @@ def _leaves(cases, plans) -> dict[str, np.ndarray]:
         "gravity": (cases.gravity, ()),
         "restitution": (cases.restitution, ()),
         "racket_height": (cases.racket_height, ()),
+        **({} if radius is None else {"racket_radius": (radius, ())}),
         **limit_leaves(cases.limits),
         "hit_limits.hitting_speed": (stroke_limits.hitting_speed, (3,)),
         "hit_limits.min_apex": (stroke_limits.min_apex, ()),
@@ -333,9 +338,10 @@ def _impact_tests(case, measured, tolerances, end, apex_at, landing_at) -> dict:
     """Tests of contact, hitting speed, apex and landing: name -> failed, excess, time."""
     relative = tolerances["relative"]
     contact, landing = measured["contact_error"], measured["landing_error"]
+    widest = np.minimum(tolerances["contact"], RIM * case.get("racket_radius", np.inf))
     lowest, highest = case["hit_limits.min_apex"], case["hit_limits.max_apex"]
     tests = {
-        "contact": (~(contact <= tolerances["contact"]), contact, end),
+        "contact": (~(contact <= widest), contact, end),
         "landing": (~(landing <= tolerances["landing"]), landing, landing_at),
         "apex low": above(-measured["apex"], -lowest, relative, apex_at),
         "apex high": above(measured["apex"], highest, relative, apex_at),

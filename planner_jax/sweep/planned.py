@@ -5,11 +5,11 @@ from typing import Any, NamedTuple
 
 import pyarrow as pa
 
-from planner_jax.protocol import Plan
+from planner_jax.protocol import Plan, lane
 from planner_jax.sweep.parquet import pick_rows
 from planner_jax.sweep.run_folder import RunFolder
-from planner_jax.sweep.settings import SettingError
-from planner_jax.sweep.sweep import Sweep, sweep_of_run
+from planner_jax.sweep.settings import SettingError, settings_of_manifest
+from planner_jax.sweep.sweep import Sweep, settings_of, sweep_of_run
 
 
 class PlannedRow(NamedTuple):
@@ -31,6 +31,26 @@ def finished_sweep(folder: RunFolder) -> tuple[dict[str, Any], Sweep]:
     remedy = f"planner-jax {sweep.kind} --resume --out {shlex.quote(str(folder.path))}"
     folder.require_whole(manifest, f"make it anew: {remedy}")
     return manifest, sweep
+
+
+def case_of_row(folder: RunFolder, row: int) -> Any:
+    """The case of a row, read or drawn again.
+
+    Args:
+        folder: of the run.
+        row: its place, from 0, one that there is.
+
+    Raises:
+        SettingError: the folder is not that of a whole, finished sweep, or the case that is read
+            or drawn now is another one.
+    """
+    manifest, sweep = finished_sweep(folder)
+    settings = settings_of_manifest(settings_of(sweep.task), manifest["parameters"], folder.name)
+    cases = sweep.open_source(settings.of(sweep.task), 1).cases(row, row + 1).cases
+    if sweep.setting(cases) != manifest["setting"]:
+        rule = "a run whose cases are drawn or read as they were"
+        raise SettingError(f"{folder.name} must be {rule}, got others for row {row}")
+    return lane(cases, 0)
 
 
 def planned_row(folder: RunFolder, row: int | None) -> PlannedRow:

@@ -1,5 +1,8 @@
 """Columns that the runs of every quadrotor task have."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 
 from planner_jax.sweep.columns import LIST, VECTOR, Column, RefereedBatch, leaves_of
@@ -24,8 +27,35 @@ MOTION = leaves_of(
     ("head_error", "m", "of the state at time 0"),
 )
 
-TRAJECTORY = leaves_of(
-    "plans.trajectory",
-    ("durations", "s", "of the pieces", LIST),
-    ("coeffs", "m/s^k", "pieces x powers k = 0..D x 3 axes, flat", LIST),
-)
+
+def _of_ending(name: str, unit: str, meaning: str) -> Column:
+    """A leaf of the ways to rest; null where plans have none."""
+
+    def values(batch: RefereedBatch) -> Any:
+        return getattr(batch.plans.ending, name, None)
+
+    return Column(f"ending_{name}", unit, meaning, LIST, values)
+
+
+TRAJECTORY = [
+    *leaves_of(
+        "plans.trajectory",
+        ("durations", "s", "of the pieces", LIST),
+        ("coeffs", "m/s^k", "pieces x powers k = 0..D x 3 axes, flat", LIST),
+    ),
+    _of_ending("durations", "s", "of the pieces behind the last contact, to rest; null if none"),
+    _of_ending("coeffs", "m/s^k", "likewise, as `coeffs`"),
+]
+
+_RESTS = {
+    "brake": "to rest where that is cheapest",
+    "home": "back to rest where the case begins",
+}
+
+
+def ending_remark(parameters: Mapping[str, Any]) -> list[str]:
+    """What plans of a run do behind their last contact, if that was asked for, a sentence."""
+    words = _RESTS.get(parameters.get("ending", ""))
+    if words is None:
+        return []
+    return [f"Behind the last contact: {words}; a plan is a success with that or not at all."]

@@ -16,10 +16,12 @@ Row = Mapping[str, Any]
 
 def quadrotor_plan(row: Row, setting: Row) -> QuadrotorPlan:
     """The plan of a row with the columns `TRAJECTORY`; gravity is that of the run's setting."""
+    rest = row.get("ending_durations")
     return QuadrotorPlan(
         **_outcome(row),
         trajectory=_polynomial(row["coeffs"], row["durations"], 3),
         gravity=_numbers(setting["gravity"]),
+        ending=None if rest is None else _polynomial(row["ending_coeffs"], rest, 3),
     )
 
 

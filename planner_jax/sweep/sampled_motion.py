@@ -2,7 +2,8 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -40,6 +41,14 @@ def sample_motion(
         scaled = pieces[piece, order:] * np.array(factors, float)[:, None]
         derivatives.append(np.einsum("nk,nki->ni", powers[:, : scaled.shape[1]], scaled))
     return SampledMotion(time, *derivatives)
+
+
+def sample_rest(row: Mapping[str, Any], num: int) -> SampledMotion | None:
+    """The way to rest of a row of `plans.parquet`, its times those of the plan; None if none."""
+    if row["ending_durations"] is None:
+        return None
+    rest = sample_motion(row["ending_coeffs"], row["ending_durations"], num)
+    return dataclasses.replace(rest, time=rest.time + np.sum(row["durations"]))
 
 
 def net_thrust(motion: SampledMotion, gravity: float) -> np.ndarray:

@@ -10,6 +10,7 @@ import tempfile
 from collections.abc import Iterable
 from typing import Any, ClassVar, Self, TypeVar
 
+from planner_jax.ending.names import CHOICES, NONE, ending_problem
 from planner_jax.memory import require_disk
 from planner_jax.registry import Task, UnknownName, require_name
 from planner_jax.task.efforts import EFFORTS
@@ -36,6 +37,17 @@ class WorkersFailed(RuntimeError):
 def option(default: Any, metavar: str, words: str) -> Any:
     """A field of settings with what the command line says of it; no `metavar` for a switch."""
     return dataclasses.field(default=default, metadata={"metavar": metavar, "help": words})
+
+
+def ending_option(usual: str = NONE) -> Any:
+    """The field of settings `ending`, of a task of quadrotors."""
+    words = f"flown behind the last contact, within all limits: {', '.join(CHOICES)}"
+    return option(usual, "NAME", words)
+
+
+def ending_options(value: str) -> dict[str, str]:
+    """What a planner is told of the argument `ending`."""
+    return {} if value == NONE else {"ending": value}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -165,6 +177,12 @@ def require_effort(value: str, planner: str | None, without: str) -> None:
     require_one_of(EFFORTS, "effort", value)
     rule = f"left out for the planner {without}, which minimises nothing"
     require(value == EFFORTS[0] or planner != without, "effort", rule, value)
+
+
+def require_ending(value: str) -> None:
+    """Raise `SettingError` unless the argument `ending` is one, or none."""
+    if problem := ending_problem(value, CHOICES):
+        raise SettingError(problem)
 
 
 def require_one_of(names: Iterable[str], name: str, value: str) -> None:

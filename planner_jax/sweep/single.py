@@ -124,8 +124,8 @@ class Single(abc.ABC):
 
 
 def sampled(found: Any) -> SampledMotion:
-    """One plan of a quadrotor, at even times."""
-    path = found.trajectory
+    """One plan of a quadrotor with its way to rest, if it has one, at even times."""
+    path = found.whole
     coeffs, durations = np.asarray(path.coeffs), np.asarray(path.durations)
     there = durations > 0.0
     return sample_motion(coeffs[there].ravel(), durations[there], _SAMPLES)

@@ -9,7 +9,14 @@ from typing import Any, ClassVar
 
 from planner_jax.registry import Task, UnknownName
 from planner_jax.sweep.robots import checked_robot, robot_option
-from planner_jax.sweep.settings import SettingError, option, require
+from planner_jax.sweep.settings import (
+    SettingError,
+    ending_option,
+    ending_options,
+    option,
+    require,
+    require_ending,
+)
 
 _OWN = "(default: the robot's)"
 
@@ -33,6 +40,7 @@ class SingleSettings:
     min_height: float | None = option(None, "Z", f"least height [m] {_OWN}")
     gravity: float | None = option(None, "G", "magnitude [m/s^2] (default: the task's)")
     robot: Any = robot_option("the task's")
+    ending: str = ending_option("brake")  # its setpoints leave for a controller
 
     RUN: ClassVar[str]  # what answers, "module:Class"
     PLANNER: ClassVar[tuple[str, ...]] = ()  # names of the settings that are the planner's options
@@ -41,6 +49,7 @@ class SingleSettings:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "robot", checked_robot(self.robot, self.TOOL))
+        require_ending(self.ending)
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if isinstance(value, list):  # as a parser has it
@@ -66,11 +75,12 @@ class SingleSettings:
 
     def planner_options(self) -> dict[str, Any]:
         """Options of the planner that these settings decide."""
-        return {name: getattr(self, name) for name in self.PLANNER}
+        own = {name: getattr(self, name) for name in self.PLANNER}
+        return own | ending_options(self.ending)
 
     def case_options(self) -> dict[str, Any]:
         """Named arguments of the task's `case` that are given."""
-        apart = {"planner", *self.PLANNER, *self.ELSEWHERE}
+        apart = {"planner", "ending", *self.PLANNER, *self.ELSEWHERE}
         given = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         return {
             name: value for name, value in given.items() if value is not None and name not in apart

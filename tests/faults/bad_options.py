@@ -42,6 +42,7 @@ def _rows() -> list:
         rows += _of(f"sweep {task}", "--limit-scale", scales, "from 0.001 to 1000")
         rows += _of(f"sweep {task}", "--limit-scale", NOT_NUMBERS)
         rows += _of(f"sweep {task}", "--effort", ("", "Best", "more"), "must be one of feasible")
+        rows += _of(f"sweep {task}", "--ending", ("", "Brake", "land"), "must be one of none")
         rows += _of(f"fly {task}", "--noise", ("x", ""))
         rows += _of(f"fly {task}", "--drag-error", ("nan", "1", "-0.1", "x"))
     rows += _of("sweep hit", "--delay", ("nan", "inf", "-1", "1e300", "3", *NOT_NUMBERS))
@@ -95,6 +96,7 @@ def _rows() -> list:
     for point in ("1 2", "1 2 3 4", "x 0 1", "1 -nan 2", "nan 0 1", "0 inf 1", "1_0 0 1", "-1e3"):
         rows.append(((*hit.split(), "--pos", *point.split()), ()))
     rows += _of(f"{hit} --pos 4 0 1", "--planner", ("", "nobody"), "must be one of")
+    rows += _of(f"{hit} --pos 4 0 1", "--ending", ("", "land"), "must be one of none, brake")
     for option in ("--speed", "--body-rate", "--acceleration", "--min-height", "--gravity"):
         rows += _of(f"{hit} --pos 4 0 1", option, ("nan", "inf", *NOT_NUMBERS))
     rows += _of(f"{hit} --pos 4 0 1", "--out", ("", "folder", "pipe", "junk/below"), "must")
@@ -110,6 +112,7 @@ def _rows() -> list:
     rows += [(("compare", name, name), ("RUN must be",)) for name in FILES]
     rows += _of("compare junk junk", "--out", ("", "x.txt"), "must")
     rows += _of("export junk --row 0", "--to", ("", "cvs", "px4\nx"), "must be one of csv")
+    rows += _of("export junk --row 0 --to csv", "--ending", ("", "land"), "must be one of none")
     rows += _of("export junk --to csv", "--row", NOT_WHOLE)
     rows += _of("export junk --to csv", "--rate", NOT_NUMBERS)
     rows += _of("export junk --to px4", "--udp", NOT_WHOLE)

@@ -9,9 +9,12 @@ from planner_jax.sweep.robots import checked_robot, robot_option
 from planner_jax.sweep.settings import (
     SettingError,
     SweepSettings,
+    ending_option,
+    ending_options,
     option,
     require,
     require_effort,
+    require_ending,
     require_one_of,
     require_scale,
 )
@@ -43,6 +46,7 @@ class CatchSettings(SweepSettings):
 
     robot: Any = robot_option("paper-catcher")
     effort: str = option("feasible", "NAME", f"of the planner: {', '.join(EFFORTS)}")
+    ending: str = ending_option()
 
     RUN: ClassVar[str] = "planner_jax.sweep.catch.sweep:CatchSweep"
     PLANNER: ClassVar[tuple[str, ...]] = ("decide", "effort")
@@ -56,12 +60,17 @@ class CatchSettings(SweepSettings):
         require_scale(self.limit_scale)
         object.__setattr__(self, "robot", checked_robot(self.robot, "net"))
         require_effort(self.effort, self.planner, "mpp")
+        require_ending(self.ending)
         try:
             split_name(DECISIONS, "decide", self.decide, TRAINED)
         except UnknownName as error:
             raise SettingError(str(error)) from None
         require_one_of(NET_TESTS, "net_test", self.net_test)
         require(0.0 <= tolerance < math.inf, "tolerance", "finite and >= 0", tolerance)
+
+    def planner_options(self) -> dict[str, Any]:
+        """Options of the planner that these settings decide."""
+        return super().planner_options() | ending_options(self.ending)
 
     @property
     def case_bytes(self) -> int:

@@ -12,6 +12,7 @@ from planner_jax.sweep.catch.figures.motion import motion_figure, plan_figure
 from planner_jax.sweep.catch.figures.outcomes import outcomes_figure
 from planner_jax.sweep.catch.settings import CatchSettings
 from planner_jax.sweep.figures.motion import CAPTION as MOTION
+from planner_jax.sweep.quadrotor import ending_remark
 from planner_jax.sweep.robots import robot_remark
 from planner_jax.sweep.row_plans import quadrotor_plan
 from planner_jax.sweep.summary import Tally
@@ -144,6 +145,7 @@ class CatchSweep(Sweep):
         gravity = limits["gravity"]
         return [
             *robot_remark(settings),
+            *ending_remark(settings),
             f"Cases: {settings['num']:,} of suite {settings['suite']}, seed {settings['seed']}. "
             "Suites of a name are of the paper's kind; the paper gives no ranges of its own.",
             f"Order and first times, decision {settings['decide']}: "

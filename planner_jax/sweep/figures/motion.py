@@ -9,23 +9,37 @@ from matplotlib.figure import Figure
 
 from planner_jax.sweep.figures import style
 from planner_jax.sweep.report import RunRows
-from planner_jax.sweep.sampled_motion import SampledMotion, body_rate, net_thrust, sample_motion
+from planner_jax.sweep.sampled_motion import (
+    SampledMotion,
+    body_rate,
+    net_thrust,
+    sample_motion,
+    sample_rest,
+)
 
 DASHED: dict[str, Any] = {"color": style.RED, "linewidth": 1.2, "linestyle": "--", "zorder": 1}
 FORBIDDEN: dict[str, Any] = {"color": style.RED, "alpha": 0.08, "linewidth": 0.0}
 _SAMPLES = 800  # of a plan
 CAPTION = (
     "One plan along its time against the limits, beside the other planners' plans for the same "
-    "case."
+    "case. Thin: the way to rest behind the last contact, where there is one."
 )
+_OF_REST: dict[str, Any] = {"linewidth": 0.9}
 
 
 class Drawn(NamedTuple):
     """A plan of the figure."""
 
     row: dict[str, Any]  # of `plans.parquet`
-    motion: SampledMotion
+    motion: SampledMotion  # up to the last contact
+    rest: SampledMotion | None  # behind it
     look: dict[str, Any]  # of its curves
+
+    def draw(self, axes: Axes, values: Callable[[SampledMotion], np.ndarray]) -> None:
+        """Draw values (N,) of the plan along its time."""
+        axes.plot(self.motion.time, values(self.motion), **self.look)
+        if self.rest is not None:
+            axes.plot(self.rest.time, values(self.rest), **{**self.look, **_OF_REST})
 
 
 # What is drawn of a plan: (label of the axis, title, values (N,) of a motion and the gravity).
@@ -64,17 +78,22 @@ def quadrotor_figure(
     plans, setting = run.same_case(), run.manifest["setting"]
     axes = figure.subplots(2, 3, sharex=True)
     drawn = [
-        Drawn(row, sample_motion(row["coeffs"], row["durations"], _SAMPLES), look_of(k, name, row))
+        Drawn(
+            row,
+            sample_motion(row["coeffs"], row["durations"], _SAMPLES),
+            sample_rest(row, _SAMPLES),
+            look_of(k, name, row),
+        )
         for k, (name, row) in enumerate(plans)
     ][::-1]
     first(axes[0, 0], setting, drawn)
     for panel, name in zip(axes.flat[1:5], panels, strict=True):
         unit, title, values = PANELS[name]
         for plan in drawn:
-            curve = values(plan.motion, setting["gravity"])
-            panel.plot(plan.motion.time, curve, **plan.look)
+            curve = lambda motion, values=values: values(motion, setting["gravity"])  # noqa: E731
+            plan.draw(panel, curve)
             if name == "jerk" and plan is drawn[-1]:
-                panel.set_ylim(0.0, 3.0 * np.nan_to_num(np.max(curve)) or None)
+                panel.set_ylim(0.0, 3.0 * np.nan_to_num(np.max(curve(plan.motion))) or None)
         style.label(panel, "", unit, title)
         if name == "thrust":
             _draw_thrust_limits(panel, setting)

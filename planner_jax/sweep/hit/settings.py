@@ -10,9 +10,12 @@ from planner_jax.sweep.robots import checked_robot, robot_option
 from planner_jax.sweep.settings import (
     SettingError,
     SweepSettings,
+    ending_option,
+    ending_options,
     option,
     require,
     require_effort,
+    require_ending,
     require_scale,
 )
 from planner_jax.task.efforts import EFFORTS
@@ -41,6 +44,7 @@ class HitSettings(SweepSettings):
 
     robot: Any = robot_option("paper-hitter")
     effort: str = option("feasible", "NAME", f"of the planner: {', '.join(EFFORTS)}")
+    ending: str = ending_option()
 
     RUN: ClassVar[str] = "planner_jax.sweep.hit.sweep:HitSweep"
     DRAW: ClassVar[tuple[str, ...]] = ("start", "delay", "limit_scale", "robot")
@@ -54,6 +58,7 @@ class HitSettings(SweepSettings):
         super().__post_init__()
         require_scale(self.limit_scale)
         require_effort(self.effort, self.planner, "juggle")
+        require_ending(self.ending)
         require(0.0 <= self.delay < math.inf, "delay", "finite and >= 0", self.delay)
         truer = not self.drag_after_impact or self.planner in (None, "exact")
         require(truer, "drag_after_impact", "left out unless the planner is exact", self.planner)
@@ -66,7 +71,7 @@ class HitSettings(SweepSettings):
         """Fields of the planner's dataclass that these settings decide."""
         truer = {"drag_after_impact": True} if self.drag_after_impact else {}
         more = {} if self.effort == EFFORTS[0] else {"effort": self.effort}
-        return more | truer
+        return more | truer | ending_options(self.ending)
 
 
 def _checked_start(start: Any) -> tuple[float, ...] | str:

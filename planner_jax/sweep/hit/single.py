@@ -34,11 +34,13 @@ class SingleHit(Single):
         ]
 
     def own_margins(self, answer: Answer) -> list[Margin]:
-        """Of the speed at the impact and of the apex."""
+        """Of the racket, of the speed at the impact and of the apex."""
         limits, verdict = answer.case.hit_limits, answer.verdict
         end = float(np.sum(answer.plan.trajectory.durations))
         speeds = np.abs(np.asarray(verdict.hitting_velocity))
-        found = [
+        off, most = float(verdict.contact_error), float(answer.case.racket_radius)
+        found = [Margin("racket's centre to ball [m]", off, most, end)]
+        found += [
             Margin(f"hitting speed {axis} [m/s]", float(speed), float(most), end)
             for axis, speed, most in zip("xyz", speeds, limits.hitting_speed, strict=True)
         ]

@@ -16,6 +16,7 @@ from planner_jax.sweep.hit.figures.path import path_figure
 from planner_jax.sweep.hit.figures.rates import compared_with, rates_figure
 from planner_jax.sweep.hit.settings import HitSettings
 from planner_jax.sweep.hit.source import ServeSource, open_source
+from planner_jax.sweep.quadrotor import ending_remark
 from planner_jax.sweep.robots import robot_remark
 from planner_jax.sweep.row_plans import quadrotor_plan
 from planner_jax.sweep.summary import Tally
@@ -114,7 +115,8 @@ class HitSweep(Sweep):
 
     def setting(self, cases: Any) -> dict[str, Any]:
         """Physics and limits that all cases have in common, for the manifest."""
-        setting = first_values(cases, ["drag", "gravity", "restitution", "racket_height"])
+        names = ("drag", "gravity", "restitution", "racket_height", "racket_radius")
+        setting = first_values(cases, names)
         return setting | first_values(cases.limits) | first_values(cases.hit_limits)
 
     def plan_of_row(self, row: dict[str, Any], setting: dict[str, Any]) -> QuadrotorPlan:
@@ -164,6 +166,7 @@ class HitSweep(Sweep):
             same = '"Same serves" are the published outcomes of this run\'s cases, where known. '
         return [
             *robot_remark(settings),
+            *ending_remark(settings),
             f"Serves: {summary['num']:,} {origin}; {manifest['serves']['distinct']:,} distinct "
             "balls (cases may share a ball and differ in the target).",
             f"Hover start {start}; planning begins {settings['delay']:g} s after the serve; speed, "

@@ -58,6 +58,7 @@ class HitCase:
     limits: QuadrotorLimits
     hit_limits: HitLimits
     extras: tuple[Any, ...] = ()  # limits and costs of the user's own, see `cost.extras`
+    racket_radius: Array | None = None  # () [m]; None: not looked at
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -76,6 +77,7 @@ def case(
     gravity=GRAVITY,
     restitution=None,
     racket_height=None,
+    racket_radius=None,
     speed=None,
     acceleration=None,
     min_thrust=None,
@@ -100,6 +102,7 @@ def case(
         gravity: [m/s^2].
         restitution: beta of the racket.
         racket_height: [m].
+        racket_radius: [m]; the ball has to meet the racket within 0.9 of it around its centre.
         speed: [m/s].
         acceleration: [m/s^2].
         min_thrust: [m/s^2], per unit mass.
@@ -155,6 +158,9 @@ def case(
             max_apex=leaf("max_apex", max_apex),
         ),
         extras=for_batch(extras, batch, dtype),
+        racket_radius=leaf(
+            "racket_radius", tool.radius if racket_radius is None else racket_radius
+        ),
     )
     require_sound(made, _ARGUMENTS)
     require_start(made)

@@ -12,6 +12,7 @@ RULES: Table = (
     Field("gravity", (), POSITIVE),
     Field("restitution", (), within(0.0, 1.0, "in [0, 1]")),
     Field("racket_height", ()),
+    Field("racket_radius", (), POSITIVE),
     *FLIGHT_RULES,
     Field("limits.min_height", (), NOT_NEGATIVE),
     Field("hit_limits.hitting_speed", (3,), POSITIVE),

@@ -27,11 +27,11 @@ def plan_figure(figure: Figure, run: RunRows, which: str) -> None:
 
 def _draw_distances(axes: Axes, setting: dict[str, Any], plans: list[Drawn]) -> None:
     """Distance of the net to the target that it catches next."""
-    for row, motion, look in plans:
-        away = due_distance(sampled_catch(row, motion, setting))
-        axes.plot(motion.time, np.maximum(away, _LEAST_DISTANCE), **look)
-        caught = np.maximum(np.array(row["net_distance"], float), _LEAST_DISTANCE)
-        axes.plot(row["catch_times"], caught, "o", color=look["color"], markersize=5)
+    for plan in plans:
+        away = due_distance(sampled_catch(plan.row, plan.motion, setting))
+        axes.plot(plan.motion.time, np.maximum(away, _LEAST_DISTANCE), **plan.look)
+        caught = np.maximum(np.array(plan.row["net_distance"], float), _LEAST_DISTANCE)
+        axes.plot(plan.row["catch_times"], caught, "o", color=plan.look["color"], markersize=5)
     axes.set_yscale("log")
     axes.axhline(setting["net_radius"], **DASHED)
     style.label(axes, "", "distance [m]", "Net to next target (red: net's radius)")

@@ -37,9 +37,10 @@ def _draw_heights(axes: Axes, setting: dict[str, Any], plans: list[Drawn]) -> No
     look: dict[str, Any] = {"color": style.INK, "linewidth": 1.2, "linestyle": ":"}
     axes.plot(time, path[:, 2], label="ball, if nobody hits it", **look)
     axes.legend(loc="upper right", fontsize=8.5)
-    for _, motion, look in plans:
-        axes.plot(motion.time, motion.pos[:, 2], **look)
-        axes.plot(motion.time[-1], motion.pos[-1, 2], "o", color=look["color"], markersize=5)
+    for plan in plans:
+        plan.draw(axes, lambda motion: motion.pos[:, 2])
+        end = (plan.motion.time[-1], plan.motion.pos[-1, 2])
+        axes.plot(*end, "o", color=plan.look["color"], markersize=5)
     axes.axhline(setting["min_height"], **DASHED)
     axes.axhspan(0.0, setting["min_height"], **FORBIDDEN)
     axes.set_ylim(bottom=0.0)

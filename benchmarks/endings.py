@@ -1,0 +1,78 @@
+"""Ways to rest behind plans that do not come to rest, as `export` makes them: how many are found.
+
+    python -m benchmarks.endings [--rows ROW,...] [--num 1000] [--seed 1] [--out DIR]
+
+Cases of each row are drawn and planned; of the plans that the referee lets pass each one is asked
+for its way to rest by itself. What is left without one has the limit that fails beside it.
+"""
+
+import time
+from collections import Counter
+from typing import Any
+
+import jax
+import numpy as np
+
+import planner_jax as pj
+from planner_jax.benchmarks.run import argument_parser, begin, chosen
+from planner_jax.ending.behind import is_rested, with_ending
+from planner_jax.ending.no_ending import NoEnding
+
+# Row -> words of the task, options of `draw` and of `planner`, and the way to rest.
+ROWS: dict[str, tuple[Any, dict[str, Any], dict[str, Any], str]] = {
+    "hits": (pj.hit, {}, {}, "brake"),
+    "hits-home": (pj.hit, {}, {}, "home"),
+    "throws": (pj.catch, {"suite": "throws"}, {}, "brake"),
+    "triangle3": (pj.catch, {"suite": "triangle3"}, {"decide": "greedy"}, "brake"),
+    **{f"car-{suite}": (pj.intercept, {"suite": suite}, {}, "brake") for suite in ("easy", "hard")},
+    **{f"arm-{regime}": (pj.block, {"regime": regime}, {}, "brake") for regime in ("R1", "R2")},
+}
+
+
+def found_behind(cases: Any, plans: Any, passed: np.ndarray, to: str) -> tuple[Counter, float]:
+    """How many plans rest, get a way to rest, or break which limit; and seconds a way, warm."""
+    counts: Counter[str] = Counter()
+    seconds = []
+    for place in np.flatnonzero(passed).tolist():
+        case, plan = pj.lane(cases, place), pj.lane(plans, place)
+        if is_rested(plan):
+            counts["rests"] += 1
+            continue
+        begin = time.perf_counter()
+        try:
+            with_ending(case, plan, to)
+            counts["found"] += 1
+        except NoEnding as error:
+            counts[str(error).partition(":")[0]] += 1
+        seconds.append(time.perf_counter() - begin)
+    return counts, float(np.median(seconds)) if seconds else 0.0
+
+
+def main() -> None:
+    parser = argument_parser("endings", __doc__, num=1000, seed=1)
+    parser.add_argument("--rows", metavar="ROW,...", default=",".join(ROWS))
+    options = parser.parse_args()
+    rows = chosen(parser, "--rows", options.rows, ROWS)
+    with begin(parser, options) as bench:
+        bench.say(
+            "| row | plans that pass | rest already | way to rest | none, by limit | ms a way |",
+            "|---|---|---|---|---|---|",
+        )
+        for row in rows:
+            task, of_draw, of_planner, to = ROWS[row]
+            drawn = task.draw(options.num, seed=options.seed, **of_draw)
+            cases = jax.tree.map(np.asarray, drawn)
+            plans = pj.plan(task.planner(**of_planner), cases)
+            passed = np.asarray(task.judge(cases, plans).success)
+            counts, median = found_behind(cases, plans, passed, to)
+            rests, found = counts.pop("rests", 0), counts.pop("found", 0)
+            none = ", ".join(f"{num} {name}" for name, num in counts.most_common()) or "-"
+            bench.say(
+                f"| {row} | {passed.sum()} | {rests} | {found} | {none} | {1e3 * median:.1f} |"
+            )
+            bench.row(row=row, passed=int(passed.sum()), rests=rests, found=found, none=counts)
+            bench.count(np.arange(passed.sum()) < rests + found)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,183 @@
+"""Float64 NumPy referee of ways to rest behind a plan's end, by themselves; one part a robot.
+
+It shares no code with the planners. A way has to go on where the plan ends, keep every limit and
+rest in the end, whatever is true of the plan.
+"""
+
+import dataclasses
+import functools
+from types import SimpleNamespace
+
+import numpy as np
+
+from planner_jax.referee.block import referee_blocks
+from planner_jax.referee.hit import HitVerdict
+from planner_jax.referee.intercept import final_poses, referee_intercepts
+from planner_jax.referee.judging import (
+    checked_leaf,
+    derivative,
+    finite_lanes,
+    first_failures,
+    judge_in_chunks,
+)
+from planner_jax.referee.quadrotor import (
+    checked_coeffs,
+    ending_leaves,
+    intervals_of,
+    judge_motion,
+    judge_rest,
+    limit_leaves,
+    pieces_of,
+)
+from planner_jax.referee.verdict import Verdict
+
+# The tests of hits that are not of the stroke, in their order.
+LIMITS = (
+    *("not finite", "head state", "continuity", "speed", "acceleration", "body rate"),
+    *("thrust low", "thrust high", "rotor low", "rotor high", "ground", "extra", "ending"),
+)
+_SAMPLES, _CHUNK = 400, 2048
+_STANDS = 1e-3  # [m/s], speed of a car that stands
+_OF_THE_BALL = ("ball", "tilt", "tunnel")
+
+
+@dataclasses.dataclass(frozen=True)
+class RestVerdict(Verdict):
+    """What the referee found, one entry a lane; times count from the last contact."""
+
+    SENTENCES = {name: HitVerdict.SENTENCES[name] for name in LIMITS}
+    UNBOUNDED = {"body rate": HitVerdict.UNBOUNDED["body rate"]}
+
+    worst_extra: np.ndarray  # (B,) int, place of the extra that is kept worst; -1 without any
+
+
+def referee_rests(
+    cases, plans, *, tolerance: float = 1e-3, continuity_tolerance: float = 1e-4
+) -> RestVerdict:
+    """The verdict on the way to rest of every plan of a batch, whatever is true of the plan.
+
+    Args:
+        cases: object with `gravity`, `limits` and `extras`, leaves with leading axis B.
+        plans: object with the fields of `QuadrotorPlan`, with `ending`; leaves with leading axis B.
+        tolerance: relative, of every limit of the case.
+        continuity_tolerance: as of `referee_hits`.
+
+    Raises:
+        ValueError: a leaf has the wrong shape.
+    """
+    coeffs = checked_coeffs(plans.trajectory.coeffs)
+    batch = coeffs.shape[:1]
+    trailing = {
+        "durations": (plans.trajectory.durations, coeffs.shape[1:2]),
+        "gravity": (cases.gravity, ()),
+        **limit_leaves(cases.limits),
+    }
+    leaves = {"lane": np.arange(len(coeffs)), "coeffs": coeffs, **ending_leaves(plans, batch)}
+    for name, (value, shape) in trailing.items():
+        leaves[name] = checked_leaf(name, value, batch + shape)
+    judge = functools.partial(
+        _judge,
+        extras=getattr(cases, "extras", ()),
+        relative=tolerance,
+        continuity=continuity_tolerance,
+    )
+    return RestVerdict(**judge_in_chunks(judge, leaves, _CHUNK))
+
+
+def _judge(case: dict, extras: tuple, relative: float, continuity: float) -> dict:
+    """The fields of `RestVerdict` for one chunk of lanes."""
+    case = {**case, "head_state": _end_states(case["coeffs"], case["durations"])}
+    pieces = pieces_of(case["ending.coeffs"], case["ending.durations"])
+    intervals = intervals_of(_SAMPLES, pieces.durations.shape[1])
+    measured, tests = judge_motion(pieces, case, extras, intervals, relative, continuity)
+    tests |= judge_rest(case, pieces, continuity)
+    found = first_failures(tests, LIMITS, finite_lanes(case))
+    return {**found, "worst_extra": measured["worst_extra"]}
+
+
+def _end_states(coeffs: np.ndarray, durations: np.ndarray) -> np.ndarray:
+    """Position to jerk (B, 4, 3) where trajectories end; pieces that take no time do not count."""
+    lanes, number = np.arange(len(coeffs)), np.arange(durations.shape[1])
+    last = np.where(durations > 0.0, number, 0).max(axis=1)
+    tail = np.moveaxis(coeffs[lanes, last], 0, -1)
+    ends = [derivative(tail, durations[lanes, last], order) for order in range(4)]
+    return np.moveaxis(np.stack(ends), -1, 0)
+
+
+def referee_stops(case, plan, rest) -> str:
+    """What is wrong with a car's way to a stand behind one plan; "" where nothing is.
+
+    `referee_intercepts` judges it as a case of its own that begins where the plan ends, without a
+    target: its limits, the map, what stands, and what moves until the car stands.
+
+    Args:
+        case: object with the fields of `InterceptCase`, of one case.
+        plan: object with the fields of `CarPlan`, of that case.
+        rest: likewise, from the end of the plan on; its `start` is not read.
+    """
+    cases, plans, rests = map(_batch_of_one, (case, plan, rest))
+    begin = final_poses(plans, cases.body)
+    later = {name: np.asarray(getattr(plans, name))[:, -1] for name in ("speed", "curvature")}
+    movers = cases.movers
+    moved = movers.centre + movers.velocity * np.asarray(plans.time)[:, None, None]
+    judged = _changed(
+        cases,
+        **later,
+        start=begin,
+        time=np.asarray(rests.time),
+        tolerance=np.full(1, np.inf),
+        heading_tolerance=np.full(1, np.inf),
+        movers=_changed(movers, centre=moved),
+    )
+    verdict = referee_intercepts(
+        judged,
+        _changed(rests, start=begin),
+        target_positions=lambda target, times: begin[:, :2],
+    )
+    if not verdict.success[0]:
+        return verdict.sentence(0)
+    last = float(rests.speed[0, -1])
+    return "" if abs(last) <= _STANDS else f"stand: the car drives at {last:.3g} m/s in the end"
+
+
+def referee_stands(case, plan, rest) -> str:
+    """What is wrong with an arm's way to rest behind one plan; "" where nothing is.
+
+    `referee_blocks` judges it as a case of its own that begins where the plan ends; what it says
+    of the ball, which has been met by then, does not count.
+
+    Args:
+        case: object with the fields of `BlockCase`, of one case.
+        plan: object with the fields of `ArmPlan`, of that case.
+        rest: likewise, from the end of the plan on.
+    """
+    cases, plans, rests = map(_batch_of_one, (case, plan, rest))
+    tail = np.moveaxis(np.asarray(plans.motion.coeffs, np.float64)[:, -1], 0, -1)
+    last = np.asarray(plans.motion.durations, np.float64)[:, -1]
+    angles, rates = (derivative(tail, last, order).T for order in range(2))
+    ends = np.asarray(rests.motion.durations, np.float64).sum(axis=1)
+    judged = _changed(
+        cases, angles=angles, rates=rates, delay=np.zeros(1), ends_at_rest=np.ones(1, bool)
+    )
+    verdict = referee_blocks(judged, _changed(rests, contact_time=ends))
+    if verdict.success[0] or verdict.failed_limit[0] in _OF_THE_BALL:
+        return ""
+    return verdict.sentence(0)
+
+
+def _batch_of_one(tree) -> SimpleNamespace:
+    """The fields of a dataclass of arrays, with a leading axis of one on every array."""
+    found = {}
+    for field in dataclasses.fields(tree):
+        value = getattr(tree, field.name)
+        if dataclasses.is_dataclass(value):
+            value = _batch_of_one(value)
+        elif field.metadata.get("pytree_node", True):
+            value = np.asarray(value)[None]
+        found[field.name] = value
+    return SimpleNamespace(**found)
+
+
+def _changed(tree: SimpleNamespace, **fields) -> SimpleNamespace:
+    """The same with other fields."""
+    return SimpleNamespace(**{**vars(tree), **fields})
