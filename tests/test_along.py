@@ -10,6 +10,8 @@ import pytest
 
 from planner_jax.cost.along import Along, _greatest, greatest_along, integrate_along
 from planner_jax.cost.along_kernel import MODES, along_kernel
+from planner_jax.cost.peaks import crest, greatest_by_tangents
+from planner_jax.cost.peaks_kernel import peaks_kernel
 from planner_jax.cost.penalty import smoothed_hinge
 from planner_jax.cost.quadrotor import motion_excess
 from planner_jax.lanes import over_lanes
@@ -95,20 +97,48 @@ def test_slopes_and_curvature_are_those_of_finite_differences(float64):
             np.testing.assert_allclose(here[order + 1], expected, rtol=tolerance, atol=1e-6)
 
 
-def test_the_greatest_of_every_limit_is_among_the_samples(float64):
+def test_the_greatest_of_every_limit_is_the_peak_between_the_samples(float64):
+    """Of speed and height; body rates of these wild ways peak too sharply for any sampling."""
     columns, durations, given = jax.tree.map(lambda x: x[0], cases(dtype=np.float64))
+    along, finer = dataclasses.replace(ALONG, nodes=20), 100
 
     @jax.jit
     @functools.partial(jax.value_and_grad, has_aux=True)
     def first_limit(h):
-        greatest = greatest_along(ALONG, columns, h, given)
-        return greatest[0][0], greatest
+        sample = functools.partial(sample_motion, along.maps, along.nodes * finer)
+        fine = jax.vmap(lambda *segment: motion_excess(sample(*segment), *given))(columns, h)
+        greatest = greatest_along(along, columns, h, given)
+        return greatest[0][0], (greatest, fine)
 
-    (_, greatest), slope = first_limit(durations)
-    for n, excess in enumerate(sampled(columns, durations, given)[0]):
-        expected = np.asarray(excess).max(axis=1)
-        np.testing.assert_allclose(np.stack(greatest)[:, n], expected, rtol=1e-12)
+    (_, (greatest, fine)), slope = first_limit(durations)
+    for limit in (0, 3):
+        samples = np.asarray(fine[limit])
+        missed = samples.max(axis=1) - samples[:, ::finer].max(axis=1)
+        off = np.abs(greatest[limit] - samples.max(axis=1))
+        assert missed.max() > 1e-3 and off.max() < 0.15 * missed.max()
     assert slope[0] < 0.0 and slope[1] == 0.0  # slower is less
+
+
+def test_three_samples_show_the_peak_of_a_parabola_and_no_other(float64):
+    """With unequal steps, also where it is nearer to an outer sample; else nothing is added."""
+    before, after = 0.3, 0.5
+    for peak, height in ((0.02, 1.0), (-0.29, 2.0), (0.49, 0.5), (-0.31, 3.0), (0.51, 1.0)):
+        left, middle, right = (height - 7.0 * (t - peak) ** 2 for t in (-before, 0.0, after))
+        expected = height - middle if -before < peak < after else 0.0
+        np.testing.assert_allclose(crest(left, middle, right, before, after), expected, atol=1e-12)
+    for values in ((1.0, 1.0, 1.0), (0.0, 1.0, 2.0), (1.0, 0.0, 1.0), (-np.inf,) * 3):
+        slopes = jax.grad(lambda x: crest(*x, before, after))(jnp.array(values))
+        assert crest(*map(jnp.array, values), before, after) == 0.0
+        assert np.isfinite(slopes).all() or np.isinf(values).any()
+
+
+def test_tangents_show_the_tip_of_a_tent_and_are_above_what_is_concave(float64):
+    times = np.linspace(0.0, 1.0, 11)
+    tent, slopes = 1.0 - 2.0 * np.abs(times - 0.537), -2.0 * np.sign(times - 0.537)
+    np.testing.assert_allclose(greatest_by_tangents(tent, slopes, 0.1), 1.0, rtol=1e-12)
+    hill, slopes = -3.0 * (times - 0.537) ** 2, -6.0 * (times - 0.537)
+    assert 0.0 < greatest_by_tangents(hill, slopes, 0.1) < 3.0 * 0.1**2 / 4.0
+    assert greatest_by_tangents(-hill, -slopes, 0.1) == (-hill).max()
 
 
 def test_worst_has_no_derivative():
@@ -160,7 +190,8 @@ def test_the_kernel_gives_the_same_numbers(mode):
         args = (args, jax.tree.map(lambda x: random.standard_normal(x.shape).astype(x.dtype), args))
     expected = jax.tree.leaves(jax.jit(jax.vmap(asked(mode), out_axes=-1))(*args))
     lanes = jax.tree.map(lambda x: jnp.asarray(np.moveaxis(x, 0, -1)), args)
-    kernel = along_kernel(ALONG, mode, interpret=True)
+    made = peaks_kernel if mode == "greatest" else functools.partial(along_kernel, mode=mode)
+    kernel = made(ALONG, interpret=True)
     found = kernel(jax.tree.structure(args), jax.tree.leaves(lanes))
     assert len(found) == len(expected)
     for ours, theirs in zip(found, expected, strict=True):

@@ -1,5 +1,6 @@
 """The exact hit planner: what is exact by construction, what is promised, what is refused."""
 
+import dataclasses
 import functools
 
 import jax
@@ -60,6 +61,19 @@ def test_any_decision_vector_meets_the_ball_and_reaches_the_target(cases):
     assert verdict.contact_error.max() < 1e-3
     assert verdict.landing_error.max() < 2e-3
     assert verdict.head_error.max() < 1e-4
+
+
+def test_the_violation_of_a_plan_is_the_excess_that_the_referee_finds(cases):
+    """Also where it peaks between samples, in plans that are refused."""
+    flown = dataclasses.replace(
+        cases.limits,
+        speed=0.4 * cases.limits.speed,
+        body_rate=np.linspace(0.2, 0.5, NUM, dtype=np.float32) * cases.limits.body_rate,
+    )
+    found = plan(FIRST_ROUND, cases.replace(limits=flown))
+    verdict = referee_hits(cases.replace(limits=flown), found)
+    excess = np.maximum(verdict.max_speed / flown.speed, verdict.max_body_rate / flown.body_rate)
+    np.testing.assert_allclose(found.violation, excess - 1.0, atol=5e-4)
 
 
 @jax.jit

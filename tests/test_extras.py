@@ -1,6 +1,7 @@
 """Limits and costs of a user's own along the way, planned by `exact` and judged by the referee."""
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
@@ -10,8 +11,9 @@ import pytest
 from flax import struct
 
 import planner_jax as pj
-from planner_jax.cost.extras import for_batch
+from planner_jax.cost.extras import for_batch, greatest_extras
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, states_at
+from planner_jax.trajectory.proportional_minco import boundary_rows
 from tests.derivatives import assert_gradient_matches_differences
 
 FREE, CATCH = pj.hit.planner("exact"), pj.catch.planner("exact", decide="given")
@@ -65,6 +67,14 @@ def way(plans, k, num=200):
     path = pj.lane(plans.trajectory, k)
     many = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf)[None], num, axis=0), path)
     return states_at(many, np.linspace(0.0, path.durations.sum(), num))[:, 0]
+
+
+def straight(path, vel):
+    """A way (1, M) from the origin on at one velocity (3,), of as long pieces as a path has."""
+    coeffs = np.zeros_like(path.coeffs[:1])
+    starts = np.cumsum(path.durations[:1], axis=1) - path.durations[:1]
+    coeffs[:, :, 0], coeffs[:, :, 1] = starts[..., None] * vel, vel
+    return PiecewisePolynomial(coeffs, path.durations[:1])
 
 
 def places(plans):
@@ -177,14 +187,9 @@ def test_a_blocked_way_is_planned_around_and_the_referee_says_which_was_not(
 
 def test_the_referee_finds_the_depth_its_time_and_the_extra(hits, free):
     """A straight way at 2 m/s through two spheres, the second of them deeper."""
-    path = free.trajectory
-    coeffs = np.zeros_like(path.coeffs[:1])
-    starts = np.cumsum(path.durations[:1], axis=1) - path.durations[:1]
-    coeffs[:, :, 0, 0], coeffs[:, :, 1, 0] = 2.0 * starts, 2.0
-    plan = pj.lane(free, slice(0, 1))
-    plan = plan.replace(trajectory=PiecewisePolynomial(coeffs, path.durations[:1]))
     head = np.zeros((1, 4, 3), np.float32)
     head[0, 1, 0] = 2.0
+    plan = pj.lane(free, slice(0, 1)).replace(trajectory=straight(free.trajectory, head[0, 1]))
     limits = dataclasses.replace(hits.limits, min_height=hits.limits.min_height - 9.0)
     case = pj.lane(hits.replace(limits=limits), slice(0, 1)).replace(head_state=head)
     zones = (
@@ -198,6 +203,34 @@ def test_the_referee_finds_the_depth_its_time_and_the_extra(hits, free):
     np.testing.assert_allclose(verdict.failed_time, 0.5, atol=5e-3)
     broken = (*zones[:2], pj.KeepOut(np.full((1, 3), np.nan), np.array([0.5])))
     assert pj.hit.judge(case.replace(extras=broken), plan).failed_limit[0] == "not finite"
+
+
+def test_the_tip_of_a_way_past_an_edge_is_found_between_samples(hits, free):
+    """A straight way at 2.8 m/s that cuts 2 mm off a box's edge, where no sample lies."""
+    one = slice(0, 1)
+    span = free.trajectory.durations[one].sum(axis=1)
+    limits = dataclasses.replace(hits.limits, min_height=hits.limits.min_height - 9.0)
+    head = np.zeros((1, 4, 3), np.float32)
+    head[0, 1] = (2.0, 2.0, 0.0)
+    case = pj.lane(hits.replace(limits=limits), one).replace(head_state=head)
+    path = straight(free.trajectory, head[0, 1])
+    plan = pj.lane(free, one).replace(trajectory=path)
+    maps, still = FREE.maps, np.zeros((FREE.num_pieces - 1, 3))
+    tail = np.stack([head[0, 1] * span, head[0, 1], *np.zeros((2, 3))])
+    rows = boundary_rows(head[0], tail, span[0] / FREE.num_pieces)
+    columns = jnp.concatenate([rows, jnp.asarray(still, rows.dtype)])
+    seen = jax.jit(functools.partial(greatest_extras, maps, columns, span[0] / FREE.num_pieces))
+    for place in (0.9, 0.9012, 0.9024, 0.9036):
+        low = np.array([[place, -0.1, -0.5]])
+        high = np.array([[1.9, place + 0.004, 0.5]])
+        zone = pj.KeepOutBox(low, high)
+        verdict = pj.hit.judge(case.replace(extras=(zone,)), plan)
+        depth = 0.002 / (0.5 * (high - low).min())
+        assert verdict.failed_limit[0] == "extra"
+        np.testing.assert_allclose(verdict.failed_excess, depth, rtol=1e-2)
+        np.testing.assert_allclose(verdict.failed_time, 0.5 * (place + 0.002), atol=1e-3)
+        (found,) = seen((pj.KeepOutBox(jnp.asarray(low[0]), jnp.asarray(high[0])),))
+        np.testing.assert_allclose(found, depth, rtol=1e-2)
 
 
 def test_lanes_of_a_batch_are_those_planned_alone(blocked, around):
@@ -233,6 +266,23 @@ def test_boxes_and_planes_are_planned_around_and_judged(hits, free, middle):
     assert (verdict.failed_limit == "extra").all() and list(verdict.worst_extra) == [3, 3, 4, 4]
     verdict = pj.hit.judge(cases, pj.plan(HIT, cases))
     assert verdict.success.all(), [verdict.sentence(k) for k in range(NUM)]
+
+
+def test_no_claim_is_refused_of_ways_past_boxes(hits, middle):
+    """Boxes of 20 to 60 cm about the middle of each way, whose edges the plans pass closely."""
+    random, claims = np.random.default_rng(2), 0
+    for _ in range(8):
+        half = random.uniform(0.1, 0.3, (NUM, 3))
+        low = middle + random.normal(0.0, 0.08, (NUM, 3)) - half
+        cases = having(hits, low=low, size=2.0 * half)
+        plans = pj.plan(HIT, cases)
+        verdict, solved = pj.hit.judge(cases, plans), pj.solved(plans)
+        claims += solved.sum()
+        assert verdict.success[solved].all(), [verdict.sentence(k) for k in range(NUM)]
+        broken = verdict.failed_limit == "extra"
+        excess = np.where(broken, verdict.failed_excess, plans.violation)
+        np.testing.assert_allclose(plans.violation, excess, atol=1e-3)
+    assert claims > 8
 
 
 def test_a_box_inside_out_and_a_plane_without_a_direction_are_refused(hits):

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from planner_jax.optimise.implicit import newton_refine, optimal_plan
 from planner_jax.optimise.evaluation import Evaluation
+from planner_jax.optimise.implicit import newton_refine, optimal_plan
 from planner_jax.protocol import Status
 from planner_jax.task.hit.exact import ExactHit
 from planner_jax.task.hit.serves import generate_serves, to_cases

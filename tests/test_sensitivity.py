@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from flax import struct
 
+from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.implicit import newton_refine, optimal_plan
 from planner_jax.optimise.inverse_kernel import inverse_kernel
-from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.multistart import minimise
 from planner_jax.optimise.planner import OptimisedPlanner, pending

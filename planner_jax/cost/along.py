@@ -18,6 +18,8 @@ from jax import Array
 from jax.custom_derivatives import SymbolicZero
 
 from planner_jax.cost.along_kernel import along_kernel
+from planner_jax.cost.peaks import greatest_by_parabolas
+from planner_jax.cost.peaks_kernel import peaks_kernel
 from planner_jax.cost.penalty import joined_trapezoid_weights, smoothed_hinge
 from planner_jax.lanes import with_kernel
 from planner_jax.trajectory.polynomial import Motion
@@ -66,6 +68,11 @@ class Along:
         each = [self.maps.sample_matrix(self.nodes, d) for d in range(self.orders)]
         return np.stack(each, axis=1)
 
+    def times(self) -> np.ndarray:
+        """Of the samples, in time over h, (K,)."""
+        steps = np.repeat(self.maps.proportions / self.nodes, self.nodes)
+        return np.concatenate([[0.0], np.cumsum(steps)])
+
     def weights(self) -> np.ndarray:
         """Of the samples, (K,); times the mean duration of a piece [s]."""
         return joined_trapezoid_weights(self.nodes, self.maps.proportions)
@@ -95,6 +102,8 @@ def greatest_along(
 ) -> tuple[Array, ...]:
     """Greatest excess over every limit along N segments; the arguments of `integrate_along`.
 
+    Peaks between the samples are those of parabolas (`peaks.greatest_by_parabolas`).
+
     Returns:
         E arrays (N,), differentiable.
     """
@@ -110,7 +119,8 @@ def _with_kernel(function: Callable, along: Along, mode: str, jvp: Any = None) -
 @functools.cache
 def _greatest(along: Along) -> Callable:
     """`greatest_along`, with a kernel."""
-    return _with_kernel(_greatest_of_segments, along, "greatest")
+    greatest = functools.partial(_greatest_of_segments, along)
+    return with_kernel(greatest, peaks_kernel(along), ("greatest", *along.key()))
 
 
 @functools.cache
@@ -148,7 +158,9 @@ def _greatest_of_segments(
 
     def of_segment(columns: Array, duration: Array) -> tuple[Array, ...]:
         motion = sample_motion(along.maps, along.nodes, columns, duration, along.orders)
-        return tuple(jnp.max(excess) for excess in along.excess(motion, parameters))
+        # Held: the peaks read every sample three times.
+        excess = jax.lax.optimization_barrier(along.excess(motion, parameters))
+        return tuple(greatest_by_parabolas(each, along.times()) for each in excess)
 
     return jax.vmap(of_segment)(columns, durations)
 

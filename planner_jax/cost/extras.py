@@ -2,8 +2,9 @@
 
 An extra is a `flax.struct.dataclass` of arrays with a method `excess`, `cost` or both, pure and for
 one case. They are called on jax arrays, and `excess` on float64 NumPy arrays by the referee: use
-operators and the methods of both. Another value compiles nothing anew; another class does. What is
-smaller than the way between two samples of a plan, some centimetres, may be missed.
+operators and the methods of both. Another value compiles nothing anew; another class does. The
+search looks at samples some centimetres apart, and a finished plan is looked at every few
+millimetres, peaks in between by tangents; what is smaller than that may be missed.
 """
 
 from collections.abc import Sequence
@@ -16,8 +17,14 @@ from flax import struct
 from jax import Array
 
 from planner_jax.checks import shapes_told, told
+from planner_jax.cost.peaks import greatest_by_tangents
 from planner_jax.rules import NOT_NEGATIVE, NOT_ZERO, POSITIVE, Field, Table, below
 from planner_jax.trajectory.polynomial import Motion
+from planner_jax.trajectory.proportional_minco import ProportionalMinco, by_pieces
+
+# Intervals a piece at which a finished plan is held against extra limits: a way past an edge, or
+# past a small sphere, peaks between two samples of the search.
+_CLOSE_NODES = 64
 
 
 @runtime_checkable
@@ -184,6 +191,38 @@ def extra_excess(motion: Motion, extras: tuple[Any, ...]) -> tuple[Array, ...]:
     """The excess (N,) over each that is a limit, along samples of a motion."""
     samples = motion.pos, motion.vel, motion.acc
     return tuple(extra.excess(*samples) for extra in extras if isinstance(extra, ExtraLimit))
+
+
+def greatest_extras(
+    maps: ProportionalMinco, columns: Array, duration: Array, extras: tuple[Any, ...]
+) -> tuple[Array, ...]:
+    """Greatest excess over each that is a limit along a whole segment, () each.
+
+    Where it is concave between samples it is not missed: see `peaks.greatest_by_tangents`.
+
+    Args:
+        maps: constant maps of M pieces.
+        columns: (2s + M - 1, 3) boundary rows and whitened offsets.
+        duration: () [s], mean of the pieces.
+        extras: of a case.
+    """
+    if not num_limits(extras):
+        return ()
+
+    def at(pos: Array, vel: Array, acc: Array) -> tuple[Array, ...]:
+        return tuple(e.excess(pos, vel, acc) for e in extras if isinstance(e, ExtraLimit))
+
+    def of_piece(motion: Motion, lasting: Array) -> tuple[Array, ...]:
+        state, change = (motion.pos, motion.vel, motion.acc), (motion.vel, motion.acc, motion.jerk)
+        values, slopes = jax.jvp(at, state, change)
+        step = lasting / _CLOSE_NODES
+        return tuple(
+            greatest_by_tangents(value, slope, step)
+            for value, slope in zip(values, slopes, strict=True)
+        )
+
+    greatest = by_pieces(of_piece, maps, _CLOSE_NODES, columns, duration)
+    return tuple(jnp.max(each) for each in greatest)
 
 
 def extra_rate(motion: Motion, given: tuple[Any, ...]) -> Array:

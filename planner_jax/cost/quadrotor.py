@@ -8,15 +8,17 @@ kernel has them.
 
 import dataclasses
 import enum
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
 from planner_jax.arithmetic import Components, components, reciprocal
-from planner_jax.cost.along import Along
-from planner_jax.cost.extras import extra_excess, extra_rate, num_limits
+from planner_jax.cost.along import Along, greatest_along
+from planner_jax.cost.extras import extra_excess, extra_rate, greatest_extras, num_limits
 from planner_jax.robot.quadrotor import (
     QuadrotorLimits,
     RotorLimits,
@@ -210,10 +212,9 @@ def flight_measures(limits: QuadrotorLimits) -> tuple[Measure, ...]:
 
 
 def relative_excess(limits: QuadrotorLimits, excess: Sequence[Array]) -> list[Array]:
-    """Relative excesses, of those of `limits_along`; what belongs to extras is relative already."""
+    """Relative excesses, of those of `flight_excess`."""
     measures = flight_measures(limits)
-    own = [of.relative(each) for of, each in zip(measures, excess, strict=False)]
-    return [*own, *excess[len(measures) :]]
+    return [of.relative(each) for of, each in zip(measures, excess, strict=True)]
 
 
 def flight_along(
@@ -247,3 +248,25 @@ def _groups(limits: QuadrotorLimits) -> tuple[tuple[tuple[int, int], ...], ...]:
     return tuple(
         tuple((order, axis) for order in sorted(each) for axis in axes(order)) for each in together
     )
+
+
+def greatest_excess(
+    maps: ProportionalMinco, nodes: int, columns: Array, durations: Array, case: Any
+) -> list[Array]:
+    """By how much a finished plan of N segments exceeds each limit, relative, (N,) each.
+
+    Peaks between the samples count: those of flight by parabolas, those of extras by tangents.
+
+    Args:
+        maps: of a segment.
+        nodes: intervals a piece at which the limits of flight are looked at.
+        columns: (N, C, 3) boundary rows and whitened offsets of each segment.
+        durations: (N,) [s], mean of its pieces.
+        case: with `gravity`, `limits` and `extras`.
+    """
+    bare = dataclasses.replace(case, extras=())
+    along = flight_along(maps, nodes, bare, 0.0, 1.0)
+    greatest = greatest_along(along, columns, durations, (case.gravity, case.limits, ()))
+    extras: Any = jax.vmap(functools.partial(greatest_extras, maps), in_axes=(0, 0, None))
+    flown = relative_excess(case.limits, greatest)
+    return [*flown, *extras(columns, durations, case.extras)]

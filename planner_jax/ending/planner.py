@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from planner_jax.cost.along import Along, greatest_along, integrate_along
-from planner_jax.cost.quadrotor import flight_along, limits_along, relative_excess
+from planner_jax.cost.along import Along, integrate_along
+from planner_jax.cost.quadrotor import flight_along, greatest_excess, limits_along
 from planner_jax.ending.case import EndingCase, EndingPlan
 from planner_jax.ending.names import ENDINGS
 from planner_jax.optimise.evaluation import Evaluation
@@ -163,15 +163,16 @@ class RestPlanner(OptimisedPlanner):
         return jnp.concatenate([bend.ravel(), smooth[None], spent[None]])
 
     def decode(self, point: Array, context: EndingCase) -> EndingPlan:
-        """The plan at a point, its violation looked for at `_DECODE_NODES` a piece."""
+        """The plan at a point, its violation looked for at `_DECODE_NODES` and between them."""
         offsets, rows, duration = self._unpack(point, context)
-        greatest = greatest_along(
-            self._along(_DECODE_NODES, context),
+        greatest = greatest_excess(
+            self.maps,
+            _DECODE_NODES,
             jnp.concatenate([rows, offsets])[None],
             duration[None],
-            (context.gravity, context.limits, context.extras),
+            context,
         )
-        violation = functools.reduce(jnp.maximum, relative_excess(context.limits, greatest))[0]
+        violation = functools.reduce(jnp.maximum, greatest)[0]
         return EndingPlan(
             trajectory=proportional_trajectory(self.maps, rows, offsets, duration),
             gravity=context.gravity,

@@ -9,8 +9,8 @@ from jax import Array
 
 from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.lbfgs import LbfgsConfig
-from planner_jax.optimise.newton import Curvature, by_products
 from planner_jax.optimise.multistart import solve_batch, solve_round
+from planner_jax.optimise.newton import Curvature, by_products
 from planner_jax.optimise.problem import Round, Settings
 
 _LONG = LbfgsConfig(max_steps=300, tolerance=1e-7, patience=6)

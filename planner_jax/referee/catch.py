@@ -132,7 +132,8 @@ def referee_catches(
     their peaks searched on the polynomial itself. Errors at time 0 and between pieces count as
     displacement (`referee.quadrotor.joint_errors`). A lane without targets has nothing to fail.
 
-    The case's extra limits are asked for their excess at the samples, in float64.
+    The case's extra limits are asked for their excess at the samples, in float64, and searched
+    between those where they may be greatest.
 
     The target's place is worked out here, in float64, for a path with the fields of `BallPath`
     (known by `ball`), of `HarmonicPath` (`amplitude`) or of `PathTable` (`resolution`; between

@@ -129,7 +129,8 @@ def referee_hits(
     `SHORTEST_PIECE`). Eight minimum-snap pieces computed in float32 with coordinates up to
     4.5 m have at most 1.3e-4 m of it, under a third of the default tolerance.
 
-    The case's extra limits are asked for their excess at the samples, in float64.
+    The case's extra limits are asked for their excess at the samples, in float64, and searched
+    between those where they may be greatest.
 
     Args:
         cases: object with the fields of `HitCase`, leaves with leading axis B.

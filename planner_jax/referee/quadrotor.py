@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from planner_jax.referee.extras import worst_extras
 from planner_jax.referee.judging import above, checked_leaf, cut, derivative, flat
 from planner_jax.referee.rotors import rotor_thrusts
 
@@ -387,31 +388,6 @@ def joint_errors(pieces: Pieces, head_state: np.ndarray) -> tuple:
     return head_error.max(axis=0), jump.max(axis=1), pieces.starts[lanes, worst], scale
 
 
-def _worst_extras(pieces: Pieces, lanes: np.ndarray, extras: tuple, u: np.ndarray) -> tuple:
-    """Greatest relative excess (B,) over extra limits, its time, and which extra it is of.
-
-    Extras are those of all cases, of which these are `lanes`. The excess is looked for at the
-    samples u (S,) of every piece; it is -1 without a limit.
-    """
-    limits = [k for k, extra in enumerate(extras) if hasattr(extra, "excess")]
-    worst, time, which = np.full(len(lanes), -1.0), np.zeros(len(lanes)), np.full(len(lanes), -1)
-    for i, lane in enumerate(lanes.astype(int) if limits else ()):
-        here = pieces.of(slice(i, i + 1))
-        samples = [np.moveaxis(values, 0, -1).reshape(-1, 3) for values in _motion(here, u)[:3]]
-        found = np.stack([_of_lane(extras[k], lane).excess(*samples) for k in limits])
-        place, top = divmod(int(found.argmax()), found.shape[1])
-        worst[i], which[i] = found[place, top], limits[place]
-        time[i] = _time(here, np.array([top]), u)[0]
-    return worst, time, which
-
-
-def _of_lane(extra: Any, lane: int) -> Any:
-    """An extra with the arrays of one lane in float64."""
-    numbers = [f.name for f in dataclasses.fields(extra) if f.metadata.get("pytree_node", True)]
-    own = {name: np.asarray(getattr(extra, name), float)[lane] for name in numbers}
-    return dataclasses.replace(extra, **own)
-
-
 def judge_motion(
     pieces: Pieces, case: dict, extras: tuple, intervals: int, relative: float, continuity: float
 ) -> tuple[dict, dict]:
@@ -439,7 +415,7 @@ def judge_motion(
         "head_error": head,
     }
     u = np.linspace(0.0, 1.0, intervals + 1)
-    beyond, at, measured["worst_extra"] = _worst_extras(pieces, case["lane"], extras, u)
+    beyond, at, measured["worst_extra"] = worst_extras(pieces, case["lane"], extras, u)
     allowed = continuity * scale
     tests = {
         "head state": (head > allowed, head, np.zeros_like(head)),

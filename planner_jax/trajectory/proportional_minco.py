@@ -18,6 +18,7 @@ the smoothest guess for any boundary, and the energy is a boundary part plus a m
 import dataclasses
 import functools
 import math
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -163,13 +164,50 @@ def sample_motion(
         piece_duration: () h = T / M [s].
         orders: 5 for the snap as well.
     """
+    matrices = np.stack([maps.sample_matrix(nodes, d) for d in range(orders)])
+    return _motion(jnp.asarray(matrices, columns.dtype), columns, piece_duration)
+
+
+def by_pieces(
+    function: Callable[[Motion, Array], Any],
+    maps: ProportionalMinco,
+    nodes: int,
+    columns: Array,
+    piece_duration: Array,
+) -> Any:
+    """What a function finds in the motion of each piece, one after another.
+
+    Many samples of all pieces at once would take a lot of memory.
+
+    Args:
+        function: of the motion at `nodes` + 1 samples of a piece, and of its duration [s].
+        maps: as for `sample_motion`, and so are the others.
+        nodes: intervals a piece.
+        columns: (2s + M - 1, 3).
+        piece_duration: () [s].
+
+    Returns:
+        What the function gives back, with a leading axis of M.
+    """
+    each = np.stack([maps.sample_matrix(nodes, d) for d in range(4)])
+    places = np.arange(maps.num_pieces)[:, None] * nodes + np.arange(nodes + 1)
+    matrices = jnp.asarray(each[:, places].swapaxes(0, 1), columns.dtype)  # (M, 4, nodes + 1, C)
+    shares = jnp.asarray(maps.proportions, columns.dtype)
+
+    def of_piece(piece: tuple[Array, Array]) -> Any:
+        matrix, share = piece
+        return function(_motion(matrix, columns, piece_duration), share * piece_duration)
+
+    return lax.map(of_piece, (matrices, shares))
+
+
+def _motion(matrices: Array, columns: Array, piece_duration: Array) -> Motion:
+    """The samples of matrices (orders, N, C)."""
     # One product for everything: on a CPU each product, division and sum of its own costs more
     # than its arithmetic. The matrix comes first, so that a batch adds columns.
-    matrices = np.stack([maps.sample_matrix(nodes, d) for d in range(orders)])
+    orders = matrices.shape[0]
     unit = jnp.matmul(
-        jnp.asarray(matrices.reshape(-1, matrices.shape[-1]), columns.dtype),
-        columns,
-        precision=lax.Precision.HIGHEST,
+        matrices.reshape(-1, matrices.shape[-1]), columns, precision=lax.Precision.HIGHEST
     ).reshape(orders, -1, 3)
     rate = reciprocal(piece_duration)
     rates = [jnp.ones_like(rate), rate, rate * rate, rate * rate * rate]

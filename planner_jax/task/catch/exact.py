@@ -15,9 +15,9 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.cost.along import Along, greatest_along, integrate_along
+from planner_jax.cost.along import Along, integrate_along
 from planner_jax.cost.penalty import smoothed_hinge
-from planner_jax.cost.quadrotor import flight_along, limits_along, relative_excess
+from planner_jax.cost.quadrotor import flight_along, greatest_excess, limits_along
 from planner_jax.lanes import in_one_kernel
 from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.lbfgs import LbfgsConfig
@@ -52,10 +52,10 @@ from planner_jax.trajectory.proportional_minco import (
 
 _ORDER = 4  # minimum snap
 _PROPORTIONS = (0.3,) + (1.0,) * 5
-# At which a piece is looked at in the end, of one catch and of several: body rates peak sharply
-# where the thrust is small, as it is between catches.
-_DECODE_NODES = (40, 80)
 _SEEN = (-0.1, 0.1)  # [s] from the decided time, at which a learned start looks at the ball
+# Intervals at which a piece is looked at in the end, of one catch and of several: body rates peak
+# sharply where the thrust is small, as it is between catches.
+_DECODE_NODES = (32, 48)
 _RIM = 0.9  # share of the net's radius that a planned catch may use
 _ENCODED_RIM = 0.99  # share of that which a point made by `encode` may use
 
@@ -412,17 +412,13 @@ class ExactCatch(OptimisedPlanner):
         return is_too_far(context)
 
     def decode(self, point: Array, context: CatchContext) -> CatchPlan:
-        """The plan at a point, its violation looked for at `_DECODE_NODES` a piece."""
+        """The plan at a point, its violation looked for at `_DECODE_NODES` and between them."""
         chain, catch = self._unpack(point, context)
         nodes = _DECODE_NODES[context.times.size > 1]
-        greatest = greatest_along(
-            self._along(nodes, context.case),
-            chain.columns,
-            chain.piece_durations,
-            (context.case.gravity, context.case.limits, context.case.extras),
+        greatest = greatest_excess(
+            self.maps, nodes, chain.columns, chain.piece_durations, context.case
         )
-        excess = [jnp.max(jnp.where(context.active, each, -1.0)) for each in greatest]
-        along = relative_excess(context.case.limits, excess)
+        along = [jnp.max(jnp.where(context.active, each, -1.0)) for each in greatest]
         at_catch = jnp.max(self._at_catch(catch, context))
         violation = functools.reduce(jnp.maximum, [*along, at_catch])
         return CatchPlan(

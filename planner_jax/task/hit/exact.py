@@ -24,11 +24,11 @@ from planner_jax.ball.flight import (
 from planner_jax.ball.impact import required_impact
 from planner_jax.ball.prediction import LEAST_NODES, target_at
 from planner_jax.checks import require_size
-from planner_jax.cost.along import Along, greatest_along, integrate_along
+from planner_jax.cost.along import Along, integrate_along
 from planner_jax.cost.along_curvature import curvature_along
 from planner_jax.cost.contact import apex_excess, hitting_speed_excess
 from planner_jax.cost.penalty import smoothed_hinge
-from planner_jax.cost.quadrotor import Measure, flight_along, limits_along, relative_excess
+from planner_jax.cost.quadrotor import Measure, flight_along, greatest_excess, limits_along
 from planner_jax.lanes import in_one_kernel
 from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.lbfgs import LbfgsConfig
@@ -467,16 +467,16 @@ class ExactHit(OptimisedPlanner):
         return is_too_far(context)
 
     def decode(self, point: Array, context: HitContext) -> HitPlan:
-        """The plan at a point, its violation looked for at 16 nodes a piece."""
+        """The plan at a point, its violation looked for at 16 nodes a piece and between them."""
         offsets, rows, duration, impact = self._unpack(point, context)
-        greatest = greatest_along(
-            self._along(_DECODE_NODES, context.case),
+        along = greatest_excess(
+            self.maps,
+            _DECODE_NODES,
             jnp.concatenate([rows, offsets])[None],
             duration[None],
-            (context.case.gravity, context.case.limits, context.case.extras),
+            context.case,
         )
         at_impact = self._at_impact(impact, context)
-        along = relative_excess(context.case.limits, greatest)
         hitting_speed = Measure.ABOVE.relative(at_impact[2:])
         violation = jnp.max(jnp.concatenate([*along, hitting_speed, at_impact[:2]]))
         return HitPlan(
