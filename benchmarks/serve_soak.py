@@ -167,7 +167,7 @@ class Soak:
 def started(options: Any) -> tuple[subprocess.Popen, int, float]:
     """The server's process, its port, and after how many seconds it answers."""
     words = [sys.executable, "-m", "planner_jax", "serve", options.task, "--port", "0", "--report"]
-    words += ["--deadline", str(options.deadline)]
+    words += ["--deadline", str(options.deadline), "--rate", str(options.rate)]
     if options.server_core is not None:
         words = ["taskset", "-c", str(options.server_core), *words]
     began = time.perf_counter()

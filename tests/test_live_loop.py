@@ -102,7 +102,11 @@ def test_a_throw_is_caught_along_a_smooth_course_and_nothing_is_compiled(warm, p
     speeds = np.array([answer.column("vel")[0] for answer in answers])
     jumps = np.diff(places, axis=0) - 0.5 * STEP * (speeds[1:] + speeds[:-1])
     assert np.abs(jumps).max() < 0.01
-    assert np.linalg.norm(speeds[-1]) < 0.3  # at rest, or nearly
+    slowing = np.linalg.norm(speeds[last + 1 :], axis=1)
+    assert slowing[-1] < 0.5 * slowing[0]
+    throw.now += 3.0
+    rest = throw.send(throw.packet(BALL, path[0]))
+    assert not rest.column("vel").any() and (rest.column("pos")[:, 2] > 0.2).all()
 
 
 def test_setpoints_agree_with_each_other(warm, path):
