@@ -33,7 +33,7 @@ from planner_jax.live.packets import BALL, LONGEST, ROBOT, Motion, read_answer, 
 from planner_jax.live.report import Latencies
 
 NUM = 200  # balls that are drawn, and thrown again and again
-SECONDS = 1.6  # of a throw
+SECONDS = 1.8  # of a throw
 NOISE = 0.005  # [m]
 LATE = 0.03  # [s]
 NAP, GAP = 0.001, 0.004  # [s], of the thread that sleeps, and what it notes
@@ -147,10 +147,11 @@ class Soak:
             state = np.zeros((3, 3)) if wanted is None else wanted
             if wanted is None:
                 state[0] = start
-            answer = self.send(ROBOT, time.monotonic(), tuple(state.ravel()), ball)
+            known = self.send(ROBOT, time.monotonic(), tuple(state.ravel()), ball)
             seen = place + self._random.normal(0.0, NOISE, 3)
-            answer = self.send(BALL, now, tuple(seen), ball) or answer
-            if answer is None or not len(answer.setpoints):
+            answer = self.send(BALL, now, tuple(seen), ball) or known
+            # Until the server has heard where the robot hovers, it hovers on.
+            if answer is None or (wanted is None and known is None):
                 continue
             wanted = answer.setpoints[0, :9].astype(float).reshape(3, 3)
             contact = answer.contact if answer.motion is Motion.PLAN else contact

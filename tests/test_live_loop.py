@@ -15,10 +15,14 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.cli import main
+from planner_jax.live import planner as live_planner
+from planner_jax.live.course import with_rest
 from planner_jax.live.packets import BALL, ROBOT, Fault, Motion, read_answer, request
 from planner_jax.live.planner import LivePlanner
 from planner_jax.live.server import Server
+from planner_jax.live.settings import CatchServe, HitServe
 from planner_jax.live.strokes import CATCH_DRAG, CatchStroke, HitStroke
+from planner_jax.sweep.settings import SettingError
 
 HOME, STEP = np.array([0.0, 0.0, 1.0]), 0.01
 PAGE = Path(__file__).parents[1] / "docs" / "live.md"
@@ -181,6 +185,27 @@ def test_a_robot_that_is_off_its_course_is_brought_to_rest_from_where_it_is(warm
     np.testing.assert_allclose(answer.column("pos")[0], [5.0, 5.0, 2.0], atol=1e-5)
 
 
+def test_a_plan_behind_which_there_is_no_way_to_rest_is_not_flown_on(warm, path, monkeypatch):
+    monkeypatch.setattr(live_planner, "with_rest", lambda *a: (with_rest(*a)[0], False))
+    before = warm.report.counts["endless"]
+    answers = Throw(warm, path, 8).fly(40)
+    assert warm.report.counts["endless"] - before > 10 and warm._flight.plan is None
+    assert answers[-2].motion is Motion.SAFE  # to a state of the robot
+    places = np.array([answer.column("pos")[0] for answer in answers])
+    assert np.linalg.norm(places - HOME, axis=1).max() < 0.02
+
+
+@pytest.mark.parametrize("rate", [2.0, 200.0])
+def test_setpoints_join_the_way_to_rest_behind_a_plan_at_any_rate(warm, path, monkeypatch, rate):
+    monkeypatch.setattr(warm, "_period", 1.0 / rate)
+    answer = balls_of(Throw(warm, path, 9).fly(40))[-1]
+    assert answer.motion is Motion.PLAN and answer.period == pytest.approx(1.0 / rate)
+    times = answer.begin + answer.period * np.arange(10)
+    assert (answer.column("vel")[times > answer.contact + 4.0] == 0.0).all()
+    way = np.linalg.norm(np.diff(answer.column("pos"), axis=0), axis=1)
+    assert (way < 5.0 * answer.period).all()  # the greatest speed
+
+
 def test_what_takes_too_long_is_answered_from_the_last_good_plan(warm, path, monkeypatch):
     goes_on = threading.Event()
     throw, again = Throw(warm, path, 6), warm.stroke.again
@@ -213,6 +238,19 @@ def test_the_client_of_the_page_prints_setpoints(warm, capsys):
         thread.join()
         server._socket.close()
     assert "PLAN" in capsys.readouterr().out
+
+
+def test_a_robot_is_served_by_its_name_and_has_to_carry_the_tool():
+    stroke = CatchServe(robot="x500-net").stroke()
+    assert float(stroke.case.net.radius) == pytest.approx(0.2)
+    assert CatchServe().stroke().case.net.radius == CatchStroke().case.net.radius
+    for settings, robot, rule in (
+        (HitServe, "x500-net", "robot must carry a racket"),
+        (CatchServe, "nobody", "robot must be one of"),
+        (CatchServe, "gone.yaml", "robot must be a file that can be read"),
+    ):
+        with pytest.raises(SettingError, match=rule):
+            settings(robot=robot)
 
 
 def test_a_port_that_is_taken_ends_the_command_with_a_line(warm, capsys):

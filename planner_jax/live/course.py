@@ -11,7 +11,6 @@ from jax import Array
 from planner_jax.ending.case import EndingCase
 from planner_jax.ending.planner import RestPlanner
 from planner_jax.live.packets import FIELDS
-from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
 from planner_jax.planning.batch import solve_cases
 from planner_jax.planning.packed import call_packed
@@ -19,9 +18,7 @@ from planner_jax.protocol import is_solved
 from planner_jax.robot.quadrotor_plan import setpoint_at
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, states_at, total_duration
 
-# A few iterations make every way to rest behind hits and catches keep the limits; what the default
-# round adds is less snap.
-_REST = RestPlanner(rounds=(Round(starts=1, solver=LbfgsConfig(max_steps=16)),))
+_REST = RestPlanner()
 
 
 @struct.dataclass
