@@ -240,6 +240,18 @@ def test_the_client_of_the_page_prints_setpoints(warm, capsys):
     assert "PLAN" in capsys.readouterr().out
 
 
+def test_packets_that_are_not_ours_get_a_line_each_kind_and_no_answer(warm, capsys):
+    server, sender = Server(warm, 0), ("127.0.0.1", 9)
+    ours = request(BALL, 1, 5.0, 5.0, (0.0, 0.0, 1.0))
+    for data in (b"GET / HTTP/1.1", ours[:30], b"", ours[:4] + b"\x02" + ours[5:], b"PJLV", b"x"):
+        server._answer(data, sender, time.perf_counter())
+    server._socket.close()
+    lines = capsys.readouterr().err.splitlines()
+    start = "planner-jax: warning: a packet from 127.0.0.1:9 "
+    assert [line.startswith(start) for line in lines] == [True] * 3
+    assert "PJLV" in lines[0] and "length" in lines[1] and "version" in lines[2]
+
+
 def test_a_robot_is_served_by_its_name_and_has_to_carry_the_tool():
     stroke = CatchServe(robot="x500-net").stroke()
     assert float(stroke.case.net.radius) == pytest.approx(0.2)

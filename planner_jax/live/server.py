@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 
 import jax
 
-from planner_jax.live.packets import LONGEST
+from planner_jax.live.packets import LONGEST, SILENT, Fault, read_request
 from planner_jax.live.planner import LivePlanner
 
 HOST = "127.0.0.1"
@@ -31,6 +31,7 @@ class Server:
 
     def __init__(self, planner: LivePlanner, port: int) -> None:
         self.planner = planner
+        self._told: set[Fault] = set()
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self._socket.bind((HOST, port))
@@ -64,6 +65,7 @@ class Server:
     def _answer(self, data: bytes, sender: tuple[str, int], received: float) -> None:
         answer = self.planner.answer(data, sender, received)
         if answer is None:
+            self._tell(data, sender)
             return
         try:
             self._socket.sendto(answer, sender)
@@ -71,6 +73,20 @@ class Server:
             self.planner.report.counts["unsent"] += 1
             return
         self.planner.sent(data, received)
+
+    def _tell(self, data: bytes, sender: tuple[str, int]) -> None:
+        """Say what is wrong with a packet that gets no answer, the first time that it happens."""
+        fault = read_request(data)
+        assert isinstance(fault, Fault)
+        if fault in self._told:
+            return
+        self._told.add(fault)
+        print(
+            f"planner-jax: warning: a packet from {sender[0]}:{sender[1]} {SILENT[fault]}; "
+            "this is not said again",
+            file=sys.stderr,
+            flush=True,
+        )
 
     def close(self) -> None:
         """Give the port back, and end the planner's thread."""
