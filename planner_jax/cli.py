@@ -374,18 +374,19 @@ def _add_serve(kind: type, parser: _Parser) -> None:
 
 
 def _serve(settings: Any) -> None:
+    from planner_jax.live.planner import LivePlanner
+    from planner_jax.live.server import Server, compute_in_place, undisturbed
+
+    compute_in_place()
     require_backend()
     keep_compiled_programs()
-    from planner_jax.live.planner import LivePlanner
-    from planner_jax.live.server import Server
-
     names = ("rate", "horizon", "deadline", "noise")
     options = {name: getattr(settings, name) for name in names}
     server = Server(LivePlanner(settings.stroke(), **options), settings.port)
     server.warm_up()
     report = server.planner.report
     rest = lambda: f"{report.counts['answered']:,} packets answered"  # noqa: E731
-    with stopping.under_way(rest, bar=False), contextlib.closing(server):
+    with stopping.under_way(rest, bar=False), contextlib.closing(server), undisturbed():
         print(f"Answering on 127.0.0.1:{server.port}; Ctrl-C stops.", flush=True)
         ends = time.monotonic() + (settings.seconds or math.inf)
         server.run(lambda: not stopping.is_told() and time.monotonic() < ends)

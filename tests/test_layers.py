@@ -51,7 +51,7 @@ ALLOWED = {
     "space": set(),
     "cost": {"arithmetic", "checks", "lanes", "robot", "rules", "trajectory"},
     "optimise": {"checks", "lanes", "protocol"},
-    "planning": {"checks", "optimise", "protocol", "rules"},
+    "planning": {"checks", "optimise", "protocol", "rules", "whole_files"},
     "ending": {
         *("cost", "optimise", "planning", "protocol", "referee", "robot", "rules", "trajectory"),
     },
@@ -66,8 +66,8 @@ ALLOWED = {
         *("digits", "memory", "plain_files", "whole_files"),
     },
     "live": {
-        *("ball", "memory", "optimise", "planning", "protocol", "robot", "sweep", "task"),
-        "trajectory",
+        *("ball", "ending", "memory", "optimise", "planning", "protocol", "robot", "sweep"),
+        *("task", "trajectory"),
     },
     "sweep": {
         *("ball", "compile_cache", "digits", "ending", "lanes", "memory", "perception", "plane"),

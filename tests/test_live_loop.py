@@ -15,10 +15,14 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.cli import main
+from planner_jax.live import planner as live_planner
+from planner_jax.live.course import with_rest
 from planner_jax.live.packets import BALL, ROBOT, Fault, Motion, read_answer, request
 from planner_jax.live.planner import LivePlanner
 from planner_jax.live.server import Server
+from planner_jax.live.settings import CatchServe, HitServe
 from planner_jax.live.strokes import CATCH_DRAG, CatchStroke, HitStroke
+from planner_jax.sweep.settings import SettingError
 
 HOME, STEP = np.array([0.0, 0.0, 1.0]), 0.01
 PAGE = Path(__file__).parents[1] / "docs" / "live.md"
@@ -102,7 +106,11 @@ def test_a_throw_is_caught_along_a_smooth_course_and_nothing_is_compiled(warm, p
     speeds = np.array([answer.column("vel")[0] for answer in answers])
     jumps = np.diff(places, axis=0) - 0.5 * STEP * (speeds[1:] + speeds[:-1])
     assert np.abs(jumps).max() < 0.01
-    assert np.linalg.norm(speeds[-1]) < 0.3  # at rest, or nearly
+    slowing = np.linalg.norm(speeds[last + 1 :], axis=1)
+    assert slowing[-1] < 0.5 * slowing[0]
+    throw.now += 3.0
+    rest = throw.send(throw.packet(BALL, path[0]))
+    assert not rest.column("vel").any() and (rest.column("pos")[:, 2] > 0.2).all()
 
 
 def test_setpoints_agree_with_each_other(warm, path):
@@ -177,6 +185,27 @@ def test_a_robot_that_is_off_its_course_is_brought_to_rest_from_where_it_is(warm
     np.testing.assert_allclose(answer.column("pos")[0], [5.0, 5.0, 2.0], atol=1e-5)
 
 
+def test_a_plan_behind_which_there_is_no_way_to_rest_is_not_flown_on(warm, path, monkeypatch):
+    monkeypatch.setattr(live_planner, "with_rest", lambda *a: (with_rest(*a)[0], False))
+    before = warm.report.counts["endless"]
+    answers = Throw(warm, path, 8).fly(40)
+    assert warm.report.counts["endless"] - before > 10 and warm._flight.plan is None
+    assert answers[-2].motion is Motion.SAFE  # to a state of the robot
+    places = np.array([answer.column("pos")[0] for answer in answers])
+    assert np.linalg.norm(places - HOME, axis=1).max() < 0.02
+
+
+@pytest.mark.parametrize("rate", [2.0, 200.0])
+def test_setpoints_join_the_way_to_rest_behind_a_plan_at_any_rate(warm, path, monkeypatch, rate):
+    monkeypatch.setattr(warm, "_period", 1.0 / rate)
+    answer = balls_of(Throw(warm, path, 9).fly(40))[-1]
+    assert answer.motion is Motion.PLAN and answer.period == pytest.approx(1.0 / rate)
+    times = answer.begin + answer.period * np.arange(10)
+    assert (answer.column("vel")[times > answer.contact + 4.0] == 0.0).all()
+    way = np.linalg.norm(np.diff(answer.column("pos"), axis=0), axis=1)
+    assert (way < 5.0 * answer.period).all()  # the greatest speed
+
+
 def test_what_takes_too_long_is_answered_from_the_last_good_plan(warm, path, monkeypatch):
     goes_on = threading.Event()
     throw, again = Throw(warm, path, 6), warm.stroke.again
@@ -209,6 +238,31 @@ def test_the_client_of_the_page_prints_setpoints(warm, capsys):
         thread.join()
         server._socket.close()
     assert "PLAN" in capsys.readouterr().out
+
+
+def test_packets_that_are_not_ours_get_a_line_each_kind_and_no_answer(warm, capsys):
+    server, sender = Server(warm, 0), ("127.0.0.1", 9)
+    ours = request(BALL, 1, 5.0, 5.0, (0.0, 0.0, 1.0))
+    for data in (b"GET / HTTP/1.1", ours[:30], b"", ours[:4] + b"\x02" + ours[5:], b"PJLV", b"x"):
+        server._answer(data, sender, time.perf_counter())
+    server._socket.close()
+    lines = capsys.readouterr().err.splitlines()
+    start = "planner-jax: warning: a packet from 127.0.0.1:9 "
+    assert [line.startswith(start) for line in lines] == [True] * 3
+    assert "PJLV" in lines[0] and "length" in lines[1] and "version" in lines[2]
+
+
+def test_a_robot_is_served_by_its_name_and_has_to_carry_the_tool():
+    stroke = CatchServe(robot="x500-net").stroke()
+    assert float(stroke.case.net.radius) == pytest.approx(0.2)
+    assert CatchServe().stroke().case.net.radius == CatchStroke().case.net.radius
+    for settings, robot, rule in (
+        (HitServe, "x500-net", "robot must carry a racket"),
+        (CatchServe, "nobody", "robot must be one of"),
+        (CatchServe, "gone.yaml", "robot must be a file that can be read"),
+    ):
+        with pytest.raises(SettingError, match=rule):
+            settings(robot=robot)
 
 
 def test_a_port_that_is_taken_ends_the_command_with_a_line(warm, capsys):

@@ -8,59 +8,72 @@ import numpy as np
 from flax import struct
 from jax import Array
 
+from planner_jax.ending.case import EndingCase
+from planner_jax.ending.planner import RestPlanner
 from planner_jax.live.packets import FIELDS
-from planner_jax.robot.quadrotor import QuadrotorLimits
+from planner_jax.optimise.problem import Round
+from planner_jax.planning.batch import solve_cases
+from planner_jax.planning.packed import call_packed
+from planner_jax.protocol import is_solved
 from planner_jax.robot.quadrotor_plan import setpoint_at
-from planner_jax.task.catch.braking import braking
-from planner_jax.trajectory.polynomial import (
-    PiecewisePolynomial,
-    evaluate,
-    states_at,
-    total_duration,
-)
+from planner_jax.trajectory.polynomial import PiecewisePolynomial, states_at, total_duration
+
+_REST = RestPlanner()
 
 
 @struct.dataclass
 class Course:
     """A trajectory that ends at rest, and stays there."""
 
-    path: PiecewisePolynomial  # of M + 1 pieces, the last of which leads to rest
+    path: PiecewisePolynomial  # of M pieces, and those of the way to rest
     gravity: Array  # () [m/s^2]
-    keeps: Array  # () bool, whether the way to rest keeps the limits
 
 
-def with_rest(path: PiecewisePolynomial, gravity: Array, limits: QuadrotorLimits) -> Course:
-    """A plan's trajectory of M pieces, and the way to rest from its end; pure."""
-    end = total_duration(path)
-    state = jnp.stack([evaluate(path, end, order) for order in range(4)])
-    return _joined(path, state, gravity, limits)
+def open_ended(path: PiecewisePolynomial, case: Any) -> Course:
+    """A plan's trajectory of M pieces, behind whose end nothing is known yet; NumPy leaves."""
+    end = _state_at(path, np.sum(path.durations))
+    return Course(_behind(path, _still(_REST.num_pieces, end[0])), case.gravity)
 
 
-@struct.dataclass
-class Stop:
-    """A state from which to come to rest, and by which limits."""
+def with_rest(path: PiecewisePolynomial, case: Any) -> tuple[Course, bool]:
+    """A plan's trajectory of M pieces, and the way to rest from its end; NumPy leaves.
 
-    state: Array  # (4, 3), position to jerk
-    gravity: Array  # () [m/s^2]
-    limits: QuadrotorLimits
+    Args:
+        path: NumPy leaves.
+        case: whose gravity and limits count.
+
+    Returns:
+        course: what is flown.
+        keeps: whether its way to rest keeps the limits.
+    """
+    state: Any = _state_at(path, np.sum(path.durations))
+    ending = EndingCase(state, state[0], case.gravity, case.limits)
+    rest = call_packed(_rested, _REST.rounds[0], _REST, ending, keep=True)
+    return Course(_behind(path, rest.trajectory), case.gravity), bool(is_solved(int(rest.status)))
 
 
-def to_rest(pieces: int, _: None, stop: Stop) -> Course:
-    """The way to rest alone, behind M pieces that take no time; pure."""
-    still = jnp.zeros((pieces, 8, 3), stop.state.dtype).at[:, 0].set(stop.state[0])
-    path = PiecewisePolynomial(coeffs=still, durations=jnp.zeros(pieces, stop.state.dtype))
-    return _joined(path, stop.state, stop.gravity, stop.limits)
+def to_rest(state: np.ndarray, pieces: int, case: Any) -> tuple[Course, bool]:
+    """As `with_rest`, from a state (4, 3), behind M pieces that take no time."""
+    path = _still(pieces, state[0])
+    path.coeffs[-1, :4] = state / np.array([[1.0], [1.0], [2.0], [6.0]])
+    return with_rest(path, case)
 
 
-def _joined(
-    path: PiecewisePolynomial, state: Array, gravity: Array, limits: QuadrotorLimits
-) -> Course:
-    rest = braking(state, gravity, limits)
-    whole = PiecewisePolynomial(
-        coeffs=jnp.concatenate([path.coeffs, rest.coeffs[None]]),
-        durations=jnp.append(path.durations, rest.duration),
-    )
-    return Course(path=whole, gravity=gravity, keeps=rest.possible)
+def _still(pieces: int, place: np.ndarray) -> Any:
+    """Pieces that take no time."""
+    coeffs = np.zeros((pieces, 8, 3), np.float32)
+    coeffs[:, 0] = place
+    return PiecewisePolynomial(coeffs, np.zeros(pieces, np.float32))  # type: ignore[arg-type]
+
+
+def _behind(path: Any, other: Any) -> Any:
+    """One trajectory and then another."""
+    parts = (path.coeffs, other.coeffs), (path.durations, other.durations)
+    return PiecewisePolynomial(*map(np.concatenate, parts))  # type: ignore[arg-type]
+
+
+def _rested(attempt: Round, planner: RestPlanner, case: EndingCase) -> Any:
+    return solve_cases(planner, case, attempt)
 
 
 @struct.dataclass
@@ -94,7 +107,11 @@ def state_of(course: Course, elapsed: float) -> np.ndarray:
     """Position to jerk (4, 3) of a course some time [s] since it began, on the host."""
     durations: Any = course.path.durations
     end = float(durations.sum())
-    state = states_at(course.path, np.asarray(min(elapsed, end)))
+    state = _state_at(course.path, min(elapsed, end))
     if elapsed >= end:
         state[1:] = 0.0
-    return state.astype(np.float32)
+    return state
+
+
+def _state_at(path: Any, elapsed: float) -> np.ndarray:
+    return states_at(path, np.asarray(elapsed)).astype(np.float32)

@@ -49,8 +49,13 @@ class Fault(enum.IntEnum):
         return self.name.lower().replace("_", " ")
 
 
-# Those without a header that could be answered.
-SILENT = (Fault.STRANGE, Fault.CUT, Fault.OTHER_VERSION, Fault.UNKNOWN_KIND)
+# Those without a header that could be answered, and what a packet does that has one.
+SILENT = {
+    Fault.STRANGE: f"does not begin with {MAGIC.decode()}",
+    Fault.CUT: "has another length than its kind",
+    Fault.OTHER_VERSION: f"is of another version than {VERSION}",
+    Fault.UNKNOWN_KIND: "is neither of a ball nor of a robot",
+}
 
 
 class Motion(enum.IntEnum):

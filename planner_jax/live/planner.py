@@ -2,10 +2,11 @@
 
 There is always a course: the way to rest from where the robot was first seen, and then plans, each
 with the way to rest behind it. An answer holds what is due of the course. A plan is searched for in
-a thread of its own, for which an answer waits no longer than the deadline leaves time.
+a thread of its own, for which an answer waits a part of the deadline and no longer.
 """
 
 import concurrent.futures
+import contextlib
 import dataclasses
 import math
 import time
@@ -14,7 +15,15 @@ from typing import Any
 import numpy as np
 
 from planner_jax.live.arrivals import Arrivals
-from planner_jax.live.course import Course, Due, Stop, setpoints, state_of, to_rest
+from planner_jax.live.course import (
+    Course,
+    Due,
+    open_ended,
+    setpoints,
+    state_of,
+    to_rest,
+    with_rest,
+)
 from planner_jax.live.packets import (
     BALL,
     MOST_SETPOINTS,
@@ -32,7 +41,7 @@ from planner_jax.live.strokes import Stroke
 from planner_jax.planning.packed import call_packed
 from planner_jax.protocol import is_solved
 
-_RESERVE = 0.001  # [s], of the deadline, for what follows planning
+_PATIENCE = 0.2  # share of the deadline that an answer waits for a plan
 _ASTRAY = 0.5  # [m], between robot and course, from which on the course begins anew
 _JOIN = (0.02, 0.2)  # [m, m/s], by which a plan that comes late may be off the course
 _NOTHING = np.zeros((0, WIDTH), np.float32)
@@ -44,7 +53,6 @@ class _Flight:
 
     course: Course
     began: float  # [s]
-    case: Any = None
     plan: Any = None
     contact: float = math.nan  # [s]
     ball: int = -1
@@ -97,6 +105,7 @@ class LivePlanner:
     def _forget(self) -> None:
         """Know nothing of robot and ball."""
         self._flight: _Flight | None = None
+        self._before: _Flight | None = None  # what is flown on if the flight finds no rest
         self._job: _Job | None = None
         self._done = -1  # number of the last ball that was met
         self._sight.forget()
@@ -116,9 +125,8 @@ class LivePlanner:
             place = tuple(ahead + (4.0 - 0.1 * k, 0.0, 0.1 * k))
             ball, _ = self._sight.see(0, place, 0.01 * k, 0.01 * k)
         assert ball is not None
-        case, plan, _ = self.stroke.first(ball, state)
-        self.stroke.again(case, plan, 0.01, ball)
-        self._worker.submit(int).result()
+        plan = self._worker.submit(self.stroke.first, ball, state).result()
+        self._worker.submit(self.stroke.again, plan, 0.01, ball).result()
         self._sight.forget()
         self.report.begin()
 
@@ -130,6 +138,7 @@ class LivePlanner:
             sender: who sent it, hashable.
             received: `time.perf_counter()` when it came [s].
         """
+        self._complete()
         report = self.report
         report.counts["packets"] += 1
         packet = read_request(data)
@@ -160,13 +169,14 @@ class LivePlanner:
         return sent
 
     def sent(self, data: bytes, received: float) -> None:
-        """Note that the answer to a packet has been sent."""
+        """Note that the answer to a packet has been sent, and do what could wait for that."""
         taken = time.perf_counter() - received
         self.report.counts["answered"] += 1
         self.report.counts["missed"] += taken > self.deadline
         self.report.stages["answer"].add(taken)
         if data[5] == BALL:
             self.report.stages["ball"].add(taken)
+        self._complete()
 
     # The robot.
 
@@ -181,13 +191,14 @@ class LivePlanner:
                 return Fault.NONE
             self.report.counts["astray"] += 1
         state = np.stack([pos + vel * (due - packet.measured), vel, acc, 0.0 * pos])
-        self._flight, self._job = self._resting(state.astype(np.float32), due), None
+        self._flight = self._resting(state.astype(np.float32), due)
+        self._before = self._job = None
         return Fault.NONE
 
-    def _resting(self, state: Any, began: float) -> _Flight:
-        case = self.stroke.case
-        stop = Stop(state, case.gravity, case.limits)
-        return _Flight(call_packed(to_rest, self.stroke.pieces, None, stop), began)
+    def _resting(self, state: np.ndarray, began: float) -> _Flight:
+        course, keeps = to_rest(state, self.stroke.pieces, self.stroke.case)
+        self.report.counts["hard_rests"] += not keeps
+        return _Flight(course, began)
 
     # The ball.
 
@@ -203,8 +214,9 @@ class LivePlanner:
             found = self._worker.submit(self._search, ball, flight, packet.ball, due)
             self._job = _Job(found, due, packet.ball)
         if self._job is not None:
-            left = self.deadline - _RESERVE - (time.perf_counter() - received)
-            concurrent.futures.wait([self._job.found], max(left, 0.0))
+            left = _PATIENCE * self.deadline - (time.perf_counter() - received)
+            with contextlib.suppress(TimeoutError):
+                self._job.found.result(max(left, 0.0))
             self._collect(due)
             self.report.counts["busy"] += self._job is not None
         return fault
@@ -222,21 +234,22 @@ class LivePlanner:
         began, elapsed = time.perf_counter(), due - flight.began
         stages = self.report.stages
         if flight.plan is not None and flight.ball == number:
-            case, plan, course = self.stroke.again(flight.case, flight.plan, elapsed, ball)
+            plan = self.stroke.again(flight.plan, elapsed, ball)
             stages["again"].add(time.perf_counter() - began)
             if is_solved(int(plan.status)):
-                return self._flight_of(case, plan, course, number, due)
+                return self._flight_of(plan, number, due)
             self.report.counts["refused"] += 1
             began = time.perf_counter()
-        case, plan, course = self.stroke.first(ball, state_of(flight.course, elapsed))
+        plan = self.stroke.first(ball, state_of(flight.course, elapsed))
         stages["first"].add(time.perf_counter() - began)
         if is_solved(int(plan.status)):
-            return self._flight_of(case, plan, course, number, due)
+            return self._flight_of(plan, number, due)
         self.report.counts["refused"] += 1
         return None
 
-    def _flight_of(self, case: Any, plan: Any, course: Course, ball: int, due: float) -> _Flight:
-        return _Flight(course, due, case, plan, due + self.stroke.contact(plan), ball)
+    def _flight_of(self, plan: Any, ball: int, due: float) -> _Flight:
+        course = open_ended(plan.trajectory, self.stroke.case)
+        return _Flight(course, due, plan, due + self.stroke.contact(plan), ball)
 
     def _collect(self, due: float) -> None:
         """Fly what the thread has found, if it is ready and can still be joined."""
@@ -254,8 +267,24 @@ class LivePlanner:
             return
         is_again = flight.plan is not None and flight.ball == job.ball
         self.report.counts["replans" if is_again else "plans"] += 1
-        self.report.counts["hard_rests"] += not found.course.keeps
-        self._flight = found
+        self._before, self._flight = flight, found
+        if due + self._num * self._period > found.contact:
+            self._complete()
+
+    def _complete(self) -> None:
+        """Find the way to rest behind the plan that is flown, or fly on what was flown before.
+
+        This is left until an answer has been sent, or needs it.
+        """
+        flight, before = self._flight, self._before
+        if flight is None or before is None:
+            return
+        began = time.perf_counter()
+        course, keeps = with_rest(flight.plan.trajectory, self.stroke.case)
+        self.report.stages["rest"].add(time.perf_counter() - began)
+        self.report.counts["endless"] += not keeps
+        self._flight = dataclasses.replace(flight, course=course) if keeps else before
+        self._before = None
 
     def _joins(self, flight: _Flight, found: _Flight, due: float) -> bool:
         old, new = (state_of(each.course, due - each.began) for each in (flight, found))
@@ -276,4 +305,5 @@ class LivePlanner:
         """The setpoints (K, 20) from a time on."""
         elapsed: Any = np.float32(due - flight.began)
         period: Any = np.float32(self._period)
-        return call_packed(setpoints, self._num, None, Due(flight.course, elapsed, period))
+        due_of = Due(flight.course, elapsed, period)
+        return call_packed(setpoints, self._num, None, due_of, keep=True)

@@ -45,6 +45,7 @@ class Report:
         "estimate": "ball estimated",
         "first": "planned from scratch",
         "again": "planned again",
+        "rest": "way to rest planned",
         "setpoints": "setpoints made and packed",
         "ball": "ball observed to setpoints sent",
         "answer": "any packet to setpoints sent",
@@ -95,10 +96,11 @@ class Report:
         """One line."""
         ball = self.stages["ball"]
         p50, p99 = 1e3 * ball.quantile(0.5), 1e3 * ball.quantile(0.99)
+        times = f"from a ball observed to setpoints p50 {p50:.2f} ms, p99 {p99:.2f} ms"
         return (
             f"{self.counts['packets']:,} packets, {self.counts['answered']:,} answered, "
-            f"{self.counts['missed']:,} after {1e3 * self.deadline:g} ms; from a ball observed to "
-            f"setpoints p50 {p50:.2f} ms, p99 {p99:.2f} ms"
+            f"{self.counts['missed']:,} after {1e3 * self.deadline:g} ms; "
+            f"{times if ball.num else 'no ball was observed'}"
         )
 
     def lines(self) -> list[str]:
@@ -134,7 +136,8 @@ COUNTS = {
     "replans": "plans made again that are flown",
     "refused": "plans that are not flown, as they break a limit",
     "unjoined": "plans that are not flown, as they came too late to join",
-    "hard_rests": "plans that are flown whose way to rest exceeds a limit",
+    "endless": "plans that are not flown, as no way to rest behind them keeps the limits",
+    "hard_rests": "ways to rest from where the robot was that exceed a limit",
     "astray": "times the robot was off course",
     "clocks": "times the senders' clock was set anew",
     "unsent": "answers that could not be sent",

@@ -7,7 +7,9 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 
-from planner_jax.live.packets import LONGEST
+import jax
+
+from planner_jax.live.packets import LONGEST, SILENT, Fault, read_request
 from planner_jax.live.planner import LivePlanner
 
 HOST = "127.0.0.1"
@@ -29,6 +31,7 @@ class Server:
 
     def __init__(self, planner: LivePlanner, port: int) -> None:
         self.planner = planner
+        self._told: set[Fault] = set()
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self._socket.bind((HOST, port))
@@ -48,21 +51,21 @@ class Server:
 
     def run(self, goes_on: Callable[[], bool]) -> None:
         """Answer while `goes_on()`, which is asked after every packet, and where none come."""
-        with _undisturbed():
-            tidied = time.perf_counter()
-            while goes_on():
-                try:
-                    data, sender = self._socket.recvfrom(LONGEST)
-                except TimeoutError:
-                    continue
-                self._answer(data, sender, time.perf_counter())
-                if time.perf_counter() - tidied > _TIDIED:
-                    gc.collect()
-                    tidied = time.perf_counter()
+        tidied = time.perf_counter()
+        while goes_on():
+            try:
+                data, sender = self._socket.recvfrom(LONGEST)
+            except TimeoutError:
+                continue
+            self._answer(data, sender, time.perf_counter())
+            if time.perf_counter() - tidied > _TIDIED:
+                gc.collect()
+                tidied = time.perf_counter()
 
     def _answer(self, data: bytes, sender: tuple[str, int], received: float) -> None:
         answer = self.planner.answer(data, sender, received)
         if answer is None:
+            self._tell(data, sender)
             return
         try:
             self._socket.sendto(answer, sender)
@@ -71,15 +74,40 @@ class Server:
             return
         self.planner.sent(data, received)
 
+    def _tell(self, data: bytes, sender: tuple[str, int]) -> None:
+        """Say what is wrong with a packet that gets no answer, the first time that it happens."""
+        fault = read_request(data)
+        assert isinstance(fault, Fault)
+        if fault in self._told:
+            return
+        self._told.add(fault)
+        print(
+            f"planner-jax: warning: a packet from {sender[0]}:{sender[1]} {SILENT[fault]}; "
+            "this is not said again",
+            file=sys.stderr,
+            flush=True,
+        )
+
     def close(self) -> None:
         """Give the port back, and end the planner's thread."""
         self._socket.close()
         self.planner.close()
 
 
+def compute_in_place() -> None:
+    """Have a CPU compute in the thread that calls; before JAX's first use of it.
+
+    To hand each call over to a thread of JAX takes as long as the smaller calls themselves.
+    """
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
+
+
 @contextlib.contextmanager
-def _undisturbed() -> Iterator[None]:
-    """Neither garbage collection nor another thread gets in the way of an answer."""
+def undisturbed() -> Iterator[None]:
+    """Neither garbage collection nor another thread gets in the way of an answer.
+
+    To begin takes some 0.1 s.
+    """
     was_on, before = gc.isenabled(), sys.getswitchinterval()
     gc.collect()
     gc.freeze()  # what is there now is not looked at again

@@ -3,6 +3,7 @@
 import dataclasses
 from typing import Any
 
+from planner_jax.sweep.robots import checked_robot, robot_option
 from planner_jax.sweep.settings import option, require, require_count
 
 PORT = 5560
@@ -44,11 +45,13 @@ class ServeSettings:
 class HitServe(ServeSettings):
     """Those of hits."""
 
+    robot: Any = robot_option("paper-hitter")
     target: tuple[float, ...] = option((3.0, 0.0, 0.0), "M", "where the ball is to land")
     drag: float = option(0.0616, "K", "K_D of the ball [1/m]")
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        object.__setattr__(self, "robot", checked_robot(self.robot, "racket"))
         require(len(self.target) == 3, "target", "3 numbers", len(self.target))
         for place in self.target:
             require(abs(place) <= 100.0, "target", "within 100 m", place)
@@ -57,25 +60,29 @@ class HitServe(ServeSettings):
     def stroke(self) -> Any:
         """A hit to the target."""
         from planner_jax.live.strokes import HitStroke
+        from planner_jax.robot.quadrotor_models import PAPER_HITTER
 
-        return HitStroke(target=self.target, drag=self.drag)
+        return HitStroke(self.robot or PAPER_HITTER, target=self.target, drag=self.drag)
 
 
 @dataclasses.dataclass(frozen=True)
 class CatchServe(ServeSettings):
     """Those of catches."""
 
+    robot: Any = robot_option("paper-catcher")
     drag: float = option(0.5, "K", "of the ball [1/s]")
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        object.__setattr__(self, "robot", checked_robot(self.robot, "net"))
         require(0.0 <= self.drag <= 10.0, "drag", "from 0 to 10", self.drag)
 
     def stroke(self) -> Any:
         """A catch."""
         from planner_jax.live.strokes import CatchStroke
+        from planner_jax.robot.quadrotor_models import PAPER_CATCHER
 
-        return CatchStroke(drag=self.drag)
+        return CatchStroke(self.robot or PAPER_CATCHER, drag=self.drag)
 
 
 SERVED: dict[str, type[ServeSettings]] = {"hit": HitServe, "catch": CatchServe}

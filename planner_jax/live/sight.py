@@ -116,7 +116,8 @@ class Sight:
     def _look(self, observation: tuple[float, ...], since: float, ahead: float) -> Seen:
         given: Any = (since, observation, max(ahead, 0.0))
         numbers: Any = [np.asarray(x, np.float32) for x in given]
-        return call_packed(_looked, self._flight, self._model, Look(self._belief, *numbers))
+        look = Look(self._belief, *numbers)
+        return call_packed(_looked, self._flight, self._model, look, keep=True)
 
     def _begin(self, number: int, observation: tuple[float, ...], measured: float) -> None:
         stds = [self._noise] * 3 + [_SPREAD] * 3

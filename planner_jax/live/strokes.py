@@ -1,7 +1,7 @@
 """What is planned in a live loop: one hit, or one catch, of the ball that is seen.
 
-Each plan is made together with the way to rest behind it, in one compiled call. Of every search
-there is one round alone, since the next look begins where it ended.
+Each plan is one compiled call. Of every search there is one round alone, since the next look begins
+where it ended.
 """
 
 import dataclasses
@@ -15,11 +15,11 @@ from jax import Array, lax
 from planner_jax.ball.estimation import Flight
 from planner_jax.ball.flight import BallState, linear_drag_flight, rk4_step
 from planner_jax.ball.target import BallPath
-from planner_jax.live.course import Course, with_rest
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
 from planner_jax.planning.batch import solve_cases
 from planner_jax.planning.packed import call_packed
+from planner_jax.planning.replan import Replanning
 from planner_jax.robot.quadrotor_model import QuadrotorModel
 from planner_jax.robot.quadrotor_models import PAPER_CATCHER, PAPER_HITTER
 from planner_jax.task.catch.case import GRAVITY as CATCH_GRAVITY
@@ -33,13 +33,14 @@ from planner_jax.task.hit.case import GRAVITY as HIT_GRAVITY
 from planner_jax.task.hit.case import case as hit_case
 from planner_jax.task.hit.exact import ExactHit
 from planner_jax.task.hit.replan import ReplanHit
+from planner_jax.trajectory.polynomial import evaluate
 
 CATCH_DRAG = 0.5  # [1/s], of the suite `throws`
 TARGET = (3.0, 0.0, 0.0)  # [m], where a hit ball is to land
 _BISECTIONS = 24
 _LONGEST = 4.0  # [s], until when a ball is waited for
 _TRIALS = (1.0, 0.2, 0.04)  # step lengths, as of the re-planners
-_AGAIN = Round(starts=1, solver=LbfgsConfig(max_steps=8, trial_steps=_TRIALS))
+_AGAIN = Round(starts=1, solver=LbfgsConfig(max_steps=5, trial_steps=_TRIALS))
 
 
 class Stroke(Protocol):
@@ -51,14 +52,12 @@ class Stroke(Protocol):
     shortest: float  # [s], least time to the contact that is planned anew
     pieces: int  # of a plan's trajectory
 
-    def first(self, ball: BallState, head_state: np.ndarray) -> tuple[Any, Any, Course]:
-        """The case, its plan from scratch, and the course of that; NumPy leaves."""
+    def first(self, ball: BallState, head_state: np.ndarray) -> Any:
+        """A plan from scratch; NumPy leaves."""
         ...
 
-    def again(
-        self, case: Any, plan: Any, elapsed: float, ball: BallState
-    ) -> tuple[Any, Any, Course]:
-        """The same, planned anew some time [s] into a plan; times count from now."""
+    def again(self, plan: Any, elapsed: float, ball: BallState) -> Any:
+        """A plan made anew some time [s] into another one; its times count from now."""
         ...
 
     def contact(self, plan: Any) -> float:
@@ -90,17 +89,15 @@ class HitStroke:
         self._again = ReplanHit(self._planner, rounds=(_AGAIN,))
         self.pieces = self._planner.num_pieces
 
-    def first(self, ball: BallState, head_state: np.ndarray) -> tuple[Any, Any, Course]:
+    def first(self, ball: BallState, head_state: np.ndarray) -> Any:
         """See `Stroke`."""
         case = dataclasses.replace(self.case, ball=ball, head_state=head_state)
-        return (case, *call_packed(_planned, self._planner.rounds[1], self._planner, case))
+        return call_packed(_planned, self._planner.rounds[1], self._planner, case, keep=True)
 
-    def again(
-        self, case: Any, plan: Any, elapsed: float, ball: BallState
-    ) -> tuple[Any, Any, Course]:
+    def again(self, plan: Any, elapsed: float, ball: BallState) -> Any:
         """See `Stroke`."""
-        left = self._again.begin(case, plan, elapsed, ball=ball)
-        return (left.case, *call_packed(_planned_again, _AGAIN, self._again, left))
+        task = _left(dataclasses.replace(self.case, ball=ball), plan, elapsed)
+        return call_packed(_hit_again, _AGAIN, self._again, task, keep=True)
 
     def contact(self, plan: Any) -> float:
         """See `Stroke`."""
@@ -125,17 +122,16 @@ class CatchStroke:
         self._again = ReplanCatch(self._planner, rounds=(_AGAIN,))
         self.pieces = self._planner.num_pieces
 
-    def first(self, ball: BallState, head_state: np.ndarray) -> tuple[Any, Any, Course]:
+    def first(self, ball: BallState, head_state: np.ndarray) -> Any:
         """See `Stroke`."""
         case = dataclasses.replace(self.case, targets=self._path(ball), head_state=head_state)
-        return (case, *call_packed(_decided, self._planner.rounds[1], self._planner, case))
+        return call_packed(_decided, self._planner.rounds[1], self._planner, case, keep=True)
 
-    def again(
-        self, case: Any, plan: Any, elapsed: float, ball: BallState
-    ) -> tuple[Any, Any, Course]:
+    def again(self, plan: Any, elapsed: float, ball: BallState) -> Any:
         """See `Stroke`."""
-        left = self._again.begin(case, plan, elapsed, targets=self._path(ball))
-        return (left.case, *call_packed(_caught_again, _AGAIN, self._again, left))
+        case = dataclasses.replace(self.case, targets=self._path(ball))
+        task = _left(case, plan, elapsed)
+        return call_packed(_caught_again, _AGAIN, self._again, task, keep=True)
 
     def contact(self, plan: Any) -> float:
         """See `Stroke`."""
@@ -146,26 +142,44 @@ class CatchStroke:
         return dataclasses.replace(self.case.targets, ball=one)
 
 
-def _planned(attempt: Round, planner: Any, case: Any) -> tuple[Any, Course]:
-    plan = solve_cases(planner, case, attempt)
-    return plan, with_rest(plan.trajectory, case.gravity, case.limits)
+def _left(case: Any, plan: Any, elapsed: float) -> Replanning:
+    """What is left some time [s] into a plan; where the robot is, the plan says."""
+    since: Any = np.float32(elapsed)
+    return Replanning(case=case, previous=plan, elapsed=since)
 
 
-def _planned_again(attempt: Round, planner: Any, task: Any) -> tuple[Any, Course]:
-    plan = solve_cases(planner, task, attempt)
-    return plan, with_rest(plan.trajectory, task.case.gravity, task.case.limits)
+def _where(task: Replanning) -> Array:
+    """Position to jerk (4, 3) of a robot that flies its plan."""
+    path = task.previous.trajectory
+    return jnp.stack([evaluate(path, task.elapsed, order) for order in range(4)])
 
 
-def _decided(attempt: Round, planner: ExactCatch, case: CatchCase) -> tuple[Any, Course]:
+def _planned(attempt: Round, planner: Any, case: Any) -> Any:
+    return solve_cases(planner, case, attempt)
+
+
+def _hit_again(attempt: Round, planner: ReplanHit, task: Replanning) -> Any:
+    case = dataclasses.replace(task.case, head_state=_where(task))
+    return _planned(attempt, planner, dataclasses.replace(task, case=case))
+
+
+def _decided(attempt: Round, planner: ExactCatch, case: CatchCase) -> Any:
     """As `_planned`, at the time at which the ball can first be caught."""
     case = dataclasses.replace(case, horizon=_time_left(case))
     choice = jax.tree.map(lambda leaf: leaf[0], Greedy().propose(case))
     return _planned(attempt, planner, case.decided(choice))
 
 
-def _caught_again(attempt: Round, planner: ReplanCatch, task: Any) -> tuple[Any, Course]:
-    case = dataclasses.replace(task.case, horizon=_time_left(task.case))
-    return _planned_again(attempt, planner, dataclasses.replace(task, case=case))
+def _caught_again(attempt: Round, planner: ReplanCatch, task: Replanning) -> Any:
+    previous = task.previous
+    case = dataclasses.replace(
+        task.case,
+        horizon=_time_left(task.case),
+        order=previous.order,
+        times=previous.times - task.elapsed,
+        head_state=_where(task),
+    )
+    return _planned(attempt, planner, dataclasses.replace(task, case=case))
 
 
 def _time_left(case: CatchCase) -> Array:

@@ -55,9 +55,9 @@ class OptimisedPlanner(abc.ABC):
         """Cost and largest violation at a point (n,)."""
 
     def curved(self, point: Array, context: Any) -> Curvature:
-        """Evaluation at a point (n,), gradient (n,), and the Hessian's products, for `NewtonConfig`.
+        """Evaluation at a point (n,), gradient (n,), and products with the Hessian.
 
-        By default each product is a derivative of the gradient.
+        What Newton's method takes. By default each product is a derivative of the gradient.
         """
         return by_products(lambda x: self.objective(x, context))(point)
 

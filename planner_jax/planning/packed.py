@@ -14,10 +14,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from planner_jax.planning.traced import traced
+
 _Layout = tuple[tuple[tuple[int, ...], Any], ...]  # shapes and dtypes of a tree's leaves
 
 
-def call_packed(function: Callable, static: Hashable, own: Any, case: Any) -> Any:
+def call_packed(
+    function: Callable, static: Hashable, own: Any, case: Any, *, keep: bool = False
+) -> Any:
     """What `function(static, own, case)` returns, with NumPy leaves.
 
     Args:
@@ -25,16 +29,17 @@ def call_packed(function: Callable, static: Hashable, own: Any, case: Any) -> An
         static: what shapes the program.
         own: a pytree that stays where it is, such as a planner.
         case: a pytree with NumPy leaves, one of them floating at least.
+        keep: the program for later processes, see `traced`; only of this library's own code.
     """
     leaves, tree = jax.tree.flatten(case)
     arrays = [np.asarray(leaf) for leaf in leaves]
     kept, own_tree = jax.tree.flatten(own)
-    program = _program(function, static, own_tree, _layout(kept), tree, _layout(arrays))
+    program = _program(function, static, own_tree, _layout(kept), tree, _layout(arrays), keep)
     vector = np.concatenate(
         [array.ravel() for array in arrays], dtype=program.dtype, casting="unsafe"
     )
     packed = np.asarray(program.run(kept, vector))
-    result = program.results[0]
+    result = program.result
     return jax.tree.unflatten(
         result.tree,
         [
@@ -62,7 +67,18 @@ class _Program:
 
     run: Callable[[list[Any], np.ndarray], jax.Array]
     dtype: np.dtype  # of both vectors
-    results: list[_Result]  # one, which is found out where the function is traced
+    examples: list[Any]  # one result of zeros, known as soon as the function has been traced
+
+    @functools.cached_property
+    def result(self) -> _Result:
+        """Where its results lie in the vector."""
+        leaves, tree = jax.tree.flatten(self.examples[0])
+        stops = np.cumsum([leaf.size for leaf in leaves]).tolist()
+        fields = [
+            (slice(stop - leaf.size, stop), leaf.shape, leaf.dtype)
+            for stop, leaf in zip(stops, leaves, strict=True)
+        ]
+        return _Result(tree, fields)
 
 
 @functools.cache
@@ -73,6 +89,7 @@ def _program(
     own: _Layout,
     tree: Any,
     layout: _Layout,
+    keep: bool,
 ) -> _Program:
     """The program for trees of these shapes and dtypes."""
     floating = [kind for _, kind in layout if np.issubdtype(kind, np.floating)]
@@ -88,16 +105,24 @@ def _program(
         given = jax.tree.unflatten(own_tree, kept)
         return function(static, given, jax.tree.unflatten(tree, shaped))
 
-    results: list[_Result] = []
+    examples: list[Any] = []
 
     def packed(kept: list[Any], vector: jax.Array) -> jax.Array:
-        leaves, result = jax.tree.flatten(unpacked(kept, vector))
-        stops = np.cumsum([leaf.size for leaf in leaves]).tolist()
-        fields = [
-            (slice(stop - leaf.size, stop), leaf.shape, leaf.dtype)
-            for stop, leaf in zip(stops, leaves, strict=True)
-        ]
-        results[:] = [_Result(result, fields)]
-        return jnp.concatenate([leaf.ravel().astype(dtype) for leaf in leaves])
+        result = unpacked(kept, vector)
+        examples[:] = [jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), result)]
+        return jnp.concatenate([leaf.ravel().astype(dtype) for leaf in jax.tree.leaves(result)])
 
-    return _Program(jax.jit(packed), dtype, results)
+    run = jax.jit(packed)
+    if keep:
+        like = [jax.ShapeDtypeStruct(shape, kind) for shape, kind in own]
+        vector = jax.ShapeDtypeStruct((int(ends[-1]),), dtype)
+        described = f"{_named(function)} {_named(static)} {own_tree} {tree} {layout}"
+        run = traced(packed, described, (like, vector), examples)
+    return _Program(run, dtype, examples)
+
+
+def _named(static: Any) -> str:
+    """What stays the same from process to process."""
+    if callable(static) and hasattr(static, "__qualname__"):
+        return f"{static.__module__}.{static.__qualname__}"
+    return repr(static)

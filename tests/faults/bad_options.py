@@ -121,6 +121,7 @@ def _rows() -> list:
         rows += _of(f"serve {task}", "--port", ("-1", "65536", "1" + "0" * 15, *NOT_WHOLE))
         rows += _of(f"serve {task}", "--rate", ("0", "1e300", "nan", *NOT_NUMBERS))
         rows += _of(f"serve {task}", "--deadline", ("0", "10", "nan", "inf", "-1", "x"))
+        rows += _of(f"serve {task}", "--robot", ("", "nobody", "gone.yaml"), "--robot must be")
         rows += _of(f"serve {task}", "--horizon", ("0", "18", "1.5", "x"))
         rows += _of(f"serve {task}", "--noise", ("0", "9", "nan"))
         rows += _of(f"serve {task}", "--drag", ("-1", "nan", "99"))
