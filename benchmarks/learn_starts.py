@@ -3,11 +3,11 @@
     python -m benchmarks.learn_starts [--tasks hit catch] [--train MINUTES] [--num 1000] [--out DIR]
 
 Trained on the planner's own objective: the mean logarithm of the cost at the guess goes down, over
-batches from a large pool of cases. Half of them are of the usual suites; in the others start, limits,
-ball, racket or net and target are anything sensible, moving starts among them. --train does so, and
-replaces the shipped files. Prints the cost above the least that very long searches find, and how
-many hold every limit, after so many iterations from the guess with the network and without it, on
-cases that no network has seen.
+batches from a large pool of cases. Half of them are of the usual suites; in the others start,
+limits, ball, racket or net and target are anything sensible, moving starts among them. --train does
+so, and replaces the shipped files. Prints the cost above the least that very long searches find,
+and how many hold every limit, after so many iterations from the guess with the network and without
+it, on cases that no network has seen.
 """
 
 import argparse

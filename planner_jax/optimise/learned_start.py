@@ -1,8 +1,9 @@
 """Starting points by a small network that has learnt where searches end.
 
 The network is trained on the planner's own objective (amortised optimisation), without solved
-examples, by `python -m benchmarks.learn_starts --write`. A search goes on from its point only where
-that costs less than the guess without it, so that nothing is lost far from what it has seen.
+examples, by `python -m benchmarks.learn_starts --train MINUTES`. A search goes on from its point
+only where that costs less than the guess without it, so that nothing is lost far from what it has
+seen.
 """
 
 import functools
@@ -10,6 +11,7 @@ import importlib.resources
 import io
 import math
 from collections.abc import Callable
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,10 +25,10 @@ REACH = 4.0  # standard deviations beyond which features are taken as that far
 class StartNetwork:
     """Weights and biases of layers, and what features are like; NumPy arrays or jax ones."""
 
-    mean: Array  # (F,), of the features
-    deviation: Array  # (F,)
-    weights: tuple[Array, ...]  # (inputs, outputs) of each layer
-    biases: tuple[Array, ...]  # (outputs,)
+    mean: Array | np.ndarray  # (F,), of the features
+    deviation: Array | np.ndarray  # (F,)
+    weights: tuple[Array | np.ndarray, ...]  # (inputs, outputs) of each layer
+    biases: tuple[Array | np.ndarray, ...]  # (outputs,)
 
     def __call__(self, features: Array) -> Array:
         """What is to be added to a guess, (n,), from features (F,)."""
@@ -69,13 +71,11 @@ def to_bytes(network: StartNetwork) -> bytes:
     for k, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
         arrays |= {f"weight{k}": weight, f"bias{k}": bias}
     file = io.BytesIO()
-    np.savez_compressed(
-        file,
-        **{
-            name: np.asarray(array).astype(np.float32 if array.ndim == 1 else np.float16)
-            for name, array in arrays.items()
-        },
-    )
+    rounded: Any = {
+        name: np.asarray(array).astype(np.float32 if array.ndim == 1 else np.float16)
+        for name, array in arrays.items()
+    }
+    np.savez_compressed(file, **rounded)
     return file.getvalue()
 
 

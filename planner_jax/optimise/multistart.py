@@ -81,7 +81,7 @@ def minimise_lanes(
     def searched(state: Any, contexts: Any, config: Solver, steps: int) -> Any:
         @over_lanes
         def step(state: Any, context: Any) -> Any:
-            of_point = None if curved is None else lambda x: curved(x, context)
+            of_point = curved and functools.partial(_given, curved, context)
             return _step(lambda x: objective(x, context), of_point, state, config)
 
         if steps <= _COUNTED:
@@ -102,6 +102,10 @@ def minimise_lanes(
         place = lambda old, new, lanes=lanes: old.at[..., lanes].set(new)  # noqa: E731
         state = jax.tree.map(place, state, later)
     return _optimum_of(state, config)
+
+
+def _given(curved: Callable[[Array, Any], Curvature], context: Any, point: Array) -> Curvature:
+    return curved(point, context)
 
 
 def _method(config: Solver) -> ModuleType:

@@ -17,7 +17,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jax import Array
+from jax import Array, lax
 
 from planner_jax.checks import numeric, require_number, require_size, told
 from planner_jax.optimise.evaluation import Evaluation, Objective, better
@@ -228,12 +228,15 @@ def _least_eigenvalue(diagonal: list[Array], beside: list[Array]) -> Array:
     ]
     low = functools.reduce(jnp.minimum, [d - r for d, r in zip(diagonal, reach, strict=True)])
     high = functools.reduce(jnp.minimum, diagonal)
-    for _ in range(_HALVINGS):
+
+    def halve(_: int, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = ends
         middle = 0.5 * (low + high)
         pivots = _pivots(diagonal, beside, -middle)
         is_below = functools.reduce(jnp.logical_or, [pivot < 0.0 for pivot in pivots])
-        low, high = jnp.where(is_below, low, middle), jnp.where(is_below, middle, high)
-    return low
+        return jnp.where(is_below, low, middle), jnp.where(is_below, middle, high)
+
+    return lax.fori_loop(0, _HALVINGS, halve, (low, high))[0]
 
 
 def _tridiagonal_solve(diagonal: list[Array], beside: list[Array], shift: Array) -> Array:

@@ -10,9 +10,11 @@ from jax import Array
 from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.multistart import solve_batch, solve_round
-from planner_jax.optimise.newton import Curvature, by_products
-from planner_jax.optimise.problem import Round, Settings
+from planner_jax.optimise.newton import Curvature, NewtonConfig, by_products
+from planner_jax.optimise.problem import Round, Settings, Solver
 
+# From a start that is near the optimum, of which most lanes are there after a few iterations.
+CONVERGED = NewtonConfig(max_steps=4, tolerance=1e-7, patience=4, stragglers=((0.25, 40),))
 _LONG = LbfgsConfig(max_steps=300, tolerance=1e-7, patience=6)
 # Of the first round, by effort.
 _GOOD = LbfgsConfig(max_steps=200, tolerance=1e-6, patience=5)
@@ -92,6 +94,11 @@ class OptimisedPlanner(abc.ABC):
     def with_solver(self, solver: LbfgsConfig = _LONG) -> Self:
         """The planner with one search from the first guess instead of its rounds, a long one."""
         return self.changed((("rounds", (Round(solver=solver),)),))
+
+    def with_first(self, solver: Solver) -> Self:
+        """The planner with another solver in its first round; the rounds behind it stay."""
+        first, *others = self.rounds
+        return self.changed((("rounds", (dataclasses.replace(first, solver=solver), *others)),))
 
     def with_effort(self, effort: str) -> Self:
         """The planner with another first round, which searches on after every limit holds.

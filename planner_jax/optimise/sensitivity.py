@@ -6,9 +6,10 @@ For a number q(u, theta) of a plan, where u minimises cost(u, theta),
 
 the adjoint form of the implicit function theorem. lambda comes from a few steps of conjugate
 gradients (Hestenes and Stiefel 1952). The derivative of all slopes of the cost along a direction
-p of the point holds both p^T cost_uu and p^T cost_utheta, so that the gradient is summed up along
-with lambda. A planner whose cost has a cheap part (`Planner.core`, see `CorePlanner`) is
-preconditioned with that part's curvature.
+p of the point holds both p^T cost_uu and p^T cost_utheta, so that either the gradient is summed up
+along with lambda, or, where the planner has quicker products with the Hessian (`Problem.curved`),
+it takes one such derivative along lambda in the end. A planner whose cost has a cheap part
+(`Planner.core`, see `CorePlanner`) can be preconditioned with that part's curvature instead.
 """
 
 import dataclasses
@@ -30,7 +31,9 @@ from planner_jax.optimise.problem import Problem, Round, Settings
 from planner_jax.protocol import Plan
 
 Quantity = str | Callable[[Any], Array]
-_CURVATURES = ("core", "whole")
+_CURVATURES = ("products", "core", "whole")
+# Of the conjugate gradients by default: unknowns are some 40, and scaled.
+_STEPS = {"products": 40, "core": 1, "whole": 1}
 
 
 @runtime_checkable
@@ -97,15 +100,16 @@ class Differentiated(OptimisedPlanner):
     # Place in the plan such as "stroke.time", or a function of the plan.
     quantity: Quantity = struct.field(pytree_node=False)
     by: tuple[str, ...] = struct.field(pytree_node=False)  # places in the case such as "net.radius"
-    steps: int = struct.field(pytree_node=False, default=1)  # of the conjugate gradients
-    # "core" or "whole", of the preconditioner.
-    curvature: str = struct.field(pytree_node=False, default="core")
+    # Of the conjugate gradients; as many as suit the curvature if None.
+    steps: int | None = struct.field(pytree_node=False, default=None)
+    curvature: str = struct.field(pytree_node=False, default="products")  # see `gradient_at`
 
     def __post_init__(self) -> None:
         if not isinstance(self.curvature, str) or self.curvature not in _CURVATURES:
             known = ", ".join(_CURVATURES)
             raise ValueError(f"curvature must be one of {known}, got {self.curvature!r}")
-        require_size("steps", self.steps, 0)
+        if self.steps is not None:
+            require_size("steps", self.steps, 0)
         if not callable(self.quantity) and not isinstance(self.quantity, str):
             raise TypeError(f"of must be a name or a function of a plan, got {told(self.quantity)}")
         if not self.by:
@@ -161,8 +165,8 @@ def gradient_at(
     quantity: Quantity,
     by: tuple[str, ...],
     *,
-    steps: int = 1,
-    curvature: str = "core",
+    steps: int | None = None,
+    curvature: str = "products",
 ) -> Gradient:
     """Gradient of a number of the plan at a point by parts of the case. One lane; pure.
 
@@ -176,8 +180,10 @@ def gradient_at(
         steps: of the conjugate gradients; each takes a product with the Hessian. A lane stops
             early where the Hessian is not positive. 0 leaves the adjoint out, which is right
             for "cost": its gradient at an optimum is that at a fixed point (envelope theorem).
-        curvature: of the preconditioner: "core" is that of the planner's core, "whole" the
-            Hessian itself, which takes n products more.
+            None for as many as suit the curvature.
+        curvature: "products" takes those of the planner's `curved`; of the others that of the
+            preconditioner, "core" the planner's core, "whole" the Hessian itself, which takes n
+            products more.
 
     Raises:
         ValueError: a place does not exist, or holds something else than floating numbers.
@@ -217,8 +223,10 @@ def gradient_at(
         slopes = lambda x: jax.grad(cost, argnums=(0, 1))(x, smooth)  # noqa: E731
         return jax.jvp(slopes, (point,), (direction,))[1]
 
-    if steps == 0:
-        solve = lambda rhs: rhs  # noqa: E731
+    steps = _STEPS[curvature] if steps is None else steps
+    solve = lambda rhs: rhs  # noqa: E731
+    if steps == 0 or curvature == "products":
+        pass
     elif curvature == "whole":
         hessian = jax.vmap(lambda unit: products(unit)[0])(
             jnp.eye(point.shape[0], dtype=point.dtype)
@@ -227,7 +235,13 @@ def gradient_at(
         solve = lambda rhs: jnp.sum(inverse * rhs, axis=1)  # noqa: E731
     else:
         solve = _core_inverse(planner, point, context)
-    by_context, residual = _adjoint(products, solve, along_point, by_context, steps)
+    if steps and curvature == "products":
+        _, _, product = planner.curved(point, context)
+        adjoint, residual = _adjoint_by(product, along_point, steps)
+        _, mixed = products(adjoint)
+        by_context = [b - m for b, m in zip(by_context, mixed, strict=True)]
+    else:
+        by_context, residual = _adjoint(products, solve, along_point, by_context, steps)
     taken = iter(by_context)
     both = zip(leaves, is_smooth, strict=True)
     cotangent = [
@@ -237,6 +251,31 @@ def gradient_at(
     finite = jnp.isfinite(value) & jnp.isfinite(residual)
     by_parts = jax.tree.map(lambda leaf: jnp.where(finite, leaf, jnp.nan), by_parts)
     return Gradient(value=value, by=by_parts, residual=residual)
+
+
+def _adjoint_by(product: Callable, rhs: Array, steps: int) -> tuple[Array, Array]:
+    """Lambda with cost_uu lambda = rhs by conjugate gradients, and the relative residual.
+
+    The residual is not finite where the cost does not curve upward to begin with.
+    """
+
+    def step(k: Array, state: tuple) -> tuple:
+        found, left, direction, size, defined = state
+        image = product(direction)
+        curvature = jnp.sum(direction * image)
+        defined = jnp.where(k == 0, (curvature > 0.0) | (size == 0.0), defined)
+        going = (curvature > 0.0) & (size > 1e-12 * first)
+        length = jnp.where(going, size / jnp.where(going, curvature, 1.0), 0.0)
+        found, left = found + length * direction, left - length * image
+        after = jnp.sum(left**2)
+        direction = jnp.where(going, left + after / jnp.where(going, size, 1.0) * direction, 0.0)
+        return found, left, direction, jnp.where(going, after, size), defined
+
+    first = jnp.sum(rhs**2)
+    start = jnp.zeros_like(rhs), rhs, rhs, first, jnp.ones((), bool)
+    found, _, _, size, defined = jax.lax.fori_loop(0, steps, step, start)
+    ratio = size / jnp.where(first > 0.0, first, 1.0)
+    return found, jnp.where(defined, jnp.sqrt(ratio), jnp.nan)
 
 
 def _adjoint(

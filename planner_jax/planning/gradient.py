@@ -9,6 +9,9 @@ from jax import Array
 
 from planner_jax.checks import require_kind, told
 from planner_jax.optimise.lbfgs import LbfgsConfig
+from planner_jax.optimise.newton import NewtonConfig
+from planner_jax.optimise.planner import CONVERGED
+from planner_jax.optimise.problem import Solver
 from planner_jax.optimise.sensitivity import Differentiated, Quantity, part_of
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.planning.plan import plan, require_fit
@@ -35,9 +38,9 @@ def gradient(
     *,
     of: Quantity,
     by: str | Sequence[str],
-    steps: int = 1,
+    steps: int | None = None,
     curvature: str | None = None,
-    solver: LbfgsConfig | None = None,
+    solver: Solver | None = CONVERGED,
     chunk: int | None = None,
     devices: Sequence[Any] | None = None,
 ) -> PlanGradient:
@@ -78,7 +81,7 @@ def gradient(
     if not isinstance(by, str | Sequence):
         raise TypeError(f"by must be a name or some, got {told(by)}")
     if solver is not None:
-        require_kind("solver", solver, LbfgsConfig)
+        require_kind("solver", solver, LbfgsConfig, NewtonConfig)
     by = (by,) if isinstance(by, str) else tuple(by)
     for name in by:
         part_of(cases, name)
@@ -91,14 +94,15 @@ def gradient(
         found = plan(planner, cases, chunk=chunk, devices=devices)
         planner, cases = planner.smooth_near(cases, found)
         curvature = curvature or "whole"
+        solver = None if solver is CONVERGED else solver
     if not hasattr(planner, "objective"):
         raise TypeError(
             f"{type(planner).__name__} minimises nothing, so that its plans have no gradient: use "
             "a planner that does, such as hits' and catches' exact or intercepts' spacetime"
         )
     if solver is not None:
-        planner = planner.with_solver(solver)
-    differentiated = Differentiated(planner, of, by, steps, curvature or "core")
+        planner = planner.with_first(solver)
+    differentiated = Differentiated(planner, of, by, steps, curvature or "products")
     plans = plan(differentiated, cases, chunk=chunk, devices=devices)
     return PlanGradient(plans=plans.whole_plan(), **_fields(plans.gradient))
 

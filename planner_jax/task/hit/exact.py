@@ -85,7 +85,10 @@ def start_features(context: HitContext) -> Array:
     case, lands = context.case, context.landing_time
     head, limits, stroke = case.head_state, case.limits, case.hit_limits
     seen = [target_at(context.path, share * lands) for share in _SEEN]
-    acceleration = limits.max_thrust if limits.acceleration is None else limits.acceleration
+    acceleration = limits.acceleration
+    if acceleration is None:  # about what the thrust leaves beside the weight
+        thrust = 2.5 * case.gravity if limits.max_thrust is None else limits.max_thrust
+        acceleration = jnp.maximum(thrust - case.gravity, 0.1 * case.gravity)
     numbers = (
         *(part for ball in seen for part in (ball.pos - head[0], ball.vel)),
         case.target - head[0],
