@@ -39,7 +39,8 @@ class NewtonConfig:
     damping: float = 1e-3  # at first
     trial_dampings: tuple[float, ...] = (0.01, 0.1, 1.0, 10.0)  # times a lane's own, tried at once
     ease: float = 0.5  # of the damping, after a step that is kept
-    tighten: float = 16.0  # of the damping, where no trial lowers the cost
+    # Of the damping, where no trial lowers the cost: the next ones begin where these ended.
+    tighten: float = 1e3
     step_cap: float = 3.0  # largest Euclidean length of a step
     tolerance: float = 1e-4  # decrease that is expected, relative to the cost, that counts as none
     patience: int = 3  # iterations without a decrease before a lane is stationary
@@ -56,6 +57,14 @@ class NewtonConfig:
             raise TypeError(f"trial_dampings must be a tuple of numbers, got {told(trials)}")
         if not trials or not all(0.0 <= each < jnp.inf for each in trials):
             raise ValueError(f"trial_dampings must be finite and >= 0, one or more, got {trials}")
+        later = self.stragglers
+        if not isinstance(later, tuple) or not all(
+            isinstance(each, tuple) and len(each) == 2 for each in later
+        ):
+            raise TypeError(f"stragglers must be a tuple of pairs, got {told(later)}")
+        for share, steps in later:
+            require_number("stragglers", share, "of shares > 0 and <= 1", lambda x: 0.0 < x <= 1.0)
+            require_size("stragglers", steps, 1)
 
 
 @struct.dataclass

@@ -1,0 +1,84 @@
+"""Second derivatives of the penalties along a way, beside those of automatic differentiation."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import planner_jax as pj
+from planner_jax.cost.along import integrate_along
+from planner_jax.cost.along_curvature import curvature_along
+from planner_jax.cost.quadrotor import flight_along
+from planner_jax.task.hit.exact import ExactHit
+from planner_jax.trajectory.proportional_minco import proportional_minco
+
+MAPS = proportional_minco(4, (0.3, 1.0, 1.0))
+CASES = {
+    "hit": lambda: pj.hit.draw(1, seed=1),
+    "catch": lambda: pj.catch.draw(1, "throws", 1),
+    "extra": lambda: pj.hit.case(
+        [[0.0, -4.0, 1.5]],
+        [[0.0, 4.0, 4.0]],
+        [[0.0, -3.0, 0.0]],
+        extras=(pj.KeepOut(centre=np.array([0.0, 0.2, 1.0]), radius=np.array(0.7)),),
+    ),
+}
+
+
+def double(tree):
+    floating = lambda leaf: jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.floating)  # noqa: E731
+    return jax.tree.map(lambda x: jnp.asarray(x, jnp.float64) if floating(x) else x, tree)
+
+
+@pytest.mark.parametrize("given", [0, 4])
+@pytest.mark.parametrize("name", CASES)
+def test_all_derivatives_are_those_of_the_integrated_penalties(name, given):
+    with jax.enable_x64(True):
+        case = double(pj.lane(CASES[name](), 0))
+        along = flight_along(MAPS, 2, case, 0.03, 0.1)
+        columns = jnp.asarray(np.random.default_rng(0).normal(size=(10, 3)))
+        theta, parameters = jnp.log(0.2), (case.gravity, case.limits, case.extras)
+        power = np.where(np.arange(10) < given, np.arange(10), 0)[:given, None]
+
+        def penalty(moving, at):
+            head = columns[:given] * jnp.exp(at - theta) ** power
+            every = jnp.concatenate([head, moving])
+            return integrate_along(along, every[None], jnp.exp(at)[None], parameters)[0][0]
+
+        found = curvature_along(along, columns, jnp.exp(theta), parameters, given)
+        at = columns[given:], theta
+        slopes = jax.grad(penalty, argnums=(0, 1))(*at)
+        hessian = jax.hessian(penalty, argnums=(0, 1))(*at)
+        pairs = [
+            (found.penalty, penalty(*at)),
+            (found.by_columns, slopes[0]),
+            (found.by_theta, slopes[1]),
+            (found.columns_columns, hessian[0][0]),
+            (found.columns_theta, hessian[0][1]),
+            (found.theta_theta, hessian[1][1]),
+        ]
+        for mine, exact in pairs:
+            assert np.abs(exact).max() > 0.0
+            np.testing.assert_allclose(mine, exact, rtol=1e-9, atol=1e-11 * np.abs(exact).max())
+
+
+def test_a_hits_products_are_those_of_its_objective():
+    planner = ExactHit(proportions=(0.2, 0.5, 1.0, 1.0, 1.0, 1.0))
+    with jax.enable_x64(True):
+        context = planner.prepare(double(pj.lane(pj.hit.draw(1, seed=1), 0)))
+        size = len(planner.scale)
+        random = np.random.default_rng(2)
+        point = planner.guesses(context, 1)[0] + 0.1 * random.normal(size=size)
+        direction = jnp.asarray(random.normal(size=size))
+
+        def cost(x):
+            return planner.objective(x, context).cost
+
+        evaluation, gradient, product = planner.curved(point, context)
+        exact = jax.jvp(jax.grad(cost), (point,), (direction,))
+        np.testing.assert_allclose(evaluation.cost, cost(point), rtol=1e-12)
+        np.testing.assert_allclose(
+            evaluation.violation, planner.objective(point, context).violation, rtol=1e-12
+        )
+        np.testing.assert_allclose(gradient, exact[0], rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(product(direction), exact[1], rtol=1e-9, atol=1e-11)

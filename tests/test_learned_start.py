@@ -1,0 +1,86 @@
+"""First guesses that were learnt: what they are worth, and that nothing is lost without them."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import planner_jax as pj
+from planner_jax.optimise.learned_start import (
+    REACH,
+    StartNetwork,
+    cheaper_start,
+    shipped_network,
+    to_bytes,
+    untrained,
+)
+from planner_jax.planning.decided import first_choice
+
+
+def throws(num):
+    return first_choice(pj.catch.Greedy(), pj.catch.draw(num, "throws", 3))
+
+
+TASKS = {
+    "hit": (pj.hit.ExactHit, lambda num: pj.hit.draw(num, seed=3)),
+    "catch": (pj.catch.ExactCatch, throws),
+}
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_learnt_guess_costs_a_hundredth_and_little_more_than_the_optimum(task):
+    planner, cases = TASKS[task][0](), TASKS[task][1](64)
+
+    def costs(case, planner):
+        context = planner.prepare(case)
+        return planner.objective(planner.guesses(context, 1)[0], context).cost
+
+    learnt, smooth = (
+        np.asarray(jax.jit(jax.vmap(lambda case, own=own: costs(case, own)))(cases))
+        for own in (planner, dataclasses.replace(planner, learned=False))
+    )
+    ended = pj.plan(planner, cases)
+    assert pj.solved(ended).all()
+    assert np.median(smooth / ended.cost) > 1.5
+    assert np.median(learnt / ended.cost) < 1.1
+    assert np.all(learnt <= smooth)
+
+
+def test_a_guess_that_costs_more_is_not_taken():
+    cost = lambda x: jnp.sum(x**2)  # noqa: E731
+    guess = jnp.array([1.0, 1.0])
+    np.testing.assert_array_equal(cheaper_start(cost, guess, jnp.array([-0.5, 0.0])), [0.5, 1.0])
+    np.testing.assert_array_equal(cheaper_start(cost, guess, jnp.array([3.0, 0.0])), guess)
+    np.testing.assert_array_equal(cheaper_start(cost, guess, jnp.full(2, jnp.nan)), guess)
+
+
+def test_an_untrained_network_adds_nothing_and_far_features_count_as_less_far():
+    features = np.random.default_rng(0).normal(size=(100, 3))
+    network = untrained(features, 2, (5,))
+    np.testing.assert_array_equal(network(jnp.asarray(features[0], jnp.float32)), 0.0)
+    network = dataclasses.replace(network, weights=(network.weights[0], np.ones((5, 2))))
+    mean, deviation = network.mean, network.deviation
+    at = [network(jnp.asarray(mean + far * deviation, jnp.float32)) for far in (REACH, 10 * REACH)]
+    np.testing.assert_allclose(at[0], at[1], rtol=1e-5)
+    assert np.abs(at[0]).max() > 0.0
+
+
+@pytest.mark.parametrize("task, name", [("hit", "exact-12"), ("catch", "exact-6")])
+def test_a_shipped_network_is_what_its_archive_holds(task, name, tmp_path):
+    network = shipped_network(f"planner_jax.task.{task}", name)
+    (tmp_path / "again.npz").write_bytes(to_bytes(network))
+    with np.load(tmp_path / "again.npz", allow_pickle=False) as file:
+        assert len(file.files) == 2 + 2 * len(network.weights)
+        for k, weight in enumerate(network.weights):
+            np.testing.assert_array_equal(file[f"weight{k}"], weight)
+    assert isinstance(network, StartNetwork)
+    assert all(np.isfinite(each).all() for each in (*network.weights, *network.biases))
+
+
+def test_other_pieces_begin_at_a_smooth_trajectory():
+    other = pj.hit.ExactHit(proportions=(0.2, 0.5, 1.0, 1.0, 1.0, 1.0))
+    context = other.prepare(pj.lane(pj.hit.draw(1, seed=3), 0))
+    plain = dataclasses.replace(other, learned=False)
+    np.testing.assert_array_equal(other.guesses(context, 1), plain.guesses(context, 1))
