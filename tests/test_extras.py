@@ -16,7 +16,9 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial, states_at
 from planner_jax.trajectory.proportional_minco import boundary_rows
 from tests.derivatives import assert_gradient_matches_differences
 
-FREE, CATCH = pj.hit.planner("exact"), pj.catch.planner("exact", decide="given")
+# Smooth ways, around whose middle obstacles are put.
+FREE = pj.hit.ExactHit(learned=False)
+CATCH = pj.catch.planner("exact", decide="given")
 HIT = FREE.changed((("rounds", FREE.rounds[1:2]),))  # one attempt: one program to compile
 NUM, AT, FAR = 4, np.zeros(3), np.full((4, 3), 50.0)
 TRACES = []

@@ -23,7 +23,13 @@ LANES = 128
 # Of one round: the ball's table; penalties with slopes, without, and the greatest of a finished
 # plan; the direction; and made by `in_one_kernel` the ends of a trajectory, at a point and at the
 # trial steps, their slopes, and the choice of a step.
-ROUND = {"flight_table": 1, "integrate_along": 3, "lanes": 4, "lbfgs_turn": 1}
+ROUND = {
+    "flight_table": 1,
+    "integrate_along": 4,
+    "lanes": 6,
+    "lbfgs_turn": 1,
+    "greatest_along": 1,
+}
 # Of gradients: the table and its slopes; penalties' slopes and curvature; the core's inverse.
 GRADIENTS = {"flight_table": 2, "integrate_along": 4, "positive_inverse": 1}
 

@@ -176,7 +176,7 @@ def test_the_kernel_gives_the_same_inverses():
         ({"of": "speed"}, "of must name a place in BowlPlan, got 'speed'"),
         ({"of": "point"}, r"of must be one number, got shape \(3,\)"),
         ({"steps": -1}, "steps must be >= 0, got -1"),
-        ({"curvature": "none"}, "curvature must be one of core, whole, got 'none'"),
+        ({"curvature": "none"}, "curvature must be one of products, core, whole, got 'none'"),
     ],
 )
 def test_what_is_wrong_is_named(bowls, options, line):

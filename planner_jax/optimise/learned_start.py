@@ -42,9 +42,9 @@ class StartNetwork:
         return values
 
 
-def cheaper_start(cost: Callable[[Array], Array], guess: Array, change: Array) -> Array:
-    """A guess (n,) with a change that was learnt, or without where that costs less."""
-    return jnp.where(cost(guess + change) < cost(guess), guess + change, guess)
+def cheaper_start(cost: Callable[[Array], Array], guess: Array, learned: Array) -> Array:
+    """A start (n,) that was learnt, or a guess where that costs less."""
+    return jnp.where(cost(learned) < cost(guess), learned, guess)
 
 
 def untrained(

@@ -11,10 +11,10 @@ from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.multistart import solve_batch, solve_round
 from planner_jax.optimise.newton import Curvature, NewtonConfig, by_products
-from planner_jax.optimise.problem import Round, Settings, Solver
+from planner_jax.optimise.problem import Round, Settings, Stage
 
-# From a start that is near the optimum, of which most lanes are there after a few iterations.
-CONVERGED = NewtonConfig(max_steps=4, tolerance=1e-7, patience=4, stragglers=((0.25, 40),))
+# From points near their optima, where most lanes are after a few iterations.
+_POLISH = NewtonConfig(max_steps=4, tolerance=1e-7, patience=4, stragglers=((0.25, 40),))
 _LONG = LbfgsConfig(max_steps=300, tolerance=1e-7, patience=6)
 # Of the first round, by effort.
 _GOOD = LbfgsConfig(max_steps=200, tolerance=1e-6, patience=5)
@@ -95,10 +95,12 @@ class OptimisedPlanner(abc.ABC):
         """The planner with one search from the first guess instead of its rounds, a long one."""
         return self.changed((("rounds", (Round(solver=solver),)),))
 
-    def with_first(self, solver: Solver) -> Self:
-        """The planner with another solver in its first round; the rounds behind it stay."""
+    def polished(self) -> Self:
+        """The planner whose first round goes on to the optimum, by Newton's method."""
         first, *others = self.rounds
-        return self.changed((("rounds", (dataclasses.replace(first, solver=solver), *others)),))
+        stages = (*first.stages, Stage(first.solver, first.settings))
+        first = dataclasses.replace(first, solver=_POLISH, stages=stages)
+        return self.changed((("rounds", (first, *others)),))
 
     def with_effort(self, effort: str) -> Self:
         """The planner with another first round, which searches on after every limit holds.

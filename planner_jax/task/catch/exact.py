@@ -57,6 +57,7 @@ _SEEN = (-0.1, 0.1)  # [s] from the decided time, at which a learned start looks
 # sharply where the thrust is small, as it is between catches.
 _DECODE_NODES = (32, 48)
 _RIM = 0.9  # share of the net's radius that a planned catch may use
+_LEARNED_PLACE = 2.0  # greatest size of a place that is learnt: 0.89 of that share
 _ENCODED_RIM = 0.99  # share of that which a point made by `encode` may use
 
 
@@ -74,6 +75,8 @@ _GUESSES = np.array(
         (1.5, 0.2, 0.2, 0.0, 0.0),
     ]
 )
+_FIRST = Round(starts=1, solver=LbfgsConfig(max_steps=8))
+_FROM_LEARNED = Round(starts=1, solver=LbfgsConfig(max_steps=2))  # in its place, of one target
 _LEAN = 0.95  # of the angle that the net may have to the ball's way, what a guess makes use of
 
 
@@ -101,6 +104,14 @@ def start_features(context: CatchContext) -> Array:
         ),
     )
     return jnp.concatenate(numbers)
+
+
+def _is_learned(case: CatchCase) -> bool:
+    """Whether the network has seen such cases, or batches: one target, and nothing in the way.
+
+    Around obstacles the side on which a search begins decides where it can end.
+    """
+    return case.num_targets == 1 and not case.extras
 
 
 @struct.dataclass
@@ -137,7 +148,7 @@ class ExactCatch(OptimisedPlanner):
     hinge_width: float = 0.1
     catch_weight: float = 0.3  # [s], of the hinges at a catch beside the integrals
     rounds: tuple[Round, ...] = (
-        Round(starts=1, solver=LbfgsConfig(max_steps=8)),
+        _FIRST,
         Round(starts=1, solver=LbfgsConfig(max_steps=25)),
         Round(starts=1, solver=LbfgsConfig(max_steps=80)),
         Round(starts=6, solver=LbfgsConfig(max_steps=200)),
@@ -174,12 +185,12 @@ class ExactCatch(OptimisedPlanner):
 
     @property
     def _network(self) -> StartNetwork | None:
-        """That makes the first guess; there is one for the shipped sizes."""
+        """That makes the first guess; there is one for the shipped sizes and the usual lift."""
         name = f"exact-{self.num_pieces}"
-        is_shipped = self.proportions == _PROPORTIONS and self.scale == shipped_scale(
-            __package__, name
-        )
-        return shipped_network(__package__, name) if self.learned and is_shipped else None
+        is_usual = self.proportions == _PROPORTIONS and self.lift == _GUESSES[0, 3]
+        if not self.learned or not is_usual or self.scale != shipped_scale(__package__, name):
+            return None
+        return shipped_network(__package__, name)
 
     @property
     def maps(self) -> ProportionalMinco:
@@ -199,11 +210,37 @@ class ExactCatch(OptimisedPlanner):
         rows = jnp.asarray(rows, context.times.dtype)
         points = jax.vmap(lambda guess: self._guess(context, guess))(rows)
         network = self._network
-        if network is None or context.times.size > 1:
+        if network is None or not _is_learned(context.case):
             return points
-        change = network(start_features(context))
+        learned = self._off_the_rim(points[0] + network(start_features(context)))
         cost = lambda point: self.objective(point, context).cost  # noqa: E731
-        return points.at[0].set(cheaper_start(cost, points[0], change))
+        return points.at[0].set(cheaper_start(cost, points[0], learned))
+
+    def solve(self, case: CatchCase, attempt: Round) -> CatchPlan:
+        """The plan of one case by one round."""
+        return super().solve(case, self._for_start(attempt, case))
+
+    def solve_lanes(self, cases: CatchCase, attempt: Round) -> CatchPlan:
+        """The plans of a batch by one round."""
+        return super().solve_lanes(cases, self._for_start(attempt, cases))
+
+    def _for_start(self, attempt: Round, case: CatchCase) -> Round:
+        """A shorter first round where it begins near its end."""
+        is_near = attempt == _FIRST and self._network is not None and _is_learned(case)
+        return _FROM_LEARNED if is_near else attempt
+
+    def _off_the_rim(self, point: Array) -> Array:
+        """A point (n,) whose places in the net still move with their variables.
+
+        The least time puts the ball on the rim, at places without bound, from which no later search
+        comes back when the ball turns out to be elsewhere.
+        """
+        offsets, natural = self._split(point)
+        place = natural[:, 1:3]
+        size = jnp.sqrt(jnp.maximum(jnp.sum(place**2, axis=1, keepdims=True), 1e-12))
+        natural = natural.at[:, 1:3].set(place * jnp.minimum(1.0, _LEARNED_PLACE / size))
+        together = jnp.concatenate([offsets.reshape(natural.shape[0], -1), natural], axis=1)
+        return (together / jnp.asarray(self.scale, point.dtype)).ravel()
 
     def _guess(self, context: CatchContext, guess: Array) -> Array:
         """The point (n,) of later times, velocities and thrusts, a row of `_GUESSES`."""

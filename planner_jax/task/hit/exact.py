@@ -187,10 +187,10 @@ class ExactHit(OptimisedPlanner):
     def _network(self) -> StartNetwork | None:
         """That makes the first guess; there is one for the shipped sizes."""
         name = f"exact-{self.num_pieces}"
-        is_shipped = self.proportions == _PROPORTIONS and self.scale == shipped_scale(
-            __package__, name
-        )
-        return shipped_network(__package__, name) if self.learned and is_shipped else None
+        if not self.learned or self.proportions != _PROPORTIONS:
+            return None
+        is_shipped = self.scale == shipped_scale(__package__, name)
+        return shipped_network(__package__, name) if is_shipped else None
 
     @property
     def maps(self) -> ProportionalMinco:
@@ -222,11 +222,12 @@ class ExactHit(OptimisedPlanner):
         natural = jnp.pad(times, ((0, 0), (self.num_offsets, 5)))
         points = natural / jnp.asarray(self.scale, natural.dtype)
         network = self._network
-        if network is None:
+        # Around obstacles the side on which a search begins decides where it can end.
+        if network is None or context.case.extras:
             return points
-        change = network(start_features(context))
+        learned = points[0] + network(start_features(context))
         cost = lambda point: self.objective(point, context).cost  # noqa: E731
-        return points.at[0].set(cheaper_start(cost, points[0], change))
+        return points.at[0].set(cheaper_start(cost, points[0], learned))
 
     def impact(self, natural: Array, context: HitContext) -> Impact:
         """The impact that the variables after the waypoint offsets describe.
