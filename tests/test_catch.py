@@ -91,10 +91,11 @@ def test_absent_targets_have_no_flight_and_the_plan_stays_at_the_last_catch(plan
 
 @pytest.mark.slow
 def test_one_throw_planned_alone_equals_its_lane_in_a_batch_for_more_targets(cases, plans):
+    """From the same start: one is learnt for throws of one target alone."""
     wide = lane_of(cases, 0)
     first = lambda leaf: leaf[:1]  # noqa: E731
     alone = plan(
-        PLANNER,
+        dataclasses.replace(PLANNER, learned=False),
         wide.replace(
             targets=jax.tree.map(first, wide.targets),
             present=wide.present[:1],

@@ -220,12 +220,19 @@ CASES = {
         {"racket_height": 1e-3, "drag": 1e-4, "limits.body_rate": 1e-3},
         {"curvature": "whole"},
     ),
+    "hit by products": (
+        ExactHit(proportions=PIECES),
+        hit_case,
+        "stroke.time",
+        {"racket_height": 1e-3, "limits.body_rate": 1e-3},
+        {},
+    ),
     "hit that no limit holds back": (
         ExactHit(proportions=PIECES),
         easy_hit_case,
         "stroke.time",
         {"racket_height": 1e-3, "drag": 1e-4},
-        {"steps": 1},
+        {"curvature": "core"},
     ),
     "catch": (
         ExactCatch(),

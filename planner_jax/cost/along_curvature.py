@@ -157,7 +157,11 @@ def _pulled_back(constants: "_Constants", curvature: dict, weight: Array, rates:
             )
             for a, b in pairs
         ]
-        product = jnp.matmul(jnp.asarray(matrix, weight.dtype), jnp.stack(numbers, axis=1))
+        product = jnp.matmul(
+            jnp.asarray(matrix, weight.dtype),
+            jnp.stack(numbers, axis=1),
+            precision=lax.Precision.HIGHEST,
+        )
         for place, pair in enumerate(pairs):
             block = product[:, place].reshape(constants.num_moving, -1)
             blocks[pair] = blocks[pair] + block if pair in blocks else block

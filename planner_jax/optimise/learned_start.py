@@ -16,7 +16,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jax import Array
+from jax import Array, lax
 
 REACH = 4.0  # standard deviations beyond which features are taken as that far
 
@@ -36,7 +36,7 @@ class StartNetwork:
         values = (features - cast(self.mean)) / cast(self.deviation)
         values = jnp.clip(values, -REACH, REACH)
         for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            values = jnp.matmul(values, cast(weight)) + cast(bias)
+            values = jnp.matmul(values, cast(weight), precision=lax.Precision.HIGHEST) + cast(bias)
             if k + 1 < len(self.weights):
                 values = jnp.tanh(values)
         return values

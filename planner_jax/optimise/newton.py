@@ -26,6 +26,7 @@ from planner_jax.optimise.evaluation import Evaluation, Objective, better
 Curvature = tuple[Evaluation, Array, Callable[[Array], Array]]
 Curved = Callable[[Array], Curvature]
 
+_HIGHEST = lax.Precision.HIGHEST
 _HALVINGS = 14  # of the interval in which the least eigenvalue is looked for
 _LEAST = 1e-7  # of a pivot, beside the greatest number of its matrix
 
@@ -151,7 +152,8 @@ def step(
     numbers, chosen, is_better, going = _chosen(
         config, state.numbers, here, dampings, trials, decrease
     )
-    point = state.point + jnp.where(going, chosen @ steps, 0.0)
+    move = jnp.matmul(chosen, steps, precision=_HIGHEST)
+    point = state.point + jnp.where(going, move, 0.0)
     return NewtonState(
         point=point,
         best_point=jnp.where(is_better, point, state.best_point),
@@ -180,7 +182,7 @@ def damped_steps(
     shift = jnp.maximum(-lowest, 0.0)
     solve = lambda damping: _tridiagonal_solve(diagonal, beside, shift + damping)  # noqa: E731
     inside = size * jax.vmap(solve)(dampings)  # (k, m)
-    steps = -inside @ vectors
+    steps = -jnp.matmul(inside, vectors, precision=_HIGHEST)
     lengths = jnp.sqrt(jnp.sum(steps**2, axis=1, keepdims=True))
     steps = steps * jnp.minimum(1.0, config.step_cap / jnp.maximum(lengths, 1e-20))
     promised = 0.5 * size**2 * solve(jnp.zeros_like(size))[0]
@@ -204,7 +206,8 @@ def _lanczos(
         if k + 1 == num:
             break
         # Against all that went before, since rounding would bring them back.
-        image = image - (vectors @ image) @ vectors
+        shares = jnp.matmul(vectors, image, precision=_HIGHEST)
+        image = image - jnp.matmul(shares, vectors, precision=_HIGHEST)
         length = jnp.sqrt(jnp.sum(image**2))
         # An invariant subspace ends here: what follows is a vector of zeros.
         is_new = length > 1e-6 * jnp.abs(diagonal[-1])

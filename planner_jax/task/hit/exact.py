@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 
 from planner_jax.ball.aim import aim_drag_free, aim_with_drag, apex_with_drag
 from planner_jax.ball.flight import (
@@ -364,14 +364,16 @@ class ExactHit(OptimisedPlanner):
         by_natural = by_natural.at[0].add(along.by_theta - power * energy)
         theta_theta = along.theta_theta + power**2 * energy
 
+        dot = functools.partial(jnp.tensordot, precision=lax.Precision.HIGHEST)
+
         def product(direction: Array) -> Array:
             step, move = self._split(direction)
-            columns = jnp.concatenate([jnp.tensordot(move, tails, 1), step])
-            image = jnp.tensordot(along.columns_columns, columns, 2)
+            columns = jnp.concatenate([dot(move, tails, 1), step])
+            image = dot(along.columns_columns, columns, 2)
             image = image + along.columns_theta * move[0]
             theta = jnp.sum(along.columns_theta * columns) + theta_theta * move[0]
             theta = theta - power * bend * jnp.sum(offsets * step)
-            own = jnp.tensordot(tails, image[:_ORDER], 2) + within @ move
+            own = dot(tails, image[:_ORDER], 2) + dot(within, move, 1)
             own = own.at[0].add(theta)
             outer = image[_ORDER:] + bend * step
             outer = outer - power * bend * offsets * move[0]
