@@ -74,7 +74,7 @@ def test_a_hits_products_are_those_of_its_objective():
         def cost(x):
             return planner.objective(x, context).cost
 
-        evaluation, gradient, product = planner.curved(point, context)
+        evaluation, gradient, product, preconditioner = planner.curved(point, context)
         exact = jax.jvp(jax.grad(cost), (point,), (direction,))
         np.testing.assert_allclose(evaluation.cost, cost(point), rtol=1e-12)
         np.testing.assert_allclose(
@@ -82,3 +82,11 @@ def test_a_hits_products_are_those_of_its_objective():
         )
         np.testing.assert_allclose(gradient, exact[0], rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(product(direction), exact[1], rtol=1e-9, atol=1e-11)
+        # What is preconditioned: the Hessian with nothing but its block of ends and its diagonal.
+        damping, hessian = 100.0, np.asarray(jax.hessian(cost)(point))
+        kept, ends = np.diag(np.abs(np.diag(hessian))), slice(size - 8, size)
+        kept[ends, ends] = hessian[ends, ends]
+        kept += damping * np.eye(size)
+        assert np.linalg.eigvalsh(kept)[0] > 0.0
+        solved = preconditioner(jnp.asarray(damping))(direction)
+        np.testing.assert_allclose(kept @ solved, direction, rtol=1e-9, atol=1e-9)

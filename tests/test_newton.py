@@ -7,7 +7,7 @@ import pytest
 
 from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.multistart import minimise, minimise_lanes
-from planner_jax.optimise.newton import NewtonConfig, by_products, damped_steps
+from planner_jax.optimise.newton import Curvature, NewtonConfig, by_products, damped_steps
 
 CURVED = np.array([[3.0, 1.0, 0.2], [1.0, 2.0, 0.0], [0.2, 0.0, 1.0]])
 SLOPE = np.array([1.0, -2.0, 0.5])
@@ -24,40 +24,66 @@ def rosenbrock(x, steepness=100.0):
     return Evaluation(cost, jnp.asarray(-1.0, x.dtype))
 
 
-def steps_of(matrix, slope, dampings, config=WHOLE):
+def steps_of(matrix, slope, damping, config=WHOLE, kept=None):
+    """Steps and promise in a subspace, preconditioned by what is kept of the Hessian."""
     matrix = jnp.asarray(matrix, jnp.float32)
-    return damped_steps(
-        jnp.asarray(slope, jnp.float32), lambda p: matrix @ p, jnp.asarray(dampings), config
+
+    def preconditioner(damping):
+        if kept is None:
+            return lambda right: right / damping
+        inverse = jnp.linalg.inv(jnp.asarray(kept, jnp.float32) + damping * jnp.eye(3))
+        return lambda right: inverse @ right
+
+    here = Curvature(
+        Evaluation(jnp.zeros(()), jnp.zeros(())),
+        jnp.asarray(slope, jnp.float32),
+        lambda direction: matrix @ direction,
+        preconditioner,
     )
+    return damped_steps(here, jnp.asarray(damping, jnp.float32), config)
 
 
-def test_a_step_in_the_whole_space_is_newtons():
-    steps, promised = steps_of(CURVED, SLOPE, [0.0, 0.7])
-    for step, damping in zip(steps, (0.0, 0.7), strict=True):
-        exact = -np.linalg.solve(CURVED + damping * np.eye(3), SLOPE)
-        np.testing.assert_allclose(step, exact, rtol=2e-5, atol=2e-6)
-    np.testing.assert_allclose(promised, 0.5 * SLOPE @ np.linalg.solve(CURVED, SLOPE), rtol=1e-5)
+@pytest.mark.parametrize("kept", [None, np.diag(np.diag(CURVED))], ids=["nothing", "diagonal"])
+def test_a_step_in_the_whole_space_is_newtons(kept):
+    """Damped by the lane's own damping, and by multiples of the preconditioner's curvature."""
+    damping, trials = 0.4, (0.0, 0.7)
+    config = NewtonConfig(subspace=3, step_cap=100.0, trial_dampings=trials)
+    steps, promised = steps_of(CURVED, SLOPE, damping, config, kept)
+    beside = damping * np.eye(3) + (0.0 if kept is None else kept)
+    own = CURVED + damping * np.eye(3)
+    for step, trial in zip(steps, trials, strict=True):
+        exact = -np.linalg.solve(own + trial * beside, SLOPE)
+        np.testing.assert_allclose(step, exact, rtol=5e-5, atol=5e-6)
+    np.testing.assert_allclose(promised, 0.5 * SLOPE @ np.linalg.solve(own, SLOPE), rtol=1e-5)
 
 
 def test_where_the_cost_bends_downward_the_hessian_is_shifted_by_that_much():
-    bent = CURVED - 4.0 * np.eye(3)
-    steps, promised = steps_of(bent, SLOPE, [0.5])
+    bent, damping = CURVED - 4.0 * np.eye(3), 1e-3
+    config = NewtonConfig(subspace=3, step_cap=100.0, trial_dampings=(500.0,))
+    steps, promised = steps_of(bent, SLOPE, damping, config)
     shift = -np.linalg.eigvalsh(bent)[0]
-    exact = -np.linalg.solve(bent + (shift + 0.5) * np.eye(3), SLOPE)
+    exact = -np.linalg.solve(bent + (shift + 500.0 * damping) * np.eye(3), SLOPE)
     # The least eigenvalue is halved to some thousandths of the interval that must hold it.
     np.testing.assert_allclose(steps[0], exact, rtol=5e-3)
     assert promised > 0.0
 
 
+def test_a_hessian_that_bends_upward_by_a_millionth_of_its_greatest_is_not_shifted():
+    steep = np.diag([1.0, 0.3, 1e-6])
+    config = NewtonConfig(subspace=3, step_cap=1e9, trial_dampings=(0.0,))
+    steps, _ = steps_of(steep, [1.0, -1.0, 1e-4], 1e-9, config, kept=np.diag([0.9, 0.3, 2e-6]))
+    np.testing.assert_allclose(steps[0], [-1.0, 1.0 / 0.3, -1e2], rtol=5e-3)
+
+
 def test_a_step_is_no_longer_than_the_cap():
-    steps, _ = steps_of(CURVED, 100.0 * SLOPE, [0.0], NewtonConfig(subspace=3, step_cap=0.25))
-    np.testing.assert_allclose(np.linalg.norm(steps), 0.25, rtol=1e-5)
+    steps, _ = steps_of(CURVED, 100.0 * SLOPE, 1e-3, NewtonConfig(subspace=3, step_cap=0.25))
+    np.testing.assert_allclose(np.linalg.norm(steps, axis=1), 0.25, rtol=1e-5)
 
 
 @pytest.mark.parametrize("slope", [np.zeros(3), np.array([0.0, 0.0, 2.0])], ids=["none", "own"])
 def test_a_subspace_that_ends_early_gives_finite_steps(slope):
-    steps, promised = steps_of(np.diag([1.0, 2.0, 4.0]), slope, [0.0])
-    np.testing.assert_allclose(steps[0], -slope / [1.0, 2.0, 4.0], atol=1e-6)
+    steps, promised = steps_of(np.diag([1.0, 2.0, 4.0]), slope, 1e-6)
+    np.testing.assert_allclose(steps[0], -slope / [1.0, 2.0, 4.0], atol=1e-5)
     assert np.isfinite(promised)
 
 
@@ -69,12 +95,13 @@ def test_a_bowl_takes_one_iteration():
 
 def test_the_products_of_an_objective_are_its_hessians():
     x = jnp.array([0.3, -0.4, 1.1])
-    evaluation, gradient, product = by_products(rosenbrock)(x)
+    evaluation, gradient, product, preconditioner = by_products(rosenbrock)(x)
     cost = lambda x: rosenbrock(x).cost  # noqa: E731
     np.testing.assert_allclose(evaluation.cost, cost(x))
     np.testing.assert_allclose(gradient, jax.grad(cost)(x), rtol=1e-6)
     for unit, row in zip(jnp.eye(3), jax.hessian(cost)(x), strict=True):
         np.testing.assert_allclose(product(unit), row, rtol=1e-5, atol=1e-4)
+        np.testing.assert_array_equal(preconditioner(4.0)(unit), unit / 4.0)
 
 
 def test_a_curved_valley_is_followed_to_its_end():

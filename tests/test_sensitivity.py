@@ -15,13 +15,13 @@ from planner_jax.optimise.inverse_kernel import inverse_kernel
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.multistart import minimise
 from planner_jax.optimise.planner import OptimisedPlanner, pending
+from planner_jax.optimise.preconditioner import positive_inverse
 from planner_jax.optimise.problem import Round
 from planner_jax.optimise.sensitivity import (
     _with_part,
     curvature_by_tangents,
     gradient_at,
     part_of,
-    positive_inverse,
 )
 from planner_jax.planning.decided import first_choice
 from planner_jax.planning.gradient import gradient

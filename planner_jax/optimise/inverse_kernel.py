@@ -18,7 +18,7 @@ _LARGEST = 12  # rows, all of whose entries a thread can keep
 
 
 def inverse_kernel(*, interpret: bool = False) -> Callable:
-    """The kernel that `lanes.with_kernel` attaches to `sensitivity.positive_inverse`.
+    """The kernel that `lanes.with_kernel` attaches to `preconditioner.positive_inverse`.
 
     Args:
         interpret: run it without a GPU, for tests.

@@ -1,18 +1,23 @@
 """Newton's method for small smooth problems, many at once.
 
-Each iteration builds a subspace of a few vectors from the gradient by products with the Hessian
-(Lanczos 1950), in which the Hessian is tridiagonal. Where it bends downward there, it is shifted
+Each iteration builds a subspace of a few vectors from the gradient by products with the damped
+Hessian (Lanczos 1950), in which that is tridiagonal. Where it bends downward there, it is shifted
 until it does not, as in trust-region methods (More and Sorensen 1983; in such a subspace Gould,
-Lucidi, Roma and Toint 1999). Steps of several dampings, which cost a few operations each, are tried
-at once, because under `vmap` a search for the right one would run to the slowest lane. As in
-`optimise.lbfgs` feasibility is watched beside the cost, and the best feasible iterate comes back.
+Lucidi, Roma and Toint 1999). As in `optimise.lbfgs` feasibility is watched beside the cost, and the
+best feasible iterate comes back.
 
-A few vectors are enough since the variables are scaled: the curvature of most is one.
+Few vectors are enough where the planner has a preconditioner, the inverse of what in the Hessian is
+strong. Damping has two metrics. A lane's own is added to the Hessian as it is: far from the optimum
+it leads down the gradient, in variables that are scaled. Beside it several multiples of the
+preconditioner's curvature are tried at once, at a few operations each, because under `vmap` a
+search for the right one would run to the slowest lane. The multiple that did best says how the
+lane's own damping goes on; it fades, and the last steps are Newton's, along flat valleys too.
 """
 
 import dataclasses
 import functools
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,9 +26,20 @@ from jax import Array, lax
 
 from planner_jax.checks import numeric, require_number, require_size, told
 from planner_jax.optimise.evaluation import Evaluation, Objective, better
+from planner_jax.optimise.preconditioner import Preconditioner
 
-# Evaluation at a point (n,), gradient (n,), and the product of the Hessian with a direction (n,).
-Curvature = tuple[Evaluation, Array, Callable[[Array], Array]]
+
+class Curvature(NamedTuple):
+    """What Newton's method takes of an objective at a point (n,)."""
+
+    evaluation: Evaluation
+    gradient: Array  # (n,)
+    product: Callable[[Array], Array]  # of the Hessian with a direction (n,)
+    # Of a positive damping (), what solves about the damped Hessian's system, (n,) of a right side
+    # (n,), by a matrix that is symmetric and positive definite.
+    preconditioner: Preconditioner
+
+
 Curved = Callable[[Array], Curvature]
 
 _HIGHEST = lax.Precision.HIGHEST
@@ -36,11 +52,12 @@ class NewtonConfig:
     """Sizes and switches of the solver: hashable, so static under jit."""
 
     max_steps: int = 6
-    subspace: int = 8  # vectors
-    damping: float = 1e-3  # at first
-    trial_dampings: tuple[float, ...] = (0.01, 0.1, 1.0, 10.0)  # times a lane's own, tried at once
-    ease: float = 0.5  # of the damping, after a step that is kept
-    # Of the damping, where no trial lowers the cost: the next ones begin where these ended.
+    subspace: int = 4  # vectors
+    damping: float = 1e-4  # at first
+    # Tried at once, as multiples of the preconditioner's curvature. The damping is multiplied by
+    # the one that does best, or by `ease` where that is greater, or by `tighten` if none does better.
+    trial_dampings: tuple[float, ...] = (0.0, 0.3, 3.0, 30.0)
+    ease: float = 0.03
     tighten: float = 1e3
     step_cap: float = 3.0  # largest Euclidean length of a step
     tolerance: float = 1e-4  # decrease that is expected, relative to the cost, that counts as none
@@ -91,6 +108,9 @@ class NewtonState:
 def by_products(objective: Objective) -> Curved:
     """The second derivatives of any objective, a tangent of its gradient for each product."""
 
+    def preconditioner(damping: Array) -> Callable[[Array], Array]:
+        return lambda right: right / damping  # nothing but the damping is known of the Hessian
+
     def curved(point: Array) -> Curvature:
         def slope(at: Array) -> tuple[Array, Evaluation]:
             def cost(x: Array) -> tuple[Array, Evaluation]:
@@ -101,7 +121,7 @@ def by_products(objective: Objective) -> Curved:
             return by, evaluation
 
         gradient, product, evaluation = jax.linearize(slope, point, has_aux=True)
-        return evaluation, gradient, product
+        return Curvature(evaluation, gradient, product, preconditioner)
 
     return curved
 
@@ -145,12 +165,11 @@ def step(
 
     A finished lane stands still.
     """
-    here, gradient, product = curved(state.point)
-    dampings = state.numbers.damping * jnp.asarray(config.trial_dampings, gradient.dtype)
-    steps, decrease = damped_steps(gradient, product, dampings, config)
+    here = curved(state.point)
+    steps, decrease = damped_steps(here, state.numbers.damping, config)
     trials = jax.vmap(lambda step: objective(state.point + step))(steps)
     numbers, chosen, is_better, going = _chosen(
-        config, state.numbers, here, dampings, trials, decrease
+        config, state.numbers, here.evaluation, trials, decrease
     )
     move = jnp.matmul(chosen, steps, precision=_HIGHEST)
     point = state.point + jnp.where(going, move, 0.0)
@@ -161,28 +180,33 @@ def step(
     )
 
 
-def damped_steps(
-    gradient: Array, product: Callable[[Array], Array], dampings: Array, config: NewtonConfig
-) -> tuple[Array, Array]:
-    """Newton steps within the subspace, of every damping.
+def damped_steps(here: Curvature, damping: Array, config: NewtonConfig) -> tuple[Array, Array]:
+    """Newton steps within the subspace, a step for each trial damping.
 
     Args:
-        gradient: (n,).
-        product: of the Hessian with a direction.
-        dampings: (k,), added to the Hessian's diagonal.
-        config: sizes and switches, static.
+        here: gradient, products and preconditioner; n unknowns.
+        damping: (), the lane's own, > 0: added to the Hessian's diagonal.
+        config: sizes and switches, static; k trial dampings.
 
     Returns:
         steps: (k, n), none longer than the step cap.
-        decrease: (), of the cost that the step without damping promises.
+        decrease: (), of the cost that the step without trial damping promises.
     """
-    size = jnp.sqrt(jnp.sum(gradient**2))
-    vectors, diagonal, beside = _lanczos(gradient, size, product, config.subspace)
-    lowest = _least_eigenvalue(diagonal, beside)
-    shift = jnp.maximum(-lowest, 0.0)
-    solve = lambda damping: _tridiagonal_solve(diagonal, beside, shift + damping)  # noqa: E731
-    inside = size * jax.vmap(solve)(dampings)  # (k, m)
-    steps = -jnp.matmul(inside, vectors, precision=_HIGHEST)
+    gradient = here.gradient
+    solve_about = here.preconditioner(damping)
+    turned = solve_about(gradient)
+    size = jnp.sqrt(jnp.maximum(jnp.sum(gradient * turned), 0.0))
+
+    def image(direction: Array) -> tuple[Array, Array]:
+        product = here.product(direction) + damping * direction
+        return product, solve_about(product)
+
+    directions, diagonal, beside = _lanczos(gradient, turned, size, image, config.subspace)
+    shift = jnp.maximum(-_lowest(diagonal, beside), 0.0)
+    solve = lambda trial: _tridiagonal_solve(diagonal, beside, shift + trial)  # noqa: E731
+    trials = jnp.asarray(config.trial_dampings, gradient.dtype)
+    inside = size * jax.vmap(solve)(trials)  # (k, m)
+    steps = -jnp.matmul(inside, directions, precision=_HIGHEST)
     lengths = jnp.sqrt(jnp.sum(steps**2, axis=1, keepdims=True))
     steps = steps * jnp.minimum(1.0, config.step_cap / jnp.maximum(lengths, 1e-20))
     promised = 0.5 * size**2 * solve(jnp.zeros_like(size))[0]
@@ -190,31 +214,43 @@ def damped_steps(
 
 
 def _lanczos(
-    gradient: Array, size: Array, product: Callable[[Array], Array], num: int
+    gradient: Array, turned: Array, size: Array, image: Callable, num: int
 ) -> tuple[Array, list[Array], list[Array]]:
-    """Orthonormal vectors (m, n) of the subspace, and the Hessian there.
+    """Directions (m, n) of the subspace, and the damped Hessian there.
 
-    Returns its diagonal, m numbers, and what stands beside it, m - 1 numbers.
+    They are orthonormal by the preconditioner's curvature M. Returns the Hessian's diagonal, m
+    numbers, and what stands beside it, m - 1 numbers.
+
+    Args:
+        gradient: (n,).
+        turned: (n,), M^-1 gradient.
+        size: (), sqrt(gradient . turned).
+        image: Hessian's product with a direction (n,), and M^-1 of that.
+        num: m.
     """
     num = min(num, gradient.size)
-    first = gradient / jnp.maximum(size, 1e-30)
-    vectors = jnp.zeros((num, gradient.size), gradient.dtype).at[0].set(first)
-    vector, diagonal, beside = first, [], []
+    scale = 1.0 / jnp.maximum(size, 1e-30)
+    # Rows M d beside rows d, of each direction d.
+    images = jnp.zeros((num, gradient.size), gradient.dtype).at[0].set(gradient * scale)
+    directions = jnp.zeros_like(images).at[0].set(turned * scale)
+    diagonal, beside = [], []
     for k in range(num):
-        image = product(vector)
-        diagonal.append(jnp.sum(vector * image))
+        product, turned = image(directions[k])
+        diagonal.append(jnp.sum(directions[k] * product))
         if k + 1 == num:
             break
         # Against all that went before, since rounding would bring them back.
-        shares = jnp.matmul(vectors, image, precision=_HIGHEST)
-        image = image - jnp.matmul(shares, vectors, precision=_HIGHEST)
-        length = jnp.sqrt(jnp.sum(image**2))
+        shares = jnp.matmul(directions, product, precision=_HIGHEST)
+        product = product - jnp.matmul(shares, images, precision=_HIGHEST)
+        turned = turned - jnp.matmul(shares, directions, precision=_HIGHEST)
+        length = jnp.sqrt(jnp.maximum(jnp.sum(product * turned), 0.0))
         # An invariant subspace ends here: what follows is a vector of zeros.
-        is_new = length > 1e-6 * jnp.abs(diagonal[-1])
-        vector = jnp.where(is_new, image / jnp.where(is_new, length, 1.0), 0.0)
+        is_new = length > 1e-5 * jnp.abs(diagonal[-1])
+        scale = jnp.where(is_new, 1.0 / jnp.where(is_new, length, 1.0), 0.0)
         beside.append(jnp.where(is_new, length, 0.0))
-        vectors = vectors.at[k + 1].set(vector)
-    return vectors, diagonal, beside
+        images = images.at[k + 1].set(scale * product)
+        directions = directions.at[k + 1].set(scale * turned)
+    return directions, diagonal, beside
 
 
 def _pivots(diagonal: list[Array], beside: list[Array], shift: Array) -> list[Array]:
@@ -230,8 +266,11 @@ def _pivots(diagonal: list[Array], beside: list[Array], shift: Array) -> list[Ar
     return found
 
 
-def _least_eigenvalue(diagonal: list[Array], beside: list[Array]) -> Array:
-    """Of the tridiagonal matrix, from below, by the signs of pivots (Sturm)."""
+def _lowest(diagonal: list[Array], beside: list[Array]) -> Array:
+    """Least eigenvalue of the tridiagonal matrix, from below; 0 if none is negative.
+
+    By halving an interval, by the signs of pivots (Sturm).
+    """
     around = [*(jnp.abs(each) for each in beside)]
     zero = jnp.zeros_like(diagonal[0])
     reach = [
@@ -241,14 +280,18 @@ def _least_eigenvalue(diagonal: list[Array], beside: list[Array]) -> Array:
     low = functools.reduce(jnp.minimum, [d - r for d, r in zip(diagonal, reach, strict=True)])
     high = functools.reduce(jnp.minimum, diagonal)
 
+    def any_below(value: Array) -> Array:
+        pivots = _pivots(diagonal, beside, -value)
+        return functools.reduce(jnp.logical_or, [pivot < 0.0 for pivot in pivots])
+
     def halve(_: int, ends: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = ends
         middle = 0.5 * (low + high)
-        pivots = _pivots(diagonal, beside, -middle)
-        is_below = functools.reduce(jnp.logical_or, [pivot < 0.0 for pivot in pivots])
+        is_below = any_below(middle)
         return jnp.where(is_below, low, middle), jnp.where(is_below, middle, high)
 
-    return lax.fori_loop(0, _HALVINGS, halve, (low, high))[0]
+    lowest = lax.fori_loop(0, _HALVINGS, halve, (low, high))[0]
+    return jnp.where(any_below(zero), lowest, 0.0)
 
 
 def _tridiagonal_solve(diagonal: list[Array], beside: list[Array], shift: Array) -> Array:
@@ -267,7 +310,6 @@ def _chosen(
     config: NewtonConfig,
     numbers: NewtonNumbers,
     here: Evaluation,
-    dampings: Array,
     trials: Evaluation,
     decrease: Array,
 ) -> tuple[NewtonNumbers, Array, Array, Array]:
@@ -282,12 +324,11 @@ def _chosen(
     there = jax.tree.map(lambda new, old: jnp.where(decreased, of_chosen(new), old), trials, here)
     best = jax.tree.map(lambda a, b: jnp.where(numbers.iteration == 0, a, b), here, numbers.best)
     is_better = better(there, best)
-    damping = jnp.where(
-        decreased, of_chosen(dampings) * config.ease, numbers.damping * config.tighten
-    )
+    factors = jnp.maximum(jnp.asarray(config.trial_dampings, costs.dtype), config.ease)
+    damping = numbers.damping * jnp.where(decreased, of_chosen(factors), config.tighten)
     after = NewtonNumbers(
         best=jax.tree.map(lambda a, b: jnp.where(is_better, a, b), there, best),
-        damping=jnp.clip(damping, 1e-8, 1e8),
+        damping=jnp.clip(damping, 1e-10, 1e4),
         expected=decrease / jnp.maximum(jnp.abs(here.cost), 1e-30),
         iteration=numbers.iteration + 1,
         stalled=jnp.where(decreased, 0, numbers.stalled + 1),

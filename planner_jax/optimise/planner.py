@@ -13,8 +13,8 @@ from planner_jax.optimise.multistart import solve_batch, solve_round
 from planner_jax.optimise.newton import Curvature, NewtonConfig, by_products
 from planner_jax.optimise.problem import Round, Settings, Stage
 
-# From points near their optima, where most lanes are after a few iterations.
-_POLISH = NewtonConfig(max_steps=4, tolerance=1e-7, patience=4, stragglers=((0.25, 40),))
+# From where the first search ends; the lanes that have most to gain go on.
+_POLISH = NewtonConfig(max_steps=6, tolerance=1e-7, patience=6, stragglers=((0.4, 6), (0.1, 30)))
 _LONG = LbfgsConfig(max_steps=300, tolerance=1e-7, patience=6)
 # Of the first round, by effort.
 _GOOD = LbfgsConfig(max_steps=200, tolerance=1e-6, patience=5)
@@ -59,7 +59,8 @@ class OptimisedPlanner(abc.ABC):
     def curved(self, point: Array, context: Any) -> Curvature:
         """Evaluation at a point (n,), gradient (n,), and products with the Hessian.
 
-        What Newton's method takes. By default each product is a derivative of the gradient.
+        What Newton's method takes. By default each product is a derivative of the gradient, and
+        nothing is known for a preconditioner.
         """
         return by_products(lambda x: self.objective(x, context))(point)
 

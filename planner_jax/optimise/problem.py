@@ -55,7 +55,7 @@ class Problem(Protocol):
         ...
 
     def curved(self, point: Array, context: Any) -> Curvature:
-        """Evaluation at a point (n,), gradient, and the Hessian's products, for Newton's method."""
+        """Evaluation, gradient and second derivatives at a point (n,), for Newton's method."""
         ...
 
     def decode(self, point: Array, context: Any) -> Any:

@@ -24,9 +24,9 @@ from flax import struct
 from jax import Array
 
 from planner_jax.checks import numeric, require_size, told
-from planner_jax.lanes import with_kernel
-from planner_jax.optimise.inverse_kernel import inverse_kernel
+from planner_jax.optimise.newton import Curvature
 from planner_jax.optimise.planner import OptimisedPlanner, pending
+from planner_jax.optimise.preconditioner import block_preconditioner, positive_inverse
 from planner_jax.optimise.problem import Problem, Round, Settings
 from planner_jax.protocol import Plan
 
@@ -34,6 +34,8 @@ Quantity = str | Callable[[Any], Array]
 _CURVATURES = ("products", "core", "whole")
 # Of the conjugate gradients by default: unknowns are some 40, and scaled.
 _STEPS = {"products": 40, "core": 1, "whole": 1}
+_DAMPING = 1e-9  # of the preconditioner for products: about none
+_SMALL = 1e-11  # square of the residual that is none, beside that of the right side
 
 
 @runtime_checkable
@@ -136,6 +138,10 @@ class Differentiated(OptimisedPlanner):
         """That of the planner."""
         return self.planner.objective(point, context.inner)
 
+    def curved(self, point: Array, context: _Context) -> Curvature:
+        """That of the planner."""
+        return self.planner.curved(point, context.inner)
+
     def rules_out(self, context: _Context) -> Array:
         """As the planner does."""
         return self.planner.rules_out(context.inner)
@@ -236,8 +242,7 @@ def gradient_at(
     else:
         solve = _core_inverse(planner, point, context)
     if steps and curvature == "products":
-        _, _, product = planner.curved(point, context)
-        adjoint, residual = _adjoint_by(product, along_point, steps)
+        adjoint, residual = _adjoint_by(planner.curved(point, context), along_point, steps)
         _, mixed = products(adjoint)
         by_context = [b - m for b, m in zip(by_context, mixed, strict=True)]
     else:
@@ -253,29 +258,36 @@ def gradient_at(
     return Gradient(value=value, by=by_parts, residual=residual)
 
 
-def _adjoint_by(product: Callable, rhs: Array, steps: int) -> tuple[Array, Array]:
+def _adjoint_by(here: Curvature, rhs: Array, steps: int) -> tuple[Array, Array]:
     """Lambda with cost_uu lambda = rhs by conjugate gradients, and the relative residual.
 
     The residual is not finite where the cost does not curve upward to begin with.
     """
+    solve = here.preconditioner(jnp.asarray(_DAMPING, rhs.dtype))
 
-    def step(k: Array, state: tuple) -> tuple:
-        found, left, direction, size, defined = state
-        image = product(direction)
+    def going(state: tuple) -> Array:
+        num, _, _, _, size, curved = state
+        return (num < steps) & (size > _SMALL * first) & curved
+
+    def step(state: tuple) -> tuple:
+        num, found, left, direction, size, _ = state
+        image = here.product(direction)
         curvature = jnp.sum(direction * image)
-        defined = jnp.where(k == 0, (curvature > 0.0) | (size == 0.0), defined)
-        going = (curvature > 0.0) & (size > 1e-12 * first)
-        length = jnp.where(going, size / jnp.where(going, curvature, 1.0), 0.0)
+        curved = curvature > 0.0
+        length = jnp.where(curved, size / jnp.where(curved, curvature, 1.0), 0.0)
         found, left = found + length * direction, left - length * image
-        after = jnp.sum(left**2)
-        direction = jnp.where(going, left + after / jnp.where(going, size, 1.0) * direction, 0.0)
-        return found, left, direction, jnp.where(going, after, size), defined
+        turned = solve(left)
+        after = jnp.sum(left * turned)
+        direction = turned + after / jnp.where(size > 0.0, size, 1.0) * direction
+        return num + 1, found, left, direction, jnp.where(curved, after, size), curved
 
-    first = jnp.sum(rhs**2)
-    start = jnp.zeros_like(rhs), rhs, rhs, first, jnp.ones((), bool)
-    found, _, _, size, defined = jax.lax.fori_loop(0, steps, step, start)
+    turned = solve(rhs)
+    first = jnp.sum(rhs * turned)
+    start = 0, jnp.zeros_like(rhs), rhs, turned, first, jnp.ones((), bool)
+    num, found, _, _, size, curved = jax.lax.while_loop(going, step, start)
+    defined = curved | (num > 1)
     ratio = size / jnp.where(first > 0.0, first, 1.0)
-    return found, jnp.where(defined, jnp.sqrt(ratio), jnp.nan)
+    return found, jnp.where(defined, jnp.sqrt(jnp.maximum(ratio, 0.0)), jnp.nan)
 
 
 def _adjoint(
@@ -319,22 +331,7 @@ def _core_inverse(planner: Any, point: Array, context: Any) -> Callable[[Array],
     if not isinstance(planner, CorePlanner):
         return lambda rhs: rhs
     blocks = planner.core_blocks(point.shape[0])
-    inside = np.zeros(point.shape[0], bool)
-    inside[blocks.ravel()] = True
-    within, row_of_others = planner.core_curvature(point, context)
-    largest = jnp.max(jnp.where(inside, 0.0, jnp.abs(row_of_others)))
-    size_of_others = jnp.maximum(jnp.abs(row_of_others), 1e-6 * largest + 1e-20)
-    inverses = [positive_inverse(block) for block in within]
-
-    def solve(rhs: Array) -> Array:
-        entries, found = tuple(rhs), list(rhs / size_of_others)
-        for block, inverse in zip(blocks, inverses, strict=True):
-            solved = jnp.sum(inverse * jnp.stack([entries[j] for j in block]), axis=1)
-            for place, value in zip(block, tuple(solved), strict=True):
-                found[place] = value
-        return jnp.stack(found)
-
-    return solve
+    return block_preconditioner(blocks, *planner.core_curvature(point, context))(jnp.zeros(()))
 
 
 def curvature_by_tangents(
@@ -359,32 +356,6 @@ def curvature_by_tangents(
         for block, matrix in zip(blocks, within, strict=True)
     ]
     return jnp.stack(found), row_of_others
-
-
-def _gauss_jordan(matrix: Array) -> Array:
-    """Inverse of a symmetric matrix (k, k), its pivots made positive.
-
-    Gauss-Jordan in k steps, in place; pivots are not exchanged. Where all of them are positive
-    without help, so is the matrix, and this is its inverse.
-    """
-    size = matrix.shape[0]
-    least = 1e-6 * jnp.abs(jnp.diagonal(matrix)) + 1e-20
-
-    def eliminate(j: Array, m: Array) -> Array:
-        here = jnp.arange(size) == j
-        row = jnp.sum(jnp.where(here[:, None], m, 0.0), axis=0)
-        column = jnp.sum(jnp.where(here, m, 0.0), axis=1)
-        pivot = jnp.maximum(
-            jnp.abs(jnp.sum(jnp.where(here, row, 0.0))), jnp.sum(jnp.where(here, least, 0.0))
-        )
-        scaled = jnp.where(here, 1.0, row) / pivot
-        rest = jnp.where(here, 0.0, m)
-        return jnp.where(here[:, None], scaled, rest - column[:, None] * scaled)
-
-    return jax.lax.fori_loop(0, size, eliminate, matrix)
-
-
-positive_inverse = with_kernel(_gauss_jordan, inverse_kernel())
 
 
 def part_of(tree: Any, name: str) -> Any:

@@ -22,7 +22,9 @@ from planner_jax.lanes import in_one_kernel
 from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.learned_start import StartNetwork, cheaper_start, shipped_network
+from planner_jax.optimise.newton import Curvature
 from planner_jax.optimise.planner import OptimisedPlanner, pending
+from planner_jax.optimise.preconditioner import block_preconditioner
 from planner_jax.optimise.problem import Round
 from planner_jax.optimise.scaling import shipped_scale
 from planner_jax.optimise.sensitivity import curvature_by_tangents
@@ -413,6 +415,12 @@ class ExactCatch(OptimisedPlanner):
         """The variables after the waypoint offsets of every segment, (N, 12)."""
         one = np.arange(self.num_offsets, len(self.scale))
         return np.arange(0, size, len(self.scale))[:, None] + one
+
+    def curved(self, point: Array, context: CatchContext) -> Curvature:
+        """Evaluation, gradient, products by tangents, and the core's curvature to precondition."""
+        blocks = self.core_blocks(point.size)
+        about = block_preconditioner(blocks, *self.core_curvature(point, context))
+        return super().curved(point, context)._replace(preconditioner=about)
 
     def core_curvature(self, point: Array, context: CatchContext) -> tuple[Array, Array]:
         """Hessian of the core in its blocks, (N, 12, 12), and of the offsets, (n,)."""

@@ -35,6 +35,7 @@ from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.learned_start import StartNetwork, cheaper_start, shipped_network
 from planner_jax.optimise.newton import Curvature
 from planner_jax.optimise.planner import OptimisedPlanner, pending
+from planner_jax.optimise.preconditioner import block_preconditioner
 from planner_jax.optimise.problem import Round
 from planner_jax.optimise.scaling import shipped_scale
 from planner_jax.protocol import require_settings
@@ -379,9 +380,26 @@ class ExactHit(OptimisedPlanner):
             outer = outer - power * bend * offsets * move[0]
             return jnp.concatenate([(outer * offset_scale).ravel(), own * own_scale])
 
+        # The second derivatives among the variables of the ends, and of each offset by itself.
+        in_tails = along.columns_columns[:_ORDER, :, :_ORDER]
+        block = dot(dot(tails, in_tails, 2), tails, ((1, 2), (1, 2))) + within
+        beside = dot(tails, along.columns_theta[:_ORDER], 2)
+        is_time = jnp.asarray(np.eye(own_scale.size)[0], point.dtype)
+        block = block + is_time * beside[:, None] + is_time[:, None] * beside
+        block = block + theta_theta * is_time * is_time[:, None]
+        of_columns = jnp.einsum("kaka->ka", along.columns_columns[_ORDER:, :, _ORDER:])
+        offsets_own = jnp.pad(((of_columns + bend) * offset_scale**2).ravel(), (0, own_scale.size))
         violation = jnp.maximum(along.worst, at_impact) + 0.004
-        evaluation = Evaluation(cost=along.penalty + core + energy, violation=violation)
-        return evaluation, jnp.concatenate([by_offsets.ravel(), by_natural * own_scale]), product
+        return Curvature(
+            evaluation=Evaluation(cost=along.penalty + core + energy, violation=violation),
+            gradient=jnp.concatenate([by_offsets.ravel(), by_natural * own_scale]),
+            product=product,
+            preconditioner=block_preconditioner(
+                self.core_blocks(point.size),
+                (block * own_scale * own_scale[:, None])[None],
+                offsets_own,
+            ),
+        )
 
     def _hinges(self, at_impact: Array) -> Array:
         hinges = smoothed_hinge(at_impact + self.margin, self.hinge_width)

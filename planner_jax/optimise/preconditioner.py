@@ -1,0 +1,77 @@
+"""Approximate inverses of Hessians that are strong in a few blocks and on their diagonal."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from planner_jax.lanes import with_kernel
+from planner_jax.optimise.inverse_kernel import inverse_kernel
+
+# Of a damping, the solver of about the damped Hessian's system: (n,) of a right side (n,).
+Preconditioner = Callable[[Array], Callable[[Array], Array]]
+
+
+def block_preconditioner(blocks: np.ndarray, within: Array, others: Array) -> Preconditioner:
+    """One of dense blocks, and a number for each of the other variables.
+
+    Args:
+        blocks: places (K, k) of the variables that couple.
+        within: second derivatives (K, k, k) among them.
+        others: those of each variable by itself, (n,); in the places of the blocks they do not
+            matter.
+
+    Returns:
+        Of a damping (), which is added to the diagonal, the solver. Its matrix is symmetric; where
+        the blocks, damped, are not positive definite, their pivots are made positive.
+    """
+    size, num = others.shape[0], blocks.shape[1]
+    inside = np.zeros(size, bool)
+    inside[blocks.ravel()] = True
+    sizes = jnp.abs(others)
+    largest = jnp.max(jnp.where(inside, 0.0, sizes))
+
+    def damped(damping: Array) -> Callable[[Array], Array]:
+        of_others = jnp.maximum(sizes, 1e-6 * largest + 1e-20) + damping
+        unit = jnp.asarray(np.eye(num), others.dtype)
+        inverses = [positive_inverse(block + damping * unit) for block in within]
+
+        def solve(right: Array) -> Array:
+            entries, found = tuple(right), list(right / of_others)
+            for block, inverse in zip(blocks, inverses, strict=True):
+                solved = jnp.sum(inverse * jnp.stack([entries[j] for j in block]), axis=1)
+                for place, value in zip(block, tuple(solved), strict=True):
+                    found[place] = value
+            return jnp.stack(found)
+
+        return solve
+
+    return damped
+
+
+def _gauss_jordan(matrix: Array) -> Array:
+    """Inverse of a symmetric matrix (k, k), its pivots made positive.
+
+    Gauss-Jordan in k steps, in place; pivots are not exchanged. Where all of them are positive
+    without help, so is the matrix, and this is its inverse.
+    """
+    size = matrix.shape[0]
+    least = 1e-6 * jnp.abs(jnp.diagonal(matrix)) + 1e-20
+
+    def eliminate(j: Array, m: Array) -> Array:
+        here = jnp.arange(size) == j
+        row = jnp.sum(jnp.where(here[:, None], m, 0.0), axis=0)
+        column = jnp.sum(jnp.where(here, m, 0.0), axis=1)
+        pivot = jnp.maximum(
+            jnp.abs(jnp.sum(jnp.where(here, row, 0.0))), jnp.sum(jnp.where(here, least, 0.0))
+        )
+        scaled = jnp.where(here, 1.0, row) / pivot
+        rest = jnp.where(here, 0.0, m)
+        return jnp.where(here[:, None], scaled, rest - column[:, None] * scaled)
+
+    return jax.lax.fori_loop(0, size, eliminate, matrix)
+
+
+positive_inverse = with_kernel(_gauss_jordan, inverse_kernel())
