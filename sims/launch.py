@@ -188,7 +188,8 @@ def require_world(loop: Loop, kind: str, num_balls: int, **planned: Any) -> None
         kind: of the tool.
         num_balls: of a flight.
         planned: (B,) each, what the plans' cases say of `gravity`, `net_height`,
-            `net_radius` or `racket_height`; only those that are given are compared.
+            `net_radius`, `racket_height` or `racket_radius`; only those that are given are
+            compared.
     """
     world, tool = loop.world, loop.world.carrier.tool
     if tool.kind != kind:

@@ -30,6 +30,7 @@ from planner_jax.sweep.columns import RefereedBatch as FlownBatch
 from planner_jax.sweep.environment import environment, require_backend
 from planner_jax.sweep.parquet import read_rows
 from planner_jax.sweep.report import require_counted
+from planner_jax.sweep.robots import robot_remark
 from planner_jax.sweep.run_folder import RunFolder
 from planner_jax.sweep.settings import SettingError, require, settings_of_manifest
 from planner_jax.sweep.source import Chunk
@@ -263,7 +264,10 @@ def write_flight_report(folder: RunFolder) -> None:
     )
     lines = headline(manifest, flight)
     title = f"Flights, {flight.settings.TASK.name}, {flight.suite}"
-    remarks = [f"Everything is simulated in MuJoCo MJX: {flight.simulated}."]
+    remarks = [
+        *robot_remark(manifest["parameters"]),
+        f"Everything is simulated in MuJoCo MJX: {flight.simulated}.",
+    ]
     text = to_markdown(title, lines, table, remarks)
     text += "".join(f"\n{to_markdown(each.title, (), each, ())}" for each in more)
     folder.write_text("table.md", text)
@@ -271,6 +275,7 @@ def write_flight_report(folder: RunFolder) -> None:
     shown = f'<p><img src="{html.escape(video)}" alt="film"></p>\n' if video else ""
     if video and video.endswith(".mp4"):
         shown = f'<p><video controls src="{html.escape(video)}"></video></p>\n'
+    notes = "".join(f"<li>{html.escape(line)}</li>\n" for line in remarks)
     record = html.escape(json.dumps(manifest, indent=2))
     folder.write_text(
         "index.html",
@@ -278,6 +283,7 @@ def write_flight_report(folder: RunFolder) -> None:
         f"<title>{html.escape(title)}</title></head>\n<body>\n<h1>{html.escape(title)}</h1>\n"
         f"{lead}{shown}{''.join(_image(name) for name in figures)}{to_html(table)}"
         f"{''.join(f'<h2>{html.escape(each.title)}</h2>{chr(10)}{to_html(each)}' for each in more)}"
+        f"<ul>\n{notes}</ul>\n"
         f'<p>All rows: <a href="plans.parquet">plans.parquet</a>. The first '
         f"{len(recording)} flights look by look: "
         f'<a href="{FILE}">{FILE}</a>; play them with <code>planner-jax view</code>.</p>\n'

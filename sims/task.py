@@ -183,10 +183,10 @@ class BallFlightTask(FlightTask):
     @property
     def simulated(self) -> str:
         """Robot, motion capture and balls."""
-        return (
-            f"{self.world().robot.WORDS}, motion capture with noise, dropout and latency, balls "
-            "with quadratic drag"
-        )
+        exact = NOISES[self.settings.noise] == NOISES["none"]
+        seen = "without errors or latency" if exact else "with noise, dropout and latency"
+        robot = self.world().robot.WORDS
+        return f"{robot}, motion capture {seen}, balls with quadratic drag"
 
     def parameters(self) -> dict[str, Any]:
         """Those of the closed loop."""

@@ -71,7 +71,7 @@ ALLOWED = {
     },
     "sweep": {
         *("ball", "compile_cache", "digits", "ending", "lanes", "memory", "perception", "plane"),
-        *("planning", "protocol", "registry", "robot", "rules", "stopping", "task"),
+        *("planning", "protocol", "referee", "registry", "robot", "rules", "stopping", "task"),
         *("plain_files", "trajectory", "whole_files"),
     },
     "compile_cache": set(),

@@ -100,6 +100,9 @@ def test_keywords_go_before_the_file():
     robot = pj.read_robot(MINE, mass="900 g", tool=TOOL, rotors={"lag": "20 ms"})
     assert (robot.mass, robot.tool, robot.rotors.lag) == (0.9, TOOL, 0.02)
     assert robot.rotors.max_thrust == 4.5
+    assert pj.read_robot(MINE, inertia=(0.003, 0.003, 0.005)) == pj.read_robot(MINE)
+    with pytest.raises(RobotError, match="my_quadrotor.yaml: inertia must have its unit, one of "):
+        pj.read_robot(MINE, inertia="3 3 5")
 
 
 @pytest.mark.parametrize("robot", [*MODELS.values(), pj.read_robot(MINE)], ids=lambda r: r.name)
@@ -178,6 +181,19 @@ def changed(**fields):
             changed(inertia="1 1 9 g m^2"),
             "inertia must be of a body, none above the other two together, "
             "got (0.001, 0.001, 0.009)",
+        ),
+        *(
+            (
+                changed(inertia=value),
+                "inertia must have its unit, one of kg m^2, kg cm^2, kg mm^2, g m^2, g cm^2, "
+                f"g mm^2, as in '3 3 5 g m^2', got {value!r}",
+            )
+            for value in ("3 3 5", [3, 3, 5], ["3 g m^2", "3 g m^2", 5], 3)
+        ),
+        (
+            changed(inertia="3 3 5 g m"),
+            "inertia must be in kg m^2, kg cm^2, kg mm^2, g m^2, g cm^2, g mm^2, "
+            "got '3 3 5 g m'; did you mean g m^2?",
         ),
         (changed(model="my.urdf"), "model must name an MJCF file, .xml, got 'my.urdf'"),
         ("- 1", "must be fields with values, got [1]"),

@@ -103,6 +103,7 @@ MOON = {"gravity": 1.62}
         (fly_catches, with_tool(CATCH_WORLD, radius=0.1), ("net_radius", 0.125, 0.1)),
         (fly_catches, dataclasses.replace(CATCH_WORLD, **MOON), ("gravity", 9.81, 1.62)),
         (fly_hits, with_tool(HIT_WORLD, height=0.1), ("racket_height", 0.06, 0.1)),
+        (fly_hits, with_tool(HIT_WORLD, radius=0.2), ("racket_radius", 0.11, 0.2)),
         (fly_hits, dataclasses.replace(HIT_WORLD, **MOON), ("gravity", 9.8, 1.62)),
     ],
 )

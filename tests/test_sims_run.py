@@ -8,6 +8,7 @@ import pytest
 from flax import struct
 from matplotlib.figure import Figure
 
+import planner_jax as pj
 from planner_jax.ball.flight import BallState
 from planner_jax.cli import main
 from planner_jax.registry import Task, all_tasks
@@ -20,6 +21,7 @@ from planner_jax.sims.scoring import passage
 from planner_jax.sims.settings import BallFly, CatchFly, HitFly, fly_settings
 from planner_jax.sims.task import BallFlightTask, FlightCases, Flights
 from planner_jax.sims.tasks.catch import CATCH_WORLD
+from planner_jax.sweep.run_folder import RunFolder
 from planner_jax.sweep.settings import SettingError
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 from tests.recordings import recording
@@ -118,6 +120,14 @@ def test_mp4_without_ffmpeg_is_refused(tmp_path, monkeypatch):
         require_film(tmp_path / "flights.mp4")
 
 
+def test_a_run_says_what_it_flies_in_words_of_its_own():
+    exact, noisy = (CatchFly(noise=noise).flight().simulated for noise in ("none", "lab"))
+    assert "motion capture without errors or latency" in exact
+    assert "motion capture with noise, dropout and latency" in noisy
+    suites = [CatchFly(balls=balls).flight().suite for balls in (1, 2)]
+    assert suites == ["1 ball", "2 balls"]
+
+
 @pytest.mark.slow
 def test_a_run_of_flights_is_written_whole(tmp_path, capsys):
     out = tmp_path / "run"
@@ -141,6 +151,15 @@ def test_a_run_of_flights_is_written_whole(tmp_path, capsys):
     assert "100.00 % of 3 flights caught all balls" in capsys.readouterr().out
     assert (out / "figures" / "flight.png").exists() and (out / "table.md").exists()
     assert (out / "index.html").read_text() == page
+    assert "Everything is simulated in MuJoCo MJX" in page and "Robot: " not in page
+    manifest = RunFolder(out).read_manifest()
+    manifest["parameters"]["robot"] = dataclasses.asdict(pj.robot_named("racer-net"))
+    RunFolder(out).write_manifest(manifest)
+    assert main(["report", str(out)]) == 0
+    capsys.readouterr()
+    assert all(
+        "Robot: racer-net" in (out / name).read_text() for name in ("index.html", "table.md")
+    )
     (out / "flights.parquet").unlink()
     assert main(["report", str(out)]) == 2
     assert "RUN must be finished, with its flights.parquet" in capsys.readouterr().err

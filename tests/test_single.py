@@ -1,6 +1,7 @@
 """One case in a few numbers: the command `plan`, its words, its table, its files and refusals."""
 
 import csv
+import dataclasses
 
 import numpy as np
 import pytest
@@ -67,6 +68,23 @@ def test_the_table_agrees_with_the_referee_and_says_when(which, request):
         assert found[name].reached == pytest.approx(float(value), rel=1e-3, abs=1e-3)
         assert 0.0 <= found[name].time <= end + 1e-6
     assert answer.success and all(0.0 <= margin.share <= 1.001 for margin in found.values())
+
+
+def test_rotors_with_limits_have_two_lines_and_others_none(hit):
+    single, answer = hit
+    assert not any("rotor" in margin.limit for margin in single.margins(answer))
+    given = single.settings
+    robot = pj.robot_named("x500")
+    case = pj.hit.case(given.pos, given.vel, given.target, robot=robot)
+    verdict = pj.hit.judge(case, answer.plan)
+    found = single.margins(dataclasses.replace(answer, case=case, verdict=verdict))
+    least, most = (margin for margin in found if "rotor" in margin.limit)
+    assert (least.allowed, most.allowed) == pytest.approx(robot.rotor_range, rel=1e-6)
+    assert least.reached == pytest.approx(float(verdict.min_rotor_thrust), rel=1e-3)
+    assert most.reached == pytest.approx(float(verdict.max_rotor_thrust), rel=1e-3)
+    end = float(np.sum(answer.plan.whole.durations))
+    assert all(0.0 <= margin.time <= end + 1e-6 for margin in (least, most))
+    assert least.least and not most.least
 
 
 def test_shares_of_bounds_from_either_side():

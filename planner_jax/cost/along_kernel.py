@@ -1,4 +1,4 @@
-"""`integrate_along` and `greatest_along` on many lanes as one kernel for CUDA.
+"""`integrate_along` on many lanes as one kernel for CUDA.
 
 A thread carries a lane. It reads the columns once, makes the samples one after another, each
 from a row of the constant matrices, and adds up penalties and, by the transposed product,
@@ -30,10 +30,10 @@ _ENOUGH = 512  # blocks that keep a large GPU busy
 _AXES = ((2,), (0, 1, 2), (0, 1, 2), (0, 1, 2))  # that a motion has of position to jerk
 _WORST = 1  # place of the greatest excess among the results
 
-# What is made of the samples: each limit's greatest excess; the sum of penalties, and the greatest
-# excess of all; also slopes by columns and durations; also those by the parameters; or the
-# derivative of all of these along a direction.
-MODES = ("greatest", "values", "slopes", "slopes by all", "curvature")
+# What is made of the samples: the sum of penalties, and the greatest excess of all; also slopes by
+# columns and durations; also those by the parameters; or the derivative of all of these along a
+# direction.
+MODES = ("values", "slopes", "slopes by all", "curvature")
 
 
 def along_kernel(along: "Along", mode: str, *, interpret: bool = False) -> Callable:
@@ -73,7 +73,7 @@ def along_kernel(along: "Along", mode: str, *, interpret: bool = False) -> Calla
         sizes = _Sizes(math.prod(lead), num_columns, lanes, threads)
         shares = _call(along, mode, interpret, treedef, sizes)(*jax.tree.leaves(args))
         results = [
-            jnp.max(share, axis=0) if mode == "greatest" or k == _WORST else jnp.sum(share, axis=0)
+            jnp.max(share, axis=0) if k == _WORST else jnp.sum(share, axis=0)
             for k, share in enumerate(shares)
         ]
         return [result.reshape(*lead, *result.shape[1:]) for result in results]
@@ -101,9 +101,8 @@ def _call(
     blocks = sizes.lanes // sizes.threads
     shares = min(max(_ENOUGH // (sizes.trajectories * blocks), 1), 8)
     share = -(-num_samples // shares)
-    shapes = _result_shapes(along, mode, treedef, num_columns)
-    num_greatest = len(shapes) if mode == "greatest" else 1
-    num_sums = sum(map(math.prod, shapes)) - num_greatest
+    shapes = _result_shapes(mode, treedef, num_columns)
+    num_sums = sum(map(math.prod, shapes)) - 1  # all but the greatest excess
 
     def body(*refs):
         leaves = [_loaded(ref) for ref in refs[: treedef.num_leaves]]
@@ -116,17 +115,17 @@ def _call(
                 [matrices_ref[k, d * num_columns + c] for c in range(num_columns)] for d in range(4)
             ]
             most, sums = carry
-            greatest, terms = _of_sample(along, mode, _Sample(row, weights_ref[k]), args)
-            most = list(map(jnp.maximum, most, greatest)) if greatest else most
+            worst, terms = _of_sample(along, mode, _Sample(row, weights_ref[k]), args)
+            most = most if worst is None else jnp.maximum(most, worst)
             return most, list(map(jnp.add, sums, jax.tree.leaves(terms)))
 
         zero = jnp.zeros_like(duration)
-        worst = zero if mode == "curvature" else jnp.full_like(duration, -jnp.inf)
+        least = zero if mode == "curvature" else jnp.full_like(duration, -jnp.inf)
         first = place_in_grid(2) * share
         last = jnp.minimum(first + share, num_samples)
-        start = [worst] * num_greatest, [zero] * num_sums
+        start = least, [zero] * num_sums
         most, sums = jax.lax.fori_loop(first, last, add_sample, start)
-        _store(out, [*sums[:_WORST], *most, *sums[_WORST:]])
+        _store(out, [*sums[:_WORST], most, *sums[_WORST:]])
 
     def whole(*shape: int) -> Block:
         return shape, lambda *_: (0,) * len(shape)
@@ -162,12 +161,8 @@ def _call(
     return call
 
 
-def _result_shapes(
-    along: "Along", mode: str, treedef: Any, num_columns: int
-) -> list[tuple[int, ...]]:
+def _result_shapes(mode: str, treedef: Any, num_columns: int) -> list[tuple[int, ...]]:
     """Shapes of the results for one trajectory of one lane."""
-    if mode == "greatest":
-        return [()] * len(along.margins)
     shapes: list[tuple[int, ...]] = [(), ()]
     if mode != "values":
         shapes += [(num_columns, 3), ()]
@@ -233,20 +228,18 @@ def _total(terms: Iterable) -> Any:
     return functools.reduce(operator.add, terms)
 
 
-def _of_sample(along: "Along", mode: str, sample: _Sample, args: Any) -> tuple[list, tuple]:
+def _of_sample(along: "Along", mode: str, sample: _Sample, args: Any) -> tuple[Any, tuple]:
     """What one sample gives in a mode.
 
     Returns:
-        greatest: excesses, the greatest of which over the samples are results.
+        worst: excess, the greatest of which over the samples is a result; None of a curvature.
         terms: of the sums over the samples, in the order of the results.
     """
     (columns, duration, given), direction = args if mode == "curvature" else (args, ())
     free = sample.unit_motion(columns), duration
-    if mode == "greatest":
-        return list(_excess(along, *free, given)), ()
     if mode == "values":
         value, worst = _penalty(along, *free, given)
-        return [worst], (sample.weight * value,)
+        return worst, (sample.weight * value,)
     if mode == "slopes":
         worst, terms = _slopes(along, sample.weight, free, (given,))
     elif mode == "slopes by all":
@@ -254,8 +247,7 @@ def _of_sample(along: "Along", mode: str, sample: _Sample, args: Any) -> tuple[l
     else:
         worst, terms = None, _curvature(along, sample, free, given, direction)
     value, by_motion, *others = terms
-    terms = value, sample.slope_by_columns(by_motion), *others
-    return [] if worst is None else [worst], terms
+    return worst, (value, sample.slope_by_columns(by_motion), *others)
 
 
 def _excess(along: "Along", unit: list, duration: Array, given: Any) -> tuple[Array, ...]:

@@ -7,7 +7,8 @@
     tool: {kind: racket, height: 6 cm, radius: 11 cm}
     limits: {speed: 5 m/s, body_rate: 344 deg/s, thrust: 0.2 to 1.9 g}
 
-A number without a unit is in SI units; "g" is the standard gravity where an acceleration stands.
+A number without a unit is in SI units; an inertia alone has to have one, as 3 is too easily meant
+in g m^2. "g" is the standard gravity where an acceleration stands.
 `model: mine.xml` takes body and rotors from MJCF; what the YAML says then goes before. Nothing here
 imports JAX.
 """
@@ -30,7 +31,7 @@ from planner_jax.robot.quadrotor_model import (
     Tool,
     cross,
 )
-from planner_jax.robot.quantities import UNITS, QuantityError, numbers_in, suggestion
+from planner_jax.robot.quantities import UNITS, QuantityError, has_unit, numbers_in, suggestion
 
 ENDINGS = (".yaml", ".yml", ".xml")
 _LARGEST = 1 << 20  # bytes of a file
@@ -48,6 +49,7 @@ class _Quantity(NamedTuple):
     count: int = 1
     span: bool = False  # "to" stands between its two numbers
     optional: bool = False  # may be null, which is no limit
+    example: str = ""  # of what has to be written with its unit; else SI is meant without one
 
 
 _LENGTH = _Quantity("length")
@@ -57,7 +59,7 @@ _FIELDS: dict[str, dict[str, _Quantity | None]] = {
         "name": None,
         "source": None,
         "mass": _Quantity("mass"),
-        "inertia": _Quantity("inertia", 3),
+        "inertia": _Quantity("inertia", 3, example="3 3 5 g m^2"),
     },
     "rotors": {
         "diagonal": _LENGTH,
@@ -93,7 +95,8 @@ def read_robot(path: str | os.PathLike, **given: Any) -> QuadrotorModel:
         path: of YAML (.yaml, .yml), or of MJCF (.xml) for MuJoCo, which is read with the extra
             `sims`. MJCF says nothing of tool and limits.
         **given: what is to be had in the place of the file's: `name`, `mass`, `inertia`, `rotors`,
-            `tool`, `limits` and `source`, as the YAML has them or as objects, such as a `Tool`.
+            `tool`, `limits` and `source`, as the YAML has them, as numbers in SI units, or as
+            objects, such as a `Tool`.
 
     Raises:
         RobotError: the file or a field breaks a rule; one line.
@@ -102,6 +105,7 @@ def read_robot(path: str | os.PathLike, **given: Any) -> QuadrotorModel:
     """
     place = os.fspath(path)
     described = _described(Path(place))
+    _require_units({k: v for k, v in given.items() if isinstance(v, str)}, place)
     for name, value in given.items():
         part = isinstance(value, tuple(_PARTS.values()))
         described = _merged(described, {name: dataclasses.asdict(value) if part else value})
@@ -197,12 +201,24 @@ def _described(path: Path) -> dict[str, Any]:
         raise RobotError(f"{path}: must be YAML, got {str(error)[:60]}") from None
     if not isinstance(found, dict) or not all(isinstance(name, str) for name in found):
         raise RobotError(f"{path}: must be fields with values, got {found!r:.60}")
+    _require_units(found, str(path))
     model = found.pop("model", None)
     if model is None:
         return found
     if not isinstance(model, str) or not model.lower().endswith(".xml"):
         raise RobotError(f"{path}: model must name an MJCF file, .xml, got {model!r:.60}")
     return _merged(_described(path.parent / model), found)
+
+
+def _require_units(described: Mapping[str, Any], place: str) -> None:
+    """Raise `RobotError` where numbers stand alone that have to be written with their unit."""
+    for name, quantity in _FIELDS[""].items():
+        if quantity is None or not quantity.example or name not in described:
+            continue
+        if not has_unit(value := described[name]):
+            units = ", ".join(UNITS[quantity.kind])
+            rule = f"must have its unit, one of {units}, as in {quantity.example!r}"
+            raise RobotError(f"{place}: {name} {rule}, got {value!r:.60}")
 
 
 def _merged(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:

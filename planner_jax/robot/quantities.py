@@ -61,6 +61,16 @@ def numbers_in(value: Any, kind: str, count: int, *, span: bool = False) -> tupl
     return found
 
 
+def has_unit(value: Any) -> bool:
+    """Whether every number of a value as `numbers_in` takes it has a unit, known or not."""
+    if isinstance(value, list | tuple):
+        return all(map(has_unit, value))
+    if isinstance(value, str):
+        written = _WRITTEN.fullmatch(value)
+        return written is None or bool(written[2])
+    return not isinstance(value, int | float)
+
+
 def _numbers(part: Any, kind: str, span: bool) -> list[float]:
     rule = f"must be in {_units(kind)}"
     if isinstance(part, int | float) and not isinstance(part, bool):

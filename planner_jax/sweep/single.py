@@ -11,6 +11,7 @@ import numpy as np
 
 from planner_jax.planning.plan import plan
 from planner_jax.protocol import Status
+from planner_jax.referee.rotors import rotor_thrusts
 from planner_jax.registry import Task
 from planner_jax.rules import CaseError
 from planner_jax.sweep.sampled_motion import SampledMotion, body_rate, net_thrust, sample_motion
@@ -120,24 +121,38 @@ class Single(abc.ABC):
 
     def margins(self, answer: Answer) -> list[Margin]:
         """How close the plan comes to each limit that the case has."""
-        return [*_of_flight(answer, sampled(answer.plan)), *self.own_margins(answer)]
+        of_flight = _of_flight(answer, sampled(answer.plan))
+        return [*of_flight, *_of_rotors(answer), *self.own_margins(answer)]
 
 
 def sampled(found: Any) -> SampledMotion:
     """One plan of a quadrotor with its way to rest, if it has one, at even times."""
+    coeffs, durations = _pieces(found)
+    return sample_motion(coeffs.ravel(), durations, _SAMPLES)
+
+
+def _pieces(found: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Coefficients (M, D + 1, 3) and durations (M,) [s] of all that one plan flies."""
     path = found.whole
-    coeffs, durations = np.asarray(path.coeffs), np.asarray(path.durations)
+    coeffs, durations = (np.asarray(each, float) for each in (path.coeffs, path.durations))
     there = durations > 0.0
-    return sample_motion(coeffs[there].ravel(), durations[there], _SAMPLES)
+    return coeffs[there], durations[there]
+
+
+def _closest(
+    words: str, times: np.ndarray, values: np.ndarray, allowed: Any, *, least: bool = False
+) -> Margin:
+    """The margin at that of the times at which a plan is closest to a limit, or beyond it most."""
+    values = np.nan_to_num(values, nan=-np.inf if least else np.inf)  # no attitude: no limit kept
+    at = int(np.argmin(values) if least else np.argmax(values))
+    return Margin(words, float(values[at]), float(allowed), float(times[at]), least)
 
 
 def _of_flight(answer: Answer, motion: SampledMotion) -> list[Margin]:
     limits, gravity = answer.case.limits, float(answer.case.gravity)
 
     def closest(words: str, values: np.ndarray, allowed: Any, *, least: bool = False) -> Margin:
-        values = np.nan_to_num(values, nan=np.inf)  # without an attitude no limit is kept
-        at = int(np.argmin(values) if least else np.argmax(values))
-        return Margin(words, float(values[at]), float(allowed), float(motion.time[at]), least)
+        return _closest(words, motion.time, values, allowed, least=least)
 
     found = [
         closest(f"{name.replace('_', ' ')} [{unit}]", size(motion, gravity), getattr(limits, name))
@@ -150,6 +165,26 @@ def _of_flight(answer: Answer, motion: SampledMotion) -> list[Margin]:
         found.append(closest("thrust, greatest [m/s^2]", thrust, limits.max_thrust))
     height = closest("height, least [m]", motion.pos[:, 2], limits.min_height, least=True)
     return [*found, height]
+
+
+def _of_rotors(answer: Answer) -> list[Margin]:
+    """Of the rotor that is closest to its least thrust, and of that closest to its greatest."""
+    rotors = answer.case.limits.rotors
+    if rotors is None:
+        return []
+    coeffs, durations = _pieces(answer.plan)
+    starts = np.concatenate([[0.0], np.cumsum(durations)[:-1]])
+    times = durations[:, None] * np.linspace(0.0, 1.0, _SAMPLES // len(durations))
+    body = (np.asarray(each, float)[None] for each in (rotors.mass, rotors.inertia, rotors.mixer))
+    gravity = np.asarray(answer.case.gravity, float)[None]
+    with np.errstate(all="ignore"):
+        thrusts = rotor_thrusts(np.moveaxis(coeffs, -1, 0)[:, None], times[None], gravity, *body)[0]
+    at = (starts[:, None] + times).ravel()
+    low, high = thrusts.min(axis=-1).ravel(), thrusts.max(axis=-1).ravel()
+    return [
+        _closest("rotor thrust, least [N]", at, low, rotors.min_thrust, least=True),
+        _closest("rotor thrust, greatest [N]", at, high, rotors.max_thrust),
+    ]
 
 
 def _table(margins: Sequence[Margin]) -> list[str]:

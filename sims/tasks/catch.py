@@ -546,4 +546,4 @@ class CatchFlight(BallFlightTask):
     @property
     def suite(self) -> str:
         """How many balls are thrown."""
-        return f"{self.settings.balls} ball(s)"
+        return "1 ball" if self.settings.balls == 1 else f"{self.settings.balls} balls"

@@ -221,7 +221,9 @@ def fly_hits(
     """
     planner, pilot = planner or smooth_planner(), pilot or HitPilot()
     truth = cases.cases
-    require_world(loop, "racket", 1, gravity=truth.gravity, racket_height=truth.racket_height)
+    sizes = {name: getattr(truth, name) for name in ("gravity", "racket_height", "racket_radius")}
+    known = {name: size for name, size in sizes.items() if size is not None}
+    require_world(loop, "racket", 1, **known)
     truth = jax.tree.map(jnp.asarray, truth)
     keys = flight_keys(seed, cases.index)
     drag = truth.drag[:, None]
