@@ -55,7 +55,7 @@ class NewtonConfig:
     subspace: int = 4  # vectors
     damping: float = 1e-4  # at first
     # Tried at once, as multiples of the preconditioner's curvature. The damping is multiplied by
-    # the one that does best, or by `ease` where that is greater, or by `tighten` if none does better.
+    # the one that does best, or by `ease` if that is greater, or by `tighten` if none does better.
     trial_dampings: tuple[float, ...] = (0.0, 0.3, 3.0, 30.0)
     ease: float = 0.03
     tighten: float = 1e3

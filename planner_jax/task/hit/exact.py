@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array, lax
+from jax import Array
 
 from planner_jax.ball.aim import aim_drag_free, aim_with_drag, apex_with_drag
 from planner_jax.ball.flight import (
@@ -25,7 +25,6 @@ from planner_jax.ball.impact import required_impact
 from planner_jax.ball.prediction import LEAST_NODES, target_at
 from planner_jax.checks import require_size
 from planner_jax.cost.along import Along, integrate_along
-from planner_jax.cost.along_curvature import curvature_along
 from planner_jax.cost.contact import apex_excess, hitting_speed_excess
 from planner_jax.cost.penalty import smoothed_hinge
 from planner_jax.cost.quadrotor import Measure, flight_along, greatest_excess, limits_along
@@ -35,7 +34,6 @@ from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.learned_start import StartNetwork, cheaper_start, shipped_network
 from planner_jax.optimise.newton import Curvature
 from planner_jax.optimise.planner import OptimisedPlanner, pending
-from planner_jax.optimise.preconditioner import block_preconditioner
 from planner_jax.optimise.problem import Round
 from planner_jax.optimise.scaling import shipped_scale
 from planner_jax.protocol import require_settings
@@ -44,6 +42,7 @@ from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.context import HitContext, Impact, prepare_hit
 from planner_jax.task.hit.plan import HitPlan, Stroke
 from planner_jax.task.hit.reach import is_too_far
+from planner_jax.task.segments import segments_curvature
 from planner_jax.trajectory.proportional_minco import (
     ProportionalMinco,
     boundary_energy,
@@ -58,6 +57,7 @@ from planner_jax.trajectory.proportional_minco import (
 _ORDER = 4  # minimum snap
 _PROPORTIONS = (0.2, 0.5) + (1.0,) * 10
 _SEEN = (0.5, 0.75, 0.95)  # of the landing time, at which a learned start looks at the ball
+_BETWEEN_NODES = 0.004  # by which peaks between penalty nodes are higher, about
 _DECODE_NODES = 16  # intervals a piece at which a finished plan is looked at
 
 
@@ -305,8 +305,7 @@ class ExactHit(OptimisedPlanner):
             (context.case.gravity, context.case.limits, context.case.extras),
         )
         energy = self.energy_weight * offset_energy(self.maps, offsets, duration)
-        # Peaks between nodes are a little higher than the nodes show.
-        violation = jnp.maximum(worst[0], at_impact) + 0.004
+        violation = jnp.maximum(worst[0], at_impact) + _BETWEEN_NODES
         return Evaluation(cost=penalties[0] + core + energy, violation=violation)
 
     def ends(self, natural: Array, context: HitContext) -> tuple[Array, Array, Array, Array]:
@@ -328,78 +327,29 @@ class ExactHit(OptimisedPlanner):
         return rows, duration, self._hinges(at_impact) + energy, jnp.max(at_impact)
 
     def curved(self, point: Array, context: HitContext) -> Curvature:
-        """Evaluation, gradient, and products with the Hessian, which is made as a whole."""
+        """Evaluation, gradient, and second derivatives, which are made as a whole."""
         offsets, natural = self._split(point)
-        scale = jnp.asarray(self.scale, point.dtype)
-        own_scale, offset_scale = (
-            scale[self.num_offsets :],
-            scale[: self.num_offsets].reshape(-1, 3),
-        )
+
+        def ends(natural: Array) -> tuple[Array, Array, Array, Array]:
+            rows, duration, core, at_impact = self.ends(natural[0], context)
+            return rows[None], duration[None], core, at_impact
+
         rows, duration, core, at_impact = in_one_kernel(ExactHit.ends, self)(natural, context)
-        num_given = _ORDER  # rows of the head state
-        along = curvature_along(
+        found = segments_curvature(
+            self.maps,
             self._along(self.nodes, context.case),
-            jnp.concatenate([rows, offsets]),
-            duration,
+            ends,
+            (rows[None], duration[None], core, at_impact),
+            natural[None],
+            offsets[None],
+            jnp.asarray(self.scale, point.dtype),
             (context.case.gravity, context.case.limits, context.case.extras),
-            num_given,
+            self.energy_weight,
+            jnp.ones(1, bool),
         )
-        by_tail, by_offsets = along.by_columns[:_ORDER], along.by_columns[_ORDER:]
-
-        def pulled(natural: Array) -> tuple[Array, Array]:
-            rows, _, core, _ = self.ends(natural, context)
-            tail = rows[_ORDER:]
-            return jnp.sum(by_tail * tail) + core, tail
-
-        def slope(natural: Array) -> tuple[Array, Array]:
-            return jax.grad(pulled, has_aux=True)(natural)
-
-        unit = jnp.asarray(np.eye(own_scale.size), point.dtype)
-        tangent = lambda unit: jax.jvp(slope, (natural,), (unit,))  # noqa: E731
-        (by_natural, _), (within, tails) = jax.vmap(tangent, out_axes=((None, None), 0))(unit)
-        # (8, 8), (8, 4, 3): Hessian of what is pulled back, and how the rows move.
-        energy = self.energy_weight * offset_energy(self.maps, offsets, duration)
-        power = 2 * _ORDER - 1
-        bend = 2.0 * self.energy_weight * self.maps.offset_energy / duration**power
-        by_offsets = (by_offsets + bend * offsets) * offset_scale
-        by_natural = by_natural.at[0].add(along.by_theta - power * energy)
-        theta_theta = along.theta_theta + power**2 * energy
-
-        dot = functools.partial(jnp.tensordot, precision=lax.Precision.HIGHEST)
-
-        def product(direction: Array) -> Array:
-            step, move = self._split(direction)
-            columns = jnp.concatenate([dot(move, tails, 1), step])
-            image = dot(along.columns_columns, columns, 2)
-            image = image + along.columns_theta * move[0]
-            theta = jnp.sum(along.columns_theta * columns) + theta_theta * move[0]
-            theta = theta - power * bend * jnp.sum(offsets * step)
-            own = dot(tails, image[:_ORDER], 2) + dot(within, move, 1)
-            own = own.at[0].add(theta)
-            outer = image[_ORDER:] + bend * step
-            outer = outer - power * bend * offsets * move[0]
-            return jnp.concatenate([(outer * offset_scale).ravel(), own * own_scale])
-
-        # The second derivatives among the variables of the ends, and of each offset by itself.
-        in_tails = along.columns_columns[:_ORDER, :, :_ORDER]
-        block = dot(dot(tails, in_tails, 2), tails, ((1, 2), (1, 2))) + within
-        beside = dot(tails, along.columns_theta[:_ORDER], 2)
-        is_time = jnp.asarray(np.eye(own_scale.size)[0], point.dtype)
-        block = block + is_time * beside[:, None] + is_time[:, None] * beside
-        block = block + theta_theta * is_time * is_time[:, None]
-        of_columns = jnp.einsum("kaka->ka", along.columns_columns[_ORDER:, :, _ORDER:])
-        offsets_own = jnp.pad(((of_columns + bend) * offset_scale**2).ravel(), (0, own_scale.size))
-        violation = jnp.maximum(along.worst, at_impact) + 0.004
-        return Curvature(
-            evaluation=Evaluation(cost=along.penalty + core + energy, violation=violation),
-            gradient=jnp.concatenate([by_offsets.ravel(), by_natural * own_scale]),
-            product=product,
-            preconditioner=block_preconditioner(
-                self.core_blocks(point.size),
-                (block * own_scale * own_scale[:, None])[None],
-                offsets_own,
-            ),
-        )
+        violation = found.evaluation.violation + _BETWEEN_NODES
+        evaluation = dataclasses.replace(found.evaluation, violation=violation)
+        return found._replace(evaluation=evaluation)
 
     def _hinges(self, at_impact: Array) -> Array:
         hinges = smoothed_hinge(at_impact + self.margin, self.hinge_width)

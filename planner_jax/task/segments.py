@@ -1,0 +1,139 @@
+"""Second derivatives of a minimum-snap trajectory of segments, by its ends and its offsets.
+
+Hits have one segment and catches one for each target. The penalties along the way are known by the
+columns of a segment and its duration (`cost.along_curvature`), and the ends make columns and
+durations from a few variables each: what is known of the one is pulled back to the other.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from planner_jax.cost.along import Along
+from planner_jax.cost.along_curvature import curvature_along
+from planner_jax.optimise.evaluation import Evaluation
+from planner_jax.optimise.newton import Curvature
+from planner_jax.optimise.preconditioner import block_preconditioner
+from planner_jax.trajectory.proportional_minco import ProportionalMinco, offset_energy
+
+# Of the variables of the ends (N, k): boundary rows (N, 2s, 3), mean durations of a piece (N,) [s],
+# the cost of the ends (), and the greatest excess there ().
+Ends = Callable[[Array], tuple[Array, Array, Array, Array]]
+
+
+def segments_curvature(
+    maps: ProportionalMinco,
+    along: Along,
+    ends: Ends,
+    found: tuple[Array, Array, Array, Array],
+    natural: Array,
+    offsets: Array,
+    scale: Array,
+    parameters: Any,
+    energy_weight: float,
+    active: Array,
+) -> Curvature:
+    """Evaluation, gradient and second derivatives of a trajectory's objective at a point.
+
+    The objective is the cost of the ends, and of each segment that counts the energy of its offsets
+    and the integral of its penalties. A point is, segment by segment, the offsets and then the
+    variables of the ends, in units of `scale`.
+
+    Args:
+        maps: constants of a segment; M pieces, s = order.
+        along: penalties along the way.
+        ends: what the variables of the ends make. The first of each segment's is the logarithm of
+            its duration and of nothing else; the head state of the first segment is given.
+        found: what `ends` comes to at `natural`.
+        natural: (N, k) variables of the ends.
+        offsets: (N, M - 1, 3) whitened waypoint offsets.
+        scale: (3 (M - 1) + k,) units of one segment's variables.
+        parameters: that the excess takes.
+        energy_weight: of the energy, in the cost.
+        active: (N,) bool, the segments that count.
+
+    Returns:
+        With the greatest excess, of the ends or of the nodes along the way, as `violation`.
+    """
+    rows, durations, core, excess = found
+    num, order, power = natural.shape[0], maps.order, 2 * maps.order - 1
+    given = order if num == 1 else 0  # rows of a head state that moves by the duration alone
+    columns = jnp.concatenate([rows, offsets], axis=1)
+    one = functools.partial(curvature_along, along, parameters=parameters, given=given)
+    of = jax.vmap(lambda columns, duration: one(columns, duration))(columns, durations)
+    worst = jnp.max(jnp.where(active, of.worst, -jnp.inf))
+
+    def counting(values: Array) -> Array:
+        return jnp.where(active.reshape(-1, *[1] * (values.ndim - 1)), values, 0.0)
+
+    of = jax.tree.map(counting, of)
+    num_rows = rows.shape[1] - given  # that move
+    energies = jax.vmap(functools.partial(offset_energy, maps))(offsets, durations)
+    energies = energy_weight * counting(energies)
+    bend = counting(2.0 * energy_weight * maps.offset_energy / durations**power)[:, None, None]
+    by_rows = of.by_columns[:, :num_rows]
+
+    def pulled(natural: Array) -> tuple[Array, Array]:
+        rows, _, core, _ = ends(natural.reshape(num, -1))
+        moving = rows[:, given:]
+        return jnp.sum(by_rows * moving) + core, moving
+
+    def slope(natural: Array) -> tuple[Array, Array]:
+        return jax.grad(pulled, has_aux=True)(natural)
+
+    unit = jnp.asarray(np.eye(natural.size), natural.dtype)
+    tangent = lambda unit: jax.jvp(slope, (natural.ravel(),), (unit,))  # noqa: E731
+    (by_natural, _), (within, turned) = jax.vmap(tangent, out_axes=((None, None), 0))(unit)
+    # Of what is pulled back: the Hessian (N k, N k), and how rows move, (N k, N, rows, 3).
+    dot = functools.partial(jnp.tensordot, precision=lax.Precision.HIGHEST)
+    einsum = functools.partial(jnp.einsum, precision=lax.Precision.HIGHEST)
+    theta_theta = of.theta_theta + power**2 * energies
+    own_units, offset_units = scale[3 * offsets.shape[1] :], scale[: 3 * offsets.shape[1]]
+
+    def joined(offsets: Array, natural: Array) -> Array:
+        parts = [offsets.reshape(num, -1) * offset_units, natural.reshape(num, -1) * own_units]
+        return jnp.concatenate(parts, axis=1).ravel()
+
+    def product(direction: Array) -> Array:
+        parts = direction.reshape(num, -1) * scale
+        step = parts[:, : offset_units.size].reshape(offsets.shape)
+        move = parts[:, offset_units.size :]
+        longer = move[:, 0, None, None]
+        columns = jnp.concatenate([dot(move.ravel(), turned, 1), step], axis=1)
+        image = einsum("ncafb,nfb->nca", of.columns_columns, columns)
+        image = image + of.columns_theta * longer
+        theta = jnp.sum(of.columns_theta * columns, axis=(1, 2)) + theta_theta * move[:, 0]
+        theta = theta - power * jnp.sum(bend * offsets * step, axis=(1, 2))
+        own = dot(turned, image[:, :num_rows], 3) + dot(within, move.ravel(), 1)
+        own = own.reshape(num, -1).at[:, 0].add(theta)
+        outer = image[:, num_rows:] + bend * step - power * bend * offsets * longer
+        return joined(outer, own)
+
+    by_natural = by_natural.reshape(num, -1).at[:, 0].add(of.by_theta - power * energies)
+    by_offsets = of.by_columns[:, num_rows:] + bend * offsets
+    # The second derivatives among all variables of the ends, and of each offset by itself.
+    half = einsum("pnca,ncafb->pnfb", turned, of.columns_columns[:, :num_rows, :, :num_rows])
+    is_time = jnp.asarray(np.eye(natural.size)[:: natural.shape[1]], scale.dtype)  # (N, N k)
+    beside = einsum("pnca,nca->pn", turned, of.columns_theta[:, :num_rows])
+    beside = dot(beside + 0.5 * theta_theta * is_time.T, is_time, 1)
+    block = dot(half, turned, ((1, 2, 3), (1, 2, 3))) + within + beside + beside.T
+    units = jnp.tile(own_units, num)
+    own_bend = einsum("nkaka->nka", of.columns_columns[:, num_rows:, :, num_rows:]) + bend
+    places = np.arange(num * scale.size).reshape(num, -1)[:, offset_units.size :]
+    return Curvature(
+        evaluation=Evaluation(
+            cost=jnp.sum(of.penalty + energies) + core, violation=jnp.maximum(worst, excess)
+        ),
+        gradient=joined(by_offsets, by_natural),
+        product=product,
+        preconditioner=block_preconditioner(
+            places.reshape(1, -1),
+            (block * units * units[:, None])[None],
+            joined(own_bend * offset_units.reshape(offsets.shape[1:]), jnp.zeros_like(natural)),
+        ),
+    )
