@@ -1,4 +1,4 @@
-"""How much plans cost beside those of a longer search."""
+"""How much plans cost beside the optimum that a long search finds."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -7,16 +7,20 @@ import jax
 import numpy as np
 
 from planner_jax.optimise.lbfgs import LbfgsConfig
+from planner_jax.optimise.newton import NewtonConfig
 from planner_jax.optimise.planner import OptimisedPlanner
+from planner_jax.optimise.problem import Round, Stage
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.planning.plan import plan
 from planner_jax.protocol import solved
 from planner_jax.registry import Task
 
 COMPARED = 1024  # plans of a batch that are looked at, at most
-# Beside which even plans are looked at whose own search is long.
-VERY_LONG = LbfgsConfig(max_steps=3000, memory=12, tolerance=1e-9, patience=30)
-_LONGEST = 100  # iterations of a first round for which a long search is yardstick enough
+# One long search from the first guess: Newton's method ends it, which follows valleys to their end.
+TO_THE_OPTIMUM = Round(
+    solver=NewtonConfig(max_steps=100, tolerance=1e-8, patience=10),
+    stages=(Stage(LbfgsConfig(max_steps=200, tolerance=1e-6, patience=5)),),
+)
 
 
 def cost_gaps(
@@ -26,12 +30,11 @@ def cost_gaps(
     devices: Sequence[Any] | None = None,
     *,
     card: Task | None = None,
-    solver: LbfgsConfig | None = None,
 ) -> np.ndarray | None:
-    """By how much plans cost more than those of a longer search.
+    """By how much plans cost more than those of a long search.
 
-    That is a long one from the same guess, for a planner that minimises by rounds; for others the
-    planner that their task's card names as a yardstick, with its own options.
+    That is `TO_THE_OPTIMUM` for a planner that minimises by rounds; for others the planner that
+    their task's card names as a yardstick, with its own options.
 
     Args:
         planner: that made the plans; what it decided on first is kept.
@@ -39,8 +42,6 @@ def cost_gaps(
         plans: of them.
         devices: as for `plan`.
         card: of the planner's task, for its yardstick.
-        solver: of the longer search; by default a long one, and `VERY_LONG` where the planner's own
-            first round is longer than most.
 
     Returns:
         (K,), relative, of the cases that both solve: 0.33 is 33 %. None where the planner has no
@@ -49,7 +50,7 @@ def cost_gaps(
     cases, plans = jax.tree.map(lambda leaf: np.asarray(leaf[:COMPARED]), (cases, plans))
     if isinstance(planner, DecidedPlanner):
         cases, planner = cases.decided(plans.choice), planner.planner
-    longer = _longer(planner, cases, card, solver)
+    longer = _longer(planner, cases, card)
     if longer is None:
         return None
     best = plan(longer, cases, devices=devices)
@@ -57,18 +58,21 @@ def cost_gaps(
     return plans.cost[both] / best.cost[both] - 1.0
 
 
-def _longer(planner: Any, cases: Any, card: Task | None, solver: LbfgsConfig | None) -> Any:
+def _longer(planner: Any, cases: Any, card: Task | None) -> Any:
     """The planner with whose costs those of a planner are compared, None if there is none."""
     if isinstance(planner, OptimisedPlanner):
-        if solver is None and planner.rounds[0].solver.max_steps > _LONGEST:
-            solver = VERY_LONG
-        return planner.with_solver() if solver is None else planner.with_solver(solver)
+        return to_the_optimum(planner)
     if card is None or card.yardstick is None:
         return None
     yardstick = card.planner(card.yardstick)
     # A task's groups, and what is planned again, are cases of other classes.
     kind = getattr(yardstick, "case_type", None)
     return yardstick if kind is None or isinstance(cases, kind) else None
+
+
+def to_the_optimum(planner: OptimisedPlanner) -> OptimisedPlanner:
+    """The planner with the long search in the place of its rounds."""
+    return planner.changed((("rounds", (TO_THE_OPTIMUM,)),))
 
 
 def gap_figures(*gaps: np.ndarray | None) -> dict[str, float | None]:

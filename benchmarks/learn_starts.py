@@ -25,7 +25,7 @@ import optax
 
 import planner_jax as pj
 import planner_jax.task
-from planner_jax.benchmarks.cost_gap import VERY_LONG
+from planner_jax.benchmarks.cost_gap import to_the_optimum
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
 from planner_jax.optimise import learned_start
 from planner_jax.optimise.learned_start import StartNetwork
@@ -230,9 +230,7 @@ def compare(bench: Bench, task: str, num: int) -> None:
         "smooth": learnt.planner,
         "learned": dataclasses.replace(learnt.planner, learned=True),
     }
-    best = np.minimum(
-        *(pj.plan(each.with_solver(VERY_LONG), cases).cost for each in planners.values())
-    )
+    best = np.minimum(*(pj.plan(to_the_optimum(each), cases).cost for each in planners.values()))
     bench.say(
         f"{task}: {num:,} cases",
         "| guess | iterations | limits hold | cost above the least found (median, p90, p99) |",

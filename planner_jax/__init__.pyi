@@ -19,6 +19,7 @@ from .export.words import export as export
 from .optimise.implicit import optimal_plan as optimal_plan
 from .optimise.lbfgs import Evaluation as Evaluation
 from .optimise.lbfgs import LbfgsConfig as LbfgsConfig
+from .optimise.newton import NewtonConfig as NewtonConfig
 from .optimise.planner import OptimisedPlanner as OptimisedPlanner
 from .optimise.planner import pending as pending
 from .optimise.problem import Round as Round

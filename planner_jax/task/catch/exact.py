@@ -24,7 +24,7 @@ from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.learned_start import StartNetwork, cheaper_start, shipped_network
 from planner_jax.optimise.newton import Curvature
 from planner_jax.optimise.planner import OptimisedPlanner, pending
-from planner_jax.optimise.problem import Round
+from planner_jax.optimise.problem import Round, Stage
 from planner_jax.optimise.scaling import shipped_scale
 from planner_jax.optimise.sensitivity import curvature_by_tangents
 from planner_jax.protocol import FEASIBILITY_TOLERANCE, require_settings
@@ -80,6 +80,8 @@ _GUESSES = np.array(
 )
 _FIRST = Round(starts=1, solver=LbfgsConfig(max_steps=8))
 _FROM_LEARNED = Round(starts=1, solver=LbfgsConfig(max_steps=2))  # in its place, of one target
+# In its place, of several targets, where Newton's method goes on: it would begin too far away.
+_LONG_CHAIN = Stage(LbfgsConfig(max_steps=200, tolerance=1e-6, patience=5))
 _LEAN = 0.95  # of the angle that the net may have to the ball's way, what a guess makes use of
 
 
@@ -228,7 +230,9 @@ class ExactCatch(OptimisedPlanner):
         return super().solve_lanes(cases, self._for_start(attempt, cases))
 
     def _for_start(self, attempt: Round, case: CatchCase) -> Round:
-        """A shorter first round where it begins near its end."""
+        """A shorter first round where it begins near its end, a longer stage where it is far."""
+        if attempt.stages == (Stage(_FIRST.solver),) and case.num_targets > 1:
+            return dataclasses.replace(attempt, stages=(_LONG_CHAIN,))
         is_near = attempt == _FIRST and self._network is not None and _is_learned(case)
         return _FROM_LEARNED if is_near else attempt
 
