@@ -3,6 +3,7 @@
 import pytest
 
 import planner_jax as pj
+from planner_jax.optimise.problem import Stage
 from planner_jax.sweep.catch.settings import CatchSettings
 from planner_jax.sweep.hit.settings import HitSettings
 from planner_jax.sweep.settings import SettingError
@@ -15,8 +16,11 @@ def test_more_effort_is_a_longer_first_round_and_the_default_is_the_planner_itse
     inside = lambda planner: getattr(planner, "planner", planner)  # noqa: E731
     rounds = [inside(task.planner("exact", effort=x)).rounds for x in ("feasible", "good", "best")]
     assert len({each[1:] for each in rounds}) == 1
-    steps = [each[0].solver.max_steps for each in rounds]
-    assert steps == sorted(set(steps)) and steps[0] == inside(own).rounds[0].solver.max_steps
+    feasible, good, best = (each[0] for each in rounds)
+    assert feasible == inside(own).rounds[0]
+    assert good.stages == best.stages == (Stage(feasible.solver),)  # and from there on Newton's
+    assert isinstance(good.solver, pj.NewtonConfig) and isinstance(best.solver, pj.NewtonConfig)
+    assert good.solver.max_steps < best.solver.max_steps
 
 
 def test_an_effort_that_is_none_and_planners_without_one_are_named():

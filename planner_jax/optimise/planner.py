@@ -14,7 +14,7 @@ from planner_jax.optimise.newton import Curvature, NewtonConfig, by_products
 from planner_jax.optimise.problem import Round, Settings, Solver, Stage
 
 # From where the first search ends; the lanes that have most to gain go on.
-_POLISH = NewtonConfig(max_steps=6, tolerance=1e-7, patience=6, stragglers=((0.4, 6), (0.1, 30)))
+_POLISH = NewtonConfig(max_steps=8, tolerance=1e-7, patience=6, stragglers=((0.3, 30),))
 _LONG = LbfgsConfig(max_steps=300, tolerance=1e-7, patience=6)
 # Of the first round, by effort.
 _EFFORTS = {
