@@ -31,10 +31,11 @@ ROUND = {
     "greatest_along": 1,
 }
 # Of gradients: the table and its slopes; penalties' slopes and, along the adjoint, curvature. By
-# the core: its inverse. By products: the ends, and a curvature of penalties that is no kernel yet.
+# the core: its inverse. By products: the ends, the inverse of their block, and a curvature of
+# penalties that is no kernel yet.
 GRADIENTS = {
     "core": {"flight_table": 2, "integrate_along": 4, "positive_inverse": 1},
-    "products": {"flight_table": 2, "integrate_along": 2, "lanes": 1},
+    "products": {"flight_table": 2, "integrate_along": 2, "lanes": 1, "positive_inverse": 1},
 }
 
 
