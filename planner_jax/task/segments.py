@@ -21,6 +21,8 @@ from planner_jax.optimise.newton import Curvature
 from planner_jax.optimise.preconditioner import block_preconditioner
 from planner_jax.trajectory.proportional_minco import ProportionalMinco, offset_energy
 
+BETWEEN_NODES = 0.004  # by which peaks between penalty nodes are higher, about
+
 # Of the variables of the ends (N, k): boundary rows (N, 2s, 3), mean durations of a piece (N,) [s],
 # the cost of the ends (), and the greatest excess there ().
 Ends = Callable[[Array], tuple[Array, Array, Array, Array]]
@@ -58,7 +60,8 @@ def segments_curvature(
         active: (N,) bool, the segments that count.
 
     Returns:
-        With the greatest excess, of the ends or of the nodes along the way, as `violation`.
+        With the greatest excess, of the ends or of the nodes along the way, as `violation`, and
+        `BETWEEN_NODES` added.
     """
     rows, durations, core, excess = found
     num, order, power = natural.shape[0], maps.order, 2 * maps.order - 1
@@ -127,7 +130,8 @@ def segments_curvature(
     places = np.arange(num * scale.size).reshape(num, -1)[:, offset_units.size :]
     return Curvature(
         evaluation=Evaluation(
-            cost=jnp.sum(of.penalty + energies) + core, violation=jnp.maximum(worst, excess)
+            cost=jnp.sum(of.penalty + energies) + core,
+            violation=jnp.maximum(worst, excess) + BETWEEN_NODES,
         ),
         gradient=joined(by_offsets, by_natural),
         product=product,

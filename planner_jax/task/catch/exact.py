@@ -44,7 +44,7 @@ from planner_jax.task.catch.chain import (
 )
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.task.catch.reach import is_too_far
-from planner_jax.task.segments import segments_curvature
+from planner_jax.task.segments import BETWEEN_NODES, segments_curvature
 from planner_jax.trajectory.proportional_minco import (
     ProportionalMinco,
     boundary_energy,
@@ -55,7 +55,6 @@ from planner_jax.trajectory.proportional_minco import (
 _ORDER = 4  # minimum snap
 _PROPORTIONS = (0.3,) + (1.0,) * 5
 _SEEN = (-0.1, 0.1)  # [s] from the decided time, at which a learned start looks at the ball
-_BETWEEN_NODES = 0.004  # by which peaks between penalty nodes are higher, about
 # Intervals at which a piece is looked at in the end, of one catch and of several: body rates peak
 # sharply where the thrust is small, as it is between catches.
 _DECODE_NODES = (32, 48)
@@ -379,7 +378,7 @@ class ExactCatch(OptimisedPlanner):
         along = penalties + self._offset_costs(offsets, durations)
         cost = core + jnp.sum(jnp.where(context.active, along, 0.0))
         worst = jnp.max(jnp.where(context.active, worst, -1.0))
-        return Evaluation(cost=cost, violation=jnp.maximum(worst, at_catches) + _BETWEEN_NODES)
+        return Evaluation(cost=cost, violation=jnp.maximum(worst, at_catches) + BETWEEN_NODES)
 
     def ends(self, natural: Array, context: CatchContext) -> tuple[Array, Array, Array, Array]:
         """What the variables after the waypoint offsets make of the objective.
@@ -423,7 +422,7 @@ class ExactCatch(OptimisedPlanner):
     def curved(self, point: Array, context: CatchContext) -> Curvature:
         """Evaluation, gradient, and second derivatives, which are made as a whole."""
         offsets, natural = self._split(point)
-        found = segments_curvature(
+        return segments_curvature(
             self.maps,
             self._along(self.nodes, context.case),
             lambda natural: self.ends(natural, context),
@@ -435,9 +434,6 @@ class ExactCatch(OptimisedPlanner):
             self.energy_weight,
             context.active,
         )
-        violation = found.evaluation.violation + _BETWEEN_NODES
-        evaluation = dataclasses.replace(found.evaluation, violation=violation)
-        return found._replace(evaluation=evaluation)
 
     def core_curvature(self, point: Array, context: CatchContext) -> tuple[Array, Array]:
         """Hessian of the core in its blocks, (N, 12, 12), and of the offsets, (n,)."""

@@ -42,7 +42,7 @@ from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.context import HitContext, Impact, prepare_hit
 from planner_jax.task.hit.plan import HitPlan, Stroke
 from planner_jax.task.hit.reach import is_too_far
-from planner_jax.task.segments import segments_curvature
+from planner_jax.task.segments import BETWEEN_NODES, segments_curvature
 from planner_jax.trajectory.proportional_minco import (
     ProportionalMinco,
     boundary_energy,
@@ -57,7 +57,6 @@ from planner_jax.trajectory.proportional_minco import (
 _ORDER = 4  # minimum snap
 _PROPORTIONS = (0.2, 0.5) + (1.0,) * 10
 _SEEN = (0.5, 0.75, 0.95)  # of the landing time, at which a learned start looks at the ball
-_BETWEEN_NODES = 0.004  # by which peaks between penalty nodes are higher, about
 _DECODE_NODES = 16  # intervals a piece at which a finished plan is looked at
 
 
@@ -305,7 +304,7 @@ class ExactHit(OptimisedPlanner):
             (context.case.gravity, context.case.limits, context.case.extras),
         )
         energy = self.energy_weight * offset_energy(self.maps, offsets, duration)
-        violation = jnp.maximum(worst[0], at_impact) + _BETWEEN_NODES
+        violation = jnp.maximum(worst[0], at_impact) + BETWEEN_NODES
         return Evaluation(cost=penalties[0] + core + energy, violation=violation)
 
     def ends(self, natural: Array, context: HitContext) -> tuple[Array, Array, Array, Array]:
@@ -335,7 +334,7 @@ class ExactHit(OptimisedPlanner):
             return rows[None], duration[None], core, at_impact
 
         rows, duration, core, at_impact = in_one_kernel(ExactHit.ends, self)(natural, context)
-        found = segments_curvature(
+        return segments_curvature(
             self.maps,
             self._along(self.nodes, context.case),
             ends,
@@ -347,9 +346,6 @@ class ExactHit(OptimisedPlanner):
             self.energy_weight,
             jnp.ones(1, bool),
         )
-        violation = found.evaluation.violation + _BETWEEN_NODES
-        evaluation = dataclasses.replace(found.evaluation, violation=violation)
-        return found._replace(evaluation=evaluation)
 
     def _hinges(self, at_impact: Array) -> Array:
         hinges = smoothed_hinge(at_impact + self.margin, self.hinge_width)
