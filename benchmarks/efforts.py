@@ -26,7 +26,7 @@ def measure(bench: Bench, options: argparse.Namespace) -> None:
     """A row an effort and suite."""
     bench.say(
         f"{options.num:,} cases, {jax.devices()[0].device_kind}, jax {jax.__version__}",
-        "| task | suite | effort | refereed | cost above the optimum's (median, p90) | "
+        "| task | suite | effort | refereed | cost above the optimum's (median, p90, p99) | "
         "fastest [s] |",
         "|---|---|---|---|---|---|",
     )

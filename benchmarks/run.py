@@ -3,7 +3,7 @@
 The folder holds manifest.json (kind "bench NAME", state, parameters, versions, device, commit,
 times, summary), table.md with what was printed and, where there are rows, rows.json. Every summary
 has `num`, the plans that were judged, and `success_rate`; where a speed is measured also the
-median and the 90 % quantile of `cost_gaps`.
+median, the 90 and the 99 % quantile of `cost_gaps`.
 """
 
 import argparse

@@ -80,7 +80,7 @@ def measure(bench: Bench, settings: ThroughputSettings) -> None:
         f"{card.name}, {len(used)} x {used[0].device_kind}, jax {jax.__version__}, load average "
         f"{os.getloadavg()[0]:.1f}" + (f"; first round: {first} iterations" if first else ""),
         "| plans | first call [s] | of it compiling [s] | fastest [ms] | median [ms] | plans/s | "
-        "refereed | cost above a longer search's (median, p90) | memory [GiB] |",
+        "refereed | cost above a longer search's (median, p90, p99) | memory [GiB] |",
         "|---|---|---|---|---|---|---|---|---|",
     )
     beside = []

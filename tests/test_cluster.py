@@ -1,13 +1,11 @@
 """Sweeps whose chunks are made by a Ray cluster: a stand-in for Ray, and Ray itself (slow)."""
 
-import contextlib
 import itertools
 import os
 import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -21,6 +19,7 @@ from planner_jax.sweep.hit.sweep import HitSweep
 from planner_jax.sweep.run import SweepInterrupted, resume_sweep, start_sweep
 from planner_jax.sweep.run_folder import RunFolder
 from planner_jax.sweep.settings import SettingError, WorkersFailed
+from tests.faults.commands import children_of
 from tests.faults.runs import quick_sweeps
 from tests.sweeps import stop_after
 
@@ -228,18 +227,6 @@ def test_without_ray_the_extra_is_named_in_one_line(tmp_path, monkeypatch, capsy
     assert not out.exists()
 
 
-def pids_of(parent, name):
-    """Processes of a parent whose programs have a name that begins so."""
-    found = []
-    for process in Path("/proc").glob("[0-9]*"):
-        with contextlib.suppress(OSError):  # it has ended meanwhile
-            told = (process / "stat").read_text().rpartition(")")[2].split()
-            program = (process / "cmdline").read_text().partition("\0")[0]
-            if int(told[1]) == parent and os.path.basename(program).startswith(name):
-                found.append(int(process.name))
-    return found
-
-
 @pytest.mark.slow
 def test_a_run_with_a_real_cluster_survives_the_death_of_a_worker(tmp_path):
     """One that is killed with the first part; the sweep ends by itself, and so does its cluster."""
@@ -254,9 +241,9 @@ def test_a_run_with_a_real_cluster_survives_the_death_of_a_worker(tmp_path):
         raylets, killed = [], False
         while sweep.poll() is None and not killed and time.monotonic() < until:
             time.sleep(0.02)
-            raylets = raylets or pids_of(sweep.pid, "raylet")
+            raylets = raylets or children_of(sweep.pid, "raylet")
             if list(out.glob("parts/part-*")):
-                for pid in pids_of(raylets[0], "ray::_make")[:1]:
+                for pid in children_of(raylets[0], "ray::_make")[:1]:
                     os.kill(pid, signal.SIGKILL)
                     killed = True
         said, _ = sweep.communicate(timeout=120.0)

@@ -9,6 +9,7 @@ as if whole; a signal ends the command with its own code and a line, and no trac
 
 import argparse
 import contextlib
+import os
 import random
 import shutil
 import signal
@@ -22,10 +23,18 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
-from tests.faults.commands import Ended, finished, is_one_line, is_stopped, start
+from tests.faults.commands import (
+    Ended,
+    children_of,
+    finished,
+    is_one_line,
+    is_stopped,
+    start,
+)
 from tests.faults.runs import TARGETS, make_runs, quick_sweeps, rows_of, verdict
 
 HIT = ("hit", "--num", "200", "--batch", "32", "--seed", "5")
+MANY = ("hit", "--num", "20000", "--batch", "500", "--seed", "5")  # for workers
 CATCH = ("catch", "--num", "96", "--batch", "16", "--seed", "5")
 Survived = Iterator[tuple[bool, str]]  # and a word on how
 
@@ -76,6 +85,35 @@ def twins(num: int, place: Path) -> Survived:
         good = ends[0].code == 0 and refused and rows_of(out) == rows_of(whole)
         named = "owned by process" in ends[1].err
         yield good, "named" if named else ends[1].err[-300:]
+        shutil.rmtree(out, ignore_errors=True)
+
+
+def worker_kills(num: int, place: Path) -> Survived:
+    """SIGKILL of a Ray worker at a random moment between the first worker and the last chunk."""
+    whole, moment = place / "whole", random.Random(11)
+    assert finished(start("sweep", *MANY, "--out", whole, cwd=place)).code == 0
+    working, tried = 1.0, 0  # seconds from the first worker to the end
+    while tried < num:
+        out = place / "run"
+        sweep = start("sweep", *MANY, "--workers", "ray", "--out", out, cwd=place)
+        workers: list[int] = []
+        while sweep.poll() is None and not workers:
+            raylets = children_of(sweep.pid, "raylet")
+            workers = [pid for raylet in raylets for pid in children_of(raylet, "ray::_make")]
+            time.sleep(0.02)
+        began, killed = time.monotonic(), False
+        try:
+            sweep.wait(moment.uniform(0.0, working))
+        except subprocess.TimeoutExpired:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(moment.choice(workers), signal.SIGKILL)
+                killed = True
+        ended = finished(sweep)
+        working = time.monotonic() - began
+        if killed or ended.code != 0:
+            tried += 1
+            good = ended.code == 0 and rows_of(out) == rows_of(whole)
+            yield good, "finished" if good else f"{ended.code} {ended.err[-500:]}"
         shutil.rmtree(out, ignore_errors=True)
 
 
@@ -144,6 +182,7 @@ def full_disk(num: int, place: Path) -> Survived:
 TRIALS: list[tuple[str, str, Callable[[int, Path], Survived], int]] = [
     ("kill-hit", "SIGKILL at a random moment, `sweep hit`", partial(kills, HIT), 100),
     ("kill-catch", "SIGKILL at a random moment, `sweep catch`", partial(kills, CATCH), 100),
+    ("workers", "SIGKILL of a worker at a random moment, `--workers ray`", worker_kills, 30),
     ("twins", "two sweeps begun at once on one folder", twins, 50),
     *(
         (f"mutants-{what.replace(' ', '-')}", f"damage to {what}", partial(mutants, what), num)

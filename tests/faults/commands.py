@@ -66,6 +66,18 @@ def finished(process: subprocess.Popen, within: float = 300.0) -> Ended:
     return Ended(process.returncode, out, err)
 
 
+def children_of(parent: int, name: str) -> list[int]:
+    """Processes that a process has begun and whose program has a name with this beginning."""
+    found = []
+    for process in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):  # it has ended meanwhile
+            told = (process / "stat").read_text().rpartition(")")[2].split()
+            program = (process / "cmdline").read_text().partition("\0")[0]
+            if int(told[1]) == parent and Path(program).name.startswith(name):
+                found.append(int(process.name))
+    return found
+
+
 def is_one_line(ended: Ended) -> bool:
     """Whether a command that failed said so in one line of its own, and nothing else."""
     said = ended.err.startswith("planner-jax: error: ") and ended.err.count("\n") == 1
