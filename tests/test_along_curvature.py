@@ -7,7 +7,11 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.cost.along import integrate_along
-from planner_jax.cost.along_curvature import curvature_along
+from planner_jax.cost.along_curvature import (
+    block_and_diagonal,
+    columns_columns,
+    curvature_along,
+)
 from planner_jax.cost.quadrotor import flight_along
 from planner_jax.planning.decided import first_choice
 from planner_jax.task.catch.decide import Greedy
@@ -52,11 +56,14 @@ def test_all_derivatives_are_those_of_the_integrated_penalties(name, given):
         at = columns[given:], theta
         slopes = jax.grad(penalty, argnums=(0, 1))(*at)
         hessian = jax.hessian(penalty, argnums=(0, 1))(*at)
+        block, diagonal = block_and_diagonal(along, found.at_samples, 4, given)
         pairs = [
             (found.penalty, penalty(*at)),
             (found.by_columns, slopes[0]),
             (found.by_theta, slopes[1]),
-            (found.columns_columns, hessian[0][0]),
+            (columns_columns(along, found.at_samples, given), hessian[0][0]),
+            (block, hessian[0][0][:4, :, :4]),
+            (diagonal, np.einsum("kaka->ka", hessian[0][0][4:, :, 4:])),
             (found.columns_theta, hessian[0][1]),
             (found.theta_theta, hessian[1][1]),
         ]
@@ -102,7 +109,7 @@ def test_second_derivatives_of_a_plan_are_those_of_its_objective(make):
         def cost(x):
             return planner.objective(x, context).cost
 
-        evaluation, gradient, product, preconditioner = planner.curved(point, context)
+        evaluation, gradient, products, preconditioner = planner.curved(point, context)
         exact = jax.jvp(jax.grad(cost), (point,), (direction,))
         np.testing.assert_allclose(evaluation.cost, cost(point), rtol=1e-12)
         np.testing.assert_allclose(
@@ -111,7 +118,9 @@ def test_second_derivatives_of_a_plan_are_those_of_its_objective(make):
         greatest = np.abs(exact[0]).max()
         np.testing.assert_allclose(gradient, exact[0], rtol=1e-9, atol=1e-11 * greatest)
         greatest = np.abs(exact[1]).max()
-        np.testing.assert_allclose(product(direction), exact[1], rtol=1e-9, atol=1e-11 * greatest)
+        np.testing.assert_allclose(
+            products()(direction), exact[1], rtol=1e-9, atol=1e-11 * greatest
+        )
         # What is preconditioned: the Hessian with nothing but its block of ends and its diagonal.
         hessian = np.asarray(jax.hessian(cost)(point))
         damping = 2.0 * np.abs(hessian).max()

@@ -37,7 +37,7 @@ def steps_of(matrix, slope, damping, config=WHOLE, kept=None):
     here = Curvature(
         Evaluation(jnp.zeros(()), jnp.zeros(())),
         jnp.asarray(slope, jnp.float32),
-        lambda direction: matrix @ direction,
+        lambda: lambda direction: matrix @ direction,
         preconditioner,
     )
     return damped_steps(here, jnp.asarray(damping, jnp.float32), config)
@@ -55,6 +55,16 @@ def test_a_step_in_the_whole_space_is_newtons(kept):
         exact = -np.linalg.solve(own + trial * beside, SLOPE)
         np.testing.assert_allclose(step, exact, rtol=5e-5, atol=5e-6)
     np.testing.assert_allclose(promised, 0.5 * SLOPE @ np.linalg.solve(own, SLOPE), rtol=1e-5)
+
+
+def test_without_a_subspace_the_step_is_the_preconditioners():
+    damping, trials, kept = 0.4, (0.0, 0.7), np.diag(np.diag(CURVED))
+    config = NewtonConfig(subspace=0, step_cap=100.0, trial_dampings=trials)
+    steps, promised = steps_of(CURVED, SLOPE, damping, config, kept)
+    exact = -np.linalg.solve(kept + damping * np.eye(3), SLOPE)
+    for step, trial in zip(steps, trials, strict=True):
+        np.testing.assert_allclose(step, exact / (1.0 + trial), rtol=1e-5)
+    np.testing.assert_allclose(promised, -0.5 * SLOPE @ exact, rtol=1e-5)
 
 
 def test_where_the_cost_bends_downward_the_hessian_is_shifted_by_that_much():
@@ -95,12 +105,12 @@ def test_a_bowl_takes_one_iteration():
 
 def test_the_products_of_an_objective_are_its_hessians():
     x = jnp.array([0.3, -0.4, 1.1])
-    evaluation, gradient, product, preconditioner = by_products(rosenbrock)(x)
+    evaluation, gradient, products, preconditioner = by_products(rosenbrock)(x)
     cost = lambda x: rosenbrock(x).cost  # noqa: E731
     np.testing.assert_allclose(evaluation.cost, cost(x))
     np.testing.assert_allclose(gradient, jax.grad(cost)(x), rtol=1e-6)
     for unit, row in zip(jnp.eye(3), jax.hessian(cost)(x), strict=True):
-        np.testing.assert_allclose(product(unit), row, rtol=1e-5, atol=1e-4)
+        np.testing.assert_allclose(products()(unit), row, rtol=1e-5, atol=1e-4)
         np.testing.assert_array_equal(preconditioner(4.0)(unit), unit / 4.0)
 
 
@@ -118,24 +128,32 @@ def test_a_batch_ends_where_its_lanes_do_and_stragglers_go_on():
     for k in range(len(starts)):
         alone = minimise(lambda x, k=k: rosenbrock(x, steepness[k]), starts[k], config)
         np.testing.assert_allclose(lanes.point[:, k], alone.point, rtol=1e-4, atol=1e-5)
-    longer = NewtonConfig(max_steps=3, subspace=2, stragglers=((0.5, 40),))
+    longer = NewtonConfig(max_steps=3, subspace=2, stragglers=(0.5, 40, 1))
     late = jax.jit(lambda s, c: minimise_lanes(rosenbrock, s, c, longer))(starts.T, steepness)
     went_on = np.asarray(late.iterations) > np.asarray(lanes.iterations)
     assert 1 <= went_on.sum() <= 2
     assert went_on[np.argmax(lanes.evaluation.cost)]
     assert np.all(late.evaluation.cost <= lanes.evaluation.cost)
     np.testing.assert_allclose(late.evaluation.cost[went_on], 1.0, atol=1e-3)
+    every = NewtonConfig(max_steps=3, subspace=2, stragglers=(0.25, 20, 50))
+    last = jax.jit(lambda s, c: minimise_lanes(rosenbrock, s, c, every))(starts.T, steepness)
+    np.testing.assert_allclose(last.evaluation.cost, 1.0, atol=1e-3)
+    assert last.stationary.all() and (last.iterations <= 3 + 20 * 50).all()
+    # A lane that is there already takes no part.
+    assert last.iterations[3] == lanes.iterations[3]
 
 
 @pytest.mark.parametrize(
     ("argument", "value", "error"),
     [
         ("max_steps", -1, ValueError),
-        ("subspace", 0, ValueError),
+        ("subspace", -1, ValueError),
         ("trial_dampings", (), ValueError),
         ("trial_dampings", 0.1, TypeError),
         ("damping", float("nan"), ValueError),
-        ("stragglers", ((1.5, 4),), ValueError),
+        ("stragglers", (1.5, 4, 1), ValueError),
+        ("stragglers", (0.5, 4), TypeError),
+        ("stragglers", (0.5, 4, 0), ValueError),
         ("stragglers", 0.5, TypeError),
     ],
 )

@@ -1,9 +1,10 @@
-"""The integrated penalties of `cost.along` with all their second derivatives, as one matrix.
+"""The integrated penalties of `cost.along` with their second derivatives: all, or the strong ones.
 
 Samples are linear in a segment's columns, and a limit looks at few orders of the motion at once. So
 the matrix is a sum over samples and pairs of orders of one number times the outer product of two
 constant rows: one product with a constant matrix for each pair of axes, whatever the number of
-lanes. By `jax.hessian` it would take as many tangents as there are unknowns.
+lanes. By `jax.hessian` it would take as many tangents as there are unknowns. Of the matrix only
+those entries are made that are asked for.
 """
 
 import dataclasses
@@ -38,9 +39,11 @@ class AlongCurvature:
     worst: Array  # (), the greatest excess at the samples
     by_columns: Array  # (C, 3)
     by_theta: Array  # ()
-    columns_columns: Array  # (C, 3, C, 3)
     columns_theta: Array  # (C, 3)
     theta_theta: Array  # ()
+    # Second derivatives at the samples, of which those by the columns are made: for each group of
+    # pairs of axes that have terms in common (terms K, pairs).
+    at_samples: tuple[Array, ...]
 
 
 def curvature_along(
@@ -86,11 +89,60 @@ def curvature_along(
         worst=worst,
         by_columns=by,
         by_theta=jnp.sum(weight * value) + summed(slope * moved),
-        columns_columns=_pulled_back(constants, curvature, weight, rates[:, 0, 0]),
         columns_theta=mixed,
         theta_theta=jnp.sum(weight * value)
         + summed(2.0 * slope * moved + slope * bent + turned * moved),
+        at_samples=tuple(
+            jnp.stack(
+                [
+                    jnp.concatenate(
+                        [
+                            weight * rates[d, 0, 0] * rates[e, 0, 0] * curvature[(d, a), (e, b)]
+                            for d, e in terms
+                        ]
+                    )
+                    for a, b in pairs
+                ],
+                axis=1,
+            )
+            for pairs, terms in constants.pairs
+        ),
     )
+
+
+def columns_columns(along: Along, at_samples: tuple[Array, ...], given: int = 0) -> Array:
+    """All second derivatives by the moving columns, (C, 3, C, 3).
+
+    Args:
+        along: constants, as for `curvature_along`.
+        at_samples: what it found.
+        given: as for it.
+    """
+    num = _constants(along, given).num_moving
+    every = [(c, f) for c in range(num) for f in range(num)]
+    return _square(_entries(along, given, every, at_samples), num)
+
+
+def block_and_diagonal(
+    along: Along, at_samples: tuple[Array, ...], num: int, given: int = 0
+) -> tuple[Array, Array]:
+    """Second derivatives among the first moving columns, and of each other number by itself.
+
+    Args:
+        along: constants, as for `curvature_along`.
+        at_samples: what it found.
+        num: E, of the first columns.
+        given: as for it.
+
+    Returns:
+        (E, 3, E, 3) and (C - E, 3).
+    """
+    among = [(c, f) for c in range(num) for f in range(num)]
+    alone = [(c, c) for c in range(num, _constants(along, given).num_moving)]
+    entries = _entries(along, given, among + alone, at_samples)
+    block = {pair: found[: len(among)] for pair, found in entries.items()}
+    diagonal = [entries[axis, axis][len(among) :] for axis in range(3)]
+    return _square(block, num), jnp.stack(diagonal, axis=1)
 
 
 def _at_samples(
@@ -147,24 +199,24 @@ def _product(groups: tuple[tuple[Slot, ...], ...], curvature: dict, direction: A
     return jnp.stack(rows)
 
 
-def _pulled_back(constants: "_Constants", curvature: dict, weight: Array, rates: Array) -> Array:
-    """Second derivatives by the moving columns, (C, 3, C, 3)."""
-    blocks: dict[tuple[int, int], Array] = {}
-    for pairs, terms, matrix in constants.products:
-        numbers = [
-            jnp.concatenate(
-                [weight * (rates[d] * rates[e]) * curvature[(d, a), (e, b)] for d, e in terms]
-            )
-            for a, b in pairs
-        ]
-        product = jnp.matmul(
-            jnp.asarray(matrix, weight.dtype),
-            jnp.stack(numbers, axis=1),
-            precision=lax.Precision.HIGHEST,
-        )
-        for place, pair in enumerate(pairs):
-            block = product[:, place].reshape(constants.num_moving, -1)
-            blocks[pair] = blocks[pair] + block if pair in blocks else block
+def _entries(
+    along: Along, given: int, places: list[tuple[int, int]], at_samples: tuple[Array, ...]
+) -> dict[tuple[int, int], Array]:
+    """Second derivatives by pairs of moving columns, (places,) for each pair of axes."""
+    matrices = _matrices(along, given, tuple(places))
+    found = {}
+    for (pairs, _), matrix, numbers in zip(
+        _constants(along, given).pairs, matrices, at_samples, strict=True
+    ):
+        constant = jnp.asarray(matrix, numbers.dtype)
+        product = jnp.matmul(constant, numbers, precision=lax.Precision.HIGHEST)
+        found |= {pair: product[:, place] for place, pair in enumerate(pairs)}
+    return found
+
+
+def _square(entries: dict[tuple[int, int], Array], num: int) -> Array:
+    """(num, 3, num, 3) of the entries of all pairs of columns, for each pair of axes."""
+    blocks = {pair: found.reshape(num, num) for pair, found in entries.items()}
     rows = [
         jnp.stack([blocks[a, b] if a <= b else blocks[b, a].T for b in range(3)], axis=-1)
         for a in range(3)
@@ -181,8 +233,8 @@ class _Constants:
     samples: np.ndarray
     moving_samples: np.ndarray  # (orders, K, C)
     groups: tuple[tuple[Slot, ...], ...]
-    # Pairs of axes, their terms (pairs of orders), and the matrix (C C, terms K) for them.
-    products: tuple[tuple[list[tuple[int, int]], list[tuple[int, int]], np.ndarray], ...]
+    # Pairs of axes, and what they have in common: terms, which are pairs of orders.
+    pairs: tuple[tuple[tuple[tuple[int, int], ...], tuple[tuple[int, int], ...]], ...]
 
     @property
     def num_moving(self) -> int:
@@ -195,7 +247,6 @@ def _constants(along: Along, given: int) -> _Constants:
     matrices = along.matrices().transpose(1, 0, 2)  # (orders, K, G + C)
     powers = np.where(np.arange(matrices.shape[-1]) < given, np.arange(matrices.shape[-1]), 0)
     samples = np.stack([matrices, matrices * powers, matrices * powers**2])
-    moving = matrices[..., given:]
     by_terms: dict[tuple, list[tuple[int, int]]] = {}
     for a, b in _PAIRS:
         terms = {
@@ -208,18 +259,29 @@ def _constants(along: Along, given: int) -> _Constants:
         if not terms:
             terms = {(0, 0)}
         by_terms.setdefault(tuple(sorted(terms)), []).append((a, b))
-    products = []
-    for terms, pairs in by_terms.items():
-        outer = []
-        for d, e in terms:
-            each = np.einsum("kc,kf->cfk", moving[d], moving[e])
-            is_half = pairs[0][0] == pairs[0][1] and d != e
-            outer.append(each + each.transpose(1, 0, 2) if is_half else each)
-        matrix = np.concatenate(outer, axis=2).reshape(moving.shape[-1] ** 2, -1)
-        products.append((pairs, list(terms), matrix))
     return _Constants(
         samples=samples.reshape(-1, samples.shape[-1]),
-        moving_samples=moving,
+        moving_samples=matrices[..., given:],
         groups=along.groups,
-        products=tuple(products),
+        pairs=tuple((tuple(pairs), terms) for terms, pairs in by_terms.items()),
     )
+
+
+@functools.cache
+def _matrices(
+    along: Along, given: int, places: tuple[tuple[int, int], ...]
+) -> tuple[np.ndarray, ...]:
+    """For each group of pairs of axes the matrix (places, terms K) from the samples."""
+    constants = _constants(along, given)
+    first, second = np.array(places).T
+    found = []
+    for pairs, terms in constants.pairs:
+        outer = []
+        for d, e in terms:
+            one, other = constants.moving_samples[d], constants.moving_samples[e]  # (K, C) each
+            each = one[:, first] * other[:, second]
+            if pairs[0][0] == pairs[0][1] and d != e:  # of the two that are equal one is a term
+                each = each + one[:, second] * other[:, first]
+            outer.append(each.T)
+        found.append(np.concatenate(outer, axis=1))
+    return tuple(found)

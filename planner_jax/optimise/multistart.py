@@ -94,13 +94,23 @@ def minimise_lanes(
 
     state = over_lanes(lambda start: _method(config).init(start, config))(starts)
     state = searched(state, contexts, config, config.max_steps)
-    for share, steps in config.stragglers if isinstance(config, NewtonConfig) else ():
-        config = dataclasses.replace(config, max_steps=config.max_steps + steps)
-        lanes = newton.most_to_gain(state.numbers, math.ceil(share * starts.shape[-1]))
-        some = jax.tree.map(lambda leaf, lanes=lanes: leaf[..., lanes], (state, contexts))
-        later = searched(*some, config, steps)
-        place = lambda old, new, lanes=lanes: old.at[..., lanes].set(new)  # noqa: E731
-        state = jax.tree.map(place, state, later)
+    if isinstance(config, NewtonConfig) and config.stragglers is not None:
+        share, steps, groups = config.stragglers
+        config, num = _with_stragglers(config), math.ceil(share * starts.shape[-1])
+
+        def next_group(made: tuple[Array, Any]) -> tuple[Array, Any]:
+            number, state = made
+            lanes = newton.most_to_gain(state.numbers, config, num)
+            some = jax.tree.map(lambda leaf: leaf[..., lanes], (state, contexts))
+            later = searched(*some, config, steps)
+            place = lambda old, new: old.at[..., lanes].set(new)  # noqa: E731
+            return number + 1, jax.tree.map(place, state, later)
+
+        def is_open(made: tuple[Array, Any]) -> Array:
+            number, state = made
+            return (number < groups) & jnp.any(newton.is_unfinished(state.numbers, config))
+
+        _, state = lax.while_loop(is_open, next_group, (jnp.zeros((), jnp.int32), state))
     return _optimum_of(state, config)
 
 
@@ -119,11 +129,11 @@ def _step(objective: Objective, curved: Curved | None, state: Any, config: Solve
 
 
 def _with_stragglers(config: Solver) -> Solver:
-    """The iterations of the lanes that have most to gain."""
-    if not isinstance(config, NewtonConfig):
+    """The iterations of a lane that goes on as long as it may."""
+    if not isinstance(config, NewtonConfig) or config.stragglers is None:
         return config
-    steps = config.max_steps + sum(steps for _, steps in config.stragglers)
-    return dataclasses.replace(config, max_steps=steps, stragglers=())
+    _, steps, groups = config.stragglers
+    return dataclasses.replace(config, max_steps=config.max_steps + steps * groups, stragglers=None)
 
 
 def _optimum_of(state: Any, config: Solver) -> Optimum:

@@ -34,7 +34,8 @@ class Curvature(NamedTuple):
 
     evaluation: Evaluation
     gradient: Array  # (n,)
-    product: Callable[[Array], Array]  # of the Hessian with a direction (n,)
+    # What makes products of the Hessian with a direction (n,); called where they are needed.
+    products: Callable[[], Callable[[Array], Array]]
     # Of a positive damping (), what solves about the damped Hessian's system, (n,) of a right side
     # (n,), by a matrix that is symmetric and positive definite.
     preconditioner: Preconditioner
@@ -52,7 +53,7 @@ class NewtonConfig:
     """Sizes and switches of the solver: hashable, so static under jit."""
 
     max_steps: int = 6
-    subspace: int = 4  # vectors
+    subspace: int = 4  # vectors; 0 for the preconditioner's step alone, without products
     damping: float = 1e-4  # at first
     # Tried at once, as multiples of the preconditioner's curvature. The damping is multiplied by
     # the one that does best, or by `ease` if that is greater, or by `tighten` if none does better.
@@ -62,11 +63,12 @@ class NewtonConfig:
     step_cap: float = 3.0  # largest Euclidean length of a step
     tolerance: float = 1e-4  # decrease that is expected, relative to the cost, that counts as none
     patience: int = 3  # iterations without a decrease before a lane is stationary
-    # Shares of the lanes that go on, those with most to gain, and their iterations.
-    stragglers: tuple[tuple[float, int], ...] = ()
+    # Lanes that go on while any has something to gain, those with most first: their share in a
+    # batch, iterations of each such group, and how many groups there are at most.
+    stragglers: tuple[float, int, int] | None = None
 
     def __post_init__(self) -> None:
-        for name, least in (("max_steps", 0), ("subspace", 1), ("patience", 0)):
+        for name, least in (("max_steps", 0), ("subspace", 0), ("patience", 0)):
             require_size(name, getattr(self, name), least)
         for name in ("damping", "ease", "tighten", "step_cap", "tolerance"):
             require_number(name, getattr(self, name), "finite and >= 0", lambda x: x >= 0.0)
@@ -76,13 +78,14 @@ class NewtonConfig:
         if not trials or not all(0.0 <= each < jnp.inf for each in trials):
             raise ValueError(f"trial_dampings must be finite and >= 0, one or more, got {trials}")
         later = self.stragglers
-        if not isinstance(later, tuple) or not all(
-            isinstance(each, tuple) and len(each) == 2 for each in later
-        ):
-            raise TypeError(f"stragglers must be a tuple of pairs, got {told(later)}")
-        for share, steps in later:
-            require_number("stragglers", share, "of shares > 0 and <= 1", lambda x: 0.0 < x <= 1.0)
-            require_size("stragglers", steps, 1)
+        if later is None:
+            return
+        if not isinstance(later, tuple) or len(later) != 3:
+            raise TypeError(f"stragglers must be a tuple of three numbers, got {told(later)}")
+        share, *counts = later
+        require_number("stragglers", share, "a share > 0 and <= 1", lambda x: 0.0 < x <= 1.0)
+        for count in counts:
+            require_size("stragglers", count, 1)
 
 
 @struct.dataclass
@@ -121,7 +124,7 @@ def by_products(objective: Objective) -> Curved:
             return by, evaluation
 
         gradient, product, evaluation = jax.linearize(slope, point, has_aux=True)
-        return Curvature(evaluation, gradient, product, preconditioner)
+        return Curvature(evaluation, gradient, lambda: product, preconditioner)
 
     return curved
 
@@ -152,10 +155,13 @@ def is_stationary(numbers: NewtonNumbers, config: NewtonConfig) -> Array:
     return (numbers.expected <= config.tolerance) | (numbers.stalled >= config.patience)
 
 
-def most_to_gain(numbers: NewtonNumbers, num: int) -> Array:
-    """The lanes (num,) of a batch whose last iterations expected the greatest decreases."""
+def most_to_gain(numbers: NewtonNumbers, config: NewtonConfig, num: int) -> Array:
+    """The lanes (num,) of a batch whose last iterations expected the greatest decreases.
+
+    Unfinished ones come before those that are finished.
+    """
     expected = jnp.where(jnp.isnan(numbers.expected), jnp.inf, numbers.expected)
-    return jnp.argsort(-expected)[:num]
+    return jnp.argsort(jnp.where(is_unfinished(numbers, config), -expected, 1.0))[:num]
 
 
 def step(
@@ -196,12 +202,17 @@ def damped_steps(here: Curvature, damping: Array, config: NewtonConfig) -> tuple
     solve_about = here.preconditioner(damping)
     turned = solve_about(gradient)
     size = jnp.sqrt(jnp.maximum(jnp.sum(gradient * turned), 0.0))
+    if config.subspace:
+        product = here.products()
 
-    def image(direction: Array) -> tuple[Array, Array]:
-        product = here.product(direction) + damping * direction
-        return product, solve_about(product)
+        def image(direction: Array) -> tuple[Array, Array]:
+            found = product(direction) + damping * direction
+            return found, solve_about(found)
 
-    directions, diagonal, beside = _lanczos(gradient, turned, size, image, config.subspace)
+        directions, diagonal, beside = _lanczos(gradient, turned, size, image, config.subspace)
+    else:  # as if the preconditioner were the whole inverse
+        directions = turned[None] / jnp.maximum(size, 1e-30)
+        diagonal, beside = [jnp.ones_like(size)], []
     shift = jnp.maximum(-_lowest(diagonal, beside), 0.0)
     solve = lambda trial: _tridiagonal_solve(diagonal, beside, shift + trial)  # noqa: E731
     trials = jnp.asarray(config.trial_dampings, gradient.dtype)

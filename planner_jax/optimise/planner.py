@@ -13,13 +13,17 @@ from planner_jax.optimise.multistart import solve_batch, solve_round
 from planner_jax.optimise.newton import Curvature, NewtonConfig, by_products
 from planner_jax.optimise.problem import Round, Settings, Solver, Stage
 
-# From where the first search ends; the lanes that have most to gain go on.
-_POLISH = NewtonConfig(max_steps=8, tolerance=1e-7, patience=6, stragglers=((0.3, 30),))
+# From where the first search ends.
+_POLISH = NewtonConfig(
+    max_steps=8, damping=1e-6, tolerance=1e-7, patience=6, stragglers=(0.125, 10, 10)
+)
 _LONG = LbfgsConfig(max_steps=300, tolerance=1e-7, patience=6)
 # Of the first round, by effort.
 _EFFORTS = {
-    "good": NewtonConfig(max_steps=8, tolerance=1e-5, stragglers=((0.3, 12),)),
-    "best": NewtonConfig(max_steps=24, tolerance=1e-7, patience=8, stragglers=((0.3, 40),)),
+    "good": NewtonConfig(max_steps=1, damping=1e-6, tolerance=2e-2, stragglers=(0.125, 2, 60)),
+    "best": NewtonConfig(
+        max_steps=8, damping=1e-6, tolerance=1e-7, patience=8, stragglers=(0.125, 8, 32)
+    ),
 }
 
 
@@ -44,6 +48,8 @@ class OptimisedPlanner(abc.ABC):
 
     rounds: tuple[Round, ...]  # what to try, in order
     case_type: ClassVar[type | None] = None
+    # Vectors of Newton's method; 0 where the preconditioner of `curved` is nearly the inverse.
+    subspace: ClassVar[int] = 4
 
     @abc.abstractmethod
     def prepare(self, case: Any) -> Any:
@@ -97,8 +103,10 @@ class OptimisedPlanner(abc.ABC):
         """The planner with one search from the first guess instead of its rounds, a long one."""
         return self.changed((("rounds", (Round(solver=solver),)),))
 
-    def polished(self, solver: NewtonConfig = _POLISH) -> Self:
+    def polished(self, solver: NewtonConfig | None = None) -> Self:
         """The planner whose first round goes on by Newton's method, to the optimum by default."""
+        if solver is None:
+            solver = dataclasses.replace(_POLISH, subspace=self.subspace)
         first, *others = self.rounds
         stages = (*first.stages, Stage(first.solver, first.settings))
         first = dataclasses.replace(first, solver=solver, stages=stages)
@@ -108,8 +116,8 @@ class OptimisedPlanner(abc.ABC):
         """The planner with another first round, which searches on after every limit holds.
 
         Args:
-            effort: "good" for 8 iterations of Newton's method and 12 more of the 30 % of the cases
-                that have most to gain; "best" for 24 and 40. The rounds behind it, for what it
-                leaves unsolved, stay as they are.
+            effort: "good" for an iteration of Newton's method, "best" for 8, and more of the cases
+                that still have something to gain: 2 % of the cost for "good", 1e-7 for "best".
+                The rounds behind it, for what it leaves unsolved, stay as they are.
         """
-        return self.polished(_EFFORTS[effort])
+        return self.polished(dataclasses.replace(_EFFORTS[effort], subspace=self.subspace))

@@ -263,7 +263,7 @@ def _adjoint_by(here: Curvature, rhs: Array, steps: int) -> tuple[Array, Array]:
 
     The residual is not finite where the cost does not curve upward to begin with.
     """
-    solve = here.preconditioner(jnp.asarray(_DAMPING, rhs.dtype))
+    solve, product = here.preconditioner(jnp.asarray(_DAMPING, rhs.dtype)), here.products()
 
     def going(state: tuple) -> Array:
         num, _, _, _, size, curved = state
@@ -271,7 +271,7 @@ def _adjoint_by(here: Curvature, rhs: Array, steps: int) -> tuple[Array, Array]:
 
     def step(state: tuple) -> tuple:
         num, found, left, direction, size, _ = state
-        image = here.product(direction)
+        image = product(direction)
         curvature = jnp.sum(direction * image)
         curved = curvature > 0.0
         length = jnp.where(curved, size / jnp.where(curved, curvature, 1.0), 0.0)

@@ -228,11 +228,18 @@ def _first_plans(
     share = _length(cases) // mesh.size
     if share == sizes.next(share):
         return _solve(planner, attempt, mesh, cases)
-    found = []
-    for begin, size in sizes.cuts(share):
+    cuts = list(sizes.cuts(share))
+
+    def solve(begin: int, size: int) -> Any:
         part = _cut(mesh, size, cases, _number(mesh, begin))
-        found.append(_solve(planner, attempt, mesh, part)[0])
-    return _joined_locally(mesh, found, share)
+        return _solve(planner, attempt, mesh, part)[0]
+
+    programs = {size: _program(planner, attempt, size, cases) for _, size in cuts}
+    if len(set(programs.values()) - _COMPILED) > 1:  # at the same time, by calls of each size
+        with ThreadPoolExecutor(len(programs)) as pool:
+            list(pool.map(solve, *zip(*{size: (begin, size) for begin, size in cuts}.values())))
+        _COMPILED.update(programs.values())
+    return _joined_locally(mesh, [solve(*cut) for cut in cuts], share)
 
 
 def _is_one_cpu(mesh: Mesh) -> bool:

@@ -15,7 +15,11 @@ import numpy as np
 from jax import Array, lax
 
 from planner_jax.cost.along import Along
-from planner_jax.cost.along_curvature import curvature_along
+from planner_jax.cost.along_curvature import (
+    block_and_diagonal,
+    columns_columns,
+    curvature_along,
+)
 from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.newton import Curvature
 from planner_jax.optimise.preconditioner import block_preconditioner
@@ -41,6 +45,9 @@ def segments_curvature(
     active: Array,
 ) -> Curvature:
     """Evaluation, gradient and second derivatives of a trajectory's objective at a point.
+
+    All second derivatives are made for products alone; the preconditioner takes those among the
+    variables of the ends, and of each offset by itself.
 
     The objective is the cost of the ends, and of each segment that counts the energy of its offsets
     and the integral of its penalties. A point is, segment by segment, the offsets and then the
@@ -102,31 +109,39 @@ def segments_curvature(
         parts = [offsets.reshape(num, -1) * offset_units, natural.reshape(num, -1) * own_units]
         return jnp.concatenate(parts, axis=1).ravel()
 
-    def product(direction: Array) -> Array:
-        parts = direction.reshape(num, -1) * scale
-        step = parts[:, : offset_units.size].reshape(offsets.shape)
-        move = parts[:, offset_units.size :]
-        longer = move[:, 0, None, None]
-        columns = jnp.concatenate([dot(move.ravel(), turned, 1), step], axis=1)
-        image = einsum("ncafb,nfb->nca", of.columns_columns, columns)
-        image = image + of.columns_theta * longer
-        theta = jnp.sum(of.columns_theta * columns, axis=(1, 2)) + theta_theta * move[:, 0]
-        theta = theta - power * jnp.sum(bend * offsets * step, axis=(1, 2))
-        own = dot(turned, image[:, :num_rows], 3) + dot(within, move.ravel(), 1)
-        own = own.reshape(num, -1).at[:, 0].add(theta)
-        outer = image[:, num_rows:] + bend * step - power * bend * offsets * longer
-        return joined(outer, own)
+    def products() -> Callable[[Array], Array]:
+        whole = functools.partial(columns_columns, along, given=given)
+        hessian = jax.vmap(whole)(of.at_samples)
+
+        def product(direction: Array) -> Array:
+            parts = direction.reshape(num, -1) * scale
+            step = parts[:, : offset_units.size].reshape(offsets.shape)
+            move = parts[:, offset_units.size :]
+            longer = move[:, 0, None, None]
+            columns = jnp.concatenate([dot(move.ravel(), turned, 1), step], axis=1)
+            image = einsum("ncafb,nfb->nca", hessian, columns)
+            image = image + of.columns_theta * longer
+            theta = jnp.sum(of.columns_theta * columns, axis=(1, 2)) + theta_theta * move[:, 0]
+            theta = theta - power * jnp.sum(bend * offsets * step, axis=(1, 2))
+            own = dot(turned, image[:, :num_rows], 3) + dot(within, move.ravel(), 1)
+            own = own.reshape(num, -1).at[:, 0].add(theta)
+            outer = image[:, num_rows:] + bend * step - power * bend * offsets * longer
+            return joined(outer, own)
+
+        return product
 
     by_natural = by_natural.reshape(num, -1).at[:, 0].add(of.by_theta - power * energies)
     by_offsets = of.by_columns[:, num_rows:] + bend * offsets
     # The second derivatives among all variables of the ends, and of each offset by itself.
-    half = einsum("pnca,ncafb->pnfb", turned, of.columns_columns[:, :num_rows, :, :num_rows])
+    strong = functools.partial(block_and_diagonal, along, num=num_rows, given=given)
+    among_rows, own_bend = jax.vmap(strong)(of.at_samples)
+    half = einsum("pnca,ncafb->pnfb", turned, among_rows)
     is_time = jnp.asarray(np.eye(natural.size)[:: natural.shape[1]], scale.dtype)  # (N, N k)
     beside = einsum("pnca,nca->pn", turned, of.columns_theta[:, :num_rows])
     beside = dot(beside + 0.5 * theta_theta * is_time.T, is_time, 1)
     block = dot(half, turned, ((1, 2, 3), (1, 2, 3))) + within + beside + beside.T
     units = jnp.tile(own_units, num)
-    own_bend = einsum("nkaka->nka", of.columns_columns[:, num_rows:, :, num_rows:]) + bend
+    own_bend = own_bend + bend
     places = np.arange(num * scale.size).reshape(num, -1)[:, offset_units.size :]
     return Curvature(
         evaluation=Evaluation(
@@ -134,7 +149,7 @@ def segments_curvature(
             violation=jnp.maximum(worst, excess) + BETWEEN_NODES,
         ),
         gradient=joined(by_offsets, by_natural),
-        product=product,
+        products=products,
         preconditioner=block_preconditioner(
             places.reshape(1, -1),
             (block * units * units[:, None])[None],

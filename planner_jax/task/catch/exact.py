@@ -81,6 +81,7 @@ _FIRST = Round(starts=1, solver=LbfgsConfig(max_steps=8))
 _FROM_LEARNED = Round(starts=1, solver=LbfgsConfig(max_steps=2))  # in its place, of one target
 # In its place, of several targets, where Newton's method goes on: it would begin too far away.
 _LONG_CHAIN = Stage(LbfgsConfig(max_steps=200, tolerance=1e-6, patience=5))
+_CHAIN_TOLERANCE = 1e-4
 _LEAN = 0.95  # of the angle that the net may have to the ball's way, what a guess makes use of
 
 
@@ -144,6 +145,7 @@ class ExactCatch(OptimisedPlanner):
     """
 
     case_type = CatchCase
+    subspace = 0
     proportions: tuple[float, ...] = _PROPORTIONS  # relative durations of the pieces
     nodes: int = 8  # penalty intervals a piece
     time_weight: float = 0.005
@@ -231,7 +233,10 @@ class ExactCatch(OptimisedPlanner):
     def _for_start(self, attempt: Round, case: CatchCase) -> Round:
         """A shorter first round where it begins near its end, a longer stage where it is far."""
         if attempt.stages == (Stage(_FIRST.solver),) and case.num_targets > 1:
-            return dataclasses.replace(attempt, stages=(_LONG_CHAIN,))
+            # Far from the end what an iteration gains says little of what all of them do.
+            slow = min(attempt.solver.tolerance, _CHAIN_TOLERANCE)
+            solver = dataclasses.replace(attempt.solver, tolerance=slow)
+            return dataclasses.replace(attempt, stages=(_LONG_CHAIN,), solver=solver)
         is_near = attempt == _FIRST and self._network is not None and _is_learned(case)
         return _FROM_LEARNED if is_near else attempt
 

@@ -129,6 +129,7 @@ class ExactHit(OptimisedPlanner):
     """
 
     case_type = HitCase
+    subspace = 0
     # Relative durations of the pieces. The first are short, because a hovering quadrotor has
     # to begin to turn at once and its jerk is continuous.
     proportions: tuple[float, ...] = _PROPORTIONS
