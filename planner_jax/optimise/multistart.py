@@ -46,7 +46,8 @@ def minimise(
     """
     if config.max_steps == 0:
         return _optimum_at(start, objective(start), config)
-    config = _with_stragglers(config)
+    if isinstance(config, NewtonConfig):
+        config = _with_stragglers(config)
     state = lax.while_loop(
         lambda s: _method(config).is_unfinished(s.numbers, config),
         lambda s: _step(objective, curved, s, config),
@@ -96,19 +97,19 @@ def minimise_lanes(
     state = searched(state, contexts, config, config.max_steps)
     if isinstance(config, NewtonConfig) and config.stragglers is not None:
         share, steps, groups = config.stragglers
-        config, num = _with_stragglers(config), math.ceil(share * starts.shape[-1])
+        longer, num = _with_stragglers(config), math.ceil(share * starts.shape[-1])
 
         def next_group(made: tuple[Array, Any]) -> tuple[Array, Any]:
             number, state = made
-            lanes = newton.most_to_gain(state.numbers, config, num)
-            some = jax.tree.map(lambda leaf: leaf[..., lanes], (state, contexts))
-            later = searched(*some, config, steps)
+            lanes = newton.most_to_gain(state.numbers, longer, num)
+            some, given = jax.tree.map(lambda leaf: leaf[..., lanes], (state, contexts))
+            later = searched(some, given, longer, steps)
             place = lambda old, new: old.at[..., lanes].set(new)  # noqa: E731
             return number + 1, jax.tree.map(place, state, later)
 
         def is_open(made: tuple[Array, Any]) -> Array:
             number, state = made
-            return (number < groups) & jnp.any(newton.is_unfinished(state.numbers, config))
+            return (number < groups) & jnp.any(newton.is_unfinished(state.numbers, longer))
 
         _, state = lax.while_loop(is_open, next_group, (jnp.zeros((), jnp.int32), state))
     return _optimum_of(state, config)
@@ -128,9 +129,9 @@ def _step(objective: Objective, curved: Curved | None, state: Any, config: Solve
     return lbfgs.step(objective, state, config)
 
 
-def _with_stragglers(config: Solver) -> Solver:
+def _with_stragglers(config: NewtonConfig) -> NewtonConfig:
     """The iterations of a lane that goes on as long as it may."""
-    if not isinstance(config, NewtonConfig) or config.stragglers is None:
+    if config.stragglers is None:
         return config
     _, steps, groups = config.stragglers
     return dataclasses.replace(config, max_steps=config.max_steps + steps * groups, stragglers=None)

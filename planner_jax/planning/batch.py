@@ -237,7 +237,8 @@ def _first_plans(
     programs = {size: _program(planner, attempt, size, cases) for _, size in cuts}
     if len(set(programs.values()) - _COMPILED) > 1:  # at the same time, by calls of each size
         with ThreadPoolExecutor(len(programs)) as pool:
-            list(pool.map(solve, *zip(*{size: (begin, size) for begin, size in cuts}.values())))
+            begins = {size: begin for begin, size in cuts}
+            list(pool.map(solve, begins.values(), begins))
         _COMPILED.update(programs.values())
     return _joined_locally(mesh, [solve(*cut) for cut in cuts], share)
 
@@ -380,11 +381,11 @@ def _each_from_host(
         yield from later
 
 
-_COMPILED: set[Hashable] = set()  # what `_program` names of the programs that threads have called
+_COMPILED: set[Hashable] = set()  # what `_program` names of the programs that have been called
 
 
 def _program(planner: Any, attempt: Attempt, num: int, cases: Any) -> Hashable:
-    """What tells a compiled `_solve` of so many lanes on one CPU apart from the others."""
+    """What tells a compiled `_solve` of so many lanes apart from the others."""
     own = tuple((leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(planner))
     given = tuple((leaf.shape[1:], leaf.dtype) for leaf in jax.tree.leaves(cases))
     return jax.tree.structure((planner, cases)), own, given, attempt, num
