@@ -176,7 +176,7 @@ def test_a_later_round_takes_only_what_is_unsolved(monkeypatch):
     goals = np.full(300, 0.5, np.float32)
     goals[[7, -1]] = 3.5
     assert is_solved(plan(WellPlanner(), Well(jnp.asarray(goals))).status).all()
-    assert sizes == [256, 128, 16]
+    assert sorted(sizes[:2]) == [128, 256] and sizes[2:] == [16]  # the first two at once
 
 
 def test_one_process_plans_the_whole_batch_alone():

@@ -235,12 +235,15 @@ def _first_plans(
         return _solve(planner, attempt, mesh, part)[0]
 
     programs = {size: _program(planner, attempt, size, cases) for _, size in cuts}
-    if len(set(programs.values()) - _COMPILED) > 1:  # at the same time, by calls of each size
-        with ThreadPoolExecutor(len(programs)) as pool:
-            begins = {size: begin for begin, size in cuts}
-            list(pool.map(solve, begins.values(), begins))
+    found: dict[int, Any] = {}
+    if len(set(programs.values()) - _COMPILED) > 1:  # compiled at the same time
+        firsts = {size: begin for begin, size in reversed(cuts)}
+        with ThreadPoolExecutor(len(firsts)) as pool:
+            made = pool.map(solve, firsts.values(), firsts)
+            found = dict(zip(firsts.values(), made, strict=True))
         _COMPILED.update(programs.values())
-    return _joined_locally(mesh, [solve(*cut) for cut in cuts], share)
+    parts = [found[begin] if begin in found else solve(begin, size) for begin, size in cuts]
+    return _joined_locally(mesh, parts, share)
 
 
 def _is_one_cpu(mesh: Mesh) -> bool:
