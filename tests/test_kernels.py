@@ -20,13 +20,13 @@ from planner_jax.task.catch.exact import ExactCatch
 from planner_jax.task.hit.exact import ExactHit
 
 LANES = 128
-# Of one round: the ball's table; penalties with slopes, without, and the greatest of a finished
-# plan; the direction; and made by `in_one_kernel` the ends of a trajectory, at a point and at the
-# trial steps, their slopes, and the choice of a step.
+# Of one round: the table; penalties with slopes, without (of guesses, of trials), greatest of a
+# finished plan; the direction; and made by `in_one_kernel` the ends of a trajectory, there and at
+# trial steps and guesses, their slopes, and the choice of a step.
 ROUND = {
     "flight_table": 1,
-    "integrate_along": 4,
-    "lanes": 6,
+    "integrate_along": 3,
+    "lanes": 5,
     "lbfgs_turn": 1,
     "greatest_along": 1,
 }
