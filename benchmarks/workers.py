@@ -6,8 +6,8 @@ Four ways to make the same hits take turns, so that a slow minute of the machine
 a plain sweep bound to one core; a plain sweep bound to each core, all at the same time; one Ray
 worker, bound to one core with the process that asks it; and a Ray worker for each core. The second
 says how much the cores of this machine give at most, since they may share caches, memory or a
-clock. A rate is of the chunks after the first few, which the workers need to begin. Linux, because
-processes are bound to cores.
+clock. A rate is of the chunks after the first few, which the workers need to begin. The cost gap is
+that of a thousand of the hits. Linux, because processes are bound to cores.
 """
 
 import os
@@ -19,6 +19,10 @@ import tempfile
 import time
 from pathlib import Path
 
+import numpy as np
+
+import planner_jax as pj
+from planner_jax.benchmarks.cost_gap import COMPARED, cost_gaps, gap_figures
 from planner_jax.benchmarks.run import argument_parser, begin
 from planner_jax.sweep.run_folder import RunFolder
 
@@ -90,18 +94,23 @@ def main() -> None:
                 rates[name].append(sum(sweep.rate() for sweep in sweeps))
                 summaries[name] = sweeps[0].summary()
                 shutil.rmtree(place)
+        planner, cases = pj.hit.planner("exact"), pj.hit.draw(COMPARED)
+        gaps = cost_gaps(planner, cases, pj.plan(planner, cases))
+        told = ", ".join(f"{100.0 * (each or 0.0):.1f} %" for each in gap_figures(gaps).values())
+        bench.say(f"cost above a longer search's (median, p90, p99): {told}")
         bench.say("| made by | plans/s, median | lowest | highest | times one | success |")
         bench.say("|---|---|---|---|---|---|")
         for name, found in rates.items():
             one = rates["one worker" if ways[name][1] else "a plain sweep on one core"]
             times = statistics.median(f / a for f, a in zip(found, one, strict=True))
             median, success = statistics.median(found), summaries[name]["success_rate"]
+            bench.count(np.arange(options.num) < summaries[name]["successes"])
             bench.say(
                 f"| {name} | {median:.0f} | {min(found):.0f} | {max(found):.0f} | {times:.2f} "
                 f"| {100 * success:.2f} % refereed |"
             )
             bench.row(made_by=name, plans_per_second=median, times_one=times, success=success)
-            bench.note(**{f"{name}, times one": times})
+            bench.note(**{f"{name}, times one": times}, **gap_figures(gaps))
 
 
 if __name__ == "__main__":
