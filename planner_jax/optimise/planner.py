@@ -106,7 +106,7 @@ class OptimisedPlanner(abc.ABC):
     def polished(self, solver: NewtonConfig | None = None) -> Self:
         """The planner whose first round goes on by Newton's method, to the optimum by default."""
         if solver is None:
-            solver = dataclasses.replace(_POLISH, subspace=self.subspace)
+            solver = self._suited(_POLISH)
         first, *others = self.rounds
         stages = (*first.stages, Stage(first.solver, first.settings))
         first = dataclasses.replace(first, solver=solver, stages=stages)
@@ -120,4 +120,8 @@ class OptimisedPlanner(abc.ABC):
                 that still have something to gain: 2 % of the cost for "good", 1e-7 for "best".
                 The rounds behind it, for what it leaves unsolved, stay as they are.
         """
-        return self.polished(dataclasses.replace(_EFFORTS[effort], subspace=self.subspace))
+        return self.polished(self._suited(_EFFORTS[effort]))
+
+    def _suited(self, solver: NewtonConfig) -> NewtonConfig:
+        """With as many vectors as the planner's preconditioner leaves to be searched."""
+        return dataclasses.replace(solver, subspace=self.subspace)

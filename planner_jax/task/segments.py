@@ -134,14 +134,14 @@ def segments_curvature(
     by_offsets = of.by_columns[:, num_rows:] + bend * offsets
     # The second derivatives among all variables of the ends, and of each offset by itself.
     strong = functools.partial(block_and_diagonal, along, num=num_rows, given=given)
-    among_rows, own_bend = jax.vmap(strong)(of.at_samples)
+    among_rows, alone = jax.vmap(strong)(of.at_samples)
     half = einsum("pnca,ncafb->pnfb", turned, among_rows)
     is_time = jnp.asarray(np.eye(natural.size)[:: natural.shape[1]], scale.dtype)  # (N, N k)
     beside = einsum("pnca,nca->pn", turned, of.columns_theta[:, :num_rows])
     beside = dot(beside + 0.5 * theta_theta * is_time.T, is_time, 1)
     block = dot(half, turned, ((1, 2, 3), (1, 2, 3))) + within + beside + beside.T
     units = jnp.tile(own_units, num)
-    own_bend = own_bend + bend
+    own_bend = alone + bend
     places = np.arange(num * scale.size).reshape(num, -1)[:, offset_units.size :]
     return Curvature(
         evaluation=Evaluation(

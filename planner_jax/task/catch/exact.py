@@ -425,7 +425,7 @@ class ExactCatch(OptimisedPlanner):
         return np.arange(0, size, len(self.scale))[:, None] + one
 
     def curved(self, point: Array, context: CatchContext) -> Curvature:
-        """Evaluation, gradient, and second derivatives, which are made as a whole."""
+        """Evaluation, gradient, and second derivatives; see `segments_curvature`."""
         offsets, natural = self._split(point)
         return segments_curvature(
             self.maps,

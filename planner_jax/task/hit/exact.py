@@ -327,7 +327,7 @@ class ExactHit(OptimisedPlanner):
         return rows, duration, self._hinges(at_impact) + energy, jnp.max(at_impact)
 
     def curved(self, point: Array, context: HitContext) -> Curvature:
-        """Evaluation, gradient, and second derivatives, which are made as a whole."""
+        """Evaluation, gradient, and second derivatives; see `segments_curvature`."""
         offsets, natural = self._split(point)
 
         def ends(natural: Array) -> tuple[Array, Array, Array, Array]:
