@@ -3,10 +3,13 @@
     python -m benchmarks.hit_rows --serves DIR [--rows base,late-0.5] [--num N] [--out DIR]
 
 Without --serves the serves are drawn by the generator (seed 0). Rows: the base start, a start
-drawn over the half court, planning that begins late, weaker limits, and drag after the impact.
+drawn over the half court, planning that begins late, weaker limits, and drag after the impact. One
+row is not of the protocol: `tight` has limits of 2.5 m/s, 10 m/s^2 and 3 rad/s, and every hundredth
+ball flies away from the quadrotor, so that no plan can reach it.
 Prints a table; the run folder also holds the indices of each row's failures.
 """
 
+import dataclasses
 import time
 from pathlib import Path
 from typing import Any
@@ -25,14 +28,29 @@ ROWS: dict[str, dict] = {
     **{f"late-{delay}": {"delay": delay} for delay in (0.3, 0.5, 0.6, 0.8)},
     **{f"limits-{scale}": {"limit_scale": scale} for scale in (0.7, 0.5, 0.35)},
     "drag-after-impact": {},
+    "tight": {},
 }
+_TIGHT = {"speed": 2.5, "acceleration": 10.0, "body_rate": 3.0}
+
+
+def cases_of(name: str, serves: Serves) -> pj.hit.HitCase:
+    """The cases of a row."""
+    cases = pj.hit.to_cases(serves, **ROWS[name])
+    if name != "tight":
+        return cases
+    vel = np.array(cases.ball.vel)
+    vel[::100, :2] *= -1.0
+    same = {field: np.full_like(vel[:, 0], value) for field, value in _TIGHT.items()}
+    return cases.replace(
+        limits=dataclasses.replace(cases.limits, **same), ball=cases.ball.replace(vel=vel)
+    )
 
 
 def run_row(bench: Bench, name: str, serves: Serves) -> dict[str, Any]:
     """One row's figures, counted."""
     drag_after = name == "drag-after-impact"
     planner = pj.hit.planner("exact", drag_after_impact=drag_after)
-    cases = pj.hit.to_cases(serves, **ROWS[name])
+    cases = cases_of(name, serves)
     began = time.perf_counter()
     pj.plan(planner, cases)
     first = time.perf_counter() - began

@@ -301,6 +301,18 @@ def test_the_energy_formula_is_the_energy_of_the_trajectory(order, pieces):
     np.testing.assert_allclose(formula, energy(np.asarray(trajectory.coeffs), form), rtol=1e-9)
 
 
+@pytest.mark.parametrize("proportions", [(1.0,) * 12, (0.2, 0.5) + (1.0,) * 10, (1.0, 30.0)])
+@every_order
+def test_the_least_energy_is_that_of_a_frame_in_uniform_motion_far_away(order, proportions):
+    form = proportional_minco(order, proportions).boundary_energy
+    rows, _ = proportional_problem(order, 3)
+    moving = rows.copy()
+    moving[[0, order]] += [[10.0], [10.0 + 3.0 * len(proportions)]]  # metres, at 3 m a piece
+    moving[[1, order + 1]] += 3.0
+    at_rest, far_away = (np.einsum("bi,bc,ci->", x, form, x) for x in (rows, moving))
+    np.testing.assert_allclose(far_away, at_rest, rtol=1e-9)
+
+
 @every_size
 def test_waypoints_and_offsets_are_found_from_each_other(order, pieces):
     maps = maps_of(order, pieces)

@@ -12,7 +12,7 @@ from jax import Array
 from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.planner import OptimisedPlanner, pending
-from planner_jax.optimise.problem import Round
+from planner_jax.optimise.problem import Round, Stage
 from planner_jax.planning import batch
 from planner_jax.planning.plan import plan, plan_across_processes
 from planner_jax.protocol import Plan, Status, is_solved
@@ -81,6 +81,40 @@ def test_a_single_case_equals_its_lane_in_a_batch():
         alone = plan(WellPlanner(), Well(goal))
         np.testing.assert_allclose(alone.point, batch.point[lane], rtol=1e-5, atol=1e-5)
         assert alone.status == batch.status[lane]
+
+
+def _kept(keep):
+    """A look at both guesses, and a search from those that are kept."""
+    look, search = (LbfgsConfig(max_steps=num, step_cap=0.2) for num in (3, 40))
+    return WellPlanner(rounds=(Round(2, search, stages=(Stage(look, keep=keep),)),))
+
+
+@pytest.mark.parametrize("keep", [1, 2, 5])
+def test_the_starts_that_a_stage_keeps_are_those_that_cost_least_by_then(keep):
+    plans = plan(_kept(keep), Well(GOALS))
+    assert is_solved(plans.status).all()
+    np.testing.assert_allclose(plans.point[:, 0], GOALS, atol=0.05)
+    for lane, goal in enumerate(GOALS):
+        alone = plan(_kept(keep), Well(goal))
+        np.testing.assert_allclose(alone.point, plans.point[lane], rtol=1e-5, atol=1e-5)
+        assert alone.status == plans.status[lane]
+        assert alone.iterations == plans.iterations[lane] > 3
+
+
+def test_a_start_whose_cost_is_not_finite_is_the_last_to_be_kept():
+    @jax.tree_util.register_static
+    class Cliff(WellPlanner):
+        def guesses(self, context, num):
+            return jnp.array([[jnp.nan], [context.goal]])[:num]
+
+    plans = plan(Cliff(rounds=_kept(1).rounds), Well(GOALS))
+    np.testing.assert_allclose(plans.point[:, 0], GOALS, atol=0.05)
+
+
+@pytest.mark.parametrize("keep", [0, -1, 1.5, True])
+def test_a_stage_that_keeps_no_starts_is_refused(keep):
+    with pytest.raises((TypeError, ValueError), match=r"^keep must be (a whole number|>= 1), got"):
+        Stage(LbfgsConfig(), keep=keep)
 
 
 def test_chunks_and_padding_change_nothing():

@@ -16,7 +16,7 @@ from planner_jax.lanes import over_lanes
 from planner_jax.optimise import lbfgs, newton
 from planner_jax.optimise.evaluation import Evaluation, Objective
 from planner_jax.optimise.newton import Curvature, Curved, NewtonConfig, by_products
-from planner_jax.optimise.problem import Problem, Round, Solver
+from planner_jax.optimise.problem import Problem, Round, Solver, Stage
 from planner_jax.protocol import FEASIBILITY_TOLERANCE, Status, is_unsolved, status_of
 
 # So few iterations are counted, so that a GPU need not tell the host whether to go on.
@@ -165,23 +165,29 @@ def solve_round(planner: Problem, attempt: Round, case: Any) -> Any:
     Returns:
         The planner's plan of the best start, its `status` and `iterations` set.
     """
-    planners, configs = _stages(planner, attempt)
-    context = planners[-1].prepare(case)
+    last = planner.changed(attempt.settings)
+    context = last.prepare(case)
 
-    def from_start(start: Array) -> Any:
-        iterations = jnp.zeros((), jnp.int32)
-        for stage, config in zip(planners, configs, strict=True):
-            optimum = minimise(
-                lambda x: stage.objective(x, context),  # noqa: B023
-                start,
-                config,
-                lambda x: stage.curved(x, context),  # noqa: B023
-            )
-            start, iterations = optimum.point, iterations + optimum.iterations
-        return _plan_at(planners[-1], dataclasses.replace(optimum, iterations=iterations), context)
+    def search(stage: Stage, start: Array) -> Optimum:
+        problem = planner.changed(stage.settings)
+        return minimise(
+            lambda x: problem.objective(x, context),
+            start,
+            stage.solver,
+            lambda x: problem.curved(x, context),
+        )
 
-    starts = planners[-1].guesses(context, attempt.starts)
-    return from_start(starts[0]) if attempt.starts == 1 else _best(jax.vmap(from_start)(starts))
+    points = last.guesses(context, attempt.starts)
+    spent = jnp.zeros(len(points), jnp.int32)
+    for stage in _stages(attempt):
+        optimum = _of_each(functools.partial(search, stage), points)
+        points, spent = optimum.point, spent + optimum.iterations
+        if stage.keep is not None:
+            kept = _cheapest(optimum.evaluation.cost, stage.keep)
+            points, spent = points[kept], spent[kept]
+    optimum = dataclasses.replace(optimum, iterations=spent)
+    plans = _of_each(lambda found: _plan_at(last, found, context), optimum)
+    return jax.tree.map(lambda leaf: leaf[0], plans) if len(points) == 1 else _best(plans)
 
 
 def solve_batch(planner: Problem, attempt: Round, cases: Any) -> Any:
@@ -195,32 +201,55 @@ def solve_batch(planner: Problem, attempt: Round, cases: Any) -> Any:
     Returns:
         Their plans, a leading axis on every leaf.
     """
-    planners, configs = _stages(planner, attempt)
+    last, num = planner.changed(attempt.settings), attempt.starts
     lanes = jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), cases)
-    contexts = over_lanes(planners[-1].prepare)(lanes)
-    starts = over_lanes(lambda context: planners[-1].guesses(context, attempt.starts))(contexts)
+    contexts = over_lanes(last.prepare)(lanes)
+    starts = over_lanes(lambda context: last.guesses(context, num))(contexts)
     # A lane of the solver is one start of one case; the starts of a case are neighbours.
     points = jnp.moveaxis(starts, 0, -1).reshape(starts.shape[1], -1)
-    if attempt.starts > 1:
-        contexts = jax.tree.map(lambda x: jnp.repeat(x, attempt.starts, axis=-1), contexts)
-    iterations = jnp.zeros(points.shape[1:], jnp.int32)
-    for stage, config in zip(planners, configs, strict=True):
-        optimum = minimise_lanes(stage.objective, points, contexts, config, stage.curved)
-        points, iterations = optimum.point, iterations + optimum.iterations
-    optimum = dataclasses.replace(optimum, iterations=iterations)
-    plans = over_lanes(functools.partial(_plan_at, planners[-1]))(optimum, contexts)
+    of_starts = _repeated(contexts, num)
+    spent = jnp.zeros(points.shape[1:], jnp.int32)
+    for stage in _stages(attempt):
+        problem = planner.changed(stage.settings)
+        optimum = minimise_lanes(problem.objective, points, of_starts, stage.solver, problem.curved)
+        points, spent = optimum.point, spent + optimum.iterations
+        if stage.keep is not None:
+            costs = optimum.evaluation.cost.reshape(-1, num)
+            kept = jax.vmap(lambda of_case: _cheapest(of_case, stage.keep))(costs)  # noqa: B023
+            kept = (kept + num * jnp.arange(len(costs))[:, None]).ravel()
+            points, spent, num = points[:, kept], spent[kept], min(stage.keep, num)
+            of_starts = _repeated(contexts, num)
+    optimum = dataclasses.replace(optimum, iterations=spent)
+    plans = over_lanes(functools.partial(_plan_at, last))(optimum, of_starts)
     plans = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), plans)
-    if attempt.starts == 1:
+    if num == 1:
         return plans
-    split = lambda x: x.reshape(-1, attempt.starts, *x.shape[1:])  # noqa: E731
+    split = lambda x: x.reshape(-1, num, *x.shape[1:])  # noqa: E731
     return jax.vmap(_best)(jax.tree.map(split, plans))
 
 
-def _stages(planner: Problem, attempt: Round) -> tuple[list[Problem], list[Solver]]:
-    """The problems to be solved one after another; the last is the one that counts."""
-    planners = [planner.changed(stage.settings) for stage in attempt.stages]
-    configs = [stage.solver for stage in attempt.stages]
-    return [*planners, planner.changed(attempt.settings)], [*configs, attempt.solver]
+def _stages(attempt: Round) -> tuple[Stage, ...]:
+    """The searches, one after another, the round's own last."""
+    return (*attempt.stages, Stage(attempt.solver, attempt.settings))
+
+
+def _of_each(function: Callable, starts: Any) -> Any:
+    """`function` of every start, without a batch where there is one alone."""
+    if len(jax.tree.leaves(starts)[0]) > 1:
+        return jax.vmap(function)(starts)
+    return jax.tree.map(lambda leaf: leaf[None], function(jax.tree.map(lambda x: x[0], starts)))
+
+
+def _repeated(contexts: Any, num: int) -> Any:
+    """The context of every start, that of each case `num` times."""
+    if num == 1:
+        return contexts
+    return jax.tree.map(lambda x: jnp.repeat(x, num, axis=-1), contexts)
+
+
+def _cheapest(costs: Array, num: int) -> Array:
+    """Which starts of a case cost least, (num,) of costs (S,); a cost that is not finite, most."""
+    return jnp.argsort(jnp.where(jnp.isfinite(costs), costs, jnp.inf))[:num]
 
 
 def _plan_at(planner: Problem, optimum: Optimum, context: Any) -> Any:

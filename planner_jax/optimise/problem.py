@@ -5,7 +5,7 @@ from typing import Any, Protocol
 
 from jax import Array
 
-from planner_jax.checks import require_kind
+from planner_jax.checks import require_kind, require_size
 from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.newton import Curvature, NewtonConfig
@@ -21,6 +21,12 @@ class Stage:
 
     solver: Solver
     settings: Settings = ()
+    keep: int | None = None  # starts of a case that go on, those that cost least; None: all
+
+    def __post_init__(self) -> None:
+        require_kind("solver", self.solver, LbfgsConfig, NewtonConfig)
+        if self.keep is not None:
+            require_size("keep", self.keep, 1)
 
 
 @dataclasses.dataclass(frozen=True)

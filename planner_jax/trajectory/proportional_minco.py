@@ -94,6 +94,22 @@ def _hermite_energy(order: int) -> np.ndarray:
     return hermite.T @ energy_form(2 * order - 1, order)[0] @ hermite
 
 
+def _energy(coefficients: np.ndarray, shares: np.ndarray) -> np.ndarray:
+    """Energy of the pieces together as a quadratic form in their columns, (C, C).
+
+    From the squares of what each piece has of it, because the form in the nodes' derivatives
+    loses the small energies of smooth motion far from the origin to rounding.
+
+    Args:
+        coefficients: (M, 2s, C) of the powers of each piece's unit time.
+        shares: (M,) durations of the pieces.
+    """
+    s = coefficients.shape[1] // 2
+    root = np.linalg.cholesky(energy_form(2 * s - 1, s)[0][s:, s:]).T
+    parts = root @ coefficients[:, s:] / np.sqrt(shares[:, None, None] ** (2 * s - 1))
+    return np.einsum("mkb,mkc->bc", parts, parts)
+
+
 @functools.cache
 def proportional_minco(order: int, proportions: tuple[float, ...]) -> ProportionalMinco:
     """Build the constant maps (cached).
@@ -134,14 +150,15 @@ def proportional_minco(order: int, proportions: tuple[float, ...]) -> Proportion
     to_offsets = np.linalg.inv(from_offsets)
     nodes = nodal @ from_offsets
     pieces = np.stack([nodes[i * s : (i + 2) * s] for i in range(m)])
+    coefficients = _hermite_map(s) @ (units[:, :, None] * pieces)  # of each piece's unit time
     powers = shares[:, None] ** np.arange(2 * s)
     return ProportionalMinco(
         order=s,
         proportions=shares,
-        coefficients=_hermite_map(s) @ (units[:, :, None] * pieces) / powers[:, :, None],
+        coefficients=coefficients / powers[:, :, None],
         waypoints=from_offsets[q],
         offsets=to_offsets[q],
-        boundary_energy=energy[b, b] + energy[b, q] @ smooth,
+        boundary_energy=_energy(coefficients[..., b], shares),
         offset_energy=float(norm) ** -2,
     )
 

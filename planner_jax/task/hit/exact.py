@@ -34,7 +34,7 @@ from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.learned_start import StartNetwork, cheaper_start, shipped_network
 from planner_jax.optimise.newton import Curvature
 from planner_jax.optimise.planner import OptimisedPlanner, pending
-from planner_jax.optimise.problem import Round
+from planner_jax.optimise.problem import Round, Stage
 from planner_jax.optimise.scaling import shipped_scale
 from planner_jax.protocol import require_settings
 from planner_jax.robot.quadrotor import tangent_basis
@@ -57,6 +57,14 @@ from planner_jax.trajectory.proportional_minco import (
 _ORDER = 4  # minimum snap
 _PROPORTIONS = (0.2, 0.5) + (1.0,) * 10
 _SEEN = (0.5, 0.75, 0.95)  # of the landing time, at which a learned start looks at the ball
+# A round that looks for any feasible plan.
+_HARD = LbfgsConfig(memory=12, tolerance=1e-6, patience=5)
+_ANY_FEASIBLE = (
+    ("energy_weight", 1e-11),
+    ("margin", 0.01),
+    ("nodes", 8),
+    ("learned", False),
+)
 _DECODE_NODES = 16  # intervals a piece at which a finished plan is looked at
 
 
@@ -141,24 +149,16 @@ class ExactHit(OptimisedPlanner):
     hinge_width: float = 0.1
     impact_weight: float = 0.3  # [s], of apex and hitting-speed hinges beside the integrals
     # The first two solve what is easy. Where limits bind all along the way, energy is worth
-    # nothing any more and the margin has to give: the others look for any feasible plan.
+    # nothing any more and the margin has to give: the last looks for any feasible plan, long from
+    # where a short search from each start says that it is worth it.
     rounds: tuple[Round, ...] = (
         Round(starts=1, solver=LbfgsConfig(max_steps=3)),
         Round(starts=1, solver=LbfgsConfig(max_steps=60)),
         Round(
-            starts=8,
-            solver=LbfgsConfig(max_steps=80),
-            settings=(("energy_weight", 1e-10), ("margin", 0.015), ("learned", False)),
-        ),
-        Round(
             starts=12,
-            solver=LbfgsConfig(max_steps=400, memory=12, tolerance=1e-6, patience=5),
-            settings=(
-                ("energy_weight", 1e-11),
-                ("margin", 0.01),
-                ("nodes", 6),
-                ("learned", False),
-            ),
+            solver=dataclasses.replace(_HARD, max_steps=400),
+            settings=_ANY_FEASIBLE,
+            stages=(Stage(dataclasses.replace(_HARD, max_steps=60), _ANY_FEASIBLE, keep=3),),
         ),
     )
     scale: tuple[float, ...] = ()
