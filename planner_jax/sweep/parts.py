@@ -6,6 +6,7 @@ with a word on the standard error stream, and its cases are planned again.
 """
 
 import dataclasses
+import io
 import json
 import sys
 import zlib
@@ -31,6 +32,22 @@ _SECONDS = ("plan_seconds", "compile_seconds", "referee_seconds", "wall_seconds"
 
 class PartError(ValueError):
     """A file is not a part of the run; a few words that say why."""
+
+
+class _Pieces(io.RawIOBase):
+    """A file in memory, as the pieces that were written: one block would be moved as it grows."""
+
+    def __init__(self) -> None:
+        self.pieces: list[Any] = []
+        self.sum = 0
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, piece: Any) -> int:
+        self.pieces.append(piece)
+        self.sum = zlib.crc32(piece, self.sum)
+        return len(piece)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,15 +89,12 @@ class Parts:
         self.folder.mkdir(exist_ok=True)
         record = {**self._own(number), **record}
         metadata = {**(rows.schema.metadata or {}), _RECORD: json.dumps(record).encode()}
-        stream = pa.BufferOutputStream()
-        how = encoding(rows.schema)
-        pq.write_table(
-            rows.replace_schema_metadata(metadata), stream, row_group_size=ROW_GROUP, **how
-        )
-        content = stream.getvalue()
-        name = f"part-{number:06d}-{zlib.crc32(content):08x}.parquet"
-        with replacing(self.folder / name) as scratch:
-            scratch.write_bytes(content)
+        rows = rows.replace_schema_metadata(metadata)
+        written = _Pieces()
+        pq.write_table(rows, written, row_group_size=ROW_GROUP, **encoding(rows.schema))
+        name = f"part-{number:06d}-{written.sum:08x}.parquet"
+        with replacing(self.folder / name) as scratch, open(scratch, "wb") as file:
+            file.writelines(written.pieces)
         self.run.sent(self.folder / name)
         return record
 
