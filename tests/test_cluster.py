@@ -1,5 +1,6 @@
 """Sweeps whose chunks are made by a Ray cluster: a stand-in for Ray, and Ray itself (slow)."""
 
+import functools
 import itertools
 import os
 import signal
@@ -424,3 +425,20 @@ def test_a_run_with_a_real_cluster_survives_the_death_of_a_worker(tmp_path):
     assert killed and sweep.returncode == 0, said
     assert rows_of(out) == rows_of(plain)
     assert not any(os.path.exists(f"/proc/{pid}") for pid in raylets)
+
+
+@pytest.mark.slow
+def test_workers_of_a_real_cluster_that_hold_shares_of_gpus_make_the_same_rows(
+    tmp_path, monkeypatch
+):
+    """The cluster is told of two GPUs, and its workers compute on the CPU."""
+    ray = pytest.importorskip("ray")
+    plain, out = tmp_path / "plain", tmp_path / "run"
+    options = "--num 32 --batch 2 --planner juggle --out".split()
+    command = [sys.executable, "-m", "planner_jax", "sweep", "hit", *options, str(plain)]
+    subprocess.run(command, check=True, capture_output=True)
+    monkeypatch.setattr(ray, "init", functools.partial(ray.init, num_gpus=2))
+    monkeypatch.setattr(cluster, "require_backend", lambda: "gpu")
+    settings = HitSettings(num=32, batch=2, planner="juggle")
+    start_sweep(TASK, settings, out, progress=False, workers="ray")
+    assert rows_of(out) == rows_of(plain)
