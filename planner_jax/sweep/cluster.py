@@ -291,7 +291,8 @@ def _made(
     """Chunks of these numbers in their order, each once it is made."""
     identity, x64 = run.parts.identity, jnp.result_type(float) == jnp.float64
     asked = identity["run"], run.sweep.task, run.source.settings, identity["settings"]
-    platforms = jax.config.jax_platforms if places.gpu else "cpu"
+    config: Any = jax.config  # whose options are no attributes to a type checker
+    platforms = config.jax_platforms if places.gpu else "cpu"
     order = ray.put(_Order(*asked, environment(), x64, platforms, places))
     ask, ahead = _asking(ray, places), _AHEAD * places.num
     waiting, under_way = iter(numbers), deque()
