@@ -9,6 +9,7 @@ import sys
 import time
 from types import SimpleNamespace
 
+import pyarrow.parquet as pq
 import pytest
 
 import planner_jax as pj
@@ -16,7 +17,7 @@ from planner_jax.cli import main
 from planner_jax.registry import MissingExtra, install_line
 from planner_jax.sweep import cluster, run
 from planner_jax.sweep.hit.settings import HitSettings
-from planner_jax.sweep.hit.sweep import HitSweep
+from planner_jax.sweep.hit.sweep import HitSweep, HitTally
 from planner_jax.sweep.run import SweepInterrupted, resume_sweep, start_sweep
 from planner_jax.sweep.run_folder import RunFolder
 from planner_jax.sweep.settings import SettingError, WorkersFailed
@@ -161,6 +162,21 @@ def test_rows_are_those_of_a_plain_run_in_whatever_order_they_are_made(finished,
     assert manifest["sessions"][0]["workers"] == "ray"
     assert manifest["summary"]["successes"] == finished[1]["summary"]["successes"]
     assert ray.ended == 1
+
+
+def test_a_worker_sends_what_is_written_and_the_columns_that_are_counted(tmp_path, ray):
+    sent, real = [], ray.get
+    ray.get = lambda number: sent.append(real(number)) or sent[-1]
+    start_sweep(TASK, SETTINGS, tmp_path / "run", progress=False, workers="ray")
+    assert len(sent) == 5
+    for rows, record in sent:
+        assert rows.counted.column_names == [
+            name
+            for name in pq.read_schema(tmp_path / "run/plans.parquet").names
+            if name in HitTally.READS
+        ]
+        assert rows.file.num_rows == record["num"] == rows.counted.num_rows
+        assert "wall_seconds" not in record and b"part" not in rows.file.metadata
 
 
 def test_a_cluster_that_is_begun_is_of_this_machine_alone_and_tells_nobody(tmp_path, ray):

@@ -1,7 +1,7 @@
 """The chunks of a sweep as tasks of a Ray cluster, for sweeps that outgrow a machine.
 
-Every chunk is one task, which draws, plans and judges it and sends back rows and record. The
-process that asks is the only one that knows of the run's folder. A worker is refused unless it
+Every chunk is one task, which draws, plans, judges and encodes it and sends back what is written.
+The process that asks is the only one that knows of the run's folder. A worker is refused unless it
 would make the same rows: by the same code, packages, settings and cases.
 
 Of a run on CPUs Ray hands tasks to free workers, one for each core of the cluster, and begins a
@@ -27,12 +27,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import pyarrow as pa
 
 from planner_jax import stopping
 from planner_jax.compile_cache import keep_compiled_programs
 from planner_jax.registry import MissingExtra, Task, install_line
-from planner_jax.sweep.chunks import Maker, Making, SweepRun, Workers
+from planner_jax.sweep.chunks import Made, Maker, Making, SweepRun, Workers
 from planner_jax.sweep.environment import environment, require_backend
 from planner_jax.sweep.identity import differences, settings_digest
 from planner_jax.sweep.settings import (
@@ -240,8 +239,8 @@ class _OnGpu:
     def begun(self) -> None:
         """Answer once there is a share."""
 
-    def make(self, order: _Order, number: int) -> tuple[pa.Table, dict[str, Any]]:
-        """Draw, plan and judge a chunk."""
+    def make(self, order: _Order, number: int) -> Made:
+        """Draw, plan, judge and encode a chunk."""
         return _make(order, number)
 
 
@@ -318,7 +317,7 @@ def _require_gpus(ray: Any, places: _Places) -> None:
         )
 
 
-def _fetched(ray: Any, number: int, made: Any) -> tuple[pa.Table, dict[str, Any]]:
+def _fetched(ray: Any, number: int, made: Any) -> Made:
     """Rows and record of a chunk that a worker has made; its exception, raised here."""
     try:
         return ray.get(made)
@@ -332,11 +331,12 @@ def _fetched(ray: Any, number: int, made: Any) -> tuple[pa.Table, dict[str, Any]
         ) from None
 
 
-def _make(order: _Order, number: int) -> tuple[pa.Table, dict[str, Any]]:
-    """Draw, plan and judge a chunk, in a worker."""
+def _make(order: _Order, number: int) -> Made:
+    """Draw, plan, judge and encode a chunk, in a worker."""
     maker = _maker_of(order)
     with CompileClock() as clock:
-        return maker.judged(maker.planned(maker.source.chunk(number), clock))
+        planned = maker.planned(maker.source.chunk(number), clock)
+    return maker.encoded(*maker.judged(planned))
 
 
 @functools.lru_cache(maxsize=1)
