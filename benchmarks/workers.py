@@ -1,11 +1,12 @@
 """How much quicker a sweep is with Ray workers for each core or GPU than for one, on this machine.
 
-    python -m benchmarks.workers [--num 60000] [--batch 2000] [--turns 3] [--out DIR]
+    python -m benchmarks.workers [--num 60000] [--batch 2000] [--turns 3] [--ways 1,2] [--out DIR]
 
 Four ways to make the same hits take turns, so that a slow minute of the machine meets all of them:
 a plain sweep on one core; a plain sweep on each core, all at the same time; one Ray worker, on one
 core with the process that asks it; and a Ray worker for each core. The second says how much the
-cores of this machine give at most, since they may share caches, memory or a clock.
+cores of this machine give at most, since they may share caches, memory or a clock. `--ways` leaves
+some of the four out.
 
 Where JAX computes on GPUs these take the place of cores, and it is workers of one GPU beside those
 of all; several workers share a GPU. One GPU has its share of the cores as well, but for the plain
@@ -31,7 +32,7 @@ import numpy as np
 
 import planner_jax as pj
 from planner_jax.benchmarks.cost_gap import COMPARED, cost_gaps, gap_figures
-from planner_jax.benchmarks.run import argument_parser, begin
+from planner_jax.benchmarks.run import argument_parser, begin, chosen
 from planner_jax.sweep.run_folder import RunFolder
 
 _FIRST = 9  # chunks that are not counted, at least
@@ -126,9 +127,13 @@ def _gpus() -> list[str]:
 def main() -> None:
     """Take turns and print the rates."""
     parser = argument_parser("workers", __doc__, num=60000, batch=2000, turns=3)
+    known = "1,2,3,4"
+    parser.add_argument("--ways", default=known, help=f"by number; default: {known}")
     options = parser.parse_args()
+    numbers = chosen(parser, "--ways", options.ways, known.split(","))
     os.environ[_PREALLOCATE] = "false"  # of GPUs: the sweeps need their memory
     ways = _ways(sorted(os.sched_getaffinity(0)), _gpus())
+    ways = {name: way for k, (name, way) in enumerate(ways.items(), 1) if str(k) in numbers}
     least = 3 + max(share.first for shares, _ in ways.values() for share in shares)
     if options.num < least * options.batch:
         parser.error(f"argument --num: must be >= {least} times --batch, got {options.num}")

@@ -18,6 +18,7 @@ _ENDING = 8  # bytes behind a footer: its length, and the magic word
 _BYTE, _SHORT, _LONG, _BINARY, _LIST, _SET, _MAP, _STRUCT = 3, 4, 6, 8, 9, 10, 11, 12
 _SIZES = {1: 0, 2: 0, _BYTE: 1, 7: 8, 13: 16}  # bytes of a value, by its kind; 1, 2: true, false
 _MOST_GROUPS = 2**15  # whose place among the others fits into their short field of it
+_BLOCK = 1 << 20  # bytes that are written at once
 _MOST_BITS = 63  # of a number, without its sign
 
 # Fields by number. Of the file:
@@ -121,7 +122,7 @@ class ParquetJoiner:
         self._num_groups += len(parts._groups)
         self._num_rows += parts.num_rows
         pages = memoryview(parts.pages)[len(_MAGIC) :]
-        self._file.write(pages)
+        write_in_blocks(self._file, pages)
         self._place += len(pages)
 
     def end(self) -> None:
@@ -402,6 +403,13 @@ def _list(length: int, items: bytes | bytearray) -> bytes:
     """A list of structs."""
     short, rest = (length, b"") if length < 15 else (15, _unsigned(length))
     return bytes([short << 4 | _STRUCT]) + rest + items
+
+
+def write_in_blocks(file: BinaryIO, content: Any) -> None:
+    """Write bytes or a buffer, a block at a time: ext4 takes 100 MB at once far more slowly."""
+    view = memoryview(content)
+    for start in range(0, len(view), _BLOCK):
+        file.write(view[start : start + _BLOCK])
 
 
 def _ending(

@@ -20,7 +20,12 @@ from typing import Any
 import pyarrow as pa
 
 from planner_jax.plain_files import open_plain
-from planner_jax.sweep.joined_parquet import JoinError, ParquetParts, parquet_parts
+from planner_jax.sweep.joined_parquet import (
+    JoinError,
+    ParquetParts,
+    parquet_parts,
+    write_in_blocks,
+)
 from planner_jax.sweep.manifest import FORMAT, is_count, is_number
 from planner_jax.sweep.parquet import encoded, opened
 from planner_jax.sweep.plain_json import JsonError, parse_object
@@ -111,7 +116,7 @@ class Parts:
         ending = rows.file.ending({**rows.file.metadata, _RECORD: json.dumps(record).encode()})
         name = f"part-{number:06d}-{zlib.crc32(ending, rows.crc32):08x}.parquet"
         with replacing(self.folder / name) as scratch, open(scratch, "wb") as file:
-            file.write(rows.file.pages)
+            write_in_blocks(file, rows.file.pages)
             file.write(ending)
         self.run.sent(self.folder / name)
         return record
@@ -187,4 +192,4 @@ class Parts:
 
 def _sum_of(path: Path) -> str:
     """The checksum of a part, as its name has it."""
-    return path.stem.rpartition("-")[2]
+    return path.stem.partition("-")[2].partition("-")[2]
