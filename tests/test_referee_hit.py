@@ -2,6 +2,7 @@
 
 import ast
 import math
+import os
 import sys
 from dataclasses import fields
 from pathlib import Path
@@ -616,6 +617,14 @@ def test_processes_judge_as_threads_do(monkeypatch):
     np.testing.assert_array_equal(in_processes["half"], in_threads["half"])
     with pytest.raises(ValueError, match="refused"):
         judging.workers().map(_refuse, [1, 2])
+
+
+@pytest.mark.parametrize(("told", "num"), [("3", 3), ("0", 1), ("", None), ("many", None)])
+def test_the_referee_keeps_as_many_cores_busy_as_nproc_says(monkeypatch, told, num):
+    monkeypatch.setenv("NPROC", told)
+    assert judging.cores() == (num or os.cpu_count())
+    monkeypatch.delenv("NPROC")
+    assert judging.cores() == os.cpu_count()
 
 
 def _halved(case):

@@ -5,14 +5,13 @@ In float64 NumPy; it shares no code with the planners.
 
 import functools
 import math
-import os
 import pickle
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from planner_jax.referee.workers import workers
+from planner_jax.referee.workers import cores, workers
 
 # Largest difference [s] between the claimed time of a contact and the one that is flown.
 CONTACT_TIME_TOLERANCE = 1e-4
@@ -47,19 +46,20 @@ def judge_in_chunks(
 ) -> dict[str, np.ndarray]:
     """The fields of a verdict from leaves with leading axis B, up to `chunk` lanes at once.
 
-    The lanes are shared among threads, one for each core: NumPy lets go of the interpreter
-    inside its loops. Many lanes and many cores are worth processes, if `judge` can be sent.
+    The lanes are shared among threads, one for each core that it may keep busy: NumPy lets go of
+    the interpreter inside its loops. Many lanes and many cores are worth processes, if `judge` can
+    be sent.
     """
-    num_lanes, cores = len(next(iter(leaves.values()))), os.cpu_count() or 1
-    size = min(chunk, max(math.ceil(num_lanes / cores), _FEWEST_LANES))
+    num_lanes, num_cores = len(next(iter(leaves.values()))), cores()
+    size = min(chunk, max(math.ceil(num_lanes / num_cores), _FEWEST_LANES))
     judged = functools.partial(_judged, judge)
     cases = [{name: leaf[lanes] for name, leaf in leaves.items()} for lanes in cut(num_lanes, size)]
-    if min(len(cases), cores) == 1:
+    if min(len(cases), num_cores) == 1:
         parts = [judged(case) for case in cases]
-    elif cores >= _MANY_CORES and num_lanes >= _MANY_LANES and _can_be_sent(judge):
+    elif num_cores >= _MANY_CORES and num_lanes >= _MANY_LANES and _can_be_sent(judge):
         parts = workers().map(judged, cases)
     else:
-        with ThreadPoolExecutor(cores) as pool:
+        with ThreadPoolExecutor(num_cores) as pool:
             parts = list(pool.map(judged, cases))
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 

@@ -56,8 +56,14 @@ class _Worker:
         self._process.stdout.close()
 
 
+def cores() -> int:
+    """How many cores the referee keeps busy: those of NPROC, which XLA minds too, or else all."""
+    told = os.environ.get("NPROC", "")
+    return max(int(told), 1) if told.isdecimal() else os.cpu_count() or 1
+
+
 class Workers:
-    """As many processes as there are cores."""
+    """As many processes as the referee has cores."""
 
     def __init__(self, num: int) -> None:
         self._threads = ThreadPoolExecutor(num)
@@ -86,7 +92,7 @@ class Workers:
 @functools.cache
 def workers() -> Workers:
     """The processes of this program, begun when they are first asked for."""
-    pool = Workers(os.cpu_count() or 1)
+    pool = Workers(cores())
     atexit.register(pool.stop)
     return pool
 

@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 import sys
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from planner_jax import stopping
 from planner_jax.sweep.columns import RefereedBatch, rows_of
-from planner_jax.sweep.parts import Part, Parts
+from planner_jax.sweep.parts import EncodedRows, Part, Parts
 from planner_jax.sweep.run_folder import RunFolder
 from planner_jax.sweep.source import Chunk, Source
 from planner_jax.sweep.summary import percent
@@ -60,6 +60,11 @@ class Maker:
         record["compile_seconds"] = clock.lap()
         return _Planned(chunk, plans, record)
 
+    @property
+    def counted(self) -> Sequence[str]:
+        """Names of the columns that are counted; none: all are."""
+        return self.sweep.tally(self.source.settings).READS
+
     def judged(self, planned: _Planned) -> tuple[pa.Table, dict[str, Any]]:
         """Rows and record of a chunk."""
         watch = Stopwatch()
@@ -72,9 +77,15 @@ class Maker:
         batch = RefereedBatch(planned.chunk, planned.plans, verdict)
         return rows_of(self.sweep.columns(batch), batch, self.sweep.frame), record
 
+    def encoded(self, rows: pa.Table, record: dict[str, Any]) -> "Made":
+        """Rows and record of a chunk as they are written."""
+        return EncodedRows.of(rows, self.counted), record
 
-# Waits for rows and record of a chunk that is being made; of one that was read, no record.
-Making = Callable[[], tuple[pa.Table, dict[str, Any] | None]]
+
+# Rows and record of a chunk; of one that was read, no record.
+Made = tuple[EncodedRows, dict[str, Any] | None]
+# Waits for a chunk that is being made.
+Making = Callable[[], Made]
 # Begin to make chunks of these numbers, and give them in their order.
 Workers = Callable[["SweepRun", Iterable[int]], Generator[Making, None, None]]
 
@@ -108,7 +119,7 @@ def plan_chunks(run: SweepRun, *, progress: bool) -> dict[str, Any]:
     tally = run.sweep.tally(source.settings)
     with tqdm(total=source.num, initial=done, disable=not progress, **look) as bar:
         for chunk, rows, record in _in_pipeline(run, there):
-            tally.add(rows)
+            tally.add(rows.counted)
             if record is None:  # there already
                 continue
             records[chunk] = record
@@ -124,11 +135,11 @@ def plan_chunks(run: SweepRun, *, progress: bool) -> dict[str, Any]:
 
 def _in_pipeline(
     run: SweepRun, there: dict[int, Part]
-) -> Iterator[tuple[int, pa.Table, dict[str, Any] | None]]:
+) -> Iterator[tuple[int, EncodedRows, dict[str, Any] | None]]:
     """Number and rows of every chunk in order, and the record of those that had no part.
 
     While one chunk is planned the next is drawn, the one before is judged, and the one before
-    that is written.
+    that is encoded, unless workers do so, and written.
 
     Args:
         run: the sweep.
@@ -145,9 +156,9 @@ def _in_pipeline(
         ThreadPoolExecutor(1) as drawer,
     ):
 
-        def write(chunk: int, made: Making) -> tuple[int, pa.Table, dict[str, Any] | None]:
+        def write(chunk: int, made: Making) -> tuple[int, EncodedRows, dict[str, Any] | None]:
             rows, record = made()
-            joined = joiner.submit(join, rows)
+            joined = joiner.submit(join, rows.file)
             if record is not None:
                 record = {**record, "wall_seconds": watch.lap()}  # since the one before
                 record = run.parts.write(chunk, rows, record)
@@ -163,7 +174,7 @@ def _in_pipeline(
             for chunk in range(source.num_chunks):
                 stopping.check()
                 if chunk in there:
-                    made = judge.submit(lambda part=there[chunk]: (part.read(), None)).result
+                    made = judge.submit(_read, run, there[chunk]).result
                 else:
                     made = next(making)
                 pending.append(writer.submit(write, chunk, made))
@@ -171,6 +182,11 @@ def _in_pipeline(
                     yield pending.popleft().result()
             while pending:
                 yield pending.popleft().result()
+
+
+def _read(run: SweepRun, part: Part) -> Made:
+    """The rows of a part that there is."""
+    return part.read(run.counted), None
 
 
 def _made_here(
@@ -182,7 +198,8 @@ def _made_here(
         following = next(draws, None)
         while following is not None:
             drawn, following = following, next(draws, None)
-            yield judge.submit(run.judged, run.planned(drawn.result(), clock)).result
+            judged = judge.submit(run.judged, run.planned(drawn.result(), clock))
+            yield lambda judged=judged: run.encoded(*judged.result())
 
 
 def _times(run: SweepRun, records: dict[int, dict[str, Any]]) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """Parquet files of runs: with checksums of their pages, which are verified when they are read."""
 
+import io
 import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -29,6 +30,27 @@ def encoding(schema: pa.Schema) -> dict[str, Any]:
         "write_statistics": others,
         "write_page_checksum": True,
     }
+
+
+class _Pieces(io.RawIOBase):
+    """A file in memory, as the pieces that were written: one block would be moved as it grows."""
+
+    def __init__(self) -> None:
+        self.pieces: list[Any] = []
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, piece: Any) -> int:
+        self.pieces.append(piece)
+        return len(piece)
+
+
+def encoded(rows: pa.Table) -> bytes:
+    """The content of a Parquet file of rows; of the same rows it is the same."""
+    written = _Pieces()
+    pq.write_table(rows, written, row_group_size=ROW_GROUP, **encoding(rows.schema))
+    return b"".join(written.pieces)
 
 
 def file_sum(path: Path) -> dict[str, int]:

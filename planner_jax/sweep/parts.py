@@ -1,23 +1,33 @@
 """The parts of a sweep: the rows of one chunk each, in `parts/` until all are joined.
 
+A part is encoded where its rows are made, and written by the process that knows of the run. What
+is joined are its pages as they are.
+
 A part is checked, not trusted. Its name holds the checksum of the file; its metadata say of which
 run it is, made by what, of which settings, and which rows it holds. What does not agree is removed
 with a word on the standard error stream, and its cases are planned again.
 """
 
 import dataclasses
+import errno
 import json
 import sys
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from planner_jax.plain_files import open_plain
+from planner_jax.sweep.joined_parquet import (
+    JoinError,
+    ParquetParts,
+    parquet_parts,
+    write_in_blocks,
+)
 from planner_jax.sweep.manifest import FORMAT, is_count, is_number
-from planner_jax.sweep.parquet import ROW_GROUP, encoding, opened
+from planner_jax.sweep.parquet import encoded, opened
 from planner_jax.sweep.plain_json import JsonError, parse_object
 from planner_jax.sweep.run_folder import RunFolder
 from planner_jax.sweep.settings import SettingError
@@ -34,18 +44,50 @@ class PartError(ValueError):
 
 
 @dataclasses.dataclass(frozen=True)
+class EncodedRows:
+    """The rows of a chunk as they are written, and those columns that are counted."""
+
+    counted: pa.Table
+    file: ParquetParts  # without a record
+    crc32: int  # of its pages
+
+    @classmethod
+    def of(cls, rows: pa.Table, counted: Sequence[str]) -> "EncodedRows":
+        """Encode rows.
+
+        Args:
+            rows: of a chunk.
+            counted: names of columns, if they are there; none: all are counted.
+        """
+        names = [name for name in rows.column_names if name in (counted or rows.column_names)]
+        file = parquet_parts(encoded(rows))
+        return cls(rows.select(names), file, zlib.crc32(file.pages))
+
+
+@dataclasses.dataclass(frozen=True)
 class Part:
     """A part that is sound."""
 
     path: Path
     record: dict[str, Any]  # how its rows came about
 
-    def read(self) -> pa.Table:
-        """Its rows."""
-        with opened(self.path) as file:
-            rows = file.read()
-        kept = {key: value for key, value in rows.schema.metadata.items() if key != _RECORD}
-        return rows.replace_schema_metadata(kept)
+    def read(self, counted: Sequence[str]) -> EncodedRows:
+        """Its rows.
+
+        Args:
+            counted: as of `EncodedRows.of`.
+
+        Raises:
+            OSError: it is not what it was when it was found sound.
+        """
+        with open_plain(self.path) as file:
+            content = file.read()
+        if f"{zlib.crc32(content):08x}" != _sum_of(self.path):
+            raise OSError(errno.EIO, "it was damaged while the run was resumed", str(self.path))
+        with opened(pa.BufferReader(content)) as file:
+            rows = file.read(list(counted) or None)
+        parts = parquet_parts(content).without(_RECORD)
+        return EncodedRows(rows, parts, zlib.crc32(parts.pages))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,20 +109,15 @@ class Parts:
         """Where they lie; it need not exist."""
         return self.run.parts
 
-    def write(self, number: int, rows: pa.Table, record: dict[str, Any]) -> dict[str, Any]:
+    def write(self, number: int, rows: EncodedRows, record: dict[str, Any]) -> dict[str, Any]:
         """Write the rows of a chunk; gives the record of how they came about as it is kept."""
         self.folder.mkdir(exist_ok=True)
         record = {**self._own(number), **record}
-        metadata = {**(rows.schema.metadata or {}), _RECORD: json.dumps(record).encode()}
-        stream = pa.BufferOutputStream()
-        how = encoding(rows.schema)
-        pq.write_table(
-            rows.replace_schema_metadata(metadata), stream, row_group_size=ROW_GROUP, **how
-        )
-        content = stream.getvalue()
-        name = f"part-{number:06d}-{zlib.crc32(content):08x}.parquet"
-        with replacing(self.folder / name) as scratch:
-            scratch.write_bytes(content)
+        ending = rows.file.ending({**rows.file.metadata, _RECORD: json.dumps(record).encode()})
+        name = f"part-{number:06d}-{zlib.crc32(ending, rows.crc32):08x}.parquet"
+        with replacing(self.folder / name) as scratch, open(scratch, "wb") as file:
+            write_in_blocks(file, rows.file.pages)
+            file.write(ending)
         self.run.sent(self.folder / name)
         return record
 
@@ -127,7 +164,7 @@ class Parts:
             PartError, JsonError: the file is none of this run, or damaged.
         """
         word, _, rest = path.stem.partition("-")
-        number, _, known = rest.partition("-")
+        number, *_ = rest.partition("-")
         counts = number.isascii() and number.isdecimal() and len(number) <= _DIGITS
         if word != "part" or not counts or path.suffix != ".parquet":
             raise PartError("is no part of a sweep")
@@ -135,20 +172,24 @@ class Parts:
             raise PartError(f"is beyond the {self.source.num_chunks} parts of the run")
         with open_plain(path) as file:
             content = file.read()
-        if f"{zlib.crc32(content):08x}" != known:
+        if f"{zlib.crc32(content):08x}" != _sum_of(path):
             raise PartError("is damaged: its checksum is not that of its name")
         try:
-            with opened(pa.BufferReader(content)) as file:
-                metadata, num_rows = file.schema_arrow.metadata or {}, file.metadata.num_rows
-        except (pa.ArrowException, OSError):
-            raise PartError("is not Parquet") from None
-        record = parse_object(metadata.get(_RECORD, b"{}"))
+            file = parquet_parts(content)
+        except JoinError as error:
+            raise PartError(str(error)) from None
+        record = parse_object(file.metadata.get(_RECORD, b"{}"))
         for name, wanted in self._own(int(number)).items():
             if record.get(name) != wanted:
                 raise PartError(f"is of {name} {record.get(name)}, and not of {wanted}")
         sound = is_count(record.get("successes")) and isinstance(record.get("warm"), bool)
         if not sound or not all(is_number(record.get(name)) for name in _SECONDS):
             raise PartError("has no whole record")
-        if num_rows != record["num"]:
-            raise PartError(f"has {num_rows} rows, and not {record['num']}")
+        if file.num_rows != record["num"]:
+            raise PartError(f"has {file.num_rows} rows, and not {record['num']}")
         return int(number), record
+
+
+def _sum_of(path: Path) -> str:
+    """The checksum of a part, as its name has it."""
+    return path.stem.partition("-")[2].partition("-")[2]

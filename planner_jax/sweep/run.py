@@ -56,7 +56,8 @@ def start_sweep(
         settings: of the sweep, of the task's class.
         out: folder, new or empty; or an address s3://BUCKET/PATH below which nothing lies.
         progress: show a bar on the standard error stream.
-        workers: "ray", to have the chunks made by a Ray cluster; decides no row.
+        workers: "ray", to have the chunks made by a Ray cluster, on all of its GPUs where JAX
+            computes on one here. A row is then that of one device, whatever their number.
 
     Returns:
         The manifest of the finished run.

@@ -16,6 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from planner_jax.sweep import manifest as manifests
+from planner_jax.sweep.joined_parquet import ParquetJoiner, ParquetParts
 from planner_jax.sweep.owner import LOCK, owned, require_free
 from planner_jax.sweep.parquet import ROW_GROUP, encoding, file_sum
 from planner_jax.sweep.settings import SettingError
@@ -203,25 +204,16 @@ class RunFolder:
             raise SettingError(f"{self.name} must be {rule}, got {shown}")
 
     @contextlib.contextmanager
-    def joining_parts(self) -> Iterator[Callable[[pa.Table], None]]:
-        """A function that adds the rows of a part to `plans.parquet`.
+    def joining_parts(self) -> Iterator[Callable[[ParquetParts], None]]:
+        """A function that adds the rows of a part to `plans.parquet`, as they are encoded.
 
         The file is there once the block has ended well, and the parts are then needed no more.
         """
-        writer: pq.ParquetWriter | None = None
-
-        def join(rows: pa.Table) -> None:
-            nonlocal writer
-            if writer is None:
-                writer = pq.ParquetWriter(scratch, rows.schema, **encoding(rows.schema))
-            writer.write_table(rows, row_group_size=ROW_GROUP)
-
         with replacing(self.plans) as scratch:
-            try:
-                yield join
-            finally:
-                if writer is not None:
-                    writer.close()
+            with open(scratch, "wb") as file:
+                joiner = ParquetJoiner(file)
+                yield joiner.add
+                joiner.end()
             self._sums[self.plans.name] = file_sum(scratch)
         self.sent(self.plans)
 

@@ -36,9 +36,14 @@ def percent(successes: int, num: int) -> str:
     return f"{rate:.2f}"
 
 
+# What every tally reads.
+COUNTED = ("index", "success", "status", "failed_limit")
+
+
 class Tally:
     """Counts over the rows of a sweep, chunk by chunk; its size does not grow with them."""
 
+    READS: ClassVar[tuple[str, ...]] = ()  # the columns that are counted; none named: any may be
     MEANS: ClassVar[tuple[str, ...]] = ()  # columns whose mean over the successes is told
 
     def __init__(self) -> None:

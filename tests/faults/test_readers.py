@@ -3,11 +3,13 @@
 import json
 import os
 import uuid
+import zlib
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from planner_jax.sweep.parts import Parts
 from planner_jax.sweep.plain_json import read_object
 from planner_jax.sweep.run import resume_sweep
 from planner_jax.sweep.run_folder import RunFolder
@@ -93,6 +95,39 @@ def test_a_part_in_the_place_of_another_is_planned_again(runs, tmp_path):
     first.rename(first.with_name(first.name.replace("000000", "000003")))
     ended = run("sweep", "hit", "--resume", "--out", out)
     assert ended.code == 0 and "is of first 0, and not of 39" in ended.err
+    assert rows_of(out) == rows_of(runs / "whole")
+
+
+def test_a_part_that_is_damaged_once_it_was_found_sound_is_not_joined(runs, tmp_path, monkeypatch):
+    out, real = copied(runs, "begun", tmp_path), Parts.sound
+
+    def sound(self):
+        found = real(self)
+        path = found[1].path
+        content = bytearray(path.read_bytes())
+        content[100] ^= 1
+        path.write_bytes(content)
+        return found
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Parts, "sound", sound)
+        ended = run("sweep", "hit", "--resume", "--out", out)
+    last = ended.err.splitlines()[-1]
+    assert ended.code == 1 and f"{out}/parts/part-000001-" in last and "damaged while" in last
+    assert not (out / "plans.parquet").exists()
+    ended = run("sweep", "hit", "--resume", "--out", out)
+    assert ended.code == 0 and "is damaged: its checksum is not that of its name" in ended.err
+    assert rows_of(out) == rows_of(runs / "whole")
+
+
+@pytest.mark.parametrize("content", [b"", b"PAR1", b"PAR1\x19\x0c\0\3\0\0\0PAR1"])
+def test_a_part_whose_name_fits_and_whose_footer_does_not_is_planned_again(runs, tmp_path, content):
+    out = copied(runs, "begun", tmp_path)
+    path = sorted((out / "parts").iterdir())[0]
+    path.unlink()
+    path.with_name(f"part-000000-{zlib.crc32(content):08x}.parquet").write_bytes(content)
+    ended = run("sweep", "hit", "--resume", "--out", out)
+    assert ended.code == 0 and ended.err.count("planned again") == 1
     assert rows_of(out) == rows_of(runs / "whole")
 
 

@@ -13,7 +13,7 @@ from planner_jax.sweep.block.settings import BlockSettings
 from planner_jax.sweep.columns import Column, RefereedBatch
 from planner_jax.sweep.row_plans import arm_plan
 from planner_jax.sweep.settings import SettingError, require
-from planner_jax.sweep.summary import Tally
+from planner_jax.sweep.summary import COUNTED, Tally
 from planner_jax.sweep.sweep import Sweep
 from planner_jax.task.block.library.adapt import AdaptBlock
 from planner_jax.task.block.library.file import LibraryFileError
@@ -27,6 +27,7 @@ class BlockTally(Tally):
     """Sums up how long the arm moves, how well balls were seen, and how long planning took."""
 
     MEANS = ("execution_time",)
+    READS = (*COUNTED, *MEANS, "fit_error", "planning_time")  # the last two where they are
 
     def __init__(self) -> None:
         super().__init__()

@@ -15,7 +15,7 @@ from planner_jax.sweep.figures.motion import CAPTION as MOTION
 from planner_jax.sweep.quadrotor import ending_remark
 from planner_jax.sweep.robots import robot_remark
 from planner_jax.sweep.row_plans import quadrotor_plan
-from planner_jax.sweep.summary import Tally
+from planner_jax.sweep.summary import COUNTED, Tally
 from planner_jax.sweep.sweep import RunFigure, Sweep, first_values
 from planner_jax.sweep.table import RateTable, own_cells
 from planner_jax.task.catch.card import SUITES
@@ -36,6 +36,8 @@ _NET_TESTS = {
 
 class CatchTally(Tally):
     """Counts targets caught, times of the catches and the optimal time ratio too."""
+
+    READS = (*COUNTED, "caught", "present", "catch_times", "time_ratio")
 
     def __init__(self, decides: bool = True) -> None:
         super().__init__()

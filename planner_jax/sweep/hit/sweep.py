@@ -19,7 +19,7 @@ from planner_jax.sweep.hit.source import ServeSource, open_source
 from planner_jax.sweep.quadrotor import ending_remark
 from planner_jax.sweep.robots import robot_remark
 from planner_jax.sweep.row_plans import quadrotor_plan
-from planner_jax.sweep.summary import Tally
+from planner_jax.sweep.summary import COUNTED, Tally
 from planner_jax.sweep.sweep import RunFigure, Sweep, first_values
 from planner_jax.sweep.table import RateTable, own_cells
 from planner_jax.task.hit import court
@@ -27,6 +27,8 @@ from planner_jax.task.hit import court
 
 class HitTally(Tally):
     """Counts by scenario too; the example is from the left to the far target (002, Fig. 7)."""
+
+    READS = (*COUNTED, "scenario", *map(published_column, court.PLANNERS))
 
     def __init__(self) -> None:
         super().__init__()

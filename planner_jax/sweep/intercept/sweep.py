@@ -16,7 +16,7 @@ from planner_jax.sweep.intercept.figures.station_time import station_time_figure
 from planner_jax.sweep.intercept.settings import InterceptSettings
 from planner_jax.sweep.row_plans import car_plan
 from planner_jax.sweep.settings import require
-from planner_jax.sweep.summary import Tally
+from planner_jax.sweep.summary import COUNTED, Tally
 from planner_jax.sweep.sweep import RunFigure, Sweep, first_values
 from planner_jax.task.intercept.case import InterceptCase
 
@@ -30,6 +30,7 @@ class InterceptTally(Tally):
     """
 
     MEANS = ("meeting_time", "miss", "rms_acceleration")
+    READS = (*COUNTED, *MEANS, "mover_clearance")
     NEAR = 0.1  # [m]
 
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
