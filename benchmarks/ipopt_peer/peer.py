@@ -24,6 +24,8 @@ TRIED: dict[str, tuple[tuple[float, dict[str, Any], bool], ...]] = {
     "limits": (
         (1e-6, _PLAIN, True),
         (1e-6, _PLAIN | _ADAPTIVE, True),
+        (1e-4, _PLAIN, True),
+        (1e-4, _PLAIN | _ADAPTIVE, True),
         (1e-3, _PLAIN, True),
         (1e-3, _PLAIN | _ADAPTIVE, True),
         (1e-3, _USUAL | _ADAPTIVE, True),
