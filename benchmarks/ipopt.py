@@ -304,7 +304,7 @@ def _told(gap: np.ndarray | None) -> str:
 def _equal_gaps(
     bench: Bench, setup: Setup, efforts: dict, peers: dict, kept: dict, repeat: int
 ) -> None:
-    """A row for each effort, form and guess: plans a second that cost no more than the planner's."""
+    """A row for each effort, form and first guess: plans a second up to the planner's cost."""
     bench.say(
         "",
         f"At the same gap; the planner's own first guess is the learned one. jaxipm has up to "

@@ -33,7 +33,7 @@ def setup(name):
 def points(name):
     """Around first guesses, limits exceeded and not."""
     starts = setup(name).batches["smooth"].starts
-    return starts + 0.2 * np.random.default_rng(0).normal(size=starts.shape)
+    return starts + 0.6 * np.random.default_rng(0).normal(size=starts.shape)
 
 
 @functools.cache
@@ -93,17 +93,14 @@ def test_derivatives_are_those_of_finite_differences(name, penalised):
 def test_with_limits_as_constraints_it_costs_no_more_than_the_planner_and_the_referee_accepts(name):
     task = setup(name)
     starts = task.batches["learned"]
-    peer = Peer(task.module, task.planner, "limits", task.cost(task.plans(starts.starts)).mean())
+    unit = task.cost(task.plans(starts.starts)).mean()
+    peer = Peer(task.module, task.planner, "limits", unit, compiled=False)
     setting = (1e-6, {"mu_strategy": "adaptive"}, False)
     found = peer.solve(setting, starts)
     plans = task.plans(found.points)
     assert found.converged.all() and task.accepted(plans).all()
     ours = pj.plan(task.card.planner("exact", **task.card.bench), task.cases)
     assert (task.cost(plans) <= task.cost(ours) * (1.0 + 1e-6)).all()
-    if name == "hit":  # by its objective, which is the planner's energy
-        np.testing.assert_allclose(found.objectives, task.cost(plans), rtol=0.2)
-    else:
-        np.testing.assert_allclose(found.objectives, task.cost(plans), rtol=1e-3)
     paths = peer.iterates(setting, starts)
     assert [len(path) - 1 for path in paths] == found.steps.tolist()
     np.testing.assert_allclose([path[-1] for path in paths], found.points, atol=1e-6)

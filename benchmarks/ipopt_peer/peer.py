@@ -84,14 +84,17 @@ class Peer:
         planner: an `ExactHit` or `ExactCatch`.
         form: "limits" has them as constraints, "penalties" minimises the planner's own objective.
         unit: a usual cost; IPOPT's tolerances are told relative to it.
+        compiled: whether the functions are there as compiled C code too, if there is a compiler.
     """
 
-    def __init__(self, module: ModuleType, planner: Any, form: str, unit: float):
+    def __init__(
+        self, module: ModuleType, planner: Any, form: str, unit: float, compiled: bool = True
+    ):
         problem, penalised = module.problem(planner), form == "penalties"
         self.form, self._scale, began = form, 1.0 / unit, time.perf_counter()
         self.programs = {False: Program(problem, penalised, BETWEEN_NODES)}
         self.build_seconds, began = time.perf_counter() - began, time.perf_counter()
-        if shutil.which(COMPILER[0]):
+        if compiled and shutil.which(COMPILER[0]):
             self.programs[True] = Program(problem, penalised, BETWEEN_NODES, compiled=True)
         self.compile_seconds = time.perf_counter() - began
 

@@ -90,16 +90,17 @@ class Program:
         self._maps = planner.maps
         self._matrices = [ca.DM(self._maps.sample_matrix(planner.nodes, d)) for d in range(ORDERS)]
         weights = joined_trapezoid_weights(planner.nodes, self._maps.proportions)
-        self._weights, self.num_samples = ca.DM(weights), len(weights)
+        self._weights, self.num_samples = ca.DM(weights).T, len(weights)
         self.num_told = sum(problem.sizes.values())
-        self._build_small()
-        self.functions = self._build()
+        self._power = 2 * self._maps.order - 1
+        self._own = planner.energy_weight * self._maps.offset_energy
+        self._lay_out()
+        self._build_ends()
+        self._build_limits()
+        self.worst = self._worst()
+        self.functions = [self._nlp(), self._gradient(), self._jacobian(), self._hessian()]
         if compiled:
             self.functions = self._as_machine_code()
-
-    def told(self, values: dict[str, Any]) -> np.ndarray:
-        """The numbers of a case in one vector."""
-        return np.concatenate([np.ravel(np.asarray(values[n], float)) for n in self.problem.sizes])
 
     def solver(self, options: dict[str, Any], callback: Any = None) -> Callable:
         """IPOPT on this program: a function of a start and of what is told, to CasADi's results."""
@@ -127,229 +128,222 @@ class Program:
         ends = np.cumsum([0, *self.problem.sizes.values()]).tolist()
         return {n: vector[ends[i] : ends[i + 1]] for i, n in enumerate(self.problem.sizes)}
 
-    def _build_small(self) -> None:
-        """The functions of the ends and of one sample, with their derivatives."""
+    def _lay_out(self) -> None:
+        """Which columns of the trajectory are where.
+
+        Columns are counted axis by axis, each with its rows and then its offsets; x has the offsets
+        waypoint by waypoint. The outer ones are offsets, the inner ones rows and then h.
+        """
+        planner, rows = self.problem.planner, 2 * ORDERS
+        inside = planner.num_pieces - 1
+        self._num_columns = rows + inside
+        self._outer = [a * self._num_columns + rows + i for a in range(3) for i in range(inside)]
+        self._inner = [a * self._num_columns + i for a in range(3) for i in range(rows)]
+        order = [3 * i + axis for axis in range(3) for i in range(inside)]
+        self._place = np.argsort(order).tolist()
+        self._scale = ca.DM(planner.scale).T
+
+    def _build_ends(self) -> None:
+        """The function of the ends, with slopes and the bend of any sum of what it gives.
+
+        It gives rows axis by axis and the duration, cost, and excesses.
+        """
         problem, planner = self.problem, self.problem.planner
         natural = ca.SX.sym("natural", problem.num_natural)
         told = ca.SX.sym("told", self.num_told)
         named = self._split(told)
         tail, time, excess, cost = problem.ends(natural, named)
-        duration = time / planner.num_pieces
+        duration, excess = time / planner.num_pieces, ca.vertcat(*excess)
         head = ca.reshape(named["head_state"], 3, ORDERS).T
-        powers = ca.vertcat(*[duration**k for k in range(ORDERS)])
-        scale = ca.repmat(powers, 1, 3)
+        scale = ca.repmat(ca.vertcat(*[duration**k for k in range(ORDERS)]), 1, 3)
         rows = ca.vertcat(head * scale, tail * scale)
-        excess = ca.vertcat(*excess)
-        hinges = problem.impact_weight * ca.sum1(
-            ca.vertcat(
-                *[
-                    hinge(excess[i] + planner.margin, planner.hinge_width)
-                    for i in range(excess.numel())
-                ]
-            )
-        )
-        self.num_at_ends = excess.numel()
         gram = ca.DM(self._maps.boundary_energy)
-        power = 2 * self._maps.order - 1
-        energy = planner.energy_weight * ca.sum1(ca.sum2(rows * (gram @ rows))) / duration**power
-        core = cost + energy + (hinges if self.penalised else 0.0)
-        # What the rest of the program depends on: 24 rows axis by axis, and the duration.
+        energy = ca.sum1(ca.sum2(rows * (gram @ rows))) / duration**self._power
+        core = cost + planner.energy_weight * energy
+        self._num_at_ends = excess.numel()
+        if self.penalised:
+            inside = ca.vertsplit(excess + planner.margin)
+            hinges = sum(hinge(each, planner.hinge_width) for each in inside)
+            core = core + problem.impact_weight * hinges
         outward = ca.vertcat(ca.vec(rows), duration)
-        weights = ca.SX.sym("weights", outward.numel() + 1 + excess.numel())
         together = ca.vertcat(outward, core, excess)
-        self._ends = ca.Function("ends", [natural, told], [outward, core, excess])
-        self._ends_slopes = ca.Function(
-            "ends_slopes",
-            [natural, told],
-            [outward, core, excess, ca.densify(ca.jacobian(together, natural))],
-        )
-        bend = ca.hessian(ca.dot(weights, together), natural)[0]
-        self._ends_bend = ca.Function("ends_bend", [natural, told, weights], [ca.densify(bend)])
+        weights = ca.SX.sym("weights", together.numel())
+        slopes = ca.densify(ca.jacobian(together, natural))
+        bend = ca.densify(ca.hessian(ca.dot(weights, together), natural)[0])
+        given, found = [natural, told], [outward, core, excess]
+        self._ends = ca.Function("ends", given, found)
+        self._ends_slopes = ca.Function("ends_slopes", given, [*found, slopes])
+        self._ends_bend = ca.Function("ends_bend", [*given, weights], [bend])
 
+    def _build_limits(self) -> None:
+        """The functions of a sample's limits, for all samples at once.
+
+        They take the sample in time over h, h, and what is told. Where limits are penalties, one
+        value stands for them all: the sum of their hinges times h.
+        """
+        planner, factors = self.problem.planner, self.problem.factors
         unit, h = ca.SX.sym("unit", len(PLACES)), ca.SX.sym("h")
+        told = ca.SX.sym("told", self.num_told)
         at = [unit[i] / h**order for i, (order, _) in enumerate(PLACES)]
-        limits = problem.limits(at[0], *(ca.vertcat(*at[i : i + 3]) for i in (1, 4, 7)), named)
-        limits = ca.vertcat(*limits)
-        self.num_limits = limits.numel()
-        self.num_constraints = (
-            0 if self.penalised else self.num_limits * self.num_samples + self.num_at_ends
-        )
-        multipliers = ca.SX.sym("multipliers", 1 if self.penalised else self.num_limits)
-        if self.penalised:  # one weighed sum of hinges stands for all limits of a sample
-            margins = planner.margin * np.array(problem.factors)
-            inside = [limits[i] + margins[i] for i in range(self.num_limits)]
-            values = h * sum(hinge(x, planner.hinge_width) for x in inside)
-        else:
-            values = limits
+        vectors = (ca.vertcat(*at[i : i + 3]) for i in (1, 4, 7))
+        limits = ca.vertcat(*self.problem.limits(at[0], *vectors, self._split(told)))
+        values = limits
+        if self.penalised:
+            inside = limits + planner.margin * ca.DM(factors)
+            values = h * sum(hinge(each, planner.hinge_width) for each in ca.vertsplit(inside))
+        self._num_values = values.numel()
+        self.num_constraints = self._num_values * self.num_samples + self._num_at_ends
+        if self.penalised:
+            self.num_constraints = 0
+        multipliers = ca.SX.sym("multipliers", self._num_values)
         variables = ca.vertcat(unit, h)
         slopes = ca.jacobian(values, variables)
-        total = ca.dot(multipliers, values)
-        bend, gradient = ca.hessian(total, variables)
+        bend, gradient = ca.hessian(ca.dot(multipliers, values), variables)
         bend = ca.triu(bend)
         self._slope_places = list(zip(*slopes.sparsity().get_triplet(), strict=True))
         self._bend_places = list(zip(*bend.sparsity().get_triplet(), strict=True))
-        nonzeros = lambda matrix: ca.vertcat(*matrix.nonzeros())  # noqa: E731
-        mapped = lambda f, given: f.map(  # noqa: E731
-            f"{f.name()}_map", "serial", self.num_samples, given, []
-        )
-        self._limits = mapped(ca.Function("limits", [unit, h, told], [limits]), [1, 2])
-        self._values = mapped(ca.Function("values", [unit, h, told], [values]), [1, 2])
-        self._slopes = mapped(
-            ca.Function("slopes", [unit, h, told], [values, nonzeros(slopes)]), [1, 2]
-        )
-        self._bends = mapped(
-            ca.Function(
-                "bends",
-                [unit, h, told, multipliers],
-                [ca.densify(gradient), nonzeros(bend)],
-            ),
-            [1, 2],
-        )
 
-    def _build(self) -> list:
-        """Program, gradient, Jacobian and Hessian, as IPOPT asks for them."""
-        planner, num_natural = self.problem.planner, self.problem.num_natural
-        pieces, num_offsets = planner.num_pieces, planner.num_offsets
-        size = num_offsets + num_natural
-        rows, num_columns = 2 * ORDERS, 2 * ORDERS + pieces - 1
-        x, told = ca.MX.sym("x", size), ca.MX.sym("told", self.num_told)
-        scale = ca.DM(planner.scale)
-        natural = x[num_offsets:] * scale[num_offsets:]
-        offsets = ca.reshape(x[:num_offsets] * scale[:num_offsets], 3, pieces - 1).T
-        outward, core, at_ends, by_natural = self._ends_slopes(natural, told)
+        def mapped(name: str, given: list, found: list) -> Any:
+            of_sample = ca.Function(name, [unit, h, told, *given], found)
+            return of_sample.map(f"{name}_map", "serial", self.num_samples, [1, 2], [])
+
+        filled = lambda matrix: ca.vertcat(*matrix.nonzeros())  # noqa: E731
+        self._limits = mapped("limits", [], [limits])
+        self._values = mapped("values", [], [values])
+        self._slopes = mapped("slopes", [], [values, filled(slopes)])
+        self._bends = mapped("bends", [multipliers], [ca.densify(gradient), filled(bend)])
+
+    def _point(self) -> tuple[Any, Any, Any, Any]:
+        """Symbols of x and of what is told; variables of the ends, and offsets (M - 1, 3)."""
+        num = self.problem.planner.num_offsets
+        x, told = ca.MX.sym("x", self._scale.numel()), ca.MX.sym("told", self.num_told)
+        natural = x * self._scale.T
+        return x, told, natural[num:], ca.reshape(natural[:num], 3, num // 3).T
+
+    def _columns(self, outward: Any, offsets: Any) -> tuple[Any, Any]:
+        """Columns (C, 3) and h, from what the ends give and the offsets."""
+        rows = 2 * ORDERS
         columns = ca.vertcat(ca.reshape(outward[: 3 * rows], rows, 3), offsets)
-        h = outward[3 * rows]
-        unit = self._unit(columns)
-        power = 2 * self._maps.order - 1
-        own = planner.energy_weight * self._maps.offset_energy
-        of_offsets = own * ca.sumsqr(offsets) / h**power
-        values, slopes = self._slopes(unit, h, told)
-        weights = ca.MX(self._weights.T)
-        f = core + of_offsets
+        return columns, outward[3 * rows]
+
+    def _offset_energy(self, offsets: Any, h: Any) -> Any:
+        """What the energy of the offsets costs."""
+        return self._own * ca.sumsqr(offsets) / h**self._power
+
+    def _to_x(self, by_outer: Any, by_natural: Any) -> Any:
+        """Slopes (R, n) by x, from those by offsets axis by axis and by the ends' variables."""
+        wide = ca.horzcat(by_outer[:, self._place], by_natural)
+        return wide * ca.repmat(self._scale, wide.shape[0], 1)
+
+    def _worst(self) -> Any:
+        """The greatest excess at a point, of samples and ends."""
+        x, told, natural, offsets = self._point()
+        outward, _, at_ends = self._ends(natural, told)
+        columns, h = self._columns(outward, offsets)
+        limits = self._limits(self._unit(columns), h, told)
+        return ca.Function("worst", [x, told], [ca.fmax(ca.mmax(limits), ca.mmax(at_ends))])
+
+    def _nlp(self) -> Any:
+        """Objective and constraints: limit by limit at all samples, then at the ends."""
+        x, told, natural, offsets = self._point()
+        outward, core, at_ends = self._ends(natural, told)
+        columns, h = self._columns(outward, offsets)
+        values = self._values(self._unit(columns), h, told)
+        f, g = core + self._offset_energy(offsets, h), ca.MX(0, 1)
         if self.penalised:
-            f, g = f + ca.sum2(values * weights), ca.MX(0, 1)
+            f = f + ca.sum2(values * self._weights)
         else:
-            g = ca.vertcat(ca.vec(values.T), at_ends)  # limit by limit
-        # x is laid out waypoint by waypoint, matrices here axis by axis.
-        order = [3 * i + axis for axis in range(3) for i in range(pieces - 1)]
-        place = np.argsort(order).tolist()
-        # Derivatives by (offsets axis by axis, rows axis by axis, h).
-        outer = [a * num_columns + rows + i for a in range(3) for i in range(pieces - 1)]
-        inner = [a * num_columns + i for a in range(3) for i in range(rows)]
-        num_out, num_in = len(outer), len(inner) + 1
-        chain = by_natural[:num_in, :]  # (25, natural)
-        by_core = by_natural[num_in : num_in + 1, :]
-        by_ends = by_natural[num_in + 1 :, :]
-        scale_row = ca.DM(np.concatenate([np.array(planner.scale)])).T
+            g = ca.vertcat(ca.vec(values.T), at_ends)
+        return ca.Function("nlp", [x, told], [f, g], ["x", "p"], ["f", "g"])
 
-        def to_x(by_outer: Any, by_natural: Any) -> Any:
-            wide = ca.horzcat(by_outer[:, place], by_natural)
-            return wide * ca.repmat(scale_row, wide.shape[0], 1)
-
-        def by_sample(of: int) -> tuple[Any, Any]:
-            """Slopes of one value at all samples by columns axis by axis, and by h."""
-            parts: list[Any] = [0.0] * 3
-            by_h: Any = ca.MX.zeros(self.num_samples, 1)
-            for k, (i, j) in enumerate(self._slope_places):
-                if i != of:
-                    continue
-                factor = slopes[k, :].T
-                if j == len(PLACES):
-                    by_h = by_h + factor
-                    continue
-                degree, axis = PLACES[j]
-                matrix = self._matrices[degree]
-                parts[axis] = parts[axis] + ca.repmat(factor, 1, num_columns) * matrix
-            zero = ca.MX.zeros(self.num_samples, num_columns)
-            return ca.horzcat(*(zero if isinstance(p, float) else p for p in parts)), by_h
-
-        offsets_row = ca.vec(offsets).T
-        grad_outer = 2.0 * own / h**power * offsets_row
-        grad_h = -power * of_offsets / h
-        multipliers_f = ca.MX.sym("sigma")
-        multipliers_g = ca.MX.sym("lambda", self.num_constraints)
-        jacobian = ca.MX(0, size)
-        gradient_columns = ca.MX.zeros(1, len(inner))
+    def _gradient(self) -> Any:
+        """The objective and its slopes by x."""
+        x, told, natural, offsets = self._point()
+        outward, core, _, by_natural = self._ends_slopes(natural, told)
+        columns, h = self._columns(outward, offsets)
+        energy, num_in = self._offset_energy(offsets, h), len(self._inner) + 1
+        f = core + energy
+        by_outer = 2.0 * self._own / h**self._power * ca.vec(offsets).T
+        by_inner, by_h = ca.MX.zeros(1, len(self._inner)), -self._power * energy / h
         if self.penalised:
-            of_samples, of_h = self._bends(unit, h, told, weights)[0], None
+            unit = self._unit(columns)
+            f = f + ca.sum2(self._values(unit, h, told) * self._weights)
+            of_samples, _ = self._bends(unit, h, told, self._weights)
             by_columns = self._columns_of(of_samples)
-            of_h = ca.sum2(of_samples[len(PLACES), :])
-            grad_outer = grad_outer + by_columns[:, outer]
-            gradient_columns = by_columns[:, inner]
-            grad_h = grad_h + of_h
-        else:
-            blocks = []
-            for limit in range(self.num_limits):
-                by_columns, by_h = by_sample(limit)
-                inward = ca.horzcat(by_columns[:, inner], by_h) @ chain
-                blocks.append(to_x(by_columns[:, outer], inward))
-            blocks.append(to_x(ca.MX.zeros(self.num_at_ends, num_out), by_ends))
-            jacobian = ca.vertcat(*blocks)
-        inward = ca.horzcat(gradient_columns, grad_h) @ chain + by_core
-        gradient = to_x(grad_outer, inward)
+            by_outer, by_inner = by_outer + by_columns[:, self._outer], by_columns[:, self._inner]
+            by_h = by_h + ca.sum2(of_samples[len(PLACES), :])
+        inward = ca.horzcat(by_inner, by_h) @ by_natural[:num_in, :] + by_natural[num_in, :]
+        gradient = self._to_x(by_outer, inward).T
+        return ca.Function("gradient", [x, told], [f, gradient], ["x", "p"], ["f", "grad_f_x"])
 
-        # The Hessian of the Lagrangian.
+    def _jacobian(self) -> Any:
+        """The constraints and their slopes by x."""
+        x, told, natural, offsets = self._point()
+        outward, _, at_ends, by_natural = self._ends_slopes(natural, told)
+        columns, h = self._columns(outward, offsets)
+        values, slopes = self._slopes(self._unit(columns), h, told)
+        g, jacobian = ca.MX(0, 1), ca.MX(0, x.numel())
+        if not self.penalised:
+            num_in, blocks = len(self._inner) + 1, []
+            for limit in range(self._num_values):
+                by_columns, by_h = self._slopes_of(limit, slopes)
+                inward = ca.horzcat(by_columns[:, self._inner], by_h) @ by_natural[:num_in, :]
+                blocks.append(self._to_x(by_columns[:, self._outer], inward))
+            none = ca.MX.zeros(self._num_at_ends, len(self._outer))
+            blocks.append(self._to_x(none, by_natural[num_in + 1 :, :]))
+            g, jacobian = ca.vertcat(ca.vec(values.T), at_ends), ca.vertcat(*blocks)
+        return ca.Function("jacobian", [x, told], [g, jacobian], ["x", "p"], ["g", "jac_g_x"])
+
+    def _hessian(self) -> Any:
+        """The upper triangle of the Hessian of the Lagrangian by x."""
+        x, told, natural, offsets = self._point()
+        of_f, of_g = ca.MX.sym("of_f"), ca.MX.sym("of_g", self.num_constraints)
+        outward, _, _, by_natural = self._ends_slopes(natural, told)
+        columns, h = self._columns(outward, offsets)
         if self.penalised:
-            multipliers = multipliers_f * weights
-            at_ends_multipliers = ca.MX.zeros(self.num_at_ends, 1)
+            multipliers, at_ends = of_f * self._weights, ca.MX.zeros(self._num_at_ends, 1)
         else:
-            count = self.num_limits * self.num_samples
-            multipliers = ca.reshape(multipliers_g[:count], self.num_samples, self.num_limits).T
-            at_ends_multipliers = multipliers_g[count:]
-        of_samples, bends = self._bends(unit, h, told, multipliers)
-        by_columns = self._columns_of(of_samples)
-        full = self._hessian_of_columns(bends, num_columns)
-        full_out_out = full[outer, outer] + multipliers_f * 2.0 * own / h**power * ca.MX.eye(
-            num_out
-        )
-        with_h = multipliers_f * (-power) * grad_of_energy(own, offsets_row, h, power)
-        inner_h = [*inner, 3 * num_columns]
-        out_in = full[outer, inner_h]
-        out_in = out_in + ca.horzcat(ca.MX.zeros(num_out, len(inner)), with_h.T)
-        corner = multipliers_f * power * (power + 1) * of_offsets / h**2
-        bump = ca.MX.zeros(num_in, num_in)
-        bump[num_in - 1, num_in - 1] = corner
-        in_in = full[inner_h, inner_h] + bump
-        slope_h = ca.sum2(of_samples[len(PLACES), :])
-        slope_h = slope_h - multipliers_f * power * of_offsets / h
-        outward_weights = ca.vertcat(by_columns[:, inner].T, slope_h)
-        bend = self._ends_bend(
-            natural, told, ca.vertcat(outward_weights, multipliers_f, at_ends_multipliers)
-        )
-        mixed = out_in @ chain
-        last = chain.T @ in_in @ chain + bend
+            count = self._num_values * self.num_samples
+            multipliers = ca.reshape(of_g[:count], self.num_samples, self._num_values).T
+            at_ends = of_g[count:]
+        of_samples, bends = self._bends(self._unit(columns), h, told, multipliers)
+        by_columns, full = self._columns_of(of_samples), self._hessian_of_columns(bends)
+        # The energy of the offsets adds to what the samples make.
+        power, energy = self._power, of_f * self._offset_energy(offsets, h)
+        bend = 2.0 * of_f * self._own / h**power
+        num_out, num_in = len(self._outer), len(self._inner) + 1
+        inner = [*self._inner, 3 * self._num_columns]
+        of_outer = full[self._outer, self._outer] + bend * ca.MX.eye(num_out)
+        with_h = -power * bend / h * ca.vec(offsets)
+        mixed = full[self._outer, inner]
+        mixed = mixed + ca.horzcat(ca.MX.zeros(num_out, num_in - 1), with_h)
+        of_h = ca.diagcat(ca.MX.zeros(num_in - 1, num_in - 1), power * (power + 1) * energy / h**2)
+        of_inner = full[inner, inner] + of_h
+        by_h = ca.sum2(of_samples[len(PLACES), :]) - power * energy / h
+        weights = ca.vertcat(by_columns[:, self._inner].T, by_h, of_f, at_ends)
+        chain = by_natural[:num_in, :]
+        of_natural = chain.T @ of_inner @ chain + self._ends_bend(natural, told, weights)
+        mixed = (mixed @ chain)[self._place, :]
         hessian = ca.vertcat(
-            ca.horzcat(full_out_out[place, place], mixed[place, :]),
-            ca.horzcat(mixed[place, :].T, last),
+            ca.horzcat(of_outer[self._place, self._place], mixed),
+            ca.horzcat(mixed.T, of_natural),
         )
-        hessian = ca.triu(hessian * ca.repmat(scale_row, size, 1) * ca.repmat(scale_row.T, 1, size))
-        cheap_outward, cheap_core, cheap_ends = self._ends(natural, told)
-        cheap_columns = ca.vertcat(ca.reshape(cheap_outward[: 3 * rows], rows, 3), offsets)
-        cheap_h = cheap_outward[3 * rows]
-        cheap = self._values(self._unit(cheap_columns), cheap_h, told)
-        cheap_f = cheap_core + own * ca.sumsqr(offsets) / cheap_h**power
-        if self.penalised:
-            cheap_f, cheap_g = cheap_f + ca.sum2(cheap * weights), ca.MX(0, 1)
-        else:
-            cheap_g = ca.vertcat(ca.vec(cheap.T), cheap_ends)
-        names = ["x", "p"]
-        # The excesses of a point, whether they are constraints or not: largest of all.
-        limits = self._limits(self._unit(cheap_columns), cheap_h, told)
-        self.worst = ca.Function(
-            "worst", [x, told], [ca.fmax(ca.mmax(limits), ca.mmax(cheap_ends))], names, ["worst"]
-        )
-        return [
-            ca.Function("nlp", [x, told], [cheap_f, cheap_g], names, ["f", "g"]),
-            ca.Function("gradient", [x, told], [f, gradient.T], names, ["f", "grad_f_x"]),
-            ca.Function("jacobian", [x, told], [g, jacobian], names, ["g", "jac_g_x"]),
-            ca.Function(
-                "hessian",
-                [x, told, multipliers_f, multipliers_g],
-                [hessian],
-                ["x", "p", "lam_f", "lam_g"],
-                ["hess"],
-            ),
-        ]
+        hessian = ca.triu(hessian * (self._scale.T @ self._scale))
+        names = ["x", "p", "lam_f", "lam_g"]
+        return ca.Function("hessian", [x, told, of_f, of_g], [hessian], names, ["hess"])
+
+    def _slopes_of(self, value: int, slopes: Any) -> tuple[Any, Any]:
+        """Slopes of one value at all samples by columns axis by axis (K, 3 C), and by h (K, 1)."""
+        parts = [ca.MX.zeros(self.num_samples, self._num_columns)] * 3
+        by_h = ca.MX.zeros(self.num_samples, 1)
+        for k, (i, j) in enumerate(self._slope_places):
+            if i == value and j == len(PLACES):
+                by_h = by_h + slopes[k, :].T
+            elif i == value:
+                order, axis = PLACES[j]
+                factor = ca.repmat(slopes[k, :].T, 1, self._num_columns)
+                parts[axis] = parts[axis] + factor * self._matrices[order]
+        return ca.horzcat(*parts), by_h
 
     def _unit(self, columns: Any) -> Any:
         """The samples (10, K) in time over h of columns (C, 3)."""
@@ -358,82 +352,41 @@ class Program:
 
     def _columns_of(self, of_samples: Any) -> Any:
         """Slopes (1, 3 C) by columns axis by axis, from those (11, K) by the samples."""
-        parts = []
-        for axis in range(3):
-            part: Any = 0.0
-            for i, (order, own) in enumerate(PLACES):
-                if own == axis:
-                    part = part + of_samples[i, :] @ self._matrices[order]
-            parts.append(part)
+        parts = [ca.MX.zeros(1, self._num_columns)] * 3
+        for i, (order, axis) in enumerate(PLACES):
+            parts[axis] = parts[axis] + of_samples[i, :] @ self._matrices[order]
         return ca.horzcat(*parts)
 
-    def _hessian_of_columns(self, bends: Any, num_columns: int) -> Any:
-        """The Hessian (3 C + 1, 3 C + 1) by columns and h, from that of every sample."""
-        last = len(PLACES)
-        blocks: list[list[Any]] = [[None] * 4 for _ in range(4)]
-
-        def add(i: int, j: int, part: Any) -> None:
-            blocks[i][j] = part if blocks[i][j] is None else blocks[i][j] + part
-
-        # (order, axis, order', axis') -> factors (K, 1); both triangles.
-        factors: dict[tuple, Any] = {}
-        for k, (i, j) in enumerate(self._bend_places):
-            value = bends[k, :].T
-            if i == last and j == last:
-                add(3, 3, ca.sum1(value))
-            elif j == last:
-                order, axis = PLACES[i]
-                part = self._matrices[order].T @ value
-                add(axis, 3, part)
-                add(3, axis, part.T)
-            else:
-                factors[i, j] = value
-                factors[j, i] = value
-        for a in range(3):
-            for b in range(a, 3):
-                whole: Any = None
-                for i, (order, axis) in enumerate(PLACES):
-                    if axis != a:
-                        continue
-                    inside: Any = None
-                    for j, (other, axis_other) in enumerate(PLACES):
-                        if axis_other != b or (i, j) not in factors:
-                            continue
-                        part = ca.repmat(factors[i, j], 1, num_columns) * self._matrices[other]
-                        inside = part if inside is None else inside + part
-                    if inside is not None:
-                        product = self._matrices[order].T @ inside
-                        whole = product if whole is None else whole + product
-                if whole is not None:
-                    add(a, b, whole)
-                    if a != b:
-                        add(b, a, whole.T)
-        sizes = (num_columns, num_columns, num_columns, 1)
-        return ca.vertcat(
-            *(
-                ca.horzcat(
-                    *(
-                        ca.MX.zeros(sizes[i], sizes[j]) if part is None else part
-                        for j, part in enumerate(line)
-                    )
-                )
-                for i, line in enumerate(blocks)
-            )
-        )
+    def _hessian_of_columns(self, bends: Any) -> Any:
+        """The Hessian (3 C + 1, 3 C + 1) by columns axis by axis and h, from those of samples."""
+        last, num = len(PLACES), self._num_columns
+        factors = {place: bends[k, :].T for k, place in enumerate(self._bend_places)}
+        sizes = (num, num, num, 1)
+        blocks = [[ca.MX.zeros(a, b) for b in sizes] for a in sizes]
+        # By sample and other place in turn, so that each product with a matrix is made but once.
+        for i, (order, axis) in enumerate(PLACES):
+            inside: dict[int, Any] = {}
+            for j, (other, of) in enumerate(PLACES):
+                factor = factors.get((min(i, j), max(i, j)))
+                if factor is not None and of >= axis:
+                    part = ca.repmat(factor, 1, num) * self._matrices[other]
+                    inside[of] = inside[of] + part if of in inside else part
+            for of, part in inside.items():
+                blocks[axis][of] = blocks[axis][of] + self._matrices[order].T @ part
+            if (i, last) in factors:
+                blocks[axis][3] = blocks[axis][3] + self._matrices[order].T @ factors[i, last]
+        if (last, last) in factors:
+            blocks[3][3] = ca.sum1(factors[last, last])
+        lower = lambda a, b: blocks[a][b] if a <= b else blocks[b][a].T  # noqa: E731
+        return ca.vertcat(*(ca.horzcat(*(lower(a, b) for b in range(4))) for a in range(4)))
 
     def _as_machine_code(self) -> list:
-        """The functions, compiled."""
-        self._folder = tempfile.TemporaryDirectory(prefix="ipopt-")
-        folder = Path(self._folder.name)
+        """The functions, compiled; loaded, they need their file no more."""
         code = ca.CodeGenerator("program.c")
         for function in self.functions:
             code.add(function)
-        code.generate(f"{folder}/")
-        library = folder / "program.so"
-        subprocess.run([*COMPILER, str(folder / "program.c"), "-o", str(library)], check=True)
-        return [ca.external(function.name(), str(library)) for function in self.functions]
-
-
-def grad_of_energy(own: float, offsets_row: Any, h: Any, power: int) -> Any:
-    """Slope by the offsets and h of their energy, over minus the power: (1, 3 (M - 1))."""
-    return 2.0 * own * offsets_row / h ** (power + 1)
+        with tempfile.TemporaryDirectory(prefix="ipopt-") as folder:
+            source, library = Path(folder, "program.c"), Path(folder, "program.so")
+            code.generate(f"{folder}/")
+            subprocess.run([*COMPILER, str(source), "-o", str(library)], check=True)
+            return [ca.external(function.name(), str(library)) for function in self.functions]
