@@ -1,5 +1,6 @@
 """The problems that IPOPT gets are the planners': objective, limits and derivatives."""
 
+import dataclasses
 import functools
 import importlib.util
 import json
@@ -104,9 +105,11 @@ def test_with_limits_as_constraints_it_costs_no_more_than_the_planner_and_the_re
     paths = peer.iterates(setting, starts)
     assert [len(path) - 1 for path in paths] == found.steps.tolist()
     np.testing.assert_allclose([path[-1] for path in paths], found.points, atol=1e-6)
-    seconds, reached = ipopt.seconds_to(task, peer, paths, found.seconds, task.cost(ours))
+    run = ipopt.Found("planner", task.cost(ours), ours.cost, np.ones(3, bool), np.ones(3))
+    seconds, reached = ipopt.seconds_to(task, peer, paths, found.seconds, run)
     assert reached.all() and (seconds <= found.seconds).all() and (seconds > 0.0).all()
-    never = ipopt.seconds_to(task, peer, paths, found.seconds, np.zeros(3))
+    free = dataclasses.replace(run, cost=np.zeros(3))
+    never = ipopt.seconds_to(task, peer, paths, found.seconds, free)
     np.testing.assert_array_equal(never[0], found.seconds)
     assert not never[1].any()
 
