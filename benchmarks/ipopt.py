@@ -174,7 +174,7 @@ def seconds_to(
     """
     worst, told = peer.programs[False].worst, setup.batches["learned"].told
     by_objective = peer.form == "penalties"
-    target = run.objective if by_objective else run.cost
+    target = np.asarray(run.objective if by_objective else run.cost)
     costs = np.full((max(map(len, paths)), len(paths)), np.inf)
     for step in range(len(costs)):
         points = np.stack([path[min(step, len(path) - 1)] for path in paths])
@@ -184,7 +184,7 @@ def seconds_to(
         costs[: len(path), k][~(excess <= FEASIBILITY_TOLERANCE)] = np.inf
         costs[len(path) :, k] = np.inf
     good = costs <= target * (1.0 + NO_MORE)
-    reached, steps = good.any(axis=0), np.array([len(path) for path in paths])
+    reached, steps = np.asarray(good.any(axis=0)), np.array([len(path) for path in paths])
     share = np.where(reached, (np.argmax(good, axis=0) + 1) / steps, 1.0)
     return whole * share, reached
 

@@ -185,8 +185,8 @@ class Program:
         unit, h = ca.SX.sym("unit", len(PLACES)), ca.SX.sym("h")
         told = ca.SX.sym("told", self.num_told)
         at = [unit[i] / h**order for i, (order, _) in enumerate(PLACES)]
-        vectors = (ca.vertcat(*at[i : i + 3]) for i in (1, 4, 7))
-        limits = ca.vertcat(*self.problem.limits(at[0], *vectors, self._split(told)))
+        vel, acc, jerk = (ca.vertcat(*at[i : i + 3]) for i in (1, 4, 7))
+        limits = ca.vertcat(*self.problem.limits(at[0], vel, acc, jerk, self._split(told)))
         values = limits
         if self.penalised:
             inside = limits + planner.margin * ca.DM(factors)
