@@ -1,0 +1,212 @@
+"""IPOPT on the cases of a batch: one after another, on one core, with its iterates if asked."""
+
+import dataclasses
+import shutil
+import time
+from types import ModuleType
+from typing import Any
+
+import jax
+import numpy as np
+
+from planner_jax.benchmarks.ipopt_peer.program import COMPILER, Program, ca
+from planner_jax.protocol import lane
+from planner_jax.task.segments import BETWEEN_NODES
+
+# How MUMPS orders and scales: what it does by default, and the least of it, as matrices are small.
+_USUAL: dict[str, Any] = {}
+_PLAIN = {"mumps_scaling": 0, "mumps_permuting_scaling": 0, "mumps_pivot_order": 0}
+_ADAPTIVE = {"mu_strategy": "adaptive"}
+_NEAR = {"mu_init": 1e-3, "bound_push": 1e-3, "slack_bound_push": 1e-3}  # starts are good ones
+_QUASI_NEWTON = {"hessian_approximation": "limited-memory", "max_iter": 100}
+# By form, what is tried: tolerance, options, and whether the functions are compiled.
+TRIED: dict[str, tuple[tuple[float, dict[str, Any], bool], ...]] = {
+    "limits": (
+        (1e-6, _PLAIN, True),
+        (1e-6, _PLAIN | _ADAPTIVE, True),
+        (1e-4, _PLAIN, True),
+        (1e-4, _PLAIN | _ADAPTIVE, True),
+        (1e-3, _PLAIN, True),
+        (1e-3, _PLAIN | _ADAPTIVE, True),
+        (1e-3, _USUAL | _ADAPTIVE, True),
+        (1e-3, _PLAIN | _ADAPTIVE, False),
+        (1e-3, _PLAIN | _NEAR, True),
+        (1e-2, _PLAIN | _ADAPTIVE, True),
+        (1e-3, _PLAIN | _QUASI_NEWTON, True),
+    ),
+    "penalties": (
+        (1e-6, _PLAIN, True),
+        (1e-4, _PLAIN, True),
+        (1e-4, _PLAIN, False),
+        (1e-4, _USUAL, True),
+        (1e-3, _PLAIN, True),
+        (1e-2, _PLAIN, True),
+        (1e-4, _PLAIN | _QUASI_NEWTON, True),
+    ),
+}
+MOST_STEPS = 300
+AS_GOOD = 1e-3  # relative cost above the least, of nine cases in ten, that counts as none
+
+
+@dataclasses.dataclass
+class Batch:
+    """Cases as a peer gets them, and where it begins."""
+
+    told: np.ndarray  # (B, P), numbers of the cases
+    starts: np.ndarray  # (B, n)
+
+
+@dataclasses.dataclass
+class Solutions:
+    """Where IPOPT ended."""
+
+    points: np.ndarray  # (B, n)
+    objectives: np.ndarray  # (B,), its own
+    seconds: np.ndarray  # (B,) of processor time
+    steps: np.ndarray  # (B,)
+    converged: np.ndarray  # (B,) bool
+
+
+def told_of(module: ModuleType, planner: Any, contexts: Any) -> np.ndarray:
+    """What programs of a task's module are told about a batch of contexts, (B, P)."""
+    contexts = jax.tree.map(np.asarray, contexts)
+    sizes = module.problem(planner).sizes
+    num = jax.tree.leaves(contexts)[0].shape[0]
+    each = (module.told(lane(contexts, k)) for k in range(num))
+    return np.stack([np.concatenate([np.ravel(one[name]) for name in sizes]) for one in each])
+
+
+class Peer:
+    """IPOPT on a planner's problem in one form.
+
+    Args:
+        module: that writes the task's problem down, `hits` or `catches`.
+        planner: an `ExactHit` or `ExactCatch`.
+        form: "limits" has them as constraints, "penalties" minimises the planner's own objective.
+        unit: a usual cost; IPOPT's tolerances are told relative to it.
+        compiled: whether the functions are there as compiled C code too, if there is a compiler.
+    """
+
+    def __init__(
+        self, module: ModuleType, planner: Any, form: str, unit: float, compiled: bool = True
+    ):
+        problem, penalised = module.problem(planner), form == "penalties"
+        self.form, self._scale, began = form, 1.0 / unit, time.perf_counter()
+        self.programs = {False: Program(problem, penalised, BETWEEN_NODES)}
+        self.build_seconds, began = time.perf_counter() - began, time.perf_counter()
+        if compiled and shutil.which(COMPILER[0]):
+            self.programs[True] = Program(problem, penalised, BETWEEN_NODES, compiled=True)
+        self.compile_seconds = time.perf_counter() - began
+
+    def solve(
+        self, setting: tuple[float, dict[str, Any], bool], batch: Batch, repeat: int = 1
+    ) -> Solutions:
+        """Solve all cases, each as fast as the fastest of some tries."""
+        solver, options = self._solver(setting)
+        solver(batch.starts[0], batch.told[0])  # IPOPT's first call sets things up
+        found, seconds = [], np.full(len(batch.starts), np.inf)
+        for _ in range(repeat):
+            found = []
+            for k, (start, told) in enumerate(zip(batch.starts, batch.told, strict=True)):
+                began = time.process_time()
+                result, stats = solver(start, told)
+                seconds[k] = min(seconds[k], time.process_time() - began)
+                found.append((np.ravel(np.asarray(result["x"])), float(result["f"]), stats))
+        points, objectives, stats = zip(*found, strict=True)
+        return Solutions(
+            points=np.stack(points),
+            objectives=np.array(objectives),
+            seconds=seconds,
+            steps=np.array([each["iter_count"] for each in stats]),
+            converged=np.array([each["success"] for each in stats]),
+        )
+
+    def iterates(
+        self, setting: tuple[float, dict[str, Any], bool], batch: Batch
+    ) -> list[np.ndarray]:
+        """The points (steps + 1, n) that each search goes through; not timed."""
+        size = batch.starts.shape[1]
+        program = self.programs[False]
+        callback = _Recorder(size, program.num_constraints, batch.told.shape[1])
+        solver, _ = self._solver(setting, callback)
+        paths = []
+        for start, told in zip(batch.starts, batch.told, strict=True):
+            callback.points.clear()
+            solver(start, told)
+            paths.append(np.stack(callback.points))
+        return paths
+
+    def _solver(self, setting: tuple[float, dict, bool], callback: Any = None) -> Any:
+        tolerance, options, compiled = setting
+        given = {"max_iter": MOST_STEPS, "obj_scaling_factor": self._scale, "tol": tolerance}
+        given |= options
+        return self.programs[compiled].solver(given, callback), given
+
+
+class _Recorder(ca.Callback):
+    """Keeps the points that IPOPT comes through."""
+
+    def __init__(self, size: int, constraints: int, told: int):
+        ca.Callback.__init__(self)
+        self.points: list[np.ndarray] = []
+        self._sizes = {"x": size, "f": 1, "g": constraints, "lam_x": size}
+        self._sizes |= {"lam_g": constraints, "lam_p": told}
+        self.construct("recorder", {})
+
+    def get_n_in(self):
+        return ca.nlpsol_n_out()
+
+    def get_n_out(self):
+        return 1
+
+    def get_name_in(self, i):
+        return ca.nlpsol_out(i)
+
+    def get_name_out(self, i):
+        return "ret"
+
+    def get_sparsity_in(self, i):
+        return ca.Sparsity.dense(self._sizes[ca.nlpsol_out(i)], 1)
+
+    def eval(self, arg):
+        self.points.append(np.ravel(np.asarray(arg[0])))
+        return [0]
+
+
+def best_setting(peer: Peer, batch: Batch, accepted: Any) -> tuple[tuple, list[dict[str, Any]]]:
+    """The quickest setting that is as good as any: by the referee, and by the peer's own objective.
+
+    Args:
+        peer: whose settings are tried.
+        batch: cases that nothing else is measured on.
+        accepted: of points (B, n), which the referee passes, (B,) bool.
+
+    Returns:
+        The setting, and a row of figures for each that was tried.
+    """
+    tried = [each for each in TRIED[peer.form] if each[2] in peer.programs]
+    found = [peer.solve(each, batch) for each in tried]
+    passed = np.stack([accepted(each.points) for each in found])
+    objectives = np.stack([each.objectives for each in found])
+    least = np.min(np.where(passed, objectives, np.inf), axis=0)
+    above = objectives / least - 1.0
+    known = np.isfinite(least)
+    quantiles = np.quantile(above[:, known], 0.9, axis=1)
+    seconds = np.array([each.seconds.mean() for each in found])
+    fit = (passed.sum(axis=1) == passed.sum(axis=1).max()) & (quantiles <= AS_GOOD)
+    chosen = np.argmin(np.where(fit, seconds, np.inf)) if fit.any() else np.argmin(quantiles)
+    rows = [
+        {
+            "form": peer.form,
+            "tolerance": setting[0],
+            "options": setting[1],
+            "compiled": setting[2],
+            "success_rate": passed[k].mean(),
+            "above_p90": quantiles[k],
+            "steps": found[k].steps.mean(),
+            "milliseconds": 1e3 * seconds[k],
+            "chosen": k == chosen,
+        }
+        for k, setting in enumerate(tried)
+    ]
+    return tried[chosen], rows

@@ -1,0 +1,392 @@
+"""The nonlinear program of one minimum-snap segment, its derivatives exact, for IPOPT.
+
+A planner's decision variables x are whitened waypoint offsets and a few variables of the ends, as
+`ExactHit` and `ExactCatch` have them. The ends make boundary rows R and the mean duration h of a
+piece; rows and offsets are the columns C of the trajectory, and constant matrices times C are its
+samples in time over h. So the ends are one small function, and a sample's limits another one:
+CasADi differentiates both symbolically, and the chain rule through the matrices is written out
+here. Differentiated as a whole the graph would be a hundred times larger, and IPOPT slower.
+
+Shares no code with the planners but the trajectory's constant matrices and the settings.
+"""
+
+import dataclasses
+import importlib
+import subprocess
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from planner_jax.cost.penalty import joined_trapezoid_weights
+
+ca: Any = importlib.import_module("casadi")  # of the extra `oracle`
+
+ORDERS = 4  # position to jerk
+# Of a sample: height, velocity, acceleration, jerk, each as (order, axis).
+PLACES = ((0, 2), *((order, axis) for order in (1, 2, 3) for axis in range(3)))
+COMPILER = ("cc", "-O3", "-march=native", "-ffast-math", "-fPIC", "-shared")
+
+
+@dataclasses.dataclass(frozen=True)
+class Problem:
+    """What a task asks of a segment; all functions take and give CasADi's symbols.
+
+    `told` is a dict of the numbers of a case by name, as in `sizes`.
+    """
+
+    planner: Any  # an `ExactHit` or `ExactCatch`, for its settings
+    sizes: dict[str, int]  # what a program is told about a case, and how many numbers that is
+    num_natural: int  # variables of the ends
+    # Of those variables and `told`: tail state (4, 3), duration [s], list of excesses, and cost.
+    ends: Callable[[Any, dict], tuple[Any, Any, list, Any]]
+    # Of height, velocity, acceleration, jerk at a sample and `told`: list of excesses.
+    limits: Callable[[Any, Any, Any, Any, dict], list]
+    factors: tuple[float, ...]  # of the planner's margin, for each of these excesses
+    impact_weight: float  # [s], of the hinges of the ends
+
+
+def hinge(x: Any, width: float) -> Any:
+    """The smoothed hinge of paper 000, eq. 27b."""
+    blend = (width - 0.5 * x) * (x / width) ** 3
+    return ca.if_else(x <= 0.0, 0.0, ca.if_else(x < width, blend, x - 0.5 * width))
+
+
+def rate_squared(acc: Any, jerk: Any, gravity: Any) -> Any:
+    """|omega|^2 of the Hopf fibration at zero heading, from flatness."""
+    thrust = acc + ca.vertcat(0.0, 0.0, gravity)
+    squared = ca.fmax(ca.sumsqr(thrust), 1e-4)
+    size = ca.sqrt(squared)
+    tilt = (ca.sumsqr(jerk) - ca.dot(thrust, jerk) ** 2 / squared) / squared
+    twist = (thrust[1] * jerk[0] - thrust[0] * jerk[1]) / size
+    return tilt + (twist / ca.fmax(size + thrust[2], 1e-2)) ** 2
+
+
+def across(axis: Any) -> tuple[Any, Any]:
+    """The body x and y axes at zero heading for a body z axis."""
+    x, y, z = axis[0], axis[1], axis[2]
+    k = 1.0 / ca.fmax(1.0 + z, 1e-6)
+    return ca.vertcat(1.0 - k * x * x, -k * x * y, -x), ca.vertcat(-k * x * y, 1.0 - k * y * y, -y)
+
+
+class Program:
+    """The program of a problem, built once for all of its cases.
+
+    Args:
+        problem: of a task.
+        penalised: whether limits are the planner's own penalties in the objective, and not
+            constraints.
+        backoff: by which excesses have to stay below zero where they are constraints.
+        compiled: whether functions are compiled C code, or run by CasADi's virtual machine.
+    """
+
+    def __init__(
+        self, problem: Problem, penalised: bool, backoff: float = 0.0, *, compiled: bool = False
+    ):
+        planner = problem.planner
+        self.problem, self.penalised, self.backoff = problem, penalised, backoff
+        self._maps = planner.maps
+        self._matrices = [ca.DM(self._maps.sample_matrix(planner.nodes, d)) for d in range(ORDERS)]
+        weights = joined_trapezoid_weights(planner.nodes, self._maps.proportions)
+        self._weights, self.num_samples = ca.DM(weights).T, len(weights)
+        self.num_told = sum(problem.sizes.values())
+        self._power = 2 * self._maps.order - 1
+        self._own = planner.energy_weight * self._maps.offset_energy
+        self._lay_out()
+        self._build_ends()
+        self._build_limits()
+        self.worst = self._worst()
+        self.functions = [self._nlp(), self._gradient(), self._jacobian(), self._hessian()]
+        if compiled:
+            self.functions = self._as_machine_code()
+
+    def solver(self, options: dict[str, Any], callback: Any = None) -> Callable:
+        """IPOPT on this program: a function of a start and of what is told, to CasADi's results."""
+        nlp, gradient, jacobian, hessian = self.functions
+        settings: dict[str, Any] = {"print_level": 0, "sb": "yes", "linear_solver": "mumps"}
+        given: dict[str, Any] = {"ipopt": settings | options, "print_time": False}
+        given |= {"error_on_fail": False, "show_eval_warnings": False}
+        given |= {"no_nlp_grad": True, "calc_lam_p": False}
+        given |= {"grad_f": gradient, "jac_g": jacobian, "hess_lag": hessian}
+        if callback is not None:
+            given["iteration_callback"] = callback
+        if options.get("hessian_approximation") == "limited-memory":
+            del given["hess_lag"]
+        solve = ca.nlpsol("segment", "ipopt", nlp, given)
+        least = -np.inf if self.num_constraints else []
+
+        def solved(start: np.ndarray, told: np.ndarray) -> tuple[dict, dict]:
+            found = solve(x0=start, p=told, lbg=least, ubg=-self.backoff)
+            return found, solve.stats()
+
+        return solved
+
+    def _split(self, vector: Any) -> dict:
+        """What is told, by name."""
+        ends = np.cumsum([0, *self.problem.sizes.values()]).tolist()
+        return {n: vector[ends[i] : ends[i + 1]] for i, n in enumerate(self.problem.sizes)}
+
+    def _lay_out(self) -> None:
+        """Which columns of the trajectory are where.
+
+        Columns are counted axis by axis, each with its rows and then its offsets; x has the offsets
+        waypoint by waypoint. The outer ones are offsets, the inner ones rows and then h.
+        """
+        planner, rows = self.problem.planner, 2 * ORDERS
+        inside = planner.num_pieces - 1
+        self._num_columns = rows + inside
+        self._outer = [a * self._num_columns + rows + i for a in range(3) for i in range(inside)]
+        self._inner = [a * self._num_columns + i for a in range(3) for i in range(rows)]
+        order = [3 * i + axis for axis in range(3) for i in range(inside)]
+        self._place = np.argsort(order).tolist()
+        self._scale = ca.DM(planner.scale).T
+
+    def _build_ends(self) -> None:
+        """The function of the ends, with slopes and the bend of any sum of what it gives.
+
+        It gives rows axis by axis and the duration, cost, and excesses.
+        """
+        problem, planner = self.problem, self.problem.planner
+        natural = ca.SX.sym("natural", problem.num_natural)
+        told = ca.SX.sym("told", self.num_told)
+        named = self._split(told)
+        tail, time, excess, cost = problem.ends(natural, named)
+        duration, excess = time / planner.num_pieces, ca.vertcat(*excess)
+        head = ca.reshape(named["head_state"], 3, ORDERS).T
+        scale = ca.repmat(ca.vertcat(*[duration**k for k in range(ORDERS)]), 1, 3)
+        rows = ca.vertcat(head * scale, tail * scale)
+        gram = ca.DM(self._maps.boundary_energy)
+        energy = ca.sum1(ca.sum2(rows * (gram @ rows))) / duration**self._power
+        core = cost + planner.energy_weight * energy
+        self._num_at_ends = excess.numel()
+        if self.penalised:
+            inside = ca.vertsplit(excess + planner.margin)
+            hinges = sum(hinge(each, planner.hinge_width) for each in inside)
+            core = core + problem.impact_weight * hinges
+        outward = ca.vertcat(ca.vec(rows), duration)
+        together = ca.vertcat(outward, core, excess)
+        weights = ca.SX.sym("weights", together.numel())
+        slopes = ca.densify(ca.jacobian(together, natural))
+        bend = ca.densify(ca.hessian(ca.dot(weights, together), natural)[0])
+        given, found = [natural, told], [outward, core, excess]
+        self._ends = ca.Function("ends", given, found)
+        self._ends_slopes = ca.Function("ends_slopes", given, [*found, slopes])
+        self._ends_bend = ca.Function("ends_bend", [*given, weights], [bend])
+
+    def _build_limits(self) -> None:
+        """The functions of a sample's limits, for all samples at once.
+
+        They take the sample in time over h, h, and what is told. Where limits are penalties, one
+        value stands for them all: the sum of their hinges times h.
+        """
+        planner, factors = self.problem.planner, self.problem.factors
+        unit, h = ca.SX.sym("unit", len(PLACES)), ca.SX.sym("h")
+        told = ca.SX.sym("told", self.num_told)
+        at = [unit[i] / h**order for i, (order, _) in enumerate(PLACES)]
+        vel, acc, jerk = (ca.vertcat(*at[i : i + 3]) for i in (1, 4, 7))
+        limits = ca.vertcat(*self.problem.limits(at[0], vel, acc, jerk, self._split(told)))
+        values = limits
+        if self.penalised:
+            inside = limits + planner.margin * ca.DM(factors)
+            values = h * sum(hinge(each, planner.hinge_width) for each in ca.vertsplit(inside))
+        self._num_values = values.numel()
+        self.num_constraints = self._num_values * self.num_samples + self._num_at_ends
+        if self.penalised:
+            self.num_constraints = 0
+        multipliers = ca.SX.sym("multipliers", self._num_values)
+        variables = ca.vertcat(unit, h)
+        slopes = ca.jacobian(values, variables)
+        bend, gradient = ca.hessian(ca.dot(multipliers, values), variables)
+        bend = ca.triu(bend)
+        self._slope_places = list(zip(*slopes.sparsity().get_triplet(), strict=True))
+        self._bend_places = list(zip(*bend.sparsity().get_triplet(), strict=True))
+
+        def mapped(name: str, given: list, found: list) -> Any:
+            of_sample = ca.Function(name, [unit, h, told, *given], found)
+            return of_sample.map(f"{name}_map", "serial", self.num_samples, [1, 2], [])
+
+        filled = lambda matrix: ca.vertcat(*matrix.nonzeros())  # noqa: E731
+        self._limits = mapped("limits", [], [limits])
+        self._values = mapped("values", [], [values])
+        self._slopes = mapped("slopes", [], [values, filled(slopes)])
+        self._bends = mapped("bends", [multipliers], [ca.densify(gradient), filled(bend)])
+
+    def _point(self) -> tuple[Any, Any, Any, Any]:
+        """Symbols of x and of what is told; variables of the ends, and offsets (M - 1, 3)."""
+        num = self.problem.planner.num_offsets
+        x, told = ca.MX.sym("x", self._scale.numel()), ca.MX.sym("told", self.num_told)
+        natural = x * self._scale.T
+        return x, told, natural[num:], ca.reshape(natural[:num], 3, num // 3).T
+
+    def _columns(self, outward: Any, offsets: Any) -> tuple[Any, Any]:
+        """Columns (C, 3) and h, from what the ends give and the offsets."""
+        rows = 2 * ORDERS
+        columns = ca.vertcat(ca.reshape(outward[: 3 * rows], rows, 3), offsets)
+        return columns, outward[3 * rows]
+
+    def _offset_energy(self, offsets: Any, h: Any) -> Any:
+        """What the energy of the offsets costs."""
+        return self._own * ca.sumsqr(offsets) / h**self._power
+
+    def _to_x(self, by_outer: Any, by_natural: Any) -> Any:
+        """Slopes (R, n) by x, from those by offsets axis by axis and by the ends' variables."""
+        wide = ca.horzcat(by_outer[:, self._place], by_natural)
+        return wide * ca.repmat(self._scale, wide.shape[0], 1)
+
+    def _worst(self) -> Any:
+        """The greatest excess at a point, of samples and ends."""
+        x, told, natural, offsets = self._point()
+        outward, _, at_ends = self._ends(natural, told)
+        columns, h = self._columns(outward, offsets)
+        limits = self._limits(self._unit(columns), h, told)
+        return ca.Function("worst", [x, told], [ca.fmax(ca.mmax(limits), ca.mmax(at_ends))])
+
+    def _nlp(self) -> Any:
+        """Objective and constraints: limit by limit at all samples, then at the ends."""
+        x, told, natural, offsets = self._point()
+        outward, core, at_ends = self._ends(natural, told)
+        columns, h = self._columns(outward, offsets)
+        values = self._values(self._unit(columns), h, told)
+        f, g = core + self._offset_energy(offsets, h), ca.MX(0, 1)
+        if self.penalised:
+            f = f + ca.sum2(values * self._weights)
+        else:
+            g = ca.vertcat(ca.vec(values.T), at_ends)
+        return ca.Function("nlp", [x, told], [f, g], ["x", "p"], ["f", "g"])
+
+    def _gradient(self) -> Any:
+        """The objective and its slopes by x."""
+        x, told, natural, offsets = self._point()
+        outward, core, _, by_natural = self._ends_slopes(natural, told)
+        columns, h = self._columns(outward, offsets)
+        energy, num_in = self._offset_energy(offsets, h), len(self._inner) + 1
+        f = core + energy
+        by_outer = 2.0 * self._own / h**self._power * ca.vec(offsets).T
+        by_inner, by_h = ca.MX.zeros(1, len(self._inner)), -self._power * energy / h
+        if self.penalised:
+            unit = self._unit(columns)
+            f = f + ca.sum2(self._values(unit, h, told) * self._weights)
+            of_samples, _ = self._bends(unit, h, told, self._weights)
+            by_columns = self._columns_of(of_samples)
+            by_outer, by_inner = by_outer + by_columns[:, self._outer], by_columns[:, self._inner]
+            by_h = by_h + ca.sum2(of_samples[len(PLACES), :])
+        inward = ca.horzcat(by_inner, by_h) @ by_natural[:num_in, :] + by_natural[num_in, :]
+        gradient = self._to_x(by_outer, inward).T
+        return ca.Function("gradient", [x, told], [f, gradient], ["x", "p"], ["f", "grad_f_x"])
+
+    def _jacobian(self) -> Any:
+        """The constraints and their slopes by x."""
+        x, told, natural, offsets = self._point()
+        outward, _, at_ends, by_natural = self._ends_slopes(natural, told)
+        columns, h = self._columns(outward, offsets)
+        values, slopes = self._slopes(self._unit(columns), h, told)
+        g, jacobian = ca.MX(0, 1), ca.MX(0, x.numel())
+        if not self.penalised:
+            num_in, blocks = len(self._inner) + 1, []
+            for limit in range(self._num_values):
+                by_columns, by_h = self._slopes_of(limit, slopes)
+                inward = ca.horzcat(by_columns[:, self._inner], by_h) @ by_natural[:num_in, :]
+                blocks.append(self._to_x(by_columns[:, self._outer], inward))
+            none = ca.MX.zeros(self._num_at_ends, len(self._outer))
+            blocks.append(self._to_x(none, by_natural[num_in + 1 :, :]))
+            g, jacobian = ca.vertcat(ca.vec(values.T), at_ends), ca.vertcat(*blocks)
+        return ca.Function("jacobian", [x, told], [g, jacobian], ["x", "p"], ["g", "jac_g_x"])
+
+    def _hessian(self) -> Any:
+        """The upper triangle of the Hessian of the Lagrangian by x."""
+        x, told, natural, offsets = self._point()
+        of_f, of_g = ca.MX.sym("of_f"), ca.MX.sym("of_g", self.num_constraints)
+        outward, _, _, by_natural = self._ends_slopes(natural, told)
+        columns, h = self._columns(outward, offsets)
+        if self.penalised:
+            multipliers, at_ends = of_f * self._weights, ca.MX.zeros(self._num_at_ends, 1)
+        else:
+            count = self._num_values * self.num_samples
+            multipliers = ca.reshape(of_g[:count], self.num_samples, self._num_values).T
+            at_ends = of_g[count:]
+        of_samples, bends = self._bends(self._unit(columns), h, told, multipliers)
+        by_columns, full = self._columns_of(of_samples), self._hessian_of_columns(bends)
+        # The energy of the offsets adds to what the samples make.
+        power, energy = self._power, of_f * self._offset_energy(offsets, h)
+        bend = 2.0 * of_f * self._own / h**power
+        num_out, num_in = len(self._outer), len(self._inner) + 1
+        inner = [*self._inner, 3 * self._num_columns]
+        of_outer = full[self._outer, self._outer] + bend * ca.MX.eye(num_out)
+        with_h = -power * bend / h * ca.vec(offsets)
+        mixed = full[self._outer, inner]
+        mixed = mixed + ca.horzcat(ca.MX.zeros(num_out, num_in - 1), with_h)
+        of_h = ca.diagcat(ca.MX.zeros(num_in - 1, num_in - 1), power * (power + 1) * energy / h**2)
+        of_inner = full[inner, inner] + of_h
+        by_h = ca.sum2(of_samples[len(PLACES), :]) - power * energy / h
+        weights = ca.vertcat(by_columns[:, self._inner].T, by_h, of_f, at_ends)
+        chain = by_natural[:num_in, :]
+        of_natural = chain.T @ of_inner @ chain + self._ends_bend(natural, told, weights)
+        mixed = (mixed @ chain)[self._place, :]
+        hessian = ca.vertcat(
+            ca.horzcat(of_outer[self._place, self._place], mixed),
+            ca.horzcat(mixed.T, of_natural),
+        )
+        hessian = ca.triu(hessian * (self._scale.T @ self._scale))
+        names = ["x", "p", "lam_f", "lam_g"]
+        return ca.Function("hessian", [x, told, of_f, of_g], [hessian], names, ["hess"])
+
+    def _slopes_of(self, value: int, slopes: Any) -> tuple[Any, Any]:
+        """Slopes of one value at all samples by columns axis by axis (K, 3 C), and by h (K, 1)."""
+        parts = [ca.MX.zeros(self.num_samples, self._num_columns)] * 3
+        by_h = ca.MX.zeros(self.num_samples, 1)
+        for k, (i, j) in enumerate(self._slope_places):
+            if i == value and j == len(PLACES):
+                by_h = by_h + slopes[k, :].T
+            elif i == value:
+                order, axis = PLACES[j]
+                factor = ca.repmat(slopes[k, :].T, 1, self._num_columns)
+                parts[axis] = parts[axis] + factor * self._matrices[order]
+        return ca.horzcat(*parts), by_h
+
+    def _unit(self, columns: Any) -> Any:
+        """The samples (10, K) in time over h of columns (C, 3)."""
+        sampled = [matrix @ columns for matrix in self._matrices]
+        return ca.vertcat(*(sampled[order][:, axis].T for order, axis in PLACES))
+
+    def _columns_of(self, of_samples: Any) -> Any:
+        """Slopes (1, 3 C) by columns axis by axis, from those (11, K) by the samples."""
+        parts = [ca.MX.zeros(1, self._num_columns)] * 3
+        for i, (order, axis) in enumerate(PLACES):
+            parts[axis] = parts[axis] + of_samples[i, :] @ self._matrices[order]
+        return ca.horzcat(*parts)
+
+    def _hessian_of_columns(self, bends: Any) -> Any:
+        """The Hessian (3 C + 1, 3 C + 1) by columns axis by axis and h, from those of samples."""
+        last, num = len(PLACES), self._num_columns
+        factors = {place: bends[k, :].T for k, place in enumerate(self._bend_places)}
+        sizes = (num, num, num, 1)
+        blocks = [[ca.MX.zeros(a, b) for b in sizes] for a in sizes]
+        # By sample and other place in turn, so that each product with a matrix is made but once.
+        for i, (order, axis) in enumerate(PLACES):
+            inside: dict[int, Any] = {}
+            for j, (other, of) in enumerate(PLACES):
+                factor = factors.get((min(i, j), max(i, j)))
+                if factor is not None and of >= axis:
+                    part = ca.repmat(factor, 1, num) * self._matrices[other]
+                    inside[of] = inside[of] + part if of in inside else part
+            for of, part in inside.items():
+                blocks[axis][of] = blocks[axis][of] + self._matrices[order].T @ part
+            if (i, last) in factors:
+                blocks[axis][3] = blocks[axis][3] + self._matrices[order].T @ factors[i, last]
+        if (last, last) in factors:
+            blocks[3][3] = ca.sum1(factors[last, last])
+        lower = lambda a, b: blocks[a][b] if a <= b else blocks[b][a].T  # noqa: E731
+        return ca.vertcat(*(ca.horzcat(*(lower(a, b) for b in range(4))) for a in range(4)))
+
+    def _as_machine_code(self) -> list:
+        """The functions, compiled; loaded, they need their file no more."""
+        code = ca.CodeGenerator("program.c")
+        for function in self.functions:
+            code.add(function)
+        with tempfile.TemporaryDirectory(prefix="ipopt-") as folder:
+            source, library = Path(folder, "program.c"), Path(folder, "program.so")
+            code.generate(f"{folder}/")
+            subprocess.run([*COMPILER, str(source), "-o", str(library)], check=True)
+            return [ca.external(function.name(), str(library)) for function in self.functions]
