@@ -41,8 +41,10 @@ def cases_of(name: str, serves: Serves) -> pj.hit.HitCase:
     vel = np.array(cases.ball.vel)
     vel[::100, :2] *= -1.0
     same = {field: np.full_like(vel[:, 0], value) for field, value in _TIGHT.items()}
-    return cases.replace(
-        limits=dataclasses.replace(cases.limits, **same), ball=cases.ball.replace(vel=vel)
+    return dataclasses.replace(
+        cases,
+        limits=dataclasses.replace(cases.limits, **same),
+        ball=dataclasses.replace(cases.ball, vel=vel),
     )
 
 

@@ -215,7 +215,7 @@ def solve_batch(planner: Problem, attempt: Round, cases: Any) -> Any:
         points, spent = optimum.point, spent + optimum.iterations
         if stage.keep is not None:
             costs = optimum.evaluation.cost.reshape(-1, num)
-            kept = jax.vmap(lambda of_case: _cheapest(of_case, stage.keep))(costs)  # noqa: B023
+            kept = jax.vmap(functools.partial(_cheapest, num=stage.keep))(costs)
             kept = (kept + num * jnp.arange(len(costs))[:, None]).ravel()
             points, spent, num = points[:, kept], spent[kept], min(stage.keep, num)
             of_starts = _repeated(contexts, num)
