@@ -265,7 +265,7 @@ def _sizes(planner: Any, attempt: Attempt, chunk: int | None, mesh: Mesh) -> _Si
     # One after another, few are as quick as many, and no core waits long for the others' last.
     if isinstance(planner, OneByOne):
         return _Sizes(BUCKETS[0], busy)
-    return _Sizes(max(128, _CPU_CHUNK // attempt.starts), busy)
+    return _Sizes(max(BUCKETS[0], _CPU_CHUNK // attempt.starts), busy)
 
 
 def _calls(lanes: np.ndarray, sizes: _Sizes, mesh: Mesh) -> list[tuple[np.ndarray, int]]:

@@ -156,7 +156,7 @@ class ExactHit(OptimisedPlanner):
         Round(starts=1, solver=LbfgsConfig(max_steps=60)),
         Round(
             starts=12,
-            solver=dataclasses.replace(_HARD, max_steps=400),
+            solver=dataclasses.replace(_HARD, max_steps=500),
             settings=_ANY_FEASIBLE,
             stages=(Stage(dataclasses.replace(_HARD, max_steps=60), _ANY_FEASIBLE, keep=3),),
         ),
