@@ -192,9 +192,8 @@ class Program:
             inside = limits + planner.margin * ca.DM(factors)
             values = h * sum(hinge(each, planner.hinge_width) for each in ca.vertsplit(inside))
         self._num_values = values.numel()
-        self.num_constraints = self._num_values * self.num_samples + self._num_at_ends
-        if self.penalised:
-            self.num_constraints = 0
+        num_limits = self._num_values * self.num_samples + self._num_at_ends
+        self.num_constraints = 0 if self.penalised else num_limits
         multipliers = ca.SX.sym("multipliers", self._num_values)
         variables = ca.vertcat(unit, h)
         slopes = ca.jacobian(values, variables)

@@ -15,7 +15,7 @@ ROW_GROUP = 2048  # rows, some 3 MB: little has to be read for one of them
 _BLOCK = 1 << 20  # bytes
 
 
-def encoding(schema: pa.Schema) -> dict[str, Any]:
+def _encoding(schema: pa.Schema) -> dict[str, Any]:
     """How rows are written.
 
     Numbers hardly repeat: only text is worth a dictionary, and lists are not worth squeezing.
@@ -46,10 +46,15 @@ class _Pieces(io.RawIOBase):
         return len(piece)
 
 
+def write_rows(rows: pa.Table, where: Any) -> None:
+    """Write a Parquet file of rows: to a path, or into what bytes can be written to."""
+    pq.write_table(rows, where, row_group_size=ROW_GROUP, **_encoding(rows.schema))
+
+
 def encoded(rows: pa.Table) -> bytes:
     """The content of a Parquet file of rows; of the same rows it is the same."""
     written = _Pieces()
-    pq.write_table(rows, written, row_group_size=ROW_GROUP, **encoding(rows.schema))
+    write_rows(rows, written)
     return b"".join(written.pieces)
 
 

@@ -13,12 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from planner_jax.sweep import manifest as manifests
 from planner_jax.sweep.joined_parquet import ParquetJoiner, ParquetParts
 from planner_jax.sweep.owner import LOCK, owned, require_free
-from planner_jax.sweep.parquet import ROW_GROUP, encoding, file_sum
+from planner_jax.sweep.parquet import file_sum, write_rows
 from planner_jax.sweep.settings import SettingError
 from planner_jax.whole_files import is_scratch, replacing
 
@@ -224,7 +223,7 @@ class RunFolder:
     def write_rows(self, path: Path, rows: pa.Table) -> None:
         """Write a Parquet file of the folder whole."""
         with replacing(path) as scratch:
-            pq.write_table(rows, scratch, row_group_size=ROW_GROUP, **encoding(rows.schema))
+            write_rows(rows, scratch)
             self._sums[path.name] = file_sum(scratch)
         self.sent(path)
 
