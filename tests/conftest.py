@@ -5,6 +5,7 @@ notebooks' kernels) and the workers of a parallel run have them too.
 """
 
 import os
+from importlib.metadata import version
 from pathlib import Path
 
 CACHE = Path(__file__).resolve().parents[1] / ".cache" / "jax"
@@ -13,6 +14,11 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("MPLBACKEND", "agg")
+# Most of the time of the tests is compilation, a third of which goes into the fusion of loops that
+# then run quicker: not worth it for a few lanes. XLA ends a process that names a flag it lacks, as
+# later versions do.
+if version("jaxlib") < "0.11":
+    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
 
 import jax  # noqa: E402
 import pytest  # noqa: E402

@@ -52,21 +52,26 @@ def test_all_derivatives_are_those_of_the_integrated_penalties(name, given):
             every = jnp.concatenate([head, moving])
             return integrate_along(along, every[None], jnp.exp(at)[None], parameters)[0][0]
 
-        found = curvature_along(along, columns, jnp.exp(theta), parameters, given)
-        at = columns[given:], theta
-        slopes = jax.grad(penalty, argnums=(0, 1))(*at)
-        hessian = jax.hessian(penalty, argnums=(0, 1))(*at)
-        block, diagonal = block_and_diagonal(along, found.at_samples, 4, given)
-        pairs = [
-            (found.penalty, penalty(*at)),
-            (found.by_columns, slopes[0]),
-            (found.by_theta, slopes[1]),
-            (columns_columns(along, found.at_samples, given), hessian[0][0]),
-            (block, hessian[0][0][:4, :, :4]),
-            (diagonal, np.einsum("kaka->ka", hessian[0][0][4:, :, 4:])),
-            (found.columns_theta, hessian[0][1]),
-            (found.theta_theta, hessian[1][1]),
-        ]
+        @jax.jit  # all at once: compiled one by one, the operations take many times as long
+        def both_ways(moving, at):
+            found = curvature_along(along, columns, jnp.exp(at), parameters, given)
+            block, diagonal = block_and_diagonal(along, found.at_samples, 4, given)
+            mine = (
+                *(found.penalty, found.by_columns, found.by_theta),
+                columns_columns(along, found.at_samples, given),
+                *(block, diagonal, found.columns_theta, found.theta_theta),
+            )
+            slopes = jax.grad(penalty, argnums=(0, 1))(moving, at)
+            hessian = jax.hessian(penalty, argnums=(0, 1))(moving, at)
+            exact = (
+                *(penalty(moving, at), *slopes, hessian[0][0]),
+                hessian[0][0][:4, :, :4],
+                jnp.einsum("kaka->ka", hessian[0][0][4:, :, 4:]),
+                *(hessian[0][1], hessian[1][1]),
+            )
+            return mine, exact
+
+        pairs = zip(*both_ways(columns[given:], theta), strict=True)
         for mine, exact in pairs:
             assert np.abs(exact).max() > 0.0
             np.testing.assert_allclose(mine, exact, rtol=1e-9, atol=1e-11 * np.abs(exact).max())
@@ -109,26 +114,29 @@ def test_second_derivatives_of_a_plan_are_those_of_its_objective(make):
         def cost(x):
             return planner.objective(x, context).cost
 
-        evaluation, gradient, products, preconditioner = planner.curved(point, context)
-        exact = jax.jvp(jax.grad(cost), (point,), (direction,))
-        np.testing.assert_allclose(evaluation.cost, cost(point), rtol=1e-12)
-        np.testing.assert_allclose(
-            evaluation.violation, planner.objective(point, context).violation, rtol=1e-12
-        )
-        greatest = np.abs(exact[0]).max()
-        np.testing.assert_allclose(gradient, exact[0], rtol=1e-9, atol=1e-11 * greatest)
-        greatest = np.abs(exact[1]).max()
-        np.testing.assert_allclose(
-            products()(direction), exact[1], rtol=1e-9, atol=1e-11 * greatest
-        )
+        @jax.jit
+        def both_ways(point):
+            evaluation, gradient, products, preconditioner = planner.curved(point, context)
+            hessian = jax.hessian(cost)(point)
+            damping = 2.0 * jnp.abs(hessian).max()
+            solved = preconditioner(damping)(direction)
+            found = (evaluation.cost, evaluation.violation, gradient, products()(direction))
+            exact = jax.jvp(jax.grad(cost), (point,), (direction,))
+            exact = (cost(point), planner.objective(point, context).violation, *exact)
+            return found, exact, hessian, damping, solved
+
+        found, exact, hessian, damping, solved = both_ways(point)
+        for mine, expected in zip(found[:2], exact[:2], strict=True):
+            np.testing.assert_allclose(mine, expected, rtol=1e-12)
+        for mine, expected in zip(found[2:], exact[2:], strict=True):
+            greatest = np.abs(expected).max()
+            np.testing.assert_allclose(mine, expected, rtol=1e-9, atol=1e-11 * greatest)
         # What is preconditioned: the Hessian with nothing but its block of ends and its diagonal.
-        hessian = np.asarray(jax.hessian(cost)(point))
-        damping = 2.0 * np.abs(hessian).max()
+        hessian = np.asarray(hessian)
         kept = np.diag(np.abs(np.diag(hessian)))
         ends = np.arange(size).reshape(num, -1)[:, -num_own:].ravel()
         kept[np.ix_(ends, ends)] = hessian[np.ix_(ends, ends)]
         kept += damping * np.eye(size)
         assert np.linalg.eigvalsh(kept)[0] > 0.0
-        solved = preconditioner(jnp.asarray(damping))(direction)
         # What has no curvature of its own, of a target that is absent, is given a millionth.
         np.testing.assert_allclose(kept @ solved, direction, rtol=2e-6)

@@ -40,7 +40,7 @@ TARGET = (3.0, 0.0, 0.0)  # [m], where a hit ball is to land
 _BISECTIONS = 24
 _LONGEST = 4.0  # [s], until when a ball is waited for
 _TRIALS = (1.0, 0.2, 0.04)  # step lengths, as of the re-planners
-_AGAIN = Round(starts=1, solver=LbfgsConfig(max_steps=5, trial_steps=_TRIALS))
+_AGAIN = Round(starts=1, solver=LbfgsConfig(max_steps=2, memory=2, trial_steps=_TRIALS))
 
 
 class Stroke(Protocol):

@@ -36,7 +36,11 @@ from planner_jax.rules import require_shapes
 BUCKETS = (16, 128, 1024, 8192, 65536)
 _CPU_CHUNK, _GPU_CHUNK = 256, 65536  # what fits the cache of a core, and what fills a GPU
 _GPU_BUSY = 8192  # starts in one call that keep a GPU busy
+_MORE = 8  # a program more is worth its compilation if it spares one lane for so many
 _LANES = PartitionSpec("lanes")
+# XLA tries its own kernels for every product of matrices, half of the time that a GPU's program
+# takes to compile; the library's are as quick for products of such shapes.
+_COMPILER_OPTIONS: Any = {"xla_gpu_enable_triton_gemm": False}
 
 PlanT = TypeVar("PlanT", bound=Plan)
 
@@ -59,10 +63,16 @@ class _Sizes:
         return smaller if smaller >= self.busy and 2 * num <= fits else fits
 
     def cuts(self, num: int) -> Iterator[tuple[int, int]]:
-        """Where the calls that take `num` lanes begin, and their sizes."""
-        begin = 0
+        """Where the calls that take `num` lanes begin, and their sizes.
+
+        The few lanes that are left after many calls take another call of their size, unless that
+        is much more work: to compile for a smaller one would take longer.
+        """
+        begin = size = 0
         while begin < num:
-            size = self.next(num - begin)
+            smaller = self.next(num - begin)
+            if size - smaller > begin // _MORE or smaller > size:
+                size = smaller
             yield begin, size
             begin += size
 
@@ -265,7 +275,8 @@ def _sizes(planner: Any, attempt: Attempt, chunk: int | None, mesh: Mesh) -> _Si
     # One after another, few are as quick as many, and no core waits long for the others' last.
     if isinstance(planner, OneByOne):
         return _Sizes(BUCKETS[0], busy)
-    return _Sizes(max(BUCKETS[0], _CPU_CHUNK // attempt.starts), busy)
+    starts = 1 << (attempt.starts - 1).bit_length()  # or more: a power of two
+    return _Sizes(max(BUCKETS[0], _CPU_CHUNK // starts), busy)
 
 
 def _calls(lanes: np.ndarray, sizes: _Sizes, mesh: Mesh) -> list[tuple[np.ndarray, int]]:
@@ -394,7 +405,9 @@ def _program(planner: Any, attempt: Attempt, num: int, cases: Any) -> Hashable:
     return jax.tree.structure((planner, cases)), own, given, attempt, num
 
 
-@functools.partial(jax.jit, static_argnames=("attempt", "mesh"))
+@functools.partial(
+    jax.jit, static_argnames=("attempt", "mesh"), compiler_options=_COMPILER_OPTIONS
+)
 def _solve(planner: Any, attempt: Attempt, mesh: Mesh, cases: Any) -> tuple[Any, Array]:
     """One attempt at the lanes of every device, and how many each leaves unsolved, (devices,)."""
 

@@ -52,7 +52,7 @@ class ReplanHit(OptimisedPlanner):
     plan_type = HitPlan
     planner: ExactHit = ExactHit()
     rounds: tuple[Round, ...] = (
-        Round(starts=1, solver=LbfgsConfig(max_steps=4, trial_steps=_TRIALS)),
+        Round(starts=1, solver=LbfgsConfig(max_steps=2, memory=2, trial_steps=_TRIALS)),
         Round(starts=1, solver=LbfgsConfig(max_steps=40, trial_steps=_TRIALS)),
     )
 
