@@ -39,7 +39,7 @@ def aim_with_drag(
 ) -> Array:
     """Velocity with which a ball with quadratic drag reaches the target after `flight_time`.
 
-    From the drag-free velocity two steps of Newton's method on the landing point of a coarse flight,
+    From the drag-free velocity two steps of Newton's method on the landing of a coarse flight,
     and with the slopes of the last one two steps on that of a fine flight. The derivatives are
     those of the root, by the implicit function theorem.
 
@@ -53,7 +53,6 @@ def aim_with_drag(
     Returns:
         (3,) [m/s].
     """
-
     return _aimed(target - pos, jnp.asarray(flight_time), jnp.asarray(drag), jnp.asarray(gravity))
 
 

@@ -405,9 +405,7 @@ def _program(planner: Any, attempt: Attempt, num: int, cases: Any) -> Hashable:
     return jax.tree.structure((planner, cases)), own, given, attempt, num
 
 
-@functools.partial(
-    jax.jit, static_argnames=("attempt", "mesh"), compiler_options=_COMPILER_OPTIONS
-)
+@functools.partial(jax.jit, static_argnames=("attempt", "mesh"), compiler_options=_COMPILER_OPTIONS)
 def _solve(planner: Any, attempt: Attempt, mesh: Mesh, cases: Any) -> tuple[Any, Array]:
     """One attempt at the lanes of every device, and how many each leaves unsolved, (devices,)."""
 
