@@ -124,10 +124,20 @@ def apex_with_drag(ball: BallState, flight_time: Array, drag: Array, gravity: Ar
     return ball.pos[2] + _climb(ball.vel, *given)
 
 
-@jax.custom_jvp
-def _climb(vel: Array, flight_time: Array, drag: Array, gravity: Array) -> Array:
+def _climbed(vel: Array, flight_time: Array, drag: Array, gravity: Array) -> Array:
     """`apex_with_drag` over where the ball is now."""
-    return _climbed(vel, flight_time, drag, gravity)
+    now = BallState(pos=jnp.zeros_like(vel), vel=vel)
+    _, path = fly(now, flight_time, drag, gravity, num_steps=_FLIGHT_STEPS)
+    height = jnp.concatenate([now.pos[None, 2], path.pos[:-1, 2]])
+    vels = jnp.concatenate([vel[None], path.vel[:-1]])
+    rising = jnp.maximum(vels[:, 2], 0.0)
+    speed = jnp.sqrt(jnp.maximum(jnp.sum(vels**2, axis=1), 1e-12))
+    reach = height + 0.5 * rising**2 / (gravity + drag * speed * rising * 2.0 / 3.0)
+    last = jnp.maximum(jnp.sum(vels[:, 2] > 0.0) - 1, 0)
+    return reach[last]
+
+
+_climb = jax.custom_jvp(_climbed)
 
 
 def _climb_jvp(primals: Sequence[Array], tangents: Sequence[Any]) -> tuple[Array, Array]:
@@ -138,15 +148,3 @@ def _climb_jvp(primals: Sequence[Array], tangents: Sequence[Any]) -> tuple[Array
 
 
 _climb.defjvp(_climb_jvp, symbolic_zeros=True)
-
-
-def _climbed(vel: Array, flight_time: Array, drag: Array, gravity: Array) -> Array:
-    now = BallState(pos=jnp.zeros_like(vel), vel=vel)
-    _, path = fly(now, flight_time, drag, gravity, num_steps=_FLIGHT_STEPS)
-    height = jnp.concatenate([now.pos[None, 2], path.pos[:-1, 2]])
-    vels = jnp.concatenate([vel[None], path.vel[:-1]])
-    rising = jnp.maximum(vels[:, 2], 0.0)
-    speed = jnp.sqrt(jnp.maximum(jnp.sum(vels**2, axis=1), 1e-12))
-    reach = height + 0.5 * rising**2 / (gravity + drag * speed * rising * 2.0 / 3.0)
-    last = jnp.maximum(jnp.sum(vels[:, 2] > 0.0) - 1, 0)
-    return reach[last]
