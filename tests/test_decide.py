@@ -213,8 +213,23 @@ def test_one_case_alone_is_decided_on_and_planned_as_in_its_batch(decide, pairs)
     np.testing.assert_allclose(alone.times, together.times[1], rtol=2e-3)
 
 
-def test_the_last_round_is_for_cases_without_any_solved_order(pairs, monkeypatch):
-    """Case 0 is solved in one order at once; the other one is not tried any longer for it.
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class LongFirst(ExactCatch):
+    """A planner that makes its first attempt alone at every order."""
+
+    def attempts_at_all(self, case):
+        return 1
+
+
+@pytest.mark.parametrize(
+    "kind, num, calls",
+    [(ExactCatch, 2, [(1, 10), (1, 2)]), (LongFirst, 3, [(1, 10), (1, 2), (1, 2)])],
+)
+def test_later_rounds_are_for_cases_without_any_solved_order(kind, num, calls, pairs, monkeypatch):
+    """The last round, or all but the first of a planner that says so.
+
+    Case 0 is solved in one order at once; the other one is not tried any longer for it.
 
     Nor is a case that is too far; here one is within the bound's reach and no plan's.
     """
@@ -228,11 +243,10 @@ def test_the_last_round_is_for_cases_without_any_solved_order(pairs, monkeypatch
         return real(planner, attempts, cases, *where)
 
     monkeypatch.setattr(batch, "_plan_from_host", noted)
-    twice = dataclasses.replace(PLANNER, rounds=2 * PLANNER.rounds[:1])
-    plans = plan(by(Best(), twice), pairs)
+    plans = plan(by(Best(), kind(rounds=num * PLANNER.rounds[:1])), pairs)
     assert is_solved(np.delete(plans.status, [1, 2])).all()
     assert is_unsolved(plans.status[1]) and plans.status[2] == Status.TOO_FAR
-    assert planned == [(1, 10), (1, 2)]
+    assert planned == calls
 
 
 def test_greedy_plans_have_the_order_of_the_estimate(pairs):

@@ -32,7 +32,8 @@ class DecidedPlanner(Generic[CaseT, PlanT]):
 
     Of several choices the solved one of least `decision.rank` is kept, or the one of least
     violation where none is solved. The planner's last attempt, its longest, is for cases of
-    which no choice is solved by then.
+    which no choice is solved by then; a planner whose earlier attempts are long, too, says by
+    `attempts_at_all(cases)` how many are made at every choice.
     """
 
     planner: Any
@@ -95,13 +96,15 @@ class DecidedPlanner(Generic[CaseT, PlanT]):
             cases, choices = jax.tree.map(np.asarray, (cases, choices))
         tried = [cases.decided(choice) for choice in choices]
         together = jax.tree.map(lambda *leaves: xp.concatenate(leaves), *tried)
-        *others, last = self.planner.attempts
-        plans, _ = drive(self.planner, together, others or [last])
+        attempts = self.planner.attempts
+        but_last = lambda _: max(len(attempts) - 1, 1)  # noqa: E731
+        at_all = getattr(self.planner, "attempts_at_all", but_last)(cases)
+        plans, _ = drive(self.planner, together, attempts[:at_all])
         of_case = lambda leaf: leaf.reshape(num, -1, *leaf.shape[1:])  # noqa: E731
-        if others:
+        for attempt in attempts[at_all:]:
             has_plan = of_case(is_solved(plans.status)).any(axis=0)
             left = is_unsolved(plans.status) & ~xp.tile(has_plan, num)
-            once_more = lambda some: drive(self.planner, some, [last])[0]  # noqa: E731
+            once_more = lambda some: drive(self.planner, some, [attempt])[0]  # noqa: B023, E731
             plans = planned_again(drive, once_more, together, plans, left)
         plans, together = jax.tree.map(lambda x: of_case(xp.asarray(x)), (plans, together))
         worse = 1e6 + xp.nan_to_num(plans.violation, nan=1e9)

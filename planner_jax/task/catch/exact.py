@@ -78,10 +78,21 @@ _GUESSES = np.array(
     ]
 )
 _FIRST = Round(starts=1, solver=LbfgsConfig(max_steps=8))
+_ROUNDS = (
+    _FIRST,
+    Round(starts=1, solver=LbfgsConfig(max_steps=25)),
+    Round(starts=1, solver=LbfgsConfig(max_steps=80)),
+    Round(starts=6, solver=LbfgsConfig(max_steps=200)),
+)
 _FROM_LEARNED = Round(starts=1, solver=LbfgsConfig(max_steps=2))  # in its place, of one target
 # In its place, of several targets, where Newton's method goes on: it would begin too far away.
 _LONG_CHAIN = Stage(LbfgsConfig(max_steps=200, tolerance=1e-6, patience=5))
 _CHAIN_TOLERANCE = 1e-4
+# In the place of the first two of `_ROUNDS`, where more than `_FEW` targets are in line, each of
+# which must be caught: few iterations lead nowhere there.
+_FEW = 3
+_STEPS_A_TARGET = 20
+_OF_MANY = LbfgsConfig(max_steps=300, memory=8, trial_steps=(1.0, 0.3))
 _LEAN = 0.95  # of the angle that the net may have to the ball's way, what a guess makes use of
 
 
@@ -153,12 +164,7 @@ class ExactCatch(OptimisedPlanner):
     margin: float = 0.03  # penalties begin this far inside a limit, relative
     hinge_width: float = 0.1
     catch_weight: float = 0.3  # [s], of the hinges at a catch beside the integrals
-    rounds: tuple[Round, ...] = (
-        _FIRST,
-        Round(starts=1, solver=LbfgsConfig(max_steps=25)),
-        Round(starts=1, solver=LbfgsConfig(max_steps=80)),
-        Round(starts=6, solver=LbfgsConfig(max_steps=200)),
-    )
+    rounds: tuple[Round, ...] = _ROUNDS
     # Of the first guess, the thrust at catches on the way, as in `_GUESSES`. Near the least that is
     # allowed catches are soonest; more leaves control a margin in flight.
     lift: float = _GUESSES[0, 3].item()
@@ -230,8 +236,20 @@ class ExactCatch(OptimisedPlanner):
         """The plans of a batch by one round."""
         return super().solve_lanes(cases, self._for_start(attempt, cases))
 
+    def attempts_at_all(self, case: CatchCase) -> int:
+        """How many attempts are made at every choice about a case, others where none is solved."""
+        return 1 if self._is_long(case) else max(len(self.attempts) - 1, 1)
+
+    def _is_long(self, case: CatchCase) -> bool:
+        """Whether a case has many targets, of which the usual rounds want all."""
+        return self.rounds == _ROUNDS and case.num_targets > _FEW and not case.optional
+
     def _for_start(self, attempt: Round, case: CatchCase) -> Round:
-        """A shorter first round where it begins near its end, a longer stage where it is far."""
+        """A shorter first round where it begins near its end, longer searches where it is far."""
+        if self._is_long(case) and attempt in _ROUNDS[:2]:
+            is_first = attempt == _FIRST
+            steps = _STEPS_A_TARGET * case.num_targets if is_first else _OF_MANY.max_steps
+            return Round(starts=1, solver=dataclasses.replace(_OF_MANY, max_steps=steps))
         if attempt.stages == (Stage(_FIRST.solver),) and case.num_targets > 1:
             # Far from the end what an iteration gains says little of what all of them do.
             slow = min(attempt.solver.tolerance, _CHAIN_TOLERANCE)
