@@ -204,5 +204,6 @@ def _shape_of_positions(tree: Any, layout: tuple, axes: tuple[int, ...]) -> tupl
     at: Any = lambda one, time: getattr(found := one.at(time), "pos", found)  # noqa: E731
     for _ in axes:
         at = jax.vmap(at)
-    path = jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(*each) for each in layout])
+    kinds = [(shape, jax.dtypes.canonicalize_dtype(dtype)) for shape, dtype in layout]
+    path = jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(*each) for each in kinds])
     return jax.eval_shape(at, path, jax.ShapeDtypeStruct(axes, np.float32)).shape

@@ -444,6 +444,7 @@ def test_a_run_with_a_real_cluster_survives_the_death_of_a_worker(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:os.fork.. was called:RuntimeWarning")  # JAX may have begun here
 def test_workers_of_a_real_cluster_that_hold_shares_of_gpus_make_the_same_rows(
     tmp_path, monkeypatch
 ):

@@ -28,12 +28,16 @@ HOME, STEP = np.array([0.0, 0.0, 1.0]), 0.01
 PAGE = Path(__file__).parents[1] / "docs" / "live.md"
 
 
+def places_of(vel):
+    """Places (200, 3) [m] of a thrown ball, a look each."""
+    ball = pj.BallState(jnp.array([3.0, 0.1, 1.7]), jnp.asarray(vel, jnp.float32))
+    thrown = pj.BallPath(ball, jnp.full(3, CATCH_DRAG), jnp.asarray(9.81))
+    return np.asarray(jax.jit(jax.vmap(thrown.at))(STEP * jnp.arange(200)).pos, float)
+
+
 @pytest.fixture(scope="module")
 def path():
-    """Places (150, 3) [m] of a thrown ball, a look each."""
-    ball = pj.BallState(jnp.array([3.0, 0.1, 1.7]), jnp.array([-2.9, 0.0, 4.4]))
-    thrown = pj.BallPath(ball, jnp.full(3, CATCH_DRAG), jnp.asarray(9.81))
-    return np.asarray(jax.jit(jax.vmap(thrown.at))(STEP * jnp.arange(150)).pos, float)
+    return places_of([-2.9, 0.0, 4.4])
 
 
 @pytest.fixture(scope="module")
@@ -90,14 +94,14 @@ def balls_of(answers):
 def test_a_throw_is_caught_along_a_smooth_course_and_nothing_is_compiled(warm, path):
     before = warm.report.compiled
     throw = Throw(warm, path, 1)
-    answers = balls_of(throw.fly(140))
+    answers = balls_of(throw.fly(180))
     assert warm.report.compiled == before
     motions = [answer.motion for answer in answers]
-    first, last = motions.index(Motion.PLAN), 139 - motions[::-1].index(Motion.PLAN)
+    first, last = motions.index(Motion.PLAN), 179 - motions[::-1].index(Motion.PLAN)
     assert 2 <= first <= 12 and set(motions[first : last + 1]) == {Motion.PLAN}
     assert set(motions[last + 1 :]) == {Motion.SAFE}  # and never planned for again
-    contact, look = answers[last].contact, np.arange(140) * STEP + answers[0].begin
-    ball = np.array([np.interp(contact, look, path[:140, k]) for k in range(3)])
+    contact, look = answers[last].contact, np.arange(180) * STEP + answers[0].begin
+    ball = np.array([np.interp(contact, look, path[:180, k]) for k in range(3)])
     at = np.argmin(np.abs(look - contact))
     wanted, thrust = answers[at].column("pos")[0], answers[at].column("acc")[0] + [0, 0, 9.81]
     net = wanted + 0.2 * thrust / np.linalg.norm(thrust)
@@ -172,6 +176,28 @@ def test_bad_packets_are_counted_by_name_and_spoil_nothing(warm, path):
     assert all(np.isfinite(answer.setpoints).all() for answer in answers)
     offset = spoiled.begin - clean.begin
     assert abs(spoiled.contact - offset - clean.contact) < 0.05
+
+
+def test_throws_are_caught_by_plans_that_all_have_a_way_to_rest_behind_them(warm):
+    """In the net where the ball is at the contact, after 100 looks that disagree by millimetres."""
+    random, before = np.random.default_rng(1), warm.report.counts.copy()
+    for number in range(20, 30):
+        places = places_of(np.array([-2.9, 0.0, 4.4]) + random.normal(0.0, 0.15, 3))
+        answers = balls_of(Throw(warm, places, number).fly(100))
+        last = [answer for answer in answers if answer.motion is Motion.PLAN][-1]
+        since = last.contact - answers[0].begin
+        ball = [np.interp(since, STEP * np.arange(200), places[:, k]) for k in range(3)]
+        times = last.period * np.arange(last.setpoints.shape[0])
+        pos, acc = (
+            np.array([np.interp(last.contact - last.begin, times, x) for x in last.column(name).T])
+            for name in ("pos", "acc")
+        )
+        thrust = acc + [0.0, 0.0, 9.81]
+        net = pos + 0.2 * thrust / np.linalg.norm(thrust)
+        assert np.linalg.norm(net - ball) < 0.125
+        assert since < 1.0
+    for name in ("endless", "refused"):
+        assert warm.report.counts[name] == before[name]
 
 
 def test_a_robot_that_is_off_its_course_is_brought_to_rest_from_where_it_is(warm, path):

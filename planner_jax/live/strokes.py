@@ -40,13 +40,16 @@ TARGET = (3.0, 0.0, 0.0)  # [m], where a hit ball is to land
 _BISECTIONS = 24
 _LONGEST = 4.0  # [s], until when a ball is waited for
 _TRIALS = (1.0, 0.2, 0.04)  # step lengths, as of the re-planners
+# Of the robot's limits, what a plan may use. Where one uses them whole, there is often no way to
+# rest from its end that keeps them, so that it cannot be flown.
+_SHARE = 0.97
 _AGAIN = Round(starts=1, solver=LbfgsConfig(max_steps=2, memory=2, trial_steps=_TRIALS))
 
 
 class Stroke(Protocol):
     """What a live loop asks of a task."""
 
-    case: Any  # NumPy leaves: robot, limits, and whatever does not change
+    case: Any  # NumPy leaves: robot, its limits, and whatever does not change
     flight: Flight
     drag: Any
     shortest: float  # [s], least time to the contact that is planned anew
@@ -69,6 +72,12 @@ def _on_host(case: Any) -> Any:
     return jax.tree.map(lambda leaf: np.asarray(leaf), case)
 
 
+def _within(case: Any) -> Any:
+    """A case with the share of its limits that plans may use."""
+    limits = case.limits.scaled(_SHARE, case.gravity)
+    return dataclasses.replace(case, limits=_on_host(limits))
+
+
 class HitStroke:
     """One hit of the ball to a target.
 
@@ -83,6 +92,7 @@ class HitStroke:
     ) -> None:
         far = (6.0, 0.0, 2.0)
         self.case = _on_host(hit_case(far, (-1.0, 0.0, 0.0), target, robot=robot, drag=drag))
+        self._case = _within(self.case)
         self.flight, self.drag, self.gravity = rk4_step, drag, HIT_GRAVITY
         self.shortest = 0.2
         self._planner = ExactHit(drag_after_impact=True)
@@ -91,12 +101,12 @@ class HitStroke:
 
     def first(self, ball: BallState, head_state: np.ndarray) -> Any:
         """See `Stroke`."""
-        case = dataclasses.replace(self.case, ball=ball, head_state=head_state)
+        case = dataclasses.replace(self._case, ball=ball, head_state=head_state)
         return call_packed(_planned, self._planner.rounds[1], self._planner, case, keep=True)
 
     def again(self, plan: Any, elapsed: float, ball: BallState) -> Any:
         """See `Stroke`."""
-        task = _left(dataclasses.replace(self.case, ball=ball), plan, elapsed)
+        task = _left(dataclasses.replace(self._case, ball=ball), plan, elapsed)
         return call_packed(_hit_again, _AGAIN, self._again, task, keep=True)
 
     def contact(self, plan: Any) -> float:
@@ -116,6 +126,7 @@ class CatchStroke:
         zero, drags = jnp.zeros((1, 3)), jnp.full((1, 3), drag, jnp.float32)
         path = BallPath(BallState(zero, zero), drags, jnp.full(1, CATCH_GRAVITY, jnp.float32))
         self.case = _on_host(catch_case(path, np.ones(1, np.float32), robot=robot))
+        self._case = _within(self.case)
         self.flight, self.drag, self.gravity = linear_drag_flight, np.full(3, drag), CATCH_GRAVITY
         self.shortest = 0.15
         self._planner = ExactCatch()
@@ -124,12 +135,12 @@ class CatchStroke:
 
     def first(self, ball: BallState, head_state: np.ndarray) -> Any:
         """See `Stroke`."""
-        case = dataclasses.replace(self.case, targets=self._path(ball), head_state=head_state)
+        case = dataclasses.replace(self._case, targets=self._path(ball), head_state=head_state)
         return call_packed(_decided, self._planner.rounds[1], self._planner, case, keep=True)
 
     def again(self, plan: Any, elapsed: float, ball: BallState) -> Any:
         """See `Stroke`."""
-        case = dataclasses.replace(self.case, targets=self._path(ball))
+        case = dataclasses.replace(self._case, targets=self._path(ball))
         task = _left(case, plan, elapsed)
         return call_packed(_caught_again, _AGAIN, self._again, task, keep=True)
 

@@ -154,7 +154,7 @@ def is_better(fresh: CatchPlan, warm: CatchPlan) -> Array:
     """Whether () bool a plan from scratch is to be preferred to one from the plan that is flown."""
     keeps = warm.violation <= _KEPT
     cheaper = (fresh.violation <= _KEPT) & (fresh.cost < _CHEAPER * warm.cost)
-    nearer = jnp.isfinite(fresh.violation) & ~(warm.violation <= fresh.violation)
+    nearer = jnp.isfinite(fresh.violation) & jnp.logical_not(warm.violation <= fresh.violation)
     return jnp.isfinite(fresh.cost) & jnp.where(keeps, cheaper, nearer)
 
 
