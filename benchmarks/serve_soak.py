@@ -9,7 +9,8 @@ answer has it. Of the packets as many per cent as --bad says are lost, come 30 m
 twice, a third each. A round trip that takes longer than the deadline is a miss. A thread that only
 sleeps notes when the host has not let it run: misses within such a gap are the host's. At the end
 stand misses, times, and the server's own report with its memory at the start and at the end. The
-success of the summary is the share of the balls that a plan was flown for to its end.
+success of the summary is the share of the balls that are within the radius of the net or racket at
+the contact, where the setpoints then have its centre.
 """
 
 import heapq
@@ -29,7 +30,15 @@ import planner_jax as pj
 from planner_jax.ball.flight import fly
 from planner_jax.benchmarks.run import argument_parser, begin
 from planner_jax.live.client import HOST
-from planner_jax.live.packets import BALL, LONGEST, ROBOT, Motion, read_answer, request
+from planner_jax.live.packets import (
+    BALL,
+    LONGEST,
+    ROBOT,
+    Answer,
+    Motion,
+    read_answer,
+    request,
+)
 from planner_jax.live.report import Latencies
 from planner_jax.live.server import undisturbed
 
@@ -37,6 +46,8 @@ NUM = 200  # balls that are drawn, and thrown again and again
 SECONDS = 1.8  # of a throw
 NOISE = 0.005  # [m]
 LATE = 0.03  # [s]
+GRAVITY = 9.81  # [m/s^2]
+TOOLS = {"hit": "racket", "catch": "net"}
 NAP, GAP = 0.001, 0.004  # [s], of the thread that sleeps, and what it notes
 
 
@@ -55,6 +66,17 @@ def paths(task: str, rate: float) -> np.ndarray:
         times = jnp.arange(1, steps + 1) / rate
         flown = jax.jit(jax.vmap(lambda path: jax.vmap(lambda t: path.at(t).pos)(times)))(targets)
     return np.asarray(flown, float)
+
+
+def distance_off(answer: Answer, height: float, ball: np.ndarray) -> float:
+    """Distance [m] of a tool's centre, above the propellers, from a ball (3,) at the contact."""
+    times = answer.begin + answer.period * np.arange(answer.setpoints.shape[0])
+    pos, acc = (
+        np.array([np.interp(answer.contact, times, x) for x in answer.column(name).T])
+        for name in ("pos", "acc")
+    )
+    thrust = acc + [0.0, 0.0, GRAVITY]
+    return float(np.linalg.norm(pos + height * thrust / np.linalg.norm(thrust) - ball))
 
 
 class Naps:
@@ -89,7 +111,8 @@ class Naps:
 class Soak:
     """Throws balls at a server and counts what comes back."""
 
-    def __init__(self, port: int, options: Any) -> None:
+    def __init__(self, port: int, options: Any, tool: tuple[float, float]) -> None:
+        self.height, self.radius = tool  # [m]
         self.options, self.naps, self.trips = options, Naps(), Latencies()
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.connect((HOST, port))
@@ -138,7 +161,7 @@ class Soak:
     def throw(self, path: np.ndarray, start: np.ndarray, ball: int) -> None:
         """One ball from its first sight to its contact, the robot in hover at first."""
         self.thrown += 1
-        period, wanted, contact = 1.0 / self.options.rate, None, np.inf
+        period, wanted, planned = 1.0 / self.options.rate, None, None
         began = time.monotonic()
         for k, place in enumerate(path):
             now = began + k * period
@@ -155,9 +178,11 @@ class Soak:
             if answer is None or (wanted is None and known is None):
                 continue
             wanted = answer.setpoints[0, :9].astype(float).reshape(3, 3)
-            contact = answer.contact if answer.motion is Motion.PLAN else contact
-            if time.monotonic() > contact:
-                self.met += 1
+            planned = answer if answer.motion is Motion.PLAN else planned
+            if planned is not None and time.monotonic() > planned.contact:
+                looks = began + period * np.arange(len(path))
+                at = np.array([np.interp(planned.contact, looks, x) for x in path.T])
+                self.met += distance_off(planned, self.height, at) < self.radius
                 break
 
     def end(self) -> None:
@@ -194,11 +219,16 @@ def main() -> None:
     options = parser.parse_args()
     with begin(parser, options) as bench:
         balls = paths(options.task, options.rate)
-        case = pj.hit.draw(1) if options.task == "hit" else pj.catch.draw(1)
-        start = np.asarray(case.head_state[0, 0], float)
+        if options.task == "hit":
+            case = pj.lane(pj.hit.draw(1), 0)
+            tool = float(case.racket_height), float(np.asarray(case.racket_radius))
+        else:
+            case = pj.lane(pj.catch.draw(1), 0)
+            tool = float(case.net.height), float(case.net.radius)
+        start = np.asarray(case.head_state[0], float)
         process, port, seconds = started(options)
         with undisturbed():  # or the pauses of this process would count
-            soak = Soak(port, options)
+            soak = Soak(port, options, tool)
             ends = time.monotonic() + 60.0 * options.minutes
             while time.monotonic() < ends:
                 soak.throw(balls[soak.thrown % NUM], start, soak.thrown % 2**16)
@@ -208,7 +238,8 @@ def main() -> None:
         trips = [1e3 * soak.trips.quantile(share) for share in (0.5, 0.99)]
         bench.say(
             f"{options.task}, {options.minutes:g} min at {options.rate:g} looks/s: answers "
-            f"{seconds:.1f} s after the start; {soak.thrown} balls, {soak.met} met by a plan",
+            f"{seconds:.1f} s after the start; {soak.thrown} balls, {soak.met} met by the "
+            f"{TOOLS[options.task]}",
             f"{soak.trips.num:,} round trips: p50 {trips[0]:.2f} ms, p99 {trips[1]:.2f} ms, max "
             f"{1e3 * soak.trips.longest:.1f} ms; {soak.missed} took longer than "
             f"{1e3 * options.deadline:g} ms, {soak.by_host} of these while the host kept a thread "
