@@ -1,6 +1,7 @@
 """Parquet files joined by their pages: rows, places, what is kept, and what is refused."""
 
 import dataclasses
+import inspect
 import io
 import pickle
 import random
@@ -180,7 +181,8 @@ def numbered(content, last=2**15 + 7):
     field = joined_parquet._Field
     more = [field(7, 4, (joined_parquet._signed(0),)), field(40, 8, (b"\3new",))]
     parts = parquet_parts(content)
-    groups = [[*group, *more] for group in parts._groups]
+    # Some versions of pyarrow write ordinals themselves.
+    groups = [[*(each for each in group if each.number != 7), *more] for group in parts._groups]
     changed = dataclasses.replace(parts, _groups=groups)
     return bytes(changed.pages) + changed.ending(changed.metadata)
 
@@ -214,7 +216,14 @@ def test_as_many_groups_as_have_no_ordinal_any_more_are_read():
         ({"write_page_index": True}, "an index of its pages"),
         ({"row_group_size": 2}, None),
         ({"use_dictionary": False, "compression": "zstd", "data_page_version": "2.0"}, None),
-        ({"bloom_filter_options": {"status": {}}}, None),
+        pytest.param(
+            {"bloom_filter_options": {"status": {}}},
+            None,
+            marks=pytest.mark.skipif(
+                "bloom_filter_options" not in inspect.signature(pq.write_table).parameters,
+                reason="this pyarrow writes no Bloom filters",
+            ),
+        ),
     ],
 )
 def test_files_of_other_writers_are_joined_or_refused(options, why):
