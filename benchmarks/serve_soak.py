@@ -46,7 +46,6 @@ NUM = 200  # balls that are drawn, and thrown again and again
 SECONDS = 1.8  # of a throw
 NOISE = 0.005  # [m]
 LATE = 0.03  # [s]
-GRAVITY = 9.81  # [m/s^2]
 TOOLS = {"hit": "racket", "catch": "net"}
 NAP, GAP = 0.001, 0.004  # [s], of the thread that sleeps, and what it notes
 
@@ -68,14 +67,14 @@ def paths(task: str, rate: float) -> np.ndarray:
     return np.asarray(flown, float)
 
 
-def distance_off(answer: Answer, height: float, ball: np.ndarray) -> float:
+def distance_off(answer: Answer, height: float, gravity: float, ball: np.ndarray) -> float:
     """Distance [m] of a tool's centre, above the propellers, from a ball (3,) at the contact."""
     times = answer.begin + answer.period * np.arange(answer.setpoints.shape[0])
     pos, acc = (
         np.array([np.interp(answer.contact, times, x) for x in answer.column(name).T])
         for name in ("pos", "acc")
     )
-    thrust = acc + [0.0, 0.0, GRAVITY]
+    thrust = acc + [0.0, 0.0, gravity]
     return float(np.linalg.norm(pos + height * thrust / np.linalg.norm(thrust) - ball))
 
 
@@ -111,8 +110,8 @@ class Naps:
 class Soak:
     """Throws balls at a server and counts what comes back."""
 
-    def __init__(self, port: int, options: Any, tool: tuple[float, float]) -> None:
-        self.height, self.radius = tool  # [m]
+    def __init__(self, port: int, options: Any, tool: tuple[float, float], gravity: float) -> None:
+        (self.height, self.radius), self.gravity = tool, gravity  # [m], [m/s^2]
         self.options, self.naps, self.trips = options, Naps(), Latencies()
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.connect((HOST, port))
@@ -182,7 +181,8 @@ class Soak:
             if planned is not None and time.monotonic() > planned.contact:
                 looks = began + period * np.arange(len(path))
                 at = np.array([np.interp(planned.contact, looks, x) for x in path.T])
-                self.met += distance_off(planned, self.height, at) < self.radius
+                off = distance_off(planned, self.height, self.gravity, at)
+                self.met += off < self.radius
                 break
 
     def end(self) -> None:
@@ -228,7 +228,7 @@ def main() -> None:
         start = np.asarray(case.head_state[0], float)
         process, port, seconds = started(options)
         with undisturbed():  # or the pauses of this process would count
-            soak = Soak(port, options, tool)
+            soak = Soak(port, options, tool, float(case.gravity))
             ends = time.monotonic() + 60.0 * options.minutes
             while time.monotonic() < ends:
                 soak.throw(balls[soak.thrown % NUM], start, soak.thrown % 2**16)

@@ -218,8 +218,8 @@ def test_one_case_alone_is_decided_on_and_planned_as_in_its_batch(decide, pairs)
 class LongFirst(ExactCatch):
     """A planner that makes its first attempt alone at every order."""
 
-    def attempts_at_all(self, case):
-        return 1
+    def begins_long(self, case):
+        return True
 
 
 @pytest.mark.parametrize(

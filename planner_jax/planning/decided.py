@@ -32,8 +32,8 @@ class DecidedPlanner(Generic[CaseT, PlanT]):
 
     Of several choices the solved one of least `decision.rank` is kept, or the one of least
     violation where none is solved. The planner's last attempt, its longest, is for cases of
-    which no choice is solved by then; a planner whose earlier attempts are long, too, says by
-    `attempts_at_all(cases)` how many are made at every choice.
+    which no choice is solved by then; all but the first are of a planner that says by
+    `begins_long(cases)` that this one is long, too.
     """
 
     planner: Any
@@ -97,8 +97,8 @@ class DecidedPlanner(Generic[CaseT, PlanT]):
         tried = [cases.decided(choice) for choice in choices]
         together = jax.tree.map(lambda *leaves: xp.concatenate(leaves), *tried)
         attempts = self.planner.attempts
-        but_last = lambda _: max(len(attempts) - 1, 1)  # noqa: E731
-        at_all = getattr(self.planner, "attempts_at_all", but_last)(cases)
+        begins_long = getattr(self.planner, "begins_long", lambda _: False)(cases)
+        at_all = 1 if begins_long else max(len(attempts) - 1, 1)
         plans, _ = drive(self.planner, together, attempts[:at_all])
         of_case = lambda leaf: leaf.reshape(num, -1, *leaf.shape[1:])  # noqa: E731
         for attempt in attempts[at_all:]:

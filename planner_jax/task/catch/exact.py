@@ -236,17 +236,13 @@ class ExactCatch(OptimisedPlanner):
         """The plans of a batch by one round."""
         return super().solve_lanes(cases, self._for_start(attempt, cases))
 
-    def attempts_at_all(self, case: CatchCase) -> int:
-        """How many attempts are made at every choice about a case, others where none is solved."""
-        return 1 if self._is_long(case) else max(len(self.attempts) - 1, 1)
-
-    def _is_long(self, case: CatchCase) -> bool:
-        """Whether a case has many targets, of which the usual rounds want all."""
+    def begins_long(self, case: CatchCase) -> bool:
+        """Whether the first search is a long one: of many targets that must all be caught."""
         return self.rounds == _ROUNDS and case.num_targets > _FEW and not case.optional
 
     def _for_start(self, attempt: Round, case: CatchCase) -> Round:
         """A shorter first round where it begins near its end, longer searches where it is far."""
-        if self._is_long(case) and attempt in _ROUNDS[:2]:
+        if self.begins_long(case) and attempt in _ROUNDS[:2]:
             is_first = attempt == _FIRST
             steps = _STEPS_A_TARGET * case.num_targets if is_first else _OF_MANY.max_steps
             return Round(starts=1, solver=dataclasses.replace(_OF_MANY, max_steps=steps))
