@@ -33,10 +33,10 @@ import numpy as np
 import planner_jax as pj
 from planner_jax.benchmarks.cost_gap import COMPARED, cost_gaps, gap_figures
 from planner_jax.benchmarks.run import argument_parser, begin, chosen
+from planner_jax.sweep.cluster import WORKERS_OF_GPU
 from planner_jax.sweep.run_folder import RunFolder
 
 _FIRST = 9  # chunks that are not counted, at least
-_OF_GPU = 4  # workers of a GPU, at most
 _GPUS, _PREALLOCATE = "CUDA_VISIBLE_DEVICES", "XLA_PYTHON_CLIENT_PREALLOCATE"
 
 
@@ -49,7 +49,7 @@ class _Share(NamedTuple):
     @property
     def first(self) -> int:
         """How many chunks are not counted: those that its workers begin with."""
-        return max(_FIRST, _OF_GPU * len(self.gpus) if self.gpus else len(self.cores))
+        return max(_FIRST, WORKERS_OF_GPU * len(self.gpus) if self.gpus else len(self.cores))
 
 
 class _Sweep:
@@ -107,13 +107,28 @@ def _ways(cores: list[int], gpus: list[str]) -> dict[str, tuple[list[_Share], bo
             "one worker": (each[-1:], True),
             f"{num} workers": ([whole], True),
         }
-    each = [_Share(cores[k::num], [gpu]) for k, gpu in enumerate(gpus)]
+    cores = sorted(cores, key=_place)
+    ends = np.linspace(0, len(cores), num + 1).astype(int)
+    each = [
+        _Share(cores[first:last], [gpu])
+        for gpu, first, last in zip(gpus, ends[:-1], ends[1:], strict=True)
+    ]
     return {
         "a plain sweep on one GPU and all cores": ([_Share(cores, gpus[:1])], False),
         "a plain sweep on each GPU": (each, False),
         "workers of one GPU": (each[:1], True),
         f"workers of {num} GPUs": ([whole], True),
     }
+
+
+def _place(core: int) -> tuple[int, ...]:
+    """Where a core, as the system counts them, is: beside those of its package and threads."""
+    topology = Path(f"/sys/devices/system/cpu/cpu{core}/topology")
+    try:
+        names = "physical_package_id", "core_id"
+        return *(int((topology / name).read_text()) for name in names), core
+    except (OSError, ValueError):  # the system does not say
+        return (core,)
 
 
 def _gpus() -> list[str]:

@@ -274,25 +274,22 @@ def test_without_ray_the_extra_is_named_in_one_line(tmp_path, monkeypatch, capsy
         ("cpu", [{"CPU": 2.0, "memory": 1e9}], (2, 0.0, 1)),
         ("cpu", [{"CPU": 4.0, "GPU": 1.0}, {"CPU": 3.0}, {}], (7, 0.0, 1)),
         ("cpu", [{}], (1, 0.0, 1)),
-        ("gpu", [{"CPU": 32.0, "GPU": 2.0}], (8, 0.25, 4)),
-        ("gpu", [{"CPU": 16.0, "GPU": 1.0}], (4, 0.25, 4)),
-        ("gpu", [{"CPU": 4.0, "GPU": 2.0}], (4, 0.5, 1)),
+        ("gpu", [{"CPU": 32.0, "GPU": 2.0}], (16, 0.125, 4)),
+        ("gpu", [{"CPU": 16.0, "GPU": 1.0}], (8, 0.125, 4)),
+        ("gpu", [{"CPU": 4.0, "GPU": 2.0}], (2, 1.0, 4)),
         ("gpu", [{"CPU": 2.0, "GPU": 4.0}], (4, 1.0, 1)),
-        (
-            "gpu",
-            [{"CPU": 64.0}, {"CPU": 8.0, "GPU": 1.0}, {"CPU": 12.0, "GPU": 4.0}],
-            (15, 1 / 3, 1),
-        ),
+        ("gpu", [{"CPU": 64.0}, {"CPU": 8.0, "GPU": 1.0}, {"CPU": 12.0, "GPU": 4.0}], (5, 1.0, 6)),
+        ("gpu", [{"CPU": 64.0}, {"CPU": 6.0, "GPU": 1.0}], (3, 1 / 3, 4)),
     ],
 )
-def test_workers_are_as_many_as_cores_or_up_to_four_a_gpu(platform, machines, places):
+def test_workers_are_as_many_as_cores_or_up_to_eight_a_gpu(platform, machines, places):
     assert cluster._places(platform, machines) == cluster._Places(*places)
 
 
 def test_workers_of_a_gpu_share_its_memory_and_the_cores_of_its_machine():
     told = cluster._places("gpu", [{"CPU": 32.0, "GPU": 2.0}]).environ()
     assert told["NPROC"] == "4" and told["XLA_PYTHON_CLIENT_PREALLOCATE"] == "false"
-    assert 4 * float(told["XLA_CLIENT_MEM_FRACTION"]) == 0.8
+    assert 8 * float(told["XLA_CLIENT_MEM_FRACTION"]) == 0.6
     assert cluster._places("cpu", [{"CPU": 32.0}]).environ() == {"NPROC": "1"}
 
 

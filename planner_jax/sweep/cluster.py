@@ -50,8 +50,11 @@ _AHEAD = 2  # chunks for each worker that are made or wait for their turn to be 
 _PATIENCE = 10.0  # seconds for a cluster to answer
 _LOOKS = 0.5  # seconds between looks whether the process was told to stop
 _GPUS = "CUDA_VISIBLE_DEVICES"  # environment variable that names those a process sees
-_SHARED = 4  # workers of a GPU, at most: it idles while a worker draws and judges
-_MEMORY = 0.8  # of a GPU, for all of its workers; the process that asks has some as well
+WORKERS_OF_GPU = 8  # at most: a GPU idles while a worker draws and judges
+# Cores for each of them, at least, and processes that judge for each core: a core idles while a
+# worker's one thread draws or encodes.
+_CORES, _BUSY = 2, 2
+_MEMORY = 0.6  # of a GPU, for all of its workers, each of which takes some more to begin
 _BEGIN = 60.0  # seconds for workers to get their shares of GPUs
 
 
@@ -179,7 +182,7 @@ class _Places:
 
     num: int
     gpu: float  # the share of one that each holds; 0.0 in a run on CPUs
-    threads: int  # of the host, that each keeps busy
+    threads: int  # of the host, that each keeps busy now and then
 
     def environ(self) -> dict[str, str]:
         """What a worker is told, before its JAX begins."""
@@ -215,8 +218,8 @@ def _places(platform: str, machines: Iterable[Mapping[str, float]]) -> _Places:
     rule = "of a cluster with GPUs where JAX has one, or asked for with JAX_PLATFORMS=cpu"
     require(bool(with_gpus), "workers", rule, "a cluster without")
     cores = min(int(each.get("CPU", 0)) // _gpus([each]) for each in with_gpus)  # of a GPU
-    shared = min(max(cores, 1), _SHARED)
-    return _Places(_gpus(with_gpus) * shared, 1.0 / shared, max(cores // shared, 1))
+    shared = min(max(cores // _CORES, 1), WORKERS_OF_GPU)
+    return _Places(_gpus(with_gpus) * shared, 1.0 / shared, max(_BUSY * cores // shared, 1))
 
 
 @dataclasses.dataclass(frozen=True)
