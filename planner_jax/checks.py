@@ -84,7 +84,8 @@ def require_path_name(name: str, value: Any) -> None:
 def numeric(value: Any) -> Any:
     """Real numbers as an array, NumPy's unless it is traced or one of jax; None of all else."""
     try:
-        array = value if isinstance(value, Tracer | jax.Array) else np.asarray(value)
+        is_array = type(value) is np.ndarray or isinstance(value, Tracer | jax.Array)
+        array = value if is_array else np.asarray(value)
     except ValueError:  # rows of different lengths
         return None
     if array.dtype.kind in "biuf" or jnp.issubdtype(array.dtype, jnp.floating):
@@ -113,7 +114,7 @@ def numbers_of(name: str, value: Any, batch: tuple[int, ...], shape: tuple[int, 
     if given.shape not in (shape, whole):
         rule = f"{shape}" if whole == shape else f"{shape} or {whole}"
         raise ValueError(f"{name} must have the shape {rule}, got {given.shape}")
-    return np.broadcast_to(given, whole)
+    return given if given.shape == whole else np.broadcast_to(given, whole)
 
 
 def shape_of(name: str, value: Any) -> tuple[int, ...]:
@@ -154,14 +155,21 @@ def require_beginning(name: str, tree: Any, shape: tuple[int, ...], words: str) 
         TypeError: there is no leaf, or one that is no array of numbers.
         ValueError: a leaf begins with another shape.
     """
-    leaves = jax.tree.leaves(tree)
-    if not leaves or any(numeric(leaf) is None for leaf in leaves):
+    _arrays_beginning(name, tree, shape, words)
+
+
+def _arrays_beginning(
+    name: str, tree: Any, shape: tuple[int, ...], words: str
+) -> tuple[list[Any], Any]:
+    """The leaves as arrays, and the tree's structure; raises as `require_beginning`."""
+    leaves, structure = jax.tree.flatten(tree)
+    arrays = [numeric(leaf) for leaf in leaves]
+    if not arrays or any(array is None for array in arrays):
         raise TypeError(f"{name} must hold arrays of numbers, got {told(tree)}")
-    for leaf in leaves:
-        if np.shape(leaf)[: len(shape)] != shape:
-            raise ValueError(
-                f"{name} must have leaves that begin with {words}, got {np.shape(leaf)}"
-            )
+    for array in arrays:
+        if array.shape[: len(shape)] != shape:
+            raise ValueError(f"{name} must have leaves that begin with {words}, got {array.shape}")
+    return arrays, structure
 
 
 def require_path(
@@ -183,9 +191,8 @@ def require_path(
     if isinstance(path, type) or not callable(getattr(path, "at", None)):
         raise TypeError(f"{name} must be a path, with a method at(time), got {told(path)}")
     of = f" of {whose}" if whose else ""
-    require_beginning(name, path, axes, f"the shape {axes}{of}")
-    leaves, tree = jax.tree.flatten(path)
-    layout = tuple((np.shape(leaf), numeric(leaf).dtype) for leaf in leaves)
+    arrays, tree = _arrays_beginning(name, path, axes, f"the shape {axes}{of}")
+    layout = tuple([(array.shape, array.dtype) for array in arrays])
     try:
         found = _shape_of_positions(tree, layout, axes)
     except (TypeError, ValueError, IndexError, AttributeError) as error:

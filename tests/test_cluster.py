@@ -330,7 +330,7 @@ def gpus(monkeypatch, ray):
     monkeypatch.setattr(cluster, "require_backend", lambda: "gpu")
     for name in ("XLA_PYTHON_CLIENT_PREALLOCATE", "XLA_CLIENT_MEM_FRACTION"):
         monkeypatch.setenv(name, "")  # to be put back
-    ray.machines = [{"CPU": 4.0, "GPU": 2.0}]
+    ray.machines = [{"CPU": 8.0, "GPU": 2.0}]
     return ray
 
 
@@ -342,7 +342,7 @@ def test_chunks_of_a_run_on_gpus_are_shared_by_workers_that_hold_parts_of_them(
     assert rows_of(out) == rows_of(finished[0])
     assert [share for share, _ in gpus.actors] == [0.5] * 4
     assert [asked for _, asked in gpus.actors] == [[0, 4], [1], [2], [3]]
-    assert os.environ["XLA_CLIENT_MEM_FRACTION"] == "0.4000"
+    assert os.environ["XLA_CLIENT_MEM_FRACTION"] == "0.3000"
 
 
 def test_a_worker_on_a_gpu_that_dies_is_begun_again(finished, tmp_path, gpus):

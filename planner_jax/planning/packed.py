@@ -40,17 +40,14 @@ def call_packed(
     )
     packed = np.asarray(program.run(kept, vector))
     result = program.result
-    return jax.tree.unflatten(
-        result.tree,
-        [
-            packed[where].reshape(shape).astype(dtype, copy=False)
-            for where, shape, dtype in result.fields
-        ],
-    )
+    found = [packed[where].reshape(shape) for where, shape in result.fields]
+    for k, dtype in result.others:
+        found[k] = found[k].astype(dtype)
+    return jax.tree.unflatten(result.tree, found)
 
 
 def _layout(leaves: Sequence[Any]) -> _Layout:
-    return tuple([(np.shape(leaf), leaf.dtype) for leaf in leaves])
+    return tuple([(leaf.shape, leaf.dtype) for leaf in leaves])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,7 +55,8 @@ class _Result:
     """What lies where in a vector."""
 
     tree: Any
-    fields: list[tuple[slice, tuple[int, ...], Any]]  # of the leaves
+    fields: list[tuple[slice, tuple[int, ...]]]  # of the leaves: place and shape
+    others: list[tuple[int, Any]]  # which leaves are of another dtype than the vector, and of which
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,10 +73,11 @@ class _Program:
         leaves, tree = jax.tree.flatten(self.examples[0])
         stops = np.cumsum([leaf.size for leaf in leaves]).tolist()
         fields = [
-            (slice(stop - leaf.size, stop), leaf.shape, leaf.dtype)
+            (slice(stop - leaf.size, stop), leaf.shape)
             for stop, leaf in zip(stops, leaves, strict=True)
         ]
-        return _Result(tree, fields)
+        dtypes = enumerate(leaf.dtype for leaf in leaves)
+        return _Result(tree, fields, [each for each in dtypes if each[1] != self.dtype])
 
 
 @functools.cache

@@ -65,23 +65,24 @@ def plan(
         TypeError: the cases are of another task than the planner, or their numbers of another
             kind; or within a transformation of JAX that the planner does not allow, see `solve`.
     """
-    watch = Watch(time_limit, progress)
-    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((planner, cases))):
+    watch, leaves = Watch(time_limit, progress), jax.tree.leaves(cases)
+    kinds = {type(leaf) for leaf in (*leaves, *jax.tree.leaves(planner))}
+    if any(issubclass(kind, Tracer) for kind in kinds):
         if watch.waits:
             raise TypeError("time_limit and progress must be left out inside of compiled functions")
         return solve(planner, cases)
     require_fit(planner, cases)
     if chunk is not None or devices is not None:
         _require_layout(chunk, devices)
-    _require_own_precision(cases)
+    _require_own_precision(leaves)
     any_planner: Any = planner
     alone = cases.batch_shape == ()
     if alone and hasattr(any_planner, "solve"):
         return _named_if_bad(plan_single(any_planner, any_planner.attempts, cases, watch), cases)
     if not alone:
         require_batch(cases)
-    if not _is_resident(cases) and not alone:
-        require_sound(cases)
+        if not _is_resident(cases):
+            require_sound(cases)
     drive = _Drive(chunk, devices, watch)
     if hasattr(any_planner, "plan_by"):
         plans = any_planner.plan_by(drive, cases)
@@ -99,7 +100,7 @@ def _named_if_bad(plan: PlanT, case: Any) -> PlanT:
 
     It is looked at afterwards, as that costs nothing where all is well.
     """
-    if plan.status == Status.BAD_INPUT and not _is_resident(case):
+    if int(plan.status) == Status.BAD_INPUT and not _is_resident(case):
         require_sound(case)
     return plan
 
@@ -119,14 +120,14 @@ def _require_layout(chunk: Any, devices: Any) -> None:
             raise ValueError(f"devices must differ, got {', '.join(map(str, devices))}")
 
 
-def _require_own_precision(cases: Any) -> None:
+def _require_own_precision(leaves: list[Any]) -> None:
     """Raise `TypeError` for cases in float64 while JAX computes in float32.
 
     One array of several that NumPy has made in float64 is no such case.
     """
     if jax.config.jax_enable_x64:  # type: ignore[attr-defined]
         return
-    kinds = (getattr(leaf, "dtype", None) for leaf in jax.tree.leaves(cases))
+    kinds = (getattr(leaf, "dtype", None) for leaf in leaves)
     if all(kind == np.float64 for kind in kinds if kind is None or kind.kind == "f"):
         raise TypeError("cases must be in float32 unless jax_enable_x64 is set, got float64")
 

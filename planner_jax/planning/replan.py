@@ -43,9 +43,9 @@ def moment_of(cases: Case, elapsed: Any) -> np.ndarray:
     dtypes = (np.asarray(leaf).dtype for leaf in jax.tree.leaves(cases))
     dtype = next(dtype for dtype in dtypes if np.issubdtype(dtype, np.floating))
     elapsed = numbers_of("elapsed", elapsed, cases.batch_shape, ()).astype(dtype)
-    if not np.all(elapsed >= 0.0):
+    if not (elapsed >= 0.0).all():
         raise ValueError(f"elapsed must be >= 0, got {np.min(elapsed)}")
-    if not np.all(elapsed < np.inf):
+    if not (elapsed < np.inf).all():
         raise ValueError(f"elapsed must be finite, got {np.max(elapsed)}")
     return elapsed
 
