@@ -35,6 +35,7 @@ ALLOWED = {
     "lanes": set(),
     "whole_files": set(),
     "stopping": set(),
+    "threads": set(),
     "checks": set(),
     "plan_files": {"checks", "plain_files", "whole_files"},
     "rules": set(),
@@ -51,7 +52,7 @@ ALLOWED = {
     "space": set(),
     "cost": {"arithmetic", "checks", "lanes", "robot", "rules", "trajectory"},
     "optimise": {"checks", "lanes", "protocol"},
-    "planning": {"checks", "optimise", "protocol", "rules", "whole_files"},
+    "planning": {"checks", "optimise", "protocol", "rules", "threads", "whole_files"},
     "ending": {
         *("cost", "optimise", "planning", "protocol", "referee", "robot", "rules", "trajectory"),
     },
@@ -72,7 +73,7 @@ ALLOWED = {
     "sweep": {
         *("ball", "compile_cache", "digits", "ending", "lanes", "memory", "perception", "plane"),
         *("planning", "protocol", "referee", "registry", "robot", "rules", "stopping", "task"),
-        *("plain_files", "trajectory", "whole_files"),
+        *("plain_files", "threads", "trajectory", "whole_files"),
     },
     "compile_cache": set(),
     "doctor": {"compile_cache", "lanes", "planning", "protocol", "registry", "sweep"},

@@ -125,6 +125,14 @@ def test_chunks_and_padding_change_nothing():
     np.testing.assert_allclose(whole.point, chunked.point, rtol=1e-5, atol=1e-5)
 
 
+def test_all_chunks_are_computed_in_the_callers_type_of_numbers():
+    goals = np.pi / 4.0 * np.linspace(-1.0, 1.0, 64)
+    with jax.enable_x64(True):
+        found = plan(WellPlanner(), Well(goals), chunk=16).point[:, 0]
+    assert found.dtype == np.float64
+    assert (found != found.astype(np.float32)).all()  # none has gone through a shorter type
+
+
 def test_new_batch_sizes_of_one_bucket_are_not_traced_again():
     plan(WellPlanner(), Well(GOALS[:3]))
     TRACES.clear()

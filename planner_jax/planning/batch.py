@@ -31,6 +31,7 @@ from planner_jax.protocol import (
     out_of_time,
 )
 from planner_jax.rules import require_shapes
+from planner_jax.threads import as_here
 
 # Lanes of a device in one call. Few, because every one is a program of its own to compile.
 BUCKETS = (16, 128, 1024, 8192, 65536)
@@ -249,7 +250,7 @@ def _first_plans(
     if len(set(programs.values()) - _COMPILED) > 1:  # compiled at the same time
         firsts = {size: begin for begin, size in reversed(cuts)}
         with ThreadPoolExecutor(len(firsts)) as pool:
-            made = pool.map(solve, firsts.values(), firsts)
+            made = pool.map(as_here(solve), firsts.values(), firsts)
             found = dict(zip(firsts.values(), made, strict=True))
         _COMPILED.update(programs.values())
     parts = [found[begin] if begin in found else solve(begin, size) for begin, size in cuts]
@@ -390,7 +391,7 @@ def _each_from_host(
     alone = [] if program in _COMPILED else [solve(calls[0])]
     _COMPILED.add(program)
     with ThreadPoolExecutor(threads) as pool:
-        later = pool.map(solve, calls[len(alone) :])
+        later = pool.map(as_here(solve), calls[len(alone) :])
         yield from alone
         yield from later
 

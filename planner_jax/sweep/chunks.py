@@ -20,6 +20,7 @@ from planner_jax.sweep.source import Chunk, Source
 from planner_jax.sweep.summary import percent
 from planner_jax.sweep.sweep import Sweep
 from planner_jax.sweep.timing import CompileClock, Stopwatch, timed, timed_warm
+from planner_jax.threads import as_here
 
 _COUNTED = ("num", "successes")  # of every part
 _UNDER_WAY = 2  # chunks that are judged or written while the next is planned
@@ -194,11 +195,11 @@ def _made_here(
 ) -> Generator[Making, None, None]:
     """Make chunks by this process: while one is planned, the next is drawn, the last is judged."""
     with CompileClock() as clock:
-        draws = (drawer.submit(run.source.chunk, number) for number in numbers)
+        draws = (drawer.submit(as_here(run.source.chunk), number) for number in numbers)
         following = next(draws, None)
         while following is not None:
             drawn, following = following, next(draws, None)
-            judged = judge.submit(run.judged, run.planned(drawn.result(), clock))
+            judged = judge.submit(as_here(run.judged), run.planned(drawn.result(), clock))
             yield lambda judged=judged: run.encoded(*judged.result())
 
 
