@@ -1,7 +1,7 @@
 """The live loop under throws one after another, with packets lost, late and repeated.
 
     python -m benchmarks.serve_soak [--task catch] [--minutes 1] [--rate 100] [--bad 2]
-        [--deadline 0.01] [--server-core N] [--out DIR]
+        [--deadline 0.01] [--server-core N] [--idle] [--out DIR]
 
 Starts `planner-jax serve TASK --report` as a process of its own, and sends it balls of the task's
 suite as they fly, with noise on their places, and the state of a robot that is where the last
@@ -195,6 +195,8 @@ def started(options: Any) -> tuple[subprocess.Popen, int, float]:
     """The server's process, its port, and after how many seconds it answers."""
     words = [sys.executable, "-m", "planner_jax", "serve", options.task, "--port", "0", "--report"]
     words += ["--deadline", str(options.deadline), "--rate", str(options.rate)]
+    if options.idle:
+        words.append("--idle")
     if options.server_core is not None:
         words = ["taskset", "-c", str(options.server_core), *words]
     began = time.perf_counter()
@@ -216,6 +218,7 @@ def main() -> None:
     parser.add_argument("--bad", type=float, default=2.0, help="per cent of packets (default: 2)")
     parser.add_argument("--deadline", type=float, default=0.01, help="[s] (default: 0.01)")
     parser.add_argument("--server-core", type=int, help="core that the server is bound to")
+    parser.add_argument("--idle", action="store_true", help="no rehearsals between packets")
     options = parser.parse_args()
     with begin(parser, options) as bench:
         balls = paths(options.task, options.rate)

@@ -382,7 +382,8 @@ def _serve(settings: Any) -> None:
     keep_compiled_programs()
     names = ("rate", "horizon", "deadline", "noise")
     options = {name: getattr(settings, name) for name in names}
-    server = Server(LivePlanner(settings.stroke(), **options), settings.port)
+    planner = LivePlanner(settings.stroke(), **options)
+    server = Server(planner, settings.port, idle=settings.idle)
     server.warm_up()
     report = server.planner.report
     rest = lambda: f"{report.counts['answered']:,} packets answered"  # noqa: E731

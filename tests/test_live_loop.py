@@ -2,6 +2,7 @@
 
 import re
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -258,6 +259,58 @@ def test_the_client_of_the_page_prints_setpoints(warm, capsys):
         thread.join()
         server._socket.close()
     assert "PLAN" in capsys.readouterr().out
+
+
+def test_a_rehearsal_changes_nothing(warm, path):
+    told = []
+
+    def rehearsed(look, data):
+        known = warm._flight, warm._sight._belief, warm._sight._looks, dict(warm.report.counts)
+        told.append(warm.rehearse())
+        assert known[:2] == (warm._flight, warm._sight._belief)
+        assert known[2:] == (warm._sight._looks, dict(warm.report.counts))
+        return [data]
+
+    answers = balls_of(Throw(warm, path, 21, rehearsed).fly(180))
+    first, *_, last = (k for k, answer in enumerate(answers) if answer.motion is Motion.PLAN)
+    assert not any(told[: first + 1]) and not any(told[last + 1 :])
+    assert sum(told) > 0.7 * (last - first)
+
+
+class Quiet:
+    """A planner that counts its rehearsals, and has no more to rehearse after some."""
+
+    def __init__(self, num):
+        self.left, self.count = num, 0
+
+    def rehearse(self):
+        self.count += 1
+        self.left -= 1
+        return self.left > 0
+
+
+@pytest.mark.parametrize(("idle", "most"), [(False, 2), (True, 0)])
+def test_a_server_rehearses_while_no_packet_comes_and_there_is_a_ball(idle, most):
+    planner = Quiet(2)
+    server, turns = Server(planner, 0, idle=idle), iter([True] * 3)
+    server._socket.settimeout(0.001)
+    began = time.perf_counter()
+    server.run(lambda: next(turns, False) and planner.count < 2)
+    server._socket.close()
+    assert planner.count == most
+    # Without a rehearsal, as after one that found no ball, it listens for a quarter of a second.
+    assert (time.perf_counter() - began > 0.5) == idle
+
+
+def test_a_packet_has_come_when_the_system_got_it(warm):
+    server = Server(warm, 0)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.sendto(b"here", ("127.0.0.1", server.port))
+    sent = time.perf_counter()
+    time.sleep(0.1)
+    data, _, received = server._received()
+    server._socket.close()
+    assert data == b"here" and abs(received - sent) < 0.05
 
 
 def test_packets_that_are_not_ours_get_a_line_each_kind_and_no_answer(warm, capsys):

@@ -24,6 +24,7 @@ class ServeSettings:
     noise: float = option(0.005, "M", "standard deviation of an observed coordinate [m]")
     seconds: float | None = option(None, "S", "end after this time (default: never)")
     report: bool = option(False, "", "tell counts, times and memory at the end")
+    idle: bool = option(False, "", "leave the core to others between packets; answers take longer")
 
     def __post_init__(self) -> None:
         require_count("port", self.port, 0)

@@ -113,6 +113,12 @@ class Sight:
         self._looks, self._outliers = self._looks + 1, 0
         return seen.ball, Fault.NONE
 
+    def rehearse(self, until: float) -> BallState | None:
+        """A look at the ball where it was seen last, which changes nothing; None without one."""
+        if self._belief is None:
+            return None
+        return self._look(tuple(self._belief.mean[:3].tolist()), 0.0, until - self._time).ball
+
     def _look(self, observation: tuple[float, ...], since: float, ahead: float) -> Seen:
         given: Any = (since, observation, max(ahead, 0.0))
         numbers: Any = [np.asarray(x, np.float32) for x in given]
