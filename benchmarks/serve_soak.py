@@ -6,19 +6,20 @@
 Starts `planner-jax serve TASK --report` as a process of its own, and sends it balls of the task's
 suite as they fly, with noise on their places, and the state of a robot that is where the last
 answer has it. Of the packets as many per cent as --bad says are lost, come 30 ms late, or are sent
-twice, a third each. A round trip that takes longer than the deadline is a miss. A thread that only
-sleeps notes when the host has not let it run: misses within such a gap are the host's. At the end
-stand misses, times, and the server's own report with its memory at the start and at the end. The
-success of the summary is the share of the balls that are within the radius of the net or racket at
-the contact, where the setpoints then have its centre.
+twice, a third each. A round trip that takes longer than the deadline is a miss. A process that only
+sleeps notes when the host has not let it run; with --server-core another one does on the server's
+core, which this process then leaves to the server. Misses within such a gap are the host's. At the
+end stand misses, times, and the server's own report with its memory at the start and at the end.
+The success of the summary is the share of the balls that are within the radius of the net or
+racket at the contact, where the setpoints then have its centre.
 """
 
 import heapq
+import os
 import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
 from typing import Any
 
@@ -47,7 +48,20 @@ SECONDS = 1.8  # of a throw
 NOISE = 0.005  # [m]
 LATE = 0.03  # [s]
 TOOLS = {"hit": "racket", "catch": "net"}
-NAP, GAP = 0.001, 0.004  # [s], of the thread that sleeps, and what it notes
+NAP, GAP = 0.001, 0.004  # [s], of a process that sleeps, and what it notes
+SLEEPER = """
+import os, sys, time
+nap, gap = map(float, sys.argv[1:3])
+if sys.argv[3:]:
+    os.sched_setaffinity(0, {int(sys.argv[3])})
+before, asker = time.monotonic(), os.getppid()
+while os.getppid() == asker:
+    time.sleep(nap)
+    now = time.monotonic()
+    if now - before > nap + gap:
+        print(before + nap, now, flush=True)
+    before = now
+"""
 
 
 def paths(task: str, rate: float) -> np.ndarray:
@@ -79,32 +93,25 @@ def distance_off(answer: Answer, height: float, gravity: float, ball: np.ndarray
 
 
 class Naps:
-    """Notes when a thread that asks for little was kept from running."""
+    """A process that only sleeps, and notes when it was not let run, on one core or on any."""
 
-    def __init__(self) -> None:
-        self.gaps: list[tuple[float, float]] = []  # begin and end [s], the latest ones
-        self.num, self.longest, self._on = 0, 0.0, True
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._thread.start()
-
-    def _run(self) -> None:
-        before = time.monotonic()
-        while self._on:
-            time.sleep(NAP)
-            now = time.monotonic()
-            if now - before - NAP > GAP:
-                self.num, self.longest = self.num + 1, max(self.longest, now - before - NAP)
-                self.gaps = [*self.gaps[-99:], (before, now)]
-            before = now
-
-    def cover(self, begin: float, end: float) -> bool:
-        """Whether there was a gap between two times [s]."""
-        return any(a < end and b > begin for a, b in self.gaps)
+    def __init__(self, core: int | None = None) -> None:
+        words = [sys.executable, "-S", "-c", SLEEPER, str(NAP), str(GAP)]
+        words += [] if core is None else [str(core)]
+        self._process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
+        self.gaps: list[tuple[float, float]] = []  # begin and end [s], when it has ended
 
     def end(self) -> None:
         """Note no more."""
-        self._on = False
-        self._thread.join()
+        self._process.terminate()
+        told, _ = self._process.communicate()
+        lines = told.splitlines(keepends=True)
+        pairs = (x.split() for x in lines if x.endswith("\n"))
+        self.gaps = [(float(begin), float(end)) for begin, end in pairs]
+
+    def __str__(self) -> str:
+        longest = max((end - begin for begin, end in self.gaps), default=0.0)
+        return f"{len(self.gaps)} times for more than {1e3 * GAP:g} ms, at most {1e3 * longest:.1f}"
 
 
 class Soak:
@@ -112,13 +119,14 @@ class Soak:
 
     def __init__(self, port: int, options: Any, tool: tuple[float, float], gravity: float) -> None:
         (self.height, self.radius), self.gravity = tool, gravity  # [m], [m/s^2]
-        self.options, self.naps, self.trips = options, Naps(), Latencies()
+        self.options, self.trips = options, Latencies()
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.connect((HOST, port))
         self._random = np.random.default_rng(options.seed)
         self._sequence = self._tie = 0
         self._later: list[tuple[float, int, bytes]] = []
-        self.lost = self.late = self.repeated = self.missed = self.by_host = self.silent = 0
+        self.lost = self.late = self.repeated = self.silent = 0
+        self.missed: list[tuple[float, float]] = []  # begin and end [s] of trips above the deadline
         self.thrown = self.met = 0
 
     def send(self, kind: int, measured: float, values: tuple, ball: int) -> Any:
@@ -151,8 +159,7 @@ class Soak:
                 taken = time.monotonic() - sent
                 self.trips.add(taken)
                 if taken > self.options.deadline:
-                    self.missed += 1
-                    self.by_host += self.naps.cover(sent, sent + taken)
+                    self.missed.append((sent, sent + taken))
                 return answer
         self.silent += 1
         return None
@@ -185,9 +192,12 @@ class Soak:
                 self.met += off < self.radius
                 break
 
+    def missed_within(self, gaps: list[tuple[float, float]]) -> int:
+        """How many trips above the deadline one of the gaps falls into."""
+        return sum(any(a < end and b > begin for a, b in gaps) for begin, end in self.missed)
+
     def end(self) -> None:
         """Give the socket back."""
-        self.naps.end()
         self._socket.close()
 
 
@@ -230,12 +240,20 @@ def main() -> None:
             tool = float(case.net.height), float(case.net.radius)
         start = np.asarray(case.head_state[0], float)
         process, port, seconds = started(options)
+        naps = {"any core": Naps()}
+        if options.server_core is not None:
+            naps["the server's core"] = Naps(options.server_core)
+            others = os.sched_getaffinity(0) - {options.server_core}
+            os.sched_setaffinity(0, others or {options.server_core})
         with undisturbed():  # or the pauses of this process would count
             soak = Soak(port, options, tool, float(case.gravity))
             ends = time.monotonic() + 60.0 * options.minutes
             while time.monotonic() < ends:
                 soak.throw(balls[soak.thrown % NUM], start, soak.thrown % 2**16)
         soak.end()
+        for sleeper in naps.values():
+            sleeper.end()
+        by_host = soak.missed_within([gap for sleeper in naps.values() for gap in sleeper.gaps])
         process.send_signal(signal.SIGINT)
         told, _ = process.communicate(timeout=30.0)
         trips = [1e3 * soak.trips.quantile(share) for share in (0.5, 0.99)]
@@ -244,12 +262,12 @@ def main() -> None:
             f"{seconds:.1f} s after the start; {soak.thrown} balls, {soak.met} met by the "
             f"{TOOLS[options.task]}",
             f"{soak.trips.num:,} round trips: p50 {trips[0]:.2f} ms, p99 {trips[1]:.2f} ms, max "
-            f"{1e3 * soak.trips.longest:.1f} ms; {soak.missed} took longer than "
-            f"{1e3 * options.deadline:g} ms, {soak.by_host} of these while the host kept a thread "
+            f"{1e3 * soak.trips.longest:.1f} ms; {len(soak.missed)} took longer "
+            f"than {1e3 * options.deadline:g} ms, {by_host} of these while the host kept a process "
             f"that sleeps from running; {soak.silent} without an answer",
-            f"lost {soak.lost}, late {soak.late}, repeated {soak.repeated}; the host kept the "
-            f"thread from running {soak.naps.num} times for more than {1e3 * GAP:g} ms, at most "
-            f"{1e3 * soak.naps.longest:.1f} ms",
+            f"lost {soak.lost}, late {soak.late}, repeated {soak.repeated}",
+            "the host kept a process that sleeps from running, on "
+            + ", on ".join(f"{where} {sleeper}" for where, sleeper in naps.items()),
             "the server's own report:",
             told.strip(),
         )
@@ -258,8 +276,8 @@ def main() -> None:
             p50_ms=trips[0],
             p99_ms=trips[1],
             trips=soak.trips.num,
-            missed=soak.missed,
-            missed_by_host=soak.by_host,
+            missed=len(soak.missed),
+            missed_by_host=by_host,
             start_seconds=seconds,
         )
 
