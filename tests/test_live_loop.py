@@ -1,5 +1,7 @@
 """The live loop: from looks at a ball to setpoints, whatever else comes."""
 
+import contextlib
+import math
 import re
 import signal
 import socket
@@ -311,6 +313,35 @@ def test_a_packet_has_come_when_the_system_got_it(warm):
     data, _, received = server._received()
     server._socket.close()
     assert data == b"here" and abs(received - sent) < 0.05
+
+
+def test_a_late_answer_for_which_the_machine_gave_too_little_time_is_told_apart(warm):
+    data = request(ROBOT, 1, 0.0, 0.0, (0.0,) * 9, 1)
+    before = {name: warm.report.counts[name] for name in ("missed", "starved")}
+
+    def count(since, computed):
+        warm.sent(data, time.perf_counter() - since, computed)
+        return tuple(warm.report.counts[name] - num for name, num in before.items())
+
+    deadline = warm.deadline
+    assert count(0.1 * deadline, 0.05 * deadline) == (0, 0)
+    assert count(3.0 * deadline, 2.0 * deadline) == (1, 0)
+    assert count(3.0 * deadline, 0.5 * deadline) == (2, 1)
+
+
+def test_a_server_knows_what_it_has_computed_since_a_packet_came(warm):
+    server = Server(warm, 0)
+    server._socket.settimeout(0.05)
+    with contextlib.suppress(TimeoutError):
+        server._received()  # sleeps
+    came = time.perf_counter()
+    assert server._computed_since(came) < 0.04  # which it listened before
+    until = time.process_time() + 0.1
+    while time.process_time() < until:
+        pass
+    assert 0.1 <= server._computed_since(came) < 0.14
+    assert server._computed_since(-math.inf) == math.inf  # nobody knows
+    server._socket.close()
 
 
 def test_packets_that_are_not_ours_get_a_line_each_kind_and_no_answer(warm, capsys):

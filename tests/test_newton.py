@@ -1,10 +1,14 @@
 """Newton's method in a subspace: closed forms, limit cases, and a batch beside its lanes."""
 
+import dataclasses
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from planner_jax.cost.penalty import smoothed_hinge
 from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.multistart import minimise, minimise_lanes
 from planner_jax.optimise.newton import Curvature, NewtonConfig, by_products, damped_steps
@@ -143,6 +147,60 @@ def test_a_batch_ends_where_its_lanes_do_and_stragglers_go_on():
     assert last.iterations[3] == lanes.iterations[3]
 
 
+def by_hessian(cost):
+    """Second derivatives preconditioned by themselves, so that no subspace is needed."""
+
+    def curved(x):
+        by, hessian = jax.grad(cost)(x), jax.hessian(cost)(x)
+
+        def preconditioner(damping):
+            inverse = jnp.linalg.inv(hessian + damping * jnp.eye(x.size))
+            return lambda right: inverse @ right
+
+        return Curvature(of_cost(cost)(x), by, lambda: lambda d: hessian @ d, preconditioner)
+
+    return curved
+
+
+def of_cost(cost):
+    return lambda x: Evaluation(cost(x), jnp.asarray(-1.0, x.dtype))
+
+
+def test_where_a_limit_begins_just_ahead_the_search_does_not_end_in_front_of_it():
+    """The step that the flat side asks for is a hundred times as long as that to the optimum."""
+
+    def cost(x):  # x = 0.02 is where a steep penalty begins, and the optimum is just behind
+        slope = 1e-6 * jnp.sum((x - 2.0) ** 2) + 1e-5
+        return slope + 10.0 * jnp.sum(smoothed_hinge(x - 0.02, 0.05))
+
+    config = NewtonConfig(
+        max_steps=60, subspace=0, damping=1e-9, tolerance=1e-3, trusted=1e-9, patience=6
+    )
+    start, curved = jnp.zeros(1), by_hessian(cost)
+    found = minimise(of_cost(cost), start, config, curved)
+    assert found.stationary
+    assert found.point[0] > 0.02
+    assert abs(float(jax.grad(cost)(found.point)[0])) < 0.1 * abs(float(jax.grad(cost)(start)[0]))
+    # By its short steps alone the search would seem to be at its end.
+    hasty = minimise(of_cost(cost), start, dataclasses.replace(config, trusted=math.inf), curved)
+    assert hasty.stationary and hasty.point[0] < 0.02
+
+
+def test_where_costs_say_nothing_steps_go_on_by_the_slope():
+    """All costs are 1 in float32, their slopes are exact."""
+
+    def cost(x):
+        return 1.0 + 1e-9 * jnp.sum((x - 3.0) ** 2)
+
+    start, curved = jnp.zeros(2), by_hessian(cost)
+    config = NewtonConfig(max_steps=8, subspace=0, damping=1e-13, tolerance=1e-12, step_cap=9.0)
+    np.testing.assert_array_equal(minimise(of_cost(cost), start, config, curved).point, 0.0)
+    by_slope = dataclasses.replace(config, slack=4.0)
+    found = minimise(of_cost(cost), start, by_slope, curved)
+    np.testing.assert_allclose(found.point, 3.0, rtol=1e-3)
+    assert found.stationary
+
+
 @pytest.mark.parametrize(
     ("argument", "value", "error"),
     [
@@ -151,6 +209,8 @@ def test_a_batch_ends_where_its_lanes_do_and_stragglers_go_on():
         ("trial_dampings", (), ValueError),
         ("trial_dampings", 0.1, TypeError),
         ("damping", float("nan"), ValueError),
+        ("slack", -1.0, ValueError),
+        ("trusted", float("nan"), ValueError),
         ("stragglers", (1.5, 4, 1), ValueError),
         ("stragglers", (0.5, 4), TypeError),
         ("stragglers", (0.5, 4, 0), ValueError),

@@ -172,11 +172,19 @@ class LivePlanner:
         report.stages["setpoints"].add(time.perf_counter() - began)
         return sent
 
-    def sent(self, data: bytes, received: float) -> None:
-        """Note that the answer to a packet has been sent, and do what could wait for that."""
+    def sent(self, data: bytes, received: float, computed: float = math.inf) -> None:
+        """Note that the answer to a packet has been sent, and do what could wait for that.
+
+        Args:
+            data: the packet.
+            received: when it came, by `time.perf_counter()`.
+            computed: time [s] that this process has had processors for since then, or more.
+        """
         taken = time.perf_counter() - received
         self.report.counts["answered"] += 1
-        self.report.counts["missed"] += taken > self.deadline
+        if taken > self.deadline:
+            self.report.counts["missed"] += 1
+            self.report.counts["starved"] += computed < self.deadline
         self.report.stages["answer"].add(taken)
         if data[5] == BALL:
             self.report.stages["ball"].add(taken)

@@ -130,6 +130,7 @@ COUNTS = {
     "used": "packets used",
     "late": "packets late, and used",
     "missed": "answers after the deadline",
+    "starved": "of these, for which the machine gave less processor time than the deadline",
     "busy": "answers from the last good plan, as planning took too long",
     "balls": "balls",
     "plans": "plans from scratch that are flown",

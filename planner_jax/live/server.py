@@ -1,7 +1,9 @@
 """The socket of a live loop: UDP on localhost, one process, one robot."""
 
+import collections
 import contextlib
 import gc
+import math
 import socket
 import struct
 import sys
@@ -38,6 +40,9 @@ class Server:
     def __init__(self, planner: LivePlanner, port: int, *, idle: bool = False) -> None:
         self.planner, self._idle = planner, idle
         self._told: set[Fault] = set()
+        # When it was listened of late, by `time.perf_counter()`, and what this process had
+        # computed by then, by `time.process_time()`.
+        self._listened: collections.deque[tuple[float, float]] = collections.deque(maxlen=16)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self._socket.bind((HOST, port))
@@ -80,6 +85,7 @@ class Server:
 
         It may have come a while ago, during an answer or a rehearsal.
         """
+        self._listened.append((time.perf_counter(), time.process_time()))
         data, others, _, sender = self._socket.recvmsg(LONGEST, socket.CMSG_SPACE(_STAMP.size))
         now, received = time.time(), time.perf_counter()
         for level, kind, stamp in others:
@@ -98,7 +104,12 @@ class Server:
         except OSError:
             self.planner.report.counts["unsent"] += 1
             return
-        self.planner.sent(data, received)
+        self.planner.sent(data, received, self._computed_since(received))
+
+    def _computed_since(self, when: float) -> float:
+        """Processor time [s] of this process since some time or shortly before it."""
+        at = [computed for listened, computed in self._listened if listened <= when]
+        return time.process_time() - at[-1] if at else math.inf
 
     def _tell(self, data: bytes, sender: tuple[str, int]) -> None:
         """Say what is wrong with a packet that gets no answer, the first time that it happens."""

@@ -16,6 +16,7 @@ lane's own damping goes on; it fades, and the last steps are Newton's, along fla
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -62,7 +63,11 @@ class NewtonConfig:
     tighten: float = 1e3
     step_cap: float = 3.0  # largest Euclidean length of a step
     tolerance: float = 1e-4  # decrease that is expected, relative to the cost, that counts as none
-    patience: int = 3  # iterations without a decrease before a lane is stationary
+    trusted: float = math.inf  # damping up to which the decrease that is expected counts
+    patience: int = 3  # iterations that lead no nearer before a lane is stationary
+    # Relative difference of two costs, in roundings of their type, that says nothing. Steps that
+    # cost no more than that are made, and lead nearer if the next one is expected to gain less.
+    slack: float = 0.0
     # Lanes that go on while any has something to gain, those with most first: their share in a
     # batch, iterations of each such group, and how many groups there are at most.
     stragglers: tuple[float, int, int] | None = None
@@ -70,8 +75,10 @@ class NewtonConfig:
     def __post_init__(self) -> None:
         for name, least in (("max_steps", 0), ("subspace", 0), ("patience", 0)):
             require_size(name, getattr(self, name), least)
-        for name in ("damping", "ease", "tighten", "step_cap", "tolerance"):
+        for name in ("damping", "ease", "tighten", "step_cap", "tolerance", "slack"):
             require_number(name, getattr(self, name), "finite and >= 0", lambda x: x >= 0.0)
+        if numeric(self.trusted) is None or not self.trusted >= 0.0:
+            raise ValueError(f"trusted must be a number >= 0, got {told(self.trusted)}")
         trials = self.trial_dampings
         if not isinstance(trials, tuple) or any(numeric(each) is None for each in trials):
             raise TypeError(f"trial_dampings must be a tuple of numbers, got {told(trials)}")
@@ -96,7 +103,7 @@ class NewtonNumbers:
     damping: Array  # ()
     expected: Array  # (), decrease that the last iteration expected, relative to the cost
     iteration: Array  # () int32
-    stalled: Array  # () int32, iterations in a row without a decrease
+    stalled: Array  # () int32, iterations in a row that led no nearer
 
 
 @struct.dataclass
@@ -326,25 +333,33 @@ def _chosen(
 ) -> tuple[NewtonNumbers, Array, Array, Array]:
     """What an iteration comes to: numbers, shares of the trials, if it is best, if it counts."""
     costs = jnp.where(jnp.isfinite(trials.cost), trials.cost, jnp.inf)
-    is_chosen = jnp.arange(costs.size) == jnp.argmin(costs)
+    slack = config.slack * jnp.finfo(costs.dtype).eps * jnp.abs(here.cost)
+    places = jnp.arange(costs.size)
+    # Of trials that rounding does not tell apart the one with the least damping.
+    is_chosen = places == jnp.argmin(jnp.where(costs <= jnp.min(costs) + slack, places, costs.size))
 
     def of_chosen(values: Array) -> Array:  # without a gather, which would need a loop of its own
         return jnp.sum(jnp.where(is_chosen, values, 0.0))
 
-    decreased = of_chosen(costs) < here.cost
-    there = jax.tree.map(lambda new, old: jnp.where(decreased, of_chosen(new), old), trials, here)
+    moved = of_chosen(costs) < here.cost + slack
+    there = jax.tree.map(lambda new, old: jnp.where(moved, of_chosen(new), old), trials, here)
     best = jax.tree.map(lambda a, b: jnp.where(numbers.iteration == 0, a, b), here, numbers.best)
-    is_better = better(there, best)
+    is_better = moved & better(there, best.replace(cost=best.cost + slack))
     factors = jnp.maximum(jnp.asarray(config.trial_dampings, costs.dtype), config.ease)
-    damping = numbers.damping * jnp.where(decreased, of_chosen(factors), config.tighten)
+    damping = numbers.damping * jnp.where(moved, of_chosen(factors), config.tighten)
+    promised = decrease / jnp.maximum(jnp.abs(here.cost), 1e-30)
+    # A short step promises less than there is to be gained.
+    is_short = numbers.damping > config.trusted
+    expected = jnp.where(is_short, jnp.maximum(promised, numbers.expected), promised)
+    is_nearer = (there.cost < here.cost - slack) | (moved & (expected < 0.5 * numbers.expected))
     after = NewtonNumbers(
         best=jax.tree.map(lambda a, b: jnp.where(is_better, a, b), there, best),
         damping=jnp.clip(damping, 1e-10, 1e4),
-        expected=decrease / jnp.maximum(jnp.abs(here.cost), 1e-30),
+        expected=expected,
         iteration=numbers.iteration + 1,
-        stalled=jnp.where(decreased, 0, numbers.stalled + 1),
+        stalled=jnp.where(is_nearer, 0, numbers.stalled + 1),
     )
     going = is_unfinished(numbers, config)
     after = jax.tree.map(lambda new, old: jnp.where(going, new, old), after, numbers)
-    shares = jnp.where(is_chosen & decreased, 1.0, 0.0)
+    shares = jnp.where(is_chosen & moved, 1.0, 0.0)
     return after, shares, is_better & going, going

@@ -15,7 +15,14 @@ from planner_jax.optimise.problem import Round, Settings, Solver, Stage
 
 # From where the first search ends.
 _POLISH = NewtonConfig(
-    max_steps=8, damping=1e-6, tolerance=1e-7, patience=6, stragglers=(0.125, 10, 10)
+    max_steps=8,
+    damping=1e-6,
+    tighten=30.0,
+    tolerance=1e-7,
+    trusted=1e-6,
+    patience=8,
+    slack=256.0,
+    stragglers=(0.125, 10, 10),
 )
 _LONG = LbfgsConfig(max_steps=300, tolerance=1e-7, patience=6)
 # Of the first round, by effort.
