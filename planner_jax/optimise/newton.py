@@ -12,6 +12,10 @@ it leads down the gradient, in variables that are scaled. Beside it several mult
 preconditioner's curvature are tried at once, at a few operations each, because under `vmap` a
 search for the right one would run to the slowest lane. The multiple that did best says how the
 lane's own damping goes on; it fades, and the last steps are Newton's, along flat valleys too.
+
+Near an optimum two costs differ by less than their rounding, while slopes still say where it is.
+With a slack the least damped step that costs no more than rounding goes on from there, as in the
+approximate conditions of Wolfe (Hager and Zhang 2005), until steps lead no nearer.
 """
 
 import dataclasses
@@ -66,7 +70,7 @@ class NewtonConfig:
     trusted: float = math.inf  # damping up to which the decrease that is expected counts
     patience: int = 3  # iterations that lead no nearer before a lane is stationary
     # Relative difference of two costs, in roundings of their type, that says nothing. Steps that
-    # cost no more than that are made, and lead nearer if the next one is expected to gain less.
+    # cost no more are made, and lead nearer where what is expected falls by half.
     slack: float = 0.0
     # Lanes that go on while any has something to gain, those with most first: their share in a
     # batch, iterations of each such group, and how many groups there are at most.
@@ -348,7 +352,7 @@ def _chosen(
     factors = jnp.maximum(jnp.asarray(config.trial_dampings, costs.dtype), config.ease)
     damping = numbers.damping * jnp.where(moved, of_chosen(factors), config.tighten)
     promised = decrease / jnp.maximum(jnp.abs(here.cost), 1e-30)
-    # A short step promises less than there is to be gained.
+    # A step that is much damped promises less than there is to be gained.
     is_short = numbers.damping > config.trusted
     expected = jnp.where(is_short, jnp.maximum(promised, numbers.expected), promised)
     is_nearer = (there.cost < here.cost - slack) | (moved & (expected < 0.5 * numbers.expected))
