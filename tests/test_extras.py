@@ -274,7 +274,7 @@ def test_boxes_and_planes_are_planned_around_and_judged(hits, free, middle):
 def test_no_claim_is_refused_of_ways_past_boxes(hits, middle):
     """Boxes of 20 to 60 cm about the middle of each way, whose edges the plans pass closely."""
     random, claims = np.random.default_rng(2), 0
-    for _ in range(8):
+    for _ in range(16):  # on some processors 8 of the first 32 cases are solved, on others more
         half = random.uniform(0.1, 0.3, (NUM, 3))
         low = middle + random.normal(0.0, 0.08, (NUM, 3)) - half
         cases = having(hits, low=low, size=2.0 * half)
