@@ -20,7 +20,6 @@ approximate conditions of Wolfe (Hager and Zhang 2005), until steps lead no near
 
 import dataclasses
 import functools
-import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -50,6 +49,7 @@ Curved = Callable[[Array], Curvature]
 
 _HIGHEST = lax.Precision.HIGHEST
 _HALVINGS = 14  # of the interval in which the least eigenvalue is looked for
+_LEAST_DAMPING, _MOST_DAMPING = 1e-10, 1e4  # of a lane's own
 _LEAST = 1e-7  # of a pivot, beside the greatest number of its matrix
 
 
@@ -67,7 +67,7 @@ class NewtonConfig:
     tighten: float = 1e3
     step_cap: float = 3.0  # largest Euclidean length of a step
     tolerance: float = 1e-4  # decrease that is expected, relative to the cost, that counts as none
-    trusted: float = math.inf  # damping up to which the decrease that is expected counts
+    trusted: float = _MOST_DAMPING  # up to which the decrease that is expected counts
     patience: int = 3  # iterations that lead no nearer before a lane is stationary
     # Relative difference of two costs, in roundings of their type, that says nothing. Steps that
     # cost no more are made, and lead nearer where what is expected falls by half.
@@ -79,10 +79,8 @@ class NewtonConfig:
     def __post_init__(self) -> None:
         for name, least in (("max_steps", 0), ("subspace", 0), ("patience", 0)):
             require_size(name, getattr(self, name), least)
-        for name in ("damping", "ease", "tighten", "step_cap", "tolerance", "slack"):
+        for name in ("damping", "ease", "tighten", "step_cap", "tolerance", "trusted", "slack"):
             require_number(name, getattr(self, name), "finite and >= 0", lambda x: x >= 0.0)
-        if numeric(self.trusted) is None or not self.trusted >= 0.0:
-            raise ValueError(f"trusted must be a number >= 0, got {told(self.trusted)}")
         trials = self.trial_dampings
         if not isinstance(trials, tuple) or any(numeric(each) is None for each in trials):
             raise TypeError(f"trial_dampings must be a tuple of numbers, got {told(trials)}")
@@ -358,7 +356,7 @@ def _chosen(
     is_nearer = (there.cost < here.cost - slack) | (moved & (expected < 0.5 * numbers.expected))
     after = NewtonNumbers(
         best=jax.tree.map(lambda a, b: jnp.where(is_better, a, b), there, best),
-        damping=jnp.clip(damping, 1e-10, 1e4),
+        damping=jnp.clip(damping, _LEAST_DAMPING, _MOST_DAMPING),
         expected=expected,
         iteration=numbers.iteration + 1,
         stalled=jnp.where(is_nearer, 0, numbers.stalled + 1),
