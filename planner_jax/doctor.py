@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 
 from planner_jax.compile_cache import keep_compiled_programs
+from planner_jax.processors import usable_cores
 from planner_jax.registry import install_line
 from planner_jax.sweep.environment import environment, require_backend
 
@@ -35,7 +36,7 @@ def examine() -> Iterator[Finding]:
     found = environment()
     versions = {name: version or "not installed" for name, version in found["versions"].items()}
     yield Finding("versions", ", ".join(f"{name} {version}" for name, version in versions.items()))
-    system = f"{found['device']['system']} {found['device']['machine']}, {os.cpu_count()} cores"
+    system = f"{found['device']['system']} {found['device']['machine']}, {usable_cores()} cores"
     yield Finding("system", f"{system}, load average {os.getloadavg()[0]:.1f}")
     yield _devices()
     yield _kernels()

@@ -138,7 +138,8 @@ def quick():
 def ray(monkeypatch, request):
     """The stand-in; Ray itself in slow tests. No report."""
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
-    for name in ("NPROC", "RAY_USAGE_STATS_ENABLED", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"):
+    told = ("RAY_USAGE_STATS_ENABLED", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER")
+    for name in ("NPROC", "PJRT_NPROC", *told):
         monkeypatch.setenv(name, "1")  # to be put back
     monkeypatch.setattr(run, "write_report", lambda folder: None)
     cluster._maker_of.cache_clear()
@@ -282,7 +283,10 @@ def test_without_ray_the_extra_is_named_in_one_line(tmp_path, monkeypatch, capsy
         ("gpu", [{"CPU": 64.0}, {"CPU": 6.0, "GPU": 1.0}], (3, 1 / 3, 4)),
     ],
 )
-def test_workers_are_as_many_as_cores_or_up_to_eight_a_gpu(platform, machines, places):
+def test_workers_are_as_many_as_cores_or_up_to_eight_a_gpu(
+    platform, machines, places, monkeypatch
+):
+    monkeypatch.setattr(cluster, "threads_of_a_computation", lambda: 1)
     assert cluster._places(platform, machines) == cluster._Places(*places)
 
 
@@ -290,7 +294,14 @@ def test_workers_of_a_gpu_share_its_memory_and_the_cores_of_its_machine():
     told = cluster._places("gpu", [{"CPU": 32.0, "GPU": 2.0}]).environ()
     assert told["NPROC"] == "4" and told["XLA_PYTHON_CLIENT_PREALLOCATE"] == "false"
     assert 8 * float(told["XLA_CLIENT_MEM_FRACTION"]) == 0.6
-    assert cluster._places("cpu", [{"CPU": 32.0}]).environ() == {"NPROC": "1"}
+    assert told["PJRT_NPROC"] == "4"
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_workers_on_cores_compute_with_as_many_threads_as_the_run(monkeypatch, threads):
+    monkeypatch.setattr(cluster, "threads_of_a_computation", lambda: threads)
+    told = cluster._places("cpu", [{"CPU": 32.0}]).environ()
+    assert told == {"NPROC": str(threads), "PJRT_NPROC": str(threads)}
 
 
 @pytest.mark.parametrize(

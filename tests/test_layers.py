@@ -52,14 +52,17 @@ ALLOWED = {
     "space": set(),
     "cost": {"arithmetic", "checks", "lanes", "robot", "rules", "trajectory"},
     "optimise": {"checks", "lanes", "protocol"},
-    "planning": {"checks", "optimise", "protocol", "rules", "threads", "whole_files"},
+    "planning": {
+        *("checks", "optimise", "processors", "protocol", "rules", "threads", "whole_files"),
+    },
     "ending": {
         *("cost", "optimise", "planning", "protocol", "referee", "robot", "rules", "trajectory"),
     },
     "export": {
         *("ending", "plan_files", "protocol", "registry", "robot", "trajectory", "whole_files"),
     },
-    "referee": set(),
+    "referee": {"processors"},
+    "processors": set(),
     "task": {
         *("ball", "checks", "cost", "ending", "lanes", "optimise", "planning", "protocol"),
         *("referee", "registry"),
@@ -73,10 +76,12 @@ ALLOWED = {
     "sweep": {
         *("ball", "compile_cache", "digits", "ending", "lanes", "memory", "perception", "plane"),
         *("planning", "protocol", "referee", "registry", "robot", "rules", "stopping", "task"),
-        *("plain_files", "threads", "trajectory", "whole_files"),
+        *("plain_files", "processors", "threads", "trajectory", "whole_files"),
     },
     "compile_cache": set(),
-    "doctor": {"compile_cache", "lanes", "planning", "protocol", "registry", "sweep"},
+    "doctor": {
+        *("compile_cache", "lanes", "planning", "processors", "protocol", "registry", "sweep"),
+    },
     "cli": {
         *("compile_cache", "digits", "doctor", "ending", "export", "live", "plan_files"),
         "registry",

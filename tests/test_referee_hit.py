@@ -2,7 +2,6 @@
 
 import ast
 import math
-import os
 import sys
 from dataclasses import fields
 from pathlib import Path
@@ -15,6 +14,7 @@ from scipy.integrate import solve_ivp
 from verdicts import assert_same
 
 from planner_jax.ball.flight import BallState
+from planner_jax.processors import usable_cores
 from planner_jax.referee import hit, judging
 from planner_jax.referee.hit import LIMITS, HitVerdict, referee_hits
 from planner_jax.robot.quadrotor import QuadrotorLimits
@@ -622,9 +622,9 @@ def test_processes_judge_as_threads_do(monkeypatch):
 @pytest.mark.parametrize(("told", "num"), [("3", 3), ("0", 1), ("", None), ("many", None)])
 def test_the_referee_keeps_as_many_cores_busy_as_nproc_says(monkeypatch, told, num):
     monkeypatch.setenv("NPROC", told)
-    assert judging.cores() == (num or os.cpu_count())
+    assert judging.cores() == (num or usable_cores())
     monkeypatch.delenv("NPROC")
-    assert judging.cores() == os.cpu_count()
+    assert judging.cores() == usable_cores()
 
 
 def _halved(case):

@@ -7,7 +7,6 @@ in a loop of its own and waits for no other.
 
 import dataclasses
 import functools
-import os
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
@@ -20,6 +19,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec, Sharding, SingleDev
 
 from planner_jax.planning.one_by_one import OneByOne
 from planner_jax.planning.watch import Watch
+from planner_jax.processors import usable_cores
 from planner_jax.protocol import (
     Attempt,
     HostPlanner,
@@ -372,7 +372,7 @@ def _each_from_host(
 
     One thread more hands over the next call while the others compute.
     """
-    threads = min(len(calls), (os.cpu_count() or 1) + 1) if _is_one_cpu(mesh) else 1
+    threads = min(len(calls), usable_cores() + 1) if _is_one_cpu(mesh) else 1
     placed = _sharding(mesh)
 
     def solve(call: tuple[np.ndarray, int]) -> Any:

@@ -15,6 +15,8 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
+from planner_jax.processors import usable_cores
+
 _ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}  # a core is one worker's
 
 
@@ -57,9 +59,9 @@ class _Worker:
 
 
 def cores() -> int:
-    """How many cores the referee keeps busy: those of NPROC, which XLA minds too, or else all."""
+    """How many cores the referee keeps busy: as NPROC says, which XLA minds too, or all it may."""
     told = os.environ.get("NPROC", "")
-    return max(int(told), 1) if told.isdecimal() else os.cpu_count() or 1
+    return max(int(told), 1) if told.isdecimal() else usable_cores()
 
 
 class Workers:

@@ -30,6 +30,7 @@ import jax.numpy as jnp
 
 from planner_jax import stopping
 from planner_jax.compile_cache import keep_compiled_programs
+from planner_jax.processors import threads_of_a_computation
 from planner_jax.registry import MissingExtra, Task, install_line
 from planner_jax.sweep.chunks import Made, Maker, Making, SweepRun, Workers
 from planner_jax.sweep.environment import environment, require_backend
@@ -182,11 +183,11 @@ class _Places:
 
     num: int
     gpu: float  # the share of one that each holds; 0.0 in a run on CPUs
-    threads: int  # of the host, that each keeps busy now and then
+    threads: int  # of the host, that each may keep busy
 
     def environ(self) -> dict[str, str]:
         """What a worker is told, before its JAX begins."""
-        told = {"NPROC": str(self.threads)}
+        told = dict.fromkeys(("NPROC", "PJRT_NPROC"), str(self.threads))
         if self.gpu:
             told["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
             told["XLA_CLIENT_MEM_FRACTION"] = f"{_MEMORY * self.gpu:.4f}"
@@ -213,7 +214,8 @@ def _places(platform: str, machines: Iterable[Mapping[str, float]]) -> _Places:
         SettingError: the run is one on a GPU, and the cluster has none.
     """
     if platform != "gpu":
-        return _Places(max(sum(int(each.get("CPU", 0)) for each in machines), 1), 0.0, 1)
+        cores = sum(int(each.get("CPU", 0)) for each in machines)
+        return _Places(max(cores, 1), 0.0, threads_of_a_computation())  # as here: same digits
     with_gpus = [each for each in machines if _gpus([each])]
     rule = "of a cluster with GPUs where JAX has one, or asked for with JAX_PLATFORMS=cpu"
     require(bool(with_gpus), "workers", rule, "a cluster without")

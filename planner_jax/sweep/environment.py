@@ -9,6 +9,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from planner_jax.processors import processor, threads_of_a_computation, usable_cores
 from planner_jax.sweep.settings import SettingError
 
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -55,7 +56,9 @@ def environment() -> dict[str, Any]:
             "platform": device.platform,
             "kind": device.device_kind,
             "count": jax.device_count(),
-            "cpu_count": os.cpu_count(),
+            "cpu_count": usable_cores(),
+            "processor": processor(),
+            "threads": threads_of_a_computation() if device.platform == "cpu" else None,
             "machine": platform.machine(),
             "system": platform.system(),
         },

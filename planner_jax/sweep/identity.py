@@ -16,7 +16,13 @@ from planner_jax.sweep.source import Source
 IDENTITY = ("run", "version", "code", "settings")  # of a manifest, and of every part
 # What a row depends on besides the code: packages, and what is known of the devices.
 _PACKAGES = ("planner-jax", "jax", "jaxlib", "numpy", "scipy")
-_OF_DEVICES = ("platform", "kind", "count")
+_OF_DEVICES = {
+    "platform": "devices of platform",
+    "kind": "devices of kind",
+    "count": "devices of count",
+    "processor": "processor",
+    "threads": "threads of a computation (NPROC)",
+}
 
 
 def begun_now() -> dict[str, Any]:
@@ -75,7 +81,7 @@ def differences(
         found: likewise.
     """
     looks = [("versions", name, name) for name in _PACKAGES]
-    looks += [("device", name, f"devices of {name}") for name in _OF_DEVICES]
+    looks += [("device", name, what) for name, what in _OF_DEVICES.items()]
     for entry, name, what in looks:
         old, new = known[entry].get(name), found[entry][name]
         if old != new:

@@ -73,6 +73,8 @@ def test_a_run_is_not_gone_on_with_by_other_versions_code_or_devices(runs, tmp_p
     for entry, value, told in (
         ("versions", {**manifest["versions"], "jax": "0.0.1"}, "jax 0.0.1, as it began, got 0."),
         ("device", {**manifest["device"], "kind": "abacus"}, "devices of kind abacus, as it"),
+        ("device", {**manifest["device"], "processor": "Z80"}, "processor Z80, as it began, got "),
+        ("device", {**manifest["device"], "threads": 99}, r"\(NPROC\) 99, as it began, got "),
         ("code", "0" * 64, r"planner-jax of commit .* \(files 000000000000\), as it began, got"),
     ):
         rewritten(out, **{**manifest, entry: value})

@@ -1,0 +1,83 @@
+"""Cores, threads and the processor's kind, and that rows of a sweep do not depend on the first."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from planner_jax import __main__ as process
+from planner_jax import cli, processors, stopping
+
+
+def test_usable_cores_are_those_that_the_process_is_bound_to(monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda who: {3, 5, 6}, raising=False)
+    assert processors.usable_cores() == 3
+    monkeypatch.delattr(os, "sched_getaffinity")
+    monkeypatch.setattr(os, "cpu_count", lambda: None)
+    assert processors.usable_cores() == 1
+
+
+@pytest.mark.parametrize(
+    ("environment", "num"),
+    [({}, 4), ({"NPROC": "2"}, 2), ({"NPROC": "2", "PJRT_NPROC": "7"}, 7), ({"NPROC": "all"}, 4)],
+)
+def test_threads_of_a_computation_are_as_the_environment_says(monkeypatch, environment, num):
+    monkeypatch.setattr(processors, "usable_cores", lambda: 4)
+    for name in ("NPROC", "PJRT_NPROC"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    assert processors.threads_of_a_computation.__wrapped__() == num
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("model name : Quick 9\nflags : fma avx avx2\n\nmodel name : Slow 1\n", "Quick 9 (avx2)"),
+        ("Processor : a\nFeatures : fp asimd\n", "machine (asimd)"),
+        ("", "machine"),
+    ],
+)
+def test_the_processor_is_known_by_its_name_and_widest_vectors(monkeypatch, text, told):
+    monkeypatch.setattr(processors.Path, "read_text", lambda *_, **__: text)
+    monkeypatch.setattr(processors.platform, "processor", lambda: "")
+    monkeypatch.setattr(processors.platform, "machine", lambda: "machine")
+    assert processors.processor.__wrapped__() == told
+
+
+@pytest.mark.parametrize(
+    ("command", "before", "told"),
+    [("sweep", None, "1"), ("sweep", "3", "3"), ("fly", None, None)],
+)
+def test_only_the_command_sweep_computes_with_one_thread(monkeypatch, command, before, told):
+    for name in ("NPROC", "PJRT_NPROC"):
+        monkeypatch.setenv(name, "1")  # to be put back
+        monkeypatch.delenv(name)
+    if before:
+        monkeypatch.setenv("NPROC", before)
+    monkeypatch.setattr(stopping, "listen", lambda: None)
+    monkeypatch.setattr(sys, "argv", ["planner-jax", command])
+    monkeypatch.setattr(cli, "main", lambda: 0)
+    with pytest.raises(SystemExit):
+        process.run()
+    assert os.environ.get("PJRT_NPROC") == told
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(processors.usable_cores() < 2, reason="needs two cores")
+@pytest.mark.parametrize("task", ["hit", "catch"])
+def test_rows_do_not_depend_on_the_number_of_cores(tmp_path, task):
+    rows = []
+    for cores in (sorted(os.sched_getaffinity(0))[:1], os.sched_getaffinity(0)):
+        out = tmp_path / str(len(rows))
+        command = [sys.executable, "-m", "planner_jax", "sweep", task, "--num", "60"]
+        subprocess.run(
+            [*command, "--batch", "20", "--out", out],
+            check=True,
+            capture_output=True,
+            env={name: value for name, value in os.environ.items() if "NPROC" not in name},
+            preexec_fn=lambda cores=cores: os.sched_setaffinity(0, cores),
+        )
+        rows.append((out / "plans.parquet").read_bytes())
+    assert rows[0] == rows[1]
