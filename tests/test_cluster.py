@@ -283,9 +283,7 @@ def test_without_ray_the_extra_is_named_in_one_line(tmp_path, monkeypatch, capsy
         ("gpu", [{"CPU": 64.0}, {"CPU": 6.0, "GPU": 1.0}], (3, 1 / 3, 4)),
     ],
 )
-def test_workers_are_as_many_as_cores_or_up_to_eight_a_gpu(
-    platform, machines, places, monkeypatch
-):
+def test_workers_are_as_many_as_cores_or_up_to_eight_a_gpu(platform, machines, places, monkeypatch):
     monkeypatch.setattr(cluster, "threads_of_a_computation", lambda: 1)
     assert cluster._places(platform, machines) == cluster._Places(*places)
 
