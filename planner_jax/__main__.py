@@ -1,5 +1,6 @@
 """The process of the command `planner-jax`: hears signals before anything large is imported."""
 
+import importlib.util
 import os
 import sys
 
@@ -9,7 +10,7 @@ from planner_jax import stopping
 def run() -> None:
     """Carry out the command of the process's arguments, and end the process."""
     stopping.listen()
-    if sys.argv[1:2] == ["sweep"]:
+    if sys.argv[1:2] == ["sweep"] and _is_on_cpu():
         # Chunks keep the cores busy. Rows would depend on the number of cores, which is that of
         # the threads of each computation if nothing else is said.
         os.environ.setdefault("PJRT_NPROC", os.environ.get("NPROC", "1"))
@@ -24,6 +25,15 @@ def run() -> None:
     if stopping.is_told():
         stopping.leave()
     sys.exit(code)
+
+
+def _is_on_cpu() -> bool:
+    """Whether JAX will compute on a CPU; False where it depends on the machine's devices.
+
+    With one thread, programs of a GPU would be compiled one after another.
+    """
+    plugins = importlib.util.find_spec("jax_plugins")  # where JAX, too, looks for other devices
+    return plugins is None or os.environ.get("JAX_PLATFORMS") == "cpu"
 
 
 if __name__ == "__main__":

@@ -47,10 +47,19 @@ def test_the_processor_is_known_by_its_name_and_widest_vectors(monkeypatch, text
 
 
 @pytest.mark.parametrize(
-    ("command", "before", "told"),
-    [("sweep", None, "1"), ("sweep", "3", "3"), ("fly", None, None)],
+    ("command", "before", "plugins", "told"),
+    [
+        ("sweep", None, None, "1"),
+        ("sweep", "3", None, "3"),
+        ("sweep", None, "cuda", None),
+        ("fly", None, None, None),
+    ],
 )
-def test_only_the_command_sweep_computes_with_one_thread(monkeypatch, command, before, told):
+def test_the_command_sweep_computes_with_one_thread_on_a_cpu(
+    monkeypatch, command, before, plugins, told
+):
+    monkeypatch.delenv("JAX_PLATFORMS", raising=False)
+    monkeypatch.setattr(process.importlib.util, "find_spec", lambda name: plugins)
     for name in ("NPROC", "PJRT_NPROC"):
         monkeypatch.setenv(name, "1")  # to be put back
         monkeypatch.delenv(name)
