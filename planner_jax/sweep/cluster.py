@@ -187,7 +187,7 @@ class _Places:
 
     def environ(self) -> dict[str, str]:
         """What a worker is told, before its JAX begins."""
-        told = dict.fromkeys(("NPROC", "PJRT_NPROC"), str(self.threads))
+        told: dict[str, str] = dict.fromkeys(("NPROC", "PJRT_NPROC"), str(self.threads))
         if self.gpu:
             told["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
             told["XLA_CLIENT_MEM_FRACTION"] = f"{_MEMORY * self.gpu:.4f}"
