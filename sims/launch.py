@@ -40,7 +40,7 @@ def ready(loop: Loop, starts: Array, keys: Array) -> FlightState:
 
     def one(start: Array, key: Array) -> FlightState:
         zero, nothing = jnp.zeros(()), jnp.zeros(number, bool)
-        unknown = jnp.zeros((number, 3)), jnp.full(number, 0.1)
+        unknown = jnp.zeros((number, 3)), jnp.full(number, 0.1, zero.dtype)
         estimates = jax.vmap(sight.first_estimate)(*unknown)
         return FlightState(
             physics=at_rest(loop.world, start),

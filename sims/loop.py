@@ -1,4 +1,4 @@
-"""One flight in one compiled scan: observe, estimate, plan anew, track, meet.
+"""A batch of flights, period by period: observe, estimate, plan anew, track, meet.
 
 Three periods are nested. A physics step is a control step; every look at the balls ends a row
 of these; a plan is made at the start of a row of looks, for the moment at which that row ends
@@ -6,13 +6,15 @@ and from what was known at its start, and takes effect there. So a plan may take
 period to compute. The known latency is made up for by flying the estimate on.
 
 The robot (`sims.robot.Robot`, in the world) says how it is tracked and commanded, the task's
-pilot what is planned and what counts as meeting a ball. Written for one flight; `fly_leg` makes a
-batch of it. Times count from the first plan.
+pilot what is planned and what counts as meeting a ball. Both are written for one flight; `fly_leg`
+has them carried out for a batch. Plans and physics of a period do not wait for each other. Times
+count from the first plan.
 """
 
 import dataclasses
 import functools
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Protocol
 
 import jax
@@ -28,6 +30,9 @@ from planner_jax.sims.noise import Sensing, require_whole
 from planner_jax.sims.robot import Physics
 from planner_jax.sims.scoring import Contact, moment, nearest
 from planner_jax.sims.sensing import Estimate
+from planner_jax.threads import as_here
+
+_FEW = 1024  # flights at once, for which compilation takes longer than all else
 
 
 @struct.dataclass
@@ -45,8 +50,17 @@ class Outlook:
 class Pilot(Protocol):
     """A task's part of the loop: a frozen dataclass, static under jit."""
 
-    def plan_anew(self, case: Any, plan: Any, outlook: Outlook) -> tuple[Any, Array]:
-        """A plan from the one that is flown; and () bool, whether to fly it."""
+    def asked(self, case: Any, plan: Any, outlook: Outlook) -> Any:
+        """What is to be planned anew, while a plan is flown."""
+        ...
+
+    @property
+    def searches(self) -> tuple[Callable[[Any], Any], ...]:
+        """Each makes a plan of what is asked; none waits for another."""
+        ...
+
+    def chosen(self, asked: Any, outlook: Outlook, found: tuple[Any, ...]) -> tuple[Any, Array]:
+        """One of the plans that the searches found; and () bool, whether to fly it."""
         ...
 
     def times(self, plan: Any) -> Array:
@@ -209,44 +223,72 @@ def expected(loop: Loop, estimates: Estimate, ahead: Any) -> BallState:
     return jax.vmap(lambda estimate: sight.predicted(estimate, span, gravity))(estimates)
 
 
-def _planned_anew(loop: Loop, pilot: Pilot, flight: FlightState, case: Any) -> tuple[Any, Array]:
-    """The plan for the end of this period, and whether to fly it."""
-    when = flight.time + loop.period
-    elapsed = when - flight.began
-    outlook = Outlook(
-        time=when,
-        elapsed=elapsed,
-        balls=expected(loop, flight.estimates, loop.period),
-        drag=flight.estimates.drag,
-        present=flight.present & (pilot.times(flight.plan) > elapsed),
-        head_state=loop.world.carrier.head_state(flight.plan, elapsed),
-    )
-    return pilot.plan_anew(case, flight.plan, outlook)
+@functools.partial(jax.jit, static_argnames=("loop", "pilot"))
+def _asked(loop: Loop, pilot: Pilot, flights: FlightState, cases: Any) -> tuple[Outlook, Any]:
+    """What is to be planned for the end of this period (B, ...), and what is then expected."""
 
-
-def _fly_period(
-    loop: Loop, pilot: Pilot, case: Any, drag: Array, flight: FlightState
-) -> tuple[FlightState, Record | None]:
-    """One period: a plan for its end, and the looks until then."""
-
-    def next_look(flight: FlightState, _: None) -> tuple[FlightState, Record | None]:
-        flight = _fly_look(loop, pilot, flight, drag)
-        return flight, _recorded(loop, pilot, flight, drag) if loop.record else None
-
-    began, plan = flight.began, flight.plan
-    good = None
-    if loop.replan > 0.0:
-        found, good = _planned_anew(loop, pilot, flight, case)
-    flight = dataclasses.replace(flight, earlier=flight.estimates)
-    flight, record = lax.scan(next_look, flight, None, length=loop.looks_per_plan)
-    gone = pilot.times(plan) <= flight.time - began
-    flight = dataclasses.replace(flight, present=flight.present & ~gone)
-    if good is not None:
-        pick = lambda new, old: jnp.where(good, new, old)  # noqa: E731
-        flight = dataclasses.replace(
-            flight, plan=jax.tree.map(pick, found, plan), began=pick(flight.time, began)
+    def one(flight: FlightState, case: Any) -> tuple[Outlook, Any]:
+        when = flight.time + loop.period
+        elapsed = when - flight.began
+        outlook = Outlook(
+            time=when,
+            elapsed=elapsed,
+            balls=expected(loop, flight.estimates, loop.period),
+            drag=flight.estimates.drag,
+            present=flight.present & (pilot.times(flight.plan) > elapsed),
+            head_state=loop.world.carrier.head_state(flight.plan, elapsed),
         )
-    return flight, record
+        return outlook, pilot.asked(case, flight.plan, outlook)
+
+    return jax.vmap(one)(flights, cases)
+
+
+@functools.partial(jax.jit, static_argnames=("pilot", "number"))
+def _found(pilot: Pilot, number: int, asked: Any) -> Any:
+    """The plans (B, ...) of one of the pilot's searches."""
+    return jax.vmap(pilot.searches[number])(asked)
+
+
+@functools.partial(jax.jit, static_argnames=("loop", "pilot", "num_periods"))
+def _fly(
+    loop: Loop, pilot: Pilot, flights: FlightState, drag: Array, num_periods: int
+) -> tuple[FlightState, Record | None]:
+    """Flights (B, ...) some periods on, by the plans that they have; records (B, K, ...)."""
+
+    def one(flight: FlightState, drag: Array) -> tuple[FlightState, Record | None]:
+        def next_look(flight: FlightState, _: None) -> tuple[FlightState, Record | None]:
+            flight = _fly_look(loop, pilot, flight, drag)
+            return flight, _recorded(loop, pilot, flight, drag) if loop.record else None
+
+        def next_period(flight: FlightState, _: None) -> tuple[FlightState, Record | None]:
+            flight = dataclasses.replace(flight, earlier=flight.estimates)
+            flight, record = lax.scan(next_look, flight, None, length=loop.looks_per_plan)
+            gone = pilot.times(flight.plan) <= flight.time - flight.began
+            return dataclasses.replace(flight, present=flight.present & ~gone), record
+
+        flight, record = lax.scan(next_period, flight, None, length=num_periods)
+        flat = lambda leaf: leaf.reshape(-1, *leaf.shape[2:])  # noqa: E731
+        return flight, jax.tree.map(flat, record)
+
+    return jax.vmap(one)(flights, drag)
+
+
+@functools.partial(jax.jit, static_argnames="pilot")
+def _with_plans(
+    pilot: Pilot, flights: FlightState, outlook: Outlook, asked: Any, found: tuple[Any, ...]
+) -> FlightState:
+    """Flights (B, ...) at the end of a period, with what was found for it where that is good."""
+
+    def one(flight: FlightState, outlook: Outlook, asked: Any, found: tuple) -> FlightState:
+        plan, good = pilot.chosen(asked, outlook, found)
+        pick = lambda new, old: jnp.where(good, new, old)  # noqa: E731
+        return dataclasses.replace(
+            flight,
+            plan=jax.tree.map(pick, plan, flight.plan),
+            began=pick(flight.time, flight.began),
+        )
+
+    return jax.vmap(one)(flights, outlook, asked, found)
 
 
 def _recorded(loop: Loop, pilot: Pilot, flight: FlightState, drag: Array) -> Record:
@@ -272,32 +314,80 @@ def _recorded(loop: Loop, pilot: Pilot, flight: FlightState, drag: Array) -> Rec
     )
 
 
-@functools.partial(jax.jit, static_argnames=("loop", "pilot", "num_periods"))
-def fly_leg(
-    loop: Loop, pilot: Pilot, flight: FlightState, cases: Any, drag: Array, *, num_periods: int
-) -> tuple[FlightState, Record | None]:
-    """A batch of flights for some periods.
+def _in_parts(flights: FlightState) -> bool:
+    """Whether each part of a period is a program of its own."""
+    (device,) = flights.time.devices()
+    return device.platform != "cpu" and len(flights.time) <= _FEW
+
+
+def _next_period(
+    loop: Loop, pilot: Pilot, flights: FlightState, cases: Any, drag: Array, begin: Callable
+) -> tuple[FlightState, Any]:
+    """Flights (B, ...) one period on, with plans that were made meanwhile, and their records.
 
     Args:
-        loop: what shapes the program.
+        loop: of the flights.
         pilot: of the task.
-        flight: at the start of the leg, leaves (B, ...).
-        cases: of the task, leaves (B, ...); their times count like the flight's.
+        flights: at the start of the period.
+        cases: of the task, leaves (B, ...).
+        drag: (B, N) K_D [1/m].
+        begin: begins a part of the period with what it is given, and returns what waits for it.
+    """
+    flown_on = begin(_fly, loop, pilot, flights, drag, 1)
+    outlook, asked = _asked(loop, pilot, flights, cases)
+    found = [begin(_found, pilot, number, asked) for number in range(len(pilot.searches))]
+    flights, record = flown_on()
+    return _with_plans(pilot, flights, outlook, asked, tuple(each() for each in found)), record
+
+
+@functools.partial(jax.jit, static_argnames=("loop", "pilot", "num_periods"))
+def _fly_and_plan(
+    loop: Loop, pilot: Pilot, flights: FlightState, cases: Any, drag: Array, num_periods: int
+) -> tuple[FlightState, Record | None]:
+    """As `_fly`, with plans made anew, in one program."""
+    begin = lambda part, *given: lambda: part(*given)  # noqa: E731
+
+    def next_period(flights: FlightState, _: None) -> tuple[FlightState, Record | None]:
+        return _next_period(loop, pilot, flights, cases, drag, begin)
+
+    flights, record = lax.scan(next_period, flights, None, length=num_periods)
+    flat = lambda leaf: jnp.moveaxis(leaf, 0, 1).reshape(len(drag), -1, *leaf.shape[3:])  # noqa: E731
+    return flights, jax.tree.map(flat, record)
+
+
+def fly_leg(
+    loop: Loop, pilot: Pilot, flights: FlightState, cases: Any, drag: Array, *, num_periods: int
+) -> tuple[FlightState, list[Record]]:
+    """A batch of flights for some periods.
+
+    Many are flown in one program. Of few on a GPU each part of a period is a program of its own,
+    since these take half as long to compile, if at the same time, and a third longer to carry out.
+
+    Args:
+        loop: what shapes the programs.
+        pilot: of the task.
+        flights: at the start of the leg, leaves (B, ...).
+        cases: of the task, leaves (B, ...); their times count like the flights'.
         drag: (B, N) K_D [1/m], the true one.
-        num_periods: how many (static).
+        num_periods: how many.
 
     Returns:
-        The flights at the end, and with `loop.record` a `Record` of every look, leaves
-        (B, K, ...).
+        The flights at the end, and with `loop.record` the looks, leaves (B, K, ...), one behind
+        another.
     """
-
-    def one(flight: FlightState, case: Any, drag: Array) -> tuple[FlightState, Record | None]:
-        period = functools.partial(_fly_period, loop, pilot, case, drag)
-        flight, record = lax.scan(lambda state, _: period(state), flight, None, length=num_periods)
-        flat = lambda leaf: leaf.reshape(-1, *leaf.shape[2:])  # noqa: E731
-        return flight, jax.tree.map(flat, record)
-
-    return jax.vmap(one)(flight, cases, drag)
+    if loop.replan == 0.0:
+        flights, record = _fly(loop, pilot, flights, drag, num_periods)
+    elif not _in_parts(flights):
+        flights, record = _fly_and_plan(loop, pilot, flights, cases, drag, num_periods)
+    else:
+        with ThreadPoolExecutor() as pool:
+            begin = lambda part, *given: pool.submit(as_here(part), *given).result  # noqa: E731
+            records = []
+            for _ in range(num_periods):
+                flights, record = _next_period(loop, pilot, flights, cases, drag, begin)
+                records.append(record)
+        return flights, records if loop.record else []
+    return flights, [record] if loop.record else []
 
 
 @dataclasses.dataclass(frozen=True)
@@ -311,14 +401,15 @@ class Flown:
     record: Record | None  # leaves (B, K, ...)
 
 
-def flown(flight: FlightState, records: list[Record | None]) -> Flown:
-    """Of flights (B, ...) at their end, and the records of their legs."""
-    there, records = jax.device_get((dataclasses.replace(flight, key=None), records))
+def flown(flights: FlightState, records: list[Record]) -> Flown:
+    """Of flights (B, ...) at their end, and what was recorded of them, in order."""
+    there, records = jax.device_get((dataclasses.replace(flights, key=None), records))
+    joined = functools.partial(jax.tree.map, lambda *leaves: np.concatenate(leaves, axis=1))
     mean = np.sqrt(there.squared_tracking / np.maximum(there.tracked, 1e-6))
     return Flown(
         contact=there.contact,
         plan=there.plan,
         began=there.began,
         tracking=np.stack([mean, there.worst_tracking], axis=1),
-        record=jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *records),
+        record=joined(*records) if records else None,
     )

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ import planner_jax as pj
 from planner_jax.ball.flight import BallState
 from planner_jax.cli import main
 from planner_jax.registry import Task, all_tasks
+from planner_jax.sims import loop as sims_loop
 from planner_jax.sims.film import FilmError, draw_flight, film_flights, require_film
 from planner_jax.sims.launch import flight_keys, launched, ready
 from planner_jax.sims.loop import flown, fly_leg
@@ -197,6 +199,23 @@ class DropPilot:
         return jnp.full(1, 0.45)
 
 
+@dataclasses.dataclass(frozen=True)
+class RisingPilot(DropPilot):
+    """Has two plans made anew: the last one, and one that is a millimetre higher."""
+
+    def asked(self, case, plan, outlook):
+        return plan
+
+    @property
+    def searches(self):
+        higher = lambda path: path.at[0, 0, 2].add(1e-3)  # noqa: E731
+        raised = lambda plan: jax.tree.map(lambda x: higher(x) if x.ndim == 3 else x, plan)  # noqa: E731
+        return (lambda plan: plan, raised)
+
+    def chosen(self, asked, outlook, found):
+        return found[1], outlook.time < 0.09
+
+
 class DropFlights(Flights):
     @property
     def success(self):
@@ -214,7 +233,11 @@ class DropFlight(BallFlightTask):
         return FlightCases(np.arange(self.settings.num))
 
     def fly(self, cases, record):
-        loop, num = self.loop(record), len(cases)
+        state, looks, plan = self.leg(self.loop(record), cases, DropPilot(), 60)
+        return DropFlights(plan, flown(state, looks), 0.0)
+
+    def leg(self, loop, cases, pilot, periods):
+        num = len(cases)
         place, drag = jnp.tile(jnp.array([0.0, 0.0, 1.0]), (num, 1)), jnp.full((num, 1), 0.06)
         path = jnp.zeros((num, 1, 8, 3)).at[:, 0, 0].set(place)
         codes = np.zeros(num, int)
@@ -223,8 +246,7 @@ class DropFlight(BallFlightTask):
         balls = self.launches(cases, None).balls
         state = launched(loop, state, balls, drag, drag, ball=0, seen=0.1)
         state = state.replace(plan=plan, began=state.time, present=state.launched)
-        state, looks = fly_leg(loop, DropPilot(), state, None, drag, num_periods=60)
-        return DropFlights(plan, flown(state, [looks]), 0.0)
+        return *fly_leg(loop, pilot, state, None, drag, num_periods=periods), plan
 
     def launches(self, cases, flown):
         at = np.tile(np.float32([0.0, 0.0, 2.2]), (len(cases), 1, 1))
@@ -237,6 +259,21 @@ def test_a_task_without_flights_is_refused_in_one_line(monkeypatch):
         fly_settings("drop")
     rule = "task must be one that can be flown (hit, catch, intercept, block)"
     assert str(error.value) == f"{rule}, got 'drop'"
+
+
+@pytest.mark.slow
+def test_the_parts_of_a_period_fly_as_one_program_does(monkeypatch):
+    flight = DropFly(num=2, noise="none").flight()
+    loop = dataclasses.replace(flight.loop(True), replan=50.0)
+    flights = []
+    for in_parts in (False, True):
+        monkeypatch.setattr(sims_loop, "_in_parts", lambda _, parts=in_parts: parts)
+        state, looks, _ = flight.leg(loop, flight.cases(), RisingPilot(), 8)
+        flights.append(dataclasses.asdict(flown(state, looks)))
+    whole, parts = flights
+    assert whole["plan"]["trajectory"]["coeffs"][0, 0, 0, 2] == pytest.approx(1.004, abs=1e-6)
+    assert whole["record"]["time"].shape == (2, 8 * loop.looks_per_plan)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=2e-5), whole, parts)
 
 
 @pytest.mark.slow

@@ -37,6 +37,7 @@ from planner_jax.threads import as_here
 BUCKETS = (16, 128, 1024, 8192, 65536)
 _CPU_CHUNK, _GPU_CHUNK = 256, 65536  # what fits the cache of a core, and what fills a GPU
 _GPU_BUSY = 8192  # starts in one call that keep a GPU busy
+_GPU_LEAST = 128  # lanes of a call: fewer take it as long, and another program to compile
 _MORE = 8  # a program more is worth its compilation if it spares one lane for so many
 _LANES = PartitionSpec("lanes")
 # XLA tries its own kernels for every product of matrices, a third of the time that a GPU's program
@@ -52,6 +53,7 @@ class _Sizes:
 
     most: int
     busy: int  # that keep a GPU busy
+    least: int = BUCKETS[0]
 
     def next(self, num: int) -> int:
         """Of the call that takes the next of `num` lanes.
@@ -59,7 +61,8 @@ class _Sizes:
         Where they would fill less than half of it, calls of the next smaller size take them if
         these still keep a GPU busy.
         """
-        fits = next((bucket for bucket in BUCKETS if num <= bucket <= self.most), self.most)
+        wanted = max(num, self.least)
+        fits = next((bucket for bucket in BUCKETS if wanted <= bucket <= self.most), self.most)
         smaller = max((bucket for bucket in BUCKETS if bucket < fits), default=0)
         return smaller if smaller >= self.busy and 2 * num <= fits else fits
 
@@ -272,7 +275,7 @@ def _sizes(planner: Any, attempt: Attempt, chunk: int | None, mesh: Mesh) -> _Si
     if chunk is not None:
         return _Sizes(chunk, busy)
     if mesh.devices[0].platform != "cpu":
-        return _Sizes(max(128, _GPU_CHUNK // attempt.starts), busy)
+        return _Sizes(max(_GPU_LEAST, _GPU_CHUNK // attempt.starts), busy, _GPU_LEAST)
     # One after another, few are as quick as many, and no core waits long for the others' last.
     if isinstance(planner, OneByOne):
         return _Sizes(BUCKETS[0], busy)

@@ -9,7 +9,7 @@ leaves the least time, and is planned anew once it is seen.
 import dataclasses
 import functools
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -109,15 +109,10 @@ class CatchPilot:
         """When each ball is to be caught (N,) [s], in the balls' order."""
         return jnp.zeros_like(plan.times).at[plan.order].set(plan.times)
 
-    def plan_anew(
+    def asked(
         self, case: CatchCase, plan: CatchPlan, outlook: Outlook
-    ) -> tuple[CatchPlan, Array]:
-        """The better of two plans, and whether it is good enough.
-
-        One comes from the plan that is flown by a short round of the re-planner. The other one is
-        planned from scratch, at the order and times that are decided for this moment; it is taken
-        where it breaks the limits less, or keeps them at a cost that is clearly lower.
-        """
+    ) -> Replanning[CatchCase, CatchPlan]:
+        """What is still to be caught, while a plan is flown."""
         made = plan.times <= outlook.elapsed
         first = jnp.argsort(made, stable=True)  # what is still to be caught
         order, times = plan.order[first], plan.times[first] - outlook.elapsed
@@ -131,20 +126,42 @@ class CatchPilot:
             times=jnp.maximum(times, 0.01),
             head_state=outlook.head_state,
         )
-        task = Replanning(case=left, previous=plan, elapsed=outlook.elapsed)
-        found = self.planner.solve(task, self.planner.rounds[0])
+        return Replanning(case=left, previous=plan, elapsed=outlook.elapsed)
+
+    @property
+    def searches(self) -> tuple[Callable[[Replanning[CatchCase, CatchPlan]], CatchPlan], ...]:
+        """From the plan that is flown, and from scratch as is decided for this moment.
+
+        The first is a short round of the re-planner.
+        """
+        from_last = lambda task: self.planner.solve(task, self.planner.rounds[0])  # noqa: E731
+        return (from_last, self._decided_anew) if self.redecide > 0.0 else (from_last,)
+
+    def chosen(
+        self,
+        asked: Replanning[CatchCase, CatchPlan],
+        outlook: Outlook,
+        found: tuple[CatchPlan, ...],
+    ) -> tuple[CatchPlan, Array]:
+        """The better of the plans, and whether it is good enough.
+
+        One from scratch is taken where it breaks the limits less, or keeps them at a cost that is
+        clearly lower.
+        """
+        plan, left = found[0], asked.case
         if self.redecide > 0.0:
-            fresh = self._decided_anew(left)
+            fresh = found[1]
             since = jnp.mod(outlook.time + _INSTANT, 1.0 / self.redecide)  # the last time was due
             take = (since < 2.0 * _INSTANT) & (fresh.times[0] >= self.planner.shortest)
-            take &= is_better(fresh, found)
-            found = jax.tree.map(lambda new, old: jnp.where(take, new, old), fresh, found)
-        good = outlook.present[order[0]] & (times[0] >= self.planner.shortest)
-        excess = jnp.where(jnp.sum(outlook.present) > 1, self.excess[1], self.excess[0])
-        return found, good & (found.violation <= jnp.maximum(excess, plan.violation))
+            take &= is_better(fresh, plan)
+            plan = jax.tree.map(lambda new, old: jnp.where(take, new, old), fresh, plan)
+        good = left.present[left.order[0]] & (left.times[0] >= self.planner.shortest)
+        excess = jnp.where(jnp.sum(left.present) > 1, self.excess[1], self.excess[0])
+        return plan, good & (plan.violation <= jnp.maximum(excess, asked.previous.violation))
 
-    def _decided_anew(self, left: CatchCase) -> CatchPlan:
+    def _decided_anew(self, asked: Replanning[CatchCase, CatchPlan]) -> CatchPlan:
         """A plan from scratch of what is left, with the decision's first choice."""
+        left = asked.case
         choices = named_decision(DECISIONS, self.decide, TRAINED).propose(left)
         choice = jax.tree.map(lambda leaf: leaf[0], choices)
         return self.planner.planner.solve(left.decided(choice), self.search)
@@ -405,7 +422,7 @@ def fly_catches(
         first = found if first is None else first
         begun = jax.tree.map(jnp.asarray, found)
         flight = with_catch(flight, begun, jnp.asarray(known.present))
-        flight, record = fly_leg(
+        flight, looks = fly_leg(
             loop,
             pilot,
             flight,
@@ -413,7 +430,7 @@ def fly_catches(
             drag,
             num_periods=loop.num_periods(float(cases.horizon.max()) + _AFTER if last else INTERVAL),
         )
-        records.append(record)
+        records += looks
     return CatchFlights(first, flown(flight, records), planning)
 
 

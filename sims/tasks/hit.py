@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -108,16 +108,27 @@ class HitPilot:
         """When the ball is to be hit (1,) [s]."""
         return plan.stroke.time[None]
 
-    def plan_anew(self, case: HitCase, plan: HitPlan, outlook: Outlook) -> tuple[HitPlan, Array]:
-        """One short round of the re-planner, and whether its plan is good enough."""
-        task = Replanning(
+    def asked(self, case: HitCase, plan: HitPlan, outlook: Outlook) -> Replanning[HitCase, HitPlan]:
+        """What is to be planned anew, while a plan is flown."""
+        return Replanning(
             case=believed(case, outlook.balls, outlook.drag, outlook.head_state),
             previous=plan,
             elapsed=outlook.elapsed,
         )
-        found = self.planner.solve(task, self.planner.rounds[0])
-        good = outlook.present[0] & (plan.stroke.time - outlook.elapsed >= self.shortest)
-        return found, good & (found.violation <= self.excess)
+
+    @property
+    def searches(self) -> tuple[Callable[[Replanning[HitCase, HitPlan]], HitPlan], ...]:
+        """One short round of the re-planner."""
+        return (lambda task: self.planner.solve(task, self.planner.rounds[0]),)
+
+    def chosen(
+        self, asked: Replanning[HitCase, HitPlan], outlook: Outlook, found: tuple[HitPlan, ...]
+    ) -> tuple[HitPlan, Array]:
+        """The plan that was found, and whether it is good enough."""
+        (plan,) = found
+        left = asked.previous.stroke.time - outlook.elapsed
+        good = outlook.present[0] & (left >= self.shortest)
+        return plan, good & (plan.violation <= self.excess)
 
 
 def believed(case: HitCase, balls: BallState, drag: Array, head: Array) -> HitCase:
@@ -236,14 +247,16 @@ def fly_hits(
     first = jax.block_until_ready(plan_all(planner, known)) if plan is None else plan
     planning = time.perf_counter() - clock
     require_plan(first, HitPlan, known.head_state)
-    begun = jax.tree.map(jnp.asarray, first)
+    # By way of the host: bound to a device, what the first period gets would be of another kind
+    # than what the others get, and its programs would be compiled twice.
+    begun = jax.tree.map(jnp.asarray, jax.device_get(first))
     flight = dataclasses.replace(flight, plan=begun, began=flight.time, present=flight.launched)
     periods = loop.num_periods(_LONGEST - SEEN + _AFTER)
-    flight, record = fly_leg(loop, pilot, flight, known, drag, num_periods=periods)
+    flight, records = fly_leg(loop, pilot, flight, known, drag, num_periods=periods)
     back, truth = _returned(flight.contact, truth), cases.cases
     point = landing(back.pos, back.vel, truth.drag, truth.gravity)[1]
     miss = np.nan_to_num(np.linalg.norm(point - truth.target, axis=1), nan=np.inf)
-    return HitFlights(first, flown(flight, [record]), planning, point, miss)
+    return HitFlights(first, flown(flight, records), planning, point, miss)
 
 
 class HitFlight(BallFlightTask):
