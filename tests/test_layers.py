@@ -61,7 +61,7 @@ ALLOWED = {
     "export": {
         *("ending", "plan_files", "protocol", "registry", "robot", "trajectory", "whole_files"),
     },
-    "referee": {"processors"},
+    "referee": set(),
     "processors": set(),
     "task": {
         *("ball", "checks", "cost", "ending", "lanes", "optimise", "planning", "protocol"),

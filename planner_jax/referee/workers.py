@@ -15,8 +15,6 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from planner_jax.processors import usable_cores
-
 _ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}  # a core is one worker's
 
 
@@ -61,7 +59,12 @@ class _Worker:
 def cores() -> int:
     """How many cores the referee keeps busy: as NPROC says, which XLA minds too, or all it may."""
     told = os.environ.get("NPROC", "")
-    return max(int(told), 1) if told.isdecimal() else usable_cores()
+    if told.isdecimal():
+        return max(int(told), 1)
+    # As `processors.usable_cores`, of which the referee, like of all that it judges, knows nothing.
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 class Workers:
