@@ -8,13 +8,18 @@
 // zero. The cost is the integral of |snap|^2, 1000 T, and penalties of speed, body rate, thrust
 // and height at 16 intervals a piece, of the net's distance from the ball and of its angle.
 //
+// With relative=1 the variables are others, and the optima the same: whitened offsets of the
+// waypoints from the smoothest way to the tail, and the net's position relative to the ball.
+// With memory=0 the search is that of BFGS with a dense matrix, for which 19 variables are few.
+//
 // The program plans all cases of the file, one after another, some times over, and prints the
 // processor time of the quickest round (without reading and printing), then a line for each case.
 //
 // How it is made quick: in time over the duration h of a piece the spline is a constant linear map
-// of six rows, (p, v h, a h^2) at T and the waypoints, all from the head, because what is at rest
-// there adds nothing. Samples lie side by side in vectors; where no limit of a vector's samples
-// is exceeded, its gradient is not computed. Nothing is allocated while planning.
+// of six rows, the waypoints and (p, v h, a h^2) at T, all from the head, because what is at rest
+// there adds nothing. Samples lie side by side in vectors; bounds that take neither root nor
+// division tell most vectors without a limit exceeded, and these have no gradient. Nothing is
+// allocated while planning.
 
 #include <algorithm>
 #include <array>
@@ -44,11 +49,11 @@ constexpr int kNodes = 16;                      // penalty intervals a piece
 constexpr int kDegree = 7;                      // of minimum snap
 constexpr int kSamples = kPieces * kNodes;      // without the head, where nothing moves
 constexpr int kBlocks = kSamples / kWidth;
-constexpr int kColumns = 6;                     // p, v, a at the tail, three waypoints
+constexpr int kInner = kPieces - 1;             // waypoints
+constexpr int kColumns = kInner + 3;            // waypoints, then p, v, a at the tail
 constexpr int kVariables = 19;
 constexpr int kRegisters = (kVariables + kWidth - 1) / kWidth;
 constexpr int kPadded = kRegisters * kWidth;
-constexpr int kEnergyBlocks = (kColumns + kWidth - 1) / kWidth;
 constexpr int kMostMemory = 64;
 constexpr int kMostPast = 64;
 
@@ -64,6 +69,8 @@ constexpr double kMostSpeed = 5.0;
 constexpr double kMostRate = 5.0;
 constexpr double kMiddleThrust = 1.4 * kGravity;
 constexpr double kHalfThrust = 1.1 * kGravity;
+constexpr double kLeastThrust = kMiddleThrust - kHalfThrust;
+constexpr double kMostThrust = kMiddleThrust + kHalfThrust;
 constexpr double kLeastHeight = 0.25;
 constexpr double kNetHeight = 0.2;
 constexpr double kNetRadius = 0.125;
@@ -123,13 +130,17 @@ double falling(int k, int order) {
 
 // Constant matrices of the spline, in time over the duration of a piece.
 struct Spline {
+    const bool relative;  // whether the first columns are offsets, not waypoints
     double coefficients[kPieces][kDegree + 1][kColumns];
     alignas(64) Vec samples[kBlocks][4][kColumns];  // by order of the derivative
-    alignas(64) Vec energy[kEnergyBlocks][kColumns];  // the energy is |energy . columns|^2
+    double energy[kColumns][kColumns];  // triangular: the energy is |energy . columns|^2
+    double offsets[kInner][kColumns];   // of waypoints and tail; their energy is their square
     Vec weights[kBlocks];  // of the trapezoid rule, of a piece's duration
 
-    Spline() {
+    explicit Spline(bool relative) : relative(relative) {
         solve();
+        factorise();
+        if (relative) change_columns();
         for (int k = 0; k < kSamples; ++k) {
             const double time = double(k + 1) / kNodes;
             for (int order = 0; order < 4; ++order) {
@@ -139,7 +150,6 @@ struct Spline {
             }
             weights[k / kWidth][k % kWidth] = (k + 1 == kSamples ? 0.5 : 1.0) / kNodes;
         }
-        factorise();
     }
 
     // A derivative at a time from 0 to 4, as a linear form of the columns.
@@ -172,12 +182,12 @@ struct Spline {
             put(blank(), 0, 0.0, order, 1.0);
             auto& last = blank();
             put(last, kPieces - 1, 1.0, order, 1.0);
-            if (order < 3) last[size + order] = 1.0;
+            if (order < 3) last[size + kInner + order] = 1.0;
         }
         for (int joint = 1; joint < kPieces; ++joint) {
             auto& through = blank();
             put(through, joint, 0.0, 0, 1.0);
-            through[size + 2 + joint] = 1.0;
+            through[size + joint - 1] = 1.0;
             for (int order = 0; order < kDegree; ++order) {
                 auto& smooth = blank();
                 put(smooth, joint - 1, 1.0, order, 1.0);
@@ -212,20 +222,43 @@ struct Spline {
                 snap.push_back(row(piece + inside, 4));
                 for (double& each : snap.back()) each *= std::sqrt(0.5 * shares[i / 2]);
             }
-        for (int block = 0; block < kEnergyBlocks; ++block)
-            for (int c = 0; c < kColumns; ++c) energy[block][c] = Vec{};
         for (int i = 0; i < kColumns; ++i) {
             double size = 0.0;
             for (const auto& each : snap) size += each[i] * each[i];
             size = std::sqrt(size);
-            energy[i / kWidth][i][i % kWidth] = size;
+            energy[i][i] = size;
+            for (int j = 0; j < i; ++j) energy[i][j] = 0.0;
             for (int j = i + 1; j < kColumns; ++j) {
                 double along = 0.0;
                 for (const auto& each : snap) along += each[i] * each[j] / size;
-                energy[i / kWidth][j][i % kWidth] = along;
+                energy[i][j] = along;
                 for (auto& each : snap) each[j] -= along * each[i] / size;
             }
         }
+        for (int i = 0; i < kInner; ++i)
+            std::copy_n(energy[i], kColumns, offsets[i]);
+    }
+
+    // Offsets in the place of waypoints: what the first rows of the energy's root make of them.
+    void change_columns() {
+        double waypoints[kInner][kColumns];
+        for (int c = 0; c < kColumns; ++c)
+            for (int i = kInner - 1; i >= 0; --i) {
+                double rest = c < kInner ? double(c == i) : -offsets[i][c];
+                for (int k = i + 1; k < kInner; ++k) rest -= offsets[i][k] * waypoints[k][c];
+                waypoints[i][c] = rest / offsets[i][i];
+            }
+        for (auto& piece : coefficients)
+            for (auto& form : piece) {
+                double changed[kColumns] = {};
+                for (int c = 0; c < kColumns; ++c) {
+                    if (c >= kInner) changed[c] = form[c];
+                    for (int i = 0; i < kInner; ++i) changed[c] += form[i] * waypoints[i][c];
+                }
+                std::copy_n(changed, kColumns, form);
+            }
+        for (int i = 0; i < kInner; ++i)
+            for (int c = 0; c < kColumns; ++c) energy[i][c] = double(c == i);
     }
 };
 
@@ -248,11 +281,6 @@ inline void fly(const Ball& ball, double time, double pos[3], double vel[3], dou
         acc[i] = kDrag * (end - vel[i]);
     }
 }
-
-// How stiff the hinges are; the problem's own numbers by default.
-struct Hinges {
-    double limit = kLimitWeight, ground = kGroundWeight, width = kWidthOfHinge;
-};
 
 struct Hinge {
     Vec value, slope;
@@ -280,18 +308,49 @@ inline double steep(double x, double width, double& slope) {
     return width * width * width + beyond * beyond * x * unit;
 }
 
+// What happens at the end of a plan.
+struct Catch {
+    double ball_pos[3], ball_vel[3], ball_acc[3];
+    double axis[3], inverse_thrust;  // of the quadrotor
+    double miss[3];                  // from the ball to the net
+    double tail[3];                  // where the quadrotor is, from the head
+};
+
+inline Catch catch_at(const Spline& spline, const Case& task, const Point& x, double duration) {
+    Catch found;
+    fly(task.ball, duration, found.ball_pos, found.ball_vel, found.ball_acc);
+    const double* acc = &x.at[kAcceleration];
+    const double tau[3] = {acc[0], acc[1], acc[2] + kGravity};
+    const double thrust2 = tau[0] * tau[0] + tau[1] * tau[1] + tau[2] * tau[2];
+    found.inverse_thrust = 1.0 / std::sqrt(std::max(thrust2, 1e-12));
+    for (int i = 0; i < 3; ++i) {
+        found.axis[i] = tau[i] * found.inverse_thrust;
+        const double at = x.at[kPosition + i], below = found.ball_pos[i] - kNetHeight * found.axis[i];
+        found.miss[i] = spline.relative ? at : at - below;
+        found.tail[i] = (spline.relative ? at + below : at) - kHead[i];
+    }
+    return found;
+}
+
+// What the spline is a linear map of.
+inline void fill_columns(const Spline& spline, const Point& x, const double tail[3], double h,
+                         double columns[kColumns][3]) {
+    for (int i = 0; i < 3; ++i) {
+        for (int k = 0; k < kInner; ++k)
+            columns[k][i] = x.at[3 * k + i] - (spline.relative ? 0.0 : kHead[i]);
+        columns[kInner][i] = tail[i];
+        columns[kInner + 1][i] = x.at[kVelocity + i] * h;
+        columns[kInner + 2][i] = x.at[kAcceleration + i] * h * h;
+    }
+}
+
 // The cost and its gradient by the variables.
-double cost_of(const Spline& spline, const Case& task, const Hinges& hinges, const Point& x,
-               Point& slope) {
+double cost_of(const Spline& spline, const Case& task, const Point& x, Point& slope) {
     const double duration = std::exp(x.at[kLogTime]), h = duration / kPieces;
     const double rate = 1.0 / h;
+    const Catch at_end = catch_at(spline, task, x, duration);
     double columns[kColumns][3], by_columns[kColumns][3];
-    for (int i = 0; i < 3; ++i) {
-        columns[0][i] = x.at[kPosition + i] - kHead[i];
-        columns[1][i] = x.at[kVelocity + i] * h;
-        columns[2][i] = x.at[kAcceleration + i] * h * h;
-        for (int k = 0; k < 3; ++k) columns[3 + k][i] = x.at[3 * k + i] - kHead[i];
-    }
+    fill_columns(spline, x, at_end.tail, h, columns);
     double by_h = 0.0, by_time = kTimeWeight, cost = kTimeWeight * duration;
 
     // Penalties along the way.
@@ -301,44 +360,52 @@ double cost_of(const Spline& spline, const Case& task, const Hinges& hinges, con
     bool any = false;
     for (int block = 0; block < kBlocks; ++block) {
         const auto& matrix = spline.samples[block];
-        Vec z = matrix[0][0] * columns[0][2], motion[3][3];
-        for (int c = 1; c < kColumns; ++c) z += matrix[0][c] * columns[c][2];
-        for (int order = 0; order < 3; ++order)
-            for (int i = 0; i < 3; ++i) {
-                Vec sum = matrix[order + 1][0] * columns[0][i];
-                for (int c = 1; c < kColumns; ++c) sum += matrix[order + 1][c] * columns[c][i];
-                motion[order][i] = sum * rates[order + 1];
-            }
+        Vec z{}, motion[3][3] = {};
+        for (int c = 0; c < kColumns; ++c) z += matrix[0][c] * columns[c][2];
+        for (int order = 0; order < 3; ++order) {
+            for (int c = 0; c < kColumns; ++c)
+                for (int i = 0; i < 3; ++i)
+                    motion[order][i] += matrix[order + 1][c] * columns[c][i];
+            for (int i = 0; i < 3; ++i) motion[order][i] *= rates[order + 1];
+        }
         const Vec *v = motion[0], *a = motion[1], *j = motion[2];
         const Vec tx = a[0], ty = a[1], tz = a[2] + kGravity;
-        const Vec squared = larger(tx * tx + ty * ty + tz * tz, spread(1e-4));
+        const Vec jerk2 = j[0] * j[0] + j[1] * j[1] + j[2] * j[2];
+        const Vec thrust2 = tx * tx + ty * ty + tz * tz;
+        const Vec fast = v[0] * v[0] + v[1] * v[1] + v[2] * v[2] - kMostSpeed * kMostSpeed;
+        const Vec low = (kLeastHeight - kHead[2]) - z;
+        // Bounds that need neither root nor division: while the thrust points up, the squared
+        // body rate is at most twice that of the jerk over the thrust.
+        const Vec inside = larger(larger(thrust2 - kMostThrust * kMostThrust,
+                                         kLeastThrust * kLeastThrust - thrust2),
+                                  larger(2.0 * jerk2 - kMostRate * kMostRate * thrust2, -tz));
+        if (greatest(larger(larger(fast, low), inside)) <= 0.0) continue;
+
+        const Vec squared = larger(thrust2, spread(1e-4));
         const Vec thrust = root(squared);
         const Vec inverse = 1.0 / thrust;
         const Vec inverse2 = inverse * inverse;
         const Vec along = (tx * j[0] + ty * j[1] + tz * j[2]) * inverse2;
-        const Vec jerk2 = j[0] * j[0] + j[1] * j[1] + j[2] * j[2];
         const Vec tilt = (jerk2 - along * along * squared) * inverse2;
         const Vec upright = larger(thrust + tz, spread(1e-2));
         const Vec inverse_twist = 1.0 / (thrust * upright);
         const Vec twist = (ty * j[0] - tx * j[1]) * inverse_twist;
         const Vec middle = thrust - kMiddleThrust;
-        const Vec fast = v[0] * v[0] + v[1] * v[1] + v[2] * v[2] - kMostSpeed * kMostSpeed;
         const Vec turning = tilt + twist * twist - kMostRate * kMostRate;
         const Vec pushing = middle * middle - kHalfThrust * kHalfThrust;
-        const Vec low = (kLeastHeight - kHead[2]) - z;
         if (greatest(larger(larger(fast, turning), larger(pushing, low))) <= 0.0) continue;
 
         any = true;
-        const Hinge speed = smoothed(fast, hinges.width), turn = smoothed(turning, hinges.width);
-        const Hinge push = smoothed(pushing, hinges.width), ground = smoothed(low, hinges.width);
+        const Hinge speed = smoothed(fast, kWidthOfHinge), turn = smoothed(turning, kWidthOfHinge);
+        const Hinge push = smoothed(pushing, kWidthOfHinge), ground = smoothed(low, kWidthOfHinge);
         const Vec weight = spline.weights[block];
-        penalty += weight * (hinges.limit * (speed.value + turn.value + push.value) +
-                             hinges.ground * ground.value);
+        penalty += weight * (kLimitWeight * (speed.value + turn.value + push.value) +
+                             kGroundWeight * ground.value);
         // Slopes by height, velocity, acceleration and jerk, times the sample's share of h.
-        const Vec share = weight * (2.0 * hinges.limit * h);
+        const Vec share = weight * (2.0 * kLimitWeight * h);
         const Vec by_speed = share * speed.slope, by_turn = share * turn.slope;
         const Vec by_push = share * push.slope * middle * inverse;
-        const Vec by_low = weight * (-hinges.ground * h) * ground.slope;
+        const Vec by_low = weight * (-kGroundWeight * h) * ground.slope;
         const Vec by_twist = by_turn * twist * inverse_twist;
         const Vec turned = by_turn * inverse2;
         // The twist's denominator is |tau|^2 + |tau| tau_z.
@@ -383,33 +450,25 @@ double cost_of(const Spline& spline, const Case& task, const Hinges& hinges, con
     const double unit = rates[3] * rates[3] * rate;
     double energy = 0.0;
     for (int i = 0; i < 3; ++i) {
-        Vec sizes = {};
-        for (int block = 0; block < kEnergyBlocks; ++block) {
-            const auto& matrix = spline.energy[block];
-            Vec found = matrix[0] * columns[0][i];
-            for (int c = 1; c < kColumns; ++c) found += matrix[c] * columns[c][i];
-            sizes += found * found;
-            found *= 2.0 * unit;
-            for (int c = 0; c < kColumns; ++c) by_columns[c][i] += total(matrix[c] * found);
+        double sizes[kColumns];
+        for (int r = 0; r < kColumns; ++r) {
+            sizes[r] = 0.0;
+            for (int c = r; c < kColumns; ++c) sizes[r] += spline.energy[r][c] * columns[c][i];
+            energy += sizes[r] * sizes[r];
+            sizes[r] *= 2.0 * unit;
         }
-        energy += total(sizes);
+        for (int c = 0; c < kColumns; ++c)
+            for (int r = 0; r <= c; ++r) by_columns[c][i] += spline.energy[r][c] * sizes[r];
     }
     cost += unit * energy;
     by_h -= kDegree * unit * energy * rate;
 
     // The catch.
-    double pos[3], vel[3], acc[3], axis[3], miss[3], at_ball[3], by_axis[3];
-    fly(task.ball, duration, pos, vel, acc);
-    const double *at = &x.at[kAcceleration];
-    const double push2 = at[0] * at[0] + at[1] * at[1] + (at[2] + kGravity) * (at[2] + kGravity);
-    const double inverse_push = 1.0 / std::sqrt(std::max(push2, 1e-12));
-    double distance2 = 0.0, speed2 = 0.0, facing = 0.0, turning = 0.0;
+    double distance2 = 0.0, speed2 = 0.0, facing = 0.0;
     for (int i = 0; i < 3; ++i) {
-        axis[i] = (at[i] + (i == 2 ? kGravity : 0.0)) * inverse_push;
-        miss[i] = x.at[kPosition + i] + kNetHeight * axis[i] - pos[i];
-        distance2 += miss[i] * miss[i];
-        speed2 += vel[i] * vel[i];
-        facing += axis[i] * vel[i];
+        distance2 += at_end.miss[i] * at_end.miss[i];
+        speed2 += at_end.ball_vel[i] * at_end.ball_vel[i];
+        facing += at_end.axis[i] * at_end.ball_vel[i];
     }
     const double distance = std::sqrt(distance2), inverse_speed = 1.0 / std::sqrt(speed2);
     double by_distance, by_angle;
@@ -418,24 +477,27 @@ double cost_of(const Spline& spline, const Case& task, const Hinges& hinges, con
     cost += kAngleWeight * steep(kSafeCosine + facing, kWidthOfHinge, by_angle);
     by_distance *= distance > 0.0 ? kMissWeight / distance : 0.0;
     by_angle *= kAngleWeight * inverse_speed;
-    double leaning = 0.0;
+    double by_pos[3], by_axis[3], leaning = 0.0, turning = 0.0;
     for (int i = 0; i < 3; ++i) {
-        at_ball[i] = by_distance * miss[i];
-        by_axis[i] = kNetHeight * at_ball[i] + by_angle * vel[i];
-        leaning += by_axis[i] * axis[i];
-        turning += (axis[i] - facing * inverse_speed * vel[i]) * acc[i];
-        by_time -= at_ball[i] * vel[i];
+        const double by_tail = by_columns[kInner][i], by_miss = by_distance * at_end.miss[i];
+        by_pos[i] = by_tail + by_miss;
+        // The ball and the axis move the net's distance, or else the tail against it.
+        const double by_below = spline.relative ? by_tail : -by_miss;
+        by_axis[i] = by_angle * at_end.ball_vel[i] - kNetHeight * by_below;
+        leaning += by_axis[i] * at_end.axis[i];
+        turning += (at_end.axis[i] - facing * inverse_speed * at_end.ball_vel[i]) * at_end.ball_acc[i];
+        by_time += by_below * at_end.ball_vel[i];
     }
     by_time += by_angle * turning;
 
     for (int i = 0; i < 3; ++i) {
-        by_h += by_columns[1][i] * x.at[kVelocity + i] +
-                2.0 * h * by_columns[2][i] * x.at[kAcceleration + i];
-        for (int k = 0; k < 3; ++k) slope.at[3 * k + i] = by_columns[3 + k][i];
-        slope.at[kPosition + i] = by_columns[0][i] + at_ball[i];
-        slope.at[kVelocity + i] = by_columns[1][i] * h;
+        const double by_vel = by_columns[kInner + 1][i], by_acc = by_columns[kInner + 2][i];
+        by_h += by_vel * x.at[kVelocity + i] + 2.0 * h * by_acc * x.at[kAcceleration + i];
+        for (int k = 0; k < kInner; ++k) slope.at[3 * k + i] = by_columns[k][i];
+        slope.at[kPosition + i] = by_pos[i];
+        slope.at[kVelocity + i] = by_vel * h;
         slope.at[kAcceleration + i] =
-            by_columns[2][i] * h * h + (by_axis[i] - leaning * axis[i]) * inverse_push;
+            by_acc * h * h + (by_axis[i] - leaning * at_end.axis[i]) * at_end.inverse_thrust;
     }
     slope.at[kLogTime] = duration * (by_time + by_h / kPieces);
     for (int i = kVariables; i < kPadded; ++i) slope.at[i] = 0.0;
@@ -443,17 +505,26 @@ double cost_of(const Spline& spline, const Case& task, const Hinges& hinges, con
 }
 
 // From rest to rest below the ball at the guessed time, waypoints on the minimum-jerk way.
-Point guess_of(const Case& task) {
+Point guess_of(const Spline& spline, const Case& task) {
     Point x{};
-    double pos[3], vel[3], acc[3];
-    fly(task.ball, task.guessed_time, pos, vel, acc);
-    pos[2] -= kNetHeight;
-    for (int k = 1; k < kPieces; ++k) {
-        const double s = double(k) / kPieces, share = s * s * s * (10.0 - 15.0 * s + 6.0 * s * s);
-        for (int i = 0; i < 3; ++i) x.at[3 * (k - 1) + i] = kHead[i] + share * (pos[i] - kHead[i]);
-    }
+    double ball[3], vel[3], acc[3];
+    fly(task.ball, task.guessed_time, ball, vel, acc);
     x.at[kLogTime] = std::log(task.guessed_time);
-    for (int i = 0; i < 3; ++i) x.at[kPosition + i] = pos[i];
+    for (int i = 0; i < 3; ++i) {
+        const double tail = ball[i] - (i == 2 ? kNetHeight : 0.0);
+        double way[kColumns] = {};
+        for (int k = 0; k < kInner; ++k) {
+            const double s = double(k + 1) / kPieces;
+            way[k] = s * s * s * (10.0 - 15.0 * s + 6.0 * s * s) * (tail - kHead[i]);
+        }
+        way[kInner] = tail - kHead[i];
+        for (int k = 0; k < kInner; ++k) {
+            double offset = 0.0;
+            for (int c = 0; c < kColumns; ++c) offset += spline.offsets[k][c] * way[c];
+            x.at[3 * k + i] = spline.relative ? offset : kHead[i] + way[k];
+        }
+        x.at[kPosition + i] = spline.relative ? 0.0 : tail;
+    }
     return x;
 }
 
@@ -463,6 +534,7 @@ struct Settings {
     double delta = 1e-7;      // relative change that ends the search
     int most_steps = 1000;
     double decrease = 1e-4, curvature = 0.9;  // of the weak Wolfe conditions
+    int relative = 0;         // whether waypoints and position are relative
     int interpolate = 0;      // whether trials within a bracket are cubic, not halves
     double scale_q = 1.0, scale_t = 1.0, scale_p = 1.0, scale_v = 1.0, scale_a = 1.0;
     int repeats = 3;
@@ -487,7 +559,7 @@ class Search {
     }
 
     Result plan(const Case& task) {
-        Point x = guess_of(task), g, x_new, g_new, direction;
+        Point x = guess_of(spline_, task), g, x_new, g_new, direction;
         for (int i = 0; i < kVariables; ++i) x.at[i] /= scale_.at[i];
         evaluations_ = 0;
         double cost = evaluate(task, x, g);
@@ -530,14 +602,14 @@ class Search {
 
     double guess_cost(const Case& task) const {
         Point slope;
-        return cost_of(spline_, task, {}, guess_of(task), slope);
+        return cost_of(spline_, task, guess_of(spline_, task), slope);
     }
 
   private:
     double evaluate(const Case& task, const Point& x, Point& g) {
         Point natural;
         for (int i = 0; i < kRegisters; ++i) natural.reg[i] = x.reg[i] * scale_.reg[i];
-        const double cost = cost_of(spline_, task, hinges_, natural, g);
+        const double cost = cost_of(spline_, task, natural, g);
         for (int i = 0; i < kRegisters; ++i) g.reg[i] *= scale_.reg[i];
         ++evaluations_;
         return cost;
@@ -644,7 +716,6 @@ class Search {
 
     const Spline& spline_;
     const Settings given_;
-    Hinges hinges_;
     Point scale_, steps_[kMostMemory], changes_[kMostMemory], matrix_[kPadded];
     double inverse_[kMostMemory], shares_[kMostMemory], costs_[kMostPast], unit_ = 1.0;
     int first_ = 0, count_ = 0, evaluations_ = 0;
@@ -653,14 +724,9 @@ class Search {
 // Whether 200 samples keep the limits, and the catch the net, with five per cent to spare.
 bool succeeds(const Spline& spline, const Case& task, const Point& x) {
     const double duration = std::exp(x.at[kLogTime]), h = duration / kPieces;
+    const Catch at_end = catch_at(spline, task, x, duration);
     double columns[kColumns][3];
-    for (int i = 0; i < 3; ++i) {
-        for (int k = 0; k < 3; ++k) {
-            const double unit[3] = {1.0, h, h * h};
-            columns[k][i] = (x.at[kPosition + 3 * k + i] - (k ? 0.0 : kHead[i])) * unit[k];
-            columns[3 + k][i] = x.at[3 * k + i] - kHead[i];
-        }
-    }
+    fill_columns(spline, x, at_end.tail, h, columns);
     for (int k = 0; k < 200; ++k) {
         double m[4][3] = {};
         for (int order = 0; order < 4; ++order) {
@@ -681,25 +747,18 @@ bool succeeds(const Spline& spline, const Case& task, const Point& x) {
         const double yaw = (axis[1] * turn[0] - axis[0] * turn[1]) / (1.0 + axis[2]);
         if (std::sqrt(size2(m[1])) > 1.05 * kMostSpeed ||
             std::sqrt(size2(turn) + yaw * yaw) > 1.05 * kMostRate ||
-            f < 0.95 * (kMiddleThrust - kHalfThrust) || f > 1.05 * (kMiddleThrust + kHalfThrust) ||
+            f < 0.95 * kLeastThrust || f > 1.05 * kMostThrust ||
             m[0][2] + kHead[2] < 0.95 * kLeastHeight)
             return false;
     }
-    double pos[3], vel[3], acc[3], distance2 = 0.0, push2 = 0.0, speed2 = 0.0, facing = 0.0;
-    fly(task.ball, duration, pos, vel, acc);
-    double tau[3];
+    double distance2 = 0.0, speed2 = 0.0, facing = 0.0;
     for (int i = 0; i < 3; ++i) {
-        tau[i] = x.at[kAcceleration + i] + (i == 2 ? kGravity : 0.0);
-        push2 += tau[i] * tau[i];
-        speed2 += vel[i] * vel[i];
-        facing -= tau[i] * vel[i];
+        distance2 += at_end.miss[i] * at_end.miss[i];
+        speed2 += at_end.ball_vel[i] * at_end.ball_vel[i];
+        facing -= at_end.axis[i] * at_end.ball_vel[i];
     }
-    for (int i = 0; i < 3; ++i) {
-        const double miss = x.at[kPosition + i] + kNetHeight * tau[i] / std::sqrt(push2) - pos[i];
-        distance2 += miss * miss;
-    }
-    const double angle = std::acos(facing / std::sqrt(push2 * speed2));
-    return distance2 <= 1.1025 * kNetRadius * kNetRadius && angle <= 1.05 * std::acos(kSafeCosine);
+    const double angle = std::acos(facing / std::sqrt(speed2));
+    return std::sqrt(distance2) <= 1.05 * kNetRadius && angle <= 1.05 * std::acos(kSafeCosine);
 }
 
 double processor_seconds() {
@@ -737,7 +796,7 @@ Settings read_settings(int count, char** words) {
     Settings given;
     const std::map<std::string, int*> counts = {
         {"memory", &given.memory}, {"past", &given.past}, {"most_steps", &given.most_steps},
-        {"interpolate", &given.interpolate}, {"repeats", &given.repeats}};
+        {"interpolate", &given.interpolate}, {"relative", &given.relative}, {"repeats", &given.repeats}};
     const std::map<std::string, double*> numbers = {
         {"delta", &given.delta}, {"decrease", &given.decrease}, {"curvature", &given.curvature},
         {"scale_q", &given.scale_q}, {"scale_t", &given.scale_t}, {"scale_p", &given.scale_p},
@@ -760,41 +819,15 @@ Settings read_settings(int count, char** words) {
     return given;
 }
 
-#ifdef CHECK
-void check(const Spline& spline, const Case& task, const Point& x0) {
-    Point slope, other;
-    cost_of(spline, task, {}, x0, slope);
-    for (int i = 0; i < kVariables; ++i) {
-        Point up = x0, down = x0;
-        const double step = 1e-6;
-        up.at[i] += step;
-        down.at[i] -= step;
-        const double numeric =
-            (cost_of(spline, task, {}, up, other) - cost_of(spline, task, {}, down, other)) /
-            (2 * step);
-        std::printf("%d %.9g %.9g %.2e\n", i, slope.at[i], numeric, slope.at[i] / numeric - 1);
-    }
-}
-#endif
-
 }  // namespace
 
 int main(int count, char** words) try {
     if (count < 2) throw std::runtime_error("usage: catch FILE [name=value ...]");
     const std::vector<Case> cases = read_cases(words[1]);
     const Settings settings = read_settings(count - 2, words + 2);
-    const Spline spline;
+    const Spline spline(settings.relative != 0);
     Search search(spline, settings);
     std::vector<Result> results(cases.size());
-#ifdef CHECK
-    for (std::size_t i = 0; i < 1; ++i) {
-        auto x = guess_of(cases[i]);
-        for (int k = 0; k < kVariables; ++k) x.at[k] += 0.3 * std::sin(k * 7.3);
-        check(spline, cases[i], x);
-        check(spline, cases[i], search.plan(cases[i]).x);
-    }
-    return 0;
-#endif
     double best = std::numeric_limits<double>::infinity();
     for (int round = 0; round < settings.repeats; ++round) {
         const double began = processor_seconds();
