@@ -14,6 +14,7 @@ Run it on an idle machine; `taskset -c 0` holds it to one core.
 import csv
 import dataclasses
 import os
+import tempfile
 import time
 from pathlib import Path
 
@@ -22,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import planner_jax as pj
+from planner_jax.benchmarks.catch_peer import peer
 from planner_jax.benchmarks.cost_gap import cost_gaps, gap_figures
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
 from planner_jax.optimise.problem import Round, Stage
@@ -148,6 +150,19 @@ def report_set(bench: Bench, data: Path, name: str, repeats: int) -> None:
     bench.row(set=name, num=success.size, success=success.mean(), **gap_figures(gaps))
 
 
+def report_peer(bench: Bench, data: Path) -> None:
+    """The C++ program of `catch_peer` on both sets, with the quickest settings of each search."""
+    with tempfile.TemporaryDirectory(prefix="catch-peer-") as folder:
+        program = peer.build(Path(folder))
+        if program is None:
+            bench.say(peer.NO_COMPILER)
+            return
+        for name in SETS:
+            for search, settings in peer.SEARCHES.items():
+                found = peer.measure(program, data / f"catch_{name}.csv", settings)
+                bench.say(f"{name}: {search}: {found}")
+
+
 def main() -> None:
     """Print everything."""
     parser = argument_parser("catch_reference", __doc__, repeats=5)
@@ -160,6 +175,7 @@ def main() -> None:
         report_paper_planner(bench, options.data)
         for name in SETS:
             report_set(bench, options.data, name, options.repeats)
+        report_peer(bench, options.data)
 
 
 if __name__ == "__main__":

@@ -176,7 +176,8 @@ struct Spline {
         };
         const auto put = [](auto& to, int piece, double time, int order, double sign) {
             for (int k = order; k <= kDegree; ++k)
-                to[piece * (kDegree + 1) + k] += sign * falling(k, order) * std::pow(time, k - order);
+                to[piece * (kDegree + 1) + k] +=
+                    sign * falling(k, order) * std::pow(time, k - order);
         };
         for (int order = 0; order < 4; ++order) {
             put(blank(), 0, 0.0, order, 1.0);
@@ -207,7 +208,8 @@ struct Spline {
         }
         for (int i = 0; i < size; ++i)
             for (int c = 0; c < kColumns; ++c)
-                coefficients[i / (kDegree + 1)][i % (kDegree + 1)][c] = rows[i][size + c] / rows[i][i];
+                coefficients[i / (kDegree + 1)][i % (kDegree + 1)][c] =
+                    rows[i][size + c] / rows[i][i];
     }
 
     // A triangular root of the energy's matrix. From the snap itself, at four Gauss points a
@@ -325,7 +327,8 @@ inline Catch catch_at(const Spline& spline, const Case& task, const Point& x, do
     found.inverse_thrust = 1.0 / std::sqrt(std::max(thrust2, 1e-12));
     for (int i = 0; i < 3; ++i) {
         found.axis[i] = tau[i] * found.inverse_thrust;
-        const double at = x.at[kPosition + i], below = found.ball_pos[i] - kNetHeight * found.axis[i];
+        const double at = x.at[kPosition + i];
+        const double below = found.ball_pos[i] - kNetHeight * found.axis[i];
         found.miss[i] = spline.relative ? at : at - below;
         found.tail[i] = (spline.relative ? at + below : at) - kHead[i];
     }
@@ -481,11 +484,12 @@ double cost_of(const Spline& spline, const Case& task, const Point& x, Point& sl
     for (int i = 0; i < 3; ++i) {
         const double by_tail = by_columns[kInner][i], by_miss = by_distance * at_end.miss[i];
         by_pos[i] = by_tail + by_miss;
-        // The ball and the axis move the net's distance, or else the tail against it.
+        // Slope by the place below the ball where the net's centre would meet it.
         const double by_below = spline.relative ? by_tail : -by_miss;
         by_axis[i] = by_angle * at_end.ball_vel[i] - kNetHeight * by_below;
         leaning += by_axis[i] * at_end.axis[i];
-        turning += (at_end.axis[i] - facing * inverse_speed * at_end.ball_vel[i]) * at_end.ball_acc[i];
+        turning += at_end.ball_acc[i] *
+                   (at_end.axis[i] - facing * inverse_speed * at_end.ball_vel[i]);
         by_time += by_below * at_end.ball_vel[i];
     }
     by_time += by_angle * turning;
@@ -796,7 +800,8 @@ Settings read_settings(int count, char** words) {
     Settings given;
     const std::map<std::string, int*> counts = {
         {"memory", &given.memory}, {"past", &given.past}, {"most_steps", &given.most_steps},
-        {"interpolate", &given.interpolate}, {"relative", &given.relative}, {"repeats", &given.repeats}};
+        {"interpolate", &given.interpolate}, {"relative", &given.relative},
+        {"repeats", &given.repeats}};
     const std::map<std::string, double*> numbers = {
         {"delta", &given.delta}, {"decrease", &given.decrease}, {"curvature", &given.curvature},
         {"scale_q", &given.scale_q}, {"scale_t", &given.scale_t}, {"scale_p", &given.scale_p},
