@@ -106,7 +106,7 @@ inline double greatest(Vec a) {
 }
 
 inline Vec root(Vec a) {
-    Vec result;
+    Vec result = a;
     for (int i = 0; i < kWidth; ++i) result[i] = std::sqrt(a[i]);
     return result;
 }

@@ -3,6 +3,27 @@
 The program minimises the objective of `planner_jax.task.catch.paper.PaperCatch`, on one core and
 in double precision: one throw after another, none of them with a heap allocation. It shares no code
 with the library.
+
+A peer gets its best settings. They were found by some 500 to 1,500 random steps for each search, on
+the 240 throws of both sets, from the least time while 97 % were within 1e-3 of the published cost.
+Tried were memories of 8 to 64 and BFGS with a dense matrix, `past` 2 to 20, `delta` 1e-7 to 1e-5,
+both constants of the weak Wolfe conditions, halved and cubic trials, a unit for each kind of
+variable, and variables relative to the smoothest way and to the ball. Plans per CPU second on a
+core of an AMD EPYC (Zen 3 or later), which others used too, so that 10 % mean nothing; in brackets
+the percentage within 1e-3 and the mean iterations:
+
+| variables | search | `past`, `delta` | easy set | hard set |
+|---|---|---|---|---|
+| published, unscaled | L-BFGS 48, halved trials | 10, 1e-7 | 2,110 (100, 255) | 1,680 (99, 321) |
+| published | L-BFGS 8 | 5, 8e-7 | 1,470 (94, 693) | 1,590 (88, 626) |
+| published | L-BFGS 24 | 5, 8e-7 | 5,430 (92, 134) | 3,750 (87, 185) |
+| published | L-BFGS 48 | 5, 8e-7 | 5,240 (99, 102) | 3,470 (99, 147) |
+| published | L-BFGS 64 | 5, 8e-7 | 5,080 (100, 98) | 3,150 (99, 145) |
+| published | BFGS | 9, 1e-6 | 9,970 (99, 158) | 5,740 (98, 222) |
+| relative | L-BFGS 12 | 10, 1e-7 | 12,200 (100, 82) | 9,400 (100, 96) |
+| relative | L-BFGS 12 | 2, 5e-6 | 23,800 (100, 44) | 13,100 (98, 65) |
+| relative | BFGS | 10, 1e-7 | 20,700 (100, 67) | 12,300 (100, 98) |
+| relative | BFGS | 3, 3e-6 | 30,700 (100, 49) | 18,100 (98, 77) |
 """
 
 import csv
@@ -17,7 +38,7 @@ SOURCE = Path(__file__).with_name("catch.cpp")
 COMPILERS = ("g++", "c++")
 # Without -ffinite-math-only: a step that is too long may overflow, and has to be seen.
 FLAGS = ("-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math")
-FLAGS += ("-fno-signed-zeros", "-fassociative-math", "-freciprocal-math")
+FLAGS += ("-fno-signed-zeros", "-fassociative-math", "-freciprocal-math", "-Wno-psabi")
 NO_COMPILER = f"C++: not measured, there is no compiler ({' or '.join(COMPILERS)})"
 AS_GOOD = 1e-3  # relative cost above the published one that counts as none
 
@@ -45,19 +66,20 @@ class Settings:
         return [f"{name}={float(value):g}" for name, value in given.items()]
 
 
-# The quickest settings found that hold `AS_GOOD` on at least 97 % of both published sets.
+# The quickest settings found that hold `AS_GOOD` on at least 98 % of both published sets, which
+# leaves room for another processor's rounding.
 SEARCHES = {
     "C++, own L-BFGS, one core, double": Settings(
-        memory=32, past=5, delta=8e-7, decrease=0.01, curvature=0.5,
+        memory=48, past=5, delta=8e-7, decrease=0.01, curvature=0.5,
         scale_q=0.35, scale_t=0.115, scale_p=0.33, scale_v=2.1, scale_a=5.1,
     ),
-    "C++, own L-BFGS, relative variables": Settings(
-        relative=True, memory=12, past=2, delta=6.8e-6, decrease=0.01,
-        scale_q=3.6, scale_t=0.174, scale_p=0.235, scale_v=2.6, scale_a=3.8,
+    "C++, own L-BFGS, relative variables, one core, double": Settings(
+        relative=True, memory=12, past=2, delta=5e-6, decrease=0.01, curvature=0.95,
+        scale_q=3.1, scale_t=0.113, scale_p=0.235, scale_v=2.5, scale_a=3.8,
     ),
-    "C++, own BFGS, relative variables": Settings(
-        relative=True, memory=0, past=3, delta=3.5e-6, decrease=0.01,
-        scale_q=11.9, scale_t=0.38, scale_p=0.88, scale_v=8.2, scale_a=23.7,
+    "C++, own BFGS, relative variables, one core, double": Settings(
+        relative=True, memory=0, past=3, delta=3e-6, decrease=0.01, curvature=0.95,
+        scale_q=12.0, scale_t=0.33, scale_p=0.88, scale_v=8.2, scale_a=25.0,
     ),
 }  # fmt: skip
 
