@@ -10,7 +10,8 @@ Tried were memories of 8 to 64 and BFGS with a dense matrix, `past` 2 to 20, `de
 both constants of the weak Wolfe conditions, halved and cubic trials, a unit for each kind of
 variable, and variables relative to the smoothest way and to the ball. Plans per CPU second on a
 core of an AMD EPYC (Zen 3 or later), which others used too, so that 10 % mean nothing; in brackets
-the percentage within 1e-3 and the mean iterations:
+the percentage within 1e-3 and the mean iterations. On 960 throws shifted from these by some 0.1 m
+and 0.15 m/s, `SEARCHES` ends within 1e-3 of a long search on 98 to 100 %.
 
 | variables | search | `past`, `delta` | easy set | hard set |
 |---|---|---|---|---|
