@@ -206,6 +206,76 @@ def test_objective_gradient_agrees_with_finite_differences(float64):
         np.testing.assert_allclose(slopes[k], numeric, rtol=1e-4, atol=1e-9)
 
 
+SUPPLE = dataclasses.replace(PLANNER, velocities=True)
+
+
+def test_a_point_that_is_carried_to_velocities_as_variables_is_the_same_plan(cases):
+    lane = pj.lane(cases, 1)
+    context, guess = begun(lane)
+    point = guess + 0.1 * np.random.default_rng(1).normal(size=guess.size).astype(np.float32)
+
+    @jax.jit
+    def both(point):
+        carried = SUPPLE.carried(point, PLANNER)
+        plans = PLANNER.decode(point, context), SUPPLE.decode(carried, context)
+        return carried, plans, PLANNER.objective(point, context), SUPPLE.objective(carried, context)
+
+    carried, (usual, supple), *costs = both(point)
+    assert carried.size == point.size + 33 == len(SUPPLE.scale)
+    np.testing.assert_allclose(
+        supple.trajectory.coeffs[:, :4], usual.trajectory.coeffs[:, :4], atol=2e-3
+    )
+    np.testing.assert_allclose(costs[1].cost, costs[0].cost, rtol=1e-3)
+    np.testing.assert_array_equal(SUPPLE.carried(carried, SUPPLE), carried)
+
+
+def test_velocities_as_variables_have_exact_derivatives(float64, cases):
+    lane = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), pj.lane(cases, 2))
+    context = SUPPLE.prepare(lane)
+    guess = SUPPLE.guesses(context, 1)[0]
+    random = np.random.default_rng(2)
+    point, direction = guess + 0.2 * random.normal(size=guess.size), random.normal(size=guess.size)
+    cost = jax.jit(lambda x: SUPPLE.objective(x, context).cost)
+    curved = SUPPLE.curved(point, context)
+    np.testing.assert_allclose(
+        curved.gradient, jax.jit(jax.grad(cost))(point), rtol=1e-6, atol=1e-9
+    )
+    numeric = (cost(point + 1e-6 * direction) - cost(point - 1e-6 * direction)) / 2e-6
+    np.testing.assert_allclose(curved.gradient @ direction, numeric, rtol=1e-5)
+
+
+def test_all_guesses_but_the_first_pass_the_ball_as_fast_as_the_way_there_asks(cases):
+    lane = pj.lane(cases, 3)
+
+    @jax.jit
+    def impacts(case):
+        context = PLANNER.prepare(case)
+        natural = PLANNER.guesses(context, 12)[:, -8:] * jnp.asarray(PLANNER.scale[-8:])
+        return jax.vmap(lambda own: PLANNER.impact(own, context))(natural)
+
+    found = impacts(lane)
+    places, vels = found.tail_state[:, 0], found.tail_state[:, 1]
+    even = 2.0 * (places - lane.head_state[0]) / found.stroke.time[:, None]
+    speed = np.linalg.norm(even, axis=1, keepdims=True)
+    even = even * np.minimum(1.0, 0.9 * lane.limits.speed / speed)
+    normal = found.stroke.normal
+    across = even - np.sum(even * normal, axis=1, keepdims=True) * normal
+    own = vels - np.sum(vels * normal, axis=1, keepdims=True) * normal
+    np.testing.assert_allclose(own[1:], across[1:], atol=1e-3)
+
+
+@pytest.mark.slow
+def test_late_hits_that_no_short_search_finds_are_found_by_the_last_two_rounds():
+    late = jax.tree.map(np.asarray, to_cases(generate_serves(300, 3), delay=0.6))
+    by_rounds = [
+        referee_hits(late, plan(dataclasses.replace(PLANNER, rounds=PLANNER.rounds[:k]), late))
+        for k in (2, 3, 4)
+    ]
+    shares = [verdict.success.mean() for verdict in by_rounds]
+    assert shares[0] + 0.01 < shares[1] <= shares[2]
+    assert shares[2] > 0.965
+
+
 def test_sizes_that_make_no_sense_are_refused(cases):
     with pytest.raises(
         ValueError, match=r"proportions must be of >= 2 pieces, finite and > 0, got \(1.0,\)"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from derivatives import assert_gradient_matches_differences
 
-from planner_jax.trajectory.polynomial import evaluate, snap_energy
+from planner_jax.trajectory.polynomial import derivative_factors, evaluate, snap_energy
 from planner_jax.trajectory.proportional_minco import (
     boundary_rows,
     equal_pieces,
@@ -38,8 +38,8 @@ def durations_of(pieces):
     return PIECE_DURATION * shares / shares.mean()
 
 
-def maps_of(order, pieces):
-    return proportional_minco(order, tuple(durations_of(pieces)))
+def maps_of(order, pieces, velocities=False):
+    return proportional_minco(order, tuple(durations_of(pieces)), velocities)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
@@ -338,6 +338,53 @@ def test_no_offsets_are_the_least_energy_over_all_waypoints(order):
     for sign in (1.0, -1.0):
         _, _, more = proportional_one(order, 3, rows, sign * offsets, PIECE_DURATION)
         np.testing.assert_allclose(more - least, raised, rtol=1e-6)
+
+
+@every_size
+def test_velocities_as_variables_change_nothing_while_they_are_the_smoothest(order, pieces):
+    usual, supple = maps_of(order, pieces), maps_of(order, pieces, True)
+    known = 2 * order + pieces - 1
+    scale = np.abs(usual.coefficients).max()
+    np.testing.assert_allclose(
+        supple.coefficients[..., :known], usual.coefficients, atol=1e-9 * scale
+    )
+    assert supple.coefficients.shape[-1] == known + pieces - 1
+    assert supple.offset_energy == pytest.approx(usual.offset_energy, rel=1e-9)
+    moved = supple.waypoints[: pieces - 1, known:]
+    np.testing.assert_allclose(moved, 0.0, atol=1e-9)
+
+
+@every_size
+def test_velocities_as_variables_cost_a_multiple_of_their_offsets_square(order, pieces):
+    maps = maps_of(order, pieces, True)
+    rows, _ = proportional_problem(order, pieces)
+    offsets = np.random.default_rng(5).normal(size=(2 * (pieces - 1), 3))
+    columns = np.concatenate([rows, offsets])
+    coeffs = np.einsum("mkc,ci->mki", maps.coefficients, columns)
+    form = energy_form(order, maps.proportions)
+    found = energy(coeffs, form)
+    least = np.einsum("bi,bc,ci->", rows, maps.boundary_energy, rows)
+    np.testing.assert_allclose(found, least + maps.offset_energy * np.sum(offsets**2), rtol=1e-8)
+    back = maps.offsets @ np.concatenate([rows, maps.waypoints @ columns])
+    np.testing.assert_allclose(back, offsets, atol=1e-8)
+
+
+@every_size
+def test_velocities_as_variables_are_those_at_the_waypoints_and_pieces_join(order, pieces):
+    maps = maps_of(order, pieces, True)
+    columns = np.random.default_rng(6).normal(size=(maps.coefficients.shape[-1], 3))
+    coeffs = np.einsum("mkc,ci->mki", maps.coefficients, columns)
+    places = maps.waypoints @ columns
+    for derivative in range(2 * order - 2):  # one fewer than with places alone
+        factors = derivative_factors(2 * order - 1, derivative)
+        powers = np.maximum(np.arange(2 * order) - derivative, 0)
+        ends = np.einsum("mk,mki->mi", factors * maps.proportions[:, None] ** powers, coeffs)[:-1]
+        begins = factors[derivative] * coeffs[1:, derivative]
+        size = np.abs(ends).max(initial=1.0)
+        np.testing.assert_allclose(ends, begins, atol=1e-7 * size)
+        if derivative < 2:
+            own = places[derivative * (pieces - 1) :][: pieces - 1]
+            np.testing.assert_allclose(begins, own, atol=1e-9 * size)
 
 
 @pytest.mark.parametrize("pieces", [2, 3, 8])

@@ -14,7 +14,7 @@ from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.problem import Round, Stage
 from planner_jax.planning import batch
-from planner_jax.planning.plan import plan, plan_across_processes
+from planner_jax.planning.plan import plan, plan_across_processes, solve
 from planner_jax.protocol import Plan, Status, is_solved
 
 
@@ -219,6 +219,53 @@ def test_a_later_round_takes_only_what_is_unsolved(monkeypatch):
     goals[[7, -1]] = 3.5
     assert is_solved(plan(WellPlanner(), Well(jnp.asarray(goals))).status).all()
     assert sorted(sizes[:2]) == [128, 256] and sizes[2:] == [16]  # the first two at once
+
+
+def _near(within):
+    """A second round for what the first leaves no farther off than this."""
+    first, second = WellPlanner().rounds
+    return WellPlanner(rounds=(first, dataclasses.replace(second, within=within)))
+
+
+@pytest.mark.parametrize("kind", ["host", "as on a GPU", "one by one", "compiled"])
+def test_a_round_leaves_alone_what_is_farther_off_than_it_says(kind, monkeypatch):
+    goals = np.array([0.5, 3.8, 3.4, 4.5], np.float32)  # all but the first behind the ridge
+
+    def planned(planner):
+        if kind == "one by one":
+            plans = [plan(planner, Well(goal)) for goal in goals]
+            return jax.tree.map(lambda *leaves: np.stack(leaves), *plans)
+        if kind == "compiled":
+            return jax.jit(lambda goals: solve(planner, Well(goals)))(goals)
+        if kind == "as on a GPU":
+            monkeypatch.setattr(batch, "_is_one_cpu", lambda mesh: False)
+            return plan(planner, Well(jnp.asarray(goals)))
+        return plan(planner, Well(goals))
+
+    first = planned(WellPlanner(rounds=WellPlanner().rounds[:1]))
+    order = np.argsort(np.asarray(first.violation)[1:]) + 1
+    nearest, middle = np.asarray(first.violation)[order[:2]]
+    near = planned(_near(0.5 * (nearest + middle)))
+    solved = is_solved(np.asarray(near.status))
+    assert list(np.flatnonzero(solved)) == sorted([0, order[0]])
+    left = [lane for lane in range(4) if not solved[lane]]
+    points = (np.asarray(plans.point)[left] for plans in (near, first))
+    np.testing.assert_array_equal(*points)
+    assert is_solved(np.asarray(planned(_near(np.inf)).status)).all()
+
+
+def test_a_round_behind_one_that_had_nothing_to_try_is_made():
+    first, second = WellPlanner().rounds
+    planner = WellPlanner(rounds=(first, dataclasses.replace(second, within=1e-3), second))
+    for goals in (GOALS, jnp.asarray(GOALS)):
+        assert is_solved(np.asarray(plan(planner, Well(goals)).status)).all()
+    assert is_solved(plan(planner, Well(GOALS[1])).status)
+
+
+@pytest.mark.parametrize("within", [0.0, -1.0, np.nan, "near"])
+def test_a_round_within_no_violation_is_refused(within):
+    with pytest.raises(ValueError, match="^within must be a number > 0, got"):
+        Round(within=within)
 
 
 def test_one_process_plans_the_whole_batch_alone():

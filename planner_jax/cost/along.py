@@ -60,7 +60,8 @@ class Along:
     def key(self) -> tuple:
         """All of it in numbers and names."""
         code = self.excess.__module__, getattr(self.excess, "__qualname__", "")
-        shape = self.maps.order, tuple(self.maps.proportions.tolist()), self.nodes
+        pieces = tuple(self.maps.proportions.tolist())
+        shape = self.maps.order, pieces, self.maps.coefficients.shape[-1], self.nodes
         return *shape, *code, self.margins, self.hinge_width, self.rate is None, self.orders
 
     def matrices(self) -> np.ndarray:

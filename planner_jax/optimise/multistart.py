@@ -168,19 +168,22 @@ def solve_round(planner: Problem, attempt: Round, case: Any) -> Any:
     last = planner.changed(attempt.settings)
     context = last.prepare(case)
 
-    def search(stage: Stage, start: Array) -> Optimum:
-        problem = planner.changed(stage.settings)
+    def search(problem: Problem, solver: Solver, start: Array) -> Optimum:
         return minimise(
             lambda x: problem.objective(x, context),
             start,
-            stage.solver,
+            solver,
             lambda x: problem.curved(x, context),
         )
 
-    points = last.guesses(context, attempt.starts)
+    before = planner.changed(_stages(attempt)[0].settings)
+    points = before.guesses(context, attempt.starts)
     spent = jnp.zeros(len(points), jnp.int32)
     for stage in _stages(attempt):
-        optimum = _of_each(functools.partial(search, stage), points)
+        problem = planner.changed(stage.settings)
+        points = _of_each(functools.partial(problem.carried, before=before), points)
+        optimum = _of_each(functools.partial(search, problem, stage.solver), points)
+        before = problem
         points, spent = optimum.point, spent + optimum.iterations
         if stage.keep is not None:
             kept = _cheapest(optimum.evaluation.cost, stage.keep)
@@ -204,13 +207,16 @@ def solve_batch(planner: Problem, attempt: Round, cases: Any) -> Any:
     last, num = planner.changed(attempt.settings), attempt.starts
     lanes = jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), cases)
     contexts = over_lanes(last.prepare)(lanes)
-    starts = over_lanes(lambda context: last.guesses(context, num))(contexts)
+    before = planner.changed(_stages(attempt)[0].settings)
+    starts = over_lanes(lambda context: before.guesses(context, num))(contexts)
     # A lane of the solver is one start of one case; the starts of a case are neighbours.
     points = jnp.moveaxis(starts, 0, -1).reshape(starts.shape[1], -1)
     of_starts = _repeated(contexts, num)
     spent = jnp.zeros(points.shape[1:], jnp.int32)
     for stage in _stages(attempt):
         problem = planner.changed(stage.settings)
+        points = over_lanes(functools.partial(problem.carried, before=before))(points)
+        before = problem
         optimum = minimise_lanes(problem.objective, points, of_starts, stage.solver, problem.curved)
         points, spent = optimum.point, spent + optimum.iterations
         if stage.keep is not None:

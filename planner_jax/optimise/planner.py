@@ -89,6 +89,14 @@ class OptimisedPlanner(abc.ABC):
         """Whether no plan can exist, by a bound that none can beat, () bool; never, by default."""
         return jnp.zeros((), bool)
 
+    def carried(self, point: Array, before: Self) -> Array:
+        """A point (n,) of `before`, this planner with other settings, as one of this planner.
+
+        Where the settings leave the variables what they are it is the same; only a planner whose
+        settings change its variables has anything to do.
+        """
+        return point
+
     @property
     def attempts(self) -> tuple[Round, ...]:
         """The rounds."""

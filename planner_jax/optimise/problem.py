@@ -78,6 +78,10 @@ class Problem(Protocol):
         """
         ...
 
+    def carried(self, point: Array, before: Any) -> Array:
+        """A point (n,) of this problem with the settings of `before`, a stage's, in its own."""
+        ...
+
     def changed(self, settings: Settings) -> "Problem":
         """The problem with some of the planner's fields set anew; plans keep their shape."""
         ...

@@ -134,6 +134,10 @@ class Differentiated(OptimisedPlanner):
         """Those of the planner."""
         return self.planner.guesses(context.inner, num)
 
+    def carried(self, point: Array, before: "Differentiated") -> Array:
+        """As the planner does."""
+        return self.planner.carried(point, before.planner)
+
     def objective(self, point: Array, context: _Context) -> Any:
         """That of the planner."""
         return self.planner.objective(point, context.inner)

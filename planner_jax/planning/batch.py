@@ -7,6 +7,7 @@ in a loop of its own and waits for no other.
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
@@ -25,6 +26,7 @@ from planner_jax.protocol import (
     HostPlanner,
     LanesPlanner,
     Plan,
+    Status,
     is_solved,
     is_unsolved,
     marked,
@@ -142,18 +144,21 @@ def plan_on_host(
     cases = jax.tree.map(lambda leaf: np.asarray(leaf)[None] if alone else np.asarray(leaf), cases)
     plans, lanes = None, np.arange(_length(cases))
     for attempt in attempts:
-        if plans is not None and watch.is_over:
-            plans = out_of_time(plans, is_unsolved(plans.status))
-            break
+        if plans is not None:
+            due = attempt.is_due(plans)
+            lanes = np.flatnonzero(due)
+            if lanes.size == 0:
+                continue
+            if watch.is_over:
+                plans = out_of_time(plans, due)
+                break
         watch.tell(planner, attempt, 0, lanes.size)
         some = jax.tree.map(lambda leaf, lanes=lanes: leaf[lanes], cases)
         later = marked(planner.solve_on_host(some, attempt), some)
         plans = jax.tree.map(np.array, later) if plans is None else merged(plans, later, lanes)
         watch.tell(planner, attempt, lanes.size, lanes.size)
-        lanes = np.flatnonzero(is_unsolved(plans.status))
-        if lanes.size == 0:
-            break
-    return jax.tree.map(lambda leaf: leaf[0], plans) if alone else plans, lanes.size
+    unsolved = np.sum(is_unsolved(plans.status))
+    return jax.tree.map(lambda leaf: leaf[0], plans) if alone else plans, unsolved
 
 
 def _plan_from_host(
@@ -169,9 +174,14 @@ def _plan_from_host(
     lanes = np.arange(_length(cases))
     plans: Any = None
     for attempt in attempts:
-        if plans is not None and watch.is_over:
-            plans = out_of_time(plans, is_unsolved(plans.status))
-            break
+        if plans is not None:
+            due = attempt.is_due(plans)
+            lanes = np.flatnonzero(due)
+            if lanes.size == 0:
+                continue
+            if watch.is_over:
+                plans = out_of_time(plans, due)
+                break
         calls = _calls(lanes, _sizes(planner, attempt, chunk, mesh), mesh)
         may_end = plans is not None
         found = _solved_from_host(planner, attempt, cases, calls, mesh, watch, may_end)
@@ -190,10 +200,7 @@ def _plan_from_host(
                     plans = merged(plans, later, call[:num])
             if untried.any():
                 plans = out_of_time(plans, untried)
-        lanes = np.flatnonzero(is_unsolved(plans.status))
-        if lanes.size == 0:
-            break
-    return plans, lanes.size
+    return plans, np.sum(is_unsolved(plans.status))
 
 
 def _plan_resident(
@@ -217,15 +224,18 @@ def _plan_resident(
     watch.tell(planner, first, 0, num)
     plans, unsolved = _first_plans(planner, first, cases, sizes, mesh)
     for attempt in others:
-        unsolved.copy_to_host_async()  # on its way as soon as it is known
-        most = np.asarray(unsolved).max()  # of the devices
+        before, due = plans.status, unsolved
+        if attempt.within < math.inf:
+            before, due = _due(mesh, attempt.within, plans)
+        due.copy_to_host_async()  # on its way as soon as it is known
+        most = np.asarray(due).max()  # of the devices
         if most == 0:
-            break
+            continue
         if watch.is_over:
-            plans = out_of_time(plans, is_unsolved(plans.status))
+            plans = out_of_time(plans, attempt.is_due(plans))
             break
-        watch.tell(planner, attempt, 0, np.asarray(unsolved).sum())
-        sizes, before = _sizes(planner, attempt, chunk, mesh), plans.status
+        watch.tell(planner, attempt, 0, np.asarray(due).sum())
+        sizes = _sizes(planner, attempt, chunk, mesh)
         for begin, size in sizes.cuts(most):
             part, lanes = _cut_unsolved(mesh, size, cases, before, _number(mesh, begin))
             later, _ = _solve(planner, attempt, mesh, part)
@@ -449,6 +459,18 @@ def _cut_unsolved(mesh: Mesh, size: int, tree: Any, status: Array, begin: Any) -
         return _taken(tree, lanes), lanes
 
     return _apart(mesh, cut, _LANES, _LANES, PartitionSpec())(tree, status, begin)
+
+
+@functools.partial(jax.jit, static_argnames=("mesh", "within"))
+def _due(mesh: Mesh, within: float, plans: Any) -> tuple[Array, Array]:
+    """Statuses, and how many are unsolved, (devices,), as if plans farther off were solved."""
+
+    def due(plans: Any) -> tuple[Array, Array]:
+        near = plans.violation <= within
+        status = jnp.where(near, plans.status, jnp.full_like(plans.status, Status.FEASIBLE))
+        return status, jnp.sum(is_unsolved(status), keepdims=True)
+
+    return _apart(mesh, due)(plans)
 
 
 @functools.partial(jax.jit, static_argnames=("mesh", "share"))

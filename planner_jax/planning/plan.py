@@ -223,11 +223,11 @@ class _DrivePurely:
         first, *others = planner.attempts if attempts is None else attempts
         plans = solve_cases(planner, cases, first)
         for attempt in others:
-            unsolved = is_unsolved(plans.status)
-            again = lambda plans, attempt=attempt, unsolved=unsolved: better_of(  # noqa: E731
-                plans, solve_cases(planner, cases, attempt), unsolved
+            due = attempt.is_due(plans)
+            again = lambda plans, attempt=attempt, due=due: better_of(  # noqa: E731
+                plans, solve_cases(planner, cases, attempt), due
             )
-            plans = lax.cond(jnp.any(unsolved), again, lambda plans: plans, plans)
+            plans = lax.cond(jnp.any(due), again, lambda plans: plans, plans)
         return plans, is_unsolved(plans.status)
 
 

@@ -6,13 +6,15 @@ from typing import Any
 from planner_jax.planning.batch import solve_cases
 from planner_jax.planning.packed import call_packed
 from planner_jax.planning.watch import Watch
-from planner_jax.protocol import Attempt, Planner, is_solved, is_unsolved, out_of_time
+from planner_jax.protocol import Attempt, Planner, is_solved, out_of_time
 
 
 def plan_single(planner: Planner, attempts: Sequence[Attempt], case: Any, watch: Watch) -> Any:
     """Attempts at one case until one of them solves it, or its time is over."""
     best: Any = None
     for attempt in attempts:
+        if best is not None and not attempt.is_due(best):
+            continue
         if best is not None and watch.is_over:
             return out_of_time(best, True)
         watch.tell(planner, attempt, 0, 1)
@@ -20,8 +22,6 @@ def plan_single(planner: Planner, attempts: Sequence[Attempt], case: Any, watch:
         if best is None or is_solved(int(plan.status)) or plan.violation < best.violation:
             best = plan
         watch.tell(planner, attempt, 1, 1)
-        if not is_unsolved(int(best.status)):
-            break
     return best
 
 

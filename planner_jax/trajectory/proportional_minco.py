@@ -13,6 +13,11 @@ The waypoints are expressed as whitened offsets y from the minimum-energy interp
 the boundary, q = -E_qq^-1 E_qb b + W y with W = R^-T / |R^-T| and E_qq = R R^T, so y = 0 is
 the smoothest guess for any boundary, and the energy is a boundary part plus a multiple of
 |y|^2.
+
+The velocities at the waypoints may be variables as well: offsets z, whitened in the same way, from
+those of least energy for boundary and waypoints. z = 0 leaves the trajectory as it is without
+them, and the energy of z is another multiple of |z|^2, the same one. Such a trajectory is
+2s - 3 times differentiable.
 """
 
 import dataclasses
@@ -42,9 +47,9 @@ class ProportionalMinco:
 
     order: int
     proportions: np.ndarray  # (M,) durations over h, mean one
-    coefficients: np.ndarray  # (M, 2s, 2s + M - 1), of powers of time over h, from [b; y]
-    waypoints: np.ndarray  # (M - 1, 2s + M - 1), waypoints from [b; y]
-    offsets: np.ndarray  # (M - 1, 2s + M - 1), y from [b; waypoints]
+    coefficients: np.ndarray  # (M, 2s, C), of powers of time over h, from C = 2s + O columns [b; y]
+    waypoints: np.ndarray  # (O, C), waypoints from [b; y], and behind them velocities times h
+    offsets: np.ndarray  # (O, C), y from [b; waypoints]
     boundary_energy: np.ndarray  # (2s, 2s), least energy for given boundary rows
     offset_energy: float  # energy a unit of |y|^2
 
@@ -54,7 +59,7 @@ class ProportionalMinco:
         return len(self.proportions)
 
     def sample_matrix(self, nodes: int, derivative: int) -> np.ndarray:
-        """Samples at `nodes` + 1 points a piece, ends shared: (M nodes + 1, 2s + M - 1).
+        """Samples at `nodes` + 1 points a piece, ends shared: (M nodes + 1, C).
 
         Multiply by [b; y] and divide by h^derivative.
         """
@@ -110,13 +115,24 @@ def _energy(coefficients: np.ndarray, shares: np.ndarray) -> np.ndarray:
     return np.einsum("mkb,mkc->bc", parts, parts)
 
 
+def _least_energy(energy: np.ndarray, num: int) -> np.ndarray:
+    """The energy as a form in the first of its unknowns, the others as they are best for these."""
+    kept, free = np.s_[:num], np.s_[num:]
+    best = np.linalg.solve(energy[free, free], energy[free, kept])
+    return energy[kept, kept] - energy[kept, free] @ best
+
+
 @functools.cache
-def proportional_minco(order: int, proportions: tuple[float, ...]) -> ProportionalMinco:
+def proportional_minco(
+    order: int, proportions: tuple[float, ...], velocities: bool = False
+) -> ProportionalMinco:
     """Build the constant maps (cached).
 
     Args:
         order: s, the derivative whose square is integrated: 2, 3 or 4.
         proportions: durations of the M >= 1 pieces relative to each other, all > 0.
+        velocities: whether those at the waypoints are variables too: O = 2 (M - 1) offsets instead
+            of M - 1.
     """
     if not proportions or min(proportions) <= 0.0:
         raise ValueError(f"proportions must be some numbers > 0, got {proportions}")
@@ -132,7 +148,8 @@ def proportional_minco(order: int, proportions: tuple[float, ...]) -> Proportion
         total[span, span] += scaled / shares[i] ** (2 * s - 1)
     head, tail = np.arange(s), np.arange(m * s, (m + 1) * s)
     positions = np.arange(1, m) * s
-    given = np.concatenate([head, tail, positions])
+    kinds = [positions, positions + 1] if velocities else [positions]
+    given = np.concatenate([head, tail, *kinds])
     free = np.setdiff1d(np.arange((m + 1) * s), given)
     nodal = np.zeros(((m + 1) * s, given.size))
     nodal[given] = np.eye(given.size)
@@ -140,13 +157,18 @@ def proportional_minco(order: int, proportions: tuple[float, ...]) -> Proportion
     energy = nodal.T @ total @ nodal
 
     b, q = np.s_[: 2 * s], np.s_[2 * s :]
-    smooth = -np.linalg.solve(energy[q, q], energy[q, b])
-    whitening = np.linalg.inv(np.linalg.cholesky(energy[q, q])).T if m > 1 else np.zeros((0, 0))
-    norm = np.linalg.norm(whitening, 2) if m > 1 else 1.0
-    whitening = whitening / norm
-    from_offsets = np.eye(given.size)
-    from_offsets[q, b] = smooth
-    from_offsets[q, q] = whitening
+    from_offsets, norm = np.eye(given.size), 1.0
+    for k in range(len(kinds) if m > 1 else 0):
+        # From what is best for all before this kind, with what follows as is best for both.
+        begin, end = (2 * s + j * (m - 1) for j in (k, k + 1))
+        before, own = np.s_[:begin], np.s_[begin:end]
+        rest = _least_energy(energy, end)
+        whitening = np.linalg.inv(np.linalg.cholesky(rest[own, own])).T
+        if k == 0:
+            norm = np.linalg.norm(whitening, 2)
+        smooth = -np.linalg.solve(rest[own, own], rest[own, before])
+        from_offsets[own, before] = smooth @ from_offsets[before, before]
+        from_offsets[own, own] = whitening / norm
     to_offsets = np.linalg.inv(from_offsets)
     nodes = nodal @ from_offsets
     pieces = np.stack([nodes[i * s : (i + 2) * s] for i in range(m)])
@@ -177,7 +199,7 @@ def sample_motion(
     Args:
         maps: constant maps of M pieces.
         nodes: intervals a piece; N = M nodes + 1 samples, ends shared.
-        columns: (2s + M - 1, 3) boundary rows and whitened offsets y.
+        columns: (C, 3) boundary rows and whitened offsets y.
         piece_duration: () h = T / M [s].
         orders: 5 for the snap as well.
     """
@@ -200,7 +222,7 @@ def by_pieces(
         function: of the motion at `nodes` + 1 samples of a piece, and of its duration [s].
         maps: as for `sample_motion`, and so are the others.
         nodes: intervals a piece.
-        columns: (2s + M - 1, 3).
+        columns: (C, 3).
         piece_duration: () [s].
 
     Returns:
@@ -240,7 +262,7 @@ def trajectory_energy(maps: ProportionalMinco, rows: Array, offsets: Array, piec
     Args:
         maps: constant maps of M pieces.
         rows: (2s, 3) boundary rows.
-        offsets: (M - 1, 3) whitened offsets y.
+        offsets: (O, 3) whitened offsets y.
         piece_duration: () h = T / M [s].
     """
     boundary = boundary_energy(maps, rows, piece_duration)
