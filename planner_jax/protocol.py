@@ -13,7 +13,6 @@ do the work. Planners that minimise an objective inherit all of it from
 
 import dataclasses
 import enum
-import math
 import os
 from collections.abc import Sequence
 from typing import Any, Protocol, Self, TypeVar, runtime_checkable
@@ -203,17 +202,18 @@ class Attempt:
     """One try at the cases that earlier tries left unsolved; static under jit."""
 
     starts: int = 1  # places that one case takes in a batch
-    # Cases that earlier attempts left with a greater violation are not tried.
-    within: float = dataclasses.field(default=math.inf, kw_only=True)
+    # Cases that earlier attempts left with a greater violation are not tried; None: all are.
+    within: float | None = dataclasses.field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         require_size("starts", self.starts)
-        if numeric(self.within) is None or not self.within > 0.0:
-            raise ValueError(f"within must be a number > 0, got {told(self.within)}")
+        if self.within is not None:
+            require_number("within", self.within, "finite and > 0", lambda x: x > 0.0)
 
     def is_due(self, plans: "Plan") -> Any:
         """Which of the plans so far it is to try and better."""
-        return is_unsolved(plans.status) & (plans.violation <= self.within)
+        unsolved = is_unsolved(plans.status)
+        return unsolved if self.within is None else unsolved & (plans.violation <= self.within)
 
 
 CaseT = TypeVar("CaseT", contravariant=True)

@@ -610,6 +610,7 @@ def test_processes_judge_as_threads_do(monkeypatch):
     lanes = np.arange(600)
     case = {"durations": lanes[:, None].astype(np.float32), "value": lanes.astype(np.float32)}
     in_threads = judging.judge_in_chunks(_halved, case, 256)
+    monkeypatch.setenv("NPROC", "2")
     monkeypatch.setattr(judging, "_MANY_CORES", 1)
     monkeypatch.setattr(judging, "_MANY_LANES", 1)
     in_processes = judging.judge_in_chunks(_halved, case, 256)

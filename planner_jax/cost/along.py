@@ -36,8 +36,8 @@ Rate = Callable[[Motion, Any], Array]
 class Along:
     """Which penalties are integrated, and how: constants of a planner.
 
-    One segment's penalty is the integral of the sum of smoothed hinges of excess + margin, by
-    the trapezoid rule, and that of the rate if there is one.
+    One segment's penalty is the integral of the weighted sum of smoothed hinges of excess +
+    margin, by the trapezoid rule, and that of the rate if there is one.
     """
 
     maps: ProportionalMinco
@@ -51,8 +51,11 @@ class Along:
     # Places (order, axis) of the motion that limits look at together, for `along_curvature`: in
     # those of different groups the penalties are a sum. By default everything together.
     groups: tuple[tuple[tuple[int, int], ...], ...] = ()
+    hinge_weights: tuple[float, ...] = ()  # (E,), of the hinges; by default one each
 
     def __post_init__(self) -> None:
+        if not self.hinge_weights:
+            object.__setattr__(self, "hinge_weights", (1.0,) * len(self.margins))
         if not self.groups:
             every = tuple((order, axis) for order in range(self.orders) for axis in range(3))
             object.__setattr__(self, "groups", (every,))
@@ -62,7 +65,8 @@ class Along:
         code = self.excess.__module__, getattr(self.excess, "__qualname__", "")
         pieces = tuple(self.maps.proportions.tolist())
         shape = self.maps.order, pieces, self.maps.coefficients.shape[-1], self.nodes
-        return *shape, *code, self.margins, self.hinge_width, self.rate is None, self.orders
+        hinges = self.margins, self.hinge_width, self.hinge_weights
+        return *shape, *code, *hinges, self.rate is None, self.orders
 
     def matrices(self) -> np.ndarray:
         """Position and derivatives at the samples, in time over h, from columns: (K, orders, C)."""
@@ -219,10 +223,13 @@ def _of_segment(
 ) -> tuple[Array, Array]:
     """Penalty and greatest excess of one segment."""
     weights = jnp.asarray(along.weights(), columns.dtype)
-    margins = jnp.asarray(np.array(along.margins)[:, None], columns.dtype)
+    margins, factors = (
+        jnp.asarray(np.array(each)[:, None], columns.dtype)
+        for each in (along.margins, along.hinge_weights)
+    )
     motion = sample_motion(along.maps, along.nodes, columns, duration, along.orders)
     excess = jnp.stack(along.excess(motion, parameters))
-    hinges = smoothed_hinge(excess + margins, along.hinge_width)
+    hinges = factors * smoothed_hinge(excess + margins, along.hinge_width)
     penalty = duration * jnp.sum(hinges * weights)
     if along.rate is not None:
         penalty = penalty + duration * jnp.sum(along.rate(motion, parameters) * weights)

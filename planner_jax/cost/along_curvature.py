@@ -152,14 +152,18 @@ def _at_samples(
 
     Groups of slots that no limit looks at together share the tangents of one derivative.
     """
-    margins = jnp.asarray(np.array(along.margins)[:, None], motion.dtype)
+    margins, factors = (
+        jnp.asarray(np.array(each)[:, None], motion.dtype)
+        for each in (along.margins, along.hinge_weights)
+    )
 
     def value(at: Array) -> tuple[Array, tuple[Array, Array]]:
         pos, vel, acc, jerk, *snap = at
         parts: Any = {"snap": snap[0]} if snap else {}
         samples = Motion(height=pos[:, 2], vel=vel, acc=acc, jerk=jerk, pos=pos, **parts)
         excess = jnp.stack(along.excess(samples, parameters))
-        penalty = jnp.sum(smoothed_hinge(excess + margins, along.hinge_width), axis=0)
+        hinges = smoothed_hinge(excess + margins, along.hinge_width)
+        penalty = jnp.sum(factors * hinges, axis=0)
         if along.rate is not None:
             penalty = penalty + along.rate(samples, parameters)
         return jnp.sum(penalty), (penalty, jnp.max(excess))

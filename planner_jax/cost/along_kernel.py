@@ -263,8 +263,8 @@ def _penalty(along: "Along", unit: list, duration: Array, given: Any) -> tuple[A
     """Sum of hinges times the duration, and the greatest excess of all."""
     excess = _excess(along, unit, duration, given)
     hinges = [
-        smoothed_hinge(value + margin, along.hinge_width)
-        for value, margin in zip(excess, along.margins, strict=True)
+        factor * smoothed_hinge(value + margin, along.hinge_width)
+        for value, margin, factor in zip(excess, along.margins, along.hinge_weights, strict=True)
     ]
     return duration * _total(hinges), functools.reduce(jnp.maximum, excess)
 

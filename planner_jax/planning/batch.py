@@ -7,7 +7,6 @@ in a loop of its own and waits for no other.
 
 import dataclasses
 import functools
-import math
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
@@ -225,7 +224,7 @@ def _plan_resident(
     plans, unsolved = _first_plans(planner, first, cases, sizes, mesh)
     for attempt in others:
         before, due = plans.status, unsolved
-        if attempt.within < math.inf:
+        if attempt.within is not None:
             before, due = _due(mesh, attempt.within, plans)
         due.copy_to_host_async()  # on its way as soon as it is known
         most = np.asarray(due).max()  # of the devices

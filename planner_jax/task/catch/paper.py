@@ -9,14 +9,16 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.cost.penalty import joined_trapezoid_weights, smoothed_hinge, steep_hinge
+from planner_jax.arithmetic import components
+from planner_jax.cost.along import Along, integrate_along
+from planner_jax.cost.penalty import steep_hinge
 from planner_jax.cost.quadrotor import ground_excess, speed_excess
 from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.problem import Round, Stage
 from planner_jax.protocol import require_settings
-from planner_jax.robot.quadrotor import body_rate_squared, body_z, net_thrust
+from planner_jax.robot.quadrotor import QuadrotorLimits, body_rate_squared, body_z
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.chain import (
     CatchContext,
@@ -32,7 +34,7 @@ from planner_jax.task.catch.chain import (
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.task.catch.reach import is_too_far
 from planner_jax.trajectory.minimum_jerk import minimum_jerk
-from planner_jax.trajectory.polynomial import evaluate
+from planner_jax.trajectory.polynomial import Motion, evaluate
 from planner_jax.trajectory.proportional_minco import (
     ProportionalMinco,
     equal_pieces,
@@ -40,9 +42,11 @@ from planner_jax.trajectory.proportional_minco import (
 )
 
 _ORDER = 4  # minimum snap
-# Units of the variables of a catch, log duration to jerk. Found by trial on the cost gap: the
-# hinges are so stiff that curvature measured at one point says little about the next.
-_CATCH_SCALE = (0.03, *(0.1,) * 3, *(1.0,) * 3, *(2.0,) * 3, *(4.0,) * 3)
+# Units of the offsets, and of the variables of a catch, log duration to jerk. Found by trial on the
+# cost gap of generated throws: the hinges are so stiff that curvature measured at one point says
+# little about the next.
+_OFFSET_SCALE = 0.05
+_CATCH_SCALE = (0.035, *(0.06,) * 3, *(0.6,) * 3, *(1.2,) * 3, *(2.4,) * 3)
 _PATIENT: dict[str, Any] = {
     "memory": 16,
     "trial_steps": (1.0, 2.5, 0.3, 0.05),
@@ -50,6 +54,29 @@ _PATIENT: dict[str, Any] = {
     "patience": 10,
 }
 COST_UNIT = 1e3  # the solver wants curvatures of moderate size
+
+
+def limits_excess(motion: Motion, given: tuple[Array, QuadrotorLimits]) -> tuple[Array, ...]:
+    """Excess over speed, body rate, thrust and ground, squares in their own units (eqs 26-28).
+
+    That of the thrust f is (f - middle)^2 - half^2 of its bounds.
+
+    Args:
+        motion: samples of a trajectory.
+        given: gravity and limits of a case.
+    """
+    gravity, limits = given
+    x, y, z = components(motion.acc)
+    along_z = z + gravity
+    thrust = jnp.sqrt(jnp.maximum(x * x + y * y + along_z * along_z, 1e-6))
+    least, most = limits.thrust_bounds
+    middle, half = 0.5 * (most + least), 0.5 * (most - least)
+    return (
+        speed_excess(motion.vel, limits) * limits.speed**2,
+        body_rate_squared(motion.acc, motion.jerk, gravity) - limits.body_rate**2,
+        (thrust - middle) ** 2 - half**2,
+        ground_excess(motion.height, limits),
+    )
 
 
 @struct.dataclass
@@ -115,7 +142,7 @@ class PaperCatch(OptimisedPlanner):
         if self.num_pieces < 2:
             raise ValueError(f"num_pieces must be >= 2, got {self.num_pieces}")
         if not self.scale:
-            object.__setattr__(self, "scale", (0.08,) * self.num_offsets + _CATCH_SCALE)
+            object.__setattr__(self, "scale", (_OFFSET_SCALE,) * self.num_offsets + _CATCH_SCALE)
 
     @property
     def maps(self) -> ProportionalMinco:
@@ -200,44 +227,33 @@ class PaperCatch(OptimisedPlanner):
         offsets = natural[:, : self.num_offsets].reshape(natural.shape[0], -1, 3)
         return Chain(rows=rows, offsets=offsets, piece_durations=piece_durations), catch
 
-    def _terms(self, point: Array, context: CatchContext) -> tuple[Array, Array, Chain, Catch]:
-        """Violations along the way, (4, N, K), in their own units, and the rest of the cost."""
-        chain, catch = self._unpack(point, context)
-        case, limits = context.case, context.case.limits
-        motion = chain_motion(self.maps, self.nodes, chain)
-        thrust = jnp.sqrt(
-            jnp.maximum(jnp.sum(net_thrust(motion.acc, case.gravity) ** 2, axis=-1), 1e-6)
-        )
-        least, most = limits.thrust_bounds
-        middle, half = 0.5 * (most + least), 0.5 * (most - least)
-        rate = body_rate_squared(motion.acc, motion.jerk, case.gravity)
-        along = jnp.stack(
-            [
-                speed_excess(motion.vel, limits) * limits.speed**2,
-                rate - limits.body_rate**2,
-                (thrust - middle) ** 2 - half**2,
-                ground_excess(motion.height, limits),
-            ]
-        )
-        at_catch = self.miss_weight * steep_hinge(catch.miss, case.net.radius)
+    def _at_ends(self, chain: Chain, catch: Catch, context: CatchContext) -> Array:
+        """The cost of energy, catches and time, ()."""
+        at_catch = self.miss_weight * steep_hinge(catch.miss, context.case.net.radius)
         at_catch += self.angle_weight * steep_hinge(catch.angle_excess, self.hinge_width)
         energy = chain_energy(self.maps, chain)
         rest = jnp.sum(jnp.where(context.active, at_catch + energy, 0.0))
-        return along, rest + self.time_weight * catch.times[-1], chain, catch
+        return rest + self.time_weight * catch.times[-1]
+
+    def _along(self) -> Along:
+        """Penalties of the limits along the way."""
+        return Along(
+            maps=self.maps,
+            nodes=self.nodes,
+            excess=limits_excess,
+            margins=(0.0,) * 4,
+            hinge_width=self.hinge_width,
+            hinge_weights=(self.limit_weight,) * 3 + (self.ground_weight,),
+        )
 
     def objective(self, point: Array, context: CatchContext) -> Evaluation:
         """The paper's cost over 1000. It names no violation, so the last iterate is the plan."""
-        along, rest, chain, _ = self._terms(point, context)
-        hinges = jnp.asarray(self._weights(), point.dtype) * smoothed_hinge(along, self.hinge_width)
-        weights = joined_trapezoid_weights(self.nodes, self.maps.proportions)
-        spans = chain.piece_durations[:, None] * jnp.asarray(weights, point.dtype)
-        penalty = jnp.sum(jnp.where(context.active[:, None], spans * jnp.sum(hinges, axis=0), 0.0))
-        cost = penalty + rest
+        chain, catch = self._unpack(point, context)
+        given = (context.case.gravity, context.case.limits)
+        along, _ = integrate_along(self._along(), chain.columns, chain.piece_durations, given)
+        penalty = jnp.sum(jnp.where(context.active, along, 0.0))
+        cost = penalty + self._at_ends(chain, catch, context)
         return Evaluation(cost=cost / COST_UNIT, violation=jnp.zeros_like(cost))
-
-    def _weights(self) -> np.ndarray:
-        """Weights of the four limits along the way."""
-        return np.array([self.limit_weight] * 3 + [self.ground_weight])[:, None, None]
 
     def rules_out(self, context: CatchContext) -> Array:
         """Whether a target is never within reach."""
@@ -245,8 +261,10 @@ class PaperCatch(OptimisedPlanner):
 
     def decode(self, point: Array, context: CatchContext) -> CatchPlan:
         """The plan at a point, its violation that of the protocol's samples."""
-        along, _, chain, catch = self._terms(point, context)
-        limits, net = context.case.limits, context.case.net
+        chain, catch = self._unpack(point, context)
+        gravity, limits, net = context.case.gravity, context.case.limits, context.case.net
+        motion = chain_motion(self.maps, self.nodes, chain)
+        along = jnp.stack(limits_excess(motion, (gravity, limits)))  # (4, N, K)
         least, most = limits.thrust_bounds
         half = 0.5 * (most - least)
         units = jnp.stack([limits.speed**2, limits.body_rate**2, half**2, limits.min_height])
