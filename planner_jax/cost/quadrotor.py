@@ -123,6 +123,21 @@ def thrust_excess(
     return 1.0 - squared * reciprocal(least) ** 2, squared * reciprocal(most) ** 2 - 1.0
 
 
+def thrust_band_excess(acc: Components, gravity: Array, least: Array, most: Array) -> Array:
+    """(f - middle)^2 - half^2 [m^2/s^4] of the bounds of the thrust f (paper 000's C++ protocol).
+
+    Args:
+        acc: (..., 3) [m/s^2].
+        gravity: () [m/s^2].
+        least: () [m/s^2], per unit mass.
+        most: () [m/s^2], per unit mass.
+    """
+    x, y, z = components(acc)
+    thrust = jnp.sqrt(jnp.maximum(_size_squared((x, y, z + gravity)), 1e-6))
+    middle, half = 0.5 * (most + least), 0.5 * (most - least)
+    return (thrust - middle) ** 2 - half**2
+
+
 class Measure(enum.Enum):
     """What an excess is in the terms of the quantity q and its limit, and what it is of."""
 

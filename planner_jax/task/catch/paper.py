@@ -9,10 +9,9 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.arithmetic import components
 from planner_jax.cost.along import Along, integrate_along
 from planner_jax.cost.penalty import steep_hinge
-from planner_jax.cost.quadrotor import ground_excess, speed_excess
+from planner_jax.cost.quadrotor import ground_excess, speed_excess, thrust_band_excess
 from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.planner import OptimisedPlanner, pending
@@ -59,22 +58,15 @@ COST_UNIT = 1e3  # the solver wants curvatures of moderate size
 def limits_excess(motion: Motion, given: tuple[Array, QuadrotorLimits]) -> tuple[Array, ...]:
     """Excess over speed, body rate, thrust and ground, squares in their own units (eqs 26-28).
 
-    That of the thrust f is (f - middle)^2 - half^2 of its bounds.
-
     Args:
         motion: samples of a trajectory.
         given: gravity and limits of a case.
     """
     gravity, limits = given
-    x, y, z = components(motion.acc)
-    along_z = z + gravity
-    thrust = jnp.sqrt(jnp.maximum(x * x + y * y + along_z * along_z, 1e-6))
-    least, most = limits.thrust_bounds
-    middle, half = 0.5 * (most + least), 0.5 * (most - least)
     return (
         speed_excess(motion.vel, limits) * limits.speed**2,
         body_rate_squared(motion.acc, motion.jerk, gravity) - limits.body_rate**2,
-        (thrust - middle) ** 2 - half**2,
+        thrust_band_excess(motion.acc, gravity, *limits.thrust_bounds),
         ground_excess(motion.height, limits),
     )
 
