@@ -31,7 +31,7 @@ from planner_jax.task.catch.paper import COST_UNIT, PaperCatch
 
 SETS = ("paper", "hard")
 BATCH_COPIES = 64
-_QUICK, _QUICK_COARSE = 40, 50  # iterations of the quick `catch`
+_QUICK, _QUICK_COARSE = 45, 60  # iterations of the quick `catch`
 
 
 def read_set(path: Path, dtype) -> tuple[pj.catch.CatchCase, dict[str, np.ndarray]]:

@@ -141,7 +141,8 @@ def plan_on_host(
     """As `plan_batch`, by a planner that works on the host; NumPy leaves. One case will do, too."""
     alone = cases.batch_shape == ()
     cases = jax.tree.map(lambda leaf: np.asarray(leaf)[None] if alone else np.asarray(leaf), cases)
-    plans, lanes = None, np.arange(_length(cases))
+    plans: Any = None
+    lanes = np.arange(_length(cases))
     for attempt in attempts:
         if plans is not None:
             due = attempt.is_due(plans)
