@@ -148,7 +148,8 @@ class ExactHit(OptimisedPlanner):
     y, log impact time, log flight time after it, log thrust, two racket velocities across the
     normal, jerk at the impact. From the two times follow the ball's velocities before and
     after (target reached exactly), from these normal and normal speed of the racket (paper
-    002, eqs 11-12), and so position, velocity and acceleration at the impact.
+    002, eqs 11-12), and so position, velocity and acceleration at the impact. With `velocities`
+    those at the waypoints are 3 (M - 1) variables more, behind the offsets.
 
     Cost: energy_weight * integral |snap|^2 + integral of the smoothed hinges of the limits
     (paper 002, eq. 18a), and of the case's extras + hinges of apex (eq. 21) and hitting speed
