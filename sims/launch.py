@@ -62,7 +62,6 @@ def ready(loop: Loop, starts: Array, keys: Array) -> FlightState:
     return jax.vmap(one)(starts, keys)
 
 
-@functools.partial(jax.jit, static_argnames=("loop", "ball", "seen"))
 def launched(
     loop: Loop,
     flights: FlightState,
@@ -81,9 +80,25 @@ def launched(
         balls: leaves (B, N, 3), each when it is planned for.
         drag: (B, N) K_D [1/m], the true one.
         believed: (B, N) K_D [1/m].
-        ball: which of the N (static).
+        ball: which of the N.
         seen: [s] that it has been in flight already (static).
     """
+    without = dataclasses.replace(flights, plan=None)  # of which nothing is changed
+    after = _launched(loop, without, balls, drag, believed, ball, seen)
+    return dataclasses.replace(after, plan=flights.plan)
+
+
+@functools.partial(jax.jit, static_argnames=("loop", "seen"))
+def _launched(
+    loop: Loop,
+    flights: FlightState,
+    balls: BallState,
+    drag: Array,
+    believed: Array,
+    ball: Array,
+    seen: float,
+) -> FlightState:
+    """As `launched`, of flights without plans."""
 
     def one(flight: FlightState, balls: BallState, drag: Array, believed: Array) -> FlightState:
         key, look_key = jax.random.split(flight.key)
@@ -104,7 +119,7 @@ def launched(
     return jax.vmap(one)(flights, balls, drag, believed)
 
 
-@functools.partial(jax.jit, static_argnames=("loop", "ball", "ahead"))
+@functools.partial(jax.jit, static_argnames=("loop", "ahead"))
 def awaited(
     loop: Loop, flights: FlightState, coming: BallState, believed: Array, *, ball: int, ahead: float
 ) -> FlightState:
@@ -117,7 +132,7 @@ def awaited(
         flights: leaves (B, ...).
         coming: leaves (3,), as it is guessed to be when it is planned for.
         believed: (B, N) K_D [1/m].
-        ball: which of the N (static).
+        ball: which of the N.
         ahead: [s] until it is planned for (static).
     """
     gravity = jnp.asarray(loop.world.gravity, believed.dtype)

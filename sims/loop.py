@@ -67,6 +67,10 @@ class Pilot(Protocol):
         """When each ball is to be met (N,) [s] since the plan began, in the balls' order."""
         ...
 
+    def plan_shapes(self, cases: Any) -> Any:
+        """What plans (B, ...) of cases (B, ...) look like, leaves `jax.ShapeDtypeStruct`."""
+        ...
+
     @property
     def passage(self) -> Callable[..., tuple[Array, Contact]]:
         """What says which balls are met or missed within a step, like `scoring.passage`."""
@@ -314,7 +318,7 @@ def _recorded(loop: Loop, pilot: Pilot, flight: FlightState, drag: Array) -> Rec
     )
 
 
-def _in_parts(flights: FlightState) -> bool:
+def in_parts(flights: FlightState) -> bool:
     """Whether each part of a period is a program of its own."""
     (device,) = flights.time.devices()
     return device.platform != "cpu" and len(flights.time) <= _FEW
@@ -333,9 +337,9 @@ def _next_period(
         drag: (B, N) K_D [1/m].
         begin: begins a part of the period with what it is given, and returns what waits for it.
     """
-    flown_on = begin(_fly, loop, pilot, flights, drag, 1)
     outlook, asked = _asked(loop, pilot, flights, cases)
     found = [begin(_found, pilot, number, asked) for number in range(len(pilot.searches))]
+    flown_on = begin(_fly, loop, pilot, flights, drag, 1)
     flights, record = flown_on()
     return _with_plans(pilot, flights, outlook, asked, tuple(each() for each in found)), record
 
@@ -377,7 +381,7 @@ def fly_leg(
     """
     if loop.replan == 0.0:
         flights, record = _fly(loop, pilot, flights, drag, num_periods)
-    elif not _in_parts(flights):
+    elif not in_parts(flights):
         flights, record = _fly_and_plan(loop, pilot, flights, cases, drag, num_periods)
     else:
         with ThreadPoolExecutor() as pool:
@@ -388,6 +392,41 @@ def fly_leg(
                 records.append(record)
         return flights, records if loop.record else []
     return flights, [record] if loop.record else []
+
+
+def begin_compiling(
+    loop: Loop, pilot: Pilot, flights: FlightState, cases: Any, drag: Array
+) -> Callable[[], Any]:
+    """Have the programs of a leg compiled by another thread, while something else is done.
+
+    Only where each part of a period is a program of its own; elsewhere nothing is begun. For the
+    programs to be those of `fly_leg`, one period is flown by plans that are nothing but zeros.
+
+    Args:
+        loop: what shapes the programs.
+        pilot: of the task.
+        flights: leaves (B, ...), which may be without plans.
+        cases: as for `fly_leg`; only their shapes count, leaves may be `jax.ShapeDtypeStruct`.
+        drag: (B, N) K_D [1/m].
+
+    Returns:
+        What waits for its end, to be called before `fly_leg`.
+    """
+    if loop.replan == 0.0 or not in_parts(flights):
+        return lambda: None
+    # By way of the host, as plans are that are made there.
+    zeros = functools.partial(
+        jax.tree.map, lambda leaf: jnp.asarray(np.zeros(leaf.shape, leaf.dtype))
+    )
+
+    def fly_one_period() -> None:
+        begun = dataclasses.replace(flights, plan=zeros(pilot.plan_shapes(cases)))
+        fly_leg(loop, pilot, begun, zeros(cases), drag, num_periods=1)
+
+    pool = ThreadPoolExecutor(1)
+    compiled = pool.submit(as_here(fly_one_period))
+    pool.shutdown(wait=False)
+    return compiled.result
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """Run folders of flights, films, and the command `planner-jax fly`."""
 
 import dataclasses
+import re
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,7 @@ from planner_jax.registry import Task, all_tasks
 from planner_jax.sims import loop as sims_loop
 from planner_jax.sims.film import FilmError, draw_flight, film_flights, require_film
 from planner_jax.sims.launch import flight_keys, launched, ready
-from planner_jax.sims.loop import flown, fly_leg
+from planner_jax.sims.loop import begin_compiling, flown, fly_leg
 from planner_jax.sims.recording import Launches
 from planner_jax.sims.run import start_flights
 from planner_jax.sims.scoring import passage
@@ -203,6 +204,14 @@ class DropPilot:
 class RisingPilot(DropPilot):
     """Has two plans made anew: the last one, and one that is a millimetre higher."""
 
+    num: int = 2
+
+    def plan_shapes(self, cases):
+        of = lambda *sizes: jax.ShapeDtypeStruct((self.num, *sizes), jnp.float32)  # noqa: E731
+        path, one = of(1, 8, 3), of(1)
+        codes = jax.ShapeDtypeStruct((self.num,), jnp.int32)
+        return HoverPlan(PiecewisePolynomial(path, one), codes, codes)
+
     def asked(self, case, plan, outlook):
         return plan
 
@@ -267,13 +276,37 @@ def test_the_parts_of_a_period_fly_as_one_program_does(monkeypatch):
     loop = dataclasses.replace(flight.loop(True), replan=50.0)
     flights = []
     for in_parts in (False, True):
-        monkeypatch.setattr(sims_loop, "_in_parts", lambda _, parts=in_parts: parts)
+        monkeypatch.setattr(sims_loop, "in_parts", lambda _, parts=in_parts: parts)
         state, looks, _ = flight.leg(loop, flight.cases(), RisingPilot(), 8)
         flights.append(dataclasses.asdict(flown(state, looks)))
     whole, parts = flights
     assert whole["plan"]["trajectory"]["coeffs"][0, 0, 0, 2] == pytest.approx(1.004, abs=1e-6)
     assert whole["record"]["time"].shape == (2, 8 * loop.looks_per_plan)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=2e-5), whole, parts)
+
+
+@pytest.mark.slow
+def test_a_leg_compiled_ahead_is_not_compiled_again(monkeypatch, caplog):
+    monkeypatch.setattr(sims_loop, "in_parts", lambda _: True)
+    flight = DropFly(num=3, noise="none").flight()
+    loop = dataclasses.replace(flight.loop(False), replan=50.0)
+    pilot, drag = RisingPilot(3), jnp.zeros((3, 1))
+    start = ready(loop, jnp.zeros((3, 3)), flight_keys(0, flight.cases().index))
+    jax.config.update("jax_log_compiles", True)  # of every thread
+    try:
+        begin_compiling(loop, pilot, start, None, drag)()
+        ahead = compiled_parts(caplog)
+        plan = jax.tree.map(lambda leaf: jnp.ones(leaf.shape, leaf.dtype), pilot.plan_shapes(None))
+        fly_leg(loop, pilot, start.replace(plan=plan), None, drag, num_periods=3)
+    finally:
+        jax.config.update("jax_log_compiles", False)
+    assert ahead == ["_asked", "_fly", "_found", "_found", "_with_plans"]
+    assert compiled_parts(caplog) == ahead
+
+
+def compiled_parts(caplog):
+    found = re.findall(r"Finished XLA compilation of jit\((_\w+)\)", caplog.text)
+    return sorted(name for name in found if hasattr(sims_loop, name))
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.problem import Round, Stage
 from planner_jax.planning import batch
+from planner_jax.planning.ahead import compile_attempts
 from planner_jax.planning.plan import plan, plan_across_processes, solve
 from planner_jax.protocol import Plan, Status, is_solved
 
@@ -139,6 +140,25 @@ def test_new_batch_sizes_of_one_bucket_are_not_traced_again():
     plan(WellPlanner(), Well(GOALS[:2]))
     plan(WellPlanner(), Well(GOALS[1:]))
     assert TRACES == []
+
+
+def test_what_was_compiled_ahead_is_not_traced_again():
+    first, second = WellPlanner().rounds
+    own = dataclasses.replace(first, solver=LbfgsConfig(max_steps=41, step_cap=0.2))
+    planner, easy = WellPlanner(rounds=(own, second, own)), Well(GOALS[:1].repeat(3))
+    compile_attempts(planner, easy)
+    before = len(TRACES)
+    plans = plan(planner, Well(np.append(GOALS, np.float32(np.nan))))
+    assert is_solved(plans.status).tolist() == [True] * 5 + [False]
+    assert len(TRACES) == before
+
+
+def test_a_plans_shapes_are_known_without_planning():
+    shapes = WellPlanner().plan_shapes(jax.eval_shape(lambda: Well(jnp.asarray(GOALS))))
+    made = plan(WellPlanner(), Well(GOALS))
+    assert jax.tree.map(lambda x: (x.shape, x.dtype), shapes) == jax.tree.map(
+        lambda x: (x.shape, x.dtype), made
+    )
 
 
 def test_a_lane_that_is_not_finite_says_so_and_spoils_no_neighbour():

@@ -4,6 +4,7 @@ import abc
 import dataclasses
 from typing import Any, ClassVar, Self
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -109,6 +110,19 @@ class OptimisedPlanner(abc.ABC):
     def solve_lanes(self, cases: Any, attempt: Round) -> Any:
         """The plans of a batch by one round."""
         return solve_batch(self, attempt, cases)
+
+    def plan_shapes(self, cases: Any) -> Any:
+        """What plans (B, ...) of cases (B, ...) look like, leaves `jax.ShapeDtypeStruct`.
+
+        Args:
+            cases: leaves may be `jax.ShapeDtypeStruct`, too.
+        """
+
+        def plan(case: Any) -> Any:
+            context = self.prepare(case)
+            return self.decode(self.guesses(context, 1)[0], context)
+
+        return jax.eval_shape(jax.vmap(plan), cases)
 
     def changed(self, settings: Settings) -> Self:
         """The planner with some of its fields set anew; its plans keep their shape."""

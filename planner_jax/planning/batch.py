@@ -119,6 +119,35 @@ def plan_batch(
     return (jax.device_put(plans, _sharding(mesh)) if resident else plans), unsolved
 
 
+def compile_at_once(planner: Any, attempts: Sequence[Attempt], cases: Any) -> Any:
+    """Try all attempts at the first of B cases, each in a thread of its own.
+
+    Afterwards the programs are compiled that `plan_batch` takes for as many on all local devices.
+
+    Args:
+        planner: that makes them.
+        attempts: one or more.
+        cases: a leading axis of B on every leaf.
+
+    Returns:
+        What the first attempt makes of the cases, (B, ...) or the first of them.
+    """
+    mesh = Mesh(np.array(jax.local_devices()), ("lanes",))
+    cases = jax.tree.map(np.asarray, cases)
+
+    def tried(attempt: Attempt) -> Any:
+        (lanes, num), *_ = _calls(
+            np.arange(_length(cases)), _sizes(planner, attempt, None, mesh), mesh
+        )
+        part = jax.device_put(jax.tree.map(lambda leaf: leaf[lanes], cases), _sharding(mesh))
+        found, _ = _solve(planner, attempt, mesh, part)
+        _COMPILED.add(_program(planner, attempt, lanes.size // mesh.size, cases))
+        return jax.tree.map(lambda leaf: leaf[:num], found)
+
+    with ThreadPoolExecutor(len(attempts)) as pool:
+        return next(iter(list(pool.map(as_here(tried), attempts))))
+
+
 def solve_cases(planner: Any, cases: Any, attempt: Attempt) -> Any:
     """The plans of one case, or of a batch with a leading axis on every leaf; pure.
 

@@ -22,6 +22,7 @@ from planner_jax.ball.prediction import PathTable, predict_path
 from planner_jax.ball.target import BallPath
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
+from planner_jax.planning.ahead import compile_attempts
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.planning.plan import plan as plan_all
 from planner_jax.planning.replan import Replanning
@@ -36,7 +37,17 @@ from planner_jax.sims.launch import (
     require_plan,
     require_world,
 )
-from planner_jax.sims.loop import FlightState, Flown, Loop, Outlook, expected, flown, fly_leg
+from planner_jax.sims.loop import (
+    FlightState,
+    Flown,
+    Loop,
+    Outlook,
+    begin_compiling,
+    expected,
+    flown,
+    fly_leg,
+    in_parts,
+)
 from planner_jax.sims.model import World
 from planner_jax.sims.recording import Launches
 from planner_jax.sims.robots.quadrotor.robot import Quadrotor
@@ -108,6 +119,10 @@ class CatchPilot:
     def times(self, plan: CatchPlan) -> Array:
         """When each ball is to be caught (N,) [s], in the balls' order."""
         return jnp.zeros_like(plan.times).at[plan.order].set(plan.times)
+
+    def plan_shapes(self, cases: CatchCase) -> CatchPlan:
+        """Those of the planner behind the re-planner."""
+        return self.planner.planner.plan_shapes(cases)
 
     def asked(
         self, case: CatchCase, plan: CatchPlan, outlook: Outlook
@@ -394,6 +409,10 @@ def fly_catches(
     balls, guess = jax.tree.map(jnp.asarray, (cases.balls, cases.believed))
     keys = flight_keys(seed, cases.index)
     flight = ready(loop, jnp.tile(jnp.array(START), (len(cases), 1)), keys)
+    nothing = np.zeros(num_balls, bool), np.zeros(cases.horizon.shape, np.float32)
+    compiled = begin_compiling(
+        loop, pilot, flight, believed.eval_shape(loop, flight, *nothing), drag
+    )
     first: Any = plan
     records, planning = [], 0.0
     shortest, window = earliest_throw("throws")
@@ -417,11 +436,14 @@ def fly_catches(
             known = jax.tree.map(np.asarray, known)
             began = time.perf_counter()
             limits = [bounds(loop, each) for each in _LIMITS]
+            if ball == 0 and not last and in_parts(flight):  # some lanes will need all attempts
+                compile_attempts(planner, known)
             known, found = planned_ahead(planner, known, ball, limits)
             planning += time.perf_counter() - began
         first = found if first is None else first
         begun = jax.tree.map(jnp.asarray, found)
         flight = with_catch(flight, begun, jnp.asarray(known.present))
+        compiled()
         flight, looks = fly_leg(
             loop,
             pilot,

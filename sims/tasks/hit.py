@@ -21,7 +21,16 @@ from planner_jax.protocol import AnyPlanner
 from planner_jax.robot.quadrotor_model import QuadrotorModel
 from planner_jax.robot.quadrotor_models import PAPER_HITTER
 from planner_jax.sims.launch import flight_keys, launched, ready, require_plan, require_world
-from planner_jax.sims.loop import FlightState, Flown, Loop, Outlook, expected, flown, fly_leg
+from planner_jax.sims.loop import (
+    FlightState,
+    Flown,
+    Loop,
+    Outlook,
+    begin_compiling,
+    expected,
+    flown,
+    fly_leg,
+)
 from planner_jax.sims.model import World
 from planner_jax.sims.recording import Launches
 from planner_jax.sims.robots.quadrotor.robot import Quadrotor
@@ -107,6 +116,10 @@ class HitPilot:
     def times(self, plan: HitPlan) -> Array:
         """When the ball is to be hit (1,) [s]."""
         return plan.stroke.time[None]
+
+    def plan_shapes(self, cases: HitCase) -> HitPlan:
+        """Those of the planner behind the re-planner."""
+        return self.planner.planner.plan_shapes(cases)
 
     def asked(self, case: HitCase, plan: HitPlan, outlook: Outlook) -> Replanning[HitCase, HitPlan]:
         """What is to be planned anew, while a plan is flown."""
@@ -239,6 +252,7 @@ def fly_hits(
     keys = flight_keys(seed, cases.index)
     drag = truth.drag[:, None]
     flight = ready(loop, truth.head_state[:, 0], keys)
+    compiled = begin_compiling(loop, pilot, flight, truth, drag)
     balls = jax.tree.map(lambda leaf: leaf[:, None], truth.ball)
     guess = jnp.asarray(cases.believed)[:, None]
     flight = launched(loop, flight, balls, drag, guess, ball=0, seen=SEEN)
@@ -252,6 +266,7 @@ def fly_hits(
     begun = jax.tree.map(jnp.asarray, jax.device_get(first))
     flight = dataclasses.replace(flight, plan=begun, began=flight.time, present=flight.launched)
     periods = loop.num_periods(_LONGEST - SEEN + _AFTER)
+    compiled()
     flight, records = fly_leg(loop, pilot, flight, known, drag, num_periods=periods)
     back, truth = _returned(flight.contact, truth), cases.cases
     point = landing(back.pos, back.vel, truth.drag, truth.gravity)[1]
