@@ -236,13 +236,13 @@ def test_later_rounds_are_for_cases_without_any_solved_order(kind, num, calls, p
     horizon = np.array(pairs.horizon)
     horizon[1, 1] = 0.7
     pairs = dataclasses.replace(pairs, horizon=horizon)
-    planned, real = [], batch._plan_from_host
+    planned, real = [], batch.plan_from_host
 
     def noted(planner, attempts, cases, *where):
         planned.append((len(attempts), cases.order.shape[0]))
         return real(planner, attempts, cases, *where)
 
-    monkeypatch.setattr(batch, "_plan_from_host", noted)
+    monkeypatch.setattr(batch, "plan_from_host", noted)
     plans = plan(by(Best(), kind(rounds=num * PLANNER.rounds[:1])), pairs)
     assert is_solved(np.delete(plans.status, [1, 2])).all()
     assert is_unsolved(plans.status[1]) and plans.status[2] == Status.TOO_FAR

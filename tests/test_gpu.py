@@ -125,14 +125,25 @@ def test_gradients_at_the_same_points_are_those_of_a_cpu(devices, serves):
 
     points = run(devices[1], optima, lanes)
     ours, theirs = (run(device, gradients, lanes, points) for device in devices)
-    is_there = [np.isfinite(by["drag"]) for by in (ours, theirs)]
+    with jax.enable_x64(True):
+        exact = run(devices[1], gradients, *jax.tree.map(in_float64, (lanes, points)))
+    is_there = [np.isfinite(by["drag"]) for by in (ours, theirs, exact)]
     assert (is_there[0] == is_there[1]).mean() > 0.98
-    both = is_there[0] & is_there[1]
-    assert both.mean() > 0.9
-    for found, expected in zip(*map(jax.tree.leaves, (ours, theirs)), strict=True):
-        # Where no limit binds the gradient is zero: the size is that of the others.
-        off = np.quantile(np.abs(found - expected)[..., both], 0.95)
-        assert off <= 1e-4 * np.abs(expected[..., both]).max()
+    all_three = np.all(is_there, axis=0)
+    assert all_three.mean() > 0.9
+
+    def off(found, expected):
+        return np.quantile(np.abs(found - expected)[..., all_three], 0.95)
+
+    # Of numbers in float32 a CPU knows the gradient by the drag to 1e-4 itself.
+    for found, other, expected in zip(*map(jax.tree.leaves, (ours, theirs, exact)), strict=True):
+        size = np.abs(expected[..., all_three]).max()
+        assert off(found, expected) <= 3.0 * off(other, expected) + 1e-5 * size
+        assert off(found, other) <= 1e-3 * size
+
+
+def in_float64(leaf):
+    return leaf.astype(np.float64) if leaf.dtype == np.float32 else leaf
 
 
 def test_several_gpus_give_the_plans_of_one(devices, serves):

@@ -13,7 +13,7 @@ from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.problem import Round, Stage
-from planner_jax.planning import batch
+from planner_jax.planning import batch, resident
 from planner_jax.planning.ahead import compile_attempts
 from planner_jax.planning.plan import plan, plan_across_processes, solve
 from planner_jax.protocol import Plan, Status, is_solved
@@ -215,7 +215,7 @@ def test_a_round_needs_a_start():
 @pytest.mark.parametrize("apart", [False, True], ids=["in host memory", "as on a GPU"])
 def test_arrays_on_a_device_stay_there_and_give_the_same_plans(apart, monkeypatch):
     if apart:
-        monkeypatch.setattr(batch, "_is_one_cpu", lambda mesh: False)
+        monkeypatch.setattr(batch, "is_one_cpu", lambda mesh: False)
     goals = np.linspace(-1.0, 5.0, 41).astype(np.float32)
     host = plan(WellPlanner(), Well(goals), chunk=16)
     resident = plan(WellPlanner(), Well(jnp.asarray(goals)), chunk=16)
@@ -227,14 +227,14 @@ def test_arrays_on_a_device_stay_there_and_give_the_same_plans(apart, monkeypatc
 
 def test_a_later_round_takes_only_what_is_unsolved(monkeypatch):
     """On a device that is not the host: also where the last lane fills up the last chunk."""
-    monkeypatch.setattr(batch, "_is_one_cpu", lambda mesh: False)
-    sizes, real = [], batch._solve
+    monkeypatch.setattr(batch, "is_one_cpu", lambda mesh: False)
+    sizes, real = [], resident.solve_on_devices
 
     def noted(planner, attempt, mesh, cases):
         sizes.append(cases.goal.size)
         return real(planner, attempt, mesh, cases)
 
-    monkeypatch.setattr(batch, "_solve", noted)
+    monkeypatch.setattr(resident, "solve_on_devices", noted)
     goals = np.full(300, 0.5, np.float32)
     goals[[7, -1]] = 3.5
     assert is_solved(plan(WellPlanner(), Well(jnp.asarray(goals))).status).all()
@@ -258,7 +258,7 @@ def test_a_round_leaves_alone_what_is_farther_off_than_it_says(kind, monkeypatch
         if kind == "compiled":
             return jax.jit(lambda goals: solve(planner, Well(goals)))(goals)
         if kind == "as on a GPU":
-            monkeypatch.setattr(batch, "_is_one_cpu", lambda mesh: False)
+            monkeypatch.setattr(batch, "is_one_cpu", lambda mesh: False)
             return plan(planner, Well(jnp.asarray(goals)))
         return plan(planner, Well(goals))
 

@@ -14,8 +14,8 @@ from scipy.stats import binomtest
 from sweeps import columns, stop_after
 
 import planner_jax as pj
-from planner_jax.planning.batch import _solve
 from planner_jax.planning.plan import plan
+from planner_jax.planning.programs import solve_on_devices
 from planner_jax.referee.hit import referee_hits
 from planner_jax.robot import quadrotor
 from planner_jax.sweep import run
@@ -308,7 +308,7 @@ def test_published_outcomes_stand_beside_the_plans_of_the_same_serves(tmp_path, 
 
 
 def test_a_single_chunk_is_timed_warm_too(tmp_path, no_report):
-    _solve.clear_cache()  # that program alone, and not all others' of the process
+    solve_on_devices.clear_cache()  # that program alone, and not all others' of the process
     serves = trial_files(tmp_path / "serves")
     manifest = start_sweep(TASK, HitSettings(serves=serves), tmp_path / "run", progress=False)
     times = manifest["times"]

@@ -17,8 +17,8 @@ from planner_jax.ball.flight import BallState, linear_drag_flight, rk4_step
 from planner_jax.ball.target import BallPath
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
-from planner_jax.planning.batch import solve_cases
 from planner_jax.planning.packed import call_packed
+from planner_jax.planning.programs import solve_cases
 from planner_jax.planning.replan import Replanning
 from planner_jax.robot.quadrotor_model import QuadrotorModel
 from planner_jax.robot.quadrotor_models import PAPER_CATCHER, PAPER_HITTER

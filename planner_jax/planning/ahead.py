@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from planner_jax.planning.batch import compile_at_once
+from planner_jax.planning.programs import compile_at_once
 from planner_jax.protocol import AnyPlanner, Attempt
 
 

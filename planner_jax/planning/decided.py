@@ -10,7 +10,7 @@ from flax import struct
 from jax import Array, lax
 from jax.core import Tracer
 
-from planner_jax.planning.batch import better_of, merged
+from planner_jax.planning.better import better_of, merged
 from planner_jax.planning.packed import call_packed
 from planner_jax.protocol import (
     Case,

@@ -12,7 +12,10 @@ from jax.core import Tracer
 from jax.experimental import multihost_utils
 
 from planner_jax.checks import require_size
-from planner_jax.planning.batch import better_of, plan_batch, plan_on_host, solve_cases
+from planner_jax.planning.batch import plan_batch
+from planner_jax.planning.better import better_of
+from planner_jax.planning.from_host import plan_on_host
+from planner_jax.planning.programs import solve_cases
 from planner_jax.planning.single import plan_single
 from planner_jax.planning.watch import Progress, Watch
 from planner_jax.protocol import AnyPlanner, Attempt, Case, Plan, Status, is_unsolved

@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from typing import Any
 
-from planner_jax.planning.batch import solve_cases
 from planner_jax.planning.packed import call_packed
+from planner_jax.planning.programs import solve_cases
 from planner_jax.planning.watch import Watch
 from planner_jax.protocol import Attempt, Planner, is_solved, out_of_time
 

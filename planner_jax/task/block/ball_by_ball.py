@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 
 from planner_jax.ball.flight import BallState
-from planner_jax.planning.batch import solve_cases
+from planner_jax.planning.programs import solve_cases
 from planner_jax.protocol import Attempt, is_solved
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.plan import BlockPlan

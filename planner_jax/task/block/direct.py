@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from planner_jax.planning.batch import first_solved
+from planner_jax.planning.better import first_solved
 from planner_jax.planning.one_by_one import OneByOne
 from planner_jax.protocol import Attempt, require_settings, status_of
 from planner_jax.task.block.case import BlockCase

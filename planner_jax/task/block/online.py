@@ -29,7 +29,7 @@ from planner_jax.optimise.levenberg import (
     go_on,
     least_squares,
 )
-from planner_jax.planning.batch import better_of, first_solved
+from planner_jax.planning.better import better_of, first_solved
 from planner_jax.planning.one_by_one import OneByOne
 from planner_jax.protocol import (
     FEASIBILITY_TOLERANCE,

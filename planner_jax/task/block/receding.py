@@ -19,7 +19,7 @@ from flax import struct
 from jax import Array
 
 from planner_jax.perception.fit import FlightFit, Sight, believed_at
-from planner_jax.planning.batch import merged
+from planner_jax.planning.better import merged
 from planner_jax.planning.plan import plan
 from planner_jax.protocol import Status, is_solved, lane
 from planner_jax.task.block.case import BlockCase

@@ -16,7 +16,7 @@ from jax import Array
 from planner_jax.ball.flight import BallState, drag_free_flight
 from planner_jax.checks import require_beginning, require_kind
 from planner_jax.optimise.levenberg import LevenbergConfig
-from planner_jax.planning.batch import better_of, merged
+from planner_jax.planning.better import better_of, merged
 from planner_jax.planning.one_by_one import OneByOne
 from planner_jax.planning.replan import Replanning, given_or_own, moment_of
 from planner_jax.protocol import Attempt, Drive, is_unsolved, lane

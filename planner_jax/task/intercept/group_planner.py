@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from planner_jax.planning.batch import better_of, merged
+from planner_jax.planning.better import better_of, merged
 from planner_jax.protocol import Attempt, Drive, Status, is_solved, is_unsolved
 from planner_jax.robot.car import pose_at
 from planner_jax.task.intercept.case import InterceptCase

@@ -20,7 +20,7 @@ from jax import Array, lax
 
 from planner_jax.ball.flight import drag_free_flight
 from planner_jax.optimise.levenberg import LevenbergConfig
-from planner_jax.planning.batch import first_solved
+from planner_jax.planning.better import first_solved
 from planner_jax.planning.one_by_one import OneByOne
 from planner_jax.protocol import Attempt, Status
 from planner_jax.task.block.case import BlockCase

@@ -1,0 +1,138 @@
+"""How batches lie on devices: chunks of a few fixed sizes, equal shares of lanes.
+
+Padding to fixed sizes keeps a new batch size from compiling the solver anew.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import numpy as np
+from jax import Array
+from jax.sharding import Mesh, NamedSharding, PartitionSpec, Sharding, SingleDeviceSharding
+
+from planner_jax.planning.one_by_one import OneByOne
+from planner_jax.protocol import Attempt
+
+# Lanes of a device in one call. Few, because every one is a program of its own to compile.
+BUCKETS = (16, 128, 1024, 8192, 65536)
+_CPU_CHUNK, _GPU_CHUNK = 256, 65536  # what fits the cache of a core, and what fills a GPU
+_GPU_BUSY = 8192  # starts in one call that keep a GPU busy
+_GPU_LEAST = 128  # lanes of a call: fewer take it as long, and another program to compile
+_MORE = 8  # a program more is worth its compilation if it spares one lane for so many
+LANES = PartitionSpec("lanes")
+
+
+@dataclasses.dataclass(frozen=True)
+class Sizes:
+    """Of the calls of one attempt, in lanes of a device."""
+
+    most: int
+    busy: int  # that keep a GPU busy
+    least: int = BUCKETS[0]
+
+    def next(self, num: int) -> int:
+        """Of the call that takes the next of `num` lanes.
+
+        Where they would fill less than half of it, calls of the next smaller size take them if
+        these still keep a GPU busy.
+        """
+        wanted = max(num, self.least)
+        fits = next((bucket for bucket in BUCKETS if wanted <= bucket <= self.most), self.most)
+        smaller = max((bucket for bucket in BUCKETS if bucket < fits), default=0)
+        return smaller if smaller >= self.busy and 2 * num <= fits else fits
+
+    def cuts(self, num: int) -> Iterator[tuple[int, int]]:
+        """Where the calls that take `num` lanes begin, and their sizes.
+
+        The few lanes that are left after many calls take another call of their size, unless that
+        is much more work: to compile for a smaller one would take longer.
+        """
+        begin = size = 0
+        while begin < num:
+            smaller = self.next(num - begin)
+            if size - smaller > begin // _MORE or smaller > size:
+                size = smaller
+            yield begin, size
+            begin += size
+
+
+def sizes_of(planner: Any, attempt: Attempt, chunk: int | None, mesh: Mesh) -> Sizes:
+    """As `chunk` says, or as it suits the device."""
+    busy = _GPU_BUSY // attempt.starts
+    if chunk is not None:
+        return Sizes(chunk, busy)
+    if mesh.devices[0].platform != "cpu":
+        return Sizes(max(_GPU_LEAST, _GPU_CHUNK // attempt.starts), busy, _GPU_LEAST)
+    # One after another, few are as quick as many, and no core waits long for the others' last.
+    if isinstance(planner, OneByOne):
+        return Sizes(BUCKETS[0], busy)
+    starts = 1 << (attempt.starts - 1).bit_length()  # or more: a power of two
+    return Sizes(max(BUCKETS[0], _CPU_CHUNK // starts), busy)
+
+
+def calls_of(lanes: np.ndarray, sizes: Sizes, mesh: Mesh) -> list[tuple[np.ndarray, int]]:
+    """The lanes of every call, filled up with its first one, and how many of them count."""
+    calls = []
+    for begin, size in sizes.cuts(-(-lanes.size // mesh.size)):
+        length = size * mesh.size
+        part = lanes[begin * mesh.size :][:length]
+        calls.append((np.append(part, np.full(length - part.size, part[0])), part.size))
+    return calls
+
+
+def length(tree: Any) -> int:
+    """How many lanes all leaves have."""
+    return jax.tree.leaves(tree)[0].shape[0]
+
+
+def is_one_cpu(mesh: Mesh) -> bool:
+    """Whether the only device is the host itself."""
+    return mesh.size == 1 and mesh.devices[0].platform == "cpu"
+
+
+def sharding(mesh: Mesh) -> Sharding:
+    """Equal shares of the lanes on every device; for one device what JAX handles quickest."""
+    return NamedSharding(mesh, LANES) if mesh.size > 1 else SingleDeviceSharding(mesh.devices[0])
+
+
+def whole(mesh: Mesh) -> Sharding:
+    """The same on every device."""
+    return NamedSharding(mesh, PartitionSpec()) if mesh.size > 1 else sharding(mesh)
+
+
+@functools.lru_cache(maxsize=4096)
+def number(mesh: Mesh, value: int) -> Array:
+    """A number that every device has; sent but once, since the way there takes time."""
+    return jax.device_put(np.int32(value), whole(mesh))
+
+
+def apart(mesh: Mesh, function: Callable, *specs: PartitionSpec) -> Callable:
+    """A function that every device carries out on its own share of the lanes.
+
+    Args:
+        mesh: the devices.
+        function: of arrays with the lanes first.
+        specs: how its arguments are split, one each; by default all by their lanes.
+    """
+    if mesh.size == 1:
+        return function
+    # Without the check of replication: the lanes of a device share nothing with another's.
+    return jax.shard_map(
+        function, mesh=mesh, in_specs=specs or LANES, out_specs=LANES, check_vma=False
+    )
+
+
+def placed(tree: Any, mesh: Mesh) -> Any:
+    """The tree with equal shares of its lanes on every device."""
+    placed = sharding(mesh)
+
+    def is_there(leaf: Array) -> bool:
+        own = leaf.sharding  # equality is quicker to find out
+        return own == placed or own.is_equivalent_to(placed, leaf.ndim)
+
+    if all(map(is_there, jax.tree.leaves(tree))):
+        return tree
+    return jax.device_put(tree, placed)
