@@ -41,11 +41,11 @@ def moment_of(cases: Case, elapsed: Any) -> np.ndarray:
         ValueError: it is negative or not finite, or of another shape.
     """
     dtypes = (np.asarray(leaf).dtype for leaf in jax.tree.leaves(cases))
-    dtype = next(dtype for dtype in dtypes if np.issubdtype(dtype, np.floating))
+    dtype = next(dtype for dtype in dtypes if dtype.kind == "f")
     elapsed = numbers_of("elapsed", elapsed, cases.batch_shape, ()).astype(dtype)
-    if not (elapsed >= 0.0).all():
-        raise ValueError(f"elapsed must be >= 0, got {np.min(elapsed)}")
-    if not (elapsed < np.inf).all():
+    if not ((elapsed >= 0.0) & (elapsed < np.inf)).all():
+        if not (elapsed >= 0.0).all():
+            raise ValueError(f"elapsed must be >= 0, got {np.min(elapsed)}")
         raise ValueError(f"elapsed must be finite, got {np.max(elapsed)}")
     return elapsed
 
