@@ -88,7 +88,7 @@ def numeric(value: Any) -> Any:
     """Real numbers as an array, NumPy's unless it is traced or one of jax; None of all else."""
     try:
         is_ours = isinstance(value, _HOSTS) or not isinstance(value, Tracer | jax.Array)
-        array = np.asarray(value) if is_ours else value
+        array: Any = np.asarray(value) if is_ours else value
     except ValueError:  # rows of different lengths
         return None
     if array.dtype.kind in "biuf" or jnp.issubdtype(array.dtype, jnp.floating):
