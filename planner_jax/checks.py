@@ -81,11 +81,14 @@ def require_path_name(name: str, value: Any) -> None:
         raise TypeError(f"{name} must be the path of a file, got {told(value)}")
 
 
+_HOSTS = (np.ndarray, np.generic, float)  # kinds that are told from JAX's arrays at once
+
+
 def numeric(value: Any) -> Any:
     """Real numbers as an array, NumPy's unless it is traced or one of jax; None of all else."""
     try:
-        is_array = type(value) is np.ndarray or isinstance(value, Tracer | jax.Array)
-        array = value if is_array else np.asarray(value)
+        is_ours = isinstance(value, _HOSTS) or not isinstance(value, Tracer | jax.Array)
+        array: Any = np.asarray(value) if is_ours else value
     except ValueError:  # rows of different lengths
         return None
     if array.dtype.kind in "biuf" or jnp.issubdtype(array.dtype, jnp.floating):

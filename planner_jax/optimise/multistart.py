@@ -48,11 +48,11 @@ def minimise(
         return _optimum_at(start, objective(start), config)
     if isinstance(config, NewtonConfig):
         config = _with_stragglers(config)
-    state = lax.while_loop(
-        lambda s: _method(config).is_unfinished(s.numbers, config),
-        lambda s: _step(objective, curved, s, config),
-        _method(config).init(start, config),
-    )
+    step = lambda s: _step(objective, curved, s, config)  # noqa: E731
+    state = _method(config).init(start, config)
+    if config.max_steps == 1:  # without a loop, around which nothing would be joined
+        return _optimum_of(step(state), config)
+    state = lax.while_loop(lambda s: _method(config).is_unfinished(s.numbers, config), step, state)
     return _optimum_of(state, config)
 
 

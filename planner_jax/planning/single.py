@@ -6,7 +6,7 @@ from typing import Any
 from planner_jax.planning.packed import call_packed
 from planner_jax.planning.programs import solve_cases
 from planner_jax.planning.watch import Watch
-from planner_jax.protocol import Attempt, Planner, is_solved, out_of_time
+from planner_jax.protocol import Attempt, Planner, is_solved, is_unsolved, out_of_time
 
 
 def plan_single(planner: Planner, attempts: Sequence[Attempt], case: Any, watch: Watch) -> Any:
@@ -22,6 +22,8 @@ def plan_single(planner: Planner, attempts: Sequence[Attempt], case: Any, watch:
         if best is None or is_solved(int(plan.status)) or plan.violation < best.violation:
             best = plan
         watch.tell(planner, attempt, 1, 1)
+        if not is_unsolved(int(best.status)):  # of a number quicker to tell than of an array
+            break
     return best
 
 

@@ -136,11 +136,12 @@ def states_at(trajectory: PiecewisePolynomial, times: np.ndarray) -> np.ndarray:
     """
     coeffs, durations = np.asarray(trajectory.coeffs), np.asarray(trajectory.durations)
     ends = durations.cumsum(axis=-1)
-    piece = (times[..., None] >= ends[..., :-1]).sum(axis=-1)
     if times.ndim:
         lanes = np.arange(times.size)
+        piece = (times[:, None] >= ends[:, :-1]).sum(axis=1)
         coeffs, starts = coeffs[lanes, piece], (ends - durations)[lanes, piece]
     else:
+        piece = ends[:-1].searchsorted(times, side="right")
         coeffs, starts = coeffs[piece], ends[piece] - durations[piece]
     factors, powers = state_basis(coeffs.shape[-2])
     return (factors * (times - starts)[..., None, None] ** powers) @ coeffs
