@@ -176,13 +176,12 @@ class ExactHit(OptimisedPlanner):
         Round(
             starts=1,
             within=0.1,
-            solver=dataclasses.replace(_HARD, max_steps=600),
+            solver=dataclasses.replace(_HARD, max_steps=500),
             settings=_TO_THE_LIMIT,
-            stages=(_hard_stage(1200, SUPPLE, keep=1),),
+            stages=(_hard_stage(800, SUPPLE, keep=1),),
         ),
         Round(
             starts=12,
-            within=0.3,
             solver=dataclasses.replace(_HARD, max_steps=240),
             settings=SUPPLE,
             stages=(_hard_stage(50, _SMOOTH, keep=2),),
