@@ -1,11 +1,14 @@
 """Train the networks that make the first guesses of hits and catches, and look what they are worth.
 
-    python -m benchmarks.learn_starts [--tasks hit catch] [--train MINUTES] [--num 1000] [--out DIR]
+    python -m benchmarks.learn_starts [--tasks hit hard-hit catch] [--train MINUTES] [--num 1000]
+        [--out DIR]
 
 Trained on the planner's own objective: the mean logarithm of the cost at the guess goes down, over
 batches from a large pool of cases. Half of them are of the usual suites; in the others start,
-limits, ball, racket or net and target are anything sensible, moving starts among them. --train does
-so, and replaces the shipped files. Prints the cost above the least that very long searches find,
+limits, ball, racket or net and target are anything sensible, moving starts among them. Those of
+`hard-hit`, with velocities at the waypoints, are of serves planned for 0.5 to 0.88 s late, or with
+0.29 to 0.5 of the limits, many of which nobody can hit. --train does so, and replaces the shipped
+files. Prints the cost above the least that very long searches find,
 and how many hold every limit, after so many iterations from the guess with the network and without
 it, on cases that no network has seen.
 """
@@ -33,13 +36,13 @@ from planner_jax.planning.decided import first_choice
 from planner_jax.task.catch import exact as catch_exact
 from planner_jax.task.hit import exact as hit_exact
 
-_HIDDEN = (128, 128)
 _POOL = 262_144  # cases that are drawn at first, and taken in another order again and again
 _BATCH = 8192
 _RATE = 2e-3  # of Adam at first; it falls to nothing along a cosine
 _SEED_APART = 90_001  # of cases that no network has seen
 _STEPS = 50  # a call
 _ITERATIONS = (0, 3, 5, 7, 12, 20)
+_CHUNKS = 64  # of hard hits, each with a delay or limits of its own
 
 
 def _varied(random: np.random.Generator, num: int, low: float, high: float) -> np.ndarray:
@@ -96,6 +99,19 @@ def hits(num: int, seed: int) -> pj.hit.HitCase:
     return _joined(plain, varied)
 
 
+def hard_hits(num: int, seed: int) -> pj.hit.HitCase:
+    """Half of them planned late, half with weak limits."""
+    random, serves = np.random.default_rng(seed), pj.hit.generate_serves(num, seed)
+    parts = []
+    for k, rows in enumerate(np.array_split(np.arange(num), _CHUNKS)):
+        if k % 2 == 0:
+            options: dict[str, Any] = {"delay": random.uniform(0.5, 0.88)}
+        else:
+            options = {"limit_scale": random.uniform(0.29, 0.5)}
+        parts.append(pj.hit.to_cases(serves[rows], **options))
+    return _joined(*parts)
+
+
 def catches(num: int, seed: int) -> pj.catch.CatchCase:
     """Half of them of the suites `throws` and `hard` in the greedy order, half varied."""
     random, half = np.random.default_rng(seed), num // 2
@@ -142,11 +158,14 @@ def _joined(*batches: Any) -> Any:
 class _Learnt:
     """A network to train."""
 
-    name: str  # of the file
+    file: str  # below planner_jax.task
     draw: Callable[[int, int], Any]
     planner: Any  # without the network
     features: Callable[[Any], Any]
     usual: Callable[[int, int], Any]  # cases of the usual suite
+    hidden: tuple[int, ...] = (128, 128)
+    floor: float = 0.0  # added to a cost, so that little is gained where it is far below
+    iterations: tuple[int, ...] = _ITERATIONS
 
 
 def _throws(num: int, seed: int) -> Any:
@@ -155,14 +174,28 @@ def _throws(num: int, seed: int) -> Any:
 
 TASKS = {
     "hit": _Learnt(
-        "exact-12",
+        "hit/start_exact-12.npz",
         hits,
         pj.hit.ExactHit(learned=False),
         hit_exact.start_features,
         lambda num, seed: pj.hit.draw(num, seed=seed),
     ),
+    "hard-hit": _Learnt(
+        "hit/start_exact-12-supple.npz",
+        hard_hits,
+        pj.hit.ExactHit(learned=False).changed(hit_exact.SUPPLE),
+        hit_exact.start_features,
+        hard_hits,
+        hidden=(160, 160),
+        floor=3e-5,
+        iterations=(0, 20, 60, 150),
+    ),
     "catch": _Learnt(
-        "exact-6", catches, pj.catch.ExactCatch(learned=False), catch_exact.start_features, _throws
+        "catch/start_exact-6.npz",
+        catches,
+        pj.catch.ExactCatch(learned=False),
+        catch_exact.start_features,
+        _throws,
     ),
 }
 
@@ -174,7 +207,7 @@ def train(learnt: _Learnt, minutes: float, seed: int, say: Callable[[str], None]
     prepare = jax.jit(jax.vmap(planner.prepare))
     few = prepare(jax.tree.map(lambda leaf: leaf[:16_384], pool))
     features = np.asarray(jax.jit(jax.vmap(learnt.features))(few), np.float64)
-    network = learned_start.untrained(features, len(planner.scale), _HIDDEN)
+    network = learned_start.untrained(features, len(planner.scale), learnt.hidden)
     params = jax.tree.map(jnp.asarray, (network.weights, network.biases))
 
     def loss(params: Any, cases: Any) -> Any:
@@ -183,7 +216,7 @@ def train(learnt: _Learnt, minutes: float, seed: int, say: Callable[[str], None]
         def of_case(case: Any) -> Any:
             context = planner.prepare(case)
             guess = planner.guesses(context, 1)[0] + own(learnt.features(context))
-            return jnp.log(planner.objective(guess, context).cost)
+            return jnp.log(planner.objective(guess, context).cost + learnt.floor)
 
         logs = jax.vmap(of_case)(cases)
         return jnp.mean(jnp.where(jnp.isfinite(logs), logs, 20.0))
@@ -236,7 +269,7 @@ def compare(bench: Bench, task: str, num: int) -> None:
         "| guess | iterations | limits hold | cost above the least found (median, p90, p99) |",
         "|---|---:|---:|---|",
     )
-    for iterations in _ITERATIONS:
+    for iterations in learnt.iterations:
         for name, planner in planners.items():
             plans = pj.plan(planner.with_solver(pj.LbfgsConfig(max_steps=iterations)), cases)
             holds = pj.solved(plans)
@@ -257,7 +290,7 @@ def compare(bench: Bench, task: str, num: int) -> None:
 
 def shipped_file(task: str) -> Path:
     """Where the network of a task is kept."""
-    return Path(planner_jax.task.__path__[0]) / task / f"start_{TASKS[task].name}.npz"
+    return Path(planner_jax.task.__path__[0]) / TASKS[task].file
 
 
 def main() -> None:

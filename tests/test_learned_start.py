@@ -48,6 +48,17 @@ def test_the_learnt_guess_costs_a_hundredth_and_little_more_than_the_optimum(tas
     assert np.all(learnt <= smooth)
 
 
+def test_late_hits_begin_where_a_few_iterations_find_what_all_guesses_do_not():
+    late = pj.hit.to_cases(pj.hit.generate_serves(64, 3), delay=0.7)
+    (search,) = [each for each in pj.hit.ExactHit().rounds if each.solver.max_steps == 150]
+
+    def share(learned):
+        planner = pj.hit.ExactHit(learned=learned, rounds=(search,))
+        return pj.solved(pj.plan(planner, late)).mean()
+
+    assert share(True) > share(False) + 0.1
+
+
 def test_a_guess_that_costs_more_is_not_taken():
     cost = lambda x: jnp.sum(x**2)  # noqa: E731
     guess = jnp.array([1.0, 1.0])
@@ -67,7 +78,9 @@ def test_an_untrained_network_adds_nothing_and_far_features_count_as_less_far():
     assert np.abs(at[0]).max() > 0.0
 
 
-@pytest.mark.parametrize("task, name", [("hit", "exact-12"), ("catch", "exact-6")])
+@pytest.mark.parametrize(
+    "task, name", [("hit", "exact-12"), ("hit", "exact-12-supple"), ("catch", "exact-6")]
+)
 def test_a_shipped_network_is_what_its_archive_holds(task, name, tmp_path):
     network = shipped_network(f"planner_jax.task.{task}", name)
     (tmp_path / "again.npz").write_bytes(to_bytes(network))

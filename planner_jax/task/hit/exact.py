@@ -58,22 +58,17 @@ _ORDER = 4  # minimum snap
 _PROPORTIONS = (0.2, 0.5) + (1.0,) * 10
 _SEEN = (0.5, 0.75, 0.95)  # of the landing time, at which a learned start looks at the ball
 # Stages of rounds that look for any feasible plan. The velocities at the waypoints are for what a
-# search without them has brought near; alone they lead astray. At last, limits that bind all along
-# the way have to leave no margin more than what peaks between nodes take.
+# network or a search without them has brought near; alone they lead astray. At last, limits that
+# bind all along the way have to leave no margin more than what peaks between nodes take.
 _HARD = LbfgsConfig(memory=12, tolerance=1e-6, patience=5)
-_ANY_FEASIBLE = (
-    ("energy_weight", 1e-11),
-    ("margin", 0.01),
-    ("nodes", 8),
-    ("learned", False),
-)
-_SUPPLE = (*_ANY_FEASIBLE, ("velocities", True))
+_ANY_FEASIBLE = (("energy_weight", 1e-11), ("margin", 0.01), ("nodes", 8))
+_SMOOTH = (*_ANY_FEASIBLE, ("learned", False))
+SUPPLE = (*_ANY_FEASIBLE, ("velocities", True))
 _TO_THE_LIMIT = (
     ("energy_weight", 1e-11),
     ("margin", 0.004),
     ("hinge_width", 0.02),
     ("nodes", 12),
-    ("learned", False),
     ("velocities", True),
 )
 
@@ -169,17 +164,27 @@ class ExactHit(OptimisedPlanner):
     hinge_width: float = 0.1
     impact_weight: float = 0.3  # [s], of apex and hitting-speed hinges beside the integrals
     # The first two solve what is easy. Where limits bind all along the way, energy is worth
-    # nothing any more and the margin has to give: the others look for any feasible plan, long from
-    # where a short search from each start says that it is worth it. The last, at twice the price
-    # a case, is for those of which little is missing: it hardly ever solved others.
+    # nothing any more and the margin has to give: the others look for any feasible plan, the third
+    # and fourth from where a network has learnt that those are, the longer one where little is
+    # missing. From there a search ends where fixed guesses seldom lead it. These are for cases
+    # and sizes that no network knows: long from where a short search from each of them says that
+    # it is worth it, and at last, at twice the price a case, where little is missing.
     rounds: tuple[Round, ...] = (
         Round(starts=1, solver=LbfgsConfig(max_steps=3)),
         Round(starts=1, solver=LbfgsConfig(max_steps=60)),
+        Round(starts=1, solver=dataclasses.replace(_HARD, max_steps=150), settings=SUPPLE),
+        Round(
+            starts=1,
+            within=0.1,
+            solver=dataclasses.replace(_HARD, max_steps=500),
+            settings=_TO_THE_LIMIT,
+            stages=(_hard_stage(800, SUPPLE, keep=1),),
+        ),
         Round(
             starts=12,
             solver=dataclasses.replace(_HARD, max_steps=240),
-            settings=_SUPPLE,
-            stages=(_hard_stage(50, _ANY_FEASIBLE, keep=2),),
+            settings=SUPPLE,
+            stages=(_hard_stage(50, _SMOOTH, keep=2),),
         ),
         Round(
             starts=12,
@@ -187,9 +192,9 @@ class ExactHit(OptimisedPlanner):
             solver=dataclasses.replace(_HARD, max_steps=300),
             settings=_TO_THE_LIMIT,
             stages=(
-                _hard_stage(60, _ANY_FEASIBLE, keep=6),
-                _hard_stage(150, _ANY_FEASIBLE, keep=2),
-                _hard_stage(400, _SUPPLE, keep=1),
+                _hard_stage(60, _SMOOTH, keep=6),
+                _hard_stage(150, _SMOOTH, keep=2),
+                _hard_stage(400, SUPPLE, keep=1),
             ),
         ),
     )
@@ -206,10 +211,8 @@ class ExactHit(OptimisedPlanner):
             )
         if not self.scale:
             object.__setattr__(self, "scale", shipped_scale(__package__, self._name))
-        places = self._num_places
-        if self.velocities and len(self.scale) == places + 8:
-            own = (_VELOCITY_SCALE,) * places
-            object.__setattr__(self, "scale", self.scale[:places] + own + self.scale[places:])
+        if self.velocities and len(self.scale) == self._num_places + 8:
+            object.__setattr__(self, "scale", self._with_velocities(self.scale))
         if len(self.scale) != self.num_offsets + 8:
             rule = f"of {self.num_offsets + 8} numbers"
             raise ValueError(f"scale must be {rule}, got {len(self.scale)}")
@@ -226,11 +229,22 @@ class ExactHit(OptimisedPlanner):
 
     @property
     def _network(self) -> StartNetwork | None:
-        """That makes the first guess; there is one for the shipped sizes."""
+        """That makes the first guess; there are two for the shipped sizes.
+
+        The one of points without velocities has learnt where every limit holds at little energy,
+        the other one where limits bind all along the way.
+        """
         if not self.learned or self.proportions != _PROPORTIONS:
             return None
-        is_shipped = self.scale == shipped_scale(__package__, self._name)
-        return shipped_network(__package__, self._name) if is_shipped else None
+        usual = shipped_scale(__package__, self._name)
+        if self.scale != (self._with_velocities(usual) if self.velocities else usual):
+            return None
+        return shipped_network(__package__, self._name + "-supple" * self.velocities)
+
+    def _with_velocities(self, scale: tuple[float, ...]) -> tuple[float, ...]:
+        """A scale without those of the velocities, with them."""
+        places = self._num_places
+        return scale[:places] + (_VELOCITY_SCALE,) * places + scale[places:]
 
     @property
     def maps(self) -> ProportionalMinco:
