@@ -164,11 +164,11 @@ class ExactHit(OptimisedPlanner):
     hinge_width: float = 0.1
     impact_weight: float = 0.3  # [s], of apex and hitting-speed hinges beside the integrals
     # The first two solve what is easy. Where limits bind all along the way, energy is worth
-    # nothing any more and the margin has to give: the others look for any feasible plan, the third
-    # and fourth from where a network has learnt that those are, the longer one where little is
-    # missing. From there a search ends where fixed guesses seldom lead it. These are for cases
-    # and sizes that no network knows: long from where a short search from each of them says that
-    # it is worth it, and at last, at twice the price a case, where little is missing.
+    # nothing any more and the margin has to give: the others look for any feasible plan. The third
+    # and the fourth begin where a network has learnt that limits can hold, the fourth, which is
+    # longer, if little is missing. The last two begin at fixed guesses, for cases and sizes that no
+    # network knows: long from those from where a short search says that it is worth it, and at
+    # last, at twice the price a case, if little is missing.
     rounds: tuple[Round, ...] = (
         Round(starts=1, solver=LbfgsConfig(max_steps=3)),
         Round(starts=1, solver=LbfgsConfig(max_steps=60)),
