@@ -153,6 +153,20 @@ def test_what_was_compiled_ahead_is_not_traced_again():
     assert len(TRACES) == before
 
 
+def test_a_planner_on_the_host_may_be_asked_to_compile_ahead_too():
+    tried = []
+
+    class OnHost:
+        attempts = WellPlanner().rounds
+
+        def solve_on_host(self, cases, attempt):
+            tried.append(attempt)
+            return jax.device_get(plan(WellPlanner(rounds=(attempt,)), cases))
+
+    compile_attempts(OnHost(), Well(GOALS))
+    assert tried == [WellPlanner().rounds[0]]
+
+
 def test_a_plans_shapes_are_known_without_planning():
     shapes = WellPlanner().plan_shapes(jax.eval_shape(lambda: Well(jnp.asarray(GOALS))))
     made = plan(WellPlanner(), Well(GOALS))

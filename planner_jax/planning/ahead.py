@@ -5,7 +5,9 @@ from typing import Any
 
 import numpy as np
 
+from planner_jax.planning.from_host import plan_on_host
 from planner_jax.planning.programs import compile_at_once
+from planner_jax.planning.watch import Watch
 from planner_jax.protocol import AnyPlanner, Attempt
 
 
@@ -21,8 +23,10 @@ class _Ahead:
         """What the first attempt makes of a batch, said to leave nothing unsolved."""
         if hasattr(planner, "plan_by"):
             return planner.plan_by(self, cases), np.zeros(1, bool)
-        plans = compile_at_once(planner, attempts or planner.attempts, cases)
-        return plans, np.zeros(1, bool)
+        tried: Sequence[Attempt] = attempts or planner.attempts
+        if hasattr(planner, "solve_on_host"):  # nothing is compiled of it
+            return plan_on_host(planner, tried[:1], cases, Watch())
+        return compile_at_once(planner, tried, cases), np.zeros(1, bool)
 
 
 def compile_attempts(planner: AnyPlanner, cases: Any) -> None:
@@ -30,12 +34,10 @@ def compile_attempts(planner: AnyPlanner, cases: Any) -> None:
 
     Otherwise an attempt is compiled when the one before has left something unsolved. That is right
     where the first ones solve most cases; where later ones will be needed, too, and there are
-    cores for all, it is to wait several times as long. A planner that works on the host has
-    nothing to compile.
+    cores for all, it is to wait several times as long.
 
     Args:
         planner: as for `pj.plan`.
         cases: a batch like the ones to come, NumPy leaves; its plans are made and dropped.
     """
-    if not hasattr(planner, "solve_on_host"):
-        _Ahead()(planner, cases)
+    _Ahead()(planner, cases)

@@ -8,11 +8,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import jax
-import numpy as np
-from jax.sharding import Mesh
 
 from planner_jax.planning.from_host import plan_from_host
-from planner_jax.planning.layout import is_one_cpu, length, sharding, sizes_of, whole
+from planner_jax.planning.layout import is_one_cpu, length, on_devices, sharding, sizes_of
 from planner_jax.planning.resident import plan_resident
 from planner_jax.planning.watch import Watch
 from planner_jax.protocol import Attempt
@@ -41,9 +39,7 @@ def plan_batch(
             those, so that nothing leaves the devices.
         unsolved: numbers that are all zero if no lane is unsolved.
     """
-    mesh = Mesh(np.array(jax.local_devices() if devices is None else devices), ("lanes",))
-    if jax.tree.leaves(planner):
-        planner = jax.device_put(planner, whole(mesh))
+    planner, mesh = on_devices(planner, devices)
     resident = all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(cases))
     num = length(cases)
     in_one_call = num == sizes_of(planner, attempts[0], chunk, mesh).next(num)

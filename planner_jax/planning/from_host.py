@@ -49,7 +49,8 @@ def plan_from_host(
     def after(attempt: Attempt, lanes: np.ndarray, plans: Any) -> Any:
         calls = calls_of(lanes, sizes_of(planner, attempt, chunk, mesh), mesh)
         may_end = plans is not None
-        found = _solved_from_host(planner, attempt, cases, calls, mesh, watch, may_end)
+        each = _each_from_host(planner, attempt, cases, calls, mesh, watch, may_end)
+        found = _told(planner, attempt, calls, watch, each)
         if plans is None:
             trimmed = [
                 jax.tree.map(lambda leaf, n=num: np.asarray(leaf)[:n], part)
@@ -95,22 +96,16 @@ def _in_turn(
     return plans, np.sum(is_unsolved(plans.status))
 
 
-def _solved_from_host(
+def _told(
     planner: Any,
     attempt: Attempt,
-    cases: Any,
     calls: list[tuple[np.ndarray, int]],
-    mesh: Mesh,
     watch: Watch,
-    may_end: bool,
+    each: Iterator[Any],
 ) -> list[Any]:
-    """One attempt at the lanes of every call.
-
-    Where it may end early, there is None for the calls that were not begun in time.
-    """
+    """What each call found, of which the watch is told as it comes."""
     found, tried, cases_left = [], 0, sum(num for _, num in calls)
     watch.tell(planner, attempt, tried, cases_left)
-    each = _each_from_host(planner, attempt, cases, calls, mesh, watch, may_end)
     for one, (_, num) in zip(each, calls, strict=True):
         found.append(one)
         if one is not None:
@@ -128,9 +123,10 @@ def _each_from_host(
     watch: Watch,
     may_end: bool,
 ) -> Iterator[Any]:
-    """As `_solved_from_host`, call by call; on one CPU device with a thread for each core.
+    """One attempt at the lanes of every call; on one CPU device with a thread for each core.
 
-    One thread more hands over the next call while the others compute.
+    One thread more hands over the next call while the others compute. Where the attempt may end
+    early, there is None for the calls that were not begun in time.
     """
     threads = min(len(calls), usable_cores() + 1) if is_one_cpu(mesh) else 1
     placed = sharding(mesh)

@@ -5,7 +5,7 @@ Padding to fixed sizes keeps a new batch size from compiling the solver anew.
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -77,10 +77,18 @@ def calls_of(lanes: np.ndarray, sizes: Sizes, mesh: Mesh) -> list[tuple[np.ndarr
     """The lanes of every call, filled up with its first one, and how many of them count."""
     calls = []
     for begin, size in sizes.cuts(-(-lanes.size // mesh.size)):
-        length = size * mesh.size
-        part = lanes[begin * mesh.size :][:length]
-        calls.append((np.append(part, np.full(length - part.size, part[0])), part.size))
+        all_lanes = size * mesh.size
+        part = lanes[begin * mesh.size :][:all_lanes]
+        calls.append((np.append(part, np.full(all_lanes - part.size, part[0])), part.size))
     return calls
+
+
+def on_devices(planner: Any, devices: Sequence[Any] | None) -> tuple[Any, Mesh]:
+    """The planner with its arrays on all devices, and these as a mesh; None for all local ones."""
+    mesh = Mesh(np.array(jax.local_devices() if devices is None else devices), ("lanes",))
+    if jax.tree.leaves(planner):
+        planner = jax.device_put(planner, whole(mesh))
+    return planner, mesh
 
 
 def length(tree: Any) -> int:
@@ -127,12 +135,12 @@ def apart(mesh: Mesh, function: Callable, *specs: PartitionSpec) -> Callable:
 
 def placed(tree: Any, mesh: Mesh) -> Any:
     """The tree with equal shares of its lanes on every device."""
-    placed = sharding(mesh)
+    wanted = sharding(mesh)
 
     def is_there(leaf: Array) -> bool:
         own = leaf.sharding  # equality is quicker to find out
-        return own == placed or own.is_equivalent_to(placed, leaf.ndim)
+        return own == wanted or own.is_equivalent_to(wanted, leaf.ndim)
 
     if all(map(is_there, jax.tree.leaves(tree))):
         return tree
-    return jax.device_put(tree, placed)
+    return jax.device_put(tree, wanted)

@@ -11,7 +11,15 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh, PartitionSpec
 
-from planner_jax.planning.layout import LANES, apart, calls_of, length, sharding, sizes_of
+from planner_jax.planning.layout import (
+    LANES,
+    apart,
+    calls_of,
+    length,
+    on_devices,
+    sharding,
+    sizes_of,
+)
 from planner_jax.protocol import Attempt, LanesPlanner, is_unsolved, marked
 from planner_jax.rules import require_shapes
 from planner_jax.threads import as_here
@@ -73,7 +81,7 @@ def compile_at_once(planner: Any, attempts: Sequence[Attempt], cases: Any) -> An
     Returns:
         What the first attempt makes of the cases, (B, ...) or the first of them.
     """
-    mesh = Mesh(np.array(jax.local_devices()), ("lanes",))
+    planner, mesh = on_devices(planner, None)
     cases = jax.tree.map(np.asarray, cases)
 
     def tried(attempt: Attempt) -> Any:
