@@ -22,12 +22,11 @@ import jax
 import numpy as np
 
 import planner_jax as pj
+from planner_jax.baselines.block.library.adapt import adapt_planner
 from planner_jax.benchmarks.block_library import library_options
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
-from planner_jax.sweep.block.library import build_library
-from planner_jax.task.block.ball_by_ball import BallByBall
-from planner_jax.task.block.library.adapt import adapt_planner
-from planner_jax.task.block.online import OnlineBlock, Search
+from planner_jax.cli.library import build_library
+from planner_jax.task.block.planner import OnlineBlock, Search
 
 WARM = 50  # balls before the clock counts
 
@@ -37,14 +36,14 @@ def measured(bench: Bench, name: str, planner: Any, cases: Any) -> None:
     cases = jax.tree.map(np.asarray, cases)
     lanes = [pj.lane(cases, k) for k in range(cases.batch_shape[0])]
     began = time.perf_counter()
-    one = BallByBall(planner, lanes[0])
+    pj.plan(planner, lanes[0])
     compiling = time.perf_counter() - began
     for case in lanes[:WARM]:
-        one.plan(case.ball.pos, case.ball.vel)
+        pj.plan(planner, case)
     seconds, busy, plans = [], [], []
     for case in lanes:
         began, begun = time.perf_counter(), time.process_time()
-        plans.append(one.plan(case.ball.pos, case.ball.vel))
+        plans.append(pj.plan(planner, case))
         seconds.append(time.perf_counter() - began)
         busy.append(time.process_time() - begun)
     together: Any = jax.tree.map(lambda *leaves: np.stack(leaves), *plans)

@@ -16,9 +16,9 @@ import planner_jax as pj
 from planner_jax.benchmarks.block_rows import STRAIGHT
 from planner_jax.benchmarks.cost_gap import cost_gaps, gap_figures
 from planner_jax.benchmarks.run import argument_parser, begin
-from planner_jax.registry import task_named
+from planner_jax.core.registry import task_named
+from planner_jax.runs.timing import timed_warm
 from planner_jax.sweep.block.settings import REGIMES
-from planner_jax.sweep.timing import timed_warm
 
 
 def main() -> None:

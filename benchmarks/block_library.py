@@ -26,16 +26,16 @@ import numpy as np
 
 import planner_jax as pj
 from planner_jax.ball.flight import BallState
+from planner_jax.baselines.block.library import build as building
+from planner_jax.baselines.block.library.cells import LAYOUTS, tunnels
+from planner_jax.baselines.block.library.coverage import check, coverage
+from planner_jax.baselines.block.library.file import load_library
+from planner_jax.baselines.block.library.planner import LibraryBlock, OneBall
+from planner_jax.baselines.block.library.table import Answer, Library, Setting, Table, lookup
 from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
 from planner_jax.robot.arm import REGIMES
 from planner_jax.robot.arm_mjcf import irb1600
-from planner_jax.sweep.timing import CompileClock
-from planner_jax.task.block.library import build as building
-from planner_jax.task.block.library.cells import LAYOUTS, tunnels
-from planner_jax.task.block.library.coverage import check, coverage
-from planner_jax.task.block.library.file import load_library
-from planner_jax.task.block.library.planner import LibraryBlock, OneBall
-from planner_jax.task.block.library.table import Answer, Library, Setting, Table, lookup
+from planner_jax.runs.timing import CompileClock
 from planner_jax.task.block.scene import paper_scene
 
 SEED = 20260

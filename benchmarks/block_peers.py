@@ -31,10 +31,10 @@ import planner_jax as pj
 from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
 from planner_jax.referee.block import BlockVerdict
 from planner_jax.robot.arm_dynamics import Torques, motion_torques
+from planner_jax.runs.timing import timed_plans
 from planner_jax.sweep.block.settings import REGIMES
-from planner_jax.sweep.timing import timed_plans
-from planner_jax.task.block.card import SUITES
 from planner_jax.task.block.plan import BlockPlan
+from planner_jax.task.block.spec import SUITES
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 PEERS = "ompl and toppra not installed: pip install 'planner-jax[arm-peers]' for rrt-connect, epase"

@@ -45,11 +45,9 @@ from planner_jax.perception.fit import across_std, believed_at, error_across, fi
 from planner_jax.perception.noise import StereoNoise, depth_std, information, noisy_depth
 from planner_jax.perception.segment import ball_look, sighting
 from planner_jax.robot.arm_mjcf import irb1600
-from planner_jax.sweep.summary import percent, wilson_interval
-from planner_jax.sweep.timing import timed_warm
-from planner_jax.task.block.case import ANYWHERE
-from planner_jax.task.block.end_poses import flight_of
-from planner_jax.task.block.eye import (
+from planner_jax.runs.summary import percent, wilson_interval
+from planner_jax.runs.timing import timed_warm
+from planner_jax.studies.block.observation import (
     Eye,
     cautious,
     eye,
@@ -59,8 +57,10 @@ from planner_jax.task.block.eye import (
     see,
     watched,
 )
-from planner_jax.task.block.met import as_met
-from planner_jax.task.block.receding import AIMS, decide
+from planner_jax.studies.block.receding import AIMS, decide
+from planner_jax.task.block.case import ANYWHERE
+from planner_jax.task.block.contact_check import as_met
+from planner_jax.task.block.end_poses import flight_of
 from planner_jax.task.block.replan import ReplanBlock
 
 RATES = (30.0, 60.0, 120.0)  # [Hz]

@@ -24,8 +24,9 @@ import numpy as np
 
 import planner_jax as pj
 from planner_jax.benchmarks.run import argument_parser, begin
+from planner_jax.studies.block import sequence
 from planner_jax.sweep.block.settings import REGIMES
-from planner_jax.task.block.card import SUITES
+from planner_jax.task.block.spec import SUITES
 
 WAYS: dict[str, dict[str, bool]] = {
     "greedy": {"reconsiders": False, "returns": False},
@@ -67,7 +68,7 @@ def main() -> None:
     places = range(1, options.balls + 1)
     with begin(parser, options) as bench:
         for apart in options.apart:
-            sequences = pj.block.draw_sequences(
+            sequences = sequence.draw_sequences(
                 options.num,
                 options.suite,
                 options.seed,
@@ -100,8 +101,8 @@ def main() -> None:
                     claimed = pj.solved(plans).reshape(success.shape)
                     reference = success.mean()
                 else:
-                    planned = pj.block.plan_in_turn(planner, sequences, **WAYS[name])
-                    success = pj.block.judge_in_turn(planned).success
+                    planned = sequence.plan_in_turn(planner, sequences, **WAYS[name])
+                    success = sequence.judge_in_turn(planned).success
                     claimed = pj.solved(planned.plans)
                 if name == REPORTED:
                     bench.count(success)

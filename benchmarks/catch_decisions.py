@@ -27,10 +27,10 @@ from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.policies.policy import policy
-from planner_jax.sweep.settings import SettingError
-from planner_jax.task.catch.card import SUITES
+from planner_jax.runs.settings import SettingError
 from planner_jax.task.catch.decide import Random
-from planner_jax.task.catch.exact import ExactCatch
+from planner_jax.task.catch.planner import ExactCatch
+from planner_jax.task.catch.spec import SUITES
 
 OTHERS = ("throws", "hard", "square4", "pentagon5", "heptagon7")
 TRAINED_ON = [name for name in SUITES if name not in OTHERS]

@@ -4,8 +4,8 @@
         [--spans 6] [--policy FILE] [--out DIR]
 
 Eight balls that sink all around, each known only from its appearance on, at a moment that is even
-between 0 and the span [s] (`planner_jax.task.catch.appearing`). At every appearance and every catch
-the decision is asked anew, the planner `exact` plans from the state in which the quadrotor is, and
+between 0 and the span [s] (`planner_jax.studies.catch.appearing`). At every appearance and every
+catch the decision is asked anew, the planner `exact` plans from the state in which the quadrotor is, and
 all that was flown is refereed as one plan of the case. "greedy" takes next whatever can be caught
 earliest, "random" any, "best" the better one of the two most promising orders of a search, and
 "policy" the order and times of the shipped policy or that of --policy; all of them also with the
@@ -28,10 +28,10 @@ from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.policies.policy import policy
 from planner_jax.referee.catch import CatchVerdict
-from planner_jax.sweep.settings import SettingError
-from planner_jax.task.catch.appearing import SPAN, draw_appearing, states_of
+from planner_jax.runs.settings import SettingError
+from planner_jax.studies.catch.appearing import SPAN, draw_appearing, states_of
+from planner_jax.studies.catch.live import fly_live, judge_live
 from planner_jax.task.catch.decide import Random
-from planner_jax.task.catch.live import fly_live, judge_live
 
 LONG = pj.catch.Best(finalists=16, width=256)
 DECISIONS = ("greedy", "best", "random", "policy")

@@ -25,11 +25,11 @@ import jax.numpy as jnp
 import numpy as np
 
 import planner_jax as pj
+from planner_jax.baselines.catch.paper import COST_UNIT, PaperCatch
 from planner_jax.benchmarks.catch_peer import peer
 from planner_jax.benchmarks.cost_gap import cost_gaps, gap_figures
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
 from planner_jax.optimise.problem import Round, Stage
-from planner_jax.task.catch.paper import COST_UNIT, PaperCatch
 
 SETS = ("paper", "hard")
 BATCH_COPIES = 64

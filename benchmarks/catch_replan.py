@@ -35,8 +35,8 @@ from planner_jax.ball.estimation import EkfModel, ekf_init, ekf_predict, ekf_upd
 from planner_jax.ball.flight import BallState
 from planner_jax.benchmarks.cost_gap import COMPARED, cost_gaps
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
+from planner_jax.core.protocol import is_solved
 from planner_jax.live.server import compute_in_place
-from planner_jax.protocol import is_solved
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial

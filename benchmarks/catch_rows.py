@@ -17,8 +17,8 @@ import jax
 import planner_jax as pj
 from planner_jax.benchmarks.cost_gap import cost_gaps, gap_figures
 from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
-from planner_jax.sweep.summary import wilson_interval
-from planner_jax.task.catch.card import DECISIONS, SUITES, TASK
+from planner_jax.runs.summary import wilson_interval
+from planner_jax.task.catch.spec import DECISIONS, SUITES, TASK
 
 
 def run_row(bench: Bench, suite: str, name: str, options: argparse.Namespace) -> dict[str, Any]:

@@ -6,14 +6,14 @@ from typing import Any
 import jax
 import numpy as np
 
+from planner_jax.core.protocol import solved
+from planner_jax.core.registry import Task
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.newton import NewtonConfig
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.problem import Round, Stage
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.planning.plan import plan
-from planner_jax.protocol import solved
-from planner_jax.registry import Task
 
 COMPARED = 1024  # plans of a batch that are looked at, at most
 # One long search from the first guess: Newton's method ends it, which follows valleys to their end.

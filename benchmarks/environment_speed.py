@@ -19,7 +19,7 @@ import jax.numpy as jnp
 
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
 from planner_jax.policies.environment import CatchEnv
-from planner_jax.task.catch.card import SUITES
+from planner_jax.task.catch.spec import SUITES
 
 
 def measure(bench: Bench, options: argparse.Namespace) -> None:

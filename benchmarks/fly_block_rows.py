@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
+from planner_jax.runs.summary import percent, wilson_interval
 from planner_jax.sweep.block.settings import REGIMES
-from planner_jax.sweep.summary import percent, wilson_interval
 
 # Row -> fields of `Drives` that differ from ideal ones, with "share" of the torques.
 ROWS: dict[str, dict[str, Any]] = {
@@ -76,11 +76,11 @@ def line(regime: str, name: str, flights: Any, seconds: float) -> str:
 
 def measure(bench: Bench, regime: str, rows: list[str], options: Any) -> None:
     """Plan once, and carry the plans out in every row."""
-    from planner_jax.protocol import is_solved
+    from planner_jax.core.protocol import is_solved
+    from planner_jax.runs.timing import timed_plans
     from planner_jax.sims.robots.arm.drives import TORQUES, Drives
     from planner_jax.sims.tasks.block_flights import BLOCK_WORLD, fly_blocks, throws
-    from planner_jax.sweep.timing import timed_plans
-    from planner_jax.task.block.words import judge, planner
+    from planner_jax.task.block.api import judge, planner
 
     sense, allowed = 0.133, 0.03
     cases = throws(

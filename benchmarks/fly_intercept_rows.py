@@ -18,6 +18,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from planner_jax.runs.summary import percent, wilson_interval
 from planner_jax.sims.settings import InterceptFly
 from planner_jax.sims.tasks.intercept import (
     FAR,
@@ -27,7 +28,6 @@ from planner_jax.sims.tasks.intercept import (
     InterceptFlights,
     fly_intercepts,
 )
-from planner_jax.sweep.summary import percent, wilson_interval
 from planner_jax.task.intercept.plan import InterceptPlan
 
 # Row -> settings that differ from the task's own.

@@ -22,13 +22,13 @@ from typing import Any
 import jax
 import numpy as np
 
+from planner_jax.runs.summary import percent, wilson_interval
 from planner_jax.sims.loop import Flown, Loop
 from planner_jax.sims.noise import NOISES
 from planner_jax.sims.tasks.catch import CATCH_WORLD, CatchFlights, fly_catches, throws
 from planner_jax.sims.tasks.hit import HIT_WORLD, HitFlights, fly_hits, volleys
-from planner_jax.sweep.summary import percent, wilson_interval
 from planner_jax.task import catch, hit
-from planner_jax.task.hit.card import REAL_SCENARIOS
+from planner_jax.task.hit.spec import REAL_SCENARIOS
 from planner_jax.trajectory.polynomial import evaluate
 
 DRAG_ERROR = 0.15

@@ -19,8 +19,8 @@ import numpy as np
 import planner_jax as pj
 from planner_jax.benchmarks.cost_gap import cost_gaps, gap_figures
 from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
-from planner_jax.sweep.summary import wilson_interval
-from planner_jax.task.hit.serves import Serves
+from planner_jax.runs.summary import wilson_interval
+from planner_jax.task.hit.suites import Serves
 
 ROWS: dict[str, dict] = {
     "base": {},

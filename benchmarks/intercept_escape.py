@@ -4,7 +4,7 @@
         [--rows greedy,reach,informed] [--out DIR]
 
 What targets can do, how they flee and what is drawn stands in
-`planner_jax.task.intercept.escape`. The car drives its plans exactly and plans anew five times a
+`planner_jax.studies.intercept.escape`. The car drives its plans exactly and plans anew five times a
 second, `meet="early"`, from where it is; where no plan is better it goes on with the old one, and
 brakes at its end. Rows:
 
@@ -30,12 +30,10 @@ import numpy as np
 
 import planner_jax as pj
 from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
+from planner_jax.core.protocol import lane
 from planner_jax.plane.target import SampledPath
-from planner_jax.protocol import lane
-from planner_jax.sweep.summary import percent, wilson_interval
-from planner_jax.task.intercept.card import SUITES
-from planner_jax.task.intercept.case import InterceptCase
-from planner_jax.task.intercept.escape import (
+from planner_jax.runs.summary import percent, wilson_interval
+from planner_jax.studies.intercept.escape import (
     CAPTURE,
     FINE,
     HORIZON,
@@ -45,7 +43,9 @@ from planner_jax.task.intercept.escape import (
     draw_escapes,
     pursue,
 )
+from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.plan import InterceptPlan
+from planner_jax.task.intercept.spec import SUITES
 
 CHUNK = 16  # lanes that a core plans in one call
 HEADER = (

@@ -30,8 +30,8 @@ import numpy as np
 import planner_jax as pj
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
 from planner_jax.plane.target import PlanePath
-from planner_jax.task.intercept.group import GroupPlan, InterceptGroup
-from planner_jax.task.intercept.group_decide import Best
+from planner_jax.task.group.case import GroupPlan, InterceptGroup
+from planner_jax.task.group.decide import Best
 
 TARGETS = 3
 DECISIONS = {

@@ -48,9 +48,9 @@ from planner_jax.benchmarks.intercept_lattice import LAYER, MINIMAL, STRICT, Lat
 from planner_jax.benchmarks.run import Bench, at_least
 from planner_jax.plane.obstacles import Obstacles
 from planner_jax.plane.target import PlanePath
-from planner_jax.sweep.summary import percent, wilson_interval
-from planner_jax.task.intercept.card import SUITES, TASK
+from planner_jax.runs.summary import percent, wilson_interval
 from planner_jax.task.intercept.case import InterceptCase
+from planner_jax.task.intercept.spec import SUITES, TASK
 from planner_jax.task.intercept.suites import draw_cases
 
 SEARCHES = ("bound", "minimal", "strict")

@@ -25,13 +25,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from planner_jax.baselines.intercept.hybrid_astar import (
+    HEURISTICS,
+    HybridAstar,
+    HybridPath,
+    hybrid_astar,
+)
+from planner_jax.baselines.intercept.path_smoothing import smooth_path
 from planner_jax.benchmarks.path_peers import CELL, INSTALL, PAD, installed, searched
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
-from planner_jax.plane.hybrid_astar import HEURISTICS, HybridAstar, HybridPath, hybrid_astar
 from planner_jax.plane.obstacles import distances, separation
-from planner_jax.plane.path_smoothing import smooth_path
+from planner_jax.task.intercept.api import positions
 from planner_jax.task.intercept.suites import draw_cases
-from planner_jax.task.intercept.words import positions
 
 SUITES = ("hard", "maze")
 ROOM = 0.9  # of the curvature, for paths that are made smooth

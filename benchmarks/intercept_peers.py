@@ -27,11 +27,11 @@ import jax.numpy as jnp
 import numpy as np
 
 import planner_jax as pj
+from planner_jax.baselines.intercept.paper import PaperIntercept, printed_speed
+from planner_jax.baselines.intercept.path_then_speed import PathThenSpeed
 from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin
 from planner_jax.referee.intercept import InterceptVerdict
-from planner_jax.task.intercept.card import SUITES
-from planner_jax.task.intercept.paper import PaperIntercept, printed_speed
-from planner_jax.task.intercept.path_then_speed import PathThenSpeed
+from planner_jax.task.intercept.spec import SUITES
 
 BASELINES = "numba not installed: pip install 'planner-jax[baselines]' for the planner paper"
 SOFT_END = 3.0 * 10.0**3 / 10.0  # w_2 T^3 / w_1 of the paper's weights, 3 and 10, and T = 10 s

@@ -31,18 +31,18 @@ import numpy as np
 
 import planner_jax as pj
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
+from planner_jax.core.protocol import is_solved
 from planner_jax.plane.prediction import select
 from planner_jax.plane.target import TurningPath
 from planner_jax.plane.turn_fit import cramer_rao, share_within
-from planner_jax.protocol import is_solved
 from planner_jax.referee.intercept import InterceptVerdict
-from planner_jax.sweep.summary import percent, wilson_interval
-from planner_jax.task.intercept.card import SUITES
+from planner_jax.runs.summary import percent, wilson_interval
+from planner_jax.task.intercept.api import positions
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.plan import InterceptPlan
-from planner_jax.task.intercept.spacetime import SpacetimeIntercept
+from planner_jax.task.intercept.planner import SpacetimeIntercept
+from planner_jax.task.intercept.spec import SUITES
 from planner_jax.task.intercept.suites import observe
-from planner_jax.task.intercept.words import positions
 
 NOISE = 0.1  # [m], standard deviation of a coordinate that is seen
 COUNT = 15  # looks up to the start

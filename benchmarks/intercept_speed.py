@@ -21,12 +21,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from planner_jax.benchmarks.qp_peers import INSTALL, PEERS, installed
-from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin
-from planner_jax.optimise.qp import solve_qp
-from planner_jax.plane.station_time import reference_line, stations_at_joints
-from planner_jax.protocol import Status
-from planner_jax.task.intercept.speed import (
+from planner_jax.baselines.intercept.bezier import bernstein, hodograph
+from planner_jax.baselines.intercept.qp import solve_qp
+from planner_jax.baselines.intercept.speed import (
     SPEED_PLANNERS,
     SpeedPlanner,
     constant_speed,
@@ -35,8 +32,11 @@ from planner_jax.task.intercept.speed import (
     speed_matrices,
     speed_template,
 )
-from planner_jax.task.intercept.speed_problems import speed_problems
-from planner_jax.trajectory.bezier import bernstein, hodograph
+from planner_jax.baselines.intercept.speed_problems import speed_problems
+from planner_jax.baselines.intercept.station_time import reference_line, stations_at_joints
+from planner_jax.benchmarks.qp_peers import INSTALL, PEERS, installed
+from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin
+from planner_jax.core.protocol import Status
 
 PIECES = (10, 20)
 CONSTANT = "constant speed"

@@ -21,9 +21,9 @@ import numpy as np
 import planner_jax as pj
 import planner_jax.task
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
+from planner_jax.core.registry import task_named
 from planner_jax.optimise.scaling import measure_scale
 from planner_jax.planning.decided import first_choice
-from planner_jax.registry import task_named
 
 HIT_PIECES, CATCH_PIECES = (6, 12), (6,)
 

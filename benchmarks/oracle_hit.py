@@ -26,9 +26,9 @@ import numpy as np
 
 from planner_jax.benchmarks.hit_oracle.search import STARTS, Finding, find_hits, starting_points
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
-from planner_jax.sweep.parquet import read_rows
-from planner_jax.sweep.summary import wilson_interval
-from planner_jax.task.hit.serves import generate_serves, read_serves, to_cases
+from planner_jax.runs.parquet import read_rows
+from planner_jax.runs.summary import wilson_interval
+from planner_jax.task.hit.suites import generate_serves, read_serves, to_cases
 from planner_jax.task.hit.validate import ServeError
 
 NUM_GENERATED = 9000  # serves that are drawn where no folder is given

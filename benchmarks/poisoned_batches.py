@@ -18,9 +18,9 @@ import numpy as np
 
 import planner_jax as pj
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
+from planner_jax.core.registry import all_tasks
+from planner_jax.core.rules import all_ruled
 from planner_jax.planning.decided import DecidedPlanner
-from planner_jax.registry import all_tasks
-from planner_jax.rules import all_ruled
 
 REPLACED = ("order", "times")  # by a decision, which does not read what they hold
 BAD = (np.nan, np.inf, -np.inf, -1.0, 0.0, 1e6)

@@ -37,10 +37,10 @@ from planner_jax.benchmarks.policy_ablations import (
 from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin
 from planner_jax.policies.environment import CatchEnv
 from planner_jax.policies.observation import PER_TARGET, choice_of, observe
-from planner_jax.task.catch.card import SUITES
 from planner_jax.task.catch.case import CatchCase, CatchChoice
 from planner_jax.task.catch.decide import CatchDecision, in_several_lengths
 from planner_jax.task.catch.estimate import timetable
+from planner_jax.task.catch.spec import SUITES
 
 torch: Any = importlib.import_module("torch")
 spaces: Any = importlib.import_module("gymnasium.spaces")

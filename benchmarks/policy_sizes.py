@@ -25,7 +25,7 @@ from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin, 
 from planner_jax.policies.policy import Policy, policy
 from planner_jax.policies.settings import TrainSettings
 from planner_jax.policies.training import train_as_asked
-from planner_jax.sweep.settings import SettingError
+from planner_jax.runs.settings import SettingError
 
 SUITES = {"4": "square4", "5": "pentagon5", "7": "heptagon7"}
 REWARD: dict[str, Any] = {"solved": (5.0,), "last": (10.0,), "ratio": (14.0,)}

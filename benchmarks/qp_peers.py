@@ -1,4 +1,4 @@
-"""Published solvers on the quadratic programs of `planner_jax.optimise.qp`: the extra `peers`."""
+"""Published solvers on the programs of `baselines.intercept.qp`, with the extra `peers`."""
 
 import dataclasses
 import importlib

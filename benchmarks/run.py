@@ -19,9 +19,9 @@ from typing import Any, Self
 import numpy as np
 
 from planner_jax.benchmarks.cost_gap import gap_figures
-from planner_jax.sweep.environment import environment
-from planner_jax.sweep.run_folder import RunFolder
-from planner_jax.sweep.settings import SettingError
+from planner_jax.runs.environment import environment
+from planner_jax.runs.run_folder import RunFolder
+from planner_jax.runs.settings import SettingError
 
 
 def argument_parser(name: str, doc: str | None, **counts: int) -> argparse.ArgumentParser:

@@ -23,8 +23,8 @@ import numpy as np
 import planner_jax as pj
 from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
 from planner_jax.robot.quadrotor_models import MODELS
-from planner_jax.task.catch.card import SUITES as CATCHES
-from planner_jax.task.intercept.card import SUITES as INTERCEPTIONS
+from planner_jax.task.catch.spec import SUITES as CATCHES
+from planner_jax.task.intercept.spec import SUITES as INTERCEPTIONS
 from planner_jax.trajectory.polynomial import states_at
 
 TOLERANCE = 1e-3  # of the referee, relative

@@ -28,12 +28,12 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from planner_jax.benchmarks.cost_gap import COMPARED, cost_gaps, gap_figures
 from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
 from planner_jax.benchmarks.throughput_settings import ThroughputSettings
+from planner_jax.core.registry import Task, all_tasks, task_named
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.planning.plan import plan
-from planner_jax.registry import Task, all_tasks, task_named
-from planner_jax.sweep.settings import require
-from planner_jax.sweep.timing import CompileClock
+from planner_jax.runs.settings import require
+from planner_jax.runs.timing import CompileClock
 
 _WARM_UP = 0.5  # [s]
 _JUDGED = 300_000  # lanes of a batch that the referee sees, at most

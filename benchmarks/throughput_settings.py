@@ -4,10 +4,10 @@ import dataclasses
 import pkgutil
 from typing import ClassVar
 
-from planner_jax.memory import require_memory
-from planner_jax.registry import task_named
-from planner_jax.sweep.settings import SettingError, SweepSettings, option, require, require_one_of
-from planner_jax.task.efforts import EFFORTS
+from planner_jax.core.efforts import EFFORTS
+from planner_jax.core.registry import task_named
+from planner_jax.host.memory import require_memory
+from planner_jax.runs.settings import SettingError, SweepSettings, option, require, require_one_of
 
 _MOST = 100_000  # iterations, or calls: an hour and more
 

@@ -33,8 +33,8 @@ import numpy as np
 import planner_jax as pj
 from planner_jax.benchmarks.cost_gap import COMPARED, cost_gaps, gap_figures
 from planner_jax.benchmarks.run import argument_parser, begin, chosen
+from planner_jax.runs.run_folder import RunFolder
 from planner_jax.sweep.cluster import WORKERS_OF_GPU
-from planner_jax.sweep.run_folder import RunFolder
 
 _FIRST = 9  # chunks that are not counted, at least
 _GPUS, _PREALLOCATE = "CUDA_VISIBLE_DEVICES", "XLA_PYTHON_CLIENT_PREALLOCATE"

@@ -4,7 +4,7 @@ import importlib.util
 import os
 import sys
 
-from planner_jax import stopping
+from planner_jax.host import signals as stopping
 
 
 def run() -> None:
@@ -15,7 +15,7 @@ def run() -> None:
         # the threads of each computation if nothing else is said.
         os.environ.setdefault("PJRT_NPROC", os.environ.get("NPROC", "1"))
     try:
-        from planner_jax.cli import main
+        from planner_jax.cli.main import main
 
         code = main()
     except Exception:

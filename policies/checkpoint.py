@@ -14,13 +14,12 @@ from typing import Any
 import numpy as np
 from flax import traverse_util
 
-from planner_jax.checks import require_path_name
-from planner_jax.plain_files import open_plain
-from planner_jax.plan_files import UNREADABLE
+from planner_jax.core.checks import require_path_name
+from planner_jax.core.plan_files import UNREADABLE
+from planner_jax.host.files import open_plain, replacing
 from planner_jax.policies.networks import NETWORKS
 from planner_jax.policies.observation import FEATURES
-from planner_jax.sweep.settings import SettingError
-from planner_jax.whole_files import replacing
+from planner_jax.runs.settings import SettingError
 
 FORMAT = 2
 SHIPPED = ("catch", "rush6")  # one for eight suites, and one for `rush6` alone

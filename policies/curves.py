@@ -17,8 +17,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from planner_jax.policies.progress import read_asked, read_rows
-from planner_jax.sweep.figures import style
-from planner_jax.sweep.settings import SettingError
+from planner_jax.runs import style
+from planner_jax.runs.settings import SettingError
 
 _TERMS = {
     "reward": ("Reward", "mean", 1.0),

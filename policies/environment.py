@@ -16,17 +16,17 @@ import numpy as np
 from brax.envs.base import Env, State
 from jax import Array
 
+from planner_jax.core.protocol import is_solved
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.multistart import solve_batch
 from planner_jax.optimise.problem import Round
 from planner_jax.policies.observation import FEATURES, PER_TARGET, choice_of, observe
 from planner_jax.policies.settings import WEIGHTS
-from planner_jax.protocol import is_solved
-from planner_jax.task.catch.card import SUITES
 from planner_jax.task.catch.case import CatchCase, CatchChoice
 from planner_jax.task.catch.decide import in_several_lengths
 from planner_jax.task.catch.estimate import earliest_next, shortfall, timetable
-from planner_jax.task.catch.exact import ExactCatch
+from planner_jax.task.catch.planner import ExactCatch
+from planner_jax.task.catch.spec import SUITES
 from planner_jax.task.catch.suites import draw_by_key
 
 # Terms of a reward that count only of cases that are solved, lest a policy be paid for early

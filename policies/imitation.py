@@ -17,14 +17,14 @@ import optax
 from flax import struct
 from jax import Array
 
+from planner_jax.core.protocol import solved
 from planner_jax.planning.plan import plan
 from planner_jax.policies.observation import HANDICAP, STRETCH, observe, turned
-from planner_jax.protocol import solved
+from planner_jax.task.catch.api import planner
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.chain import targets_at
 from planner_jax.task.catch.estimate import arrivals, follow, timetable, top_speed
 from planner_jax.task.catch.suites import draw
-from planner_jax.task.catch.words import planner
 
 _SOFT = 0.2  # [s]: how much earlier a target has to be to be chosen more than twice as often
 

@@ -11,9 +11,9 @@ import jax
 import numpy as np
 import orbax.checkpoint as orbax
 
-from planner_jax.sweep.manifest import to_write
-from planner_jax.sweep.plain_json import JsonError, read_object, require_sealed
-from planner_jax.whole_files import replacing
+from planner_jax.host.files import replacing
+from planner_jax.runs.manifest import to_write
+from planner_jax.runs.plain_json import JsonError, read_object, require_sealed
 
 
 class KeptParts:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from planner_jax.checks import require_number, require_size, told
+from planner_jax.core.checks import require_number, require_size, told
 from planner_jax.policies.checkpoint import checkpoint_of
 from planner_jax.policies.networks import LEAST_STD
 from planner_jax.policies.observation import PER_TARGET, STRETCH, choice_of, observe

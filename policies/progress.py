@@ -22,18 +22,18 @@ from brax.training.agents.ppo import losses
 from tensorboardX import SummaryWriter
 from tqdm import tqdm
 
-from planner_jax import stopping
-from planner_jax.plain_files import open_plain
-from planner_jax.sweep.manifest import (
+from planner_jax.host import signals as stopping
+from planner_jax.host.files import open_plain
+from planner_jax.runs.manifest import (
     is_count,
     is_number,
     read_sealed,
     require_format,
     to_write,
 )
-from planner_jax.sweep.plain_json import JsonError, parse_object, require_sealed
-from planner_jax.sweep.run_folder import RunFolder
-from planner_jax.sweep.settings import SettingError
+from planner_jax.runs.plain_json import JsonError, parse_object, require_sealed
+from planner_jax.runs.run_folder import RunFolder
+from planner_jax.runs.settings import SettingError
 
 FILE, ASKED = "progress.jsonl", "training.json"
 # What every row of the curve has.

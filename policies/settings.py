@@ -4,9 +4,9 @@ import dataclasses
 import math
 from typing import Any, ClassVar
 
-from planner_jax.memory import require_memory
-from planner_jax.sweep.settings import SettingError, option, require, require_count, require_seed
-from planner_jax.task.catch.card import SUITES
+from planner_jax.host.memory import require_memory
+from planner_jax.runs.settings import SettingError, option, require, require_count, require_seed
+from planner_jax.task.catch.spec import SUITES
 
 _MOST_DECISIONS = 1e12
 _CASE_BYTES = 20_000  # of memory, as estimated, of a case that is decided with others

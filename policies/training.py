@@ -28,7 +28,8 @@ from brax.training.agents.ppo import train as ppo
 from brax.training.distribution import NormalTanhDistribution
 from jax import Array
 
-from planner_jax import stopping
+from planner_jax.core.protocol import solved
+from planner_jax.host import signals as stopping
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.planning.plan import plan
 from planner_jax.policies import brax_compat
@@ -47,13 +48,12 @@ from planner_jax.policies.observation import FEATURES, PER_TARGET
 from planner_jax.policies.policy import Policy
 from planner_jax.policies.progress import ASKED, Progress, read_asked, reported_terms
 from planner_jax.policies.settings import WEIGHTS, TrainSettings
-from planner_jax.protocol import solved
-from planner_jax.sweep.environment import code_digest, installed_version
-from planner_jax.sweep.manifest import to_write
-from planner_jax.sweep.run_folder import RunFolder
-from planner_jax.sweep.settings import SettingError
+from planner_jax.runs.environment import code_digest, installed_version
+from planner_jax.runs.manifest import to_write
+from planner_jax.runs.run_folder import RunFolder
+from planner_jax.runs.settings import SettingError
 from planner_jax.task.catch.decide import optimal_time_ratio
-from planner_jax.task.catch.exact import ExactCatch
+from planner_jax.task.catch.planner import ExactCatch
 from planner_jax.task.catch.suites import draw
 
 _ROWS = 50  # of a part's curve, at most

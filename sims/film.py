@@ -11,12 +11,12 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
+from planner_jax.host.files import replacing
+from planner_jax.runs.style import BLUE, GREEN, GREY, INK, ORANGE, PALE, PURPLE, RED, SKY
 from planner_jax.sims.recording import Recording, frame
 from planner_jax.sims.robot import Solid, rotation
 from planner_jax.sims.scenery import FLAT, Part, Prism, machine_parts, outlines, part_solid
 from planner_jax.sims.task import FlightTask
-from planner_jax.sweep.figures.style import BLUE, GREEN, GREY, INK, ORANGE, PALE, PURPLE, RED, SKY
-from planner_jax.whole_files import replacing
 
 BALL_COLOURS = (ORANGE, PURPLE, GREEN)
 FORMATS = (".gif", ".mp4")

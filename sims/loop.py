@@ -24,13 +24,13 @@ from flax import struct
 from jax import Array, lax
 
 from planner_jax.ball.flight import BallState, fly
+from planner_jax.host.threads import as_here
 from planner_jax.sims import sensing as sight
 from planner_jax.sims.model import World, ball_states, ball_velocity, step
 from planner_jax.sims.noise import Sensing, require_whole
 from planner_jax.sims.robot import Physics
 from planner_jax.sims.scoring import Contact, moment, nearest
 from planner_jax.sims.sensing import Estimate
-from planner_jax.threads import as_here
 
 _FEW = 1024  # flights at once, for which compilation takes longer than all else
 

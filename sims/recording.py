@@ -13,12 +13,12 @@ import numpy as np
 import pyarrow as pa
 
 from planner_jax.ball.flight import BallState
+from planner_jax.runs.columns import BOOL, LIST, VECTOR, RefereedBatch, leaves_of, rows_of
+from planner_jax.runs.parquet import read_rows
+from planner_jax.runs.source import Chunk
 from planner_jax.sims.loop import Flown
 from planner_jax.sims.model import World
 from planner_jax.sims.robot import Robot
-from planner_jax.sweep.columns import BOOL, LIST, VECTOR, RefereedBatch, leaves_of, rows_of
-from planner_jax.sweep.parquet import read_rows
-from planner_jax.sweep.source import Chunk
 from planner_jax.task.hit.validate import fly, landing
 
 FILE = "flights.parquet"

@@ -11,12 +11,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from planner_jax import stopping
-from planner_jax.sims.film import FilmError, draw_flight, film_flights, require_film
-from planner_jax.sims.recording import FILE, Recording, read_recording, to_rows
-from planner_jax.sims.settings import FlySettings, fly_settings
-from planner_jax.sims.task import FlightTask
-from planner_jax.sweep.columns import (
+from planner_jax.host import signals as stopping
+from planner_jax.runs.columns import (
     BOOL,
     COUNT,
     INDEX,
@@ -26,17 +22,21 @@ from planner_jax.sweep.columns import (
     rows_of,
     status_column,
 )
-from planner_jax.sweep.columns import RefereedBatch as FlownBatch
-from planner_jax.sweep.environment import environment, require_backend
-from planner_jax.sweep.parquet import read_rows
+from planner_jax.runs.columns import RefereedBatch as FlownBatch
+from planner_jax.runs.environment import environment, require_backend
+from planner_jax.runs.parquet import read_rows
+from planner_jax.runs.run_folder import RunFolder
+from planner_jax.runs.settings import SettingError, require, settings_of_manifest
+from planner_jax.runs.source import Chunk
+from planner_jax.runs.summary import percent, wilson_interval
+from planner_jax.runs.table import RateTable, own_cells, to_html, to_markdown
+from planner_jax.runs.timing import CompileClock, Stopwatch
+from planner_jax.sims.film import FilmError, draw_flight, film_flights, require_film
+from planner_jax.sims.recording import FILE, Recording, read_recording, to_rows
+from planner_jax.sims.settings import FlySettings, fly_settings
+from planner_jax.sims.task import FlightTask
 from planner_jax.sweep.report import require_counted
 from planner_jax.sweep.robots import robot_remark
-from planner_jax.sweep.run_folder import RunFolder
-from planner_jax.sweep.settings import SettingError, require, settings_of_manifest
-from planner_jax.sweep.source import Chunk
-from planner_jax.sweep.summary import percent, wilson_interval
-from planner_jax.sweep.table import RateTable, own_cells, to_html, to_markdown
-from planner_jax.sweep.timing import CompileClock, Stopwatch
 
 _FILMED = 3  # flights at most
 _RECORDED = 256  # flights of a batch that are recorded whole

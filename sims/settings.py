@@ -8,13 +8,10 @@ import math
 import pkgutil
 from typing import Any, ClassVar
 
-from planner_jax.memory import require_memory
-from planner_jax.registry import Task, UnknownName, all_tasks, split_name
-from planner_jax.sims.noise import NOISES, PLANE_NOISES, PlaneSensing, Sensing, require_whole
-from planner_jax.sims.robots.arm.drives import ENCODERS, TORQUES, Drives
-from planner_jax.sweep.block.settings import REGIMES, require_frame_rate, require_moderate
-from planner_jax.sweep.robots import checked_robot, robot_option
-from planner_jax.sweep.settings import (
+from planner_jax.core.registry import Task, UnknownName, all_tasks, split_name
+from planner_jax.core.scales import SCALES
+from planner_jax.host.memory import require_memory
+from planner_jax.runs.settings import (
     SettingError,
     option,
     require,
@@ -22,13 +19,16 @@ from planner_jax.sweep.settings import (
     require_one_of,
     require_seed,
 )
-from planner_jax.task.block.card import TASK as BLOCK
-from planner_jax.task.catch.card import DECISIONS, TRAINED
-from planner_jax.task.catch.card import TASK as CATCH
-from planner_jax.task.hit.card import TASK as HIT
-from planner_jax.task.intercept.card import GROUPS
-from planner_jax.task.intercept.card import TASK as INTERCEPT
-from planner_jax.task.scales import SCALES
+from planner_jax.sims.noise import NOISES, PLANE_NOISES, PlaneSensing, Sensing, require_whole
+from planner_jax.sims.robots.arm.drives import ENCODERS, TORQUES, Drives
+from planner_jax.sweep.block.settings import REGIMES, require_frame_rate, require_moderate
+from planner_jax.sweep.robots import checked_robot, robot_option
+from planner_jax.task.block.spec import TASK as BLOCK
+from planner_jax.task.catch.spec import DECISIONS, TRAINED
+from planner_jax.task.catch.spec import TASK as CATCH
+from planner_jax.task.hit.spec import TASK as HIT
+from planner_jax.task.intercept.spec import GROUPS
+from planner_jax.task.intercept.spec import TASK as INTERCEPT
 
 _REPLAN = "plans a second, 0 for the first only (default: {} with {}, 0 with other planners)"
 # Flights have no order or times of their own to be given.

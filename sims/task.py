@@ -9,14 +9,14 @@ from typing import Any, ClassVar, Self
 import jax
 import numpy as np
 
+from planner_jax.runs.columns import LIST, Column, leaves_of
+from planner_jax.runs.table import RateTable
 from planner_jax.sims.loop import Flown, Loop
 from planner_jax.sims.model import BALL_RADIUS, World
 from planner_jax.sims.noise import NOISES
 from planner_jax.sims.recording import Launches, Recording, recorded
 from planner_jax.sims.scenery import Prism
 from planner_jax.sims.settings import BallFly
-from planner_jax.sweep.columns import LIST, Column, leaves_of
-from planner_jax.sweep.table import RateTable
 
 
 @dataclasses.dataclass(frozen=True)

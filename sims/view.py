@@ -16,14 +16,14 @@ from typing import Any
 
 import numpy as np
 
-from planner_jax.registry import install_line
+from planner_jax.core.registry import install_line
+from planner_jax.runs.settings import SettingError, require
+from planner_jax.runs.style import BLUE, GREEN, GREY, INK, RED, SKY
 from planner_jax.sims.film import BALL_COLOURS
 from planner_jax.sims.guard import guarded
 from planner_jax.sims.recording import Recording, frame
 from planner_jax.sims.scenery import GROUND_COLOUR, Part, machine_parts
 from planner_jax.sims.task import FlightTask
-from planner_jax.sweep.figures.style import BLUE, GREEN, GREY, INK, RED, SKY
-from planner_jax.sweep.settings import SettingError, require
 
 _RATE = 30.0  # [Hz], of playing
 _STEP = 0.01  # [s], of the slider

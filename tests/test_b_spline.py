@@ -9,7 +9,7 @@ import pytest
 from derivatives import assert_gradient_matches_differences
 from scipy.interpolate import BSpline
 
-from planner_jax.trajectory.b_spline import b_spline, basis, hodograph
+from planner_jax.baselines.block.b_spline import b_spline, basis, hodograph
 from planner_jax.trajectory.polynomial import evaluate
 
 SHARES = np.linspace(0.0, 1.0, 98)

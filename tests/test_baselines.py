@@ -12,16 +12,16 @@ from derivatives import assert_gradient_matches_differences
 import planner_jax as pj
 from planner_jax.ball.flight import BallState, drag_free_flight, fly
 from planner_jax.ball.impact import racket_impact
+from planner_jax.baselines.hit.bat import BatHit, serve_origin, transition_point
+from planner_jax.baselines.hit.decoupled import aim_at_angle, decoupled_hit
+from planner_jax.baselines.hit.juggle import JuggleHit
+from planner_jax.baselines.parts.minimum_jerk import eased_minimum_jerk, minimum_jerk
+from planner_jax.core.protocol import Status, is_solved
 from planner_jax.planning.plan import plan
-from planner_jax.protocol import Status, is_solved
 from planner_jax.referee.hit import referee_hits
 from planner_jax.task.hit import court
-from planner_jax.task.hit.bat import BatHit, serve_origin, transition_point
-from planner_jax.task.hit.card import TASK
-from planner_jax.task.hit.decoupled import aim_at_angle, decoupled_hit
-from planner_jax.task.hit.juggle import JuggleHit
-from planner_jax.task.hit.serves import generate_serves, to_cases
-from planner_jax.trajectory.minimum_jerk import eased_minimum_jerk, minimum_jerk
+from planner_jax.task.hit.spec import TASK
+from planner_jax.task.hit.suites import generate_serves, to_cases
 from planner_jax.trajectory.polynomial import evaluate
 
 NUM = 16

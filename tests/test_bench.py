@@ -13,12 +13,13 @@ import pytest
 from flax import struct
 
 import planner_jax as pj
-from planner_jax import benchmarks, registry
+from planner_jax import benchmarks
 from planner_jax.benchmarks.block_rows import METHODS, ROWS
 from planner_jax.benchmarks.cost_gap import cost_gaps, gap_figures
 from planner_jax.benchmarks.run import Bench
 from planner_jax.benchmarks.throughput import report
-from planner_jax.sweep.settings import SettingError
+from planner_jax.core import registry
+from planner_jax.runs.settings import SettingError
 
 NEEDS = {"oracle_hit": "casadi", "policy_peer": "stable_baselines3"}  # not what tests install
 BENCHMARKS = sorted(Path(benchmarks.__path__[0]).glob("*.py"))

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from planner_jax.trajectory.bezier import (
+from planner_jax.baselines.intercept.bezier import (
     BezierCurve,
     bernstein,
     bounds_of_pieces,

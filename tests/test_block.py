@@ -10,8 +10,8 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.ball.flight import BallState, drag_free_flight
+from planner_jax.core.plan_files import named_leaves
 from planner_jax.optimise.levenberg import LevenbergConfig
-from planner_jax.plan_files import named_leaves
 from planner_jax.referee.arm_clearance import KINDS
 from planner_jax.referee.arm_clearance import clearances as referee_clearances
 from planner_jax.robot.arm import REGIMES
@@ -20,7 +20,7 @@ from planner_jax.sweep.block.settings import REGIMES as SWEPT
 from planner_jax.task.block.clearance import clearance_slopes, clearances, num_of_pole
 from planner_jax.task.block.end_poses import end_poses, flight_of
 from planner_jax.task.block.motion import angles_at, polynomial, profiles, sums
-from planner_jax.task.block.online import OnlineBlock, Search
+from planner_jax.task.block.planner import OnlineBlock, Search
 from planner_jax.task.block.scene import entry_time, paper_scene
 from planner_jax.trajectory.polynomial import evaluate
 

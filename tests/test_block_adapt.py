@@ -9,18 +9,17 @@ import numpy as np
 import pytest
 
 import planner_jax as pj
+from planner_jax.baselines.block.library import build as building
+from planner_jax.baselines.block.library.adapt import AdaptBlock, Effort, adapt_planner
+from planner_jax.baselines.block.library.cells import Face, Layout, cell_of, cells_around
+from planner_jax.baselines.block.library.file import LibraryFileError, save_library
+from planner_jax.baselines.block.library.planner import LibraryBlock, OtherLibrary
+from planner_jax.baselines.block.library.table import Row, Setting, library_of, packed
 from planner_jax.robot.arm import REGIMES
 from planner_jax.robot.arm_mjcf import irb1600
-from planner_jax.task.block.ball_by_ball import BallByBall
 from planner_jax.task.block.end_poses import end_poses, flight_of
-from planner_jax.task.block.library import build as building
-from planner_jax.task.block.library.adapt import AdaptBlock, Effort, adapt_planner
-from planner_jax.task.block.library.cells import Face, Layout, cell_of, cells_around
-from planner_jax.task.block.library.file import LibraryFileError, save_library
-from planner_jax.task.block.library.planner import LibraryBlock, OtherLibrary
-from planner_jax.task.block.library.table import Row, Setting, library_of, packed
 from planner_jax.task.block.motion import profiles
-from planner_jax.task.block.online import OnlineBlock
+from planner_jax.task.block.planner import OnlineBlock
 from planner_jax.task.block.scene import paper_scene
 
 ONLINE = OnlineBlock(pieces=6, points=10)
@@ -148,18 +147,6 @@ def test_statuses_of_a_batch_say_why_and_the_referee_confirms_what_is_solved(pla
     assert [S(int(s)) for s in plans.status[3:6]] == [S.BLOCKED] * 3
     verdict: Any = pj.block.judge(cases, plans)
     assert pj.solved(plans)[GOOD].all() and verdict.success[GOOD].all()
-
-
-@pytest.mark.slow
-def test_balls_one_by_one_are_planned_as_in_a_batch(planned):
-    own, cases, plans = planned
-    one = BallByBall(own, pj.lane(cases, 0))
-    for k in GOOD:
-        plan = one.plan(cases.ball.pos[k], cases.ball.vel[k])
-        assert pj.Status(int(plan.status)) == plans.status[k]
-        np.testing.assert_allclose(plan.contact_time, plans.contact_time[k], atol=1e-5)
-        np.testing.assert_allclose(plan.motion.coeffs, plans.motion.coeffs[k], atol=1e-3)
-    assert one.plan(cases.ball.pos[1], cases.ball.vel[1]).status == pj.Status.OUT_OF_REACH
 
 
 def test_what_is_wrong_with_a_file_or_with_cases_is_named(tmp_path):

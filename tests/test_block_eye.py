@@ -12,9 +12,9 @@ import planner_jax as pj
 from planner_jax.ball.flight import drag_free_flight
 from planner_jax.perception.camera import in_view, looking_at
 from planner_jax.perception.fit import Sight, believed_at, error_across
+from planner_jax.studies.block.observation import cautious, eye, frame_times, mast_camera, see
+from planner_jax.task.block.contact_check import as_met
 from planner_jax.task.block.end_poses import flight_of
-from planner_jax.task.block.eye import cautious, eye, frame_times, mast_camera, see
-from planner_jax.task.block.met import as_met
 
 
 @pytest.mark.parametrize("suite", ["pole", "short"])

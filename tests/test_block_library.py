@@ -10,13 +10,8 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.ball.flight import drag_free_flight
-from planner_jax.cli import main
-from planner_jax.robot.arm import REGIMES
-from planner_jax.robot.arm_mjcf import irb1600
-from planner_jax.sweep.block import library as command
-from planner_jax.sweep.settings import SettingError
-from planner_jax.task.block.library import build as building
-from planner_jax.task.block.library.cells import (
+from planner_jax.baselines.block.library import build as building
+from planner_jax.baselines.block.library.cells import (
     GRAVITY,
     LAYOUTS,
     Face,
@@ -26,10 +21,10 @@ from planner_jax.task.block.library.cells import (
     nominal_ball,
     tunnels,
 )
-from planner_jax.task.block.library.coverage import check, coverage
-from planner_jax.task.block.library.file import LibraryFileError, load_library, save_library
-from planner_jax.task.block.library.planner import LibraryBlock, OneBall, OtherLibrary
-from planner_jax.task.block.library.table import (
+from planner_jax.baselines.block.library.coverage import check, coverage
+from planner_jax.baselines.block.library.file import LibraryFileError, load_library, save_library
+from planner_jax.baselines.block.library.planner import LibraryBlock, OneBall, OtherLibrary
+from planner_jax.baselines.block.library.table import (
     Row,
     Setting,
     library_of,
@@ -37,6 +32,11 @@ from planner_jax.task.block.library.table import (
     packed,
     unpacked,
 )
+from planner_jax.cli.main import library as command
+from planner_jax.cli.main import main
+from planner_jax.robot.arm import REGIMES
+from planner_jax.robot.arm_mjcf import irb1600
+from planner_jax.runs.settings import SettingError
 from planner_jax.task.block.motion import profiles
 from planner_jax.task.block.scene import Box, paper_scene
 

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 
 import planner_jax as pj
-from planner_jax.registry import MissingExtra, install_line
+from planner_jax.baselines.block.free_space import FreeSpace
+from planner_jax.baselines.block.path_timing import PIECES, timed_way
+from planner_jax.baselines.parts.bang_bang import bang_bang, least_times
+from planner_jax.core.registry import MissingExtra, install_line
 from planner_jax.robot.arm import REGIMES
 from planner_jax.robot.arm_dynamics import inverse_dynamics, motion_torques
 from planner_jax.robot.arm_mjcf import irb1600
 from planner_jax.sweep.block.settings import BlockSettings
 from planner_jax.sweep.block.sweep import BlockSweep
-from planner_jax.task.block.card import TASK
-from planner_jax.task.block.free_space import FreeSpace
-from planner_jax.task.block.way_timing import PIECES, timed_way
-from planner_jax.trajectory.bang_bang import bang_bang, least_times
+from planner_jax.task.block.spec import TASK
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 LIMITS = REGIMES["R2"].limits

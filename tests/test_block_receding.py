@@ -9,17 +9,17 @@ from test_block import SMALL
 
 import planner_jax as pj
 from planner_jax.ball.flight import drag_free_flight
+from planner_jax.core.protocol import Status, lane
 from planner_jax.perception.camera import looking_at
 from planner_jax.perception.fit import Sight
-from planner_jax.protocol import Status, lane
+from planner_jax.runs.settings import SettingError
+from planner_jax.studies.block.observation import cautious, eye
+from planner_jax.studies.block.receding import Aim, decide
 from planner_jax.sweep.block.settings import BlockSettings
 from planner_jax.sweep.run import start_sweep
-from planner_jax.sweep.settings import SettingError
-from planner_jax.task.block.card import TASK
-from planner_jax.task.block.eye import cautious, eye
-from planner_jax.task.block.met import as_met, begun_late
-from planner_jax.task.block.receding import Aim, decide
+from planner_jax.task.block.contact_check import as_met, begun_late
 from planner_jax.task.block.replan import ReplanBlock, WarmBlock
+from planner_jax.task.block.spec import TASK
 
 AIMS = (Aim(0.02), Aim(0.09))
 AGAIN = ReplanBlock(warm=WarmBlock(planner=SMALL), planner=SMALL)

@@ -7,21 +7,22 @@ import pytest
 from test_block import SMALL
 
 import planner_jax as pj
+from planner_jax.studies.block import sequence
+from planner_jax.studies.block.sequence import narrowed
 from planner_jax.task.block.end_poses import flight_of
 from planner_jax.task.block.motion import cut, polynomial
-from planner_jax.task.block.sequence import narrowed
 from planner_jax.trajectory.polynomial import evaluate
 
 NUM = 12  # the program for 16 cases in jax arrays is one of its own
 
 
 def drawn(num=NUM, **options):
-    return pj.block.draw_sequences(num, seed=4, regime="R1", wide=True, **options)
+    return sequence.draw_sequences(num, seed=4, regime="R1", wide=True, **options)
 
 
 @pytest.fixture(scope="module")
 def planned():
-    return pj.block.plan_in_turn(SMALL, drawn())
+    return sequence.plan_in_turn(SMALL, drawn())
 
 
 @jax.jit
@@ -47,13 +48,13 @@ def test_a_sequence_is_the_same_wherever_a_batch_begins():
 @pytest.mark.slow
 def test_a_sequence_of_one_is_a_single_ball():
     sequences = drawn(balls=1, delay=0.1)
-    planned = pj.block.plan_in_turn(SMALL, sequences)
+    planned = sequence.plan_in_turn(SMALL, sequences)
     alone = jax.tree.map(lambda leaf: np.asarray(leaf[:, 0]), sequences.balls)
     plans = pj.plan(SMALL, alone)
     assert pj.solved(plans).sum() > NUM // 2
     np.testing.assert_array_equal(planned.plans.status[:, 0], plans.status)
     np.testing.assert_allclose(planned.plans.contact_time[:, 0], plans.contact_time, atol=1e-5)
-    verdict = pj.block.judge_in_turn(planned)
+    verdict = sequence.judge_in_turn(planned)
     np.testing.assert_array_equal(verdict.success[:, 0], pj.block.judge(alone, plans).success)
 
 
@@ -72,14 +73,14 @@ def test_each_ball_starts_where_the_motion_to_the_last_one_ends(planned):
     latest = jax.jit(jax.vmap(flight_of))
     due = sequences.seen[:, 1] + latest(pj.lane(sequences.balls, np.s_[:, 1])).latest
     np.testing.assert_allclose(planned.begins[:, 1] + latest(second).latest, due, atol=1e-4)
-    np.testing.assert_array_equal(pj.block.judge_in_turn(planned).success, met)
+    np.testing.assert_array_equal(sequence.judge_in_turn(planned).success, met)
 
 
 @pytest.mark.slow
 def test_sequences_of_a_batch_are_those_planned_alone(planned):
     sequences = drawn()
     for k in (0, 5):
-        one = pj.block.plan_in_turn(SMALL, pj.lane(sequences, np.s_[k : k + 1]))
+        one = sequence.plan_in_turn(SMALL, pj.lane(sequences, np.s_[k : k + 1]))
         np.testing.assert_array_equal(one.plans.status[0], planned.plans.status[k])
         np.testing.assert_allclose(one.begins[0], planned.begins[k], atol=1e-3)
 
@@ -88,7 +89,7 @@ def test_sequences_of_a_batch_are_those_planned_alone(planned):
 def test_an_arm_reconsiders_only_when_it_knows_of_the_next_ball(planned):
     """More balls are met than without, and by motions that were the same until then."""
     sequences = drawn()
-    greedy = pj.block.plan_in_turn(SMALL, sequences, reconsiders=False)
+    greedy = sequence.plan_in_turn(SMALL, sequences, reconsiders=False)
     met, before = pj.solved(planned.plans), pj.solved(greedy.plans)
     changed = planned.plans.contact_time[:, 0] != greedy.plans.contact_time[:, 0]
     assert changed.any() and met[changed, 1].all() and not before[changed, 1].any()
@@ -99,14 +100,14 @@ def test_an_arm_reconsiders_only_when_it_knows_of_the_next_ball(planned):
             for each in (planned, greedy)
         ]
         np.testing.assert_allclose(*states, atol=1e-3)
-    foreknown = pj.block.plan_in_turn(SMALL, sequences, foreknown=True)
+    foreknown = sequence.plan_in_turn(SMALL, sequences, foreknown=True)
     assert before.sum() < met.sum() <= pj.solved(foreknown.plans).sum()
 
 
 def test_a_ball_that_flies_past_is_let_through(planned):
     sequences = jax.tree.map(np.array, drawn())
     sequences.balls.ball.vel[:, 1] *= -1.0
-    passed = pj.block.plan_in_turn(SMALL, sequences, reconsiders=False)
+    passed = sequence.plan_in_turn(SMALL, sequences, reconsiders=False)
     assert (passed.plans.status[:, 1] == pj.Status.OUT_OF_REACH).all()
     np.testing.assert_array_equal(passed.begins[:, 2], passed.begins[:, 1])
     assert pj.solved(passed.plans)[:, 2].mean() > 0.5
@@ -116,8 +117,8 @@ def test_a_ball_that_flies_past_is_let_through(planned):
 def test_an_arm_without_a_ball_goes_home_or_stops(returns):
     """And is judged while it does; the second ball comes five seconds later."""
     sequences = drawn(balls=2, apart=5.0)
-    planned = pj.block.plan_in_turn(SMALL, sequences, returns=returns)
-    assert pj.block.judge_in_turn(planned).success.mean() > 0.7
+    planned = sequence.plan_in_turn(SMALL, sequences, returns=returns)
+    assert sequence.judge_in_turn(planned).success.mean() > 0.7
     met = pj.solved(planned.plans)[:, 0]
     waited = pj.lane(planned.plans.motion, np.s_[:, 1])
     angles, rates = np.moveaxis(state_at(waited, sequences.seen[:, 1] - planned.begins[:, 1]), 1, 0)
@@ -163,4 +164,4 @@ def test_what_is_wrong_with_a_draw_is_named(options, message):
 
 def test_one_sequence_without_an_axis_is_refused():
     with pytest.raises(ValueError, match="^cases must be a batch of at least one"):
-        pj.block.plan_in_turn(SMALL, pj.lane(drawn(1), 0))
+        sequence.plan_in_turn(SMALL, pj.lane(drawn(1), 0))

@@ -10,6 +10,7 @@ import pytest
 from flax import struct
 from jax import Array
 
+from planner_jax.core.protocol import Plan, Status, is_solved
 from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.multistart import solve_round
@@ -18,11 +19,10 @@ from planner_jax.optimise.problem import Round, Stage
 from planner_jax.optimise.scaling import shipped_scale
 from planner_jax.planning.decided import first_choice
 from planner_jax.planning.plan import plan
-from planner_jax.protocol import Plan, Status, is_solved
 from planner_jax.referee.catch import referee_catches
 from planner_jax.task.catch.chain import nearest_upright
 from planner_jax.task.catch.decide import Greedy
-from planner_jax.task.catch.exact import ExactCatch
+from planner_jax.task.catch.planner import ExactCatch
 from planner_jax.task.catch.suites import draw
 from planner_jax.trajectory.polynomial import evaluate
 from tests.jaxpr import assert_full_precision

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from planner_jax.ball.flight import BallState
+from planner_jax.core.protocol import Status, is_solved, lane
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
 from planner_jax.planning.plan import plan
-from planner_jax.protocol import Status, is_solved, lane
 from planner_jax.referee.catch import referee_catches
-from planner_jax.task.catch.exact import ExactCatch
+from planner_jax.task.catch.planner import ExactCatch
 from planner_jax.task.catch.replan import ReplanCatch
 from planner_jax.task.catch.suites import draw
 

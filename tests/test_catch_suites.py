@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from planner_jax.ball.target import BallPath
-from planner_jax.task.catch.card import SUITES, TASK
+from planner_jax.task.catch.spec import SUITES, TASK
 from planner_jax.task.catch.suites import CATCH_HEIGHT, LAUNCH, draw, earliest_throw
 
 NUM = 64

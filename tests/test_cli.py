@@ -6,7 +6,7 @@ import sys
 import jax
 import pytest
 
-from planner_jax.cli import main
+from planner_jax.cli.main import main
 from planner_jax.sweep import run as sweep_run
 from planner_jax.sweep.hit.sweep import HitSweep
 
@@ -247,7 +247,7 @@ def test_a_sweep_prints_rate_and_speed_together(capsys, elsewhere, monkeypatch):
 )
 def test_help_names_the_defaults_and_loads_no_jax(task, parts):
     script = (
-        "import sys; from planner_jax.cli import main\n"
+        "import sys; from planner_jax.cli.main import main\n"
         f"try: main(['sweep', '{task}', '--help'])\n"
         "except SystemExit: pass\n"
         "sys.exit('jax' in sys.modules or 'numpy' in sys.modules)"

@@ -13,14 +13,14 @@ import pyarrow.parquet as pq
 import pytest
 
 import planner_jax as pj
-from planner_jax.cli import main
-from planner_jax.registry import MissingExtra, install_line
+from planner_jax.cli.main import main
+from planner_jax.core.registry import MissingExtra, install_line
+from planner_jax.runs.run_folder import RunFolder
+from planner_jax.runs.settings import SettingError, WorkersFailed
 from planner_jax.sweep import cluster, run
 from planner_jax.sweep.hit.settings import HitSettings
 from planner_jax.sweep.hit.sweep import HitSweep, HitTally
 from planner_jax.sweep.run import SweepInterrupted, resume_sweep, start_sweep
-from planner_jax.sweep.run_folder import RunFolder
-from planner_jax.sweep.settings import SettingError, WorkersFailed
 from tests.faults.commands import children_of
 from tests.faults.runs import quick_sweeps
 from tests.sweeps import stop_after

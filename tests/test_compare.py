@@ -7,10 +7,10 @@ import pyarrow as pa
 import pytest
 from scipy.stats import binomtest
 
-from planner_jax.cli import main
+from planner_jax.cli.main import main
+from planner_jax.runs.run_folder import RunFolder
+from planner_jax.runs.summary import wilson_interval
 from planner_jax.sweep.compare import described, difference_of, differing, other_cases, read_run
-from planner_jax.sweep.run_folder import RunFolder
-from planner_jax.sweep.summary import wilson_interval
 
 FAILED = {0: "", 1: "speed", 2: "landing"}
 

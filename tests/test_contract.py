@@ -14,20 +14,20 @@ from jaxpr import assert_full_precision
 from test_block_library import made_up
 
 import planner_jax as pj
+from planner_jax.baselines.block.library.planner import LibraryBlock
+from planner_jax.baselines.intercept.projection import Projection
+from planner_jax.baselines.intercept.static_paths import PathSource
+from planner_jax.core.protocol import Attempt, HostPlanner, LanesPlanner, Plan, is_solved, outcome
+from planner_jax.core.rules import has_rules
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.problem import Round
 from planner_jax.plane.reach import Lattice
 from planner_jax.planning import one_by_one
-from planner_jax.protocol import Attempt, HostPlanner, LanesPlanner, Plan, is_solved, outcome
-from planner_jax.rules import has_rules
-from planner_jax.task.block.library.planner import LibraryBlock
-from planner_jax.task.block.online import Search as BlockSearch
-from planner_jax.task.intercept.projection import Projection
+from planner_jax.task.block.planner import Search as BlockSearch
+from planner_jax.task.intercept.planner import SpacetimeIntercept
 from planner_jax.task.intercept.searches import Search
-from planner_jax.task.intercept.spacetime import SpacetimeIntercept
-from planner_jax.task.intercept.static_paths import PathSource
 
 NUM = 6  # cases of a batch; no more than one bucket
 

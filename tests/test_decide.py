@@ -10,12 +10,12 @@ import pytest
 import planner_jax as pj
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath
+from planner_jax.core.protocol import Status, is_solved, is_unsolved
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
 from planner_jax.planning import batch
 from planner_jax.planning.decided import DecidedPlanner, first_choice
 from planner_jax.planning.plan import plan
-from planner_jax.protocol import Status, is_solved, is_unsolved
 from planner_jax.referee.catch import referee_catches
 from planner_jax.task.catch.beam import beam
 from planner_jax.task.catch.decide import (
@@ -28,7 +28,7 @@ from planner_jax.task.catch.decide import (
     optimal_time_ratio,
 )
 from planner_jax.task.catch.estimate import follow, timetable
-from planner_jax.task.catch.exact import ExactCatch
+from planner_jax.task.catch.planner import ExactCatch
 from planner_jax.task.catch.suites import draw
 
 PLANNER = ExactCatch(rounds=(Round(1, LbfgsConfig(max_steps=20)),))

@@ -4,8 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
-from planner_jax.plane.dubins import (
+from dubins import (
     WORDS,
     DubinsPath,
     dubins,

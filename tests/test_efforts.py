@@ -4,9 +4,9 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.optimise.problem import Stage
+from planner_jax.runs.settings import SettingError
 from planner_jax.sweep.catch.settings import CatchSettings
 from planner_jax.sweep.hit.settings import HitSettings
-from planner_jax.sweep.settings import SettingError
 
 
 @pytest.mark.parametrize("task", [pj.hit, pj.catch], ids=["hit", "catch"])

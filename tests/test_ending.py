@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 
 import planner_jax as pj
-from planner_jax.ending.case import EndingCase, end_state
-from planner_jax.ending.planner import RestPlanner
+from planner_jax.recovery.case import EndingCase, end_state
+from planner_jax.recovery.planner import RestPlanner
 from planner_jax.robot.quadrotor import QuadrotorLimits
+from planner_jax.runs.run_folder import RunFolder
+from planner_jax.runs.settings import SettingError
 from planner_jax.sweep import run
 from planner_jax.sweep.catch.settings import CatchSettings
 from planner_jax.sweep.hit.settings import HitSettings
 from planner_jax.sweep.hit.sweep import HitSweep
 from planner_jax.sweep.planned import planned_row
 from planner_jax.sweep.quadrotor import ending_remark
-from planner_jax.sweep.run_folder import RunFolder
-from planner_jax.sweep.settings import SettingError
 from planner_jax.sweep.single import sampled
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, total_duration
 

@@ -8,11 +8,11 @@ import pytest
 from flown_plans import SOLVED, quadrotor, table
 
 import planner_jax as pj
-from planner_jax.cli import main
-from planner_jax.ending.behind import is_rested, with_ending
-from planner_jax.ending.no_ending import NoEnding
+from planner_jax.cli.main import main
 from planner_jax.export.setpoints import ExportError
 from planner_jax.plane.target import TurningPath
+from planner_jax.recovery.after_plan import is_rested, with_ending
+from planner_jax.recovery.no_ending import NoEnding
 from planner_jax.referee.rest import referee_rests, referee_stands, referee_stops
 from planner_jax.robot.arm_plan import ArmPlan
 from planner_jax.robot.car import CarPlan

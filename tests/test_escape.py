@@ -10,7 +10,7 @@ from jax import lax
 
 import planner_jax as pj
 from planner_jax.plane.target import SampledPath
-from planner_jax.task.intercept.escape import (
+from planner_jax.studies.intercept.escape import (
     CAPTURE,
     HORIZON,
     PLANNER,

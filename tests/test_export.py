@@ -11,11 +11,11 @@ from cflib.crazyflie.mem.trajectory_memory import Poly4D
 from flown_plans import PLANS, arm, as_it_is, bag, car, matrices, quadrotor, table
 
 import planner_jax as pj
+from planner_jax.core.registry import MissingExtra, UnknownName, install_line
 from planner_jax.export import csv_rows, ros2
 from planner_jax.export.crazyflie import poly4d
 from planner_jax.export.setpoints import MOST, ExportError, setpoints_of
 from planner_jax.export.words import stream
-from planner_jax.registry import MissingExtra, UnknownName, install_line
 
 RATE = 50.0
 

@@ -10,20 +10,20 @@ import pytest
 from flown_plans import PLANS, as_it_is, quadrotor
 
 import planner_jax as pj
-from planner_jax.cli import main
+from planner_jax.cli.main import main
+from planner_jax.core.plan_files import PlanFileError, load_fitting
 from planner_jax.export.saved import saved_plan
-from planner_jax.plan_files import PlanFileError, load_fitting
 from planner_jax.robot.car import CarPlan
 from planner_jax.robot.quadrotor_plan import QuadrotorPlan
-from planner_jax.sweep import columns as known
+from planner_jax.runs import columns as known
+from planner_jax.runs.run_folder import RunFolder
+from planner_jax.runs.settings import SettingError
+from planner_jax.runs.source import Chunk
 from planner_jax.sweep.block.columns import COLUMNS as BLOCK
 from planner_jax.sweep.catch.columns import COLUMNS as CATCH
 from planner_jax.sweep.hit.columns import COLUMNS as HIT
 from planner_jax.sweep.intercept.columns import COLUMNS as INTERCEPT
 from planner_jax.sweep.planned import planned_row
-from planner_jax.sweep.run_folder import RunFolder
-from planner_jax.sweep.settings import SettingError
-from planner_jax.sweep.source import Chunk
 from planner_jax.task.hit.plan import HitPlan
 
 NUM = 3

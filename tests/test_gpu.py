@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 
 import planner_jax as pj
+from planner_jax.core.protocol import is_solved
 from planner_jax.lanes import over_lanes, pallas
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.multistart import minimise_lanes, solve_batch
 from planner_jax.optimise.problem import Round
 from planner_jax.optimise.sensitivity import gradient_at
 from planner_jax.planning.plan import plan
-from planner_jax.protocol import is_solved
 from planner_jax.task.catch.suites import draw
-from planner_jax.task.hit.exact import ExactHit
-from planner_jax.task.hit.serves import generate_serves, to_cases
+from planner_jax.task.hit.planner import ExactHit
+from planner_jax.task.hit.suites import generate_serves, to_cases
 
 pytestmark = pytest.mark.gpu
 
@@ -68,8 +68,8 @@ WITHOUT_KERNELS = """
 import sys
 import jax, numpy as np
 from planner_jax.lanes import pallas
-from planner_jax.task.hit.exact import ExactHit
-from planner_jax.task.hit.serves import generate_serves, to_cases
+from planner_jax.task.hit.planner import ExactHit
+from planner_jax.task.hit.suites import generate_serves, to_cases
 from planner_jax.planning.plan import plan
 
 assert jax.default_backend() == "gpu" and pallas.kernels() is pallas.Kernels.OFF

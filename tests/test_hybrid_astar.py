@@ -6,13 +6,13 @@ import sys
 import jax
 import numpy as np
 import pytest
+from dubins import dubins
 
-from planner_jax.plane.dubins import dubins
-from planner_jax.plane.hybrid_astar import HEURISTICS, HybridAstar, hybrid_astar
+from planner_jax.baselines.intercept.hybrid_astar import HEURISTICS, HybridAstar, hybrid_astar
 from planner_jax.plane.obstacles import distances, obstacles, separation
 
 pytest.importorskip("numba", reason="needs the extra baselines")
-from planner_jax.plane import hybrid_astar_kernels as kernels  # noqa: E402
+from planner_jax.baselines.intercept import hybrid_astar_kernels as kernels  # noqa: E402
 
 CURVATURE, BODY, MIDDLE = 2.0, (-0.05, 0.35, 0.125), 0.15
 START = np.array([0.8, 4.0, 0.0])
@@ -250,7 +250,7 @@ def test_what_is_out_of_its_range_is_told_in_a_line(change, words):
 
 
 def test_without_numba_the_error_says_what_to_install(monkeypatch):
-    monkeypatch.delitem(sys.modules, "planner_jax.plane.hybrid_astar_kernels")
+    monkeypatch.delitem(sys.modules, "planner_jax.baselines.intercept.hybrid_astar_kernels")
     monkeypatch.setitem(sys.modules, "numba", None)
     with pytest.raises(ModuleNotFoundError, match=r"pip install .*\[baselines\]'"):
         found((6.0, 4.0))

@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from planner_jax.core.protocol import Status
 from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.implicit import newton_refine, optimal_plan
-from planner_jax.protocol import Status
-from planner_jax.task.hit.exact import ExactHit
-from planner_jax.task.hit.serves import generate_serves, to_cases
+from planner_jax.task.hit.planner import ExactHit
+from planner_jax.task.hit.suites import generate_serves, to_cases
 
 PLANNER = ExactHit()
 

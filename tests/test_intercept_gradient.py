@@ -13,7 +13,7 @@ import planner_jax as pj
 from planner_jax.optimise.sensitivity import gradient_at
 from planner_jax.plane.reach import Lattice
 from planner_jax.plane.target import TurningPath
-from planner_jax.task.intercept.checked import straight_on
+from planner_jax.task.intercept.finalize import straight_on
 from planner_jax.task.intercept.searches import Search
 
 BY = ("movers.centre", "walls.centre", "limits.acceleration", "target.vel", "speed")

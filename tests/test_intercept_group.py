@@ -13,16 +13,16 @@ from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.plane.reach import Lattice
 from planner_jax.planning.decided import first_choice
 from planner_jax.robot.car import pose_at
+from planner_jax.runs.settings import SettingError
 from planner_jax.sweep.intercept.settings import InterceptSettings
 from planner_jax.sweep.run import start_sweep
-from planner_jax.sweep.settings import SettingError
 from planner_jax.sweep.sweep import sweep_of
-from planner_jax.task.intercept.card import GROUPS, TASK
-from planner_jax.task.intercept.group import CarState
-from planner_jax.task.intercept.group_decide import Best, Given, Greedy
+from planner_jax.task.group.case import CarState
+from planner_jax.task.group.decide import Best, Given, Greedy
+from planner_jax.task.intercept.planner import SpacetimeIntercept
 from planner_jax.task.intercept.rejection import SIZE
 from planner_jax.task.intercept.searches import Search
-from planner_jax.task.intercept.spacetime import SpacetimeIntercept
+from planner_jax.task.intercept.spec import GROUPS, TASK
 
 # One search is one program to compile.
 SEARCH = Search(12, LevenbergConfig(40), lattice=Lattice(layers=22))
@@ -48,7 +48,7 @@ def line(*xs, present=True, **settings):
     """Targets that stand on a line ahead of the car."""
     places = jnp.array([[x, 4.0] for x in xs])
     path = pj.TurningPath(places, jnp.zeros_like(places), jnp.zeros(len(xs)))
-    return pj.intercept.group(path, present=present, **settings)
+    return pj.group.group(path, present=present, **settings)
 
 
 def test_a_group_is_the_same_in_every_batch():

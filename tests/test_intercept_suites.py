@@ -7,13 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from planner_jax.protocol import lane
+from planner_jax.core.protocol import lane
 from planner_jax.referee.clearance import clearances
 from planner_jax.referee.intercept import referee_intercepts
-from planner_jax.task.intercept.arrival import earliest_arrival
-from planner_jax.task.intercept.card import SUITES
 from planner_jax.task.intercept.plan import InterceptPlan
+from planner_jax.task.intercept.reach_time import earliest_arrival
 from planner_jax.task.intercept.rejection import BODY_MIDDLE, CAUSES, SIZE, first_cause
+from planner_jax.task.intercept.spec import SUITES
 from planner_jax.task.intercept.suites import draw_cases, drawn, observe
 
 NUM, SEED = 24, 3

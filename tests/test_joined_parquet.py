@@ -13,10 +13,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from planner_jax.sweep import joined_parquet
-from planner_jax.sweep.columns import LIST, VECTOR
-from planner_jax.sweep.joined_parquet import JoinError, ParquetJoiner, parquet_parts
-from planner_jax.sweep.parquet import (
+from planner_jax.runs import joined_parquet
+from planner_jax.runs.columns import LIST, VECTOR
+from planner_jax.runs.joined_parquet import JoinError, ParquetJoiner, parquet_parts
+from planner_jax.runs.parquet import (
     ROW_GROUP,
     encoded,
     file_sum,

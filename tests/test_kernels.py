@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 import planner_jax as pj
-from planner_jax import doctor
+from planner_jax.cli.main import doctor
 from planner_jax.lanes import in_one_kernel, over_lanes, pallas
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.multistart import solve_batch
 from planner_jax.optimise.problem import Round
 from planner_jax.optimise.sensitivity import gradient_at
-from planner_jax.sweep.environment import require_backend
-from planner_jax.sweep.settings import SettingError
-from planner_jax.task.catch.exact import ExactCatch
-from planner_jax.task.hit.exact import ExactHit
+from planner_jax.runs.environment import require_backend
+from planner_jax.runs.settings import SettingError
+from planner_jax.task.catch.planner import ExactCatch
+from planner_jax.task.hit.planner import ExactHit
 
 LANES = 128
 # Of one round: the table; penalties with slopes, without (of guesses, of trials), greatest of a

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 import planner_jax as pj
+from planner_jax.core.protocol import Status
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
 from planner_jax.planning.decided import DecidedPlanner
-from planner_jax.protocol import Status
-from planner_jax.task.catch.appearing import AppearingPath, draw_appearing, states_of
-from planner_jax.task.catch.braking import braking
-from planner_jax.task.catch.live import fly_live, judge_live
+from planner_jax.studies.catch.appearing import AppearingPath, draw_appearing, states_of
+from planner_jax.studies.catch.braking import braking
+from planner_jax.studies.catch.live import fly_live, judge_live
 from planner_jax.task.catch.suites import draw
 from planner_jax.trajectory.polynomial import states_at
 

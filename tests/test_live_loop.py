@@ -18,7 +18,7 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.benchmarks.serve_soak import distance_off
-from planner_jax.cli import main
+from planner_jax.cli.main import main
 from planner_jax.live import planner as live_planner
 from planner_jax.live.course import with_rest
 from planner_jax.live.packets import BALL, ROBOT, Fault, Motion, read_answer, request
@@ -26,7 +26,7 @@ from planner_jax.live.planner import LivePlanner
 from planner_jax.live.server import Server
 from planner_jax.live.settings import CatchServe, HitServe
 from planner_jax.live.strokes import CATCH_DRAG, CatchStroke, HitStroke
-from planner_jax.sweep.settings import SettingError
+from planner_jax.runs.settings import SettingError
 
 HOME, STEP = np.array([0.0, 0.0, 1.0]), 0.01
 PAGE = Path(__file__).parents[1] / "docs" / "live.md"

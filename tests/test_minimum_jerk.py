@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from derivatives import assert_gradient_matches_differences
 
-from planner_jax.trajectory.minimum_jerk import minimum_jerk
+from planner_jax.baselines.parts.minimum_jerk import minimum_jerk
 from planner_jax.trajectory.polynomial import snap_energy
 
 DURATION = 0.9

@@ -14,8 +14,8 @@ import pyarrow.parquet as pq
 import pytest
 
 import planner_jax as pj
-from planner_jax.cli import main
-from planner_jax.registry import all_tasks
+from planner_jax.cli.main import main
+from planner_jax.core.registry import all_tasks
 
 OWN_TASK = Path(__file__).parent / "own_task"
 BROKEN = {

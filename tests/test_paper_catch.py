@@ -17,9 +17,9 @@ import pytest
 import planner_jax as pj
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath
+from planner_jax.baselines.catch.paper import PaperCatch
 from planner_jax.planning.plan import plan
 from planner_jax.referee.catch import referee_catches
-from planner_jax.task.catch.paper import PaperCatch
 from planner_jax.trajectory.polynomial import derivative_factors
 from planner_jax.trajectory.proportional_minco import (
     equal_pieces,

@@ -4,10 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from dubins import dubins, sample_dubins
 
-from planner_jax.plane.dubins import dubins, sample_dubins
-from planner_jax.plane.obstacles import obstacles, separation
-from planner_jax.plane.path_smoothing import (
+from planner_jax.baselines.intercept.path_smoothing import (
     Smoothing,
     control_points,
     resampled,
@@ -15,6 +14,7 @@ from planner_jax.plane.path_smoothing import (
     smooth_points,
     smoothing_cost,
 )
+from planner_jax.plane.obstacles import obstacles, separation
 
 CURVATURE, BODY = 2.0, (-0.05, 0.35, 0.125)
 NUM = 65

@@ -8,28 +8,28 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from dubins import dubins, sample_dubins
 
 import planner_jax as pj
-from planner_jax.plane.dubins import dubins, sample_dubins
-from planner_jax.plane.obstacles import obstacles, separation
-from planner_jax.plane.reach import Lattice
-from planner_jax.robot.car import pose_at
-from planner_jax.task.intercept.path import path_along, path_beside, path_of_drive
-from planner_jax.task.intercept.path_then_speed import (
+from planner_jax.baselines.intercept.path import path_along, path_beside, path_of_drive
+from planner_jax.baselines.intercept.path_then_speed import (
     PathSource,
     SpeedStep,
     lattice,
     ramp_and_cruise,
 )
-from planner_jax.task.intercept.projection import (
+from planner_jax.baselines.intercept.projection import (
     Projection,
     blocked_by,
     overlap,
     speed_limits,
     station_time_problem,
 )
+from planner_jax.baselines.intercept.static_paths import turns_around
+from planner_jax.plane.obstacles import obstacles, separation
+from planner_jax.plane.reach import Lattice
+from planner_jax.robot.car import pose_at
 from planner_jax.task.intercept.searches import Search
-from planner_jax.task.intercept.static_paths import turns_around
 from planner_jax.task.intercept.terms import ends_of
 
 SQUARE = np.array([[-0.2, -0.2], [0.2, -0.2], [0.2, 0.2], [-0.2, 0.2]])

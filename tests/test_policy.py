@@ -11,7 +11,7 @@ import pytest
 from flax import traverse_util
 
 import planner_jax as pj
-from planner_jax.cli import main
+from planner_jax.cli.main import main
 from planner_jax.planning.decided import first_choice
 from planner_jax.policies.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 from planner_jax.policies.networks import NETWORKS

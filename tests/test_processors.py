@@ -7,7 +7,9 @@ import sys
 import pytest
 
 from planner_jax import __main__ as process
-from planner_jax import cli, processors, stopping
+from planner_jax.cli.main import main as cli
+from planner_jax.host import processors
+from planner_jax.host import signals as stopping
 
 
 def test_usable_cores_are_those_that_the_process_is_bound_to(monkeypatch):

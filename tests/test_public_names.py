@@ -6,7 +6,7 @@ import sys
 import pytest
 
 import planner_jax as pj
-from planner_jax.registry import all_tasks
+from planner_jax.core.registry import all_tasks
 
 NAMES = [
     (module, name)
@@ -57,7 +57,7 @@ def test_unknown_name_is_an_attribute_error():
 
 
 @pytest.mark.parametrize(
-    "code", ["planner_jax", "planner_jax.registry", "planner_jax.task.hit.card"]
+    "code", ["planner_jax", "planner_jax.core.registry", "planner_jax.task.hit.spec"]
 )
 def test_importing_the_package_or_what_names_the_tasks_does_not_import_jax(code):
     code = f"import sys, {code}; sys.exit('jax' in sys.modules)"

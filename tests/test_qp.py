@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from planner_jax.optimise.qp import QpConfig, qp_template, solve_qp
-from planner_jax.protocol import Status
+from planner_jax.baselines.intercept.qp import QpConfig, qp_template, solve_qp
+from planner_jax.core.protocol import Status
 
 UNKNOWNS, GIVEN, STILL, ROWS, LANES = 12, 2, 1, 24, 64
 RNG = np.random.default_rng(0)

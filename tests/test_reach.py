@@ -9,7 +9,7 @@ import pytest
 import planner_jax as pj
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath
-from planner_jax.protocol import Status, is_unsolved
+from planner_jax.core.protocol import Status, is_unsolved
 from planner_jax.robot.quadrotor import QuadrotorLimits
 from planner_jax.robot.quadrotor_reach import ALLOWED, beyond_reach
 from planner_jax.task.catch import reach as catch_reach

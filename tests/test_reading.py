@@ -7,10 +7,10 @@ import pytest
 from closed_forms import region_of
 
 import planner_jax as pj
-from planner_jax.protocol import is_unsolved
-from planner_jax.registry import all_tasks
+from planner_jax.core.protocol import is_unsolved
+from planner_jax.core.registry import all_tasks
 from planner_jax.task.hit import court
-from planner_jax.task.hit.card import REAL_SCENARIOS
+from planner_jax.task.hit.spec import REAL_SCENARIOS
 from planner_jax.task.hit.validate import landing
 
 TASKS = ("hit", "catch")

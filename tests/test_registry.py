@@ -8,21 +8,21 @@ import numpy as np
 import pytest
 
 import planner_jax as pj
-from planner_jax import registry
-from planner_jax.registry import Task, UnknownName, all_tasks, task_named
+from planner_jax.core import registry
+from planner_jax.core.registry import Task, UnknownName, all_tasks, task_named
 from planner_jax.task.catch.suites import draw as draw_catches
 
 METADATA = "Metadata-Version: 2.1\nName: planner-jax-others\nVersion: 1.0\n"
 MODULE = '''
-from planner_jax.registry import Task
-from planner_jax.task.hit.juggle import JuggleHit
+from planner_jax.core.registry import Task
+from planner_jax.baselines.hit.juggle import JuggleHit
 from planner_jax.task.catch.suites import draw
 
 TASK = Task(
     name="meet",
     summary="two quadrotors meet",
     home="planner_jax_others",
-    planners={"first": "planner_jax.task.hit.juggle:JuggleHit"},
+    planners={"first": "planner_jax.baselines.hit.juggle:JuggleHit"},
     suites={"still": "Nobody moves."},
 )
 THEIRS = Task("hit", "another hit", "planner_jax_others", {}, {})
@@ -210,7 +210,7 @@ def test_a_suite_of_another_package_is_drawn_by_its_name(others):
 
 def test_names_are_listed_without_jax():
     code = (
-        "import sys; from planner_jax.registry import task_named; task = task_named('hit'); "
+        "import sys; from planner_jax.core.registry import task_named; task = task_named('hit'); "
         "assert 'exact' in task.all_planners() and 'court' in task.all_suites(); "
         "sys.exit('jax' in sys.modules)"
     )
@@ -221,5 +221,7 @@ def test_a_missing_extra_is_installed_from_the_checkout_or_else_from_the_index(
     monkeypatch, tmp_path
 ):
     assert registry.install_line("view") == "pip install -c constraints.txt -e '.[view]'"
-    monkeypatch.setattr(registry, "__file__", str(tmp_path / "planner_jax" / "registry.py"))
+    monkeypatch.setattr(
+        registry, "__file__", str(tmp_path / "planner_jax" / "core" / "registry.py")
+    )
     assert registry.install_line("view") == "pip install 'planner-jax[view]'"

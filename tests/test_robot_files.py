@@ -12,14 +12,14 @@ import pytest
 import yaml
 
 import planner_jax as pj
-from planner_jax.cli import main
-from planner_jax.registry import UnknownName
+from planner_jax.cli.main import main
+from planner_jax.core.registry import UnknownName
 from planner_jax.robot.quadrotor_file import RobotError, as_yaml, model_of
 from planner_jax.robot.quadrotor_models import MODELS, ready_robot
 from planner_jax.robot.quantities import UNITS, QuantityError, numbers_in
+from planner_jax.runs.settings import SettingError, settings_to_resume
 from planner_jax.sims.settings import HitFly
 from planner_jax.sweep.hit.settings import HitSettings
-from planner_jax.sweep.settings import SettingError, settings_to_resume
 
 DATA = Path(__file__).parent / "data"
 MINE = DATA / "my_quadrotor.yaml"

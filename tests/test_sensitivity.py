@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from flax import struct
 
+from planner_jax.core.protocol import Plan
 from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.implicit import newton_refine, optimal_plan
 from planner_jax.optimise.inverse_kernel import inverse_kernel
@@ -25,12 +26,11 @@ from planner_jax.optimise.sensitivity import (
 )
 from planner_jax.planning.decided import first_choice
 from planner_jax.planning.gradient import gradient
-from planner_jax.protocol import Plan
 from planner_jax.task.catch.decide import Greedy
-from planner_jax.task.catch.exact import ExactCatch
+from planner_jax.task.catch.planner import ExactCatch
 from planner_jax.task.catch.suites import draw
-from planner_jax.task.hit.exact import ExactHit
-from planner_jax.task.hit.serves import generate_serves, to_cases
+from planner_jax.task.hit.planner import ExactHit
+from planner_jax.task.hit.suites import generate_serves, to_cases
 
 CURVED = np.array([[3.0, 1.0, 0.2], [1.0, 2.0, 0.0], [0.2, 0.0, 1.0]])
 

@@ -9,10 +9,10 @@ from closed_forms import region_of
 
 import planner_jax as pj
 from planner_jax.ball import flight
-from planner_jax.rules import CaseError
+from planner_jax.core.rules import CaseError
 from planner_jax.task.hit import court
 from planner_jax.task.hit.case import DRAG, GRAVITY
-from planner_jax.task.hit.serves import (
+from planner_jax.task.hit.suites import (
     DEPTH,
     MAX_FLIGHT_TIME,
     MIN_APPROACH_SPEED,

@@ -11,10 +11,12 @@ import pytest
 from test_block_library import made_up
 
 import planner_jax as pj
-from planner_jax.cli import main
+from planner_jax.baselines.block.library.file import save_library
+from planner_jax.cli.main import main
 from planner_jax.referee.arm_clearance import KINDS
 from planner_jax.robot.arm import shield_pose
 from planner_jax.robot.arm_mjcf import irb1600
+from planner_jax.runs.settings import SettingError
 from planner_jax.sims.execution import FRAME, TIMESTEP, Executed, execute
 from planner_jax.sims.film import draw_flight
 from planner_jax.sims.launch import flight_keys
@@ -37,12 +39,10 @@ from planner_jax.sims.tasks.block_flights import (
 )
 from planner_jax.sims.tasks.intercept import CAR_WORLD
 from planner_jax.sims.view import Viewer
-from planner_jax.sweep.settings import SettingError
-from planner_jax.task.block.eye import eye, see
-from planner_jax.task.block.library.file import save_library
+from planner_jax.studies.block.observation import eye, see
+from planner_jax.studies.block.receding import Decided
 from planner_jax.task.block.motion import polynomial, profiles
 from planner_jax.task.block.plan import BlockPlan
-from planner_jax.task.block.receding import Decided
 
 HOME, LANES = np.asarray(irb1600().home), 4  # all batches are of one size: one program
 TURN = np.array([-0.4, -0.5, 0.4, 0.6, -0.5, 0.8])  # [rad], of a motion that touches nothing

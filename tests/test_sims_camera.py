@@ -18,7 +18,7 @@ from planner_jax.robot.arm_mjcf import irb1600
 from planner_jax.sims import camera as scene_camera
 from planner_jax.sims.board import calibrated, show_board
 from planner_jax.sims.camera import RenderError, SceneCamera, sightings_of
-from planner_jax.task.block.eye import mast_camera
+from planner_jax.studies.block.observation import mast_camera
 from planner_jax.task.block.scene import paper_scene
 
 CAMERA = mast_camera(size=(640, 360))

@@ -11,8 +11,9 @@ import pytest
 from jax import lax
 
 import planner_jax as pj
-from planner_jax.cli import main
+from planner_jax.cli.main import main
 from planner_jax.plane.target import TurningPath
+from planner_jax.runs.settings import SettingError
 from planner_jax.sims.drive import DriveLoop, drive_on, started
 from planner_jax.sims.film import draw_flight
 from planner_jax.sims.model import step
@@ -33,7 +34,6 @@ from planner_jax.sims.tasks.intercept import (
     require_car,
     scored,
 )
-from planner_jax.sweep.settings import SettingError
 from planner_jax.task import intercept
 from planner_jax.task.intercept.plan import InterceptPlan
 from tests.recordings import recording

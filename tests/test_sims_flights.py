@@ -11,7 +11,7 @@ import pytest
 from flax import struct
 
 import planner_jax as pj
-from planner_jax.protocol import Status, is_unsolved
+from planner_jax.core.protocol import Status, is_unsolved
 from planner_jax.sims.loop import Loop
 from planner_jax.sims.noise import NOISES
 from planner_jax.sims.robots.quadrotor.robot import Quadrotor
@@ -28,7 +28,7 @@ from planner_jax.sims.tasks.catch import (
 )
 from planner_jax.sims.tasks.hit import HIT_WORLD, fly_hits, volleys
 from planner_jax.task import catch
-from planner_jax.task.hit.card import REAL_SCENARIOS
+from planner_jax.task.hit.spec import REAL_SCENARIOS
 from planner_jax.trajectory.polynomial import evaluate
 
 

@@ -12,8 +12,10 @@ from matplotlib.figure import Figure
 
 import planner_jax as pj
 from planner_jax.ball.flight import BallState
-from planner_jax.cli import main
-from planner_jax.registry import Task, all_tasks
+from planner_jax.cli.main import main
+from planner_jax.core.registry import Task, all_tasks
+from planner_jax.runs.run_folder import RunFolder
+from planner_jax.runs.settings import SettingError
 from planner_jax.sims import loop as sims_loop
 from planner_jax.sims.film import FilmError, draw_flight, film_flights, require_film
 from planner_jax.sims.launch import flight_keys, launched, ready
@@ -24,8 +26,6 @@ from planner_jax.sims.scoring import passage
 from planner_jax.sims.settings import BallFly, CatchFly, HitFly, fly_settings
 from planner_jax.sims.task import BallFlightTask, FlightCases, Flights
 from planner_jax.sims.tasks.catch import CATCH_WORLD
-from planner_jax.sweep.run_folder import RunFolder
-from planner_jax.sweep.settings import SettingError
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 from tests.recordings import recording
 

@@ -14,8 +14,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from planner_jax.ball.flight import BallState
-from planner_jax.cli import main
-from planner_jax.registry import install_line
+from planner_jax.cli.main import main
+from planner_jax.core.registry import install_line
+from planner_jax.runs.run_folder import RunFolder
+from planner_jax.runs.settings import SettingError
 from planner_jax.sims import view
 from planner_jax.sims.loop import Flown, Record
 from planner_jax.sims.model import BALL_RADIUS
@@ -34,8 +36,6 @@ from planner_jax.sims.settings import CatchFly
 from planner_jax.sims.tasks.catch import CATCH_WORLD
 from planner_jax.sims.tasks.hit import HIT_WORLD
 from planner_jax.sims.view import Viewer, free_address, segments
-from planner_jax.sweep.run_folder import RunFolder
-from planner_jax.sweep.settings import SettingError
 from tests.recordings import recording
 
 GRAVITY, NET = CATCH_WORLD.gravity, CATCH_WORLD.robot

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import planner_jax as pj
-from planner_jax.cli import main
+from planner_jax.cli.main import main
 from planner_jax.sweep.catch.single import SingleCatch
 from planner_jax.sweep.catch.single_settings import SingleCatchSettings
 from planner_jax.sweep.hit.single import SingleHit

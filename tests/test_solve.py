@@ -9,14 +9,15 @@ import pytest
 from flax import struct
 from jax import Array
 
+from planner_jax.core.protocol import Plan, Status, is_solved
 from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.problem import Round, Stage
-from planner_jax.planning import batch, resident
-from planner_jax.planning.ahead import compile_attempts
+from planner_jax.planning import batch
+from planner_jax.planning import device_batch as resident
 from planner_jax.planning.plan import plan, plan_across_processes, solve
-from planner_jax.protocol import Plan, Status, is_solved
+from planner_jax.planning.warmup import compile_attempts
 
 
 @struct.dataclass

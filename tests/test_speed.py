@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from derivatives import assert_gradient_matches_differences
 
-from planner_jax.benchmarks.qp_peers import clarabel_solver
-from planner_jax.protocol import Status
-from planner_jax.task.intercept.speed import (
+from planner_jax.baselines.intercept.bezier import BezierCurve, bernstein, hodograph
+from planner_jax.baselines.intercept.speed import (
     SPEED_PLANNERS,
     SpeedPlanner,
     constant_speed,
@@ -18,8 +17,9 @@ from planner_jax.task.intercept.speed import (
     speed_bounds,
     speed_matrices,
 )
-from planner_jax.task.intercept.speed_problems import speed_problems
-from planner_jax.trajectory.bezier import BezierCurve, bernstein, hodograph
+from planner_jax.baselines.intercept.speed_problems import speed_problems
+from planner_jax.benchmarks.qp_peers import clarabel_solver
+from planner_jax.core.protocol import Status
 
 NUM = 32
 TRAPEZOID = SPEED_PLANNERS["trapezoid"]

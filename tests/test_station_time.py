@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from planner_jax.plane.station_time import (
+from planner_jax.baselines.intercept.station_time import (
     Blocked,
     StationTimeGrid,
     StationTimeProblem,

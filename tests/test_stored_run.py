@@ -9,11 +9,11 @@ import sys
 import pytest
 from pyarrow import fs
 
-from planner_jax.sweep import stored_run
-from planner_jax.sweep.bucket import Bucket, bucket_of
+from planner_jax.runs import stored_run
+from planner_jax.runs.bucket import Bucket, bucket_of
+from planner_jax.runs.settings import SettingError
 from planner_jax.sweep.hit.sweep import HitSweep
 from planner_jax.sweep.run import SweepInterrupted, resume_sweep, start_sweep
-from planner_jax.sweep.settings import SettingError
 from tests.faults.commands import is_one_line, run
 from tests.faults.runs import SETTINGS, TASK, quick_sweeps
 from tests.sweeps import stop_after

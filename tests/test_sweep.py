@@ -18,22 +18,22 @@ from planner_jax.planning.plan import plan
 from planner_jax.planning.programs import solve_on_devices
 from planner_jax.referee.hit import referee_hits
 from planner_jax.robot import quadrotor
+from planner_jax.runs.parquet import pick_rows
+from planner_jax.runs.run_folder import RunFolder
+from planner_jax.runs.settings import SettingError
+from planner_jax.runs.summary import percent, wilson_interval
+from planner_jax.runs.timing import CompileClock
 from planner_jax.sweep import run
 from planner_jax.sweep.hit.figures.motion import motion_figure
 from planner_jax.sweep.hit.settings import HitSettings
 from planner_jax.sweep.hit.source import open_source
 from planner_jax.sweep.hit.sweep import HitSweep
-from planner_jax.sweep.parquet import pick_rows
 from planner_jax.sweep.report import RunRows, write_report
 from planner_jax.sweep.run import SweepInterrupted, resume_sweep, start_sweep
-from planner_jax.sweep.run_folder import RunFolder
 from planner_jax.sweep.sampled_motion import body_rate, net_thrust, sample_motion
-from planner_jax.sweep.settings import SettingError
-from planner_jax.sweep.summary import percent, wilson_interval
-from planner_jax.sweep.timing import CompileClock
 from planner_jax.task.hit import court
-from planner_jax.task.hit.card import REAL_SCENARIOS
-from planner_jax.task.hit.exact import ExactHit
+from planner_jax.task.hit.planner import ExactHit
+from planner_jax.task.hit.spec import REAL_SCENARIOS
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 TASK = pj.task_named("hit")

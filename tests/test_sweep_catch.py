@@ -14,16 +14,16 @@ import planner_jax as pj
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
 from planner_jax.referee.catch import referee_catches
+from planner_jax.runs.columns import RefereedBatch, rows_of
+from planner_jax.runs.run_folder import RunFolder
+from planner_jax.runs.settings import SettingError
 from planner_jax.sweep.catch.columns import COLUMNS, FRAME
 from planner_jax.sweep.catch.settings import CatchSettings
 from planner_jax.sweep.catch.sweep import CatchSweep, CatchTally
 from planner_jax.sweep.catch.targets import target_positions
-from planner_jax.sweep.columns import RefereedBatch, rows_of
 from planner_jax.sweep.report import write_report
 from planner_jax.sweep.run import SweepInterrupted, resume_sweep, start_sweep
-from planner_jax.sweep.run_folder import RunFolder
-from planner_jax.sweep.settings import SettingError
-from planner_jax.task.catch.card import SUITES
+from planner_jax.task.catch.spec import SUITES
 
 TASK = pj.task_named("catch")
 NUM, BATCH = 8, 4

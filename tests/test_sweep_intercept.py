@@ -15,15 +15,15 @@ import planner_jax as pj
 from planner_jax.plane.reach import Lattice
 from planner_jax.plane.target import PolynomialPath
 from planner_jax.referee.intercept import referee_intercepts
-from planner_jax.sweep.columns import RefereedBatch
+from planner_jax.runs.columns import RefereedBatch
+from planner_jax.runs.run_folder import RunFolder
+from planner_jax.runs.source import Chunk
 from planner_jax.sweep.intercept.columns import COLUMNS, WAY_POINTS
 from planner_jax.sweep.intercept.drive import case_of, sampled_drive
 from planner_jax.sweep.intercept.figures.scene import instants
 from planner_jax.sweep.intercept.settings import InterceptSettings
 from planner_jax.sweep.intercept.sweep import InterceptSweep
 from planner_jax.sweep.report import write_report
-from planner_jax.sweep.run_folder import RunFolder
-from planner_jax.sweep.source import Chunk
 from planner_jax.task.intercept.searches import Search
 
 TASK = pj.task_named("intercept")

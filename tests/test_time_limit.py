@@ -11,7 +11,7 @@ from flax import struct
 from jax import Array
 
 import planner_jax as pj
-from planner_jax.planning import watch
+from planner_jax.planning import progress as watch
 from planner_jax.planning.decided import DecidedPlanner
 
 

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from planner_jax.planning import packed
-from planner_jax.planning import traced as module
-from planner_jax.planning.traced import FOLDER, traced
+from planner_jax.planning import export_cache as module
+from planner_jax.planning import single_call as packed
+from planner_jax.planning.export_cache import FOLDER, traced
 
 SHAPE = (jax.ShapeDtypeStruct((3,), jnp.float32),)
 NUMBERS = np.arange(3, dtype=np.float32)

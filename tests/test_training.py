@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from planner_jax.cli import main
+from planner_jax.cli.main import main
+from planner_jax.core.registry import install_line
 from planner_jax.planning.decided import first_choice
 from planner_jax.policies.checkpoint import save_checkpoint
 from planner_jax.policies.curves import draw_curves
@@ -17,9 +18,8 @@ from planner_jax.policies.networks import NETWORKS, Mlp
 from planner_jax.policies.observation import FEATURES
 from planner_jax.policies.policy import Policy
 from planner_jax.policies.progress import FILE, read_rows, to_text
-from planner_jax.registry import install_line
-from planner_jax.sweep.plain_json import sealed
-from planner_jax.sweep.settings import SettingError
+from planner_jax.runs.plain_json import sealed
+from planner_jax.runs.settings import SettingError
 from planner_jax.task.catch.estimate import shortfall
 from planner_jax.task.catch.suites import draw_by_key
 

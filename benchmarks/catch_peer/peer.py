@@ -1,7 +1,7 @@
 """Build the C++ program of this folder, run it on a table of throws, and compare with the table.
 
-The program minimises the objective of `planner_jax.task.catch.paper.PaperCatch`, on one core and
-in double precision: one throw after another, none of them with a heap allocation. It shares no code
+The program minimises the objective of `planner_jax.baselines.catch.paper.PaperCatch`, on one core
+and in double precision: one throw after another, none of them with a heap allocation. It shares no code
 with the library.
 
 A peer gets its best settings. They were found by some 500 to 1,500 random steps for each search, on

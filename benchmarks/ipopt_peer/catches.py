@@ -4,7 +4,7 @@ import math
 from typing import Any
 
 from planner_jax.benchmarks.ipopt_peer.program import Problem, across, ca, rate_squared
-from planner_jax.protocol import FEASIBILITY_TOLERANCE
+from planner_jax.core.protocol import FEASIBILITY_TOLERANCE
 
 RIM = 0.9  # share of the net's radius that a planned catch may use
 

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jax.custom_derivatives import SymbolicZero
 
-from planner_jax.arithmetic import reciprocal
 from planner_jax.ball.flight import BallState, fly, gravity_vector
+from planner_jax.core.arithmetic import reciprocal
 
 _FLIGHT_STEPS = 10  # the landing of a 2 s flight is then right to 0.2 mm
 _COARSE_STEPS = 8  # enough for slopes; fewer go astray where drag is strong

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from planner_jax.arithmetic import components
-from planner_jax.checks import require_kind, require_number, require_size, shape_of
+from planner_jax.core.arithmetic import components
+from planner_jax.core.checks import require_kind, require_number, require_size, shape_of
 
 Vector = TypeVar("Vector", Array, tuple[Array, Array, Array])
 

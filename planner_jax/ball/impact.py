@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jax import Array
 
-from planner_jax.arithmetic import inverse_sqrt, reciprocal
+from planner_jax.core.arithmetic import inverse_sqrt, reciprocal
 
 
 def racket_impact(ball_vel: Array, racket_vel: Array, normal: Array, restitution: Array) -> Array:

@@ -14,12 +14,12 @@ from flax import struct
 from jax import Array
 from jax.custom_derivatives import SymbolicZero
 
-from planner_jax.arithmetic import reciprocal
 from planner_jax.ball.flight import BallState, require_ball, rk4_step
 from planner_jax.ball.prediction_kernel import table_kernel
-from planner_jax.checks import require_kind, require_number, require_scalar, require_size
+from planner_jax.core.arithmetic import reciprocal
+from planner_jax.core.checks import require_kind, require_number, require_scalar, require_size
+from planner_jax.core.rules import POSITIVE, Field, Table
 from planner_jax.lanes import with_kernel
-from planner_jax.rules import POSITIVE, Field, Table
 
 LEAST_NODES = 5  # of a table
 

@@ -9,7 +9,7 @@ from jax.core import Tracer
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from planner_jax.ball.prediction import PathTable, convolution_weights
-from planner_jax.checks import floating, require_number, require_size, shape_of
+from planner_jax.core.checks import floating, require_number, require_size, shape_of
 
 MOST_NODES = 4096  # that are chosen for a path
 _CHECKED = (0.2, 0.5, 0.8)  # shares of the way between two nodes, where errors are looked for

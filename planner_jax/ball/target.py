@@ -13,7 +13,7 @@ from flax import struct
 from jax import Array
 
 from planner_jax.ball.flight import BallState, linear_drag_flight
-from planner_jax.rules import NOT_NEGATIVE, Field, Table
+from planner_jax.core.rules import NOT_NEGATIVE, Field, Table
 
 
 class TargetPath(Protocol):

@@ -17,7 +17,7 @@ import numpy as np
 from flax import struct
 from jax import Array, lax
 
-from planner_jax.arithmetic import reciprocal
+from planner_jax.core.arithmetic import reciprocal
 from planner_jax.cost.along import Along
 from planner_jax.cost.penalty import smoothed_hinge
 from planner_jax.trajectory.polynomial import Motion

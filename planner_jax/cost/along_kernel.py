@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from planner_jax.arithmetic import reciprocal
+from planner_jax.core.arithmetic import reciprocal
 from planner_jax.cost.penalty import smoothed_hinge
 from planner_jax.lanes.pallas import Block, block_width, kernel_call, place_in_grid
 from planner_jax.trajectory.polynomial import Motion

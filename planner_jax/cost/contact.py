@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jax import Array
 
-from planner_jax.arithmetic import reciprocal
+from planner_jax.core.arithmetic import reciprocal
 
 
 def apex_excess(apex: Array, min_apex: Array, max_apex: Array) -> Array:

@@ -16,9 +16,9 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.checks import shapes_told, told
+from planner_jax.core.checks import shapes_told, told
+from planner_jax.core.rules import NOT_NEGATIVE, NOT_ZERO, POSITIVE, Field, Table, below
 from planner_jax.cost.peaks import greatest_by_tangents
-from planner_jax.rules import NOT_NEGATIVE, NOT_ZERO, POSITIVE, Field, Table, below
 from planner_jax.trajectory.polynomial import Motion
 from planner_jax.trajectory.proportional_minco import ProportionalMinco, by_pieces
 

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from planner_jax.arithmetic import reciprocal
+from planner_jax.core.arithmetic import reciprocal
 
 
 def greatest_by_parabolas(values: Array, times: np.ndarray) -> Array:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from planner_jax.arithmetic import reciprocal
+from planner_jax.core.arithmetic import reciprocal
 from planner_jax.cost.peaks import crest
 from planner_jax.lanes.pallas import Block, block_width, kernel_call, place_in_grid
 from planner_jax.trajectory.polynomial import Motion

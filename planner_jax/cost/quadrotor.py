@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from planner_jax.arithmetic import Components, components, reciprocal
+from planner_jax.core.arithmetic import Components, components, reciprocal
 from planner_jax.cost.along import Along, greatest_along
 from planner_jax.cost.extras import extra_excess, extra_rate, greatest_extras, num_limits
 from planner_jax.robot.quadrotor import (

@@ -4,8 +4,8 @@ from typing import BinaryIO
 
 import numpy as np
 
+from planner_jax.core.protocol import Plan
 from planner_jax.export.setpoints import robot_of, setpoints_of
-from planner_jax.protocol import Plan
 
 _AXES, _JOINTS = ("x", "y", "z"), ("1", "2", "3", "4", "5", "6")
 # Of each robot: a field of its setpoints, the names of its columns, and their unit.

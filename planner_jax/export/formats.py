@@ -9,7 +9,7 @@ import pkgutil
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from planner_jax.registry import MissingExtra, UnknownName, install_line, require_name
+from planner_jax.core.registry import MissingExtra, UnknownName, install_line, require_name
 
 EXTRA = "export"
 

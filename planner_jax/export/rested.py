@@ -3,11 +3,11 @@
 import dataclasses
 from typing import Any
 
-from planner_jax.ending.behind import is_rested, with_ending
-from planner_jax.ending.names import ending_problem
-from planner_jax.ending.no_ending import NoEnding
+from planner_jax.core.protocol import Plan
+from planner_jax.core.recovery_names import ending_problem
 from planner_jax.export.setpoints import ExportError, robot_of
-from planner_jax.protocol import Plan
+from planner_jax.recovery.after_plan import is_rested, with_ending
+from planner_jax.recovery.no_ending import NoEnding
 from planner_jax.robot.quadrotor_plan import QuadrotorPlan
 
 # By robot: a field that the cases of its plans have, and those of others do not.

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from planner_jax.core.protocol import Plan
+from planner_jax.core.registry import MissingExtra
 from planner_jax.export.frames import rotated
 from planner_jax.export.setpoints import DEFAULT_RATE, Setpoints, setpoints_of
-from planner_jax.protocol import Plan
-from planner_jax.registry import MissingExtra
 from planner_jax.robot.arm_plan import ArmSetpoints
 from planner_jax.robot.quadrotor_plan import QuadrotorSetpoints
 

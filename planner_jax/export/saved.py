@@ -4,9 +4,9 @@ import os
 
 import numpy as np
 
+from planner_jax.core.plan_files import PlanFileError, load_fitting, named_leaves
+from planner_jax.core.protocol import Plan, lane
 from planner_jax.export.setpoints import ROBOTS, ExportError
-from planner_jax.plan_files import PlanFileError, load_fitting, named_leaves
-from planner_jax.protocol import Plan, lane
 
 
 def saved_plan(path: str | os.PathLike, row: int | None = None) -> Plan:

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from planner_jax.plan_files import named_leaves
-from planner_jax.protocol import Plan, Status, is_solved
+from planner_jax.core.plan_files import named_leaves
+from planner_jax.core.protocol import Plan, Status, is_solved
 from planner_jax.robot.arm_plan import ArmPlan, ArmSetpoints
 from planner_jax.robot.car import CarPlan, CarSetpoints
 from planner_jax.robot.quadrotor_plan import QuadrotorPlan, QuadrotorSetpoints

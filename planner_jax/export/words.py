@@ -4,11 +4,11 @@ import os
 from pathlib import Path
 from typing import Any
 
+from planner_jax.core.protocol import Plan
 from planner_jax.export.formats import Format, format_named, required
 from planner_jax.export.rested import rested
 from planner_jax.export.setpoints import DEFAULT_RATE, ExportError, robot_of
-from planner_jax.protocol import Plan
-from planner_jax.whole_files import new_file_problem, replacing
+from planner_jax.host.files import new_file_problem, replacing
 
 
 def export(

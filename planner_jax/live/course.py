@@ -8,13 +8,13 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.ending.case import EndingCase
-from planner_jax.ending.planner import RestPlanner
+from planner_jax.core.protocol import is_solved
 from planner_jax.live.packets import FIELDS
 from planner_jax.optimise.problem import Round
-from planner_jax.planning.packed import call_packed
 from planner_jax.planning.programs import solve_cases
-from planner_jax.protocol import is_solved
+from planner_jax.planning.single_call import call_packed
+from planner_jax.recovery.case import EndingCase
+from planner_jax.recovery.planner import RestPlanner
 from planner_jax.robot.quadrotor_plan import setpoint_at
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, states_at, total_duration
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from planner_jax.core.protocol import is_solved
 from planner_jax.live.arrivals import Arrivals
 from planner_jax.live.course import (
     Course,
@@ -38,8 +39,7 @@ from planner_jax.live.packets import (
 from planner_jax.live.report import Report
 from planner_jax.live.sight import Sight
 from planner_jax.live.strokes import Stroke
-from planner_jax.planning.packed import call_packed
-from planner_jax.protocol import is_solved
+from planner_jax.planning.single_call import call_packed
 
 _IMMINENT = 1e-3  # [s], before the next look, in which nothing is rehearsed any longer
 _PATIENCE = 0.2  # share of the deadline that an answer waits for a plan

@@ -7,8 +7,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from planner_jax.host.memory import resident_memory, shown
 from planner_jax.live.packets import Fault
-from planner_jax.memory import resident_memory, shown
 
 _SHORTEST = 1e-6  # [s]
 _STEP = 0.01  # relative, of the classes of times

@@ -3,8 +3,8 @@
 import dataclasses
 from typing import Any
 
+from planner_jax.runs.settings import option, require, require_count
 from planner_jax.sweep.robots import checked_robot, robot_option
-from planner_jax.sweep.settings import option, require, require_count
 
 PORT = 5560
 

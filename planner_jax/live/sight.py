@@ -17,7 +17,7 @@ from planner_jax.ball.estimation import (
 )
 from planner_jax.ball.flight import BallState
 from planner_jax.live.packets import Fault
-from planner_jax.planning.packed import call_packed
+from planner_jax.planning.single_call import call_packed
 
 _SPREAD = 15.0  # [m/s], of the velocity before anything is known of it
 _DENSITY = 0.01  # [m^2/s^3], of what the flight leaves out

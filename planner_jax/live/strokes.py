@@ -17,21 +17,21 @@ from planner_jax.ball.flight import BallState, linear_drag_flight, rk4_step
 from planner_jax.ball.target import BallPath
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
-from planner_jax.planning.packed import call_packed
 from planner_jax.planning.programs import solve_cases
 from planner_jax.planning.replan import Replanning
+from planner_jax.planning.single_call import call_packed
 from planner_jax.robot.quadrotor_model import QuadrotorModel
 from planner_jax.robot.quadrotor_models import PAPER_CATCHER, PAPER_HITTER
 from planner_jax.task.catch.case import GRAVITY as CATCH_GRAVITY
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.case import case as catch_case
 from planner_jax.task.catch.decide import Greedy
-from planner_jax.task.catch.exact import ExactCatch
+from planner_jax.task.catch.planner import ExactCatch
 from planner_jax.task.catch.replan import ReplanCatch
 from planner_jax.task.hit.case import DRAG as HIT_DRAG
 from planner_jax.task.hit.case import GRAVITY as HIT_GRAVITY
 from planner_jax.task.hit.case import case as hit_case
-from planner_jax.task.hit.exact import ExactHit
+from planner_jax.task.hit.planner import ExactHit
 from planner_jax.task.hit.replan import ReplanHit
 from planner_jax.trajectory.polynomial import evaluate
 

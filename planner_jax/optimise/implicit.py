@@ -13,11 +13,11 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array, lax
 
-from planner_jax.checks import require_kind, require_size
+from planner_jax.core.checks import require_kind, require_size
+from planner_jax.core.protocol import marked, status_of
 from planner_jax.optimise.evaluation import Objective
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.multistart import minimise
-from planner_jax.protocol import marked, status_of
 
 
 @struct.dataclass

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from planner_jax.checks import numeric, require_number, require_size, told
+from planner_jax.core.checks import numeric, require_number, require_size, told
 from planner_jax.lanes import in_one_kernel, with_kernel
 from planner_jax.optimise.evaluation import Evaluation, Objective, better
 from planner_jax.optimise.lbfgs_kernel import judged_pair, shortening, start_scale, turn_kernel

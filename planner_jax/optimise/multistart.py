@@ -12,12 +12,12 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array, lax
 
+from planner_jax.core.protocol import FEASIBILITY_TOLERANCE, Status, is_unsolved, status_of
 from planner_jax.lanes import over_lanes
 from planner_jax.optimise import lbfgs, newton
 from planner_jax.optimise.evaluation import Evaluation, Objective
 from planner_jax.optimise.newton import Curvature, Curved, NewtonConfig, by_products
 from planner_jax.optimise.problem import Problem, Round, Solver, Stage
-from planner_jax.protocol import FEASIBILITY_TOLERANCE, Status, is_unsolved, status_of
 
 # So few iterations are counted, so that a GPU need not tell the host whether to go on.
 _COUNTED = 16

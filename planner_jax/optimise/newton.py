@@ -28,7 +28,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array, lax
 
-from planner_jax.checks import numeric, require_number, require_size, told
+from planner_jax.core.checks import numeric, require_number, require_size, told
 from planner_jax.optimise.evaluation import Evaluation, Objective, better
 from planner_jax.optimise.preconditioner import Preconditioner
 

@@ -5,11 +5,11 @@ from typing import Any, Protocol
 
 from jax import Array
 
-from planner_jax.checks import require_kind, require_size
+from planner_jax.core.checks import require_kind, require_size
+from planner_jax.core.protocol import Attempt
 from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.newton import Curvature, NewtonConfig
-from planner_jax.protocol import Attempt
 
 Solver = LbfgsConfig | NewtonConfig
 Settings = tuple[tuple[str, Any], ...]  # fields of a planner, and the values they take

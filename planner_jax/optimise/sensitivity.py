@@ -23,12 +23,12 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.checks import numeric, require_size, told
+from planner_jax.core.checks import numeric, require_size, told
+from planner_jax.core.protocol import Plan
 from planner_jax.optimise.newton import Curvature
 from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.preconditioner import block_preconditioner, positive_inverse
 from planner_jax.optimise.problem import Problem, Round, Settings
-from planner_jax.protocol import Plan
 
 Quantity = str | Callable[[Any], Array]
 _CURVATURES = ("products", "core", "whole")

@@ -8,7 +8,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.checks import floating, numeric, require_size, told
+from planner_jax.core.checks import floating, numeric, require_size, told
 
 
 @struct.dataclass

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from planner_jax.rules import POSITIVE, Field, Table
+from planner_jax.core.rules import POSITIVE, Field, Table
 
 
 @struct.dataclass

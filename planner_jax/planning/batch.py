@@ -9,11 +9,11 @@ from typing import Any
 
 import jax
 
-from planner_jax.planning.from_host import plan_from_host
+from planner_jax.core.protocol import Attempt
+from planner_jax.planning.device_batch import plan_resident
+from planner_jax.planning.host_batch import plan_from_host
 from planner_jax.planning.layout import is_one_cpu, length, on_devices, sharding, sizes_of
-from planner_jax.planning.resident import plan_resident
-from planner_jax.planning.watch import Watch
-from planner_jax.protocol import Attempt
+from planner_jax.planning.progress import Watch
 
 
 def plan_batch(

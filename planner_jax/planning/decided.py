@@ -10,9 +10,7 @@ from flax import struct
 from jax import Array, lax
 from jax.core import Tracer
 
-from planner_jax.planning.better import better_of, merged
-from planner_jax.planning.packed import call_packed
-from planner_jax.protocol import (
+from planner_jax.core.protocol import (
     Case,
     Decision,
     Drive,
@@ -21,6 +19,8 @@ from planner_jax.protocol import (
     is_unsolved,
     out_of_time,
 )
+from planner_jax.planning.select import better_of, merged
+from planner_jax.planning.single_call import call_packed
 
 CaseT = TypeVar("CaseT", bound=Case)
 PlanT = TypeVar("PlanT", bound=Plan)

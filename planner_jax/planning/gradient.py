@@ -7,14 +7,14 @@ from typing import Any, Generic, TypeVar
 from flax import struct
 from jax import Array
 
-from planner_jax.checks import require_kind, require_switch, told
+from planner_jax.core.checks import require_kind, require_switch, told
+from planner_jax.core.protocol import Plan
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.newton import NewtonConfig
 from planner_jax.optimise.problem import Solver
 from planner_jax.optimise.sensitivity import Differentiated, Quantity, part_of
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.planning.plan import plan, require_fit
-from planner_jax.protocol import Plan
 
 PlanT = TypeVar("PlanT", bound=Plan)
 

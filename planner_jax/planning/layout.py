@@ -13,8 +13,8 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh, NamedSharding, PartitionSpec, Sharding, SingleDeviceSharding
 
+from planner_jax.core.protocol import Attempt
 from planner_jax.planning.one_by_one import OneByOne
-from planner_jax.protocol import Attempt
 
 # Lanes of a device in one call. Few, because every one is a program of its own to compile.
 BUCKETS = (16, 128, 1024, 8192, 65536)

@@ -11,15 +11,15 @@ from jax import lax
 from jax.core import Tracer
 from jax.experimental import multihost_utils
 
-from planner_jax.checks import require_size
+from planner_jax.core.checks import require_size
+from planner_jax.core.protocol import AnyPlanner, Attempt, Case, Plan, Status, is_unsolved
+from planner_jax.core.rules import has_rules, require_shapes, require_sound
 from planner_jax.planning.batch import plan_batch
-from planner_jax.planning.better import better_of
-from planner_jax.planning.from_host import plan_on_host
+from planner_jax.planning.host_batch import plan_on_host
 from planner_jax.planning.programs import solve_cases
+from planner_jax.planning.progress import Progress, Watch
+from planner_jax.planning.select import better_of
 from planner_jax.planning.single import plan_single
-from planner_jax.planning.watch import Progress, Watch
-from planner_jax.protocol import AnyPlanner, Attempt, Case, Plan, Status, is_unsolved
-from planner_jax.rules import has_rules, require_shapes, require_sound
 
 CaseT = TypeVar("CaseT", bound=Case)
 PlanT = TypeVar("PlanT", bound=Plan)

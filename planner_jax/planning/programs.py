@@ -11,6 +11,9 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh, PartitionSpec
 
+from planner_jax.core.protocol import Attempt, LanesPlanner, is_unsolved, marked
+from planner_jax.core.rules import require_shapes
+from planner_jax.host.threads import as_here
 from planner_jax.planning.layout import (
     LANES,
     apart,
@@ -20,9 +23,6 @@ from planner_jax.planning.layout import (
     sharding,
     sizes_of,
 )
-from planner_jax.protocol import Attempt, LanesPlanner, is_unsolved, marked
-from planner_jax.rules import require_shapes
-from planner_jax.threads import as_here
 
 # XLA tries its own kernels for every product of matrices, a third of the time that a GPU's program
 # takes to compile; the library's are as quick for products of such shapes. No effect on a CPU.

@@ -7,9 +7,9 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.checks import numbers_of, require_kind, told
+from planner_jax.core.checks import numbers_of, require_kind, told
+from planner_jax.core.protocol import Case, Plan
 from planner_jax.planning.plan import plan, require_planner
-from planner_jax.protocol import Case, Plan
 
 CaseT = TypeVar("CaseT", bound=Case)
 PlanT = TypeVar("PlanT", bound=Plan)

@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from typing import Any
 
-from planner_jax.planning.packed import call_packed
+from planner_jax.core.protocol import Attempt, Planner, is_solved, is_unsolved, out_of_time
 from planner_jax.planning.programs import solve_cases
-from planner_jax.planning.watch import Watch
-from planner_jax.protocol import Attempt, Planner, is_solved, is_unsolved, out_of_time
+from planner_jax.planning.progress import Watch
+from planner_jax.planning.single_call import call_packed
 
 
 def plan_single(planner: Planner, attempts: Sequence[Attempt], case: Any, watch: Watch) -> Any:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from planner_jax.plain_files import open_plain
+from planner_jax.host.files import open_plain
 from planner_jax.robot.arm import Arm
 from planner_jax.robot.arm_ik import misfit
 

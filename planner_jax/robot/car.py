@@ -13,7 +13,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.protocol import Plan
+from planner_jax.core.protocol import Plan
 from planner_jax.robot.setpoints import sampled_at_rate
 
 

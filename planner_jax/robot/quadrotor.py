@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from planner_jax.arithmetic import Components, at_least, components, inverse_sqrt, reciprocal
+from planner_jax.core.arithmetic import Components, at_least, components, inverse_sqrt, reciprocal
 
 
 @struct.dataclass

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from planner_jax.plain_files import open_plain
+from planner_jax.host.files import open_plain
 from planner_jax.robot.quadrotor_model import (
     NET,
     RACKET,

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from planner_jax.registry import MissingExtra, install_line
+from planner_jax.core.registry import MissingExtra, install_line
 from planner_jax.robot.quadrotor_file import RobotError
 
 _SKEW = 0.02  # of the greatest moment of inertia, what may lie off the body's axes

@@ -8,7 +8,7 @@ what the rotors can do; so are the shares of the rotors' thrusts that plans use.
 import dataclasses
 from typing import Any
 
-from planner_jax.registry import UnknownName
+from planner_jax.core.registry import UnknownName
 from planner_jax.robot.quadrotor_file import ENDINGS, read_robot
 from planner_jax.robot.quadrotor_model import (
     GRAVITY,

@@ -8,7 +8,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.protocol import Plan
+from planner_jax.core.protocol import Plan
 from planner_jax.robot.quadrotor import body_z, flat_attitude, net_thrust, tilt_quaternion
 from planner_jax.robot.setpoints import sampled_at_rate
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, joined

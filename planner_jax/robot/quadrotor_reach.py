@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jax import Array
 
-from planner_jax.arithmetic import components
+from planner_jax.core.arithmetic import components
 from planner_jax.robot.quadrotor import QuadrotorLimits
 
 # By how much limits may be exceeded here, far more than in any plan that is solved: how closely

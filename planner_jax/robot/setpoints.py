@@ -7,7 +7,7 @@ import jax
 import numpy as np
 from jax import Array
 
-from planner_jax.checks import require_number
+from planner_jax.core.checks import require_number
 
 _MOST = 10**8  # setpoints of a batch
 

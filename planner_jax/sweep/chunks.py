@@ -12,15 +12,15 @@ import numpy as np
 import pyarrow as pa
 from tqdm import tqdm
 
-from planner_jax import stopping
-from planner_jax.sweep.columns import RefereedBatch, rows_of
-from planner_jax.sweep.parts import EncodedRows, Part, Parts
-from planner_jax.sweep.run_folder import RunFolder
-from planner_jax.sweep.source import Chunk, Source
-from planner_jax.sweep.summary import percent
+from planner_jax.host import signals as stopping
+from planner_jax.host.threads import as_here
+from planner_jax.runs.columns import RefereedBatch, rows_of
+from planner_jax.runs.parts import EncodedRows, Part, Parts
+from planner_jax.runs.run_folder import RunFolder
+from planner_jax.runs.source import Chunk, Source
+from planner_jax.runs.summary import percent
+from planner_jax.runs.timing import CompileClock, Stopwatch, timed, timed_warm
 from planner_jax.sweep.sweep import Sweep
-from planner_jax.sweep.timing import CompileClock, Stopwatch, timed, timed_warm
-from planner_jax.threads import as_here
 
 _COUNTED = ("num", "successes")  # of every part
 _UNDER_WAY = 2  # chunks that are judged or written while the next is planned

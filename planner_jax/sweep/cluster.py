@@ -28,21 +28,21 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from planner_jax import stopping
-from planner_jax.compile_cache import keep_compiled_programs
-from planner_jax.processors import threads_of_a_computation
-from planner_jax.registry import MissingExtra, Task, install_line
-from planner_jax.sweep.chunks import Made, Maker, Making, SweepRun, Workers
-from planner_jax.sweep.environment import environment, require_backend
-from planner_jax.sweep.identity import differences, settings_digest
-from planner_jax.sweep.settings import (
+from planner_jax.core.registry import MissingExtra, Task, install_line
+from planner_jax.host import signals as stopping
+from planner_jax.host.compile_cache import keep_compiled_programs
+from planner_jax.host.processors import threads_of_a_computation
+from planner_jax.runs.environment import environment, require_backend
+from planner_jax.runs.settings import (
     SettingError,
     SweepSettings,
     WorkersFailed,
     require,
 )
+from planner_jax.runs.timing import CompileClock
+from planner_jax.sweep.chunks import Made, Maker, Making, SweepRun, Workers
+from planner_jax.sweep.identity import differences, settings_digest
 from planner_jax.sweep.sweep import sweep_of
-from planner_jax.sweep.timing import CompileClock
 
 _ADDRESS = "RAY_ADDRESS"  # environment variable that names a cluster to join
 _HOST = "127.0.0.1"  # nothing else reaches a cluster that is begun here

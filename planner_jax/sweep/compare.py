@@ -12,11 +12,11 @@ import numpy as np
 import pyarrow as pa
 from scipy.stats import binomtest
 
-from planner_jax.sweep.parquet import read_rows
+from planner_jax.runs.parquet import read_rows
+from planner_jax.runs.run_folder import RunFolder
+from planner_jax.runs.settings import SettingError
+from planner_jax.runs.summary import percent, wilson_interval
 from planner_jax.sweep.planned import finished_sweep
-from planner_jax.sweep.run_folder import RunFolder
-from planner_jax.sweep.settings import SettingError
-from planner_jax.sweep.summary import percent, wilson_interval
 from planner_jax.sweep.sweep import settings_of
 
 # Columns of the rows that are read, which all sweeps have.

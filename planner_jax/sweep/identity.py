@@ -7,11 +7,11 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from planner_jax.sweep.environment import environment
-from planner_jax.sweep.parquet import file_sum
-from planner_jax.sweep.plain_json import digest_of
-from planner_jax.sweep.settings import SettingError
-from planner_jax.sweep.source import Source
+from planner_jax.runs.environment import environment
+from planner_jax.runs.parquet import file_sum
+from planner_jax.runs.plain_json import digest_of
+from planner_jax.runs.settings import SettingError
+from planner_jax.runs.source import Source
 
 IDENTITY = ("run", "version", "code", "settings")  # of a manifest, and of every part
 # What a row depends on besides the code: packages, and what is known of the devices.

@@ -5,7 +5,7 @@ import json
 from collections.abc import Sequence
 from typing import Any
 
-from planner_jax.sweep import table
+from planner_jax.runs import table
 from planner_jax.sweep.sweep import Sweep
 
 _STYLE = """

@@ -5,10 +5,10 @@ from typing import Any, NamedTuple
 
 import pyarrow as pa
 
-from planner_jax.protocol import Plan, lane
-from planner_jax.sweep.parquet import pick_rows
-from planner_jax.sweep.run_folder import RunFolder
-from planner_jax.sweep.settings import SettingError, settings_of_manifest
+from planner_jax.core.protocol import Plan, lane
+from planner_jax.runs.parquet import pick_rows
+from planner_jax.runs.run_folder import RunFolder
+from planner_jax.runs.settings import SettingError, settings_of_manifest
 from planner_jax.sweep.sweep import Sweep, settings_of, sweep_of_run
 
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from planner_jax.sweep.columns import LIST, VECTOR, Column, RefereedBatch, leaves_of
+from planner_jax.runs.columns import LIST, VECTOR, Column, RefereedBatch, leaves_of
 
 
 def _starts(batch: RefereedBatch) -> np.ndarray:

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from planner_jax.sweep.figures.style import draw
+from planner_jax.runs.parquet import pick_rows, read_rows, row_groups
+from planner_jax.runs.run_folder import RunFolder
+from planner_jax.runs.settings import SettingError, settings_of_manifest
+from planner_jax.runs.style import draw
+from planner_jax.runs.table import headline, to_markdown
 from planner_jax.sweep.page import to_page
-from planner_jax.sweep.parquet import pick_rows, read_rows, row_groups
-from planner_jax.sweep.run_folder import RunFolder
-from planner_jax.sweep.settings import SettingError, settings_of_manifest
 from planner_jax.sweep.sweep import RunFigure, settings_of, sweep_of_run
-from planner_jax.sweep.table import headline, to_markdown
 
 PAGE = "index.html"
 _CASES_SHOWN = 60

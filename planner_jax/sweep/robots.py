@@ -6,8 +6,8 @@ Robots are imported where one is named, so that a command's help needs no NumPy.
 from collections.abc import Mapping
 from typing import Any
 
-from planner_jax.registry import UnknownName
-from planner_jax.sweep.settings import SettingError, option
+from planner_jax.core.registry import UnknownName
+from planner_jax.runs.settings import SettingError, option
 
 
 def robot_option(usual: str) -> Any:

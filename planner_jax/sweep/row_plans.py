@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from planner_jax.protocol import Status
+from planner_jax.core.protocol import Status
 from planner_jax.robot.arm_plan import ArmPlan
 from planner_jax.robot.car import CarPlan
 from planner_jax.robot.quadrotor_plan import QuadrotorPlan

@@ -10,12 +10,22 @@ import jax
 import numpy as np
 import pyarrow as pa
 
-from planner_jax import stopping
-from planner_jax.registry import Task
+from planner_jax.core.registry import Task
+from planner_jax.host import signals as stopping
+from planner_jax.runs.columns import RefereedBatch, rows_of
+from planner_jax.runs.environment import require_backend
+from planner_jax.runs.parts import Parts
+from planner_jax.runs.run_folder import RunFolder
+from planner_jax.runs.settings import (
+    SettingError,
+    SweepSettings,
+    WorkersFailed,
+    settings_to_resume,
+)
+from planner_jax.runs.source import Source
+from planner_jax.runs.stored_run import run_folder
 from planner_jax.sweep.chunks import SweepRun, plan_chunks
 from planner_jax.sweep.cluster import workers_of
-from planner_jax.sweep.columns import RefereedBatch, rows_of
-from planner_jax.sweep.environment import require_backend
 from planner_jax.sweep.identity import (
     IDENTITY,
     begun_now,
@@ -23,17 +33,7 @@ from planner_jax.sweep.identity import (
     require_same_maker,
     settings_digest,
 )
-from planner_jax.sweep.parts import Parts
 from planner_jax.sweep.report import PAGE, draw_comparisons, rewrite_page, write_report
-from planner_jax.sweep.run_folder import RunFolder
-from planner_jax.sweep.settings import (
-    SettingError,
-    SweepSettings,
-    WorkersFailed,
-    settings_to_resume,
-)
-from planner_jax.sweep.source import Source
-from planner_jax.sweep.stored_run import run_folder
 from planner_jax.sweep.sweep import Sweep, settings_of, sweep_of
 
 

@@ -9,13 +9,13 @@ from typing import Any, ClassVar
 import jax
 import numpy as np
 
+from planner_jax.core.protocol import Status
+from planner_jax.core.registry import Task
+from planner_jax.core.rules import CaseError
 from planner_jax.planning.plan import plan
-from planner_jax.protocol import Status
 from planner_jax.referee.rotors import rotor_thrusts
-from planner_jax.registry import Task
-from planner_jax.rules import CaseError
+from planner_jax.runs.settings import SettingError
 from planner_jax.sweep.sampled_motion import SampledMotion, body_rate, net_thrust, sample_motion
-from planner_jax.sweep.settings import SettingError
 
 _SAMPLES = 4001  # of a plan
 _PLACES = re.compile(r"\b(?:[a-z_]+\.)+(?=[a-z_])")  # before the name of a field

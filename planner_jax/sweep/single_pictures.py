@@ -7,13 +7,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from planner_jax.registry import Task
-from planner_jax.sweep.columns import RefereedBatch, rows_of
-from planner_jax.sweep.figures.style import draw
+from planner_jax.core.registry import Task
+from planner_jax.runs.columns import RefereedBatch, rows_of
+from planner_jax.runs.run_folder import RunFolder
+from planner_jax.runs.source import Chunk
+from planner_jax.runs.style import draw
 from planner_jax.sweep.report import RunRows
-from planner_jax.sweep.run_folder import RunFolder
 from planner_jax.sweep.single import Answer
-from planner_jax.sweep.source import Chunk
 from planner_jax.sweep.sweep import sweep_of
 
 

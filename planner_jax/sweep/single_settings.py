@@ -7,9 +7,8 @@ import dataclasses
 import math
 from typing import Any, ClassVar
 
-from planner_jax.registry import Task, UnknownName
-from planner_jax.sweep.robots import checked_robot, robot_option
-from planner_jax.sweep.settings import (
+from planner_jax.core.registry import Task, UnknownName
+from planner_jax.runs.settings import (
     SettingError,
     ending_option,
     ending_options,
@@ -17,6 +16,7 @@ from planner_jax.sweep.settings import (
     require,
     require_ending,
 )
+from planner_jax.sweep.robots import checked_robot, robot_option
 
 _OWN = "(default: the robot's)"
 

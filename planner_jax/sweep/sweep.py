@@ -9,15 +9,15 @@ from typing import Any, ClassVar
 import numpy as np
 from matplotlib.figure import Figure
 
+from planner_jax.core.protocol import Plan
+from planner_jax.core.registry import MissingExtra, Task, UnknownName, task_named
 from planner_jax.planning.plan import plan
-from planner_jax.protocol import Plan
-from planner_jax.registry import MissingExtra, Task, UnknownName, task_named
-from planner_jax.sweep.columns import Column, RefereedBatch, leaf_columns
+from planner_jax.runs.columns import Column, RefereedBatch, leaf_columns
+from planner_jax.runs.settings import SettingError, SweepSettings, require
+from planner_jax.runs.source import DrawnSource, Source, filled_in
+from planner_jax.runs.summary import Tally
+from planner_jax.runs.table import RateTable, own_cells
 from planner_jax.sweep.figures.outcomes import outcomes_figure
-from planner_jax.sweep.settings import SettingError, SweepSettings, require
-from planner_jax.sweep.source import DrawnSource, Source, filled_in
-from planner_jax.sweep.summary import Tally
-from planner_jax.sweep.table import RateTable, own_cells
 
 
 @dataclasses.dataclass(frozen=True)

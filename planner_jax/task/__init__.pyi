@@ -1,4 +1,5 @@
 from . import block as block
 from . import catch as catch
+from . import group as group
 from . import hit as hit
 from . import intercept as intercept

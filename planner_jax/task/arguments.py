@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from planner_jax.checks import numbers_of, require_size, shape_of
-from planner_jax.memory import require_memory
+from planner_jax.core.checks import numbers_of, require_size, shape_of
+from planner_jax.host.memory import require_memory
 
 _DRAWN_BYTES = 1_000  # of a case, as estimated
 

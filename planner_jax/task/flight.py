@@ -7,9 +7,9 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 
+from planner_jax.core.rules import require_rule
 from planner_jax.robot.quadrotor import QuadrotorLimits, RotorLimits
 from planner_jax.robot.quadrotor_model import NET, QuadrotorModel, Tool
-from planner_jax.rules import require_rule
 
 # Fields of a case, by which its rules know them, that are arguments of what makes it.
 ARGUMENTS = {

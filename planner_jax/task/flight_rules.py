@@ -1,6 +1,6 @@
 """What the numbers of a quadrotor's limits must be, in the cases of all its tasks."""
 
-from planner_jax.rules import NOT_NEGATIVE, POSITIVE, POSITIVE_OR_NONE, Field, Table, below
+from planner_jax.core.rules import NOT_NEGATIVE, POSITIVE, POSITIVE_OR_NONE, Field, Table, below
 
 FLIGHT_RULES: Table = (
     Field("limits.speed", (), POSITIVE),

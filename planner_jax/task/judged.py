@@ -7,8 +7,8 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 
-from planner_jax.checks import numeric, require_number, require_size, require_switch, told
-from planner_jax.protocol import Case, Plan, lane
+from planner_jax.core.checks import numeric, require_number, require_size, require_switch, told
+from planner_jax.core.protocol import Case, Plan, lane
 
 VerdictT = TypeVar("VerdictT")
 

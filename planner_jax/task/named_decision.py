@@ -3,8 +3,8 @@
 import pkgutil
 from collections.abc import Collection, Mapping
 
-from planner_jax.protocol import Decision
-from planner_jax.registry import split_name
+from planner_jax.core.protocol import Decision
+from planner_jax.core.registry import split_name
 
 
 def named_decision(

@@ -32,7 +32,7 @@ import numpy as np
 from flax import struct
 from jax import Array, lax
 
-from planner_jax.arithmetic import reciprocal
+from planner_jax.core.arithmetic import reciprocal
 from planner_jax.trajectory.polynomial import (
     Motion,
     PiecewisePolynomial,

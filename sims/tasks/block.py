@@ -8,6 +8,11 @@ from typing import Any
 import numpy as np
 
 from planner_jax.referee.arm_clearance import links_of, shield_middle
+from planner_jax.runs.columns import BOOL, LIST, NUMBER, TEXT, Column, leaves_of
+from planner_jax.runs.style import draw
+from planner_jax.runs.summary import percent
+from planner_jax.runs.table import RateTable
+from planner_jax.runs.timing import timed
 from planner_jax.sims.execution import FRAME
 from planner_jax.sims.model import World
 from planner_jax.sims.recording import Recording
@@ -33,16 +38,11 @@ from planner_jax.sims.tasks.block_shown import (
     scenery,
 )
 from planner_jax.sweep.block.pipeline import SeeingArms
-from planner_jax.sweep.columns import BOOL, LIST, NUMBER, TEXT, Column, leaves_of
-from planner_jax.sweep.figures.style import draw
-from planner_jax.sweep.summary import percent
-from planner_jax.sweep.table import RateTable
-from planner_jax.sweep.timing import timed
-from planner_jax.task.block.card import SUITES
+from planner_jax.task.block.api import planner as block_planner
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.scene import FLOOR
+from planner_jax.task.block.spec import SUITES
 from planner_jax.task.block.suites import BALL_RADIUS
-from planner_jax.task.block.words import planner as block_planner
 
 _BOUNCE = 0.5  # restitution of a blocked ball, in pictures alone: an assumption
 _KEPT = 5  # frames from one that is recorded to the next

@@ -15,11 +15,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from planner_jax.plan_files import named_leaves
-from planner_jax.protocol import is_solved
+from planner_jax.core.plan_files import named_leaves
+from planner_jax.core.protocol import is_solved
 from planner_jax.referee.arm_clearance import clearances, links_of, shield_middle
 from planner_jax.referee.block import times_inside
 from planner_jax.referee.solids import from_segment, turned, turned_back
+from planner_jax.runs.timing import timed_plans
 from planner_jax.sims.execution import FRAME, TIMESTEP, Executed, execute
 from planner_jax.sims.launch import flight_keys
 from planner_jax.sims.model import World
@@ -27,14 +28,13 @@ from planner_jax.sims.robots.arm.control import Course
 from planner_jax.sims.robots.arm.drives import IDEAL, Drives
 from planner_jax.sims.robots.arm.robot import ShieldArm
 from planner_jax.sims.task import FlightCases, Flights
-from planner_jax.sweep.timing import timed_plans
+from planner_jax.studies.block.receding import Decided
+from planner_jax.task.block.api import draw as draw_throws
+from planner_jax.task.block.api import planner as block_planner
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.plan import BlockPlan
-from planner_jax.task.block.receding import Decided
 from planner_jax.task.block.scene import FLOOR
 from planner_jax.task.block.suites import BALL_RADIUS, GRAVITY
-from planner_jax.task.block.words import draw as draw_throws
-from planner_jax.task.block.words import planner as block_planner
 
 BLOCK_ARM = ShieldArm(base_height=-FLOOR)
 BLOCK_WORLD = World(BLOCK_ARM, GRAVITY, num_balls=0, timestep=TIMESTEP)

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 
 from planner_jax.robot.arm import Arm
+from planner_jax.runs.style import BLUE, GREEN, GREY, INK, PALE, PURPLE, RED, SKY, label
+from planner_jax.runs.table import RateTable
 from planner_jax.sims.scenery import Part
-from planner_jax.sweep.figures.style import BLUE, GREEN, GREY, INK, PALE, PURPLE, RED, SKY, label
-from planner_jax.sweep.table import RateTable
 from planner_jax.task.block.scene import FLOOR, Box, paper_scene
 
 _POLE = 3.0  # [m], of the pole as it is drawn

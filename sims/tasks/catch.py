@@ -20,15 +20,16 @@ from jax import Array
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.prediction import PathTable, predict_path
 from planner_jax.ball.target import BallPath
+from planner_jax.core.protocol import AnyPlanner, is_solved
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
-from planner_jax.planning.ahead import compile_attempts
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.planning.plan import plan as plan_all
 from planner_jax.planning.replan import Replanning
-from planner_jax.protocol import AnyPlanner, is_solved
+from planner_jax.planning.warmup import compile_attempts
 from planner_jax.robot.quadrotor_model import QuadrotorModel
 from planner_jax.robot.quadrotor_models import PAPER_CATCHER
+from planner_jax.runs.columns import BOOL, Column, list_of
 from planner_jax.sims.launch import (
     awaited,
     flight_keys,
@@ -54,15 +55,14 @@ from planner_jax.sims.robots.quadrotor.robot import Quadrotor
 from planner_jax.sims.scoring import passage
 from planner_jax.sims.settings import INTERVAL, CatchFly, require_interval
 from planner_jax.sims.task import BallFlightTask, FlightCases, Flights
-from planner_jax.sweep.columns import BOOL, Column, list_of
-from planner_jax.task.catch.card import DECISIONS, TRAINED
+from planner_jax.task.catch.api import planner as catch_planner
 from planner_jax.task.catch.case import GRAVITY, START, CatchCase
 from planner_jax.task.catch.case import case as catch_case
-from planner_jax.task.catch.exact import ExactCatch
 from planner_jax.task.catch.plan import CatchPlan
+from planner_jax.task.catch.planner import ExactCatch
 from planner_jax.task.catch.replan import ReplanCatch
+from planner_jax.task.catch.spec import DECISIONS, TRAINED
 from planner_jax.task.catch.suites import LAUNCH, draw, earliest_throw
-from planner_jax.task.catch.words import planner as catch_planner
 from planner_jax.task.hit.case import DRAG  # of the published serves; paper 000 gives none
 from planner_jax.task.named_decision import named_decision
 

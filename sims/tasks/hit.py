@@ -13,13 +13,15 @@ from jax import Array
 
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.impact import racket_impact
+from planner_jax.core.protocol import AnyPlanner
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
 from planner_jax.planning.plan import plan as plan_all
 from planner_jax.planning.replan import Replanning
-from planner_jax.protocol import AnyPlanner
 from planner_jax.robot.quadrotor_model import QuadrotorModel
 from planner_jax.robot.quadrotor_models import PAPER_HITTER
+from planner_jax.runs.columns import BOOL, NUMBER, VECTOR, Column
+from planner_jax.runs.summary import percent
 from planner_jax.sims.launch import flight_keys, launched, ready, require_plan, require_world
 from planner_jax.sims.loop import (
     FlightState,
@@ -38,17 +40,15 @@ from planner_jax.sims.scenery import Part
 from planner_jax.sims.scoring import Contact, passage
 from planner_jax.sims.settings import HitFly
 from planner_jax.sims.task import BallFlightTask, FlightCases, Flights
-from planner_jax.sweep.columns import BOOL, NUMBER, VECTOR, Column
-from planner_jax.sweep.summary import percent
 from planner_jax.task.hit import court
-from planner_jax.task.hit.card import REAL_SCENARIOS
+from planner_jax.task.hit.api import planner as hit_planner
 from planner_jax.task.hit.case import GRAVITY, HitCase
-from planner_jax.task.hit.exact import ExactHit
 from planner_jax.task.hit.plan import HitPlan
+from planner_jax.task.hit.planner import ExactHit
 from planner_jax.task.hit.replan import ReplanHit
-from planner_jax.task.hit.serves import DEPTH, SERVE_HEIGHT, generate_serves, to_cases
+from planner_jax.task.hit.spec import REAL_SCENARIOS
+from planner_jax.task.hit.suites import DEPTH, SERVE_HEIGHT, generate_serves, to_cases
 from planner_jax.task.hit.validate import landing
-from planner_jax.task.hit.words import planner as hit_planner
 
 SEEN = 0.25  # [s], a serve's flight before it is planned for: 2 m and more (paper 000, VII-A)
 _AFTER = 0.1  # [s] flown after the last impact planned

@@ -18,13 +18,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from planner_jax.core.protocol import is_solved
 from planner_jax.plane.obstacles import Obstacles
 from planner_jax.plane.polynomial_fit import fit_polynomial
 from planner_jax.plane.prediction import select
 from planner_jax.plane.target import PointState, TurningPath
 from planner_jax.planning.plan import plan as plan_all
-from planner_jax.protocol import is_solved
 from planner_jax.referee.clearance import clearances
+from planner_jax.runs.columns import NUMBER, Column, leaves_of
+from planner_jax.runs.summary import percent
 from planner_jax.sims.drive import (
     DriveLoop,
     DriveState,
@@ -42,14 +44,12 @@ from planner_jax.sims.robots.car.vehicle import GRAVITY, Tyres, Vehicle
 from planner_jax.sims.scenery import Prism
 from planner_jax.sims.settings import InterceptFly
 from planner_jax.sims.task import FlightCases, Flights, FlightTask
-from planner_jax.sweep.columns import NUMBER, Column, leaves_of
-from planner_jax.sweep.summary import percent
+from planner_jax.task.intercept.api import draw, positions
+from planner_jax.task.intercept.api import planner as intercept_planner
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.plan import InterceptPlan
-from planner_jax.task.intercept.spacetime import SpacetimeIntercept
+from planner_jax.task.intercept.planner import SpacetimeIntercept
 from planner_jax.task.intercept.suites import observe
-from planner_jax.task.intercept.words import draw, positions
-from planner_jax.task.intercept.words import planner as intercept_planner
 
 CAR_WORLD = World(Car(), GRAVITY, num_balls=0, timestep=1.0 / CONTROL_RATE)
 SUCCESS, NEAR, FAR = 0.3, 0.05, 0.5  # [m], of the miss: what counts, and two more that are told

@@ -120,7 +120,7 @@ def _cases() -> list[tuple[str, str]]:
     rows += _of(intercept, "heading_tolerance", "'x'", "(1, 2)")
     rows += _of(intercept, "dtype", "int", "np.float64")
 
-    group = "pj.intercept.group(**{**dict(targets=turning(3)), **dict(@)})"
+    group = "pj.group.group(**{**dict(targets=turning(3)), **dict(@)})"
     rows += _of(group, "targets", "None", "5", "'x'", "pj.lane(turning(1), 0)")
     rows += _of(group, "targets", "ball_path(3)", words="target must give positions of the shape")
     rows += _of(group, "present", "(True,)", "'x'", "None", "(1, 0, 1)", "0.5")

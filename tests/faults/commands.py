@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from typing import NamedTuple
 
-from planner_jax.cli import main
+from planner_jax.cli.main import main
 
 
 class Ended(NamedTuple):

@@ -14,19 +14,19 @@ import numpy as np
 import pytest
 
 import planner_jax as pj
-from planner_jax.plan_files import PlanFileError
+from planner_jax.core.plan_files import PlanFileError
 from planner_jax.planning.plan import plan
 from planner_jax.policies.progress import to_text
+from planner_jax.runs.manifest import to_write
+from planner_jax.runs.run_folder import RunFolder
+from planner_jax.runs.settings import SettingError
 from planner_jax.sims.recording import FILE, read_recording, to_rows
 from planner_jax.sims.settings import CatchFly
 from planner_jax.sweep.hit.settings import HitSettings
 from planner_jax.sweep.hit.sweep import HitSweep
-from planner_jax.sweep.manifest import to_write
 from planner_jax.sweep.run import SweepInterrupted, start_sweep
-from planner_jax.sweep.run_folder import RunFolder
-from planner_jax.sweep.settings import SettingError
-from planner_jax.task.hit.exact import ExactHit
 from planner_jax.task.hit.plan import HitPlan
+from planner_jax.task.hit.planner import ExactHit
 from tests.faults.commands import Ended, is_one_line, run
 from tests.faults.damage import damage
 from tests.recordings import recording

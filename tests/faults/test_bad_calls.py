@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import planner_jax as pj
+from planner_jax.core.rules import named
 from planner_jax.policies.policy import Policy, policy
-from planner_jax.rules import named
 from planner_jax.task.block.plan import BlockPlan
 from planner_jax.task.block.replan import ReplanBlock
 from planner_jax.task.catch.decide import Best

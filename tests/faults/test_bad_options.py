@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from planner_jax.cli import main
+from planner_jax.cli.main import main
 from tests.faults.bad_options import ROWS
 
 

@@ -8,7 +8,7 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.benchmarks.poisoned_batches import compare, poisoned, poisons
-from planner_jax.rules import is_sound, named
+from planner_jax.core.rules import is_sound, named
 from planner_jax.task.catch.beam import MOST_SEARCHED
 
 TASKS = ("hit", "catch", "intercept", "block")
@@ -81,7 +81,7 @@ def test_orders_of_forty_targets_differ_and_of_too_many_are_refused():
 
 def test_groups_of_too_many_targets_are_refused():
     still = np.ones((9, 2), np.float32)
-    group = pj.intercept.group(pj.TurningPath(still, 0.0 * still, still[:, 0]))
+    group = pj.group.group(pj.TurningPath(still, 0.0 * still, still[:, 0]))
     with pytest.raises(ValueError, match="^targets must be at most 8, of which all orders"):
         pj.intercept.planner("group").decision.propose(group)
 

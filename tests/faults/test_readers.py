@@ -9,11 +9,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from planner_jax.sweep.parts import Parts
-from planner_jax.sweep.plain_json import read_object
+from planner_jax.runs.parts import Parts
+from planner_jax.runs.plain_json import read_object
+from planner_jax.runs.run_folder import RunFolder
+from planner_jax.runs.settings import SettingError
 from planner_jax.sweep.run import resume_sweep
-from planner_jax.sweep.run_folder import RunFolder
-from planner_jax.sweep.settings import SettingError
 from tests.faults.commands import is_one_line, run
 from tests.faults.runs import TARGETS, TASK, copied, rows_of, verdict
 

@@ -13,7 +13,7 @@ from tests.faults.runs import make_flights
 
 PREPARED = """
 import os, signal, sys, time
-from planner_jax import stopping
+from planner_jax.host import signals as stopping
 stopping.listen()
 """
 # What a command does then; `rest` is what it says of itself.

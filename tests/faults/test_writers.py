@@ -10,11 +10,11 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from planner_jax import whole_files
-from planner_jax.sweep.owner import LOCK, owned
+from planner_jax.host import files as whole_files
+from planner_jax.runs.owner import LOCK, owned
+from planner_jax.runs.run_folder import RunFolder
+from planner_jax.runs.settings import SettingError
 from planner_jax.sweep.run import resume_sweep, start_sweep
-from planner_jax.sweep.run_folder import RunFolder
-from planner_jax.sweep.settings import SettingError
 from tests.faults.commands import is_one_line, run
 from tests.faults.runs import SETTINGS, TASK, rows_of
 

@@ -3,8 +3,8 @@
 import numpy as np
 
 from planner_jax.perception.fit import Sight
-from planner_jax.sweep import columns as known
-from planner_jax.sweep.columns import LIST, VECTOR, Column, RefereedBatch, leaves_of
+from planner_jax.runs import columns as known
+from planner_jax.runs.columns import LIST, VECTOR, Column, RefereedBatch, leaves_of
 
 FRAME = "base of the robot, z up; times from the moment at which the ball is first seen"
 

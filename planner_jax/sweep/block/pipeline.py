@@ -9,14 +9,14 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.protocol import lane
-from planner_jax.sweep.timing import timed_plans
+from planner_jax.core.protocol import lane
+from planner_jax.runs.timing import timed_plans
+from planner_jax.studies.block.observation import eye
+from planner_jax.studies.block.receding import Decided, decide
 from planner_jax.task.block.case import BlockCase
+from planner_jax.task.block.contact_check import as_met, begun_late
 from planner_jax.task.block.end_poses import flight_of
-from planner_jax.task.block.eye import eye
-from planner_jax.task.block.met import as_met, begun_late
 from planner_jax.task.block.plan import BlockPlan
-from planner_jax.task.block.receding import Decided, decide
 
 
 @struct.dataclass

@@ -4,7 +4,7 @@ import dataclasses
 import math
 from typing import Any, ClassVar
 
-from planner_jax.sweep.settings import SweepSettings, option, require, require_one_of
+from planner_jax.runs.settings import SweepSettings, option, require, require_one_of
 
 REGIMES = ("R1", "R2", "R3")  # of `planner_jax.robot.arm`, which imports JAX
 

@@ -6,19 +6,19 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from planner_jax.baselines.block.library.adapt import AdaptBlock
+from planner_jax.baselines.block.library.file import LibraryFileError
+from planner_jax.baselines.block.library.planner import LibraryBlock, OtherLibrary
 from planner_jax.robot.arm_plan import ArmPlan
+from planner_jax.runs.columns import Column, RefereedBatch
+from planner_jax.runs.settings import SettingError, require
+from planner_jax.runs.summary import COUNTED, Tally
 from planner_jax.sweep.block.columns import COLUMNS, FRAME, SEEN_COLUMNS, TIMED_COLUMNS
 from planner_jax.sweep.block.pipeline import CountedPlanner, SeeingArms, SeenPlan, TimedPlan
 from planner_jax.sweep.block.settings import BlockSettings
-from planner_jax.sweep.columns import Column, RefereedBatch
 from planner_jax.sweep.row_plans import arm_plan
-from planner_jax.sweep.settings import SettingError, require
-from planner_jax.sweep.summary import COUNTED, Tally
 from planner_jax.sweep.sweep import Sweep
-from planner_jax.task.block.library.adapt import AdaptBlock
-from planner_jax.task.block.library.file import LibraryFileError
-from planner_jax.task.block.library.planner import LibraryBlock, OtherLibrary
-from planner_jax.task.block.online import OnlineBlock
+from planner_jax.task.block.planner import OnlineBlock
 
 _ROOM = 0.1  # [m], of a ball that may be met off the shield's middle
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import pyarrow as pa
 
-from planner_jax.sweep import columns as known
-from planner_jax.sweep.columns import LIST, Column, leaves_of, list_of
+from planner_jax.runs import columns as known
+from planner_jax.runs.columns import LIST, Column, leaves_of, list_of
 from planner_jax.sweep.quadrotor import MOTION, START, TRAJECTORY
 from planner_jax.task.catch.decide import optimal_time_ratio
 

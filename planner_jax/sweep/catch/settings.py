@@ -4,9 +4,9 @@ import dataclasses
 import math
 from typing import Any, ClassVar
 
-from planner_jax.registry import UnknownName, split_name
-from planner_jax.sweep.robots import checked_robot, robot_option
-from planner_jax.sweep.settings import (
+from planner_jax.core.efforts import EFFORTS
+from planner_jax.core.registry import UnknownName, split_name
+from planner_jax.runs.settings import (
     SettingError,
     SweepSettings,
     ending_option,
@@ -18,8 +18,8 @@ from planner_jax.sweep.settings import (
     require_one_of,
     require_scale,
 )
-from planner_jax.task.catch.card import DECISIONS, SUITES, TRAINED
-from planner_jax.task.efforts import EFFORTS
+from planner_jax.sweep.robots import checked_robot, robot_option
+from planner_jax.task.catch.spec import DECISIONS, SUITES, TRAINED
 
 NET_TESTS = ("plane", "ball")  # of `referee_catches`
 

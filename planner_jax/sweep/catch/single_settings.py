@@ -3,10 +3,10 @@
 import dataclasses
 from typing import ClassVar
 
-from planner_jax.registry import UnknownName, split_name
-from planner_jax.sweep.settings import SettingError, option, require
+from planner_jax.core.registry import UnknownName, split_name
+from planner_jax.runs.settings import SettingError, option, require
 from planner_jax.sweep.single_settings import SingleSettings
-from planner_jax.task.catch.card import DECISIONS, TRAINED
+from planner_jax.task.catch.spec import DECISIONS, TRAINED
 
 _MOST_BALLS = 6  # of which all orders are looked at
 

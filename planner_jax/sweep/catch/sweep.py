@@ -6,6 +6,8 @@ import numpy as np
 import pyarrow as pa
 
 from planner_jax.robot.quadrotor_plan import QuadrotorPlan
+from planner_jax.runs.summary import COUNTED, Tally
+from planner_jax.runs.table import RateTable, own_cells
 from planner_jax.sweep.catch.columns import COLUMNS, FRAME
 from planner_jax.sweep.catch.figures.flight import flight_figure
 from planner_jax.sweep.catch.figures.motion import motion_figure, plan_figure
@@ -15,10 +17,8 @@ from planner_jax.sweep.figures.motion import CAPTION as MOTION
 from planner_jax.sweep.quadrotor import ending_remark
 from planner_jax.sweep.robots import robot_remark
 from planner_jax.sweep.row_plans import quadrotor_plan
-from planner_jax.sweep.summary import COUNTED, Tally
 from planner_jax.sweep.sweep import RunFigure, Sweep, first_values
-from planner_jax.sweep.table import RateTable, own_cells
-from planner_jax.task.catch.card import SUITES
+from planner_jax.task.catch.spec import SUITES
 
 _SOLVED = ("CONVERGED", "FEASIBLE")
 _DECISIONS = {

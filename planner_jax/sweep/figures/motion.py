@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from planner_jax.sweep.figures import style
+from planner_jax.runs import style
 from planner_jax.sweep.report import RunRows
 from planner_jax.sweep.sampled_motion import (
     SampledMotion,

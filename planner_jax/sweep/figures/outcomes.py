@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from planner_jax.sweep.figures import style
+from planner_jax.runs import style
 
 
 def outcomes_figure(figure: Figure, run: Any) -> None:

@@ -3,8 +3,8 @@
 import numpy as np
 import pyarrow as pa
 
-from planner_jax.sweep import columns as known
-from planner_jax.sweep.columns import BOOL, COUNT, TEXT, VECTOR, Column, leaves_of, list_of
+from planner_jax.runs import columns as known
+from planner_jax.runs.columns import BOOL, COUNT, TEXT, VECTOR, Column, leaves_of, list_of
 from planner_jax.sweep.quadrotor import MOTION, START, TRAJECTORY
 from planner_jax.task.hit import court
 

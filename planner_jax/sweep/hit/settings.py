@@ -5,9 +5,9 @@ import math
 import os
 from typing import Any, ClassVar
 
-from planner_jax.digits import written_number
-from planner_jax.sweep.robots import checked_robot, robot_option
-from planner_jax.sweep.settings import (
+from planner_jax.core.digits import written_number
+from planner_jax.core.efforts import EFFORTS
+from planner_jax.runs.settings import (
     SettingError,
     SweepSettings,
     ending_option,
@@ -18,8 +18,8 @@ from planner_jax.sweep.settings import (
     require_ending,
     require_scale,
 )
-from planner_jax.task.efforts import EFFORTS
-from planner_jax.task.hit.card import START
+from planner_jax.sweep.robots import checked_robot, robot_option
+from planner_jax.task.hit.spec import START
 
 _FARTHEST = 1e6  # [m]
 

@@ -3,7 +3,7 @@
 import dataclasses
 from typing import ClassVar
 
-from planner_jax.sweep.settings import option
+from planner_jax.runs.settings import option
 from planner_jax.sweep.single_settings import SingleSettings
 
 

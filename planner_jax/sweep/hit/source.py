@@ -7,12 +7,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from planner_jax.rules import CaseError
+from planner_jax.core.rules import CaseError
+from planner_jax.runs.settings import SettingError, require_one_of
+from planner_jax.runs.source import Chunk, Source, filled_in
 from planner_jax.sweep.hit.settings import HitSettings
-from planner_jax.sweep.settings import SettingError, require_one_of
-from planner_jax.sweep.source import Chunk, Source, filled_in
-from planner_jax.task.hit.card import REAL_SCENARIOS, TASK
-from planner_jax.task.hit.serves import Serves, generate_serves, read_serves, to_cases
+from planner_jax.task.hit.spec import REAL_SCENARIOS, TASK
+from planner_jax.task.hit.suites import Serves, generate_serves, read_serves, to_cases
 from planner_jax.task.hit.validate import ServeError, check_cases
 
 

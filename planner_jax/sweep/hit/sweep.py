@@ -7,7 +7,9 @@ import numpy as np
 import pyarrow as pa
 
 from planner_jax.robot.quadrotor_plan import QuadrotorPlan
-from planner_jax.sweep.columns import Column
+from planner_jax.runs.columns import Column
+from planner_jax.runs.summary import COUNTED, Tally
+from planner_jax.runs.table import RateTable, own_cells
 from planner_jax.sweep.figures.motion import CAPTION as MOTION
 from planner_jax.sweep.hit.columns import COLUMNS, FRAME, SINGLE_COLUMNS, published_column
 from planner_jax.sweep.hit.figures.court import court_figure
@@ -19,9 +21,7 @@ from planner_jax.sweep.hit.source import ServeSource, open_source
 from planner_jax.sweep.quadrotor import ending_remark
 from planner_jax.sweep.robots import robot_remark
 from planner_jax.sweep.row_plans import quadrotor_plan
-from planner_jax.sweep.summary import COUNTED, Tally
 from planner_jax.sweep.sweep import RunFigure, Sweep, first_values
-from planner_jax.sweep.table import RateTable, own_cells
 from planner_jax.task.hit import court
 
 

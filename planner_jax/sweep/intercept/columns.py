@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 import pyarrow as pa
 
-from planner_jax.sweep import columns as known
-from planner_jax.sweep.columns import LIST, VECTOR, Column, RefereedBatch, leaves_of, list_of
+from planner_jax.runs import columns as known
+from planner_jax.runs.columns import LIST, VECTOR, Column, RefereedBatch, leaves_of, list_of
 
 FRAME = "world, in the plane, headings counter-clockwise from x; times from the car's start"
 WAY_POINTS = 65  # of a target's way

@@ -3,7 +3,7 @@
 import dataclasses
 from typing import ClassVar
 
-from planner_jax.sweep.settings import SweepSettings
+from planner_jax.runs.settings import SweepSettings
 
 
 @dataclasses.dataclass(frozen=True)

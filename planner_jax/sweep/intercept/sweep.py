@@ -6,6 +6,8 @@ import numpy as np
 import pyarrow as pa
 
 from planner_jax.robot.car import CarPlan
+from planner_jax.runs.settings import require
+from planner_jax.runs.summary import COUNTED, Tally
 from planner_jax.sweep.figures.motion import CAPTION as MOTION
 from planner_jax.sweep.figures.outcomes import outcomes_figure
 from planner_jax.sweep.intercept.columns import COLUMNS, FRAME
@@ -15,8 +17,6 @@ from planner_jax.sweep.intercept.figures.reach import reach_figure
 from planner_jax.sweep.intercept.figures.station_time import station_time_figure
 from planner_jax.sweep.intercept.settings import InterceptSettings
 from planner_jax.sweep.row_plans import car_plan
-from planner_jax.sweep.settings import require
-from planner_jax.sweep.summary import COUNTED, Tally
 from planner_jax.sweep.sweep import RunFigure, Sweep, first_values
 from planner_jax.task.intercept.case import InterceptCase
 

@@ -9,11 +9,11 @@ from flax import struct
 from jax import Array
 
 from planner_jax.ball.flight import BallState
-from planner_jax.checks import floating, require_kind, require_switch, shape_of
-from planner_jax.registry import require_name
+from planner_jax.core.checks import floating, require_kind, require_switch, shape_of
+from planner_jax.core.registry import require_name
+from planner_jax.core.rules import Table, require_sound
 from planner_jax.robot.arm import REGIMES, Arm, ArmLimits
 from planner_jax.robot.arm_mjcf import irb1600
-from planner_jax.rules import Table, require_sound
 from planner_jax.task.arguments import array_of, batch_of
 from planner_jax.task.block.rules import RULES
 from planner_jax.task.block.scene import Scene, paper_scene

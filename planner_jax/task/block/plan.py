@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array, lax
 
-from planner_jax.protocol import Status, is_solved
+from planner_jax.core.protocol import Status, is_solved
 from planner_jax.robot.arm_plan import ArmPlan
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import least_clearances

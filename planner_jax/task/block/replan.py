@@ -14,18 +14,18 @@ import numpy as np
 from jax import Array
 
 from planner_jax.ball.flight import BallState, drag_free_flight
-from planner_jax.checks import require_beginning, require_kind
+from planner_jax.core.checks import require_beginning, require_kind
+from planner_jax.core.protocol import Attempt, Drive, is_unsolved, lane
 from planner_jax.optimise.levenberg import LevenbergConfig
-from planner_jax.planning.better import better_of, merged
 from planner_jax.planning.one_by_one import OneByOne
 from planner_jax.planning.replan import Replanning, given_or_own, moment_of
-from planner_jax.protocol import Attempt, Drive, is_unsolved, lane
+from planner_jax.planning.select import better_of, merged
 from planner_jax.robot.arm import shield_pose
 from planner_jax.task.block.case import BlockCase
+from planner_jax.task.block.contact_check import braked
 from planner_jax.task.block.end_poses import flight_of
-from planner_jax.task.block.met import braked
-from planner_jax.task.block.online import OnlineBlock
 from planner_jax.task.block.plan import BlockPlan
+from planner_jax.task.block.planner import OnlineBlock
 from planner_jax.trajectory.polynomial import evaluate
 
 _SHORTEST = 0.02  # [s], of a guess from a motion that has all but ended

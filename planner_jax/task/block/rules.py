@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from planner_jax.rules import NOT_NEGATIVE, POSITIVE, Field, Table, below, within
+from planner_jax.core.rules import NOT_NEGATIVE, POSITIVE, Field, Table, below, within
 
 RULES: Table = (
     Field("ball.pos", (3,)),

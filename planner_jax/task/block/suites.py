@@ -1,7 +1,7 @@
 """Named, seeded suites of thrown balls.
 
 Paper 004 throws from 6 to 12 m and says that its 200 projectiles cross both boxes (Section V-A); it
-gives no other range. Those here and in `planner_jax.task.block.card` are this library's, and part
+gives no other range. Those here and in `planner_jax.task.block.spec` are this library's, and part
 of each suite's name: a change of a range is another suite. All draws are uniform.
 
 | what | drawn from |
@@ -20,9 +20,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from planner_jax.registry import require_name
+from planner_jax.core.registry import require_name
 from planner_jax.task.arguments import require_draw
-from planner_jax.task.block.card import SUITES, Suite
 from planner_jax.task.block.case import BlockCase, case
 from planner_jax.task.block.scene import (
     INNER_HALF,
@@ -33,6 +32,7 @@ from planner_jax.task.block.scene import (
     POLE_RADIUS,
     paper_scene,
 )
+from planner_jax.task.block.spec import SUITES, Suite
 
 GRAVITY = 9.81  # [m/s^2]
 BALL_RADIUS = 0.05  # [m]

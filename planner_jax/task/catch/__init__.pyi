@@ -1,3 +1,5 @@
+from .api import judge as judge
+from .api import planner as planner
 from .case import CatchCase as CatchCase
 from .case import CatchChoice as CatchChoice
 from .case import Net as Net
@@ -7,9 +9,7 @@ from .decide import Given as Given
 from .decide import Greedy as Greedy
 from .decide import closest_approach as closest_approach
 from .decide import optimal_time_ratio as optimal_time_ratio
-from .exact import ExactCatch as ExactCatch
 from .plan import CatchPlan as CatchPlan
+from .planner import ExactCatch as ExactCatch
 from .replan import ReplanCatch as ReplanCatch
 from .suites import draw as draw
-from .words import judge as judge
-from .words import planner as planner

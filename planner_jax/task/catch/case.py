@@ -10,12 +10,19 @@ from flax import struct
 from jax import Array
 
 from planner_jax.ball.target import TargetPath
-from planner_jax.checks import floating, numbers_of, require_path, require_switch, shape_of, told
+from planner_jax.core.checks import (
+    floating,
+    numbers_of,
+    require_path,
+    require_switch,
+    shape_of,
+    told,
+)
+from planner_jax.core.rules import Table, require_sound
 from planner_jax.cost.extras import Extra, for_batch
 from planner_jax.robot.quadrotor import QuadrotorLimits
 from planner_jax.robot.quadrotor_model import NET, QuadrotorModel
 from planner_jax.robot.quadrotor_models import PAPER_CATCHER
-from planner_jax.rules import Table, require_sound
 from planner_jax.task.arguments import array_of
 from planner_jax.task.catch.rules import RULES
 from planner_jax.task.flight import ARGUMENTS, limits_of, require_start, require_tool

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from planner_jax.protocol import Status, is_unsolved, require_settings
+from planner_jax.core.protocol import Status, is_unsolved, require_settings
 from planner_jax.task.catch.beam import beam
 from planner_jax.task.catch.case import CatchCase, CatchChoice
 from planner_jax.task.catch.estimate import (

@@ -14,7 +14,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.checks import require_path
+from planner_jax.core.checks import require_path
 from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.planner import OptimisedPlanner
@@ -23,8 +23,8 @@ from planner_jax.planning.replan import Replanning, given_or_own, moment_of
 from planner_jax.robot.quadrotor import body_z
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.chain import CatchContext, targets_at
-from planner_jax.task.catch.exact import ExactCatch
 from planner_jax.task.catch.plan import CatchPlan
+from planner_jax.task.catch.planner import ExactCatch
 from planner_jax.trajectory.polynomial import (
     PiecewisePolynomial,
     shift_basis,

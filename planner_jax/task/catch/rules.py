@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from planner_jax.rules import (
+from planner_jax.core.rules import (
     PERMUTATION,
     POSITIVE,
     Field,

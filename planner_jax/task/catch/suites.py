@@ -78,15 +78,15 @@ from jax import Array
 
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath, HarmonicPath
-from planner_jax.checks import floating, require_scalar
-from planner_jax.registry import suite_named
+from planner_jax.core.checks import floating, require_scalar
+from planner_jax.core.registry import suite_named
+from planner_jax.core.scales import scale_problem
 from planner_jax.robot.quadrotor_model import QuadrotorModel
 from planner_jax.robot.quadrotor_models import PAPER_CATCHER
 from planner_jax.task.arguments import require_draw
-from planner_jax.task.catch.card import SUITES, TASK
 from planner_jax.task.catch.case import GRAVITY, CatchCase, case
+from planner_jax.task.catch.spec import SUITES, TASK
 from planner_jax.task.flight import require_own_robot
-from planner_jax.task.scales import scale_problem
 
 LAUNCH = (4.0, 0.0, 0.8)  # [m], of every throw
 CATCH_HEIGHT = 0.45  # [m], least height of a thrown ball at its catch

@@ -9,16 +9,16 @@ from flax import struct
 from jax import Array
 
 from planner_jax.ball.flight import BallState
-from planner_jax.checks import floating, numbers_of
+from planner_jax.core.checks import floating, numbers_of
+from planner_jax.core.rules import Table, require_rule, require_sound
 from planner_jax.cost.extras import Extra, for_batch
 from planner_jax.robot.quadrotor import QuadrotorLimits
 from planner_jax.robot.quadrotor_model import RACKET, QuadrotorModel
 from planner_jax.robot.quadrotor_models import PAPER_HITTER
-from planner_jax.rules import Table, require_rule, require_sound
 from planner_jax.task.arguments import array_of, batch_of
 from planner_jax.task.flight import ARGUMENTS, limits_of, require_start, require_tool
-from planner_jax.task.hit.card import START
 from planner_jax.task.hit.rules import RULES
+from planner_jax.task.hit.spec import START
 
 # Fit to the published landing points; the residual is 1 cm.
 DRAG = 0.0616  # K_D [1/m]

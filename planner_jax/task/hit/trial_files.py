@@ -8,8 +8,8 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from planner_jax.digits import written_number
-from planner_jax.plain_files import open_plain
+from planner_jax.core.digits import written_number
+from planner_jax.host.files import open_plain
 from planner_jax.task.hit import court
 from planner_jax.task.hit.case import DRAG, GRAVITY
 from planner_jax.task.hit.validate import ServeError, landing
@@ -38,7 +38,7 @@ def read_trials(folder: str | os.PathLike) -> list[Trial]:
     """Every serve of a folder of trial files  S_L_T_M.csv, line by line of all scenarios.
 
     Raises:
-        ServeError: as `planner_jax.task.hit.serves.read_serves` says.
+        ServeError: as `planner_jax.task.hit.suites.read_serves` says.
     """
     problems: list[str] = []
     trials: list[Trial] = []

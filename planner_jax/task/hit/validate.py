@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from planner_jax.rules import require_rule, require_sound
+from planner_jax.core.rules import require_rule, require_sound
 from planner_jax.task.hit.case import HitCase
 
 _FLIGHT_STEPS = 16  # puts the landing point of a serve within 0.1 mm

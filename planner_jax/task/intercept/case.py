@@ -9,11 +9,11 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.checks import floating, require_path, shape_of
+from planner_jax.core.checks import floating, require_path, shape_of
+from planner_jax.core.rules import Table, require_sound
 from planner_jax.plane.obstacles import Obstacles, obstacles
 from planner_jax.plane.target import PlanePath
 from planner_jax.robot.car import CarBody, CarLimits
-from planner_jax.rules import Table, require_sound
 from planner_jax.task.arguments import array_of, batch_of
 from planner_jax.task.intercept.rules import RULES
 

@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from planner_jax.task.intercept.card import Suite
+from planner_jax.task.intercept.spec import Suite
 
 SIZE = 8.0  # [m], side of the map
 TOP_SPEED = 1.5  # [m/s]

@@ -13,18 +13,18 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from planner_jax.checks import require_beginning, require_kind, require_path
+from planner_jax.core.checks import require_beginning, require_kind, require_path
+from planner_jax.core.protocol import Attempt
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.plane.obstacles import Obstacles
 from planner_jax.plane.target import PlanePath
 from planner_jax.planning.one_by_one import OneByOne
 from planner_jax.planning.replan import Replanning, given_or_own, moment_of
-from planner_jax.protocol import Attempt
 from planner_jax.robot.car import pose_at
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.plan import InterceptPlan
+from planner_jax.task.intercept.planner import SpacetimeIntercept
 from planner_jax.task.intercept.searches import Search
-from planner_jax.task.intercept.spacetime import SpacetimeIntercept
 
 
 @dataclasses.dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from planner_jax.rules import (
+from planner_jax.core.rules import (
     NOT_NEGATIVE,
     PERMUTATION,
     POSITIVE,

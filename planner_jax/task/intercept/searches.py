@@ -2,9 +2,9 @@
 
 import dataclasses
 
+from planner_jax.core.protocol import Attempt
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.plane import reach
-from planner_jax.protocol import Attempt
 
 # A way takes about as much memory as so many starts of planners with few unknowns.
 _ROOM = 8

@@ -1,7 +1,7 @@
 """Named, seeded suites of interceptions on a map of 8 m x 8 m, and what is seen of their targets.
 
 Paper 003 shows one map of its own (Section V) and gives no ranges. Those here and in
-`planner_jax.task.intercept.card` are this library's, and part of each suite's name: a change of a
+`planner_jax.task.intercept.spec` are this library's, and part of each suite's name: a change of a
 range is another suite. All draws are uniform; the car is that of `case`.
 
 | what | drawn from |
@@ -22,7 +22,7 @@ alone; walls less than 2.5 m from the map's edge have none, so that the start ha
 
 A rush is what `hard` draws, with a tag of its own, and its target is to be met earlier than after
 the 10 s that the rest is drawn for: 0.5 s after the first layer of the reach set of
-`planner_jax.task.intercept.arrival`, worked out in double precision. So its time differs from case
+`task.intercept.reach_time`, worked out in double precision. So its time differs from case
 to case. A target that is not reached within 10 s is drawn anew, as is one at which something is
 wrong at the new time.
 
@@ -40,16 +40,16 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from planner_jax.checks import floating
+from planner_jax.core.checks import floating
+from planner_jax.core.protocol import lane
+from planner_jax.core.registry import require_name
 from planner_jax.plane.obstacles import Obstacles
 from planner_jax.plane.target import PlanePath, TurningPath
-from planner_jax.protocol import lane
-from planner_jax.registry import require_name
 from planner_jax.task.arguments import require_draw
-from planner_jax.task.intercept.arrival import earliest_arrival
-from planner_jax.task.intercept.card import SUITES, Suite
 from planner_jax.task.intercept.case import InterceptCase, case
+from planner_jax.task.intercept.reach_time import earliest_arrival
 from planner_jax.task.intercept.rejection import CAUSES, SIZE, TOP_SPEED, first_cause, moved
+from planner_jax.task.intercept.spec import SUITES, Suite
 
 START_X, START_SPEED = 0.8, 0.5  # [m], [m/s]
 EDGE_ROOM = 0.3  # [m], from the meeting point to the edge of the map

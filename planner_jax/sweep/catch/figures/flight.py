@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from planner_jax.runs import style
 from planner_jax.sweep.catch.targets import SampledCatch, sampled_catch
-from planner_jax.sweep.figures import style
 from planner_jax.sweep.report import RunRows
 from planner_jax.sweep.sampled_motion import sample_motion
 

@@ -6,8 +6,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from planner_jax.runs import style
 from planner_jax.sweep.catch.targets import due_distance, sampled_catch
-from planner_jax.sweep.figures import style
 from planner_jax.sweep.figures.motion import DASHED, Drawn, quadrotor_figure
 from planner_jax.sweep.report import RunRows
 

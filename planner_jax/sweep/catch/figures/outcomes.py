@@ -6,10 +6,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from planner_jax.sweep.figures import style
+from planner_jax.runs import style
 from planner_jax.sweep.figures.outcomes import draw_outcomes
 from planner_jax.sweep.report import RunRows
-from planner_jax.task.catch.card import SUITES
+from planner_jax.task.catch.spec import SUITES
 
 _PLACES = ("first", "second", "third", "fourth", "fifth", "sixth")
 _COLOURS = (style.BLUE, style.ORANGE, style.GREEN, style.PURPLE, style.SKY, style.GREY)

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 
-from planner_jax.sweep.figures import style
+from planner_jax.runs import style
 from planner_jax.sweep.report import RunRows
 from planner_jax.sweep.sampled_motion import sample_motion
 from planner_jax.task.hit import court

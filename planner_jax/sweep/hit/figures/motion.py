@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from planner_jax.sweep.figures import style
+from planner_jax.runs import style
 from planner_jax.sweep.figures.motion import DASHED, FORBIDDEN, Drawn, quadrotor_figure
 from planner_jax.sweep.hit.figures.court import ball_path
 from planner_jax.sweep.report import RunRows

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from planner_jax.sweep.figures import style
+from planner_jax.runs import style
 from planner_jax.sweep.hit.figures.court import draw_case
 from planner_jax.sweep.report import RunRows
 

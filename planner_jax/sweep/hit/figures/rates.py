@@ -6,9 +6,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from planner_jax.sweep.figures import style
+from planner_jax.runs import style
+from planner_jax.runs.summary import wilson_interval
 from planner_jax.sweep.report import RunRows
-from planner_jax.sweep.summary import wilson_interval
 from planner_jax.task.hit import court
 
 _WIDTH = 0.26

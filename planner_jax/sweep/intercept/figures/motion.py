@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from planner_jax.sweep.figures import style
+from planner_jax.runs import style
 from planner_jax.sweep.figures.motion import draw_upper_limit, look_of, write_verdicts
 from planner_jax.sweep.intercept.drive import SampledDrive, sampled_drive
 from planner_jax.sweep.report import RunRows

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from planner_jax.sweep.figures import style
+from planner_jax.runs import style
 from planner_jax.sweep.intercept.drive import SampledDrive, sampled_drive
 from planner_jax.sweep.intercept.figures.scene import (
     colours_of_time,

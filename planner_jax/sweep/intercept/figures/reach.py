@@ -11,12 +11,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from planner_jax.sweep.figures import style
+from planner_jax.runs import style
 from planner_jax.sweep.intercept.drive import case_of, sampled_drive
 from planner_jax.sweep.intercept.figures.scene import draw_map, draw_polygons
 from planner_jax.sweep.report import RunRows
 from planner_jax.task.intercept.case import InterceptCase
-from planner_jax.task.intercept.spacetime import SpacetimeIntercept
+from planner_jax.task.intercept.planner import SpacetimeIntercept
 
 _SLICES = 6
 _SAMPLES = 241

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import ListedColormap
 
-from planner_jax.sweep.figures import style
+from planner_jax.runs import style
 
 # Viridis without its light end, which paper does not show.
 _STOPS = ("#440154", "#443983", "#31688E", "#21918C", "#35B779", "#90D743")

@@ -13,17 +13,17 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from planner_jax.protocol import is_solved
+from planner_jax.baselines.intercept.path import path_of_drive
+from planner_jax.baselines.intercept.path_then_speed import SpeedStep, ramp_and_cruise
+from planner_jax.baselines.intercept.projection import overlap
+from planner_jax.baselines.intercept.speed import SPEED_PLANNERS, plan_speed
+from planner_jax.core.protocol import is_solved
 from planner_jax.robot.car import knots_at
-from planner_jax.sweep.figures import style
+from planner_jax.runs import style
 from planner_jax.sweep.figures.motion import DASHED
 from planner_jax.sweep.intercept.drive import case_of
 from planner_jax.sweep.report import RunRows
 from planner_jax.task.intercept.case import InterceptCase
-from planner_jax.task.intercept.path import path_of_drive
-from planner_jax.task.intercept.path_then_speed import SpeedStep, ramp_and_cruise
-from planner_jax.task.intercept.projection import overlap
-from planner_jax.task.intercept.speed import SPEED_PLANNERS, plan_speed
 
 _POINTS, _SAMPLES = 129, 401  # of the way as planners of paths have it, and of a curve
 _BLOCKED = "#E9C46A"

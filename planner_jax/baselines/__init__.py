@@ -1,0 +1,1 @@
+"""Published methods that the planners are compared with, loaded by name only."""

@@ -1,0 +1,323 @@
+"""The planner `insat` of paper 004: a search over steps of the joints, interleaved with splines.
+
+Algorithm 2 of the paper. The search is that of `epase`. A state that it comes to is lifted: the
+spline of each of its ancestors goes on straight to the state, control points are fitted to that,
+and the splines of all ancestors are optimised at once; the one that costs least of those that touch
+nothing is the state's. The goal is tried from every state, first of all from the start.
+
+A spline is clamped, of degree 3 (order 4), with 7 control points: the paper's code has 4 to 7, and
+the fewer there are, the longer a motion has to take to hold bounds at the control points of its
+derivatives, with 4 from rest to rest twice as long as it need. What is minimised is (4a),
+
+    w_1 t_f + w_2 int_0^{t_f} |q'(t)|_2 dt,    w_1 = 1, w_2 = 0.1,
+
+over the control points and t_f, with (4d) and bounds on accelerations held by the control points of
+the derivatives, the arm at rest at the start, and at the goal if the case asks for that. For given
+control points the least t_f that keeps these bounds is a maximum in closed form, so that they hold
+at every iterate; for the gradient it is smoothed. Obstacles (4c) are no part of it: they are looked
+at afterwards, at every iterate, and the last one that touches nothing is kept.
+
+What the code behind the paper has beyond it is left out: bounds on jerk, to which it gives those of
+accelerations, and the pull at the last control points. States are lifted when they are expanded,
+and not when they are found, as its edges are. Everything is done by one thread, where PINSAT has
+many; compiled programs may use more.
+"""
+
+import dataclasses
+import functools
+import heapq
+import itertools
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array, lax
+
+from planner_jax.baselines.block.b_spline import b_spline, basis, hodograph
+from planner_jax.baselines.block.epase import STEPS, cell_of
+from planner_jax.baselines.block.free_space import FreeSpace
+from planner_jax.baselines.block.pose_by_pose import Clock, Goal, HostMotion, PoseByPose
+from planner_jax.optimise import lbfgs
+from planner_jax.task.block.case import BlockCase
+from planner_jax.task.block.plan import BlockPlan
+
+DEGREE = 3
+CONTROL_POINTS = 7  # of a spline
+ANCESTORS = 8  # that are looked at at once: the first, and the nearest
+TIME_WEIGHT, LENGTH_WEIGHT = 1.0, 0.1  # [1/s], [1/rad]
+LEAST_TIME = 0.1  # [s], of a spline; the greatest is the time there is
+_SHARES = np.linspace(0.0, 1.0, 33)  # of a spline's duration, where it is sampled
+_OUTSIDE = 100.0  # [1/rad^2], weight of control points beyond the position limits
+_NORM = 16  # of the smoothed maximum
+_UNIT = 0.3  # [rad], of the optimiser's variables
+
+
+@struct.dataclass
+class Bounds:
+    """What a spline has to keep."""
+
+    lower: Array  # (6,) [rad]
+    upper: Array  # (6,) [rad]
+    velocity: Array  # (6,) [rad/s]
+    acceleration: Array  # (6,) [rad/s^2]
+
+
+@struct.dataclass
+class Splines:
+    """Iterates of the optimisation, K of each of A splines with m control points."""
+
+    points: Array  # (A, K, m, 6) [rad]
+    time: Array  # (A, K) [s], t_f
+    length: Array  # (A, K) [rad], of the way of the joints
+    angles: Array  # (A, K, S, 6) [rad], samples
+
+
+@dataclasses.dataclass
+class State:
+    """A state of the search; its spline is there once it is lifted."""
+
+    angles: np.ndarray  # (6,) [rad]
+    length: float  # [rad], of the way there
+    parent: "State | None" = None
+    way: np.ndarray | None = None  # (S, 6) [rad], samples of its spline from the start
+
+    def ways(self) -> list[np.ndarray]:
+        """Ways of the lifted states before this one, the nearest first and the start last."""
+        found, state = [], self.parent
+        while state is not None:
+            if state.way is not None:
+                found.append(state.way)
+            state = state.parent
+        return found
+
+
+@dataclasses.dataclass(frozen=True)
+class InsatBlock(PoseByPose):
+    """Tries end poses one after another; motions end at rest only if the case asks for that."""
+
+    pieces: ClassVar[int] = CONTROL_POINTS - DEGREE + 1  # the first one to wait
+    degree: ClassVar[int] = DEGREE
+    longest: float = 0.05  # [s]; past this few searches end, while other poses are easy
+    weight: float = 10.0  # of the heuristic
+    solver: lbfgs.LbfgsConfig = lbfgs.LbfgsConfig(max_steps=12)
+
+    def plan_of(self, case: BlockCase) -> BlockPlan:
+        """The plan of one case with NumPy leaves."""
+        _compile(np.asarray(case.angles).dtype, self.solver)
+        return super().plan_of(case)
+
+    def motion_to(
+        self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
+    ) -> HostMotion | None:
+        """The first spline that is found; where it is to end in motion, the arm waits at first."""
+        start = np.asarray(case.angles, float)
+        first = State(start, 0.0, way=start[None])
+        costs, closed, number = {cell_of(start): 0.0}, set(), itertools.count()
+        open_states = [(0.0, next(number), first)]
+        while open_states and left() > 0.0:
+            state = heapq.heappop(open_states)[2]
+            cell = cell_of(state.angles)
+            if cell in closed:
+                continue
+            closed.add(cell)
+            if state.way is None and not self.lift(case, free, goal, state):
+                continue
+            end = State(goal.angles, np.inf, state)
+            found = self.best_spline(case, free, goal, end, bool(case.ends_at_rest))
+            if found is not None:
+                return _motion(case, goal, *found[:2])
+            there = state.angles + STEPS
+            cost = state.length + np.linalg.norm(STEPS, axis=1)
+            cells = [cell_of(each) for each in there]
+            news = [
+                k
+                for k, cell in enumerate(cells)
+                if cell not in closed and cost[k] < costs.get(cell, np.inf)
+            ]
+            if not news:
+                continue
+            for k in np.array(news)[free.are_edges_free(state.angles, there[news])]:
+                costs[cells[k]] = cost[k]
+                ahead = np.linalg.norm(there[k] - goal.angles)
+                child = State(there[k], cost[k], state)
+                heapq.heappush(open_states, (cost[k] + self.weight * ahead, next(number), child))
+        return None
+
+    def lift(self, case: BlockCase, free: FreeSpace, goal: Goal, state: State) -> bool:
+        """Give a state its spline, if there is one."""
+        found = self.best_spline(case, free, goal, state, rests=False)
+        if found is None:
+            return False
+        _, _, state.length, state.way = found
+        return True
+
+    def best_spline(
+        self, case: BlockCase, free: FreeSpace, goal: Goal, state: State, rests: bool
+    ) -> tuple[np.ndarray, float, float, np.ndarray] | None:
+        """The cheapest spline to a state from any of its ancestors that is free and in time.
+
+        Returns:
+            Its control points (m, 6), duration, length and samples (S, 6), or None.
+        """
+        before, dtype = state.ways(), case.angles.dtype
+        before = before[: ANCESTORS - 1] + before[ANCESTORS - 1 :][-1:]
+        guesses = np.stack([_fitted(way, state.angles, rests) for way in before])
+        filled = np.concatenate([guesses, np.repeat(guesses[:1], ANCESTORS - len(before), axis=0)])
+        splines = jax.tree.map(
+            lambda leaf: np.asarray(leaf)[: len(before)],
+            _optimised(
+                case.angles,
+                state.angles.astype(dtype),
+                filled.astype(dtype),
+                rests,
+                _bounds(case),
+                self.solver,
+            ),
+        )
+        good = splines.time <= goal.available
+        # Every eighth sample first: that is where most iterates fail.
+        is_first = np.arange(len(_SHARES)) % 8 == 0
+        for some in (is_first, ~is_first):
+            if good.any():
+                samples = splines.angles[good][:, some]
+                good[good] = free.is_free(samples.reshape(-1, 6)).reshape(samples.shape[:2]).all(1)
+        last = good.shape[1] - 1 - np.argmax(good[:, ::-1], axis=1)
+        each = np.arange(len(before))
+        cost = TIME_WEIGHT * splines.time + LENGTH_WEIGHT * splines.length
+        cost = np.where(good[each, last], cost[each, last], np.inf)
+        for k in np.argsort(cost)[: np.isfinite(cost).sum()]:
+            place = k, last[k]
+            points, time = splines.points[place], float(splines.time[place])
+            if free.is_motion_free(*_pieces(points, time)):
+                return points, time, float(splines.length[place]), splines.angles[place]
+        return None
+
+
+def _bounds(case: BlockCase) -> Bounds:
+    return Bounds(
+        lower=case.arm.lower,
+        upper=case.arm.upper,
+        velocity=case.limits.velocity,
+        acceleration=case.limits.acceleration,
+    )
+
+
+@functools.cache
+def _compile(dtype: Any, config: lbfgs.LbfgsConfig) -> None:
+    """Have the programs compiled, which must not count as time of a search."""
+    joints = np.zeros(6, dtype)
+    guesses: Any = np.zeros((ANCESTORS, CONTROL_POINTS, 6), dtype)
+    bounds: Any = Bounds(joints, joints, joints + 1, joints + 1)  # type: ignore[arg-type]
+    _optimised(joints, joints, guesses, False, bounds, config)  # type: ignore[arg-type]
+    _pieces(guesses[0], 1.0)
+
+
+def _fitted(way: np.ndarray, end: np.ndarray, rests: bool) -> np.ndarray:
+    """Control points (m, 6) of a spline along a way (N, 6), and straight on to an end (6,)."""
+    straight = way[-1] + _SHARES[1:, None] * (end - way[-1])
+    curve = np.concatenate([way, straight])
+    lengths = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1)))
+    places = _SHARES * lengths[-1]
+    wanted = np.stack([np.interp(places, lengths, joint) for joint in curve.T], axis=1)
+    points = np.stack([way[0]] * 2 + [end] * (CONTROL_POINTS - 2))
+    free = slice(2, CONTROL_POINTS - (2 if rests else 1))
+    of_points, of_free = _fit(free.stop)
+    points[free] += of_free @ (wanted - of_points @ points)
+    return points
+
+
+@functools.cache
+def _fit(stop: int) -> tuple[np.ndarray, np.ndarray]:
+    """The basis (S, m), and least squares by its columns from 2 to `stop`."""
+    of_points = basis(DEGREE, CONTROL_POINTS, _SHARES)
+    return of_points, np.linalg.pinv(of_points[:, 2:stop])
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def _optimised(
+    start: Array,
+    end: Array,
+    guesses: Array,
+    rests: Array,
+    bounds: Bounds,
+    config: lbfgs.LbfgsConfig,
+) -> Splines:
+    """The iterates of splines, the first of which are guesses.
+
+    Args:
+        start: (6,) [rad].
+        end: (6,) [rad].
+        guesses: (A, m, 6) [rad], control points.
+        rests: () bool, whether the motion ends at rest.
+        bounds: of the joints.
+        config: of the optimiser.
+    """
+    num, dtype = guesses.shape[1], guesses.dtype
+    first, second = (jnp.asarray(hodograph(DEGREE, k, num), dtype) for k in (1, 2))
+    of_points = jnp.asarray(basis(DEGREE, num, _SHARES), dtype)
+
+    def product(a: Array, b: Array) -> Array:
+        return jnp.matmul(a, b, precision=lax.Precision.HIGHEST)
+
+    def points_of(x: Array) -> Array:
+        moved = _UNIT * x.reshape(num - 3, 6)
+        before = jnp.where(rests, end, moved[-1])
+        return jnp.concatenate([start[None], start[None], moved[:-1], before[None], end[None]])
+
+    def shares_of(points: Array) -> Array:
+        """Squares of the durations that bounds ask for."""
+        rates = (product(first, points) / bounds.velocity) ** 2
+        rises = jnp.abs(product(second, points)) / bounds.acceleration
+        return jnp.maximum(jnp.concatenate([rates, rises]), LEAST_TIME**2)
+
+    def length_of(points: Array) -> tuple[Array, Array]:
+        angles = product(of_points, points)
+        steps = jnp.sum(jnp.diff(angles, axis=0) ** 2, axis=1)
+        return angles, jnp.sum(jnp.sqrt(jnp.maximum(steps, 1e-10)))
+
+    def objective(x: Array) -> lbfgs.Evaluation:
+        points = points_of(x)
+        squares = shares_of(points)
+        most = lax.stop_gradient(jnp.max(squares))
+        total = jnp.sum((squares / most) ** (_NORM // 2))
+        time = jnp.sqrt(most) * total ** (1.0 / _NORM)
+        beyond = jnp.maximum(jnp.maximum(points - bounds.upper, bounds.lower - points), 0.0)
+        cost = TIME_WEIGHT * time + LENGTH_WEIGHT * length_of(points)[1]
+        return lbfgs.Evaluation(cost + _OUTSIDE * jnp.sum(beyond**2), jnp.zeros((), dtype))
+
+    def of_one(guess: Array) -> Splines:
+        x = (guess[2:-1] / _UNIT).reshape(-1)
+
+        def next_one(state: lbfgs.LbfgsState, _: None) -> tuple[lbfgs.LbfgsState, Array]:
+            state = lbfgs.step(objective, state, config)
+            return state, state.point
+
+        _, later = lax.scan(next_one, lbfgs.init(x, config), length=config.max_steps)
+        points = jax.vmap(points_of)(jnp.concatenate([x[None], later]))
+        angles, length = jax.vmap(length_of)(points)
+        time = jax.vmap(lambda points: jnp.sqrt(jnp.max(shares_of(points))))(points)
+        return Splines(points=points, time=time, length=length, angles=angles)
+
+    return jax.vmap(of_one)(guesses)
+
+
+_of_points = jax.jit(functools.partial(b_spline, DEGREE))
+
+
+def _pieces(points: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
+    """Coefficients (m - 3, 4, 6) and durations (m - 3,) of a spline."""
+    spline = _of_points(points, time)
+    return np.asarray(spline.coeffs, float), np.asarray(spline.durations, float)
+
+
+def _motion(case: BlockCase, goal: Goal, points: np.ndarray, time: float) -> HostMotion:
+    """The motion along a spline; one that does not end at rest begins as late as it may."""
+    coeffs, durations = _pieces(points, time)
+    if not case.ends_at_rest:
+        wait = np.zeros((1, DEGREE + 1, 6))
+        wait[0, 0] = case.angles
+        coeffs = np.concatenate([wait, coeffs])
+        durations = np.append(goal.available - time, durations)
+    return HostMotion(coeffs, durations, time)

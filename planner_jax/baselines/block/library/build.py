@@ -1,0 +1,365 @@
+"""Libraries built, and repaired where an obstacle has moved."""
+
+import dataclasses
+import functools
+import json
+import os
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from tqdm import tqdm
+
+from planner_jax.baselines.block.library.cells import Layout, Tunnels, tunnels
+from planner_jax.baselines.block.library.file import BUILD_VERSION, save_library
+from planner_jax.baselines.block.library.pairs import BentPair, PairCase, PairPlanner, StraightPair
+from planner_jax.baselines.block.library.table import (
+    Library,
+    Row,
+    Setting,
+    fingerprint,
+    library_of,
+    moved,
+    packed,
+    pieces_of,
+    unpacked,
+)
+from planner_jax.core.protocol import solved
+from planner_jax.host.files import replacing
+from planner_jax.planning.plan import plan
+from planner_jax.robot.arm import shield_pose
+from planner_jax.task.block.clearance import least_clearances
+from planner_jax.task.block.motion import angles_at
+from planner_jax.task.block.planner import learned_starts
+from planner_jax.task.block.scene import Scene
+
+# Learned starts that are tried where there is a motion already; all where there is none. In a
+# repair, what began with the old motion is as good mostly, and one more will do.
+STARTS, REPAIR_STARTS = (2, 0, 1, 3, 4, 5), (2,)
+_WORTH = 0.03  # [s], earlier: what a search for a better motion has to promise
+_LOOKED_AT = 1024  # stored motions whose distances are worked out at once
+
+
+@dataclasses.dataclass(frozen=True)
+class Portions:
+    """How much is planned at a time."""
+
+    pairs: int  # before the next part is written
+    lanes: tuple[int, int]  # of a device in a call, of few and of many
+    # Of one pair in a call. One, where those that come after a motion was found are work saved;
+    # all, where a few lanes take as long as thousands.
+    starts: int
+
+
+_ON_CPU = Portions(256, (16, 16), 1)
+_ON_GPU = Portions(32768, (512, 8192), 16)
+_FEW = 6  # calls of few lanes that take about as long as one of many
+
+
+@dataclasses.dataclass(frozen=True)
+class _Motions:
+    """The best motions of P pairs so far."""
+
+    point: np.ndarray  # (P, 6 K + 1)
+    entry: np.ndarray  # (P,) [s]; infinite without one
+    quickest: np.ndarray  # (P,) [s]
+
+
+def build(
+    path: str | os.PathLike,
+    setting: Setting,
+    homes: Any,
+    layout: Layout,
+    *,
+    progress: bool = True,
+) -> Library:
+    """Plan for all pairs of cells that a ball can pass through, and write the library.
+
+    What has been planned is kept in a folder beside the file, with the ending ".parts", until the
+    library is whole: the same call after an interruption goes on from there, to the same library.
+
+    Args:
+        path: of the file.
+        setting: NumPy leaves.
+        homes: (H, 6) [rad], where motions begin, one or more.
+        layout: of the cells.
+        progress: show a bar on the standard error stream.
+
+    Raises:
+        ValueError: the arm touches something at a home; one line.
+        OSError: the file or the folder cannot be written.
+    """
+    homes = np.atleast_2d(np.asarray(homes, np.float32))
+    _require_free(setting, homes)
+    tunnel = tunnels(layout, setting.scene.inner, setting.scene.outer)
+    feasible = np.flatnonzero(tunnel.is_feasible)
+    parts = _Parts(Path(f"{os.fspath(path)}.parts"), setting, homes, layout)
+    size = portions().pairs
+    work = [
+        (k, feasible[begin : begin + size])
+        for k in range(len(homes))
+        for begin in range(0, len(feasible), size)
+    ]
+    rows = _empty_rows(len(homes), layout, StraightPair(setting, homes[0]))
+    with _bar(len(homes) * len(feasible), "pairs", progress) as bar:
+        for number, (k, pairs) in enumerate(work):
+            found = parts.read(number)
+            if found is None:
+                found = plan_pairs(setting, homes[k], tunnel, pairs)
+                parts.write(number, found)
+            rows[k, pairs] = found
+            bar.update(len(pairs))
+    library = library_of(rows, homes, layout, setting)
+    save_library(path, library)
+    parts.remove()
+    return library
+
+
+def repair(
+    library: Library, scene: Scene, *, retry: bool = False, progress: bool = True
+) -> tuple[Library, np.ndarray]:
+    """The library in another scene: what is no longer free there is planned anew.
+
+    Args:
+        library: of a scene with the same boxes.
+        scene: what stands around now.
+        retry: whether to plan for pairs that had no motion, too.
+        progress: show a bar on the standard error stream.
+
+    Returns:
+        The library, NumPy leaves, and which motions were planned for anew, (H, P) bool. All
+        others are the old ones, bit for bit.
+
+    Raises:
+        ValueError: a box of the scene is not that of the library, or the arm touches something at
+            a home.
+    """
+    table, setting = library.table, moved(library, scene).setting
+    _require_free(setting, table.homes)
+    rows = np.array(table.rows)
+    tunnel = tunnels(table.layout, scene.inner, scene.outer)
+    touched = np.zeros(rows.shape[:2], bool)
+    for k, home in enumerate(np.asarray(table.homes)):
+        stored = np.flatnonzero(library.found[k])
+        touched[k, stored] = ~_is_free(setting, home, rows[k, stored])
+        if retry:
+            touched[k] |= tunnel.is_feasible & ~library.found[k]
+    size = portions().pairs
+    with _bar(int(touched.sum()), "pairs", progress) as bar:
+        for k, home in enumerate(np.asarray(table.homes)):
+            anew = np.flatnonzero(touched[k])
+            for begin in range(0, len(anew), size):
+                pairs = anew[begin : begin + size]
+                rows[k, pairs] = plan_pairs(setting, home, tunnel, pairs, rows[k, pairs])
+                bar.update(len(pairs))
+    return library_of(rows, table.homes, table.layout, setting), touched
+
+
+def portions() -> Portions:
+    """How much this process's devices plan at a time."""
+    return _ON_CPU if jax.default_backend() == "cpu" else _ON_GPU
+
+
+def _require_free(setting: Setting, homes: Any) -> None:
+    """Raise `ValueError` where the arm touches something at a home."""
+    for k, home in enumerate(np.asarray(homes)):
+        near = float(_nearest(setting, home[None, None])[0])
+        if not near > 0.0:
+            raise ValueError(f"homes must be free, got {near:.3g} m to what is nearest at home {k}")
+
+
+def plan_pairs(
+    setting: Setting, home: Any, tunnel: Tunnels, pairs: np.ndarray, old: Any = None
+) -> np.ndarray:
+    """Rows (N, 6 K + 10) of a table for some pairs (N,), from one home.
+
+    Straight motions first. Then least squares from one learned start after another, for those
+    pairs that might be reached earlier or have nothing yet. All of it again, more coarsely, for
+    those that are left with nothing.
+
+    Args:
+        setting: NumPy leaves.
+        home: (6,) [rad].
+        tunnel: of all pairs.
+        pairs: numbers of those to plan for.
+        old: their rows in another scene, from which to begin as well.
+    """
+    straight, bent = StraightPair(setting, home), BentPair(setting, home)
+    corners = (getattr(tunnel, name)[pairs].astype(np.float32) for name in ("outer", "inner"))
+    outer, inner = corners
+    given: Any = np.zeros((len(pairs), 6 * straight.online.pieces + 1), np.float32)
+    has_old = np.zeros(len(pairs), bool)
+    if old is not None:
+        row = unpacked(old)
+        has_old = np.isfinite(row.duration)
+        given[has_old, :-1] = row.steps[has_old].reshape(has_old.sum(), -1)
+        given[has_old, -1] = row.duration[has_old]
+    found = _Motions(
+        point=np.zeros_like(given),
+        entry=np.full(len(pairs), np.inf, np.float32),
+        quickest=np.full(len(pairs), np.inf, np.float32),
+    )
+
+    def improve(
+        planner: PairPlanner, some: np.ndarray, starts: Sequence[int], is_coarse: bool
+    ) -> None:
+        if not some.size:
+            return
+        lanes = np.repeat(some, len(starts))
+        start: Any = np.tile(np.asarray(starts, np.int32), len(some))
+        coarse: Any = np.full(len(lanes), is_coarse)
+        best: Any = found.entry[lanes]
+        cases = PairCase(outer[lanes], inner[lanes], coarse, best, start, given[lanes])
+        plans = _planned(planner, cases)
+        cost = np.where(solved(plans), plans.cost, np.inf).reshape(len(some), -1)
+        first = np.arange(0, len(lanes), len(starts)) + np.argmin(cost, axis=1)
+        cost = np.min(cost, axis=1)
+        better = cost < found.entry[some]
+        found.point[some[better]] = plans.point[first[better]]
+        found.entry[some[better]] = cost[better]
+        found.quickest[some] = plans.quickest[first]
+
+    improving = STARTS if old is None else (-1, *REPAIR_STARTS)
+    rest = [start for start in STARTS if start not in improving]
+    others = [start for start in range(len(learned_starts()[0])) if start not in STARTS]
+    for is_coarse in (False, True):
+        left = np.isinf(found.entry)
+        improve(straight, np.flatnonzero(left), [0], is_coarse)
+        for starts in (*_groups(improving), *_groups(rest + others * is_coarse)):
+            with np.errstate(invalid="ignore"):
+                hard = left & ~(found.entry - found.quickest <= _WORTH)
+            if starts[0] not in improving:
+                hard &= np.isinf(found.entry)
+            hard &= np.isfinite(found.quickest) & (has_old if tuple(starts) == (-1,) else True)
+            improve(bent, np.flatnonzero(hard), starts, is_coarse)
+    return _rows_of(straight, found)
+
+
+def _groups(starts: Sequence[int]) -> list[Sequence[int]]:
+    """Starts in groups, each for one call."""
+    num = portions().starts
+    return [starts[begin : begin + num] for begin in range(0, len(starts), num)]
+
+
+def _planned(planner: Any, cases: PairCase) -> Any:
+    """Plans of a batch, in calls of few sizes, so that few programs are compiled."""
+    num, devices = len(cases.best), jax.local_device_count()
+    few, many = portions().lanes
+    lanes = few if num <= _FEW * few * devices else many
+    whole = -(-num // (lanes * devices)) * lanes * devices
+    # The last one again: on a CPU it is not solved again.
+    filled = jax.tree.map(lambda leaf: leaf[np.minimum(np.arange(whole), num - 1)], cases)
+    plans: Any = plan(planner, filled, chunk=lanes)
+    return jax.tree.map(lambda leaf: leaf[:num], plans)
+
+
+def _rows_of(planner: PairPlanner, found: _Motions) -> np.ndarray:
+    """Rows of a table for motions; those without one have an infinite duration."""
+    stored = np.isfinite(found.entry)
+    pieces = planner.online.pieces
+    steps: Any = found.point[:, :-1].reshape(-1, pieces, 6).copy()
+    if planner.setting.ends_at_rest:
+        steps[:, -1] = 0.0
+    steps[~stored] = 0.0
+    ends = [_ends(planner.setting, planner.home, some) for some in _in_parts(steps)]
+    parts: Any = (np.concatenate(each)[: len(steps)] for each in zip(*ends, strict=True))
+    rotation, middle = parts
+    duration: Any = np.where(stored, found.point[:, -1], np.inf)
+    row: Any = Row(steps, duration, middle, rotation[:, :, 0], rotation[:, :, 1])
+    return packed(row)
+
+
+def _in_parts(array: np.ndarray) -> list[np.ndarray]:
+    """An array cut into equal parts along its first axis, the last one filled up."""
+    num = -(-len(array) // _LOOKED_AT) * _LOOKED_AT
+    filled = array[np.minimum(np.arange(num), len(array) - 1)]
+    return list(filled.reshape(-1, _LOOKED_AT, *array.shape[1:]))
+
+
+@jax.jit
+def _ends(setting: Setting, home: Array, steps: Array) -> tuple[Array, Array]:
+    """Rotations (N, 3, 3) and middles (N, 3) [m] of the shield where motions end."""
+
+    def end(steps: Array) -> tuple[Array, Array]:
+        angles = angles_at(home, jnp.zeros_like(home), steps, (1.0,))[0]
+        return shield_pose(setting.arm, angles)
+
+    return jax.vmap(end)(steps)
+
+
+def _is_free(setting: Setting, home: Any, rows: np.ndarray) -> np.ndarray:
+    """Which of some stored motions keep the planner's margin from everything, (N,) bool."""
+    online = StraightPair(setting, home).online
+    if not len(rows):
+        return np.zeros(0, bool)
+    shares = tuple(np.arange(1, online.checked + 1) / online.checked)
+    steps = unpacked(rows).steps
+    near = [_nearest_on_way(setting, home, some, shares) for some in _in_parts(np.asarray(steps))]
+    # Plans are accepted to rounding.
+    return np.concatenate(near)[: len(rows)] >= online.margin - 1e-5
+
+
+@functools.partial(jax.jit, static_argnames="shares")
+def _nearest_on_way(setting: Setting, home: Array, steps: Array, shares: tuple) -> Array:
+    """Least distances (N,) [m] along motions with steps (N, K, 6)."""
+    at = lambda steps: angles_at(home, jnp.zeros_like(home), steps, shares)  # noqa: E731
+    return _nearest(setting, jax.vmap(at)(steps))
+
+
+@jax.jit
+def _nearest(setting: Setting, angles: Array) -> Array:
+    """Least distances (N,) [m] at angles (N, S, 6)."""
+    flat = least_clearances(setting.arm, setting.scene, angles.reshape(-1, 6))
+    return jnp.min(flat.reshape(angles.shape[:2]), axis=1)
+
+
+def _empty_rows(homes: int, layout: Layout, planner: PairPlanner) -> np.ndarray:
+    """Rows of a table without a motion."""
+    pieces = planner.online.pieces
+    rows = np.zeros((homes, layout.num_pairs, 6 * pieces + 10), np.float32)
+    rows[..., 6 * pieces] = np.inf
+    assert pieces_of(rows) == pieces
+    return rows
+
+
+def _bar(total: int, unit: str, progress: bool) -> tqdm:
+    return tqdm(total=total, unit=f" {unit}", desc="library", disable=not progress)
+
+
+class _Parts:
+    """What has been planned of a library that is not whole yet, a file each, written atomically."""
+
+    def __init__(self, folder: Path, setting: Setting, homes: np.ndarray, layout: Layout):
+        self._folder = folder
+        what = {
+            "version": BUILD_VERSION,
+            "fingerprint": fingerprint(setting),
+            "homes": homes.tolist(),
+            "layout": dataclasses.asdict(layout),
+            "device": jax.default_backend(),  # on which the size of a part depends
+        }
+        text = json.dumps(what, sort_keys=True)
+        known = folder / "what.json"
+        # What is of another library or version is not gone on with.
+        if not known.exists() or known.read_text() != text:
+            self.remove()
+            folder.mkdir(parents=True)
+            known.write_text(text)
+
+    def read(self, number: int) -> np.ndarray | None:
+        path = self._folder / f"{number:05d}.npy"
+        return np.load(path, allow_pickle=False) if path.exists() else None
+
+    def write(self, number: int, rows: np.ndarray) -> None:
+        path = self._folder / f"{number:05d}.npy"
+        with replacing(path) as scratch, open(scratch, "wb") as file:
+            np.save(file, rows, allow_pickle=False)
+
+    def remove(self) -> None:
+        if self._folder.exists():
+            shutil.rmtree(self._folder)

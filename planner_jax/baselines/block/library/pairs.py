@@ -1,0 +1,338 @@
+"""Least-time motions to the shield poses of one pair of cells (paper 004, Algorithm 1).
+
+The paper plans to equidistant points of the centreline and stores the plan of least time. A nominal
+ball flies here from the middle of the one cell to that of the other. Of two motions the better one
+is that for which the ball may come earlier: a pose farther in gives the arm more time. This is
+the paper's least time for a ball that is infinitely fast.
+"""
+
+import dataclasses
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array, lax
+
+from planner_jax.ball.flight import drag_free_flight
+from planner_jax.baselines.block.library.cells import GRAVITY, farthest_crossing, nominal_ball
+from planner_jax.baselines.block.library.table import Setting
+from planner_jax.core.protocol import (
+    FEASIBILITY_TOLERANCE,
+    Attempt,
+    Plan,
+    Status,
+    is_solved,
+    status_of,
+)
+from planner_jax.optimise.levenberg import LevenbergConfig, Model, least_squares
+from planner_jax.planning.one_by_one import OneByOne
+from planner_jax.robot.arm import product, shield_jacobian, shield_pose
+from planner_jax.robot.arm_ik import inverse_kinematics
+from planner_jax.task.block.case import STRICT, BlockCase
+from planner_jax.task.block.clearance import least_clearances
+from planner_jax.task.block.end_poses import EndPoses, Flight, facing, frame_of, profile_peaks
+from planner_jax.task.block.motion import angles_at, sums
+from planner_jax.task.block.planner import OnlineBlock, learned_starts
+
+# How far a stored pose may be off the nominal ball's way, [m] and [rad]: the paper allows "a small
+# tolerance". Where no pose within it is reached, a shield that blocks a part is better than none.
+FINE, COARSE = STRICT, (0.08, np.deg2rad(20.0))
+_PATIENCE = 0.8  # [s], later than the quickest motion if nothing were in the way, at most
+_ROLL = np.deg2rad(1.0)  # [rad], greatest of a shield that is to block a whole tunnel
+_TOUCHING = 10.0  # [s], added to the entry times of poses that touch something: they come last
+# How near to both cells a shield may be, as shares of the way between: fine and coarse. Across an
+# oblique tunnel, planes farther out cut a cell.
+_NEAREST = (0.1, 0.02)
+
+
+@struct.dataclass
+class PairCase:
+    """A pair of cells to plan for, and where to begin."""
+
+    outer: Array  # (2, 3) [m], corners of the outer cell's part that sees the inner one
+    inner: Array  # (2, 3) [m], corners of the inner cell
+    is_coarse: Array  # () bool, whether a shield will do that blocks only a part of the tunnel
+    best: Array  # () [s], entry time that has been reached; infinite if none has
+    start: Array  # () int32, number of a learned start; -1 begins with `given`
+    given: Array  # (6 K + 1,), unknowns of a motion that may no longer be free
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """() for one pair, (B,) for a batch."""
+        return np.shape(self.best)
+
+
+@struct.dataclass
+class PairPlan(Plan):
+    """A motion to a pose of the shield; the cost is the ball's earliest entry time [s]."""
+
+    point: Array  # (6 K + 1,), unknowns of `OnlineBlock`: steps and duration of the motion
+    quickest: Array  # () [s], the entry time that a motion through obstacles would reach
+
+
+@struct.dataclass
+class PairPlanner(OneByOne):
+    """What both planners of pairs share: where the arm starts, and its surroundings.
+
+    The shield's edges lie along those of the frame whose second axis is horizontal, as those of
+    cells on upright faces do; of the four equal rolls the nearest to the arm's own is taken.
+    """
+
+    setting: Setting
+    home: Array  # (6,) [rad]
+    online: OnlineBlock = struct.field(pytree_node=False, default=OnlineBlock())
+    points: int = struct.field(pytree_node=False, default=5)  # of the centreline
+
+    case_type: ClassVar[type] = PairCase
+
+    def case_of(self, pair: PairCase, entry: Array) -> tuple[BlockCase, Flight]:
+        """The nominal ball as a case, getting into the outer box at a time () [s]."""
+        ball, span = nominal_ball(pair.outer, pair.inner)
+        gravity = jnp.asarray(GRAVITY, span.dtype)
+        case = BlockCase(
+            ball=drag_free_flight(ball, -entry, gravity),
+            gravity=gravity,
+            delay=jnp.zeros_like(span),
+            angles=self.home,
+            rates=jnp.zeros_like(self.home),
+            arm=self.setting.arm,
+            limits=self.setting.limits,
+            ends_at_rest=self.setting.ends_at_rest,
+            offset=jnp.where(pair.is_coarse, COARSE[0], FINE[0]).astype(span.dtype),
+            tilt=jnp.where(pair.is_coarse, COARSE[1], FINE[1]).astype(span.dtype),
+            scene=self.setting.scene,
+        )
+        here = jnp.asarray(True)
+        near = span * jnp.where(pair.is_coarse, *_NEAREST[::-1]).astype(span.dtype)
+        flight = Flight(earliest=entry + near, latest=entry + span - near, comes=here)
+        return case, flight
+
+    def poses(self, pair: PairCase) -> EndPoses:
+        """Eight poses at each point of the centreline, and the straight motions to them.
+
+        Returns:
+            Poses whose `time` is the duration of the quickest straight motion [s], and whose
+            `effort` is the entry time [s] that it leaves the ball, `_TOUCHING` later where the
+            arm would touch something; infinite where there is no pose, or where the shield does
+            not block the whole tunnel though it is to.
+        """
+        online, arm, limits = self.online, self.setting.arm, self.setting.limits
+        ball, span = nominal_ball(pair.outer, pair.inner)
+        shares = (np.arange(self.points) + 1.0) / (self.points + 1.0)
+
+        def of_point(time: Array) -> tuple[Array, Array]:
+            there = drag_free_flight(ball, time, jnp.asarray(GRAVITY, time.dtype))
+            rotation = frame_of(facing(there.vel))
+            far = farthest_crossing(pair.outer, pair.inner, there.pos, rotation)
+            angles, found = inverse_kinematics(arm, rotation, there.pos)
+            return angles, found & (pair.is_coarse | (far < arm.shield_half))
+
+        after = jnp.asarray(shares, span.dtype) * span
+        angles, found = jax.vmap(of_point)(after)
+        angles, found = angles.reshape(-1, 6), found.reshape(-1)
+        quarter = 0.5 * jnp.pi
+        roll = angles[:, 5] + quarter * jnp.round((self.home[5] - angles[:, 5]) / quarter)
+        angles = angles.at[:, 5].set(roll)
+        found = found & (roll >= arm.lower[5]) & (roll <= arm.upper[5])
+        rates, rises, rests = profile_peaks(online.pieces)
+        most = 1.0 - online.slack
+        turned = jnp.abs(angles - self.home)
+        of_rate = jnp.max(turned / limits.velocity, axis=1) / most
+        of_rise = jnp.sqrt(jnp.max(turned / limits.acceleration, axis=1) / most)
+        durations = jnp.maximum(of_rate[:, None] * rates, of_rise[:, None] * np.sqrt(rises))
+        durations = jnp.where(rests | ~self.setting.ends_at_rest, durations, jnp.inf)
+        duration = jnp.maximum(jnp.min(durations, axis=1), 1e-3)
+        near = least_clearances(arm, self.setting.scene, angles)
+        entry = duration - jnp.repeat(after, 8)
+        entry = jnp.where(near >= online.margin, entry, entry + _TOUCHING)
+        return EndPoses(
+            angles=angles,
+            time=duration,
+            effort=jnp.where(found, entry, jnp.inf),
+            profile=jnp.argmin(durations, axis=1).astype(jnp.int32),
+        )
+
+    def model(self, pair: PairCase, point: Array, case: BlockCase, flight: Flight) -> Model:
+        """`OnlineBlock.model`, and the shield's roll against the frame of `facing`."""
+        online = self.online
+        model = online.model(point, case, flight)
+        moves, first, _ = online.parts(case, point)
+        angles = angles_at(case.angles, first, moves, (1.0,))[0]
+        rotation, _ = shield_pose(case.arm, angles)
+        ball = drag_free_flight(case.ball, point[-1], case.gravity)
+        frame = frame_of(facing(ball.vel))
+        cosine = jnp.sum(rotation[:, 1] * frame[:, 1])
+        roll = jnp.arctan2(jnp.sum(rotation[:, 1] * frame[:, 2]), cosine)
+        roll = roll - 0.5 * jnp.pi * jnp.round(roll / (0.5 * jnp.pi))
+        by_angles = product(shield_jacobian(case.arm, angles)[3:].T, rotation[:, 0])
+        of_steps = jnp.asarray(sums(online.pieces, (1.0,))[1][0], point.dtype)
+        held = jnp.where(case.ends_at_rest, 0.0, of_steps[-1])
+        slope = jnp.append((of_steps.at[-1].set(held)[:, None] * by_angles).reshape(-1), 0.0)
+        weight = jnp.where(pair.is_coarse, 0.0, online.weights.tilt**2)
+        off = jnp.where(pair.is_coarse, -1.0, jnp.abs(roll) / _ROLL - 1.0)
+        return Model(
+            cost=model.cost + weight * roll**2,
+            gradient=model.gradient + weight * roll * slope,
+            curvature=model.curvature + weight * slope[:, None] * slope,
+            violation=jnp.maximum(model.violation, off),
+        )
+
+    def planned(self, pair: PairCase, point: Array, entry: Array, steps: Array) -> PairPlan:
+        """The plan of a point, checked as `OnlineBlock` does; it has to block the tunnel, too."""
+        case, flight = self.case_of(pair, entry)
+        plan = self.online.plan_at(case, flight, point, steps)
+        moves, first, _ = self.online.parts(case, point)
+        rotation, middle = shield_pose(case.arm, angles_at(case.angles, first, moves, (1.0,))[0])
+        far = farthest_crossing(pair.outer, pair.inner, middle, rotation)
+        beyond = jnp.where(pair.is_coarse, 0.0, far / case.arm.shield_half - 1.0)
+        violation = jnp.maximum(plan.violation, beyond)
+        return PairPlan(
+            cost=entry,
+            violation=violation,
+            iterations=plan.iterations,
+            status=status_of(plan.cost, violation, violation > FEASIBILITY_TOLERANCE),
+            point=point,
+            quickest=entry,
+        )
+
+
+@struct.dataclass
+class StraightPair(PairPlanner):
+    """The straight motion of the joints that is free and lets the ball come earliest.
+
+    It looks at one after another, those of the earliest balls first.
+    """
+
+    @property
+    def attempts(self) -> tuple[Attempt, ...]:
+        """One."""
+        return (Attempt(),)
+
+    def solve(self, pair: PairCase, attempt: Attempt) -> PairPlan:
+        """The plan of one pair."""
+        poses = self.poses(pair)
+        order = jnp.argsort(poses.effort)
+        possible = jnp.sum(poses.effort < 0.5 * _TOUCHING)
+        case, _ = self.case_of(pair, jnp.zeros_like(pair.best))
+
+        def next_one(state: tuple) -> tuple:
+            k, _ = state
+            place = order[k]
+            point = self.online.straight_point(case, poses, place)
+            entry = jnp.where(k < possible, poses.effort[place], 0.0)
+            return k + 1, self.planned(pair, point, entry, jnp.zeros((), jnp.int32))
+
+        def is_open(state: tuple) -> Array:
+            k, plan = state
+            return (k < possible) & ~is_solved(plan.status)
+
+        still = jnp.zeros((6 * self.online.pieces + 1,), pair.best.dtype)
+        none = jnp.full_like(pair.best, jnp.inf)
+        nothing = PairPlan(
+            cost=none,
+            violation=none,
+            iterations=jnp.zeros((), jnp.int32),
+            status=jnp.full((), Status.OUT_OF_REACH, jnp.int32),
+            point=still,
+            quickest=none,
+        )
+        _, plan = lax.while_loop(is_open, next_one, (0, nothing))
+        solved = is_solved(plan.status)
+        return dataclasses.replace(
+            plan,
+            cost=jnp.where(solved, plan.cost, jnp.inf),
+            violation=jnp.where(solved, plan.violation, jnp.inf),
+            quickest=_entry(jnp.min(poses.effort)),
+        )
+
+
+def _entry(effort: Array) -> Array:
+    """The entry time () [s] of a pose, whether or not the arm touches something there."""
+    return jnp.where(effort > 0.5 * _TOUCHING, effort - _TOUCHING, effort)
+
+
+@dataclasses.dataclass(frozen=True)
+class Bends(Attempt):
+    """Least squares, again and again with less time or with more; static."""
+
+    rounds: int = 4
+    solver: LevenbergConfig = LevenbergConfig(
+        16, damping=1e-2, ease=0.25, tighten=6.0, settled=1, tolerance=1.0
+    )
+
+
+@struct.dataclass
+class BentPair(PairPlanner):
+    """A motion around what is in the way, by least squares of `OnlineBlock` from a learned start.
+
+    By bisection between the entry time of the best motion so far and that of the quickest one, were
+    nothing in the way; without any, from `_PATIENCE` later than the latter.
+    """
+
+    search: Bends = struct.field(pytree_node=False, default=Bends())
+
+    @property
+    def attempts(self) -> tuple[Bends, ...]:
+        """The one search."""
+        return (self.search,)
+
+    def solve(self, pair: PairCase, attempt: Bends) -> PairPlan:
+        """The plan of one pair from its start; the status is that of the last round that solved."""
+        online, dtype = self.online, pair.best.dtype
+        poses = self.poses(pair)
+        order = jnp.argsort(poses.effort)
+        possible = jnp.sum(jnp.isfinite(poses.effort))
+        ranks, bumps = (jnp.asarray(each) for each in learned_starts())
+        number = pair.start % len(ranks)
+        place = order[jnp.clip(ranks[number], 0, jnp.maximum(possible - 1, 0))]
+        of_place = jnp.where(possible > 0, _entry(poses.effort[place]), 0.0)
+        quickest = jnp.where(possible > 0, _entry(jnp.min(poses.effort)), 0.0)
+        case, _ = self.case_of(pair, jnp.zeros_like(of_place))
+        bump = online.bump(bumps[number]).reshape(-1)
+        learned = online.straight_point(case, poses, place).at[:-1].add(bump.astype(dtype))
+        is_given = pair.start < 0
+        start = jnp.where(is_given, pair.given, learned)
+        # A given motion ends on the nominal ball's way about where its own pose did.
+        span = nominal_ball(pair.outer, pair.inner)[1]
+        entry = jnp.where(is_given, pair.given[-1] - 0.5 * span, of_place)
+        none = jnp.isinf(pair.best)
+        high = jnp.where(none, quickest + _PATIENCE, pair.best)
+        first = jnp.where(none, high, 0.5 * (quickest + high))
+
+        def at(point: Array, old: Array, new: Array) -> Array:
+            """The same motion for a ball that enters at another time [s]."""
+            return point.at[-1].set(jnp.maximum(point[-1] + new - old, 0.02))
+
+        def one_round(k: Array, state: tuple) -> tuple:
+            low, high, tried, point, of_point, best = state
+            case, flight = self.case_of(pair, tried)
+            model = lambda point: self.model(pair, point, case, flight)  # noqa: E731
+            end = least_squares(model, at(point, of_point, tried), attempt.solver)
+            plan = self.planned(pair, end.point, tried, end.steps)
+            good = is_solved(plan.status)
+            best = jax.tree.map(lambda new, old: jnp.where(good, new, old), plan, best)
+            low, high = jnp.where(good, low, tried), jnp.where(good, tried, high)
+            point, of_point = jnp.where(good, end.point, point), jnp.where(good, tried, of_point)
+            return low, high, 0.5 * (low + high), point, of_point, best
+
+        nothing = PairPlan(
+            cost=jnp.full_like(entry, jnp.inf),
+            violation=jnp.full_like(entry, jnp.inf),
+            iterations=jnp.zeros((), jnp.int32),
+            status=jnp.full((), Status.NO_PATH, jnp.int32),
+            point=jnp.zeros_like(start),
+            quickest=quickest,
+        )
+
+        def is_open(state: tuple) -> Array:
+            k, (_, _, _, _, _, best) = state
+            goes_on = (k == 0) | ~none | is_solved(best.status)
+            return (k < attempt.rounds) & goes_on & (possible > 0)
+
+        state = (quickest, high, first, start, entry, nothing)
+        _, state = lax.while_loop(
+            is_open, lambda s: (s[0] + 1, one_round(s[0], s[1])), (jnp.zeros((), jnp.int32), state)
+        )
+        return dataclasses.replace(state[-1], quickest=quickest)

@@ -1,0 +1,212 @@
+"""The library: a stored motion for every pair of cells, and how a ball's is looked up.
+
+A lookup is two intersections of the ball's parabola with the boxes, two cells, and one row of a
+table (paper 004, Section IV-D2). It takes as long for every ball and searches nothing. What is
+added to the paper's is the moment at which this very ball crosses the plane of the shield that
+waits for it, and where on the shield.
+"""
+
+import dataclasses
+import hashlib
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+from planner_jax.ball.flight import BallState
+from planner_jax.baselines.block.library.cells import Layout, cell_of
+from planner_jax.robot.arm import Arm, ArmLimits
+from planner_jax.task.block.case import BlockCase
+from planner_jax.task.block.scene import Box, Scene, entry_time
+
+
+@struct.dataclass
+class Setting:
+    """What motions are planned for, besides a ball and where the arm starts."""
+
+    arm: Arm
+    limits: ArmLimits
+    ends_at_rest: Array  # () bool
+    scene: Scene
+
+
+def setting_of(case: BlockCase) -> Setting:
+    """The setting of a case, or of a batch."""
+    return Setting(
+        arm=case.arm, limits=case.limits, ends_at_rest=case.ends_at_rest, scene=case.scene
+    )
+
+
+def fingerprint(setting: Setting) -> str:
+    """Twelve hexadecimal digits that tell settings apart, by all of their numbers in float32."""
+    digest = hashlib.sha256(repr(setting.arm.capsule_link).encode())
+    for path, leaf in jax.tree_util.tree_leaves_with_path(setting):
+        value = np.asarray(leaf)
+        value = value.astype("<f4") if value.dtype.kind == "f" else value.astype("<i4")
+        digest.update(f"{jax.tree_util.keystr(path)}{value.shape}".encode())
+        digest.update(value.tobytes())
+    return digest.hexdigest()[:12]
+
+
+@struct.dataclass
+class Table:
+    """What a lookup reads. Row p of a home is `Row`s fields for pair p, one after another."""
+
+    rows: Array  # (H, P, 6 K + 10) float32
+    homes: Array  # (H, 6) [rad], where stored motions begin, at rest
+    inner: Box
+    outer: Box
+    layout: Layout = struct.field(pytree_node=False)
+
+
+class Row(NamedTuple):
+    """A stored motion and the shield at its end; also a batch, with leading axes.
+
+    A tuple, as is `Answer`: on the host it is made in a tenth of the time of a dataclass.
+    """
+
+    steps: Array  # (K, 6) [rad], see `planner_jax.task.block.motion`
+    duration: Array  # () [s]; infinite where no motion is stored
+    middle: Array  # (3,) [m], of the shield's face
+    normal: Array  # (3,) unit
+    edge: Array  # (3,) unit, along one of its edges
+
+
+def pieces_of(rows: Any) -> int:
+    """K of rows (..., 6 K + 10)."""
+    return (rows.shape[-1] - 10) // 6
+
+
+def packed(row: Row) -> np.ndarray:
+    """Rows (..., 6 K + 10) of a table, float32."""
+    steps, duration = np.asarray(row.steps), np.asarray(row.duration)
+    flat = steps.reshape(*steps.shape[:-2], -1)
+    parts = (flat, duration[..., None], row.middle, row.normal, row.edge)
+    return np.concatenate(parts, axis=-1).astype(np.float32)
+
+
+def unpacked(values: Any) -> Row:
+    """The fields of rows (..., 6 K + 10) of a table."""
+    pieces = pieces_of(values)
+    rest = values[..., 6 * pieces :]
+    return Row(
+        steps=values[..., : 6 * pieces].reshape(*values.shape[:-1], pieces, 6),
+        duration=rest[..., 0],
+        middle=rest[..., 1:4],
+        normal=rest[..., 4:7],
+        edge=rest[..., 7:10],
+    )
+
+
+class Answer(NamedTuple):
+    """What the table has for a ball, and how the ball meets the shield at the motion's end."""
+
+    row: Row
+    pair: Array  # () int32, number of the pair of cells; 0 without one
+    stored: Array  # () bool, whether the ball goes through two cells with a stored motion
+    time: Array  # () [s], when it crosses the plane of the shield
+    slack: Array  # () [s], since it is in the outer box, or until it is in the inner one
+    beside: tuple[Array, Array]  # () [m] each, along the shield's edges from its middle
+    cosine: Array  # (), of the angle between the shield's normal and the ball's way
+
+
+def lookup(table: Table, ball: BallState, gravity: Array, home: Array | int = 0) -> Answer:
+    """What is stored for a ball; pure, for one: constant in time, without a search.
+
+    By components, so that a compiled program of one ball has few loops.
+
+    Args:
+        table: of a library.
+        ball: when it is first seen.
+        gravity: () [m/s^2], magnitude.
+        home: () int32, from which of the homes.
+    """
+    layout = table.layout
+
+    def at(time: Array) -> tuple[list[Array], list[Array]]:
+        """Where the ball is [m], and its velocity [m/s]."""
+        x, y, z = (ball.pos[k] + ball.vel[k] * time for k in range(3))
+        fall = gravity * time
+        return [x, y, z - 0.5 * fall * time], [ball.vel[0], ball.vel[1], ball.vel[2] - fall]
+
+    outside, enters = entry_time(table.outer, ball, gravity)
+    inside, hits = entry_time(table.inner, ball, gravity)
+    place, velocity = at(outside)
+    first, is_first = cell_of(layout.outer, table.outer, place)
+    last, is_last = cell_of(layout.inner, table.inner, at(inside)[0])
+    passes = enters & hits & is_first & is_last & (inside > outside)
+    pair = jnp.where(passes, first * layout.num_inner + last, 0)
+    row = unpacked(table.rows[home, pair])
+    # The nearer root of the way to the plane, a parabola in time.
+    middle, normal, edge = (tuple(each) for each in (row.middle, row.normal, row.edge))
+    away = _dot(normal, _minus(place, middle))
+    toward = -_dot(normal, velocity)
+    root = jnp.sqrt(jnp.maximum(toward**2 + 2.0 * gravity * normal[2] * away, 0.0))
+    after = 2.0 * away / jnp.maximum(toward + root, 1e-6)
+    place, velocity = at(outside + after)
+    across = _minus(place, middle)
+    other = (
+        normal[1] * edge[2] - normal[2] * edge[1],
+        normal[2] * edge[0] - normal[0] * edge[2],
+        normal[0] * edge[1] - normal[1] * edge[0],
+    )
+    speed = jnp.sqrt(jnp.maximum(_dot(velocity, velocity), 1e-12))
+    return Answer(
+        row=row,
+        pair=pair,
+        stored=passes & jnp.isfinite(row.duration),
+        time=outside + after,
+        slack=jnp.minimum(after, inside - outside - after),
+        beside=(_dot(across, edge), _dot(across, other)),
+        cosine=-_dot(normal, velocity) / speed,
+    )
+
+
+def _minus(a: Any, b: Any) -> list[Array]:
+    return [x - y for x, y in zip(a, b, strict=True)]
+
+
+def _dot(a: Any, b: Any) -> Array:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@struct.dataclass
+class Library:
+    """Stored motions, and all that they were planned for."""
+
+    table: Table
+    setting: Setting
+
+    @property
+    def found(self) -> np.ndarray:
+        """Which pairs have a motion, (H, P) bool."""
+        return np.isfinite(np.asarray(unpacked(self.table.rows).duration))
+
+    @property
+    def num_bytes(self) -> int:
+        """Memory of the table."""
+        return sum(np.asarray(leaf).nbytes for leaf in jax.tree.leaves(self.table))
+
+
+def library_of(rows: Any, homes: Any, layout: Layout, setting: Setting) -> Library:
+    """A library of rows (H, P, 6 K + 10) from homes (H, 6)."""
+    scene = setting.scene
+    table = Table(rows=rows, homes=homes, inner=scene.inner, outer=scene.outer, layout=layout)
+    return Library(table=table, setting=setting)
+
+
+def moved(library: Library, scene: Scene) -> Library:
+    """The same motions in another scene with the same boxes.
+
+    Raises:
+        ValueError: a box is another one, so that cells would be others.
+    """
+    for name in ("inner", "outer"):
+        old, new = getattr(library.setting.scene, name), getattr(scene, name)
+        for side in ("lower", "upper"):
+            if not np.array_equal(getattr(old, side), getattr(new, side)):
+                raise ValueError(f"scene.{name} must be the library's, got another box")
+    return dataclasses.replace(library, setting=dataclasses.replace(library.setting, scene=scene))

@@ -1,0 +1,129 @@
+"""The quickest motion of the joints along a way, by TOPP-RA.
+
+Pham and Pham, "A new approach to time-optimal path parameterization based on reachability
+analysis" (2018), the package `toppra`: paper 004 times the ways of its baselines with it. A cubic
+spline leads through the way's points, and the arm begins and ends at rest.
+"""
+
+import importlib
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from planner_jax.core.registry import MissingExtra, install_line
+
+INSTALL = f"rrt-connect and epase need {{name}}: {install_line('arm-peers')}"
+PIECES = 128  # of a timed motion, at most
+DEGREE = 6  # a cubic of a quadratic
+_INSIDE = np.array([0.0, 0.25, 0.5, 0.75, 1.0])  # shares of pieces, where limits are looked at
+_SPARE = 2e-4  # share of the limits that is kept free
+
+
+def required(name: str) -> ModuleType:
+    """A module of the extra `arm-peers`.
+
+    Raises:
+        MissingExtra: its package is not installed.
+    """
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        package = name.partition(".")[0]
+        if error.name != package:
+            raise
+        raise MissingExtra(INSTALL.format(name=package), name=package) from None
+
+
+def timed_way(
+    points: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """The quickest motion from rest to rest along a spline through points, or None.
+
+    TOPP-RA keeps the limits at points of a grid; what exceeds them in between is slowed down with
+    all the rest.
+
+    Args:
+        points: (N, 6) [rad], two or more, no two neighbours the same, at most half of `PIECES`.
+        velocity: (6,) [rad/s], > 0.
+        acceleration: (6,) [rad/s^2], > 0.
+
+    Returns:
+        Coefficients (M, DEGREE + 1, 6) [rad/s^k] and durations (M,) [s] of M <= `PIECES` pieces.
+
+    Raises:
+        MissingExtra: toppra is not installed.
+    """
+    toppra = required("toppra")
+    constraint = importlib.import_module("toppra.constraint")
+    algorithm = importlib.import_module("toppra.algorithm")
+    toppra.setup_logging("ERROR")
+    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    knots = np.append(0.0, np.cumsum(lengths))
+    path: Any = toppra.SplineInterpolator(knots, points)
+    grid = _grid(knots)
+    limits = [
+        constraint.JointVelocityConstraint(velocity),
+        constraint.JointAccelerationConstraint(
+            acceleration, discretization_scheme=constraint.DiscretizationType.Interpolation
+        ),
+    ]
+    timing = algorithm.TOPPRA(limits, path, gridpoints=grid, solver_wrapper="seidel")
+    _, speeds, _ = timing.compute_parameterization(0.0, 0.0)
+    if speeds is None or not np.isfinite(speeds).all():
+        return None
+    steps = np.diff(grid)
+    means = 0.5 * (speeds[1:] + speeds[:-1])
+    if not (means > 0.0).all():
+        return None
+    durations = steps / means
+    rises = 0.5 * (speeds[1:] - speeds[:-1]) / durations
+    spline = np.stack([path(grid[:-1], k) for k in range(3)], axis=1)
+    third = (path(grid[1:], 2) - path(grid[:-1], 2)) / steps[:, None]
+    coeffs = _composed(
+        np.concatenate([spline, third[:, None]], axis=1) / [[[1.0], [1.0], [2.0], [6.0]]],
+        speeds[:-1, None],
+        rises[:, None],
+    )
+    slow = (1.0 + _SPARE) * _excess(coeffs, durations, velocity, acceleration)
+    return coeffs / slow ** np.arange(DEGREE + 1)[:, None], slow * durations
+
+
+def _grid(knots: np.ndarray) -> np.ndarray:
+    """Places along a way, about equally far apart and the knots among them, `PIECES` + 1 at most.
+
+    Each span between knots is cut into equal parts, in proportion to its length.
+    """
+    spans = np.diff(knots)
+    parts = 1 + np.floor((PIECES - len(spans)) * spans / spans.sum()).astype(int)
+    cut = [knots[k] + spans[k] * np.arange(count) / count for k, count in enumerate(parts)]
+    return np.append(np.concatenate(cut), knots[-1])
+
+
+def _composed(cubic: np.ndarray, speed: np.ndarray, rise: np.ndarray) -> np.ndarray:
+    """Coefficients (M, 7, 6) in time of cubics (M, 4, 6) in p = speed t + rise t^2."""
+    none, one, two, three = np.moveaxis(cubic, 1, 0)
+    return np.stack(
+        [
+            none,
+            one * speed,
+            one * rise + two * speed**2,
+            2.0 * two * speed * rise + three * speed**3,
+            two * rise**2 + 3.0 * three * speed**2 * rise,
+            3.0 * three * speed * rise**2,
+            three * rise**3,
+        ],
+        axis=1,
+    )
+
+
+def _excess(
+    coeffs: np.ndarray, durations: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
+) -> float:
+    """How many times longer a motion has to take to keep its limits, >= 1."""
+    powers = np.arange(coeffs.shape[1])
+    times = (_INSIDE * durations[:, None])[..., None]  # (M, S, 1)
+    rates = np.where(powers > 0, times ** np.maximum(powers - 1, 0), 0.0) * powers
+    rises = np.where(powers > 1, times ** np.maximum(powers - 2, 0), 0.0) * powers * (powers - 1)
+    rate, rise = (np.abs(np.matmul(each, coeffs)).max(axis=(0, 1)) for each in (rates, rises))
+    return max(1.0, float(np.max(rate / velocity)), float(np.max(rise / acceleration)) ** 0.5)

@@ -1,0 +1,91 @@
+"""The baseline `rrt-connect` of paper 004: RRT-Connect by OMPL, timed by TOPP-RA; one thread.
+
+Kuffner and LaValle, "RRT-Connect: An efficient approach to single-query path planning" (2000). A
+tree grows from either end by edges of up to `reach`, the length that the code behind the paper
+has. Edges are looked at in one batch each.
+"""
+
+import dataclasses
+import functools
+from typing import Any, ClassVar
+
+import numpy as np
+
+from planner_jax.baselines.block.free_space import FreeSpace
+from planner_jax.baselines.block.path_timing import required
+from planner_jax.baselines.block.pose_by_pose import Clock, Goal, WayThenTime
+from planner_jax.task.block.case import BlockCase
+
+_SEED = 1  # of OMPL's random numbers: one sequence a process
+
+
+@functools.cache
+def _ompl() -> tuple[Any, Any]:
+    """OMPL's modules `base` and `geometric`, told to be silent and what to draw."""
+    util = required("ompl.util")
+    util.setLogLevel(util.LOG_ERROR)
+    util.RNG.setSeed(_SEED)
+    return required("ompl.base"), required("ompl.geometric")
+
+
+@dataclasses.dataclass(frozen=True)
+class RrtConnectBlock(WayThenTime):
+    """Tries end poses one after another; needs the extra `arm-peers`."""
+
+    packages: ClassVar[tuple[str, ...]] = ("toppra", "ompl")
+    reach: float = 1.0  # [rad], longest edge
+    shortcuts: bool = True  # whether a way is made simpler and shorter before it is timed
+
+    def way_to(
+        self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
+    ) -> np.ndarray | None:
+        """Points of a way, or None."""
+        base, geometric = _ompl()
+        space = base.RealVectorStateSpace(6)
+        bounds = base.RealVectorBounds(6)
+        for k in range(6):
+            bounds.setLow(k, float(free.lower[k]))
+            bounds.setHigh(k, float(free.upper[k]))
+        space.setBounds(bounds)
+        information = base.SpaceInformation(space)
+        information.setStateValidityChecker(lambda state: bool(free.is_free(_numbers(state)[None])))
+        information.setMotionValidator(_validator(base, information, free))
+        information.setup()
+        ends = []
+        for angles in (case.angles, goal.angles):
+            state = space.allocState()
+            for k in range(6):
+                state[k] = float(angles[k])
+            ends.append(state)
+        problem = base.ProblemDefinition(information)
+        problem.setStartAndGoalStates(*ends)
+        planner = geometric.RRTConnect(information)
+        planner.setRange(self.reach)
+        planner.setProblemDefinition(problem)
+        planner.setup()
+        if (
+            (seconds := left()) <= 0.0
+            or not planner.solve(seconds)
+            or not problem.hasExactSolution()
+        ):
+            return None
+        path = problem.getSolutionPath()
+        if self.shortcuts:
+            geometric.PathSimplifier(information).simplify(path, max(left(), 0.0))
+        return np.stack([_numbers(state) for state in path.getStates()])
+
+
+def _numbers(state: Any) -> np.ndarray:
+    """The angles (6,) of a state of OMPL's."""
+    return np.array([state[k] for k in range(6)])
+
+
+def _validator(base: Any, information: Any, free: FreeSpace) -> Any:
+    """What OMPL asks whether an edge is free."""
+
+    class Edges(base.MotionValidator):
+        def checkMotion(self, begin: Any, end: Any) -> bool:  # noqa: N802
+            """The name is OMPL's."""
+            return bool(free.are_edges_free(_numbers(begin), _numbers(end)[None])[0])
+
+    return Edges(information)

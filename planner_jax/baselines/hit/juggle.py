@@ -1,0 +1,140 @@
+"""The `juggle` baseline: one state-to-state primitive to a stroke that is fixed beforehand."""
+
+import dataclasses
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from planner_jax.ball.impact import required_impact
+from planner_jax.ball.prediction import PathTable, target_at
+from planner_jax.baselines.hit.common import largest_violation, make_impact
+from planner_jax.baselines.parts.minimum_jerk import eased_minimum_jerk
+from planner_jax.core.protocol import Attempt, outcome, require_settings
+from planner_jax.cost.quadrotor import motion_excess
+from planner_jax.task.hit.case import HitCase
+from planner_jax.task.hit.context import HitContext, Impact, prepare_hit
+from planner_jax.task.hit.plan import HitPlan
+from planner_jax.trajectory.polynomial import sample_pieces, snap_energy
+
+_BISECTIONS = 30
+_SHORTEST = 1e-2  # [s], of a trajectory
+_LEAST_UPRIGHT = 1e-2  # vertical part of the racket's normal, by which v_z is divided
+
+
+def falling_time(path: PathTable, height: Array, earliest: Array, latest: Array) -> Array:
+    """Time at which the target falls through a height.
+
+    Bisection, then a step of Newton's method, which alone is differentiated.
+
+    Args:
+        path: of the target.
+        height: () [m].
+        earliest: () [s], when the target is above `height`.
+        latest: () [s], when it is below.
+
+    Returns:
+        () [s]; next to one of the bounds where the height is not crossed between them.
+    """
+
+    def halve(_: int, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
+        middle = 0.5 * (bounds[0] + bounds[1])
+        above = target_at(path, middle).pos[2] > height
+        return jnp.where(above, middle, bounds[0]), jnp.where(above, bounds[1], middle)
+
+    earliest, latest = lax.fori_loop(0, _BISECTIONS, halve, (earliest, latest))
+    time = lax.stop_gradient(0.5 * (earliest + latest))
+    ball = target_at(path, time)
+    missing = ball.pos[2] - height
+    crossed = jnp.abs(missing) < 1e-2
+    sinking = lax.stop_gradient(jnp.minimum(ball.vel[2], -0.1))
+    return time - jnp.where(crossed, missing, 0.0) / sinking
+
+
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class JuggleHit:
+    """A minimum-jerk primitive to a stroke that is fixed beforehand; nothing is optimised.
+
+    The "Juggle" of paper 002. What is taken from where:
+
+    - Mueller, Lupashin, D'Andrea 2011 (its ref. [7]) and Dong et al. 2015 ([8]): the ball is
+      met where it falls through a fixed height; the returned ball rises to a fixed apex;
+      two components of the racket's velocity are fixed and the third follows from the impact.
+    - Mueller, Hehn, D'Andrea 2015 ([9]): the primitive of least jerk to that state.
+    - Paper 002: eqs 11-12 (the impact solved for normal and normal speed), 15-17 (the
+      primitive), and its tau_z = 1.1 g at the impact.
+    - The published trials: v_x = v_y = 0 in every recorded hit; the quadrotor at 1.43 to
+      1.50 m, never above, which is the first 10 ms sample below 1.5 m; an apex of 2.3 m
+      (median; quartiles 2.2 and 2.4) that attitude and target imply, if gravity alone acts.
+    - Assumed: the ramp of `eased_minimum_jerk`. Without it the body rate jumps at time 0.
+
+    With the restitution 0.7 of paper 002 this planner succeeds on two serves of three, and
+    not on the one in ten of the published trials. Their recorded hits have a restitution near
+    0.32: a racket that must rise at 3 m/s at the impact instead of nearly resting. With that
+    restitution in the cases it succeeds on one in ten, and mostly in those of the 36
+    cases in which the published one did (correlation 0.65).
+
+    It does not look at a case's extras; the referee does.
+    """
+
+    attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)
+    case_type: ClassVar[type] = HitCase
+    height: float = 1.5  # [m], of the ball at the impact
+    apex: float = 2.3  # [m], of the returned ball
+    thrust_z: float = 1.1  # vertical thrust at the impact over gravity
+    racket_vel_xy: tuple[float, float] = (0.0, 0.0)  # [m/s], of the quadrotor at the impact
+    ease: float = 0.02  # [s], in which the jerk reaches that of the primitive
+    nodes: int = 60  # intervals a piece in which limits are looked at
+    num_table_nodes: int = 48
+
+    def __post_init__(self) -> None:
+        require_settings(self)
+
+    def solve(self, case: HitCase, attempt: Attempt) -> HitPlan:
+        """The primitive to the stroke; no variable is left to decide on.
+
+        Its cost is the mean squared jerk (paper 002, eq. 15).
+        """
+        impact = self.impact(prepare_hit(case, self.num_table_nodes))
+        trajectory = eased_minimum_jerk(
+            case.head_state, impact.tail_state[:3], impact.stroke.time, self.ease
+        )
+        motion = sample_pieces(trajectory, self.nodes)
+        along = jnp.stack(motion_excess(motion, case.gravity, case.limits))
+        # A height or an apex that cannot be, or a racket on edge, is a broken limit too.
+        meeting = jnp.abs(impact.stroke.ball_pos[2] - self.height)
+        too_low = jnp.maximum(impact.stroke.ball_pos[2], case.target[2]) - self.apex
+        lying = _LEAST_UPRIGHT - impact.stroke.normal[2]
+        missed = jnp.maximum(jnp.maximum(meeting, too_low) - 1e-3, lying)
+        violation = jnp.maximum(largest_violation(along, impact, case), missed)
+        mean_jerk = snap_energy(trajectory, 3) / impact.stroke.time
+        return HitPlan(
+            trajectory=trajectory,
+            gravity=case.gravity,
+            stroke=impact.stroke,
+            **outcome(mean_jerk, violation),
+        )
+
+    def impact(self, context: HitContext) -> Impact:
+        """The stroke. A ball that never falls through `height` is met where it comes closest."""
+        case, path = context.case, context.path
+        gravity = case.gravity
+        highest = jnp.maximum(case.ball.vel[2], 0.0) / gravity
+        latest = jnp.maximum(context.landing_time, highest)
+        height = jnp.asarray(self.height, gravity.dtype)
+        time = jnp.maximum(falling_time(path, height, highest, latest), _SHORTEST)
+        ball = target_at(path, time)
+        rise = jnp.sqrt(2.0 * gravity * jnp.maximum(self.apex - ball.pos[2], 1e-3))
+        fall = jnp.sqrt(2.0 / gravity * jnp.maximum(self.apex - case.target[2], 1e-3))
+        flight_time = rise / gravity + fall
+        across = (case.target - ball.pos)[:2] / flight_time
+        after = jnp.concatenate([across, rise[None]])
+        normal, normal_speed = required_impact(ball.vel, after, case.restitution)
+        upright = jnp.maximum(normal[2], _LEAST_UPRIGHT)
+        fixed = jnp.asarray(self.racket_vel_xy, rise.dtype)
+        vel_z = (normal_speed - jnp.sum(fixed * normal[:2])) / upright
+        racket_vel = jnp.concatenate([fixed, vel_z[None]])
+        thrust = self.thrust_z * gravity / upright * normal
+        return make_impact(time, flight_time, ball, after, racket_vel, thrust, case)

@@ -1,0 +1,1 @@
+"""Published methods for interceptions, and the searches and splines they need."""

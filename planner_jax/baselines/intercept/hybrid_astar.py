@@ -1,0 +1,218 @@
+"""Hybrid A*: a way for a car that only drives forward, among polygons that stand.
+
+A search over cells of place and heading, with one continuous state a cell, along arcs that the car
+can drive (D. Dolgov, S. Thrun, M. Montemerlo and J. Diebel, Practical search techniques in path
+planning for autonomous driving, 2008). It is the first half of paper 003's path planning (Section
+III-B). Shots, free Dubins ways from a node to the goal, are tried the more often, the nearer the
+goal is; the cheapest one ends the search once nothing that is left can be cheaper, where the paper
+takes the first. Unlike the rest of `plane` it runs on the host, one search at a time; its loops are
+compiled by numba, which the extra `baselines` installs. World frame in the plane, SI units,
+headings counter-clockwise from the x axis.
+"""
+
+import dataclasses
+import importlib
+from typing import Any, Literal
+
+import numpy as np
+
+from planner_jax.core.registry import MissingExtra, install_line
+from planner_jax.plane.obstacles import Obstacles
+
+_DISCS = 3  # that cover the body
+HEURISTICS = ("dubins", "grid", "both")
+
+
+@dataclasses.dataclass(frozen=True)
+class HybridAstar:
+    """How a way is sought.
+
+    A way costs its length, and turns cost more by `turn_price`. The heuristic is the length of the
+    shortest way without obstacles, "dubins", that in the plane among obstacles on the grid without
+    the curvature's limit, "grid", or the greater one, "both". Paper 003 takes the greater one of
+    Dubins's length and the straight line, which is "dubins": the straight line is never longer.
+    """
+
+    heuristic: Literal["dubins", "grid", "both"] = "both"
+    cell: float = 0.1  # [m], side of a cell
+    headings: int = 72  # bins of a turn
+    turn_price: float = 0.05  # of a metre at the tightest curvature, in metres
+    # By how much, relative, the heuristic is stretched (weighted A*, I. Pohl, 1970), and so how far
+    # the cost may be above the least on the lattice.
+    slack: float = 0.1
+    margin: float = 0.01  # [m], from polygons, for what lies between samples and nodes
+    poses: int = 129  # of the result
+    max_expansions: int = 200_000
+
+
+@dataclasses.dataclass(frozen=True)
+class HybridPath:
+    """What a search found; without a way the arrays are NaN, length and cost infinite.
+
+    Poses lie at equal distances along the way. It consists of arcs and straight lines, so that
+    curvatures jump between two poses.
+    """
+
+    poses: np.ndarray  # (N, 3) x, y [m] of the rear axle and heading [rad], not wrapped
+    curvature: np.ndarray  # (N,) [1/m], just after a pose, of the last one just before
+    length: float  # [m]
+    cost: float  # [m], the length with the price of turns
+    expansions: int  # of nodes
+    found: bool
+    blocked: bool  # whether the car cannot stand at its start, or in no way at the goal
+
+
+def hybrid_astar(
+    start: Any,
+    meeting: Any,
+    walls: Obstacles,
+    *,
+    curvature: float,
+    body: tuple[float, float, float],
+    lower: Any,
+    upper: Any,
+    end_heading: float | None = None,
+    settings: HybridAstar = HybridAstar(),
+) -> HybridPath:
+    """A way from a pose to where the body's middle is on a point.
+
+    The body is three discs that cover it, so that it is taken for wider and longer than it is: a
+    gap just as wide as the car counts as closed. Where the end's heading is free, ways end with an
+    arc and a straight line.
+
+    Args:
+        start: (3,) x, y [m] of the rear axle and heading [rad].
+        meeting: (2,) [m], where the body's middle shall be.
+        walls: of one case; their velocities are not looked at.
+        curvature: [1/m], > 0, the tightest.
+        body: ends of the body behind (negative) and ahead of the rear axle, and half its width
+            [m], as for `separation`.
+        lower: (2,) [m], corner of the map, which the body's middle does not leave.
+        upper: (2,) [m], opposite corner.
+        end_heading: [rad]; left free if not given.
+        settings: how the way is sought.
+
+    Raises:
+        ValueError: an argument or a setting is out of its range.
+        ModuleNotFoundError: numba is not installed.
+    """
+    start, meeting, lower, upper = (np.array(x, np.float64) for x in (start, meeting, lower, upper))
+    _require(start, meeting, lower, upper, curvature, body, end_heading, settings)
+    kernels = _kernels()
+    behind, ahead, half_width = map(float, body)
+    middle, half = 0.5 * (behind + ahead), 0.5 * (ahead - behind) / _DISCS
+    has_heading = end_heading is not None
+    heading = float(end_heading or 0.0)
+    direction = np.array([np.cos(heading), np.sin(heading)])
+    place = meeting - middle * direction if has_heading else meeting
+    places = middle + half * np.arange(1.0 - _DISCS, _DISCS, 2.0)
+    around = np.ceil(max(abs(middle), *abs(places - middle)) / settings.cell + 0.5)
+    corner = lower - around * settings.cell
+    shape = np.ceil((upper - corner) / settings.cell + around).astype(int) + 1
+    scene = kernels.Scene(
+        polygons=np.array(walls.vertices(0.0), np.float64),
+        present=np.array(walls.present, bool),
+        lower=lower,
+        upper=upper,
+        middle=middle,
+        places=places,
+        clear=float(np.hypot(half, half_width)) + settings.margin,
+        corner=corner,
+        shape=(int(shape[0]), int(shape[1])),
+    )
+    rules = kernels.Rules(
+        curvature=float(curvature),
+        cell=float(settings.cell),
+        headings=settings.headings,
+        price=float(settings.turn_price),
+        slack=float(settings.slack),
+        with_dubins=settings.heuristic != "grid",
+        with_grid=settings.heuristic != "dubins",
+        max_expansions=settings.max_expansions,
+    )
+    goal = kernels.Goal(np.append(place, heading), has_heading)
+    node_of = np.zeros(int(shape.prod()) * settings.headings, np.int32)
+    status, curvatures, lengths, cost, expansions = kernels.search(
+        start, goal, scene, rules, node_of
+    )
+    poses, bends = _sampled(start, curvatures, lengths, settings.poses)
+    found = status == kernels.FOUND
+    return HybridPath(
+        poses=poses,
+        curvature=bends,
+        length=float(lengths.sum()) if found else np.inf,
+        cost=float(cost),
+        expansions=int(expansions),
+        found=found,
+        blocked=status == kernels.BLOCKED,
+    )
+
+
+def _kernels() -> Any:
+    """The compiled loops; says what to install where numba is missing."""
+    try:
+        return importlib.import_module("planner_jax.baselines.intercept.hybrid_astar_kernels")
+    except ModuleNotFoundError as error:
+        if error.name != "numba":
+            raise
+        raise MissingExtra(
+            f"Hybrid A* and the planner paper need numba: {install_line('baselines')}",
+            name="numba",
+        ) from None
+
+
+def _require(start, meeting, lower, upper, curvature, body, end_heading, settings) -> None:
+    """Raises `ValueError` for what is out of its range."""
+    shapes = {
+        "start": (start, 3),
+        "meeting": (meeting, 2),
+        "lower": (lower, 2),
+        "upper": (upper, 2),
+    }
+    for name, (value, size) in shapes.items():
+        if value.shape != (size,) or not np.isfinite(value).all():
+            raise ValueError(f"{name} must be ({size},) and finite, got {value}")
+    if not (upper > lower).all():
+        raise ValueError(f"upper must be > lower, got {upper} and {lower}")
+    if not (body[0] < body[1] and body[2] > 0.0):
+        raise ValueError(f"body must be (behind, ahead > behind, half width > 0), got {body}")
+    if end_heading is not None and not np.isfinite(end_heading):
+        raise ValueError(f"end_heading must be finite, got {end_heading}")
+    positive = {"curvature": curvature, "cell": settings.cell}
+    for name, value in (positive | {"max_expansions": settings.max_expansions}).items():
+        if not (np.isfinite(value) and value > 0):
+            raise ValueError(f"{name} must be > 0 and finite, got {value}")
+    for name in ("turn_price", "slack", "margin"):
+        if not 0.0 <= getattr(settings, name) < np.inf:
+            raise ValueError(f"{name} must be >= 0 and finite, got {getattr(settings, name)}")
+    for name, least in (("headings", 8), ("poses", 2)):
+        if getattr(settings, name) < least:
+            raise ValueError(f"{name} must be >= {least}, got {getattr(settings, name)}")
+    if settings.heuristic not in HEURISTICS:
+        known = ", ".join(HEURISTICS)
+        raise ValueError(f"heuristic must be one of {known}, got {settings.heuristic!r}")
+
+
+def _sampled(
+    start: np.ndarray, curvatures: np.ndarray, lengths: np.ndarray, num: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Poses (num, 3) and curvatures (num,) at equal distances along arcs (P,) from a pose."""
+    if not len(lengths):
+        return np.full((num, 3), np.nan), np.full(num, np.nan)
+    ends = np.cumsum(lengths)
+    heading = start[2] + np.append(0.0, np.cumsum(curvatures * lengths))
+    steps = _chords(heading[:-1], curvatures, lengths)
+    corners = start[:2] + np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
+    stations = np.linspace(0.0, ends[-1], num)
+    part = np.minimum(np.searchsorted(ends, stations, side="right"), len(ends) - 1)
+    along = stations - np.append(0.0, ends)[part]
+    places = corners[part] + _chords(heading[part], curvatures[part], along)
+    turned = heading[part] + curvatures[part] * along
+    return np.concatenate([places, turned[:, None]], axis=1), curvatures[part]
+
+
+def _chords(heading: np.ndarray, curvature: np.ndarray, length: np.ndarray) -> np.ndarray:
+    """From begin to end (..., 2) [m] of arcs."""
+    half = 0.5 * curvature * length
+    chord = length * np.sinc(half / np.pi)
+    return chord[..., None] * np.stack([np.cos(heading + half), np.sin(heading + half)], axis=-1)

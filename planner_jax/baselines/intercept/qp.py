@@ -1,0 +1,274 @@
+"""Many convex quadratic programs that differ by their bounds alone, each solved exactly.
+
+    minimise x' Q x / 2   subject to   E x = e,   lower <= R x <= upper
+
+with Q, E and R constant, e, lower and upper free. All that depends on the matrices is done once, in
+double precision on the host: x = base e + Z y with Z' Q Z = 1 leaves the point y of least length
+between pairs of parallel planes. From y = 0, the optimum without bounds, the dual method of
+D. Goldfarb and A. Idnani (A numerically stable dual method for solving strictly convex quadratic
+programs, Mathematical Programming 27, 1983) takes one plane after another into its working set: as
+many steps as planes are active in the end, when none has to leave again. Its linear algebra is
+products with matrices, no factorisation, so that a batch is a batch of products.
+"""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array, lax
+
+from planner_jax.core.protocol import Status
+
+
+@struct.dataclass
+class QpTemplate:
+    """What programs of the same matrices share, made by `qp_template`, in double precision."""
+
+    base: Any  # (n, q), to the optimum without bounds, from e
+    base_cost: Any  # (q, q), its cost is e' base_cost e
+    directions: Any  # (n, d) Z
+    reach: Any  # (M, q), R x at the optimum without bounds, from e
+    normals: Any  # (M, d), rows of R Z as unit vectors; 0 where the equalities decide R x
+    scales: Any  # (M,), their lengths before; 1 where the equalities decide
+
+
+@struct.dataclass
+class QpSolution:
+    """One solution, or a batch of them with a leading axis on every leaf."""
+
+    point: Array  # (n,) x
+    cost: Array  # (), x' Q x / 2
+    multiplier: Array  # (M,), slope of the cost by a bound: > 0 lower, < 0 upper, 0 not active
+    violation: Array  # (), the largest excess over a bound, relative to 1 + |bound|
+    steps: Array  # () int32, planes taken up and dropped
+    status: Array  # () int32: CONVERGED, INFEASIBLE, MAX_STEPS or NON_FINITE of `Status`
+
+
+@dataclasses.dataclass(frozen=True)
+class QpConfig:
+    """Sizes of the method; what they leave unsolved has status MAX_STEPS."""
+
+    active: int = 64  # bounds that can be active at once; no more than the unknowns d
+    max_steps: int = 60
+
+
+def qp_template(hessian: Any, equalities: Any, rows: Any, zeros: Any = None) -> QpTemplate:
+    """What programs of these matrices share; NumPy, in double precision.
+
+    A term linear in x is a product with an unknown that an equality holds at 1.
+
+    Args:
+        hessian: (n, n) Q, symmetric, positive definite where E x = 0.
+        equalities: (q, n) E, independent rows.
+        rows: (M, n) R.
+        zeros: (z, n), more rows of equalities, whose right side is always 0.
+
+    Raises:
+        ValueError: the equalities depend on each other, or the cost has no single minimum; one
+            line.
+    """
+    q, e, r = (np.asarray(each, np.float64) for each in (hessian, equalities, rows))
+    given = len(e)
+    if zeros is not None:
+        e = np.concatenate([e, np.asarray(zeros, np.float64)])
+    _, singular, axes = np.linalg.svd(e)
+    if e.shape[0] > e.shape[1] or not singular.min() > 1e-12 * singular.max():
+        raise ValueError(f"equalities must be independent, got singular values from {singular[-1]}")
+    free = axes[len(singular) :].T
+    try:
+        factor = np.linalg.cholesky(free.T @ q @ free)
+    except np.linalg.LinAlgError:
+        raise ValueError("hessian must be positive definite where the equalities hold") from None
+    directions = np.linalg.solve(factor, free.T).T
+    base = np.linalg.pinv(e)[:, :given]
+    base = base - directions @ (directions.T @ q @ base)
+    normals = r @ directions
+    scales = np.linalg.norm(normals, axis=1)
+    is_decided = scales <= 1e-9 * scales.max(initial=0.0)
+    normals[is_decided], scales[is_decided] = 0.0, 1.0
+    return QpTemplate(
+        base=base,
+        base_cost=0.5 * base.T @ q @ base,
+        directions=directions,
+        reach=r @ base,
+        normals=normals / scales[:, None],
+        scales=scales,
+    )
+
+
+@struct.dataclass
+class _Search:
+    """One program on its way: a point, and the working set of planes on which it is optimal."""
+
+    point: Array  # (d,) y
+    excess: Array  # (M,), how far it is beyond the nearer plane of each pair, above the tolerance
+    maps: Array  # (d + A, d): projector off the working set's normals, and their pseudo-inverse
+    rows: Array  # (A,) int32, which planes are in the working set
+    sides: Array  # (A,), 1 for a lower bound, -1 for an upper one, 0 for none: the slot is free
+    multipliers: Array  # (A,)
+    held: Array  # (M,) bool, which rows are in the working set
+    entering: Array  # () int32, the plane that is being taken up, -1 before it is chosen
+    pressure: Array  # (), its multiplier so far
+    steps: Array  # () int32
+    status: Array  # () int32: MAX_STEPS until no step can lead on or there is no place left
+    is_stuck: Array  # () bool
+
+
+def solve_qp(
+    template: QpTemplate,
+    right_side: Array,
+    lower: Array,
+    upper: Array,
+    config: QpConfig = QpConfig(),
+) -> QpSolution:
+    """The optimum of one program; differentiable by the right side and the bounds.
+
+    Derivatives are those at a fixed working set, which are the true ones wherever no active bound
+    has a multiplier of zero. In single precision the cost is right to some 1e-6.
+
+    Args:
+        template: of the matrices.
+        right_side: (q,) e.
+        lower: (M,), -inf for none.
+        upper: (M,), inf for none.
+        config: sizes.
+
+    Returns:
+        The solution; of a program without one the best point that was found. Rows whose value
+        the equalities decide count in `violation`, and can be the reason why there is none.
+    """
+    dtype = lower.dtype
+    t: QpTemplate = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), template)
+    unbounded = _product(t.reach, right_side)
+    # Bounds of unit normals on y, and what of them rounding may exceed.
+    low, high = (lower - unbounded) / t.scales, (upper - unbounded) / t.scales
+    eps = jnp.finfo(dtype).eps
+    slack = 16.0 * eps * (1.0 + jnp.where(jnp.isfinite(low), jnp.abs(low), 0.0))
+    slack = slack + 16.0 * eps * jnp.where(jnp.isfinite(high), jnp.abs(high), 0.0)
+    is_free = jnp.any(t.normals != 0.0, axis=1)
+    search = _searched(t.normals, is_free, *lax.stop_gradient((low, high, slack)), config)
+
+    inverse = search.maps[t.normals.shape[1] :]  # (A, d)
+    is_lower, is_upper = search.sides > 0.0, search.sides < 0.0
+    target = jnp.where(is_upper, -high[search.rows], low[search.rows])
+    target = jnp.where(is_lower | is_upper, target, 0.0)
+    point = _product(target, inverse)
+    missing = target - search.sides * _product(t.normals, point)[search.rows]
+    point = point + _product(missing, inverse)
+
+    reached = unbounded + t.scales * _product(t.normals, point)
+    excess = jnp.maximum(
+        jnp.where(jnp.isfinite(lower), (lower - reached) / (1.0 + jnp.abs(lower)), -jnp.inf),
+        jnp.where(jnp.isfinite(upper), (reached - upper) / (1.0 + jnp.abs(upper)), -jnp.inf),
+    )
+    cost = _product(right_side, _product(t.base_cost, right_side)) + 0.5 * jnp.sum(point**2)
+    pressure = search.sides * _product(inverse, point)
+    is_row = search.rows[:, None] == jnp.arange(lower.shape[0])
+    multiplier = jnp.sum(jnp.where(is_row, pressure[:, None], 0.0), axis=0) / t.scales
+    violation = jnp.max(excess, initial=0.0)
+    is_over = jnp.max(search.excess) > 0.0
+    status = jnp.where(is_over, search.status, Status.CONVERGED)
+    status = jnp.where(violation > 1e-5, jnp.maximum(status, Status.INFEASIBLE), status)
+    status = jnp.where(jnp.isfinite(cost + violation), status, Status.NON_FINITE)
+    return QpSolution(
+        point=_product(t.base, right_side) + _product(t.directions, point),
+        cost=cost,
+        multiplier=multiplier,
+        violation=violation,
+        steps=search.steps,
+        status=status.astype(jnp.int32),
+    )
+
+
+def _searched(
+    normals: Array, is_free: Array, low: Array, high: Array, slack: Array, config: QpConfig
+) -> _Search:
+    """The dual method, from the empty working set to the optimum."""
+    num, size = normals.shape
+    slots = min(config.active, size)
+    dtype = normals.dtype
+    rounding = jnp.asarray(float(jnp.finfo(dtype).eps) ** 0.7, dtype)
+
+    def excess_of(reached: Array) -> Array:
+        return jnp.where(is_free, jnp.maximum(low - reached, reached - high) - slack, -jnp.inf)
+
+    def is_running(s: _Search) -> Array:
+        is_optimal = (s.entering < 0) & ~(jnp.max(s.excess) > 0.0)
+        return ~is_optimal & ~s.is_stuck & (s.steps < config.max_steps)
+
+    def step(s: _Search) -> _Search:
+        row = jnp.where(s.entering < 0, lax.argmax(s.excess, 0, jnp.int32), s.entering)
+        normal = normals[row]
+        reached = jnp.sum(normal * s.point)
+        side = jnp.where(low[row] - reached > reached - high[row], 1.0, -1.0).astype(dtype)
+        gap = jnp.maximum(low[row] - reached, reached - high[row])
+        # Where the point moves as the plane is taken up, and how fast multipliers fall.
+        both = _product(s.maps, side * normal)
+        move, fall = both[:size], both[size:]
+        freedom = jnp.sum(move**2)
+        is_movable = freedom > rounding
+        taken = s.sides != 0.0
+        until = jnp.where(taken & (fall > rounding), s.multipliers / fall, jnp.inf)
+        loser = lax.argmin(until, 0, jnp.int32)
+        full = jnp.where(is_movable, gap / freedom, jnp.inf)
+        is_added = full <= until[loser]
+        length = jnp.minimum(full, until[loser])
+        place = jnp.where(is_added, lax.argmin(taken.astype(jnp.int32), 0, jnp.int32), loser)
+        is_hopeless = ~jnp.isfinite(length)
+        is_stuck = is_hopeless | (is_added & taken[place])
+        length = jnp.where(is_stuck, 0.0, length)
+
+        # Both a plane more and a plane less change the maps by a product of two vectors.
+        lost = s.maps[size + loser]
+        other = jnp.where(is_added, both, _product(s.maps, lost))
+        axis = jnp.where(is_added, move, lost)
+        is_place = jnp.arange(slots) == place
+        kept = jnp.concatenate(
+            [jnp.where(is_added, 0.0, lost), (is_added & is_place).astype(dtype)]
+        )
+        maps = s.maps + (kept - other)[:, None] * (axis / jnp.sum(axis**2))
+
+        point = s.point + jnp.where(is_movable, length, 0.0) * move
+        pressure = s.pressure + length
+        multipliers = jnp.maximum(s.multipliers - length * fall, 0.0)
+        gone = jnp.where(is_added, num, s.rows[place])
+        held = (s.held | (is_added & (jnp.arange(num) == row))) & (jnp.arange(num) != gone)
+        excess = jnp.where(held, -jnp.inf, excess_of(_product(normals, point)))
+        return _Search(
+            point=point,
+            excess=excess,
+            maps=jnp.where(is_stuck, s.maps, maps),
+            rows=jnp.where(is_place & is_added & ~is_stuck, row, s.rows),
+            sides=jnp.where(is_place & ~is_stuck, jnp.where(is_added, side, 0.0), s.sides),
+            multipliers=jnp.where(is_place, jnp.where(is_added, pressure, 0.0), multipliers),
+            held=held,
+            entering=jnp.where(is_added & ~is_stuck, -1, row),
+            pressure=jnp.where(is_added, 0.0, pressure),
+            steps=s.steps + 1,
+            status=jnp.where(is_hopeless, Status.INFEASIBLE, Status.MAX_STEPS).astype(jnp.int32),
+            is_stuck=is_stuck,
+        )
+
+    maps = jnp.concatenate([jnp.eye(size, dtype=dtype), jnp.zeros((slots, size), dtype)])
+    start = _Search(
+        point=jnp.zeros(size, dtype),
+        excess=excess_of(jnp.zeros(num, dtype)),
+        maps=maps,
+        rows=jnp.zeros(slots, jnp.int32),
+        sides=jnp.zeros(slots, dtype),
+        multipliers=jnp.zeros(slots, dtype),
+        held=jnp.zeros(num, bool),
+        entering=jnp.asarray(-1, jnp.int32),
+        pressure=jnp.zeros((), dtype),
+        steps=jnp.asarray(0, jnp.int32),
+        status=jnp.asarray(Status.MAX_STEPS, jnp.int32),
+        is_stuck=jnp.asarray(False),
+    )
+    return lax.while_loop(is_running, step, start)
+
+
+def _product(a: Array, b: Array) -> Array:
+    return jnp.matmul(a, b, precision=lax.Precision.HIGHEST)

@@ -1,0 +1,70 @@
+"""Seeded problems of speed planning, for a comparison like Table II of paper 003."""
+
+from typing import Any
+
+import jax
+import numpy as np
+
+from planner_jax.baselines.intercept.station_time import Blocked, StationTimeProblem, reference_line
+
+_BLOCK = 256  # problems drawn at once
+_MOST = 3  # polygons of one problem
+
+
+def speed_problems(num: int, seed: int = 0, *, dtype: Any = np.float32) -> StationTimeProblem:
+    """Problems with the setting of paper 003, Section V-C, and one to three random parallelograms.
+
+    6 m in 10 s, beginning with 0.5 m/s and no acceleration. The limits, 1.5 m/s and 2 m/s^2, and
+    the parallelograms are assumptions: centres at 1 to 5 m and 1.5 to 8.5 s, 0.6 to 1.5 m high and
+    1 to 2.5 s long, moving at -0.3 to 0.5 m/s. Only problems through which dynamic programming on
+    the default grid finds a line are kept. The first ones are the same whatever `num` is.
+
+    Args:
+        num: how many.
+        seed: of NumPy's generator.
+        dtype: of every floating leaf.
+
+    Returns:
+        Leaves with a leading axis `num`, NumPy arrays.
+    """
+    found = jax.jit(jax.vmap(lambda problem: reference_line(problem).found))
+    rng = np.random.default_rng(seed)
+    kept, have = [], 0
+    while have < num:
+        block = _drawn(rng)
+        places = np.flatnonzero(found(_as(block, np.float32)))
+        kept.append(jax.tree.map(lambda leaf, places=places: leaf[places], block))
+        have += places.size
+    return _as(jax.tree.map(lambda *parts: np.concatenate(parts)[:num], *kept), dtype)
+
+
+def _as(problems: StationTimeProblem, dtype: Any) -> StationTimeProblem:
+    return jax.tree.map(
+        lambda leaf: leaf.astype(dtype) if leaf.dtype == np.float64 else leaf, problems
+    )
+
+
+def _drawn(rng: np.random.Generator) -> StationTimeProblem:
+    """One block of problems, whether or not there is a line through them, in double precision."""
+    shape = (_BLOCK, _MOST)
+    num = rng.integers(1, _MOST + 1, _BLOCK)
+    station, time = rng.uniform(1.0, 5.0, shape), rng.uniform(1.5, 8.5, shape)
+    height, duration = rng.uniform(0.6, 1.5, shape), rng.uniform(1.0, 2.5, shape)
+    rise = rng.uniform(-0.3, 0.5, shape) * duration
+    middle = station[..., None] + rise[..., None] * np.array([-0.5, 0.5])
+    polygons: dict[str, Any] = {
+        "start": time - 0.5 * duration,
+        "end": time + 0.5 * duration,
+        "lower": middle - 0.5 * height[..., None],
+        "upper": middle + 0.5 * height[..., None],
+        "present": np.arange(_MOST) < num[:, None],
+    }
+    others: dict[str, Any] = {
+        "end_station": np.full(_BLOCK, 6.0),
+        "horizon": np.full(_BLOCK, 10.0),
+        "initial_speed": np.full(_BLOCK, 0.5),
+        "initial_acceleration": np.zeros(_BLOCK),
+        "speed_limit": np.full((_BLOCK, 1), 1.5),
+        "acceleration_limit": np.full(_BLOCK, 2.0),
+    }
+    return StationTimeProblem(blocked=Blocked(**polygons), **others)

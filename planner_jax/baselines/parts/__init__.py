@@ -1,0 +1,1 @@
+"""Motion primitives that several published methods share."""

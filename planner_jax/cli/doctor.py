@@ -1,0 +1,132 @@
+"""`planner-jax doctor`: is this machine fit for planning? Facts, and one timed plan."""
+
+import dataclasses
+import os
+import platform
+import time
+from collections.abc import Iterator
+
+from planner_jax.core.registry import install_line
+from planner_jax.host.compile_cache import keep_compiled_programs
+from planner_jax.host.processors import usable_cores
+from planner_jax.runs.environment import environment, require_backend
+
+_BATCH = 1024  # hits that are planned and refereed
+# Products in float32 err by some 1e-7; those in the ten bits of TF32 by some 1e-3.
+_FULL_PRECISION = 1e-5
+
+
+@dataclasses.dataclass(frozen=True)
+class Finding:
+    """One line of the report."""
+
+    name: str
+    text: str
+    good: bool = True
+
+
+def examine() -> Iterator[Finding]:
+    """Look at versions, devices, precision, cache and plans, one after another.
+
+    Raises:
+        SettingError: JAX has no platform that works.
+    """
+    require_backend()
+    folder = keep_compiled_programs()
+    found = environment()
+    versions = {name: version or "not installed" for name, version in found["versions"].items()}
+    yield Finding("versions", ", ".join(f"{name} {version}" for name, version in versions.items()))
+    system = f"{found['device']['system']} {found['device']['machine']}, {usable_cores()} cores"
+    yield Finding("system", f"{system}, load average {os.getloadavg()[0]:.1f}")
+    yield _devices()
+    yield _kernels()
+    yield _precision()
+    yield _cache(folder)
+    yield from _plans()
+
+
+def _devices() -> Finding:
+    import jax
+
+    devices = jax.local_devices()
+    memory = (devices[0].memory_stats() or {}).get("bytes_limit")
+    text = f"{len(devices)} x {devices[0].device_kind} ({devices[0].platform})"
+    if memory:
+        text += f", {memory / 2**30:.0f} GiB for JAX each"
+    if devices[0].platform == "cpu" and os.path.exists("/dev/nvidia0"):
+        hint = f"; there is an NVIDIA GPU that JAX does not use: {install_line('gpu')}"
+        return Finding("devices", text + hint, good=False)
+    return Finding("devices", text)
+
+
+def _kernels() -> Finding:
+    """Whether kernels take the place of JAX's operations, which on a GPU makes plans quicker."""
+    from planner_jax.lanes import pallas
+
+    state = pallas.kernels()
+    if not pallas.has_gpu():
+        return Finding("kernels", f"{state.value}; JAX has no GPU to use them on")
+    return Finding("kernels", state.value, good=state is not pallas.Kernels.MISSING)
+
+
+def _precision() -> Finding:
+    import jax.numpy as jnp
+    import numpy as np
+    from jax import lax
+
+    left, right = np.random.default_rng(0).standard_normal((2, 256, 256)).astype(np.float32)
+    exact = left.astype(float) @ right.astype(float)
+
+    def error(precision: lax.Precision) -> float:
+        product = np.asarray(jnp.matmul(left, right, precision=precision))
+        return float(np.max(np.abs(product - exact)) / np.max(np.abs(exact)))
+
+    ours, unasked = error(lax.Precision.HIGHEST), error(lax.Precision.DEFAULT)
+    text = f"float32 products err by {ours:.0e}; unasked JAX would err by {unasked:.0e}"
+    return Finding("precision", text, good=ours < _FULL_PRECISION)
+
+
+def _cache(folder) -> Finding:
+    if folder is None:
+        return Finding("cache", "no folder for compiled programs can be made", good=False)
+    entries = [entry for entry in folder.iterdir() if entry.is_file()]
+    size = sum(entry.stat().st_size for entry in entries) / 2**20
+    return Finding(
+        "cache", f"{len(entries)} files, {size:.0f} MiB of compiled programs in {folder}"
+    )
+
+
+def _plans() -> Iterator[Finding]:
+    """A hit alone and hits in a batch, timed cold and warm and judged by the referee."""
+    import jax
+    import numpy as np
+
+    from planner_jax.core.protocol import lane
+    from planner_jax.core.registry import task_named
+    from planner_jax.planning.plan import plan
+
+    hit = task_named("hit")
+    planner, batch = hit.planner(), jax.tree.map(np.asarray, hit.draw(_BATCH))
+    for name, cases in (("one plan", lane(batch, 0)), (f"{_BATCH} plans", batch)):
+        seconds = []
+        for _ in range(6):
+            began = time.perf_counter()
+            plans = plan(planner, cases)
+            seconds.append(time.perf_counter() - began)
+        success = float(np.mean(hit.judge(cases, plans).success))
+        text = (
+            f"{1e3 * min(seconds[1:]):.2f} ms (the first call, with what had to be compiled, "
+            f"{seconds[0]:.1f} s); the referee accepts {100.0 * success:.1f} %"
+        )
+        yield Finding(name, text, good=success > 0.99)
+
+
+def report() -> bool:
+    """Print the findings as they are made; whether all are good."""
+    print(f"planner-jax doctor, Python {platform.python_version()}")
+    good = True
+    for finding in examine():
+        mark = "ok " if finding.good else "BAD"
+        print(f"{mark}  {finding.name:<12} {finding.text}", flush=True)
+        good &= finding.good
+    return good

@@ -1,0 +1,253 @@
+"""The command `planner-jax library`: builds, shows, checks and repairs libraries of blocks."""
+
+import math
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from planner_jax.baselines.block.library.build import build, repair
+from planner_jax.baselines.block.library.cells import LAYOUTS, Face
+from planner_jax.baselines.block.library.coverage import Coverage, check, coverage
+from planner_jax.baselines.block.library.file import load_library, save_library
+from planner_jax.baselines.block.library.table import Library, Setting, fingerprint
+from planner_jax.host.memory import require_memory
+from planner_jax.robot.arm import REGIMES
+from planner_jax.robot.arm_mjcf import irb1600, read_arm
+from planner_jax.runs import style
+from planner_jax.runs.environment import require_backend
+from planner_jax.runs.settings import (
+    SettingError,
+    require,
+    require_count,
+    require_one_of,
+    require_seed,
+)
+from planner_jax.sweep.block.settings import BlockSettings
+from planner_jax.task.block.scene import paper_scene
+
+
+def build_library(
+    path: str,
+    *,
+    layout: str = "full",
+    regime: str = "R2",
+    pole: bool = True,
+    arm: str | None = None,
+    home: Sequence[float] | None = None,
+) -> None:
+    """Build a library in the scene of paper 004, or go on with one that was interrupted.
+
+    Args:
+        path: of its file.
+        layout: a key of `LAYOUTS`.
+        regime: a key of `REGIMES`.
+        pole: whether the pole stands.
+        arm: path of an MJCF file; the IRB 1600 if not given.
+        home: angles [rad], six for each home; the arm's own if not given.
+
+    Raises:
+        SettingError: an argument breaks a rule; one line.
+    """
+    require_one_of(LAYOUTS, "layout", layout)
+    require_one_of(REGIMES, "regime", regime)
+    require(
+        home is None or (len(home) > 0 and len(home) % 6 == 0),
+        "home",
+        "six angles for each home",
+        f"{len(home or ())} numbers",
+    )
+    finite = home is None or all(map(math.isfinite, home))
+    require(finite, "home", "finite angles", " ".join(map(str, home or ())))
+    if Path(path).exists():
+        _loaded(path)  # lest a file of another kind be lost
+    require_backend()
+    try:
+        body = irb1600() if arm is None else read_arm(arm)
+    except ValueError as error:
+        raise SettingError(f"arm {error}") from None
+    except OSError as error:
+        raise SettingError(f"arm must be a file, got {arm!r} ({error.strerror})") from None
+    chosen: Any = REGIMES[regime]
+    at_rest: Any = np.asarray(chosen.ends_at_rest)
+    scene = paper_scene(has_pole=pole)
+    setting = Setting(arm=body, limits=chosen.limits, ends_at_rest=at_rest, scene=scene)
+    homes = np.reshape(body.home if home is None else home, (-1, 6))
+    began = time.perf_counter()
+    try:
+        library = build(path, setting, homes, LAYOUTS[layout])
+    except ValueError as error:
+        raise SettingError(str(error)) from None
+    print(f"Built in {time.perf_counter() - began:.1f} s, compilation included.")
+    _print(path, library, coverage(library))
+
+
+def show_library(path: str, *, map: str | None = None) -> None:
+    """Print what a library covers, and draw a map of it if asked.
+
+    Args:
+        path: of its file.
+        map: path of a picture, PNG.
+    """
+    library = _loaded(path)
+    covered = coverage(library)
+    _print(path, library, covered)
+    if map is not None:
+        style.draw(Path(map), coverage_map, (12.0, 7.0), library, covered)
+        print(f"Map: {map}")
+
+
+def check_library(path: str, *, num: int = 2000, seed: int = 0) -> None:
+    """Have the referee judge the stored motions as answers to random balls.
+
+    Args:
+        path: of its file.
+        num: balls for each home.
+        seed: of the balls.
+    """
+    require_count("num", num, 1)
+    require_seed(seed)
+    try:
+        require_memory("num", num, BlockSettings.CASE_BYTES)
+    except ValueError as error:
+        raise SettingError(str(error)) from None
+    library = _loaded(path)
+    require_backend()
+    for home in range(len(library.table.homes)):
+        try:
+            found = check(library, num, seed, home)
+        except ValueError as error:
+            raise SettingError(str(error)) from None
+        blocked = found.verdict.success
+        wrong = found.claimed & ~blocked
+        print(
+            f"Home {home}: {num} balls through tunnels with a motion; the referee says that "
+            f"{100 * blocked.mean():.2f} % are blocked. Of {found.claimed.sum()} claims it refuses "
+            f"{wrong.sum()}."
+        )
+        for k in np.flatnonzero(wrong)[:5]:
+            print(f"  pair {found.pairs[k]}: {found.verdict.sentence(int(k))}")
+
+
+def repair_library(path: str, *, pole: Sequence[float], out: str, retry: bool = False) -> None:
+    """Plan anew what touches a pole that has moved.
+
+    Args:
+        path: of the library's file.
+        pole: where it stands now, (2,) [m].
+        out: path of the new file.
+        retry: whether to try pairs without a motion again.
+    """
+    library = _loaded(path)
+    require(len(pole) == 2, "pole", "two numbers [m]", f"{len(pole)} numbers")
+    require(bool(np.isfinite(pole).all()), "pole", "finite", list(pole))
+    require_backend()
+    place: Any = np.asarray(pole, np.float32)
+    there: Any = np.asarray(True)
+    scene = library.setting.scene.replace(pole=place, has_pole=there)  # type: ignore[attr-defined]
+    began = time.perf_counter()
+    try:
+        repaired, touched = repair(library, scene, retry=retry)
+    except ValueError as error:
+        raise SettingError(str(error)) from None
+    save_library(out, repaired)
+    print(
+        f"Planned {touched.sum()} of {library.found.sum()} motions anew in "
+        f"{time.perf_counter() - began:.1f} s, compilation included."
+    )
+    _print(out, repaired, coverage(repaired))
+
+
+def _loaded(path: str) -> Library:
+    try:
+        return load_library(path)
+    except ValueError as error:
+        raise SettingError(str(error)) from None
+
+
+def _print(path: str, library: Library, covered: Coverage) -> None:
+    """What is in a library, in lines."""
+    table, setting = library.table, library.setting
+    faces = [
+        " ".join(f"{face.name} {face.cells[0]}x{face.cells[1]}" for face in side)
+        for side in (table.layout.outer, table.layout.inner)
+    ]
+    print(f"{path}: {table.layout.num_pairs} pairs of cells, outer {faces[0]}; inner {faces[1]}")
+    print(f"Setting {fingerprint(setting)}, {library.num_bytes / 1e6:.1f} MB.")
+    limits = setting.limits
+    ends = "at rest" if setting.ends_at_rest else "in motion"
+    velocity = " ".join(f"{x:.3g}" for x in np.asarray(limits.velocity))
+    acceleration = " ".join(f"{x:.3g}" for x in np.asarray(limits.acceleration))
+    print(f"Joints up to {velocity} rad/s and {acceleration} rad/s^2; motions end {ends}.")
+    scene = setting.scene
+    x, y = np.asarray(scene.pole)
+    print(f"Pole at ({x:.3f}, {y:.3f}) m." if scene.has_pole else "No pole.")
+    of_all = covered.found.mean(axis=1)
+    of_feasible, of_centred = (
+        covered.share(of) for of in (covered.is_feasible, covered.is_centred)
+    )
+    sure = covered.is_sure.sum(axis=1) / np.maximum(covered.found.sum(axis=1), 1)
+    print(
+        f"Balls can pass through {covered.is_feasible.sum()} pairs, from the middle of the outer "
+        f"cell through {covered.is_centred.sum()}."
+    )
+    for home, angles in enumerate(np.asarray(table.homes)):
+        print(
+            f"Home {home} ({' '.join(f'{x:.4f}' for x in angles)}): motions for "
+            f"{100 * of_feasible[home]:.1f} % of these, {100 * of_centred[home]:.1f} % of those, "
+            f"{100 * of_all[home]:.1f} % of all; {100 * sure[home]:.1f} % of the shields block "
+            "their whole tunnel."
+        )
+
+
+def coverage_map(figure: Figure, library: Library, covered: Coverage) -> None:
+    """Each face with cells: what share of a cell's feasible pairs has a motion from any home.
+
+    Args:
+        figure: empty.
+        library: that is shown.
+        covered: what it covers.
+    """
+    layout, scene = library.table.layout, library.setting.scene
+    shape = (layout.num_outer, layout.num_inner)
+    found = covered.found.any(axis=0).reshape(shape)
+    feasible = covered.is_feasible.reshape(shape)
+    sides = ((layout.outer, scene.outer, 1, "outer"), (layout.inner, scene.inner, 0, "inner"))
+    columns = max(len(faces) for faces, *_ in sides)
+    panels = figure.subplots(2, columns, squeeze=False)
+    picture = None
+    for row, (faces, box, axis, name) in zip(panels, sides, strict=True):
+        possible = feasible.sum(axis=axis)
+        share = (found & feasible).sum(axis=axis) / np.maximum(possible, 1)
+        values = np.where(possible > 0, 100.0 * share, np.nan)
+        begin = 0
+        for panel, face in zip(row, faces, strict=False):
+            cells = values[begin : begin + face.num].reshape(face.cells)
+            picture = panel.imshow(
+                cells.T,
+                origin="lower",
+                vmin=80.0,
+                vmax=100.0,
+                cmap="viridis",
+                extent=_ends(face, box),
+            )
+            first, second = ("xyz"[each] for each in face.across)
+            style.label(panel, f"{first} [m]", f"{second} [m]", f"{name} {face.name}")
+            panel.grid(False)
+            begin += face.num
+        for panel in row[len(faces) :]:
+            panel.set_axis_off()
+    if picture is not None:
+        figure.colorbar(picture, ax=panels, label="pairs with a motion, % of those possible")
+
+
+def _ends(face: Face, box: Any) -> tuple[float, float, float, float]:
+    """Where a face begins and ends along its two axes [m]."""
+    (left, bottom), (right, top) = (
+        (float(side[face.across[0]]), float(side[face.across[1]]))
+        for side in (box.lower, box.upper)
+    )
+    return left, right, bottom, top

@@ -1,0 +1,1 @@
+"""The contract of planners, cases and tasks: statuses, rules, checks, registry, plan files."""

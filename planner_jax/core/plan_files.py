@@ -1,0 +1,146 @@
+"""Dataclasses of arrays as NumPy's .npz files: names of the fields, a version, and no pickle."""
+
+import contextlib
+import dataclasses
+import json
+import os
+import struct
+import typing
+import zipfile
+import zlib
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+
+from planner_jax.core.checks import require_path_name
+from planner_jax.host.files import open_plain, replacing
+
+VERSION = 1
+# What NumPy and the archive that it reads may raise of a damaged file.
+UNREADABLE = (
+    *(OSError, ValueError, KeyError, TypeError, EOFError, RuntimeError, MemoryError),
+    *(zipfile.BadZipFile, zlib.error, struct.error),
+)
+_HEADER = "header"
+Kind = TypeVar("Kind")
+
+
+class PlanFileError(ValueError):
+    """A file cannot be read as plans; one line that names the file."""
+
+
+def save_arrays(path: str | os.PathLike, tree: Any) -> None:
+    """Write a dataclass, the leaves of which are arrays or such dataclasses, whole or not at all.
+
+    Args:
+        path: of the file; its name is taken as it is.
+        tree: the dataclass.
+
+    Raises:
+        TypeError: a leaf is not an array of numbers, or the path is none.
+    """
+    require_path_name("path", path)
+    header = json.dumps({"version": VERSION, "class": type(tree).__name__})
+    arrays: dict[str, Any] = {name: np.asarray(leaf) for name, leaf in named_leaves(tree).items()}
+    for name, array in arrays.items():
+        if array.dtype.kind in "OSU":  # objects NumPy would pickle
+            raise TypeError(f"{name} must be an array of numbers, got {array.dtype}")
+    with replacing(path) as scratch, open(scratch, "wb") as file:
+        np.savez(file, **{_HEADER: np.array(header), **arrays})
+
+
+def load_arrays(path: str | os.PathLike, kind: type[Kind]) -> Kind:
+    """The dataclass that `save_arrays` wrote, NumPy leaves.
+
+    Raises:
+        PlanFileError: the file is something else, of another class or of another version.
+        TypeError: the path is none.
+    """
+    require_path_name("path", path)
+    version, name, arrays = _read(path)
+    if version != VERSION or name != kind.__name__:
+        raise PlanFileError(
+            f"path must be a file of {kind.__name__} of version {VERSION}, got {name} of version "
+            f"{version} in {str(path)!r}"
+        )
+    try:
+        tree = _tree(kind, "", arrays)
+    except KeyError as error:
+        raise PlanFileError(f"path must hold {error.args[0]}, got {str(path)!r}") from None
+    if arrays:
+        raise PlanFileError(f"path must not hold {', '.join(arrays)}, got {str(path)!r}")
+    return tree
+
+
+def load_fitting(path: str | os.PathLike, kinds: Sequence[type[Kind]]) -> Kind:
+    """What `save_arrays` wrote, as the first of some classes all of whose fields the file has.
+
+    A class that was derived from one of them is read as that one, without its own fields.
+
+    Raises:
+        PlanFileError: the file is something else, of none of the classes or of another version.
+    """
+    version, name, arrays = _read(path)
+    if version == VERSION:
+        for kind in kinds:
+            with contextlib.suppress(KeyError):
+                return _tree(kind, "", dict(arrays))
+    names = " or ".join(kind.__name__ for kind in kinds)
+    raise PlanFileError(
+        f"path must be a file of {names} of version {VERSION}, got {name} of version {version} in "
+        f"{str(path)!r}"
+    )
+
+
+def _read(path: str | os.PathLike) -> tuple[Any, Any, dict[str, np.ndarray]]:
+    """Version and name of the class in a file, and its arrays.
+
+    Raises:
+        PlanFileError: the file is something else.
+    """
+    try:
+        # NumPy leaves open a broken file that it has opened itself.
+        with open_plain(path) as raw, np.load(raw, allow_pickle=False) as file:
+            arrays = dict(file)
+        header = json.loads(str(arrays.pop(_HEADER)))
+        version, name = header["version"], header["class"]
+    except UNREADABLE as error:
+        if isinstance(error, FileNotFoundError):
+            raise PlanFileError(f"path must be a file of plans, got {str(path)!r}") from None
+        raise PlanFileError(
+            f"path must be a whole file of plans, got {str(path)!r} ({type(error).__name__})"
+        ) from None
+    return version, name, arrays
+
+
+def named_leaves(tree: Any, prefix: str = "") -> dict[str, Any]:
+    """The arrays of a dataclass by their names, joined by dots; without what is static or None."""
+    named = {}
+    for field in dataclasses.fields(tree):
+        if field.metadata.get("pytree_node", True):
+            value = getattr(tree, field.name)
+            place = prefix + field.name
+            if value is None and field.default is None:
+                continue
+            inner = dataclasses.is_dataclass(value)
+            named |= named_leaves(value, f"{place}.") if inner else {place: value}
+    return named
+
+
+def _tree(kind: Any, prefix: str, arrays: dict[str, np.ndarray]) -> Any:
+    """A dataclass of the arrays of its names, which are taken out."""
+    types = typing.get_type_hints(kind)
+    values = {}
+    for field in dataclasses.fields(kind):
+        inner, place = types[field.name], prefix + field.name
+        if type(None) in typing.get_args(inner):
+            inner = next(each for each in typing.get_args(inner) if each is not type(None))
+            if not any(f"{name}.".startswith(f"{place}.") for name in arrays):
+                values[field.name] = None
+                continue
+        if isinstance(inner, type) and dataclasses.is_dataclass(inner):
+            values[field.name] = _tree(inner, f"{place}.", arrays)
+        else:
+            values[field.name] = arrays.pop(place)
+    return kind(**values)

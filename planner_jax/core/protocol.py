@@ -1,0 +1,373 @@
+"""What `plan` asks of a planner and of a decision, and what comes back for every case.
+
+A planner is a pytree: sizes and switches are static, arrays such as a library of motions or the
+weights of a network are leaves, so that other arrays of the same shapes compile nothing anew. A
+frozen dataclass of sizes and switches alone is made one by `jax.tree_util.register_static`.
+
+There are four kinds, and `plan` takes them all. A `Planner` solves one case at a time in a pure
+function. A `LanesPlanner` also solves a batch in a layout of its own. A `HostPlanner` works on
+NumPy arrays on the host, with whatever library it likes. A `CompositePlanner` has other planners
+do the work. Planners that minimise an objective inherit all of it from
+`planner_jax.optimise.planner.OptimisedPlanner`.
+"""
+
+import dataclasses
+import enum
+import os
+from collections.abc import Sequence
+from typing import Any, Protocol, Self, TypeVar, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+from planner_jax.core.checks import (
+    numeric,
+    require_kind,
+    require_number,
+    require_size,
+    require_switch,
+    told,
+)
+from planner_jax.core.plan_files import load_arrays, save_arrays
+from planner_jax.core.rules import has_rules, is_sound
+
+
+class Status(enum.IntEnum):
+    """What became of one case; `message` says what it means and what to do about it."""
+
+    CONVERGED = 0
+    FEASIBLE = 1
+    INFEASIBLE = 2
+    MAX_STEPS = 3
+    NON_FINITE = 4
+    OUT_OF_REACH = 5
+    NO_PATH = 6
+    BLOCKED = 7
+    BAD_INPUT = 8
+    TOO_FAR = 9
+    OUT_OF_TIME = 10
+
+    @property
+    def message(self) -> str:
+        """A sentence for the user, with the remedy."""
+        return _MESSAGES[self]
+
+    @classmethod
+    def _missing_(cls, value: Any) -> "Status | None":
+        """The status that a jax array of one number holds; arrays are no keys of the lookup."""
+        return next((status for status in cls if status == value), None)
+
+
+_MESSAGES = {
+    Status.CONVERGED: "stationary, and every limit holds",
+    Status.FEASIBLE: "every limit holds; more iterations may lower the cost",
+    Status.INFEASIBLE: "stationary with a limit exceeded; try more starts, or relax the limit",
+    Status.MAX_STEPS: "out of iterations with a limit exceeded; allow more iterations or starts",
+    Status.NON_FINITE: "the cost of the plan is not finite; bring the case's numbers nearer to one",
+    Status.OUT_OF_REACH: "a target never comes within reach; `closest_approach` says by how much",
+    Status.NO_PATH: "no way was found through the obstacles in time; allow more time",
+    Status.BLOCKED: "the start or the goal lies in an obstacle or off the map; move it",
+    Status.BAD_INPUT: "a number of the case is absurd; `pj.require_sound(cases)` names it",
+    Status.TOO_FAR: "no plan exists: at no time is a target where the robot can be by then; allow "
+    "more speed or acceleration, or start nearer",
+    Status.OUT_OF_TIME: "a limit is exceeded, and `time_limit` ended the search; allow more time",
+}
+
+
+def is_solved(status: Any) -> Any:
+    """Which statuses are those of a plan that meets every limit the planner looked at."""
+    return (status == Status.CONVERGED) | (status == Status.FEASIBLE)
+
+
+def is_unsolved(status: Any) -> Any:
+    """Which statuses are worth another attempt: not solved, but neither broken nor hopeless."""
+    worth = (status == Status.INFEASIBLE) | (status == Status.MAX_STEPS)
+    return worth | (status == Status.OUT_OF_REACH)
+
+
+# Plans are refereed to 1e-3 of a limit; half of that is left for peaks between samples.
+FEASIBILITY_TOLERANCE = 5e-4
+
+
+def status_of(cost: Array, violation: Array, stationary: Array | bool) -> Array:
+    """The `Status` of a finished case, () int32."""
+    feasible = violation <= FEASIBILITY_TOLERANCE
+    status = jnp.where(
+        feasible,
+        jnp.where(stationary, Status.CONVERGED, Status.FEASIBLE),
+        jnp.where(stationary, Status.INFEASIBLE, Status.MAX_STEPS),
+    )
+    finite = jnp.isfinite(cost) & jnp.isfinite(violation)
+    return jnp.where(finite, status, Status.NON_FINITE).astype(jnp.int32)
+
+
+def outcome(cost: Array, violation: Array, *, stationary: Array | bool = True) -> dict[str, Any]:
+    """The fields that every `Plan` has, of a planner that does not iterate.
+
+    Args:
+        cost: (), the planner's own objective.
+        violation: (), largest relative excess over a limit that the planner saw.
+        stationary: () bool, whether another attempt could not change the plan.
+    """
+    return {
+        "cost": cost,
+        "violation": violation,
+        "iterations": jnp.zeros_like(cost, jnp.int32),
+        "status": status_of(cost, violation, stationary),
+    }
+
+
+@struct.dataclass
+class Plan:
+    """What every planner gives back: the outcome; a task's own plan adds the motion.
+
+    One plan, or a batch of them with a leading axis on every leaf.
+    """
+
+    cost: Array  # (), the planner's own objective
+    violation: Array  # (), largest relative excess over a limit that the planner saw; <= 0 is good
+    iterations: Array  # () int32
+    status: Array  # () int32, a `Status`
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Write the plan, or the batch, as NumPy's .npz; `load` of the same class reads it."""
+        save_arrays(path, self)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike) -> Self:
+        """The plan or batch that `save` wrote, NumPy leaves.
+
+        Raises:
+            PlanFileError: the file is not one of plans, or of another class or version; one line.
+        """
+        return load_arrays(path, cls)
+
+
+class Case(Protocol):
+    """A pytree of arrays for one case, or for a batch with a leading axis on every leaf."""
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """() for one case, (B,) for a batch."""
+        ...
+
+
+def require_settings(planner: Any) -> None:
+    """Raise unless every field of a planner, a dataclass, is of the kind that its default is.
+
+    Sizes are whole numbers of 1 or more, 0 only where that is the default; weights and times are
+    finite, and not negative where the default is not; attempts are one or more.
+
+    Raises:
+        TypeError: a field is of another kind.
+        ValueError: a field is too small, not finite, or has no attempt.
+    """
+    for field in dataclasses.fields(planner):
+        name, value, usual = field.name, getattr(planner, field.name), field.default
+        if isinstance(usual, bool):
+            require_switch(name, value)
+        elif isinstance(usual, int):
+            require_size(name, value, min(usual, 1))
+        elif isinstance(usual, float) and usual >= 0.0:
+            require_number(name, value, "finite and >= 0", lambda x: x >= 0.0)
+        elif isinstance(usual, float):
+            require_number(name, value)
+        elif isinstance(usual, tuple) and usual and isinstance(usual[0], Attempt):
+            require_attempts(name, value, type(usual[0]))
+        elif isinstance(usual, tuple):
+            if not isinstance(value, tuple) or any(numeric(x) is None for x in value):
+                raise TypeError(f"{name} must be a tuple of numbers, got {told(value)}")
+        elif dataclasses.is_dataclass(usual):
+            require_kind(name, value, type(usual))
+
+
+def require_attempts(name: str, value: Any, kind: type) -> None:
+    """Raise unless a setting is a tuple of attempts of a class, one or more.
+
+    Raises:
+        TypeError: it is something else.
+        ValueError: it has none.
+    """
+    if not isinstance(value, tuple) or not all(isinstance(each, kind) for each in value):
+        raise TypeError(f"{name} must be a tuple of {kind.__name__}, got {told(value)}")
+    if not value:
+        raise ValueError(f"{name} must have an entry, got none")
+
+
+@dataclasses.dataclass(frozen=True)
+class Attempt:
+    """One try at the cases that earlier tries left unsolved; static under jit."""
+
+    starts: int = 1  # places that one case takes in a batch
+    # Cases that earlier attempts left with a greater violation are not tried; None: all are.
+    within: float | None = dataclasses.field(default=None, kw_only=True)
+
+    def __post_init__(self) -> None:
+        require_size("starts", self.starts)
+        if self.within is not None:
+            require_number("within", self.within, "finite and > 0", lambda x: x > 0.0)
+
+    def is_due(self, plans: "Plan") -> Any:
+        """Which of the plans so far it is to try and better."""
+        unsolved = is_unsolved(plans.status)
+        return unsolved if self.within is None else unsolved & (plans.violation <= self.within)
+
+
+CaseT = TypeVar("CaseT", contravariant=True)
+PlanT = TypeVar("PlanT", bound=Plan, covariant=True)
+
+
+class Planner(Protocol[CaseT, PlanT]):
+    """Solves one case; pure, so that `plan` may compile, batch and spread it over devices.
+
+    A planner may have a `case_type`, the class of its cases; `plan` then refuses others.
+    """
+
+    @property
+    def attempts(self) -> Sequence[Attempt]:
+        """What to try, in order."""
+        ...
+
+    def solve(self, case: CaseT, attempt: Any, /) -> PlanT:
+        """The plan that one attempt makes of one case."""
+        ...
+
+
+@runtime_checkable
+class LanesPlanner(Planner[CaseT, PlanT], Protocol[CaseT, PlanT]):
+    """A `Planner` that solves a batch in a layout of its own."""
+
+    def solve_lanes(self, cases: CaseT, attempt: Any, /) -> PlanT:
+        """The plans that one attempt makes of a batch; a leading axis on every leaf; pure."""
+        ...
+
+
+@runtime_checkable
+class HostPlanner(Protocol[CaseT, PlanT]):
+    """Solves a batch on the host, outside of compiled programs."""
+
+    @property
+    def attempts(self) -> Sequence[Attempt]:
+        """What to try, in order."""
+        ...
+
+    def solve_on_host(self, cases: CaseT, attempt: Any, /) -> PlanT:
+        """The plans that one attempt makes of a batch with NumPy leaves; NumPy leaves."""
+        ...
+
+
+class Drive(Protocol):
+    """What a `CompositePlanner` has its other planners carried out by."""
+
+    @property
+    def is_pure(self) -> bool:
+        """Whether this happens inside a compiled program, where nothing is a number yet."""
+        ...
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the caller's time has passed, so that no more is to be begun."""
+        ...
+
+    def __call__(
+        self, planner: Any, cases: Any, attempts: Sequence[Attempt] | None = None
+    ) -> tuple[Any, Any]:
+        """Plans of a batch by some of a planner's attempts, by default all of them.
+
+        Returns:
+            The plans, and numbers that are all zero if no case is unsolved.
+        """
+        ...
+
+
+@runtime_checkable
+class CompositePlanner(Protocol[CaseT, PlanT]):
+    """Has other planners plan a batch, once or several times."""
+
+    def plan_by(self, drive: Drive, cases: CaseT, /) -> PlanT:
+        """The plans of a batch."""
+        ...
+
+
+AnyPlanner = (
+    Planner[CaseT, PlanT]
+    | LanesPlanner[CaseT, PlanT]
+    | HostPlanner[CaseT, PlanT]
+    | CompositePlanner[CaseT, PlanT]
+)
+
+
+class Decision(Protocol):
+    """Settles what a case leaves open, such as an order; a pytree, as planners are.
+
+    Best of all orders, a network's answer and what was given are all of this kind.
+    """
+
+    def check(self, cases: Any, /) -> None:
+        """Raise `ValueError` for a batch about which this cannot decide; on the host."""
+        ...
+
+    def propose(self, case: Any, /) -> Any:
+        """Choices for one case, best first, that `case.decided` takes; leaves (F, ...); pure."""
+        ...
+
+    def rank(self, plans: Any, /) -> Array:
+        """What is least for the choice whose plan is to be kept, one number a plan; pure.
+
+        It takes plans of any batch shape, in NumPy or jax arrays.
+        """
+        ...
+
+    def explain(self, case: Any, status: Array, /) -> Array:
+        """The status () of an unsolved case, or one that says more; pure."""
+        ...
+
+
+Tree = TypeVar("Tree")
+
+
+def out_of_time(plans: PlanT, left: Any) -> PlanT:
+    """The plans, with the status `OUT_OF_TIME` where one is left unsolved."""
+    xp: Any = jnp if isinstance(plans.status, jax.Array) else np
+    status = xp.where(left, Status.OUT_OF_TIME, plans.status).astype(np.int32)
+    return dataclasses.replace(plans, status=status)  # type: ignore[type-var]
+
+
+def lane(tree: Tree, k: Any) -> Tree:
+    """One case, plan or verdict of a batch, or some of them: entry `k` of every leaf.
+
+    Args:
+        tree: a pytree, or a dataclass of arrays such as a verdict, with a leading axis.
+        k: a place, a slice, or an array of places.
+    """
+    if dataclasses.is_dataclass(tree) and jax.tree_util.all_leaves([tree]):
+        fields = {f.name: getattr(tree, f.name)[k] for f in dataclasses.fields(tree)}
+        return dataclasses.replace(tree, **fields)  # type: ignore[type-var]
+    return jax.tree.map(lambda leaf: leaf[k], tree)
+
+
+def solved(plans: Plan) -> np.ndarray:
+    """Whether each plan meets every limit that its planner looked at, bool; see `Status`.
+
+    Raises:
+        TypeError: these are no plans.
+    """
+    require_kind("plans", plans, Plan)
+    return np.asarray(is_solved(plans.status))
+
+
+def marked(plans: PlanT, cases: Any) -> PlanT:
+    """The plans, with the status `BAD_INPUT` where a number of the case breaks its rule; pure.
+
+    Args:
+        plans: one plan, or a batch.
+        cases: of them; those of a class without `rules` are left as they are.
+    """
+    if not has_rules(cases):
+        return plans
+    xp: Any = jnp if isinstance(plans.status, jax.Array) else np
+    status = xp.where(is_sound(cases), plans.status, Status.BAD_INPUT).astype(np.int32)
+    return dataclasses.replace(plans, status=status)  # type: ignore[type-var]

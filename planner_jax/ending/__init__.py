@@ -1,1 +1,0 @@
-"""What a quadrotor flies after its last contact: to rest where it may, or back home."""

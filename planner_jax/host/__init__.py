@@ -1,0 +1,1 @@
+"""Services of the machine: signals, files, memory, processors, threads and the compile cache."""

@@ -1,0 +1,1 @@
+"""Trajectories to standstill that follow the end of a plan."""

@@ -1,0 +1,47 @@
+"""One ending to plan: the state at the end of a plan, and where the quadrotor may come to rest."""
+
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+from planner_jax.core.rules import POSITIVE, Field, Table
+from planner_jax.robot.quadrotor import QuadrotorLimits
+from planner_jax.robot.quadrotor_plan import QuadrotorPlan
+from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
+
+
+@struct.dataclass
+class EndingCase:
+    """One case. Every number is a leaf."""
+
+    rules: ClassVar[Table] = (
+        Field("head_state", (4, 3)),
+        Field("home", (3,)),
+        Field("gravity", (), POSITIVE),
+    )
+
+    head_state: Array  # (4, 3) position, velocity, acceleration, jerk of the quadrotor at time 0
+    home: Array  # (3,) [m], where it comes to rest if it returns
+    gravity: Array  # () [m/s^2], magnitude
+    limits: QuadrotorLimits
+    extras: tuple[Any, ...] = ()  # limits and costs of the user's own, see `cost.extras`
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """() for one case, (B,) for a batch."""
+        return np.shape(self.gravity)
+
+
+@struct.dataclass
+class EndingPlan(QuadrotorPlan):
+    """One way to rest, or a batch of them with a leading axis on every leaf."""
+
+
+def end_state(path: PiecewisePolynomial) -> Array:
+    """Position to jerk (4, 3) where a trajectory ends; pieces that take no time do not count."""
+    last = jnp.max(jnp.where(path.durations > 0.0, jnp.arange(path.durations.size), 0))
+    piece = PiecewisePolynomial(path.coeffs[last][None], path.durations[last][None])
+    return jnp.stack([evaluate(piece, path.durations[last], order) for order in range(4)])

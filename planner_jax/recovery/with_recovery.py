@@ -1,0 +1,115 @@
+"""A planner whose plans go on to rest behind their last contact."""
+
+import dataclasses
+from typing import Any, Generic, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from planner_jax.core.protocol import Case, Drive, Plan, Status, is_solved
+from planner_jax.core.recovery_names import ending_problem
+from planner_jax.planning.decided import planned_again
+from planner_jax.recovery.case import EndingCase, end_state
+from planner_jax.recovery.planner import RestPlanner
+
+CaseT = TypeVar("CaseT", bound=Case)
+PlanT = TypeVar("PlanT", bound=Plan)
+
+# Where a plan ends so fast that nothing keeps the speed limit behind it, the plan is made again
+# for these shares of the limit.
+_SLOWER = (0.8, 0.65, 0.5)
+
+
+@struct.dataclass
+class EndedPlanner(Generic[CaseT, PlanT]):
+    """A `CompositePlanner`: a quadrotor's planner, and one that goes on from its plans to rest.
+
+    A plan whose ending breaks a limit is not solved. It is then made again with less speed.
+    """
+
+    planner: Any
+    rest: RestPlanner
+
+    @property
+    def case_type(self) -> type | None:
+        """That of the planner."""
+        return getattr(self.planner, "case_type", None)
+
+    def replanner(self) -> Any:
+        """That of the planner, if it has one: what is planned anew has no ending."""
+        return getattr(self.planner, "replanner", lambda: self.planner)()
+
+    def plan_by(self, drive: Drive, cases: Any) -> Any:
+        """The plans of one case or of a batch, with their endings."""
+        if cases.batch_shape == ():
+            one = self.plan_by(drive, jax.tree.map(lambda leaf: np.asarray(leaf)[None], cases))
+            return jax.tree.map(lambda leaf: leaf[0], one)
+        if not drive.is_pure:
+            cases = jax.tree.map(np.asarray, cases)
+        plans, left = self._ended(drive, cases, 1.0)
+        if not drive.is_pure:
+            plans = jax.tree.map(np.array, plans)
+        for factor in _SLOWER:
+            slower = lambda some, factor=factor: self._ended(drive, some, factor)[0]  # noqa: E731
+            plans = planned_again(drive, slower, cases, plans, left)
+            left = left & ~is_solved(plans.status)
+        return plans
+
+    def _ended(self, drive: Drive, cases: Any, factor: float) -> tuple[Any, Any]:
+        """Plans (B,) for a share of the speed limit, and which of them only lack an ending."""
+        limits = cases.limits
+        slower = dataclasses.replace(
+            limits, speed=(factor * limits.speed).astype(limits.speed.dtype)
+        )
+        plans, _ = drive(self.planner, dataclasses.replace(cases, limits=slower))
+        endings, _ = drive(self.rest, ending_cases(cases, plans))
+        xp: Any = jnp if drive.is_pure else np
+        whole, rests = is_solved(plans.status), is_solved(endings.status)
+        lacking = whole & ~rests
+        ended = dataclasses.replace(
+            plans,
+            ending=endings.trajectory,
+            violation=xp.where(
+                whole, xp.maximum(plans.violation, endings.violation), plans.violation
+            ),
+            iterations=plans.iterations + endings.iterations,
+            status=xp.where(lacking, Status.INFEASIBLE, plans.status).astype(np.int32),
+        )
+        return ended, lacking
+
+
+def ending_cases(cases: Any, plans: Any) -> EndingCase:
+    """What is left to plan behind plans (B,) of a quadrotor's cases (B,): leaves of their kind."""
+    states: Any = _end_states(plans.trajectory)
+    if isinstance(plans.status, np.ndarray):
+        states = np.asarray(states)
+    return EndingCase(
+        head_state=states,
+        home=cases.head_state[:, 0],
+        gravity=cases.gravity,
+        limits=cases.limits,
+        extras=cases.extras,
+    )
+
+
+_end_states = jax.jit(jax.vmap(end_state))
+
+
+def ended(planner: Any, ending: str | None) -> Any:
+    """A quadrotor's planner, with an ending behind its plans if one is asked for.
+
+    Args:
+        planner: of plans with the trajectory of a quadrotor.
+        ending: "brake" for the way to rest that is cheapest, wherever that is; "home" for the one
+            back to where the case begins; None for plans that end at the last contact.
+
+    Raises:
+        ValueError: `ending` is something else.
+    """
+    if ending is None:
+        return planner
+    if problem := ending_problem(ending):
+        raise ValueError(problem)
+    return EndedPlanner(planner, RestPlanner(to=ending))

@@ -1,0 +1,1 @@
+"""Run folders: manifest, tables, environment and figures of what a command computed."""

@@ -1,0 +1,177 @@
+"""The columns of `plans.parquet`: a row a case, SI units, world frame (z up)."""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+
+from planner_jax.core.protocol import Status
+from planner_jax.runs.source import Chunk
+
+
+@dataclasses.dataclass(frozen=True)
+class RefereedBatch:
+    """B cases with everything that is known about them; leaves are NumPy or JAX arrays."""
+
+    chunk: Chunk
+    plans: Any
+    verdict: Any
+
+    @property
+    def cases(self) -> Any:
+        """The cases themselves."""
+        return self.chunk.cases
+
+
+class Column(NamedTuple):
+    """One column of a task's rows."""
+
+    name: str
+    unit: str  # "" for names and counts, "1" for ratios
+    meaning: str
+    type: pa.DataType
+    values: Callable[[RefereedBatch], Any]  # (B,) or (B, ...), lists flat; None: all null
+
+
+BOOL, TEXT, COUNT, NUMBER = pa.bool_(), pa.string(), pa.int32(), pa.float32()
+_KINDS = {"b": BOOL, "U": TEXT, "i": COUNT}  # kind of a NumPy type -> type of a column
+
+
+def list_of(kind: pa.DataType, length: int = -1) -> pa.DataType:
+    """The type of a list column, under the name that Parquet gives its entries back."""
+    return pa.list_(pa.field("element", kind), length)
+
+
+VECTOR, LIST = list_of(pa.float32(), 3), list_of(pa.float32())
+
+INDEX = Column("index", "", "place in the whole", pa.int64(), lambda b: b.chunk.index)
+
+
+def leaves_of(part: str, *rows: tuple) -> list[Column]:
+    """Columns that are leaves of one part of a batch.
+
+    Args:
+        part: dotted path of it in a `RefereedBatch`.
+        *rows: name, unit and meaning of a column; then, where they are not these, its type,
+            NUMBER, and the leaf's dotted path in the part, the name.
+    """
+    return [_leaf_column(part, *row) for row in rows]
+
+
+def _leaf_column(
+    part: str, name: str, unit: str, meaning: str, kind: pa.DataType = NUMBER, path: str = ""
+) -> Column:
+    return Column(name, unit, meaning, kind, lambda b: _leaf(b, f"{part}.{path or name}"))
+
+
+_STATUS_NAMES = np.array([Status(code).name for code in range(len(Status))])
+
+
+def status_column(meaning: str) -> Column:
+    """The column of the plans' statuses, by name."""
+    return Column("status", "", meaning, TEXT, lambda b: _STATUS_NAMES[np.asarray(b.plans.status)])
+
+
+SOLVER = [
+    *leaves_of(
+        "plans",
+        ("cost", "1", "the planner's own objective"),
+        ("violation", "1", "largest relative excess the planner saw"),
+        ("iterations", "", "of the round that gave the plan", COUNT),
+    ),
+    status_column("of the solver"),
+]
+
+OUTCOME = [
+    *leaves_of(
+        "verdict",
+        ("success", "", "the referee's word", BOOL),
+        ("failed_limit", "", "first limit that fails, or empty", TEXT),
+        ("failed_time", "s", "where that limit is worst"),
+        ("failed_excess", "as in `sentence`", "by how much, tolerance not taken off"),
+    ),
+    Column("sentence", "", "what failed, in words", TEXT, lambda b: _sentences(b.verdict)),
+]
+
+
+def leaf_columns(batch: RefereedBatch) -> list[Column]:
+    """A column for every leaf of the cases, the plans and the verdict.
+
+    Names are those of the fields, joined by dots, behind "case.", "plan." or "verdict."; what
+    every task has is named as in all runs. A field's metadata may hold its `unit` and `meaning`.
+    """
+    known = {f"plan.{c.name}" for c in SOLVER} | {f"verdict.{c.name}" for c in OUTCOME}
+    found = [INDEX]
+    for part, tree in (("case", batch.cases), ("plan", batch.plans), ("verdict", batch.verdict)):
+        found += [c for c in _columns_of(tree, part, part, {}) if c.name not in known]
+    return [*found, *SOLVER, *OUTCOME]
+
+
+def _columns_of(tree: Any, name: str, part: str, words: Mapping[str, str]) -> list[Column]:
+    if dataclasses.is_dataclass(tree):
+        fields = [
+            (f.name, getattr(tree, f.name), f.metadata)
+            for f in dataclasses.fields(tree)
+            if f.metadata.get("pytree_node", True)  # what is static is not of one row
+        ]
+        return [
+            column
+            for field, value, metadata in fields
+            for column in _columns_of(value, f"{name}.{field}", part, metadata)
+        ]
+    values = np.asarray(tree)
+    kind = _KINDS.get(values.dtype.kind, NUMBER)
+    column = Column(
+        name,
+        words.get("unit", ""),
+        words.get("meaning", ""),
+        kind if values.ndim == 1 else list_of(kind),
+        lambda b: _leaf({"case": b.cases, "plan": b.plans, "verdict": b.verdict}, name),
+    )
+    return [column]
+
+
+def rows_of(columns: Sequence[Column], batch: RefereedBatch, frame: str) -> pa.Table:
+    """The rows of a batch.
+
+    Args:
+        columns: of the task.
+        batch: the cases.
+        frame: axes and times of the columns, in words, for the metadata.
+    """
+    num = len(batch.chunk)
+    fields = [
+        pa.field(c.name, c.type, metadata={"unit": c.unit, "meaning": c.meaning}) for c in columns
+    ]
+    arrays = [_array(column.values(batch), column.type, num) for column in columns]
+    return pa.Table.from_arrays(arrays, schema=pa.schema(fields, metadata={"frame": frame}))
+
+
+def _array(values: Any, kind: pa.DataType, num: int) -> pa.Array:
+    """An Arrow array of `num` entries from (num,) or (num, ...) values."""
+    if values is None:
+        return pa.nulls(num, kind)
+    if isinstance(values, pa.Array):
+        return values
+    values = np.asarray(values)
+    if not isinstance(kind, pa.FixedSizeListType | pa.ListType):
+        return pa.array(values.tolist() if values.dtype.kind == "U" else values, kind)
+    flat = pa.array(np.ravel(values), kind.value_type, safe=False)
+    if isinstance(kind, pa.FixedSizeListType):
+        return pa.FixedSizeListArray.from_arrays(flat, type=kind)
+    offsets = np.arange(num + 1, dtype=np.int32) * (values.size // num)
+    return pa.ListArray.from_arrays(pa.array(offsets), flat, type=kind)
+
+
+def _leaf(tree: Any, path: str) -> Any:
+    for name in path.split("."):
+        tree = tree[name] if isinstance(tree, dict) else getattr(tree, name)
+    return tree
+
+
+def _sentences(verdict: Any) -> np.ndarray:
+    return np.array(
+        ["" if good else verdict.sentence(lane) for lane, good in enumerate(verdict.success)]
+    )

@@ -1,0 +1,242 @@
+"""What a run is asked to do, checked before anything is read, compiled or written.
+
+Settings are frozen dataclasses; the command line is made from their fields. Nothing here imports
+JAX.
+"""
+
+import dataclasses
+import os
+import tempfile
+from collections.abc import Iterable
+from typing import Any, ClassVar, Self, TypeVar
+
+from planner_jax.core.efforts import EFFORTS
+from planner_jax.core.recovery_names import CHOICES, NONE, ending_problem
+from planner_jax.core.registry import Task, UnknownName, require_name
+from planner_jax.core.scales import scale_problem
+from planner_jax.host.memory import require_disk
+
+SCHEME = "s3://"  # of addresses in object stores
+AnySettings = TypeVar("AnySettings", bound="SweepSettings")
+KnownSettings = TypeVar("KnownSettings")
+
+
+def is_address(out: Any) -> bool:
+    """Whether an argument for a folder names one in an object store."""
+    return isinstance(out, str) and out.startswith(SCHEME)
+
+
+class SettingError(ValueError):
+    """An argument of a run breaks a rule; one line that begins with the argument's name."""
+
+
+class WorkersFailed(RuntimeError):
+    """Workers could not make a chunk of a run, which can be resumed; one line."""
+
+
+def option(default: Any, metavar: str, words: str) -> Any:
+    """A field of settings with what the command line says of it; no `metavar` for a switch."""
+    return dataclasses.field(default=default, metadata={"metavar": metavar, "help": words})
+
+
+def ending_option(usual: str = NONE) -> Any:
+    """The field of settings `ending`, of a task of quadrotors."""
+    words = f"flown behind the last contact, within all limits: {', '.join(CHOICES)}"
+    return option(usual, "NAME", words)
+
+
+def ending_options(value: str) -> dict[str, str]:
+    """What a planner is told of the argument `ending`."""
+    return {} if value == NONE else {"ending": value}
+
+
+@dataclasses.dataclass(frozen=True)
+class SweepSettings:
+    """The arguments that the sweeps of all tasks have; a task's own class adds its own.
+
+    Together they decide every number of the run's table.
+
+    Raises:
+        SettingError: a value breaks its rule.
+    """
+
+    planner: str | None = option(None, "NAME", "")  # None: the task's first
+    suite: str | None = option(None, "NAME", "")  # None: the task's first
+    num: int | None = option(None, "N", "cases")  # None: `DEFAULT_NUM`, or all that a source holds
+    batch: int | None = option(
+        None, "B", "cases planned, judged and written at once; bounds the memory"
+    )
+    seed: int = option(0, "K", "of what is drawn")
+
+    RUN: ClassVar[str] = "planner_jax.sweep.sweep:Sweep"  # what carries it out, "module:Class"
+    DEFAULT_NUM: ClassVar[int] = 1000
+    # As estimated, bytes of memory for a case of a batch, and of the disk for a row.
+    CASE_BYTES: ClassVar[int] = 20_000
+    ROW_BYTES: ClassVar[int] = 1_000
+    CPU_BATCH: ClassVar[int] = 1024
+    GPU_BATCH: ClassVar[int] = 65536
+    # Names of the settings that are options of the task's `planner`, `draw` and `judge`.
+    PLANNER: ClassVar[tuple[str, ...]] = ()
+    DRAW: ClassVar[tuple[str, ...]] = ()
+    JUDGE: ClassVar[tuple[str, ...]] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("num", "batch"):
+            require_count(name, getattr(self, name), 1, none=True)
+        require_seed(self.seed)
+
+    def of(self, task: Task) -> Self:
+        """The same with the names of the task's planner and suite filled in, or checked.
+
+        Raises:
+            SettingError: the task has no planner or suite of the name.
+        """
+        planners, suites = task.all_planners(), task.all_suites()
+        filled = dataclasses.replace(
+            self,
+            planner=next(iter(planners)) if self.planner is None else self.planner,
+            suite=next(iter(suites)) if self.suite is None else self.suite,
+        )
+        try:
+            task.split_planner(str(filled.planner))
+            require_name(suites, "suite", str(filled.suite))
+        except UnknownName as error:
+            raise SettingError(str(error)) from None
+        return filled
+
+    @property
+    def case_bytes(self) -> int:
+        """Memory that a case of a batch takes while it is planned, judged and written."""
+        return self.CASE_BYTES
+
+    def require_room(self, out: str | os.PathLike) -> None:
+        """Raise `SettingError` if the rows that are asked for do not fit on the disk of a folder.
+
+        Args:
+            out: of the run.
+        """
+        if is_address(out):
+            out = tempfile.gettempdir()  # where the files are made
+        try:
+            require_disk("num", self.num or self.DEFAULT_NUM, self.ROW_BYTES, out)
+        except ValueError as error:
+            raise SettingError(str(error)) from None
+
+    def parameters(self) -> dict[str, Any]:
+        """The settings as plain values for `manifest.json`; the class brings them back."""
+        return dataclasses.asdict(self)
+
+    def planner_options(self) -> dict[str, Any]:
+        """Options of the planner that these settings decide."""
+        return {name: getattr(self, name) for name in self.PLANNER}
+
+    def draw_options(self) -> dict[str, Any]:
+        """Options of the task's `draw` that these settings decide; None is left to it."""
+        return {name: value for name in self.DRAW if (value := getattr(self, name)) is not None}
+
+    def judge_options(self) -> dict[str, Any]:
+        """Options of the task's `judge` that these settings decide."""
+        return {name: getattr(self, name) for name in self.JUDGE}
+
+
+def require(holds: bool, name: str, rule: str, value: Any) -> None:
+    """Raise `SettingError` unless a rule on an argument holds."""
+    if not holds:
+        raise SettingError(f"{name} must be {rule}, got {value}")
+
+
+def require_count(name: str, value: Any, least: int, *, none: bool = False) -> None:
+    """Raise `SettingError` unless a value is a whole number of at least `least`, or None if so."""
+    if value is None and none:
+        return
+    if not isinstance(value, int) or isinstance(value, bool):
+        raise SettingError(f"{name} must be a whole number, got {value!r}")
+    require(value >= least, name, f">= {least}", value)
+
+
+def require_seed(value: Any) -> None:
+    """Raise `SettingError` unless the argument `seed` is one of all random generators."""
+    require_count("seed", value, 0)
+    require(value < 2**63, "seed", "< 2**63", value)
+
+
+def require_scale(value: float) -> None:
+    """Raise `SettingError` unless the argument `limit_scale` leaves limits of a machine."""
+    if problem := scale_problem(value):
+        raise SettingError(problem)
+
+
+def require_effort(value: str, planner: str | None, without: str) -> None:
+    """Raise `SettingError` unless the argument `effort` is one, and of a planner that has it.
+
+    Args:
+        value: of the argument.
+        planner: the sweep's.
+        without: the task's planner that minimises nothing.
+    """
+    require_one_of(EFFORTS, "effort", value)
+    rule = f"left out for the planner {without}, which minimises nothing"
+    require(value == EFFORTS[0] or planner != without, "effort", rule, value)
+
+
+def require_ending(value: str) -> None:
+    """Raise `SettingError` unless the argument `ending` is one, or none."""
+    if problem := ending_problem(value, CHOICES):
+        raise SettingError(problem)
+
+
+def require_one_of(names: Iterable[str], name: str, value: str) -> None:
+    """Raise `SettingError` unless an argument is one of some words."""
+    names = tuple(names)
+    require(value in names, name, f"one of {', '.join(names)}", repr(value))
+
+
+def settings_to_resume(
+    kind: type[AnySettings], parameters: dict[str, Any], given: dict[str, Any]
+) -> AnySettings:
+    """The settings of the run that is resumed, after a check of those given again.
+
+    Args:
+        kind: class of the settings.
+        parameters: of the run's manifest.
+        given: settings that the caller named; they must be the run's.
+
+    Raises:
+        SettingError: a given value is not the run's, or the run's are not such settings.
+    """
+    settings = settings_of_manifest(kind, parameters, "out")
+    asked = dataclasses.replace(settings, **given)
+    for name in given:
+        part, old, new = _difference(name, getattr(settings, name), getattr(asked, name))
+        require(new == old, part, f"{old} as in the run that is resumed", new)
+    return settings
+
+
+def settings_of_manifest(
+    kind: type[KnownSettings], parameters: dict[str, Any], name: str
+) -> KnownSettings:
+    """The settings of a run.
+
+    Args:
+        kind: class of the settings.
+        parameters: of the run's manifest.
+        name: of the caller's argument that holds the run's folder, for messages.
+
+    Raises:
+        SettingError: they are not such settings, as where another version wrote them.
+    """
+    try:
+        return kind(**parameters)
+    except (TypeError, ValueError) as error:
+        rule = "a run with settings of this version"
+        raise SettingError(f"{name} must be {rule}, got others: {error}") from None
+
+
+def _difference(name: str, old: Any, new: Any) -> tuple[str, Any, Any]:
+    """Where two settings of a name differ: the name of the first part that does, and its values."""
+    if dataclasses.is_dataclass(old) and type(old) is type(new):
+        for field in dataclasses.fields(old):
+            mine, other = getattr(old, field.name), getattr(new, field.name)
+            if mine != other:
+                return _difference(f"{name}.{field.name}", mine, other)
+    return name, old, new

@@ -1,0 +1,119 @@
+"""The cases of a sweep, chunk by chunk."""
+
+import abc
+import dataclasses
+import hashlib
+from typing import Any
+
+import jax
+import numpy as np
+
+from planner_jax.core.registry import Task
+from planner_jax.host.memory import require_memory
+from planner_jax.runs.settings import SettingError, SweepSettings
+
+_MOST_PARTS = 10**6  # of a run: files in one folder
+
+
+@dataclasses.dataclass(frozen=True)
+class Chunk:
+    """B cases that are next to each other in a sweep."""
+
+    index: np.ndarray  # (B,) int, places in the whole
+    cases: Any  # the task's pytree, NumPy leaves with leading axis B
+    origin: Any = None  # what the cases were made from, where a task has that
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+
+@dataclasses.dataclass(frozen=True)
+class Source(abc.ABC):
+    """Where the cases of a sweep come from."""
+
+    settings: Any  # of the task's sweep, with `num` and `batch` filled in
+    num: int  # of all cases
+    batch: int  # cases a chunk
+
+    @property
+    def num_chunks(self) -> int:
+        """How many chunks the sweep has; the last one may be smaller."""
+        return -(-self.num // self.batch)
+
+    def chunk(self, number: int) -> Chunk:
+        """The cases of one chunk, checked."""
+        return self.cases(number * self.batch, min((number + 1) * self.batch, self.num))
+
+    def check(self) -> Any:
+        """Look at cases before anything is written; those of one chunk.
+
+        They stand for all, where all are drawn from one law.
+        """
+        return self.chunk(0).cases
+
+    @abc.abstractmethod
+    def cases(self, first: int, last: int) -> Chunk:
+        """The cases from place `first` up to `last`, that one left out, checked.
+
+        Raises:
+            SettingError: a case breaks a rule.
+        """
+
+    @abc.abstractmethod
+    def description(self) -> dict[str, Any]:
+        """Entries of the manifest by which the same cases are known again."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DrawnSource(Source):
+    """The cases of a suite, drawn chunk by chunk."""
+
+    task: Task
+
+    def cases(self, first: int, last: int) -> Chunk:
+        """The cases from place `first` up to `last`, that one left out.
+
+        Raises:
+            SettingError: what draws them refuses a setting.
+        """
+        settings = self.settings
+        try:
+            drawn = self.task.draw(
+                last - first, settings.suite, settings.seed, first=first, **settings.draw_options()
+            )
+        except ValueError as error:
+            raise SettingError(str(error)) from error
+        return Chunk(index=np.arange(first, last), cases=jax.tree.map(np.asarray, drawn))
+
+    def description(self) -> dict[str, Any]:
+        """Suite, and digest of the numbers of the first chunk."""
+        digest = hashlib.sha256()
+        for leaf in jax.tree.leaves(self.chunk(0).cases):
+            digest.update(np.ascontiguousarray(leaf).tobytes())
+        return {"suite": {"name": self.settings.suite, "sha256": digest.hexdigest()}}
+
+
+def filled_in(settings: SweepSettings, num: int, batch: int) -> dict[str, Any]:
+    """Fields of a `Source`: settings without gaps, `num` and `batch`.
+
+    Args:
+        settings: of the sweep.
+        num: cases, where the settings name no number.
+        batch: cases a chunk, likewise.
+
+    Raises:
+        SettingError: the cases of a chunk do not fit into memory, or there are too many chunks.
+    """
+    num, batch = settings.num or num, settings.batch or batch
+    if num > _MOST_PARTS * batch:
+        rule = f"at most {_MOST_PARTS * batch:,} with a batch of {batch}, of which each is a file"
+        raise SettingError(f"num must be {rule}, got {num}")
+    try:
+        if settings.batch is None:
+            require_memory("num", min(num, batch), settings.case_bytes)
+        else:
+            require_memory("batch", batch, settings.case_bytes)
+    except ValueError as error:
+        raise SettingError(str(error)) from None
+    resolved = dataclasses.replace(settings, num=num, batch=batch)
+    return {"settings": resolved, "num": num, "batch": batch}

@@ -1,0 +1,76 @@
+"""One look for all figures: colours that colour-blind readers can tell apart (Okabe and Ito)."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from planner_jax.host.files import replacing
+
+BLUE, ORANGE, GREEN, RED = "#0072B2", "#E69F00", "#009E73", "#D55E00"
+PURPLE, SKY, GREY, INK = "#CC79A7", "#56B4E9", "#8A8F98", "#24292F"
+PALE = "#C9CDD2"
+
+PLANNER_COLOURS = {
+    "exact": BLUE,
+    "bat": ORANGE,
+    "bat-lite": GREEN,
+    "juggle": PURPLE,
+    "catch": ORANGE,
+    "mpp": PURPLE,
+    "spacetime": BLUE,
+    "lattice": GREEN,
+    "paper": ORANGE,
+    "em": PURPLE,
+    "constant": SKY,
+}
+
+_LOOK: dict[Any, Any] = {
+    "font.size": 10.0,
+    "axes.titlesize": 11.0,
+    "axes.titlelocation": "left",
+    "axes.titleweight": "bold",
+    "axes.edgecolor": GREY,
+    "axes.labelcolor": INK,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#E6E8EB",
+    "grid.linewidth": 0.8,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "text.color": INK,
+    "legend.frameon": False,
+    "figure.dpi": 110.0,
+    "savefig.dpi": 150.0,
+    "figure.constrained_layout.use": True,
+}
+
+
+def draw(path: Path, figure: Callable[..., None], size: tuple[float, float], *data: Any) -> None:
+    """Draw one figure and write it whole, as PNG.
+
+    Args:
+        path: of the file.
+        figure: called with an empty figure and the data.
+        size: (width, height) [inch].
+        *data: what the figure shows.
+    """
+    with matplotlib.rc_context(_LOOK):
+        canvas = Figure(figsize=size)
+        FigureCanvasAgg(canvas)
+        figure(canvas, *data)
+        with replacing(path) as scratch:
+            canvas.savefig(scratch, format="png")
+
+
+def label(axes: Axes, x: str, y: str, title: str = "") -> None:
+    """Name both axes, with their units."""
+    axes.set_xlabel(x)
+    axes.set_ylabel(y)
+    axes.set_title(title)

@@ -1,0 +1,87 @@
+"""The table of a run, and what its numbers mean, as text, Markdown and HTML."""
+
+import html
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from planner_jax.runs.summary import percent, wilson_interval
+
+
+class RateTable(NamedTuple):
+    """Text of a table."""
+
+    title: str
+    header: list[str]
+    rows: list[list[str]]
+    strong: int | None = None  # the row that stands out
+
+
+def own_cells(successes: int, num: int) -> list[str]:
+    """Cases, success in percent and its interval, the run's own cells of a row."""
+    low, high = wilson_interval(successes, num)
+    return [
+        f"{num:,}",
+        f"{100.0 * successes / num:.2f}",
+        f"{100.0 * low:.2f} to {100.0 * high:.2f}",
+    ]
+
+
+def headline(manifest: dict[str, Any], findings: Sequence[str] = ()) -> list[str]:
+    """Success, speed and failures of a run, a sentence each.
+
+    Args:
+        manifest: of the run.
+        findings: what its task says in between.
+    """
+    summary, times = manifest["summary"], manifest["times"]
+    settings, device = manifest["parameters"], manifest["device"]
+    low, high = summary["wilson_95"]
+    rate = percent(summary["successes"], summary["num"])
+    lines = [
+        f"Planner {settings['planner']}: {rate} % success, "
+        f"{summary['successes']:,} of {summary['num']:,} plans pass the referee "
+        f"(95 % interval {100.0 * low:.2f} to {100.0 * high:.2f} %).",
+        *findings,
+        f"{summary['plans_per_second_warm']:,.0f} plans/s warm, {times['compile_seconds']:.1f} s "
+        f"compiling, {times['referee_seconds']:.1f} s judging, {times['wall_seconds']:.1f} s for "
+        f"all chunks on {device['kind']} ({device['cpu_count']} CPU cores).",
+    ]
+    if failed := summary["failed_limits"]:
+        reasons = ", ".join(f"{name} {count:,}" for name, count in failed.items())
+        lines.append(f"First failed limit of the others: {reasons}.")
+    return lines
+
+
+def to_markdown(title: str, lines: Sequence[str], table: RateTable, remarks: Sequence[str]) -> str:
+    """The contents of `table.md`.
+
+    Args:
+        title: of the run.
+        lines: of its headline.
+        table: of its rates.
+        remarks: where the numbers come from.
+    """
+    text = [f"# {title}", "", *(line + "  " for line in lines), ""]
+    text += [_bars(table.header), _bars(["---"] + ["---:"] * (len(table.header) - 1))]
+    for place, row in enumerate(table.rows):
+        strong = place == table.strong
+        text.append(_bars([f"**{cell}**" if strong and cell else cell for cell in row]))
+    text += ["", *(f"- {remark}" for remark in remarks)]
+    return "\n".join(text) + "\n"
+
+
+def _bars(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def to_html(table: RateTable) -> str:
+    """The table as HTML, without its title."""
+    rows = [_html_row(table.header, "th")]
+    for place, row in enumerate(table.rows):
+        rows.append(_html_row(row, "td", " class=strong" if place == table.strong else ""))
+    return f"<table>\n{''.join(rows)}</table>\n"
+
+
+def _html_row(cells: Sequence[str], tag: str, mark: str = "") -> str:
+    inner = "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells)
+    return f"<tr{mark}>{inner}</tr>\n"

@@ -1,0 +1,97 @@
+"""Seconds of a sweep: those in which JAX compiled apart from those of warm planning."""
+
+import time
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import jax
+import jax.monitoring
+import numpy as np
+
+from planner_jax.core.protocol import AnyPlanner, lane
+from planner_jax.planning.plan import CaseT, PlanT, plan
+
+# Tracing, lowering and the backend's compilation, which includes reading the compile cache.
+# Inner functions are traced inside outer ones: spans are joined, not added.
+_COMPILING = "/jax/core/compile/"
+_WARM_CALLS = 3  # at most, until nothing is compiled
+
+FoundT = TypeVar("FoundT")
+
+
+class CompileClock:
+    """Seconds within its block in which JAX traced, lowered or compiled, in any thread."""
+
+    def __init__(self) -> None:
+        self._spans: list[tuple[float, float]] = []
+        self._last = 0.0
+
+    def __enter__(self) -> "CompileClock":
+        jax.monitoring.register_event_time_span_listener(self._listen)
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        jax.monitoring.unregister_event_time_span_listener(self._listen)
+
+    def _listen(self, event: str, start_time: float, end_time: float, **kwargs: Any) -> None:
+        if event.startswith(_COMPILING):
+            self._spans.append((start_time, end_time))
+
+    @property
+    def seconds(self) -> float:
+        """Length of the union of all spans so far [s]."""
+        total, reached = 0.0, 0.0
+        for start, end in sorted(self._spans):
+            total += max(end - max(start, reached), 0.0)
+            reached = max(reached, end)
+        return total
+
+    def lap(self) -> float:
+        """What `seconds` have grown by since the last call, or since the start."""
+        last, self._last = self._last, self.seconds
+        return self._last - last
+
+    @property
+    def compiled(self) -> bool:
+        """Whether anything was compiled."""
+        return bool(self._spans)
+
+
+class Stopwatch:
+    """Seconds since the last lap."""
+
+    def __init__(self) -> None:
+        self._last = time.perf_counter()
+
+    def lap(self) -> float:
+        """Seconds since the last call, or since the start."""
+        last, self._last = self._last, time.perf_counter()
+        return self._last - last
+
+
+def timed(call: Callable[[], FoundT]) -> tuple[FoundT, float, bool]:
+    """What a call gives, the seconds that it took, and whether nothing was compiled meanwhile."""
+    watch = Stopwatch()
+    with CompileClock() as clock:
+        found = call()
+    return found, watch.lap(), not clock.compiled
+
+
+def timed_warm(call: Callable[[], FoundT]) -> tuple[FoundT, float]:
+    """What a call gives, and the seconds that it takes once nothing is compiled.
+
+    One that compiles something in every call is timed with that.
+    """
+    for _ in range(_WARM_CALLS - 1):
+        found, seconds, warm = timed(call)
+        if warm:
+            return found, seconds
+    return timed(call)[:2]
+
+
+def timed_plans(planner: AnyPlanner[CaseT, PlanT], cases: CaseT) -> tuple[PlanT, np.ndarray]:
+    """Plans of cases (B,), made one after another, and the seconds (B,) that each takes, warm."""
+    num = jax.tree.leaves(cases)[0].shape[0]
+    timed_each = [timed_warm(lambda k=k: plan(planner, lane(cases, k))) for k in range(num)]
+    plans, seconds = zip(*timed_each, strict=True)
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *plans), np.array(seconds)

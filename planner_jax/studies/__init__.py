@@ -1,0 +1,1 @@
+"""Experiments that answered a question and are not part of the public interface."""

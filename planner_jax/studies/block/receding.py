@@ -1,0 +1,353 @@
+"""Receding horizon: the motion is decided anew while more of the ball's flight is seen.
+
+At given moments all that was seen so far is fitted anew. A motion that would still meet the ball of
+the new fit near where it was aimed to goes on. Else one is planned from where the arm will be once
+it can begin, with the rates that it then has; if none is found that meets the ball closer to the
+shield's middle, the old one goes on, and brakes after its contact. What the arm has done by the end
+is one plan, of pieces of all of them, which the referee judges against the true ball. With one
+moment this is what an arm does that decides once. Robot base frame, z up, SI units.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+from planner_jax.core.protocol import Status, is_solved, lane
+from planner_jax.perception.fit import FlightFit, Sight, believed_at
+from planner_jax.planning.plan import plan
+from planner_jax.planning.select import merged
+from planner_jax.studies.block.observation import (
+    Eye,
+    cautious,
+    fit_errors,
+    fitted,
+    frame_times,
+    watched,
+)
+from planner_jax.task.block.case import BlockCase
+from planner_jax.task.block.contact_check import as_met, braked
+from planner_jax.task.block.end_poses import flight_of
+from planner_jax.task.block.plan import BlockPlan
+from planner_jax.task.block.planner import OnlineBlock
+from planner_jax.task.block.replan import ReplanBlock, WarmBlock
+from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
+
+# [m]; a motion that would meet the ball within so much of the shield's middle needs no better one.
+_NEAR = 0.02
+_EXCESS = 0.05  # share by which the contact of a motion that goes on may exceed what is asked for
+_LONG = 100.0  # [s], that an arm stands after its motion
+
+
+@dataclasses.dataclass(frozen=True)
+class Aim:
+    """How a ball that is not known exactly is to be met; as in `cautious`."""
+
+    offset: float  # [m]
+    at_rest: bool = False
+    edge: float = 0.0  # [m]
+
+
+# In order: each for the balls for which nothing was found by those before.
+AIMS = (
+    Aim(0.005, at_rest=True, edge=0.05),
+    Aim(0.005, edge=0.05),
+    Aim(0.03, edge=0.03),
+    Aim(0.09),
+)
+
+
+@struct.dataclass
+class Decided:
+    """A batch of throws, and what arms did that decided while they watched."""
+
+    cases: BlockCase  # the true balls, with the delay from which on the motions count
+    plans: BlockPlan  # give them to `as_met`, then to the referee, with these cases
+    fits: FlightFit  # leaves (M, B, ...), of every moment
+    begun: Array  # (B,) [s], when the first motion began; infinite without any
+    motions: Array  # (B,) int32, how many motions were begun
+
+    def fit_errors(self, place: int) -> tuple[Array, Array]:
+        """Errors (B,) [m] of the fits of a moment, and what they are believed to be."""
+        return fit_errors(self.cases, lane(self.fits, place))
+
+
+def plan_with_aims(
+    planner: Any, cases: Any, aims: Sequence[Aim] = AIMS, *, of: Callable = lambda cases: cases
+) -> BlockPlan:
+    """Plans of a batch with fitted balls, by the first aim that leads to one.
+
+    Args:
+        planner: of blocks; or of what `of` finds the cases in.
+        cases: a batch of B.
+        aims: one or more.
+        of: the `BlockCase` in an entry.
+    """
+    cases, plans = jax.tree.map(np.asarray, cases), None
+    lanes = np.arange(cases.batch_shape[0])
+    for aim in aims:
+        some = lane(cases, lanes)
+        aimed = cautious(of(some), **dataclasses.asdict(aim))
+        # NumPy arrays, for which there are programs already.
+        aimed = jax.tree.map(np.asarray, aimed)
+        given = aimed if some is of(some) else dataclasses.replace(some, case=aimed)
+        found = jax.tree.map(np.array, plan(planner, given))
+        plans = found if plans is None else merged(plans, found, lanes)
+        lanes = np.flatnonzero(~is_solved(plans.status))
+        if not lanes.size:
+            break
+    assert plans is not None
+    return plans
+
+
+def decide(
+    planner: Any,
+    cases: BlockCase,
+    eye: Eye,
+    moments: Sequence[float],
+    *,
+    overhead: float = 0.05,
+    seed: Any = 0,
+    aims: Sequence[Aim] = AIMS,
+    shortest: float = 0.03,
+    patient: bool = False,
+    again: bool = True,
+) -> Decided:
+    """What arms do that watch their balls and decide at given moments.
+
+    Args:
+        planner: of the first motion, and of those that the previous one does not lead to. One that
+            is no `OnlineBlock` decides once.
+        cases: a batch of B, with the true balls; arms are where they say until the first moment.
+        eye: that sees the balls.
+        moments: [s], at which flights are fitted, rising; frames until then count.
+        overhead: [s], from a moment until its motion may begin, planning included, >= 0.
+        seed: of the noise; or (B,), of each throw's own.
+        aims: how balls are to be met, tried in this order; offsets must not fall.
+        shortest: [s], least time that is left for a new motion.
+        patient: whether an arm that stands waits, and sees more, while it could meet the ball by
+            the first of the aims if it began at the next moment.
+        again: whether motions are decided anew; if not, an arm begins one motion.
+
+    Raises:
+        ValueError: moments that do not rise from 0 or later, or a negative overhead; one line.
+        TypeError: several moments for another planner than `OnlineBlock`.
+    """
+    moments = [float(moment) for moment in moments]
+    if len(moments) == 0 or moments[0] < 0.0 or not np.all(np.diff(moments) > 0.0):
+        raise ValueError(f"moments must rise from 0 or later, got {moments}")
+    if not overhead >= 0.0:
+        raise ValueError(f"overhead must be >= 0, got {overhead:g}")
+    if len(moments) > 1 and not isinstance(planner, OnlineBlock):
+        raise TypeError(f"{type(planner).__name__} decides once: give it one moment")
+    cases = jax.tree.map(np.asarray, cases)
+    dtype, num = cases.gravity.dtype, cases.batch_shape[0]
+    times = jnp.asarray(frame_times(eye, moments[-1]), dtype)
+    places = _watch(cases, eye, times, _keys(seed))
+    begin = np.full(num, moments[0] + overhead, dtype)
+    cases = dataclasses.replace(cases, delay=begin)
+    arms = _Arms(cases)
+    fits = []
+    for moment, following in zip(moments, [*moments[1:], None], strict=True):
+        balls, fit = jax.tree.map(np.asarray, _fit(cases, eye, times, places, dtype.type(moment)))
+        begin = np.full(num, moment + overhead, dtype)
+        known = dataclasses.replace(cases, ball=balls, delay=begin)
+        fits.append(fit)
+        open_ = np.asarray(fit.status) == Sight.SEEN
+        left = np.asarray(_latest(cautious(known))) - begin
+        stands = arms.motions == 0
+        open_ &= (left > shortest) & (again | stands)
+        useful = arms.useful(planner, known, aims)
+        if patient and following is not None:
+            later = np.full(num, following + overhead, dtype)
+            lanes = np.flatnonzero(open_ & stands)
+            if lanes.size:
+                some = lane(dataclasses.replace(known, delay=later), lanes)
+                open_[lanes] = ~is_solved(plan_with_aims(planner, some, aims[:1]).status)
+        arms.decide(planner, known, np.where(open_, useful, 0), aims)
+    plans = arms.composed()
+    seen = np.asarray(fits[-1].status) == Sight.SEEN
+    status = np.where(seen | is_solved(plans.status), plans.status, Status.NON_FINITE)
+    plans = dataclasses.replace(plans, status=status.astype(np.int32))
+    every = jax.tree.map(lambda *leaves: np.stack(leaves), *fits)
+    return Decided(cases=cases, plans=plans, fits=every, begun=arms.first, motions=arms.motions)
+
+
+class _Arms:
+    """The arms of a batch: the motions that they carry out, and the pieces that they have."""
+
+    def __init__(self, cases: BlockCase):
+        num, dtype = cases.batch_shape[0], cases.gravity.dtype
+        none: Any = np.full(num, np.inf, dtype)
+        contact: Any = np.array(cases.delay)
+        steps: Any = np.zeros(num, np.int32)
+        status: Any = np.full(num, Status.INFEASIBLE, np.int32)
+        self.cases, self.since = cases, np.array(cases.delay)
+        self.plans = BlockPlan(
+            motion=_still(cases, (1, 3)),
+            contact_time=contact,
+            cost=none,
+            violation=none.copy(),
+            iterations=steps,
+            status=status,
+        )
+        motions: Any = np.zeros(num, np.int32)
+        first: Any = np.full(num, np.inf, dtype)
+        self.done, self.first, self.motions = [], first, motions
+
+    def useful(self, planner: Any, known: BlockCase, aims: Sequence[Aim]) -> np.ndarray:
+        """How many of the aims (B,) are closer than motions would meet the balls now known.
+
+        All of them for an arm whose motion misses the ball, or that has none.
+        """
+        num = np.full(len(self.motions), len(aims))
+        if not self.motions.any():
+            return num
+        since = dataclasses.replace(known, delay=self.since)
+        moves = is_solved(self.plans.status)
+        for offset in sorted({aim.offset for aim in aims}, reverse=True):
+            closer = sum(aim.offset < offset for aim in aims)
+            near = cautious(since, offset=max(offset, _NEAR))
+            meets = np.asarray(_meets(planner, near, self.plans))
+            num = np.where(moves & meets, closer, num)
+        return num
+
+    def decide(
+        self, planner: Any, known: BlockCase, useful: np.ndarray, aims: Sequence[Aim]
+    ) -> None:
+        """Go over to new motions where there are any.
+
+        Args:
+            planner: of motions.
+            known: the balls as they are known now, and when motions may begin.
+            useful: (B,) int, how many of the aims are worth trying.
+            aims: those that ask for less offset first.
+        """
+        begun = dataclasses.replace(self.cases, delay=self.since)
+        tasks = ReplanBlock().begin(begun, self.plans, known.delay - self.since, ball=known.ball)
+        moves, begin = is_solved(self.plans.status), np.asarray(known.delay)
+        for num in np.unique(useful[moves & (useful > 0)]):
+            lanes = np.flatnonzero(moves & (useful == num))
+            warm, some = WarmBlock(planner=planner), lane(tasks, lanes)
+            found = plan_with_aims(warm, some, aims[:num], of=lambda tasks: tasks.case)
+            self._begin(begin, lanes, found)
+            useful[lanes[is_solved(found.status)]] = 0
+        # A search from scratch takes long: only for a ball that is missed else.
+        lanes = np.flatnonzero(useful == len(aims))
+        if lanes.size:
+            self._begin(begin, lanes, plan_with_aims(planner, lane(tasks.case, lanes), aims))
+
+    def _begin(self, begin: np.ndarray, lanes: np.ndarray, found: BlockPlan) -> None:
+        """Go over to the plans found for some lanes (N,) that are solved."""
+        good = is_solved(found.status)
+        if not good.any():
+            return
+        lanes, found = lanes[good], lane(found, good)
+        if not self.motions.any():  # from now on motions are of this shape
+            still = _still(self.cases, found.motion.coeffs.shape[1:3])
+            self.plans = dataclasses.replace(self.plans, motion=still)
+        until = np.array(self.since)
+        until[lanes] = begin[lanes]
+        self.done.append(
+            jax.tree.map(np.asarray, _begun(self.cases, self.plans.motion, until - self.since))
+        )
+
+        def put(old: np.ndarray, new: Any) -> np.ndarray:
+            old[lanes] = new
+            return old
+
+        steps = self.plans.iterations[lanes]
+        self.plans = jax.tree.map(put, jax.tree.map(np.array, self.plans), found)
+        self.plans.iterations[lanes] += steps
+        self.since[lanes] = begin[lanes]
+        self.first[lanes] = np.minimum(self.first[lanes], begin[lanes])
+        self.motions[lanes] += 1
+
+    def composed(self) -> BlockPlan:
+        """What the arms have done and are about to do, as one plan each."""
+        motions = [*self.done, self.plans.motion]
+        coeffs: Any = np.concatenate([motion.coeffs for motion in motions], axis=1)
+        durations: Any = np.concatenate([motion.durations for motion in motions], axis=1)
+        # Pieces of no length go behind the others, and there go on from the end.
+        order = np.argsort(durations <= 0.0, axis=1, kind="stable")
+        num = max(int((durations > 0.0).sum(axis=1).max()), 1)
+        coeffs = np.take_along_axis(coeffs, order[:, :num, None, None], axis=1)
+        durations = np.take_along_axis(durations, order[:, :num], axis=1)
+        last = np.maximum((durations > 0.0).sum(axis=1) - 1, 0)
+        rows = np.arange(len(last))
+        of_last, long = coeffs[rows, last], durations[rows, last, None]
+        end, power = np.zeros_like(of_last), np.arange(of_last.shape[1])
+        end[:, 0] = np.sum(of_last * long[..., None] ** power[:, None], axis=1)
+        slope = power * long ** np.maximum(power - 1, 0)
+        end[:, 1] = np.sum(of_last * slope[..., None], axis=1)
+        coeffs = np.where((durations > 0.0)[:, :, None, None], coeffs, end[:, None])
+        return dataclasses.replace(
+            self.plans,
+            motion=PiecewisePolynomial(coeffs=coeffs, durations=durations),
+            cost=self.plans.cost + self.since - self.cases.delay,
+        )
+
+
+def _still(cases: BlockCase, shape: tuple[int, ...]) -> PiecewisePolynomial:
+    """Motions of no length, of so many pieces and powers, from where the arms are."""
+    num, dtype = cases.batch_shape[0], cases.gravity.dtype
+    coeffs: Any = np.zeros((num, *shape, 6), dtype)
+    coeffs[:, :, 0], coeffs[:, :, 1] = cases.angles[:, None], cases.rates[:, None]
+    durations: Any = np.zeros((num, shape[0]), dtype)
+    return PiecewisePolynomial(coeffs=coeffs, durations=durations)
+
+
+def _keys(seed: Any) -> Array:
+    """A key, or (B,) of them."""
+    return jax.vmap(jax.random.key)(seed) if np.ndim(seed) else jax.random.key(seed)
+
+
+_watch = jax.jit(watched)
+
+
+@jax.jit
+def _fit(cases: BlockCase, eye: Eye, times: Array, places: Array, moment: Array) -> Any:
+    """Balls at the time 0, and fits, of what was seen until a moment."""
+    fits = jax.vmap(fitted, (None, None, 0, 0, None))(eye, times, places, cases.gravity, moment)
+    start = jnp.zeros((), times.dtype)
+    return jax.vmap(believed_at, (0, None, 0))(fits, start, cases.gravity).ball, fits
+
+
+@jax.jit
+@jax.vmap
+def _latest(case: BlockCase) -> Array:
+    return flight_of(case).latest
+
+
+@jax.jit
+def _meets(planner: OnlineBlock, cases: BlockCase, plans: BlockPlan) -> Array:
+    """Whether motions meet the balls of some cases as these ask for, (B,) bool."""
+
+    def one(case: BlockCase, plan: BlockPlan) -> Array:
+        time = plan.contact_time - case.delay
+        angles = evaluate(plan.motion, jnp.minimum(time, jnp.sum(plan.motion.durations)))
+        flight = flight_of(case)
+        excess = planner.contact_terms(case, flight, angles, plan.contact_time)[2]
+        return flight.comes & (excess <= _EXCESS)
+
+    return jax.vmap(one)(cases, as_met(cases, plans))
+
+
+@jax.jit
+@jax.vmap
+def _begun(case: BlockCase, motion: PiecewisePolynomial, time: Array) -> PiecewisePolynomial:
+    """The pieces of a motion, of its braking and of standing thereafter, until a time () [s]."""
+    motion = braked(case, motion)
+    end = jnp.sum(motion.durations)
+    stand = jnp.zeros_like(motion.coeffs[:1]).at[0, 0].set(evaluate(motion, end))
+    durations = jnp.append(motion.durations, jnp.asarray(_LONG, end.dtype))
+    starts = jnp.cumsum(durations) - durations
+    return PiecewisePolynomial(
+        coeffs=jnp.concatenate([motion.coeffs, stand]),
+        durations=jnp.clip(time - starts, 0.0, durations),
+    )

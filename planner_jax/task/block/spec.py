@@ -1,0 +1,44 @@
+"""What the registry knows of blocks; imports no JAX."""
+
+import dataclasses
+
+from planner_jax.core.registry import Task
+
+
+@dataclasses.dataclass(frozen=True)
+class Suite:
+    """One kind of throw."""
+
+    description: str
+    distance: tuple[float, float] = (6.0, 12.0)  # [m], from the arm's axis to where it is thrown
+    has_pole: bool = True
+
+
+# The other ranges are those of `planner_jax.task.block.suites`.
+SUITES = {
+    "pole": Suite("Throws from 6 to 12 m, a pole in front of the arm."),
+    "open": Suite("The same without a pole.", has_pole=False),
+    "short": Suite("Throws from 6 to 8 m, a pole in front of the arm.", distance=(6.0, 8.0)),
+}
+
+TASK = Task(
+    name="block",
+    summary="an arm with a shield protects a box from thrown balls",
+    home="planner_jax.task.block",
+    planners={
+        "online": "planner_jax.task.block.planner:OnlineBlock",
+        "brisk": "planner_jax.task.block.planner:brisk",
+        "direct": "planner_jax.baselines.block.direct:DirectBlock",
+        "rrt-connect": "planner_jax.baselines.block.rrt_connect:RrtConnectBlock",
+        "epase": "planner_jax.baselines.block.epase:EpaseBlock",
+        "insat": "planner_jax.baselines.block.insat:InsatBlock",
+        "library": "planner_jax.baselines.block.library.planner:library_planner",
+        "adapt": "planner_jax.baselines.block.library.adapt:adapt_planner",
+    },
+    from_file={name: "planner-jax library build FILE" for name in ("library", "adapt")},
+    suites={name: suite.description for name, suite in SUITES.items()},
+    sweep="planner_jax.sweep.block.settings:BlockSettings",
+    flight="planner_jax.sims.settings:BlockFly",
+    contact="contact_time",
+    yardstick="brisk",
+)

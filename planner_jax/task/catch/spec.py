@@ -1,0 +1,72 @@
+"""What the registry knows of catches; imports no JAX."""
+
+import dataclasses
+
+from planner_jax.core.registry import Task
+
+
+@dataclasses.dataclass(frozen=True)
+class Suite:
+    """One kind of catching task."""
+
+    num_targets: int
+    horizon: float  # [s], until when a target may be caught at the latest
+    description: str
+    # Planning success [%], optimal time ratio, and success of its MPP [%] in paper 000, Tables I
+    # and III. Those of `throws` are of 50 real throws, planned; the others of 1,000 simulated ones
+    # each. The paper gives no ranges: a suite of the same name is of the same kind, no more.
+    success: float | None = None
+    time_ratio: float | None = None
+    mpp_success: float | None = None
+    optional: bool = False  # whether targets may be left: there are more than can be caught
+
+
+# The ranges are those of `planner_jax.task.catch.suites`.
+SUITES = {
+    "throws": Suite(
+        1, 1.42, "The paper's throws: with drag, to within 2 m x 0.8 m.", 96.0, 0.092, 14.0
+    ),
+    "hard": Suite(1, 1.22, "Throws to within 4 m x 3 m that are seen 0.2 s later."),
+    "parabola1": Suite(
+        1, 1.66, "A throw without drag, as high as its flight time asks.", 99.3, 0.052
+    ),
+    "parabola2": Suite(2, 1.96, "Two throws without drag, in the air together.", 98.2, 0.119),
+    "harmonic2": Suite(2, 7.0, "Two targets that swing in height and drift across.", 84.7, 0.234),
+    "triangle3": Suite(3, 6.0, "Three targets along the sides of a triangle.", 99.7, 0.126),
+    "hexagon6": Suite(6, 10.0, "Six targets in parallel, on a hexagon.", 76.3, 0.458),
+    "square4": Suite(4, 10.0, "Four targets in parallel, on a square."),
+    "pentagon5": Suite(5, 10.0, "Five targets in parallel, on a pentagon."),
+    "heptagon7": Suite(7, 10.0, "Seven targets in parallel, on a heptagon."),
+    "rush3": Suite(3, 4.4, "Three targets of `triangle3`, each with a deadline of its own."),
+    "rush6": Suite(6, 8.6, "Six targets of `hexagon6`, each with a deadline of its own."),
+    "swarm8": Suite(8, 13.9, "Eight balls that sink all around: as many as can be.", optional=True),
+    "swarm12": Suite(
+        12, 13.9, "Twelve balls that sink all around: as many as can be.", optional=True
+    ),
+}
+
+DECISIONS = {
+    "best": "planner_jax.task.catch.decide:Best",
+    "greedy": "planner_jax.task.catch.decide:Greedy",
+    "random": "planner_jax.task.catch.decide:Random",
+    "given": "planner_jax.task.catch.decide:Given",
+    "policy": "planner_jax.policies.policy:policy",
+}
+TRAINED = ("policy",)  # of these, those that may be read from a file, as "policy:FILE"
+
+TASK = Task(
+    name="catch",
+    summary="a quadrotor catches flying targets with a net",
+    home="planner_jax.task.catch",
+    planners={
+        "exact": "planner_jax.task.catch.planner:ExactCatch",
+        "catch": "planner_jax.baselines.catch.paper:PaperCatch",
+        "mpp": "planner_jax.baselines.catch.mpp:MppCatch",
+    },
+    suites={name: suite.description for name, suite in SUITES.items()},
+    sweep="planner_jax.sweep.catch.settings:CatchSettings",
+    single="planner_jax.sweep.catch.single_settings:SingleCatchSettings",
+    flight="planner_jax.sims.settings:CatchFly",
+    bench={"decide": "greedy"},
+    contact="times",
+)

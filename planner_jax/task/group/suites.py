@@ -1,0 +1,79 @@
+"""Named, seeded suites of groups: several targets for one car among walls and movers.
+
+They are this library's, as are those of `planner_jax.task.intercept.suites`. Start, walls, movers
+and one target are drawn as there, for the time until when all targets are to be met. Then how many
+targets there are is drawn, and targets are drawn as the first one was until there is room for no
+more: each anew until nothing is wrong with it (`planner_jax.task.intercept.rejection`). So all of
+them stay on the map and off the walls up to that time. World frame in the plane, SI units.
+"""
+
+import dataclasses
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from planner_jax.core.checks import floating
+from planner_jax.core.registry import require_name
+from planner_jax.task.group.case import InterceptGroup
+from planner_jax.task.intercept.rejection import CAUSES, first_cause
+from planner_jax.task.intercept.spec import GROUPS
+from planner_jax.task.intercept.suites import (
+    accepted_draws,
+    anywhere,
+    cases_of,
+    generators,
+    path_of,
+    target_to,
+)
+
+_TARGET = ("pos", "angle", "speed", "rate")
+
+
+def draw_groups(
+    suite: str, num: int, seed: int, first: int = 0, *, dtype: Any = jnp.float32
+) -> InterceptGroup:
+    """A batch of groups of a suite, drawn in float64 and then cast.
+
+    Args:
+        suite: a key of `GROUPS`.
+        num: B, how many, >= 1.
+        seed: >= 0. Group k of a suite and seed is always the same one.
+        first: place of the first one, >= 0.
+        dtype: of every floating leaf.
+
+    Raises:
+        ValueError: an argument is out of its range; one line.
+    """
+    require_name(GROUPS, "suite", suite)
+    own, randoms, dtype = GROUPS[suite], generators(suite, num, seed, first), floating(dtype)
+    drawn, _, _ = accepted_draws(own, randoms)
+    fewest, most = own.num_targets
+    count = np.array([random.integers(fewest, most + 1) for random in randoms])
+    targets = [{name: drawn[name] for name in _TARGET}]
+    targets += [_another_target(suite, randoms, drawn) for _ in range(most - 1)]
+    together = {name: np.stack([each[name] for each in targets], axis=1) for name in _TARGET}
+    return InterceptGroup(
+        shared=dataclasses.replace(cases_of(drawn, dtype), target=path_of(together, dtype)),
+        present=jnp.asarray(np.arange(most) < count[:, None]),
+        order=jnp.asarray(np.broadcast_to(np.arange(most), (num, most)), jnp.int32),
+    )
+
+
+def _another_target(
+    suite: str, randoms: list[np.random.Generator], drawn: dict[str, np.ndarray]
+) -> dict[str, np.ndarray]:
+    """One more target for each of B draws, with which nothing is wrong either."""
+    own, pending = GROUPS[suite], np.arange(len(randoms))
+    turning = np.array([random.random() < 0.5 for random in randoms])
+    found = {name: np.zeros_like(drawn[name]) for name in _TARGET}
+    while len(pending):
+        uniform = np.stack([randoms[k].random(6) for k in pending])
+        meeting = anywhere(uniform[:, :2])
+        target = target_to(meeting, own.time, turning[pending], uniform[:, 2:])
+        around = {name: leaf[pending] for name, leaf in drawn.items()}
+        is_good = first_cause(own, {**around, **target, "meeting": meeting}) == len(CAUSES)
+        for name in _TARGET:
+            found[name][pending[is_good]] = target[name][is_good]
+        pending = pending[~is_good]
+    return found

@@ -1,0 +1,116 @@
+"""The words of the task: `pj.hit.draw`, `planner` and `judge`; `case` stands in `case.py`."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+
+from planner_jax.core.efforts import with_effort
+from planner_jax.core.protocol import AnyPlanner
+from planner_jax.core.registry import suite_named
+from planner_jax.recovery.with_recovery import ended
+from planner_jax.referee.hit import HitVerdict, referee_hits
+from planner_jax.robot.quadrotor_model import QuadrotorModel
+from planner_jax.robot.quadrotor_models import PAPER_HITTER
+from planner_jax.task.flight import require_own_robot
+from planner_jax.task.hit.case import HitCase
+from planner_jax.task.hit.plan import HitPlan
+from planner_jax.task.hit.spec import REAL_SCENARIOS, START, TASK
+from planner_jax.task.hit.suites import generate_serves, to_cases
+from planner_jax.task.judged import judged
+
+
+def draw(
+    num: int,
+    suite: str | None = None,
+    seed: int = 0,
+    *,
+    first: int = 0,
+    start: Sequence[float] | str = START,
+    delay: float = 0.0,
+    limit_scale: float = 1.0,
+    robot: QuadrotorModel = PAPER_HITTER,
+    dtype: Any = jnp.float32,
+) -> HitCase:
+    """Drawn serves as a batch of cases; see `generate_serves` and `to_cases`.
+
+    Args:
+        num: how many, >= 1.
+        suite: "court", the default, or one of the six real scenarios of paper 002, "S.1" to
+            "S.6", or one that another package offers.
+        seed: >= 0. Case k of a suite and seed is always the same one.
+        first: place of the first one, >= 0.
+        start: (3,) [m], hover position of the quadrotor; or "uniform" over the half court.
+        delay: [s] from the serve to the moment at which planning begins.
+        limit_scale: factor on the speed, acceleration and body-rate limits.
+        robot: with a racket; suites of other packages have their own.
+        dtype: of every leaf.
+
+    Raises:
+        ValueError: an argument is out of its range, or there is no such suite.
+    """
+    suite = suite_named(suite, "court")
+    if suite not in TASK.suites:
+        require_own_robot(robot, PAPER_HITTER, suite)
+        return TASK.other_suite(suite)(num, seed, first)
+    serves = generate_serves(num, seed, REAL_SCENARIOS.get(suite), first=first)
+    return to_cases(
+        serves,
+        start=start,
+        seed=seed,
+        delay=delay,
+        limit_scale=limit_scale,
+        robot=robot,
+        dtype=dtype,
+    )
+
+
+def planner(
+    name: str = "exact", *, effort: str = "feasible", ending: str | None = None, **options: Any
+) -> AnyPlanner[HitCase, HitPlan]:
+    """The hit planner of a name, with some of its fields set.
+
+    * `exact`: contact, impact and landing hold by construction; the one to use.
+    * `bat`: the published planner of paper 002, impact and trajectory optimised together.
+    * `bat-lite`: `bat` without the transition point before the impact.
+    * `juggle`: a primitive to a stroke that is fixed beforehand; nothing is optimised.
+
+    Args:
+        name: one of these, or one that another package offers.
+        ending: what is flown behind the last contact, within all limits: "brake" to rest where that
+            is cheapest, "home" for the way back to where the case begins; by default the plan ends
+            at the contact.
+        effort: "feasible" is done with a case as soon as every limit holds; "good" and "best"
+            search on for less cost. Of 1,000 hits of `court` it is above that of a very long
+            search by 469, 0.00 and 0.00 % (median), 2,467, 0.05 and 0.00 % (90 % quantile), in
+            0.05, 3.6 and 21 s on two CPU cores that had other work.
+        **options: fields of that planner's dataclass, for example `rounds`.
+
+    Returns:
+        `ExactHit`, `BatHit` (`bat` and `bat-lite`) or `JuggleHit`, for `pj.plan`; with an ending a
+        planner whose `planner` is one of these.
+
+    Raises:
+        ValueError: there is no planner of that name, or it has no such effort.
+        TypeError: the planner has no such field.
+    """
+    return ended(with_effort(TASK.make_planner(name, options), effort), ending)
+
+
+def judge(cases: HitCase, plans: HitPlan, **settings: Any) -> HitVerdict:
+    """What the referee says of one plan or of a batch: the physics alone decides.
+
+    Args:
+        cases: one case, or a batch.
+        plans: of them.
+        **settings: such as `drag_after_impact` and `tolerance`; see `referee_hits`.
+
+    Returns:
+        A verdict with the batch shape of the cases: `success`, `sentence(k)`, and what was
+        measured.
+
+    Raises:
+        TypeError: the cases or plans are not hits.
+        ValueError: shapes that do not fit, or a setting out of its range.
+    """
+    return judged(referee_hits, cases, plans, (HitCase, HitPlan), settings)

@@ -1,0 +1,43 @@
+"""What the registry knows of hits; imports no JAX."""
+
+from planner_jax.core.registry import Task
+
+# Where the quadrotor hovers: an assumption, the paper draws it at the near/far boundary of the
+# hitting half.
+START = (-3.0, 0.0, 1.5)  # [m]
+
+# Serve, landing and target region of the simulated court (`court.SCENARIOS`) for the six real
+# scenarios of paper 002, Section VI-C, which it names in words alone: an assumption.
+REAL_SCENARIOS = {
+    "S.1": ("FNN", "FFN"),  # from different distances
+    "S.2": ("FFF", "LFF"),  # serves from different directions
+    "S.3": ("FFN", "FLN"),  # hit from different directions
+    "S.4": ("FFL", "FNL"),  # hit straight, shoot sideways
+    "S.5": ("FLL", "LLL"),  # hit and shoot sideways to the same side
+    "S.6": ("FLR", "LLR"),  # hit and shoot sideways to different sides
+}
+
+TASK = Task(
+    name="hit",
+    summary="a quadrotor hits served balls to a target with a racket",
+    home="planner_jax.task.hit",
+    planners={
+        "exact": "planner_jax.task.hit.planner:ExactHit",
+        "bat": "planner_jax.baselines.hit.bat:BatHit",
+        "bat-lite": "planner_jax.baselines.hit.bat:bat_lite",
+        "juggle": "planner_jax.baselines.hit.juggle:JuggleHit",
+    },
+    suites={
+        "court": "Serves by the law of the published ones, all 36 scenarios of the court.",
+        "S.1": "Serves from different distances.",
+        "S.2": "Serves from different directions.",
+        "S.3": "Balls that are hit from different directions.",
+        "S.4": "Balls that come straight and go sideways.",
+        "S.5": "Balls that come from one side and go to the same side.",
+        "S.6": "Balls that come from one side and go to the other side.",
+    },
+    sweep="planner_jax.sweep.hit.settings:HitSettings",
+    single="planner_jax.sweep.hit.single_settings:SingleHitSettings",
+    flight="planner_jax.sims.settings:HitFly",
+    contact="stroke.time",
+)

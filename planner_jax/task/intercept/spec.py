@@ -1,0 +1,94 @@
+"""What the registry knows of interceptions; imports no JAX."""
+
+import dataclasses
+
+from planner_jax.core.registry import Task
+
+
+@dataclasses.dataclass(frozen=True)
+class Suite:
+    """One kind of interception: how much stands and moves in the way, and how much time there is.
+
+    The shapes of a suite's arrays depend on its room alone, so that all of its cases share a
+    compiled program.
+    """
+
+    description: str
+    num_walls: tuple[int, int]  # fewest and most; of a maze, of the walls across the map
+    num_movers: tuple[int, int]  # fewest and most
+    mover_speed: tuple[float, float] = (0.1, 0.6)  # [m/s]
+    time: float = 10.0  # [s], when the target is to be met
+    # [s], if the target is to be met earlier: so long after a reach set first meets it.
+    spare: float | None = None
+    is_maze: bool = False
+    # How many polygons of how many corners the arrays hold.
+    wall_room: tuple[int, int] = (12, 6)
+    mover_room: tuple[int, int] = (4, 6)
+    num_targets: tuple[int, int] = (1, 1)  # fewest and most, for which there is room
+
+
+# The other ranges are those of `planner_jax.task.intercept.suites`.
+SUITES = {
+    "easy": Suite("Four to six walls and one mover.", (4, 6), (1, 1)),
+    "medium": Suite("Seven to nine walls, two or three movers.", (7, 9), (2, 3)),
+    "hard": Suite("Ten to twelve walls, three or four movers.", (10, 12), (3, 4)),
+    "storm": Suite(
+        "Twelve movers, the fastest at 1 m/s, among five to eight walls.",
+        (5, 8),
+        (12, 12),
+        mover_speed=(0.2, 1.0),
+        mover_room=(12, 6),
+    ),
+    "gale": Suite("Eight movers among eight to twelve walls.", (8, 12), (8, 8), mover_room=(12, 6)),
+    "maze": Suite(
+        "Two or three walls across the map, each with one gap, and dead ends before them.",
+        (2, 3),
+        (1, 2),
+        time=15.0,
+        is_maze=True,
+    ),
+    "rush": Suite(
+        "What stands and moves in `hard`, to be met 0.5 s after a reach set first meets it.",
+        (10, 12),
+        (3, 4),
+        spare=0.5,
+    ),
+}
+
+# Of several targets: their cases are of a class of their own.
+GROUPS = {
+    "group": Suite(
+        "Two to four targets for one car, five to eight walls, two or three movers.",
+        (5, 8),
+        (2, 3),
+        time=15.0,
+        num_targets=(2, 4),
+    ),
+}
+
+DECISIONS = {
+    "best": "planner_jax.task.group.decide:Best",
+    "greedy": "planner_jax.task.group.decide:Greedy",
+    "given": "planner_jax.task.group.decide:Given",
+}
+
+TASK = Task(
+    name="intercept",
+    summary="a car meets a moving target among obstacles that stand and move",
+    home="planner_jax.task.intercept",
+    planners={
+        "spacetime": "planner_jax.task.intercept.planner:SpacetimeIntercept",
+        "quick": "planner_jax.task.intercept.planner:quick",
+        "best": "planner_jax.task.intercept.planner:best",
+        "lattice": "planner_jax.baselines.intercept.path_then_speed:lattice",
+        "paper": "planner_jax.baselines.intercept.paper:PaperIntercept",
+        "em": "planner_jax.baselines.intercept.path_then_speed:em",
+        "constant": "planner_jax.baselines.intercept.path_then_speed:constant",
+        "group": "planner_jax.task.group.planner:GroupIntercept",
+    },
+    suites={name: suite.description for name, suite in {**SUITES, **GROUPS}.items()},
+    sweep="planner_jax.sweep.intercept.settings:InterceptSettings",
+    flight="planner_jax.sims.settings:InterceptFly",
+    contact="time",
+    yardstick="best",
+)
