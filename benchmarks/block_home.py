@@ -26,7 +26,7 @@ from planner_jax.benchmarks.run import argument_parser, begin
 from planner_jax.robot.arm_mjcf import irb1600
 from planner_jax.sweep.block.settings import REGIMES
 from planner_jax.task.block.clearance import clearances, num_of_pole
-from planner_jax.task.block.planner import OnlineBlock, Search
+from planner_jax.task.block.default_planner import OnlineBlock, Search
 from planner_jax.task.block.scene import paper_scene
 
 # Of the angles [rad] that are tried first: within what the arm can do, and in front of it.

@@ -33,8 +33,8 @@ from planner_jax.benchmarks.block_starts import follow, random_starts
 from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin, chosen
 from planner_jax.runs.summary import wilson_interval
 from planner_jax.task.block.clearance import least_clearances
+from planner_jax.task.block.default_planner import OnlineBlock, Search
 from planner_jax.task.block.end_poses import end_poses, flight_of
-from planner_jax.task.block.planner import OnlineBlock, Search
 
 # Suite and settings of a row; late: 0.133 s until the arm may start.
 LATE = 0.133

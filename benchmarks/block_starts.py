@@ -28,7 +28,7 @@ import planner_jax as pj
 from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin
 from planner_jax.core.protocol import is_solved
 from planner_jax.optimise.levenberg import least_squares
-from planner_jax.task.block import planner as online
+from planner_jax.task.block import default_planner as online
 from planner_jax.task.block.end_poses import all_profiles, end_poses, flight_of
 from planner_jax.task.block.motion import angles_at
 from planner_jax.task.block.plan import BlockPlan

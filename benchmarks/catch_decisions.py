@@ -29,7 +29,7 @@ from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.policies.policy import policy
 from planner_jax.runs.settings import SettingError
 from planner_jax.task.catch.decide import Random
-from planner_jax.task.catch.planner import ExactCatch
+from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.catch.spec import SUITES
 
 OTHERS = ("throws", "hard", "square4", "pentagon5", "heptagon7")

@@ -5,8 +5,9 @@
 
 Eight balls that sink all around, each known only from its appearance on, at a moment that is even
 between 0 and the span [s] (`planner_jax.studies.catch.appearing`). At every appearance and every
-catch the decision is asked anew, the planner `exact` plans from the state in which the quadrotor is, and
-all that was flown is refereed as one plan of the case. "greedy" takes next whatever can be caught
+catch the decision is asked anew, the planner `exact` plans from the state in which the quadrotor
+is, and all that was flown is refereed as one plan of the case. "greedy" takes next whatever can be
+caught
 earliest, "random" any, "best" the better one of the two most promising orders of a search, and
 "policy" the order and times of the shipped policy or that of --policy; all of them also with the
 last catch or the last two left out. "known" is the plan of a long search, sixteen orders in three

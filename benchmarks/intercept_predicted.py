@@ -39,8 +39,8 @@ from planner_jax.referee.intercept import InterceptVerdict
 from planner_jax.runs.summary import percent, wilson_interval
 from planner_jax.task.intercept.api import positions
 from planner_jax.task.intercept.case import InterceptCase
+from planner_jax.task.intercept.default_planner import SpacetimeIntercept
 from planner_jax.task.intercept.plan import InterceptPlan
-from planner_jax.task.intercept.planner import SpacetimeIntercept
 from planner_jax.task.intercept.spec import SUITES
 from planner_jax.task.intercept.suites import observe
 

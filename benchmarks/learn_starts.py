@@ -33,8 +33,8 @@ from planner_jax.benchmarks.run import Bench, argument_parser, begin
 from planner_jax.optimise import learned_start
 from planner_jax.optimise.learned_start import StartNetwork
 from planner_jax.planning.decided import first_choice
-from planner_jax.task.catch import planner as catch_exact
-from planner_jax.task.hit import planner as hit_exact
+from planner_jax.task.catch import default_planner as catch_exact
+from planner_jax.task.hit import default_planner as hit_exact
 
 _POOL = 262_144  # cases that are drawn at first, and taken in another order again and again
 _BATCH = 8192

@@ -22,7 +22,7 @@ from planner_jax.benchmarks.cost_gap import gap_figures
 from planner_jax.benchmarks.hit_rows import ROWS
 from planner_jax.benchmarks.run import argument_parser, begin
 from planner_jax.optimise.multistart import minimise
-from planner_jax.task.hit.planner import ExactHit
+from planner_jax.task.hit.default_planner import ExactHit
 
 PLANNER = ExactHit()
 

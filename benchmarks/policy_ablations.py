@@ -30,7 +30,7 @@ from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.policies.policy import Policy
 from planner_jax.policies.settings import WEIGHTS
 from planner_jax.policies.training import Part, Training, train
-from planner_jax.task.catch.planner import ExactCatch
+from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.catch.spec import SUITES
 
 ITERATIONS = 25  # of the planner in training

@@ -24,8 +24,8 @@ from planner_jax.policies.observation import FEATURES, PER_TARGET, choice_of, ob
 from planner_jax.policies.settings import WEIGHTS
 from planner_jax.task.catch.case import CatchCase, CatchChoice
 from planner_jax.task.catch.decide import in_several_lengths
+from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.catch.estimate import earliest_next, shortfall, timetable
-from planner_jax.task.catch.planner import ExactCatch
 from planner_jax.task.catch.spec import SUITES
 from planner_jax.task.catch.suites import draw_by_key
 

@@ -53,7 +53,7 @@ from planner_jax.runs.manifest import to_write
 from planner_jax.runs.run_folder import RunFolder
 from planner_jax.runs.settings import SettingError
 from planner_jax.task.catch.decide import optimal_time_ratio
-from planner_jax.task.catch.planner import ExactCatch
+from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.catch.suites import draw
 
 _ROWS = 50  # of a part's curve, at most

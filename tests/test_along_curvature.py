@@ -15,8 +15,8 @@ from planner_jax.cost.along_curvature import (
 from planner_jax.cost.quadrotor import flight_along
 from planner_jax.planning.decided import first_choice
 from planner_jax.task.catch.decide import Greedy
-from planner_jax.task.catch.planner import ExactCatch
-from planner_jax.task.hit.planner import ExactHit
+from planner_jax.task.catch.default_planner import ExactCatch
+from planner_jax.task.hit.default_planner import ExactHit
 from planner_jax.trajectory.proportional_minco import proportional_minco
 
 MAPS = proportional_minco(4, (0.3, 1.0, 1.0))

@@ -18,9 +18,9 @@ from planner_jax.robot.arm import REGIMES
 from planner_jax.robot.arm_mjcf import irb1600
 from planner_jax.sweep.block.settings import REGIMES as SWEPT
 from planner_jax.task.block.clearance import clearance_slopes, clearances, num_of_pole
+from planner_jax.task.block.default_planner import OnlineBlock, Search
 from planner_jax.task.block.end_poses import end_poses, flight_of
 from planner_jax.task.block.motion import angles_at, polynomial, profiles, sums
-from planner_jax.task.block.planner import OnlineBlock, Search
 from planner_jax.task.block.scene import entry_time, paper_scene
 from planner_jax.trajectory.polynomial import evaluate
 

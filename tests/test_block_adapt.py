@@ -17,9 +17,9 @@ from planner_jax.baselines.block.library.planner import LibraryBlock, OtherLibra
 from planner_jax.baselines.block.library.table import Row, Setting, library_of, packed
 from planner_jax.robot.arm import REGIMES
 from planner_jax.robot.arm_mjcf import irb1600
+from planner_jax.task.block.default_planner import OnlineBlock
 from planner_jax.task.block.end_poses import end_poses, flight_of
 from planner_jax.task.block.motion import profiles
-from planner_jax.task.block.planner import OnlineBlock
 from planner_jax.task.block.scene import paper_scene
 
 ONLINE = OnlineBlock(pieces=6, points=10)

@@ -32,7 +32,7 @@ from planner_jax.baselines.block.library.table import (
     packed,
     unpacked,
 )
-from planner_jax.cli.main import library as command
+from planner_jax.cli import library as command
 from planner_jax.cli.main import main
 from planner_jax.robot.arm import REGIMES
 from planner_jax.robot.arm_mjcf import irb1600

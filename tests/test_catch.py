@@ -22,7 +22,7 @@ from planner_jax.planning.plan import plan
 from planner_jax.referee.catch import referee_catches
 from planner_jax.task.catch.chain import nearest_upright
 from planner_jax.task.catch.decide import Greedy
-from planner_jax.task.catch.planner import ExactCatch
+from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.catch.suites import draw
 from planner_jax.trajectory.polynomial import evaluate
 from tests.jaxpr import assert_full_precision

@@ -12,7 +12,7 @@ from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
 from planner_jax.planning.plan import plan
 from planner_jax.referee.catch import referee_catches
-from planner_jax.task.catch.planner import ExactCatch
+from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.catch.replan import ReplanCatch
 from planner_jax.task.catch.suites import draw
 

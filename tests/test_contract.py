@@ -25,8 +25,8 @@ from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.problem import Round
 from planner_jax.plane.reach import Lattice
 from planner_jax.planning import one_by_one
-from planner_jax.task.block.planner import Search as BlockSearch
-from planner_jax.task.intercept.planner import SpacetimeIntercept
+from planner_jax.task.block.default_planner import Search as BlockSearch
+from planner_jax.task.intercept.default_planner import SpacetimeIntercept
 from planner_jax.task.intercept.searches import Search
 
 NUM = 6  # cases of a batch; no more than one bucket

@@ -27,8 +27,8 @@ from planner_jax.task.catch.decide import (
     closest_approach,
     optimal_time_ratio,
 )
+from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.catch.estimate import follow, timetable
-from planner_jax.task.catch.planner import ExactCatch
 from planner_jax.task.catch.suites import draw
 
 PLANNER = ExactCatch(rounds=(Round(1, LbfgsConfig(max_steps=20)),))

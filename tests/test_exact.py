@@ -16,7 +16,7 @@ from planner_jax.core.protocol import Status, is_solved
 from planner_jax.optimise.scaling import shipped_scale
 from planner_jax.planning.plan import plan
 from planner_jax.referee.hit import referee_hits
-from planner_jax.task.hit.planner import ExactHit
+from planner_jax.task.hit.default_planner import ExactHit
 from planner_jax.task.hit.suites import generate_serves, to_cases
 from planner_jax.trajectory.polynomial import evaluate, total_duration
 from tests.jaxpr import assert_full_precision

@@ -20,7 +20,7 @@ from planner_jax.optimise.problem import Round
 from planner_jax.optimise.sensitivity import gradient_at
 from planner_jax.planning.plan import plan
 from planner_jax.task.catch.suites import draw
-from planner_jax.task.hit.planner import ExactHit
+from planner_jax.task.hit.default_planner import ExactHit
 from planner_jax.task.hit.suites import generate_serves, to_cases
 
 pytestmark = pytest.mark.gpu
@@ -68,7 +68,7 @@ WITHOUT_KERNELS = """
 import sys
 import jax, numpy as np
 from planner_jax.lanes import pallas
-from planner_jax.task.hit.planner import ExactHit
+from planner_jax.task.hit.default_planner import ExactHit
 from planner_jax.task.hit.suites import generate_serves, to_cases
 from planner_jax.planning.plan import plan
 

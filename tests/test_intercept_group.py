@@ -19,7 +19,7 @@ from planner_jax.sweep.run import start_sweep
 from planner_jax.sweep.sweep import sweep_of
 from planner_jax.task.group.case import CarState
 from planner_jax.task.group.decide import Best, Given, Greedy
-from planner_jax.task.intercept.planner import SpacetimeIntercept
+from planner_jax.task.intercept.default_planner import SpacetimeIntercept
 from planner_jax.task.intercept.rejection import SIZE
 from planner_jax.task.intercept.searches import Search
 from planner_jax.task.intercept.spec import GROUPS, TASK

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import planner_jax as pj
-from planner_jax.cli.main import doctor
+from planner_jax.cli import doctor
 from planner_jax.lanes import in_one_kernel, over_lanes, pallas
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.multistart import solve_batch
@@ -16,8 +16,8 @@ from planner_jax.optimise.problem import Round
 from planner_jax.optimise.sensitivity import gradient_at
 from planner_jax.runs.environment import require_backend
 from planner_jax.runs.settings import SettingError
-from planner_jax.task.catch.planner import ExactCatch
-from planner_jax.task.hit.planner import ExactHit
+from planner_jax.task.catch.default_planner import ExactCatch
+from planner_jax.task.hit.default_planner import ExactHit
 
 LANES = 128
 # Of one round: the table; penalties with slopes, without (of guesses, of trials), greatest of a

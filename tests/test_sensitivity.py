@@ -27,9 +27,9 @@ from planner_jax.optimise.sensitivity import (
 from planner_jax.planning.decided import first_choice
 from planner_jax.planning.gradient import gradient
 from planner_jax.task.catch.decide import Greedy
-from planner_jax.task.catch.planner import ExactCatch
+from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.catch.suites import draw
-from planner_jax.task.hit.planner import ExactHit
+from planner_jax.task.hit.default_planner import ExactHit
 from planner_jax.task.hit.suites import generate_serves, to_cases
 
 CURVED = np.array([[3.0, 1.0, 0.2], [1.0, 2.0, 0.0], [0.2, 0.0, 1.0]])

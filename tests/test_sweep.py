@@ -32,7 +32,7 @@ from planner_jax.sweep.report import RunRows, write_report
 from planner_jax.sweep.run import SweepInterrupted, resume_sweep, start_sweep
 from planner_jax.sweep.sampled_motion import body_rate, net_thrust, sample_motion
 from planner_jax.task.hit import court
-from planner_jax.task.hit.planner import ExactHit
+from planner_jax.task.hit.default_planner import ExactHit
 from planner_jax.task.hit.spec import REAL_SCENARIOS
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 

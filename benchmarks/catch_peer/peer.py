@@ -1,8 +1,8 @@
 """Build the C++ program of this folder, run it on a table of throws, and compare with the table.
 
 The program minimises the objective of `planner_jax.baselines.catch.paper.PaperCatch`, on one core
-and in double precision: one throw after another, none of them with a heap allocation. It shares no code
-with the library.
+and in double precision: one throw after another, none of them with a heap allocation. It shares no
+code with the library.
 
 A peer gets its best settings. They were found by some 500 to 1,500 random steps for each search, on
 the 240 throws of both sets, from the least time while 97 % were within 1e-3 of the published cost.

@@ -249,7 +249,7 @@ def _add_library(commands: Any) -> None:
 
 def _library(name: str, given: dict[str, Any]) -> None:
     keep_compiled_programs()
-    from planner_jax.cli.main import library
+    from planner_jax.cli import library
 
     parts = Path(f"{given['path']}.parts")
     rest = functools.partial(_rest, parts, f"go on with: {_same_command()}", "what.json")

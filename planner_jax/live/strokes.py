@@ -26,12 +26,12 @@ from planner_jax.task.catch.case import GRAVITY as CATCH_GRAVITY
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.case import case as catch_case
 from planner_jax.task.catch.decide import Greedy
-from planner_jax.task.catch.planner import ExactCatch
+from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.catch.replan import ReplanCatch
 from planner_jax.task.hit.case import DRAG as HIT_DRAG
 from planner_jax.task.hit.case import GRAVITY as HIT_GRAVITY
 from planner_jax.task.hit.case import case as hit_case
-from planner_jax.task.hit.planner import ExactHit
+from planner_jax.task.hit.default_planner import ExactHit
 from planner_jax.task.hit.replan import ReplanHit
 from planner_jax.trajectory.polynomial import evaluate
 

@@ -58,8 +58,8 @@ from planner_jax.sims.task import BallFlightTask, FlightCases, Flights
 from planner_jax.task.catch.api import planner as catch_planner
 from planner_jax.task.catch.case import GRAVITY, START, CatchCase
 from planner_jax.task.catch.case import case as catch_case
+from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.catch.plan import CatchPlan
-from planner_jax.task.catch.planner import ExactCatch
 from planner_jax.task.catch.replan import ReplanCatch
 from planner_jax.task.catch.spec import DECISIONS, TRAINED
 from planner_jax.task.catch.suites import LAUNCH, draw, earliest_throw

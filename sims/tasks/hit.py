@@ -43,8 +43,8 @@ from planner_jax.sims.task import BallFlightTask, FlightCases, Flights
 from planner_jax.task.hit import court
 from planner_jax.task.hit.api import planner as hit_planner
 from planner_jax.task.hit.case import GRAVITY, HitCase
+from planner_jax.task.hit.default_planner import ExactHit
 from planner_jax.task.hit.plan import HitPlan
-from planner_jax.task.hit.planner import ExactHit
 from planner_jax.task.hit.replan import ReplanHit
 from planner_jax.task.hit.spec import REAL_SCENARIOS
 from planner_jax.task.hit.suites import DEPTH, SERVE_HEIGHT, generate_serves, to_cases

@@ -47,8 +47,8 @@ from planner_jax.sims.task import FlightCases, Flights, FlightTask
 from planner_jax.task.intercept.api import draw, positions
 from planner_jax.task.intercept.api import planner as intercept_planner
 from planner_jax.task.intercept.case import InterceptCase
+from planner_jax.task.intercept.default_planner import SpacetimeIntercept
 from planner_jax.task.intercept.plan import InterceptPlan
-from planner_jax.task.intercept.planner import SpacetimeIntercept
 from planner_jax.task.intercept.suites import observe
 
 CAR_WORLD = World(Car(), GRAVITY, num_balls=0, timestep=1.0 / CONTROL_RATE)

@@ -25,8 +25,8 @@ from planner_jax.sims.settings import CatchFly
 from planner_jax.sweep.hit.settings import HitSettings
 from planner_jax.sweep.hit.sweep import HitSweep
 from planner_jax.sweep.run import SweepInterrupted, start_sweep
+from planner_jax.task.hit.default_planner import ExactHit
 from planner_jax.task.hit.plan import HitPlan
-from planner_jax.task.hit.planner import ExactHit
 from tests.faults.commands import Ended, is_one_line, run
 from tests.faults.damage import damage
 from tests.recordings import recording

@@ -21,8 +21,8 @@ from planner_jax.plane import reach
 from planner_jax.plane.obstacles import Obstacles
 from planner_jax.plane.target import TurningPath
 from planner_jax.task.intercept.case import InterceptCase
+from planner_jax.task.intercept.default_planner import Found, Guess, SpacetimeIntercept
 from planner_jax.task.intercept.motion import motion
-from planner_jax.task.intercept.planner import Found, Guess, SpacetimeIntercept
 from planner_jax.task.intercept.searches import Search
 from planner_jax.task.intercept.terms import wrapped
 

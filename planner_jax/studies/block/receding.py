@@ -32,9 +32,9 @@ from planner_jax.studies.block.observation import (
 )
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.contact_check import as_met, braked
+from planner_jax.task.block.default_planner import OnlineBlock
 from planner_jax.task.block.end_poses import flight_of
 from planner_jax.task.block.plan import BlockPlan
-from planner_jax.task.block.planner import OnlineBlock
 from planner_jax.task.block.replan import ReplanBlock, WarmBlock
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 

@@ -25,8 +25,8 @@ from planner_jax.referee.catch import CatchVerdict, referee_catches
 from planner_jax.studies.catch.appearing import states_of
 from planner_jax.studies.catch.braking import Braking, braking
 from planner_jax.task.catch.case import CatchCase
+from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.catch.plan import CatchPlan
-from planner_jax.task.catch.planner import ExactCatch
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, shift_basis, states_at
 
 CHUNKS = (16, 64)  # cases that are decided in one compiled call

@@ -36,8 +36,8 @@ from planner_jax.plane.target import SampledPath
 from planner_jax.planning.plan import plan
 from planner_jax.robot.car import pose_at
 from planner_jax.task.intercept.case import InterceptCase
+from planner_jax.task.intercept.default_planner import SpacetimeIntercept
 from planner_jax.task.intercept.plan import InterceptPlan
-from planner_jax.task.intercept.planner import SpacetimeIntercept
 from planner_jax.task.intercept.searches import Search
 from planner_jax.task.intercept.suites import draw_cases
 

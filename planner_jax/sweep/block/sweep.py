@@ -18,7 +18,7 @@ from planner_jax.sweep.block.pipeline import CountedPlanner, SeeingArms, SeenPla
 from planner_jax.sweep.block.settings import BlockSettings
 from planner_jax.sweep.row_plans import arm_plan
 from planner_jax.sweep.sweep import Sweep
-from planner_jax.task.block.planner import OnlineBlock
+from planner_jax.task.block.default_planner import OnlineBlock
 
 _ROOM = 0.1  # [m], of a ball that may be met off the shield's middle
 

@@ -3,7 +3,7 @@ from .api import judge as judge
 from .api import planner as planner
 from .case import BlockCase as BlockCase
 from .case import case as case
+from .default_planner import OnlineBlock as OnlineBlock
 from .plan import BlockPlan as BlockPlan
-from .planner import OnlineBlock as OnlineBlock
 from .scene import Scene as Scene
 from .scene import paper_scene as paper_scene

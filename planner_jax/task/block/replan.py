@@ -23,9 +23,9 @@ from planner_jax.planning.select import better_of, merged
 from planner_jax.robot.arm import shield_pose
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.contact_check import braked
+from planner_jax.task.block.default_planner import OnlineBlock
 from planner_jax.task.block.end_poses import flight_of
 from planner_jax.task.block.plan import BlockPlan
-from planner_jax.task.block.planner import OnlineBlock
 from planner_jax.trajectory.polynomial import evaluate
 
 _SHORTEST = 0.02  # [s], of a guess from a motion that has all but ended

@@ -26,8 +26,8 @@ TASK = Task(
     summary="an arm with a shield protects a box from thrown balls",
     home="planner_jax.task.block",
     planners={
-        "online": "planner_jax.task.block.planner:OnlineBlock",
-        "brisk": "planner_jax.task.block.planner:brisk",
+        "online": "planner_jax.task.block.default_planner:OnlineBlock",
+        "brisk": "planner_jax.task.block.default_planner:brisk",
         "direct": "planner_jax.baselines.block.direct:DirectBlock",
         "rrt-connect": "planner_jax.baselines.block.rrt_connect:RrtConnectBlock",
         "epase": "planner_jax.baselines.block.epase:EpaseBlock",

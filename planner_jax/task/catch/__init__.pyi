@@ -9,7 +9,7 @@ from .decide import Given as Given
 from .decide import Greedy as Greedy
 from .decide import closest_approach as closest_approach
 from .decide import optimal_time_ratio as optimal_time_ratio
+from .default_planner import ExactCatch as ExactCatch
 from .plan import CatchPlan as CatchPlan
-from .planner import ExactCatch as ExactCatch
 from .replan import ReplanCatch as ReplanCatch
 from .suites import draw as draw

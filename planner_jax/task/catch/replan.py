@@ -23,8 +23,8 @@ from planner_jax.planning.replan import Replanning, given_or_own, moment_of
 from planner_jax.robot.quadrotor import body_z
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.chain import CatchContext, targets_at
+from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.catch.plan import CatchPlan
-from planner_jax.task.catch.planner import ExactCatch
 from planner_jax.trajectory.polynomial import (
     PiecewisePolynomial,
     shift_basis,

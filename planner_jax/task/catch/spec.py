@@ -59,7 +59,7 @@ TASK = Task(
     summary="a quadrotor catches flying targets with a net",
     home="planner_jax.task.catch",
     planners={
-        "exact": "planner_jax.task.catch.planner:ExactCatch",
+        "exact": "planner_jax.task.catch.default_planner:ExactCatch",
         "catch": "planner_jax.baselines.catch.paper:PaperCatch",
         "mpp": "planner_jax.baselines.catch.mpp:MppCatch",
     },

@@ -4,9 +4,9 @@ from .api import planner as planner
 from .case import HitCase as HitCase
 from .case import HitLimits as HitLimits
 from .case import case as case
+from .default_planner import ExactHit as ExactHit
 from .plan import HitPlan as HitPlan
 from .plan import Stroke as Stroke
-from .planner import ExactHit as ExactHit
 from .suites import generate_serves as generate_serves
 from .suites import read_serves as read_serves
 from .suites import to_cases as to_cases

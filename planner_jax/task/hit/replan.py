@@ -24,8 +24,8 @@ from planner_jax.planning.replan import Replanning, given_or_own, moment_of
 from planner_jax.robot.quadrotor import net_thrust, tangent_basis
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.context import HitContext
+from planner_jax.task.hit.default_planner import ExactHit
 from planner_jax.task.hit.plan import HitPlan
-from planner_jax.task.hit.planner import ExactHit
 from planner_jax.trajectory.polynomial import evaluate, states_at, total_duration
 
 _SHORTEST = 0.01  # [s], least time to the impact that is guessed

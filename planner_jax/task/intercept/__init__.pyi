@@ -3,7 +3,7 @@ from .api import judge as judge
 from .api import planner as planner
 from .case import InterceptCase as InterceptCase
 from .case import case as case
+from .default_planner import SpacetimeIntercept as SpacetimeIntercept
 from .plan import InterceptPlan as InterceptPlan
-from .planner import SpacetimeIntercept as SpacetimeIntercept
 from .suites import drawn as drawn
 from .suites import observe as observe

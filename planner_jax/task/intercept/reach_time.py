@@ -5,7 +5,7 @@ from jax import Array
 
 from planner_jax.plane.reach import Lattice
 from planner_jax.task.intercept.case import InterceptCase
-from planner_jax.task.intercept.planner import SpacetimeIntercept
+from planner_jax.task.intercept.default_planner import SpacetimeIntercept
 from planner_jax.task.intercept.searches import Search
 
 # Spelled out, since what is drawn by them is published.

@@ -22,8 +22,8 @@ from planner_jax.planning.one_by_one import OneByOne
 from planner_jax.planning.replan import Replanning, given_or_own, moment_of
 from planner_jax.robot.car import pose_at
 from planner_jax.task.intercept.case import InterceptCase
+from planner_jax.task.intercept.default_planner import SpacetimeIntercept
 from planner_jax.task.intercept.plan import InterceptPlan
-from planner_jax.task.intercept.planner import SpacetimeIntercept
 from planner_jax.task.intercept.searches import Search
 
 

@@ -26,7 +26,7 @@ from planner_jax.task.intercept.plan import InterceptPlan
 from planner_jax.task.intercept.terms import together
 
 if TYPE_CHECKING:
-    from planner_jax.task.intercept.planner import SpacetimeIntercept
+    from planner_jax.task.intercept.default_planner import SpacetimeIntercept
 
 
 # What being early weighs: so little beside the limits that the least cost lies within their slack.

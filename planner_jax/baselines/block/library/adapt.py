@@ -29,10 +29,10 @@ from planner_jax.planning.one_by_one import OneByOne
 from planner_jax.planning.select import first_solved
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import clearances, num_of_pole
+from planner_jax.task.block.default_planner import OnlineBlock
 from planner_jax.task.block.end_poses import EndPoses, Flight, end_poses, flight_of
 from planner_jax.task.block.motion import angles_at, profiles, sums
 from planner_jax.task.block.plan import BlockPlan, explained, no_plan
-from planner_jax.task.block.planner import OnlineBlock
 
 _HIGHEST = lax.Precision.HIGHEST
 # How far joints are to be turned, squared, counts less for those of the wrist, which carry little;

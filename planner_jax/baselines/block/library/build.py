@@ -34,8 +34,8 @@ from planner_jax.host.files import replacing
 from planner_jax.planning.plan import plan
 from planner_jax.robot.arm import shield_pose
 from planner_jax.task.block.clearance import least_clearances
+from planner_jax.task.block.default_planner import learned_starts
 from planner_jax.task.block.motion import angles_at
-from planner_jax.task.block.planner import learned_starts
 from planner_jax.task.block.scene import Scene
 
 # Learned starts that are tried where there is a motion already; all where there is none. In a

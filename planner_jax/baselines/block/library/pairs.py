@@ -32,9 +32,9 @@ from planner_jax.robot.arm import product, shield_jacobian, shield_pose
 from planner_jax.robot.arm_ik import inverse_kinematics
 from planner_jax.task.block.case import STRICT, BlockCase
 from planner_jax.task.block.clearance import least_clearances
+from planner_jax.task.block.default_planner import OnlineBlock, learned_starts
 from planner_jax.task.block.end_poses import EndPoses, Flight, facing, frame_of, profile_peaks
 from planner_jax.task.block.motion import angles_at, sums
-from planner_jax.task.block.planner import OnlineBlock, learned_starts
 
 # How far a stored pose may be off the nominal ball's way, [m] and [rad]: the paper allows "a small
 # tolerance". Where no pose within it is reached, a shield that blocks a part is better than none.

@@ -16,7 +16,7 @@ from planner_jax.sweep.intercept.drive import case_of, sampled_drive
 from planner_jax.sweep.intercept.figures.scene import draw_map, draw_polygons
 from planner_jax.sweep.report import RunRows
 from planner_jax.task.intercept.case import InterceptCase
-from planner_jax.task.intercept.planner import SpacetimeIntercept
+from planner_jax.task.intercept.default_planner import SpacetimeIntercept
 
 _SLICES = 6
 _SAMPLES = 241

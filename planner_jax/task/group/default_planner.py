@@ -20,8 +20,8 @@ from planner_jax.planning.select import better_of, merged
 from planner_jax.robot.car import pose_at
 from planner_jax.task.group.case import CarState, GroupPlan, InterceptGroup
 from planner_jax.task.intercept.case import InterceptCase
+from planner_jax.task.intercept.default_planner import SpacetimeIntercept
 from planner_jax.task.intercept.plan import InterceptPlan
-from planner_jax.task.intercept.planner import SpacetimeIntercept
 
 # Fewer ways than one target alone is met by: there are many legs.
 _EARLY = dataclasses.replace(SpacetimeIntercept("early").attempts[0], ways=12)
