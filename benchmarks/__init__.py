@@ -1,1 +1,1 @@
-"""Measurements that anyone can run again: speed, success and cost, side by side."""
+"""Measurements of speed, success and cost."""

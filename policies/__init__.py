@@ -1,1 +1,1 @@
-"""Learned policies over the planner: Brax environments, Flax networks and their training."""
+"""Learned decisions: Brax environments, Flax networks and their training."""

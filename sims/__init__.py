@@ -1,4 +1,4 @@
-"""Plans in simulation, in closed loop: quadrotors that catch and hit, a car, an arm."""
+"""Closed-loop flights and drives in MuJoCo MJX: quadrotors, a car and an arm."""
 
 import importlib.util
 

@@ -1,1 +1,1 @@
-"""Penalty shapes, limits and contact: short pure functions."""
+"""Penalties, limits, quadrature along a trajectory, and contact."""

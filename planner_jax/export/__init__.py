@@ -1,1 +1,1 @@
-"""Plans for controllers: setpoints and polynomials in the formats that flight stacks read."""
+"""Plans in the file formats of controllers: setpoints and polynomials."""

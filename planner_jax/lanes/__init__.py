@@ -1,4 +1,4 @@
-"""Functions of one case on many, the lanes last, with kernels where programs are for CUDA."""
+"""Functions of one case applied to a batch, with the batch axis last, and kernels for CUDA."""
 
 from planner_jax.lanes.attach import in_one_kernel, with_kernel
 from planner_jax.lanes.over import over_lanes

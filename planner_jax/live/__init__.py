@@ -1,4 +1,4 @@
-"""A live loop for one robot: what it sees of a ball in, setpoints of a plan out, over UDP."""
+"""A live loop for one robot: observations of a ball in, setpoints of a plan out, over UDP."""
 
 import lazy_loader
 

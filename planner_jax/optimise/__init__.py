@@ -1,1 +1,1 @@
-"""The batched optimiser, its status codes, scaling and gradients through an optimum."""
+"""Batched L-BFGS, Newton and least-squares solvers, scaling, and gradients of an optimum."""

@@ -1,1 +1,1 @@
-"""Seeing a ball in flight: cameras, their noise, colour masks, fits of flights, calibration."""
+"""A ball seen by cameras: noise, colour masks, fits of trajectories, calibration."""

@@ -1,1 +1,1 @@
-"""What stands and moves in the plane: obstacles, targets, and where a car can be among them."""
+"""Obstacles and targets in the plane, and the sets of states that a car can reach."""

@@ -1,1 +1,1 @@
-"""The calls of a user: plan, solve, replan and gradient, for planners of any kind."""
+"""The functions plan, solve, replan and gradient, for planners of any kind."""

@@ -1,1 +1,1 @@
-"""What a robot can do: flatness, kinematics and limits."""
+"""Models of quadrotors, cars and arms: flatness, kinematics and limits."""

@@ -1,1 +1,1 @@
-"""Run folders: manifest, tables, environment and figures of what a command computed."""
+"""Run folders: manifest, rows, tables and figures of a command."""

@@ -1,1 +1,1 @@
-"""How far bodies in space are from each other: segments, rectangles, boxes, vertical lines."""
+"""Distances between segments, rectangles, boxes and vertical lines in space."""

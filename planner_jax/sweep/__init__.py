@@ -1,1 +1,1 @@
-"""Sweeps: thousands of scenarios planned and refereed in chunks, into one run folder."""
+"""Sweeps: seeded cases, planned and refereed in chunks, into one run folder."""

@@ -1,4 +1,4 @@
-"""One room a task."""
+"""Hits, catches, interceptions, blocks and groups: one package a task."""
 
 import lazy_loader
 

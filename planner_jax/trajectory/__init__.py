@@ -1,1 +1,1 @@
-"""Piecewise polynomials and the maps that make them."""
+"""Piecewise polynomials and minimum-control splines."""
