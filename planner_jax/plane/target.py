@@ -5,13 +5,11 @@ leaf. The ones here cover paper 003's targets and what is fitted to observations
 of a user's own serves as well. World frame in the plane, SI units.
 """
 
-from typing import ClassVar, Protocol
+from typing import Protocol
 
 import jax.numpy as jnp
 from flax import struct
 from jax import Array
-
-from planner_jax.core.rules import POSITIVE, Field, Table
 
 
 @struct.dataclass
@@ -77,28 +75,6 @@ class LaterPath:
     def at(self, time: Array) -> PointState:
         """Position [m] and velocity [m/s] at one time () [s] after that moment."""
         return self.path.at(self.begin + time)
-
-
-@struct.dataclass
-class SampledPath:
-    """Places at equal times from 0 on, straight lines between them; it stays at the last one."""
-
-    rules: ClassVar[Table] = (Field("step", None, POSITIVE),)
-
-    places: Array  # (S, 2) [m], S >= 2
-    step: Array  # () [s], from one place to the next
-
-    def at(self, time: Array) -> PointState:
-        """Position [m] and velocity [m/s] at one time () [s]."""
-        last = self.places.shape[0] - 1
-        place = jnp.clip(time / self.step, 0.0, last)
-        below = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, last - 1)
-        way = self.places[below + 1] - self.places[below]
-        moves = (time >= 0.0) & (time < last * self.step)
-        return PointState(
-            pos=self.places[below] + (place - below) * way,
-            vel=jnp.where(moves, way / self.step, 0.0),
-        )
 
 
 def arc(turn_rate: Array, time: Array) -> tuple[Array, Array]:
