@@ -60,8 +60,8 @@ def test_compiled_programs_hold_their_kernels(devices, serves):
     attempt = Round(1, LbfgsConfig(max_steps=2))
     hits = jax.jit(lambda cases: solve_batch(ExactHit(), attempt, cases))
     program = hits.lower(jax.device_put(serves, devices[0])).compile().as_text()
-    # The ball's table, penalties (3), direction, ends (3) and choice of a step.
-    assert program.count('custom_call_target="__gpu$xla.gpu.triton"') >= 9
+    # The ball's table, penalties (3), and direction.
+    assert program.count('custom_call_target="__gpu$xla.gpu.triton"') >= 5
 
 
 WITHOUT_KERNELS = """

@@ -9,9 +9,10 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.cli import doctor
-from planner_jax.lanes import in_one_kernel, over_lanes, pallas
+from planner_jax.lanes import over_lanes, pallas
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.multistart import solve_batch
+from planner_jax.optimise.preconditioner import positive_inverse
 from planner_jax.optimise.problem import Round
 from planner_jax.optimise.sensitivity import gradient_at
 from planner_jax.runs.environment import require_backend
@@ -21,21 +22,19 @@ from planner_jax.task.hit.default_planner import ExactHit
 
 LANES = 128
 # Of one round: the table; penalties with slopes, without (of guesses, of trials), greatest of a
-# finished plan; the direction; and made by `in_one_kernel` the ends of a trajectory, there and at
-# trial steps and guesses, their slopes, and the choice of a step.
+# finished plan; and the direction.
 ROUND = {
     "flight_table": 1,
     "integrate_along": 3,
-    "lanes": 5,
     "lbfgs_turn": 1,
     "greatest_along": 1,
 }
 # Of gradients: the table and its slopes; penalties' slopes and, along the adjoint, curvature. By
-# the core: its inverse. By products: the ends, the inverse of their block, and a curvature of
+# the core: its inverse. By products: the inverse of the block of the ends, and a curvature of
 # penalties that is no kernel yet.
 GRADIENTS = {
     "core": {"flight_table": 2, "integrate_along": 4, "positive_inverse": 1},
-    "products": {"flight_table": 2, "integrate_along": 2, "lanes": 1, "positive_inverse": 1},
+    "products": {"flight_table": 2, "integrate_along": 2, "positive_inverse": 1},
 }
 
 
@@ -73,15 +72,11 @@ def serves():
 
 
 def small():
-    """A function of one lane with one kernel, made anew."""
-
-    def sines(x):
-        return np.float32(2.0) * jax.numpy.sin(x)
-
-    return over_lanes(in_one_kernel(sines))
+    """Return a function of one lane with one kernel, which nothing has traced before."""
+    return over_lanes(lambda x: positive_inverse(x))
 
 
-X = np.ones((3, LANES), np.float32)
+X = np.broadcast_to(np.eye(3, dtype=np.float32)[..., None], (3, 3, LANES))
 
 
 def test_a_round_of_hits_holds_its_kernels(gpu):
@@ -116,7 +111,7 @@ def test_gradients_hold_their_kernels(gpu, curvature):
 
 def test_the_switch_takes_all_kernels_away(gpu, monkeypatch):
     monkeypatch.setenv(pallas.SWITCH, "on")
-    assert kernels_in(small(), X) == {"lanes": 1}
+    assert kernels_in(small(), X) == {"positive_inverse": 1}
     monkeypatch.setenv(pallas.SWITCH, "off")
     assert kernels_in(small(), X) == {}
     assert kernels_in(round_of(ExactHit()), serves()) == {}

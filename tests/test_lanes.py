@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from jax.sharding import Mesh, PartitionSpec
 
-from planner_jax.lanes import attach, in_one_kernel, over_lanes, pallas
-from planner_jax.lanes.scalars import Unsupported, scalar_kernel
+from planner_jax.lanes import over_lanes, pallas, with_kernel
 
 MATRIX = np.random.default_rng(0).standard_normal((5, 4))
 LANES = 32  # what a kernel takes
@@ -96,123 +95,24 @@ def test_lanes_do_not_mix():
     np.testing.assert_array_equal(np.delete(broken, 2, -1), np.delete(np.asarray(clean), 2, -1))
 
 
-# What a kernel of single operations does not do: loops, branches, sorting, and reading at a
-# place of each lane's own from anything but an argument.
-NOT_IN_A_KERNEL = {"loop", "branches", "order", "window of a constant"}
-
-
-@pytest.mark.parametrize("name", FUNCTIONS)
-def test_a_kernel_of_single_operations_gives_the_same(name, float64):
-    (x, k), function = lanes(), FUNCTIONS[name]
-    closed = jax.make_jaxpr(lambda *args: jax.tree.leaves(function(*args)))(x[..., 0], k[0])
-    if name in NOT_IN_A_KERNEL:
-        with pytest.raises(Unsupported):
-            scalar_kernel(closed, [x, k], 16, interpret=True)
-        return
-    found = jax.jit(lambda *args: scalar_kernel(closed, [*args], 16, interpret=True))(x, k)
-    for ours, theirs in zip(found, jax.tree.leaves(by_vmap(name)), strict=True):
-        assert ours.dtype == theirs.dtype
-        np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-14)
-
-
-def test_a_kernel_does_nothing_twice_and_nothing_in_vain():
-    def function(x):
-        unused = jnp.cos(x)
-        return jnp.sin(x[0]) * jnp.sin(x[0]) + 0.0 * unused.size
-
-    kernel = functools.partial(scalar_kernel, threads=16, interpret=True)
-    lanes = jnp.ones((2, 16), jnp.float32)
-    closed = jax.make_jaxpr(function)(lanes[:, 0])
-    jaxpr = str(jax.make_jaxpr(lambda lanes: kernel(closed, [lanes]))(lanes))
-    assert jaxpr.count("= sin ") == 1
-    assert jaxpr.count("= cos ") == 0
-
-
-def test_axes_in_front_of_some_arguments_are_in_front_of_all_results():
-    closed = jax.make_jaxpr(lambda x, k: (jnp.sum(x) * k, k + 1.0))(jnp.ones(3), jnp.ones(()))
-    x = jnp.arange(2.0 * 3 * 16).reshape(2, 3, 16)
-    k = jnp.arange(16.0)
-    product, later = scalar_kernel(closed, [x, k], 16, interpret=True)
-    np.testing.assert_allclose(product, x.sum(axis=1) * k)
-    np.testing.assert_allclose(later, [k + 1.0, k + 1.0])
-
-
-def test_arguments_that_all_lanes_share_are_constants():
-    closed = jax.make_jaxpr(lambda x, c: c @ x)(jnp.ones(3), jnp.ones((2, 3)))
-    x, shared = jnp.arange(3.0 * 16).reshape(3, 16), np.arange(6.0, dtype=np.float32).reshape(2, 3)
-    np.testing.assert_allclose(
-        scalar_kernel(closed, [x, shared], 16, interpret=True)[0], shared @ x, rtol=1e-6
-    )
-
-
-def test_a_function_that_would_take_long_to_compile_is_refused():
-    closed = jax.make_jaxpr(lambda x: jnp.cumsum(jnp.sin(x)))(jnp.ones(500))
-    with pytest.raises(Unsupported, match="too large"):
-        scalar_kernel(closed, [jnp.ones((500, 16))], 16)
-
-
-@pytest.fixture
-def used(monkeypatch):
-    """What kernels were made, as if there were a GPU: for each how many arguments it has."""
-    made = []
-
-    def interpreted(closed, args, threads):
-        found = scalar_kernel(closed, args, threads, interpret=True)
-        made.append(len(args))
-        return found
-
-    monkeypatch.setattr(attach, "scalar_kernel", interpreted)
-    monkeypatch.setattr(pallas, "has_gpu", lambda: True)
-    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *x, cuda, default: cuda(*x))
-    return made
-
-
-def test_a_program_for_several_devices_has_the_kernels_of_one(used):
-    """There `jnp.where` also says that a device's arrays are its own."""
+def test_a_program_for_several_devices_calls_the_kernel_and_gives_the_results_of_one(monkeypatch):
+    """There `jnp.where` also states that a device's arrays are its own."""
+    calls = []
 
     def chosen(x, y):
         return jnp.sum(jnp.where(jnp.isfinite(x), x, jnp.inf)) + y
 
+    def kernel(treedef, leaves):
+        calls.append(treedef)
+        return [jax.vmap(chosen, -1, -1)(*leaves)]
+
+    monkeypatch.setattr(pallas, "has_gpu", lambda: True)
+    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *x, cuda, default: cuda(*x))
+    attached = with_kernel(chosen, kernel)
     x, y = jnp.arange(3.0 * 16).reshape(3, 16), jnp.arange(16.0)
-    mapped = over_lanes(lambda x, y: in_one_kernel(chosen)(x, jnp.where(y > 2.0, y, 0.0)))
+    mapped = over_lanes(lambda x, y: attached(x, jnp.where(y > 2.0, y, 0.0)))
     spec = PartitionSpec(None, "lanes"), PartitionSpec("lanes")
     mesh = Mesh(np.array(jax.devices()[:1]), ("lanes",))
     spread = jax.shard_map(mapped, mesh=mesh, in_specs=spec, out_specs=spec[1], check_vma=False)
     np.testing.assert_array_equal(spread(x, y), mapped(x, y))
-    assert len(used) == 2
-
-
-def test_halves_of_a_function_in_one_kernel_are_kernels(used, float64):
-    """Values, `vmap` within a lane, slopes in both modes and the slope of a slope."""
-
-    def plain(x, given):
-        return {"y": jnp.sin(x) * given["k"], "z": jnp.sum(MATRIX @ x**3)}
-
-    one = in_one_kernel(plain)
-
-    def total(function, x, given):
-        found = function(x, given)
-        return jnp.sum(found["y"] ** 2) + found["z"]
-
-    x = jnp.asarray(np.random.default_rng(3).standard_normal((4, 16)))
-    given = {"k": jnp.linspace(0.5, 1.0, 16)}
-    for number, asked in (
-        (1, lambda f: lambda x, g: f(x, g)),
-        (1, lambda f: lambda x, g: jax.vmap(lambda a: f(a * x, g))(jnp.arange(3.0))),
-        (2, lambda f: jax.grad(lambda x, g: total(f, x, g))),
-        (0, lambda f: jax.value_and_grad(lambda x, g: total(f, x, g), argnums=(0, 1))),
-        (1, lambda f: lambda x, g: jax.jvp(lambda y: total(f, y, g), (x,), (jnp.ones(4),))[1]),
-        (2, lambda f: jax.grad(lambda x, g: jnp.sum(jax.grad(lambda y: total(f, y, g))(x) ** 2))),
-    ):
-        used.clear()
-        expected = jax.jit(jax.vmap(asked(plain), in_axes=-1, out_axes=-1))(x, given)
-        found = jax.jit(over_lanes(asked(one)))(x, given)
-        assert len(used) >= number and bool(used) == bool(number)
-        for ours, theirs in zip(*map(jax.tree.leaves, (found, expected)), strict=True):
-            np.testing.assert_allclose(ours, theirs, rtol=1e-10, atol=1e-12)
-
-
-def test_without_a_gpu_a_function_in_one_kernel_is_what_it_was(float64):
-    function = FUNCTIONS["gradient"]
-    x, k = jnp.ones((4, 3)), jnp.ones((), int)
-    np.testing.assert_allclose(in_one_kernel(function)(x, k), function(x, k), rtol=1e-13)
+    assert len(calls) == 2

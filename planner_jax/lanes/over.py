@@ -89,7 +89,7 @@ def _outputs(eqn: JaxprEqn, inputs: list[Any], lanes: int) -> list[Any]:
     """Values of the outputs of one operation, by a kernel or a rule if there is one for it."""
     name, closed = eqn.primitive.name, called(eqn)
     if closed is not None:
-        kernel = kernel_of(eqn, closed, inputs) if pallas.in_use() else None
+        kernel = kernel_of(eqn) if pallas.in_use() else None
         if kernel is None:
             return _evaluate(closed, inputs, lanes)
         return _by_kernel(eqn, closed, kernel, inputs, lanes)

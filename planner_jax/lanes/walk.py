@@ -1,7 +1,4 @@
-"""Walking through a jaxpr, JAX's list of a function's operations, with values of any kind.
-
-`over` walks with arrays that have the lanes last, `scalars` with the single numbers of a kernel.
-"""
+"""Walking through a jaxpr, JAX's list of a function's operations, with values of any kind."""
 
 from collections.abc import Callable
 from typing import Any

@@ -18,7 +18,7 @@ from flax import struct
 from jax import Array
 
 from planner_jax.core.checks import numeric, require_number, require_size, told
-from planner_jax.lanes import in_one_kernel, with_kernel
+from planner_jax.lanes import with_kernel
 from planner_jax.optimise.evaluation import Evaluation, Objective, better
 from planner_jax.optimise.lbfgs_kernel import judged_pair, shortening, start_scale, turn_kernel
 
@@ -166,7 +166,7 @@ def step(objective: Objective, state: LbfgsState, config: LbfgsConfig) -> LbfgsS
     lengths = state.numbers.reach * jnp.asarray(config.trial_steps, grad.dtype)
     trials = jax.vmap(lambda length: objective(state.point + length * direction))(lengths)
     here = Evaluation(cost, violation)
-    choice = in_one_kernel(_chosen, config)(state.numbers, here, lengths, trials)
+    choice = _chosen(config, state.numbers, here, lengths, trials)
     step = jnp.where(choice.going, choice.length * direction, state.step)
     point = jnp.where(choice.going, state.point + step, state.point)
     return LbfgsState(

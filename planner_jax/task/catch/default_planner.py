@@ -19,7 +19,6 @@ from planner_jax.core.protocol import FEASIBILITY_TOLERANCE, require_settings
 from planner_jax.cost.along import Along, integrate_along
 from planner_jax.cost.penalty import smoothed_hinge
 from planner_jax.cost.quadrotor import flight_along, greatest_excess, limits_along
-from planner_jax.lanes import in_one_kernel
 from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.learned_start import StartNetwork, cheaper_start, shipped_network
@@ -386,8 +385,7 @@ class ExactCatch(OptimisedPlanner):
     def objective(self, point: Array, context: CatchContext) -> Evaluation:
         """Cost, and the largest excess at the penalty nodes (squares over squares)."""
         offsets, natural = self._split(point)
-        ends = in_one_kernel(ExactCatch.ends, self)
-        rows, durations, core, at_catches = ends(natural, context)
+        rows, durations, core, at_catches = self.ends(natural, context)
         penalties, worst = integrate_along(
             self._along(self.nodes, context.case),
             jnp.concatenate([rows, offsets], axis=1),
@@ -445,7 +443,7 @@ class ExactCatch(OptimisedPlanner):
             self.maps,
             self._along(self.nodes, context.case),
             lambda natural: self.ends(natural, context),
-            in_one_kernel(ExactCatch.ends, self)(natural, context),
+            self.ends(natural, context),
             natural,
             offsets,
             jnp.asarray(self.scale, point.dtype),

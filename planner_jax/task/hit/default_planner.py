@@ -29,7 +29,6 @@ from planner_jax.cost.along import Along, integrate_along
 from planner_jax.cost.contact import apex_excess, hitting_speed_excess
 from planner_jax.cost.penalty import smoothed_hinge
 from planner_jax.cost.quadrotor import Measure, flight_along, greatest_excess, limits_along
-from planner_jax.lanes import in_one_kernel
 from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.learned_start import StartNetwork, cheaper_start, shipped_network
@@ -379,7 +378,7 @@ class ExactHit(OptimisedPlanner):
     def objective(self, point: Array, context: HitContext) -> Evaluation:
         """Cost, and the largest excess at the penalty nodes (squares over squares)."""
         offsets, natural = self._split(point)
-        rows, duration, core, at_impact = in_one_kernel(ExactHit.ends, self)(natural, context)
+        rows, duration, core, at_impact = self.ends(natural, context)
         penalties, worst = integrate_along(
             self._along(self.nodes, context.case),
             jnp.concatenate([rows, offsets])[None],
@@ -416,7 +415,7 @@ class ExactHit(OptimisedPlanner):
             rows, duration, core, at_impact = self.ends(natural[0], context)
             return rows[None], duration[None], core, at_impact
 
-        rows, duration, core, at_impact = in_one_kernel(ExactHit.ends, self)(natural, context)
+        rows, duration, core, at_impact = self.ends(natural, context)
         return segments_curvature(
             self.maps,
             self._along(self.nodes, context.case),
