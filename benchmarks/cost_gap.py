@@ -66,8 +66,7 @@ def _longer(planner: Any, cases: Any, card: Task | None) -> Any:
         return None
     yardstick = card.planner(card.yardstick)
     # A task's groups, and what is planned again, are cases of other classes.
-    kind = getattr(yardstick, "case_type", None)
-    return yardstick if kind is None or isinstance(cases, kind) else None
+    return yardstick if isinstance(cases, yardstick.case_type) else None
 
 
 def to_the_optimum(planner: OptimisedPlanner) -> OptimisedPlanner:

@@ -21,7 +21,7 @@ Limits and costs of one's own along the way, a case's `extras`: `KeepOut`, `Keep
 `BallState`, `fly`, `BallPath`, `HarmonicPath`, `table_path`, `predict_path`, `target_at`; in the
 plane `TurningPath`, `PolynomialPath`, and what is in a car's way, `Obstacles`, made by `obstacles`.
 What a trajectory does: `PiecewisePolynomial`, `evaluate`. For planners and tasks of one's own:
-`Plan`, `Attempt`, `outcome`, `OptimisedPlanner`, `pending`, `Round`, `LbfgsConfig`,
+`Planner`, `Plan`, `Attempt`, `outcome`, `OptimisedPlanner`, `pending`, `Round`, `LbfgsConfig`,
 `NewtonConfig`, `Evaluation`, `Verdict`, `Task`.
 
 Everything is imported on first use, so that `import planner_jax` itself is quick.

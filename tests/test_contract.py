@@ -17,14 +17,15 @@ import planner_jax as pj
 from planner_jax.baselines.block.library.planner import LibraryBlock
 from planner_jax.baselines.intercept.projection import Projection
 from planner_jax.baselines.intercept.static_paths import PathSource
-from planner_jax.core.protocol import Attempt, HostPlanner, LanesPlanner, Plan, is_solved, outcome
+from planner_jax.core import planner as planner_module
+from planner_jax.core.planner import Kind
+from planner_jax.core.protocol import Attempt, Plan, is_solved, outcome
 from planner_jax.core.rules import has_rules
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.problem import Round
 from planner_jax.plane.reach import Lattice
-from planner_jax.planning import one_by_one
 from planner_jax.task.block.default_planner import Search as BlockSearch
 from planner_jax.task.intercept.default_planner import SpacetimeIntercept
 from planner_jax.task.intercept.searches import Search
@@ -59,7 +60,7 @@ def places(num):
 
 
 @struct.dataclass
-class LibraryPlanner:
+class LibraryPlanner(pj.Planner):
     """The nearest of some known points, in the first attempt of a few of them."""
 
     points: Array  # (K, 2)
@@ -76,7 +77,7 @@ class LibraryPlanner:
 
 
 @dataclasses.dataclass(frozen=True)
-class NumpyPlanner:
+class NumpyPlanner(pj.Planner):
     """A step towards the goal, the length of which the attempt gives; NumPy alone."""
 
     attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(1), Attempt(2))
@@ -128,7 +129,7 @@ class Entry:
 
     @property
     def on_host(self):
-        return isinstance(self.planner, HostPlanner)
+        return self.planner.kind is Kind.HOST
 
 
 def hit(name, gradient, **options):
@@ -232,7 +233,7 @@ OF_THEIR_OWN = ("hit exact", "intercept spacetime")
 
 def inside(planner):
     """The planner that plans, also behind a decision."""
-    return getattr(planner, "planner", planner)
+    return planner.inner
 
 
 def assert_equal(ours, theirs, lanes=slice(None)):
@@ -313,13 +314,12 @@ def test_every_status_is_a_status_and_solved_says_which_are_good(entry):
 
 @entries(on_host=False, slow=(*LIKE_OTHERS, "intercept spacetime"))
 def test_every_matrix_product_asks_for_full_precision(entry, monkeypatch):
-    monkeypatch.setattr(one_by_one, "has_only_cpu", lambda: False)  # also in what is for a GPU
+    monkeypatch.setattr(planner_module, "has_only_cpu", lambda: False)  # also in what is for a GPU
     planner, case = inside(entry.planner), pj.lane(entry.batch, 0)
     for attempt in planner.attempts:
         assert_full_precision(lambda p, case, a=attempt: p.solve(case, a), planner, case)
-        if isinstance(planner, LanesPlanner):
-            solve = lambda p, cases, a=attempt: p.solve_lanes(cases, a)  # noqa: E731
-            assert_full_precision(solve, planner, entry.batch)
+        solve = lambda p, cases, a=attempt: p.solve_lanes(cases, a)  # noqa: E731
+        assert_full_precision(solve, planner, entry.batch)
     if isinstance(planner, OptimisedPlanner):
         further = planner.polished().attempts[0]
         assert_full_precision(lambda p, case: p.solve(case, further), planner, case)
@@ -432,8 +432,8 @@ def test_a_derivative_is_refused_with_the_names_of_what_has_one(entry, call):
 @entries(slow=(*LIKE_OTHERS, "intercept spacetime"))
 def test_a_gradient_is_there_where_it_is_promised_and_refused_elsewhere(entry):
     planner = inside(entry.planner)
-    searches_first = hasattr(planner, "smooth_near")  # plans are then settled anew
-    if not (hasattr(planner, "objective") or searches_first):
+    searches_first = isinstance(planner, SpacetimeIntercept)  # plans are then settled anew
+    if not (isinstance(planner, OptimisedPlanner) or searches_first):
         with pytest.raises(
             TypeError, match=f"^{type(planner).__name__} minimises nothing"
         ) as caught:
@@ -476,10 +476,12 @@ def test_cases_of_another_task_are_refused_in_one_line(entry, call):
 
 @pytest.mark.parametrize("only_cpu", [True, False])
 def test_what_is_for_other_devices_is_not_traced_where_there_are_none(only_cpu, monkeypatch):
-    monkeypatch.setattr(one_by_one, "has_only_cpu", lambda: only_cpu)
+    monkeypatch.setattr(planner_module, "has_only_cpu", lambda: only_cpu)
     traced = []
 
-    class Doubles(one_by_one.OneByOne):
+    class Doubles(pj.Planner):
+        is_sequential = True
+
         def solve(self, case, attempt):
             return 2.0 * case
 
@@ -496,7 +498,7 @@ def test_what_is_for_other_devices_is_not_traced_where_there_are_none(only_cpu, 
 @pytest.mark.parametrize("call", [pj.plan, pj.solve], ids=["plan", "solve"])
 def test_a_planner_that_is_no_pytree_is_told_how_to_become_one(call):
     @dataclasses.dataclass(frozen=True)
-    class Plain:
+    class Plain(pj.Planner):
         attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)
 
         def solve(self, case, attempt):

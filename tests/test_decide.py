@@ -218,7 +218,7 @@ def test_one_case_alone_is_decided_on_and_planned_as_in_its_batch(decide, pairs)
 class LongFirst(ExactCatch):
     """A planner that makes its first attempt alone at every order."""
 
-    def begins_long(self, case):
+    def starts_long(self, case):
         return True
 
 

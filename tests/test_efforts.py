@@ -13,7 +13,7 @@ from planner_jax.sweep.hit.settings import HitSettings
 def test_more_effort_is_a_longer_first_round_and_the_default_is_the_planner_itself(task):
     own = task.planner("exact")
     assert task.planner("exact", effort="feasible") == own
-    inside = lambda planner: getattr(planner, "planner", planner)  # noqa: E731
+    inside = lambda planner: planner.inner  # noqa: E731
     rounds = [inside(task.planner("exact", effort=x)).rounds for x in ("feasible", "good", "best")]
     assert len({each[1:] for each in rounds}) == 1
     feasible, good, best = (each[0] for each in rounds)

@@ -128,7 +128,7 @@ def test_an_optimal_plan_has_the_same_gradient(float64):
 
     slope, plan = jax.jit(jax.grad(time, has_aux=True))(case.limits.acceleration)
     assert pj.solved(plan)
-    smooth, begun = planner.smooth(case)
+    smooth, begun = planner.settle(case)
     begun = dataclasses.replace(begun, begun=settle(smooth)(begun))
     found = differentiate(smooth, duration, BY, 1)(begun)
     assert slope == pytest.approx(float(found.by["limits.acceleration"]), rel=1e-3)

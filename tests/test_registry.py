@@ -90,11 +90,11 @@ def test_the_library_has_three_tasks_that_name_themselves():
 def test_every_planner_of_a_task_can_be_made_and_the_first_is_the_default(name):
     task = task_named(name)
     for planner in task.all_planners().keys() - task.from_file.keys():
-        assert hasattr(task.make_planner(planner, {}), "attempts")
+        assert task.make_planner(planner, {}).attempts
     first = next(iter(task.planners))
     assert task.planner() == task.planner(first)
     made = task.planner()
-    assert getattr(made, "planner", made) == task.make_planner(first, {})
+    assert made.inner == task.make_planner(first, {})
 
 
 def test_unknown_names_are_told_in_one_line_which_there_are():

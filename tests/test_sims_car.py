@@ -227,7 +227,7 @@ def test_what_is_expected_of_a_target_rests_on_what_was_shown_until_then():
 
 
 @dataclasses.dataclass
-class StraightOn:
+class StraightOn(pj.Planner):
     """Plans with one even acceleration along the heading; unsolved once it has made `solved`."""
 
     case_type = intercept.InterceptCase

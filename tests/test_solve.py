@@ -9,6 +9,7 @@ import pytest
 from flax import struct
 from jax import Array
 
+from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Plan, Status, is_solved
 from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.lbfgs import LbfgsConfig
@@ -157,7 +158,7 @@ def test_what_was_compiled_ahead_is_not_traced_again():
 def test_a_planner_on_the_host_may_be_asked_to_compile_ahead_too():
     tried = []
 
-    class OnHost:
+    class OnHost(Planner):
         attempts = WellPlanner().rounds
 
         def solve_on_host(self, cases, attempt):

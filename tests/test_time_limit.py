@@ -41,14 +41,14 @@ def outcome_of(task, attempt):
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class Rounds:
+class Rounds(pj.Planner):
     attempts: tuple = (Try(number=1), Try(number=2), Try(number=3))
 
     def solve(self, case, attempt):
         return outcome_of(case, attempt)
 
 
-class OnHost:
+class OnHost(pj.Planner):
     attempts = Rounds().attempts
 
     def solve_on_host(self, cases, attempt):

@@ -1,20 +1,8 @@
-"""What `plan` asks of a planner and of a decision, and what comes back for every case.
-
-A planner is a pytree: sizes and switches are static, arrays such as a library of motions or the
-weights of a network are leaves, so that other arrays of the same shapes compile nothing anew. A
-frozen dataclass of sizes and switches alone is made one by `jax.tree_util.register_static`.
-
-There are four kinds, and `plan` takes them all. A `Planner` solves one case at a time in a pure
-function. A `LanesPlanner` also solves a batch in a layout of its own. A `HostPlanner` works on
-NumPy arrays on the host, with whatever library it likes. A `CompositePlanner` has other planners
-do the work. Planners that minimise an objective inherit all of it from
-`planner_jax.optimise.planner.OptimisedPlanner`.
-"""
+"""What comes back for every case, and what planners and decisions are made of."""
 
 import dataclasses
 import enum
 import os
-from collections.abc import Sequence
 from typing import Any, Protocol, Self, TypeVar, runtime_checkable
 
 import jax
@@ -146,6 +134,7 @@ class Plan:
         return load_arrays(path, cls)
 
 
+@runtime_checkable
 class Case(Protocol):
     """A pytree of arrays for one case, or for a batch with a leading axis on every leaf."""
 
@@ -216,90 +205,10 @@ class Attempt:
         return unsolved if self.within is None else unsolved & (plans.violation <= self.within)
 
 
-CaseT = TypeVar("CaseT", contravariant=True)
-PlanT = TypeVar("PlanT", bound=Plan, covariant=True)
-
-
-class Planner(Protocol[CaseT, PlanT]):
-    """Solves one case; pure, so that `plan` may compile, batch and spread it over devices.
-
-    A planner may have a `case_type`, the class of its cases; `plan` then refuses others.
-    """
-
-    @property
-    def attempts(self) -> Sequence[Attempt]:
-        """What to try, in order."""
-        ...
-
-    def solve(self, case: CaseT, attempt: Any, /) -> PlanT:
-        """The plan that one attempt makes of one case."""
-        ...
+PlanT = TypeVar("PlanT", bound=Plan)
 
 
 @runtime_checkable
-class LanesPlanner(Planner[CaseT, PlanT], Protocol[CaseT, PlanT]):
-    """A `Planner` that solves a batch in a layout of its own."""
-
-    def solve_lanes(self, cases: CaseT, attempt: Any, /) -> PlanT:
-        """The plans that one attempt makes of a batch; a leading axis on every leaf; pure."""
-        ...
-
-
-@runtime_checkable
-class HostPlanner(Protocol[CaseT, PlanT]):
-    """Solves a batch on the host, outside of compiled programs."""
-
-    @property
-    def attempts(self) -> Sequence[Attempt]:
-        """What to try, in order."""
-        ...
-
-    def solve_on_host(self, cases: CaseT, attempt: Any, /) -> PlanT:
-        """The plans that one attempt makes of a batch with NumPy leaves; NumPy leaves."""
-        ...
-
-
-class Drive(Protocol):
-    """What a `CompositePlanner` has its other planners carried out by."""
-
-    @property
-    def is_pure(self) -> bool:
-        """Whether this happens inside a compiled program, where nothing is a number yet."""
-        ...
-
-    @property
-    def is_over(self) -> bool:
-        """Whether the caller's time has passed, so that no more is to be begun."""
-        ...
-
-    def __call__(
-        self, planner: Any, cases: Any, attempts: Sequence[Attempt] | None = None
-    ) -> tuple[Any, Any]:
-        """Plans of a batch by some of a planner's attempts, by default all of them.
-
-        Returns:
-            The plans, and numbers that are all zero if no case is unsolved.
-        """
-        ...
-
-
-@runtime_checkable
-class CompositePlanner(Protocol[CaseT, PlanT]):
-    """Has other planners plan a batch, once or several times."""
-
-    def plan_by(self, drive: Drive, cases: CaseT, /) -> PlanT:
-        """The plans of a batch."""
-        ...
-
-
-AnyPlanner = (
-    Planner[CaseT, PlanT]
-    | LanesPlanner[CaseT, PlanT]
-    | HostPlanner[CaseT, PlanT]
-    | CompositePlanner[CaseT, PlanT]
-)
-
-
 class Decision(Protocol):
     """Settles what a case leaves open, such as an order; a pytree, as planners are.
 

@@ -14,6 +14,7 @@ from flax import struct
 from jax import Array, lax
 
 from planner_jax.core.checks import require_kind, require_size
+from planner_jax.core.planner import require_fit
 from planner_jax.core.protocol import marked, status_of
 from planner_jax.optimise.evaluation import Objective
 from planner_jax.optimise.lbfgs import LbfgsConfig
@@ -121,10 +122,7 @@ def optimal_plan(
         TypeError: the planner does not minimise, or the case is of another task.
         ValueError: the case is a batch, or `newton_steps` < 0.
     """
-    kind = getattr(planner, "case_type", None)
-    if not hasattr(case, "batch_shape") or not isinstance(case, kind or object):
-        wanted = kind.__name__ if kind else "case"
-        raise TypeError(f"case must be a {wanted}, got a {type(case).__name__}")
+    require_fit(planner, case)
     require_size("newton_steps", newton_steps, 0)
     if solver is not None:
         require_kind("solver", solver, LbfgsConfig)
@@ -133,10 +131,7 @@ def optimal_plan(
             f"case must be one case, got batch shape {case.batch_shape}; for batches "
             "there is pj.gradient, or jax.vmap of this"
         )
-    if hasattr(planner, "smooth"):
-        planner, case = planner.smooth(case)
-    if not hasattr(planner, "objective"):
-        raise TypeError(f"planner must be one that minimises, got a {type(planner).__name__}")
+    planner, case = planner.settle(case)
     solver = solver or LbfgsConfig(max_steps=200, tolerance=1e-7, patience=6)
     context = planner.prepare(case)
     start = lax.stop_gradient(planner.guesses(context, 1)[0])

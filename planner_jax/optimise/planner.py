@@ -2,12 +2,14 @@
 
 import abc
 import dataclasses
+from collections.abc import Callable
 from typing import Any, ClassVar, Self
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
+from planner_jax.core.planner import CaseT, Planner, PlanT
 from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.multistart import solve_batch, solve_round
@@ -46,8 +48,8 @@ def pending(violation: Array) -> dict[str, Any]:
     }
 
 
-class OptimisedPlanner(abc.ABC):
-    """A `LanesPlanner` by batched L-BFGS: a problem of one case and rounds of attempts at it.
+class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
+    """A planner by batched L-BFGS: a problem of one case and rounds of attempts at it.
 
     A subclass is a frozen dataclass and a pytree (`jax.tree_util.register_static` where it holds
     no arrays) with a field `rounds`. The four functions are pure and written for one case, in
@@ -55,9 +57,9 @@ class OptimisedPlanner(abc.ABC):
     """
 
     rounds: tuple[Round, ...]  # what to try, in order
-    case_type: ClassVar[type | None] = None
     # Vectors of Newton's method; 0 where the preconditioner of `curved` is nearly the inverse.
     subspace: ClassVar[int] = 4
+    adjoint: ClassVar[str] = "products"  # the `curvature` of `pj.gradient` by default
 
     @abc.abstractmethod
     def prepare(self, case: Any) -> Any:
@@ -110,6 +112,12 @@ class OptimisedPlanner(abc.ABC):
     def solve_lanes(self, cases: Any, attempt: Round) -> Any:
         """The plans of a batch by one round."""
         return solve_batch(self, attempt, cases)
+
+    def settle(
+        self, cases: Any, plan_of: Callable[[Planner, Any], Any] | None = None
+    ) -> tuple[Self, Any]:
+        """Return the planner and the cases: nothing is decided before it minimises."""
+        return self, cases
 
     def plan_shapes(self, cases: Any) -> Any:
         """What plans (B, ...) of cases (B, ...) look like, leaves `jax.ShapeDtypeStruct`.

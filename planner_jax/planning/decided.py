@@ -1,7 +1,7 @@
 """A planner that first has a decision taken: in what order, when, which of several."""
 
 from collections.abc import Callable
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,47 +10,51 @@ from flax import struct
 from jax import Array, lax
 from jax.core import Tracer
 
-from planner_jax.core.protocol import (
-    Case,
-    Decision,
-    Drive,
-    Plan,
-    is_solved,
-    is_unsolved,
-    out_of_time,
-)
+from planner_jax.core.planner import CaseT, Drive, Planner, PlanT
+from planner_jax.core.protocol import Decision, is_solved, is_unsolved, out_of_time
 from planner_jax.planning.select import better_of, merged
 from planner_jax.planning.single_call import call_packed
 
-CaseT = TypeVar("CaseT", bound=Case)
-PlanT = TypeVar("PlanT", bound=Plan)
-
 
 @struct.dataclass
-class DecidedPlanner(Generic[CaseT, PlanT]):
-    """A `CompositePlanner`: a decision proposes choices, a planner plans every one of them.
+class DecidedPlanner(Planner[CaseT, PlanT]):
+    """A composite planner: a decision proposes choices, a planner plans every one of them.
 
     Of several choices the solved one of least `decision.rank` is kept, or the one of least
     violation where none is solved. The planner's last attempt, its longest, is for cases of
     which no choice is solved by then; all but the first are of a planner that says by
-    `begins_long(cases)` that this one is long, too.
+    `starts_long(cases)` that this one is long, too.
     """
 
-    planner: Any
+    planner: Planner[CaseT, PlanT]
     decision: Any  # a `Decision`
 
     @property
-    def case_type(self) -> type | None:
-        """That of the planner."""
-        return getattr(self.planner, "case_type", None)
+    def case_type(self) -> type:
+        """The class of the planner's cases."""
+        return self.planner.case_type
 
-    def replanner(self) -> Any:
-        """That of the planner, if it has one: the order of the plan that is carried out is kept."""
-        return getattr(self.planner, "replanner", lambda: self.planner)()
+    @property
+    def inner(self) -> Planner:
+        """The planner of decided cases."""
+        return self.planner
 
-    def smooth(self, case: CaseT) -> tuple[Any, CaseT]:
-        """The planner inside, and the case with the decision's first choice; see `optimal_plan`."""
-        return self.planner, first_choice(self.decision, case)
+    def replanner(self) -> Planner:
+        """Return the planner's: the order of the plan that is carried out is kept."""
+        return self.planner.replanner()
+
+    def settle(
+        self, cases: Any, plan_of: Callable[[Planner, Any], Any] | None = None
+    ) -> tuple[Any, Any]:
+        """Return what minimises, and the cases with the choice that planning all of them takes.
+
+        Without `plan_of` it is the decision's first choice.
+        """
+        if plan_of is None:
+            return self.planner.settle(first_choice(self.decision, cases))
+        only = self.only_choice(cases)
+        choice = plan_of(self, cases).choice if only is None else only
+        return self.planner.settle(cases.decided(choice), plan_of)
 
     def only_choice(self, cases: Any) -> Any:
         """The choice about every case if the decision leaves but one, or else None."""
@@ -97,8 +101,7 @@ class DecidedPlanner(Generic[CaseT, PlanT]):
         tried = [cases.decided(choice) for choice in choices]
         together = jax.tree.map(lambda *leaves: xp.concatenate(leaves), *tried)
         attempts = self.planner.attempts
-        begins_long = getattr(self.planner, "begins_long", lambda _: False)(cases)
-        at_all = 1 if begins_long else max(len(attempts) - 1, 1)
+        at_all = 1 if self.planner.starts_long(cases) else max(len(attempts) - 1, 1)
         plans, _ = drive(self.planner, together, attempts[:at_all])
         of_case = lambda leaf: leaf.reshape(num, -1, *leaf.shape[1:])  # noqa: E731
         for attempt in attempts[at_all:]:

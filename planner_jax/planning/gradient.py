@@ -1,6 +1,7 @@
 """`gradient`: plans, and how one of their numbers changes with the case."""
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any, Generic, TypeVar
 
@@ -13,7 +14,6 @@ from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.newton import NewtonConfig
 from planner_jax.optimise.problem import Solver
 from planner_jax.optimise.sensitivity import Differentiated, Quantity, part_of
-from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.planning.plan import plan, require_fit
 
 PlanT = TypeVar("PlanT", bound=Plan)
@@ -89,26 +89,13 @@ def gradient(
     by = (by,) if isinstance(by, str) else tuple(by)
     for name in by:
         part_of(cases, name)
-    if isinstance(planner, DecidedPlanner):
-        only = planner.only_choice(cases)
-        if only is None:
-            only = plan(planner, cases, chunk=chunk, devices=devices).choice
-        cases, planner = cases.decided(only), planner.planner
-    elif hasattr(planner, "smooth_near"):
-        found = plan(planner, cases, chunk=chunk, devices=devices)
-        planner, cases = planner.smooth_near(cases, found)
-        curvature = curvature or "whole"
-        polish = False
-    if not hasattr(planner, "objective"):
-        raise TypeError(
-            f"{type(planner).__name__} minimises nothing, so that its plans have no gradient: use "
-            "a planner that does, such as hits' and catches' exact or intercepts' spacetime"
-        )
+    plan_of = functools.partial(plan, chunk=chunk, devices=devices)
+    minimiser, cases = planner.settle(cases, plan_of)
     if solver is not None:
-        planner = planner.with_solver(solver)
+        minimiser = minimiser.with_solver(solver)
     elif polish:
-        planner = planner.polished()
-    differentiated = Differentiated(planner, of, by, steps, curvature or "products")
+        minimiser = minimiser.polished()
+    differentiated = Differentiated(minimiser, of, by, steps, curvature or minimiser.adjoint)
     plans = plan(differentiated, cases, chunk=chunk, devices=devices)
     return PlanGradient(plans=plans.whole_plan(), **_fields(plans.gradient))
 

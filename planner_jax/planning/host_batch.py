@@ -8,7 +8,8 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
-from planner_jax.core.protocol import Attempt, HostPlanner, is_unsolved, marked, out_of_time
+from planner_jax.core.planner import Planner
+from planner_jax.core.protocol import Attempt, is_unsolved, marked, out_of_time
 from planner_jax.host.processors import usable_cores
 from planner_jax.host.threads import as_here
 from planner_jax.planning.layout import calls_of, is_one_cpu, length, sharding, sizes_of
@@ -18,7 +19,7 @@ from planner_jax.planning.select import merged
 
 
 def plan_on_host(
-    planner: HostPlanner, attempts: Sequence[Attempt], cases: Any, watch: Watch
+    planner: Planner, attempts: Sequence[Attempt], cases: Any, watch: Watch
 ) -> tuple[Any, int]:
     """As `plan_batch`, by a planner that works on the host; NumPy leaves. One case will do, too."""
     alone = cases.batch_shape == ()

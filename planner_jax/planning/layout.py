@@ -14,7 +14,6 @@ from jax import Array
 from jax.sharding import Mesh, NamedSharding, PartitionSpec, Sharding, SingleDeviceSharding
 
 from planner_jax.core.protocol import Attempt
-from planner_jax.planning.one_by_one import OneByOne
 
 # Lanes of a device in one call. Few, because every one is a program of its own to compile.
 BUCKETS = (16, 128, 1024, 8192, 65536)
@@ -67,7 +66,7 @@ def sizes_of(planner: Any, attempt: Attempt, chunk: int | None, mesh: Mesh) -> S
     if mesh.devices[0].platform != "cpu":
         return Sizes(max(_GPU_LEAST, _GPU_CHUNK // attempt.starts), busy, _GPU_LEAST)
     # One after another, few are as quick as many, and no core waits long for the others' last.
-    if isinstance(planner, OneByOne):
+    if planner.is_sequential:
         return Sizes(BUCKETS[0], busy)
     starts = 1 << (attempt.starts - 1).bit_length()  # or more: a power of two
     return Sizes(max(BUCKETS[0], _CPU_CHUNK // starts), busy)

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,8 @@ from jax.core import Tracer
 from jax.experimental import multihost_utils
 
 from planner_jax.core.checks import require_size
-from planner_jax.core.protocol import AnyPlanner, Attempt, Case, Plan, Status, is_unsolved
+from planner_jax.core.planner import CaseT, Kind, Planner, PlanT, require_fit
+from planner_jax.core.protocol import Attempt, Case, Status, is_unsolved
 from planner_jax.core.rules import has_rules, require_shapes, require_sound
 from planner_jax.planning.batch import plan_batch
 from planner_jax.planning.host_batch import plan_on_host
@@ -21,12 +22,9 @@ from planner_jax.planning.progress import Progress, Watch
 from planner_jax.planning.select import better_of
 from planner_jax.planning.single import plan_single
 
-CaseT = TypeVar("CaseT", bound=Case)
-PlanT = TypeVar("PlanT", bound=Plan)
-
 
 def plan(
-    planner: AnyPlanner[CaseT, PlanT],
+    planner: Planner[CaseT, PlanT],
     cases: CaseT,
     *,
     chunk: int | None = None,
@@ -78,17 +76,16 @@ def plan(
     if chunk is not None or devices is not None:
         _require_layout(chunk, devices)
     _require_own_precision(leaves)
-    any_planner: Any = planner
     alone = cases.batch_shape == ()
-    if alone and hasattr(any_planner, "solve"):
-        return _named_if_bad(plan_single(any_planner, any_planner.attempts, cases, watch), cases)
+    if alone and planner.kind is Kind.COMPILED:
+        return _named_if_bad(plan_single(planner, planner.attempts, cases, watch), cases)
     if not alone:
         require_batch(cases)
         if not _is_resident(cases):
             require_sound(cases)
     drive = _Drive(chunk, devices, watch)
-    if hasattr(any_planner, "plan_by"):
-        plans = any_planner.plan_by(drive, cases)
+    if planner.kind is Kind.COMPOSITE:
+        plans = planner.plan_by(drive, cases)
     else:
         plans, _ = drive(planner, cases)
     if alone:
@@ -158,11 +155,11 @@ class _Drive:
         self, planner: Any, cases: Any, attempts: Sequence[Attempt] | None = None
     ) -> tuple[Any, Any]:
         """Plans of one case or of a batch, and numbers that are all zero if none is unsolved."""
-        if hasattr(planner, "plan_by"):
+        if planner.kind is Kind.COMPOSITE:
             plans = planner.plan_by(self, cases)
             return plans, is_unsolved(plans.status)
         tried: Sequence[Attempt] = attempts or planner.attempts
-        if hasattr(planner, "solve_on_host"):
+        if planner.kind is Kind.HOST:
             return plan_on_host(planner, tried, cases, self.watch)
         if cases.batch_shape == ():
             one = plan_single(planner, tried, cases, self.watch)
@@ -170,7 +167,7 @@ class _Drive:
         return plan_batch(planner, tried, cases, self.chunk, self.devices, self.watch)
 
 
-def solve(planner: AnyPlanner[CaseT, PlanT], cases: CaseT) -> PlanT:
+def solve(planner: Planner[CaseT, PlanT], cases: CaseT) -> PlanT:
     """`plan` as a pure function, for the inside of a compiled function, `vmap` or `scan`.
 
     Every attempt after the first is made only if some case is unsolved by then, but then at all
@@ -190,7 +187,7 @@ def solve(planner: AnyPlanner[CaseT, PlanT], cases: CaseT) -> PlanT:
     require_fit(planner, cases)
     _require_pure(planner)
     require_shapes(cases)
-    if cases.batch_shape == () and hasattr(planner, "plan_by"):
+    if cases.batch_shape == () and planner.kind is Kind.COMPOSITE:
         plans = solve(planner, jax.tree.map(lambda leaf: leaf[None], cases))
         return jax.tree.map(lambda leaf: leaf[0], plans)
     return _solve(planner, cases)
@@ -219,7 +216,7 @@ class _DrivePurely:
         self, planner: Any, cases: Any, attempts: Sequence[Attempt] | None = None
     ) -> tuple[Any, Any]:
         """Plans, and which cases are unsolved."""
-        if hasattr(planner, "plan_by"):
+        if planner.kind is Kind.COMPOSITE:
             plans = planner.plan_by(self, cases)
             return plans, is_unsolved(plans.status)
         _require_pure(planner)
@@ -239,38 +236,10 @@ _drive_purely = _DrivePurely()
 
 def _require_pure(planner: Any) -> None:
     """Raise `TypeError` for a planner that works on the host."""
-    if hasattr(planner, "solve_on_host"):
+    if planner.kind is Kind.HOST:
         raise TypeError(
             f"{type(planner).__name__} works on the host: call pj.plan outside of what is compiled"
         )
-
-
-def require_fit(planner: Any, cases: Any) -> None:
-    """Raise `TypeError` unless the planner is one, a pytree, and the cases are of its class."""
-    require_planner(planner)
-    if jax.tree_util.all_leaves([planner]) and not hasattr(planner, "solve_on_host"):
-        raise TypeError(
-            f"{type(planner).__name__} must be a pytree: put @jax.tree_util.register_static over "
-            "its frozen dataclass, or make it a flax.struct.dataclass if it holds arrays"
-        )
-    kind = getattr(planner, "case_type", None)
-    if kind is not None and not isinstance(cases, kind):
-        raise TypeError(
-            f"{type(planner).__name__} plans cases of the class {kind.__name__}, got "
-            f"{type(cases).__name__}"
-        )
-    if not hasattr(cases, "batch_shape"):
-        raise TypeError(f"cases must be a case or a batch, got a {type(cases).__name__}")
-    if not getattr(planner, "attempts", True):
-        raise ValueError(f"{type(planner).__name__} must have at least one attempt, got none")
-
-
-def require_planner(planner: Any) -> None:
-    """Raise `TypeError` unless the planner is one."""
-    is_class, ways = isinstance(planner, type), ("solve", "solve_on_host", "plan_by")
-    if is_class or not any(hasattr(planner, way) for way in ways):
-        found = f"the class {planner.__name__}" if is_class else f"a {type(planner).__name__}"
-        raise TypeError(f"planner must be one, such as pj.hit.planner(), got {found}")
 
 
 def require_batch(cases: Case) -> int:
@@ -288,7 +257,7 @@ def require_batch(cases: Case) -> int:
 
 
 def plan_across_processes(
-    planner: AnyPlanner[CaseT, PlanT], cases: CaseT, *, chunk: int | None = None
+    planner: Planner[CaseT, PlanT], cases: CaseT, *, chunk: int | None = None
 ) -> PlanT:
     """`plan` where each process of `jax.distributed` plans its share of one batch.
 

@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh, PartitionSpec
 
-from planner_jax.core.protocol import Attempt, LanesPlanner, is_unsolved, marked
+from planner_jax.core.protocol import Attempt, is_unsolved, marked
 from planner_jax.core.rules import require_shapes
 from planner_jax.host.threads import as_here
 from planner_jax.planning.layout import (
@@ -39,10 +39,8 @@ def solve_cases(planner: Any, cases: Any, attempt: Attempt) -> Any:
     require_shapes(cases)
     if cases.batch_shape == ():
         plans = planner.solve(cases, attempt)
-    elif isinstance(planner, LanesPlanner):
-        plans = planner.solve_lanes(cases, attempt)
     else:
-        plans = jax.vmap(lambda case: planner.solve(case, attempt))(cases)
+        plans = planner.solve_lanes(cases, attempt)
     return marked(plans, cases)
 
 

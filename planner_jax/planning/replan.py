@@ -8,8 +8,9 @@ from flax import struct
 from jax import Array
 
 from planner_jax.core.checks import numbers_of, require_kind, told
+from planner_jax.core.planner import require_planner
 from planner_jax.core.protocol import Case, Plan
-from planner_jax.planning.plan import plan, require_planner
+from planner_jax.planning.plan import plan
 
 CaseT = TypeVar("CaseT", bound=Case)
 PlanT = TypeVar("PlanT", bound=Plan)
@@ -97,14 +98,9 @@ def replan(planner: Any, cases: Any, previous: PlanT, elapsed: Any, **news: Any)
         ValueError: `elapsed` is negative, or plans or news are not one for each case.
     """
     require_planner(planner)
-    again = planner.replanner() if hasattr(planner, "replanner") else planner
-    if not hasattr(again, "begin"):
-        raise TypeError(
-            f"{type(again).__name__} cannot plan again: use hits' and catches' exact, intercepts' "
-            "spacetime, or ReplanBlock"
-        )
-    require_kind("cases", cases, getattr(getattr(again, "planner", None), "case_type", object))
-    require_kind("previous", previous, getattr(again, "plan_type", Plan))
+    again = planner.replanner()
+    require_kind("cases", cases, again.inner.case_type)
+    require_kind("previous", previous, again.plan_type)
     if np.shape(previous.status) != cases.batch_shape:
         raise ValueError(
             f"previous must have the batch shape of the cases, {cases.batch_shape}, got "

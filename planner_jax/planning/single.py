@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 from typing import Any
 
-from planner_jax.core.protocol import Attempt, Planner, is_solved, is_unsolved, out_of_time
+from planner_jax.core.planner import Planner
+from planner_jax.core.protocol import Attempt, is_solved, is_unsolved, out_of_time
 from planner_jax.planning.programs import solve_cases
 from planner_jax.planning.progress import Watch
 from planner_jax.planning.single_call import call_packed

@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from planner_jax.core.protocol import AnyPlanner, Attempt
+from planner_jax.core.planner import Kind, Planner
+from planner_jax.core.protocol import Attempt
 from planner_jax.planning.host_batch import plan_on_host
 from planner_jax.planning.programs import compile_at_once
 from planner_jax.planning.progress import Watch
@@ -21,15 +22,15 @@ class _Ahead:
         self, planner: Any, cases: Any, attempts: Sequence[Attempt] | None = None
     ) -> tuple[Any, Any]:
         """What the first attempt makes of a batch, said to leave nothing unsolved."""
-        if hasattr(planner, "plan_by"):
+        if planner.kind is Kind.COMPOSITE:
             return planner.plan_by(self, cases), np.zeros(1, bool)
         tried: Sequence[Attempt] = attempts or planner.attempts
-        if hasattr(planner, "solve_on_host"):  # nothing is compiled of it
+        if planner.kind is Kind.HOST:  # nothing is compiled of it
             return plan_on_host(planner, tried[:1], cases, Watch())
         return compile_at_once(planner, tried, cases), np.zeros(1, bool)
 
 
-def compile_attempts(planner: AnyPlanner, cases: Any) -> None:
+def compile_attempts(planner: Planner, cases: Any) -> None:
     """Compile what planning a few cases may take, with a thread for each attempt of the planner.
 
     Otherwise an attempt is compiled when the one before has left something unsolved. That is right

@@ -1,21 +1,20 @@
 """A planner whose plans go on to rest behind their last contact."""
 
 import dataclasses
-from typing import Any, Generic, TypeVar
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from planner_jax.core.protocol import Case, Drive, Plan, Status, is_solved
+from planner_jax.core.planner import CaseT, Drive, Planner, PlanT
+from planner_jax.core.protocol import Status, is_solved
 from planner_jax.core.recovery_names import ending_problem
 from planner_jax.planning.decided import planned_again
 from planner_jax.recovery.case import EndingCase, end_state
 from planner_jax.recovery.planner import RestPlanner
-
-CaseT = TypeVar("CaseT", bound=Case)
-PlanT = TypeVar("PlanT", bound=Plan)
 
 # Where a plan ends so fast that nothing keeps the speed limit behind it, the plan is made again
 # for these shares of the limit.
@@ -23,23 +22,37 @@ _SLOWER = (0.8, 0.65, 0.5)
 
 
 @struct.dataclass
-class EndedPlanner(Generic[CaseT, PlanT]):
-    """A `CompositePlanner`: a quadrotor's planner, and one that goes on from its plans to rest.
+class EndedPlanner(Planner[CaseT, PlanT]):
+    """A composite planner: a quadrotor's planner, and one that goes on from its plans to rest.
 
     A plan whose ending breaks a limit is not solved. It is then made again with less speed.
     """
 
-    planner: Any
+    planner: Planner[CaseT, PlanT]
     rest: RestPlanner
 
     @property
-    def case_type(self) -> type | None:
-        """That of the planner."""
-        return getattr(self.planner, "case_type", None)
+    def case_type(self) -> type:
+        """The class of the planner's cases."""
+        return self.planner.case_type
 
-    def replanner(self) -> Any:
-        """That of the planner, if it has one: what is planned anew has no ending."""
-        return getattr(self.planner, "replanner", lambda: self.planner)()
+    @property
+    def inner(self) -> Planner:
+        """The planner of plans without an ending."""
+        return self.planner
+
+    def replanner(self) -> Planner:
+        """Return the planner's: what is planned anew has no ending."""
+        return self.planner.replanner()
+
+    def settle(
+        self, cases: Any, plan_of: Callable[[Planner, Any], Any] | None = None
+    ) -> tuple[Any, Any]:
+        """Raise `TypeError`: an ending follows from its plan, and minimises for itself."""
+        raise TypeError(
+            "plans with an ending have no gradient, as plan and ending are minimised one after "
+            "the other: leave `ending` out"
+        )
 
     def plan_by(self, drive: Drive, cases: Any) -> Any:
         """The plans of one case or of a batch, with their endings."""

@@ -8,7 +8,8 @@ import jax
 import jax.monitoring
 import numpy as np
 
-from planner_jax.core.protocol import AnyPlanner, lane
+from planner_jax.core.planner import Planner
+from planner_jax.core.protocol import lane
 from planner_jax.planning.plan import CaseT, PlanT, plan
 
 # Tracing, lowering and the backend's compilation, which includes reading the compile cache.
@@ -89,7 +90,7 @@ def timed_warm(call: Callable[[], FoundT]) -> tuple[FoundT, float]:
     return timed(call)[:2]
 
 
-def timed_plans(planner: AnyPlanner[CaseT, PlanT], cases: CaseT) -> tuple[PlanT, np.ndarray]:
+def timed_plans(planner: Planner[CaseT, PlanT], cases: CaseT) -> tuple[PlanT, np.ndarray]:
     """Plans of cases (B,), made one after another, and the seconds (B,) that each takes, warm."""
     num = jax.tree.leaves(cases)[0].shape[0]
     timed_each = [timed_warm(lambda k=k: plan(planner, lane(cases, k))) for k in range(num)]

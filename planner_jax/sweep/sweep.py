@@ -86,15 +86,13 @@ class Sweep:
             if name != own and name not in self.task.from_file:
                 with contextlib.suppress(MissingExtra):
                     made[name] = self.task.planner(name)
-        kind = _case_type(self.planner(settings))
-        fits = lambda one: kind is None or _case_type(one) in (None, kind)  # noqa: E731
-        return {name: one for name, one in made.items() if fits(one)}
+        kind = self.planner(settings).case_type
+        return {name: one for name, one in made.items() if one.case_type is kind}
 
     def require_fit(self, settings: Any, planner: Any, cases: Any) -> None:
         """Raise `SettingError` unless the planner is one of such cases."""
-        kind = _case_type(planner)
         require(
-            kind is None or isinstance(cases, kind),
+            isinstance(cases, planner.case_type),
             "planner",
             f"one that takes the cases of suite {settings.suite}",
             settings.planner,
@@ -160,11 +158,6 @@ class Sweep:
             f"Cases: {settings['num']:,} of suite {settings['suite']}, seed {settings['seed']}.",
             "A success is the referee's.",
         ]
-
-
-def _case_type(planner: Any) -> type | None:
-    """The class of a planner's cases, where it tells."""
-    return getattr(planner, "case_type", None)
 
 
 def settings_of(task: Task) -> type[SweepSettings]:

@@ -23,7 +23,7 @@ def named_decision(
         TypeError: it is neither a name nor a decision.
     """
     if not isinstance(decide, str):
-        if isinstance(decide, type) or not hasattr(decide, "propose"):
+        if isinstance(decide, type) or not isinstance(decide, Decision):
             raise TypeError(f"decide must be a name or a decision, got {decide!r:.60}")
         return decide
     name, file = split_name(names, "decide", decide, from_file)

@@ -20,7 +20,8 @@ from jax import Array
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.prediction import PathTable, predict_path
 from planner_jax.ball.target import BallPath
-from planner_jax.core.protocol import AnyPlanner, is_solved
+from planner_jax.core.planner import Planner
+from planner_jax.core.protocol import is_solved
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
 from planner_jax.planning.decided import DecidedPlanner
@@ -86,8 +87,8 @@ _LIFT = 0.1  # of guesses in flight, at every catch: a little more thrust than t
 
 
 def _steadier(
-    planner: AnyPlanner[CatchCase, CatchPlan],
-) -> AnyPlanner[CatchCase, CatchPlan]:
+    planner: Planner[CatchCase, CatchPlan],
+) -> Planner[CatchCase, CatchPlan]:
     """The planner with guesses for flights, where it is `exact` behind a decision."""
     if isinstance(planner, DecidedPlanner) and isinstance(planner.planner, ExactCatch):
         own = dataclasses.replace(planner.planner, lift=_LIFT)
@@ -377,7 +378,7 @@ def fly_catches(
     cases: Throws,
     seed: int = 0,
     *,
-    planner: AnyPlanner[CatchCase, CatchPlan] | None = None,
+    planner: Planner[CatchCase, CatchPlan] | None = None,
     pilot: CatchPilot | None = None,
     plan: CatchPlan | None = None,
 ) -> CatchFlights:
@@ -457,7 +458,7 @@ def fly_catches(
 
 
 def planned_ahead(
-    planner: AnyPlanner[CatchCase, CatchPlan],
+    planner: Planner[CatchCase, CatchPlan],
     known: CatchCase,
     ball: int,
     limits: Sequence[dict[str, Any]],

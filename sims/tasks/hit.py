@@ -13,7 +13,7 @@ from jax import Array
 
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.impact import racket_impact
-from planner_jax.core.protocol import AnyPlanner
+from planner_jax.core.planner import Planner
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
 from planner_jax.planning.plan import plan as plan_all
@@ -226,7 +226,7 @@ def fly_hits(
     cases: Volleys,
     seed: int = 0,
     *,
-    planner: AnyPlanner[HitCase, HitPlan] | None = None,
+    planner: Planner[HitCase, HitPlan] | None = None,
     pilot: HitPilot | None = None,
     plan: HitPlan | None = None,
 ) -> HitFlights:

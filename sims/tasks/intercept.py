@@ -312,7 +312,7 @@ def planned_anew(
     """
     pose, speed, curvature = jax.vmap(functools.partial(believed_state, loop))(drive)
     elapsed = drive.time - drive.began
-    if hasattr(planner, "replanner"):
+    if isinstance(planner, SpacetimeIntercept):
         again = planner.replanner()
         now = {"start": pose, "speed": speed, "curvature": curvature}
         task = again.begin(begun, drive.plan, elapsed, target=target, movers=movers, **now)

@@ -80,11 +80,10 @@ class SmoothMeet(pj.OptimisedPlanner):
 
 
 @dataclasses.dataclass(frozen=True)
-class ScipyMeet:
+class ScipyMeet(pj.Planner):
     """By SciPy's SLSQP on the host, one case after another."""
 
     case_type = MeetCase
-    attempts = (pj.Attempt(),)
 
     def solve_on_host(self, cases: MeetCase, attempt: pj.Attempt) -> MeetPlan:
         plans = [self._solve(pj.lane(cases, k)) for k in range(cases.batch_shape[0])]

@@ -14,8 +14,8 @@ import numpy as np
 from jax import Array
 
 from planner_jax.baselines.parts.bang_bang import bang_bang, least_times
+from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt, require_settings, status_of
-from planner_jax.planning.one_by_one import OneByOne
 from planner_jax.planning.select import first_solved
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import least_clearances
@@ -48,10 +48,11 @@ def poses_in_time(case: BlockCase, points: int) -> tuple[EndPoses, Array]:
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class DirectBlock(OneByOne):
+class DirectBlock(Planner):
     """Bang-bang motions of the joints; the cost of a plan is its execution time [s]."""
 
     case_type: ClassVar[type] = BlockCase
+    is_sequential: ClassVar[bool] = True
     attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)
     points: int = 48  # of the ball's way, where end poses are looked at
     tries: int = 384  # end poses whose motions are looked at, the soonest first

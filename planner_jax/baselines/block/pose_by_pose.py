@@ -23,6 +23,7 @@ from jax import Array
 from planner_jax.baselines.block.direct import poses_in_time
 from planner_jax.baselines.block.free_space import FreeSpace
 from planner_jax.baselines.block.path_timing import DEGREE, PIECES, required, timed_way
+from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt, Status, lane, require_settings
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.plan import BlockPlan, explained
@@ -49,7 +50,7 @@ class HostMotion:
 
 
 @dataclasses.dataclass(frozen=True)
-class PoseByPose(abc.ABC):
+class PoseByPose(Planner, abc.ABC):
     """What such planners share; the cost of a plan is how long its motion takes [s].
 
     A plan's `violation` is by how much the motion is longer than the time there is, relative, and

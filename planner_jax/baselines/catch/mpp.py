@@ -12,6 +12,7 @@ from jax import Array, lax
 from planner_jax.ball.flight import BallState, gravity_vector
 from planner_jax.ball.target import state_at
 from planner_jax.baselines.parts.minimum_jerk import eased_minimum_jerk
+from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt, outcome, require_settings
 from planner_jax.cost.quadrotor import (
     body_rate_excess,
@@ -80,7 +81,7 @@ def falling_time(target, height: Array, horizon: Array, nodes: int) -> tuple[Arr
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class MppCatch:
+class MppCatch(Planner):
     """The motion primitive planner that paper 000 compares with; nothing is optimised.
 
     What is taken from where:

@@ -11,6 +11,7 @@ from planner_jax.ball.impact import required_impact
 from planner_jax.ball.prediction import PathTable, target_at
 from planner_jax.baselines.hit.common import largest_violation, make_impact
 from planner_jax.baselines.parts.minimum_jerk import eased_minimum_jerk
+from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt, outcome, require_settings
 from planner_jax.cost.quadrotor import motion_excess
 from planner_jax.task.hit.case import HitCase
@@ -54,7 +55,7 @@ def falling_time(path: PathTable, height: Array, earliest: Array, latest: Array)
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class JuggleHit:
+class JuggleHit(Planner):
     """A minimum-jerk primitive to a stroke that is fixed beforehand; nothing is optimised.
 
     The "Juggle" of paper 002. What is taken from where:

@@ -19,6 +19,7 @@ from planner_jax.baselines.intercept.path import FollowConfig, Path, path_beside
 from planner_jax.baselines.intercept.path_smoothing import Smoothing, smooth_path
 from planner_jax.baselines.intercept.path_then_speed import SpeedStep
 from planner_jax.baselines.intercept.speed import SPEED_PLANNERS
+from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Status, lane
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.finalize import explained
@@ -41,7 +42,7 @@ def printed_speed(end_weight: float | None = None) -> SpeedStep:
 
 
 @dataclasses.dataclass(frozen=True)
-class PaperIntercept:
+class PaperIntercept(Planner):
     """Meets the target at the case's time along one searched path."""
 
     case_type: ClassVar[type] = InterceptCase

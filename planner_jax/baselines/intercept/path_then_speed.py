@@ -17,8 +17,8 @@ from planner_jax.baselines.intercept.speed import SPEED_PLANNERS, SpeedPlanner, 
 from planner_jax.baselines.intercept.static_paths import PathSource, StaticPaths
 from planner_jax.baselines.intercept.station_time import StationTimeProblem, reference_line
 from planner_jax.core.checks import require_size
+from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Status, is_solved, require_settings
-from planner_jax.planning.one_by_one import OneByOne
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.finalize import checked_plan, explained
 from planner_jax.task.intercept.plan import InterceptPlan
@@ -96,10 +96,11 @@ def ramp_and_cruise(problem: StationTimeProblem, times: Array) -> tuple[Array, A
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class PathThenSpeed(OneByOne):
+class PathThenSpeed(Planner):
     """Meets the target at the case's time along one of several paths among what stands."""
 
     case_type: ClassVar[type] = InterceptCase
+    is_sequential: ClassVar[bool] = True
     source: PathSource = PathSource()
     step: SpeedStep = SpeedStep()
     # How many paths get a speed, those first through which dynamic programming finds the line of

@@ -4,7 +4,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from planner_jax.core.protocol import AnyPlanner
+from planner_jax.core.planner import Planner
 from planner_jax.core.registry import suite_named
 from planner_jax.referee.block import BlockVerdict, referee_blocks
 from planner_jax.task.block.case import BlockCase
@@ -58,7 +58,7 @@ def draw(
     )
 
 
-def planner(name: str = "online", **options: Any) -> AnyPlanner[Any, Any]:
+def planner(name: str = "online", **options: Any) -> Planner[Any, Any]:
     """The block planner of a name, with some of its fields set.
 
     * `library:FILE`: the motion that a file of `planner-jax library build` has for the two cells

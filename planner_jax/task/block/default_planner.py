@@ -21,6 +21,7 @@ import numpy as np
 from jax import Array, lax
 
 from planner_jax.ball.flight import drag_free_flight
+from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import (
     FEASIBILITY_TOLERANCE,
     Attempt,
@@ -36,7 +37,6 @@ from planner_jax.optimise.levenberg import (
     go_on,
     least_squares,
 )
-from planner_jax.planning.one_by_one import OneByOne
 from planner_jax.planning.select import better_of, first_solved
 from planner_jax.robot.arm import product, shield_jacobian, shield_pose
 from planner_jax.task.block.case import BlockCase
@@ -128,10 +128,11 @@ def _hopes(tried: LevenbergState, solver: LevenbergConfig) -> Array:
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class OnlineBlock(OneByOne):
+class OnlineBlock(Planner):
     """Meets a ball somewhere between the boxes; the cost of a plan is its execution time [s]."""
 
     case_type: ClassVar[type] = BlockCase
+    is_sequential: ClassVar[bool] = True
     pieces: int = 10  # of rates
     points: int = 48  # of the ball's way, where end poses are looked at
     samples: int = 32  # of a motion, where least squares look at distances

@@ -15,9 +15,9 @@ from jax import Array
 
 from planner_jax.ball.flight import BallState, drag_free_flight
 from planner_jax.core.checks import require_beginning, require_kind
-from planner_jax.core.protocol import Attempt, Drive, is_unsolved, lane
+from planner_jax.core.planner import Drive, Planner
+from planner_jax.core.protocol import Attempt, is_unsolved, lane
 from planner_jax.optimise.levenberg import LevenbergConfig
-from planner_jax.planning.one_by_one import OneByOne
 from planner_jax.planning.replan import Replanning, given_or_own, moment_of
 from planner_jax.planning.select import better_of, merged
 from planner_jax.robot.arm import shield_pose
@@ -40,10 +40,11 @@ class Warm(Attempt):
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class WarmBlock(OneByOne):
+class WarmBlock(Planner):
     """Motions bent from those that are carried out; of tasks as `ReplanBlock.begin` makes them."""
 
     case_type: ClassVar[type] = Replanning
+    is_sequential: ClassVar[bool] = True
     planner: OnlineBlock = OnlineBlock()  # whose unknowns, limits and weights these are
     attempts: tuple[Warm, ...] = (Warm(),)
 
@@ -75,7 +76,7 @@ class WarmBlock(OneByOne):
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class ReplanBlock:
+class ReplanBlock(Planner):
     """Blocks re-planned from the motion that is carried out, as `pj.replan` asks for them.
 
     Times of cases and plans go on counting from when the ball was first seen; what moves on is the
@@ -86,6 +87,11 @@ class ReplanBlock:
     plan_type: ClassVar[type] = BlockPlan
     warm: WarmBlock = WarmBlock()
     planner: OnlineBlock = OnlineBlock()  # for what the warm start does not solve
+
+    @property
+    def inner(self) -> OnlineBlock:
+        """The planner of the cases that are planned again."""
+        return self.planner
 
     def begin(
         self,

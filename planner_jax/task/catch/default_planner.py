@@ -235,13 +235,13 @@ class ExactCatch(OptimisedPlanner):
         """The plans of a batch by one round."""
         return super().solve_lanes(cases, self._for_start(attempt, cases))
 
-    def begins_long(self, case: CatchCase) -> bool:
+    def starts_long(self, case: CatchCase) -> bool:
         """Whether the first search is a long one: of many targets that must all be caught."""
         return self.rounds == _ROUNDS and case.num_targets > _FEW and not case.optional
 
     def _for_start(self, attempt: Round, case: CatchCase) -> Round:
         """A shorter first round where it begins near its end, longer searches where it is far."""
-        if self.begins_long(case) and attempt in _ROUNDS[:2]:
+        if self.starts_long(case) and attempt in _ROUNDS[:2]:
             is_first = attempt == _FIRST
             steps = _STEPS_A_TARGET * case.num_targets if is_first else _OF_MANY.max_steps
             return Round(starts=1, solver=dataclasses.replace(_OF_MANY, max_steps=steps))

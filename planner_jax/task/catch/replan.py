@@ -80,6 +80,11 @@ class ReplanCatch(OptimisedPlanner):
     )
     shortest: float = 0.05  # [s], least time to the next catch that is planned anew
 
+    @property
+    def inner(self) -> ExactCatch:
+        """The planner of the cases that are planned again."""
+        return self.planner
+
     def begin(
         self,
         cases: CatchCase,

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from planner_jax.core.protocol import Attempt, Drive, Status, is_solved, is_unsolved
+from planner_jax.core.planner import Drive, Planner
+from planner_jax.core.protocol import Attempt, Status, is_solved, is_unsolved
 from planner_jax.planning.select import better_of, merged
 from planner_jax.robot.car import pose_at
 from planner_jax.task.group.case import CarState, GroupPlan, InterceptGroup
@@ -29,8 +30,8 @@ _EARLY = dataclasses.replace(SpacetimeIntercept("early").attempts[0], ways=12)
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class GroupIntercept:
-    """A `CompositePlanner` of groups whose order is decided.
+class GroupIntercept(Planner):
+    """A composite planner of groups whose order is decided.
 
     What it gives up for the sake of speed: every leg ends as early as it can, whatever that
     means for the next one.

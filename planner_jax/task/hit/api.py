@@ -6,7 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from planner_jax.core.efforts import with_effort
-from planner_jax.core.protocol import AnyPlanner
+from planner_jax.core.planner import Planner
 from planner_jax.core.registry import suite_named
 from planner_jax.recovery.with_recovery import ended
 from planner_jax.referee.hit import HitVerdict, referee_hits
@@ -67,7 +67,7 @@ def draw(
 
 def planner(
     name: str = "exact", *, effort: str = "feasible", ending: str | None = None, **options: Any
-) -> AnyPlanner[HitCase, HitPlan]:
+) -> Planner[HitCase, HitPlan]:
     """The hit planner of a name, with some of its fields set.
 
     * `exact`: contact, impact and landing hold by construction; the one to use.

@@ -56,6 +56,11 @@ class ReplanHit(OptimisedPlanner):
         Round(starts=1, solver=LbfgsConfig(max_steps=40, trial_steps=_TRIALS)),
     )
 
+    @property
+    def inner(self) -> ExactHit:
+        """The planner of the cases that are planned again."""
+        return self.planner
+
     def begin(
         self,
         cases: HitCase,

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from planner_jax.core.checks import require_kind, require_path
-from planner_jax.core.protocol import AnyPlanner
+from planner_jax.core.planner import Planner
 from planner_jax.core.registry import suite_named
 from planner_jax.plane.target import PlanePath
 from planner_jax.planning.decided import DecidedPlanner
@@ -52,7 +52,7 @@ def draw(
     return draw_cases(suite, num, seed, first, dtype=dtype)
 
 
-def planner(name: str = "spacetime", **options: Any) -> AnyPlanner[Any, Any]:
+def planner(name: str = "spacetime", **options: Any) -> Planner[Any, Any]:
     """The intercept planner of a name, with some of its fields set.
 
     * `spacetime`: way and speed together, from a reach set in space and time.

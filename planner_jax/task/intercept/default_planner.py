@@ -9,6 +9,7 @@ on the way; one that keeps every limit; and, once one does, one of less effort, 
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import jax
@@ -17,6 +18,7 @@ import numpy as np
 from flax import struct
 from jax import Array, lax
 
+from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Status, is_solved, require_attempts, require_settings
 from planner_jax.optimise.levenberg import (
     LevenbergState,
@@ -25,7 +27,6 @@ from planner_jax.optimise.levenberg import (
 )
 from planner_jax.plane import reach
 from planner_jax.plane.distance_field import DistanceField, distance_field
-from planner_jax.planning.one_by_one import OneByOne
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.finalize import checked_plan, explained, straight_on
 from planner_jax.task.intercept.motion import Quadratic, by_unknowns, motion
@@ -92,7 +93,7 @@ class Found:
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class SpacetimeIntercept(OneByOne):
+class SpacetimeIntercept(Planner):
     """Meets the target at the case's time, or earlier.
 
     `meet` says when: at the "given" time, as "early" as it can until then, or at that time until
@@ -101,6 +102,7 @@ class SpacetimeIntercept(OneByOne):
     """
 
     case_type: ClassVar[type] = InterceptCase
+    is_sequential: ClassVar[bool] = True
     meet: Literal["given", "early", "least"] = "given"
     pieces: int = 32  # of speed and curvature
     samples: int = 3  # of each piece, where obstacles are looked at
@@ -146,10 +148,15 @@ class SpacetimeIntercept(OneByOne):
         begun = jnp.concatenate(parts if self.is_time_free else parts[:2], axis=-1)
         return SmoothIntercept(self), begun_case(cases, begun)
 
-    def smooth(self, case: InterceptCase) -> "tuple[SmoothIntercept, BegunCase]":
-        """The same from the plan of the first search, constant to derivatives."""
-        plan = self.solve(lax.stop_gradient(case), self.attempts[0])
-        return self.smooth_near(case, plan)
+    def settle(
+        self, cases: InterceptCase, plan_of: Callable[[Planner, Any], Any] | None = None
+    ) -> "tuple[SmoothIntercept, BegunCase]":
+        """Return what minimises from plans on; by default from the plan of the first search."""
+        if plan_of is None:
+            plans = self.solve(lax.stop_gradient(cases), self.attempts[0])
+        else:
+            plans = plan_of(self, cases)
+        return self.smooth_near(cases, plans)
 
     def solve(self, case: InterceptCase, attempt: Search) -> InterceptPlan:
         """The plan of one case: way after way, until one keeps every limit.

@@ -14,11 +14,11 @@ import numpy as np
 from jax import Array
 
 from planner_jax.core.checks import require_beginning, require_kind, require_path
+from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.plane.obstacles import Obstacles
 from planner_jax.plane.target import PlanePath
-from planner_jax.planning.one_by_one import OneByOne
 from planner_jax.planning.replan import Replanning, given_or_own, moment_of
 from planner_jax.robot.car import pose_at
 from planner_jax.task.intercept.case import InterceptCase
@@ -40,7 +40,7 @@ class Warm(Attempt):
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class ReplanIntercept(OneByOne):
+class ReplanIntercept(Planner):
     """Interceptions re-planned from the previous plan, as `pj.replan` asks for them.
 
     With less than `shortest` left until the meeting nothing is planned: what is left of the
@@ -48,6 +48,7 @@ class ReplanIntercept(OneByOne):
     """
 
     case_type: ClassVar[type] = Replanning
+    is_sequential: ClassVar[bool] = True
     plan_type: ClassVar[type] = InterceptPlan
     planner: SpacetimeIntercept = SpacetimeIntercept()
     warm: Warm = Warm()
@@ -57,6 +58,11 @@ class ReplanIntercept(OneByOne):
     def attempts(self) -> tuple[Attempt, ...]:
         """From the previous plan, then the first from scratch: others take too long."""
         return (self.warm, self.planner.attempts[0])
+
+    @property
+    def inner(self) -> SpacetimeIntercept:
+        """The planner of the cases that are planned again."""
+        return self.planner
 
     def begin(
         self,

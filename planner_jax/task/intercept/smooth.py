@@ -18,6 +18,7 @@ from jax import Array, lax
 from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.levenberg import LevenbergConfig, Model, least_squares
+from planner_jax.optimise.newton import NewtonConfig
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.problem import Round
 from planner_jax.plane.distance_field import DistanceField
@@ -57,6 +58,7 @@ class SmoothIntercept(OptimisedPlanner):
     """
 
     case_type: ClassVar[type] = BegunCase
+    adjoint: ClassVar[str] = "whole"
     planner: "SpacetimeIntercept"
     solver: LevenbergConfig = LevenbergConfig(2000, settled=12, tolerance=1e-9)
     # None of its own: least squares have been to the end.
@@ -105,6 +107,10 @@ class SmoothIntercept(OptimisedPlanner):
     def decode(self, point: Array, context: _Context) -> InterceptPlan:
         """The plan of a point."""
         return self.planner.plan_at(context.case, point, jnp.zeros((), jnp.int32))
+
+    def polished(self, solver: NewtonConfig | None = None) -> "SmoothIntercept":
+        """Return the planner: its plans are optimal already."""
+        return self
 
     def core_blocks(self, size: int) -> np.ndarray:
         """All unknowns together; see `CorePlanner`."""

@@ -23,9 +23,9 @@ from planner_jax.baselines.block.library.cells import cells_around
 from planner_jax.baselines.block.library.file import LibraryFileError, load_library
 from planner_jax.baselines.block.library.planner import LibraryBlock
 from planner_jax.baselines.block.library.table import pieces_of, unpacked
+from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt, Status
 from planner_jax.optimise.levenberg import LevenbergConfig
-from planner_jax.planning.one_by_one import OneByOne
 from planner_jax.planning.select import first_solved
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import clearances, num_of_pole
@@ -69,7 +69,7 @@ class Warped:
 
 
 @struct.dataclass
-class AdaptBlock(OneByOne):
+class AdaptBlock(Planner):
     """Meets the very ball with a stored motion that is warped; the cost is its duration [s].
 
     Arm, limits and scene have to be those of the library, and the arm has to stand at one of its
@@ -88,6 +88,7 @@ class AdaptBlock(OneByOne):
     )
 
     case_type: ClassVar[type] = BlockCase
+    is_sequential: ClassVar[bool] = True
 
     @property
     def attempts(self) -> tuple[Effort, ...]:

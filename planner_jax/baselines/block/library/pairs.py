@@ -18,6 +18,7 @@ from jax import Array, lax
 from planner_jax.ball.flight import drag_free_flight
 from planner_jax.baselines.block.library.cells import GRAVITY, farthest_crossing, nominal_ball
 from planner_jax.baselines.block.library.table import Setting
+from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import (
     FEASIBILITY_TOLERANCE,
     Attempt,
@@ -27,7 +28,6 @@ from planner_jax.core.protocol import (
     status_of,
 )
 from planner_jax.optimise.levenberg import LevenbergConfig, Model, least_squares
-from planner_jax.planning.one_by_one import OneByOne
 from planner_jax.robot.arm import product, shield_jacobian, shield_pose
 from planner_jax.robot.arm_ik import inverse_kinematics
 from planner_jax.task.block.case import STRICT, BlockCase
@@ -73,7 +73,7 @@ class PairPlan(Plan):
 
 
 @struct.dataclass
-class PairPlanner(OneByOne):
+class PairPlanner(Planner):
     """What both planners of pairs share: where the arm starts, and its surroundings.
 
     The shield's edges lie along those of the frame whose second axis is horizontal, as those of
@@ -86,6 +86,7 @@ class PairPlanner(OneByOne):
     points: int = struct.field(pytree_node=False, default=5)  # of the centreline
 
     case_type: ClassVar[type] = PairCase
+    is_sequential: ClassVar[bool] = True
 
     def case_of(self, pair: PairCase, entry: Array) -> tuple[BlockCase, Flight]:
         """The nominal ball as a case, getting into the outer box at a time () [s]."""

@@ -21,6 +21,7 @@ from planner_jax.baselines.block.library.table import (
     setting_of,
     unpacked,
 )
+from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import FEASIBILITY_TOLERANCE, Attempt, Status, status_of
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.motion import polynomial
@@ -35,7 +36,7 @@ class OtherLibrary(ValueError):
 
 
 @struct.dataclass
-class LibraryBlock:
+class LibraryBlock(Planner):
     """Answers with the stored motion of a ball's pair of cells; the cost is its duration [s].
 
     The arm stands at a home of the library. A motion that must end at rest begins when the arm may
