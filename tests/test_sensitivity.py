@@ -20,7 +20,6 @@ from planner_jax.optimise.preconditioner import positive_inverse
 from planner_jax.optimise.problem import Round
 from planner_jax.optimise.sensitivity import (
     _with_part,
-    curvature_by_tangents,
     gradient_at,
     part_of,
 )
@@ -176,7 +175,7 @@ def test_the_kernel_gives_the_same_inverses():
         ({"of": "speed"}, "of must name a place in BowlPlan, got 'speed'"),
         ({"of": "point"}, r"of must be one number, got shape \(3,\)"),
         ({"steps": -1}, "steps must be >= 0, got -1"),
-        ({"curvature": "none"}, "curvature must be one of products, core, whole, got 'none'"),
+        ({"curvature": "none"}, "curvature must be one of products, whole, got 'none'"),
     ],
 )
 def test_what_is_wrong_is_named(bowls, options, line):
@@ -232,7 +231,7 @@ CASES = {
         easy_hit_case,
         "stroke.time",
         {"racket_height": 1e-3, "drag": 1e-4},
-        {"curvature": "core"},
+        {},
     ),
     "catch": (
         ExactCatch(),
@@ -242,28 +241,6 @@ CASES = {
         {"curvature": "whole"},
     ),
 }
-
-
-@pytest.mark.parametrize(
-    "options",
-    [{"margin": 0.4}, pytest.param({"drag_after_impact": True}, marks=pytest.mark.slow)],
-)
-def test_curvature_of_the_core_in_closed_form_is_that_of_tangents(options, float64):
-    planner, case = ExactHit(proportions=PIECES, **options), first(easy_hit_case())
-
-    @jax.jit
-    def both(case):
-        context = planner.prepare(case)
-        point = planner.guesses(context, 1)[0]
-        point = point + 0.3 * jnp.cos(jnp.arange(point.size))
-        core = lambda x: planner.core(x, context)  # noqa: E731
-        blocks = planner.core_blocks(point.size)
-        return planner.core_curvature(point, context), curvature_by_tangents(core, blocks, point)
-
-    (block, factors), (expected, others) = both(case)
-    np.testing.assert_allclose(block, expected, rtol=1e-8, atol=1e-8 * np.abs(expected).max())
-    num = planner.num_offsets
-    np.testing.assert_allclose(factors[:num], others[:num], rtol=1e-10)
 
 
 @pytest.mark.slow

@@ -5,17 +5,15 @@ For a number q(u, theta) of a plan, where u minimises cost(u, theta),
     dq/dtheta = q_theta - lambda^T cost_utheta,   cost_uu lambda = q_u,
 
 the adjoint form of the implicit function theorem. lambda comes from a few steps of conjugate
-gradients (Hestenes and Stiefel 1952). The derivative of all slopes of the cost along a direction
-p of the point holds both p^T cost_uu and p^T cost_utheta, so that either the gradient is summed up
-along with lambda, or, where the planner has quicker products with the Hessian (`Problem.curved`),
-it takes one such derivative along lambda in the end. A planner whose cost has a cheap part
-(`Planner.core`, see `CorePlanner`) can be preconditioned with that part's curvature instead.
+gradients (Hestenes and Stiefel 1952) with the planner's own products with the Hessian
+(`Problem.curved`), or with the whole Hessian. The derivative of all slopes of the cost along lambda
+then holds lambda^T cost_utheta.
 """
 
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -27,38 +25,16 @@ from planner_jax.core.checks import numeric, require_size, told
 from planner_jax.core.protocol import Plan
 from planner_jax.optimise.newton import Curvature
 from planner_jax.optimise.planner import OptimisedPlanner, pending
-from planner_jax.optimise.preconditioner import block_preconditioner, positive_inverse
+from planner_jax.optimise.preconditioner import positive_inverse
 from planner_jax.optimise.problem import Problem, Round, Settings
 
 Quantity = str | Callable[[Any], Array]
-_CURVATURES = ("products", "core", "whole")
+Product = Callable[[Array], Array]  # of a vector (n,), a vector (n,)
+_CURVATURES = ("products", "whole")
 # Of the conjugate gradients by default: unknowns are some 40, and scaled.
-_STEPS = {"products": 40, "core": 1, "whole": 1}
+_STEPS = {"products": 40, "whole": 1}
 _DAMPING = 1e-9  # of the preconditioner for products: about none
 _SMALL = 1e-11  # square of the residual that is none, beside that of the right side
-
-
-@runtime_checkable
-class CorePlanner(Protocol):
-    """A planner that knows the second derivatives of a part of its cost, the core, in closed form.
-
-    They make a cheap preconditioner of the whole Hessian.
-    """
-
-    def core_blocks(self, size: int) -> np.ndarray:
-        """Places (K, k) in a point (size,) of the variables that the core couples.
-
-        In the others it is a sum of squares, with a factor each.
-        """
-        ...
-
-    def core_curvature(self, point: Array, context: Any) -> tuple[Array, Array]:
-        """The core's second derivatives: in the blocks (K, k, k), and by the others, (n,).
-
-        The core is the cost without what has to be sampled along the trajectory. What is
-        said of the others in the places of the blocks does not matter.
-        """
-        ...
 
 
 @struct.dataclass
@@ -191,9 +167,8 @@ def gradient_at(
             early where the Hessian is not positive. 0 leaves the adjoint out, which is right
             for "cost": its gradient at an optimum is that at a fixed point (envelope theorem).
             None for as many as suit the curvature.
-        curvature: "products" takes those of the planner's `curved`; of the others that of the
-            preconditioner, "core" the planner's core, "whole" the Hessian itself, which takes n
-            products more.
+        curvature: "products" takes products and preconditioner of the planner's `curved`; "whole"
+            preconditions by the Hessian itself, which takes n products more.
 
     Raises:
         ValueError: a place does not exist, or holds something else than floating numbers.
@@ -234,23 +209,18 @@ def gradient_at(
         return jax.jvp(slopes, (point,), (direction,))[1]
 
     steps = _STEPS[curvature] if steps is None else steps
-    solve = lambda rhs: rhs  # noqa: E731
-    if steps == 0 or curvature == "products":
-        pass
-    elif curvature == "whole":
-        hessian = jax.vmap(lambda unit: products(unit)[0])(
-            jnp.eye(point.shape[0], dtype=point.dtype)
-        )
-        inverse = positive_inverse(hessian)
-        solve = lambda rhs: jnp.sum(inverse * rhs, axis=1)  # noqa: E731
+    if steps == 0:
+        residual = jnp.where(jnp.any(along_point != 0.0), jnp.ones_like(value), 0.0)
     else:
-        solve = _core_inverse(planner, point, context)
-    if steps and curvature == "products":
-        adjoint, residual = _adjoint_by(planner.curved(point, context), along_point, steps)
+        if curvature == "products":
+            here = planner.curved(point, context)
+            solve = here.preconditioner(jnp.asarray(_DAMPING, point.dtype))
+            product = here.products()
+        else:
+            solve, product = _by_whole_hessian(lambda unit: products(unit)[0], point)
+        adjoint, residual = _adjoint(solve, product, along_point, steps)
         _, mixed = products(adjoint)
         by_context = [b - m for b, m in zip(by_context, mixed, strict=True)]
-    else:
-        by_context, residual = _adjoint(products, solve, along_point, by_context, steps)
     taken = iter(by_context)
     both = zip(leaves, is_smooth, strict=True)
     cotangent = [
@@ -262,12 +232,18 @@ def gradient_at(
     return Gradient(value=value, by=by_parts, residual=residual)
 
 
-def _adjoint_by(here: Curvature, rhs: Array, steps: int) -> tuple[Array, Array]:
-    """Lambda with cost_uu lambda = rhs by conjugate gradients, and the relative residual.
+def _by_whole_hessian(product: Product, point: Array) -> tuple[Product, Product]:
+    """Return the inverse of the Hessian, its pivots made positive, and the product itself."""
+    hessian = jax.vmap(product)(jnp.eye(point.shape[0], dtype=point.dtype))
+    inverse = positive_inverse(hessian)
+    return lambda right: jnp.sum(inverse * right, axis=1), product
+
+
+def _adjoint(solve: Product, product: Product, rhs: Array, steps: int) -> tuple[Array, Array]:
+    """Solve cost_uu lambda = rhs by conjugate gradients; return lambda and the relative residual.
 
     The residual is not finite where the cost does not curve upward to begin with.
     """
-    solve, product = here.preconditioner(jnp.asarray(_DAMPING, rhs.dtype)), here.products()
 
     def going(state: tuple) -> Array:
         num, _, _, _, size, curved = state
@@ -292,74 +268,6 @@ def _adjoint_by(here: Curvature, rhs: Array, steps: int) -> tuple[Array, Array]:
     defined = curved | (num > 1)
     ratio = size / jnp.where(first > 0.0, first, 1.0)
     return found, jnp.where(defined, jnp.sqrt(jnp.maximum(ratio, 0.0)), jnp.nan)
-
-
-def _adjoint(
-    products: Callable, solve: Callable, rhs: Array, total: list, steps: int
-) -> tuple[list, Array]:
-    """`total` - lambda^T cost_uc with cost_uu lambda = rhs, and the relative residual.
-
-    The residual is not finite where the cost does not curve upward to begin with.
-    """
-    left = rhs
-    corrected = solve(left)
-    size = first = jnp.sum(left * corrected)
-    direction = corrected
-    going = defined = jnp.ones((), bool)
-    for k in range(steps):
-        curved, mixed = products(direction)
-        curvature = jnp.sum(direction * curved)
-        if k == 0:
-            defined = (curvature > 0.0) | (size == 0.0)
-        going = going & (curvature > 0.0) & (size > 0.0)
-        length = jnp.where(going, size / jnp.where(going, curvature, 1.0), 0.0)
-        total = [
-            t - jnp.where(length > 0.0, length * m, 0.0) for t, m in zip(total, mixed, strict=True)
-        ]
-        left = left - length * curved
-        corrected = solve(left)
-        after = jnp.sum(left * corrected)
-        if k + 1 < steps:
-            ratio = after / jnp.where(size > 0.0, size, 1.0)
-            direction = corrected + ratio * direction
-        size = jnp.where(going, after, size)
-    ratio = size / jnp.where(first > 0.0, first, 1.0)
-    return total, jnp.where(defined, jnp.sqrt(jnp.maximum(ratio, 0.0)), jnp.nan)
-
-
-def _core_inverse(planner: Any, point: Array, context: Any) -> Callable[[Array], Array]:
-    """An approximate inverse of the Hessian, positive definite: that of the core.
-
-    Without a core it is one, because scaled variables have curvature of one size.
-    """
-    if not isinstance(planner, CorePlanner):
-        return lambda rhs: rhs
-    blocks = planner.core_blocks(point.shape[0])
-    return block_preconditioner(blocks, *planner.core_curvature(point, context))(jnp.zeros(()))
-
-
-def curvature_by_tangents(
-    core: Callable[[Array], Array], blocks: np.ndarray, point: Array
-) -> tuple[Array, Array]:
-    """`CorePlanner.core_curvature` of a core, a tangent of its slope for each coupled variable.
-
-    Args:
-        core: of a point, ().
-        blocks: (K, k), that of the planner.
-        point: (n,).
-    """
-    inside = np.zeros(point.shape[0], bool)
-    inside[blocks.ravel()] = True
-    # As constants, so that the lanes share them: unit vectors, and ones for the others.
-    units = np.concatenate([np.eye(point.shape[0])[blocks.ravel()], ~inside[None]])
-    tangent = lambda unit: jax.jvp(jax.grad(core), (point,), (unit,))[1]  # noqa: E731
-    *rows, row_of_others = jax.vmap(tangent)(jnp.asarray(units, point.dtype))
-    within = jnp.stack(rows).reshape(*blocks.shape, -1)  # (K, k, n)
-    found = [
-        jnp.stack([matrix[:, j] for j in block], axis=1)
-        for block, matrix in zip(blocks, within, strict=True)
-    ]
-    return jnp.stack(found), row_of_others
 
 
 def part_of(tree: Any, name: str) -> Any:

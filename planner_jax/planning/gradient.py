@@ -65,9 +65,8 @@ def gradient(
         steps: of the conjugate gradients for the adjoint, by default as many as suit the
             curvature; 0 is exact for "cost", by the envelope theorem.
         curvature: "products", the default, takes those of the whole Hessian, exact where limits
-            bind too; "core" is quicker, and exact after one step where none binds; "whole" is
-            preconditioned by the Hessian itself, at the cost of some n solver iterations, and the
-            default of planners that search for a way first, such as
+            bind too; "whole" is preconditioned by the Hessian itself, at the cost of some n solver
+            iterations, and the default of planners that search for a way first, such as
             `pj.intercept.planner("spacetime")`.
         solver: one search with this in the place of the planner's rounds.
         polish: whether the first round goes on to the optimum, unless there is a `solver`; plans

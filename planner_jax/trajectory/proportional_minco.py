@@ -29,7 +29,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 from jax import Array, lax
 
 from planner_jax.core.arithmetic import reciprocal
@@ -300,41 +299,6 @@ def _by_rows(maps: ProportionalMinco, rows: Array) -> Array:
     """The energy's matrix times the rows; sums, because a small product costs more to call."""
     gram = jnp.asarray(maps.boundary_energy, rows.dtype)
     return jnp.sum(gram[..., None] * rows, axis=1)
-
-
-@struct.dataclass
-class EnergyCurvature:
-    """Derivatives of `trajectory_energy` by the tail state, in seconds, and theta = log h."""
-
-    by_tail: Array  # (s, 3)
-    by_tails: Array  # (s, s), second derivative, the same on each axis
-    by_tail_and_theta: Array  # (s, 3)
-    by_thetas: Array  # (), second derivative
-    by_offsets: Array  # (), second derivative by each offset
-
-
-def energy_curvature(
-    maps: ProportionalMinco, rows: Array, offsets: Array, piece_duration: Array
-) -> EnergyCurvature:
-    """In closed form: each entry of the energy's matrix is a power of h; arguments as above."""
-    s = maps.order
-    order = np.tile(np.arange(s), 2)
-    power = order[:, None] + order - (2 * s - 1)
-    gram = [maps.boundary_energy * power**k for k in range(3)]
-    stacked = jnp.asarray(np.stack([gram[0][s:], gram[1][s:]]), rows.dtype)  # (2, s, 2s)
-    rate = reciprocal(piece_duration)
-    unit = rate ** (2 * s - 1)
-    scale = unit * jnp.stack([piece_duration**k for k in range(s)])
-    slopes = 2.0 * scale[:, None] * jnp.sum(stacked[..., None] * rows, axis=2)
-    bent = jnp.sum(rows * jnp.sum(jnp.asarray(gram[2], rows.dtype)[..., None] * rows, axis=1))
-    within = 2.0 * jnp.asarray(maps.boundary_energy[s:, s:], rows.dtype)
-    return EnergyCurvature(
-        by_tail=slopes[0],
-        by_tails=within * scale[:, None] * (scale / unit),
-        by_tail_and_theta=slopes[1],
-        by_thetas=unit * (bent + (2 * s - 1) ** 2 * maps.offset_energy * jnp.sum(offsets**2)),
-        by_offsets=2.0 * maps.offset_energy * unit,
-    )
 
 
 def proportional_trajectory(

@@ -26,7 +26,6 @@ from planner_jax.optimise.newton import Curvature
 from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.problem import Round, Stage
 from planner_jax.optimise.scaling import shipped_scale
-from planner_jax.optimise.sensitivity import curvature_by_tangents
 from planner_jax.robot.quadrotor import body_z, tangent_basis
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.chain import (
@@ -424,18 +423,6 @@ class ExactCatch(OptimisedPlanner):
         energies = jax.vmap(functools.partial(offset_energy, self.maps))(offsets, durations)
         return self.energy_weight * energies
 
-    def core(self, point: Array, context: CatchContext) -> Array:
-        """The part of the cost that needs no samples, for `optimise.sensitivity`."""
-        offsets, natural = self._split(point)
-        _, durations, core, _ = self.ends(natural, context)
-        costs = self._offset_costs(offsets, durations)
-        return core + jnp.sum(jnp.where(context.active, costs, 0.0))
-
-    def core_blocks(self, size: int) -> np.ndarray:
-        """The variables after the waypoint offsets of every segment, (N, 12)."""
-        one = np.arange(self.num_offsets, len(self.scale))
-        return np.arange(0, size, len(self.scale))[:, None] + one
-
     def curved(self, point: Array, context: CatchContext) -> Curvature:
         """Evaluation, gradient, and second derivatives; see `segments_curvature`."""
         offsets, natural = self._split(point)
@@ -450,12 +437,6 @@ class ExactCatch(OptimisedPlanner):
             (context.case.gravity, context.case.limits, context.case.extras),
             self.energy_weight,
             context.active,
-        )
-
-    def core_curvature(self, point: Array, context: CatchContext) -> tuple[Array, Array]:
-        """Hessian of the core in its blocks, (N, 12, 12), and of the offsets, (n,)."""
-        return curvature_by_tangents(
-            lambda x: self.core(x, context), self.core_blocks(point.size), point
         )
 
     def residuals(self, point: Array, context: CatchContext) -> Array:

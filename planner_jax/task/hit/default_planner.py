@@ -6,8 +6,6 @@ choice of variables, which needs none of the singular divisions of its eqs 13-14
 """
 
 import dataclasses
-import functools
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -46,7 +44,6 @@ from planner_jax.trajectory.proportional_minco import (
     ProportionalMinco,
     boundary_energy,
     boundary_rows,
-    energy_curvature,
     offset_energy,
     proportional_minco,
     proportional_trajectory,
@@ -432,67 +429,6 @@ class ExactHit(OptimisedPlanner):
     def _hinges(self, at_impact: Array) -> Array:
         hinges = smoothed_hinge(at_impact + self.margin, self.hinge_width)
         return self.impact_weight * jnp.sum(hinges)
-
-    def core(self, point: Array, context: HitContext) -> Array:
-        """The part of the cost that needs no samples, for `optimise.sensitivity`."""
-        offsets, natural = self._split(point)
-        _, duration, core, _ = self.ends(natural, context)
-        return core + self.energy_weight * offset_energy(self.maps, offsets, duration)
-
-    def core_blocks(self, size: int) -> np.ndarray:
-        """The variables after the waypoint offsets, (1, 8)."""
-        return np.arange(self.num_offsets, size)[None]
-
-    def core_curvature(self, point: Array, context: HitContext) -> tuple[Array, Array]:
-        """Hessian of the core in its block, (1, 8, 8), and what it is for the offsets, (n,).
-
-        Curvature of energy and hinges by both ends of the trajectory, pulled back, and curvature
-        of the ends: among the variables that is of the two times with all, and of the thrust.
-        """
-        offsets, rows, duration, impact = self._unpack(point, context)
-        scale = np.array(self.scale)
-        own = scale[self.num_offsets :]
-        natural = point[self.num_offsets :] * jnp.asarray(own, point.dtype)
-        num, units = own.size, np.eye(own.size)
-
-        def ends(natural: Array) -> tuple[Array, Array]:
-            found = self.impact(natural, context)
-            return found.tail_state, jnp.append(found.tail_state[1], found.apex)
-
-        def hinges(at: Array) -> Array:
-            tail_state = impact.tail_state.at[1].set(at[:3])
-            moved = dataclasses.replace(impact, tail_state=tail_state, apex=at[3])
-            return self._hinges(self._at_impact(moved, context))
-
-        def along(function: Callable, unit: Array) -> Any:
-            return jax.jvp(function, (natural,), (unit,))[1]
-
-        by_tail, by_at = jax.vmap(functools.partial(along, ends))(jnp.asarray(units, point.dtype))
-        energy = jax.tree.map(
-            lambda leaf: self.energy_weight * leaf,
-            energy_curvature(self.maps, rows, offsets, duration),
-        )
-        at = jnp.append(impact.tail_state[1], impact.apex)
-        slope, bend = jax.grad(hinges)(at), jax.hessian(hinges)(at)
-
-        def pulled(natural: Array) -> Array:
-            tail, at = ends(natural)
-            return jnp.sum(energy.by_tail * tail) + jnp.sum(slope * at)
-
-        times = jax.vmap(functools.partial(along, jax.grad(pulled)))(
-            jnp.asarray(units[:2], point.dtype)
-        )
-        # Half of the symmetric matrix that first slopes and the ends' curvature make.
-        half = jnp.pad(times * np.where(np.arange(num) < 2, 0.5, 1.0), ((0, num - 2), (0, 0)))
-        by_time = jnp.sum(energy.by_tail_and_theta * by_tail, axis=(1, 2))
-        half = half + units[0][:, None] * (by_time + 0.5 * energy.by_thetas * units[0])
-        half = half + units[2][:, None] * units[2] * 0.5 * jnp.sum(energy.by_tail * by_tail[2])
-        weighed = jnp.sum(energy.by_tails[..., None] * by_tail[:, None], axis=2)
-        block = jnp.sum(weighed * by_tail[:, None], axis=(2, 3))
-        bent = jnp.sum(bend * by_at[:, None], axis=2)
-        block = block + jnp.sum(bent * by_at[:, None], axis=2) + half + half.T
-        factors = energy.by_offsets * jnp.asarray(scale**2, point.dtype)
-        return (block * jnp.asarray(own * own[:, None], point.dtype))[None], factors
 
     def residuals(self, point: Array, context: HitContext) -> Array:
         """Squared hinges and energy as residuals, for `measure_scale`.

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, ClassVar
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 from jax import Array, lax
 
@@ -111,14 +110,6 @@ class SmoothIntercept(OptimisedPlanner):
     def polished(self, solver: NewtonConfig | None = None) -> "SmoothIntercept":
         """Return the planner: its plans are optimal already."""
         return self
-
-    def core_blocks(self, size: int) -> np.ndarray:
-        """All unknowns together; see `CorePlanner`."""
-        return np.arange(size)[None]
-
-    def core_curvature(self, point: Array, context: _Context) -> tuple[Array, Array]:
-        """The second derivatives of the sum of squares without those of the residuals: 2 J'J."""
-        return 2.0 * self.model(point, context).curvature[None], jnp.zeros_like(point)
 
 
 def begun_case(case: InterceptCase, begun: Array) -> BegunCase:
