@@ -23,7 +23,7 @@ import jax
 import numpy as np
 
 from planner_jax.runs.summary import percent, wilson_interval
-from planner_jax.sims.loop import Flown, Loop
+from planner_jax.sims.loop_state import Flown, Loop
 from planner_jax.sims.noise import NOISES
 from planner_jax.sims.tasks.catch import CATCH_WORLD, CatchFlights, fly_catches, throws
 from planner_jax.sims.tasks.hit import HIT_WORLD, HitFlights, fly_hits, volleys

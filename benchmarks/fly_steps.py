@@ -22,17 +22,13 @@ import numpy as np
 
 from planner_jax.planning.plan import plan
 from planner_jax.sims.launch import launched, ready
-from planner_jax.sims.loop import Loop, fly_leg
+from planner_jax.sims.loop import fly_leg
+from planner_jax.sims.loop_state import Loop
 from planner_jax.sims.model import World, at_rest, step
 from planner_jax.sims.noise import NOISES
-from planner_jax.sims.tasks.catch import (
-    CATCH_WORLD,
-    SEEN,
-    CatchPilot,
-    believed,
-    throws,
-    with_catch,
-)
+from planner_jax.sims.tasks.catch import CATCH_WORLD, SEEN, throws
+from planner_jax.sims.tasks.catch_ahead import believed, with_catch
+from planner_jax.sims.tasks.catch_pilot import CatchPilot
 from planner_jax.task import catch
 from planner_jax.task.catch.case import START
 

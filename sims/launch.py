@@ -16,7 +16,7 @@ from jax import Array, lax
 
 from planner_jax.ball.flight import BallState, fly
 from planner_jax.sims import sensing as sight
-from planner_jax.sims.loop import FlightState, Loop
+from planner_jax.sims.loop_state import FlightState, Loop
 from planner_jax.sims.model import at_rest, placed
 from planner_jax.sims.scoring import no_contact
 from planner_jax.sims.sensing import Estimate

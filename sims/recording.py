@@ -16,7 +16,7 @@ from planner_jax.ball.flight import BallState
 from planner_jax.runs.columns import BOOL, LIST, VECTOR, RefereedBatch, leaves_of, rows_of
 from planner_jax.runs.parquet import read_rows
 from planner_jax.runs.source import Chunk
-from planner_jax.sims.loop import Flown
+from planner_jax.sims.loop_state import Flown
 from planner_jax.sims.model import World
 from planner_jax.sims.robot import Robot
 from planner_jax.task.hit.validate import fly, landing

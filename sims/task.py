@@ -11,7 +11,7 @@ import numpy as np
 
 from planner_jax.runs.columns import LIST, Column, leaves_of
 from planner_jax.runs.table import RateTable
-from planner_jax.sims.loop import Flown, Loop
+from planner_jax.sims.loop_state import Flown, Loop
 from planner_jax.sims.model import BALL_RADIUS, World
 from planner_jax.sims.noise import NOISES
 from planner_jax.sims.recording import Launches, Recording, recorded

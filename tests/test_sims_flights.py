@@ -12,20 +12,13 @@ from flax import struct
 
 import planner_jax as pj
 from planner_jax.core.protocol import Status, is_unsolved
-from planner_jax.sims.loop import Loop
+from planner_jax.sims.loop_state import Loop
 from planner_jax.sims.noise import NOISES
 from planner_jax.sims.robots.quadrotor.robot import Quadrotor
-from planner_jax.sims.tasks import catch as flown_catches
-from planner_jax.sims.tasks.catch import (
-    _LIMITS,
-    CATCH_WORLD,
-    bounds,
-    fly_catches,
-    is_better,
-    planned_ahead,
-    throws,
-    within,
-)
+from planner_jax.sims.tasks import catch_ahead
+from planner_jax.sims.tasks.catch import CATCH_WORLD, fly_catches, throws
+from planner_jax.sims.tasks.catch_ahead import LIMITS, bounds, planned_ahead, within
+from planner_jax.sims.tasks.catch_pilot import is_better
 from planner_jax.sims.tasks.hit import HIT_WORLD, fly_hits, volleys
 from planner_jax.task import catch
 from planner_jax.task.hit.spec import REAL_SCENARIOS
@@ -131,7 +124,7 @@ def test_cases_out_of_range_are_refused(build, message):
     assert str(error.value) == message
 
 
-WIDER = [bounds(Loop(CATCH_WORLD), distance) for distance in _LIMITS]
+WIDER = [bounds(Loop(CATCH_WORLD), distance) for distance in LIMITS]
 
 
 @pytest.mark.slow
@@ -175,7 +168,7 @@ def test_the_next_ball_is_given_up_only_where_no_limits_admit_both(
         status = Status.CONVERGED if violation <= 0.0 else Status.INFEASIBLE
         return Outcome(np.array([status]), np.array([violation]))
 
-    monkeypatch.setattr(flown_catches, "plan_all", planned)
+    monkeypatch.setattr(catch_ahead, "plan_all", planned)
     both = jax.tree.map(np.asarray, catch.draw(1, "parabola2", seed=4))
     known, plans = planned_ahead(catch.planner(), within(both, WIDER[0]), 0, WIDER)
     assert (known.present.all(), known.limits.body_rate[0]) == chosen

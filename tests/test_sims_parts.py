@@ -14,7 +14,8 @@ from planner_jax.ball.flight import BallState, fly
 from planner_jax.robot.quadrotor import flat_attitude
 from planner_jax.robot.quadrotor_model import FlightLimits
 from planner_jax.sims.launch import awaited, ready, require_plan, require_world
-from planner_jax.sims.loop import Loop, expected
+from planner_jax.sims.loop import expected
+from planner_jax.sims.loop_state import Loop
 from planner_jax.sims.model import (
     BALL_MASS,
     at_rest,
@@ -38,7 +39,8 @@ from planner_jax.sims.sensing import (
     predicted,
     with_drag,
 )
-from planner_jax.sims.tasks.catch import _LIMITS, CATCH_WORLD, bounds
+from planner_jax.sims.tasks.catch import CATCH_WORLD
+from planner_jax.sims.tasks.catch_ahead import LIMITS, bounds
 from planner_jax.sims.tasks.hit import HIT_WORLD, court_parts
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
@@ -110,7 +112,7 @@ def test_at_rest_the_rotors_carry_the_robot_without_turning_it(rotors):
 
 @pytest.mark.parametrize(
     ("distance", "thrust", "rate"),
-    [(_LIMITS[0], 0.5, 3.0), (_LIMITS[1], 0.4, 4.5), (_LIMITS[2], 0.3, 5.0)],
+    [(LIMITS[0], 0.5, 3.0), (LIMITS[1], 0.4, 4.5), (LIMITS[2], 0.3, 5.0)],
 )
 def test_plans_in_flight_stay_within_the_limits_of_the_robot(distance, thrust, rate):
     found = bounds(Loop(CATCH_WORLD), distance)

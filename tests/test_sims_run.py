@@ -19,7 +19,8 @@ from planner_jax.runs.settings import SettingError
 from planner_jax.sims import loop as sims_loop
 from planner_jax.sims.film import FilmError, draw_flight, film_flights, require_film
 from planner_jax.sims.launch import flight_keys, launched, ready
-from planner_jax.sims.loop import begin_compiling, flown, fly_leg
+from planner_jax.sims.loop import begin_compiling, fly_leg
+from planner_jax.sims.loop_state import flown
 from planner_jax.sims.recording import Launches
 from planner_jax.sims.run import start_flights
 from planner_jax.sims.scoring import passage

@@ -19,7 +19,7 @@ from planner_jax.core.registry import install_line
 from planner_jax.runs.run_folder import RunFolder
 from planner_jax.runs.settings import SettingError
 from planner_jax.sims import view
-from planner_jax.sims.loop import Flown, Record
+from planner_jax.sims.loop_state import Flown, Record
 from planner_jax.sims.model import BALL_RADIUS
 from planner_jax.sims.recording import (
     FILE,

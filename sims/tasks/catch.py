@@ -7,26 +7,16 @@ leaves the least time, and is planned anew once it is seen.
 """
 
 import dataclasses
-import functools
 import time
-from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
 from planner_jax.ball.flight import BallState
-from planner_jax.ball.prediction import PathTable, predict_path
-from planner_jax.ball.target import BallPath
 from planner_jax.core.planner import Planner
-from planner_jax.core.protocol import is_solved
-from planner_jax.optimise.lbfgs import LbfgsConfig
-from planner_jax.optimise.problem import Round
 from planner_jax.planning.decided import DecidedPlanner
-from planner_jax.planning.plan import plan as plan_all
-from planner_jax.planning.replan import Replanning
 from planner_jax.planning.warmup import compile_attempts
 from planner_jax.robot.quadrotor_model import QuadrotorModel
 from planner_jax.robot.quadrotor_models import PAPER_CATCHER
@@ -39,51 +29,25 @@ from planner_jax.sims.launch import (
     require_plan,
     require_world,
 )
-from planner_jax.sims.loop import (
-    FlightState,
-    Flown,
-    Loop,
-    Outlook,
-    begin_compiling,
-    expected,
-    flown,
-    fly_leg,
-    in_parts,
-)
+from planner_jax.sims.loop import begin_compiling, fly_leg, in_parts
+from planner_jax.sims.loop_state import Flown, Loop, flown
 from planner_jax.sims.model import World
 from planner_jax.sims.recording import Launches
 from planner_jax.sims.robots.quadrotor.robot import Quadrotor
-from planner_jax.sims.scoring import passage
 from planner_jax.sims.settings import INTERVAL, CatchFly, require_interval
 from planner_jax.sims.task import BallFlightTask, FlightCases, Flights
+from planner_jax.sims.tasks.catch_ahead import LIMITS, believed, bounds, planned_ahead, with_catch
+from planner_jax.sims.tasks.catch_pilot import LIFT, CatchPilot
 from planner_jax.task.catch.api import planner as catch_planner
 from planner_jax.task.catch.case import GRAVITY, START, CatchCase
-from planner_jax.task.catch.case import case as catch_case
 from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.catch.plan import CatchPlan
-from planner_jax.task.catch.replan import ReplanCatch
-from planner_jax.task.catch.spec import DECISIONS, TRAINED
 from planner_jax.task.catch.suites import LAUNCH, draw, earliest_throw
 from planner_jax.task.hit.case import DRAG  # of the published serves; paper 000 gives none
-from planner_jax.task.named_decision import named_decision
 
 CATCH_WORLD = World(Quadrotor(PAPER_CATCHER), GRAVITY, mouth=LAUNCH)
 SEEN = 0.3  # [s], a throw's flight before it is planned for: 2 m and more (paper 000, VII-A)
-_TABLE_NODES = 36
-_AIM = 0.4  # share of the net's radius that plans are made for; the rest is left for errors
-# How far plans stay from the robot's least thrust, of the way from there to hover, and their share
-# of its body rate. A weak thrust and a fast turn leave control little; the first catch stays away
-# from them, so that the next can begin within bounds. Plans of later catches begin with the second
-# limits. Where no plan keeps them, the next ones count; the last are as wide as the robot's own.
-_LIMITS = ((2.0 / 7.0, 0.6), (1.0 / 7.0, 0.9), (0.0, 1.0))
-_BORNE = 0.1  # share of a limit by which a plan may break it and is still flown
-_KEPT = 0.01  # relative excess up to which limits count as kept by a plan of the loop
-_CHEAPER = 0.95  # share of the cost below which a plan from scratch replaces one that keeps them
-_INSTANT = 1e-3  # [s], shorter than any look
 _AFTER = 0.05  # [s] flown after the last ball has come down to where it may be caught
-
-
-_LIFT = 0.1  # of guesses in flight, at every catch: a little more thrust than the weight
 
 
 def _steadier(
@@ -91,111 +55,9 @@ def _steadier(
 ) -> Planner[CatchCase, CatchPlan]:
     """The planner with guesses for flights, where it is `exact` behind a decision."""
     if isinstance(planner, DecidedPlanner) and isinstance(planner.planner, ExactCatch):
-        own = dataclasses.replace(planner.planner, lift=_LIFT)
+        own = dataclasses.replace(planner.planner, lift=LIFT)
         return dataclasses.replace(planner, planner=own)
     return planner
-
-
-@dataclasses.dataclass(frozen=True)
-class CatchPilot:
-    """Plans catches anew from the plan that is flown, and from order and times decided anew."""
-
-    # Later than 0.2 s before a catch a new plan shakes more than the news of the ball is worth.
-    planner: ReplanCatch = ReplanCatch(ExactCatch(lift=_LIFT), shortest=0.2)
-    # By which share of a limit a new plan may break it and is still flown; one that breaks it by
-    # more is flown only if the old plan breaks its limits by as much. The first share holds for
-    # the last catch, the second while several are left: then most of the excess lies on the
-    # way to catches that will be planned from scratch later, and keeping the old plan would miss
-    # the ball that comes first.
-    excess: tuple[float, float] = (_BORNE, 1.0)
-    # The name of a decision about catches, or "policy:FILE"; "given" keeps order and times of the
-    # plan that is flown, and only its way is searched for from scratch.
-    decide: str = "greedy"
-    redecide: float = (
-        100.0  # [Hz], of deciding anew, a divisor of the rate of planning; 0 for never
-    )
-    search: Round = Round(starts=1, solver=LbfgsConfig(max_steps=25))  # of what is decided anew
-    passage = staticmethod(passage)
-
-    def times(self, plan: CatchPlan) -> Array:
-        """When each ball is to be caught (N,) [s], in the balls' order."""
-        return jnp.zeros_like(plan.times).at[plan.order].set(plan.times)
-
-    def plan_shapes(self, cases: CatchCase) -> CatchPlan:
-        """Those of the planner behind the re-planner."""
-        return self.planner.planner.plan_shapes(cases)
-
-    def asked(
-        self, case: CatchCase, plan: CatchPlan, outlook: Outlook
-    ) -> Replanning[CatchCase, CatchPlan]:
-        """What is still to be caught, while a plan is flown."""
-        made = plan.times <= outlook.elapsed
-        first = jnp.argsort(made, stable=True)  # what is still to be caught
-        order, times = plan.order[first], plan.times[first] - outlook.elapsed
-        horizon = case.horizon - outlook.time
-        left = dataclasses.replace(
-            case,
-            targets=tables(outlook.balls, outlook.drag, horizon, case.gravity),
-            present=outlook.present,
-            horizon=horizon,
-            order=order,
-            times=jnp.maximum(times, 0.01),
-            head_state=outlook.head_state,
-        )
-        return Replanning(case=left, previous=plan, elapsed=outlook.elapsed)
-
-    @property
-    def searches(self) -> tuple[Callable[[Replanning[CatchCase, CatchPlan]], CatchPlan], ...]:
-        """From the plan that is flown, and from scratch as is decided for this moment.
-
-        The first is a short round of the re-planner.
-        """
-        from_last = lambda task: self.planner.solve(task, self.planner.rounds[0])  # noqa: E731
-        return (from_last, self._decided_anew) if self.redecide > 0.0 else (from_last,)
-
-    def chosen(
-        self,
-        asked: Replanning[CatchCase, CatchPlan],
-        outlook: Outlook,
-        found: tuple[CatchPlan, ...],
-    ) -> tuple[CatchPlan, Array]:
-        """The better of the plans, and whether it is good enough.
-
-        One from scratch is taken where it breaks the limits less, or keeps them at a cost that is
-        clearly lower.
-        """
-        plan, left = found[0], asked.case
-        if self.redecide > 0.0:
-            fresh = found[1]
-            since = jnp.mod(outlook.time + _INSTANT, 1.0 / self.redecide)  # the last time was due
-            take = (since < 2.0 * _INSTANT) & (fresh.times[0] >= self.planner.shortest)
-            take &= is_better(fresh, plan)
-            plan = jax.tree.map(lambda new, old: jnp.where(take, new, old), fresh, plan)
-        good = left.present[left.order[0]] & (left.times[0] >= self.planner.shortest)
-        excess = jnp.where(jnp.sum(left.present) > 1, self.excess[1], self.excess[0])
-        return plan, good & (plan.violation <= jnp.maximum(excess, asked.previous.violation))
-
-    def _decided_anew(self, asked: Replanning[CatchCase, CatchPlan]) -> CatchPlan:
-        """A plan from scratch of what is left, with the decision's first choice."""
-        left = asked.case
-        choices = named_decision(DECISIONS, self.decide, TRAINED).propose(left)
-        choice = jax.tree.map(lambda leaf: leaf[0], choices)
-        return self.planner.planner.solve(left.decided(choice), self.search)
-
-
-def is_better(fresh: CatchPlan, warm: CatchPlan) -> Array:
-    """Whether () bool a plan from scratch is to be preferred to one from the plan that is flown."""
-    keeps = warm.violation <= _KEPT
-    cheaper = (fresh.violation <= _KEPT) & (fresh.cost < _CHEAPER * warm.cost)
-    nearer = jnp.isfinite(fresh.violation) & jnp.logical_not(warm.violation <= fresh.violation)
-    return jnp.isfinite(fresh.cost) & jnp.where(keeps, cheaper, nearer)
-
-
-def tables(balls: BallState, drag: Array, horizon: Array, gravity: Array) -> PathTable:
-    """Predicted paths with quadratic drag of balls (N, ...) up to a horizon (N,) [s]."""
-    predict = functools.partial(predict_path, num_nodes=_TABLE_NODES)
-    horizon = jnp.maximum(horizon, 0.1)
-    return jax.vmap(predict, in_axes=(0, 0, 0, None))(balls, horizon, drag, gravity)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -265,114 +127,6 @@ class CatchFlights(Flights):
         return np.all(self.caught, axis=1)
 
 
-@functools.partial(jax.jit, static_argnames="loop")
-def believed(loop: Loop, flights: FlightState, new: Array, horizon: Array) -> CatchCase:
-    """What is believed of a ball that has come into sight and of the next one, to be planned.
-
-    The plans begin where and when the last catch of a ball seen before will have been made, or
-    now where no such catch is left; times count from there.
-
-    Args:
-        loop: of the flights.
-        flights: leaves (B, ...).
-        new: (N,) bool, the balls that are to be planned.
-        horizon: (B, N) [s] from now, until when each may be caught.
-    """
-    robot = loop.world.carrier
-    # Their targets are those that are seen, filled in below.
-    zeros = jnp.zeros((*horizon.shape, 3), horizon.dtype)
-    nowhere = BallPath(BallState(zeros, zeros), drag=zeros, gravity=zeros[..., 0])
-    empty = catch_case(
-        nowhere,
-        np.zeros(horizon.shape),
-        robot=robot.model,
-        gravity=loop.world.gravity,
-        net_radius=_AIM * robot.tool.radius,
-        **bounds(loop, _LIMITS[0 if flights.plan is None else 1]),
-    )
-
-    def one(case: CatchCase, flight: FlightState, horizon: Array) -> CatchCase:
-        head, after = case.head_state, jnp.zeros_like(flight.time)
-        if flight.plan is None:
-            head = head.at[0].set(robot.state(flight.physics).pos)
-        else:
-            after = until_last_catch(flight, new)
-            head = robot.head_state(flight.plan, flight.time - flight.began + after)
-        balls = expected(loop, flight.earlier, loop.period + after)
-        horizon = horizon - after
-        return dataclasses.replace(
-            case,
-            targets=tables(balls, flight.earlier.drag, horizon, case.gravity),
-            present=new,
-            horizon=horizon,
-            head_state=head,
-        )
-
-    return jax.vmap(one)(empty, flights, horizon)
-
-
-def until_last_catch(flight: FlightState, new: Array) -> Array:
-    """Time () [s] to the last catch that is planned of balls not `new` (N,); 0 if none is left."""
-    planned = CatchPilot().times(flight.plan) - (flight.time - flight.began)
-    return jnp.maximum(jnp.max(jnp.where(flight.present & ~new, planned, 0.0)), 0.0)
-
-
-@jax.jit
-def with_catch(flights: FlightState, found: CatchPlan, new: Array) -> FlightState:
-    """Flights (B, ...) whose plans go on with new catches after those of the balls seen before.
-
-    Where a ball seen before is still to be caught, the new plan is appended to the one that is
-    flown, after its last such catch. Elsewhere the new plan is flown alone, from now on.
-
-    Args:
-        flights: the ones for which `believed` was called.
-        found: plans (B, ...) of the cases that it returned.
-        new: (B, N) bool, the balls that `found` catches.
-    """
-
-    def one(flight: FlightState, found: CatchPlan, new: Array) -> FlightState:
-        present = flight.present | new
-        alone = dataclasses.replace(flight, plan=found, began=flight.time, present=present)
-        if flight.plan is None:
-            return alone
-        old, number = flight.plan, new.size
-        each = found.trajectory.durations.size // number
-        used = jnp.sum(old.trajectory.durations.reshape(number, each), axis=1) > 0.0
-        # How many catches of the old plan are kept, those already made included. The catch that
-        # was only awaited comes last in the old plan; the found plan replaces it.
-        num_kept = jnp.sum(used & ~new[old.order])
-        place = jnp.arange(number)
-        kept = place < num_kept
-
-        def behind(old: Array, found: Array) -> Array:
-            """Rows (N, ...), one a catch: those kept of the old plan, then the found plan's."""
-            rows = jnp.where(kept, 0, place - num_kept)
-            shape = (number, *(1,) * (old.ndim - 1))
-            return jnp.where(kept.reshape(shape), old, found[rows])
-
-        split = lambda leaf: leaf.reshape(number, each, *leaf.shape[1:])  # noqa: E731
-        flat = lambda leaf: leaf.reshape(-1, *leaf.shape[2:])  # noqa: E731
-        trajectory = jax.tree.map(
-            lambda a, b: flat(behind(split(a), split(b))), old.trajectory, found.trajectory
-        )
-        end = old.times[num_kept - 1]
-        rank = jnp.zeros_like(place).at[old.order].set(jnp.where(kept, place, 2 * number))
-        behind_rank = jnp.zeros_like(place).at[found.order].set(number + place)
-        order = jnp.argsort(jnp.where(new, behind_rank, rank), stable=True)
-        joined = dataclasses.replace(
-            found,
-            trajectory=trajectory,
-            order=order.astype(old.order.dtype),
-            decided_times=behind(old.decided_times, end + found.decided_times),
-            times=behind(old.times, end + found.times),
-        )
-        joined = dataclasses.replace(flight, plan=joined, present=present)
-        busy = until_last_catch(flight, new) > 0.0  # a ball seen before is still to be caught
-        return jax.tree.map(lambda a, b: jnp.where(busy, a, b), joined, alone)
-
-    return jax.vmap(one)(flights, found, new)
-
-
 def fly_catches(
     loop: Loop,
     cases: Throws,
@@ -436,7 +190,7 @@ def fly_catches(
         else:
             known = jax.tree.map(np.asarray, known)
             began = time.perf_counter()
-            limits = [bounds(loop, each) for each in _LIMITS]
+            limits = [bounds(loop, each) for each in LIMITS]
             if ball == 0 and not last and in_parts(flight):  # some lanes will need all attempts
                 compile_attempts(planner, known)
             known, found = planned_ahead(planner, known, ball, limits)
@@ -455,81 +209,6 @@ def fly_catches(
         )
         records += looks
     return CatchFlights(first, flown(flight, records), planning)
-
-
-def planned_ahead(
-    planner: Planner[CatchCase, CatchPlan],
-    known: CatchCase,
-    ball: int,
-    limits: Sequence[dict[str, Any]],
-) -> tuple[CatchCase, CatchPlan]:
-    """Plans from scratch that catch a ball and, where that is possible too, the next one.
-
-    Where no plan of both is found within the limits, both are planned for within wider ones:
-    what catches the ball alone leaves the quadrotor where the next may be out of reach. Where that
-    breaks a limit by more than is flown in the loop, the ball is planned for alone, and if nothing
-    is solved, the plan of it that breaks its limits least is left.
-
-    Args:
-        planner: of catches, which also decides about their order.
-        known: of both balls, or of the last one, a batch with NumPy leaves.
-        ball: its place among the targets.
-        limits: ever wider ones, as `bounds` has them, of which the first are those of `known` for
-            the first ball and the second those for the others.
-
-    Returns:
-        The cases and their plans; `present` says which catches each has.
-    """
-    alone = np.arange(known.num_targets) == ball
-    both = np.ones_like(alone)
-    wider = limits[1 if ball == 0 else 2 :]
-    tries: list[tuple[np.ndarray, dict[str, Any] | None]] = [(both, each) for each in wider]
-    if ball < known.num_targets - 1:
-        tries += [(alone, each) for each in (None, *wider)]
-    cases, plans = known, plan_all(planner, known)
-    for balls, wide in tries:
-        tried = known.present & balls
-        same = (tried == cases.present).all(axis=1)
-        unsolved = ~is_solved(np.asarray(plans.status))
-        lanes = np.flatnonzero(unsolved & (same | ~(plans.violation <= _BORNE)))
-        if not lanes.size:
-            continue
-        part = dataclasses.replace(known, present=tried)
-        part = jax.tree.map(lambda leaf, lanes=lanes: np.asarray(leaf)[lanes], part)
-        part = within(part, wide)
-        found = plan_all(planner, part)
-        before = np.where(same, plans.violation, np.inf)[lanes]
-        better = is_solved(np.asarray(found.status)) | (found.violation < before)
-        to, chosen = lanes[better], np.flatnonzero(better)
-
-        def merged(old: Any, new: Any, to: np.ndarray = to, chosen: np.ndarray = chosen) -> Any:
-            old = np.array(old)
-            old[to] = np.asarray(new)[chosen]
-            return old
-
-        cases, plans = jax.tree.map(merged, (cases, plans), (part, found))
-    return cases, plans
-
-
-def within(cases: CatchCase, limits: dict[str, Any] | None) -> CatchCase:
-    """Cases with NumPy leaves with other limits, as `bounds` has them."""
-    if limits is None:
-        return cases
-    leaves = {
-        name: np.full_like(getattr(cases.limits, name), value) for name, value in limits.items()
-    }
-    return dataclasses.replace(cases, limits=dataclasses.replace(cases.limits, **leaves))
-
-
-def bounds(loop: Loop, distance: tuple[float, float]) -> dict[str, Any]:
-    """Least thrust [m/s^2] and greatest body rate [rad/s] of plans, as `_LIMITS` has them."""
-    model, gravity = loop.world.carrier.model, loop.world.gravity
-    least, _ = model.thrust_bounds
-    above, share = distance
-    return {
-        "min_thrust": least + above * (gravity - least),
-        "body_rate": share * model.limits.body_rate,
-    }
 
 
 class CatchFlight(BallFlightTask):

@@ -23,16 +23,8 @@ from planner_jax.robot.quadrotor_models import PAPER_HITTER
 from planner_jax.runs.columns import BOOL, NUMBER, VECTOR, Column
 from planner_jax.runs.summary import percent
 from planner_jax.sims.launch import flight_keys, launched, ready, require_plan, require_world
-from planner_jax.sims.loop import (
-    FlightState,
-    Flown,
-    Loop,
-    Outlook,
-    begin_compiling,
-    expected,
-    flown,
-    fly_leg,
-)
+from planner_jax.sims.loop import begin_compiling, expected, fly_leg
+from planner_jax.sims.loop_state import FlightState, Flown, Loop, Outlook, flown
 from planner_jax.sims.model import World
 from planner_jax.sims.recording import Launches
 from planner_jax.sims.robots.quadrotor.robot import Quadrotor
