@@ -30,8 +30,9 @@ import numpy as np
 import planner_jax as pj
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
 from planner_jax.plane.target import PlanePath
-from planner_jax.task.group.case import GroupPlan, InterceptGroup
+from planner_jax.task.group.case import InterceptGroup
 from planner_jax.task.group.decide import Best
+from planner_jax.task.group.plan import GroupPlan
 
 TARGETS = 3
 DECISIONS = {
@@ -45,7 +46,7 @@ STEP = 0.005  # [s], of the bound
 
 def draw(num: int, seed: int) -> InterceptGroup:
     """Groups of three, NumPy leaves."""
-    groups = jax.tree.map(np.asarray, pj.intercept.draw(num, "group", seed))
+    groups = jax.tree.map(np.asarray, pj.group.draw(num, seed=seed))
     present = np.broadcast_to(np.arange(groups.num_targets) < TARGETS, groups.present.shape)
     return dataclasses.replace(groups, present=present)
 
@@ -114,7 +115,7 @@ def _met(
 
 def timed(groups: InterceptGroup, decide: str | Best) -> tuple[GroupPlan, float, float]:
     """Plans, and the seconds of the first call and of another one."""
-    planner, seconds = pj.intercept.planner("group", decide=decide), []
+    planner, seconds = pj.group.planner(decide=decide), []
     for _ in range(2):
         began = time.perf_counter()
         plans = pj.plan(planner, groups)
@@ -128,7 +129,7 @@ def measure(bench: Bench, options: argparse.Namespace) -> None:
     least, found = bound(groups), {}
     for name, decide in DECISIONS.items():
         plans, cold, warm = timed(groups, decide)
-        success = pj.intercept.judge(groups, plans).success
+        success = pj.group.judge(groups, plans).success
         found[name] = np.asarray(plans.cost), success, max(cold - warm, 0.0), warm
     common = np.all([success for _, success, _, _ in found.values()], axis=0)
     bench.say(

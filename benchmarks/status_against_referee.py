@@ -163,7 +163,7 @@ def _others() -> dict[str, Row]:
         **{suite: Row("intercept", suite, every=10) for suite in INTERCEPTIONS},
         **{f"{suite}-quick": Row("intercept", suite, **quick) for suite in ("hard", "storm")},
         "hard-lattice": Row("intercept", "hard", options={"name": "lattice"}, every=40),
-        "group": Row("intercept", "group", options={"name": "group"}, every=40),
+        "group": Row("group", "group", every=40),
         **blocks,
         "pole-wide": Row("block", "pole", {"regime": "R1", "wide": True}, every=10),
         "pole-brisk": Row("block", "pole", {"regime": "R2"}, {"name": "brisk"}, every=10),

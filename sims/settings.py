@@ -27,7 +27,6 @@ from planner_jax.task.block.spec import TASK as BLOCK
 from planner_jax.task.catch.spec import DECISIONS, TRAINED
 from planner_jax.task.catch.spec import TASK as CATCH
 from planner_jax.task.hit.spec import TASK as HIT
-from planner_jax.task.intercept.spec import GROUPS
 from planner_jax.task.intercept.spec import TASK as INTERCEPT
 
 _REPLAN = "plans a second, 0 for the first only (default: {} with {}, 0 with other planners)"
@@ -251,12 +250,9 @@ class InterceptFly(FlySettings):
 
     def __post_init__(self) -> None:
         require_one_of(PLANE_NOISES, "noise", self.noise)
-        # The car is after one target.
-        suites = [name for name in INTERCEPT.all_suites() if name not in GROUPS]
-        require_one_of(suites, "suite", self.suite)
+        require_one_of(INTERCEPT.all_suites(), "suite", self.suite)
         require_moderate("latency", self.latency)
         require_moderate("looks", self.looks, _FASTEST)
-        require(self.planner != "group", "planner", "of single targets", self.planner)
         super().__post_init__()
 
     @property

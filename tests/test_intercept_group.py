@@ -6,6 +6,7 @@ import itertools
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 import planner_jax as pj
@@ -14,15 +15,14 @@ from planner_jax.plane.reach import Lattice
 from planner_jax.planning.decided import first_choice
 from planner_jax.robot.car import pose_at
 from planner_jax.runs.settings import SettingError
-from planner_jax.sweep.intercept.settings import InterceptSettings
+from planner_jax.sweep.intercept.settings import GroupSettings
 from planner_jax.sweep.run import start_sweep
-from planner_jax.sweep.sweep import sweep_of
 from planner_jax.task.group.case import CarState
 from planner_jax.task.group.decide import Best, Given, Greedy
+from planner_jax.task.group.spec import SUITES, TASK
 from planner_jax.task.intercept.default_planner import SpacetimeIntercept
 from planner_jax.task.intercept.rejection import SIZE
 from planner_jax.task.intercept.searches import Search
-from planner_jax.task.intercept.spec import GROUPS, TASK
 
 # One search is one program to compile.
 SEARCH = Search(12, LevenbergConfig(40), lattice=Lattice(layers=22))
@@ -30,7 +30,7 @@ LEGS = SpacetimeIntercept(meet="early", pieces=16, searches=(SEARCH,))
 
 
 def planner(decide):
-    return pj.intercept.planner("group", decide=decide, planner=LEGS, patient=LEGS)
+    return pj.group.planner(decide=decide, planner=LEGS, patient=LEGS)
 
 
 def numpy(tree):
@@ -39,7 +39,7 @@ def numpy(tree):
 
 def draw(num, seed, count):
     """Drawn groups with so many targets each."""
-    groups = numpy(pj.intercept.draw(num, "group", seed))
+    groups = numpy(pj.group.draw(num, seed=seed))
     present = np.broadcast_to(np.arange(4) < count, (num, 4))
     return dataclasses.replace(groups, present=present)
 
@@ -48,21 +48,21 @@ def line(*xs, present=True, **settings):
     """Targets that stand on a line ahead of the car."""
     places = jnp.array([[x, 4.0] for x in xs])
     path = pj.TurningPath(places, jnp.zeros_like(places), jnp.zeros(len(xs)))
-    return pj.group.group(path, present=present, **settings)
+    return pj.group.case(path, present=present, **settings)
 
 
 def test_a_group_is_the_same_in_every_batch():
-    whole, again = pj.intercept.draw(7, "group", 5), pj.intercept.draw(3, "group", 5, first=2)
+    whole, again = pj.group.draw(7, seed=5), pj.group.draw(3, seed=5, first=2)
     for a, b in zip(*map(jax.tree.leaves, (whole, again)), strict=True):
         np.testing.assert_array_equal(a[2:5], b)
         assert a.dtype in (np.float32, np.int32, bool)
     # A change here is a change of published cases.
-    place = pj.intercept.draw(1, "group", 0).shared.target.pos[0, 3]
+    place = pj.group.draw(1).shared.target.pos[0, 3]
     np.testing.assert_allclose(place, [7.109591, 4.838748], rtol=1e-5)
 
 
 def test_groups_have_two_to_four_targets_that_stay_on_the_map():
-    groups, suite = numpy(pj.intercept.draw(40, "group", 3)), GROUPS["group"]
+    groups, suite = numpy(pj.group.draw(40, seed=3)), SUITES["group"]
     assert set(groups.present.sum(axis=1)) == {2, 3, 4}
     assert not (groups.present[:, 1:] & ~groups.present[:, :-1]).any()
     np.testing.assert_array_equal(groups.shared.time, suite.time)
@@ -130,7 +130,7 @@ def planned():
 @pytest.mark.parametrize("decide", ["best", "greedy"])
 def test_what_is_solved_the_referee_confirms(planned, decide):
     groups, plans = planned[0], planned[1][decide]
-    verdict = pj.intercept.judge(groups, plans)
+    verdict = pj.group.judge(groups, plans)
     assert all(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(plans))
     np.testing.assert_array_equal(verdict.success, pj.solved(plans))
     assert verdict.success[:5].sum() >= 4 and plans.status[5] == pj.Status.NO_PATH
@@ -165,7 +165,7 @@ def test_one_group_is_planned_as_in_a_batch(planned, decide):
     one, batch = pj.plan(planner(decide), pj.lane(planned[0], k)), pj.lane(planned[1][decide], k)
     assert one.status == batch.status and one.order.tolist() == batch.order.tolist()
     np.testing.assert_allclose(one.cost, batch.cost, atol=1e-3)
-    assert pj.intercept.judge(pj.lane(planned[0], k), one).success
+    assert pj.group.judge(pj.lane(planned[0], k), one).success
 
 
 def test_legs_join(planned):
@@ -191,7 +191,7 @@ def test_one_target_is_planned_as_an_interception(planned):
     assert solved.sum() >= 4
     np.testing.assert_allclose(plans.cost[solved], alone.time[solved], rtol=1e-6)
     np.testing.assert_allclose(plans.legs.speed[solved, 0], alone.speed[solved], atol=1e-6)
-    assert pj.intercept.judge(groups, plans).success[solved].all()
+    assert pj.group.judge(groups, plans).success[solved].all()
 
 
 def cut(plans, **changes):
@@ -217,30 +217,40 @@ def test_the_referee_refuses_a_plan_with_a_wrong_leg(planned):
         "a target twice": (dataclasses.replace(plans, order=plans.order * 0), 0, {"order"}),
     }
     for name, (broken, leg, limits) in wrong.items():
-        verdict = pj.intercept.judge(groups, broken)
+        verdict = pj.group.judge(groups, broken)
         assert not verdict.success.any(), name
         assert set(verdict.failed_limit) <= limits, name
         if limits != {"order"}:
             np.testing.assert_array_equal(verdict.leg, leg)
-    one = pj.intercept.judge(*pj.lane((groups, wrong["a leg that begins aside"][0]), 0))
+    one = pj.group.judge(*pj.lane((groups, wrong["a leg that begins aside"][0]), 0))
     assert one.sentence().startswith("start: leg 1: the plan starts 0.01 off")
 
 
-def test_groups_and_single_targets_are_told_apart(tmp_path):
+def test_groups_and_single_targets_are_told_apart():
     with pytest.raises(ValueError, match="decide must be one of best, greedy, given, got 'worst'"):
-        pj.intercept.planner("group", decide="worst")
+        pj.group.planner(decide="worst")
     with pytest.raises(TypeError, match="decide"):
         pj.intercept.planner("spacetime", decide="best")
     with pytest.raises(TypeError, match="class InterceptCase, got InterceptGroup"):
         pj.plan(pj.intercept.planner(), draw(1, 0, 2))
-    for planner in ("spacetime", "group"):
-        settings = InterceptSettings(planner=planner, suite="group", num=1)
-        with pytest.raises(SettingError, match="suite must be of single targets"):
-            start_sweep(TASK, settings, tmp_path / "run")
-    settings = InterceptSettings(planner="group", suite="easy", num=1)
-    with pytest.raises(SettingError, match="planner must be one that takes the cases of suite"):
-        start_sweep(TASK, settings, tmp_path / "run")
-    assert not (tmp_path / "run").exists()
-    # Neither is compared with the other either.
-    others = sweep_of(TASK).other_planners(InterceptSettings(planner="lattice", suite="easy"))
-    assert set(others) == {"spacetime"}
+    with pytest.raises(TypeError, match="cases must be a InterceptCase, got a InterceptGroup"):
+        pj.intercept.judge(draw(1, 0, 2), None)
+    for name in ("group", "spacetime"):
+        with pytest.raises(ValueError, match="suite must be one of easy, medium"):
+            pj.intercept.draw(1, name)
+    with pytest.raises(ValueError, match="planner must be one of spacetime, quick"):
+        pj.intercept.planner("group")
+
+
+def test_a_sweep_of_groups_has_a_row_for_every_group(monkeypatch, tmp_path):
+    small = {"decide": "greedy", "planner": LEGS, "patient": LEGS}
+    monkeypatch.setattr(GroupSettings, "planner_options", lambda self: small)
+    settings = GroupSettings(num=2, seed=4, batch=2, decide="greedy")
+    start_sweep(TASK, settings, tmp_path / "run", progress=False)
+    rows = pq.read_table(tmp_path / "run" / "plans.parquet")
+    groups = pj.group.draw(2, seed=4)
+    for name, leaf in {"case.present": groups.present, "plan.order": groups.order}.items():
+        assert np.shape(rows[name].to_pylist()) == leaf.shape
+    assert rows["case.present"].to_pylist() == groups.present.tolist()
+    with pytest.raises(SettingError, match="^decide must be one of best, greedy, given"):
+        GroupSettings(decide="worst")

@@ -4,16 +4,24 @@ import math
 from dataclasses import fields
 from types import SimpleNamespace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import struct
 from scipy.integrate import solve_ivp
 
 from planner_jax.plane.obstacles import Obstacles
-from planner_jax.plane.target import PolynomialPath, TurningPath
+from planner_jax.plane.target import LaterPath, PointState, PolynomialPath, TurningPath
 from planner_jax.referee.clearance import clearances
-from planner_jax.referee.intercept import LIMITS, InterceptVerdict, referee_intercepts
+from planner_jax.referee.intercept import (
+    LIMITS,
+    InterceptVerdict,
+    referee_intercepts,
+    target_positions_of,
+)
 from planner_jax.robot.car import CarBody, CarLimits
+from planner_jax.task.intercept.api import by_own_class
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.plan import InterceptPlan
 
@@ -522,3 +530,36 @@ def test_every_limit_has_its_sentence():
     verdict = InterceptVerdict(**blank | {"failed_limit": np.array(LIMITS)})
     for lane, name in enumerate(LIMITS):
         assert verdict.sentence(lane).startswith(f"{name}: ")
+
+
+def test_referee_and_planner_agree_where_a_target_is():
+    random = np.random.default_rng(3)
+    num, times = 50, random.uniform(0.0, 12.0, 50)
+
+    def draw(*shape):
+        return random.standard_normal((num, *shape))
+
+    rates = np.where(np.arange(num) < 10, 0.0, 0.1 * draw())
+    turning = TurningPath(pos=draw(2), vel=draw(2), turn_rate=rates)
+    polynomial = PolynomialPath(coeffs=0.1 * draw(4, 2), origin=draw())
+    paths = [turning, polynomial]
+    paths += [LaterPath(path=path, begin=random.uniform(0.0, 5.0, num)) for path in paths]
+    for path in paths:
+        assert by_own_class(path) == {}
+        with jax.enable_x64(True):
+            theirs = jax.vmap(lambda path, time: path.at(time).pos)(path, times)
+        # The planner's series of sin(x) / x for small angles is right to 1e-10.
+        np.testing.assert_allclose(target_positions_of(path, times), theirs, rtol=0, atol=1e-9)
+
+
+def test_a_target_of_an_own_class_is_where_its_method_says():
+    @struct.dataclass
+    class Standing:
+        pos: object
+
+        def at(self, time):
+            return PointState(pos=self.pos + 0.0 * time, vel=jnp.zeros_like(self.pos))
+
+    target = LaterPath(path=Standing(np.array([[1.0, 2.0]])), begin=np.array([0.5]))
+    where = by_own_class(target)["target_positions"]
+    np.testing.assert_array_equal(where(target, np.array([3.0])), [[1.0, 2.0]])

@@ -79,14 +79,14 @@ def assert_one_line(call, says, kind=UnknownName):
 
 
 def test_the_library_has_three_tasks_that_name_themselves():
-    assert list(all_tasks()) == ["hit", "catch", "intercept", "block"]
+    assert list(all_tasks()) == ["hit", "catch", "intercept", "group", "block"]
     for name, task in all_tasks().items():
         assert task_named(name) is task
         assert task.name == name
         assert task.summary[0].islower() and not task.summary.endswith(".")
 
 
-@pytest.mark.parametrize("name", ["hit", "catch", "intercept", "block"])
+@pytest.mark.parametrize("name", ["hit", "catch", "intercept", "group", "block"])
 def test_every_planner_of_a_task_can_be_made_and_the_first_is_the_default(name):
     task = task_named(name)
     for planner in task.all_planners().keys() - task.from_file.keys():
@@ -100,7 +100,7 @@ def test_every_planner_of_a_task_can_be_made_and_the_first_is_the_default(name):
 def test_unknown_names_are_told_in_one_line_which_there_are():
     assert_one_line(
         lambda: task_named("juggle"),
-        "^task must be one of hit, catch, intercept, block, got 'juggle'$",
+        "^task must be one of hit, catch, intercept, group, block, got 'juggle'$",
     )
     assert_one_line(
         lambda: pj.hit.planner("mpp"),
@@ -127,7 +127,7 @@ def test_unknown_names_are_told_in_one_line_which_there_are():
 
 def test_a_task_of_another_package_stands_behind_the_librarys_own(others):
     others(tasks={"meet": "planner_jax_others:TASK"})
-    assert list(all_tasks()) == ["hit", "catch", "intercept", "block", "meet"]
+    assert list(all_tasks()) == ["hit", "catch", "intercept", "group", "block", "meet"]
     task = pj.task_named("meet")
     assert task.summary == "two quadrotors meet"
     assert task.case.__doc__ == "A case."
@@ -146,7 +146,7 @@ def test_a_task_of_another_package_stands_behind_the_librarys_own(others):
 def test_a_task_that_does_not_work_is_warned_about_and_the_others_do(others, place, says):
     others(tasks={"broken": place, "meet": "planner_jax_others:TASK"})
     with pytest.warns(UserWarning, match=f"^task 'broken' of {place} is {says}") as told:
-        assert list(all_tasks()) == ["hit", "catch", "intercept", "block", "meet"]
+        assert list(all_tasks()) == ["hit", "catch", "intercept", "group", "block", "meet"]
     assert len(told) == 1 and "\n" not in str(told[0].message)
     assert pj.task_named("hit").draw(1).batch_shape == (1,)
 

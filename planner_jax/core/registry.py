@@ -23,7 +23,8 @@ from typing import Any
 
 _GROUP = "planner_jax"
 _OWN = {
-    name: f"planner_jax.task.{name}.spec:TASK" for name in ("hit", "catch", "intercept", "block")
+    name: f"planner_jax.task.{name}.spec:TASK"
+    for name in ("hit", "catch", "intercept", "group", "block")
 }
 
 

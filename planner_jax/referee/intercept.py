@@ -1,10 +1,10 @@
 """Float64 NumPy referee of interceptions: the kinematics alone decides whether a plan succeeds.
 
-It shares no code with the planners: the car's equations of motion (paper 003, eq. 1) are
-integrated here from the plan's start along its speed and curvature, the rectangle of its body is
-held against every obstacle at every sample by separating axes, and the target is followed along
-its path. A plan's own claims (status, cost, meeting point) are not trusted. World frame in the
-plane, SI units, headings counter-clockwise from the x axis.
+It shares no code with the planners, except for targets of a user's own class: the car's equations
+of motion (paper 003, eq. 1) are integrated here from the plan's start along its speed and
+curvature, the rectangle of its body is held against every obstacle at every sample by separating
+axes, and the target is followed along its path. A plan's own claims (status, cost, meeting point)
+are not trusted. World frame in the plane, SI units, headings counter-clockwise from the x axis.
 """
 
 import dataclasses
@@ -108,8 +108,11 @@ def referee_intercepts(
     most `step` apart. There the test of rectangle against convex polygon is exact. In between,
     nothing is looked at: at 1.5 m/s the car drives 3 cm in a step of 20 ms.
 
-    Where the target is is worked out here, in float64, for a path with the fields of
-    `TurningPath` (known by `turn_rate`) or of `PolynomialPath` (`coeffs`).
+    The position of the target is computed here, in float64, for a path with the fields of
+    `TurningPath` (known by `turn_rate`), of `PolynomialPath` (`coeffs`), or of a `LaterPath`
+    (`path` and `begin`) of either. For a target of any other class the caller passes
+    `target_positions`; `pj.intercept.judge` then calls the method `at` of that class, which the
+    planner has used too.
 
     Args:
         cases: object with the fields of `InterceptCase`, leaves with leading axis B. Polygons
@@ -197,23 +200,25 @@ def _obstacle_leaves(name: str, group, batch: int) -> dict[str, np.ndarray]:
     }
 
 
-def target_positions_of(target, times: np.ndarray) -> np.ndarray:
-    """Positions (B, 2) [m] at times (B,) of targets of the classes that are known here."""
-    batch = times.shape
+def target_positions_of(target: object, times: np.ndarray) -> np.ndarray:
+    """Return positions (B, 2) [m] at times (B,) [s] of targets of the classes known here."""
+    given, batch = getattr(target, "__dict__", {}), times.shape
 
     def leaf(name: str, *trailing: int) -> np.ndarray:
-        value = checked_leaf(f"target.{name}", getattr(target, name), batch + trailing)
+        value = checked_leaf(f"target.{name}", given[name], batch + trailing)
         return value.astype(np.float64)
 
-    if hasattr(target, "turn_rate"):
+    if given.keys() >= {"path", "begin"}:
+        return target_positions_of(given["path"], leaf("begin") + times)
+    if "turn_rate" in given:
         # The chord of an arc: shorter than it by the sinc of half the angle, and turned by that.
         half = 0.5 * leaf("turn_rate") * times
         (x, y), chord = leaf("vel", 2).T, times * np.sinc(half / np.pi)
         cos, sin = np.cos(half), np.sin(half)
         way = np.stack([cos * x - sin * y, sin * x + cos * y], axis=1)
         return leaf("pos", 2) + chord[:, None] * way
-    if hasattr(target, "coeffs"):
-        shape = np.shape(target.coeffs)
+    if "coeffs" in given:
+        shape = np.shape(given["coeffs"])
         if len(shape) != 3:
             raise ValueError(f"target.coeffs must be ({len(times)}, n + 1, 2), got {shape}")
         powers = (times - leaf("origin"))[:, None] ** np.arange(shape[1])

@@ -55,8 +55,7 @@ def referee_groups(
         cases: object with the fields of `InterceptGroup`, leaves with leading axis B.
         plans: object with the fields of `GroupPlan`, leaves with leading axis B. Of legs to
             absent targets nothing is read.
-        target_positions: for targets of classes that `referee_intercepts` does not know:
-            `(target, times (B,) [s]) -> positions (B, 2) [m]`.
+        target_positions: as for `referee_intercepts`.
         **settings: such as `tolerance`; see `referee_intercepts`.
 
     Raises:

@@ -6,7 +6,6 @@ import numpy as np
 import pyarrow as pa
 
 from planner_jax.robot.car import CarPlan
-from planner_jax.runs.settings import require
 from planner_jax.runs.summary import COUNTED, Tally
 from planner_jax.sweep.figures.motion import CAPTION as MOTION
 from planner_jax.sweep.figures.outcomes import outcomes_figure
@@ -18,7 +17,6 @@ from planner_jax.sweep.intercept.figures.station_time import station_time_figure
 from planner_jax.sweep.intercept.settings import InterceptSettings
 from planner_jax.sweep.row_plans import car_plan
 from planner_jax.sweep.sweep import RunFigure, Sweep, first_values
-from planner_jax.task.intercept.case import InterceptCase
 
 COMPARED = ("lattice", "spacetime")  # beside a run's own planner, for one case
 
@@ -78,12 +76,6 @@ class InterceptSweep(Sweep):
         """The best that splits path and speed, or the default: each takes a minute to compile."""
         others = super().other_planners(settings)
         return {name: others[name] for name in COMPARED if name in others}
-
-    def require_fit(self, settings: InterceptSettings, planner: Any, cases: Any) -> None:
-        """Raise `SettingError` unless these are cases of one target, and of the planner."""
-        rule = "of single targets (of groups: python -m planner_jax.benchmarks.intercept_group)"
-        require(isinstance(cases, InterceptCase), "suite", rule, settings.suite)
-        super().require_fit(settings, planner, cases)
 
     def setting(self, cases: Any) -> dict[str, Any]:
         """Map, body and limits that all cases have in common, for the manifest."""

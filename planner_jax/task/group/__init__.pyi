@@ -1,6 +1,10 @@
-from .case import GroupPlan as GroupPlan
+from .api import draw as draw
+from .api import judge as judge
+from .api import planner as planner
 from .case import InterceptGroup as InterceptGroup
-from .case import group as group
+from .case import case as case
 from .decide import Best as Best
 from .decide import Given as Given
 from .decide import Greedy as Greedy
+from .default_planner import GroupIntercept as GroupIntercept
+from .plan import GroupPlan as GroupPlan

@@ -13,12 +13,11 @@ from flax import struct
 from jax import Array
 
 from planner_jax.core.checks import require_path, told
-from planner_jax.core.protocol import Plan
 from planner_jax.core.rules import Table
 from planner_jax.plane.target import LaterPath, PlanePath
-from planner_jax.task.intercept.case import InterceptCase, case
-from planner_jax.task.intercept.plan import InterceptPlan
-from planner_jax.task.intercept.rules import OF_GROUP
+from planner_jax.task.group.rules import RULES
+from planner_jax.task.intercept.case import InterceptCase
+from planner_jax.task.intercept.case import case as single_case
 
 
 @struct.dataclass
@@ -45,7 +44,7 @@ class InterceptGroup:
     same tolerance and with the same heading if one is given.
     """
 
-    rules: ClassVar[Table] = OF_GROUP
+    rules: ClassVar[Table] = RULES
 
     # Car, obstacles and map. Its `target` has leaves with a leading axis N, and all are to be met
     # until its `time`.
@@ -90,26 +89,7 @@ class InterceptGroup:
         )
 
 
-@struct.dataclass
-class GroupPlan(Plan):
-    """One plan, or a batch of them with a leading axis on every leaf: a leg to each target.
-
-    Every leg begins where and when the one before ends. Legs to absent targets are the last ones
-    and take no time. Where a leg is not solved, those behind it take no time either. The cost is
-    when the last target is met [s].
-    """
-
-    order: Array  # (N,) int32, which target is met first, second, ...
-    begins: Array  # (N,) [s], when each leg begins
-    legs: InterceptPlan  # leaves with a leading axis N, in that order
-
-    @property
-    def choice(self) -> GroupChoice:
-        """What was decided."""
-        return GroupChoice(order=self.order)
-
-
-def group(
+def case(
     targets: PlanePath, time: Any = 15.0, *, present: Any = True, **settings: Any
 ) -> InterceptGroup:
     """A group, or a batch of them, by default with the car and the map of `case`.
@@ -134,7 +114,7 @@ def group(
             f"targets must be paths with {axis + 1} axes in front, got {told(targets)}"
         )
     one = jax.tree.map(lambda leaf: np.asarray(leaf).take(0, axis), targets)
-    shared = case(one, time, **settings)
+    shared = single_case(one, time, **settings)
     batch, num = shared.batch_shape, np.shape(leaves[0])[axis]
     require_path("targets", targets, (*batch, num), 2)
     there = np.asarray(present)

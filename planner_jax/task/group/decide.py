@@ -15,7 +15,8 @@ from flax import struct
 from jax import Array
 
 from planner_jax.core.protocol import require_settings
-from planner_jax.task.group.case import GroupChoice, GroupPlan, InterceptGroup
+from planner_jax.task.group.case import GroupChoice, InterceptGroup
+from planner_jax.task.group.plan import GroupPlan
 
 _GRID = 128  # times at which every target is looked at
 _PACE = 0.8  # of the greatest speed, sustained

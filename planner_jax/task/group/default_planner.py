@@ -19,7 +19,8 @@ from planner_jax.core.planner import Drive, Planner
 from planner_jax.core.protocol import Attempt, Status, is_solved, is_unsolved
 from planner_jax.planning.select import better_of, merged
 from planner_jax.robot.car import pose_at
-from planner_jax.task.group.case import CarState, GroupPlan, InterceptGroup
+from planner_jax.task.group.case import CarState, InterceptGroup
+from planner_jax.task.group.plan import GroupPlan
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.default_planner import SpacetimeIntercept
 from planner_jax.task.intercept.plan import InterceptPlan

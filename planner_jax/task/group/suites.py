@@ -16,8 +16,8 @@ import numpy as np
 from planner_jax.core.checks import floating
 from planner_jax.core.registry import require_name
 from planner_jax.task.group.case import InterceptGroup
+from planner_jax.task.group.spec import SUITES
 from planner_jax.task.intercept.rejection import CAUSES, first_cause
-from planner_jax.task.intercept.spec import GROUPS
 from planner_jax.task.intercept.suites import (
     accepted_draws,
     anywhere,
@@ -36,7 +36,7 @@ def draw_groups(
     """A batch of groups of a suite, drawn in float64 and then cast.
 
     Args:
-        suite: a key of `GROUPS`.
+        suite: a key of `SUITES`.
         num: B, how many, >= 1.
         seed: >= 0. Group k of a suite and seed is always the same one.
         first: place of the first one, >= 0.
@@ -45,8 +45,8 @@ def draw_groups(
     Raises:
         ValueError: an argument is out of its range; one line.
     """
-    require_name(GROUPS, "suite", suite)
-    own, randoms, dtype = GROUPS[suite], generators(suite, num, seed, first), floating(dtype)
+    require_name(SUITES, "suite", suite)
+    own, randoms, dtype = SUITES[suite], generators(suite, num, seed, first), floating(dtype)
     drawn, _, _ = accepted_draws(own, randoms)
     fewest, most = own.num_targets
     count = np.array([random.integers(fewest, most + 1) for random in randoms])
@@ -64,7 +64,7 @@ def _another_target(
     suite: str, randoms: list[np.random.Generator], drawn: dict[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
     """One more target for each of B draws, with which nothing is wrong either."""
-    own, pending = GROUPS[suite], np.arange(len(randoms))
+    own, pending = SUITES[suite], np.arange(len(randoms))
     turning = np.array([random.random() < 0.5 for random in randoms])
     found = {name: np.zeros_like(drawn[name]) for name in _TARGET}
     while len(pending):

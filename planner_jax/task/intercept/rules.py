@@ -1,10 +1,9 @@
-"""What the numbers of an interception must be, and those of a group."""
+"""What the numbers of an interception must be."""
 
 import numpy as np
 
 from planner_jax.core.rules import (
     NOT_NEGATIVE,
-    PERMUTATION,
     POSITIVE,
     POSITIVE_OR_NONE,
     Field,
@@ -41,9 +40,4 @@ RULES: Table = (
     Field("limits.lateral_acceleration", (), POSITIVE_OR_NONE),
     Field("limits.curvature", (), POSITIVE_OR_NONE),
     Field("limits.steering_rate", (), POSITIVE_OR_NONE),
-)
-
-OF_GROUP: Table = (
-    Field("present", ("N",), kind=np.bool_),
-    Field("order", ("N",), PERMUTATION, kind=np.integer),
 )

@@ -55,23 +55,6 @@ SUITES = {
     ),
 }
 
-# Of several targets: their cases are of a class of their own.
-GROUPS = {
-    "group": Suite(
-        "Two to four targets for one car, five to eight walls, two or three movers.",
-        (5, 8),
-        (2, 3),
-        time=15.0,
-        num_targets=(2, 4),
-    ),
-}
-
-DECISIONS = {
-    "best": "planner_jax.task.group.decide:Best",
-    "greedy": "planner_jax.task.group.decide:Greedy",
-    "given": "planner_jax.task.group.decide:Given",
-}
-
 TASK = Task(
     name="intercept",
     summary="a car meets a moving target among obstacles that stand and move",
@@ -84,9 +67,8 @@ TASK = Task(
         "paper": "planner_jax.baselines.intercept.paper:PaperIntercept",
         "em": "planner_jax.baselines.intercept.path_then_speed:em",
         "constant": "planner_jax.baselines.intercept.path_then_speed:constant",
-        "group": "planner_jax.task.group.default_planner:GroupIntercept",
     },
-    suites={name: suite.description for name, suite in {**SUITES, **GROUPS}.items()},
+    suites={name: suite.description for name, suite in SUITES.items()},
     sweep="planner_jax.sweep.intercept.settings:InterceptSettings",
     flight="planner_jax.sims.settings:InterceptFly",
     contact="time",

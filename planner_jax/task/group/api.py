@@ -1,0 +1,88 @@
+"""The functions `pj.group.draw`, `planner` and `judge`; `case` is in a module of its own."""
+
+import jax.numpy as jnp
+
+from planner_jax.core.protocol import Decision
+from planner_jax.core.registry import suite_named
+from planner_jax.planning.decided import DecidedPlanner
+from planner_jax.referee.intercept import InterceptVerdict, referee_intercepts
+from planner_jax.referee.intercept_group import referee_groups
+from planner_jax.task.group.case import InterceptGroup
+from planner_jax.task.group.plan import GroupPlan
+from planner_jax.task.group.spec import DECISIONS, SUITES, TASK
+from planner_jax.task.group.suites import draw_groups
+from planner_jax.task.intercept.api import by_own_class
+from planner_jax.task.judged import judged, require_settings
+from planner_jax.task.named_decision import named_decision
+
+
+def draw(
+    num: int,
+    suite: str | None = None,
+    seed: int = 0,
+    *,
+    first: int = 0,
+    dtype: object = jnp.float32,
+) -> InterceptGroup:
+    """Draw a batch of groups of a suite.
+
+    Args:
+        num: number of groups, >= 1.
+        suite: "group", the default, or a suite that another package offers.
+        seed: >= 0. Group k of a suite and seed is always the same group.
+        first: index of the first group, >= 0.
+        dtype: of every floating leaf.
+
+    Raises:
+        ValueError: an argument is out of its range, or there is no such suite.
+    """
+    suite = suite_named(suite, "group")
+    if suite not in SUITES:
+        return TASK.other_suite(suite)(num, seed, first)
+    return draw_groups(suite, num, seed, first, dtype=dtype)
+
+
+def planner(
+    name: str = "spacetime", *, decide: str | Decision = "best", **options: object
+) -> DecidedPlanner[InterceptGroup, GroupPlan]:
+    """Make the group planner of a name, behind a decision about the order of the targets.
+
+    * `spacetime`: one target after another by the intercept planner of that name, each as early
+      as it can be met.
+
+    Args:
+        name: `spacetime`, or a name that another package offers.
+        decide: "best" plans the most promising of all orders and keeps the earliest last meeting,
+            "greedy" meets next the target with the earliest estimated meeting, "given" takes the
+            order of the cases; or a decision with settings, such as `Best(finalists=3)`.
+        **options: fields of that planner's dataclass.
+
+    Returns:
+        A planner for `pj.plan`; its `planner` is a `GroupIntercept`.
+
+    Raises:
+        ValueError: there is no planner or decision of that name.
+        TypeError: the planner has no such field.
+    """
+    return DecidedPlanner(TASK.make_planner(name, options), named_decision(DECISIONS, decide))
+
+
+def judge(cases: InterceptGroup, plans: GroupPlan, **settings: object) -> InterceptVerdict:
+    """Judge every leg of one plan, or of a batch of plans, by the referee.
+
+    Args:
+        cases: one group, or a batch.
+        plans: of the groups.
+        **settings: such as `tolerance`; see `referee_intercepts`.
+
+    Returns:
+        A verdict with the batch shape of the groups; see `referee_groups`.
+
+    Raises:
+        TypeError: the cases or plans are no groups.
+        ValueError: shapes that do not fit, or a setting out of its range.
+    """
+    require_settings(referee_intercepts, settings)
+    if isinstance(cases, InterceptGroup):
+        settings = {**by_own_class(cases.shared.target), **settings}
+    return judged(referee_groups, cases, plans, (InterceptGroup, GroupPlan), settings)

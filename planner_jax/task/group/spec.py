@@ -1,0 +1,31 @@
+"""Specification of the task `group` for the registry; imports no JAX."""
+
+from planner_jax.core.registry import Task
+from planner_jax.task.intercept.spec import Suite
+
+SUITES = {
+    "group": Suite(
+        "Two to four targets for one car, five to eight walls, two or three movers.",
+        (5, 8),
+        (2, 3),
+        time=15.0,
+        num_targets=(2, 4),
+    ),
+}
+
+DECISIONS = {
+    "best": "planner_jax.task.group.decide:Best",
+    "greedy": "planner_jax.task.group.decide:Greedy",
+    "given": "planner_jax.task.group.decide:Given",
+}
+
+TASK = Task(
+    name="group",
+    summary="a car meets several moving targets one after another among obstacles",
+    home="planner_jax.task.group",
+    planners={"spacetime": "planner_jax.task.group.default_planner:GroupIntercept"},
+    suites={name: suite.description for name, suite in SUITES.items()},
+    sweep="planner_jax.sweep.intercept.settings:GroupSettings",
+    bench={"decide": "greedy"},
+    contact="cost",
+)
