@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from planner_jax.planning import export_cache as module
+from planner_jax.live import export_cache as module
+from planner_jax.live.export_cache import FOLDER, traced
 from planner_jax.planning import single_call as packed
-from planner_jax.planning.export_cache import FOLDER, traced
 
 SHAPE = (jax.ShapeDtypeStruct((3,), jnp.float32),)
 NUMBERS = np.arange(3, dtype=np.float32)
@@ -112,7 +112,7 @@ def test_a_packed_call_is_the_same_from_a_kept_program(folder, monkeypatch):
     found = []
     for _ in range(2):  # processes, each of which finds its programs itself
         monkeypatch.setattr(packed, "_program", functools.cache(packed._program.__wrapped__))
-        found.append(packed.call_packed(_doubled, 2.0, np.float32(3.0), case, keep=True))
+        found.append(packed.call_packed(_doubled, 2.0, np.float32(3.0), case, compiler=traced))
     for each in found:
         np.testing.assert_array_equal(each["doubled"], 6.0 * NUMBERS)
         assert each["num"] == 6 and each["num"].dtype == np.int32

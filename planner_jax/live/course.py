@@ -9,6 +9,7 @@ from flax import struct
 from jax import Array
 
 from planner_jax.core.protocol import is_solved
+from planner_jax.live.export_cache import traced
 from planner_jax.live.packets import FIELDS
 from planner_jax.optimise.problem import Round
 from planner_jax.planning.programs import solve_cases
@@ -48,7 +49,7 @@ def with_rest(path: PiecewisePolynomial, case: Any) -> tuple[Course, bool]:
     """
     state: Any = _state_at(path, np.sum(path.durations))
     ending = EndingCase(state, state[0], case.gravity, case.limits)
-    rest = call_packed(_rested, _REST.rounds[0], _REST, ending, keep=True)
+    rest = call_packed(_rested, _REST.rounds[0], _REST, ending, compiler=traced)
     return Course(_behind(path, rest.trajectory), case.gravity), bool(is_solved(int(rest.status)))
 
 

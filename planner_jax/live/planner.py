@@ -25,6 +25,7 @@ from planner_jax.live.course import (
     to_rest,
     with_rest,
 )
+from planner_jax.live.export_cache import traced
 from planner_jax.live.packets import (
     BALL,
     MOST_SETPOINTS,
@@ -342,4 +343,4 @@ class LivePlanner:
         elapsed: Any = np.float32(due - flight.began)
         period: Any = np.float32(self._period)
         due_of = Due(flight.course, elapsed, period)
-        return call_packed(setpoints, self._num, None, due_of, keep=True)
+        return call_packed(setpoints, self._num, None, due_of, compiler=traced)

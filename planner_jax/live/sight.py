@@ -16,6 +16,7 @@ from planner_jax.ball.estimation import (
     solve_definite,
 )
 from planner_jax.ball.flight import BallState
+from planner_jax.live.export_cache import traced
 from planner_jax.live.packets import Fault
 from planner_jax.planning.single_call import call_packed
 
@@ -123,7 +124,7 @@ class Sight:
         given: Any = (since, observation, max(ahead, 0.0))
         numbers: Any = [np.asarray(x, np.float32) for x in given]
         look = Look(self._belief, *numbers)
-        return call_packed(_looked, self._flight, self._model, look, keep=True)
+        return call_packed(_looked, self._flight, self._model, look, compiler=traced)
 
     def _begin(self, number: int, observation: tuple[float, ...], measured: float) -> None:
         stds = [self._noise] * 3 + [_SPREAD] * 3

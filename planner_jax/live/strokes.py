@@ -15,6 +15,7 @@ from jax import Array, lax
 from planner_jax.ball.estimation import Flight
 from planner_jax.ball.flight import BallState, linear_drag_flight, rk4_step
 from planner_jax.ball.target import BallPath
+from planner_jax.live.export_cache import traced
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
 from planner_jax.planning.programs import solve_cases
@@ -102,12 +103,12 @@ class HitStroke:
     def first(self, ball: BallState, head_state: np.ndarray) -> Any:
         """See `Stroke`."""
         case = dataclasses.replace(self._case, ball=ball, head_state=head_state)
-        return call_packed(_planned, self._planner.rounds[1], self._planner, case, keep=True)
+        return call_packed(_planned, self._planner.rounds[1], self._planner, case, compiler=traced)
 
     def again(self, plan: Any, elapsed: float, ball: BallState) -> Any:
         """See `Stroke`."""
         task = _left(dataclasses.replace(self._case, ball=ball), plan, elapsed)
-        return call_packed(_hit_again, _AGAIN, self._again, task, keep=True)
+        return call_packed(_hit_again, _AGAIN, self._again, task, compiler=traced)
 
     def contact(self, plan: Any) -> float:
         """See `Stroke`."""
@@ -136,13 +137,13 @@ class CatchStroke:
     def first(self, ball: BallState, head_state: np.ndarray) -> Any:
         """See `Stroke`."""
         case = dataclasses.replace(self._case, targets=self._path(ball), head_state=head_state)
-        return call_packed(_decided, self._planner.rounds[1], self._planner, case, keep=True)
+        return call_packed(_decided, self._planner.rounds[1], self._planner, case, compiler=traced)
 
     def again(self, plan: Any, elapsed: float, ball: BallState) -> Any:
         """See `Stroke`."""
         case = dataclasses.replace(self._case, targets=self._path(ball))
         task = _left(case, plan, elapsed)
-        return call_packed(_caught_again, _AGAIN, self._again, task, keep=True)
+        return call_packed(_caught_again, _AGAIN, self._again, task, compiler=traced)
 
     def contact(self, plan: Any) -> float:
         """See `Stroke`."""

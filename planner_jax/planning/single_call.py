@@ -14,27 +14,30 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from planner_jax.planning.export_cache import traced
-
 _Layout = tuple[tuple[tuple[int, ...], Any], ...]  # shapes and dtypes of a tree's leaves
 
 
 def call_packed(
-    function: Callable, static: Hashable, own: Any, case: Any, *, keep: bool = False
+    function: Callable,
+    static: Hashable,
+    own: Any,
+    case: Any,
+    *,
+    compiler: Callable[..., Callable] | None = None,
 ) -> Any:
-    """What `function(static, own, case)` returns, with NumPy leaves.
+    """Return `function(static, own, case)` with NumPy leaves.
 
     Args:
-        function: pure; compiled once for each of what is static and for each layout of the rest.
-        static: what shapes the program.
+        function: pure; compiled once for each static value and for each layout of the rest.
+        static: hashable, a constant of the program.
         own: a pytree that stays where it is, such as a planner.
         case: a pytree with NumPy leaves, one of them floating at least.
-        keep: the program for later processes, see `traced`; only of this library's own code.
+        compiler: compiles in the place of `jax.jit`; see `planner_jax.live.export_cache`.
     """
     leaves, tree = jax.tree.flatten(case)
     arrays = [np.asarray(leaf) for leaf in leaves]
     kept, own_tree = jax.tree.flatten(own)
-    program = _program(function, static, own_tree, _layout(kept), tree, _layout(arrays), keep)
+    program = _program(function, static, own_tree, _layout(kept), tree, _layout(arrays), compiler)
     vector = np.concatenate(
         [array.ravel() for array in arrays], dtype=program.dtype, casting="unsafe"
     )
@@ -88,7 +91,7 @@ def _program(
     own: _Layout,
     tree: Any,
     layout: _Layout,
-    keep: bool,
+    compiler: Callable[..., Callable] | None,
 ) -> _Program:
     """The program for trees of these shapes and dtypes."""
     floating = [kind for _, kind in layout if np.issubdtype(kind, np.floating)]
@@ -111,12 +114,13 @@ def _program(
         examples[:] = [jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), result)]
         return jnp.concatenate([leaf.ravel().astype(dtype) for leaf in jax.tree.leaves(result)])
 
-    run = jax.jit(packed)
-    if keep:
+    if compiler is None:
+        run = jax.jit(packed)
+    else:
         like = [jax.ShapeDtypeStruct(shape, kind) for shape, kind in own]
         vector = jax.ShapeDtypeStruct((int(ends[-1]),), dtype)
         described = f"{_named(function)} {_named(static)} {own_tree} {tree} {layout}"
-        run = traced(packed, described, (like, vector), examples)
+        run = compiler(packed, described, (like, vector), examples)
     return _Program(run, dtype, examples)
 
 
