@@ -216,8 +216,8 @@ def test_derivatives_in_lanes_are_those_without_a_kernel(monkeypatch):
 
         return counted
 
-    monkeypatch.setattr("planner_jax.cost.along.along_kernel", in_lanes)
-    monkeypatch.setattr("planner_jax.lanes.pallas.has_gpu", lambda: True)
+    monkeypatch.setattr("planner_jax.cost.along_kernel.along_kernel", in_lanes)
+    monkeypatch.setattr("planner_jax.lanes.kernels.has_gpu", lambda: True)
     monkeypatch.setattr(jax.lax, "platform_dependent", lambda *x, cuda, default: cuda(*x))
     along = dataclasses.replace(ALONG, hinge_width=0.25)  # another, to be built with these
     args = cases()
@@ -270,7 +270,7 @@ def test_a_kernel_has_the_same_name_whatever_was_compiled_before(monkeypatch):
 
     def names(alongs):
         known = {}
-        monkeypatch.setattr("planner_jax.lanes.attach._KERNELS", known)
+        monkeypatch.setattr("planner_jax.lanes.kernels._ENTRIES", known)
         for along in alongs:
             jax.make_jaxpr(_greatest.__wrapped__(along))(*lane)
         return list(known)

@@ -13,7 +13,7 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.core.protocol import is_solved
-from planner_jax.lanes import over_lanes, pallas
+from planner_jax.lanes import kernels, over_lanes
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.multistart import minimise_lanes, solve_batch
 from planner_jax.optimise.problem import Round
@@ -67,12 +67,12 @@ def test_compiled_programs_hold_their_kernels(devices, serves):
 WITHOUT_KERNELS = """
 import sys
 import jax, numpy as np
-from planner_jax.lanes import pallas
+from planner_jax.lanes import kernels
 from planner_jax.task.hit.default_planner import ExactHit
 from planner_jax.task.hit.suites import generate_serves, to_cases
 from planner_jax.planning.plan import plan
 
-assert jax.default_backend() == "gpu" and pallas.kernels() is pallas.Kernels.OFF
+assert jax.default_backend() == "gpu" and kernels.kernels() is kernels.Kernels.OFF
 cases = jax.tree.map(np.asarray, to_cases(generate_serves(int(sys.argv[1]), 0)))
 plans = plan(ExactHit(), cases, devices=jax.devices()[:1])
 np.savez(sys.argv[2], status=plans.status, time=plans.stroke.time)
@@ -81,7 +81,7 @@ np.savez(sys.argv[2], status=plans.status, time=plans.stroke.time)
 
 def test_hits_are_those_of_a_process_without_kernels(devices, serves, tmp_path):
     without = tmp_path / "plans.npz"
-    off = {pallas.SWITCH: "off", "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+    off = {kernels.SWITCH: "off", "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
     subprocess.run(
         [sys.executable, "-c", WITHOUT_KERNELS, str(LANES), str(without)],
         env={**os.environ, **off},

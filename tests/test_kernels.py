@@ -9,7 +9,7 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.cli import doctor
-from planner_jax.lanes import over_lanes, pallas
+from planner_jax.lanes import kernels, over_lanes
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.multistart import solve_batch
 from planner_jax.optimise.preconditioner import positive_inverse
@@ -37,14 +37,15 @@ GRADIENT = {"flight_table": 2, "integrate_along": 2, "positive_inverse": 1}
 @pytest.fixture
 def gpu(monkeypatch):
     """As on a machine with a GPU, for which programs are lowered, but not compiled."""
-    monkeypatch.delenv(pallas.SWITCH, raising=False)
-    monkeypatch.setattr(pallas, "has_gpu", lambda: True)
+    monkeypatch.delenv(kernels.SWITCH, raising=False)
+    monkeypatch.setattr(kernels, "has_gpu", lambda: True)
 
 
 @pytest.fixture
 def no_triton(monkeypatch):
     """A JAX without Pallas' Triton backend."""
     monkeypatch.setitem(sys.modules, "jax.experimental.pallas.triton", None)
+    monkeypatch.delitem(sys.modules, "planner_jax.lanes.pallas", raising=False)
 
 
 def kernels_in(function, *args):
@@ -103,34 +104,34 @@ def test_gradients_hold_their_kernels(gpu):
 
 
 def test_the_switch_takes_all_kernels_away(gpu, monkeypatch):
-    monkeypatch.setenv(pallas.SWITCH, "on")
+    monkeypatch.setenv(kernels.SWITCH, "on")
     assert kernels_in(small(), X) == {"positive_inverse": 1}
-    monkeypatch.setenv(pallas.SWITCH, "off")
+    monkeypatch.setenv(kernels.SWITCH, "off")
     assert kernels_in(small(), X) == {}
     assert kernels_in(round_of(ExactHit()), serves()) == {}
 
 
 def test_without_triton_programs_have_no_kernels_and_are_made_all_the_same(gpu, no_triton):
-    assert pallas.kernels() is pallas.Kernels.MISSING
+    assert kernels.kernels() is kernels.Kernels.MISSING
     assert kernels_in(small(), X) == {}
 
 
 def test_a_wrong_value_of_the_switch_is_one_line(monkeypatch):
-    monkeypatch.setenv(pallas.SWITCH, "no")
+    monkeypatch.setenv(kernels.SWITCH, "no")
     line = "^PLANNER_JAX_KERNELS must be one of on, off, got 'no'$"
     with pytest.raises(ValueError, match=line):
         small()(X)
     with pytest.raises(ValueError, match=line):
-        pallas.kernels()
+        kernels.kernels()
     with pytest.raises(SettingError, match=line):  # before a command does anything
         require_backend()
 
 
 def test_the_doctor_says_whether_there_are_kernels(gpu, monkeypatch):
     assert doctor._kernels() == doctor.Finding("kernels", "on")
-    monkeypatch.setenv(pallas.SWITCH, "off")
+    monkeypatch.setenv(kernels.SWITCH, "off")
     assert doctor._kernels() == doctor.Finding("kernels", "off, by PLANNER_JAX_KERNELS")
-    monkeypatch.setattr(pallas, "has_gpu", lambda: False)
+    monkeypatch.setattr(kernels, "has_gpu", lambda: False)
     assert "no GPU" in doctor._kernels().text
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from jax.sharding import Mesh, PartitionSpec
 
-from planner_jax.lanes import over_lanes, pallas, with_kernel
+from planner_jax.lanes import kernels, over_lanes, with_kernel
 
 MATRIX = np.random.default_rng(0).standard_normal((5, 4))
 LANES = 32  # what a kernel takes
@@ -106,9 +106,10 @@ def test_a_program_for_several_devices_calls_the_kernel_and_gives_the_results_of
         calls.append(treedef)
         return [jax.vmap(chosen, -1, -1)(*leaves)]
 
-    monkeypatch.setattr(pallas, "has_gpu", lambda: True)
+    monkeypatch.setattr(kernels, "has_gpu", lambda: True)
     monkeypatch.setattr(jax.lax, "platform_dependent", lambda *x, cuda, default: cuda(*x))
-    attached = with_kernel(chosen, kernel)
+    monkeypatch.setattr(f"{__name__}.chosen_kernel", lambda: kernel, raising=False)
+    attached = with_kernel(chosen, f"{__name__}:chosen_kernel")
     x, y = jnp.arange(3.0 * 16).reshape(3, 16), jnp.arange(16.0)
     mapped = over_lanes(lambda x, y: attached(x, jnp.where(y > 2.0, y, 0.0)))
     spec = PartitionSpec(None, "lanes"), PartitionSpec("lanes")

@@ -15,7 +15,6 @@ from jax import Array
 from jax.custom_derivatives import SymbolicZero
 
 from planner_jax.ball.flight import BallState, require_ball, rk4_step
-from planner_jax.ball.prediction_kernel import table_kernel
 from planner_jax.core.arithmetic import reciprocal
 from planner_jax.core.checks import require_kind, require_number, require_scalar, require_size
 from planner_jax.core.rules import POSITIVE, Field, Table
@@ -90,11 +89,13 @@ def _integrated(num_nodes: int) -> Callable:
         )
         return nodes.pos, nodes.vel
 
+    path = "planner_jax.ball.prediction_kernel:table_kernel"
+
     @functools.cache
     def slopes(moving: tuple[int, ...]) -> Callable:
         """Derivatives of positions, then of velocities, by some arguments."""
         derivatives = jax.jacfwd(integrated, argnums=moving)
-        return with_kernel(derivatives, table_kernel(num_nodes, moving), (num_nodes, moving))
+        return with_kernel(derivatives, path, num_nodes, moving)
 
     def moved(primals: tuple, tangents: tuple) -> tuple:
         nodes = integrated_in_lanes(*primals)
@@ -111,7 +112,7 @@ def _integrated(num_nodes: int) -> Callable:
                     found[k] = found[k] + (jnp.sum(along, axis=-1) if of_vector else along)
         return nodes, tuple(found)
 
-    integrated_in_lanes = with_kernel(integrated, table_kernel(num_nodes), num_nodes, moved)
+    integrated_in_lanes = with_kernel(integrated, path, num_nodes, jvp=moved)
     return integrated_in_lanes
 
 

@@ -8,11 +8,12 @@ derivatives are asked for, these along with it.
 import dataclasses
 import functools
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.tree_util import PyTreeDef
+from jax.typing import ArrayLike
 
 from planner_jax.ball.flight import BallState, rk4_step
 from planner_jax.lanes.pallas import block_width, kernel_by_lanes
@@ -24,7 +25,7 @@ _VEL = 1  # place of the velocity among the arguments; numbers follow it
 def table_kernel(
     num_nodes: int, moving: tuple[int, ...] = (), *, interpret: bool = False
 ) -> Callable:
-    """The kernel that `lanes.with_kernel` attaches to the states at the nodes of a `PathTable`.
+    """Make the kernel of the states at the nodes of a `PathTable`.
 
     Args:
         num_nodes: N.
@@ -34,7 +35,7 @@ def table_kernel(
         interpret: run it without a GPU, for tests.
     """
 
-    def kernel(treedef: Any, leaves: Sequence[Array]) -> list[Array] | None:
+    def kernel(treedef: PyTreeDef, leaves: Sequence[Array]) -> list[Array] | None:
         pos, _, *numbers = leaves
         if pos.ndim != 2 or pos.dtype != jnp.float32 or any(x.ndim != 1 for x in numbers):
             return None
@@ -73,7 +74,7 @@ def _directions(moving: tuple[int, ...]) -> list[_Direction]:
 def _call(
     num_nodes: int, moving: tuple[int, ...], lanes: int, threads: int, interpret: bool
 ) -> Callable:
-    """The kernel for tables of `num_nodes` on `lanes` lanes."""
+    """Make the kernel for tables of `num_nodes` on `lanes` lanes."""
     directions = _directions(moving)
     shapes = [(num_nodes, 3, 3) if place == _VEL else (num_nodes, 3) for place in moving]
     shapes = 2 * (shapes or [(num_nodes, 3)])  # of positions, of velocities
@@ -82,16 +83,18 @@ def _call(
         numbers = resolution[...], drag[...], gravity[...]
         zero = jnp.zeros_like(numbers[0])
 
-        def full(values: Iterable) -> Any:
+        def full(values: Iterable[ArrayLike]) -> tuple[Array, ...]:
             return tuple(zero + value for value in values)
 
         def flown(ball: BallState, moved: list[BallState], sign: float = 1.0) -> tuple:
-            step: Any = lambda ball, h, *others: rk4_step(ball, sign * h, *others)  # noqa: E731
+            def step(ball: BallState, h: Array, *others: Array) -> BallState:
+                return rk4_step(ball, sign * h, *others)
+
             after, push = jax.linearize(step, ball, *numbers)
             pairs = zip(moved, directions, strict=True)
             return after, [push(state, *full(way.numbers)) for state, way in pairs]
 
-        def write(node: Any, ball: BallState, moved: list[BallState]) -> None:
+        def write(node: ArrayLike, ball: BallState, moved: list[BallState]) -> None:
             ways = [(way.result, way.index) for way in directions] or [(0, ())]
             for (result, index), state in zip(ways, moved or [ball], strict=True):
                 for k in range(3):
@@ -108,5 +111,6 @@ def _call(
         write(num_nodes - 1, *jax.lax.fori_loop(1, num_nodes - 1, advance, (ball, moved)))
 
     inputs = [(3,), (3,), (), (), ()]
-    options = {"name": "flight_table", "interpret": interpret}
-    return kernel_by_lanes(body, inputs, shapes, lanes, threads, **options)
+    return kernel_by_lanes(
+        body, inputs, shapes, lanes, threads, name="flight_table", interpret=interpret
+    )

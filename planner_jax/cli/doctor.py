@@ -61,12 +61,12 @@ def _devices() -> Finding:
 
 def _kernels() -> Finding:
     """Whether kernels take the place of JAX's operations, which on a GPU makes plans quicker."""
-    from planner_jax.lanes import pallas
+    from planner_jax.lanes import kernels
 
-    state = pallas.kernels()
-    if not pallas.has_gpu():
+    state = kernels.kernels()
+    if not kernels.has_gpu():
         return Finding("kernels", f"{state.value}; JAX has no GPU to use them on")
-    return Finding("kernels", state.value, good=state is not pallas.Kernels.MISSING)
+    return Finding("kernels", state.value, good=state is not kernels.Kernels.MISSING)
 
 
 def _precision() -> Finding:

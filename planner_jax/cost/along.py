@@ -17,9 +17,7 @@ import numpy as np
 from jax import Array
 from jax.custom_derivatives import SymbolicZero
 
-from planner_jax.cost.along_kernel import along_kernel
 from planner_jax.cost.peaks import greatest_by_parabolas
-from planner_jax.cost.peaks_kernel import peaks_kernel
 from planner_jax.cost.penalty import joined_trapezoid_weights, smoothed_hinge
 from planner_jax.lanes import with_kernel
 from planner_jax.trajectory.polynomial import Motion
@@ -60,13 +58,13 @@ class Along:
             every = tuple((order, axis) for order in range(self.orders) for axis in range(3))
             object.__setattr__(self, "groups", (every,))
 
-    def key(self) -> tuple:
-        """All of it in numbers and names."""
+    def __repr__(self) -> str:
+        """Return all constants in numbers and names, the same text in every process."""
         code = self.excess.__module__, getattr(self.excess, "__qualname__", "")
         pieces = tuple(self.maps.proportions.tolist())
         shape = self.maps.order, pieces, self.maps.coefficients.shape[-1], self.nodes
         hinges = self.margins, self.hinge_width, self.hinge_weights
-        return *shape, *code, *hinges, self.rate is None, self.orders
+        return f"Along{(*shape, *code, *hinges, self.rate is None, self.orders)}"
 
     def matrices(self) -> np.ndarray:
         """Position and derivatives at the samples, in time over h, from columns: (K, orders, C)."""
@@ -98,8 +96,7 @@ def integrate_along(
         penalties: (N,).
         worst: (N,), the greatest excess at the samples; it has no derivative.
     """
-    integral: Any = _integral(along)
-    return integral(columns, piece_durations, parameters)
+    return _integral(along)(columns, piece_durations, parameters)
 
 
 def greatest_along(
@@ -115,17 +112,19 @@ def greatest_along(
     return _greatest(along)(columns, piece_durations, parameters)
 
 
-def _with_kernel(function: Callable, along: Along, mode: str, jvp: Any = None) -> Callable:
-    """A function of constants and arguments, with these constants and the kernel of a mode."""
-    kernel = along_kernel(along, mode)
-    return with_kernel(functools.partial(function, along), kernel, (mode, *along.key()), jvp)
+def _with_kernel(
+    function: Callable, along: Along, mode: str, jvp: Callable | None = None
+) -> Callable:
+    """Bind a function of constants and arguments to constants, with the kernel of a mode."""
+    path = "planner_jax.cost.along_kernel:along_kernel"
+    return with_kernel(functools.partial(function, along), path, along, mode, jvp=jvp)
 
 
 @functools.cache
 def _greatest(along: Along) -> Callable:
-    """`greatest_along`, with a kernel."""
+    """Return `greatest_along` of these constants, with a kernel."""
     greatest = functools.partial(_greatest_of_segments, along)
-    return with_kernel(greatest, peaks_kernel(along), ("greatest", *along.key()))
+    return with_kernel(greatest, "planner_jax.cost.peaks_kernel:peaks_kernel", along)
 
 
 @functools.cache

@@ -11,33 +11,139 @@ import functools
 import math
 import operator
 from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
-from jax import Array
+import numpy as np
+from jax import Array, Ref
+from jax.tree_util import PyTreeDef
+from jaxtyping import PyTree
 
 from planner_jax.core.arithmetic import reciprocal
+from planner_jax.cost.along import Along
 from planner_jax.cost.penalty import smoothed_hinge
-from planner_jax.lanes.pallas import Block, block_width, kernel_call, place_in_grid
+from planner_jax.lanes.pallas import Block, block_width, grid_index, kernel_call
 from planner_jax.trajectory.polynomial import Motion
-
-if TYPE_CHECKING:
-    from planner_jax.cost.along import Along
 
 _THREADS = 128  # lanes of a block
 _ENOUGH = 512  # blocks that keep a large GPU busy
 _AXES = ((2,), (0, 1, 2), (0, 1, 2), (0, 1, 2))  # that a motion has of position to jerk
-_WORST = 1  # place of the greatest excess among the results
+_WORST = 1  # index of the greatest excess among the results
 
 # What is made of the samples: the sum of penalties, and the greatest excess of all; also slopes by
-# columns and durations; also those by the parameters; or the derivative of all of these along a
+# columns and durations; also slopes by the parameters; or the derivative of all of these along a
 # direction.
 MODES = ("values", "slopes", "slopes by all", "curvature")
 
+Vectors = list[list[Array]]  # columns or derivatives, each of three numbers
 
-def along_kernel(along: "Along", mode: str, *, interpret: bool = False) -> Callable:
-    """The kernel that `lanes.with_kernel` attaches to one of the functions in `along`.
+
+@dataclasses.dataclass(frozen=True)
+class Grid:
+    """The blocks of a kernel for some trajectories of each lane."""
+
+    trajectories: int
+    num_columns: int  # C
+    lanes: int
+    threads: int  # of a block, each of which carries a lane
+
+    @property
+    def blocks(self) -> int:
+        """Blocks of one trajectory."""
+        return self.lanes // self.threads
+
+    @property
+    def shares(self) -> int:
+        """Threads that share the samples of one trajectory of a lane."""
+        return min(max(_ENOUGH // (self.trajectories * self.blocks), 1), 8)
+
+    def flatten(self, leaf: Array, lead: tuple[int, ...], *own: int) -> Array:
+        """Join the axes that `vmap` has put in front of an array of (*own, lanes)."""
+        return jnp.broadcast_to(leaf, (*lead, *own, self.lanes)).reshape(-1, *own, self.lanes)
+
+
+def grid_of(
+    along: Along, leaves: Sequence[Array], points: Sequence[tuple[Array, Array, PyTree]]
+) -> tuple[Grid, tuple[int, ...]] | None:
+    """Return the grid for some arguments, and the axes that `vmap` has put in front of them.
+
+    Args:
+        along: constants.
+        leaves: of all arguments.
+        points: columns, durations and parameters; of a point, or of a point and a direction.
+
+    Returns:
+        None where a kernel does not support these arguments.
+    """
+    *_, num_columns, _, lanes = points[0][0].shape
+    threads = block_width(lanes, _THREADS)
+    # Extras take vectors and the position, and rotors the snap: neither is computed here.
+    if along.rate is not None or along.orders != 4 or threads is None:
+        return None
+    if any(leaf.dtype != jnp.float32 for leaf in leaves):
+        return None
+    if any(leaf.ndim != 1 for *_, given in points for leaf in jax.tree.leaves(given)):
+        return None
+    lead = jnp.broadcast_shapes(
+        *(columns.shape[:-3] for columns, *_ in points),
+        *(durations.shape[:-1] for _, durations, _ in points),
+    )
+    return Grid(math.prod(lead), num_columns, lanes, threads), lead
+
+
+def call_on_grid(
+    body: Callable[..., None],
+    grid: Grid,
+    shapes: Sequence[tuple[int, ...]],
+    constants: Sequence[np.ndarray],
+    *,
+    name: str,
+    interpret: bool,
+) -> Callable[..., list[Array]]:
+    """Make a kernel, from the leaves of its arguments to results with shares of the samples first.
+
+    Args:
+        body: of references to the leaves, to the constants, and to the results.
+        grid: of its blocks.
+        shapes: of the results for one trajectory of one lane.
+        constants: that every block reads.
+        name: of the kernel.
+        interpret: run it without a GPU.
+    """
+
+    def whole(shape: tuple[int, ...]) -> Block:
+        return shape, lambda *_: (0,) * len(shape)
+
+    def result(shape: tuple[int, ...]) -> tuple[tuple[int, ...], type, Block]:
+        block = (None, None, *shape, grid.threads)
+        index = lambda t, i, s: (s, t, *(0 for _ in shape), i)  # noqa: E731
+        return (grid.shares, grid.trajectories, *shape, grid.lanes), jnp.float32, (block, index)
+
+    inputs: dict[int, Block] = {  # by the axes of an argument's leaf
+        1: ((grid.threads,), lambda t, i, s: (i,)),
+        2: ((None, grid.threads), lambda t, i, s: (t, i)),
+        4: ((None, grid.num_columns, 3, grid.threads), lambda t, i, s: (t, 0, 0, i)),
+    }
+
+    def call(*leaves: Array) -> list[Array]:
+        kernel = kernel_call(
+            body,
+            (grid.trajectories, grid.blocks, grid.shares),
+            [*(inputs[leaf.ndim] for leaf in leaves), *(whole(x.shape) for x in constants)],
+            [result(shape) for shape in shapes],
+            name=name,
+            threads=grid.threads,
+            interpret=interpret,
+        )
+        return kernel(*leaves, *(jnp.asarray(x, jnp.float32) for x in constants))
+
+    return call
+
+
+def along_kernel(
+    along: Along, mode: str, *, interpret: bool = False
+) -> Callable[[PyTreeDef, Sequence[Array]], list[Array] | None]:
+    """Make the kernel of one of the functions in `along`.
 
     Args:
         along: constants.
@@ -46,32 +152,18 @@ def along_kernel(along: "Along", mode: str, *, interpret: bool = False) -> Calla
         interpret: run it without a GPU, for tests.
     """
 
-    def kernel(treedef: Any, leaves: Sequence[Array]) -> list[Array] | None:
+    def kernel(treedef: PyTreeDef, leaves: Sequence[Array]) -> list[Array] | None:
         args = jax.tree.unflatten(treedef, leaves)
         points = args if mode == "curvature" else (args,)
-        parameters = jax.tree.leaves([given for *_, given in points])
-        shape: Any = leaves[0].shape
-        *_, num_columns, _, lanes = shape
-        threads = block_width(lanes, _THREADS)
-        if along.rate is not None:  # extras take vectors, and the position that is not made here
+        found = grid_of(along, leaves, points)
+        if found is None:
             return None
-        if any(leaf.dtype != jnp.float32 for leaf in leaves) or threads is None:
-            return None
-        if any(leaf.ndim != 1 for leaf in parameters):
-            return None
-        # `vmap` may have put axes in front of a point, or of a direction alone.
-        lead: Any = jnp.broadcast_shapes(
-            *(columns.shape[:-3] for columns, *_ in points),
-            *(durations.shape[:-1] for _, durations, _ in points),
+        grid, lead = found
+        flat = tuple(
+            (grid.flatten(c, lead, grid.num_columns, 3), grid.flatten(h, lead), given)
+            for c, h, given in points
         )
-
-        def flat(leaf: Array, *own: int) -> Array:
-            return jnp.broadcast_to(leaf, (*lead, *own, lanes)).reshape(-1, *own, lanes)
-
-        args = [(flat(c, num_columns, 3), flat(h), given) for c, h, given in points]
-        args = tuple(args) if mode == "curvature" else args[0]
-        sizes = _Sizes(math.prod(lead), num_columns, lanes, threads)
-        shares = _call(along, mode, interpret, treedef, sizes)(*jax.tree.leaves(args))
+        shares = _call(along, mode, interpret, treedef, grid)(*jax.tree.leaves(flat))
         results = [
             jnp.max(share, axis=0) if k == _WORST else jnp.sum(share, axis=0)
             for k, share in enumerate(shares)
@@ -81,88 +173,44 @@ def along_kernel(along: "Along", mode: str, *, interpret: bool = False) -> Calla
     return kernel
 
 
-@dataclasses.dataclass(frozen=True)
-class _Sizes:
-    """Of a kernel for some trajectories of each lane."""
-
-    trajectories: int
-    num_columns: int  # C
-    lanes: int
-    threads: int  # of a block, each of which carries a lane
-
-
 @functools.cache
 def _call(
-    along: "Along", mode: str, interpret: bool, treedef: Any, sizes: _Sizes
+    along: Along, mode: str, interpret: bool, treedef: PyTreeDef, grid: Grid
 ) -> Callable[..., list[Array]]:
-    """The kernel, of the leaves of its arguments, to results with shares of the samples first."""
+    """Make the kernel for a grid, of the leaves of its arguments."""
     matrices, weights = along.matrices(), along.weights()
-    num_samples, num_columns = len(weights), sizes.num_columns
-    blocks = sizes.lanes // sizes.threads
-    shares = min(max(_ENOUGH // (sizes.trajectories * blocks), 1), 8)
-    share = -(-num_samples // shares)
-    shapes = _result_shapes(mode, treedef, num_columns)
+    num_samples = len(weights)
+    share = -(-num_samples // grid.shares)
+    shapes = _result_shapes(mode, treedef, grid.num_columns)
     num_sums = sum(map(math.prod, shapes)) - 1  # all but the greatest excess
 
-    def body(*refs):
-        leaves = [_loaded(ref) for ref in refs[: treedef.num_leaves]]
+    def body(*refs: Ref) -> None:
+        leaves = [load_numbers(ref) for ref in refs[: treedef.num_leaves]]
         matrices_ref, weights_ref, *out = refs[treedef.num_leaves :]
         args = jax.tree.unflatten(treedef, leaves)
         duration = leaves[1]
 
-        def add_sample(k: Array, carry: tuple) -> tuple:
-            row = [
-                [matrices_ref[k, d * num_columns + c] for c in range(num_columns)] for d in range(4)
-            ]
+        def add_sample(k: Array, carry: tuple[Array, list[Array]]) -> tuple[Array, list[Array]]:
             most, sums = carry
-            worst, terms = _of_sample(along, mode, _Sample(row, weights_ref[k]), args)
+            sample = Sample(load_row(matrices_ref, k, grid.num_columns), weights_ref[k])
+            worst, terms = _of_sample(along, mode, sample, args)
             most = most if worst is None else jnp.maximum(most, worst)
             return most, list(map(jnp.add, sums, jax.tree.leaves(terms)))
 
         zero = jnp.zeros_like(duration)
         least = zero if mode == "curvature" else jnp.full_like(duration, -jnp.inf)
-        first = place_in_grid(2) * share
+        first = grid_index(2) * share
         last = jnp.minimum(first + share, num_samples)
         start = least, [zero] * num_sums
         most, sums = jax.lax.fori_loop(first, last, add_sample, start)
         _store(out, [*sums[:_WORST], most, *sums[_WORST:]])
 
-    def whole(*shape: int) -> Block:
-        return shape, lambda *_: (0,) * len(shape)
-
-    def result(*shape: int) -> tuple[tuple[int, ...], Any, Block]:
-        block = (None, None, *shape, sizes.threads)
-        place = lambda t, i, s: (s, t, *(0 for _ in shape), i)  # noqa: E731
-        return (shares, sizes.trajectories, *shape, sizes.lanes), jnp.float32, (block, place)
-
-    inputs: dict[int, Block] = {  # by the axes of an argument's leaf
-        1: ((sizes.threads,), lambda t, i, s: (i,)),
-        2: ((None, sizes.threads), lambda t, i, s: (t, i)),
-        4: ((None, num_columns, 3, sizes.threads), lambda t, i, s: (t, 0, 0, i)),
-    }
-
-    def call(*leaves: Array) -> list[Array]:
-        kernel = kernel_call(
-            body,
-            (sizes.trajectories, blocks, shares),
-            [
-                *(inputs[leaf.ndim] for leaf in leaves),
-                whole(num_samples, 4 * num_columns),
-                whole(num_samples),
-            ],
-            [result(*shape) for shape in shapes],
-            name="integrate_along",
-            threads=sizes.threads,
-            interpret=interpret,
-        )
-        rows = jnp.asarray(matrices.reshape(num_samples, -1), jnp.float32)
-        return kernel(*leaves, rows, jnp.asarray(weights, jnp.float32))
-
-    return call
+    constants = matrices.reshape(num_samples, -1), weights
+    return call_on_grid(body, grid, shapes, constants, name="integrate_along", interpret=interpret)
 
 
-def _result_shapes(mode: str, treedef: Any, num_columns: int) -> list[tuple[int, ...]]:
-    """Shapes of the results for one trajectory of one lane."""
+def _result_shapes(mode: str, treedef: PyTreeDef, num_columns: int) -> list[tuple[int, ...]]:
+    """Return the shapes of the results for one trajectory of one lane."""
     shapes: list[tuple[int, ...]] = [(), ()]
     if mode != "values":
         shapes += [(num_columns, 3), ()]
@@ -173,14 +221,19 @@ def _result_shapes(mode: str, treedef: Any, num_columns: int) -> list[tuple[int,
     return shapes
 
 
-def _loaded(ref: Any) -> Any:
-    """Number of each lane, or C columns of three numbers."""
+def load_numbers(ref: Ref) -> Array | Vectors:
+    """Load the number of each lane, or C columns of three numbers."""
     if len(ref.shape) != 3:
         return ref[...]
     return [[ref[c, axis] for axis in range(3)] for c in range(ref.shape[0])]
 
 
-def _store(refs: Sequence[Any], values: Iterable[Array]) -> None:
+def load_row(matrices: Ref, sample: Array, num_columns: int) -> Vectors:
+    """Load the row of a sample: position to jerk, each from C columns."""
+    return [[matrices[sample, d * num_columns + c] for c in range(num_columns)] for d in range(4)]
+
+
+def _store(refs: Sequence[Ref], values: Iterable[Array]) -> None:
     """Write the results, of which columns come number by number."""
     numbers = iter(values)
     for ref in refs:
@@ -193,14 +246,14 @@ def _store(refs: Sequence[Any], values: Iterable[Array]) -> None:
 
 
 @dataclasses.dataclass
-class _Sample:
+class Sample:
     """The constants of one sample."""
 
-    row: list[list[Array]]  # position to jerk, each from C columns
-    weight: Array
+    row: Vectors  # position to jerk, each from C columns
+    weight: Array | None
 
-    def unit_motion(self, columns: list[list[Array]]) -> list[list[Array]]:
-        """Position to jerk, in time over the duration; of the position the height alone."""
+    def unit_motion(self, columns: Vectors) -> Vectors:
+        """Return position to jerk, in time over the duration; of the position the height alone."""
         return [
             [
                 _total(self.row[d][c] * columns[c][axis] for c in range(len(columns)))
@@ -209,8 +262,8 @@ class _Sample:
             for d, axes in enumerate(_AXES)
         ]
 
-    def slope_by_columns(self, slope: list[list[Array]]) -> list[list[Array]]:
-        """What a slope by the unit motion is by the columns."""
+    def slope_by_columns(self, slope: Vectors) -> Vectors:
+        """Convert a slope by the unit motion to a slope by the columns."""
         return [
             [
                 _total(
@@ -224,15 +277,15 @@ class _Sample:
         ]
 
 
-def _total(terms: Iterable) -> Any:
+def _total(terms: Iterable[Array]) -> Array:
     return functools.reduce(operator.add, terms)
 
 
-def _of_sample(along: "Along", mode: str, sample: _Sample, args: Any) -> tuple[Any, tuple]:
-    """What one sample gives in a mode.
+def _of_sample(along: Along, mode: str, sample: Sample, args: PyTree) -> tuple[Array | None, tuple]:
+    """Evaluate one sample in a mode.
 
     Returns:
-        worst: excess, the greatest of which over the samples is a result; None of a curvature.
+        worst: the greatest excess of the sample; None for a curvature.
         terms: of the sums over the samples, in the order of the results.
     """
     (columns, duration, given), direction = args if mode == "curvature" else (args, ())
@@ -250,18 +303,20 @@ def _of_sample(along: "Along", mode: str, sample: _Sample, args: Any) -> tuple[A
     return worst, (value, sample.slope_by_columns(by_motion), *others)
 
 
-def _excess(along: "Along", unit: list, duration: Array, given: Any) -> tuple[Array, ...]:
-    """Excess over each limit, of a motion in time over the duration."""
+def sample_excess(along: Along, unit: Vectors, duration: Array, given: PyTree) -> tuple[Array, ...]:
+    """Return the excess over each limit, of a motion in time over the duration."""
     rate = reciprocal(duration)
-    rates = [None, rate, rate * rate, rate * rate * rate]
-    vel, acc, jerk = (tuple(value * rates[d] for value in unit[d]) for d in range(1, 4))
-    parts: Any = {"height": unit[0][0], "vel": vel, "acc": acc, "jerk": jerk}
-    return along.excess(Motion(**parts), given)
+    rates = [rate, rate * rate, rate * rate * rate]
+    vel, acc, jerk = (
+        tuple(value * power for value in vector)
+        for vector, power in zip(unit[1:], rates, strict=True)
+    )
+    return along.excess(Motion(unit[0][0], vel, acc, jerk), given)
 
 
-def _penalty(along: "Along", unit: list, duration: Array, given: Any) -> tuple[Array, Array]:
-    """Sum of hinges times the duration, and the greatest excess of all."""
-    excess = _excess(along, unit, duration, given)
+def _penalty(along: Along, unit: Vectors, duration: Array, given: PyTree) -> tuple[Array, Array]:
+    """Return the sum of hinges times the duration, and the greatest excess of all."""
+    excess = sample_excess(along, unit, duration, given)
     hinges = [
         factor * smoothed_hinge(value + margin, along.hinge_width)
         for value, margin, factor in zip(excess, along.margins, along.hinge_weights, strict=True)
@@ -269,8 +324,8 @@ def _penalty(along: "Along", unit: list, duration: Array, given: Any) -> tuple[A
     return duration * _total(hinges), functools.reduce(jnp.maximum, excess)
 
 
-def _slopes(along: "Along", weight: Array, free: tuple, fixed: tuple) -> tuple[Array, tuple]:
-    """The greatest excess; and the weighted penalty with its slopes by what is free.
+def _slopes(along: Along, weight: Array, free: tuple, fixed: tuple) -> tuple[Array, tuple]:
+    """Return the greatest excess, and the weighted penalty with its slopes by the free arguments.
 
     The arguments of `_penalty` are first the free ones, then the fixed ones.
     """
@@ -278,16 +333,14 @@ def _slopes(along: "Along", weight: Array, free: tuple, fixed: tuple) -> tuple[A
     return worst, (weight * value, *pull_back(jnp.ones_like(value) * weight))
 
 
-def _curvature(
-    along: "Along", sample: _Sample, free: tuple, given: Any, direction: tuple
-) -> tuple[Any, ...]:
-    """Derivative, along a direction, of the weighted penalty and its slopes by all arguments."""
+def _curvature(along: Along, sample: Sample, free: tuple, given: PyTree, direction: tuple) -> tuple:
+    """Return the derivative, along a direction, of the weighted penalty and all its slopes."""
     columns, duration, moved_given = direction
     moving, tangents, still = free, (sample.unit_motion(columns), duration), (given,)
     if moved_given is not None:
         moving, tangents, still = (*free, given), (*tangents, moved_given), ()
 
-    def slopes(*moving: Any) -> tuple:
+    def slopes(*moving: PyTree) -> tuple:
         return _slopes(along, sample.weight, (*moving, *still), ())[1]
 
     return jax.jvp(slopes, moving, tangents)[1]

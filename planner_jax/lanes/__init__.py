@@ -1,6 +1,6 @@
 """Functions of one case applied to a batch, with the batch axis last, and kernels for CUDA."""
 
-from planner_jax.lanes.attach import with_kernel
+from planner_jax.lanes.kernels import with_kernel
 from planner_jax.lanes.over import over_lanes
 
 __all__ = ["over_lanes", "with_kernel"]

@@ -7,18 +7,25 @@ and the product with a constant matrix is one large product. Same numbers, anoth
 """
 
 import functools
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
-from jax.extend.core import ClosedJaxpr, JaxprEqn
+from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var
+from jax.typing import ArrayLike
 
-from planner_jax.lanes import pallas
-from planner_jax.lanes.attach import CallKernel, kernel_of
-from planner_jax.lanes.walk import called, evaluate, shape_of
+from planner_jax.lanes import kernels
 
+Results = TypeVar("Results")
+
+_CALLS = frozenset(
+    "checkpoint closed_call core_call custom_jvp_call custom_vjp_call jit pjit remat2".split()
+)
+# Operations that return their operands. In a program for several devices `jnp.where` and others
+# state by `reshard` that an array is a device's own, which in one lane all are.
+_UNCHANGED = frozenset("copy copy_p reshard stop_gradient".split())
 _ELEMENTWISE = frozenset(
     "abs acos add add_any and asin atan atan2 cbrt ceil clamp convert_element_type "
     "cos cosh div eq erf exp exp2 expm1 floor ge gt integer_pow is_finite le log log1p logistic "
@@ -32,21 +39,31 @@ _BY_AXIS = frozenset(
 )
 
 
-def over_lanes(function: Callable) -> Callable:
-    """The function on many lanes at once.
+class _Lanes:
+    """An array with lanes on its last axis."""
+
+    def __init__(self, array: Array) -> None:
+        self.array = array
+
+
+_Value = _Lanes | ArrayLike  # anything but `_Lanes` is the same for all lanes
+
+
+def over_lanes(function: Callable[..., Results]) -> Callable[..., Results]:
+    """Map a function of one lane over many lanes at once.
 
     Args:
         function: of pytrees of arrays of ONE lane, to a pytree of arrays.
 
     Returns:
         A function of the same pytrees with one more, last, axis on every leaf: the lanes.
-        Its results too have the lanes last. To rounding it is `jax.vmap` with all axes -1; it
+        Its results have the lanes last, too. To rounding it is `jax.vmap` with all axes -1; it
         is meant for the inside of a compiled function, and cannot be differentiated where
-        `function` has derivatives of its own making (differentiate within `function`).
+        `function` has custom derivatives (differentiate within `function`).
     """
 
     @functools.wraps(function)
-    def mapped(*args: Any) -> Any:
+    def mapped(*args: object) -> Results:
         leaves, treedef = jax.tree.flatten(args)
         lanes = leaves[0].shape[-1]
         single = [jax.ShapeDtypeStruct(leaf.shape[:-1], leaf.dtype) for leaf in leaves]
@@ -59,68 +76,78 @@ def over_lanes(function: Callable) -> Callable:
     return mapped
 
 
-class _Lanes:
-    """An array with lanes on its last axis; anything else is the same for all lanes."""
-
-    def __init__(self, array: Array) -> None:
-        self.array = array
+def _shape(atom: Var | Literal) -> tuple[int, ...]:
+    return atom.aval.shape
 
 
-def _widened(value: Any, shape: tuple[int, ...], lanes: int) -> Array:
-    """The array of a value, of (*shape, lanes)."""
+def _widen(value: _Value, shape: tuple[int, ...], lanes: int) -> Array:
+    """Return the array of a value, of (*shape, lanes)."""
     if isinstance(value, _Lanes):
         return value.array
     return jnp.broadcast_to(jnp.asarray(value)[..., None], (*shape, lanes))
 
 
-def _evaluate(closed: ClosedJaxpr, args: list[Any], lanes: int) -> list[Any]:
-    """Values of the outputs, `_Lanes` or not, of a function of one lane."""
-    return evaluate(closed, args, functools.partial(_outputs, lanes=lanes))
-
-
-def _full_results(closed: ClosedJaxpr, leaves: Any, lanes: int) -> list[Array]:
-    """Results of a function of one lane, all with the lanes last, of arguments that are so."""
+def _full_results(closed: ClosedJaxpr, leaves: Sequence[Array], lanes: int) -> list[Array]:
+    """Evaluate a function of one lane; arguments and results have the lanes last."""
     values = _evaluate(closed, [_Lanes(leaf) for leaf in leaves], lanes)
     pairs = zip(values, closed.jaxpr.outvars, strict=True)
-    return [_widened(value, shape_of(out), lanes) for value, out in pairs]
+    return [_widen(value, _shape(out), lanes) for value, out in pairs]
 
 
-def _outputs(eqn: JaxprEqn, inputs: list[Any], lanes: int) -> list[Any]:
-    """Values of the outputs of one operation, by a kernel or a rule if there is one for it."""
-    name, closed = eqn.primitive.name, called(eqn)
-    if closed is not None:
-        kernel = kernel_of(eqn) if pallas.in_use() else None
+def _evaluate(closed: ClosedJaxpr, args: Sequence[_Value], lanes: int) -> list[_Value]:
+    """Evaluate a function of one lane operation by operation."""
+    jaxpr = closed.jaxpr
+    values: dict[Var, _Value] = dict(zip(jaxpr.constvars, closed.consts, strict=True))
+    values.update(zip(jaxpr.invars, args, strict=True))
+
+    def read(atom: Var | Literal) -> _Value:
+        return atom.val if isinstance(atom, Literal) else values[atom]
+
+    for eqn in jaxpr.eqns:
+        inputs = [read(atom) for atom in eqn.invars]
+        is_same = eqn.primitive.name in _UNCHANGED
+        outputs = inputs if is_same else _outputs(eqn, inputs, lanes)
+        values.update(zip(eqn.outvars, outputs, strict=True))
+    return [read(atom) for atom in jaxpr.outvars]
+
+
+def _outputs(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[_Value]:
+    """Evaluate one operation, by a kernel or a rule if there is one for it."""
+    name = eqn.primitive.name
+    if name in _CALLS:
+        inner = eqn.params["jaxpr"] if "jaxpr" in eqn.params else eqn.params["call_jaxpr"]
+        closed = inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
+        kernel = kernels.kernel_of(eqn) if kernels.in_use() else None
         if kernel is None:
             return _evaluate(closed, inputs, lanes)
         return _by_kernel(eqn, closed, kernel, inputs, lanes)
     if not any(isinstance(value, _Lanes) for value in inputs):
-        return _bound(eqn, inputs)
-    shapes = [shape_of(atom) for atom in eqn.invars]
+        return _bind(eqn, inputs)
     arrays = None
     if name in _ELEMENTWISE:
-        out_shape = shape_of(eqn.outvars[0])
-        arrays = _bound(eqn, [_spread(value, out_shape, lanes) for value in inputs])
+        out_shape = _shape(eqn.outvars[0])
+        arrays = _bind(eqn, [_spread(value, out_shape, lanes) for value in inputs])
     elif name in _BY_AXIS:
-        arrays = _bound(eqn, [_widened(v, s, lanes) for v, s in zip(inputs, shapes, strict=True)])
+        pairs = zip(inputs, eqn.invars, strict=True)
+        arrays = _bind(eqn, [_widen(value, _shape(atom), lanes) for value, atom in pairs])
     elif name in _RULES:
         arrays = _RULES[name](eqn, inputs, lanes)
     if arrays is None:
-        return _mapped(eqn, inputs)
+        arrays = _by_vmap(eqn, inputs)
     return [_Lanes(array) for array in arrays]
 
 
 def _by_kernel(
-    eqn: JaxprEqn, closed: ClosedJaxpr, kernel: CallKernel, inputs: list[Any], lanes: int
-) -> list[Any]:
-    """Results of a called function that has a kernel.
+    eqn: JaxprEqn, closed: ClosedJaxpr, kernel: kernels.Kernel, inputs: list[_Value], lanes: int
+) -> list[_Value]:
+    """Evaluate a call of a function that has a kernel.
 
     The program holds both: the kernel, which is compiled for CUDA, and the function's operations,
-    which are compiled for every other device, or where the kernel is not made for the shapes.
+    which are compiled for every other device, or where the kernel does not support the shapes.
     """
-    arrays = [
-        _widened(v, shape_of(atom), lanes) for v, atom in zip(inputs, eqn.invars, strict=True)
-    ]
-    shapes = [(*shape_of(atom), lanes) for atom in eqn.outvars]
+    pairs = zip(inputs, eqn.invars, strict=True)
+    arrays = [_widen(value, _shape(atom), lanes) for value, atom in pairs]
+    shapes = [(*_shape(atom), lanes) for atom in eqn.outvars]
 
     def by_operations(*leaves: Array) -> list[Array]:
         return _full_results(closed, leaves, lanes)
@@ -135,100 +162,93 @@ def _by_kernel(
         as_called = all(r.shape == shape for r, shape in zip(results, shapes, strict=True))
         return results if as_called else by_operations(*leaves)
 
-    return [
-        _Lanes(leaf)
-        for leaf in lax.platform_dependent(*arrays, cuda=in_kernel, default=by_operations)
-    ]
+    results = lax.platform_dependent(*arrays, cuda=in_kernel, default=by_operations)
+    return [_Lanes(leaf) for leaf in results]
 
 
-def _bound(eqn: JaxprEqn, inputs: list[Any], **changes: Any) -> list[Any]:
-    """Results of the operation itself, some of its parameters changed."""
+def _bind(eqn: JaxprEqn, inputs: Sequence[ArrayLike], **changes: object) -> list[Array]:
+    """Evaluate the operation itself, with some of its parameters changed."""
     results = eqn.primitive.bind(*inputs, **{**eqn.params, **changes})
     return list(results) if eqn.primitive.multiple_results else [results]
 
 
-def _spread(value: Any, shape: tuple[int, ...], lanes: int) -> Array:
-    """An operand of an elementwise operation, of (*shape, lanes)."""
+def _spread(value: _Value, shape: tuple[int, ...], lanes: int) -> Array:
+    """Return an operand of an elementwise operation, of (*shape, lanes)."""
     array = value.array if isinstance(value, _Lanes) else jnp.asarray(value)[..., None]
     if array.ndim == 1 and shape:  # one number a lane, such as the bound of a clamp
         array = array.reshape((1,) * len(shape) + array.shape)
     return jnp.broadcast_to(array, (*shape, lanes))
 
 
-def _mapped(eqn: JaxprEqn, inputs: list[Any]) -> list[Any]:
-    """Results of any operation, by way of `jax.vmap` with the lanes first."""
+def _by_vmap(eqn: JaxprEqn, inputs: list[_Value]) -> list[Array]:
+    """Evaluate any operation by `jax.vmap`, for which the lanes are moved to the front."""
     arrays = [jnp.moveaxis(v.array, -1, 0) if isinstance(v, _Lanes) else v for v in inputs]
     axes = tuple(0 if isinstance(value, _Lanes) else None for value in inputs)
-    results = jax.vmap(lambda *operands: _bound(eqn, list(operands)), in_axes=axes)(*arrays)
-    return [_Lanes(jnp.moveaxis(array, 0, -1)) for array in results]
+    results = jax.vmap(lambda *operands: _bind(eqn, operands), in_axes=axes)(*arrays)
+    return [jnp.moveaxis(array, 0, -1) for array in results]
 
 
-def _broadcast(eqn: JaxprEqn, inputs: list[Any], lanes: int) -> list[Any]:
+def _broadcast(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[Array]:
     shape, dims = eqn.params["shape"], eqn.params["broadcast_dimensions"]
     return [lax.broadcast_in_dim(inputs[0].array, (*shape, lanes), (*dims, len(shape)))]
 
 
-def _reshape(eqn: JaxprEqn, inputs: list[Any], lanes: int) -> list[Any]:
+def _reshape(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[Array]:
     return [inputs[0].array.reshape(*eqn.params["new_sizes"], lanes)]
 
 
-def _transpose(eqn: JaxprEqn, inputs: list[Any], lanes: int) -> list[Any]:
+def _transpose(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[Array]:
     order = eqn.params["permutation"]
     return [lax.transpose(inputs[0].array, (*order, len(order)))]
 
 
-def _slice(eqn: JaxprEqn, inputs: list[Any], lanes: int) -> list[Any]:
+def _slice(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[Array]:
+    starts, limits = eqn.params["start_indices"], eqn.params["limit_indices"]
     strides = eqn.params["strides"]
-    return [
-        lax.slice(
-            inputs[0].array,
-            (*eqn.params["start_indices"], 0),
-            (*eqn.params["limit_indices"], lanes),
-            None if strides is None else (*strides, 1),
-        )
-    ]
+    strides = None if strides is None else (*strides, 1)
+    return [lax.slice(inputs[0].array, (*starts, 0), (*limits, lanes), strides)]
 
 
-def _pad(eqn: JaxprEqn, inputs: list[Any], lanes: int) -> list[Any] | None:
+def _pad(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[Array] | None:
     operand, filling = inputs
     if isinstance(filling, _Lanes):
         return None
     return [lax.pad(operand.array, filling, (*eqn.params["padding_config"], (0, 0, 0)))]
 
 
-def _dot_general(eqn: JaxprEqn, inputs: list[Any], lanes: int) -> list[Any] | None:
-    """A product with a matrix that all lanes share: one product, the lanes among its columns."""
+def _dot_general(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[Array] | None:
+    """Multiply by a matrix that all lanes share: one product, the lanes among its columns."""
     (left, right), ((left_dims, right_dims), batch) = inputs, eqn.params["dimension_numbers"]
     both = isinstance(left, _Lanes) and isinstance(right, _Lanes)
     if both or batch != ((), ()):
         return None
     if isinstance(right, _Lanes):
-        return _bound(eqn, [left, right.array])
+        return _bind(eqn, [left, right.array])
     swapped = ((right_dims, left_dims), batch)
-    product = _bound(eqn, [right, left.array], dimension_numbers=swapped)[0]
+    product = _bind(eqn, [right, left.array], dimension_numbers=swapped)[0]
     ahead = right.ndim - len(right_dims)
-    places = (*range(ahead, product.ndim - 1), *range(ahead), product.ndim - 1)
-    return [lax.transpose(product, places)]
+    order = (*range(ahead, product.ndim - 1), *range(ahead), product.ndim - 1)
+    return [lax.transpose(product, order)]
 
 
-def _dynamic_slice(eqn: JaxprEqn, inputs: list[Any], lanes: int) -> list[Any] | None:
-    """A window that each lane begins elsewhere."""
+def _dynamic_slice(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[Array]:
+    """Take a window that starts at another index in each lane."""
     operand, *starts = inputs
-    shape = shape_of(eqn.invars[0])
-    window = _widened(operand, shape, lanes)
+    shape = _shape(eqn.invars[0])
+    window = _widen(operand, shape, lanes)
     for axis, (start, size) in enumerate(zip(starts, eqn.params["slice_sizes"], strict=True)):
         if not isinstance(start, _Lanes):
             window = lax.dynamic_slice_in_dim(window, start, size, axis)
             continue
         first = jnp.clip(start.array, 0, shape[axis] - size)
-        places = [1] * len(shape)
-        places[axis] = size
-        places = jnp.arange(size, dtype=first.dtype).reshape(*places, 1) + first
-        window = jnp.take_along_axis(window, places, axis)
+        sizes = [1] * len(shape)
+        sizes[axis] = size
+        indices = jnp.arange(size, dtype=first.dtype).reshape(*sizes, 1) + first
+        window = jnp.take_along_axis(window, indices, axis)
     return [window]
 
 
-_RULES: dict[str, Callable[[JaxprEqn, list[Any], int], list[Any] | None]] = {
+_RULES: dict[str, Callable[[JaxprEqn, list[_Value], int], list[Array] | None]] = {
     "broadcast_in_dim": _broadcast,
     "dot_general": _dot_general,
     "dynamic_slice": _dynamic_slice,

@@ -6,10 +6,10 @@ the pivots wait for one another, and all entries cross the memory at each.
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax.numpy as jnp
 from jax import Array
+from jax.tree_util import PyTreeDef
 
 from planner_jax.lanes.pallas import block_width, kernel_by_lanes
 
@@ -18,13 +18,13 @@ _LARGEST = 12  # rows, all of whose entries a thread can keep
 
 
 def inverse_kernel(*, interpret: bool = False) -> Callable:
-    """The kernel that `lanes.with_kernel` attaches to `preconditioner.positive_inverse`.
+    """Make the kernel of `preconditioner.positive_inverse`.
 
     Args:
         interpret: run it without a GPU, for tests.
     """
 
-    def kernel(treedef: Any, leaves: Sequence[Array]) -> list[Array] | None:
+    def kernel(treedef: PyTreeDef, leaves: Sequence[Array]) -> list[Array] | None:
         (matrix,) = leaves
         width = block_width(matrix.shape[-1], _THREADS)
         if matrix.ndim != 3 or matrix.dtype != jnp.float32 or width is None:
@@ -38,7 +38,7 @@ def inverse_kernel(*, interpret: bool = False) -> Callable:
 
 @functools.cache
 def _call(size: int, lanes: int, width: int, interpret: bool) -> Callable:
-    """The kernel for matrices of `size` rows on `lanes` lanes."""
+    """Make the kernel for matrices of `size` rows on `lanes` lanes."""
 
     def body(matrix, out):
         entries = [[matrix[i, j] for j in range(size)] for i in range(size)]
@@ -57,5 +57,6 @@ def _call(size: int, lanes: int, width: int, interpret: bool) -> Callable:
                 out[i, j] = entries[i][j]
 
     shapes = [(size, size)]
-    options = {"name": "positive_inverse", "interpret": interpret}
-    return kernel_by_lanes(body, shapes, shapes, lanes, width, **options)
+    return kernel_by_lanes(
+        body, shapes, shapes, lanes, width, name="positive_inverse", interpret=interpret
+    )

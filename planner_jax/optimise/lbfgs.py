@@ -20,7 +20,6 @@ from jax import Array
 from planner_jax.core.checks import numeric, require_number, require_size, told
 from planner_jax.lanes import with_kernel
 from planner_jax.optimise.evaluation import Evaluation, Objective, better
-from planner_jax.optimise.lbfgs_kernel import judged_pair, shortening, start_scale, turn_kernel
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,13 +96,37 @@ def init(point: Array, config: LbfgsConfig) -> LbfgsState:
     )
 
 
+def weigh_pair(curvature: Array, change: Array, step: Array) -> tuple[Array, Array, Array]:
+    """Return the weight of a new pair, given s.y, y.y and s.s.
+
+    Returns:
+        keep: whether its curvature is positive.
+        moved: whether there was a step, that is, one whose squared length is not zero.
+        inverse: 1 / s.y if it is kept, otherwise 0.
+    """
+    keep = curvature > 1e-8 * change
+    return keep, step > 0.0, jnp.where(keep, 1.0 / jnp.where(keep, curvature, 1.0), 0.0)
+
+
+def start_scale(newest: Array, change: Array, grad: Array) -> Array:
+    """Return gamma, given 1 / s.y (0 without a pair) and y.y of the newest pair, and g.g."""
+    size = change * newest
+    slope = jnp.sqrt(jnp.maximum(grad, 1e-30))
+    return jnp.where(newest > 0.0, 1.0 / jnp.where(newest > 0.0, size, 1.0), 1.0 / slope)
+
+
+def shortening(squared_length: Array, step_cap: float) -> Array:
+    """Return the factor that makes a direction no longer than the cap."""
+    return jnp.minimum(1.0, step_cap / jnp.sqrt(jnp.maximum(squared_length, 1e-30)))
+
+
 def remember(memory: Memory, step: Array, change: Array) -> Memory:
     """The memory with one pair (n,), (n,) more.
 
     A pair without positive curvature is left out. After no step, or one too short for its squared
     length to be a number above zero, the memory is emptied: the next direction is steepest descent.
     """
-    keep, moved, inverse = judged_pair(jnp.sum(step * change), jnp.sum(change**2), jnp.sum(step**2))
+    keep, moved, inverse = weigh_pair(jnp.sum(step * change), jnp.sum(change**2), jnp.sum(step**2))
 
     def push(old: Array, new: Array) -> Array:
         pushed = jnp.concatenate([old[1:], new[None]])
@@ -145,7 +168,8 @@ def _turn(num_pairs: int, step_cap: float) -> Callable:
         memory = remember(memory, step, change)
         return memory, search_direction(memory, grad, step_cap)
 
-    return with_kernel(turn, turn_kernel(num_pairs, step_cap), step_cap)
+    path = "planner_jax.optimise.lbfgs_kernel:turn_kernel"
+    return with_kernel(turn, path, num_pairs, step_cap)
 
 
 def step(objective: Objective, state: LbfgsState, config: LbfgsConfig) -> LbfgsState:

@@ -2,49 +2,25 @@
 
 As operations of their own it is a chain of some thirty sums that each wait for the last. Here a
 block of threads keeps its lanes' gradient and pairs in registers; it reads every pair once and
-writes it where the memory has been, so that nothing is copied between iterations. The formulas of
-single numbers are functions that `lbfgs` calls too.
+writes it where the memory has been, so that nothing is copied between iterations.
 """
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, Ref
+from jax.tree_util import PyTreeDef
 
-from planner_jax.lanes.pallas import block_width, kernel_by_lanes, load, store
+from planner_jax.lanes.pallas import block_width, kernel_by_lanes, load_masked, store_masked
+from planner_jax.optimise.lbfgs import shortening, start_scale, weigh_pair
 
 _LANES, _THREADS = 32, 128  # of a block
 
 
-def judged_pair(curvature: Array, change: Array, step: Array) -> tuple[Array, Array, Array]:
-    """What a new pair is worth, given s.y, y.y and s.s.
-
-    Returns:
-        keep: whether its curvature is positive.
-        moved: whether there was a step, that is, one whose squared length is not zero.
-        inverse: 1 / s.y if it is kept, otherwise 0.
-    """
-    keep = curvature > 1e-8 * change
-    return keep, step > 0.0, jnp.where(keep, 1.0 / jnp.where(keep, curvature, 1.0), 0.0)
-
-
-def start_scale(newest: Array, change: Array, grad: Array) -> Array:
-    """Gamma, given 1 / s.y (0 without a pair) and y.y of the newest pair, and g.g."""
-    size = change * newest
-    slope = jnp.sqrt(jnp.maximum(grad, 1e-30))
-    return jnp.where(newest > 0.0, 1.0 / jnp.where(newest > 0.0, size, 1.0), 1.0 / slope)
-
-
-def shortening(squared_length: Array, step_cap: float) -> Array:
-    """Factor that makes a direction no longer than the cap."""
-    return jnp.minimum(1.0, step_cap / jnp.sqrt(jnp.maximum(squared_length, 1e-30)))
-
-
 def turn_kernel(num_pairs: int, step_cap: float, *, interpret: bool = False) -> Callable:
-    """The kernel that `lanes.with_kernel` attaches to `remember` and then `search_direction`.
+    """Make the kernel of `lbfgs.remember` and then `lbfgs.search_direction`.
 
     Args:
         num_pairs: m.
@@ -52,7 +28,7 @@ def turn_kernel(num_pairs: int, step_cap: float, *, interpret: bool = False) -> 
         interpret: run it without a GPU, for tests.
     """
 
-    def kernel(treedef: Any, leaves: Sequence[Array]) -> list[Array] | None:
+    def kernel(treedef: PyTreeDef, leaves: Sequence[Array]) -> list[Array] | None:
         grad = leaves[-1]
         width = block_width(grad.shape[-1], _LANES)
         if grad.ndim != 2 or grad.dtype != jnp.float32 or width is None:
@@ -66,7 +42,7 @@ def turn_kernel(num_pairs: int, step_cap: float, *, interpret: bool = False) -> 
 def _call(
     num_pairs: int, step_cap: float, n: int, lanes: int, width: int, interpret: bool
 ) -> Callable:
-    """The kernel for vectors of n on `lanes` lanes."""
+    """Make the kernel for vectors of n on `lanes` lanes."""
     height = 1 << (n - 1).bit_length()  # a block's rows are a power of two
 
     def body(steps, changes, inverses, step, change, grad, *out):
@@ -75,17 +51,17 @@ def _call(
         columns = jax.lax.broadcasted_iota(jnp.int32, (height, width), 1)
         there = rows < n
 
-        def read(ref: Any, *pair: int) -> Array:
-            return load(ref, (*pair, rows, columns), there)
+        def read(ref: Ref, *pair: int) -> Array:
+            return load_masked(ref, (*pair, rows, columns), there)
 
-        def write(ref: Any, value: Array, *pair: int) -> None:
-            store(ref, (*pair, rows, columns), value, there)
+        def write(ref: Ref, value: Array, *pair: int) -> None:
+            store_masked(ref, (*pair, rows, columns), value, there)
 
         def dot(a: Array, b: Array) -> Array:
             return jnp.sum(a * b, axis=0)
 
         step, change, grad = read(step), read(change), read(grad)
-        keep, moved, inverse = judged_pair(dot(step, change), dot(change, change), dot(step, step))
+        keep, moved, inverse = weigh_pair(dot(step, change), dot(change, change), dot(step, step))
         none = jnp.zeros_like(inverse)
 
         # Newest first. A slot's pair is the one behind it if there is a new one.
@@ -115,8 +91,15 @@ def _call(
         write(direction, -q * shortening(dot(q, q), step_cap))
 
     memory = [(num_pairs, n), (num_pairs, n), (num_pairs,)]
-    options = {"name": "lbfgs_turn", "threads": _THREADS, "in_place": 3, "interpret": interpret}
     vector = (n,)
     return kernel_by_lanes(
-        body, [*memory, vector, vector, vector], [*memory, vector], lanes, width, **options
+        body,
+        [*memory, vector, vector, vector],
+        [*memory, vector],
+        lanes,
+        width,
+        name="lbfgs_turn",
+        threads=_THREADS,
+        in_place=3,
+        interpret=interpret,
     )

@@ -8,7 +8,6 @@ import numpy as np
 from jax import Array
 
 from planner_jax.lanes import with_kernel
-from planner_jax.optimise.inverse_kernel import inverse_kernel
 
 # Of a damping, the solver of about the damped Hessian's system: (n,) of a right side (n,).
 Preconditioner = Callable[[Array], Callable[[Array], Array]]
@@ -74,4 +73,4 @@ def _gauss_jordan(matrix: Array) -> Array:
     return jax.lax.fori_loop(0, size, eliminate, matrix)
 
 
-positive_inverse = with_kernel(_gauss_jordan, inverse_kernel())
+positive_inverse = with_kernel(_gauss_jordan, "planner_jax.optimise.inverse_kernel:inverse_kernel")

@@ -73,7 +73,7 @@ def require_backend() -> str:
     """
     import jax
 
-    from planner_jax.lanes.pallas import is_switched_on
+    from planner_jax.lanes.kernels import is_switched_on
 
     try:
         is_switched_on()

@@ -1,0 +1,155 @@
+"""Functions of one lane that have a kernel for CUDA, and the switch for all kernels.
+
+A function with a kernel is compiled under a name of its own (`jax.jit`), the only mark that every
+transformation of a larger function preserves. `over_lanes` sees a call of that name and calls the
+kernel instead. A kernel's module is imported when a program for a GPU is traced, and never on a
+machine without one.
+"""
+
+import dataclasses
+import enum
+import functools
+import importlib
+import os
+import pkgutil
+import zlib
+from collections.abc import Callable, Hashable, Sequence
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.extend.core import JaxprEqn
+from jax.tree_util import PyTreeDef
+
+SWITCH = "PLANNER_JAX_KERNELS"
+
+Results = TypeVar("Results")
+Shape = tuple[int, ...]
+# Takes the leaves of a function's arguments, with the lanes last; returns the leaves of the
+# results, or None if the kernel does not support such shapes or types.
+Kernel = Callable[[Sequence[Array]], list[Array] | None]
+
+
+class Kernels(enum.Enum):
+    """Whether programs for CUDA have kernels, in words."""
+
+    ON = "on"
+    OFF = f"off, by {SWITCH}"
+    MISSING = "unavailable: this JAX lacks Pallas' Triton backend; plans are slower, but the same"
+
+
+def kernels() -> Kernels:
+    """Return whether programs for CUDA have kernels.
+
+    Raises:
+        ValueError: the environment variable PLANNER_JAX_KERNELS is neither "on" nor "off".
+    """
+    if not is_switched_on():
+        return Kernels.OFF
+    return Kernels.ON if _has_triton() else Kernels.MISSING
+
+
+def in_use() -> bool:
+    """Return whether a function that is traced at this time gets kernels. Raises as `kernels`."""
+    return is_switched_on() and has_gpu() and _has_triton()
+
+
+def has_gpu() -> bool:
+    """Return whether a GPU is JAX's default device."""
+    return jax.default_backend() == "gpu"
+
+
+def is_switched_on() -> bool:
+    """Return whether the environment variable allows kernels. Raises as `kernels`."""
+    value = os.environ.get(SWITCH, "on")
+    if value not in ("on", "off"):
+        raise ValueError(f"{SWITCH} must be one of on, off, got {value!r}")
+    return value == "on"
+
+
+def _has_triton() -> bool:
+    try:
+        importlib.import_module("planner_jax.lanes.pallas")
+    except ImportError:
+        return False
+    return True
+
+
+@dataclasses.dataclass
+class _Entry:
+    """A compiled function that has a kernel."""
+
+    path: str
+    constants: tuple[Hashable, ...]
+    treedef: PyTreeDef  # of the arguments
+    shapes: list[Shape]  # of the leaves of one lane's arguments, then of the results
+
+
+_ENTRIES: dict[str, _Entry] = {}  # by the names of compiled functions
+
+
+def with_kernel(
+    function: Callable[..., Results],
+    path: str,
+    *constants: Hashable,
+    jvp: Callable[[tuple, tuple], tuple[Results, Results]] | None = None,
+) -> Callable[..., Results]:
+    """Attach a kernel to a function; `over_lanes` calls it in programs for CUDA.
+
+    Args:
+        function: of pytrees of arrays of ONE lane, to a pytree of arrays.
+        path: "module:name" of a factory of kernels. Of the constants it makes a function of the
+            tree of the arguments and of their leaves with the lanes last, to the leaves of the
+            results, or None. `jax.vmap` within a lane adds axes in front of some leaves; where it
+            has added one elsewhere, as after a matrix product, the kernel is not called.
+        constants: of the factory. Functions of one path with different constants must differ in
+            the `repr` of these, by which programs in the compile cache are found again.
+        jvp: derivative as `jax.custom_jvp` takes it, with zeros as `SymbolicZero`; by default the
+            function's own.
+    """
+
+    @functools.cache
+    def compiled(treedef: PyTreeDef, shapes: tuple[Shape, ...]) -> Callable[..., Results]:
+        text = repr((path, constants, treedef, shapes))
+        name = f"kernel_{zlib.crc32(text.encode()):08x}"
+        while name in _ENTRIES:
+            name += "_"
+        entry = _ENTRIES[name] = _Entry(path, constants, treedef, [])
+
+        def named(*leaves: Array) -> Results:
+            results = function(*jax.tree.unflatten(treedef, leaves))
+            entry.shapes = [*shapes, *(leaf.shape for leaf in jax.tree.leaves(results))]
+            return results
+
+        named.__name__ = named.__qualname__ = name
+        return jax.jit(named)
+
+    # JAX's own derivative of the named function would bear its name, and get its kernel.
+    @jax.custom_jvp
+    def guarded(*args: object) -> Results:
+        leaves, treedef = jax.tree.flatten(args)
+        return compiled(treedef, tuple(map(jnp.shape, leaves)))(*leaves)
+
+    if jvp is None:
+        guarded.defjvp(lambda primals, tangents: jax.jvp(function, primals, tangents))
+    else:
+        guarded.defjvp(jvp, symbolic_zeros=True)
+    return guarded
+
+
+def kernel_of(eqn: JaxprEqn) -> Kernel | None:
+    """Return the kernel for a call in a jaxpr; None if its function has none."""
+    entry = _ENTRIES.get(eqn.params.get("name", ""))
+    if entry is None:
+        return None
+    # The halves into which reverse mode splits a function keep its name, but not all its shapes.
+    shapes = [atom.aval.shape for atom in (*eqn.invars, *eqn.outvars)]
+    is_whole = len(shapes) == len(entry.shapes) and all(
+        of_call[len(of_call) - len(of_lane) :] == of_lane
+        for of_call, of_lane in zip(shapes, entry.shapes, strict=True)
+    )
+    if not is_whole:
+        return None
+    make_kernel = pkgutil.resolve_name(entry.path)
+    return functools.partial(make_kernel(*entry.constants), entry.treedef)
