@@ -47,6 +47,7 @@ from planner_jax.perception.segment import ball_look, sighting
 from planner_jax.robot.arm_mjcf import irb1600
 from planner_jax.runs.summary import percent, wilson_interval
 from planner_jax.runs.timing import timed_warm
+from planner_jax.studies.block.contact_check import end_at_contact
 from planner_jax.studies.block.observation import (
     Eye,
     cautious,
@@ -59,7 +60,6 @@ from planner_jax.studies.block.observation import (
 )
 from planner_jax.studies.block.receding import AIMS, decide
 from planner_jax.task.block.case import ANYWHERE
-from planner_jax.task.block.contact_check import as_met
 from planner_jax.task.block.end_poses import flight_of
 from planner_jax.task.block.replan import ReplanBlock
 
@@ -287,7 +287,7 @@ def pipeline(bench: Bench, num: int, seed: int) -> None:
         seer, began = eye(std=std), time.perf_counter()
         moments = moments_of(first, last, rate)
         done = decide(planner, cases, seer, moments, overhead=OVERHEAD, seed=seed, **options)
-        met = as_met(done.cases, done.plans)
+        met = end_at_contact(done.cases, done.plans)
         some = pj.solved(met)
         verdict = pj.block.judge(done.cases, met)
         anywhere = dataclasses.replace(

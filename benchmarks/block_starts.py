@@ -30,7 +30,7 @@ from planner_jax.core.protocol import is_solved
 from planner_jax.optimise.levenberg import least_squares
 from planner_jax.task.block import default_planner as online
 from planner_jax.task.block.end_poses import all_profiles, end_poses, flight_of
-from planner_jax.task.block.motion import angles_at
+from planner_jax.task.block.motion import angles_at, bump_steps
 from planner_jax.task.block.plan import BlockPlan
 
 SEED, DELAY = 1001, 0.05
@@ -75,12 +75,12 @@ def follow(
     """
     flight = flight_of(case)
     poses = end_poses(case, flight, planner.points, planner.pieces)
-    place = planner.order(poses, LATER_RANKS)[rank]
-    start = planner.straight_point(case, poses, place)
-    start = start.at[:-1].add(planner.bump(bump).reshape(-1))
+    place = planner.rank_poses(poses, LATER_RANKS)[rank]
+    start = planner.encode_straight(case, poses, place)
+    start = start.at[:-1].add(bump_steps(bump, planner.pieces).reshape(-1))
     solver = dataclasses.replace(planner.attempts[0].solver, max_steps=steps, hope=None)
     end = least_squares(lambda point: planner.model(point, case, flight), start, solver)
-    plan = planner.plan_at(case, flight, end.point, end.steps)
+    plan = planner.finish(case, flight, end.point, end.steps)
     return Followed(plan, end.point, poses.profile[place])
 
 
@@ -98,7 +98,7 @@ def tried(
 
     def one(case: pj.block.BlockCase, bump: Array, rank: Array) -> tuple[Array, Array]:
         end = follow(planner, case, bump, rank, steps)
-        moves, first, _ = planner.parts(case, end.point)
+        moves, first, _ = planner.decode(case, end.point)
         angles = angles_at(case.angles, first, moves, SHARES)
         shape = jnp.asarray(all_profiles(planner.pieces)[0], angles.dtype)[end.profile]
         straight = shape[:, None] * (angles[-1] - case.angles)

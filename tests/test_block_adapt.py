@@ -18,8 +18,8 @@ from planner_jax.baselines.block.library.table import Row, Setting, library_of, 
 from planner_jax.robot.arm import REGIMES
 from planner_jax.robot.arm_mjcf import irb1600
 from planner_jax.task.block.default_planner import OnlineBlock
-from planner_jax.task.block.end_poses import end_poses, flight_of
-from planner_jax.task.block.motion import profiles
+from planner_jax.task.block.end_poses import contact_terms, end_poses, flight_of
+from planner_jax.task.block.motion import joint_terms, profiles
 from planner_jax.task.block.scene import paper_scene
 
 ONLINE = OnlineBlock(pieces=6, points=10)
@@ -89,10 +89,12 @@ def test_warped_motions_end_where_the_ball_is_and_open_ones_keep_their_limits():
         warped = warped_by(own, case, EFFORT)
 
         def one(point):
-            steps, first, duration = ONLINE.parts(case, point)
-            excess = ONLINE.joint_terms(case, steps, first, duration)[3]
+            steps, first, duration = ONLINE.decode(case, point)
+            excess = joint_terms(
+                case, steps, first, duration, ONLINE.weights, 1.0 - ONLINE.slack
+            ).excess
             angles = case.angles + jnp.asarray(1.0 / 6.0) * jnp.sum(steps, axis=0)
-            return ONLINE.contact_terms(case, flight, angles, point[-1])[2], excess
+            return contact_terms(case, flight, angles, point[-1], ONLINE.weights)[2], excess
 
         return warped, *jax.vmap(one)(warped.points)
 

@@ -12,8 +12,8 @@ import planner_jax as pj
 from planner_jax.ball.flight import drag_free_flight
 from planner_jax.perception.camera import in_view, looking_at
 from planner_jax.perception.fit import Sight, believed_at, error_across
+from planner_jax.studies.block.contact_check import end_at_contact
 from planner_jax.studies.block.observation import cautious, eye, frame_times, mast_camera, see
-from planner_jax.task.block.contact_check import as_met
 from planner_jax.task.block.end_poses import flight_of
 
 
@@ -64,7 +64,7 @@ def test_a_camera_that_never_sees_the_ball_is_a_status_all_the_way():
     assert (plans.status == pj.Status.BAD_INPUT).all()
     assert not np.isin(plans.status, [0, 1]).any()
     truth = dataclasses.replace(cases, delay=seen.cases.delay)
-    assert not pj.block.judge(truth, as_met(truth, plans)).success.any()
+    assert not pj.block.judge(truth, end_at_contact(truth, plans)).success.any()
 
 
 @pytest.mark.parametrize("regime", ["R1", "R2"])
@@ -72,7 +72,7 @@ def test_the_referee_agrees_on_plans_for_the_true_ball(regime):
     cases = jax.tree.map(np.asarray, pj.block.draw(6, seed=8, regime=regime, wide=True))
     plans = pj.plan(SMALL, cases)
     solved = pj.solved(plans)
-    met = as_met(cases, plans)
+    met = end_at_contact(cases, plans)
     assert solved.sum() >= 3
     np.testing.assert_allclose(met.contact_time[solved], plans.contact_time[solved], atol=2e-4)
     if regime == "R1":
@@ -88,7 +88,7 @@ def test_a_ball_that_comes_later_meets_a_braking_arm_that_was_there_in_time():
     assert solved.sum() >= 3
     back = jax.vmap(drag_free_flight)(cases.ball, np.full(6, -0.01, np.float32), cases.gravity)
     late = dataclasses.replace(cases, ball=back)
-    met = as_met(late, plans)
+    met = end_at_contact(late, plans)
     moved = met.contact_time - plans.contact_time
     np.testing.assert_allclose(moved[solved], 0.01, atol=5e-3)
     verdict = pj.block.judge(late, met)

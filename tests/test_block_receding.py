@@ -13,11 +13,11 @@ from planner_jax.core.protocol import Status, lane
 from planner_jax.perception.camera import looking_at
 from planner_jax.perception.fit import Sight
 from planner_jax.runs.settings import SettingError
+from planner_jax.studies.block.contact_check import delay_motion, end_at_contact
 from planner_jax.studies.block.observation import cautious, eye
 from planner_jax.studies.block.receding import Aim, decide
 from planner_jax.sweep.block.settings import BlockSettings
 from planner_jax.sweep.run import start_sweep
-from planner_jax.task.block.contact_check import as_met, begun_late
 from planner_jax.task.block.replan import ReplanBlock, WarmBlock
 from planner_jax.task.block.spec import TASK
 
@@ -31,7 +31,7 @@ def cases():
 
 
 def accepted(done):
-    plans = as_met(done.cases, done.plans)
+    plans = end_at_contact(done.cases, done.plans)
     return pj.block.judge(done.cases, plans), pj.solved(plans)
 
 
@@ -101,10 +101,10 @@ def test_replanning_goes_on_from_the_motion_for_the_ball_as_it_is_now_known(case
 def test_a_motion_that_begins_late_is_met_later_or_not_in_time(cases):
     plans = pj.plan(SMALL, cases)
     solved = pj.solved(plans)
-    in_time = begun_late(cases, plans, np.zeros(6, np.float32))
+    in_time = delay_motion(cases, plans, np.zeros(6, np.float32))
     np.testing.assert_array_equal(in_time.contact_time, plans.contact_time)
     assert pj.block.judge(cases, in_time).success[solved].all()
-    late = begun_late(cases, plans, np.full(6, 0.25, np.float32))
+    late = delay_motion(cases, plans, np.full(6, 0.25, np.float32))
     verdict = pj.block.judge(cases, late)
     assert not verdict.success.any()
     assert not np.isin(verdict.failed_limit[solved], ("start", "continuity", "velocity")).any()

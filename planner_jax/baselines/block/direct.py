@@ -20,7 +20,7 @@ from planner_jax.planning.select import first_solved
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import least_clearances
 from planner_jax.task.block.end_poses import EndPoses, end_poses, flight_of
-from planner_jax.task.block.plan import BlockPlan, explained, no_plan
+from planner_jax.task.block.plan import BlockPlan, explain_status, make_empty_plan
 from planner_jax.trajectory.polynomial import evaluate
 
 _BANG_BANG_PIECES = 13  # of the motions of six joints
@@ -72,8 +72,8 @@ class DirectBlock(Planner):
             place = order[k]
             return self.plan_to(case, poses.angles[place], poses.time[place], times[place])
 
-        best = first_solved(plan_of, num, no_plan(case, _BANG_BANG_PIECES))
-        return dataclasses.replace(best, status=explained(case, poses, best.status))
+        best = first_solved(plan_of, num, make_empty_plan(case, _BANG_BANG_PIECES))
+        return dataclasses.replace(best, status=explain_status(case, poses, best.status))
 
     def plan_to(self, case: BlockCase, goal: Array, contact: Array, duration: Array) -> BlockPlan:
         """The plan to one end pose.

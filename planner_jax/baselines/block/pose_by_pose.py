@@ -26,7 +26,7 @@ from planner_jax.baselines.block.path_timing import DEGREE, PIECES, required, ti
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt, Status, lane, require_settings
 from planner_jax.task.block.case import BlockCase
-from planner_jax.task.block.plan import BlockPlan, explained
+from planner_jax.task.block.plan import BlockPlan, explain_status
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 Clock = Callable[[], float]  # seconds that are left
@@ -160,7 +160,7 @@ def _goals(case: BlockCase, points: int) -> tuple[Array, Array, Array, Array]:
     """
     poses, times = poses_in_time(case, points)
     share = times / jnp.maximum(poses.time - case.delay, 1e-6)
-    status = explained(case, poses, jnp.asarray(Status.NO_PATH))
+    status = explain_status(case, poses, jnp.asarray(Status.NO_PATH))
     return status, poses.angles, poses.time, share
 
 

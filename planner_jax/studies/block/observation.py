@@ -128,9 +128,9 @@ def see(
 ) -> SeenThrows:
     """A batch of throws after some seconds of flight were seen.
 
-    Plan with the cases that come back, made `cautious`. To judge, give the true cases the delay of
-    these, and the plans to `task.block.contact_check.as_met` with them. A ball that was not seen
-    at two times is NaN, and `fits.status` says why.
+    Plan with the returned cases, made `cautious`. To judge the plans, give the true cases the delay
+    of the returned ones, and pass both through `studies.block.contact_check.end_at_contact`. A ball
+    that was seen at fewer than two times is NaN, and `fits.status` gives the reason.
 
     Args:
         cases: a batch of B, with the true balls.

@@ -22,6 +22,7 @@ from planner_jax.core.protocol import Status, is_solved, lane
 from planner_jax.perception.fit import FlightFit, Sight, believed_at
 from planner_jax.planning.plan import plan
 from planner_jax.planning.select import merged
+from planner_jax.studies.block.contact_check import end_at_contact
 from planner_jax.studies.block.observation import (
     Eye,
     cautious,
@@ -31,9 +32,9 @@ from planner_jax.studies.block.observation import (
     watched,
 )
 from planner_jax.task.block.case import BlockCase
-from planner_jax.task.block.contact_check import as_met, braked
 from planner_jax.task.block.default_planner import OnlineBlock
-from planner_jax.task.block.end_poses import flight_of
+from planner_jax.task.block.end_poses import contact_terms, flight_of
+from planner_jax.task.block.motion import append_braking
 from planner_jax.task.block.plan import BlockPlan
 from planner_jax.task.block.replan import ReplanBlock, WarmBlock
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
@@ -67,7 +68,7 @@ class Decided:
     """A batch of throws, and what arms did that decided while they watched."""
 
     cases: BlockCase  # the true balls, with the delay from which on the motions count
-    plans: BlockPlan  # give them to `as_met`, then to the referee, with these cases
+    plans: BlockPlan  # give them to `end_at_contact`, then to the referee, with these cases
     fits: FlightFit  # leaves (M, B, ...), of every moment
     begun: Array  # (B,) [s], when the first motion began; infinite without any
     motions: Array  # (B,) int32, how many motions were begun
@@ -332,17 +333,17 @@ def _meets(planner: OnlineBlock, cases: BlockCase, plans: BlockPlan) -> Array:
         time = plan.contact_time - case.delay
         angles = evaluate(plan.motion, jnp.minimum(time, jnp.sum(plan.motion.durations)))
         flight = flight_of(case)
-        excess = planner.contact_terms(case, flight, angles, plan.contact_time)[2]
+        excess = contact_terms(case, flight, angles, plan.contact_time, planner.weights)[2]
         return flight.comes & (excess <= _EXCESS)
 
-    return jax.vmap(one)(cases, as_met(cases, plans))
+    return jax.vmap(one)(cases, end_at_contact(cases, plans))
 
 
 @jax.jit
 @jax.vmap
 def _begun(case: BlockCase, motion: PiecewisePolynomial, time: Array) -> PiecewisePolynomial:
     """The pieces of a motion, of its braking and of standing thereafter, until a time () [s]."""
-    motion = braked(case, motion)
+    motion = append_braking(case, motion)
     end = jnp.sum(motion.durations)
     stand = jnp.zeros_like(motion.coeffs[:1]).at[0, 0].set(evaluate(motion, end))
     durations = jnp.append(motion.durations, jnp.asarray(_LONG, end.dtype))

@@ -11,10 +11,10 @@ from jax import Array
 
 from planner_jax.core.protocol import lane
 from planner_jax.runs.timing import timed_plans
+from planner_jax.studies.block.contact_check import delay_motion, end_at_contact
 from planner_jax.studies.block.observation import eye
 from planner_jax.studies.block.receding import Decided, decide
 from planner_jax.task.block.case import BlockCase
-from planner_jax.task.block.contact_check import as_met, begun_late
 from planner_jax.task.block.end_poses import flight_of
 from planner_jax.task.block.plan import BlockPlan
 
@@ -49,7 +49,7 @@ class SeeingArms:
         done = self.decided(cases)
         (error, std), (last, _) = (done.fit_errors(place) for place in (0, -1))
         first = lane(done.fits, 0)
-        met = as_met(done.cases, done.plans)
+        met = end_at_contact(done.cases, done.plans)
         parts = {field.name: getattr(met, field.name) for field in dataclasses.fields(met)}
         return jax.tree.map(
             np.asarray,
@@ -114,6 +114,6 @@ class CountedPlanner:
         plans, spent = timed_plans(self.planner, cases)
         seconds: Any = spent
         late = np.maximum(seconds - self.allowed, 0.0).astype(cases.delay.dtype)
-        met = begun_late(cases, plans, late)
+        met = delay_motion(cases, plans, late)
         parts = {field.name: getattr(met, field.name) for field in dataclasses.fields(met)}
         return jax.tree.map(np.asarray, TimedPlan(**parts, planning_time=seconds))

@@ -5,18 +5,32 @@ that how far the joints turn does not depend on T. Angles are quadratic from kno
 greatest at knots, and accelerations constant in between, so that limits at knots are exact.
 """
 
+import dataclasses
 import functools
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from planner_jax.task.block.case import BlockCase
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
+
+
+@dataclasses.dataclass(frozen=True)
+class Weights:
+    """Factors of the residuals of least squares; static."""
+
+    meeting: float = 100.0  # [1/m]
+    tilt: float = 30.0  # [1/rad]
+    limits: float = 30.0  # of relative excesses
+    clearance: float = 100.0  # [1/m]
+    effort: float = 0.1  # of accelerations in shares of their limits
 
 
 @functools.cache
 def sums(pieces: int, shares: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """What steps add up to at shares of the duration.
+    """Return the weights with which steps add up to angles at shares of the duration.
 
     Returns:
         first: (N,), of the rates at the beginning, times the duration.
@@ -33,7 +47,7 @@ def sums(pieces: int, shares: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray
 
 
 def angles_at(start: Array, first: Array, steps: Array, shares: tuple[float, ...]) -> Array:
-    """Angles (N, 6) [rad] at shares of the duration.
+    """Return the angles (N, 6) [rad] at shares of the duration.
 
     Args:
         start: (6,) [rad].
@@ -46,8 +60,87 @@ def angles_at(start: Array, first: Array, steps: Array, shares: tuple[float, ...
     return start + jnp.asarray(of_first, steps.dtype)[:, None] * first + turned
 
 
+class JointTerms(NamedTuple):
+    """Squared residuals of the joints' limits and effort, by each joint's K steps and the time."""
+
+    cost: Array  # ()
+    gradient: Array  # (6, K + 1)
+    curvature: Array  # (6, K + 1, K + 1)
+    excess: Array  # (), largest over a limit, relative
+
+
+def joint_terms(
+    case: BlockCase, steps: Array, first: Array, duration: Array, weights: Weights, most: float
+) -> JointTerms:
+    """Return the terms of limits and effort of the joints.
+
+    Args:
+        case: one case.
+        steps: (K, 6) [rad].
+        first: (6,) [rad], the rates at the beginning times the duration.
+        duration: () [s].
+        weights: of the residuals.
+        most: share of every limit that may be used.
+    """
+    pieces, dtype = steps.shape[0], steps.dtype
+    knots = tuple(np.arange(1, pieces + 1) / pieces)
+    of_first, of_steps = (jnp.asarray(each, dtype) for each in sums(pieces, knots))
+    rise = jnp.asarray(np.eye(pieces) - np.eye(pieces, k=-1), dtype)
+    rates = steps / duration
+    risen = steps - jnp.concatenate([first[None], steps[:-1]])
+    accelerations = risen * (pieces / duration**2)
+    angles = angles_at(case.angles, first, steps, knots)
+    middle = 0.5 * (case.arm.upper + case.arm.lower)
+    half = 0.5 * (case.arm.upper - case.arm.lower)
+
+    def row(
+        value: Array, by_steps: Array, by_time: Array, slope: float | Array
+    ) -> tuple[Array, Array]:
+        """Return residuals (6, K) and their slopes (6, K, K + 1)."""
+        slopes = jnp.concatenate([by_steps, by_time.T[:, :, None]], axis=2)
+        return value.T, slopes * jnp.broadcast_to(slope, value.shape).T[:, :, None]
+
+    def hinge(share: Array, by_steps: Array, by_time: Array) -> tuple[Array, Array]:
+        """Return the residuals of shares beyond `most`, and their slopes."""
+        over = weights.limits * jnp.maximum(jnp.abs(share) - most, 0.0)
+        sign = weights.limits * jnp.sign(share) * (over > 0.0)
+        return row(over, by_steps, by_time, sign)
+
+    of_rate = jnp.eye(pieces, dtype=dtype) / (duration * case.limits.velocity[:, None, None])
+    rate_shares = rates / case.limits.velocity
+    of_rise = rise * (pieces / duration**2 / case.limits.acceleration[:, None, None])
+    rise_shares = accelerations / case.limits.acceleration
+    # The first of the rises falls with the duration by half as much as the others.
+    carried = jnp.zeros_like(rise_shares).at[0].set(first * pieces / duration**2)
+    by_time = (-2.0 * rise_shares - carried / case.limits.acceleration) / duration
+    angle_shares = (angles - middle) / half
+    of_angle = of_steps / half[:, None, None]
+    effort = weights.effort
+    parts = [
+        hinge(rate_shares, of_rate, -rate_shares / duration),
+        hinge(rise_shares, of_rise, by_time),
+        hinge(angle_shares, of_angle, of_first[:, None] * case.rates / half),
+        row(effort * rise_shares, of_rise, by_time, effort),
+    ]
+    values = jnp.concatenate([value for value, _ in parts], axis=1)
+    slopes = jnp.concatenate([slope for _, slope in parts], axis=1)
+    excess = [jnp.max(jnp.abs(each)) for each in (rate_shares, rise_shares, angle_shares)]
+    return JointTerms(
+        jnp.sum(values**2),
+        jnp.einsum("irk,ir->ik", slopes, values, precision=lax.Precision.HIGHEST),
+        jnp.einsum("irk,irl->ikl", slopes, slopes, precision=lax.Precision.HIGHEST),
+        jnp.max(jnp.stack(excess)) - 1.0,
+    )
+
+
+def bump_steps(height: Array, pieces: int) -> Array:
+    """Return steps (K, 6) that turn joints by a height (6,) [rad] and back: a squared sine."""
+    knots = np.arange(1, pieces + 1) / pieces
+    return jnp.asarray(np.pi * np.sin(2.0 * np.pi * knots), height.dtype)[:, None] * height
+
+
 def polynomial(start: Array, first: Array, steps: Array, duration: Array) -> PiecewisePolynomial:
-    """The same motion as a piecewise polynomial: K pieces of degree 2."""
+    """Return the motion as a piecewise polynomial: K pieces of degree 2."""
     pieces = steps.shape[0]
     step = duration / pieces
     rates = jnp.concatenate([first[None], steps]) / jnp.maximum(duration, 1e-9)
@@ -60,10 +153,10 @@ def polynomial(start: Array, first: Array, steps: Array, duration: Array) -> Pie
     )
 
 
-def quickened(
+def speed_up(
     motion: PiecewisePolynomial, velocity: Array, acceleration: Array
 ) -> tuple[PiecewisePolynomial, Array]:
-    """A motion from rest to rest on the same way, as quick as limits allow, but no slower.
+    """Return a motion from rest to rest along the same path, as quick as limits allow.
 
     Args:
         motion: of degree 2.
@@ -71,8 +164,8 @@ def quickened(
         acceleration: (6,) [rad/s^2], the most.
 
     Returns:
-        motion: the same, in time.
-        pace: () in (0, 1], the share of the duration that it takes.
+        motion: along the same path, never slower.
+        pace: () in (0, 1], the new duration over the old one.
     """
     rates = motion.coeffs[:, 1] / velocity
     rises = 2.0 * motion.coeffs[:, 2] / acceleration
@@ -84,9 +177,9 @@ def quickened(
 
 
 def cut(motion: PiecewisePolynomial, time: Array) -> PiecewisePolynomial:
-    """A motion up to a time () [s] since its start, or as a whole if it ends before.
+    """Cut a motion at a time () [s] since its start; a motion that ends before stays whole.
 
-    What is not begun by then lasts 0 s, and goes on from where the motion is cut.
+    Pieces that begin later last 0 s, and start from where the motion is cut.
     """
     starts = jnp.cumsum(motion.durations) - motion.durations
     last = jnp.minimum(time, jnp.sum(motion.durations))
@@ -98,9 +191,26 @@ def cut(motion: PiecewisePolynomial, time: Array) -> PiecewisePolynomial:
     )
 
 
+def append_braking(case: BlockCase, motion: PiecewisePolynomial) -> PiecewisePolynomial:
+    """Return a motion, and after it all joints slowing down evenly to a stop at the same time.
+
+    The piece that is added has no length where the motion has to end at rest.
+    """
+    end = jnp.sum(motion.durations)
+    angles, rates = evaluate(motion, end), evaluate(motion, end, 1)
+    duration = jnp.max(jnp.abs(rates) / case.limits.acceleration)
+    duration = jnp.where(case.ends_at_rest, 0.0, duration)
+    slowing = -0.5 * rates / jnp.where(duration > 0.0, duration, 1.0)
+    piece = jnp.zeros_like(motion.coeffs[:1]).at[0, :3].set(jnp.stack([angles, rates, slowing]))
+    return PiecewisePolynomial(
+        coeffs=jnp.concatenate([motion.coeffs, piece]),
+        durations=jnp.append(motion.durations, duration),
+    )
+
+
 @functools.cache
 def profiles(pieces: int, ends_at_rest: bool) -> np.ndarray:
-    """Shapes (P, K) of steps that turn a joint by one [rad] from rest, even ramps at either end.
+    """Return shapes (P, K) of steps that turn a joint by 1 rad from rest, with even ramps.
 
     Ramps take a whole number of pieces: from one up to half of them, and up to all of them where
     the motion need not end at rest.

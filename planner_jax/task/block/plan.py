@@ -1,4 +1,4 @@
-"""What a block planner returns."""
+"""The plan that a block planner returns."""
 
 import jax
 import jax.numpy as jnp
@@ -24,8 +24,8 @@ class BlockPlan(ArmPlan):
     contact_time: Array  # () [s], when the shield meets the ball, since the ball was first seen
 
 
-def no_plan(case: BlockCase, pieces: int) -> BlockPlan:
-    """What is given back without a plan, of one case: no success, and no motion for a second."""
+def make_empty_plan(case: BlockCase, pieces: int) -> BlockPlan:
+    """Return the plan of a case without a solution: not solved, standing for a second."""
     none = jnp.full((), jnp.inf, case.angles.dtype)
     still = jnp.zeros((pieces, 6), case.angles.dtype)
     second = jnp.ones((), case.angles.dtype)
@@ -40,14 +40,14 @@ def no_plan(case: BlockCase, pieces: int) -> BlockPlan:
 
 
 def has_nan(case: BlockCase) -> Array:
-    """Whether any number of a case is NaN, () bool."""
+    """Return whether any number of a case is NaN, () bool."""
     leaves = [jnp.ravel(leaf) for leaf in map(jnp.asarray, jax.tree.leaves(case))]
     numbers = [leaf for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.floating)]
     return jnp.any(jnp.isnan(jnp.concatenate(numbers)))
 
 
-def explained(case: BlockCase, poses: EndPoses, status: Array) -> Array:
-    """The status () int32 of a plan, or the one that says why there is none.
+def explain_status(case: BlockCase, poses: EndPoses, status: Array) -> Array:
+    """Return the status () int32 of a plan, or the status that explains why there is none.
 
     Args:
         case: one case. Without a plan the status is NON_FINITE if it has a NaN; OUT_OF_REACH if

@@ -22,9 +22,9 @@ from planner_jax.planning.replan import Replanning, given_or_own, moment_of
 from planner_jax.planning.select import better_of, merged
 from planner_jax.robot.arm import shield_pose
 from planner_jax.task.block.case import BlockCase
-from planner_jax.task.block.contact_check import braked
 from planner_jax.task.block.default_planner import OnlineBlock
 from planner_jax.task.block.end_poses import flight_of
+from planner_jax.task.block.motion import append_braking
 from planner_jax.task.block.plan import BlockPlan
 from planner_jax.trajectory.polynomial import evaluate
 
@@ -51,7 +51,7 @@ class WarmBlock(Planner):
     def solve(self, task: Replanning, attempt: Warm) -> BlockPlan:
         """The plan of one case."""
         case, planner = task.case, self.planner
-        return planner.bent(case, flight_of(case), self.rest(task), attempt.solver)
+        return planner.refine(case, flight_of(case), self.rest(task), attempt.solver)
 
     def rest(self, task: Replanning) -> Array:
         """The unknowns of what is left of the previous motion, over the time until the contact.
@@ -68,7 +68,7 @@ class WarmBlock(Planner):
         time = jnp.maximum(time, case.delay + _SHORTEST)
         left = jnp.maximum(ends - task.elapsed, 0.0)
         shares = np.arange(1, self.planner.pieces + 1) / self.planner.pieces
-        motion = braked(case, previous.motion)
+        motion = append_braking(case, previous.motion)
         at = lambda share: evaluate(motion, task.elapsed + left * share, 1)  # noqa: E731
         steps = left * jax.vmap(at)(jnp.asarray(shares, time.dtype))
         return jnp.append(steps.reshape(-1), time)
@@ -153,7 +153,7 @@ class ReplanBlock(Planner):
 @jax.jit
 def _state(case: BlockCase, plan: BlockPlan, elapsed: Array) -> tuple[Array, Array]:
     """Angles (6,) [rad] and rates (6,) [rad/s] some time [s] into the motion of a plan."""
-    motion = braked(case, plan.motion)
+    motion = append_braking(case, plan.motion)
     is_over = elapsed >= jnp.sum(motion.durations)
     elapsed = jnp.minimum(elapsed, jnp.sum(motion.durations))
     rates = jnp.where(is_over, 0.0, evaluate(motion, elapsed, 1))

@@ -32,7 +32,7 @@ from planner_jax.task.block.clearance import clearances, num_of_pole
 from planner_jax.task.block.default_planner import OnlineBlock
 from planner_jax.task.block.end_poses import EndPoses, Flight, end_poses, flight_of
 from planner_jax.task.block.motion import angles_at, profiles, sums
-from planner_jax.task.block.plan import BlockPlan, explained, no_plan
+from planner_jax.task.block.plan import BlockPlan, explain_status, make_empty_plan
 
 _HIGHEST = lax.Precision.HIGHEST
 # How far joints are to be turned, squared, counts less for those of the wrist, which carry little;
@@ -110,17 +110,17 @@ class AdaptBlock(Planner):
         online = dataclasses.replace(self.online, checked=attempt.checked)
 
         def as_warped(k: Array) -> BlockPlan:
-            return online.plan_at(case, flight, warped.points[k], jnp.zeros((), jnp.int32))
+            return online.finish(case, flight, warped.points[k], jnp.zeros((), jnp.int32))
 
         def bent(k: Array) -> BlockPlan:
-            return online.bent(case, flight, warped.points[k], attempt.solver)
+            return online.refine(case, flight, warped.points[k], attempt.solver)
 
-        best = first_solved(as_warped, tries, no_plan(case, online.pieces))
+        best = first_solved(as_warped, tries, make_empty_plan(case, online.pieces))
         if attempt.bent:
             there = jnp.sum(jnp.isfinite(warped.promise))
             most = jnp.where(goes, jnp.minimum(there, attempt.bent), 0)
             best = first_solved(bent, most, best)
-        status = explained(case, poses, jnp.where(fits, best.status, Status.BLOCKED))
+        status = explain_status(case, poses, jnp.where(fits, best.status, Status.BLOCKED))
         return dataclasses.replace(best, status=status)
 
     def warped(

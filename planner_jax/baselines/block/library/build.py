@@ -34,7 +34,7 @@ from planner_jax.host.files import replacing
 from planner_jax.planning.plan import plan
 from planner_jax.robot.arm import shield_pose
 from planner_jax.task.block.clearance import least_clearances
-from planner_jax.task.block.default_planner import learned_starts
+from planner_jax.task.block.default_planner import read_learned_starts
 from planner_jax.task.block.motion import angles_at
 from planner_jax.task.block.scene import Scene
 
@@ -226,7 +226,7 @@ def plan_pairs(
 
     improving = STARTS if old is None else (-1, *REPAIR_STARTS)
     rest = [start for start in STARTS if start not in improving]
-    others = [start for start in range(len(learned_starts()[0])) if start not in STARTS]
+    others = [start for start in range(len(read_learned_starts()[0])) if start not in STARTS]
     for is_coarse in (False, True):
         left = np.isinf(found.entry)
         improve(straight, np.flatnonzero(left), [0], is_coarse)

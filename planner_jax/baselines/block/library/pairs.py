@@ -32,9 +32,9 @@ from planner_jax.robot.arm import product, shield_jacobian, shield_pose
 from planner_jax.robot.arm_ik import inverse_kinematics
 from planner_jax.task.block.case import STRICT, BlockCase
 from planner_jax.task.block.clearance import least_clearances
-from planner_jax.task.block.default_planner import OnlineBlock, learned_starts
-from planner_jax.task.block.end_poses import EndPoses, Flight, facing, frame_of, profile_peaks
-from planner_jax.task.block.motion import angles_at, sums
+from planner_jax.task.block.default_planner import OnlineBlock, read_learned_starts
+from planner_jax.task.block.end_poses import EndPoses, Flight, face_ball, frame_of, profile_peaks
+from planner_jax.task.block.motion import angles_at, bump_steps, sums
 
 # How far a stored pose may be off the nominal ball's way, [m] and [rad]: the paper allows "a small
 # tolerance". Where no pose within it is reached, a shield that blocks a part is better than none.
@@ -125,7 +125,7 @@ class PairPlanner(Planner):
 
         def of_point(time: Array) -> tuple[Array, Array]:
             there = drag_free_flight(ball, time, jnp.asarray(GRAVITY, time.dtype))
-            rotation = frame_of(facing(there.vel))
+            rotation = frame_of(face_ball(there.vel))
             far = farthest_crossing(pair.outer, pair.inner, there.pos, rotation)
             angles, found = inverse_kinematics(arm, rotation, there.pos)
             return angles, found & (pair.is_coarse | (far < arm.shield_half))
@@ -156,14 +156,14 @@ class PairPlanner(Planner):
         )
 
     def model(self, pair: PairCase, point: Array, case: BlockCase, flight: Flight) -> Model:
-        """`OnlineBlock.model`, and the shield's roll against the frame of `facing`."""
+        """`OnlineBlock.model`, and the shield's roll against the frame of `face_ball`."""
         online = self.online
         model = online.model(point, case, flight)
-        moves, first, _ = online.parts(case, point)
+        moves, first, _ = online.decode(case, point)
         angles = angles_at(case.angles, first, moves, (1.0,))[0]
         rotation, _ = shield_pose(case.arm, angles)
         ball = drag_free_flight(case.ball, point[-1], case.gravity)
-        frame = frame_of(facing(ball.vel))
+        frame = frame_of(face_ball(ball.vel))
         cosine = jnp.sum(rotation[:, 1] * frame[:, 1])
         roll = jnp.arctan2(jnp.sum(rotation[:, 1] * frame[:, 2]), cosine)
         roll = roll - 0.5 * jnp.pi * jnp.round(roll / (0.5 * jnp.pi))
@@ -183,8 +183,8 @@ class PairPlanner(Planner):
     def planned(self, pair: PairCase, point: Array, entry: Array, steps: Array) -> PairPlan:
         """The plan of a point, checked as `OnlineBlock` does; it has to block the tunnel, too."""
         case, flight = self.case_of(pair, entry)
-        plan = self.online.plan_at(case, flight, point, steps)
-        moves, first, _ = self.online.parts(case, point)
+        plan = self.online.finish(case, flight, point, steps)
+        moves, first, _ = self.online.decode(case, point)
         rotation, middle = shield_pose(case.arm, angles_at(case.angles, first, moves, (1.0,))[0])
         far = farthest_crossing(pair.outer, pair.inner, middle, rotation)
         beyond = jnp.where(pair.is_coarse, 0.0, far / case.arm.shield_half - 1.0)
@@ -221,7 +221,7 @@ class StraightPair(PairPlanner):
         def next_one(state: tuple) -> tuple:
             k, _ = state
             place = order[k]
-            point = self.online.straight_point(case, poses, place)
+            point = self.online.encode_straight(case, poses, place)
             entry = jnp.where(k < possible, poses.effort[place], 0.0)
             return k + 1, self.planned(pair, point, entry, jnp.zeros((), jnp.int32))
 
@@ -285,14 +285,14 @@ class BentPair(PairPlanner):
         poses = self.poses(pair)
         order = jnp.argsort(poses.effort)
         possible = jnp.sum(jnp.isfinite(poses.effort))
-        ranks, bumps = (jnp.asarray(each) for each in learned_starts())
+        ranks, bumps = (jnp.asarray(each) for each in read_learned_starts())
         number = pair.start % len(ranks)
         place = order[jnp.clip(ranks[number], 0, jnp.maximum(possible - 1, 0))]
         of_place = jnp.where(possible > 0, _entry(poses.effort[place]), 0.0)
         quickest = jnp.where(possible > 0, _entry(jnp.min(poses.effort)), 0.0)
         case, _ = self.case_of(pair, jnp.zeros_like(of_place))
-        bump = online.bump(bumps[number]).reshape(-1)
-        learned = online.straight_point(case, poses, place).at[:-1].add(bump.astype(dtype))
+        bump = bump_steps(bumps[number], online.pieces).reshape(-1)
+        learned = online.encode_straight(case, poses, place).at[:-1].add(bump.astype(dtype))
         is_given = pair.start < 0
         start = jnp.where(is_given, pair.given, learned)
         # A given motion ends on the nominal ball's way about where its own pose did.

@@ -1,0 +1,105 @@
+"""Contacts of plans with a ball that differs a little from the ball they were planned for.
+
+A plan names the time at which its ball is met. The true ball comes to the shield a little earlier
+or later, and a little beside. `end_at_contact` names the true time instead, so that the referee
+judges the true contact. Robot base frame, z up, SI units.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from planner_jax.ball.flight import drag_free_flight
+from planner_jax.robot.arm import shield_pose
+from planner_jax.task.block.case import BlockCase
+from planner_jax.task.block.end_poses import flight_of
+from planner_jax.task.block.motion import append_braking, cut
+from planner_jax.task.block.plan import BlockPlan
+from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
+
+_SAMPLES = 256  # times at which ball and shield are compared
+_HALVINGS = 24  # of the time between two of them
+
+
+def end_at_contact(cases: BlockCase, plans: BlockPlan) -> BlockPlan:
+    """Return the motions up to their contacts with the balls of these cases.
+
+    An arm that need not stand at the contact brakes evenly after its motion, as fast as its limits
+    allow; the ball meets it while it brakes, or standing. Where a ball crosses the shield's plane
+    several times, the crossing nearest to the shield's middle counts. A plan whose ball never
+    crosses the plane is returned unchanged, and the referee rejects it.
+
+    Args:
+        cases: a batch of B, with the true balls, and the delays of the plans.
+        plans: plans of these cases for other balls; polynomials of degree 2 or more.
+
+    Returns:
+        Plans with one piece more, of no length if the contact comes before.
+    """
+    return _end_each_at_contact(cases, plans)
+
+
+def delay_motion(cases: BlockCase, plans: BlockPlan, late: np.ndarray) -> BlockPlan:
+    """Return the motions begun later, up to their contacts as `end_at_contact` finds them.
+
+    Args:
+        cases: a batch of B, of arms that stand.
+        plans: plans of these cases.
+        late: (B,) [s], delays, >= 0. A plan with a delay of 0 keeps its motion and its contact.
+
+    Returns:
+        Plans with two pieces more.
+    """
+    return _delay_each(cases, plans, late)
+
+
+@jax.jit
+@jax.vmap
+def _delay_each(case: BlockCase, plan: BlockPlan, late: Array) -> BlockPlan:
+    motion = plan.motion
+    still = jnp.zeros_like(motion.coeffs[:1]).at[0, 0].set(case.angles)
+    waited = PiecewisePolynomial(
+        coeffs=jnp.concatenate([still, motion.coeffs]),
+        durations=jnp.concatenate([late[None], motion.durations]),
+    )
+    whole = append_braking(case, waited)
+    in_time = dataclasses.replace(
+        plan, motion=dataclasses.replace(whole, durations=whole.durations.at[-1].set(0.0))
+    )
+    met = _find_contact(case, dataclasses.replace(plan, motion=waited))
+    return jax.tree.map(lambda ours, theirs: jnp.where(late > 0.0, ours, theirs), met, in_time)
+
+
+def _find_contact(case: BlockCase, plan: BlockPlan) -> BlockPlan:
+    """Return one plan up to its contact."""
+    motion = append_braking(case, plan.motion)
+
+    def above(time: Array) -> tuple[Array, Array]:
+        """Return the ball's height () [m] over the shield's plane, and its squared distance."""
+        ends = jnp.sum(motion.durations)
+        angles = evaluate(motion, jnp.clip(time - case.delay, 0.0, ends))
+        rotation, middle = shield_pose(case.arm, angles)
+        away = drag_free_flight(case.ball, time, case.gravity).pos - middle
+        return jnp.sum(rotation[:, 0] * away), jnp.sum(away**2)
+
+    latest = jnp.maximum(flight_of(case).latest, case.delay)
+    times = case.delay + (latest - case.delay) * jnp.linspace(0.0, 1.0, _SAMPLES)
+    height, away = jax.vmap(above)(times)
+    crosses = (height[:-1] > 0.0) & (height[1:] <= 0.0)
+    nearest = jnp.argmin(jnp.where(crosses, away[1:], jnp.inf))
+
+    def halve(_: Array, between: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = between
+        middle = 0.5 * (low + high)
+        before = above(middle)[0] > 0.0
+        return jnp.where(before, middle, low), jnp.where(before, high, middle)
+
+    low, high = lax.fori_loop(0, _HALVINGS, halve, (times[nearest], times[nearest + 1]))
+    time = jnp.where(jnp.any(crosses), 0.5 * (low + high), plan.contact_time)
+    return dataclasses.replace(plan, motion=cut(motion, time - case.delay), contact_time=time)
+
+
+_end_each_at_contact = jax.jit(jax.vmap(_find_contact))
