@@ -107,11 +107,18 @@ def objects(leaves):
     case = SimpleNamespace(
         targets=tree(leaves, "targets"),
         net=tree(leaves, "net"),
-        limits=tree(leaves, "limits"),
+        limits=SimpleNamespace(
+            **{"acceleration": None, "min_thrust": None, "max_thrust": None, "rotors": None}
+            | vars(tree(leaves, "limits"))
+        ),
+        extras=(),
+        optional=False,
         **{name: leaves[name] for name in ("present", "horizon", "head_state", "gravity")},
     )
     trajectory = SimpleNamespace(coeffs=leaves["coeffs"], durations=leaves["durations"])
-    plan = SimpleNamespace(trajectory=trajectory, order=leaves["order"], times=leaves["times"])
+    plan = SimpleNamespace(
+        trajectory=trajectory, order=leaves["order"], times=leaves["times"], ending=None
+    )
     return case, plan
 
 

@@ -109,18 +109,19 @@ def volley(*, target=(3.0, 0.0, 0.0), flight_time=1.5, ball_vel=BALL_VEL, pieces
 def objects(leaves):
     """A case and a plan of the referee's own fields alone."""
 
-    def part(room):
+    def part(room, **optional):
         inside = {name.split(".")[1]: v for name, v in leaves.items() if name.startswith(room)}
-        return SimpleNamespace(**inside)
+        return SimpleNamespace(**optional | inside)
 
+    optional = {"racket_radius": None, "extras": ()}
     case = SimpleNamespace(
         ball=part("ball."),
-        limits=part("limits."),
+        limits=part("limits.", acceleration=None, min_thrust=None, max_thrust=None, rotors=None),
         hit_limits=part("hit_limits."),
-        **{name: leaf for name, leaf in leaves.items() if "." not in name},
+        **optional | {name: leaf for name, leaf in leaves.items() if "." not in name},
     )
     trajectory = SimpleNamespace(coeffs=leaves["coeffs"], durations=leaves["durations"])
-    return case, SimpleNamespace(trajectory=trajectory, stroke=part("stroke."))
+    return case, SimpleNamespace(trajectory=trajectory, stroke=part("stroke."), ending=None)
 
 
 def judge(leaves, **options) -> HitVerdict:

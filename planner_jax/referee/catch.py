@@ -1,10 +1,10 @@
 """Float64 NumPy referee of catch plans: the physics alone decides whether a plan succeeds.
 
-It shares no code with the planner: `referee.quadrotor` samples the returned polynomial and
-recomputes attitude and body rate from flatness; here the targets are followed along their
-paths and the net is held against them. A plan's own claims (status, cost) are not trusted; its
-order is checked, and the times of the catches that it claims are compared with those at which
-its pieces end. World frame, z up, SI units.
+No code is shared with the planners but the case's own extra limits (`referee.extras`):
+`referee.quadrotor` samples the returned polynomial and recomputes attitude and body rate from
+flatness; here the targets are followed along their paths and compared with the net. A plan's own
+claims (status, cost) are not trusted; its order is checked, and its times of the catches are
+compared with those at which its pieces end. World frame, z up, SI units.
 
 Paper 000 is "Catch Planner": eq. 9 ball with linear drag (with its constant), eq. 22 net centre
 p + l z_d, eq. 25 angle between z_d and minus the ball's velocity; z_d is the thrust direction.
@@ -25,46 +25,37 @@ from planner_jax.referee.judging import (
     finite_lanes,
     first_failures,
     judge_in_chunks,
+    read_leaves,
 )
 from planner_jax.referee.quadrotor import (
+    MOTION_SENTENCES,
+    MOTION_UNBOUNDED,
     check_sampling,
     checked_coeffs,
-    ending_leaves,
     intervals_of,
     judge_motion,
-    judge_rest,
-    limit_leaves,
     pieces_of,
+    read_flight,
     with_ending,
 )
-from planner_jax.referee.verdict import Verdict
+from planner_jax.referee.verdict import FlightVerdict
 
-# Limit -> what is said when it fails. In the order in which they are tested: a failed plan is
-# named after its first failure.
+_ORDER_OF_MOTION = (
+    *("head state", "continuity", "speed", "thrust low", "thrust high", "body rate"),
+    *("acceleration", "rotor low", "rotor high", "ground", "extra", "ending"),
+)
 _SENTENCES = {
     "not finite": "the plan or its case is not finite",
     "order": "{excess:.0f} wrong, the first at {time:.3f} s; every target that is caught must have "
     "one place, before the others",
     "catch time": "off by {excess:.3g} s at {time:.3f} s; catches must be at rising positive "
     "times, where their pieces end, and not after the target's horizon",
-    "head state": "the trajectory starts {excess:.3g} m off the head state",
-    "continuity": "the trajectory jumps by {excess:.3g} m at {time:.3f} s",
-    "speed": "{excess:.2%} above its limit at {time:.3f} s",
-    "thrust low": "{excess:.2%} below the least thrust at {time:.3f} s",
-    "thrust high": "{excess:.2%} above the greatest thrust at {time:.3f} s",
-    "body rate": "{excess:.2%} above its limit at {time:.3f} s",
-    "acceleration": "{excess:.2%} above its limit at {time:.3f} s",
-    "rotor low": "a rotor's thrust is {excess:.2%} of the greatest below the least at {time:.3f} s",
-    "rotor high": "{excess:.2%} above the greatest thrust of a rotor at {time:.3f} s",
-    "ground": "{excess:.2%} below the least height at {time:.3f} s",
-    "extra": "{excess:.2%} beyond extras[{worst_extra}] of the case at {time:.3f} s",
-    "ending": "the way to rest ends with what makes {excess:.3g} m of displacement",
+    **{name: MOTION_SENTENCES[name] for name in _ORDER_OF_MOTION},
     "net": "the target is {excess:.2%} outside the hoop's radius at {time:.3f} s",
     "net plane": "the target is {excess:.3g} m off the hoop's plane at {time:.3f} s",
     "angle": "{excess:.2%} above its limit between the net's axis and the target's way back at "
     "{time:.3f} s",
 }
-_UNBOUNDED = {"body rate": "no thrust or upside down, so without attitude, at {time:.3f} s"}
 LIMITS = tuple(_SENTENCES)
 
 # A target slower than this [m/s] is at rest: what is left of its velocity is rounding.
@@ -72,34 +63,22 @@ SLOWEST_TARGET = 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
-class CatchVerdict(Verdict):
-    """What the referee found, one entry a lane. What is measured may be NaN if inputs are.
+class CatchVerdict(FlightVerdict):
+    """What the referee found, one entry a lane.
 
     Entries (B, N) are in the order of catching, as `order` and `times` of the plan, and NaN
-    at a place where no target is left to be caught or a wrong one is named.
+    at an index where no target is left to be caught or a wrong one is named.
     """
 
     SENTENCES = _SENTENCES
-    UNBOUNDED = _UNBOUNDED
+    UNBOUNDED = MOTION_UNBOUNDED
 
-    max_speed: np.ndarray  # (B,) [m/s]
-    max_acceleration: np.ndarray  # (B,) [m/s^2]
-    max_body_rate: np.ndarray  # (B,) [rad/s], infinite where the attitude is not defined
-    min_thrust: np.ndarray  # (B,) [m/s^2], per unit mass
-    max_thrust: np.ndarray  # (B,) [m/s^2], per unit mass
-    min_height: np.ndarray  # (B,) [m]
-    # (B,) [N], of one rotor; NaN where the case has no limits of rotors.
-    min_rotor_thrust: np.ndarray
-    max_rotor_thrust: np.ndarray
     net_distance: np.ndarray  # (B, N) [m], from the net's centre to the target at the catch
     net_offset: np.ndarray  # (B, N) [m], its part along z_d: the target above the hoop's plane
     angle: np.ndarray  # (B, N) [rad], net's axis to target's way back; NaN for one at rest too
     catch_times: np.ndarray  # (B, N) [s], where the pieces up to each catch end
     caught: np.ndarray  # (B, N) bool: order, catch time, net and angle hold for that target
     num_caught: np.ndarray  # (B,) int
-    continuity_error: np.ndarray  # (B,) [m], worst jump between pieces, as displacement
-    head_error: np.ndarray  # (B,) [m], error at time 0, likewise
-    worst_extra: np.ndarray  # (B,) int, place of the extra that is kept worst; -1 without any
 
     def praise(self, k: int | tuple) -> str:
         """What is said of a success."""
@@ -174,8 +153,7 @@ def referee_catches(
     check_sampling(samples, chunk)
     if net_test not in ("plane", "ball"):
         raise ValueError(f'net_test must be "plane" or "ball", got {net_test!r}')
-    leaves = _leaves(cases, plans)
-    optional = bool(getattr(cases, "optional", False))
+    leaves = _read(cases, plans)
     shape = leaves["present"].shape
     # A broken lane is told by its verdict, not by a warning.
     with np.errstate(all="ignore"):
@@ -190,10 +168,10 @@ def referee_catches(
     leaves["target vel"] = checked_leaf("target_states' vel", vel, (*shape, 3))
     judge = functools.partial(
         _judge,
-        extras=getattr(cases, "extras", ()),
+        extras=cases.extras,
         intervals=intervals_of(samples, leaves["durations"].shape[1] // shape[1]),
         net_test=net_test,
-        optional=optional,
+        optional=bool(cases.optional),
         tolerances={
             "relative": tolerance,
             "contact": contact_tolerance,
@@ -203,33 +181,20 @@ def referee_catches(
     return CatchVerdict(**judge_in_chunks(judge, leaves, chunk))
 
 
-def _leaves(cases, plans) -> dict[str, np.ndarray]:
-    """Every array that the referee reads but those of the targets, by name, its shape checked."""
-    net, path = cases.net, plans.trajectory
-    coeffs, present = checked_coeffs(path.coeffs), np.asarray(cases.present)
+def _read(cases, plans) -> dict[str, np.ndarray]:
+    """Read all arrays but those of the targets, and check their shapes."""
+    coeffs, present = checked_coeffs(plans.trajectory.coeffs), np.asarray(cases.present)
     batch, pieces = coeffs.shape[:1], coeffs.shape[1]
     if present.ndim != 2 or present.shape[:1] != batch or 0 in present.shape[1:]:
         raise ValueError(f"present must be ({batch[0]}, N), got {present.shape}")
     num = present.shape[1]
     if pieces % num:
         raise ValueError(f"coeffs must have N * M pieces for N = {num} targets, got {pieces}")
-    trailing = {
-        "durations": (path.durations, (pieces,)),
-        "order": (plans.order, (num,)),
-        "times": (plans.times, (num,)),
-        "horizon": (cases.horizon, (num,)),
-        "head_state": (cases.head_state, (4, 3)),
-        "gravity": (cases.gravity, ()),
-        "net.height": (net.height, ()),
-        "net.radius": (net.radius, ()),
-        "net.max_angle": (net.max_angle, ()),
-        **limit_leaves(cases.limits),
-    }
-    leaves = {"lane": np.arange(len(coeffs)), "coeffs": coeffs, "present": present}
-    leaves |= ending_leaves(plans, batch)
-    for name, (value, shape) in trailing.items():
-        leaves[name] = checked_leaf(name, value, batch + shape)
-    return leaves
+    leaves = read_flight(cases, plans) | {"present": present}
+    shapes = {"horizon": (num,), "head_state": (4, 3)}
+    shapes |= {"net.height": (), "net.radius": (), "net.max_angle": ()}
+    leaves |= read_leaves(cases, shapes, len(coeffs))
+    return leaves | read_leaves(plans, {"order": (num,), "times": (num,)}, len(coeffs))
 
 
 def _ends(durations: np.ndarray, num: int) -> np.ndarray:
@@ -249,7 +214,8 @@ def _known_states(targets, order: np.ndarray, times: np.ndarray) -> tuple[np.nda
         finite[...] &= np.isfinite(value).all(axis=tuple(range(2, value.ndim)))
         return value
 
-    if hasattr(targets, "ball"):
+    fields = dir(targets)
+    if "ball" in fields:
         states = _ball_states(
             leaf("ball.pos", targets.ball.pos, 3),
             leaf("ball.vel", targets.ball.vel, 3),
@@ -257,14 +223,14 @@ def _known_states(targets, order: np.ndarray, times: np.ndarray) -> tuple[np.nda
             leaf("gravity", targets.gravity),
             times,
         )
-    elif hasattr(targets, "amplitude"):
+    elif "amplitude" in fields:
         vel, amplitude = leaf("vel", targets.vel, 3), leaf("amplitude", targets.amplitude, 3)
         rate = leaf("rate", targets.rate)[..., None]
         angle = rate * times[..., None] + leaf("phase", targets.phase)[..., None]
         start = leaf("pos", targets.pos, 3)
         pos = start + vel * times[..., None] + amplitude * np.sin(angle)
         states = pos, vel + amplitude * rate * np.cos(angle)
-    elif hasattr(targets, "resolution"):
+    elif "resolution" in fields:
         nodes = np.shape(targets.pos)[2] if np.ndim(targets.pos) == 4 else 0
         if nodes < 4:
             raise ValueError(f"targets.pos must be (B, N, T >= 4, 3), got {np.shape(targets.pos)}")
@@ -371,7 +337,6 @@ def _judge(
     motion, tests = judge_motion(
         whole, case, extras, intervals, tolerances["relative"], tolerances["continuity"]
     )
-    tests |= judge_rest(case, whole, tolerances["continuity"])
     flying = whole.flown.any(axis=1)
     tests = {
         name: (failed & flying, np.where(flying, excess, 0.0), time)

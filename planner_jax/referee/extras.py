@@ -1,14 +1,25 @@
-"""By how much a quadrotor exceeds the extra limits of a case, in float64, for the referee.
+"""The excess of a quadrotor over the extra limits of a case, in float64.
 
-It asks the extras themselves, which are the case's, for their excess at places on the polynomial.
+The referee calls the method `excess` of the case's own extras at points on the polynomial. This is
+the one piece of code that referee and planners share.
 """
 
 import dataclasses
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from planner_jax.referee.judging import derivative
+
+
+@runtime_checkable
+class ExtraLimit(Protocol):
+    """A limit of a case; other extras are terms of the planner's cost."""
+
+    def excess(self, pos: np.ndarray, vel: np.ndarray, acc: np.ndarray) -> np.ndarray:
+        """Return the relative excess (...) at points (..., 3) [m], [m/s], [m/s^2]."""
+        ...
+
 
 # Intervals between samples in which the excess is searched, and how many times each of them is cut
 # to a quarter.
@@ -24,7 +35,7 @@ def worst_extras(pieces: Any, lanes: np.ndarray, extras: tuple, u: np.ndarray) -
     samples u (S,) of every piece, and where lines through two of them on either side say that it
     may be greatest, it is searched in between. It is -1 without a limit.
     """
-    limits = [k for k, extra in enumerate(extras) if hasattr(extra, "excess")]
+    limits = [k for k, extra in enumerate(extras) if isinstance(extra, ExtraLimit)]
     worst, time, which = np.full(len(lanes), -1.0), np.zeros(len(lanes)), np.full(len(lanes), -1)
     for i, lane in enumerate(lanes.astype(int) if limits else ()):
         here = pieces.of(slice(i, i + 1))
@@ -75,5 +86,5 @@ def _worst_excess(pieces: Any, extra: Any, u: np.ndarray) -> tuple[float, float]
 def _of_lane(extra: Any, lane: int) -> Any:
     """An extra with the arrays of one lane in float64."""
     numbers = [f.name for f in dataclasses.fields(extra) if f.metadata.get("pytree_node", True)]
-    own = {name: np.asarray(getattr(extra, name), float)[lane] for name in numbers}
+    own = {name: np.asarray(vars(extra)[name], float)[lane] for name in numbers}
     return dataclasses.replace(extra, **own)

@@ -1,9 +1,10 @@
 """Float64 NumPy referee of hit plans: the physics alone decides whether a plan succeeds.
 
-It shares no code with the planner: `referee.quadrotor` samples the returned polynomial and
-recomputes attitude and body rate from flatness; here the ball is integrated, the impact applied
-and the ball followed to the ground. A plan's own claims (status, cost, stroke) are not trusted;
-only the impact time that it claims is compared. World frame, z up, ground at z = 0, SI units.
+No code is shared with the planners but the case's own extra limits (`referee.extras`):
+`referee.quadrotor` samples the returned polynomial and recomputes attitude and body rate from
+flatness; here the ball is integrated, the impact applied and the ball followed to the ground. A
+plan's own claims (status, cost, stroke) are not trusted; only its impact time is compared. World
+frame, z up, ground at z = 0, SI units.
 
 Paper 002 is "Bat Planner": eq. 2 drag, eq. 3 impact (with 1 + beta), eq. 18 limits. Body
 rates are those of the Hopf fibration at zero heading (Watterson and Kumar).
@@ -17,43 +18,29 @@ import numpy as np
 from planner_jax.referee.judging import (
     CONTACT_TIME_TOLERANCE,
     above,
-    checked_leaf,
     derivative,
     finite_lanes,
     first_failures,
     judge_in_chunks,
+    read_leaves,
 )
 from planner_jax.referee.quadrotor import (
+    MOTION_SENTENCES,
+    MOTION_UNBOUNDED,
     check_sampling,
-    checked_coeffs,
-    ending_leaves,
     intervals_of,
     judge_motion,
-    judge_rest,
-    limit_leaves,
     pieces_of,
+    read_flight,
     with_ending,
 )
-from planner_jax.referee.verdict import Verdict
+from planner_jax.referee.verdict import FlightVerdict
 
-# Limit -> what is said when it fails. In the order in which they are tested: a failed plan is
-# named after its first failure.
 _SENTENCES = {
     "not finite": "the plan or its case is not finite",
     "contact time": "off by {excess:.3g} s; it must be positive, the end of the trajectory "
     "({time:.3f} s), and before the ball lands",
-    "head state": "the trajectory starts {excess:.3g} m off the head state",
-    "continuity": "the trajectory jumps by {excess:.3g} m at {time:.3f} s",
-    "speed": "{excess:.2%} above its limit at {time:.3f} s",
-    "acceleration": "{excess:.2%} above its limit at {time:.3f} s",
-    "body rate": "{excess:.2%} above its limit at {time:.3f} s",
-    "thrust low": "{excess:.2%} below the least thrust at {time:.3f} s",
-    "thrust high": "{excess:.2%} above the greatest thrust at {time:.3f} s",
-    "rotor low": "a rotor's thrust is {excess:.2%} of the greatest below the least at {time:.3f} s",
-    "rotor high": "{excess:.2%} above the greatest thrust of a rotor at {time:.3f} s",
-    "ground": "{excess:.2%} below the least height at {time:.3f} s",
-    "extra": "{excess:.2%} beyond extras[{worst_extra}] of the case at {time:.3f} s",
-    "ending": "the way to rest ends with what makes {excess:.3g} m of displacement",
+    **MOTION_SENTENCES,
     "hitting speed x": "{excess:.2%} above its limit at {time:.3f} s",
     "hitting speed y": "{excess:.2%} above its limit at {time:.3f} s",
     "hitting speed z": "{excess:.2%} above its limit at {time:.3f} s",
@@ -63,11 +50,12 @@ _SENTENCES = {
     "apex high": "{excess:.2%} above the greatest apex at {time:.3f} s",
     "landing": "the ball lands {excess:.3g} m from the target at {time:.3f} s",
 }
-_UNBOUNDED = {
-    "body rate": "no thrust or upside down, so without attitude, at {time:.3f} s",
-    "landing": "the ball never comes down to the target's height; its apex is at {time:.3f} s",
-}
 LIMITS = tuple(_SENTENCES)
+_CASE_SHAPES = {
+    **{"ball.pos": (3,), "ball.vel": (3,), "head_state": (4, 3), "target": (3,), "drag": ()},
+    **{"restitution": (), "racket_height": (), "racket_radius": ()},
+    **{"hit_limits.hitting_speed": (3,), "hit_limits.min_apex": (), "hit_limits.max_apex": ()},
+}
 
 # Runge-Kutta: steps up to the impact; step and longest flight [s] after it.
 _INCOMING_STEPS = 60
@@ -78,29 +66,19 @@ RIM = 0.9
 
 
 @dataclasses.dataclass(frozen=True)
-class HitVerdict(Verdict):
-    """What the referee found, one entry a lane. What is measured may be NaN if inputs are."""
+class HitVerdict(FlightVerdict):
+    """What the referee found, one entry a lane."""
 
     SENTENCES = _SENTENCES
-    UNBOUNDED = _UNBOUNDED
+    UNBOUNDED = MOTION_UNBOUNDED | {
+        "landing": "the ball never comes down to the target's height; its apex is at {time:.3f} s"
+    }
 
-    max_speed: np.ndarray  # (B,) [m/s]
-    max_acceleration: np.ndarray  # (B,) [m/s^2]
-    max_body_rate: np.ndarray  # (B,) [rad/s], infinite where the attitude is not defined
-    min_height: np.ndarray  # (B,) [m]
-    min_thrust: np.ndarray  # (B,) [m/s^2], per unit mass
-    max_thrust: np.ndarray  # (B,) [m/s^2], per unit mass
-    # (B,) [N], of one rotor; NaN where the case has no limits of rotors.
-    min_rotor_thrust: np.ndarray
-    max_rotor_thrust: np.ndarray
     hitting_velocity: np.ndarray  # (B, 3) [m/s], of the quadrotor at the impact
     apex: np.ndarray  # (B,) [m], of the ball after the impact
     landing_point: np.ndarray  # (B, 3) [m], NaN where the ball does not come down to the target
     landing_error: np.ndarray  # (B,) [m], horizontal; infinite where it does not come down
     contact_error: np.ndarray  # (B,) [m], racket centre to ball at the impact
-    continuity_error: np.ndarray  # (B,) [m], worst jump between pieces, as displacement
-    head_error: np.ndarray  # (B,) [m], error at time 0, likewise
-    worst_extra: np.ndarray  # (B,) int, place of the extra that is kept worst; -1 without any
 
     def praise(self, k: int | tuple) -> str:
         """What is said of a success."""
@@ -154,7 +132,9 @@ def referee_hits(
         ValueError: a leaf has the wrong shape, `samples` < 200 or `chunk` < 1.
     """
     check_sampling(samples, chunk)
-    leaves = _leaves(cases, plans)
+    leaves = read_flight(cases, plans)
+    leaves |= read_leaves(cases, _CASE_SHAPES, len(leaves["lane"]))
+    leaves |= read_leaves(plans, {"stroke.time": ()}, len(leaves["lane"]))
     tolerances = {
         "relative": tolerance,
         "landing": landing_tolerance,
@@ -163,41 +143,12 @@ def referee_hits(
     }
     judge = functools.partial(
         _judge,
-        extras=getattr(cases, "extras", ()),
+        extras=cases.extras,
         intervals=intervals_of(samples, leaves["durations"].shape[1]),
         drag_after_impact=drag_after_impact,
         tolerances=tolerances,
     )
     return HitVerdict(**judge_in_chunks(judge, leaves, chunk))
-
-
-def _leaves(cases, plans) -> dict[str, np.ndarray]:
-    """Every array that the referee reads, by name, its shape checked."""
-    stroke_limits, path = cases.hit_limits, plans.trajectory
-    radius = getattr(cases, "racket_radius", None)
-    coeffs = checked_coeffs(path.coeffs)
-    trailing = {
-        "durations": (path.durations, coeffs.shape[1:2]),
-        "stroke.time": (plans.stroke.time, ()),
-        "ball.pos": (cases.ball.pos, (3,)),
-        "ball.vel": (cases.ball.vel, (3,)),
-        "head_state": (cases.head_state, (4, 3)),
-        "target": (cases.target, (3,)),
-        "drag": (cases.drag, ()),
-        "gravity": (cases.gravity, ()),
-        "restitution": (cases.restitution, ()),
-        "racket_height": (cases.racket_height, ()),
-        **({} if radius is None else {"racket_radius": (radius, ())}),
-        **limit_leaves(cases.limits),
-        "hit_limits.hitting_speed": (stroke_limits.hitting_speed, (3,)),
-        "hit_limits.min_apex": (stroke_limits.min_apex, ()),
-        "hit_limits.max_apex": (stroke_limits.max_apex, ()),
-    }
-    leaves = {"lane": np.arange(len(coeffs)), "coeffs": coeffs}
-    leaves |= ending_leaves(plans, coeffs.shape[:1])
-    for name, (value, shape) in trailing.items():
-        leaves[name] = checked_leaf(name, value, coeffs.shape[:1] + shape)
-    return leaves
 
 
 def _judge(
@@ -209,7 +160,6 @@ def _judge(
         pieces, case, extras, intervals, tolerances["relative"], tolerances["continuity"]
     )
     at_impact, impact_tests = _judge_impact(case, drag_after_impact, tolerances)
-    tests |= judge_rest(case, pieces, tolerances["continuity"])
     return first_failures(tests | impact_tests, LIMITS, finite_lanes(case)) | measured | at_impact
 
 

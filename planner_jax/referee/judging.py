@@ -1,15 +1,14 @@
-"""What every referee does with lanes: checks leaves, shares lanes out, names first failures.
-
-In float64 NumPy; it shares no code with the planners.
-"""
+"""What every referee does with lanes: read leaves, share lanes out, name first failures."""
 
 import functools
 import math
+import operator
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from planner_jax.referee.workers import cores, workers
 
@@ -23,49 +22,73 @@ _FEWEST_LANES = 256
 _MANY_LANES, _MANY_CORES = 16384, 4
 
 
-def checked_leaf(name: str, value, shape: tuple[int, ...]) -> np.ndarray:
-    """A leaf as an array; ValueError if it does not have this shape."""
+def checked_leaf(name: str, value: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
+    """Return a leaf as an array; raise ValueError unless it has this shape."""
     leaf = np.asarray(value)
     if leaf.shape != shape:
         raise ValueError(f"{name} must be {shape}, got {leaf.shape}")
     return leaf
 
 
+def read_leaves(
+    tree: object, shapes: Mapping[str, tuple[int, ...]], num_lanes: int, prefix: str = ""
+) -> dict[str, np.ndarray]:
+    """Read arrays of a case or a plan, and check their shapes.
+
+    Args:
+        tree: object whose leaves have a leading axis of lanes.
+        shapes: path of field names, such as "ball.pos", -> shape in one lane.
+        num_lanes: B.
+        prefix: put before each path in the names of the arrays and in errors.
+
+    Returns:
+        Arrays by name. A field that is None is left out.
+
+    Raises:
+        ValueError: an array has another shape.
+    """
+    values = {path: operator.attrgetter(path)(tree) for path in shapes}
+    return {
+        prefix + path: checked_leaf(prefix + path, value, (num_lanes, *shapes[path]))
+        for path, value in values.items()
+        if value is not None
+    }
+
+
 def flat(values: np.ndarray) -> np.ndarray:
-    """(B, ...) as (B, N); the empty batch too."""
+    """Return (B, ...) as (B, N); the empty batch too."""
     return values.reshape(len(values), math.prod(values.shape[1:]))
 
 
 def cut(num_lanes: int, size: int) -> list[slice]:
-    """Runs of so many lanes; one of no lanes if there are none."""
+    """Cut lanes into slices of a size; one empty slice if there are no lanes."""
     return [slice(start, start + size) for start in range(0, max(num_lanes, 1), size)]
 
 
 def judge_in_chunks(
     judge: Callable[[dict], dict], leaves: dict[str, np.ndarray], chunk: int
 ) -> dict[str, np.ndarray]:
-    """The fields of a verdict from leaves with leading axis B, up to `chunk` lanes at once.
+    """Return the fields of a verdict from leaves with leading axis B, by chunks of lanes.
 
-    The lanes are shared among threads, one for each core that it may keep busy: NumPy lets go of
-    the interpreter inside its loops. Many lanes and many cores are worth processes, if `judge` can
-    be sent.
+    Threads share the lanes, one for each core: NumPy releases the interpreter inside its loops.
+    Processes share them if there are many lanes and many cores, and `judge` can be pickled.
     """
     num_lanes, num_cores = len(next(iter(leaves.values()))), cores()
     size = min(chunk, max(math.ceil(num_lanes / num_cores), _FEWEST_LANES))
-    judged = functools.partial(_judged, judge)
+    judge_part = functools.partial(_judge_in_float64, judge)
     cases = [{name: leaf[lanes] for name, leaf in leaves.items()} for lanes in cut(num_lanes, size)]
     if min(len(cases), num_cores) == 1:
-        parts = [judged(case) for case in cases]
+        parts = [judge_part(case) for case in cases]
     elif num_cores >= _MANY_CORES and num_lanes >= _MANY_LANES and _can_be_sent(judge):
-        parts = workers().map(judged, cases)
+        parts = workers().map(judge_part, cases)
     else:
         with ThreadPoolExecutor(num_cores) as pool:
-            parts = list(pool.map(judged, cases))
+            parts = list(pool.map(judge_part, cases))
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def _judged(judge: Callable[[dict], dict], case: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    # A broken or absurd lane may overflow; its verdict says so, not a warning.
+def _judge_in_float64(judge: Callable[[dict], dict], case: dict[str, np.ndarray]) -> dict:
+    # A broken or absurd lane may overflow; its verdict reports that, not a warning.
     with np.errstate(all="ignore"):
         return judge({name: leaf.astype(np.float64) for name, leaf in case.items()})
 
@@ -79,7 +102,7 @@ def _can_be_sent(judge: Callable) -> bool:
 
 
 def finite_lanes(case: dict, unbounded: tuple[str, ...] = ()) -> np.ndarray:
-    """Lanes (B,) whose inputs are finite; limits and `unbounded` may be infinite, but not NaN."""
+    """Return which lanes (B,) are finite; limits and `unbounded` may be infinite, but not NaN."""
     finite = np.ones(len(next(iter(case.values()))), bool)
     for name, leaf in case.items():
         limit = "limits." in name or name in unbounded
@@ -89,13 +112,13 @@ def finite_lanes(case: dict, unbounded: tuple[str, ...] = ()) -> np.ndarray:
 
 
 def first_failures(tests: dict, limits: tuple[str, ...], finite: np.ndarray) -> dict:
-    """Success, failed limit, its time and excess of every lane.
+    """Return success, failed limit, its time and its excess of every lane.
 
     Args:
         tests: name -> failed, excess, time, each (B,).
-        limits: the names in the order in which they are tested, after "not finite"; those without
-            a test are passed over.
-        finite: (B,) bool, lanes whose inputs are.
+        limits: "not finite", then the names in the order of the tests; names without a test are
+            skipped.
+        finite: (B,) bool, lanes whose inputs are finite.
     """
     limits = (limits[0], *(name for name in limits[1:] if name in tests))
     failed = np.stack([tests[name][0] for name in limits[1:]], axis=1)
@@ -115,15 +138,15 @@ def first_failures(tests: dict, limits: tuple[str, ...], finite: np.ndarray) -> 
     }
 
 
-def above(value, limit, tolerance: float, time) -> tuple:
-    """Test of value <= limit: failed, relative excess, time."""
+def above(value: np.ndarray, limit: np.ndarray, tolerance: float, time: np.ndarray) -> tuple:
+    """Test value <= limit: failed, relative excess, time."""
     scale = np.where(np.isinf(limit), 1.0, np.maximum(np.abs(limit), SMALLEST_LIMIT))
     excess = (value - limit) / scale
     return excess > tolerance, excess, time
 
 
 def derivative(coeffs: np.ndarray, times: np.ndarray, order: int) -> np.ndarray:
-    """A derivative (3, ...) of polynomials (D + 1, 3, ...) at times (...) since they began."""
+    """Return a derivative (3, ...) of polynomials (D + 1, 3, ...) at times (...) [s]."""
     value = np.zeros(np.broadcast_shapes(coeffs.shape[1:], times.shape))
     for k in range(len(coeffs) - 1, order - 1, -1):
         value *= times

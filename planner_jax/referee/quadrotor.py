@@ -1,8 +1,8 @@
-"""What a referee asks of a quadrotor's trajectory, in float64: motion, peaks, head state, joints.
+"""Tests of a quadrotor's trajectory in float64: motion, peaks, head state, joints, rest.
 
-It shares no code with the planners: polynomial pieces are sampled, attitude and body rate come
-from flatness (the Hopf fibration at zero heading; Watterson and Kumar). World frame, z up, SI
-units.
+No code is shared with the planners but the case's own extra limits (`referee.extras`). Polynomial
+pieces are sampled; attitude and body rate come from flatness (the Hopf fibration at zero heading;
+Watterson and Kumar). World frame, z up, SI units.
 """
 
 import dataclasses
@@ -10,10 +10,29 @@ import math
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from planner_jax.referee.extras import worst_extras
-from planner_jax.referee.judging import above, checked_leaf, cut, derivative, flat
+from planner_jax.referee.judging import above, checked_leaf, cut, derivative, flat, read_leaves
 from planner_jax.referee.rotors import rotor_thrusts
+
+# Limit -> sentence for its failure.
+MOTION_SENTENCES = {
+    "head state": "the trajectory starts {excess:.3g} m off the head state",
+    "continuity": "the trajectory jumps by {excess:.3g} m at {time:.3f} s",
+    "speed": "{excess:.2%} above its limit at {time:.3f} s",
+    "acceleration": "{excess:.2%} above its limit at {time:.3f} s",
+    "body rate": "{excess:.2%} above its limit at {time:.3f} s",
+    "thrust low": "{excess:.2%} below the least thrust at {time:.3f} s",
+    "thrust high": "{excess:.2%} above the greatest thrust at {time:.3f} s",
+    "rotor low": "a rotor's thrust is {excess:.2%} of the greatest below the least at {time:.3f} s",
+    "rotor high": "{excess:.2%} above the greatest thrust of a rotor at {time:.3f} s",
+    "ground": "{excess:.2%} below the least height at {time:.3f} s",
+    "extra": "{excess:.2%} beyond extras[{worst_extra}] of the case at {time:.3f} s",
+    "ending": "the way to rest ends with what makes {excess:.3g} m of displacement",
+}
+MOTION_UNBOUNDED = {"body rate": "no thrust or upside down, so without attitude, at {time:.3f} s"}
+_ROTOR_SHAPES = {"mass": (), "inertia": (3,), "mixer": (4, 4), "min_thrust": (), "max_thrust": ()}
 
 # Jumps of derivatives count as displacement over one piece, or over this time [s] if longer.
 SHORTEST_PIECE = 0.1
@@ -38,13 +57,13 @@ class Pieces:
     flown: np.ndarray  # (B, M) bool
 
     def of(self, lanes: slice) -> "Pieces":
-        """The pieces of some lanes."""
+        """Return the pieces of some lanes."""
         rest = (part[lanes] for part in (self.durations, self.starts, self.flown))
         return Pieces(self.coeffs[:, lanes], *rest)
 
 
 def pieces_of(coeffs: np.ndarray, durations: np.ndarray, flown: np.ndarray | None = None) -> Pieces:
-    """The pieces of a batch of trajectories.
+    """Return the pieces of a batch of trajectories.
 
     Args:
         coeffs: (B, M, D + 1, 3), rising powers of the time [s] since the piece's start.
@@ -65,19 +84,8 @@ def pieces_of(coeffs: np.ndarray, durations: np.ndarray, flown: np.ndarray | Non
     return Pieces(np.ascontiguousarray(coeffs), durations, starts, flown)
 
 
-def ending_leaves(plans: Any, batch: tuple[int, ...]) -> dict[str, np.ndarray]:
-    """The way to rest of plans, by name, its shape checked; none where they have none."""
-    ending = getattr(plans, "ending", None)
-    if ending is None:
-        return {}
-    coeffs = checked_coeffs(ending.coeffs)
-    durations = checked_leaf("ending.durations", ending.durations, (*batch, coeffs.shape[1]))
-    checked_leaf("ending.coeffs", coeffs, (*batch, *coeffs.shape[1:]))
-    return {"ending.coeffs": coeffs, "ending.durations": durations}
-
-
 def with_ending(pieces: Pieces, case: dict) -> Pieces:
-    """The pieces of trajectories with those of their ways to rest, if there are any."""
+    """Return the pieces of trajectories and of their endings, if there are any."""
     if "ending.coeffs" not in case:
         return pieces
     durations = case["ending.durations"]
@@ -98,31 +106,8 @@ def with_ending(pieces: Pieces, case: dict) -> Pieces:
     )
 
 
-def judge_rest(case: dict, pieces: Pieces, continuity: float) -> dict:
-    """The test of ways to rest, by name; none where there are none.
-
-    Velocity, acceleration and jerk at the end count as displacement, as those between pieces do.
-    """
-    if "ending.coeffs" not in case:
-        return {}
-    durations = case["ending.durations"]
-    last = np.moveaxis(case["ending.coeffs"][:, -1], 0, -1)
-    period = np.maximum(durations.mean(axis=1), SHORTEST_PIECE)
-    moved = np.stack(
-        [
-            np.linalg.norm(derivative(last, durations[:, -1], order), axis=0)
-            * (period**order / math.factorial(order))
-            for order in (1, 2, 3)
-        ]
-    ).max(axis=0)
-    scale = np.maximum(np.abs(pieces.coeffs[..., 0]).max(axis=(0, 2)), 1.0)
-    late = (durations <= 0.0).any(axis=1)
-    failed = ~(moved <= continuity * scale) | late
-    return {"ending": (failed, moved, pieces.starts[:, -1] + pieces.durations[:, -1])}
-
-
 def check_sampling(samples: int, chunk: int) -> None:
-    """Raise ValueError for sizes that a referee does not take."""
+    """Raise ValueError for sizes that a referee does not accept."""
     if samples < 200:
         raise ValueError(f"samples must be >= 200, got {samples}")
     if chunk < 1:
@@ -130,32 +115,43 @@ def check_sampling(samples: int, chunk: int) -> None:
 
 
 def intervals_of(samples: int, num_pieces: int) -> int:
-    """Intervals between the samples of one of the pieces that `samples` are shared among."""
+    """Return the intervals between samples of one piece, if pieces share `samples`."""
     return max(math.ceil(samples / num_pieces), _FEWEST_INTERVALS)
 
 
-def checked_coeffs(value) -> np.ndarray:
-    """Coefficients as an array; ValueError if they are not (B, M, D + 1, 3)."""
+def checked_coeffs(value: ArrayLike) -> np.ndarray:
+    """Return coefficients as an array; raise ValueError unless they are (B, M, D + 1, 3)."""
     coeffs = np.asarray(value)
     if coeffs.ndim != 4 or coeffs.shape[-1] != 3 or 0 in coeffs.shape[1:]:
         raise ValueError(f"coeffs must be (B, M, D + 1, 3), got {coeffs.shape}")
     return coeffs
 
 
-def limit_leaves(limits: Any) -> dict[str, tuple[Any, tuple[int, ...]]]:
-    """The limits that there are, by name, each with its shape in one case."""
-    names = ("speed", "acceleration", "body_rate", "min_thrust", "max_thrust", "min_height")
-    found: dict[str, Any] = {f"limits.{name}": (getattr(limits, name, None), ()) for name in names}
-    if (rotors := getattr(limits, "rotors", None)) is not None:
-        of_rotors: dict[str, Any] = {"mass": (), "inertia": (3,), "mixer": (4, 4)}
-        of_rotors |= {"min_thrust": (), "max_thrust": ()}
-        for name, shape in of_rotors.items():
-            found[f"limits.rotors.{name}"] = getattr(rotors, name), shape
-    return {name: leaf for name, leaf in found.items() if leaf[0] is not None}
+def read_flight(cases: Any, plans: Any) -> dict[str, np.ndarray]:
+    """Read the arrays of cases and plans that `judge_motion` needs but the head state.
+
+    The optional limits are those that are not None: acceleration, thrust, rotors. So is the
+    trajectory to rest behind the plan, `ending`.
+    """
+    coeffs = checked_coeffs(plans.trajectory.coeffs)
+    num_lanes, num_pieces = coeffs.shape[:2]
+    leaves = {"lane": np.arange(num_lanes), "coeffs": coeffs}
+    durations = plans.trajectory.durations
+    leaves["durations"] = checked_leaf("durations", durations, (num_lanes, num_pieces))
+    limits = ("speed", "acceleration", "body_rate", "min_thrust", "max_thrust", "min_height")
+    shapes = {"gravity": ()} | {f"limits.{name}": () for name in limits}
+    leaves |= read_leaves(cases, shapes, num_lanes)
+    if cases.limits.rotors is not None:
+        leaves |= read_leaves(cases.limits.rotors, _ROTOR_SHAPES, num_lanes, "limits.rotors.")
+    if plans.ending is not None:
+        coeffs = checked_coeffs(plans.ending.coeffs)
+        shapes = {"coeffs": coeffs.shape[1:], "durations": coeffs.shape[1:2]}
+        leaves |= read_leaves(plans.ending, shapes, num_lanes, "ending.")
+    return leaves
 
 
 def _judge_rotors(pieces: Pieces, case: dict, u: np.ndarray, relative: float) -> tuple[dict, dict]:
-    """Least and greatest thrust (B,) [N] that a rotor has at the samples u (S,), and the tests."""
+    """Return least and greatest thrust (B,) [N] of a rotor at samples u (S,), and the tests."""
     parts = [
         _rotor_range(pieces.of(lanes), {name: leaf[lanes] for name, leaf in case.items()}, u)
         for lanes in cut(len(pieces.durations), max(_PRODUCT // (pieces.flown[0].size * u.size), 1))
@@ -174,7 +170,7 @@ def _judge_rotors(pieces: Pieces, case: dict, u: np.ndarray, relative: float) ->
 
 
 def _rotor_range(pieces: Pieces, case: dict, u: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Least thrust (B,) [N] of a rotor and its time, and the greatest and its time."""
+    """Return least thrust (B,) [N] of a rotor and its time, greatest thrust and its time."""
     times = pieces.durations[:, :, None] * u
     body = (case[f"limits.rotors.{name}"] for name in ("mass", "inertia", "mixer"))
     thrusts = rotor_thrusts(pieces.coeffs, times, case["gravity"], *body)
@@ -188,7 +184,7 @@ def _rotor_range(pieces: Pieces, case: dict, u: np.ndarray) -> tuple[np.ndarray,
 
 
 def _motion(pieces: Pieces, u: np.ndarray) -> list:
-    """Derivatives (3, B, M, S) of order 0 to 3 at the same fractions u (S,) of all pieces."""
+    """Return derivatives (3, B, M, S) of order 0 to 3 at fractions u (S,) of all pieces."""
     durations, num = pieces.durations, pieces.coeffs.shape[-1]
     spans = np.vander(durations.ravel(), num, increasing=True)
     powers = np.vander(u, num, increasing=True).T
@@ -203,17 +199,17 @@ def _motion(pieces: Pieces, u: np.ndarray) -> list:
 
 
 def _squared(vector: np.ndarray) -> np.ndarray:
-    """Squared length of vectors (3, ...)."""
+    """Return the squared length of vectors (3, ...)."""
     return vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2
 
 
 def _thrust_squared(gravity, acc: np.ndarray) -> np.ndarray:
-    """|a + g e_3|^2 of accelerations (3, ...)."""
+    """Return |a + g e_3|^2 of accelerations (3, ...)."""
     return acc[0] ** 2 + acc[1] ** 2 + (acc[2] + gravity) ** 2
 
 
 def _body_rate_squared(gravity, acc: np.ndarray, jerk: np.ndarray) -> np.ndarray:
-    """|omega|^2 of the Hopf fibration at zero heading, from c = tau x jerk.
+    """Return |omega|^2 of the Hopf fibration at zero heading, from c = tau x jerk.
 
     z' = (c / |tau|^2) x z, so |z'| = |c| / |tau|^2, and the yaw rate
     (z_y z_x' - z_x z_y') / (1 + z_z) is -c_z / (|tau| (|tau| + tau_z)).
@@ -241,10 +237,10 @@ _MEASURES = {
 
 
 def _tops(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What samples (N, M, S) of M pieces show; they are overwritten.
+    """Return the greatest of samples (N, M, S) of M pieces, and the likeliest peak.
 
-    Index (N,) of the greatest one among the M S, its value, and the index next to the greatest
-    parabola through three samples of a piece.
+    The samples are overwritten. Results are the index (N,) of the greatest sample among the M S,
+    its value, and the index next to the greatest parabola through three samples of a piece.
     """
     line, rows = values.ravel(), flat(values)
     top = rows.argmax(axis=1)
@@ -259,10 +255,10 @@ def _tops(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def peaks(pieces: Pieces, gravity: np.ndarray, intervals: int) -> dict[str, tuple]:
-    """Greatest value (B,) of every measure along the trajectory, and its time (B,) [s].
+    """Return the greatest value (B,) of every measure along the trajectory, and its time [s].
 
     Every piece is sampled at both ends and inside; the likeliest peak by parabolas through
-    three samples is then searched on the polynomial itself, so that what is found is reached.
+    three samples is then searched on the polynomial itself, so that the value is reached.
     """
     u = np.linspace(0.0, 1.0, intervals + 1)
     parts = [_peaks(pieces.of(lanes), gravity[lanes], u) for lanes in cut(len(gravity), _SEARCHED)]
@@ -275,17 +271,17 @@ def peaks(pieces: Pieces, gravity: np.ndarray, intervals: int) -> dict[str, tupl
 
 
 def _peaks(pieces: Pieces, gravity: np.ndarray, u: np.ndarray) -> dict[str, tuple]:
-    """`peaks` of as many lanes as are searched at once; the samples are at fractions u (S,)."""
+    """Return `peaks` of the lanes that are searched at once, sampled at fractions u (S,)."""
     num_lanes, num_pieces = pieces.durations.shape
     products = num_pieces * pieces.coeffs.shape[-1] * len(u)
     tiles = cut(num_lanes, max(_PRODUCT // products, 1))
-    sampled = [_sampled(pieces.of(tile), gravity[tile], u) for tile in tiles]
+    sampled = [_sample(pieces.of(tile), gravity[tile], u) for tile in tiles]
     top, greatest, likeliest, sharpest, turn = (
         np.concatenate(parts, axis=-1) for parts in zip(*sampled, strict=True)
     )
     peaks = {
         name: _greater(
-            _searched(name, pieces, gravity, likeliest[i], u),
+            _search(name, pieces, gravity, likeliest[i], u),
             (greatest[i], _time(pieces, top[i], u)),
         )
         for i, name in enumerate(_MEASURES)
@@ -294,8 +290,8 @@ def _peaks(pieces: Pieces, gravity: np.ndarray, u: np.ndarray) -> dict[str, tupl
     return peaks
 
 
-def _sampled(pieces: Pieces, gravity: np.ndarray, u: np.ndarray) -> tuple:
-    """What the samples show: `_tops` of every measure, (6, B), and `_fastest_turn`, (B,)."""
+def _sample(pieces: Pieces, gravity: np.ndarray, u: np.ndarray) -> tuple:
+    """Return `_tops` of every measure, (6, B), and `_fastest_turn`, (B,)."""
     motion = _motion(pieces, u)
     gravity = gravity[:, None, None]
     values = np.empty((len(_MEASURES), *motion[0].shape[1:]))
@@ -307,14 +303,14 @@ def _sampled(pieces: Pieces, gravity: np.ndarray, u: np.ndarray) -> tuple:
 
 
 def _time(pieces: Pieces, index: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Time (B,) [s] of one sample a lane, counted through all of its pieces."""
+    """Return the time (B,) [s] of one sample a lane, counted through all of its pieces."""
     piece, sample = np.divmod(index, len(u))
     lanes = np.arange(len(index))
     return pieces.starts[lanes, piece] + pieces.durations[lanes, piece] * u[sample]
 
 
-def _searched(name: str, pieces: Pieces, gravity, likeliest, u: np.ndarray) -> tuple:
-    """Greatest value (B,) of a measure up to one sample away from a sample a lane; its time."""
+def _search(name: str, pieces: Pieces, gravity, likeliest, u: np.ndarray) -> tuple:
+    """Search the greatest value (B,) of a measure around one sample a lane; return its time too."""
     orders, measure = _MEASURES[name]
     piece, sample = np.divmod(likeliest, len(u))
     lanes = np.arange(len(piece))
@@ -330,15 +326,15 @@ def _searched(name: str, pieces: Pieces, gravity, likeliest, u: np.ndarray) -> t
 
 
 def _greater(first: tuple, second: tuple) -> tuple[np.ndarray, np.ndarray]:
-    """The greater of two values, lane by lane, with its time."""
+    """Return the greater of two values, lane by lane, with its time."""
     better = second[0] > first[0]
     return np.where(better, second[0], first[0]), np.where(better, second[1], first[1])
 
 
 def _fastest_turn(acc, gravity, pieces: Pieces, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Sample (B,) before the fastest turn of the thrust to the next sample; squared body rate.
+    """Return the sample (B,) before the fastest turn of the thrust, and the squared body rate.
 
-    The mean over a step, so never above the true maximum. It is what betrays a thrust that
+    The rate is the mean over a step, so never above the true maximum. It reveals a thrust that
     passes through zero between two samples and turns the quadrotor over at once.
     """
     tau = acc.copy()
@@ -358,7 +354,7 @@ def _fastest_turn(acc, gravity, pieces: Pieces, u: np.ndarray) -> tuple[np.ndarr
 
 
 def joint_errors(pieces: Pieces, head_state: np.ndarray) -> tuple:
-    """Errors of head state and joints as displacement [m], time of the worst joint, scale [m].
+    """Return errors of head state and joints [m], time of the worst joint, and scale [m].
 
     An error e_n of the n-th derivative (n = 0..3) counts as the displacement |e_n| h^n / n!
     that it makes over one mean piece h, at least `SHORTEST_PIECE`. The scale is the largest
@@ -391,12 +387,11 @@ def joint_errors(pieces: Pieces, head_state: np.ndarray) -> tuple:
 def judge_motion(
     pieces: Pieces, case: dict, extras: tuple, intervals: int, relative: float, continuity: float
 ) -> tuple[dict, dict]:
-    """What a trajectory does, and the tests of it: name -> failed, excess, time.
+    """Return the measurements of `FlightVerdict`, and tests: name -> failed, excess, time.
 
     Args:
         pieces: of B lanes.
-        case: leaves with leading axis B: "head_state", "gravity", "lane" among all cases, and
-            the limits of `limit_leaves`, which are those that are tested.
+        case: leaves with leading axis B: "head_state", and those of `read_flight`.
         extras: of all cases.
         intervals: between the samples of one piece.
         relative: tolerance of every limit.
@@ -442,4 +437,27 @@ def judge_motion(
     else:
         unknown = np.full(len(head), np.nan)
         measured |= {"min_rotor_thrust": unknown, "max_rotor_thrust": unknown}
-    return measured, tests
+    return measured, tests | _judge_rest(case, pieces, continuity)
+
+
+def _judge_rest(case: dict, pieces: Pieces, continuity: float) -> dict:
+    """Test that trajectories behind plans end at rest; no test without such trajectories.
+
+    Velocity, acceleration and jerk at the end count as displacement, as jumps between pieces do.
+    """
+    if "ending.coeffs" not in case:
+        return {}
+    durations = case["ending.durations"]
+    last = np.moveaxis(case["ending.coeffs"][:, -1], 0, -1)
+    period = np.maximum(durations.mean(axis=1), SHORTEST_PIECE)
+    moved = np.stack(
+        [
+            np.linalg.norm(derivative(last, durations[:, -1], order), axis=0)
+            * (period**order / math.factorial(order))
+            for order in (1, 2, 3)
+        ]
+    ).max(axis=0)
+    scale = np.maximum(np.abs(pieces.coeffs[..., 0]).max(axis=(0, 2)), 1.0)
+    late = (durations <= 0.0).any(axis=1)
+    failed = ~(moved <= continuity * scale) | late
+    return {"ending": (failed, moved, pieces.starts[:, -1] + pieces.durations[:, -1])}

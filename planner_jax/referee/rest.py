@@ -1,7 +1,7 @@
-"""Float64 NumPy referee of ways to rest behind a plan's end, by themselves; one part a robot.
+"""Float64 NumPy referee of trajectories to rest behind a plan's end; one function a robot.
 
-It shares no code with the planners. A way has to go on where the plan ends, keep every limit and
-rest in the end, whatever is true of the plan.
+Such a trajectory has to continue where the plan ends, keep every limit and end at rest, whatever
+is true of the plan. No code is shared with the planners but the case's own extra limits.
 """
 
 import dataclasses
@@ -11,31 +11,25 @@ from types import SimpleNamespace
 import numpy as np
 
 from planner_jax.referee.block import referee_blocks
-from planner_jax.referee.hit import HitVerdict
 from planner_jax.referee.intercept import final_poses, referee_intercepts
 from planner_jax.referee.judging import (
-    checked_leaf,
     derivative,
     finite_lanes,
     first_failures,
     judge_in_chunks,
 )
 from planner_jax.referee.quadrotor import (
-    checked_coeffs,
-    ending_leaves,
+    MOTION_SENTENCES,
+    MOTION_UNBOUNDED,
     intervals_of,
     judge_motion,
-    judge_rest,
-    limit_leaves,
     pieces_of,
+    read_flight,
 )
 from planner_jax.referee.verdict import Verdict
 
-# The tests of hits that are not of the stroke, in their order.
-LIMITS = (
-    *("not finite", "head state", "continuity", "speed", "acceleration", "body rate"),
-    *("thrust low", "thrust high", "rotor low", "rotor high", "ground", "extra", "ending"),
-)
+_SENTENCES = {"not finite": "the plan or its case is not finite", **MOTION_SENTENCES}
+LIMITS = tuple(_SENTENCES)
 _SAMPLES, _CHUNK = 400, 2048
 _STANDS = 1e-3  # [m/s], speed of a car that stands
 _OF_THE_BALL = ("ball", "tilt", "tunnel")
@@ -45,8 +39,8 @@ _OF_THE_BALL = ("ball", "tilt", "tunnel")
 class RestVerdict(Verdict):
     """What the referee found, one entry a lane; times count from the last contact."""
 
-    SENTENCES = {name: HitVerdict.SENTENCES[name] for name in LIMITS}
-    UNBOUNDED = {"body rate": HitVerdict.UNBOUNDED["body rate"]}
+    SENTENCES = _SENTENCES
+    UNBOUNDED = MOTION_UNBOUNDED
 
     worst_extra: np.ndarray  # (B,) int, place of the extra that is kept worst; -1 without any
 
@@ -65,23 +59,10 @@ def referee_rests(
     Raises:
         ValueError: a leaf has the wrong shape.
     """
-    coeffs = checked_coeffs(plans.trajectory.coeffs)
-    batch = coeffs.shape[:1]
-    trailing = {
-        "durations": (plans.trajectory.durations, coeffs.shape[1:2]),
-        "gravity": (cases.gravity, ()),
-        **limit_leaves(cases.limits),
-    }
-    leaves = {"lane": np.arange(len(coeffs)), "coeffs": coeffs, **ending_leaves(plans, batch)}
-    for name, (value, shape) in trailing.items():
-        leaves[name] = checked_leaf(name, value, batch + shape)
     judge = functools.partial(
-        _judge,
-        extras=getattr(cases, "extras", ()),
-        relative=tolerance,
-        continuity=continuity_tolerance,
+        _judge, extras=cases.extras, relative=tolerance, continuity=continuity_tolerance
     )
-    return RestVerdict(**judge_in_chunks(judge, leaves, _CHUNK))
+    return RestVerdict(**judge_in_chunks(judge, read_flight(cases, plans), _CHUNK))
 
 
 def _judge(case: dict, extras: tuple, relative: float, continuity: float) -> dict:
@@ -90,7 +71,6 @@ def _judge(case: dict, extras: tuple, relative: float, continuity: float) -> dic
     pieces = pieces_of(case["ending.coeffs"], case["ending.durations"])
     intervals = intervals_of(_SAMPLES, pieces.durations.shape[1])
     measured, tests = judge_motion(pieces, case, extras, intervals, relative, continuity)
-    tests |= judge_rest(case, pieces, continuity)
     found = first_failures(tests, LIMITS, finite_lanes(case))
     return {**found, "worst_extra": measured["worst_extra"]}
 
@@ -117,21 +97,21 @@ def referee_stops(case, plan, rest) -> str:
     """
     cases, plans, rests = map(_batch_of_one, (case, plan, rest))
     begin = final_poses(plans, cases.body)
-    later = {name: np.asarray(getattr(plans, name))[:, -1] for name in ("speed", "curvature")}
     movers = cases.movers
     moved = movers.centre + movers.velocity * np.asarray(plans.time)[:, None, None]
-    judged = _changed(
+    judged = _replace(
         cases,
-        **later,
+        speed=plans.speed[:, -1],
+        curvature=plans.curvature[:, -1],
         start=begin,
         time=np.asarray(rests.time),
         tolerance=np.full(1, np.inf),
         heading_tolerance=np.full(1, np.inf),
-        movers=_changed(movers, centre=moved),
+        movers=_replace(movers, centre=moved),
     )
     verdict = referee_intercepts(
         judged,
-        _changed(rests, start=begin),
+        _replace(rests, start=begin),
         target_positions=lambda target, times: begin[:, :2],
     )
     if not verdict.success[0]:
@@ -156,20 +136,20 @@ def referee_stands(case, plan, rest) -> str:
     last = np.asarray(plans.motion.durations, np.float64)[:, -1]
     angles, rates = (derivative(tail, last, order).T for order in range(2))
     ends = np.asarray(rests.motion.durations, np.float64).sum(axis=1)
-    judged = _changed(
+    judged = _replace(
         cases, angles=angles, rates=rates, delay=np.zeros(1), ends_at_rest=np.ones(1, bool)
     )
-    verdict = referee_blocks(judged, _changed(rests, contact_time=ends))
+    verdict = referee_blocks(judged, _replace(rests, contact_time=ends))
     if verdict.success[0] or verdict.failed_limit[0] in _OF_THE_BALL:
         return ""
     return verdict.sentence(0)
 
 
 def _batch_of_one(tree) -> SimpleNamespace:
-    """The fields of a dataclass of arrays, with a leading axis of one on every array."""
-    found = {}
+    """Return the fields of a dataclass of arrays, with a leading axis of one on every array."""
+    found, values = {}, vars(tree)
     for field in dataclasses.fields(tree):
-        value = getattr(tree, field.name)
+        value = values[field.name]
         if dataclasses.is_dataclass(value):
             value = _batch_of_one(value)
         elif field.metadata.get("pytree_node", True):
@@ -178,6 +158,6 @@ def _batch_of_one(tree) -> SimpleNamespace:
     return SimpleNamespace(**found)
 
 
-def _changed(tree: SimpleNamespace, **fields) -> SimpleNamespace:
-    """The same with other fields."""
+def _replace(tree: SimpleNamespace, **fields) -> SimpleNamespace:
+    """Return a copy with other fields."""
     return SimpleNamespace(**{**vars(tree), **fields})
