@@ -22,6 +22,11 @@ if version("jaxlib") < "0.11":
 
 import jax  # noqa: E402
 import pytest  # noqa: E402
+from jaxtyping import install_import_hook  # noqa: E402
+from typecheck import PACKAGES, accept_leaves  # noqa: E402
+
+accept_leaves()
+install_import_hook([f"planner_jax.{name}" for name in PACKAGES], "typecheck.check")
 
 # Every compiled program takes some of the mappings that Linux lets a process have, 65,530 by
 # default; without any left a compilation aborts the process.

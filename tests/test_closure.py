@@ -3,7 +3,7 @@
 import subprocess
 import sys
 
-from tests.layers import ROOT
+from layers import ROOT
 
 
 def test_few_files_are_imported_to_draw_plan_and_judge_one_hit():

@@ -1,9 +1,8 @@
 """Imports go downwards: no module of a package imports a package that is built on it."""
 
+import layers
 import pytest
-
-from tests import layers
-from tests.layers import BY_NAME, LAYERS, OUTSIDE, ROOT, package_of
+from layers import BY_NAME, LAYERS, OUTSIDE, ROOT, package_of
 
 IMPORTS = [found for path in layers.list_modules() for found in layers.read_imports(path)]
 

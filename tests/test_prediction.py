@@ -236,7 +236,7 @@ def test_the_kernel_gives_the_same_table():
     numbers = [random.uniform(*ends, lanes).astype(np.float32) for ends in ((0.01, 0.1), (0, 0.3))]
     gravity = np.full(lanes, 9.8, np.float32)
     args = [jnp.asarray(x) for x in (pos, vel, *numbers, gravity)]
-    found = table_kernel(nodes, interpret=True)(None, args)
+    found = table_kernel(nodes, interpret=True)(jax.tree.structure(args), args)
     table = jax.vmap(
         lambda p, v, step, drag, g: predict_path(
             BallState(p, v), step * (nodes - 3), drag, g, num_nodes=nodes

@@ -161,7 +161,7 @@ def test_the_kernel_gives_the_same_inverses():
     matrices = roots @ roots.transpose(0, 2, 1) + 0.1 * np.eye(5)
     matrices[3] -= 2.0 * np.eye(5)  # not positive
     lanes = jnp.asarray(np.moveaxis(matrices, 0, -1), jnp.float32)
-    (found,) = inverse_kernel(interpret=True)(None, [lanes])
+    (found,) = inverse_kernel(interpret=True)(jax.tree.structure([lanes]), [lanes])
     expected = jax.vmap(positive_inverse, in_axes=-1, out_axes=-1)(lanes)
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4)
 

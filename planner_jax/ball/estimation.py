@@ -8,11 +8,11 @@ many. Something not seen is NaN here, and passes without a trace.
 
 from collections.abc import Callable
 
-import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array, lax
+from jaxtyping import Float
 
 from planner_jax.ball.flight import BallState, linear_drag_flight
 
@@ -66,7 +66,9 @@ def solve_definite(A: Array, B: Array) -> Array:
     return jnp.stack(X)
 
 
-def ekf_init(pos: Array, vel: Array, *, pos_std: Array, vel_std: Array) -> EkfState:
+def ekf_init(
+    pos: Float[Array, "3"], vel: Float[Array, "3"], *, pos_std: Array, vel_std: Array
+) -> EkfState:
     """The belief before the first observation.
 
     Args:
@@ -77,7 +79,6 @@ def ekf_init(pos: Array, vel: Array, *, pos_std: Array, vel_std: Array) -> EkfSt
             observations below 1000 times their standard deviation: at 3000 the covariance
             after the second observation is lost in rounding.
     """
-    chex.assert_shape([pos, vel], (3,))
     std = jnp.concatenate([jnp.ones_like(pos) * pos_std, jnp.ones_like(vel) * vel_std])
     return EkfState(mean=jnp.concatenate([pos, vel]), covariance=jnp.diag(std**2))
 
@@ -105,7 +106,7 @@ def ekf_predict(
     return EkfState(mean=transition(state.mean), covariance=_congruence(F, state.covariance) + Q)
 
 
-def ekf_update(state: EkfState, observation: Array, model: EkfModel) -> EkfState:
+def ekf_update(state: EkfState, observation: Float[Array, "3"], model: EkfModel) -> EkfState:
     """The belief after one observed position, s + K_a (Z - H s)  (paper 002, eq. 5).
 
     H = [I 0]. The covariance takes Joseph's form, which stays positive definite in float32
@@ -116,7 +117,6 @@ def ekf_update(state: EkfState, observation: Array, model: EkfModel) -> EkfState
         observation: (3,) Z [m]. Where any coordinate is not finite, the belief stays as it is.
         model: only the sensor is used.
     """
-    chex.assert_shape(observation, (3,))
     observed = jnp.all(jnp.isfinite(observation))
     dtype = state.mean.dtype
     R = jnp.diag(jnp.ones(3, dtype) * model.observation_std**2)

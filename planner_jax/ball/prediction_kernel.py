@@ -35,7 +35,7 @@ def table_kernel(
         interpret: run it without a GPU, for tests.
     """
 
-    def kernel(treedef: PyTreeDef, leaves: Sequence[Array]) -> list[Array] | None:
+    def kernel(treedef: PyTreeDef, leaves: Sequence[Array]) -> Sequence[Array] | None:
         pos, _, *numbers = leaves
         if pos.ndim != 2 or pos.dtype != jnp.float32 or any(x.ndim != 1 for x in numbers):
             return None

@@ -125,7 +125,7 @@ def call_on_grid(
         4: ((None, grid.num_columns, 3, grid.threads), lambda t, i, s: (t, 0, 0, i)),
     }
 
-    def call(*leaves: Array) -> list[Array]:
+    def call(*leaves: Array) -> Sequence[Array]:
         kernel = kernel_call(
             body,
             (grid.trajectories, grid.blocks, grid.shares),
@@ -152,7 +152,7 @@ def along_kernel(
         interpret: run it without a GPU, for tests.
     """
 
-    def kernel(treedef: PyTreeDef, leaves: Sequence[Array]) -> list[Array] | None:
+    def kernel(treedef: PyTreeDef, leaves: Sequence[Array]) -> Sequence[Array] | None:
         args = jax.tree.unflatten(treedef, leaves)
         points = args if mode == "curvature" else (args,)
         found = grid_of(along, leaves, points)

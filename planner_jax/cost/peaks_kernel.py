@@ -37,7 +37,7 @@ def peaks_kernel(
         interpret: run it without a GPU, for tests.
     """
 
-    def kernel(treedef: PyTreeDef, leaves: Sequence[Array]) -> list[Array] | None:
+    def kernel(treedef: PyTreeDef, leaves: Sequence[Array]) -> Sequence[Array] | None:
         columns, durations, *parameters = leaves
         found = grid_of(along, leaves, [(columns, durations, parameters)])
         if found is None:

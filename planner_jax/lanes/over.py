@@ -209,14 +209,14 @@ def _slice(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[Array]:
     return [lax.slice(inputs[0].array, (*starts, 0), (*limits, lanes), strides)]
 
 
-def _pad(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[Array] | None:
+def _pad(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> Sequence[Array] | None:
     operand, filling = inputs
     if isinstance(filling, _Lanes):
         return None
     return [lax.pad(operand.array, filling, (*eqn.params["padding_config"], (0, 0, 0)))]
 
 
-def _dot_general(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[Array] | None:
+def _dot_general(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> Sequence[Array] | None:
     """Multiply by a matrix that all lanes share: one product, the lanes among its columns."""
     (left, right), ((left_dims, right_dims), batch) = inputs, eqn.params["dimension_numbers"]
     both = isinstance(left, _Lanes) and isinstance(right, _Lanes)

@@ -24,7 +24,7 @@ def inverse_kernel(*, interpret: bool = False) -> Callable:
         interpret: run it without a GPU, for tests.
     """
 
-    def kernel(treedef: PyTreeDef, leaves: Sequence[Array]) -> list[Array] | None:
+    def kernel(treedef: PyTreeDef, leaves: Sequence[Array]) -> Sequence[Array] | None:
         (matrix,) = leaves
         width = block_width(matrix.shape[-1], _THREADS)
         if matrix.ndim != 3 or matrix.dtype != jnp.float32 or width is None:

@@ -28,7 +28,7 @@ def turn_kernel(num_pairs: int, step_cap: float, *, interpret: bool = False) -> 
         interpret: run it without a GPU, for tests.
     """
 
-    def kernel(treedef: PyTreeDef, leaves: Sequence[Array]) -> list[Array] | None:
+    def kernel(treedef: PyTreeDef, leaves: Sequence[Array]) -> Sequence[Array] | None:
         grad = leaves[-1]
         width = block_width(grad.shape[-1], _LANES)
         if grad.ndim != 2 or grad.dtype != jnp.float32 or width is None:

@@ -304,7 +304,7 @@ def _lowest(diagonal: list[Array], beside: list[Array]) -> Array:
         pivots = _pivots(diagonal, beside, -value)
         return functools.reduce(jnp.logical_or, [pivot < 0.0 for pivot in pivots])
 
-    def halve(_: int, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+    def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = ends
         middle = 0.5 * (low + high)
         is_below = any_below(middle)
