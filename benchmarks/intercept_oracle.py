@@ -49,9 +49,9 @@ from planner_jax.benchmarks.run import Bench, at_least
 from planner_jax.plane.obstacles import Obstacles
 from planner_jax.plane.target import PlanePath
 from planner_jax.runs.summary import percent, wilson_interval
+from planner_jax.task.intercept.api import draw
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.spec import SUITES, TASK
-from planner_jax.task.intercept.suites import draw_cases
 
 SEARCHES = ("bound", "minimal", "strict")
 
@@ -222,7 +222,7 @@ def main() -> None:
     if options.early and options.failed:
         parser.error("--early looks at all cases, --failed at those that are not solved")
     with Bench("intercept_oracle", vars(options)) as bench:
-        cases = draw_cases(options.suite, options.num, options.seed, options.first)
+        cases = draw(options.num, options.suite, options.seed, first=options.first)
         plans = pj.plan(pj.intercept.planner(options.planner), cases)
         solved = np.asarray(pj.intercept.judge(cases, plans).success)
         drawn = np.arange(options.num)

@@ -35,8 +35,7 @@ from planner_jax.baselines.intercept.path_smoothing import smooth_path
 from planner_jax.benchmarks.path_peers import CELL, INSTALL, PAD, installed, searched
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
 from planner_jax.plane.obstacles import distances, separation
-from planner_jax.task.intercept.api import positions
-from planner_jax.task.intercept.suites import draw_cases
+from planner_jax.task.intercept.api import draw, positions
 
 SUITES = ("hard", "maze")
 ROOM = 0.9  # of the curvature, for paths that are made smooth
@@ -220,7 +219,7 @@ def main() -> None:
         )
         drawn = {}
         for suite in SUITES:
-            batch = draw_cases(suite, options.num, options.seed)
+            batch = draw(options.num, suite, options.seed)
             meetings = positions(batch.target, np.asarray(batch.time))
             host = jax.tree.map(np.asarray, batch)
             cases = [jax.tree.map(lambda leaf, k=k: leaf[k], host) for k in range(options.num)]

@@ -42,7 +42,6 @@ from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.default_planner import SpacetimeIntercept
 from planner_jax.task.intercept.plan import InterceptPlan
 from planner_jax.task.intercept.spec import SUITES
-from planner_jax.task.intercept.suites import observe
 
 NOISE = 0.1  # [m], standard deviation of a coordinate that is seen
 COUNT = 15  # looks up to the start
@@ -295,7 +294,7 @@ def main() -> None:
         truth = taken(pj.intercept.draw(options.num, options.suite, options.seed), slice(None))
         turning = np.asarray(cast("Any", truth.target).turn_rate) != 0.0
         end = float(truth.time[0])  # the same of all cases of a suite
-        looks = Looks(*observe(truth, options.seed, NOISE, COUNT, INTERVAL, until=end))
+        looks = Looks(*pj.intercept.observe(truth, options.seed, NOISE, COUNT, INTERVAL, until=end))
         device = jax.devices()[0].device_kind
         bench.say(f"{options.num} cases, suite {options.suite}, seed {options.seed}; {device}", "")
         rows = {}

@@ -28,6 +28,7 @@ from planner_jax.optimise.problem import Round
 from planner_jax.plane.reach import Lattice
 from planner_jax.task.block.default_planner import Search as BlockSearch
 from planner_jax.task.intercept.default_planner import SpacetimeIntercept
+from planner_jax.task.intercept.problem import MotionProblem
 from planner_jax.task.intercept.searches import Search
 
 NUM = 6  # cases of a batch; no more than one bucket
@@ -146,8 +147,8 @@ def last_time(plan):
 
 
 def path_then_speed(name, **options):
-    small = SpacetimeIntercept(pieces=12, samples=2, checked=2)
-    source = PathSource(planner=small, drawn=2, later=2, points=33)
+    small = MotionProblem(pieces=12, samples=2, checked=2)
+    source = PathSource(problem=small, drawn=2, later=2, points=33)
     projection = Projection(runs=1, slabs=2)
     step = pj.intercept.planner(name).step
     speed = step.speed and dataclasses.replace(step.speed, pieces=4)

@@ -13,7 +13,7 @@ from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.plane.reach import Lattice
 from planner_jax.robot.car import pose_at
 from planner_jax.task.intercept.motion import Quadratic, by_unknowns, motion
-from planner_jax.task.intercept.searches import Search
+from planner_jax.task.intercept.searches import Search, make_field, make_grid
 from planner_jax.task.intercept.terms import Weights
 
 # One search is one program to compile.
@@ -111,11 +111,14 @@ def test_the_gradient_of_a_cost_is_that_of_finite_differences(way, float64, meet
     )
     case = dataclasses.replace(case, end_heading=jnp.array(2.0), heading_tolerance=jnp.array(0.1))
     planner = pj.intercept.planner(pieces=8, meet=meet)
-    field = jax.jit(lambda case: planner.field(case, planner.grid(case, SEARCHES[0])))(case)
+    problem = planner.problem
+    field = jax.jit(lambda case: make_field(case, make_grid(case, SEARCHES[0].lattice)))(case)
     places = np.random.default_rng(3).uniform(1.0, 7.0, (8, 2))
-    model = jax.jit(lambda point: planner.model(point, case, field, Weights(follow=1.0), places))
+    model = jax.jit(
+        lambda point: problem.build_model(point, case, field, Weights(follow=1.0), places)
+    )
     speed, curvature = (jnp.asarray(1.2 * each[1:]) for each in way)
-    point = planner.point(speed, curvature, jnp.array(9.0))
+    point = problem.pack(speed, curvature, jnp.array(9.0))
     found = model(point)
     assert found.cost > 1.0 and found.violation > 0.0
     steps = 1e-6 * jnp.eye(point.size)

@@ -13,7 +13,7 @@ import planner_jax as pj
 from planner_jax.optimise.sensitivity import gradient_at
 from planner_jax.plane.reach import Lattice
 from planner_jax.plane.target import TurningPath
-from planner_jax.task.intercept.finalize import straight_on
+from planner_jax.task.intercept.plan import make_straight_plan
 from planner_jax.task.intercept.searches import Search
 
 BY = ("movers.centre", "walls.centre", "limits.acceleration", "target.vel", "speed")
@@ -49,7 +49,7 @@ def settle(planner):
 
 def at_rest(planner, case):
     """The problem about a drive straight on, with a case that begins where its cost is least."""
-    smooth, begun = planner.smooth_near(case, straight_on(case, planner.pieces))
+    smooth, begun = planner.smooth_near(case, make_straight_plan(case, planner.pieces))
     return smooth, dataclasses.replace(begun, begun=settle(smooth)(begun))
 
 

@@ -21,8 +21,8 @@ from planner_jax.task.group.case import CarState
 from planner_jax.task.group.decide import Best, Given, Greedy
 from planner_jax.task.group.spec import SUITES, TASK
 from planner_jax.task.intercept.default_planner import SpacetimeIntercept
-from planner_jax.task.intercept.rejection import SIZE
 from planner_jax.task.intercept.searches import Search
+from planner_jax.task.intercept.suites import SIZE
 
 # One search is one program to compile.
 SEARCH = Search(12, LevenbergConfig(40), lattice=Lattice(layers=22))

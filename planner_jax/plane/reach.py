@@ -79,7 +79,7 @@ class ReachSet:
 
 
 @struct.dataclass
-class Way:
+class CellPath:
     """Speed, heading and cell after every layer of a way through a reach set."""
 
     level: Array  # (layers,) int32, of speed from one layer to the next
@@ -401,7 +401,7 @@ def draw_chance(lattice: Lattice, num: int, seed: int, drawn: int) -> Chance:
     return Chance(*(jnp.asarray(each, jnp.float32) for each in (layers, ends, steps)))
 
 
-def smooth_way(
+def draw_smooth_path(
     grid: Grid,
     reach: ReachSet,
     num: Array,
@@ -409,10 +409,10 @@ def smooth_way(
     there: Array,
     chance: Chance,
     directness: float,
-) -> Way:
-    """The smoothest of some random ways to a goal; arguments as of `draw_way`."""
+) -> CellPath:
+    """The smoothest of some random ways to a goal; arguments as of `draw_path`."""
     ways = jax.vmap(
-        lambda ends, steps: draw_way(grid, reach, num, cells, there, ends, steps, directness)
+        lambda ends, steps: draw_path(grid, reach, num, cells, there, ends, steps, directness)
     )(chance.ends, chance.steps)
     best = jnp.argmin(jax.vmap(lambda way: _roughness(way, grid.lattice, num))(ways))
     return jax.tree.map(lambda leaf: leaf[best], ways)
@@ -424,14 +424,14 @@ def _velocity(level: Array, heading: Array, lattice: Lattice) -> Array:
     return level[..., None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
 
 
-def _roughness(way: Way, lattice: Lattice, num: Array) -> Array:
+def _roughness(path: CellPath, lattice: Lattice, num: Array) -> Array:
     """Sum of the squared changes of velocity over two layers, in levels of speed."""
-    velocity = _velocity(way.level, way.bin, lattice)
+    velocity = _velocity(path.level, path.bin, lattice)
     change = jnp.sum((velocity[2:] - velocity[:-2]) ** 2, axis=1)
     return jnp.sum(jnp.where(jnp.arange(2, lattice.layers) < num, change, 0.0))
 
 
-def draw_way(
+def draw_path(
     grid: Grid,
     reach: ReachSet,
     num: Array,
@@ -440,7 +440,7 @@ def draw_way(
     ends: Array,
     steps: Array,
     directness: float,
-) -> Way:
+) -> CellPath:
     """A random way to a goal, walked back from it.
 
     Args:
@@ -495,4 +495,4 @@ def draw_way(
     )
     _, (levels, bins, passed) = lax.scan(back, start, jnp.arange(lattice.layers), reverse=True)
     # Bins of heading count from the start on, without a jump.
-    return Way(level=levels, bin=bins, cell=passed)
+    return CellPath(level=levels, bin=bins, cell=passed)

@@ -1,5 +1,6 @@
 """Arguments of what makes a case, as arrays of one case or of a batch."""
 
+import zlib
 from typing import Any
 
 import jax.numpy as jnp
@@ -46,3 +47,14 @@ def require_draw(num: Any, seed: Any, first: Any) -> None:
         if value >= 2**63:
             raise ValueError(f"{name} must be < 2**63, got {value}")
     require_memory("num", num, _DRAWN_BYTES)
+
+
+def make_generators(suite: str, num: int, seed: int, first: int) -> list[np.random.Generator]:
+    """Make a generator for every case of a suite, so that no case depends on the others.
+
+    Raises:
+        TypeError, ValueError: as of `require_draw`.
+    """
+    require_draw(num, seed, first)
+    tag = zlib.crc32(suite.encode())
+    return [np.random.default_rng([seed, first + k, tag]) for k in range(num)]

@@ -44,12 +44,12 @@ from planner_jax.sims.robots.car.vehicle import GRAVITY, Tyres, Vehicle
 from planner_jax.sims.scenery import Prism
 from planner_jax.sims.settings import InterceptFly
 from planner_jax.sims.task import FlightCases, Flights, FlightTask
-from planner_jax.task.intercept.api import draw, positions
+from planner_jax.task.intercept.api import draw, observe, positions
 from planner_jax.task.intercept.api import planner as intercept_planner
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.default_planner import SpacetimeIntercept
 from planner_jax.task.intercept.plan import InterceptPlan
-from planner_jax.task.intercept.suites import observe
+from planner_jax.task.intercept.searches import search_reach
 
 CAR_WORLD = World(Car(), GRAVITY, num_balls=0, timestep=1.0 / CONTROL_RATE)
 SUCCESS, NEAR, FAR = 0.3, 0.05, 0.5  # [m], of the miss: what counts, and two more that are told
@@ -621,7 +621,11 @@ def reach_layers(
         case: one.
     """
     search = planner.attempts[0]
-    found = jax.device_get(jax.jit(lambda case: planner.prepare(case, search))(case))
+    found = jax.device_get(
+        jax.jit(lambda case: search_reach(case, search, is_time_free=planner.problem.is_time_free))(
+            case
+        )
+    )
     grid, words = found.grid, np.bitwise_or.reduce(found.reach.bits, axis=(2, 3))
     layers = []
     for number in range(int(grid.num) + 1):

@@ -22,8 +22,7 @@ from planner_jax.baselines.intercept.speed import SPEED_PLANNERS
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Status, lane
 from planner_jax.task.intercept.case import InterceptCase
-from planner_jax.task.intercept.finalize import explained
-from planner_jax.task.intercept.plan import InterceptPlan
+from planner_jax.task.intercept.plan import InterceptPlan, explain
 from planner_jax.task.intercept.searches import Search
 from planner_jax.task.intercept.terms import ends_of
 
@@ -142,6 +141,6 @@ def _driven(
         worst = jnp.where(is_found, plan.violation, jnp.inf)
         status = jnp.where(is_found, plan.status, Status.NO_PATH)
         plan = dataclasses.replace(plan, violation=worst, status=status)
-        return explained(case, status, plan)
+        return explain(case, status, plan)
 
     return lax.map(one, (cases, poses, bends, length, is_found))

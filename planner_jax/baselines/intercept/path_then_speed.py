@@ -20,9 +20,8 @@ from planner_jax.core.checks import require_size
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Status, is_solved, require_settings
 from planner_jax.task.intercept.case import InterceptCase
-from planner_jax.task.intercept.finalize import checked_plan, explained
-from planner_jax.task.intercept.plan import InterceptPlan
-from planner_jax.task.intercept.searches import Search
+from planner_jax.task.intercept.plan import InterceptPlan, explain, make_plan
+from planner_jax.task.intercept.searches import Search, make_grid
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,7 +59,7 @@ class SpeedStep:
             found = plan_speed(problem, self.speed)
             station, speed = found.curve.at(times), found.curve.at(times, 1)
             is_found, steps, status = is_solved(found.status), found.iterations, found.status
-        plan = checked_plan(
+        plan = make_plan(
             case,
             case.time,
             jnp.maximum(speed, 0.0).at[0].set(case.speed),
@@ -125,8 +124,7 @@ class PathThenSpeed(Planner):
     def solve_at_once(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:
         """The plans of a batch, all together."""
         # All go through as many layers as the one with the most, so that they stay in step.
-        grid = self.source.planner.grid
-        layers = jnp.max(jax.vmap(lambda case: grid(case, attempt).num)(cases))
+        layers = jnp.max(jax.vmap(lambda case: make_grid(case, attempt.lattice).num)(cases))
         return jax.vmap(lambda case: self.solve_in_layers(case, attempt, layers))(cases)
 
     def solve_in_layers(
@@ -136,7 +134,7 @@ class PathThenSpeed(Planner):
         found = self.source.paths(case, attempt, layers)
         plan = self.best_drive(case, found)
         reason = jnp.where(found.is_reached, plan.status, Status.NO_PATH)
-        return explained(case, reason, plan)
+        return explain(case, reason, plan)
 
     def best_drive(self, case: InterceptCase, found: StaticPaths) -> InterceptPlan:
         """The plan of least acceleration along one of the paths; without any the least bad."""

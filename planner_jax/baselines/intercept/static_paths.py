@@ -21,9 +21,9 @@ from planner_jax.plane import reach
 from planner_jax.plane.obstacles import Obstacles
 from planner_jax.plane.target import TurningPath
 from planner_jax.task.intercept.case import InterceptCase
-from planner_jax.task.intercept.default_planner import Found, Guess, SpacetimeIntercept
 from planner_jax.task.intercept.motion import motion
-from planner_jax.task.intercept.searches import Search
+from planner_jax.task.intercept.problem import Guess, MotionProblem
+from planner_jax.task.intercept.searches import Found, Search, draw_cell_path, search_reach
 from planner_jax.task.intercept.terms import wrapped
 
 _SHARES = 8  # of a way, where it is compared with others
@@ -45,7 +45,7 @@ class StaticPaths:
 class PathSource:
     """Finds paths; as many as an attempt has ways."""
 
-    planner: SpacetimeIntercept = SpacetimeIntercept()
+    problem: MotionProblem = MotionProblem()
     drawn: int = 8  # ways for every path, of which those that differ are refined
     later: int = 10  # layers after the earliest arrival that ways arrive at, in turns
     points: int = 129  # of a path
@@ -53,11 +53,10 @@ class PathSource:
     def paths(
         self, case: InterceptCase, attempt: Search, layers: Array | None = None
     ) -> StaticPaths:
-        """The paths of one case; see `SpacetimeIntercept.prepare` for the layers of a batch."""
+        """Find the paths of one case; see `search_reach` for the layers of a batch."""
         still = standing(case)
-        found = self.planner.prepare(still, attempt, layers)
-        arrivals = self.arrivals(still, found)
-        is_reached = jnp.any(arrivals)
+        found = search_reach(still, attempt, is_time_free=True, layers=layers)
+        arrivals, is_reached = found.layers, found.is_reached
         first = jnp.argmax(arrivals)
         num = self.drawn * attempt.ways
         layer = jnp.minimum(first + 1 + np.arange(num) % self.later, found.grid.num)
@@ -71,8 +70,8 @@ class PathSource:
         def path(start: tuple[Array, Guess]) -> tuple[Path, Array, Array]:
             time, guess = start
             drive = dataclasses.replace(still, time=time)
-            stages = self.planner.stages(attempt)
-            plan = self.planner.refined(drive, found.field, guess, attempt, stages)
+            stages = self.problem.list_stages(attempt)
+            plan = self.problem.refine(drive, found.field, guess, attempt, stages)
             speed = jnp.maximum(plan.speed, 0.0)
             driven = path_of_drive(plan.start, time, speed, plan.curvature, self.points)
             return driven, plan.violation, plan.iterations
@@ -89,22 +88,14 @@ class PathSource:
             steps=jnp.max(steps),
         )
 
-    def arrivals(self, case: InterceptCase, found: Found) -> Array:
-        """Which layers meet the target, (layers + 1,) bool."""
-        place = jnp.arange(found.layers.shape[0])
-        there = jax.vmap(lambda n: self.planner.meetings(case, found.grid, found.reach, n)[1])
-        in_time = (place >= 1) & (place <= found.grid.num)
-        return jnp.any(there(place), axis=(1, 2, 3)) & in_time
-
     def guess(
         self, case: InterceptCase, found: Found, layer: Array, chance: reach.Chance
     ) -> tuple[Array, Guess]:
         """When a random way arrives that ends at a layer, and where least squares begin."""
         grid = found.grid
-        cells, there = self.planner.meetings(case, grid, found.reach, layer)
-        way = reach.smooth_way(grid, found.reach, layer, cells, there, chance, 0.0)
+        path = draw_cell_path(case, found, layer, chance, 0.0)
         time = (layer + 0.5) * grid.step
-        guess = self.planner.guess(dataclasses.replace(case, time=time), grid, way, layer)
+        guess = self.problem.guess_along(dataclasses.replace(case, time=time), grid, path, layer)
         return time, guess
 
     def different(self, case: InterceptCase, times: Array, guesses: Guess, num: int) -> Array:
@@ -116,7 +107,7 @@ class PathSource:
         goal = case.target.at(case.time).pos
 
         def way(time: Array, guess: Guess) -> tuple[Array, Array, Array]:
-            speed, curvature, _ = self.planner.parts(case, guess.point)
+            speed, curvature, _ = self.problem.unpack(case, guess.point)
             pos = motion(case.start, time, speed, curvature, 1).pos[:, 0]
             step = time / (speed.shape[0] - 1)
             station = jnp.cumsum(jnp.maximum(0.5 * (speed[1:] + speed[:-1]), 1e-3) * step)

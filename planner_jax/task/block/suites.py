@@ -14,14 +14,13 @@ A throw is drawn anew unless the ball, of 0.05 m radius, gets into the outer box
 the top, from there into the inner box, and touches no pole before. Robot base frame, z up, SI.
 """
 
-import zlib
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from planner_jax.core.registry import require_name
-from planner_jax.task.arguments import require_draw
+from planner_jax.task.arguments import make_generators
 from planner_jax.task.block.case import BlockCase, case
 from planner_jax.task.block.scene import (
     INNER_HALF,
@@ -71,9 +70,7 @@ def draw_cases(
         ValueError: an argument is out of its range; one line.
     """
     require_name(SUITES, "suite", suite)
-    require_draw(num, seed, first)
-    own, tag = SUITES[suite], zlib.crc32(suite.encode())
-    randoms = (np.random.default_rng([seed, first + k, tag]) for k in range(num))
+    own, randoms = SUITES[suite], make_generators(suite, num, seed, first)
     thrown = np.array([_throw(own, random) for random in randoms])
     return case(
         thrown[:, 0],

@@ -1,6 +1,7 @@
 """The functions `pj.group.draw`, `planner` and `judge`; `case` is in a module of its own."""
 
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 
 from planner_jax.core.protocol import Decision
 from planner_jax.core.registry import suite_named
@@ -22,7 +23,7 @@ def draw(
     seed: int = 0,
     *,
     first: int = 0,
-    dtype: object = jnp.float32,
+    dtype: DTypeLike = jnp.float32,
 ) -> InterceptGroup:
     """Draw a batch of groups of a suite.
 

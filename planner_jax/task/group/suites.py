@@ -1,10 +1,10 @@
 """Named, seeded suites of groups: several targets for one car among walls and movers.
 
-They are this library's, as are those of `planner_jax.task.intercept.suites`. Start, walls, movers
-and one target are drawn as there, for the time until when all targets are to be met. Then how many
-targets there are is drawn, and targets are drawn as the first one was until there is room for no
-more: each anew until nothing is wrong with it (`planner_jax.task.intercept.rejection`). So all of
-them stay on the map and off the walls up to that time. World frame in the plane, SI units.
+The suites are this library's. Start, walls, movers and one target are drawn as in
+`planner_jax.task.intercept.suites`, for the time until which all targets are to be met. Then the
+number of targets is drawn, and other targets are drawn as the first one, each again until no cause
+of rejection applies. So all targets stay on the map and off the walls up to that time. World frame
+in the plane, SI units.
 """
 
 import dataclasses
@@ -15,14 +15,15 @@ import numpy as np
 
 from planner_jax.core.checks import floating
 from planner_jax.core.registry import require_name
+from planner_jax.task.arguments import make_generators
 from planner_jax.task.group.case import InterceptGroup
 from planner_jax.task.group.spec import SUITES
-from planner_jax.task.intercept.rejection import CAUSES, first_cause
 from planner_jax.task.intercept.suites import (
+    CAUSES,
     accepted_draws,
     anywhere,
     cases_of,
-    generators,
+    first_cause,
     path_of,
     target_to,
 )
@@ -46,7 +47,7 @@ def draw_groups(
         ValueError: an argument is out of its range; one line.
     """
     require_name(SUITES, "suite", suite)
-    own, randoms, dtype = SUITES[suite], generators(suite, num, seed, first), floating(dtype)
+    own, randoms, dtype = SUITES[suite], make_generators(suite, num, seed, first), floating(dtype)
     drawn, _, _ = accepted_draws(own, randoms)
     fewest, most = own.num_targets
     count = np.array([random.integers(fewest, most + 1) for random in randoms])

@@ -1,9 +1,9 @@
 from .api import draw as draw
 from .api import judge as judge
+from .api import observe as observe
 from .api import planner as planner
 from .case import InterceptCase as InterceptCase
 from .case import case as case
 from .default_planner import SpacetimeIntercept as SpacetimeIntercept
 from .plan import InterceptPlan as InterceptPlan
 from .suites import drawn as drawn
-from .suites import observe as observe

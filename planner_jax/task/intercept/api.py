@@ -1,8 +1,12 @@
-"""The functions `pj.intercept.draw`, `planner` and `judge`; `case` is in a module of its own."""
+"""The functions `pj.intercept.draw`, `observe`, `planner` and `judge`."""
+
+import zlib
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from jax.typing import DTypeLike
 from jaxtyping import Float
 
 from planner_jax.core.checks import require_kind, require_path
@@ -13,7 +17,7 @@ from planner_jax.referee.intercept import InterceptVerdict, referee_intercepts
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.plan import InterceptPlan
 from planner_jax.task.intercept.spec import SUITES, TASK
-from planner_jax.task.intercept.suites import draw_cases
+from planner_jax.task.intercept.suites import drawn
 from planner_jax.task.judged import judged
 
 
@@ -23,7 +27,7 @@ def draw(
     seed: int = 0,
     *,
     first: int = 0,
-    dtype: object = jnp.float32,
+    dtype: DTypeLike = jnp.float32,
 ) -> InterceptCase:
     """Draw a batch of interceptions of a suite; `drawn` also reports how many draws it rejected.
 
@@ -41,7 +45,56 @@ def draw(
     suite = suite_named(suite, "easy")
     if suite not in SUITES:
         return TASK.other_suite(suite)(num, seed, first)
-    return draw_cases(suite, num, seed, first, dtype=dtype)
+    return drawn(suite, num, seed, first, dtype=dtype).cases
+
+
+def observe(
+    cases: InterceptCase,
+    seed: int,
+    noise: float = 0.1,
+    count: int = 15,
+    interval: float = 1.0,
+    first: int = 0,
+    until: float = 0.0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draw noisy observations of the targets until the cars set out (paper 003, eq. 4), or longer.
+
+    Args:
+        cases: leaves with leading axis B.
+        seed: >= 0. The observations of case k of a seed are always the same.
+        noise: [m], standard deviation on each axis.
+        count: number of observations up to time 0, when the last of them is made.
+        interval: [s], between two observations.
+        first: index of the first case, >= 0.
+        until: [s], time of the last observation, >= 0. It does not change earlier observations.
+
+    Returns:
+        times: (L,) [s], L = count + floor(until / interval).
+        positions: (B, L, 2) [m].
+
+    Raises:
+        ValueError: an argument is out of its range; one line.
+    """
+    given = {"count": (count, 1), "noise": (noise, 0), "first": (first, 0), "until": (until, 0)}
+    for name, (value, least) in given.items():
+        if not value >= least:
+            raise ValueError(f"{name} must be >= {least}, got {value}")
+    if not interval > 0.0:
+        raise ValueError(f"interval must be > 0, got {interval}")
+    times = interval * np.arange(1.0 - count, 1.0 + np.floor(until / interval + 1e-9))
+    positions = np.asarray(_positions_at(cases.target, times.astype(cases.time.dtype)))
+    tag = zlib.crc32(b"observations")
+    errors = [
+        np.random.default_rng([seed, first + k, tag]).standard_normal((len(times), 2))
+        for k in range(len(positions))
+    ]
+    return times, positions + noise * np.stack(errors)
+
+
+@jax.jit
+def _positions_at(paths: PlanePath, times: Array) -> Array:
+    """Return positions (B, L, 2) [m] on paths with leading axis B at times (L,) [s]."""
+    return jax.vmap(lambda path: jax.vmap(lambda time: path.at(time).pos)(times))(paths)
 
 
 def planner(name: str = "spacetime", **options: object) -> Planner[InterceptCase, InterceptPlan]:

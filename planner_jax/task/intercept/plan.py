@@ -1,13 +1,108 @@
-"""What an intercept planner returns."""
+"""The plan of an interception, and how compiled planners make it and set its status."""
 
+import dataclasses
+
+import jax
+import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
+from planner_jax.core.protocol import Status, is_solved, status_of
 from planner_jax.robot.car import CarPlan
+from planner_jax.task.intercept.case import InterceptCase
+from planner_jax.task.intercept.motion import motion
+from planner_jax.task.intercept.terms import (
+    Weights,
+    clearance,
+    is_blocked,
+    limit_terms,
+    meeting_terms,
+)
+
+_GRAZING = 5e-3  # [m], kept from obstacles, so that nothing is touched between two samples
 
 
 @struct.dataclass
 class InterceptPlan(CarPlan):
-    """One plan, or a batch of them with a leading axis on every leaf; ends at the meeting."""
+    """One plan, or a batch of plans with a leading axis on every leaf; it ends at the meeting."""
 
-    meeting: Array  # (2,) [m], where the planner takes the target to be at the end
+    meeting: Array  # (2,) [m], the position of the target at the end, as the planner expects it
+
+
+def make_plan(
+    case: InterceptCase,
+    time: Array,
+    speed: Array,
+    curvature: Array,
+    *,
+    samples: int,
+    places: int,
+    steps: Array,
+) -> InterceptPlan:
+    """Make the plan of knots and check it against every limit of its case.
+
+    The cost of the plan is the integral of the squared acceleration [m^2/s^3] (paper 003, eq. 8a).
+
+    Args:
+        case: one case.
+        time: () [s], when the plan ends, at the target.
+        speed: (K + 1,) [m/s], at equal knots, the first as the case has it.
+        curvature: (K + 1,) [1/m], at the same knots.
+        samples: of every piece, at which obstacles are checked, static.
+        places: of every piece, at which the lateral acceleration is checked, static.
+        steps: () int32, iterations of the plan.
+    """
+    drive = motion(case.start, time, speed, curvature, samples)
+    _, violation = limit_terms(case, time, speed, curvature, Weights(), places)
+    _, missed = meeting_terms(case, drive, time, Weights())
+    bumped = (_GRAZING - jnp.min(clearance(case, drive))) / case.body.width
+    worst = jnp.maximum(jnp.maximum(violation, missed), bumped)
+    effort = jnp.sum((speed[1:] - speed[:-1]) ** 2) * (speed.shape[0] - 1) / time
+    return InterceptPlan(
+        cost=effort,
+        violation=worst,
+        iterations=steps,
+        status=status_of(effort, worst, True),
+        start=case.start,
+        time=time,
+        speed=speed,
+        curvature=curvature,
+        meeting=case.target.at(time).pos,
+    )
+
+
+def make_straight_plan(case: InterceptCase, pieces: int) -> InterceptPlan:
+    """Make the unsolved plan of a case for which there is no other plan."""
+    return InterceptPlan(
+        cost=jnp.zeros_like(case.time),
+        violation=jnp.full_like(case.time, jnp.inf),
+        iterations=jnp.zeros((), jnp.int32),
+        status=jnp.full((), Status.INFEASIBLE, jnp.int32),
+        start=case.start,
+        time=case.time,
+        speed=jnp.full(pieces + 1, case.speed),
+        curvature=jnp.full(pieces + 1, case.curvature),
+        meeting=case.target.at(case.time).pos,
+    )
+
+
+def explain(
+    case: InterceptCase, reason: Array, plan: InterceptPlan, *, is_time_free: bool = False
+) -> InterceptPlan:
+    """Set the status of an unsolved plan to the reason why the case has no plan.
+
+    Args:
+        case: one case.
+        reason: () int32, the status if nothing is wrong with the case itself.
+        plan: of the case.
+        is_time_free: whether the target may be met before the case's time, static.
+    """
+    is_start_blocked, is_goal_blocked = is_blocked(case)
+    blocked = is_start_blocked if is_time_free else is_start_blocked | is_goal_blocked
+    reason = jnp.where(blocked, Status.BLOCKED, reason)
+    floats = [leaf for leaf in jax.tree.leaves(case) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    is_finite = jnp.all(jnp.stack([jnp.all(~jnp.isnan(leaf)) for leaf in floats]))
+    reason = jnp.where(is_finite, reason, Status.NON_FINITE)
+    keeps = (is_solved(plan.status) | (plan.status == Status.NON_FINITE)) & is_finite
+    status = jnp.where(keeps, plan.status, reason).astype(jnp.int32)
+    return dataclasses.replace(plan, status=status)

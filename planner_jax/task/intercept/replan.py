@@ -1,66 +1,57 @@
-"""Re-planning: from the plan that is being driven, for what the target is now thought to do.
+"""Re-planning: from the plan that is being driven, for the path that the target is now expected on.
 
-Between two looks at a target its expected path moves by centimetres, and so does the best way.
-What is left of the previous plan is a guess from which a few steps of least squares suffice;
-planning from scratch stays for what they do not mend.
+Between two observations of a target its expected path moves by centimetres, and so does the best
+trajectory. The rest of the previous plan is a guess from which a few steps of least squares
+suffice. Planning from scratch remains for cases that these steps do not solve.
 """
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import ArrayLike
 
 from planner_jax.core.checks import require_beginning, require_kind, require_path
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt
-from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.plane.obstacles import Obstacles
 from planner_jax.plane.target import PlanePath
 from planner_jax.planning.replan import Replanning, given_or_own, moment_of
 from planner_jax.robot.car import pose_at
 from planner_jax.task.intercept.case import InterceptCase
-from planner_jax.task.intercept.default_planner import SpacetimeIntercept
 from planner_jax.task.intercept.plan import InterceptPlan
-from planner_jax.task.intercept.searches import Search
-
-
-@dataclasses.dataclass(frozen=True)
-class Warm(Attempt):
-    """An attempt: steps of least squares from what is left of the previous plan; static."""
-
-    solver: LevenbergConfig = LevenbergConfig(8)
-    settling: int = 4  # steps towards less effort
-    margin: float = 0.03  # as of a `Search`
-    slack: float = 0.015
-    discs: int = 3
+from planner_jax.task.intercept.problem import MotionProblem
+from planner_jax.task.intercept.searches import Search, Warm, make_field, make_grid
 
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class ReplanIntercept(Planner):
-    """Interceptions re-planned from the previous plan, as `pj.replan` asks for them.
+class ReplanIntercept(Planner[Replanning, InterceptPlan]):
+    """Plans interceptions again from the previous plan; `SpacetimeIntercept.replanner` makes it.
 
-    With less than `shortest` left until the meeting nothing is planned: what is left of the
-    previous plan comes back.
+    With less than `shortest` left until the meeting nothing is planned: the rest of the previous
+    plan is returned.
     """
 
     case_type: ClassVar[type] = Replanning
     is_sequential: ClassVar[bool] = True
     plan_type: ClassVar[type] = InterceptPlan
-    planner: SpacetimeIntercept = SpacetimeIntercept()
+    planner: Planner[InterceptCase, InterceptPlan]  # from scratch, by a `Search`
+    search: Search  # of that planner
+    problem: MotionProblem  # of that planner
     warm: Warm = Warm()
     shortest: float = 0.1  # [s]
 
     @property
     def attempts(self) -> tuple[Attempt, ...]:
-        """From the previous plan, then the first from scratch: others take too long."""
-        return (self.warm, self.planner.attempts[0])
+        """One from the previous plan, then the first from scratch: others take too long."""
+        return (self.warm, self.search)
 
     @property
-    def inner(self) -> SpacetimeIntercept:
+    def inner(self) -> Planner[InterceptCase, InterceptPlan]:
         """The planner of the cases that are planned again."""
         return self.planner
 
@@ -68,26 +59,26 @@ class ReplanIntercept(Planner):
         self,
         cases: InterceptCase,
         previous: InterceptPlan,
-        elapsed: Any,
+        elapsed: ArrayLike,
         *,
         target: PlanePath,
         movers: Obstacles | None = None,
-        start: Any = None,
-        speed: Any = None,
-        curvature: Any = None,
+        start: ArrayLike | None = None,
+        speed: ArrayLike | None = None,
+        curvature: ArrayLike | None = None,
     ) -> Replanning:
-        """What is left of a case, or of a batch, some time into its plan; see `pj.replan`.
+        """Return the rest of a case, or of a batch, some time into its plan; see `pj.replan`.
 
         Args:
-            cases: what `previous` was planned for.
+            cases: the cases that `previous` was planned for.
             previous: the plan that is being driven.
-            elapsed: () or (B,) [s], since it began, >= 0.
-            target: its path as expected now, with times that count from now.
-            movers: the moving obstacles as they are now; moved on evenly if not given.
-            start: (3,) or (B, 3), where the rear axle is: x, y [m] and heading [rad].
-            speed: () or (B,) [m/s], now.
-            curvature: () or (B,) [1/m], now. Of these three what is not given is the plan's own;
-                what is beyond the car's limits counts as at them.
+            elapsed: () or (B,) [s], time since the plan began, >= 0.
+            target: the expected path of the target, with times that count from now.
+            movers: the moving obstacles as they are now; moved on evenly by default.
+            start: (3,) or (B, 3), pose of the rear axle: x, y [m] and heading [rad]; by default
+                the plan's own, as for `speed` and `curvature`.
+            speed: () or (B,) [m/s]; clipped to the car's limits.
+            curvature: () or (B,) [1/m]; clipped to the car's limits.
 
         Raises:
             ValueError: a negative time.
@@ -111,7 +102,7 @@ class ReplanIntercept(Planner):
             passed = cases.movers.velocity * elapsed[..., None, None]
             movers = dataclasses.replace(cases.movers, centre=cases.movers.centre + passed)
         # A plan that was free to choose its time may choose a later one again.
-        until = cases.time if self.planner.is_time_free else previous.time
+        until = cases.time if self.problem.is_time_free else previous.time
         left = dataclasses.replace(
             cases,
             start=start,
@@ -123,31 +114,30 @@ class ReplanIntercept(Planner):
         )
         return Replanning(case=left, previous=previous, elapsed=elapsed)
 
-    def solve(self, task: Replanning, attempt: Any) -> InterceptPlan:
-        """The plan of one case."""
+    def solve(self, task: Replanning, attempt: Search | Warm) -> InterceptPlan:
+        """Return the plan of one case."""
         if isinstance(attempt, Search):
             return self.planner.solve(task.case, attempt)
-        case, planner = task.case, self.planner
+        case, problem = task.case, self.problem
         time = jnp.maximum(task.previous.time - task.elapsed, 0.5 * self.shortest)
-        point = planner.point(*self.rest(task, time), time)
-        guess = planner.guess_at(point)
-        grid = planner.grid(case, planner.attempts[0])
+        guess = problem.guess_at(problem.pack(*self._sample_rest(task, time), time))
+        grid = make_grid(case, self.search.lattice)
         stages = [
             dataclasses.replace(stage, steps=jnp.where(time < self.shortest, 0, stage.steps))
-            for stage in planner.last_stages(attempt)
+            for stage in problem.list_last_stages(attempt)
         ]
-        field = planner.field(case, grid)
-        return planner.refined(case, field, guess, attempt, stages)
+        field = make_field(case, grid)
+        return problem.refine(case, field, guess, attempt, stages)
 
-    def solve_at_once(self, tasks: Replanning, attempt: Any) -> InterceptPlan:
-        """The plans of a batch, all at once."""
+    def solve_at_once(self, tasks: Replanning, attempt: Search | Warm) -> InterceptPlan:
+        """Return the plans of a batch, all at once."""
         if isinstance(attempt, Search):
             return self.planner.solve_at_once(tasks.case, attempt)
         return super().solve_at_once(tasks, attempt)
 
-    def rest(self, task: Replanning, time: Array) -> tuple[Array, Array]:
-        """Speed and curvature of the previous plan at the new knots 1..K, (K,) each."""
-        previous, num = task.previous, self.planner.pieces
+    def _sample_rest(self, task: Replanning, time: Array) -> tuple[Array, Array]:
+        """Sample speed and curvature of the previous plan at the new knots 1..K, (K,) each."""
+        previous, num = task.previous, self.problem.pieces
         at = task.elapsed + time * (jnp.arange(1, num + 1) / num)
         old = previous.time * jnp.linspace(0.0, 1.0, previous.speed.shape[0])
         speed, curvature = (
@@ -158,7 +148,7 @@ class ReplanIntercept(Planner):
 
 @jax.jit
 def _state(plan: InterceptPlan, time: Array) -> tuple[Array, Array, Array]:
-    """Pose (3,), speed and curvature at one time of a plan."""
+    """Return pose (3,), speed and curvature at one time of a plan."""
     time = jnp.minimum(time, plan.time)
     old = plan.time * jnp.linspace(0.0, 1.0, plan.speed.shape[0])
     return (

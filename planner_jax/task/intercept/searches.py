@@ -1,33 +1,43 @@
-"""Attempts of `spacetime` at an interception: how many ways, and how many steps from each."""
+"""Searches for starting points of an interception: their sizes, and the reach set of a case."""
 
 import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
 
 from planner_jax.core.protocol import Attempt
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.plane import reach
+from planner_jax.plane.distance_field import DistanceField, distance_field
+from planner_jax.task.intercept.case import InterceptCase
+from planner_jax.task.intercept.terms import discs_of, wrapped
 
-# A way takes about as much memory as so many starts of planners with few unknowns.
+# A path takes about as much memory as so many starts of planners with few unknowns.
 _ROOM = 8
-_ROOM_OF_WORD = 1 / 32768  # the same of a word of a reach set
+_ROOM_OF_WORD = 1 / 32768  # a word of a reach set takes as much memory as so many starts
+_FIELD = 128  # nodes of the distance field along either side of the map
 
 
 @dataclasses.dataclass(frozen=True)
 class Search(Attempt):
-    """An attempt: so many ways, and so many steps from each; static."""
+    """An attempt at a case: a number of paths, and of steps from each; static."""
 
     starts: int = dataclasses.field(init=False, default=1)
-    ways: int = 16
+    ways: int = 16  # paths
     solver: LevenbergConfig = LevenbergConfig()  # of the stage that keeps limits
-    following: int = 4  # steps along the way of cells
+    following: int = 4  # steps that follow the path of cells
     settling: int = 16  # steps towards less effort, or an earlier meeting
     margin: float = 0.03  # [m], kept from obstacles
     slack: float = 0.015  # share of every limit that is kept free
-    discs: int = 3  # that the body counts as in least squares
-    seed: int = 0  # of the ways
-    drawn: int = 4  # ways for each that is tried: the smoothest of them
-    directness: float = 2.0  # of these ways; see `reach.draw_way`
+    discs: int = 3  # that stand for the body in least squares
+    seed: int = 0  # of the paths
+    drawn: int = 4  # paths for each that is tried: the smoothest of them
+    directness: float = 2.0  # of these paths; see `reach.draw_path`
     lattice: reach.Lattice = reach.Lattice()
-    girth: float = 1.0  # of the body in the reach set; less finds ways that rounding closes
+    girth: float = 1.0  # of the body in the reach set; less finds paths that rounding closes
 
     def __post_init__(self) -> None:
         if self.ways < 1:
@@ -36,6 +46,21 @@ class Search(Attempt):
         words = lattice.cells**2 // 32 * lattice.levels * lattice.headings * lattice.layers
         starts = max(_ROOM * self.ways, round(_ROOM_OF_WORD * words))
         object.__setattr__(self, "starts", starts)
+
+    def draw_chances(self) -> reach.Chance:
+        """Draw the noise of every path; leaves have a leading axis for the paths."""
+        return reach.draw_chance(self.lattice, self.ways, self.seed, self.drawn)
+
+
+@dataclasses.dataclass(frozen=True)
+class Warm(Attempt):
+    """An attempt at re-planning: steps from the rest of the previous plan; static."""
+
+    solver: LevenbergConfig = LevenbergConfig(8)
+    settling: int = 4  # steps towards less effort
+    margin: float = 0.03  # of a `Search`
+    slack: float = 0.015
+    discs: int = 3
 
 
 _GIVEN = (
@@ -47,21 +72,16 @@ QUICK = tuple(
     dataclasses.replace(search, ways=ways, solver=LevenbergConfig(steps), settling=12)
     for search, ways, steps in zip(_GIVEN, (2, 4, 6), (8, 10, 14), strict=True)
 )
-# A car that begins beside a wall has no room for margins: many ways, which keep next to none.
+# A car that starts beside a wall has no room for margins: many paths, with next to no margin.
 _NARROW = tuple(
     Search(64, LevenbergConfig(60), seed=seed, girth=girth, margin=0.006, slack=1e-3, discs=7)
     for seed, girth in ((3, 0.9), (4, 0.75), (6, 0.9))
 )
 BEST = (dataclasses.replace(_GIVEN[0], ways=8, settling=48), *_GIVEN[1:], *_NARROW)
-# Of a free time every way is tried, until it brings little, and the best one is kept. To hurry is
-# to leave the cells: early meetings come out earlier where nothing follows them.
+# If the time is free, every path is tried until it improves little, and the best one is selected.
+# Early meetings come out earlier if no step follows the cells.
 _EARLY = Search(
-    32,
-    LevenbergConfig(60, tolerance=5e-4),
-    following=0,
-    girth=0.85,
-    drawn=1,
-    directness=0.0,
+    32, LevenbergConfig(60, tolerance=5e-4), following=0, girth=0.85, drawn=1, directness=0.0
 )
 _LEAST = Search(16, LevenbergConfig(60, tolerance=5e-4))
 _LATER = (
@@ -73,3 +93,99 @@ SEARCHES = {
     "early": (_EARLY, *_LATER),
     "least": (_LEAST, *_LATER),
 }
+
+
+@struct.dataclass
+class Found:
+    """The parts of a case that all its paths share."""
+
+    grid: reach.Grid
+    field: DistanceField  # of the walls
+    reach: reach.ReachSet
+    layers: Array  # (layers + 1,) bool, at which a path of cells leads to the target
+
+    @property
+    def is_reached(self) -> Array:
+        """Whether a path of cells leads to the target, () bool."""
+        return jnp.any(self.layers)
+
+
+def make_grid(case: InterceptCase, lattice: reach.Lattice) -> reach.Grid:
+    """Make the grid of cells and layers of a case."""
+    return reach.grid_of(lattice, case.start, case.time, case.limits.speed, case.lower, case.upper)
+
+
+def make_field(case: InterceptCase, grid: reach.Grid) -> DistanceField:
+    """Make the field of distances from the walls, with some nodes for each cell."""
+    spacing = grid.cell * (grid.lattice.cells / _FIELD)
+    return distance_field(case.walls, grid.corner, spacing, _FIELD)
+
+
+def search_reach(
+    case: InterceptCase, search: Search, *, is_time_free: bool, layers: Array | None = None
+) -> Found:
+    """Compute the reach set of a case.
+
+    Args:
+        case: one case.
+        search: sizes.
+        is_time_free: whether layers before the case's time may meet the target, static.
+        layers: () int32, number of layers to compute; by default those up to the case's time.
+    """
+    grid = make_grid(case, search.lattice)
+    field = make_field(case, grid)
+    radius, ahead = discs_of(case.body, 2)
+    level = case.limits.speed * jnp.linspace(0.0, 1.0, search.lattice.levels)
+    turn_rates = jnp.minimum(
+        case.limits.curvature * level,
+        case.limits.lateral_acceleration / jnp.maximum(level, 0.1 * case.limits.speed),
+    )
+    vehicle = reach.Vehicle(
+        radius=search.girth * radius, ahead=ahead, speed=case.limits.speed, turn_rates=turn_rates
+    )
+    needed = grid.num if layers is None else layers
+    by = _FIELD // search.lattice.cells
+    coarse = field.values[::by, ::by]
+    found = reach.reach_set(grid, coarse, case.movers, vehicle, case.speed, needed)
+    numbers = jnp.arange(search.lattice.layers + 1)
+    is_met = jax.vmap(lambda n: jnp.any(_meeting_cells(case, grid, found, n)[1]))
+    if is_time_free:
+        reached = is_met(numbers) & (numbers >= 1) & (numbers <= grid.num)
+    else:
+        reached = is_met(grid.num[None])[0] & (numbers == grid.num)
+    return Found(grid=grid, field=field, reach=found, layers=reached)
+
+
+def _meeting_cells(
+    case: InterceptCase, grid: reach.Grid, found: reach.ReachSet, layer: Array
+) -> tuple[Array, Array]:
+    """Return the cells of a layer at which the target is met; see `reach.goal_cells`."""
+    goal = case.target.at((layer + 0.5) * grid.step).pos
+    num = grid.lattice.headings
+    width = 2.0 * np.pi / num
+    angle = grid.heading + width * jnp.arange(num)
+    headings = jnp.abs(wrapped(angle - case.end_heading)) <= case.heading_tolerance + width
+    return reach.goal_cells(grid, found.bits[layer], goal, case.body.middle, headings)
+
+
+def draw_cell_path(
+    case: InterceptCase, found: Found, layer: Array, chance: reach.Chance, directness: float
+) -> reach.CellPath:
+    """Draw a random path of cells that meets the target at a layer () int32."""
+    cells, there = _meeting_cells(case, found.grid, found.reach, layer)
+    return reach.draw_smooth_path(found.grid, found.reach, layer, cells, there, chance, directness)
+
+
+# Written out, since published cases are drawn by it.
+_ARRIVAL = Search(ways=1, lattice=reach.Lattice(64, 30, 4, 32, 6.0), girth=1.0)
+
+
+def earliest_arrival(case: InterceptCase) -> Array:
+    """Return the time () [s] of the first layer of a reach set at which one case's target is met.
+
+    The layers are half a second apart where the case's time is 10 s. Infinite where no layer up to
+    that time meets the target; pure. No path is drawn, and nothing is optimised.
+    """
+    found = search_reach(case, _ARRIVAL, is_time_free=True)
+    first = jnp.argmax(found.layers).astype(case.time.dtype)
+    return jnp.where(found.is_reached, (first + 0.5) * found.grid.step, jnp.inf)

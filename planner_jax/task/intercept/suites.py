@@ -1,8 +1,9 @@
-"""Named, seeded suites of interceptions on a map of 8 m x 8 m, and what is seen of their targets.
+"""Named, seeded suites of interceptions on a map of 8 m x 8 m.
 
-Paper 003 shows one map of its own (Section V) and gives no ranges. Those here and in
+Paper 003 shows one map of its own (Section V) and gives no ranges. The ranges here and in
 `planner_jax.task.intercept.spec` are this library's, and part of each suite's name: a change of a
-range is another suite. All draws are uniform; the car is that of `case`.
+range is another suite. All draws are uniform; the car is the default car of `case`. World frame in
+the plane, SI units.
 
 | what | drawn from |
 |---|---|
@@ -13,116 +14,109 @@ range is another suite. All draws are uniform; the car is that of `case`.
 | movers | 4 to 6 corners on a circle of 0.2 to 0.4 m, 0.1 to 0.6 m/s (`storm`: 0.2 to 1 m/s) |
 
 A mover's middle crosses the straight line from start to meeting point at 0.2 to 0.8 of the time,
-in any direction, where a car that drives evenly along that line is just then.
+in any direction, at the point where a car that drives evenly along that line is then.
 
 A maze has walls of 0.2 m across the whole map, each with a gap of 0.7 to 1.1 m. Two arms of 0.5
-to 0.8 m on the side of the start, 0.8 to 1.4 m apart, make a dead end of the place where the
-straight line to the meeting point runs into a wall, or of the nearest one that leaves the gap
-alone; walls less than 2.5 m from the map's edge have none, so that the start has room to turn.
+to 0.8 m on the side of the start, 0.8 to 1.4 m apart, make a dead end where the straight line to
+the meeting point runs into a wall, or at the nearest position that leaves the gap alone; walls less
+than 2.5 m from the map's edge have none, so that the start has room to turn.
 
-A rush is what `hard` draws, with a tag of its own, and its target is to be met earlier than after
-the 10 s that the rest is drawn for: 0.5 s after the first layer of the reach set of
-`task.intercept.reach_time`, worked out in double precision. So its time differs from case
-to case. A target that is not reached within 10 s is drawn anew, as is one at which something is
-wrong at the new time.
+The suite `rush` draws the cases of `hard` with a tag of its own. The time to meet the target is not
+10 s, but 0.5 s after the first layer of the reach set (`searches.earliest_arrival`, in double
+precision), so that it differs from case to case.
 
-Whether the target turns and how many walls and movers there are is drawn once a case; the rest is
-drawn anew until `planner_jax.task.intercept.rejection` finds nothing wrong with it. World frame in
-the plane, SI units.
+Whether the target turns and how many walls and movers there are is drawn once a case. The rest is
+drawn again until no cause of rejection (`_APPLIES`) applies.
+
+Draws are dictionaries of arrays with leading axis B: "start" and "meeting" (B, 2) [m], of the rear
+axle's middle and of the target; the "time" (B,) [s] of the meeting, and whether the target is
+"reached" (B,) by then; the target's "pos" (B, 2) [m], "angle" [rad] and "speed" [m/s] at time 0,
+and its turn "rate" [rad/s]; corners of "walls" and, at time 0, "movers" (B, N, V, 2) [m],
+counter-clockwise and possibly repeated; "walls present" and "movers present" (B, N); and the
+"velocity" (B, N, 2) [m/s] of movers.
 """
 
 import dataclasses
-import zlib
-from typing import Any
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax.typing import ArrayLike, DTypeLike
+from scipy import ndimage
 
 from planner_jax.core.checks import floating
 from planner_jax.core.protocol import lane
 from planner_jax.core.registry import require_name
 from planner_jax.plane.obstacles import Obstacles
-from planner_jax.plane.target import PlanePath, TurningPath
-from planner_jax.task.arguments import require_draw
+from planner_jax.plane.target import TurningPath
+from planner_jax.task.arguments import make_generators
 from planner_jax.task.intercept.case import InterceptCase, case
-from planner_jax.task.intercept.reach_time import earliest_arrival
-from planner_jax.task.intercept.rejection import CAUSES, SIZE, TOP_SPEED, first_cause, moved
+from planner_jax.task.intercept.searches import earliest_arrival
 from planner_jax.task.intercept.spec import SUITES, Suite
 
+SIZE = 8.0  # [m], side of the map
+TOP_SPEED = 1.5  # [m/s]
+BODY_MIDDLE = 0.15  # [m], ahead of the rear axle
+START_ROOM = 0.35  # [m], from the body's middle at the start to walls and movers
+MEETING_ROOM = 0.4  # [m], from the meeting point to walls and movers
+TARGET_ROOM = 0.05  # [m], from the target to walls
+BODY_ROOM = 0.13  # [m], from the middle of a body that drives to walls: half its width
+_STEP = 0.1  # [s], between the positions of a target that are tested
+_CELL = 0.1  # [m], side of a cell of the grid
 START_X, START_SPEED = 0.8, 0.5  # [m], [m/s]
 EDGE_ROOM = 0.3  # [m], from the meeting point to the edge of the map
 THICKNESS = 0.2  # [m], of a maze's walls
 _SHAPE = 9  # numbers that a polygon takes: radius, corners, rotation, and six angles
 
+Draws = dict[str, np.ndarray]  # leaves with leading axis B; see above
+
 
 @dataclasses.dataclass(frozen=True)
 class Drawn:
-    """Cases of a suite, and how many draws they took."""
+    """Cases of a suite, and the number of draws that they took."""
 
     cases: InterceptCase  # leaves with leading axis B
     draws: np.ndarray  # (B,) int, the accepted one included
-    rejected: dict[str, np.ndarray]  # cause -> (B,) int, draws rejected for it first
-
-    @property
-    def acceptance(self) -> float:
-        """Share of all draws that were accepted."""
-        return len(self.draws) / int(self.draws.sum())
+    rejected: dict[str, np.ndarray]  # cause -> (B,) int, draws to which it was the first to apply
 
 
-def draw_cases(
-    suite: str, num: int, seed: int, first: int = 0, *, dtype: Any = jnp.float32
-) -> InterceptCase:
-    """A batch of cases of a suite, drawn in float64 and then cast.
+def drawn(
+    suite: str, num: int, seed: int, first: int = 0, *, dtype: DTypeLike = jnp.float32
+) -> Drawn:
+    """Draw a batch of cases of a suite in float64, cast it, and count the rejected draws.
 
     Args:
         suite: a key of `SUITES`.
-        num: B, how many, >= 1.
-        seed: >= 0. Case k of a suite and seed is always the same one.
-        first: place of the first one, >= 0.
+        num: B, number of cases, >= 1.
+        seed: >= 0. Case k of a suite and seed is always the same case.
+        first: index of the first case, >= 0.
         dtype: of every floating leaf.
 
     Raises:
         ValueError: an argument is out of its range; one line.
     """
-    return drawn(suite, num, seed, first, dtype=dtype).cases
-
-
-def drawn(suite: str, num: int, seed: int, first: int = 0, *, dtype: Any = jnp.float32) -> Drawn:
-    """The same cases, and how many draws of each were rejected, and why; see `draw_cases`."""
     require_name(SUITES, "suite", suite)
-    own, randoms, dtype = SUITES[suite], generators(suite, num, seed, first), floating(dtype)
+    own, randoms, dtype = SUITES[suite], make_generators(suite, num, seed, first), floating(dtype)
     accepted, draws, rejected = accepted_draws(own, randoms)
     return Drawn(cases=cases_of(accepted, dtype), draws=draws, rejected=rejected)
 
 
-def generators(suite: str, num: int, seed: int, first: int) -> list[np.random.Generator]:
-    """A generator of its own for every case, so that none depends on the others.
-
-    Raises:
-        ValueError: an argument is out of its range; one line.
-    """
-    require_draw(num, seed, first)
-    tag = zlib.crc32(suite.encode())
-    return [np.random.default_rng([seed, first + k, tag]) for k in range(num)]
-
-
 def accepted_draws(
     own: Suite, randoms: list[np.random.Generator]
-) -> tuple[dict[str, np.ndarray], np.ndarray, dict[str, np.ndarray]]:
-    """Of every generator the first draw in which nothing is wrong.
+) -> tuple[Draws, np.ndarray, dict[str, np.ndarray]]:
+    """Return the first draw of every generator to which no cause of rejection applies.
 
     Returns:
-        accepted: see `planner_jax.task.intercept.rejection`.
-        draws: (B,) int, as of `Drawn`.
-        rejected: likewise.
+        accepted: (B,) draws.
+        draws: as of `Drawn`.
+        rejected: as of `Drawn`.
     """
     num = len(randoms)
     kinds = np.stack([random.random(3) for random in randoms])
     pending, draws = np.arange(num), np.zeros(num, int)
     rejected = np.zeros((len(CAUSES), num), int)
-    accepted: dict[str, np.ndarray] = {}
+    accepted: Draws = {}
     while len(pending):
         uniform = np.stack([randoms[k].random(_columns(own)) for k in pending])
         candidates = _candidates(own, kinds[pending], uniform)
@@ -136,90 +130,39 @@ def accepted_draws(
         is_good = cause == len(CAUSES)
         rejected[cause[~is_good], pending[~is_good]] += 1
         for name, leaf in candidates.items():
-            if name not in accepted:
-                accepted[name] = np.zeros((num, *leaf.shape[1:]), leaf.dtype)
-            accepted[name][pending[is_good]] = leaf[is_good]
+            kept = accepted.setdefault(name, np.zeros((num, *leaf.shape[1:]), leaf.dtype))
+            kept[pending[is_good]] = leaf[is_good]
         pending = pending[~is_good]
     return accepted, draws, dict(zip(CAUSES, rejected, strict=True))
 
 
-def observe(
-    cases: InterceptCase,
-    seed: int,
-    noise: float = 0.1,
-    count: int = 15,
-    interval: float = 1.0,
-    first: int = 0,
-    until: float = 0.0,
-) -> tuple[np.ndarray, np.ndarray]:
-    """What was seen of the targets until the cars set out (paper 003, eq. 4), or longer.
-
-    Args:
-        cases: leaves with leading axis B.
-        seed: >= 0. What is seen in case k is always the same.
-        noise: [m], standard deviation on each axis.
-        count: how many observations up to time 0, when the last of them is made.
-        interval: [s], between two of them.
-        first: place of the first case, >= 0.
-        until: [s], how long the targets are still looked at after time 0, >= 0. What is seen
-            before is the same for all.
-
-    Returns:
-        times: (L,) [s], L = count + floor(until / interval).
-        positions: (B, L, 2) [m].
-
-    Raises:
-        ValueError: an argument is out of its range; one line.
-    """
-    given = {"count": (count, 1), "noise": (noise, 0), "first": (first, 0), "until": (until, 0)}
-    for name, (value, least) in given.items():
-        if not value >= least:
-            raise ValueError(f"{name} must be >= {least}, got {value}")
-    if not interval > 0.0:
-        raise ValueError(f"interval must be > 0, got {interval}")
-    times = interval * np.arange(1.0 - count, 1.0 + np.floor(until / interval + 1e-9))
-    positions = np.asarray(_seen(cases.target, times.astype(cases.time.dtype)))
-    tag = zlib.crc32(b"observations")
-    errors = [
-        np.random.default_rng([seed, first + k, tag]).standard_normal((len(times), 2))
-        for k in range(len(positions))
-    ]
-    return times, positions + noise * np.stack(errors)
-
-
-@jax.jit
-def _seen(paths: PlanePath, times: Array) -> Array:
-    """Positions (B, L, 2) [m] on paths with leading axis B at times (L,) [s]."""
-    return jax.vmap(lambda path: jax.vmap(lambda time: path.at(time).pos)(times))(paths)
-
-
 def _columns(suite: Suite) -> int:
-    """How many numbers one draw takes."""
+    """Return how many numbers one draw takes."""
     return 7 + suite.wall_room[0] * (2 + _SHAPE) + suite.mover_room[0] * (3 + _SHAPE)
 
 
-def _between(uniform: np.ndarray, low: Any, high: Any) -> np.ndarray:
-    """Numbers of [0, 1) spread over an interval."""
+def _between(uniform: np.ndarray, low: ArrayLike, high: ArrayLike) -> np.ndarray:
+    """Spread numbers of [0, 1) over an interval."""
     return low + uniform * (high - low)
 
 
 def _whole(uniform: np.ndarray, fewest: int, most: int) -> np.ndarray:
-    """Numbers of [0, 1) as whole ones from the fewest to the most."""
+    """Turn numbers of [0, 1) into whole ones from the fewest to the most."""
     return np.floor(_between(uniform, fewest, most + 1)).astype(int)
 
 
 def _unit(angle: np.ndarray) -> np.ndarray:
-    """Unit vectors (..., 2) at angles (...) [rad]."""
+    """Return unit vectors (..., 2) at angles (...) [rad]."""
     return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
-def _candidates(suite: Suite, kinds: np.ndarray, uniform: np.ndarray) -> dict[str, np.ndarray]:
-    """One draw for each of B cases, leaves with leading axis B.
+def _candidates(suite: Suite, kinds: np.ndarray, uniform: np.ndarray) -> Draws:
+    """Make one draw for each of B cases.
 
     Args:
-        suite: what to draw.
-        kinds: (B, 3), numbers that hold for all draws of a case.
-        uniform: (B, `_columns(suite)`), those of this draw.
+        suite: ranges.
+        kinds: (B, 3), numbers of [0, 1) that hold for all draws of a case.
+        uniform: (B, `_columns(suite)`), numbers of this draw.
     """
     turning, count_walls = kinds[:, 0] < 0.5, _whole(kinds[:, 1], *suite.num_walls)
     count_movers = _whole(kinds[:, 2], *suite.num_movers)
@@ -259,17 +202,15 @@ def _candidates(suite: Suite, kinds: np.ndarray, uniform: np.ndarray) -> dict[st
 
 
 def anywhere(uniform: np.ndarray) -> np.ndarray:
-    """Places (..., 2) [m] where targets may be met, from numbers of [0, 1)."""
+    """Return positions (..., 2) [m] at which targets may be met, from numbers of [0, 1)."""
     return _between(uniform, EDGE_ROOM, SIZE - EDGE_ROOM)
 
 
-def target_to(
-    meeting: np.ndarray, time: float, turning: np.ndarray, uniform: np.ndarray
-) -> dict[str, np.ndarray]:
-    """Targets that are at a place at a time, as draws have them.
+def target_to(meeting: np.ndarray, time: float, turning: np.ndarray, uniform: np.ndarray) -> Draws:
+    """Return the parts of draws for targets that are at a position at a time.
 
     Args:
-        meeting: (B, 2) [m], that place.
+        meeting: (B, 2) [m], that position.
         time: [s].
         turning: (B,) bool, whether they turn.
         uniform: (B, 4), numbers of [0, 1).
@@ -277,30 +218,30 @@ def target_to(
     side = np.where(uniform[:, 3] < 0.5, 1.0, -1.0)
     rate = np.where(turning, side * _between(uniform[:, 2], 0.03, 0.1), 0.0)
     angle, speed = 2.0 * np.pi * uniform[:, 0], _between(uniform[:, 1], 0.2, 0.5)
-    pos = meeting - moved(angle, speed, rate, np.full(len(meeting), time))
+    pos = meeting - _moved(angle, speed, rate, np.full(len(meeting), time))
     return {"pos": pos, "angle": angle, "speed": speed, "rate": rate}
 
 
-def _hurried(suite: Suite, drawn: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The same draws with an earlier meeting, and whether the reach set meets the target at all."""
+def _hurried(suite: Suite, drawn: Draws) -> Draws:
+    """Return draws with an earlier meeting, and whether the reach set meets the target at all."""
     with jax.enable_x64(True):
         cases = jax.tree.map(np.asarray, cases_of(drawn, jnp.float64))
         num = len(drawn["time"])
         arrivals = np.array([float(_earliest(lane(cases, k))) for k in range(num)])
     reached = np.isfinite(arrivals)
     time = np.where(reached, arrivals + suite.spare, drawn["time"])
-    way = moved(drawn["angle"], drawn["speed"], drawn["rate"], time)
+    way = _moved(drawn["angle"], drawn["speed"], drawn["rate"], time)
     return {**drawn, "time": time, "reached": reached, "meeting": drawn["pos"] + way}
 
 
-# One case at a time, so that what comes of it is no matter of the batch.
+# One case at a time, so that the result does not depend on the batch.
 _earliest = jax.jit(earliest_arrival)
 
 
 def _polygons(
     uniform: np.ndarray, corners: tuple[int, int], radius: tuple[float, float]
 ) -> np.ndarray:
-    """Convex polygons (..., 6, 2) [m] around the origin from `_SHAPE` numbers each.
+    """Make convex polygons (..., 6, 2) [m] around the origin from `_SHAPE` numbers each.
 
     Their corners lie on a circle, counter-clockwise; the last one is repeated.
     """
@@ -312,7 +253,7 @@ def _polygons(
 
 
 def _across(uniform: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Where on the x axis (B, 3) [m] the walls across a maze stand, from a number each."""
+    """Return positions on the x axis (B, 3) [m] of a maze's walls, from a number each."""
     even = np.where((count == 2)[:, None], [2.9, 5.5, SIZE], [2.2, 4.1, 6.0])
     return even + _between(uniform, -0.2, 0.2)
 
@@ -320,14 +261,14 @@ def _across(uniform: np.ndarray, count: np.ndarray) -> np.ndarray:
 def _maze(
     uniform: np.ndarray, across: np.ndarray, count: np.ndarray, start: np.ndarray, end: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (B, 12, 6, 2) [m] of a maze's polygons, and which of them there are, (B, 12).
+    """Return corners (B, 12, 6, 2) [m] of a maze's polygons, and which are present, (B, 12).
 
     Args:
         uniform: (B, 12, M), of which the first three rows are used.
-        across: (B, 3) [m], where the walls are.
-        count: (B,), how many of them there are.
+        across: (B, 3) [m], positions of the walls.
+        count: (B,), number of walls.
         start: (B, 2) [m].
-        end: (B, 2) [m], the straight line to which runs into dead ends.
+        end: (B, 2) [m]; the straight line from the start to it runs into dead ends.
     """
     u = np.moveaxis(uniform[:, :3], 2, 0)
     gap, half = _between(u[1], 0.8, SIZE - 0.8), 0.5 * _between(u[2], 0.7, 1.1)
@@ -335,7 +276,7 @@ def _maze(
     outer = mouth + THICKNESS
     slope = (end[:, 1:] - start[:, 1:]) / (end[:, :1] - start[:, :1])
     line = start[:, 1:] + slope * (across - start[:, :1])
-    # The line's place, or the nearest one on either side of the gap that is wide enough.
+    # The line's position, or the nearest one on either side of the gap that is wide enough.
     below = np.where(gap - half >= 2.0 * outer, np.clip(line, outer, gap - half - outer), np.inf)
     fits = SIZE - gap - half >= 2.0 * outer
     above = np.where(fits, np.clip(line, gap + half + outer, SIZE - outer), np.inf)
@@ -355,14 +296,14 @@ def _maze(
 
 
 def _boxes(left, low, right, high) -> np.ndarray:
-    """Corners (B, N, 6, 2) of upright rectangles with sides (B, N); the last one is repeated."""
+    """Return corners (B, N, 6, 2) of upright rectangles with sides (B, N), the last repeated."""
     x = np.stack([left, right, right, left, left, left], axis=-1)
     y = np.stack([low, low, high, high, high, high], axis=-1)
     return np.stack([x, y], axis=-1)
 
 
-def path_of(drawn: dict[str, np.ndarray], dtype: Any) -> TurningPath:
-    """The path of targets (...), as draws have them."""
+def path_of(drawn: Draws, dtype: DTypeLike) -> TurningPath:
+    """Return the paths of the targets of draws."""
     return TurningPath(
         pos=jnp.asarray(drawn["pos"], dtype),
         vel=jnp.asarray(drawn["speed"][..., None] * _unit(drawn["angle"]), dtype),
@@ -370,20 +311,17 @@ def path_of(drawn: dict[str, np.ndarray], dtype: Any) -> TurningPath:
     )
 
 
-def cases_of(drawn: dict[str, np.ndarray], dtype: Any) -> InterceptCase:
-    """The cases of accepted draws."""
-
-    def cast(value: np.ndarray) -> Array:
-        return jnp.asarray(value, dtype)
+def cases_of(drawn: Draws, dtype: DTypeLike) -> InterceptCase:
+    """Return the cases of accepted draws."""
 
     def group(kind: str, velocity: np.ndarray) -> Obstacles:
         present = drawn[f"{kind} present"]
         corners = np.where(present[..., None, None], drawn[kind], 0.0)
         centre = corners.mean(axis=2)
         return Obstacles(
-            centre=cast(centre),
-            corners=cast(corners - centre[:, :, None]),
-            velocity=cast(np.where(present[..., None], velocity, 0.0)),
+            centre=jnp.asarray(centre, dtype),
+            corners=jnp.asarray(corners - centre[:, :, None], dtype),
+            velocity=jnp.asarray(np.where(present[..., None], velocity, 0.0), dtype),
             present=jnp.asarray(present),
         )
 
@@ -399,3 +337,114 @@ def cases_of(drawn: dict[str, np.ndarray], dtype: Any) -> InterceptCase:
         speed=TOP_SPEED,
         dtype=dtype,
     )
+
+
+def _moved(angle, speed, rate, time) -> np.ndarray:
+    """Return the displacement (..., 2) [m] of targets with direction `angle` at time 0."""
+    half = 0.5 * rate * time
+    direction, chord = angle + half, speed * time * np.sinc(half / np.pi)
+    return np.stack([chord * np.cos(direction), chord * np.sin(direction)], axis=-1)
+
+
+def _path(suite: Suite, drawn: Draws) -> np.ndarray:
+    """Return positions (B, M, 2) [m] of the targets from time 0 to the meeting."""
+    times = np.linspace(0.0, drawn["time"], round(suite.time / _STEP) + 1, axis=1)
+    angle, speed, rate = (drawn[name][:, None] for name in ("angle", "speed", "rate"))
+    return drawn["pos"][:, None] + _moved(angle, speed, rate, times)
+
+
+def _is_off_map(suite: Suite, drawn: Draws) -> np.ndarray:
+    """Return whether the targets leave the map, (B,)."""
+    from_middle = np.abs(_path(suite, drawn) - 0.5 * SIZE)
+    return from_middle.max(axis=(1, 2)) > 0.5 * SIZE
+
+
+def _middle(drawn: Draws) -> np.ndarray:
+    """Return the middle (B, 2) [m] of the car's body at the start."""
+    return drawn["start"] + [BODY_MIDDLE, 0.0]
+
+
+def _is_too_far(_: Suite, drawn: Draws) -> np.ndarray:
+    """Return whether the greatest speed does not suffice, (B,)."""
+    distance = drawn["meeting"] - _middle(drawn)
+    return np.linalg.norm(distance, axis=1) > TOP_SPEED * drawn["time"]
+
+
+def _room(drawn: Draws, kind: str, points: np.ndarray, times: ArrayLike = 0.0) -> np.ndarray:
+    """Return the least distance (B,) [m] of points (B, [M,] 2) from obstacles at times (B,)."""
+    corners, points = drawn[kind], points if points.ndim == 3 else points[:, None]
+    if kind == "movers":
+        times = np.broadcast_to(times, len(points))[:, None, None, None]
+        corners = corners + times * drawn["velocity"][:, :, None]
+    least = np.full(len(points), np.inf)
+    for k in range(corners.shape[1]):
+        there = drawn[f"{kind} present"][:, k]
+        far = _distance(points[there], corners[there, None, k])
+        least[there] = np.minimum(least[there], far.min(axis=1))
+    return least
+
+
+def _distance(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Return the distance (...) [m] of points (..., 2) from convex polygons (..., V, 2); 0 inside.
+
+    The corners are counter-clockwise and may be repeated.
+    """
+    edge = np.roll(corners, -1, axis=-2) - corners
+    away = points[..., None, :] - corners
+    square = np.maximum((edge**2).sum(axis=-1), 1e-12)
+    share = np.clip((away * edge).sum(axis=-1) / square, 0.0, 1.0)
+    left_of = edge[..., 0] * away[..., 1] - edge[..., 1] * away[..., 0] >= 0.0
+    gap = ((away - share[..., None] * edge) ** 2).sum(axis=-1).min(axis=-1)
+    return np.where(left_of.all(axis=-1), 0.0, np.sqrt(gap))
+
+
+def _is_parted(_: Suite, drawn: Draws) -> np.ndarray:
+    """Return whether walls part the start from the meeting point, (B,)."""
+    count = round(SIZE / _CELL)
+    middles = (np.arange(count) + 0.5) * _CELL
+    parted = np.zeros(len(drawn["start"]), bool)
+    for k, ends in enumerate(np.stack([_middle(drawn), drawn["meeting"]], axis=1)):
+        free = np.ones((count, count), bool)
+        for corners in drawn["walls"][k][drawn["walls present"][k]]:
+            lowest = (corners.min(axis=0) - BODY_ROOM) / _CELL - 0.5
+            highest = (corners.max(axis=0) + BODY_ROOM) / _CELL - 0.5
+            first = np.clip(np.ceil(lowest), 0, count).astype(int)
+            last = np.clip(np.floor(highest), -1, count - 1).astype(int) + 1
+            box = tuple(slice(a, b) for a, b in zip(first, last, strict=True))
+            points = np.stack(np.meshgrid(middles[box[0]], middles[box[1]], indexing="ij"), axis=2)
+            free[box] &= _distance(points, corners) > BODY_ROOM
+        parts = np.zeros(free.shape, np.int32)
+        ndimage.label(free, np.ones((3, 3)), output=parts)
+        here, there = parts[tuple((ends / _CELL).astype(int).T)]
+        parted[k] = here != there
+    return parted
+
+
+# Cause of rejection -> whether it applies, (B,), in the order in which the causes are tested.
+_APPLIES: dict[str, Callable[[Suite, Draws], np.ndarray]] = {
+    "target off the map": _is_off_map,
+    "start near a wall": lambda _, drawn: _room(drawn, "walls", _middle(drawn)) < START_ROOM,
+    "meeting near a wall": lambda _, drawn: _room(drawn, "walls", drawn["meeting"]) < MEETING_ROOM,
+    "target through a wall": lambda suite, drawn: (
+        _room(drawn, "walls", _path(suite, drawn)) < TARGET_ROOM
+    ),
+    "mover at the start": lambda _, drawn: _room(drawn, "movers", _middle(drawn)) < START_ROOM,
+    "mover at the meeting": lambda _, drawn: (
+        _room(drawn, "movers", drawn["meeting"], drawn["time"]) < MEETING_ROOM
+    ),
+    "too far": _is_too_far,  # straight on at its greatest speed
+    "no way": _is_parted,  # for a disc as wide as the car
+    "out of reach": lambda _, drawn: ~drawn["reached"],  # by a layer of the reach set
+}
+CAUSES = tuple(_APPLIES)
+
+
+def first_cause(suite: Suite, drawn: Draws) -> np.ndarray:
+    """Return the index (B,) in `CAUSES` of the first cause that applies; their number if none."""
+    cause = np.full(len(drawn["start"]), len(CAUSES))
+    alive = np.arange(len(cause))
+    for place, applies in enumerate(_APPLIES.values()):
+        found = applies(suite, {name: leaf[alive] for name, leaf in drawn.items()})
+        cause[alive[found]] = place
+        alive = alive[~found]
+    return cause

@@ -247,8 +247,8 @@ def obstacle_terms(
     return squares, close / case.body.width
 
 
-def together(walls: Obstacles, movers: Obstacles) -> Obstacles:
-    """Both as one."""
+def join_obstacles(walls: Obstacles, movers: Obstacles) -> Obstacles:
+    """Return walls and movers as one."""
     size = max(walls.corners.shape[1], movers.corners.shape[1])
 
     def padded(corners: Array) -> Array:
@@ -271,7 +271,7 @@ def clearance(case: InterceptCase, way: Motion) -> Array:
     pos, heading, times = way.pos.reshape(-1, 2), way.heading.reshape(-1), way.time.reshape(-1)
     middle = pos + case.body.middle * way.direction.reshape(-1, 2)
     free = jnp.min(jnp.minimum(middle - case.lower, case.upper - middle), axis=1)
-    both = together(case.walls, case.movers)
+    both = join_obstacles(case.walls, case.movers)
     moved = both.centre[:, None] + both.velocity[:, None] * times[:, None]
     apart = separation(
         both.corners,
@@ -287,7 +287,7 @@ def clearance(case: InterceptCase, way: Motion) -> Array:
 def is_blocked(case: InterceptCase) -> tuple[Array, Array]:
     """Whether the car stands in an obstacle, and whether it cannot be at the meeting; () each."""
     goal = case.target.at(case.time).pos
-    both = together(case.walls, case.movers)
+    both = join_obstacles(case.walls, case.movers)
     before = both.centre - case.start[:2]
     here = separation(
         both.corners,

@@ -16,7 +16,7 @@ from planner_jax.sweep.intercept.drive import case_of, sampled_drive
 from planner_jax.sweep.intercept.figures.scene import draw_map, draw_polygons
 from planner_jax.sweep.report import RunRows
 from planner_jax.task.intercept.case import InterceptCase
-from planner_jax.task.intercept.default_planner import SpacetimeIntercept
+from planner_jax.task.intercept.searches import SEARCHES, search_reach
 
 _SLICES = 6
 _SAMPLES = 241
@@ -76,8 +76,7 @@ def reach_figure(figure: Figure, run: RunRows) -> None:
 @jax.jit
 def _layers(case: InterceptCase) -> dict[str, Array]:
     """Grid of a case, and what share of speeds and headings every cell of every layer holds."""
-    planner = SpacetimeIntercept()
-    found = planner.prepare(case, planner.attempts[0])
+    found = search_reach(case, SEARCHES["given"][0], is_time_free=False)
     bits = found.reach.bits  # (layers + 1, words, levels, headings, cells)
     every = (bits[..., None] >> jnp.arange(32, dtype=bits.dtype)) & 1
     share = jnp.mean(every.astype(jnp.float32), axis=(2, 3))  # (layers + 1, words, y, 32)
