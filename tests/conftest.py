@@ -59,16 +59,30 @@ def finished(request, tmp_path_factory):
     return out, start_sweep(module.TASK, module.SETTINGS, out, progress=False)
 
 
+# Published baselines, studies, learned policies, stores and clusters: `make test-slow` runs them.
+SLOW = (
+    *("b_spline", "baselines", "bezier", "block_adapt", "block_library", "block_peers"),
+    *("catch_peer", "hybrid_astar", "minimum_jerk", "mpp", "paper_catch", "path_smoothing"),
+    *("path_then_speed", "qp", "speed", "station_time"),
+    *("block_eye", "block_receding", "live"),
+    *("policy", "training", "learned_start"),
+    *("cluster", "joined_parquet", "stored_run"),
+    *("bench", "benchmark_ipopt", "intercept_oracle"),
+)
 # Modules that take longest, or whose compiled programs others find in the cache: the hit planner's
 # of test_exact, the catch planner's of test_decide. Workers get whole modules in this order: none
 # is left with a long one in the end, and none compiles what another one is compiling.
 FIRST = (
-    *("sims_flights", "path_then_speed", "exact", "notebooks", "intercept", "decide"),
-    *("contract", "own_task", "baselines", "along", "estimation"),
+    *("along_curvature", "sims_flights", "exact", "notebooks", "intercept", "decide"),
+    *("contract", "block", "own_task", "along", "estimation"),
 )
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """The modules of FIRST, then the others."""
+    """Mark the modules of SLOW, and put those of FIRST before the others."""
     places = {f"test_{name}": place for place, name in enumerate(FIRST)}
     items.sort(key=lambda item: places.get(item.path.stem, len(FIRST)))
+    for item in items:
+        if item.path.stem.removeprefix("test_") in SLOW:
+            item.add_marker(pytest.mark.slow)
