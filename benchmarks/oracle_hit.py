@@ -1,7 +1,7 @@
 """Does any feasible hit exist? A direct transcription with an interior-point solver looks for it.
 
     python -m benchmarks.oracle_hit [--serves DIR] [--delay S] [--limit-scale F]
-        [--failures plans.parquet | --indices FILE.npy] [--num N] [--starts K] [--out DIR]
+        [--failures RUN/plans | --indices FILE.npy] [--num N] [--starts K] [--out DIR]
 
 It draws a sample of the serves on which a planner failed and looks for hits by other means than
 the planners', with which it shares no code. The quadrotor's snap is constant on pieces of free
@@ -26,7 +26,7 @@ import numpy as np
 
 from planner_jax.benchmarks.hit_oracle.search import STARTS, Finding, find_hits, starting_points
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
-from planner_jax.runs.parquet import read_rows
+from planner_jax.runs.dataset import Dataset
 from planner_jax.runs.summary import wilson_interval
 from planner_jax.task.hit.suites import generate_serves, read_serves, to_cases
 from planner_jax.task.hit.validate import ServeError
@@ -36,8 +36,8 @@ VERDICTS = ("feasible", "infeasible", "undecided")
 
 
 def failed_indices(plans: Path) -> np.ndarray:
-    """Indices of the serves whose plan did not succeed, from a sweep's `plans.parquet`."""
-    table = read_rows(plans, ["index", "success"])
+    """Indices of the serves whose plan did not succeed, from a sweep's `plans`."""
+    table = Dataset(plans).read(["index", "success"])
     return table["index"].to_numpy()[~table["success"].to_numpy()]
 
 
@@ -104,7 +104,7 @@ def parser_of_arguments() -> argparse.ArgumentParser:
     add("--delay", type=float, default=0.0, help="seconds from the serve to the planning")
     add("--limit-scale", type=float, default=1.0, help="of speed, acceleration, body rate")
     which = parser.add_mutually_exclusive_group()
-    which.add_argument("--failures", type=Path, help="plans.parquet of a sweep (default: all)")
+    which.add_argument("--failures", type=Path, help="folder plans of a sweep (default: all)")
     which.add_argument("--indices", type=Path, help=".npy file with indices of serves")
     return parser
 

@@ -11,9 +11,8 @@ import jax
 import numpy as np
 import orbax.checkpoint as orbax
 
-from planner_jax.host.files import replacing
-from planner_jax.runs.manifest import to_write
-from planner_jax.runs.plain_json import JsonError, read_object, require_sealed
+from planner_jax.host.files import open_plain, replacing
+from planner_jax.runs.manifest import JsonError, parse_written, to_write
 
 
 class KeptParts:
@@ -48,8 +47,8 @@ class KeptParts:
             like: parameters of the same shapes.
         """
         try:
-            note = read_object(self._note(number))
-            require_sealed(note)
+            with open_plain(self._note(number)) as file:
+                note = parse_written(file.read())
             found = jax.device_get(self._keeper.restore(self._place(number), like))
             if _digest(found) == note["sha256"]:
                 return found

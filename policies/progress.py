@@ -25,19 +25,16 @@ from tqdm import tqdm
 from planner_jax.host import signals as stopping
 from planner_jax.host.files import open_plain
 from planner_jax.runs.manifest import (
-    is_count,
-    is_number,
-    read_sealed,
-    require_format,
+    JsonError,
+    parse_object,
+    parse_written,
+    read_written,
     to_write,
 )
-from planner_jax.runs.plain_json import JsonError, parse_object, require_sealed
 from planner_jax.runs.run_folder import RunFolder
 from planner_jax.runs.settings import SettingError
 
 FILE, ASKED = "progress.jsonl", "training.json"
-# What every row of the curve has.
-_CURVE = {"per_second", "reward", "solved", "last", "ratio", "violation"}
 _EVENTS = "tensorboard"
 
 
@@ -171,35 +168,14 @@ def read_rows(folder: Path) -> list[dict[str, Any]]:
         raise SettingError(f"run must be {rule}, got {shown} ({error.strerror})") from None
     first, _, rest = text.partition(b"\n")
     try:
-        head = parse_object(first)
-        require_format(head, "run", "a training", shown)
-        require_sealed(head)
+        head = parse_written(first)
         if head.get("sha256") != hashlib.sha256(rest).hexdigest():
             raise JsonError("has other rows than were written")
         rows = [parse_object(line) for line in rest.splitlines()]
-        if len(rows) != head.get("rows") or not all(map(_is_sound, rows)):
-            raise JsonError("has rows that are none of a training")
     except JsonError as error:
         rule = f"a training whose {FILE} is whole"
         raise SettingError(f"run must be {rule}, got {shown}, where it {error}") from None
     return rows
-
-
-def _is_sound(row: dict[str, Any]) -> bool:
-    """Whether a row has what every row has, and numbers where numbers belong."""
-    named = row.get("suites", {})
-    figures = [*(named.values() if isinstance(named, dict) else [None]), row]
-    return (
-        all(is_count(row.get(name)) for name in ("part", "decisions"))
-        and ("suites" in row or _CURVE <= row.keys())
-        and all(isinstance(each, dict) for each in figures)
-        and all(
-            value is None or is_number(value)
-            for each in figures
-            for name, value in each.items()
-            if name != "suites"
-        )
-    )
 
 
 def read_asked(folder: Path) -> dict[str, Any]:
@@ -208,4 +184,4 @@ def read_asked(folder: Path) -> dict[str, Any]:
     Raises:
         SettingError: the folder is not that of a training, or it is not as it was written.
     """
-    return read_sealed(folder / ASKED, "run", "a training")
+    return read_written(folder / ASKED, "run", "a training")

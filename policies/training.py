@@ -112,7 +112,7 @@ def train(training: Training, out: str | os.PathLike, *, progress: bool = True) 
     folder = Path(out)
     network = NETWORKS[training.network]()
     params = _first_params(training, network)  # before anything is written
-    with RunFolder(folder).begun():
+    with RunFolder(folder).owned():
         _require_same(folder, training)
         return _train_parts(training, folder, network, params, progress)
 

@@ -1,12 +1,11 @@
 """What is kept of a run's first flights, so that they can be drawn, filmed and played again.
 
-The file is `flights.parquet` in the run folder: a row a flight, lists flat, SI units, meanings
+They are the dataset `flights/` in the run folder: a row a flight, lists flat, SI units, meanings
 in the column metadata. Looks are at equal steps. They begin when the first ball leaves its
 machine, before there is a plan, and end when the last returned ball is down.
 """
 
 import dataclasses
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,14 +13,13 @@ import pyarrow as pa
 
 from planner_jax.ball.flight import BallState
 from planner_jax.runs.columns import BOOL, LIST, VECTOR, RefereedBatch, leaves_of, rows_of
-from planner_jax.runs.parquet import read_rows
 from planner_jax.runs.source import Chunk
 from planner_jax.sims.loop_state import Flown
 from planner_jax.sims.model import World
 from planner_jax.sims.robot import Robot
 from planner_jax.task.hit.validate import fly, landing
 
-FILE = "flights.parquet"
+FLIGHTS = "flights"
 _FAR = 20.0  # [m], where balls wait that are not in flight
 _LONGEST = 3.0  # [s], that a returned ball is followed
 
@@ -213,14 +211,12 @@ def to_rows(recording: Recording) -> pa.Table:
     return rows_of(_COLUMNS, batch, "world, z up; times from the first plan")
 
 
-def read_recording(path: Path) -> Recording:
-    """The recording in a file that was made from `to_rows`.
+def read_recording(table: pa.Table) -> Recording:
+    """Return the recording whose rows `to_rows` returned.
 
     Raises:
         ValueError: columns are missing, or do not fit each other.
-        pa.ArrowException, OSError: it cannot be read.
     """
-    table = read_rows(path)
     wanted = {column.name: column.type for column in _COLUMNS}
     found = dict(zip(table.column_names, table.schema.types, strict=True))
     if found != wanted:

@@ -23,8 +23,8 @@ from planner_jax.runs.columns import (
     status_column,
 )
 from planner_jax.runs.columns import RefereedBatch as FlownBatch
+from planner_jax.runs.dataset import Dataset
 from planner_jax.runs.environment import environment, require_backend
-from planner_jax.runs.parquet import read_rows
 from planner_jax.runs.run_folder import RunFolder
 from planner_jax.runs.settings import SettingError, require, settings_of_manifest
 from planner_jax.runs.source import Chunk
@@ -32,7 +32,7 @@ from planner_jax.runs.summary import percent, wilson_interval
 from planner_jax.runs.table import RateTable, own_cells, to_html, to_markdown
 from planner_jax.runs.timing import CompileClock, Stopwatch
 from planner_jax.sims.film import FilmError, draw_flight, film_flights, require_film
-from planner_jax.sims.recording import FILE, Recording, read_recording, to_rows
+from planner_jax.sims.recording import FLIGHTS, Recording, read_recording, to_rows
 from planner_jax.sims.settings import FlySettings, fly_settings
 from planner_jax.sims.task import FlightTask
 from planner_jax.sweep.report import require_counted
@@ -121,9 +121,9 @@ def _fly_into(
 ) -> dict[str, Any]:
     """Fly, and write everything; gives the manifest."""
     rows, times, flights = _fly_all(flight, cases, kept)
-    folder.write_rows(folder.plans, rows)
+    folder.plans.write_rows(rows)
     recording = flight.recording(cases, flights, np.arange(kept))
-    folder.write_rows(folder.path / FILE, to_rows(recording))
+    Dataset(folder.path / FLIGHTS).write_rows(to_rows(recording))
     if video := manifest["video"]:
         film_flights(folder.path / video, flight, recording, min(_FILMED, kept))
     done = {"state": "complete", "summary": _summary(flight, rows), "times": times}
@@ -139,20 +139,21 @@ def read_flights(folder: RunFolder) -> tuple[dict[str, Any], FlightTask, Recordi
         SettingError: the folder is not that of such a run.
     """
     manifest = folder.read_manifest()
-    path = folder.path / FILE
+    flights = Dataset(folder.path / FLIGHTS)
     kind, _, task = str(manifest["kind"]).partition(" ")
     if kind != "fly":
         raise SettingError(f"{folder.name} must be a run of flights, got a {manifest['kind']}")
-    if manifest["state"] != "complete" or not path.exists():
-        rule = f"{folder.name} must be finished, with its {FILE}"
+    if manifest["state"] != "complete" or not flights.files():
+        rule = f"{folder.name} must be finished, with its {FLIGHTS}"
         raise SettingError(f"{rule}, got {str(folder.path)!r}; fly it again")
-    folder.require_whole(manifest, "fly it again")
+    folder.require_whole(folder.plans, "fly it again", manifest["summary"]["num"])
+    folder.require_whole(flights, "fly it again")
     settings = settings_of_manifest(fly_settings(task), manifest["parameters"], folder.name)
     try:
-        recording = read_recording(path)
+        recording = read_recording(flights.read())
     except (pa.ArrowException, OSError, ValueError) as error:
         why = " ".join(str(error).split())
-        raise SettingError(f"{folder.name} must have a whole {FILE}: {why}") from None
+        raise SettingError(f"{folder.name} must have whole {FLIGHTS}: {why}") from None
     return manifest, settings.flight(), recording
 
 
@@ -160,7 +161,7 @@ def require_sound(folder: RunFolder) -> None:
     """Raise `SettingError` unless the files of flights are whole, and their summary counts them."""
     manifest, flight, _ = read_flights(folder)
     try:
-        counted = _summary(flight, read_rows(folder.plans))
+        counted = _summary(flight, folder.plans.read())
     except (pa.ArrowException, OSError, KeyError) as error:
         why = " ".join(str(error).split())
         raise SettingError(f"{folder.name} must have whole rows: {why}; fly it again") from None
@@ -244,7 +245,7 @@ def write_flight_report(folder: RunFolder) -> None:
     """Write `table.md`, `figures/` and `index.html` of a run of flights anew.
 
     Args:
-        folder: with `manifest.json` and `flights.parquet`; a film may be there.
+        folder: with `manifest.json`, `plans/` and `flights/`; a film may be there.
 
     Raises:
         SettingError: the folder is not that of a finished run of flights.
@@ -252,7 +253,7 @@ def write_flight_report(folder: RunFolder) -> None:
     manifest, flight, recording = read_flights(folder)
     folder.figures.mkdir(exist_ok=True)
     draw_flight(folder.figures / "flight.png", flight, recording, 0)
-    rows = read_rows(folder.plans)
+    rows = folder.plans.read()
     figures = ["flight.png", *flight.draw(folder.figures, rows)]
     more = flight.tables(rows)
     summary, video = manifest["summary"], manifest["video"]
@@ -284,9 +285,9 @@ def write_flight_report(folder: RunFolder) -> None:
         f"{lead}{shown}{''.join(_image(name) for name in figures)}{to_html(table)}"
         f"{''.join(f'<h2>{html.escape(each.title)}</h2>{chr(10)}{to_html(each)}' for each in more)}"
         f"<ul>\n{notes}</ul>\n"
-        f'<p>All rows: <a href="plans.parquet">plans.parquet</a>. The first '
+        f'<p>All rows: <a href="plans/">plans/</a>. The first '
         f"{len(recording)} flights look by look: "
-        f'<a href="{FILE}">{FILE}</a>; play them with <code>planner-jax view</code>.</p>\n'
+        f'<a href="{FLIGHTS}/">{FLIGHTS}/</a>; play them with <code>planner-jax view</code>.</p>\n'
         f"<details><summary>manifest.json</summary><pre>{record}</pre></details>\n"
         "</body></html>\n",
     )

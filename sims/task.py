@@ -63,7 +63,7 @@ class FlightTask(abc.ABC):
     CONTACT: ClassVar[str]  # what a thing is that was met, in pictures: "caught"
     SUCCESS: ClassVar[str]  # what a flight has done that succeeded: "caught all balls"
     PUBLISHED: ClassVar[str]  # what is published of the task, for the table
-    COLUMNS: ClassVar[Sequence[Column]]  # of `plans.parquet`, besides those of all tasks
+    COLUMNS: ClassVar[Sequence[Column]]  # of the rows, besides those of all tasks
     # Corners of what pictures show [m]; None for all that moves and stands.
     BOUNDS: ClassVar[tuple[tuple[float, float, float], tuple[float, float, float]] | None] = None
     HAS_REACH: ClassVar[bool] = False  # whether `reachable` can say anything

@@ -1,7 +1,7 @@
 """Sweeps whose chunks are made by a Ray cluster: a stand-in for Ray, and Ray itself (slow)."""
 
+import dataclasses
 import functools
-import itertools
 import os
 import signal
 import subprocess
@@ -9,7 +9,6 @@ import sys
 import time
 from types import SimpleNamespace
 
-import pyarrow.parquet as pq
 import pytest
 
 import planner_jax as pj
@@ -18,12 +17,13 @@ from planner_jax.core.registry import MissingExtra, install_line
 from planner_jax.runs.run_folder import RunFolder
 from planner_jax.runs.settings import SettingError, WorkersFailed
 from planner_jax.sweep import cluster, run
+from planner_jax.sweep.chunks import Maker
 from planner_jax.sweep.hit.settings import HitSettings
-from planner_jax.sweep.hit.sweep import HitSweep, HitTally
+from planner_jax.sweep.hit.sweep import HitSweep
 from planner_jax.sweep.run import SweepInterrupted, resume_sweep, start_sweep
 from tests.faults.commands import children_of
 from tests.faults.runs import quick_sweeps
-from tests.sweeps import stop_after
+from tests.sweeps import rows_of, stop_after
 
 TASK = pj.task_named("hit")
 NUM, BATCH = 64, 13  # five chunks
@@ -46,15 +46,14 @@ class RayTaskError(RayError):
 class StandIn:
     """What a sweep asks of Ray, in this process: the task that was asked for last is done first.
 
-    Workers die so often in the chunks of `deaths`, before the task is done. Of actors the first
-    `begins` get what they ask for. While `idle` is left, it is taken and nothing is done.
+    Workers die so often in the chunks of `deaths`, before the task is done.
     """
 
     exceptions = SimpleNamespace(RayError=RayError, RayTaskError=RayTaskError)
 
     def __init__(self):
-        self.deaths, self.done, self.begun, self.ended, self.retries = {}, [], [], 0, None
-        self.machines, self.actors, self.begins, self.idle = [{"CPU": 2.0}], [], 99, []
+        self.deaths, self.done, self.begun, self.ended, self.options = {}, [], [], 0, {}
+        self.resources = {"CPU": 2.0}
         self._waiting, self._found = {}, {}
 
     def init(self, **how):
@@ -63,56 +62,32 @@ class StandIn:
     def shutdown(self):
         self.ended += 1
 
-    def nodes(self):
-        alive = [{"Alive": True, "Resources": each} for each in self.machines]
-        return [*alive, {"Alive": False, "Resources": {"CPU": 64.0, "GPU": 8.0}}]
+    def cluster_resources(self):
+        return self.resources
 
     def put(self, value):
         return value
 
-    def remote(self, *, num_cpus, max_retries=None, num_gpus=0, **of_actors):
-        assert num_cpus == 1
-        if num_gpus:
-            assert of_actors == {"max_restarts": -1, "max_task_retries": 3} and max_retries is None
-            self.retries = of_actors["max_task_retries"]
-            return lambda kind: SimpleNamespace(remote=lambda: self._actor(kind(), num_gpus))
-        self.retries = max_retries
-        return self._task_of
+    def remote(self, **options):
+        self.options = options
 
-    def _task_of(self, function):
-        def remote(order, number):
-            self._waiting[number] = (function, order)
-            return number
+        def task_of(function):
+            def remote(order, number):
+                self._waiting[number] = (function, order)
+                return number
 
-        return SimpleNamespace(remote=remote)
+            return SimpleNamespace(remote=remote)
 
-    def _actor(self, worker, share):
-        name = f"actor {len(self.actors)}"
-        make, asked = self._task_of(worker.make), []
-        self.actors.append((share, asked))
+        return task_of
 
-        def remote(order, number):
-            asked.append(number)
-            return make.remote(order, number)
-
-        begun = SimpleNamespace(remote=lambda: name)
-        return SimpleNamespace(begun=begun, make=SimpleNamespace(remote=remote))
-
-    def wait(self, asked, timeout, num_returns=1):
-        if str(asked[0]).startswith("actor"):
-            assert num_returns == len(asked)
-            return asked[: self.begins], asked[self.begins :]
-        if self.idle and timeout:
-            self.idle.pop()()
-            return [], asked
-        while self._waiting and timeout:
+    def wait(self, asked, timeout):
+        while self._waiting:
             number = next(reversed(self._waiting))
             self._found[number] = self._outcome(number, *self._waiting.pop(number))
-        there = [number for number in asked if number not in self._waiting]
-        return there, [number for number in asked if number in self._waiting]
+        return asked, []
 
     def _outcome(self, number, function, order):
-        if self.deaths.get(number, 0) > self.retries:
+        if self.deaths.get(number, 0) > self.options["max_retries"]:
             return RayError("a worker died\nas did others")
         self.done.append(number)
         try:
@@ -139,8 +114,10 @@ def ray(monkeypatch, request):
     """The stand-in; Ray itself in slow tests. No report."""
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     told = ("RAY_USAGE_STATS_ENABLED", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER")
-    for name in ("NPROC", "PJRT_NPROC", *told):
+    changed = ("XLA_PYTHON_CLIENT_PREALLOCATE", "XLA_CLIENT_MEM_FRACTION", "CUDA_VISIBLE_DEVICES")
+    for name in ("NPROC", "PJRT_NPROC", *told, *changed):
         monkeypatch.setenv(name, "1")  # to be put back
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
     monkeypatch.setattr(run, "write_report", lambda folder: None)
     cluster._maker_of.cache_clear()
     if request.node.get_closest_marker("slow"):
@@ -150,34 +127,15 @@ def ray(monkeypatch, request):
     return stand_in
 
 
-def rows_of(out):
-    return (out / "plans.parquet").read_bytes()
-
-
 def test_rows_are_those_of_a_plain_run_in_whatever_order_they_are_made(finished, tmp_path, ray):
     out = tmp_path / "run"
     manifest = start_sweep(TASK, SETTINGS, out, progress=False, workers="ray")
     assert ray.done == [3, 2, 1, 0, 4]  # two for each worker at first
     assert rows_of(out) == rows_of(finished[0])
-    assert manifest["settings"] == finished[1]["settings"]
+    assert manifest["run"] == finished[1]["run"]
     assert manifest["sessions"][0]["workers"] == "ray"
     assert manifest["summary"]["successes"] == finished[1]["summary"]["successes"]
     assert ray.ended == 1
-
-
-def test_a_worker_sends_what_is_written_and_the_columns_that_are_counted(tmp_path, ray):
-    sent, real = [], ray.get
-    ray.get = lambda number: sent.append(real(number)) or sent[-1]
-    start_sweep(TASK, SETTINGS, tmp_path / "run", progress=False, workers="ray")
-    assert len(sent) == 5
-    for rows, record in sent:
-        assert rows.counted.column_names == [
-            name
-            for name in pq.read_schema(tmp_path / "run/plans.parquet").names
-            if name in HitTally.READS
-        ]
-        assert rows.file.num_rows == record["num"] == rows.counted.num_rows
-        assert "wall_seconds" not in record and b"part" not in rows.file.metadata
 
 
 def test_a_cluster_that_is_begun_is_of_this_machine_alone_and_tells_nobody(tmp_path, ray):
@@ -236,17 +194,23 @@ def test_a_run_begun_alone_is_finished_by_workers(finished, tmp_path, monkeypatc
     assert [session.get("workers") for session in manifest["sessions"]] == [None, "ray"]
 
 
-@pytest.mark.parametrize("entry", ["code", "settings"])
-def test_a_worker_that_would_make_other_rows_is_refused(tmp_path, monkeypatch, ray, entry):
-    out = tmp_path / "run"
-    if entry == "code":
-        asked_by = cluster.environment()
-        others = itertools.repeat({**asked_by, "code": "0" * 64})
-        found = itertools.chain([asked_by], others)
-        monkeypatch.setattr(cluster, "environment", lambda: next(found))
-    else:
-        monkeypatch.setattr(cluster, "settings_digest", lambda *_: "0" * 64)
-    with pytest.raises(WorkersFailed, match="workers must (be of planner-jax of|have the files)"):
+@pytest.mark.parametrize(
+    ("other", "told"),
+    [
+        (lambda made: {"makers": {**made.makers, "jax": "0.0.1"}}, "workers must be of jax "),
+        (lambda made: {"run": "0"}, "workers must have the files"),
+    ],
+)
+def test_a_worker_that_would_make_other_rows_is_refused(tmp_path, monkeypatch, ray, other, told):
+    out, real = tmp_path / "run", Maker.of
+
+    def change(*given):
+        made = real(*given)
+        return dataclasses.replace(made, **other(made))
+
+    monkeypatch.setattr(cluster.Maker, "of", change)
+    monkeypatch.setattr(run, "_maker_of", lambda sweep, settings: real(sweep, settings, BATCH))
+    with pytest.raises(WorkersFailed, match=told):
         start_sweep(TASK, SETTINGS, out, progress=False, workers="ray")
     assert RunFolder(out).read_manifest()["state"] == "interrupted"
 
@@ -270,156 +234,79 @@ def test_without_ray_the_extra_is_named_in_one_line(tmp_path, monkeypatch, capsy
 
 
 @pytest.mark.parametrize(
-    ("platform", "machines", "places"),
-    [
-        ("cpu", [{"CPU": 2.0, "memory": 1e9}], (2, 0.0, 1)),
-        ("cpu", [{"CPU": 4.0, "GPU": 1.0}, {"CPU": 3.0}, {}], (7, 0.0, 1)),
-        ("cpu", [{}], (1, 0.0, 1)),
-        ("gpu", [{"CPU": 32.0, "GPU": 2.0}], (16, 0.125, 4)),
-        ("gpu", [{"CPU": 16.0, "GPU": 1.0}], (8, 0.125, 4)),
-        ("gpu", [{"CPU": 4.0, "GPU": 2.0}], (2, 1.0, 4)),
-        ("gpu", [{"CPU": 2.0, "GPU": 4.0}], (4, 1.0, 1)),
-        ("gpu", [{"CPU": 64.0}, {"CPU": 8.0, "GPU": 1.0}, {"CPU": 12.0, "GPU": 4.0}], (5, 1.0, 6)),
-        ("gpu", [{"CPU": 64.0}, {"CPU": 6.0, "GPU": 1.0}], (3, 1 / 3, 4)),
-    ],
+    ("seen", "first"), [(None, "0"), ("0,1", "0"), ("3", "3"), ("2,0,1", "2"), ("", "")]
 )
-def test_workers_are_as_many_as_cores_or_up_to_eight_a_gpu(platform, machines, places, monkeypatch):
-    monkeypatch.setattr(cluster, "threads_of_a_computation", lambda: 1)
-    assert cluster._places(platform, machines) == cluster._Places(*places)
-
-
-def test_workers_of_a_gpu_share_its_memory_and_the_cores_of_its_machine():
-    told = cluster._places("gpu", [{"CPU": 32.0, "GPU": 2.0}]).environ()
-    assert told["NPROC"] == "4" and told["XLA_PYTHON_CLIENT_PREALLOCATE"] == "false"
-    assert 8 * float(told["XLA_CLIENT_MEM_FRACTION"]) == 0.6
-    assert told["PJRT_NPROC"] == "4"
-
-
-@pytest.mark.parametrize("threads", [1, 3])
-def test_workers_on_cores_compute_with_as_many_threads_as_the_run(monkeypatch, threads):
-    monkeypatch.setattr(cluster, "threads_of_a_computation", lambda: threads)
-    told = cluster._places("cpu", [{"CPU": 32.0}]).environ()
-    assert told == {"NPROC": str(threads), "PJRT_NPROC": str(threads)}
-
-
-@pytest.mark.parametrize(
-    ("seen", "first"),
-    [
-        (None, "0"),
-        ("0,1", "0"),
-        ("3", "3"),
-        ("2,0,1", "2"),
-        ("GPU-8f2a,GPU-17c0", "GPU-8f2a"),
-        ("", ""),
-        ("-1", "-1"),
-    ],
-)
-def test_the_process_that_asks_sees_the_first_gpu_of_those_it_may(seen, first):
-    environ = {"PATH": "/bin"} if seen is None else {"CUDA_VISIBLE_DEVICES": seen}
-    told = {"CUDA_VISIBLE_DEVICES": first, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
-    assert cluster._one_gpu(environ) == told
-
-
-@pytest.mark.parametrize("seen", [None, "1,0"])
-def test_gpus_are_hidden_while_jax_begins_and_no_longer(monkeypatch, seen):
-    found = {}
-    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+def test_the_process_that_asks_sees_the_first_gpu_of_those_it_may(
+    monkeypatch, tmp_path, ray, seen, first
+):
     if seen is not None:
         monkeypatch.setenv("CUDA_VISIBLE_DEVICES", seen)
-    before = dict(os.environ)
-    monkeypatch.setattr(cluster, "require_backend", lambda: found.update(os.environ) or "gpu")
-    assert cluster._platform() == "gpu"
-    assert found["CUDA_VISIBLE_DEVICES"] == ("0" if seen is None else "1")
-    assert dict(os.environ) == before
+    start_sweep(TASK, SETTINGS, tmp_path / "run", progress=False, workers="ray")
+    assert os.environ["CUDA_VISIBLE_DEVICES"] == first
 
 
 @pytest.fixture
 def gpus(monkeypatch, ray):
     """JAX says that it computes on a GPU, and the cluster has two."""
     monkeypatch.setattr(cluster, "require_backend", lambda: "gpu")
-    for name in ("XLA_PYTHON_CLIENT_PREALLOCATE", "XLA_CLIENT_MEM_FRACTION"):
-        monkeypatch.setenv(name, "")  # to be put back
-    ray.machines = [{"CPU": 8.0, "GPU": 2.0}]
+    ray.resources = {"CPU": 8.0, "GPU": 2.0}
     return ray
 
 
-def test_chunks_of_a_run_on_gpus_are_shared_by_workers_that_hold_parts_of_them(
-    finished, tmp_path, gpus
+@pytest.mark.parametrize(
+    ("cores", "num", "shared", "threads"),
+    [(32.0, 2.0, 8, "4"), (8.0, 2.0, 2, "4"), (2.0, 4.0, 1, "1"), (16.0, 1.0, 8, "4")],
+)
+def test_workers_share_gpus_their_memory_and_cores(
+    finished, tmp_path, gpus, cores, num, shared, threads
 ):
-    out = tmp_path / "run"
+    gpus.resources, out = {"CPU": cores, "GPU": num}, tmp_path / "run"
     start_sweep(TASK, SETTINGS, out, progress=False, workers="ray")
     assert rows_of(out) == rows_of(finished[0])
-    assert [share for share, _ in gpus.actors] == [0.5] * 4
-    assert [asked for _, asked in gpus.actors] == [[0, 4], [1], [2], [3]]
-    assert os.environ["XLA_CLIENT_MEM_FRACTION"] == "0.3000"
+    assert gpus.options["num_gpus"] == 1.0 / shared and gpus.options["max_calls"] == 0
+    assert os.environ["XLA_CLIENT_MEM_FRACTION"] == f"{0.6 / shared:.4f}"
+    assert os.environ["PJRT_NPROC"] == threads
 
 
-def test_a_worker_on_a_gpu_that_dies_is_begun_again(finished, tmp_path, gpus):
-    gpus.deaths, out = {1: 3}, tmp_path / "run"
-    start_sweep(TASK, SETTINGS, out, progress=False, workers="ray")
-    assert rows_of(out) == rows_of(finished[0])
-
-
-def test_workers_that_get_no_share_in_time_are_done_without(finished, tmp_path, monkeypatch, gpus):
-    monkeypatch.setattr(cluster, "_BEGIN", 0.01)
-    gpus.begins, out = 2, tmp_path / "run"
-    start_sweep(TASK, SETTINGS, out, progress=False, workers="ray")
-    assert rows_of(out) == rows_of(finished[0])
-    assert [len(asked) for _, asked in gpus.actors] == [3, 2, 0, 0]
-
-
-def test_a_cluster_whose_gpus_are_taken_ends_a_run_that_can_be_finished(
-    tmp_path, monkeypatch, gpus
+@pytest.mark.parametrize("threads", [1, 3])
+def test_workers_on_cores_compute_with_as_many_threads_as_the_run(
+    monkeypatch, tmp_path, ray, threads
 ):
-    monkeypatch.setattr(cluster, "_BEGIN", 0.01)
-    gpus.begins, out = 0, tmp_path / "run"
-    with pytest.raises(WorkersFailed, match="workers must get shares of GPUs within"):
-        start_sweep(TASK, SETTINGS, out, progress=False, workers="ray")
-    assert RunFolder(out).read_manifest()["state"] == "interrupted" and gpus.ended == 1
+    monkeypatch.setattr(cluster, "threads_of_a_computation", lambda: threads)
+    start_sweep(TASK, SETTINGS, tmp_path / "run", progress=False, workers="ray")
+    assert os.environ["NPROC"] == os.environ["PJRT_NPROC"] == str(threads)
+    assert ray.options == {"num_cpus": 1, "max_retries": 3}
 
 
-def test_a_run_on_a_gpu_is_refused_by_a_cluster_without(tmp_path, gpus, capsys):
-    gpus.machines, out = [{"CPU": 64.0}], tmp_path / "run"
-    assert main([*COMMAND, "--workers", "ray", "--out", str(out)]) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1 and "--workers must be of a cluster with GPUs" in said
-    assert not out.exists() and gpus.ended == 1
-
-
-def test_a_process_whose_jax_has_several_gpus_is_refused(tmp_path, monkeypatch, gpus):
-    monkeypatch.setattr(cluster.jax, "device_count", lambda: 2)
-    with pytest.raises(SettingError, match="workers must be asked for before JAX .* got 2 GPUs"):
+def test_a_run_on_a_gpu_is_refused_by_a_cluster_without(tmp_path, gpus):
+    gpus.resources = {"CPU": 64.0}
+    with pytest.raises(SettingError, match="workers must be of a cluster with GPUs"):
         start_sweep(TASK, SETTINGS, tmp_path / "run", progress=False, workers="ray")
     assert not (tmp_path / "run").exists() and gpus.ended == 1
 
 
-def test_a_machine_that_is_lost_with_its_gpus_ends_a_run_that_can_be_finished(
-    finished, tmp_path, gpus
-):
-    gpus.machines, out = [{"CPU": 1.0, "GPU": 1.0}] * 2, tmp_path / "run"
-    gpus.idle = [lambda: setattr(gpus, "machines", gpus.machines[:1])]
-    with pytest.raises(WorkersFailed, match="must keep the 2 GPUs .* got 1: a machine"):
-        start_sweep(TASK, SETTINGS, out, progress=False, workers="ray")
-    assert RunFolder(out).read_manifest()["state"] == "interrupted"
-    resume_sweep(TASK, out, progress=False)
-    assert rows_of(out) == rows_of(finished[0])
+def test_a_process_whose_jax_has_several_gpus_is_refused(tmp_path, monkeypatch, gpus):
+    monkeypatch.setattr(cluster.jax, "device_count", lambda: 2)
+    with pytest.raises(SettingError, match="workers must be asked for before JAX .* got 2"):
+        start_sweep(TASK, SETTINGS, tmp_path / "run", progress=False, workers="ray")
+    assert not (tmp_path / "run").exists() and gpus.ended == 1
 
 
-def test_a_worker_whose_jax_gets_no_gpu_ends_a_run_that_can_be_finished(
-    tmp_path, monkeypatch, gpus, capsys
+def test_a_worker_whose_jax_has_no_device_ends_a_run_that_can_be_finished(
+    tmp_path, monkeypatch, ray, capsys
 ):
+    platforms = iter(["cpu"])
+
     def backend():
-        if gpus.actors:
-            raise SettingError(
-                "JAX_PLATFORMS must name a platform that works here, got 'cuda' (no)"
-            )
-        return "gpu"
+        if (platform := next(platforms, None)) is None:
+            raise SettingError("JAX_PLATFORMS must name a platform that works here, got 'x' (no)")
+        return platform
 
     out = tmp_path / "run"
     monkeypatch.setattr(cluster, "require_backend", backend)
     assert main([*COMMAND, "--workers", "ray", "--out", str(out)]) == 1
     said = capsys.readouterr().err.splitlines()[-1]
-    assert "--workers must have a device to compute on, got none: JAX_PLATFORMS" in said
+    assert "--workers must be able to start the run, got: JAX_PLATFORMS" in said
     assert "finish with" in said
     assert RunFolder(out).read_manifest()["state"] == "interrupted"
 
@@ -439,7 +326,7 @@ def test_a_run_with_a_real_cluster_survives_the_death_of_a_worker(tmp_path):
         while sweep.poll() is None and not killed and time.monotonic() < until:
             time.sleep(0.02)
             raylets = raylets or children_of(sweep.pid, "raylet")
-            if list(out.glob("parts/part-*")):
+            if list(out.glob("plans/part-*")):
                 for pid in children_of(raylets[0], "ray::_make")[:1]:
                     os.kill(pid, signal.SIGKILL)
                     killed = True

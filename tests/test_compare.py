@@ -44,10 +44,8 @@ def written_run(folder, outcomes, *, kind="sweep hit", **settings):
         summary |= {"wilson_95": [0.0, 1.0], "plans_per_second_warm": 500.0}
         summary |= {"status_counts": {}, "failed_limits": {}}
         seconds = {f"{name}_seconds": 2.0 for name in ("compile", "referee", "wall")}
-        run.write_rows(run.plans, rows)
-        run.write_manifest(
-            {**manifest, "state": "complete", "summary": summary, "times": seconds, "files": {}}
-        )
+        run.plans.write_rows(rows)
+        run.write_manifest({**manifest, "state": "complete", "summary": summary, "times": seconds})
     return str(folder)
 
 

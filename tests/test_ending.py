@@ -16,8 +16,8 @@ from planner_jax.sweep import run
 from planner_jax.sweep.catch.settings import CatchSettings
 from planner_jax.sweep.hit.settings import HitSettings
 from planner_jax.sweep.hit.sweep import HitSweep
-from planner_jax.sweep.planned import planned_row
 from planner_jax.sweep.quadrotor import ending_remark
+from planner_jax.sweep.rows import planned_row
 from planner_jax.sweep.single import sampled
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, total_duration
 

@@ -23,7 +23,7 @@ from planner_jax.sweep.block.columns import COLUMNS as BLOCK
 from planner_jax.sweep.catch.columns import COLUMNS as CATCH
 from planner_jax.sweep.hit.columns import COLUMNS as HIT
 from planner_jax.sweep.intercept.columns import COLUMNS as INTERCEPT
-from planner_jax.sweep.planned import planned_row
+from planner_jax.sweep.rows import planned_row
 from planner_jax.task.hit.plan import HitPlan
 
 NUM = 3
@@ -79,9 +79,9 @@ def written_run(folder, task="hit", *, finished=True):
             summary = {"num": NUM, "successes": 1, "success_rate": 1 / 3, "wilson_95": [0.0, 1.0]}
             summary |= {"plans_per_second_warm": 0.0, "status_counts": {}, "failed_limits": {}}
             seconds = {f"{name}_seconds": 0.0 for name in ("compile", "referee", "wall")}
-            run.write_rows(run.plans, rows)
+            run.plans.write_rows(rows)
             run.write_manifest(
-                {**manifest, "state": "complete", "summary": summary, "times": seconds, "files": {}}
+                {**manifest, "state": "complete", "summary": summary, "times": seconds}
             )
     return run
 
@@ -115,10 +115,11 @@ def test_a_run_that_is_not_finished_or_damaged_or_of_flights(tmp_path):
     with pytest.raises(SettingError, match="^RUN must be finished, got .*; resume it first$"):
         planned_row(written_run(tmp_path / "half", finished=False), 0)
     run = written_run(tmp_path / "damaged")
-    content = bytearray(run.plans.read_bytes())
+    (part,) = run.plans.files()
+    content = bytearray(part.read_bytes())
     content[len(content) // 2] ^= 0xFF
-    run.plans.write_bytes(content)
-    with pytest.raises(SettingError, match="^RUN must be a run whose plans.parquet is whole, got"):
+    part.write_bytes(content)
+    with pytest.raises(SettingError, match="^RUN must be a run whose plans/part-000000-"):
         planned_row(run, 0)
     flown = RunFolder(tmp_path / "flown", name="RUN")
     manifest = {"kind": "fly hit", "state": "running", "parameters": {}}

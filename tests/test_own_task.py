@@ -16,6 +16,7 @@ import pytest
 import planner_jax as pj
 from planner_jax.cli.main import main
 from planner_jax.core.registry import all_tasks
+from tests.sweeps import rows_of
 
 OWN_TASK = Path(__file__).parent / "own_task"
 BROKEN = {
@@ -87,11 +88,11 @@ def test_a_sweep_writes_the_whole_run_folder(swept):
     assert 'src="figures/outcomes.png"' in page
     assert (out / "figures" / "outcomes.png").read_bytes().startswith(b"\x89PNG")
     assert "| square | 24 | 100.00 |" in (out / "table.md").read_text()
-    assert pq.read_table(out / "baselines.parquet")["planner"].to_pylist() == ["scipy"]
+    assert pq.read_table(out / "baselines")["planner"].to_pylist() == ["scipy"]
 
 
 def test_the_rows_are_the_leaves_of_case_plan_and_verdict(swept, meet):
-    rows = pq.read_table(swept[0] / "plans.parquet")
+    rows = pq.read_table(swept[0] / "plans")
     assert rows["index"].to_pylist() == list(range(24))
     assert set(rows["status"].to_pylist()) <= {"CONVERGED", "FEASIBLE"}
     cases, columns = meet.draw(24), {"case.most": "most", "case.target_pos": "target_pos"}
@@ -136,7 +137,7 @@ def test_a_sweep_that_ctrl_c_stops_is_resumed_to_the_same_rows(swept, tmp_path):
     assert manifest_of(tmp_path / "run")["state"] == "interrupted"
     done = command(tmp_path, "sweep", "meet", "--resume", "--out", "run")
     assert done.code == 0, done.err
-    rows = [(tmp_path / name / "plans.parquet").read_bytes() for name in ("run", "whole")]
+    rows = [rows_of(tmp_path / name) for name in ("run", "whole")]
     assert rows[0] == rows[1]
 
 

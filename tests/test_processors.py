@@ -10,6 +10,7 @@ from planner_jax import __main__ as process
 from planner_jax.cli.main import main as cli
 from planner_jax.host import processors
 from planner_jax.host import signals as stopping
+from tests.sweeps import rows_of
 
 
 def test_usable_cores_are_those_that_the_process_is_bound_to(monkeypatch):
@@ -90,5 +91,5 @@ def test_rows_do_not_depend_on_the_number_of_cores(tmp_path, task):
             env={name: value for name, value in os.environ.items() if "NPROC" not in name},
             preexec_fn=lambda cores=cores: os.sched_setaffinity(0, cores),
         )
-        rows.append((out / "plans.parquet").read_bytes())
+        rows.append(rows_of(out))
     assert rows[0] == rows[1]

@@ -10,19 +10,20 @@ from types import SimpleNamespace
 
 import jax
 import numpy as np
-import pyarrow.parquet as pq
+import pyarrow as pa
 import pytest
 
 from planner_jax.ball.flight import BallState
 from planner_jax.cli.main import main
 from planner_jax.core.registry import install_line
+from planner_jax.runs.dataset import Dataset
 from planner_jax.runs.run_folder import RunFolder
 from planner_jax.runs.settings import SettingError
 from planner_jax.sims import view
 from planner_jax.sims.loop_state import Flown, Record
 from planner_jax.sims.model import BALL_RADIUS
 from planner_jax.sims.recording import (
-    FILE,
+    FLIGHTS,
     Launches,
     Recording,
     frame,
@@ -124,8 +125,8 @@ def test_a_second_ball_is_there_from_its_own_launch():
 
 def test_a_recording_is_read_as_it_was_written(tmp_path):
     written = recording()
-    pq.write_table(to_rows(written), tmp_path / FILE)
-    read = read_recording(tmp_path / FILE)
+    Dataset(tmp_path / FLIGHTS).write_rows(to_rows(written))
+    read = read_recording(Dataset(tmp_path / FLIGHTS).read())
     for field in dataclasses.fields(written):
         before, after = getattr(written, field.name), getattr(read, field.name)
         assert before.shape == after.shape
@@ -192,8 +193,9 @@ def run_folder(tmp_path):
             **{"tracking_rms_median": 0.0, "tracking_worst": 0.0},
         },
     }
-    with folder.begun():
-        folder.write_rows(folder.path / FILE, to_rows(recording()))
+    with folder.owned():
+        Dataset(folder.path / FLIGHTS).write_rows(to_rows(recording()))
+        folder.plans.write_rows(pa.table({"index": [0]}))
         folder.write_manifest(manifest)
     return folder
 
@@ -210,14 +212,14 @@ def test_a_folder_without_flights_is_refused_in_one_line(run_folder, tmp_path, c
     run_folder.write_manifest({**manifest, "kind": "bench hit_rows"})
     assert said(capsys, run_folder.path) == "RUN must be a run of flights, got a bench hit_rows\n"
     run_folder.write_manifest({**manifest, "state": "running"})
-    assert said(capsys, run_folder.path).startswith("RUN must be finished, with its flights.parq")
+    assert said(capsys, run_folder.path).startswith("RUN must be finished, with its flights, got")
     run_folder.write_manifest(manifest)
     settings = {**manifest["parameters"], "task": "catch"}
     run_folder.write_manifest({**manifest, "parameters": settings})
     assert said(capsys, run_folder.path).startswith("RUN must be a run with settings of this ver")
     run_folder.write_manifest(manifest)
-    (run_folder.path / FILE).write_bytes(b"half of it")
-    assert said(capsys, run_folder.path).startswith("RUN must be a run whose flights.parquet is ")
+    Dataset(run_folder.path / FLIGHTS).files()[0].write_bytes(b"half of it")
+    assert said(capsys, run_folder.path).startswith("RUN must be a run whose flights/part-000000-")
 
 
 def test_a_missing_viser_is_named_with_its_remedy(run_folder, capsys, monkeypatch):

@@ -1,7 +1,7 @@
 """Sweeps: run folder, resuming, tables, figures, clocks and rates, on the hit task."""
 
-import html
 import json
+import shutil
 from types import SimpleNamespace
 
 import jax
@@ -11,15 +11,14 @@ import pyarrow.parquet as pq
 import pytest
 from matplotlib.figure import Figure
 from scipy.stats import binomtest
-from sweeps import columns, stop_after
+from sweeps import columns, rows_of, stop_after
 
 import planner_jax as pj
 from planner_jax.planning.plan import plan
 from planner_jax.planning.programs import solve_on_devices
 from planner_jax.referee.hit import referee_hits
 from planner_jax.robot import quadrotor
-from planner_jax.runs.parquet import pick_rows
-from planner_jax.runs.run_folder import RunFolder
+from planner_jax.runs.run_folder import LOCK, RunFolder
 from planner_jax.runs.settings import SettingError
 from planner_jax.runs.summary import percent, wilson_interval
 from planner_jax.runs.timing import CompileClock
@@ -66,14 +65,8 @@ def no_report(monkeypatch):
 
 @pytest.fixture
 def no_figures(monkeypatch):
-    """Draw nothing, and write the page all the same."""
+    """Draw nothing."""
     monkeypatch.setattr(HitSweep, "figures", ())
-
-
-def manifest_on_page(out):
-    """What the page of a run shows of its manifest."""
-    _, _, rest = (out / "index.html").read_text().partition("manifest.json</summary><pre>")
-    return json.loads(html.unescape(rest.partition("</pre>")[0]))
 
 
 # The folder.
@@ -83,14 +76,14 @@ def test_a_finished_run_holds_manifest_rows_table_figures_and_page(finished):
     out, manifest = finished
     assert manifest == json.loads((out / "manifest.json").read_text())
     assert manifest["state"] == "complete"
-    for name in ("plans.parquet", "baselines.parquet", "table.md", "index.html"):
+    for name in ("plans", "baselines", "table.md", "index.html"):
         assert (out / name).stat().st_size > 0
     page = (out / "index.html").read_text()
     for name in FIGURES:
         assert (out / "figures" / name).read_bytes().startswith(b"\x89PNG")
         assert f'src="figures/{name}"' in page
-    assert manifest_on_page(out) == manifest
-    assert not (out / "parts").exists() and not list(out.rglob(".*"))
+    assert len(list((out / "plans").iterdir())) == -(-NUM // BATCH)
+    assert [path.name for path in out.rglob(".*")] == [LOCK]
 
 
 def test_the_manifest_says_what_was_run_where_and_how_long(finished):
@@ -128,7 +121,7 @@ def test_the_summary_counts_the_rows(finished):
 
 def test_every_column_has_its_unit_and_meaning(finished):
     out, _ = finished
-    for field in pq.read_schema(out / "plans.parquet"):
+    for field in pq.ParquetDataset(out / "plans").schema:
         assert field.metadata.keys() == {b"unit", b"meaning"} and field.metadata[b"meaning"]
 
 
@@ -163,16 +156,15 @@ def test_the_rows_alone_lead_the_referee_to_the_same_verdict(finished):
     np.testing.assert_allclose(verdict.max_speed, rows["max_speed"], rtol=1e-5)
 
 
-def test_rows_are_picked_across_row_groups(finished):
-    out, _ = finished
-    picked = pick_rows(out / "plans.parquet", [BATCH, 0, NUM - 1, BATCH], ["index"])
+def test_rows_are_picked_across_parts(finished):
+    picked = RunFolder(finished[0]).plans.pick([BATCH, 0, NUM - 1, BATCH], ["index"])
     assert [row["index"] for row in picked] == [0, BATCH, NUM - 1]
 
 
 def test_a_report_is_drawn_again_from_the_folder_alone(finished, tmp_path):
     out, manifest = finished
-    for name in ("manifest.json", "plans.parquet"):
-        (tmp_path / name).write_bytes((out / name).read_bytes())
+    shutil.copytree(out / "plans", tmp_path / "plans")
+    shutil.copy(out / "manifest.json", tmp_path)
     write_report(RunFolder(tmp_path))
     for name in ("table.md", "index.html"):
         assert (tmp_path / name).read_text() == (out / name).read_text()
@@ -194,7 +186,7 @@ def test_an_interrupted_sweep_is_resumed_to_the_same_rows(
     assert RunFolder(out).read_manifest()["state"] == "interrupted"
     manifest = resume_sweep(TASK, out, progress=False, num=NUM, delay=0.8)
     assert manifest["state"] == "complete" and len(manifest["sessions"]) == 2
-    assert (out / "plans.parquet").read_bytes() == (finished[0] / "plans.parquet").read_bytes()
+    assert rows_of(out) == rows_of(finished[0])
     assert manifest["summary"]["successes"] == finished[1]["summary"]["successes"]
     assert resume_sweep(TASK, out, progress=False) == manifest
 
@@ -209,48 +201,29 @@ def test_a_sweep_killed_while_writing_is_resumed_to_the_same_rows(
             start_sweep(TASK, SETTINGS, out, progress=False)
     folder = RunFolder(out)
     folder.write_manifest({**folder.read_manifest(), "state": "running"})
-    (out / "parts" / ".4711.tmp.part-000002.parquet").write_bytes(b"half a part")
-    (out / ".4711.tmp.plans.parquet").write_bytes(b"half a table")
+    (out / "plans" / ".4711.tmp.part-000002.parquet").write_bytes(b"half a part")
+    (out / ".4711.tmp.table.md").write_bytes(b"half a table")
     resume_sweep(TASK, out, progress=False)
-    assert (out / "plans.parquet").read_bytes() == (finished[0] / "plans.parquet").read_bytes()
-    assert not list(out.rglob(".*"))
+    assert rows_of(out) == rows_of(finished[0])
+    assert [path.name for path in out.rglob(".*")] == [LOCK]
 
 
-def test_the_page_of_an_interrupted_sweep_says_so_until_it_is_resumed(
-    tmp_path, monkeypatch, no_figures
+@pytest.mark.parametrize("step", ["plan_baselines", "write_report"])
+def test_a_sweep_interrupted_behind_its_rows_is_resumed_to_its_report(
+    tmp_path, monkeypatch, no_figures, step
 ):
     def interrupted(*_):
         raise KeyboardInterrupt
 
     out = tmp_path / "run"
     with monkeypatch.context() as patch:
-        patch.setattr(run, "plan_baselines", interrupted)
+        patch.setattr(run, step, interrupted)
         with pytest.raises(SweepInterrupted):
             start_sweep(TASK, SETTINGS, out, progress=False)
-    assert manifest_on_page(out)["state"] == "interrupted"
-    assert manifest_on_page(out) == RunFolder(out).read_manifest()
-    monkeypatch.setattr(HitSweep, "other_planners", lambda *_: {})
+    assert RunFolder(out).read_manifest()["state"] == "interrupted"
+    assert not (out / "index.html").exists()
     manifest = resume_sweep(TASK, out, progress=False)
-    assert manifest["state"] == "complete" and manifest_on_page(out) == manifest
-
-
-def test_a_sweep_killed_before_its_last_manifest_is_resumed(tmp_path, monkeypatch, no_figures):
-    class Killed(BaseException):
-        pass
-
-    def killed(folder, manifest):
-        real(folder, manifest)
-        raise Killed
-
-    out, real = tmp_path / "run", run.rewrite_page
-    monkeypatch.setattr(HitSweep, "other_planners", lambda *_: {})
-    with monkeypatch.context() as patch:
-        patch.setattr(run, "rewrite_page", killed)
-        with pytest.raises(Killed):
-            start_sweep(TASK, SETTINGS, out, progress=False)
-    assert RunFolder(out).read_manifest()["state"] == "running"
-    manifest = resume_sweep(TASK, out, progress=False)
-    assert manifest["state"] == "complete" and manifest_on_page(out) == manifest
+    assert manifest["state"] == "complete" and (out / "index.html").exists()
 
 
 def test_resuming_with_another_setting_names_it(finished):

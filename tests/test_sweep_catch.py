@@ -1,6 +1,7 @@
 """The catch sweep: rows, table and figures of a suite, resuming, and what it refuses."""
 
 import json
+import shutil
 from types import SimpleNamespace
 
 import jax
@@ -8,14 +9,15 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from sweeps import columns, stop_after
+from sweeps import columns, rows_of, stop_after
 
 import planner_jax as pj
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
 from planner_jax.referee.catch import referee_catches
-from planner_jax.runs.columns import RefereedBatch, rows_of
-from planner_jax.runs.run_folder import RunFolder
+from planner_jax.runs.columns import RefereedBatch
+from planner_jax.runs.columns import rows_of as columns_of
+from planner_jax.runs.run_folder import LOCK, RunFolder
 from planner_jax.runs.settings import SettingError
 from planner_jax.sweep.catch.columns import COLUMNS, FRAME
 from planner_jax.sweep.catch.settings import CatchSettings
@@ -59,8 +61,8 @@ def test_a_finished_run_holds_manifest_rows_table_figures_and_page(finished):
     for name in FIGURES:
         assert (out / "figures" / name).read_bytes().startswith(b"\x89PNG")
         assert f'src="figures/{name}"' in page
-    assert pq.read_table(out / "baselines.parquet")["planner"].to_pylist() == ["mpp"]
-    assert not (out / "parts").exists() and not list(out.rglob(".*"))
+    assert pq.read_table(out / "baselines")["planner"].to_pylist() == ["mpp"]
+    assert [path.name for path in out.rglob(".*")] == [LOCK]
 
 
 def test_the_summary_counts_the_rows(finished):
@@ -82,13 +84,13 @@ def test_the_summary_counts_the_rows(finished):
 
 def test_a_planner_that_decides_itself_has_no_optimal_time_ratio(finished):
     tally = CatchTally(decides=False)
-    tally.add(pq.read_table(finished[0] / "plans.parquet"))
+    tally.add(pq.read_table(finished[0] / "plans"))
     assert tally.summary()["optimal_time_ratio"] is None
     assert CatchSweep(TASK).tally(CatchSettings(planner="mpp"))._decides is False
 
 
 def test_every_column_has_its_unit_and_meaning(finished):
-    for field in pq.read_schema(finished[0] / "plans.parquet"):
+    for field in pq.ParquetDataset(finished[0] / "plans").schema:
         assert field.metadata.keys() == {b"unit", b"meaning"} and field.metadata[b"meaning"]
 
 
@@ -130,8 +132,8 @@ def test_the_rows_alone_lead_the_referee_to_the_same_verdict(finished):
 
 def test_a_report_is_drawn_again_from_the_folder_alone(finished, tmp_path):
     out, _ = finished
-    for name in ("manifest.json", "plans.parquet"):
-        (tmp_path / name).write_bytes((out / name).read_bytes())
+    shutil.copytree(out / "plans", tmp_path / "plans")
+    shutil.copy(out / "manifest.json", tmp_path)
     write_report(RunFolder(tmp_path))
     assert (tmp_path / "table.md").read_text() == (out / "table.md").read_text()
     assert {path.name for path in (tmp_path / "figures").iterdir()} == set(FIGURES)
@@ -140,14 +142,14 @@ def test_a_report_is_drawn_again_from_the_folder_alone(finished, tmp_path):
 def test_a_plan_that_is_not_finite_is_reported_too(finished, tmp_path):
     out, manifest = finished
     (tmp_path / "manifest.json").write_bytes((out / "manifest.json").read_bytes())
-    table = pq.read_table(out / "plans.parquet").slice(manifest["example"], 1)
+    table = pq.read_table(out / "plans").slice(manifest["example"], 1)
     row = table.to_pylist()[0]
     row |= {"index": 0, "success": False, "sentence": "not finite", "caught": [False, False]}
     for name in ("coeffs", "durations", "catch_times", "net_distance"):
         row[name] = [float("nan")] * len(row[name])
     folder = RunFolder(tmp_path)
     folder.write_manifest({**manifest, "example": 0})
-    folder.write_rows(folder.plans, pa.Table.from_pylist([row], schema=table.schema))
+    folder.plans.write_rows(pa.Table.from_pylist([row], schema=table.schema))
     write_report(folder)
     assert "not finite" in (tmp_path / "index.html").read_text()
 
@@ -163,7 +165,7 @@ def test_an_interrupted_sweep_is_resumed_to_the_same_rows(finished, tmp_path, mo
     assert RunFolder(out).read_manifest()["state"] == "interrupted"
     manifest = resume_sweep(TASK, out, progress=False, suite="parabola2")
     assert manifest["state"] == "complete" and len(manifest["sessions"]) == 2
-    assert (out / "plans.parquet").read_bytes() == (finished[0] / "plans.parquet").read_bytes()
+    assert rows_of(out) == rows_of(finished[0])
 
 
 @pytest.mark.parametrize(
@@ -180,7 +182,7 @@ def test_a_run_is_resumed_as_what_it_is(finished, name, given, message):
 
 def test_cases_that_are_drawn_otherwise_are_not_mixed_into_a_run(finished, tmp_path, monkeypatch):
     out = tmp_path / "run"
-    with RunFolder(out).begun():
+    with RunFolder(out).owned():
         RunFolder(out).write_manifest({**finished[1], "state": "interrupted"})
     real = pj.catch.draw
     monkeypatch.setattr(
@@ -207,7 +209,7 @@ def test_the_columns_of_the_targets_bring_their_paths_back(suite):
     chunk = source.chunk(1)
     case_columns = [c for c in COLUMNS if c.name.startswith(("index", "ball", "drag", "swing"))]
     batch = RefereedBatch(chunk, None, None)
-    row = rows_of(case_columns, batch, FRAME).to_pylist()[0]
+    row = columns_of(case_columns, batch, FRAME).to_pylist()[0]
     assert row["index"] == 2
     times = np.array([0.0, 0.7, 1.3], np.float32)
     targets = jax.tree.map(lambda leaf: leaf[0], chunk.cases.targets)

@@ -47,7 +47,7 @@ def quick_planners():
 
 @pytest.fixture
 def rows(finished):
-    return pq.read_table(finished[0] / "plans.parquet").to_pylist()
+    return pq.read_table(finished[0] / "plans").to_pylist()
 
 
 def test_a_finished_run_holds_rows_figures_and_page(finished):
@@ -59,7 +59,7 @@ def test_a_finished_run_holds_rows_figures_and_page(finished):
     for name in FIGURES:
         assert (out / "figures" / name).read_bytes().startswith(b"\x89PNG")
         assert f'src="figures/{name}"' in page
-    for field in pq.read_schema(out / "plans.parquet"):
+    for field in pq.ParquetDataset(out / "plans").schema:
         assert field.metadata.keys() == {b"unit", b"meaning"} and field.metadata[b"meaning"]
 
 
@@ -138,7 +138,7 @@ def test_a_target_of_another_class_has_a_way_and_no_leaves():
 
 def test_a_plan_that_is_not_finite_is_reported_too(finished, tmp_path):
     out, manifest = finished
-    table = pq.read_table(out / "plans.parquet").slice(manifest["example"], 1)
+    table = pq.read_table(out / "plans").slice(manifest["example"], 1)
     row = table.to_pylist()[0]
     row |= {"index": 0, "success": False, "sentence": "not finite", "failed_limit": "not finite"}
     row |= dict.fromkeys(("meeting_time", "failed_time", "miss", "mover_clearance"), float("nan"))
@@ -146,7 +146,7 @@ def test_a_plan_that_is_not_finite_is_reported_too(finished, tmp_path):
         row[name] = [float("nan")] * len(row[name])
     folder = RunFolder(tmp_path)
     folder.write_manifest({**manifest, "example": 0})
-    folder.write_rows(folder.plans, pa.Table.from_pylist([row], schema=table.schema))
+    folder.plans.write_rows(pa.Table.from_pylist([row], schema=table.schema))
     write_report(folder)
     assert "not finite" in (tmp_path / "index.html").read_text()
 

@@ -18,7 +18,7 @@ from planner_jax.policies.networks import NETWORKS, Mlp
 from planner_jax.policies.observation import FEATURES
 from planner_jax.policies.policy import Policy
 from planner_jax.policies.progress import FILE, read_rows, to_text
-from planner_jax.runs.plain_json import sealed
+from planner_jax.runs.manifest import to_write
 from planner_jax.runs.settings import SettingError
 from planner_jax.task.catch.estimate import shortfall
 from planner_jax.task.catch.suites import draw_by_key
@@ -96,10 +96,10 @@ def test_curves_of_several_seeds_are_drawn_together_and_of_other_settings_are_no
     other.mkdir()
     asked = json.loads((out / "training.json").read_text())
     (other / FILE).write_text(to_text(read_rows(out)[:-3]))
-    (other / "training.json").write_text(json.dumps(sealed({**asked, "seed": 1})))
+    (other / "training.json").write_text(json.dumps(to_write({**asked, "seed": 1})))
     draw_curves([out, other], tmp_path / "both.png")
     assert (tmp_path / "both.png").stat().st_size > 10_000
-    (other / "training.json").write_text(json.dumps(sealed({**asked, "lanes": 7})))
+    (other / "training.json").write_text(json.dumps(to_write({**asked, "lanes": 7})))
     with pytest.raises(SettingError, match=f"same lanes as .*, {LANES}, got 7"):
         draw_curves([out, other], tmp_path / "both.png")
     with pytest.raises(SettingError, match="run must be the folder of a training"):

@@ -41,7 +41,6 @@ from planner_jax.runs.settings import (
     SettingError,
     WorkersFailed,
     ending_options,
-    is_address,
     require_ending,
 )
 
@@ -342,7 +341,7 @@ def _plan_of(source: str, row: int | None) -> tuple[Any, str]:
     """The plan of a row of a sweep or of a file, and what the referee says against it, if known."""
     if os.path.isdir(source):
         from planner_jax.runs.run_folder import RunFolder
-        from planner_jax.sweep.planned import planned_row
+        from planner_jax.sweep.rows import planned_row
 
         return planned_row(RunFolder(source, name="RUN"), row)
     from planner_jax.export.saved import saved_plan
@@ -358,7 +357,7 @@ def _case_of(source: str, row: Any, ending: str) -> Any:
         rule = "none for plans of a file that do not come to rest, as it does not hold their limits"
         raise SettingError(f"ending must be {rule}, got {ending}")
     from planner_jax.runs.run_folder import RunFolder
-    from planner_jax.sweep.planned import case_of_row
+    from planner_jax.sweep.rows import case_of_row
 
     keep_compiled_programs()
     return case_of_row(RunFolder(source, name="RUN"), row)
@@ -452,7 +451,7 @@ def _type_of(hint: Any) -> Callable[[str], Any]:
 def _add_sweep(task: Task, parser: _Parser) -> None:
     parser.description = (
         f"Many cases of one task, {task.summary}:\nplanned, and every plan judged by a referee.\n"
-        "Writes a run folder: index.html, table.md, figures, plans.parquet, manifest.json."
+        "Writes a run folder: index.html, table.md, figures, plans (Parquet), manifest.json."
     )
     _add_settings(parser, pkgutil.resolve_name(task.sweep), task)
     where = f"run folder (default: runs/{task.name}-PLANNER-DATE-TIME)"
@@ -523,7 +522,7 @@ def _add_fly(task: Task, parser: _Parser) -> None:
     parser.description = (
         f"Many flights of one task, {task.summary},\n"
         "in MuJoCo MJX with noise and latency.\n"
-        "Writes a run folder: index.html, table.md, a figure, plans.parquet, flights.parquet,\n"
+        "Writes a run folder: index.html, table.md, a figure, plans and flights (Parquet),\n"
         "manifest.json."
     )
     kind = pkgutil.resolve_name(str(task.flight))
@@ -539,18 +538,17 @@ def _add_fly(task: Task, parser: _Parser) -> None:
     parser.set_defaults(command=lambda given: _fly(task, kind, given))
 
 
-def _out(given: dict[str, Any], kind: str = "folder", *, stored: bool = False) -> str | None:
+def _out(given: dict[str, Any], kind: str = "folder") -> str | None:
     """The folder, or file, of the option `--out`, which is taken out of what was given.
 
     Args:
         given: options.
         kind: what it is.
-        stored: whether it may be an address in an object store.
     """
     out = given.pop("out", None)
     if out == "":
         raise SettingError(f"out must name a {kind}, got ''")
-    if out and not stored and is_address(out):
+    if out and "://" in out:
         raise SettingError(f"out must be a {kind} of this machine, got {out!r}")
     return out
 
@@ -561,25 +559,17 @@ def _run_folder(name: str) -> str:
 
 
 def _sweep(task: Task, given: dict[str, Any]) -> None:
-    resume, workers, out = (
-        given.pop("resume", False),
-        given.pop("workers", None),
-        _out(given, stored=True),
-    )
+    resume, workers, out = given.pop("resume", False), given.pop("workers", None), _out(given)
     if resume and out is None:
         raise SettingError("out must name the folder to resume, got nothing")
     settings = pkgutil.resolve_name(task.sweep)(**given).of(task)
     out = out or _run_folder(f"{task.name}-{task.split_planner(settings.planner)[0]}")
     settings.require_room(out)
     keep_compiled_programs()
-    from planner_jax.runs.stored_run import has_begun
     from planner_jax.sweep import run
 
-    again = f"planner-jax sweep {task.name} --resume --out {shlex.quote(str(out))}"
-
-    def rest() -> str:
-        return f"finish with: {again}" if has_begun(out) else stopping.NOTHING
-
+    again = f"finish with: planner-jax sweep {task.name} --resume --out {shlex.quote(str(out))}"
+    rest = functools.partial(_rest, Path(out), again)
     with stopping.under_way(rest), _told_how_to_go_on(rest):
         if resume:
             manifest = run.resume_sweep(task, out, workers=workers, **given)
@@ -664,11 +654,11 @@ def _throughput(given: dict[str, Any]) -> None:
 
 
 def _report(options: dict[str, Any]) -> None:
-    from planner_jax.runs.stored_run import run_folder
+    from planner_jax.runs.run_folder import RunFolder
 
-    folder = run_folder(options["run"], "RUN")
+    folder = RunFolder(options["run"], "RUN")
     manifest = folder.read_manifest()
-    with folder.resumed():
+    with folder.owned():
         if str(manifest["kind"]).startswith("fly "):
             from planner_jax.sims.run import require_sound, write_flight_report
 
@@ -680,7 +670,7 @@ def _report(options: dict[str, Any]) -> None:
 
             require_sound(folder)
             write_report(folder)
-            _print_sweep(folder.read_manifest(), folder.shown)
+            _print_sweep(manifest, str(folder.path))
 
 
 def _compare(options: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""The columns of `plans.parquet`: a row a case, SI units, world frame (z up)."""
+"""The columns of the run: a row a case, SI units, world frame (z up)."""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence

@@ -7,16 +7,17 @@ import platform
 import subprocess
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 from planner_jax.host.processors import processor, threads_of_a_computation, usable_cores
+from planner_jax.runs.manifest import Entries
 from planner_jax.runs.settings import SettingError
 
+_PACKAGES = ("planner-jax", "jax", "jaxlib", "numpy", "scipy")  # that decide rows
 _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def installed_version(name: str) -> str | None:
-    """Version of a package; None where it is used without being installed."""
+    """Return the version of a package; None where it is used without being installed."""
     try:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
@@ -25,10 +26,7 @@ def installed_version(name: str) -> str | None:
 
 @functools.cache
 def code_digest() -> str:
-    """SHA-256 of the names and contents of all that is installed of the package.
-
-    Without benchmarks, which decide no row of a run.
-    """
+    """Return the SHA-256 of the names and contents of the package's files, without benchmarks."""
     digest = hashlib.sha256()
     for place, folders, files in os.walk(_PACKAGE, followlinks=True):
         folders[:] = sorted(set(folders) - {"__pycache__", "benchmarks"})
@@ -39,16 +37,15 @@ def code_digest() -> str:
     return digest.hexdigest()
 
 
-def environment() -> dict[str, Any]:
-    """Versions, code, git commit and device, for the manifest."""
+def environment() -> Entries:
+    """Return versions, code, git commit and device, for the manifest."""
     import jax
 
     device = jax.devices()[0]
-    packages = ("planner-jax", "jax", "jaxlib", "numpy", "scipy", "pyarrow")
     return {
         "versions": {
             "python": platform.python_version(),
-            **{name: installed_version(name) for name in packages},
+            **{name: installed_version(name) for name in (*_PACKAGES, "pyarrow")},
         },
         "code": code_digest(),
         "git_commit": _git_commit(),
@@ -65,8 +62,24 @@ def environment() -> dict[str, Any]:
     }
 
 
+def makers_of(found: Entries) -> Entries:
+    """Return what decides rows besides settings and cases, in words.
+
+    Args:
+        found: as `environment` returns it.
+    """
+    device = found["device"]
+    return {
+        **{name: found["versions"][name] for name in _PACKAGES},
+        **{f"devices of {name}": device[name] for name in ("platform", "kind", "count")},
+        "processor": device["processor"],
+        "threads of a computation (NPROC)": device["threads"],
+        "files of planner-jax": found["code"][:12],
+    }
+
+
 def require_backend() -> str:
-    """The platform that JAX computes on.
+    """Return the platform that JAX computes on.
 
     Raises:
         SettingError: JAX has none that works, or the switch for kernels has a wrong value.
@@ -91,10 +104,7 @@ def require_backend() -> str:
 
 
 def _git_commit() -> str | None:
-    """Commit of the checkout that holds this package, "+" behind it where files differ.
-
-    None outside a checkout, and where git is missing.
-    """
+    """Return the commit of this checkout, with "+" where files differ; None where there is none."""
 
     def git(*arguments: str) -> str:
         command = ["git", "-C", str(_PACKAGE), *arguments]

@@ -6,7 +6,6 @@ JAX.
 
 import dataclasses
 import os
-import tempfile
 from collections.abc import Iterable
 from typing import Any, ClassVar, Self, TypeVar
 
@@ -16,14 +15,8 @@ from planner_jax.core.registry import Task, UnknownName, require_name
 from planner_jax.core.scales import scale_problem
 from planner_jax.host.memory import require_disk
 
-SCHEME = "s3://"  # of addresses in object stores
 AnySettings = TypeVar("AnySettings", bound="SweepSettings")
 KnownSettings = TypeVar("KnownSettings")
-
-
-def is_address(out: Any) -> bool:
-    """Whether an argument for a folder names one in an object store."""
-    return isinstance(out, str) and out.startswith(SCHEME)
 
 
 class SettingError(ValueError):
@@ -115,8 +108,6 @@ class SweepSettings:
         Args:
             out: of the run.
         """
-        if is_address(out):
-            out = tempfile.gettempdir()  # where the files are made
         try:
             require_disk("num", self.num or self.DEFAULT_NUM, self.ROW_BYTES, out)
         except ValueError as error:

@@ -57,7 +57,7 @@ class Tally:
         self._sums = dict.fromkeys(self.MEANS, 0.0)
 
     def add(self, rows: pa.Table) -> None:
-        """Count some rows of `plans.parquet`."""
+        """Count some rows of the run."""
         success = rows["success"].to_numpy().astype(bool)
         self.num += len(success)
         self.successes += int(success.sum())

@@ -1,28 +1,34 @@
-"""The chunks of a sweep: drawn or read, planned, refereed, written and counted."""
+"""The chunks of a sweep: drawn or read, planned, refereed and written as parts of the rows."""
 
 import contextlib
-import dataclasses
-import sys
+import functools
+import os
+import zlib
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypedDict
 
 import numpy as np
-import pyarrow as pa
+from jaxtyping import PyTree
 from tqdm import tqdm
 
+from planner_jax.core.planner import Planner
 from planner_jax.host import signals as stopping
+from planner_jax.host.files import open_plain
 from planner_jax.host.threads import as_here
 from planner_jax.runs.columns import RefereedBatch, rows_of
-from planner_jax.runs.parts import EncodedRows, Part, Parts
-from planner_jax.runs.run_folder import RunFolder
+from planner_jax.runs.dataset import Dataset, encode
+from planner_jax.runs.environment import environment, makers_of
+from planner_jax.runs.manifest import Entries, digest_of
+from planner_jax.runs.settings import SweepSettings
 from planner_jax.runs.source import Chunk, Source
 from planner_jax.runs.summary import percent
 from planner_jax.runs.timing import CompileClock, Stopwatch, timed, timed_warm
 from planner_jax.sweep.sweep import Sweep
 
-_COUNTED = ("num", "successes")  # of every part
 _UNDER_WAY = 2  # chunks that are judged or written while the next is planned
 _MEASURED = {
     "compile_seconds": "JAX tracing, lowering, compiling or reading its cache, while chunks were "
@@ -32,197 +38,174 @@ _MEASURED = {
     "host: decisions, ball tables, guesses and all rounds. Where these were less than half a "
     "batch, the first chunk planned again. Seconds of workers are added up",
     "referee_seconds": "judging, while the next chunk is planned",
-    "wall_seconds": "all chunks of all sessions with drawing, checking and writing; without "
-    "imports and report",
+    "wall_seconds": "all chunks of all sessions that were not killed, with drawing, checking and "
+    "writing; without imports and report",
 }
 
 
-@dataclasses.dataclass(frozen=True)
-class _Planned:
-    """One chunk, not judged yet."""
+class Record(TypedDict):
+    """How the rows of a part were made; its metadata hold this."""
 
-    chunk: Chunk
-    plans: Any
-    record: dict[str, Any]  # how long it took
+    run: str  # the digest of the `Maker`
+    number: int
+    num: int  # rows
+    successes: int
+    warm: bool  # whether nothing was compiled
+    plan_seconds: float
+    compile_seconds: float
+    referee_seconds: float
 
 
-@dataclasses.dataclass(frozen=True)
+Made = tuple[bytes, Record]  # content and record of a part
+# Start to make parts of these numbers, and yield functions that wait for each of them, in order.
+Workers = Callable[["Maker", Iterable[int]], Generator[Callable[[], Made], None, None]]
+
+
+@dataclass(frozen=True)
 class Maker:
-    """What is needed to make the rows of chunks."""
+    """What makes the rows of chunks."""
 
     sweep: Sweep
     source: Source
-    planner: Any
+    planner: Planner
+    makers: Entries  # versions, code and devices that decide rows
+    description: Entries  # of the source
+    run: str  # the SHA-256 of all that decides rows: these, the settings, and files they name
 
-    def planned(self, chunk: Chunk, clock: CompileClock) -> _Planned:
-        """A chunk's plans. What the clock has counted since its last lap is their compilation."""
+    @classmethod
+    def of(cls, sweep: Sweep, settings: SweepSettings, batch: int) -> "Maker":
+        """Open the source and the planner of a sweep.
+
+        Args:
+            sweep: of the task.
+            settings: of the sweep.
+            batch: cases a chunk, where the settings name no number.
+
+        Raises:
+            SettingError: the settings ask for what is not there.
+        """
+        source = sweep.open_source(settings, batch)
+        makers, description = makers_of(environment()), source.description()
+        parameters = source.settings.parameters()
+        decided = {"parameters": parameters, **description, "files": _files_of(parameters)}
+        run = digest_of({"makers": makers, **decided})
+        return cls(sweep, source, sweep.planner(source.settings), makers, description, run)
+
+    def plan(self, chunk: Chunk, clock: CompileClock) -> tuple[PyTree, Record]:
+        """Plan a chunk; what the clock has counted since its last lap is its compilation."""
         plans, seconds, warm = timed(lambda: self.sweep.plan(self.planner, chunk.cases))
-        record = {"num": len(chunk), "plan_seconds": seconds, "warm": warm}
-        record["compile_seconds"] = clock.lap()
-        return _Planned(chunk, plans, record)
+        return plans, {
+            "run": self.run,
+            "number": int(chunk.index[0]) // self.source.batch,
+            "num": len(chunk),
+            "successes": 0,
+            "warm": warm,
+            "plan_seconds": seconds,
+            "compile_seconds": clock.lap(),
+            "referee_seconds": 0.0,
+        }
 
-    @property
-    def counted(self) -> Sequence[str]:
-        """Names of the columns that are counted; none: all are."""
-        return self.sweep.tally(self.source.settings).READS
-
-    def judged(self, planned: _Planned) -> tuple[pa.Table, dict[str, Any]]:
-        """Rows and record of a chunk."""
+    def judge(self, chunk: Chunk, plans: PyTree, record: Record) -> Made:
+        """Judge plans, and encode the rows of their chunk."""
         watch = Stopwatch()
-        verdict = self.sweep.judge(planned.chunk.cases, planned.plans, self.source.settings)
+        verdict = self.sweep.judge(chunk.cases, plans, self.source.settings)
         record = {
-            **planned.record,
+            **record,
             "referee_seconds": watch.lap(),
             "successes": int(np.sum(verdict.success)),
         }
-        batch = RefereedBatch(planned.chunk, planned.plans, verdict)
-        return rows_of(self.sweep.columns(batch), batch, self.sweep.frame), record
-
-    def encoded(self, rows: pa.Table, record: dict[str, Any]) -> "Made":
-        """Rows and record of a chunk as they are written."""
-        return EncodedRows.of(rows, self.counted), record
+        batch = RefereedBatch(chunk, plans, verdict)
+        return encode(rows_of(self.sweep.columns(batch), batch, self.sweep.frame), record), record
 
 
-# Rows and record of a chunk; of one that was read, no record.
-Made = tuple[EncodedRows, dict[str, Any] | None]
-# Waits for a chunk that is being made.
-Making = Callable[[], Made]
-# Begin to make chunks of these numbers, and give them in their order.
-Workers = Callable[["SweepRun", Iterable[int]], Generator[Making, None, None]]
+def _files_of(parameters: Entries) -> dict[str, int]:
+    """Return checksums of the files that settings name, as in "library:FILE"."""
+    found = {}
+    for name, value in parameters.items():
+        path = value.partition(":")[2] if isinstance(value, str) else ""
+        if os.path.isfile(path):
+            with open_plain(Path(path)) as file:
+                for block in iter(lambda file=file: file.read(1 << 20), b""):
+                    found[name] = zlib.crc32(block, found.get(name, 0))
+    return found
 
 
-@dataclasses.dataclass(frozen=True)
-class SweepRun(Maker):
-    """A sweep under way."""
+def make_parts(
+    maker: Maker, rows: Dataset, there: dict[int, Record], workers: Workers | None, progress: bool
+) -> dict[int, Record]:
+    """Plan, referee and write every chunk that has no part yet.
 
-    folder: RunFolder
-    parts: Parts
-    workers: Workers | None = None  # None: chunks are made by this process
-
-
-def plan_chunks(run: SweepRun, *, progress: bool) -> dict[str, Any]:
-    """Plan, referee and write every chunk that has no part yet, and join all to `plans.parquet`.
+    While one chunk is planned, the next is drawn, and the last ones are judged and written.
 
     Args:
-        run: the sweep.
+        maker: of the sweep.
+        rows: of the run.
+        there: records of the parts that there are, by number.
+        workers: that make the chunks; None for this process.
         progress: show a bar on the standard error stream.
 
     Returns:
-        Entries for the manifest: `summary`, `times`, and `example`, a case worth a figure.
+        The records of all parts by number.
     """
-    source, folder = run.source, run.folder
-    there = run.parts.sound()
-    records = {number: part.record for number, part in there.items()}
-    done, successes = (sum(each[name] for each in records.values()) for name in _COUNTED)
-    if progress:
-        print(f"Writing {folder.shown}; the first chunk compiles.", file=sys.stderr)
-    look: dict[str, Any] = {"unit": " plans", "desc": source.settings.planner}
-    tally = run.sweep.tally(source.settings)
-    with tqdm(total=source.num, initial=done, disable=not progress, **look) as bar:
-        for chunk, rows, record in _in_pipeline(run, there):
-            tally.add(rows.counted)
-            if record is None:  # there already
-                continue
-            records[chunk] = record
-            done, successes = done + record["num"], successes + record["successes"]
-            bar.set_postfix_str(f"success {percent(successes, done)} %", refresh=False)
-            bar.update(record["num"])
-    times = _times(run, records)
-    summary = tally.summary()
-    summary["plans_per_second_warm"] = round(times["warm_plans"] / times["warm_seconds"], 1)
-    summary["compile_seconds"] = times["compile_seconds"]
-    return {"summary": summary, "times": times, "example": tally.example}
+    source, records = maker.source, dict(there)
+    done, successes = (sum(each[name] for each in there.values()) for name in ("num", "successes"))
+    look = {"unit": " plans", "desc": source.settings.planner, "disable": not progress}
+    pending: deque[Future[Record]] = deque()
 
+    def write(make: Callable[[], Made]) -> Record:
+        content, record = make()
+        rows.write(record["number"], content)
+        return record
 
-def _in_pipeline(
-    run: SweepRun, there: dict[int, Part]
-) -> Iterator[tuple[int, EncodedRows, dict[str, Any] | None]]:
-    """Number and rows of every chunk in order, and the record of those that had no part.
+    with tqdm(total=source.num, initial=done, **look) as bar, ThreadPoolExecutor(2) as pool:
+        missing = [number for number in range(source.num_chunks) if number not in there]
+        making = workers(maker, missing) if workers else _make_here(maker, missing, pool)
 
-    While one chunk is planned the next is drawn, the one before is judged, and the one before
-    that is encoded, unless workers do so, and written.
+        def wait_until(most: int) -> None:
+            nonlocal done, successes
+            while len(pending) > most:
+                record = pending.popleft().result()
+                records[record["number"]] = record
+                done, successes = done + record["num"], successes + record["successes"]
+                bar.set_postfix_str(f"success {percent(successes, done)} %", refresh=False)
+                bar.update(record["num"])
+            stopping.check()
 
-    Args:
-        run: the sweep.
-        there: the parts that there are, by the numbers of their chunks.
-    """
-    folder, source, watch = run.folder, run.source, Stopwatch()
-    pending: deque[Future] = deque()
-    with (
-        folder.joining_parts() as join,
-        # Left in the opposite order: what has been planned is still judged, written and joined.
-        ThreadPoolExecutor(1) as joiner,
-        ThreadPoolExecutor(1) as writer,
-        ThreadPoolExecutor(1) as judge,
-        ThreadPoolExecutor(1) as drawer,
-    ):
-
-        def write(chunk: int, made: Making) -> tuple[int, EncodedRows, dict[str, Any] | None]:
-            rows, record = made()
-            joined = joiner.submit(join, rows.file)
-            if record is not None:
-                record = {**record, "wall_seconds": watch.lap()}  # since the one before
-                record = run.parts.write(chunk, rows, record)
-            joined.result()
-            return chunk, rows, record
-
-        missing = [chunk for chunk in range(source.num_chunks) if chunk not in there]
-        if run.workers is None:
-            making = _made_here(run, missing, drawer, judge)
-        else:
-            making = run.workers(run, missing)
         with contextlib.closing(making):
-            for chunk in range(source.num_chunks):
-                stopping.check()
-                if chunk in there:
-                    made = judge.submit(_read, run, there[chunk]).result
-                else:
-                    made = next(making)
-                pending.append(writer.submit(write, chunk, made))
-                if len(pending) > _UNDER_WAY:
-                    yield pending.popleft().result()
-            while pending:
-                yield pending.popleft().result()
+            wait_until(0)
+            for make in making:
+                pending.append(pool.submit(as_here(write), make))
+                wait_until(_UNDER_WAY)
+            wait_until(0)
+    return records
 
 
-def _read(run: SweepRun, part: Part) -> Made:
-    """The rows of a part that there is."""
-    return part.read(run.counted), None
-
-
-def _made_here(
-    run: SweepRun, numbers: Iterable[int], drawer: ThreadPoolExecutor, judge: ThreadPoolExecutor
-) -> Generator[Making, None, None]:
-    """Make chunks by this process: while one is planned, the next is drawn, the last is judged."""
+def _make_here(
+    maker: Maker, numbers: Iterable[int], pool: ThreadPoolExecutor
+) -> Generator[Callable[[], Made], None, None]:
+    """Plan chunks in this process, and yield what judges them."""
     with CompileClock() as clock:
-        draws = (drawer.submit(as_here(run.source.chunk), number) for number in numbers)
+        draws = (pool.submit(as_here(maker.source.chunk), number) for number in numbers)
         following = next(draws, None)
         while following is not None:
-            drawn, following = following, next(draws, None)
-            judged = judge.submit(as_here(run.judged), run.planned(drawn.result(), clock))
-            yield lambda judged=judged: run.encoded(*judged.result())
+            chunk, following = following.result(), next(draws, None)
+            yield functools.partial(maker.judge, chunk, *maker.plan(chunk, clock))
 
 
-def _times(run: SweepRun, records: dict[int, dict[str, Any]]) -> dict[str, Any]:
-    """The times of the manifest, from the records of the parts by their numbers."""
-    seconds = dict.fromkeys(_MEASURED, 0.0)
-    warm_plans = 0
-    for chunk, record in sorted(records.items()):
-        for name in ("compile_seconds", "referee_seconds", "wall_seconds"):
-            seconds[name] += record[name]
-        if chunk == 0:
-            seconds["first_seconds"] = record["plan_seconds"]
-        if record["warm"]:
-            warm_plans += record["num"]
-            seconds["warm_seconds"] += record["plan_seconds"]
-    if 2 * warm_plans < min(run.source.batch, run.source.num):
-        warm_plans, seconds["warm_seconds"] = _warm_first_chunk(run)
-    rounded = {name: round(value, 4) for name, value in seconds.items()}
-    return {**rounded, "warm_plans": warm_plans, "measured": _MEASURED}
-
-
-def _warm_first_chunk(run: SweepRun) -> tuple[int, float]:
-    """Number of plans and seconds of the first chunk, planned until nothing is compiled."""
-    chunk = run.source.chunk(0)
-    _, seconds = timed_warm(lambda: run.sweep.plan(run.planner, chunk.cases))
-    return len(chunk), seconds
+def times_of(maker: Maker, records: dict[int, Record]) -> Entries:
+    """Return the times of the manifest but `wall_seconds`, from the records of all parts."""
+    parts = [records[number] for number in sorted(records)]
+    warm = [part for part in parts if part["warm"]]
+    num, seconds = (sum(part[name] for part in warm) for name in ("num", "plan_seconds"))
+    if 2 * num < min(maker.source.batch, maker.source.num):
+        chunk = maker.source.chunk(0)
+        _, seconds = timed_warm(lambda: maker.sweep.plan(maker.planner, chunk.cases))
+        num = len(chunk)
+    found = {
+        "compile_seconds": sum(part["compile_seconds"] for part in parts),
+        "first_seconds": parts[0]["plan_seconds"],
+        "warm_seconds": seconds,
+        "referee_seconds": sum(part["referee_seconds"] for part in parts),
+    }
+    rounded = {name: round(value, 4) for name, value in found.items()}
+    return {**rounded, "warm_plans": num, "measured": _MEASURED}

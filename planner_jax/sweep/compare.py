@@ -12,11 +12,10 @@ import numpy as np
 import pyarrow as pa
 from scipy.stats import binomtest
 
-from planner_jax.runs.parquet import read_rows
 from planner_jax.runs.run_folder import RunFolder
 from planner_jax.runs.settings import SettingError
 from planner_jax.runs.summary import percent, wilson_interval
-from planner_jax.sweep.planned import finished_sweep
+from planner_jax.sweep.report import finished_sweep
 from planner_jax.sweep.sweep import settings_of
 
 # Columns of the rows that are read, which all sweeps have.
@@ -67,7 +66,7 @@ def read_run(path: str | os.PathLike) -> ComparedRun:
     folder = RunFolder(path, name="RUN")
     manifest, sweep = finished_sweep(folder)
     try:
-        rows = read_rows(folder.plans, _READ)
+        rows = folder.plans.read(_READ)
         found = {name: rows[name].to_numpy() for name in _READ}
     except (pa.ArrowException, KeyError, OSError) as error:
         rule, why = "a run whose rows can be read", " ".join(str(error).split())

@@ -1,23 +1,23 @@
 """Table, figures and page of a run, from nothing but its folder."""
 
 import dataclasses
+import html
 import math
 import shlex
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pyarrow as pa
 
-from planner_jax.runs.parquet import pick_rows, read_rows, row_groups
+from planner_jax.runs.dataset import Dataset
+from planner_jax.runs.manifest import Entries, Row
 from planner_jax.runs.run_folder import RunFolder
-from planner_jax.runs.settings import SettingError, settings_of_manifest
+from planner_jax.runs.settings import SettingError, SweepSettings, settings_of_manifest
 from planner_jax.runs.style import draw
-from planner_jax.runs.table import headline, to_markdown
-from planner_jax.sweep.page import to_page
-from planner_jax.sweep.sweep import RunFigure, settings_of, sweep_of_run
+from planner_jax.runs.summary import Tally
+from planner_jax.runs.table import RateTable, headline, to_html, to_markdown
+from planner_jax.sweep.sweep import Sweep, settings_of, sweep_of_run
 
-PAGE = "index.html"
 _CASES_SHOWN = 60
 _FAILURES_SHOWN = 12
 
@@ -27,53 +27,77 @@ class RunRows:
     """What the figures of a run are drawn from."""
 
     folder: RunFolder
-    manifest: dict[str, Any]
-    failures: list[dict[str, Any]]  # the first few rows that failed
+    manifest: Entries
+    failures: list[Row]  # the first few rows that failed
 
-    def sample(self) -> list[dict[str, Any]]:
-        """Rows taken evenly from the run; where nearly all succeed, failures are added."""
+    @property
+    def setting(self) -> Entries:
+        """Physics and limits that all cases have in common."""
+        return self.manifest["setting"]
+
+    def sample(self) -> list[Row]:
+        """Return rows taken evenly from the run; where nearly all succeed, failures are added."""
         last = self.manifest["summary"]["num"] - 1
         spread = np.linspace(0, last, _CASES_SHOWN).astype(int).tolist()
-        shown = pick_rows(self.folder.plans, spread)
+        shown = self.folder.plans.pick(spread)
         missing = _FAILURES_SHOWN - sum(not row["success"] for row in shown)
         others = [row for row in self.failures if row["index"] not in spread]
         return shown + others[: max(missing, 0)]
 
-    def same_case(self) -> list[tuple[str, dict[str, Any]]]:
-        """Planner and row of the run's example, and of the other planners for the same case."""
-        own = pick_rows(self.folder.plans, [self.manifest["example"]])[0]
-        plans = [(self.manifest["parameters"]["planner"], own)]
-        if self.folder.baselines.exists():
-            others = read_rows(self.folder.baselines).to_pylist()
-            plans += [(row["planner"], row) for row in others]
-        return plans
+    def same_case(self) -> list[tuple[str, Row]]:
+        """Return planner and row of the run's example, and of other planners for the same case."""
+        own = self.folder.plans.pick([self.manifest["example"]])[0]
+        others = self.folder.baselines
+        rows = others.read().to_pylist() if others.files() else []
+        name = self.manifest["parameters"]["planner"]
+        return [(name, own), *((row["planner"], row) for row in rows)]
 
     def columns(self, *names: str) -> pa.Table:
-        """Some columns of all rows."""
-        return read_rows(self.folder.plans, names)
+        """Return some columns of all rows."""
+        return self.folder.plans.read(names)
+
+
+def count_rows(sweep: Sweep, settings: SweepSettings, rows: Dataset) -> Tally:
+    """Return the counts over all rows of a run."""
+    tally = sweep.tally(settings)
+    for part in rows.parts(tally.READS or None):
+        tally.add(part)
+    return tally
+
+
+def finished_sweep(folder: RunFolder) -> tuple[Entries, Sweep]:
+    """Return manifest and sweep of a folder after a check of the manifest and all parts.
+
+    Raises:
+        SettingError: the folder is not that of a whole, finished sweep.
+    """
+    manifest = folder.read_manifest()
+    sweep = sweep_of_run(manifest, folder.name)
+    if "summary" not in manifest:
+        rule = f"{folder.name} must be finished"
+        raise SettingError(f"{rule}, got {str(folder.path)!r}; resume it first")
+    again = f"planner-jax {sweep.kind} --resume --out {shlex.quote(str(folder.path))}"
+    remedy = f"make it anew: {again}"
+    folder.require_whole(folder.plans, remedy, manifest["summary"]["num"])
+    folder.require_whole(folder.baselines, remedy)
+    return manifest, sweep
 
 
 def require_sound(folder: RunFolder) -> None:
     """Raise `SettingError` unless a sweep's rows are whole, and its summary counts them."""
-    manifest = folder.read_manifest()
-    sweep = sweep_of_run(manifest, folder.name)
-    folder.require_finished(manifest)
-    again = f"planner-jax {sweep.kind} --resume --out {shlex.quote(folder.shown)}"
-    remedy = f"make it anew: {again}"
-    folder.require_whole(manifest, remedy)
-    kind = settings_of(sweep.task)
-    tally = sweep.tally(settings_of_manifest(kind, manifest["parameters"], folder.name))
+    manifest, sweep = finished_sweep(folder)
+    parameters = manifest["parameters"]
+    settings = settings_of_manifest(settings_of(sweep.task), parameters, folder.name)
     try:
-        for _, rows in row_groups(folder.plans):
-            tally.add(rows)
+        tally = count_rows(sweep, settings, folder.plans)
         counted = {**tally.summary(), "example": tally.example}
     except (pa.ArrowException, KeyError, ZeroDivisionError) as error:
         rule, why = "a run whose rows can be read", " ".join(str(error).split())
-        raise SettingError(f"{folder.name} must be {rule}, got {why}; {remedy}") from None
+        raise SettingError(f"{folder.name} must be {rule}, got {why}") from None
     require_counted(folder, {**manifest["summary"], "example": manifest.get("example")}, counted)
 
 
-def require_counted(folder: RunFolder, told: dict[str, Any], counted: dict[str, Any]) -> None:
+def require_counted(folder: RunFolder, told: Mapping[str, object], counted: Entries) -> None:
     """Raise `SettingError` unless a manifest's summary says what its rows do.
 
     Args:
@@ -85,11 +109,11 @@ def require_counted(folder: RunFolder, told: dict[str, Any], counted: dict[str, 
         if not _agree(told.get(name), value):
             rule = f"a run whose {name} is that of its rows, {value}"
             raise SettingError(
-                f"{folder.name} must be {rule}, got {told.get(name)} in {folder.shown!r}"
+                f"{folder.name} must be {rule}, got {told.get(name)} in {str(folder.path)!r}"
             )
 
 
-def _agree(one: Any, other: Any) -> bool:
+def _agree(one: object, other: object) -> bool:
     """Whether two plain values are the same, but for the order in which numbers were added."""
     if isinstance(one, dict) and isinstance(other, dict):
         return one.keys() == other.keys() and all(_agree(one[key], other[key]) for key in one)
@@ -104,49 +128,84 @@ def write_report(folder: RunFolder) -> None:
     """Write `table.md`, `figures/` and `index.html` of a run anew.
 
     Args:
-        folder: with `manifest.json` and `plans.parquet`; `baselines.parquet` may be there.
-
-    Raises:
-        SettingError: the folder is not that of a sweep, or the run is not finished.
+        folder: with a manifest that has its summary, and rows.
     """
     manifest = folder.read_manifest()
     sweep = sweep_of_run(manifest, folder.name)
-    folder.require_finished(manifest)
     folder.figures.mkdir(exist_ok=True)
-    failed = _failed_rows(folder)
-    _draw(RunRows(folder, manifest, failed), sweep.figures)
+    failed = _failed_rows(folder.plans)
+    rows = RunRows(folder, manifest, failed)
+    for figure in sweep.figures:
+        draw(folder.figures / figure.name, figure.draw, figure.size, rows)
+    title, table, remarks = sweep.title(manifest), sweep.table(manifest), sweep.remarks(manifest)
     lines = headline(manifest, sweep.findings(manifest))
-    text = to_markdown(sweep.title(manifest), lines, sweep.table(manifest), sweep.remarks(manifest))
-    folder.write_text("table.md", text)
-    folder.write_text(PAGE, to_page(sweep, manifest, failed))
+    folder.write_text("table.md", to_markdown(title, lines, table, remarks))
+    folder.write_text("index.html", _page(sweep, manifest, lines, failed))
 
 
-def rewrite_page(folder: RunFolder, manifest: dict[str, Any]) -> None:
-    """Write `index.html` anew with a manifest, where it has been written before."""
-    if (folder.path / PAGE).exists():
-        page = to_page(sweep_of_run(manifest, folder.name), manifest, _failed_rows(folder))
-        folder.write_text(PAGE, page)
-
-
-def draw_comparisons(folder: RunFolder) -> None:
-    """Draw anew the figures that show other planners too, now that they have planned."""
-    manifest = folder.read_manifest()
-    figures = [f for f in sweep_of_run(manifest, folder.name).figures if f.compares]
-    _draw(RunRows(folder, manifest, failures=[]), figures)
-
-
-def _draw(rows: RunRows, figures: Sequence[RunFigure]) -> None:
-    for figure in figures:
-        path = rows.folder.figures / figure.name
-        draw(path, figure.draw, figure.size, rows)
-        rows.folder.sent(path)
-
-
-def _failed_rows(folder: RunFolder) -> list[dict[str, Any]]:
-    """The first failures, a few."""
-    failed: list[int] = []
-    for first, rows in row_groups(folder.plans, ["success"]):
+def _failed_rows(plans: Dataset) -> list[Row]:
+    """Return the first failures, a few."""
+    failed, first = [], 0
+    for rows in plans.parts(["success"]):
         failed += (first + np.flatnonzero(~np.asarray(rows["success"]))).tolist()
+        first += len(rows)
         if len(failed) >= _FAILURES_SHOWN:
             break
-    return pick_rows(folder.plans, failed[:_FAILURES_SHOWN])
+    return plans.pick(failed[:_FAILURES_SHOWN])
+
+
+_STYLE = """
+body { font: 16px/1.5 system-ui, sans-serif; color: #24292f; max-width: 68rem; margin: 2rem auto;
+       padding: 0 1rem; }
+h1 { font-size: 1.6rem; } h2 { font-size: 1.2rem; margin-top: 2.2rem; }
+img { max-width: 100%; max-height: 56rem; }
+figure { margin: 1rem 0; } figcaption { color: #57606a; font-size: 0.9rem; }
+.scroll { overflow-x: auto; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: 0.9rem; }
+th, td { padding: 0.2rem 0.8rem; text-align: right; white-space: nowrap; }
+th:first-child, td:first-child { text-align: left; }
+.words td { text-align: left; white-space: normal; }
+tr { border-bottom: 1px solid #e6e8eb; } th { border-bottom: 2px solid #8a8f98; }
+.rates tr.strong { font-weight: bold; background: #f0f4f8; }
+.lead { font-size: 1.05rem; }
+""".strip()
+
+
+def _page(sweep: Sweep, manifest: Entries, lines: Sequence[str], failures: Sequence[Row]) -> str:
+    """Return `index.html`: everything in the folder of a run on one plain page."""
+    title, rates = html.escape(sweep.title(manifest)), sweep.table(manifest)
+    lead = "".join(f"<p class=lead>{html.escape(line)}</p>\n" for line in lines)
+    notes = "".join(f"<li>{html.escape(line)}</li>\n" for line in sweep.remarks(manifest))
+    figures = "".join(
+        f'<figure><a href="figures/{figure.name}"><img src="figures/{figure.name}" '
+        f'alt="{figure.caption}"></a>\n<figcaption>{figure.caption}</figcaption></figure>\n'
+        for figure in sweep.figures
+    )
+    listed = ""
+    if failures:
+        summary, words = manifest["summary"], sweep.failure_words
+        rows = [[str(row[column]) for column in words.values()] for row in failures]
+        total = summary["num"] - summary["successes"]
+        table = to_html(RateTable("", list(words), rows))
+        listed = f"<h2>Failures, the first {len(failures)} of {total:,}</h2>\n"
+        listed += f'<div class="scroll words">\n{table}</div>\n'
+    return f"""<!doctype html>
+<html lang="en">
+<head><meta charset="utf-8"><meta name="viewport" content="width=device-width">
+<title>{title}</title>
+<style>
+{_STYLE}
+</style></head>
+<body>
+<h1>{title}</h1>
+{lead}{figures}<h2>{rates.title}</h2>
+<div class="scroll rates">
+{to_html(rates)}</div>
+<ul>
+{notes}</ul>
+{listed}<h2>The run</h2>
+<p>All rows: the Parquet dataset <a href="plans/">plans/</a> (units in the column metadata); this
+table: <a href="table.md">table.md</a>; everything about the run:
+<a href="manifest.json">manifest.json</a>.</p>
+</body></html>
+"""

@@ -2,19 +2,22 @@
 
 import contextlib
 import dataclasses
+import datetime
 import os
 import sys
-from typing import Any
+from collections.abc import Mapping
 
 import jax
 import numpy as np
 import pyarrow as pa
 
+from planner_jax.core.planner import Planner
 from planner_jax.core.registry import Task
 from planner_jax.host import signals as stopping
 from planner_jax.runs.columns import RefereedBatch, rows_of
-from planner_jax.runs.environment import require_backend
-from planner_jax.runs.parts import Parts
+from planner_jax.runs.dataset import DamagedPart, check_part, number_of
+from planner_jax.runs.environment import environment, makers_of, require_backend
+from planner_jax.runs.manifest import Entries
 from planner_jax.runs.run_folder import RunFolder
 from planner_jax.runs.settings import (
     SettingError,
@@ -23,17 +26,10 @@ from planner_jax.runs.settings import (
     settings_to_resume,
 )
 from planner_jax.runs.source import Source
-from planner_jax.runs.stored_run import run_folder
-from planner_jax.sweep.chunks import SweepRun, plan_chunks
+from planner_jax.runs.timing import Stopwatch
+from planner_jax.sweep.chunks import Maker, Record, Workers, make_parts, times_of
 from planner_jax.sweep.cluster import workers_of
-from planner_jax.sweep.identity import (
-    IDENTITY,
-    begun_now,
-    identity_of,
-    require_same_maker,
-    settings_digest,
-)
-from planner_jax.sweep.report import PAGE, draw_comparisons, rewrite_page, write_report
+from planner_jax.sweep.report import count_rows, write_report
 from planner_jax.sweep.sweep import Sweep, settings_of, sweep_of
 
 
@@ -48,13 +44,13 @@ def start_sweep(
     *,
     progress: bool = True,
     workers: str | None = None,
-) -> dict[str, Any]:
+) -> Entries:
     """Plan and referee a sweep into a new folder.
 
     Args:
         task: that is swept.
         settings: of the sweep, of the task's class.
-        out: folder, new or empty; or an address s3://BUCKET/PATH below which nothing lies.
+        out: folder, new or empty.
         progress: show a bar on the standard error stream.
         workers: "ray", to have the chunks made by a Ray cluster, on all of its GPUs where JAX
             computes on one here. A row is then that of one device, whatever their number.
@@ -66,33 +62,32 @@ def start_sweep(
         SettingError: an argument or a case breaks a rule; nothing is left behind.
         SweepInterrupted: on Ctrl-C; the folder can be resumed.
         WorkersFailed: workers could not make a chunk; the folder can be resumed.
-        OSError: the disk or the store fails; the folder can be resumed.
+        OSError: the disk fails; the folder can be resumed.
     """
-    folder = run_folder(out)
+    folder = RunFolder(out)
     folder.require_new()
     sweep, settings = sweep_of(task), settings.of(task)
     with workers_of(workers) as others:
-        source = _source(sweep, settings)
-        planner = sweep.planner(settings)
+        maker = _maker_of(sweep, settings)
+        source = maker.source
         cases = source.check()
-        sweep.require_fit(source.settings, planner, cases)
-        session, description = begun_now(), source.description()
-        identity = identity_of(source, description, session)
-        parts = Parts(folder, identity, source)
+        sweep.require_fit(source.settings, maker.planner, cases)
+        session = _session(workers)
         manifest = {
             "kind": sweep.kind,
             "state": "running",
-            **identity,
+            "run": maker.run,
             **session,
+            "makers": maker.makers,
             "seed": source.settings.seed,
             "parameters": source.settings.parameters(),
-            **description,
+            **maker.description,
             "setting": sweep.setting(cases),
-            "planner": {"name": source.settings.planner, **_settings_of_planner(planner)},
-            "sessions": [_with_workers(session, workers)],
+            "planner": {"name": source.settings.planner, **_fields_of(maker.planner)},
+            "sessions": [session],
         }
         with folder.created(manifest):
-            return _finish(SweepRun(sweep, source, planner, folder, parts, others), progress)
+            return _finish(folder, manifest, maker, {}, others, progress)
 
 
 def resume_sweep(
@@ -101,11 +96,11 @@ def resume_sweep(
     *,
     progress: bool = True,
     workers: str | None = None,
-    **given: Any,
-) -> dict[str, Any]:
+    **given: object,
+) -> Entries:
     """Finish a sweep that was interrupted or killed; a whole, finished one is left as it is.
 
-    Parts and rows that are missing, damaged or of another run are planned again.
+    Parts that are missing, damaged or of another run are planned again.
 
     Args:
         task: that was swept.
@@ -119,122 +114,133 @@ def resume_sweep(
 
     Raises:
         SettingError: the folder is not that of such a sweep, a given setting is not the
-            run's, or the cases are not what they were.
+            run's, or its rows would not be what they were.
         SweepInterrupted: on Ctrl-C; the folder can be resumed.
         WorkersFailed: workers could not make a chunk; the folder can be resumed.
     """
-    folder, sweep = run_folder(out), sweep_of(task)
-    _settings_of_run(folder, sweep, task, given)
-    with workers_of(workers) as others, folder.resumed():
-        manifest, settings = _settings_of_run(folder, sweep, task, given)
-        damages = folder.damages(manifest)
-        if manifest["state"] == "complete" and not damages:
+    folder, sweep = RunFolder(out), sweep_of(task)
+    _settings_of_run(folder, sweep, given)
+    with workers_of(workers) as others, folder.owned():
+        manifest, settings = _settings_of_run(folder, sweep, given)
+        there = _sound_parts(folder, manifest)
+        num, batch = settings.num or 1, settings.batch or 1
+        is_whole = len(there) == -(-num // batch) and not folder.baselines.damages()
+        if manifest["state"] == "complete" and is_whole:
             return manifest
-        session = begun_now()
-        require_same_maker(manifest, session)
-        source = _source(sweep, settings)
-        description = source.description()
-        for entry, known in description.items():
+        session = _session(workers)
+        for what, old in manifest["makers"].items():
+            if (new := makers_of(session).get(what)) != old:
+                rule = f"resumed by {what} {old}, as it began"
+                raise SettingError(
+                    f"out must be {rule}, got {new}; or begin anew in another folder"
+                )
+        maker = _maker_of(sweep, settings)
+        for entry, known in maker.description.items():
             if known != manifest.get(entry):
                 raise SettingError(f"{entry} must be the same as when the run began")
-        if manifest["settings"] != settings_digest(source, description):
+        if maker.run != manifest["run"]:
             raise SettingError("out must be resumed with the files that its settings named then")
-        parts = Parts(folder, {name: manifest[name] for name in IDENTITY}, source)
-        parts.require_plain(folder.name)
-        for name, why in damages.items():
-            print(f"planner-jax: {folder.shown}/{name} is {why}; it is made anew", file=sys.stderr)
-        if folder.plans.name in damages:  # the parts are gone since there was a summary
-            manifest = {name: value for name, value in manifest.items() if name not in _FOUND}
-        sessions = [*manifest["sessions"], _with_workers(session, workers)]
-        folder.write_manifest({**manifest, "state": "running", "sessions": sessions})
-        planner = sweep.planner(settings)
-        return _finish(SweepRun(sweep, source, planner, folder, parts, others), progress)
+        sessions = [*manifest["sessions"], session]
+        manifest = folder.write_manifest({**manifest, "state": "running", "sessions": sessions})
+        return _finish(folder, manifest, maker, there, others, progress)
 
 
-# What a manifest has of the rows, once they are joined.
-_FOUND = ("summary", "times", "example", "files")
-
-
-def _with_workers(session: dict[str, Any], workers: str | None) -> dict[str, Any]:
-    """A session, and who made its chunks unless it was its own process."""
-    return session if workers is None else {**session, "workers": workers}
+def _session(workers: str | None) -> Entries:
+    """Return when and where a session begins, and who makes its chunks if not its own process."""
+    now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    made = {} if workers is None else {"workers": workers}
+    return {"started": now, **environment(), **made}
 
 
 def _settings_of_run(
-    folder: RunFolder, sweep: Sweep, task: Task, given: dict[str, Any]
-) -> tuple[dict[str, Any], SweepSettings]:
-    """Manifest and settings of a run that may be resumed with some settings named again."""
+    folder: RunFolder, sweep: Sweep, given: Mapping[str, object]
+) -> tuple[Entries, SweepSettings]:
+    """Return manifest and settings of a run that may be resumed with some settings named again."""
     manifest = folder.read_manifest()
     if manifest["kind"] != sweep.kind:
         raise SettingError(
             f"out must be the folder of a {sweep.kind}, got one of a {manifest['kind']}"
         )
-    return manifest, settings_to_resume(settings_of(task), manifest["parameters"], given)
+    kind = settings_of(sweep.task)
+    return manifest, settings_to_resume(kind, manifest["parameters"], dict(given))
 
 
-def _source(sweep: Sweep, settings: SweepSettings) -> Source:
+def _maker_of(sweep: Sweep, settings: SweepSettings) -> Maker:
     batch = settings.CPU_BATCH if require_backend() == "cpu" else settings.GPU_BATCH
-    return sweep.open_source(settings, batch)
+    return Maker.of(sweep, settings, batch)
 
 
-def _finish(run: SweepRun, progress: bool) -> dict[str, Any]:
-    """Everything that is missing, from the first chunk to the report."""
-    folder = run.folder
+def _sound_parts(folder: RunFolder, manifest: Entries) -> dict[int, Record]:
+    """Return the records of the parts of a run by number; remove files that are none of it."""
+    files, found = folder.plans.files(), {}
+    for path in files:
+        if not path.is_file():
+            rule = "a run whose parts are plain files"
+            raise SettingError(f"{folder.name} must be {rule}, got {str(path)!r}, which is none")
+    for path in files:
+        try:
+            number, record = number_of(path), check_part(path)
+            if (record.get("run"), record.get("number")) != (manifest["run"], number):
+                raise DamagedPart("is of another run or place")
+            if number in found:
+                raise DamagedPart("is there twice")
+            found[number] = record
+        except DamagedPart as error:
+            print(f"planner-jax: {path} {error}; what it held is planned again", file=sys.stderr)
+            path.unlink()
+    return found
+
+
+def _finish(
+    folder: RunFolder,
+    manifest: Entries,
+    maker: Maker,
+    there: dict[int, Record],
+    workers: Workers | None,
+    progress: bool,
+) -> Entries:
+    """Make everything that is missing, from the first chunk to the report."""
+    source, watch = maker.source, Stopwatch()
+    *earlier, session = manifest["sessions"]
     try:
-        if "summary" not in folder.read_manifest():
-            _plan(run, progress)
-        folder.remove_parts()
+        if progress:
+            print(f"Writing {folder.path}; the first chunk compiles.", file=sys.stderr)
+        records = make_parts(maker, folder.plans, there, workers, progress)
+        session["seconds"] = watch.lap()
+        wall = sum(each.get("seconds", 0.0) for each in (*earlier, session))
+        times = {**times_of(maker, records), "wall_seconds": round(wall, 4)}
+        tally = count_rows(maker.sweep, source.settings, folder.plans)
+        summary = {
+            **tally.summary(),
+            "plans_per_second_warm": round(times["warm_plans"] / times["warm_seconds"], 1),
+            "compile_seconds": times["compile_seconds"],
+        }
+        found = {"summary": summary, "times": times, "example": tally.example}
+        manifest = folder.write_manifest({**manifest, **found})
+        if others := maker.sweep.other_planners(source.settings):
+            if progress:
+                print("Now one case with the other planners.", file=sys.stderr)
+            rows = plan_baselines(maker.sweep, source, others, tally.example)
+            folder.baselines.write_rows(rows)
         write_report(folder)
-        _add_baselines(run, progress)
-        return _end(folder, "complete")
-    except KeyboardInterrupt:
-        _end(folder, "interrupted")
-        raise SweepInterrupted(folder.shown) from None
-    except WorkersFailed:
-        _end(folder, "interrupted")
-        raise
-    except OSError:
-        with contextlib.suppress(OSError):  # it may be the disk that is full
-            _end(folder, "interrupted")
-        raise
-
-
-def _end(folder: RunFolder, state: str) -> dict[str, Any]:
-    """Tell on the page, if there is one yet, and in the manifest how a session ended.
-
-    The manifest comes last: a run that is killed in between is resumed, and its page made anew.
-    """
-    manifest = folder.with_sums({**folder.read_manifest(), "state": state})
-    rewrite_page(folder, manifest)
-    return folder.write_manifest(manifest)
-
-
-def _plan(run: SweepRun, progress: bool) -> None:
-    """All chunks, joined and counted in the manifest."""
-    try:
-        found = plan_chunks(run, progress=progress)
+        return folder.write_manifest({**manifest, "state": "complete"})
     except SettingError:
         # A case that was drawn late breaks a rule, so that this run can never be finished.
-        run.folder.discard()
+        folder.discard()
         raise
-    run.folder.write_manifest({**run.folder.read_manifest(), **found})
+    except (KeyboardInterrupt, WorkersFailed, OSError) as error:
+        session.setdefault("seconds", watch.lap())
+        with contextlib.suppress(OSError):  # it may be the disk that is full
+            folder.write_manifest({**manifest, "state": "interrupted"})
+        if isinstance(error, KeyboardInterrupt):
+            raise SweepInterrupted(str(folder.path)) from None
+        raise
 
 
-def _add_baselines(run: SweepRun, progress: bool) -> None:
-    """Plan one case with the other planners too, and show them beside the run's plan."""
-    others = run.sweep.other_planners(run.source.settings)
-    if progress and others:
-        page = f"{run.folder.shown}/{PAGE}"
-        print(f"First figures: {page}. Now one case with the other planners.", file=sys.stderr)
-    if others:
-        example = run.folder.read_manifest()["example"]
-        rows = plan_baselines(run.sweep, run.source, others, example)
-        run.folder.write_rows(run.folder.baselines, rows)
-        draw_comparisons(run.folder)
-
-
-def plan_baselines(sweep: Sweep, source: Source, planners: dict[str, Any], index: int) -> pa.Table:
-    """Refereed plans of other planners for one case, solved or not.
+def plan_baselines(
+    sweep: Sweep, source: Source, planners: Mapping[str, Planner], index: int
+) -> pa.Table:
+    """Return refereed plans of other planners for one case, solved or not.
 
     Args:
         sweep: of the run.
@@ -243,7 +249,7 @@ def plan_baselines(sweep: Sweep, source: Source, planners: dict[str, Any], index
         index: place of the case in the run.
 
     Returns:
-        The columns of `plans.parquet` behind a column `planner`.
+        The columns of the run's rows behind a column `planner`.
     """
     chunk, tables = source.cases(index, index + 1), []
     for name, planner in planners.items():
@@ -259,8 +265,8 @@ def plan_baselines(sweep: Sweep, source: Source, planners: dict[str, Any], index
 _OF_NETWORKS = ("parent", "name")  # fields of a Flax module that are none of its sizes
 
 
-def _settings_of_planner(planner: Any) -> dict[str, Any]:
-    """Sizes and switches of a planner, for the manifest; of arrays, their shapes.
+def _fields_of(planner: object) -> Entries:
+    """Return sizes and switches of a planner, for the manifest; of arrays, their shapes.
 
     Of a network's weights it is how many there are.
     """
@@ -270,12 +276,12 @@ def _settings_of_planner(planner: Any) -> dict[str, Any]:
         if field.name in _OF_NETWORKS and hasattr(planner, "apply"):
             continue
         if dataclasses.is_dataclass(value):
-            value = {"class": type(value).__name__, **_settings_of_planner(value)}
+            value = {"class": type(value).__name__, **_fields_of(value)}
         elif isinstance(value, dict):
             value = {"weights": sum(np.size(leaf) for leaf in jax.tree.leaves(value))}
         elif hasattr(value, "shape"):
             value = {"shape": list(value.shape)}
         elif isinstance(value, tuple):
-            value = [_settings_of_planner(x) or x for x in value]
+            value = [_fields_of(x) or x for x in value]
         found[field.name] = value
     return found

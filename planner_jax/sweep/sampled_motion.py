@@ -1,4 +1,4 @@
-"""A quadrotor's trajectory as `plans.parquet` holds it, sampled; float64 and NumPy alone."""
+"""A quadrotor's trajectory as the rows hold it, sampled; float64 and NumPy alone."""
 
 import dataclasses
 import math
@@ -22,7 +22,7 @@ class SampledMotion:
 def sample_motion(
     coeffs: Sequence[float] | np.ndarray, durations: Sequence[float] | np.ndarray, num: int
 ) -> SampledMotion:
-    """A trajectory as `plans.parquet` holds it, at even times.
+    """A trajectory as the rows hold it, at even times.
 
     Args:
         coeffs: flat, M pieces x ascending powers of the piece's own time x 3 axes.
@@ -44,7 +44,7 @@ def sample_motion(
 
 
 def sample_rest(row: Mapping[str, Any], num: int) -> SampledMotion | None:
-    """The way to rest of a row of `plans.parquet`, its times those of the plan; None if none."""
+    """The way to rest of a row of the run, its times those of the plan; None if none."""
     if row["ending_durations"] is None:
         return None
     rest = sample_motion(row["ending_coeffs"], row["ending_durations"], num)

@@ -64,7 +64,7 @@ class Sweep:
         return f"sweep {self.task.name}"
 
     def columns(self, batch: RefereedBatch) -> Sequence[Column]:
-        """The columns of `plans.parquet`: the task's own, or every leaf of case, plan, verdict."""
+        """The columns of the run: the task's own, or every leaf of case, plan, verdict."""
         return self.own_columns or leaf_columns(batch)
 
     def single_columns(self) -> Sequence[Column]:
@@ -119,7 +119,7 @@ class Sweep:
         return {}
 
     def plan_of_row(self, row: dict[str, Any], setting: dict[str, Any]) -> Plan | None:
-        """The plan of a row of `plans.parquet` as its robot's class, such as `QuadrotorPlan`.
+        """The plan of a row of the run as its robot's class, such as `QuadrotorPlan`.
 
         Args:
             row: of the run.

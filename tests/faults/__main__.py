@@ -31,7 +31,8 @@ from tests.faults.commands import (
     is_stopped,
     start,
 )
-from tests.faults.runs import TARGETS, make_runs, quick_sweeps, rows_of, verdict
+from tests.faults.runs import TARGETS, make_runs, quick_sweeps, verdict
+from tests.sweeps import rows_of
 
 HIT = ("hit", "--num", "200", "--batch", "32", "--seed", "5")
 MANY = ("hit", "--num", "20000", "--batch", "500", "--seed", "5")  # for workers
@@ -189,8 +190,8 @@ TRIALS: list[tuple[str, str, Callable[[int, Path], Survived], int]] = [
         for what, num in (
             ("manifest", 500),
             ("manifest of an interrupted run", 300),
+            ("parts of an interrupted run", 300),
             ("parts", 300),
-            ("plans.parquet", 300),
             ("flights", 300),
             ("training", 200),
             ("plans.npz", 100),

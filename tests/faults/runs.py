@@ -11,16 +11,18 @@ from typing import Any
 
 import jax
 import numpy as np
+import pyarrow as pa
 import pytest
 
 import planner_jax as pj
 from planner_jax.core.plan_files import PlanFileError
 from planner_jax.planning.plan import plan
 from planner_jax.policies.progress import to_text
+from planner_jax.runs.dataset import Dataset
 from planner_jax.runs.manifest import to_write
 from planner_jax.runs.run_folder import RunFolder
 from planner_jax.runs.settings import SettingError
-from planner_jax.sims.recording import FILE, read_recording, to_rows
+from planner_jax.sims.recording import FLIGHTS, read_recording, to_rows
 from planner_jax.sims.settings import CatchFly
 from planner_jax.sweep.hit.settings import HitSettings
 from planner_jax.sweep.hit.sweep import HitSweep
@@ -30,7 +32,7 @@ from planner_jax.task.hit.plan import HitPlan
 from tests.faults.commands import Ended, is_one_line, run
 from tests.faults.damage import damage
 from tests.recordings import recording
-from tests.sweeps import stop_after
+from tests.sweeps import rows_of, stop_after
 
 TASK = pj.task_named("hit")
 SETTINGS = HitSettings(num=40, batch=13, seed=3)  # by the program of tests/test_sweep.py
@@ -49,8 +51,10 @@ def quick_sweeps() -> Iterator[pytest.MonkeyPatch]:
 
 
 def make_runs(place: Path) -> None:
-    """A finished sweep, one with two of four parts, recorded flights, a training and plans."""
+    """Two finished sweeps, one with some of its four parts, flights, a training and plans."""
     start_sweep(TASK, SETTINGS, place / "whole", progress=False)
+    other = dataclasses.replace(SETTINGS, seed=4)
+    start_sweep(TASK, other, place / "other", progress=False)
     with pytest.MonkeyPatch.context() as patch, contextlib.suppress(SweepInterrupted):
         stop_after(patch, HitSweep, 3)
         start_sweep(TASK, SETTINGS, place / "begun", progress=False)
@@ -73,8 +77,9 @@ def make_flights(out: Path) -> None:
         },
     }
     folder = RunFolder(out)
-    with folder.begun():
-        folder.write_rows(out / FILE, to_rows(recording()))
+    with folder.owned():
+        Dataset(out / FLIGHTS).write_rows(to_rows(recording()))
+        folder.plans.write_rows(pa.table({"index": [0]}))
         folder.write_manifest(manifest)
 
 
@@ -137,10 +142,9 @@ def _resume(place: Path, out: Path) -> str | None:
     ended = run("sweep", "hit", "--resume", "--out", out)
     if ended.code:
         return REFUSED if is_one_line(ended) else None
-    rows = [(each / "plans.parquet").read_bytes() for each in (out, place / "whole")]
-    if rows[0] != rows[1] or "Traceback" in ended.err:
+    if rows_of(out) != rows_of(place / "whole") or "Traceback" in ended.err:
         return None
-    return MENDED if "made anew" in ended.err or "planned again" in ended.err else IDENTICAL
+    return MENDED if "planned again" in ended.err else IDENTICAL
 
 
 def _view(place: Path, out: Path) -> str | None:
@@ -152,7 +156,7 @@ def _view(place: Path, out: Path) -> str | None:
         ended = run("view", out)
     if ended.code:
         return REFUSED if is_one_line(ended) else None
-    wanted = vars(read_recording(place / "flights" / FILE))
+    wanted = vars(read_recording(Dataset(place / "flights" / FLIGHTS).read()))
     same = [
         np.array_equal(getattr(shown[0], name), value, equal_nan=value.dtype.kind == "f")
         for name, value in wanted.items()
@@ -205,9 +209,9 @@ _READERS = {
 TARGETS = {
     "manifest": [("whole:report", "manifest.json"), ("whole:resume", "manifest.json")],
     "manifest of an interrupted run": [("begun:resume", "manifest.json")],
-    "parts": [("begun:resume", "parts/*.parquet")],
-    "plans.parquet": [("whole:report", "plans.parquet"), ("whole:resume", "plans.parquet")],
-    "flights": [("flights:view", FILE), ("flights:view", "manifest.json")],
+    "parts of an interrupted run": [("begun:resume", "plans/*.parquet")],
+    "parts": [("whole:report", "plans/*.parquet"), ("whole:resume", "plans/*.parquet")],
+    "flights": [("flights:view", "flights/*.parquet"), ("flights:view", "manifest.json")],
     "training": [("training:curves", "training.json"), ("training:curves", "progress.jsonl")],
     "plans.npz": [("plans:load", "plans.npz")],
 }
@@ -216,8 +220,3 @@ TARGETS = {
 def copied(place: Path, which: str, under: Path) -> Path:
     """A copy of a run in a folder."""
     return Path(shutil.copytree(place / which, under / which))
-
-
-def rows_of(out: Path) -> bytes:
-    """The rows of a run as they are in its file."""
-    return (out / "plans.parquet").read_bytes()

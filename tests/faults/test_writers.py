@@ -4,6 +4,7 @@ import contextlib
 import errno
 import os
 import resource
+import shutil
 import socket
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -11,12 +12,12 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from planner_jax.host import files as whole_files
-from planner_jax.runs.owner import LOCK, owned
-from planner_jax.runs.run_folder import RunFolder
+from planner_jax.runs.run_folder import LOCK, RunFolder
 from planner_jax.runs.settings import SettingError
 from planner_jax.sweep.run import resume_sweep, start_sweep
 from tests.faults.commands import is_one_line, run
-from tests.faults.runs import SETTINGS, TASK, rows_of
+from tests.faults.runs import SETTINGS, TASK
+from tests.sweeps import rows_of
 
 COMMAND = ("sweep", "hit", "--num", "40", "--batch", "13", "--seed", "3", "--out")
 
@@ -45,7 +46,7 @@ def test_a_sweep_killed_before_any_of_its_writes_is_resumed_to_the_same_rows(
     with monkeypatch.context() as patch:
         count = failing(patch, 0, Killed())
         start_sweep(TASK, SETTINGS, tmp_path / "counted", progress=False)
-    assert count[0] >= 9  # manifests, four parts, rows, table, page
+    assert count[0] >= 9  # manifests, four parts, table, page
     for number in range(2, count[0] + 1):
         out = tmp_path / str(number)
         with monkeypatch.context() as patch:
@@ -54,7 +55,7 @@ def test_a_sweep_killed_before_any_of_its_writes_is_resumed_to_the_same_rows(
                 start_sweep(TASK, SETTINGS, out, progress=False)
         resume_sweep(TASK, out, progress=False)
         assert rows_of(out) == rows_of(runs / "whole")
-        assert not list(out.rglob(".*"))
+        assert [path.name for path in out.rglob(".*")] == [LOCK]
 
 
 def test_a_folder_without_its_first_manifest_is_new(runs, tmp_path, monkeypatch):
@@ -63,7 +64,8 @@ def test_a_folder_without_its_first_manifest_is_new(runs, tmp_path, monkeypatch)
     (out / LOCK).write_text("{")  # of a process that was killed
     (out / ".4711.tmp.manifest.json").write_text("{")
     start_sweep(TASK, SETTINGS, out, progress=False)
-    assert rows_of(out) == rows_of(runs / "whole") and not list(out.rglob(".*"))
+    assert rows_of(out) == rows_of(runs / "whole")
+    assert [path.name for path in out.rglob(".*")] == [LOCK]
 
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EACCES])
@@ -77,21 +79,22 @@ def test_a_write_that_fails_names_file_and_option_and_how_to_go_on(
     assert ended.code == 1 and ended.out == ""
     last = ended.err.splitlines()[-1]
     assert last.startswith("planner-jax: error: --out must be a folder that can be written, got '")
-    assert f"{out}/parts/part-" in last and os.strerror(code) in last
+    assert f"{out}/plans/part-" in last and os.strerror(code) in last
     assert last.endswith(f"; finish with: planner-jax sweep hit --resume --out {out}")
     assert run("sweep", "hit", "--resume", "--out", out).code == 0
     assert rows_of(out) == rows_of(runs / "whole")
 
 
 def test_files_that_may_not_grow_are_told_of(runs, tmp_path):
-    """As where the disk is full; the limit is between a part and all rows."""
+    """As where the disk is full; the limit is between the smallest part and the others."""
     out, before = tmp_path / "run", resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (len(rows_of(runs / "whole")) // 2, before[1]))
+    small, other, *_ = sorted(path.stat().st_size for path in (runs / "whole/plans").iterdir())
+    resource.setrlimit(resource.RLIMIT_FSIZE, ((small + other) // 2, before[1]))
     try:
         ended = run(*COMMAND, out)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert ended.code == 1 and "plans.parquet' (" in ended.err.splitlines()[-1]
+    assert ended.code == 1 and f"{out}/plans/part-" in ended.err.splitlines()[-1]
     assert run("sweep", "hit", "--resume", "--out", out).code == 0
     assert rows_of(out) == rows_of(runs / "whole")
 
@@ -104,10 +107,10 @@ def test_a_name_that_is_too_long_is_refused_in_one_line(tmp_path):
 
 def test_the_second_writer_is_refused_and_told_of_the_first(runs, tmp_path):
     out = tmp_path / "run"
-    with RunFolder(out).begun():
+    with RunFolder(out).owned():
+        shutil.copytree(runs / "whole" / "plans", out / "plans")
         for arguments in (COMMAND, ("sweep", "hit", "--resume", "--out")):
             (out / "manifest.json").write_bytes((runs / "whole" / "manifest.json").read_bytes())
-            (out / "plans.parquet").write_bytes(rows_of(runs / "whole"))
             ended = run(*arguments, out)
             assert is_one_line(ended) and ended.code == 2
             assert "--out must be a folder that no other process writes, got" in ended.err
@@ -123,7 +126,7 @@ def test_of_many_that_begin_at_once_one_owns_the_folder(tmp_path):
 
     def hold(number):
         barrier.wait()
-        with contextlib.suppress(SettingError), owned(tmp_path, "out"):
+        with contextlib.suppress(SettingError), RunFolder(tmp_path).owned():
             won.append(number)
             barrier.wait()
             return
@@ -132,4 +135,4 @@ def test_of_many_that_begin_at_once_one_owns_the_folder(tmp_path):
     for count in range(1, 11):
         with ThreadPoolExecutor(4) as pool:
             list(pool.map(hold, range(4)))
-        assert len(won) == count and not list(tmp_path.iterdir())
+        assert len(won) == count

@@ -16,7 +16,7 @@ from planner_jax.runs.summary import COUNTED, Tally
 from planner_jax.sweep.block.columns import COLUMNS, FRAME, SEEN_COLUMNS, TIMED_COLUMNS
 from planner_jax.sweep.block.pipeline import CountedPlanner, SeeingArms, SeenPlan, TimedPlan
 from planner_jax.sweep.block.settings import BlockSettings
-from planner_jax.sweep.row_plans import arm_plan
+from planner_jax.sweep.rows import arm_plan
 from planner_jax.sweep.sweep import Sweep
 from planner_jax.task.block.default_planner import OnlineBlock
 
@@ -34,7 +34,7 @@ class BlockTally(Tally):
         self._errors, self._seconds = [], []
 
     def add(self, rows: pa.Table) -> None:
-        """Count some rows of `plans.parquet`."""
+        """Count some rows of the run."""
         super().add(rows)
         for name, values in (("fit_error", self._errors), ("planning_time", self._seconds)):
             if name in rows.column_names:

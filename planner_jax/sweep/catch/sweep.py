@@ -16,7 +16,7 @@ from planner_jax.sweep.catch.settings import CatchSettings
 from planner_jax.sweep.figures.motion import CAPTION as MOTION
 from planner_jax.sweep.quadrotor import ending_remark
 from planner_jax.sweep.robots import robot_remark
-from planner_jax.sweep.row_plans import quadrotor_plan
+from planner_jax.sweep.rows import quadrotor_plan
 from planner_jax.sweep.sweep import RunFigure, Sweep, first_values
 from planner_jax.task.catch.spec import SUITES
 
@@ -46,7 +46,7 @@ class CatchTally(Tally):
         self._num_ratios = self._num_caught = 0
 
     def add(self, rows: pa.Table) -> None:
-        """Count some rows of `plans.parquet`."""
+        """Count some rows of the run."""
         super().add(rows)
         caught, present, times = (
             np.stack(rows[name].to_pylist()) for name in ("caught", "present", "catch_times")

@@ -1,4 +1,4 @@
-"""Where the targets, the quadrotor and its net of one row of `plans.parquet` are."""
+"""Where the targets, the quadrotor and its net of one row of the run are."""
 
 from typing import Any, NamedTuple
 

@@ -30,7 +30,7 @@ _OF_REST: dict[str, Any] = {"linewidth": 0.9}
 class Drawn(NamedTuple):
     """A plan of the figure."""
 
-    row: dict[str, Any]  # of `plans.parquet`
+    row: dict[str, Any]  # of the run
     motion: SampledMotion  # up to the last contact
     rest: SampledMotion | None  # behind it
     look: dict[str, Any]  # of its curves

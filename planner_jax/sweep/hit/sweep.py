@@ -20,7 +20,7 @@ from planner_jax.sweep.hit.settings import HitSettings
 from planner_jax.sweep.hit.source import ServeSource, open_source
 from planner_jax.sweep.quadrotor import ending_remark
 from planner_jax.sweep.robots import robot_remark
-from planner_jax.sweep.row_plans import quadrotor_plan
+from planner_jax.sweep.rows import quadrotor_plan
 from planner_jax.sweep.sweep import RunFigure, Sweep, first_values
 from planner_jax.task.hit import court
 
@@ -38,7 +38,7 @@ class HitTally(Tally):
         self._num_published: Counter[tuple[str, str]] = Counter()
 
     def add(self, rows: pa.Table) -> None:
-        """Count some rows of `plans.parquet`."""
+        """Count some rows of the run."""
         super().add(rows)
         scenario = rows["scenario"].to_numpy()
         self._num.update(scenario)

@@ -1,4 +1,4 @@
-"""The case and the drive of one row of `plans.parquet`."""
+"""The case and the drive of one row of the run."""
 
 import dataclasses
 from typing import Any

@@ -15,7 +15,7 @@ from planner_jax.sweep.intercept.figures.plane import plane_figure
 from planner_jax.sweep.intercept.figures.reach import reach_figure
 from planner_jax.sweep.intercept.figures.station_time import station_time_figure
 from planner_jax.sweep.intercept.settings import InterceptSettings
-from planner_jax.sweep.row_plans import car_plan
+from planner_jax.sweep.rows import car_plan
 from planner_jax.sweep.sweep import RunFigure, Sweep, first_values
 
 COMPARED = ("lattice", "spacetime")  # beside a run's own planner, for one case

@@ -1,0 +1,114 @@
+"""Cases and plans of finished sweeps, read back from their rows bit for bit."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pyarrow as pa
+from jaxtyping import PyTree
+
+from planner_jax.core.protocol import Plan, Status, lane
+from planner_jax.robot.arm_plan import ArmPlan
+from planner_jax.robot.car import CarPlan
+from planner_jax.robot.quadrotor_plan import QuadrotorPlan
+from planner_jax.runs.manifest import Entries, Row
+from planner_jax.runs.run_folder import RunFolder
+from planner_jax.runs.settings import SettingError, settings_of_manifest
+from planner_jax.sweep.report import finished_sweep
+from planner_jax.sweep.sweep import settings_of
+from planner_jax.trajectory.polynomial import PiecewisePolynomial
+
+
+class PlannedRow(NamedTuple):
+    """A plan, bit for bit as in its row, and what the referee says against it."""
+
+    plan: Plan  # of its robot's class, such as `QuadrotorPlan`
+    sentence: str  # "" where the referee accepts the plan
+
+
+def case_of_row(folder: RunFolder, row: int) -> PyTree:
+    """Return the case of a row, read or drawn again.
+
+    Args:
+        folder: of the run.
+        row: its place, from 0, one that there is.
+
+    Raises:
+        SettingError: the folder is not that of a whole, finished sweep, or the case that is read
+            or drawn now is another one.
+    """
+    manifest, sweep = finished_sweep(folder)
+    settings = settings_of_manifest(settings_of(sweep.task), manifest["parameters"], folder.name)
+    cases = sweep.open_source(settings.of(sweep.task), 1).cases(row, row + 1).cases
+    if sweep.setting(cases) != manifest["setting"]:
+        rule = "a run whose cases are drawn or read as they were"
+        raise SettingError(f"{folder.name} must be {rule}, got others for row {row}")
+    return lane(cases, 0)
+
+
+def planned_row(folder: RunFolder, row: int | None) -> PlannedRow:
+    """Return the plan of a row, whatever became of it.
+
+    Args:
+        folder: of the run.
+        row: its place, from 0.
+
+    Raises:
+        SettingError: the folder is not that of a whole, finished sweep, or there is no such row.
+    """
+    manifest, sweep = finished_sweep(folder)
+    last = manifest["summary"]["num"] - 1
+    if row is None or not 0 <= row <= last:
+        shown = "nothing" if row is None else row
+        raise SettingError(f"row must be from 0 to {last}, got {shown}")
+    try:
+        (found,) = folder.plans.pick([row])
+        plan = sweep.plan_of_row(found, manifest.get("setting", {}))
+    except (pa.ArrowException, KeyError, TypeError, ValueError) as error:
+        rule, why = "a run whose rows can be read", " ".join(str(error).split())
+        raise SettingError(f"{folder.name} must be {rule}, got {why}") from None
+    if plan is None:
+        rule = "a sweep of a task whose rows are read back as plans"
+        raise SettingError(f"{folder.name} must be {rule}, got a {sweep.kind}")
+    return PlannedRow(plan, found["sentence"])
+
+
+def quadrotor_plan(row: Row, setting: Row) -> QuadrotorPlan:
+    """Return the plan of a row of a quadrotor; gravity is that of the run's setting."""
+    rest = row.get("ending_durations")
+    return QuadrotorPlan(
+        **_outcome(row),
+        trajectory=_polynomial(row["coeffs"], row["durations"], 3),
+        gravity=_numbers(setting["gravity"]),
+        ending=None if rest is None else _polynomial(row["ending_coeffs"], rest, 3),
+    )
+
+
+def arm_plan(row: Row) -> ArmPlan:
+    """Return the plan of a row of blocks; it begins at the row's `delay`."""
+    return ArmPlan(
+        **_outcome(row), motion=_polynomial(row["motion_coeffs"], row["motion_durations"], 6)
+    )
+
+
+def car_plan(row: Row) -> CarPlan:
+    """Return the plan of a row of interceptions."""
+    knots = {name: _numbers(row[name]) for name in ("start", "speed", "curvature")}
+    return CarPlan(**_outcome(row), time=_numbers(row["meeting_time"]), **knots)
+
+
+def _outcome(row: Row) -> Entries:
+    """Return the fields that every plan has."""
+    counts = {"iterations": row["iterations"], "status": Status[row["status"]]}
+    return {
+        **{name: _numbers(row[name]) for name in ("cost", "violation")},
+        **{name: np.asarray(count, np.int32) for name, count in counts.items()},
+    }
+
+
+def _polynomial(coeffs: list, durations: list, axes: int) -> PiecewisePolynomial:
+    pieces = _numbers(coeffs).reshape(len(durations), -1, axes)
+    return PiecewisePolynomial(coeffs=pieces, durations=_numbers(durations))
+
+
+def _numbers(values: float | list) -> np.ndarray:
+    return np.asarray(values, np.float32)
