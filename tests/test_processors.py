@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from planner_jax import __main__ as process
-from planner_jax.cli.main import main as cli
+from planner_jax.cli import main as cli
 from planner_jax.host import processors
 from planner_jax.host import signals as stopping
 from tests.sweeps import rows_of

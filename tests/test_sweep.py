@@ -131,16 +131,22 @@ def test_the_rows_alone_lead_the_referee_to_the_same_verdict(finished):
     head = np.zeros((NUM, 4, 3))
     head[:, 0] = rows["start"]
 
-    def same(*names):
-        return SimpleNamespace(**{n: np.tile(setting[n], (NUM, 1)).squeeze() for n in names})
+    def same(*names, **others):
+        values = {name: np.tile(setting[name], (NUM, 1)).squeeze() for name in names}
+        return SimpleNamespace(**values, **others)
 
     physics = vars(same("drag", "gravity", "restitution", "racket_height"))
     cases = SimpleNamespace(
         ball=SimpleNamespace(pos=rows["ball_pos"], vel=rows["ball_vel"]),
         head_state=head,
         target=rows["target"],
-        limits=same("speed", "acceleration", "body_rate", "min_height"),
+        limits=same(
+            *("speed", "acceleration", "body_rate", "min_height"),
+            **{"min_thrust": None, "max_thrust": None, "rotors": None},
+        ),
         hit_limits=same("hitting_speed", "min_apex", "max_apex"),
+        racket_radius=None,
+        extras=(),
         **physics,
     )
     pieces = rows["durations"].shape[1]
@@ -148,7 +154,7 @@ def test_the_rows_alone_lead_the_referee_to_the_same_verdict(finished):
         durations=rows["durations"], coeffs=rows["coeffs"].reshape(NUM, pieces, -1, 3)
     )
     plans = SimpleNamespace(
-        trajectory=trajectory, stroke=SimpleNamespace(time=rows["contact_time"])
+        trajectory=trajectory, stroke=SimpleNamespace(time=rows["contact_time"]), ending=None
     )
     verdict = referee_hits(cases, plans)
     np.testing.assert_array_equal(verdict.success, rows["success"])

@@ -116,13 +116,20 @@ def test_the_rows_alone_lead_the_referee_to_the_same_verdict(finished):
             **vars(same("height", "radius", prefix="net_")),
             max_angle=np.full(NUM, setting["net_max_angle"]),
         ),
-        limits=same("speed", "min_thrust", "max_thrust", "body_rate", "min_height"),
+        limits=SimpleNamespace(
+            **vars(same("speed", "min_thrust", "max_thrust", "body_rate", "min_height")),
+            acceleration=None,
+            rotors=None,
+        ),
+        optional=None,
+        extras=(),
     )
     coeffs = rows["coeffs"].reshape(NUM, rows["durations"].shape[1], -1, 3)
     plans = SimpleNamespace(
         trajectory=SimpleNamespace(coeffs=coeffs, durations=rows["durations"]),
         order=rows["order"],
         times=rows["catch_times"],
+        ending=None,
     )
     verdict = referee_catches(cases, plans)
     np.testing.assert_array_equal(verdict.success, rows["success"])
