@@ -1,7 +1,7 @@
 """The live loop under throws one after another, with packets lost, late and repeated.
 
     python -m benchmarks.serve_soak [--task catch] [--minutes 1] [--rate 100] [--bad 2]
-        [--deadline 0.01] [--server-core N] [--idle] [--out DIR]
+        [--deadline 0.01] [--server-core N] [--out DIR]
 
 Starts `planner-jax serve TASK --report` as a process of its own, and sends it balls of the task's
 suite as they fly, with noise on their places, and the state of a robot that is where the last
@@ -14,6 +14,7 @@ The success of the summary is the share of the balls that are within the radius 
 racket at the contact, where the setpoints then have its centre.
 """
 
+import gc
 import heapq
 import os
 import signal
@@ -41,7 +42,6 @@ from planner_jax.live.packets import (
     request,
 )
 from planner_jax.live.report import Latencies
-from planner_jax.live.server import undisturbed
 
 NUM = 200  # balls that are drawn, and thrown again and again
 SECONDS = 1.8  # of a throw
@@ -205,8 +205,6 @@ def started(options: Any) -> tuple[subprocess.Popen, int, float]:
     """The server's process, its port, and after how many seconds it answers."""
     words = [sys.executable, "-m", "planner_jax", "serve", options.task, "--port", "0", "--report"]
     words += ["--deadline", str(options.deadline), "--rate", str(options.rate)]
-    if options.idle:
-        words.append("--idle")
     if options.server_core is not None:
         words = ["taskset", "-c", str(options.server_core), *words]
     began = time.perf_counter()
@@ -228,7 +226,6 @@ def main() -> None:
     parser.add_argument("--bad", type=float, default=2.0, help="per cent of packets (default: 2)")
     parser.add_argument("--deadline", type=float, default=0.01, help="[s] (default: 0.01)")
     parser.add_argument("--server-core", type=int, help="core that the server is bound to")
-    parser.add_argument("--idle", action="store_true", help="no rehearsals between packets")
     options = parser.parse_args()
     with begin(parser, options) as bench:
         balls = paths(options.task, options.rate)
@@ -245,11 +242,11 @@ def main() -> None:
             naps["the server's core"] = Naps(options.server_core)
             others = os.sched_getaffinity(0) - {options.server_core}
             os.sched_setaffinity(0, others or {options.server_core})
-        with undisturbed():  # or the pauses of this process would count
-            soak = Soak(port, options, tool, float(case.gravity))
-            ends = time.monotonic() + 60.0 * options.minutes
-            while time.monotonic() < ends:
-                soak.throw(balls[soak.thrown % NUM], start, soak.thrown % 2**16)
+        gc.disable()  # or the pauses of this process would count
+        soak = Soak(port, options, tool, float(case.gravity))
+        ends = time.monotonic() + 60.0 * options.minutes
+        while time.monotonic() < ends:
+            soak.throw(balls[soak.thrown % NUM], start, soak.thrown % 2**16)
         soak.end()
         for sleeper in naps.values():
             sleeper.end()

@@ -374,7 +374,7 @@ def _add_serve(kind: type, parser: _Parser) -> None:
 
 def _serve(settings: Any) -> None:
     from planner_jax.live.planner import LivePlanner
-    from planner_jax.live.server import Server, compute_in_place, undisturbed
+    from planner_jax.live.server import Server, compute_in_place
 
     compute_in_place()
     require_backend()
@@ -382,11 +382,11 @@ def _serve(settings: Any) -> None:
     names = ("rate", "horizon", "deadline", "noise")
     options = {name: getattr(settings, name) for name in names}
     planner = LivePlanner(settings.stroke(), **options)
-    server = Server(planner, settings.port, idle=settings.idle)
+    server = Server(planner, settings.port)
     server.warm_up()
     report = server.planner.report
     rest = lambda: f"{report.counts['answered']:,} packets answered"  # noqa: E731
-    with stopping.under_way(rest, bar=False), contextlib.closing(server), undisturbed():
+    with stopping.under_way(rest, bar=False), contextlib.closing(server):
         print(f"Answering on 127.0.0.1:{server.port}; Ctrl-C stops.", flush=True)
         ends = time.monotonic() + (settings.seconds or math.inf)
         server.run(lambda: not stopping.is_told() and time.monotonic() < ends)

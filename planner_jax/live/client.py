@@ -1,8 +1,10 @@
-"""The other side of a live loop, for programs in Python; others find the packets in the docs."""
+"""The client of a live loop in Python; docs/live.md describes its packets for other languages."""
 
 import socket
 import time
-from typing import Any, Self
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Self
 
 from planner_jax.live.packets import BALL, LONGEST, ROBOT, Answer, read_answer, request
 from planner_jax.live.server import HOST
@@ -10,11 +12,11 @@ from planner_jax.live.settings import PORT
 
 
 class Client:
-    """Sends what was measured, and waits for the setpoints; its socket is closed with its block.
+    """Sends measurements, and waits for setpoints; the end of its block closes its socket.
 
     Args:
         port: of the loop.
-        timeout: [s], for which an answer is waited for.
+        timeout: [s], longest wait for an answer.
     """
 
     def __init__(self, port: int = PORT, *, timeout: float = 0.1) -> None:
@@ -22,33 +24,38 @@ class Client:
         self._socket.connect((HOST, port))
         self._timeout, self._sequence = timeout, 0
 
-    def ball(self, pos: tuple, *, measured: float | None = None, number: int = 0) -> Answer | None:
-        """The answer to a ball that was seen at a place (3,) [m]; None if none comes in time.
+    def ball(
+        self, pos: Sequence[float], *, measured: float | None = None, number: int = 0
+    ) -> Answer | None:
+        """Send the position of a ball; return the answer, or None if none comes in time.
 
         Args:
             pos: (3,) [m].
-            measured: [s], when, by `time.monotonic()`; now if not given.
+            measured: [s], time of the observation by `time.monotonic()`; by default now.
             number: of the ball, from 0 to 65535; another number is another ball.
         """
-        return self._asked(BALL, measured, (*map(float, pos),), number)
+        return self._send(BALL, measured, pos, number)
 
     def robot(
         self,
-        pos: tuple,
-        vel: tuple = (0.0,) * 3,
-        acc: tuple = (0.0,) * 3,
+        pos: Sequence[float],
+        vel: Sequence[float] = (0.0,) * 3,
+        acc: Sequence[float] = (0.0,) * 3,
         *,
         measured: float | None = None,
     ) -> Answer | None:
-        """The answer to the robot's position [m], velocity [m/s] and acceleration [m/s^2]."""
-        return self._asked(ROBOT, measured, (*map(float, (*pos, *vel, *acc)),), 0)
+        """Send the robot's position [m], velocity [m/s] and acceleration [m/s^2]; as `ball`."""
+        return self._send(ROBOT, measured, (*pos, *vel, *acc), 0)
 
-    def _asked(self, kind: int, measured: float | None, values: tuple, ball: int) -> Answer | None:
+    def _send(
+        self, kind: int, measured: float | None, values: Sequence[float], ball: int
+    ) -> Answer | None:
         sent = time.monotonic()
         self._sequence = (self._sequence + 1) % 2**32
         when = sent if measured is None else measured
         try:
-            self._socket.send(request(kind, self._sequence, sent, when, values, ball))
+            data = request(kind, self._sequence, sent, when, tuple(map(float, values)), ball)
+            self._socket.send(data)
             while (left := sent + self._timeout - time.monotonic()) > 0.0:
                 self._socket.settimeout(left)
                 answer = read_answer(self._socket.recv(LONGEST))
@@ -61,5 +68,5 @@ class Client:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *_: Any) -> None:
+    def __exit__(self, *_: type | BaseException | TracebackType | None) -> None:
         self._socket.close()

@@ -1,8 +1,10 @@
-"""What a live loop counts and times, in memory that does not grow, and how that is told."""
+"""Counts and times of a live loop, in memory that does not grow."""
 
 import collections
+import contextlib
 import math
-from typing import Any
+import time
+from collections.abc import Iterator
 
 import jax
 import numpy as np
@@ -24,28 +26,35 @@ class Latencies:
         self.num, self.longest = 0, 0.0
 
     def add(self, seconds: float) -> None:
-        """Count one."""
-        place = int(math.log(max(seconds, _SHORTEST) / _SHORTEST) / _STEP)
-        self._counts[min(place, _CLASSES - 1)] += 1
+        """Count one time."""
+        index = int(math.log(max(seconds, _SHORTEST) / _SHORTEST) / _STEP)
+        self._counts[min(index, _CLASSES - 1)] += 1
         self.num, self.longest = self.num + 1, max(self.longest, seconds)
 
+    @contextlib.contextmanager
+    def timed(self) -> Iterator[None]:
+        """Count the time of a block."""
+        start = time.perf_counter()
+        yield
+        self.add(time.perf_counter() - start)
+
     def quantile(self, share: float) -> float:
-        """The time [s] below which a share of them lies, to 1 %; NaN of none."""
+        """Return the time [s] below which a share of the times lies, to 1 %; NaN without any."""
         if not self.num:
             return math.nan
-        place = int(np.searchsorted(np.cumsum(self._counts), share * self.num))
-        return min(_SHORTEST * math.exp(_STEP * (place + 1)), self.longest)
+        index = int(np.searchsorted(np.cumsum(self._counts), share * self.num))
+        return min(_SHORTEST * math.exp(_STEP * (index + 1)), self.longest)
 
 
 class Report:
-    """Counts by name, times by stage, memory, and programs that were compiled on the way."""
+    """Counts by name, times by stage, memory, and programs that were compiled after the start."""
 
     STAGES = {
         "read": "packet read and checked",
         "estimate": "ball estimated",
         "first": "planned from scratch",
         "again": "planned again",
-        "rest": "way to rest planned",
+        "rest": "recovery planned",
         "setpoints": "setpoints made and packed",
         "ball": "ball observed to setpoints sent",
         "answer": "any packet to setpoints sent",
@@ -61,39 +70,19 @@ class Report:
         self._memory: int | None = None
 
     def begin(self) -> None:
-        """Count from now on what is compiled, and remember the memory."""
+        """Start to count compiled programs, and note the memory."""
         self._memory = resident_memory()
-        jax.monitoring.register_event_duration_secs_listener(self._heard)
+        jax.monitoring.register_event_duration_secs_listener(self._count_compiled)
 
     def end(self) -> None:
-        """No longer listen to what is compiled."""
-        jax.monitoring.unregister_event_duration_listener(self._heard)
+        """Stop to count compiled programs."""
+        jax.monitoring.unregister_event_duration_listener(self._count_compiled)
 
-    def _heard(self, event: str, duration_secs: float, **_: str | int) -> None:
+    def _count_compiled(self, event: str, duration_secs: float, **_: str | int) -> None:
         self.compiled += event.startswith(_COMPILING)
 
-    def figures(self) -> dict[str, Any]:
-        """All of it, as plain values; times in ms."""
-        times = {
-            name: {
-                "num": stage.num,
-                "p50_ms": 1e3 * stage.quantile(0.5),
-                "p99_ms": 1e3 * stage.quantile(0.99),
-                "max_ms": 1e3 * stage.longest,
-            }
-            for name, stage in self.stages.items()
-        }
-        return {
-            **{name: self.counts[name] for name in COUNTS},
-            "faults": {fault.words: num for fault, num in sorted(self.faults.items())},
-            "times": times,
-            "farthest_off_course_m": self.tracking,
-            "compiled_after_start": self.compiled,
-            "memory_bytes": [self._memory, resident_memory()],
-        }
-
     def headline(self) -> str:
-        """One line."""
+        """Return the report in one line."""
         ball = self.stages["ball"]
         p50, p99 = 1e3 * ball.quantile(0.5), 1e3 * ball.quantile(0.99)
         times = f"from a ball observed to setpoints p50 {p50:.2f} ms, p99 {p99:.2f} ms"
@@ -104,7 +93,7 @@ class Report:
         )
 
     def lines(self) -> list[str]:
-        """The whole report, to read."""
+        """Return the lines of the whole report."""
         lines = [self.headline(), ""]
         lines += [f"{self.counts[name]:>9,}  {words}" for name, words in COUNTS.items()]
         lines += [
@@ -130,15 +119,14 @@ COUNTS = {
     "used": "packets used",
     "late": "packets late, and used",
     "missed": "answers after the deadline",
-    "starved": "of these, for which the machine gave less processor time than the deadline",
-    "busy": "answers from the last good plan, as planning took too long",
+    "busy": "answers from the last plan, as planning took too long",
     "balls": "balls",
     "plans": "plans from scratch that are flown",
     "replans": "plans made again that are flown",
     "refused": "plans that are not flown, as they break a limit",
     "unjoined": "plans that are not flown, as they came too late to join",
-    "endless": "plans that are not flown, as no way to rest behind them keeps the limits",
-    "hard_rests": "ways to rest from where the robot was that exceed a limit",
+    "endless": "plans that are not flown, as no recovery behind them keeps the limits",
+    "hard_rests": "recoveries from the robot's state that exceed a limit",
     "astray": "times the robot was off course",
     "clocks": "times the senders' clock was set anew",
     "unsent": "answers that could not be sent",

@@ -1,17 +1,20 @@
-"""What `planner-jax serve` is asked to do, checked before anything is compiled; imports no JAX."""
+"""Settings of `planner-jax serve`, checked before anything is compiled; imports no JAX."""
 
 import dataclasses
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from planner_jax.runs.settings import option, require, require_count
 from planner_jax.sweep.robots import checked_robot, robot_option
+
+if TYPE_CHECKING:
+    from planner_jax.live.strokes import CatchStroke, HitStroke, Stroke
 
 PORT = 5560
 
 
 @dataclasses.dataclass(frozen=True)
 class ServeSettings:
-    """The options that all tasks have.
+    """Settings of all tasks.
 
     Raises:
         SettingError: a value breaks its rule.
@@ -23,8 +26,7 @@ class ServeSettings:
     deadline: float = option(0.01, "S", "from a packet to its answer [s]")
     noise: float = option(0.005, "M", "standard deviation of an observed coordinate [m]")
     seconds: float | None = option(None, "S", "end after this time (default: never)")
-    report: bool = option(False, "", "tell counts, times and memory at the end")
-    idle: bool = option(False, "", "leave the core to others between packets; answers take longer")
+    report: bool = option(False, "", "print counts, times and memory at the end")
 
     def __post_init__(self) -> None:
         require_count("port", self.port, 0)
@@ -37,29 +39,29 @@ class ServeSettings:
         if self.seconds is not None:
             require(0.0 < self.seconds <= 1e7, "seconds", "> 0 and at most 1e7", self.seconds)
 
-    def stroke(self) -> Any:
-        """What is planned."""
+    def stroke(self) -> "Stroke":
+        """Return the task of the loop."""
         raise NotImplementedError
 
 
 @dataclasses.dataclass(frozen=True)
 class HitServe(ServeSettings):
-    """Those of hits."""
+    """Settings of hits."""
 
     robot: Any = robot_option("paper-hitter")
-    target: tuple[float, ...] = option((3.0, 0.0, 0.0), "M", "where the ball is to land")
+    target: tuple[float, ...] = option((3.0, 0.0, 0.0), "M", "landing position of the ball")
     drag: float = option(0.0616, "K", "K_D of the ball [1/m]")
 
     def __post_init__(self) -> None:
         super().__post_init__()
         object.__setattr__(self, "robot", checked_robot(self.robot, "racket"))
         require(len(self.target) == 3, "target", "3 numbers", len(self.target))
-        for place in self.target:
-            require(abs(place) <= 100.0, "target", "within 100 m", place)
+        for value in self.target:
+            require(abs(value) <= 100.0, "target", "within 100 m", value)
         require(0.0 <= self.drag <= 1.0, "drag", "from 0 to 1", self.drag)
 
-    def stroke(self) -> Any:
-        """A hit to the target."""
+    def stroke(self) -> "HitStroke":
+        """Return a hit to the target."""
         from planner_jax.live.strokes import HitStroke
         from planner_jax.robot.quadrotor_models import PAPER_HITTER
 
@@ -68,7 +70,7 @@ class HitServe(ServeSettings):
 
 @dataclasses.dataclass(frozen=True)
 class CatchServe(ServeSettings):
-    """Those of catches."""
+    """Settings of catches."""
 
     robot: Any = robot_option("paper-catcher")
     drag: float = option(0.5, "K", "of the ball [1/s]")
@@ -78,8 +80,8 @@ class CatchServe(ServeSettings):
         object.__setattr__(self, "robot", checked_robot(self.robot, "net"))
         require(0.0 <= self.drag <= 10.0, "drag", "from 0 to 10", self.drag)
 
-    def stroke(self) -> Any:
-        """A catch."""
+    def stroke(self) -> "CatchStroke":
+        """Return a catch."""
         from planner_jax.live.strokes import CatchStroke
         from planner_jax.robot.quadrotor_models import PAPER_CATCHER
 

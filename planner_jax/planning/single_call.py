@@ -17,14 +17,7 @@ import numpy as np
 _Layout = tuple[tuple[tuple[int, ...], Any], ...]  # shapes and dtypes of a tree's leaves
 
 
-def call_packed(
-    function: Callable,
-    static: Hashable,
-    own: Any,
-    case: Any,
-    *,
-    compiler: Callable[..., Callable] | None = None,
-) -> Any:
+def call_packed(function: Callable, static: Hashable, own: Any, case: Any) -> Any:
     """Return `function(static, own, case)` with NumPy leaves.
 
     Args:
@@ -32,12 +25,11 @@ def call_packed(
         static: hashable, a constant of the program.
         own: a pytree that stays where it is, such as a planner.
         case: a pytree with NumPy leaves, one of them floating at least.
-        compiler: compiles in the place of `jax.jit`; see `planner_jax.live.export_cache`.
     """
     leaves, tree = jax.tree.flatten(case)
     arrays = [np.asarray(leaf) for leaf in leaves]
     kept, own_tree = jax.tree.flatten(own)
-    program = _program(function, static, own_tree, _layout(kept), tree, _layout(arrays), compiler)
+    program = _program(function, static, own_tree, _layout(kept), tree, _layout(arrays))
     vector = np.concatenate(
         [array.ravel() for array in arrays], dtype=program.dtype, casting="unsafe"
     )
@@ -91,9 +83,8 @@ def _program(
     own: _Layout,
     tree: Any,
     layout: _Layout,
-    compiler: Callable[..., Callable] | None,
 ) -> _Program:
-    """The program for trees of these shapes and dtypes."""
+    """Return the program for trees of these shapes and dtypes."""
     floating = [kind for _, kind in layout if np.issubdtype(kind, np.floating)]
     dtype = jax.dtypes.canonicalize_dtype(np.result_type(*floating))
     ends = np.cumsum([math.prod(shape) for shape, _ in layout])
@@ -114,18 +105,4 @@ def _program(
         examples[:] = [jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), result)]
         return jnp.concatenate([leaf.ravel().astype(dtype) for leaf in jax.tree.leaves(result)])
 
-    if compiler is None:
-        run = jax.jit(packed)
-    else:
-        like = [jax.ShapeDtypeStruct(shape, kind) for shape, kind in own]
-        vector = jax.ShapeDtypeStruct((int(ends[-1]),), dtype)
-        described = f"{_named(function)} {_named(static)} {own_tree} {tree} {layout}"
-        run = compiler(packed, described, (like, vector), examples)
-    return _Program(run, dtype, examples)
-
-
-def _named(static: Any) -> str:
-    """What stays the same from process to process."""
-    if callable(static) and hasattr(static, "__qualname__"):
-        return f"{static.__module__}.{static.__qualname__}"
-    return repr(static)
+    return _Program(jax.jit(packed), dtype, examples)
