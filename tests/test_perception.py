@@ -10,21 +10,21 @@ from scipy.spatial.transform import Rotation
 
 from planner_jax.ball.estimation import EkfModel, ekf_init, ekf_predict, ekf_update
 from planner_jax.ball.flight import BallState, drag_free_flight
-from planner_jax.perception.calibrate import calibrate, hand_eye, pose, rigid_motion
 from planner_jax.perception.camera import back_project, in_view, looking_at, project
 from planner_jax.perception.fit import Sight, across_std, believed_at, error_across, fit_flight
 from planner_jax.perception.noise import (
     RoundNoise,
     depth_std,
     information,
-    noisy_depth,
     sightings,
     stereo_noise,
 )
-from planner_jax.perception.segment import (
+from planner_jax.sims.calibrate import calibrate, hand_eye, pose, rigid_motion
+from planner_jax.sims.segment import (
     ball_look,
     colour_mask,
     hue_saturation_value,
+    noisy_depth,
     sighting,
 )
 

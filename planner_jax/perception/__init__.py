@@ -1,1 +1,1 @@
-"""A ball seen by cameras: noise, colour masks, fits of trajectories, calibration."""
+"""A ball seen by cameras: noise of the observations, and fits of trajectories."""

@@ -5,12 +5,17 @@ to the right and y down in the image, and z ahead. Depth is measured along z, as
 it, not along the ray. Points and pixels may have any leading axes.
 """
 
-from typing import Any
+import functools
+from collections.abc import Callable
+from typing import TypeVar
 
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array, lax
+from jax.typing import ArrayLike
+
+Kind = TypeVar("Kind")
 
 
 @struct.dataclass
@@ -28,10 +33,15 @@ class Camera:
         return jnp.asarray(0.5 * (np.array(self.size) - 1.0), jnp.result_type(self.focal))
 
 
+def from_numbers(kind: Callable[..., Kind], **leaves: ArrayLike) -> Kind:
+    """Make a dataclass with NumPy float32 leaves."""
+    return kind(**{name: np.asarray(leaf, np.float32) for name, leaf in leaves.items()})
+
+
 def looking_at(
-    position: Any, target: Any, *, size: tuple[int, int], field_of_view: float
+    position: ArrayLike, target: ArrayLike, *, size: tuple[int, int], field_of_view: float
 ) -> Camera:
-    """A camera that looks at a target, its image level; NumPy float32 leaves.
+    """Make a camera that looks at a target, its image level; NumPy float32 leaves.
 
     Args:
         position: (3,) [m].
@@ -53,21 +63,16 @@ def looking_at(
     z = ahead / np.linalg.norm(ahead)
     x = np.cross(z, [0.0, 0.0, 1.0])
     x /= np.linalg.norm(x)
-    leaves = {
-        "rotation": np.stack([x, np.cross(z, x), z], axis=1),
-        "position": position,
-        "focal": 0.5 * size[0] / np.tan(0.5 * field_of_view),
-    }
-    arrays: Any = {name: np.asarray(leaf, np.float32) for name, leaf in leaves.items()}
-    return Camera(**arrays, size=size)
+    rotation = np.stack([x, np.cross(z, x), z], axis=1)
+    focal = 0.5 * size[0] / np.tan(0.5 * field_of_view)
+    pinhole = functools.partial(Camera, size=size)
+    return from_numbers(pinhole, rotation=rotation, position=position, focal=focal)
 
 
 def placed(camera: Camera, pose: np.ndarray) -> Camera:
-    """The same camera where a pose (4, 4) has it, such as one that calibration found."""
-    there: Any = np.asarray(pose, np.float32)
-    return Camera(
-        rotation=there[:3, :3], position=there[:3, 3], focal=camera.focal, size=camera.size
-    )
+    """Move a camera to a pose (4, 4), such as one that calibration found."""
+    own = functools.partial(Camera, focal=camera.focal, size=camera.size)
+    return from_numbers(own, rotation=pose[:3, :3], position=pose[:3, 3])
 
 
 def to_camera(camera: Camera, points: Array) -> Array:

@@ -11,11 +11,11 @@ for what is still to come, is fitted anew in constant time.
 """
 
 import enum
-from typing import Any
 
 import jax.numpy as jnp
 from flax import struct
 from jax import Array, lax
+from jax.typing import ArrayLike
 
 from planner_jax.ball.estimation import EkfState, solve_definite
 from planner_jax.ball.flight import BallState, drag_free_flight
@@ -57,7 +57,7 @@ class FlightFit:
         return self.belief.ball
 
 
-def fit_flight(times: Array, places: Array, information: Any, gravity: Array) -> FlightFit:
+def fit_flight(times: Array, places: Array, information: ArrayLike, gravity: Array) -> FlightFit:
     """The free flight of least squares through observations; pure, so jit and vmap it.
 
     Minimises  sum_k e_k' W_k e_k,  e_k = p + v t_k - (0, 0, g t_k^2 / 2) - x_k.  With equal weights

@@ -6,15 +6,19 @@ the square of the distance, whereas that across the ray grows with the distance 
 as large in every direction and at every distance, stands beside it for comparisons.
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 from jax import Array, lax
 
-from planner_jax.perception.camera import Camera, back_project, in_view, project, to_camera
+from planner_jax.perception.camera import (
+    Camera,
+    back_project,
+    from_numbers,
+    in_view,
+    project,
+    to_camera,
+)
 
 
 @struct.dataclass
@@ -66,8 +70,7 @@ def stereo_noise(
     for name in ("dropout", "mismatch"):
         if not given[name] < 1.0:
             raise ValueError(f"{name} must be < 1, got {given[name]:g}")
-    leaves: Any = {name: np.asarray(value, np.float32) for name, value in given.items()}
-    return StereoNoise(**leaves)
+    return from_numbers(StereoNoise, **given)
 
 
 def depth_std(camera: Camera, noise: StereoNoise, depths: Array) -> Array:
@@ -104,9 +107,9 @@ def information(camera: Camera, noise: Noise, points: Array) -> Array:
 def sightings(key: Array, camera: Camera, noise: Noise, points: Array) -> Array:
     """Where balls at (N, 3) [m] are seen, a frame each; NaN where they are not.
 
-    This is what `segment.sighting` makes of images, without the images. A ball outside the image is
-    not seen, but nothing stands in its way either. A stereo camera's pixels and disparities have
-    Gaussian errors, and frames are lost.
+    This is what `sims.segment.sighting` makes of images, without the images. A ball outside the
+    image is not seen, but nothing stands in its way either. A stereo camera's pixels and
+    disparities have Gaussian errors, and frames are lost.
 
     Returns:
         (N, 3) [m], world frame.
@@ -125,37 +128,3 @@ def sightings(key: Array, camera: Camera, noise: Noise, points: Array) -> Array:
     lost = jax.random.uniform(to_loss, depths.shape, dtype) < noise.dropout
     seen = back_project(camera, pixels, scale / jnp.where(there, disparity, 1.0))
     return jnp.where((there & ~lost)[:, None], seen, jnp.nan)
-
-
-def noisy_depth(
-    key: Array, camera: Camera, noise: StereoNoise, depth: Array
-) -> tuple[Array, Array]:
-    """A depth image as a stereo camera would have it, from the true one.
-
-    One error of disparity is common to the image, as if one thing were looked at; pixels have
-    errors of their own beside it, none at all (NaN), or the depth of something else, up to twice
-    as near or far.
-
-    Args:
-        key: of the noise.
-        camera: for its focal length.
-        noise: of the stereo camera.
-        depth: (rows, columns) [m], > 0.
-
-    Returns:
-        depth: (rows, columns) [m].
-        confidence: (rows, columns), 0 to 1; an assumption: evenly spread over 0.4 to 1 where the
-            pixel was matched well, and over 0 to 0.6 where with something else.
-    """
-    common, own, hole, other, factor, trust = jax.random.split(key, 6)
-    dtype = depth.dtype
-    error = noise.disparity_std * jax.random.normal(common, (), dtype)
-    error = error + noise.speckle_std * jax.random.normal(own, depth.shape, dtype)
-    disparity = camera.focal * noise.baseline / depth + error
-    wrong = jax.random.uniform(other, depth.shape, dtype) < noise.mismatch
-    stretch = jnp.exp2(jax.random.uniform(factor, depth.shape, dtype, -1.0, 1.0))
-    disparity = jnp.where(wrong, disparity * stretch, disparity)
-    lost = (jax.random.uniform(hole, depth.shape, dtype) < noise.dropout) | (disparity <= 0.0)
-    seen = camera.focal * noise.baseline / jnp.where(lost, 1.0, disparity)
-    confidence = 0.6 * jax.random.uniform(trust, depth.shape, dtype) + jnp.where(wrong, 0.0, 0.4)
-    return jnp.where(lost, jnp.nan, seen), confidence

@@ -5,14 +5,15 @@ little confidence and depths that do not belong to the ball are dropped, and wha
 is enough of it, has a centroid.
 """
 
-from typing import Any
-
+import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array, lax
+from jax.typing import ArrayLike
 
-from planner_jax.perception.camera import Camera, back_project
+from planner_jax.perception.camera import Camera, back_project, from_numbers
+from planner_jax.perception.noise import StereoNoise
 
 WINDOW = 64  # [px], edge of the square around the mask's middle that is looked at closely
 # Of a sphere's visible half, seen from afar: mean height above the plane through its middle, in
@@ -34,8 +35,8 @@ class BallLook:
 
 
 def ball_look(
-    lower: Any = (0.02, 0.5, 0.25),
-    upper: Any = (0.13, 1.0, 1.0),
+    lower: ArrayLike = (0.02, 0.5, 0.25),
+    upper: ArrayLike = (0.13, 1.0, 1.0),
     *,
     radius: float = 0.05,
     confidence: float = 0.5,
@@ -53,16 +54,15 @@ def ball_look(
             raise ValueError(f"{name} must be three numbers between 0 and 1, got {value}")
     if not radius > 0.0:
         raise ValueError(f"radius must be > 0, got {radius:g}")
-    given = {
-        "lower": lower,
-        "upper": upper,
-        "radius": radius,
-        "confidence": confidence,
-        "pixels": pixels,
-        "reach": reach,
-    }
-    leaves: Any = {name: np.asarray(value, np.float32) for name, value in given.items()}
-    return BallLook(**leaves)
+    return from_numbers(
+        BallLook,
+        lower=lower,
+        upper=upper,
+        radius=radius,
+        confidence=confidence,
+        pixels=pixels,
+        reach=reach,
+    )
 
 
 @struct.dataclass
@@ -168,6 +168,40 @@ def sighting(
         depth=jnp.where(seen, deep, jnp.nan),
         pixels=jnp.where(seen, num, 0).astype(jnp.int32),
     )
+
+
+def noisy_depth(
+    key: Array, camera: Camera, noise: StereoNoise, depth: Array
+) -> tuple[Array, Array]:
+    """A depth image as a stereo camera would have it, from the true one.
+
+    One error of disparity is common to the image, as if one thing were looked at; pixels have
+    errors of their own beside it, none at all (NaN), or the depth of something else, up to twice
+    as near or far.
+
+    Args:
+        key: of the noise.
+        camera: for its focal length.
+        noise: of the stereo camera.
+        depth: (rows, columns) [m], > 0.
+
+    Returns:
+        depth: (rows, columns) [m].
+        confidence: (rows, columns), 0 to 1; an assumption: evenly spread over 0.4 to 1 where the
+            pixel was matched well, and over 0 to 0.6 where with something else.
+    """
+    common, own, hole, other, factor, trust = jax.random.split(key, 6)
+    dtype = depth.dtype
+    error = noise.disparity_std * jax.random.normal(common, (), dtype)
+    error = error + noise.speckle_std * jax.random.normal(own, depth.shape, dtype)
+    disparity = camera.focal * noise.baseline / depth + error
+    wrong = jax.random.uniform(other, depth.shape, dtype) < noise.mismatch
+    stretch = jnp.exp2(jax.random.uniform(factor, depth.shape, dtype, -1.0, 1.0))
+    disparity = jnp.where(wrong, disparity * stretch, disparity)
+    lost = (jax.random.uniform(hole, depth.shape, dtype) < noise.dropout) | (disparity <= 0.0)
+    seen = camera.focal * noise.baseline / jnp.where(lost, 1.0, disparity)
+    confidence = 0.6 * jax.random.uniform(trust, depth.shape, dtype) + jnp.where(wrong, 0.0, 0.4)
+    return jnp.where(lost, jnp.nan, seen), confidence
 
 
 def _middle(counts: Array) -> Array:
