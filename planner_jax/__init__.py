@@ -10,7 +10,7 @@ Every task, `hit`, `catch`, `intercept` and those of other packages (`task_named
 `case`, `draw`, `planner` and `judge`. The calls are the same for all of them:
 
 * `plan`: one case or many, on all devices; `solve`, the same for the inside of compiled functions;
-  `plan_across_processes`; `keep_compiled_programs`
+  `keep_compiled_programs`
 * `replan`: from the plan that is being carried out
 * `gradient`: of a number of every plan by parts of its case; `optimal_plan` inside a loss
 * `lane`, `solved`, `Status`: reading plans; a plan has `sample`, `save` and `load`

@@ -38,7 +38,6 @@ from .plane.target import PolynomialPath as PolynomialPath
 from .plane.target import TurningPath as TurningPath
 from .planning.gradient import gradient as gradient
 from .planning.plan import plan as plan
-from .planning.plan import plan_across_processes as plan_across_processes
 from .planning.plan import solve as solve
 from .planning.progress import Progress as Progress
 from .planning.replan import replan as replan

@@ -1,16 +1,13 @@
-"""Run by `test_devices.py` in processes of its own: plans on several devices or processes.
+"""Run by `test_devices.py` in a process of its own: plans on several devices.
 
-python spread.py devices             needs --xla_force_host_platform_device_count=4
-python spread.py process INDEX PORT  of two
+It needs --xla_force_host_platform_device_count=4.
 """
-
-import sys
 
 import jax
 import numpy as np
 from test_solve import Well, WellPlanner
 
-from planner_jax.planning.plan import plan, plan_across_processes
+from planner_jax.planning.plan import plan
 
 GOALS = np.linspace(-1.0, 5.0, 203).astype(np.float32)
 
@@ -43,22 +40,6 @@ def on_devices():
     np.testing.assert_array_equal(spoiled.point[others], clean.point[others])
 
 
-def on_processes(index, port):
-    """Each of two processes plans its half and has the whole in the end."""
-    jax.distributed.initialize(f"127.0.0.1:{port}", num_processes=2, process_id=index)
-    alone = plan(WellPlanner(), Well(GOALS))
-    equal(plan_across_processes(WellPlanner(), Well(GOALS)), alone)
-    try:
-        plan_across_processes(WellPlanner(), Well(GOALS[:1]))
-    except ValueError as error:
-        assert "a lane for each of 2 processes, got 1" in str(error)
-    else:
-        raise AssertionError("one lane for two processes was accepted")
-
-
 if __name__ == "__main__":
-    if sys.argv[1] == "devices":
-        on_devices()
-    else:
-        on_processes(int(sys.argv[2]), int(sys.argv[3]))
+    on_devices()
     print("equal")

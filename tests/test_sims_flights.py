@@ -9,16 +9,26 @@ import jax
 import numpy as np
 import pytest
 from flax import struct
+from test_solve import GOALS, TRACES, Well, WellPlanner
 
 import planner_jax as pj
-from planner_jax.core.protocol import Status, is_unsolved
+from planner_jax.core.planner import Planner
+from planner_jax.core.protocol import Status, is_solved, is_unsolved
+from planner_jax.optimise.lbfgs import LbfgsConfig
+from planner_jax.planning.plan import plan
 from planner_jax.sims.loop_state import Loop
 from planner_jax.sims.noise import NOISES
 from planner_jax.sims.robots.quadrotor.robot import Quadrotor
 from planner_jax.sims.tasks import catch_ahead
 from planner_jax.sims.tasks.catch import CATCH_WORLD, fly_catches, throws
-from planner_jax.sims.tasks.catch_ahead import LIMITS, bounds, planned_ahead, within
-from planner_jax.sims.tasks.catch_pilot import is_better
+from planner_jax.sims.tasks.catch_ahead import (
+    LIMITS,
+    bounds,
+    compile_attempts,
+    planned_ahead,
+    within,
+)
+from planner_jax.sims.tasks.catch_pilot import is_worth_flying
 from planner_jax.sims.tasks.hit import HIT_WORLD, fly_hits, volleys
 from planner_jax.task import catch
 from planner_jax.task.hit.spec import REAL_SCENARIOS
@@ -228,7 +238,7 @@ def test_a_plan_from_scratch_is_flown_where_it_keeps_limits_better_or_costs_less
     """Pairs of the greatest relative excess over a limit and of the cost."""
     plan: Any = SimpleNamespace
     first, second = (plan(violation=v, cost=c) for v, c in (fresh, warm))
-    assert bool(is_better(first, second)) == preferred
+    assert bool(is_worth_flying(first, second)) == preferred
 
 
 @pytest.mark.slow
@@ -256,3 +266,28 @@ def test_a_heavy_robot_with_a_large_net_catches():
     flights = fly_catches(Loop(world), throws(4, seed=1, robot=robot))
     assert flights.flown.tracking[:, 1].max() < 0.05
     assert flights.caught.mean() >= 0.75
+
+
+def test_what_was_compiled_ahead_is_not_traced_again():
+    first, second = WellPlanner().rounds
+    own = dataclasses.replace(first, solver=LbfgsConfig(max_steps=41, step_cap=0.2))
+    planner, easy = WellPlanner(rounds=(own, second, own)), Well(GOALS[:1].repeat(3))
+    compile_attempts(planner, easy)
+    before = len(TRACES)
+    plans = plan(planner, Well(np.append(GOALS, np.float32(np.nan))))
+    assert is_solved(plans.status).tolist() == [True] * 5 + [False]
+    assert len(TRACES) == before
+
+
+def test_a_planner_on_the_host_may_be_asked_to_compile_ahead_too():
+    tried = []
+
+    class OnHost(Planner):
+        attempts = WellPlanner().rounds
+
+        def solve_on_host(self, cases, attempt):
+            tried.append(attempt)
+            return jax.device_get(plan(WellPlanner(rounds=(attempt,)), cases))
+
+    compile_attempts(OnHost(), Well(GOALS))
+    assert tried == [WellPlanner().rounds[0]]

@@ -9,16 +9,13 @@ import pytest
 from flax import struct
 from jax import Array
 
-from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Plan, Status, is_solved
 from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.problem import Round, Stage
 from planner_jax.planning import batch
-from planner_jax.planning import device_batch as resident
-from planner_jax.planning.plan import plan, plan_across_processes, solve
-from planner_jax.planning.warmup import compile_attempts
+from planner_jax.planning.plan import plan, solve
 
 
 @struct.dataclass
@@ -144,31 +141,6 @@ def test_new_batch_sizes_of_one_bucket_are_not_traced_again():
     assert TRACES == []
 
 
-def test_what_was_compiled_ahead_is_not_traced_again():
-    first, second = WellPlanner().rounds
-    own = dataclasses.replace(first, solver=LbfgsConfig(max_steps=41, step_cap=0.2))
-    planner, easy = WellPlanner(rounds=(own, second, own)), Well(GOALS[:1].repeat(3))
-    compile_attempts(planner, easy)
-    before = len(TRACES)
-    plans = plan(planner, Well(np.append(GOALS, np.float32(np.nan))))
-    assert is_solved(plans.status).tolist() == [True] * 5 + [False]
-    assert len(TRACES) == before
-
-
-def test_a_planner_on_the_host_may_be_asked_to_compile_ahead_too():
-    tried = []
-
-    class OnHost(Planner):
-        attempts = WellPlanner().rounds
-
-        def solve_on_host(self, cases, attempt):
-            tried.append(attempt)
-            return jax.device_get(plan(WellPlanner(rounds=(attempt,)), cases))
-
-    compile_attempts(OnHost(), Well(GOALS))
-    assert tried == [WellPlanner().rounds[0]]
-
-
 def test_a_plans_shapes_are_known_without_planning():
     shapes = WellPlanner().plan_shapes(jax.eval_shape(lambda: Well(jnp.asarray(GOALS))))
     made = plan(WellPlanner(), Well(GOALS))
@@ -244,13 +216,13 @@ def test_arrays_on_a_device_stay_there_and_give_the_same_plans(apart, monkeypatc
 def test_a_later_round_takes_only_what_is_unsolved(monkeypatch):
     """On a device that is not the host: also where the last lane fills up the last chunk."""
     monkeypatch.setattr(batch, "is_one_cpu", lambda mesh: False)
-    sizes, real = [], resident.solve_on_devices
+    sizes, real = [], batch.solve_on_devices
 
     def noted(planner, attempt, mesh, cases):
         sizes.append(cases.goal.size)
         return real(planner, attempt, mesh, cases)
 
-    monkeypatch.setattr(resident, "solve_on_devices", noted)
+    monkeypatch.setattr(batch, "solve_on_devices", noted)
     goals = np.full(300, 0.5, np.float32)
     goals[[7, -1]] = 3.5
     assert is_solved(plan(WellPlanner(), Well(jnp.asarray(goals))).status).all()
@@ -305,12 +277,6 @@ def test_a_round_behind_one_that_had_nothing_to_try_is_made():
 def test_a_round_within_no_violation_is_refused(within, error):
     with pytest.raises(error, match="^within must be "):
         Round(within=within)
-
-
-def test_one_process_plans_the_whole_batch_alone():
-    shared = plan_across_processes(WellPlanner(), Well(GOALS))
-    alone = plan(WellPlanner(), Well(GOALS))
-    jax.tree.map(np.testing.assert_array_equal, shared, alone)
 
 
 def test_lanes_of_unequal_length_are_refused():

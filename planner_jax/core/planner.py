@@ -52,6 +52,17 @@ class Drive(Protocol):
         """
         ...
 
+    def plan_again(self, plan_of: Callable[[Any], Any], cases: Any, plans: Any, left: Any) -> Any:
+        """Return plans (B,) after one more try at the cases that are left, with the better plans.
+
+        Args:
+            plan_of: makes plans of a batch of the cases.
+            cases: (B,).
+            plans: of the cases; those with NumPy leaves are changed in place.
+            left: (B,) bool. When the caller's time has passed, they are not tried again.
+        """
+        ...
+
 
 class Planner(Generic[CaseT, PlanT]):
     """A planner of one class of cases.

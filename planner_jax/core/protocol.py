@@ -245,6 +245,11 @@ def out_of_time(plans: PlanT, left: Any) -> PlanT:
     return dataclasses.replace(plans, status=status)  # type: ignore[type-var]
 
 
+def is_resident(tree: Any) -> bool:
+    """Return whether all leaves are jax arrays, which may lie on other devices than the host."""
+    return all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(tree))
+
+
 def lane(tree: Tree, k: Any) -> Tree:
     """One case, plan or verdict of a batch, or some of them: entry `k` of every leaf.
 

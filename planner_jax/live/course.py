@@ -10,8 +10,7 @@ from jaxtyping import Float
 from planner_jax.core.protocol import is_solved
 from planner_jax.live.packets import FIELDS
 from planner_jax.optimise.problem import Round
-from planner_jax.planning.programs import solve_cases
-from planner_jax.planning.single_call import call_packed
+from planner_jax.planning.programs import call_packed, solve_cases
 from planner_jax.recovery.case import EndingCase, EndingPlan
 from planner_jax.recovery.planner import RestPlanner
 from planner_jax.robot.quadrotor import QuadrotorLimits

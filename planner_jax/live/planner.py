@@ -42,7 +42,7 @@ from planner_jax.live.packets import (
 from planner_jax.live.report import Report
 from planner_jax.live.sight import Sight
 from planner_jax.live.strokes import CaseT, PlanT, Stroke
-from planner_jax.planning.single_call import call_packed
+from planner_jax.planning.programs import call_packed
 
 _PATIENCE = 0.2  # share of the deadline for which an answer waits for a plan
 _ASTRAY = 0.5  # [m], between robot and course, from which on the course starts anew

@@ -18,7 +18,7 @@ from planner_jax.ball.estimation import (
 )
 from planner_jax.ball.flight import BallState
 from planner_jax.live.packets import Fault
-from planner_jax.planning.single_call import call_packed
+from planner_jax.planning.programs import call_packed
 
 _SPREAD = 15.0  # [m/s], standard deviation of the velocity at the first observation
 _DENSITY = 0.01  # [m^2/s^3], of accelerations that the model of the flight omits

@@ -22,9 +22,8 @@ from planner_jax.ball.target import BallPath
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.problem import Round
-from planner_jax.planning.programs import solve_cases
+from planner_jax.planning.programs import call_packed, solve_cases
 from planner_jax.planning.replan import Replanning
-from planner_jax.planning.single_call import call_packed
 from planner_jax.robot.quadrotor_model import QuadrotorModel
 from planner_jax.robot.quadrotor_models import PAPER_CATCHER, PAPER_HITTER
 from planner_jax.task.catch.case import GRAVITY as CATCH_GRAVITY

@@ -18,8 +18,9 @@ from flax import struct
 from jax import Array
 
 from planner_jax.core.checks import numeric, require_number, require_size, told
+from planner_jax.core.select import is_better
 from planner_jax.lanes import with_kernel
-from planner_jax.optimise.evaluation import Evaluation, Objective, better
+from planner_jax.optimise.evaluation import Evaluation, Objective
 
 
 @dataclasses.dataclass(frozen=True)
@@ -236,10 +237,10 @@ def _chosen(
     decreased = of_chosen(costs) < here.cost
     there = jax.tree.map(lambda new, old: jnp.where(decreased, of_chosen(new), old), trials, here)
     best = jax.tree.map(lambda a, b: jnp.where(numbers.iteration == 0, a, b), here, numbers.best)
-    is_better = better(there, best)
+    is_best = is_better(there, best, tolerance=0.0) | ~jnp.isfinite(best.cost)
     progress = here.cost - there.cost > config.tolerance * jnp.abs(here.cost)
     after = LbfgsNumbers(
-        best=jax.tree.map(lambda a, b: jnp.where(is_better, a, b), there, best),
+        best=jax.tree.map(lambda a, b: jnp.where(is_best, a, b), there, best),
         # Without a decrease the lane next looks nearer.
         reach=jnp.where(decreased, 1.0, 0.05 * numbers.reach),
         iteration=numbers.iteration + 1,
@@ -249,6 +250,6 @@ def _chosen(
     return _Choice(
         numbers=jax.tree.map(lambda new, old: jnp.where(going, new, old), after, numbers),
         length=jnp.where(decreased, of_chosen(lengths), 0.0),
-        better=is_better & going,
+        better=is_best & going,
         going=going,
     )

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array, lax
 
-from planner_jax.core.protocol import FEASIBILITY_TOLERANCE, Status, is_unsolved, status_of
+from planner_jax.core.protocol import Status, is_unsolved, status_of
+from planner_jax.core.select import index_of_best
 from planner_jax.lanes import over_lanes
 from planner_jax.optimise import lbfgs, newton
 from planner_jax.optimise.evaluation import Evaluation, Objective
@@ -269,10 +270,6 @@ def _plan_at(planner: Problem, optimum: Optimum, context: Any) -> Any:
 
 
 def _best(plans: Any) -> Any:
-    """The plan of least cost among the feasible ones of several starts, or of least violation."""
-    feasible = plans.violation <= FEASIBILITY_TOLERANCE
-    finite = jnp.isfinite(plans.cost) & jnp.isfinite(plans.violation)
-    by_cost = jnp.where(feasible, plans.cost, jnp.inf)
-    score = jnp.where(jnp.any(feasible & finite), by_cost, plans.violation)
-    best = jnp.argmin(jnp.where(finite, score, jnp.inf))
+    """Return the plan that is selected of those of several starts."""
+    best = index_of_best(plans)
     return jax.tree.map(lambda leaf: leaf[best], plans)

@@ -29,7 +29,8 @@ from flax import struct
 from jax import Array, lax
 
 from planner_jax.core.checks import numeric, require_number, require_size, told
-from planner_jax.optimise.evaluation import Evaluation, Objective, better
+from planner_jax.core.select import is_better
+from planner_jax.optimise.evaluation import Evaluation, Objective
 from planner_jax.optimise.preconditioner import Preconditioner
 
 
@@ -183,14 +184,14 @@ def step(
     here = curved(state.point)
     steps, decrease = damped_steps(here, state.numbers.damping, config)
     trials = jax.vmap(lambda step: objective(state.point + step))(steps)
-    numbers, chosen, is_better, going = _chosen(
+    numbers, chosen, is_best, going = _chosen(
         config, state.numbers, here.evaluation, trials, decrease
     )
     move = jnp.matmul(chosen, steps, precision=_HIGHEST)
     point = state.point + jnp.where(going, move, 0.0)
     return NewtonState(
         point=point,
-        best_point=jnp.where(is_better, point, state.best_point),
+        best_point=jnp.where(is_best, point, state.best_point),
         numbers=numbers,
     )
 
@@ -346,7 +347,9 @@ def _chosen(
     moved = of_chosen(costs) < here.cost + slack
     there = jax.tree.map(lambda new, old: jnp.where(moved, of_chosen(new), old), trials, here)
     best = jax.tree.map(lambda a, b: jnp.where(numbers.iteration == 0, a, b), here, numbers.best)
-    is_better = moved & better(there, best.replace(cost=best.cost + slack))
+    before = best.replace(cost=best.cost + slack)
+    is_best = is_better(there, before, tolerance=0.0) | ~jnp.isfinite(before.cost)
+    is_best &= moved
     factors = jnp.maximum(jnp.asarray(config.trial_dampings, costs.dtype), config.ease)
     damping = numbers.damping * jnp.where(moved, of_chosen(factors), config.tighten)
     promised = decrease / jnp.maximum(jnp.abs(here.cost), 1e-30)
@@ -355,7 +358,7 @@ def _chosen(
     expected = jnp.where(is_short, jnp.maximum(promised, numbers.expected), promised)
     is_nearer = (there.cost < here.cost - slack) | (moved & (expected < 0.5 * numbers.expected))
     after = NewtonNumbers(
-        best=jax.tree.map(lambda a, b: jnp.where(is_better, a, b), there, best),
+        best=jax.tree.map(lambda a, b: jnp.where(is_best, a, b), there, best),
         damping=jnp.clip(damping, _LEAST_DAMPING, _MOST_DAMPING),
         expected=expected,
         iteration=numbers.iteration + 1,
@@ -364,4 +367,4 @@ def _chosen(
     going = is_unfinished(numbers, config)
     after = jax.tree.map(lambda new, old: jnp.where(going, new, old), after, numbers)
     shares = jnp.where(is_chosen & moved, 1.0, 0.0)
-    return after, shares, is_better & going, going
+    return after, shares, is_best & going, going

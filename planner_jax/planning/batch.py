@@ -1,51 +1,325 @@
-"""Batches of plans: chunks of a few fixed sizes, spread over the devices, round after round.
+"""Batches of plans: chunks of a few fixed sizes, spread over the devices, attempt after attempt.
 
-After each round the lanes that are still unsolved are packed together for the next one. Every
+After each attempt the lanes that are still unsolved are packed together for the next one. Every
 device solves its lanes in a loop of its own and waits for no other.
 """
 
-from collections.abc import Sequence
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.sharding import Mesh, PartitionSpec
 
-from planner_jax.core.protocol import Attempt
-from planner_jax.planning.device_batch import plan_resident
-from planner_jax.planning.host_batch import plan_from_host
-from planner_jax.planning.layout import is_one_cpu, length, on_devices, sharding, sizes_of
+from planner_jax.core.planner import Planner
+from planner_jax.core.protocol import Attempt, Status, is_resident, is_unsolved, marked, out_of_time
+from planner_jax.core.select import select, select_into
+from planner_jax.host.processors import usable_cores
+from planner_jax.host.threads import as_here
+from planner_jax.planning.layout import (
+    LANES,
+    Sizes,
+    apart,
+    is_one_cpu,
+    length,
+    number,
+    on_devices,
+    placed,
+    sharding,
+    sizes_of,
+)
+from planner_jax.planning.programs import compilation_of, solve_on_devices, with_unsolved
 from planner_jax.planning.progress import Watch
+
+_Call = tuple[np.ndarray, int]  # lanes of one call, filled up with its first one; how many count
 
 
 def plan_batch(
-    planner: Any,
+    planner: Planner,
     attempts: Sequence[Attempt],
     cases: Any,
     chunk: int | None,
-    devices: Sequence[Any] | None,
+    devices: Sequence[jax.Device] | None,
     watch: Watch,
 ) -> tuple[Any, Any]:
-    """Attempts at B cases, each at the lanes that are still unsolved.
+    """Return plans of a batch by attempts, each at the lanes that are still unsolved.
 
     Args:
-        planner: that makes them.
+        planner: makes the attempts.
         attempts: in order, one or more.
         cases: a leading axis of B on every leaf.
-        chunk: lanes a device solves in one call; None for what suits it.
-        devices: that share the work; None for all local ones.
-        watch: after whose end no attempt but the first is begun.
+        chunk: lanes that a device solves in one call; None for what suits it.
+        devices: share the work; None for all local ones.
+        watch: after its end no attempt but the first is started.
 
     Returns:
-        plans: with NumPy leaves, or where all leaves of the cases are jax arrays, with
-            those, so that nothing leaves the devices.
+        plans: with NumPy leaves; or, where all leaves of the cases are jax arrays, with jax
+            arrays, so that nothing leaves the devices.
         unsolved: numbers that are all zero if no lane is unsolved.
     """
     planner, mesh = on_devices(planner, devices)
-    resident = all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(cases))
-    num = length(cases)
-    in_one_call = num == sizes_of(planner, attempts[0], chunk, mesh).next(num)
-    # One CPU's memory is the host's: there a thread for each core plans chunks, and they are cut
-    # and joined without programs, which would be compiled for every new size.
-    if resident and (in_one_call or not is_one_cpu(mesh)):
-        return plan_resident(planner, attempts, cases, chunk, mesh, watch)
-    plans, unsolved = plan_from_host(planner, attempts, cases, chunk, mesh, watch)
+    batch = _Batch(planner, chunk, mesh, watch)
+    resident, num = is_resident(cases), length(cases)
+    # The memory of one CPU is the host's: there a thread for each core plans chunks, and they are
+    # cut and joined without programs, which would be compiled for every new size.
+    if resident and (num == batch.sizes(attempts[0]).next(num) or not is_one_cpu(mesh)):
+        return batch.plan_resident(attempts, cases)
+    plans, unsolved = batch.plan_from_host(attempts, cases)
     return (jax.device_put(plans, sharding(mesh)) if resident else plans), unsolved
+
+
+def plan_on_host(
+    planner: Planner, attempts: Sequence[Attempt], cases: Any, watch: Watch
+) -> tuple[Any, int]:
+    """Return what `plan_batch` does, by a planner on the host, of NumPy leaves or of one case."""
+    alone = cases.batch_shape == ()
+    cases = jax.tree.map(lambda leaf: np.asarray(leaf)[None] if alone else np.asarray(leaf), cases)
+
+    def try_lanes(attempt: Attempt, lanes: np.ndarray, plans: Any) -> Any:
+        watch.tell(planner, attempt, 0, lanes.size)
+        some = jax.tree.map(lambda leaf: leaf[lanes], cases)
+        later = marked(planner.solve_on_host(some, attempt), some)
+        watch.tell(planner, attempt, lanes.size, lanes.size)
+        return jax.tree.map(np.array, later) if plans is None else select_into(plans, later, lanes)
+
+    plans, unsolved = _try_in_turn(attempts, length(cases), watch, try_lanes)
+    return jax.tree.map(lambda leaf: leaf[0], plans) if alone else plans, unsolved
+
+
+def _try_in_turn(
+    attempts: Sequence[Attempt],
+    num: int,
+    watch: Watch,
+    try_lanes: Callable[[Attempt, np.ndarray, Any], Any],
+) -> tuple[Any, int]:
+    """Return plans (num, ...) by one attempt after another, and how many are unsolved.
+
+    `try_lanes` makes an attempt at some lanes, and returns the plans so far, None at first, with
+    those that are better.
+    """
+    first, *others = attempts
+    plans = try_lanes(first, np.arange(num), None)
+    for attempt in others:
+        due = attempt.is_due(plans)
+        lanes = np.flatnonzero(due)
+        if not lanes.size:
+            continue
+        if watch.is_over:
+            plans = out_of_time(plans, due)
+            break
+        plans = try_lanes(attempt, lanes, plans)
+    return plans, np.sum(is_unsolved(plans.status))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Batch:
+    """One planner on the devices of a mesh."""
+
+    planner: Planner
+    chunk: int | None
+    mesh: Mesh
+    watch: Watch
+
+    def sizes(self, attempt: Attempt) -> Sizes:
+        """Return the sizes of the calls of an attempt."""
+        return sizes_of(self.planner, attempt, self.chunk, self.mesh)
+
+    def plan_from_host(self, attempts: Sequence[Attempt], cases: Any) -> tuple[Any, int]:
+        """Return plans of cases in NumPy arrays: chunks go to the devices, and plans come back."""
+        cases = jax.tree.map(np.asarray, cases)
+        try_lanes = functools.partial(self._try_from_host, cases)
+        return _try_in_turn(attempts, length(cases), self.watch, try_lanes)
+
+    def _try_from_host(self, cases: Any, attempt: Attempt, lanes: np.ndarray, plans: Any) -> Any:
+        """Return the plans after one attempt at some lanes."""
+        calls = self._calls(attempt, lanes)
+        found, tried = [], 0
+        self.watch.tell(self.planner, attempt, 0, lanes.size)
+        for one, (_, num) in zip(
+            self._results(attempt, cases, calls, plans is not None), calls, strict=True
+        ):
+            found.append(one)
+            if one is not None:
+                tried += num
+                self.watch.tell(self.planner, attempt, tried, lanes.size)
+        if plans is None:
+            trimmed = [
+                jax.tree.map(lambda leaf, n=num: np.asarray(leaf)[:n], part)
+                for part, (_, num) in zip(found, calls, strict=True)
+            ]
+            return jax.tree.map(lambda *leaves: np.concatenate(leaves), *trimmed)
+        untried = np.zeros(len(plans.status), bool)
+        for (call, num), later in zip(calls, found, strict=True):
+            if later is None:
+                untried[call[:num]] = True
+            else:
+                plans = select_into(plans, later, call[:num])
+        return out_of_time(plans, untried) if untried.any() else plans
+
+    def _calls(self, attempt: Attempt, lanes: np.ndarray) -> list[_Call]:
+        """Return the calls that lanes take."""
+        calls, devices = [], self.mesh.size
+        for first, size in self.sizes(attempt).cuts(-(-lanes.size // devices)):
+            part = lanes[first * devices :][: size * devices]
+            filling = np.full(size * devices - part.size, part[0])
+            calls.append((np.append(part, filling), part.size))
+        return calls
+
+    def _results(
+        self, attempt: Attempt, cases: Any, calls: list[_Call], may_end: bool
+    ) -> Iterator[Any]:
+        """Yield the plans of every call; on one CPU device with a thread for each core.
+
+        One more thread prepares the next call while the others compute. Where the attempt may end
+        early, there is None for the calls that were not started in time.
+        """
+        watch, spec = self.watch, sharding(self.mesh)
+        threads = min(len(calls), usable_cores() + 1) if is_one_cpu(self.mesh) else 1
+
+        def solve(call: _Call) -> Any:
+            if may_end and watch.is_over:
+                return None
+            part = jax.device_put(jax.tree.map(lambda leaf: leaf[call[0]], cases), spec)
+            found, _ = solve_on_devices(self.planner, attempt, self.mesh, part)
+            return jax.block_until_ready(found) if threads > 1 or watch.waits else found
+
+        if threads == 1:  # calls return before they are done, so that the next is under way
+            yield from map(solve, calls) if watch.waits else [solve(call) for call in calls]
+            return
+        # A first call compiles, once for all threads; they all find what is compiled.
+        compilation = compilation_of(self.planner, attempt, calls[0][0].size, cases)
+        alone = [] if compilation.is_done else [solve(calls[0])]
+        compilation.is_done = True
+        with ThreadPoolExecutor(threads) as pool:
+            later = pool.map(as_here(solve), calls[len(alone) :])
+            yield from alone
+            yield from later
+
+    def plan_resident(self, attempts: Sequence[Attempt], cases: Any) -> tuple[Any, Array]:
+        """Return plans of cases in jax arrays; only how many are unsolved comes to the host.
+
+        Every device plans its own share, without asking the others for a lane.
+        """
+        planner, mesh, watch, num = self.planner, self.mesh, self.watch, length(cases)
+        if num % mesh.size:  # the last lane is there again until all shares are equal
+            cases = _take(cases, np.arange(-(-num // mesh.size) * mesh.size))
+        cases = placed(cases, mesh)
+        first, *others = attempts
+        watch.tell(planner, first, 0, num)
+        plans, unsolved = self._first_plans(first, cases)
+        for attempt in others:
+            before, due = plans.status, unsolved
+            if attempt.within is not None:
+                before, due = _due(mesh, attempt.within, plans)
+            due.copy_to_host_async()  # on its way as soon as it is known
+            most = np.asarray(due).max()  # of the devices
+            if most == 0:
+                continue
+            if watch.is_over:
+                plans = out_of_time(plans, attempt.is_due(plans))
+                break
+            watch.tell(planner, attempt, 0, np.asarray(due).sum())
+            for begin, size in self.sizes(attempt).cuts(most):
+                part, lanes = _cut_unsolved(mesh, size, cases, before, number(mesh, begin))
+                later, _ = solve_on_devices(planner, attempt, mesh, part)
+                plans, unsolved = _select_locally(mesh, plans, later, lanes)
+        if num % mesh.size:  # arrays have equal shares or none
+            plans = _take(jax.device_put(plans, mesh.devices[0]), np.arange(num))
+        return plans, unsolved
+
+    def _first_plans(self, attempt: Attempt, cases: Any) -> tuple[Any, Array]:
+        """Return what `solve_on_devices` does of all lanes of every device, chunk by chunk."""
+        mesh, sizes, share = self.mesh, self.sizes(attempt), length(cases) // self.mesh.size
+        if share == sizes.next(share):
+            return solve_on_devices(self.planner, attempt, mesh, cases)
+        cuts = list(sizes.cuts(share))
+
+        def solve(begin: int, size: int) -> Any:
+            part = _cut(mesh, size, cases, number(mesh, begin))
+            return solve_on_devices(self.planner, attempt, mesh, part)[0]
+
+        firsts = {size: begin for begin, size in reversed(cuts)}
+        programs = [compilation_of(self.planner, attempt, size, cases) for size in firsts]
+        found: dict[int, Any] = {}
+        if sum(not each.is_done for each in programs) > 1:  # compiled at the same time
+            with ThreadPoolExecutor(len(firsts)) as pool:
+                made = pool.map(as_here(solve), firsts.values(), firsts)
+                found = dict(zip(firsts.values(), made, strict=True))
+            for each in programs:
+                each.is_done = True
+        parts = [found[begin] if begin in found else solve(begin, size) for begin, size in cuts]
+        return _join_locally(mesh, parts, share)
+
+
+@jax.jit
+def _take(tree: Any, lanes: Any) -> Any:
+    """Return some lanes; the last one for those behind it."""
+    return jax.tree.map(lambda leaf: leaf[jnp.minimum(lanes, leaf.shape[0] - 1)], tree)
+
+
+@functools.partial(jax.jit, static_argnames=("mesh", "size"))
+def _cut(mesh: Mesh, size: int, tree: Any, begin: Any) -> Any:
+    """Return the next lanes of every device's share, filled up with its last one."""
+
+    def cut(tree: Any, begin: Array) -> Any:
+        return _take(tree, begin + jnp.arange(size))
+
+    return apart(mesh, cut, LANES, PartitionSpec())(tree, begin)
+
+
+@functools.partial(jax.jit, static_argnames=("mesh", "size"))
+def _cut_unsolved(mesh: Mesh, size: int, tree: Any, status: Array, begin: Any) -> tuple[Any, Array]:
+    """Return the next unsolved lanes of every device's share, and their indices.
+
+    They are filled up with the last lane, whose index is then behind the share.
+    """
+
+    def cut(tree: Any, status: Array, begin: Array) -> tuple[Any, Array]:
+        (num,) = status.shape
+        (unsolved,) = jnp.nonzero(is_unsolved(status), size=num, fill_value=num)
+        lanes = _take(unsolved, begin + jnp.arange(size))
+        return _take(tree, lanes), lanes
+
+    return apart(mesh, cut, LANES, LANES, PartitionSpec())(tree, status, begin)
+
+
+@functools.partial(jax.jit, static_argnames=("mesh", "within"))
+def _due(mesh: Mesh, within: float, plans: Any) -> tuple[Array, Array]:
+    """Return statuses, and how many are unsolved, (devices,), as if plans farther off were not."""
+
+    def due(plans: Any) -> tuple[Array, Array]:
+        near = plans.violation <= within
+        status = jnp.where(near, plans.status, jnp.full_like(plans.status, Status.FEASIBLE))
+        return status, jnp.sum(is_unsolved(status), keepdims=True)
+
+    return apart(mesh, due)(plans)
+
+
+@functools.partial(jax.jit, static_argnames=("mesh", "share"))
+def _join_locally(mesh: Mesh, parts: list[Any], share: int) -> tuple[Any, Array]:
+    """Return the parts of every device joined to its share, and how many it leaves unsolved."""
+
+    def join(*parts: Any) -> tuple[Any, Array]:
+        return with_unsolved(jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:share], *parts))
+
+    return apart(mesh, join)(*parts)
+
+
+@functools.partial(jax.jit, static_argnames="mesh")
+def _select_locally(mesh: Mesh, plans: Any, later: Any, lanes: Array) -> tuple[Any, Array]:
+    """Return what `select_into` does of every device's share, and how many it leaves unsolved."""
+
+    def merge(plans: Any, later: Any, lanes: Array) -> tuple[Any, Array]:
+        kept = select(later, _take(plans, lanes))
+
+        def replace(old: Array, new: Array) -> Array:
+            return old.at[lanes].set(new, mode="drop")
+
+        return with_unsolved(jax.tree.map(replace, plans, kept))
+
+    return apart(mesh, merge)(plans, later, lanes)

@@ -11,9 +11,9 @@ from jax import Array, lax
 from jax.core import Tracer
 
 from planner_jax.core.planner import CaseT, Drive, Planner, PlanT
-from planner_jax.core.protocol import Decision, is_solved, is_unsolved, out_of_time
-from planner_jax.planning.select import better_of, merged
-from planner_jax.planning.single_call import call_packed
+from planner_jax.core.protocol import Decision, is_resident, is_solved, is_unsolved
+from planner_jax.core.select import index_of_best
+from planner_jax.planning.programs import call_packed
 
 
 @struct.dataclass
@@ -65,12 +65,13 @@ class DecidedPlanner(Planner[CaseT, PlanT]):
 
     def plan_by(self, drive: Drive, cases: Any) -> Any:
         """The plans of one case or of a batch, with what was decided in them."""
-        is_resident = all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(cases))
         if not drive.is_pure:
             self.decision.check(cases)
         choices = self._proposed(drive, cases)
         if len(choices) == 1:
-            decided = cases.decided(choices[0] if is_resident else jax.device_get(choices[0]))
+            decided = cases.decided(
+                choices[0] if is_resident(cases) else jax.device_get(choices[0])
+            )
             plans, unsolved = drive(self.planner, decided)
         elif cases.batch_shape == ():
             one = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (cases, choices))
@@ -108,35 +109,11 @@ class DecidedPlanner(Planner[CaseT, PlanT]):
             has_plan = of_case(is_solved(plans.status)).any(axis=0)
             left = is_unsolved(plans.status) & ~xp.tile(has_plan, num)
             once_more = lambda some: drive(self.planner, some, [attempt])[0]  # noqa: B023, E731
-            plans = planned_again(drive, once_more, together, plans, left)
+            plans = drive.plan_again(once_more, together, plans, left)
         plans, together = jax.tree.map(lambda x: of_case(xp.asarray(x)), (plans, together))
-        worse = 1e6 + xp.nan_to_num(plans.violation, nan=1e9)
-        rank = xp.where(is_solved(plans.status), self.decision.rank(plans), worse)
-        chosen, lanes = rank.argmin(axis=0), np.arange(rank.shape[1])
+        chosen = index_of_best(plans, self.decision.rank(plans))
+        lanes = np.arange(len(chosen))
         return jax.tree.map(lambda leaf: leaf[chosen, lanes], (together, plans))
-
-
-def planned_again(
-    drive: Drive, plan_of: Callable[[Any], Any], cases: Any, plans: Any, left: Any
-) -> Any:
-    """The plans (B,) after one more try at the cases that are left.
-
-    Args:
-        drive: whose kind of arrays the plans are; where its time is over, nothing more is tried.
-        plan_of: makes plans of a batch of the cases.
-        cases: (B,).
-        plans: of them; those that come from the host are changed in place.
-        left: (B,) bool.
-    """
-    if drive.is_pure:
-        again = lambda plans: better_of(plans, plan_of(cases), left)  # noqa: E731
-        return lax.cond(jnp.any(left), again, lambda plans: plans, plans)
-    lanes = np.flatnonzero(left)
-    if not lanes.size:
-        return plans
-    if drive.is_over:
-        return out_of_time(plans, left)
-    return merged(plans, plan_of(jax.tree.map(lambda leaf: leaf[lanes], cases)), lanes)
 
 
 def _propose(_: None, decision: Any, case: Any) -> Any:

@@ -12,7 +12,6 @@ from flax import struct
 from planner_jax.core.planner import CaseT, Drive, Planner, PlanT
 from planner_jax.core.protocol import Status, is_solved
 from planner_jax.core.recovery_names import ending_problem
-from planner_jax.planning.decided import planned_again
 from planner_jax.recovery.case import EndingCase, end_state
 from planner_jax.recovery.planner import RestPlanner
 
@@ -66,7 +65,7 @@ class EndedPlanner(Planner[CaseT, PlanT]):
             plans = jax.tree.map(np.array, plans)
         for factor in _SLOWER:
             slower = lambda some, factor=factor: self._ended(drive, some, factor)[0]  # noqa: E731
-            plans = planned_again(drive, slower, cases, plans, left)
+            plans = drive.plan_again(slower, cases, plans, left)
             left = left & ~is_solved(plans.status)
         return plans
 

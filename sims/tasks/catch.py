@@ -17,7 +17,6 @@ import numpy as np
 from planner_jax.ball.flight import BallState
 from planner_jax.core.planner import Planner
 from planner_jax.planning.decided import DecidedPlanner
-from planner_jax.planning.warmup import compile_attempts
 from planner_jax.robot.quadrotor_model import QuadrotorModel
 from planner_jax.robot.quadrotor_models import PAPER_CATCHER
 from planner_jax.runs.columns import BOOL, Column, list_of
@@ -36,7 +35,14 @@ from planner_jax.sims.recording import Launches
 from planner_jax.sims.robots.quadrotor.robot import Quadrotor
 from planner_jax.sims.settings import INTERVAL, CatchFly, require_interval
 from planner_jax.sims.task import BallFlightTask, FlightCases, Flights
-from planner_jax.sims.tasks.catch_ahead import LIMITS, believed, bounds, planned_ahead, with_catch
+from planner_jax.sims.tasks.catch_ahead import (
+    LIMITS,
+    believed,
+    bounds,
+    compile_attempts,
+    planned_ahead,
+    with_catch,
+)
 from planner_jax.sims.tasks.catch_pilot import LIFT, CatchPilot
 from planner_jax.task.catch.api import planner as catch_planner
 from planner_jax.task.catch.case import GRAVITY, START, CatchCase

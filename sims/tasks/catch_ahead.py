@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
@@ -12,9 +13,12 @@ from jax import Array
 
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath
-from planner_jax.core.planner import Planner
-from planner_jax.core.protocol import is_solved
+from planner_jax.core.planner import Kind, Planner
+from planner_jax.core.protocol import Attempt, is_solved
+from planner_jax.host.threads import as_here
+from planner_jax.planning.drive import Driver
 from planner_jax.planning.plan import plan as plan_all
+from planner_jax.planning.progress import Watch
 from planner_jax.sims.loop import expected
 from planner_jax.sims.loop_state import FlightState, Loop
 from planner_jax.sims.tasks.catch_pilot import BORNE, CatchPilot, tables
@@ -136,6 +140,34 @@ def with_catch(flights: FlightState, found: CatchPlan, new: Array) -> FlightStat
         return jax.tree.map(lambda a, b: jnp.where(busy, a, b), joined, alone)
 
     return jax.vmap(one)(flights, found, new)
+
+
+@dataclasses.dataclass(frozen=True)
+class _EveryAttempt(Driver):
+    """The driver that makes all attempts of a planner at the same time, needed or not."""
+
+    watch: Watch = dataclasses.field(default_factory=lambda: Watch(0.0))  # no more is started
+
+    def __call__(
+        self, planner: Planner, cases: Any, attempts: Sequence[Attempt] | None = None
+    ) -> tuple[Any, Any]:
+        """Return the plans of the first attempt."""
+        if planner.kind is not Kind.COMPILED:
+            return super().__call__(planner, cases, attempts)
+        make = functools.partial(super().__call__, planner, cases)
+        tried = [[attempt] for attempt in attempts or planner.attempts]
+        with ThreadPoolExecutor(len(tried)) as pool:
+            first, *_ = pool.map(as_here(make), tried)
+        return first
+
+
+def compile_attempts(planner: Planner, cases: Any) -> None:
+    """Compile all that plans of a batch may need, with a thread for each attempt.
+
+    `plan` compiles an attempt as soon as the one before has left something unsolved. Some throws
+    need all attempts, and to compile one after another would take several times as long.
+    """
+    _EveryAttempt()(planner, cases)
 
 
 def planned_ahead(

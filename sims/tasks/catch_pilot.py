@@ -10,6 +10,7 @@ from jax import Array
 
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.prediction import PathTable, predict_path
+from planner_jax.core.select import is_better
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
 from planner_jax.planning.replan import Replanning
@@ -103,7 +104,7 @@ class CatchPilot:
             fresh = found[1]
             since = jnp.mod(outlook.time + _INSTANT, 1.0 / self.redecide)  # the last time was due
             take = (since < 2.0 * _INSTANT) & (fresh.times[0] >= self.planner.shortest)
-            take &= is_better(fresh, plan)
+            take &= is_worth_flying(fresh, plan)
             plan = jax.tree.map(lambda new, old: jnp.where(take, new, old), fresh, plan)
         good = left.present[left.order[0]] & (left.times[0] >= self.planner.shortest)
         excess = jnp.where(jnp.sum(left.present) > 1, self.excess[1], self.excess[0])
@@ -117,12 +118,9 @@ class CatchPilot:
         return self.planner.planner.solve(left.decided(choice), self.search)
 
 
-def is_better(fresh: CatchPlan, warm: CatchPlan) -> Array:
+def is_worth_flying(fresh: CatchPlan, warm: CatchPlan) -> Array:
     """Whether () bool a plan from scratch is to be preferred to one from the plan that is flown."""
-    keeps = warm.violation <= _KEPT
-    cheaper = (fresh.violation <= _KEPT) & (fresh.cost < _CHEAPER * warm.cost)
-    nearer = jnp.isfinite(fresh.violation) & jnp.logical_not(warm.violation <= fresh.violation)
-    return jnp.isfinite(fresh.cost) & jnp.where(keeps, cheaper, nearer)
+    return jnp.isfinite(fresh.cost) & is_better(fresh, warm, tolerance=_KEPT, share=_CHEAPER)
 
 
 def tables(balls: BallState, drag: Array, horizon: Array, gravity: Array) -> PathTable:

@@ -293,11 +293,6 @@ def _plans() -> list[tuple[str, str]]:
     rows += _of(plan, "chunk", "0", "-1", "1.5", "'2'", "True", "nan", "(1,)", "1j")
     rows += _of(plan, "devices", "()", "[]", "5", "'cpu'", "[0]", "['cpu:0']", "[None]")
     rows += _of(plan, "devices", "jax.devices() * 2", "jax.devices()[0]", "set(jax.devices())")
-    across = "pj.plan_across_processes(exact, hits, @)"
-    rows += _of(across, "chunk", "0", "1.5", "'2'")
-    rows.append(("pj.plan_across_processes(exact, hit)", "cases must be a batch"))
-    rows.append(("pj.plan_across_processes(exact, None)", "ExactHit plans cases of the class"))
-    rows.append(("pj.plan_across_processes(None, hits)", "planner must be one"))
     return rows
 
 

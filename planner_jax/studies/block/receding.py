@@ -19,9 +19,9 @@ from flax import struct
 from jax import Array
 
 from planner_jax.core.protocol import Status, is_solved, lane
+from planner_jax.core.select import select_into
 from planner_jax.perception.fit import FlightFit, Sight, believed_at
 from planner_jax.planning.plan import plan
-from planner_jax.planning.select import merged
 from planner_jax.studies.block.contact_check import end_at_contact
 from planner_jax.studies.block.observation import (
     Eye,
@@ -98,7 +98,7 @@ def plan_with_aims(
         aimed = jax.tree.map(np.asarray, aimed)
         given = aimed if some is of(some) else dataclasses.replace(some, case=aimed)
         found = jax.tree.map(np.array, plan(planner, given))
-        plans = found if plans is None else merged(plans, found, lanes)
+        plans = found if plans is None else select_into(plans, found, lanes)
         lanes = np.flatnonzero(~is_solved(plans.status))
         if not lanes.size:
             break

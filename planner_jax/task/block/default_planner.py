@@ -27,6 +27,7 @@ from planner_jax.core.protocol import (
     require_settings,
     status_of,
 )
+from planner_jax.core.select import first_solved, select
 from planner_jax.optimise.levenberg import (
     LevenbergConfig,
     LevenbergState,
@@ -35,7 +36,6 @@ from planner_jax.optimise.levenberg import (
     go_on,
     least_squares,
 )
-from planner_jax.planning.select import better_of, first_solved
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import (
     clearance_slopes,
@@ -230,8 +230,7 @@ class OnlineBlock(Planner):
             return self.finish(case, flight, point, jnp.zeros((), jnp.int32))
 
         def keep_quicker(k: Array, best: BlockPlan) -> BlockPlan:
-            plan = plan_straight(k)
-            return better_of(best, plan, ~is_solved(best.status) | (plan.cost < best.cost))
+            return select(plan_straight(k), best)
 
         best = make_empty_plan(case, self.pieces)
         if self.brisk:
@@ -284,7 +283,7 @@ class OnlineBlock(Planner):
                 lambda search: self.finish(case, flight, search.point, search.steps),
                 search,
             )
-            return k + 1, searches, costs, better_of(best, plan, jnp.asarray(True))
+            return k + 1, searches, costs, select(plan, best)
 
         def is_open(turn: tuple[Array, LevenbergState, Array, BlockPlan]) -> Array:
             return (turn[0] < total) & ~is_solved(turn[-1].status)
@@ -307,7 +306,7 @@ class OnlineBlock(Planner):
         plans = jax.vmap(lambda end: self.finish(case, flight, end.point, end.steps))(ends)
         least = jnp.argmin(jnp.where(jnp.isnan(plans.violation), jnp.inf, plans.violation))
         plan = jax.tree.map(lambda leaf: leaf[least], plans)
-        return better_of(best, plan, ~is_solved(best.status))
+        return select(plan, best, ~is_solved(best.status))
 
     def rank_poses(self, poses: EndPoses, num: int) -> Array:
         """Return the indices (num,) of poses of little effort, mixed so that they differ."""

@@ -16,10 +16,9 @@ from jax import Array
 from planner_jax.ball.flight import BallState, drag_free_flight
 from planner_jax.core.checks import require_beginning, require_kind
 from planner_jax.core.planner import Drive, Planner
-from planner_jax.core.protocol import Attempt, is_unsolved, lane
+from planner_jax.core.protocol import Attempt, is_unsolved
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.planning.replan import Replanning, given_or_own, moment_of
-from planner_jax.planning.select import better_of, merged
 from planner_jax.robot.arm import shield_pose
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.default_planner import OnlineBlock
@@ -138,16 +137,12 @@ class ReplanBlock(Planner):
     def plan_by(self, drive: Drive, tasks: Replanning) -> BlockPlan:
         """The plans of one case or of a batch: warm, and from scratch where that fails."""
         plans, _ = drive(self.warm, tasks)
-        unsolved = is_unsolved(plans.status)
-        if drive.is_pure:
-            return better_of(plans, drive(self.planner, tasks.case)[0], unsolved)
+        unsolved, cases = is_unsolved(plans.status), tasks.case
         if not tasks.batch_shape:
-            return drive(self.planner, tasks.case)[0] if unsolved else plans
-        lanes = np.flatnonzero(unsolved)
-        if not lanes.size:
-            return plans
-        plans, cases = jax.tree.map(np.array, (plans, tasks.case))
-        return merged(plans, drive(self.planner, lane(cases, lanes))[0], lanes)
+            return drive(self.planner, cases)[0] if unsolved else plans
+        if not drive.is_pure:
+            plans, cases = jax.tree.map(np.array, (plans, cases))
+        return drive.plan_again(lambda some: drive(self.planner, some)[0], cases, plans, unsolved)
 
 
 @jax.jit

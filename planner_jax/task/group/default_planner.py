@@ -17,7 +17,6 @@ from jax import Array, lax
 
 from planner_jax.core.planner import Drive, Planner
 from planner_jax.core.protocol import Attempt, Status, is_solved, is_unsolved
-from planner_jax.planning.select import better_of, merged
 from planner_jax.robot.car import pose_at
 from planner_jax.task.group.case import CarState, InterceptGroup
 from planner_jax.task.group.plan import GroupPlan
@@ -71,11 +70,10 @@ class GroupIntercept(Planner):
 
     def _planned(self, drive: Drive, case: InterceptCase, wanted: Array) -> InterceptPlan:
         """Plans of the legs that are wanted, (B,) bool; what the others hold means nothing."""
+        patiently = lambda some: drive(self.patient, some)[0]  # noqa: E731
         if drive.is_pure:
             plans, _ = drive(self.planner, case)
-            left = wanted & _is_left(plans.status)
-            again = lambda plans: better_of(plans, drive(self.patient, case)[0], left)  # noqa: E731
-            return lax.cond(jnp.any(left), again, lambda plans: plans, plans)
+            return drive.plan_again(patiently, case, plans, wanted & _is_left(plans.status))
         case, wanted = jax.tree.map(np.asarray, (case, wanted))
         # Orders that begin alike have legs in common. Without any leg, one stands for all.
         some = np.flatnonzero(wanted) if np.any(wanted) else np.zeros(1, int)
@@ -84,10 +82,7 @@ class GroupIntercept(Planner):
         _, first, place = np.unique(rows, axis=0, return_index=True, return_inverse=True)
         case = jax.tree.map(lambda leaf: leaf[some[first]], case)
         plans, _ = drive(self.planner, case)
-        left = np.flatnonzero(_is_left(plans.status))
-        if left.size:
-            later, _ = drive(self.patient, jax.tree.map(lambda leaf: leaf[left], case))
-            plans = merged(plans, later, left)
+        plans = drive.plan_again(patiently, case, plans, _is_left(plans.status))
         places = np.zeros(len(wanted), int)
         places[some] = place
         return jax.tree.map(lambda leaf: leaf[places], plans)

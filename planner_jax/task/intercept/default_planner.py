@@ -18,6 +18,7 @@ from jax import Array, lax
 
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Status, is_solved, require_attempts, require_settings
+from planner_jax.core.select import index_of_best, select
 from planner_jax.plane import reach
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.plan import InterceptPlan, explain, make_straight_plan
@@ -27,7 +28,6 @@ from planner_jax.task.intercept.problem import (
     MotionProblem,
     SmoothIntercept,
     add_start,
-    select_better,
 )
 from planner_jax.task.intercept.replan import ReplanIntercept
 from planner_jax.task.intercept.searches import (
@@ -121,7 +121,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         def try_path(state: tuple) -> tuple:
             k, best = state
             chance = jax.tree.map(lambda leaf: leaf[k], chances)
-            return k + 1, select_better(best, self._solve_along(case, found, chance, attempt))
+            return k + 1, select(self._solve_along(case, found, chance, attempt), best)
 
         def is_open(state: tuple) -> Array:
             k, best = state
@@ -158,8 +158,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
 
         solve = solve_along if self.tries_all else solve_without_last_stage
         plans = jax.vmap(solve)(attempt.draw_chances())
-        cost = jnp.where(is_solved(plans.status), plans.cost - 1e6, plans.violation)
-        best = jnp.argmin(jnp.where(jnp.isfinite(cost), cost, jnp.inf))
+        best = index_of_best(plans)
         plan = jax.tree.map(lambda leaf: leaf[best], plans)
         if not self.tries_all:
             plan = problem.refine_solved(case, found.field, plan, attempt)

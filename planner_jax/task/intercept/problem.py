@@ -18,6 +18,7 @@ from flax import struct
 from jax import Array, lax
 
 from planner_jax.core.protocol import is_solved
+from planner_jax.core.select import select
 from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.levenberg import LevenbergConfig, LevenbergState, Model, least_squares
@@ -265,7 +266,7 @@ class MotionProblem:
         points, steps = self.run_stages(case, field, guess, attempt, stages)
         plans = lax.map(lambda point: self.decode(case, point, steps), points[-2:])
         before, after = (jax.tree.map(lambda leaf, k=k: leaf[k], plans) for k in range(2))
-        return select_better(before, after)
+        return select(after, before)
 
     def refine_solved(
         self, case: InterceptCase, field: DistanceField, plan: InterceptPlan, attempt: Search
@@ -276,15 +277,7 @@ class MotionProblem:
         steps = jnp.where(is_solved(plan.status), last.steps, 0)
         stage = dataclasses.replace(last, steps=steps, of_good=False)
         points, steps = self.run_stages(case, field, guess, attempt, [stage])
-        return select_better(plan, self.decode(case, points[0], plan.iterations + steps))
-
-
-def select_better(plan: InterceptPlan, later: InterceptPlan) -> InterceptPlan:
-    """Select the later plan if it is solved at less cost, or violates less than an unsolved one."""
-    both = is_solved(plan.status) & is_solved(later.status)
-    less = (later.violation < plan.violation) | ~jnp.isfinite(plan.violation)
-    better = jnp.where(both, later.cost < plan.cost, less & ~is_solved(plan.status))
-    return jax.tree.map(lambda new, old: jnp.where(better, new, old), later, plan)
+        return select(self.decode(case, points[0], plan.iterations + steps), plan)
 
 
 @struct.dataclass

@@ -25,8 +25,8 @@ from planner_jax.baselines.block.library.planner import LibraryBlock
 from planner_jax.baselines.block.library.table import pieces_of, unpacked
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt, Status
+from planner_jax.core.select import first_solved
 from planner_jax.optimise.levenberg import LevenbergConfig
-from planner_jax.planning.select import first_solved
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import clearances, num_of_pole
 from planner_jax.task.block.default_planner import OnlineBlock

@@ -1,0 +1,102 @@
+"""The driver of attempts: it has planners of every kind plan, on the host or inside a program."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from planner_jax.core.planner import Kind, Planner
+from planner_jax.core.protocol import Attempt, is_unsolved, out_of_time
+from planner_jax.core.select import is_better, select, select_into
+from planner_jax.planning.batch import plan_batch, plan_on_host
+from planner_jax.planning.programs import solve_cases, solve_one
+from planner_jax.planning.progress import Watch
+
+
+@dataclasses.dataclass(frozen=True)
+class Driver:
+    """The `Drive` of `plan`; or that of `solve`, which is pure."""
+
+    chunk: int | None = None
+    devices: Sequence[jax.Device] | None = None
+    watch: Watch = dataclasses.field(default_factory=Watch)
+    is_pure: bool = False  # inside a compiled program
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the caller's time has passed."""
+        return self.watch.is_over
+
+    def __call__(
+        self, planner: Planner, cases: Any, attempts: Sequence[Attempt] | None = None
+    ) -> tuple[Any, Any]:
+        """Return plans of one case or of a batch; see `Drive`."""
+        if planner.kind is Kind.COMPOSITE:
+            plans = planner.plan_by(self, cases)
+            return plans, is_unsolved(plans.status)
+        attempts = attempts or planner.attempts
+        if self.is_pure:
+            plans = _plan_purely(planner, attempts, cases)
+            return plans, is_unsolved(plans.status)
+        if planner.kind is Kind.HOST:
+            return plan_on_host(planner, attempts, cases, self.watch)
+        if cases.batch_shape == ():
+            plans = _plan_one(planner, attempts, cases, self.watch)
+            return plans, is_unsolved(int(plans.status))
+        return plan_batch(planner, attempts, cases, self.chunk, self.devices, self.watch)
+
+    def plan_again(self, plan_of: Callable[[Any], Any], cases: Any, plans: Any, left: Any) -> Any:
+        """Return plans (B,) after one more try at the cases that are left; see `Drive`."""
+        if self.is_pure:
+            again = lambda plans: select(plan_of(cases), plans, left)  # noqa: E731
+            return lax.cond(jnp.any(left), again, lambda plans: plans, plans)
+        lanes = np.flatnonzero(left)
+        if not lanes.size:
+            return plans
+        if self.is_over:
+            return out_of_time(plans, left)
+        return select_into(plans, plan_of(jax.tree.map(lambda leaf: leaf[lanes], cases)), lanes)
+
+
+def _plan_one(planner: Planner, attempts: Sequence[Attempt], case: Any, watch: Watch) -> Any:
+    """Return the plan of one case: attempts until one solves it, or the time is over."""
+    best: Any = None
+    for attempt in attempts:
+        if best is not None and not attempt.is_due(best):
+            continue
+        if best is not None and watch.is_over:
+            return out_of_time(best, True)
+        watch.tell(planner, attempt, 0, 1)
+        plan = solve_one(planner, case, attempt)
+        watch.tell(planner, attempt, 1, 1)
+        if best is None or is_better(plan, best):
+            best = plan
+        if not is_unsolved(int(best.status)):  # of a number quicker to find out than of an array
+            break
+    return best
+
+
+def _plan_purely(planner: Planner, attempts: Sequence[Attempt], cases: Any) -> Any:
+    """Return plans as jax arrays: every further attempt is made if it is due at some case."""
+    require_pure(planner)
+    first, *others = attempts
+    plans = solve_cases(planner, cases, first)
+    for attempt in others:
+        due = attempt.is_due(plans)
+        again = lambda plans, attempt=attempt, due=due: select(  # noqa: E731
+            solve_cases(planner, cases, attempt), plans, due
+        )
+        plans = lax.cond(jnp.any(due), again, lambda plans: plans, plans)
+    return plans
+
+
+def require_pure(planner: Planner) -> None:
+    """Raise `TypeError` for a planner that works on the host."""
+    if planner.kind is Kind.HOST:
+        raise TypeError(
+            f"{type(planner).__name__} works on the host: call pj.plan outside of what is compiled"
+        )
