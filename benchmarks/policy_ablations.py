@@ -6,12 +6,12 @@
 "whole" is a training as `planner-jax train` makes it: the network of attention, every decision
 planned, rewards for success, early last catches and times that hold. Of the others each differs
 in one thing: "mlp" in its network; "estimate" has decisions judged by the estimate, without a
-planner; "no last" and "no ratio" lack a term of the reward; "imitation" begins with decisions
-learned from `best`. "small" is of the size that the paper names (IV-B): its network, 100
-environments, and a tenth of the decisions, which already takes longer. What is trained decides
-about cases of a seed that it was not trained on; every plan is by `exact` and refereed, last
-catches and optimal time ratios (OTR) are of what the referee accepts. The spread is that of the
-seeds, as least and largest. Seconds are those of training, compilation included.
+planner; "no last" and "no ratio" lack a term of the reward. "small" is of the size that the paper
+names (IV-B): its network, 100 environments, and a tenth of the decisions, which already takes
+longer. What is trained decides about cases of a seed that it was not trained on; every plan is by
+`exact` and refereed, last catches and optimal time ratios (OTR) are of what the referee accepts.
+The spread over the seeds is given as least and largest. Seconds are of training, compilation
+included.
 """
 
 import argparse
@@ -40,7 +40,6 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "estimate": {"iterations": 0},
     "no last": {"weights": {"last": 0.0}},
     "no ratio": {"weights": {"ratio": 0.0}},
-    "imitation": {"lessons": 2000},
     "small": {"network": "mlp", "lanes": 100, "minibatches": 4, "share": 0.1},
 }
 FIGURES = ("success", "last", "ratio", "seconds")

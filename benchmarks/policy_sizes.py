@@ -23,26 +23,27 @@ import planner_jax as pj
 from planner_jax.benchmarks.policy_ablations import figures_of
 from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin, chosen
 from planner_jax.policies.policy import Policy, policy
-from planner_jax.policies.settings import TrainSettings
-from planner_jax.policies.training import train_as_asked
+from planner_jax.policies.settings import WEIGHTS, usual_iterations
+from planner_jax.policies.training import Part, Training, train
 from planner_jax.runs.settings import SettingError
 
 SUITES = {"4": "square4", "5": "pentagon5", "7": "heptagon7"}
-REWARD: dict[str, Any] = {"solved": (5.0,), "last": (10.0,), "ratio": (14.0,)}
+REWARD = {**WEIGHTS, "solved": 5.0, "last": 10.0, "ratio": -14.0}
 
 
 def trained(suite: str, options: argparse.Namespace) -> tuple[Policy, float]:
     """A policy that goes on from given weights on one suite, and the seconds that it took."""
-    settings = TrainSettings(
-        suite=suite,
-        decisions=(options.decisions,),
+    training = Training(
+        suites=(suite,),
+        parts=(Part(options.decisions, (usual_iterations(suite),)),),
+        lanes=510 if jax.default_backend() == "cpu" else 8190,
+        weights=tuple(REWARD.items()),
         begin=options.begin or options.policy,
         judged=0,
-        **REWARD,
     )
     began = time.perf_counter()
     with tempfile.TemporaryDirectory() as scratch:
-        found = train_as_asked(settings, scratch)
+        found = train(training, scratch)
     return found, time.perf_counter() - began
 
 

@@ -1,11 +1,10 @@
 """Training by Brax's PPO (paper 000, eqs 5 and 7): in parts, so that it can go on.
 
 A run is a row of parts, each one call of `brax.training.agents.ppo.train` from the weights of the
-last: imitation first if asked for, then rewards by the estimate, then by the planner. What a part
-leaves is kept by Orbax before the next one begins, and the seed of a part follows from the run's
-and its number: a run that was interrupted goes on to the same weights, bit for bit. Adam's
-moments are begun anew with each part, since Brax does not hand them out. `progress` says how a run
-is watched, and `curves` draws it.
+last, with rewards by the planner or by the estimate. What a part leaves is kept by Orbax before
+the next one begins, and the seed of a part follows from the run's and its number: a run that was
+interrupted goes on to the same weights, bit for bit. Adam's moments start anew with each part,
+since Brax does not return them. `progress` says how a run is watched, and `curves` draws it.
 """
 
 import dataclasses
@@ -41,13 +40,17 @@ from planner_jax.policies.checkpoint import (
 )
 from planner_jax.policies.curves import draw_curves
 from planner_jax.policies.environment import CatchEnv
-from planner_jax.policies.imitation import imitated, lessons
 from planner_jax.policies.kept import KeptParts
 from planner_jax.policies.networks import LEAST_STD, NETWORKS, Value
 from planner_jax.policies.observation import FEATURES, PER_TARGET
 from planner_jax.policies.policy import Policy
 from planner_jax.policies.progress import ASKED, Progress, read_asked, reported_terms
-from planner_jax.policies.settings import WEIGHTS, TrainSettings
+from planner_jax.policies.settings import (
+    LEARNING_RATE,
+    WEIGHTS,
+    TrainSettings,
+    usual_iterations,
+)
 from planner_jax.runs.environment import code_digest, installed_version
 from planner_jax.runs.manifest import to_write
 from planner_jax.runs.run_folder import RunFolder
@@ -66,7 +69,7 @@ class Part:
 
     steps: int  # decisions
     iterations: tuple[int, ...] = ()  # of the planner, one a suite; none: the estimate judges
-    learning_rate: float = 1e-4  # to begin with; then as far as the divergence allows
+    learning_rate: float = LEARNING_RATE  # to begin with; then as far as the divergence allows
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,14 +83,11 @@ class Training:
     lanes: int = 8190  # decided at once; a multiple of the number of suites
     updates: int = 4  # of all data
     minibatches: int = 6
-    lessons: int = 0  # cases of each suite by whose best decisions it begins; 0: as `Greedy`
-    lesson_steps: int = 3000
     divergence: float = 0.01  # wanted of an update, by which the learning rate is set
     entropy: float = 1e-4
     # Of each term, one or one a suite.
     weights: tuple[tuple[str, float | tuple[float, ...]], ...] = tuple(WEIGHTS.items())
     begin: str | None = None  # a checkpoint by whose weights it begins, or a shipped one's name
-    kept: float = 0.0  # share of these in the weights that it ends with
     judged: int = 256  # cases of each suite by which it is watched; 0: it is not
 
 
@@ -131,8 +131,6 @@ def _train_parts(
             params = kept
             begun += decisions
             continue
-        if number == 0 and training.lessons:
-            params = _begun_by_imitation(training, network, params)
         title = f"part {number + 1} of {len(training.parts)}"
         with told.part(number, title, begun, decisions) as tell:
             if number == 0 and training.judged:
@@ -146,23 +144,30 @@ def _train_parts(
                 print(f"{title}: {_sentence(suites)}", file=sys.stderr)
         draw_curves([folder], folder / "curves.png")
         keeper.save(number, params)
-    found = params[1]
-    if training.kept:
-        share, first = training.kept, _first_params(training, network)[1]
-        found = jax.tree.map(lambda a, b: share * a + (1.0 - share) * b, first, found)
     about = {"suites": list(training.suites), "seed": training.seed}
-    save_checkpoint(folder / "policy.npz", found, network, about)
-    return Policy(params=found, network=network)
+    save_checkpoint(folder / "policy.npz", params[1], network, about)
+    return Policy(params=params[1], network=network)
 
 
 def train_as_asked(settings: TrainSettings, out: str | os.PathLike) -> Policy:
-    """The training of `planner-jax train`; arguments and errors of `train`."""
+    """Train as `planner-jax train` does; arguments and errors of `train`."""
     lanes = settings.lanes or (510 if jax.default_backend() == "cpu" else 8190)
-    parts = tuple(
-        Part(int(steps), settings.iterations_of(number))
-        for number, steps in enumerate(settings.decisions)
+    minibatches = 6
+    step = len(settings.suites) * minibatches  # one share a suite, and even minibatches
+    iterations = tuple(map(usual_iterations, settings.suites))
+    training = Training(
+        suites=settings.suites,
+        parts=tuple(
+            Part(int(steps), iterations, settings.learning_rate) for steps in settings.decisions
+        ),
+        network=settings.network,
+        seed=settings.seed,
+        lanes=lanes // step * step,
+        minibatches=minibatches,
+        begin=settings.begin,
+        judged=settings.judged,
     )
-    return train(Training(parts=parts, **settings.training(lanes)), out)
+    return train(training, out)
 
 
 def judge_policy(training: Training, network: Any, params: Any) -> dict[str, Any]:
@@ -229,14 +234,6 @@ def _first_params(training: Training, network: Any) -> Any:
 def _words(network: Any) -> str:
     name, sizes = name_and_sizes(network)
     return f"{name} ({', '.join(f'{field} {size}' for field, size in sizes.items())})"
-
-
-def _begun_by_imitation(training: Training, network: Any, params: Any) -> Any:
-    env = _environment(training, training.parts[0])
-    some = lessons(training.suites, training.lessons, 1_000_003 + training.seed, env.size)
-    key = jax.random.fold_in(jax.random.key(training.seed), 1)
-    learned, _ = imitated(network, some, key, training.lesson_steps, params[1])
-    return (params[0], learned, params[2])
 
 
 def _environment(training: Training, part: Part) -> CatchEnv:

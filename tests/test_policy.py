@@ -166,8 +166,7 @@ def test_the_command_line_names_a_decision_that_takes_no_file(capsys, tmp_path):
     [
         (["--suite", "triangle9"], "--suite must be one or more of throws"),
         (["--network", "deep"], "--network must be attention or mlp, got deep"),
-        (["--iterations", "8"], "--iterations must be 5 numbers, one a suite, got 1"),
-        (["--kept", "0.5"], "--kept must be left out without begin"),
+        (["--learning-rate", "0"], "--learning-rate must be > 0 and at most 1, got 0"),
         (["--suite", "triangle3", "--begin", "nowhere.npz"], "that `planner-jax train` wrote"),
     ],
 )

@@ -157,12 +157,11 @@ def _rows() -> list:
     rows += _of("bench throughput", "--out", ("", "pipe"))
     rows += _of("train", "--suite", ("x", "", "parabola1,"))
     rows += _of("train", "--decisions", ("0", "nan", "inf", "1e300", "x"))
-    rows += _of("train", "--kept", ("2", "nan", "0.5"))
+    rows += _of("train", "--learning-rate", ("0", "nan", "x"))
     rows += _of("train", "--lanes", ("1", "x", "1" + "0" * 15))
-    for option in ("--judged", "--lessons", "--seed"):
+    for option in ("--judged", "--seed"):
         rows += _of("train", option, ("-1", "x", "9" * 30))
-    rows += _of("train", "--network", ("x",)) + _of("train", "--last", ("nan", "-1"))
-    rows += _of("train", "--iterations", ("-1", "1")) + _of("train", "--estimated", ("-1", "9"))
+    rows += _of("train", "--network", ("x",))
     rows += _of("view folder", "--port", ("x", "1_0", "", "٣"))
     rows.append((("compare",), ("RUN",)))
     for words in ("", "plan", "sweep", "fly", "serve", "library", "bench", "nobody", "doctor x"):
