@@ -23,11 +23,11 @@ from jax.flatten_util import ravel_pytree
 
 import planner_jax as pj
 from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
+from planner_jax.core.errors import ArgumentError
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.policies.policy import policy
-from planner_jax.runs.settings import SettingError
 from planner_jax.task.catch.decide import Random
 from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.catch.spec import SUITES
@@ -117,7 +117,7 @@ def main() -> None:
     with begin(parser, options) as bench:
         try:
             measure(bench, suites, options)
-        except SettingError as error:
+        except ArgumentError as error:
             parser.error(str(error))
 
 

@@ -26,10 +26,10 @@ import numpy as np
 
 import planner_jax as pj
 from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
+from planner_jax.core.errors import ArgumentError
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.policies.policy import policy
 from planner_jax.referee.catch import CatchVerdict
-from planner_jax.runs.settings import SettingError
 from planner_jax.studies.catch.appearing import SPAN, draw_appearing, states_of
 from planner_jax.studies.catch.live import fly_live, judge_live
 from planner_jax.task.catch.decide import Random
@@ -122,7 +122,7 @@ def main() -> None:
         try:
             for span in spans:
                 run_span(bench, span, names, options)
-        except SettingError as error:
+        except ArgumentError as error:
             parser.error(str(error))
 
 

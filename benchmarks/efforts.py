@@ -17,7 +17,7 @@ import numpy as np
 import planner_jax as pj
 from planner_jax.benchmarks.cost_gap import cost_gaps, gap_figures
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
-from planner_jax.core.efforts import EFFORTS
+from planner_jax.core.choices import EFFORTS
 
 SUITES = (("hit", "court"), ("catch", "throws"), ("catch", "parabola2"))
 

@@ -15,8 +15,8 @@ import numpy as np
 
 import planner_jax as pj
 from planner_jax.benchmarks.run import argument_parser, begin, chosen
+from planner_jax.core.errors import NoEnding
 from planner_jax.recovery.after_plan import is_rested, with_ending
-from planner_jax.recovery.no_ending import NoEnding
 
 # Row -> words of the task, options of `draw` and of `planner`, and the way to rest.
 ROWS: dict[str, tuple[Any, dict[str, Any], dict[str, Any], str]] = {

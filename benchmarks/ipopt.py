@@ -34,9 +34,9 @@ import numpy as np
 import planner_jax as pj
 from planner_jax.benchmarks.cost_gap import gap_figures
 from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin, chosen
-from planner_jax.core.efforts import EFFORTS
+from planner_jax.core.choices import EFFORTS
+from planner_jax.core.errors import install_line
 from planner_jax.core.protocol import FEASIBILITY_TOLERANCE
-from planner_jax.core.registry import install_line
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.task.segments import BETWEEN_NODES
 from planner_jax.trajectory.polynomial import snap_energy

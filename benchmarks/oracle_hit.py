@@ -26,10 +26,10 @@ import numpy as np
 
 from planner_jax.benchmarks.hit_oracle.search import STARTS, Finding, find_hits, starting_points
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
+from planner_jax.core.errors import ArgumentError
 from planner_jax.runs.dataset import Dataset
 from planner_jax.runs.summary import wilson_interval
 from planner_jax.task.hit.suites import generate_serves, read_serves, to_cases
-from planner_jax.task.hit.validate import ServeError
 
 NUM_GENERATED = 9000  # serves that are drawn where no folder is given
 VERDICTS = ("feasible", "infeasible", "undecided")
@@ -131,7 +131,7 @@ def main() -> None:
                 limit_scale=options.limit_scale,
                 dtype=jnp.float64,
             )
-    except (ServeError, OSError, ValueError) as error:
+    except (ArgumentError, OSError, ValueError) as error:
         parser.error(str(error))
     with begin(parser, options) as bench:
         starts = starting_points(options.starts, options.seed)

@@ -22,10 +22,10 @@ import jax
 import planner_jax as pj
 from planner_jax.benchmarks.policy_ablations import figures_of
 from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin, chosen
+from planner_jax.core.errors import ArgumentError
 from planner_jax.policies.policy import Policy, policy
 from planner_jax.policies.settings import WEIGHTS, usual_iterations
 from planner_jax.policies.training import Part, Training, train
-from planner_jax.runs.settings import SettingError
 
 SUITES = {"4": "square4", "5": "pentagon5", "7": "heptagon7"}
 REWARD = {**WEIGHTS, "solved": 5.0, "last": 10.0, "ratio": -14.0}
@@ -92,7 +92,7 @@ def main() -> None:
     with begin(parser, options) as bench:
         try:
             measure(bench, sizes, options)
-        except SettingError as error:
+        except ArgumentError as error:
             parser.error(str(error))
 
 

@@ -19,9 +19,9 @@ from typing import Any, Self
 import numpy as np
 
 from planner_jax.benchmarks.cost_gap import gap_figures
+from planner_jax.core.errors import ArgumentError
 from planner_jax.runs.environment import environment
 from planner_jax.runs.run_folder import RunFolder
-from planner_jax.runs.settings import SettingError
 
 
 def argument_parser(name: str, doc: str | None, **counts: int) -> argparse.ArgumentParser:
@@ -60,14 +60,14 @@ def begin(parser: argparse.ArgumentParser, options: argparse.Namespace) -> "Benc
     given = {name: value for name, value in vars(options).items() if name != "benchmark"}
     try:
         return Bench(options.benchmark, given, given.pop("out"))
-    except SettingError as error:
+    except ArgumentError as error:
         parser.error(f"argument --{error}")
 
 
 class Bench:
     """One run; its folder is made where its block begins, and JAX is not started before.
 
-    Raises `SettingError` unless `out` (None: runs/bench-NAME-DATE-TIME) can be a new folder.
+    Raises `ArgumentError` unless `out` (None: runs/bench-NAME-DATE-TIME) can be a new folder.
     """
 
     def __init__(self, name: str, parameters: Mapping[str, Any], out: Any = None):

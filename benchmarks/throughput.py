@@ -28,11 +28,11 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from planner_jax.benchmarks.cost_gap import COMPARED, cost_gaps, gap_figures
 from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
 from planner_jax.benchmarks.throughput_settings import ThroughputSettings
+from planner_jax.core.choices import require
 from planner_jax.core.registry import Task, all_tasks, task_named
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.planning.plan import plan
-from planner_jax.runs.settings import require
 from planner_jax.runs.timing import CompileClock
 
 _WARM_UP = 0.5  # [s]
@@ -47,7 +47,7 @@ def report(*, out: str | os.PathLike | None = None, **settings: Any) -> None:
         **settings: of `ThroughputSettings`.
 
     Raises:
-        SettingError: the folder cannot be written, or a setting breaks a rule.
+        ArgumentError: the folder cannot be written, or a setting breaks a rule.
         UnknownName: as `measure` says.
     """
     asked, there = ThroughputSettings(**settings), len(jax.local_devices())
@@ -60,7 +60,7 @@ def measure(bench: Bench, settings: ThroughputSettings) -> None:
     """Measure and print one row a batch size.
 
     Raises:
-        SettingError: there are fewer devices, or the planner has no rounds.
+        ArgumentError: there are fewer devices, or the planner has no rounds.
         UnknownName: there is no such task, planner or suite.
     """
     devices, iterations = settings.devices, settings.iterations

@@ -4,10 +4,9 @@ import dataclasses
 import pkgutil
 from typing import ClassVar
 
-from planner_jax.core.efforts import EFFORTS
+from planner_jax.core.choices import EFFORTS, require, require_memory, require_one_of
 from planner_jax.core.registry import task_named
-from planner_jax.host.memory import require_memory
-from planner_jax.runs.settings import SettingError, SweepSettings, option, require, require_one_of
+from planner_jax.runs.settings import SweepSettings, option
 
 _MOST = 100_000  # iterations, or calls: an hour and more
 
@@ -17,7 +16,7 @@ class ThroughputSettings:
     """The arguments of a measurement.
 
     Raises:
-        SettingError: a value breaks its rule.
+        ArgumentError: a value breaks its rule.
         UnknownName: there is no such task.
     """
 
@@ -53,7 +52,4 @@ class ThroughputSettings:
         task = task_named(self.task)
         kind: type[SweepSettings] = pkgutil.resolve_name(task.sweep)
         asked = kind(planner=self.planner, suite=self.suite, seed=self.seed).of(task)
-        try:
-            require_memory("batch", max(self.batch), asked.case_bytes)
-        except ValueError as error:
-            raise SettingError(str(error)) from None
+        require_memory("batch", max(self.batch), asked.case_bytes)

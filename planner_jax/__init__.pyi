@@ -6,6 +6,7 @@ from .ball.prediction import target_at as target_at
 from .ball.table import table_path as table_path
 from .ball.target import BallPath as BallPath
 from .ball.target import HarmonicPath as HarmonicPath
+from .core.errors import CaseError as CaseError
 from .core.planner import Planner as Planner
 from .core.protocol import Attempt as Attempt
 from .core.protocol import Plan as Plan
@@ -15,7 +16,6 @@ from .core.protocol import outcome as outcome
 from .core.protocol import solved as solved
 from .core.registry import Task as Task
 from .core.registry import task_named as task_named
-from .core.rules import CaseError as CaseError
 from .core.rules import require_sound as require_sound
 from .cost.extras import Dislike as Dislike
 from .cost.extras import Geofence as Geofence

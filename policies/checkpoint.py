@@ -15,19 +15,15 @@ import numpy as np
 from flax import traverse_util
 
 from planner_jax.core.checks import require_path_name
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.plan_files import UNREADABLE
 from planner_jax.host.files import open_plain, replacing
 from planner_jax.policies.networks import NETWORKS
 from planner_jax.policies.observation import FEATURES
-from planner_jax.runs.settings import SettingError
 
 FORMAT = 2
 SHIPPED = ("catch", "rush6")  # one for eight suites, and one for `rush6` alone
 _OF_FLAX = ("parent", "name")  # fields of every module
-
-
-class CheckpointError(SettingError):
-    """A file is no checkpoint of a policy, or one of another version; one line."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,7 +65,7 @@ def load_checkpoint(path: str | os.PathLike) -> Checkpoint:
     """The policy in a file.
 
     Raises:
-        CheckpointError: there is none, it is no checkpoint, or one of another version.
+        ArgumentError: there is none, it is no checkpoint, or one of another version.
     """
     require_path_name("checkpoint", path)
     name = os.fspath(path)
@@ -79,24 +75,27 @@ def load_checkpoint(path: str | os.PathLike) -> Checkpoint:
         about = json.loads(str(arrays.pop("about")))
         found, network = about["format"], about["network"]
     except UNREADABLE as error:
-        raise CheckpointError(
-            f"checkpoint must be one that `planner-jax train` wrote, got {name!r} "
-            f"({type(error).__name__})"
+        raise ArgumentError(
+            "checkpoint",
+            "one that `planner-jax train` wrote",
+            shown=f"{name!r} ({type(error).__name__})",
         ) from error
     if found != FORMAT or about["features"] != FEATURES:
-        raise CheckpointError(
-            f"checkpoint must be of format {FORMAT} with {FEATURES} features of a target, got "
-            f"format {found} with {about['features']} in {name!r}"
+        raise ArgumentError(
+            "checkpoint",
+            f"of format {FORMAT} with {FEATURES} features of a target",
+            shown=f"format {found} with {about['features']} in {name!r}",
         )
     if network not in NETWORKS:
         known = ", ".join(NETWORKS)
-        raise CheckpointError(f"network must be one of {known}, got {network!r} in {name!r}")
+        raise ArgumentError("network", f"one of {known}", shown=f"{network!r} in {name!r}")
     kind, sizes = NETWORKS[network], about.get("sizes", {})
     known = [field.name for field in dataclasses.fields(kind) if field.name not in _OF_FLAX]
     if not set(sizes) <= set(known):
-        raise CheckpointError(
-            f"sizes of network {network!r} must be among {', '.join(known)}, "
-            f"got {', '.join(sizes)} in {name!r}"
+        raise ArgumentError(
+            f"sizes of network {network!r}",
+            f"among {', '.join(known)}",
+            shown=f"{', '.join(sizes)} in {name!r}",
         )
     params = traverse_util.unflatten_dict(arrays, sep="/")
     return Checkpoint(params=params, network=kind(**sizes), about=about)

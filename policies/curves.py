@@ -16,9 +16,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from planner_jax.core.errors import ArgumentError
 from planner_jax.policies.progress import read_asked, read_rows
 from planner_jax.runs import style
-from planner_jax.runs.settings import SettingError
 
 _TERMS = {
     "reward": ("Reward", "mean", 1.0),
@@ -40,7 +40,7 @@ def draw_curves(folders: Sequence[str | os.PathLike], path: str | os.PathLike) -
         path: of the picture, a PNG.
 
     Raises:
-        SettingError: a folder is no training's, or they differ in more than their seed.
+        ArgumentError: a folder is no training's, or they differ in more than their seed.
     """
     _require_alike([Path(folder) for folder in folders])
     runs = [read_rows(Path(folder)) for folder in folders]
@@ -114,9 +114,10 @@ def _require_alike(folders: Sequence[Path]) -> None:
         asked = {name: value for name, value in found.items() if name not in _OF_RUN}
         first = first or asked
         for name in (name for name in first if name != "seed" and asked.get(name) != first[name]):
-            raise SettingError(
-                f"run must be of the same {name} as {str(folders[0])!r}, {first[name]}, "
-                f"got {asked.get(name)} in {str(folder)!r}"
+            raise ArgumentError(
+                "run",
+                f"of the same {name} as {str(folders[0])!r}, {first[name]}",
+                shown=f"{asked.get(name)} in {str(folder)!r}",
             )
 
 
@@ -129,7 +130,7 @@ def main() -> None:
     options = parser.parse_args()
     try:
         draw_curves(options.runs, options.out)
-    except SettingError as error:
+    except ArgumentError as error:
         parser.error(str(error))
 
 

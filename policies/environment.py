@@ -16,6 +16,7 @@ import numpy as np
 from brax.envs.base import Env, State
 from jax import Array
 
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import is_solved
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.multistart import solve_batch
@@ -61,8 +62,8 @@ class CatchEnv(Env):
         """States of a batch of keys (B, 2); B is a multiple of the number of suites."""
         num = rng.shape[0]
         if num % len(self.suites):
-            raise ValueError(
-                f"lanes must be a multiple of {len(self.suites)}, one share a suite, got {num}"
+            raise ArgumentError(
+                "lanes", f"a multiple of {len(self.suites)}, one share a suite", num
             )
         key, own = jax.random.split(rng[0])
         cases = self._drawn(own, num)

@@ -9,7 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from planner_jax.core.checks import require_number, require_size, told
+from planner_jax.core.checks import require_number
+from planner_jax.core.choices import require_size
+from planner_jax.core.errors import ArgumentTypeError
 from planner_jax.policies.checkpoint import checkpoint_of
 from planner_jax.policies.networks import LEAST_STD
 from planner_jax.policies.observation import PER_TARGET, STRETCH, choice_of, observe
@@ -42,7 +44,7 @@ class Policy(CatchDecision):
         require_number("spread", self.spread, "finite and >= 0", lambda x: x >= 0.0)
         require_number("stretch", self.stretch, "finite and > 0", lambda x: x > 0.0)
         if not callable(getattr(self.network, "apply", None)):
-            raise TypeError(f"network must be a Flax module, got {told(self.network)}")
+            raise ArgumentTypeError("network", "a Flax module", self.network)
 
     def check(self, cases: CatchCase) -> None:
         """Raise `ValueError` where there are more targets than the network takes."""
@@ -81,7 +83,7 @@ def policy(file: str | os.PathLike = "catch", **options: Any) -> Policy:
     Raises:
         TypeError: an option is of another kind.
         ValueError: there is no proposal, or an option is negative, zero or not finite.
-        CheckpointError: it is no checkpoint of a policy, or of another version; one line.
+        ArgumentError: it is no checkpoint of a policy, or of another version; one line.
     """
     found = checkpoint_of(file)
     params = jax.tree.map(jnp.asarray, found.params)  # sent to the device once, not each time

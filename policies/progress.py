@@ -22,6 +22,7 @@ from brax.training.agents.ppo import losses
 from tensorboardX import SummaryWriter
 from tqdm import tqdm
 
+from planner_jax.core.errors import ArgumentError
 from planner_jax.host import signals as stopping
 from planner_jax.host.files import open_plain
 from planner_jax.runs.manifest import (
@@ -32,7 +33,6 @@ from planner_jax.runs.manifest import (
     to_write,
 )
 from planner_jax.runs.run_folder import RunFolder
-from planner_jax.runs.settings import SettingError
 
 FILE, ASKED = "progress.jsonl", "training.json"
 _EVENTS = "tensorboard"
@@ -157,7 +157,7 @@ def read_rows(folder: Path) -> list[dict[str, Any]]:
     """The rows of a run, in the order of their decisions.
 
     Raises:
-        SettingError: the folder is not that of a training, or a row is not as it was written.
+        ArgumentError: the folder is not that of a training, or a row is not as it was written.
     """
     shown = repr(str(folder))
     try:
@@ -165,7 +165,7 @@ def read_rows(folder: Path) -> list[dict[str, Any]]:
             text = file.read()
     except OSError as error:
         rule = f"the folder of a training, with its {FILE}"
-        raise SettingError(f"run must be {rule}, got {shown} ({error.strerror})") from None
+        raise ArgumentError("run", rule, shown=f"{shown} ({error.strerror})") from None
     first, _, rest = text.partition(b"\n")
     try:
         head = parse_written(first)
@@ -174,7 +174,7 @@ def read_rows(folder: Path) -> list[dict[str, Any]]:
         rows = [parse_object(line) for line in rest.splitlines()]
     except JsonError as error:
         rule = f"a training whose {FILE} is whole"
-        raise SettingError(f"run must be {rule}, got {shown}, where it {error}") from None
+        raise ArgumentError("run", rule, shown=f"{shown}, where it {error}") from None
     return rows
 
 
@@ -182,6 +182,6 @@ def read_asked(folder: Path) -> dict[str, Any]:
     """What a training was asked for, of `training.json`.
 
     Raises:
-        SettingError: the folder is not that of a training, or it is not as it was written.
+        ArgumentError: the folder is not that of a training, or it is not as it was written.
     """
     return read_written(folder / ASKED, "run", "a training")

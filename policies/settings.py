@@ -3,8 +3,8 @@
 import dataclasses
 from typing import ClassVar
 
-from planner_jax.host.memory import require_memory
-from planner_jax.runs.settings import SettingError, option, require, require_count, require_seed
+from planner_jax.core.choices import require, require_memory, require_seed
+from planner_jax.runs.settings import option, require_count
 from planner_jax.task.catch.spec import SUITES
 
 _MOST_DECISIONS = 1e12
@@ -21,7 +21,7 @@ class TrainSettings:
     """The arguments of a training. `training.Training` has more of them, for programs.
 
     Raises:
-        SettingError: a value breaks its rule.
+        ArgumentError: a value breaks its rule.
     """
 
     suite: str = option(",".join(_PAPER), "A,B", "whose cases are decided on, one or more")
@@ -45,7 +45,7 @@ class TrainSettings:
     def __post_init__(self) -> None:
         for suite in self.suites:
             known = ", ".join(SUITES)
-            require(suite in SUITES, "suite", f"one or more of {known}", repr(suite))
+            require(suite in SUITES, "suite", f"one or more of {known}", suite)
         require(self.network in NETWORK_NAMES, "network", " or ".join(NETWORK_NAMES), self.network)
         require(len(self.decisions) > 0, "decisions", "a number for each part", "none")
         for each in self.decisions:
@@ -56,10 +56,7 @@ class TrainSettings:
         require_seed(self.seed)
         for name, value, least in (("judged", self.judged, 0), ("lanes", self.lanes, 60)):
             require_count(name, value, least, none=True)
-            try:
-                require_memory(name, value or 0, _CASE_BYTES)
-            except ValueError as error:
-                raise SettingError(str(error)) from None
+            require_memory(name, value or 0, _CASE_BYTES)
 
     @property
     def suites(self) -> tuple[str, ...]:

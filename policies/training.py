@@ -27,17 +27,13 @@ from brax.training.agents.ppo import train as ppo
 from brax.training.distribution import NormalTanhDistribution
 from jax import Array
 
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import solved
 from planner_jax.host import signals as stopping
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.planning.plan import plan
 from planner_jax.policies import brax_compat
-from planner_jax.policies.checkpoint import (
-    CheckpointError,
-    checkpoint_of,
-    name_and_sizes,
-    save_checkpoint,
-)
+from planner_jax.policies.checkpoint import checkpoint_of, name_and_sizes, save_checkpoint
 from planner_jax.policies.curves import draw_curves
 from planner_jax.policies.environment import CatchEnv
 from planner_jax.policies.kept import KeptParts
@@ -54,7 +50,6 @@ from planner_jax.policies.settings import (
 from planner_jax.runs.environment import code_digest, installed_version
 from planner_jax.runs.manifest import to_write
 from planner_jax.runs.run_folder import RunFolder
-from planner_jax.runs.settings import SettingError
 from planner_jax.task.catch.decide import optimal_time_ratio
 from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.catch.suites import draw
@@ -104,9 +99,9 @@ def train(training: Training, out: str | os.PathLike, *, progress: bool = True) 
         The policy after the last part.
 
     Raises:
-        SettingError: the folder is that of a run with other settings or of other code, or another
+        ArgumentError: the folder is that of a run with other settings or of other code, or another
             process writes it.
-        CheckpointError: the one to begin with cannot be read, or is of another network.
+        ArgumentError: the one to begin with cannot be read, or is of another network.
     """
     brax_compat.install()
     folder = Path(out)
@@ -197,7 +192,7 @@ def _sentence(suites: Mapping[str, Any]) -> str:
 
 
 def _require_same(folder: Path, training: Training) -> None:
-    """Write down what is trained and by what, or raise `SettingError` if the folder has others."""
+    """Write down what is trained and by what, or raise `ArgumentError` if the folder has others."""
     asked = json.loads(json.dumps(dataclasses.asdict(training)))
     maker = {"version": str(installed_version("planner-jax")), "code": code_digest()}
     wanted = {**maker, **asked}
@@ -205,9 +200,8 @@ def _require_same(folder: Path, training: Training) -> None:
         found = read_asked(folder)
         for name, value in wanted.items():
             if found.get(name) != value:
-                raise SettingError(
-                    f"{name} must be {found.get(name)}, as in the run of {str(folder)!r}, "
-                    f"got {value}"
+                raise ArgumentError(
+                    name, f"{found.get(name)}, as in the run of {str(folder)!r}", value
                 )
         return
     RunFolder(folder).write_text(ASKED, json.dumps(to_write(wanted), indent=1) + "\n")
@@ -224,8 +218,8 @@ def _first_params(training: Training, network: Any) -> Any:
     if training.begin is not None:
         given = checkpoint_of(training.begin)
         if given.network != network:
-            raise CheckpointError(
-                f"begin must hold the weights of {_words(network)}, got {_words(given.network)}"
+            raise ArgumentError(
+                "begin", f"the weights of {_words(network)}", _words(given.network), verb="hold"
             )
         own = given.params
     return jax.device_get((normaliser, own, jax.jit(Value().init)(other, seen)))

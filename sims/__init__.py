@@ -2,8 +2,7 @@
 
 import importlib.util
 
-from planner_jax.core.registry import install_line
-from planner_jax.runs.settings import SettingError
+from planner_jax.core.errors import MissingExtra
 
 if not all(importlib.util.find_spec(name) for name in ("mujoco", "mujoco.mjx")):
-    raise SettingError(f"flights need MuJoCo and MJX: {install_line('sims')}")
+    raise MissingExtra("a flight", "MuJoCo and MJX", "sims")

@@ -21,6 +21,7 @@ import mujoco
 import numpy as np
 from jax import Array
 
+from planner_jax.core.errors import PlannerJaxError
 from planner_jax.perception.camera import Camera
 from planner_jax.perception.noise import StereoNoise
 from planner_jax.sims.scenery import GROUND_COLOUR, xml_colour, xml_numbers
@@ -34,7 +35,7 @@ _NEAR, _FAR = 0.1, 40.0  # [m], what is rendered
 _BALL, _POLE, _STEEL, _ARM_COLOUR, _WALL = "#FF7A0A", "#E59BC0", "#A7AFB5", "#D9D9D4", "#9AA7B4"
 
 
-class RenderError(RuntimeError):
+class RenderError(PlannerJaxError, RuntimeError):
     """Images that cannot be rendered here, in one line."""
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from flax import struct
 from jax import Array, lax
 
+from planner_jax.core.errors import ArgumentError
 from planner_jax.robot.car import CarPlan, pose_at
 from planner_jax.sims.model import World, step
 from planner_jax.sims.noise import CONTROL_RATE, FRAME_RATE, PlaneSensing
@@ -40,10 +41,11 @@ class DriveLoop:
 
     def __post_init__(self) -> None:
         if not isinstance(self.world.robot, Car):
-            raise ValueError(f"world must hold a car, got a {type(self.world.robot).__name__}")
+            raise ArgumentError(
+                "world", "a car", verb="hold", shown=f"a {type(self.world.robot).__name__}"
+            )
         if not np.isclose(self.world.timestep * CONTROL_RATE, 1.0):
-            rule = f"timestep must be {1.0 / CONTROL_RATE:g}"
-            raise ValueError(f"{rule}, got {self.world.timestep}")
+            raise ArgumentError("timestep", f"{1.0 / CONTROL_RATE:g}", self.world.timestep)
 
     @property
     def car(self) -> Car:

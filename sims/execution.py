@@ -16,6 +16,7 @@ import numpy as np
 from flax import struct
 from jax import Array, lax
 
+from planner_jax.core.errors import ArgumentError
 from planner_jax.sims.model import World, step
 from planner_jax.sims.robot import Physics
 from planner_jax.sims.robots.arm.control import Course, JointReference
@@ -197,9 +198,9 @@ def execute(
         ValueError: the world has no arm, or steps of another length.
     """
     if not isinstance(world.robot, ShieldArm):
-        raise ValueError(f"world must hold an arm, got a {type(world.robot).__name__}")
+        raise ArgumentError("world", "an arm", verb="hold", shown=f"a {type(world.robot).__name__}")
     if not np.isclose(world.timestep, TIMESTEP):
-        raise ValueError(f"timestep must be {TIMESTEP:g}, got {world.timestep}")
+        raise ArgumentError("timestep", f"{TIMESTEP:g}", world.timestep)
     begin, on, wanted = _compiled(world)
     dtype = jnp.asarray(courses.begin).dtype
     num = len(courses.begin)

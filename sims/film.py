@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
+from planner_jax.core.errors import ArgumentError
 from planner_jax.host.files import replacing
 from planner_jax.runs.style import BLUE, GREEN, GREY, INK, ORANGE, PALE, PURPLE, RED, SKY
 from planner_jax.sims.recording import Recording, frame
@@ -24,16 +25,12 @@ _FRAME = 2  # looks a frame
 _GHOSTS, _APART = 7, 0.45  # at most; [m] of way from one to the next
 
 
-class FilmError(ValueError):
-    """A film that cannot be made, in one line."""
-
-
 def require_film(path: Path) -> None:
-    """Raise `FilmError` unless a film can be written here."""
+    """Raise `ArgumentError` unless a film can be written here."""
     if path.suffix not in FORMATS:
-        raise FilmError(f"video must end in {' or '.join(FORMATS)}, got {path.name!r}")
+        raise ArgumentError("video", " or ".join(FORMATS), path.name, verb="end in")
     if path.suffix == ".mp4" and shutil.which("ffmpeg") is None:
-        raise FilmError(f"video must end in .gif where ffmpeg is not installed, got {path.name!r}")
+        raise ArgumentError("video", ".gif where ffmpeg is not installed", path.name, verb="end in")
 
 
 class Scene:
@@ -264,7 +261,7 @@ def film_flights(path: Path, task: FlightTask, recording: Recording, num: int) -
         num: how many flights are filmed.
 
     Raises:
-        FilmError: the file cannot be of that kind.
+        ArgumentError: the file cannot be of that kind.
     """
     require_film(path)
     fps = 20

@@ -15,6 +15,7 @@ import numpy as np
 from jax import Array, lax
 
 from planner_jax.ball.flight import BallState, fly
+from planner_jax.core.errors import ArgumentError
 from planner_jax.sims import sensing as sight
 from planner_jax.sims.loop_state import FlightState, Loop
 from planner_jax.sims.model import at_rest, placed
@@ -208,18 +209,19 @@ def require_world(loop: Loop, kind: str, num_balls: int, **planned: Any) -> None
     """
     world, tool = loop.world, loop.world.carrier.tool
     if tool.kind != kind:
-        raise ValueError(f"world must carry a {kind}, got a {tool.kind}")
+        raise ArgumentError("world", f"a {kind}", verb="carry", shown=f"a {tool.kind}")
     if world.num_balls != num_balls:
-        raise ValueError(f"world must have {num_balls} balls, got {world.num_balls}")
+        raise ArgumentError("world", f"{num_balls} balls", world.num_balls, verb="have")
     flown = {"gravity": world.gravity}
     flown |= {f"{kind}_height": tool.height, f"{kind}_radius": tool.radius}
     for name, values in planned.items():
         apart = ~np.isclose(values, flown[name], rtol=1e-5, atol=0.0)
         if apart.any():
             value = np.asarray(values)[apart][0]
-            raise ValueError(
-                f"{name} must be the same in plan and flown world, "
-                f"got {value:g} in the plan's case and {flown[name]:g} in the world"
+            raise ArgumentError(
+                name,
+                "the same in plan and flown world",
+                shown=f"{value:g} in the plan's case and {flown[name]:g} in the world",
             )
 
 
@@ -232,15 +234,13 @@ def require_plan(plan: Any, kind: type, head_state: Any) -> None:
         head_state: (B, 4, 3) of the robot.
     """
     if not isinstance(plan, kind):
-        raise ValueError(f"plan must be a {kind.__name__}, got a {type(plan).__name__}")
+        raise ArgumentError("plan", f"a {kind.__name__}", shown=f"a {type(plan).__name__}")
     begin = np.asarray(plan.trajectory.coeffs)[:, 0, 0]
     place = np.asarray(head_state)[:, 0]
     if begin.shape != place.shape:
-        raise ValueError(f"plan must be of {len(place)} flights, got {len(begin)}")
+        raise ArgumentError("plan", f"of {len(place)} flights", len(begin))
     away = np.linalg.norm(begin - place, axis=1)
     if away.size and not np.nanmax(away) < 0.01:
         lane = int(np.nanargmax(away))
-        raise ValueError(
-            f"plan must begin where its robot is, got {away[lane]:.2f} m from there "
-            f"in flight {lane}"
-        )
+        shown = f"{away[lane]:.2f} m from there in flight {lane}"
+        raise ArgumentError("plan", "where its robot is", verb="begin", shown=shown)

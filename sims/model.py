@@ -32,6 +32,7 @@ with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp, not need
     from mujoco import mjx
 
 from planner_jax.ball.flight import BallState, ball_acceleration
+from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.sims.robot import Physics, Robot, ToolRobot
 from planner_jax.sims.scenery import (
     GROUND_COLOUR,
@@ -60,9 +61,9 @@ class World:
 
     def __post_init__(self) -> None:
         if self.num_balls < 0:
-            raise ValueError(f"num_balls must be >= 0, got {self.num_balls}")
+            raise ArgumentError("num_balls", ">= 0", self.num_balls)
         if not self.timestep > 0.0:
-            raise ValueError(f"timestep must be > 0, got {self.timestep}")
+            raise ArgumentError("timestep", "> 0", self.timestep)
 
     @property
     def carrier(self) -> ToolRobot:
@@ -72,7 +73,9 @@ class World:
             TypeError: it carries no tool.
         """
         if not hasattr(self.robot, "tool"):
-            raise TypeError(f"robot must carry a tool, got a {type(self.robot).__name__}")
+            raise ArgumentTypeError(
+                "robot", "a tool", verb="carry", shown=f"a {type(self.robot).__name__}"
+            )
         return cast(ToolRobot, self.robot)
 
 

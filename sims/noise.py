@@ -5,11 +5,13 @@ Nothing here needs JAX or MuJoCo, so that settings can be checked before either 
 
 import dataclasses
 
+from planner_jax.core.errors import ArgumentError
+
 
 def require_whole(ratio: float, name: str, rule: str, value: float) -> None:
     """Raise `ValueError`, "name must be rule, got value", unless a ratio is a whole number."""
     if abs(ratio - round(ratio)) > 1e-6 or (ratio > 0.0 and round(ratio) == 0):
-        raise ValueError(f"{name} must be {rule}, got {value:g}")
+        raise ArgumentError(name, rule, value)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,11 +34,11 @@ class Sensing:
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if not all(part >= 0.0 for part in (value if isinstance(value, tuple) else (value,))):
-                raise ValueError(f"{field.name} must be >= 0, got {value}")
+                raise ArgumentError(field.name, ">= 0", value)
         if not self.rate > 0.0:
-            raise ValueError(f"rate must be > 0, got {self.rate}")
+            raise ArgumentError("rate", "> 0", self.rate)
         if not self.dropout < 1.0:
-            raise ValueError(f"dropout must be < 1, got {self.dropout}")
+            raise ArgumentError("dropout", "< 1", self.dropout)
 
     def looks_per_plan(self, replan: float) -> int:
         """Looks from plan to plan at a rate of planning anew; one where that rate is 0.
@@ -48,7 +50,7 @@ class Sensing:
             ValueError: the rate is negative or does not divide that of the looks.
         """
         if not replan >= 0.0:
-            raise ValueError(f"replan must be >= 0, got {replan}")
+            raise ArgumentError("replan", ">= 0", replan)
         if replan == 0.0:
             return 1
         rule = f"a divisor of the looks' {self.rate:g} Hz"
@@ -98,7 +100,7 @@ class PlaneSensing:
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if not all(part >= 0.0 for part in (value if isinstance(value, tuple) else (value,))):
-                raise ValueError(f"{field.name} must be >= 0, got {value}")
+                raise ArgumentError(field.name, ">= 0", value)
         rule = f"a multiple of the control steps' {1.0 / CONTROL_RATE:g} s"
         require_whole(self.latency * CONTROL_RATE, "latency", rule, self.latency)
 
@@ -112,7 +114,7 @@ class PlaneSensing:
             ValueError: the rate is negative or does not divide that of the frames.
         """
         if not replan >= 0.0:
-            raise ValueError(f"replan must be >= 0, got {replan}")
+            raise ArgumentError("replan", ">= 0", replan)
         if replan == 0.0:
             return FRAME_RATE
         require_whole(FRAME_RATE / replan, "replan", f"a divisor of {FRAME_RATE} Hz", replan)

@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow as pa
 
 from planner_jax.ball.flight import BallState
+from planner_jax.core.errors import ArgumentError
 from planner_jax.runs.columns import BOOL, LIST, VECTOR, RefereedBatch, leaves_of, rows_of
 from planner_jax.runs.source import Chunk
 from planner_jax.sims.loop_state import Flown
@@ -105,7 +106,7 @@ def frame(recording: Recording, robot: Robot, flight: int, look: int) -> Frame:
         ("look", look, recording.time.shape[1]),
     ):
         if not 0 <= value < number:
-            raise ValueError(f"{name} must be >= 0 and < {number}, got {value}")
+            raise ArgumentError(name, f">= 0 and < {number}", value)
     flown = np.isfinite(recording.robot[flight]).all(axis=1)
     at = min(look, int(np.flatnonzero(flown)[-1]))
     pose = recording.robot[flight, at]
@@ -221,9 +222,9 @@ def read_recording(table: pa.Table) -> Recording:
     found = dict(zip(table.column_names, table.schema.types, strict=True))
     if found != wanted:
         odd = sorted(name for name in wanted | found if found.get(name) != wanted.get(name))
-        raise ValueError(f"columns must be those of a recording, got others for {', '.join(odd)}")
+        raise ArgumentError("columns", "those of a recording", shown=f"others for {', '.join(odd)}")
     if not len(table):
-        raise ValueError("flights must be one or more, got none")
+        raise ArgumentError("flights", "one or more", shown="none")
     columns = {
         name: np.array(table[name].to_pylist(), None if name in ("index", "success") else float)
         for name in table.column_names

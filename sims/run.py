@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from planner_jax.core.choices import require
+from planner_jax.core.errors import ArgumentError
 from planner_jax.host import signals as stopping
 from planner_jax.runs.columns import (
     BOOL,
@@ -26,12 +28,12 @@ from planner_jax.runs.columns import RefereedBatch as FlownBatch
 from planner_jax.runs.dataset import Dataset
 from planner_jax.runs.environment import environment, require_backend
 from planner_jax.runs.run_folder import RunFolder
-from planner_jax.runs.settings import SettingError, require, settings_of_manifest
+from planner_jax.runs.settings import settings_of_manifest
 from planner_jax.runs.source import Chunk
 from planner_jax.runs.summary import percent, wilson_interval
 from planner_jax.runs.table import RateTable, own_cells, to_html, to_markdown
 from planner_jax.runs.timing import CompileClock, Stopwatch
-from planner_jax.sims.film import FilmError, draw_flight, film_flights, require_film
+from planner_jax.sims.film import draw_flight, film_flights, require_film
 from planner_jax.sims.recording import FLIGHTS, Recording, read_recording, to_rows
 from planner_jax.sims.settings import FlySettings, fly_settings
 from planner_jax.sims.task import FlightTask
@@ -72,16 +74,13 @@ def start_flights(
         The manifest.
 
     Raises:
-        SettingError: an argument breaks a rule; nothing is left behind.
+        ArgumentError: an argument breaks a rule; nothing is left behind.
     """
     folder = RunFolder(out)
     require(1 <= record <= _RECORDED, "record", f">= 1 and <= {_RECORDED}", record)
     if video is not None:
-        require(os.path.basename(video) == video, "video", "a file name", repr(video))
-        try:
-            require_film(Path(video))
-        except FilmError as error:
-            raise SettingError(str(error)) from None
+        require(os.path.basename(video) == video, "video", "a file name", video)
+        require_film(Path(video))
     folder.require_new()
     require_backend()
     flight = settings.flight()
@@ -110,7 +109,7 @@ def _dropped(folder: RunFolder) -> str:
     try:
         if folder.read_manifest()["state"] == "complete":
             return f"the flights are finished: {folder.path}"
-    except SettingError:
+    except ArgumentError:
         pass
     folder.discard()
     return f"{stopping.NOTHING}: flights are kept when all of them are flown"
@@ -136,16 +135,16 @@ def read_flights(folder: RunFolder) -> tuple[dict[str, Any], FlightTask, Recordi
     """Manifest, task and recording of a finished run of flights.
 
     Raises:
-        SettingError: the folder is not that of such a run.
+        ArgumentError: the folder is not that of such a run.
     """
     manifest = folder.read_manifest()
     flights = Dataset(folder.path / FLIGHTS)
     kind, _, task = str(manifest["kind"]).partition(" ")
     if kind != "fly":
-        raise SettingError(f"{folder.name} must be a run of flights, got a {manifest['kind']}")
+        raise ArgumentError(folder.name, "a run of flights", shown=f"a {manifest['kind']}")
     if manifest["state"] != "complete" or not flights.files():
-        rule = f"{folder.name} must be finished, with its {FLIGHTS}"
-        raise SettingError(f"{rule}, got {str(folder.path)!r}; fly it again")
+        shown = f"{str(folder.path)!r}; fly it again"
+        raise ArgumentError(folder.name, f"finished, with its {FLIGHTS}", shown=shown)
     folder.require_whole(folder.plans, "fly it again", manifest["summary"]["num"])
     folder.require_whole(flights, "fly it again")
     settings = settings_of_manifest(fly_settings(task), manifest["parameters"], folder.name)
@@ -153,18 +152,20 @@ def read_flights(folder: RunFolder) -> tuple[dict[str, Any], FlightTask, Recordi
         recording = read_recording(flights.read())
     except (pa.ArrowException, OSError, ValueError) as error:
         why = " ".join(str(error).split())
-        raise SettingError(f"{folder.name} must have whole {FLIGHTS}: {why}") from None
+        raise ArgumentError(folder.name, f"whole {FLIGHTS}: {why}", verb="have", shown="") from None
     return manifest, settings.flight(), recording
 
 
 def require_sound(folder: RunFolder) -> None:
-    """Raise `SettingError` unless the files of flights are whole, and their summary counts them."""
+    """Raise `ArgumentError` unless files of flights are whole, and their summary counts them."""
     manifest, flight, _ = read_flights(folder)
     try:
         counted = _summary(flight, folder.plans.read())
     except (pa.ArrowException, OSError, KeyError) as error:
         why = " ".join(str(error).split())
-        raise SettingError(f"{folder.name} must have whole rows: {why}; fly it again") from None
+        raise ArgumentError(
+            folder.name, f"whole rows: {why}; fly it again", verb="have", shown=""
+        ) from None
     require_counted(folder, manifest["summary"], counted)
 
 
@@ -248,7 +249,7 @@ def write_flight_report(folder: RunFolder) -> None:
         folder: with `manifest.json`, `plans/` and `flights/`; a film may be there.
 
     Raises:
-        SettingError: the folder is not that of a finished run of flights.
+        ArgumentError: the folder is not that of a finished run of flights.
     """
     manifest, flight, recording = read_flights(folder)
     folder.figures.mkdir(exist_ok=True)

@@ -8,17 +8,9 @@ import math
 import pkgutil
 from typing import Any, ClassVar
 
-from planner_jax.core.registry import Task, UnknownName, all_tasks, split_name
-from planner_jax.core.scales import SCALES
-from planner_jax.host.memory import require_memory
-from planner_jax.runs.settings import (
-    SettingError,
-    option,
-    require,
-    require_count,
-    require_one_of,
-    require_seed,
-)
+from planner_jax.core.choices import SCALES, require, require_memory, require_one_of, require_seed
+from planner_jax.core.registry import Task, all_tasks, split_name
+from planner_jax.runs.settings import option, require_count
 from planner_jax.sims.noise import NOISES, PLANE_NOISES, PlaneSensing, Sensing, require_whole
 from planner_jax.sims.robots.arm.drives import ENCODERS, TORQUES, Drives
 from planner_jax.sweep.block.settings import REGIMES, require_frame_rate, require_moderate
@@ -47,10 +39,10 @@ def fly_settings(task: str) -> type["FlySettings"]:
         task: its name in the registry, which knows the settings as the task's `flight`.
 
     Raises:
-        SettingError: there is no task of that name, or it has no flights.
+        ArgumentError: there is no task of that name, or it has no flights.
     """
     flown = {name: found.flight for name, found in all_tasks().items() if found.flight}
-    require(task in flown, "task", f"one that can be flown ({', '.join(flown)})", repr(task))
+    require(task in flown, "task", f"one that can be flown ({', '.join(flown)})", task)
     return pkgutil.resolve_name(flown[task])
 
 
@@ -71,7 +63,7 @@ class FlySettings:
     """The settings that the flights of all tasks have; a task's own class adds its own.
 
     Raises:
-        SettingError: a value breaks its rule; one line that begins with its name.
+        ArgumentError: a value breaks its rule; one line that begins with its name.
     """
 
     num: int = option(64, "N", "flights")
@@ -89,28 +81,19 @@ class FlySettings:
             require_count(name, getattr(self, name), 1, none=name == "batch")
         require_seed(self.seed)
         self.require_memory()
-        try:
-            self.TASK.split_planner(self.planner)
-        except UnknownName as error:
-            raise SettingError(str(error)) from None
+        self.TASK.split_planner(self.planner)
         require(not self.rate > _FASTEST, "replan", f"<= {_FASTEST:g}", self.rate)
         again = self.rate > 0.0
         require(not again or self._is_first, "replan", "0 for other planners", self.rate)
-        try:
-            self.check_rate()
-        except ValueError as error:
-            raise SettingError(str(error)) from None
+        self.check_rate()
 
     def require_memory(self) -> None:
-        """Raise `SettingError` if the flights that are simulated at once do not fit into memory."""
-        try:
-            if self.batch is None:
-                require_memory("num", min(self.num, _AT_ONCE), _FLIGHT_BYTES)
-            else:
-                require_memory("batch", self.batch, _FLIGHT_BYTES)
-            require_memory("num", self.num, _FLOWN_BYTES)
-        except ValueError as error:
-            raise SettingError(str(error)) from None
+        """Raise `ArgumentError` unless flights that are simulated at once fit into memory."""
+        if self.batch is None:
+            require_memory("num", min(self.num, _AT_ONCE), _FLIGHT_BYTES)
+        else:
+            require_memory("batch", self.batch, _FLIGHT_BYTES)
+        require_memory("num", self.num, _FLOWN_BYTES)
 
     @property
     def rate(self) -> float:
@@ -178,10 +161,7 @@ class CatchFly(BallFly):
         object.__setattr__(self, "robot", checked_robot(self.robot, "net"))
         require_count("balls", self.balls, 1)
         require(self.balls <= _MOST_BALLS, "balls", f"<= {_MOST_BALLS}", self.balls)
-        try:
-            split_name(_FLOWN_DECISIONS, "decide", self.decide, TRAINED)
-        except UnknownName as error:
-            raise SettingError(str(error)) from None
+        split_name(_FLOWN_DECISIONS, "decide", self.decide, TRAINED)
 
     @property
     def redecide_rate(self) -> float:
@@ -192,7 +172,7 @@ class CatchFly(BallFly):
         """As for every task.
 
         Raises:
-            SettingError: the policy's file cannot be read.
+            ArgumentError: the policy's file cannot be read.
         """
         from planner_jax.task.named_decision import named_decision
 
@@ -362,16 +342,13 @@ class BlockFly(FlySettings):
         """As for every task.
 
         Raises:
-            SettingError: the planner's file is no library, or one of another scene or limits.
+            ArgumentError: the planner's file is no library, or one of another scene or limits.
         """
         if BLOCK.split_planner(self.planner)[1]:
             from planner_jax.task.block import draw
 
-            try:
-                planner = BLOCK.make_planner(self.planner, {})
-                planner.check(draw(1, self.suite, regime=self.regime))
-            except ValueError as error:
-                raise SettingError(str(error)) from None
+            planner = BLOCK.make_planner(self.planner, {})
+            planner.check(draw(1, self.suite, regime=self.regime))
         return super().flight()
 
     def check_rate(self) -> None:

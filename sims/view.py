@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from planner_jax.core.registry import install_line
-from planner_jax.runs.settings import SettingError, require
+from planner_jax.core.choices import require
+from planner_jax.core.errors import ArgumentError, MissingExtra
 from planner_jax.runs.style import BLUE, GREEN, GREY, INK, RED, SKY
 from planner_jax.sims.film import BALL_COLOURS
 from planner_jax.sims.guard import guarded
@@ -45,10 +45,10 @@ def free_address(host: str, port: int) -> str:
     """The numeric address of a host of this machine whose port is free; 0 stands for any.
 
     Raises:
-        SettingError: there is none; one line that begins with `host` or `port`.
+        ArgumentError: there is none; one line that begins with `host` or `port`.
     """
     require(0 <= port <= 65535, "port", ">= 0 and <= 65535", port)
-    own = SettingError(f"host must be an address of this machine, got {host!r}")
+    own = ArgumentError("host", "an address of this machine", host)
     try:
         found = sorted(socket.getaddrinfo(host, port, type=socket.SOCK_STREAM))[0]
     except (socket.gaierror, UnicodeError):
@@ -60,7 +60,7 @@ def free_address(host: str, port: int) -> str:
         except OSError as error:
             if error.errno == errno.EADDRNOTAVAIL:
                 raise own from None
-            raise SettingError(f"port must be free, got {port} ({error.strerror})") from None
+            raise ArgumentError("port", "free", shown=f"{port} ({error.strerror})") from None
     return str(found[4][0])
 
 
@@ -68,12 +68,12 @@ def _viser() -> Any:
     """The package.
 
     Raises:
-        SettingError: it is not installed.
+        ArgumentError: it is not installed.
     """
     try:
         return importlib.import_module("viser")
     except ModuleNotFoundError:
-        raise SettingError(f"the viewer needs the package viser: {install_line('view')}") from None
+        raise MissingExtra("the viewer", "the package viser", "view") from None
 
 
 class Viewer:
@@ -101,7 +101,7 @@ class Viewer:
             port: 0 takes any that is free.
 
         Raises:
-            SettingError: viser is missing, or the page cannot be served there.
+            ArgumentError: viser is missing, or the page cannot be served there.
         """
         viser = _viser()
         address = free_address(host, port)
@@ -113,11 +113,11 @@ class Viewer:
             self._server = viser.ViserServer(address, port, label="planner-jax", verbose=False)
         if not is_guarded():
             self._server.stop()
-            raise SettingError("the viewer cannot be guarded with this version of viser")
+            raise ArgumentError("viser", "a version that can be guarded", shown="another one")
         bound = self._server.get_port()
         if port and bound != port:  # someone was faster
             self._server.stop()
-            raise SettingError(f"port must be free, got {port}")
+            raise ArgumentError("port", "free", port)
         self.url = f"http://{f'[{host}]' if ':' in host else host}:{bound}"
         self.url += "" if token is None else f"/?token={token}"
         self._lock = threading.RLock()

@@ -19,7 +19,7 @@ from planner_jax.benchmarks.cost_gap import cost_gaps, gap_figures
 from planner_jax.benchmarks.run import Bench
 from planner_jax.benchmarks.throughput import report
 from planner_jax.core import registry
-from planner_jax.runs.settings import SettingError
+from planner_jax.core.errors import ArgumentError
 
 NEEDS = {"oracle_hit": "casadi", "policy_peer": "stable_baselines3"}  # not what tests install
 BENCHMARKS = sorted(Path(benchmarks.__path__[0]).glob("*.py"))
@@ -87,7 +87,7 @@ def test_a_run_that_fails_says_so_and_no_run_is_overwritten(tmp_path):
     with pytest.raises(ZeroDivisionError), Bench("nothing", {}, tmp_path / "run"):
         _ = 1 / 0
     assert read(tmp_path / "run")["state"] == "failed"
-    with pytest.raises(SettingError, match="out must be a new or empty folder"):
+    with pytest.raises(ArgumentError, match="out must be a new or empty folder"):
         Bench("nothing", {}, tmp_path / "run")
 
 
@@ -172,5 +172,5 @@ def test_a_yardstick_for_cases_of_another_class_is_none():
 
 
 def test_a_planner_without_rounds_has_no_iterations_to_set(halving, tmp_path):
-    with pytest.raises(SettingError, match="iterations must be left out"):
+    with pytest.raises(ArgumentError, match="iterations must be left out"):
         report(task="halve", batch=[4], repeat=1, iterations=7, out=tmp_path / "run")

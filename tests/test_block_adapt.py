@@ -12,9 +12,10 @@ import planner_jax as pj
 from planner_jax.baselines.block.library import build as building
 from planner_jax.baselines.block.library.adapt import AdaptBlock, Effort, adapt_planner
 from planner_jax.baselines.block.library.cells import Face, Layout, cell_of, cells_around
-from planner_jax.baselines.block.library.file import LibraryFileError, save_library
-from planner_jax.baselines.block.library.planner import LibraryBlock, OtherLibrary
+from planner_jax.baselines.block.library.file import save_library
+from planner_jax.baselines.block.library.planner import LibraryBlock
 from planner_jax.baselines.block.library.table import Row, Setting, library_of, packed
+from planner_jax.core.errors import ArgumentError
 from planner_jax.robot.arm import REGIMES
 from planner_jax.robot.arm_mjcf import irb1600
 from planner_jax.task.block.default_planner import OnlineBlock
@@ -154,16 +155,16 @@ def test_statuses_of_a_batch_say_why_and_the_referee_confirms_what_is_solved(pla
 def test_what_is_wrong_with_a_file_or_with_cases_is_named(tmp_path):
     with pytest.raises(ValueError, match="adapt:FILE, which `planner-jax library build FILE`"):
         pj.block.planner("adapt")
-    with pytest.raises(LibraryFileError, match="^library must be a file, got 'no/file'"):
+    with pytest.raises(ArgumentError, match="^library must be a file, got 'no/file'"):
         pj.block.planner("adapt:no/file")
     path = tmp_path / "a.lib"
     save_library(path, library())
-    with pytest.raises(LibraryFileError, match="^library must have motions of 10 pieces, got 6 in"):
+    with pytest.raises(ArgumentError, match="^library must have motions of 10 pieces, got 6 in"):
         pj.block.planner(f"adapt:{path}")
     save_library(path, library(pieces=10))
     own = adapt_planner(path)
     own.check(pj.block.draw(2))
-    with pytest.raises(OtherLibrary, match=r"one of [0-9a-f]{12} for cases of [0-9a-f]{12}$"):
+    with pytest.raises(ArgumentError, match=r"one of [0-9a-f]{12} for cases of [0-9a-f]{12}$"):
         own.check(pj.block.draw(1, regime="R1"))
 
 

@@ -22,8 +22,8 @@ from planner_jax.baselines.block.library.cells import (
     tunnels,
 )
 from planner_jax.baselines.block.library.coverage import check, coverage
-from planner_jax.baselines.block.library.file import LibraryFileError, load_library, save_library
-from planner_jax.baselines.block.library.planner import LibraryBlock, OneBall, OtherLibrary
+from planner_jax.baselines.block.library.file import load_library, save_library
+from planner_jax.baselines.block.library.planner import LibraryBlock, OneBall
 from planner_jax.baselines.block.library.table import (
     Row,
     Setting,
@@ -34,9 +34,9 @@ from planner_jax.baselines.block.library.table import (
 )
 from planner_jax.cli import library as command
 from planner_jax.cli.main import main
+from planner_jax.core.errors import ArgumentError
 from planner_jax.robot.arm import REGIMES
 from planner_jax.robot.arm_mjcf import irb1600
-from planner_jax.runs.settings import SettingError
 from planner_jax.task.block.motion import profiles
 from planner_jax.task.block.scene import Box, paper_scene
 
@@ -252,11 +252,11 @@ def test_motions_that_end_in_motion_wait_and_others_begin_at_once():
 def test_a_library_of_other_cases_is_refused_with_both_hashes():
     planner = LibraryBlock(made_up())
     planner.check(pj.block.draw(2))
-    with pytest.raises(OtherLibrary, match=r"one of [0-9a-f]{12} for cases of [0-9a-f]{12}$"):
+    with pytest.raises(ArgumentError, match=r"one of [0-9a-f]{12} for cases of [0-9a-f]{12}$"):
         planner.check(pj.block.draw(1, regime="R3"))
-    with pytest.raises(OtherLibrary, match="one of"):
+    with pytest.raises(ArgumentError, match="one of"):
         planner.check(pj.block.draw(1, "open"))
-    with pytest.raises(OtherLibrary, match="angles must be a home of the library"):
+    with pytest.raises(ArgumentError, match="angles must be a home of the library"):
         planner.check(pj.block.case(np.ones(3), np.ones(3), angles=np.zeros(6)))
 
 
@@ -280,7 +280,7 @@ def test_what_is_wrong_with_a_file_is_told_in_one_line(tmp_path, monkeypatch):
     path = tmp_path / "a.lib"
 
     def refused(says):
-        with pytest.raises(LibraryFileError, match=says) as caught:
+        with pytest.raises(ArgumentError, match=says) as caught:
             load_library(path)
         assert "\n" not in str(caught.value)
 
@@ -424,7 +424,7 @@ def test_a_home_in_collision_is_refused(tmp_path):
     ],
 )
 def test_what_is_wrong_with_a_build_is_named(options, says, tmp_path):
-    with pytest.raises(SettingError, match=says):
+    with pytest.raises(ArgumentError, match=says):
         command.build_library(str(tmp_path / "a"), **options)
 
 
@@ -435,9 +435,9 @@ def test_a_library_is_shown_with_a_map(tmp_path, capsys):
     told = capsys.readouterr().out
     assert "24 pairs of cells, outer +x 2x2 +z 1x2; inner +x 2x2" in told
     assert picture.stat().st_size > 10_000
-    with pytest.raises(SettingError, match="^library must be a file, got"):
+    with pytest.raises(ArgumentError, match="^library must be a file, got"):
         command.show_library(str(tmp_path / "b.lib"))
-    with pytest.raises(SettingError, match=r"^pole must be finite, got \[0\.8, nan\]$"):
+    with pytest.raises(ArgumentError, match=r"^pole must be finite, got \[0\.8, nan\]$"):
         command.repair_library(str(path), pole=[0.8, float("nan")], out=str(tmp_path / "b.lib"))
 
 
@@ -462,7 +462,7 @@ def test_a_planner_of_a_file_needs_the_file_and_others_take_none():
         pj.block.planner("library")
     with pytest.raises(ValueError, match="^planner online takes no file, got 'online:x'$"):
         pj.block.planner("online:x")
-    with pytest.raises(LibraryFileError, match="^library must be a file, got 'no/file'"):
+    with pytest.raises(ArgumentError, match="^library must be a file, got 'no/file'"):
         pj.block.planner("library:no/file")
 
 

@@ -13,7 +13,7 @@ import planner_jax as pj
 from planner_jax.baselines.block.free_space import FreeSpace
 from planner_jax.baselines.block.path_timing import PIECES, timed_way
 from planner_jax.baselines.parts.bang_bang import bang_bang, least_times
-from planner_jax.core.registry import MissingExtra, install_line
+from planner_jax.core.errors import MissingExtra, install_line
 from planner_jax.robot.arm import REGIMES
 from planner_jax.robot.arm_dynamics import inverse_dynamics, motion_torques
 from planner_jax.robot.arm_mjcf import irb1600

@@ -9,10 +9,10 @@ from test_block import SMALL
 
 import planner_jax as pj
 from planner_jax.ball.flight import drag_free_flight
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import Status, lane
 from planner_jax.perception.camera import looking_at
 from planner_jax.perception.fit import Sight
-from planner_jax.runs.settings import SettingError
 from planner_jax.studies.block.contact_check import delay_motion, end_at_contact
 from planner_jax.studies.block.observation import cautious, eye
 from planner_jax.studies.block.receding import Aim, decide
@@ -152,7 +152,7 @@ def test_times_before_a_motion_are_refused(cases):
     ],
 )
 def test_settings_that_do_not_fit_are_named(given, name):
-    with pytest.raises(SettingError, match=f"^{name} must be"):
+    with pytest.raises(ArgumentError, match=f"^{name} must be"):
         BlockSettings(**given)
 
 

@@ -145,7 +145,9 @@ def test_bad_serves_are_named_by_file_and_line(capsys, elsewhere, tmp_path):
         (gone, "1_1_1_p.csv:2: serve must land in the hitting half"),
         (empty, "1_1_1_p.csv: file must have a row of numbers"),
     ]:
-        expect_one_line(capsys, ["sweep", "hit", "--serves", folder], "--serves in", part)
+        expect_one_line(
+            capsys, ["sweep", "hit", "--serves", folder], "--serves must be sound", part
+        )
     assert not list(elsewhere.iterdir())
 
 

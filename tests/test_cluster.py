@@ -13,9 +13,9 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.cli.main import main
-from planner_jax.core.registry import MissingExtra, install_line
+from planner_jax.core.errors import ArgumentError, MissingExtra, install_line
 from planner_jax.runs.run_folder import RunFolder
-from planner_jax.runs.settings import SettingError, WorkersFailed
+from planner_jax.runs.settings import WorkersFailed
 from planner_jax.sweep import cluster, run
 from planner_jax.sweep.chunks import Maker
 from planner_jax.sweep.hit.settings import HitSettings
@@ -157,7 +157,7 @@ def test_a_cluster_with_an_address_is_joined(monkeypatch, tmp_path, ray):
 
 def test_an_address_at_which_nothing_answers_is_named(monkeypatch, tmp_path, ray):
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
-    with pytest.raises(SettingError, match="RAY_ADDRESS must be .* got '127.0.0.1:1'"):
+    with pytest.raises(ArgumentError, match="RAY_ADDRESS must be .* got '127.0.0.1:1'"):
         start_sweep(TASK, SETTINGS, tmp_path / "run", progress=False, workers="ray")
     assert not (tmp_path / "run").exists() and not ray.begun
 
@@ -217,7 +217,7 @@ def test_a_worker_that_would_make_other_rows_is_refused(tmp_path, monkeypatch, r
 
 def test_a_serve_drawn_late_by_a_worker_that_breaks_a_rule_leaves_nothing_behind(tmp_path, ray):
     late = HitSettings(num=40, batch=4, delay=1.56, seed=0)
-    with pytest.raises(SettingError, match="delay must be"):
+    with pytest.raises(ArgumentError, match="delay must be"):
         start_sweep(TASK, late, tmp_path / "run", progress=False, workers="ray")
     assert not (tmp_path / "run").exists() and ray.ended == 1
 
@@ -280,14 +280,14 @@ def test_workers_on_cores_compute_with_as_many_threads_as_the_run(
 
 def test_a_run_on_a_gpu_is_refused_by_a_cluster_without(tmp_path, gpus):
     gpus.resources = {"CPU": 64.0}
-    with pytest.raises(SettingError, match="workers must be of a cluster with GPUs"):
+    with pytest.raises(ArgumentError, match="workers must be of a cluster with GPUs"):
         start_sweep(TASK, SETTINGS, tmp_path / "run", progress=False, workers="ray")
     assert not (tmp_path / "run").exists() and gpus.ended == 1
 
 
 def test_a_process_whose_jax_has_several_gpus_is_refused(tmp_path, monkeypatch, gpus):
     monkeypatch.setattr(cluster.jax, "device_count", lambda: 2)
-    with pytest.raises(SettingError, match="workers must be asked for before JAX .* got 2"):
+    with pytest.raises(ArgumentError, match="workers must be asked for before JAX .* got 2"):
         start_sweep(TASK, SETTINGS, tmp_path / "run", progress=False, workers="ray")
     assert not (tmp_path / "run").exists() and gpus.ended == 1
 
@@ -299,7 +299,7 @@ def test_a_worker_whose_jax_has_no_device_ends_a_run_that_can_be_finished(
 
     def backend():
         if (platform := next(platforms, None)) is None:
-            raise SettingError("JAX_PLATFORMS must name a platform that works here, got 'x' (no)")
+            raise ArgumentError("JAX_PLATFORMS must name a platform that works here, got 'x' (no)")
         return platform
 
     out = tmp_path / "run"

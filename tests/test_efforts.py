@@ -3,8 +3,8 @@
 import pytest
 
 import planner_jax as pj
+from planner_jax.core.errors import ArgumentError
 from planner_jax.optimise.problem import Stage
-from planner_jax.runs.settings import SettingError
 from planner_jax.sweep.catch.settings import CatchSettings
 from planner_jax.sweep.hit.settings import HitSettings
 
@@ -30,6 +30,6 @@ def test_an_effort_that_is_none_and_planners_without_one_are_named():
         with pytest.raises(ValueError, match="effort must be feasible for a .*, which minimises"):
             task.planner(name, effort="good")
     for kind, name in ((HitSettings, "juggle"), (CatchSettings, "mpp")):
-        with pytest.raises(SettingError, match=f"effort must be left out for the planner {name}"):
+        with pytest.raises(ArgumentError, match=f"effort must be left out for the planner {name}"):
             kind(planner=name, effort="good")
         assert kind(effort="good").planner_options()["effort"] == "good"

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 import planner_jax as pj
+from planner_jax.core.errors import ArgumentError
 from planner_jax.recovery.case import EndingCase, end_state
 from planner_jax.recovery.planner import RestPlanner
 from planner_jax.robot.quadrotor import QuadrotorLimits
 from planner_jax.runs.run_folder import RunFolder
-from planner_jax.runs.settings import SettingError
 from planner_jax.sweep import run
 from planner_jax.sweep.catch.settings import CatchSettings
 from planner_jax.sweep.hit.settings import HitSettings
@@ -153,7 +153,7 @@ def test_rows_of_a_sweep_have_the_way_to_rest_that_was_judged(swept, braked):
 
 def test_a_sweep_is_resumed_with_its_ending_alone(swept):
     out, _ = swept
-    with pytest.raises(SettingError, match="^ending must be brake as in the run that is resumed"):
+    with pytest.raises(ArgumentError, match="^ending must be brake as in the run that is resumed"):
         run.resume_sweep(pj.task_named("hit"), out, progress=False, ending="home")
 
 
@@ -164,7 +164,7 @@ def test_the_limits_of_one_case_are_looked_at_behind_the_contact_too(braked):
 
 @pytest.mark.parametrize("settings", [HitSettings, CatchSettings])
 def test_settings_refuse_another_ending_and_leave_none_to_the_planner(settings):
-    with pytest.raises(SettingError, match="^ending must be one of none, brake, home, got 'land'"):
+    with pytest.raises(ArgumentError, match="^ending must be one of none, brake, home, got 'land'"):
         settings(ending="land")
     assert "ending" not in settings().planner_options()
     assert settings(ending="home").planner_options()["ending"] == "home"

@@ -9,10 +9,9 @@ from flown_plans import SOLVED, quadrotor, table
 
 import planner_jax as pj
 from planner_jax.cli.main import main
-from planner_jax.export.setpoints import ExportError
+from planner_jax.core.errors import ArgumentError, NoEnding
 from planner_jax.plane.target import TurningPath
 from planner_jax.recovery.after_plan import is_rested, with_ending
-from planner_jax.recovery.no_ending import NoEnding
 from planner_jax.referee.rest import referee_rests, referee_stands, referee_stops
 from planner_jax.robot.arm_plan import ArmPlan
 from planner_jax.robot.car import CarPlan
@@ -63,19 +62,19 @@ def test_a_plan_that_has_its_own_keeps_it_or_leaves_without_it(hit, here):
 
 def test_without_its_case_a_plan_is_refused_in_one_line(here):
     says = "^case must be given, .* or ending=None to leave that out, got neither$"
-    with pytest.raises(ExportError, match=says):
+    with pytest.raises(ArgumentError, match=says):
         pj.export(quadrotor(), to="csv", out="a.csv")
-    with pytest.raises(ExportError, match="^ending must be one of brake, home, got 'land'$"):
+    with pytest.raises(ArgumentError, match="^ending must be one of brake, home, got 'land'$"):
         pj.export(quadrotor(), to="csv", out="a.csv", ending="land")
     assert not list(here.iterdir())
 
 
 def test_the_case_of_another_plan_and_a_batch_of_cases_are_refused(hit, here):
     case, plan = hit
-    with pytest.raises(ExportError, match="^case must be that of the plan, got InterceptCase$"):
+    with pytest.raises(ArgumentError, match="^case must be that of the plan, got InterceptCase$"):
         pj.export(plan, to="csv", out="a.csv", case=driving()[0])
     many = jax.tree.map(lambda leaf: leaf[None], case)
-    with pytest.raises(ExportError, match=r"^case must be one, .* got a batch of shape \(1,\)$"):
+    with pytest.raises(ArgumentError, match=r"^case must be one, .* got a batch of shape \(1,\)$"):
         pj.export(plan, to="csv", out="a.csv", case=many)
 
 
@@ -83,7 +82,7 @@ def test_where_no_way_to_rest_keeps_the_limits_nothing_is_written(hit, here):
     case, plan = hit
     slow = dataclasses.replace(case.limits, speed=np.float32(0.1))
     says = "^ending must be none .* keeps every limit, got 'brake' .speed: .* above its limit"
-    with pytest.raises(ExportError, match=says):
+    with pytest.raises(ArgumentError, match=says):
         pj.export(plan, to="csv", out="a.csv", case=dataclasses.replace(case, limits=slow))
     assert not list(here.iterdir())
 
@@ -184,7 +183,9 @@ def test_a_car_steers_past_what_stands_in_its_way_and_says_where_it_cannot():
 
 def test_only_quadrotors_go_home(here):
     case, plan = driving()
-    with pytest.raises(ExportError, match="^ending must be brake, as only quadrotors go home, got"):
+    with pytest.raises(
+        ArgumentError, match="^ending must be brake, as only quadrotors go home, got"
+    ):
         pj.export(plan, to="csv", out="a.csv", case=case, ending="home")
     assert not list(here.iterdir())
 

@@ -11,10 +11,10 @@ from cflib.crazyflie.mem.trajectory_memory import Poly4D
 from flown_plans import PLANS, arm, as_it_is, bag, car, matrices, quadrotor, table
 
 import planner_jax as pj
-from planner_jax.core.registry import MissingExtra, UnknownName, install_line
+from planner_jax.core.errors import ArgumentError, MissingExtra, UnknownName, install_line
 from planner_jax.export import csv_rows, ros2
 from planner_jax.export.crazyflie import poly4d
-from planner_jax.export.setpoints import MOST, ExportError, setpoints_of
+from planner_jax.export.setpoints import MOST, setpoints_of
 from planner_jax.export.words import stream
 
 RATE = 50.0
@@ -180,15 +180,15 @@ def test_pieces_that_take_no_time_are_left_out():
 
 def test_a_higher_degree_and_more_pieces_than_fit_are_refused():
     assert len(poly4d(quadrotor(num=31))) == 31
-    with pytest.raises(ExportError, match="^plan must have at most 31 pieces, .* got 32$"):
+    with pytest.raises(ArgumentError, match="^plan must have at most 31 pieces, .* got 32$"):
         poly4d(quadrotor(num=32))
-    with pytest.raises(ExportError, match="^plan must be of degree 7 or less for this, got 9$"):
+    with pytest.raises(ArgumentError, match="^plan must be of degree 7 or less for this, got 9$"):
         poly4d(quadrotor(powers=10))
     high = quadrotor(powers=10)
     nought = high.trajectory.coeffs * (np.arange(10)[:, None] < 8)
     assert poly4d(high.replace(trajectory=high.trajectory.replace(coeffs=nought))).shape == (2, 33)
     large = high.trajectory.replace(coeffs=1e300 * np.ones((2, 8, 3)))
-    with pytest.raises(ExportError, match="^plan must have numbers that float32 holds"):
+    with pytest.raises(ArgumentError, match="^plan must have numbers that float32 holds"):
         poly4d(high.replace(trajectory=large))
 
 
@@ -204,7 +204,7 @@ def test_a_plan_that_is_not_solved_is_refused_by_its_status(tmp_path, status):
     plan = quadrotor().replace(status=np.int32(status))
     for to in ("csv", "crazyflie"):
         with pytest.raises(
-            ExportError, match=f"^plan must be solved, got the status {status.name}: "
+            ArgumentError, match=f"^plan must be solved, got the status {status.name}: "
         ):
             exported(tmp_path, plan, to=to)
     assert not list(tmp_path.iterdir())
@@ -212,22 +212,26 @@ def test_a_plan_that_is_not_solved_is_refused_by_its_status(tmp_path, status):
 
 def test_a_batch_another_class_and_a_plan_that_is_not_whole_are_refused(tmp_path):
     batch = jax.tree.map(lambda leaf: np.stack([leaf] * 3), quadrotor())
-    with pytest.raises(ExportError, match=r"^plan must be one, as pj.lane\(plans, k\) gives, got"):
+    with pytest.raises(
+        ArgumentError, match=r"^plan must be one, as pj.lane\(plans, k\) gives, got"
+    ):
         exported(tmp_path, batch)
-    with pytest.raises(ExportError, match=r"^plan must be that of a robot .* got a PiecewisePoly"):
+    with pytest.raises(
+        ArgumentError, match=r"^plan must be that of a robot .* got a PiecewisePoly"
+    ):
         exported(tmp_path, quadrotor().trajectory)
     shorter = quadrotor().replace(trajectory=quadrotor().trajectory.replace(durations=np.ones(3)))
     with pytest.raises(
-        ExportError, match=r"^plan must have trajectory.durations of the shape \(2\)"
+        ArgumentError, match=r"^plan must have trajectory.durations of the shape \(2\)"
     ):
         exported(tmp_path, shorter)
     lost = jax.tree.map(lambda leaf: np.full_like(leaf, np.nan), quadrotor().trajectory.coeffs)
     gone = quadrotor().replace(trajectory=quadrotor().trajectory.replace(coeffs=lost))
     for to in ("csv", "crazyflie"):
-        with pytest.raises(ExportError, match="^plan must be finite, got"):
+        with pytest.raises(ArgumentError, match="^plan must be finite, got"):
             exported(tmp_path, gone, to=to)
     still = jax.tree.map(np.zeros_like, quadrotor().trajectory)
-    with pytest.raises(ExportError, match="^plan must take some time, got 0 s$"):
+    with pytest.raises(ArgumentError, match="^plan must take some time, got 0 s$"):
         exported(tmp_path, quadrotor().replace(trajectory=still))
     assert not list(tmp_path.iterdir())
 
@@ -237,7 +241,7 @@ def test_an_absurd_rate_is_refused(tmp_path, rate):
     rule = (
         "a number" if np.ndim(rate) or isinstance(rate, str | bool) else r"from 2.439 to 2.439e\+05"
     )
-    with pytest.raises(ExportError, match=f"^rate must be {rule}"):
+    with pytest.raises(ArgumentError, match=f"^rate must be {rule}"):
         exported(tmp_path, rate=rate)
     assert not list(tmp_path.iterdir())
 
@@ -246,7 +250,7 @@ def test_the_bounds_of_a_rate_are_two_setpoints_and_very_many():
     end = 0.41
     assert len(setpoints_of(quadrotor(), 1.0 / end).time) == 2
     assert len(setpoints_of(quadrotor(), (MOST - 2) / end).time) <= MOST
-    with pytest.raises(ExportError, match="^rate must be at most 1000 for MAVLink, got 1001$"):
+    with pytest.raises(ArgumentError, match="^rate must be at most 1000 for MAVLink, got 1001$"):
         stream(quadrotor(), ending=None, to="px4", udp=9, rate=1001)
 
 
@@ -254,7 +258,7 @@ def test_the_bounds_of_a_rate_are_two_setpoints_and_very_many():
 def test_a_format_that_cannot_carry_the_robot_says_so(tmp_path, robot, to):
     article = "an arm" if robot == "arm" else "a car"
     says = f"^to must be a format for plans of {article}, got '{to}', which is for quadrotor$"
-    with pytest.raises(ExportError, match=says):
+    with pytest.raises(ArgumentError, match=says):
         exported(tmp_path, PLANS[robot], to=to)
 
 
@@ -277,12 +281,12 @@ def test_a_file_is_new_whole_and_has_an_ending_of_its_format(tmp_path):
         ("no/a.csv", "out must be in a folder that can be written, got"),
         ("a.csv/b.csv", "out must be in a folder that can be written, got"),
     ]:
-        with pytest.raises(ExportError, match=f"^{says}"):
+        with pytest.raises(ArgumentError, match=f"^{says}"):
             exported(tmp_path, name=name)
-    with pytest.raises(ExportError, match="^out must end in .tlog or .mcap or .csv for px4, got"):
+    with pytest.raises(ArgumentError, match="^out must end in .tlog or .mcap or .csv for px4, got"):
         exported(tmp_path, to="px4", name="b.bin")
     with pytest.raises(
-        ExportError, match="^rate must not be given for crazyflie, which takes poly"
+        ArgumentError, match="^rate must not be given for crazyflie, which takes poly"
     ):
         exported(tmp_path, to="crazyflie", name="b.csv", rate=100.0)
     assert [each.name for each in tmp_path.iterdir()] == ["a.csv"] and path.read_bytes() == before

@@ -11,13 +11,13 @@ from flown_plans import PLANS, as_it_is, quadrotor
 
 import planner_jax as pj
 from planner_jax.cli.main import main
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.plan_files import PlanFileError, load_fitting
 from planner_jax.export.saved import saved_plan
 from planner_jax.robot.car import CarPlan
 from planner_jax.robot.quadrotor_plan import QuadrotorPlan
 from planner_jax.runs import columns as known
 from planner_jax.runs.run_folder import RunFolder
-from planner_jax.runs.settings import SettingError
 from planner_jax.runs.source import Chunk
 from planner_jax.sweep.block.columns import COLUMNS as BLOCK
 from planner_jax.sweep.catch.columns import COLUMNS as CATCH
@@ -107,25 +107,25 @@ def test_a_row_is_read_back_bit_for_bit_with_what_the_referee_says(tmp_path, tas
 @pytest.mark.parametrize("row", [-1, 3, None])
 def test_a_row_that_is_not_there(tmp_path, row):
     shown = "nothing" if row is None else row
-    with pytest.raises(SettingError, match=f"^row must be from 0 to 2, got {shown}$"):
+    with pytest.raises(ArgumentError, match=f"^row must be from 0 to 2, got {shown}$"):
         planned_row(written_run(tmp_path / "run"), row)
 
 
 def test_a_run_that_is_not_finished_or_damaged_or_of_flights(tmp_path):
-    with pytest.raises(SettingError, match="^RUN must be finished, got .*; resume it first$"):
+    with pytest.raises(ArgumentError, match="^RUN must be finished, got .*; resume it first$"):
         planned_row(written_run(tmp_path / "half", finished=False), 0)
     run = written_run(tmp_path / "damaged")
     (part,) = run.plans.files()
     content = bytearray(part.read_bytes())
     content[len(content) // 2] ^= 0xFF
     part.write_bytes(content)
-    with pytest.raises(SettingError, match="^RUN must be a run whose plans/part-000000-"):
+    with pytest.raises(ArgumentError, match="^RUN must be a run whose plans/part-000000-"):
         planned_row(run, 0)
     flown = RunFolder(tmp_path / "flown", name="RUN")
     manifest = {"kind": "fly hit", "state": "running", "parameters": {}}
     with flown.created({**manifest, "seed": 0, "device": {}, "loop": {}}):
         pass
-    with pytest.raises(SettingError, match="^RUN must be the folder of a sweep, got a fly hit$"):
+    with pytest.raises(ArgumentError, match="^RUN must be the folder of a sweep, got a fly hit$"):
         planned_row(flown, 0)
 
 

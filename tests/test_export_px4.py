@@ -11,9 +11,10 @@ from flown_plans import as_it_is, bag, matrices, quadrotor, table
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import common
 
+from planner_jax.core.errors import ArgumentError
 from planner_jax.export import frames
 from planner_jax.export.px4 import trajectory_setpoints
-from planner_jax.export.setpoints import ExportError, setpoints_of
+from planner_jax.export.setpoints import setpoints_of
 from planner_jax.export.words import stream
 
 RATE = 50.0
@@ -172,7 +173,7 @@ def test_a_stream_arrives_in_real_time_and_is_decoded():
 
 @pytest.mark.parametrize("port", [0, -1, 65536, "14540", True, None])
 def test_a_port_is_one_that_there_is(port):
-    with pytest.raises(ExportError, match="^udp must be a port from 1 to 65535, got"):
+    with pytest.raises(ArgumentError, match="^udp must be a port from 1 to 65535, got"):
         stream(quadrotor(), ending=None, to="px4", udp=port)
 
 
@@ -180,10 +181,10 @@ def test_a_port_on_which_nobody_listens_is_refused():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
         port = taken.getsockname()[1]
-    with pytest.raises(ExportError, match=f"^udp must be .* listens, got {port}$"):
+    with pytest.raises(ArgumentError, match=f"^udp must be .* listens, got {port}$"):
         stream(quadrotor(), ending=None, to="px4", udp=port)
 
 
 def test_only_px4_is_streamed():
-    with pytest.raises(ExportError, match="^udp must not be given for csv, only for px4, got 9$"):
+    with pytest.raises(ArgumentError, match="^udp must not be given for csv, only for px4, got 9$"):
         stream(quadrotor(), ending=None, to="csv", udp=9)

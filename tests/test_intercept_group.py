@@ -10,11 +10,11 @@ import pyarrow.parquet as pq
 import pytest
 
 import planner_jax as pj
+from planner_jax.core.errors import ArgumentError
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.plane.reach import Lattice
 from planner_jax.planning.decided import first_choice
 from planner_jax.robot.car import pose_at
-from planner_jax.runs.settings import SettingError
 from planner_jax.sweep.intercept.settings import GroupSettings
 from planner_jax.sweep.run import start_sweep
 from planner_jax.task.group.case import CarState
@@ -252,5 +252,5 @@ def test_a_sweep_of_groups_has_a_row_for_every_group(monkeypatch, tmp_path):
     for name, leaf in {"case.present": groups.present, "plan.order": groups.order}.items():
         assert np.shape(rows[name].to_pylist()) == leaf.shape
     assert rows["case.present"].to_pylist() == groups.present.tolist()
-    with pytest.raises(SettingError, match="^decide must be one of best, greedy, given"):
+    with pytest.raises(ArgumentError, match="^decide must be one of best, greedy, given"):
         GroupSettings(decide="worst")

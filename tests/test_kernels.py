@@ -9,6 +9,7 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.cli import doctor
+from planner_jax.core.errors import ArgumentError
 from planner_jax.lanes import kernels, over_lanes
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.multistart import solve_batch
@@ -16,7 +17,6 @@ from planner_jax.optimise.preconditioner import positive_inverse
 from planner_jax.optimise.problem import Round
 from planner_jax.optimise.sensitivity import gradient_at
 from planner_jax.runs.environment import require_backend
-from planner_jax.runs.settings import SettingError
 from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.hit.default_planner import ExactHit
 
@@ -123,7 +123,7 @@ def test_a_wrong_value_of_the_switch_is_one_line(monkeypatch):
         small()(X)
     with pytest.raises(ValueError, match=line):
         kernels.kernels()
-    with pytest.raises(SettingError, match=line):  # before a command does anything
+    with pytest.raises(ArgumentError, match=line):  # before a command does anything
         require_backend()
 
 

@@ -17,6 +17,7 @@ import pytest
 import planner_jax as pj
 from planner_jax.benchmarks.serve_soak import distance_off
 from planner_jax.cli.main import main
+from planner_jax.core.errors import ArgumentError
 from planner_jax.live import planner as live_planner
 from planner_jax.live.course import with_recovery
 from planner_jax.live.packets import BALL, ROBOT, Fault, Motion, read_answer, request
@@ -24,7 +25,6 @@ from planner_jax.live.planner import LivePlanner
 from planner_jax.live.server import Server
 from planner_jax.live.settings import CatchServe, HitServe
 from planner_jax.live.strokes import CATCH_DRAG, CatchStroke, HitStroke
-from planner_jax.runs.settings import SettingError
 
 HOME, STEP = np.array([0.0, 0.0, 1.0]), 0.01
 PAGE = Path(__file__).parents[1] / "docs" / "live.md"
@@ -293,7 +293,7 @@ def test_a_robot_is_served_by_its_name_and_has_to_carry_the_tool():
         (CatchServe, "nobody", "robot must be one of"),
         (CatchServe, "gone.yaml", "robot must be a file that can be read"),
     ):
-        with pytest.raises(SettingError, match=rule):
+        with pytest.raises(ArgumentError, match=rule):
             settings(robot=robot)
 
 

@@ -12,8 +12,9 @@ from flax import traverse_util
 
 import planner_jax as pj
 from planner_jax.cli.main import main
+from planner_jax.core.errors import ArgumentError
 from planner_jax.planning.decided import first_choice
-from planner_jax.policies.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
+from planner_jax.policies.checkpoint import load_checkpoint, save_checkpoint
 from planner_jax.policies.networks import NETWORKS
 from planner_jax.policies.observation import FEATURES, PER_TARGET, choice_of, observe
 from planner_jax.policies.policy import Policy, policy
@@ -146,7 +147,7 @@ def test_a_file_that_is_no_checkpoint_is_named(tmp_path, fresh):
     save_checkpoint(odd, fresh["mlp"], NETWORKS["mlp"](), {"sizes": {"depth": 9}})
     says = {missing: "none", torn: "torn", other: "format 99", odd: "'mlp'.* got depth"}
     for path, words in says.items():
-        with pytest.raises(CheckpointError, match=words):
+        with pytest.raises(ArgumentError, match=words):
             load_checkpoint(path)
 
 

@@ -13,11 +13,11 @@ import yaml
 
 import planner_jax as pj
 from planner_jax.cli.main import main
-from planner_jax.core.registry import UnknownName
+from planner_jax.core.errors import ArgumentError, UnknownName
 from planner_jax.robot.quadrotor_file import RobotError, as_yaml, model_of
 from planner_jax.robot.quadrotor_models import MODELS, ready_robot
 from planner_jax.robot.quantities import UNITS, QuantityError, numbers_in
-from planner_jax.runs.settings import SettingError, settings_to_resume
+from planner_jax.runs.settings import settings_to_resume
 from planner_jax.sims.settings import HitFly
 from planner_jax.sweep.hit.settings import HitSettings
 
@@ -372,10 +372,10 @@ def test_a_run_is_not_resumed_with_another_robot(tmp_path):
     again = settings_to_resume(HitSettings, parameters, {"robot": str(MINE)})
     assert again.robot == pj.read_robot(MINE)
     rule = "robot.rotors.lag must be 0.03 as in the run that is resumed, got 0.02"
-    with pytest.raises(SettingError, match=f"^{rule}$"):
+    with pytest.raises(ArgumentError, match=f"^{rule}$"):
         settings_to_resume(HitSettings, parameters, {"robot": str(tmp_path / "other.yaml")})
     old = {**parameters, "robot": None}
-    with pytest.raises(SettingError, match="^robot must be None as .*, got 'x500'$"):
+    with pytest.raises(ArgumentError, match="^robot must be None as .*, got 'x500'$"):
         settings_to_resume(HitSettings, old, {"robot": "x500"})
 
 

@@ -9,7 +9,7 @@ from closed_forms import region_of
 
 import planner_jax as pj
 from planner_jax.ball import flight
-from planner_jax.core.rules import CaseError
+from planner_jax.core.errors import ArgumentError, CaseError
 from planner_jax.task.hit import court
 from planner_jax.task.hit.case import DRAG, GRAVITY
 from planner_jax.task.hit.suites import (
@@ -23,12 +23,7 @@ from planner_jax.task.hit.suites import (
     read_serves,
     to_cases,
 )
-from planner_jax.task.hit.validate import (
-    ServeError,
-    check_cases,
-    fly,
-    landing,
-)
+from planner_jax.task.hit.validate import check_cases, fly, landing
 
 PUBLISHED = Path(__file__).resolve().parents[2] / "shared" / "data" / "serves"
 needs_published = pytest.mark.skipif(
@@ -129,12 +124,12 @@ def test_a_missing_planner_is_nan_and_scenarios_take_turns(tmp_path):
 
 
 def test_an_absent_or_unsuitable_folder_is_named(tmp_path):
-    with pytest.raises(ServeError, match="existing folder, got .*nowhere"):
+    with pytest.raises(ArgumentError, match="existing folder, got .*nowhere"):
         read_serves(tmp_path / "nowhere")
-    with pytest.raises(ServeError, match="S_L_T_M.csv files, got none"):
+    with pytest.raises(ArgumentError, match="S_L_T_M.csv files, got none"):
         read_serves(tmp_path)
     write(tmp_path, "1_1_4_p.csv", row())
-    with pytest.raises(ServeError, match=r"36 scenarios, got 1_1_4_p.csv \(NNR"):
+    with pytest.raises(ArgumentError, match=r"36 scenarios, got 1_1_4_p.csv \(NNR"):
         read_serves(tmp_path)
 
 
@@ -154,35 +149,35 @@ def test_an_absent_or_unsuitable_folder_is_named(tmp_path):
 )
 def test_a_bad_row_is_named_by_file_line_rule_and_value(tmp_path, bad, says):
     write(tmp_path, "1_1_1_p.csv", row(), bad)
-    with pytest.raises(ServeError) as caught:
+    with pytest.raises(ArgumentError) as caught:
         read_serves(tmp_path)
     assert f"1_1_1_p.csv:3: {says}" in str(caught.value)
-    assert "\n" not in str(caught.value) and len(caught.value.problems) == 1
+    assert "\n" not in str(caught.value) and len(caught.value.value) == 1
 
 
 def test_all_bad_rows_are_collected_and_the_first_few_spelled_out(tmp_path):
     write(tmp_path, "1_1_1_p.csv", *["broken"] * 4, row())
     write(tmp_path, "1_1_2_p.csv", *["broken"] * 3)
-    with pytest.raises(ServeError, match="1_1_2_p.csv:2: .*; and 2 more$") as caught:
+    with pytest.raises(ArgumentError, match="1_1_2_p.csv:2: .*; and 2 more$") as caught:
         read_serves(tmp_path)
-    assert len(caught.value.problems) == 7
+    assert len(caught.value.value) == 7
 
 
 @pytest.mark.parametrize("text", ["", HEADER + "\n"])
 def test_an_empty_file_is_named_once(tmp_path, text):
     write(tmp_path, "1_1_1_p.csv", row())
     (tmp_path / "1_1_1_l.csv").write_text(text)
-    with pytest.raises(ServeError, match="1_1_1_l.csv: file must have a row") as caught:
+    with pytest.raises(ArgumentError, match="1_1_1_l.csv: file must have a row") as caught:
         read_serves(tmp_path)
-    assert len(caught.value.problems) == 1
+    assert len(caught.value.value) == 1
 
 
 def test_files_of_one_scenario_must_hold_the_same_serves(tmp_path):
     write(tmp_path, "1_1_1_b.csv", row(), row(2), row(3))
     write(tmp_path, "1_1_1_p.csv", row(), row(2, position="2.6 0 2"))
-    with pytest.raises(ServeError) as caught:
+    with pytest.raises(ArgumentError) as caught:
         read_serves(tmp_path)
-    changed, missing = caught.value.problems
+    changed, missing = caught.value.value
     assert changed.startswith(
         "1_1_1_p.csv:3: serve must be the one in 1_1_1_b.csv, [2.5, -0.3, 2.0"
     )
@@ -327,12 +322,12 @@ def test_generated_serves_are_distributed_as_the_published_ones():
         ({"num": 0}, "num must be >= 1, got 0"),
         ({"seed": -1}, "seed must be >= 0, got -1"),
         ({"first": -5}, "first must be >= 0, got -5"),
-        ({"scenarios": ["NNN", "NNR"]}, "scenarios must be names out of .*, got NNR"),
+        ({"scenarios": ["NNN", "NNR"]}, "scenarios must be names out of .*, got 'NNR'"),
         ({"scenarios": []}, "scenarios must be names out of .*, got none"),
     ],
 )
 def test_arguments_of_the_generator_out_of_range_are_named(arguments, says):
-    with pytest.raises(ServeError, match=says):
+    with pytest.raises(ArgumentError, match=says):
         generate_serves(**{"num": 1, "seed": 0, **arguments})
 
 
@@ -353,7 +348,7 @@ def test_two_delays_in_a_row_are_their_sum():
 
 @pytest.mark.parametrize("delay", [-0.1, float("nan"), float("inf")])
 def test_a_delay_must_be_finite_and_not_negative(delay):
-    with pytest.raises(ServeError, match=f"delay must be finite and >= 0, got {delay:g}"):
+    with pytest.raises(ArgumentError, match=f"delay must be finite and >= 0, got {delay:g}"):
         advance(generate_serves(2, 0), delay)
 
 
@@ -361,7 +356,7 @@ def test_a_delay_beyond_the_flight_names_the_serve():
     serves = generate_serves(50, 0)
     time, _ = landing(serves.position, serves.velocity, DRAG, GRAVITY)
     first = np.argmax(time <= 1.6)
-    with pytest.raises(ServeError, match=f"{time[first]:.3f} s for serve {first}, got 1.6"):
+    with pytest.raises(ArgumentError, match=f"{time[first]:.3f} s for serve {first}, got 1.6"):
         to_cases(serves, delay=1.6)
 
 
@@ -406,7 +401,7 @@ def test_uniform_starts_fill_the_half_court_and_belong_to_their_serve():
     ],
 )
 def test_arguments_of_cases_out_of_range_are_named(arguments, says):
-    with pytest.raises(ServeError, match=says):
+    with pytest.raises(ArgumentError, match=says):
         to_cases(generate_serves(1, 0), **arguments)
 
 

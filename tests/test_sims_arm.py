@@ -13,10 +13,10 @@ from test_block_library import made_up
 import planner_jax as pj
 from planner_jax.baselines.block.library.file import save_library
 from planner_jax.cli.main import main
+from planner_jax.core.errors import ArgumentError
 from planner_jax.referee.arm_clearance import KINDS
 from planner_jax.robot.arm import shield_pose
 from planner_jax.robot.arm_mjcf import irb1600
-from planner_jax.runs.settings import SettingError
 from planner_jax.sims.execution import FRAME, TIMESTEP, Executed, execute
 from planner_jax.sims.film import draw_flight
 from planner_jax.sims.launch import flight_keys
@@ -404,7 +404,7 @@ def test_balls_that_are_only_seen_are_blocked_from_the_command_line(tmp_path, ca
     ],
 )
 def test_settings_that_break_a_rule_are_refused_in_one_line(build, message):
-    with pytest.raises(SettingError) as error:
+    with pytest.raises(ArgumentError) as error:
         build()
     assert str(error.value) == message
 
@@ -414,12 +414,12 @@ def test_flights_take_a_library_of_their_limits_and_scene_alone(tmp_path):
     save_library(path, made_up(regime="R1"))
     assert BlockFly(planner=f"library:{path}", regime="R1").flight().settings.regime == "R1"
     for options in ({"regime": "R2"}, {"regime": "R1", "suite": "open"}):
-        with pytest.raises(SettingError, match="^library must be of the cases' arm, limits and"):
+        with pytest.raises(ArgumentError, match="^library must be of the cases' arm, limits and"):
             BlockFly(planner=f"library:{path}", **options).flight()
     path.write_bytes(path.read_bytes()[:2000])
-    with pytest.raises(SettingError, match="^library must be a whole file"):
+    with pytest.raises(ArgumentError, match="^library must be a whole file"):
         BlockFly(planner=f"library:{path}", regime="R1").flight()
-    with pytest.raises(SettingError, match="^planner must name its file, as in library:FILE"):
+    with pytest.raises(ArgumentError, match="^planner must name its file, as in library:FILE"):
         BlockFly(planner="library")
 
 

@@ -12,8 +12,8 @@ from jax import lax
 
 import planner_jax as pj
 from planner_jax.cli.main import main
+from planner_jax.core.errors import ArgumentError
 from planner_jax.plane.target import TurningPath
-from planner_jax.runs.settings import SettingError
 from planner_jax.sims.drive import DriveLoop, drive_on, started
 from planner_jax.sims.film import draw_flight
 from planner_jax.sims.model import step
@@ -295,7 +295,7 @@ def test_a_plan_made_anew_begins_where_the_car_is_and_is_driven_if_it_is_good(so
     ],
 )
 def test_settings_that_break_a_rule_are_refused_in_one_line(build, message):
-    with pytest.raises(SettingError) as error:
+    with pytest.raises(ArgumentError) as error:
         build()
     assert str(error.value) == message
 

@@ -14,11 +14,11 @@ from matplotlib.figure import Figure
 import planner_jax as pj
 from planner_jax.ball.flight import BallState
 from planner_jax.cli.main import main
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.registry import Task, all_tasks
 from planner_jax.runs.run_folder import RunFolder
-from planner_jax.runs.settings import SettingError
 from planner_jax.sims import loop as sims_loop
-from planner_jax.sims.film import FilmError, draw_flight, film_flights, require_film
+from planner_jax.sims.film import draw_flight, film_flights, require_film
 from planner_jax.sims.launch import flight_keys, launched, ready
 from planner_jax.sims.loop import begin_compiling, fly_leg
 from planner_jax.sims.loop_state import flown
@@ -72,7 +72,7 @@ from tests.recordings import recording
     ],
 )
 def test_settings_that_break_a_rule_are_refused_in_one_line(build, message):
-    with pytest.raises(SettingError) as error:
+    with pytest.raises(ArgumentError) as error:
         build()
     assert str(error.value) == message
 
@@ -121,7 +121,9 @@ def test_a_picture_of_a_hit_shows_court_machine_and_target(tmp_path):
 
 def test_mp4_without_ffmpeg_is_refused(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(FilmError, match="^video must end in .gif where ffmpeg is not installed"):
+    with pytest.raises(
+        ArgumentError, match="^video must end in .gif where ffmpeg is not installed"
+    ):
         require_film(tmp_path / "flights.mp4")
 
 
@@ -266,7 +268,7 @@ class DropFlight(BallFlightTask):
 
 def test_a_task_without_flights_is_refused_in_one_line(monkeypatch):
     monkeypatch.setitem(all_tasks(), "drop", dataclasses.replace(DROP, flight=None))
-    with pytest.raises(SettingError) as error:
+    with pytest.raises(ArgumentError) as error:
         fly_settings("drop")
     rule = "task must be one that can be flown (hit, catch, intercept, block)"
     assert str(error.value) == f"{rule}, got 'drop'"

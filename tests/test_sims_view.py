@@ -15,10 +15,9 @@ import pytest
 
 from planner_jax.ball.flight import BallState
 from planner_jax.cli.main import main
-from planner_jax.core.registry import install_line
+from planner_jax.core.errors import ArgumentError, install_line
 from planner_jax.runs.dataset import Dataset
 from planner_jax.runs.run_folder import RunFolder
-from planner_jax.runs.settings import SettingError
 from planner_jax.sims import view
 from planner_jax.sims.loop_state import Flown, Record
 from planner_jax.sims.model import BALL_RADIUS
@@ -171,12 +170,12 @@ def test_a_path_is_drawn_between_points_that_are_there():
 def test_what_cannot_be_served_is_said_in_one_line():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        with pytest.raises(SettingError, match=f"^port must be free, got {port}"):
+        with pytest.raises(ArgumentError, match=f"^port must be free, got {port}"):
             free_address("localhost", port)
-    with pytest.raises(SettingError, match="^port must be >= 0 and <= 65535, got 70000$"):
+    with pytest.raises(ArgumentError, match="^port must be >= 0 and <= 65535, got 70000$"):
         free_address("localhost", 70000)
     for host in ("192.0.2.1", "no such host"):
-        with pytest.raises(SettingError, match="^host must be an address of this machine, got '"):
+        with pytest.raises(ArgumentError, match="^host must be an address of this machine, got '"):
             free_address(host, 0)
 
 

@@ -14,12 +14,12 @@ from scipy.stats import binomtest
 from sweeps import columns, rows_of, stop_after
 
 import planner_jax as pj
+from planner_jax.core.errors import ArgumentError
 from planner_jax.planning.plan import plan
 from planner_jax.planning.programs import solve_on_devices
 from planner_jax.referee.hit import referee_hits
 from planner_jax.robot import quadrotor
 from planner_jax.runs.run_folder import LOCK, RunFolder
-from planner_jax.runs.settings import SettingError
 from planner_jax.runs.summary import percent, wilson_interval
 from planner_jax.runs.timing import CompileClock
 from planner_jax.sweep import run
@@ -233,12 +233,12 @@ def test_a_sweep_interrupted_behind_its_rows_is_resumed_to_its_report(
 
 
 def test_resuming_with_another_setting_names_it(finished):
-    with pytest.raises(SettingError, match=r"delay must be 0.8 as in the run .*, got 0.5"):
+    with pytest.raises(ArgumentError, match=r"delay must be 0.8 as in the run .*, got 0.5"):
         resume_sweep(TASK, finished[0], delay=0.5)
 
 
 def test_resuming_what_is_no_run_is_refused(tmp_path):
-    with pytest.raises(SettingError, match="out must be the folder of a run"):
+    with pytest.raises(ArgumentError, match="out must be the folder of a run"):
         resume_sweep(TASK, tmp_path)
 
 
@@ -248,7 +248,7 @@ def test_a_serve_drawn_late_that_breaks_a_rule_leaves_nothing_behind(tmp_path):
     source = open_source(settings.of(TASK), batch=4)
     source.check()
     out = tmp_path / "runs" / "run"
-    with pytest.raises(SettingError, match="delay must be shorter than each serve's flight"):
+    with pytest.raises(ArgumentError, match="delay must be shorter than each serve's flight"):
         start_sweep(TASK, settings, out, progress=False)
     assert not list(tmp_path.iterdir())
 
@@ -316,7 +316,7 @@ def test_resuming_needs_the_serves_that_the_run_began_with(tmp_path, monkeypatch
         resume_sweep(TASK, out, progress=False)
     for path in (tmp_path / "serves").iterdir():
         path.write_text(path.read_text().replace("7.2", "7.0"))
-    with pytest.raises(SettingError, match="serves must be the same as when the run began"):
+    with pytest.raises(ArgumentError, match="serves must be the same as when the run began"):
         resume_sweep(TASK, out, progress=False)
 
 
@@ -436,13 +436,13 @@ def test_hover_is_named_where_no_curve_runs(finished):
     ],
 )
 def test_a_setting_out_of_its_range_is_named(given, message):
-    with pytest.raises(SettingError, match=message):
+    with pytest.raises(ArgumentError, match=message):
         HitSettings(**given).of(TASK)
 
 
 def test_the_truer_model_is_for_the_exact_planner_alone():
     assert HitSettings(drag_after_impact=True).planner_options() == {"drag_after_impact": True}
-    with pytest.raises(SettingError, match="drag_after_impact must be left out"):
+    with pytest.raises(ArgumentError, match="drag_after_impact must be left out"):
         HitSettings(planner="bat", drag_after_impact=True)
 
 
@@ -475,5 +475,5 @@ def test_a_real_scenario_is_served_by_its_own_two(suite):
 
 
 def test_a_suite_without_serves_is_refused_before_anything_is_drawn():
-    with pytest.raises(SettingError, match=r"^suite must be one of court, S\.1, .* got 'gusts'$"):
+    with pytest.raises(ArgumentError, match=r"^suite must be one of court, S\.1, .* got 'gusts'$"):
         open_source(HitSettings(suite="gusts"), batch=1)

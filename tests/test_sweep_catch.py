@@ -12,13 +12,13 @@ import pytest
 from sweeps import columns, rows_of, stop_after
 
 import planner_jax as pj
+from planner_jax.core.errors import ArgumentError
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
 from planner_jax.referee.catch import referee_catches
 from planner_jax.runs.columns import RefereedBatch
 from planner_jax.runs.columns import rows_of as columns_of
 from planner_jax.runs.run_folder import LOCK, RunFolder
-from planner_jax.runs.settings import SettingError
 from planner_jax.sweep.catch.columns import COLUMNS, FRAME
 from planner_jax.sweep.catch.settings import CatchSettings
 from planner_jax.sweep.catch.sweep import CatchSweep, CatchTally
@@ -183,7 +183,7 @@ def test_an_interrupted_sweep_is_resumed_to_the_same_rows(finished, tmp_path, mo
     ],
 )
 def test_a_run_is_resumed_as_what_it_is(finished, name, given, message):
-    with pytest.raises(SettingError, match=message):
+    with pytest.raises(ArgumentError, match=message):
         resume_sweep(pj.task_named(name), finished[0], **given)
 
 
@@ -196,7 +196,7 @@ def test_cases_that_are_drawn_otherwise_are_not_mixed_into_a_run(finished, tmp_p
         "planner_jax.task.catch.draw",
         lambda num, suite, seed, **options: real(num, suite, seed + 1, **options),
     )
-    with pytest.raises(SettingError, match="suite must be the same as when the run began"):
+    with pytest.raises(ArgumentError, match="suite must be the same as when the run began"):
         resume_sweep(TASK, out)
 
 
@@ -268,5 +268,5 @@ def test_the_published_protocol_reaches_the_referee_when_it_is_asked_for(monkeyp
     ],
 )
 def test_a_setting_out_of_its_range_is_named(given, message):
-    with pytest.raises(SettingError, match=message):
+    with pytest.raises(ArgumentError, match=message):
         CatchSettings(**given).of(TASK)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from planner_jax.cli.main import main
-from planner_jax.core.registry import install_line
+from planner_jax.core.errors import ArgumentError, install_line
 from planner_jax.planning.decided import first_choice
 from planner_jax.policies.checkpoint import save_checkpoint
 from planner_jax.policies.curves import draw_curves
@@ -19,7 +19,6 @@ from planner_jax.policies.observation import FEATURES
 from planner_jax.policies.policy import Policy
 from planner_jax.policies.progress import FILE, read_rows, to_text
 from planner_jax.runs.manifest import to_write
-from planner_jax.runs.settings import SettingError
 from planner_jax.task.catch.estimate import shortfall
 from planner_jax.task.catch.suites import draw_by_key
 
@@ -100,14 +99,14 @@ def test_curves_of_several_seeds_are_drawn_together_and_of_other_settings_are_no
     draw_curves([out, other], tmp_path / "both.png")
     assert (tmp_path / "both.png").stat().st_size > 10_000
     (other / "training.json").write_text(json.dumps(to_write({**asked, "lanes": 7})))
-    with pytest.raises(SettingError, match=f"same lanes as .*, {LANES}, got 7"):
+    with pytest.raises(ArgumentError, match=f"same lanes as .*, {LANES}, got 7"):
         draw_curves([out, other], tmp_path / "both.png")
-    with pytest.raises(SettingError, match="run must be the folder of a training"):
+    with pytest.raises(ArgumentError, match="run must be the folder of a training"):
         draw_curves([tmp_path], tmp_path / "both.png")
 
 
 def test_a_run_of_other_settings_is_not_gone_on_with(asked, trained):
-    with pytest.raises(SettingError, match="seed must be 0, as in the run of .*, got 1"):
+    with pytest.raises(ArgumentError, match="seed must be 0, as in the run of .*, got 1"):
         training.train(dataclasses.replace(asked, seed=1), trained[1])
 
 

@@ -1,5 +1,8 @@
 """Checks of the types and shapes that functions of the library annotate, while tests run."""
 
+import functools
+import inspect
+
 import jax
 import jaxtyping
 import numpy as np
@@ -11,6 +14,7 @@ PACKAGES = (
     *("core", "lanes", "ball", "trajectory", "robot", "space", "plane"),
     *("cost", "optimise", "planning"),
 )
+is_on = True  # False for tests of the library's own checks, which take arguments of any type
 # A leaf of a pytree is a NumPy array on the host, a shape where nothing is computed, and a number
 # where a test or a constant says so. Numbers may be NumPy's.
 _LEAF = jax.typing.ArrayLike | jax.ShapeDtypeStruct
@@ -38,6 +42,14 @@ def check(function):
     if function.__name__ == "__init__":
         return function
     try:
-        return _check(function)
+        checked = _check(function)
     except BeartypeDecorHintException:
         return function
+    if not inspect.isfunction(function):  # a class, whose methods are checked one by one
+        return checked
+
+    @functools.wraps(function)
+    def call(*args, **kwargs):
+        return (checked if is_on else function)(*args, **kwargs)
+
+    return call

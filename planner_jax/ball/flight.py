@@ -12,7 +12,9 @@ from flax import struct
 from jax import Array
 
 from planner_jax.core.arithmetic import components
-from planner_jax.core.checks import require_kind, require_number, require_size, shape_of
+from planner_jax.core.checks import require_kind, require_number, shape_of
+from planner_jax.core.choices import require_size
+from planner_jax.core.errors import ArgumentError
 
 Vector = TypeVar("Vector", Array, tuple[Array, Array, Array])
 
@@ -36,7 +38,7 @@ def require_ball(ball: Any) -> None:
     for name in ("pos", "vel"):
         shape = shape_of(f"ball.{name}", getattr(ball, name))
         if shape != (3,):
-            raise ValueError(f"ball.{name} must have the shape (3,), got {shape}")
+            raise ArgumentError(f"ball.{name}", "the shape (3,)", shape, verb="have")
 
 
 def gravity_vector(gravity: Array) -> Array:

@@ -16,7 +16,8 @@ from jax.custom_derivatives import SymbolicZero
 
 from planner_jax.ball.flight import BallState, require_ball, rk4_step
 from planner_jax.core.arithmetic import reciprocal
-from planner_jax.core.checks import require_kind, require_number, require_scalar, require_size
+from planner_jax.core.checks import require_kind, require_number, require_scalar
+from planner_jax.core.choices import require_size
 from planner_jax.core.rules import POSITIVE, Field, Table
 from planner_jax.lanes import with_kernel
 

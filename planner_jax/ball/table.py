@@ -9,7 +9,9 @@ from jax.core import Tracer
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from planner_jax.ball.prediction import PathTable, convolution_weights
-from planner_jax.core.checks import floating, require_number, require_size, shape_of
+from planner_jax.core.checks import floating, require_number, shape_of
+from planner_jax.core.choices import require_size
+from planner_jax.core.errors import ArgumentError
 
 MOST_NODES = 4096  # that are chosen for a path
 _CHECKED = (0.2, 0.5, 0.8)  # shares of the way between two nodes, where errors are looked for
@@ -56,10 +58,8 @@ def table_path(
     given = [("positions", positions), ("velocities", velocities)]
     values = [_checked(name, value, times.size) for name, value in given if value is not None]
     if len(values) == 2 and np.shape(values[0]) != np.shape(values[1]):
-        raise ValueError(
-            f"velocities must have the shape {np.shape(values[0])} of positions, "
-            f"got {np.shape(values[1])}"
-        )
+        rule = f"the shape {np.shape(values[0])} of positions"
+        raise ArgumentError("velocities", rule, np.shape(values[1]), verb="have")
     if nodes is None:
         nodes = _fewest_nodes(times, values, error)
     require_size("nodes", nodes, 5)
@@ -71,31 +71,30 @@ def table_path(
 
 def _checked_times(times: Any) -> np.ndarray:
     if isinstance(times, Tracer):
-        raise ValueError("times must be known when a program is compiled, got traced ones")
+        raise ArgumentError("times", "known when a program is compiled", shown="traced ones")
     shape = shape_of("times", times)
     if len(shape) != 1 or shape[0] < 2:
-        raise ValueError(f"times must have the shape (K,) with K >= 2, got {shape}")
+        raise ArgumentError("times", "the shape (K,) with K >= 2", shape, verb="have")
     times = np.asarray(times, np.float64)
     steps = np.diff(times)
     if not np.isfinite(times).all() or not (steps > 0.0).all():
-        raise ValueError(f"times must be finite and rise, got a step of {steps.min():g} s")
+        raise ArgumentError("times", "finite and rise", shown=f"a step of {steps.min():g} s")
     if not times[0] <= 0.0 < times[-1]:
-        raise ValueError(
-            f"times must begin at 0, when planning begins, or before, and end after it, "
-            f"got {times[0]:g} to {times[-1]:g} s"
-        )
+        rule = "at 0, when planning begins, or before, and end after it"
+        shown = f"{times[0]:g} to {times[-1]:g} s"
+        raise ArgumentError("times", rule, verb="begin", shown=shown)
     return times
 
 
 def _checked(name: str, value: Any, num: int) -> Any:
     """Values (..., K, 3), in float64 if they are not traced."""
     if shape_of(name, value)[-2:] != (num, 3):
-        raise ValueError(f"{name} must have the shape (..., {num}, 3), got {np.shape(value)}")
+        raise ArgumentError(name, f"the shape (..., {num}, 3)", np.shape(value), verb="have")
     if isinstance(value, Tracer):
         return value
     value = np.asarray(value, np.float64)
     if not np.isfinite(value).all():
-        raise ValueError(f"{name} must be finite, got {value[~np.isfinite(value)][0]}")
+        raise ArgumentError(name, "finite", value[~np.isfinite(value)][0])
     return value
 
 
@@ -120,7 +119,7 @@ def _read(times: np.ndarray, values: list[Any], at: np.ndarray, order: int) -> A
 def _fewest_nodes(times: np.ndarray, values: list[Any], error: float) -> int:
     """A power of two of nodes with which the table is as near to the spline as it has to be."""
     if any(isinstance(value, Tracer) for value in values):
-        raise ValueError("nodes must be given where positions are traced, got none")
+        raise ArgumentError("nodes", "given where positions are traced", shown="none")
     require_number("error", error, "finite and > 0", lambda value: value > 0.0)
     nodes, worst = 16, np.inf
     while nodes <= MOST_NODES:
@@ -137,7 +136,6 @@ def _fewest_nodes(times: np.ndarray, values: list[Any], error: float) -> int:
         if worst <= 1.0:
             return nodes
         nodes *= 2
-    raise ValueError(
-        f"error must be >= {worst * error:.2g} m, which is what {MOST_NODES} nodes leave, "
-        f"got {error:g}"
+    raise ArgumentError(
+        "error", f">= {worst * error:.2g} m, which is what {MOST_NODES} nodes leave", error
     )

@@ -6,7 +6,7 @@ import platform
 import time
 from collections.abc import Iterator
 
-from planner_jax.core.registry import install_line
+from planner_jax.core.errors import install_line
 from planner_jax.host.compile_cache import keep_compiled_programs
 from planner_jax.host.processors import usable_cores
 from planner_jax.runs.environment import environment, require_backend
@@ -29,7 +29,7 @@ def examine() -> Iterator[Finding]:
     """Look at versions, devices, precision, cache and plans, one after another.
 
     Raises:
-        SettingError: JAX has no platform that works.
+        ArgumentError: JAX has no platform that works.
     """
     require_backend()
     folder = keep_compiled_programs()

@@ -14,18 +14,13 @@ from planner_jax.baselines.block.library.cells import LAYOUTS, Face
 from planner_jax.baselines.block.library.coverage import Coverage, check, coverage
 from planner_jax.baselines.block.library.file import load_library, save_library
 from planner_jax.baselines.block.library.table import Library, Setting, fingerprint
-from planner_jax.host.memory import require_memory
+from planner_jax.core.choices import require, require_memory, require_one_of, require_seed
+from planner_jax.core.errors import ArgumentError
 from planner_jax.robot.arm import REGIMES
 from planner_jax.robot.arm_mjcf import irb1600, read_arm
 from planner_jax.runs import style
 from planner_jax.runs.environment import require_backend
-from planner_jax.runs.settings import (
-    SettingError,
-    require,
-    require_count,
-    require_one_of,
-    require_seed,
-)
+from planner_jax.runs.settings import require_count
 from planner_jax.sweep.block.settings import BlockSettings
 from planner_jax.task.block.scene import paper_scene
 
@@ -50,7 +45,7 @@ def build_library(
         home: angles [rad], six for each home; the arm's own if not given.
 
     Raises:
-        SettingError: an argument breaks a rule; one line.
+        ArgumentError: an argument breaks a rule; one line.
     """
     require_one_of(LAYOUTS, "layout", layout)
     require_one_of(REGIMES, "regime", regime)
@@ -68,19 +63,16 @@ def build_library(
     try:
         body = irb1600() if arm is None else read_arm(arm)
     except ValueError as error:
-        raise SettingError(f"arm {error}") from None
+        raise ArgumentError("arm", f"an arm of six joints: {error}", shown="") from None
     except OSError as error:
-        raise SettingError(f"arm must be a file, got {arm!r} ({error.strerror})") from None
+        raise ArgumentError("arm", "a file", shown=f"{arm!r} ({error.strerror})") from None
     chosen: Any = REGIMES[regime]
     at_rest: Any = np.asarray(chosen.ends_at_rest)
     scene = paper_scene(has_pole=pole)
     setting = Setting(arm=body, limits=chosen.limits, ends_at_rest=at_rest, scene=scene)
     homes = np.reshape(body.home if home is None else home, (-1, 6))
     began = time.perf_counter()
-    try:
-        library = build(path, setting, homes, LAYOUTS[layout])
-    except ValueError as error:
-        raise SettingError(str(error)) from None
+    library = build(path, setting, homes, LAYOUTS[layout])
     print(f"Built in {time.perf_counter() - began:.1f} s, compilation included.")
     _print(path, library, coverage(library))
 
@@ -110,17 +102,11 @@ def check_library(path: str, *, num: int = 2000, seed: int = 0) -> None:
     """
     require_count("num", num, 1)
     require_seed(seed)
-    try:
-        require_memory("num", num, BlockSettings.CASE_BYTES)
-    except ValueError as error:
-        raise SettingError(str(error)) from None
+    require_memory("num", num, BlockSettings.CASE_BYTES)
     library = _loaded(path)
     require_backend()
     for home in range(len(library.table.homes)):
-        try:
-            found = check(library, num, seed, home)
-        except ValueError as error:
-            raise SettingError(str(error)) from None
+        found = check(library, num, seed, home)
         blocked = found.verdict.success
         wrong = found.claimed & ~blocked
         print(
@@ -149,10 +135,7 @@ def repair_library(path: str, *, pole: Sequence[float], out: str, retry: bool = 
     there: Any = np.asarray(True)
     scene = library.setting.scene.replace(pole=place, has_pole=there)  # type: ignore[attr-defined]
     began = time.perf_counter()
-    try:
-        repaired, touched = repair(library, scene, retry=retry)
-    except ValueError as error:
-        raise SettingError(str(error)) from None
+    repaired, touched = repair(library, scene, retry=retry)
     save_library(out, repaired)
     print(
         f"Planned {touched.sum()} of {library.found.sum()} motions anew in "
@@ -162,10 +145,7 @@ def repair_library(path: str, *, pole: Sequence[float], out: str, retry: bool = 
 
 
 def _loaded(path: str) -> Library:
-    try:
-        return load_library(path)
-    except ValueError as error:
-        raise SettingError(str(error)) from None
+    return load_library(path)
 
 
 def _print(path: str, library: Library, covered: Coverage) -> None:

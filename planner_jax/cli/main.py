@@ -22,23 +22,16 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
+from planner_jax.core.choices import CHOICES
 from planner_jax.core.digits import written_number, written_whole
-from planner_jax.core.recovery_names import CHOICES
-from planner_jax.core.registry import (
-    MissingExtra,
-    Task,
-    UnknownName,
-    all_tasks,
-    install_line,
-    task_named,
-)
+from planner_jax.core.errors import ArgumentError, MissingExtra, PlannerJaxError
+from planner_jax.core.registry import Task, all_tasks, task_named
 from planner_jax.host import signals as stopping
 from planner_jax.host.compile_cache import keep_compiled_programs
 from planner_jax.host.files import new_file_problem, replacing
 from planner_jax.live.settings import SERVED
 from planner_jax.runs.environment import installed_version, require_backend
 from planner_jax.runs.settings import (
-    SettingError,
     WorkersFailed,
     ending_options,
     require_ending,
@@ -73,11 +66,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             stopping.leave()
         print(f"planner-jax: {str(stop) or 'interrupted'}", file=sys.stderr)
         return _INTERRUPTED
-    except (SettingError, UnknownName, MissingExtra) as error:
-        return _fail(str(error))
     except _NotFinished as error:
         _fail(str(error))
         return _FAILED
+    except PlannerJaxError as error:
+        return _fail(error)
     except MemoryError:
         _fail("the machine has not memory enough: ask for less at once")
         return _FAILED
@@ -94,12 +87,11 @@ class _NotFinished(Exception):
 _ARGUMENTS: set[str] = set()  # names of all options, as they are written in Python
 
 
-def _fail(message: str) -> int:
+def _fail(error: str | PlannerJaxError) -> int:
     """Print one line, in which an argument's name is written as on the command line."""
-    name, _, rest = message.partition(" ")
-    if name in _ARGUMENTS:
-        message = f"--{name.replace('_', '-')} {rest}"
-    print(f"planner-jax: error: {' '.join(message.split())}", file=sys.stderr)
+    if isinstance(error, ArgumentError | MissingExtra):
+        error = error.renamed({name: f"--{name.replace('_', '-')}" for name in _ARGUMENTS})
+    print(f"planner-jax: error: {' '.join(str(error).split())}", file=sys.stderr)
     return _BAD_ARGUMENT
 
 
@@ -214,7 +206,7 @@ def _robots(options: dict[str, Any]) -> None:
     try:
         print(listing() if name is None else as_yaml(robot_named(name)), end="")
     except RobotError as error:
-        raise SettingError(f"NAME must be a sound robot: {error}") from None
+        raise ArgumentError("NAME", f"a sound robot: {error}", shown="") from None
 
 
 def _add_library(commands: Any) -> None:
@@ -273,9 +265,7 @@ def _train(given: dict[str, Any]) -> None:
     try:
         from planner_jax.policies.training import train_as_asked
     except ModuleNotFoundError as error:
-        raise MissingExtra(
-            f"train needs {error.name}: {install_line('policies')}", name=error.name
-        ) from None
+        raise MissingExtra("train", error.name, "policies") from None
     rest = functools.partial(_rest, Path(out), f"go on with: {_same_command()}", "training.json")
     with stopping.under_way(rest), _told_how_to_go_on(rest):
         train_as_asked(settings, out)
@@ -308,14 +298,13 @@ def _export(given: dict[str, Any]) -> None:
     from planner_jax.core.plan_files import PlanFileError
     from planner_jax.export import words
     from planner_jax.export.rested import lacks_ending
-    from planner_jax.export.setpoints import ExportError
 
     source, row = given.pop("plans"), given.pop("row", None)
     out, udp = _out(given, "file"), given.pop("udp", None)
     require_ending(name := given.pop("ending", "brake"))
     ending = ending_options(name).get("ending")
     if out is not None and udp is not None:
-        raise SettingError(f"udp must not be given with --out, got {udp}")
+        raise ArgumentError("udp", "given with --out", udp, verb="not be")
     try:
         out = out or words.default_name(source, row, given["to"])
         plan, against = _plan_of(source, row)
@@ -326,9 +315,7 @@ def _export(given: dict[str, Any]) -> None:
         else:
             told = f"{words.stream(plan, udp=udp, **given)} setpoints sent"
     except PlanFileError as error:
-        raise SettingError(f"RUN{str(error).removeprefix('path')}") from None
-    except ExportError as error:
-        raise SettingError(str(error)) from None
+        raise error.renamed({"path": "RUN"}) from None
     if against:
         print(f"planner-jax: warning: row {row} fails the referee: {against}", file=sys.stderr)
     if lacks:
@@ -347,7 +334,7 @@ def _plan_of(source: str, row: int | None) -> tuple[Any, str]:
     from planner_jax.export.saved import saved_plan
 
     if not os.path.exists(source):
-        raise SettingError(f"RUN must be the folder of a sweep or a file of plans, got {source!r}")
+        raise ArgumentError("RUN", "the folder of a sweep or a file of plans", source)
     return saved_plan(source, row), ""
 
 
@@ -355,7 +342,7 @@ def _case_of(source: str, row: Any, ending: str) -> Any:
     """The case of a row of a sweep, whose limits a way to rest has to keep."""
     if not os.path.isdir(source):
         rule = "none for plans of a file that do not come to rest, as it does not hold their limits"
-        raise SettingError(f"ending must be {rule}, got {ending}")
+        raise ArgumentError("ending", rule, ending)
     from planner_jax.runs.run_folder import RunFolder
     from planner_jax.sweep.rows import case_of_row
 
@@ -477,9 +464,9 @@ def _plan(task: Task, given: dict[str, Any]) -> int:
     out, rate = _out(given), given.pop("rate", None)
     settings = pkgutil.resolve_name(str(task.single))(**given).of(task)
     if rate is not None and out is None:
-        raise SettingError(f"rate must be left out without --out, got {rate:g}")
+        raise ArgumentError("rate", "left out without --out", rate)
     if out is not None and (problem := new_file_problem(out)):
-        raise SettingError(f"out must be {problem.replace('file', 'folder')}, got {out!r}")
+        raise ArgumentError("out", problem.replace("file", "folder"), out)
     require_backend()
     keep_compiled_programs()
     single = pkgutil.resolve_name(settings.RUN)(task, settings)
@@ -493,13 +480,10 @@ def _plan(task: Task, given: dict[str, Any]) -> int:
 
 
 def _require_rate(plan: Any, rate: float) -> None:
-    """Raise `SettingError` unless a plan can be sampled at a rate [Hz]."""
-    from planner_jax.export.setpoints import ExportError, setpoints_of
+    """Raise `ArgumentError` unless a plan can be sampled at a rate [Hz]."""
+    from planner_jax.export.setpoints import setpoints_of
 
-    try:
-        setpoints_of(plan, rate)
-    except ExportError as error:
-        raise SettingError(str(error)) from None
+    setpoints_of(plan, rate)
 
 
 def _write_answer(task: Task, planner: str, answer: Any, out: Path, rate: float | None) -> None:
@@ -547,9 +531,9 @@ def _out(given: dict[str, Any], kind: str = "folder") -> str | None:
     """
     out = given.pop("out", None)
     if out == "":
-        raise SettingError(f"out must name a {kind}, got ''")
+        raise ArgumentError("out", f"a {kind}", verb="name", shown="''")
     if out and "://" in out:
-        raise SettingError(f"out must be a {kind} of this machine, got {out!r}")
+        raise ArgumentError("out", f"a {kind} of this machine", out)
     return out
 
 
@@ -561,7 +545,7 @@ def _run_folder(name: str) -> str:
 def _sweep(task: Task, given: dict[str, Any]) -> None:
     resume, workers, out = given.pop("resume", False), given.pop("workers", None), _out(given)
     if resume and out is None:
-        raise SettingError("out must name the folder to resume, got nothing")
+        raise ArgumentError("out", "the folder to resume", verb="name", shown="nothing")
     settings = pkgutil.resolve_name(task.sweep)(**given).of(task)
     out = out or _run_folder(f"{task.name}-{task.split_planner(settings.planner)[0]}")
     settings.require_room(out)
@@ -688,11 +672,11 @@ def _compare(options: dict[str, Any]) -> None:
 
 
 def _require_new_file(out: str, ending: str) -> None:
-    """Raise `SettingError` unless a path of the option `--out` is that of a file to be made."""
+    """Raise `ArgumentError` unless a path of the option `--out` is that of a file to be made."""
     if not out.endswith(ending):
-        raise SettingError(f"out must end in {ending}, got {out!r}")
+        raise ArgumentError("out", ending, out, verb="end in")
     if problem := new_file_problem(out):
-        raise SettingError(f"out must be {problem}, got {out!r}")
+        raise ArgumentError("out", problem, out)
 
 
 def _doctor(options: dict[str, Any]) -> int:

@@ -14,10 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-
-def told(value: Any) -> str:
-    """A value in one short line, for a message."""
-    return " ".join(f"{value!r}".split())[:60]
+from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 
 
 def shapes_told(tree: Any) -> str:
@@ -25,14 +22,6 @@ def shapes_told(tree: Any) -> str:
     parts = jax.tree_util.tree_leaves_with_path(tree)
     names = (jax.tree_util.keystr(place, simple=True, separator=".") for place, _ in parts)
     return ", ".join(f"{n} {np.shape(leaf)}" for n, (_, leaf) in zip(names, parts, strict=True))
-
-
-def require_size(name: str, value: Any, least: int = 1) -> None:
-    """Raise unless an argument is a whole number that is not too small."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise TypeError(f"{name} must be a whole number, got {told(value)}")
-    if value < least:
-        raise ValueError(f"{name} must be >= {least}, got {value}")
 
 
 def require_number(
@@ -52,33 +41,33 @@ def require_number(
     """
     require_scalar(name, value)
     if not isinstance(value, jax.Array) and not (np.isfinite(value) and holds(value)):
-        raise ValueError(f"{name} must be {words}, got {value}")
+        raise ArgumentError(name, words, value)
 
 
 def require_scalar(name: str, value: Any) -> None:
     """Raise `TypeError` unless an argument is one number, finite or not."""
     number = numeric(value)
     if number is None or number.shape or number.dtype == np.bool_:
-        raise TypeError(f"{name} must be a number, got {told(value)}")
+        raise ArgumentTypeError(name, "a number", value)
 
 
 def require_switch(name: str, value: Any) -> None:
     """Raise `TypeError` unless an argument is true or false."""
     if not isinstance(value, bool | np.bool_):
-        raise TypeError(f"{name} must be True or False, got {told(value)}")
+        raise ArgumentTypeError(name, "True or False", value)
 
 
 def require_kind(name: str, value: Any, *kinds: type) -> None:
     """Raise `TypeError` unless an argument is of a class, or of one of some."""
     if not isinstance(value, kinds):
         known = " or a ".join(kind.__name__ for kind in kinds)
-        raise TypeError(f"{name} must be a {known}, got a {type(value).__name__}")
+        raise ArgumentTypeError(name, f"a {known}", shown=f"a {type(value).__name__}")
 
 
 def require_path_name(name: str, value: Any) -> None:
     """Raise `TypeError` unless an argument may be the path of a file."""
     if not isinstance(value, str | os.PathLike):
-        raise TypeError(f"{name} must be the path of a file, got {told(value)}")
+        raise ArgumentTypeError(name, "the path of a file", value)
 
 
 _HOSTS = (np.ndarray, np.generic, float)  # kinds that are told from JAX's arrays at once
@@ -112,11 +101,11 @@ def numbers_of(name: str, value: Any, batch: tuple[int, ...], shape: tuple[int, 
     """
     given = numeric(value)
     if given is None:
-        raise TypeError(f"{name} must be numbers, got {told(value)}")
+        raise ArgumentTypeError(name, "numbers", value)
     given, whole = np.asarray(given), (*batch, *shape)
     if given.shape not in (shape, whole):
         rule = f"{shape}" if whole == shape else f"{shape} or {whole}"
-        raise ValueError(f"{name} must have the shape {rule}, got {given.shape}")
+        raise ArgumentError(name, f"the shape {rule}", given.shape, verb="have")
     return given if given.shape == whole else np.broadcast_to(given, whole)
 
 
@@ -124,7 +113,7 @@ def shape_of(name: str, value: Any) -> tuple[int, ...]:
     """The shape of an argument that holds numbers; raises `TypeError` where it does not."""
     given = numeric(value)
     if given is None:
-        raise TypeError(f"{name} must be numbers, got {told(value)}")
+        raise ArgumentTypeError(name, "numbers", value)
     return given.shape
 
 
@@ -139,9 +128,9 @@ def floating(dtype: Any) -> Any:
     except TypeError:
         kind = None
     if kind is None or not jnp.issubdtype(kind, np.floating):
-        raise TypeError(f"dtype must be a type of floating-point numbers, got {told(dtype)}")
+        raise ArgumentTypeError("dtype", "a type of floating-point numbers", dtype)
     if jax.dtypes.canonicalize_dtype(kind) != kind:
-        raise TypeError(f"dtype must be float32 unless jax_enable_x64 is set, got {kind}")
+        raise ArgumentTypeError("dtype", "float32 unless jax_enable_x64 is set", kind)
     return kind
 
 
@@ -168,10 +157,10 @@ def _arrays_beginning(
     leaves, structure = jax.tree.flatten(tree)
     arrays = [numeric(leaf) for leaf in leaves]
     if not arrays or any(array is None for array in arrays):
-        raise TypeError(f"{name} must hold arrays of numbers, got {told(tree)}")
+        raise ArgumentTypeError(name, "arrays of numbers", tree, verb="hold")
     for array in arrays:
         if array.shape[: len(shape)] != shape:
-            raise ValueError(f"{name} must have leaves that begin with {words}, got {array.shape}")
+            raise ArgumentError(name, f"leaves that begin with {words}", array.shape, verb="have")
     return arrays, structure
 
 
@@ -192,7 +181,7 @@ def require_path(
         ValueError: it has other axes.
     """
     if isinstance(path, type) or not callable(getattr(path, "at", None)):
-        raise TypeError(f"{name} must be a path, with a method at(time), got {told(path)}")
+        raise ArgumentTypeError(name, "a path, with a method at(time)", path)
     of = f" of {whose}" if whose else ""
     arrays, tree = _arrays_beginning(name, path, axes, f"the shape {axes}{of}")
     layout = tuple([(array.shape, array.dtype) for array in arrays])
@@ -201,10 +190,10 @@ def require_path(
     except (TypeError, ValueError, IndexError, AttributeError) as error:
         rule = f"a path of which at(time) gives a position, with the axes {axes}{of}"
         found = f"a {type(path).__name__} with {shapes_told(path)}"
-        raise TypeError(f"{name} must be {rule}, got {found}") from error
+        raise ArgumentTypeError(name, rule, shown=found) from error
     if found != (*axes, dimensions):
         rule = f"the shape {(*axes, dimensions)}"
-        raise ValueError(f"{name} must give positions of {rule}, got {found}")
+        raise ArgumentError(name, f"positions of {rule}", verb="give", shown=found)
 
 
 @functools.lru_cache(maxsize=256)

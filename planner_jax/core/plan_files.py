@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from planner_jax.core.checks import require_path_name
+from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.host.files import open_plain, replacing
 
 VERSION = 1
@@ -26,7 +27,7 @@ _HEADER = "header"
 Kind = TypeVar("Kind")
 
 
-class PlanFileError(ValueError):
+class PlanFileError(ArgumentError):
     """A file cannot be read as plans; one line that names the file."""
 
 
@@ -45,7 +46,7 @@ def save_arrays(path: str | os.PathLike, tree: Any) -> None:
     arrays: dict[str, Any] = {name: np.asarray(leaf) for name, leaf in named_leaves(tree).items()}
     for name, array in arrays.items():
         if array.dtype.kind in "OSU":  # objects NumPy would pickle
-            raise TypeError(f"{name} must be an array of numbers, got {array.dtype}")
+            raise ArgumentTypeError(name, "an array of numbers", shown=str(array.dtype))
     with replacing(path) as scratch, open(scratch, "wb") as file:
         np.savez(file, **{_HEADER: np.array(header), **arrays})
 
@@ -61,15 +62,16 @@ def load_arrays(path: str | os.PathLike, kind: type[Kind]) -> Kind:
     version, name, arrays = _read(path)
     if version != VERSION or name != kind.__name__:
         raise PlanFileError(
-            f"path must be a file of {kind.__name__} of version {VERSION}, got {name} of version "
-            f"{version} in {str(path)!r}"
+            "path",
+            f"a file of {kind.__name__} of version {VERSION}",
+            shown=f"{name} of version {version} in {str(path)!r}",
         )
     try:
         tree = _tree(kind, "", arrays)
     except KeyError as error:
-        raise PlanFileError(f"path must hold {error.args[0]}, got {str(path)!r}") from None
+        raise PlanFileError("path", error.args[0], str(path), verb="hold") from None
     if arrays:
-        raise PlanFileError(f"path must not hold {', '.join(arrays)}, got {str(path)!r}")
+        raise PlanFileError("path", ", ".join(arrays), str(path), verb="not hold")
     return tree
 
 
@@ -88,8 +90,9 @@ def load_fitting(path: str | os.PathLike, kinds: Sequence[type[Kind]]) -> Kind:
                 return _tree(kind, "", dict(arrays))
     names = " or ".join(kind.__name__ for kind in kinds)
     raise PlanFileError(
-        f"path must be a file of {names} of version {VERSION}, got {name} of version {version} in "
-        f"{str(path)!r}"
+        "path",
+        f"a file of {names} of version {VERSION}",
+        shown=f"{name} of version {version} in {str(path)!r}",
     )
 
 
@@ -107,9 +110,9 @@ def _read(path: str | os.PathLike) -> tuple[Any, Any, dict[str, np.ndarray]]:
         version, name = header["version"], header["class"]
     except UNREADABLE as error:
         if isinstance(error, FileNotFoundError):
-            raise PlanFileError(f"path must be a file of plans, got {str(path)!r}") from None
+            raise PlanFileError("path", "a file of plans", str(path)) from None
         raise PlanFileError(
-            f"path must be a whole file of plans, got {str(path)!r} ({type(error).__name__})"
+            "path", "a whole file of plans", shown=f"{str(path)!r} ({type(error).__name__})"
         ) from None
     return version, name, arrays
 

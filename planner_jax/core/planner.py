@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jax.extend.backend import backends
 
+from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.protocol import Attempt, Case, Plan
 
 CaseT = TypeVar("CaseT", bound=Case)
@@ -165,13 +166,13 @@ class Planner(Generic[CaseT, PlanT]):
         )
 
     def with_effort(self, effort: str) -> "Planner":
-        """Return the planner with a longer search; see `planner_jax.core.efforts`.
+        """Return the planner with a longer search; see `planner_jax.core.choices`.
 
         Raises:
             ValueError: the planner minimises nothing.
         """
         rule = f"feasible for a {type(self).__name__}, which minimises nothing"
-        raise ValueError(f"effort must be {rule}, got {effort!r}")
+        raise ArgumentError("effort", rule, effort)
 
 
 def require_planner(planner: object) -> None:
@@ -179,7 +180,7 @@ def require_planner(planner: object) -> None:
     if not isinstance(planner, Planner) or planner.kind is None:
         is_class = isinstance(planner, type)
         got = f"the class {planner.__name__}" if is_class else f"a {type(planner).__name__}"
-        raise TypeError(f"planner must be one, such as pj.hit.planner(), got {got}")
+        raise ArgumentTypeError("planner", "one, such as pj.hit.planner()", got)
 
 
 def require_fit(planner: Planner, cases: object) -> None:
@@ -191,17 +192,18 @@ def require_fit(planner: Planner, cases: object) -> None:
     """
     require_planner(planner)
     if jax.tree_util.all_leaves([planner]) and planner.kind is not Kind.HOST:
-        raise TypeError(
-            f"{type(planner).__name__} must be a pytree: put @jax.tree_util.register_static over "
-            "its frozen dataclass, or make it a flax.struct.dataclass if it holds arrays"
-        )
+        rule = "a pytree: put @jax.tree_util.register_static over its frozen dataclass, or make it "
+        rule += "a flax.struct.dataclass if it holds arrays"
+        raise ArgumentTypeError(type(planner).__name__, rule, shown="")
     if not isinstance(cases, planner.case_type):
         raise TypeError(
             f"{type(planner).__name__} plans cases of the class {planner.case_type.__name__}, got "
             f"{type(cases).__name__}"
         )
     if not planner.attempts:
-        raise ValueError(f"{type(planner).__name__} must have at least one attempt, got none")
+        raise ArgumentError(
+            type(planner).__name__, "at least one attempt", verb="have", shown="none"
+        )
 
 
 def has_only_cpu() -> bool:

@@ -11,14 +11,9 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.core.checks import (
-    numeric,
-    require_kind,
-    require_number,
-    require_size,
-    require_switch,
-    told,
-)
+from planner_jax.core.checks import numeric, require_kind, require_number, require_switch
+from planner_jax.core.choices import require_size
+from planner_jax.core.errors import ArgumentError, ArgumentTypeError, format_value
 from planner_jax.core.plan_files import load_arrays, save_arrays
 from planner_jax.core.rules import has_rules, is_sound
 
@@ -168,7 +163,7 @@ def require_settings(planner: Any) -> None:
             require_attempts(name, value, type(usual[0]))
         elif isinstance(usual, tuple):
             if not isinstance(value, tuple) or any(numeric(x) is None for x in value):
-                raise TypeError(f"{name} must be a tuple of numbers, got {told(value)}")
+                raise ArgumentTypeError(name, "a tuple of numbers", format_value(value))
         elif dataclasses.is_dataclass(usual):
             require_kind(name, value, type(usual))
 
@@ -181,9 +176,9 @@ def require_attempts(name: str, value: Any, kind: type) -> None:
         ValueError: it has none.
     """
     if not isinstance(value, tuple) or not all(isinstance(each, kind) for each in value):
-        raise TypeError(f"{name} must be a tuple of {kind.__name__}, got {told(value)}")
+        raise ArgumentTypeError(name, f"a tuple of {kind.__name__}", format_value(value))
     if not value:
-        raise ValueError(f"{name} must have an entry, got none")
+        raise ArgumentError(name, "an entry", verb="have", shown="none")
 
 
 @dataclasses.dataclass(frozen=True)

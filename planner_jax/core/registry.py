@@ -18,29 +18,15 @@ import pkgutil
 import warnings
 from collections.abc import Callable, Collection, Mapping
 from importlib import metadata
-from pathlib import Path
 from typing import Any
+
+from planner_jax.core.errors import ArgumentTypeError, UnknownName
 
 _GROUP = "planner_jax"
 _OWN = {
     name: f"planner_jax.task.{name}.spec:TASK"
     for name in ("hit", "catch", "intercept", "group", "block")
 }
-
-
-class UnknownName(ValueError):
-    """There is no task, planner or suite of a name; one line that lists those there are."""
-
-
-class MissingExtra(ModuleNotFoundError):
-    """A planner needs a package that is not installed; one line that says how to install it."""
-
-
-def install_line(extra: str) -> str:
-    """What installs the packages of an extra: into a checkout, or beside an installed wheel."""
-    if (Path(__file__).parents[2] / "pyproject.toml").is_file():
-        return f"pip install -c constraints.txt -e '.[{extra}]'"
-    return f"pip install 'planner-jax[{extra}]'"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,7 +86,7 @@ class Task:
         others = _offered("suites", self.name, self.suites)
         return {**self.suites, **{name: f"{entry.value}." for name, entry in others.items()}}
 
-    def split_planner(self, name: str) -> tuple[str, str]:
+    def split_planner(self, name: object) -> tuple[str, str]:
         """The key of `all_planners` in a planner's name, and its file, or nothing.
 
         Raises:
@@ -109,12 +95,14 @@ class Task:
         planner, file = split_name(self.all_planners(), "planner", name, self.from_file)
         if planner in self.from_file and not file:
             raise UnknownName(
-                f"planner must name its file, as in {planner}:FILE, which "
-                f"`{self.from_file[planner]}` makes, got {name!r}"
+                "planner",
+                f"its file, as in {planner}:FILE, which `{self.from_file[planner]}` makes",
+                name,
+                verb="name",
             )
         return planner, file
 
-    def make_planner(self, name: str, options: Mapping[str, Any]) -> Any:
+    def make_planner(self, name: object, options: Mapping[str, Any]) -> Any:
         """The planner of a name.
 
         Args:
@@ -132,10 +120,10 @@ class Task:
             for option in options:
                 if option not in known:
                     rule = f"one of {', '.join(known)}" if known else "left out"
-                    raise TypeError(f"option of planner {planner} must be {rule}, got {option!r}")
+                    raise ArgumentTypeError(f"option of planner {planner}", rule, option)
         return maker(*filter(None, [file]), **options)
 
-    def other_suite(self, name: str) -> Callable[..., Any]:
+    def other_suite(self, name: object) -> Callable[..., Any]:
         """What draws a suite of another package: `draw(num, seed, first)`.
 
         Raises:
@@ -148,27 +136,27 @@ class Task:
         return pkgutil.resolve_name(f"{self.home}:{word}")
 
 
-def require_name(known: Mapping[str, Any], kind: str, name: str) -> None:
+def require_name(known: Mapping[str, Any], kind: str, name: object) -> None:
     """Raise `UnknownName` unless a name is known."""
     if not isinstance(name, str):
-        raise UnknownName(f"{kind} must be a name, got {name!r:.60}")
+        raise UnknownName(kind, "a name", name)
     if name not in known:
-        raise UnknownName(f"{kind} must be one of {', '.join(known)}, got {name!r}")
+        raise UnknownName(kind, f"one of {', '.join(known)}", name)
 
 
-def suite_named(name: Any, default: str) -> str:
+def suite_named(name: object, default: str) -> str:
     """The name of a suite, or the default where none is given.
 
     Raises:
         UnknownName: it is no name.
     """
     if name is not None and not isinstance(name, str):
-        raise UnknownName(f"suite must be a name, got {name!r:.60}")
+        raise UnknownName("suite", "a name", name)
     return name or default
 
 
 def split_name(
-    known: Mapping[str, Any], kind: str, name: str, from_file: Collection[str] = ()
+    known: Mapping[str, Any], kind: str, name: object, from_file: Collection[str] = ()
 ) -> tuple[str, str]:
     """A known name and the file behind it, as in "policy:FILE", or nothing.
 
@@ -184,13 +172,13 @@ def split_name(
     own, _, file = name.partition(":") if isinstance(name, str) else (name, "", "")
     require_name(known, kind, own)
     if own != name and own not in from_file:
-        raise UnknownName(f"{kind} {own} takes no file, got {name!r}")
+        raise UnknownName(kind, f"{own} without a file", name)
     if own != name and not file:
-        raise UnknownName(f"{kind} must name a file behind {own}:, got {name!r}")
+        raise UnknownName(kind, f"a file behind {own}:", name, verb="name")
     return own, file
 
 
-def task_named(name: str) -> Task:
+def task_named(name: object) -> Task:
     """The task of a name, of the library or of another package.
 
     Raises:
@@ -246,6 +234,6 @@ def _resolved(place: str | metadata.EntryPoint) -> Any:
     try:
         return place.load()
     except Exception as error:  # whatever it is, it is the other package's
-        raise UnknownName(
-            f"{place.name} of {place.value} cannot be loaded: {type(error).__name__}: {error}"
-        ) from error
+        why = f"{type(error).__name__}: {error}"
+        name = f"{place.name} of {place.value}"
+        raise UnknownName(name, "one that can be loaded", shown=why) from error

@@ -16,9 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-
-class CaseError(ValueError):
-    """A value of a case breaks a rule; the message names the value, the rule and the lane."""
+from planner_jax.core.errors import ArgumentError, ArgumentTypeError, CaseError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,6 +28,7 @@ class Rule:
     # the case, or part of it, whose table has the rule.
     holds: Callable[[Any, Any], Any]
     infinite: bool = False  # whether the number may be infinite
+    other: str = ""  # the array of the same part that the number is compared with
 
 
 FINITE = Rule("finite", lambda value, part: abs(value) < np.inf)
@@ -49,7 +48,7 @@ def within(low: float, high: float, words: str) -> Rule:
 
 def below(other: str) -> Rule:
     """The rule of what must be less than another array of the same part and shape."""
-    return Rule(f"< {other}", lambda value, part: value < named(part, other))
+    return Rule("<", lambda value, part: value < named(part, other), other=other)
 
 
 def _is_own_place(value: Any, part: Any) -> Any:
@@ -103,54 +102,59 @@ def has_rules(cases: Any) -> bool:
 
 
 def require_sound(cases: Any, names: Mapping[str, str] | None = None) -> None:
-    """Raise for the first rule that some lane of the cases breaks, in one line.
+    """Raise for the first rule that a case breaks, in one line.
 
     Args:
         cases: one case, or a batch, in arrays of any kind. Classes without `rules` pass; of traced
-            arrays, which have no values yet, only shape and kind are looked at.
-        names: of fields, as the caller knows them: of the arguments that they were made of.
+            arrays, which have no values yet, only shape and kind are checked.
+        names: arguments of the caller by the fields that they become, for the message.
 
     Raises:
         CaseError: a number breaks its rule; the line has the field, the rule, the value and the
-            first lane.
-        ValueError: an array has not the shape of its field.
-        TypeError: an array has not the kind of numbers of its field.
+            first such case of the batch.
+        ArgumentError: an array has not the shape of its field.
+        ArgumentTypeError: an array has not the kind of numbers of its field.
     """
+    try:
+        _require_sound(cases)
+    except ArgumentError as error:
+        raise error.renamed(names or {}) from None
+
+
+def _require_sound(cases: Any) -> None:
+    """Raise for the first rule that a case breaks, with the names of fields."""
     if isinstance(cases, type) or not hasattr(cases, "batch_shape"):
-        raise TypeError(f"cases must be a case or a batch, got a {type(cases).__name__}")
+        raise ArgumentTypeError("cases", "a case or a batch", shown=f"a {type(cases).__name__}")
     require_shapes(cases)
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(cases)):
         return
     for ruled in all_ruled(jax.tree.map(np.asarray, cases)):
-        name, words = ruled.name, ruled.rule.words
-        for field, argument in (names or {}).items():
-            name = argument if name == field else name
-            words = words.replace(field, argument)
-        require_rule(name, ruled.value, ruled.holds(), words, cases.batch_shape)
+        words, other = ruled.rule.words, ruled.rule.other
+        require_rule(ruled.name, ruled.value, ruled.holds(), words, cases.batch_shape, other)
 
 
-def require_rule(name: str, value: Any, holds: Any, words: str, batch: tuple[int, ...]) -> None:
-    """Raise `CaseError` for the first lane where a rule does not hold.
+def require_rule(
+    name: str, value: Any, holds: Any, words: str, batch: tuple[int, ...], other: str = ""
+) -> None:
+    """Raise `CaseError` for the first case where a rule does not hold.
 
     Args:
         name: of the value, for the message.
         value: batch + shape.
-        holds: likewise, bool.
+        holds: batch + shape, bool, where the rule holds.
         words: what the value must be.
         batch: () or (B,).
+        other: name of the array that the value is compared with.
     """
     broken = ~np.asarray(holds)
     if not broken.any():
         return
     first = np.asarray(value)[broken].flat[0]
-    lanes = broken.any(axis=tuple(range(len(batch), broken.ndim)))
-    where = ""
-    if batch:
-        lane = tuple(int(i) for i in np.argwhere(lanes)[0])
-        where = f" in lane {lane[0] if len(lane) == 1 else lane}"
-        if (others := int(lanes.sum()) - 1) > 0:
-            where += f" ({others} more such lane{'s' if others > 1 else ''})"
-    raise CaseError(f"{name} must be {words}, got {first:g}{where}")
+    cases = np.argwhere(broken.any(axis=tuple(range(len(batch), broken.ndim))))
+    index = tuple(map(int, cases[0])) if batch else None
+    if index is not None and len(index) == 1:
+        (index,) = index
+    raise CaseError(name, words, first, index, other=other, more=len(cases) - 1)
 
 
 def require_shapes(cases: Any) -> None:
@@ -167,7 +171,7 @@ def require_shapes(cases: Any) -> None:
         batch = _usual_batch(part)
         for each in dataclasses.fields(part):
             if getattr(part, each.name) is None and each.default is not None:
-                raise TypeError(f"{place}{each.name} must be given, got None")
+                raise ArgumentTypeError(f"{place}{each.name}", "given", shown="None")
         for field in type(part).rules:
             value, name = named(part, field.name), place + field.name
             if value is None:
@@ -175,9 +179,9 @@ def require_shapes(cases: Any) -> None:
             kind = np.asarray(value).dtype if isinstance(value, _PLAIN) else jnp.result_type(value)
             if not jnp.issubdtype(kind, field.kind):
                 wanted = _KINDS[field.kind]
-                raise TypeError(f"{name} must be {wanted}, got an array of {kind}")
+                raise ArgumentTypeError(name, wanted, shown=f"an array of {kind}")
             if kind == np.float16:
-                raise TypeError(f"{name} must be in float32 or float64, got an array of {kind}")
+                raise ArgumentTypeError(name, "in float32 or float64", shown=f"an array of {kind}")
             if field.shape is None:
                 continue
             shape = np.shape(value)
@@ -192,7 +196,7 @@ def require_shapes(cases: Any) -> None:
             if shape != (*batch, *known):
                 wanted = ", ".join(map(str, whole := (*batch, *known)))
                 comma = "," if len(whole) == 1 else ""
-                raise ValueError(f"{name} must have the shape ({wanted}{comma}), got {shape}")
+                raise ArgumentError(name, f"the shape ({wanted}{comma})", shape, verb="have")
 
 
 def _usual_batch(part: Any) -> tuple[int, ...]:

@@ -16,7 +16,8 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.core.checks import shapes_told, told
+from planner_jax.core.checks import shapes_told
+from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.rules import NOT_NEGATIVE, NOT_ZERO, POSITIVE, Field, Table, below
 from planner_jax.cost.peaks import greatest_by_tangents
 from planner_jax.trajectory.polynomial import Motion
@@ -150,7 +151,7 @@ class Dislike:
         return self.weight * inside.clip(0.0, 1.0) ** 2
 
 
-def for_batch(extras: Sequence[Extra], batch: tuple[int, ...], dtype: Any) -> tuple[Any, ...]:
+def for_batch(extras: object, batch: tuple[int, ...], dtype: Any) -> tuple[Any, ...]:
     """Extras whose leaves have a dtype and the axes of a batch, () or (B,), in front.
 
     Raises:
@@ -158,10 +159,10 @@ def for_batch(extras: Sequence[Extra], batch: tuple[int, ...], dtype: Any) -> tu
         ValueError: an extra is not for one case, and not all of its leaves have these axes.
     """
     if not isinstance(extras, Sequence) or isinstance(extras, str):
-        raise TypeError(f"extras must be a sequence of limits and costs, got {told(extras)}")
+        raise ArgumentTypeError("extras", "a sequence of limits and costs", extras)
     for extra in extras:
         if isinstance(extra, type) or not isinstance(extra, ExtraLimit | ExtraCost):
-            raise TypeError(f"extras must have a method excess or cost, got {told(extra)}")
+            raise ArgumentTypeError("extras", "a method excess or cost", extra, verb="have")
 
     def spread(place: int, extra: Any) -> Any:
         extra = jax.tree.map(np.asarray, extra, is_leaf=lambda x: isinstance(x, tuple | list))
@@ -175,7 +176,7 @@ def for_batch(extras: Sequence[Extra], batch: tuple[int, ...], dtype: Any) -> tu
         if not alike and (not batch or any(shape[: len(batch)] != batch for shape in shapes)):
             rule = f"for one case, or have the axes {batch} in front" if batch else "for one case"
             found = f"a {type(extra).__name__} with {shapes_told(extra)}"
-            raise ValueError(f"extras.{place} must be {rule}, got {found}")
+            raise ArgumentError(f"extras.{place}", rule, shown=found)
         lead = batch if alike else ()
         return jax.tree.map(lambda x: jnp.asarray(np.broadcast_to(x, lead + x.shape), dtype), extra)
 

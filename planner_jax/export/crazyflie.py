@@ -9,8 +9,9 @@ from typing import BinaryIO
 
 import numpy as np
 
+from planner_jax.core.errors import ArgumentError
 from planner_jax.export.csv_rows import write_table
-from planner_jax.export.setpoints import ExportError, pieces_of
+from planner_jax.export.setpoints import pieces_of
 from planner_jax.robot.quadrotor_plan import QuadrotorPlan
 
 MEMORY = 4096  # bytes for trajectories in the firmware
@@ -25,24 +26,24 @@ def poly4d(plan: QuadrotorPlan) -> np.ndarray:
     began. The yaw is zero throughout.
 
     Raises:
-        ExportError: the plan may not leave, its degree is above 7, it has more pieces than the
+        ArgumentError: the plan may not leave, its degree is above 7, it has more pieces than the
             memory holds, or its numbers are too large for float32.
     """
     pieces = pieces_of(plan)
     num, powers, _ = pieces.coeffs.shape
     degree = int(np.max(np.nonzero(pieces.coeffs)[1], initial=0))
     if degree >= POWERS:
-        raise ExportError(f"plan must be of degree {POWERS - 1} or less for this, got {degree}")
+        raise ArgumentError("plan", f"of degree {POWERS - 1} or less for this", degree)
     if num > MEMORY // _BYTES:
         rule = f"at most {MEMORY // _BYTES} pieces, which fill a Crazyflie's {MEMORY} bytes"
-        raise ExportError(f"plan must have {rule}, got {num}")
+        raise ArgumentError("plan", rule, num, verb="have")
     rows = np.zeros((num, 4, POWERS), np.float32)
     kept = min(powers, POWERS)
     with np.errstate(over="ignore"):
         rows[:, :3, :kept] = np.swapaxes(pieces.coeffs[:, :kept], 1, 2)
         found = np.hstack([pieces.durations[:, None].astype(np.float32), rows.reshape(num, -1)])
     if not np.isfinite(found).all() or not (found[:, 0] > 0.0).all():
-        raise ExportError("plan must have numbers that float32 holds, got larger ones")
+        raise ArgumentError("plan", "numbers that float32 holds", verb="have", shown="larger ones")
     return found
 
 

@@ -9,7 +9,7 @@ import pkgutil
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from planner_jax.core.registry import MissingExtra, UnknownName, install_line, require_name
+from planner_jax.core.errors import MissingExtra, UnknownName, format_value
 
 EXTRA = "export"
 
@@ -72,12 +72,11 @@ def format_named(name: str) -> Format:
     Raises:
         UnknownName: there is none; one line with those there are, and the one that is most alike.
     """
-    try:
-        require_name(FORMATS, "to", name)
-    except UnknownName as error:
+    if name not in FORMATS:
         alike = difflib.get_close_matches(str(name).lower(), FORMATS, n=1)
         hint = f"; did you mean {alike[0]!r}?" if alike else ""
-        raise UnknownName(f"{error}{hint}") from None
+        shown = f"{format_value(name)}{hint}"
+        raise UnknownName("to", f"one of {', '.join(FORMATS)}", shown=shown)
     return FORMATS[name]
 
 
@@ -90,6 +89,4 @@ def required(place: str, purpose: str) -> Any:
     try:
         return pkgutil.resolve_name(place)
     except ModuleNotFoundError as error:
-        raise MissingExtra(
-            f"{purpose} needs {error.name}: {install_line(EXTRA)}", name=error.name
-        ) from None
+        raise MissingExtra(purpose, error.name, EXTRA) from None

@@ -8,8 +8,9 @@ from typing import BinaryIO
 
 from pymavlink.dialects.v20 import common
 
+from planner_jax.core.errors import ArgumentError
 from planner_jax.export.px4 import trajectory_setpoints
-from planner_jax.export.setpoints import DEFAULT_RATE, ExportError
+from planner_jax.export.setpoints import DEFAULT_RATE
 from planner_jax.robot.quadrotor_plan import QuadrotorPlan
 
 FASTEST = 1000.0  # [Hz], as the messages count milliseconds
@@ -24,11 +25,11 @@ def packets(plan: QuadrotorPlan, rate: float) -> Iterator[tuple[int, bytes]]:
     Position, velocity, acceleration, yaw and its rate are all set; see `trajectory_setpoints`.
 
     Raises:
-        ExportError: the plan may not leave, or the rate is absurd.
+        ArgumentError: the plan may not leave, or the rate is absurd.
     """
     fields = trajectory_setpoints(plan, rate)
     if rate > FASTEST:
-        raise ExportError(f"rate must be at most {FASTEST:g} for MAVLink, got {rate:g}")
+        raise ArgumentError("rate", f"at most {FASTEST:g} for MAVLink", rate)
     sender = common.MAVLink(None, srcSystem=_SENDER)
     for stamp, position, velocity, acceleration, _, yaw, yawspeed in zip(
         *(values.tolist() for values in fields.values()), strict=True
@@ -63,10 +64,10 @@ def stream(plan: QuadrotorPlan, port: int, rate: float = DEFAULT_RATE) -> int:
         rate: [Hz].
 
     Raises:
-        ExportError: the plan may not leave, the rate is absurd, or nobody listens on the port.
+        ArgumentError: the plan may not leave, the rate is absurd, or nobody listens on the port.
     """
     if isinstance(port, bool) or not isinstance(port, int) or not 0 < port < 2**16:
-        raise ExportError(f"udp must be a port from 1 to {2**16 - 1}, got {port!r:.60}")
+        raise ArgumentError("udp", f"a port from 1 to {2**16 - 1}", port)
     ready = list(packets(plan, rate))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
         out.connect(("127.0.0.1", port))
@@ -77,5 +78,5 @@ def stream(plan: QuadrotorPlan, port: int, rate: float = DEFAULT_RATE) -> int:
                 out.send(packet)
             except ConnectionRefusedError:
                 rule = "a port on which a program of this machine listens"
-                raise ExportError(f"udp must be {rule}, got {port}") from None
+                raise ArgumentError("udp", rule, port) from None
     return len(ready)

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from planner_jax.core.errors import MissingExtra
 from planner_jax.core.protocol import Plan
-from planner_jax.core.registry import MissingExtra
 from planner_jax.export.frames import rotated
 from planner_jax.export.setpoints import DEFAULT_RATE, Setpoints, setpoints_of
 from planner_jax.robot.arm_plan import ArmSetpoints
@@ -56,7 +56,7 @@ def trajectory_message(plan: Plan, rate: float = DEFAULT_RATE) -> Any:
         `trajectory_msgs.msg.JointTrajectory` of an arm.
 
     Raises:
-        ExportError: the plan may not leave, or the rate is absurd.
+        ArgumentError: the plan may not leave, or the rate is absurd.
         MissingExtra: this Python has no ROS 2.
     """
     kind, fields = trajectory(plan, rate)

@@ -4,9 +4,10 @@ import os
 
 import numpy as np
 
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.plan_files import PlanFileError, load_fitting, named_leaves
 from planner_jax.core.protocol import Plan, lane
-from planner_jax.export.setpoints import ROBOTS, ExportError
+from planner_jax.export.setpoints import ROBOTS
 
 
 def saved_plan(path: str | os.PathLike, row: int | None = None) -> Plan:
@@ -18,23 +19,23 @@ def saved_plan(path: str | os.PathLike, row: int | None = None) -> Plan:
 
     Raises:
         PlanFileError: the file holds no plans of a quadrotor, a car or an arm.
-        ExportError: there is no such row.
+        ArgumentError: there is no such row.
     """
     plans: Plan = load_fitting(path, [robot.plan for robot in ROBOTS])
     shape = np.shape(plans.status)
     if shape == ():
         if row is not None:
-            raise ExportError(f"row must not be given for a file of one plan, got {row}")
+            raise ArgumentError("row", "given for a file of one plan", row, verb="not be")
         return plans
     require_row(row, shape[0])
     sizes = {np.shape(leaf)[:1] for leaf in named_leaves(plans).values()}
     if len(shape) != 1 or len(sizes) != 1:
-        raise PlanFileError(f"path must hold as much of every plan, got {str(path)!r}")
+        raise PlanFileError("path", "as much of every plan", str(path), verb="hold")
     return lane(plans, row)
 
 
 def require_row(row: int | None, num: int) -> None:
-    """Raise `ExportError` unless a row is one of so many."""
+    """Raise `ArgumentError` unless a row is one of so many."""
     if row is None or not 0 <= row < num:
         shown = "nothing" if row is None else row
-        raise ExportError(f"row must be from 0 to {num - 1}, got {shown}")
+        raise ArgumentError("row", f"from 0 to {num - 1}", shown=shown)

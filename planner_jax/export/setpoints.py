@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.plan_files import named_leaves
 from planner_jax.core.protocol import Plan, Status, is_solved
 from planner_jax.robot.arm_plan import ArmPlan, ArmSetpoints
@@ -21,10 +22,6 @@ MOST = 100_000  # setpoints of a plan
 DEFAULT_RATE = 100.0  # [Hz]
 
 Setpoints = QuadrotorSetpoints | CarSetpoints | ArmSetpoints
-
-
-class ExportError(ValueError):
-    """A plan cannot leave as it was asked for; one line that begins with the argument's name."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,21 +60,21 @@ def robot_of(plan: Plan) -> Robot:
     """The robot of one plan that may leave.
 
     Raises:
-        ExportError: it is no plan, a batch, of another robot, not solved, or not whole.
+        ArgumentError: it is no plan, a batch, of another robot, not solved, or not whole.
     """
     robot = next((robot for robot in ROBOTS if isinstance(plan, robot.plan)), None)
     if robot is None:
         names = ", ".join(robot.name for robot in ROBOTS)
-        raise ExportError(f"plan must be that of a robot ({names}), got a {type(plan).__name__}")
+        raise ArgumentError("plan", f"that of a robot ({names})", shown=f"a {type(plan).__name__}")
     if np.ndim(plan.status) != 0:
         shown = f"a batch of shape {np.shape(plan.status)}"
-        raise ExportError(f"plan must be one, as pj.lane(plans, k) gives, got {shown}")
+        raise ArgumentError("plan", "one, as pj.lane(plans, k) gives", shown=shown)
     if not is_solved(plan.status):
         shown = [f"{each.name}: {each.message}" for each in Status if each == plan.status]
-        raise ExportError(f"plan must be solved, got the status {(*shown, plan.status)[0]}")
+        raise ArgumentError("plan", "solved", shown=f"the status {(*shown, plan.status)[0]}")
     _require_shapes(plan, robot)
     if not 0.0 < float(robot.end(plan)) < np.inf:
-        raise ExportError(f"plan must take some time, got {float(robot.end(plan)):g} s")
+        raise ArgumentError("plan", "some time", verb="take", shown=f"{float(robot.end(plan)):g} s")
     return robot
 
 
@@ -93,7 +90,7 @@ def _require_shapes(plan: Plan, robot: Robot) -> None:
         )
         if not fits or 0 in shape:
             words = ", ".join(str(sizes.get(want, want)) for want in wanted)
-            raise ExportError(f"plan must have {name} of the shape ({words}), got {shape}")
+            raise ArgumentError("plan", f"{name} of the shape ({words})", shape, verb="have")
 
 
 def setpoints_of(plan: Plan, rate: float) -> Setpoints:
@@ -104,21 +101,21 @@ def setpoints_of(plan: Plan, rate: float) -> Setpoints:
         rate: [Hz].
 
     Raises:
-        ExportError: the plan may not leave, see `robot_of`, or is not finite; or the rate is none,
-            leaves nothing but the beginning, or asks for more than `MOST` setpoints.
+        ArgumentError: the plan may not leave, see `robot_of`, or is not finite; or the rate is
+            none, leaves nothing but the beginning, or asks for more than `MOST` setpoints.
     """
     end = float(robot_of(plan).end(plan))
     low, high = 1.0 / end, (MOST - 1) / end
     if isinstance(rate, str | bool) or np.ndim(rate) != 0:
-        raise ExportError(f"rate must be a number, got {rate!r:.60}")
+        raise ArgumentError("rate", "a number", rate)
     if not low * (1.0 - 1e-6) <= rate <= high:
         rule = f"from {low:.4g} to {high:.4g} for a plan of {end:.4g} s"
-        raise ExportError(f"rate must be {rule}, got {rate:g}")
+        raise ArgumentError("rate", rule, rate)
     any_plan: Any = plan
     setpoints: Setpoints = any_plan.sample(rate)
     for field in dataclasses.fields(setpoints):
         if not np.isfinite(getattr(setpoints, field.name)).all():
-            raise ExportError(f"plan must be finite, got {field.name} that is not")
+            raise ArgumentError("plan", "finite", shown=f"{field.name} that is not")
     return setpoints
 
 
@@ -126,7 +123,7 @@ def pieces_of(plan: QuadrotorPlan) -> PiecewisePolynomial:
     """The polynomials of one plan that may leave, without pieces that take no time.
 
     Raises:
-        ExportError: the plan may not leave, see `robot_of`, or is not finite.
+        ArgumentError: the plan may not leave, see `robot_of`, or is not finite.
     """
     robot_of(plan)
     path = plan.whole
@@ -134,5 +131,5 @@ def pieces_of(plan: QuadrotorPlan) -> PiecewisePolynomial:
     durations: Any = np.asarray(path.durations)
     taken = durations != 0.0
     if not (np.isfinite(coeffs[taken]).all() and (durations[taken] > 0.0).all()):
-        raise ExportError("plan must be finite, got a trajectory that is not")
+        raise ArgumentError("plan", "finite", shown="a trajectory that is not")
     return PiecewisePolynomial(coeffs=coeffs[taken], durations=durations[taken])

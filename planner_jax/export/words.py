@@ -4,10 +4,11 @@ import os
 from pathlib import Path
 from typing import Any
 
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import Plan
 from planner_jax.export.formats import Format, format_named, required
 from planner_jax.export.rested import rested
-from planner_jax.export.setpoints import DEFAULT_RATE, ExportError, robot_of
+from planner_jax.export.setpoints import DEFAULT_RATE, robot_of
 from planner_jax.host.files import new_file_problem, replacing
 
 
@@ -46,7 +47,7 @@ def export(
 
     Raises:
         UnknownName: there is no such format.
-        ExportError: an argument breaks a rule; one line.
+        ArgumentError: an argument breaks a rule; one line.
         MissingExtra: a package that the format needs is not installed.
         OSError: the file system fails; its `filename` is the path.
     """
@@ -57,7 +58,7 @@ def export(
     if form.sampled:
         rate = DEFAULT_RATE if rate is None else rate
     elif rate is not None:
-        raise ExportError(f"rate must not be given for {to}, which takes polynomials, got {rate}")
+        raise ArgumentError("rate", f"given for {to}, which takes polynomials", rate, verb="not be")
     plan = rested(plan, ending, case)
     with replacing(path) as scratch, open(scratch, "wb") as file:
         write(plan, rate, file)
@@ -85,12 +86,12 @@ def stream(
 
     Raises:
         UnknownName: there is no such format.
-        ExportError: an argument breaks a rule, or nobody listens on the port; one line.
+        ArgumentError: an argument breaks a rule, or nobody listens on the port; one line.
         MissingExtra: pymavlink is not installed.
     """
     form = format_named(to)
     if to != "px4":
-        raise ExportError(f"udp must not be given for {to}, only for px4, got {udp}")
+        raise ArgumentError("udp", f"given for {to}, only for px4", udp, verb="not be")
     _require_robot(plan, to, form)
     send = required("planner_jax.export.mavlink:stream", "export over UDP")
     return send(rested(plan, ending, case), udp, DEFAULT_RATE if rate is None else rate)
@@ -108,7 +109,7 @@ def _require_robot(plan: Plan, to: str, form: Format) -> None:
     if robot.name not in form.robots:
         article = "an" if robot.name[0] in "aeiou" else "a"
         rule = f"a format for plans of {article} {robot.name}"
-        raise ExportError(f"to must be {rule}, got {to!r}, which is for {', '.join(form.robots)}")
+        raise ArgumentError("to", rule, shown=f"{to!r}, which is for {', '.join(form.robots)}")
 
 
 def _new_file(out: str | os.PathLike, to: str, form: Format) -> Path:
@@ -116,7 +117,7 @@ def _new_file(out: str | os.PathLike, to: str, form: Format) -> Path:
     path = Path(out)
     if path.suffix not in form.writers:
         endings = " or ".join(form.writers)
-        raise ExportError(f"out must end in {endings} for {to}, got {str(out)!r}")
+        raise ArgumentError("out", f"{endings} for {to}", str(out), verb="end in")
     if problem := new_file_problem(path):
-        raise ExportError(f"out must be {problem}, got {str(path)!r}")
+        raise ArgumentError("out", problem, str(path))
     return path

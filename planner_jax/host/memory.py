@@ -39,41 +39,13 @@ def _of_container() -> int | None:
     return max(int(most) - taken + int(cached.get("inactive_file", 0)), 0)
 
 
-def require_memory(name: str, num: int, bytes_each: int) -> None:
-    """Raise `ValueError` if so many of something would not fit into memory.
-
-    Args:
-        name: of the argument that asks for them.
-        num: how many.
-        bytes_each: that one takes, as estimated.
-    """
-    free = available_memory()
-    if free is not None and num * bytes_each > free:
-        raise ValueError(
-            f"{name} must be at most {max(free // bytes_each, 1):,}, for which this machine has "
-            f"memory ({shown(bytes_each)} each, {shown(free)} free), got {num}"
-        )
-
-
-def require_disk(name: str, num: int, bytes_each: int, folder: str | os.PathLike) -> None:
-    """Raise `ValueError` if so many rows would not fit on the disk of a folder that is to be.
-
-    Args:
-        name: of the argument that asks for them.
-        num: how many.
-        bytes_each: that one takes, as estimated.
-        folder: which may not be there yet.
-    """
+def free_disk(folder: str | os.PathLike) -> int | None:
+    """Return the free bytes on the disk of a folder, which may not exist yet; None if unknown."""
     path = Path(folder).absolute()
-    # A name that is too long for the disk is nowhere, and is told where the folder is made.
-    there = next((each for each in [path, *path.parents] if os.path.exists(each)), Path.cwd())
-    disk = shutil.disk_usage(there)
-    free = disk.free
-    if disk.total and num * bytes_each > free:  # some of the system's own folders have no disk
-        raise ValueError(
-            f"{name} must be at most {max(free // bytes_each, 1):,}, for which the disk has room "
-            f"({shown(bytes_each)} each, {shown(free)} free), got {num}"
-        )
+    # A name that is too long for the disk does not exist; the disk of a parent is measured.
+    existing = next((each for each in [path, *path.parents] if os.path.exists(each)), Path.cwd())
+    disk = shutil.disk_usage(existing)
+    return disk.free if disk.total else None  # some of the system's own folders have no disk
 
 
 def shown(size: float) -> str:

@@ -22,6 +22,8 @@ from jax import Array
 from jax.extend.core import JaxprEqn
 from jax.tree_util import PyTreeDef
 
+from planner_jax.core.errors import ArgumentError
+
 SWITCH = "PLANNER_JAX_KERNELS"
 
 Results = TypeVar("Results")
@@ -64,7 +66,7 @@ def is_switched_on() -> bool:
     """Return whether the environment variable allows kernels. Raises as `kernels`."""
     value = os.environ.get(SWITCH, "on")
     if value not in ("on", "off"):
-        raise ValueError(f"{SWITCH} must be one of on, off, got {value!r}")
+        raise ArgumentError(SWITCH, "one of on, off", value)
     return value == "on"
 
 

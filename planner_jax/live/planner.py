@@ -17,6 +17,7 @@ from typing import Generic
 import numpy as np
 
 from planner_jax.ball.flight import BallState
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import is_solved
 from planner_jax.live.arrivals import Arrivals
 from planner_jax.live.course import (
@@ -93,10 +94,10 @@ class LivePlanner(Generic[CaseT, PlanT]):
         known: float = 0.3,
     ) -> None:
         if not 1 <= horizon <= MOST_SETPOINTS:
-            raise ValueError(f"horizon must be from 1 to {MOST_SETPOINTS}, got {horizon}")
+            raise ArgumentError("horizon", f"from 1 to {MOST_SETPOINTS}", horizon)
         for name, value in {"rate": rate, "deadline": deadline, "noise": noise}.items():
             if not 0.0 < value < math.inf:
-                raise ValueError(f"{name} must be finite and > 0, got {value}")
+                raise ArgumentError(name, "finite and > 0", value)
         self.stroke, self.deadline = stroke, deadline
         self._period, self._num, self._known = 1.0 / rate, horizon, known
         self._gravity, self._limits = stroke.case.gravity, stroke.case.limits

@@ -3,7 +3,8 @@
 import dataclasses
 from typing import TYPE_CHECKING, Any
 
-from planner_jax.runs.settings import option, require, require_count
+from planner_jax.core.choices import require
+from planner_jax.runs.settings import option, require_count
 from planner_jax.sweep.robots import checked_robot, robot_option
 
 if TYPE_CHECKING:
@@ -17,7 +18,7 @@ class ServeSettings:
     """Settings of all tasks.
 
     Raises:
-        SettingError: a value breaks its rule.
+        ArgumentError: a value breaks its rule.
     """
 
     port: int = option(PORT, "N", "UDP port of this machine, 0 takes a free one")

@@ -13,7 +13,8 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array, lax
 
-from planner_jax.core.checks import require_kind, require_size
+from planner_jax.core.checks import require_kind
+from planner_jax.core.choices import require_size
 from planner_jax.core.planner import require_fit
 from planner_jax.core.protocol import marked, status_of
 from planner_jax.optimise.evaluation import Objective

@@ -17,7 +17,9 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from planner_jax.core.checks import numeric, require_number, require_size, told
+from planner_jax.core.checks import numeric, require_number
+from planner_jax.core.choices import require_size
+from planner_jax.core.errors import format_value
 from planner_jax.core.select import is_better
 from planner_jax.lanes import with_kernel
 from planner_jax.optimise.evaluation import Evaluation, Objective
@@ -41,7 +43,7 @@ class LbfgsConfig:
             require_number(name, getattr(self, name), "finite and >= 0", lambda x: x >= 0.0)
         steps = self.trial_steps
         if not isinstance(steps, tuple) or any(numeric(each) is None for each in steps):
-            raise TypeError(f"trial_steps must be a tuple of numbers, got {told(steps)}")
+            raise TypeError(f"trial_steps must be a tuple of numbers, got {format_value(steps)}")
         if not steps or not all(0.0 < each < jnp.inf for each in steps):
             raise ValueError(f"trial_steps must be finite and > 0, one or more, got {steps}")
 

@@ -28,7 +28,9 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array, lax
 
-from planner_jax.core.checks import numeric, require_number, require_size, told
+from planner_jax.core.checks import numeric, require_number
+from planner_jax.core.choices import require_size
+from planner_jax.core.errors import format_value
 from planner_jax.core.select import is_better
 from planner_jax.optimise.evaluation import Evaluation, Objective
 from planner_jax.optimise.preconditioner import Preconditioner
@@ -84,14 +86,18 @@ class NewtonConfig:
             require_number(name, getattr(self, name), "finite and >= 0", lambda x: x >= 0.0)
         trials = self.trial_dampings
         if not isinstance(trials, tuple) or any(numeric(each) is None for each in trials):
-            raise TypeError(f"trial_dampings must be a tuple of numbers, got {told(trials)}")
+            raise TypeError(
+                f"trial_dampings must be a tuple of numbers, got {format_value(trials)}"
+            )
         if not trials or not all(0.0 <= each < jnp.inf for each in trials):
             raise ValueError(f"trial_dampings must be finite and >= 0, one or more, got {trials}")
         later = self.stragglers
         if later is None:
             return
         if not isinstance(later, tuple) or len(later) != 3:
-            raise TypeError(f"stragglers must be a tuple of three numbers, got {told(later)}")
+            raise TypeError(
+                f"stragglers must be a tuple of three numbers, got {format_value(later)}"
+            )
         share, *counts = later
         require_number("stragglers", share, "a share > 0 and <= 1", lambda x: 0.0 < x <= 1.0)
         for count in counts:

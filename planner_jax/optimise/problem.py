@@ -5,7 +5,8 @@ from typing import Any, Protocol
 
 from jax import Array
 
-from planner_jax.core.checks import require_kind, require_size
+from planner_jax.core.checks import require_kind
+from planner_jax.core.choices import require_size
 from planner_jax.core.protocol import Attempt
 from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.lbfgs import LbfgsConfig

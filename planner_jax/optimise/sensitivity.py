@@ -21,7 +21,9 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.core.checks import numeric, require_size, told
+from planner_jax.core.checks import numeric
+from planner_jax.core.choices import require_size
+from planner_jax.core.errors import format_value
 from planner_jax.core.protocol import Plan
 from planner_jax.optimise.newton import Curvature
 from planner_jax.optimise.planner import OptimisedPlanner, pending
@@ -89,7 +91,9 @@ class Differentiated(OptimisedPlanner):
         if self.steps is not None:
             require_size("steps", self.steps, 0)
         if not callable(self.quantity) and not isinstance(self.quantity, str):
-            raise TypeError(f"of must be a name or a function of a plan, got {told(self.quantity)}")
+            raise TypeError(
+                f"of must be a name or a function of a plan, got {format_value(self.quantity)}"
+            )
         if not self.by:
             raise ValueError("by must name something in the case, got nothing")
 
@@ -196,7 +200,7 @@ def gradient_at(
         plan = planner.decode(x, context_of(smooth))
         value = number(plan.replace(cost=cost(x, smooth)))
         if numeric(value) is None:
-            raise TypeError(f"of must be one number, got {told(value)}")
+            raise TypeError(f"of must be one number, got {format_value(value)}")
         if value.shape:
             raise ValueError(f"of must be one number, got shape {value.shape}")
         return value
@@ -285,7 +289,7 @@ def part_of(tree: Any, name: str) -> Any:
 
 def _found(tree: Any, name: str, argument: str) -> Any:
     if not isinstance(name, str):
-        raise TypeError(f"{argument} must be a name or some, got {told(name)}")
+        raise TypeError(f"{argument} must be a name or some, got {format_value(name)}")
     part = tree
     for field in name.split("."):
         known = _members(part)

@@ -8,7 +8,9 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.core.checks import floating, numeric, require_size, told
+from planner_jax.core.checks import floating, numeric
+from planner_jax.core.choices import require_size
+from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 
 
 @struct.dataclass
@@ -30,7 +32,7 @@ class Obstacles:
 
 
 def obstacles(
-    polygons: Sequence[Any],
+    polygons: object,
     velocities: Any = 0.0,
     *,
     room: tuple[int, int] | None = None,
@@ -52,23 +54,21 @@ def obstacles(
     """
     dtype = floating(dtype)
     if isinstance(polygons, str) or not isinstance(polygons, Sequence | np.ndarray):
-        raise TypeError(f"polygons must be a sequence of corners (V, 2), got {told(polygons)}")
+        raise ArgumentTypeError("polygons", "a sequence of corners (V, 2)", polygons)
     checked = [_checked(k, corners) for k, corners in enumerate(polygons)]
     most = max((len(each) for each in checked), default=3)
     num, size = _room(room) or (max(len(checked), 1), most)
     if len(checked) > num or most > size:
-        raise ValueError(
-            f"polygons must be at most {num} of at most {size} corners, got {len(checked)} of "
-            f"up to {most}: give more room"
-        )
+        shown = f"{len(checked)} of up to {most}: give more room"
+        raise ArgumentError("polygons", f"at most {num} of at most {size} corners", shown=shown)
     given = numeric(velocities)
     if given is None:
-        raise TypeError(f"velocities must be numbers, got {told(velocities)}")
+        raise ArgumentTypeError("velocities", "numbers", velocities)
     if given.shape not in ((), (2,), (len(checked), 2)):
         rule = f"the shape (2,) or ({len(checked)}, 2)"
-        raise ValueError(f"velocities must have {rule}, got {given.shape}")
+        raise ArgumentError("velocities", rule, given.shape, verb="have")
     if not np.isfinite(given).all():
-        raise ValueError(f"velocities must be finite, got {told(velocities)}")
+        raise ArgumentError("velocities", "finite", velocities)
     speeds = np.broadcast_to(np.asarray(given, float), (len(checked), 2))
     centre, velocity = np.zeros((num, 2)), np.zeros((num, 2))
     corners = np.zeros((num, size, 2))
@@ -88,7 +88,7 @@ def _room(given: Any) -> tuple[int, int] | None:
     if given is None:
         return None
     if not isinstance(given, tuple | list) or len(given) != 2:
-        raise TypeError(f"room must be two whole numbers, got {told(given)}")
+        raise ArgumentTypeError("room", "two whole numbers", given)
     for value in given:
         require_size("room", value)
     return given[0], given[1]
@@ -97,26 +97,25 @@ def _room(given: Any) -> tuple[int, int] | None:
 def _checked(k: int, corners: Any) -> np.ndarray:
     """Corners counter-clockwise; raises unless they are those of a convex polygon."""
     if numeric(corners) is None:
-        raise TypeError(f"polygon {k} must have corners of numbers, got {told(corners)}")
+        raise ArgumentTypeError("polygons", "corners of numbers", corners, k, verb="have")
     polygon = np.asarray(corners, float)
     if polygon.ndim != 2 or polygon.shape[1:] != (2,) or len(polygon) < 3:
-        raise ValueError(f"polygon {k} must have corners (V, 2), V >= 3, got {polygon.shape}")
+        raise ArgumentError("polygons", "corners (V, 2), V >= 3", polygon.shape, k, verb="have")
     if not np.isfinite(polygon).all():
-        raise ValueError(f"polygon {k} must be finite")
+        raise ArgumentError("polygons", "finite", polygon, k)
     edges = np.roll(polygon, -1, axis=0) - polygon
     after = np.roll(edges, -1, axis=0)
     turns = edges[:, 0] * after[:, 1] - edges[:, 1] * after[:, 0]
     area = 0.5 * np.sum(polygon[:, 0] * np.roll(polygon[:, 1], -1))
     area -= 0.5 * np.sum(polygon[:, 1] * np.roll(polygon[:, 0], -1))
     if abs(area) < 1e-9:
-        raise ValueError(f"polygon {k} must have an area, got none")
+        raise ArgumentError("polygons", "an area", 0, k, verb="have")
     if area < 0.0:
         polygon, turns = polygon[::-1], -turns
     if (turns < -1e-9).any():
-        raise ValueError(
-            f"polygon {k} must be convex: cut it into convex parts, such as the triangles of "
-            "scipy.spatial.Delaunay whose centres lie inside, and give each as one"
-        )
+        rule = "convex: cut it into convex parts, such as the triangles of scipy.spatial.Delaunay"
+        rule += " whose centres lie inside, and give each as one"
+        raise ArgumentError("polygons", rule, index=k, shown="")
     return polygon
 
 

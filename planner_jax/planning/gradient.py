@@ -8,7 +8,8 @@ from typing import Any, Generic, TypeVar
 from flax import struct
 from jax import Array
 
-from planner_jax.core.checks import require_kind, require_switch, told
+from planner_jax.core.checks import require_kind, require_switch
+from planner_jax.core.errors import format_value
 from planner_jax.core.protocol import Plan
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.newton import NewtonConfig
@@ -81,7 +82,7 @@ def gradient(
     """
     require_fit(planner, cases)
     if not isinstance(by, str | Sequence):
-        raise TypeError(f"by must be a name or some, got {told(by)}")
+        raise TypeError(f"by must be a name or some, got {format_value(by)}")
     if solver is not None:
         require_kind("solver", solver, LbfgsConfig, NewtonConfig)
     require_switch("polish", polish)

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
-from planner_jax.core.checks import require_size
+from planner_jax.core.choices import require_size
 from planner_jax.core.planner import CaseT, Kind, Planner, PlanT, require_fit
 from planner_jax.core.protocol import Case, Status, is_resident
 from planner_jax.core.rules import has_rules, require_shapes, require_sound

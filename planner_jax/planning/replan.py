@@ -7,7 +7,8 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.core.checks import numbers_of, require_kind, told
+from planner_jax.core.checks import numbers_of, require_kind
+from planner_jax.core.errors import format_value
 from planner_jax.core.planner import require_planner
 from planner_jax.core.protocol import Case, Plan
 from planner_jax.planning.plan import plan
@@ -72,7 +73,7 @@ def given_or_own(name: str, given: Any, own: Any, elapsed: np.ndarray) -> np.nda
     batch = elapsed.shape
     found = numbers_of(name, given, batch, np.shape(own)[len(batch) :]).astype(elapsed.dtype)
     if not np.isfinite(found).all():
-        raise ValueError(f"{name} must be finite, got {told(given)}")
+        raise ValueError(f"{name} must be finite, got {format_value(given)}")
     return found
 
 

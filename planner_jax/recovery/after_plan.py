@@ -6,11 +6,11 @@ from typing import Any
 import jax
 import numpy as np
 
+from planner_jax.core.errors import NoEnding
 from planner_jax.core.protocol import Plan, lane
 from planner_jax.planning.plan import plan
 from planner_jax.recovery.arm import braked_arm
 from planner_jax.recovery.car import braked_car
-from planner_jax.recovery.no_ending import NoEnding
 from planner_jax.recovery.planner import RestPlanner
 from planner_jax.recovery.with_recovery import ending_cases
 from planner_jax.referee.rest import referee_rests

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from planner_jax.recovery.no_ending import NoEnding
+from planner_jax.core.errors import NoEnding
 from planner_jax.referee.rest import referee_stands
 from planner_jax.robot.arm_plan import ArmPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, states_at

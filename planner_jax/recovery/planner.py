@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from planner_jax.core.choices import ENDINGS
 from planner_jax.core.protocol import require_settings
-from planner_jax.core.recovery_names import ENDINGS
 from planner_jax.cost.along import Along, integrate_along
 from planner_jax.cost.quadrotor import flight_along, greatest_excess, limits_along
 from planner_jax.optimise.evaluation import Evaluation

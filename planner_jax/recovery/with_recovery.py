@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from planner_jax.core.choices import ENDINGS, require_one_of
 from planner_jax.core.planner import CaseT, Drive, Planner, PlanT
 from planner_jax.core.protocol import Status, is_solved
-from planner_jax.core.recovery_names import ending_problem
 from planner_jax.recovery.case import EndingCase, end_state
 from planner_jax.recovery.planner import RestPlanner
 
@@ -122,6 +122,5 @@ def ended(planner: Any, ending: str | None) -> Any:
     """
     if ending is None:
         return planner
-    if problem := ending_problem(ending):
-        raise ValueError(problem)
+    require_one_of(ENDINGS, "ending", ending)
     return EndedPlanner(planner, RestPlanner(to=ending))

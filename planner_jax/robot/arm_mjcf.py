@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from planner_jax.core.errors import ArgumentError
 from planner_jax.host.files import open_plain
 from planner_jax.robot.arm import Arm
 from planner_jax.robot.arm_ik import misfit
@@ -62,7 +63,7 @@ def read_arm(path_or_xml: str, *, dtype: Any = np.float32) -> Arm:
     try:
         root = ET.fromstring(path_or_xml if is_text else _text_of(path_or_xml))
     except (ET.ParseError, UnicodeDecodeError) as error:
-        raise ValueError(f"MJCF must be well-formed XML: {error}") from None
+        raise ArgumentError("MJCF", f"well-formed XML: {error}", shown="") from None
     _only(root, {"model"}, {"compiler", "worldbody", "keyframe", *_AROUND})
     reader = _Reader(root)
     base, links = _chain(_one(root, "worldbody"))
@@ -111,10 +112,10 @@ class _Reader:
             told |= compiler.attrib
         angle, self.sequence = told.get("angle", "degree"), told.get("eulerseq", "xyz")
         if angle not in ("degree", "radian"):
-            raise ValueError(f'<compiler>: angle must be degree or radian, got "{angle}"')
+            raise ArgumentError("<compiler>: angle", "degree or radian", shown=f'"{angle}"')
         if not re.fullmatch("[xyz]{3}|[XYZ]{3}", self.sequence):
-            raise ValueError(
-                f'<compiler>: eulerseq must be three of xyz or of XYZ, got "{self.sequence}"'
+            raise ArgumentError(
+                "<compiler>: eulerseq", "three of xyz or of XYZ", shown=f'"{self.sequence}"'
             )
         self.unit = np.pi / 180.0 if angle == "degree" else 1.0
 
@@ -122,29 +123,29 @@ class _Reader:
         """Place (3,) [m] and attitude of an element in its body's, or its parent's, frame."""
         place = _numbers(element, "pos", 3, (0.0, 0.0, 0.0))
         if "quat" in element.attrib and "euler" in element.attrib:
-            raise ValueError(f"{_tag(element)} must have quat or euler, not both")
+            raise ArgumentError(_tag(element), "quat or euler, not both", verb="have", shown="")
         if "euler" in element.attrib:
             angles = self.unit * _numbers(element, "euler", 3)
             # Small letters turn with the frame here, and stand still in SciPy.
             return place, Rotation.from_euler(self.sequence.swapcase(), angles)
         quaternion = _numbers(element, "quat", 4, (1.0, 0.0, 0.0, 0.0))
         if not np.any(quaternion):
-            raise ValueError(f"{_tag(element)}: quat must not be zero")
+            raise ArgumentError(f"{_tag(element)}: quat", "zero", verb="not be", shown="")
         return place, Rotation.from_quat(quaternion, scalar_first=True)
 
     def joint(self, joint: ET.Element) -> tuple[np.ndarray, np.ndarray]:
         """Axis (3,) and position limits (2,) [rad] of a hinge joint."""
         _only(joint, {"name", "type", "pos", "axis", "range", "limited"}, ())
         if np.any(_numbers(joint, "pos", 3, (0.0, 0.0, 0.0))):
-            raise ValueError(f"{_tag(joint)}: pos must be 0 0 0, where its link's frame is")
+            raise ArgumentError(f"{_tag(joint)}: pos", "0 0 0, where its link's frame is", shown="")
         if joint.get("limited", "auto") not in ("auto", "true"):
-            raise ValueError(f"{_tag(joint)} must be limited")
+            raise ArgumentError(_tag(joint), "limited", shown="")
         limits = self.unit * _numbers(joint, "range", 2)
         if not limits[0] < limits[1]:
             raise ValueError(f"{_tag(joint)}: range must rise")
         axis = _numbers(joint, "axis", 3, (0.0, 0.0, 1.0))
         if not np.any(axis):
-            raise ValueError(f"{_tag(joint)}: axis must not be zero")
+            raise ArgumentError(f"{_tag(joint)}: axis", "zero", verb="not be", shown="")
         return axis / np.linalg.norm(axis), limits
 
     def inertial(self, inertial: ET.Element) -> tuple[float, np.ndarray, np.ndarray]:
@@ -160,14 +161,14 @@ class _Reader:
             axes = self.frame(inertial)[1].as_matrix()
             inertia = axes * _numbers(inertial, "diaginertia", 3) @ axes.T
         if not mass > 0.0 or not np.all(np.linalg.eigvalsh(inertia) > 0.0):
-            raise ValueError(f"{_tag(inertial)}: mass and inertia must be positive")
+            raise ArgumentError(f"{_tag(inertial)}: mass and inertia", "positive", shown="")
         return mass, centre, inertia
 
     def capsule(self, geom: ET.Element) -> tuple[np.ndarray, float]:
         """Ends (2, 3) [m] and radius [m] of a capsule; the ends of a sphere are one point."""
         kind = geom.get("type", "sphere")
         if kind not in ("capsule", "sphere"):
-            raise ValueError(f"{_tag(geom)} must be a capsule or a sphere")
+            raise ArgumentError(_tag(geom), "a capsule or a sphere", shown="")
         if kind == "capsule" and "fromto" in geom.attrib:
             _only(geom, {"name", "type", "size", "fromto", *_LOOK}, ())
             ends = _numbers(geom, "fromto", 6).reshape(2, 3)
@@ -178,7 +179,7 @@ class _Reader:
             place, turn = self.frame(geom)
             ends = place + np.outer([-half, half], turn.as_matrix()[:, 2])
         if not radius > 0.0:
-            raise ValueError(f"{_tag(geom)}: its radius must be > 0")
+            raise ArgumentError(f"{_tag(geom)}: its radius", "> 0", shown="")
         return ends, radius
 
 
@@ -195,7 +196,7 @@ def _chain(world: ET.Element) -> tuple[ET.Element, list[ET.Element]]:
     kinds = [[joint.get("type", "hinge") for joint in link.findall("joint")] for link in links]
     if kinds != [["hinge"]] * 6:
         counted = ", ".join("+".join(each) or "none" for each in kinds) or "no links"
-        raise ValueError(f"an arm must have six links with one hinge joint each, got {counted}")
+        raise ArgumentError("an arm", "six links with one hinge joint each", counted, verb="have")
     return base, links
 
 
@@ -206,15 +207,17 @@ def _shield(link: ET.Element) -> tuple[ET.Element, np.ndarray, float]:
         for tag in ("geom", "site")
     )
     if geom is None or site is None:
-        raise ValueError(f"{_tag(link)} must have a geom and a site named shield")
+        raise ArgumentError(_tag(link), "a geom and a site named shield", verb="have", shown="")
     _only(site, {"name", "pos", "type", "size", *_LOOK}, ())
     (thick, half, other), place = _box(geom)
     if half != other:
-        raise ValueError(f"{_tag(geom)} must be square across x")
+        raise ArgumentError(_tag(geom), "square across x", shown="")
     front = place + [thick, 0.0, 0.0]
     middle = _numbers(site, "pos", 3, (0.0, 0.0, 0.0))
     if not np.allclose(middle, front, rtol=0.0, atol=1e-6):
-        raise ValueError(f"{_tag(site)}: pos must be the middle of the shield's face along +x")
+        raise ArgumentError(
+            f"{_tag(site)}: pos", "the middle of the shield's face along +x", shown=""
+        )
     return geom, middle, half
 
 
@@ -222,7 +225,7 @@ def _base_box(base: ET.Element) -> tuple[ET.Element, np.ndarray]:
     """The base's box as a geom, and its lowest and highest corner (2, 3) [m]."""
     boxes = [geom for geom in base.findall("geom") if geom.get("type") == "box"]
     if len(boxes) != 1:
-        raise ValueError(f"{_tag(base)} must have one box, got {len(boxes)}")
+        raise ArgumentError(_tag(base), "one box", len(boxes), verb="have")
     half, place = _box(boxes[0])
     return boxes[0], np.stack([place - half, place + half])
 
@@ -231,10 +234,10 @@ def _box(geom: ET.Element) -> tuple[np.ndarray, np.ndarray]:
     """Half the edges (3,) [m] and the middle (3,) [m] of a box along the axes of its body."""
     _only(geom, {"name", "type", "pos", "size", *_LOOK}, ())
     if geom.get("type") != "box":
-        raise ValueError(f"{_tag(geom)} must be a box")
+        raise ArgumentError(_tag(geom), "a box", shown="")
     half = _numbers(geom, "size", 3)
     if not np.all(half > 0.0):
-        raise ValueError(f"{_tag(geom)}: size must be > 0")
+        raise ArgumentError(f"{_tag(geom)}: size", "> 0", shown="")
     return half, _numbers(geom, "pos", 3, (0.0, 0.0, 0.0))
 
 
@@ -244,9 +247,11 @@ def _home(root: ET.Element, limits: np.ndarray) -> np.ndarray:
         if key.get("name") == "home":
             home = _numbers(key, "qpos", 6)
             if np.any((home < limits[:, 0]) | (home > limits[:, 1])):
-                raise ValueError(f"{_tag(key)}: qpos must be within the ranges of the joints")
+                raise ArgumentError(
+                    f"{_tag(key)}: qpos", "within the ranges of the joints", shown=""
+                )
             return home
-    raise ValueError("<keyframe> must have a key named home")
+    raise ArgumentError("<keyframe>", "a key named home", verb="have", shown="")
 
 
 def _tag(element: ET.Element) -> str:
@@ -269,7 +274,7 @@ def _one(element: ET.Element, tag: str) -> ET.Element:
     """The one child of a tag."""
     found = element.findall(tag)
     if len(found) != 1:
-        raise ValueError(f"{_tag(element)} must have one <{tag}>, got {len(found)}")
+        raise ArgumentError(_tag(element), f"one <{tag}>", len(found), verb="have")
     return found[0]
 
 
@@ -285,5 +290,5 @@ def _numbers(
     except ValueError:
         numbers = np.array([])
     if numbers.shape != (count,) or not np.all(np.isfinite(numbers)):
-        raise ValueError(f"{_tag(element)}: {attribute} must be {count} finite number(s)")
+        raise ArgumentError(f"{_tag(element)}: {attribute}", f"{count} finite number(s)", shown="")
     return numbers

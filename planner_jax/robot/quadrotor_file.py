@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 
 import yaml
 
+from planner_jax.core.errors import PlannerJaxError
 from planner_jax.host.files import open_plain
 from planner_jax.robot.quadrotor_model import (
     NET,
@@ -38,7 +39,7 @@ _LARGEST = 1 << 20  # bytes of a file
 _PARTS: dict[str, type] = {"rotors": Rotors, "tool": Tool, "limits": FlightLimits}
 
 
-class RobotError(ValueError):
+class RobotError(PlannerJaxError, ValueError):
     """A robot's description breaks a rule; one line that names file and field."""
 
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from planner_jax.core.registry import MissingExtra, install_line
+from planner_jax.core.errors import MissingExtra
 from planner_jax.robot.quadrotor_file import RobotError
 
 _SKEW = 0.02  # of the greatest moment of inertia, what may lie off the body's axes
@@ -25,9 +25,7 @@ def described_by(path: Path) -> dict[str, Any]:
     try:
         import mujoco
     except ModuleNotFoundError as error:
-        raise MissingExtra(
-            f"{path.name} needs {error.name}: {install_line('sims')}", name=error.name
-        ) from None
+        raise MissingExtra(path.name, error.name, "sims") from None
     try:
         model = mujoco.MjModel.from_xml_path(str(path))  # type: ignore[attr-defined]
     except ValueError as error:

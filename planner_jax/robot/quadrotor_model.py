@@ -9,6 +9,8 @@ import math
 
 import numpy as np
 
+from planner_jax.core.errors import ArgumentError
+
 GRAVITY = 9.81  # [m/s^2], by which a model is asked whether it can hover
 
 NET, RACKET = "net", "racket"
@@ -26,7 +28,7 @@ class Tool:
 
     def __post_init__(self) -> None:
         if self.kind not in (NET, RACKET):
-            raise ValueError(f"tool.kind must be {NET} or {RACKET}, got {self.kind!r}")
+            raise ArgumentError("tool.kind", f"{NET} or {RACKET}", self.kind)
         _require("tool.radius", self.radius, above=0.0)
         _require("tool.height", self.height)
         _require("tool.restitution", self.restitution, least=0.0, most=1.0)
@@ -46,15 +48,15 @@ class Rotors:
 
     def __post_init__(self) -> None:
         if np.shape(self.places) != (4, 2):
-            raise ValueError(f"rotors.places must be 4 of 2 numbers, got {self.places}")
+            raise ArgumentError("rotors.places", "4 of 2 numbers", self.places)
         if not np.isfinite(self.places).all():
-            raise ValueError(f"rotors.places must be finite, got {self.places}")
+            raise ArgumentError("rotors.places", "finite", self.places)
         _require("rotors.min_thrust", self.min_thrust, least=0.0)
         _require("rotors.max_thrust", self.max_thrust, above=self.min_thrust)
         for name in ("torque_ratio", "lag", "radius"):
             _require(f"rotors.{name}", getattr(self, name), above=0.0)
         if abs(np.linalg.det(self.allocation)) < 1e-12:
-            raise ValueError(f"rotors.places must let them turn the body, got {self.places}")
+            raise ArgumentError("rotors.places", "them turn the body", self.places, verb="let")
 
     @property
     def positions(self) -> np.ndarray:
@@ -135,29 +137,26 @@ class QuadrotorModel:
     def __post_init__(self) -> None:
         _require("mass", self.mass, above=0.0)
         if np.shape(self.inertia) != (3,):
-            raise ValueError(f"inertia must be 3 numbers, got {self.inertia}")
+            raise ArgumentError("inertia", "3 numbers", self.inertia)
         for axis in self.inertia:
             _require("inertia", axis, above=0.0)
         if not 2.0 * max(self.inertia) <= sum(self.inertia) * (1.0 + 1e-9):
-            raise ValueError(
-                f"inertia must be of a body, none above the other two together, got {self.inertia}"
+            raise ArgumentError(
+                "inertia", "of a body, none above the other two together", self.inertia
             )
         weight, most = self.mass * GRAVITY, 4.0 * self.rotors.max_thrust
         if not most > weight:
-            raise ValueError(
-                f"4 x rotors.max_thrust must be > the weight of {weight:.3g} N, got {most:.3g} N"
-            )
+            rule = f"> the weight of {weight:.3g} N"
+            raise ArgumentError("4 x rotors.max_thrust", rule, shown=f"{most:.3g} N")
         lift = weight * self.rotors.shares
         if not np.all((lift > self.rotors.min_thrust) & (lift < self.rotors.max_thrust)):
             shown = " ".join(f"{each:.3g}" for each in lift)
-            raise ValueError(
-                f"rotors.places must let each rotor carry its part of the weight, got {shown} N"
-            )
+            rule = "each rotor carry its part of the weight"
+            raise ArgumentError("rotors.places", rule, verb="let", shown=f"{shown} N")
         thrust = self.limits.thrust
         if thrust is not None and not thrust[0] < GRAVITY < thrust[1]:
-            raise ValueError(
-                f"limits.thrust must include the weight of {GRAVITY} m/s^2, got {thrust}"
-            )
+            rule = f"the weight of {GRAVITY} m/s^2"
+            raise ArgumentError("limits.thrust", rule, thrust, verb="include")
 
     def __str__(self) -> str:
         return repr(self.name)
@@ -191,7 +190,7 @@ def _require(
 ) -> None:
     """Raise `ValueError` unless a number is finite and within bounds."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.number):
-        raise ValueError(f"{name} must be a number, got {value!r:.60}")
+        raise ArgumentError(name, "a number", value)
     if math.isfinite(value) and value > above and least <= value <= most:
         return
     if above > -math.inf and most < math.inf:
@@ -204,4 +203,4 @@ def _require(
         rule = f">= {least:g}"
     else:
         rule = "finite"
-    raise ValueError(f"{name} must be {rule}, got {value:g}")
+    raise ArgumentError(name, rule, value)

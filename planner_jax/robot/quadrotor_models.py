@@ -8,7 +8,7 @@ what the rotors can do; so are the shares of the rotors' thrusts that plans use.
 import dataclasses
 from typing import Any
 
-from planner_jax.core.registry import UnknownName
+from planner_jax.core.errors import UnknownName
 from planner_jax.robot.quadrotor_file import ENDINGS, read_robot
 from planner_jax.robot.quadrotor_model import (
     GRAVITY,
@@ -128,7 +128,7 @@ def ready_robot(name: str) -> QuadrotorModel:
     if name in MODELS:
         return MODELS[name]
     hint = suggestion(str(name), MODELS)
-    raise UnknownName(f"robot must be one of {', '.join(MODELS)}, got {name!r:.60}{hint}")
+    raise UnknownName("robot", f"one of {', '.join(MODELS)}", shown=f"{name!r:.60}{hint}")
 
 
 def robot_named(word: str) -> QuadrotorModel:
@@ -145,7 +145,7 @@ def robot_named(word: str) -> QuadrotorModel:
         return read_robot(word)
     except OSError as error:
         why = error.strerror or error
-        raise UnknownName(f"robot must be a file that can be read, got {word!r} ({why})") from None
+        raise UnknownName("robot", "a file that can be read", shown=f"{word!r} ({why})") from None
 
 
 def listing() -> str:

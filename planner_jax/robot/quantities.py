@@ -7,6 +7,8 @@ from collections.abc import Iterable, Mapping
 from fractions import Fraction
 from typing import Any
 
+from planner_jax.core.errors import PlannerJaxError
+
 STANDARD_GRAVITY = "9.80665"  # [m/s^2], exact by definition
 
 _SQUARES = {
@@ -36,7 +38,7 @@ _WRITTEN = re.compile(rf"\s*({_NUMBER}(?:(?:\s*,\s*|\s+){_NUMBER})*)\s*(\D.*?)?\
 _LONGEST = 200  # characters
 
 
-class QuantityError(ValueError):
+class QuantityError(PlannerJaxError, ValueError):
     """A value is not the quantity that is asked for; what it has to be, in one line."""
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from jax import Array
 
 from planner_jax.core.checks import require_number
+from planner_jax.core.errors import ArgumentError
 
 _MOST = 10**8  # setpoints of a batch
 
@@ -44,7 +45,7 @@ def sampled_at_rate(
     if last * rate * ends.size > _MOST:
         most = _MOST / (last * ends.size)
         rule = f"at most {most:.3g} for {ends.size} plans of up to {last:.3g} s"
-        raise ValueError(f"rate must be {rule}, got {rate:g}")
+        raise ArgumentError("rate", rule, rate)
     times = np.arange(int(last * rate * (1.0 + 1e-6)) + 1) / rate
     setpoints = jax.tree.map(np.array, dict(sample(leaves, times.astype(ends.dtype))))
     past = ~(times <= ends[:, None] * (1.0 + 1e-6))

@@ -8,9 +8,9 @@ import subprocess
 from importlib import metadata
 from pathlib import Path
 
+from planner_jax.core.errors import ArgumentError
 from planner_jax.host.processors import processor, threads_of_a_computation, usable_cores
 from planner_jax.runs.manifest import Entries
-from planner_jax.runs.settings import SettingError
 
 _PACKAGES = ("planner-jax", "jax", "jaxlib", "numpy", "scipy")  # that decide rows
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -82,24 +82,24 @@ def require_backend() -> str:
     """Return the platform that JAX computes on.
 
     Raises:
-        SettingError: JAX has none that works, or the switch for kernels has a wrong value.
+        ArgumentError: JAX has none that works, or the switch for kernels has a wrong value.
     """
     import jax
 
     from planner_jax.lanes.kernels import is_switched_on
 
-    try:
-        is_switched_on()
-    except ValueError as error:
-        raise SettingError(str(error)) from None
+    is_switched_on()
     try:
         return jax.default_backend()
     except (RuntimeError, AssertionError) as error:
         # JAX 0.10 only asserts, without a word, where it knows a platform but has no device of it.
         reason = (str(error) or "JAX finds no device of it").splitlines()[0]
         asked = os.environ.get("JAX_PLATFORMS", "")
-        raise SettingError(
-            f"JAX_PLATFORMS must name a platform that works here, got {asked!r} ({reason})"
+        raise ArgumentError(
+            "JAX_PLATFORMS",
+            "a platform that works here",
+            verb="name",
+            shown=f"{asked!r} ({reason})",
         ) from None
 
 

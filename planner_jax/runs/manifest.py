@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from planner_jax.core.errors import ArgumentError, PlannerJaxError
 from planner_jax.host.files import open_plain
-from planner_jax.runs.settings import SettingError
 
 FORMAT = 2  # of manifest, parts, rows and recordings
 MANIFEST = "manifest.json"
@@ -21,7 +21,7 @@ Entries: TypeAlias = dict[str, Any]  # of a JSON object, such as a manifest
 Row: TypeAlias = Mapping[str, Any]  # a row of a dataset, by columns
 
 
-class JsonError(ValueError):
+class JsonError(PlannerJaxError, ValueError):
     """A text is not what was written; a few words that say why."""
 
 
@@ -83,7 +83,7 @@ def read_written(path: Path, name: str, what: str) -> Entries:
         what: the folder is of, in words.
 
     Raises:
-        SettingError: there is none, it is of another format, or it is not as it was written.
+        ArgumentError: there is none, it is of another format, or it is not as it was written.
     """
     shown = repr(str(path.parent))
     try:
@@ -94,7 +94,7 @@ def read_written(path: Path, name: str, what: str) -> Entries:
         return parse_written(text)
     except OSError:
         rule = f"the folder of {what}, with its {path.name}"
-        raise SettingError(f"{name} must be {rule}, got {shown}") from None
+        raise ArgumentError(name, rule, shown=shown) from None
     except JsonError as error:
         rule = f"{what} whose {path.name} is whole"
-        raise SettingError(f"{name} must be {rule}, got {shown}, where it {error}") from None
+        raise ArgumentError(name, rule, shown=f"{shown}, where it {error}") from None

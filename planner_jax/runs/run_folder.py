@@ -15,10 +15,10 @@ import socket
 from collections.abc import Iterator
 from pathlib import Path
 
+from planner_jax.core.errors import ArgumentError
 from planner_jax.host.files import is_scratch, replacing
 from planner_jax.runs.dataset import Dataset
 from planner_jax.runs.manifest import MANIFEST, Entries, read_written, to_write
-from planner_jax.runs.settings import SettingError
 
 LOCK = ".lock"
 
@@ -40,7 +40,7 @@ class RunFolder:
         self._made: list[Path] = []
 
     def require_new(self) -> None:
-        """Raise `SettingError` unless a run may be written here; writes no run."""
+        """Raise `ArgumentError` unless a run may be written here; writes no run."""
         try:
             if (self.path / LOCK).exists():
                 with self._locked():
@@ -58,7 +58,7 @@ class RunFolder:
         """Make the folder with its first manifest, and own it for the length of the block.
 
         Raises:
-            SettingError: the folder cannot be made, or is not new any more.
+            ArgumentError: the folder cannot be made, or is not new any more.
         """
         self._made = [p for p in [self.path, *self.path.absolute().parents] if not p.exists()]
         with self.owned():
@@ -75,7 +75,7 @@ class RunFolder:
         """Make the folder if it is not there, and own it for the length of the block.
 
         Raises:
-            SettingError: another process owns it, or it cannot be made or written.
+            ArgumentError: another process owns it, or it cannot be made or written.
         """
         try:
             self.path.mkdir(parents=True, exist_ok=True)
@@ -104,25 +104,23 @@ class RunFolder:
             except BlockingIOError:
                 rule = "a folder that no other process writes"
                 owner = f"owned by process {file.read(200)}"
-                raise SettingError(
-                    f"{self.name} must be {rule}, got {str(self.path)!r}, {owner}"
-                ) from None
+                raise ArgumentError(self.name, rule, shown=f"{str(self.path)!r}, {owner}") from None
             except OSError as error:
                 raise self._unwritable(error) from None
             yield
 
-    def _unwritable(self, error: OSError | None = None) -> SettingError:
+    def _unwritable(self, error: OSError | None = None) -> ArgumentError:
         why = f" ({error.strerror})" if error else ""
         rule = "a folder that can be written"
-        return SettingError(f"{self.name} must be {rule}, got {str(self.path)!r}{why}")
+        return ArgumentError(self.name, rule, shown=f"{str(self.path)!r}{why}")
 
     def _require_empty(self) -> None:
-        """Raise `SettingError` if there is more than a killed process leaves before a manifest."""
+        """Raise `ArgumentError` if there is more than a killed process leaves before a manifest."""
         if not all(path.name == LOCK or is_scratch(path) for path in self.path.iterdir()):
             rule = "a new or empty folder"
             if (self.path / MANIFEST).exists():
                 rule += ", or that of a run with resume"
-            raise SettingError(f"{self.name} must be {rule}, got {str(self.path)!r}")
+            raise ArgumentError(self.name, rule, str(self.path))
 
     def discard(self) -> None:
         """Remove all that was written since `created`, and the folders made for it."""
@@ -149,7 +147,7 @@ class RunFolder:
         """Return the manifest.
 
         Raises:
-            SettingError: the folder is not that of a run, or its manifest is not as it was written.
+            ArgumentError: the folder is not that of a run, or its manifest was changed.
         """
         return read_written(self.path / MANIFEST, self.name, "a run")
 
@@ -165,7 +163,7 @@ class RunFolder:
             scratch.write_text(text, encoding="utf-8")
 
     def require_whole(self, rows: Dataset, remedy: str, num: int | None = None) -> None:
-        """Raise `SettingError` if a part of some rows is missing or damaged.
+        """Raise `ArgumentError` if a part of some rows is missing or damaged.
 
         Args:
             rows: of the run.
@@ -175,6 +173,6 @@ class RunFolder:
         for path, why in rows.damages(num).items():
             place = path.relative_to(self.path)
             rule = f"a run whose {place} is whole"
-            raise SettingError(
-                f"{self.name} must be {rule}, got {str(self.path)!r}, where it {why}; {remedy}"
+            raise ArgumentError(
+                self.name, rule, shown=f"{str(self.path)!r}, where it {why}; {remedy}"
             )

@@ -6,24 +6,26 @@ JAX.
 
 import dataclasses
 import os
-from collections.abc import Iterable
 from typing import Any, ClassVar, Self, TypeVar
 
-from planner_jax.core.efforts import EFFORTS
-from planner_jax.core.recovery_names import CHOICES, NONE, ending_problem
-from planner_jax.core.registry import Task, UnknownName, require_name
-from planner_jax.core.scales import scale_problem
-from planner_jax.host.memory import require_disk
+from planner_jax.core.choices import (
+    CHOICES,
+    EFFORTS,
+    NONE,
+    require,
+    require_disk,
+    require_one_of,
+    require_seed,
+    require_size,
+)
+from planner_jax.core.errors import ArgumentError, PlannerJaxError
+from planner_jax.core.registry import Task, require_name
 
 AnySettings = TypeVar("AnySettings", bound="SweepSettings")
 KnownSettings = TypeVar("KnownSettings")
 
 
-class SettingError(ValueError):
-    """An argument of a run breaks a rule; one line that begins with the argument's name."""
-
-
-class WorkersFailed(RuntimeError):
+class WorkersFailed(PlannerJaxError, RuntimeError):
     """Workers could not make a chunk of a run, which can be resumed; one line."""
 
 
@@ -43,6 +45,17 @@ def ending_options(value: str) -> dict[str, str]:
     return {} if value == NONE else {"ending": value}
 
 
+def require_count(name: str, value: int | None, least: int, *, none: bool = False) -> None:
+    """Raise unless a value is a whole number of at least `least`, or None where that is allowed."""
+    if value is not None or not none:
+        require_size(name, value, least)  # type: ignore[arg-type]
+
+
+def require_ending(value: str) -> None:
+    """Raise `ArgumentError` unless the argument `ending` is one, or none."""
+    require_one_of(CHOICES, "ending", value)
+
+
 @dataclasses.dataclass(frozen=True)
 class SweepSettings:
     """The arguments that the sweeps of all tasks have; a task's own class adds its own.
@@ -50,7 +63,7 @@ class SweepSettings:
     Together they decide every number of the run's table.
 
     Raises:
-        SettingError: a value breaks its rule.
+        ArgumentError: a value breaks its rule.
     """
 
     planner: str | None = option(None, "NAME", "")  # None: the task's first
@@ -82,7 +95,7 @@ class SweepSettings:
         """The same with the names of the task's planner and suite filled in, or checked.
 
         Raises:
-            SettingError: the task has no planner or suite of the name.
+            ArgumentError: the task has no planner or suite of the name.
         """
         planners, suites = task.all_planners(), task.all_suites()
         filled = dataclasses.replace(
@@ -90,11 +103,8 @@ class SweepSettings:
             planner=next(iter(planners)) if self.planner is None else self.planner,
             suite=next(iter(suites)) if self.suite is None else self.suite,
         )
-        try:
-            task.split_planner(str(filled.planner))
-            require_name(suites, "suite", str(filled.suite))
-        except UnknownName as error:
-            raise SettingError(str(error)) from None
+        task.split_planner(str(filled.planner))
+        require_name(suites, "suite", str(filled.suite))
         return filled
 
     @property
@@ -103,15 +113,12 @@ class SweepSettings:
         return self.CASE_BYTES
 
     def require_room(self, out: str | os.PathLike) -> None:
-        """Raise `SettingError` if the rows that are asked for do not fit on the disk of a folder.
+        """Raise `ArgumentError` if the rows that are asked for do not fit on the disk of a folder.
 
         Args:
             out: of the run.
         """
-        try:
-            require_disk("num", self.num or self.DEFAULT_NUM, self.ROW_BYTES, out)
-        except ValueError as error:
-            raise SettingError(str(error)) from None
+        require_disk("num", self.num or self.DEFAULT_NUM, self.ROW_BYTES, out)
 
     def parameters(self) -> dict[str, Any]:
         """The settings as plain values for `manifest.json`; the class brings them back."""
@@ -130,35 +137,8 @@ class SweepSettings:
         return {name: getattr(self, name) for name in self.JUDGE}
 
 
-def require(holds: bool, name: str, rule: str, value: Any) -> None:
-    """Raise `SettingError` unless a rule on an argument holds."""
-    if not holds:
-        raise SettingError(f"{name} must be {rule}, got {value}")
-
-
-def require_count(name: str, value: Any, least: int, *, none: bool = False) -> None:
-    """Raise `SettingError` unless a value is a whole number of at least `least`, or None if so."""
-    if value is None and none:
-        return
-    if not isinstance(value, int) or isinstance(value, bool):
-        raise SettingError(f"{name} must be a whole number, got {value!r}")
-    require(value >= least, name, f">= {least}", value)
-
-
-def require_seed(value: Any) -> None:
-    """Raise `SettingError` unless the argument `seed` is one of all random generators."""
-    require_count("seed", value, 0)
-    require(value < 2**63, "seed", "< 2**63", value)
-
-
-def require_scale(value: float) -> None:
-    """Raise `SettingError` unless the argument `limit_scale` leaves limits of a machine."""
-    if problem := scale_problem(value):
-        raise SettingError(problem)
-
-
 def require_effort(value: str, planner: str | None, without: str) -> None:
-    """Raise `SettingError` unless the argument `effort` is one, and of a planner that has it.
+    """Raise `ArgumentError` unless the argument `effort` is one, and of a planner that has it.
 
     Args:
         value: of the argument.
@@ -168,18 +148,6 @@ def require_effort(value: str, planner: str | None, without: str) -> None:
     require_one_of(EFFORTS, "effort", value)
     rule = f"left out for the planner {without}, which minimises nothing"
     require(value == EFFORTS[0] or planner != without, "effort", rule, value)
-
-
-def require_ending(value: str) -> None:
-    """Raise `SettingError` unless the argument `ending` is one, or none."""
-    if problem := ending_problem(value, CHOICES):
-        raise SettingError(problem)
-
-
-def require_one_of(names: Iterable[str], name: str, value: str) -> None:
-    """Raise `SettingError` unless an argument is one of some words."""
-    names = tuple(names)
-    require(value in names, name, f"one of {', '.join(names)}", repr(value))
 
 
 def settings_to_resume(
@@ -193,13 +161,13 @@ def settings_to_resume(
         given: settings that the caller named; they must be the run's.
 
     Raises:
-        SettingError: a given value is not the run's, or the run's are not such settings.
+        ArgumentError: a given value is not the run's, or the run's are not such settings.
     """
     settings = settings_of_manifest(kind, parameters, "out")
     asked = dataclasses.replace(settings, **given)
     for name in given:
         part, old, new = _difference(name, getattr(settings, name), getattr(asked, name))
-        require(new == old, part, f"{old} as in the run that is resumed", new)
+        require(new == old, part, f"{old} as in the run that is resumed", new, shown=str(new))
     return settings
 
 
@@ -214,13 +182,13 @@ def settings_of_manifest(
         name: of the caller's argument that holds the run's folder, for messages.
 
     Raises:
-        SettingError: they are not such settings, as where another version wrote them.
+        ArgumentError: they are not such settings, as where another version wrote them.
     """
     try:
         return kind(**parameters)
     except (TypeError, ValueError) as error:
         rule = "a run with settings of this version"
-        raise SettingError(f"{name} must be {rule}, got others: {error}") from None
+        raise ArgumentError(name, rule, shown=f"others: {error}") from None
 
 
 def _difference(name: str, old: Any, new: Any) -> tuple[str, Any, Any]:

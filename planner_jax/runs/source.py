@@ -8,9 +8,10 @@ from typing import Any
 import jax
 import numpy as np
 
+from planner_jax.core.choices import require_memory
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.registry import Task
-from planner_jax.host.memory import require_memory
-from planner_jax.runs.settings import SettingError, SweepSettings
+from planner_jax.runs.settings import SweepSettings
 
 _MOST_PARTS = 10**6  # of a run: files in one folder
 
@@ -56,7 +57,7 @@ class Source(abc.ABC):
         """The cases from place `first` up to `last`, that one left out, checked.
 
         Raises:
-            SettingError: a case breaks a rule.
+            ArgumentError: a case breaks a rule.
         """
 
     @abc.abstractmethod
@@ -74,15 +75,12 @@ class DrawnSource(Source):
         """The cases from place `first` up to `last`, that one left out.
 
         Raises:
-            SettingError: what draws them refuses a setting.
+            ArgumentError: what draws them refuses a setting.
         """
         settings = self.settings
-        try:
-            drawn = self.task.draw(
-                last - first, settings.suite, settings.seed, first=first, **settings.draw_options()
-            )
-        except ValueError as error:
-            raise SettingError(str(error)) from error
+        drawn = self.task.draw(
+            last - first, settings.suite, settings.seed, first=first, **settings.draw_options()
+        )
         return Chunk(index=np.arange(first, last), cases=jax.tree.map(np.asarray, drawn))
 
     def description(self) -> dict[str, Any]:
@@ -102,18 +100,15 @@ def filled_in(settings: SweepSettings, num: int, batch: int) -> dict[str, Any]:
         batch: cases a chunk, likewise.
 
     Raises:
-        SettingError: the cases of a chunk do not fit into memory, or there are too many chunks.
+        ArgumentError: the cases of a chunk do not fit into memory, or there are too many chunks.
     """
     num, batch = settings.num or num, settings.batch or batch
     if num > _MOST_PARTS * batch:
         rule = f"at most {_MOST_PARTS * batch:,} with a batch of {batch}, of which each is a file"
-        raise SettingError(f"num must be {rule}, got {num}")
-    try:
-        if settings.batch is None:
-            require_memory("num", min(num, batch), settings.case_bytes)
-        else:
-            require_memory("batch", batch, settings.case_bytes)
-    except ValueError as error:
-        raise SettingError(str(error)) from None
+        raise ArgumentError("num", rule, num)
+    if settings.batch is None:
+        require_memory("num", min(num, batch), settings.case_bytes)
+    else:
+        require_memory("batch", batch, settings.case_bytes)
     resolved = dataclasses.replace(settings, num=num, batch=batch)
     return {"settings": resolved, "num": num, "batch": batch}

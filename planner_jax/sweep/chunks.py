@@ -82,7 +82,7 @@ class Maker:
             batch: cases a chunk, where the settings name no number.
 
         Raises:
-            SettingError: the settings ask for what is not there.
+            ArgumentError: the settings ask for what is not there.
         """
         source = sweep.open_source(settings, batch)
         makers, description = makers_of(environment()), source.description()

@@ -22,12 +22,13 @@ from types import ModuleType
 import jax
 import jax.numpy as jnp
 
-from planner_jax.core.registry import MissingExtra, install_line
+from planner_jax.core.choices import require
+from planner_jax.core.errors import ArgumentError, MissingExtra, install_line
 from planner_jax.host import signals as stopping
 from planner_jax.host.compile_cache import keep_compiled_programs
 from planner_jax.host.processors import threads_of_a_computation
 from planner_jax.runs.environment import require_backend
-from planner_jax.runs.settings import SettingError, WorkersFailed, require
+from planner_jax.runs.settings import WorkersFailed
 from planner_jax.runs.timing import CompileClock
 from planner_jax.sweep.chunks import Made, Maker, Workers
 from planner_jax.sweep.sweep import sweep_of
@@ -47,13 +48,13 @@ def workers_of(kind: str | None) -> Iterator[Workers | None]:
     and GPUs is started and ended. JAX starts here with one GPU, as in each worker.
 
     Raises:
-        SettingError: there are no such workers, no cluster answers, or JAX has several GPUs.
+        ArgumentError: there are no such workers, no cluster answers, or JAX has several GPUs.
         MissingExtra: Ray is not installed.
     """
     if kind is None:
         yield None
         return
-    require(kind == "ray", "workers", "ray", repr(kind))
+    require(kind == "ray", "workers", "ray", kind)
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
     try:
         import ray
@@ -93,8 +94,10 @@ def _start(ray: ModuleType, folder: str) -> None:
         reason = (str(error) or type(error).__name__).splitlines()[0]
         if address:
             rule = "the address of a Ray cluster that answers"
-            raise SettingError(f"{_ADDRESS} must be {rule}, got {address!r} ({reason})") from None
-        raise SettingError(f"workers must be left out where Ray cannot start ({reason})") from None
+            raise ArgumentError(_ADDRESS, rule, shown=f"{address!r} ({reason})") from None
+        raise ArgumentError(
+            "workers", f"left out where Ray cannot start ({reason})", shown=""
+        ) from None
     finally:
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTERM, handler)  # Ray has put its own in the place of this one

@@ -12,8 +12,8 @@ import numpy as np
 import pyarrow as pa
 from scipy.stats import binomtest
 
+from planner_jax.core.errors import ArgumentError
 from planner_jax.runs.run_folder import RunFolder
-from planner_jax.runs.settings import SettingError
 from planner_jax.runs.summary import percent, wilson_interval
 from planner_jax.sweep.report import finished_sweep
 from planner_jax.sweep.sweep import settings_of
@@ -61,7 +61,7 @@ def read_run(path: str | os.PathLike) -> ComparedRun:
     """A run for `compare`.
 
     Raises:
-        SettingError: the folder is not that of a whole, finished sweep.
+        ArgumentError: the folder is not that of a whole, finished sweep.
     """
     folder = RunFolder(path, name="RUN")
     manifest, sweep = finished_sweep(folder)
@@ -70,7 +70,7 @@ def read_run(path: str | os.PathLike) -> ComparedRun:
         found = {name: rows[name].to_numpy() for name in _READ}
     except (pa.ArrowException, KeyError, OSError) as error:
         rule, why = "a run whose rows can be read", " ".join(str(error).split())
-        raise SettingError(f"{folder.name} must be {rule}, got {why}") from None
+        raise ArgumentError(folder.name, rule, shown=why) from None
     return ComparedRun(
         name=str(path),
         manifest=manifest,
@@ -84,9 +84,9 @@ def read_run(path: str | os.PathLike) -> ComparedRun:
 
 
 def require_comparable(runs: Sequence[ComparedRun]) -> None:
-    """Raise `SettingError` unless there are several runs, of one task, suite and seed."""
+    """Raise `ArgumentError` unless there are several runs, of one task, suite and seed."""
     if len(runs) < 2:
-        raise SettingError(f"RUN must be the folders of two runs or more, got {len(runs)}")
+        raise ArgumentError("RUN", "the folders of two runs or more", len(runs))
     first = runs[0]
     for other in runs[1:]:
         told = [(run.manifest["kind"], run.settings) for run in (first, other)]
@@ -95,7 +95,7 @@ def require_comparable(runs: Sequence[ComparedRun]) -> None:
         for name, mine, theirs in looks:
             if mine != theirs:
                 shown = f"{mine} in {first.name!r} and {theirs} in {other.name!r}"
-                raise SettingError(f"RUN must be runs of one {name}, got {shown}")
+                raise ArgumentError("RUN", f"runs of one {name}", shown=shown)
 
 
 def other_cases(first: ComparedRun, other: ComparedRun) -> list[str]:

@@ -9,10 +9,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pyarrow as pa
 
+from planner_jax.core.errors import ArgumentError
 from planner_jax.runs.dataset import Dataset
 from planner_jax.runs.manifest import Entries, Row
 from planner_jax.runs.run_folder import RunFolder
-from planner_jax.runs.settings import SettingError, SweepSettings, settings_of_manifest
+from planner_jax.runs.settings import SweepSettings, settings_of_manifest
 from planner_jax.runs.style import draw
 from planner_jax.runs.summary import Tally
 from planner_jax.runs.table import RateTable, headline, to_html, to_markdown
@@ -69,13 +70,13 @@ def finished_sweep(folder: RunFolder) -> tuple[Entries, Sweep]:
     """Return manifest and sweep of a folder after a check of the manifest and all parts.
 
     Raises:
-        SettingError: the folder is not that of a whole, finished sweep.
+        ArgumentError: the folder is not that of a whole, finished sweep.
     """
     manifest = folder.read_manifest()
     sweep = sweep_of_run(manifest, folder.name)
     if "summary" not in manifest:
-        rule = f"{folder.name} must be finished"
-        raise SettingError(f"{rule}, got {str(folder.path)!r}; resume it first")
+        shown = f"{str(folder.path)!r}; resume it first"
+        raise ArgumentError(folder.name, "finished", shown=shown)
     again = f"planner-jax {sweep.kind} --resume --out {shlex.quote(str(folder.path))}"
     remedy = f"make it anew: {again}"
     folder.require_whole(folder.plans, remedy, manifest["summary"]["num"])
@@ -84,7 +85,7 @@ def finished_sweep(folder: RunFolder) -> tuple[Entries, Sweep]:
 
 
 def require_sound(folder: RunFolder) -> None:
-    """Raise `SettingError` unless a sweep's rows are whole, and its summary counts them."""
+    """Raise `ArgumentError` unless a sweep's rows are whole, and its summary counts them."""
     manifest, sweep = finished_sweep(folder)
     parameters = manifest["parameters"]
     settings = settings_of_manifest(settings_of(sweep.task), parameters, folder.name)
@@ -93,12 +94,12 @@ def require_sound(folder: RunFolder) -> None:
         counted = {**tally.summary(), "example": tally.example}
     except (pa.ArrowException, KeyError, ZeroDivisionError) as error:
         rule, why = "a run whose rows can be read", " ".join(str(error).split())
-        raise SettingError(f"{folder.name} must be {rule}, got {why}") from None
+        raise ArgumentError(folder.name, rule, shown=why) from None
     require_counted(folder, {**manifest["summary"], "example": manifest.get("example")}, counted)
 
 
 def require_counted(folder: RunFolder, told: Mapping[str, object], counted: Entries) -> None:
-    """Raise `SettingError` unless a manifest's summary says what its rows do.
+    """Raise `ArgumentError` unless a manifest's summary says what its rows do.
 
     Args:
         folder: of the run.
@@ -108,8 +109,8 @@ def require_counted(folder: RunFolder, told: Mapping[str, object], counted: Entr
     for name, value in counted.items():
         if not _agree(told.get(name), value):
             rule = f"a run whose {name} is that of its rows, {value}"
-            raise SettingError(
-                f"{folder.name} must be {rule}, got {told.get(name)} in {str(folder.path)!r}"
+            raise ArgumentError(
+                folder.name, rule, shown=f"{told.get(name)} in {str(folder.path)!r}"
             )
 
 

@@ -6,8 +6,8 @@ Robots are imported where one is named, so that a command's help needs no NumPy.
 from collections.abc import Mapping
 from typing import Any
 
-from planner_jax.core.registry import UnknownName
-from planner_jax.runs.settings import SettingError, option
+from planner_jax.core.errors import ArgumentError
+from planner_jax.runs.settings import option
 
 
 def robot_option(usual: str) -> Any:
@@ -27,7 +27,7 @@ def checked_robot(given: Any, tool: str) -> Any:
         The `QuadrotorModel`, or None.
 
     Raises:
-        SettingError: there is no such robot, its file is not sound, or it carries something else.
+        ArgumentError: there is no such robot, its file is not sound, or it carries something else.
     """
     if given is None:
         return None
@@ -38,15 +38,13 @@ def checked_robot(given: Any, tool: str) -> Any:
     try:
         found = model_of(given) if isinstance(given, Mapping) else given
         found = robot_named(found) if isinstance(found, str) else found
-    except UnknownName as error:
-        raise SettingError(str(error)) from None
     except RobotError as error:
-        raise SettingError(f"robot must be a sound one: {error}") from None
+        raise ArgumentError("robot", f"a sound one: {error}", shown="") from None
     if not isinstance(found, QuadrotorModel):
-        raise SettingError(f"robot must be a name, a file or a QuadrotorModel, got {given!r:.60}")
+        raise ArgumentError("robot", "a name, a file or a QuadrotorModel", given)
     if found.tool.kind != tool:
-        raise SettingError(
-            f"robot must carry a {tool}, got {found.name!r} with a {found.tool.kind}"
+        raise ArgumentError(
+            "robot", f"a {tool}", verb="carry", shown=f"{found.name!r} with a {found.tool.kind}"
         )
     return found
 

@@ -6,13 +6,14 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import PyTree
 
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import Plan, Status, lane
 from planner_jax.robot.arm_plan import ArmPlan
 from planner_jax.robot.car import CarPlan
 from planner_jax.robot.quadrotor_plan import QuadrotorPlan
 from planner_jax.runs.manifest import Entries, Row
 from planner_jax.runs.run_folder import RunFolder
-from planner_jax.runs.settings import SettingError, settings_of_manifest
+from planner_jax.runs.settings import settings_of_manifest
 from planner_jax.sweep.report import finished_sweep
 from planner_jax.sweep.sweep import settings_of
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
@@ -33,7 +34,7 @@ def case_of_row(folder: RunFolder, row: int) -> PyTree:
         row: its place, from 0, one that there is.
 
     Raises:
-        SettingError: the folder is not that of a whole, finished sweep, or the case that is read
+        ArgumentError: the folder is not that of a whole, finished sweep, or the case that is read
             or drawn now is another one.
     """
     manifest, sweep = finished_sweep(folder)
@@ -41,7 +42,7 @@ def case_of_row(folder: RunFolder, row: int) -> PyTree:
     cases = sweep.open_source(settings.of(sweep.task), 1).cases(row, row + 1).cases
     if sweep.setting(cases) != manifest["setting"]:
         rule = "a run whose cases are drawn or read as they were"
-        raise SettingError(f"{folder.name} must be {rule}, got others for row {row}")
+        raise ArgumentError(folder.name, rule, shown=f"others for row {row}")
     return lane(cases, 0)
 
 
@@ -53,22 +54,22 @@ def planned_row(folder: RunFolder, row: int | None) -> PlannedRow:
         row: its place, from 0.
 
     Raises:
-        SettingError: the folder is not that of a whole, finished sweep, or there is no such row.
+        ArgumentError: the folder is not that of a whole, finished sweep, or there is no such row.
     """
     manifest, sweep = finished_sweep(folder)
     last = manifest["summary"]["num"] - 1
     if row is None or not 0 <= row <= last:
         shown = "nothing" if row is None else row
-        raise SettingError(f"row must be from 0 to {last}, got {shown}")
+        raise ArgumentError("row", f"from 0 to {last}", shown=shown)
     try:
         (found,) = folder.plans.pick([row])
         plan = sweep.plan_of_row(found, manifest.get("setting", {}))
     except (pa.ArrowException, KeyError, TypeError, ValueError) as error:
         rule, why = "a run whose rows can be read", " ".join(str(error).split())
-        raise SettingError(f"{folder.name} must be {rule}, got {why}") from None
+        raise ArgumentError(folder.name, rule, shown=why) from None
     if plan is None:
         rule = "a sweep of a task whose rows are read back as plans"
-        raise SettingError(f"{folder.name} must be {rule}, got a {sweep.kind}")
+        raise ArgumentError(folder.name, rule, shown=f"a {sweep.kind}")
     return PlannedRow(plan, found["sentence"])
 
 

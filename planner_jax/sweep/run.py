@@ -11,6 +11,7 @@ import jax
 import numpy as np
 import pyarrow as pa
 
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import Planner
 from planner_jax.core.registry import Task
 from planner_jax.host import signals as stopping
@@ -19,12 +20,7 @@ from planner_jax.runs.dataset import DamagedPart, check_part, number_of
 from planner_jax.runs.environment import environment, makers_of, require_backend
 from planner_jax.runs.manifest import Entries
 from planner_jax.runs.run_folder import RunFolder
-from planner_jax.runs.settings import (
-    SettingError,
-    SweepSettings,
-    WorkersFailed,
-    settings_to_resume,
-)
+from planner_jax.runs.settings import SweepSettings, WorkersFailed, settings_to_resume
 from planner_jax.runs.source import Source
 from planner_jax.runs.timing import Stopwatch
 from planner_jax.sweep.chunks import Maker, Record, Workers, make_parts, times_of
@@ -59,7 +55,7 @@ def start_sweep(
         The manifest of the finished run.
 
     Raises:
-        SettingError: an argument or a case breaks a rule; nothing is left behind.
+        ArgumentError: an argument or a case breaks a rule; nothing is left behind.
         SweepInterrupted: on Ctrl-C; the folder can be resumed.
         WorkersFailed: workers could not make a chunk; the folder can be resumed.
         OSError: the disk fails; the folder can be resumed.
@@ -113,7 +109,7 @@ def resume_sweep(
         The manifest of the finished run, whose rows are those of an uninterrupted one.
 
     Raises:
-        SettingError: the folder is not that of such a sweep, a given setting is not the
+        ArgumentError: the folder is not that of such a sweep, a given setting is not the
             run's, or its rows would not be what they were.
         SweepInterrupted: on Ctrl-C; the folder can be resumed.
         WorkersFailed: workers could not make a chunk; the folder can be resumed.
@@ -131,15 +127,15 @@ def resume_sweep(
         for what, old in manifest["makers"].items():
             if (new := makers_of(session).get(what)) != old:
                 rule = f"resumed by {what} {old}, as it began"
-                raise SettingError(
-                    f"out must be {rule}, got {new}; or begin anew in another folder"
-                )
+                raise ArgumentError("out", rule, shown=f"{new}; or begin anew in another folder")
         maker = _maker_of(sweep, settings)
         for entry, known in maker.description.items():
             if known != manifest.get(entry):
-                raise SettingError(f"{entry} must be the same as when the run began")
+                raise ArgumentError(entry, "the same as when the run began", shown="")
         if maker.run != manifest["run"]:
-            raise SettingError("out must be resumed with the files that its settings named then")
+            raise ArgumentError(
+                "out", "resumed with the files that its settings named then", shown=""
+            )
         sessions = [*manifest["sessions"], session]
         manifest = folder.write_manifest({**manifest, "state": "running", "sessions": sessions})
         return _finish(folder, manifest, maker, there, others, progress)
@@ -158,8 +154,8 @@ def _settings_of_run(
     """Return manifest and settings of a run that may be resumed with some settings named again."""
     manifest = folder.read_manifest()
     if manifest["kind"] != sweep.kind:
-        raise SettingError(
-            f"out must be the folder of a {sweep.kind}, got one of a {manifest['kind']}"
+        raise ArgumentError(
+            "out", f"the folder of a {sweep.kind}", shown=f"one of a {manifest['kind']}"
         )
     kind = settings_of(sweep.task)
     return manifest, settings_to_resume(kind, manifest["parameters"], dict(given))
@@ -176,7 +172,7 @@ def _sound_parts(folder: RunFolder, manifest: Entries) -> dict[int, Record]:
     for path in files:
         if not path.is_file():
             rule = "a run whose parts are plain files"
-            raise SettingError(f"{folder.name} must be {rule}, got {str(path)!r}, which is none")
+            raise ArgumentError(folder.name, rule, shown=f"{str(path)!r}, which is none")
     for path in files:
         try:
             number, record = number_of(path), check_part(path)
@@ -224,7 +220,7 @@ def _finish(
             folder.baselines.write_rows(rows)
         write_report(folder)
         return folder.write_manifest({**manifest, "state": "complete"})
-    except SettingError:
+    except ArgumentError:
         # A case that was drawn late breaks a rule, so that this run can never be finished.
         folder.discard()
         raise

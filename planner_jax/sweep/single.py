@@ -2,23 +2,20 @@
 
 import abc
 import dataclasses
-import re
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import jax
 import numpy as np
 
+from planner_jax.core.errors import CaseError
 from planner_jax.core.protocol import Status
 from planner_jax.core.registry import Task
-from planner_jax.core.rules import CaseError
 from planner_jax.planning.plan import plan
 from planner_jax.referee.rotors import rotor_thrusts
-from planner_jax.runs.settings import SettingError
 from planner_jax.sweep.sampled_motion import SampledMotion, body_rate, net_thrust, sample_motion
 
 _SAMPLES = 4001  # of a plan
-_PLACES = re.compile(r"\b(?:[a-z_]+\.)+(?=[a-z_])")  # before the name of a field
 
 # Limits of the flight that are bounds from above: name, unit, size at every time.
 _ABOVE = {
@@ -91,21 +88,19 @@ class Single(abc.ABC):
         """The plan, and the referee's verdict on it.
 
         Raises:
-            SettingError: a number of the case breaks a rule.
+            ArgumentError: a number of the case breaks a rule.
         """
         try:
             case = jax.tree.map(np.asarray, self.case())
             planner = self.task.planner(self.settings.planner, **self.settings.planner_options())
             found = plan(planner, case)
         except CaseError as error:
-            raise SettingError(self._renamed(str(error))) from None
+            raise error.renamed(dict(map(self._setting_of, (error.name, error.other)))) from None
         return Answer(case, found, self.task.judge(case, found))
 
-    def _renamed(self, message: str) -> str:
-        """The message about a field of the case, with the name of the setting."""
-        name, _, rest = message.partition(" ")
-        own = self.NAMES.get(name, name.rpartition(".")[2])
-        return f"{own} {_PLACES.sub('', rest)}"
+    def _setting_of(self, field: str) -> tuple[str, str]:
+        """Return a field of the case and the setting that decides it."""
+        return field, self.NAMES.get(field, field.rpartition(".")[2])
 
     def described(self, answer: Answer) -> list[str]:
         """The answer as lines of text."""

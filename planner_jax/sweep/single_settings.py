@@ -7,13 +7,12 @@ import dataclasses
 import math
 from typing import Any, ClassVar
 
-from planner_jax.core.registry import Task, UnknownName
+from planner_jax.core.choices import require
+from planner_jax.core.registry import Task
 from planner_jax.runs.settings import (
-    SettingError,
     ending_option,
     ending_options,
     option,
-    require,
     require_ending,
 )
 from planner_jax.sweep.robots import checked_robot, robot_option
@@ -28,7 +27,7 @@ class SingleSettings:
     A field of several numbers has as many words in its `metavar`.
 
     Raises:
-        SettingError: a value breaks a rule.
+        ArgumentError: a value breaks a rule.
     """
 
     planner: str | None = option(None, "NAME", "")  # None: the task's first
@@ -64,13 +63,10 @@ class SingleSettings:
         """The same with the name of the task's planner filled in, or checked.
 
         Raises:
-            SettingError: the task has no planner of the name.
+            ArgumentError: the task has no planner of the name.
         """
         name = next(iter(task.all_planners())) if self.planner is None else self.planner
-        try:
-            task.split_planner(name)
-        except UnknownName as error:
-            raise SettingError(str(error)) from None
+        task.split_planner(name)
         return dataclasses.replace(self, planner=name)
 
     def planner_options(self) -> dict[str, Any]:

@@ -9,11 +9,13 @@ from typing import Any, ClassVar
 import numpy as np
 from matplotlib.figure import Figure
 
+from planner_jax.core.choices import require
+from planner_jax.core.errors import ArgumentError, MissingExtra, UnknownName
 from planner_jax.core.protocol import Plan
-from planner_jax.core.registry import MissingExtra, Task, UnknownName, task_named
+from planner_jax.core.registry import Task, task_named
 from planner_jax.planning.plan import plan
 from planner_jax.runs.columns import Column, RefereedBatch, leaf_columns
-from planner_jax.runs.settings import SettingError, SweepSettings, require
+from planner_jax.runs.settings import SweepSettings
 from planner_jax.runs.source import DrawnSource, Source, filled_in
 from planner_jax.runs.summary import Tally
 from planner_jax.runs.table import RateTable, own_cells
@@ -90,7 +92,7 @@ class Sweep:
         return {name: one for name, one in made.items() if one.case_type is kind}
 
     def require_fit(self, settings: Any, planner: Any, cases: Any) -> None:
-        """Raise `SettingError` unless the planner is one of such cases."""
+        """Raise `ArgumentError` unless the planner is one of such cases."""
         require(
             isinstance(cases, planner.case_type),
             "planner",
@@ -102,7 +104,7 @@ class Sweep:
         """The source of a sweep's cases; `batch` where the settings name none.
 
         Raises:
-            SettingError: the settings ask for what is not there.
+            ArgumentError: the settings ask for what is not there.
         """
         return DrawnSource(**filled_in(settings, settings.DEFAULT_NUM, batch), task=self.task)
 
@@ -178,15 +180,15 @@ def sweep_of_run(manifest: dict[str, Any], name: str = "out") -> Sweep:
         name: of the caller's argument that holds the run's path, for the message.
 
     Raises:
-        SettingError: the run is of another kind, or of a task that is not installed.
+        ArgumentError: the run is of another kind, or of a task that is not installed.
     """
     first, _, task = str(manifest["kind"]).partition(" ")
     if first != "sweep":
-        raise SettingError(f"{name} must be the folder of a sweep, got a {manifest['kind']}")
+        raise ArgumentError(name, "the folder of a sweep", shown=f"a {manifest['kind']}")
     try:
         return sweep_of(task_named(task))
     except UnknownName as error:
-        raise SettingError(f"{name} must be the folder of a known task: {error}") from None
+        raise ArgumentError(name, f"the folder of a known task: {error}", shown="") from None
 
 
 def first_values(tree: Any, names: Sequence[str] = (), prefix: str = "") -> dict[str, Any]:

@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from planner_jax.core.checks import numbers_of, require_size, shape_of
-from planner_jax.host.memory import require_memory
+from planner_jax.core.checks import numbers_of, shape_of
+from planner_jax.core.choices import require_memory, require_size
+from planner_jax.core.errors import ArgumentError
 
 _DRAWN_BYTES = 1_000  # of a case, as estimated
 
@@ -31,7 +32,7 @@ def batch_of(name: str, vectors: Any, *shape: int) -> tuple[int, ...]:
     given = shape_of(name, vectors)
     if given[len(given) - len(shape) :] != shape or len(given) < len(shape):
         ends = ", ".join(map(str, shape))
-        raise ValueError(f"{name} must have a shape that ends with ({ends},), got {given}")
+        raise ArgumentError(name, f"a shape that ends with ({ends},)", given, verb="have")
     return given[: len(given) - len(shape)]
 
 
@@ -44,8 +45,6 @@ def require_draw(num: Any, seed: Any, first: Any) -> None:
     """
     for name, value, least in (("num", num, 1), ("seed", seed, 0), ("first", first, 0)):
         require_size(name, value, least)
-        if value >= 2**63:
-            raise ValueError(f"{name} must be < 2**63, got {value}")
     require_memory("num", num, _DRAWN_BYTES)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 
+from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.rules import require_rule
 from planner_jax.robot.quadrotor import QuadrotorLimits, RotorLimits
 from planner_jax.robot.quadrotor_model import NET, QuadrotorModel, Tool
@@ -30,9 +31,11 @@ def require_tool(robot: Any, kind: str) -> Tool:
     """
     if not isinstance(robot, QuadrotorModel):
         rule = "a QuadrotorModel, such as pj.robot_named('x500') or pj.read_robot('my.yaml')"
-        raise TypeError(f"robot must be {rule}, got {robot!r:.60}")
+        raise ArgumentTypeError("robot", rule, robot)
     if robot.tool.kind != kind:
-        raise ValueError(f"robot must carry a {kind}, got {robot.name!r} with a {robot.tool.kind}")
+        raise ArgumentError(
+            "robot", f"a {kind}", verb="carry", shown=f"{robot.name!r} with a {robot.tool.kind}"
+        )
     return robot.tool
 
 
@@ -51,7 +54,7 @@ def require_start(cases: Any) -> None:
 def require_own_robot(robot: Any, usual: QuadrotorModel, suite: str) -> None:
     """Raise `ValueError` if a robot is named for a suite of another package, which has its own."""
     if robot != usual:
-        raise ValueError(f"robot must be left out with suite {suite!r}, which has its own")
+        raise ArgumentError("robot", f"left out with suite {suite!r}, which has its own", shown="")
 
 
 def limits_of(robot: QuadrotorModel, leaf: Callable[..., Array], **given: Any) -> QuadrotorLimits:

@@ -7,7 +7,9 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 
-from planner_jax.core.checks import numeric, require_number, require_size, require_switch, told
+from planner_jax.core.checks import numeric, require_number, require_switch
+from planner_jax.core.choices import require_size
+from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.protocol import Case, Plan, lane
 
 VerdictT = TypeVar("VerdictT")
@@ -36,15 +38,15 @@ def judged(
     """
     for name, tree, kind in zip(("cases", "plans"), (cases, plans), kinds, strict=True):
         if not isinstance(tree, kind):
-            raise TypeError(f"{name} must be a {kind.__name__}, got a {type(tree).__name__}")
+            raise ArgumentTypeError(name, f"a {kind.__name__}", shown=f"a {type(tree).__name__}")
     require_settings(referee, settings)
     for leaf in jax.tree.leaves((cases, plans)):
         if numeric(leaf) is None:
-            raise TypeError(f"cases and plans must hold numbers, got {told(leaf)}")
+            raise ArgumentTypeError("cases and plans", "numbers", leaf, verb="hold")
     num = np.shape(plans.status)
     if num != cases.batch_shape:
-        raise ValueError(
-            f"plans must have the batch shape of the cases, {cases.batch_shape}, got {num}"
+        raise ArgumentError(
+            "plans", f"the batch shape of the cases, {cases.batch_shape}", num, verb="have"
         )
     alone = cases.batch_shape == ()
     if alone:
@@ -64,7 +66,7 @@ def require_settings(referee: Callable[..., Any], settings: dict[str, Any]) -> N
         if name not in known and hands_on:
             continue
         if name not in known:
-            raise TypeError(f"{name} must be a setting of the referee's, got {told(value)}")
+            raise ArgumentTypeError(name, "a setting of the referee's", value)
         usual = known[name].default
         if isinstance(usual, bool):
             require_switch(name, value)

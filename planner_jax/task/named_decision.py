@@ -3,6 +3,7 @@
 import pkgutil
 from collections.abc import Collection, Mapping
 
+from planner_jax.core.errors import ArgumentTypeError
 from planner_jax.core.protocol import Decision
 from planner_jax.core.registry import split_name
 
@@ -24,7 +25,7 @@ def named_decision(
     """
     if not isinstance(decide, str):
         if isinstance(decide, type) or not isinstance(decide, Decision):
-            raise TypeError(f"decide must be a name or a decision, got {decide!r:.60}")
+            raise ArgumentTypeError("decide", "a name or a decision", decide)
         return decide
     name, file = split_name(names, "decide", decide, from_file)
     return pkgutil.resolve_name(names[name])(*filter(None, [file]))

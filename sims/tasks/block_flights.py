@@ -15,6 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.plan_files import named_leaves
 from planner_jax.core.protocol import is_solved
 from planner_jax.referee.arm_clearance import clearances, links_of, shield_middle
@@ -167,7 +168,7 @@ def fly_blocks(
     require_arm(world, case)
     delay = np.asarray(case.delay, float)
     if allowed is not None and not 0.0 <= allowed <= delay.min() + 1e-6:
-        raise ValueError(f"allowed must be >= 0 and <= the delay {delay.min():g}, got {allowed:g}")
+        raise ArgumentError("allowed", f">= 0 and <= the delay {delay.min():g}", allowed)
     if decided is not None:
         plan = decided.plans
     if plan is None:
@@ -210,14 +211,14 @@ def fly_blocks(
 def require_arm(world: World, cases: BlockCase) -> None:
     """Raise `ValueError` unless the simulated arm is the one that is planned for."""
     if not isinstance(world.robot, ShieldArm):
-        raise ValueError(f"world must hold an arm, got a {type(world.robot).__name__}")
+        raise ArgumentError("world", "an arm", verb="hold", shown=f"a {type(world.robot).__name__}")
     own = jax.tree.leaves_with_path(world.robot.arm)
     for (path, value), planned in zip(own, jax.tree.leaves(cases.arm), strict=True):
         name = path[-1].name
         same = np.shape(planned)[1:] == np.shape(value)
         # Each case says itself where its arm begins.
         if name != "home" and not (same and np.allclose(planned, value, rtol=1e-5, atol=1e-6)):
-            raise ValueError(f"{name} must be the same in plan and simulated arm")
+            raise ArgumentError(name, "the same in plan and simulated arm", shown="")
 
 
 def referee_leaves(cases: BlockCase) -> dict[str, np.ndarray]:

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from planner_jax.ball.flight import BallState
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import Planner
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.robot.quadrotor_model import QuadrotorModel
@@ -99,9 +100,9 @@ def throws(
         robot: with a net.
     """
     if num_balls < 1:
-        raise ValueError(f"num_balls must be >= 1, got {num_balls}")
+        raise ArgumentError("num_balls", ">= 1", num_balls)
     if not 0.0 <= drag_error < 1.0:
-        raise ValueError(f"drag_error must be >= 0 and < 1, got {drag_error}")
+        raise ArgumentError("drag_error", ">= 0 and < 1", drag_error)
     suite = jax.tree.map(np.asarray, draw(num * num_balls, "throws", seed, robot=robot))
     shaped = lambda leaf: leaf[:, 0].reshape(num, num_balls, *leaf.shape[2:])  # noqa: E731
     first = lambda leaf: leaf[::num_balls]  # noqa: E731
@@ -192,7 +193,7 @@ def fly_catches(
             found: Any = plan
             require_plan(found, CatchPlan, known.head_state)
             if found.times.shape[-1] != num_balls:
-                raise ValueError(f"plan must be of {num_balls} balls, got {found.times.shape[-1]}")
+                raise ArgumentError("plan", f"of {num_balls} balls", found.times.shape[-1])
         else:
             known = jax.tree.map(np.asarray, known)
             began = time.perf_counter()

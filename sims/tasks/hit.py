@@ -13,6 +13,7 @@ from jax import Array
 
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.impact import racket_impact
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import Planner
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.problem import Round
@@ -168,7 +169,7 @@ def volleys(
         robot: with a racket.
     """
     if not 0.0 <= drag_error < 1.0:
-        raise ValueError(f"drag_error must be >= 0 and < 1, got {drag_error}")
+        raise ArgumentError("drag_error", ">= 0 and < 1", drag_error)
     cases = to_cases(generate_serves(num, seed, names), delay=SEEN, robot=robot)
     sign = np.random.default_rng([seed, 1]).choice([-1.0, 1.0], num)
     true = np.asarray(cases.drag)

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import is_solved
 from planner_jax.plane.obstacles import Obstacles
 from planner_jax.plane.polynomial_fit import fit_polynomial
@@ -431,9 +432,10 @@ def require_car(vehicle: Vehicle, cases: InterceptCase) -> None:
     for name in ("length", "width", "wheelbase", "rear_overhang"):
         own, planned = getattr(vehicle, name), np.asarray(getattr(cases.body, name))
         if not np.allclose(planned, own, rtol=1e-5):
-            raise ValueError(
-                f"{name} must be the same in plan and simulated car, got {planned.flat[0]:g} in "
-                f"the plan's case and {own:g} in the car"
+            raise ArgumentError(
+                name,
+                "the same in plan and simulated car",
+                shown=f"{planned.flat[0]:g} in the plan's case and {own:g} in the car",
             )
 
 

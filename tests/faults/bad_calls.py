@@ -104,23 +104,23 @@ def _cases() -> list[tuple[str, str]]:
     rows += _of(intercept, "time", "(5.0, 5.0)", words="target must have leaves that begin with")
     rows += _of(intercept, "start", "(1, 2)", "'x'", "None", "(nan, 0, 0)", "5")
     rows += _of(intercept, "initial_speed", "'x'", "None", "1j")
-    rows += _of(intercept, "initial_speed", "-1", "nan", words="speed must be")
-    rows += _of(intercept, "initial_curvature", "nan", words="curvature must be finite")
+    rows += _of(intercept, "initial_speed", "-1", "nan")
+    rows += _of(intercept, "initial_curvature", "nan")
     rows += _of(intercept, "tolerance", "0", "nan", "'x'")
     for name in ("walls", "movers"):
         wrong = ("None", "5", "'x'", "[5]", "[[(0, 0), (1, 1)]]", "['x']", "[[(0, 0), (1,)]]")
         wrong += ("[np.zeros((4, 2))]", "[np.full((3, 2), nan)]", "[SQUARE[[0, 2, 1, 3]]]")
-        rows += _of(intercept, name, *wrong, words=f"{name} must be polygons: ")
+        rows += _of(intercept, name, *wrong)
     rows += _of(intercept, "walls", "two_walls", words="walls.centre must have the shape")
     rows += _of(intercept, "mover_velocities", "'x'", "None", "(1, 2, 3)", "(nan, 0)")
     rows += _of(intercept, "lower", "(9, 9)", "(0, 0, 0)", "'x'", "None", "1.0")
     rows += _of(intercept, "upper", "(nan, 8)", "8.0")
-    rows += _of(intercept, "length", "0", words="body.length must be > 0")
-    rows += _of(intercept, "curvature", "0", words="limits.curvature must be > 0")
+    rows += _of(intercept, "length", "0")
+    rows += _of(intercept, "curvature", "0")
     rows += _of(intercept, "heading_tolerance", "'x'", "(1, 2)")
     rows += _of(intercept, "dtype", "int", "np.float64")
 
-    group = "pj.group.group(**{**dict(targets=turning(3)), **dict(@)})"
+    group = "pj.group.case(**{**dict(targets=turning(3)), **dict(@)})"
     rows += _of(group, "targets", "None", "5", "'x'", "pj.lane(turning(1), 0)")
     rows += _of(group, "targets", "ball_path(3)", words="target must give positions of the shape")
     rows += _of(group, "present", "(True,)", "'x'", "None", "(1, 0, 1)", "0.5")
@@ -129,7 +129,7 @@ def _cases() -> list[tuple[str, str]]:
     block = "pj.block.case(**{**BLOCK, **dict(@)})"
     for name in ("ball_pos", "ball_vel"):
         rows += _of(block, name, "'abc'", "None", "5.0", "(1, 2)", "(1j, 0, 1)", "[]")
-    rows += _of(block, "ball_pos", "(nan, 0, 1)", words="ball.pos must be finite")
+    rows += _of(block, "ball_pos", "(nan, 0, 1)")
     rows += _of(block, "delay", "-1", "nan", "'x'", "None", "1j")
     rows += _of(block, "regime", "'R9'", "None", "5", "['R1']")
     rows += _of(block, "wide", "'no'", "None", "5", "np.array([True, False])")
@@ -191,9 +191,9 @@ def _planners() -> list[tuple[str, str]]:
     rows += _of("pj.catch.planner(@)", "lift", "nan", "'x'")
     decide = ("'nobody'", "5", "None", "''", "'policy:'", "list", "['best']")
     rows += _of("pj.catch.planner(@)", "decide", *decide)
-    rows += [("pj.catch.planner(decide='best:file')", "decide best takes no file")]
+    rows += [("pj.catch.planner(decide='best:file')", "decide must be best without a file")]
     rows += [("pj.catch.planner(decide='policy:gone')", "checkpoint must be")]
-    rows += _of("pj.intercept.planner('group', @)", "decide", "'nobody'", "5", "None")
+    rows += _of("pj.group.planner(@)", "decide", "'nobody'", "5", "None")
     rows += _of("Best(@)", "finalists", "0", "-1", "1.5", "'6'", "None", "inf")
     rows += _of("Best(@)", "width", "0", "nan") + _of("Best(finalists=9, @)", "width", "8")
     spacetime = "pj.intercept.planner(@)"
@@ -470,7 +470,7 @@ def _readings() -> list[tuple[str, str]]:
     rows += _of(fly, "ball", "hits.ball", words="ball.pos must have the shape (3,), got (2, 3)")
     walls = "pj.obstacles(**{**dict(polygons=[SQUARE]), **dict(@)})"
     rows += _of(walls, "polygons", "None", "5", "'x'", words="polygons must be a sequence")
-    rows += _of(walls, "polygons", "[5]", "['x']", words="polygon 0 must have corners")
+    rows += _of(walls, "polygons", "[5]", "['x']", words="polygons must have corners")
     rows += _of(walls, "velocities", "'x'", "None", "(1, 2, 3)", "(nan, 0)", "np.zeros((2, 2))")
     rows += _of(walls, "room", "5", "(0, 0)", "(1,)", "'x'", "(1.5, 4)")
     rows += _of(walls, "dtype", "int", "'x'")

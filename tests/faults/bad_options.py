@@ -23,7 +23,7 @@ def _rows() -> list:
         for option in ("--num", "--batch", "--record"):
             rows += _of(f"fly {task}", option, ("0", "-1", "x", "1.5", "4_3", "٣", "1" + "0" * 15))
         rows += _of(f"sweep {task}", "--num", ("0", "-4"), "must be >= 1")
-        rows += _of(f"sweep {task}", "--num", ("1" + "0" * 15, "9" * 20), "must be at most")
+        rows += _of(f"sweep {task}", "--num", ("1" + "0" * 15,), "must be at most")
         rows += _of(f"sweep {task} --num 1000000", "--batch", ("1000000000",), "memory")
         rows += _of(f"sweep {task}", "--seed", ("-1", "9" * 20, str(2**63)), "must be")
         rows += _of(f"sweep {task}", "--planner", ("", ":", "nobody", "é", "exact:file"))

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+import typecheck
 from hypothesis.configuration import set_hypothesis_home_dir
 
 from tests.faults.runs import make_runs, quick_sweeps
@@ -17,3 +18,9 @@ def runs(tmp_path_factory):
     with quick_sweeps():
         make_runs(place)
         yield place
+
+
+@pytest.fixture
+def own_checks(monkeypatch):
+    """Have the library check malformed arguments itself, without the types that tests check."""
+    monkeypatch.setattr(typecheck, "is_on", False)

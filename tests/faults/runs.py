@@ -15,13 +15,13 @@ import pyarrow as pa
 import pytest
 
 import planner_jax as pj
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.plan_files import PlanFileError
 from planner_jax.planning.plan import plan
 from planner_jax.policies.progress import to_text
 from planner_jax.runs.dataset import Dataset
 from planner_jax.runs.manifest import to_write
 from planner_jax.runs.run_folder import RunFolder
-from planner_jax.runs.settings import SettingError
 from planner_jax.sims.recording import FLIGHTS, read_recording, to_rows
 from planner_jax.sims.settings import CatchFly
 from planner_jax.sweep.hit.settings import HitSettings
@@ -181,7 +181,7 @@ def _curves(place: Path, out: Path) -> str | None:
         patch.setattr(curves.style, "draw", lambda *data: drawn.append(data[-1]))
         try:
             curves.draw_curves([out], out / "curves.png")
-        except SettingError as error:
+        except ArgumentError as error:
             return REFUSED if "\n" not in str(error) else None
         curves.draw_curves([place / "training"], out / "curves.png")
     return IDENTICAL if drawn[0] == drawn[1] else None

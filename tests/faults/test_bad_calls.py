@@ -134,7 +134,7 @@ def test_the_list_is_long():
 
 
 @pytest.mark.parametrize(("call", "words"), ROWS, ids=[call for call, _ in ROWS])
-def test_it_is_refused_in_one_line(monkeypatch, given, call, words):
+def test_it_is_refused_in_one_line(monkeypatch, own_checks, given, call, words):
     folder, names = given
     monkeypatch.chdir(folder)
     with pytest.raises((TypeError, ValueError)) as caught:

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from planner_jax.core.errors import ArgumentError
 from planner_jax.runs.manifest import parse_object
 from planner_jax.runs.run_folder import RunFolder
-from planner_jax.runs.settings import SettingError
 from planner_jax.sweep.hit.sweep import HitSweep
 from planner_jax.sweep.run import resume_sweep
 from tests.faults.commands import is_one_line, run
@@ -85,7 +85,7 @@ def test_a_run_is_not_gone_on_with_by_other_versions_code_or_devices(runs, tmp_p
         ("files of planner-jax", "0" * 12, "files of planner-jax 000000000000, as it began, got"),
     ):
         rewritten(out, makers={**makers, what: value})
-        with pytest.raises(SettingError, match=told):
+        with pytest.raises(ArgumentError, match=told):
             resume_sweep(TASK, out, progress=False)
 
 
@@ -161,7 +161,7 @@ def test_what_is_no_plain_file_is_refused_without_waiting(
 
 def test_a_pipe_in_the_place_of_the_lock_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / ".lock")
-    with pytest.raises(SettingError, match="out must be a folder that can be written"):
+    with pytest.raises(ArgumentError, match="out must be a folder that can be written"):
         RunFolder(tmp_path).require_new()
 
 

@@ -11,9 +11,9 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
+from planner_jax.core.errors import ArgumentError
 from planner_jax.host import files as whole_files
 from planner_jax.runs.run_folder import LOCK, RunFolder
-from planner_jax.runs.settings import SettingError
 from planner_jax.sweep.run import resume_sweep, start_sweep
 from tests.faults.commands import is_one_line, run
 from tests.faults.runs import SETTINGS, TASK
@@ -126,7 +126,7 @@ def test_of_many_that_begin_at_once_one_owns_the_folder(tmp_path):
 
     def hold(number):
         barrier.wait()
-        with contextlib.suppress(SettingError), RunFolder(tmp_path).owned():
+        with contextlib.suppress(ArgumentError), RunFolder(tmp_path).owned():
             won.append(number)
             barrier.wait()
             return

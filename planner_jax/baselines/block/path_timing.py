@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from planner_jax.core.registry import MissingExtra, install_line
+from planner_jax.core.errors import MissingExtra
 
-INSTALL = f"rrt-connect and epase need {{name}}: {install_line('arm-peers')}"
 PIECES = 128  # of a timed motion, at most
 DEGREE = 6  # a cubic of a quadratic
 _INSIDE = np.array([0.0, 0.25, 0.5, 0.75, 1.0])  # shares of pieces, where limits are looked at
@@ -32,7 +31,7 @@ def required(name: str) -> ModuleType:
         package = name.partition(".")[0]
         if error.name != package:
             raise
-        raise MissingExtra(INSTALL.format(name=package), name=package) from None
+        raise MissingExtra("rrt-connect or epase", package, "arm-peers") from None
 
 
 def timed_way(

@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from planner_jax.core.registry import MissingExtra, install_line
+from planner_jax.core.errors import MissingExtra
 from planner_jax.plane.obstacles import Obstacles
 
 _DISCS = 3  # that cover the body
@@ -155,10 +155,7 @@ def _kernels() -> Any:
     except ModuleNotFoundError as error:
         if error.name != "numba":
             raise
-        raise MissingExtra(
-            f"Hybrid A* and the planner paper need numba: {install_line('baselines')}",
-            name="numba",
-        ) from None
+        raise MissingExtra("Hybrid A*, and so the planner paper,", "numba", "baselines") from None
 
 
 def _require(start, meeting, lower, upper, curvature, body, end_heading, settings) -> None:

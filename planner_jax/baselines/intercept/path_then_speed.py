@@ -16,7 +16,7 @@ from planner_jax.baselines.intercept.projection import Projection, station_time_
 from planner_jax.baselines.intercept.speed import SPEED_PLANNERS, SpeedPlanner, plan_speed
 from planner_jax.baselines.intercept.static_paths import PathSource, StaticPaths
 from planner_jax.baselines.intercept.station_time import StationTimeProblem, reference_line
-from planner_jax.core.checks import require_size
+from planner_jax.core.choices import require_size
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Status, is_solved, require_settings
 from planner_jax.task.intercept.case import InterceptCase

@@ -4,7 +4,8 @@ import dataclasses
 import math
 from typing import Any, ClassVar
 
-from planner_jax.runs.settings import SweepSettings, option, require, require_one_of
+from planner_jax.core.choices import require, require_one_of
+from planner_jax.runs.settings import SweepSettings, option
 
 REGIMES = ("R1", "R2", "R3")  # of `planner_jax.robot.arm`, which imports JAX
 
@@ -14,14 +15,14 @@ _FASTEST = 1000.0  # [Hz]
 
 
 def require_moderate(name: str, value: float | None, most: float = _LONGEST) -> None:
-    """Raise `SettingError` unless a value is None, or not negative and no absurd one."""
+    """Raise `ArgumentError` unless a value is None, or not negative and no absurd one."""
     if value is not None:
         require(0.0 <= value < math.inf, name, "finite and >= 0", value)
         require(value <= most, name, f"<= {most:g}", value)
 
 
 def require_frame_rate(value: float) -> None:
-    """Raise `SettingError` unless the argument `frame_rate` is that of a camera."""
+    """Raise `ArgumentError` unless the argument `frame_rate` is that of a camera."""
     require(0.0 < value < math.inf, "frame_rate", "finite and > 0", value)
     require(1.0 <= value <= _FASTEST, "frame_rate", f"from 1 to {_FASTEST:g}", value)
 

@@ -7,11 +7,10 @@ import numpy as np
 import pyarrow as pa
 
 from planner_jax.baselines.block.library.adapt import AdaptBlock
-from planner_jax.baselines.block.library.file import LibraryFileError
-from planner_jax.baselines.block.library.planner import LibraryBlock, OtherLibrary
+from planner_jax.baselines.block.library.planner import LibraryBlock
+from planner_jax.core.choices import require
 from planner_jax.robot.arm_plan import ArmPlan
 from planner_jax.runs.columns import Column, RefereedBatch
-from planner_jax.runs.settings import SettingError, require
 from planner_jax.runs.summary import COUNTED, Tally
 from planner_jax.sweep.block.columns import COLUMNS, FRAME, SEEN_COLUMNS, TIMED_COLUMNS
 from planner_jax.sweep.block.pipeline import CountedPlanner, SeeingArms, SeenPlan, TimedPlan
@@ -65,11 +64,8 @@ class BlockSweep(Sweep):
         return [*COLUMNS, *more]
 
     def planner(self, settings: BlockSettings) -> Any:
-        """The planner of a run; `SettingError` where its file is no library."""
-        try:
-            planner = super().planner(settings)
-        except LibraryFileError as error:
-            raise SettingError(str(error)) from None
+        """The planner of a run; `ArgumentError` where its file is no library."""
+        planner = super().planner(settings)
         if settings.perception:
             for name in ("refit", "wait"):
                 value = getattr(settings, name)
@@ -90,14 +86,11 @@ class BlockSweep(Sweep):
         return super().other_planners(settings)
 
     def require_fit(self, settings: BlockSettings, planner: Any, cases: Any) -> None:
-        """Raise `SettingError` unless the planner is one of such cases, and a library of these."""
+        """Raise `ArgumentError` unless the planner is one of such cases, and a library of these."""
         planner = getattr(planner, "planner", planner)
         super().require_fit(settings, planner, cases)
         if isinstance(planner, LibraryBlock | AdaptBlock):
-            try:
-                planner.check(cases)
-            except OtherLibrary as error:
-                raise SettingError(str(error)) from None
+            planner.check(cases)
 
     def plan(self, planner: Any, cases: Any) -> Any:
         """The plans of a batch; of arms that see or wait, what they do."""

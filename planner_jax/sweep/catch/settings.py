@@ -4,19 +4,15 @@ import dataclasses
 import math
 from typing import Any, ClassVar
 
-from planner_jax.core.efforts import EFFORTS
-from planner_jax.core.registry import UnknownName, split_name
+from planner_jax.core.choices import EFFORTS, require, require_one_of, require_scale
+from planner_jax.core.registry import split_name
 from planner_jax.runs.settings import (
-    SettingError,
     SweepSettings,
     ending_option,
     ending_options,
     option,
-    require,
     require_effort,
     require_ending,
-    require_one_of,
-    require_scale,
 )
 from planner_jax.sweep.robots import checked_robot, robot_option
 from planner_jax.task.catch.spec import DECISIONS, SUITES, TRAINED
@@ -61,10 +57,7 @@ class CatchSettings(SweepSettings):
         object.__setattr__(self, "robot", checked_robot(self.robot, "net"))
         require_effort(self.effort, self.planner, "mpp")
         require_ending(self.ending)
-        try:
-            split_name(DECISIONS, "decide", self.decide, TRAINED)
-        except UnknownName as error:
-            raise SettingError(str(error)) from None
+        split_name(DECISIONS, "decide", self.decide, TRAINED)
         require_one_of(NET_TESTS, "net_test", self.net_test)
         require(0.0 <= tolerance < math.inf, "tolerance", "finite and >= 0", tolerance)
 

@@ -3,8 +3,9 @@
 import dataclasses
 from typing import ClassVar
 
-from planner_jax.core.registry import UnknownName, split_name
-from planner_jax.runs.settings import SettingError, option, require
+from planner_jax.core.choices import require
+from planner_jax.core.registry import split_name
+from planner_jax.runs.settings import option
 from planner_jax.sweep.single_settings import SingleSettings
 from planner_jax.task.catch.spec import DECISIONS, TRAINED
 
@@ -43,10 +44,7 @@ class SingleCatchSettings(SingleSettings):
         num = len(self.ball)
         require(num <= _MOST_BALLS, "ball", f"given at most {_MOST_BALLS} times", num)
         require(self.drag is None or self.drag >= 0.0, "drag", ">= 0", self.drag)
-        try:
-            split_name(DECISIONS, "decide", self.decide, TRAINED)
-        except UnknownName as error:
-            raise SettingError(str(error)) from None
+        split_name(DECISIONS, "decide", self.decide, TRAINED)
 
     @property
     def balls(self) -> list[tuple[tuple[float, ...], tuple[float, ...]]]:

@@ -5,18 +5,15 @@ import math
 import os
 from typing import Any, ClassVar
 
-from planner_jax.core.digits import written_number
-from planner_jax.core.efforts import EFFORTS
+from planner_jax.core.choices import EFFORTS, require, require_scale
+from planner_jax.core.errors import ArgumentError
 from planner_jax.runs.settings import (
-    SettingError,
     SweepSettings,
     ending_option,
     ending_options,
     option,
-    require,
     require_effort,
     require_ending,
-    require_scale,
 )
 from planner_jax.sweep.robots import checked_robot, robot_option
 from planner_jax.task.hit.spec import START
@@ -79,9 +76,9 @@ def _checked_start(start: Any) -> tuple[float, ...] | str:
     if start in ("uniform", ["uniform"]):
         return "uniform"
     try:
-        point = tuple(written_number(str(each)) for each in start)
+        point = tuple(float(each) for each in start)
     except (TypeError, ValueError):
-        raise SettingError(f"start must be {rule}, got {start!r}") from None
+        raise ArgumentError("start", rule, start) from None
     sound = len(point) == 3 and all(abs(x) <= _FARTHEST for x in point) and point[2] > 0.0
-    require(sound, "start", rule, " ".join(f"{each:g}" for each in point))
+    require(sound, "start", rule, start, shown=" ".join(f"{each:g}" for each in point))
     return point

@@ -7,13 +7,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from planner_jax.core.rules import CaseError
-from planner_jax.runs.settings import SettingError, require_one_of
+from planner_jax.core.choices import require_one_of
+from planner_jax.core.errors import ArgumentError, CaseError
 from planner_jax.runs.source import Chunk, Source, filled_in
 from planner_jax.sweep.hit.settings import HitSettings
 from planner_jax.task.hit.spec import REAL_SCENARIOS, TASK
 from planner_jax.task.hit.suites import Serves, generate_serves, read_serves, to_cases
-from planner_jax.task.hit.validate import ServeError, check_cases
+from planner_jax.task.hit.validate import check_cases
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,10 +33,8 @@ class ServeSource(Source):
         try:
             cases = to_cases(serves, seed=settings.seed, **settings.draw_options())
             check_cases(cases)
-        except ServeError as error:
-            raise SettingError(str(error)) from error
         except CaseError as error:
-            raise SettingError(f"serves must make sound cases: {error}") from error
+            raise ArgumentError("serves", f"sound cases: {error}", verb="make", shown="") from error
         return Chunk(serves.index, jax.tree.map(np.asarray, cases), serves)
 
     def check(self) -> Any:
@@ -62,16 +60,13 @@ def open_source(settings: HitSettings, batch: int) -> ServeSource:
     """As `Sweep.open_source`; a folder is read and checked whole.
 
     Raises:
-        SettingError: the suite is of another package, the folder is missing, a row is not sound,
+        ArgumentError: the suite is of another package, the folder is missing, a row is not sound,
             or too few serves are in it.
     """
     require_one_of(TASK.suites, "suite", str(settings.suite))  # others know no serves
-    try:
-        folder = None if settings.serves is None else read_serves(settings.serves)
-    except ServeError as error:
-        raise SettingError(str(error)) from error
+    folder = None if settings.serves is None else read_serves(settings.serves)
     if folder is not None and (settings.num or 0) > len(folder):
-        rule = f"num must be <= {len(folder)}, the serves that the folder holds"
-        raise SettingError(f"{rule}, got {settings.num}")
+        rule = f"<= {len(folder)}, the serves that the folder holds"
+        raise ArgumentError("num", rule, settings.num)
     fields = filled_in(settings, settings.DEFAULT_NUM if folder is None else len(folder), batch)
     return ServeSource(**fields, folder=folder)

@@ -3,7 +3,8 @@
 import dataclasses
 from typing import ClassVar
 
-from planner_jax.runs.settings import SweepSettings, option, require_one_of
+from planner_jax.core.choices import require_one_of
+from planner_jax.runs.settings import SweepSettings, option
 from planner_jax.task.group.spec import DECISIONS
 
 

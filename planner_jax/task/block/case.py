@@ -133,5 +133,5 @@ def case(
         tilt=leaf("tilt", tilt),
         scene=shared(scene),
     )
-    require_sound(made)
+    require_sound(made, {"ball.pos": "ball_pos", "ball.vel": "ball_vel"})
     return made

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from planner_jax.core.efforts import with_effort
+from planner_jax.core.choices import with_effort
 from planner_jax.core.protocol import Decision
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.recovery.with_recovery import EndedPlanner, ended

@@ -8,6 +8,7 @@ import numpy as np
 from flax import struct
 from jax import Array, lax
 
+from planner_jax.core.errors import ArgumentError
 from planner_jax.task.catch.case import CatchCase, CatchChoice
 from planner_jax.task.catch.estimate import (
     INSTANT,
@@ -51,7 +52,7 @@ def beam(case: CatchCase, table: Timetable, width: int) -> CatchChoice:
     """
     num, speed = case.num_targets, top_speed(case)
     if num > MOST_SEARCHED:
-        raise ValueError(f"targets must be at most {MOST_SEARCHED} of a case, got {num}")
+        raise ArgumentError("targets", f"at most {MOST_SEARCHED} of a case", num)
     from_all = jax.vmap(arrivals, (None, 0, 0, None))
     # Which targets are taken, in words of so many bits that 32 hold one and the last target, too.
     words = np.arange(0, num, _WORD)

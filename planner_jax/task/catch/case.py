@@ -10,14 +10,8 @@ from flax import struct
 from jax import Array
 
 from planner_jax.ball.target import TargetPath
-from planner_jax.core.checks import (
-    floating,
-    numbers_of,
-    require_path,
-    require_switch,
-    shape_of,
-    told,
-)
+from planner_jax.core.checks import floating, numbers_of, require_path, require_switch, shape_of
+from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.rules import Table, require_sound
 from planner_jax.cost.extras import Extra, for_batch
 from planner_jax.robot.quadrotor import QuadrotorLimits
@@ -147,7 +141,7 @@ def case(
     dtype, shape = floating(dtype), shape_of("horizon", horizon)
     if not shape or not shape[-1]:
         found = "none" if shape else "one number"
-        raise ValueError(f"horizon must have an entry for each target, got {found}")
+        raise ArgumentError("horizon", "an entry for each target", verb="have", shown=found)
     require_switch("optional", optional)
     batch, num = shape[:-1], shape[-1]
 
@@ -193,7 +187,7 @@ def _present(given: Any, shape: tuple[int, ...]) -> Array:
     """Which targets there are, of the shape (..., N) of the horizon."""
     found = np.asarray(given)
     if found.dtype != np.bool_:
-        raise TypeError(f"present must be True or False of each target, got {told(given)}")
+        raise ArgumentTypeError("present", "True or False of each target", given)
     if found.shape not in ((), shape[-1:], shape):
-        raise ValueError(f"present must have the shape {shape}, got {found.shape}")
+        raise ArgumentError("present", f"the shape {shape}", found.shape, verb="have")
     return jnp.asarray(np.broadcast_to(found, shape), bool)

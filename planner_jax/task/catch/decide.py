@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import Status, is_unsolved, require_settings
 from planner_jax.task.catch.beam import beam
 from planner_jax.task.catch.case import CatchCase, CatchChoice
@@ -126,7 +127,7 @@ class Best(CatchDecision):
     def __post_init__(self) -> None:
         require_settings(self)
         if self.width < self.finalists:
-            raise ValueError(f"width must be >= {self.finalists} finalists, got {self.width}")
+            raise ArgumentError("width", f">= {self.finalists} finalists", self.width)
 
     def propose(self, case: CatchCase) -> CatchChoice:
         """The finalists of one case, leaves (F, N)."""
@@ -179,9 +180,10 @@ class Given(CatchDecision):
         order = np.asarray(cases.order)
         wrong = np.flatnonzero((np.sort(order, axis=-1) != np.arange(order.shape[-1])).any(axis=-1))
         if wrong.size:
-            raise ValueError(
-                f"order must be a permutation of 0..{order.shape[-1] - 1}, "
-                f"got {order[wrong[0]].tolist()} in case {wrong[0]}"
+            raise ArgumentError(
+                "order",
+                f"a permutation of 0..{order.shape[-1] - 1}",
+                shown=f"{order[wrong[0]].tolist()} in case {wrong[0]}",
             )
 
     def propose(self, case: CatchCase) -> CatchChoice:

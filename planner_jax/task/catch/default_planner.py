@@ -15,6 +15,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import FEASIBILITY_TOLERANCE, require_settings
 from planner_jax.cost.along import Along, integrate_along
 from planner_jax.cost.penalty import smoothed_hinge
@@ -172,16 +173,14 @@ class ExactCatch(OptimisedPlanner):
     def __post_init__(self) -> None:
         require_settings(self)
         if len(self.proportions) < 2 or not all(0.0 < x < np.inf for x in self.proportions):
-            raise ValueError(
-                f"proportions must be of >= 2 pieces, finite and > 0, got {self.proportions}"
-            )
+            raise ArgumentError("proportions", "of >= 2 pieces, finite and > 0", self.proportions)
         if not self.scale:
             object.__setattr__(
                 self, "scale", shipped_scale(__package__, f"exact-{self.num_pieces}")
             )
         if len(self.scale) != self.num_offsets + 12:
             rule = f"of {self.num_offsets + 12} numbers"
-            raise ValueError(f"scale must be {rule}, got {len(self.scale)}")
+            raise ArgumentError("scale", rule, len(self.scale))
 
     @property
     def num_offsets(self) -> int:
@@ -214,7 +213,7 @@ class ExactCatch(OptimisedPlanner):
     def guesses(self, context: CatchContext, num: int) -> Array:
         """Smooth trajectories that face the balls, at and after the guessed times, (num, n)."""
         if num > len(_GUESSES):
-            raise ValueError(f"starts must be <= {len(_GUESSES)}, got {num}")
+            raise ArgumentError("starts", f"<= {len(_GUESSES)}", num)
         rows = _GUESSES[:num].copy()
         rows[0, 3] = self.lift
         rows = jnp.asarray(rows, context.times.dtype)

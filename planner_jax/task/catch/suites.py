@@ -79,8 +79,9 @@ from jax import Array
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath, HarmonicPath
 from planner_jax.core.checks import floating, require_scalar
+from planner_jax.core.choices import require_scale
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.registry import suite_named
-from planner_jax.core.scales import scale_problem
 from planner_jax.robot.quadrotor_model import QuadrotorModel
 from planner_jax.robot.quadrotor_models import PAPER_CATCHER
 from planner_jax.task.arguments import require_draw
@@ -149,15 +150,14 @@ def draw(
     require_draw(num, seed, first)
     dtype = floating(dtype)
     require_scalar("limit_scale", limit_scale)
-    if problem := scale_problem(limit_scale):
-        raise ValueError(problem)
+    require_scale(limit_scale)
     if suite not in SUITES:
         require_own_robot(robot, PAPER_CATCHER, suite)
         return TASK.other_suite(suite)(num, seed, first)
     own = SUITES[suite].num_targets
     size = own if num_targets is None else num_targets
     if size < own:
-        raise ValueError(f"num_targets must be >= {own} for suite {suite!r}, got {size}")
+        raise ArgumentError("num_targets", f">= {own} for suite {suite!r}", size)
     random = np.random.default_rng([seed, zlib.crc32(suite.encode())])
     # One row a case: what stands in front is passed over.
     columns = _columns(suite)
@@ -278,7 +278,7 @@ def earliest_throw(name: str) -> tuple[BallState, float]:
         ValueError: no such suite.
     """
     if name not in _THROWS or len(_THROWS[name]) > 1:
-        raise ValueError(f"suite must be one of single throws, got {name!r}")
+        raise ArgumentError("suite", "one of single throws", name)
     middle_and_shortest = np.array([[0.5, 0.5, 0.0]])
     pos, vel, horizon = _throw(middle_and_shortest, _THROWS[name][0])
     pos, vel = (leaf[0].astype(np.float32) for leaf in (pos, vel))

@@ -12,7 +12,8 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.core.checks import require_path, told
+from planner_jax.core.checks import require_path
+from planner_jax.core.errors import ArgumentError, format_value
 from planner_jax.core.rules import Table
 from planner_jax.plane.target import LaterPath, PlanePath
 from planner_jax.task.group.rules import RULES
@@ -110,8 +111,8 @@ def case(
     shapes = [np.shape(time), np.shape(settings.get("start", 0.0))[:-1], *map(np.shape, given)]
     axis, leaves = len(max(shapes, key=len)), jax.tree.leaves(targets)
     if not leaves or any(np.ndim(leaf) <= axis for leaf in leaves):
-        raise ValueError(
-            f"targets must be paths with {axis + 1} axes in front, got {told(targets)}"
+        raise ArgumentError(
+            "targets", f"paths with {axis + 1} axes in front", format_value(targets)
         )
     one = jax.tree.map(lambda leaf: np.asarray(leaf).take(0, axis), targets)
     shared = single_case(one, time, **settings)
@@ -119,7 +120,7 @@ def case(
     require_path("targets", targets, (*batch, num), 2)
     there = np.asarray(present)
     if there.dtype != np.bool_ or there.shape not in ((), (num,), (*batch, num)):
-        raise ValueError(f"present must be True or False of {num} targets, got {told(present)}")
+        raise ArgumentError("present", f"True or False of {num} targets", format_value(present))
     return InterceptGroup(
         shared=dataclasses.replace(shared, target=targets),
         present=jnp.asarray(np.broadcast_to(there, (*batch, num))),

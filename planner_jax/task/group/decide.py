@@ -14,6 +14,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import require_settings
 from planner_jax.task.group.case import GroupChoice, InterceptGroup
 from planner_jax.task.group.plan import GroupPlan
@@ -128,7 +129,7 @@ class Best(GroupDecision):
         num = case.num_targets
         if num > MOST_PERMUTED:
             rule = f"at most {MOST_PERMUTED}, of which all orders are looked at"
-            raise ValueError(f"targets must be {rule}, got {num}")
+            raise ArgumentError("targets", rule, num)
         orders = jnp.asarray(list(itertools.permutations(range(num))), jnp.int32)
         table = _timetable(case)
         rank = jax.vmap(functools.partial(_rank, case, table))(orders)
@@ -177,9 +178,10 @@ class Given(GroupDecision):
         order = np.asarray(cases.order).reshape(-1, cases.num_targets)
         wrong = np.flatnonzero((np.sort(order, axis=1) != np.arange(order.shape[1])).any(axis=1))
         if wrong.size:
-            raise ValueError(
-                f"order must be a permutation of 0..{order.shape[1] - 1}, "
-                f"got {order[wrong[0]].tolist()} in case {wrong[0]}"
+            raise ArgumentError(
+                "order",
+                f"a permutation of 0..{order.shape[1] - 1}",
+                shown=f"{order[wrong[0]].tolist()} in case {wrong[0]}",
             )
 
     def propose(self, case: InterceptGroup) -> GroupChoice:

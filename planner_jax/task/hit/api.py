@@ -5,7 +5,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from planner_jax.core.efforts import with_effort
+from planner_jax.core.choices import with_effort
 from planner_jax.core.planner import Planner
 from planner_jax.core.registry import suite_named
 from planner_jax.recovery.with_recovery import ended

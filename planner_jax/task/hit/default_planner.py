@@ -21,7 +21,8 @@ from planner_jax.ball.flight import (
 )
 from planner_jax.ball.impact import required_impact
 from planner_jax.ball.prediction import LEAST_NODES, target_at
-from planner_jax.core.checks import require_size
+from planner_jax.core.choices import require_size
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import require_settings
 from planner_jax.cost.along import Along, integrate_along
 from planner_jax.cost.contact import apex_excess, hitting_speed_excess
@@ -202,16 +203,14 @@ class ExactHit(OptimisedPlanner):
         require_settings(self)
         require_size("num_table_nodes", self.num_table_nodes, LEAST_NODES)
         if len(self.proportions) < 2 or not all(0.0 < x < np.inf for x in self.proportions):
-            raise ValueError(
-                f"proportions must be of >= 2 pieces, finite and > 0, got {self.proportions}"
-            )
+            raise ArgumentError("proportions", "of >= 2 pieces, finite and > 0", self.proportions)
         if not self.scale:
             object.__setattr__(self, "scale", shipped_scale(__package__, self._name))
         if self.velocities and len(self.scale) == self._num_places + 8:
             object.__setattr__(self, "scale", self._with_velocities(self.scale))
         if len(self.scale) != self.num_offsets + 8:
             rule = f"of {self.num_offsets + 8} numbers"
-            raise ValueError(f"scale must be {rule}, got {len(self.scale)}")
+            raise ArgumentError("scale", rule, len(self.scale))
 
     @property
     def num_pieces(self) -> int:
@@ -264,7 +263,7 @@ class ExactHit(OptimisedPlanner):
     def guesses(self, context: HitContext, num: int) -> Array:
         """Smooth trajectories to a few impact times, flight times and thrusts, (num, n)."""
         if num > len(_GUESSES):
-            raise ValueError(f"starts must be <= {len(_GUESSES)}, got {num}")
+            raise ArgumentError("starts", f"<= {len(_GUESSES)}", num)
         fraction, flight_time, thrust = jnp.asarray(_GUESSES[:num], context.landing_time.dtype).T
         times = jnp.stack(
             [

@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.interpolate import RectBivariateSpline
 
-from planner_jax.core.checks import numeric, require_scalar, told
-from planner_jax.core.scales import scale_problem
+from planner_jax.core.checks import numeric, require_scalar
+from planner_jax.core.choices import require_scale
+from planner_jax.core.errors import ArgumentError
 from planner_jax.robot.quadrotor_model import QuadrotorModel
 from planner_jax.robot.quadrotor_models import PAPER_HITTER
 from planner_jax.task.arguments import require_draw
@@ -20,7 +21,7 @@ from planner_jax.task.hit import court
 from planner_jax.task.hit.case import DRAG, GRAVITY, HitCase, case
 from planner_jax.task.hit.spec import START
 from planner_jax.task.hit.trial_files import read_trials
-from planner_jax.task.hit.validate import ServeError, fly, landing
+from planner_jax.task.hit.validate import fly, landing
 
 # The law of the published serves, fitted to them. Position and velocity are uniform, and those
 # serves are kept that meet the following and land in the region asked for.
@@ -78,9 +79,9 @@ def read_serves(folder: str | os.PathLike) -> Serves:
         fair sample of the court. `published` has NaN for the files that are missing.
 
     Raises:
-        ServeError: the folder is missing or holds no such file; or any row does not parse, is not
-            finite, does not land in the hitting half, or differs between the files of a scenario.
-            `problems` has all of these rows.
+        ArgumentError: the folder is missing or holds no such file; or any row does not parse, is
+            not finite, does not land in the hitting half, or differs between the files of a
+            scenario; `value` has all of these rows.
     """
     trials = read_trials(folder)
     numbers = np.array([trial.numbers for trial in trials])
@@ -117,17 +118,14 @@ def generate_serves(
         first: place of the first one in the sequence, >= 0.
 
     Raises:
-        ServeError: an argument is out of its range.
+        ArgumentError: an argument is out of its range.
     """
     names = court.SCENARIOS if scenarios is None else tuple(scenarios)
-    try:
-        require_draw(num, seed, first)
-    except ValueError as error:
-        raise ServeError(str(error)) from None
+    require_draw(num, seed, first)
     unknown = [name for name in names if name not in court.SCENARIOS]
     if unknown or not names:
         rule = f"names out of {' '.join(court.SCENARIOS)}"
-        raise ServeError(f"scenarios must be {rule}, got {unknown[0] if unknown else 'none'}")
+        raise ArgumentError("scenarios", rule, shown=repr(unknown[0]) if unknown else "none")
     places = np.array([court.SCENARIOS.index(name) for name in names])
     size = _ROUNDS * len(places)
     begin = first // size
@@ -239,17 +237,15 @@ def advance(serves: Serves, delay: float) -> Serves:
     """The same serves `delay` seconds later, flown with drag.
 
     Raises:
-        ServeError: the delay is negative or not finite, or a ball is down by then.
+        ArgumentError: the delay is negative or not finite, or a ball is down by then.
     """
     if not 0.0 <= delay < math.inf:
-        raise ServeError(f"delay must be finite and >= 0, got {delay:g}")
+        raise ArgumentError("delay", "finite and >= 0", delay)
     time, _ = landing(serves.position, serves.velocity, DRAG, GRAVITY)
     if (down := time <= delay).any():
         first = int(np.argmax(down))
-        raise ServeError(
-            f"delay must be shorter than each serve's flight, {time[first]:.3f} s for serve "
-            f"{serves.index[first]}, got {delay:g}"
-        )
+        flight = f"{time[first]:.3f} s for serve {serves.index[first]}"
+        raise ArgumentError("delay", f"shorter than each serve's flight, {flight}", delay)
     position, velocity = fly(
         serves.position, serves.velocity, np.full(len(serves), delay), DRAG, GRAVITY
     )
@@ -295,22 +291,21 @@ def to_cases(
         dtype: of every leaf.
 
     Raises:
-        ServeError: an argument is out of its range.
+        ArgumentError: an argument is out of its range.
     """
     require_scalar("limit_scale", limit_scale)
     require_scalar("delay", delay)
-    if problem := scale_problem(limit_scale):
-        raise ServeError(problem)
+    require_scale(limit_scale)
     if isinstance(start, str):
         if start != "uniform":
-            raise ServeError(f"start must be three numbers or 'uniform', got {start!r}")
+            raise ArgumentError("start", "three numbers or 'uniform'", start)
         if seed < 0:
-            raise ServeError(f"seed must be >= 0, got {seed}")
+            raise ArgumentError("seed", ">= 0", seed)
         head = uniform_starts(serves.index, seed)
     else:
         head = numeric(start)
         if head is None or head.shape != (3,) or not np.isfinite(head).all():
-            raise ServeError(f"start must be three finite numbers or 'uniform', got {told(start)}")
+            raise ArgumentError("start", "three finite numbers or 'uniform'", start)
     late = advance(serves, delay) if delay != 0.0 else serves
     cases = case(
         late.position,

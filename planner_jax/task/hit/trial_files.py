@@ -8,11 +8,11 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from planner_jax.core.digits import written_number
+from planner_jax.core.errors import ArgumentError
 from planner_jax.host.files import open_plain
 from planner_jax.task.hit import court
 from planner_jax.task.hit.case import DRAG, GRAVITY
-from planner_jax.task.hit.validate import ServeError, landing
+from planner_jax.task.hit.validate import landing
 
 _FILE_NAME = re.compile(r"([1-4])_([1-4])_([1-4])_([plb])\.csv")
 _FILE_PLANNER = {"p": "bat", "l": "bat-lite", "b": "juggle"}
@@ -38,7 +38,7 @@ def read_trials(folder: str | os.PathLike) -> list[Trial]:
     """Every serve of a folder of trial files  S_L_T_M.csv, line by line of all scenarios.
 
     Raises:
-        ServeError: as `planner_jax.task.hit.suites.read_serves` says.
+        ArgumentError: as `planner_jax.task.hit.suites.read_serves` says.
     """
     problems: list[str] = []
     trials: list[Trial] = []
@@ -51,7 +51,8 @@ def read_trials(folder: str | os.PathLike) -> list[Trial]:
     if problems:
         listed = "; ".join(problems[:_LISTED])
         rest = f"; and {len(problems) - _LISTED} more" if len(problems) > _LISTED else ""
-        raise ServeError(f"serves in {str(folder)!r} must be sound: {listed}{rest}", problems)
+        rule = f"sound, not as in {str(folder)!r}: {listed}{rest}"
+        raise ArgumentError("serves", rule, tuple(problems), shown="")
     return trials
 
 
@@ -59,20 +60,22 @@ def _trial_files(folder) -> dict[int, dict[str, Path]]:
     """Paths of the trial files of a folder, by place of the scenario and letter of the planner."""
     folder = Path(folder)
     if not folder.is_dir():
-        raise ServeError(f"serves must be an existing folder, got {str(folder)!r}")
+        raise ArgumentError("serves", "an existing folder", str(folder))
     files: dict[int, dict[str, Path]] = {}
     for path in sorted(folder.iterdir()):
         if match := _FILE_NAME.fullmatch(path.name):
             name = "".join(court.REGIONS[int(code) - 1] for code in match.groups()[:3])
             if name not in court.SCENARIOS:
-                raise ServeError(
-                    f"serves must name one of the court's {len(court.SCENARIOS)} scenarios, "
-                    f"got {path.name} ({name}, the mirror image of another)"
+                raise ArgumentError(
+                    "serves",
+                    f"one of the court's {len(court.SCENARIOS)} scenarios",
+                    verb="name",
+                    shown=f"{path.name} ({name}, the mirror image of another)",
                 )
             files.setdefault(court.SCENARIOS.index(name), {})[match[4]] = path
     if not files:
-        raise ServeError(
-            f"serves must be a folder of S_L_T_M.csv files, got none in {str(folder)!r}"
+        raise ArgumentError(
+            "serves", "a folder of S_L_T_M.csv files", shown=f"none in {str(folder)!r}"
         )
     return files
 
@@ -103,7 +106,7 @@ def _parse(line: str) -> tuple[list[float], bool]:
     """Twelve numbers of the serve, and whether the planner solved it, from one line."""
     cells = [cell.strip() for cell in line.split(",")]
     if len(cells) != 8:
-        raise ValueError(f"row must have 8 columns between commas, got {len(cells)}")
+        raise ArgumentError("row", "8 columns between commas", len(cells), verb="have")
     numbers = []
     for name, cell in zip(_SERVE_COLUMNS, cells[1:5], strict=True):
         numbers += _vector(name, cell, 3)
@@ -117,11 +120,11 @@ def _parse(line: str) -> tuple[list[float], bool]:
 def _vector(name: str, cell: str, size: int) -> list[float]:
     """The finite numbers of one blank-separated cell."""
     try:
-        vector = [written_number(word) for word in cell.split()]
+        vector = [float(word) for word in cell.split()]
     except ValueError:
         vector = []
     if len(vector) != size or not all(map(math.isfinite, vector)):
-        raise ValueError(f"{name} must be {size} finite numbers, got {cell!r}")
+        raise ArgumentError(name, f"{size} finite numbers", cell)
     return vector
 
 

@@ -4,7 +4,6 @@ Everything here is float64 NumPy over whole batches, so that a bad value is foun
 before a program is compiled for it.
 """
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -14,18 +13,6 @@ from planner_jax.task.hit.case import HitCase
 
 _FLIGHT_STEPS = 16  # puts the landing point of a serve within 0.1 mm
 _NEWTON_STEPS = 5
-
-
-class ServeError(ValueError):
-    """Serves cannot be read, drawn or moved on; one line with the argument, rule and value.
-
-    Attributes:
-        problems: every bad row of a folder as "file:line: rule, value"; empty otherwise.
-    """
-
-    def __init__(self, message: str, problems: Sequence[str] = ()):
-        super().__init__(message)
-        self.problems = tuple(problems)
 
 
 # Inside, the axis of the components comes first: NumPy is quick along the last one.

@@ -10,12 +10,25 @@ from flax import struct
 from jax import Array
 
 from planner_jax.core.checks import floating, require_path, shape_of
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.rules import Table, require_sound
 from planner_jax.plane.obstacles import Obstacles, obstacles
 from planner_jax.plane.target import PlanePath
 from planner_jax.robot.car import CarBody, CarLimits
 from planner_jax.task.arguments import array_of, batch_of
 from planner_jax.task.intercept.rules import RULES
+
+# Arguments of `case` by the fields that they become, for messages.
+_ARGUMENTS = {
+    "speed": "initial_speed",
+    "curvature": "initial_curvature",
+    **{f"body.{name}": name for name in ("length", "width", "wheelbase", "rear_overhang")},
+    "limits.speed": "speed",
+    "limits.acceleration": "acceleration",
+    "limits.lateral_acceleration": "lateral_acceleration",
+    "limits.curvature": "curvature",
+    "limits.steering_rate": "steering_rate",
+}
 
 
 @struct.dataclass
@@ -151,7 +164,7 @@ def case(
             steering_rate=leaf("steering_rate", steering_rate),
         ),
     )
-    require_sound(made)
+    require_sound(made, _ARGUMENTS)
     return made
 
 
@@ -168,8 +181,7 @@ def _for_batch(
         return given
     try:
         one = obstacles(given, velocities, dtype=dtype)
-    except (TypeError, ValueError) as error:
-        of_speed = str(error).startswith("velocities")
-        begins = f"{name.removesuffix('s')}_" if of_speed else f"{name} must be polygons: "
-        raise type(error)(f"{begins}{error}") from None
+    except ArgumentError as error:
+        names = {"polygons": name, "velocities": "mover_velocities"}
+        raise error.renamed(names) from None
     return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, batch + leaf.shape), one)

@@ -5,6 +5,8 @@ Nothing here needs JAX or MuJoCo, so that settings can be checked before either 
 
 import dataclasses
 
+from planner_jax.core.errors import ArgumentError
+
 # [N m] of the joints of an IRB 1600-6/1.2, an assumption: its maker publishes no torques. Plans
 # with the greatest accelerations of the regimes, 60 rad/s^2, need hardly more of joints 1 to 3.
 # The wrist never needs so much: the model gives neither rotors nor the shield a mass.
@@ -28,13 +30,13 @@ class Drives:
 
     def __post_init__(self) -> None:
         if len(self.torques) != 6 or not all(torque > 0.0 for torque in self.torques):
-            raise ValueError(f"torques must be six numbers > 0, got {self.torques}")
+            raise ArgumentError("torques", "six numbers > 0", self.torques)
         for name in ("lag", "latency", "angle_std", "rate_std"):
             value = getattr(self, name)
             if not value >= 0.0:
-                raise ValueError(f"{name} must be >= 0, got {value}")
+                raise ArgumentError(name, ">= 0", value)
         if not self.mass_error > -1.0:
-            raise ValueError(f"mass_error must be > -1, got {self.mass_error}")
+            raise ArgumentError("mass_error", "> -1", self.mass_error)
 
 
 IDEAL = Drives()  # but for the limits of its torques

@@ -7,6 +7,8 @@ control works with.
 
 import dataclasses
 
+from planner_jax.core.errors import ArgumentError
+
 GRAVITY = 9.81  # [m/s^2]
 
 
@@ -24,7 +26,7 @@ class Tyres:
         for name in ("stiffness", "friction"):
             value = getattr(self, name)
             if not value > 0.0:
-                raise ValueError(f"{name} must be > 0, got {value}")
+                raise ArgumentError(name, "> 0", value)
 
 
 @dataclasses.dataclass(frozen=True)

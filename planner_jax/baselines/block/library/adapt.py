@@ -20,9 +20,10 @@ from jax import Array, lax
 
 from planner_jax.ball.flight import drag_free_flight
 from planner_jax.baselines.block.library.cells import cells_around
-from planner_jax.baselines.block.library.file import LibraryFileError, load_library
+from planner_jax.baselines.block.library.file import load_library
 from planner_jax.baselines.block.library.planner import LibraryBlock
 from planner_jax.baselines.block.library.table import pieces_of, unpacked
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt, Status
 from planner_jax.core.select import first_solved
@@ -96,7 +97,7 @@ class AdaptBlock(Planner):
         return self.efforts
 
     def check(self, cases: BlockCase) -> None:
-        """Raise `OtherLibrary` unless the first of the cases is what the library was built for."""
+        """Raise `ArgumentError` unless the first of the cases is what the library was built for."""
         self.stored.check(cases)
 
     def solve(self, case: BlockCase, attempt: Effort) -> BlockPlan:
@@ -208,13 +209,16 @@ def adapt_planner(file: str | os.PathLike) -> AdaptBlock:
     The table is read, and kept on the default device.
 
     Raises:
-        LibraryFileError: the file is no whole library, or one of motions with another number of
+        ArgumentError: the file is no whole library, or one of motions with another number of
             pieces than the planner's; one line.
     """
     library, own = load_library(file), OnlineBlock().pieces
     if (pieces := pieces_of(library.table.rows)) != own:
-        raise LibraryFileError(
-            f"library must have motions of {own} pieces, got {pieces} in {os.fspath(file)!r}"
+        raise ArgumentError(
+            "library",
+            f"motions of {own} pieces",
+            verb="have",
+            shown=f"{pieces} in {os.fspath(file)!r}",
         )
     rows = jnp.asarray(np.asarray(library.table.rows))
     table = dataclasses.replace(library.table, rows=rows)

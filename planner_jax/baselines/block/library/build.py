@@ -29,6 +29,7 @@ from planner_jax.baselines.block.library.table import (
     pieces_of,
     unpacked,
 )
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import solved
 from planner_jax.host.files import replacing
 from planner_jax.planning.plan import plan
@@ -170,7 +171,9 @@ def _require_free(setting: Setting, homes: Any) -> None:
     for k, home in enumerate(np.asarray(homes)):
         near = float(_nearest(setting, home[None, None])[0])
         if not near > 0.0:
-            raise ValueError(f"homes must be free, got {near:.3g} m to what is nearest at home {k}")
+            raise ArgumentError(
+                "homes", "free", shown=f"{near:.3g} m to what is nearest at home {k}"
+            )
 
 
 def plan_pairs(

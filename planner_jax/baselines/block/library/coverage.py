@@ -12,6 +12,7 @@ from planner_jax.ball.flight import BallState, drag_free_flight
 from planner_jax.baselines.block.library.cells import GRAVITY, Tunnels, farthest_crossing, tunnels
 from planner_jax.baselines.block.library.planner import LibraryBlock
 from planner_jax.baselines.block.library.table import Library, Row, unpacked
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import solved
 from planner_jax.planning.plan import plan
 from planner_jax.referee.block import BlockVerdict, referee_blocks
@@ -87,7 +88,7 @@ def check(library: Library, num: int, seed: int = 0, home: int = 0) -> Check:
     """
     stored = np.flatnonzero(library.found[home])
     if not stored.size:
-        raise ValueError(f"library must have motions, got none from home {home}")
+        raise ArgumentError("library", "motions", verb="have", shown=f"none from home {home}")
     rng = np.random.default_rng(seed)
     shuffled = [rng.permutation(stored) for _ in range(-(-num // stored.size))]
     pairs = np.concatenate(shuffled)[:num]

@@ -23,6 +23,7 @@ from planner_jax.baselines.block.library.table import (
     library_of,
     pieces_of,
 )
+from planner_jax.core.errors import ArgumentError
 from planner_jax.host.files import open_plain, replacing
 from planner_jax.robot.arm import Arm, ArmLimits
 from planner_jax.task.block.scene import Box, Scene
@@ -31,10 +32,6 @@ VERSION = 1
 BUILD_VERSION = 1  # of how libraries are planned: parts of another one are not gone on with
 _MAGIC = "planner-jax block library"
 _ALIGNED, _LONGEST = 64, 1 << 20  # bytes
-
-
-class LibraryFileError(ValueError):
-    """A file cannot be read as a library; one line that names the file."""
 
 
 def save_library(path: str | os.PathLike, library: Library) -> None:
@@ -74,7 +71,7 @@ def load_library(path: str | os.PathLike) -> Library:
     """The library that `save_library` wrote; its table is mapped, read when it is looked at.
 
     Raises:
-        LibraryFileError: the file is not there, is something else, of another version, or cut off.
+        ArgumentError: the file is not there, is something else, of another version, or cut off.
     """
     shown = repr(os.fspath(path))
     try:
@@ -83,41 +80,42 @@ def load_library(path: str | os.PathLike) -> Library:
             second = file.readline(_LONGEST)
             size = os.fstat(file.fileno()).st_size
     except OSError as error:
-        raise LibraryFileError(
-            f"library must be a file, got {shown} ({error.strerror}); "
-            f"`planner-jax library build {os.fspath(path)}` makes one"
-        ) from None
+        hint = f"`planner-jax library build {os.fspath(path)}` makes one"
+        shown = f"{shown} ({error.strerror}); {hint}"
+        raise ArgumentError("library", "a file", shown=shown) from None
     magic, _, version = first.decode("latin-1").rstrip("\n").rpartition(" ")
     if magic != _MAGIC:
-        raise LibraryFileError(f"library must be a file of a block library, got {shown}")
+        raise ArgumentError("library", "a file of a block library", shown=shown)
     if version != str(VERSION):
-        raise LibraryFileError(
-            f"library must be of version {VERSION}, got version {version} in {shown}"
+        raise ArgumentError(
+            "library", f"of version {VERSION}", shown=f"version {version} in {shown}"
         )
     try:
         header = json.loads(second)
     except (ValueError, RecursionError):
-        raise LibraryFileError(f"library must be a whole file, {shown} is cut off") from None
+        raise ArgumentError("library", f"a whole file, {shown} is cut off", shown="") from None
     try:
         if size != header["size"]:
-            raise LibraryFileError(
-                f"library must be a whole file of {header['size']} bytes, got {size} in {shown}"
+            raise ArgumentError(
+                "library", f"a whole file of {header['size']} bytes", shown=f"{size} in {shown}"
             )
         library, rows = _library(path, header)
     except (KeyError, TypeError, IndexError, AttributeError, OverflowError, OSError) as error:
         raise _damaged(shown, error) from None
     except ValueError as error:
-        raise error if isinstance(error, LibraryFileError) else _damaged(shown, error) from None
+        raise error if isinstance(error, ArgumentError) else _damaged(shown, error) from None
     layout = library.table.layout
     known, found = header["fingerprint"], fingerprint(library.setting)
     if known != found or rows.shape[1] != layout.num_pairs or pieces_of(rows) < 1:
-        raise LibraryFileError(f"library must have the setting {known}, got {found} in {shown}")
+        raise ArgumentError(
+            "library", f"the setting {known}", verb="have", shown=f"{found} in {shown}"
+        )
     return library
 
 
-def _damaged(shown: str, error: Exception) -> LibraryFileError:
-    return LibraryFileError(
-        f"library must be a whole file, {shown} has a damaged header ({type(error).__name__})"
+def _damaged(shown: str, error: Exception) -> ArgumentError:
+    return ArgumentError(
+        "library", f"a whole file, {shown} has a damaged header ({type(error).__name__})", shown=""
     )
 
 

@@ -21,6 +21,7 @@ from planner_jax.baselines.block.library.table import (
     setting_of,
     unpacked,
 )
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import FEASIBILITY_TOLERANCE, Attempt, Status, status_of
 from planner_jax.task.block.case import BlockCase
@@ -29,10 +30,6 @@ from planner_jax.task.block.plan import BlockPlan, has_nan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 _SAME_START = 1e-4  # [rad] and [rad/s], how exactly the arm has to be where stored motions begin
-
-
-class OtherLibrary(ValueError):
-    """A library is of another scene, arm, limits or home than the cases; one line."""
 
 
 @struct.dataclass
@@ -57,7 +54,7 @@ class LibraryBlock(Planner):
         return (Attempt(),)
 
     def check(self, cases: BlockCase) -> None:
-        """Raise `OtherLibrary` unless the first of the cases is what the library was built for.
+        """Raise `ArgumentError` unless the first of the cases is what the library was built for.
 
         Args:
             cases: one, or a batch.
@@ -67,15 +64,16 @@ class LibraryBlock(Planner):
             first = jax.tree.map(lambda leaf: leaf[0], first)
         own, asked = fingerprint(self.library.setting), fingerprint(setting_of(first))
         if own != asked:
-            raise OtherLibrary(
-                f"library must be of the cases' arm, limits and scene, got one of {own} for cases "
-                f"of {asked}"
+            raise ArgumentError(
+                "library",
+                "of the cases' arm, limits and scene",
+                shown=f"one of {own} for cases of {asked}",
             )
         homes = np.asarray(self.library.table.homes)
         off = np.abs(homes - first.angles).max(axis=1).min()
         if off > _SAME_START:
-            raise OtherLibrary(
-                f"angles must be a home of the library to {_SAME_START} rad, got {off:.3g} rad off"
+            raise ArgumentError(
+                "angles", f"a home of the library to {_SAME_START} rad", shown=f"{off:.3g} rad off"
             )
 
     def solve(self, case: BlockCase, attempt: Attempt) -> BlockPlan:
@@ -150,7 +148,7 @@ def library_planner(file: str | os.PathLike) -> LibraryBlock:
     """The planner of a file that `planner-jax library build` wrote.
 
     Raises:
-        LibraryFileError: the file is no whole library; one line.
+        ArgumentError: the file is no whole library; one line.
     """
     return LibraryBlock(load_library(file))
 

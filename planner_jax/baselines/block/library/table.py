@@ -18,6 +18,7 @@ from jax import Array
 
 from planner_jax.ball.flight import BallState
 from planner_jax.baselines.block.library.cells import Layout, cell_of
+from planner_jax.core.errors import ArgumentError
 from planner_jax.robot.arm import Arm, ArmLimits
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.scene import Box, Scene, entry_time
@@ -208,5 +209,5 @@ def moved(library: Library, scene: Scene) -> Library:
         old, new = getattr(library.setting.scene, name), getattr(scene, name)
         for side in ("lower", "upper"):
             if not np.array_equal(getattr(old, side), getattr(new, side)):
-                raise ValueError(f"scene.{name} must be the library's, got another box")
+                raise ArgumentError(f"scene.{name}", "the library's", shown="another box")
     return dataclasses.replace(library, setting=dataclasses.replace(library.setting, scene=scene))

@@ -1,0 +1,127 @@
+"""The exceptions of the library: one tree, whose base is `PlannerJaxError`.
+
+An error of an argument holds its parts as fields. Code that needs another name for the argument,
+such as the command line, calls `renamed`; nothing reads the text. Nothing here imports JAX.
+"""
+
+import copy
+import numbers
+from collections.abc import Mapping
+from pathlib import Path
+from typing import ClassVar, Self
+
+
+class PlannerJaxError(Exception):
+    """Base of the exceptions that the library defines; the text is one line."""
+
+
+class ArgumentError(PlannerJaxError, ValueError):
+    """An argument breaks a rule: "NAME must be RULE, got VALUE".
+
+    Args:
+        name: argument, or field of an argument, such as "limits.speed".
+        rule: what the argument must be, such as "> 0".
+        value: what it is.
+        index: first entry, or first case of a batch, that breaks the rule, if there are several.
+        verb: word between "must" and the rule.
+        other: argument to which the rule compares this one; it follows the rule.
+        shown: text in the place of `value`; "" leaves the value out.
+        more: number of further elements of the batch that break the rule.
+    """
+
+    _where: ClassVar[str] = "at index"
+
+    def __init__(
+        self,
+        name: str,
+        rule: str,
+        value: object = None,
+        index: int | tuple[int, ...] | None = None,
+        *,
+        verb: str = "be",
+        other: str = "",
+        shown: str | None = None,
+        more: int = 0,
+    ):
+        super().__init__(name, rule, value, index)
+        self.name, self.rule, self.value, self.index = name, rule, value, index
+        self.verb, self.other, self.more = verb, other, more
+        self.shown = format_value(value) if shown is None else shown
+
+    def __str__(self) -> str:
+        text = f"{self.name} must {self.verb} {self.rule}{self.other and f' {self.other}'}"
+        if self.shown:
+            text += f", got {self.shown}"
+        if self.index is not None:
+            text += f" {self._where} {self.index}"
+        if self.more:
+            text += f" ({self.more} more such lane{'s' if self.more > 1 else ''})"
+        return " ".join(text.split())
+
+    def renamed(self, names: Mapping[str, str]) -> Self:
+        """Return the same error with arguments under other names.
+
+        Args:
+            names: new names by old ones; a name that is missing stays.
+        """
+        error = copy.copy(self)
+        error.name = names.get(self.name, self.name)
+        error.other = names.get(self.other, self.other)
+        return error
+
+
+class ArgumentTypeError(ArgumentError, TypeError):
+    """An argument is of a kind that its rule excludes, such as text in the place of a number."""
+
+
+class CaseError(ArgumentError):
+    """A number of a case breaks a rule; `index` is the first such case of the batch."""
+
+    _where = "in lane"
+
+
+class UnknownName(ArgumentError):
+    """No task, planner, suite or robot has this name; the rule lists the names that exist."""
+
+
+class MissingExtra(PlannerJaxError, ModuleNotFoundError):
+    """A feature needs a package that is not installed; the text says how to install it.
+
+    Args:
+        feature: argument or command that needs the package.
+        package: package that is missing.
+        extra: extra of `planner-jax` that installs the package.
+    """
+
+    def __init__(self, feature: str, package: str | None, extra: str):
+        super().__init__(feature, package, extra)
+        self.feature, self.name = feature, package
+        self.install = install_line(extra)
+
+    def __str__(self) -> str:
+        return f"{self.feature} needs {self.name}: {self.install}"
+
+    def renamed(self, names: Mapping[str, str]) -> Self:
+        """Return the same error with the feature under another name, if `names` has one."""
+        error = copy.copy(self)
+        error.feature = names.get(self.feature, self.feature)
+        return error
+
+
+class NoEnding(PlannerJaxError, ValueError):
+    """No trajectory to a standstill behind a plan keeps every limit; the text says which fails."""
+
+
+def install_line(extra: str) -> str:
+    """Return the command that installs an extra, into a checkout or beside an installed wheel."""
+    if (Path(__file__).parents[2] / "pyproject.toml").is_file():
+        return f"pip install -c constraints.txt -e '.[{extra}]'"
+    return f"pip install 'planner-jax[{extra}]'"
+
+
+def format_value(value: object) -> str:
+    """Return a value as one short line for a message."""
+    if isinstance(value, numbers.Real) and not isinstance(value, numbers.Integral):
+        return f"{float(value):g}"
+    text = str(value) if isinstance(value, numbers.Number) else repr(value)
+    return " ".join(text.split())[: 200 if isinstance(value, str) else 60]
