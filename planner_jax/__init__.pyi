@@ -23,7 +23,7 @@ from .cost.extras import KeepOut as KeepOut
 from .cost.extras import KeepOutBox as KeepOutBox
 from .cost.extras import Plane as Plane
 from .cost.extras import SpeedZone as SpeedZone
-from .export.words import export as export
+from .export.api import export as export
 from .host.compile_cache import keep_compiled_programs as keep_compiled_programs
 from .optimise.implicit import optimal_plan as optimal_plan
 from .optimise.lbfgs import Evaluation as Evaluation

@@ -13,9 +13,9 @@ from flown_plans import PLANS, arm, as_it_is, bag, car, matrices, quadrotor, tab
 import planner_jax as pj
 from planner_jax.core.errors import ArgumentError, MissingExtra, UnknownName, install_line
 from planner_jax.export import csv_rows, ros2
+from planner_jax.export.api import stream
 from planner_jax.export.crazyflie import poly4d
 from planner_jax.export.setpoints import MOST, setpoints_of
-from planner_jax.export.words import stream
 
 RATE = 50.0
 

@@ -13,7 +13,7 @@ import planner_jax as pj
 from planner_jax.cli.main import main
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.plan_files import PlanFileError, load_fitting
-from planner_jax.export.saved import saved_plan
+from planner_jax.export.setpoints import load_plan
 from planner_jax.robot.car import CarPlan
 from planner_jax.robot.quadrotor_plan import QuadrotorPlan
 from planner_jax.runs import columns as known
@@ -137,7 +137,7 @@ def test_a_saved_batch_is_read_as_what_its_robot_knows(tmp_path, robot):
     plans = batch(robot)
     plans.save(tmp_path / "a.npz")
     for row in range(NUM):
-        plan = saved_plan(tmp_path / "a.npz", row)
+        plan = load_plan(tmp_path / "a.npz", row)
         assert type(plan) is type(plans)
         assert_same(plan, pj.lane(plans, row))
 
@@ -147,7 +147,7 @@ def test_what_a_task_adds_to_a_saved_plan_is_left_out(tmp_path):
     stroke = pj.hit.Stroke(number, vector, vector, vector, vector, number)
     plan = quadrotor()
     HitPlan(**vars(plan), stroke=stroke).save(tmp_path / "a.npz")
-    read = saved_plan(tmp_path / "a.npz")
+    read = load_plan(tmp_path / "a.npz")
     assert type(read) is QuadrotorPlan
     assert_same(read, plan)
 
@@ -163,7 +163,7 @@ def test_a_saved_file_of_something_else_is_named(tmp_path):
 def test_a_saved_batch_of_unequal_leaves_is_refused(tmp_path):
     batch("quadrotor").replace(gravity=np.ones(2, np.float32)).save(tmp_path / "a.npz")
     with pytest.raises(PlanFileError, match="^path must hold as much of every plan, got"):
-        saved_plan(tmp_path / "a.npz", 1)
+        load_plan(tmp_path / "a.npz", 1)
 
 
 # The command.

@@ -13,9 +13,9 @@ from pymavlink.dialects.v20 import common
 
 from planner_jax.core.errors import ArgumentError
 from planner_jax.export import frames
+from planner_jax.export.api import stream
 from planner_jax.export.px4 import trajectory_setpoints
 from planner_jax.export.setpoints import setpoints_of
-from planner_jax.export.words import stream
 
 RATE = 50.0
 

@@ -273,7 +273,7 @@ def _train(given: dict[str, Any]) -> None:
 
 
 def _add_export(parser: _Parser) -> None:
-    from planner_jax.export.formats import FORMATS
+    from planner_jax.export.api import FORMATS
 
     parser.description = (
         "One plan of a sweep, or of a file that plan.save wrote, in a format that controllers read."
@@ -296,8 +296,7 @@ def _add_export(parser: _Parser) -> None:
 
 def _export(given: dict[str, Any]) -> None:
     from planner_jax.core.plan_files import PlanFileError
-    from planner_jax.export import words
-    from planner_jax.export.rested import lacks_ending
+    from planner_jax.export import api
 
     source, row = given.pop("plans"), given.pop("row", None)
     out, udp = _out(given, "file"), given.pop("udp", None)
@@ -306,14 +305,14 @@ def _export(given: dict[str, Any]) -> None:
     if out is not None and udp is not None:
         raise ArgumentError("udp", "given with --out", udp, verb="not be")
     try:
-        out = out or words.default_name(source, row, given["to"])
+        out = out or api.default_name(source, row, given["to"])
         plan, against = _plan_of(source, row)
-        lacks = ending is not None and lacks_ending(plan)
+        lacks = ending is not None and api.lacks_ending(plan)
         given |= {"ending": ending, "case": _case_of(source, row, name) if lacks else None}
         if udp is None:
-            told = str(words.export(plan, out=out, **given))
+            told = str(api.export(plan, out=out, **given))
         else:
-            told = f"{words.stream(plan, udp=udp, **given)} setpoints sent"
+            told = f"{api.stream(plan, udp=udp, **given)} setpoints sent"
     except PlanFileError as error:
         raise error.renamed({"path": "RUN"}) from None
     if against:
@@ -331,11 +330,11 @@ def _plan_of(source: str, row: int | None) -> tuple[Any, str]:
         from planner_jax.sweep.rows import planned_row
 
         return planned_row(RunFolder(source, name="RUN"), row)
-    from planner_jax.export.saved import saved_plan
+    from planner_jax.export.setpoints import load_plan
 
     if not os.path.exists(source):
         raise ArgumentError("RUN", "the folder of a sweep or a file of plans", source)
-    return saved_plan(source, row), ""
+    return load_plan(source, row), ""
 
 
 def _case_of(source: str, row: Any, ending: str) -> Any:
@@ -488,7 +487,7 @@ def _require_rate(plan: Any, rate: float) -> None:
 
 def _write_answer(task: Task, planner: str, answer: Any, out: Path, rate: float | None) -> None:
     """Write a new folder: the plan, its setpoints where the referee lets it pass, and pictures."""
-    from planner_jax.export.words import export
+    from planner_jax.export.api import export
     from planner_jax.sweep.single_pictures import write_pictures
 
     out.mkdir()

@@ -26,8 +26,8 @@ def poly4d(plan: QuadrotorPlan) -> np.ndarray:
     began. The yaw is zero throughout.
 
     Raises:
-        ArgumentError: the plan may not leave, its degree is above 7, it has more pieces than the
-            memory holds, or its numbers are too large for float32.
+        ArgumentError: the plan cannot be exported, its degree is above 7, it has more pieces than
+            the memory holds, or its numbers are too large for float32.
     """
     pieces = pieces_of(plan)
     num, powers, _ = pieces.coeffs.shape

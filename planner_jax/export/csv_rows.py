@@ -1,4 +1,4 @@
-"""Setpoints as a table of text: a header with names and units, a row a time."""
+"""Setpoints as a table of text: a header with names and units, and a row for each time."""
 
 from typing import BinaryIO
 
@@ -46,7 +46,7 @@ def write(plan: Plan, rate: float, file: BinaryIO) -> None:
     columns = _COLUMNS[robot_of(plan).name]
     setpoints = setpoints_of(plan, rate)
     header = [f"{name} [{unit}]" for _, names, unit in columns for name in names]
-    write_table(file, header, [getattr(setpoints, field) for field, _, _ in columns])
+    write_table(file, header, [vars(setpoints)[field] for field, _, _ in columns])
 
 
 def write_table(file: BinaryIO, header: list[str], columns: list[np.ndarray]) -> None:

@@ -25,7 +25,7 @@ def packets(plan: QuadrotorPlan, rate: float) -> Iterator[tuple[int, bytes]]:
     Position, velocity, acceleration, yaw and its rate are all set; see `trajectory_setpoints`.
 
     Raises:
-        ArgumentError: the plan may not leave, or the rate is absurd.
+        ArgumentError: the plan cannot be exported, or the rate is absurd.
     """
     fields = trajectory_setpoints(plan, rate)
     if rate > FASTEST:
@@ -64,7 +64,8 @@ def stream(plan: QuadrotorPlan, port: int, rate: float = DEFAULT_RATE) -> int:
         rate: [Hz].
 
     Raises:
-        ArgumentError: the plan may not leave, the rate is absurd, or nobody listens on the port.
+        ArgumentError: the plan cannot be exported, the rate is absurd, or nobody listens on the
+            port.
     """
     if isinstance(port, bool) or not isinstance(port, int) or not 0 < port < 2**16:
         raise ArgumentError("udp", f"a port from 1 to {2**16 - 1}", port)

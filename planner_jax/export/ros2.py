@@ -5,7 +5,8 @@ car is one joint of six degrees of freedom, whose velocities, turning included, 
 frame; an arm has its joints.
 """
 
-import importlib
+import pkgutil
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from planner_jax.export.setpoints import DEFAULT_RATE, Setpoints, setpoints_of
 from planner_jax.robot.arm_plan import ArmSetpoints
 from planner_jax.robot.quadrotor_plan import QuadrotorSetpoints
 
+Json = Any  # plain values, lists and dictionaries
 WORLD, BODY = "world", "base_link"
 JOINTS = [f"joint_{k}" for k in range(1, 7)]  # as the ROS packages of the arm's maker have them
 BODIES, ARM = "trajectory_msgs/MultiDOFJointTrajectory", "trajectory_msgs/JointTrajectory"
@@ -44,8 +46,8 @@ TYPES = {
 _NOW = {"sec": 0, "nanosec": 0}  # controllers begin with a trajectory of this stamp at once
 
 
-def trajectory_message(plan: Plan, rate: float = DEFAULT_RATE) -> Any:
-    """A plan as an object of ROS 2's own class, to be published.
+def trajectory_message(plan: Plan, rate: float = DEFAULT_RATE) -> object:
+    """Convert a plan to an object of ROS 2's own class, to be published.
 
     Args:
         plan: one, solved; of a quadrotor, a car or an arm.
@@ -56,21 +58,20 @@ def trajectory_message(plan: Plan, rate: float = DEFAULT_RATE) -> Any:
         `trajectory_msgs.msg.JointTrajectory` of an arm.
 
     Raises:
-        ArgumentError: the plan may not leave, or the rate is absurd.
+        ArgumentError: the plan cannot be exported, or the rate is absurd.
         MissingExtra: this Python has no ROS 2.
     """
     kind, fields = trajectory(plan, rate)
     try:
         return _as_ros(kind, fields)
     except ModuleNotFoundError as error:
-        raise MissingExtra(
-            f"trajectory_message needs {error.name} of ROS 2: source its setup file first",
-            name=error.name,
-        ) from None
+        missing = MissingExtra("trajectory_message", f"{error.name} of ROS 2", "export")
+        missing.install = "source its setup file first"
+        raise missing from None
 
 
-def trajectory(plan: Plan, rate: float) -> tuple[str, dict[str, Any]]:
-    """The type of the message, a key of `TYPES`, and its fields as plain values."""
+def trajectory(plan: Plan, rate: float) -> tuple[str, dict[str, Json]]:
+    """Return the type of the message, a key of `TYPES`, and its fields as plain values."""
     found = setpoints_of(plan, rate)
     nanoseconds = np.round(found.time * 1e9).astype(int).tolist()
     times = [dict(zip(("sec", "nanosec"), divmod(t, 10**9), strict=True)) for t in nanoseconds]
@@ -94,7 +95,7 @@ def trajectory(plan: Plan, rate: float) -> tuple[str, dict[str, Any]]:
     return BODIES, _trajectory([BODY], points)
 
 
-def _trajectory(joints: list[str], points: list[dict[str, Any]]) -> dict[str, Any]:
+def _trajectory(joints: list[str], points: list[dict[str, Json]]) -> dict[str, Json]:
     return {"header": {"stamp": _NOW, "frame_id": WORLD}, "joint_names": joints, "points": points}
 
 
@@ -103,9 +104,9 @@ def _joints(found: ArmSetpoints) -> tuple[np.ndarray, ...]:
 
 
 def _motion(found: Setpoints) -> tuple[np.ndarray, ...]:
-    """Position, quaternion x, y, z, w, velocity, body rate and acceleration, all in the world.
+    """Return position, quaternion x, y, z, w, velocity, body rate and acceleration in the world.
 
-    Of accelerations of a body's turning setpoints know nothing.
+    Setpoints do not hold angular accelerations.
     """
     if isinstance(found, QuadrotorSetpoints):
         xyzw = np.roll(found.quat_wxyz, -1, axis=1)
@@ -125,15 +126,15 @@ def _motion(found: Setpoints) -> tuple[np.ndarray, ...]:
     )
 
 
-def _vector(values: Any) -> dict[str, float]:
-    """A vector, or a quaternion, by the names of its components."""
+def _vector(values: Sequence[float]) -> dict[str, float]:
+    """Name the components of a vector or a quaternion."""
     return dict(zip("xyzw"[: len(values)], values, strict=True))
 
 
-def _as_ros(kind: str, fields: dict[str, Any]) -> Any:
-    """An object of the class of a ROS 2 type, with all fields set."""
+def _as_ros(kind: str, fields: Mapping[str, Json]) -> object:
+    """Make an object of the class of a ROS 2 type, with all fields set."""
     package, name = kind.split("/")
-    made = getattr(importlib.import_module(f"{package}.msg"), name)()
+    message = pkgutil.resolve_name(f"{package}.msg:{name}")()
     for line in TYPES[kind].splitlines():
         inner, field = line.split()
         value, of_one = fields[field], inner.removesuffix("[]")
@@ -143,5 +144,5 @@ def _as_ros(kind: str, fields: dict[str, Any]) -> Any:
                 if of_one == inner
                 else [_as_ros(of_one, each) for each in value]
             )
-        setattr(made, field, value)
-    return made
+        setattr(message, field, value)
+    return message

@@ -1,18 +1,17 @@
-"""What leaves of a plan: its setpoints, or its polynomials. Every format is made of these alone.
+"""Content of every format: the setpoints of a plan, or its polynomials, up to its end.
 
-`setpoints_of` and `pieces_of` are where a plan is taken as it is, up to its end: that of its ending
-where it was planned with one.
+The end of a plan with a recovery trajectory is the end of the latter.
 """
 
 import dataclasses
+import os
 from collections.abc import Callable, Mapping
-from typing import Any
 
 import numpy as np
 
 from planner_jax.core.errors import ArgumentError
-from planner_jax.core.plan_files import named_leaves
-from planner_jax.core.protocol import Plan, Status, is_solved
+from planner_jax.core.plan_files import PlanFileError, load_fitting, named_leaves
+from planner_jax.core.protocol import Plan, Status, is_solved, lane
 from planner_jax.robot.arm_plan import ArmPlan, ArmSetpoints
 from planner_jax.robot.car import CarPlan, CarSetpoints
 from planner_jax.robot.quadrotor_plan import QuadrotorPlan, QuadrotorSetpoints
@@ -26,12 +25,13 @@ Setpoints = QuadrotorSetpoints | CarSetpoints | ArmSetpoints
 
 @dataclasses.dataclass(frozen=True)
 class Robot:
-    """A robot whose plans can leave."""
+    """A robot whose plans can be exported."""
 
     name: str
     plan: type[Plan]
     shapes: Mapping[str, tuple[int | str, ...]]  # of the leaves; a letter is one size throughout
-    end: Callable[[Any], Any]  # [s], of a plan
+    case_field: str  # of the cases of its plans, and of no others
+    end: Callable[..., float]  # [s], of a plan
 
 
 ROBOTS = (
@@ -39,25 +39,28 @@ ROBOTS = (
         "quadrotor",
         QuadrotorPlan,
         {"trajectory.coeffs": ("M", "D", 3), "trajectory.durations": ("M",), "gravity": ()},
-        lambda plan: np.sum(np.asarray(plan.whole.durations)),
+        "head_state",
+        lambda plan: float(np.sum(np.asarray(plan.whole.durations))),
     ),
     Robot(
         "car",
         CarPlan,
         {"start": (3,), "time": (), "speed": ("K",), "curvature": ("K",)},
-        lambda plan: plan.time,
+        "movers",
+        lambda plan: float(plan.time),
     ),
     Robot(
         "arm",
         ArmPlan,
         {"motion.coeffs": ("M", "D", 6), "motion.durations": ("M",)},
-        lambda plan: np.sum(np.asarray(plan.motion.durations)),
+        "scene",
+        lambda plan: float(np.sum(np.asarray(plan.motion.durations))),
     ),
 )
 
 
 def robot_of(plan: Plan) -> Robot:
-    """The robot of one plan that may leave.
+    """Return the robot of one plan that can be exported.
 
     Raises:
         ArgumentError: it is no plan, a batch, of another robot, not solved, or not whole.
@@ -73,14 +76,14 @@ def robot_of(plan: Plan) -> Robot:
         shown = [f"{each.name}: {each.message}" for each in Status if each == plan.status]
         raise ArgumentError("plan", "solved", shown=f"the status {(*shown, plan.status)[0]}")
     _require_shapes(plan, robot)
-    if not 0.0 < float(robot.end(plan)) < np.inf:
-        raise ArgumentError("plan", "some time", verb="take", shown=f"{float(robot.end(plan)):g} s")
+    if not 0.0 < robot.end(plan) < np.inf:
+        raise ArgumentError("plan", "some time", verb="take", shown=f"{robot.end(plan):g} s")
     return robot
 
 
 def _require_shapes(plan: Plan, robot: Robot) -> None:
-    """Raise unless the leaves of one plan have the shapes of its robot's."""
-    sizes: dict[Any, int] = {}
+    """Raise unless the leaves of one plan have the shapes of its robot."""
+    sizes: dict[int | str, int] = {}
     leaves = named_leaves(plan)
     for name, wanted in robot.shapes.items():
         shape = np.shape(leaves[name])
@@ -94,42 +97,66 @@ def _require_shapes(plan: Plan, robot: Robot) -> None:
 
 
 def setpoints_of(plan: Plan, rate: float) -> Setpoints:
-    """One plan at a rate, as its `sample` gives it, from its beginning up to its end.
+    """Return `plan.sample(rate)` of one plan.
 
     Args:
         plan: of a robot of `ROBOTS`, solved.
         rate: [Hz].
 
     Raises:
-        ArgumentError: the plan may not leave, see `robot_of`, or is not finite; or the rate is
-            none, leaves nothing but the beginning, or asks for more than `MOST` setpoints.
+        ArgumentError: the plan cannot be exported, see `robot_of`, or is not finite; or the rate is
+            no number, or gives one setpoint only or more than `MOST`.
     """
-    end = float(robot_of(plan).end(plan))
+    end = robot_of(plan).end(plan)
     low, high = 1.0 / end, (MOST - 1) / end
     if isinstance(rate, str | bool) or np.ndim(rate) != 0:
         raise ArgumentError("rate", "a number", rate)
     if not low * (1.0 - 1e-6) <= rate <= high:
         rule = f"from {low:.4g} to {high:.4g} for a plan of {end:.4g} s"
         raise ArgumentError("rate", rule, rate)
-    any_plan: Any = plan
-    setpoints: Setpoints = any_plan.sample(rate)
-    for field in dataclasses.fields(setpoints):
-        if not np.isfinite(getattr(setpoints, field.name)).all():
-            raise ArgumentError("plan", "finite", shown=f"{field.name} that is not")
+    assert isinstance(plan, QuadrotorPlan | CarPlan | ArmPlan)
+    setpoints = plan.sample(rate)
+    for name, values in vars(setpoints).items():
+        if not np.isfinite(values).all():
+            raise ArgumentError("plan", "finite", shown=f"{name} that is not")
     return setpoints
 
 
 def pieces_of(plan: QuadrotorPlan) -> PiecewisePolynomial:
-    """The polynomials of one plan that may leave, without pieces that take no time.
+    """Return the polynomials of one plan, without pieces that take no time.
 
     Raises:
-        ArgumentError: the plan may not leave, see `robot_of`, or is not finite.
+        ArgumentError: the plan cannot be exported, see `robot_of`, or is not finite.
     """
     robot_of(plan)
-    path = plan.whole
-    coeffs: Any = np.asarray(path.coeffs)
-    durations: Any = np.asarray(path.durations)
+    coeffs, durations = np.asarray(plan.whole.coeffs), np.asarray(plan.whole.durations)
     taken = durations != 0.0
     if not (np.isfinite(coeffs[taken]).all() and (durations[taken] > 0.0).all()):
         raise ArgumentError("plan", "finite", shown="a trajectory that is not")
     return PiecewisePolynomial(coeffs=coeffs[taken], durations=durations[taken])
+
+
+def load_plan(path: str | os.PathLike, row: int | None = None) -> Plan:
+    """Load one plan of a file that `plan.save` wrote, without the fields that a task adds.
+
+    Args:
+        path: of the file.
+        row: index in the batch of the file; None for a file of one plan.
+
+    Raises:
+        PlanFileError: the file holds no plans of a quadrotor, a car or an arm.
+        ArgumentError: there is no such row.
+    """
+    plans: Plan = load_fitting(path, [robot.plan for robot in ROBOTS])
+    shape = np.shape(plans.status)
+    if shape == ():
+        if row is not None:
+            raise ArgumentError("row", "given for a file of one plan", row, verb="not be")
+        return plans
+    if row is None or not 0 <= row < shape[0]:
+        shown = "nothing" if row is None else row
+        raise ArgumentError("row", f"from 0 to {shape[0] - 1}", shown=shown)
+    sizes = {np.shape(leaf)[:1] for leaf in named_leaves(plans).values()}
+    if len(shape) != 1 or len(sizes) != 1:
+        raise PlanFileError("path", "as much of every plan", str(path), verb="hold")
+    return lane(plans, row)

@@ -27,7 +27,7 @@ def is_rested(found: Plan) -> bool:
     if isinstance(found, QuadrotorPlan):
         return found.ending is not None
     if isinstance(found, ArmPlan):
-        end = np.asarray(found.motion.durations).sum()
+        end = np.asarray(np.sum(found.motion.durations))
         return bool(np.abs(states_at(found.motion, end)[1]).max() <= _ARM_AT_REST)
     return isinstance(found, CarPlan) and not float(np.asarray(found.speed)[-1]) > 0.0
 
