@@ -13,7 +13,7 @@ SHORT = public_names cli solve decide referee_hit serves
 COMPILE = $(VENV)/bin/uv pip compile pyproject.toml --universal --python-version 3.11 \
 	--all-extras --no-annotate --quiet --custom-compile-command "make constraints"
 
-.PHONY: help demo test test-slow test-faults test-short test-wheel test-range test-lowest lint format docs bench \
+.PHONY: help demo test test-slow coverage test-faults test-short test-wheel test-range test-lowest lint format docs bench \
 	constraints clean
 
 help:  ## this list
@@ -27,6 +27,9 @@ test: $(VENV)/.installed-test  ## the default tests
 
 test-slow: $(VENV)/.installed-test  ## the tests marked slow
 	$(PYTEST) -m "slow and not gpu"
+
+coverage: $(VENV)/.installed-test  ## the share of planner_jax's lines that default and slow tests run
+	$(PYTEST) -m "not gpu" --cov --cov-report=term:skip-covered --cov-fail-under=90
 
 test-faults: $(VENV)/.installed-test  ## every fault in numbers: kills, twins, damage, full disks, signals; hours on 2 cores
 	$(VENV)/bin/python -m tests.faults --out build/faults.md
