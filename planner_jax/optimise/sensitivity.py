@@ -13,7 +13,7 @@ then holds lambda^T cost_utheta.
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -114,7 +114,7 @@ class Differentiated(OptimisedPlanner):
         """Those of the planner."""
         return self.planner.guesses(context.inner, num)
 
-    def carried(self, point: Array, before: "Differentiated") -> Array:
+    def carried(self, point: Array, before: Self) -> Array:
         """As the planner does."""
         return self.planner.carried(point, before.planner)
 

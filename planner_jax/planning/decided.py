@@ -30,7 +30,7 @@ class DecidedPlanner(Planner[CaseT, PlanT]):
     decision: Any  # a `Decision`
 
     @property
-    def case_type(self) -> type:
+    def case_type(self) -> type:  # pyright: ignore[reportIncompatibleVariableOverride]
         """The class of the planner's cases."""
         return self.planner.case_type
 

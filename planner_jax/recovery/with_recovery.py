@@ -31,7 +31,7 @@ class EndedPlanner(Planner[CaseT, PlanT]):
     rest: RestPlanner
 
     @property
-    def case_type(self) -> type:
+    def case_type(self) -> type:  # pyright: ignore[reportIncompatibleVariableOverride]
         """The class of the planner's cases."""
         return self.planner.case_type
 

@@ -47,7 +47,7 @@ class _Quantity(NamedTuple):
     """What a field holds."""
 
     kind: str  # a key of `UNITS`
-    count: int = 1
+    count: int = 1  # pyright: ignore[reportIncompatibleMethodOverride]
     span: bool = False  # "to" stands between its two numbers
     optional: bool = False  # may be null, which is no limit
     example: str = ""  # of what has to be written with its unit; else SI is meant without one

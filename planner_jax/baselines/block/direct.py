@@ -53,7 +53,7 @@ class DirectBlock(Planner):
 
     case_type: ClassVar[type] = BlockCase
     is_sequential: ClassVar[bool] = True
-    attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)
+    attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)  # pyright: ignore[reportIncompatibleMethodOverride]
     points: int = 48  # of the ball's way, where end poses are looked at
     tries: int = 384  # end poses whose motions are looked at, the soonest first
     samples: int = 96  # of a motion, where distances are looked at

@@ -59,7 +59,7 @@ class PoseByPose(Planner, abc.ABC):
     """
 
     case_type: ClassVar[type] = BlockCase
-    attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)
+    attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)  # pyright: ignore[reportIncompatibleMethodOverride]
     pieces: ClassVar[int]
     degree: ClassVar[int]
     points: int = 12  # of the ball's way, where end poses are looked at

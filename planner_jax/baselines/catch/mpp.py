@@ -109,7 +109,7 @@ class MppCatch(Planner):
     It does not look at a case's extras; the referee does.
     """
 
-    attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)
+    attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)  # pyright: ignore[reportIncompatibleMethodOverride]
     case_type: ClassVar[type] = CatchCase
     height: float = 1.2  # [m], of the targets at the catches
     speeds: tuple[float, ...] = (-1.0, 0.0, 1.0)  # [m/s], sampled on each axis at a catch

@@ -80,7 +80,7 @@ class JuggleHit(Planner):
     It does not look at a case's extras; the referee does.
     """
 
-    attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)
+    attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)  # pyright: ignore[reportIncompatibleMethodOverride]
     case_type: ClassVar[type] = HitCase
     height: float = 1.5  # [m], of the ball at the impact
     apex: float = 2.3  # [m], of the returned ball

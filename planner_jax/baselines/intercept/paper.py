@@ -49,7 +49,7 @@ class PaperIntercept(Planner):
     smoothing: Smoothing = Smoothing()
     follow: FollowConfig = FollowConfig()
     step: SpeedStep = printed_speed()
-    attempts: ClassVar[tuple[Search, ...]] = (Search(1),)
+    attempts: ClassVar[tuple[Search, ...]] = (Search(1),)  # pyright: ignore[reportIncompatibleMethodOverride]
 
     def solve_on_host(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:
         """The plans of a batch."""

@@ -45,7 +45,7 @@ class WarmBlock(Planner):
     case_type: ClassVar[type] = Replanning
     is_sequential: ClassVar[bool] = True
     planner: OnlineBlock = OnlineBlock()  # whose unknowns, limits and weights these are
-    attempts: tuple[Warm, ...] = (Warm(),)
+    attempts: tuple[Warm, ...] = (Warm(),)  # pyright: ignore[reportIncompatibleMethodOverride]
 
     def solve(self, task: Replanning, attempt: Warm) -> BlockPlan:
         """The plan of one case."""

@@ -136,7 +136,7 @@ class ReplanCatch(OptimisedPlanner):
         )
         return Replanning(case=left, previous=previous, elapsed=elapsed)
 
-    def prepare(self, task: Replanning) -> ReplanContext:
+    def prepare(self, task: Replanning) -> ReplanContext:  # pyright: ignore[reportIncompatibleMethodOverride]
         """The targets in the order of catching, and the previous plan as a point."""
         context = self.planner.prepare(task.case)
         left = _segments(task)[1][0]

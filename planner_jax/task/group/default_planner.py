@@ -38,7 +38,7 @@ class GroupIntercept(Planner):
     """
 
     case_type: ClassVar[type] = InterceptGroup
-    attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)
+    attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)  # pyright: ignore[reportIncompatibleMethodOverride]
     # One search: where it fails, others take long.
     planner: SpacetimeIntercept = SpacetimeIntercept("early", searches=(_EARLY,))
     patient: SpacetimeIntercept = SpacetimeIntercept("least")  # of legs that it leaves unsolved

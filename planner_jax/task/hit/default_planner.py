@@ -6,7 +6,7 @@ choice of variables, which needs none of the singular divisions of its eqs 13-14
 """
 
 import dataclasses
-from typing import Any
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -300,7 +300,7 @@ class ExactHit(OptimisedPlanner):
         across = tangent_basis(impact.stroke.normal)
         return natural.at[3:5].set(jnp.stack([jnp.sum(vel * each) for each in across]))
 
-    def carried(self, point: Array, before: "ExactHit") -> Array:
+    def carried(self, point: Array, before: Self) -> Array:
         """A point (n,) without velocities as one with the smoothest ones."""
         if self.velocities == before.velocities:
             return point

@@ -94,7 +94,7 @@ class ReplanHit(OptimisedPlanner):
         now = dataclasses.replace(cases, ball=ball, drag=drag, head_state=head_state)
         return Replanning(case=now, previous=previous, elapsed=elapsed)
 
-    def prepare(self, task: Replanning) -> ReplanHitContext:
+    def prepare(self, task: Replanning) -> ReplanHitContext:  # pyright: ignore[reportIncompatibleMethodOverride]
         """The incoming ball's table, and the previous stroke as a point."""
         return ReplanHitContext(hit=self.planner.prepare(task.case), start=self._start(task))
 
