@@ -226,6 +226,11 @@ def flight_measures(limits: QuadrotorLimits) -> tuple[Measure, ...]:
     return tuple(measure for kind in _kinds(limits) for measure in kind.measures)
 
 
+def flight_names(limits: QuadrotorLimits) -> tuple[str, ...]:
+    """Return the fields of the limits that the excesses of `flight_excess` belong to."""
+    return tuple(kind.field for kind in _kinds(limits) for _ in kind.measures)
+
+
 def relative_excess(limits: QuadrotorLimits, excess: Sequence[Array]) -> list[Array]:
     """Relative excesses, of those of `flight_excess`."""
     measures = flight_measures(limits)

@@ -1,4 +1,4 @@
-"""A way to rest behind a plan that has been made already, of any robot, judged by the referee."""
+"""Recovery trajectories behind a plan that has been made already, of any robot."""
 
 import dataclasses
 from typing import Any
@@ -7,23 +7,23 @@ import jax
 import numpy as np
 
 from planner_jax.core.errors import NoEnding
-from planner_jax.core.protocol import Plan, lane
+from planner_jax.core.protocol import Plan, is_solved, lane
+from planner_jax.cost.quadrotor import flight_excess, flight_names, relative_excess
 from planner_jax.planning.plan import plan
-from planner_jax.recovery.arm import braked_arm
-from planner_jax.recovery.car import braked_car
+from planner_jax.recovery.braking import brake_arm, brake_car
 from planner_jax.recovery.planner import RestPlanner
 from planner_jax.recovery.with_recovery import ending_cases
-from planner_jax.referee.rest import referee_rests
 from planner_jax.robot.arm_plan import ArmPlan
 from planner_jax.robot.car import CarPlan
 from planner_jax.robot.quadrotor_plan import QuadrotorPlan
-from planner_jax.trajectory.polynomial import states_at
+from planner_jax.trajectory.polynomial import sample_pieces, states_at
 
-_ARM_AT_REST = 0.01  # [rad/s], fastest joint, as the referee has it
+_ARM_AT_REST = 0.01  # [rad/s], fastest joint of an arm that stands
+_NODES = 40  # intervals of a piece, at which the exceeded limit is looked for
 
 
 def is_rested(found: Plan) -> bool:
-    """Whether one plan comes to rest, by itself or by a way that was planned behind it."""
+    """Return whether one plan ends at standstill, by itself or by its recovery trajectory."""
     if isinstance(found, QuadrotorPlan):
         return found.ending is not None
     if isinstance(found, ArmPlan):
@@ -33,36 +33,41 @@ def is_rested(found: Plan) -> bool:
 
 
 def with_ending(case: Any, found: Plan, to: str) -> Plan:
-    """One plan that comes to rest.
+    """Return one plan that ends at standstill.
 
     Args:
-        case: of the plan, with its limits and what stands in the way; one case.
-        found: the plan, of a quadrotor, a car or an arm, which stays as it is up to its end.
+        case: of the plan, with its limits and obstacles; one case.
+        found: the plan of a quadrotor, a car or an arm, which stays as it is up to its end.
         to: "brake", or of a quadrotor "home", as of `planner_jax.recovery.with_recovery.ended`.
 
     Returns:
-        The plan with its `ending`; of a car or an arm one `CarPlan` or `ArmPlan` up to rest.
+        The plan with its `ending`; of a car or an arm one `CarPlan` or `ArmPlan` to standstill.
 
     Raises:
-        NoEnding: there is none that the referee lets pass.
+        NoEnding: no recovery trajectory keeps every limit; one line that names the limit.
         ValueError: only quadrotors go home.
     """
     if isinstance(found, QuadrotorPlan):
-        return _quadrotor(case, found, to)
+        return _end_flight(case, found, to)
     if to != "brake":
         raise ValueError(f"to must be brake, as only quadrotors go home, got {to!r}")
     if isinstance(found, CarPlan):
-        return braked_car(case, found)
+        return brake_car(case, found)
     if isinstance(found, ArmPlan):
-        return braked_arm(case, found)
+        return brake_arm(case, found)
     raise TypeError(f"found must be the plan of a robot, got a {type(found).__name__}")
 
 
-def _quadrotor(case: Any, found: QuadrotorPlan, to: str) -> QuadrotorPlan:
+def _end_flight(case: Any, found: QuadrotorPlan, to: str) -> QuadrotorPlan:
+    """Return the plan of a quadrotor with its recovery trajectory; see `with_ending`."""
     cases, plans = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (case, found))
     rest = plan(RestPlanner(to=to), ending_cases(cases, plans))
-    ended = dataclasses.replace(plans, ending=jax.tree.map(np.asarray, rest.trajectory))
-    verdict = referee_rests(cases, ended)
-    if not verdict.success[0]:
-        raise NoEnding(verdict.sentence(0))
-    return lane(ended, 0)
+    if is_solved(rest.status[0]):
+        return lane(dataclasses.replace(plans, ending=rest.trajectory), 0)
+    motion = sample_pieces(lane(rest.trajectory, 0), _NODES)
+    flown = relative_excess(case.limits, flight_excess(motion, case.gravity, case.limits))
+    worst = [float(np.max(excess)) for excess in flown]
+    k = int(np.argmax(worst))
+    if worst[k] > 0.0:
+        raise NoEnding(f"{flight_names(case.limits)[k]}: {worst[k]:.2%} above its limit")
+    raise NoEnding(f"a limit is exceeded by {float(rest.violation[0]):.2%}")

@@ -15,6 +15,7 @@ from planner_jax.core.rules import Table, require_sound
 from planner_jax.robot.arm import REGIMES, Arm, ArmLimits
 from planner_jax.robot.arm_mjcf import irb1600
 from planner_jax.task.arguments import array_of, batch_of
+from planner_jax.task.block.clearance import least_clearances
 from planner_jax.task.block.rules import RULES
 from planner_jax.task.block.scene import Scene, paper_scene
 
@@ -50,6 +51,10 @@ class BlockCase:
     def batch_shape(self) -> tuple[int, ...]:
         """() for one case, (B,) for a batch."""
         return np.shape(self.gravity)
+
+    def clearances(self, angles: Array) -> Array:
+        """Return the least distance (N,) [m] of the arm in poses (N, 6) from its obstacles."""
+        return least_clearances(self.arm, self.scene, angles)
 
 
 def case(

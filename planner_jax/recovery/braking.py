@@ -1,0 +1,197 @@
+"""How cars and arms brake behind the end of a plan.
+
+Of a few ways to brake that keep the limits of the robot by construction, the first one is taken
+that touches nothing, by the distances that planners compute, too.
+"""
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from planner_jax.core.errors import NoEnding
+from planner_jax.plane.obstacles import separation
+from planner_jax.robot.arm_plan import ArmPlan
+from planner_jax.robot.car import CarPlan, pose_at
+from planner_jax.trajectory.polynomial import PiecewisePolynomial, states_at
+
+PlanT = TypeVar("PlanT", CarPlan, ArmPlan)
+
+_SPARE = 0.98  # share of each limit that is used
+_SAMPLES = 400  # at which distances are computed
+_GAP = 1e-3  # [m], kept from everything, as something may be nearer between two samples
+# Shares of a car's greatest deceleration; and of its greatest curvature, to the left, beside the
+# curvature at the meeting.
+_DECELERATIONS = (1.0, 0.7, 0.4)
+_CURVATURES = (0.0, 0.5, -0.5, 1.0, -1.0)
+_USUAL = 1.0  # [m/s^2] and [1/m], where there is no limit
+_SLOWER = (1.5, 2.0, 3.0)  # times the shortest duration in which all joints stop at once
+
+
+def brake_car(case: Any, plan: CarPlan) -> CarPlan:
+    """Return a plan of a car that goes on until the car stands.
+
+    Args:
+        case: with limits, body, map and obstacles; one case.
+        plan: of the case.
+
+    Raises:
+        NoEnding: every way to brake touches something.
+    """
+    why = ""
+    knots = (jnp.asarray(plan.speed), jnp.asarray(plan.curvature))
+    begin = pose_at(jnp.asarray(plan.start), plan.time, *knots, plan.time)
+    for speed, curvature in _car_ways(case, plan):
+        time = float(plan.time) / (len(plan.speed) - 1) * (len(speed) - 1)
+        problem = _car_problem(case, begin, float(plan.time), time, speed, curvature)
+        if not problem:
+            return _change(
+                CarPlan,
+                plan,
+                time=np.float32(float(plan.time) + time),
+                speed=np.append(plan.speed, speed[1:]).astype(np.float32),
+                curvature=np.append(plan.curvature, curvature[1:]).astype(np.float32),
+            )
+        why = why or problem
+    raise NoEnding(why)
+
+
+def _car_ways(case: Any, plan: CarPlan) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield speeds and curvatures (n + 1,) at the plan's last knot, and at knots behind it."""
+    limits = case.limits
+    step = float(plan.time) / (len(plan.speed) - 1)
+    first, bend = float(plan.speed[-1]), float(plan.curvature[-1])
+    quickest, sharpest = (
+        float(limit) if np.isfinite(limit) else _USUAL
+        for limit in (limits.acceleration, limits.curvature)
+    )
+    targets = [bend, *(_SPARE * share * sharpest for share in _CURVATURES)]
+    # The steering angle turns fastest where the path is straight.
+    turn = _SPARE * float(limits.steering_rate) / float(case.body.wheelbase) * step
+    for share in _DECELERATIONS:
+        num = max(int(np.ceil(first / (_SPARE * share * quickest * step))), 1)
+        speed = first * np.linspace(1.0, 0.0, num + 1)
+        # No tighter than the lateral acceleration allows at the speed before.
+        before = np.maximum(speed[:-1] ** 2, 1e-9)
+        most = np.maximum(_SPARE * float(limits.lateral_acceleration) / before, abs(bend))
+        for target in targets:
+            curvature = [bend]
+            for bound in most:
+                change = np.clip(target - curvature[-1], -turn, turn)
+                curvature.append(np.clip(curvature[-1] + change, -bound, bound))
+            yield speed, np.array(curvature)
+
+
+def _car_problem(
+    case: Any, begin: Array, since: float, time: float, speed: np.ndarray, curvature: np.ndarray
+) -> str:
+    """Return what a car touches that brakes from a pose (3,) on; "" if it touches nothing.
+
+    Args:
+        case: as for `brake_car`.
+        begin: where the plan ends.
+        since: [s], the duration of the plan.
+        time: [s], that braking takes.
+        speed: at knots, as of `CarPlan`.
+        curvature: at the same knots.
+    """
+    times = np.linspace(0.0, time, _SAMPLES)
+    poses = np.asarray(_poses(begin, time, jnp.asarray(speed), jnp.asarray(curvature), times))
+    direction = np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], axis=1)
+    middle = poses[:, :2] + float(case.body.middle) * direction
+    inside = np.minimum(middle - case.lower, case.upper - middle).min()
+    if inside < 0.0:
+        return f"map: the body's middle is {-inside:.3g} m outside of the map"
+    body = case.body
+    ends = (-body.rear_overhang, body.length - body.rear_overhang, 0.5 * body.width)
+    for name, each in (("wall", case.walls), ("mover", case.movers)):
+        if not np.any(each.present):
+            continue
+        moved = each.centre[:, None] + each.velocity[:, None] * (since + times)[:, None]
+        apart = (poses[:, :2] - np.asarray(moved)).astype(np.float32)
+        gaps = np.asarray(
+            separation(each.corners, each.present, apart[..., 0], apart[..., 1], poses[:, 2], ends)
+        ).min(axis=1)
+        k = int(gaps.argmin())
+        if gaps[k] < _GAP:
+            return f"{name}: the body is {max(-gaps[k], 0.0):.3g} m inside {name}s[{k}]"
+    return ""
+
+
+_poses = jax.jit(jax.vmap(pose_at, in_axes=(None, None, None, None, 0)))
+
+
+def brake_arm(case: Any, plan: ArmPlan) -> ArmPlan:
+    """Return a plan of an arm that goes on until the arm stands.
+
+    Its joints brake evenly, all at once or each alone.
+
+    Args:
+        case: a `BlockCase`, of one case.
+        plan: of the case.
+
+    Raises:
+        NoEnding: with every way to brake a joint leaves its range, or the arm touches something.
+    """
+    coeffs, durations = (np.asarray(x, np.float64) for x in vars(plan.motion).values())
+    state = states_at(plan.motion, np.asarray(durations.sum()))
+    why = ""
+    for pieces, times in _arm_ways(state[0], state[1], np.asarray(case.limits.acceleration, float)):
+        problem = _arm_problem(case, pieces, times)
+        if not problem:
+            size = max(coeffs.shape[1], 3)
+            wide = [np.pad(x, [(0, 0), (0, size - x.shape[1]), (0, 0)]) for x in (coeffs, pieces)]
+            motion = PiecewisePolynomial(
+                coeffs=np.concatenate(wide).astype(np.float32),
+                durations=np.append(durations, times).astype(np.float32),
+            )
+            return _change(ArmPlan, plan, motion=motion)
+        why = why or problem
+    raise NoEnding(why)
+
+
+def _arm_ways(
+    angles: np.ndarray, rates: np.ndarray, most: np.ndarray
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield coefficients (M, 3, 6) and durations (M,) of motions to standstill.
+
+    Args:
+        angles: (6,) [rad], at the start of the motions.
+        rates: (6,) [rad/s], at the start.
+        most: (6,) [rad/s^2], greatest accelerations.
+    """
+    alone = np.maximum(np.abs(rates) / (_SPARE * most), 1e-3)
+    together = np.full(6, alone.max())
+    for ends in (together, alone, *(factor * together for factor in _SLOWER)):
+        times = np.unique(ends)
+        begins = np.append(0.0, times[:-1])
+        pieces = []
+        for begin in begins:
+            past = np.minimum(begin, ends)
+            share = 1.0 - past / ends  # of the first rate, that is left
+            reached = angles + 0.5 * rates * past * (1.0 + share)
+            pieces.append([reached, rates * share, np.where(share > 0.0, -0.5 * rates / ends, 0.0)])
+        yield np.array(pieces), times - begins
+
+
+def _arm_problem(case: Any, pieces: np.ndarray, times: np.ndarray) -> str:
+    """Return what is wrong with a motion, coefficients (M, 3, 6) and durations (M,); or ""."""
+    tau = times[:, None, None] * np.linspace(0.0, 1.0, _SAMPLES // len(times))[:, None]
+    first, second, third = np.moveaxis(pieces, 1, 0)[:, :, None]
+    angles = (first + tau * (second + tau * third)).reshape(-1, 6)
+    beyond = np.maximum(angles - case.arm.upper, case.arm.lower - angles).max(axis=0)
+    joint = int(beyond.argmax())
+    if beyond[joint] > 0.0:
+        return f"position: joint {joint + 1} is {beyond[joint]:.3g} rad beyond its limit"
+    gap = float(np.min(case.clearances(jnp.asarray(angles, jnp.float32))))
+    return "" if gap >= _GAP else f"clearance: the arm is {gap:.3g} m from what it must not touch"
+
+
+def _change(kind: type[PlanT], plan: PlanT, **fields: Any) -> PlanT:
+    """Return a plan of a class with the fields of a plan, some of them changed."""
+    values = {field.name: vars(plan)[field.name] for field in dataclasses.fields(kind)}
+    return kind(**{**values, **fields})
