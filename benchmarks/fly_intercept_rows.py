@@ -20,14 +20,8 @@ import numpy as np
 
 from planner_jax.runs.summary import percent, wilson_interval
 from planner_jax.sims.settings import InterceptFly
-from planner_jax.sims.tasks.intercept import (
-    FAR,
-    NEAR,
-    SUCCESS,
-    TOUCH,
-    InterceptFlights,
-    fly_intercepts,
-)
+from planner_jax.sims.tasks.intercept import SUCCESS, TOUCH, InterceptFlights, fly_intercepts
+from planner_jax.sims.tasks.intercept_flights import FAR, NEAR
 from planner_jax.task.intercept.plan import InterceptPlan
 
 # Row -> settings that differ from the task's own.

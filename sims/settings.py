@@ -225,7 +225,7 @@ class InterceptFly(FlySettings):
     slip: bool = option(False, "", "tyres that slip")
 
     TASK: ClassVar[Task] = INTERCEPT
-    FLIGHT: ClassVar[str] = "planner_jax.sims.tasks.intercept:InterceptFlight"
+    FLIGHT: ClassVar[str] = "planner_jax.sims.tasks.intercept_flights:InterceptFlight"
     RATE: ClassVar[float] = 1.0
 
     def __post_init__(self) -> None:

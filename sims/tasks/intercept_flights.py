@@ -1,0 +1,231 @@
+"""Flights of interceptions: their settings, columns, recordings and findings."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from planner_jax.runs.columns import NUMBER, Column, leaves_of
+from planner_jax.runs.summary import percent
+from planner_jax.sims.drive import DriveLoop
+from planner_jax.sims.model import World
+from planner_jax.sims.recording import Recording
+from planner_jax.sims.robots.car.robot import Car
+from planner_jax.sims.robots.car.vehicle import Tyres, Vehicle
+from planner_jax.sims.scenery import Prism
+from planner_jax.sims.settings import InterceptFly
+from planner_jax.sims.task import FlightTask
+from planner_jax.sims.tasks.intercept import (
+    CAR_WORLD,
+    SUCCESS,
+    TOUCH,
+    Driven,
+    InterceptFlights,
+    Meetings,
+    fly_intercepts,
+    meetings,
+)
+from planner_jax.task.intercept.api import draw, positions
+from planner_jax.task.intercept.api import planner as intercept_planner
+from planner_jax.task.intercept.case import InterceptCase
+from planner_jax.task.intercept.searches import SEARCHES, search_reach
+
+NEAR, FAR = 0.05, 0.5  # [m], of the miss: two more distances that are counted
+_KEPT = 2  # frames from one that is recorded to the next
+_WALL, _MOVER = "#8C959F", "#D9A441"  # colours
+_WALL_HEIGHT, _MOVER_HEIGHT, _TARGET_HEIGHT = 0.25, 0.2, 0.08  # [m], as they are drawn
+
+
+class InterceptFlight(FlightTask):
+    """Interceptions as a run of flights knows them; the settings are `InterceptFly`."""
+
+    settings: InterceptFly
+
+    THING = "target"
+    THING_RADIUS = 0.06
+    CONTACT = "met"
+    SUCCESS = f"met the target within {SUCCESS:g} m and touched nothing"
+    PUBLISHED = "paper 003 shows single drives, without rates"
+    HAS_REACH = True
+    VIEW = (58.0, -90.0)
+    EYE = ((4.0, -5.0, 9.0), (4.0, 3.8, 0.0))
+    COLUMNS = (
+        *leaves_of(
+            "verdict",
+            ("miss", "m", "from the body's middle to the true target"),
+            ("wall_clearance", "m", "least; negative inside"),
+            ("mover_clearance", "m", "least; negative inside"),
+        ),
+        Column("meeting_time", "s", "end of the last plan", NUMBER, lambda b: _flown(b).meeting),
+        Column("drive_saturated", "1", "share", NUMBER, lambda b: _flown(b).saturation[:, 0]),
+        Column("steering_saturated", "1", "share", NUMBER, lambda b: _flown(b).saturation[:, 1]),
+        Column("num_plans", "", "that were driven", NUMBER, lambda b: _flown(b).plans),
+    )
+
+    def world(self) -> World:
+        """The ground with the car; what stands around differs from drive to drive."""
+        tyres = Tyres() if self.settings.slip else None
+        return dataclasses.replace(CAR_WORLD, robot=Car(Vehicle(tyres=tyres)))
+
+    def loop(self) -> DriveLoop:
+        """The closed loop of the drives."""
+        return DriveLoop(self.world(), self.settings.sensing)
+
+    def parameters(self) -> dict[str, Any]:
+        """Those of the closed loop."""
+        return dataclasses.asdict(self.loop())
+
+    def cases(self) -> Meetings:
+        """All interceptions of the run."""
+        settings = self.settings
+        sensing = settings.sensing
+        return meetings(
+            settings.suite,
+            settings.num,
+            settings.seed,
+            noise=sensing.target_std,
+            looks=sensing.looks,
+        )
+
+    def fly(self, cases: Meetings, record: bool) -> InterceptFlights:
+        """Drives of some interceptions; they are recorded in any case."""
+        settings = self.settings
+        return fly_intercepts(
+            self.loop(),
+            cases,
+            settings.seed,
+            replan=settings.rate,
+            planner=intercept_planner(settings.planner),
+            known=settings.known,
+            see_movers=settings.see_movers,
+        )
+
+    def recording(
+        self, cases: Meetings, flights: InterceptFlights, lanes: Sequence[int] | np.ndarray
+    ) -> Recording:
+        """The recording of some of the drives; see `FlightTask`."""
+        some, flown = cases[np.asarray(lanes)], flights.flown
+        kept = np.arange(0, flown.times.size, _KEPT)
+        times = np.tile(flown.times[kept], (len(some), 1))
+        seen = [positions(some.cases.target, at) for at in times.T.astype(np.float32)]
+        met = np.where(flights.miss <= SUCCESS, flown.meeting, np.nan)[lanes]
+        where = np.where(np.isfinite(met)[:, None], flights.target[lanes], np.nan)
+        return Recording(
+            index=some.index,
+            success=flights.success[lanes],
+            time=times,
+            robot=flown.poses[lanes][:, kept],
+            wanted=_raised(flown.wanted[lanes][:, kept], 0.0),
+            balls=_raised(np.stack(seen, axis=1), _TARGET_HEIGHT)[:, :, None],
+            met=met[:, None],
+            contact=_raised(where, _TARGET_HEIGHT)[:, None],
+            target=np.full((len(some), 3), np.nan),
+            expected=_raised(flown.ways[lanes][:, kept], _TARGET_HEIGHT),
+        )
+
+    @property
+    def suite(self) -> str:
+        """The suite of interceptions."""
+        return self.settings.suite
+
+    @property
+    def conditions(self) -> str:
+        """Noise, latency, prediction and tyres."""
+        settings = self.settings
+        of = "known" if settings.known else f"predicted from looks at {settings.looks:g} Hz"
+        movers = "seen" if settings.see_movers else "known"
+        tyres = "slipping tyres" if settings.slip else "tyres without slip"
+        return (
+            f"Noise {settings.noise}, latency {1e3 * settings.latency:g} ms, the target {of}, "
+            f"movers {movers}, {tyres}"
+        )
+
+    @property
+    def simulated(self) -> str:
+        """The car, and what it sees."""
+        return f"{self.world().robot.WORDS}; poses and looks with noise and latency"
+
+    def surroundings(self, index: int) -> Sequence[Prism]:
+        """Walls and movers of one drive."""
+        case = self._case(index)
+        found = []
+        for group, height, colour in (
+            (case.walls, _WALL_HEIGHT, _WALL),
+            (case.movers, _MOVER_HEIGHT, _MOVER),
+        ):
+            for k in np.flatnonzero(group.present):
+                corners = np.asarray(group.centre[k] + group.corners[k], float)
+                own = corners[np.any(corners != np.roll(corners, 1, axis=0), axis=1)]
+                x, y = np.asarray(group.velocity[k], float)
+                found.append(Prism(own, height, colour, (float(x), float(y))))
+        return found
+
+    def reachable(self, index: int) -> Sequence[tuple[float, np.ndarray]]:
+        """Cells of the planner's reach set, layer by layer."""
+        return reach_layers(jax.tree.map(jnp.asarray, self._case(index)))
+
+    def _case(self, index: int) -> InterceptCase:
+        settings = self.settings
+        one = draw(1, settings.suite, settings.seed, first=index)
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[0], one)
+
+    def counts(self, rows: Any) -> dict[str, Any]:
+        """Nearer and farther meetings, contacts, and how often an actuator was at its limit."""
+        miss = np.asarray(rows["miss"])
+        wall, mover = (np.asarray(rows[f"{name}_clearance"]) < -TOUCH for name in ("wall", "mover"))
+        return {
+            "within_0.05_m": int((miss <= NEAR).sum()),
+            "within_0.3_m": int((miss <= SUCCESS).sum()),
+            "within_0.5_m": int((miss <= FAR).sum()),
+            "miss_median": float(np.median(miss)),
+            "touched_wall": int(wall.sum()),
+            "touched_mover": int(mover.sum()),
+            "drive_saturated": float(np.mean(rows["drive_saturated"])),
+            "steering_saturated": float(np.mean(rows["steering_saturated"])),
+        }
+
+    def findings(self, summary: Mapping[str, Any]) -> list[str]:
+        """Misses and contacts; saturation."""
+        number = summary["num"]
+        near, success, far = (
+            percent(summary[f"within_{width:g}_m"], number) for width in (NEAR, SUCCESS, FAR)
+        )
+        walls, movers = (percent(summary[f"touched_{one}"], number) for one in ("wall", "mover"))
+        drive, steering = (100.0 * summary[f"{one}_saturated"] for one in ("drive", "steering"))
+        return [
+            f"Whatever they touched, {near} % came within {NEAR:g} m of the true target, "
+            f"{success} % within {SUCCESS:g} m, {far} % within {FAR:g} m; "
+            f"{walls} % touched a wall, {movers} % a mover.",
+            f"Drive saturated {drive:.2f} % of the time, steering {steering:.2f} %.",
+        ]
+
+
+def _flown(batch: Any) -> Driven:
+    return batch.verdict.flown
+
+
+def _raised(points: np.ndarray, height: float) -> np.ndarray:
+    """Points of the plane (..., 2) at a height, (..., 3) [m]."""
+    high = np.where(np.isfinite(points[..., :1]), height, np.nan)
+    return np.concatenate([points, high], axis=-1)
+
+
+def reach_layers(case: InterceptCase) -> list[tuple[float, np.ndarray]]:
+    """Return where the car of one case could be: time [s] and cells (P, 2) [m], by layer."""
+    search = SEARCHES["given"][0]
+    found = jax.device_get(
+        jax.jit(lambda case: search_reach(case, search, is_time_free=False))(case)
+    )
+    grid, words = found.grid, np.bitwise_or.reduce(found.reach.bits, axis=(2, 3))
+    layers = []
+    for number in range(int(grid.num) + 1):
+        bits = np.unpackbits(
+            words[number].transpose(1, 0).copy().view(np.uint8), axis=1, bitorder="little"
+        ).astype(bool)  # (cells, cells), rows are y
+        y, x = np.nonzero(bits)
+        points = grid.corner + grid.cell * np.stack([x, y], axis=1)
+        layers.append((float((number + 0.5) * grid.step), points))
+    return layers
