@@ -247,7 +247,7 @@ def test_a_sweep_of_groups_has_a_row_for_every_group(monkeypatch, tmp_path):
     monkeypatch.setattr(GroupSettings, "planner_options", lambda self: small)
     settings = GroupSettings(num=2, seed=4, batch=2, decide="greedy")
     start_sweep(TASK, settings, tmp_path / "run", progress=False)
-    rows = pq.read_table(tmp_path / "run" / "plans.parquet")
+    rows = pq.read_table(tmp_path / "run" / "plans")
     groups = pj.group.draw(2, seed=4)
     for name, leaf in {"case.present": groups.present, "plan.order": groups.order}.items():
         assert np.shape(rows[name].to_pylist()) == leaf.shape

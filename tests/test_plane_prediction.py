@@ -11,12 +11,8 @@ from scipy.optimize import least_squares
 from scipy.special import ellipe
 from scipy.stats import ncx2
 
-from planner_jax.plane.observed import no_observations, observe
 from planner_jax.plane.polynomial_fit import (
-    begin_polynomial,
     fit_polynomial,
-    observe_polynomial,
-    polynomial_of,
 )
 from planner_jax.plane.prediction import (
     Alternatives,
@@ -75,15 +71,6 @@ def drawn():
 @jax.jit
 def fits(times, seen, weights):
     return [fit_polynomial(times, seen, degree, weights) for degree in (1, 2, 3)]
-
-
-@jax.jit
-def one_by_one(times, seen, weights):
-    def add(state, observation):
-        return observe_polynomial(state, *observation), None
-
-    begin = begin_polynomial(3, origin=-7.0, span=7.0, dtype=seen.dtype)
-    return polynomial_of(jax.lax.scan(add, begin, (times, seen, weights))[0])
 
 
 @jax.jit
@@ -167,34 +154,6 @@ def test_a_weight_is_that_many_observations():
     twice = alone(times, seen)
     weights[3], weights[4] = 2.0, 0.0
     assert_same(alone(times, seen, weights), twice, rtol=1e-7, atol=1e-9)
-
-
-@float64
-def test_a_polynomial_of_observations_one_by_one_is_that_of_all_at_once():
-    seen, weights = noisy(TURN), np.linspace(0.5, 2.0, 15)
-    seen[4] = np.nan
-    found, expected = one_by_one(TIMES, seen, weights), fits(TIMES, seen, weights)[2]
-    for time in (0.0, AHEAD):
-        np.testing.assert_allclose(at(found, time), at(expected, time), rtol=1e-11)
-    # Two observations make a line, whatever the degree, and none stay at rest.
-    few = np.where(np.arange(15) < 2, weights, 0.0)
-    line = seen[1] + (seen[1] - seen[0]) * (AHEAD - TIMES[1])
-    for cubic in (one_by_one(TIMES, seen, few), fits(TIMES, seen, few)[2]):
-        np.testing.assert_allclose(at(cubic, AHEAD), line, rtol=1e-9)
-    assert not np.any(one_by_one(TIMES, seen, 0.0 * weights).coeffs)
-
-
-@float64
-def test_what_is_seen_one_by_one_is_predicted_from_as_what_is_seen_at_once():
-    times = np.arange(-19.0, 1.0)
-    positions = noisy(TURN, times)
-    seen, add = no_observations(15, jnp.float64), jax.jit(observe)
-    for time, position in zip(times, positions, strict=True):
-        seen = add(seen, time, position)
-        seen = add(seen, time, np.array([np.nan, 0.0]))
-    assert seen.num == 20
-    expected = alone(times[5:], positions[5:])
-    assert_same(alone(seen.times, seen.positions), expected, rtol=1e-7, atol=1e-9)
 
 
 @pytest.mark.parametrize("precision", ["single", "double"])
@@ -388,12 +347,10 @@ def test_what_cannot_be_fitted_is_refused_in_one_line():
     with pytest.raises(ValueError, match="degree must be 1, 2 or 3, got 4"):
         fit_polynomial(TIMES, np.zeros((15, 2)), 4)
     with pytest.raises(ValueError, match="degree must be 1, 2 or 3, got 0"):
-        begin_polynomial(0)
+        fit_polynomial(TIMES, np.zeros((15, 2)), 0)
     with pytest.raises(ValueError, match=r"positions \(L, 2\), got \(15,\) and \(15, 3\)"):
         select(TIMES, np.zeros((15, 3)), NOISE)
     with pytest.raises(ValueError, match=r"weights must be \(L,\) as times \(15,\), got \(3,\)"):
         select(TIMES, np.zeros((15, 2)), NOISE, np.ones(3))
     with pytest.raises(ValueError, match="noise must be > 0, got 0.0"):
         select(TIMES, np.zeros((15, 2)), 0.0)
-    with pytest.raises(ValueError, match="room must be >= 1, got 0"):
-        no_observations(0)

@@ -1,4 +1,4 @@
-"""How far the nearest standing obstacle is, worked out once on a grid and looked up between."""
+"""Distance from the nearest wall, computed once on a grid and interpolated."""
 
 import jax.numpy as jnp
 from flax import struct
@@ -9,17 +9,17 @@ from planner_jax.plane.obstacles import Obstacles, distances
 
 @struct.dataclass
 class DistanceField:
-    """Distances at equally spaced places; negative inside of an obstacle."""
+    """Distances at equally spaced nodes; negative inside of a wall."""
 
     values: Array  # (F, F) [m], rows are y
     corner: Array  # (2,) [m], the place of entry (0, 0)
     spacing: Array  # () [m]
 
     def near(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
-        """Distances [m] of points and their slopes by x and y, bilinear; arrays as `x`.
+        """Return distances [m] of points and their slopes by x and y, bilinear; arrays as `x`.
 
-        Between the places it is too far by up to spacing^2 / (4 distance) beside a corner. Points
-        beyond the grid are as far as the nearest one on it.
+        Beside a corner the distance between nodes is too great by up to spacing^2 / (4 distance).
+        Points beyond the grid have the distance of the nearest one on it.
         """
         most = self.values.shape[0] - 2
         at = [(each - low) / self.spacing for each, low in zip((x, y), self.corner, strict=True)]
@@ -37,10 +37,10 @@ class DistanceField:
 
 
 def distance_field(walls: Obstacles, corner: Array, spacing: Array, size: int) -> DistanceField:
-    """The field of what stands.
+    """Compute the distances from the walls on a grid.
 
     Args:
-        walls: obstacles; where they are at time 0.
+        walls: obstacles, at their positions of time 0.
         corner: (2,) [m], of the grid.
         spacing: () [m].
         size: F, places along either side, static.

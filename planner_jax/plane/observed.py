@@ -1,65 +1,20 @@
-"""Noisy observations of a target in the plane: kept as they come, and made ready for a fit.
+"""Noisy observations of a target in the plane, centred for a fit.
 
 World frame, SI units, one target. An observation that is not finite, or of weight zero, counts as
 absent, so that shapes stay fixed. Inside the fits points are pairs (x, y) of arrays.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
-from flax import struct
 from jax import Array
+from jax.typing import ArrayLike
 
 Pair = tuple[Array, Array]  # x and y of points of the plane, each (...)
 
 
-@struct.dataclass
-class Observations:
-    """The last L observations, in no order; entries not made yet are NaN.
-
-    Its arrays are what `select` and the fits take: what was seen one by one is predicted from as
-    what was seen at once, to rounding.
-    """
-
-    times: Array  # (L,) [s]
-    positions: Array  # (L, 2) [m]
-    num: Array  # () int32, how many were made in all
-
-
-def no_observations(room: int, dtype: Any = jnp.float32) -> Observations:
-    """Room for the last L observations, none made.
-
-    Raises:
-        ValueError: the room is not positive.
-    """
-    if room < 1:
-        raise ValueError(f"room must be >= 1, got {room}")
-    return Observations(
-        times=jnp.full(room, jnp.nan, dtype),
-        positions=jnp.full((room, 2), jnp.nan, dtype),
-        num=jnp.zeros((), jnp.int32),
-    )
-
-
-def observe(seen: Observations, time: Any, position: Any) -> Observations:
-    """One observation more at a time () [s] of a position (2,) [m]; it takes the oldest's place.
-
-    One that is not finite passes without a trace.
-    """
-    time = jnp.asarray(time, seen.times.dtype)
-    position = jnp.asarray(position, seen.positions.dtype)
-    room = seen.times.shape[0]
-    finite = jnp.isfinite(time) & jnp.all(jnp.isfinite(position))
-    here = finite & (jnp.arange(room) == seen.num % room)
-    return Observations(
-        times=jnp.where(here, time, seen.times),
-        positions=jnp.where(here[:, None], position, seen.positions),
-        num=seen.num + finite.astype(seen.num.dtype),
-    )
-
-
 class Centred(NamedTuple):
-    """Observations around their weighted means."""
+    """Observations relative to their weighted means."""
 
     weight: Array  # (L,), 0 where absent
     after: Array  # (L,) [s], from the middle on
@@ -70,11 +25,13 @@ class Centred(NamedTuple):
     num: Array  # () how many are present
 
 
-def centred(times: Any, positions: Any, weights: Any, least: int) -> Centred:
-    """Observations at times (L,) of positions (L, 2), with weights (L,) or None, for a fit.
+def centre(
+    times: ArrayLike, positions: ArrayLike, weights: ArrayLike | None, least: int
+) -> Centred:
+    """Centre observations at times (L,) of positions (L, 2), with weights (L,), for a fit.
 
     Raises:
-        ValueError: the shapes do not match, or there is no room for the `least` observations; one
+        ValueError: the shapes do not match, or there is no room for `least` observations; one
             line.
     """
     times, positions = jnp.asarray(times), jnp.asarray(positions)
@@ -106,6 +63,6 @@ def centred(times: Any, positions: Any, weights: Any, least: int) -> Centred:
 
 
 def safe_sqrt(value: Array) -> Array:
-    """Roots of numbers (...) >= 0, of slope zero at zero."""
+    """Return the roots of numbers (...) >= 0; the slope at zero is zero."""
     positive = value > 0.0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, value, 1.0)), 0.0)

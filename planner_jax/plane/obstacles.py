@@ -1,12 +1,12 @@
 """Convex polygons that stand or move evenly, and how far a point is from them."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array
+from jax.typing import ArrayLike
 
 from planner_jax.core.checks import floating, numeric
 from planner_jax.core.choices import require_size
@@ -26,19 +26,19 @@ class Obstacles:
     velocity: Array  # (N, 2) [m/s]
     present: Array  # (N,) bool, which of the N there are
 
-    def vertices(self, time: Any) -> Array:
-        """Corners in the world at one time () [s], (N, V, 2) [m]."""
+    def vertices(self, time: ArrayLike) -> Array:
+        """Return the corners in the world at one time () [s], (N, V, 2) [m]."""
         return (self.centre + self.velocity * time)[..., None, :] + self.corners
 
 
 def obstacles(
     polygons: object,
-    velocities: Any = 0.0,
+    velocities: object = 0.0,
     *,
-    room: tuple[int, int] | None = None,
-    dtype: Any = jnp.float32,
+    room: object = None,
+    dtype: object = jnp.float32,
 ) -> Obstacles:
-    """Obstacles of one case.
+    """Make the obstacles of one case.
 
     Args:
         polygons: of each its corners (V_k, 2) [m] at time 0, convex, in either sense.
@@ -55,7 +55,7 @@ def obstacles(
     dtype = floating(dtype)
     if isinstance(polygons, str) or not isinstance(polygons, Sequence | np.ndarray):
         raise ArgumentTypeError("polygons", "a sequence of corners (V, 2)", polygons)
-    checked = [_checked(k, corners) for k, corners in enumerate(polygons)]
+    checked = [_check_polygon(k, corners) for k, corners in enumerate(polygons)]
     most = max((len(each) for each in checked), default=3)
     num, size = _room(room) or (max(len(checked), 1), most)
     if len(checked) > num or most > size:
@@ -83,8 +83,8 @@ def obstacles(
     )
 
 
-def _room(given: Any) -> tuple[int, int] | None:
-    """How many obstacles and corners arrays hold; raises unless these are two sizes, or None."""
+def _room(given: object) -> tuple[int, int] | None:
+    """Return the numbers of obstacles and corners; raise unless these are two sizes, or None."""
     if given is None:
         return None
     if not isinstance(given, tuple | list) or len(given) != 2:
@@ -94,8 +94,8 @@ def _room(given: Any) -> tuple[int, int] | None:
     return given[0], given[1]
 
 
-def _checked(k: int, corners: Any) -> np.ndarray:
-    """Corners counter-clockwise; raises unless they are those of a convex polygon."""
+def _check_polygon(k: int, corners: object) -> np.ndarray:
+    """Return corners counter-clockwise; raise unless they are the corners of a convex polygon."""
     if numeric(corners) is None:
         raise ArgumentTypeError("polygons", "corners of numbers", corners, k, verb="have")
     polygon = np.asarray(corners, float)
@@ -122,16 +122,16 @@ def _checked(k: int, corners: Any) -> np.ndarray:
 def distances(
     corners: Array, present: Array, x: Array, y: Array
 ) -> tuple[Array, tuple[Array, Array]]:
-    """How far points are outside of convex polygons, and in which direction away from them.
+    """Return distances of points from convex polygons, and the directions away from them.
 
     Args:
         corners: (N, V, 2) [m], counter-clockwise; they may be repeated.
         present: (N,) bool; polygons that are not there are far away.
         x: (N, P) or (1, P) [m], of points, each row for one polygon or one for all.
-        y: likewise.
+        y: (N, P) or (1, P) [m].
 
     Returns:
-        distance: (N, P) [m]; negative inside, where it is the way to the nearest edge's line.
+        distance: (N, P) [m]; negative inside, where it is measured to the nearest edge's line.
         away: two of (N, P), the unit vector that is its gradient by the point.
     """
     before = jnp.roll(corners, 1, axis=1)
@@ -171,7 +171,7 @@ def distances(
 def separation(
     corners: Array, present: Array, x: Array, y: Array, heading: Array, body: tuple
 ) -> Array:
-    """How far a rectangle is from convex polygons along the axis that parts them best.
+    """Return distances of a rectangle from convex polygons along the axis that parts them best.
 
     It is positive just where they do not touch (the theorem of separating axes), and at most
     their distance.
@@ -180,7 +180,7 @@ def separation(
         corners: (N, V, 2) [m], as for `distances`.
         present: (N,) bool.
         x: (N, P) or (1, P) [m], of a point on the rectangle's long axis.
-        y: likewise.
+        y: (N, P) or (1, P) [m].
         heading: (P,) [rad], of that axis.
         body: ends of the rectangle behind and ahead of the point, and half its width [m].
 

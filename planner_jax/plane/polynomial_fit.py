@@ -1,22 +1,21 @@
-"""Polynomials through observations of a target, at once and one by one (paper 003, eqs 9-11).
+"""Polynomials through observations of a target (paper 003, eqs 9-11).
 
 Each additional degree multiplies the noise of a prediction, and a straight line misses targets
 that turn: `planner_jax.plane.prediction.select` usually does better than any of them.
 """
 
-import dataclasses
-from typing import Any
-
 import jax.numpy as jnp
-from flax import struct
 from jax import Array
+from jax.typing import ArrayLike
 
-from planner_jax.plane.observed import centred
+from planner_jax.plane.observed import centre
 from planner_jax.plane.target import PolynomialPath
 
 
-def fit_polynomial(times: Any, positions: Any, degree: int, weights: Any = None) -> PolynomialPath:
-    """The polynomial of least squares through observations (paper 003, eqs 9 and 10).
+def fit_polynomial(
+    times: ArrayLike, positions: ArrayLike, degree: int, weights: ArrayLike | None = None
+) -> PolynomialPath:
+    """Fit a polynomial to observations by least squares (paper 003, eqs 9 and 10).
 
     Orthogonal columns in normalised time stand for the normal equations of eq. 11, whose H is
     printed as the sum T'T, and would there be squared once too often. With fewer observations
@@ -33,8 +32,9 @@ def fit_polynomial(times: Any, positions: Any, degree: int, weights: Any = None)
         ValueError: the degree is another one, there is no room for degree + 1 observations, or
             the shapes do not match; one line.
     """
-    _check_degree(degree)
-    seen = centred(times, positions, weights, degree + 1)
+    if degree not in (1, 2, 3):
+        raise ValueError(f"degree must be 1, 2 or 3, got {degree}")
+    seen = centre(times, positions, weights, degree + 1)
     span = jnp.max(jnp.abs(seen.after))
     span = jnp.where(span > 0.0, span, 1.0)
     present = seen.weight > 0.0
@@ -56,79 +56,8 @@ def fit_polynomial(times: Any, positions: Any, degree: int, weights: Any = None)
     return PolynomialPath(coeffs=coeffs.at[0].add(jnp.stack(seen.centre)), origin=seen.middle)
 
 
-@struct.dataclass
-class PolynomialState:
-    """The polynomial of least squares through all observations so far.
-
-    A triangle R and a right side Q'p of the weighted observations in normalised time, so that
-    R'R is the H of paper 003, eq. 11, which is never formed. It equals the fit at once to
-    rounding, and takes as little room for a thousand observations as for one.
-    """
-
-    root: Array  # (n + 1, n + 1) R
-    values: Array  # (n + 1, 2) [m] Q'p
-    origin: Array  # () [s]
-    span: Array  # () [s]
-
-
-def begin_polynomial(
-    degree: int, origin: Any = 0.0, span: Any = 1.0, dtype: Any = jnp.float32
-) -> PolynomialState:
-    """A polynomial before the first observation.
-
-    Args:
-        degree: n, 1 to 3.
-        origin: () [s], about the middle of the observations to come.
-        span: () [s] > 0, about half their length.
-        dtype: of every leaf.
-
-    Raises:
-        ValueError: the degree is another one.
-    """
-    _check_degree(degree)
-    return PolynomialState(
-        root=jnp.zeros((degree + 1, degree + 1), dtype),
-        values=jnp.zeros((degree + 1, 2), dtype),
-        origin=jnp.asarray(origin, dtype),
-        span=jnp.asarray(span, dtype),
-    )
-
-
-def observe_polynomial(
-    state: PolynomialState, time: Any, position: Any, weight: Any = 1.0
-) -> PolynomialState:
-    """One observation more, at a time () [s], of a position (2,) [m] and of a weight () >= 0.
-
-    Rotations bring it into the triangle. One that is not finite passes without a trace.
-    """
-    dtype = state.root.dtype
-    time, position, weight = (jnp.asarray(each, dtype) for each in (time, position, weight))
-    usable = jnp.isfinite(time) & jnp.all(jnp.isfinite(position)) & (weight > 0.0)
-    root = jnp.where(usable, jnp.sqrt(jnp.where(usable, weight, 1.0)), 0.0)
-    num = state.root.shape[0]
-    passed = (jnp.where(usable, time, state.origin) - state.origin) / state.span
-    new = root * jnp.concatenate([_powers(passed, num - 1), jnp.where(usable, position, 0.0)])
-    rows = []
-    for k, row in enumerate(jnp.concatenate([state.root, state.values], axis=1)):
-        total = row[k] ** 2 + new[k] ** 2
-        length = jnp.sqrt(jnp.where(total > 0.0, total, 1.0))
-        cos = jnp.where(total > 0.0, row[k] / length, 1.0)
-        sin = jnp.where(total > 0.0, new[k] / length, 0.0)
-        rows.append(cos * row + sin * new)
-        new = cos * new - sin * row
-    joined = jnp.stack(rows)
-    return dataclasses.replace(state, root=joined[:, :num], values=joined[:, num:])
-
-
-def polynomial_of(state: PolynomialState) -> PolynomialPath:
-    """The path so far; of a lower degree where the observations are too few for its own."""
-    return PolynomialPath(
-        coeffs=_coefficients(state.root, state.values, state.span), origin=state.origin
-    )
-
-
 def _coefficients(root: Array, values: Array, span: Array) -> Array:
-    """The X (n + 1, 2) [m/s^k] of  R X = Y, out of normalised time.
+    """Solve R X = Y for X (n + 1, 2) [m/s^k], and undo the normalisation of time.
 
     Zero where R (n + 1, n + 1) has no more than rounding on its diagonal.
     """
@@ -142,11 +71,5 @@ def _coefficients(root: Array, values: Array, span: Array) -> Array:
 
 
 def _powers(x: Array, degree: int) -> Array:
-    """Powers (..., degree + 1) of numbers (...)."""
+    """Return the powers (..., degree + 1) of numbers (...)."""
     return jnp.stack([x**k for k in range(degree + 1)], axis=-1)
-
-
-def _check_degree(degree: int) -> None:
-    """Raises `ValueError` unless it is one of the fits'."""
-    if degree not in (1, 2, 3):
-        raise ValueError(f"degree must be 1, 2 or 3, got {degree}")

@@ -1,4 +1,4 @@
-"""Where a target in the plane will be, and how surely, from noisy observations of its position.
+"""Prediction of a target's position in the plane, and of its error, from noisy observations.
 
 Paper 003, Section III-A, fits a polynomial (`polynomial_fit.py`) of a degree that it does not
 give. `select` weighs a straight line against an even turn instead, and its prediction says how
@@ -6,15 +6,14 @@ far it can be trusted: `covariance`, `chance_within`. World frame in the plane, 
 target; `jax.vmap` makes many. Noise is Gaussian, equal on both axes.
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array, lax
+from jax.typing import ArrayLike
 
-from planner_jax.plane.observed import centred, safe_sqrt
+from planner_jax.plane.observed import centre, safe_sqrt
 from planner_jax.plane.target import TurningPath, arc
 from planner_jax.plane.turn_fit import best_turn, given_rate, path_of, tangent
 
@@ -26,7 +25,7 @@ _NODE, _WEIGHT = np.polynomial.legendre.leggauss(24)
 
 @struct.dataclass
 class TurnPrior:
-    """What is taken for granted about targets before the first observation.
+    """Prior knowledge about targets before the first observation.
 
     They go straight, or turn at a rate whose size has a log-normal distribution, to either side
     alike. The numbers are for targets of 0.2 to 0.5 m/s that turn at 0.03 to 0.1 rad/s. Faster
@@ -35,12 +34,12 @@ class TurnPrior:
     which predicts straight targets less well.
     """
 
-    chance: Any = 0.4  # () of a turn, between 0 and 1
-    typical: Any = 0.065  # () [rad/s] > 0, median size of the turn rate
-    spread: Any = 0.4  # () > 0, standard deviation of the logarithm of its size
+    chance: ArrayLike = 0.4  # () of a turn, between 0 and 1
+    typical: ArrayLike = 0.065  # () [rad/s] > 0, median size of the turn rate
+    spread: ArrayLike = 0.4  # () > 0, standard deviation of the logarithm of its size
 
     def log_density(self, rate: Array) -> Array:
-        """Logarithm (...) of the density [s/rad] of turn rates (...) [rad/s], given a turn."""
+        """Return the logarithm (...) of the density [s/rad] of rates (...) [rad/s] of turns."""
         turns = rate != 0.0
         size = jnp.log(jnp.where(turns, jnp.abs(rate), 1.0))
         apart = (size - jnp.log(self.typical)) / self.spread
@@ -49,7 +48,7 @@ class TurnPrior:
 
     @property
     def variance(self) -> Array:
-        """Of the turn rate, given a turn, () [rad^2/s^2]."""
+        """The variance of the turn rate, given a turn, () [rad^2/s^2]."""
         return jnp.square(self.typical) * jnp.exp(2.0 * jnp.square(self.spread))
 
 
@@ -58,7 +57,7 @@ USUAL = TurnPrior()
 
 @struct.dataclass
 class Alternatives:
-    """Paths that the observations leave open, and how probable each is; the first is straight.
+    """Paths that the observations allow, and their probabilities; the first path is straight.
 
     Path k is at  centre + velocity_k g_k(t - middle), a product of complex numbers, where g is how
     far a target of its turn rate goes that begins at unit velocity along x, less the lever. Its
@@ -78,7 +77,7 @@ class Alternatives:
 
 @struct.dataclass
 class Prediction:
-    """The path that is expected, and what is known about its error."""
+    """The expected path, and what is known about its error."""
 
     path: TurningPath  # of turn rate 0 if it is straight
     is_turning: Array  # () bool, which model was chosen
@@ -90,16 +89,16 @@ class Prediction:
 
 
 def select(
-    times: Any,
-    positions: Any,
-    noise: Any = None,
-    weights: Any = None,
+    times: ArrayLike,
+    positions: ArrayLike,
+    noise: ArrayLike | None = None,
+    weights: ArrayLike | None = None,
     *,
     prior: TurnPrior = USUAL,
-    threshold: Any = None,
-    fastest: Any = 1.0,
+    threshold: ArrayLike | None = None,
+    fastest: ArrayLike = 1.0,
 ) -> Prediction:
-    """A straight path, or one that turns evenly.
+    """Select a straight path or one that turns evenly.
 
     Every turn rate gets its probability by Bayes, with the prior for turns and none for place and
     velocity, by quadrature along the rate. The path is that of the median rate, which is zero
@@ -134,7 +133,7 @@ def select(
     if isinstance(noise, int | float) and not noise > 0.0:
         raise ValueError(f"noise must be > 0, got {noise}")
     least = 4 if noise is None else 3
-    seen = centred(times, positions, weights, least)
+    seen = centre(times, positions, weights, least)
     dtype = seen.after.dtype
     best = best_turn(seen, fastest)
     enough, freedom = seen.num >= least, jnp.maximum(2.0 * seen.num - 5.0, 3.0)
@@ -148,7 +147,7 @@ def select(
         variance = error_variance = jnp.square(jnp.asarray(noise, dtype))
 
     def gain(squares: Array) -> Array:
-        """Twice the logarithm of how much better the best turn explains what was seen."""
+        """Return twice the logarithm of the ratio of likelihoods, the best turn's over this one."""
         excess = (squares - best.squares) / variance
         return excess if noise is not None else (freedom + 1.0) * jnp.log1p(excess / freedom)
 
@@ -190,7 +189,7 @@ def select(
 
 
 def _median(rates: Array, step: Array, chance: Array, of_zero: Array) -> Array:
-    """Median () of a rate that is zero or in cells of a width () around rates (K,), rising."""
+    """Return the median () of a rate that is zero or in cells around rates (K,), rising."""
     below = jnp.cumsum(chance) - chance
     right = jnp.sum(jnp.where(rates < 0.0, chance, 0.0)) <= 0.5  # the median is not negative
     level = jnp.where(right, 0.5 - of_zero, 0.5)
@@ -201,15 +200,15 @@ def _median(rates: Array, step: Array, chance: Array, of_zero: Array) -> Array:
     return jnp.where(right, jnp.maximum(rate, 0.0), jnp.minimum(rate, 0.0))
 
 
-def mean_position(prediction: Prediction, time: Any) -> Array:
-    """Mean (2,) [m] over all alternatives at one time () [s]: the least expected square error."""
+def mean_position(prediction: Prediction, time: ArrayLike) -> Array:
+    """Return the mean (2,) [m] of all alternatives at a time () [s]."""
     offset, _ = _errors(prediction, time)
     mean = jnp.sum(prediction.alternatives.chance[:, None] * offset, axis=0)
     return prediction.path.at(time).pos + mean
 
 
-def covariance(prediction: Prediction, time: Any) -> Array:
-    """Mean square (2, 2) [m^2] of the error of the chosen path's position at one time () [s].
+def covariance(prediction: Prediction, time: ArrayLike) -> Array:
+    """Return the mean square (2, 2) [m^2] of the error of the path's position at a time () [s].
 
     About that position, not about the mean of the alternatives. Its diagonal is infinite where
     there were too few observations.
@@ -221,8 +220,8 @@ def covariance(prediction: Prediction, time: Any) -> Array:
     return apart + jnp.where(jnp.eye(2, dtype=bool), alike, 0.0)
 
 
-def chance_within(prediction: Prediction, time: Any, radius: Any) -> Array:
-    """Probability () that the target is within a radius () [m] of the path at one time () [s].
+def chance_within(prediction: Prediction, time: ArrayLike, radius: ArrayLike) -> Array:
+    """Return the probability () that the target is within a radius () [m] of the path at a time.
 
     Zero where there were too few observations.
     """
@@ -235,8 +234,8 @@ def chance_within(prediction: Prediction, time: Any, radius: Any) -> Array:
     return jnp.sum(prediction.alternatives.chance * jnp.where(known, inside, 0.0))
 
 
-def _errors(prediction: Prediction, time: Any) -> tuple[Array, Array]:
-    """Where each alternative is from the chosen path, (K, 2) [m], and its variance (K,) [m^2].
+def _errors(prediction: Prediction, time: ArrayLike) -> tuple[Array, Array]:
+    """Return each alternative relative to the chosen path, (K, 2) [m], and its variance (K,) [m^2].
 
     The variance of the centre, which is the same for all, is to be added.
     """
@@ -251,7 +250,7 @@ def _errors(prediction: Prediction, time: Any) -> tuple[Array, Array]:
 
 
 def _chance_in_circle(distance: Array, std: Array, radius: Array) -> Array:
-    """Probability () of a circle whose centre is at a distance from that of a round Gaussian.
+    """Return the probability () of a circle whose centre is at a distance from a round Gaussian.
 
     Strips of the circle across the line of centres, equally spaced in angle near the Gaussian.
     """

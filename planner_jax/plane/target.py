@@ -1,4 +1,4 @@
-"""Paths of targets in the plane: anything that says where it is, and how fast, at a time.
+"""Paths of targets in the plane: any class with position and velocity at a time.
 
 A path is a pytree with a method `at(time) -> PointState`, differentiable in time and in every
 leaf. The ones here cover paper 003's targets and what is fitted to observations of them; a class
@@ -21,10 +21,10 @@ class PointState:
 
 
 class PlanePath(Protocol):
-    """What a planner needs to know about a target."""
+    """The path of a target, as a planner uses it."""
 
     def at(self, time: Array) -> PointState:
-        """Position [m] and velocity [m/s] at one time () [s]."""
+        """Return position [m] and velocity [m/s] at one time () [s]."""
         ...
 
 
@@ -40,7 +40,7 @@ class TurningPath:
     turn_rate: Array  # () [rad/s], to the left
 
     def at(self, time: Array) -> PointState:
-        """Position [m] and velocity [m/s] at one time () [s]."""
+        """Return position [m] and velocity [m/s] at one time () [s]."""
         ahead, aside = arc(self.turn_rate, time)
         left = jnp.stack([-self.vel[1], self.vel[0]])
         cos, sin = jnp.cos(self.turn_rate * time), jnp.sin(self.turn_rate * time)
@@ -57,7 +57,7 @@ class PolynomialPath:
     origin: Array  # () [s], the time at which the powers are zero
 
     def at(self, time: Array) -> PointState:
-        """Position [m] and velocity [m/s] at one time () [s]."""
+        """Return position [m] and velocity [m/s] at one time () [s]."""
         passed = time - self.origin
         pos = vel = jnp.zeros_like(self.coeffs[0])
         for row in self.coeffs[::-1]:
@@ -73,23 +73,23 @@ class LaterPath:
     begin: Array  # () [s], that moment in the path's own times
 
     def at(self, time: Array) -> PointState:
-        """Position [m] and velocity [m/s] at one time () [s] after that moment."""
+        """Return position [m] and velocity [m/s] at one time () [s] after that moment."""
         return self.path.at(self.begin + time)
 
 
 def arc(turn_rate: Array, time: Array) -> tuple[Array, Array]:
-    """How far ahead and to the left (...) [s] a target of unit speed is after a time (...) [s]."""
+    """Return the displacement ahead and to the left (...) [s] of a target of unit speed."""
     angle = turn_rate * time
     return time * _sinc(angle), time * _cosc(angle)
 
 
 def _sinc(angle: Array) -> Array:
-    """sin(x) / x."""
+    """Return sin(x) / x."""
     small = jnp.abs(angle) < 1e-2
     safe = jnp.where(small, 1.0, angle)
     return jnp.where(small, 1.0 - angle**2 / 6.0, jnp.sin(safe) / safe)
 
 
 def _cosc(angle: Array) -> Array:
-    """(1 - cos(x)) / x, as 2 sin(x / 2)^2 / x: nothing cancels."""
+    """Return (1 - cos(x)) / x, as 2 sin(x / 2)^2 / x, which does not cancel."""
     return 0.5 * angle * _sinc(0.5 * angle) ** 2

@@ -7,14 +7,15 @@ are Gaussian and round, since a turn of the plane turns both. Here complex numbe
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
+from jax.typing import ArrayLike
 
-from planner_jax.plane.observed import Centred, Pair, centred, safe_sqrt
+from planner_jax.plane.observed import Centred, Pair, centre, safe_sqrt
 from planner_jax.plane.target import TurningPath, arc
 
 _RATES = 33  # turn rates from which the best one is refined
@@ -32,8 +33,14 @@ class TurnFit(NamedTuple):
     squares: Array  # () [m^2], weighted sum of |residual|^2
 
 
-def fit_turn(times: Any, positions: Any, weights: Any = None, *, fastest: Any = 1.0) -> TurningPath:
-    """The path of constant speed and turn rate of least squares through observations.
+def fit_turn(
+    times: ArrayLike,
+    positions: ArrayLike,
+    weights: ArrayLike | None = None,
+    *,
+    fastest: ArrayLike = 1.0,
+) -> TurningPath:
+    """Fit a path of constant speed and turn rate to observations by least squares.
 
     Gauss-Newton in the rate from the best of 33 equally spaced ones. The path is straight where
     fewer than three observations are present.
@@ -49,12 +56,12 @@ def fit_turn(times: Any, positions: Any, weights: Any = None, *, fastest: Any = 
     Raises:
         ValueError: there is no room for three observations, or the shapes do not match; one line.
     """
-    seen = centred(times, positions, weights, 3)
+    seen = centre(times, positions, weights, 3)
     return path_of(seen, best_turn(seen, fastest))
 
 
 def given_rate(seen: Centred, rate: Array) -> TurnFit:
-    """Place and velocity of least squares for a turn rate () [rad/s]."""
+    """Fit position and velocity for a turn rate () [rad/s] by least squares."""
     arcs = arc(rate, seen.after)
     lever = _mean(seen, arcs)
     arm = _minus(arcs, lever)
@@ -65,7 +72,7 @@ def given_rate(seen: Centred, rate: Array) -> TurnFit:
 
 
 def tangent(seen: Centred, fit: TurnFit) -> tuple[Callable[[Array], Pair], Array]:
-    """How the path moves with the turn rate when place and velocity follow.
+    """Return how the path moves with the turn rate if position and velocity are fitted to it.
 
     Returns:
         slope: of times (...) [s] after the middle the slopes, each (...) [m s/rad].
@@ -73,7 +80,7 @@ def tangent(seen: Centred, fit: TurnFit) -> tuple[Callable[[Array], Pair], Array
     """
 
     def bent(after: Array) -> tuple[Pair, Pair]:
-        """Arcs, and how the ways along them move with the rate alone."""
+        """Return arcs, and how the paths along them move with the rate alone."""
         one = jnp.ones_like(fit.rate)
         arcs, slopes = jax.jvp(lambda rate: arc(rate, after), (fit.rate,), (one,))
         return arcs, _times(fit.velocity, slopes)
@@ -89,11 +96,11 @@ def tangent(seen: Centred, fit: TurnFit) -> tuple[Callable[[Array], Pair], Array
     return lambda after: left(*bent(after)), _sum(seen, of_seen, of_seen)
 
 
-def best_turn(seen: Centred, fastest: Any) -> TurnFit:
-    """The turn of least squares; its derivatives are those of the optimum."""
+def best_turn(seen: Centred, fastest: ArrayLike) -> TurnFit:
+    """Fit a turn by least squares; its derivatives are the derivatives of the optimum."""
 
     def downhill(rate: Array) -> Array:
-        """Half of how fast the sum of squares falls with the rate, () [m^2 s/rad]."""
+        """Return half the negative slope of the sum of squares by the rate, () [m^2 s/rad]."""
         fit = given_rate(seen, rate)
         _, slopes = jax.jvp(lambda rate: arc(rate, seen.after), (rate,), (jnp.ones_like(rate),))
         return _sum(seen, _times(fit.velocity, slopes), fit.residual)
@@ -109,7 +116,7 @@ def best_turn(seen: Centred, fastest: Any) -> TurnFit:
 
 
 def _searched(seen: Centred, spacing: Array) -> Array:
-    """The best turn rate, by Gauss-Newton in it alone (Kaufman's variable projection).
+    """Search the best turn rate by Gauss-Newton (Kaufman's variable projection).
 
     It begins from the best of rates that are equally spaced around zero, and goes no further than
     the next ones.
@@ -117,7 +124,7 @@ def _searched(seen: Centred, spacing: Array) -> Array:
     rates = spacing * (jnp.arange(_RATES) - _RATES // 2)
     squares = jax.vmap(lambda rate: given_rate(seen, rate).squares)(rates)
 
-    def refine(k: int, rate: Array) -> Array:
+    def refine(k: Array, rate: Array) -> Array:
         fit = given_rate(seen, rate)
         slope, information = tangent(seen, fit)
         step = _sum(seen, slope(seen.after), fit.residual)
@@ -130,16 +137,16 @@ def _searched(seen: Centred, spacing: Array) -> Array:
 
 
 def path_of(seen: Centred, fit: TurnFit) -> TurningPath:
-    """The path of a fit, which counts from time 0."""
+    """Return the path of a fit, which counts from time 0."""
     place = jnp.stack(_minus(seen.centre, _times(fit.velocity, fit.lever)))
     start = TurningPath(place, jnp.stack(fit.velocity), fit.rate).at(-seen.middle)
     return TurningPath(start.pos, start.vel, fit.rate)
 
 
 def cramer_rao(
-    path: TurningPath, times: Any, noise: Any, time: Any, *, turning: bool = True
+    path: TurningPath, times: ArrayLike, noise: ArrayLike, time: ArrayLike, *, turning: bool = True
 ) -> Array:
-    """Least covariance (2, 2) [m^2] of an unbiased prediction of where a target is at one time.
+    """Return the least covariance (2, 2) [m^2] of an unbiased prediction of a position at one time.
 
     The inverse of the exact Fisher information of place, velocity and turn rate, taken to the
     position by its derivatives.
@@ -155,7 +162,7 @@ def cramer_rao(
         ValueError: there is no room for two observations, or for three of a turn.
     """
     times = jnp.asarray(times)
-    seen = centred(times, jnp.zeros((*times.shape, 2)), None, 3 if turning else 2)
+    seen = centre(times, jnp.zeros((*times.shape, 2)), None, 3 if turning else 2)
     velocity = path.at(seen.middle).vel
     fit = given_rate(seen, path.turn_rate)._replace(velocity=(velocity[0], velocity[1]))
     variance = jnp.square(jnp.asarray(noise, seen.after.dtype))
@@ -171,43 +178,44 @@ def cramer_rao(
 
 
 def mean_distance(bound: Array) -> Array:
-    """Mean length () [m] of a Gaussian error of a covariance (2, 2) [m^2]."""
+    """Return the mean length () [m] of a Gaussian error of a covariance (2, 2) [m^2]."""
     return np.sqrt(0.5 * np.pi) * jnp.mean(safe_sqrt(_around(bound)))
 
 
-def share_within(bound: Array, radius: Any) -> Array:
-    """Probability () that a Gaussian error of a covariance (2, 2) [m^2] is within a radius [m]."""
+def share_within(bound: Array, radius: ArrayLike) -> Array:
+    """Return the probability () that a Gaussian error of a covariance is within a radius [m]."""
     return 1.0 - jnp.mean(jnp.exp(-0.5 * radius**2 / _around(bound)))
 
 
 def _around(bound: Array) -> Array:
-    """Squares (64,) of the standard ellipse's radius at equal steps of its parameter."""
+    """Return squares (64,) of the standard ellipse's radius at equal steps of its parameter."""
     mean = 0.5 * (bound[0, 0] + bound[1, 1])
     apart = safe_sqrt((0.5 * (bound[0, 0] - bound[1, 1])) ** 2 + bound[0, 1] ** 2)
     return mean + apart * jnp.asarray(np.cos(np.arange(64) * (np.pi / 32.0)), bound.dtype)
 
 
 def _minus(a: Pair, b: Pair) -> Pair:
+    """Return the difference of points."""
     return a[0] - b[0], a[1] - b[1]
 
 
 def _times(a: Pair, b: Pair) -> Pair:
-    """Product of complex numbers."""
+    """Return the product of complex numbers."""
     return a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]
 
 
 def _sum(seen: Centred, a: Pair, b: Pair) -> Array:
-    """Weighted sum () of the scalar products of points."""
+    """Return the weighted sum () of the scalar products of points."""
     return jnp.sum(seen.weight * (a[0] * b[0] + a[1] * b[1]))
 
 
 def _mean(seen: Centred, a: Pair) -> Pair:
-    """Weighted mean, each ()."""
+    """Return the weighted mean, each ()."""
     x, y = (jnp.sum(seen.weight * each) / seen.total for each in a)
     return x, y
 
 
 def _share(seen: Centred, arm: Pair, power: Array, a: Pair) -> Pair:
-    """The complex number that makes arms of a power most like points in the least squares."""
+    """Return the complex factor by which arms of a power fit points by least squares."""
     safe = jnp.where(power > 0.0, power, 1.0)
     return _sum(seen, arm, a) / safe, _sum(seen, (-arm[1], arm[0]), a) / safe

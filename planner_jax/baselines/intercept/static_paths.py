@@ -17,7 +17,7 @@ from flax import struct
 from jax import Array, lax
 
 from planner_jax.baselines.intercept.path import Path, path_of_drive
-from planner_jax.plane import reach
+from planner_jax.plane.cell_paths import Chance, draw_chance
 from planner_jax.plane.obstacles import Obstacles
 from planner_jax.plane.target import TurningPath
 from planner_jax.task.intercept.case import InterceptCase
@@ -61,7 +61,7 @@ class PathSource:
         num = self.drawn * attempt.ways
         layer = jnp.minimum(first + 1 + np.arange(num) % self.later, found.grid.num)
         layer = jnp.where(arrivals[layer], layer, first).astype(jnp.int32)
-        chances = reach.draw_chance(attempt.lattice, num, attempt.seed, 1)
+        chances = draw_chance(attempt.lattice, num, attempt.seed, 1)
         times, guesses = jax.vmap(lambda n, chance: self.guess(still, found, n, chance))(
             layer, chances
         )
@@ -89,7 +89,7 @@ class PathSource:
         )
 
     def guess(
-        self, case: InterceptCase, found: Found, layer: Array, chance: reach.Chance
+        self, case: InterceptCase, found: Found, layer: Array, chance: Chance
     ) -> tuple[Array, Guess]:
         """When a random way arrives that ends at a layer, and where least squares begin."""
         grid = found.grid

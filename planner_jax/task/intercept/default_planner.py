@@ -19,7 +19,7 @@ from jax import Array, lax
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Status, is_solved, require_attempts, require_settings
 from planner_jax.core.select import index_of_best, select
-from planner_jax.plane import reach
+from planner_jax.plane.cell_paths import Chance
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.plan import InterceptPlan, explain, make_straight_plan
 from planner_jax.task.intercept.problem import (
@@ -147,13 +147,13 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         problem = self.problem
         found = search_reach(case, attempt, is_time_free=problem.is_time_free, layers=layers)
 
-        def solve_without_last_stage(chance: reach.Chance) -> InterceptPlan:
+        def solve_without_last_stage(chance: Chance) -> InterceptPlan:
             guess = self._guess(case, found, chance, attempt)
             stages = problem.list_stages(attempt)[:-1]
             points, steps = problem.run_stages(case, found.field, guess, attempt, stages)
             return problem.decode(case, points[-1], steps)
 
-        def solve_along(chance: reach.Chance) -> InterceptPlan:
+        def solve_along(chance: Chance) -> InterceptPlan:
             return self._solve_along(case, found, chance, attempt)
 
         solve = solve_along if self.tries_all else solve_without_last_stage
@@ -165,16 +165,14 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         return self._explain(case, attempt, found, plan)
 
     def _solve_along(
-        self, case: InterceptCase, found: Found, chance: reach.Chance, attempt: Search
+        self, case: InterceptCase, found: Found, chance: Chance, attempt: Search
     ) -> InterceptPlan:
         """Return the plan that one random path leads to, after all stages."""
         guess = self._guess(case, found, chance, attempt)
         stages = self.problem.list_stages(attempt)
         return self.problem.refine(case, found.field, guess, attempt, stages)
 
-    def _guess(
-        self, case: InterceptCase, found: Found, chance: reach.Chance, attempt: Search
-    ) -> Guess:
+    def _guess(self, case: InterceptCase, found: Found, chance: Chance, attempt: Search) -> Guess:
         """Draw a random path to one of the first layers that reach the target, or to any layer."""
         layer = found.grid.num
         if self.problem.is_time_free:

@@ -25,8 +25,9 @@ from planner_jax.optimise.levenberg import LevenbergConfig, LevenbergState, Mode
 from planner_jax.optimise.newton import NewtonConfig
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.problem import Round
-from planner_jax.plane import reach
+from planner_jax.plane.cell_paths import CellPath
 from planner_jax.plane.distance_field import DistanceField
+from planner_jax.plane.reach import Grid
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.motion import Quadratic, by_unknowns, motion
 from planner_jax.task.intercept.plan import InterceptPlan, make_plan
@@ -118,9 +119,7 @@ class MotionProblem:
         """Return a guess at unknowns (n,) for stages that follow no path of cells."""
         return Guess(point=point, places=jnp.zeros((self.pieces, 2), point.dtype))
 
-    def guess_along(
-        self, case: InterceptCase, grid: reach.Grid, path: reach.CellPath, layer: Array
-    ) -> Guess:
+    def guess_along(self, case: InterceptCase, grid: Grid, path: CellPath, layer: Array) -> Guess:
         """Return a guess along a path of cells up to a layer."""
         width = 2.0 * np.pi / grid.lattice.headings
         pace = case.limits.speed / (grid.lattice.levels - 1)

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.typing import ArrayLike
+from numpy.typing import ArrayLike
 
 from planner_jax.core.checks import require_beginning, require_kind, require_path
 from planner_jax.core.planner import Planner

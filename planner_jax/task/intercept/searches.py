@@ -10,7 +10,7 @@ from jax import Array
 
 from planner_jax.core.protocol import Attempt
 from planner_jax.optimise.levenberg import LevenbergConfig
-from planner_jax.plane import reach
+from planner_jax.plane import cell_paths, reach
 from planner_jax.plane.distance_field import DistanceField, distance_field
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.terms import discs_of, wrapped
@@ -35,7 +35,7 @@ class Search(Attempt):
     discs: int = 3  # that stand for the body in least squares
     seed: int = 0  # of the paths
     drawn: int = 4  # paths for each that is tried: the smoothest of them
-    directness: float = 2.0  # of these paths; see `reach.draw_path`
+    directness: float = 2.0  # of these paths; see `cell_paths.draw_path`
     lattice: reach.Lattice = reach.Lattice()
     girth: float = 1.0  # of the body in the reach set; less finds paths that rounding closes
 
@@ -47,9 +47,9 @@ class Search(Attempt):
         starts = max(_ROOM * self.ways, round(_ROOM_OF_WORD * words))
         object.__setattr__(self, "starts", starts)
 
-    def draw_chances(self) -> reach.Chance:
+    def draw_chances(self) -> cell_paths.Chance:
         """Draw the noise of every path; leaves have a leading axis for the paths."""
-        return reach.draw_chance(self.lattice, self.ways, self.seed, self.drawn)
+        return cell_paths.draw_chance(self.lattice, self.ways, self.seed, self.drawn)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -169,11 +169,12 @@ def _meeting_cells(
 
 
 def draw_cell_path(
-    case: InterceptCase, found: Found, layer: Array, chance: reach.Chance, directness: float
-) -> reach.CellPath:
+    case: InterceptCase, found: Found, layer: Array, chance: cell_paths.Chance, directness: float
+) -> cell_paths.CellPath:
     """Draw a random path of cells that meets the target at a layer () int32."""
     cells, there = _meeting_cells(case, found.grid, found.reach, layer)
-    return reach.draw_smooth_path(found.grid, found.reach, layer, cells, there, chance, directness)
+    draw = cell_paths.draw_smooth_path
+    return draw(found.grid, found.reach, layer, cells, there, chance, directness)
 
 
 # Written out, since published cases are drawn by it.
