@@ -37,8 +37,8 @@ from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin, 
 from planner_jax.core.choices import EFFORTS
 from planner_jax.core.errors import install_line
 from planner_jax.core.protocol import FEASIBILITY_TOLERANCE
+from planner_jax.optimise.chain_curvature import BETWEEN_NODES
 from planner_jax.planning.decided import DecidedPlanner
-from planner_jax.task.segments import BETWEEN_NODES
 from planner_jax.trajectory.polynomial import snap_energy
 
 # By task: the suite, and the module that writes its problem down.

@@ -16,6 +16,8 @@ it, on cases that no network has seen.
 import argparse
 import dataclasses
 import functools
+import io
+import math
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -30,11 +32,9 @@ import planner_jax as pj
 import planner_jax.task
 from planner_jax.benchmarks.cost_gap import to_the_optimum
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
-from planner_jax.optimise import learned_start
-from planner_jax.optimise.learned_start import StartNetwork
+from planner_jax.optimise.shipped import StartNetwork
 from planner_jax.planning.decided import first_choice
-from planner_jax.task.catch import default_planner as catch_exact
-from planner_jax.task.hit import default_planner as hit_exact
+from planner_jax.task.hit.default_planner import SUPPLE
 
 _POOL = 262_144  # cases that are drawn at first, and taken in another order again and again
 _BATCH = 8192
@@ -161,7 +161,6 @@ class _Learnt:
     file: str  # below planner_jax.task
     draw: Callable[[int, int], Any]
     planner: Any  # without the network
-    features: Callable[[Any], Any]
     usual: Callable[[int, int], Any]  # cases of the usual suite
     hidden: tuple[int, ...] = (128, 128)
     floor: float = 0.0  # added to a cost, so that little is gained where it is far below
@@ -177,14 +176,12 @@ TASKS = {
         "hit/start_exact-12.npz",
         hits,
         pj.hit.ExactHit(learned=False),
-        hit_exact.start_features,
         lambda num, seed: pj.hit.draw(num, seed=seed),
     ),
     "hard-hit": _Learnt(
         "hit/start_exact-12-supple.npz",
         hard_hits,
-        pj.hit.ExactHit(learned=False).changed(hit_exact.SUPPLE),
-        hit_exact.start_features,
+        pj.hit.ExactHit(learned=False).changed(SUPPLE),
         hard_hits,
         hidden=(160, 160),
         floor=3e-5,
@@ -194,10 +191,41 @@ TASKS = {
         "catch/start_exact-6.npz",
         catches,
         pj.catch.ExactCatch(learned=False),
-        catch_exact.start_features,
         _throws,
     ),
 }
+
+
+def make_untrained(
+    features: np.ndarray, outputs: int, hidden: tuple[int, ...], seed: int = 0
+) -> StartNetwork:
+    """Return a network that adds nothing yet, for features (B, F) of a batch of cases."""
+    random = np.random.default_rng(seed)
+    sizes = (features.shape[-1], *hidden, outputs)
+    weights = [
+        random.normal(size=(a, b)) / math.sqrt(a) for a, b in zip(sizes, sizes[1:], strict=False)
+    ]
+    weights[-1] *= 0.0
+    return StartNetwork(
+        mean=features.mean(axis=0),
+        deviation=np.maximum(features.std(axis=0), 1e-3),
+        weights=tuple(each.astype(np.float32) for each in weights),
+        biases=tuple(np.zeros(size, np.float32) for size in sizes[1:]),
+    )
+
+
+def to_bytes(network: StartNetwork) -> bytes:
+    """Return a network as an archive of arrays in half precision, which is more than it knows."""
+    arrays = {"mean": network.mean, "deviation": network.deviation}
+    for k, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
+        arrays |= {f"weight{k}": weight, f"bias{k}": bias}
+    file = io.BytesIO()
+    rounded: Any = {
+        name: np.asarray(array).astype(np.float32 if array.ndim == 1 else np.float16)
+        for name, array in arrays.items()
+    }
+    np.savez_compressed(file, **rounded)
+    return file.getvalue()
 
 
 def train(learnt: _Learnt, minutes: float, seed: int, say: Callable[[str], None]) -> StartNetwork:
@@ -206,8 +234,8 @@ def train(learnt: _Learnt, minutes: float, seed: int, say: Callable[[str], None]
     pool = jax.device_put(jax.tree.map(jnp.asarray, learnt.draw(_POOL, seed)))
     prepare = jax.jit(jax.vmap(planner.prepare))
     few = prepare(jax.tree.map(lambda leaf: leaf[:16_384], pool))
-    features = np.asarray(jax.jit(jax.vmap(learnt.features))(few), np.float64)
-    network = learned_start.untrained(features, len(planner.scale), learnt.hidden)
+    features = np.asarray(jax.jit(jax.vmap(planner.start_features))(few), np.float64)
+    network = make_untrained(features, len(planner.scale), learnt.hidden)
     params = jax.tree.map(jnp.asarray, (network.weights, network.biases))
 
     def loss(params: Any, cases: Any) -> Any:
@@ -215,7 +243,7 @@ def train(learnt: _Learnt, minutes: float, seed: int, say: Callable[[str], None]
 
         def of_case(case: Any) -> Any:
             context = planner.prepare(case)
-            guess = planner.guesses(context, 1)[0] + own(learnt.features(context))
+            guess = planner.guesses(context, 1)[0] + own(planner.start_features(context))
             return jnp.log(planner.objective(guess, context).cost + learnt.floor)
 
         logs = jax.vmap(of_case)(cases)
@@ -304,7 +332,7 @@ def main() -> None:
         for task in options.tasks:
             if options.train:
                 network = train(TASKS[task], options.train, options.seed, bench.say)
-                shipped_file(task).write_bytes(learned_start.to_bytes(network))
+                shipped_file(task).write_bytes(to_bytes(network))
                 bench.say(f"wrote {shipped_file(task).name}")
             if not options.only_train:
                 compare(bench, task, options.num)

@@ -4,13 +4,16 @@
 
 Hits: serves of the generator (seed 7), 100 of each hard kind, so that limits are active.
 Catches: throws of the suite `hard`, at limits x 1 and 0.8; one segment serves for all.
-Prints the largest ratio to the shipped scale, and of how many cases the referee accepts the plan
-that is made with the measured one; --write makes the shipped files anew.
+Scale i is 1 / sqrt(floor + median H_ii), where H = J^T J is the Gauss-Newton curvature of the
+planner's residuals in SI units, and the median is over cases, each taken at its first guess and at
+a solution. Prints the largest ratio to the shipped scale, and of how many cases the referee accepts
+the plan that is made with the measured one; --write makes the shipped files anew.
 """
 
 import dataclasses
 import functools
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +25,13 @@ import planner_jax as pj
 import planner_jax.task
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
 from planner_jax.core.registry import task_named
-from planner_jax.optimise.scaling import measure_scale
+from planner_jax.cost.quadrotor import limits_along
+from planner_jax.optimise.chain import ChainPlanner
+from planner_jax.optimise.lbfgs import LbfgsConfig
+from planner_jax.optimise.multistart import minimise
 from planner_jax.planning.decided import first_choice
+from planner_jax.trajectory.chain import Chain, chain_motion, chain_rows
+from planner_jax.trajectory.proportional_minco import trajectory_energy
 
 HIT_PIECES, CATCH_PIECES = (6, 12), (6,)
 
@@ -33,6 +41,91 @@ _FIRST_HIT = (0.05, 0.1, 0.2, 0.6, 0.8, 30.0, 30.0, 30.0)
 _FIRST_CATCH = (0.03, 0.5, 0.5, 0.6, 0.6, 0.6, 2.0, 2.0, 2.0, 40.0, 40.0, 30.0)
 # Curvature taken as none: easy throws hardly feel the place in the net and the last jerk.
 _CATCH_FLOOR = 0.1
+
+
+# Of a planner, a point (n,) and its context, residuals (R,).
+Residuals = Callable[[Any, jax.Array, Any], jax.Array]
+_ROUNDS = 3  # of measuring with the scale that the round before has found
+
+
+def curvature_diagonal(residuals: Callable[[jax.Array], jax.Array], point: jax.Array) -> jax.Array:
+    """Return the diagonal of J^T J of a residual function at a point (n,), shape (n,)."""
+    jacobian = jax.jacfwd(residuals)(point)
+    return jnp.sum(jacobian**2, axis=0)
+
+
+def measure_scale(
+    planner: Any, cases: Any, residuals: Residuals, *, floor: float = 1e-4
+) -> np.ndarray:
+    """Measure the scale of every decision variable on a batch of cases.
+
+    Solutions depend on the scale they were found with, so measuring is repeated with its own
+    result; two or three rounds settle it.
+
+    Args:
+        planner: a frozen dataclass with a `scale` field, the first value of which only has
+            to be sensible.
+        cases: a batch; a few hundred, hard ones among them, so that limits are active.
+        residuals: of the planner, a point (n,) and its context: (R,) whose squares sum to about
+            twice the objective near its minimum.
+        floor: curvature that is taken as none, so that a variable which hardly matters keeps
+            a finite scale.
+
+    Returns:
+        (n,) float64.
+    """
+    config = LbfgsConfig(max_steps=30)
+    for _ in range(_ROUNDS):
+
+        def diagonals(case: Any, planner: Any = planner) -> jax.Array:
+            context = planner.prepare(case)
+            scale = jnp.asarray(planner.scale)
+            start = planner.guesses(context, 1)[0]
+            optimum = minimise(lambda x: planner.objective(x, context), start, config)
+
+            def at(point: jax.Array) -> jax.Array:
+                return curvature_diagonal(
+                    lambda natural: residuals(planner, natural / scale, context), point * scale
+                )
+
+            return at(start) + at(optimum.point)
+
+        curvature = np.asarray(jax.jit(jax.vmap(diagonals))(cases), np.float64)
+        scale = 1.0 / np.sqrt(floor + np.nanmedian(curvature, axis=0))
+        planner = dataclasses.replace(planner, scale=tuple(scale.tolist()))
+    return np.asarray(planner.scale)
+
+
+def chain_residuals(planner: ChainPlanner, point: jax.Array, context: Any) -> jax.Array:
+    """Return the residuals of a planner of segments: squared hinges, energy and time.
+
+    The smoothed hinge bends at most with 3 / (2 hinge_width); the residuals bend alike.
+    """
+    case, along = context.case, planner.along(planner.nodes, context.case)
+    offsets, natural = planner.split(point)
+    ends = planner.meet(natural, context)
+    durations = ends.durations / planner.num_pieces
+    rows = chain_rows(case.head_state, ends.tail_states, durations)
+    chain = Chain(rows=rows, offsets=offsets, piece_durations=durations)
+    active = planner.active(context)
+    motion = chain_motion(planner.maps, planner.nodes, chain, along.orders)
+    excess = jnp.stack(limits_along(motion, (case.gravity, case.limits, case.extras)))
+    excess = jnp.where(active[:, None], excess, -1.0)
+    inside = jnp.maximum(excess + jnp.asarray(along.margins, point.dtype)[:, None, None], 0.0)
+    inside = inside * jnp.sqrt(durations[:, None] * jnp.asarray(along.weights(), point.dtype))
+    at_ends = jnp.sqrt(planner.end_weight) * jnp.maximum(ends.excess + planner.margin, 0.0)
+    bend = jnp.sqrt(1.5 / planner.hinge_width)
+    if planner.time_weight:
+        energy = jax.vmap(functools.partial(trajectory_energy, planner.maps))
+        energy = jnp.where(active, energy(rows, offsets, durations), 0.0)
+        smooth = jnp.sqrt(2.0 * planner.energy_weight * jnp.maximum(energy, 1e-6))
+    else:
+        unit = jnp.sqrt(planner.energy_weight / durations ** (2 * planner.maps.order - 1))
+        smooth = unit[:, None, None] * np.sqrt(planner.maps.offset_energy) * offsets
+    spent = jnp.where(active, ends.durations, 1e-6)
+    late = jnp.sqrt(2.0 * planner.time_weight * jnp.maximum(spent, 1e-6))
+    parts = (bend * inside, bend * at_ends, smooth, late)
+    return jnp.concatenate([part.ravel() for part in parts])
 
 
 def hard_serves(num: int, seed: int) -> pj.hit.HitCase:
@@ -97,7 +190,7 @@ def measure(bench: Bench, task: str, num: int, seed: int) -> dict[str, np.ndarra
     cases, found = draw(num, seed), {}
     shipped = json.loads(shipped_file(task).read_text("utf-8"))
     for name, planner in planners().items():
-        scale = found[name] = measure_scale(planner, cases, **options)
+        scale = found[name] = measure_scale(planner, cases, chain_residuals, **options)
         bench.say(f"{task} {name} {np.array2string(scale, precision=3, max_line_width=100)}")
         ratio = None
         if name in shipped:

@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array, lax
 
 from planner_jax.task.catch.case import CatchCase, CatchChoice
-from planner_jax.task.catch.chain import targets_at
+from planner_jax.task.catch.context import targets_at
 from planner_jax.task.catch.estimate import INSTANT, Timetable, arrivals, earliest_next, top_speed
 
 HANDICAP = 4.0  # [s], greatest

@@ -18,7 +18,7 @@ from planner_jax.runs.source import Chunk
 from planner_jax.sims.loop_state import Flown
 from planner_jax.sims.model import World
 from planner_jax.sims.robot import Robot
-from planner_jax.task.hit.validate import fly, landing
+from planner_jax.task.hit.court import fly, landing
 
 FLIGHTS = "flights"
 _FAR = 20.0  # [m], where balls wait that are not in flight

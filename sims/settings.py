@@ -174,9 +174,9 @@ class CatchFly(BallFly):
         Raises:
             ArgumentError: the policy's file cannot be read.
         """
-        from planner_jax.task.named_decision import named_decision
+        from planner_jax.task.arguments import find_decision
 
-        named_decision(DECISIONS, self.decide, TRAINED)
+        find_decision(DECISIONS, self.decide, TRAINED)
         return super().flight()
 
     def check_rate(self) -> None:

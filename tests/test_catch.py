@@ -16,11 +16,11 @@ from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.multistart import solve_round
 from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.problem import Round, Stage
-from planner_jax.optimise.scaling import shipped_scale
+from planner_jax.optimise.shipped import shipped_scale
 from planner_jax.planning.decided import first_choice
 from planner_jax.planning.plan import plan
 from planner_jax.referee.catch import referee_catches
-from planner_jax.task.catch.chain import nearest_upright
+from planner_jax.task.catch.context import nearest_upright
 from planner_jax.task.catch.decide import Greedy
 from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.catch.suites import draw

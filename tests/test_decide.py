@@ -17,13 +17,13 @@ from planner_jax.planning import drive
 from planner_jax.planning.decided import DecidedPlanner, first_choice
 from planner_jax.planning.plan import plan
 from planner_jax.referee.catch import referee_catches
-from planner_jax.task.catch.beam import beam
 from planner_jax.task.catch.decide import (
     LENGTHS,
     Best,
     Given,
     Greedy,
     Random,
+    beam,
     closest_approach,
     optimal_time_ratio,
 )

@@ -8,14 +8,8 @@ import numpy as np
 import pytest
 
 import planner_jax as pj
-from planner_jax.optimise.learned_start import (
-    REACH,
-    StartNetwork,
-    cheaper_start,
-    shipped_network,
-    to_bytes,
-    untrained,
-)
+from planner_jax.benchmarks.learn_starts import make_untrained, to_bytes
+from planner_jax.optimise.shipped import REACH, StartNetwork, cheaper_start, shipped_network
 from planner_jax.planning.decided import first_choice
 
 
@@ -69,7 +63,7 @@ def test_a_guess_that_costs_more_is_not_taken():
 
 def test_an_untrained_network_adds_nothing_and_far_features_count_as_less_far():
     features = np.random.default_rng(0).normal(size=(100, 3))
-    network = untrained(features, 2, (5,))
+    network = make_untrained(features, 2, (5,))
     np.testing.assert_array_equal(network(jnp.asarray(features[0], jnp.float32)), 0.0)
     network = dataclasses.replace(network, weights=(network.weights[0], np.ones((5, 2))))
     mean, deviation = network.mean, network.deviation

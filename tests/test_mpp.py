@@ -12,7 +12,7 @@ from planner_jax.baselines.catch.mpp import MppCatch, falling_time
 from planner_jax.core.protocol import Status, is_solved
 from planner_jax.planning.plan import plan
 from planner_jax.referee.catch import referee_catches
-from planner_jax.task.catch.chain import ordered_context, targets_at
+from planner_jax.task.catch.context import ordered_context, targets_at
 from planner_jax.task.catch.suites import draw
 
 NUM = 16

@@ -10,8 +10,8 @@ import planner_jax as pj
 from planner_jax.core.protocol import is_unsolved
 from planner_jax.core.registry import all_tasks
 from planner_jax.task.hit import court
+from planner_jax.task.hit.court import landing
 from planner_jax.task.hit.spec import REAL_SCENARIOS
-from planner_jax.task.hit.validate import landing
 
 TASKS = ("hit", "catch")
 SUITES = [(name, suite) for name in TASKS for suite in all_tasks()[name].suites]

@@ -12,6 +12,12 @@ from planner_jax.ball import flight
 from planner_jax.core.errors import ArgumentError, CaseError
 from planner_jax.task.hit import court
 from planner_jax.task.hit.case import DRAG, GRAVITY
+from planner_jax.task.hit.court import (
+    check_cases,
+    fly,
+    landing,
+)
+from planner_jax.task.hit.published import published_rates
 from planner_jax.task.hit.suites import (
     DEPTH,
     MAX_FLIGHT_TIME,
@@ -23,7 +29,6 @@ from planner_jax.task.hit.suites import (
     read_serves,
     to_cases,
 )
-from planner_jax.task.hit.validate import check_cases, fly, landing
 
 PUBLISHED = Path(__file__).resolve().parents[2] / "shared" / "data" / "serves"
 needs_published = pytest.mark.skipif(
@@ -77,7 +82,7 @@ def test_the_court_has_36_scenarios_without_mirror_images():
 
 
 def test_published_rates_have_the_known_means():
-    rates = court.published_rates()
+    rates = published_rates()
     np.testing.assert_allclose(rates.paper.mean(axis=0), [12.66, 47.86, 77.91], atol=5e-3)
     np.testing.assert_allclose(rates.trials.mean(axis=0), [9.42, 46.57, 85.38], atol=5e-3)
     np.testing.assert_allclose(rates.paper[court.SCENARIOS.index("FLR")], [0.3, 60.6, 85.4])
@@ -192,7 +197,7 @@ def test_the_published_serves_are_read_with_their_rates():
     np.testing.assert_allclose(serves.target, court.target_of(serves.scenario))
     # 250 of the 1,000 trials of each scenario: the means are near, not equal.
     rates = 100.0 * serves.published.mean(axis=0)
-    np.testing.assert_allclose(rates, court.published_rates().trials.mean(axis=0), atol=1.0)
+    np.testing.assert_allclose(rates, published_rates().trials.mean(axis=0), atol=1.0)
 
 
 # Flight on the host.

@@ -32,6 +32,7 @@ from planner_jax.sweep.run import SweepInterrupted, resume_sweep, start_sweep
 from planner_jax.sweep.sampled_motion import body_rate, net_thrust, sample_motion
 from planner_jax.task.hit import court
 from planner_jax.task.hit.default_planner import ExactHit
+from planner_jax.task.hit.published import published_rates
 from planner_jax.task.hit.spec import REAL_SCENARIOS
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
@@ -325,7 +326,7 @@ def test_resuming_needs_the_serves_that_the_run_began_with(tmp_path, monkeypatch
 
 def test_the_table_has_all_scenarios_beside_both_published_rates(finished):
     _, manifest = finished
-    table, rates = HitSweep(TASK).table(manifest), court.published_rates()
+    table, rates = HitSweep(TASK).table(manifest), published_rates()
     assert [row[0] for row in table.rows] == [*court.SCENARIOS, "all"]
     assert table.header[-2:] == ["bat, paper %", "bat, trial files %"]
     column = court.PLANNERS.index("bat")

@@ -5,7 +5,6 @@ back through every step of a flight for the slopes of a few numbers.
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +16,8 @@ from planner_jax.core.arithmetic import reciprocal
 
 _FLIGHT_STEPS = 10  # the landing of a 2 s flight is then right to 0.2 mm
 _COARSE_STEPS = 8  # enough for slopes; fewer go astray where drag is strong
+
+Tangent = Array | SymbolicZero
 
 
 def aim_drag_free(pos: Array, target: Array, flight_time: Array, gravity: Array) -> Array:
@@ -60,7 +61,7 @@ def aim_with_drag(
 def _aimed(way: Array, flight_time: Array, drag: Array, gravity: Array) -> Array:
     """`aim_with_drag` over a way (3,) [m]."""
 
-    def newton_step(_: Any, near: tuple[Array, Array]) -> tuple[Array, Array]:
+    def newton_step(_: Array, near: tuple[Array, Array]) -> tuple[Array, Array]:
         def landing(vel: Array) -> tuple[Array, Array]:
             landed = _way(vel, flight_time, drag, gravity, _COARSE_STEPS)
             return landed, landed
@@ -73,13 +74,13 @@ def _aimed(way: Array, flight_time: Array, drag: Array, gravity: Array) -> Array
     start = aim_drag_free(jnp.zeros_like(way), way, flight_time, gravity)
     vel, slope = lax.fori_loop(0, 2, newton_step, (start, jnp.eye(3, dtype=start.dtype)))
 
-    def chord_step(_: Any, vel: Array) -> Array:
+    def chord_step(_: Array, vel: Array) -> Array:
         return vel - _solve3(slope, _way(vel, flight_time, drag, gravity) - way)
 
     return lax.fori_loop(0, 2, chord_step, vel)
 
 
-def _aimed_jvp(primals: Sequence[Array], tangents: Sequence[Any]) -> tuple[Array, Array]:
+def _aimed_jvp(primals: Sequence[Array], tangents: Sequence[Tangent]) -> tuple[Array, Array]:
     way, *given = primals
     by_way, *others = tangents
     vel = _aimed(way, *given)
@@ -91,7 +92,7 @@ def _aimed_jvp(primals: Sequence[Array], tangents: Sequence[Any]) -> tuple[Array
     return vel, _solve3(by_vel, sum(changes[1:], changes[0]))
 
 
-def _moving(tangents: Sequence[Any]) -> list[int]:
+def _moving(tangents: Sequence[Tangent]) -> list[int]:
     """Places of the arguments that change at all."""
     return [k for k, each in enumerate(tangents) if not isinstance(each, SymbolicZero)]
 
@@ -140,7 +141,7 @@ def _climbed(vel: Array, flight_time: Array, drag: Array, gravity: Array) -> Arr
 _climb = jax.custom_jvp(_climbed)
 
 
-def _climb_jvp(primals: Sequence[Array], tangents: Sequence[Any]) -> tuple[Array, Array]:
+def _climb_jvp(primals: Sequence[Array], tangents: Sequence[Tangent]) -> tuple[Array, Array]:
     moving = _moving(tangents)
     slopes = jax.jacfwd(_climbed, moving)(*primals)
     changes = [jnp.sum(slope * tangents[k]) for k, slope in zip(moving, slopes, strict=True)]

@@ -4,12 +4,13 @@ World frame, z up, SI units. Everything here is written for one ball; `jax.vmap`
 """
 
 import math
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array
+from jaxtyping import PyTree
 
 from planner_jax.core.arithmetic import components
 from planner_jax.core.checks import require_kind, require_number, shape_of
@@ -27,7 +28,7 @@ class BallState:
     vel: Array  # (3,) [m/s]
 
 
-def require_ball(ball: Any) -> None:
+def require_ball(ball: object) -> None:
     """Raise unless an argument `ball` is one ball.
 
     Raises:
@@ -64,7 +65,7 @@ def ball_acceleration(vel: Vector, drag: Array, gravity: Array) -> Vector:
     # The inner where keeps the gradient of sqrt finite for a ball at rest.
     speed = jnp.where(moving, jnp.sqrt(jnp.where(moving, speed_squared, 1.0)), 0.0)
     braking = -drag * speed
-    acc: Any = (braking * x, braking * y, braking * z - gravity)
+    acc: PyTree = (braking * x, braking * y, braking * z - gravity)
     if not isinstance(vel, tuple):
         acc = jnp.stack(acc)
     return acc
@@ -77,7 +78,7 @@ def rk4_step(ball: BallState, duration: Array, drag: Array, gravity: Array) -> B
     """
 
     def rate(state: BallState) -> BallState:
-        slopes: Any = ball_acceleration(state.vel, drag, gravity)
+        slopes: PyTree = ball_acceleration(state.vel, drag, gravity)
         return BallState(pos=state.vel, vel=slopes)
 
     def ahead(slope: BallState, step: Array) -> BallState:

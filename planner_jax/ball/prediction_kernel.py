@@ -12,8 +12,8 @@ from collections.abc import Callable, Iterable, Sequence
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jax.tree_util import PyTreeDef
 from jax.typing import ArrayLike
+from jaxtyping import PyTreeDef
 
 from planner_jax.ball.flight import BallState, rk4_step
 from planner_jax.lanes.pallas import block_width, kernel_by_lanes

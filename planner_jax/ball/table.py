@@ -1,14 +1,15 @@
 """The path of a target from a table of a user's own: recorded, simulated, or sent by a tracker."""
 
-from typing import Any
-
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.core import Tracer
+from jax.typing import ArrayLike, DTypeLike
+from jaxtyping import PyTree
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from planner_jax.ball.prediction import PathTable, convolution_weights
+from planner_jax.core.arithmetic import Numbers
 from planner_jax.core.checks import floating, require_number, shape_of
 from planner_jax.core.choices import require_size
 from planner_jax.core.errors import ArgumentError
@@ -18,13 +19,13 @@ _CHECKED = (0.2, 0.5, 0.8)  # shares of the way between two nodes, where errors 
 
 
 def table_path(
-    times: Any,
-    positions: Any,
-    velocities: Any = None,
+    times: ArrayLike,
+    positions: ArrayLike,
+    velocities: ArrayLike | None = None,
     *,
     nodes: int | None = None,
     error: float = 1e-3,
-    dtype: Any = jnp.float32,
+    dtype: DTypeLike = jnp.float32,
 ) -> PathTable:
     """The path through positions at times that need not be evenly spaced.
 
@@ -69,7 +70,7 @@ def table_path(
     return PathTable(pos, vel, jnp.full(pos.shape[:-2], resolution, dtype))
 
 
-def _checked_times(times: Any) -> np.ndarray:
+def _checked_times(times: ArrayLike) -> np.ndarray:
     if isinstance(times, Tracer):
         raise ArgumentError("times", "known when a program is compiled", shown="traced ones")
     shape = shape_of("times", times)
@@ -86,7 +87,7 @@ def _checked_times(times: Any) -> np.ndarray:
     return times
 
 
-def _checked(name: str, value: Any, num: int) -> Any:
+def _checked(name: str, value: ArrayLike, num: int) -> Numbers:
     """Values (..., K, 3), in float64 if they are not traced."""
     if shape_of(name, value)[-2:] != (num, 3):
         raise ArgumentError(name, f"the shape (..., {num}, 3)", np.shape(value), verb="have")
@@ -98,25 +99,25 @@ def _checked(name: str, value: Any, num: int) -> Any:
     return value
 
 
-def _read(times: np.ndarray, values: list[Any], at: np.ndarray, order: int) -> Any:
+def _read(times: np.ndarray, values: list[PyTree], at: np.ndarray, order: int) -> PyTree:
     """Derivative (..., T, 3) of the spline at times (T,): linear in the values."""
     units, none = np.eye(times.size), np.zeros((times.size, times.size))
     if len(values) == 1:
         splines = [CubicSpline(times, units)]
     else:
         splines = [CubicHermiteSpline(times, *pair) for pair in ((units, none), (none, units))]
-    total: Any = 0.0
+    parts = []
     for spline, value in zip(splines, values, strict=True):
         weights = spline(at, order)
         if isinstance(value, Tracer):
             weights = jnp.asarray(weights, value.dtype)
-            total = total + jnp.matmul(weights, value, precision=lax.Precision.HIGHEST)
+            parts.append(jnp.matmul(weights, value, precision=lax.Precision.HIGHEST))
         else:
-            total = total + weights @ value
-    return total
+            parts.append(weights @ value)
+    return sum(parts[1:], parts[0])
 
 
-def _fewest_nodes(times: np.ndarray, values: list[Any], error: float) -> int:
+def _fewest_nodes(times: np.ndarray, values: list[PyTree], error: float) -> int:
     """A power of two of nodes with which the table is as near to the spline as it has to be."""
     if any(isinstance(value, Tracer) for value in values):
         raise ArgumentError("nodes", "given where positions are traced", shown="none")

@@ -5,7 +5,7 @@ gives a `BallState`, or the position alone. The ones here cover the papers' targ
 class serves as well.
 """
 
-from typing import Any, ClassVar, Protocol
+from typing import ClassVar, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ from planner_jax.ball.flight import BallState, linear_drag_flight
 from planner_jax.core.rules import NOT_NEGATIVE, Field, Table
 
 
+@runtime_checkable
 class TargetPath(Protocol):
     """What a planner needs to know about a target."""
 
@@ -29,8 +30,8 @@ def state_at(path: TargetPath, time: Array) -> BallState:
 
     Where its class says only the position, the velocity is the derivative by the time.
     """
-    state: Any = path.at(time)
-    if hasattr(state, "vel"):
+    state = path.at(time)
+    if isinstance(state, BallState):
         return state
     pos, vel = jax.jvp(path.at, (time,), (jnp.ones_like(time),))
     return BallState(pos=pos, vel=vel)

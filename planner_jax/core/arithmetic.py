@@ -6,7 +6,10 @@ for the number of loops, not for what they compute.
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
+
+Numbers = Array | np.ndarray
 
 
 @jax.custom_jvp

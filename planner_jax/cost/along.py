@@ -9,13 +9,13 @@ of this file, which are the kernels' reference.
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.custom_derivatives import SymbolicZero
+from jaxtyping import PyTree
 
 from planner_jax.cost.peaks import greatest_by_parabolas
 from planner_jax.cost.penalty import joined_trapezoid_weights, smoothed_hinge
@@ -25,9 +25,9 @@ from planner_jax.trajectory.proportional_minco import ProportionalMinco, sample_
 
 # Of a motion and any pytree of numbers: E arrays, each of the shape of the motion's height,
 # positive where a limit is exceeded. It must know no other array.
-Excess = Callable[[Motion, Any], tuple[Array, ...]]
+Excess = Callable[[Motion, PyTree], tuple[Array, ...]]
 # Of the same: a cost a second at each sample.
-Rate = Callable[[Motion, Any], Array]
+Rate = Callable[[Motion, PyTree], Array]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Along:
 
 
 def integrate_along(
-    along: Along, columns: Array, piece_durations: Array, parameters: Any
+    along: Along, columns: Array, piece_durations: Array, parameters: PyTree
 ) -> tuple[Array, Array]:
     """Integrated penalties and greatest excesses of N segments.
 
@@ -100,7 +100,7 @@ def integrate_along(
 
 
 def greatest_along(
-    along: Along, columns: Array, piece_durations: Array, parameters: Any
+    along: Along, columns: Array, piece_durations: Array, parameters: PyTree
 ) -> tuple[Array, ...]:
     """Greatest excess over every limit along N segments; the arguments of `integrate_along`.
 
@@ -156,7 +156,7 @@ def _integral(along: Along) -> Callable:
 
 
 def _greatest_of_segments(
-    along: Along, columns: Array, durations: Array, parameters: Any
+    along: Along, columns: Array, durations: Array, parameters: PyTree
 ) -> tuple[Array, ...]:
     """Greatest excess over every limit: E arrays (N,)."""
 
@@ -169,35 +169,39 @@ def _greatest_of_segments(
     return jax.vmap(of_segment)(columns, durations)
 
 
-def _values(along: Along, columns: Array, durations: Array, parameters: Any) -> tuple[Array, Array]:
+def _values(
+    along: Along, columns: Array, durations: Array, parameters: PyTree
+) -> tuple[Array, Array]:
     """Penalties and greatest excesses, (N,) each."""
     segments = jax.vmap(functools.partial(_of_segment, along), in_axes=(0, 0, None))
     return segments(columns, durations, parameters)
 
 
-def _slopes(along: Along, columns: Array, durations: Array, parameters: Any) -> tuple[Array, ...]:
+def _slopes(
+    along: Along, columns: Array, durations: Array, parameters: PyTree
+) -> tuple[Array, ...]:
     """Values, and slopes of the penalties by columns (N, C, 3) and durations (N,)."""
-    value: Any = lambda c, h: _values(along, c, h, parameters)  # noqa: E731
+    value = lambda c, h: _values(along, c, h, parameters)  # noqa: E731
     penalties, pull_back, worst = jax.vjp(value, columns, durations, has_aux=True)
     return penalties, worst, *pull_back(jnp.ones_like(penalties))
 
 
-def _slopes_by_all(along: Along, columns: Array, durations: Array, parameters: Any) -> tuple:
+def _slopes_by_all(along: Along, columns: Array, durations: Array, parameters: PyTree) -> tuple:
     """`_slopes`, and those by the parameters, which every segment has for itself: N in front."""
 
-    def of_segment(columns: Array, duration: Array, parameters: Any) -> tuple:
-        value: Any = functools.partial(_of_segment, along)
+    def of_segment(columns: Array, duration: Array, parameters: PyTree) -> tuple:
+        value = functools.partial(_of_segment, along)
         penalty, pull_back, worst = jax.vjp(value, columns, duration, parameters, has_aux=True)
         return penalty, jax.lax.stop_gradient(worst), *pull_back(jnp.ones_like(penalty))
 
-    segments: Any = jax.vmap(of_segment, in_axes=(0, 0, None))
+    segments = jax.vmap(of_segment, in_axes=(0, 0, None))
     return segments(columns, durations, parameters)
 
 
 def _curvature(along: Along, primals: tuple, tangents: tuple) -> tuple:
     """Derivative of `_slopes_by_all` along tangents; None for those of still parameters."""
     moves = 2 if tangents[2] is None else 3
-    slopes: Any = lambda *moving: _slopes_by_all(along, *moving, *primals[moves:])  # noqa: E731
+    slopes = lambda *moving: _slopes_by_all(along, *moving, *primals[moves:])  # noqa: E731
     return jax.jvp(slopes, primals[:moves], tangents[:moves])[1]
 
 
@@ -206,19 +210,19 @@ def _contracted(slope: Array, tangent: Array) -> Array:
     return jnp.sum(slope * tangent, axis=tuple(range(1, slope.ndim)))
 
 
-def _is_still(tangent: Any) -> bool:
+def _is_still(tangent: PyTree) -> bool:
     return all(isinstance(leaf, SymbolicZero) for leaf in jax.tree.leaves(tangent))
 
 
-def _dense(tangent: Any) -> Any:
+def _dense(tangent: PyTree) -> PyTree:
     if not isinstance(tangent, SymbolicZero):
         return tangent
-    aval: Any = tangent.aval
+    aval: PyTree = tangent.aval
     return jnp.zeros(aval.shape, aval.dtype)
 
 
 def _of_segment(
-    along: Along, columns: Array, duration: Array, parameters: Any
+    along: Along, columns: Array, duration: Array, parameters: PyTree
 ) -> tuple[Array, Array]:
     """Penalty and greatest excess of one segment."""
     weights = jnp.asarray(along.weights(), columns.dtype)

@@ -9,13 +9,13 @@ those entries are made that are asked for.
 
 import dataclasses
 import functools
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array, lax
+from jaxtyping import PyTree
 
 from planner_jax.core.arithmetic import reciprocal
 from planner_jax.cost.along import Along
@@ -47,7 +47,7 @@ class AlongCurvature:
 
 
 def curvature_along(
-    along: Along, columns: Array, piece_duration: Array, parameters: Any, given: int = 0
+    along: Along, columns: Array, piece_duration: Array, parameters: PyTree, given: int = 0
 ) -> AlongCurvature:
     """Integrated penalties of one segment with first and second derivatives.
 
@@ -146,7 +146,7 @@ def block_and_diagonal(
 
 
 def _at_samples(
-    along: Along, motion: Array, parameters: Any
+    along: Along, motion: Array, parameters: PyTree
 ) -> tuple[Array, Array, Array, dict[tuple[Slot, Slot], Array]]:
     """Penalties (K,), their greatest excess, slopes (orders, K, 3) and second derivatives (K,).
 
@@ -159,7 +159,7 @@ def _at_samples(
 
     def value(at: Array) -> tuple[Array, tuple[Array, Array]]:
         pos, vel, acc, jerk, *snap = at
-        parts: Any = {"snap": snap[0]} if snap else {}
+        parts = {"snap": snap[0]} if snap else {}
         samples = Motion(height=pos[:, 2], vel=vel, acc=acc, jerk=jerk, pos=pos, **parts)
         excess = jnp.stack(along.excess(samples, parameters))
         hinges = smoothed_hinge(excess + margins, along.hinge_width)

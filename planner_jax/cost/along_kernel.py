@@ -16,8 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, Ref
-from jax.tree_util import PyTreeDef
-from jaxtyping import PyTree
+from jaxtyping import PyTree, PyTreeDef
 
 from planner_jax.core.arithmetic import reciprocal
 from planner_jax.cost.along import Along

@@ -8,14 +8,17 @@ millimetres, peaks in between by tangents; what is smaller than that may be miss
 """
 
 from collections.abc import Sequence
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import ClassVar, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array
+from jax.typing import DTypeLike
+from jaxtyping import PyTree
 
+from planner_jax.core.arithmetic import Numbers
 from planner_jax.core.checks import shapes_told
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.rules import NOT_NEGATIVE, NOT_ZERO, POSITIVE, Field, Table, below
@@ -32,22 +35,24 @@ _CLOSE_NODES = 64
 class ExtraLimit(Protocol):
     """A limit; the planner keeps it, the referee judges it."""
 
-    def excess(self, pos: Any, vel: Any, acc: Any) -> Any:
+    def excess(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
         """Excess (...) relative to the limit, > 0 where it is broken; arguments (..., 3), SI."""
+        ...
 
 
 @runtime_checkable
 class ExtraCost(Protocol):
     """A term of the planner's cost; the referee does not look at it."""
 
-    def cost(self, pos: Any, vel: Any, acc: Any) -> Any:
-        """Cost a second (...), >= 0, integrated along the way; arguments (..., 3), SI."""
+    def cost(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
+        """Cost a second (...), >= 0, integrated along the trajectory; arguments (..., 3), SI."""
+        ...
 
 
 Extra = ExtraLimit | ExtraCost
 
 
-def _size(vector: Any) -> Any:
+def _size(vector: Numbers) -> Numbers:
     """Length (...) of vectors (..., 3); its slope at zero is zero."""
     return ((vector**2).sum(-1) + 1e-12) ** 0.5
 
@@ -58,10 +63,10 @@ class KeepOut:
 
     rules: ClassVar[Table] = (Field("radius", None, POSITIVE),)
 
-    centre: Any  # (3,) [m]
-    radius: Any  # () [m], > 0
+    centre: Numbers  # (3,) [m]
+    radius: Numbers  # () [m], > 0
 
-    def excess(self, pos: Any, vel: Any, acc: Any) -> Any:
+    def excess(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
         """Depth over radius."""
         return 1.0 - _size(pos - self.centre) / self.radius
 
@@ -72,10 +77,10 @@ class KeepOutBox:
 
     rules: ClassVar[Table] = (Field("low", None, below("high")),)
 
-    low: Any  # (3,) [m]
-    high: Any  # (3,) [m]
+    low: Numbers  # (3,) [m]
+    high: Numbers  # (3,) [m]
 
-    def excess(self, pos: Any, vel: Any, acc: Any) -> Any:
+    def excess(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
         """Depth under the nearest face, over half of the shortest side."""
         half = 0.5 * (self.high - self.low)
         return (half - abs(pos - self.low - half)).min(-1) / half.min(-1)
@@ -87,10 +92,10 @@ class Plane:
 
     rules: ClassVar[Table] = (Field("normal", None, NOT_ZERO),)
 
-    point: Any  # (3,) [m], anywhere on the plane
-    normal: Any  # (3,), of any length
+    point: Numbers  # (3,) [m], anywhere on the plane
+    normal: Numbers  # (3,), of any length
 
-    def excess(self, pos: Any, vel: Any, acc: Any) -> Any:
+    def excess(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
         """Metres beyond the plane."""
         return ((self.point - pos) * self.normal).sum(-1) / (self.normal**2).sum(-1) ** 0.5
 
@@ -101,10 +106,10 @@ class Geofence:
 
     rules: ClassVar[Table] = (Field("low", None, below("high")),)
 
-    low: Any  # (3,) [m]
-    high: Any  # (3,) [m]
+    low: Numbers  # (3,) [m]
+    high: Numbers  # (3,) [m]
 
-    def excess(self, pos: Any, vel: Any, acc: Any) -> Any:
+    def excess(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
         """Metres outside, of the worst axis."""
         half = 0.5 * (self.high - self.low)
         return (abs(pos - self.low - half) - half).max(-1)
@@ -122,11 +127,11 @@ class SpeedZone:
         Field("speed", None, POSITIVE),
     )
 
-    centre: Any  # (3,) [m]
-    radius: Any  # () [m], > 0
-    speed: Any  # () [m/s], > 0
+    centre: Numbers  # (3,) [m]
+    radius: Numbers  # () [m], > 0
+    speed: Numbers  # () [m/s], > 0
 
-    def excess(self, pos: Any, vel: Any, acc: Any) -> Any:
+    def excess(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
         """Speed over the limit, less one."""
         u = (5.0 - 4.0 * _size(pos - self.centre) / self.radius).clip(0.0, 1.0)
         return u * u * (3.0 - 2.0 * u) * _size(vel) / self.speed - 1.0
@@ -141,17 +146,17 @@ class Dislike:
         Field("weight", None, NOT_NEGATIVE),
     )
 
-    centre: Any  # (3,) [m]
-    radius: Any  # () [m], > 0
-    weight: Any  # () [1/s]; the planners' other costs are of the order of 1e-5 to 1
+    centre: Numbers  # (3,) [m]
+    radius: Numbers  # () [m], > 0
+    weight: Numbers  # () [1/s]; the planners' other costs are of the order of 1e-5 to 1
 
-    def cost(self, pos: Any, vel: Any, acc: Any) -> Any:
+    def cost(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
         """Weight * (1 - distance^2 / radius^2)^2 inside, nothing outside."""
         inside = 1.0 - ((pos - self.centre) ** 2).sum(-1) / self.radius**2
         return self.weight * inside.clip(0.0, 1.0) ** 2
 
 
-def for_batch(extras: object, batch: tuple[int, ...], dtype: Any) -> tuple[Any, ...]:
+def for_batch(extras: object, batch: tuple[int, ...], dtype: DTypeLike) -> tuple[Extra, ...]:
     """Extras whose leaves have a dtype and the axes of a batch, () or (B,), in front.
 
     Raises:
@@ -164,7 +169,7 @@ def for_batch(extras: object, batch: tuple[int, ...], dtype: Any) -> tuple[Any, 
         if isinstance(extra, type) or not isinstance(extra, ExtraLimit | ExtraCost):
             raise ArgumentTypeError("extras", "a method excess or cost", extra, verb="have")
 
-    def spread(place: int, extra: Any) -> Any:
+    def spread(place: int, extra: Extra) -> Extra:
         extra = jax.tree.map(np.asarray, extra, is_leaf=lambda x: isinstance(x, tuple | list))
         shapes = [leaf.shape for leaf in jax.tree.leaves(extra)]
         sample = np.ones((2 + max((0, *batch, *sum(shapes, ()))), 3))  # longer than any leaf
@@ -183,19 +188,19 @@ def for_batch(extras: object, batch: tuple[int, ...], dtype: Any) -> tuple[Any, 
     return tuple(spread(place, extra) for place, extra in enumerate(extras))
 
 
-def num_limits(extras: tuple[Any, ...]) -> int:
+def num_limits(extras: tuple[Extra, ...]) -> int:
     """How many of them are limits."""
     return sum(isinstance(extra, ExtraLimit) for extra in extras)
 
 
-def extra_excess(motion: Motion, extras: tuple[Any, ...]) -> tuple[Array, ...]:
+def extra_excess(motion: Motion, extras: tuple[Extra, ...]) -> tuple[Numbers, ...]:
     """The excess (N,) over each that is a limit, along samples of a motion."""
     samples = motion.pos, motion.vel, motion.acc
     return tuple(extra.excess(*samples) for extra in extras if isinstance(extra, ExtraLimit))
 
 
 def greatest_extras(
-    maps: ProportionalMinco, columns: Array, duration: Array, extras: tuple[Any, ...]
+    maps: ProportionalMinco, columns: Array, duration: Array, extras: tuple[Extra, ...]
 ) -> tuple[Array, ...]:
     """Greatest excess over each that is a limit along a whole segment, () each.
 
@@ -210,7 +215,7 @@ def greatest_extras(
     if not num_limits(extras):
         return ()
 
-    def at(pos: Array, vel: Array, acc: Array) -> tuple[Array, ...]:
+    def at(pos: Array, vel: Array, acc: Array) -> tuple[Numbers, ...]:
         return tuple(e.excess(pos, vel, acc) for e in extras if isinstance(e, ExtraLimit))
 
     def of_piece(motion: Motion, lasting: Array) -> tuple[Array, ...]:
@@ -226,7 +231,7 @@ def greatest_extras(
     return tuple(jnp.max(each) for each in greatest)
 
 
-def extra_rate(motion: Motion, given: tuple[Any, ...]) -> Array:
+def extra_rate(motion: Motion, given: tuple) -> PyTree:
     """The cost a second (N,) of all extras, which are the last of what is given."""
     samples = motion.pos, motion.vel, motion.acc
     rates = (extra.cost(*samples) for extra in given[-1] if isinstance(extra, ExtraCost))

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, Ref
-from jax.tree_util import PyTreeDef
+from jaxtyping import PyTreeDef
 
 from planner_jax.cost.along import Along
 from planner_jax.cost.along_kernel import (

@@ -10,15 +10,16 @@ import dataclasses
 import enum
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import ClassVar, Protocol
 
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jaxtyping import PyTree
 
 from planner_jax.core.arithmetic import Components, components, reciprocal
 from planner_jax.cost.along import Along, greatest_along
-from planner_jax.cost.extras import extra_excess, extra_rate, greatest_extras, num_limits
+from planner_jax.cost.extras import Extra, extra_excess, extra_rate, greatest_extras, num_limits
 from planner_jax.robot.quadrotor import (
     QuadrotorLimits,
     RotorLimits,
@@ -79,8 +80,8 @@ def motion_excess(
 
 
 def limits_along(
-    motion: Motion, given: tuple[Array, QuadrotorLimits, tuple[Any, ...]]
-) -> tuple[Array, ...]:
+    motion: Motion, given: tuple[Array, QuadrotorLimits, tuple[Extra, ...]]
+) -> tuple[PyTree, ...]:
     """Excess (N,) over the limits of flight and then over the extra ones, for `cost.along`.
 
     Args:
@@ -138,6 +139,37 @@ def thrust_band_excess(acc: Components, gravity: Array, least: Array, most: Arra
     return (thrust - middle) ** 2 - half**2
 
 
+class QuadrotorCase(Protocol):
+    """What the penalties of a flight take from a case, which is a dataclass."""
+
+    __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[PyTree]]]
+
+    @property
+    def head_state(self) -> Array:
+        """Position to jerk (4, 3) of the quadrotor at time 0."""
+        ...
+
+    @property
+    def gravity(self) -> Array:
+        """Magnitude () [m/s^2]."""
+        ...
+
+    @property
+    def limits(self) -> QuadrotorLimits:
+        """Limits of the quadrotor."""
+        ...
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """() for one case, (B,) for a batch."""
+        ...
+
+    @property
+    def extras(self) -> tuple[Extra, ...]:
+        """Limits and costs of the user's own."""
+        ...
+
+
 class Measure(enum.Enum):
     """What an excess is in the terms of the quantity q and its limit, and what it is of."""
 
@@ -165,7 +197,9 @@ class _Kind:
 
     field: str  # of `QuadrotorLimits`, None where they are not there
     measures: tuple[Measure, ...]  # one for each excess
-    excess: Callable[[Motion, Array, Any], tuple[Array, ...]]  # of motion, gravity and limits
+    excess: Callable[
+        [Motion, Array, QuadrotorLimits], tuple[Array, ...]
+    ]  # of motion, gravity and limits
     orders: tuple[int, ...]  # of the motion, that they look at
 
 
@@ -238,7 +272,7 @@ def relative_excess(limits: QuadrotorLimits, excess: Sequence[Array]) -> list[Ar
 
 
 def flight_along(
-    maps: ProportionalMinco, nodes: int, case: Any, margin: float, hinge_width: float
+    maps: ProportionalMinco, nodes: int, case: QuadrotorCase, margin: float, hinge_width: float
 ) -> Along:
     """Penalties of all limits of a flight along its way; squares carry twice the relative margin.
 
@@ -271,7 +305,7 @@ def _groups(limits: QuadrotorLimits) -> tuple[tuple[tuple[int, int], ...], ...]:
 
 
 def greatest_excess(
-    maps: ProportionalMinco, nodes: int, columns: Array, durations: Array, case: Any
+    maps: ProportionalMinco, nodes: int, columns: Array, durations: Array, case: QuadrotorCase
 ) -> list[Array]:
     """By how much a finished plan of N segments exceeds each limit, relative, (N,) each.
 
@@ -287,6 +321,6 @@ def greatest_excess(
     bare = dataclasses.replace(case, extras=())
     along = flight_along(maps, nodes, bare, 0.0, 1.0)
     greatest = greatest_along(along, columns, durations, (case.gravity, case.limits, ()))
-    extras: Any = jax.vmap(functools.partial(greatest_extras, maps), in_axes=(0, 0, None))
+    extras = jax.vmap(functools.partial(greatest_extras, maps), in_axes=(0, 0, None))
     flown = relative_excess(case.limits, greatest)
     return [*flown, *extras(columns, durations, case.extras)]

@@ -6,12 +6,13 @@ iterations that led there, and nothing is unrolled.
 """
 
 import functools
-from typing import Any
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array, lax
+from jaxtyping import PyTree
 
 from planner_jax.core.checks import require_kind
 from planner_jax.core.choices import require_size
@@ -20,6 +21,7 @@ from planner_jax.core.protocol import marked, status_of
 from planner_jax.optimise.evaluation import Objective
 from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.multistart import minimise
+from planner_jax.optimise.planner import OptimisedPlanner
 
 
 @struct.dataclass
@@ -99,8 +101,12 @@ def newton_refine(
 
 
 def optimal_plan(
-    planner: Any, case: Any, *, solver: LbfgsConfig | None = None, newton_steps: int = 100
-) -> Any:
+    planner: OptimisedPlanner,
+    case: PyTree,
+    *,
+    solver: LbfgsConfig | None = None,
+    newton_steps: int = 100,
+) -> PyTree:
     """The plan at the optimum of the first guess's basin, differentiable by the case.
 
     `jax.grad` and `jax.jacobian` of any number in the plan, by any leaf of the case, go
@@ -142,7 +148,7 @@ def optimal_plan(
     def cost(point: Array) -> Array:
         return planner.objective(point, context).cost
 
-    def solve(_: Any, start: Array) -> tuple[Array, Array]:
+    def solve(_: Callable, start: Array) -> tuple[Array, Array]:
         def objective(point: Array):
             return planner.objective(point, context)
 
@@ -153,7 +159,7 @@ def optimal_plan(
         )
         return point, slope / tolerance
 
-    def tangent_solve(hessian_product: Any, rhs: Array) -> Array:
+    def tangent_solve(hessian_product: Callable[[Array], Array], rhs: Array) -> Array:
         return jnp.linalg.solve(jax.jacobian(hessian_product)(rhs), rhs)
 
     point, excess = lax.custom_root(jax.grad(cost), start, solve, tangent_solve, has_aux=True)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 
 import jax.numpy as jnp
 from jax import Array
-from jax.tree_util import PyTreeDef
+from jaxtyping import PyTreeDef
 
 from planner_jax.lanes.pallas import block_width, kernel_by_lanes
 

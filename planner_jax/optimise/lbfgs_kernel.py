@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 import jax
 import jax.numpy as jnp
 from jax import Array, Ref
-from jax.tree_util import PyTreeDef
+from jaxtyping import PyTreeDef
 
 from planner_jax.lanes.pallas import block_width, kernel_by_lanes, load_masked, store_masked
 from planner_jax.optimise.lbfgs import shortening, start_scale, weigh_pair

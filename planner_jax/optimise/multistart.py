@@ -5,12 +5,12 @@ import functools
 import math
 from collections.abc import Callable
 from types import ModuleType
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array, lax
+from jaxtyping import PyTree
 
 from planner_jax.core.protocol import Status, is_unsolved, status_of
 from planner_jax.core.select import index_of_best
@@ -58,11 +58,11 @@ def minimise(
 
 
 def minimise_lanes(
-    objective: Callable[[Array, Any], Evaluation],
+    objective: Callable[[Array, PyTree], Evaluation],
     starts: Array,
-    contexts: Any,
+    contexts: PyTree,
     config: Solver,
-    curved: Callable[[Array, Any], Curvature] | None = None,
+    curved: Callable[[Array, PyTree], Curvature] | None = None,
 ) -> Optimum:
     """`minimise` on many lanes, each with its own start and context.
 
@@ -80,9 +80,9 @@ def minimise_lanes(
         evaluate = lambda x, context: _optimum_at(x, objective(x, context), config)  # noqa: E731
         return over_lanes(evaluate)(starts, contexts)
 
-    def searched(state: Any, contexts: Any, config: Solver, steps: int) -> Any:
+    def searched(state: PyTree, contexts: PyTree, config: Solver, steps: int) -> PyTree:
         @over_lanes
-        def step(state: Any, context: Any) -> Any:
+        def step(state: PyTree, context: PyTree) -> PyTree:
             of_point = curved and functools.partial(_given, curved, context)
             return _step(lambda x: objective(x, context), of_point, state, config)
 
@@ -100,7 +100,7 @@ def minimise_lanes(
         share, steps, groups = config.stragglers
         longer, num = _with_stragglers(config), math.ceil(share * starts.shape[-1])
 
-        def next_group(made: tuple[Array, Any]) -> tuple[Array, Any]:
+        def next_group(made: tuple[Array, PyTree]) -> tuple[Array, PyTree]:
             number, state = made
             lanes = newton.most_to_gain(state.numbers, longer, num)
             some, given = jax.tree.map(lambda leaf: leaf[..., lanes], (state, contexts))
@@ -108,7 +108,7 @@ def minimise_lanes(
             place = lambda old, new: old.at[..., lanes].set(new)  # noqa: E731
             return number + 1, jax.tree.map(place, state, later)
 
-        def is_open(made: tuple[Array, Any]) -> Array:
+        def is_open(made: tuple[Array, PyTree]) -> Array:
             number, state = made
             return (number < groups) & jnp.any(newton.is_unfinished(state.numbers, longer))
 
@@ -116,7 +116,9 @@ def minimise_lanes(
     return _optimum_of(state, config)
 
 
-def _given(curved: Callable[[Array, Any], Curvature], context: Any, point: Array) -> Curvature:
+def _given(
+    curved: Callable[[Array, PyTree], Curvature], context: PyTree, point: Array
+) -> Curvature:
     return curved(point, context)
 
 
@@ -124,7 +126,7 @@ def _method(config: Solver) -> ModuleType:
     return newton if isinstance(config, NewtonConfig) else lbfgs
 
 
-def _step(objective: Objective, curved: Curved | None, state: Any, config: Solver) -> Any:
+def _step(objective: Objective, curved: Curved | None, state: PyTree, config: Solver) -> PyTree:
     if isinstance(config, NewtonConfig):
         return newton.step(objective, curved or by_products(objective), state, config)
     return lbfgs.step(objective, state, config)
@@ -138,7 +140,7 @@ def _with_stragglers(config: NewtonConfig) -> NewtonConfig:
     return dataclasses.replace(config, max_steps=config.max_steps + steps * groups, stragglers=None)
 
 
-def _optimum_of(state: Any, config: Solver) -> Optimum:
+def _optimum_of(state: PyTree, config: Solver) -> Optimum:
     return Optimum(
         point=state.best_point,
         evaluation=state.numbers.best,
@@ -153,7 +155,7 @@ def _optimum_at(point: Array, evaluation: Evaluation, config: Solver) -> Optimum
     return Optimum(point, evaluation, jnp.zeros((), jnp.int32), stationary)
 
 
-def solve_round(planner: Problem, attempt: Round, case: Any) -> Any:
+def solve_round(planner: Problem, attempt: Round, case: PyTree) -> PyTree:
     """Plan one case with one round's starts and iterations; pure, so jit and vmap it.
 
     For a batch `solve_batch` is quicker.
@@ -194,7 +196,7 @@ def solve_round(planner: Problem, attempt: Round, case: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf[0], plans) if len(points) == 1 else _best(plans)
 
 
-def solve_batch(planner: Problem, attempt: Round, cases: Any) -> Any:
+def solve_batch(planner: Problem, attempt: Round, cases: PyTree) -> PyTree:
     """`solve_round` on a batch, the lanes of which end at their own times.
 
     Args:
@@ -240,14 +242,14 @@ def _stages(attempt: Round) -> tuple[Stage, ...]:
     return (*attempt.stages, Stage(attempt.solver, attempt.settings))
 
 
-def _of_each(function: Callable, starts: Any) -> Any:
+def _of_each(function: Callable, starts: PyTree) -> PyTree:
     """`function` of every start, without a batch where there is one alone."""
     if len(jax.tree.leaves(starts)[0]) > 1:
         return jax.vmap(function)(starts)
     return jax.tree.map(lambda leaf: leaf[None], function(jax.tree.map(lambda x: x[0], starts)))
 
 
-def _repeated(contexts: Any, num: int) -> Any:
+def _repeated(contexts: PyTree, num: int) -> PyTree:
     """The context of every start, that of each case `num` times."""
     if num == 1:
         return contexts
@@ -259,7 +261,7 @@ def _cheapest(costs: Array, num: int) -> Array:
     return jnp.argsort(jnp.where(jnp.isfinite(costs), costs, jnp.inf))[:num]
 
 
-def _plan_at(planner: Problem, optimum: Optimum, context: Any) -> Any:
+def _plan_at(planner: Problem, optimum: Optimum, context: PyTree) -> PyTree:
     """The plan of one optimum."""
     plan = planner.decode(optimum.point, context)
     cost = optimum.evaluation.cost
@@ -269,7 +271,7 @@ def _plan_at(planner: Problem, optimum: Optimum, context: Any) -> Any:
     return plan.replace(cost=cost, iterations=optimum.iterations, status=status)
 
 
-def _best(plans: Any) -> Any:
+def _best(plans: PyTree) -> PyTree:
     """Return the plan that is selected of those of several starts."""
     best = index_of_best(plans)
     return jax.tree.map(lambda leaf: leaf[best], plans)

@@ -3,11 +3,12 @@
 import abc
 import dataclasses
 from collections.abc import Callable
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jaxtyping import PyTree
 
 from planner_jax.core.planner import CaseT, Planner, PlanT
 from planner_jax.optimise.evaluation import Evaluation
@@ -37,7 +38,7 @@ _EFFORTS = {
 }
 
 
-def pending(violation: Array) -> dict[str, Any]:
+def pending(violation: Array) -> dict[str, PyTree]:
     """The fields that every `Plan` has, before the solver fills in all but the violation."""
     zero = jnp.zeros((), jnp.int32)
     return {
@@ -62,18 +63,18 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
     adjoint: ClassVar[str] = "products"  # the `curvature` of `pj.gradient` by default
 
     @abc.abstractmethod
-    def prepare(self, case: Any) -> Any:
+    def prepare(self, case: PyTree) -> PyTree:
         """What every evaluation needs and none changes, such as the ball's path table."""
 
     @abc.abstractmethod
-    def guesses(self, context: Any, num: int) -> Array:
+    def guesses(self, context: PyTree, num: int) -> Array:
         """The first `num` starting points, (num, n), best first."""
 
     @abc.abstractmethod
-    def objective(self, point: Array, context: Any) -> Evaluation:
+    def objective(self, point: Array, context: PyTree) -> Evaluation:
         """Cost and largest violation at a point (n,)."""
 
-    def curved(self, point: Array, context: Any) -> Curvature:
+    def curved(self, point: Array, context: PyTree) -> Curvature:
         """Evaluation at a point (n,), gradient (n,), and products with the Hessian.
 
         What Newton's method takes. By default each product is a derivative of the gradient, and
@@ -82,13 +83,13 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         return by_products(lambda x: self.objective(x, context))(point)
 
     @abc.abstractmethod
-    def decode(self, point: Array, context: Any) -> Any:
+    def decode(self, point: Array, context: PyTree) -> PyTree:
         """The plan at a point (n,), its violation looked at more closely.
 
         The solver fills in `cost`, `iterations` and `status`; until then they are `pending`.
         """
 
-    def rules_out(self, context: Any) -> Array:
+    def rules_out(self, context: PyTree) -> Array:
         """Whether no plan can exist, by a bound that none can beat, () bool; never, by default."""
         return jnp.zeros((), bool)
 
@@ -105,28 +106,28 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         """The rounds."""
         return self.rounds
 
-    def solve(self, case: Any, attempt: Round) -> Any:
+    def solve(self, case: PyTree, attempt: Round) -> PyTree:
         """The plan of one case by one round."""
         return solve_round(self, attempt, case)
 
-    def solve_lanes(self, cases: Any, attempt: Round) -> Any:
+    def solve_lanes(self, cases: PyTree, attempt: Round) -> PyTree:
         """The plans of a batch by one round."""
         return solve_batch(self, attempt, cases)
 
     def settle(
-        self, cases: Any, plan_of: Callable[[Planner, Any], Any] | None = None
-    ) -> tuple[Self, Any]:
+        self, cases: PyTree, plan_of: Callable[[Planner, PyTree], PyTree] | None = None
+    ) -> tuple[Self, PyTree]:
         """Return the planner and the cases: nothing is decided before it minimises."""
         return self, cases
 
-    def plan_shapes(self, cases: Any) -> Any:
+    def plan_shapes(self, cases: PyTree) -> PyTree:
         """What plans (B, ...) of cases (B, ...) look like, leaves `jax.ShapeDtypeStruct`.
 
         Args:
             cases: leaves may be `jax.ShapeDtypeStruct`, too.
         """
 
-        def plan(case: Any) -> Any:
+        def plan(case: PyTree) -> PyTree:
             context = self.prepare(case)
             return self.decode(self.guesses(context, 1)[0], context)
 

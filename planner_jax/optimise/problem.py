@@ -1,9 +1,10 @@
 """What the solver asks of a planner that minimises: a problem for ONE case, and attempts at it."""
 
 import dataclasses
-from typing import Any, Protocol
+from typing import Protocol
 
 from jax import Array
+from jaxtyping import PyTree
 
 from planner_jax.core.checks import require_kind
 from planner_jax.core.choices import require_size
@@ -13,7 +14,7 @@ from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.newton import Curvature, NewtonConfig
 
 Solver = LbfgsConfig | NewtonConfig
-Settings = tuple[tuple[str, Any], ...]  # fields of a planner, and the values they take
+Settings = tuple[tuple[str, object], ...]  # fields of a planner, and the values they take
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,37 +50,37 @@ class Problem(Protocol):
     All functions are pure and written for one case.
     """
 
-    def prepare(self, case: Any) -> Any:
+    def prepare(self, case: PyTree) -> PyTree:
         """What every evaluation needs and none changes, such as the ball's path table."""
         ...
 
-    def guesses(self, context: Any, num: int) -> Array:
+    def guesses(self, context: PyTree, num: int) -> Array:
         """The first `num` starting points, (num, n), best first."""
         ...
 
-    def objective(self, point: Array, context: Any) -> Evaluation:
+    def objective(self, point: Array, context: PyTree) -> Evaluation:
         """Cost and largest violation at a point (n,)."""
         ...
 
-    def curved(self, point: Array, context: Any) -> Curvature:
+    def curved(self, point: Array, context: PyTree) -> Curvature:
         """Evaluation, gradient and second derivatives at a point (n,), for Newton's method."""
         ...
 
-    def decode(self, point: Array, context: Any) -> Any:
+    def decode(self, point: Array, context: PyTree) -> PyTree:
         """The plan at a point (n,), its violation looked at more closely.
 
         The solver fills in `cost`, `iterations` and `status`.
         """
         ...
 
-    def rules_out(self, context: Any) -> Array:
+    def rules_out(self, context: PyTree) -> Array:
         """Whether no plan can exist, by a bound that none can beat, () bool.
 
         Such a case has the status `TOO_FAR` unless it is solved, and no further attempt is made.
         """
         ...
 
-    def carried(self, point: Array, before: Any) -> Array:
+    def carried(self, point: Array, before: PyTree) -> Array:
         """A point (n,) of this problem with the settings of `before`, a stage's, in its own."""
         ...
 

@@ -13,24 +13,26 @@ then holds lambda^T cost_utheta.
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, Self
+from typing import Self
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array
+from jaxtyping import PyTree
 
 from planner_jax.core.checks import numeric
 from planner_jax.core.choices import require_size
 from planner_jax.core.errors import format_value
 from planner_jax.core.protocol import Plan
+from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.newton import Curvature
 from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.preconditioner import positive_inverse
 from planner_jax.optimise.problem import Problem, Round, Settings
 
-Quantity = str | Callable[[Any], Array]
+Quantity = str | Callable[[PyTree], Array]
 Product = Callable[[Array], Array]  # of a vector (n,), a vector (n,)
 _CURVATURES = ("products", "whole")
 # Of the conjugate gradients by default: unknowns are some 40, and scaled.
@@ -44,7 +46,7 @@ class Gradient:
     """A number of a plan, and its gradient by some of the case."""
 
     value: Array  # ()
-    by: dict[str, Any]  # name -> what the case has there, of d value / d leaf
+    by: dict[str, PyTree]  # name -> what the case has there, of d value / d leaf
     # () what is left of q_u, relative, in the preconditioner's norm: 0 if lambda is exact. It
     # says nothing about how far the point is from the optimum. NaN, and so is `by`, where the
     # cost does not curve upward in the first direction: there is no minimum to follow.
@@ -55,18 +57,18 @@ class Gradient:
 class DifferentiatedPlan(Plan):
     """A planner's plan with a gradient."""
 
-    plan: Any
+    plan: PyTree
     gradient: Gradient
 
-    def whole_plan(self) -> Any:
+    def whole_plan(self) -> PyTree:
         """The plan with what the solver filled in."""
         return self.plan.replace(cost=self.cost, iterations=self.iterations, status=self.status)
 
 
 @struct.dataclass
 class _Context:
-    case: Any
-    inner: Any
+    case: PyTree
+    inner: PyTree
 
 
 @struct.dataclass
@@ -76,7 +78,7 @@ class Differentiated(OptimisedPlanner):
     It is solved like the planner itself; the gradient is taken where the solver ends.
     """
 
-    planner: Any
+    planner: OptimisedPlanner
     # Place in the plan such as "stroke.time", or a function of the plan.
     quantity: Quantity = struct.field(pytree_node=False)
     by: tuple[str, ...] = struct.field(pytree_node=False)  # places in the case such as "net.radius"
@@ -106,7 +108,7 @@ class Differentiated(OptimisedPlanner):
         """With settings of the planner inside."""
         return dataclasses.replace(self, planner=self.planner.changed(settings))
 
-    def prepare(self, case: Any) -> _Context:
+    def prepare(self, case: PyTree) -> _Context:
         """As the planner does."""
         return _Context(case=case, inner=self.planner.prepare(case))
 
@@ -118,7 +120,7 @@ class Differentiated(OptimisedPlanner):
         """As the planner does."""
         return self.planner.carried(point, before.planner)
 
-    def objective(self, point: Array, context: _Context) -> Any:
+    def objective(self, point: Array, context: _Context) -> Evaluation:
         """That of the planner."""
         return self.planner.objective(point, context.inner)
 
@@ -150,7 +152,7 @@ class Differentiated(OptimisedPlanner):
 
 def gradient_at(
     planner: Problem,
-    case: Any,
+    case: PyTree,
     point: Array,
     quantity: Quantity,
     by: tuple[str, ...],
@@ -180,7 +182,7 @@ def gradient_at(
     number = _quantity(quantity)
     parts = {name: part_of(case, name) for name in by}
 
-    def moved(parts: dict) -> Any:
+    def moved(parts: dict) -> PyTree:
         return functools.reduce(lambda s, name: _with_part(s, name, parts[name]), parts, case)
 
     context, pull = jax.vjp(lambda parts: planner.prepare(moved(parts)), parts)
@@ -188,7 +190,7 @@ def gradient_at(
     is_smooth = [jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves]
     smooth = [leaf for leaf, flag in zip(leaves, is_smooth, strict=True) if flag]
 
-    def context_of(smooth: list) -> Any:
+    def context_of(smooth: list) -> PyTree:
         taken = iter(smooth)
         both = zip(leaves, is_smooth, strict=True)
         return jax.tree.unflatten(treedef, [next(taken) if flag else leaf for leaf, flag in both])
@@ -274,7 +276,7 @@ def _adjoint(solve: Product, product: Product, rhs: Array, steps: int) -> tuple[
     return found, jnp.where(defined, jnp.sqrt(jnp.maximum(ratio, 0.0)), jnp.nan)
 
 
-def part_of(tree: Any, name: str) -> Any:
+def part_of(tree: PyTree, name: str) -> PyTree:
     """What stands at a place, names and places in tuples joined by dots, in a case.
 
     Raises:
@@ -287,7 +289,7 @@ def part_of(tree: Any, name: str) -> Any:
     return jax.tree.map(jnp.asarray, part)
 
 
-def _found(tree: Any, name: str, argument: str) -> Any:
+def _found(tree: PyTree, name: str, argument: str) -> PyTree:
     if not isinstance(name, str):
         raise TypeError(f"{argument} must be a name or some, got {format_value(name)}")
     part = tree
@@ -302,14 +304,14 @@ def _found(tree: Any, name: str, argument: str) -> Any:
     return part
 
 
-def _members(tree: Any) -> dict[str, Any]:
+def _members(tree: PyTree) -> dict[str, PyTree]:
     """What a tuple or a dataclass holds, by place or name."""
     if isinstance(tree, tuple):
         return {str(k): member for k, member in enumerate(tree)}
     return {name: getattr(tree, name) for name in getattr(tree, "__dataclass_fields__", {})}
 
 
-def _with_part(tree: Any, name: str, part: Any) -> Any:
+def _with_part(tree: PyTree, name: str, part: PyTree) -> PyTree:
     """The tree with something else at a place."""
     first, _, rest = name.partition(".")
     inner = _with_part(_members(tree)[first], rest, part) if rest else part
@@ -318,7 +320,7 @@ def _with_part(tree: Any, name: str, part: Any) -> Any:
     return dataclasses.replace(tree, **{first: inner})
 
 
-def _quantity(quantity: Quantity) -> Callable[[Any], Array]:
+def _quantity(quantity: Quantity) -> Callable[[PyTree], Array]:
     if callable(quantity):
         return quantity
     return lambda plan: _found(plan, quantity, "of")

@@ -23,7 +23,7 @@ class Replanning(Generic[CaseT, PlanT]):
 
     case: CaseT  # as it is known now
     previous: PlanT  # that is being carried out; its times began `elapsed` ago
-    elapsed: Array  # () [s]
+    elapsed: Array | np.ndarray  # () [s]
 
     @property
     def batch_shape(self) -> tuple[int, ...]:

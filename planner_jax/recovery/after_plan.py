@@ -1,10 +1,10 @@
 """Recovery trajectories behind a plan that has been made already, of any robot."""
 
 import dataclasses
-from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
 from planner_jax.core.errors import NoEnding
 from planner_jax.core.protocol import Plan, is_solved, lane
@@ -32,7 +32,7 @@ def is_rested(found: Plan) -> bool:
     return isinstance(found, CarPlan) and not float(np.asarray(found.speed)[-1]) > 0.0
 
 
-def with_ending(case: Any, found: Plan, to: str) -> Plan:
+def with_ending(case: PyTree, found: Plan, to: str) -> Plan:
     """Return one plan that ends at standstill.
 
     Args:
@@ -58,7 +58,7 @@ def with_ending(case: Any, found: Plan, to: str) -> Plan:
     raise TypeError(f"found must be the plan of a robot, got a {type(found).__name__}")
 
 
-def _end_flight(case: Any, found: QuadrotorPlan, to: str) -> QuadrotorPlan:
+def _end_flight(case: PyTree, found: QuadrotorPlan, to: str) -> QuadrotorPlan:
     """Return the plan of a quadrotor with its recovery trajectory; see `with_ending`."""
     cases, plans = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (case, found))
     rest = plan(RestPlanner(to=to), ending_cases(cases, plans))

@@ -1,6 +1,6 @@
 """One ending to plan: the state at the end of a plan, and where the quadrotor may come to rest."""
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +8,7 @@ from flax import struct
 from jax import Array
 
 from planner_jax.core.rules import POSITIVE, Field, Table
+from planner_jax.cost.extras import Extra
 from planner_jax.robot.quadrotor import QuadrotorLimits
 from planner_jax.robot.quadrotor_plan import QuadrotorPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
@@ -27,7 +28,7 @@ class EndingCase:
     home: Array  # (3,) [m], where it comes to rest if it returns
     gravity: Array  # () [m/s^2], magnitude
     limits: QuadrotorLimits
-    extras: tuple[Any, ...] = ()  # limits and costs of the user's own, see `cost.extras`
+    extras: tuple[Extra, ...] = ()  # limits and costs of the user's own, see `cost.extras`
 
     @property
     def batch_shape(self) -> tuple[int, ...]:

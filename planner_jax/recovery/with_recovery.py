@@ -2,12 +2,13 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from types import ModuleType
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jaxtyping import PyTree
 
 from planner_jax.core.choices import ENDINGS, require_one_of
 from planner_jax.core.planner import CaseT, Drive, Planner, PlanT
@@ -45,15 +46,15 @@ class EndedPlanner(Planner[CaseT, PlanT]):
         return self.planner.replanner()
 
     def settle(
-        self, cases: Any, plan_of: Callable[[Planner, Any], Any] | None = None
-    ) -> tuple[Any, Any]:
+        self, cases: PyTree, plan_of: Callable[[Planner, PyTree], PyTree] | None = None
+    ) -> tuple[PyTree, PyTree]:
         """Raise `TypeError`: an ending follows from its plan, and minimises for itself."""
         raise TypeError(
             "plans with an ending have no gradient, as plan and ending are minimised one after "
             "the other: leave `ending` out"
         )
 
-    def plan_by(self, drive: Drive, cases: Any) -> Any:
+    def plan_by(self, drive: Drive, cases: PyTree) -> PyTree:
         """The plans of one case or of a batch, with their endings."""
         if cases.batch_shape == ():
             one = self.plan_by(drive, jax.tree.map(lambda leaf: np.asarray(leaf)[None], cases))
@@ -69,7 +70,7 @@ class EndedPlanner(Planner[CaseT, PlanT]):
             left = left & ~is_solved(plans.status)
         return plans
 
-    def _ended(self, drive: Drive, cases: Any, factor: float) -> tuple[Any, Any]:
+    def _ended(self, drive: Drive, cases: PyTree, factor: float) -> tuple[PyTree, PyTree]:
         """Plans (B,) for a share of the speed limit, and which of them only lack an ending."""
         limits = cases.limits
         slower = dataclasses.replace(
@@ -77,7 +78,7 @@ class EndedPlanner(Planner[CaseT, PlanT]):
         )
         plans, _ = drive(self.planner, dataclasses.replace(cases, limits=slower))
         endings, _ = drive(self.rest, ending_cases(cases, plans))
-        xp: Any = jnp if drive.is_pure else np
+        xp: ModuleType = jnp if drive.is_pure else np
         whole, rests = is_solved(plans.status), is_solved(endings.status)
         lacking = whole & ~rests
         ended = dataclasses.replace(
@@ -92,9 +93,9 @@ class EndedPlanner(Planner[CaseT, PlanT]):
         return ended, lacking
 
 
-def ending_cases(cases: Any, plans: Any) -> EndingCase:
+def ending_cases(cases: PyTree, plans: PyTree) -> EndingCase:
     """What is left to plan behind plans (B,) of a quadrotor's cases (B,): leaves of their kind."""
-    states: Any = _end_states(plans.trajectory)
+    states: PyTree = _end_states(plans.trajectory)
     if isinstance(plans.status, np.ndarray):
         states = np.asarray(states)
     return EndingCase(
@@ -109,7 +110,7 @@ def ending_cases(cases: Any, plans: Any) -> EndingCase:
 _end_states = jax.jit(jax.vmap(end_state))
 
 
-def ended(planner: Any, ending: str | None) -> Any:
+def ended(planner: Planner[CaseT, PlanT], ending: str | None) -> Planner[CaseT, PlanT]:
     """A quadrotor's planner, with an ending behind its plans if one is asked for.
 
     Args:

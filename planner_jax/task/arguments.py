@@ -1,28 +1,32 @@
-"""Arguments of what makes a case, as arrays of one case or of a batch."""
+"""Arguments of the functions of a task: arrays of a case or a batch, draws, and decisions."""
 
+import pkgutil
 import zlib
-from typing import Any
+from collections.abc import Collection, Mapping
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import DTypeLike
 
 from planner_jax.core.checks import numbers_of, shape_of
 from planner_jax.core.choices import require_memory, require_size
-from planner_jax.core.errors import ArgumentError
+from planner_jax.core.errors import ArgumentError, ArgumentTypeError
+from planner_jax.core.protocol import Decision
+from planner_jax.core.registry import split_name
 
 _DRAWN_BYTES = 1_000  # of a case, as estimated
 
 
 def array_of(
-    name: str, value: Any, batch: tuple[int, ...], shape: tuple[int, ...], dtype: Any
+    name: str, value: object, batch: tuple[int, ...], shape: tuple[int, ...], dtype: DTypeLike
 ) -> Array:
     """`numbers_of`, as a jax array of a type."""
     with np.errstate(over="ignore"):  # what is too large is infinite, and refused as that
         return jnp.asarray(numbers_of(name, value, batch, shape), dtype)
 
 
-def batch_of(name: str, vectors: Any, *shape: int) -> tuple[int, ...]:
+def batch_of(name: str, vectors: object, *shape: int) -> tuple[int, ...]:
     """The batch's axes of an argument (..., *shape), which the others follow.
 
     Raises:
@@ -36,7 +40,7 @@ def batch_of(name: str, vectors: Any, *shape: int) -> tuple[int, ...]:
     return given[: len(given) - len(shape)]
 
 
-def require_draw(num: Any, seed: Any, first: Any) -> None:
+def require_draw(num: int, seed: int, first: int) -> None:
     """Raise unless so many cases of a suite can be drawn from a seed, from a place on.
 
     Raises:
@@ -57,3 +61,26 @@ def make_generators(suite: str, num: int, seed: int, first: int) -> list[np.rand
     require_draw(num, seed, first)
     tag = zlib.crc32(suite.encode())
     return [np.random.default_rng([seed, first + k, tag]) for k in range(num)]
+
+
+def find_decision(
+    names: Mapping[str, str], decide: str | Decision, from_file: Collection[str] = ()
+) -> Decision:
+    """Return the decision of a name, or the decision itself.
+
+    Args:
+        names: name -> "module:class", those of a task.
+        decide: one of these names, with ":" and a file behind it if it may be read from one; or a
+            decision.
+        from_file: the names that may have a file behind them.
+
+    Raises:
+        ValueError: there is no decision of that name, or it takes no file.
+        TypeError: it is neither a name nor a decision.
+    """
+    if not isinstance(decide, str):
+        if isinstance(decide, type) or not isinstance(decide, Decision):
+            raise ArgumentTypeError("decide", "a name or a decision", decide)
+        return decide
+    name, file = split_name(names, "decide", decide, from_file)
+    return pkgutil.resolve_name(names[name])(*filter(None, [file]))

@@ -2,12 +2,12 @@
 
 import functools
 import math
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array, lax
+from jaxtyping import PyTree
 
 
 @struct.dataclass
@@ -30,8 +30,8 @@ class Motion:
     vel: Array  # (N, 3) [m/s]
     acc: Array  # (N, 3) [m/s^2]
     jerk: Array  # (N, 3) [m/s^3]
-    pos: Any = None  # (N, 3) [m]
-    snap: Any = None  # (N, 3) [m/s^4], where it is asked for
+    pos: PyTree = None  # (N, 3) [m]
+    snap: PyTree = None  # (N, 3) [m/s^4], where it is asked for
 
 
 def derivative_factors(degree: int, order: int) -> np.ndarray:

@@ -24,12 +24,12 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
+from jaxtyping import PyTree
 
 from planner_jax.core.arithmetic import reciprocal
 from planner_jax.trajectory.polynomial import (
@@ -207,12 +207,12 @@ def sample_motion(
 
 
 def by_pieces(
-    function: Callable[[Motion, Array], Any],
+    function: Callable[[Motion, Array], PyTree],
     maps: ProportionalMinco,
     nodes: int,
     columns: Array,
     piece_duration: Array,
-) -> Any:
+) -> PyTree:
     """What a function finds in the motion of each piece, one after another.
 
     Many samples of all pieces at once would take a lot of memory.
@@ -232,7 +232,7 @@ def by_pieces(
     matrices = jnp.asarray(each[:, places].swapaxes(0, 1), columns.dtype)  # (M, 4, nodes + 1, C)
     shares = jnp.asarray(maps.proportions, columns.dtype)
 
-    def of_piece(piece: tuple[Array, Array]) -> Any:
+    def of_piece(piece: tuple[Array, Array]) -> PyTree:
         matrix, share = piece
         return function(_motion(matrix, columns, piece_duration), share * piece_duration)
 
@@ -251,7 +251,7 @@ def _motion(matrices: Array, columns: Array, piece_duration: Array) -> Motion:
     rates = [jnp.ones_like(rate), rate, rate * rate, rate * rate * rate]
     rates = jnp.stack([*rates, rates[2] * rates[2]][:orders])
     pos, vel, acc, jerk, *snap = unit * rates[:, None, None]
-    parts: Any = {"snap": snap[0]} if snap else {}
+    parts: dict[str, Array] = {"snap": snap[0]} if snap else {}
     return Motion(height=pos[:, 2], vel=vel, acc=acc, jerk=jerk, pos=pos, **parts)
 
 
@@ -270,8 +270,7 @@ def trajectory_energy(maps: ProportionalMinco, rows: Array, offsets: Array, piec
 
 def boundary_energy(maps: ProportionalMinco, rows: Array, piece_duration: Array) -> Array:
     """The part of `trajectory_energy` that the boundary makes, the least there is for it, ()."""
-    form: Any = _boundary_form
-    return form(maps, rows) * reciprocal(piece_duration) ** (2 * maps.order - 1)
+    return _boundary_form(maps, rows) * reciprocal(piece_duration) ** (2 * maps.order - 1)
 
 
 def offset_energy(maps: ProportionalMinco, offsets: Array, piece_duration: Array) -> Array:

@@ -16,12 +16,12 @@ from planner_jax.optimise.problem import Round
 from planner_jax.planning.replan import Replanning
 from planner_jax.sims.loop_state import Outlook
 from planner_jax.sims.scoring import passage
+from planner_jax.task.arguments import find_decision
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.task.catch.replan import ReplanCatch
 from planner_jax.task.catch.spec import DECISIONS, TRAINED
-from planner_jax.task.named_decision import named_decision
 
 _TABLE_NODES = 36
 BORNE = 0.1  # share of a limit by which a plan may break it and is still flown
@@ -113,7 +113,7 @@ class CatchPilot:
     def _decided_anew(self, asked: Replanning[CatchCase, CatchPlan]) -> CatchPlan:
         """A plan from scratch of what is left, with the decision's first choice."""
         left = asked.case
-        choices = named_decision(DECISIONS, self.decide, TRAINED).propose(left)
+        choices = find_decision(DECISIONS, self.decide, TRAINED).propose(left)
         choice = jax.tree.map(lambda leaf: leaf[0], choices)
         return self.planner.planner.solve(left.decided(choice), self.search)
 

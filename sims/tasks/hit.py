@@ -36,12 +36,12 @@ from planner_jax.sims.task import BallFlightTask, FlightCases, Flights
 from planner_jax.task.hit import court
 from planner_jax.task.hit.api import planner as hit_planner
 from planner_jax.task.hit.case import GRAVITY, HitCase
+from planner_jax.task.hit.court import landing
 from planner_jax.task.hit.default_planner import ExactHit
 from planner_jax.task.hit.plan import HitPlan
 from planner_jax.task.hit.replan import ReplanHit
 from planner_jax.task.hit.spec import REAL_SCENARIOS
 from planner_jax.task.hit.suites import DEPTH, SERVE_HEIGHT, generate_serves, to_cases
-from planner_jax.task.hit.validate import landing
 
 SEEN = 0.25  # [s], a serve's flight before it is planned for: 2 m and more (paper 000, VII-A)
 _AFTER = 0.1  # [s] flown after the last impact planned

@@ -9,7 +9,7 @@ import pytest
 import planner_jax as pj
 from planner_jax.benchmarks.poisoned_batches import compare, poisoned, poisons
 from planner_jax.core.rules import is_sound, named
-from planner_jax.task.catch.beam import MOST_SEARCHED
+from planner_jax.task.catch.decide import MOST_SEARCHED
 
 TASKS = ("hit", "catch", "intercept", "block")
 # Of a kind that stays on the host, another batch would be drawn for every test.

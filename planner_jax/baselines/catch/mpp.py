@@ -1,13 +1,14 @@
 """The `mpp` baseline: sampled state-to-state primitives to catches at a height fixed beforehand."""
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array, lax
+from jaxtyping import PyTree
 
 from planner_jax.ball.flight import BallState, gravity_vector
 from planner_jax.ball.target import state_at
@@ -22,7 +23,7 @@ from planner_jax.cost.quadrotor import (
     thrust_excess,
 )
 from planner_jax.task.catch.case import CatchCase
-from planner_jax.task.catch.chain import CatchContext, ordered_context, targets_at
+from planner_jax.task.catch.context import CatchContext, ordered_context, targets_at
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.trajectory.polynomial import (
     PiecewisePolynomial,
@@ -226,7 +227,7 @@ class MppCatch(Planner):
         return jnp.max(jnp.stack([*parts, jnp.max(ground_excess(motion.height, limits))]))
 
 
-def _lane(tree: Any, lane: Any) -> Any:
+def _lane(tree: PyTree, lane: Array) -> PyTree:
     """One entry of the leading axis of every leaf."""
     return jax.tree.map(lambda leaf: leaf[lane], tree)
 

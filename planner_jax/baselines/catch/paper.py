@@ -1,7 +1,6 @@
 """The `catch` planner of paper 000: contact and attitude by penalties (its eqs 18-28)."""
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,19 +19,21 @@ from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.problem import Round, Stage
 from planner_jax.robot.quadrotor import QuadrotorLimits, body_rate_squared, body_z
 from planner_jax.task.catch.case import CatchCase
-from planner_jax.task.catch.chain import (
+from planner_jax.task.catch.context import (
     CatchContext,
+    facing_cosine,
+    is_too_far,
+    ordered_context,
+    targets_at,
+)
+from planner_jax.task.catch.plan import CatchPlan
+from planner_jax.trajectory.chain import (
     Chain,
     chain_energy,
     chain_motion,
     chain_rows,
     chain_trajectory,
-    facing_cosine,
-    ordered_context,
-    targets_at,
 )
-from planner_jax.task.catch.plan import CatchPlan
-from planner_jax.task.catch.reach import is_too_far
 from planner_jax.trajectory.polynomial import Motion, evaluate
 from planner_jax.trajectory.proportional_minco import (
     ProportionalMinco,
@@ -46,7 +47,7 @@ _ORDER = 4  # minimum snap
 # little about the next.
 _OFFSET_SCALE = 0.05
 _CATCH_SCALE = (0.035, *(0.06,) * 3, *(0.6,) * 3, *(1.2,) * 3, *(2.4,) * 3)
-_PATIENT: dict[str, Any] = {
+_PATIENT = {
     "memory": 16,
     "trial_steps": (1.0, 2.5, 0.3, 0.05),
     "tolerance": 1e-8,

@@ -23,9 +23,8 @@ from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.problem import Round
 from planner_jax.task.hit.case import HitCase
-from planner_jax.task.hit.context import HitContext, Impact, prepare_hit
+from planner_jax.task.hit.context import HitContext, Impact, is_too_far, prepare_hit
 from planner_jax.task.hit.plan import HitPlan
-from planner_jax.task.hit.reach import is_too_far
 from planner_jax.trajectory.polynomial import Motion, evaluate
 from planner_jax.trajectory.proportional_minco import (
     ProportionalMinco,

@@ -8,12 +8,13 @@ the span, the fewer are there at a time. World frame, z up, SI units.
 
 import dataclasses
 import zlib
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array
+from jax.typing import DTypeLike
+from jaxtyping import PyTree
 
 from planner_jax.ball.flight import BallState
 from planner_jax.task.catch.case import CatchCase
@@ -64,7 +65,7 @@ def states_of(
 
 
 def draw_appearing(
-    num: int, seed: int = 0, first: int = 0, *, span: float = SPAN, dtype: Any = jnp.float32
+    num: int, seed: int = 0, first: int = 0, *, span: float = SPAN, dtype: DTypeLike = jnp.float32
 ) -> CatchCase:
     """Cases of balls that appear one by one, leaves with a leading axis B.
 
@@ -80,7 +81,7 @@ def draw_appearing(
     """
     if not 0.0 <= span < np.inf:
         raise ValueError(f"span must be >= 0, got {span}")
-    cases: Any = draw(num, SUITE, seed, first=first, dtype=dtype)
+    cases: PyTree = draw(num, SUITE, seed, first=first, dtype=dtype)
     size = cases.num_targets
     random = np.random.default_rng([seed, zlib.crc32(b"appearing")])
     random.bit_generator.advance(first * size)  # type: ignore[attr-defined]

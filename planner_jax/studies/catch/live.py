@@ -81,10 +81,11 @@ def fly_live(cases: CatchCase, decision: Decision, *, planner: ExactCatch | None
         planner: `ExactCatch()` if not given.
     """
     known: Any = jax.tree.map(np.asarray, cases)
-    decided = DecidedPlanner(planner or ExactCatch(), decision)
+    planner = planner or ExactCatch()
+    decided = DecidedPlanner(planner, decision)
     appears = known.targets.appears.astype(np.float64)
     caught = np.full(appears.shape, np.inf)
-    course = _waiting(known, decided.planner.num_pieces)
+    course = _waiting(known, planner.num_pieces)
     now = np.zeros(len(appears))
     goes_on = _finite(known)
     status = np.where(goes_on, Status.FEASIBLE, Status.NON_FINITE)

@@ -11,9 +11,9 @@ from planner_jax.core.choices import require_one_of
 from planner_jax.core.errors import ArgumentError, CaseError
 from planner_jax.runs.source import Chunk, Source, filled_in
 from planner_jax.sweep.hit.settings import HitSettings
+from planner_jax.task.hit.court import check_cases
 from planner_jax.task.hit.spec import REAL_SCENARIOS, TASK
 from planner_jax.task.hit.suites import Serves, generate_serves, read_serves, to_cases
-from planner_jax.task.hit.validate import check_cases
 
 
 @dataclasses.dataclass(frozen=True)

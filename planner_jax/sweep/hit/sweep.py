@@ -23,6 +23,7 @@ from planner_jax.sweep.robots import robot_remark
 from planner_jax.sweep.rows import quadrotor_plan
 from planner_jax.sweep.sweep import RunFigure, Sweep, first_values
 from planner_jax.task.hit import court
+from planner_jax.task.hit.published import published_rates
 
 
 class HitTally(Tally):
@@ -133,7 +134,7 @@ class HitSweep(Sweep):
         """Success per scenario in percent, beside the published rates of `compared_with`."""
         planner, summary = manifest["parameters"]["planner"], manifest["summary"]
         other = compared_with(planner)
-        published, column = court.published_rates(), court.PLANNERS.index(other)
+        published, column = published_rates(), court.PLANNERS.index(other)
         beside = [rates[:, column] for rates in (published.paper, published.trials)]
         header = ["scenario", "cases", f"{planner} %", "95 % interval"]
         header += [f"{other}, paper %", f"{other}, trial files %"]

@@ -11,7 +11,7 @@ from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.plan import BlockPlan
 from planner_jax.task.block.spec import SUITES, TASK
 from planner_jax.task.block.suites import draw_cases
-from planner_jax.task.judged import judged
+from planner_jax.task.judge import judge_by
 
 
 def draw(
@@ -107,4 +107,4 @@ def judge(cases: BlockCase, plans: BlockPlan, **settings: Any) -> BlockVerdict:
         TypeError: the cases or plans are not blocks.
         ValueError: shapes that do not fit, or a setting out of its range.
     """
-    return judged(referee_blocks, cases, plans, (BlockCase, BlockPlan), settings)
+    return judge_by(referee_blocks, cases, plans, (BlockCase, BlockPlan), settings)

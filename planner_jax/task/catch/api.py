@@ -1,18 +1,25 @@
 """The words of the task: `pj.catch.planner` and `judge`; `case` and `draw` stand beside."""
 
-from typing import Any
+import jax
+import numpy as np
+from jax import Array
 
+from planner_jax.ball.flight import BallState
+from planner_jax.ball.prediction import PathTable
+from planner_jax.ball.target import BallPath, HarmonicPath, TargetPath
 from planner_jax.core.choices import with_effort
+from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Decision
 from planner_jax.planning.decided import DecidedPlanner
-from planner_jax.recovery.with_recovery import EndedPlanner, ended
+from planner_jax.recovery.with_recovery import ended
 from planner_jax.referee.catch import CatchVerdict, referee_catches
+from planner_jax.task.arguments import find_decision
 from planner_jax.task.catch.case import CatchCase
-from planner_jax.task.catch.own_targets import is_own, states_by_class
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.task.catch.spec import DECISIONS, TASK, TRAINED
-from planner_jax.task.judged import judged
-from planner_jax.task.named_decision import named_decision
+from planner_jax.task.judge import judge_by
+
+_HALF_STEP = 1e-4  # [s], of the central difference
 
 
 def planner(
@@ -21,8 +28,8 @@ def planner(
     decide: str | Decision = "best",
     effort: str = "feasible",
     ending: str | None = None,
-    **options: Any,
-) -> DecidedPlanner[CatchCase, CatchPlan] | EndedPlanner[CatchCase, CatchPlan]:
+    **options: object,
+) -> Planner[CatchCase, CatchPlan]:
     """The catch planner of a name, behind a decision about order and times.
 
     * `exact`: the ball is in the net by construction; the one to use.
@@ -55,12 +62,12 @@ def planner(
             or a file cannot be read.
         TypeError: the planner has no such field.
     """
-    decision = named_decision(DECISIONS, decide, TRAINED)
+    decision = find_decision(DECISIONS, decide, TRAINED)
     own = with_effort(TASK.make_planner(name, options), effort)
     return ended(DecidedPlanner(own, decision), ending)
 
 
-def judge(cases: CatchCase, plans: CatchPlan, **settings: Any) -> CatchVerdict:
+def judge(cases: CatchCase, plans: CatchPlan, **settings: object) -> CatchVerdict:
     """What the referee says of one plan or of a batch: the physics alone decides.
 
     Targets of the library's classes are followed by the referee itself. Those of a class of one's
@@ -79,6 +86,50 @@ def judge(cases: CatchCase, plans: CatchPlan, **settings: Any) -> CatchVerdict:
         TypeError: the cases or plans are not catches.
         ValueError: shapes that do not fit, or a setting out of its range.
     """
-    if isinstance(cases, CatchCase) and is_own(cases.targets):
-        settings = {"target_states": states_by_class, **settings}
-    return judged(referee_catches, cases, plans, (CatchCase, CatchPlan), settings)
+    if isinstance(cases, CatchCase) and _is_own(cases.targets):
+        settings = {"target_states": _states_by_class, **settings}
+    return judge_by(referee_catches, cases, plans, (CatchCase, CatchPlan), settings)
+
+
+def _is_own(targets: object) -> bool:
+    """Return whether targets are paths of a class that the referee does not follow by itself."""
+    return isinstance(targets, TargetPath) and type(targets) not in (
+        BallPath,
+        HarmonicPath,
+        PathTable,
+    )
+
+
+def _states_by_class(
+    targets: TargetPath, order: np.ndarray, times: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions and velocities (B, N, 3) of the targets `order` at `times`, both (B, N).
+
+    A velocity that the class itself may give is not asked for: it is what the planner has used.
+
+    Args:
+        targets: leaves (B, N, ...).
+        order: places of the targets.
+        times: [s].
+    """
+    lanes = np.arange(len(order))[:, None]
+    with jax.enable_x64(True):
+        ordered = jax.tree.map(lambda leaf: _double(leaf)[lanes, order], targets)
+        before, at, after = (
+            np.asarray(_positions(ordered, times + step)) for step in (-_HALF_STEP, 0.0, _HALF_STEP)
+        )
+    return at, (after - before) / (2.0 * _HALF_STEP)
+
+
+def _double(leaf: Array | np.ndarray) -> np.ndarray:
+    leaf = np.asarray(leaf)
+    return leaf.astype(np.float64) if leaf.dtype.kind == "f" else leaf
+
+
+@jax.jit
+def _positions(targets: TargetPath, times: Array) -> Array:
+    def position(target: TargetPath, time: Array) -> Array:
+        state = target.at(time)
+        return state.pos if isinstance(state, BallState) else state
+
+    return jax.vmap(jax.vmap(position))(targets, times)

@@ -2,12 +2,13 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array
+from jax.typing import ArrayLike
 
 from planner_jax.ball.target import TargetPath
 from planner_jax.core.checks import floating, numbers_of, require_path, require_switch, shape_of
@@ -19,7 +20,7 @@ from planner_jax.robot.quadrotor_model import NET, QuadrotorModel
 from planner_jax.robot.quadrotor_models import PAPER_CATCHER
 from planner_jax.task.arguments import array_of
 from planner_jax.task.catch.rules import RULES
-from planner_jax.task.flight import ARGUMENTS, limits_of, require_start, require_tool
+from planner_jax.task.quadrotor import ARGUMENTS, limits_of, require_start, require_tool
 
 GRAVITY = 9.81  # [m/s^2]
 START = (0.0, 0.0, 1.0)  # [m], where the quadrotor hovers
@@ -67,7 +68,7 @@ class CatchCase:
     gravity: Array  # () [m/s^2], magnitude
     net: Net
     limits: QuadrotorLimits  # with a least and a greatest thrust (paper 000, eq. 3d-e)
-    extras: tuple[Any, ...] = ()  # limits and costs of the user's own, see `cost.extras`
+    extras: tuple[Extra, ...] = ()  # limits and costs of the user's own, see `cost.extras`
     optional: bool = struct.field(pytree_node=False, default=False)  # targets may be left
 
     @property
@@ -90,10 +91,10 @@ def case(
     targets: TargetPath,
     horizon,
     *,
-    present: Any = True,
+    present: ArrayLike = True,
     robot: QuadrotorModel = PAPER_CATCHER,
     start=START,
-    gravity: Any = GRAVITY,
+    gravity: ArrayLike = GRAVITY,
     net_height=None,
     net_radius=None,
     max_angle=None,
@@ -145,7 +146,7 @@ def case(
     require_switch("optional", optional)
     batch, num = shape[:-1], shape[-1]
 
-    def leaf(name: str, value: Any, *trailing: int) -> Array:
+    def leaf(name: str, value: object, *trailing: int) -> Array:
         return array_of(name, value, batch, trailing, dtype)
 
     require_path("targets", targets, shape, 3, "horizon")
@@ -183,7 +184,7 @@ def case(
     return made
 
 
-def _present(given: Any, shape: tuple[int, ...]) -> Array:
+def _present(given: ArrayLike, shape: tuple[int, ...]) -> Array:
     """Which targets there are, of the shape (..., N) of the horizon."""
     found = np.asarray(given)
     if found.dtype != np.bool_:

@@ -1,62 +1,42 @@
 """The `exact` catch planner: every catch is built into the decision variables.
 
 Paper 000 brings the net to the ball by a penalty (eqs 22-24), and its plans miss by what the
-penalty lets through. Here the net's centre is the ball's position less an offset inside the
+penalty accepts. Here the net's centre is the ball's position less an offset inside the
 hoop, so that no plan misses; attitude and limits stay inequalities.
 """
 
 import dataclasses
-import functools
-from typing import Any
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 from jax import Array
 
-from planner_jax.core.errors import ArgumentError
-from planner_jax.core.protocol import FEASIBILITY_TOLERANCE, require_settings
-from planner_jax.cost.along import Along, integrate_along
-from planner_jax.cost.penalty import smoothed_hinge
-from planner_jax.cost.quadrotor import flight_along, greatest_excess, limits_along
-from planner_jax.optimise.evaluation import Evaluation
+from planner_jax.core.protocol import FEASIBILITY_TOLERANCE
+from planner_jax.optimise.chain import ChainEnds, ChainPlanner
 from planner_jax.optimise.lbfgs import LbfgsConfig
-from planner_jax.optimise.learned_start import StartNetwork, cheaper_start, shipped_network
-from planner_jax.optimise.newton import Curvature
-from planner_jax.optimise.planner import OptimisedPlanner, pending
+from planner_jax.optimise.planner import pending
 from planner_jax.optimise.problem import Round, Stage
-from planner_jax.optimise.scaling import shipped_scale
+from planner_jax.optimise.shipped import StartNetwork, shipped_network
 from planner_jax.robot.quadrotor import body_z, tangent_basis
 from planner_jax.task.catch.case import CatchCase
-from planner_jax.task.catch.chain import (
+from planner_jax.task.catch.context import (
     CatchContext,
-    Chain,
-    chain_energy,
-    chain_motion,
-    chain_rows,
-    chain_trajectory,
     facing_cosine,
+    is_too_far,
     nearest_upright,
     ordered_context,
     targets_at,
 )
 from planner_jax.task.catch.plan import CatchPlan
-from planner_jax.task.catch.reach import is_too_far
-from planner_jax.task.segments import BETWEEN_NODES, segments_curvature
-from planner_jax.trajectory.proportional_minco import (
-    ProportionalMinco,
-    boundary_energy,
-    offset_energy,
-    proportional_minco,
-)
+from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
-_ORDER = 4  # minimum snap
+if TYPE_CHECKING:
+    from planner_jax.task.catch.replan import ReplanCatch
+
 _PROPORTIONS = (0.3,) + (1.0,) * 5
-_SEEN = (-0.1, 0.1)  # [s] from the decided time, at which a learned start looks at the ball
-# Intervals at which a piece is looked at in the end, of one catch and of several: body rates peak
-# sharply where the thrust is small, as it is between catches.
-_DECODE_NODES = (32, 48)
+_SEEN = (-0.1, 0.1)  # [s] from the decided time, at which the network's features take the ball
 _RIM = 0.9  # share of the net's radius that a planned catch may use
 _LEARNED_PLACE = 2.0  # greatest size of a place that is learnt: 0.89 of that share
 _ENCODED_RIM = 0.99  # share of that which a point made by `encode` may use
@@ -96,7 +76,7 @@ _LEAN = 0.95  # of the angle that the net may have to the ball's way, what a gue
 
 
 def start_features(context: CatchContext) -> Array:
-    """What a learned start of a single catch is made from, (F,): ball, quadrotor and limits."""
+    """Return the inputs of the network of a single catch, (F,): ball, quadrotor and limits."""
     case, net = context.case, context.case.net
     head, limits, time = case.head_state, case.limits, context.times[0]
     seen = [targets_at(context.targets, context.times[:1] + late) for late in _SEEN]
@@ -121,27 +101,9 @@ def start_features(context: CatchContext) -> Array:
     return jnp.concatenate(numbers)
 
 
-def _is_learned(case: CatchCase) -> bool:
-    """Whether the network has seen such cases, or batches: one target, and nothing in the way.
-
-    Around obstacles the side on which a search begins decides where it can end.
-    """
-    return case.num_targets == 1 and not case.extras
-
-
-@struct.dataclass
-class Catch:
-    """The N catches that a point describes."""
-
-    times: Array  # (N,) [s]
-    durations: Array  # (N,) [s], of the segments
-    tail_states: Array  # (N, 4, 3) of the quadrotor
-    angle_excess: Array  # (N,) of the net's angle over theta_safe, relative; <= 0 is good
-
-
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class ExactCatch(OptimisedPlanner):
+class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
     """Minimum-snap catches with the ball in the net by construction.
 
     Decision variables, N segments with 3 (M - 1) + 12 each, in units of `scale`: whitened
@@ -155,90 +117,67 @@ class ExactCatch(OptimisedPlanner):
     """
 
     case_type = CatchCase
-    subspace = 0
+    package = "planner_jax.task.catch"
+    num_end_variables = 12
+    guess_table = _GUESSES
     proportions: tuple[float, ...] = _PROPORTIONS  # relative durations of the pieces
-    nodes: int = 8  # penalty intervals a piece
-    time_weight: float = 0.005
-    energy_weight: float = 3e-8
-    margin: float = 0.03  # penalties begin this far inside a limit, relative
-    hinge_width: float = 0.1
     catch_weight: float = 0.3  # [s], of the hinges at a catch beside the integrals
     rounds: tuple[Round, ...] = _ROUNDS
     # Of the first guess, the thrust at catches on the way, as in `_GUESSES`. Near the least that is
     # allowed catches are soonest; more leaves control a margin in flight.
     lift: float = _GUESSES[0, 3].item()
-    scale: tuple[float, ...] = ()  # of one segment
     learned: bool = True  # whether a network makes the first guess of a single catch
 
-    def __post_init__(self) -> None:
-        require_settings(self)
-        if len(self.proportions) < 2 or not all(0.0 < x < np.inf for x in self.proportions):
-            raise ArgumentError("proportions", "of >= 2 pieces, finite and > 0", self.proportions)
-        if not self.scale:
-            object.__setattr__(
-                self, "scale", shipped_scale(__package__, f"exact-{self.num_pieces}")
-            )
-        if len(self.scale) != self.num_offsets + 12:
-            rule = f"of {self.num_offsets + 12} numbers"
-            raise ArgumentError("scale", rule, len(self.scale))
-
     @property
-    def num_offsets(self) -> int:
-        """Number of waypoint variables of a segment."""
-        return 3 * (self.num_pieces - 1)
+    def end_weight(self) -> float:
+        """Weight [s] of the hinges at a catch."""
+        return self.catch_weight
 
-    @property
-    def num_pieces(self) -> int:
-        """M, of one segment."""
-        return len(self.proportions)
+    def active(self, context: CatchContext) -> Array:
+        """Return which catches, in their order, are of targets that are there, (N,) bool."""
+        return context.active
 
-    @property
-    def _network(self) -> StartNetwork | None:
-        """That makes the first guess; there is one for the shipped sizes and the usual lift."""
-        name = f"exact-{self.num_pieces}"
+    def start_network(self, case: CatchCase) -> StartNetwork | None:
+        """Return the network for the first guess of a single catch of usual sizes and lift.
+
+        Around obstacles there is none, because the side on which a search starts decides where it
+        can end.
+        """
         is_usual = self.proportions == _PROPORTIONS and self.lift == _GUESSES[0, 3]
-        if not self.learned or not is_usual or self.scale != shipped_scale(__package__, name):
+        is_usual &= case.num_targets == 1 and not case.extras
+        if not self.learned or not is_usual or self.scale != self._usual_scale:
             return None
-        return shipped_network(__package__, name)
+        return shipped_network(self.package, "exact-6")
 
-    @property
-    def maps(self) -> ProportionalMinco:
-        """Constant maps from boundary and offsets to one segment."""
-        return proportional_minco(_ORDER, self.proportions)
+    def start_features(self, context: CatchContext) -> Array:
+        """Return the inputs of the network, (F,)."""
+        return start_features(context)
 
     def prepare(self, case: CatchCase) -> CatchContext:
-        """The targets in the order of catching."""
+        """Return the targets in the order of catching."""
         return ordered_context(case)
 
-    def guesses(self, context: CatchContext, num: int) -> Array:
-        """Smooth trajectories that face the balls, at and after the guessed times, (num, n)."""
-        if num > len(_GUESSES):
-            raise ArgumentError("starts", f"<= {len(_GUESSES)}", num)
+    def guess_ends(self, context: CatchContext, num: int) -> Array:
+        """Return catches that face the balls, at and after the guessed times, (num, N, 12)."""
         rows = _GUESSES[:num].copy()
         rows[0, 3] = self.lift
         rows = jnp.asarray(rows, context.times.dtype)
-        points = jax.vmap(lambda guess: self._guess(context, guess))(rows)
-        network = self._network
-        if network is None or not _is_learned(context.case):
-            return points
-        learned = self._off_the_rim(points[0] + network(start_features(context)))
-        cost = lambda point: self.objective(point, context).cost  # noqa: E731
-        return points.at[0].set(cheaper_start(cost, points[0], learned))
+        return jax.vmap(lambda guess: self._guess(context, guess))(rows)
 
     def solve(self, case: CatchCase, attempt: Round) -> CatchPlan:
-        """The plan of one case by one round."""
+        """Return the plan of one case by one round."""
         return super().solve(case, self._for_start(attempt, case))
 
     def solve_lanes(self, cases: CatchCase, attempt: Round) -> CatchPlan:
-        """The plans of a batch by one round."""
+        """Return the plans of a batch by one round."""
         return super().solve_lanes(cases, self._for_start(attempt, cases))
 
     def starts_long(self, case: CatchCase) -> bool:
-        """Whether the first search is a long one: of many targets that must all be caught."""
+        """Return whether the first search is a long one: many targets that must all be caught."""
         return self.rounds == _ROUNDS and case.num_targets > _FEW and not case.optional
 
     def _for_start(self, attempt: Round, case: CatchCase) -> Round:
-        """A shorter first round where it begins near its end, longer searches where it is far."""
+        """Return a shorter first round where it starts near its end, longer searches elsewhere."""
         if self.starts_long(case) and attempt in _ROUNDS[:2]:
             is_first = attempt == _FIRST
             steps = _STEPS_A_TARGET * case.num_targets if is_first else _OF_MANY.max_steps
@@ -248,24 +187,23 @@ class ExactCatch(OptimisedPlanner):
             slow = min(attempt.solver.tolerance, _CHAIN_TOLERANCE)
             solver = dataclasses.replace(attempt.solver, tolerance=slow)
             return dataclasses.replace(attempt, stages=(_LONG_CHAIN,), solver=solver)
-        is_near = attempt == _FIRST and self._network is not None and _is_learned(case)
+        is_near = attempt == _FIRST and self.start_network(case) is not None
         return _FROM_LEARNED if is_near else attempt
 
-    def _off_the_rim(self, point: Array) -> Array:
-        """A point (n,) whose places in the net still move with their variables.
+    def limit_learned(self, point: Array) -> Array:
+        """Return a point (n,) whose places in the net still move with their variables.
 
         The least time puts the ball on the rim, at places without bound, from which no later search
         comes back when the ball turns out to be elsewhere.
         """
-        offsets, natural = self._split(point)
+        offsets, natural = self.split(point)
         place = natural[:, 1:3]
         size = jnp.sqrt(jnp.maximum(jnp.sum(place**2, axis=1, keepdims=True), 1e-12))
         natural = natural.at[:, 1:3].set(place * jnp.minimum(1.0, _LEARNED_PLACE / size))
-        together = jnp.concatenate([offsets.reshape(natural.shape[0], -1), natural], axis=1)
-        return (together / jnp.asarray(self.scale, point.dtype)).ravel()
+        return self.join(offsets, natural)
 
     def _guess(self, context: CatchContext, guess: Array) -> Array:
-        """The point (n,) of later times, velocities and thrusts, a row of `_GUESSES`."""
+        """Return the end variables (N, 12) for a row of the table of starting points."""
         case = context.case
         factor, *of_catches = guess
         begin = jnp.zeros_like(context.times[:1])
@@ -285,21 +223,16 @@ class ExactCatch(OptimisedPlanner):
         up = jnp.array([0.0, 0.0, 1.0], times.dtype)
         lean = _LEAN * case.net.max_angle
         acc = thrust * nearest_upright(ball.vel, lean) - case.gravity * up
-        natural = jnp.concatenate(
-            [
-                jnp.zeros((times.size, self.num_offsets)),
-                jnp.log(durations)[:, None],
-                jnp.zeros((times.size, 2)),
-                vel,
-                acc,
-                jnp.zeros((times.size, 3)),
-            ],
-            axis=1,
+        still = jnp.zeros((times.size, 3))
+        return jnp.concatenate(
+            [jnp.log(durations)[:, None], jnp.zeros((times.size, 2)), vel, acc, still], axis=1
         )
-        return (natural / jnp.asarray(self.scale, times.dtype)).ravel()
 
-    def catches(self, natural: Array, context: CatchContext) -> Catch:
-        """The catches that the variables (N, 12) after the waypoint offsets describe."""
+    def meet(self, natural: Array, context: CatchContext) -> ChainEnds:
+        """Return the catches that the variables (N, 12) describe, as the ends of the segments.
+
+        Their excess (2, N) is that of the net's angle, and the time after the horizon.
+        """
         case, net = context.case, context.case.net
         durations = jnp.exp(natural[:, 0])
         times = jnp.cumsum(jnp.where(context.active, durations, 0.0))
@@ -317,12 +250,20 @@ class ExactCatch(OptimisedPlanner):
         excess = (jnp.cos(angle) - facing) / (angle * jnp.sin(angle))
         excess = jnp.where(moving, excess, -1.0)
         tail_states = jnp.stack([pos, natural[:, 3:6], acc, natural[:, 9:12]], axis=1)
-        return Catch(times=times, durations=durations, tail_states=tail_states, angle_excess=excess)
+        # The horizon is a hard end: the tolerance of a feasible plan is taken off.
+        late = times / context.horizon - 1.0 + FEASIBILITY_TOLERANCE
+        return ChainEnds(
+            durations=durations,
+            tail_states=tail_states,
+            total_time=times[-1],
+            excess=jnp.where(context.active, jnp.stack([excess, late]), -1.0),
+            contact=times,
+        )
 
     def encode(
         self, context: CatchContext, durations: Array, tail_states: Array, offsets: Array
     ) -> Array:
-        """The point (n,) that describes given catches: the inverse of `decode`.
+        """Return the point (n,) that describes given catches: the inverse of `decode`.
 
         A place in the net cannot hold what is outside of the hoop or off its plane; the catch
         is then the nearest across the net's axis.
@@ -345,148 +286,33 @@ class ExactCatch(OptimisedPlanner):
         share *= jnp.minimum(1.0, _ENCODED_RIM / jnp.sqrt(jnp.maximum(squared, 1e-12)))
         place = share / jnp.sqrt(1.0 - jnp.sum(share**2, axis=1, keepdims=True))
         natural = jnp.concatenate(
-            [
-                offsets.reshape(times.size, -1),
-                jnp.log(durations)[:, None],
-                place,
-                tail_states[:, 1:].reshape(times.size, -1),
-            ],
-            axis=1,
+            [jnp.log(durations)[:, None], place, tail_states[:, 1:].reshape(times.size, -1)], axis=1
         )
-        return (natural / jnp.asarray(self.scale, natural.dtype)).ravel()
-
-    def _split(self, point: Array) -> tuple[Array, Array]:
-        """Whitened offsets (N, M - 1, 3) and the variables after them, (N, 12), at a point."""
-        scale = jnp.asarray(self.scale, point.dtype)
-        natural = point.reshape(-1, scale.size) * scale
-        offsets = natural[:, : self.num_offsets].reshape(natural.shape[0], -1, 3)
-        return offsets, natural[:, self.num_offsets :]
-
-    def _unpack(self, point: Array, context: CatchContext) -> tuple[Chain, Catch]:
-        """Segments and catches at a point."""
-        offsets, natural = self._split(point)
-        catch = self.catches(natural, context)
-        piece_durations = catch.durations / self.num_pieces
-        rows = chain_rows(context.case.head_state, catch.tail_states, piece_durations)
-        return Chain(rows=rows, offsets=offsets, piece_durations=piece_durations), catch
-
-    def _at_catch(self, catch: Catch, context: CatchContext) -> Array:
-        """Excess at the catches, (2, N): of the angle, and over the horizon."""
-        # The horizon is a hard end: the tolerance of a feasible plan is taken off.
-        late = catch.times / context.horizon - 1.0 + FEASIBILITY_TOLERANCE
-        return jnp.where(context.active, jnp.stack([catch.angle_excess, late]), -1.0)
-
-    def _along(self, nodes: int, case: CatchCase) -> Along:
-        """Penalties along the way."""
-        return flight_along(self.maps, nodes, case, self.margin, self.hinge_width)
-
-    def objective(self, point: Array, context: CatchContext) -> Evaluation:
-        """Cost, and the largest excess at the penalty nodes (squares over squares)."""
-        offsets, natural = self._split(point)
-        rows, durations, core, at_catches = self.ends(natural, context)
-        penalties, worst = integrate_along(
-            self._along(self.nodes, context.case),
-            jnp.concatenate([rows, offsets], axis=1),
-            durations,
-            (context.case.gravity, context.case.limits, context.case.extras),
-        )
-        along = penalties + self._offset_costs(offsets, durations)
-        cost = core + jnp.sum(jnp.where(context.active, along, 0.0))
-        worst = jnp.max(jnp.where(context.active, worst, -1.0))
-        return Evaluation(cost=cost, violation=jnp.maximum(worst, at_catches) + BETWEEN_NODES)
-
-    def ends(self, natural: Array, context: CatchContext) -> tuple[Array, Array, Array, Array]:
-        """What the variables after the waypoint offsets make of the objective.
-
-        Args:
-            natural: (N, 12) as for `catches`.
-            context: of the case.
-
-        Returns:
-            Boundary rows (N, 8, 3) and mean durations of a piece (N,) [s] of the segments, the
-            cost of time and of the ends, and the greatest excess at the catches.
-        """
-        catch = self.catches(natural, context)
-        durations = catch.durations / self.num_pieces
-        rows = chain_rows(context.case.head_state, catch.tail_states, durations)
-        at_catch = self._at_catch(catch, context)
-        energies = jax.vmap(functools.partial(boundary_energy, self.maps))(rows, durations)
-        energy = jnp.sum(jnp.where(context.active, energies, 0.0))
-        hinges = smoothed_hinge(at_catch + self.margin, self.hinge_width)
-        weighed = self.energy_weight * energy + self.time_weight * catch.times[-1]
-        core = self.catch_weight * jnp.sum(hinges) + weighed
-        return rows, durations, core, jnp.max(at_catch)
-
-    def _offset_costs(self, offsets: Array, durations: Array) -> Array:
-        """Cost of the energy that the offsets make, (N,)."""
-        energies = jax.vmap(functools.partial(offset_energy, self.maps))(offsets, durations)
-        return self.energy_weight * energies
-
-    def curved(self, point: Array, context: CatchContext) -> Curvature:
-        """Evaluation, gradient, and second derivatives; see `segments_curvature`."""
-        offsets, natural = self._split(point)
-        return segments_curvature(
-            self.maps,
-            self._along(self.nodes, context.case),
-            lambda natural: self.ends(natural, context),
-            self.ends(natural, context),
-            natural,
-            offsets,
-            jnp.asarray(self.scale, point.dtype),
-            (context.case.gravity, context.case.limits, context.case.extras),
-            self.energy_weight,
-            context.active,
-        )
-
-    def residuals(self, point: Array, context: CatchContext) -> Array:
-        """Squared hinges, energy and time as residuals, for `measure_scale`.
-
-        The smoothed hinge bends at most with 3 / (2 hinge_width); the residuals bend alike.
-        """
-        chain, catch = self._unpack(point, context)
-        along = self._along(self.nodes, context.case)
-        bend = jnp.sqrt(1.5 / self.hinge_width)
-        margins = jnp.asarray(along.margins, point.dtype)[:, None, None]
-        motion, case = chain_motion(self.maps, self.nodes, chain, along.orders), context.case
-        excess = jnp.stack(limits_along(motion, (case.gravity, case.limits, case.extras)))
-        excess = jnp.where(context.active[:, None], excess, -1.0)
-        inside = jnp.maximum(excess + margins, 0.0)
-        weights = jnp.asarray(along.weights(), point.dtype)
-        inside = inside * jnp.sqrt(chain.piece_durations[:, None] * weights)
-        at_catch = self._at_catch(catch, context) + self.margin
-        at_catch = jnp.sqrt(self.catch_weight) * jnp.maximum(at_catch, 0.0)
-        energy = jnp.where(context.active, chain_energy(self.maps, chain), 0.0)
-        smooth = jnp.sqrt(2.0 * self.energy_weight * jnp.maximum(energy, 1e-6))
-        spent = jnp.where(context.active, catch.durations, 1e-6)
-        late = jnp.sqrt(2.0 * self.time_weight * spent)
-        parts = (bend * inside, bend * at_catch, smooth, late)
-        return jnp.concatenate([part.ravel() for part in parts])
+        return self.join(offsets, natural)
 
     def rules_out(self, context: CatchContext) -> Array:
-        """Whether a target is never within reach."""
+        """Return whether a target is never within reach."""
         return is_too_far(context)
 
-    def decode(self, point: Array, context: CatchContext) -> CatchPlan:
-        """The plan at a point, its violation looked for at `_DECODE_NODES` and between them."""
-        chain, catch = self._unpack(point, context)
-        nodes = _DECODE_NODES[context.times.size > 1]
-        greatest = greatest_excess(
-            self.maps, nodes, chain.columns, chain.piece_durations, context.case
-        )
-        along = [jnp.max(jnp.where(context.active, each, -1.0)) for each in greatest]
-        at_catch = jnp.max(self._at_catch(catch, context))
-        violation = functools.reduce(jnp.maximum, [*along, at_catch])
+    def make_plan(
+        self,
+        trajectory: PiecewisePolynomial,
+        ends: ChainEnds,
+        violation: Array,
+        context: CatchContext,
+    ) -> CatchPlan:
+        """Return the plan of a trajectory and the times of its catches."""
         return CatchPlan(
-            trajectory=chain_trajectory(self.maps, chain, context.active),
+            trajectory=trajectory,
             gravity=context.case.gravity,
             order=context.case.order,
             decided_times=context.times,
-            times=catch.times,
+            times=ends.contact,
             **pending(violation),
         )
 
-    def replanner(self) -> Any:
-        """The `ReplanCatch` that goes on from this planner's plans; see `pj.replan`."""
+    def replanner(self) -> "ReplanCatch":
+        """Return the `ReplanCatch` that continues from this planner's plans; see `pj.replan`."""
         from planner_jax.task.catch.replan import ReplanCatch
 
         return ReplanCatch(self)

@@ -17,7 +17,7 @@ from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import state_at
 from planner_jax.lanes import over_lanes
 from planner_jax.task.catch.case import CatchCase, CatchChoice
-from planner_jax.task.catch.chain import targets_at
+from planner_jax.task.catch.context import targets_at
 
 GRID = 64  # times at which every target is looked at
 _ACCELERATION = 7.0  # [m/s^2], sustained, of the estimate

@@ -6,14 +6,16 @@ from scratch stays for the first look and for surprises.
 """
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array
+from jax.typing import ArrayLike
 
+from planner_jax.ball.target import TargetPath
+from planner_jax.core.arithmetic import Numbers
 from planner_jax.core.checks import require_path
 from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.lbfgs import LbfgsConfig
@@ -22,7 +24,7 @@ from planner_jax.optimise.problem import Round
 from planner_jax.planning.replan import Replanning, given_or_own, moment_of
 from planner_jax.robot.quadrotor import body_z
 from planner_jax.task.catch.case import CatchCase
-from planner_jax.task.catch.chain import CatchContext, targets_at
+from planner_jax.task.catch.context import CatchContext, targets_at
 from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.trajectory.polynomial import (
@@ -89,10 +91,10 @@ class ReplanCatch(OptimisedPlanner):
         self,
         cases: CatchCase,
         previous: CatchPlan,
-        elapsed: Any,
+        elapsed: ArrayLike,
         *,
-        targets: Any,
-        head_state: Any = None,
+        targets: TargetPath,
+        head_state: ArrayLike | None = None,
     ) -> Replanning:
         """What is left of a case, or of a batch, some time into its plan; see `pj.replan`.
 
@@ -206,7 +208,7 @@ def _states(coeffs: Array, time: Array) -> Array:
     return jnp.sum(basis[..., None] * coeffs[:, None], axis=2)
 
 
-def _flown(trajectory: PiecewisePolynomial, times: Array) -> Array:
+def _flown(trajectory: PiecewisePolynomial, times: Numbers) -> Array:
     """States (K, 4, 3) at times (K,) of a trajectory."""
     ends = jnp.cumsum(trajectory.durations)
     piece = jnp.sum(times[:, None] >= ends[:-1], axis=1)

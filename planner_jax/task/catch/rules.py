@@ -1,9 +1,9 @@
 """What the numbers of a catch must be."""
 
-from typing import Any
-
 import numpy as np
+from jaxtyping import PyTree
 
+from planner_jax.core.arithmetic import Numbers
 from planner_jax.core.rules import (
     PERMUTATION,
     POSITIVE,
@@ -12,10 +12,10 @@ from planner_jax.core.rules import (
     Table,
     within,
 )
-from planner_jax.task.flight_rules import FLIGHT_RULES
+from planner_jax.task.quadrotor import FLIGHT_RULES
 
 
-def _lies_ahead(horizon: Any, case: Any) -> Any:
+def _lies_ahead(horizon: Numbers, case: PyTree) -> Numbers:
     return (horizon > 0.0) | ~case.present
 
 

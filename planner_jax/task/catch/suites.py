@@ -69,15 +69,17 @@ import dataclasses
 import functools
 import zlib
 from collections.abc import Callable
-from typing import Any
+from types import ModuleType
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import DTypeLike
+from jaxtyping import PyTree
 
 from planner_jax.ball.flight import BallState
-from planner_jax.ball.target import BallPath, HarmonicPath
+from planner_jax.ball.target import BallPath, HarmonicPath, TargetPath
 from planner_jax.core.checks import floating, require_scalar
 from planner_jax.core.choices import require_scale
 from planner_jax.core.errors import ArgumentError
@@ -87,7 +89,7 @@ from planner_jax.robot.quadrotor_models import PAPER_CATCHER
 from planner_jax.task.arguments import require_draw
 from planner_jax.task.catch.case import GRAVITY, CatchCase, case
 from planner_jax.task.catch.spec import SUITES, TASK
-from planner_jax.task.flight import require_own_robot
+from planner_jax.task.quadrotor import require_own_robot
 
 LAUNCH = (4.0, 0.0, 0.8)  # [m], of every throw
 CATCH_HEIGHT = 0.45  # [m], least height of a thrown ball at its catch
@@ -125,7 +127,7 @@ def draw(
     limit_scale: float = 1.0,
     robot: QuadrotorModel = PAPER_CATCHER,
     num_targets: int | None = None,
-    dtype: Any = jnp.float32,
+    dtype: DTypeLike = jnp.float32,
 ) -> CatchCase:
     """A batch of cases of a suite, drawn in float64 and then cast.
 
@@ -200,7 +202,7 @@ def _columns(suite: str) -> int:
     return 3 * len(throws) if throws else _PATHS[suite][0]
 
 
-def _targets(suite: str, uniform: Any) -> tuple[Any, Any]:
+def _targets(suite: str, uniform: PyTree) -> tuple[TargetPath, PyTree]:
     """Targets, leaves (num, N, ...), and horizons (num, N) [s] from numbers of [0, 1).
 
     Args:
@@ -213,17 +215,17 @@ def _targets(suite: str, uniform: Any) -> tuple[Any, Any]:
     return _PATHS[suite][1](uniform)
 
 
-def _module(array: Any) -> Any:
+def _module(array: PyTree) -> ModuleType:
     """What computes with an array: jax.numpy or NumPy."""
     return jnp if isinstance(array, jax.Array) else np
 
 
-def _between(uniform: Any, low: float, high: float) -> Any:
-    """Numbers of [0, 1) spread over an interval."""
+def _between(uniform: PyTree, low: float, high: float) -> PyTree:
+    """PyTree of [0, 1) spread over an interval."""
     return low + uniform * (high - low)
 
 
-def _unit(angle: Any) -> Any:
+def _unit(angle: PyTree) -> PyTree:
     """Level unit vectors (..., 3) at angles (...) [rad]."""
     xp = _module(angle)
     return xp.stack([xp.cos(angle), xp.sin(angle), xp.zeros_like(angle)], axis=-1)
@@ -232,7 +234,7 @@ def _unit(angle: Any) -> Any:
 # Throws.
 
 
-def _throws(uniform: Any, throws: tuple[_Throw, ...]) -> tuple[BallPath, Any]:
+def _throws(uniform: PyTree, throws: tuple[_Throw, ...]) -> tuple[BallPath, PyTree]:
     """Thrown balls from three numbers each, and when they fall through `CATCH_HEIGHT`."""
     xp = _module(uniform)
     drawn = [_throw(u, t) for u, t in zip(xp.split(uniform, len(throws), 1), throws, strict=True)]
@@ -241,12 +243,12 @@ def _throws(uniform: Any, throws: tuple[_Throw, ...]) -> tuple[BallPath, Any]:
     return _balls(pos, vel, drag, np.full(horizon.shape, GRAVITY)), horizon
 
 
-def _balls(pos: Any, vel: Any, drag: Any, gravity: Any) -> BallPath:
+def _balls(pos: PyTree, vel: PyTree, drag: PyTree, gravity: PyTree) -> BallPath:
     """Paths with NumPy leaves."""
     return BallPath(ball=BallState(pos=pos, vel=vel), drag=drag, gravity=gravity)
 
 
-def _throw(uniform: Any, throw: _Throw) -> tuple[Any, Any, Any]:
+def _throw(uniform: PyTree, throw: _Throw) -> tuple[PyTree, PyTree, PyTree]:
     """Position (B, 3), velocity (B, 3) at the planning and horizon (B,) of one ball a row."""
     xp = _module(uniform)
     level = (2.0 * uniform[:, :2] - 1.0) * xp.asarray(throw.land)
@@ -285,7 +287,7 @@ def earliest_throw(name: str) -> tuple[BallState, float]:
     return BallState(pos=pos, vel=vel), float(horizon[0])
 
 
-def _fly(pos, vel, time, drag: float, gravity: float = GRAVITY) -> tuple[Any, Any]:
+def _fly(pos, vel, time, drag: float, gravity: float = GRAVITY) -> tuple[PyTree, PyTree]:
     """Balls (B, 3) after `time` (B,) [s] with linear drag [1/s] (paper 000, eq. 9)."""
     xp, t = _module(vel), time[:, None]
     pull = np.array([0.0, 0.0, -gravity])
@@ -299,12 +301,12 @@ def _fly(pos, vel, time, drag: float, gravity: float = GRAVITY) -> tuple[Any, An
 # Lines and swings.
 
 
-def _lines(pos: Any, vel: Any) -> BallPath:
+def _lines(pos: PyTree, vel: PyTree) -> BallPath:
     """Targets that fly straight on from `pos` (B, N, 3) at `vel`."""
     return _balls(pos, vel, np.zeros(pos.shape), np.zeros(pos.shape[:2]))
 
 
-def _harmonic(uniform: Any) -> tuple[HarmonicPath, Any]:
+def _harmonic(uniform: PyTree) -> tuple[HarmonicPath, PyTree]:
     """Two swings from nine numbers each."""
     u = uniform.reshape(len(uniform), 2, 9)
     drift = _between(u[..., :1], 1.0, 1.5) * _unit(2.0 * np.pi * u[..., 1])
@@ -313,11 +315,11 @@ def _harmonic(uniform: Any) -> tuple[HarmonicPath, Any]:
     swing = xp.concatenate([xp.zeros_like(u[..., :2]), _between(u[..., 5:6], 0.6, 1.0)], axis=-1)
     rate, phase = _between(u[..., 6], 1.5, 2.5), 2.0 * np.pi * u[..., 7]
     when = _between(u[..., 8:9], 2.0, 5.0)
-    leaves: tuple[Any, ...] = (near - drift * when, drift, swing, rate, phase)
+    leaves: tuple[PyTree, ...] = (near - drift * when, drift, swing, rate, phase)
     return HarmonicPath(*leaves), np.full(when.shape[:2], SUITES["harmonic2"].horizon)
 
 
-def _triangle(uniform: Any) -> tuple[BallPath, Any]:
+def _triangle(uniform: PyTree) -> tuple[BallPath, PyTree]:
     """Three targets on the sides of an equilateral triangle, from seven numbers."""
     xp, u = _module(uniform), uniform[:, :, None]
     centre = xp.concatenate([uniform[:, :2] - 0.5, _between(uniform[:, 2:3], 1.5, 2.5)], axis=1)
@@ -328,7 +330,7 @@ def _triangle(uniform: Any) -> tuple[BallPath, Any]:
     return targets, np.full(corner.shape, SUITES["triangle3"].horizon)
 
 
-def _polygon(uniform: Any, *, num: int) -> tuple[BallPath, Any]:
+def _polygon(uniform: PyTree, *, num: int) -> tuple[BallPath, PyTree]:
     """Targets in parallel at the corners of a regular polygon, from eight numbers."""
     xp, u = _module(uniform), uniform[:, :, None]
     near = xp.concatenate([uniform[:, :2] - 0.5, _between(uniform[:, 2:3], 1.5, 2.5)], axis=1)
@@ -342,15 +344,15 @@ def _polygon(uniform: Any, *, num: int) -> tuple[BallPath, Any]:
 
 
 def _rush(
-    uniform: Any, *, of: Callable, num: int, first: float, after: float, spread: float
-) -> tuple[BallPath, Any]:
+    uniform: PyTree, *, of: Callable, num: int, first: float, after: float, spread: float
+) -> tuple[BallPath, PyTree]:
     """Targets of another suite with horizons of their own, from two numbers more for each."""
     xp, own = _module(uniform), uniform[:, : -2 * num]
     order = xp.argsort(uniform[:, -2 * num : -num], axis=1)
     return of(own)[0], first + after * order + spread * (uniform[:, -num:] - 0.5)
 
 
-def _swarm(uniform: Any, *, num: int) -> tuple[BallPath, Any]:
+def _swarm(uniform: PyTree, *, num: int) -> tuple[BallPath, PyTree]:
     """Balls that sink all around, from six numbers each."""
     xp, u = _module(uniform), uniform.reshape(len(uniform), num, 6)
     height, sinking = _between(u[..., 2:3], 2.0, 6.0), _between(u[..., 3:4], 0.4, 2.0)

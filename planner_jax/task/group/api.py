@@ -8,13 +8,13 @@ from planner_jax.core.registry import suite_named
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.referee.intercept import InterceptVerdict, referee_intercepts
 from planner_jax.referee.intercept_group import referee_groups
+from planner_jax.task.arguments import find_decision
 from planner_jax.task.group.case import InterceptGroup
 from planner_jax.task.group.plan import GroupPlan
 from planner_jax.task.group.spec import DECISIONS, SUITES, TASK
 from planner_jax.task.group.suites import draw_groups
 from planner_jax.task.intercept.api import by_own_class
-from planner_jax.task.judged import judged, require_settings
-from planner_jax.task.named_decision import named_decision
+from planner_jax.task.judge import judge_by, require_settings
 
 
 def draw(
@@ -65,7 +65,7 @@ def planner(
         ValueError: there is no planner or decision of that name.
         TypeError: the planner has no such field.
     """
-    return DecidedPlanner(TASK.make_planner(name, options), named_decision(DECISIONS, decide))
+    return DecidedPlanner(TASK.make_planner(name, options), find_decision(DECISIONS, decide))
 
 
 def judge(cases: InterceptGroup, plans: GroupPlan, **settings: object) -> InterceptVerdict:
@@ -86,4 +86,4 @@ def judge(cases: InterceptGroup, plans: GroupPlan, **settings: object) -> Interc
     require_settings(referee_intercepts, settings)
     if isinstance(cases, InterceptGroup):
         settings = {**by_own_class(cases.shared.target), **settings}
-    return judged(referee_groups, cases, plans, (InterceptGroup, GroupPlan), settings)
+    return judge_by(referee_groups, cases, plans, (InterceptGroup, GroupPlan), settings)

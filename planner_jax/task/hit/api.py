@@ -1,9 +1,9 @@
 """The words of the task: `pj.hit.draw`, `planner` and `judge`; `case` stands in `case.py`."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 
 from planner_jax.core.choices import with_effort
 from planner_jax.core.planner import Planner
@@ -12,12 +12,12 @@ from planner_jax.recovery.with_recovery import ended
 from planner_jax.referee.hit import HitVerdict, referee_hits
 from planner_jax.robot.quadrotor_model import QuadrotorModel
 from planner_jax.robot.quadrotor_models import PAPER_HITTER
-from planner_jax.task.flight import require_own_robot
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.plan import HitPlan
 from planner_jax.task.hit.spec import REAL_SCENARIOS, START, TASK
 from planner_jax.task.hit.suites import generate_serves, to_cases
-from planner_jax.task.judged import judged
+from planner_jax.task.judge import judge_by
+from planner_jax.task.quadrotor import require_own_robot
 
 
 def draw(
@@ -30,7 +30,7 @@ def draw(
     delay: float = 0.0,
     limit_scale: float = 1.0,
     robot: QuadrotorModel = PAPER_HITTER,
-    dtype: Any = jnp.float32,
+    dtype: DTypeLike = jnp.float32,
 ) -> HitCase:
     """Drawn serves as a batch of cases; see `generate_serves` and `to_cases`.
 
@@ -66,7 +66,7 @@ def draw(
 
 
 def planner(
-    name: str = "exact", *, effort: str = "feasible", ending: str | None = None, **options: Any
+    name: str = "exact", *, effort: str = "feasible", ending: str | None = None, **options: object
 ) -> Planner[HitCase, HitPlan]:
     """The hit planner of a name, with some of its fields set.
 
@@ -97,7 +97,7 @@ def planner(
     return ended(with_effort(TASK.make_planner(name, options), effort), ending)
 
 
-def judge(cases: HitCase, plans: HitPlan, **settings: Any) -> HitVerdict:
+def judge(cases: HitCase, plans: HitPlan, **settings: object) -> HitVerdict:
     """What the referee says of one plan or of a batch: the physics alone decides.
 
     Args:
@@ -113,4 +113,4 @@ def judge(cases: HitCase, plans: HitPlan, **settings: Any) -> HitVerdict:
         TypeError: the cases or plans are not hits.
         ValueError: shapes that do not fit, or a setting out of its range.
     """
-    return judged(referee_hits, cases, plans, (HitCase, HitPlan), settings)
+    return judge_by(referee_hits, cases, plans, (HitCase, HitPlan), settings)

@@ -1,7 +1,7 @@
 """One volley to plan: the incoming ball, the hovering quadrotor, the target and the limits."""
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,9 +16,9 @@ from planner_jax.robot.quadrotor import QuadrotorLimits
 from planner_jax.robot.quadrotor_model import RACKET, QuadrotorModel
 from planner_jax.robot.quadrotor_models import PAPER_HITTER
 from planner_jax.task.arguments import array_of, batch_of
-from planner_jax.task.flight import ARGUMENTS, limits_of, require_start, require_tool
 from planner_jax.task.hit.rules import RULES
 from planner_jax.task.hit.spec import START
+from planner_jax.task.quadrotor import ARGUMENTS, limits_of, require_start, require_tool
 
 # Fit to the published landing points; the residual is 1 cm.
 DRAG = 0.0616  # K_D [1/m]
@@ -57,7 +57,7 @@ class HitCase:
     racket_height: Array  # () [m], racket centre above the propeller plane
     limits: QuadrotorLimits
     hit_limits: HitLimits
-    extras: tuple[Any, ...] = ()  # limits and costs of the user's own, see `cost.extras`
+    extras: tuple[Extra, ...] = ()  # limits and costs of the user's own, see `cost.extras`
     racket_radius: Array | None = None  # () [m]; None: not looked at
 
     @property
@@ -127,7 +127,7 @@ def case(
     dtype, batch = floating(dtype), batch_of("serve_pos", serve_pos, 3)
     tool = require_tool(robot, RACKET)
 
-    def leaf(name: str, value: Any, *shape: int) -> Array:
+    def leaf(name: str, value: object, *shape: int) -> Array:
         return array_of(name, value, batch, shape, dtype)
 
     head = np.zeros(batch + (4, 3))

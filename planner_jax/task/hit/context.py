@@ -1,13 +1,17 @@
-"""One hit as every planner of the task looks at it: the incoming ball's path, and an impact."""
+"""One hit as every planner of the task sees it: the ball's path, an impact, and a bound on both."""
 
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jax import Array, lax
 
 from planner_jax.ball.flight import drag_free_fall_time
 from planner_jax.ball.prediction import PathTable, predict_path
+from planner_jax.robot.quadrotor_reach import ALLOWED, beyond_reach, greatest_speed
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.plan import Stroke
+
+_SLACK = 0.02  # [m], far more than a plan that the referee accepts may be off its ball
 
 
 @struct.dataclass
@@ -41,3 +45,37 @@ class Impact:
     stroke: Stroke
     tail_state: Array  # (4, 3) of the quadrotor at the impact
     apex: Array  # () [m], of the returned ball
+
+
+def is_too_far(context: HitContext) -> Array:
+    """Return whether the quadrotor can be near the ball at no time of its flight, () bool.
+
+    At an impact the quadrotor is the racket's height away from the ball, above its least height,
+    and the ball above the ground and not above the greatest apex. Looked at are the nodes of the
+    ball's table: an impact is within half a step of one of them, in which ball and quadrotor move
+    by what is added to the distance.
+
+    False does not say that there is a plan. A number that is not finite makes it false.
+
+    Args:
+        context: of one case.
+    """
+    case, path = context.case, context.path
+    limits, ball = case.limits, case.ball
+    pos, vel = path.pos[1:-1], path.vel[1:-1]
+    half_step = 0.5 * path.resolution
+    times = path.resolution * jnp.asarray(np.arange(pos.shape[0]), pos.dtype)
+    # The ball is fastest at the ground if drag takes nothing away.
+    fastest_squared = jnp.sum(ball.vel * ball.vel) + 2.0 * case.gravity * jnp.abs(ball.pos[2])
+    bend = 0.5 * (case.gravity + case.drag * fastest_squared) * half_step**2
+    speed = jnp.sqrt(jnp.sum(vel * vel, axis=1))
+    moved = (speed + greatest_speed(case.head_state, limits)) * half_step + bend
+    arm = jnp.abs(case.racket_height) + _SLACK
+    far = beyond_reach(pos, times, case.head_state, limits, case.gravity)
+    lowest = jnp.maximum(limits.min_height - arm, 0.0)
+    low = lowest - pos[:, 2] - _SLACK
+    high = pos[:, 2] - ALLOWED * case.hit_limits.max_apex - _SLACK
+    apart = jnp.maximum(far - arm, jnp.maximum(low, high))
+    # A ball that is still up at the end of the table goes on behind it.
+    is_down = (pos[-1, 2] < lowest) & (vel[-1, 2] < 0.0)
+    return jnp.all(apart > moved) & is_down

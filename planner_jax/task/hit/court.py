@@ -1,4 +1,4 @@
-"""The court of paper 002, Section VI-B: regions, targets, 36 scenarios and published rates.
+"""The court of paper 002, Section VI-B: regions, targets, 36 scenarios, and flights of serves.
 
 World frame, z up, x towards the opponent, net at x = 0, y to the left. The opponent's half
 has x > 0, the hitting half x < 0; the same lines, mirrored in x, divide both.
@@ -6,19 +6,25 @@ has x > 0, the hitting half x < 0; the same lines, mirrored in x, divide both.
 The paper gives the size of the court; the lines inside it are measured from the published
 serves, landing points and targets. The lane line shows itself at 0.84 m: points of the middle
 lanes reach 0.8395 m, points of the side lanes begin at 0.8418 m.
+
+Flights are computed in float64 NumPy over whole batches, so that a bad serve is found and named
+before a program is compiled for it.
 """
 
-import csv
-import dataclasses
-from importlib import resources
-
 import numpy as np
+from numpy.typing import ArrayLike
+
+from planner_jax.core.rules import require_rule, require_sound
+from planner_jax.task.hit.case import HitCase
 
 HALF_LENGTH = 5.0  # [m], net to back line
 HALF_WIDTH = 2.5  # [m], middle line to side line
 DEAD_ZONE = 0.5  # [m], from the net
 NEAR_LINE = 3.0  # [m], from the net; near ends and far begins, in the middle lane
 LANE_LINE = 0.84  # [m], from the middle line; middle lane ends and side lane begins
+
+_FLIGHT_STEPS = 16  # puts the landing point of a serve within 0.1 mm
+_NEWTON_STEPS = 5
 
 # Near, Far, Left, Right; the published files count them from 1.
 REGIONS = "NFLR"
@@ -43,32 +49,6 @@ def _scenario_names() -> tuple[str, ...]:
 
 
 SCENARIOS = _scenario_names()
-
-
-@dataclasses.dataclass(frozen=True)
-class PublishedRates:
-    """Planning success rates in percent: a row per name in SCENARIOS, a column per planner.
-
-    The two sources differ by up to 20 points, so name the one that a number is compared with.
-    """
-
-    paper: np.ndarray  # (36, 3) [%], Table I of the paper
-    trials: np.ndarray  # (36, 3) [%], counted from the published trial files, 1,000 rows each
-
-
-def published_rates() -> PublishedRates:
-    """The rates that came with paper 002, columns in the order of PLANNERS."""
-    text = (resources.files("planner_jax.task.hit") / "published_rates.csv").read_text(
-        encoding="utf-8"
-    )
-    table = csv.DictReader(line for line in text.splitlines() if not line.startswith("#"))
-    rows = {row["scenario"]: row for row in table}
-
-    def columns(source: str) -> np.ndarray:
-        names = [f"{source}_{planner.replace('-', '_')}" for planner in PLANNERS]
-        return np.array([[float(rows[scenario][name]) for name in names] for scenario in SCENARIOS])
-
-    return PublishedRates(paper=columns("paper"), trials=columns("data"))
 
 
 def region_bounds(depth: float = HALF_LENGTH) -> np.ndarray:
@@ -99,3 +79,120 @@ def scenario_regions(scenario) -> np.ndarray:
 def target_of(scenario) -> np.ndarray:
     """Target points (..., 3) [m] of scenarios given by their place in SCENARIOS."""
     return np.array(TARGETS)[scenario_regions(scenario)[..., 2] - 1]
+
+
+# Inside, the axis of the components comes first: NumPy is quick along the last one.
+
+
+def _acceleration(velocity: np.ndarray, drag: np.ndarray, gravity: np.ndarray) -> np.ndarray:
+    """Acceleration  g - K_D |v| v  (3, ...) (paper 002, eq. 2)."""
+    x, y, z = velocity
+    acceleration = -drag * np.sqrt(x * x + y * y + z * z) * velocity
+    acceleration[2] -= gravity
+    return acceleration
+
+
+def _rk4_step(position, velocity, step, drag, gravity):
+    """Position and velocity (3, ...) after one Runge-Kutta step (...) [s] of order 4."""
+    half = 0.5 * step
+    a1 = _acceleration(velocity, drag, gravity)
+    a2 = _acceleration(velocity + half * a1, drag, gravity)
+    a3 = _acceleration(velocity + half * a2, drag, gravity)
+    a4 = _acceleration(velocity + step * a3, drag, gravity)
+    return (
+        position + step * velocity + step**2 / 6.0 * (a1 + a2 + a3),
+        velocity + step / 6.0 * (a1 + 2.0 * (a2 + a3) + a4),
+    )
+
+
+def _components_first(vectors: ArrayLike) -> np.ndarray:
+    return np.ascontiguousarray(np.moveaxis(np.asarray(vectors, float), -1, 0))
+
+
+def fly(position, velocity, duration, drag, gravity, *, num_steps: int = _FLIGHT_STEPS):
+    """Position and velocity of balls after a flight with quadratic drag.
+
+    Args:
+        position: (..., 3) [m].
+        velocity: (..., 3) [m/s].
+        duration: (...) [s].
+        drag: (...) K_D [1/m].
+        gravity: (...) [m/s^2], magnitude.
+        num_steps: how many equal Runge-Kutta steps.
+
+    Returns:
+        position: (..., 3) [m].
+        velocity: (..., 3) [m/s].
+    """
+    step = np.asarray(duration, float) / num_steps
+    drag, gravity = np.asarray(drag, float), np.asarray(gravity, float)
+    position, velocity = np.asarray(position, float), np.asarray(velocity, float)
+    lead = np.broadcast_shapes(position.shape[:-1], velocity.shape[:-1], step.shape)
+    position, velocity = (
+        _components_first(np.broadcast_to(vector, (*lead, 3))) for vector in (position, velocity)
+    )
+    for _ in range(num_steps):
+        position, velocity = _rk4_step(position, velocity, step, drag, gravity)
+    return np.moveaxis(position, 0, -1), np.moveaxis(velocity, 0, -1)
+
+
+def landing(position, velocity, drag, gravity):
+    """When and where balls come down to the floor z = 0 if nobody hits them.
+
+    Flies in equal steps until the ball is below the floor, then back to it by Newton's method on
+    the height, each of its steps a Runge-Kutta step.
+
+    Args:
+        position: (..., 3) [m], with z > 0.
+        velocity: (..., 3) [m/s].
+        drag: (...) K_D [1/m], >= 0.
+        gravity: (...) [m/s^2], magnitude, > 0.
+
+    Returns:
+        time: (...) [s] from now.
+        point: (..., 3) [m]. Both are NaN for balls that are never down: too fast to compute with,
+            or held up by a drag out of all proportion.
+    """
+    vectors = np.broadcast_arrays(np.asarray(position, float), velocity)
+    point, velocity = (_components_first(vector) for vector in vectors)
+    drag, gravity = np.asarray(drag, float), np.asarray(gravity, float)
+    rise = velocity[2]
+    with np.errstate(all="ignore"):
+        drag_free_time = (rise + np.sqrt(rise**2 + 2.0 * gravity * point[2])) / gravity
+        # Drag slows a ball down within 1 / (drag speed); a step must be a fraction of that.
+        stiffness = drag * np.linalg.norm(velocity, axis=0) * drag_free_time
+        num_steps = int(np.clip(8.0 * np.nanmax(stiffness, initial=0.0), _FLIGHT_STEPS, 1024))
+        step = drag_free_time / num_steps
+        time = np.zeros_like(step)
+        for _ in range(8 * num_steps):
+            above = point[2] > 0.0
+            if not above.any():
+                break
+            ahead = _rk4_step(point, velocity, step, drag, gravity)
+            point, velocity = np.where(above, ahead, (point, velocity))
+            time = time + np.where(above, step, 0.0)
+        for _ in range(_NEWTON_STEPS):
+            back = -point[2] / velocity[2]
+            point, velocity = _rk4_step(point, velocity, back, drag, gravity)
+            time = time + back
+    down = np.abs(point[2]) < 1e-6
+    return np.where(down, time, np.nan), np.moveaxis(np.where(down, point, np.nan), 0, -1)
+
+
+def check_cases(cases: HitCase) -> None:
+    """Raise `CaseError` for the first rule that some lane of a batch breaks.
+
+    Every number keeps the rules of `HitCase`; the ball is above the floor, and comes down in the
+    hitting half, x < 0.
+
+    Args:
+        cases: one case, or a batch with leading axes. Its leaves must be concrete.
+    """
+    require_sound(cases)
+    batch, ball = cases.batch_shape, cases.ball
+    position, velocity = np.asarray(ball.pos, float), np.asarray(ball.vel, float)
+    height = position[..., 2]
+    require_rule("height of ball.pos", height, height > 0.0, "> 0", batch)
+    _, point = landing(position, velocity, cases.drag, cases.gravity)
+    x = point[..., 0]
+    require_rule("landing point of ball", x, x < 0.0, "in the hitting half, x < 0", batch)

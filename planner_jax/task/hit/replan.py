@@ -7,12 +7,12 @@ plans once, because "even minor updates in the terminal state could lead to dras
 """
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array
+from jax.typing import ArrayLike
 
 from planner_jax.ball.flight import BallState
 from planner_jax.core.checks import require_beginning, require_kind
@@ -65,11 +65,11 @@ class ReplanHit(OptimisedPlanner):
         self,
         cases: HitCase,
         previous: HitPlan,
-        elapsed: Any,
+        elapsed: ArrayLike,
         *,
         ball: BallState,
-        drag: Any = None,
-        head_state: Any = None,
+        drag: ArrayLike | None = None,
+        head_state: ArrayLike | None = None,
     ) -> Replanning:
         """What is left of a case, or of a batch, some time into its plan; see `pj.replan`.
 
@@ -109,13 +109,12 @@ class ReplanHit(OptimisedPlanner):
         sizes = jnp.append(times, jnp.sqrt(jnp.sum(pull**2)))
         natural = jnp.concatenate(
             [
-                jnp.zeros(planner.num_offsets, sizes.dtype),
                 jnp.log(jnp.maximum(sizes, _SHORTEST)),
                 jnp.stack([jnp.sum(vel * across_x), jnp.sum(vel * across_y)]),
                 jerk,
             ]
         )
-        return natural / jnp.asarray(planner.scale, natural.dtype)
+        return planner.join(jnp.zeros(planner.num_offsets, sizes.dtype), natural[None])
 
     def guesses(self, context: ReplanHitContext, num: int) -> Array:
         """The previous stroke, and then those from scratch, (num, n)."""

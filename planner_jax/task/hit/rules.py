@@ -1,7 +1,7 @@
 """What the numbers of a hit must be."""
 
 from planner_jax.core.rules import NOT_NEGATIVE, POSITIVE, Field, Table, below, within
-from planner_jax.task.flight_rules import FLIGHT_RULES
+from planner_jax.task.quadrotor import FLIGHT_RULES
 
 RULES: Table = (
     Field("ball.pos", (3,)),

@@ -19,9 +19,8 @@ from planner_jax.robot.quadrotor_models import PAPER_HITTER
 from planner_jax.task.arguments import require_draw
 from planner_jax.task.hit import court
 from planner_jax.task.hit.case import DRAG, GRAVITY, HitCase, case
+from planner_jax.task.hit.court import fly, landing
 from planner_jax.task.hit.spec import START
-from planner_jax.task.hit.trial_files import read_trials
-from planner_jax.task.hit.validate import fly, landing
 
 # The law of the published serves, fitted to them. Position and velocity are uniform, and those
 # serves are kept that meet the following and land in the region asked for.
@@ -83,6 +82,8 @@ def read_serves(folder: str | os.PathLike) -> Serves:
             not finite, does not land in the hitting half, or differs between the files of a
             scenario; `value` has all of these rows.
     """
+    from planner_jax.task.hit.published import read_trials
+
     trials = read_trials(folder)
     numbers = np.array([trial.numbers for trial in trials])
     return Serves(

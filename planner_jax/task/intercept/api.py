@@ -18,7 +18,7 @@ from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.plan import InterceptPlan
 from planner_jax.task.intercept.spec import SUITES, TASK
 from planner_jax.task.intercept.suites import drawn
-from planner_jax.task.judged import judged
+from planner_jax.task.judge import judge_by
 
 
 def draw(
@@ -153,7 +153,7 @@ def judge(cases: InterceptCase, plans: InterceptPlan, **settings: object) -> Int
             one = jax.tree.map(lambda leaf: np.asarray(leaf)[None], truth)
             settings = {**settings, "truth": one}
     settings = {**by_own_class(target), **settings}
-    return judged(referee_intercepts, cases, plans, (InterceptCase, InterceptPlan), settings)
+    return judge_by(referee_intercepts, cases, plans, (InterceptCase, InterceptPlan), settings)
 
 
 def by_own_class(target: PlanePath) -> dict[str, object]:

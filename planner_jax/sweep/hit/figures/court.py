@@ -12,7 +12,7 @@ from planner_jax.runs import style
 from planner_jax.sweep.report import RunRows
 from planner_jax.sweep.sampled_motion import sample_motion
 from planner_jax.task.hit import court
-from planner_jax.task.hit.validate import fly, landing
+from planner_jax.task.hit.court import fly, landing
 
 _SAMPLES = 48
 _FLOOR = "#F6F8FA"

@@ -10,7 +10,7 @@ from planner_jax.runs import style
 from planner_jax.sweep.figures.motion import DASHED, FORBIDDEN, Drawn, quadrotor_figure
 from planner_jax.sweep.hit.figures.court import ball_path
 from planner_jax.sweep.report import RunRows
-from planner_jax.task.hit.validate import landing
+from planner_jax.task.hit.court import landing
 
 _PANELS = ("speed", "acceleration", "body_rate", "thrust")
 

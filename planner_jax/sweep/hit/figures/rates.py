@@ -10,6 +10,7 @@ from planner_jax.runs import style
 from planner_jax.runs.summary import wilson_interval
 from planner_jax.sweep.report import RunRows
 from planner_jax.task.hit import court
+from planner_jax.task.hit.published import published_rates
 
 _WIDTH = 0.26
 
@@ -19,7 +20,7 @@ def rates_figure(figure: Figure, run: RunRows) -> None:
     manifest = run.manifest
     summary, name = manifest["summary"], manifest["parameters"]["planner"]
     other = compared_with(name)
-    published = court.published_rates()
+    published = published_rates()
     column = court.PLANNERS.index(other)
     panels = figure.subplot_mosaic("N" * 10 + "F" * 10 + "\n" + "L" * 16 + "....")
     words = {"N": "near", "F": "far", "L": "the left"}

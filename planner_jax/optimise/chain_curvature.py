@@ -7,12 +7,12 @@ durations from a few variables each: what is known of the one is pulled back to 
 
 import functools
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
+from jaxtyping import PyTree
 
 from planner_jax.cost.along import Along
 from planner_jax.cost.along_curvature import (
@@ -32,7 +32,7 @@ BETWEEN_NODES = 0.004  # by which peaks between penalty nodes are higher, about
 Ends = Callable[[Array], tuple[Array, Array, Array, Array]]
 
 
-def segments_curvature(
+def chain_curvature(
     maps: ProportionalMinco,
     along: Along,
     ends: Ends,
@@ -40,7 +40,7 @@ def segments_curvature(
     natural: Array,
     offsets: Array,
     scale: Array,
-    parameters: Any,
+    parameters: PyTree,
     energy_weight: float,
     active: Array,
 ) -> Curvature:

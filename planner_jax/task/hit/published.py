@@ -1,8 +1,11 @@
-"""The published trial files of paper 002: what was served, and whether it was planned for."""
+"""What was published with paper 002: trial files (serves and outcomes), and success rates."""
 
+import csv
+import dataclasses
 import math
 import os
 import re
+from importlib import resources
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
@@ -12,7 +15,7 @@ from planner_jax.core.errors import ArgumentError
 from planner_jax.host.files import open_plain
 from planner_jax.task.hit import court
 from planner_jax.task.hit.case import DRAG, GRAVITY
-from planner_jax.task.hit.validate import landing
+from planner_jax.task.hit.court import landing
 
 _FILE_NAME = re.compile(r"([1-4])_([1-4])_([1-4])_([plb])\.csv")
 _FILE_PLANNER = {"p": "bat", "l": "bat-lite", "b": "juggle"}
@@ -169,3 +172,31 @@ def _out_of_play(trials: list[Trial]) -> list[str]:
         elif not x < 0.0:
             problems.append(f"{where}: serve must land in the hitting half, x < 0, got x = {x:.3g}")
     return problems
+
+
+@dataclasses.dataclass(frozen=True)
+class PublishedRates:
+    """Planning success rates in percent: a row per name in court.SCENARIOS, a column per planner.
+
+    The two sources differ by up to 20 points, so name the one that a number is compared with.
+    """
+
+    paper: np.ndarray  # (36, 3) [%], Table I of the paper
+    trials: np.ndarray  # (36, 3) [%], counted from the published trial files, 1,000 rows each
+
+
+def published_rates() -> PublishedRates:
+    """The rates that came with paper 002, columns in the order of court.PLANNERS."""
+    text = (resources.files("planner_jax.task.hit") / "published_rates.csv").read_text(
+        encoding="utf-8"
+    )
+    table = csv.DictReader(line for line in text.splitlines() if not line.startswith("#"))
+    rows = {row["scenario"]: row for row in table}
+
+    def columns(source: str) -> np.ndarray:
+        names = [f"{source}_{planner.replace('-', '_')}" for planner in court.PLANNERS]
+        return np.array(
+            [[float(rows[scenario][name]) for name in names] for scenario in court.SCENARIOS]
+        )
+
+    return PublishedRates(paper=columns("paper"), trials=columns("data"))

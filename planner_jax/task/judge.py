@@ -1,8 +1,8 @@
-"""The way from cases and plans of any kind of arrays to a referee, which takes NumPy batches."""
+"""Cases and plans of any kind of arrays, passed to a referee of NumPy batches."""
 
 import inspect
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax
 import numpy as np
@@ -15,14 +15,14 @@ from planner_jax.core.protocol import Case, Plan, lane
 VerdictT = TypeVar("VerdictT")
 
 
-def judged(
+def judge_by(
     referee: Callable[..., VerdictT],
-    cases: Any,
-    plans: Any,
+    cases: Case,
+    plans: Plan,
     kinds: tuple[type[Case], type[Plan]],
-    settings: dict[str, Any],
+    settings: dict[str, object],
 ) -> VerdictT:
-    """The verdict on one plan, or on a batch.
+    """Return the verdict on one plan, or on a batch.
 
     Args:
         referee: of batches.
@@ -55,7 +55,7 @@ def judged(
     return lane(verdict, 0) if alone else verdict
 
 
-def require_settings(referee: Callable[..., Any], settings: dict[str, Any]) -> None:
+def require_settings(referee: Callable[..., object], settings: dict[str, object]) -> None:
     """Raise unless settings are a referee's, each of the kind that its default is.
 
     Those that a referee hands on to another are looked at for that one.

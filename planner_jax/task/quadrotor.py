@@ -1,16 +1,40 @@
-"""What the cases of all quadrotor tasks take from the robot."""
+"""The quadrotor in a case: rules of its limits, and what a case takes from the robot."""
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from jax import Array
 from jax.core import Tracer
+from jaxtyping import PyTree
 
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
-from planner_jax.core.rules import require_rule
+from planner_jax.core.rules import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    POSITIVE_OR_NONE,
+    Field,
+    Table,
+    below,
+    require_rule,
+)
 from planner_jax.robot.quadrotor import QuadrotorLimits, RotorLimits
 from planner_jax.robot.quadrotor_model import NET, QuadrotorModel, Tool
+
+# Rules of the limits, in the cases of all quadrotor tasks.
+FLIGHT_RULES: Table = (
+    Field("limits.speed", (), POSITIVE),
+    Field("limits.body_rate", (), POSITIVE),
+    Field("limits.acceleration", (), POSITIVE),
+    Field("limits.min_thrust", (), NOT_NEGATIVE),
+    Field("limits.min_thrust", (), below("limits.max_thrust")),
+    Field("limits.max_thrust", (), POSITIVE_OR_NONE),
+    Field("limits.rotors.mass", (), POSITIVE),
+    Field("limits.rotors.inertia", (3,), POSITIVE),
+    Field("limits.rotors.mixer", (4, 4)),
+    Field("limits.rotors.min_thrust", (), NOT_NEGATIVE),
+    Field("limits.rotors.min_thrust", (), below("limits.rotors.max_thrust")),
+    Field("limits.rotors.max_thrust", ()),
+)
 
 # Fields of a case, by which its rules know them, that are arguments of what makes it.
 ARGUMENTS = {
@@ -22,7 +46,7 @@ ARGUMENTS = {
 }
 
 
-def require_tool(robot: Any, kind: str) -> Tool:
+def require_tool(robot: object, kind: str) -> Tool:
     """The tool of a robot.
 
     Raises:
@@ -39,7 +63,7 @@ def require_tool(robot: Any, kind: str) -> Tool:
     return robot.tool
 
 
-def require_start(cases: Any) -> None:
+def require_start(cases: PyTree) -> None:
     """Raise `CaseError` if a quadrotor begins below its least height, which no plan may do.
 
     Of traced arrays, which have no values yet, nothing is asked.
@@ -51,13 +75,15 @@ def require_start(cases: Any) -> None:
     require_rule("start", height, height >= least, "at a height >= min_height", cases.batch_shape)
 
 
-def require_own_robot(robot: Any, usual: QuadrotorModel, suite: str) -> None:
+def require_own_robot(robot: object, usual: QuadrotorModel, suite: str) -> None:
     """Raise `ValueError` if a robot is named for a suite of another package, which has its own."""
     if robot != usual:
         raise ArgumentError("robot", f"left out with suite {suite!r}, which has its own", shown="")
 
 
-def limits_of(robot: QuadrotorModel, leaf: Callable[..., Array], **given: Any) -> QuadrotorLimits:
+def limits_of(
+    robot: QuadrotorModel, leaf: Callable[..., Array], **given: object
+) -> QuadrotorLimits:
     """The limits of a case, a robot's where they are not given.
 
     A robot with a net has a least and a greatest thrust, those of its rotors if it says no other.

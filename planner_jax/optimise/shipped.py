@@ -1,0 +1,80 @@
+"""Measured scales and trained starting points that are shipped beside a task's modules.
+
+A quasi-Newton step is only as good as its coordinates, so that each planner solves in units that
+`python -m benchmarks.measure_scales` measures. The networks for starting points are trained on the
+planner's own objective (amortised optimisation), without solved examples, by
+`python -m benchmarks.learn_starts --train MINUTES`. A search starts at the network's point only
+where that costs less than the guess without it, so that nothing is lost far from the training data.
+"""
+
+import functools
+import importlib.resources
+import io
+import json
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array, lax
+
+REACH = 4.0  # standard deviations beyond which features are taken as that far
+
+
+@struct.dataclass
+class StartNetwork:
+    """A network: weights and biases of its layers, mean and deviation of its features."""
+
+    mean: Array | np.ndarray  # (F,), of the features
+    deviation: Array | np.ndarray  # (F,)
+    weights: tuple[Array | np.ndarray, ...]  # (inputs, outputs) of each layer
+    biases: tuple[Array | np.ndarray, ...]  # (outputs,)
+
+    def __call__(self, features: Array) -> Array:
+        """Return what is added to a guess, (n,), from features (F,)."""
+        cast = functools.partial(jnp.asarray, dtype=features.dtype)
+        values = (features - cast(self.mean)) / cast(self.deviation)
+        values = jnp.clip(values, -REACH, REACH)
+        for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            values = jnp.matmul(values, cast(weight), precision=lax.Precision.HIGHEST) + cast(bias)
+            if k + 1 < len(self.weights):
+                values = jnp.tanh(values)
+        return values
+
+
+def cheaper_start(cost: Callable[[Array], Array], guess: Array, learned: Array) -> Array:
+    """Return a learned starting point (n,), or a guess where that costs less."""
+    costs = jax.vmap(cost)(jnp.stack([guess, learned]))  # at once, in one program
+    return jnp.where(costs[1] < costs[0], learned, guess)
+
+
+@functools.cache
+def shipped_scale(package: str, name: str) -> tuple[float, ...]:
+    """Return a measured scale from the `measured_scales.json` of a task's package.
+
+    Raises:
+        ValueError: there is none of that name.
+    """
+    path = importlib.resources.files(package) / "measured_scales.json"
+    scales = json.loads(path.read_text("utf-8"))
+    if name not in scales:
+        raise ValueError(
+            f"no measured scale for {name!r}: give `scale`, or one of {', '.join(scales)}"
+        )
+    return tuple(scales[name])
+
+
+@functools.cache
+def shipped_network(package: str, name: str) -> StartNetwork:
+    """Return the network `name` of a task's package."""
+    path = importlib.resources.files(package) / f"start_{name}.npz"
+    with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
+        arrays = {key: file[key].astype(np.float32) for key in file.files}
+    num = sum(key.startswith("weight") for key in arrays)
+    return StartNetwork(
+        mean=arrays["mean"],
+        deviation=arrays["deviation"],
+        weights=tuple(arrays[f"weight{k}"] for k in range(num)),
+        biases=tuple(arrays[f"bias{k}"] for k in range(num)),
+    )
