@@ -1,4 +1,4 @@
-"""A planner that first has a decision taken: in what order, when, which of several."""
+"""A planner behind a decision: in what order, when, which of several."""
 
 from collections.abc import Callable
 from typing import Any
@@ -20,10 +20,9 @@ from planner_jax.planning.programs import call_packed
 class DecidedPlanner(Planner[CaseT, PlanT]):
     """A composite planner: a decision proposes choices, a planner plans every one of them.
 
-    Of several choices the solved one of least `decision.rank` is kept, or the one of least
-    violation where none is solved. The planner's last attempt, its longest, is for cases of
-    which no choice is solved by then; all but the first are of a planner that says by
-    `starts_long(cases)` that this one is long, too.
+    Of several choices the solved one of least `decision.rank` is selected, or the one of least
+    violation if none is solved. The last attempt of the planner, its longest, is made at cases of
+    which no choice is solved by then; if the planner `starts_long`, so are all but the first.
     """
 
     planner: Planner[CaseT, PlanT]
@@ -40,61 +39,51 @@ class DecidedPlanner(Planner[CaseT, PlanT]):
         return self.planner
 
     def replanner(self) -> Planner:
-        """Return the planner's: the order of the plan that is carried out is kept."""
+        """Return the re-planner of the planner: it keeps the order of the plan."""
         return self.planner.replanner()
 
     def settle(
         self, cases: Any, plan_of: Callable[[Planner, Any], Any] | None = None
     ) -> tuple[Any, Any]:
-        """Return what minimises, and the cases with the choice that planning all of them takes.
+        """Return the planner that minimises, and the cases with the choice of their plans.
 
-        Without `plan_of` it is the decision's first choice.
+        Without `plan_of` it is the first choice of the decision.
         """
         if plan_of is None:
             return self.planner.settle(first_choice(self.decision, cases))
-        only = self.only_choice(cases)
-        choice = plan_of(self, cases).choice if only is None else only
-        return self.planner.settle(cases.decided(choice), plan_of)
-
-    def only_choice(self, cases: Any) -> Any:
-        """The choice about every case if the decision leaves but one, or else None."""
         if not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(cases)):
             self.decision.check(cases)
-        choices = _proposals(self.decision, cases)
-        return choices[0] if len(choices) == 1 else None
+        choices = _propose_all(self.decision, cases)
+        choice = choices[0] if len(choices) == 1 else plan_of(self, cases).choice
+        return self.planner.settle(cases.decided(choice), plan_of)
 
     def plan_by(self, drive: Drive, cases: Any) -> Any:
-        """The plans of one case or of a batch, with what was decided in them."""
+        """Return the plans of one case or of a batch, with the choices made in them."""
+        alone = cases.batch_shape == ()
         if not drive.is_pure:
             self.decision.check(cases)
-        choices = self._proposed(drive, cases)
-        if len(choices) == 1:
-            decided = cases.decided(
-                choices[0] if is_resident(cases) else jax.device_get(choices[0])
-            )
-            plans, unsolved = drive(self.planner, decided)
-        elif cases.batch_shape == ():
-            one = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (cases, choices))
-            best = self._best_choice(drive, *one)
-            decided, plans = jax.tree.map(lambda leaf: leaf[0], best)
-            unsolved = is_unsolved(plans.status)
+        if alone and not drive.is_pure:
+            choices = _split(call_packed(_propose, None, self.decision, cases), 0)
         else:
-            decided, plans = self._best_choice(drive, cases, choices)
+            choices = _propose_all(self.decision, cases)
+        if len(choices) == 1:
+            choice = choices[0] if is_resident(cases) else jax.device_get(choices[0])
+            decided = cases.decided(choice)
+            plans, unsolved = drive(self.planner, decided)
+        else:
+            if alone:
+                cases, choices = jax.tree.map(lambda x: np.asarray(x)[None], (cases, choices))
+            best = self._plan_all(drive, cases, choices)
+            decided, plans = jax.tree.map(lambda leaf: leaf[0], best) if alone else best
             unsolved = is_unsolved(plans.status)
         if not drive.is_pure and not np.any(unsolved):
             return plans
-        status = _explained(self.decision, decided, plans.status)
+        status = _explain(self.decision, decided, plans.status)
         on_devices = isinstance(plans.status, jax.Array)
         return plans.replace(status=status if on_devices else np.asarray(status))
 
-    def _proposed(self, drive: Drive, cases: Any) -> list[Any]:
-        """The first choice of one case or of each of a batch, the second, ..."""
-        if drive.is_pure or cases.batch_shape != ():
-            return _proposals(self.decision, cases)
-        return _each(call_packed(_propose, None, self.decision, cases))
-
-    def _best_choice(self, drive: Drive, cases: Any, choices: Any) -> tuple[Any, Any]:
-        """The cases as decided and their plans, after all choices have been planned together."""
+    def _plan_all(self, drive: Drive, cases: Any, choices: Any) -> tuple[Any, Any]:
+        """Plan all choices together, and return the decided cases (B,) with the best plans."""
         xp: Any = jnp if drive.is_pure else np
         num = len(choices)
         if not drive.is_pure:
@@ -104,48 +93,48 @@ class DecidedPlanner(Planner[CaseT, PlanT]):
         attempts = self.planner.attempts
         at_all = 1 if self.planner.starts_long(cases) else max(len(attempts) - 1, 1)
         plans, _ = drive(self.planner, together, attempts[:at_all])
-        of_case = lambda leaf: leaf.reshape(num, -1, *leaf.shape[1:])  # noqa: E731
+        by_choice = lambda leaf: leaf.reshape(num, -1, *leaf.shape[1:])  # noqa: E731
         for attempt in attempts[at_all:]:
-            has_plan = of_case(is_solved(plans.status)).any(axis=0)
+            has_plan = by_choice(is_solved(plans.status)).any(axis=0)
             left = is_unsolved(plans.status) & ~xp.tile(has_plan, num)
             once_more = lambda some: drive(self.planner, some, [attempt])[0]  # noqa: B023, E731
             plans = drive.plan_again(once_more, together, plans, left)
-        plans, together = jax.tree.map(lambda x: of_case(xp.asarray(x)), (plans, together))
+        plans, together = jax.tree.map(lambda x: by_choice(xp.asarray(x)), (plans, together))
         chosen = index_of_best(plans, self.decision.rank(plans))
         lanes = np.arange(len(chosen))
         return jax.tree.map(lambda leaf: leaf[chosen, lanes], (together, plans))
 
 
-def _propose(_: None, decision: Any, case: Any) -> Any:
+def _propose(_: None, decision: Decision, case: Any) -> Any:
+    """Return the choices (F, ...) of one case."""
     return decision.propose(case)
 
 
-def _each(choices: Any) -> list[Any]:
-    """Choices (F, ...) one by one."""
-    num = jax.tree.leaves(choices)[0].shape[0]
-    return [jax.tree.map(lambda leaf: leaf[k], choices) for k in range(num)]  # noqa: B023
+def _split(choices: Any, axis: int) -> list[Any]:
+    """Return choices one by one that lie along an axis."""
+    num = jax.tree.leaves(choices)[0].shape[axis]
+    before = (slice(None),) * axis
+    return [jax.tree.map(lambda leaf: leaf[*before, k], choices) for k in range(num)]  # noqa: B023
 
 
 @jax.jit
-def _proposals(decision: Any, cases: Any) -> list[Any]:
-    """The first choice of one case or of each of a batch, the second, ..."""
+def _propose_all(decision: Decision, cases: Any) -> list[Any]:
+    """Return the first choice of one case or of each case of a batch, the second, ..."""
     if cases.batch_shape == ():
-        return _each(decision.propose(cases))
-    choices = jax.vmap(decision.propose)(cases)
-    num = jax.tree.leaves(choices)[0].shape[1]
-    return [jax.tree.map(lambda leaf: leaf[:, k], choices) for k in range(num)]  # noqa: B023
+        return _split(decision.propose(cases), 0)
+    return _split(jax.vmap(decision.propose)(cases), 1)
 
 
 @jax.jit
-def _explained(decision: Any, cases: Any, status: Array) -> Array:
-    """The status of one case or of each of a batch; of the unsolved, what the decision knows."""
+def _explain(decision: Decision, cases: Any, status: Array) -> Array:
+    """Return statuses of one case or of a batch; of unsolved cases, what the decision knows."""
     explain = decision.explain if cases.batch_shape == () else jax.vmap(decision.explain)
     return explain(cases, status)
 
 
 def first_choice(decision: Decision, cases: Any) -> Any:
-    """The cases with a decision's first choice, without planning; one case or a batch.
+    """Return one case or a batch with the first choice of a decision, without planning.
 
-    It is pure, and constant to derivatives.
+    The function is pure, and its result constant to derivatives.
     """
-    return cases.decided(_proposals(decision, lax.stop_gradient(cases))[0])
+    return cases.decided(_propose_all(decision, lax.stop_gradient(cases))[0])

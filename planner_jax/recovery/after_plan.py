@@ -38,7 +38,7 @@ def with_ending(case: PyTree, found: Plan, to: str) -> Plan:
     Args:
         case: of the plan, with its limits and obstacles; one case.
         found: the plan of a quadrotor, a car or an arm, which stays as it is up to its end.
-        to: "brake", or of a quadrotor "home", as of `planner_jax.recovery.with_recovery.ended`.
+        to: "brake", or of a quadrotor "home"; see `with_recovery.add_recovery`.
 
     Returns:
         The plan with its `ending`; of a car or an arm one `CarPlan` or `ArmPlan` to standstill.

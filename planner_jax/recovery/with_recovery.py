@@ -110,18 +110,16 @@ def ending_cases(cases: PyTree, plans: PyTree) -> EndingCase:
 _end_states = jax.jit(jax.vmap(end_state))
 
 
-def ended(planner: Planner[CaseT, PlanT], ending: str | None) -> Planner[CaseT, PlanT]:
-    """A quadrotor's planner, with an ending behind its plans if one is asked for.
+def add_recovery(planner: Planner[CaseT, PlanT], ending: str) -> EndedPlanner[CaseT, PlanT]:
+    """Return a quadrotor's planner whose plans continue to standstill behind their last contact.
 
     Args:
         planner: of plans with the trajectory of a quadrotor.
-        ending: "brake" for the way to rest that is cheapest, wherever that is; "home" for the one
-            back to where the case begins; None for plans that end at the last contact.
+        ending: "brake" for the cheapest trajectory to standstill, wherever that is; "home" for the
+            trajectory back to where the case begins.
 
     Raises:
         ValueError: `ending` is something else.
     """
-    if ending is None:
-        return planner
     require_one_of(ENDINGS, "ending", ending)
     return EndedPlanner(planner, RestPlanner(to=ending))

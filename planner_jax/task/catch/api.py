@@ -11,7 +11,6 @@ from planner_jax.core.choices import with_effort
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Decision
 from planner_jax.planning.decided import DecidedPlanner
-from planner_jax.recovery.with_recovery import ended
 from planner_jax.referee.catch import CatchVerdict, referee_catches
 from planner_jax.task.arguments import find_decision
 from planner_jax.task.catch.case import CatchCase
@@ -64,7 +63,12 @@ def planner(
     """
     decision = find_decision(DECISIONS, decide, TRAINED)
     own = with_effort(TASK.make_planner(name, options), effort)
-    return ended(DecidedPlanner(own, decision), ending)
+    decided = DecidedPlanner(own, decision)
+    if ending is None:
+        return decided
+    from planner_jax.recovery.with_recovery import add_recovery  # few catches need it
+
+    return add_recovery(decided, ending)
 
 
 def judge(cases: CatchCase, plans: CatchPlan, **settings: object) -> CatchVerdict:

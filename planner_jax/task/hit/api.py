@@ -8,7 +8,6 @@ from jax.typing import DTypeLike
 from planner_jax.core.choices import with_effort
 from planner_jax.core.planner import Planner
 from planner_jax.core.registry import suite_named
-from planner_jax.recovery.with_recovery import ended
 from planner_jax.referee.hit import HitVerdict, referee_hits
 from planner_jax.robot.quadrotor_model import QuadrotorModel
 from planner_jax.robot.quadrotor_models import PAPER_HITTER
@@ -94,7 +93,12 @@ def planner(
         ValueError: there is no planner of that name, or it has no such effort.
         TypeError: the planner has no such field.
     """
-    return ended(with_effort(TASK.make_planner(name, options), effort), ending)
+    made = with_effort(TASK.make_planner(name, options), effort)
+    if ending is None:
+        return made
+    from planner_jax.recovery.with_recovery import add_recovery  # few hits need it
+
+    return add_recovery(made, ending)
 
 
 def judge(cases: HitCase, plans: HitPlan, **settings: object) -> HitVerdict:
