@@ -7,9 +7,9 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 import planner_jax as pj
-from planner_jax.robot.arm_plan import ArmPlan
+from planner_jax.robot.arm import ArmPlan
 from planner_jax.robot.car import CarPlan
-from planner_jax.robot.quadrotor_plan import QuadrotorPlan
+from planner_jax.robot.quadrotor import QuadrotorPlan
 
 FLOAT = np.float32
 SOLVED = {

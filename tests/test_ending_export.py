@@ -13,7 +13,7 @@ from planner_jax.core.errors import ArgumentError, NoEnding
 from planner_jax.plane.target import TurningPath
 from planner_jax.recovery.after_plan import is_rested, with_ending
 from planner_jax.referee.rest import referee_rests, referee_stands, referee_stops
-from planner_jax.robot.arm_plan import ArmPlan
+from planner_jax.robot.arm import ArmPlan
 from planner_jax.robot.car import CarPlan
 from planner_jax.sweep import run
 from planner_jax.sweep.hit.settings import HitSettings

@@ -15,7 +15,7 @@ from planner_jax.core.errors import ArgumentError
 from planner_jax.core.plan_files import PlanFileError, load_fitting
 from planner_jax.export.setpoints import load_plan
 from planner_jax.robot.car import CarPlan
-from planner_jax.robot.quadrotor_plan import QuadrotorPlan
+from planner_jax.robot.quadrotor import QuadrotorPlan
 from planner_jax.runs import columns as known
 from planner_jax.runs.run_folder import RunFolder
 from planner_jax.runs.source import Chunk

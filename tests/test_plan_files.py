@@ -9,7 +9,7 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.core.plan_files import PlanFileError
-from planner_jax.robot.quadrotor_plan import QuadrotorPlan
+from planner_jax.robot.quadrotor import QuadrotorPlan
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.task.hit.plan import HitPlan
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import planner_jax as pj
-from planner_jax.robot.quadrotor_plan import QuadrotorPlan
+from planner_jax.robot.quadrotor import QuadrotorPlan
 
 GRAVITY = 9.81
 FIELDS = ("pos", "vel", "acc", "jerk", "quat_wxyz", "body_rate", "thrust")

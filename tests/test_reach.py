@@ -10,8 +10,7 @@ import planner_jax as pj
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath
 from planner_jax.core.protocol import Status, is_unsolved
-from planner_jax.robot.quadrotor import QuadrotorLimits
-from planner_jax.robot.quadrotor_reach import ALLOWED, beyond_reach
+from planner_jax.robot.quadrotor import ALLOWED, QuadrotorLimits, beyond_reach
 from planner_jax.task.catch.context import is_too_far as is_catch_too_far
 from planner_jax.task.catch.context import ordered_context
 from planner_jax.task.hit.context import is_too_far as is_hit_too_far

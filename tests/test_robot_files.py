@@ -14,9 +14,15 @@ import yaml
 import planner_jax as pj
 from planner_jax.cli.main import main
 from planner_jax.core.errors import ArgumentError, UnknownName
-from planner_jax.robot.quadrotor_file import RobotError, as_yaml, model_of
+from planner_jax.robot.quadrotor_file import (
+    UNITS,
+    QuantityError,
+    RobotError,
+    as_yaml,
+    model_of,
+    numbers_in,
+)
 from planner_jax.robot.quadrotor_models import MODELS, ready_robot
-from planner_jax.robot.quantities import UNITS, QuantityError, numbers_in
 from planner_jax.runs.settings import settings_to_resume
 from planner_jax.sims.settings import HitFly
 from planner_jax.sweep.hit.settings import HitSettings

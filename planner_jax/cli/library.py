@@ -1,10 +1,10 @@
 """The command `planner-jax library`: builds, shows, checks and repairs libraries of blocks."""
 
+import dataclasses
 import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -14,6 +14,7 @@ from planner_jax.baselines.block.library.cells import LAYOUTS, Face
 from planner_jax.baselines.block.library.coverage import Coverage, check, coverage
 from planner_jax.baselines.block.library.file import load_library, save_library
 from planner_jax.baselines.block.library.table import Library, Setting, fingerprint
+from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.choices import require, require_memory, require_one_of, require_seed
 from planner_jax.core.errors import ArgumentError
 from planner_jax.robot.arm import REGIMES
@@ -22,7 +23,7 @@ from planner_jax.runs import style
 from planner_jax.runs.environment import require_backend
 from planner_jax.runs.settings import require_count
 from planner_jax.sweep.block.settings import BlockSettings
-from planner_jax.task.block.scene import paper_scene
+from planner_jax.task.block.scene import Box, paper_scene
 
 
 def build_library(
@@ -66,10 +67,10 @@ def build_library(
         raise ArgumentError("arm", f"an arm of six joints: {error}", shown="") from None
     except OSError as error:
         raise ArgumentError("arm", "a file", shown=f"{arm!r} ({error.strerror})") from None
-    chosen: Any = REGIMES[regime]
-    at_rest: Any = np.asarray(chosen.ends_at_rest)
-    scene = paper_scene(has_pole=pole)
-    setting = Setting(arm=body, limits=chosen.limits, ends_at_rest=at_rest, scene=scene)
+    chosen, scene = REGIMES[regime], paper_scene(has_pole=pole)
+    setting = Setting(
+        arm=body, limits=chosen.limits, ends_at_rest=host_leaf(chosen.ends_at_rest), scene=scene
+    )
     homes = np.reshape(body.home if home is None else home, (-1, 6))
     began = time.perf_counter()
     library = build(path, setting, homes, LAYOUTS[layout])
@@ -131,9 +132,9 @@ def repair_library(path: str, *, pole: Sequence[float], out: str, retry: bool = 
     require(len(pole) == 2, "pole", "two numbers [m]", f"{len(pole)} numbers")
     require(bool(np.isfinite(pole).all()), "pole", "finite", list(pole))
     require_backend()
-    place: Any = np.asarray(pole, np.float32)
-    there: Any = np.asarray(True)
-    scene = library.setting.scene.replace(pole=place, has_pole=there)  # type: ignore[attr-defined]
+    scene = dataclasses.replace(
+        library.setting.scene, pole=host_leaf(pole, np.float32), has_pole=host_leaf(True)
+    )
     began = time.perf_counter()
     repaired, touched = repair(library, scene, retry=retry)
     save_library(out, repaired)
@@ -149,7 +150,7 @@ def _loaded(path: str) -> Library:
 
 
 def _print(path: str, library: Library, covered: Coverage) -> None:
-    """What is in a library, in lines."""
+    """Print the contents of a library."""
     table, setting = library.table, library.setting
     faces = [
         " ".join(f"{face.name} {face.cells[0]}x{face.cells[1]}" for face in side)
@@ -184,7 +185,7 @@ def _print(path: str, library: Library, covered: Coverage) -> None:
 
 
 def coverage_map(figure: Figure, library: Library, covered: Coverage) -> None:
-    """Each face with cells: what share of a cell's feasible pairs has a motion from any home.
+    """Draw each face with cells, coloured by the share of a cell's feasible pairs with a motion.
 
     Args:
         figure: empty.
@@ -224,8 +225,8 @@ def coverage_map(figure: Figure, library: Library, covered: Coverage) -> None:
         figure.colorbar(picture, ax=panels, label="pairs with a motion, % of those possible")
 
 
-def _ends(face: Face, box: Any) -> tuple[float, float, float, float]:
-    """Where a face begins and ends along its two axes [m]."""
+def _ends(face: Face, box: Box) -> tuple[float, float, float, float]:
+    """Return where a face begins and ends along its two axes [m]."""
     (left, bottom), (right, top) = (
         (float(side[face.across[0]]), float(side[face.across[1]]))
         for side in (box.lower, box.upper)

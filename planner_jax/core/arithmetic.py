@@ -8,6 +8,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
+from numpy.typing import DTypeLike
+
+
+def host_leaf(value: object, dtype: DTypeLike | None = None) -> Array:
+    """Return a value as a NumPy array that is a leaf of a case or plan, typed as its other leaves.
+
+    Leaves are jax arrays inside compiled programs and may be NumPy arrays outside.
+    """
+    return np.asarray(value, dtype)  # type: ignore[return-value]
+
 
 Numbers = Array | np.ndarray
 

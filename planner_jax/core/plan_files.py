@@ -67,7 +67,7 @@ def load_arrays(path: str | os.PathLike, kind: type[Kind]) -> Kind:
             shown=f"{name} of version {version} in {str(path)!r}",
         )
     try:
-        tree = _tree(kind, "", arrays)
+        tree = build_tree(kind, "", arrays)
     except KeyError as error:
         raise PlanFileError("path", error.args[0], str(path), verb="hold") from None
     if arrays:
@@ -87,7 +87,7 @@ def load_fitting(path: str | os.PathLike, kinds: Sequence[type[Kind]]) -> Kind:
     if version == VERSION:
         for kind in kinds:
             with contextlib.suppress(KeyError):
-                return _tree(kind, "", dict(arrays))
+                return build_tree(kind, "", dict(arrays))
     names = " or ".join(kind.__name__ for kind in kinds)
     raise PlanFileError(
         "path",
@@ -131,8 +131,8 @@ def named_leaves(tree: Any, prefix: str = "") -> dict[str, Any]:
     return named
 
 
-def _tree(kind: Any, prefix: str, arrays: dict[str, np.ndarray]) -> Any:
-    """A dataclass of the arrays of its names, which are taken out."""
+def build_tree(kind: Any, prefix: str, arrays: dict[str, Any]) -> Any:
+    """Build a dataclass from the arrays named as its fields, which are removed from `arrays`."""
     types = typing.get_type_hints(kind)
     values = {}
     for field in dataclasses.fields(kind):
@@ -143,7 +143,7 @@ def _tree(kind: Any, prefix: str, arrays: dict[str, np.ndarray]) -> Any:
                 values[field.name] = None
                 continue
         if isinstance(inner, type) and dataclasses.is_dataclass(inner):
-            values[field.name] = _tree(inner, f"{place}.", arrays)
+            values[field.name] = build_tree(inner, f"{place}.", arrays)
         else:
             values[field.name] = arrays.pop(place)
     return kind(**values)

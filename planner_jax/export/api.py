@@ -23,7 +23,7 @@ from planner_jax.core.protocol import Case, Plan
 from planner_jax.export.setpoints import DEFAULT_RATE, robot_of
 from planner_jax.host.files import new_file_problem, replacing
 from planner_jax.recovery.after_plan import is_rested, with_ending
-from planner_jax.robot.quadrotor_plan import QuadrotorPlan
+from planner_jax.robot.quadrotor import QuadrotorPlan
 
 PlanT = TypeVar("PlanT", bound=Plan)
 Writer = Callable[[Plan, float | None, BinaryIO], None]

@@ -12,7 +12,7 @@ import numpy as np
 from planner_jax.core.errors import ArgumentError
 from planner_jax.export.csv_rows import write_table
 from planner_jax.export.setpoints import pieces_of
-from planner_jax.robot.quadrotor_plan import QuadrotorPlan
+from planner_jax.robot.quadrotor import QuadrotorPlan
 
 MEMORY = 4096  # bytes for trajectories in the firmware
 POWERS = 8

@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import common
 from planner_jax.core.errors import ArgumentError
 from planner_jax.export.px4 import trajectory_setpoints
 from planner_jax.export.setpoints import DEFAULT_RATE
-from planner_jax.robot.quadrotor_plan import QuadrotorPlan
+from planner_jax.robot.quadrotor import QuadrotorPlan
 
 FASTEST = 1000.0  # [Hz], as the messages count milliseconds
 _VEHICLE, _AUTOPILOT = 1, 1  # system and component that is meant

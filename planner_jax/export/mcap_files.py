@@ -10,7 +10,7 @@ from mcap_ros2.writer import Writer
 
 from planner_jax.core.protocol import Plan
 from planner_jax.export import px4, ros2
-from planner_jax.robot.quadrotor_plan import QuadrotorPlan
+from planner_jax.robot.quadrotor import QuadrotorPlan
 
 SETPOINT, SETPOINT_TOPIC = "px4_msgs/TrajectorySetpoint", "/fmu/in/trajectory_setpoint"
 _TYPES = {

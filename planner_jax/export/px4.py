@@ -7,7 +7,7 @@ import numpy as np
 from planner_jax.export.csv_rows import write_table
 from planner_jax.export.frames import to_ned, to_ned_yaw, yaw_of
 from planner_jax.export.setpoints import setpoints_of
-from planner_jax.robot.quadrotor_plan import QuadrotorPlan, QuadrotorSetpoints
+from planner_jax.robot.quadrotor import QuadrotorPlan, QuadrotorSetpoints
 
 _VECTORS = ("position", "velocity", "acceleration", "jerk")
 

@@ -15,8 +15,8 @@ from planner_jax.core.errors import MissingExtra
 from planner_jax.core.protocol import Plan
 from planner_jax.export.frames import rotated
 from planner_jax.export.setpoints import DEFAULT_RATE, Setpoints, setpoints_of
-from planner_jax.robot.arm_plan import ArmSetpoints
-from planner_jax.robot.quadrotor_plan import QuadrotorSetpoints
+from planner_jax.robot.arm import ArmSetpoints
+from planner_jax.robot.quadrotor import QuadrotorSetpoints
 
 Json = Any  # plain values, lists and dictionaries
 WORLD, BODY = "world", "base_link"

@@ -12,9 +12,9 @@ import numpy as np
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.plan_files import PlanFileError, load_fitting, named_leaves
 from planner_jax.core.protocol import Plan, Status, is_solved, lane
-from planner_jax.robot.arm_plan import ArmPlan, ArmSetpoints
+from planner_jax.robot.arm import ArmPlan, ArmSetpoints
 from planner_jax.robot.car import CarPlan, CarSetpoints
-from planner_jax.robot.quadrotor_plan import QuadrotorPlan, QuadrotorSetpoints
+from planner_jax.robot.quadrotor import QuadrotorPlan, QuadrotorSetpoints
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 MOST = 100_000  # setpoints of a plan

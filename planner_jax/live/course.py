@@ -13,8 +13,7 @@ from planner_jax.optimise.problem import Round
 from planner_jax.planning.programs import call_packed, solve_cases
 from planner_jax.recovery.case import EndingCase, EndingPlan
 from planner_jax.recovery.planner import RestPlanner
-from planner_jax.robot.quadrotor import QuadrotorLimits
-from planner_jax.robot.quadrotor_plan import setpoint_at
+from planner_jax.robot.quadrotor import QuadrotorLimits, setpoint_at
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, states_at, total_duration
 
 _REST = RestPlanner()

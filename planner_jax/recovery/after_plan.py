@@ -13,9 +13,9 @@ from planner_jax.planning.plan import plan
 from planner_jax.recovery.braking import brake_arm, brake_car
 from planner_jax.recovery.planner import RestPlanner
 from planner_jax.recovery.with_recovery import ending_cases
-from planner_jax.robot.arm_plan import ArmPlan
+from planner_jax.robot.arm import ArmPlan
 from planner_jax.robot.car import CarPlan
-from planner_jax.robot.quadrotor_plan import QuadrotorPlan
+from planner_jax.robot.quadrotor import QuadrotorPlan
 from planner_jax.trajectory.polynomial import sample_pieces, states_at
 
 _ARM_AT_REST = 0.01  # [rad/s], fastest joint of an arm that stands

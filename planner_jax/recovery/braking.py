@@ -15,7 +15,7 @@ from jax import Array
 
 from planner_jax.core.errors import NoEnding
 from planner_jax.plane.obstacles import separation
-from planner_jax.robot.arm_plan import ArmPlan
+from planner_jax.robot.arm import ArmPlan
 from planner_jax.robot.car import CarPlan, pose_at
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, states_at
 

@@ -9,8 +9,7 @@ from jax import Array
 
 from planner_jax.core.rules import POSITIVE, Field, Table
 from planner_jax.cost.extras import Extra
-from planner_jax.robot.quadrotor import QuadrotorLimits
-from planner_jax.robot.quadrotor_plan import QuadrotorPlan
+from planner_jax.robot.quadrotor import QuadrotorLimits, QuadrotorPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 

@@ -56,20 +56,20 @@ class _Capsule:
         return 0.5 * length(self.second[..., :1] - self.first[..., :1]) + self.radius
 
     def lowest(self) -> np.ndarray:
-        """Height (B, S) [m] of its lowest point."""
+        """Return height (B, S) [m] of its lowest point."""
         return np.minimum(self.first[2], self.second[2]) - self.radius
 
     def from_point(self, point: np.ndarray) -> np.ndarray:
-        """Distances (B, S) [m] of points (3, B, S)."""
+        """Return distances (B, S) [m] of points (3, B, S)."""
         return from_segment(point, self.first, self.second) - self.radius
 
     def from_capsule(self, other: "_Capsule") -> np.ndarray:
-        """Distances (P,) [m] of capsules, of both at P samples."""
+        """Return distances (P,) [m] of capsules, of both at P samples."""
         apart = between_segments(self.first, self.second, other.first, other.second)
         return apart - self.radius - other.radius
 
     def at(self, lane: np.ndarray, sample: np.ndarray) -> "_Capsule":
-        """It at P samples of lanes, (3, P) and (P,)."""
+        """Return the capsules at P samples of lanes, (3, P) and (P,)."""
         first, second = (_picked(end, lane, sample) for end in (self.first, self.second))
         return _Capsule(self.name, self.link, first, second, self.radius[lane, 0])
 
@@ -89,29 +89,29 @@ class _Box:
         return length(self.half)
 
     def lowest(self) -> np.ndarray:
-        """Height (B, S) [m] of its lowest point."""
+        """Return height (B, S) [m] of its lowest point."""
         return self.middle[2] - sum(np.abs(self.turn[2, k]) * self.half[k] for k in range(3))
 
     def from_point(self, point: np.ndarray) -> np.ndarray:
-        """Distances (B, S) [m] of points (3, B, S)."""
+        """Return distances (B, S) [m] of points (3, B, S)."""
         inside = turned_back(self.turn, point - self.middle)
         return length(np.maximum(np.abs(inside) - self.half, 0.0))
 
     def from_capsule(self, other: _Capsule) -> np.ndarray:
-        """Distances (P,) [m] of capsules, of both at P samples."""
+        """Return distances (P,) [m] of capsules, of both at P samples."""
         first, second = (
             turned_back(self.turn, end - self.middle) for end in (other.first, other.second)
         )
         return segment_to_box(first, second, self.half) - other.radius
 
     def from_box(self, other: "_Box") -> np.ndarray:
-        """Distances (P,) [m] of boxes, of both at P samples."""
+        """Return distances (P,) [m] of boxes, of both at P samples."""
         middle = turned_back(self.turn, other.middle - self.middle)
         turn = np.stack([turned_back(self.turn, other.turn[:, k]) for k in range(3)], axis=1)
         return between_boxes(middle, turn, other.half, self.half)
 
     def at(self, lane: np.ndarray, sample: np.ndarray) -> "_Box":
-        """It at P samples of lanes, (3, P) and (3, 3, P)."""
+        """Return the boxes at P samples of lanes, (3, P) and (3, 3, P)."""
         middle, turn = (_picked(each, lane, sample) for each in (self.middle, self.turn))
         return _Box(self.name, middle, turn, self.half[:, lane, 0])
 
@@ -126,7 +126,7 @@ class _Pair:
 
 
 def links_of(case: dict, angles: np.ndarray) -> tuple[list, list]:
-    """Rotations (3, 3, B, S) of links 1 to 6 and the places (3, B, S) [m] of their joints.
+    """Return rotations (3, 3, B, S) of links 1 to 6 and the places (3, B, S) [m] of their joints.
 
     Args:
         case: leaves of B lanes.
@@ -150,12 +150,12 @@ def links_of(case: dict, angles: np.ndarray) -> tuple[list, list]:
 
 
 def shield_middle(case: dict, turns: list, places: list) -> np.ndarray:
-    """Middle (3, B, S) [m] of the shield's face; its outward normal is the last link's x."""
+    """Return middle (3, B, S) [m] of the shield's face; its outward normal is the last link's x."""
     return places[5] + turned(turns[5], case["arm.shield_centre"].T[..., None])
 
 
 def clearances(case: dict, links: Sequence, angles: np.ndarray, sampled: np.ndarray) -> dict:
-    """Least distances of an arm from what it must not touch, by `KINDS`.
+    """Return least distances of an arm from what it must not touch, by `KINDS`.
 
     Those of overlapping solids are less than zero: minus the depth, but for a capsule not less
     than minus its radius, and for two not less than minus both. Pairs of solids and samples that
@@ -194,7 +194,7 @@ def clearances(case: dict, links: Sequence, angles: np.ndarray, sampled: np.ndar
 
 
 def _arm(case: dict, links: Sequence, angles: np.ndarray) -> tuple[list[_Capsule], _Box]:
-    """The arm's capsules and its shield at angles (6, B, S)."""
+    """Return the arm's capsules and its shield at angles (6, B, S)."""
     turns, places = links_of(case, angles)
     capsules = []
     for k, link in enumerate(links):
@@ -211,7 +211,7 @@ def _arm(case: dict, links: Sequence, angles: np.ndarray) -> tuple[list[_Capsule
 
 
 def _beside_shield(case: dict, links: Sequence, capsules: list[_Capsule]) -> list[_Capsule]:
-    """Those of the arm's capsules that are held against the shield besides link 1: links 2 to 4.
+    """Return the capsules of links 2 to 4, whose distance from the shield is tested like link 1's.
 
     A capsule around the whole of link 4, as thick as the forearm is wide, reaches through the
     shield however the wrist is bent. The shield only ever comes at the forearm's narrow sides,
@@ -233,7 +233,7 @@ def _beside_shield(case: dict, links: Sequence, capsules: list[_Capsule]) -> lis
 
 
 def _pole(case: dict) -> _Capsule:
-    """The pole; where there is none, one that nothing can touch."""
+    """Return the pole; where there is none, one that nothing can touch."""
     x, y = case["scene.pole"].T[..., None]
     first, second = (np.stack([x, y, np.full_like(x, end)]) for end in (-_POLE_HALF, _POLE_HALF))
     radius = np.where(case["scene.has_pole"] != 0.0, case["scene.pole_radius"], -np.inf)
@@ -241,7 +241,7 @@ def _pole(case: dict) -> _Capsule:
 
 
 def _beams(case: dict) -> list[_Capsule]:
-    """The beams of the rig."""
+    """Return the beams of the rig."""
     beams = []
     for k, radius in enumerate(case["scene.beam_radius"].T):
         first, second = case["scene.beam_ends"][:, k].transpose(1, 2, 0)[..., None]
@@ -250,14 +250,14 @@ def _beams(case: dict) -> list[_Capsule]:
 
 
 def _base_box(case: dict) -> _Box:
-    """The base."""
+    """Return the base."""
     lower, upper = (case["arm.base_box"][:, k].T[..., None] for k in range(2))
     turn = np.broadcast_to(np.eye(3)[..., None, None], (3, *lower.shape))
     return _Box("the base", 0.5 * (lower + upper), turn, 0.5 * (upper - lower))
 
 
 def _pair(one: _Capsule | _Box, other: _Capsule | _Box, name: str) -> _Pair:
-    """Two solids, of which the first has the smaller sphere around it."""
+    """Return two solids, of which the first has the smaller sphere around it."""
 
     def exact(lane: np.ndarray, sample: np.ndarray) -> np.ndarray:
         return _distance(one.at(lane, sample), other.at(lane, sample))
@@ -266,14 +266,14 @@ def _pair(one: _Capsule | _Box, other: _Capsule | _Box, name: str) -> _Pair:
 
 
 def _distance(one: _Capsule | _Box, other: _Capsule | _Box) -> np.ndarray:
-    """Distances (P,) [m] of two solids at P samples."""
+    """Return distances (P,) [m] of two solids at P samples."""
     if isinstance(one, _Capsule):
         return other.from_capsule(one)
     return one.from_capsule(other) if isinstance(other, _Capsule) else other.from_box(one)
 
 
 def _least(pairs: list[_Pair], sampled: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Least distance (B,) of all pairs, its sample (B,) and the pair's name (B,)."""
+    """Return least distance (B,) of all pairs, its sample (B,) and the pair's name (B,)."""
     num_lanes, num_samples = sampled.shape
     if not pairs:
         return np.full(num_lanes, np.inf), np.zeros(num_lanes, int), np.full(num_lanes, "")
@@ -282,7 +282,7 @@ def _least(pairs: list[_Pair], sampled: np.ndarray) -> tuple[np.ndarray, np.ndar
     distances = np.full_like(bounds, np.inf)
 
     def work_out(wanted: np.ndarray) -> None:
-        """The distances of the pairs and samples that are wanted (B, pairs x samples)."""
+        """Return the distances of the pairs and samples that are wanted (B, pairs x samples)."""
         for k, pair in enumerate(pairs):
             here = slice(k * num_samples, (k + 1) * num_samples)
             lane, sample = np.nonzero(wanted[:, here])
@@ -302,23 +302,23 @@ def _least(pairs: list[_Pair], sampled: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _picked(values: np.ndarray, lane: np.ndarray, sample: np.ndarray) -> np.ndarray:
-    """Values (..., P) of values (..., B, S) at P samples of lanes; what stands still has one."""
+    """Return values (..., P) of values (..., B, S) at P samples of lanes; S = 1 if constant."""
     return values[..., lane, sample if values.shape[-1] > 1 else 0]
 
 
 def _product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Products (3, 3, ...) of matrices (3, 3, ...)."""
+    """Return products (3, 3, ...) of matrices (3, 3, ...)."""
     return np.stack([turned(first, second[:, k]) for k in range(3)], axis=1)
 
 
 def _cross(axis: np.ndarray) -> np.ndarray:
-    """Matrices (3, 3, ...) whose products with vectors are the cross products of axes (3, ...)."""
+    """Return matrices (3, 3, ...) that multiply vectors to cross products with axes (3, ...)."""
     (x, y, z), none = axis, np.zeros_like(axis[0])
     return np.array([[none, -z, y], [z, none, -x], [-y, x, none]])
 
 
 def _rotation(quaternion: np.ndarray) -> np.ndarray:
-    """Rotations (3, 3, ...) of unit quaternions (4, ...), w x y z."""
+    """Return rotations (3, 3, ...) of unit quaternions (4, ...), w x y z."""
     w, v = quaternion[0], quaternion[1:]
     upright = np.eye(3).reshape(3, 3, *(1,) * w.ndim)
     return (w * w - dot(v, v)) * upright + 2.0 * (v[:, None] * v[None] + w * _cross(v))

@@ -1,10 +1,10 @@
 """Float64 NumPy referee of blocks: the kinematics alone decides whether a plan succeeds.
 
-It shares no code with the planners: the joints' polynomials are held against their limits at
-their extrema, the arm and its shield against all that they must not touch at every sample, and
-the ball falls along its parabola (paper 004, eqs 5 to 7). A plan's own claims (status, cost) are
-not trusted; of the contact only the time that it claims is read. Robot base frame, z up, SI
-units. Times count from the moment at which the ball is first seen.
+It shares no code with the planners. The joints' polynomials are compared with their limits at
+their extrema, the arm and its shield with their obstacles at every sample, and the ball falls
+along its parabola (paper 004, eqs 5 to 7). A plan's own claims (status, cost) are not trusted; only
+its time of contact is read. Robot base frame, z up, SI units. Times count from the moment at which
+the ball is first seen.
 """
 
 import dataclasses
@@ -17,18 +17,16 @@ from planner_jax.referee.judging import (
     CONTACT_TIME_TOLERANCE,
     SMALLEST_LIMIT,
     above,
-    checked_leaf,
     derivative,
     finite_lanes,
     first_failures,
     flat,
     judge_in_chunks,
+    read_leaves,
 )
 from planner_jax.referee.solids import turned_back
 from planner_jax.referee.verdict import Verdict
 
-# Limit -> what is said when it fails. In the order in which they are tested: a failed plan is
-# named after its first failure.
 _SENTENCES = {
     "not finite": "the plan or its case is not finite",
     "time": "the contact at {time:.3f} s is off by {excess:.3g} s; it must not come before the arm "
@@ -52,35 +50,42 @@ _SENTENCES = {
     "tunnel": "the contact at {time:.3f} s is {excess:.3g} s off the time that the ball is in the "
     "outer box before it gets into the inner one",
 }
-_UNBOUNDED = {"tunnel": "the ball never gets into the outer box"}
 LIMITS = tuple(_SENTENCES)
 # Leaves that may be infinite, besides the limits of the joints.
 _UNBOUNDED_LEAVES = ("arm.lower", "arm.upper", "offset", "tilt")
 _SIDES = ("lower", "upper")
+# Of one case, besides capsules and beams.
+_CASE_SHAPES: dict[str, tuple[int, ...]] = {
+    **{"ball.pos": (3,), "ball.vel": (3,), "angles": (6,), "rates": (6,), "gravity": ()},
+    **{"delay": (), "ends_at_rest": (), "offset": (), "tilt": ()},
+    **{"arm.origin": (6, 3), "arm.turn": (6, 4), "arm.axis": (6, 3), "arm.base_box": (2, 3)},
+    **{"arm.lower": (6,), "arm.upper": (6,), "arm.shield_centre": (3,), "arm.shield_half": ()},
+    **{"limits.velocity": (6,), "limits.acceleration": (6,), "scene.pole": (2,)},
+    **{"scene.pole_radius": (), "scene.has_pole": (), "scene.floor": ()},
+    **{f"scene.{box}.{side}": (3,) for box in ("inner", "outer") for side in _SIDES},
+}
 _JOINTS = np.array([f"joint {k}" for k in range(1, 7)])
 
 LONGEST_STEP = 0.002  # [s], between two samples
 LARGEST_TURN = 0.017  # [rad], of all joints together, between two samples
-# Joints that turn faster than this [rad/s] together are sampled as if they did not.
-_FASTEST = 100.0
+_FASTEST = 100.0  # [rad/s], of all joints together, beyond which samples get no denser
 LONGEST_PLAN = 60.0  # [s], until the contact
 REST = 0.01  # [rad/s], fastest joint of an arm at rest
-# Halvings of a piece in the search for a root, and samples of arms that are worked out at once:
-# few enough for the cache.
+# Halvings of a piece in the search for a root; samples of arms at once, few enough for the cache.
 _HALVINGS, _SAMPLES = 45, 16384
 
 
 @dataclasses.dataclass(frozen=True)
 class BlockVerdict(Verdict):
-    """What the referee found, one entry a lane.
+    """Verdict on blocks, one entry a lane.
 
-    What is measured is NaN where the inputs are not finite or the plan's times are wrong.
-    Clearances are those at the samples; where solids overlap they are minus the depth, though for
-    a capsule no less than minus its radius. They are infinite where there is nothing to touch.
+    Measurements are NaN where the inputs are not finite or the plan's times are wrong. Clearances
+    are least distances at the samples: minus the depth where solids overlap, though for a capsule
+    no less than minus its radius; infinite without an obstacle.
     """
 
     SENTENCES = _SENTENCES
-    UNBOUNDED = _UNBOUNDED
+    UNBOUNDED = {"tunnel": "the ball never gets into the outer box"}
 
     failed_part: np.ndarray  # (B,) str, the joint, link or shield that fails; "" without any
     contact_time: np.ndarray  # (B,) [s]
@@ -97,7 +102,7 @@ class BlockVerdict(Verdict):
     tilt: np.ndarray  # (B,) [rad], of the shield's normal to the way that the ball comes from
 
     def praise(self, k: int | tuple) -> str:
-        """What is said of a success."""
+        """Return the end of the sentence for a success."""
         miss, time = np.asarray(self.miss)[k], np.asarray(self.contact_time)[k]
         return f"the ball is {miss:.2g} m from the shield's middle at {time:.3g} s"
 
@@ -111,19 +116,18 @@ def referee_blocks(
     step: float = LONGEST_STEP,
     chunk: int = 256,
 ) -> BlockVerdict:
-    """The verdict on every plan of a batch.
+    """Judge every plan of a batch.
 
-    Angles, rates and accelerations are held against their limits at the ends of each piece and at
-    their extrema inside of it. Those are the roots of the next derivative, which lie between its
-    own extrema, and so on up to the derivative that is constant; each is found by bisection.
+    Angles, rates and accelerations are compared with their limits at the ends of each piece and at
+    their extrema inside. These are roots of the next derivative, which lie between its own extrema,
+    and so on up to the derivative that is constant; each root is found by bisection.
 
-    Clearances are looked at in samples: the ends of the pieces, and between them at most `step`
-    and `LARGEST_TURN` apart, though never under 0.17 ms. There the distances of capsules, the
-    shield's plate and boxes are exact to rounding (`referee.arm_clearance` says which solids are
-    held against which). In between, nothing is looked at.
+    Clearances are computed at samples: the ends of the pieces, and between them at most `step` and
+    `LARGEST_TURN` apart, though never under 0.17 ms. There the distances of capsules, the shield's
+    plate and boxes (`referee.arm_clearance` lists the pairs) are exact to rounding.
 
     The motion begins at the case's delay, and the arm stays where it ends: it has to be at rest
-    there if the case asks for that, or if that is before the contact.
+    there if the case requires that, or if the contact comes later.
 
     Args:
         cases: object with the fields of `BlockCase`, leaves with leading axis B; gravity > 0.
@@ -132,8 +136,8 @@ def referee_blocks(
         tolerance: relative, of velocities, accelerations, the case's offset and its tilt; [rad]
             and [rad/s] of the start and of jumps between pieces, [rad] of positions.
         contact_tolerance: [m], how far the ball's centre may be off the plane of the shield's
-            face and outside of its square, how far the arm may be inside of what it must not
-            touch, and the ball outside the outer box or inside the inner one.
+            face and outside of its square, the arm inside of an obstacle, and the ball outside of
+            the outer box or inside of the inner one.
         step: [s], longest time between two samples, at most `LONGEST_STEP`.
         chunk: most lanes that a thread judges at once; it bounds the memory.
 
@@ -146,59 +150,34 @@ def referee_blocks(
     """
     if not 0.0 < step <= LONGEST_STEP:
         raise ValueError(f"step must be > 0 and <= {LONGEST_STEP}, got {step}")
-    if chunk < 1:
-        raise ValueError(f"chunk must be >= 1, got {chunk}")
-    leaves, links = _leaves(cases, plans)
+    leaves, links = _read(cases, plans)
     judge = functools.partial(
         _judge, links=links, step=step, relative=tolerance, contact=contact_tolerance
     )
     return BlockVerdict(**judge_in_chunks(judge, leaves, chunk))
 
 
-def _leaves(cases, plans) -> tuple[dict[str, np.ndarray], tuple[int, ...]]:
-    """Every array that the referee reads, by name, its shape checked; the capsules' links."""
+def _read(cases, plans) -> tuple[dict[str, np.ndarray], tuple[int, ...]]:
+    """Read all arrays, check their shapes, and return the capsules' links too."""
     coeffs = np.asarray(plans.motion.coeffs)
     if coeffs.ndim != 4 or coeffs.shape[-1] != 6 or 0 in coeffs.shape[1:]:
         raise ValueError(f"plan.motion.coeffs must be (B, M, D + 1, 6), got {coeffs.shape}")
-    arm, limits, scene = cases.arm, cases.limits, cases.scene
-    links = tuple(int(link) for link in arm.capsule_link)
+    links = tuple(int(link) for link in cases.arm.capsule_link)
     if not all(-1 <= link <= 5 for link in links):
         raise ValueError(f"arm.capsule_link must be in -1, ..., 5, got {links}")
-    beams = np.shape(scene.beam_radius)
+    beams = np.shape(cases.scene.beam_radius)
     if len(beams) != 2:
         raise ValueError(f"scene.beam_radius must be ({len(coeffs)}, N), got {beams}")
-    trailing = {
-        "plan.motion.durations": (plans.motion.durations, coeffs.shape[1:2]),
-        "plan.contact_time": (plans.contact_time, ()),
-        "ball.pos": (cases.ball.pos, (3,)),
-        "ball.vel": (cases.ball.vel, (3,)),
-        "angles": (cases.angles, (6,)),
-        "rates": (cases.rates, (6,)),
-        "arm.origin": (arm.origin, (6, 3)),
-        "arm.turn": (arm.turn, (6, 4)),
-        "arm.axis": (arm.axis, (6, 3)),
-        "arm.lower": (arm.lower, (6,)),
-        "arm.upper": (arm.upper, (6,)),
-        "arm.capsule_ends": (arm.capsule_ends, (len(links), 2, 3)),
-        "arm.capsule_radius": (arm.capsule_radius, (len(links),)),
-        "arm.base_box": (arm.base_box, (2, 3)),
-        "arm.shield_centre": (arm.shield_centre, (3,)),
-        "arm.shield_half": (arm.shield_half, ()),
-        "limits.velocity": (limits.velocity, (6,)),
-        "limits.acceleration": (limits.acceleration, (6,)),
-        "scene.pole": (scene.pole, (2,)),
-        "scene.beam_ends": (scene.beam_ends, (*beams[1:], 2, 3)),
-        "scene.beam_radius": (scene.beam_radius, beams[1:]),
+    num_lanes, capsules = len(coeffs), len(links)
+    shapes = _CASE_SHAPES | {
+        "arm.capsule_ends": (capsules, 2, 3),
+        "arm.capsule_radius": (capsules,),
+        "scene.beam_ends": (*beams[1:], 2, 3),
+        "scene.beam_radius": beams[1:],
     }
-    names = ("gravity", "delay", "ends_at_rest", "offset", "tilt")
-    trailing |= {name: (getattr(cases, name), ()) for name in names}
-    names = ("pole_radius", "has_pole", "floor")
-    trailing |= {f"scene.{name}": (getattr(scene, name), ()) for name in names}
-    for name, box in (("inner", scene.inner), ("outer", scene.outer)):
-        trailing |= {f"scene.{name}.{side}": (getattr(box, side), (3,)) for side in _SIDES}
-    leaves = {"plan.motion.coeffs": coeffs}
-    for name, (value, shape) in trailing.items():
-        leaves[name] = checked_leaf(name, value, coeffs.shape[:1] + shape)
+    leaves = {"plan.motion.coeffs": coeffs} | read_leaves(cases, shapes, num_lanes)
+    of_plan = {"motion.durations": coeffs.shape[1:2], "contact_time": ()}
+    leaves |= read_leaves(plans, of_plan, num_lanes, "plan.")
     absent = leaves["scene.has_pole"] == 0
     leaves["scene.pole"] = np.where(absent[:, None], 0.0, leaves["scene.pole"])
     leaves["scene.pole_radius"] = np.where(absent, 0.0, leaves["scene.pole_radius"])
@@ -206,7 +185,7 @@ def _leaves(cases, plans) -> tuple[dict[str, np.ndarray], tuple[int, ...]]:
 
 
 def _judge(case: dict, links: tuple, step: float, relative: float, contact: float) -> dict:
-    """The fields of `BlockVerdict` for one chunk of lanes."""
+    """Return the fields of `BlockVerdict` for one chunk of lanes."""
     finite = finite_lanes(case, _UNBOUNDED_LEAVES)
     execution = case["plan.motion.durations"].sum(axis=1)
     # How long the arm stays where its motion ends.
@@ -244,7 +223,7 @@ def _judge(case: dict, links: tuple, step: float, relative: float, contact: floa
 
 
 def _times(case: dict, stays: np.ndarray) -> tuple:
-    """Test of the plan's times: failed, how far off the worst is, the contact."""
+    """Test the plan's times: failed, how far off the worst is, the contact."""
     contact = case["plan.contact_time"]
     shortest = case["plan.motion.durations"].min(axis=1)
     off = np.maximum.reduce([case["delay"] - contact, -stays, contact - LONGEST_PLAN, -shortest])
@@ -261,9 +240,9 @@ class _Motion:
 
 
 def _extremes(motion: _Motion) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Angles, rates and accelerations (K, 6, B, M) at their extrema and at the pieces' ends.
+    """Return angles, rates and accelerations (K, 6, B, M) at their extrema and the pieces' ends.
 
-    Each with the times (K, 6, B, M) [s] since the piece's start; K differs.
+    Each comes with its times (K, 6, B, M) [s] since the piece's start; K differs.
     """
     degree, shape = len(motion.coeffs) - 1, motion.coeffs.shape[1:]
     ends = np.stack([np.zeros(shape), np.broadcast_to(motion.durations, shape)])
@@ -284,12 +263,7 @@ def _extremes(motion: _Motion) -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def _worst(excess: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The greatest of values (K, 6, B, M), its time (B,) and its joint (B,) str.
-
-    Args:
-        excess: of joints and pieces.
-        times: [s], broadcasts to the same.
-    """
+    """Return the greatest of values (K, 6, B, M), its time (B,) [s] and its joint (B,) str."""
     by_lane = flat(np.moveaxis(excess, 2, 0))
     lanes, top = np.arange(len(by_lane)), by_lane.argmax(axis=1)
     k, joint, piece = np.unravel_index(top, (*excess.shape[:2], excess.shape[3]))
@@ -298,10 +272,7 @@ def _worst(excess: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def _judge_limits(case: dict, motion: _Motion, extremes: list, relative: float) -> tuple:
-    """What the motion asks of the joints; the tests of that; and the joints that are worst.
-
-    The tests are name -> failed, excess, time, the joints name -> (B,) str.
-    """
+    """Return shares of the joints' limits, tests, and the worst joint (B,) str of each test."""
     tests, parts, measured = {}, {}, {}
 
     def test(name: str, excess: np.ndarray, times: np.ndarray, allowed: float) -> None:
@@ -330,7 +301,7 @@ def _judge_limits(case: dict, motion: _Motion, extremes: list, relative: float) 
 
 
 def _rest(case: dict, motion: _Motion, stays: np.ndarray) -> tuple[tuple, np.ndarray]:
-    """Test of the rates where the motion ends, and the fastest joint (B,) str."""
+    """Test the rates where the motion ends; return the fastest joint (B,) str too."""
     rates = np.abs(derivative(motion.coeffs[..., -1], motion.durations[:, -1], 1))
     has_to = (case["ends_at_rest"] != 0.0) | (stays > CONTACT_TIME_TOLERANCE)
     time = motion.starts[:, -1] + motion.durations[:, -1]
@@ -339,9 +310,9 @@ def _rest(case: dict, motion: _Motion, stays: np.ndarray) -> tuple[tuple, np.nda
 
 
 def _final(motion: _Motion, stays: np.ndarray) -> np.ndarray:
-    """Angles (6, B) [rad] at the contact.
+    """Return the angles (6, B) [rad] at the contact.
 
-    A motion that ends earlier or later by less than what counts is continued or cut short.
+    A motion that ends within the tolerance of the contact is extended or cut to it.
     """
     beyond = np.where(np.abs(stays) > CONTACT_TIME_TOLERANCE, 0.0, stays)
     return derivative(motion.coeffs[..., -1], motion.durations[:, -1] + beyond, 0)
@@ -350,7 +321,7 @@ def _final(motion: _Motion, stays: np.ndarray) -> np.ndarray:
 def _clearances(
     case: dict, links: tuple, motion: _Motion, turning: np.ndarray, step: float
 ) -> dict[str, tuple]:
-    """Least distances (B,) [m] by kind, their times (B,) [s], and what (B,) str comes so close.
+    """Return least distances (B,) [m] by kind, their times (B,) [s], and the parts (B,) str.
 
     Args:
         case: leaves of B lanes.
@@ -363,7 +334,7 @@ def _clearances(
     longest = np.minimum(step, LARGEST_TURN / turning)
     count = np.maximum(np.ceil(motion.durations / longest - 1e-9), 1.0)
     most = count.sum(axis=1).astype(int) + 1
-    # Lanes of about as many samples are worked out together.
+    # Lanes with similar numbers of samples are judged together.
     order, begin = np.argsort(-most), 0
     nothing = np.zeros(0), np.zeros(0), np.zeros(0, str)
     found = {kind: [nothing] for kind in KINDS}
@@ -371,7 +342,7 @@ def _clearances(
         lanes = order[begin : begin + max(_SAMPLES // int(most[order[begin]]), 1)]
         begin += len(lanes)
         sample = np.arange(most[lanes[0]])
-        times, angles = _sampled(motion, lanes, count[lanes], sample)
+        times, angles = _sample(motion, lanes, count[lanes], sample)
         of_lanes = {name: leaf[lanes] for name, leaf in case.items()}
         near = clearances(of_lanes, links, angles, sample < most[lanes, None])
         for kind, (least, at, part) in near.items():
@@ -383,12 +354,12 @@ def _clearances(
     }
 
 
-def _sampled(
+def _sample(
     motion: _Motion, lanes: np.ndarray, count: np.ndarray, sample: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Times (B, S) [s] and angles (6, B, S) [rad] of some lanes at their samples.
+    """Return times (B, S) [s] and angles (6, B, S) [rad] of some lanes at their samples.
 
-    Lanes of fewer samples than others stay at their end.
+    Lanes with fewer samples than others stay at their end.
 
     Args:
         motion: of all lanes.
@@ -407,7 +378,7 @@ def _sampled(
 
 
 def _judge_contact(case: dict, angles: np.ndarray, relative: float, contact: float) -> tuple:
-    """Where and how the ball meets the shield, and the tests of ball, tilt and tunnel.
+    """Measure how the ball meets the shield, and test ball, tilt and tunnel.
 
     Args:
         case: leaves of B lanes.
@@ -435,11 +406,11 @@ def _judge_contact(case: dict, angles: np.ndarray, relative: float, contact: flo
 
 
 def _tunnel(case: dict, contact: float) -> tuple:
-    """Test of the contact's time against those of the ball in both boxes."""
+    """Test the contact's time against the ball's times in both boxes."""
     time = case["plan.contact_time"]
 
     def off(grown: float) -> np.ndarray:
-        """How far (B,) [s] it is off with the tunnel so much larger [m] at both ends."""
+        """Return the error (B,) [s] with boxes grown by a length [m] at both ends."""
         begin, end = times_inside(case, "outer", grown)
         out = np.maximum(np.maximum(begin - time, time - end), 0.0).min(axis=0)
         begin, end = times_inside(case, "inner", -grown)
@@ -450,10 +421,10 @@ def _tunnel(case: dict, contact: float) -> tuple:
 
 
 def times_inside(case: dict, name: str, grown: float) -> tuple[np.ndarray, np.ndarray]:
-    """When balls are inside a box that is grown on all sides [m]: begins and ends (2, B) [s].
+    """Return when balls enter and leave a box grown on all sides [m], (2, B) [s] each.
 
-    On their way up, and on their way down. What never is begins at infinity and ends at minus
-    infinity.
+    The first entry is on the way up, the second on the way down. A ball that is never inside
+    enters at infinity and leaves at minus infinity.
     """
     pos, vel, gravity = case["ball.pos"].T, case["ball.vel"].T, case["gravity"]
     lower = case[f"scene.{name}.lower"].T - pos - grown

@@ -27,16 +27,14 @@ from planner_jax.referee.judging import (
     judge_in_chunks,
     read_leaves,
 )
+from planner_jax.referee.pieces import pieces_of, with_ending
 from planner_jax.referee.quadrotor import (
     MOTION_SENTENCES,
     MOTION_UNBOUNDED,
-    check_sampling,
     checked_coeffs,
     intervals_of,
     judge_motion,
-    pieces_of,
     read_flight,
-    with_ending,
 )
 from planner_jax.referee.verdict import FlightVerdict
 
@@ -81,7 +79,7 @@ class CatchVerdict(FlightVerdict):
     num_caught: np.ndarray  # (B,) int
 
     def praise(self, k: int | tuple) -> str:
-        """What is said of a success."""
+        """Return the end of the sentence for a success."""
         if not (number := int(np.asarray(self.num_caught)[k])):
             return "there is no target to catch"
         farthest = np.nanmax(self.net_distance[k])
@@ -100,7 +98,7 @@ def referee_catches(
     samples: int = 400,
     chunk: int = 2048,
 ) -> CatchVerdict:
-    """The verdict on every plan of a batch.
+    """Judge every plan of a batch.
 
     Catch i (i = 0, 1, ... in the plan's order) is the end of piece (i + 1) M - 1. Pieces after
     the last present target that have no duration are not looked at, and neither is anything
@@ -150,7 +148,6 @@ def referee_catches(
         ValueError: a leaf has the wrong shape, the class of the targets is not known,
             `net_test` is another word, `samples` < 200 or `chunk` < 1.
     """
-    check_sampling(samples, chunk)
     if net_test not in ("plane", "ball"):
         raise ValueError(f'net_test must be "plane" or "ball", got {net_test!r}')
     leaves = _read(cases, plans)
@@ -198,17 +195,17 @@ def _read(cases, plans) -> dict[str, np.ndarray]:
 
 
 def _ends(durations: np.ndarray, num: int) -> np.ndarray:
-    """Times (B, N) [s] at which the pieces (B, N * M) up to each catch end."""
+    """Return times (B, N) [s] at which the pieces (B, N * M) up to each catch end."""
     each = durations.shape[1] // num
     return np.cumsum(durations, axis=1)[:, each - 1 :: each]
 
 
 def _known_states(targets, order: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Position and velocity (B, N, 3) of the targets `order` at `times`, both (B, N)."""
+    """Return position and velocity (B, N, 3) of the targets `order` at `times`, both (B, N)."""
     lanes, finite = np.arange(len(order))[:, None], np.ones(order.shape, bool)
 
     def leaf(name: str, value, *trailing: int) -> np.ndarray:
-        """One leaf (B, N, ...) of the targets, in the order of catching."""
+        """Return one leaf (B, N, ...) of the targets, in the order of catching."""
         value = checked_leaf(f"targets.{name}", value, order.shape + trailing)
         value = value[lanes, order].astype(np.float64)
         finite[...] &= np.isfinite(value).all(axis=tuple(range(2, value.ndim)))
@@ -247,7 +244,7 @@ def _known_states(targets, order: np.ndarray, times: np.ndarray) -> tuple[np.nda
 
 
 def _ball_states(start, vel, drag, gravity, times) -> tuple[np.ndarray, np.ndarray]:
-    """Position and velocity (B, N, 3) of balls with linear drag on each axis.
+    """Return position and velocity (B, N, 3) of balls with linear drag on each axis.
 
     Paper 000, eq. 9 with its constant: s_0 + (v_0 - g / K) (1 - e^-x) / K + g t / K, x = K t,
     which is s_0 + v_0 t f(x) + g t^2 h(x) with f = (1 - e^-x) / x and h = (1 - f) / x. Both are
@@ -276,7 +273,7 @@ def _ball_states(start, vel, drag, gravity, times) -> tuple[np.ndarray, np.ndarr
 
 
 def _table_states(pos, vel, resolution, times) -> tuple[np.ndarray, np.ndarray]:
-    """Position and velocity (B, N, 3) read from tables whose node k is at (k - 1) resolution.
+    """Interpolate position and velocity (B, N, 3) in tables with node k at (k - 1) resolution.
 
     Keys' cubic convolution with a = -1/2 is the cubic between two nodes whose slopes there are
     the central differences. Beyond the table the target goes on at its last velocity.
@@ -307,7 +304,7 @@ def _table_states(pos, vel, resolution, times) -> tuple[np.ndarray, np.ndarray]:
 def _judge(
     case: dict, extras: tuple, intervals: int, net_test: str, optional: bool, tolerances: dict
 ) -> dict:
-    """The fields of `CatchVerdict` for one chunk of lanes."""
+    """Return the fields of `CatchVerdict` for one chunk of lanes."""
     durations, present = case["durations"], case["present"] != 0.0
     num = present.shape[1]
     ends = _ends(durations, num)
@@ -356,7 +353,7 @@ def _judge(
 def _places(
     order: np.ndarray, present: np.ndarray, due: np.ndarray, optional: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Places (B, N) of the order that are right, and the target that each one names.
+    """Return places (B, N) of the order that are right, and the target that each one names.
 
     The first places, those that are due, name present targets, the others absent ones (or any
     that are left where targets are optional), and none names a target that has been named before.
@@ -373,7 +370,7 @@ def _places(
 
 
 def _judge_catches(case, pieces, held, ends, net_test: str, tolerances: dict) -> tuple[dict, dict]:
-    """What happens at the catches, and the tests of it: name -> failed, excess, time (B, N)."""
+    """Measure and test the catches: name -> failed, excess, time (B, N)."""
     num = held.shape[1]
     each = pieces.durations.shape[1] // num
     tail = np.moveaxis(pieces.coeffs[:, :, each - 1 :: each], -1, 0)
@@ -425,7 +422,7 @@ def _catch_time(case: dict, held: np.ndarray, ends: np.ndarray) -> tuple:
 
 
 def _worst(test: tuple, held: np.ndarray) -> tuple:
-    """The worst catch of every lane: a test (B, N) of the catches that are held as one (B,)."""
+    """Return the test (B,) of each lane's worst catch from a test (B, N) of all catches."""
     failed, excess, time = test
     failed = failed & held
     counts = failed | (held & np.isnan(excess))

@@ -12,7 +12,7 @@ _SLACK = 1e-9
 
 
 def clearances(group: dict, half: np.ndarray, times: np.ndarray, poses: np.ndarray) -> tuple:
-    """Least distance (B,) [m] of rectangles from polygons, when (B,) [s], and of which (B,).
+    """Return least distance (B,) [m] of rectangles from polygons, when (B,) [s], and of which (B,).
 
     Pairs of a sample and an obstacle that bounds show to be farther apart than another pair of
     their lane are left out: first by circles around both, then by the lines of the polygon's
@@ -39,7 +39,7 @@ def clearances(group: dict, half: np.ndarray, times: np.ndarray, poses: np.ndarr
     apart = np.sqrt(apart) - reach[:, None]  # infinite for absent ones
 
     def exact(lane: np.ndarray, sample: np.ndarray, which: np.ndarray) -> np.ndarray:
-        """Distances (P,) of so many pairs."""
+        """Return distances (P,) of so many pairs."""
         found = [np.zeros(0)]
         for part in (slice(k, k + _PAIRS) for k in range(0, len(lane), _PAIRS)):
             b, s, n = lane[part], sample[part], which[part]
@@ -49,7 +49,7 @@ def clearances(group: dict, half: np.ndarray, times: np.ndarray, poses: np.ndarr
         return np.concatenate(found)
 
     def closest(bound: np.ndarray, of: np.ndarray) -> np.ndarray:
-        """Place of the least `bound` (P,) of each lane that has any; the lanes rise in `of`."""
+        """Return the index of the least `bound` (P,) of each lane in `of`, whose lanes rise."""
         lowest = np.full(num_lanes, np.inf)
         np.minimum.at(lowest, of, bound)
         hits = np.flatnonzero(bound == lowest[of])
@@ -80,7 +80,7 @@ def clearances(group: dict, half: np.ndarray, times: np.ndarray, poses: np.ndarr
 
 
 def _edges(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Outward unit normals (..., V, 2) of convex polygons (..., V, 2), and the edges' heights.
+    """Return outward unit normals (..., V, 2) of polygons (..., V, 2), and the edges' heights.
 
     The height (..., V) [m] of an edge is how far out along its normal it lies. One without
     length, between repeated corners, has no normal, and lies infinitely far out.
@@ -95,7 +95,7 @@ def _edges(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _separation(corners, normals, pose, half) -> np.ndarray:
-    """Distances (P,) [m] of rectangles from convex polygons; of overlapping ones minus the depth.
+    """Return distances (P,) [m] of rectangles from polygons; minus the depth where they overlap.
 
     By separating axes: the greatest gap along the normal of an edge of either. If it is
     negative the two overlap, and it is the shortest way out. If not, the distance is that of a
@@ -110,7 +110,7 @@ def _separation(corners, normals, pose, half) -> np.ndarray:
     cos, sin = np.cos(pose[:, 2, None]), np.sin(pose[:, 2, None])
 
     def turned(vectors: np.ndarray) -> np.ndarray:
-        """Vectors (P, V, 2) in the rectangle's frame."""
+        """Return vectors (P, V, 2) in the rectangle's frame."""
         x, y = vectors[..., 0], vectors[..., 1]
         return np.stack([cos * x + sin * y, cos * y - sin * x], axis=2)
 

@@ -5,11 +5,12 @@ the one piece of code that referee and planners share.
 """
 
 import dataclasses
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from planner_jax.referee.judging import derivative
+from planner_jax.referee.pieces import Pieces
 
 
 @runtime_checkable
@@ -28,8 +29,8 @@ _LOOKED_INTO, _CLOSER = 6, 4
 _STEEP = 1e9
 
 
-def worst_extras(pieces: Any, lanes: np.ndarray, extras: tuple, u: np.ndarray) -> tuple:
-    """Greatest relative excess (B,) over extra limits, its time, and which extra it is of.
+def worst_extras(pieces: Pieces, lanes: np.ndarray, extras: tuple, u: np.ndarray) -> tuple:
+    """Return greatest relative excess (B,) over extra limits, its time, and which extra it is of.
 
     Extras are those of all cases, of which these are `lanes`. The excess is looked for at the
     samples u (S,) of every piece, and where lines through two of them on either side say that it
@@ -46,11 +47,11 @@ def worst_extras(pieces: Any, lanes: np.ndarray, extras: tuple, u: np.ndarray) -
     return worst, time, which
 
 
-def _worst_excess(pieces: Any, extra: Any, u: np.ndarray) -> tuple[float, float]:
-    """Greatest excess over one extra of one lane, and its time [s]."""
+def _worst_excess(pieces: Pieces, extra: ExtraLimit, u: np.ndarray) -> tuple[float, float]:
+    """Return greatest excess over one extra of one lane, and its time [s]."""
 
     def excess(coeffs: np.ndarray, times: np.ndarray) -> np.ndarray:
-        """At times (...) since pieces of coefficients (D + 1, 3, ...) began."""
+        """Return the excess at times (...) since the start of pieces (D + 1, 3, ...)."""
         state = (derivative(coeffs, times, order) for order in range(3))
         flown = [np.moveaxis(each, 0, -1).reshape(-1, 3) for each in state]
         return np.asarray(extra.excess(*flown), float).reshape(times.shape)
@@ -83,8 +84,8 @@ def _worst_excess(pieces: Any, extra: Any, u: np.ndarray) -> tuple[float, float]
     return float(worst), float(time)
 
 
-def _of_lane(extra: Any, lane: int) -> Any:
-    """An extra with the arrays of one lane in float64."""
+def _of_lane(extra, lane: int) -> ExtraLimit:
+    """Return an extra with the arrays of one lane in float64."""
     numbers = [f.name for f in dataclasses.fields(extra) if f.metadata.get("pytree_node", True)]
     own = {name: np.asarray(vars(extra)[name], float)[lane] for name in numbers}
     return dataclasses.replace(extra, **own)

@@ -24,15 +24,13 @@ from planner_jax.referee.judging import (
     judge_in_chunks,
     read_leaves,
 )
+from planner_jax.referee.pieces import pieces_of, with_ending
 from planner_jax.referee.quadrotor import (
     MOTION_SENTENCES,
     MOTION_UNBOUNDED,
-    check_sampling,
     intervals_of,
     judge_motion,
-    pieces_of,
     read_flight,
-    with_ending,
 )
 from planner_jax.referee.verdict import FlightVerdict
 
@@ -81,7 +79,7 @@ class HitVerdict(FlightVerdict):
     contact_error: np.ndarray  # (B,) [m], racket centre to ball at the impact
 
     def praise(self, k: int | tuple) -> str:
-        """What is said of a success."""
+        """Return the end of the sentence for a success."""
         return f"the ball lands {np.asarray(self.landing_error)[k]:.2g} m from the target"
 
 
@@ -97,7 +95,7 @@ def referee_hits(
     samples: int = 400,
     chunk: int = 2048,
 ) -> HitVerdict:
-    """The verdict on every plan of a batch.
+    """Judge every plan of a batch.
 
     Speed, acceleration, body rate and height are sampled at both ends and inside of every
     piece; the likeliest peak by parabolas through three samples is then searched on the
@@ -131,7 +129,6 @@ def referee_hits(
     Raises:
         ValueError: a leaf has the wrong shape, `samples` < 200 or `chunk` < 1.
     """
-    check_sampling(samples, chunk)
     leaves = read_flight(cases, plans)
     leaves |= read_leaves(cases, _CASE_SHAPES, len(leaves["lane"]))
     leaves |= read_leaves(plans, {"stroke.time": ()}, len(leaves["lane"]))
@@ -154,7 +151,7 @@ def referee_hits(
 def _judge(
     case: dict, extras: tuple, intervals: int, drag_after_impact: bool, tolerances: dict
 ) -> dict:
-    """The fields of `HitVerdict` for one chunk of lanes."""
+    """Return the fields of `HitVerdict` for one chunk of lanes."""
     pieces = with_ending(pieces_of(case["coeffs"], case["durations"]), case)
     measured, tests = judge_motion(
         pieces, case, extras, intervals, tolerances["relative"], tolerances["continuity"]
@@ -164,14 +161,14 @@ def _judge(
 
 
 def _ball_acc(vel: np.ndarray, drag: np.ndarray, gravity: np.ndarray) -> np.ndarray:
-    """Acceleration (3, B) of a ball of velocity (3, B):  v' = g - K_D |v| v."""
+    """Return acceleration (3, B) of a ball of velocity (3, B):  v' = g - K_D |v| v."""
     acc = -drag * np.sqrt((vel * vel).sum(axis=0)) * vel
     acc[2] -= gravity
     return acc
 
 
 def _ball_step(state, step: np.ndarray, drag, gravity) -> np.ndarray:
-    """One Runge-Kutta step of order 4, its length (B,) [s], of position and velocity (6, B).
+    """Return one Runge-Kutta step of order 4, its length (B,) [s], of position and velocity (6, B).
 
     The acceleration does not depend on the position, whose own sum of velocities is therefore
     v + step / 6 (a_1 + a_2 + a_3).
@@ -190,7 +187,7 @@ def _ball_step(state, step: np.ndarray, drag, gravity) -> np.ndarray:
 
 
 def _step_down_to(state, entry: int, level, drag, gravity) -> tuple[np.ndarray, np.ndarray]:
-    """Time (B,) within one outgoing step at which an entry has fallen to a level; the ball then.
+    """Return the time (B,) in an outgoing step when an entry falls to a level, and the ball then.
 
     Newton from the far end of the step: height and vertical speed are concave or falling
     there, so that it comes to the later crossing.
@@ -204,7 +201,7 @@ def _step_down_to(state, entry: int, level, drag, gravity) -> tuple[np.ndarray, 
 
 
 def _return_in_air(state, height, drag, gravity) -> tuple:
-    """Apex, its time, landing point (3, B) and flight time of the ball with quadratic drag."""
+    """Return apex, its time, landing point (3, B) and flight time with quadratic drag."""
     before_top, before_end, state = state.copy(), state.copy(), state.copy()
     top_time, end_time = np.zeros_like(height), np.zeros_like(height)
     flying = np.arange(len(height))
@@ -233,7 +230,7 @@ def _return_in_air(state, height, drag, gravity) -> tuple:
 
 
 def _return_in_vacuum(state, height, gravity) -> tuple:
-    """Apex, its time, landing point (3, B) and flight time of the ball under gravity alone."""
+    """Return apex, its time, landing point (3, B) and flight time under gravity alone."""
     pos, vel = state[:3], state[3:]
     apex_time = np.maximum(vel[2], 0.0) / gravity
     apex = pos[2] + 0.5 * gravity * apex_time**2
@@ -245,7 +242,7 @@ def _return_in_vacuum(state, height, gravity) -> tuple:
 
 
 def _judge_impact(case: dict, drag_after_impact: bool, tolerances: dict) -> tuple[dict, dict]:
-    """The ball up to the landing, and the tests of it: name -> failed, excess, time.
+    """Return the ball up to the landing, and the tests of it: name -> failed, excess, time.
 
     In here vectors are (3, B), states of the ball (6, B).
     """
@@ -286,7 +283,7 @@ def _judge_impact(case: dict, drag_after_impact: bool, tolerances: dict) -> tupl
 
 
 def _impact_tests(case, measured, tolerances, end, apex_at, landing_at) -> dict:
-    """Tests of contact, hitting speed, apex and landing: name -> failed, excess, time."""
+    """Return tests of contact, hitting speed, apex and landing: name -> failed, excess, time."""
     relative = tolerances["relative"]
     contact, landing = measured["contact_error"], measured["landing_error"]
     widest = np.minimum(tolerances["contact"], RIM * case.get("racket_radius", np.inf))

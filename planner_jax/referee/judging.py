@@ -72,7 +72,12 @@ def judge_in_chunks(
 
     Threads share the lanes, one for each core: NumPy releases the interpreter inside its loops.
     Processes share them if there are many lanes and many cores, and `judge` can be pickled.
+
+    Raises:
+        ValueError: `chunk` < 1.
     """
+    if chunk < 1:
+        raise ValueError(f"chunk must be >= 1, got {chunk}")
     num_lanes, num_cores = len(next(iter(leaves.values()))), cores()
     size = min(chunk, max(math.ceil(num_lanes / num_cores), _FEWEST_LANES))
     judge_part = functools.partial(_judge_in_float64, judge)

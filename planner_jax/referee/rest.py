@@ -18,12 +18,12 @@ from planner_jax.referee.judging import (
     first_failures,
     judge_in_chunks,
 )
+from planner_jax.referee.pieces import pieces_of
 from planner_jax.referee.quadrotor import (
     MOTION_SENTENCES,
     MOTION_UNBOUNDED,
     intervals_of,
     judge_motion,
-    pieces_of,
     read_flight,
 )
 from planner_jax.referee.verdict import Verdict
@@ -48,7 +48,7 @@ class RestVerdict(Verdict):
 def referee_rests(
     cases, plans, *, tolerance: float = 1e-3, continuity_tolerance: float = 1e-4
 ) -> RestVerdict:
-    """The verdict on the way to rest of every plan of a batch, whatever is true of the plan.
+    """Return the verdict on the way to rest of every plan of a batch, whatever is true of the plan.
 
     Args:
         cases: object with `gravity`, `limits` and `extras`, leaves with leading axis B.
@@ -66,7 +66,7 @@ def referee_rests(
 
 
 def _judge(case: dict, extras: tuple, relative: float, continuity: float) -> dict:
-    """The fields of `RestVerdict` for one chunk of lanes."""
+    """Return the fields of `RestVerdict` for one chunk of lanes."""
     case = {**case, "head_state": _end_states(case["coeffs"], case["durations"])}
     pieces = pieces_of(case["ending.coeffs"], case["ending.durations"])
     intervals = intervals_of(_SAMPLES, pieces.durations.shape[1])
@@ -76,7 +76,7 @@ def _judge(case: dict, extras: tuple, relative: float, continuity: float) -> dic
 
 
 def _end_states(coeffs: np.ndarray, durations: np.ndarray) -> np.ndarray:
-    """Position to jerk (B, 4, 3) where trajectories end; pieces that take no time do not count."""
+    """Return position to jerk (B, 4, 3) at the ends of trajectories; empty pieces do not count."""
     lanes, number = np.arange(len(coeffs)), np.arange(durations.shape[1])
     last = np.where(durations > 0.0, number, 0).max(axis=1)
     tail = np.moveaxis(coeffs[lanes, last], 0, -1)
@@ -85,7 +85,7 @@ def _end_states(coeffs: np.ndarray, durations: np.ndarray) -> np.ndarray:
 
 
 def referee_stops(case, plan, rest) -> str:
-    """What is wrong with a car's way to a stand behind one plan; "" where nothing is.
+    """Return the fault of a car's trajectory to a standstill behind one plan; "" without a fault.
 
     `referee_intercepts` judges it as a case of its own that begins where the plan ends, without a
     target: its limits, the map, what stands, and what moves until the car stands.
@@ -121,7 +121,7 @@ def referee_stops(case, plan, rest) -> str:
 
 
 def referee_stands(case, plan, rest) -> str:
-    """What is wrong with an arm's way to rest behind one plan; "" where nothing is.
+    """Return the fault of an arm's motion to rest behind one plan; "" without a fault.
 
     `referee_blocks` judges it as a case of its own that begins where the plan ends; what it says
     of the ball, which has been met by then, does not count.

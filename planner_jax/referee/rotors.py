@@ -18,7 +18,7 @@ def rotor_thrusts(
     inertia: np.ndarray,
     mixer: np.ndarray,
 ) -> np.ndarray:
-    """Thrust of each rotor [N] (B, M, S, 4); not finite where there is no attitude.
+    """Return thrust of each rotor [N] (B, M, S, 4); not finite where there is no attitude.
 
     Args:
         coeffs: (3, B, M, D + 1), rising powers of the time [s] since each piece's start.
@@ -47,7 +47,7 @@ def rotor_thrusts(
 def _pull_and_rate(
     coeffs: np.ndarray, times: np.ndarray, gravity: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Thrust per unit mass [m/s^2] and angular velocity [rad/s], world frame, (B, M, S, 3)."""
+    """Return thrust per unit mass [m/s^2] and world angular velocity [rad/s], (B, M, S, 3)."""
     powers = np.arange(coeffs.shape[-1])
     twice, thrice = powers * (powers - 1.0), powers * (powers - 1.0) * (powers - 2.0)
     acc = _at(coeffs * twice, times, 2)
@@ -62,7 +62,7 @@ def _pull_and_rate(
 
 
 def _at(coeffs: np.ndarray, times: np.ndarray, order: int) -> np.ndarray:
-    """Polynomials (3, B, M, D + 1), whose first `order` powers are gone, at times: (B, M, S, 3)."""
+    """Evaluate polynomials (3, B, M, D + 1) without their first `order` powers: (B, M, S, 3)."""
     value = np.zeros((3, *times.shape))
     for k in range(coeffs.shape[-1] - 1, order - 1, -1):
         value = value * times + coeffs[..., k, None]
@@ -70,7 +70,7 @@ def _at(coeffs: np.ndarray, times: np.ndarray, order: int) -> np.ndarray:
 
 
 def _body_axes(pull: np.ndarray) -> np.ndarray:
-    """Rotation (..., 3, 3), body to world: the shortest turn from upright to a thrust (..., 3)."""
+    """Return the shortest rotation (..., 3, 3), body to world, from upright to a thrust."""
     up = pull / np.linalg.norm(pull, axis=-1, keepdims=True)
     x, y, z = np.moveaxis(up, -1, 0)
     k = 1.0 / (1.0 + z)

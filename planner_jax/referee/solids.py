@@ -13,27 +13,27 @@ _PARALLEL = 1e-9
 
 
 def dot(a: np.ndarray | list, b: np.ndarray | list) -> np.ndarray:
-    """Inner products (...) of vectors (3, ...), or of lists of their components."""
+    """Return inner products (...) of vectors (3, ...), or of lists of their components."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def length(vector: np.ndarray | list) -> np.ndarray:
-    """Lengths (...) of vectors (3, ...)."""
+    """Return lengths (...) of vectors (3, ...)."""
     return np.sqrt(dot(vector, vector))
 
 
 def turned(rotation: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Products (3, ...) of matrices (3, 3, ...) and vectors (3, ...)."""
+    """Return products (3, ...) of matrices (3, 3, ...) and vectors (3, ...)."""
     return np.stack([dot(rotation[k], vector) for k in range(3)])
 
 
 def turned_back(rotation: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Vectors (3, ...) in the frames that rotations (3, 3, ...) lead out of."""
+    """Return vectors (3, ...) in the frames that rotations (3, 3, ...) lead out of."""
     return np.stack([dot(rotation[:, k], vector) for k in range(3)])
 
 
 def from_segment(point: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Distances (...) [m] of points from segments between two ends, which may be one point."""
+    """Return distances (...) [m] of points from segments; their two ends may be one point."""
     way, away = second - first, point - first
     square = dot(way, way)
     share = np.clip(_ratio(dot(away, way), square), 0.0, 1.0)
@@ -43,7 +43,7 @@ def from_segment(point: np.ndarray, first: np.ndarray, second: np.ndarray) -> np
 def between_segments(
     first: np.ndarray, second: np.ndarray, third: np.ndarray, fourth: np.ndarray
 ) -> np.ndarray:
-    """Distances (...) [m] of segments from `first` to `second` from those to `fourth`.
+    """Return distances (...) [m] of segments from `first` to `second` from those to `fourth`.
 
     The shares of either way at the nearest points: those of the two lines, held in [0, 1] one
     after the other (Ericson, Real-Time Collision Detection, Section 5.1.9).
@@ -58,7 +58,7 @@ def between_segments(
 
 
 def segment_to_box(first: np.ndarray, second: np.ndarray, half: np.ndarray) -> np.ndarray:
-    """Distances (...) [m] of segments from boxes around the origin; zero where they meet.
+    """Return distances (...) [m] of segments from boxes around the origin; zero where they meet.
 
     The squared distance is convex along the segment, and its slope is a line between the places
     where the segment crosses the planes of the box's sides: the root lies between the last of
@@ -72,7 +72,7 @@ def segment_to_box(first: np.ndarray, second: np.ndarray, half: np.ndarray) -> n
     way = second - first
 
     def beyond(share: np.ndarray) -> list:
-        """How far out of the box a place on the segment is, component by component."""
+        """Return how far out of the box a place on the segment is, component by component."""
         places = (first[k] + share * way[k] for k in range(3))
         return [place - np.clip(place, -half[k], half[k]) for k, place in enumerate(places)]
 
@@ -91,7 +91,7 @@ def segment_to_box(first: np.ndarray, second: np.ndarray, half: np.ndarray) -> n
 def between_boxes(
     middle: np.ndarray, rotation: np.ndarray, half: np.ndarray, other: np.ndarray
 ) -> np.ndarray:
-    """Distances (P,) [m] between boxes; of overlapping ones minus the depth.
+    """Return distances (P,) [m] between boxes; of overlapping ones minus the depth.
 
     By separating axes: if the greatest gap along the normals of sides and the products of edges
     is negative the two overlap, and it is the shortest way out. If not, the nearest points lie
@@ -123,7 +123,7 @@ def between_boxes(
 
 
 def _edges_to_box(middle, rotation, half, other) -> np.ndarray:
-    """Distances (P,) [m] of boxes' nearest edges from others, as `between_boxes` is asked."""
+    """Return distances (P,) [m] of boxes' nearest edges from others; as in `between_boxes`."""
     edges = rotation * half  # (3, 3, P), half of each
     starts = [
         middle + first * edges[:, (k + 1) % 3] + second * edges[:, (k + 2) % 3] - edges[:, k]
@@ -134,6 +134,6 @@ def _edges_to_box(middle, rotation, half, other) -> np.ndarray:
 
 
 def _ratio(value: np.ndarray, by: np.ndarray) -> np.ndarray:
-    """The quotient, and zero where `by` is."""
+    """Return the quotient, and zero where `by` is."""
     none = by == 0.0
     return np.where(none, 0.0, value / np.where(none, 1.0, by))

@@ -13,8 +13,10 @@ import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import TypeVar
 
+Given = TypeVar("Given")
+Found = TypeVar("Found")
 _ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}  # a core is one worker's
 
 
@@ -33,8 +35,8 @@ class _Worker:
             },
         )
 
-    def call(self, function: Callable, argument: Any) -> Any:
-        """The function's result, computed there; its exception, raised here."""
+    def call(self, function: Callable[[Given], Found], argument: Given) -> Found:
+        """Return the function's result, computed there; its exception, raised here."""
         process = self._process
         assert process.stdin is not None and process.stdout is not None
         try:
@@ -57,35 +59,34 @@ class _Worker:
 
 
 def cores() -> int:
-    """How many cores the referee keeps busy: as NPROC says, which XLA minds too, or all it may."""
+    """Return the number of cores to use: NPROC, as for XLA, or all that the process may use."""
     told = os.environ.get("NPROC", "")
     if told.isdecimal():
         return max(int(told), 1)
-    # As `processors.usable_cores`, of which the referee, like of all that it judges, knows nothing.
-    if hasattr(os, "sched_getaffinity"):
+    try:
         return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    except AttributeError:  # another system than Linux
+        return os.cpu_count() or 1
 
 
 class Workers:
     """As many processes as the referee has cores."""
 
     def __init__(self, num: int) -> None:
-        self._threads = ThreadPoolExecutor(num)
+        self._threads = ThreadPoolExecutor(num, initializer=self._start_worker)
         self._own = threading.local()
         self._all: list[_Worker] = []
 
-    def map(self, function: Callable, arguments: list[Any]) -> list[Any]:
-        """`function` of each argument; both must be known to `pickle`."""
+    def map(self, function: Callable[[Given], Found], arguments: list[Given]) -> list[Found]:
+        """Return `function` of each argument; both must be known to `pickle`."""
+        return list(
+            self._threads.map(lambda each: self._own.worker.call(function, each), arguments)
+        )
 
-        def call(argument: Any) -> Any:
-            worker = getattr(self._own, "worker", None)
-            if worker is None:
-                worker = self._own.worker = _Worker()
-                self._all.append(worker)
-            return worker.call(function, argument)
-
-        return list(self._threads.map(call, arguments))
+    def _start_worker(self) -> None:
+        """Start the process of the thread that calls this."""
+        self._own.worker = _Worker()
+        self._all.append(self._own.worker)
 
     def stop(self) -> None:
         """End all processes."""
@@ -96,7 +97,7 @@ class Workers:
 
 @functools.cache
 def workers() -> Workers:
-    """The processes of this program, begun when they are first asked for."""
+    """Return the processes of this program, begun when they are first asked for."""
     pool = Workers(cores())
     atexit.register(pool.stop)
     return pool

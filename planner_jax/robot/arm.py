@@ -1,15 +1,20 @@
-"""A six-axis arm with a square shield at its flange: kinematics, clearance shapes and limits.
+"""A six-axis arm with a square shield at its flange: kinematics, limits, and plans of the joints.
 
 Base frame of the robot, z up, SI units, angles of the joints (6,) [rad]. The frame of a link lies
 at its joint and turns with it, as in MuJoCo's model files (`planner_jax.robot.arm_mjcf` reads one).
 """
 
-from typing import Any
+import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array, lax
+
+from planner_jax.core.arithmetic import host_leaf
+from planner_jax.core.protocol import Plan
+from planner_jax.robot.setpoints import sample_at_rate
+from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 
 @struct.dataclass
@@ -52,10 +57,10 @@ class Regime:
 
 
 def _regime(factor: float, acceleration: float, ends_at_rest: bool) -> Regime:
-    """A regime of the IRB 1600-6/1.2 at `factor` times the speeds of its datasheet."""
-    speeds: Any = np.deg2rad(np.array([150, 160, 170, 320, 400, 450], np.float32))
-    accelerations: Any = np.full(6, acceleration, np.float32)
-    limits = ArmLimits(velocity=factor * speeds, acceleration=accelerations)
+    """Return a regime of the IRB 1600-6/1.2 at `factor` times the speeds of its datasheet."""
+    speeds = np.deg2rad(np.array([150, 160, 170, 320, 400, 450], np.float32))
+    accelerations = np.full(6, acceleration, np.float32)
+    limits = ArmLimits(host_leaf(factor * speeds), host_leaf(accelerations))
     return Regime(limits=limits, ends_at_rest=ends_at_rest)
 
 
@@ -69,12 +74,12 @@ REGIMES = {
 
 
 def product(a: Array, b: Array) -> Array:
-    """Matrix product in the full precision of its arguments."""
+    """Return matrix product in the full precision of its arguments."""
     return jnp.matmul(a, b, precision=lax.Precision.HIGHEST)
 
 
 def quaternion_rotation(quaternion: Array) -> Array:
-    """Rotations (..., 3, 3) of unit quaternions (..., 4), w x y z."""
+    """Return rotations (..., 3, 3) of unit quaternions (..., 4), w x y z."""
     w, x, y, z = jnp.moveaxis(quaternion, -1, 0)
     rows = (
         (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
@@ -85,7 +90,7 @@ def quaternion_rotation(quaternion: Array) -> Array:
 
 
 def _joint_rotations(arm: Arm, angles: Array) -> Array:
-    """Rotation of every link to the one before it, (6, 3, 3): Rodrigues' formula on each axis."""
+    """Return rotations (6, 3, 3) of links to those before: Rodrigues' formula on each axis."""
     turn = quaternion_rotation(jnp.asarray(arm.turn))
     axis = jnp.asarray(arm.axis)
     x, y, z = axis[:, 0], axis[:, 1], axis[:, 2]
@@ -99,7 +104,7 @@ def _joint_rotations(arm: Arm, angles: Array) -> Array:
 
 
 def link_frames(arm: Arm, angles: Array) -> tuple[Array, Array]:
-    """Where the links are at angles (6,) [rad].
+    """Return where the links are at angles (6,) [rad].
 
     Returns:
         rotations: (6, 3, 3), link to base.
@@ -115,12 +120,12 @@ def link_frames(arm: Arm, angles: Array) -> tuple[Array, Array]:
 
 
 def joint_axes(arm: Arm, rotations: Array) -> Array:
-    """Directions (6, 3) of the joints in the base frame, from the links' rotations (6, 3, 3)."""
+    """Return directions (6, 3) of the joints in the base frame by links' rotations (6, 3, 3)."""
     return product(rotations, jnp.asarray(arm.axis)[:, :, None])[:, :, 0]
 
 
 def shield_pose(arm: Arm, angles: Array) -> tuple[Array, Array]:
-    """Rotation (3, 3) of the shield at angles (6,) and the middle (3,) [m] of its front face.
+    """Return the shield's rotation (3, 3) at angles (6,) and the middle (3,) [m] of its face.
 
     The columns of the rotation are the outward normal and the directions of the edges.
     """
@@ -129,7 +134,7 @@ def shield_pose(arm: Arm, angles: Array) -> tuple[Array, Array]:
 
 
 def shield_jacobian(arm: Arm, angles: Array) -> Array:
-    """How the shield moves with each joint at angles (6,): the geometric Jacobian (6, 6).
+    """Return how the shield moves with each joint at angles (6,): the geometric Jacobian (6, 6).
 
     Its first three rows are the velocity of the middle of the front face [m/rad], the last three
     the angular velocity [rad/rad], both in the base frame; a column a joint.
@@ -141,7 +146,7 @@ def shield_jacobian(arm: Arm, angles: Array) -> Array:
 
 
 def capsules(arm: Arm, angles: Array) -> Array:
-    """Ends (C, 2, 3) [m] of the capsules' segments in the base frame, at angles (6,)."""
+    """Return ends (C, 2, 3) [m] of the capsules' segments in the base frame, at angles (6,)."""
     rotations, positions = link_frames(arm, angles)
     # The base is the last one, where -1 finds it.
     rotations = jnp.concatenate([rotations, jnp.eye(3, dtype=rotations.dtype)[None]])
@@ -149,3 +154,38 @@ def capsules(arm: Arm, angles: Array) -> Array:
     link = np.asarray(arm.capsule_link, np.int32)
     turned = product(jnp.asarray(arm.capsule_ends), jnp.swapaxes(rotations[link], 1, 2))
     return positions[link][:, None] + turned
+
+
+@dataclasses.dataclass(frozen=True)
+class ArmSetpoints:
+    """A plan at K equally spaced times; of a batch every array but `time` has a leading axis B.
+
+    Entries past the end of a plan are NaN.
+    """
+
+    time: np.ndarray  # (K,) [s] since the plan began
+    angles: np.ndarray  # (K, 6) [rad], of the joints
+    rates: np.ndarray  # (K, 6) [rad/s]
+    accelerations: np.ndarray  # (K, 6) [rad/s^2]
+
+
+@struct.dataclass
+class ArmPlan(Plan):
+    """A plan with the motion of an arm's joints, coefficients (M, D + 1, 6) in [rad]."""
+
+    motion: PiecewisePolynomial
+
+    def sample(self, rate: float) -> ArmSetpoints:
+        """Sample the plan, or the batch, at a rate [Hz], from its beginning up to its end.
+
+        Raises:
+            ValueError: the rate is not positive.
+        """
+        ends = np.sum(np.asarray(self.motion.durations), axis=-1)
+        return ArmSetpoints(**sample_at_rate(rate, ends, self.motion, _setpoint_at))
+
+
+def _setpoint_at(motion: PiecewisePolynomial, time: Array) -> dict[str, Array]:
+    """Return one setpoint of one motion at a time () [s]."""
+    names = ("angles", "rates", "accelerations")
+    return {name: evaluate(motion, time, order) for order, name in enumerate(names)}

@@ -21,7 +21,7 @@ class Torques:
 def inverse_dynamics(
     arm: Arm, angles: Array, velocity: Array, acceleration: Array, gravity: float | Array = 9.81
 ) -> Array:
-    """Torques of the joints (6,) [N m] of a motion, without friction and rotors.
+    """Return torques of the joints (6,) [N m] of a motion, without friction and rotors.
 
     The forward recursion (Luh, Walker and Paul 1980) in the base frame adds to the motion of each
     link what its joint adds; the backward one adds up the forces and moments of the links beyond
@@ -41,7 +41,7 @@ def inverse_dynamics(
     spin_rate = jnp.cumsum(axes * acceleration[:, None] + jnp.cross(spin - added, added), axis=0)
 
     def carried(arm_to: Array, spin: Array, spin_rate: Array) -> Array:
-        """Acceleration of points at `arm_to` from one of the same body, beyond that one's own."""
+        """Return the acceleration of points at `arm_to` relative to a point of the same body."""
         return jnp.cross(spin_rate, arm_to) + jnp.cross(spin, jnp.cross(spin, arm_to))
 
     between = positions[1:] - positions[:-1]
@@ -62,7 +62,7 @@ def inverse_dynamics(
 def motion_torques(
     arm: Arm, motion: PiecewisePolynomial, gravity: float | Array = 9.81, samples: int = 256
 ) -> Torques:
-    """Torques of the joints over a motion: sqrt(1/T int tau^2 dt) as in Table II of paper 004.
+    """Return joint torques over a motion: sqrt(1/T int tau^2 dt) as in Table II of paper 004.
 
     The integral is that of the midpoint rule, as accelerations may jump at the ends. The paper
     does not say whether gravity counts, nor how it samples; without gravity ask for 0.

@@ -75,7 +75,7 @@ def _geometry(arm: Arm) -> _Geometry:
 
 
 def inverse_kinematics(arm: Arm, rotation: Array, middle: Array) -> tuple[Array, Array]:
-    """All angles at which the shield is where it is wanted: the eight branches.
+    """Return all angles at which the shield is where it is wanted: the eight branches.
 
     Branch 4 i + 2 j + k has the wrist in front of the shoulder (i = 0) or reached over it (1),
     the elbow on one side or the other (j), the wrist bent one way or the other (k). Where joint
@@ -118,7 +118,7 @@ def inverse_kinematics(arm: Arm, rotation: Array, middle: Array) -> tuple[Array,
 def _arm_angles(
     geometry: _Geometry, wrist: Array, front: Array, elbow: Array
 ) -> tuple[Array, Array]:
-    """Joints 1 to 3 (3,) [rad] that put the wrist's centre at (3,) [m] in the basis; if they do."""
+    """Return joints 1 to 3 (3,) [rad] that put the wrist's centre at (3,) [m]; whether they can."""
     x, y, z = wrist
     lateral, upper_arm, forearm = geometry.lateral, geometry.upper_arm, geometry.forearm
     # Rounding must not take a pose at the very end of the reach out of it.
@@ -138,7 +138,7 @@ def _arm_angles(
 
 
 def _wrist_angles(wanted: Array, flip: int, bend: Array) -> Array:
-    """Joints 4 to 6 (3,) [rad] of the rotation (3, 3) = X(j4) Y(j5 + bend) X(j6), by one branch."""
+    """Return joints 4 to 6 (3,) [rad] of X(j4) Y(j5 + bend) X(j6) = rotation (3, 3), one branch."""
     fourth = _angle(flip * wanted[1, 0], -flip * wanted[2, 0])
     sine, cosine = jnp.sin(fourth), jnp.cos(fourth)
     # What joint 4 leaves is well determined at a straight wrist too, where joint 4 is not.
@@ -148,13 +148,13 @@ def _wrist_angles(wanted: Array, flip: int, bend: Array) -> Array:
 
 
 def _angle(y: Array, x: Array) -> Array:
-    """The angle atan2(y, x) of lengths [m] or parts of one; 0 with no slope where it has none."""
+    """Return the angle atan2(y, x); 0 with no slope where it is not defined."""
     none = x * x + y * y <= jnp.finfo(x.dtype).eps ** 2
     return jnp.arctan2(jnp.where(none, 0.0, y), jnp.where(none, 1.0, x))
 
 
 def _root(x: Array) -> Array:
-    """Square root of x (...), 0 with no slope where x is not positive."""
+    """Return square root of x (...), 0 with no slope where x is not positive."""
     positive = x > 0.0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
 
@@ -172,7 +172,7 @@ def _about_y(angle: Array) -> Array:
 
 
 def misfit(arm: Arm) -> str | None:
-    """Why the closed form does not fit an arm with NumPy leaves, in words; None where it does."""
+    """Return why the closed form does not fit an arm with NumPy leaves; None if it fits."""
     rotation, position = Rotation.identity(), np.zeros(3)
     axes, positions = np.zeros((6, 3)), np.zeros((6, 3))
     for k in range(6):

@@ -13,11 +13,12 @@ import importlib.resources
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
+from numpy.typing import DTypeLike
 from scipy.spatial.transform import Rotation
 
+from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.errors import ArgumentError
 from planner_jax.host.files import open_plain
 from planner_jax.robot.arm import Arm
@@ -31,7 +32,7 @@ _LOOK = {"rgba", "group", "material"}
 
 @functools.cache
 def irb1600() -> Arm:
-    """The ABB IRB 1600-6/1.2 with a shield of 0.30 m, leaves NumPy float32.
+    """Return the ABB IRB 1600-6/1.2 with a shield of 0.30 m, leaves NumPy float32.
 
     The file `models/irb1600.xml` names the sources of its numbers.
     """
@@ -44,8 +45,8 @@ def _text_of(path: str) -> str:
         return file.read().decode("utf-8-sig")
 
 
-def read_arm(path_or_xml: str, *, dtype: Any = np.float32) -> Arm:
-    """The arm of an MJCF file, or of MJCF text, with NumPy leaves.
+def read_arm(path_or_xml: str, *, dtype: DTypeLike = np.float32) -> Arm:
+    """Return the arm of an MJCF file, or of MJCF text, with NumPy leaves.
 
     Its base frame is that of the base body, wherever in the world that stands.
 
@@ -94,7 +95,7 @@ def read_arm(path_or_xml: str, *, dtype: Any = np.float32) -> Arm:
         "shield_centre": shield_centre,
         "shield_half": shield_half,
     }
-    arrays: dict[str, Any] = {name: np.asarray(leaf, dtype) for name, leaf in leaves.items()}
+    arrays = {name: host_leaf(leaf, dtype) for name, leaf in leaves.items()}
     arm = Arm(**arrays, capsule_link=tuple(k for k, _, _ in shapes))
     reason = misfit(arm)
     if reason is not None:
@@ -120,7 +121,7 @@ class _Reader:
         self.unit = np.pi / 180.0 if angle == "degree" else 1.0
 
     def frame(self, element: ET.Element) -> tuple[np.ndarray, Rotation]:
-        """Place (3,) [m] and attitude of an element in its body's, or its parent's, frame."""
+        """Return position (3,) [m] and attitude of an element in its body's or parent's frame."""
         place = _numbers(element, "pos", 3, (0.0, 0.0, 0.0))
         if "quat" in element.attrib and "euler" in element.attrib:
             raise ArgumentError(_tag(element), "quat or euler, not both", verb="have", shown="")
@@ -134,7 +135,7 @@ class _Reader:
         return place, Rotation.from_quat(quaternion, scalar_first=True)
 
     def joint(self, joint: ET.Element) -> tuple[np.ndarray, np.ndarray]:
-        """Axis (3,) and position limits (2,) [rad] of a hinge joint."""
+        """Return axis (3,) and position limits (2,) [rad] of a hinge joint."""
         _only(joint, {"name", "type", "pos", "axis", "range", "limited"}, ())
         if np.any(_numbers(joint, "pos", 3, (0.0, 0.0, 0.0))):
             raise ArgumentError(f"{_tag(joint)}: pos", "0 0 0, where its link's frame is", shown="")
@@ -149,7 +150,7 @@ class _Reader:
         return axis / np.linalg.norm(axis), limits
 
     def inertial(self, inertial: ET.Element) -> tuple[float, np.ndarray, np.ndarray]:
-        """Mass [kg], its centre (3,) [m] and the inertia (3, 3) [kg m^2] along the link's axes."""
+        """Return mass [kg], its centre (3,) [m] and inertia (3, 3) [kg m^2] along the axes."""
         full = "fullinertia" in inertial.attrib
         how = {"fullinertia"} if full else {"diaginertia", "quat", "euler"}
         _only(inertial, {"pos", "mass", *how}, ())
@@ -165,7 +166,7 @@ class _Reader:
         return mass, centre, inertia
 
     def capsule(self, geom: ET.Element) -> tuple[np.ndarray, float]:
-        """Ends (2, 3) [m] and radius [m] of a capsule; the ends of a sphere are one point."""
+        """Return ends (2, 3) [m] and radius [m] of a capsule; a sphere's ends are one point."""
         kind = geom.get("type", "sphere")
         if kind not in ("capsule", "sphere"):
             raise ArgumentError(_tag(geom), "a capsule or a sphere", shown="")
@@ -184,7 +185,7 @@ class _Reader:
 
 
 def _chain(world: ET.Element) -> tuple[ET.Element, list[ET.Element]]:
-    """The base and the six links, each of them with one hinge joint."""
+    """Return the base and the six links, each of them with one hinge joint."""
     _only(world, set(), {"body", "geom", *_SEEN})
     body = base = _one(world, "body")
     _only(base, _FRAME, {"body", "geom", *_SEEN})
@@ -201,7 +202,7 @@ def _chain(world: ET.Element) -> tuple[ET.Element, list[ET.Element]]:
 
 
 def _shield(link: ET.Element) -> tuple[ET.Element, np.ndarray, float]:
-    """The shield's geom, the middle (3,) [m] of its front face and half [m] of its edge."""
+    """Return the shield's geom, the middle (3,) [m] of its front face and half [m] of its edge."""
     geom, site = (
         next((each for each in link.findall(tag) if each.get("name") == "shield"), None)
         for tag in ("geom", "site")
@@ -222,7 +223,7 @@ def _shield(link: ET.Element) -> tuple[ET.Element, np.ndarray, float]:
 
 
 def _base_box(base: ET.Element) -> tuple[ET.Element, np.ndarray]:
-    """The base's box as a geom, and its lowest and highest corner (2, 3) [m]."""
+    """Return the base's box as a geom, and its lowest and highest corner (2, 3) [m]."""
     boxes = [geom for geom in base.findall("geom") if geom.get("type") == "box"]
     if len(boxes) != 1:
         raise ArgumentError(_tag(base), "one box", len(boxes), verb="have")
@@ -231,7 +232,7 @@ def _base_box(base: ET.Element) -> tuple[ET.Element, np.ndarray]:
 
 
 def _box(geom: ET.Element) -> tuple[np.ndarray, np.ndarray]:
-    """Half the edges (3,) [m] and the middle (3,) [m] of a box along the axes of its body."""
+    """Return half the edges (3,) [m] and the middle (3,) [m] of a box along its body's axes."""
     _only(geom, {"name", "type", "pos", "size", *_LOOK}, ())
     if geom.get("type") != "box":
         raise ArgumentError(_tag(geom), "a box", shown="")
@@ -242,7 +243,7 @@ def _box(geom: ET.Element) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _home(root: ET.Element, limits: np.ndarray) -> np.ndarray:
-    """Angles (6,) [rad] of the key named home, within position limits (6, 2) [rad]."""
+    """Return angles (6,) [rad] of the key named home, within position limits (6, 2) [rad]."""
     for key in root.iterfind("keyframe/key"):
         if key.get("name") == "home":
             home = _numbers(key, "qpos", 6)
@@ -255,13 +256,13 @@ def _home(root: ET.Element, limits: np.ndarray) -> np.ndarray:
 
 
 def _tag(element: ET.Element) -> str:
-    """An element as it is written, without what it contains: this is how messages name it."""
+    """Return an element as it is written, without its children, for messages."""
     written = [f'{name}="{value}"' for name, value in element.items()]
     return f"<{' '.join([element.tag, *written])}>"
 
 
 def _only(element: ET.Element, attributes: set[str], children: Iterable[str]) -> None:
-    """Raises `ValueError` where an element has something else than what is understood."""
+    """Raise `ValueError` where an element has something else than what is understood."""
     for name in element.keys():
         if name not in attributes:
             raise ValueError(f"{_tag(element)}: {name} is not understood")
@@ -271,7 +272,7 @@ def _only(element: ET.Element, attributes: set[str], children: Iterable[str]) ->
 
 
 def _one(element: ET.Element, tag: str) -> ET.Element:
-    """The one child of a tag."""
+    """Return the one child of a tag."""
     found = element.findall(tag)
     if len(found) != 1:
         raise ArgumentError(_tag(element), f"one <{tag}>", len(found), verb="have")
@@ -281,7 +282,7 @@ def _one(element: ET.Element, tag: str) -> ET.Element:
 def _numbers(
     element: ET.Element, attribute: str, count: int, default: tuple[float, ...] | None = None
 ) -> np.ndarray:
-    """An attribute's numbers (count,); a default of None means that it must be there."""
+    """Return an attribute's numbers (count,); a default of None means that it must be there."""
     text = element.get(attribute)
     if text is None and default is not None:
         return np.array(default)

@@ -14,7 +14,7 @@ from flax import struct
 from jax import Array
 
 from planner_jax.core.protocol import Plan
-from planner_jax.robot.setpoints import sampled_at_rate
+from planner_jax.robot.setpoints import sample_at_rate
 
 
 @struct.dataclass
@@ -69,16 +69,13 @@ class CarPlan(Plan):
     curvature: Array  # (K + 1,) [1/m], at the knots
 
     def sample(self, rate: float) -> CarSetpoints:
-        """The plan, or the batch, at a rate [Hz], from its beginning up to its end.
+        """Return the plan, or the batch, at a rate [Hz], from its beginning up to its end.
 
         Raises:
             ValueError: the rate is not positive.
         """
         leaves = (self.start, self.time, self.speed, self.curvature)
-        time, setpoints = sampled_at_rate(
-            rate, self.time, leaves, lambda leaves, time: _sampled(*leaves, time)
-        )
-        return CarSetpoints(time=time, **setpoints)
+        return CarSetpoints(**sample_at_rate(rate, self.time, leaves, _setpoint_at))
 
 
 # Gauss-Legendre nodes and weights on (0, 1), exact to order 9.
@@ -87,7 +84,7 @@ _NODE, _WEIGHT = 0.5 * (_NODES[0] + 1.0), 0.5 * _NODES[1]
 
 
 def pose_at(start: Array, end: Array, speed: Array, curvature: Array, time: Array) -> Array:
-    """Pose (3,) of the rear axle at one time () of a plan with knots (K + 1,); see `CarPlan`."""
+    """Return the rear axle's pose (3,) at a time () of a plan with knots (K + 1,)."""
     num = speed.shape[0] - 1
     step = end / num
     length = jnp.clip(time - step * jnp.arange(num), 0.0, step)  # of every piece that is driven
@@ -96,7 +93,7 @@ def pose_at(start: Array, end: Array, speed: Array, curvature: Array, time: Arra
     v, c = speed[:-1], curvature[:-1]
 
     def turned(tau: Array) -> Array:
-        """Angle turned since the beginning of a piece."""
+        """Return angle turned since the beginning of a piece."""
         return tau * (v * c + tau * ((v * bend + rise * c) / 2.0 + tau * rise * bend / 3.0))
 
     whole = turned(length)
@@ -109,7 +106,7 @@ def pose_at(start: Array, end: Array, speed: Array, curvature: Array, time: Arra
 
 
 def knots_at(end: Array, speed: Array, curvature: Array, time: Array) -> tuple[Array, Array, Array]:
-    """Speed [m/s], curvature [1/m] and acceleration [m/s^2] at one time () of knots (K + 1,)."""
+    """Return speed [m/s], curvature [1/m] and acceleration [m/s^2] at a time ()."""
     num = speed.shape[0] - 1
     place = jnp.clip(time / end * num, 0.0, num)
     k = jnp.clip(place.astype(jnp.int32), 0, num - 1)
@@ -119,25 +116,16 @@ def knots_at(end: Array, speed: Array, curvature: Array, time: Array) -> tuple[A
     return v, c, (speed[k + 1] - speed[k]) * num / end
 
 
-@jax.jit
-def _sampled(
-    start: Array, end: Array, speed: Array, curvature: Array, time: Array
-) -> dict[str, Array]:
-    """The setpoints of plans with leaves (B, ...) at times (K,)."""
-
-    def at(
-        start: Array, end: Array, speed: Array, curvature: Array, time: Array
-    ) -> dict[str, Array]:
-        pose = pose_at(start, end, speed, curvature, time)
-        v, c, acceleration = knots_at(end, speed, curvature, time)
-        return {
-            "pos": pose[:2],
-            "heading": pose[2],
-            "speed": v,
-            "acceleration": acceleration,
-            "curvature": c,
-            "yaw_rate": v * c,
-        }
-
-    of_plan = jax.vmap(at, in_axes=(None, None, None, None, 0))
-    return jax.vmap(of_plan, in_axes=(0, 0, 0, 0, None))(start, end, speed, curvature, time)
+def _setpoint_at(leaves: tuple[Array, Array, Array, Array], time: Array) -> dict[str, Array]:
+    """Return one setpoint of one plan's start, end and knots at a time () [s]."""
+    start, end, speed, curvature = leaves
+    pose = pose_at(start, end, speed, curvature, time)
+    v, c, acceleration = knots_at(end, speed, curvature, time)
+    return {
+        "pos": pose[:2],
+        "heading": pose[2],
+        "speed": v,
+        "acceleration": acceleration,
+        "curvature": c,
+        "yaw_rate": v * c,
+    }

@@ -1,4 +1,4 @@
-"""Quadrotor limits and differential flatness (paper 002, eq. 1; attitude by the Hopf fibration).
+"""A quadrotor: limits, differential flatness (paper 002, eq. 1), bounds on reach, and plans.
 
 The body z axis follows the net thrust  tau = a + g e_3  (per unit mass). With the heading
 held at zero, the Hopf fibration gives the body rates from tau and the jerk alone
@@ -6,14 +6,22 @@ held at zero, the Hopf fibration gives the body rates from tau and the jerk alon
 """
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jax import Array
 
 from planner_jax.core.arithmetic import Components, at_least, components, inverse_sqrt, reciprocal
+from planner_jax.core.protocol import Plan
+from planner_jax.robot.setpoints import sample_at_rate
+from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, joined
+
+# By how much limits may be exceeded here, far more than in any plan that is solved: how closely
+# peaks are looked at must not matter to a bound.
+ALLOWED = 1.01
+_SHORTEST = 1e-3  # [s], so that a limit which is infinite is not multiplied by zero
 
 
 @struct.dataclass
@@ -50,8 +58,8 @@ class QuadrotorLimits:
         return least, none + jnp.inf if self.max_thrust is None else self.max_thrust
 
     def scaled(self, factor: float, gravity: Array) -> "QuadrotorLimits":
-        """Speed, acceleration, body rate and the thrust's distance from hover times `factor`."""
-        scaled = {name: factor * getattr(self, name) for name in ("speed", "body_rate")}
+        """Scale speed, acceleration, body rate and the thrust's distance from hover by a factor."""
+        scaled = {"speed": factor * self.speed, "body_rate": factor * self.body_rate}
         if self.acceleration is not None:
             scaled["acceleration"] = factor * self.acceleration
         if self.min_thrust is not None and self.max_thrust is not None:
@@ -62,12 +70,12 @@ class QuadrotorLimits:
 
 
 def net_thrust(acc: Array, gravity: Array) -> Array:
-    """Thrust per unit mass  a + g e_3  [m/s^2], shape (..., 3)."""
+    """Return thrust per unit mass  a + g e_3  [m/s^2], shape (..., 3)."""
     return acc + gravity * jnp.array([0.0, 0.0, 1.0], acc.dtype)
 
 
 def body_z(acc: Array, gravity: Array) -> Array:
-    """Unit vector along the net thrust, shape (..., 3); zero where there is no thrust."""
+    """Return unit vector along the net thrust, shape (..., 3); zero where there is no thrust."""
     thrust = net_thrust(acc, gravity)
     size_squared = jnp.sum(thrust**2, axis=-1, keepdims=True)
     pushing = size_squared > 0.0
@@ -75,7 +83,7 @@ def body_z(acc: Array, gravity: Array) -> Array:
 
 
 def body_rate_squared(acc: Components, jerk: Components, gravity: Array) -> Array:
-    """Squared body rate  |omega|^2  of the Hopf fibration at zero heading [rad^2/s^2].
+    """Return squared body rate  |omega|^2  of the Hopf fibration at zero heading [rad^2/s^2].
 
     |z'|^2 + ((z_y z_x' - z_x z_y') / (1 + z_z))^2 , where z' is the jerk across the thrust
     over the thrust's size. Written without square roots, so that its gradient is finite
@@ -107,7 +115,7 @@ def body_rate_squared(acc: Components, jerk: Components, gravity: Array) -> Arra
 
 
 def body_rate(acc: Components, jerk: Components, gravity: Array) -> tuple[Array, Array, Array]:
-    """Body rate of the Hopf fibration at zero heading [rad/s], body frame, its components (...).
+    """Return components (...) of the body rate [rad/s] of the Hopf fibration, body frame.
 
     Args:
         acc: (..., 3) [m/s^2].
@@ -130,7 +138,7 @@ def body_rate(acc: Components, jerk: Components, gravity: Array) -> tuple[Array,
 def rotor_thrusts(
     acc: Components, jerk: Components, snap: Components, gravity: Array, rotors: RotorLimits
 ) -> tuple[Array, ...]:
-    """Thrust of each of the four rotors that a motion at zero heading takes [N], (...) each.
+    """Return thrust of each of the four rotors that a motion at zero heading takes [N], (...) each.
 
     Args:
         acc: (..., 3) [m/s^2].
@@ -140,8 +148,7 @@ def rotor_thrusts(
         rotors: and the body that they carry.
     """
     a, j, s = (tuple(components(each)) for each in (acc, jerk, snap))
-    turn: Any = lambda acc, jerk: body_rate(acc, jerk, gravity)  # noqa: E731
-    rate, turning = jax.jvp(turn, (a, j), (j, s))
+    rate, turning = jax.jvp(lambda acc, jerk: body_rate(acc, jerk, gravity), (a, j), (j, s))
     x, y, z = a
     thrust = rotors.mass * jnp.sqrt(at_least(x * x + y * y + (z + gravity) ** 2, 1e-4))
     about_x, about_y, about_z = (rotors.inertia[..., k] for k in range(3))
@@ -156,7 +163,7 @@ def rotor_thrusts(
 
 
 def tangent_basis(normal: Array) -> tuple[Array, Array]:
-    """The body x and y axes of the Hopf fibration at zero heading.
+    """Return the body x and y axes of the Hopf fibration at zero heading.
 
     Args:
         normal: (3,) body z axis, unit length.
@@ -173,7 +180,7 @@ def tangent_basis(normal: Array) -> tuple[Array, Array]:
 
 
 def flat_attitude(acc: Array, jerk: Array, gravity: Array) -> tuple[Array, Array]:
-    """Attitude and body rate of a motion, at zero heading of the Hopf fibration.
+    """Return attitude and body rate of a motion, at zero heading of the Hopf fibration.
 
     Args:
         acc: (3,) [m/s^2].
@@ -193,10 +200,139 @@ def flat_attitude(acc: Array, jerk: Array, gravity: Array) -> tuple[Array, Array
 
 
 def tilt_quaternion(normal: Array) -> Array:
-    """The attitude at zero heading of the Hopf fibration, of the body z axis, (4,) w x y z.
+    """Return the attitude at zero heading of the Hopf fibration, of the body z axis, (4,) w x y z.
 
     The shortest turn from upright: (1 + z, -y, x, 0) / sqrt(2 (1 + z)).
     """
     x, y, z = components(normal)
     w = jnp.sqrt(0.5 * at_least(1.0 + z, 1e-6))
     return jnp.stack([w, -0.5 * y / w, 0.5 * x / w, jnp.zeros_like(w)])
+
+
+def greatest_speed(head_state: Array, limits: QuadrotorLimits) -> Array:
+    """Return the greatest speed of the quadrotor, () [m/s]."""
+    first = jnp.sqrt(jnp.sum(head_state[1] * head_state[1]))
+    return jnp.maximum(ALLOWED * limits.speed, first)
+
+
+def beyond_reach(
+    places: Array, times: Array, head_state: Array, limits: QuadrotorLimits, gravity: Array
+) -> Array:
+    """Return how far places lie beyond all that a quadrotor can reach by certain times, (K,) [m].
+
+    A bound from below: zero or less says nothing. By the time t the quadrotor is in each of
+
+    - the ball around the start whose radius is the integral of the greatest speed, which rises
+      with the greatest acceleration A up to its limit,
+    - the ball of radius A t^2 / 2 around where the first velocity alone takes it,
+    - the ball of radius T t^2 / 2 around where it falls freely, with the greatest thrust T,
+
+    as far as there are such limits: the mean of accelerations lies in a ball that holds them all.
+
+    Args:
+        places: (K, 3) [m].
+        times: (K,) [s], >= 0.
+        head_state: (4, 3) of the quadrotor at time 0.
+        limits: of the quadrotor.
+        gravity: () [m/s^2], magnitude.
+    """
+    start, vel = head_state[0], head_state[1]
+    x, y, z = (place - start[k] for k, place in enumerate(components(places)))
+    half_square = 0.5 * jnp.maximum(times, _SHORTEST) ** 2
+    thrust = _greatest_thrust(limits)
+    acceleration = _greatest_acceleration(limits, thrust, gravity)
+    first, most = jnp.sqrt(jnp.sum(vel * vel)), greatest_speed(head_state, limits)
+    if acceleration is None:
+        return _length(x, y, z) - most * times
+    rise = (most - first) / acceleration
+    hurried = first * times + acceleration * half_square
+    reached = jnp.where(times < rise, hurried, most * times - 0.5 * (most - first) * rise)
+    beyond = _length(x, y, z) - reached
+    x, y, z = x - vel[0] * times, y - vel[1] * times, z - vel[2] * times
+    beyond = jnp.maximum(beyond, _length(x, y, z) - acceleration * half_square)
+    if thrust is None:
+        return beyond
+    return jnp.maximum(beyond, _length(x, y, z + gravity * half_square) - thrust * half_square)
+
+
+def _greatest_thrust(limits: QuadrotorLimits) -> Array | None:
+    """Return the greatest thrust of all rotors per unit mass, () [m/s^2]; None without a limit."""
+    found = [] if limits.max_thrust is None else [limits.max_thrust]
+    if limits.rotors is not None:
+        found.append(4.0 * limits.rotors.max_thrust / limits.rotors.mass)
+    return ALLOWED * jnp.min(jnp.stack(found)) if found else None
+
+
+def _greatest_acceleration(
+    limits: QuadrotorLimits, thrust: Array | None, gravity: Array
+) -> Array | None:
+    """Return the greatest acceleration, () [m/s^2]; None without a limit."""
+    found = [] if limits.acceleration is None else [ALLOWED * limits.acceleration]
+    if thrust is not None:
+        found.append(thrust + gravity)
+    return jnp.min(jnp.stack(found)) if found else None
+
+
+def _length(x: Array, y: Array, z: Array) -> Array:
+    return jnp.sqrt(x * x + y * y + z * z)
+
+
+@dataclasses.dataclass(frozen=True)
+class QuadrotorSetpoints:
+    """A plan at K equally spaced times; world frame, z up; body x forward, z along the thrust.
+
+    Of a batch every array but `time` has a leading axis B, and is NaN past the end of each plan.
+    """
+
+    time: np.ndarray  # (K,) [s] since the plan began
+    pos: np.ndarray  # (K, 3) [m], of the propeller plane's centre
+    vel: np.ndarray  # (K, 3) [m/s]
+    acc: np.ndarray  # (K, 3) [m/s^2]
+    jerk: np.ndarray  # (K, 3) [m/s^3]
+    quat_wxyz: np.ndarray  # (K, 4), body to world, at zero heading of the Hopf fibration
+    body_rate: np.ndarray  # (K, 3) [rad/s], body frame
+    thrust: np.ndarray  # (K,) [m/s^2], per unit mass
+
+
+@struct.dataclass
+class QuadrotorPlan(Plan):
+    """A plan with the trajectory of a quadrotor's propeller plane."""
+
+    trajectory: PiecewisePolynomial  # up to the last contact
+    gravity: Array  # () [m/s^2], magnitude, for which it was planned
+    # From there on to rest, where it was asked for.
+    ending: PiecewisePolynomial | None = struct.field(default=None, kw_only=True)
+
+    @property
+    def whole(self) -> PiecewisePolynomial:
+        """The trajectory and the ending in one, of a plan or of a batch."""
+        return self.trajectory if self.ending is None else joined(self.trajectory, self.ending)
+
+    def sample(self, rate: float) -> QuadrotorSetpoints:
+        """Sample the plan, or the batch, at a rate [Hz] up to its end, `ending` included.
+
+        Raises:
+            ValueError: the rate is not positive.
+        """
+        path = jax.tree.map(np.asarray, self.whole)
+        ends = np.sum(path.durations, axis=-1)
+        return QuadrotorSetpoints(**sample_at_rate(rate, ends, (path, self.gravity), _setpoint_at))
+
+
+def _setpoint_at(leaves: tuple[PiecewisePolynomial, Array], time: Array) -> dict[str, Array]:
+    """Return one setpoint of a trajectory and the gravity it was planned for."""
+    return setpoint_at(*leaves, time)
+
+
+def setpoint_at(path: PiecewisePolynomial, gravity: Array, time: Array) -> dict[str, Array]:
+    """Return the fields of `QuadrotorSetpoints` but the time, at a time () [s] of a trajectory."""
+    pos, vel, acc, jerk = (evaluate(path, time, order) for order in range(4))
+    return {
+        "pos": pos,
+        "vel": vel,
+        "acc": acc,
+        "jerk": jerk,
+        "quat_wxyz": tilt_quaternion(body_z(acc, gravity)),
+        "body_rate": flat_attitude(acc, jerk, gravity)[1],
+        "thrust": jnp.sqrt(jnp.sum(net_thrust(acc, gravity) ** 2)),
+    }

@@ -14,8 +14,12 @@ imports JAX.
 """
 
 import dataclasses
+import difflib
+import math
 import os
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,8 +36,36 @@ from planner_jax.robot.quadrotor_model import (
     Tool,
     cross,
 )
-from planner_jax.robot.quantities import UNITS, QuantityError, has_unit, numbers_in, suggestion
 
+STANDARD_GRAVITY = "9.80665"  # [m/s^2], exact by definition
+
+_SQUARES = {
+    f"{mass} {length}^2": Fraction(of_mass) * Fraction(of_length) ** 2
+    for mass, of_mass in (("kg", "1"), ("g", "1e-3"))
+    for length, of_length in (("m", "1"), ("cm", "1e-2"), ("mm", "1e-3"))
+}
+_DEGREE = Fraction(math.pi) / 180
+# What can be measured, and its units in those of SI, that one first.
+UNITS: dict[str, dict[str, Fraction]] = {
+    name: {unit: Fraction(value) for unit, value in units.items()}
+    for name, units in {
+        "mass": {"kg": "1", "g": "1e-3"},
+        "inertia": _SQUARES,
+        "length": {"m": "1", "cm": "1e-2", "mm": "1e-3"},
+        "time": {"s": "1", "ms": "1e-3"},
+        "speed": {"m/s": "1", "cm/s": "1e-2", "km/h": "5/18"},
+        "acceleration": {"m/s^2": "1", "g": STANDARD_GRAVITY},
+        "force": {"N": "1", "mN": "1e-3", "gf": f"{Fraction(STANDARD_GRAVITY) / 1000}"},
+        "rate": {"rad/s": "1", "deg/s": _DEGREE},
+        "angle": {"rad": "1", "deg": _DEGREE},
+        "share": {"": "1", "%": "1e-2"},
+    }.items()
+}
+_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?"
+_WRITTEN = re.compile(rf"\s*({_NUMBER}(?:(?:\s*,\s*|\s+){_NUMBER})*)\s*(\D.*?)?\s*", re.ASCII)
+_LONGEST = 200  # characters
+
+Value = Any  # of a field: text, a number, a list of these, fields of a part, or None
 ENDINGS = (".yaml", ".yml", ".xml")
 _LARGEST = 1 << 20  # bytes of a file
 _PARTS: dict[str, type] = {"rotors": Rotors, "tool": Tool, "limits": FlightLimits}
@@ -89,8 +121,8 @@ _FIELDS: dict[str, dict[str, _Quantity | None]] = {
 }
 
 
-def read_robot(path: str | os.PathLike, **given: Any) -> QuadrotorModel:
-    """The quadrotor of a file.
+def read_robot(path: str | os.PathLike, **given: Value) -> QuadrotorModel:
+    """Return the quadrotor of a file.
 
     Args:
         path: of YAML (.yaml, .yml), or of MJCF (.xml) for MuJoCo, which is read with the extra
@@ -113,8 +145,8 @@ def read_robot(path: str | os.PathLike, **given: Any) -> QuadrotorModel:
     return model_of({"name": Path(place).stem, **described}, place)
 
 
-def model_of(described: Mapping[str, Any], place: str = "robot") -> QuadrotorModel:
-    """The quadrotor of a description with the fields of a YAML file.
+def model_of(described: Mapping[str, Value], place: str = "robot") -> QuadrotorModel:
+    """Return the quadrotor of a description with the fields of a YAML file.
 
     `dataclasses.asdict` of a model is such a description as well.
 
@@ -126,7 +158,7 @@ def model_of(described: Mapping[str, Any], place: str = "robot") -> QuadrotorMod
         RobotError: a field breaks a rule, is not known or is missing; one line.
     """
     _only(described, [*_FIELDS[""], *_PARTS], "", place)
-    parts: dict[str, Any] = {}
+    parts: dict[str, Value] = {}
     for part in _PARTS:
         value = described.get(part)
         if value is None:
@@ -153,9 +185,9 @@ def model_of(described: Mapping[str, Any], place: str = "robot") -> QuadrotorMod
 
 
 def as_yaml(model: QuadrotorModel) -> str:
-    """The YAML file of a quadrotor; `read_robot` makes the same one of it, to the last digit."""
-    plain: dict[str, Any] = dataclasses.asdict(model)
-    shown: dict[str, Any] = {"name": plain["name"]}
+    """Return a quadrotor as YAML; `read_robot` restores it to the last digit."""
+    plain: dict[str, Value] = dataclasses.asdict(model)
+    shown: dict[str, Value] = {"name": plain["name"]}
     if model.source:
         shown["source"] = plain["source"]
     shown |= {name: _text(plain[name], _FIELDS[""][name]) for name in ("mass", "inertia")}
@@ -170,8 +202,8 @@ def as_yaml(model: QuadrotorModel) -> str:
     return yaml.safe_dump(shown, sort_keys=False, allow_unicode=True, width=100)
 
 
-def _text(value: Any, quantity: _Quantity | None) -> Any:
-    """A value with its SI unit."""
+def _text(value: Value, quantity: _Quantity | None) -> Value:
+    """Return a value with its SI unit."""
     if quantity is None or value is None or quantity.kind == "share":
         return value
     unit = next(iter(UNITS[quantity.kind]))
@@ -182,8 +214,8 @@ def _text(value: Any, quantity: _Quantity | None) -> Any:
     return f"{between.join(repr(float(number)) for number in numbers)} {unit}"
 
 
-def _described(path: Path) -> dict[str, Any]:
-    """The description in a file, without what keyword arguments say."""
+def _described(path: Path) -> dict[str, Value]:
+    """Return the description in a file, without what keyword arguments say."""
     if path.suffix.lower() not in ENDINGS:
         raise RobotError(f"path must end in {', '.join(ENDINGS)}, got {str(path)!r}")
     with open_plain(path) as file:
@@ -211,7 +243,7 @@ def _described(path: Path) -> dict[str, Any]:
     return _merged(_described(path.parent / model), found)
 
 
-def _require_units(described: Mapping[str, Any], place: str) -> None:
+def _require_units(described: Mapping[str, Value], place: str) -> None:
     """Raise `RobotError` where numbers stand alone that have to be written with their unit."""
     for name, quantity in _FIELDS[""].items():
         if quantity is None or not quantity.example or name not in described:
@@ -222,8 +254,8 @@ def _require_units(described: Mapping[str, Any], place: str) -> None:
             raise RobotError(f"{place}: {name} {rule}, got {value!r:.60}")
 
 
-def _merged(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields of two descriptions; those of the second go before, field by field of a part."""
+def _merged(under: Mapping[str, Value], over: Mapping[str, Value]) -> dict[str, Value]:
+    """Merge two descriptions field by field; the second one overrides the first."""
     found = dict(under)
     for name, value in over.items():
         old = found.get(name)
@@ -239,13 +271,13 @@ def _merged(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]
 class _Loader(yaml.SafeLoader):
     """YAML in which no field is said twice and nothing refers to something else."""
 
-    def compose_node(self, parent: Any, index: Any) -> Any:
+    def compose_node(self, parent: yaml.Node | None, index: Value) -> yaml.Node | None:
         """Refuse references, by which a short text can become endless."""
         if self.check_event(yaml.AliasEvent):
             raise yaml.MarkedYAMLError(None, None, "no *reference", self.peek_event().start_mark)
         return super().compose_node(parent, index)
 
-    def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> Value:
         """Refuse a field that stands there twice."""
         names = [key.value for key, _ in node.value]
         for key, _ in node.value:
@@ -255,7 +287,7 @@ class _Loader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-def _only(given: Mapping[str, Any], known: list[str], prefix: str, place: str) -> None:
+def _only(given: Mapping[str, Value], known: list[str], prefix: str, place: str) -> None:
     """Raise `RobotError` for a field that is not known."""
     for name in given:
         if name not in known:
@@ -264,11 +296,11 @@ def _only(given: Mapping[str, Any], known: list[str], prefix: str, place: str) -
             raise RobotError(f"{place}: {prefix}field {rule}, got {str(name)!r:.60}{hint}")
 
 
-def _values(given: Mapping[str, Any], part: str, place: str) -> dict[str, Any]:
-    """The fields of a part in SI units."""
+def _values(given: Mapping[str, Value], part: str, place: str) -> dict[str, Value]:
+    """Return the fields of a part in SI units."""
     fields, prefix = _FIELDS[part], f"{part}." if part else ""
     _only(given, list(fields), f"{part} " if part else "", place)
-    found: dict[str, Any] = {}
+    found: dict[str, Value] = {}
     for name, value in given.items():
         quantity = fields[name]
         if quantity is None:
@@ -282,7 +314,7 @@ def _values(given: Mapping[str, Any], part: str, place: str) -> dict[str, Any]:
     return found
 
 
-def _number(value: Any, quantity: _Quantity, name: str) -> Any:
+def _number(value: Value, quantity: _Quantity, name: str) -> Value:
     if quantity.count == 8 and isinstance(value, list | tuple):  # four pairs
         value = [
             each for pair in value for each in (pair if isinstance(pair, list | tuple) else [pair])
@@ -296,8 +328,8 @@ def _number(value: Any, quantity: _Quantity, name: str) -> Any:
     return numbers[0] if quantity.count == 1 else numbers
 
 
-def _with_places(rotors: dict[str, Any], place: str) -> dict[str, Any]:
-    """Rotors whose places are said, by themselves or by their diagonal."""
+def _with_places(rotors: dict[str, Value], place: str) -> dict[str, Value]:
+    """Return rotors whose places are said, by themselves or by their diagonal."""
     if "diagonal" not in rotors:
         return rotors
     if "places" in rotors:
@@ -306,9 +338,81 @@ def _with_places(rotors: dict[str, Any], place: str) -> dict[str, Any]:
     return {"places": cross(diagonal), **rotors}
 
 
-def _require_all(kind: type, given: Mapping[str, Any], prefix: str, place: str) -> None:
+def _require_all(kind: type, given: Mapping[str, Value], prefix: str, place: str) -> None:
     """Raise `RobotError` unless all fields are given that have no usual value."""
     for field in dataclasses.fields(kind):
         if field.default is dataclasses.MISSING and field.name not in given:
             name = "places or diagonal" if field.name == "places" else field.name
             raise RobotError(f"{place}: {prefix}{name} must be given, got nothing")
+
+
+class QuantityError(PlannerJaxError, ValueError):
+    """A value is not the quantity that is asked for; what it has to be, in one line."""
+
+
+def numbers_in(value: Value, kind: str, count: int, *, span: bool = False) -> tuple[float, ...]:
+    """Return numbers in SI units.
+
+    Args:
+        value: text such as "3 3 5 g m^2", whose unit is that of all its numbers; a number or a
+            list of numbers in SI units; or a list of texts.
+        kind: a key of `UNITS`.
+        count: of the numbers.
+        span: whether "to" stands between two numbers.
+
+    Raises:
+        QuantityError: another unit, another count, or no numbers.
+    """
+    parts = value if isinstance(value, list | tuple) else [value]
+    found = tuple(number for part in parts for number in _numbers(part, kind, span))
+    if len(found) != count:
+        what = "a number" if count == 1 else f"{count} numbers"
+        raise QuantityError(f"must be {what} in {_units(kind)}, got {_shown(value)}")
+    return found
+
+
+def has_unit(value: Value) -> bool:
+    """Return whether every number of a value as `numbers_in` takes it has a unit, known or not."""
+    if isinstance(value, list | tuple):
+        return all(map(has_unit, value))
+    if isinstance(value, str):
+        written = _WRITTEN.fullmatch(value)
+        return written is None or bool(written[2])
+    return not isinstance(value, int | float)
+
+
+def _numbers(part: Value, kind: str, span: bool) -> list[float]:
+    rule = f"must be in {_units(kind)}"
+    if isinstance(part, int | float) and not isinstance(part, bool):
+        if not math.isfinite(part):
+            raise QuantityError(f"must be finite, got {part}")
+        return [float(part)]
+    if not isinstance(part, str) or len(part) > _LONGEST:
+        raise QuantityError(f"{rule}, got {_shown(part)}")
+    written = _WRITTEN.fullmatch(part.replace(" to ", " ") if span else part)
+    if written is None:
+        raise QuantityError(f"{rule}, got {_shown(part)}")
+    unit = " ".join((written[2] or "").replace("*", " ").split())
+    known = UNITS[kind]
+    if unit and unit not in known:
+        raise QuantityError(f"{rule}, got {_shown(part)}{suggestion(unit, known)}")
+    factor = known[unit] if unit else Fraction(1)
+    try:  # exact until the end, so that 33 g are 0.033 kg to the last digit
+        return [float(Fraction(number) * factor) for number in re.findall(_NUMBER, written[1])]
+    except OverflowError:
+        raise QuantityError(f"must be finite, got {_shown(part)}") from None
+
+
+def suggestion(given: str, known: Iterable[str] | Mapping[str, Value]) -> str:
+    """Return a suggestion as the end of a message; empty if no known name is similar."""
+    near = difflib.get_close_matches(given, [name for name in known if name], n=1, cutoff=0.5)
+    return f"; did you mean {near[0]}?" if near else ""
+
+
+def _units(kind: str) -> str:
+    return ", ".join(unit or "no unit" for unit in UNITS[kind])
+
+
+def _shown(value: Value) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

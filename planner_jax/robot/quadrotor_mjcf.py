@@ -1,18 +1,20 @@
 """Body and rotors of a quadrotor from MuJoCo's model format, MJCF, as MuJoCo compiles it."""
 
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 
 from planner_jax.core.errors import MissingExtra
-from planner_jax.robot.quadrotor_file import RobotError
+from planner_jax.robot.quadrotor_file import RobotError, Value
 
+_Mj = Any  # a structure of MuJoCo, whose package has no types
 _SKEW = 0.02  # of the greatest moment of inertia, what may lie off the body's axes
 
 
-def described_by(path: Path) -> dict[str, Any]:
-    """What MJCF says of a quadrotor, in the fields of a YAML file, in SI units.
+def described_by(path: Path) -> dict[str, Value]:
+    """Return the quadrotor of an MJCF file, in the fields of a YAML file, in SI units.
 
     Mass and inertia are those of all that hangs on the one free joint, about its centre of mass. A
     rotor is an actuator on a site whose `gear` pushes along z and turns about it; its thrusts are
@@ -57,8 +59,10 @@ def described_by(path: Path) -> dict[str, Any]:
     return {"mass": mass, "inertia": np.diag(inertia).tolist(), "rotors": _rotors(path, rotors)}
 
 
-def _body(model: Any, data: Any, root: int, turn: np.ndarray) -> tuple[float, Any, np.ndarray]:
-    """Mass [kg], centre of mass (3,) [m] and inertia (3, 3) [kg m^2] along axes, of a tree."""
+def _body(
+    model: _Mj, data: _Mj, root: int, turn: np.ndarray
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Return mass [kg], its centre (3,) [m] and inertia (3, 3) [kg m^2] of a tree of bodies."""
     mass, centre = float(model.body_subtreemass[root]), data.subtree_com[root]
     total = np.zeros((3, 3))
     for body in range(root, model.nbody):
@@ -71,9 +75,15 @@ def _body(model: Any, data: Any, root: int, turn: np.ndarray) -> tuple[float, An
 
 
 def _rotor(
-    path: Path, mujoco: Any, model: Any, data: Any, k: int, centre: Any, turn: np.ndarray
-) -> dict[str, Any]:
-    """Place (2,) [m], thrusts (2,) [N], torque over thrust [m] and lag [s] of an actuator."""
+    path: Path,
+    mujoco: ModuleType,
+    model: _Mj,
+    data: _Mj,
+    k: int,
+    centre: np.ndarray,
+    turn: np.ndarray,
+) -> dict[str, Value]:
+    """Return position (2,) [m], thrusts (2,) [N], torque ratio [m] and lag [s] of an actuator."""
     name = model.actuator(k).name or k
     site = int(model.actuator_trnid[k, 0])
     frame = turn.T @ data.site_xmat[site].reshape(3, 3)
@@ -92,8 +102,8 @@ def _rotor(
     return {"place": place, "force": force, "ratio": spin[2] / push[2], "lag": lag}
 
 
-def _rotors(path: Path, found: list[dict[str, Any]]) -> dict[str, Any]:
-    """The rotors counter-clockwise, the first of those that turn the body to the left."""
+def _rotors(path: Path, found: list[dict[str, Value]]) -> dict[str, Value]:
+    """Return the rotors counter-clockwise, the first of those that turn the body to the left."""
     found = sorted(found, key=lambda rotor: np.arctan2(rotor["place"][1], rotor["place"][0]) % 6.28)
     if found[0]["ratio"] < 0.0:
         found = [*found[1:], found[0]]

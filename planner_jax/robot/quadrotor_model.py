@@ -6,6 +6,7 @@ the propellers. SI units. Nothing here imports JAX.
 
 import dataclasses
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -29,10 +30,10 @@ class Tool:
     def __post_init__(self) -> None:
         if self.kind not in (NET, RACKET):
             raise ArgumentError("tool.kind", f"{NET} or {RACKET}", self.kind)
-        _require("tool.radius", self.radius, above=0.0)
-        _require("tool.height", self.height)
-        _require("tool.restitution", self.restitution, least=0.0, most=1.0)
-        _require("tool.max_angle", self.max_angle, least=0.0, most=math.pi)
+        _require_positive("tool.radius", self.radius)
+        _require("tool.height", self.height, "finite", lambda x: True)
+        _require("tool.restitution", self.restitution, "in [0, 1]", lambda x: 0.0 <= x <= 1.0)
+        _require("tool.max_angle", self.max_angle, "in [0, 3.14159]", lambda x: 0.0 <= x <= math.pi)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,10 +52,12 @@ class Rotors:
             raise ArgumentError("rotors.places", "4 of 2 numbers", self.places)
         if not np.isfinite(self.places).all():
             raise ArgumentError("rotors.places", "finite", self.places)
-        _require("rotors.min_thrust", self.min_thrust, least=0.0)
-        _require("rotors.max_thrust", self.max_thrust, above=self.min_thrust)
-        for name in ("torque_ratio", "lag", "radius"):
-            _require(f"rotors.{name}", getattr(self, name), above=0.0)
+        _require_not_negative("rotors.min_thrust", self.min_thrust)
+        least = self.min_thrust
+        _require("rotors.max_thrust", self.max_thrust, f"> {least:g}", lambda x: x > least)
+        _require_positive("rotors.torque_ratio", self.torque_ratio)
+        _require_positive("rotors.lag", self.lag)
+        _require_positive("rotors.radius", self.radius)
         if abs(np.linalg.det(self.allocation)) < 1e-12:
             raise ArgumentError("rotors.places", "them turn the body", self.places, verb="let")
 
@@ -86,7 +89,7 @@ class Rotors:
 
 
 def cross(diagonal: float) -> tuple[tuple[float, float], ...]:
-    """Places of four rotors at 45, 135, 225 and 315 degrees, by the distance of opposite ones."""
+    """Return positions of four rotors at 45, 135, 225 and 315 degrees on a circle's diagonal."""
     half = 0.5 * diagonal * math.sqrt(0.5)
     return ((half, half), (-half, half), (-half, -half), (half, -half))
 
@@ -105,17 +108,17 @@ class FlightLimits:
     rotor_share: float | None = 0.9
 
     def __post_init__(self) -> None:
-        _require("limits.speed", self.speed, above=0.0)
-        _require("limits.body_rate", self.body_rate, above=0.0)
-        _require("limits.min_height", self.min_height, least=0.0)
+        _require_positive("limits.speed", self.speed)
+        _require_positive("limits.body_rate", self.body_rate)
+        _require_not_negative("limits.min_height", self.min_height)
         if self.acceleration is not None:
-            _require("limits.acceleration", self.acceleration, above=0.0)
+            _require_positive("limits.acceleration", self.acceleration)
         if self.thrust is not None:
             least, most = self.thrust
-            _require("limits.thrust, the least,", least, least=0.0)
-            _require("limits.thrust, the greatest,", most, above=least)
+            _require_not_negative("limits.thrust, the least,", least)
+            _require("limits.thrust, the greatest,", most, f"> {least:g}", lambda x: x > least)
         if self.rotor_share is not None:
-            _require("limits.rotor_share", self.rotor_share, above=0.0, most=1.0)
+            _require("limits.rotor_share", self.rotor_share, "in (0, 1]", lambda x: 0.0 < x <= 1.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,11 +138,11 @@ class QuadrotorModel:
     source: str = ""  # of the figures
 
     def __post_init__(self) -> None:
-        _require("mass", self.mass, above=0.0)
+        _require_positive("mass", self.mass)
         if np.shape(self.inertia) != (3,):
             raise ArgumentError("inertia", "3 numbers", self.inertia)
         for axis in self.inertia:
-            _require("inertia", axis, above=0.0)
+            _require_positive("inertia", axis)
         if not 2.0 * max(self.inertia) <= sum(self.inertia) * (1.0 + 1e-9):
             raise ArgumentError(
                 "inertia", "of a body, none above the other two together", self.inertia
@@ -180,27 +183,19 @@ class QuadrotorModel:
         return least + spare, most - spare
 
 
-def _require(
-    name: str,
-    value: float,
-    *,
-    above: float = -math.inf,
-    least: float = -math.inf,
-    most: float = math.inf,
-) -> None:
-    """Raise `ValueError` unless a number is finite and within bounds."""
+def _require(name: str, value: object, rule: str, holds: Callable[[float], bool]) -> None:
+    """Raise `ValueError` unless a value is a finite number that keeps a rule."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.number):
         raise ArgumentError(name, "a number", value)
-    if math.isfinite(value) and value > above and least <= value <= most:
-        return
-    if above > -math.inf and most < math.inf:
-        rule = f"in ({above:g}, {most:g}]"
-    elif above > -math.inf:
-        rule = f"> {above:g}"
-    elif most < math.inf:
-        rule = f"in [{least:g}, {most:g}]"
-    elif least > -math.inf:
-        rule = f">= {least:g}"
-    else:
-        rule = "finite"
-    raise ArgumentError(name, rule, value)
+    if not (math.isfinite(value) and holds(float(value))):
+        raise ArgumentError(name, rule, value)
+
+
+def _require_positive(name: str, value: object) -> None:
+    """Raise `ValueError` unless a value is a number > 0."""
+    _require(name, value, "> 0", lambda x: x > 0.0)
+
+
+def _require_not_negative(name: str, value: object) -> None:
+    """Raise `ValueError` unless a value is a number >= 0."""
+    _require(name, value, ">= 0", lambda x: x >= 0.0)

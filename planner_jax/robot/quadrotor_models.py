@@ -6,10 +6,9 @@ what the rotors can do; so are the shares of the rotors' thrusts that plans use.
 """
 
 import dataclasses
-from typing import Any
 
 from planner_jax.core.errors import UnknownName
-from planner_jax.robot.quadrotor_file import ENDINGS, read_robot
+from planner_jax.robot.quadrotor_file import ENDINGS, read_robot, suggestion
 from planner_jax.robot.quadrotor_model import (
     GRAVITY,
     NET,
@@ -20,7 +19,6 @@ from planner_jax.robot.quadrotor_model import (
     Tool,
     cross,
 )
-from planner_jax.robot.quantities import suggestion
 
 # Paper 000: l and radius of the net (Fig. 6). It gives no limits; these are the shared protocol's.
 # The papers give neither mass, inertia nor rotors. Those here are assumptions: 0.9 kg of computer,
@@ -117,7 +115,7 @@ MODELS = {
 
 
 def ready_robot(name: str) -> QuadrotorModel:
-    """The ready quadrotor of a name.
+    """Return the ready quadrotor of a name.
 
     There are `paper-catcher`, `paper-hitter`, `crazyflie`, `racer`, `racer-net`, `x500` and
     `x500-net`; `planner-jax robots` shows their figures.
@@ -132,7 +130,7 @@ def ready_robot(name: str) -> QuadrotorModel:
 
 
 def robot_named(word: str) -> QuadrotorModel:
-    """The ready quadrotor of a name, or that of a file.
+    """Return the ready quadrotor of a name, or that of a file.
 
     Raises:
         UnknownName: there is neither a ready one nor such a file; one line.
@@ -149,9 +147,9 @@ def robot_named(word: str) -> QuadrotorModel:
 
 
 def listing() -> str:
-    """The ready quadrotors with their main figures, a line each under a heading."""
+    """Return the ready quadrotors with their main figures, a line each under a heading."""
     rows = [_figures(model) for model in MODELS.values()]
-    table = [list(rows[0]), *([str(cell) for cell in row.values()] for row in rows)]
+    table = [list(rows[0]), *(list(row.values()) for row in rows)]
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     lines = (
         "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
@@ -160,7 +158,7 @@ def listing() -> str:
     return "\n".join(lines) + "\n"
 
 
-def _figures(model: QuadrotorModel) -> dict[str, Any]:
+def _figures(model: QuadrotorModel) -> dict[str, str]:
     rotors, limits = model.rotors, model.limits
     places = rotors.positions[:, :2]
     across = max(float(((a - b) ** 2).sum()) for a in places for b in places) ** 0.5

@@ -8,9 +8,9 @@ from jaxtyping import PyTree
 
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import Plan, Status, lane
-from planner_jax.robot.arm_plan import ArmPlan
+from planner_jax.robot.arm import ArmPlan
 from planner_jax.robot.car import CarPlan
-from planner_jax.robot.quadrotor_plan import QuadrotorPlan
+from planner_jax.robot.quadrotor import QuadrotorPlan
 from planner_jax.runs.manifest import Entries, Row
 from planner_jax.runs.run_folder import RunFolder
 from planner_jax.runs.settings import settings_of_manifest

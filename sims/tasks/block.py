@@ -94,13 +94,13 @@ class BlockFlight(FlightTask):
     )
 
     def world(self) -> World:
-        """The arm, and what stands around it."""
+        """Return the arm, and what stands around it."""
         return dataclasses.replace(
             BLOCK_WORLD, scenery=scenery(BLOCK_ARM.arm, SUITES[self.suite].has_pole)
         )
 
     def parameters(self) -> dict[str, Any]:
-        """Drives, encoders and control."""
+        """Return drives, encoders and control."""
         robot = BLOCK_ARM
         return {
             "drives": dataclasses.asdict(self.settings.drives),
@@ -110,7 +110,7 @@ class BlockFlight(FlightTask):
         }
 
     def cases(self) -> Throws:
-        """All throws of the run."""
+        """Return all throws of the run."""
         settings = self.settings
         return throws(
             settings.suite,
@@ -122,7 +122,7 @@ class BlockFlight(FlightTask):
         )
 
     def fly(self, cases: Throws, record: bool) -> BlockFlights:
-        """Blocks of some balls; they are recorded in any case."""
+        """Return blocks of some balls; they are recorded in any case."""
         settings, planner = self.settings, block_planner(self.settings.planner)
         decided, seconds = None, 0.0
         if settings.perception:
@@ -151,7 +151,7 @@ class BlockFlight(FlightTask):
     def recording(
         self, cases: Throws, flights: BlockFlights, lanes: Sequence[int] | np.ndarray
     ) -> Recording:
-        """The recording of some of the flights; see `FlightTask`."""
+        """Return the recording of some of the flights; see `FlightTask`."""
         lanes = np.asarray(lanes)
         some, flown, robot = cases[lanes], flights.flown, BLOCK_ARM
         kept = np.arange(0, flown.times.size, _KEPT)
@@ -204,7 +204,7 @@ class BlockFlight(FlightTask):
         )
 
     def counts(self, rows: Any) -> dict[str, Any]:
-        """Plans, contacts, misses, torques and times."""
+        """Return plans, contacts, misses, torques and times."""
         planned, miss = np.asarray(rows["planned"]), np.asarray(rows["miss"])
         blocked = np.asarray(rows["blocked"])
         late = np.asarray(rows["time_plan"]) > self.settings.until_set
@@ -234,7 +234,7 @@ class BlockFlight(FlightTask):
         }
 
     def findings(self, summary: Mapping[str, Any]) -> list[str]:
-        """Plans and blocks; contacts; torques."""
+        """Return plans and blocks; contacts; torques."""
         number = summary["num"]
         planned, blocked, touched, after, late = (
             percent(summary[name], number)
@@ -266,11 +266,11 @@ class BlockFlight(FlightTask):
         return lines
 
     def tables(self, rows: Any) -> Sequence[RateTable]:
-        """Where the time of flight goes, and what the joints did."""
+        """Return where the time of flight goes, and what the joints did."""
         return [budget_table(rows), joint_table(rows)]
 
     def draw(self, folder: Path, rows: Any) -> Sequence[str]:
-        """The time budget of the first balls."""
+        """Return the time budget of the first balls."""
         draw(folder / "budget.png", budget_figure, (8.0, 5.0), rows)
         return ["budget.png"]
 
@@ -280,7 +280,7 @@ def _part(batch: Any, name: str) -> np.ndarray:
 
 
 def _balls(cases: BlockCase, flights: BlockFlights, lanes: np.ndarray) -> np.ndarray:
-    """Places (F, S, 3) [m] of balls as they are drawn: on their way, and off the shield."""
+    """Return places (F, S, 3) [m] of balls as they are drawn: on their way, and off the shield."""
     case, flown = referee_leaves(cases), flights.flown
     times, met = flown.times, flights.contact[lanes]
     free = np.moveaxis(ball_places(case, times), 0, 2)

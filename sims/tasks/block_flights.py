@@ -112,13 +112,13 @@ def throws(
     wide: bool = False,
     delay: float = 0.0,
 ) -> Throws:
-    """Throws of a suite; see `pj.block.draw`."""
+    """Return throws of a suite; see `pj.block.draw`."""
     cases = draw_throws(num, suite, seed, regime=regime, wide=wide, delay=delay)
     return Throws(index=np.arange(num), cases=jax.tree.map(np.asarray, cases))
 
 
 def courses_of(cases: BlockCase, plans: BlockPlan) -> Course:
-    """What arms follow: their plans from the delay on; without a plan they stay where they are.
+    """Return the courses of arms: their plans from the delay on; without a plan, a standstill.
 
     Joints brake as hard as plans may speed them up.
     """
@@ -222,26 +222,26 @@ def require_arm(world: World, cases: BlockCase) -> None:
 
 
 def referee_leaves(cases: BlockCase) -> dict[str, np.ndarray]:
-    """All leaves of cases (B, ...) in float64 by their dotted names, as the referee has them."""
+    """Return all leaves of cases (B, ...) in float64 by dotted names, as in the referee."""
     return {name: np.asarray(leaf, float) for name, leaf in named_leaves(cases).items()}
 
 
 def entry_times(cases: BlockCase) -> np.ndarray:
-    """When balls get into the inner box, (B,) [s]; infinite if never."""
+    """Return when balls get into the inner box, (B,) [s]; infinite if never."""
     with np.errstate(invalid="ignore"):  # of balls that never rise so high
         begin, end = times_inside(referee_leaves(cases), "inner", 0.0)
     return np.where(end >= 0.0, np.maximum(begin, 0.0), np.inf).min(axis=0)
 
 
 def ball_places(case: dict[str, np.ndarray], times: np.ndarray) -> np.ndarray:
-    """Places (3, B, S) [m] of balls at times (S,) or (B, S) [s]."""
+    """Return places (3, B, S) [m] of balls at times (S,) or (B, S) [s]."""
     pos, vel = case["ball.pos"].T[..., None], case["ball.vel"].T[..., None]
     fall = np.multiply.outer(FALL, case["gravity"])[..., None]
     return pos + vel * times - 0.5 * fall * times**2
 
 
 def scored(cases: BlockCase, plans: BlockPlan, flown: Executed, budget: Budget) -> BlockFlights:
-    """What arms did, held against the balls and all that they must not touch, in float64.
+    """Compare flown motions with the balls and all obstacles, in float64.
 
     A ball is blocked when it comes down on the face of the shield, from in front and with its
     centre over the face, before its centre is in the inner box and before it touches the arm. Miss
@@ -307,7 +307,7 @@ def scored(cases: BlockCase, plans: BlockPlan, flown: Executed, budget: Budget) 
 def _strikes(
     case: dict[str, np.ndarray], links: Sequence[int], turns: list, places: list, ball: np.ndarray
 ) -> np.ndarray:
-    """Which balls touch the base or links 1 to 3 at which frame, (B, S) bool.
+    """Return which balls touch the base or links 1 to 3 at which frame, (B, S) bool.
 
     The capsules of the wrist behind the shield bulge out of its face, where the links do not.
     """
@@ -326,7 +326,7 @@ def _strikes(
 def _least(
     case: dict[str, np.ndarray], links: Sequence[int], angles: np.ndarray, looked: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Least clearance (B,) [m] of arms at the frames that are looked at, and what comes so near.
+    """Return the least clearance (B,) [m] of arms at frames, and the nearest obstacle.
 
     It is infinite where no frame is looked at.
     """

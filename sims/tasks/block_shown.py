@@ -24,20 +24,20 @@ BUDGET = {
 
 
 def _boxed(box: Box, colour: str, opacity: float) -> Part:
-    """A box of the scene as it is drawn, in the world."""
+    """Return a box of the scene as it is drawn, in the world."""
     lower, upper = np.asarray(box.lower, float), np.asarray(box.upper, float)
     (x, y, z), (length, width, height) = 0.5 * (lower + upper), upper - lower
     return Part("box", (length, width, height), (x, y, z - FLOOR), colour, opacity=opacity)
 
 
 def _around(ends: np.ndarray, radius: float) -> np.ndarray:
-    """Corners (2, 3) [m] of the box around a beam along an axis, of two ends (2, 3)."""
+    """Return corners (2, 3) [m] of the box around a beam along an axis, of two ends (2, 3)."""
     across = radius * (ends[0] == ends[1])
     return np.stack([ends.min(axis=0) - across, ends.max(axis=0) + across])
 
 
 def scenery(arm: Arm, has_pole: bool) -> tuple[Part, ...]:
-    """Both boxes, the beams, what the arm stands on and the pole, as they are drawn."""
+    """Return both boxes, the beams, what the arm stands on and the pole, as they are drawn."""
     scene, (lower, upper) = paper_scene(), arm.base_box
     parts = [_boxed(scene.inner, GREEN, 0.1), _boxed(scene.outer, SKY, 0.07)]
     for ends, radius in zip(scene.beam_ends, scene.beam_radius, strict=True):
@@ -53,7 +53,7 @@ def scenery(arm: Arm, has_pole: bool) -> tuple[Part, ...]:
 
 
 def budget_table(rows: Any) -> RateTable:
-    """Where the time of flight goes: eq. (1) of paper 004, from the rows of a run."""
+    """Return where the time of flight goes: eq. (1) of paper 004, from the rows of a run."""
     planned = np.asarray(rows["planned"])
     parts = {name: 1e3 * np.asarray(rows[f"time_{name}"])[planned] for name in BUDGET}
     parts["flight, the sum"] = np.sum(list(parts.values()), axis=0)
@@ -67,7 +67,7 @@ def budget_table(rows: Any) -> RateTable:
 
 
 def joint_table(rows: Any) -> RateTable:
-    """Errors and torques of the joints of arms with a plan."""
+    """Return errors and torques of the joints of arms with a plan."""
     planned = np.asarray(rows["planned"])
 
     def of(name: str) -> np.ndarray:
@@ -95,7 +95,7 @@ def joint_table(rows: Any) -> RateTable:
 
 
 def budget_figure(figure: Any, rows: Any) -> None:
-    """A bar a ball, from when it is first seen until it gets into the inner box."""
+    """Return a bar a ball, from when it is first seen until it gets into the inner box."""
     axes = figure.add_subplot()
     number = min(len(rows), _BARS)
     flights = np.arange(number)

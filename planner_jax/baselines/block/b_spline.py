@@ -32,7 +32,7 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 
 def basis(degree: int, num: int, shares: ArrayLike) -> np.ndarray:
-    """The basis at shares (...) of the duration: times control points the curve, (..., num).
+    """Return the basis at shares (...) of the duration: times control points the curve, (..., num).
 
     Args:
         degree: k >= 0.
@@ -50,7 +50,7 @@ def basis(degree: int, num: int, shares: ArrayLike) -> np.ndarray:
 
 
 def hodograph(degree: int, order: int, num: int) -> np.ndarray:
-    """From the control points to those of a derivative by the share, (num - order, num).
+    """Return the matrix (num - order, num) from control points to those of a derivative by share.
 
     The derivative is a B-spline again, of a degree less by the order, over the same spans. A point
     of the first one is the difference of two neighbours, times the degree, over the share between
@@ -75,7 +75,7 @@ def hodograph(degree: int, order: int, num: int) -> np.ndarray:
 
 
 def b_spline(degree: int, points: ArrayLike, duration: ArrayLike) -> PiecewisePolynomial:
-    """The B-spline of some control points as a piecewise polynomial, a piece for each span.
+    """Return the B-spline of some control points as a piecewise polynomial, a piece for each span.
 
     Args:
         degree: k.
@@ -113,12 +113,12 @@ def _spans(degree: int, num: int) -> int:
 
 
 def _knots(degree: int, spans: int) -> np.ndarray:
-    """The knots (spans + 2 degree + 1,), in spans: whole numbers."""
+    """Return the knots (spans + 2 degree + 1,), in spans: whole numbers."""
     return np.clip(np.arange(spans + 2 * degree + 1) - degree, 0, spans)
 
 
 def _basis(degree: int, num: int, places: np.ndarray) -> np.ndarray:
-    """The basis (..., num) at places (...) in spans, from 0 to their number."""
+    """Return the basis (..., num) at places (...) in spans, from 0 to their number."""
     spans = num - degree
     knots = _knots(degree, spans)
     span = np.minimum(np.floor(places), spans - 1)  # the last one holds its end too

@@ -63,7 +63,7 @@ class DirectBlock(Planner):
         require_settings(self)
 
     def solve(self, case: BlockCase, attempt: Attempt) -> BlockPlan:
-        """The plan of one case."""
+        """Return the plan of one case."""
         poses, times = poses_in_time(case, self.points)
         order = jnp.argsort(times)
         num = jnp.minimum(jnp.sum(jnp.isfinite(times)), self.tries)
@@ -76,7 +76,7 @@ class DirectBlock(Planner):
         return dataclasses.replace(best, status=explain_status(case, poses, best.status))
 
     def plan_to(self, case: BlockCase, goal: Array, contact: Array, duration: Array) -> BlockPlan:
-        """The plan to one end pose.
+        """Return the plan to one end pose.
 
         Args:
             case: one case.

@@ -2,12 +2,12 @@
 
 The steps are those of the code behind the paper: 7 degrees of joints 1 to 4 and 4 degrees of each
 joint, either way, and straight to the goal, which is tried first. States within a cell of 0.05 rad
-are taken for one. The heuristic is the distance to the goal in the space of the joints, the cost
-the length of the way there.
+count as one state. The heuristic is the distance to the goal in the space of the joints, the cost
+the length of the path there.
 
-ePA*SE (Mukherjee, Aine and Likhachev 2022) looks at edges in parallel, on 64 cores in the paper;
-without its threads it is this search. Here all edges of a state are looked at in one batch, by one
-thread. Where the paper's code stops within 0.1 rad of the goal, a way here ends at the goal.
+ePA*SE (Mukherjee, Aine and Likhachev 2022) evaluates edges in parallel, on 64 cores in the paper;
+without its threads it is this search. Here all edges of a state are evaluated in one batch, by one
+thread. Where the paper's code stops within 0.1 rad of the goal, a path here ends at the goal.
 """
 
 import dataclasses
@@ -30,31 +30,65 @@ STEPS = np.concatenate(
 )
 
 
-@dataclasses.dataclass(frozen=True)
-class Node:
-    """A state that the search has come to."""
+@dataclasses.dataclass
+class State:
+    """A state that a search has reached."""
 
     angles: np.ndarray  # (6,) [rad]
-    cost: float  # [rad], of the way there
-    parent: "Node | None"
+    length: float  # [rad], of the path there
+    parent: "State | None" = None
+    spline: np.ndarray | None = None  # (S, 6) [rad], samples from the start, where there is one
 
-    def way(self) -> np.ndarray:
-        """States (N, 6) from the start to here."""
-        states, node = [], self
-        while node is not None:
-            states.append(node.angles)
-            node = node.parent
-        return np.stack(states[::-1])
+    def path(self) -> list["State"]:
+        """Return the states from this one back to the start."""
+        return [self, *(self.parent.path() if self.parent else ())]
 
 
-def cell_of(angles: np.ndarray) -> tuple[int, ...]:
-    """The cell of a state (6,)."""
+class OpenStates:
+    """The states that a search has not expanded, by length plus weighted distance to the goal."""
+
+    def __init__(self, start: State, goal: np.ndarray, weight: float) -> None:
+        self._goal, self._weight = goal, weight
+        self._number = itertools.count()  # equal states are expanded in the order of their pushes
+        self._states = [(0.0, next(self._number), start)]
+        self._lengths, self._closed = {_cell_of(start.angles): 0.0}, set()
+
+    def pop(self) -> State | None:
+        """Remove the most promising state of an open cell, close its cell, and return the state."""
+        while self._states:
+            state = heapq.heappop(self._states)[2]
+            if (cell := _cell_of(state.angles)) not in self._closed:
+                self._closed.add(cell)
+                return state
+        return None
+
+    def steps_from(self, state: State) -> list[State]:
+        """Return the states one step away in open cells, where no shorter path leads."""
+        there = state.angles + STEPS
+        lengths = state.length + np.linalg.norm(there - state.angles, axis=1)
+        return [
+            State(angles, length, state)
+            for angles, length in zip(there, lengths, strict=True)
+            if (cell := _cell_of(angles)) not in self._closed
+            and length < self._lengths.get(cell, np.inf)
+        ]
+
+    def push(self, state: State) -> None:
+        """Add a state."""
+        self._lengths[_cell_of(state.angles)] = state.length
+        ahead = np.linalg.norm(state.angles - self._goal)
+        entry = state.length + self._weight * ahead, next(self._number), state
+        heapq.heappush(self._states, entry)
+
+
+def _cell_of(angles: np.ndarray) -> tuple[int, ...]:
+    """Return the cell of angles (6,)."""
     return tuple(np.round(angles / CELL).astype(int).tolist())
 
 
 @dataclasses.dataclass(frozen=True)
 class EpaseBlock(WayThenTime):
-    """Tries end poses one after another; needs the extra `arm-peers`."""
+    """A planner that tries end poses one after another; it needs the extra `arm-peers`."""
 
     longest: float = 0.05  # [s]; past this few searches end, while other poses are easy
     weight: float = 10.0  # of the heuristic
@@ -62,34 +96,16 @@ class EpaseBlock(WayThenTime):
     def way_to(
         self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
     ) -> np.ndarray | None:
-        """Points of a way, or None."""
+        """Return points (N, 6) [rad] of a free path, or None."""
         end = np.asarray(goal.angles, float)
-        start = Node(np.asarray(case.angles, float), 0.0, None)
-        costs, closed = {cell_of(start.angles): 0.0}, set()
-        number = itertools.count()  # equal states are taken in turn
-        open_states = [(0.0, next(number), start)]
-        while open_states and left() > 0.0:
-            node = heapq.heappop(open_states)[2]
-            cell = cell_of(node.angles)
-            if cell in closed:
-                continue
-            closed.add(cell)
-            there = np.concatenate([end[None], node.angles + STEPS])
-            ahead = np.linalg.norm(there - end, axis=1)
-            cost = node.cost + np.linalg.norm(there - node.angles, axis=1)
-            cells = [cell_of(each) for each in there]
-            news = [
-                k
-                for k in range(1, len(there))
-                if cells[k] not in closed and cost[k] < costs.get(cells[k], np.inf)
-            ]
-            chosen = np.array([0, *news])
-            is_free = free.are_edges_free(node.angles, there[chosen])
-            if is_free[0]:
-                return Node(end, cost[0], node).way()
-            for k in chosen[is_free]:
-                costs[cells[k]] = cost[k]
-                child = Node(there[k], cost[k], node)
-                entry = cost[k] + self.weight * ahead[k], next(number), child
-                heapq.heappush(open_states, entry)
+        states = OpenStates(State(np.asarray(case.angles, float), 0.0), end, self.weight)
+        while left() > 0.0 and (state := states.pop()) is not None:
+            news = states.steps_from(state)
+            ends = np.stack([end, *(new.angles for new in news)])
+            is_goal_free, *are_free = free.are_edges_free(state.angles, ends)
+            if is_goal_free:
+                return np.stack([*(each.angles for each in state.path()[::-1]), end])
+            for new, is_free in zip(news, are_free, strict=True):
+                if is_free:
+                    states.push(new)
         return None

@@ -5,7 +5,7 @@ numbers, for each of which there is one compiled program.
 """
 
 import functools
-from typing import Any
+from collections.abc import Hashable
 
 import jax
 import numpy as np
@@ -24,13 +24,19 @@ _BATCHES = (1, 64, 256, 1024)  # angles of a program
 
 @jax.jit
 def _nearest(arm: Arm, scene: Scene, angles: Array) -> Array:
-    """Least distances (N,) [m] at angles (N, 6)."""
+    """Return least distances (N,) [m] at angles (N, 6)."""
     return least_clearances(arm, scene, angles)
 
 
 @functools.cache
-def _compile(tree: Any, layout: tuple, dtype: Any) -> None:
-    """Have all programs compiled, which must not count as time of a search."""
+def _compile(tree: Hashable, layout: tuple, dtype: np.dtype) -> None:
+    """Compile all programs, which must not count as time of a search.
+
+    Args:
+        tree: structure of (arm, scene).
+        layout: shape and type of each leaf.
+        dtype: of the angles.
+    """
     arm, scene = jax.tree.unflatten(tree, [np.zeros(*leaf) for leaf in layout])
     for size in _BATCHES:
         _nearest(arm, scene, np.zeros((size, 6), dtype))
@@ -49,7 +55,7 @@ class FreeSpace:
         _compile(tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves), self._dtype)
 
     def is_free(self, angles: np.ndarray) -> np.ndarray:
-        """Whether each of angles (N, 6) [rad] is, (N,) bool."""
+        """Return whether each of angles (N, 6) [rad] is, (N,) bool."""
         num, begin, gaps = len(angles), 0, []
         while begin < num:
             size = next((size for size in _BATCHES if size >= num - begin), _BATCHES[-1])
@@ -62,7 +68,7 @@ class FreeSpace:
         return is_within & (np.concatenate(gaps) >= self._margin)
 
     def are_edges_free(self, begins: np.ndarray, ends: np.ndarray) -> np.ndarray:
-        """Whether straight motions of the joints are, (N,) bool; the ends count, begins do not.
+        """Return which straight motions of the joints are free, (N,) bool; their ends count too.
 
         Args:
             begins: (N, 6) [rad], or (6,) of all.
@@ -85,7 +91,7 @@ class FreeSpace:
         return found
 
     def is_motion_free(self, coeffs: np.ndarray, durations: np.ndarray) -> bool:
-        """Whether a piecewise polynomial of the joints is, at samples no farther apart.
+        """Return whether a piecewise polynomial of the joints is, at samples no farther apart.
 
         Args:
             coeffs: (M, D + 1, 6), rising powers of the time [s] since the piece began.
@@ -98,7 +104,7 @@ class FreeSpace:
 
 
 def _sampled(coeffs: np.ndarray, durations: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Angles of every piece at both ends and between, so many steps each, one after another."""
+    """Return angles (N, 6) of all pieces, each at both ends and between in a number of steps."""
     piece = np.repeat(np.arange(len(counts)), counts + 1)
     number = np.arange(len(piece)) - np.repeat(np.cumsum(counts + 1) - counts - 1, counts + 1)
     time = (number / counts[piece] * durations[piece])[:, None]

@@ -25,9 +25,7 @@ many; compiled programs may use more.
 
 import dataclasses
 import functools
-import heapq
-import itertools
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -36,9 +34,10 @@ from flax import struct
 from jax import Array, lax
 
 from planner_jax.baselines.block.b_spline import b_spline, basis, hodograph
-from planner_jax.baselines.block.epase import STEPS, cell_of
+from planner_jax.baselines.block.epase import OpenStates, State
 from planner_jax.baselines.block.free_space import FreeSpace
 from planner_jax.baselines.block.pose_by_pose import Clock, Goal, HostMotion, PoseByPose
+from planner_jax.core.arithmetic import host_leaf
 from planner_jax.optimise import lbfgs
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.plan import BlockPlan
@@ -74,25 +73,6 @@ class Splines:
     angles: Array  # (A, K, S, 6) [rad], samples
 
 
-@dataclasses.dataclass
-class State:
-    """A state of the search; its spline is there once it is lifted."""
-
-    angles: np.ndarray  # (6,) [rad]
-    length: float  # [rad], of the way there
-    parent: "State | None" = None
-    way: np.ndarray | None = None  # (S, 6) [rad], samples of its spline from the start
-
-    def ways(self) -> list[np.ndarray]:
-        """Ways of the lifted states before this one, the nearest first and the start last."""
-        found, state = [], self.parent
-        while state is not None:
-            if state.way is not None:
-                found.append(state.way)
-            state = state.parent
-        return found
-
-
 @dataclasses.dataclass(frozen=True)
 class InsatBlock(PoseByPose):
     """Tries end poses one after another; motions end at rest only if the case asks for that."""
@@ -104,64 +84,48 @@ class InsatBlock(PoseByPose):
     solver: lbfgs.LbfgsConfig = lbfgs.LbfgsConfig(max_steps=12)
 
     def plan_of(self, case: BlockCase) -> BlockPlan:
-        """The plan of one case with NumPy leaves."""
+        """Return the plan of one case with NumPy leaves."""
         _compile(np.asarray(case.angles).dtype, self.solver)
         return super().plan_of(case)
 
     def motion_to(
         self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
     ) -> HostMotion | None:
-        """The first spline that is found; where it is to end in motion, the arm waits at first."""
+        """Return the motion along the first spline found; one that ends in motion waits first."""
         start = np.asarray(case.angles, float)
-        first = State(start, 0.0, way=start[None])
-        costs, closed, number = {cell_of(start): 0.0}, set(), itertools.count()
-        open_states = [(0.0, next(number), first)]
-        while open_states and left() > 0.0:
-            state = heapq.heappop(open_states)[2]
-            cell = cell_of(state.angles)
-            if cell in closed:
-                continue
-            closed.add(cell)
-            if state.way is None and not self.lift(case, free, goal, state):
+        first = State(start, 0.0, spline=start[None])
+        states = OpenStates(first, np.asarray(goal.angles, float), self.weight)
+        while left() > 0.0 and (state := states.pop()) is not None:
+            if state.spline is None and not self.lift(case, free, goal, state):
                 continue
             end = State(goal.angles, np.inf, state)
             found = self.best_spline(case, free, goal, end, bool(case.ends_at_rest))
             if found is not None:
                 return _motion(case, goal, *found[:2])
-            there = state.angles + STEPS
-            cost = state.length + np.linalg.norm(STEPS, axis=1)
-            cells = [cell_of(each) for each in there]
-            news = [
-                k
-                for k, cell in enumerate(cells)
-                if cell not in closed and cost[k] < costs.get(cell, np.inf)
-            ]
-            if not news:
-                continue
-            for k in np.array(news)[free.are_edges_free(state.angles, there[news])]:
-                costs[cells[k]] = cost[k]
-                ahead = np.linalg.norm(there[k] - goal.angles)
-                child = State(there[k], cost[k], state)
-                heapq.heappush(open_states, (cost[k] + self.weight * ahead, next(number), child))
+            news = states.steps_from(state)
+            ends = np.stack([new.angles for new in news]) if news else np.zeros((0, 6))
+            for k in np.flatnonzero(free.are_edges_free(state.angles, ends)) if news else ():
+                states.push(news[k])
         return None
 
     def lift(self, case: BlockCase, free: FreeSpace, goal: Goal, state: State) -> bool:
-        """Give a state its spline, if there is one."""
+        """Give a state its spline, and return whether there is one."""
         found = self.best_spline(case, free, goal, state, rests=False)
         if found is None:
             return False
-        _, _, state.length, state.way = found
+        _, _, state.length, state.spline = found
         return True
 
     def best_spline(
         self, case: BlockCase, free: FreeSpace, goal: Goal, state: State, rests: bool
     ) -> tuple[np.ndarray, float, float, np.ndarray] | None:
-        """The cheapest spline to a state from any of its ancestors that is free and in time.
+        """Return the cheapest spline to a state from an ancestor that is free and in time.
 
         Returns:
             Its control points (m, 6), duration, length and samples (S, 6), or None.
         """
-        before, dtype = state.ways(), case.angles.dtype
+        before = [each.spline for each in state.path()[1:] if each.spline is not None]
+        dtype = case.angles.dtype
         before = before[: ANCESTORS - 1] + before[ANCESTORS - 1 :][-1:]
         guesses = np.stack([_fitted(way, state.angles, rests) for way in before])
         filled = np.concatenate([guesses, np.repeat(guesses[:1], ANCESTORS - len(before), axis=0)])
@@ -172,7 +136,9 @@ class InsatBlock(PoseByPose):
                 state.angles.astype(dtype),
                 filled.astype(dtype),
                 rests,
-                _bounds(case),
+                Bounds(
+                    case.arm.lower, case.arm.upper, case.limits.velocity, case.limits.acceleration
+                ),
                 self.solver,
             ),
         )
@@ -195,27 +161,18 @@ class InsatBlock(PoseByPose):
         return None
 
 
-def _bounds(case: BlockCase) -> Bounds:
-    return Bounds(
-        lower=case.arm.lower,
-        upper=case.arm.upper,
-        velocity=case.limits.velocity,
-        acceleration=case.limits.acceleration,
-    )
-
-
 @functools.cache
-def _compile(dtype: Any, config: lbfgs.LbfgsConfig) -> None:
+def _compile(dtype: np.dtype, config: lbfgs.LbfgsConfig) -> None:
     """Have the programs compiled, which must not count as time of a search."""
-    joints = np.zeros(6, dtype)
-    guesses: Any = np.zeros((ANCESTORS, CONTROL_POINTS, 6), dtype)
-    bounds: Any = Bounds(joints, joints, joints + 1, joints + 1)  # type: ignore[arg-type]
-    _optimised(joints, joints, guesses, False, bounds, config)  # type: ignore[arg-type]
+    joints = host_leaf(np.zeros(6, dtype))
+    guesses = np.zeros((ANCESTORS, CONTROL_POINTS, 6), dtype)
+    bounds = Bounds(joints, joints, joints + 1, joints + 1)
+    _optimised(joints, joints, host_leaf(guesses), host_leaf(False), bounds, config)
     _pieces(guesses[0], 1.0)
 
 
 def _fitted(way: np.ndarray, end: np.ndarray, rests: bool) -> np.ndarray:
-    """Control points (m, 6) of a spline along a way (N, 6), and straight on to an end (6,)."""
+    """Fit control points (m, 6) to a path (N, 6) and the straight line on to an end (6,)."""
     straight = way[-1] + _SHARES[1:, None] * (end - way[-1])
     curve = np.concatenate([way, straight])
     lengths = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1)))
@@ -230,7 +187,7 @@ def _fitted(way: np.ndarray, end: np.ndarray, rests: bool) -> np.ndarray:
 
 @functools.cache
 def _fit(stop: int) -> tuple[np.ndarray, np.ndarray]:
-    """The basis (S, m), and least squares by its columns from 2 to `stop`."""
+    """Return the basis (S, m), and least squares by its columns from 2 to `stop`."""
     of_points = basis(DEGREE, CONTROL_POINTS, _SHARES)
     return of_points, np.linalg.pinv(of_points[:, 2:stop])
 
@@ -244,7 +201,7 @@ def _optimised(
     bounds: Bounds,
     config: lbfgs.LbfgsConfig,
 ) -> Splines:
-    """The iterates of splines, the first of which are guesses.
+    """Return the iterates of splines, the first of which are guesses.
 
     Args:
         start: (6,) [rad].
@@ -267,7 +224,7 @@ def _optimised(
         return jnp.concatenate([start[None], start[None], moved[:-1], before[None], end[None]])
 
     def shares_of(points: Array) -> Array:
-        """Squares of the durations that bounds ask for."""
+        """Return squares of the durations that bounds ask for."""
         rates = (product(first, points) / bounds.velocity) ** 2
         rises = jnp.abs(product(second, points)) / bounds.acceleration
         return jnp.maximum(jnp.concatenate([rates, rises]), LEAST_TIME**2)
@@ -307,13 +264,13 @@ _of_points = jax.jit(functools.partial(b_spline, DEGREE))
 
 
 def _pieces(points: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients (m - 3, 4, 6) and durations (m - 3,) of a spline."""
+    """Return coefficients (m - 3, 4, 6) and durations (m - 3,) of a spline."""
     spline = _of_points(points, time)
     return np.asarray(spline.coeffs, float), np.asarray(spline.durations, float)
 
 
 def _motion(case: BlockCase, goal: Goal, points: np.ndarray, time: float) -> HostMotion:
-    """The motion along a spline; one that does not end at rest begins as late as it may."""
+    """Return the motion along a spline; one that does not end at rest begins as late as it may."""
     coeffs, durations = _pieces(points, time)
     if not case.ends_at_rest:
         wait = np.zeros((1, DEGREE + 1, 6))

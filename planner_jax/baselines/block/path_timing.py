@@ -7,7 +7,6 @@ spline leads through the way's points, and the arm begins and ends at rest.
 
 import importlib
 from types import ModuleType
-from typing import Any
 
 import numpy as np
 
@@ -20,7 +19,7 @@ _SPARE = 2e-4  # share of the limits that is kept free
 
 
 def required(name: str) -> ModuleType:
-    """A module of the extra `arm-peers`.
+    """Return a module of the extra `arm-peers`.
 
     Raises:
         MissingExtra: its package is not installed.
@@ -37,7 +36,7 @@ def required(name: str) -> ModuleType:
 def timed_way(
     points: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """The quickest motion from rest to rest along a spline through points, or None.
+    """Return the quickest motion from rest to rest along a spline through points, or None.
 
     TOPP-RA keeps the limits at points of a grid; what exceeds them in between is slowed down with
     all the rest.
@@ -59,7 +58,7 @@ def timed_way(
     toppra.setup_logging("ERROR")
     lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
     knots = np.append(0.0, np.cumsum(lengths))
-    path: Any = toppra.SplineInterpolator(knots, points)
+    path = toppra.SplineInterpolator(knots, points)
     grid = _grid(knots)
     limits = [
         constraint.JointVelocityConstraint(velocity),
@@ -89,7 +88,7 @@ def timed_way(
 
 
 def _grid(knots: np.ndarray) -> np.ndarray:
-    """Places along a way, about equally far apart and the knots among them, `PIECES` + 1 at most.
+    """Return up to `PIECES` + 1 points along a path, about equally spaced, knots included.
 
     Each span between knots is cut into equal parts, in proportion to its length.
     """
@@ -100,7 +99,7 @@ def _grid(knots: np.ndarray) -> np.ndarray:
 
 
 def _composed(cubic: np.ndarray, speed: np.ndarray, rise: np.ndarray) -> np.ndarray:
-    """Coefficients (M, 7, 6) in time of cubics (M, 4, 6) in p = speed t + rise t^2."""
+    """Return coefficients (M, 7, 6) in time of cubics (M, 4, 6) in p = speed t + rise t^2."""
     none, one, two, three = np.moveaxis(cubic, 1, 0)
     return np.stack(
         [
@@ -119,7 +118,7 @@ def _composed(cubic: np.ndarray, speed: np.ndarray, rise: np.ndarray) -> np.ndar
 def _excess(
     coeffs: np.ndarray, durations: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
 ) -> float:
-    """How many times longer a motion has to take to keep its limits, >= 1."""
+    """Return how many times longer a motion has to take to keep its limits, >= 1."""
     powers = np.arange(coeffs.shape[1])
     times = (_INSIDE * durations[:, None])[..., None]  # (M, S, 1)
     rates = np.where(powers > 0, times ** np.maximum(powers - 1, 0), 0.0) * powers

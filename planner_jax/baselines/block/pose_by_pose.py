@@ -13,16 +13,18 @@ import dataclasses
 import functools
 import time
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 
 from planner_jax.baselines.block.direct import poses_in_time
 from planner_jax.baselines.block.free_space import FreeSpace
 from planner_jax.baselines.block.path_timing import DEGREE, PIECES, required, timed_way
+from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt, Status, lane, require_settings
 from planner_jax.task.block.case import BlockCase
@@ -79,15 +81,15 @@ class PoseByPose(Planner, abc.ABC):
     def motion_to(
         self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
     ) -> HostMotion | None:
-        """A motion to one end pose that touches nothing, or None if none is found in time."""
+        """Return a motion to one end pose that touches nothing, or None if time runs out."""
 
     def solve_on_host(self, cases: BlockCase, attempt: Attempt) -> BlockPlan:
-        """The plans of a batch, one case after another."""
+        """Return the plans of a batch, one case after another."""
         plans = [self.plan_of(lane(cases, k)) for k in range(cases.batch_shape[0])]
         return jax.tree.map(lambda *leaves: np.stack(leaves), *plans)
 
     def plan_of(self, case: BlockCase) -> BlockPlan:
-        """The plan of one case with NumPy leaves."""
+        """Return the plan of one case with NumPy leaves."""
         hopeless, angles, contacts, shares = (np.asarray(x) for x in _goals(case, self.points))
         if hopeless != Status.NO_PATH:
             return self._plan(case, Status(int(hopeless)))
@@ -118,10 +120,10 @@ class PoseByPose(Planner, abc.ABC):
         case: BlockCase,
         status: Status,
         motion: HostMotion | None = None,
-        contact: Any = 0.0,
+        contact: ArrayLike = 0.0,
         tries: int = 0,
     ) -> BlockPlan:
-        """The plan of a motion to a contact [s], or one to stay, which is none, for a reason."""
+        """Return the plan of a motion to a contact [s]; without a motion, a plan to stay."""
         dtype = np.asarray(case.angles).dtype
         if motion is None:
             stay = np.zeros((1, self.degree + 1, 6))
@@ -130,27 +132,26 @@ class PoseByPose(Planner, abc.ABC):
             contact, cost, violation = case.delay + 1.0, np.inf, np.inf
         else:
             coeffs, durations, cost = motion.coeffs, motion.durations, motion.execution
-            violation = cost / (contact - case.delay) - 1.0
+            violation = cost / (np.asarray(contact) - case.delay) - 1.0
             status = Status.FEASIBLE if violation <= 0.0 else Status.INFEASIBLE
         rest = np.zeros((self.pieces - len(durations), self.degree + 1, 6))
         rest[:, 0] = sum(coeffs[-1, k] * durations[-1] ** k for k in range(self.degree + 1))
-        leaves: dict[str, Any] = {
-            "motion": PiecewisePolynomial(
-                coeffs=np.concatenate([coeffs, rest]).astype(dtype),  # type: ignore[arg-type]
-                durations=np.append(durations, np.zeros(len(rest))).astype(dtype),  # type: ignore[arg-type]
+        return BlockPlan(
+            motion=PiecewisePolynomial(
+                coeffs=host_leaf(np.concatenate([coeffs, rest]), dtype),
+                durations=host_leaf(np.append(durations, np.zeros(len(rest))), dtype),
             ),
-            "contact_time": np.asarray(contact, dtype),
-            "cost": np.asarray(cost, dtype),
-            "violation": np.asarray(violation, dtype),
-            "iterations": np.asarray(tries, np.int32),
-            "status": np.asarray(status, np.int32),
-        }
-        return BlockPlan(**leaves)
+            contact_time=host_leaf(contact, dtype),
+            cost=host_leaf(cost, dtype),
+            violation=host_leaf(violation, dtype),
+            iterations=host_leaf(tries, np.int32),
+            status=host_leaf(status, np.int32),
+        )
 
 
 @functools.partial(jax.jit, static_argnames="points")
 def _goals(case: BlockCase, points: int) -> tuple[Array, Array, Array, Array]:
-    """Why there can be no plan, and end poses.
+    """Return why there can be no plan, and end poses.
 
     Returns:
         status: () int32, NO_PATH unless the case itself says that there is none.
@@ -181,13 +182,15 @@ class WayThenTime(PoseByPose):
             required(name)
 
     @abc.abstractmethod
-    def way_to(self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock) -> Any:
-        """Points (N, 6) [rad] of a free way from the case's angles to a goal, or None."""
+    def way_to(
+        self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
+    ) -> np.ndarray | None:
+        """Return points (N, 6) [rad] of a free way from the case's angles to a goal, or None."""
 
     def motion_to(
         self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
     ) -> HostMotion | None:
-        """The way with its timing; none at all where the arm is at the goal already.
+        """Return the way with its timing; none at all where the arm is at the goal already.
 
         The spline through a way's points may leave the way: where it then touches something,
         points are put half-way between the others, so that it follows the way more closely.

@@ -7,7 +7,9 @@ has. Edges are looked at in one batch each.
 
 import dataclasses
 import functools
-from typing import Any, ClassVar
+from collections.abc import Sequence
+from types import ModuleType
+from typing import ClassVar
 
 import numpy as np
 
@@ -20,8 +22,8 @@ _SEED = 1  # of OMPL's random numbers: one sequence a process
 
 
 @functools.cache
-def _ompl() -> tuple[Any, Any]:
-    """OMPL's modules `base` and `geometric`, told to be silent and what to draw."""
+def _ompl() -> tuple[ModuleType, ModuleType]:
+    """Return OMPL's modules `base` and `geometric`, told to be silent and what to draw."""
     util = required("ompl.util")
     util.setLogLevel(util.LOG_ERROR)
     util.RNG.setSeed(_SEED)
@@ -39,7 +41,7 @@ class RrtConnectBlock(WayThenTime):
     def way_to(
         self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
     ) -> np.ndarray | None:
-        """Points of a way, or None."""
+        """Return points of a way, or None."""
         base, geometric = _ompl()
         space = base.RealVectorStateSpace(6)
         bounds = base.RealVectorBounds(6)
@@ -75,16 +77,16 @@ class RrtConnectBlock(WayThenTime):
         return np.stack([_numbers(state) for state in path.getStates()])
 
 
-def _numbers(state: Any) -> np.ndarray:
-    """The angles (6,) of a state of OMPL's."""
+def _numbers(state: Sequence[float]) -> np.ndarray:
+    """Return the angles (6,) of a state of OMPL's."""
     return np.array([state[k] for k in range(6)])
 
 
-def _validator(base: Any, information: Any, free: FreeSpace) -> Any:
-    """What OMPL asks whether an edge is free."""
+def _validator(base: ModuleType, information: object, free: FreeSpace) -> object:
+    """Return the object that tells OMPL whether an edge is free."""
 
     class Edges(base.MotionValidator):
-        def checkMotion(self, begin: Any, end: Any) -> bool:  # noqa: N802
+        def checkMotion(self, begin: Sequence[float], end: Sequence[float]) -> bool:  # noqa: N802
             """The name is OMPL's."""
             return bool(free.are_edges_free(_numbers(begin), _numbers(end)[None])[0])
 

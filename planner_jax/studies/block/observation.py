@@ -6,7 +6,6 @@ base frame, z up, SI units.
 """
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +14,7 @@ from flax import struct
 from jax import Array
 
 from planner_jax.ball.flight import BallState, drag_free_flight
+from planner_jax.core.arithmetic import host_leaf
 from planner_jax.perception.camera import Camera, looking_at
 from planner_jax.perception.fit import (
     FlightFit,
@@ -39,7 +39,7 @@ class Eye:
 
 
 def mast_camera(size: tuple[int, int] = (1280, 720)) -> Camera:
-    """A camera 1.6 m above the base, on a mast on the rig's beam behind the arm.
+    """Return a camera 1.6 m above the base, on a mast on the rig's beam behind the arm.
 
     Paper 004 mounts its camera on the rig's beams, its authors' model in front of the arm, where
     110 degrees do not take in what is thrown from 60 degrees on either side. From here a width of
@@ -52,7 +52,7 @@ def mast_camera(size: tuple[int, int] = (1280, 720)) -> Camera:
 
 
 def eye(*, rate: float = 60.0, std: float | None = None, camera: Camera | None = None) -> Eye:
-    """A stereo camera with the noise of `stereo_noise`, by default on the mast.
+    """Return a stereo camera with the noise of `stereo_noise`, by default on the mast.
 
     Args:
         rate: [Hz], of frames.
@@ -66,22 +66,21 @@ def eye(*, rate: float = 60.0, std: float | None = None, camera: Camera | None =
         raise ValueError(f"rate must be > 0, got {rate:g}")
     if std is not None and not std > 0.0:
         raise ValueError(f"std must be > 0, got {std:g}")
-    alike: Any = np.asarray(std, np.float32)
     return Eye(
         camera=mast_camera() if camera is None else camera,
-        noise=stereo_noise() if std is None else RoundNoise(std=alike),
+        noise=stereo_noise() if std is None else RoundNoise(std=host_leaf(std, np.float32)),
         rate=rate,
     )
 
 
 def frame_times(eye: Eye, seconds: float) -> np.ndarray:
-    """Times (N,) [s] of the frames until a moment [s], the first at 0."""
+    """Return times (N,) [s] of the frames until a moment [s], the first at 0."""
     # A frame at that very moment counts, whatever its time rounds to.
     return np.arange(int(np.floor(seconds * eye.rate + 1e-6)) + 1) / eye.rate
 
 
 def watched(cases: BlockCase, eye: Eye, times: Array, key: Array) -> Array:
-    """Where the balls of a batch of cases are seen at times (N,) [s]; pure.
+    """Return where the balls of a batch of cases are seen at times (N,) [s]; pure.
 
     Args:
         cases: a batch of B, with the true balls.
@@ -102,7 +101,7 @@ def watched(cases: BlockCase, eye: Eye, times: Array, key: Array) -> Array:
 
 
 def fitted(eye: Eye, times: Array, places: Array, gravity: Array, until: Array) -> FlightFit:
-    """The flight of one ball from where it was seen until a moment; pure.
+    """Return the flight of one ball from where it was seen until a moment; pure.
 
     Args:
         eye: that saw it.
@@ -126,7 +125,7 @@ class SeenThrows:
 def see(
     cases: BlockCase, eye: Eye, seconds: float, *, seed: int = 0, overhead: float = 0.0
 ) -> SeenThrows:
-    """A batch of throws after some seconds of flight were seen.
+    """Return a batch of throws after some seconds of flight were seen.
 
     Plan with the returned cases, made `cautious`. To judge the plans, give the true cases the delay
     of the returned ones, and pass both through `studies.block.contact_check.end_at_contact`. A ball
@@ -159,7 +158,7 @@ def cautious(
     edge: float = 0.0,
     at_rest: bool = False,
 ) -> BlockCase:
-    """A batch of seen cases as a planner should get it, which takes the ball at its word.
+    """Return a batch of seen cases as a planner should get it, which takes the ball at its word.
 
     The ball is to be met near the shield's middle, so that the rest of the shield is left for the
     error of the fit. One that is believed to pass the protected box by may well come into it: for
@@ -191,7 +190,7 @@ def cautious(
 
 @jax.jit
 def fit_errors(cases: BlockCase, fits: FlightFit) -> tuple[Array, Array]:
-    """Errors of fits across the flight midway between the boxes, of a batch with the true balls.
+    """Return errors of fits across the flight midway between the boxes, for the true balls.
 
     Returns:
         error: (B,) [m].

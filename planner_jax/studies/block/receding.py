@@ -9,8 +9,7 @@ moment this is what an arm does that decides once. Robot base frame, z up, SI un
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -18,10 +17,14 @@ import numpy as np
 from flax import struct
 from jax import Array
 
+from planner_jax.ball.flight import BallState
+from planner_jax.core.arithmetic import host_leaf
+from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Status, is_solved, lane
 from planner_jax.core.select import select_into
 from planner_jax.perception.fit import FlightFit, Sight, believed_at
 from planner_jax.planning.plan import plan
+from planner_jax.planning.replan import Replanning
 from planner_jax.studies.block.contact_check import end_at_contact
 from planner_jax.studies.block.observation import (
     Eye,
@@ -34,7 +37,7 @@ from planner_jax.studies.block.observation import (
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.default_planner import OnlineBlock
 from planner_jax.task.block.end_poses import contact_terms, flight_of
-from planner_jax.task.block.motion import append_braking
+from planner_jax.task.block.motion import Weights, append_braking
 from planner_jax.task.block.plan import BlockPlan
 from planner_jax.task.block.replan import ReplanBlock, WarmBlock
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
@@ -74,30 +77,30 @@ class Decided:
     motions: Array  # (B,) int32, how many motions were begun
 
     def fit_errors(self, place: int) -> tuple[Array, Array]:
-        """Errors (B,) [m] of the fits of a moment, and what they are believed to be."""
+        """Return errors (B,) [m] of the fits of a moment, and what they are believed to be."""
         return fit_errors(self.cases, lane(self.fits, place))
 
 
 def plan_with_aims(
-    planner: Any, cases: Any, aims: Sequence[Aim] = AIMS, *, of: Callable = lambda cases: cases
+    planner: Planner, cases: BlockCase | Replanning, aims: Sequence[Aim] = AIMS
 ) -> BlockPlan:
-    """Plans of a batch with fitted balls, by the first aim that leads to one.
+    """Plan for a batch with fitted balls, by the first aim that leads to a plan.
 
     Args:
-        planner: of blocks; or of what `of` finds the cases in.
+        planner: of these cases.
         cases: a batch of B.
         aims: one or more.
-        of: the `BlockCase` in an entry.
     """
     cases, plans = jax.tree.map(np.asarray, cases), None
     lanes = np.arange(cases.batch_shape[0])
     for aim in aims:
         some = lane(cases, lanes)
-        aimed = cautious(of(some), **dataclasses.asdict(aim))
+        is_again = isinstance(some, Replanning)
+        aimed = cautious(some.case if is_again else some, **dataclasses.asdict(aim))
         # NumPy arrays, for which there are programs already.
         aimed = jax.tree.map(np.asarray, aimed)
-        given = aimed if some is of(some) else dataclasses.replace(some, case=aimed)
-        found = jax.tree.map(np.array, plan(planner, given))
+        asked = dataclasses.replace(some, case=aimed) if is_again else aimed
+        found = jax.tree.map(np.array, plan(planner, asked))
         plans = found if plans is None else select_into(plans, found, lanes)
         lanes = np.flatnonzero(~is_solved(plans.status))
         if not lanes.size:
@@ -107,19 +110,19 @@ def plan_with_aims(
 
 
 def decide(
-    planner: Any,
+    planner: Planner[BlockCase, BlockPlan],
     cases: BlockCase,
     eye: Eye,
     moments: Sequence[float],
     *,
     overhead: float = 0.05,
-    seed: Any = 0,
+    seed: int | np.ndarray = 0,
     aims: Sequence[Aim] = AIMS,
     shortest: float = 0.03,
     patient: bool = False,
     again: bool = True,
 ) -> Decided:
-    """What arms do that watch their balls and decide at given moments.
+    """Simulate arms that observe their balls and decide at given moments.
 
     Args:
         planner: of the first motion, and of those that the previous one does not lead to. One that
@@ -163,7 +166,7 @@ def decide(
         left = np.asarray(_latest(cautious(known))) - begin
         stands = arms.motions == 0
         open_ &= (left > shortest) & (again | stands)
-        useful = arms.useful(planner, known, aims)
+        useful = arms.count_useful(known, aims)
         if patient and following is not None:
             later = np.full(num, following + overhead, dtype)
             lanes = np.flatnonzero(open_ & stands)
@@ -176,7 +179,8 @@ def decide(
     status = np.where(seen | is_solved(plans.status), plans.status, Status.NON_FINITE)
     plans = dataclasses.replace(plans, status=status.astype(np.int32))
     every = jax.tree.map(lambda *leaves: np.stack(leaves), *fits)
-    return Decided(cases=cases, plans=plans, fits=every, begun=arms.first, motions=arms.motions)
+    begun, motions = host_leaf(arms.first), host_leaf(arms.motions)
+    return Decided(cases=cases, plans=plans, fits=every, begun=begun, motions=motions)
 
 
 class _Arms:
@@ -184,27 +188,22 @@ class _Arms:
 
     def __init__(self, cases: BlockCase):
         num, dtype = cases.batch_shape[0], cases.gravity.dtype
-        none: Any = np.full(num, np.inf, dtype)
-        contact: Any = np.array(cases.delay)
-        steps: Any = np.zeros(num, np.int32)
-        status: Any = np.full(num, Status.INFEASIBLE, np.int32)
         self.cases, self.since = cases, np.array(cases.delay)
         self.plans = BlockPlan(
             motion=_still(cases, (1, 3)),
-            contact_time=contact,
-            cost=none,
-            violation=none.copy(),
-            iterations=steps,
-            status=status,
+            contact_time=host_leaf(np.array(cases.delay)),
+            cost=host_leaf(np.full(num, np.inf, dtype)),
+            violation=host_leaf(np.full(num, np.inf, dtype)),
+            iterations=host_leaf(np.zeros(num, np.int32)),
+            status=host_leaf(np.full(num, Status.INFEASIBLE, np.int32)),
         )
-        motions: Any = np.zeros(num, np.int32)
-        first: Any = np.full(num, np.inf, dtype)
-        self.done, self.first, self.motions = [], first, motions
+        self.done: list[PiecewisePolynomial] = []
+        self.first, self.motions = np.full(num, np.inf, dtype), np.zeros(num, np.int32)
 
-    def useful(self, planner: Any, known: BlockCase, aims: Sequence[Aim]) -> np.ndarray:
-        """How many of the aims (B,) are closer than motions would meet the balls now known.
+    def count_useful(self, known: BlockCase, aims: Sequence[Aim]) -> np.ndarray:
+        """Count the aims (B,) with less offset than that of the contact now expected.
 
-        All of them for an arm whose motion misses the ball, or that has none.
+        All aims count for an arm whose motion misses the ball, or that has no motion.
         """
         num = np.full(len(self.motions), len(aims))
         if not self.motions.any():
@@ -214,12 +213,12 @@ class _Arms:
         for offset in sorted({aim.offset for aim in aims}, reverse=True):
             closer = sum(aim.offset < offset for aim in aims)
             near = cautious(since, offset=max(offset, _NEAR))
-            meets = np.asarray(_meets(planner, near, self.plans))
+            meets = np.asarray(_meets(near, self.plans))
             num = np.where(moves & meets, closer, num)
         return num
 
     def decide(
-        self, planner: Any, known: BlockCase, useful: np.ndarray, aims: Sequence[Aim]
+        self, planner: Planner, known: BlockCase, useful: np.ndarray, aims: Sequence[Aim]
     ) -> None:
         """Go over to new motions where there are any.
 
@@ -234,8 +233,9 @@ class _Arms:
         moves, begin = is_solved(self.plans.status), np.asarray(known.delay)
         for num in np.unique(useful[moves & (useful > 0)]):
             lanes = np.flatnonzero(moves & (useful == num))
+            assert isinstance(planner, OnlineBlock)
             warm, some = WarmBlock(planner=planner), lane(tasks, lanes)
-            found = plan_with_aims(warm, some, aims[:num], of=lambda tasks: tasks.case)
+            found = plan_with_aims(warm, some, aims[:num])
             self._begin(begin, lanes, found)
             useful[lanes[is_solved(found.status)]] = 0
         # A search from scratch takes long: only for a ball that is missed else.
@@ -258,7 +258,7 @@ class _Arms:
             jax.tree.map(np.asarray, _begun(self.cases, self.plans.motion, until - self.since))
         )
 
-        def put(old: np.ndarray, new: Any) -> np.ndarray:
+        def put(old: np.ndarray, new: np.ndarray) -> np.ndarray:
             old[lanes] = new
             return old
 
@@ -270,10 +270,10 @@ class _Arms:
         self.motions[lanes] += 1
 
     def composed(self) -> BlockPlan:
-        """What the arms have done and are about to do, as one plan each."""
+        """Return the past and planned motions of the arms, as one plan each."""
         motions = [*self.done, self.plans.motion]
-        coeffs: Any = np.concatenate([motion.coeffs for motion in motions], axis=1)
-        durations: Any = np.concatenate([motion.durations for motion in motions], axis=1)
+        coeffs = np.concatenate([motion.coeffs for motion in motions], axis=1)
+        durations = np.concatenate([motion.durations for motion in motions], axis=1)
         # Pieces of no length go behind the others, and there go on from the end.
         order = np.argsort(durations <= 0.0, axis=1, kind="stable")
         num = max(int((durations > 0.0).sum(axis=1).max()), 1)
@@ -289,22 +289,22 @@ class _Arms:
         coeffs = np.where((durations > 0.0)[:, :, None, None], coeffs, end[:, None])
         return dataclasses.replace(
             self.plans,
-            motion=PiecewisePolynomial(coeffs=coeffs, durations=durations),
+            motion=PiecewisePolynomial(coeffs=host_leaf(coeffs), durations=host_leaf(durations)),
             cost=self.plans.cost + self.since - self.cases.delay,
         )
 
 
 def _still(cases: BlockCase, shape: tuple[int, ...]) -> PiecewisePolynomial:
-    """Motions of no length, of so many pieces and powers, from where the arms are."""
+    """Return motions of no length, of so many pieces and powers, from where the arms are."""
     num, dtype = cases.batch_shape[0], cases.gravity.dtype
-    coeffs: Any = np.zeros((num, *shape, 6), dtype)
+    coeffs = np.zeros((num, *shape, 6), dtype)
     coeffs[:, :, 0], coeffs[:, :, 1] = cases.angles[:, None], cases.rates[:, None]
-    durations: Any = np.zeros((num, shape[0]), dtype)
-    return PiecewisePolynomial(coeffs=coeffs, durations=durations)
+    durations = np.zeros((num, shape[0]), dtype)
+    return PiecewisePolynomial(coeffs=host_leaf(coeffs), durations=host_leaf(durations))
 
 
-def _keys(seed: Any) -> Array:
-    """A key, or (B,) of them."""
+def _keys(seed: int | np.ndarray) -> Array:
+    """Return a key, or (B,) of them."""
     return jax.vmap(jax.random.key)(seed) if np.ndim(seed) else jax.random.key(seed)
 
 
@@ -312,8 +312,10 @@ _watch = jax.jit(watched)
 
 
 @jax.jit
-def _fit(cases: BlockCase, eye: Eye, times: Array, places: Array, moment: Array) -> Any:
-    """Balls at the time 0, and fits, of what was seen until a moment."""
+def _fit(
+    cases: BlockCase, eye: Eye, times: Array, places: Array, moment: Array
+) -> tuple[BallState, FlightFit]:
+    """Return balls at the time 0, and fits, of what was seen until a moment."""
     fits = jax.vmap(fitted, (None, None, 0, 0, None))(eye, times, places, cases.gravity, moment)
     start = jnp.zeros((), times.dtype)
     return jax.vmap(believed_at, (0, None, 0))(fits, start, cases.gravity).ball, fits
@@ -326,14 +328,14 @@ def _latest(case: BlockCase) -> Array:
 
 
 @jax.jit
-def _meets(planner: OnlineBlock, cases: BlockCase, plans: BlockPlan) -> Array:
-    """Whether motions meet the balls of some cases as these ask for, (B,) bool."""
+def _meets(cases: BlockCase, plans: BlockPlan) -> Array:
+    """Return whether motions meet the balls of cases within these cases' limits, (B,) bool."""
 
     def one(case: BlockCase, plan: BlockPlan) -> Array:
         time = plan.contact_time - case.delay
         angles = evaluate(plan.motion, jnp.minimum(time, jnp.sum(plan.motion.durations)))
         flight = flight_of(case)
-        excess = contact_terms(case, flight, angles, plan.contact_time, planner.weights)[2]
+        excess = contact_terms(case, flight, angles, plan.contact_time, Weights())[2]
         return flight.comes & (excess <= _EXCESS)
 
     return jax.vmap(one)(cases, end_at_contact(cases, plans))
@@ -342,7 +344,7 @@ def _meets(planner: OnlineBlock, cases: BlockCase, plans: BlockPlan) -> Array:
 @jax.jit
 @jax.vmap
 def _begun(case: BlockCase, motion: PiecewisePolynomial, time: Array) -> PiecewisePolynomial:
-    """The pieces of a motion, of its braking and of standing thereafter, until a time () [s]."""
+    """Return the pieces of a motion, its braking and the standstill after, up to a time () [s]."""
     motion = append_braking(case, motion)
     end = jnp.sum(motion.durations)
     stand = jnp.zeros_like(motion.coeffs[:1]).at[0, 0].set(evaluate(motion, end))

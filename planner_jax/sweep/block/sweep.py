@@ -9,7 +9,7 @@ import pyarrow as pa
 from planner_jax.baselines.block.library.adapt import AdaptBlock
 from planner_jax.baselines.block.library.planner import LibraryBlock
 from planner_jax.core.choices import require
-from planner_jax.robot.arm_plan import ArmPlan
+from planner_jax.robot.arm import ArmPlan
 from planner_jax.runs.columns import Column, RefereedBatch
 from planner_jax.runs.summary import COUNTED, Tally
 from planner_jax.sweep.block.columns import COLUMNS, FRAME, SEEN_COLUMNS, TIMED_COLUMNS

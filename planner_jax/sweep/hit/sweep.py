@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from planner_jax.robot.quadrotor_plan import QuadrotorPlan
+from planner_jax.robot.quadrotor import QuadrotorPlan
 from planner_jax.runs.columns import Column
 from planner_jax.runs.summary import COUNTED, Tally
 from planner_jax.runs.table import RateTable, own_cells

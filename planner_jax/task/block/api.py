@@ -1,8 +1,7 @@
 """The words of the task: `pj.block.draw`, `planner` and `judge`; `case` stands beside."""
 
-from typing import Any
-
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 
 from planner_jax.core.planner import Planner
 from planner_jax.core.registry import suite_named
@@ -24,9 +23,9 @@ def draw(
     wide: bool = False,
     anywhere: bool = False,
     delay: float = 0.0,
-    dtype: Any = jnp.float32,
+    dtype: DTypeLike = jnp.float32,
 ) -> BlockCase:
-    """Drawn throws as a batch of cases.
+    """Draw throws as a batch of cases.
 
     Args:
         num: how many, >= 1.
@@ -58,8 +57,8 @@ def draw(
     )
 
 
-def planner(name: str = "online", **options: Any) -> Planner[Any, Any]:
-    """The block planner of a name, with some of its fields set.
+def planner(name: str = "online", **options: object) -> Planner[BlockCase, BlockPlan]:
+    """Return the block planner of a name, with some of its fields set.
 
     * `library:FILE`: the motion that a file of `planner-jax library build` has for the two cells
       through which the ball comes.
@@ -91,8 +90,8 @@ def planner(name: str = "online", **options: Any) -> Planner[Any, Any]:
     return TASK.make_planner(name, options)
 
 
-def judge(cases: BlockCase, plans: BlockPlan, **settings: Any) -> BlockVerdict:
-    """What the referee says of one plan or of a batch: kinematics and geometry alone decide.
+def judge(cases: BlockCase, plans: BlockPlan, **settings: object) -> BlockVerdict:
+    """Judge one plan, or a batch: kinematics and geometry alone decide.
 
     Args:
         cases: one case, or a batch.

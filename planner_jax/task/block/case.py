@@ -1,12 +1,13 @@
 """One thrown ball, and the arm that is to block it."""
 
-from typing import Any, ClassVar
+from typing import ClassVar, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array
+from numpy.typing import ArrayLike, DTypeLike
 
 from planner_jax.ball.flight import BallState
 from planner_jax.core.checks import floating, require_kind, require_switch, shape_of
@@ -19,6 +20,7 @@ from planner_jax.task.block.clearance import least_clearances
 from planner_jax.task.block.rules import RULES
 from planner_jax.task.block.scene import Scene, paper_scene
 
+TreeT = TypeVar("TreeT")
 # How exactly a ball is to be met: greatest distance from the middle of the shield [m], and greatest
 # angle [rad] between the shield's normal and the way that the ball comes from.
 STRICT = (0.002, np.deg2rad(0.5))
@@ -58,21 +60,21 @@ class BlockCase:
 
 
 def case(
-    ball_pos: Any,
-    ball_vel: Any,
+    ball_pos: ArrayLike,
+    ball_vel: ArrayLike,
     *,
-    delay: Any = 0.0,
+    delay: ArrayLike = 0.0,
     regime: str = "R2",
     wide: bool = False,
     anywhere: bool = False,
     scene: Scene | None = None,
     arm: Arm | None = None,
-    angles: Any = None,
-    rates: Any = 0.0,
-    gravity: Any = 9.81,
-    dtype: Any = jnp.float32,
+    angles: ArrayLike | None = None,
+    rates: ArrayLike = 0.0,
+    gravity: ArrayLike = 9.81,
+    dtype: DTypeLike = jnp.float32,
 ) -> BlockCase:
-    """A ball to block, or a batch of them, by default in the scene of paper 004.
+    """Return a case of a ball to block, or a batch, by default in the scene of paper 004.
 
     Args:
         ball_pos: (3,) or (B, 3) [m], where the ball is first seen.
@@ -112,13 +114,13 @@ def case(
     shapes += [shape_of("delay", delay), shape_of("gravity", gravity)]
     batch, dtype = max(shapes, key=len), floating(dtype)
 
-    def leaf(name: str, value: Any, *trailing: int) -> Array:
+    def leaf(name: str, value: ArrayLike, *trailing: int) -> Array:
         return array_of(name, value, batch, trailing, dtype)
 
-    def shared(tree: Any) -> Any:
-        def one(value: Any) -> Array:
+    def shared(tree: TreeT) -> TreeT:
+        def one(value: ArrayLike) -> Array:
             value = np.asarray(value)
-            kind = dtype if value.dtype.kind == "f" else value.dtype
+            kind = np.dtype(dtype) if value.dtype.kind == "f" else value.dtype
             return jnp.asarray(np.broadcast_to(value, batch + value.shape), kind)
 
         return jax.tree.map(one, tree)

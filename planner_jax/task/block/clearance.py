@@ -9,7 +9,7 @@ works on several poses with one instruction.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -54,14 +54,14 @@ class _Pairs(NamedTuple):
 
     measure: Callable  # of `space.distances`
     bodies: tuple[Array, ...]  # what it takes, with lanes (P or 1, N) on the last axes
-    thick: Any  # (P, 1) or () [m], what both bodies reach beyond that
-    link: Any  # (P,) or (), 0 to 5, that the one turns with
-    fixed: Any = -1  # likewise of the other body; -1 if it stands
+    thick: Array | float  # (P, 1) or () [m], what both bodies reach beyond that
+    link: np.ndarray | int  # (P,) or (), 0 to 5, that the one turns with
+    fixed: np.ndarray | int = -1  # likewise of the other body; -1 if it stands
     first: bool = True  # whether the body that moves is the measure's first one
 
 
 def clearances(arm: Arm, scene: Scene, angles: Array) -> Array:
-    """Distances (R, N) [m] of all pairs; capsules that overlap have negative ones.
+    """Return distances (R, N) [m] of all pairs; capsules that overlap have negative ones.
 
     The first `num_of_pole(arm)` are those from the pole.
 
@@ -75,12 +75,12 @@ def clearances(arm: Arm, scene: Scene, angles: Array) -> Array:
 
 
 def least_clearances(arm: Arm, scene: Scene, angles: Array) -> Array:
-    """The least of `clearances` in each of N poses, (N,) [m]."""
+    """Return the least of `clearances` in each of N poses, (N,) [m]."""
     return jnp.min(clearances(arm, scene, angles), axis=0)
 
 
 def clearance_slopes(arm: Arm, scene: Scene, angles: Array) -> Array:
-    """How `clearances` change with each joint, (R, 6, N) [m/rad].
+    """Return how `clearances` change with each joint, (R, 6, N) [m/rad].
 
     A joint that turns both bodies of a pair leaves their distance as it is.
     """
@@ -101,24 +101,24 @@ def clearance_slopes(arm: Arm, scene: Scene, angles: Array) -> Array:
 
 
 def num_of_pole(arm: Arm) -> int:
-    """How many of the pairs are those with the pole: a capsule each, and the shield."""
+    """Return how many of the pairs are those with the pole: a capsule each, and the shield."""
     return len(_from_link(arm, 1)) + 1
 
 
 def _from_link(arm: Arm, first: int) -> np.ndarray:
-    """Places of the capsules of a link, 1 to 6, and of those behind it."""
+    """Return places of the capsules of a link, 1 to 6, and of those behind it."""
     return np.flatnonzero(np.asarray(arm.capsule_link) >= first - 1)
 
 
 def _poses(arm: Arm, angles: Array) -> _Poses:
-    """Where the arm is at angles (N, 6)."""
+    """Return where the arm is at angles (N, 6)."""
     # Held, since the loops over distances would each work them out anew.
     rotations, origins = lax.optimization_barrier(
         jax.vmap(lambda angles: link_frames(arm, angles), out_axes=-1)(angles)
     )
 
     def turned(rotations: Array, vector: Array) -> Array:
-        """Vectors (..., 3) of links in the base frame, (..., 3, N)."""
+        """Return vectors (..., 3) of links in the base frame, (..., 3, N)."""
         x, y, z = (rotations[..., j, :] * vector[..., j, None, None] for j in range(3))
         return x + y + z
 
@@ -143,7 +143,7 @@ def _poses(arm: Arm, angles: Array) -> _Poses:
 
 
 def _pairs(arm: Arm, scene: Scene, poses: _Poses) -> list[_Pairs]:
-    """All pairs, those with the pole first."""
+    """Return all pairs, those with the pole first."""
     link, radius = np.asarray(arm.capsule_link), jnp.asarray(arm.capsule_radius)
     turning, swung, far = (_from_link(arm, first) for first in (1, 2, 3))
     trunk = np.flatnonzero(link == 0)
@@ -160,7 +160,7 @@ def _pairs(arm: Arm, scene: Scene, poses: _Poses) -> list[_Pairs]:
     num_beams = beams.shape[2]
 
     def with_beams(places: np.ndarray) -> Array:
-        """Segments (2, 3, K, N) of capsules and of all beams."""
+        """Return segments (2, 3, K, N) of capsules and of all beams."""
         return jnp.concatenate([poses.ends[:, :, places], beams], axis=2)
 
     wrist = jnp.sqrt(jnp.sum((arm.origin[5] + arm.shield_centre) ** 2))

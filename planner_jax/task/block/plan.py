@@ -6,7 +6,7 @@ from flax import struct
 from jax import Array, lax
 
 from planner_jax.core.protocol import Status, is_solved
-from planner_jax.robot.arm_plan import ArmPlan
+from planner_jax.robot.arm import ArmPlan
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import least_clearances
 from planner_jax.task.block.end_poses import EndPoses

@@ -6,14 +6,16 @@ which a few steps of least squares suffice; a search from scratch stays for what
 """
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 
 from planner_jax.ball.flight import BallState, drag_free_flight
+from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.checks import require_beginning, require_kind
 from planner_jax.core.planner import Drive, Planner
 from planner_jax.core.protocol import Attempt, is_unsolved
@@ -48,12 +50,12 @@ class WarmBlock(Planner):
     attempts: tuple[Warm, ...] = (Warm(),)  # pyright: ignore[reportIncompatibleMethodOverride]
 
     def solve(self, task: Replanning, attempt: Warm) -> BlockPlan:
-        """The plan of one case."""
+        """Return the plan of one case."""
         case, planner = task.case, self.planner
         return planner.refine(case, flight_of(case), self.rest(task), attempt.solver)
 
     def rest(self, task: Replanning) -> Array:
-        """The unknowns of what is left of the previous motion, over the time until the contact.
+        """Return the unknowns of the remainder of the previous motion until the contact.
 
         The contact is moved to when the ball, as it is now known, is nearest to where the shield
         was to meet it.
@@ -96,13 +98,13 @@ class ReplanBlock(Planner):
         self,
         cases: BlockCase,
         previous: BlockPlan,
-        elapsed: Any,
+        elapsed: ArrayLike,
         *,
         ball: BallState | None = None,
-        angles: Any = None,
-        rates: Any = None,
+        angles: ArrayLike | None = None,
+        rates: ArrayLike | None = None,
     ) -> Replanning:
-        """What is left of a case, or of a batch, some time into its motion; see `pj.replan`.
+        """Return the rest of a case, or of a batch, some time into its motion; see `pj.replan`.
 
         Args:
             cases: what `previous` was planned for.
@@ -132,10 +134,10 @@ class ReplanBlock(Planner):
             angles=angles,
             rates=rates,
         )
-        return Replanning(case=left, previous=previous, elapsed=elapsed)
+        return Replanning(case=left, previous=previous, elapsed=host_leaf(elapsed))
 
     def plan_by(self, drive: Drive, tasks: Replanning) -> BlockPlan:
-        """The plans of one case or of a batch: warm, and from scratch where that fails."""
+        """Return the plans of one case or of a batch: warm, and from scratch where that fails."""
         plans, _ = drive(self.warm, tasks)
         unsolved, cases = is_unsolved(plans.status), tasks.case
         if not tasks.batch_shape:
@@ -147,7 +149,7 @@ class ReplanBlock(Planner):
 
 @jax.jit
 def _state(case: BlockCase, plan: BlockPlan, elapsed: Array) -> tuple[Array, Array]:
-    """Angles (6,) [rad] and rates (6,) [rad/s] some time [s] into the motion of a plan."""
+    """Return angles (6,) [rad] and rates (6,) [rad/s] some time [s] into the motion of a plan."""
     motion = append_braking(case, plan.motion)
     is_over = elapsed >= jnp.sum(motion.durations)
     elapsed = jnp.minimum(elapsed, jnp.sum(motion.durations))

@@ -3,14 +3,14 @@
 Robot base frame, z up, SI units.
 """
 
-from typing import Any
-
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array
+from numpy.typing import ArrayLike
 
 from planner_jax.ball.flight import BallState, drag_free_fall_time
+from planner_jax.core.arithmetic import host_leaf
 
 INNER_HALF, INNER_HEIGHT = 0.4, 1.35  # [m], of the box that is protected
 OUTER_HALF, OUTER_HEIGHT = 1.0, 1.85  # [m], of the box in which a ball may be met
@@ -43,20 +43,19 @@ class Scene:
 
 
 def paper_scene(*, has_pole: bool = True) -> Scene:
-    """The scene of the paper's simulation, NumPy float32 leaves.
+    """Return the scene of the paper's simulation, NumPy float32 leaves.
 
     The sizes are those of the authors' model (their repository of the planner); the paper shows
     them in its Fig. 5. The box that keeps the arm from the camera is left out: the authors' own
     home pose reaches into it.
     """
 
-    def leaf(value: Any) -> Any:
-        return np.asarray(value, np.float32)
+    def leaf(value: ArrayLike) -> Array:
+        return host_leaf(value, np.float32)
 
     def box(half: float, height: float) -> Box:
         return Box(lower=leaf([-half, -half, 0.0]), upper=leaf([half, half, height]))
 
-    is_there: Any = np.asarray(has_pole)
     ends = []
     for along in range(2):
         for side in (-RIG_HALF, RIG_HALF):
@@ -69,7 +68,7 @@ def paper_scene(*, has_pole: bool = True) -> Scene:
         outer=box(OUTER_HALF, OUTER_HEIGHT),
         pole=leaf(POLE),
         pole_radius=leaf(POLE_RADIUS),
-        has_pole=is_there,
+        has_pole=host_leaf(has_pole),
         floor=leaf(FLOOR),
         beam_ends=leaf(ends),
         beam_radius=leaf(np.full(4, RIG_RADIUS)),
@@ -77,7 +76,7 @@ def paper_scene(*, has_pole: bool = True) -> Scene:
 
 
 def entry_time(box: Box, ball: BallState, gravity: Array) -> tuple[Array, Array]:
-    """When a ball that comes from outside gets into a box, through a side or the top.
+    """Return when a ball that comes from outside gets into a box, through a side or the top.
 
     By components, so that a compiled program of one ball has few loops.
 

@@ -14,10 +14,9 @@ A throw is drawn anew unless the ball, of 0.05 m radius, gets into the outer box
 the top, from there into the inner box, and touches no pole before. Robot base frame, z up, SI.
 """
 
-from typing import Any
-
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 
 from planner_jax.core.registry import require_name
 from planner_jax.task.arguments import make_generators
@@ -51,9 +50,9 @@ def draw_cases(
     wide: bool = False,
     anywhere: bool = False,
     delay: float = 0.0,
-    dtype: Any = jnp.float32,
+    dtype: DTypeLike = jnp.float32,
 ) -> BlockCase:
-    """A batch of cases of a suite, drawn in float64 and then cast.
+    """Return a batch of cases of a suite, drawn in float64 and then cast.
 
     Args:
         suite: a key of `SUITES`.
@@ -85,7 +84,7 @@ def draw_cases(
 
 
 def _throw(suite: Suite, random: np.random.Generator) -> np.ndarray:
-    """The first draw that counts: position [m] and velocity [m/s] at the launch, (2, 3)."""
+    """Return the first draw that counts: position [m] and velocity [m/s] at the launch, (2, 3)."""
     while True:
         azimuth, distance = random.uniform(-AZIMUTH, AZIMUTH), random.uniform(*suite.distance)
         pos = np.array(
@@ -105,7 +104,7 @@ def _throw(suite: Suite, random: np.random.Generator) -> np.ndarray:
 
 
 def _counts(suite: Suite, pos: np.ndarray, vel: np.ndarray, duration: float) -> bool:
-    """Whether a ball that comes to the inner box at a time [s] enters both boxes, past the pole."""
+    """Return whether a ball, in the inner box at a time [s], enters both boxes past the pole."""
     times = np.linspace(0.0, duration, int(np.ceil(duration / _LOOK)) + 1)[:-1]
     places = pos + vel * times[:, None]
     places[:, 2] -= 0.5 * GRAVITY * times**2

@@ -8,7 +8,7 @@ from jax import Array
 
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath, HarmonicPath, TargetPath, state_at
-from planner_jax.robot.quadrotor_reach import beyond_reach, greatest_speed
+from planner_jax.robot.quadrotor import beyond_reach, greatest_speed
 from planner_jax.task.catch.case import CatchCase
 
 _RESTING = 1e-3  # [m/s]: a target that is much slower has no direction to come from

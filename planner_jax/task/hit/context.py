@@ -7,7 +7,7 @@ from jax import Array, lax
 
 from planner_jax.ball.flight import drag_free_fall_time
 from planner_jax.ball.prediction import PathTable, predict_path
-from planner_jax.robot.quadrotor_reach import ALLOWED, beyond_reach, greatest_speed
+from planner_jax.robot.quadrotor import ALLOWED, beyond_reach, greatest_speed
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.plan import Stroke
 

@@ -3,7 +3,7 @@
 from flax import struct
 from jax import Array
 
-from planner_jax.robot.quadrotor_plan import QuadrotorPlan
+from planner_jax.robot.quadrotor import QuadrotorPlan
 
 
 @struct.dataclass

@@ -51,7 +51,7 @@ class JointReference:
 
 
 def reference_at(course: Course, time: Array) -> JointReference:
-    """The course at a time () [s].
+    """Return the course at a time () [s].
 
     Before it begins the joints turn as evenly as they do when it does, mostly not at all. Where it
     ends each joint brakes evenly, and stays where it stands.
@@ -75,7 +75,7 @@ def reference_at(course: Course, time: Array) -> JointReference:
 def control(
     state: JointState, reference: JointReference, arm: Arm, gains: Gains, gravity: float
 ) -> Array:
-    """Torques (6,) [N m] to ask for, of an arm as it is believed to be."""
+    """Return torques (6,) [N m] to ask for, of an arm as it is believed to be."""
     angle_error, rate_error = reference.angles - state.angles, reference.rates - state.rates
     wanted = (
         reference.accelerations

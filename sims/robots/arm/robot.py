@@ -39,12 +39,12 @@ _THICKNESS = 0.01  # [m], of the shield
 
 @functools.cache
 def _arm(xml: str) -> Any:
-    """The `Arm` of MJCF text, NumPy float64 leaves."""
+    """Return the `Arm` of MJCF text, NumPy float64 leaves."""
     return read_arm(xml, dtype=np.float64)
 
 
 def lanes_of(arm: Arm) -> dict[str, np.ndarray]:
-    """One arm as the referee's kinematics take a batch of one lane."""
+    """Return one arm as the referee's kinematics take a batch of one lane."""
     names = ("origin", "turn", "axis", "shield_centre")
     return {f"arm.{name}": np.asarray(getattr(arm, name), float)[None] for name in names}
 
@@ -70,7 +70,7 @@ class ShieldArm:
         return _arm(self.xml)
 
     def mjcf(self) -> tuple[str, str]:
-        """The chain of links with capsules and shield, and a motor a joint."""
+        """Return the chain of links with capsules and shield, and a motor a joint."""
         arm = self.arm
         solids = {k: [] for k in range(-1, 6)}
         for link, ends, radius in zip(
@@ -99,7 +99,7 @@ class ShieldArm:
         return base + "".join(solids[-1]) + chain + 7 * "</body>", motors
 
     def _link(self, k: int) -> str:
-        """The begin of link k + 1: its body, joint and inertial."""
+        """Return the begin of link k + 1: its body, joint and inertial."""
         arm = self.arm
         inertia = arm.inertia[k]
         full = [*np.diag(inertia), inertia[0, 1], inertia[0, 2], inertia[1, 2]]
@@ -112,20 +112,20 @@ class ShieldArm:
         )
 
     def at_rest(self, place: Array, gravity: float) -> tuple[Array, Array, Array]:
-        """At home; an arm stands where its base does, whatever the place (3,) [m]."""
+        """Return the state at home; the arm stands at its base, whatever the position (3,) [m]."""
         home = jnp.asarray(self.arm.home, place.dtype)
         return home, jnp.zeros_like(home), jnp.zeros(0, place.dtype)
 
     def drive(self, physics: Physics, command: Array, timestep: float) -> tuple[Array, Array]:
-        """The torques (6,) [N m] as they are, and no other forces."""
+        """Return the torques (6,) [N m] as they are, and no other forces."""
         return command, jnp.zeros_like(command)
 
     def state(self, physics: Physics) -> JointState:
-        """The arm's part of the simulated state."""
+        """Return the arm's part of the simulated state."""
         return JointState(angles=physics.qpos[:6], rates=physics.qvel[:6])
 
     def sensed(self, state: JointState, noise: Array, stds: Any) -> JointState:
-        """What the encoders say.
+        """Return the measurements of the encoders.
 
         Args:
             state: the true one.
@@ -136,7 +136,7 @@ class ShieldArm:
         return JointState(angles=state.angles + errors[0], rates=state.rates + errors[1])
 
     def references(self, plan: Course, times: Array, world: World) -> JointReference:
-        """What is tracked at times (K,) [s]; leaves (K, ...).
+        """Return the references at times (K,) [s]; leaves (K, ...).
 
         MuJoCo keeps rates of half a step before, and applies a torque until a step later.
         """
@@ -152,7 +152,7 @@ class ShieldArm:
     def command(
         self, state: JointState, reference: JointReference, world: World, mass_error: Any = 0.0
     ) -> Array:
-        """Torques (6,) [N m], of an arm whose masses are believed so much wrong, relative."""
+        """Return torques (6,) [N m] of an arm whose believed masses have a relative error."""
         dtype = state.angles.dtype
         arm = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), self.arm)
         factor = 1.0 + mass_error
@@ -160,7 +160,7 @@ class ShieldArm:
         return control(state, reference, believed, self.gains, world.gravity)
 
     def shapes(self) -> list[Shape]:
-        """The base, links 1 to 6 with their capsules, and the shield."""
+        """Return the base, links 1 to 6 with their capsules, and the shield."""
         arm = self.arm
         solids: list[list[Solid]] = [[] for _ in range(7)]
         solids[0].append(box_solid(*arm.base_box))
@@ -181,7 +181,7 @@ class ShieldArm:
         ]
 
     def places(self, pose: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Position [m] and attitude, w x y z, of base, links and shield."""
+        """Return position [m] and attitude, w x y z, of base, links and shield."""
         turns, places = links_of(lanes_of(self.arm), np.reshape(pose, (6, 1, 1)))
         base = np.array([0.0, 0.0, self.base_height])
         found = [(base, np.array([1.0, 0.0, 0.0, 0.0]))]
@@ -191,17 +191,17 @@ class ShieldArm:
         return [*found, found[-1]]
 
     def place(self, poses: np.ndarray) -> np.ndarray:
-        """The middle of the shield's face, (..., 3) [m]."""
+        """Return the middle of the shield's face, (..., 3) [m]."""
         case = lanes_of(self.arm)
         angles = np.moveaxis(np.reshape(poses, (1, -1, 6)), 2, 0)
         middle = shield_middle(case, *links_of(case, angles))[:, 0].T
         return middle.reshape(*np.shape(poses)[:-1], 3) + [0.0, 0.0, self.base_height]
 
     def held_ball(self, pose: np.ndarray) -> np.ndarray:
-        """NaN (3,): it holds none."""
+        """Return naN (3,): it holds none."""
         return np.full(3, np.nan)
 
 
 def _box(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Middle and half edges (3,) [m] of a box of two corners (2, 3)."""
+    """Return middle and half edges (3,) [m] of a box of two corners (2, 3)."""
     return 0.5 * (corners[0] + corners[1]), 0.5 * (corners[1] - corners[0])

@@ -10,7 +10,7 @@ none is free, least squares of `OnlineBlock` begin with them.
 
 import dataclasses
 import os
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ from flax import struct
 from jax import Array, lax
 
 from planner_jax.ball.flight import drag_free_flight
-from planner_jax.baselines.block.library.cells import cells_around
+from planner_jax.baselines.block.library.cells import Face, cells_around
 from planner_jax.baselines.block.library.file import load_library
 from planner_jax.baselines.block.library.planner import LibraryBlock
 from planner_jax.baselines.block.library.table import pieces_of, unpacked
@@ -34,6 +34,7 @@ from planner_jax.task.block.default_planner import OnlineBlock
 from planner_jax.task.block.end_poses import EndPoses, Flight, end_poses, flight_of
 from planner_jax.task.block.motion import angles_at, profiles, sums
 from planner_jax.task.block.plan import BlockPlan, explain_status, make_empty_plan
+from planner_jax.task.block.scene import Box
 
 _HIGHEST = lax.Precision.HIGHEST
 # How far joints are to be turned, squared, counts less for those of the wrist, which carry little;
@@ -101,7 +102,7 @@ class AdaptBlock(Planner):
         self.stored.check(cases)
 
     def solve(self, case: BlockCase, attempt: Effort) -> BlockPlan:
-        """The plan of one case."""
+        """Return the plan of one case."""
         flight = flight_of(case)
         home, fits = self.stored.home_of(case)
         poses = end_poses(case, flight, attempt.points, self.online.pieces)
@@ -127,7 +128,7 @@ class AdaptBlock(Planner):
     def warped(
         self, case: BlockCase, flight: Flight, home: Array, poses: EndPoses, effort: Effort
     ) -> Warped:
-        """Stored motions from a home, warped to end poses at points of the ball's way."""
+        """Return stored motions from a home, warped to end poses at points of the ball's way."""
         online, dtype = self.online, case.angles.dtype
         pieces, num = online.pieces, effort.points
         steps, away, found = self.neighbours(case, flight, home, effort.neighbours)
@@ -168,7 +169,7 @@ class AdaptBlock(Planner):
     def neighbours(
         self, case: BlockCase, flight: Flight, home: Array, num: int
     ) -> tuple[Array, Array, Array]:
-        """Motions stored for the cells around the ball's own.
+        """Return motions stored for the cells around the ball's own.
 
         Returns:
             steps: (N, K, 6) [rad]; zero without one.
@@ -178,7 +179,7 @@ class AdaptBlock(Planner):
         table = self.stored.library.table
         layout = table.layout
 
-        def around(faces: Any, box: Any, time: Array) -> tuple[Array, Array, Array]:
+        def around(faces: tuple[Face, ...], box: Box, time: Array) -> tuple[Array, Array, Array]:
             place = drag_free_flight(case.ball, time, case.gravity).pos
             return cells_around(faces, box, tuple(place))
 
@@ -195,7 +196,7 @@ class AdaptBlock(Planner):
         return jnp.where(found[:, None, None], row.steps, 0.0), -away, found
 
     def short_of_pole(self, case: BlockCase, moves: Array, samples: int) -> Array:
-        """How much nearer to the pole than they may some motions (C, K, 6) get, (C,) [m]."""
+        """Return how much nearer to the pole than they may some motions (C, K, 6) get, (C,) [m]."""
         shares = tuple(np.arange(1, samples + 1) / samples)
         rest = jnp.zeros_like(case.angles)
         angles = jax.vmap(lambda steps: angles_at(case.angles, rest, steps, shares))(moves)
@@ -204,7 +205,7 @@ class AdaptBlock(Planner):
 
 
 def adapt_planner(file: str | os.PathLike) -> AdaptBlock:
-    """The planner of a file that `planner-jax library build` wrote.
+    """Return the planner of a file that `planner-jax library build` wrote.
 
     The table is read, and kept on the default device.
 

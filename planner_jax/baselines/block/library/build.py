@@ -7,17 +7,23 @@ import os
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 from tqdm import tqdm
 
 from planner_jax.baselines.block.library.cells import Layout, Tunnels, tunnels
 from planner_jax.baselines.block.library.file import BUILD_VERSION, save_library
-from planner_jax.baselines.block.library.pairs import BentPair, PairCase, PairPlanner, StraightPair
+from planner_jax.baselines.block.library.pairs import (
+    BentPair,
+    PairCase,
+    PairPlan,
+    PairPlanner,
+    StraightPair,
+)
 from planner_jax.baselines.block.library.table import (
     Library,
     Row,
@@ -29,13 +35,14 @@ from planner_jax.baselines.block.library.table import (
     pieces_of,
     unpacked,
 )
+from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import solved
 from planner_jax.host.files import replacing
 from planner_jax.planning.plan import plan
 from planner_jax.robot.arm import shield_pose
 from planner_jax.task.block.clearance import least_clearances
-from planner_jax.task.block.default_planner import read_learned_starts
+from planner_jax.task.block.default_planner import OnlineBlock, read_learned_starts
 from planner_jax.task.block.motion import angles_at
 from planner_jax.task.block.scene import Scene
 
@@ -74,7 +81,7 @@ class _Motions:
 def build(
     path: str | os.PathLike,
     setting: Setting,
-    homes: Any,
+    homes: ArrayLike,
     layout: Layout,
     *,
     progress: bool = True,
@@ -124,7 +131,7 @@ def build(
 def repair(
     library: Library, scene: Scene, *, retry: bool = False, progress: bool = True
 ) -> tuple[Library, np.ndarray]:
-    """The library in another scene: what is no longer free there is planned anew.
+    """Return the library in another scene: what is no longer free there is planned anew.
 
     Args:
         library: of a scene with the same boxes.
@@ -162,11 +169,11 @@ def repair(
 
 
 def portions() -> Portions:
-    """How much this process's devices plan at a time."""
+    """Return the numbers of pairs that this process's devices plan at a time."""
     return _ON_CPU if jax.default_backend() == "cpu" else _ON_GPU
 
 
-def _require_free(setting: Setting, homes: Any) -> None:
+def _require_free(setting: Setting, homes: ArrayLike) -> None:
     """Raise `ValueError` where the arm touches something at a home."""
     for k, home in enumerate(np.asarray(homes)):
         near = float(_nearest(setting, home[None, None])[0])
@@ -177,9 +184,13 @@ def _require_free(setting: Setting, homes: Any) -> None:
 
 
 def plan_pairs(
-    setting: Setting, home: Any, tunnel: Tunnels, pairs: np.ndarray, old: Any = None
+    setting: Setting,
+    home: np.ndarray,
+    tunnel: Tunnels,
+    pairs: np.ndarray,
+    old: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Rows (N, 6 K + 10) of a table for some pairs (N,), from one home.
+    """Return rows (N, 6 K + 10) of a table for some pairs (N,), from one home.
 
     Straight motions first. Then least squares from one learned start after another, for those
     pairs that might be reached earlier or have nothing yet. All of it again, more coarsely, for
@@ -192,10 +203,10 @@ def plan_pairs(
         pairs: numbers of those to plan for.
         old: their rows in another scene, from which to begin as well.
     """
-    straight, bent = StraightPair(setting, home), BentPair(setting, home)
-    corners = (getattr(tunnel, name)[pairs].astype(np.float32) for name in ("outer", "inner"))
-    outer, inner = corners
-    given: Any = np.zeros((len(pairs), 6 * straight.online.pieces + 1), np.float32)
+    straight = StraightPair(setting, host_leaf(home))
+    bent = BentPair(setting, host_leaf(home))
+    outer, inner = (each[pairs].astype(np.float32) for each in (tunnel.outer, tunnel.inner))
+    given = np.zeros((len(pairs), 6 * straight.online.pieces + 1), np.float32)
     has_old = np.zeros(len(pairs), bool)
     if old is not None:
         row = unpacked(old)
@@ -214,11 +225,10 @@ def plan_pairs(
         if not some.size:
             return
         lanes = np.repeat(some, len(starts))
-        start: Any = np.tile(np.asarray(starts, np.int32), len(some))
-        coarse: Any = np.full(len(lanes), is_coarse)
-        best: Any = found.entry[lanes]
-        cases = PairCase(outer[lanes], inner[lanes], coarse, best, start, given[lanes])
-        plans = _planned(planner, cases)
+        start = np.tile(np.asarray(starts, np.int32), len(some))
+        coarse = np.full(len(lanes), is_coarse)
+        leaves = (outer[lanes], inner[lanes], coarse, found.entry[lanes], start, given[lanes])
+        plans = _plan_batch(planner, PairCase(*map(host_leaf, leaves)))
         cost = np.where(solved(plans), plans.cost, np.inf).reshape(len(some), -1)
         first = np.arange(0, len(lanes), len(starts)) + np.argmin(cost, axis=1)
         cost = np.min(cost, axis=1)
@@ -244,41 +254,41 @@ def plan_pairs(
 
 
 def _groups(starts: Sequence[int]) -> list[Sequence[int]]:
-    """Starts in groups, each for one call."""
+    """Return starts in groups, each for one call."""
     num = portions().starts
     return [starts[begin : begin + num] for begin in range(0, len(starts), num)]
 
 
-def _planned(planner: Any, cases: PairCase) -> Any:
-    """Plans of a batch, in calls of few sizes, so that few programs are compiled."""
+def _plan_batch(planner: PairPlanner, cases: PairCase) -> PairPlan:
+    """Return plans of a batch, in calls of few sizes, so that few programs are compiled."""
     num, devices = len(cases.best), jax.local_device_count()
     few, many = portions().lanes
     lanes = few if num <= _FEW * few * devices else many
     whole = -(-num // (lanes * devices)) * lanes * devices
     # The last one again: on a CPU it is not solved again.
     filled = jax.tree.map(lambda leaf: leaf[np.minimum(np.arange(whole), num - 1)], cases)
-    plans: Any = plan(planner, filled, chunk=lanes)
+    plans = plan(planner, filled, chunk=lanes)
     return jax.tree.map(lambda leaf: leaf[:num], plans)
 
 
 def _rows_of(planner: PairPlanner, found: _Motions) -> np.ndarray:
-    """Rows of a table for motions; those without one have an infinite duration."""
+    """Return rows of a table for motions; those without one have an infinite duration."""
     stored = np.isfinite(found.entry)
     pieces = planner.online.pieces
-    steps: Any = found.point[:, :-1].reshape(-1, pieces, 6).copy()
+    steps = found.point[:, :-1].reshape(-1, pieces, 6).copy()
     if planner.setting.ends_at_rest:
         steps[:, -1] = 0.0
     steps[~stored] = 0.0
     ends = [_ends(planner.setting, planner.home, some) for some in _in_parts(steps)]
-    parts: Any = (np.concatenate(each)[: len(steps)] for each in zip(*ends, strict=True))
+    parts = (np.concatenate(each)[: len(steps)] for each in zip(*ends, strict=True))
     rotation, middle = parts
-    duration: Any = np.where(stored, found.point[:, -1], np.inf)
-    row: Any = Row(steps, duration, middle, rotation[:, :, 0], rotation[:, :, 1])
-    return packed(row)
+    duration = np.where(stored, found.point[:, -1], np.inf)
+    leaves = (steps, duration, middle, rotation[:, :, 0], rotation[:, :, 1])
+    return packed(Row(*map(host_leaf, leaves)))
 
 
 def _in_parts(array: np.ndarray) -> list[np.ndarray]:
-    """An array cut into equal parts along its first axis, the last one filled up."""
+    """Return an array cut into equal parts along its first axis, the last one filled up."""
     num = -(-len(array) // _LOOKED_AT) * _LOOKED_AT
     filled = array[np.minimum(np.arange(num), len(array) - 1)]
     return list(filled.reshape(-1, _LOOKED_AT, *array.shape[1:]))
@@ -286,7 +296,7 @@ def _in_parts(array: np.ndarray) -> list[np.ndarray]:
 
 @jax.jit
 def _ends(setting: Setting, home: Array, steps: Array) -> tuple[Array, Array]:
-    """Rotations (N, 3, 3) and middles (N, 3) [m] of the shield where motions end."""
+    """Return rotations (N, 3, 3) and middles (N, 3) [m] of the shield where motions end."""
 
     def end(steps: Array) -> tuple[Array, Array]:
         angles = angles_at(home, jnp.zeros_like(home), steps, (1.0,))[0]
@@ -295,9 +305,9 @@ def _ends(setting: Setting, home: Array, steps: Array) -> tuple[Array, Array]:
     return jax.vmap(end)(steps)
 
 
-def _is_free(setting: Setting, home: Any, rows: np.ndarray) -> np.ndarray:
-    """Which of some stored motions keep the planner's margin from everything, (N,) bool."""
-    online = StraightPair(setting, home).online
+def _is_free(setting: Setting, home: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Return which of some stored motions keep the planner's margin from everything, (N,) bool."""
+    online = OnlineBlock()
     if not len(rows):
         return np.zeros(0, bool)
     shares = tuple(np.arange(1, online.checked + 1) / online.checked)
@@ -309,20 +319,20 @@ def _is_free(setting: Setting, home: Any, rows: np.ndarray) -> np.ndarray:
 
 @functools.partial(jax.jit, static_argnames="shares")
 def _nearest_on_way(setting: Setting, home: Array, steps: Array, shares: tuple) -> Array:
-    """Least distances (N,) [m] along motions with steps (N, K, 6)."""
+    """Return least distances (N,) [m] along motions with steps (N, K, 6)."""
     at = lambda steps: angles_at(home, jnp.zeros_like(home), steps, shares)  # noqa: E731
     return _nearest(setting, jax.vmap(at)(steps))
 
 
 @jax.jit
 def _nearest(setting: Setting, angles: Array) -> Array:
-    """Least distances (N,) [m] at angles (N, S, 6)."""
+    """Return least distances (N,) [m] at angles (N, S, 6)."""
     flat = least_clearances(setting.arm, setting.scene, angles.reshape(-1, 6))
     return jnp.min(flat.reshape(angles.shape[:2]), axis=1)
 
 
 def _empty_rows(homes: int, layout: Layout, planner: PairPlanner) -> np.ndarray:
-    """Rows of a table without a motion."""
+    """Return rows of a table without a motion."""
     pieces = planner.online.pieces
     rows = np.zeros((homes, layout.num_pairs, 6 * pieces + 10), np.float32)
     rows[..., 6 * pieces] = np.inf

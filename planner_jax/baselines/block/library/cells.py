@@ -71,7 +71,7 @@ class Layout:
 
 
 def _faces(names: str, cells: tuple[int, int]) -> tuple[Face, ...]:
-    """Faces by names such as "+x +y", with as many cells each."""
+    """Return faces by names such as "+x +y", with as many cells each."""
     return tuple(
         Face("xyz".index(name[1]), 1 if name[0] == "+" else -1, cells) for name in names.split()
     )
@@ -90,7 +90,7 @@ LAYOUTS = {
 
 
 def cell_of(faces: tuple[Face, ...], box: Box, point: Sequence[Array]) -> tuple[Array, Array]:
-    """The cell in which a point of a box's surface lies, in closed form.
+    """Return the cell in which a point of a box's surface lies, in closed form.
 
     The point is of the face that it is farthest out towards, in shares of the box; where these are
     equal, as on an edge, of the face across the first axis. What lies between two cells is of the
@@ -124,7 +124,7 @@ def cell_of(faces: tuple[Face, ...], box: Box, point: Sequence[Array]) -> tuple[
 def cells_around(
     faces: tuple[Face, ...], box: Box, point: Sequence[Array]
 ) -> tuple[Array, Array, Array]:
-    """The cells nearest to a point of a box's surface: up to two each way, of the point's face.
+    """Return the cells nearest to a point of a box's surface, up to two in each direction.
 
     Args:
         faces: that have cells.
@@ -166,7 +166,7 @@ class Tunnels:
 
 
 def tunnels(layout: Layout, inner: Box, outer: Box) -> Tunnels:
-    """The tunnels between the cells of two boxes.
+    """Return the tunnels between the cells of two boxes.
 
     A ball gets to an inner cell only from in front of that cell's face. The outer cell is therefore
     cut off at the plane of this face; what is left is again a rectangle, and as both boxes are
@@ -195,7 +195,7 @@ def tunnels(layout: Layout, inner: Box, outer: Box) -> Tunnels:
 
 
 def _corners(faces: tuple[Face, ...], box: Box) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest corners (N, 2, 3) [m] of all cells, and their faces' places (N,)."""
+    """Return the extreme corners (N, 2, 3) [m] of all cells, and the indices (N,) of faces."""
     lower, upper = np.asarray(box.lower, float), np.asarray(box.upper, float)
     found, of_face = [], []
     for place, face in enumerate(faces):
@@ -212,7 +212,7 @@ def _corners(faces: tuple[Face, ...], box: Box) -> tuple[np.ndarray, np.ndarray]
 
 
 def nominal_ball(outer: Array, inner: Array) -> tuple[BallState, Array]:
-    """The ball that stands for all of a tunnel: from the middle of one cell to that of the other.
+    """Return the ball that represents a tunnel: from the middle of one cell to the other middle.
 
     Args:
         outer: (2, 3) [m], corners of the outer cell, lowest and highest.
@@ -230,7 +230,7 @@ def nominal_ball(outer: Array, inner: Array) -> tuple[BallState, Array]:
 
 
 def farthest_crossing(outer: Array, inner: Array, middle: Array, rotation: Array) -> Array:
-    """How far from a shield's middle the balls of a tunnel cross its plane.
+    """Return how far from a shield's middle the balls of a tunnel cross its plane.
 
     All straight lines from a rectangle to another one cross a plane between the two within the
     convex hull of the crossings of the lines from corner to corner: with one end held, the crossing
@@ -260,6 +260,6 @@ def farthest_crossing(outer: Array, inner: Array, middle: Array, rotation: Array
 
 
 def _corners_of(box: Array) -> Array:
-    """The corners (8, 3) of a box along the axes (2, 3); of a flat one each is there twice."""
+    """Return the corners (8, 3) of a box along the axes (2, 3); a flat box has each one twice."""
     high = np.indices((2, 2, 2)).reshape(3, 8).T == 1
     return jnp.where(high, box[1], box[0])

@@ -1,17 +1,18 @@
 """How much of what balls can do a library covers, and whether its motions hold."""
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import ArrayLike
 
 from planner_jax.ball.flight import BallState, drag_free_flight
 from planner_jax.baselines.block.library.cells import GRAVITY, Tunnels, farthest_crossing, tunnels
 from planner_jax.baselines.block.library.planner import LibraryBlock
 from planner_jax.baselines.block.library.table import Library, Row, unpacked
+from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import solved
 from planner_jax.planning.plan import plan
@@ -32,12 +33,12 @@ class Coverage:
     is_sure: np.ndarray  # and its shield blocks the whole tunnel
 
     def share(self, of: np.ndarray) -> np.ndarray:
-        """Share of some pairs (P,) that have a motion, (H,)."""
+        """Return share of some pairs (P,) that have a motion, (H,)."""
         return (self.found & of).sum(axis=1) / of.sum()
 
 
 def coverage(library: Library) -> Coverage:
-    """What a library covers."""
+    """Return the coverage of a library."""
     scene, found = library.setting.scene, library.found
     tunnel = tunnels(library.table.layout, scene.inner, scene.outer)
     row = unpacked(np.asarray(library.table.rows))
@@ -54,11 +55,11 @@ def coverage(library: Library) -> Coverage:
 
 @jax.jit
 def _farthest(outer: Array, inner: Array, row: Row) -> Array:
-    """`farthest_crossing` of every home's rows, (H, P) [m]."""
+    """Return `farthest_crossing` of every home's rows, (H, P) [m]."""
 
     def one(outer: Array, inner: Array, row: Row) -> Array:
         sides = [row.normal, row.edge, jnp.cross(row.normal, row.edge)]
-        return farthest_crossing(outer, inner, row.middle, jnp.stack(sides, axis=1))
+        return farthest_crossing(outer, inner, jnp.asarray(row.middle), jnp.stack(sides, axis=1))
 
     of_home = jax.vmap(one)
     return jax.vmap(of_home, (None, None, 0))(outer, inner, row)
@@ -104,7 +105,7 @@ def check(library: Library, num: int, seed: int = 0, home: int = 0) -> Check:
 def _thrown(
     library: Library, tunnel: Tunnels, pairs: np.ndarray, rng: np.random.Generator, home: int
 ) -> BlockCase:
-    """Balls from anywhere on outer cells to anywhere on inner ones."""
+    """Return balls from anywhere on outer cells to anywhere on inner ones."""
     num, setting = len(pairs), library.setting
     ends = []
     for corners in (tunnel.outer[pairs], tunnel.inner[pairs]):
@@ -118,8 +119,8 @@ def _thrown(
     duration = unpacked(np.asarray(library.table.rows)[home, pairs]).duration
     before = jax.tree.map(np.asarray, _earlier(ball, jnp.asarray(duration + _SPARE)))
 
-    def shared(leaf: Any) -> Any:
-        return np.broadcast_to(leaf, (num, *np.shape(leaf)))
+    def shared(leaf: ArrayLike) -> Array:
+        return host_leaf(np.broadcast_to(np.asarray(leaf), (num, *np.shape(leaf))))
 
     setting = jax.tree.map(shared, setting)
     same = lambda value: shared(np.asarray(value, np.float32))  # noqa: E731
@@ -140,6 +141,6 @@ def _thrown(
 
 @jax.jit
 def _earlier(balls: BallState, times: Array) -> BallState:
-    """Balls (B,) so much time (B,) [s] before."""
+    """Return balls (B,) so much time (B,) [s] before."""
     gravity = jnp.asarray(GRAVITY, times.dtype)
     return jax.vmap(drag_free_flight, (0, 0, None))(balls, -times, gravity)

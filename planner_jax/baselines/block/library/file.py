@@ -1,10 +1,10 @@
-"""Libraries as files: a header of text, then arrays that are mapped into memory; no pickle.
+"""Files of libraries: a header of text, then arrays that are mapped into memory; no pickle.
 
     planner-jax block library 1
     {"fingerprint": ..., "layout": ..., "links": ..., "arrays": ..., "size": ...}
 
-The second line is JSON: hash of the setting, faces with cells, links of the arm's capsules, name,
-kind, shape and place of every array, and the file's size. Blanks fill it up to the first array.
+The second line is JSON: the setting's hash, faces with cells, links of the arm's capsules, type,
+shape and offset of every array by name, and the file's size. Blanks fill it up to the first array.
 Arrays are little-endian, in C order, and begin at multiples of 64 bytes.
 """
 
@@ -14,6 +14,7 @@ import os
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from planner_jax.baselines.block.library.cells import Face, Layout
 from planner_jax.baselines.block.library.table import (
@@ -24,12 +25,11 @@ from planner_jax.baselines.block.library.table import (
     pieces_of,
 )
 from planner_jax.core.errors import ArgumentError
+from planner_jax.core.plan_files import UNREADABLE, build_tree, named_leaves
 from planner_jax.host.files import open_plain, replacing
-from planner_jax.robot.arm import Arm, ArmLimits
-from planner_jax.task.block.scene import Box, Scene
 
 VERSION = 1
-BUILD_VERSION = 1  # of how libraries are planned: parts of another one are not gone on with
+BUILD_VERSION = 1  # of how libraries are planned: a build does not continue another version's
 _MAGIC = "planner-jax block library"
 _ALIGNED, _LONGEST = 64, 1 << 20  # bytes
 
@@ -42,8 +42,8 @@ def save_library(path: str | os.PathLike, library: Library) -> None:
     """
     table, setting = library.table, library.setting
     arrays = {"rows": np.asarray(table.rows, "<f4"), "homes": np.asarray(table.homes, "<f4")}
-    arrays |= {name: _plain(leaf) for name, leaf in _leaves(setting) if name != _LINKS}
-    header: dict[str, Any] = {
+    arrays |= {name: _plain(leaf) for name, leaf in named_leaves(setting).items()}
+    header: dict[str, object] = {
         "fingerprint": fingerprint(setting),
         "layout": dataclasses.asdict(table.layout),
         "links": list(setting.arm.capsule_link),
@@ -68,7 +68,7 @@ def save_library(path: str | os.PathLike, library: Library) -> None:
 
 
 def load_library(path: str | os.PathLike) -> Library:
-    """The library that `save_library` wrote; its table is mapped, read when it is looked at.
+    """Load the library that `save_library` wrote; its table is mapped, and read when it is used.
 
     Raises:
         ArgumentError: the file is not there, is something else, of another version, or cut off.
@@ -76,8 +76,7 @@ def load_library(path: str | os.PathLike) -> Library:
     shown = repr(os.fspath(path))
     try:
         with open_plain(path) as file:
-            first = file.readline(_LONGEST)
-            second = file.readline(_LONGEST)
+            first, second = file.readline(_LONGEST), file.readline(_LONGEST)
             size = os.fstat(file.fileno()).st_size
     except OSError as error:
         hint = f"`planner-jax library build {os.fspath(path)}` makes one"
@@ -95,83 +94,41 @@ def load_library(path: str | os.PathLike) -> Library:
     except (ValueError, RecursionError):
         raise ArgumentError("library", f"a whole file, {shown} is cut off", shown="") from None
     try:
-        if size != header["size"]:
-            raise ArgumentError(
-                "library", f"a whole file of {header['size']} bytes", shown=f"{size} in {shown}"
-            )
-        library, rows = _library(path, header)
-    except (KeyError, TypeError, IndexError, AttributeError, OverflowError, OSError) as error:
-        raise _damaged(shown, error) from None
-    except ValueError as error:
-        raise error if isinstance(error, ArgumentError) else _damaged(shown, error) from None
-    layout = library.table.layout
-    known, found = header["fingerprint"], fingerprint(library.setting)
-    if known != found or rows.shape[1] != layout.num_pairs or pieces_of(rows) < 1:
-        raise ArgumentError(
-            "library", f"the setting {known}", verb="have", shown=f"{found} in {shown}"
-        )
+        whole = header["size"]
+        library = _map_library(path, header) if size == whole else None
+    except (*UNREADABLE, IndexError, AttributeError, OverflowError) as error:
+        damage = f"a whole file, {shown} has a damaged header ({type(error).__name__})"
+        raise ArgumentError("library", damage, shown="") from None
+    if library is None:
+        raise ArgumentError("library", f"a whole file of {whole} bytes", shown=f"{size} in {shown}")
+    rows, known = library.table.rows, header["fingerprint"]
+    found, num_pairs = fingerprint(library.setting), library.table.layout.num_pairs
+    if known != found or rows.shape[1] != num_pairs or pieces_of(rows) < 1:
+        rule = f"the setting {known}"
+        raise ArgumentError("library", rule, verb="have", shown=f"{found} in {shown}")
     return library
 
 
-def _damaged(shown: str, error: Exception) -> ArgumentError:
-    return ArgumentError(
-        "library", f"a whole file, {shown} has a damaged header ({type(error).__name__})", shown=""
+def _map_library(path: str | os.PathLike, header: dict[str, Any]) -> Library:
+    """Return the library that a header describes, its rows mapped."""
+    arrays: dict[str, Any] = {}
+    for name, (kind, shape, place) in header["arrays"].items():
+        mapped = np.memmap(path, kind, "r", place, tuple(shape) or (1,))
+        mapped = mapped if shape else mapped[0]
+        arrays[name] = mapped if name == "rows" else np.array(mapped)
+    layout = Layout(
+        *(
+            tuple(Face(face["axis"], face["side"], tuple(face["cells"])) for face in faces)
+            for faces in (header["layout"]["outer"], header["layout"]["inner"])
+        )
     )
+    rows, homes = arrays.pop("rows"), arrays.pop("homes")
+    setting = build_tree(Setting, "", arrays | {"arm.capsule_link": tuple(header["links"])})
+    return library_of(rows, homes, layout, setting)
 
 
-def _library(path: str | os.PathLike, header: dict[str, Any]) -> tuple[Library, np.ndarray]:
-    """The library that a header describes, and its rows, which are mapped."""
-    arrays: dict[str, Any] = {
-        name: np.memmap(path, kind, "r", place, tuple(shape))
-        if shape
-        else np.memmap(path, kind, "r", place, (1,))[0]
-        for name, (kind, shape, place) in header["arrays"].items()
-    }
-    layout = Layout(*(tuple(_face(face) for face in header["layout"][s]) for s in _BOXES))
-    rows = arrays.pop("rows")
-    homes = np.array(arrays.pop("homes"))
-    return library_of(rows, homes, layout, _setting(header, arrays)), rows
-
-
-_BOXES = ("outer", "inner")
-_LINKS = "arm.capsule_link"
-
-
-def _face(values: dict[str, Any]) -> Face:
-    return Face(values["axis"], values["side"], tuple(values["cells"]))
-
-
-def _setting(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Setting:
-    """The setting of arrays by the names of its leaves."""
-    leaves = {name: np.array(value) for name, value in arrays.items()}
-
-    def tree(kind: Any, prefix: str, **other: Any) -> Any:
-        names = {field.name for field in dataclasses.fields(kind)} - other.keys()
-        return kind(**{name: leaves[prefix + name] for name in names}, **other)
-
-    return Setting(
-        arm=tree(Arm, "arm.", capsule_link=tuple(header["links"])),
-        limits=tree(ArmLimits, "limits."),
-        ends_at_rest=leaves["ends_at_rest"],  # type: ignore[arg-type]
-        scene=tree(
-            Scene, "scene.", **{name: tree(Box, f"scene.{name}.") for name in ("inner", "outer")}
-        ),
-    )
-
-
-def _leaves(tree: Any, prefix: str = "") -> list[tuple[str, Any]]:
-    """Names, joined by dots, and leaves of a dataclass."""
-    found = []
-    for field in dataclasses.fields(tree):
-        value = getattr(tree, field.name)
-        name = prefix + field.name
-        inner = dataclasses.is_dataclass(value)
-        found += _leaves(value, f"{name}.") if inner else [(name, value)]
-    return found
-
-
-def _plain(leaf: Any) -> np.ndarray:
-    """An array as it is written."""
+def _plain(leaf: ArrayLike) -> np.ndarray:
+    """Return a leaf as the array that is written."""
     value = np.ascontiguousarray(leaf)
     return value.astype({"f": "<f4", "b": "|b1"}.get(value.dtype.kind, "<i4")).reshape(
         np.shape(leaf)

@@ -89,7 +89,7 @@ class PairPlanner(Planner):
     is_sequential: ClassVar[bool] = True
 
     def case_of(self, pair: PairCase, entry: Array) -> tuple[BlockCase, Flight]:
-        """The nominal ball as a case, getting into the outer box at a time () [s]."""
+        """Return the nominal ball as a case, getting into the outer box at a time () [s]."""
         ball, span = nominal_ball(pair.outer, pair.inner)
         gravity = jnp.asarray(GRAVITY, span.dtype)
         case = BlockCase(
@@ -111,7 +111,7 @@ class PairPlanner(Planner):
         return case, flight
 
     def poses(self, pair: PairCase) -> EndPoses:
-        """Eight poses at each point of the centreline, and the straight motions to them.
+        """Return eight poses at each point of the centreline, and the straight motions to them.
 
         Returns:
             Poses whose `time` is the duration of the quickest straight motion [s], and whose
@@ -156,7 +156,7 @@ class PairPlanner(Planner):
         )
 
     def model(self, pair: PairCase, point: Array, case: BlockCase, flight: Flight) -> Model:
-        """`OnlineBlock.model`, and the shield's roll against the frame of `face_ball`."""
+        """Return `OnlineBlock.model`, and the shield's roll against the frame of `face_ball`."""
         online = self.online
         model = online.model(point, case, flight)
         moves, first, _ = online.decode(case, point)
@@ -181,7 +181,7 @@ class PairPlanner(Planner):
         )
 
     def planned(self, pair: PairCase, point: Array, entry: Array, steps: Array) -> PairPlan:
-        """The plan of a point, checked as `OnlineBlock` does; it has to block the tunnel, too."""
+        """Return the plan of a point, checked as in `OnlineBlock`, that blocks the whole tunnel."""
         case, flight = self.case_of(pair, entry)
         plan = self.online.finish(case, flight, point, steps)
         moves, first, _ = self.online.decode(case, point)
@@ -212,7 +212,7 @@ class StraightPair(PairPlanner):
         return (Attempt(),)
 
     def solve(self, pair: PairCase, attempt: Attempt) -> PairPlan:
-        """The plan of one pair."""
+        """Return the plan of one pair."""
         poses = self.poses(pair)
         order = jnp.argsort(poses.effort)
         possible = jnp.sum(poses.effort < 0.5 * _TOUCHING)
@@ -250,7 +250,7 @@ class StraightPair(PairPlanner):
 
 
 def _entry(effort: Array) -> Array:
-    """The entry time () [s] of a pose, whether or not the arm touches something there."""
+    """Return the entry time () [s] of a pose, whether or not the arm touches something there."""
     return jnp.where(effort > 0.5 * _TOUCHING, effort - _TOUCHING, effort)
 
 
@@ -280,7 +280,7 @@ class BentPair(PairPlanner):
         return (self.search,)
 
     def solve(self, pair: PairCase, attempt: Bends) -> PairPlan:
-        """The plan of one pair from its start; the status is that of the last round that solved."""
+        """Return the plan of one pair from its start, with the status of the last solved round."""
         online, dtype = self.online, pair.best.dtype
         poses = self.poses(pair)
         order = jnp.argsort(poses.effort)
@@ -303,7 +303,7 @@ class BentPair(PairPlanner):
         first = jnp.where(none, high, 0.5 * (quickest + high))
 
         def at(point: Array, old: Array, new: Array) -> Array:
-            """The same motion for a ball that enters at another time [s]."""
+            """Return the same motion for a ball that enters at another time [s]."""
             return point.at[-1].set(jnp.maximum(point[-1] + new - old, 0.02))
 
         def one_round(k: Array, state: tuple) -> tuple:

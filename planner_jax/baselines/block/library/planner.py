@@ -1,13 +1,14 @@
 """The planner that looks motions up; see `planner_jax.baselines.block.library.table`."""
 
 import os
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array
+from jax.typing import ArrayLike
 
 from planner_jax.ball.flight import BallState
 from planner_jax.baselines.block.library.file import load_library
@@ -77,7 +78,7 @@ class LibraryBlock(Planner):
             )
 
     def solve(self, case: BlockCase, attempt: Attempt) -> BlockPlan:
-        """The plan of one case; pure."""
+        """Return the plan of one case; pure."""
         home, fits = self.home_of(case)
         plan = _answered(self.library.table, case, home)
         status = jnp.where(fits, plan.status, Status.BLOCKED)
@@ -85,7 +86,7 @@ class LibraryBlock(Planner):
         return plan.replace(status=status.astype(jnp.int32))  # type: ignore[attr-defined]
 
     def home_of(self, case: BlockCase) -> tuple[Array, Array]:
-        """The home () int32 nearest to where the arm is, and whether the library is of the case."""
+        """Return the nearest home () int32 to the arm, and whether the library fits the case."""
         off = jnp.max(jnp.abs(jnp.asarray(self.library.table.homes) - case.angles), axis=1)
         home = jnp.argmin(off)
         fits = (off[home] <= _SAME_START) & (jnp.max(jnp.abs(case.rates)) <= _SAME_START)
@@ -117,8 +118,8 @@ class OneBall:
         vector = jax.ShapeDtypeStruct((6,), np.float32)
         self._lookup = jax.jit(packed).lower(self._rows, vector).compile()
 
-    def answer(self, pos: Any, vel: Any) -> Answer:
-        """What `lookup` finds for a ball, in NumPy arrays and plain numbers.
+    def answer(self, pos: ArrayLike, vel: ArrayLike) -> Answer:
+        """Look up a ball; return the answer in NumPy arrays and plain numbers.
 
         Args:
             pos: (3,) [m], when it is first seen.
@@ -128,12 +129,12 @@ class OneBall:
         vector[:3], vector[3:] = pos, vel
         found = np.asarray(self._lookup(self._rows, vector))
         pair, stored, time, slack, along, across, cosine = found[-7:].tolist()
-        numbers: Any = (int(pair), bool(stored), time, slack, (along, across), cosine)
-        return Answer(unpacked(found[:-7]), *numbers)
+        row = unpacked(found[:-7])
+        return Answer(row, int(pair), bool(stored), time, slack, (along, across), cosine)
 
 
 def _is_same(own: Setting, asked: Setting) -> Array:
-    """Whether two settings are equal, () bool; false where their shapes differ."""
+    """Return whether two settings are equal, () bool; false where their shapes differ."""
     mine, theirs = jax.tree.leaves(own), jax.tree.leaves(asked)
     if jax.tree.structure(own) != jax.tree.structure(asked) or any(
         np.shape(a) != np.shape(b) for a, b in zip(mine, theirs, strict=True)
@@ -145,7 +146,7 @@ def _is_same(own: Setting, asked: Setting) -> Array:
 
 
 def library_planner(file: str | os.PathLike) -> LibraryBlock:
-    """The planner of a file that `planner-jax library build` wrote.
+    """Return the planner of a file that `planner-jax library build` wrote.
 
     Raises:
         ArgumentError: the file is no whole library; one line.
@@ -154,7 +155,7 @@ def library_planner(file: str | os.PathLike) -> LibraryBlock:
 
 
 def _answered(table: Table, case: BlockCase, home: Array) -> BlockPlan:
-    """The plan of a case whose arm stands at a home."""
+    """Return the plan of a case whose arm stands at a home."""
     answer = lookup(table, case.ball, case.gravity, home)
     row, stored = answer.row, answer.stored
     dtype = case.angles.dtype

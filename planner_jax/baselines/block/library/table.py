@@ -8,7 +8,8 @@ waits for it, and where on the shield.
 
 import dataclasses
 import hashlib
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -35,14 +36,14 @@ class Setting:
 
 
 def setting_of(case: BlockCase) -> Setting:
-    """The setting of a case, or of a batch."""
+    """Return the setting of a case, or of a batch."""
     return Setting(
         arm=case.arm, limits=case.limits, ends_at_rest=case.ends_at_rest, scene=case.scene
     )
 
 
 def fingerprint(setting: Setting) -> str:
-    """Twelve hexadecimal digits that tell settings apart, by all of their numbers in float32."""
+    """Return twelve hexadecimal digits that identify a setting, of all its float32 numbers."""
     digest = hashlib.sha256(repr(setting.arm.capsule_link).encode())
     for path, leaf in jax.tree_util.tree_leaves_with_path(setting):
         value = np.asarray(leaf)
@@ -56,8 +57,8 @@ def fingerprint(setting: Setting) -> str:
 class Table:
     """What a lookup reads. Row p of a home is `Row`s fields for pair p, one after another."""
 
-    rows: Array  # (H, P, 6 K + 10) float32
-    homes: Array  # (H, 6) [rad], where stored motions begin, at rest
+    rows: Array | np.ndarray  # (H, P, 6 K + 10) float32
+    homes: Array | np.ndarray  # (H, 6) [rad], where stored motions begin, at rest
     inner: Box
     outer: Box
     layout: Layout = struct.field(pytree_node=False)
@@ -69,28 +70,28 @@ class Row(NamedTuple):
     A tuple, as is `Answer`: on the host it is made in a tenth of the time of a dataclass.
     """
 
-    steps: Array  # (K, 6) [rad], see `planner_jax.task.block.motion`
-    duration: Array  # () [s]; infinite where no motion is stored
-    middle: Array  # (3,) [m], of the shield's face
-    normal: Array  # (3,) unit
-    edge: Array  # (3,) unit, along one of its edges
+    steps: Array | np.ndarray  # (K, 6) [rad], see `planner_jax.task.block.motion`
+    duration: Array | np.ndarray  # () [s]; infinite where no motion is stored
+    middle: Array | np.ndarray  # (3,) [m], of the shield's face
+    normal: Array | np.ndarray  # (3,) unit
+    edge: Array | np.ndarray  # (3,) unit, along one of its edges
 
 
-def pieces_of(rows: Any) -> int:
-    """K of rows (..., 6 K + 10)."""
+def pieces_of(rows: Array | np.ndarray) -> int:
+    """Return K of rows (..., 6 K + 10)."""
     return (rows.shape[-1] - 10) // 6
 
 
 def packed(row: Row) -> np.ndarray:
-    """Rows (..., 6 K + 10) of a table, float32."""
+    """Return rows (..., 6 K + 10) of a table, float32."""
     steps, duration = np.asarray(row.steps), np.asarray(row.duration)
     flat = steps.reshape(*steps.shape[:-2], -1)
     parts = (flat, duration[..., None], row.middle, row.normal, row.edge)
     return np.concatenate(parts, axis=-1).astype(np.float32)
 
 
-def unpacked(values: Any) -> Row:
-    """The fields of rows (..., 6 K + 10) of a table."""
+def unpacked(values: Array | np.ndarray) -> Row:
+    """Return the fields of rows (..., 6 K + 10) of a table."""
     pieces = pieces_of(values)
     rest = values[..., 6 * pieces :]
     return Row(
@@ -106,16 +107,18 @@ class Answer(NamedTuple):
     """What the table has for a ball, and how the ball meets the shield at the motion's end."""
 
     row: Row
-    pair: Array  # () int32, number of the pair of cells; 0 without one
-    stored: Array  # () bool, whether the ball goes through two cells with a stored motion
-    time: Array  # () [s], when it crosses the plane of the shield
-    slack: Array  # () [s], since it is in the outer box, or until it is in the inner one
-    beside: tuple[Array, Array]  # () [m] each, along the shield's edges from its middle
-    cosine: Array  # (), of the angle between the shield's normal and the ball's way
+    pair: Array | int  # () int32, number of the pair of cells; 0 without one
+    stored: Array | bool  # () bool, whether the ball goes through two cells with a stored motion
+    time: Array | float  # () [s], when it crosses the plane of the shield
+    slack: Array | float  # () [s], since it is in the outer box, or until it is in the inner one
+    beside: tuple[
+        Array | float, Array | float
+    ]  # () [m] each, along the shield's edges from its middle
+    cosine: Array | float  # (), of the angle between the shield's normal and the ball's way
 
 
 def lookup(table: Table, ball: BallState, gravity: Array, home: Array | int = 0) -> Answer:
-    """What is stored for a ball; pure, for one: constant in time, without a search.
+    """Look up one ball, in constant time and without a search; pure.
 
     By components, so that a compiled program of one ball has few loops.
 
@@ -128,7 +131,7 @@ def lookup(table: Table, ball: BallState, gravity: Array, home: Array | int = 0)
     layout = table.layout
 
     def at(time: Array) -> tuple[list[Array], list[Array]]:
-        """Where the ball is [m], and its velocity [m/s]."""
+        """Return where the ball is [m], and its velocity [m/s]."""
         x, y, z = (ball.pos[k] + ball.vel[k] * time for k in range(3))
         fall = gravity * time
         return [x, y, z - 0.5 * fall * time], [ball.vel[0], ball.vel[1], ball.vel[2] - fall]
@@ -166,11 +169,11 @@ def lookup(table: Table, ball: BallState, gravity: Array, home: Array | int = 0)
     )
 
 
-def _minus(a: Any, b: Any) -> list[Array]:
+def _minus(a: Sequence[Array], b: Sequence[Array]) -> list[Array]:
     return [x - y for x, y in zip(a, b, strict=True)]
 
 
-def _dot(a: Any, b: Any) -> Array:
+def _dot(a: Sequence[Array], b: Sequence[Array]) -> Array:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
@@ -192,22 +195,23 @@ class Library:
         return sum(np.asarray(leaf).nbytes for leaf in jax.tree.leaves(self.table))
 
 
-def library_of(rows: Any, homes: Any, layout: Layout, setting: Setting) -> Library:
-    """A library of rows (H, P, 6 K + 10) from homes (H, 6)."""
+def library_of(
+    rows: Array | np.ndarray, homes: Array | np.ndarray, layout: Layout, setting: Setting
+) -> Library:
+    """Return a library of rows (H, P, 6 K + 10) from homes (H, 6)."""
     scene = setting.scene
     table = Table(rows=rows, homes=homes, inner=scene.inner, outer=scene.outer, layout=layout)
     return Library(table=table, setting=setting)
 
 
 def moved(library: Library, scene: Scene) -> Library:
-    """The same motions in another scene with the same boxes.
+    """Return the same motions in another scene with the same boxes.
 
     Raises:
         ValueError: a box is another one, so that cells would be others.
     """
-    for name in ("inner", "outer"):
-        old, new = getattr(library.setting.scene, name), getattr(scene, name)
-        for side in ("lower", "upper"):
-            if not np.array_equal(getattr(old, side), getattr(new, side)):
-                raise ArgumentError(f"scene.{name}", "the library's", shown="another box")
+    own = library.setting.scene
+    for name, old, new in (("inner", own.inner, scene.inner), ("outer", own.outer, scene.outer)):
+        if not np.array_equal([old.lower, old.upper], [new.lower, new.upper]):
+            raise ArgumentError(f"scene.{name}", "the library's", shown="another box")
     return dataclasses.replace(library, setting=dataclasses.replace(library.setting, scene=scene))
