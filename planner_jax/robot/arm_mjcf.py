@@ -197,7 +197,8 @@ def _chain(world: ET.Element) -> tuple[ET.Element, list[ET.Element]]:
     kinds = [[joint.get("type", "hinge") for joint in link.findall("joint")] for link in links]
     if kinds != [["hinge"]] * 6:
         counted = ", ".join("+".join(each) or "none" for each in kinds) or "no links"
-        raise ArgumentError("an arm", "six links with one hinge joint each", counted, verb="have")
+        rule = "six links with one hinge joint each"
+        raise ArgumentError("an arm", rule, verb="have", shown=counted)
     return base, links
 
 
