@@ -11,13 +11,14 @@ import planner_jax as pj
 from planner_jax.ball import flight
 from planner_jax.core.errors import ArgumentError, CaseError
 from planner_jax.task.hit import court
-from planner_jax.task.hit.case import DRAG, GRAVITY
+from planner_jax.task.hit.case import GRAVITY
 from planner_jax.task.hit.court import (
     check_cases,
     fly,
     landing,
 )
 from planner_jax.task.hit.published import published_rates
+from planner_jax.task.hit.spec import DRAG
 from planner_jax.task.hit.suites import (
     DEPTH,
     MAX_FLIGHT_TIME,

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 from planner_jax.core.choices import require
 from planner_jax.runs.settings import option, require_count
 from planner_jax.sweep.robots import checked_robot, robot_option
+from planner_jax.task.hit.spec import DRAG
 
 if TYPE_CHECKING:
     from planner_jax.live.strokes import CatchStroke, HitStroke, Stroke
@@ -51,7 +52,7 @@ class HitServe(ServeSettings):
 
     robot: Any = robot_option("paper-hitter")
     target: tuple[float, ...] = option((3.0, 0.0, 0.0), "M", "landing position of the ball")
-    drag: float = option(0.0616, "K", "K_D of the ball [1/m]")
+    drag: float = option(DRAG, "K", "K_D of the ball [1/m]")
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -33,12 +33,12 @@ from planner_jax.task.catch.decide import Greedy
 from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.task.catch.replan import ReplanCatch
-from planner_jax.task.hit.case import DRAG as HIT_DRAG
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.case import case as hit_case
 from planner_jax.task.hit.default_planner import ExactHit
 from planner_jax.task.hit.plan import HitPlan
 from planner_jax.task.hit.replan import ReplanHit
+from planner_jax.task.hit.spec import DRAG as HIT_DRAG
 from planner_jax.trajectory.polynomial import evaluate
 
 CATCH_DRAG = 0.5  # [1/s], of the suite `throws`

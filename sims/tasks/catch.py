@@ -50,7 +50,7 @@ from planner_jax.task.catch.case import GRAVITY, START, CatchCase
 from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.task.catch.suites import LAUNCH, draw, earliest_throw
-from planner_jax.task.hit.case import DRAG  # of the published serves; paper 000 gives none
+from planner_jax.task.hit.spec import DRAG  # of the published serves; paper 000 gives none
 
 CATCH_WORLD = World(Quadrotor(PAPER_CATCHER), GRAVITY, mouth=LAUNCH)
 SEEN = 0.3  # [s], a throw's flight before it is planned for: 2 m and more (paper 000, VII-A)

@@ -5,6 +5,7 @@ from typing import ClassVar
 
 from planner_jax.runs.settings import option
 from planner_jax.sweep.single_settings import SingleSettings
+from planner_jax.task.hit.spec import DRAG
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -21,7 +22,7 @@ class SingleHitSettings(SingleSettings):
     min_apex: float | None = option(None, "Z", "of the returned ball [m] (default: 2.2)")
     max_apex: float | None = option(None, "Z", "of the returned ball [m] (default: 6.2)")
     restitution: float | None = option(None, "B", "of the racket (default: the robot's)")
-    drag: float | None = option(None, "K", "of the ball, quadratic [1/m] (default: 0.0616)")
+    drag: float | None = option(None, "K", f"of the ball, quadratic [1/m] (default: {DRAG})")
 
     TOOL: ClassVar[str] = "racket"
     RUN: ClassVar[str] = "planner_jax.sweep.hit.single:SingleHit"

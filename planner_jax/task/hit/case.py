@@ -17,11 +17,9 @@ from planner_jax.robot.quadrotor_model import RACKET, QuadrotorModel
 from planner_jax.robot.quadrotor_models import PAPER_HITTER
 from planner_jax.task.arguments import array_of, batch_of
 from planner_jax.task.hit.rules import RULES
-from planner_jax.task.hit.spec import START
+from planner_jax.task.hit.spec import DRAG, START
 from planner_jax.task.quadrotor import ARGUMENTS, limits_of, require_start, require_tool
 
-# Fit to the published landing points; the residual is 1 cm.
-DRAG = 0.0616  # K_D [1/m]
 GRAVITY = 9.8  # [m/s^2]
 _ARGUMENTS = {
     **ARGUMENTS,

@@ -18,9 +18,9 @@ from planner_jax.robot.quadrotor_model import QuadrotorModel
 from planner_jax.robot.quadrotor_models import PAPER_HITTER
 from planner_jax.task.arguments import require_draw
 from planner_jax.task.hit import court
-from planner_jax.task.hit.case import DRAG, GRAVITY, HitCase, case
+from planner_jax.task.hit.case import GRAVITY, HitCase, case
 from planner_jax.task.hit.court import fly, landing
-from planner_jax.task.hit.spec import START
+from planner_jax.task.hit.spec import DRAG, START
 
 # The law of the published serves, fitted to them. Position and velocity are uniform, and those
 # serves are kept that meet the following and land in the region asked for.
