@@ -37,7 +37,7 @@ def require_ball(ball: object) -> None:
     """
     require_kind("ball", ball, BallState)
     for name in ("pos", "vel"):
-        shape = shape_of(f"ball.{name}", getattr(ball, name))
+        shape = shape_of(f"ball.{name}", vars(ball)[name])
         if shape != (3,):
             raise ArgumentError(f"ball.{name}", "the shape (3,)", shape, verb="have")
 

@@ -173,7 +173,8 @@ def for_batch(extras: object, batch: tuple[int, ...], dtype: DTypeLike) -> tuple
         extra = jax.tree.map(np.asarray, extra, is_leaf=lambda x: isinstance(x, tuple | list))
         shapes = [leaf.shape for leaf in jax.tree.leaves(extra)]
         sample = np.ones((2 + max((0, *batch, *sum(shapes, ()))), 3))  # longer than any leaf
-        methods = [getattr(extra, m) for m in ("excess", "cost") if hasattr(extra, m)]
+        methods = [extra.excess] if isinstance(extra, ExtraLimit) else []
+        methods += [extra.cost] if isinstance(extra, ExtraCost) else []
         try:
             alike = {np.shape(m(sample, sample, sample)) for m in methods} == {sample.shape[:1]}
         except (ValueError, TypeError):

@@ -245,7 +245,7 @@ _KINDS = (
 
 def _kinds(limits: QuadrotorLimits) -> list[_Kind]:
     """Those that there are."""
-    return [kind for kind in _KINDS if getattr(limits, kind.field) is not None]
+    return [kind for kind in _KINDS if vars(limits)[kind.field] is not None]
 
 
 def flight_excess(motion: Motion, gravity: Array, limits: QuadrotorLimits) -> tuple[Array, ...]:

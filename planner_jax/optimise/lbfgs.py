@@ -38,9 +38,9 @@ class LbfgsConfig:
 
     def __post_init__(self) -> None:
         for name, least in (("max_steps", 0), ("memory", 1), ("patience", 0)):
-            require_size(name, getattr(self, name), least)
+            require_size(name, vars(self)[name], least)
         for name in ("step_cap", "tolerance"):
-            require_number(name, getattr(self, name), "finite and >= 0", lambda x: x >= 0.0)
+            require_number(name, vars(self)[name], "finite and >= 0", lambda x: x >= 0.0)
         steps = self.trial_steps
         if not isinstance(steps, tuple) or any(numeric(each) is None for each in steps):
             raise TypeError(f"trial_steps must be a tuple of numbers, got {format_value(steps)}")

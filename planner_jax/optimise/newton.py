@@ -81,9 +81,9 @@ class NewtonConfig:
 
     def __post_init__(self) -> None:
         for name, least in (("max_steps", 0), ("subspace", 0), ("patience", 0)):
-            require_size(name, getattr(self, name), least)
+            require_size(name, vars(self)[name], least)
         for name in ("damping", "ease", "tighten", "step_cap", "tolerance", "trusted", "slack"):
-            require_number(name, getattr(self, name), "finite and >= 0", lambda x: x >= 0.0)
+            require_number(name, vars(self)[name], "finite and >= 0", lambda x: x >= 0.0)
         trials = self.trial_dampings
         if not isinstance(trials, tuple) or any(numeric(each) is None for each in trials):
             raise TypeError(

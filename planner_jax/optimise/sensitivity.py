@@ -308,7 +308,7 @@ def _members(tree: PyTree) -> dict[str, PyTree]:
     """What a tuple or a dataclass holds, by place or name."""
     if isinstance(tree, tuple):
         return {str(k): member for k, member in enumerate(tree)}
-    return {name: getattr(tree, name) for name in getattr(tree, "__dataclass_fields__", {})}
+    return vars(tree) if dataclasses.is_dataclass(tree) else {}
 
 
 def _with_part(tree: PyTree, name: str, part: PyTree) -> PyTree:

@@ -58,8 +58,7 @@ class Serves:
         return len(self.scenario)
 
     def __getitem__(self, rows) -> "Serves":
-        columns = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        picked = {name: column[rows] for name, column in columns.items() if column is not None}
+        picked = {name: column[rows] for name, column in vars(self).items() if column is not None}
         return dataclasses.replace(self, **picked)
 
 
