@@ -8,14 +8,15 @@ derivatives are asked for, these along with it.
 import dataclasses
 import functools
 from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
-from jaxtyping import PyTreeDef
 
 from planner_jax.ball.flight import BallState, rk4_step
+from planner_jax.lanes.kernels import Treedef
 from planner_jax.lanes.pallas import block_width, kernel_by_lanes
 
 _THREADS = 32  # lanes of a block
@@ -35,7 +36,7 @@ def table_kernel(
         interpret: run it without a GPU, for tests.
     """
 
-    def kernel(treedef: PyTreeDef, leaves: Sequence[Array]) -> Sequence[Array] | None:
+    def kernel(treedef: Treedef, leaves: Sequence[Array]) -> Sequence[Array] | None:
         pos, _, *numbers = leaves
         if pos.ndim != 2 or pos.dtype != jnp.float32 or any(x.ndim != 1 for x in numbers):
             return None
@@ -83,7 +84,7 @@ def _call(
         numbers = resolution[...], drag[...], gravity[...]
         zero = jnp.zeros_like(numbers[0])
 
-        def full(values: Iterable[ArrayLike]) -> tuple[Array, ...]:
+        def full(values: Iterable[ArrayLike]) -> Any:  # a tuple in the place of a vector
             return tuple(zero + value for value in values)
 
         def flown(ball: BallState, moved: list[BallState], sign: float = 1.0) -> tuple:

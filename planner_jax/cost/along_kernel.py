@@ -11,16 +11,18 @@ import functools
 import math
 import operator
 from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, Ref
-from jaxtyping import PyTree, PyTreeDef
+from jaxtyping import PyTree
 
 from planner_jax.core.arithmetic import reciprocal
 from planner_jax.cost.along import Along
 from planner_jax.cost.penalty import smoothed_hinge
+from planner_jax.lanes.kernels import Treedef
 from planner_jax.lanes.pallas import Block, block_width, grid_index, kernel_call
 from planner_jax.trajectory.polynomial import Motion
 
@@ -98,7 +100,7 @@ def call_on_grid(
     *,
     name: str,
     interpret: bool,
-) -> Callable[..., list[Array]]:
+) -> Callable[..., Sequence[Array]]:
     """Make a kernel, from the leaves of its arguments to results with shares of the samples first.
 
     Args:
@@ -141,7 +143,7 @@ def call_on_grid(
 
 def along_kernel(
     along: Along, mode: str, *, interpret: bool = False
-) -> Callable[[PyTreeDef, Sequence[Array]], list[Array] | None]:
+) -> Callable[[Treedef, Sequence[Array]], Sequence[Array] | None]:
     """Make the kernel of one of the functions in `along`.
 
     Args:
@@ -151,7 +153,7 @@ def along_kernel(
         interpret: run it without a GPU, for tests.
     """
 
-    def kernel(treedef: PyTreeDef, leaves: Sequence[Array]) -> Sequence[Array] | None:
+    def kernel(treedef: Treedef, leaves: Sequence[Array]) -> Sequence[Array] | None:
         args = jax.tree.unflatten(treedef, leaves)
         points = args if mode == "curvature" else (args,)
         found = grid_of(along, leaves, points)
@@ -174,8 +176,8 @@ def along_kernel(
 
 @functools.cache
 def _call(
-    along: Along, mode: str, interpret: bool, treedef: PyTreeDef, grid: Grid
-) -> Callable[..., list[Array]]:
+    along: Along, mode: str, interpret: bool, treedef: Treedef, grid: Grid
+) -> Callable[..., Sequence[Array]]:
     """Make the kernel for a grid, of the leaves of its arguments."""
     matrices, weights = along.matrices(), along.weights()
     num_samples = len(weights)
@@ -191,7 +193,7 @@ def _call(
 
         def add_sample(k: Array, carry: tuple[Array, list[Array]]) -> tuple[Array, list[Array]]:
             most, sums = carry
-            sample = Sample(load_row(matrices_ref, k, grid.num_columns), weights_ref[k])
+            sample = _Sample(load_row(matrices_ref, k, grid.num_columns), weights_ref[k])
             worst, terms = _of_sample(along, mode, sample, args)
             most = most if worst is None else jnp.maximum(most, worst)
             return most, list(map(jnp.add, sums, jax.tree.leaves(terms)))
@@ -208,7 +210,7 @@ def _call(
     return call_on_grid(body, grid, shapes, constants, name="integrate_along", interpret=interpret)
 
 
-def _result_shapes(mode: str, treedef: PyTreeDef, num_columns: int) -> list[tuple[int, ...]]:
+def _result_shapes(mode: str, treedef: Treedef, num_columns: int) -> list[tuple[int, ...]]:
     """Return the shapes of the results for one trajectory of one lane."""
     shapes: list[tuple[int, ...]] = [(), ()]
     if mode != "values":
@@ -220,7 +222,7 @@ def _result_shapes(mode: str, treedef: PyTreeDef, num_columns: int) -> list[tupl
     return shapes
 
 
-def load_numbers(ref: Ref) -> Array | Vectors:
+def load_numbers(ref: Ref) -> PyTree:
     """Load the number of each lane, or C columns of three numbers."""
     if len(ref.shape) != 3:
         return ref[...]
@@ -244,22 +246,20 @@ def _store(refs: Sequence[Ref], values: Iterable[Array]) -> None:
             ref[...] = next(numbers)
 
 
+def unit_motion(row: Vectors, columns: Vectors) -> Vectors:
+    """Return position to jerk, in time over the duration; of the position the height alone."""
+    return [
+        [_total(row[d][c] * columns[c][axis] for c in range(len(columns))) for axis in axes]
+        for d, axes in enumerate(_AXES)
+    ]
+
+
 @dataclasses.dataclass
-class Sample:
+class _Sample:
     """The constants of one sample."""
 
     row: Vectors  # position to jerk, each from C columns
-    weight: Array | None
-
-    def unit_motion(self, columns: Vectors) -> Vectors:
-        """Return position to jerk, in time over the duration; of the position the height alone."""
-        return [
-            [
-                _total(self.row[d][c] * columns[c][axis] for c in range(len(columns)))
-                for axis in axes
-            ]
-            for d, axes in enumerate(_AXES)
-        ]
+    weight: Array
 
     def slope_by_columns(self, slope: Vectors) -> Vectors:
         """Convert a slope by the unit motion to a slope by the columns."""
@@ -280,7 +280,9 @@ def _total(terms: Iterable[Array]) -> Array:
     return functools.reduce(operator.add, terms)
 
 
-def _of_sample(along: Along, mode: str, sample: Sample, args: PyTree) -> tuple[Array | None, tuple]:
+def _of_sample(
+    along: Along, mode: str, sample: _Sample, args: PyTree
+) -> tuple[Array | None, tuple]:
     """Evaluate one sample in a mode.
 
     Returns:
@@ -288,7 +290,7 @@ def _of_sample(along: Along, mode: str, sample: Sample, args: PyTree) -> tuple[A
         terms: of the sums over the samples, in the order of the results.
     """
     (columns, duration, given), direction = args if mode == "curvature" else (args, ())
-    free = sample.unit_motion(columns), duration
+    free = unit_motion(sample.row, columns), duration
     if mode == "values":
         value, worst = _penalty(along, *free, given)
         return worst, (sample.weight * value,)
@@ -310,7 +312,8 @@ def sample_excess(along: Along, unit: Vectors, duration: Array, given: PyTree) -
         tuple(value * power for value in vector)
         for vector, power in zip(unit[1:], rates, strict=True)
     )
-    return along.excess(Motion(unit[0][0], vel, acc, jerk), given)
+    parts: dict[str, Any] = {"height": unit[0][0], "vel": vel, "acc": acc, "jerk": jerk}
+    return along.excess(Motion(**parts), given)
 
 
 def _penalty(along: Along, unit: Vectors, duration: Array, given: PyTree) -> tuple[Array, Array]:
@@ -332,10 +335,12 @@ def _slopes(along: Along, weight: Array, free: tuple, fixed: tuple) -> tuple[Arr
     return worst, (weight * value, *pull_back(jnp.ones_like(value) * weight))
 
 
-def _curvature(along: Along, sample: Sample, free: tuple, given: PyTree, direction: tuple) -> tuple:
+def _curvature(
+    along: Along, sample: _Sample, free: tuple, given: PyTree, direction: tuple
+) -> tuple:
     """Return the derivative, along a direction, of the weighted penalty and all its slopes."""
     columns, duration, moved_given = direction
-    moving, tangents, still = free, (sample.unit_motion(columns), duration), (given,)
+    moving, tangents, still = free, (unit_motion(sample.row, columns), duration), (given,)
     if moved_given is not None:
         moving, tangents, still = (*free, given), (*tangents, moved_given), ()
 

@@ -11,25 +11,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, Ref
-from jaxtyping import PyTreeDef
 
 from planner_jax.cost.along import Along
 from planner_jax.cost.along_kernel import (
     Grid,
-    Sample,
     call_on_grid,
     grid_of,
     load_numbers,
     load_row,
     sample_excess,
+    unit_motion,
 )
 from planner_jax.cost.peaks import crest
+from planner_jax.lanes.kernels import Treedef
 from planner_jax.lanes.pallas import grid_index
 
 
 def peaks_kernel(
     along: Along, *, interpret: bool = False
-) -> Callable[[PyTreeDef, Sequence[Array]], list[Array] | None]:
+) -> Callable[[Treedef, Sequence[Array]], Sequence[Array] | None]:
     """Make the kernel of `greatest_along`.
 
     Args:
@@ -37,7 +37,7 @@ def peaks_kernel(
         interpret: run it without a GPU, for tests.
     """
 
-    def kernel(treedef: PyTreeDef, leaves: Sequence[Array]) -> Sequence[Array] | None:
+    def kernel(treedef: Treedef, leaves: Sequence[Array]) -> Sequence[Array] | None:
         columns, durations, *parameters = leaves
         found = grid_of(along, leaves, [(columns, durations, parameters)])
         if found is None:
@@ -52,8 +52,8 @@ def peaks_kernel(
 
 @functools.cache
 def _call(
-    along: Along, interpret: bool, treedef: PyTreeDef, grid: Grid
-) -> Callable[..., list[Array]]:
+    along: Along, interpret: bool, treedef: Treedef, grid: Grid
+) -> Callable[..., Sequence[Array]]:
     """Make the kernel for a grid, of the leaves of its arguments."""
     matrices, steps = along.matrices(), np.diff(along.times())
     num_samples, num = len(matrices), len(along.margins)
@@ -70,8 +70,8 @@ def _call(
 
         def add_sample(k: Array, carry: tuple) -> tuple:
             most, before, middle = carry
-            sample = Sample(load_row(matrices_ref, k, grid.num_columns), None)
-            values = sample_excess(along, sample.unit_motion(columns), duration, given)
+            unit = unit_motion(load_row(matrices_ref, k, grid.num_columns), columns)
+            values = sample_excess(along, unit, duration, given)
             gaps = steps_ref[jnp.maximum(k - 2, 0)], steps_ref[jnp.maximum(k - 1, 0)]
             for i, value in enumerate(values):
                 rise = crest(before[i], middle[i], value, *gaps)

@@ -9,7 +9,7 @@ import os
 import pkgutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import BinaryIO, TypeVar
+from typing import BinaryIO
 
 from planner_jax.core.choices import ENDINGS, require_one_of
 from planner_jax.core.errors import (
@@ -25,7 +25,6 @@ from planner_jax.host.files import new_file_problem, replacing
 from planner_jax.recovery.after_plan import is_rested, with_ending
 from planner_jax.robot.quadrotor import QuadrotorPlan
 
-PlanT = TypeVar("PlanT", bound=Plan)
 Writer = Callable[[Plan, float | None, BinaryIO], None]
 _ALL = ("quadrotor", "car", "arm")
 
@@ -165,7 +164,7 @@ def default_name(source: str | os.PathLike, row: int | None, to: str) -> str:
     return f"{Path(os.path.abspath(source)).stem}{index}-{to}{extension}"
 
 
-def bring_to_rest(plan: PlanT, ending: str | None, case: Case | None = None) -> PlanT:
+def bring_to_rest(plan: Plan, ending: str | None, case: Case | None = None) -> Plan:
     """Return one plan with the recovery trajectory with which it is exported.
 
     Args:

@@ -7,6 +7,7 @@ import dataclasses
 import os
 from collections.abc import Callable, Mapping
 
+import jax
 import numpy as np
 
 from planner_jax.core.errors import ArgumentError
@@ -129,11 +130,12 @@ def pieces_of(plan: QuadrotorPlan) -> PiecewisePolynomial:
         ArgumentError: the plan cannot be exported, see `robot_of`, or is not finite.
     """
     robot_of(plan)
-    coeffs, durations = np.asarray(plan.whole.coeffs), np.asarray(plan.whole.durations)
+    path = jax.tree.map(np.asarray, plan.whole)
+    coeffs, durations = path.coeffs, path.durations
     taken = durations != 0.0
     if not (np.isfinite(coeffs[taken]).all() and (durations[taken] > 0.0).all()):
         raise ArgumentError("plan", "finite", shown="a trajectory that is not")
-    return PiecewisePolynomial(coeffs=coeffs[taken], durations=durations[taken])
+    return jax.tree.map(lambda leaf: leaf[taken], path)
 
 
 def load_plan(path: str | os.PathLike, row: int | None = None) -> Plan:
@@ -154,7 +156,7 @@ def load_plan(path: str | os.PathLike, row: int | None = None) -> Plan:
             raise ArgumentError("row", "given for a file of one plan", row, verb="not be")
         return plans
     if row is None or not 0 <= row < shape[0]:
-        shown = "nothing" if row is None else row
+        shown = "nothing" if row is None else str(row)
         raise ArgumentError("row", f"from 0 to {shape[0] - 1}", shown=shown)
     sizes = {np.shape(leaf)[:1] for leaf in named_leaves(plans).values()}
     if len(shape) != 1 or len(sizes) != 1:

@@ -14,13 +14,12 @@ import os
 import pkgutil
 import zlib
 from collections.abc import Callable, Hashable, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 from jax.extend.core import JaxprEqn
-from jax.tree_util import PyTreeDef
 
 from planner_jax.core.errors import ArgumentError
 
@@ -28,9 +27,10 @@ SWITCH = "PLANNER_JAX_KERNELS"
 
 Results = TypeVar("Results")
 Shape = tuple[int, ...]
+Treedef = Any  # a PyTreeDef, whose class JAX does not show to type checkers
 # Takes the leaves of a function's arguments, with the lanes last; returns the leaves of the
 # results, or None if the kernel does not support such shapes or types.
-Kernel = Callable[[Sequence[Array]], list[Array] | None]
+Kernel = Callable[[Sequence[Array]], Sequence[Array] | None]
 
 
 class Kernels(enum.Enum):
@@ -84,7 +84,7 @@ class _Entry:
 
     path: str
     constants: tuple[Hashable, ...]
-    treedef: PyTreeDef  # of the arguments
+    treedef: Treedef  # of the arguments
     shapes: list[Shape]  # of the leaves of one lane's arguments, then of the results
 
 
@@ -112,7 +112,7 @@ def with_kernel(
     """
 
     @functools.cache
-    def compiled(treedef: PyTreeDef, shapes: tuple[Shape, ...]) -> Callable[..., Results]:
+    def compiled(treedef: Treedef, shapes: tuple[Shape, ...]) -> Callable[..., Results]:
         text = repr((path, constants, treedef, shapes))
         name = f"kernel_{zlib.crc32(text.encode()):08x}"
         while name in _ENTRIES:
@@ -140,13 +140,18 @@ def with_kernel(
     return guarded
 
 
+def shape_of(atom: Any) -> Shape:
+    """Return the shape of a variable or literal of a jaxpr."""
+    return atom.aval.shape
+
+
 def kernel_of(eqn: JaxprEqn) -> Kernel | None:
     """Return the kernel for a call in a jaxpr; None if its function has none."""
     entry = _ENTRIES.get(eqn.params.get("name", ""))
     if entry is None:
         return None
     # The halves into which reverse mode splits a function keep its name, but not all its shapes.
-    shapes = [atom.aval.shape for atom in (*eqn.invars, *eqn.outvars)]
+    shapes = [shape_of(atom) for atom in (*eqn.invars, *eqn.outvars)]
     is_whole = len(shapes) == len(entry.shapes) and all(
         of_call[len(of_call) - len(of_lane) :] == of_lane
         for of_call, of_lane in zip(shapes, entry.shapes, strict=True)

@@ -8,15 +8,15 @@ and the product with a constant matrix is one large product. Same numbers, anoth
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var
-from jax.typing import ArrayLike
 
 from planner_jax.lanes import kernels
+from planner_jax.lanes.kernels import shape_of
 
 Results = TypeVar("Results")
 
@@ -46,7 +46,7 @@ class _Lanes:
         self.array = array
 
 
-_Value = _Lanes | ArrayLike  # anything but `_Lanes` is the same for all lanes
+_Value = Any  # `_Lanes`, or an array or a number that is the same for all lanes
 
 
 def over_lanes(function: Callable[..., Results]) -> Callable[..., Results]:
@@ -76,10 +76,6 @@ def over_lanes(function: Callable[..., Results]) -> Callable[..., Results]:
     return mapped
 
 
-def _shape(atom: Var | Literal) -> tuple[int, ...]:
-    return atom.aval.shape
-
-
 def _widen(value: _Value, shape: tuple[int, ...], lanes: int) -> Array:
     """Return the array of a value, of (*shape, lanes)."""
     if isinstance(value, _Lanes):
@@ -91,7 +87,7 @@ def _full_results(closed: ClosedJaxpr, leaves: Sequence[Array], lanes: int) -> l
     """Evaluate a function of one lane; arguments and results have the lanes last."""
     values = _evaluate(closed, [_Lanes(leaf) for leaf in leaves], lanes)
     pairs = zip(values, closed.jaxpr.outvars, strict=True)
-    return [_widen(value, _shape(out), lanes) for value, out in pairs]
+    return [_widen(value, shape_of(out), lanes) for value, out in pairs]
 
 
 def _evaluate(closed: ClosedJaxpr, args: Sequence[_Value], lanes: int) -> list[_Value]:
@@ -125,11 +121,11 @@ def _outputs(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[_Value]:
         return _bind(eqn, inputs)
     arrays = None
     if name in _ELEMENTWISE:
-        out_shape = _shape(eqn.outvars[0])
+        out_shape = shape_of(eqn.outvars[0])
         arrays = _bind(eqn, [_spread(value, out_shape, lanes) for value in inputs])
     elif name in _BY_AXIS:
         pairs = zip(inputs, eqn.invars, strict=True)
-        arrays = _bind(eqn, [_widen(value, _shape(atom), lanes) for value, atom in pairs])
+        arrays = _bind(eqn, [_widen(value, shape_of(atom), lanes) for value, atom in pairs])
     elif name in _RULES:
         arrays = _RULES[name](eqn, inputs, lanes)
     if arrays is None:
@@ -146,8 +142,8 @@ def _by_kernel(
     which are compiled for every other device, or where the kernel does not support the shapes.
     """
     pairs = zip(inputs, eqn.invars, strict=True)
-    arrays = [_widen(value, _shape(atom), lanes) for value, atom in pairs]
-    shapes = [(*_shape(atom), lanes) for atom in eqn.outvars]
+    arrays = [_widen(value, shape_of(atom), lanes) for value, atom in pairs]
+    shapes = [(*shape_of(atom), lanes) for atom in eqn.outvars]
 
     def by_operations(*leaves: Array) -> list[Array]:
         return _full_results(closed, leaves, lanes)
@@ -166,7 +162,7 @@ def _by_kernel(
     return [_Lanes(leaf) for leaf in results]
 
 
-def _bind(eqn: JaxprEqn, inputs: Sequence[ArrayLike], **changes: object) -> list[Array]:
+def _bind(eqn: JaxprEqn, inputs: Sequence[_Value], **changes: object) -> list[Array]:
     """Evaluate the operation itself, with some of its parameters changed."""
     results = eqn.primitive.bind(*inputs, **{**eqn.params, **changes})
     return list(results) if eqn.primitive.multiple_results else [results]
@@ -209,14 +205,14 @@ def _slice(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[Array]:
     return [lax.slice(inputs[0].array, (*starts, 0), (*limits, lanes), strides)]
 
 
-def _pad(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> Sequence[Array] | None:
+def _pad(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[Array] | None:
     operand, filling = inputs
     if isinstance(filling, _Lanes):
         return None
     return [lax.pad(operand.array, filling, (*eqn.params["padding_config"], (0, 0, 0)))]
 
 
-def _dot_general(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> Sequence[Array] | None:
+def _dot_general(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[Array] | None:
     """Multiply by a matrix that all lanes share: one product, the lanes among its columns."""
     (left, right), ((left_dims, right_dims), batch) = inputs, eqn.params["dimension_numbers"]
     both = isinstance(left, _Lanes) and isinstance(right, _Lanes)
@@ -234,7 +230,7 @@ def _dot_general(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> Sequence[Ar
 def _dynamic_slice(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[Array]:
     """Take a window that starts at another index in each lane."""
     operand, *starts = inputs
-    shape = _shape(eqn.invars[0])
+    shape = shape_of(eqn.invars[0])
     window = _widen(operand, shape, lanes)
     for axis, (start, size) in enumerate(zip(starts, eqn.params["slice_sizes"], strict=True)):
         if not isinstance(start, _Lanes):
@@ -248,7 +244,7 @@ def _dynamic_slice(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[Arra
     return [window]
 
 
-_RULES: dict[str, Callable[[JaxprEqn, list[_Value], int], list[Array] | None]] = {
+_RULES: dict[str, Callable[..., list[Array] | None]] = {
     "broadcast_in_dim": _broadcast,
     "dot_general": _dot_general,
     "dynamic_slice": _dynamic_slice,

@@ -45,7 +45,7 @@ def kernel_call(
     threads: int,
     in_place: int = 0,
     interpret: bool = False,
-) -> Callable[..., list[Array]]:
+) -> Callable[..., Sequence[Array]]:
     """Make a kernel: a function of arrays that runs a body once for every index of a grid.
 
     Args:
@@ -83,7 +83,7 @@ def kernel_by_lanes(
     threads: int | None = None,
     in_place: int = 0,
     interpret: bool = False,
-) -> Callable[..., list[Array]]:
+) -> Callable[..., Sequence[Array]]:
     """Make a `kernel_call` in float32, each block of which has all numbers of `width` lanes.
 
     Args:

@@ -1,5 +1,7 @@
 """The course of the robot: a plan and the recovery trajectory behind it, or the latter alone."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -47,7 +49,7 @@ def with_recovery(
         course: of both.
         is_within: whether the recovery trajectory keeps the limits.
     """
-    state = state_on(path, np.sum(path.durations))
+    state: Any = state_on(path, np.sum(path.durations))
     case = EndingCase(state, state[0], gravity, limits)
     rest: EndingPlan = call_packed(_recover, _REST.rounds[0], _REST, case)
     return Course(_join(path, rest.trajectory), gravity), bool(is_solved(rest.status))
@@ -64,9 +66,10 @@ def recovery_from(
 
 def _stand_still(pieces: int, pos: np.ndarray) -> PiecewisePolynomial:
     """Return pieces that take no time."""
-    coeffs = np.zeros((pieces, 8, 3), np.float32)
+    coeffs: Any = np.zeros((pieces, 8, 3), np.float32)
+    durations: Any = np.zeros(pieces, np.float32)
     coeffs[:, 0] = pos
-    return PiecewisePolynomial(coeffs, np.zeros(pieces, np.float32))
+    return PiecewisePolynomial(coeffs, durations)
 
 
 def _join(path: PiecewisePolynomial, other: PiecewisePolynomial) -> PiecewisePolynomial:

@@ -12,7 +12,7 @@ import dataclasses
 import math
 import time
 from collections.abc import Hashable
-from typing import Generic
+from typing import Any, Generic
 
 import numpy as np
 
@@ -121,7 +121,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
 
     def warm_up(self) -> None:
         """Compile all programs, and start the report."""
-        state = self.stroke.case.head_state
+        state = np.asarray(self.stroke.case.head_state)
         self._setpoints(self._recover(state, 0.0), 0.0)
         for k in range(3):  # towards the robot
             pos = tuple(state[0] + (4.0 - 0.1 * k, 0.0, 0.1 * k))
@@ -214,10 +214,10 @@ class LivePlanner(Generic[CaseT, PlanT]):
         self.report.counts["balls"] += self._sight.number != before
         self._collect(due)
         flight = self._flight
-        is_free = ball is not None and flight is not None and self._job is None
-        if is_free and self._is_worth_planning(flight, packet.ball, due):
-            found = self._worker.submit(self._search, ball, flight, packet.ball, due)
-            self._job = _Job(found, due, packet.ball)
+        if ball is not None and flight is not None and self._job is None:
+            if self._is_worth_planning(flight, packet.ball, due):
+                found = self._worker.submit(self._search, ball, flight, packet.ball, due)
+                self._job = _Job(found, due, packet.ball)
         if self._job is not None:
             left = _PATIENCE * self.deadline - (time.perf_counter() - received)
             with contextlib.suppress(TimeoutError):
@@ -307,6 +307,6 @@ class LivePlanner(Generic[CaseT, PlanT]):
 
     def _setpoints(self, flight: _Flight[PlanT], due: float) -> np.ndarray:
         """Return the setpoints (K, 20) from a time on."""
-        elapsed, period = np.float32(due - flight.start), np.float32(self._period)
-        query = Query(flight.course, elapsed, period)
+        times: Any = np.float32(due - flight.start), np.float32(self._period)
+        query = Query(flight.course, *times)
         return call_packed(setpoints_of, self._num, None, query)

@@ -1,6 +1,7 @@
 """A Kalman filter of one ball, which rejects outliers and starts anew for another ball."""
 
 import math
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -109,8 +110,9 @@ class Sight:
             return None, Fault.NONE
         if measured <= self._time:
             return None, Fault.STALE
-        numbers = measured - self._time, pos, max(until - measured, 0.0)
-        seen = Observation(belief, *(np.asarray(x, np.float32) for x in numbers))
+        given = measured - self._time, pos, max(until - measured, 0.0)
+        numbers: Any = [np.asarray(x, np.float32) for x in given]
+        seen = Observation(belief, *numbers)
         found: Estimate = call_packed(_filter, self._flight, self._model, seen)
         if found.is_outlier:
             self._outliers += 1
@@ -123,8 +125,8 @@ class Sight:
 
     def _start(self, number: int, pos: tuple[float, ...], measured: float) -> None:
         stds = [self._noise] * 3 + [_SPREAD] * 3
-        mean = np.array([*pos, 0.0, 0.0, 0.0], np.float32)
-        covariance = np.diag(np.square(stds)).astype(np.float32)
+        mean: Any = np.array([*pos, 0.0, 0.0, 0.0], np.float32)
+        covariance: Any = np.diag(np.square(stds)).astype(np.float32)
         self._belief = EkfState(mean=mean, covariance=covariance)
         self.number, self._time, self.spread = number, measured, math.inf
         self._num, self._outliers = 1, 0

@@ -7,7 +7,7 @@ starts where it ended.
 import abc
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -83,7 +83,8 @@ class Stroke(abc.ABC, Generic[CaseT, PlanT]):
 
     def again(self, plan: PlanT, elapsed: float, ball: BallState) -> PlanT:
         """Plan again some time [s] into a plan, from where the plan has the robot."""
-        task = Replanning(self._with_ball(ball), plan, np.float32(elapsed))
+        since: Any = np.float32(elapsed)
+        task = Replanning(self._with_ball(ball), plan, since)
         return call_packed(self._solve_again, _AGAIN, self._replanner, task)
 
     @abc.abstractmethod
@@ -201,5 +202,6 @@ class CatchStroke(Stroke[CatchCase, CatchPlan]):
 
     def _with_ball(self, ball: BallState) -> CatchCase:
         one = BallState(pos=ball.pos[None], vel=ball.vel[None])
-        targets = dataclasses.replace(self.case.targets, ball=one)
+        path: Any = self.case.targets
+        targets = dataclasses.replace(path, ball=one)
         return dataclasses.replace(self._case, targets=targets)

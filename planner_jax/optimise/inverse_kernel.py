@@ -9,8 +9,8 @@ from collections.abc import Callable, Sequence
 
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import PyTreeDef
 
+from planner_jax.lanes.kernels import Treedef
 from planner_jax.lanes.pallas import block_width, kernel_by_lanes
 
 _THREADS = 32  # lanes of a block
@@ -24,7 +24,7 @@ def inverse_kernel(*, interpret: bool = False) -> Callable:
         interpret: run it without a GPU, for tests.
     """
 
-    def kernel(treedef: PyTreeDef, leaves: Sequence[Array]) -> Sequence[Array] | None:
+    def kernel(treedef: Treedef, leaves: Sequence[Array]) -> Sequence[Array] | None:
         (matrix,) = leaves
         width = block_width(matrix.shape[-1], _THREADS)
         if matrix.ndim != 3 or matrix.dtype != jnp.float32 or width is None:

@@ -11,8 +11,8 @@ from collections.abc import Callable, Sequence
 import jax
 import jax.numpy as jnp
 from jax import Array, Ref
-from jaxtyping import PyTreeDef
 
+from planner_jax.lanes.kernels import Treedef
 from planner_jax.lanes.pallas import block_width, kernel_by_lanes, load_masked, store_masked
 from planner_jax.optimise.lbfgs import shortening, start_scale, weigh_pair
 
@@ -28,7 +28,7 @@ def turn_kernel(num_pairs: int, step_cap: float, *, interpret: bool = False) -> 
         interpret: run it without a GPU, for tests.
     """
 
-    def kernel(treedef: PyTreeDef, leaves: Sequence[Array]) -> Sequence[Array] | None:
+    def kernel(treedef: Treedef, leaves: Sequence[Array]) -> Sequence[Array] | None:
         grad = leaves[-1]
         width = block_width(grad.shape[-1], _LANES)
         if grad.ndim != 2 or grad.dtype != jnp.float32 or width is None:
