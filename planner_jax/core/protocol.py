@@ -14,7 +14,6 @@ from jax import Array
 from planner_jax.core.checks import numeric, require_kind, require_number, require_switch
 from planner_jax.core.choices import require_size
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError, format_value
-from planner_jax.core.plan_files import load_arrays, save_arrays
 from planner_jax.core.rules import has_rules, is_sound
 
 
@@ -117,6 +116,8 @@ class Plan:
 
     def save(self, path: str | os.PathLike) -> None:
         """Write the plan, or the batch, as NumPy's .npz; `load` of the same class reads it."""
+        from planner_jax.core.plan_files import save_arrays
+
         save_arrays(path, self)
 
     @classmethod
@@ -126,6 +127,8 @@ class Plan:
         Raises:
             PlanFileError: the file is not one of plans, or of another class or version; one line.
         """
+        from planner_jax.core.plan_files import load_arrays
+
         return load_arrays(path, cls)
 
 

@@ -8,7 +8,6 @@ what the rotors can do; so are the shares of the rotors' thrusts that plans use.
 import dataclasses
 
 from planner_jax.core.errors import UnknownName
-from planner_jax.robot.quadrotor_file import ENDINGS, read_robot, suggestion
 from planner_jax.robot.quadrotor_model import (
     GRAVITY,
     NET,
@@ -125,6 +124,8 @@ def ready_robot(name: str) -> QuadrotorModel:
     """
     if name in MODELS:
         return MODELS[name]
+    from planner_jax.robot.quadrotor_file import suggestion
+
     hint = suggestion(str(name), MODELS)
     raise UnknownName("robot", f"one of {', '.join(MODELS)}", shown=f"{name!r:.60}{hint}")
 
@@ -137,6 +138,8 @@ def robot_named(word: str) -> QuadrotorModel:
         RobotError: the file breaks a rule; one line.
         MissingExtra: the file needs MuJoCo, which is not installed.
     """
+    from planner_jax.robot.quadrotor_file import ENDINGS, read_robot
+
     if not word.lower().endswith(ENDINGS):
         return ready_robot(word)
     try:
