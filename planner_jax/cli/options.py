@@ -1,0 +1,149 @@
+"""Parsers of the command line, and the options that the fields of settings become.
+
+Settings are dataclasses whose fields have `metavar` and `help` in their metadata, as
+`planner_jax.runs.settings.option` makes them.
+"""
+
+import argparse
+import dataclasses
+import functools
+import re
+import sys
+import typing
+from collections.abc import Callable, Mapping
+from typing import Any, NoReturn
+
+from planner_jax.core.errors import ArgumentError, MissingExtra, PlannerJaxError, format_value
+from planner_jax.core.registry import Task
+from planner_jax.runs.settings import SweepSettings
+
+Options = dict[str, Any]  # values of the options that were given, by their names in Python
+FAILED, BAD_ARGUMENT = 1, 2  # exit codes
+
+
+class BadOption(PlannerJaxError):
+    """A word of the command line is not of the kind that its option takes."""
+
+
+class Unfinished(PlannerJaxError):
+    """The file system or workers failed while a run was under way; the text says how to go on."""
+
+
+def fail(
+    error: str | PlannerJaxError, flags: Mapping[str, str] | None = None, code: int = BAD_ARGUMENT
+) -> int:
+    """Print one line about an error and return an exit code.
+
+    Args:
+        error: text, or error that names an argument or a feature.
+        flags: options of the command by their names in Python, which take the place of the names.
+        code: exit code.
+    """
+    if isinstance(error, ArgumentError | MissingExtra):
+        error = error.renamed(flags or {})
+    print(f"planner-jax: error: {' '.join(str(error).split())}", file=sys.stderr)
+    return code
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser that reports a bad argument in one line.
+
+    Args:
+        fill: adds the options, when the parser is first used.
+        **look: arguments of `argparse.ArgumentParser`.
+    """
+
+    def __init__(self, *, fill: Callable[["Parser"], None] = lambda parser: None, **look: Any):
+        shape = functools.partial(
+            argparse.RawDescriptionHelpFormatter, max_help_position=28, width=100
+        )
+        super().__init__(**{"formatter_class": shape, "allow_abbrev": False, **look})
+        self._fill, self._flags = fill, {}
+        # What is a number and no option: argparse's own pattern knows no exponents, before 3.14.
+        self._negative_number_matcher = re.compile(r"-\.?[0-9]")
+
+    def parse_known_args(self, *arguments: Any, **how: Any) -> Any:
+        """Add the options, and parse words; the flags of the options are one of the results."""
+        self._fill(self)
+        self.set_defaults(flags=self._flags)
+        return super().parse_known_args(*arguments, **how)
+
+    def add(self, flag: str, *, type: type | None = None, **how: Any) -> None:
+        """Add an option, of whole numbers or numbers if its type is `int` or `float`."""
+        if type in (int, float):
+            how["type"] = functools.partial(_read_number, flag, type)
+        self._flags[self.add_argument(flag, **how).dest] = flag
+
+    def error(self, message: str) -> NoReturn:
+        """Print one line and end the process."""
+        sys.exit(fail(message.removeprefix("argument ")))
+
+
+def _read_number(flag: str, kind: Callable[[str], float], word: str) -> float:
+    """Return the number that a word of the command line stands for."""
+    try:
+        return kind(word)
+    except ValueError:
+        rule = "a whole number" if kind is int else "a number"
+        raise BadOption(f"{flag} must be {rule}, got {format_value(word)}") from None
+
+
+def add_settings(parser: Parser, kind: Any, task: Task | None = None) -> None:
+    """Add an option for every field of a class of settings; options not given stay absent."""
+    hints = typing.get_type_hints(kind)
+    names = {"planner": task.all_planners(), "suite": task.all_suites()} if task else {}
+    defaults: dict[str, object] = {name: next(iter(known)) for name, known in names.items()}
+    if issubclass(kind, SweepSettings):
+        batch = f"{kind.CPU_BATCH} on a CPU, {kind.GPU_BATCH} on a GPU"
+        defaults |= {"num": kind.DEFAULT_NUM, "batch": batch}
+    for field in dataclasses.fields(kind):
+        words, default = field.metadata["help"], field.default
+        if field.name in names:
+            words = ", ".join(names[field.name])
+        default = defaults.get(field.name) if default is None else default
+        how: Options = {"action": "store_true"}
+        if not isinstance(default, bool):
+            if default not in (None, (), dataclasses.MISSING) and "(default:" not in words:
+                shown = default
+                if isinstance(default, tuple):
+                    shown = " ".join(f"{x:g}" for x in default)
+                words += f" (default: {shown})"
+            how = {"type": _type_of(hints[field.name]), **_form_of(field)}
+            if isinstance(default, tuple):
+                how = {"nargs": "+", **how}
+        parser.add(f"--{field.name.replace('_', '-')}", help=words, **how)
+
+
+def _form_of(field: dataclasses.Field) -> Options:
+    """Return how an option is read that is required, holds several numbers, or is repeated."""
+    names = field.metadata["metavar"].split()
+    how: Options = {"required": True} if field.default is dataclasses.MISSING else {}
+    if len(names) == 1:
+        return {"metavar": names[0], **how}
+    if field.default == ():
+        how["action"] = "append"
+    return {"metavar": tuple(names), "nargs": len(names), **how}
+
+
+def _type_of(hint: Any) -> type:
+    """Return the type of an option's words: int or float where its field holds these, or str."""
+    held = typing.get_args(hint) or (hint,)
+    if str in held:  # beside numbers, as where "uniform" may stand for three of them
+        return str
+    inner = [_type_of(kind) for kind in held if typing.get_args(kind)]
+    return next((kind for kind in (int, float) if kind in held), next(iter(inner), str))
+
+
+def pop_out(given: Options, kind: str = "folder") -> str | None:
+    """Take the option `--out` out of the options that were given, and return it.
+
+    Args:
+        given: options.
+        kind: "folder" or "file".
+    """
+    out = given.pop("out", None)
+    if out == "":
+        raise ArgumentError("out", f"a {kind}", out, verb="name")
+    if out and "://" in out:
+        raise ArgumentError("out", f"a {kind} of this machine", out)
+    return out

@@ -1,0 +1,274 @@
+"""Commands that make run folders or files of motions, and those that read run folders."""
+
+import contextlib
+import datetime
+import functools
+import os
+import pkgutil
+import shlex
+import sys
+from argparse import SUPPRESS
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from planner_jax.cli.options import Options, Parser, Unfinished, add_settings, pop_out
+from planner_jax.core.errors import ArgumentError, MissingExtra
+from planner_jax.core.registry import Task
+from planner_jax.host import signals as stopping
+from planner_jax.host.compile_cache import keep_compiled_programs
+from planner_jax.host.files import new_file_problem, replacing
+from planner_jax.runs.environment import require_backend
+from planner_jax.runs.settings import WorkersFailed
+
+_TRAIN = "planner_jax.policies.settings:TrainSettings"
+_THROUGHPUT = "planner_jax.benchmarks.throughput_settings:ThroughputSettings"
+
+
+def add_sweep(task: Task, parser: Parser) -> None:
+    """Add the options of `sweep` of one task."""
+    parser.description = (
+        f"Many cases of one task, {task.summary}:\nplanned, and every plan judged by a referee.\n"
+        "Writes a run folder: index.html, table.md, figures, plans (Parquet), manifest.json."
+    )
+    add_settings(parser, pkgutil.resolve_name(task.sweep), task)
+    where = f"run folder (default: runs/{task.name}-PLANNER-DATE-TIME)"
+    parser.add("--out", metavar="DIR", help=where)
+    parser.add("--resume", action="store_true", help="finish the interrupted run in --out")
+    where = "ray: chunks are made by a Ray cluster, that of RAY_ADDRESS or one of this machine"
+    parser.add("--workers", metavar="KIND", help=f"{where} (default: by this process)")
+    parser.set_defaults(command=lambda given: _sweep(task, given))
+
+
+def _sweep(task: Task, given: Options) -> None:
+    resume, workers, out = given.pop("resume", False), given.pop("workers", None), pop_out(given)
+    if resume and out is None:
+        raise ArgumentError("out", "the folder to resume", verb="name", shown="nothing")
+    settings = pkgutil.resolve_name(task.sweep)(**given).of(task)
+    out = out or _name_run_folder(f"{task.name}-{task.split_planner(settings.planner)[0]}")
+    settings.require_room(out)
+    keep_compiled_programs()
+    from planner_jax.sweep import run
+
+    again = f"finish with: planner-jax sweep {task.name} --resume --out {shlex.quote(str(out))}"
+    rest = functools.partial(_how_to_continue, Path(out), again)
+    with stopping.under_way(rest), _tell_how_to_continue(rest):
+        if resume:
+            manifest = run.resume_sweep(task, out, workers=workers, **given)
+        else:
+            manifest = run.start_sweep(task, settings, out, workers=workers)
+        _print_sweep(manifest, out)
+
+
+def _print_sweep(manifest: Options, out: str) -> None:
+    from planner_jax.runs.table import headline
+    from planner_jax.sweep.sweep import sweep_of_run
+
+    print("\n".join(headline(manifest, sweep_of_run(manifest).findings(manifest))))
+    print(f"Look at {os.path.join(out, 'index.html')}")
+
+
+def add_fly(task: Task, parser: Parser) -> None:
+    """Add the options of `fly` of one task."""
+    parser.description = (
+        f"Many flights of one task, {task.summary},\n"
+        "in MuJoCo MJX with noise and latency.\n"
+        "Writes a run folder: index.html, table.md, a figure, plans and flights (Parquet),\n"
+        "manifest.json."
+    )
+    kind = pkgutil.resolve_name(str(task.flight))
+    add_settings(parser, kind, task)
+    kept = "flights kept look by look for `planner-jax view`, the first ones (default: 16)"
+    parser.add("--record", type=int, metavar="K", help=kept)
+    film = (
+        "film the first three of these into the run folder, .gif, or .mp4 where ffmpeg is "
+        "installed (default name: flights.gif)"
+    )
+    parser.add("--video", nargs="?", const="flights.gif", metavar="FILE", help=film)
+    parser.add("--out", metavar="DIR", help=f"run folder (default: runs/fly-{task.name}-DATE-TIME)")
+    parser.set_defaults(command=lambda given: _fly(task, kind, given))
+
+
+def _fly(task: Task, kind: type, given: Options) -> None:
+    out = pop_out(given) or _name_run_folder(f"fly-{task.name}")
+    kept = {name: given.pop(name) for name in ("video", "record") if name in given}
+    settings = kind(**given)
+    keep_compiled_programs()
+    from planner_jax.sims.run import start_flights
+
+    with _tell_how_to_continue(lambda: "nothing is kept of these flights, fly again"):
+        start_flights(settings, out, **kept)
+    _print_flights(Path(out))
+
+
+def _print_flights(out: Path) -> None:
+    from planner_jax.runs.run_folder import RunFolder
+    from planner_jax.sims.run import headline, read_flights
+
+    manifest, flight, _ = read_flights(RunFolder(out))
+    print("\n".join(headline(manifest, flight)))
+    print(f"Look at {out / 'index.html'}, or play it: planner-jax view {shlex.quote(str(out))}")
+
+
+def add_train(parser: Parser) -> None:
+    """Add the options of `train`."""
+    kind = pkgutil.resolve_name(_TRAIN)
+    parser.description = kind.DESCRIPTION
+    add_settings(parser, kind)
+    parser.add("--out", metavar="DIR", help="folder of the run (default: runs/train)")
+    parser.set_defaults(command=_train)
+
+
+def _train(given: Options) -> None:
+    out = pop_out(given) or "runs/train"
+    settings = pkgutil.resolve_name(_TRAIN)(**given)
+    require_backend()
+    keep_compiled_programs()
+    try:
+        from planner_jax.policies.training import train_as_asked
+    except ModuleNotFoundError as error:
+        raise MissingExtra("train", error.name, "policies") from None
+    rest = functools.partial(
+        _how_to_continue, Path(out), f"go on with: {_own_command()}", "training.json"
+    )
+    with stopping.under_way(rest), _tell_how_to_continue(rest):
+        train_as_asked(settings, out)
+    print(f"{Path(out) / 'policy.npz'}")
+
+
+def report(options: Options) -> None:
+    """Write the report of a run anew."""
+    from planner_jax.runs.run_folder import RunFolder
+
+    folder = RunFolder(options["run"], "RUN")
+    manifest = folder.read_manifest()
+    with folder.owned():
+        if str(manifest["kind"]).startswith("fly "):
+            from planner_jax.sims.run import require_sound, write_flight_report
+
+            require_sound(folder)
+            write_flight_report(folder)
+            _print_flights(folder.path)
+        else:
+            from planner_jax.sweep.report import require_sound, write_report
+
+            require_sound(folder)
+            write_report(folder)
+            _print_sweep(manifest, str(folder.path))
+
+
+def compare(options: Options) -> None:
+    """Print a comparison of runs, and write it as a table if asked."""
+    from planner_jax.sweep.compare import as_csv, described, read_run, require_comparable
+
+    out = pop_out(options, "file")
+    if out is not None:
+        if not out.endswith(".csv"):
+            raise ArgumentError("out", ".csv", out, verb="end in")
+        if problem := new_file_problem(out):
+            raise ArgumentError("out", problem, out)
+    runs = [read_run(path) for path in options["runs"]]
+    require_comparable(runs)
+    print("\n".join(described(runs, None if options["all"] else 10)))
+    if out is not None:
+        with replacing(out) as scratch:
+            scratch.write_text(as_csv(runs), encoding="utf-8")
+
+
+def view(options: Options) -> None:
+    """Serve the flights of a run to a browser."""
+    from planner_jax.runs.run_folder import RunFolder
+    from planner_jax.sims.run import read_flights
+    from planner_jax.sims.view import Viewer
+
+    _, flight, recording = read_flights(RunFolder(options["run"], name="RUN"))
+    viewer = Viewer(flight, recording, options["host"], options["port"])
+    print(f"Playing {len(recording)} flights at {viewer.url}; Ctrl-C stops.", flush=True)
+    viewer.run()
+
+
+def add_throughput(parser: Parser) -> None:
+    """Add the options of `bench throughput`."""
+    kind = pkgutil.resolve_name(_THROUGHPUT)
+    parser.description = kind.DESCRIPTION
+    add_settings(parser, kind)
+    parser.add("--out", metavar="DIR", help="run folder (default: runs/bench-throughput-DATE-TIME)")
+    parser.set_defaults(command=_throughput)
+
+
+def _throughput(given: Options) -> None:
+    out = pop_out(given)
+    require_backend()
+    keep_compiled_programs()
+    from planner_jax.benchmarks.throughput import report as report_throughput
+
+    report_throughput(out=out, **given)
+
+
+def _name_run_folder(name: str) -> str:
+    """Return the run folder of a name and this moment."""
+    return os.path.join("runs", f"{name}-{datetime.datetime.now():%Y%m%d-%H%M%S}")
+
+
+def _own_command() -> str:
+    """Return the command of this process, as a shell takes it."""
+    return shlex.join(["planner-jax", *sys.argv[1:]])
+
+
+def _how_to_continue(out: Path, again: str, sign: str = "manifest.json") -> str:
+    """Return how to continue a stopped run, if the file `sign` shows that it has begun."""
+    return again if (out / sign).exists() else stopping.NOTHING
+
+
+@contextlib.contextmanager
+def _tell_how_to_continue(
+    rest: Callable[[], str], rule: str = "out must be a folder that can be written"
+) -> Iterator[None]:
+    """Add `rest()` to the message of an interruption, and of a file system or workers that fail."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"interrupted; {rest()}") from None
+    except WorkersFailed as error:
+        raise Unfinished(f"{error}; {rest()}") from None
+    except OSError as error:
+        shown = f"{error.filename!r} ({error.strerror or error})"
+        raise Unfinished(f"{rule}, got {shown}; {rest()}") from None
+
+
+def add_library(library: Parser) -> None:
+    """Add the commands about files of stored motions."""
+    commands = library.add_subparsers(title="commands", required=True, metavar="command")
+
+    def command(name: str, words: str) -> Parser:
+        added = commands.add_parser(name, help=words, description=words, argument_default=SUPPRESS)
+        added.add_argument("path", metavar="FILE", help="of the library")
+        added.set_defaults(command=functools.partial(_library, name))
+        return added
+
+    build = command("build", "plan for every pair of cells; goes on where it was interrupted")
+    build.add("--layout", metavar="NAME", help="full, or A, B, C, D of fewer (default: full)")
+    build.add("--regime", metavar="NAME", help="limits of the joints: R1, R2, R3 (default: R2)")
+    build.add("--no-pole", dest="pole", action="store_false", help="the scene without its pole")
+    build.add("--arm", metavar="FILE", help="an MJCF file (default: the IRB 1600)")
+    angles = "six angles [rad] where the arm waits, or six for each of several homes"
+    build.add("--home", type=float, nargs="+", metavar="Q", help=angles)
+    show = command("show", "coverage, memory and hashes of a library")
+    show.add("--map", metavar="FILE", help="write a picture of the coverage")
+    check = command("check", "have the referee judge stored motions as answers to random balls")
+    check.add("--num", type=int, metavar="N", help="balls for each home (default: 2000)")
+    check.add("--seed", type=int, metavar="K", help="of the balls (default: 0)")
+    repair = command("repair", "plan anew what touches a pole that has moved")
+    place = "where it stands now [m]"
+    repair.add("--pole", type=float, nargs=2, metavar="M", help=place, required=True)
+    repair.add("--out", metavar="FILE", help="of the new library", required=True)
+    repair.add("--retry", action="store_true", help="pairs without a motion, too")
+
+
+def _library(name: str, given: Options) -> None:
+    keep_compiled_programs()
+    run = pkgutil.resolve_name(f"planner_jax.cli.library:{name}_library")
+    parts = Path(f"{given['path']}.parts")
+    rest = functools.partial(_how_to_continue, parts, f"go on with: {_own_command()}", "what.json")
+    rule = "FILE must be one that can be written"
+    with stopping.under_way(rest, patient=False), _tell_how_to_continue(rest, rule):
+        run(**given)

@@ -1,0 +1,198 @@
+"""Commands about one case, one plan or one robot: `plan`, `export`, `serve`, `robots`."""
+
+import contextlib
+import math
+import os
+import pkgutil
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from planner_jax.cli.options import FAILED, Options, Parser, add_settings, pop_out
+from planner_jax.core.choices import CHOICES
+from planner_jax.core.errors import ArgumentError
+from planner_jax.core.registry import Task
+from planner_jax.host import signals as stopping
+from planner_jax.host.compile_cache import keep_compiled_programs
+from planner_jax.host.files import new_file_problem
+from planner_jax.live.settings import ServeSettings
+from planner_jax.runs.environment import require_backend
+from planner_jax.runs.settings import ending_options, require_ending
+
+if TYPE_CHECKING:
+    from planner_jax.core.protocol import Case, Plan
+    from planner_jax.sweep.single import Answer
+
+
+def add_plan(task: Task, parser: Parser) -> None:
+    """Add the options of `plan` of one task."""
+    parser.description = (
+        f"One case, {task.summary}: planned, and the plan judged by a referee.\n"
+        "Says when and where the contact is, and how close the plan comes to each limit."
+    )
+    add_settings(parser, pkgutil.resolve_name(str(task.single)), task)
+    parser.add("--rate", type=float, metavar="HZ", help="setpoints a second (default: 100)")
+    parser.add("--out", metavar="DIR", help="new folder for plan, setpoints and pictures")
+    parser.set_defaults(command=lambda given: _plan(task, given))
+
+
+def _plan(task: Task, given: Options) -> int:
+    out, rate = pop_out(given), given.pop("rate", None)
+    settings = pkgutil.resolve_name(str(task.single))(**given).of(task)
+    if rate is not None and out is None:
+        raise ArgumentError("rate", "left out without --out", rate)
+    if out is not None and (problem := new_file_problem(out)):
+        raise ArgumentError("out", problem.replace("file", "folder"), out)
+    require_backend()
+    keep_compiled_programs()
+    single = pkgutil.resolve_name(settings.RUN)(task, settings)
+    answer = single.answer()
+    if rate is not None and answer.success:
+        from planner_jax.export.setpoints import setpoints_of
+
+        setpoints_of(answer.plan, rate)  # raises for a rate that the plan cannot have
+    print("\n".join(single.described(answer)))
+    if out is not None:
+        _write_answer(task, settings.planner, answer, Path(out), rate)
+    return 0 if answer.success else FAILED
+
+
+def _write_answer(
+    task: Task, planner: str, answer: "Answer", out: Path, rate: float | None
+) -> None:
+    """Write a new folder: the plan, its setpoints where the referee lets it pass, and pictures."""
+    from planner_jax.export.api import export
+    from planner_jax.sweep.single_pictures import write_pictures
+
+    out.mkdir()
+    written = [out / "plan.npz"]
+    answer.plan.save(written[0])
+    if answer.success:
+        ending = None if answer.plan.ending is None else "brake"  # one of its own stays
+        how = {"rate": rate, "ending": ending}
+        written.append(export(answer.plan, to="csv", out=out / "setpoints.csv", **how))
+    written += write_pictures(task, planner, answer, out)
+    print("\n" + "\n".join(map(str, written)))
+
+
+def add_export(parser: Parser) -> None:
+    """Add the options of `export`."""
+    from planner_jax.export.api import FORMATS
+
+    parser.description = (
+        "One plan of a sweep, or of a file that plan.save wrote, in a format that controllers read."
+    )
+    parser.add_argument("plans", metavar="RUN", help="folder of a sweep, or a file of plans")
+    rows = "of the plan, from 0; left out for a file that holds one plan"
+    parser.add("--row", type=int, metavar="K", help=rows)
+    formats = "; ".join(f"{name}: {form.summary}" for name, form in FORMATS.items())
+    parser.add("--to", metavar="FORMAT", required=True, help=formats)
+    parser.add("--rate", type=float, metavar="HZ", help="setpoints a second (default: 100)")
+    endings = "; ".join(f"{name}: {', '.join(form.writers)}" for name, form in FORMATS.items())
+    name = "default: RUN-K-FORMAT with the first ending"
+    parser.add("--out", metavar="FILE", help=f"new file; its ending says which ({endings}; {name})")
+    port = "of this machine, to which px4 is sent in real time over UDP in the place of a file"
+    parser.add("--udp", type=int, metavar="PORT", help=port)
+    rest = "how a plan comes to rest behind its end, where it does not do so itself"
+    parser.add("--ending", metavar="NAME", help=f"{rest}: {', '.join(CHOICES)} (default: brake)")
+    parser.set_defaults(command=_export)
+
+
+def _export(given: Options) -> None:
+    from planner_jax.core.plan_files import PlanFileError
+    from planner_jax.export import api
+
+    source, row = given.pop("plans"), given.pop("row", None)
+    out, udp = pop_out(given, "file"), given.pop("udp", None)
+    require_ending(name := given.pop("ending", "brake"))
+    ending = ending_options(name).get("ending")
+    if out is not None and udp is not None:
+        raise ArgumentError("udp", "given with --out", udp, verb="not be")
+    try:
+        out = out or api.default_name(source, row, given["to"])
+        plan, against = _plan_of(source, row)
+        lacks = ending is not None and api.lacks_ending(plan)
+        given |= {"ending": ending, "case": _case_of(source, row, name) if lacks else None}
+        if udp is None:
+            told = str(api.export(plan, out=out, **given))
+        else:
+            told = f"{api.stream(plan, udp=udp, **given)} setpoints sent"
+    except PlanFileError as error:
+        raise error.renamed({"path": "RUN"}) from None
+    if against:
+        print(f"planner-jax: warning: row {row} fails the referee: {against}", file=sys.stderr)
+    if lacks:
+        rest = f"row {row} goes on to rest behind its end ({name}), within the limits of its case"
+        print(f"planner-jax: {rest}; --ending none leaves that out", file=sys.stderr)
+    print(told)
+
+
+def _plan_of(source: str, row: int | None) -> "tuple[Plan, str]":
+    """Return the plan of a row of a sweep or a file, and the referee's objection, if known."""
+    if os.path.isdir(source):
+        from planner_jax.runs.run_folder import RunFolder
+        from planner_jax.sweep.rows import planned_row
+
+        return planned_row(RunFolder(source, name="RUN"), row)
+    from planner_jax.export.setpoints import load_plan
+
+    if not os.path.exists(source):
+        raise ArgumentError("RUN", "the folder of a sweep or a file of plans", source)
+    return load_plan(source, row), ""
+
+
+def _case_of(source: str, row: int | None, ending: str) -> "Case":
+    """Return the case of a row of a sweep, whose limits a recovery trajectory has to keep."""
+    if not os.path.isdir(source):
+        rule = "none for plans of a file that do not come to rest, as it does not hold their limits"
+        raise ArgumentError("ending", rule, ending)
+    from planner_jax.runs.run_folder import RunFolder
+    from planner_jax.sweep.rows import case_of_row
+
+    keep_compiled_programs()
+    return case_of_row(RunFolder(source, name="RUN"), row)
+
+
+def add_serve(kind: type[ServeSettings], parser: Parser) -> None:
+    """Add the options of `serve` of one task."""
+    parser.description = (
+        "Takes what is seen of a ball and of the robot as packets of UDP on localhost, plans as\n"
+        "soon as the ball is known, and answers every packet with the setpoints that are due."
+    )
+    add_settings(parser, kind)
+    parser.set_defaults(command=lambda given: _serve(kind(**given)))
+
+
+def _serve(settings: ServeSettings) -> None:
+    from planner_jax.live.planner import LivePlanner
+    from planner_jax.live.server import Server, compute_in_place
+
+    compute_in_place()
+    require_backend()
+    keep_compiled_programs()
+    names = ("rate", "horizon", "deadline", "noise")
+    options = {name: getattr(settings, name) for name in names}
+    planner = LivePlanner(settings.stroke(), **options)
+    server = Server(planner, settings.port)
+    server.warm_up()
+    report = server.planner.report
+    rest = lambda: f"{report.counts['answered']:,} packets answered"  # noqa: E731
+    with stopping.under_way(rest, bar=False), contextlib.closing(server):
+        print(f"Answering on 127.0.0.1:{server.port}; Ctrl-C stops.", flush=True)
+        ends = time.monotonic() + (settings.seconds or math.inf)
+        server.run(lambda: not stopping.is_told() and time.monotonic() < ends)
+        print("\n".join(report.lines() if settings.report else [report.headline()]), flush=True)
+        stopping.check()
+
+
+def robots(options: Options) -> None:
+    """Print the ready robots, or one of them as YAML."""
+    from planner_jax.robot.quadrotor_file import RobotError, as_yaml
+    from planner_jax.robot.quadrotor_models import listing, robot_named
+
+    name = options["robot"]
+    try:
+        print(listing() if name is None else as_yaml(robot_named(name)), end="")
+    except RobotError as error:
+        raise ArgumentError("NAME", f"a sound robot: {error}", shown="") from None
