@@ -128,7 +128,7 @@ def test_a_plan_that_is_not_finite_is_nan_beside_its_neighbours():
 
 @pytest.mark.parametrize("rate", [0.0, -3.0, np.nan])
 def test_a_rate_must_be_positive(rate):
-    with pytest.raises(ValueError, match=f"^rate must be finite and > 0, got {rate}$"):
+    with pytest.raises(ValueError, match=f"^rate must be finite and > 0, got {rate:g}$"):
         hover().sample(rate)
 
 
