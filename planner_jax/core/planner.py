@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 from jax.extend.backend import backends
+from jaxtyping import PyTree
 
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.protocol import Attempt, Case, Plan
@@ -44,8 +45,8 @@ class Drive(Protocol):
         ...
 
     def __call__(
-        self, planner: "Planner", cases: Any, attempts: Sequence[Attempt] | None = None
-    ) -> tuple[Any, Any]:
+        self, planner: "Planner", cases: PyTree, attempts: Sequence[Attempt] | None = None
+    ) -> tuple[PyTree, PyTree]:
         """Return plans of a batch by some of a planner's attempts, by default all of them.
 
         Returns:
@@ -53,7 +54,9 @@ class Drive(Protocol):
         """
         ...
 
-    def plan_again(self, plan_of: Callable[[Any], Any], cases: Any, plans: Any, left: Any) -> Any:
+    def plan_again(
+        self, plan_of: Callable[[PyTree], PyTree], cases: PyTree, plans: PyTree, left: PyTree
+    ) -> PyTree:
         """Return plans (B,) after one more try at the cases that are left, with the better plans.
 
         Args:
@@ -148,8 +151,8 @@ class Planner(Generic[CaseT, PlanT]):
         )
 
     def settle(
-        self, cases: CaseT, plan_of: Callable[["Planner", Any], Any] | None = None
-    ) -> "tuple[Any, Any]":
+        self, cases: CaseT, plan_of: Callable[["Planner", PyTree], PyTree] | None = None
+    ) -> "tuple[PyTree, PyTree]":
         """Return an `OptimisedPlanner`, and the cases with all that is decided before it starts.
 
         Args:
@@ -211,7 +214,7 @@ def has_only_cpu() -> bool:
     return set(backends()) == {"cpu"}
 
 
-def solve_in_turn(solve: Callable[[Any], Any], cases: Any) -> Any:
+def solve_in_turn(solve: Callable[[PyTree], PyTree], cases: PyTree) -> PyTree:
     """Return what a function makes of every case of a batch, one after another; pure.
 
     A case that equals the one before, such as those that fill up a batch, is not solved again.
@@ -221,7 +224,7 @@ def solve_in_turn(solve: Callable[[Any], Any], cases: Any) -> Any:
         lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(solve, first)
     )
 
-    def next_one(state: tuple[Array, Any, Any], case: Any) -> tuple[tuple, Any]:
+    def next_one(state: tuple[Array, PyTree, PyTree], case: PyTree) -> tuple[tuple, PyTree]:
         is_first, before, plan = state
         same = jax.tree.map(lambda a, b: jnp.array_equal(a, b), before, case)
         is_again = jnp.all(jnp.stack(jax.tree.leaves(same))) & ~is_first

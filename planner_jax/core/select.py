@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
+from jaxtyping import PyTree
 
 from planner_jax.core.protocol import Plan, is_solved
 
@@ -19,8 +20,8 @@ PlanT = TypeVar("PlanT", bound=Plan)
 
 
 def is_better(
-    later: Any, before: Any, *, tolerance: float | None = None, share: float = 1.0
-) -> Any:
+    later: PyTree, before: PyTree, *, tolerance: float | None = None, share: float = 1.0
+) -> PyTree:
     """Return whether later plans are selected in the place of earlier ones, bool.
 
     Args:
@@ -57,7 +58,7 @@ def select(later: PlanT, before: PlanT, where: Array | bool = True) -> PlanT:
     return jax.tree.map(pick, before, later)
 
 
-def select_into(plans: Any, later: Any, lanes: np.ndarray) -> Any:
+def select_into(plans: PyTree, later: PyTree, lanes: np.ndarray) -> PyTree:
     """Return plans with NumPy leaves, changed in place where later plans of some lanes are better.
 
     Args:
@@ -75,7 +76,7 @@ def select_into(plans: Any, later: Any, lanes: np.ndarray) -> Any:
     return jax.tree.map(replace, plans, later)
 
 
-def index_of_best(plans: Any, cost: Any = None) -> Any:
+def index_of_best(plans: PyTree, cost: PyTree = None) -> PyTree:
     """Return the index along the first axis of the plan that is selected of each case's.
 
     Args:

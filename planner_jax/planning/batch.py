@@ -8,13 +8,13 @@ import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import PyTree
 
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt, Status, is_resident, is_unsolved, marked, out_of_time
@@ -42,11 +42,11 @@ _Call = tuple[np.ndarray, int]  # lanes of one call, filled up with its first on
 def plan_batch(
     planner: Planner,
     attempts: Sequence[Attempt],
-    cases: Any,
+    cases: PyTree,
     chunk: int | None,
     devices: Sequence[jax.Device] | None,
     watch: Watch,
-) -> tuple[Any, Any]:
+) -> tuple[PyTree, PyTree]:
     """Return plans of a batch by attempts, each at the lanes that are still unsolved.
 
     Args:
@@ -74,13 +74,13 @@ def plan_batch(
 
 
 def plan_on_host(
-    planner: Planner, attempts: Sequence[Attempt], cases: Any, watch: Watch
-) -> tuple[Any, int]:
+    planner: Planner, attempts: Sequence[Attempt], cases: PyTree, watch: Watch
+) -> tuple[PyTree, int]:
     """Return what `plan_batch` does, by a planner on the host, of NumPy leaves or of one case."""
     alone = cases.batch_shape == ()
     cases = jax.tree.map(lambda leaf: np.asarray(leaf)[None] if alone else np.asarray(leaf), cases)
 
-    def try_lanes(attempt: Attempt, lanes: np.ndarray, plans: Any) -> Any:
+    def try_lanes(attempt: Attempt, lanes: np.ndarray, plans: PyTree) -> PyTree:
         watch.tell(planner, attempt, 0, lanes.size)
         some = jax.tree.map(lambda leaf: leaf[lanes], cases)
         later = marked(planner.solve_on_host(some, attempt), some)
@@ -95,8 +95,8 @@ def _try_in_turn(
     attempts: Sequence[Attempt],
     num: int,
     watch: Watch,
-    try_lanes: Callable[[Attempt, np.ndarray, Any], Any],
-) -> tuple[Any, int]:
+    try_lanes: Callable[[Attempt, np.ndarray, PyTree], PyTree],
+) -> tuple[PyTree, int]:
     """Return plans (num, ...) by one attempt after another, and how many are unsolved.
 
     `try_lanes` makes an attempt at some lanes, and returns the plans so far, None at first, with
@@ -129,13 +129,15 @@ class _Batch:
         """Return the sizes of the calls of an attempt."""
         return sizes_of(self.planner, attempt, self.chunk, self.mesh)
 
-    def plan_from_host(self, attempts: Sequence[Attempt], cases: Any) -> tuple[Any, int]:
+    def plan_from_host(self, attempts: Sequence[Attempt], cases: PyTree) -> tuple[PyTree, int]:
         """Return plans of cases in NumPy arrays: chunks go to the devices, and plans come back."""
         cases = jax.tree.map(np.asarray, cases)
         try_lanes = functools.partial(self._try_from_host, cases)
         return _try_in_turn(attempts, length(cases), self.watch, try_lanes)
 
-    def _try_from_host(self, cases: Any, attempt: Attempt, lanes: np.ndarray, plans: Any) -> Any:
+    def _try_from_host(
+        self, cases: PyTree, attempt: Attempt, lanes: np.ndarray, plans: PyTree
+    ) -> PyTree:
         """Return the plans after one attempt at some lanes."""
         calls = self._calls(attempt, lanes)
         found, tried = [], 0
@@ -171,8 +173,8 @@ class _Batch:
         return calls
 
     def _results(
-        self, attempt: Attempt, cases: Any, calls: list[_Call], may_end: bool
-    ) -> Iterator[Any]:
+        self, attempt: Attempt, cases: PyTree, calls: list[_Call], may_end: bool
+    ) -> Iterator[PyTree]:
         """Yield the plans of every call; on one CPU device with a thread for each core.
 
         One more thread prepares the next call while the others compute. Where the attempt may end
@@ -181,7 +183,7 @@ class _Batch:
         watch, spec = self.watch, sharding(self.mesh)
         threads = min(len(calls), usable_cores() + 1) if is_one_cpu(self.mesh) else 1
 
-        def solve(call: _Call) -> Any:
+        def solve(call: _Call) -> PyTree:
             if may_end and watch.is_over:
                 return None
             part = jax.device_put(jax.tree.map(lambda leaf: leaf[call[0]], cases), spec)
@@ -200,7 +202,7 @@ class _Batch:
             yield from alone
             yield from later
 
-    def plan_resident(self, attempts: Sequence[Attempt], cases: Any) -> tuple[Any, Array]:
+    def plan_resident(self, attempts: Sequence[Attempt], cases: PyTree) -> tuple[PyTree, Array]:
         """Return plans of cases in jax arrays; only how many are unsolved comes to the host.
 
         Every device plans its own share, without asking the others for a lane.
@@ -232,20 +234,20 @@ class _Batch:
             plans = _take(jax.device_put(plans, mesh.devices[0]), np.arange(num))
         return plans, unsolved
 
-    def _first_plans(self, attempt: Attempt, cases: Any) -> tuple[Any, Array]:
+    def _first_plans(self, attempt: Attempt, cases: PyTree) -> tuple[PyTree, Array]:
         """Return what `solve_on_devices` does of all lanes of every device, chunk by chunk."""
         mesh, sizes, share = self.mesh, self.sizes(attempt), length(cases) // self.mesh.size
         if share == sizes.next(share):
             return solve_on_devices(self.planner, attempt, mesh, cases)
         cuts = list(sizes.cuts(share))
 
-        def solve(begin: int, size: int) -> Any:
+        def solve(begin: int, size: int) -> PyTree:
             part = _cut(mesh, size, cases, number(mesh, begin))
             return solve_on_devices(self.planner, attempt, mesh, part)[0]
 
         firsts = {size: begin for begin, size in reversed(cuts)}
         programs = [compilation_of(self.planner, attempt, size, cases) for size in firsts]
-        found: dict[int, Any] = {}
+        found: dict[int, PyTree] = {}
         if sum(not each.is_done for each in programs) > 1:  # compiled at the same time
             with ThreadPoolExecutor(len(firsts)) as pool:
                 made = pool.map(as_here(solve), firsts.values(), firsts)
@@ -257,29 +259,31 @@ class _Batch:
 
 
 @jax.jit
-def _take(tree: Any, lanes: Any) -> Any:
+def _take(tree: PyTree, lanes: PyTree) -> PyTree:
     """Return some lanes; the last one for those behind it."""
     return jax.tree.map(lambda leaf: leaf[jnp.minimum(lanes, leaf.shape[0] - 1)], tree)
 
 
 @functools.partial(jax.jit, static_argnames=("mesh", "size"))
-def _cut(mesh: Mesh, size: int, tree: Any, begin: Any) -> Any:
+def _cut(mesh: Mesh, size: int, tree: PyTree, begin: PyTree) -> PyTree:
     """Return the next lanes of every device's share, filled up with its last one."""
 
-    def cut(tree: Any, begin: Array) -> Any:
+    def cut(tree: PyTree, begin: Array) -> PyTree:
         return _take(tree, begin + jnp.arange(size))
 
     return apart(mesh, cut, LANES, PartitionSpec())(tree, begin)
 
 
 @functools.partial(jax.jit, static_argnames=("mesh", "size"))
-def _cut_unsolved(mesh: Mesh, size: int, tree: Any, status: Array, begin: Any) -> tuple[Any, Array]:
+def _cut_unsolved(
+    mesh: Mesh, size: int, tree: PyTree, status: Array, begin: PyTree
+) -> tuple[PyTree, Array]:
     """Return the next unsolved lanes of every device's share, and their indices.
 
     They are filled up with the last lane, whose index is then behind the share.
     """
 
-    def cut(tree: Any, status: Array, begin: Array) -> tuple[Any, Array]:
+    def cut(tree: PyTree, status: Array, begin: Array) -> tuple[PyTree, Array]:
         (num,) = status.shape
         (unsolved,) = jnp.nonzero(is_unsolved(status), size=num, fill_value=num)
         lanes = _take(unsolved, begin + jnp.arange(size))
@@ -289,10 +293,10 @@ def _cut_unsolved(mesh: Mesh, size: int, tree: Any, status: Array, begin: Any) -
 
 
 @functools.partial(jax.jit, static_argnames=("mesh", "within"))
-def _due(mesh: Mesh, within: float, plans: Any) -> tuple[Array, Array]:
+def _due(mesh: Mesh, within: float, plans: PyTree) -> tuple[Array, Array]:
     """Return statuses, and how many are unsolved, (devices,), as if plans farther off were not."""
 
-    def due(plans: Any) -> tuple[Array, Array]:
+    def due(plans: PyTree) -> tuple[Array, Array]:
         near = plans.violation <= within
         status = jnp.where(near, plans.status, jnp.full_like(plans.status, Status.FEASIBLE))
         return status, jnp.sum(is_unsolved(status), keepdims=True)
@@ -301,20 +305,20 @@ def _due(mesh: Mesh, within: float, plans: Any) -> tuple[Array, Array]:
 
 
 @functools.partial(jax.jit, static_argnames=("mesh", "share"))
-def _join_locally(mesh: Mesh, parts: list[Any], share: int) -> tuple[Any, Array]:
+def _join_locally(mesh: Mesh, parts: list[PyTree], share: int) -> tuple[PyTree, Array]:
     """Return the parts of every device joined to its share, and how many it leaves unsolved."""
 
-    def join(*parts: Any) -> tuple[Any, Array]:
+    def join(*parts: PyTree) -> tuple[PyTree, Array]:
         return with_unsolved(jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:share], *parts))
 
     return apart(mesh, join)(*parts)
 
 
 @functools.partial(jax.jit, static_argnames="mesh")
-def _select_locally(mesh: Mesh, plans: Any, later: Any, lanes: Array) -> tuple[Any, Array]:
+def _select_locally(mesh: Mesh, plans: PyTree, later: PyTree, lanes: Array) -> tuple[PyTree, Array]:
     """Return what `select_into` does of every device's share, and how many it leaves unsolved."""
 
-    def merge(plans: Any, later: Any, lanes: Array) -> tuple[Any, Array]:
+    def merge(plans: PyTree, later: PyTree, lanes: Array) -> tuple[PyTree, Array]:
         kept = select(later, _take(plans, lanes))
 
         def replace(old: Array, new: Array) -> Array:

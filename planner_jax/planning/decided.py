@@ -9,6 +9,7 @@ import numpy as np
 from flax import struct
 from jax import Array, lax
 from jax.core import Tracer
+from jaxtyping import PyTree
 
 from planner_jax.core.planner import CaseT, Drive, Planner, PlanT
 from planner_jax.core.protocol import Decision, is_resident, is_solved, is_unsolved
@@ -26,7 +27,7 @@ class DecidedPlanner(Planner[CaseT, PlanT]):
     """
 
     planner: Planner[CaseT, PlanT]
-    decision: Any  # a `Decision`
+    decision: PyTree  # a `Decision`
 
     @property
     def case_type(self) -> type:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -43,8 +44,8 @@ class DecidedPlanner(Planner[CaseT, PlanT]):
         return self.planner.replanner()
 
     def settle(
-        self, cases: Any, plan_of: Callable[[Planner, Any], Any] | None = None
-    ) -> tuple[Any, Any]:
+        self, cases: PyTree, plan_of: Callable[[Planner, PyTree], PyTree] | None = None
+    ) -> tuple[PyTree, PyTree]:
         """Return the planner that minimises, and the cases with the choice of their plans.
 
         Without `plan_of` it is the first choice of the decision.
@@ -57,7 +58,7 @@ class DecidedPlanner(Planner[CaseT, PlanT]):
         choice = choices[0] if len(choices) == 1 else plan_of(self, cases).choice
         return self.planner.settle(cases.decided(choice), plan_of)
 
-    def plan_by(self, drive: Drive, cases: Any) -> Any:
+    def plan_by(self, drive: Drive, cases: PyTree) -> PyTree:
         """Return the plans of one case or of a batch, with the choices made in them."""
         alone = cases.batch_shape == ()
         if not drive.is_pure:
@@ -82,7 +83,7 @@ class DecidedPlanner(Planner[CaseT, PlanT]):
         on_devices = isinstance(plans.status, jax.Array)
         return plans.replace(status=status if on_devices else np.asarray(status))
 
-    def _plan_all(self, drive: Drive, cases: Any, choices: Any) -> tuple[Any, Any]:
+    def _plan_all(self, drive: Drive, cases: PyTree, choices: PyTree) -> tuple[PyTree, PyTree]:
         """Plan all choices together, and return the decided cases (B,) with the best plans."""
         xp: Any = jnp if drive.is_pure else np
         num = len(choices)
@@ -105,12 +106,12 @@ class DecidedPlanner(Planner[CaseT, PlanT]):
         return jax.tree.map(lambda leaf: leaf[chosen, lanes], (together, plans))
 
 
-def _propose(_: None, decision: Decision, case: Any) -> Any:
+def _propose(_: None, decision: Decision, case: PyTree) -> PyTree:
     """Return the choices (F, ...) of one case."""
     return decision.propose(case)
 
 
-def _split(choices: Any, axis: int) -> list[Any]:
+def _split(choices: PyTree, axis: int) -> list[PyTree]:
     """Return choices one by one that lie along an axis."""
     num = jax.tree.leaves(choices)[0].shape[axis]
     before = (slice(None),) * axis
@@ -118,7 +119,7 @@ def _split(choices: Any, axis: int) -> list[Any]:
 
 
 @jax.jit
-def _propose_all(decision: Decision, cases: Any) -> list[Any]:
+def _propose_all(decision: Decision, cases: PyTree) -> list[PyTree]:
     """Return the first choice of one case or of each case of a batch, the second, ..."""
     if cases.batch_shape == ():
         return _split(decision.propose(cases), 0)
@@ -126,13 +127,13 @@ def _propose_all(decision: Decision, cases: Any) -> list[Any]:
 
 
 @jax.jit
-def _explain(decision: Decision, cases: Any, status: Array) -> Array:
+def _explain(decision: Decision, cases: PyTree, status: Array) -> Array:
     """Return statuses of one case or of a batch; of unsolved cases, what the decision knows."""
     explain = decision.explain if cases.batch_shape == () else jax.vmap(decision.explain)
     return explain(cases, status)
 
 
-def first_choice(decision: Decision, cases: Any) -> Any:
+def first_choice(decision: Decision, cases: PyTree) -> PyTree:
     """Return one case or a batch with the first choice of a decision, without planning.
 
     The function is pure, and its result constant to derivatives.

@@ -2,12 +2,12 @@
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import PyTree
 
 from planner_jax.core.planner import Kind, Planner
 from planner_jax.core.protocol import Attempt, is_unsolved, out_of_time
@@ -32,8 +32,8 @@ class Driver:
         return self.watch.is_over
 
     def __call__(
-        self, planner: Planner, cases: Any, attempts: Sequence[Attempt] | None = None
-    ) -> tuple[Any, Any]:
+        self, planner: Planner, cases: PyTree, attempts: Sequence[Attempt] | None = None
+    ) -> tuple[PyTree, PyTree]:
         """Return plans of one case or of a batch; see `Drive`."""
         if planner.kind is Kind.COMPOSITE:
             plans = planner.plan_by(self, cases)
@@ -49,7 +49,9 @@ class Driver:
             return plans, is_unsolved(int(plans.status))
         return plan_batch(planner, attempts, cases, self.chunk, self.devices, self.watch)
 
-    def plan_again(self, plan_of: Callable[[Any], Any], cases: Any, plans: Any, left: Any) -> Any:
+    def plan_again(
+        self, plan_of: Callable[[PyTree], PyTree], cases: PyTree, plans: PyTree, left: PyTree
+    ) -> PyTree:
         """Return plans (B,) after one more try at the cases that are left; see `Drive`."""
         if self.is_pure:
             again = lambda plans: select(plan_of(cases), plans, left)  # noqa: E731
@@ -62,9 +64,9 @@ class Driver:
         return select_into(plans, plan_of(jax.tree.map(lambda leaf: leaf[lanes], cases)), lanes)
 
 
-def _plan_one(planner: Planner, attempts: Sequence[Attempt], case: Any, watch: Watch) -> Any:
+def _plan_one(planner: Planner, attempts: Sequence[Attempt], case: PyTree, watch: Watch) -> PyTree:
     """Return the plan of one case: attempts until one solves it, or the time is over."""
-    best: Any = None
+    best: PyTree = None
     for attempt in attempts:
         if best is not None and not attempt.is_due(best):
             continue
@@ -80,7 +82,7 @@ def _plan_one(planner: Planner, attempts: Sequence[Attempt], case: Any, watch: W
     return best
 
 
-def _plan_purely(planner: Planner, attempts: Sequence[Attempt], cases: Any) -> Any:
+def _plan_purely(planner: Planner, attempts: Sequence[Attempt], cases: PyTree) -> PyTree:
     """Return plans as jax arrays: every further attempt is made if it is due at some case."""
     require_pure(planner)
     first, *others = attempts

@@ -5,8 +5,10 @@ import functools
 from collections.abc import Sequence
 from typing import Any, Generic, TypeVar
 
+import jax
 from flax import struct
 from jax import Array
+from jaxtyping import PyTree
 
 from planner_jax.core.checks import require_kind, require_switch
 from planner_jax.core.errors import format_value
@@ -33,8 +35,8 @@ class PlanGradient(Generic[PlanT]):
 
 
 def gradient(
-    planner: Any,
-    cases: Any,
+    planner: PyTree,
+    cases: PyTree,
     *,
     of: Quantity,
     by: str | Sequence[str],
@@ -43,7 +45,7 @@ def gradient(
     solver: Solver | None = None,
     polish: bool = True,
     chunk: int | None = None,
-    devices: Sequence[Any] | None = None,
+    devices: Sequence[jax.Device] | None = None,
 ) -> PlanGradient:
     """`plan`, and the gradient of one number of every plan by parts of its case.
 
@@ -100,5 +102,5 @@ def gradient(
     return PlanGradient(plans=plans.whole_plan(), **_fields(plans.gradient))
 
 
-def _fields(tree: Any) -> dict[str, Any]:
+def _fields(tree: PyTree) -> dict[str, PyTree]:
     return {field.name: getattr(tree, field.name) for field in dataclasses.fields(tree)}

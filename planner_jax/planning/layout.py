@@ -6,12 +6,12 @@ Padding to fixed sizes keeps a new batch size from compiling the solver anew.
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
 
 import jax
 import numpy as np
 from jax import Array
 from jax.sharding import Mesh, NamedSharding, PartitionSpec, Sharding, SingleDeviceSharding
+from jaxtyping import PyTree
 
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt
@@ -81,7 +81,7 @@ def on_devices(planner: Planner, devices: Sequence[jax.Device] | None) -> tuple[
     return planner, mesh
 
 
-def length(tree: Any) -> int:
+def length(tree: PyTree) -> int:
     """Return the number of lanes of all leaves."""
     return jax.tree.leaves(tree)[0].shape[0]
 
@@ -123,7 +123,7 @@ def apart(mesh: Mesh, function: Callable, *specs: PartitionSpec) -> Callable:
     )
 
 
-def placed(tree: Any, mesh: Mesh) -> Any:
+def placed(tree: PyTree, mesh: Mesh) -> PyTree:
     """Return the tree with equal shares of its lanes on every device."""
     target = sharding(mesh)
 

@@ -1,11 +1,11 @@
 """`plan`: one call for one case or a million, on one device or all of them; and `solve`, pure."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax
 import numpy as np
 from jax.core import Tracer
+from jaxtyping import PyTree
 
 from planner_jax.core.choices import require_size
 from planner_jax.core.planner import CaseT, Kind, Planner, PlanT, require_fit
@@ -22,9 +22,9 @@ def plan(
     cases: CaseT,
     *,
     chunk: int | None = None,
-    devices: Sequence[Any] | None = None,
+    devices: Sequence[jax.Device] | None = None,
     time_limit: float | None = None,
-    progress: Callable[[Progress], Any] | None = None,
+    progress: Callable[[Progress], PyTree] | None = None,
 ) -> PlanT:
     """Plan one case, or a batch of them with a leading axis on every leaf.
 
@@ -84,7 +84,7 @@ def plan(
     return plans
 
 
-def _require_layout(chunk: Any, devices: Any) -> None:
+def _require_layout(chunk: object, devices: object) -> None:
     """Raise unless a chunk is a number of cases, and devices are some that differ."""
     if chunk is not None:
         require_size("chunk", chunk)
@@ -99,7 +99,7 @@ def _require_layout(chunk: Any, devices: Any) -> None:
             raise ValueError(f"devices must differ, got {', '.join(map(str, devices))}")
 
 
-def _require_own_precision(leaves: list[Any]) -> None:
+def _require_own_precision(leaves: list[PyTree]) -> None:
     """Raise `TypeError` for cases in float64 while JAX computes in float32.
 
     Cases of which only some arrays are in float64, as NumPy makes them, are accepted.
@@ -152,7 +152,7 @@ def solve(planner: Planner[CaseT, PlanT], cases: CaseT) -> PlanT:
 
 
 @jax.custom_jvp
-def _solve(planner: Any, cases: Any) -> Any:
+def _solve(planner: PyTree, cases: PyTree) -> PyTree:
     """Return plans, without derivatives."""
     return Driver(is_pure=True)(planner, cases)[0]
 

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import PyTree
 
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt, is_unsolved, marked
@@ -29,7 +30,7 @@ _COMPILER_OPTIONS: Any = {"xla_gpu_enable_triton_gemm": False}
 _Layout = tuple[tuple[tuple[int, ...], np.dtype], ...]  # shapes and dtypes of a tree's leaves
 
 
-def solve_cases(planner: Planner, cases: Any, attempt: Attempt) -> Any:
+def solve_cases(planner: Planner, cases: PyTree, attempt: Attempt) -> PyTree:
     """Return the plans of one case, or of a batch with a leading axis on every leaf; pure.
 
     Every compiled plan is made here: a case that breaks a rule of its class is `BAD_INPUT`,
@@ -43,17 +44,17 @@ def solve_cases(planner: Planner, cases: Any, attempt: Attempt) -> Any:
 
 @functools.partial(jax.jit, static_argnames=("attempt", "mesh"), compiler_options=_COMPILER_OPTIONS)
 def solve_on_devices(
-    planner: Planner, attempt: Attempt, mesh: Mesh, cases: Any
-) -> tuple[Any, Array]:
+    planner: Planner, attempt: Attempt, mesh: Mesh, cases: PyTree
+) -> tuple[PyTree, Array]:
     """Return plans of the lanes of every device, and how many it leaves unsolved, (devices,)."""
 
-    def solve(planner: Planner, cases: Any) -> tuple[Any, Array]:
+    def solve(planner: Planner, cases: PyTree) -> tuple[PyTree, Array]:
         return with_unsolved(solve_cases(planner, cases, attempt))
 
     return apart(mesh, solve, PartitionSpec(), LANES)(planner, cases)
 
 
-def with_unsolved(plans: Any) -> tuple[Any, Array]:
+def with_unsolved(plans: PyTree) -> tuple[PyTree, Array]:
     """Return the plans, and how many are unsolved, (1,)."""
     return plans, jnp.sum(is_unsolved(plans.status), keepdims=True)
 
@@ -65,7 +66,7 @@ class Compilation:
     is_done: bool = False
 
 
-def compilation_of(planner: Planner, attempt: Attempt, num: int, cases: Any) -> Compilation:
+def compilation_of(planner: Planner, attempt: Attempt, num: int, cases: PyTree) -> Compilation:
     """Return the compilation of the `solve_on_devices` that takes `num` lanes of a device."""
     own = tuple((leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(planner))
     lanes = tuple((leaf.shape[1:], leaf.dtype) for leaf in jax.tree.leaves(cases))
@@ -78,16 +79,16 @@ def _compilation(program: Hashable) -> Compilation:
     return Compilation()
 
 
-def solve_one(planner: Planner, case: Any, attempt: Attempt) -> Any:
+def solve_one(planner: Planner, case: PyTree, attempt: Attempt) -> PyTree:
     """Return the plan of one case, with NumPy leaves."""
     return call_packed(_solve_one, attempt, planner, case)
 
 
-def _solve_one(attempt: Attempt, planner: Planner, case: Any) -> Any:
+def _solve_one(attempt: Attempt, planner: Planner, case: PyTree) -> PyTree:
     return solve_cases(planner, case, attempt)
 
 
-def call_packed(function: Callable, static: Hashable, own: Any, case: Any) -> Any:
+def call_packed(function: Callable, static: Hashable, own: PyTree, case: PyTree) -> PyTree:
     """Return `function(static, own, case)` with NumPy leaves.
 
     Args:
@@ -110,7 +111,7 @@ def call_packed(function: Callable, static: Hashable, own: Any, case: Any) -> An
     return jax.tree.unflatten(result.tree, found)
 
 
-def _layout(leaves: Sequence[Any]) -> _Layout:
+def _layout(leaves: Sequence[PyTree]) -> _Layout:
     """Return what a program must know of arrays."""
     return tuple([(leaf.shape, leaf.dtype) for leaf in leaves])
 
@@ -119,7 +120,7 @@ def _layout(leaves: Sequence[Any]) -> _Layout:
 class _Result:
     """How the leaves of a tree lie in a vector; known as soon as a function has been traced."""
 
-    tree: Any = None
+    tree: PyTree = None
     fields: list[tuple[slice, tuple[int, ...]]] = dataclasses.field(default_factory=list)
     # Leaves of another dtype than the vector, and their dtypes.
     others: list[tuple[int, np.dtype]] = dataclasses.field(default_factory=list)
@@ -129,14 +130,19 @@ class _Result:
 class _Program:
     """A compiled function of the leaves that stay and a vector, which returns a vector."""
 
-    run: Callable[[list[Any], np.ndarray], Array]
+    run: Callable[[list[PyTree], np.ndarray], Array]
     dtype: np.dtype  # of both vectors
     result: _Result
 
 
 @functools.cache
 def _program(
-    function: Callable, static: Hashable, own_tree: Any, own: _Layout, tree: Any, layout: _Layout
+    function: Callable,
+    static: Hashable,
+    own_tree: PyTree,
+    own: _Layout,
+    tree: PyTree,
+    layout: _Layout,
 ) -> _Program:
     """Return the program for trees of these shapes and dtypes."""
     canonical = jax.dtypes.canonicalize_dtype
@@ -144,7 +150,7 @@ def _program(
     ends = np.cumsum([math.prod(shape) for shape, _ in layout])
     result = _Result()
 
-    def packed(kept: list[Any], vector: Array) -> Array:
+    def packed(kept: list[PyTree], vector: Array) -> Array:
         leaves = [
             piece.reshape(shape).astype(canonical(kind))
             for piece, (shape, kind) in zip(jnp.split(vector, ends[:-1]), layout, strict=True)

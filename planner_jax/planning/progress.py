@@ -3,9 +3,11 @@
 import dataclasses
 import time
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
+
+from planner_jax.core.planner import Planner
+from planner_jax.core.protocol import Attempt
 
 _QUIET = 1.0  # [s], at least, between two reports of one round
 
@@ -42,7 +44,7 @@ class Watch:
     def __init__(
         self,
         time_limit: float | None = None,
-        progress: Callable[[Progress], Any] | None = None,
+        progress: Callable[[Progress], object] | None = None,
     ) -> None:
         if time_limit is not None:
             if isinstance(time_limit, str | bool) or np.ndim(time_limit) != 0:
@@ -64,7 +66,7 @@ class Watch:
         """Whether the time has passed."""
         return self._limit is not None and time.monotonic() - self._began >= self._limit
 
-    def tell(self, planner: Any, attempt: Any, tried: int, cases: int) -> None:
+    def tell(self, planner: Planner, attempt: Attempt, tried: int, cases: int) -> None:
         """Report of a round: its beginning and its end always, its middle once a second."""
         if self._progress is None:
             return

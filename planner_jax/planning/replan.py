@@ -6,6 +6,7 @@ import jax
 import numpy as np
 from flax import struct
 from jax import Array
+from jaxtyping import PyTree
 
 from planner_jax.core.checks import numbers_of, require_kind
 from planner_jax.core.errors import format_value
@@ -31,7 +32,7 @@ class Replanning(Generic[CaseT, PlanT]):
         return self.case.batch_shape
 
 
-def moment_of(cases: Case, elapsed: Any) -> np.ndarray:
+def moment_of(cases: Case, elapsed: PyTree) -> np.ndarray:
     """When plans that are being carried out are left, in the cases' shape and type of numbers.
 
     Args:
@@ -55,7 +56,7 @@ def moment_of(cases: Case, elapsed: Any) -> np.ndarray:
     return elapsed
 
 
-def given_or_own(name: str, given: Any, own: Any, elapsed: np.ndarray) -> np.ndarray:
+def given_or_own(name: str, given: PyTree, own: PyTree, elapsed: np.ndarray) -> np.ndarray:
     """What is known of a state, in the shape of a plan's own.
 
     Args:
@@ -77,7 +78,7 @@ def given_or_own(name: str, given: Any, own: Any, elapsed: np.ndarray) -> np.nda
     return found
 
 
-def replan(planner: Any, cases: Any, previous: PlanT, elapsed: Any, **news: Any) -> PlanT:
+def replan(planner: PyTree, cases: PyTree, previous: PlanT, elapsed: PyTree, **news: Any) -> PlanT:
     """Plan again some time into a plan; a few iterations from what is left of it.
 
     Args:

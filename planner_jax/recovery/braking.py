@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jaxtyping import PyTree
 
 from planner_jax.core.errors import NoEnding
 from planner_jax.plane.obstacles import separation
@@ -32,7 +33,7 @@ _USUAL = 1.0  # [m/s^2] and [1/m], where there is no limit
 _SLOWER = (1.5, 2.0, 3.0)  # times the shortest duration in which all joints stop at once
 
 
-def brake_car(case: Any, plan: CarPlan) -> CarPlan:
+def brake_car(case: PyTree, plan: CarPlan) -> CarPlan:
     """Return a plan of a car that goes on until the car stands.
 
     Args:
@@ -60,7 +61,7 @@ def brake_car(case: Any, plan: CarPlan) -> CarPlan:
     raise NoEnding(why)
 
 
-def _car_ways(case: Any, plan: CarPlan) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def _car_ways(case: PyTree, plan: CarPlan) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield speeds and curvatures (n + 1,) at the plan's last knot, and at knots behind it."""
     limits = case.limits
     step = float(plan.time) / (len(plan.speed) - 1)
@@ -87,7 +88,7 @@ def _car_ways(case: Any, plan: CarPlan) -> Iterator[tuple[np.ndarray, np.ndarray
 
 
 def _car_problem(
-    case: Any, begin: Array, since: float, time: float, speed: np.ndarray, curvature: np.ndarray
+    case: PyTree, begin: Array, since: float, time: float, speed: np.ndarray, curvature: np.ndarray
 ) -> str:
     """Return what a car touches that brakes from a pose (3,) on; "" if it touches nothing.
 
@@ -125,7 +126,7 @@ def _car_problem(
 _poses = jax.jit(jax.vmap(pose_at, in_axes=(None, None, None, None, 0)))
 
 
-def brake_arm(case: Any, plan: ArmPlan) -> ArmPlan:
+def brake_arm(case: PyTree, plan: ArmPlan) -> ArmPlan:
     """Return a plan of an arm that goes on until the arm stands.
 
     Its joints brake evenly, all at once or each alone.
@@ -178,7 +179,7 @@ def _arm_ways(
         yield np.array(pieces), times - begins
 
 
-def _arm_problem(case: Any, pieces: np.ndarray, times: np.ndarray) -> str:
+def _arm_problem(case: PyTree, pieces: np.ndarray, times: np.ndarray) -> str:
     """Return what is wrong with a motion, coefficients (M, 3, 6) and durations (M,); or ""."""
     tau = times[:, None, None] * np.linspace(0.0, 1.0, _SAMPLES // len(times))[:, None]
     first, second, third = np.moveaxis(pieces, 1, 0)[:, :, None]
