@@ -19,10 +19,9 @@ from jaxtyping import Bool, Float, PyTree
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import CaseT, PlanT
 from planner_jax.core.protocol import require_settings
-from planner_jax.cost.along import Along, integrate_along
+from planner_jax.cost.along import BETWEEN_NODES, Along, integrate_along
 from planner_jax.cost.penalty import smoothed_hinge
 from planner_jax.cost.quadrotor import QuadrotorCase, flight_along, greatest_excess
-from planner_jax.optimise.chain_curvature import BETWEEN_NODES, chain_curvature
 from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.newton import Curvature
 from planner_jax.optimise.planner import OptimisedPlanner
@@ -229,6 +228,8 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
 
     def curved(self, point: Float[Array, " n"], context: PyTree) -> Curvature:
         """Return evaluation, gradient, and second derivatives; see `chain_curvature`."""
+        from planner_jax.optimise.chain_curvature import chain_curvature
+
         case = context.case
         offsets, natural = self.split(point)
         return chain_curvature(

@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import PyTree
 
-from planner_jax.cost.along import Along
+from planner_jax.cost.along import BETWEEN_NODES, Along
 from planner_jax.cost.along_curvature import (
     block_and_diagonal,
     columns_columns,
@@ -24,8 +24,6 @@ from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.newton import Curvature
 from planner_jax.optimise.preconditioner import block_preconditioner
 from planner_jax.trajectory.proportional_minco import ProportionalMinco, offset_energy
-
-BETWEEN_NODES = 0.004  # by which peaks between penalty nodes are higher, about
 
 # Of the variables of the ends (N, k): boundary rows (N, 2s, 3), mean durations of a piece (N,) [s],
 # the cost of the ends (), and the greatest excess there ().
