@@ -32,10 +32,10 @@ from planner_jax.baselines.intercept.speed import (
     speed_matrices,
     speed_template,
 )
-from planner_jax.baselines.intercept.speed_problems import speed_problems
 from planner_jax.baselines.intercept.station_time import reference_line, stations_at_joints
 from planner_jax.benchmarks.qp_peers import INSTALL, PEERS, installed
 from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin
+from planner_jax.benchmarks.speed_problems import speed_problems
 from planner_jax.core.protocol import Status
 
 PIECES = (10, 20)

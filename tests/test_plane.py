@@ -68,10 +68,13 @@ def test_a_rectangle_is_apart_from_a_polygon_just_where_no_point_is_in_both(floa
 @pytest.mark.parametrize(
     "polygons, message",
     [
-        ([[[0, 0], [1, 0]]], "polygon 0 must have corners"),
-        ([SQUARE, [[0, 0], [2, 0], [0.5, 0.5], [0, 2]]], "polygon 1 must be convex: cut it"),
-        ([[[0, 0], [1, 1], [2, 2]]], "polygon 0 must have an area"),
-        ([[[0, 0], [1, np.nan], [2, 2]]], "polygon 0 must be finite"),
+        ([[[0, 0], [1, 0]]], r"polygons must have corners .* at index 0$"),
+        (
+            [SQUARE, [[0, 0], [2, 0], [0.5, 0.5], [0, 2]]],
+            "be convex: cut it .* at index 1$",
+        ),
+        ([[[0, 0], [1, 1], [2, 2]]], "polygons must have an area, .* at index 0$"),
+        ([[[0, 0], [1, np.nan], [2, 2]]], "polygons must be finite, .* at index 0$"),
         ([SQUARE] * 3, "polygons must be at most 2 of at most 4 corners, got 3"),
     ],
 )

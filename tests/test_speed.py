@@ -17,8 +17,8 @@ from planner_jax.baselines.intercept.speed import (
     speed_bounds,
     speed_matrices,
 )
-from planner_jax.baselines.intercept.speed_problems import speed_problems
 from planner_jax.benchmarks.qp_peers import clarabel_solver
+from planner_jax.benchmarks.speed_problems import speed_problems
 from planner_jax.core.protocol import Status
 
 NUM = 32

@@ -22,6 +22,7 @@ from planner_jax.referee.judging import (
     finite_lanes,
     first_failures,
     judge_in_chunks,
+    read_leaves,
 )
 from planner_jax.referee.verdict import Verdict
 
@@ -156,35 +157,38 @@ def referee_intercepts(
     return InterceptVerdict(**judge_in_chunks(judge, leaves, chunk))
 
 
+# Leaves of a case -> shape in one lane.
+_SHAPES: dict[str, tuple[int, ...]] = {
+    "start": (3,),
+    "speed": (),
+    "curvature": (),
+    "time": (),
+    "tolerance": (),
+    "end_heading": (),
+    "heading_tolerance": (),
+    "lower": (2,),
+    "upper": (2,),
+    **{f"body.{name}": () for name in ("length", "width", "wheelbase", "rear_overhang")},
+    **{f"limits.{name}": () for name in ("speed", "acceleration", "lateral_acceleration")},
+    **{f"limits.{name}": () for name in ("curvature", "steering_rate")},
+}
+
+
 def _leaves(cases, plans) -> dict[str, np.ndarray]:
-    """Every array that the referee reads but the target's, by name, its shape checked."""
+    """Read every array of cases and plans but the target's, and check their shapes."""
     speed = np.asarray(plans.speed)
     if speed.ndim != 2 or speed.shape[1] < 2:
         raise ValueError(f"plan.speed must be (B, K + 1), K >= 1, got {speed.shape}")
-    trailing = {
-        "plan.start": (plans.start, (3,)),
-        "plan.time": (plans.time, ()),
-        "plan.curvature": (plans.curvature, speed.shape[1:]),
-        "start": (cases.start, (3,)),
-        "lower": (cases.lower, (2,)),
-        "upper": (cases.upper, (2,)),
-    }
-    names = ("speed", "curvature", "time", "tolerance", "end_heading", "heading_tolerance")
-    trailing |= {name: (getattr(cases, name), ()) for name in names}
-    names = ("length", "width", "wheelbase", "rear_overhang")
-    trailing |= {f"body.{name}": (getattr(cases.body, name), ()) for name in names}
-    names = ("speed", "acceleration", "lateral_acceleration", "curvature", "steering_rate")
-    trailing |= {f"limits.{name}": (getattr(cases.limits, name), ()) for name in names}
-    leaves = {"plan.speed": speed}
-    for name, (value, shape) in trailing.items():
-        leaves[name] = checked_leaf(name, value, speed.shape[:1] + shape)
+    of_plan = {"start": (3,), "time": (), "curvature": speed.shape[1:], "speed": speed.shape[1:]}
+    leaves = read_leaves(plans, of_plan, len(speed), "plan.")
+    leaves |= read_leaves(cases, _SHAPES, len(speed))
     for name, group in (("walls", cases.walls), ("movers", cases.movers)):
         leaves |= _obstacle_leaves(name, group, len(speed))
     return leaves
 
 
 def _obstacle_leaves(name: str, group, batch: int) -> dict[str, np.ndarray]:
-    """The arrays of walls or movers by name; those of absent ones are zero."""
+    """Return the arrays of walls or movers by name; the arrays of absent ones are zero."""
     corners = np.asarray(group.corners)
     if corners.ndim != 4 or corners.shape[::3] != (batch, 2) or corners.shape[2] < 3:
         raise ValueError(f"{name}.corners must be ({batch}, N, V >= 3, 2), got {corners.shape}")
@@ -266,10 +270,14 @@ def final_poses(plans, body) -> np.ndarray:
         plans: object with the fields of `CarPlan`, leaves with leading axis B.
         body: of the cars, object with the fields of `CarBody`.
     """
-    names = ("start", "speed", "curvature")
-    case = {f"plan.{name}": np.asarray(getattr(plans, name), np.float64) for name in names}
-    for name in ("length", "rear_overhang"):
-        case[f"body.{name}"] = np.asarray(getattr(body, name), np.float64)
+    case = {
+        "plan.start": plans.start,
+        "plan.speed": plans.speed,
+        "plan.curvature": plans.curvature,
+        "body.length": body.length,
+        "body.rear_overhang": body.rear_overhang,
+    }
+    case = {name: np.asarray(leaf, np.float64) for name, leaf in case.items()}
     end = np.asarray(plans.time, np.float64)
     # What is not driven ends where it begins.
     end = np.where((end > 0.0) & (end <= LONGEST_PLAN), end, 0.0)

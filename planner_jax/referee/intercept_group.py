@@ -77,7 +77,7 @@ def referee_groups(
         case = _leg(shared, _entries(shared.target, (lanes, order[:, k])), begin, car)
         where = _later(target_positions or target_positions_of, begin)
         verdict = referee_intercepts(case, leg, target_positions=where, **settings)
-        found.append({f.name: getattr(verdict, f.name) for f in dataclasses.fields(verdict)})
+        found.append(dict(vars(verdict)))
         for name in ("failed_time", "meeting_time"):
             found[k][name] = found[k][name] + begin
         begin = begin + np.asarray(leg.time, np.float64)
@@ -104,7 +104,7 @@ def _leg(shared: Any, target: Any, begin: np.ndarray, car: tuple) -> SimpleNames
     passed = begin[:, None, None] * np.asarray(movers.velocity, np.float64)
     names = ("tolerance", "end_heading", "heading_tolerance", "walls", "lower", "upper")
     return SimpleNamespace(
-        **{name: getattr(shared, name) for name in (*names, "body", "limits")},
+        **{name: vars(shared)[name] for name in (*names, "body", "limits")},
         start=start,
         speed=speed,
         curvature=curvature,
@@ -128,5 +128,4 @@ def _entries(tree: Any, at: tuple) -> Any:
     """Entries of every leaf of a dataclass of arrays, or of such dataclasses."""
     if not dataclasses.is_dataclass(tree):
         return np.asarray(tree)[at]
-    fields = {f.name: _entries(getattr(tree, f.name), at) for f in dataclasses.fields(tree)}
-    return type(tree)(**fields)
+    return type(tree)(**{name: _entries(leaf, at) for name, leaf in vars(tree).items()})

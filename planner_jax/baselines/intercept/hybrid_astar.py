@@ -12,9 +12,11 @@ headings counter-clockwise from the x axis.
 
 import dataclasses
 import importlib
-from typing import Any, Literal
+from types import ModuleType
+from typing import Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from planner_jax.core.errors import MissingExtra
 from planner_jax.plane.obstacles import Obstacles
@@ -63,14 +65,14 @@ class HybridPath:
 
 
 def hybrid_astar(
-    start: Any,
-    meeting: Any,
+    start: ArrayLike,
+    meeting: ArrayLike,
     walls: Obstacles,
     *,
     curvature: float,
     body: tuple[float, float, float],
-    lower: Any,
-    upper: Any,
+    lower: ArrayLike,
+    upper: ArrayLike,
     end_heading: float | None = None,
     settings: HybridAstar = HybridAstar(),
 ) -> HybridPath:
@@ -148,7 +150,7 @@ def hybrid_astar(
     )
 
 
-def _kernels() -> Any:
+def _kernels() -> ModuleType:
     """The compiled loops; says what to install where numba is missing."""
     try:
         return importlib.import_module("planner_jax.baselines.intercept.hybrid_astar_kernels")
@@ -179,12 +181,13 @@ def _require(start, meeting, lower, upper, curvature, body, end_heading, setting
     for name, value in (positive | {"max_expansions": settings.max_expansions}).items():
         if not (np.isfinite(value) and value > 0):
             raise ValueError(f"{name} must be > 0 and finite, got {value}")
+    chosen = vars(settings)
     for name in ("turn_price", "slack", "margin"):
-        if not 0.0 <= getattr(settings, name) < np.inf:
-            raise ValueError(f"{name} must be >= 0 and finite, got {getattr(settings, name)}")
+        if not 0.0 <= chosen[name] < np.inf:
+            raise ValueError(f"{name} must be >= 0 and finite, got {chosen[name]}")
     for name, least in (("headings", 8), ("poses", 2)):
-        if getattr(settings, name) < least:
-            raise ValueError(f"{name} must be >= {least}, got {getattr(settings, name)}")
+        if chosen[name] < least:
+            raise ValueError(f"{name} must be >= {least}, got {chosen[name]}")
     if settings.heuristic not in HEURISTICS:
         known = ", ".join(HEURISTICS)
         raise ValueError(f"heuristic must be one of {known}, got {settings.heuristic!r}")

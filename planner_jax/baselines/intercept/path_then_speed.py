@@ -5,7 +5,7 @@ several paths are tried, each another way round what stands.
 """
 
 import dataclasses
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -166,7 +166,7 @@ def best_of(plans: InterceptPlan) -> Array:
     return jnp.argmin(cost + jnp.where(plans.status == Status.NO_PATH, 1e6, 0.0))
 
 
-def lattice(**fields: Any) -> PathThenSpeed:
+def lattice(**fields: object) -> PathThenSpeed:
     """Up to eight paths, on each a curve of least acceleration in a corridor of trapezoids.
 
     Args:
@@ -175,7 +175,7 @@ def lattice(**fields: Any) -> PathThenSpeed:
     return PathThenSpeed(**fields)
 
 
-def em(kind: Literal["em", "em-exact"] = "em", **fields: Any) -> PathThenSpeed:
+def em(kind: Literal["em", "em-exact"] = "em", **fields: object) -> PathThenSpeed:
     """The best path with the speed step of the EM planner, at the same setting.
 
     Args:
@@ -186,7 +186,7 @@ def em(kind: Literal["em", "em-exact"] = "em", **fields: Any) -> PathThenSpeed:
     return PathThenSpeed(**{"tries": 1, "step": SpeedStep(speed=speed), **fields})
 
 
-def constant(**fields: Any) -> PathThenSpeed:
+def constant(**fields: object) -> PathThenSpeed:
     """The best path with constant speed after a short ramp, whatever moves.
 
     Args:

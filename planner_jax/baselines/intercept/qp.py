@@ -12,13 +12,13 @@ products with matrices, no factorisation, so that a batch is a batch of products
 """
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array, lax
+from numpy.typing import ArrayLike
 
 from planner_jax.core.protocol import Status
 
@@ -27,12 +27,14 @@ from planner_jax.core.protocol import Status
 class QpTemplate:
     """What programs of the same matrices share, made by `qp_template`, in double precision."""
 
-    base: Any  # (n, q), to the optimum without bounds, from e
-    base_cost: Any  # (q, q), its cost is e' base_cost e
-    directions: Any  # (n, d) Z
-    reach: Any  # (M, q), R x at the optimum without bounds, from e
-    normals: Any  # (M, d), rows of R Z as unit vectors; 0 where the equalities decide R x
-    scales: Any  # (M,), their lengths before; 1 where the equalities decide
+    base: Array | np.ndarray  # (n, q), to the optimum without bounds, from e
+    base_cost: Array | np.ndarray  # (q, q), its cost is e' base_cost e
+    directions: Array | np.ndarray  # (n, d) Z
+    reach: Array | np.ndarray  # (M, q), R x at the optimum without bounds, from e
+    normals: (
+        Array | np.ndarray
+    )  # (M, d), rows of R Z as unit vectors; 0 where the equalities decide R x
+    scales: Array | np.ndarray  # (M,), their lengths before; 1 where the equalities decide
 
 
 @struct.dataclass
@@ -55,7 +57,9 @@ class QpConfig:
     max_steps: int = 60
 
 
-def qp_template(hessian: Any, equalities: Any, rows: Any, zeros: Any = None) -> QpTemplate:
+def qp_template(
+    hessian: ArrayLike, equalities: ArrayLike, rows: ArrayLike, zeros: ArrayLike | None = None
+) -> QpTemplate:
     """What programs of these matrices share; NumPy, in double precision.
 
     A term linear in x is a product with an unknown that an equality holds at 1.

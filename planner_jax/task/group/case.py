@@ -4,13 +4,14 @@ Paper 003 meets one target and names groups as future work; what is here is this
 """
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array
+from numpy.typing import ArrayLike
 
 from planner_jax.core.checks import require_path
 from planner_jax.core.errors import ArgumentError, format_value
@@ -91,7 +92,7 @@ class InterceptGroup:
 
 
 def case(
-    targets: PlanePath, time: Any = 15.0, *, present: Any = True, **settings: Any
+    targets: PlanePath, time: ArrayLike = 15.0, *, present: ArrayLike = True, **settings: object
 ) -> InterceptGroup:
     """A group, or a batch of them, by default with the car and the map of `case`.
 

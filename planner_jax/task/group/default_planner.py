@@ -8,7 +8,7 @@ ones, then all second ones.
 """
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -52,7 +52,7 @@ class GroupIntercept(Planner):
         car = CarState(pose=shared.start, speed=shared.speed, curvature=shared.curvature)
         state = (car, jnp.zeros_like(shared.time), jnp.ones(shared.time.shape, bool))
 
-        def leg(state: tuple, k: Any) -> tuple[tuple, tuple[Array, InterceptPlan]]:
+        def leg(state: tuple, k: Array | int) -> tuple[tuple, tuple[Array, InterceptPlan]]:
             car, begin, fine = state
             case, wanted = _leg(cases, k, begin, car, fine)
             plans = _of_wanted(case, self._planned(drive, case, wanted), wanted)
@@ -88,14 +88,14 @@ class GroupIntercept(Planner):
         return jax.tree.map(lambda leaf: leaf[places], plans)
 
 
-def _is_left(status: Any) -> Any:
+def _is_left(status: Array) -> Array:
     """Which legs are worth another planner; it has other meeting times, and thinner bodies."""
     return is_unsolved(status) | (status == Status.NO_PATH)
 
 
 @jax.jit
 def _leg(
-    cases: InterceptGroup, k: Any, begin: Array, car: CarState, fine: Array
+    cases: InterceptGroup, k: Array | int, begin: Array, car: CarState, fine: Array
 ) -> tuple[InterceptCase, Array]:
     """The legs to the targets at a place of the order, and which of them are to be planned.
 

@@ -8,10 +8,10 @@ in the plane, SI units.
 """
 
 import dataclasses
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 
 from planner_jax.core.checks import floating
 from planner_jax.core.registry import require_name
@@ -32,7 +32,7 @@ _TARGET = ("pos", "angle", "speed", "rate")
 
 
 def draw_groups(
-    suite: str, num: int, seed: int, first: int = 0, *, dtype: Any = jnp.float32
+    suite: str, num: int, seed: int, first: int = 0, *, dtype: DTypeLike = jnp.float32
 ) -> InterceptGroup:
     """A batch of groups of a suite, drawn in float64 and then cast.
 

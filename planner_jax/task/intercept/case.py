@@ -1,13 +1,15 @@
 """One interception: a car, its target, and what stands or moves in its way."""
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array
+from jax.typing import DTypeLike
+from numpy.typing import ArrayLike
 
 from planner_jax.core.checks import floating, require_path, shape_of
 from planner_jax.core.errors import ArgumentError
@@ -64,29 +66,29 @@ class InterceptCase:
 
 def case(
     target: PlanePath,
-    time: Any = 10.0,
+    time: ArrayLike = 10.0,
     *,
-    start: Any = (0.8, 4.0, 0.0),
-    initial_speed: Any = 0.5,
-    initial_curvature: Any = 0.0,
-    walls: Sequence[Any] | Obstacles = (),
-    movers: Sequence[Any] | Obstacles = (),
-    mover_velocities: Any = 0.0,
-    tolerance: Any = 0.05,
-    end_heading: Any = None,
-    heading_tolerance: Any = 0.05,
-    lower: Any = (0.0, 0.0),
-    upper: Any = (8.0, 8.0),
-    length: Any = 0.4,
-    width: Any = 0.25,
-    wheelbase: Any = 0.3,
-    rear_overhang: Any = 0.05,
-    speed: Any = 1.5,
-    acceleration: Any = 1.0,
-    lateral_acceleration: Any = 0.8,
-    curvature: Any = 2.0,
-    steering_rate: Any = 2.0,
-    dtype: Any = jnp.float32,
+    start: ArrayLike = (0.8, 4.0, 0.0),
+    initial_speed: ArrayLike = 0.5,
+    initial_curvature: ArrayLike = 0.0,
+    walls: Sequence[ArrayLike] | Obstacles = (),
+    movers: Sequence[ArrayLike] | Obstacles = (),
+    mover_velocities: ArrayLike = 0.0,
+    tolerance: ArrayLike = 0.05,
+    end_heading: ArrayLike | None = None,
+    heading_tolerance: ArrayLike = 0.05,
+    lower: ArrayLike = (0.0, 0.0),
+    upper: ArrayLike = (8.0, 8.0),
+    length: ArrayLike = 0.4,
+    width: ArrayLike = 0.25,
+    wheelbase: ArrayLike = 0.3,
+    rear_overhang: ArrayLike = 0.05,
+    speed: ArrayLike = 1.5,
+    acceleration: ArrayLike = 1.0,
+    lateral_acceleration: ArrayLike = 0.8,
+    curvature: ArrayLike = 2.0,
+    steering_rate: ArrayLike = 2.0,
+    dtype: DTypeLike = jnp.float32,
 ) -> InterceptCase:
     """An interception, or a batch of them, by default with the setting of paper 003.
 
@@ -131,7 +133,7 @@ def case(
     shapes += [shape_of(name, value) for name, value in own.items()]
     batch = max(shapes, key=len)
 
-    def leaf(name: str, value: Any, *trailing: int) -> Array:
+    def leaf(name: str, value: ArrayLike, *trailing: int) -> Array:
         return array_of(name, value, batch, trailing, dtype)
 
     require_path("target", target, batch, 2)
@@ -169,7 +171,11 @@ def case(
 
 
 def _for_batch(
-    name: str, given: Any, velocities: Any, batch: tuple[int, ...], dtype: Any
+    name: str,
+    given: Sequence[ArrayLike] | Obstacles,
+    velocities: ArrayLike,
+    batch: tuple[int, ...],
+    dtype: DTypeLike,
 ) -> Obstacles:
     """Obstacles with the batch's axes on every leaf.
 
