@@ -37,8 +37,8 @@ from planner_jax.sims.film import draw_flight, film_flights, require_film
 from planner_jax.sims.recording import FLIGHTS, Recording, read_recording, to_rows
 from planner_jax.sims.settings import FlySettings, fly_settings
 from planner_jax.sims.task import FlightTask
+from planner_jax.sweep.quadrotor_settings import robot_remark
 from planner_jax.sweep.report import require_counted
-from planner_jax.sweep.robots import robot_remark
 
 _FILMED = 3  # flights at most
 _RECORDED = 256  # flights of a batch that are recorded whole

@@ -66,7 +66,7 @@ SLOW = (
     *("path_then_speed", "qp", "speed", "station_time"),
     *("block_eye", "block_receding", "live"),
     *("policy", "training", "learned_start"),
-    *("cluster", "joined_parquet", "stored_run"),
+    "cluster",
     *("bench", "benchmark_ipopt", "intercept_oracle"),
 )
 # Modules that take longest, or whose compiled programs others find in the cache: the hit planner's

@@ -32,7 +32,6 @@ LAYERS = (
 BY_NAME = {
     "cli": {"benchmarks"},
     "core": {"runs"},
-    "runs": {"sweep"},
     "task": {"baselines", "policies", "sims", "sweep"},
 }
 REGENERATE = "run `python -m tests.layers --write` and commit CONTRIBUTING.md"

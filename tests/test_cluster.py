@@ -120,7 +120,7 @@ def ray(monkeypatch, request):
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
     monkeypatch.setattr(run, "write_report", lambda folder: None)
     cluster._maker_of.cache_clear()
-    if request.node.get_closest_marker("slow"):
+    if "real_cluster" in request.node.name:
         return None
     stand_in = StandIn()
     monkeypatch.setitem(sys.modules, "ray", stand_in)
@@ -175,7 +175,7 @@ def test_a_chunk_in_which_every_worker_dies_leaves_a_run_that_can_be_finished(
     ray.deaths, out = {2: 99}, tmp_path / "run"
     assert main([*COMMAND, "--workers", "ray", "--out", str(out)]) == 1
     said = capsys.readouterr().err.splitlines()[-1]
-    assert "--workers must live" in said and "chunk 2 in 4 tries (a worker died)" in said
+    assert "workers must live" in said and "chunk 2 in 4 tries (a worker died)" in said
     assert f"finish with: planner-jax sweep hit --resume --out {out}" in said
     assert RunFolder(out).read_manifest()["state"] == "interrupted" and ray.ended == 1
     resume_sweep(TASK, out, progress=False)
@@ -299,14 +299,14 @@ def test_a_worker_whose_jax_has_no_device_ends_a_run_that_can_be_finished(
 
     def backend():
         if (platform := next(platforms, None)) is None:
-            raise ArgumentError("JAX_PLATFORMS must name a platform that works here, got 'x' (no)")
+            raise ArgumentError("JAX_PLATFORMS", "a platform", verb="name", shown="'x' (no)")
         return platform
 
     out = tmp_path / "run"
     monkeypatch.setattr(cluster, "require_backend", backend)
     assert main([*COMMAND, "--workers", "ray", "--out", str(out)]) == 1
     said = capsys.readouterr().err.splitlines()[-1]
-    assert "--workers must be able to start the run, got: JAX_PLATFORMS" in said
+    assert "workers must be able to start the run, got: JAX_PLATFORMS" in said
     assert "finish with" in said
     assert RunFolder(out).read_manifest()["state"] == "interrupted"
 

@@ -64,19 +64,19 @@ def pair(tmp_path):
 def test_of_the_same_cases_only_those_count_that_one_run_alone_solves(pair):
     first, other = map(read_run, pair)
     found = difference_of(first, other)
-    assert (found.first_only, found.other_only) == (9, 3)
-    assert found.chance == pytest.approx(binomtest(3, 12).pvalue)
+    assert (found.first_only, found.this_only) == (9, 3)
+    assert found.mcnemar_p == pytest.approx(binomtest(3, 12).pvalue)
     assert found.difference == pytest.approx(-6.0 / 60.0)
     low, high = binomtest(3, 12).proportion_ci(0.95, "exact")
-    np.testing.assert_allclose(found.interval, [(2 * x - 1) * 12 / 60 for x in (low, high)])
-    assert found.interval[0] < found.difference < found.interval[1]
+    np.testing.assert_allclose(found[1:3], [(2 * x - 1) * 12 / 60 for x in (low, high)])
+    assert found.difference_low < found.difference < found.difference_high
 
 
 def test_runs_that_end_alike_differ_by_nothing(pair):
     first = read_run(pair[0])
     found = difference_of(first, first)
-    assert (found.first_only, found.other_only, found.chance) == (0, 0, 1.0)
-    low, high = found.interval
+    assert (found.first_only, found.this_only, found.mcnemar_p) == (0, 0, 1.0)
+    low, high = found[1:3]
     assert low == -high and (1.0 - high) ** 60 == pytest.approx(0.025)
     assert "ends alike" in described([first, first])[-1]
 
@@ -86,11 +86,11 @@ def test_other_limits_make_other_cases_which_are_compared_as_independent(tmp_pat
     other = read_run(written_run(tmp_path / "b", OTHER[:50], limit_scale=0.5, num=50))
     assert other_cases(first, other) == ["num 60 and 50", "limit_scale 1.0 and 0.5"]
     found = difference_of(first, other)
-    assert found.chance is None and found.first_only is None
+    assert found.mcnemar_p is None and found.first_only is None
     (l1, u1), (l2, u2) = wilson_interval(49, 60), wilson_interval(41, 50)
     p1, p2 = 49 / 60, 41 / 50
-    assert found.interval[0] == pytest.approx(p2 - p1 - np.hypot(p2 - l2, u1 - p1))
-    assert found.interval[1] == pytest.approx(p2 - p1 + np.hypot(u2 - p2, p1 - l1))
+    assert found.difference_low == pytest.approx(p2 - p1 - np.hypot(p2 - l2, u1 - p1))
+    assert found.difference_high == pytest.approx(p2 - p1 + np.hypot(u2 - p2, p1 - l1))
     text = "\n".join(described([first, other]))
     assert "the cases differ in num 60 and 50, limit_scale 1.0 and 0.5." in text
     assert "McNemar" not in text and "tell them apart" not in text

@@ -8,10 +8,10 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.cli.main import main
+from planner_jax.sweep.catch.settings import SingleCatchSettings
 from planner_jax.sweep.catch.single import SingleCatch
-from planner_jax.sweep.catch.single_settings import SingleCatchSettings
+from planner_jax.sweep.hit.settings import SingleHitSettings
 from planner_jax.sweep.hit.single import SingleHit
-from planner_jax.sweep.hit.single_settings import SingleHitSettings
 from planner_jax.sweep.single import Margin
 from planner_jax.task.hit.plan import HitPlan
 

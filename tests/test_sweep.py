@@ -27,9 +27,9 @@ from planner_jax.sweep.hit.figures.motion import motion_figure
 from planner_jax.sweep.hit.settings import HitSettings
 from planner_jax.sweep.hit.source import open_source
 from planner_jax.sweep.hit.sweep import HitSweep
+from planner_jax.sweep.quadrotor import body_rate, net_thrust, sample_motion
 from planner_jax.sweep.report import RunRows, write_report
 from planner_jax.sweep.run import SweepInterrupted, resume_sweep, start_sweep
-from planner_jax.sweep.sampled_motion import body_rate, net_thrust, sample_motion
 from planner_jax.task.hit import court
 from planner_jax.task.hit.default_planner import ExactHit
 from planner_jax.task.hit.published import published_rates

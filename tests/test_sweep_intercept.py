@@ -29,7 +29,7 @@ from planner_jax.task.intercept.searches import Search
 TASK = pj.task_named("intercept")
 NUM, BATCH = 12, 6
 SETTINGS = InterceptSettings(suite="hard", num=NUM, batch=BATCH, seed=0)  # some of these fail
-FIGURES = ("plane.png", "station_time.png", "reach.png", "motion.png", "outcomes.png")
+FIGURES = ("plane.png", "motion.png", "outcomes.png")
 
 
 def one_search():

@@ -63,7 +63,7 @@ def _write_answer(
 ) -> None:
     """Write a new folder: the plan, its setpoints where the referee lets it pass, and pictures."""
     from planner_jax.export.api import export
-    from planner_jax.sweep.single_pictures import write_pictures
+    from planner_jax.sweep.single import write_pictures
 
     out.mkdir()
     written = [out / "plan.npz"]

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 from planner_jax.core.choices import require
 from planner_jax.runs.settings import option, require_count
-from planner_jax.sweep.robots import checked_robot, robot_option
+from planner_jax.sweep.quadrotor_settings import checked_robot, robot_option
 from planner_jax.task.hit.spec import DRAG
 
 if TYPE_CHECKING:

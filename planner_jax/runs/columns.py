@@ -2,10 +2,11 @@
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import pyarrow as pa
+from jaxtyping import ArrayLike, PyTree
 
 from planner_jax.core.protocol import Status
 from planner_jax.runs.source import Chunk
@@ -16,13 +17,16 @@ class RefereedBatch:
     """B cases with everything that is known about them; leaves are NumPy or JAX arrays."""
 
     chunk: Chunk
-    plans: Any
-    verdict: Any
+    plans: PyTree
+    verdict: PyTree
 
     @property
-    def cases(self) -> Any:
+    def cases(self) -> PyTree:
         """The cases themselves."""
         return self.chunk.cases
+
+
+Values: TypeAlias = ArrayLike | pa.Array | None
 
 
 class Column(NamedTuple):
@@ -32,7 +36,7 @@ class Column(NamedTuple):
     unit: str  # "" for names and counts, "1" for ratios
     meaning: str
     type: pa.DataType
-    values: Callable[[RefereedBatch], Any]  # (B,) or (B, ...), lists flat; None: all null
+    values: Callable[[RefereedBatch], Values]  # (B,) or (B, ...), lists flat; None: all null
 
 
 BOOL, TEXT, COUNT, NUMBER = pa.bool_(), pa.string(), pa.int32(), pa.float32()
@@ -40,7 +44,7 @@ _KINDS = {"b": BOOL, "U": TEXT, "i": COUNT}  # kind of a NumPy type -> type of a
 
 
 def list_of(kind: pa.DataType, length: int = -1) -> pa.DataType:
-    """The type of a list column, under the name that Parquet gives its entries back."""
+    """Return the type of a list column, under the name that Parquet gives its entries back."""
     return pa.list_(pa.field("element", kind), length)
 
 
@@ -50,7 +54,7 @@ INDEX = Column("index", "", "place in the whole", pa.int64(), lambda b: b.chunk.
 
 
 def leaves_of(part: str, *rows: tuple) -> list[Column]:
-    """Columns that are leaves of one part of a batch.
+    """Return columns that are leaves of one part of a batch.
 
     Args:
         part: dotted path of it in a `RefereedBatch`.
@@ -70,7 +74,7 @@ _STATUS_NAMES = np.array([Status(code).name for code in range(len(Status))])
 
 
 def status_column(meaning: str) -> Column:
-    """The column of the plans' statuses, by name."""
+    """Return the column of the plans' statuses, by name."""
     return Column("status", "", meaning, TEXT, lambda b: _STATUS_NAMES[np.asarray(b.plans.status)])
 
 
@@ -97,7 +101,7 @@ OUTCOME = [
 
 
 def leaf_columns(batch: RefereedBatch) -> list[Column]:
-    """A column for every leaf of the cases, the plans and the verdict.
+    """Return a column for every leaf of the cases, the plans and the verdict.
 
     Names are those of the fields, joined by dots, behind "case.", "plan." or "verdict."; what
     every task has is named as in all runs. A field's metadata may hold its `unit` and `meaning`.
@@ -109,10 +113,10 @@ def leaf_columns(batch: RefereedBatch) -> list[Column]:
     return [*found, *SOLVER, *OUTCOME]
 
 
-def _columns_of(tree: Any, name: str, part: str, words: Mapping[str, str]) -> list[Column]:
+def _columns_of(tree: PyTree, name: str, part: str, words: Mapping[str, str]) -> list[Column]:
     if dataclasses.is_dataclass(tree):
         fields = [
-            (f.name, getattr(tree, f.name), f.metadata)
+            (f.name, vars(tree)[f.name], f.metadata)
             for f in dataclasses.fields(tree)
             if f.metadata.get("pytree_node", True)  # what is static is not of one row
         ]
@@ -134,7 +138,7 @@ def _columns_of(tree: Any, name: str, part: str, words: Mapping[str, str]) -> li
 
 
 def rows_of(columns: Sequence[Column], batch: RefereedBatch, frame: str) -> pa.Table:
-    """The rows of a batch.
+    """Return the rows of a batch.
 
     Args:
         columns: of the task.
@@ -149,8 +153,8 @@ def rows_of(columns: Sequence[Column], batch: RefereedBatch, frame: str) -> pa.T
     return pa.Table.from_arrays(arrays, schema=pa.schema(fields, metadata={"frame": frame}))
 
 
-def _array(values: Any, kind: pa.DataType, num: int) -> pa.Array:
-    """An Arrow array of `num` entries from (num,) or (num, ...) values."""
+def _array(values: Values, kind: pa.DataType, num: int) -> pa.Array:
+    """Return an Arrow array of `num` entries from (num,) or (num, ...) values."""
     if values is None:
         return pa.nulls(num, kind)
     if isinstance(values, pa.Array):
@@ -165,13 +169,13 @@ def _array(values: Any, kind: pa.DataType, num: int) -> pa.Array:
     return pa.ListArray.from_arrays(pa.array(offsets), flat, type=kind)
 
 
-def _leaf(tree: Any, path: str) -> Any:
+def _leaf(tree: PyTree, path: str) -> ArrayLike:
     for name in path.split("."):
         tree = tree[name] if isinstance(tree, dict) else getattr(tree, name)
     return tree
 
 
-def _sentences(verdict: Any) -> np.ndarray:
+def _sentences(verdict: PyTree) -> np.ndarray:
     return np.array(
         ["" if good else verdict.sentence(lane) for lane, good in enumerate(verdict.success)]
     )

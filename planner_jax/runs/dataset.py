@@ -128,8 +128,10 @@ class Dataset:
                 counted += check_part(path)["num"]
                 if number_of(path) != place:
                     raise DamagedPart(f"stands in the place of part {place}")
-            except (DamagedPart, OSError) as error:
-                found[path] = str(getattr(error, "strerror", None) or error)
+            except DamagedPart as error:
+                found[path] = str(error)
+            except OSError as error:
+                found[path] = f"cannot be read: {error.strerror}"
         if not found and num not in (None, counted):
             found[self.folder] = f"has {counted} rows, and not {num}"
         return found

@@ -12,6 +12,7 @@ import json
 import os
 import shutil
 import socket
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from planner_jax.runs.dataset import Dataset
 from planner_jax.runs.manifest import MANIFEST, Entries, read_written, to_write
 
 LOCK = ".lock"
+_TRIES, _BETWEEN = 20, 0.01  # of a lock that is taken, and seconds from one to the next
 
 
 class RunFolder:
@@ -89,25 +91,29 @@ class RunFolder:
     @contextlib.contextmanager
     def _locked(self) -> Iterator[None]:
         """Hold the lock, whose file says who holds it."""
-        try:
-            handle = os.open(self.path / LOCK, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK, 0o644)
-        except OSError as error:
-            raise self._unwritable(error) from None
-        with os.fdopen(handle, "r+", errors="replace") as file:
+        with contextlib.ExitStack() as opened:
             try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                handle = os.open(self.path / LOCK, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK, 0o644)
+                opened.callback(os.close, handle)
+                self._lock(handle)
                 since = datetime.datetime.now().astimezone().isoformat(timespec="seconds")
+                owner = f"{os.getpid()} on {socket.gethostname()}, since {since}"
                 os.ftruncate(handle, 0)
-                os.pwrite(
-                    handle, f"{os.getpid()} on {socket.gethostname()}, since {since}".encode(), 0
-                )
-            except BlockingIOError:
-                rule = "a folder that no other process writes"
-                owner = f"owned by process {file.read(200)}"
-                raise ArgumentError(self.name, rule, shown=f"{str(self.path)!r}, {owner}") from None
+                os.pwrite(handle, owner.encode(), 0)
             except OSError as error:
                 raise self._unwritable(error) from None
             yield
+
+    def _lock(self, handle: int) -> None:
+        """Lock an open file; a process that only looks whether a folder is free is waited for."""
+        for _ in range(_TRIES):
+            with contextlib.suppress(BlockingIOError):
+                return fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            time.sleep(_BETWEEN)
+        owner = os.pread(handle, 200, 0).decode(errors="replace")
+        rule = "a folder that no other process writes"
+        shown = f"{str(self.path)!r}, owned by process {owner}"
+        raise ArgumentError(self.name, rule, shown=shown)
 
     def _unwritable(self, error: OSError | None = None) -> ArgumentError:
         why = f" ({error.strerror})" if error else ""
@@ -173,6 +179,5 @@ class RunFolder:
         for path, why in rows.damages(num).items():
             place = path.relative_to(self.path)
             rule = f"a run whose {place} is whole"
-            raise ArgumentError(
-                self.name, rule, shown=f"{str(self.path)!r}, where it {why}; {remedy}"
-            )
+            shown = f"{str(self.path)!r}, where it {why}; {remedy}"
+            raise ArgumentError(self.name, rule, shown=shown)

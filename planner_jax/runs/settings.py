@@ -74,7 +74,7 @@ class SweepSettings:
     )
     seed: int = option(0, "K", "of what is drawn")
 
-    RUN: ClassVar[str] = "planner_jax.sweep.sweep:Sweep"  # what carries it out, "module:Class"
+    RUN: ClassVar[str] = ""  # what carries it out, "module:Class"; "": `Sweep`
     DEFAULT_NUM: ClassVar[int] = 1000
     # As estimated, bytes of memory for a case of a batch, and of the disk for a row.
     CASE_BYTES: ClassVar[int] = 20_000

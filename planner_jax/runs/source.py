@@ -3,14 +3,15 @@
 import abc
 import dataclasses
 import hashlib
-from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
 from planner_jax.core.choices import require_memory
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.registry import Task
+from planner_jax.runs.manifest import Entries
 from planner_jax.runs.settings import SweepSettings
 
 _MOST_PARTS = 10**6  # of a run: files in one folder
@@ -21,8 +22,8 @@ class Chunk:
     """B cases that are next to each other in a sweep."""
 
     index: np.ndarray  # (B,) int, places in the whole
-    cases: Any  # the task's pytree, NumPy leaves with leading axis B
-    origin: Any = None  # what the cases were made from, where a task has that
+    cases: PyTree  # the task's pytree, NumPy leaves with leading axis B
+    origin: object = None  # what the cases were made from, where a task has that
 
     def __len__(self) -> int:
         return len(self.index)
@@ -32,7 +33,7 @@ class Chunk:
 class Source(abc.ABC):
     """Where the cases of a sweep come from."""
 
-    settings: Any  # of the task's sweep, with `num` and `batch` filled in
+    settings: SweepSettings  # of the task's sweep, with `num` and `batch` filled in
     num: int  # of all cases
     batch: int  # cases a chunk
 
@@ -42,10 +43,10 @@ class Source(abc.ABC):
         return -(-self.num // self.batch)
 
     def chunk(self, number: int) -> Chunk:
-        """The cases of one chunk, checked."""
+        """Return the cases of one chunk, checked."""
         return self.cases(number * self.batch, min((number + 1) * self.batch, self.num))
 
-    def check(self) -> Any:
+    def check(self) -> PyTree:
         """Look at cases before anything is written; those of one chunk.
 
         They stand for all, where all are drawn from one law.
@@ -54,15 +55,15 @@ class Source(abc.ABC):
 
     @abc.abstractmethod
     def cases(self, first: int, last: int) -> Chunk:
-        """The cases from place `first` up to `last`, that one left out, checked.
+        """Return the cases from place `first` up to `last`, that one left out, checked.
 
         Raises:
             ArgumentError: a case breaks a rule.
         """
 
     @abc.abstractmethod
-    def description(self) -> dict[str, Any]:
-        """Entries of the manifest by which the same cases are known again."""
+    def description(self) -> Entries:
+        """Return entries of the manifest by which the same cases are known again."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,7 +73,7 @@ class DrawnSource(Source):
     task: Task
 
     def cases(self, first: int, last: int) -> Chunk:
-        """The cases from place `first` up to `last`, that one left out.
+        """Return the cases from place `first` up to `last`, that one left out.
 
         Raises:
             ArgumentError: what draws them refuses a setting.
@@ -83,16 +84,16 @@ class DrawnSource(Source):
         )
         return Chunk(index=np.arange(first, last), cases=jax.tree.map(np.asarray, drawn))
 
-    def description(self) -> dict[str, Any]:
-        """Suite, and digest of the numbers of the first chunk."""
+    def description(self) -> Entries:
+        """Return suite, and digest of the numbers of the first chunk."""
         digest = hashlib.sha256()
         for leaf in jax.tree.leaves(self.chunk(0).cases):
             digest.update(np.ascontiguousarray(leaf).tobytes())
         return {"suite": {"name": self.settings.suite, "sha256": digest.hexdigest()}}
 
 
-def filled_in(settings: SweepSettings, num: int, batch: int) -> dict[str, Any]:
-    """Fields of a `Source`: settings without gaps, `num` and `batch`.
+def filled_in(settings: SweepSettings, num: int, batch: int) -> Entries:
+    """Return fields of a `Source`: settings without gaps, `num` and `batch`.
 
     Args:
         settings: of the sweep.

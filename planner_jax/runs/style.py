@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import matplotlib
 from matplotlib.axes import Axes
@@ -29,7 +29,9 @@ PLANNER_COLOURS = {
     "constant": SKY,
 }
 
-_LOOK: dict[Any, Any] = {
+Look: TypeAlias = dict[str, Any]  # named arguments of Matplotlib
+
+_LOOK: Look = {
     "font.size": 10.0,
     "axes.titlesize": 11.0,
     "axes.titlelocation": "left",
@@ -52,7 +54,7 @@ _LOOK: dict[Any, Any] = {
 }
 
 
-def draw(path: Path, figure: Callable[..., None], size: tuple[float, float], *data: Any) -> None:
+def draw(path: Path, figure: Callable[..., None], size: tuple[float, float], *data: object) -> None:
     """Draw one figure and write it whole, as PNG.
 
     Args:

@@ -1,17 +1,17 @@
 """Success rates of a sweep, counted row by row from what was written."""
 
-import math
 from collections import Counter
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import pyarrow as pa
+from scipy.stats import binomtest
 
-_NORMAL_QUANTILE = 1.959964  # of 0.975
+from planner_jax.runs.manifest import Entries
 
 
 def wilson_interval(successes: int, num: int) -> tuple[float, float]:
-    """The 95 % interval of a success rate after Wilson (1927); stays within 0 and 1.
+    """Return the 95 % interval of a success rate after Wilson (1927).
 
     Args:
         successes: how many trials succeeded.
@@ -19,17 +19,12 @@ def wilson_interval(successes: int, num: int) -> tuple[float, float]:
     """
     if num == 0:
         return 0.0, 1.0
-    rate, z = successes / num, _NORMAL_QUANTILE
-    shrink = 1.0 + z**2 / num
-    centre = (rate + z**2 / (2.0 * num)) / shrink
-    half = z / shrink * math.sqrt(rate * (1.0 - rate) / num + z**2 / (4.0 * num**2))
-    low, high = max(centre - half, 0.0), min(centre + half, 1.0)
-    # At the ends the interval closes exactly; rounding must not leave the rate outside.
-    return min(low, rate), max(high, rate)
+    found = binomtest(successes, num).proportion_ci(0.95, "wilson")
+    return float(found.low), float(found.high)
 
 
 def percent(successes: int, num: int) -> str:
-    """A success rate in percent with two decimals; 100 and 0 only where they are exact."""
+    """Return a success rate in percent with two decimals; 100 and 0 only where they are exact."""
     rate = 100.0 * successes / num
     if 0 < successes < num:
         rate = min(max(rate, 0.01), 99.99)
@@ -72,11 +67,11 @@ class Tally:
                 self._example_rank, self.example = rank, int(index[there][0])
 
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
-        """Which rows (B,) make examples, the best kind first; the first of a kind is taken."""
+        """Return which rows (B,) make examples, the best kind first."""
         return [success, np.ones_like(success)]
 
-    def summary(self) -> dict[str, Any]:
-        """Rates as fractions, 0 to 1, and means, None without any success, for the manifest."""
+    def summary(self) -> Entries:
+        """Return rates as fractions, 0 to 1, and means over successes, None without any."""
         num = self.successes
         means = {f"mean_{name}": total / num if num else None for name, total in self._sums.items()}
         return {

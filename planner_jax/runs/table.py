@@ -2,8 +2,9 @@
 
 import html
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+from planner_jax.runs.manifest import Entries
 from planner_jax.runs.summary import percent, wilson_interval
 
 
@@ -17,7 +18,7 @@ class RateTable(NamedTuple):
 
 
 def own_cells(successes: int, num: int) -> list[str]:
-    """Cases, success in percent and its interval, the run's own cells of a row."""
+    """Return cases, success in percent and its interval, the run's own cells of a row."""
     low, high = wilson_interval(successes, num)
     return [
         f"{num:,}",
@@ -26,8 +27,8 @@ def own_cells(successes: int, num: int) -> list[str]:
     ]
 
 
-def headline(manifest: dict[str, Any], findings: Sequence[str] = ()) -> list[str]:
-    """Success, speed and failures of a run, a sentence each.
+def headline(manifest: Entries, findings: Sequence[str] = ()) -> list[str]:
+    """Return success, speed and failures of a run, a sentence each.
 
     Args:
         manifest: of the run.
@@ -53,7 +54,7 @@ def headline(manifest: dict[str, Any], findings: Sequence[str] = ()) -> list[str
 
 
 def to_markdown(title: str, lines: Sequence[str], table: RateTable, remarks: Sequence[str]) -> str:
-    """The contents of `table.md`.
+    """Return the contents of `table.md`.
 
     Args:
         title: of the run.
@@ -75,7 +76,7 @@ def _bars(cells: Sequence[str]) -> str:
 
 
 def to_html(table: RateTable) -> str:
-    """The table as HTML, without its title."""
+    """Return the table as HTML, without its title."""
     rows = [_html_row(table.header, "th")]
     for place, row in enumerate(table.rows):
         rows.append(_html_row(row, "td", " class=strong" if place == table.strong else ""))

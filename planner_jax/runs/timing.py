@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax
 import jax.monitoring
@@ -31,10 +31,10 @@ class CompileClock:
         jax.monitoring.register_event_time_span_listener(self._listen)
         return self
 
-    def __exit__(self, *_: Any) -> None:
+    def __exit__(self, *_: object) -> None:
         jax.monitoring.unregister_event_time_span_listener(self._listen)
 
-    def _listen(self, event: str, start_time: float, end_time: float, **kwargs: Any) -> None:
+    def _listen(self, event: str, start_time: float, end_time: float, **kwargs: object) -> None:
         if event.startswith(_COMPILING):
             self._spans.append((start_time, end_time))
 
@@ -48,7 +48,7 @@ class CompileClock:
         return total
 
     def lap(self) -> float:
-        """What `seconds` have grown by since the last call, or since the start."""
+        """Return what `seconds` have grown by since the last call, or since the start."""
         last, self._last = self._last, self.seconds
         return self._last - last
 
@@ -65,13 +65,13 @@ class Stopwatch:
         self._last = time.perf_counter()
 
     def lap(self) -> float:
-        """Seconds since the last call, or since the start."""
+        """Return seconds since the last call, or since the start."""
         last, self._last = self._last, time.perf_counter()
         return self._last - last
 
 
 def timed(call: Callable[[], FoundT]) -> tuple[FoundT, float, bool]:
-    """What a call gives, the seconds that it took, and whether nothing was compiled meanwhile."""
+    """Return a call's result, its seconds, and whether nothing was compiled meanwhile."""
     watch = Stopwatch()
     with CompileClock() as clock:
         found = call()
@@ -79,7 +79,7 @@ def timed(call: Callable[[], FoundT]) -> tuple[FoundT, float, bool]:
 
 
 def timed_warm(call: Callable[[], FoundT]) -> tuple[FoundT, float]:
-    """What a call gives, and the seconds that it takes once nothing is compiled.
+    """Return what a call gives, and the seconds that it takes once nothing is compiled.
 
     One that compiles something in every call is timed with that.
     """
@@ -91,7 +91,7 @@ def timed_warm(call: Callable[[], FoundT]) -> tuple[FoundT, float]:
 
 
 def timed_plans(planner: Planner[CaseT, PlanT], cases: CaseT) -> tuple[PlanT, np.ndarray]:
-    """Plans of cases (B,), made one after another, and the seconds (B,) that each takes, warm."""
+    """Return plans of cases (B,), made one after another, and their warm seconds (B,)."""
     num = jax.tree.leaves(cases)[0].shape[0]
     timed_each = [timed_warm(lambda k=k: plan(planner, lane(cases, k))) for k in range(num)]
     plans, seconds = zip(*timed_each, strict=True)

@@ -105,6 +105,12 @@ class Maker:
             "referee_seconds": 0.0,
         }
 
+    def make(self, number: int) -> Made:
+        """Draw, plan, judge and encode a chunk."""
+        chunk = self.source.chunk(number)
+        with CompileClock() as clock:
+            return self.judge(chunk, *self.plan(chunk, clock))
+
     def judge(self, chunk: Chunk, plans: PyTree, record: Record) -> Made:
         """Judge plans, and encode the rows of their chunk."""
         watch = Stopwatch()

@@ -1,8 +1,7 @@
 """The chunks of a sweep as tasks of a Ray cluster, for sweeps that outgrow a machine.
 
-Every chunk is one task, which returns the content of its part; only the process that was started
-writes the folder. A worker refuses a chunk unless its rows would be those of the run. Ray repeats
-a task on another worker where its worker dies.
+Every chunk is one task, which returns the content of its part. A worker refuses a chunk unless its
+rows would be those of the run. Where a worker dies, Ray repeats its task on another one.
 """
 
 import contextlib
@@ -14,7 +13,6 @@ import pickle
 import signal
 import socket
 import tempfile
-import threading
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from types import ModuleType
@@ -23,13 +21,12 @@ import jax
 import jax.numpy as jnp
 
 from planner_jax.core.choices import require
-from planner_jax.core.errors import ArgumentError, MissingExtra, install_line
+from planner_jax.core.errors import ArgumentError, MissingExtra
 from planner_jax.host import signals as stopping
 from planner_jax.host.compile_cache import keep_compiled_programs
 from planner_jax.host.processors import threads_of_a_computation
 from planner_jax.runs.environment import require_backend
 from planner_jax.runs.settings import WorkersFailed
-from planner_jax.runs.timing import CompileClock
 from planner_jax.sweep.chunks import Made, Maker, Workers
 from planner_jax.sweep.sweep import sweep_of
 
@@ -42,15 +39,7 @@ _MEMORY = 0.6  # of a GPU, for all of its workers, each of which takes some more
 
 @contextlib.contextmanager
 def workers_of(kind: str | None) -> Iterator[Workers | None]:
-    """Start workers for the length of the block; yield None where no kind is asked for.
-
-    A cluster that RAY_ADDRESS names is joined and left again; otherwise one of this machine's cores
-    and GPUs is started and ended. JAX starts here with one GPU, as in each worker.
-
-    Raises:
-        ArgumentError: there are no such workers, no cluster answers, or JAX has several GPUs.
-        MissingExtra: Ray is not installed.
-    """
+    """Join the cluster of RAY_ADDRESS, or start one of this machine; of kind None, do neither."""
     if kind is None:
         yield None
         return
@@ -58,18 +47,17 @@ def workers_of(kind: str | None) -> Iterator[Workers | None]:
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
     try:
         import ray
-    except ModuleNotFoundError as error:
-        told = f"workers needs {error.name}: {install_line('cluster')}"
-        raise MissingExtra(told, name=error.name) from None
-    logs = tempfile.TemporaryDirectory(prefix="ray-", dir="/tmp", ignore_cleanup_errors=True)
-    with logs as folder:
+    except ModuleNotFoundError:
+        raise MissingExtra("workers", "ray", "cluster") from None
+    with tempfile.TemporaryDirectory("", "ray-", "/tmp", ignore_cleanup_errors=True) as folder:
         _start(ray, folder)
         try:
+            # JAX starts here with one GPU, as in each worker.
             os.environ[_GPUS] = os.environ.get(_GPUS, "0").partition(",")[0]
             os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
             on_gpus = require_backend() == "gpu"
-            rule = "asked for before JAX starts with several GPUs"
-            require(not on_gpus or jax.device_count() == 1, "workers", rule, jax.device_count())
+            num = jax.device_count() if on_gpus else 1
+            require(num == 1, "workers", "asked for before JAX starts with several GPUs", num)
             yield functools.partial(_make_parts, ray, on_gpus)
         finally:
             ray.shutdown()
@@ -92,38 +80,31 @@ def _start(ray: ModuleType, folder: str) -> None:
         ray.init(**how, log_to_driver=False, logging_level=logging.ERROR)
     except (OSError, ValueError, RuntimeError) as error:
         reason = (str(error) or type(error).__name__).splitlines()[0]
-        if address:
-            rule = "the address of a Ray cluster that answers"
-            raise ArgumentError(_ADDRESS, rule, shown=f"{address!r} ({reason})") from None
-        raise ArgumentError(
-            "workers", f"left out where Ray cannot start ({reason})", shown=""
-        ) from None
+        rule = "the address of a Ray cluster that answers, or left out where Ray starts"
+        raise ArgumentError(_ADDRESS, rule, shown=f"{address!r} ({reason})") from None
     finally:
-        if threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGTERM, handler)  # Ray has put its own in the place of this one
+        with contextlib.suppress(ValueError):  # Ray has replaced it, but in the main thread only
+            signal.signal(signal.SIGTERM, handler)
 
 
 def _make_parts(
     ray: ModuleType, on_gpus: bool, maker: Maker, numbers: Iterable[int]
 ) -> Generator[Callable[[], Made], None, None]:
     """Have parts of these numbers made, and yield them in order as they are there."""
-    found = ray.cluster_resources()
-    cores, gpus = max(int(found.get("CPU", 0)), 1), int(found.get("GPU", 0))
-    how, num, threads = {}, cores, threads_of_a_computation()
-    environ = {}
+    cores, gpus = (int(ray.cluster_resources().get(name, 0)) for name in ("CPU", "GPU"))
+    num, threads = max(cores, 1), threads_of_a_computation()
+    environ, config, how = {}, {"jax_platforms": "cpu"}, {}
     if on_gpus:
-        require(gpus > 0, "workers", "of a cluster with GPUs, as this process has", "none")
+        require(gpus > 0, "workers", "of a cluster with GPUs, as this process has", gpus)
         shared = min(max(cores // (2 * gpus), 1), WORKERS_OF_GPU)
         num, threads = gpus * shared, max(2 * cores // (gpus * shared), 1)
-        # A worker lives on, on the GPU of its first task.
-        how = {"num_gpus": 1.0 / shared, "max_calls": 0}
-        environ = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
-        environ |= {"XLA_CLIENT_MEM_FRACTION": f"{_MEMORY / shared:.4f}"}
+        memory = {"XLA_CLIENT_MEM_FRACTION": f"{_MEMORY / shared:.4f}"}
+        environ, config = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false", **memory}, {}
+        how = {"num_gpus": 1.0 / shared, "max_calls": 0}  # a worker stays on its first GPU
     environ |= dict.fromkeys(("NPROC", "PJRT_NPROC"), str(threads))
-    config = {"jax_enable_x64": jnp.result_type(float) == jnp.float64}
-    config |= {} if on_gpus else {"jax_platforms": "cpu"}
-    wanted = (maker.sweep.task, maker.source.settings, maker.makers, maker.run)
-    order = ray.put(pickle.dumps((environ, config, wanted)))
+    config |= {"jax_enable_x64": jnp.result_type(float) == jnp.float64}
+    run = (maker.sweep.task, maker.source.settings, maker.makers, maker.run)
+    order = ray.put(pickle.dumps((environ, config, run)))
     make = ray.remote(num_cpus=1, max_retries=_RETRIES, **how)(_make)
     waiting, under_way = iter(numbers), deque()
     while True:
@@ -150,11 +131,8 @@ def _fetch(ray: ModuleType, number: int, promise: object) -> Made:
 
 
 def _make(order: bytes, number: int) -> Made:
-    """Draw, plan, judge and encode a chunk, in a worker."""
-    maker = _maker_of(order)
-    chunk = maker.source.chunk(number)
-    with CompileClock() as clock:
-        return maker.judge(chunk, *maker.plan(chunk, clock))
+    """Make a part, in a worker."""
+    return _maker_of(order).make(number)
 
 
 @functools.lru_cache(maxsize=1)

@@ -5,14 +5,15 @@ import dataclasses
 import io
 import math
 import os
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
 from scipy.stats import binomtest
 
 from planner_jax.core.errors import ArgumentError
+from planner_jax.runs.manifest import Entries
 from planner_jax.runs.run_folder import RunFolder
 from planner_jax.runs.summary import percent, wilson_interval
 from planner_jax.sweep.report import finished_sweep
@@ -20,45 +21,52 @@ from planner_jax.sweep.sweep import settings_of
 
 # Columns of the rows that are read, which all sweeps have.
 _READ = ("index", "success", "failed_limit", "cost", "iterations")
-# Names of what a `Difference` holds, in the rows of `table_of`.
-_DIFFERENCE = ("difference", "difference_low", "difference_high")
-_DIFFERENCE += ("first_only", "this_only", "mcnemar_p")
 
 
 @dataclasses.dataclass(frozen=True)
 class ComparedRun:
-    """A finished sweep, and of its cases what is compared."""
+    """A finished sweep, and of its B cases what is compared."""
 
     name: str  # as it was given
-    manifest: dict[str, Any]
+    manifest: Entries
     deciding: tuple[str, ...]  # names of the settings that decide the cases
     index: np.ndarray  # (B,) int
     success: np.ndarray  # (B,) bool
-    failed: np.ndarray  # (B,) str, the first limit that fails; "" for a success
+    failed_limit: np.ndarray  # (B,) str, the first limit that fails; "" for a success
     cost: np.ndarray  # (B,)
     iterations: np.ndarray  # (B,)
 
     @property
-    def settings(self) -> dict[str, Any]:
-        """Those of the run."""
+    def settings(self) -> Entries:
+        """The settings of the run."""
         return self.manifest["parameters"]
 
+    @property
+    def rate(self) -> float:
+        """The share of successes."""
+        return float(self.success.mean())
 
-@dataclasses.dataclass(frozen=True)
-class Difference:
-    """How the success of a run differs from that of the first one."""
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Wilson's 95 % interval of the rate."""
+        return wilson_interval(int(self.success.sum()), len(self.success))
+
+
+class Difference(NamedTuple):
+    """How the success of a run differs from the success of the first one."""
 
     difference: float  # of the rates, -1 to 1
-    interval: tuple[float, float]  # 95 %
-    # Of the same cases: those that the first run alone solves, those that the other alone does, and
-    # the chance of as uneven a split if neither were better (McNemar, exact). None otherwise.
+    difference_low: float  # of its 95 % interval
+    difference_high: float
+    # Of the same cases: how many the first run alone solves, how many this one alone, and the
+    # chance of as uneven a split if neither were better (McNemar, exact). None otherwise.
     first_only: int | None = None
-    other_only: int | None = None
-    chance: float | None = None
+    this_only: int | None = None
+    mcnemar_p: float | None = None
 
 
 def read_run(path: str | os.PathLike) -> ComparedRun:
-    """A run for `compare`.
+    """Read a run to be compared.
 
     Raises:
         ArgumentError: the folder is not that of a whole, finished sweep.
@@ -67,20 +75,13 @@ def read_run(path: str | os.PathLike) -> ComparedRun:
     manifest, sweep = finished_sweep(folder)
     try:
         rows = folder.plans.read(_READ)
-        found = {name: rows[name].to_numpy() for name in _READ}
     except (pa.ArrowException, KeyError, OSError) as error:
         rule, why = "a run whose rows can be read", " ".join(str(error).split())
         raise ArgumentError(folder.name, rule, shown=why) from None
-    return ComparedRun(
-        name=str(path),
-        manifest=manifest,
-        deciding=("num", "serves", *settings_of(sweep.task).DRAW),
-        index=found["index"],
-        success=found["success"].astype(bool),
-        failed=found["failed_limit"].astype(str),
-        cost=found["cost"].astype(float),
-        iterations=found["iterations"].astype(float),
-    )
+    kinds = {"index": int, "success": bool, "failed_limit": str, "cost": float, "iterations": float}
+    columns = {name: rows[name].to_numpy().astype(kind) for name, kind in kinds.items()}
+    deciding = ("num", "serves", *settings_of(sweep.task).DRAW)
+    return ComparedRun(str(path), manifest, deciding, **columns)
 
 
 def require_comparable(runs: Sequence[ComparedRun]) -> None:
@@ -89,24 +90,17 @@ def require_comparable(runs: Sequence[ComparedRun]) -> None:
         raise ArgumentError("RUN", "the folders of two runs or more", len(runs))
     first = runs[0]
     for other in runs[1:]:
-        told = [(run.manifest["kind"], run.settings) for run in (first, other)]
-        looks = [("task", *(kind for kind, _ in told))]
-        looks += [(name, *(own.get(name) for _, own in told)) for name in ("suite", "seed")]
-        for name, mine, theirs in looks:
+        kinds = ("task", first.manifest["kind"], other.manifest["kind"])
+        words = [(n, first.settings.get(n), other.settings.get(n)) for n in ("suite", "seed")]
+        for name, mine, theirs in (kinds, *words):
             if mine != theirs:
                 shown = f"{mine} in {first.name!r} and {theirs} in {other.name!r}"
                 raise ArgumentError("RUN", f"runs of one {name}", shown=shown)
 
 
 def other_cases(first: ComparedRun, other: ComparedRun) -> list[str]:
-    """Settings in which the cases of two runs differ, as "name VALUE and VALUE"."""
+    """Return the settings in which the cases of two runs differ, as "name VALUE and VALUE"."""
     return _unlike(first, other, first.deciding)
-
-
-def other_settings(first: ComparedRun, other: ComparedRun) -> list[str]:
-    """The other settings in which two runs differ, likewise; `batch` decides no plan's way."""
-    names = [name for name in first.settings if name not in ("batch", *first.deciding)]
-    return _unlike(first, other, names)
 
 
 def _unlike(first: ComparedRun, other: ComparedRun, names: Sequence[str]) -> list[str]:
@@ -121,77 +115,67 @@ def _unlike(first: ComparedRun, other: ComparedRun, names: Sequence[str]) -> lis
 
 
 def difference_of(first: ComparedRun, other: ComparedRun) -> Difference:
-    """How much more often a run succeeds than the first one.
+    """Return how much more often a run succeeds than the first one.
 
     Of the same cases only those count that one run alone solves: given how many these are, either
     run is as likely to have each of them if neither is better (McNemar's test, exact), and the
-    interval is that of Clopper and Pearson for its share of them. Of other cases the interval is
+    interval is Clopper and Pearson's for its share of them. Of other cases the interval is
     Newcombe's, from Wilson's of both rates.
     """
-    rates = [float(run.success.mean()) for run in (first, other)]
-    change = rates[1] - rates[0]
+    change = other.rate - first.rate
     if other_cases(first, other):
-        (low, high), (other_low, other_high) = (
-            wilson_interval(int(run.success.sum()), len(run.success)) for run in (first, other)
-        )
-        below = math.hypot(rates[1] - other_low, high - rates[0])
-        above = math.hypot(other_high - rates[1], rates[0] - low)
-        return Difference(change, (change - below, change + above))
+        (low, high), (other_low, other_high) = first.interval, other.interval
+        below = math.hypot(other.rate - other_low, high - first.rate)
+        above = math.hypot(other_high - other.rate, first.rate - low)
+        return Difference(change, change - below, change + above)
     mine = int((first.success & ~other.success).sum())
     theirs = int((other.success & ~first.success).sum())
     apart, num = mine + theirs, len(first.success)
-    if not apart:
-        # As of no event in so many trials (the rule of three, exact).
-        reach = 1.0 - 0.025 ** (1.0 / num)
-        return Difference(change, (-reach, reach), mine, theirs, 1.0)
+    if not apart:  # as of no event in so many trials
+        reach = float(binomtest(0, num).proportion_ci(0.95, "exact").high)
+        return Difference(change, -reach, reach, mine, theirs, 1.0)
     test = binomtest(theirs, apart)
     share = test.proportion_ci(0.95, "exact")
     low, high = ((2.0 * end - 1.0) * apart / num for end in (share.low, share.high))
-    return Difference(change, (low, high), mine, theirs, float(test.pvalue))
+    return Difference(change, low, high, mine, theirs, float(test.pvalue))
 
 
-def table_of(runs: Sequence[ComparedRun]) -> list[dict[str, Any]]:
-    """A row of numbers for every run; those of the difference are empty for the first."""
+def table_of(runs: Sequence[ComparedRun]) -> list[Entries]:
+    """Return a row of numbers for every run; those of the difference are empty for the first."""
     rows = []
     for place, run in enumerate(runs):
-        num, successes = len(run.success), int(run.success.sum())
-        low, high = wilson_interval(successes, num)
         times, speed = run.manifest["times"], run.manifest["summary"]["plans_per_second_warm"]
-        cost = run.cost[run.success]
+        low, high = run.interval
         row = {
             "run": run.name,
             "planner": run.settings.get("planner"),
-            "cases": num,
-            "successes": successes,
-            "success_rate": successes / num,
+            "cases": len(run.success),
+            "successes": int(run.success.sum()),
+            "success_rate": run.rate,
             "wilson_low": low,
             "wilson_high": high,
-            "cost_mean": _of(np.mean, cost),
-            "cost_median": _of(np.median, cost),
+            "cost_mean": _of(np.mean, run.cost[run.success]),
+            "cost_median": _of(np.median, run.cost[run.success]),
             "iterations_mean": _of(np.mean, run.iterations),
             "iterations_median": _of(np.median, run.iterations),
             "plans_per_second": speed,
             "milliseconds_a_plan": 1e3 / speed if speed else None,
             "compile_seconds": times["compile_seconds"],
             "wall_seconds": times["wall_seconds"],
-            **dict.fromkeys(_DIFFERENCE),
+            **dict.fromkeys(Difference._fields),
         }
-        if place:
-            found = difference_of(runs[0], run)
-            values = (found.difference, *found.interval, found.first_only, found.other_only)
-            row |= dict(zip(_DIFFERENCE, (*values, found.chance), strict=True))
-        rows.append(row)
+        rows.append(row | difference_of(runs[0], run)._asdict() if place else row)
     return rows
 
 
-def _of(measure: Any, values: np.ndarray) -> float | None:
-    """A measure of the finite ones among values, if there are any."""
+def _of(measure: Callable[[np.ndarray], np.floating], values: np.ndarray) -> float | None:
+    """Return a measure of the finite ones among values, if there are any."""
     finite = values[np.isfinite(values)]
     return float(measure(finite)) if finite.size else None
 
 
 def differing(runs: Sequence[ComparedRun]) -> list[tuple[int, list[str]]]:
-    """The cases that some runs solve and others do not: index, and what fails in each run.
+    """Return the cases that some runs solve and others do not: index, and what fails in each run.
 
     Args:
         runs: of the same cases.
@@ -199,14 +183,14 @@ def differing(runs: Sequence[ComparedRun]) -> list[tuple[int, list[str]]]:
     solved = np.stack([run.success for run in runs])
     places = np.flatnonzero(solved.any(axis=0) & ~solved.all(axis=0))
     index = runs[0].index
-    return [(int(index[k]), [str(run.failed[k]) for run in runs]) for k in places]
+    return [(int(index[k]), [str(run.failed_limit[k]) for run in runs]) for k in places]
 
 
 def described(runs: Sequence[ComparedRun], most: int | None = 10) -> list[str]:
-    """The comparison as lines of text.
+    """Return the comparison as lines of text.
 
     Args:
-        runs: that `require_comparable` lets pass.
+        runs: that `require_comparable` accepts.
         most: cases that are listed; None for all.
     """
     first, *others = runs
@@ -215,80 +199,79 @@ def described(runs: Sequence[ComparedRun], most: int | None = 10) -> list[str]:
     lines += [f"[{k}] {run.name}" for k, run in enumerate(runs, 1)]
     lines += ["", *_aligned(_cells(rows)), ""]
     for k, (run, row) in enumerate(zip(others, rows[1:], strict=True), 2):
-        lines += _told(first, run, row, k)
+        lines += _sentences(first, run, row, k)
     same = [(k, run) for k, run in enumerate(runs, 1) if not other_cases(first, run)]
     if len(same) < 2:
         return lines
     apart = differing([run for _, run in same])
     if not apart:
         return [*lines, "Every case ends alike in all runs of the same cases."]
-    shown = apart if most is None else apart[:most]
+    shown = apart[:most]
     lines.append(f"Cases that tell them apart: {len(apart):,}.")
     header = ["case", *(f"[{k}]" for k, _ in same)]
-    lines += _aligned(
-        [header, *([str(at), *(f or "success" for f in fails)] for at, fails in shown)]
-    )
+    listed = [[str(at), *(failed or "success" for failed in fails)] for at, fails in shown]
+    lines += _aligned([header, *listed])
     if len(shown) < len(apart):
         lines.append(f"... and {len(apart) - len(shown):,} more; --all lists them.")
     return lines
 
 
-def _told(first: ComparedRun, run: ComparedRun, row: dict[str, Any], k: int) -> list[str]:
-    """How one run differs from the first one."""
+def _sentences(first: ComparedRun, run: ComparedRun, row: Entries, k: int) -> Iterator[str]:
+    """Yield how one run differs from the first one."""
     low, high = 100.0 * row["difference_low"], 100.0 * row["difference_high"]
     change = f"[{k}] less [1]: {100.0 * row['difference']:+.2f} points of success"
     interval = f"95 % interval {low:+.2f} to {high:+.2f}"
     if cases := other_cases(first, run):
-        told = f"{change}, {interval}, as of independent runs: the cases differ in "
-        return [told + ", ".join(cases) + "."]
-    told = (
+        cases = ", ".join(cases)
+        yield f"{change}, {interval}, as of independent runs: the cases differ in {cases}."
+        return
+    yield (
         f"{change}, {interval}; of the same cases [1] alone solves {row['first_only']:,} and [{k}] "
         f"alone {row['this_only']:,}, p = {row['mcnemar_p']:.3g} (McNemar, exact)."
     )
-    settings = other_settings(first, run)
-    return [told, f"    settings that differ: {'; '.join(settings)}"] if settings else [told]
+    # The batch decides no plan but in its last digits.
+    names = [name for name in first.settings if name not in ("batch", *first.deciding)]
+    if settings := _unlike(first, run, names):
+        yield f"    settings that differ: {'; '.join(settings)}"
 
 
-def _cells(rows: Sequence[dict[str, Any]]) -> list[list[str]]:
-    """The table of all runs as text, a line a measure and a column a run."""
-
-    def number(name: str, form: str) -> list[str]:
-        return ["-" if row[name] is None else format(row[name], form) for row in rows]
-
+def _cells(rows: Sequence[Entries]) -> list[list[str]]:
+    """Return the table of all runs as text, a line a measure and a column a run."""
     spread = [
         f"{100.0 * row['wilson_low']:.2f} to {100.0 * row['wilson_high']:.2f}" for row in rows
     ]
-    return [
+    cells = [
         ["", *(f"[{k}]" for k in range(1, len(rows) + 1))],
         ["planner", *(str(row["planner"]) for row in rows)],
-        ["cases", *number("cases", ",")],
+        ["cases", *(f"{row['cases']:,}" for row in rows)],
         ["success %", *(percent(row["successes"], row["cases"]) for row in rows)],
         ["95 % interval", *spread],
-        ["cost of successes, mean", *number("cost_mean", ".4g")],
-        ["cost of successes, median", *number("cost_median", ".4g")],
-        ["iterations, mean", *number("iterations_mean", ".1f")],
-        ["iterations, median", *number("iterations_median", ".0f")],
-        ["plans/s warm", *number("plans_per_second", ",.0f")],
-        ["ms a plan", *number("milliseconds_a_plan", ".3g")],
-        ["compiling [s]", *number("compile_seconds", ".1f")],
-        ["all chunks [s]", *number("wall_seconds", ".1f")],
     ]
+    for words, name, form in (
+        ("cost of successes, mean", "cost_mean", ".4g"),
+        ("cost of successes, median", "cost_median", ".4g"),
+        ("iterations, mean", "iterations_mean", ".1f"),
+        ("iterations, median", "iterations_median", ".0f"),
+        ("plans/s warm", "plans_per_second", ",.0f"),
+        ("ms a plan", "milliseconds_a_plan", ".3g"),
+        ("compiling [s]", "compile_seconds", ".1f"),
+        ("all chunks [s]", "wall_seconds", ".1f"),
+    ):
+        numbers = ("-" if row[name] is None else format(row[name], form) for row in rows)
+        cells.append([words, *numbers])
+    return cells
 
 
 def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Cells as lines, the first column to the left and the others to the right."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    """Return cells as lines, the first column to the left and the others to the right."""
+    first, *widths = (max(map(len, column)) for column in zip(*rows, strict=True))
     return [
-        "  ".join(
-            cell.ljust(width) if k == 0 else cell.rjust(width)
-            for k, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in rows
+        "  ".join([row[0].ljust(first), *map(str.rjust, row[1:], widths)]).rstrip() for row in rows
     ]
 
 
 def as_csv(runs: Sequence[ComparedRun]) -> str:
-    """The comparison as comma-separated text: a column a run, a row a measure or case.
+    """Return the comparison as comma-separated text: a column a run, a row a measure or case.
 
     The rows of cases hold what fails in each run, for all cases that tell runs apart.
     """
@@ -298,7 +281,8 @@ def as_csv(runs: Sequence[ComparedRun]) -> str:
     writer.writerows([name, *(row[name] for row in rows)] for name in rows[0])
     same = [k for k, run in enumerate(runs) if not other_cases(runs[0], run)]
     for at, fails in differing([runs[k] for k in same]):
-        told = dict(zip(same, fails, strict=True))
-        words = (told[k] or "success" if k in told else "" for k in range(len(runs)))
+        words = [""] * len(runs)
+        for k, failed in zip(same, fails, strict=True):
+            words[k] = failed or "success"
         writer.writerow([f"case {at}", *words])
     return text.getvalue()

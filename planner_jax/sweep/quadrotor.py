@@ -1,11 +1,13 @@
-"""Columns that the runs of every quadrotor task have."""
+"""What the runs of every quadrotor task share: columns, and trajectories sampled from rows."""
 
-from collections.abc import Mapping
-from typing import Any
+import dataclasses
+import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from planner_jax.runs.columns import LIST, VECTOR, Column, RefereedBatch, leaves_of
+from planner_jax.runs.manifest import Row
 
 
 def _starts(batch: RefereedBatch) -> np.ndarray:
@@ -29,10 +31,11 @@ MOTION = leaves_of(
 
 
 def _of_ending(name: str, unit: str, meaning: str) -> Column:
-    """A leaf of the ways to rest; null where plans have none."""
+    """Return a leaf of the ways to rest; null where plans have none."""
 
-    def values(batch: RefereedBatch) -> Any:
-        return getattr(batch.plans.ending, name, None)
+    def values(batch: RefereedBatch) -> np.ndarray | None:
+        ending = batch.plans.ending
+        return None if ending is None else vars(ending)[name]
 
     return Column(f"ending_{name}", unit, meaning, LIST, values)
 
@@ -53,9 +56,72 @@ _RESTS = {
 }
 
 
-def ending_remark(parameters: Mapping[str, Any]) -> list[str]:
-    """What plans of a run do behind their last contact, if that was asked for, a sentence."""
+def ending_remark(parameters: Row) -> list[str]:
+    """Return a sentence on what plans do behind their last contact, if they do anything."""
     words = _RESTS.get(parameters.get("ending", ""))
     if words is None:
         return []
     return [f"Behind the last contact: {words}; a plan is a success with that or not at all."]
+
+
+@dataclasses.dataclass(frozen=True)
+class SampledMotion:
+    """A trajectory at N times."""
+
+    time: np.ndarray  # (N,) [s]
+    pos: np.ndarray  # (N, 3) [m]
+    vel: np.ndarray  # (N, 3) [m/s]
+    acc: np.ndarray  # (N, 3) [m/s^2]
+    jerk: np.ndarray  # (N, 3) [m/s^3]
+
+
+def sample_motion(
+    coeffs: Sequence[float] | np.ndarray, durations: Sequence[float] | np.ndarray, num: int
+) -> SampledMotion:
+    """Sample a trajectory as the rows hold it, at even times, in float64.
+
+    Args:
+        coeffs: flat, M pieces x ascending powers of the piece's own time x 3 axes.
+        durations: (M,) [s].
+        num: how many samples.
+    """
+    ends = np.cumsum(np.asarray(durations, float))
+    pieces = np.asarray(coeffs, float).reshape(len(ends), -1, 3)
+    time = np.linspace(0.0, ends[-1], num)
+    piece = np.minimum(np.searchsorted(ends, time, side="right"), len(ends) - 1)
+    local = time - np.concatenate([[0.0], ends[:-1]])[piece]
+    powers = local[:, None] ** np.arange(pieces.shape[1])
+    derivatives = []
+    for order in range(4):
+        factors = [math.perm(k, order) for k in range(order, pieces.shape[1])]
+        scaled = pieces[piece, order:] * np.array(factors, float)[:, None]
+        derivatives.append(np.einsum("nk,nki->ni", powers[:, : scaled.shape[1]], scaled))
+    return SampledMotion(time, *derivatives)
+
+
+def sample_rest(row: Row, num: int) -> SampledMotion | None:
+    """Sample the recovery trajectory of a row, at the plan's times; None where there is none."""
+    if row["ending_durations"] is None:
+        return None
+    rest = sample_motion(row["ending_coeffs"], row["ending_durations"], num)
+    return dataclasses.replace(rest, time=rest.time + np.sum(row["durations"]))
+
+
+def net_thrust(motion: SampledMotion, gravity: float) -> np.ndarray:
+    """Return the thrust per unit mass  a + g e_3, (N, 3) [m/s^2]."""
+    return motion.acc + gravity * np.array([0.0, 0.0, 1.0])
+
+
+def body_rate(motion: SampledMotion, gravity: float) -> np.ndarray:
+    """Return the size (N,) [rad/s] of the body rate by the Hopf fibration at zero heading.
+
+    From  c = thrust x jerk: |z'| = |c| / |thrust|^2 across the body z axis, and
+    -c_z / (|thrust| (|thrust| + thrust_z)) about it. NaN without thrust and upside down.
+    """
+    thrust = net_thrust(motion, gravity)
+    size = np.linalg.norm(thrust, axis=1)
+    cross = np.cross(thrust, motion.jerk)
+    with np.errstate(all="ignore"):
+        across = np.linalg.norm(cross, axis=1) / size**2
+        about = cross[:, 2] / (size * (size + thrust[:, 2]))
+        return np.hypot(across, about)

@@ -268,14 +268,14 @@ def _fields_of(planner: object) -> Entries:
     """
     found = {}
     for field in dataclasses.fields(planner) if dataclasses.is_dataclass(planner) else ():
-        value = getattr(planner, field.name)
-        if field.name in _OF_NETWORKS and hasattr(planner, "apply"):
+        value = vars(planner)[field.name]
+        if field.name in _OF_NETWORKS:
             continue
         if dataclasses.is_dataclass(value):
             value = {"class": type(value).__name__, **_fields_of(value)}
         elif isinstance(value, dict):
             value = {"weights": sum(np.size(leaf) for leaf in jax.tree.leaves(value))}
-        elif hasattr(value, "shape"):
+        elif isinstance(value, np.ndarray | jax.Array):
             value = {"shape": list(value.shape)}
         elif isinstance(value, tuple):
             value = [_fields_of(x) or x for x in value]

@@ -3,17 +3,29 @@
 import abc
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from pathlib import Path
+from typing import ClassVar
 
 import jax
 import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import PyTree
 
 from planner_jax.core.errors import CaseError
 from planner_jax.core.protocol import Status
 from planner_jax.core.registry import Task
 from planner_jax.planning.plan import plan
 from planner_jax.referee.rotors import rotor_thrusts
-from planner_jax.sweep.sampled_motion import SampledMotion, body_rate, net_thrust, sample_motion
+from planner_jax.robot.quadrotor import QuadrotorPlan
+from planner_jax.runs.columns import RefereedBatch, rows_of
+from planner_jax.runs.manifest import Row
+from planner_jax.runs.run_folder import RunFolder
+from planner_jax.runs.settings import SweepSettings
+from planner_jax.runs.source import Chunk
+from planner_jax.runs.style import draw
+from planner_jax.sweep.quadrotor import SampledMotion, body_rate, net_thrust, sample_motion
+from planner_jax.sweep.report import RunRows
+from planner_jax.sweep.sweep import sweep_of
 
 _SAMPLES = 4001  # of a plan
 
@@ -48,9 +60,9 @@ class Margin:
 class Answer:
     """A case, its plan and the verdict on it."""
 
-    case: Any
-    plan: Any
-    verdict: Any
+    case: PyTree
+    plan: PyTree
+    verdict: PyTree
 
     @property
     def success(self) -> bool:
@@ -69,23 +81,23 @@ class Single(abc.ABC):
     # Names of a case's fields, where they are not those of the settings behind their last dot.
     NAMES: ClassVar[dict[str, str]] = {"head_state": "start"}
 
-    def __init__(self, task: Task, settings: Any):
+    def __init__(self, task: Task, settings: SweepSettings):
         self.task, self.settings = task, settings
 
     @abc.abstractmethod
-    def case(self) -> Any:
-        """The case; NumPy leaves."""
+    def case(self) -> PyTree:
+        """Return the case; NumPy leaves."""
 
     @abc.abstractmethod
     def contact(self, answer: Answer) -> list[str]:
-        """When and where the contact is, a sentence each."""
+        """Return when and where the contact is, a sentence each."""
 
     @abc.abstractmethod
     def own_margins(self, answer: Answer) -> list[Margin]:
-        """Of the limits that quadrotors of other tasks do not have."""
+        """Return margins of the limits that quadrotors of other tasks do not have."""
 
     def answer(self) -> Answer:
-        """The plan, and the referee's verdict on it.
+        """Return the plan, and the referee's verdict on it.
 
         Raises:
             ArgumentError: a number of the case breaks a rule.
@@ -103,7 +115,7 @@ class Single(abc.ABC):
         return field, self.NAMES.get(field, field.rpartition(".")[2])
 
     def described(self, answer: Answer) -> list[str]:
-        """The answer as lines of text."""
+        """Return the answer as lines of text."""
         status = Status(int(answer.plan.status))
         sentence = answer.verdict.sentence()
         told = f"Planner {self.settings.planner}: {status.name}, {status.message}."
@@ -115,18 +127,18 @@ class Single(abc.ABC):
         return [*lines, "", *_table(self.margins(answer))]
 
     def margins(self, answer: Answer) -> list[Margin]:
-        """How close the plan comes to each limit that the case has."""
+        """Return how close the plan comes to each limit that the case has."""
         of_flight = _of_flight(answer, sampled(answer.plan))
         return [*of_flight, *_of_rotors(answer), *self.own_margins(answer)]
 
 
-def sampled(found: Any) -> SampledMotion:
+def sampled(found: QuadrotorPlan) -> SampledMotion:
     """One plan of a quadrotor with its way to rest, if it has one, at even times."""
     coeffs, durations = _pieces(found)
     return sample_motion(coeffs.ravel(), durations, _SAMPLES)
 
 
-def _pieces(found: Any) -> tuple[np.ndarray, np.ndarray]:
+def _pieces(found: QuadrotorPlan) -> tuple[np.ndarray, np.ndarray]:
     """Coefficients (M, D + 1, 3) and durations (M,) [s] of all that one plan flies."""
     path = found.whole
     coeffs, durations = (np.asarray(each, float) for each in (path.coeffs, path.durations))
@@ -135,9 +147,9 @@ def _pieces(found: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _closest(
-    words: str, times: np.ndarray, values: np.ndarray, allowed: Any, *, least: bool = False
+    words: str, times: np.ndarray, values: np.ndarray, allowed: ArrayLike, *, least: bool = False
 ) -> Margin:
-    """The margin at that of the times at which a plan is closest to a limit, or beyond it most."""
+    """Return the margin at the time at which a plan is closest to a limit, or beyond it most."""
     values = np.nan_to_num(values, nan=-np.inf if least else np.inf)  # no attitude: no limit kept
     at = int(np.argmin(values) if least else np.argmax(values))
     return Margin(words, float(values[at]), float(allowed), float(times[at]), least)
@@ -146,13 +158,15 @@ def _closest(
 def _of_flight(answer: Answer, motion: SampledMotion) -> list[Margin]:
     limits, gravity = answer.case.limits, float(answer.case.gravity)
 
-    def closest(words: str, values: np.ndarray, allowed: Any, *, least: bool = False) -> Margin:
+    def closest(
+        words: str, values: np.ndarray, allowed: ArrayLike, *, least: bool = False
+    ) -> Margin:
         return _closest(words, motion.time, values, allowed, least=least)
 
     found = [
-        closest(f"{name.replace('_', ' ')} [{unit}]", size(motion, gravity), getattr(limits, name))
+        closest(f"{name.replace('_', ' ')} [{unit}]", size(motion, gravity), vars(limits)[name])
         for name, (unit, size) in _ABOVE.items()
-        if getattr(limits, name) is not None
+        if vars(limits)[name] is not None
     ]
     if limits.max_thrust is not None:
         thrust = np.linalg.norm(net_thrust(motion, gravity), axis=1)
@@ -163,7 +177,7 @@ def _of_flight(answer: Answer, motion: SampledMotion) -> list[Margin]:
 
 
 def _of_rotors(answer: Answer) -> list[Margin]:
-    """Of the rotor that is closest to its least thrust, and of that closest to its greatest."""
+    """Return the margins of the rotors with the least and the greatest thrust."""
     rotors = answer.case.limits.rotors
     if rotors is None:
         return []
@@ -183,7 +197,7 @@ def _of_rotors(answer: Answer) -> list[Margin]:
 
 
 def _table(margins: Sequence[Margin]) -> list[str]:
-    """A line a limit."""
+    """Return lines of a table, one for each limit."""
     rows = [("limit", "reached", "allowed", "share", "at [s]")]
     for margin in margins:
         share = f"{100.0 * margin.share:.1f} %" if np.isfinite(margin.share) else "exceeded"
@@ -193,3 +207,38 @@ def _table(margins: Sequence[Margin]) -> list[str]:
     return [
         "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows
     ]
+
+
+@dataclasses.dataclass(frozen=True)
+class OneRow(RunRows):
+    """A case that is of no run, as the figures of runs look at one."""
+
+    row: Row
+
+    def same_case(self) -> list[tuple[str, Row]]:
+        """Planner and row."""
+        return [(self.manifest["parameters"]["planner"], self.row)]
+
+
+def write_pictures(task: Task, planner: str, answer: Answer, out: Path) -> list[Path]:
+    """Draw a case, and write the pictures into a folder; their paths.
+
+    Args:
+        task: of the case.
+        planner: its name.
+        answer: the case, its plan and verdict.
+        out: folder.
+    """
+    sweep = sweep_of(task)
+    case, plan = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (answer.case, answer.plan))
+    verdict = dataclasses.replace(
+        answer.verdict,
+        **{name: np.asarray(value)[None] for name, value in vars(answer.verdict).items()},
+    )
+    batch = RefereedBatch(Chunk(np.zeros(1, int), case), plan, verdict)
+    (row,) = rows_of(sweep.single_columns, batch, sweep.frame).to_pylist()
+    manifest = {"parameters": {"planner": planner}, "setting": sweep.setting(case)}
+    run = OneRow(RunFolder(out), manifest, [], row)
+    for figure in sweep.single_figures:
+        draw(out / figure.name, figure.draw, figure.size, run)
+    return [out / figure.name for figure in sweep.single_figures]

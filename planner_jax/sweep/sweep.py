@@ -4,22 +4,28 @@ import contextlib
 import dataclasses
 import pkgutil
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
+from jaxtyping import PyTree
 from matplotlib.figure import Figure
 
 from planner_jax.core.choices import require
 from planner_jax.core.errors import ArgumentError, MissingExtra, UnknownName
+from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Plan
 from planner_jax.core.registry import Task, task_named
 from planner_jax.planning.plan import plan
 from planner_jax.runs.columns import Column, RefereedBatch, leaf_columns
+from planner_jax.runs.manifest import Entries, Row
 from planner_jax.runs.settings import SweepSettings
 from planner_jax.runs.source import DrawnSource, Source, filled_in
 from planner_jax.runs.summary import Tally
 from planner_jax.runs.table import RateTable, own_cells
 from planner_jax.sweep.figures.outcomes import outcomes_figure
+
+if TYPE_CHECKING:
+    from planner_jax.sweep.report import RunRows
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,8 +35,7 @@ class RunFigure:
     name: str  # of the file
     caption: str
     size: tuple[float, float]  # width and height [inch]
-    draw: Callable[[Figure, Any], None]  # takes an empty figure and a `report.RunRows`
-    compares: bool = False  # shows plans of the other planners too
+    draw: Callable[[Figure, "RunRows"], None]  # takes an empty figure and a `report.RunRows`
 
 
 class Sweep:
@@ -42,6 +47,7 @@ class Sweep:
 
     frame: ClassVar[str] = ""  # axes and times of the columns, in words
     own_columns: ClassVar[Sequence[Column]] = ()
+    single_columns: ClassVar[Sequence[Column]] = ()  # of one case that was asked for alone
     figures: ClassVar[Sequence[RunFigure]] = (
         RunFigure(
             "outcomes.png",
@@ -50,6 +56,7 @@ class Sweep:
             outcomes_figure,
         ),
     )
+    counts: ClassVar[type[Tally]] = Tally  # of rows
     single_figures: ClassVar[Sequence[RunFigure]] = ()  # of one case that was asked for alone
     failure_words: ClassVar[Mapping[str, str]] = {  # heading -> column that is shown of a failure
         "case": "index",
@@ -66,22 +73,15 @@ class Sweep:
         return f"sweep {self.task.name}"
 
     def columns(self, batch: RefereedBatch) -> Sequence[Column]:
-        """The columns of the run: the task's own, or every leaf of case, plan, verdict."""
+        """Return the columns of the run: the task's own, or every leaf of case, plan, verdict."""
         return self.own_columns or leaf_columns(batch)
 
-    def single_columns(self) -> Sequence[Column]:
-        """Those that a case which is of no run has, too."""
-        return self.own_columns
-
-    def planner(self, settings: Any) -> Any:
-        """The planner of a run."""
+    def planner(self, settings: SweepSettings) -> Planner:
+        """Return the planner of a run."""
         return self.task.planner(settings.planner, **settings.planner_options())
 
-    def other_planners(self, settings: Any) -> dict[str, Any]:
-        """The task's other planners of such cases, by name, to be compared with that of a run.
-
-        Without those that come from a file, or whose packages are not installed.
-        """
+    def other_planners(self, settings: SweepSettings) -> Entries:
+        """Return the task's other planners of such cases by name, as far as they are installed."""
         own, _ = self.task.split_planner(settings.planner)
         made = {}
         for name in self.task.all_planners():
@@ -91,7 +91,7 @@ class Sweep:
         kind = self.planner(settings).case_type
         return {name: one for name, one in made.items() if one.case_type is kind}
 
-    def require_fit(self, settings: Any, planner: Any, cases: Any) -> None:
+    def require_fit(self, settings: SweepSettings, planner: Planner, cases: PyTree) -> None:
         """Raise `ArgumentError` unless the planner is one of such cases."""
         require(
             isinstance(cases, planner.case_type),
@@ -100,61 +100,58 @@ class Sweep:
             settings.planner,
         )
 
-    def open_source(self, settings: Any, batch: int) -> Source:
-        """The source of a sweep's cases; `batch` where the settings name none.
+    def open_source(self, settings: SweepSettings, batch: int) -> Source:
+        """Return the source of a sweep's cases; `batch` where the settings name none.
 
         Raises:
             ArgumentError: the settings ask for what is not there.
         """
         return DrawnSource(**filled_in(settings, settings.DEFAULT_NUM, batch), task=self.task)
 
-    def plan(self, planner: Any, cases: Any) -> Any:
-        """The plans of a batch."""
+    def plan(self, planner: Planner, cases: PyTree) -> PyTree:
+        """Return the plans of a batch."""
         return plan(planner, cases)
 
-    def judge(self, cases: Any, plans: Any, settings: Any) -> Any:
-        """The referee's verdict on plans."""
+    def judge(self, cases: PyTree, plans: PyTree, settings: SweepSettings) -> PyTree:
+        """Return the referee's verdict on plans."""
         return self.task.judge(cases, plans, **settings.judge_options())
 
-    def setting(self, cases: Any) -> dict[str, Any]:
-        """Physics and limits that all cases have in common, for the manifest."""
+    def setting(self, cases: PyTree) -> Entries:
+        """Return physics and limits that all cases have in common, for the manifest."""
         return {}
 
-    def plan_of_row(self, row: dict[str, Any], setting: dict[str, Any]) -> Plan | None:
-        """The plan of a row of the run as its robot's class, such as `QuadrotorPlan`.
+    def plan_of_row(self, row: Row, setting: Entries) -> Plan | None:
+        """Return the plan of a row; None where rows of the task are not read back.
 
         Args:
             row: of the run.
             setting: of its manifest.
-
-        Returns:
-            The plan; None where rows of the task are not read back.
         """
         return None
 
-    def tally(self, settings: Any) -> Tally:
-        """An empty count of rows."""
-        return Tally()
+    def tally(self, settings: SweepSettings) -> Tally:
+        """Return an empty count of rows."""
+        return self.counts()
 
-    def title(self, manifest: dict[str, Any]) -> str:
-        """Of table and page."""
+    def title(self, manifest: Entries) -> str:
+        """Return margins of table and page."""
         settings = manifest["parameters"]
         name = self.task.name.capitalize()
         return f"{name} sweep, suite {settings['suite']}, planner {settings['planner']}"
 
-    def table(self, manifest: dict[str, Any]) -> RateTable:
-        """Success rates."""
+    def table(self, manifest: Entries) -> RateTable:
+        """Return success rates."""
         summary, settings = manifest["summary"], manifest["parameters"]
         header = ["suite", "cases", f"{settings['planner']} %", "95 % interval"]
         cells = own_cells(summary["successes"], summary["num"])
         return RateTable("Success", header, [[settings["suite"], *cells]])
 
-    def findings(self, manifest: dict[str, Any]) -> list[str]:
-        """What else a run says of itself at the top, a sentence each."""
+    def findings(self, manifest: Entries) -> list[str]:
+        """Return what else a run says of itself at the top, a sentence each."""
         return []
 
-    def remarks(self, manifest: dict[str, Any]) -> list[str]:
-        """Where the numbers come from, a sentence each."""
+    def remarks(self, manifest: Entries) -> list[str]:
+        """Return where the numbers come from, a sentence each."""
         settings = manifest["parameters"]
         return [
             f"Cases: {settings['num']:,} of suite {settings['suite']}, seed {settings['seed']}.",
@@ -163,17 +160,18 @@ class Sweep:
 
 
 def settings_of(task: Task) -> type[SweepSettings]:
-    """The class of a task's sweep settings."""
+    """Return the class of a task's sweep settings."""
     return pkgutil.resolve_name(task.sweep)
 
 
 def sweep_of(task: Task) -> Sweep:
-    """The sweep of a task."""
-    return pkgutil.resolve_name(settings_of(task).RUN)(task)
+    """Return the sweep of a task."""
+    name = settings_of(task).RUN
+    return pkgutil.resolve_name(name)(task) if name else Sweep(task)
 
 
-def sweep_of_run(manifest: dict[str, Any], name: str = "out") -> Sweep:
-    """The sweep that a run is of.
+def sweep_of_run(manifest: Entries, name: str = "out") -> Sweep:
+    """Return the sweep that a run is of.
 
     Args:
         manifest: of the run.
@@ -191,14 +189,14 @@ def sweep_of_run(manifest: dict[str, Any], name: str = "out") -> Sweep:
         raise ArgumentError(name, f"the folder of a known task: {error}", shown="") from None
 
 
-def first_values(tree: Any, names: Sequence[str] = (), prefix: str = "") -> dict[str, Any]:
-    """Leaves of the first case as plain numbers, to six digits so that float32 does not show.
+def first_values(tree: PyTree, names: Sequence[str] = (), prefix: str = "") -> Entries:
+    """Return leaves of the first case as plain numbers, to six digits to hide float32.
 
     Without `names` these are all fields of the tree. Those that are not there, and those that hold
     fields of their own, are left out.
     """
     names = names or [field.name for field in dataclasses.fields(tree)]
-    known = {name: getattr(tree, name) for name in names}
+    known = {name: vars(tree)[name] for name in names}
     leaves = {
         prefix + name: np.asarray(value, float)[0]
         for name, value in known.items()

@@ -37,7 +37,7 @@ from planner_jax.sims.tasks.block_shown import (
     joint_table,
     scenery,
 )
-from planner_jax.sweep.block.pipeline import SeeingArms
+from planner_jax.studies.block.seeing import SeeingArms
 from planner_jax.task.block.api import planner as block_planner
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.scene import FLOOR

@@ -166,9 +166,10 @@ def full_disk(num: int, place: Path) -> Survived:
     """A limit on the size of files, between the smallest and the largest; then without it."""
     whole, limits = place / "whole", random.Random(10)
     assert finished(start("sweep", *HIT, "--out", whole, cwd=place)).code == 0
+    largest = max(path.stat().st_size for path in (whole / "plans").iterdir())
     for number in range(num):
         out = place / str(number)
-        blocks = limits.randrange(1, len(rows_of(whole)) // 1024)
+        blocks = limits.randrange(1, largest // 1024)
         ended = finished(start("sweep", *HIT, "--out", out, cwd=place, blocks=blocks))
         last = ended.err.rstrip("\n").rpartition("\n")[2]
         told = ended.code in (1, 2) and "--out must be a folder that can be written" in last

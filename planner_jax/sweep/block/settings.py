@@ -2,9 +2,10 @@
 
 import dataclasses
 import math
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from planner_jax.core.choices import require, require_one_of
+from planner_jax.runs.manifest import Entries
 from planner_jax.runs.settings import SweepSettings, option
 
 REGIMES = ("R1", "R2", "R3")  # of `planner_jax.robot.arm`, which imports JAX
@@ -81,7 +82,7 @@ class BlockSettings(SweepSettings):
         super().__post_init__()
         require_one_of(REGIMES, "regime", self.regime)
         for name in ("delay", "count", "sense", "overhead", "wait", "noise"):
-            require_moderate(name, getattr(self, name))
+            require_moderate(name, vars(self)[name])
         require_moderate("refit", self.refit, _FASTEST)
         require_frame_rate(self.frame_rate)
         if self.perception:
@@ -91,7 +92,7 @@ class BlockSettings(SweepSettings):
             require(once, "wait", "0 with refit", self.wait)
             require(self.count is None, "count", "left out with perception", self.count)
 
-    def draw_options(self) -> dict[str, Any]:
-        """Options of the task's `draw`: the delay is until the first motion may start."""
+    def draw_options(self) -> Entries:
+        """Draw options of the task's `draw`: the delay is until the first motion may start."""
         first = self.sense + self.overhead if self.perception else self.delay + (self.count or 0.0)
         return {**super().draw_options(), "delay": first}

@@ -1,25 +1,57 @@
 """What blocks add to a sweep: rows of their own, how long the arm moves, and what it saw."""
 
+import dataclasses
 from collections.abc import Sequence
-from typing import Any
 
+import jax
 import numpy as np
 import pyarrow as pa
+from flax import struct
+from jax import Array
+from jaxtyping import PyTree
 
 from planner_jax.baselines.block.library.adapt import AdaptBlock
 from planner_jax.baselines.block.library.planner import LibraryBlock
 from planner_jax.core.choices import require
+from planner_jax.core.planner import Planner
 from planner_jax.robot.arm import ArmPlan
 from planner_jax.runs.columns import Column, RefereedBatch
+from planner_jax.runs.manifest import Entries, Row
 from planner_jax.runs.summary import COUNTED, Tally
+from planner_jax.runs.timing import timed_plans
+from planner_jax.studies.block.contact_check import delay_motion
+from planner_jax.studies.block.seeing import SeeingArms, SeenPlan
 from planner_jax.sweep.block.columns import COLUMNS, FRAME, SEEN_COLUMNS, TIMED_COLUMNS
-from planner_jax.sweep.block.pipeline import CountedPlanner, SeeingArms, SeenPlan, TimedPlan
 from planner_jax.sweep.block.settings import BlockSettings
 from planner_jax.sweep.rows import arm_plan
 from planner_jax.sweep.sweep import Sweep
+from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.default_planner import OnlineBlock
+from planner_jax.task.block.plan import BlockPlan
 
 _ROOM = 0.1  # [m], of a ball that may be met off the shield's middle
+
+
+@struct.dataclass
+class TimedPlan(BlockPlan):
+    """A plan that was waited for."""
+
+    planning_time: Array  # () [s]
+
+
+@dataclasses.dataclass(frozen=True)
+class CountedPlanner:
+    """Plans one after another by the clock; a plan that comes too late begins so much later."""
+
+    planner: Planner
+    allowed: float  # [s], that planning may take; in the delay already
+
+    def plans(self, cases: BlockCase) -> TimedPlan:
+        """Return the plans of a batch, up to where they meet the balls."""
+        plans, spent = timed_plans(self.planner, cases)
+        late = np.maximum(spent - self.allowed, 0.0).astype(cases.delay.dtype)
+        met = delay_motion(cases, plans, late)
+        return jax.tree.map(np.asarray, TimedPlan(**vars(met), planning_time=spent))
 
 
 class BlockTally(Tally):
@@ -39,8 +71,8 @@ class BlockTally(Tally):
             if name in rows.column_names:
                 values.append(rows[name].to_numpy())
 
-    def summary(self) -> dict[str, Any]:
-        """Those of every sweep; with a camera or a clock also errors [m] and times [s]."""
+    def summary(self) -> Entries:
+        """Return those of every sweep; with a camera or a clock also errors [m] and times [s]."""
         found = super().summary()
         if self._errors:
             errors = np.concatenate(self._errors)
@@ -56,58 +88,55 @@ class BlockTally(Tally):
 class BlockSweep(Sweep):
     """Arms that block thrown balls."""
 
-    frame = FRAME
+    frame, counts = FRAME, BlockTally
 
     def columns(self, batch: RefereedBatch) -> Sequence[Column]:
-        """The columns of blocks, and what the arms saw or waited for."""
+        """Return the columns of blocks, and what the arms saw or waited for."""
         more = {SeenPlan: SEEN_COLUMNS, TimedPlan: TIMED_COLUMNS}.get(type(batch.plans), [])
         return [*COLUMNS, *more]
 
-    def planner(self, settings: BlockSettings) -> Any:
-        """The planner of a run; `ArgumentError` where its file is no library."""
+    def planner(self, settings: BlockSettings) -> Planner | SeeingArms | CountedPlanner:
+        """Return the planner of a run; `ArgumentError` where its file is no library."""
         planner = super().planner(settings)
         if settings.perception:
             for name in ("refit", "wait"):
-                value = getattr(settings, name)
+                value = vars(settings)[name]
                 may = isinstance(planner, OnlineBlock) or value == 0.0
                 require(may, name, "0 for a planner other than online", value)
             own = not isinstance(planner, LibraryBlock)
             require(own, "planner", "one that plans for the very ball", settings.planner)
             names = ("sense", "overhead", "refit", "wait", "noise", "frame_rate", "seed")
-            return SeeingArms(planner, **{name: getattr(settings, name) for name in names})
+            return SeeingArms(planner, **{name: vars(settings)[name] for name in names})
         if settings.count is not None:
             return CountedPlanner(planner, settings.count)
         return planner
 
-    def other_planners(self, settings: BlockSettings) -> dict[str, Any]:
-        """The task's other planners, to be compared; none where a camera or a clock has a say."""
+    def other_planners(self, settings: BlockSettings) -> Entries:
+        """Return the task's other planners; none where a camera or a clock matters."""
         if settings.perception or settings.count is not None:
             return {}
         return super().other_planners(settings)
 
-    def require_fit(self, settings: BlockSettings, planner: Any, cases: Any) -> None:
+    def require_fit(self, settings: BlockSettings, planner: Planner, cases: PyTree) -> None:
         """Raise `ArgumentError` unless the planner is one of such cases, and a library of these."""
-        planner = getattr(planner, "planner", planner)
+        if isinstance(planner, SeeingArms | CountedPlanner):
+            planner = planner.planner
         super().require_fit(settings, planner, cases)
         if isinstance(planner, LibraryBlock | AdaptBlock):
             planner.check(cases)
 
-    def plan(self, planner: Any, cases: Any) -> Any:
-        """The plans of a batch; of arms that see or wait, what they do."""
+    def plan(self, planner: Planner, cases: PyTree) -> PyTree:
+        """Return the plans of a batch; of arms that see or wait, what they do."""
         if isinstance(planner, SeeingArms | CountedPlanner):
             return planner.plans(cases)
         return super().plan(planner, cases)
 
-    def plan_of_row(self, row: dict[str, Any], setting: dict[str, Any]) -> ArmPlan:
-        """The plan of a row; it begins when the arm may start, at the row's `delay`."""
+    def plan_of_row(self, row: Row, setting: Entries) -> ArmPlan:
+        """Return the plan of a row; it begins when the arm may start, at the row's `delay`."""
         return arm_plan(row)
 
-    def tally(self, settings: BlockSettings) -> BlockTally:
-        """An empty count of rows."""
-        return BlockTally()
-
-    def findings(self, manifest: dict[str, Any]) -> list[str]:
-        """How long the arm moves, how well the ball was seen, and how long planning took."""
+    def findings(self, manifest: Entries) -> list[str]:
+        """Return how long the arm moves, how well the ball was seen, and how long planning took."""
         summary, found = manifest["summary"], []
         if (mean := summary["mean_execution_time"]) is not None:
             found.append(f"The arm moves for {mean:.3f} s, in the mean of the successes.")

@@ -4,8 +4,7 @@ N targets, so that lists of a row have N entries, or N points one behind the oth
 the decision, the plan and the verdict are in the order of catching.
 """
 
-from typing import Any
-
+import numpy as np
 import pyarrow as pa
 
 from planner_jax.runs import columns as known
@@ -18,18 +17,18 @@ _WHICH, _FLAGS = list_of(pa.int32()), list_of(pa.bool_())
 
 
 def _target(name: str, unit: str, meaning: str, path: str) -> Column:
-    """A leaf of the targets at a dotted path; null for targets of a class without it."""
+    """Return a leaf of the targets at a dotted path; null for targets of a class without it."""
 
-    def values(batch: known.RefereedBatch) -> Any:
+    def values(batch: known.RefereedBatch) -> known.Values:
         leaf = batch.cases.targets
         for step in path.split("."):
-            leaf = getattr(leaf, step, None)
+            leaf = None if leaf is None else vars(leaf).get(step)
         return leaf
 
     return Column(name, unit, meaning, LIST, values)
 
 
-def _time_ratio(batch: known.RefereedBatch) -> Any:
+def _time_ratio(batch: known.RefereedBatch) -> np.ndarray:
     return optimal_time_ratio(batch.cases, batch.plans)
 
 

@@ -2,31 +2,22 @@
 
 import dataclasses
 import math
-from typing import Any, ClassVar
+from typing import ClassVar
 
-from planner_jax.core.choices import EFFORTS, require, require_one_of, require_scale
+from planner_jax.core.choices import require, require_one_of
 from planner_jax.core.registry import split_name
-from planner_jax.runs.settings import (
-    SweepSettings,
-    ending_option,
-    ending_options,
-    option,
-    require_effort,
-    require_ending,
-)
-from planner_jax.sweep.robots import checked_robot, robot_option
+from planner_jax.runs.settings import option
+from planner_jax.sweep.quadrotor_settings import QuadrotorSettings, SingleSettings
 from planner_jax.task.catch.spec import DECISIONS, SUITES, TRAINED
 
+_MOST_BALLS = 6  # of which all orders are looked at
 NET_TESTS = ("plane", "ball")  # of `referee_catches`
 
 
 @dataclasses.dataclass(frozen=True)
-class CatchSettings(SweepSettings):
+class CatchSettings(QuadrotorSettings):
     """The arguments of a catch sweep."""
 
-    limit_scale: float = option(
-        1.0, "F", "factor on the speed and body-rate limits and on the thrust's distance from hover"
-    )
     decide: str = option(
         "best", "NAME", f"order and first times: {', '.join(DECISIONS)}, policy:FILE"
     )
@@ -40,12 +31,10 @@ class CatchSettings(SweepSettings):
         "or all around its centre",
     )
 
-    robot: Any = robot_option("paper-catcher")
-    effort: str = option("feasible", "NAME", f"of the planner: {', '.join(EFFORTS)}")
-    ending: str = ending_option()
-
+    TOOL: ClassVar[str] = "net"
+    WITHOUT_EFFORT: ClassVar[str] = "mpp"
     RUN: ClassVar[str] = "planner_jax.sweep.catch.sweep:CatchSweep"
-    PLANNER: ClassVar[tuple[str, ...]] = ("decide", "effort")
+    PLANNER: ClassVar[tuple[str, ...]] = ("decide",)
     DRAW: ClassVar[tuple[str, ...]] = ("limit_scale", "robot")
     JUDGE: ClassVar[tuple[str, ...]] = ("tolerance", "net_test")
     GPU_BATCH: ClassVar[int] = 8192  # all orders of six targets at once: 1 MB a case
@@ -53,17 +42,9 @@ class CatchSettings(SweepSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         tolerance = self.tolerance
-        require_scale(self.limit_scale)
-        object.__setattr__(self, "robot", checked_robot(self.robot, "net"))
-        require_effort(self.effort, self.planner, "mpp")
-        require_ending(self.ending)
         split_name(DECISIONS, "decide", self.decide, TRAINED)
         require_one_of(NET_TESTS, "net_test", self.net_test)
         require(0.0 <= tolerance < math.inf, "tolerance", "finite and >= 0", tolerance)
-
-    def planner_options(self) -> dict[str, Any]:
-        """Options of the planner that these settings decide."""
-        return super().planner_options() | ending_options(self.ending)
 
     @property
     def case_bytes(self) -> int:
@@ -72,3 +53,45 @@ class CatchSettings(SweepSettings):
         all_orders = self.decide == "best" and suite is not None and not suite.optional
         orders = math.factorial(min(suite.num_targets, 6)) if suite and all_orders else 1
         return self.CASE_BYTES + 1_400 * orders
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SingleCatchSettings(SingleSettings):
+    """One ball by `pos` and `vel`, or any number of `balls`, and until when."""
+
+    pos: tuple[float, ...] | None = option(None, "X Y Z", "of the one ball now [m]")
+    vel: tuple[float, ...] | None = option(None, "X Y Z", "of the one ball now [m/s]")
+    ball: tuple[tuple[float, ...], ...] = option(
+        (), "X Y Z VX VY VZ", "place and velocity of a ball now; once for each of several"
+    )
+    horizon: float = option(dataclasses.MISSING, "S", "until when to catch [s]")
+    drag: float | None = option(None, "K", "of the balls, linear [1/s] (default: none)")
+    net_height: float | None = option(None, "L", "over the propellers [m] (default: the robot's)")
+    net_radius: float | None = option(None, "R", "of the hoop [m] (default: the robot's)")
+    max_angle: float | None = option(
+        None, "A", "between the net's axis and a ball's way back [rad] (default: the robot's)"
+    )
+    decide: str = option("best", "NAME", f"order and first times: {', '.join(DECISIONS)}")
+
+    TOOL: ClassVar[str] = "net"
+    RUN: ClassVar[str] = "planner_jax.sweep.catch.single:SingleCatch"
+    PLANNER: ClassVar[tuple[str, ...]] = ("decide",)
+    ELSEWHERE: ClassVar[tuple[str, ...]] = ("pos", "vel", "ball", "horizon", "drag")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("pos", "vel"):
+            given = vars(self)[name] is not None
+            rule = "left out beside --ball" if self.ball else "given, or --ball"
+            require(given != bool(self.ball), name, rule, "both" if given else "nothing")
+        num = len(self.ball)
+        require(num <= _MOST_BALLS, "ball", f"given at most {_MOST_BALLS} times", num)
+        require(self.drag is None or self.drag >= 0.0, "drag", ">= 0", self.drag)
+        split_name(DECISIONS, "decide", self.decide, TRAINED)
+
+    @property
+    def balls(self) -> list[tuple[tuple[float, ...], tuple[float, ...]]]:
+        """Place and velocity of every ball."""
+        if self.pos is not None and self.vel is not None:
+            return [(self.pos, self.vel)]
+        return [(ball[:3], ball[3:]) for ball in self.ball]

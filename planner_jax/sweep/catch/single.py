@@ -1,9 +1,8 @@
 """One catch of one ball or several that was asked for in a few numbers."""
 
-from typing import Any
-
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath
@@ -19,8 +18,8 @@ class SingleCatch(Single):
         **{f"net.{name}": f"net_{name}" for name in ("height", "radius")},
     }
 
-    def case(self) -> Any:
-        """The case."""
+    def case(self) -> PyTree:
+        """Return the case."""
         given = self.settings
         pos, vel = (jnp.asarray(part, jnp.float32) for part in zip(*given.balls, strict=True))
         num = pos.shape[0]
@@ -33,7 +32,7 @@ class SingleCatch(Single):
         return self.task.case(path, np.full(num, given.horizon), **given.case_options())
 
     def contact(self, answer: Answer) -> list[str]:
-        """Of every ball with the net."""
+        """Return a sentence on every ball that meets the net."""
         lines = []
         targets = answer.case.targets
         for place, (target, time) in enumerate(
@@ -54,7 +53,7 @@ class SingleCatch(Single):
         return lines
 
     def own_margins(self, answer: Answer) -> list[Margin]:
-        """Of the net, of its angle, and of the horizon; the catch that is closest to each."""
+        """Return the margins of net, angle and horizon, each at the closest catch."""
         net, verdict = answer.case.net, answer.verdict
         times = np.asarray(verdict.catch_times)
         horizons = np.asarray(answer.case.horizon)[np.asarray(answer.plan.order)]

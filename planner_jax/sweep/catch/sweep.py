@@ -1,11 +1,11 @@
 """What catches add to a sweep: targets caught, their times, the decision, and the paper's rates."""
 
-from typing import Any
-
 import numpy as np
 import pyarrow as pa
+from jaxtyping import PyTree
 
 from planner_jax.robot.quadrotor import QuadrotorPlan
+from planner_jax.runs.manifest import Entries, Row
 from planner_jax.runs.summary import COUNTED, Tally
 from planner_jax.runs.table import RateTable, own_cells
 from planner_jax.sweep.catch.columns import COLUMNS, FRAME
@@ -15,7 +15,7 @@ from planner_jax.sweep.catch.figures.outcomes import outcomes_figure
 from planner_jax.sweep.catch.settings import CatchSettings
 from planner_jax.sweep.figures.motion import CAPTION as MOTION
 from planner_jax.sweep.quadrotor import ending_remark
-from planner_jax.sweep.robots import robot_remark
+from planner_jax.sweep.quadrotor_settings import robot_remark
 from planner_jax.sweep.rows import quadrotor_plan
 from planner_jax.sweep.sweep import RunFigure, Sweep, first_values
 from planner_jax.task.catch.spec import SUITES
@@ -59,7 +59,7 @@ class CatchTally(Tally):
         self._ratios += float(ratio[known].sum())
         self._num_ratios += int(known.sum())
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> Entries:
         """Rates as fractions, 0 to 1, and times [s], for the manifest; None where unknown."""
         return {
             **super().summary(),
@@ -72,7 +72,7 @@ class CatchTally(Tally):
 class CatchSweep(Sweep):
     """Quadrotors that catch flying targets with a net."""
 
-    frame, own_columns = FRAME, COLUMNS
+    frame, own_columns, single_columns = FRAME, COLUMNS, COLUMNS
     figures = (
         RunFigure(
             "flight.png",
@@ -81,7 +81,7 @@ class CatchSweep(Sweep):
             (13.0, 7.6),
             flight_figure,
         ),
-        RunFigure("motion.png", MOTION, (13.0, 6.8), motion_figure, compares=True),
+        RunFigure("motion.png", MOTION, (13.0, 6.8), motion_figure),
         RunFigure(
             "outcomes.png",
             "Success with its 95 % Wilson interval beside the published rates, failures by "
@@ -101,20 +101,20 @@ class CatchSweep(Sweep):
         ),
     )
 
-    def setting(self, cases: Any) -> dict[str, Any]:
-        """Physics and limits that all cases have in common, for the manifest."""
+    def setting(self, cases: PyTree) -> Entries:
+        """Return physics and limits that all cases have in common, for the manifest."""
         net = first_values(cases.net, ["height", "radius", "max_angle"], "net_")
         return {**first_values(cases, ["gravity"]), **net, **first_values(cases.limits)}
 
-    def plan_of_row(self, row: dict[str, Any], setting: dict[str, Any]) -> QuadrotorPlan:
-        """The plan of a row, without its order and times of catches."""
+    def plan_of_row(self, row: Row, setting: Entries) -> QuadrotorPlan:
+        """Return the plan of a row, without its order and times of catches."""
         return quadrotor_plan(row, setting)
 
     def tally(self, settings: CatchSettings) -> CatchTally:
-        """An empty count of rows."""
+        """Return an empty count of rows."""
         return CatchTally(decides=settings.planner != "mpp")
 
-    def table(self, manifest: dict[str, Any]) -> RateTable:
+    def table(self, manifest: Entries) -> RateTable:
         """Success and optimal time ratio, beside Tables I and III of paper 000, every suite."""
         summary, settings = manifest["summary"], manifest["parameters"]
         planner, names = settings["planner"], list({**SUITES, settings["suite"]: None})
@@ -127,12 +127,13 @@ class CatchSweep(Sweep):
             if place == strong:
                 ratio = _number(summary["optimal_time_ratio"], 3)
                 own = [*own_cells(summary["successes"], summary["num"]), ratio]
-            paper = [getattr(SUITES.get(name), word, None) for word in words]
+            suite = SUITES.get(name)
+            paper = [None if suite is None else vars(suite)[word] for word in words]
             rows.append([name, *own, *map(_number, paper, (1, 3, 1))])
         return RateTable("Success beside the paper", header, rows, strong)
 
-    def findings(self, manifest: dict[str, Any]) -> list[str]:
-        """What was caught, when, and how close the decision was."""
+    def findings(self, manifest: Entries) -> list[str]:
+        """Return what was caught, when, and how close the decision was."""
         summary = manifest["summary"]
         text = f"{100.0 * summary['caught']:.2f} % of the targets caught"
         if summary["mean_catch_time"] is not None:
@@ -141,8 +142,8 @@ class CatchSweep(Sweep):
             text += f"; optimal time ratio {summary['optimal_time_ratio']:.3f}"
         return [f"{text}."]
 
-    def remarks(self, manifest: dict[str, Any]) -> list[str]:
-        """Where the numbers come from, a sentence each."""
+    def remarks(self, manifest: Entries) -> list[str]:
+        """Return where the numbers come from, a sentence each."""
         settings, limits = manifest["parameters"], manifest["setting"]
         gravity = limits["gravity"]
         return [

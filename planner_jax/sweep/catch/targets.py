@@ -1,6 +1,6 @@
 """Where the targets, the quadrotor and its net of one row of the run are."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -8,11 +8,12 @@ import numpy as np
 
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath, HarmonicPath
-from planner_jax.sweep.sampled_motion import SampledMotion, net_thrust
+from planner_jax.runs.manifest import Entries, Row
+from planner_jax.sweep.quadrotor import SampledMotion, net_thrust
 
 
-def target_paths(row: dict[str, Any]) -> BallPath | HarmonicPath:
-    """The targets, leaves with a leading axis N."""
+def target_paths(row: Row) -> BallPath | HarmonicPath:
+    """Return the targets, leaves with a leading axis N."""
 
     def leaf(name: str, *trailing: int) -> jax.Array:
         return jnp.asarray(np.reshape(row[name], (-1, *trailing)), jnp.float32)
@@ -24,8 +25,8 @@ def target_paths(row: dict[str, Any]) -> BallPath | HarmonicPath:
     return HarmonicPath(**vectors, rate=leaf("swing_rate"), phase=leaf("swing_phase"))
 
 
-def target_positions(row: dict[str, Any], times: np.ndarray) -> np.ndarray:
-    """Where all targets are at some times (K,) [s], (N, K, 3) [m]."""
+def target_positions(row: Row, times: np.ndarray) -> np.ndarray:
+    """Return where all targets are at some times (K,) [s], (N, K, 3) [m]."""
     return np.asarray(_positions(target_paths(row), jnp.asarray(times, jnp.float32)))
 
 
@@ -37,7 +38,7 @@ def _positions(paths: BallPath | HarmonicPath, times: jax.Array) -> jax.Array:
 class SampledCatch(NamedTuple):
     """A row, and its quadrotor, net and N targets at K times."""
 
-    row: dict[str, Any]
+    row: Row
     motion: SampledMotion
     axis: np.ndarray  # (K, 3) thrust direction
     centre: np.ndarray  # (K, 3) [m], of the hoop
@@ -46,8 +47,8 @@ class SampledCatch(NamedTuple):
     catches: np.ndarray  # (n,) places of the n catches among the times
 
 
-def sampled_catch(row: dict, motion: SampledMotion, setting: dict) -> SampledCatch:
-    """A row whose plan has been sampled, with the physics of the manifest's `setting`."""
+def sampled_catch(row: Row, motion: SampledMotion, setting: Entries) -> SampledCatch:
+    """Return a row whose plan has been sampled, with the physics of the manifest's `setting`."""
     thrust = net_thrust(motion, setting["gravity"])
     axis = thrust / np.maximum(np.linalg.norm(thrust, axis=1, keepdims=True), 1e-9)
     centre = motion.pos + setting["net_height"] * axis
@@ -58,7 +59,7 @@ def sampled_catch(row: dict, motion: SampledMotion, setting: dict) -> SampledCat
 
 
 def due_distance(plan: SampledCatch) -> np.ndarray:
-    """Distance (K,) [m] from the net's centre to the target that is to be caught next.
+    """Return distance (K,) [m] from the net's centre to the target that is to be caught next.
 
     NaN at the first time after a catch, so that curves have a gap there.
     """

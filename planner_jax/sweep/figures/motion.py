@@ -1,39 +1,41 @@
 """The figure of a quadrotor's plans along their time."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from planner_jax.runs import style
-from planner_jax.sweep.report import RunRows
-from planner_jax.sweep.sampled_motion import (
+from planner_jax.runs.manifest import Entries, Row
+from planner_jax.runs.style import Look
+from planner_jax.sweep.quadrotor import (
     SampledMotion,
     body_rate,
     net_thrust,
     sample_motion,
     sample_rest,
 )
+from planner_jax.sweep.report import RunRows
 
-DASHED: dict[str, Any] = {"color": style.RED, "linewidth": 1.2, "linestyle": "--", "zorder": 1}
-FORBIDDEN: dict[str, Any] = {"color": style.RED, "alpha": 0.08, "linewidth": 0.0}
+DASHED: Look = {"color": style.RED, "linewidth": 1.2, "linestyle": "--", "zorder": 1}
+FORBIDDEN: Look = {"color": style.RED, "alpha": 0.08, "linewidth": 0.0}
 _SAMPLES = 800  # of a plan
 CAPTION = (
     "One plan along its time against the limits, beside the other planners' plans for the same "
     "case. Thin: the way to rest behind the last contact, where there is one."
 )
-_OF_REST: dict[str, Any] = {"linewidth": 0.9}
+_OF_REST: Look = {"linewidth": 0.9}
 
 
 class Drawn(NamedTuple):
     """A plan of the figure."""
 
-    row: dict[str, Any]  # of the run
+    row: Row  # of the run
     motion: SampledMotion  # up to the last contact
     rest: SampledMotion | None  # behind it
-    look: dict[str, Any]  # of its curves
+    look: Look  # of its curves
 
     def draw(self, axes: Axes, values: Callable[[SampledMotion], np.ndarray]) -> None:
         """Draw values (N,) of the plan along its time."""
@@ -60,11 +62,11 @@ def quadrotor_figure(
     figure: Figure,
     run: RunRows,
     panels: Sequence[str],
-    first: Callable[[Axes, dict[str, Any], list[Drawn]], None],
-    word: Callable[[dict[str, Any]], str],
+    first: Callable[[Axes, Entries, list[Drawn]], None],
+    word: Callable[[Row], str],
     which: str,
 ) -> None:
-    """A quadrotor's plans for the same case along their time against the limits.
+    """Draw a quadrotor's plans for the same case along their time against the limits.
 
     Args:
         figure: empty.
@@ -105,8 +107,8 @@ def quadrotor_figure(
     write_verdicts(axes[1, 2], f"Case {plans[0][1]['index']}, {which}", plans, word)
 
 
-def look_of(place: int, name: str, row: dict[str, Any]) -> dict[str, Any]:
-    """Of a plan's curves: dashed if it failed, thick for the first, the sweep's own."""
+def look_of(place: int, name: str, row: Row) -> Entries:
+    """Return the look of a plan's curves: dashed if it failed, thick for the sweep's own."""
     return {
         "color": style.PLANNER_COLOURS.get(name, style.INK),
         "linestyle": "-" if row["success"] else (0, (4, 1.5)),
@@ -116,14 +118,14 @@ def look_of(place: int, name: str, row: dict[str, Any]) -> dict[str, Any]:
 
 
 def draw_upper_limit(axes: Axes, limit: float) -> None:
-    """A limit as a dashed line, the forbidden side above it shaded."""
+    """Draw a limit as a dashed line, the forbidden side above it shaded."""
     top = min(max(axes.get_ylim()[1], 1.15 * limit), 3.0 * limit)
     axes.axhline(limit, **DASHED)
     axes.axhspan(limit, top, **FORBIDDEN)
     axes.set_ylim(0.0, top)
 
 
-def _draw_thrust_limits(axes: Axes, setting: dict[str, Any]) -> None:
+def _draw_thrust_limits(axes: Axes, setting: Entries) -> None:
     """Hover and limits; a bound that only follows from the acceleration's is grey, not red."""
     gravity = setting["gravity"]
     axes.axhline(gravity, color=style.GREY, linewidth=1.0, linestyle=":")
@@ -145,12 +147,12 @@ def _draw_thrust_limits(axes: Axes, setting: dict[str, Any]) -> None:
 def write_verdicts(
     axes: Axes,
     case: str,
-    plans: Sequence[tuple[str, dict[str, Any]]],
-    word: Callable[[dict[str, Any]], str],
+    plans: Sequence[tuple[str, Row]],
+    word: Callable[[Row], str],
 ) -> None:
-    """The legend, each planner with the referee's word."""
+    """Write the legend, each planner with the referee's word."""
     axes.axis("off")
-    look: dict[str, Any] = {"va": "top", "transform": axes.transAxes}
+    look: Look = {"va": "top", "transform": axes.transAxes}
     axes.text(0.0, 1.0, f"{case}\nlimits: red; curves of failed plans: dashed", **look)
     step = min(0.22, 0.9 / len(plans))
     for place, (name, row) in enumerate(plans):

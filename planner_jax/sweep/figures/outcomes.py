@@ -1,6 +1,6 @@
 """Success, failures by name, and iterations: what every task's runs can show."""
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -8,10 +8,14 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from planner_jax.runs import style
+from planner_jax.runs.manifest import Entries
+
+if TYPE_CHECKING:
+    from planner_jax.sweep.report import RunRows
 
 
-def outcomes_figure(figure: Figure, run: Any) -> None:
-    """The rate, failures and a histogram of iterations.
+def outcomes_figure(figure: Figure, run: "RunRows") -> None:
+    """Draw the rate, failures and a histogram of iterations.
 
     Args:
         figure: empty.
@@ -24,9 +28,7 @@ def outcomes_figure(figure: Figure, run: Any) -> None:
     last.xaxis.set_major_locator(MaxNLocator(integer=True))
 
 
-def draw_outcomes(
-    figure: Figure, manifest: dict[str, Any], published: list[tuple[str, float]]
-) -> Axes:
+def draw_outcomes(figure: Figure, manifest: Entries, published: list[tuple[str, float]]) -> Axes:
     """Panels of success and, where there are any, of failures, and an empty one beside them.
 
     Args:
@@ -43,7 +45,7 @@ def draw_outcomes(
     return panels[-1]
 
 
-def _draw_rates(axes: Axes, manifest: dict[str, Any], published: list[tuple[str, float]]) -> None:
+def _draw_rates(axes: Axes, manifest: Entries, published: list[tuple[str, float]]) -> None:
     """This run's rate with its interval, and published ones."""
     summary, settings = manifest["summary"], manifest["parameters"]
     rate, name = 100.0 * summary["success_rate"], settings["planner"]
@@ -64,7 +66,7 @@ def _draw_rates(axes: Axes, manifest: dict[str, Any], published: list[tuple[str,
 
 
 def _draw_failures(axes: Axes, failed: dict[str, int]) -> None:
-    """How many plans fail each limit first."""
+    """Draw how many plans fail each limit first."""
     style.label(axes, "plans", "", f"First failed limit of {sum(failed.values()):,}")
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     places = range(len(failed))

@@ -3,33 +3,26 @@
 import dataclasses
 import math
 import os
-from typing import Any, ClassVar
+from typing import ClassVar
 
-from planner_jax.core.choices import EFFORTS, require, require_scale
+from planner_jax.core.choices import require
 from planner_jax.core.errors import ArgumentError
-from planner_jax.runs.settings import (
-    SweepSettings,
-    ending_option,
-    ending_options,
-    option,
-    require_effort,
-    require_ending,
-)
-from planner_jax.sweep.robots import checked_robot, robot_option
-from planner_jax.task.hit.spec import START
+from planner_jax.runs.manifest import Entries
+from planner_jax.runs.settings import option
+from planner_jax.sweep.quadrotor_settings import QuadrotorSettings, SingleSettings
+from planner_jax.task.hit.spec import DRAG, START
 
 _FARTHEST = 1e6  # [m]
 
 
 @dataclasses.dataclass(frozen=True)
-class HitSettings(SweepSettings):
+class HitSettings(QuadrotorSettings):
     """The arguments of a hit sweep.
 
     `num` is by default the whole folder, or `DEFAULT_NUM` drawn serves; `seed` is of drawn serves
     and of uniform starts.
     """
 
-    limit_scale: float = option(1.0, "F", "factor on the speed, acceleration and body-rate limits")
     serves: str | None = option(None, "DIR", "read published trial files (default: draw serves)")
     start: tuple[float, ...] | str = option(
         START, "X", "hover start X Y Z in m, or 'uniform' over the half court"
@@ -39,10 +32,8 @@ class HitSettings(SweepSettings):
         False, "", "plan and judge the returned ball with drag too (exact only)"
     )
 
-    robot: Any = robot_option("paper-hitter")
-    effort: str = option("feasible", "NAME", f"of the planner: {', '.join(EFFORTS)}")
-    ending: str = ending_option()
-
+    TOOL: ClassVar[str] = "racket"
+    WITHOUT_EFFORT: ClassVar[str] = "juggle"
     RUN: ClassVar[str] = "planner_jax.sweep.hit.sweep:HitSweep"
     DRAW: ClassVar[tuple[str, ...]] = ("start", "delay", "limit_scale", "robot")
     JUDGE: ClassVar[tuple[str, ...]] = ("drag_after_impact",)
@@ -53,25 +44,20 @@ class HitSettings(SweepSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_scale(self.limit_scale)
-        require_effort(self.effort, self.planner, "juggle")
-        require_ending(self.ending)
         require(0.0 <= self.delay < math.inf, "delay", "finite and >= 0", self.delay)
         truer = not self.drag_after_impact or self.planner in (None, "exact")
         require(truer, "drag_after_impact", "left out unless the planner is exact", self.planner)
         object.__setattr__(self, "start", _checked_start(self.start))
-        object.__setattr__(self, "robot", checked_robot(self.robot, "racket"))
         if self.serves is not None:
             object.__setattr__(self, "serves", os.path.abspath(self.serves))
 
-    def planner_options(self) -> dict[str, Any]:
-        """Fields of the planner's dataclass that these settings decide."""
+    def planner_options(self) -> Entries:
+        """Return the options of the planner that these settings decide."""
         truer = {"drag_after_impact": True} if self.drag_after_impact else {}
-        more = {} if self.effort == EFFORTS[0] else {"effort": self.effort}
-        return more | truer | ending_options(self.ending)
+        return super().planner_options() | truer
 
 
-def _checked_start(start: Any) -> tuple[float, ...] | str:
+def _checked_start(start: object) -> tuple[float, ...] | str:
     rule = f"three finite numbers with z > 0, none beyond {_FARTHEST:g}, or 'uniform'"
     if start in ("uniform", ["uniform"]):
         return "uniform"
@@ -82,3 +68,24 @@ def _checked_start(start: Any) -> tuple[float, ...] | str:
     sound = len(point) == 3 and all(abs(x) <= _FARTHEST for x in point) and point[2] > 0.0
     require(sound, "start", rule, start, shown=" ".join(f"{each:g}" for each in point))
     return point
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SingleHitSettings(SingleSettings):
+    """A ball, a target, and what may be other than in the paper."""
+
+    pos: tuple[float, ...] = option(dataclasses.MISSING, "X Y Z", "of the ball now [m]")
+    vel: tuple[float, ...] = option(dataclasses.MISSING, "X Y Z", "of the ball now [m/s]")
+    target: tuple[float, ...] = option(dataclasses.MISSING, "X Y Z", "where it is to land [m]")
+    acceleration: float | None = option(None, "A", "greatest [m/s^2] (default: the robot's)")
+    hitting_speed: tuple[float, ...] | None = option(
+        None, "X Y Z", "greatest at the impact, by axis [m/s] (default: 4 3 4)"
+    )
+    min_apex: float | None = option(None, "Z", "of the returned ball [m] (default: 2.2)")
+    max_apex: float | None = option(None, "Z", "of the returned ball [m] (default: 6.2)")
+    restitution: float | None = option(None, "B", "of the racket (default: the robot's)")
+    drag: float | None = option(None, "K", f"of the ball, quadratic [1/m] (default: {DRAG})")
+
+    TOOL: ClassVar[str] = "racket"
+    RUN: ClassVar[str] = "planner_jax.sweep.hit.single:SingleHit"
+    ELSEWHERE: ClassVar[tuple[str, ...]] = ("pos", "vel", "target")

@@ -1,8 +1,7 @@
 """One hit that was asked for in a few numbers."""
 
-from typing import Any
-
 import numpy as np
+from jaxtyping import PyTree
 
 from planner_jax.sweep.single import Answer, Margin, Single
 
@@ -15,13 +14,13 @@ class SingleHit(Single):
         **{f"{of}{x}": x for of in ("ball.", "serve_") for x in ("pos", "vel")},
     }
 
-    def case(self) -> Any:
-        """The case."""
+    def case(self) -> PyTree:
+        """Return the case."""
         given = self.settings
         return self.task.case(given.pos, given.vel, given.target, **given.case_options())
 
     def contact(self, answer: Answer) -> list[str]:
-        """Of ball and racket, and of the landing."""
+        """Return a sentence on impact and landing."""
         stroke = answer.plan.stroke
         x, y, z = np.asarray(stroke.ball_pos)
         before, after = (
@@ -34,7 +33,7 @@ class SingleHit(Single):
         ]
 
     def own_margins(self, answer: Answer) -> list[Margin]:
-        """Of the racket, of the speed at the impact and of the apex."""
+        """Return margins of the racket, of the speed at the impact and of the apex."""
         limits, verdict = answer.case.hit_limits, answer.verdict
         end = float(np.sum(answer.plan.trajectory.durations))
         speeds = np.abs(np.asarray(verdict.hitting_velocity))

@@ -2,13 +2,14 @@
 
 import dataclasses
 import hashlib
-from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
 from planner_jax.core.choices import require_one_of
 from planner_jax.core.errors import ArgumentError, CaseError
+from planner_jax.runs.manifest import Entries
 from planner_jax.runs.source import Chunk, Source, filled_in
 from planner_jax.sweep.hit.settings import HitSettings
 from planner_jax.task.hit.court import check_cases
@@ -37,15 +38,15 @@ class ServeSource(Source):
             raise ArgumentError("serves", f"sound cases: {error}", verb="make", shown="") from error
         return Chunk(serves.index, jax.tree.map(np.asarray, cases), serves)
 
-    def check(self) -> Any:
+    def check(self) -> PyTree:
         """Look at every serve of a folder; drawn ones obey their law."""
         cases = super().check()
         for chunk in range(1, 1 if self.folder is None else self.num_chunks):
             self.chunk(chunk)
         return cases
 
-    def description(self) -> dict[str, Any]:
-        """Source, number of distinct serves and digest of their numbers."""
+    def description(self) -> Entries:
+        """Return source, number of distinct serves and digest of their numbers."""
         if self.folder is None:
             return {"serves": {"source": "generated", "distinct": self.num, "sha256": None}}
         used = self.folder[: self.num]

@@ -1,25 +1,24 @@
 """What hits add to a sweep: serves, the 36 scenarios of the court, and their published rates."""
 
 from collections import Counter
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
+from jaxtyping import PyTree
 
 from planner_jax.robot.quadrotor import QuadrotorPlan
-from planner_jax.runs.columns import Column
+from planner_jax.runs.manifest import Entries, Row
 from planner_jax.runs.summary import COUNTED, Tally
 from planner_jax.runs.table import RateTable, own_cells
 from planner_jax.sweep.figures.motion import CAPTION as MOTION
 from planner_jax.sweep.hit.columns import COLUMNS, FRAME, SINGLE_COLUMNS, published_column
-from planner_jax.sweep.hit.figures.court import court_figure
+from planner_jax.sweep.hit.figures.court import court_figure, path_figure
 from planner_jax.sweep.hit.figures.motion import motion_figure, plan_figure
-from planner_jax.sweep.hit.figures.path import path_figure
 from planner_jax.sweep.hit.figures.rates import compared_with, rates_figure
 from planner_jax.sweep.hit.settings import HitSettings
 from planner_jax.sweep.hit.source import ServeSource, open_source
 from planner_jax.sweep.quadrotor import ending_remark
-from planner_jax.sweep.robots import robot_remark
+from planner_jax.sweep.quadrotor_settings import robot_remark
 from planner_jax.sweep.rows import quadrotor_plan
 from planner_jax.sweep.sweep import RunFigure, Sweep, first_values
 from planner_jax.task.hit import court
@@ -57,7 +56,7 @@ class HitTally(Tally):
         left_to_far = success & np.array([name[0] + name[2] == "LF" for name in scenario])
         return [left_to_far, *super().examples(rows, success)]
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> Entries:
         """Rates as fractions, 0 to 1, for the manifest; published ones of these very serves."""
         per_scenario = {
             name: {
@@ -79,7 +78,7 @@ class HitTally(Tally):
 class HitSweep(Sweep):
     """Quadrotors that return served balls with a racket."""
 
-    frame, own_columns = FRAME, COLUMNS
+    frame, own_columns, counts = FRAME, COLUMNS, HitTally
     figures = (
         RunFigure(
             "court.png",
@@ -89,7 +88,7 @@ class HitSweep(Sweep):
             (9.0, 10.6),
             court_figure,
         ),
-        RunFigure("motion.png", MOTION, (13.0, 6.8), motion_figure, compares=True),
+        RunFigure("motion.png", MOTION, (13.0, 6.8), motion_figure),
         RunFigure(
             "rates.png",
             "Success per scenario with 95 % Wilson intervals, beside the published rates.",
@@ -97,6 +96,7 @@ class HitSweep(Sweep):
             rates_figure,
         ),
     )
+    single_columns = SINGLE_COLUMNS
     single_figures = (
         RunFigure("path.png", "Ball and quadrotor in space.", (11.0, 8.0), path_figure),
         RunFigure(
@@ -108,30 +108,22 @@ class HitSweep(Sweep):
     )
     failure_words = {"case": "index", "scenario": "scenario", **Sweep.failure_words}
 
-    def single_columns(self) -> list[Column]:
-        """Without those of a serve's origin."""
-        return SINGLE_COLUMNS
-
     def open_source(self, settings: HitSettings, batch: int) -> ServeSource:
-        """The source of a sweep's serves."""
+        """Return the source of a sweep's serves."""
         return open_source(settings, batch)
 
-    def setting(self, cases: Any) -> dict[str, Any]:
-        """Physics and limits that all cases have in common, for the manifest."""
+    def setting(self, cases: PyTree) -> Entries:
+        """Return physics and limits that all cases have in common, for the manifest."""
         names = ("drag", "gravity", "restitution", "racket_height", "racket_radius")
         setting = first_values(cases, names)
         return setting | first_values(cases.limits) | first_values(cases.hit_limits)
 
-    def plan_of_row(self, row: dict[str, Any], setting: dict[str, Any]) -> QuadrotorPlan:
-        """The plan of a row, without its stroke."""
+    def plan_of_row(self, row: Row, setting: Entries) -> QuadrotorPlan:
+        """Return the plan of a row, without its stroke."""
         return quadrotor_plan(row, setting)
 
-    def tally(self, settings: HitSettings) -> HitTally:
-        """An empty count of rows."""
-        return HitTally()
-
-    def table(self, manifest: dict[str, Any]) -> RateTable:
-        """Success per scenario in percent, beside the published rates of `compared_with`."""
+    def table(self, manifest: Entries) -> RateTable:
+        """Return success per scenario in percent, beside the published rates of `compared_with`."""
         planner, summary = manifest["parameters"]["planner"], manifest["summary"]
         other = compared_with(planner)
         published, column = published_rates(), court.PLANNERS.index(other)
@@ -156,8 +148,8 @@ class HitSweep(Sweep):
         total += [f"{100.0 * solved / known:.2f}"] if same else []
         return RateTable("Success per scenario", header, [*rows, total], strong=len(rows))
 
-    def remarks(self, manifest: dict[str, Any]) -> list[str]:
-        """Where the numbers come from, a sentence each."""
+    def remarks(self, manifest: Entries) -> list[str]:
+        """Return where the numbers come from, a sentence each."""
         summary, settings = manifest["summary"], manifest["parameters"]
         other, start = compared_with(settings["planner"]), settings["start"]
         law = f"drawn from the published law, suite {settings['suite']}, seed {settings['seed']}"
@@ -183,6 +175,6 @@ class HitSweep(Sweep):
         ]
 
 
-def _knows_same_serves(summary: dict[str, Any], other: str) -> bool:
-    """Whether published outcomes of the run's own cases are known."""
+def _knows_same_serves(summary: Entries, other: str) -> bool:
+    """Return whether published outcomes of the run's own cases are known."""
     return any(other in c["published_on_these_serves"] for c in summary["per_scenario"].values())

@@ -5,12 +5,12 @@ behind the other; polygons with fewer corners repeat one.
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pyarrow as pa
+from jaxtyping import PyTree
 
 from planner_jax.runs import columns as known
 from planner_jax.runs.columns import LIST, VECTOR, Column, RefereedBatch, leaves_of, list_of
@@ -21,8 +21,8 @@ _FLAGS, _POINT = list_of(pa.bool_()), list_of(pa.float32(), 2)
 
 
 def _target(name: str, unit: str, meaning: str, kind: pa.DataType) -> Column:
-    """A leaf of targets that turn evenly; null for those of another class."""
-    values = lambda b: getattr(b.cases.target, name, None)  # noqa: E731
+    """Return a leaf of targets that turn evenly; null for those of another class."""
+    values = lambda b: vars(b.cases.target).get(name)  # noqa: E731
     return Column(f"target_{name}", unit, meaning, kind, values)
 
 
@@ -32,16 +32,16 @@ def _target_way(batch: RefereedBatch) -> np.ndarray:
 
 
 @jax.jit
-def _positions(targets: Any, times: jax.Array) -> jax.Array:
-    """Where targets (B,) are at times (B, K) [s], (B, K, 2) [m]."""
+def _positions(targets: PyTree, times: jax.Array) -> jax.Array:
+    """Return where targets (B,) are at times (B, K) [s], (B, K, 2) [m]."""
     return jax.vmap(jax.vmap(lambda path, time: path.at(time).pos, (None, 0)))(targets, times)
 
 
 def _corners(name: str) -> Callable[[RefereedBatch], np.ndarray]:
-    """Corners of walls or movers in the world at time 0, (B, N, V, 2)."""
+    """Return corners of walls or movers in the world at time 0, (B, N, V, 2)."""
 
     def values(batch: RefereedBatch) -> np.ndarray:
-        group = getattr(batch.cases, name)
+        group = vars(batch.cases)[name]
         return np.asarray(group.centre)[:, :, None] + np.asarray(group.corners)
 
     return values

@@ -1,17 +1,18 @@
 """The case and the drive of one row of the run."""
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array
+from jax.typing import ArrayLike
 
 from planner_jax.plane.obstacles import Obstacles
 from planner_jax.plane.target import PointState
 from planner_jax.robot.car import CarBody, CarLimits, knots_at, pose_at
+from planner_jax.runs.manifest import Entries, Row
 from planner_jax.task.intercept.case import InterceptCase
 
 _BODY = tuple(field.name for field in dataclasses.fields(CarBody))
@@ -38,8 +39,8 @@ class SampledTarget:
 class SampledDrive:
     """A row, its obstacles as polygons, and car and target at K even times of the plan."""
 
-    row: dict[str, Any]
-    setting: dict[str, Any]  # of the manifest
+    row: Row
+    setting: Entries  # of the manifest
     walls: list[np.ndarray]  # (V, 2) [m] each
     movers: list[np.ndarray]  # likewise, at time 0
     velocities: np.ndarray  # (N, 2) [m/s], of the movers
@@ -51,8 +52,8 @@ class SampledDrive:
     curvature: np.ndarray  # (K,) [1/m]
     target: np.ndarray  # (K, 2) [m]
 
-    def target_at(self, times: Any) -> np.ndarray:
-        """Where the target is expected at times (T,) [s] up to the case's, (T, 2) [m]."""
+    def target_at(self, times: np.ndarray | float) -> np.ndarray:
+        """Return where the target is expected at times (T,) [s] up to the case's, (T, 2) [m]."""
         places = np.reshape(self.row["target_way"], (-1, 2))
         known = np.linspace(0.0, self.row["due_time"], len(places))
         return np.stack([np.interp(times, known, places[:, k]) for k in range(2)], axis=-1)
@@ -62,7 +63,7 @@ class SampledDrive:
         return np.array([np.interp(time, self.time, self.pose[:, k]) for k in range(3)])
 
     def footprint(self, pose: np.ndarray) -> np.ndarray:
-        """Corners (4, 2) [m] of the body around a pose (3,) of the rear axle."""
+        """Return corners (4, 2) [m] of the body around a pose (3,) of the rear axle."""
         behind, half = -self.setting["body_rear_overhang"], 0.5 * self.setting["body_width"]
         ahead = behind + self.setting["body_length"]
         corners = np.array([(behind, -half), (ahead, -half), (ahead, half), (behind, half)])
@@ -70,8 +71,8 @@ class SampledDrive:
         return pose[:2] + corners @ np.array([[cos, sin], [-sin, cos]])
 
 
-def sampled_drive(row: dict[str, Any], setting: dict[str, Any], num: int) -> SampledDrive:
-    """A row at so many even times, with the manifest's `setting`."""
+def sampled_drive(row: Row, setting: Entries, num: int) -> SampledDrive:
+    """Return a row at so many even times, with the manifest's `setting`."""
     start, speed, curvature = (
         jnp.asarray(row[name], jnp.float32) for name in ("start", "speed", "curvature")
     )
@@ -95,8 +96,8 @@ def sampled_drive(row: dict[str, Any], setting: dict[str, Any], num: int) -> Sam
     return dataclasses.replace(drive, target=drive.target_at(drive.time))
 
 
-def _polygons(row: dict[str, Any], kind: str) -> list[np.ndarray]:
-    """Those of a kind that are there, (V, 2) [m] each."""
+def _polygons(row: Row, kind: str) -> list[np.ndarray]:
+    """Return those of a kind that are there, (V, 2) [m] each."""
     present = np.array(row[f"{kind}_present"], bool)
     corners = np.reshape(row[f"{kind}_corners"], (len(present), -1, 2))
     return list(corners[present])
@@ -106,7 +107,7 @@ def _polygons(row: dict[str, Any], kind: str) -> list[np.ndarray]:
 def _sampled(
     start: Array, end: Array, speed: Array, curvature: Array, shares: Array
 ) -> dict[str, Array]:
-    """Fields of `SampledDrive` of one plan at shares (K,) of its time, by name."""
+    """Return fields of `SampledDrive` of one plan at shares (K,) of its time, by name."""
     time = end * shares
 
     def at(time: Array) -> tuple[Array, ...]:
@@ -116,10 +117,10 @@ def _sampled(
     return {"time": time, "pose": pose, "speed": v, "curvature": c, "acceleration": acceleration}
 
 
-def case_of(row: dict[str, Any], setting: dict[str, Any]) -> InterceptCase:
-    """The case of a row, with the manifest's `setting`; its target is a `SampledTarget`."""
+def case_of(row: Row, setting: Entries) -> InterceptCase:
+    """Return the case of a row, with the manifest's `setting`; its target is a `SampledTarget`."""
 
-    def leaf(value: Any, *shape: int) -> Array:
+    def leaf(value: ArrayLike, *shape: int) -> Array:
         return jnp.asarray(np.reshape(value, shape), jnp.float32)
 
     due = leaf(row["due_time"])
@@ -140,7 +141,7 @@ def case_of(row: dict[str, Any], setting: dict[str, Any]) -> InterceptCase:
     )
 
 
-def _obstacles(row: dict[str, Any], kind: str, velocity: Any) -> Obstacles:
+def _obstacles(row: Row, kind: str, velocity: ArrayLike) -> Obstacles:
     present = np.array(row[f"{kind}_present"], bool)
     corners = np.reshape(row[f"{kind}_corners"], (len(present), -1, 2))
     centre = corners.mean(axis=1, keepdims=True)

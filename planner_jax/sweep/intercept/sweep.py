@@ -1,19 +1,17 @@
 """What interceptions add to a sweep: rows of their own, times and effort, and figures."""
 
-from typing import Any
-
 import numpy as np
 import pyarrow as pa
+from jaxtyping import PyTree
 
 from planner_jax.robot.car import CarPlan
+from planner_jax.runs.manifest import Entries, Row
 from planner_jax.runs.summary import COUNTED, Tally
 from planner_jax.sweep.figures.motion import CAPTION as MOTION
 from planner_jax.sweep.figures.outcomes import outcomes_figure
 from planner_jax.sweep.intercept.columns import COLUMNS, FRAME
 from planner_jax.sweep.intercept.figures.motion import motion_figure
 from planner_jax.sweep.intercept.figures.plane import plane_figure
-from planner_jax.sweep.intercept.figures.reach import reach_figure
-from planner_jax.sweep.intercept.figures.station_time import station_time_figure
 from planner_jax.sweep.intercept.settings import InterceptSettings
 from planner_jax.sweep.rows import car_plan
 from planner_jax.sweep.sweep import RunFigure, Sweep, first_values
@@ -40,7 +38,7 @@ class InterceptTally(Tally):
 class InterceptSweep(Sweep):
     """Cars that meet moving targets among obstacles."""
 
-    frame, own_columns = FRAME, COLUMNS
+    frame, own_columns, counts = FRAME, COLUMNS, InterceptTally
     figures = (
         RunFigure(
             "plane.png",
@@ -49,21 +47,7 @@ class InterceptSweep(Sweep):
             (13.0, 8.7),
             plane_figure,
         ),
-        RunFigure(
-            "station_time.png",
-            "One plan along its own way: what the movers block of it and when, the plan's station, "
-            "speed and acceleration, and what speed steps of paper 003 make of the same way.",
-            (13.0, 6.4),
-            station_time_figure,
-        ),
-        RunFigure(
-            "reach.png",
-            "Where the car can be, and when, in the same case: the cells that the reach set of the "
-            "planner spacetime holds at some times, with what stands and moves, and the plan.",
-            (13.0, 8.6),
-            reach_figure,
-        ),
-        RunFigure("motion.png", MOTION, (13.0, 6.8), motion_figure, compares=True),
+        RunFigure("motion.png", MOTION, (13.0, 6.8), motion_figure),
         RunFigure(
             "outcomes.png",
             "Success with its 95 % Wilson interval, failures by name, and iterations.",
@@ -72,26 +56,22 @@ class InterceptSweep(Sweep):
         ),
     )
 
-    def other_planners(self, settings: InterceptSettings) -> dict[str, Any]:
+    def other_planners(self, settings: InterceptSettings) -> Entries:
         """The best that splits path and speed, or the default: each takes a minute to compile."""
         others = super().other_planners(settings)
         return {name: others[name] for name in COMPARED if name in others}
 
-    def setting(self, cases: Any) -> dict[str, Any]:
-        """Map, body and limits that all cases have in common, for the manifest."""
+    def setting(self, cases: PyTree) -> Entries:
+        """Return map, body and limits that all cases have in common, for the manifest."""
         bounds = first_values(cases, ["lower", "upper"])
         return bounds | first_values(cases.body, prefix="body_") | first_values(cases.limits)
 
-    def plan_of_row(self, row: dict[str, Any], setting: dict[str, Any]) -> CarPlan:
-        """The plan of a row, without the place of the meeting."""
+    def plan_of_row(self, row: Row, setting: Entries) -> CarPlan:
+        """Return the plan of a row, without the place of the meeting."""
         return car_plan(row)
 
-    def tally(self, settings: InterceptSettings) -> InterceptTally:
-        """An empty count of rows."""
-        return InterceptTally()
-
-    def findings(self, manifest: dict[str, Any]) -> list[str]:
-        """When targets are met, how closely, and with how much acceleration."""
+    def findings(self, manifest: Entries) -> list[str]:
+        """Return when targets are met, how closely, and with how much acceleration."""
         summary = manifest["summary"]
         if summary["mean_miss"] is None:
             return []
@@ -101,8 +81,8 @@ class InterceptSweep(Sweep):
             f"{summary['mean_rms_acceleration']:.3f} m/s² rms acceleration; means of the successes."
         ]
 
-    def remarks(self, manifest: dict[str, Any]) -> list[str]:
-        """Where the numbers come from, a sentence each."""
+    def remarks(self, manifest: Entries) -> list[str]:
+        """Return where the numbers come from, a sentence each."""
         limits = manifest["setting"]
         return [
             *super().remarks(manifest)[:-1],

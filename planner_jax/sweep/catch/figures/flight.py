@@ -1,16 +1,15 @@
 """One plan in space: targets, quadrotor, and the net at every catch (paper 000, Figs 6 and 8)."""
 
-from typing import Any
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from planner_jax.runs import style
+from planner_jax.runs.style import Look
 from planner_jax.sweep.catch.targets import SampledCatch, sampled_catch
+from planner_jax.sweep.quadrotor import sample_motion
 from planner_jax.sweep.report import RunRows
-from planner_jax.sweep.sampled_motion import sample_motion
 
 _SAMPLES = 1601
 _ROTORS = 0.165  # [m], half the diagonal between the paper's propellers
@@ -19,12 +18,11 @@ _TARGETS = (style.ORANGE, style.GREEN, style.PURPLE, style.SKY, "#8C564B", style
 
 
 def flight_figure(figure: Figure, run: RunRows) -> None:
-    """The example from the side and from above, with a close-up of every catch."""
+    """Draw the example from the side and from above, with a close-up of every catch."""
     setting, (_, row) = run.manifest["setting"], run.same_case()[0]
     motion = sample_motion(row["coeffs"], row["durations"], _SAMPLES)
     plan = sampled_catch(row, motion, setting)
-    parts: Any = figure.subfigures(1, 2, width_ratios=[3.0, 1.6])
-    left, right = parts
+    left, right = figure.subfigures(1, 2, width_ratios=[3.0, 1.6])
     low, high = _window(plan)
     views = left.subplots(2, 1, sharex=True, height_ratios=(high - low)[[2, 1]])
     for axes, second in zip(views, (2, 1), strict=True):
@@ -92,7 +90,7 @@ def _draw_quadrotor(axes: Axes, plan: SampledCatch, at: int, where: list, alpha:
     across /= max(np.linalg.norm(across), 1e-9)
     turn = np.linspace(0.0, 2.0 * np.pi, 41)[:, None]
     circle = np.cos(turn) * across + np.sin(turn) * np.cross(axis, across)
-    look: dict[str, Any] = {"alpha": alpha, "zorder": 5}
+    look: Look = {"alpha": alpha, "zorder": 5}
     axes.plot(*(centre + plan.radius * circle)[:, where].T, color=style.RED, linewidth=1.5, **look)
     axes.plot(*(pos + _ROTORS * circle)[:, where].T, color=style.BLUE, linewidth=1.2, **look)
     axes.plot(*np.stack([pos, centre])[:, where].T, color=style.GREY, linewidth=1.2, **look)

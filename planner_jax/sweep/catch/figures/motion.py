@@ -1,12 +1,11 @@
 """One plan along its time against the limits, beside the others' (paper 000, Figs 6e-h and 7)."""
 
-from typing import Any
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from planner_jax.runs import style
+from planner_jax.runs.manifest import Entries, Row
 from planner_jax.sweep.catch.targets import due_distance, sampled_catch
 from planner_jax.sweep.figures.motion import DASHED, Drawn, quadrotor_figure
 from planner_jax.sweep.report import RunRows
@@ -16,17 +15,17 @@ _LEAST_DISTANCE = 1e-3  # [m], of the logarithmic axis
 
 
 def motion_figure(figure: Figure, run: RunRows) -> None:
-    """Net distance, speed, body rate, thrust and jerk of plans for the same case."""
+    """Draw net distance, speed, body rate, thrust and jerk of plans for the same case."""
     plan_figure(figure, run, f"suite {run.manifest['parameters']['suite']}")
 
 
 def plan_figure(figure: Figure, run: RunRows, which: str) -> None:
-    """The same, with words of what the case is of."""
+    """Draw the same, with words of what the case is of."""
     quadrotor_figure(figure, run, _PANELS, _draw_distances, _word, which)
 
 
-def _draw_distances(axes: Axes, setting: dict[str, Any], plans: list[Drawn]) -> None:
-    """Distance of the net to the target that it catches next."""
+def _draw_distances(axes: Axes, setting: Entries, plans: list[Drawn]) -> None:
+    """Draw distance of the net to the target that it catches next."""
     for plan in plans:
         away = due_distance(sampled_catch(plan.row, plan.motion, setting))
         axes.plot(plan.motion.time, np.maximum(away, _LEAST_DISTANCE), **plan.look)
@@ -37,7 +36,7 @@ def _draw_distances(axes: Axes, setting: dict[str, Any], plans: list[Drawn]) -> 
     style.label(axes, "", "distance [m]", "Net to next target (red: net's radius)")
 
 
-def _word(row: dict[str, Any]) -> str:
+def _word(row: Row) -> str:
     num = row["num_caught"]
     farthest = 1e3 * max(row["net_distance"][:num])
     return f"{num} caught by {row['catch_times'][num - 1]:.2f} s, {farthest:.3g} mm off at most"

@@ -1,7 +1,5 @@
 """Success beside the paper, failures by name, and when targets are caught."""
 
-from typing import Any
-
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
@@ -17,7 +15,7 @@ _COLOURS = (style.BLUE, style.ORANGE, style.GREEN, style.PURPLE, style.SKY, styl
 
 def outcomes_figure(figure: Figure, run: RunRows) -> None:
     """Rates, failures and a histogram of the catches that hold, by their place in the order."""
-    suite: Any = SUITES.get(run.manifest["parameters"]["suite"])
+    suite = SUITES.get(run.manifest["parameters"]["suite"])
     rates = (suite.success, suite.mpp_success) if suite else (None, None)
     labelled = zip(("Catch\nPlanner,\npaper", "MPP,\npaper"), rates, strict=True)
     axes = draw_outcomes(figure, run.manifest, [(a, b) for a, b in labelled if b is not None])

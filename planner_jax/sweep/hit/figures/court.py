@@ -1,7 +1,5 @@
 """The court from above and from the side, with serves, plans, returned balls and failures."""
 
-from typing import Any
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -9,18 +7,21 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 
 from planner_jax.runs import style
+from planner_jax.runs.manifest import Entries, Row
+from planner_jax.runs.style import Look
+from planner_jax.sweep.quadrotor import sample_motion
 from planner_jax.sweep.report import RunRows
-from planner_jax.sweep.sampled_motion import sample_motion
 from planner_jax.task.hit import court
 from planner_jax.task.hit.court import fly, landing
 
 _SAMPLES = 48
+_SHORTEST = 0.12  # half of a panel's height, in its width
 _FLOOR = "#F6F8FA"
-_TARGET: dict[str, Any] = {"marker": "o", "mfc": "none", "mec": style.INK, "mew": 1.6}
+_TARGET: Look = {"marker": "o", "mfc": "none", "mec": style.INK, "mew": 1.6}
 
 
 def court_figure(figure: Figure, run: RunRows) -> None:
-    """A sample of a run's cases in both views."""
+    """Draw a sample of a run's cases in both views."""
     rows, setting = run.sample(), run.manifest["setting"]
     drag_after = run.manifest["parameters"]["drag_after_impact"]
     aside, top = court.HALF_WIDTH + 0.3, 6.4
@@ -48,7 +49,7 @@ def court_figure(figure: Figure, run: RunRows) -> None:
         Line2D([], [], markersize=9, linestyle="", label="target", **_TARGET),
     ]
     if num_failed:
-        look: dict[str, Any] = {"color": style.RED, "linestyle": "--", "marker": "X"}
+        look: Look = {"color": style.RED, "linestyle": "--", "marker": "X"}
         entries.append(Line2D([], [], label="failed: ball and plan", **look))
     figure.legend(handles=entries, loc="outside upper center", ncols=len(entries))
 
@@ -62,14 +63,12 @@ def ball_path(
     return time, fly(np.tile(pos, again), np.tile(vel, again), time, drag, gravity)[0]
 
 
-def draw_case(
-    axes: Axes, row: dict[str, Any], second: int, setting: dict[str, Any], drag_after: bool
-) -> None:
+def draw_case(axes: Axes, row: Row, second: int, setting: Entries, drag_after: bool) -> None:
     """Serve, trajectory and returned ball of one case in the plane of x and a second axis."""
     good, gravity, drag = row["success"], setting["gravity"], setting["drag"]
 
     def line(path: np.ndarray, colour: str, width: float, alpha: float, dash: str = "-") -> None:
-        look: dict[str, Any] = {"color": colour, "linewidth": width, "alpha": alpha}
+        look: Look = {"color": colour, "linewidth": width, "alpha": alpha}
         order = 4 if colour == style.RED else 3
         axes.plot(path[:, 0], path[:, second], linestyle=dash, zorder=order, **look)
 
@@ -95,14 +94,14 @@ def draw_case(
 def _draw_floor(axes: Axes) -> None:
     """Lines, dead zone and region letters, from above."""
     length, width, dead = court.HALF_LENGTH, court.HALF_WIDTH, court.DEAD_ZONE
-    line: dict[str, Any] = {"color": style.GREY, "linewidth": 1.0, "zorder": 1}
-    whole: dict[str, Any] = {"facecolor": _FLOOR, "edgecolor": style.GREY}
+    line: Look = {"color": style.GREY, "linewidth": 1.0, "zorder": 1}
+    whole: Look = {"facecolor": _FLOOR, "edgecolor": style.GREY}
     axes.add_patch(Rectangle((-length, -width), 2 * length, 2 * width, **whole))
-    zone: dict[str, Any] = {"facecolor": style.RED, "alpha": 0.12, "linewidth": 0.0}
+    zone: Look = {"facecolor": style.RED, "alpha": 0.12, "linewidth": 0.0}
     axes.add_patch(Rectangle((-dead, -width), 2 * dead, 2 * width, **zone))
     axes.axvline(0.0, color=style.INK, linewidth=1.6, zorder=1)
     paper = {"facecolor": _FLOOR, "edgecolor": "none", "alpha": 0.75, "pad": 1.0}
-    look: dict[str, Any] = {"ha": "center", "va": "center", "zorder": 7, "bbox": paper}
+    look: Look = {"ha": "center", "va": "center", "zorder": 7, "bbox": paper}
     for way in (-1.0, 1.0):
         for side in (-court.LANE_LINE, court.LANE_LINE):
             axes.plot([way * dead, way * length], [side] * 2, **line)
@@ -110,3 +109,25 @@ def _draw_floor(axes: Axes) -> None:
         for letter, x, y in (("N", 1.0, 0.0), ("F", 4.7, 0.0), ("L", 4.7, 2.2), ("R", 4.7, -2.2)):
             axes.text(way * x, y, letter, color=style.INK, **look)
     axes.grid(visible=False)
+
+
+def path_figure(figure: Figure, run: RunRows) -> None:
+    """Draw the example from above and from the side, wherever it is."""
+    (_, row), setting = run.same_case()[0], run.manifest["setting"]
+    drag_after = run.manifest["parameters"].get("drag_after_impact", False)
+    above, side = figure.subplots(2, 1, sharex=True)
+    target: Look = {"marker": "o", "mfc": "none", "mec": style.INK, "markersize": 11}
+    for axes, second in ((above, 1), (side, 2)):
+        draw_case(axes, row, second, setting, drag_after)
+        axes.plot(row["start"][0], row["start"][second], "s", color=style.BLUE, markersize=5)
+        axes.plot(row["target"][0], row["target"][second], zorder=6, **target)
+        low, high = axes.get_ylim()
+        wide = np.ptp(axes.get_xlim())
+        # No side is so short that its panel cannot be read.
+        middle, half = 0.5 * (low + high), max(0.5 * (high - low), _SHORTEST * wide)
+        axes.set(ylim=(middle - half, middle + half), aspect="equal")
+    side.axhline(0.0, color=style.GREY, linewidth=1.5)
+    end = "success" if row["success"] else row["sentence"]
+    style.label(above, "", "y [m]", f"From above ({end})")
+    words = "orange: ball, blue: quadrotor, green: returned ball, ring: target; red: what fails"
+    style.label(side, "x [m]", "z [m]", f"From the side ({words})")

@@ -1,12 +1,12 @@
 """One plan along its time against the limits, beside the other planners' (paper 002, Fig. 7)."""
 
-from typing import Any
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from planner_jax.runs import style
+from planner_jax.runs.manifest import Entries, Row
+from planner_jax.runs.style import Look
 from planner_jax.sweep.figures.motion import DASHED, FORBIDDEN, Drawn, quadrotor_figure
 from planner_jax.sweep.hit.figures.court import ball_path
 from planner_jax.sweep.report import RunRows
@@ -16,25 +16,25 @@ _PANELS = ("speed", "acceleration", "body_rate", "thrust")
 
 
 def motion_figure(figure: Figure, run: RunRows) -> None:
-    """Height, speed, acceleration, body rate and thrust of plans for the same serve."""
+    """Draw height, speed, acceleration, body rate and thrust of plans for the same serve."""
     plan_figure(figure, run, f"scenario {run.same_case()[0][1]['scenario']}")
 
 
 def plan_figure(figure: Figure, run: RunRows, which: str) -> None:
-    """The same, with words of what the case is of."""
+    """Draw the same, with words of what the case is of."""
     quadrotor_figure(figure, run, _PANELS, _draw_heights, _word, which)
 
 
-def _word(row: dict[str, Any]) -> str:
+def _word(row: Row) -> str:
     return f"lands {1e3 * row['landing_error']:.2g} mm from the target"
 
 
-def _draw_heights(axes: Axes, setting: dict[str, Any], plans: list[Drawn]) -> None:
-    """Height of the quadrotor, and of the ball down to the floor as if nobody hit it."""
+def _draw_heights(axes: Axes, setting: Entries, plans: list[Drawn]) -> None:
+    """Draw height of the quadrotor, and of the ball down to the floor as if nobody hit it."""
     row, physics = plans[-1].row, (setting["drag"], setting["gravity"])
     pos, vel = np.array(row["ball_pos"]), np.array(row["ball_vel"])
     time, path = ball_path(pos, vel, float(landing(pos, vel, *physics)[0]), *physics)
-    look: dict[str, Any] = {"color": style.INK, "linewidth": 1.2, "linestyle": ":"}
+    look: Look = {"color": style.INK, "linewidth": 1.2, "linestyle": ":"}
     axes.plot(time, path[:, 2], label="ball, if nobody hits it", **look)
     axes.legend(loc="upper right", fontsize=8.5)
     for plan in plans:

@@ -1,12 +1,12 @@
 """Success per scenario, beside what was published."""
 
-from typing import Any
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from planner_jax.runs import style
+from planner_jax.runs.manifest import Entries
+from planner_jax.runs.style import Look
 from planner_jax.runs.summary import wilson_interval
 from planner_jax.sweep.report import RunRows
 from planner_jax.task.hit import court
@@ -31,7 +31,7 @@ def rates_figure(figure: Figure, run: RunRows) -> None:
             (0.0, published.paper, style.PALE, "paper, Table I"),
             (0.28, published.trials, style.SKY, "trial files"),
         ):
-            look: dict[str, Any] = {"color": colour, "label": f"{other}: {source}"}
+            look: Look = {"color": colour, "label": f"{other}: {source}"}
             axes.bar(np.arange(len(places)) + shift, rates[places, column], _WIDTH, **look)
         axes.set_xticks(range(len(places)), [court.SCENARIOS[i] for i in places])
         axes.grid(axis="x", visible=False)
@@ -45,13 +45,13 @@ def rates_figure(figure: Figure, run: RunRows) -> None:
     legend.set_in_layout(False)
 
 
-def _draw_bars(axes: Axes, counted: dict[str, Any], places: list[int], planner: str) -> None:
-    """The run's own rates with their intervals; a gap for a scenario without cases."""
+def _draw_bars(axes: Axes, counted: Entries, places: list[int], planner: str) -> None:
+    """Draw the run's own rates with their intervals; a gap for a scenario without cases."""
     counts = [counted.get(court.SCENARIOS[i], {"successes": 0, "num": 0}) for i in places]
     num = np.array([count["num"] for count in counts])
     rates = 100.0 * np.array([count["successes"] for count in counts]) / np.maximum(num, 1)
     ends = np.array([wilson_interval(count["successes"], count["num"]) for count in counts])
-    look: dict[str, Any] = {"color": style.PLANNER_COLOURS.get(planner, style.INK)}
+    look: Look = {"color": style.PLANNER_COLOURS.get(planner, style.INK)}
     look |= {"ecolor": style.INK, "error_kw": {"linewidth": 0.9, "capsize": 1.5}}
     look["label"] = f"{planner}: this run"
     known, off = np.where(num > 0, rates, np.nan), np.abs(100.0 * ends.T - rates)
@@ -59,5 +59,5 @@ def _draw_bars(axes: Axes, counted: dict[str, Any], places: list[int], planner: 
 
 
 def compared_with(planner: str) -> str:
-    """The published planner that a planner's rates stand beside: itself, or else bat."""
+    """Return the published planner that a planner's rates stand beside: itself, or else bat."""
     return planner if planner in court.PLANNERS else "bat"

@@ -1,12 +1,12 @@
 """One plan along its time against the limits, beside the other planners' for the same case."""
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from planner_jax.runs import style
+from planner_jax.runs.manifest import Row
 from planner_jax.sweep.figures.motion import draw_upper_limit, look_of, write_verdicts
 from planner_jax.sweep.intercept.drive import SampledDrive, sampled_drive
 from planner_jax.sweep.report import RunRows
@@ -54,7 +54,7 @@ def motion_figure(figure: Figure, run: RunRows) -> None:
     write_verdicts(panels[1, 2], f"Case {plans[0][1]['index']}, suite {suite}", plans, _word)
 
 
-def _word(row: dict[str, Any]) -> str:
+def _word(row: Row) -> str:
     return (
         f"meets after {row['meeting_time']:.2f} s, {1e3 * row['miss']:.2g} mm off, "
         f"{row['rms_acceleration']:.3f} m/s² rms"

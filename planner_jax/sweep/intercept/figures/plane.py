@@ -3,9 +3,8 @@
 After paper 003, Fig. 3, where one case is shown at four times.
 """
 
-from typing import Any
-
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
@@ -15,6 +14,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from planner_jax.runs import style
+from planner_jax.runs.manifest import Row
+from planner_jax.runs.style import Look
 from planner_jax.sweep.intercept.drive import SampledDrive, sampled_drive
 from planner_jax.sweep.intercept.figures.scene import (
     colours_of_time,
@@ -30,7 +31,7 @@ _MOST_BODIES, _MOST_MOVERS = 6, 16  # of instants, and of polygons that are draw
 
 
 def plane_figure(figure: Figure, run: RunRows) -> None:
-    """The run's example and cases beside it."""
+    """Draw the run's example and cases beside it."""
     setting = run.manifest["setting"]
     drives = [sampled_drive(row, setting, _SAMPLES) for row in chosen(run)]
     latest = max(drive.row["due_time"] for drive in drives)
@@ -52,8 +53,8 @@ def plane_figure(figure: Figure, run: RunRows) -> None:
     figure.legend(handles=entries(colours), loc="outside upper center", ncols=6)
 
 
-def chosen(run: RunRows) -> list[dict[str, Any]]:
-    """Rows to be shown: the example, others evenly from the run, and failures at the end."""
+def chosen(run: RunRows) -> list[Row]:
+    """Return rows to be shown: the example, others evenly from the run, and failures at the end."""
     (_, example), rows = run.same_case()[0], run.sample()
     others = [row for row in rows if row["index"] != example["index"]]
     failures = [row for row in others if not row["success"]][:_FAILURES]
@@ -98,10 +99,10 @@ def draw_drive(axes: Axes, drive: SampledDrive, colours: ScalarMappable) -> None
     style.label(axes, "", "", f"Case {row['index']}, {text}")
 
 
-def entries(colours: ScalarMappable) -> list[Any]:
-    """What the legend explains."""
-    early: Any = colours.get_cmap()(0.3)
-    look: dict[str, Any] = {"linestyle": "", "marker": "o"}
+def entries(colours: ScalarMappable) -> list[Artist]:
+    """Return what the legend explains."""
+    early = colours.get_cmap()(0.3)
+    look: Look = {"linestyle": "", "marker": "o"}
     return [
         Patch(facecolor=style.PALE, edgecolor=style.GREY, label="wall"),
         Patch(facecolor=(*early[:3], 0.25), edgecolor=early, label="mover"),

@@ -1,17 +1,16 @@
-"""Sweeps of blocks with more of the pipeline: balls that are only seen, planning by the clock."""
+"""Arms that block balls which they only see, and what they saw."""
 
 import dataclasses
 import zlib
-from typing import Any
 
 import jax
 import numpy as np
 from flax import struct
 from jax import Array
 
+from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import lane
-from planner_jax.runs.timing import timed_plans
-from planner_jax.studies.block.contact_check import delay_motion, end_at_contact
+from planner_jax.studies.block.contact_check import end_at_contact
 from planner_jax.studies.block.observation import eye
 from planner_jax.studies.block.receding import Decided, decide
 from planner_jax.task.block.case import BlockCase
@@ -35,7 +34,7 @@ class SeenPlan(BlockPlan):
 class SeeingArms:
     """Arms that plan with what a camera has seen, once or again and again."""
 
-    planner: Any
+    planner: Planner
     sense: float  # [s], until the first fit
     overhead: float  # [s]
     refit: float  # [Hz], rate of later fits; 0 for none
@@ -45,16 +44,15 @@ class SeeingArms:
     seed: int
 
     def plans(self, cases: BlockCase) -> SeenPlan:
-        """What the arms of a batch do, up to where they meet the true balls."""
+        """Return what the arms of a batch do, up to where they meet the true balls."""
         done = self.decided(cases)
         (error, std), (last, _) = (done.fit_errors(place) for place in (0, -1))
         first = lane(done.fits, 0)
         met = end_at_contact(done.cases, done.plans)
-        parts = {field.name: getattr(met, field.name) for field in dataclasses.fields(met)}
         return jax.tree.map(
             np.asarray,
             SeenPlan(
-                **parts,
+                **vars(met),
                 sight=first.status,
                 sightings=first.num,
                 fit_error=error,
@@ -65,7 +63,7 @@ class SeeingArms:
         )
 
     def decided(self, cases: BlockCase) -> Decided:
-        """What the arms of a batch do, wherever they meet their balls."""
+        """Return what the arms of a batch do, wherever they meet their balls."""
         return decide(
             self.planner,
             cases,
@@ -78,7 +76,7 @@ class SeeingArms:
         )
 
     def moments(self, cases: BlockCase) -> list[float]:
-        """When flights are fitted [s]; anew until the last ball of a batch is there."""
+        """Return when flights are fitted [s]; again until the last ball of a batch is there."""
         moments = [self.sense]
         if self.wait:
             num = int(self.wait * self.frame_rate + 1e-6)
@@ -90,30 +88,6 @@ class SeeingArms:
         return moments
 
     def _seeds(self, cases: BlockCase) -> np.ndarray:
-        """A seed (B,) of each throw's noise, the same in whatever batch it is."""
+        """Return a seed (B,) of each throw's noise, the same in whatever batch it is."""
         balls = np.concatenate([cases.ball.pos, cases.ball.vel], axis=1).astype(np.float32)
         return np.array([zlib.crc32(ball.tobytes(), self.seed) for ball in balls], np.uint32)
-
-
-@struct.dataclass
-class TimedPlan(BlockPlan):
-    """A plan that was waited for."""
-
-    planning_time: Array  # () [s]
-
-
-@dataclasses.dataclass(frozen=True)
-class CountedPlanner:
-    """Plans one after another by the clock; a plan that comes too late begins so much later."""
-
-    planner: Any
-    allowed: float  # [s], that planning may take; in the delay already
-
-    def plans(self, cases: BlockCase) -> TimedPlan:
-        """The plans of a batch, up to where they meet the balls."""
-        plans, spent = timed_plans(self.planner, cases)
-        seconds: Any = spent
-        late = np.maximum(seconds - self.allowed, 0.0).astype(cases.delay.dtype)
-        met = delay_motion(cases, plans, late)
-        parts = {field.name: getattr(met, field.name) for field in dataclasses.fields(met)}
-        return jax.tree.map(np.asarray, TimedPlan(**parts, planning_time=seconds))
