@@ -3,9 +3,11 @@
 import dataclasses
 import os
 
+import hypothesis
 import jax
 import numpy as np
 import pytest
+from hypothesis import strategies as st
 
 import planner_jax as pj
 from planner_jax.core.rules import named
@@ -16,7 +18,7 @@ from planner_jax.task.catch.decide import Best
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.task.hit.plan import HitPlan, Stroke
 from planner_jax.task.intercept.plan import InterceptPlan
-from tests.faults.bad_calls import ROWS
+from tests.faults.bad_calls import ARGUMENTS, ROWS
 
 
 def host(tree):
@@ -120,7 +122,7 @@ def given(tmp_path_factory):
         "HITS": {name: np.ones((2, 3)) for name in ("serve_pos", "serve_vel", "target")},
         "CATCH": {"targets": ball_path(2), "horizon": (2.0, 2.0)},
         "TABLE": {"times": (0.0, 0.5, 1.0), "positions": np.eye(3)},
-        "INTERCEPT": {"target": pj.lane(turning(1), 0)},
+        "DRIVE": {"target": pj.lane(turning(1), 0)},
         "BLOCK": {"ball_pos": (4, 0, 1), "ball_vel": (-8, 0, 2)},
         "PATH": {"ball": ball, "horizon": 1.0, "drag": 0.06, "gravity": 9.8, "num_nodes": 8},
         "FLY": {"ball": ball, "duration": 1.0, "drag": 0.06, "gravity": 9.8, "num_steps": 8},
@@ -129,16 +131,41 @@ def given(tmp_path_factory):
     return folder, names
 
 
-def test_the_list_is_long():
-    assert len(set(ROWS)) == len(ROWS) >= 1000
+def refuse(given, call):
+    """The one line with which a call is refused, by the library itself."""
+    folder, names = given
+    before = os.getcwd()
+    os.chdir(folder)
+    try:
+        with pytest.raises((TypeError, ValueError)) as caught:
+            eval(call, dict(names))
+    finally:
+        os.chdir(before)
+    line, last = str(caught.value), caught.traceback[-1].path
+    assert line and "\n" not in line
+    assert "site-packages" not in str(last), f"{line}, from {last}"
+    return line
 
 
 @pytest.mark.parametrize(("call", "words"), ROWS, ids=[call for call, _ in ROWS])
-def test_it_is_refused_in_one_line(monkeypatch, own_checks, given, call, words):
-    folder, names = given
-    monkeypatch.chdir(folder)
-    with pytest.raises((TypeError, ValueError)) as caught:
-        eval(call, dict(names))
-    said, last = str(caught.value), caught.traceback[-1].path
-    assert said.startswith(words) and said and "\n" not in said
-    assert "site-packages" not in str(last), f"{said}, from {last}"
+def test_it_is_refused_in_one_line(own_checks, given, call, words):
+    assert refuse(given, call).startswith(words)
+
+
+CALLS = st.sampled_from(ARGUMENTS).flatmap(
+    lambda row: st.tuples(st.just(row[0]), st.sampled_from(row[1]), st.sampled_from(row[2]))
+)
+
+
+@hypothesis.settings(
+    max_examples=200,
+    deadline=None,
+    derandomize=True,
+    database=None,
+    suppress_health_check=[hypothesis.HealthCheck.function_scoped_fixture],
+)
+@hypothesis.given(drawn=CALLS)
+def test_a_malformed_argument_is_named_with_its_rule_and_value(own_checks, given, drawn):
+    call, argument, value = drawn
+    line = refuse(given, call.replace("@", f"{argument}={value}"))
+    assert line.startswith(f"{argument} must ") and ", got " in line
