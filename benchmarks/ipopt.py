@@ -37,7 +37,7 @@ from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin, 
 from planner_jax.core.choices import EFFORTS
 from planner_jax.core.errors import install_line
 from planner_jax.core.protocol import FEASIBILITY_TOLERANCE
-from planner_jax.optimise.chain_curvature import BETWEEN_NODES
+from planner_jax.cost.along import BETWEEN_NODES
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.trajectory.polynomial import snap_energy
 

@@ -14,7 +14,7 @@ import pytest
 import planner_jax as pj
 from planner_jax.benchmarks import ipopt
 from planner_jax.core.errors import install_line
-from planner_jax.optimise.chain_curvature import BETWEEN_NODES
+from planner_jax.cost.along import BETWEEN_NODES
 
 HAS_CASADI = importlib.util.find_spec("casadi") is not None
 needs_casadi = pytest.mark.skipif(not HAS_CASADI, reason=f"no casadi: {install_line('oracle')}")

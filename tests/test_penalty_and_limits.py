@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from derivatives import assert_gradient_matches_differences
 
-from planner_jax.cost.contact import apex_excess, hitting_speed_excess
 from planner_jax.cost.penalty import (
     joined_trapezoid_weights,
     smoothed_hinge,
@@ -21,6 +20,7 @@ from planner_jax.cost.quadrotor import (
     speed_excess,
 )
 from planner_jax.robot.quadrotor import QuadrotorLimits
+from planner_jax.task.hit.context import apex_excess, hitting_speed_excess
 
 WIDTH = 0.1
 GRAVITY = 9.8

@@ -11,7 +11,7 @@ import numpy as np
 
 from planner_jax.benchmarks.ipopt_peer.program import COMPILER, Program, ca
 from planner_jax.core.protocol import lane
-from planner_jax.optimise.chain_curvature import BETWEEN_NODES
+from planner_jax.cost.along import BETWEEN_NODES
 
 # How MUMPS orders and scales: what it does by default, and the least of it, as matrices are small.
 _USUAL: dict[str, Any] = {}

@@ -23,6 +23,8 @@ from planner_jax.lanes import with_kernel
 from planner_jax.trajectory.polynomial import Motion
 from planner_jax.trajectory.proportional_minco import ProportionalMinco, sample_motion
 
+BETWEEN_NODES = 0.004  # by which peaks between penalty nodes are higher, about
+
 # Of a motion and any pytree of numbers: E arrays, each of the shape of the motion's height,
 # positive where a limit is exceeded. It must know no other array.
 Excess = Callable[[Motion, PyTree], tuple[Array, ...]]

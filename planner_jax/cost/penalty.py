@@ -1,11 +1,13 @@
 """Smooth penalty shapes and the quadrature that sums them along a trajectory."""
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 
-def smoothed_hinge(x: Array, width: float) -> Array:
+def smoothed_hinge(x: Array, width: float | Array) -> Array:
     """L_mu: zero below 0, linear above mu, a quartic blend between (paper 000, eq. 27b).
 
     Twice continuously differentiable. x - mu/2 above the blend.
@@ -47,7 +49,9 @@ def trapezoid_weights(num_intervals: int) -> np.ndarray:
     return weights / num_intervals
 
 
-def joined_trapezoid_weights(num_intervals: int, proportions: np.ndarray) -> np.ndarray:
+def joined_trapezoid_weights(
+    num_intervals: int, proportions: np.ndarray | Sequence[float]
+) -> np.ndarray:
     """Trapezoid weights of pieces whose shared ends are sampled once.
 
     Args:

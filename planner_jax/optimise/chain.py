@@ -228,6 +228,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
 
     def curved(self, point: Float[Array, " n"], context: PyTree) -> Curvature:
         """Return evaluation, gradient, and second derivatives; see `chain_curvature`."""
+        # Only Newton's method needs them.
         from planner_jax.optimise.chain_curvature import chain_curvature
 
         case = context.case

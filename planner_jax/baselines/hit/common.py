@@ -4,10 +4,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from planner_jax.ball.flight import BallState, drag_free_apex, gravity_vector
-from planner_jax.cost.contact import apex_excess, hitting_speed_excess
 from planner_jax.cost.quadrotor import relative
 from planner_jax.task.hit.case import HitCase
-from planner_jax.task.hit.context import Impact
+from planner_jax.task.hit.context import Impact, apex_excess, hitting_speed_excess
 from planner_jax.task.hit.plan import Stroke
 
 

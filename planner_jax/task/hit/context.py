@@ -7,6 +7,7 @@ from jax import Array, lax
 
 from planner_jax.ball.flight import drag_free_fall_time
 from planner_jax.ball.prediction import PathTable, predict_path
+from planner_jax.core.arithmetic import reciprocal
 from planner_jax.robot.quadrotor import ALLOWED, beyond_reach, greatest_speed
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.plan import Stroke
@@ -79,3 +80,17 @@ def is_too_far(context: HitContext) -> Array:
     # A ball that is still up at the end of the table goes on behind it.
     is_down = (pos[-1, 2] < lowest) & (vel[-1, 2] < 0.0)
     return jnp.all(apart > moved) & is_down
+
+
+def apex_excess(apex: Array, min_apex: Array, max_apex: Array) -> Array:
+    """Return the relative excess over the floor and roof of the returned ball (paper 002, eq. 21).
+
+    Returns:
+        (2,) (H_min - H) / H_min and (H - H_max) / H_max.
+    """
+    return jnp.stack([1.0 - apex * reciprocal(min_apex), apex * reciprocal(max_apex) - 1.0])
+
+
+def hitting_speed_excess(vel: Array, limit: Array) -> Array:
+    """Return v_j^2 / v_max,j^2 - 1 on each world axis (paper 002, eq. 24), shape (3,)."""
+    return (vel * reciprocal(limit)) ** 2 - 1.0

@@ -18,7 +18,6 @@ from planner_jax.ball.flight import BallState, drag_free_apex, gravity_vector
 from planner_jax.ball.impact import required_impact
 from planner_jax.ball.prediction import LEAST_NODES, target_at
 from planner_jax.core.choices import require_size
-from planner_jax.cost.contact import apex_excess, hitting_speed_excess
 from planner_jax.cost.quadrotor import Measure
 from planner_jax.optimise.chain import ChainEnds, ChainPlanner
 from planner_jax.optimise.lbfgs import LbfgsConfig
@@ -27,7 +26,14 @@ from planner_jax.optimise.problem import Round, Settings, Stage
 from planner_jax.optimise.shipped import StartNetwork, shipped_network
 from planner_jax.robot.quadrotor import tangent_basis
 from planner_jax.task.hit.case import HitCase
-from planner_jax.task.hit.context import HitContext, Impact, is_too_far, prepare_hit
+from planner_jax.task.hit.context import (
+    HitContext,
+    Impact,
+    apex_excess,
+    hitting_speed_excess,
+    is_too_far,
+    prepare_hit,
+)
 from planner_jax.task.hit.plan import HitPlan, Stroke
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 from planner_jax.trajectory.proportional_minco import ProportionalMinco, proportional_minco
