@@ -2,8 +2,7 @@
 
 Paper 003 shows one map of its own (Section V) and gives no ranges. The ranges here and in
 `planner_jax.task.intercept.spec` are this library's, and part of each suite's name: a change of a
-range is another suite. All draws are uniform; the car is the default car of `case`. World frame in
-the plane, SI units.
+range is another suite. All draws are uniform; the car is the default of `case`; SI units.
 
 | what | drawn from |
 |---|---|
