@@ -221,7 +221,7 @@ def _how_to_continue(out: Path, again: str, sign: str = "manifest.json") -> str:
 
 @contextlib.contextmanager
 def _tell_how_to_continue(
-    rest: Callable[[], str], rule: str = "out must be a folder that can be written"
+    rest: Callable[[], str], rule: str = "--out must be a folder that can be written"
 ) -> Iterator[None]:
     """Add `rest()` to the message of an interruption, and of a file system or workers that fail."""
     try:
