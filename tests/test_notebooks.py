@@ -1,5 +1,6 @@
 """Every notebook runs from top to bottom."""
 
+import ast
 from pathlib import Path
 
 import nbclient
@@ -20,6 +21,16 @@ def test_notebook_runs(path, tmp_path):
         output.get("text", "") for cell in notebook.cells for output in cell.get("outputs", [])
     )
     assert "confirmed" in printed
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_every_name_that_a_notebook_imports_exists(path):
+    cells = [cell for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
+    for cell in cells:
+        for statement in ast.walk(ast.parse(cell.source)):
+            module = getattr(statement, "module", None) or ""
+            if isinstance(statement, ast.ImportFrom) and module.startswith("planner_jax"):
+                exec(ast.unparse(statement), {})
 
 
 def test_from_a_measured_ball_to_setpoints_are_six_lines():
