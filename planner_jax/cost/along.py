@@ -30,7 +30,6 @@ BETWEEN_NODES = 0.004  # by which peaks between penalty nodes are higher, about
 Excess = Callable[[Motion, PyTree], tuple[Array, ...]]
 # Of the same: a cost a second at each sample.
 Rate = Callable[[Motion, PyTree], Array]
-BETWEEN_NODES = 0.004  # by which peaks between penalty nodes are higher, about
 
 
 @dataclasses.dataclass(frozen=True)
