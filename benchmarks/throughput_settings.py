@@ -47,7 +47,7 @@ class ThroughputSettings:
             require_one_of(EFFORTS, "effort", self.effort)
             has_effort = self.task in ("hit", "catch")
             require(has_effort, "effort", f"left out for the task {self.task}", self.effort)
-        require(len(self.batch) > 0, "batch", "one or more sizes", "none")
+        require(len(self.batch) > 0, "batch", "one or more sizes", shown="none")
         require(min(self.batch) >= 1, "batch", ">= 1", min(self.batch))
         task = task_named(self.task)
         kind: type[SweepSettings] = pkgutil.resolve_name(task.sweep)

@@ -47,7 +47,7 @@ class TrainSettings:
             known = ", ".join(SUITES)
             require(suite in SUITES, "suite", f"one or more of {known}", suite)
         require(self.network in NETWORK_NAMES, "network", " or ".join(NETWORK_NAMES), self.network)
-        require(len(self.decisions) > 0, "decisions", "a number for each part", "none")
+        require(len(self.decisions) > 0, "decisions", "a number for each part", shown="none")
         for each in self.decisions:
             rule = f"from 1 to {_MOST_DECISIONS:g} in each part"
             require(1.0 <= each <= _MOST_DECISIONS, "decisions", rule, each)

@@ -219,7 +219,10 @@ def _first_params(training: Training, network: Any) -> Any:
         given = checkpoint_of(training.begin)
         if given.network != network:
             raise ArgumentError(
-                "begin", f"the weights of {_words(network)}", _words(given.network), verb="hold"
+                "begin",
+                f"the weights of {_words(network)}",
+                verb="hold",
+                shown=_words(given.network),
             )
         own = given.params
     return jax.device_get((normaliser, own, jax.jit(Value().init)(other, seen)))

@@ -460,7 +460,7 @@ def test_the_command_line_shows_a_library_and_refuses_what_is_none(tmp_path, cap
 def test_a_planner_of_a_file_needs_the_file_and_others_take_none():
     with pytest.raises(ValueError, match="library:FILE, which `planner-jax library build FILE`"):
         pj.block.planner("library")
-    with pytest.raises(ValueError, match="^planner online takes no file, got 'online:x'$"):
+    with pytest.raises(ValueError, match="^planner must be online without a file, got 'online:x'$"):
         pj.block.planner("online:x")
     with pytest.raises(ArgumentError, match="^library must be a file, got 'no/file'"):
         pj.block.planner("library:no/file")

@@ -159,7 +159,7 @@ def test_more_targets_than_a_network_takes_are_refused(fresh):
 
 def test_the_command_line_names_a_decision_that_takes_no_file(capsys, tmp_path):
     assert main(["sweep", "catch", "--decide", "greedy:x", "--out", str(tmp_path / "run")]) == 2
-    assert "decide greedy takes no file" in capsys.readouterr().err
+    assert "decide must be greedy without a file" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -287,7 +287,7 @@ def test_a_plan_made_anew_begins_where_the_car_is_and_is_driven_if_it_is_good(so
             lambda: InterceptFly(latency=0.012),
             "latency must be a multiple of the control steps' 0.005 s, got 0.012",
         ),
-        (lambda: InterceptFly(latency=-1.0), "latency must be finite and >= 0, got -1.0"),
+        (lambda: InterceptFly(latency=-1.0), "latency must be finite and >= 0, got -1"),
         (
             lambda: InterceptFly(suite="hardest"),
             "suite must be one of easy, medium, hard, storm, gale, maze, rush, got 'hardest'",

@@ -51,18 +51,21 @@ from tests.recordings import recording
             lambda: CatchFly(decide="given"),
             "decide must be one of best, greedy, random, policy, got 'given'",
         ),
-        (lambda: CatchFly(decide="best:file"), "decide best takes no file, got 'best:file'"),
+        (
+            lambda: CatchFly(decide="best:file"),
+            "decide must be best without a file, got 'best:file'",
+        ),
         (
             lambda: CatchFly(redecide=40.0),
             "redecide must be 0 or a divisor of the 100 Hz at which plans are made anew, got 40",
         ),
         (
             lambda: CatchFly(planner="mpp", redecide=100.0),
-            "redecide must be 0 or a divisor of the 0 Hz at which plans are made anew, got 100.0",
+            "redecide must be 0 or a divisor of the 0 Hz at which plans are made anew, got 100",
         ),
         (
             lambda: HitFly(planner="juggle", replan=50.0),
-            "replan must be 0 for other planners, got 50.0",
+            "replan must be 0 for other planners, got 50",
         ),
         (
             lambda: HitFly(suite="S.7"),

@@ -132,8 +132,8 @@ def test_several_balls_are_caught_one_after_another(capsys):
     ("command", "told"),
     [
         (f"hit {HIT} --speed -1", "--speed must be > 0, got -1"),
-        (f"hit {HIT} --min-thrust 9 --max-thrust 3", "--min-thrust must be < max_thrust, got 9"),
-        (f"hit {HIT} --min-apex 9", "--min-apex must be < max_apex, got 9"),
+        (f"hit {HIT} --min-thrust 9 --max-thrust 3", "--min-thrust must be < --max-thrust, got 9"),
+        (f"hit {HIT} --min-apex 9", "--min-apex must be < --max-apex, got 9"),
         (f"hit {HIT} --restitution 2", "--restitution must be in [0, 1], got 2"),
         (f"hit {HIT} --gravity 0", "--gravity must be > 0, got 0"),
         (f"hit {HIT} --pos 1e300 0 1", "--pos must be finite, got inf"),

@@ -54,10 +54,10 @@ def build_library(
         home is None or (len(home) > 0 and len(home) % 6 == 0),
         "home",
         "six angles for each home",
-        f"{len(home or ())} numbers",
+        shown=f"{len(home or ())} numbers",
     )
     finite = home is None or all(map(math.isfinite, home))
-    require(finite, "home", "finite angles", " ".join(map(str, home or ())))
+    require(finite, "home", "finite angles", shown=" ".join(map(str, home or ())))
     if Path(path).exists():
         _loaded(path)  # lest a file of another kind be lost
     require_backend()
@@ -129,7 +129,7 @@ def repair_library(path: str, *, pole: Sequence[float], out: str, retry: bool = 
         retry: whether to try pairs without a motion again.
     """
     library = _loaded(path)
-    require(len(pole) == 2, "pole", "two numbers [m]", f"{len(pole)} numbers")
+    require(len(pole) == 2, "pole", "two numbers [m]", shown=f"{len(pole)} numbers")
     require(bool(np.isfinite(pole).all()), "pole", "finite", list(pole))
     require_backend()
     scene = dataclasses.replace(

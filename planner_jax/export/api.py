@@ -190,7 +190,7 @@ def bring_to_rest(plan: Plan, ending: str | None, case: Case | None = None) -> P
         rule += ", or ending=None to leave that out"
         raise ArgumentError("case", rule, shown="neither")
     if robot.case_field not in vars(case):
-        raise ArgumentError("case", "that of the plan", type(case).__name__)
+        raise ArgumentError("case", "that of the plan", shown=type(case).__name__)
     if case.batch_shape != ():
         shown = f"a batch of shape {case.batch_shape}"
         raise ArgumentError("case", "one, as pj.lane(cases, k) gives", shown=shown)

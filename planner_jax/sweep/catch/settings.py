@@ -83,7 +83,7 @@ class SingleCatchSettings(SingleSettings):
         for name in ("pos", "vel"):
             given = vars(self)[name] is not None
             rule = "left out beside --ball" if self.ball else "given, or --ball"
-            require(given != bool(self.ball), name, rule, "both" if given else "nothing")
+            require(given != bool(self.ball), name, rule, shown="both" if given else "nothing")
         num = len(self.ball)
         require(num <= _MOST_BALLS, "ball", f"given at most {_MOST_BALLS} times", num)
         require(self.drag is None or self.drag >= 0.0, "drag", ">= 0", self.drag)
