@@ -43,7 +43,7 @@ from .planning.progress import Progress as Progress
 from .planning.replan import replan as replan
 from .recovery.planner import RestPlanner as RestPlanner
 from .recovery.with_recovery import EndedPlanner as EndedPlanner
-from .referee.verdict import Verdict as Verdict
+from .referee.judging import Verdict as Verdict
 from .robot.quadrotor import QuadrotorLimits as QuadrotorLimits
 from .robot.quadrotor import RotorLimits as RotorLimits
 from .robot.quadrotor_file import read_robot as read_robot

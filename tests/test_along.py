@@ -10,9 +10,8 @@ import pytest
 
 from planner_jax.cost.along import Along, _greatest, greatest_along, integrate_along
 from planner_jax.cost.along_kernel import MODES, along_kernel
-from planner_jax.cost.peaks import crest, greatest_by_tangents
 from planner_jax.cost.peaks_kernel import peaks_kernel
-from planner_jax.cost.penalty import smoothed_hinge
+from planner_jax.cost.penalty import crest, greatest_by_tangents, smoothed_hinge
 from planner_jax.cost.quadrotor import motion_excess
 from planner_jax.lanes import over_lanes
 from planner_jax.robot.quadrotor import QuadrotorLimits

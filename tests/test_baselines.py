@@ -10,8 +10,7 @@ import pytest
 from derivatives import assert_gradient_matches_differences
 
 import planner_jax as pj
-from planner_jax.ball.flight import BallState, drag_free_flight, fly
-from planner_jax.ball.impact import racket_impact
+from planner_jax.ball.flight import BallState, drag_free_flight, fly, racket_impact
 from planner_jax.baselines.hit.bat import BatHit, serve_origin, transition_point
 from planner_jax.baselines.hit.decoupled import aim_at_angle, decoupled_hit
 from planner_jax.baselines.hit.juggle import JuggleHit

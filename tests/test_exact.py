@@ -10,8 +10,7 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.ball.aim import aim_with_drag, apex_with_drag
-from planner_jax.ball.flight import BallState, fly
-from planner_jax.ball.impact import racket_impact
+from planner_jax.ball.flight import BallState, fly, racket_impact
 from planner_jax.core.protocol import Status, is_solved
 from planner_jax.optimise.shipped import shipped_scale
 from planner_jax.planning.plan import plan

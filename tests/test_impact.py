@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from derivatives import assert_gradient_matches_differences
 
-from planner_jax.ball.impact import racket_impact, required_impact
+from planner_jax.ball.flight import racket_impact, required_impact
 
 RESTITUTION = 0.7
 BALL_VEL = np.array([-5.0, -0.4, -5.5])

@@ -15,7 +15,7 @@ from verdicts import assert_same
 
 from planner_jax.ball.flight import BallState
 from planner_jax.host.processors import usable_cores
-from planner_jax.referee import hit, judging
+from planner_jax.referee import hit, judging, workers
 from planner_jax.referee.hit import LIMITS, HitVerdict, referee_hits
 from planner_jax.robot.quadrotor import QuadrotorLimits
 from planner_jax.task.hit.case import HitCase, HitLimits
@@ -615,10 +615,10 @@ def test_processes_judge_as_threads_do(monkeypatch):
     monkeypatch.setattr(judging, "_MANY_CORES", 1)
     monkeypatch.setattr(judging, "_MANY_LANES", 1)
     in_processes = judging.judge_in_chunks(_halved, case, 256)
-    assert judging.workers.cache_info().currsize == 1
+    assert workers.workers.cache_info().currsize == 1
     np.testing.assert_array_equal(in_processes["half"], in_threads["half"])
     with pytest.raises(ValueError, match="refused"):
-        judging.workers().map(_refuse, [1, 2])
+        workers.workers().map(_refuse, [1, 2])
 
 
 @pytest.mark.parametrize(("told", "num"), [("3", 3), ("0", 1), ("", None), ("many", None)])

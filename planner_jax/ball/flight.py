@@ -1,4 +1,4 @@
-"""Ball flight: quadratic drag (paper 002, eq. 2), and the closed form for linear drag.
+"""Ball flight with quadratic drag (paper 002, eq. 2) or linear drag, and impacts on a racket.
 
 World frame, z up, SI units. Everything here is written for one ball; `jax.vmap` makes many.
 """
@@ -12,7 +12,7 @@ from flax import struct
 from jax import Array
 from jaxtyping import PyTree
 
-from planner_jax.core.arithmetic import components
+from planner_jax.core.arithmetic import components, inverse_sqrt, reciprocal
 from planner_jax.core.checks import require_kind, require_number, shape_of
 from planner_jax.core.choices import require_size
 from planner_jax.core.errors import ArgumentError
@@ -201,3 +201,46 @@ def drag_free_fall_time(ball: BallState, height: Array, gravity: Array) -> tuple
     time = (ball.vel[2] + jnp.sqrt(jnp.where(real, discriminant, 1.0))) / gravity
     reached = real & (time > 0.0)
     return jnp.where(reached, time, 0.0), reached
+
+
+def racket_impact(ball_vel: Array, racket_vel: Array, normal: Array, restitution: Array) -> Array:
+    """Ball velocity after the bounce.
+
+    v+ = v- - (1 + beta) ((v- - u) . z) z . Paper 002, eq. 3 prints (1 - beta); its own
+    definition of beta and its eq. 12 need the plus sign. The tangential velocity is kept.
+
+    Args:
+        ball_vel: (3,) v- [m/s].
+        racket_vel: (3,) u [m/s].
+        normal: (3,) z, unit normal of the racket.
+        restitution: () beta, 0 to 1.
+
+    Returns:
+        (3,) v+ [m/s].
+    """
+    return ball_vel - (1.0 + restitution) * jnp.sum((ball_vel - racket_vel) * normal) * normal
+
+
+def required_impact(
+    ball_vel: Array, ball_vel_after: Array, restitution: Array
+) -> tuple[Array, Array]:
+    """Racket normal and normal speed that turn one ball velocity into another.
+
+    Paper 002, eq. 11 (the normal points along v+ - v-; the print has it reversed) and eq. 12.
+
+    Args:
+        ball_vel: (3,) v- [m/s].
+        ball_vel_after: (3,) v+ [m/s], different from v-.
+        restitution: () beta.
+
+    Returns:
+        normal: (3,) unit vector.
+        normal_speed: () [m/s], of the racket along `normal`.
+    """
+    change = ball_vel_after - ball_vel
+    size_squared = jnp.sum(change**2)
+    distinct = size_squared > 0.0
+    normal = change * inverse_sqrt(jnp.where(distinct, size_squared, 1.0))
+    mean = (restitution * ball_vel + ball_vel_after) * reciprocal(1.0 + restitution)
+    normal_speed = jnp.sum(mean * normal)
+    return normal, normal_speed

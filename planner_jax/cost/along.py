@@ -17,8 +17,7 @@ from jax import Array
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import PyTree
 
-from planner_jax.cost.peaks import greatest_by_parabolas
-from planner_jax.cost.penalty import joined_trapezoid_weights, smoothed_hinge
+from planner_jax.cost.penalty import greatest_by_parabolas, joined_trapezoid_weights, smoothed_hinge
 from planner_jax.lanes import with_kernel
 from planner_jax.trajectory.polynomial import Motion
 from planner_jax.trajectory.proportional_minco import ProportionalMinco, sample_motion
@@ -106,7 +105,7 @@ def greatest_along(
 ) -> tuple[Array, ...]:
     """Greatest excess over every limit along N segments; the arguments of `integrate_along`.
 
-    Peaks between the samples are those of parabolas (`peaks.greatest_by_parabolas`).
+    Peaks between the samples are those of parabolas (`penalty.greatest_by_parabolas`).
 
     Returns:
         E arrays (N,), differentiable.

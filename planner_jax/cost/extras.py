@@ -22,7 +22,7 @@ from planner_jax.core.arithmetic import Numbers
 from planner_jax.core.checks import shapes_told
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.rules import NOT_NEGATIVE, NOT_ZERO, POSITIVE, Field, Table, below
-from planner_jax.cost.peaks import greatest_by_tangents
+from planner_jax.cost.penalty import greatest_by_tangents
 from planner_jax.trajectory.polynomial import Motion
 from planner_jax.trajectory.proportional_minco import ProportionalMinco, by_pieces
 
@@ -205,7 +205,7 @@ def greatest_extras(
 ) -> tuple[Array, ...]:
     """Greatest excess over each that is a limit along a whole segment, () each.
 
-    Where it is concave between samples it is not missed: see `peaks.greatest_by_tangents`.
+    Where it is concave between samples it is not missed: see `penalty.greatest_by_tangents`.
 
     Args:
         maps: constant maps of M pieces.

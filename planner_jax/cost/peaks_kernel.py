@@ -22,7 +22,7 @@ from planner_jax.cost.along_kernel import (
     sample_excess,
     unit_motion,
 )
-from planner_jax.cost.peaks import crest
+from planner_jax.cost.penalty import crest
 from planner_jax.lanes.kernels import Treedef
 from planner_jax.lanes.pallas import grid_index
 

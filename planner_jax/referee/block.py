@@ -16,6 +16,7 @@ from planner_jax.referee.arm_clearance import KINDS, clearances, links_of, shiel
 from planner_jax.referee.judging import (
     CONTACT_TIME_TOLERANCE,
     SMALLEST_LIMIT,
+    Verdict,
     above,
     derivative,
     finite_lanes,
@@ -25,7 +26,6 @@ from planner_jax.referee.judging import (
     read_leaves,
 )
 from planner_jax.referee.solids import turned_back
-from planner_jax.referee.verdict import Verdict
 
 _SENTENCES = {
     "not finite": "the plan or its case is not finite",

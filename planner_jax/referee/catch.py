@@ -19,6 +19,7 @@ import numpy as np
 
 from planner_jax.referee.judging import (
     CONTACT_TIME_TOLERANCE,
+    FlightVerdict,
     above,
     checked_leaf,
     derivative,
@@ -27,16 +28,16 @@ from planner_jax.referee.judging import (
     judge_in_chunks,
     read_leaves,
 )
-from planner_jax.referee.pieces import pieces_of, with_ending
 from planner_jax.referee.quadrotor import (
     MOTION_SENTENCES,
     MOTION_UNBOUNDED,
     checked_coeffs,
     intervals_of,
     judge_motion,
+    pieces_of,
     read_flight,
+    with_ending,
 )
-from planner_jax.referee.verdict import FlightVerdict
 
 _ORDER_OF_MOTION = (
     *("head state", "continuity", "speed", "thrust low", "thrust high", "body rate"),

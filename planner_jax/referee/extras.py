@@ -10,7 +10,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from planner_jax.referee.judging import derivative
-from planner_jax.referee.pieces import Pieces
+from planner_jax.referee.quadrotor import Pieces
 
 
 @runtime_checkable

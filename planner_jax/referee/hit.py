@@ -17,6 +17,7 @@ import numpy as np
 
 from planner_jax.referee.judging import (
     CONTACT_TIME_TOLERANCE,
+    FlightVerdict,
     above,
     derivative,
     finite_lanes,
@@ -24,15 +25,15 @@ from planner_jax.referee.judging import (
     judge_in_chunks,
     read_leaves,
 )
-from planner_jax.referee.pieces import pieces_of, with_ending
 from planner_jax.referee.quadrotor import (
     MOTION_SENTENCES,
     MOTION_UNBOUNDED,
     intervals_of,
     judge_motion,
+    pieces_of,
     read_flight,
+    with_ending,
 )
-from planner_jax.referee.verdict import FlightVerdict
 
 _SENTENCES = {
     "not finite": "the plan or its case is not finite",

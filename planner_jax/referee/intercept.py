@@ -17,6 +17,7 @@ from planner_jax.referee.clearance import clearances
 from planner_jax.referee.judging import (
     CONTACT_TIME_TOLERANCE,
     SMALLEST_LIMIT,
+    Verdict,
     above,
     checked_leaf,
     finite_lanes,
@@ -24,7 +25,6 @@ from planner_jax.referee.judging import (
     judge_in_chunks,
     read_leaves,
 )
-from planner_jax.referee.verdict import Verdict
 
 # Limit -> what is said when it fails. In the order in which they are tested: a failed plan is
 # named after its first failure.

@@ -5,15 +5,76 @@ pieces are sampled; attitude and body rate come from flatness (the Hopf fibratio
 Watterson and Kumar). World frame, z up, SI units.
 """
 
+import dataclasses
 import math
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from planner_jax.referee.extras import worst_extras
 from planner_jax.referee.judging import above, checked_leaf, cut, derivative, flat, read_leaves
-from planner_jax.referee.pieces import Pieces
-from planner_jax.referee.rotors import rotor_thrusts
+
+
+@dataclasses.dataclass(frozen=True)
+class Pieces:
+    """Polynomial pieces in float64; one that is not flown repeats the last one that is.
+
+    A repeated piece changes no greatest and no least value.
+    """
+
+    coeffs: np.ndarray  # (3, B, M, D + 1)
+    durations: np.ndarray  # (B, M) [s]
+    starts: np.ndarray  # (B, M) [s]
+    flown: np.ndarray  # (B, M) bool
+
+    def of(self, lanes: slice) -> "Pieces":
+        """Return the pieces of some lanes."""
+        rest = (part[lanes] for part in (self.durations, self.starts, self.flown))
+        return Pieces(self.coeffs[:, lanes], *rest)
+
+
+def pieces_of(coeffs: np.ndarray, durations: np.ndarray, flown: np.ndarray | None = None) -> Pieces:
+    """Return the pieces of a batch of trajectories.
+
+    Args:
+        coeffs: (B, M, D + 1, 3), rising powers of the time [s] since the piece's start.
+        durations: (B, M) [s].
+        flown: (B, M) bool, which pieces are part of the trajectory; all of them if not given.
+            The others must have no duration.
+    """
+    coeffs = np.moveaxis(coeffs, -1, 0)
+    starts = np.cumsum(durations, axis=1) - durations
+    if flown is None:
+        flown = np.ones(durations.shape, bool)
+    else:
+        number = np.arange(durations.shape[1])
+        last = np.maximum.accumulate(np.where(flown, number, 0), axis=1)
+        lanes = np.arange(len(durations))[:, None]
+        coeffs = coeffs[:, lanes, last]
+        durations, starts = durations[lanes, last], starts[lanes, last]
+    return Pieces(np.ascontiguousarray(coeffs), durations, starts, flown)
+
+
+def with_ending(pieces: Pieces, case: dict) -> Pieces:
+    """Return the pieces of trajectories and of their endings, if there are any."""
+    if "ending.coeffs" not in case:
+        return pieces
+    durations = case["ending.durations"]
+    size = max(pieces.coeffs.shape[-1], case["ending.coeffs"].shape[2])
+
+    def wide(coeffs: np.ndarray) -> np.ndarray:
+        return np.pad(coeffs, [(0, 0)] * 3 + [(0, size - coeffs.shape[-1])])
+
+    begin = np.where(pieces.flown, pieces.starts + pieces.durations, 0.0).max(axis=1)
+    starts = begin[:, None] + durations.cumsum(axis=1) - durations
+    return Pieces(
+        np.concatenate(
+            [wide(pieces.coeffs), wide(np.moveaxis(case["ending.coeffs"], -1, 0))], axis=2
+        ),
+        np.concatenate([pieces.durations, durations], axis=1),
+        np.concatenate([pieces.starts, starts], axis=1),
+        np.concatenate([pieces.flown, np.ones(durations.shape, bool)], axis=1),
+    )
+
 
 # Limit -> sentence for its failure.
 MOTION_SENTENCES = {
@@ -83,39 +144,6 @@ def read_flight(cases, plans) -> dict[str, np.ndarray]:
         shapes = {"coeffs": coeffs.shape[1:], "durations": coeffs.shape[1:2]}
         leaves |= read_leaves(plans.ending, shapes, num_lanes, "ending.")
     return leaves
-
-
-def _judge_rotors(pieces: Pieces, case: dict, u: np.ndarray, relative: float) -> tuple[dict, dict]:
-    """Return least and greatest thrust (B,) [N] of a rotor at samples u (S,), and the tests."""
-    parts = [
-        _rotor_range(pieces.of(lanes), {name: leaf[lanes] for name, leaf in case.items()}, u)
-        for lanes in cut(len(pieces.durations), max(_PRODUCT // (pieces.flown[0].size * u.size), 1))
-    ]
-    least, least_time, most, most_time = (
-        np.concatenate(found) for found in zip(*parts, strict=True)
-    )
-    low, high = case["limits.rotors.min_thrust"], case["limits.rotors.max_thrust"]
-    # Both are relative to the greatest thrust: the least is zero for most rotors.
-    below, beyond = (low - least) / high, most / high - 1.0
-    tests = {
-        "rotor low": (~(below <= relative), below, least_time),
-        "rotor high": (~(beyond <= relative), beyond, most_time),
-    }
-    return {"min_rotor_thrust": least, "max_rotor_thrust": most}, tests
-
-
-def _rotor_range(pieces: Pieces, case: dict, u: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return least thrust (B,) [N] of a rotor and its time, greatest thrust and its time."""
-    times = pieces.durations[:, :, None] * u
-    body = (case[f"limits.rotors.{name}"] for name in ("mass", "inertia", "mixer"))
-    thrusts = rotor_thrusts(pieces.coeffs, times, case["gravity"], *body)
-    lanes, at = np.arange(len(thrusts)), (times + pieces.starts[:, :, None]).reshape(len(times), -1)
-    found = []
-    for rows, sign in ((thrusts.min(axis=-1), 1.0), (thrusts.max(axis=-1), -1.0)):
-        signed = np.where(np.isnan(rows), -np.inf, sign * rows).reshape(len(rows), -1)
-        place = signed.argmin(axis=1)
-        found += [sign * signed[lanes, place], at[lanes, place]]
-    return tuple(found)
 
 
 def _motion(pieces: Pieces, u: np.ndarray) -> list:
@@ -345,7 +373,12 @@ def judge_motion(
         "head_error": head,
     }
     u = np.linspace(0.0, 1.0, intervals + 1)
-    beyond, at, measured["worst_extra"] = worst_extras(pieces, case["lane"], extras, u)
+    num = len(head)
+    beyond, at, measured["worst_extra"] = np.full(num, -1.0), np.zeros(num), np.full(num, -1)
+    if extras:
+        from planner_jax.referee.extras import worst_extras  # few cases have extra limits
+
+        beyond, at, measured["worst_extra"] = worst_extras(pieces, case["lane"], extras, u)
     allowed = continuity * scale
     tests = {
         "head state": (head > allowed, head, np.zeros_like(head)),
@@ -367,7 +400,9 @@ def judge_motion(
             value = sign * measured[field]
             tests[name] = above(value, sign * limit, relative, found[peak][1])
     if "limits.rotors.mass" in case:
-        of_rotors, rotor_tests = _judge_rotors(pieces, case, u, relative)
+        from planner_jax.referee.rotors import judge_rotors  # few cases limit rotors
+
+        of_rotors, rotor_tests = judge_rotors(pieces, case, u, relative)
         measured, tests = measured | of_rotors, tests | rotor_tests
     else:
         unknown = np.full(len(head), np.nan)

@@ -13,20 +13,20 @@ import numpy as np
 from planner_jax.referee.block import referee_blocks
 from planner_jax.referee.intercept import final_poses, referee_intercepts
 from planner_jax.referee.judging import (
+    Verdict,
     derivative,
     finite_lanes,
     first_failures,
     judge_in_chunks,
 )
-from planner_jax.referee.pieces import pieces_of
 from planner_jax.referee.quadrotor import (
     MOTION_SENTENCES,
     MOTION_UNBOUNDED,
     intervals_of,
     judge_motion,
+    pieces_of,
     read_flight,
 )
-from planner_jax.referee.verdict import Verdict
 
 _SENTENCES = {"not finite": "the plan or its case is not finite", **MOTION_SENTENCES}
 LIMITS = tuple(_SENTENCES)

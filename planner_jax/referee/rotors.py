@@ -7,7 +7,44 @@ shared with the planners, who take it from the snap.
 
 import numpy as np
 
+from planner_jax.referee.judging import cut
+from planner_jax.referee.quadrotor import Pieces
+
 _MOMENT = 1e-5  # [s]
+_NUMBERS = 250_000  # samples of the rotors that are computed at once, so that they fit a cache
+
+
+def judge_rotors(pieces: Pieces, case: dict, u: np.ndarray, relative: float) -> tuple[dict, dict]:
+    """Return least and greatest thrust (B,) [N] of a rotor at samples u (S,), and the tests."""
+    parts = [
+        _rotor_range(pieces.of(lanes), {name: leaf[lanes] for name, leaf in case.items()}, u)
+        for lanes in cut(len(pieces.durations), max(_NUMBERS // (pieces.flown[0].size * u.size), 1))
+    ]
+    least, least_time, most, most_time = (
+        np.concatenate(found) for found in zip(*parts, strict=True)
+    )
+    low, high = case["limits.rotors.min_thrust"], case["limits.rotors.max_thrust"]
+    # Both are relative to the greatest thrust: the least is zero for most rotors.
+    below, beyond = (low - least) / high, most / high - 1.0
+    tests = {
+        "rotor low": (~(below <= relative), below, least_time),
+        "rotor high": (~(beyond <= relative), beyond, most_time),
+    }
+    return {"min_rotor_thrust": least, "max_rotor_thrust": most}, tests
+
+
+def _rotor_range(pieces: Pieces, case: dict, u: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return least thrust (B,) [N] of a rotor and its time, greatest thrust and its time."""
+    times = pieces.durations[:, :, None] * u
+    body = (case[f"limits.rotors.{name}"] for name in ("mass", "inertia", "mixer"))
+    thrusts = rotor_thrusts(pieces.coeffs, times, case["gravity"], *body)
+    lanes, at = np.arange(len(thrusts)), (times + pieces.starts[:, :, None]).reshape(len(times), -1)
+    found = []
+    for rows, sign in ((thrusts.min(axis=-1), 1.0), (thrusts.max(axis=-1), -1.0)):
+        signed = np.where(np.isnan(rows), -np.inf, sign * rows).reshape(len(rows), -1)
+        place = signed.argmin(axis=1)
+        found += [sign * signed[lanes, place], at[lanes, place]]
+    return tuple(found)
 
 
 def rotor_thrusts(

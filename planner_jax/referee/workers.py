@@ -15,6 +15,8 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
+from planner_jax.referee.judging import cores
+
 Given = TypeVar("Given")
 Found = TypeVar("Found")
 _ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}  # a core is one worker's
@@ -56,17 +58,6 @@ class _Worker:
         self._process.stdin.close()
         self._process.wait()
         self._process.stdout.close()
-
-
-def cores() -> int:
-    """Return the number of cores to use: NPROC, as for XLA, or all that the process may use."""
-    told = os.environ.get("NPROC", "")
-    if told.isdecimal():
-        return max(int(told), 1)
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:  # another system than Linux
-        return os.cpu_count() or 1
 
 
 class Workers:

@@ -11,8 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from planner_jax.ball.flight import BallState
-from planner_jax.ball.impact import racket_impact
+from planner_jax.ball.flight import BallState, racket_impact
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import Planner
 from planner_jax.optimise.lbfgs import LbfgsConfig

@@ -9,8 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from planner_jax.ball.flight import BallState, drag_free_fall_time, fly
-from planner_jax.ball.impact import required_impact
+from planner_jax.ball.flight import BallState, drag_free_fall_time, fly, required_impact
 from planner_jax.ball.prediction import target_at
 from planner_jax.baselines.hit.common import largest_violation, make_impact
 from planner_jax.baselines.hit.decoupled import aim_at_angle, decoupled_hit

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from planner_jax.ball.impact import required_impact
+from planner_jax.ball.flight import required_impact
 from planner_jax.ball.prediction import PathTable, target_at
 from planner_jax.baselines.hit.common import largest_violation, make_impact
 from planner_jax.baselines.parts.minimum_jerk import eased_minimum_jerk

@@ -9,18 +9,54 @@ import numpy as np
 from flax import struct
 from jax import Array
 from jax.typing import ArrayLike
+from jaxtyping import PyTree
 
 from planner_jax.ball.target import TargetPath
+from planner_jax.core.arithmetic import Numbers
 from planner_jax.core.checks import floating, numbers_of, require_path, require_switch, shape_of
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
-from planner_jax.core.rules import Table, require_sound
+from planner_jax.core.rules import (
+    PERMUTATION,
+    POSITIVE,
+    Field,
+    Rule,
+    Table,
+    require_sound,
+    within,
+)
 from planner_jax.cost.extras import Extra, for_batch
 from planner_jax.robot.quadrotor import QuadrotorLimits
 from planner_jax.robot.quadrotor_model import NET, QuadrotorModel
 from planner_jax.robot.quadrotor_models import PAPER_CATCHER
 from planner_jax.task.arguments import array_of
-from planner_jax.task.catch.rules import RULES
-from planner_jax.task.quadrotor import ARGUMENTS, limits_of, require_start, require_tool
+from planner_jax.task.quadrotor import (
+    ARGUMENTS,
+    FLIGHT_RULES,
+    limits_of,
+    require_start,
+    require_tool,
+)
+
+
+def _lies_ahead(horizon: Numbers, case: PyTree) -> Numbers:
+    return (horizon > 0.0) | ~case.present
+
+
+# What the numbers of a case must be.
+RULES: Table = (
+    Field("present", ("N",), kind=np.bool_),
+    Field("horizon", ("N",), Rule("> 0 of a target that is present", _lies_ahead)),
+    Field("order", ("N",), PERMUTATION, kind=np.integer),
+    Field("times", ("N",)),
+    Field("head_state", (4, 3)),
+    Field("gravity", (), POSITIVE),
+    Field("net.height", ()),
+    Field("net.radius", (), POSITIVE),
+    Field("net.max_angle", (), within(0.0, np.pi, "in [0, pi]")),
+    *FLIGHT_RULES,
+    Field("limits.min_height", ()),
+)
+
 
 GRAVITY = 9.81  # [m/s^2]
 START = (0.0, 0.0, 1.0)  # [m], where the quadrotor hovers

@@ -15,11 +15,16 @@ from numpy.typing import ArrayLike
 
 from planner_jax.core.checks import require_path
 from planner_jax.core.errors import ArgumentError, format_value
-from planner_jax.core.rules import Table
+from planner_jax.core.rules import PERMUTATION, Field, Table
 from planner_jax.plane.target import LaterPath, PlanePath
-from planner_jax.task.group.rules import RULES
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.case import case as single_case
+
+# What the numbers of a case must be.
+RULES: Table = (
+    Field("present", ("N",), kind=np.bool_),
+    Field("order", ("N",), PERMUTATION, kind=np.integer),
+)
 
 
 @struct.dataclass

@@ -10,15 +10,49 @@ from jax import Array
 
 from planner_jax.ball.flight import BallState
 from planner_jax.core.checks import floating, numbers_of
-from planner_jax.core.rules import Table, require_rule, require_sound
+from planner_jax.core.rules import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    Field,
+    Table,
+    below,
+    require_rule,
+    require_sound,
+    within,
+)
 from planner_jax.cost.extras import Extra, for_batch
 from planner_jax.robot.quadrotor import QuadrotorLimits
 from planner_jax.robot.quadrotor_model import RACKET, QuadrotorModel
 from planner_jax.robot.quadrotor_models import PAPER_HITTER
 from planner_jax.task.arguments import array_of, batch_of
-from planner_jax.task.hit.rules import RULES
 from planner_jax.task.hit.spec import DRAG, START
-from planner_jax.task.quadrotor import ARGUMENTS, limits_of, require_start, require_tool
+from planner_jax.task.quadrotor import (
+    ARGUMENTS,
+    FLIGHT_RULES,
+    limits_of,
+    require_start,
+    require_tool,
+)
+
+# What the numbers of a case must be.
+RULES: Table = (
+    Field("ball.pos", (3,)),
+    Field("ball.vel", (3,)),
+    Field("head_state", (4, 3)),
+    Field("target", (3,)),
+    Field("drag", (), NOT_NEGATIVE),
+    Field("gravity", (), POSITIVE),
+    Field("restitution", (), within(0.0, 1.0, "in [0, 1]")),
+    Field("racket_height", ()),
+    Field("racket_radius", (), POSITIVE),
+    *FLIGHT_RULES,
+    Field("limits.min_height", (), NOT_NEGATIVE),
+    Field("hit_limits.hitting_speed", (3,), POSITIVE),
+    Field("hit_limits.min_apex", (), NOT_NEGATIVE),
+    Field("hit_limits.min_apex", (), below("hit_limits.max_apex")),
+    Field("hit_limits.max_apex", ()),
+)
+
 
 GRAVITY = 9.8  # [m/s^2]
 _ARGUMENTS = {

@@ -14,8 +14,7 @@ import numpy as np
 from jax import Array
 
 from planner_jax.ball.aim import aim_drag_free, aim_with_drag, apex_with_drag
-from planner_jax.ball.flight import BallState, drag_free_apex, gravity_vector
-from planner_jax.ball.impact import required_impact
+from planner_jax.ball.flight import BallState, drag_free_apex, gravity_vector, required_impact
 from planner_jax.ball.prediction import LEAST_NODES, target_at
 from planner_jax.core.choices import require_size
 from planner_jax.cost.quadrotor import Measure
