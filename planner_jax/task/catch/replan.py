@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array
-from jax.typing import ArrayLike
+from numpy.typing import ArrayLike
 
 from planner_jax.ball.target import TargetPath
 from planner_jax.core.arithmetic import Numbers

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array
-from jax.typing import ArrayLike
+from numpy.typing import ArrayLike
 
 from planner_jax.ball.flight import BallState
 from planner_jax.core.checks import require_beginning, require_kind
@@ -114,7 +114,7 @@ class ReplanHit(OptimisedPlanner):
                 jerk,
             ]
         )
-        return planner.join(jnp.zeros(planner.num_offsets, sizes.dtype), natural[None])
+        return planner.join(jnp.zeros((1, planner.num_offsets // 3, 3), sizes.dtype), natural[None])
 
     def guesses(self, context: ReplanHitContext, num: int) -> Array:
         """The previous stroke, and then those from scratch, (num, n)."""
