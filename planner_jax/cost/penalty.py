@@ -9,7 +9,7 @@ from jax import Array
 from planner_jax.core.arithmetic import reciprocal
 
 
-def smoothed_hinge(x: Array, width: float | Array) -> Array:
+def smoothed_hinge(x: Array, width: float | Array | Array) -> Array:
     """L_mu: zero below 0, linear above mu, a quartic blend between (paper 000, eq. 27b).
 
     Twice continuously differentiable. x - mu/2 above the blend.
@@ -25,7 +25,7 @@ def smoothed_hinge(x: Array, width: float | Array) -> Array:
     return blend + jnp.where(below, 0.0, x - width)
 
 
-def steep_hinge(x: Array, width: float | Array) -> Array:
+def steep_hinge(x: Array, width: float | Array | Array) -> Array:
     """L_eps: cubic up to eps, then a far steeper cubic (paper 000, eq. 23).
 
     eps^3 + (x - eps)^2 x / eps^4 above eps, as printed: the value is continuous there, but
