@@ -6,8 +6,9 @@
     plans = pj.plan(pj.hit.planner("exact"), cases)
     verdict = pj.hit.judge(cases, plans)
 
-Every task, `hit`, `catch`, `intercept` and those of other packages (`task_named`), has the words
-`case`, `draw`, `planner` and `judge`. The calls are the same for all of them:
+Every task, `hit`, `catch`, `intercept`, `group`, `block` and the tasks of other packages
+(`task_named`), has the functions `case`, `draw`, `planner` and `judge`. The calls are the same for
+all tasks:
 
 * `plan`: one case or many, on all devices; `solve`, the same for the inside of compiled functions;
   `keep_compiled_programs`
