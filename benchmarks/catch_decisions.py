@@ -24,8 +24,7 @@ from jax.flatten_util import ravel_pytree
 import planner_jax as pj
 from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
 from planner_jax.core.errors import ArgumentError
-from planner_jax.optimise.lbfgs import LbfgsConfig
-from planner_jax.optimise.problem import Round
+from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.policies.policy import policy
 from planner_jax.task.catch.decide import Random

@@ -29,7 +29,7 @@ from planner_jax.baselines.catch.paper import COST_UNIT, PaperCatch
 from planner_jax.benchmarks.catch_peer import peer
 from planner_jax.benchmarks.cost_gap import cost_gaps, gap_figures
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
-from planner_jax.optimise.problem import Round, Stage
+from planner_jax.optimise.settings import Round, Stage
 
 SETS = ("paper", "hard")
 BATCH_COPIES = 64

@@ -8,10 +8,8 @@ import numpy as np
 
 from planner_jax.core.protocol import solved
 from planner_jax.core.registry import Task
-from planner_jax.optimise.lbfgs import LbfgsConfig
-from planner_jax.optimise.newton import NewtonConfig
 from planner_jax.optimise.planner import OptimisedPlanner
-from planner_jax.optimise.problem import Round, Stage
+from planner_jax.optimise.settings import LbfgsConfig, NewtonConfig, Round, Stage
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.planning.plan import plan
 

@@ -24,7 +24,7 @@ import planner_jax as pj
 from planner_jax.benchmarks.cost_gap import cost_gaps
 from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin
 from planner_jax.core.registry import task_named
-from planner_jax.optimise.newton import NewtonConfig
+from planner_jax.optimise.settings import NewtonConfig
 from planner_jax.planning.decided import first_choice
 
 _LONG = NewtonConfig(max_steps=100, tolerance=1e-12, patience=10)

@@ -27,8 +27,8 @@ from planner_jax.benchmarks.run import Bench, argument_parser, begin
 from planner_jax.core.registry import task_named
 from planner_jax.cost.quadrotor import limits_along
 from planner_jax.optimise.chain import ChainPlanner
-from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.multistart import minimise
+from planner_jax.optimise.settings import LbfgsConfig
 from planner_jax.planning.decided import first_choice
 from planner_jax.trajectory.chain import Chain, chain_motion, chain_rows
 from planner_jax.trajectory.proportional_minco import trajectory_energy

@@ -26,12 +26,12 @@ from .cost.extras import SpeedZone as SpeedZone
 from .export.api import export as export
 from .host.compile_cache import keep_compiled_programs as keep_compiled_programs
 from .optimise.implicit import optimal_plan as optimal_plan
-from .optimise.lbfgs import Evaluation as Evaluation
-from .optimise.lbfgs import LbfgsConfig as LbfgsConfig
-from .optimise.newton import NewtonConfig as NewtonConfig
 from .optimise.planner import OptimisedPlanner as OptimisedPlanner
 from .optimise.planner import pending as pending
-from .optimise.problem import Round as Round
+from .optimise.settings import Evaluation as Evaluation
+from .optimise.settings import LbfgsConfig as LbfgsConfig
+from .optimise.settings import NewtonConfig as NewtonConfig
+from .optimise.settings import Round as Round
 from .plane.obstacles import Obstacles as Obstacles
 from .plane.obstacles import obstacles as obstacles
 from .plane.target import PolynomialPath as PolynomialPath

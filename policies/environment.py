@@ -18,9 +18,8 @@ from jax import Array
 
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import is_solved
-from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.multistart import solve_batch
-from planner_jax.optimise.problem import Round
+from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.policies.observation import FEATURES, PER_TARGET, choice_of, observe
 from planner_jax.policies.settings import WEIGHTS
 from planner_jax.task.catch.case import CatchCase, CatchChoice

@@ -8,8 +8,7 @@ import pytest
 
 from planner_jax.ball.flight import BallState
 from planner_jax.core.protocol import Status, is_solved, lane
-from planner_jax.optimise.lbfgs import LbfgsConfig
-from planner_jax.optimise.problem import Round
+from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.planning.plan import plan
 from planner_jax.referee.catch import referee_catches
 from planner_jax.task.catch.default_planner import ExactCatch

@@ -21,10 +21,9 @@ from planner_jax.core import planner as planner_module
 from planner_jax.core.planner import Kind
 from planner_jax.core.protocol import Attempt, Plan, is_solved, outcome
 from planner_jax.core.rules import has_rules
-from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.optimise.planner import OptimisedPlanner
-from planner_jax.optimise.problem import Round
+from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.plane.reach import Lattice
 from planner_jax.task.block.default_planner import Search as BlockSearch
 from planner_jax.task.intercept.default_planner import SpacetimeIntercept

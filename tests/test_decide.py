@@ -11,8 +11,7 @@ import planner_jax as pj
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath
 from planner_jax.core.protocol import Status, is_solved, is_unsolved
-from planner_jax.optimise.lbfgs import LbfgsConfig
-from planner_jax.optimise.problem import Round
+from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.planning import drive
 from planner_jax.planning.decided import DecidedPlanner, first_choice
 from planner_jax.planning.plan import plan

@@ -4,7 +4,7 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.core.errors import ArgumentError
-from planner_jax.optimise.problem import Stage
+from planner_jax.optimise.settings import Stage
 from planner_jax.sweep.catch.settings import CatchSettings
 from planner_jax.sweep.hit.settings import HitSettings
 

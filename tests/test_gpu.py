@@ -14,10 +14,9 @@ import pytest
 import planner_jax as pj
 from planner_jax.core.protocol import is_solved
 from planner_jax.lanes import kernels, over_lanes
-from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.multistart import minimise_lanes, solve_batch
-from planner_jax.optimise.problem import Round
 from planner_jax.optimise.sensitivity import gradient_at
+from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.planning.plan import plan
 from planner_jax.task.catch.suites import draw
 from planner_jax.task.hit.default_planner import ExactHit

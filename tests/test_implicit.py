@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from planner_jax.core.protocol import Status
-from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.implicit import newton_refine, optimal_plan
+from planner_jax.optimise.settings import Evaluation
 from planner_jax.task.hit.default_planner import ExactHit
 from planner_jax.task.hit.suites import generate_serves, to_cases
 

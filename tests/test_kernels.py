@@ -11,11 +11,10 @@ import planner_jax as pj
 from planner_jax.cli import doctor
 from planner_jax.core.errors import ArgumentError
 from planner_jax.lanes import kernels, over_lanes
-from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.multistart import solve_batch
 from planner_jax.optimise.preconditioner import positive_inverse
-from planner_jax.optimise.problem import Round
 from planner_jax.optimise.sensitivity import gradient_at
+from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.runs.environment import require_backend
 from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.hit.default_planner import ExactHit

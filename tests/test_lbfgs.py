@@ -10,10 +10,9 @@ import scipy.optimize
 
 from planner_jax.core.protocol import Status, status_of
 from planner_jax.optimise import lbfgs
-from planner_jax.optimise.evaluation import Evaluation
-from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.lbfgs_kernel import turn_kernel
 from planner_jax.optimise.multistart import minimise
+from planner_jax.optimise.settings import Evaluation, LbfgsConfig
 
 stepped = jax.jit(lbfgs.step, static_argnums=(0, 2))
 direction_of = jax.jit(lbfgs.search_direction, static_argnums=2)

@@ -10,8 +10,7 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.core.protocol import Status
-from planner_jax.optimise.lbfgs import LbfgsConfig
-from planner_jax.optimise.problem import Round
+from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.studies.catch.appearing import AppearingPath, draw_appearing, states_of
 from planner_jax.studies.catch.braking import braking

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from planner_jax.cost.penalty import smoothed_hinge
-from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.multistart import minimise, minimise_lanes
-from planner_jax.optimise.newton import Curvature, NewtonConfig, by_products, damped_steps
+from planner_jax.optimise.newton import by_products, damped_steps
+from planner_jax.optimise.settings import Curvature, Evaluation, NewtonConfig
 
 CURVED = np.array([[3.0, 1.0, 0.2], [1.0, 2.0, 0.0], [0.2, 0.0, 1.0]])
 SLOPE = np.array([1.0, -2.0, 0.5])

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 import planner_jax as pj
-from planner_jax.optimise.lbfgs import LbfgsConfig
-from planner_jax.optimise.problem import Round
+from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.planning.replan import Replanning
 from planner_jax.task.hit.replan import ReplanHit
 from planner_jax.trajectory.polynomial import states_at

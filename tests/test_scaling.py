@@ -8,7 +8,7 @@ from flax import struct
 from jax import Array
 
 from planner_jax.benchmarks.measure_scales import curvature_diagonal, measure_scale
-from planner_jax.optimise.evaluation import Evaluation
+from planner_jax.optimise.settings import Evaluation
 
 
 @struct.dataclass

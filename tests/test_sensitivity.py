@@ -10,19 +10,17 @@ import pytest
 from flax import struct
 
 from planner_jax.core.protocol import Plan
-from planner_jax.optimise.evaluation import Evaluation
 from planner_jax.optimise.implicit import newton_refine, optimal_plan
 from planner_jax.optimise.inverse_kernel import inverse_kernel
-from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.multistart import minimise
 from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.preconditioner import positive_inverse
-from planner_jax.optimise.problem import Round
 from planner_jax.optimise.sensitivity import (
     _with_part,
     gradient_at,
     part_of,
 )
+from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round
 from planner_jax.planning.decided import first_choice
 from planner_jax.planning.gradient import gradient
 from planner_jax.task.catch.decide import Greedy

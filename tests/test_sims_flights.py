@@ -14,7 +14,7 @@ from test_solve import GOALS, TRACES, Well, WellPlanner
 import planner_jax as pj
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Status, is_solved, is_unsolved
-from planner_jax.optimise.lbfgs import LbfgsConfig
+from planner_jax.optimise.settings import LbfgsConfig
 from planner_jax.planning.plan import plan
 from planner_jax.sims.loop_state import Loop
 from planner_jax.sims.noise import NOISES

@@ -10,10 +10,8 @@ from flax import struct
 from jax import Array
 
 from planner_jax.core.protocol import Plan, Status, is_solved
-from planner_jax.optimise.evaluation import Evaluation
-from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.planner import OptimisedPlanner, pending
-from planner_jax.optimise.problem import Round, Stage
+from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round, Stage
 from planner_jax.planning import batch
 from planner_jax.planning.plan import plan, solve
 

@@ -13,8 +13,7 @@ from sweeps import columns, rows_of, stop_after
 
 import planner_jax as pj
 from planner_jax.core.errors import ArgumentError
-from planner_jax.optimise.lbfgs import LbfgsConfig
-from planner_jax.optimise.problem import Round
+from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.referee.catch import referee_catches
 from planner_jax.runs.columns import RefereedBatch
 from planner_jax.runs.columns import rows_of as columns_of

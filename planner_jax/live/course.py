@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from planner_jax.core.protocol import is_solved
 from planner_jax.live.packets import FIELDS
-from planner_jax.optimise.problem import Round
+from planner_jax.optimise.settings import Round
 from planner_jax.planning.programs import call_packed, solve_cases
 from planner_jax.recovery.case import EndingCase, EndingPlan
 from planner_jax.recovery.planner import RestPlanner

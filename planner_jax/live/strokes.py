@@ -19,9 +19,8 @@ from jaxtyping import Float
 from planner_jax.ball.estimation import Flight
 from planner_jax.ball.flight import BallState, linear_drag_flight, rk4_step
 from planner_jax.ball.target import BallPath
-from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.planner import OptimisedPlanner
-from planner_jax.optimise.problem import Round
+from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.planning.programs import call_packed, solve_cases
 from planner_jax.planning.replan import Replanning
 from planner_jax.robot.quadrotor_model import QuadrotorModel

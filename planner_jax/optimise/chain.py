@@ -22,9 +22,8 @@ from planner_jax.core.protocol import require_settings
 from planner_jax.cost.along import BETWEEN_NODES, Along, integrate_along
 from planner_jax.cost.penalty import smoothed_hinge
 from planner_jax.cost.quadrotor import QuadrotorCase, flight_along, greatest_excess
-from planner_jax.optimise.evaluation import Evaluation
-from planner_jax.optimise.newton import Curvature
 from planner_jax.optimise.planner import OptimisedPlanner
+from planner_jax.optimise.settings import Curvature, Evaluation
 from planner_jax.optimise.shipped import StartNetwork, cheaper_start, shipped_scale
 from planner_jax.trajectory.chain import Chain, chain_rows, chain_trajectory
 from planner_jax.trajectory.polynomial import PiecewisePolynomial

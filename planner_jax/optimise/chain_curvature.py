@@ -20,9 +20,8 @@ from planner_jax.cost.along_curvature import (
     columns_columns,
     curvature_along,
 )
-from planner_jax.optimise.evaluation import Evaluation
-from planner_jax.optimise.newton import Curvature
 from planner_jax.optimise.preconditioner import block_preconditioner
+from planner_jax.optimise.settings import Curvature, Evaluation
 from planner_jax.trajectory.proportional_minco import ProportionalMinco, offset_energy
 
 # Of the variables of the ends (N, k): boundary rows (N, 2s, 3), mean durations of a piece (N,) [s],

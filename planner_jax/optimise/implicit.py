@@ -18,10 +18,9 @@ from planner_jax.core.checks import require_kind
 from planner_jax.core.choices import require_size
 from planner_jax.core.planner import require_fit
 from planner_jax.core.protocol import marked, status_of
-from planner_jax.optimise.evaluation import Objective
-from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.multistart import minimise
 from planner_jax.optimise.planner import OptimisedPlanner
+from planner_jax.optimise.settings import LbfgsConfig, Objective
 
 
 @struct.dataclass

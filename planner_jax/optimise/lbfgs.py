@@ -8,7 +8,6 @@ is what comes back.
 Direction: Liu and Nocedal 1989, two-loop recursion, with gamma = s.y / y.y of the newest pair.
 """
 
-import dataclasses
 import functools
 from collections.abc import Callable
 
@@ -17,35 +16,9 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from planner_jax.core.checks import numeric, require_number
-from planner_jax.core.choices import require_size
-from planner_jax.core.errors import format_value
 from planner_jax.core.select import is_better
 from planner_jax.lanes import with_kernel
-from planner_jax.optimise.evaluation import Evaluation, Objective
-
-
-@dataclasses.dataclass(frozen=True)
-class LbfgsConfig:
-    """Sizes and switches of the solver: hashable, so static under jit."""
-
-    max_steps: int = 10  # 0 for the start itself
-    memory: int = 6
-    trial_steps: tuple[float, ...] = (1.0, 2.5, 0.3)
-    step_cap: float = 2.0  # largest Euclidean length of a unit step
-    tolerance: float = 1e-4  # relative decrease of the cost that counts as none
-    patience: int = 2  # iterations without a decrease before a lane is stationary
-
-    def __post_init__(self) -> None:
-        for name, least in (("max_steps", 0), ("memory", 1), ("patience", 0)):
-            require_size(name, vars(self)[name], least)
-        for name in ("step_cap", "tolerance"):
-            require_number(name, vars(self)[name], "finite and >= 0", lambda x: x >= 0.0)
-        steps = self.trial_steps
-        if not isinstance(steps, tuple) or any(numeric(each) is None for each in steps):
-            raise TypeError(f"trial_steps must be a tuple of numbers, got {format_value(steps)}")
-        if not steps or not all(0.0 < each < jnp.inf for each in steps):
-            raise ValueError(f"trial_steps must be finite and > 0, one or more, got {steps}")
+from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Objective
 
 
 @struct.dataclass

@@ -5,6 +5,7 @@ import functools
 import math
 from collections.abc import Callable
 from types import ModuleType
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -15,10 +16,20 @@ from jaxtyping import PyTree
 from planner_jax.core.protocol import Status, is_unsolved, status_of
 from planner_jax.core.select import index_of_best
 from planner_jax.lanes import over_lanes
-from planner_jax.optimise import lbfgs, newton
-from planner_jax.optimise.evaluation import Evaluation, Objective
-from planner_jax.optimise.newton import Curvature, Curved, NewtonConfig, by_products
-from planner_jax.optimise.problem import Problem, Round, Solver, Stage
+from planner_jax.optimise import lbfgs
+from planner_jax.optimise.settings import (
+    Curvature,
+    Curved,
+    Evaluation,
+    NewtonConfig,
+    Objective,
+    Round,
+    Solver,
+    Stage,
+)
+
+if TYPE_CHECKING:
+    from planner_jax.optimise.planner import OptimisedPlanner
 
 # So few iterations are counted, so that a GPU need not tell the host whether to go on.
 _COUNTED = 16
@@ -97,7 +108,7 @@ def minimise_lanes(
     state = over_lanes(lambda start: _method(config).init(start, config))(starts)
     state = searched(state, contexts, config, config.max_steps)
     if isinstance(config, NewtonConfig) and config.stragglers is not None:
-        share, steps, groups = config.stragglers
+        newton, (share, steps, groups) = _method(config), config.stragglers
         longer, num = _with_stragglers(config), math.ceil(share * starts.shape[-1])
 
         def next_group(made: tuple[Array, PyTree]) -> tuple[Array, PyTree]:
@@ -123,13 +134,19 @@ def _given(
 
 
 def _method(config: Solver) -> ModuleType:
-    return newton if isinstance(config, NewtonConfig) else lbfgs
+    """Return the module of a method."""
+    if not isinstance(config, NewtonConfig):
+        return lbfgs
+    from planner_jax.optimise import newton  # only planners that search for low costs take it
+
+    return newton
 
 
 def _step(objective: Objective, curved: Curved | None, state: PyTree, config: Solver) -> PyTree:
-    if isinstance(config, NewtonConfig):
-        return newton.step(objective, curved or by_products(objective), state, config)
-    return lbfgs.step(objective, state, config)
+    method = _method(config)
+    if method is lbfgs:
+        return lbfgs.step(objective, state, config)
+    return method.step(objective, curved or method.by_products(objective), state, config)
 
 
 def _with_stragglers(config: NewtonConfig) -> NewtonConfig:
@@ -155,7 +172,7 @@ def _optimum_at(point: Array, evaluation: Evaluation, config: Solver) -> Optimum
     return Optimum(point, evaluation, jnp.zeros((), jnp.int32), stationary)
 
 
-def solve_round(planner: Problem, attempt: Round, case: PyTree) -> PyTree:
+def solve_round(planner: "OptimisedPlanner", attempt: Round, case: PyTree) -> PyTree:
     """Plan one case with one round's starts and iterations; pure, so jit and vmap it.
 
     For a batch `solve_batch` is quicker.
@@ -171,7 +188,7 @@ def solve_round(planner: Problem, attempt: Round, case: PyTree) -> PyTree:
     last = planner.changed(attempt.settings)
     context = last.prepare(case)
 
-    def search(problem: Problem, solver: Solver, start: Array) -> Optimum:
+    def search(problem: "OptimisedPlanner", solver: Solver, start: Array) -> Optimum:
         return minimise(
             lambda x: problem.objective(x, context),
             start,
@@ -196,7 +213,7 @@ def solve_round(planner: Problem, attempt: Round, case: PyTree) -> PyTree:
     return jax.tree.map(lambda leaf: leaf[0], plans) if len(points) == 1 else _best(plans)
 
 
-def solve_batch(planner: Problem, attempt: Round, cases: PyTree) -> PyTree:
+def solve_batch(planner: "OptimisedPlanner", attempt: Round, cases: PyTree) -> PyTree:
     """`solve_round` on a batch, the lanes of which end at their own times.
 
     Args:
@@ -261,7 +278,7 @@ def _cheapest(costs: Array, num: int) -> Array:
     return jnp.argsort(jnp.where(jnp.isfinite(costs), costs, jnp.inf))[:num]
 
 
-def _plan_at(planner: Problem, optimum: Optimum, context: PyTree) -> PyTree:
+def _plan_at(planner: "OptimisedPlanner", optimum: Optimum, context: PyTree) -> PyTree:
     """The plan of one optimum."""
     plan = planner.decode(optimum.point, context)
     cost = optimum.evaluation.cost

@@ -18,90 +18,28 @@ With a slack the least damped step that costs no more than rounding goes on from
 approximate conditions of Wolfe (Hager and Zhang 2005), until steps lead no nearer.
 """
 
-import dataclasses
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array, lax
 
-from planner_jax.core.checks import numeric, require_number
-from planner_jax.core.choices import require_size
-from planner_jax.core.errors import format_value
 from planner_jax.core.select import is_better
-from planner_jax.optimise.evaluation import Evaluation, Objective
-from planner_jax.optimise.preconditioner import Preconditioner
-
-
-class Curvature(NamedTuple):
-    """What Newton's method takes of an objective at a point (n,)."""
-
-    evaluation: Evaluation
-    gradient: Array  # (n,)
-    # What makes products of the Hessian with a direction (n,); called where they are needed.
-    products: Callable[[], Callable[[Array], Array]]
-    # Of a positive damping (), what solves about the damped Hessian's system, (n,) of a right side
-    # (n,), by a matrix that is symmetric and positive definite.
-    preconditioner: Preconditioner
-
-
-Curved = Callable[[Array], Curvature]
+from planner_jax.optimise.settings import (
+    MOST_DAMPING,
+    Curvature,
+    Curved,
+    Evaluation,
+    NewtonConfig,
+    Objective,
+)
 
 _HIGHEST = lax.Precision.HIGHEST
 _HALVINGS = 14  # of the interval in which the least eigenvalue is looked for
-_LEAST_DAMPING, _MOST_DAMPING = 1e-10, 1e4  # of a lane's own
+_LEAST_DAMPING = 1e-10  # of a lane's own
 _LEAST = 1e-7  # of a pivot, beside the greatest number of its matrix
-
-
-@dataclasses.dataclass(frozen=True)
-class NewtonConfig:
-    """Sizes and switches of the solver: hashable, so static under jit."""
-
-    max_steps: int = 6
-    subspace: int = 4  # vectors; 0 for the preconditioner's step alone, without products
-    damping: float = 1e-4  # at first
-    # Tried at once, as multiples of the preconditioner's curvature. The damping is multiplied by
-    # the one that does best, or by `ease` if that is greater, or by `tighten` if none does better.
-    trial_dampings: tuple[float, ...] = (0.0, 0.3, 3.0, 30.0)
-    ease: float = 0.03
-    tighten: float = 1e3
-    step_cap: float = 3.0  # largest Euclidean length of a step
-    tolerance: float = 1e-4  # decrease that is expected, relative to the cost, that counts as none
-    trusted: float = _MOST_DAMPING  # up to which the decrease that is expected counts
-    patience: int = 3  # iterations that lead no nearer before a lane is stationary
-    # Relative difference of two costs, in roundings of their type, that says nothing. Steps that
-    # cost no more are made, and lead nearer where what is expected falls by half.
-    slack: float = 0.0
-    # Lanes that go on while any has something to gain, those with most first: their share in a
-    # batch, iterations of each such group, and how many groups there are at most.
-    stragglers: tuple[float, int, int] | None = None
-
-    def __post_init__(self) -> None:
-        for name, least in (("max_steps", 0), ("subspace", 0), ("patience", 0)):
-            require_size(name, vars(self)[name], least)
-        for name in ("damping", "ease", "tighten", "step_cap", "tolerance", "trusted", "slack"):
-            require_number(name, vars(self)[name], "finite and >= 0", lambda x: x >= 0.0)
-        trials = self.trial_dampings
-        if not isinstance(trials, tuple) or any(numeric(each) is None for each in trials):
-            raise TypeError(
-                f"trial_dampings must be a tuple of numbers, got {format_value(trials)}"
-            )
-        if not trials or not all(0.0 <= each < jnp.inf for each in trials):
-            raise ValueError(f"trial_dampings must be finite and >= 0, one or more, got {trials}")
-        later = self.stragglers
-        if later is None:
-            return
-        if not isinstance(later, tuple) or len(later) != 3:
-            raise TypeError(
-                f"stragglers must be a tuple of three numbers, got {format_value(later)}"
-            )
-        share, *counts = later
-        require_number("stragglers", share, "a share > 0 and <= 1", lambda x: 0.0 < x <= 1.0)
-        for count in counts:
-            require_size("stragglers", count, 1)
 
 
 @struct.dataclass
@@ -365,7 +303,7 @@ def _chosen(
     is_nearer = (there.cost < here.cost - slack) | (moved & (expected < 0.5 * numbers.expected))
     after = NewtonNumbers(
         best=jax.tree.map(lambda a, b: jnp.where(is_best, a, b), there, best),
-        damping=jnp.clip(damping, _LEAST_DAMPING, _MOST_DAMPING),
+        damping=jnp.clip(damping, _LEAST_DAMPING, MOST_DAMPING),
         expected=expected,
         iteration=numbers.iteration + 1,
         stalled=jnp.where(is_nearer, 0, numbers.stalled + 1),

@@ -11,11 +11,17 @@ from jax import Array
 from jaxtyping import PyTree
 
 from planner_jax.core.planner import CaseT, Planner, PlanT
-from planner_jax.optimise.evaluation import Evaluation
-from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.multistart import solve_batch, solve_round
-from planner_jax.optimise.newton import Curvature, NewtonConfig, by_products
-from planner_jax.optimise.problem import Round, Settings, Solver, Stage
+from planner_jax.optimise.settings import (
+    Curvature,
+    Evaluation,
+    LbfgsConfig,
+    NewtonConfig,
+    Round,
+    Settings,
+    Solver,
+    Stage,
+)
 
 # From where the first search ends.
 _POLISH = NewtonConfig(
@@ -80,6 +86,8 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         What Newton's method takes. By default each product is a derivative of the gradient, and
         nothing is known for a preconditioner.
         """
+        from planner_jax.optimise.newton import by_products  # only planners that polish need it
+
         return by_products(lambda x: self.objective(x, context))(point)
 
     @abc.abstractmethod

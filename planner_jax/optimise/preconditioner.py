@@ -8,9 +8,7 @@ import numpy as np
 from jax import Array
 
 from planner_jax.lanes import with_kernel
-
-# Of a damping, the solver of about the damped Hessian's system: (n,) of a right side (n,).
-Preconditioner = Callable[[Array], Callable[[Array], Array]]
+from planner_jax.optimise.settings import Preconditioner
 
 
 def block_preconditioner(blocks: np.ndarray, within: Array, others: Array) -> Preconditioner:

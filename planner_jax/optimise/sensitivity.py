@@ -6,8 +6,8 @@ For a number q(u, theta) of a plan, where u minimises cost(u, theta),
 
 the adjoint form of the implicit function theorem. lambda comes from a few steps of conjugate
 gradients (Hestenes and Stiefel 1952) with the planner's own products with the Hessian
-(`Problem.curved`), or with the whole Hessian. The derivative of all slopes of the cost along lambda
-then holds lambda^T cost_utheta.
+(`OptimisedPlanner.curved`), or with the whole Hessian. The derivative of all slopes of the cost
+along lambda then holds lambda^T cost_utheta.
 """
 
 import dataclasses
@@ -26,11 +26,9 @@ from planner_jax.core.checks import numeric
 from planner_jax.core.choices import require_size
 from planner_jax.core.errors import format_value
 from planner_jax.core.protocol import Plan
-from planner_jax.optimise.evaluation import Evaluation
-from planner_jax.optimise.newton import Curvature
 from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.preconditioner import positive_inverse
-from planner_jax.optimise.problem import Problem, Round, Settings
+from planner_jax.optimise.settings import Curvature, Evaluation, Round, Settings
 
 Quantity = str | Callable[[PyTree], Array]
 Product = Callable[[Array], Array]  # of a vector (n,), a vector (n,)
@@ -151,7 +149,7 @@ class Differentiated(OptimisedPlanner):
 
 
 def gradient_at(
-    planner: Problem,
+    planner: OptimisedPlanner,
     case: PyTree,
     point: Array,
     quantity: Quantity,

@@ -13,10 +13,8 @@ from jaxtyping import PyTree
 from planner_jax.core.checks import require_kind, require_switch
 from planner_jax.core.errors import format_value
 from planner_jax.core.protocol import Plan
-from planner_jax.optimise.lbfgs import LbfgsConfig
-from planner_jax.optimise.newton import NewtonConfig
-from planner_jax.optimise.problem import Solver
 from planner_jax.optimise.sensitivity import Differentiated, Quantity, part_of
+from planner_jax.optimise.settings import LbfgsConfig, NewtonConfig, Solver
 from planner_jax.planning.plan import plan, require_fit
 
 PlanT = TypeVar("PlanT", bound=Plan)

@@ -10,9 +10,8 @@ from jax import Array
 
 from planner_jax.core.choices import ENDINGS
 from planner_jax.optimise.chain import ChainEnds, ChainPlanner
-from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.planner import pending
-from planner_jax.optimise.problem import Round
+from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.recovery.case import EndingCase, EndingPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 

@@ -14,8 +14,7 @@ from jax import Array
 from planner_jax.ball.flight import BallState, racket_impact
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import Planner
-from planner_jax.optimise.lbfgs import LbfgsConfig
-from planner_jax.optimise.problem import Round
+from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.planning.plan import plan as plan_all
 from planner_jax.planning.replan import Replanning
 from planner_jax.robot.quadrotor_model import QuadrotorModel

@@ -13,10 +13,8 @@ from planner_jax.core.protocol import require_settings
 from planner_jax.cost.along import Along, integrate_along
 from planner_jax.cost.penalty import steep_hinge
 from planner_jax.cost.quadrotor import ground_excess, speed_excess, thrust_band_excess
-from planner_jax.optimise.evaluation import Evaluation
-from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.planner import OptimisedPlanner, pending
-from planner_jax.optimise.problem import Round, Stage
+from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round, Stage
 from planner_jax.robot.quadrotor import QuadrotorLimits, body_rate_squared, body_z
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.context import (

@@ -17,10 +17,8 @@ from planner_jax.baselines.parts.minimum_jerk import minimum_jerk
 from planner_jax.core.protocol import require_settings
 from planner_jax.cost.penalty import joined_trapezoid_weights, smoothed_hinge
 from planner_jax.cost.quadrotor import motion_excess
-from planner_jax.optimise.evaluation import Evaluation
-from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.planner import OptimisedPlanner, pending
-from planner_jax.optimise.problem import Round
+from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.context import HitContext, Impact, is_too_far, prepare_hit
 from planner_jax.task.hit.plan import HitPlan

@@ -15,9 +15,8 @@ from jax import Array
 
 from planner_jax.core.protocol import FEASIBILITY_TOLERANCE
 from planner_jax.optimise.chain import ChainEnds, ChainPlanner
-from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.planner import pending
-from planner_jax.optimise.problem import Round, Stage
+from planner_jax.optimise.settings import LbfgsConfig, Round, Stage
 from planner_jax.optimise.shipped import StartNetwork, shipped_network
 from planner_jax.robot.quadrotor import body_z, tangent_basis
 from planner_jax.task.catch.case import CatchCase

@@ -17,10 +17,8 @@ from numpy.typing import ArrayLike
 from planner_jax.ball.target import TargetPath
 from planner_jax.core.arithmetic import Numbers
 from planner_jax.core.checks import require_path
-from planner_jax.optimise.evaluation import Evaluation
-from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.planner import OptimisedPlanner
-from planner_jax.optimise.problem import Round
+from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round
 from planner_jax.planning.replan import Replanning, given_or_own, moment_of
 from planner_jax.robot.quadrotor import body_z
 from planner_jax.task.catch.case import CatchCase

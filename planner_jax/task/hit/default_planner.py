@@ -19,9 +19,8 @@ from planner_jax.ball.prediction import LEAST_NODES, target_at
 from planner_jax.core.choices import require_size
 from planner_jax.cost.quadrotor import Measure
 from planner_jax.optimise.chain import ChainEnds, ChainPlanner
-from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.planner import pending
-from planner_jax.optimise.problem import Round, Settings, Stage
+from planner_jax.optimise.settings import LbfgsConfig, Round, Settings, Stage
 from planner_jax.optimise.shipped import StartNetwork, shipped_network
 from planner_jax.robot.quadrotor import tangent_basis
 from planner_jax.task.hit.case import HitCase

@@ -16,10 +16,8 @@ from numpy.typing import ArrayLike
 
 from planner_jax.ball.flight import BallState
 from planner_jax.core.checks import require_beginning, require_kind
-from planner_jax.optimise.evaluation import Evaluation
-from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.planner import OptimisedPlanner
-from planner_jax.optimise.problem import Round
+from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round
 from planner_jax.planning.replan import Replanning, given_or_own, moment_of
 from planner_jax.robot.quadrotor import net_thrust, tangent_basis
 from planner_jax.task.hit.case import HitCase

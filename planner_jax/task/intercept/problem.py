@@ -19,12 +19,9 @@ from jax import Array, lax
 
 from planner_jax.core.protocol import is_solved
 from planner_jax.core.select import select
-from planner_jax.optimise.evaluation import Evaluation
-from planner_jax.optimise.lbfgs import LbfgsConfig
 from planner_jax.optimise.levenberg import LevenbergConfig, LevenbergState, Model, least_squares
-from planner_jax.optimise.newton import NewtonConfig
 from planner_jax.optimise.planner import OptimisedPlanner
-from planner_jax.optimise.problem import Round
+from planner_jax.optimise.settings import Evaluation, LbfgsConfig, NewtonConfig, Round
 from planner_jax.plane.cell_paths import CellPath
 from planner_jax.plane.distance_field import DistanceField
 from planner_jax.plane.reach import Grid
