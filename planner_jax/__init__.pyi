@@ -36,10 +36,10 @@ from .plane.obstacles import Obstacles as Obstacles
 from .plane.obstacles import obstacles as obstacles
 from .plane.target import PolynomialPath as PolynomialPath
 from .plane.target import TurningPath as TurningPath
+from .planning.batch import Progress as Progress
 from .planning.gradient import gradient as gradient
 from .planning.plan import plan as plan
 from .planning.plan import solve as solve
-from .planning.progress import Progress as Progress
 from .planning.replan import replan as replan
 from .recovery.planner import RestPlanner as RestPlanner
 from .recovery.with_recovery import EndedPlanner as EndedPlanner

@@ -8,17 +8,17 @@ import pytest
 
 from planner_jax import __main__ as process
 from planner_jax.cli import main as cli
-from planner_jax.host import processors
+from planner_jax.host import machine
 from planner_jax.host import signals as stopping
 from tests.sweeps import rows_of
 
 
 def test_usable_cores_are_those_that_the_process_is_bound_to(monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda who: {3, 5, 6}, raising=False)
-    assert processors.usable_cores() == 3
+    assert machine.usable_cores() == 3
     monkeypatch.delattr(os, "sched_getaffinity")
     monkeypatch.setattr(os, "cpu_count", lambda: None)
-    assert processors.usable_cores() == 1
+    assert machine.usable_cores() == 1
 
 
 @pytest.mark.parametrize(
@@ -26,12 +26,12 @@ def test_usable_cores_are_those_that_the_process_is_bound_to(monkeypatch):
     [({}, 4), ({"NPROC": "2"}, 2), ({"NPROC": "2", "PJRT_NPROC": "7"}, 7), ({"NPROC": "all"}, 4)],
 )
 def test_threads_of_a_computation_are_as_the_environment_says(monkeypatch, environment, num):
-    monkeypatch.setattr(processors, "usable_cores", lambda: 4)
+    monkeypatch.setattr(machine, "usable_cores", lambda: 4)
     for name in ("NPROC", "PJRT_NPROC"):
         monkeypatch.delenv(name, raising=False)
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
-    assert processors.threads_of_a_computation.__wrapped__() == num
+    assert machine.threads_of_a_computation.__wrapped__() == num
 
 
 @pytest.mark.parametrize(
@@ -43,10 +43,10 @@ def test_threads_of_a_computation_are_as_the_environment_says(monkeypatch, envir
     ],
 )
 def test_the_processor_is_known_by_its_name_and_widest_vectors(monkeypatch, text, told):
-    monkeypatch.setattr(processors.Path, "read_text", lambda *_, **__: text)
-    monkeypatch.setattr(processors.platform, "processor", lambda: "")
-    monkeypatch.setattr(processors.platform, "machine", lambda: "machine")
-    assert processors.processor.__wrapped__() == told
+    monkeypatch.setattr(machine.Path, "read_text", lambda *_, **__: text)
+    monkeypatch.setattr(machine.platform, "processor", lambda: "")
+    monkeypatch.setattr(machine.platform, "machine", lambda: "machine")
+    assert machine.processor.__wrapped__() == told
 
 
 @pytest.mark.parametrize(
@@ -77,7 +77,7 @@ def test_the_command_sweep_computes_with_one_thread_on_a_cpu(
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(processors.usable_cores() < 2, reason="needs two cores")
+@pytest.mark.skipif(machine.usable_cores() < 2, reason="needs two cores")
 @pytest.mark.parametrize("task", ["hit", "catch"])
 def test_rows_do_not_depend_on_the_number_of_cores(tmp_path, task):
     rows = []

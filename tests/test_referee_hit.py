@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 from verdicts import assert_same
 
 from planner_jax.ball.flight import BallState
-from planner_jax.host.processors import usable_cores
+from planner_jax.host.machine import usable_cores
 from planner_jax.referee import hit, judging, workers
 from planner_jax.referee.hit import LIMITS, HitVerdict, referee_hits
 from planner_jax.robot.quadrotor import QuadrotorLimits

@@ -6,8 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from planner_jax.core.protocol import Plan, Status
-from planner_jax.core.select import index_of_best, is_better, select, select_into
+from planner_jax.core.protocol import Plan, Status, index_of_best, is_better, select, select_into
 
 GOOD, BAD = Status.FEASIBLE, Status.MAX_STEPS
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 from planner_jax.core.errors import install_line
 from planner_jax.host.compile_cache import keep_compiled_programs
-from planner_jax.host.processors import usable_cores
+from planner_jax.host.machine import usable_cores
 from planner_jax.runs.environment import environment, require_backend
 
 _BATCH = 1024  # hits that are planned and refereed

@@ -9,7 +9,7 @@ from numbers import Integral
 from typing import Protocol, Self, TypeVar
 
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
-from planner_jax.host import memory
+from planner_jax.host import machine
 
 EFFORTS = ("feasible", "good", "best")  # default first
 ENDINGS = ("brake", "home")  # to a standstill where that is cheapest, or where the case begins
@@ -83,7 +83,7 @@ def require_memory(name: str, num: int, bytes_each: int) -> None:
         num: number of elements.
         bytes_each: estimated size of one element.
     """
-    free = memory.available_memory()
+    free = machine.available_memory()
     _require_space(name, num, bytes_each, free, "which this machine has memory")
 
 
@@ -96,12 +96,12 @@ def require_disk(name: str, num: int, bytes_each: int, folder: str | os.PathLike
         bytes_each: estimated size of one row.
         folder: folder of the rows.
     """
-    _require_space(name, num, bytes_each, memory.free_disk(folder), "which the disk has room")
+    _require_space(name, num, bytes_each, machine.free_disk(folder), "which the disk has room")
 
 
 def _require_space(name: str, num: int, bytes_each: int, free: int | None, what: str) -> None:
     """Raise `ArgumentError` unless `num` elements fit into the free bytes; None is unknown."""
     if free is not None and num * bytes_each > free:
-        sizes = f"{memory.shown(bytes_each)} each, {memory.shown(free)} free"
+        sizes = f"{machine.shown(bytes_each)} each, {machine.shown(free)} free"
         most = max(free // bytes_each, 1)
         raise ArgumentError(name, f"at most {most:,}, for {what} ({sizes})", num)

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import jax
 import numpy as np
 
-from planner_jax.host.memory import resident_memory, shown
+from planner_jax.host.machine import resident_memory, shown
 from planner_jax.live.packets import Fault
 
 _SHORTEST = 1e-6  # [s]

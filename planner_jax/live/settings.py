@@ -65,7 +65,7 @@ class HitServe(ServeSettings):
     def stroke(self) -> "HitStroke":
         """Return a hit to the target."""
         from planner_jax.live.strokes import HitStroke
-        from planner_jax.robot.quadrotor_models import PAPER_HITTER
+        from planner_jax.robot.quadrotor_model import PAPER_HITTER
 
         return HitStroke(self.robot or PAPER_HITTER, target=self.target, drag=self.drag)
 
@@ -85,7 +85,7 @@ class CatchServe(ServeSettings):
     def stroke(self) -> "CatchStroke":
         """Return a catch."""
         from planner_jax.live.strokes import CatchStroke
-        from planner_jax.robot.quadrotor_models import PAPER_CATCHER
+        from planner_jax.robot.quadrotor_model import PAPER_CATCHER
 
         return CatchStroke(self.robot or PAPER_CATCHER, drag=self.drag)
 

@@ -23,8 +23,7 @@ from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.planning.programs import call_packed, solve_cases
 from planner_jax.planning.replan import Replanning
-from planner_jax.robot.quadrotor_model import QuadrotorModel
-from planner_jax.robot.quadrotor_models import PAPER_CATCHER, PAPER_HITTER
+from planner_jax.robot.quadrotor_model import PAPER_CATCHER, PAPER_HITTER, QuadrotorModel
 from planner_jax.task.catch.case import GRAVITY as CATCH_GRAVITY
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.case import case as catch_case

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from planner_jax.core.select import is_better
+from planner_jax.core.protocol import is_better
 from planner_jax.lanes import with_kernel
 from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Objective
 

@@ -13,8 +13,7 @@ from flax import struct
 from jax import Array, lax
 from jaxtyping import PyTree
 
-from planner_jax.core.protocol import Status, is_unsolved, status_of
-from planner_jax.core.select import index_of_best
+from planner_jax.core.protocol import Status, index_of_best, is_unsolved, status_of
 from planner_jax.lanes import over_lanes
 from planner_jax.optimise import lbfgs
 from planner_jax.optimise.settings import (

@@ -26,7 +26,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array, lax
 
-from planner_jax.core.select import is_better
+from planner_jax.core.protocol import is_better
 from planner_jax.optimise.settings import (
     MOST_DAMPING,
     Curvature,

@@ -12,8 +12,7 @@ from jax.core import Tracer
 from jaxtyping import PyTree
 
 from planner_jax.core.planner import CaseT, Drive, Planner, PlanT
-from planner_jax.core.protocol import Decision, is_resident, is_solved, is_unsolved
-from planner_jax.core.select import index_of_best
+from planner_jax.core.protocol import Decision, index_of_best, is_resident, is_solved, is_unsolved
 from planner_jax.planning.programs import call_packed
 
 

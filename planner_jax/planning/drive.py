@@ -10,11 +10,16 @@ from jax import lax
 from jaxtyping import PyTree
 
 from planner_jax.core.planner import Kind, Planner
-from planner_jax.core.protocol import Attempt, is_unsolved, out_of_time
-from planner_jax.core.select import is_better, select, select_into
-from planner_jax.planning.batch import plan_batch, plan_on_host
+from planner_jax.core.protocol import (
+    Attempt,
+    is_better,
+    is_unsolved,
+    out_of_time,
+    select,
+    select_into,
+)
+from planner_jax.planning.batch import Watch, plan_batch, plan_on_host
 from planner_jax.planning.programs import solve_cases, solve_one
-from planner_jax.planning.progress import Watch
 
 
 @dataclasses.dataclass(frozen=True)

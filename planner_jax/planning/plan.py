@@ -11,8 +11,8 @@ from planner_jax.core.choices import require_size
 from planner_jax.core.planner import CaseT, Kind, Planner, PlanT, require_fit
 from planner_jax.core.protocol import Case, Status, is_resident
 from planner_jax.core.rules import has_rules, require_shapes, require_sound
+from planner_jax.planning.batch import Progress, Watch
 from planner_jax.planning.drive import Driver, require_pure
-from planner_jax.planning.progress import Progress, Watch
 
 _ARRAYS = (jax.Array, np.ndarray, np.generic)
 

@@ -15,7 +15,6 @@ from jax import Array
 
 from planner_jax.core.arithmetic import Components, at_least, components, inverse_sqrt, reciprocal
 from planner_jax.core.protocol import Plan
-from planner_jax.robot.setpoints import sample_at_rate
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, joined
 
 # By how much limits may be exceeded here, far more than in any plan that is solved: how closely
@@ -314,6 +313,8 @@ class QuadrotorPlan(Plan):
         Raises:
             ValueError: the rate is not positive.
         """
+        from planner_jax.robot.setpoints import sample_at_rate  # few plans are sampled
+
         path = jax.tree.map(np.asarray, self.whole)
         ends = np.sum(path.durations, axis=-1)
         return QuadrotorSetpoints(**sample_at_rate(rate, ends, (path, self.gravity), _setpoint_at))

@@ -9,7 +9,7 @@ from importlib import metadata
 from pathlib import Path
 
 from planner_jax.core.errors import ArgumentError
-from planner_jax.host.processors import processor, threads_of_a_computation, usable_cores
+from planner_jax.host.machine import processor, threads_of_a_computation, usable_cores
 from planner_jax.runs.manifest import Entries
 
 _PACKAGES = ("planner-jax", "jax", "jaxlib", "numpy", "scipy")  # that decide rows

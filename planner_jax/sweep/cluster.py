@@ -24,7 +24,7 @@ from planner_jax.core.choices import require
 from planner_jax.core.errors import ArgumentError, MissingExtra
 from planner_jax.host import signals as stopping
 from planner_jax.host.compile_cache import keep_compiled_programs
-from planner_jax.host.processors import threads_of_a_computation
+from planner_jax.host.machine import threads_of_a_computation
 from planner_jax.runs.environment import require_backend
 from planner_jax.runs.settings import WorkersFailed
 from planner_jax.sweep.chunks import Made, Maker, Workers

@@ -18,8 +18,7 @@ from planner_jax.ball.flight import BallState
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import Planner
 from planner_jax.planning.decided import DecidedPlanner
-from planner_jax.robot.quadrotor_model import QuadrotorModel
-from planner_jax.robot.quadrotor_models import PAPER_CATCHER
+from planner_jax.robot.quadrotor_model import PAPER_CATCHER, QuadrotorModel
 from planner_jax.runs.columns import BOOL, Column, list_of
 from planner_jax.sims.launch import (
     awaited,

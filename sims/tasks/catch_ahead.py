@@ -15,10 +15,10 @@ from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath
 from planner_jax.core.planner import Kind, Planner
 from planner_jax.core.protocol import Attempt, is_solved
-from planner_jax.host.threads import as_here
+from planner_jax.host.machine import as_here
+from planner_jax.planning.batch import Watch
 from planner_jax.planning.drive import Driver
 from planner_jax.planning.plan import plan as plan_all
-from planner_jax.planning.progress import Watch
 from planner_jax.sims.loop import expected
 from planner_jax.sims.loop_state import FlightState, Loop
 from planner_jax.sims.tasks.catch_pilot import BORNE, CatchPilot, tables

@@ -10,7 +10,7 @@ from jax import Array
 
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.prediction import PathTable, predict_path
-from planner_jax.core.select import is_better
+from planner_jax.core.protocol import is_better
 from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.planning.replan import Replanning
 from planner_jax.sims.loop_state import Outlook

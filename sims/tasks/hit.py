@@ -17,8 +17,7 @@ from planner_jax.core.planner import Planner
 from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.planning.plan import plan as plan_all
 from planner_jax.planning.replan import Replanning
-from planner_jax.robot.quadrotor_model import QuadrotorModel
-from planner_jax.robot.quadrotor_models import PAPER_HITTER
+from planner_jax.robot.quadrotor_model import PAPER_HITTER, QuadrotorModel
 from planner_jax.runs.columns import BOOL, NUMBER, VECTOR, Column
 from planner_jax.runs.summary import percent
 from planner_jax.sims.launch import flight_keys, launched, ready, require_plan, require_world

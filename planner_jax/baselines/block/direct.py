@@ -15,8 +15,7 @@ from jax import Array
 
 from planner_jax.baselines.parts.bang_bang import bang_bang, least_times
 from planner_jax.core.planner import Planner
-from planner_jax.core.protocol import Attempt, require_settings, status_of
-from planner_jax.core.select import first_solved
+from planner_jax.core.protocol import Attempt, first_solved, require_settings, status_of
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import least_clearances
 from planner_jax.task.block.end_poses import EndPoses, end_poses, flight_of

@@ -20,8 +20,7 @@ from jax import Array
 from planner_jax.ball.flight import BallState
 from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.planner import Planner
-from planner_jax.core.protocol import Status, is_solved, lane
-from planner_jax.core.select import select_into
+from planner_jax.core.protocol import Status, is_solved, lane, select_into
 from planner_jax.perception.fit import FlightFit, Sight, believed_at
 from planner_jax.planning.plan import plan
 from planner_jax.planning.replan import Replanning

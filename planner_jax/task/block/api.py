@@ -6,11 +6,11 @@ from jax.typing import DTypeLike
 from planner_jax.core.planner import Planner
 from planner_jax.core.registry import suite_named
 from planner_jax.referee.block import BlockVerdict, referee_blocks
+from planner_jax.task.arguments import judge_by
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.plan import BlockPlan
 from planner_jax.task.block.spec import SUITES, TASK
 from planner_jax.task.block.suites import draw_cases
-from planner_jax.task.judge import judge_by
 
 
 def draw(

@@ -23,11 +23,12 @@ from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import (
     FEASIBILITY_TOLERANCE,
     Attempt,
+    first_solved,
     is_solved,
     require_settings,
+    select,
     status_of,
 )
-from planner_jax.core.select import first_solved, select
 from planner_jax.optimise.levenberg import (
     LevenbergConfig,
     LevenbergState,

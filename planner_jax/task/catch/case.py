@@ -26,8 +26,7 @@ from planner_jax.core.rules import (
 )
 from planner_jax.cost.extras import Extra, for_batch
 from planner_jax.robot.quadrotor import QuadrotorLimits
-from planner_jax.robot.quadrotor_model import NET, QuadrotorModel
-from planner_jax.robot.quadrotor_models import PAPER_CATCHER
+from planner_jax.robot.quadrotor_model import NET, PAPER_CATCHER, QuadrotorModel
 from planner_jax.task.arguments import array_of
 from planner_jax.task.quadrotor import (
     ARGUMENTS,

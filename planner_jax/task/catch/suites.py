@@ -84,8 +84,7 @@ from planner_jax.core.checks import floating, require_scalar
 from planner_jax.core.choices import require_scale
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.registry import suite_named
-from planner_jax.robot.quadrotor_model import QuadrotorModel
-from planner_jax.robot.quadrotor_models import PAPER_CATCHER
+from planner_jax.robot.quadrotor_model import PAPER_CATCHER, QuadrotorModel
 from planner_jax.task.arguments import require_draw
 from planner_jax.task.catch.case import GRAVITY, CatchCase, case
 from planner_jax.task.catch.spec import SUITES, TASK

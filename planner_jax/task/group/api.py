@@ -8,13 +8,12 @@ from planner_jax.core.registry import suite_named
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.referee.intercept import InterceptVerdict, referee_intercepts
 from planner_jax.referee.intercept_group import referee_groups
-from planner_jax.task.arguments import find_decision
+from planner_jax.task.arguments import find_decision, judge_by, require_settings
 from planner_jax.task.group.case import InterceptGroup
 from planner_jax.task.group.plan import GroupPlan
 from planner_jax.task.group.spec import DECISIONS, SUITES, TASK
 from planner_jax.task.group.suites import draw_groups
 from planner_jax.task.intercept.api import by_own_class
-from planner_jax.task.judge import judge_by, require_settings
 
 
 def draw(

@@ -9,13 +9,12 @@ from planner_jax.core.choices import with_effort
 from planner_jax.core.planner import Planner
 from planner_jax.core.registry import suite_named
 from planner_jax.referee.hit import HitVerdict, referee_hits
-from planner_jax.robot.quadrotor_model import QuadrotorModel
-from planner_jax.robot.quadrotor_models import PAPER_HITTER
+from planner_jax.robot.quadrotor_model import PAPER_HITTER, QuadrotorModel
+from planner_jax.task.arguments import judge_by
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.plan import HitPlan
 from planner_jax.task.hit.spec import REAL_SCENARIOS, START, TASK
 from planner_jax.task.hit.suites import generate_serves, to_cases
-from planner_jax.task.judge import judge_by
 from planner_jax.task.quadrotor import require_own_robot
 
 

@@ -22,8 +22,7 @@ from planner_jax.core.rules import (
 )
 from planner_jax.cost.extras import Extra, for_batch
 from planner_jax.robot.quadrotor import QuadrotorLimits
-from planner_jax.robot.quadrotor_model import RACKET, QuadrotorModel
-from planner_jax.robot.quadrotor_models import PAPER_HITTER
+from planner_jax.robot.quadrotor_model import PAPER_HITTER, RACKET, QuadrotorModel
 from planner_jax.task.arguments import array_of, batch_of
 from planner_jax.task.hit.spec import DRAG, START
 from planner_jax.task.quadrotor import (

@@ -14,8 +14,7 @@ from scipy.interpolate import RectBivariateSpline
 from planner_jax.core.checks import numeric, require_scalar
 from planner_jax.core.choices import require_scale
 from planner_jax.core.errors import ArgumentError
-from planner_jax.robot.quadrotor_model import QuadrotorModel
-from planner_jax.robot.quadrotor_models import PAPER_HITTER
+from planner_jax.robot.quadrotor_model import PAPER_HITTER, QuadrotorModel
 from planner_jax.task.arguments import require_draw
 from planner_jax.task.hit import court
 from planner_jax.task.hit.case import GRAVITY, HitCase, case

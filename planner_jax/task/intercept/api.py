@@ -14,11 +14,11 @@ from planner_jax.core.planner import Planner
 from planner_jax.core.registry import suite_named
 from planner_jax.plane.target import LaterPath, PlanePath, PolynomialPath, TurningPath
 from planner_jax.referee.intercept import InterceptVerdict, referee_intercepts
+from planner_jax.task.arguments import judge_by
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.plan import InterceptPlan
 from planner_jax.task.intercept.spec import SUITES, TASK
 from planner_jax.task.intercept.suites import drawn
-from planner_jax.task.judge import judge_by
 
 
 def draw(

@@ -17,8 +17,14 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from planner_jax.core.planner import Planner
-from planner_jax.core.protocol import Status, is_solved, require_attempts, require_settings
-from planner_jax.core.select import index_of_best, select
+from planner_jax.core.protocol import (
+    Status,
+    index_of_best,
+    is_solved,
+    require_attempts,
+    require_settings,
+    select,
+)
 from planner_jax.plane.cell_paths import Chance
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.plan import InterceptPlan, explain, make_straight_plan

@@ -17,8 +17,7 @@ import numpy as np
 from flax import struct
 from jax import Array, lax
 
-from planner_jax.core.protocol import is_solved
-from planner_jax.core.select import select
+from planner_jax.core.protocol import is_solved, select
 from planner_jax.optimise.levenberg import LevenbergConfig, LevenbergState, Model, least_squares
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.settings import Evaluation, LbfgsConfig, NewtonConfig, Round

@@ -25,8 +25,7 @@ from planner_jax.baselines.block.library.planner import LibraryBlock
 from planner_jax.baselines.block.library.table import pieces_of, unpacked
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import Planner
-from planner_jax.core.protocol import Attempt, Status
-from planner_jax.core.select import first_solved
+from planner_jax.core.protocol import Attempt, Status, first_solved
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import clearances, num_of_pole

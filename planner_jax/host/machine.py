@@ -1,0 +1,136 @@
+"""Memory, disk, processor and threads of the machine.
+
+The command line imports this module before it imports JAX.
+"""
+
+import contextlib
+import functools
+import os
+import platform
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import ParamSpec, TypeVar
+
+_Arguments = ParamSpec("_Arguments")
+_Result = TypeVar("_Result")
+
+_CGROUP = Path("/sys/fs/cgroup")  # of a container, version 2
+
+
+def available_memory() -> int | None:
+    """Bytes that a process may still take, or None where the system does not tell."""
+    found = [each for each in (_of_system(), _of_container()) if each is not None]
+    return min(found, default=None)
+
+
+def _of_system() -> int | None:
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+    except OSError:
+        try:
+            return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+        except (OSError, ValueError, AttributeError):
+            return None
+    kilobytes = dict(line.split(":", 1) for line in lines if ":" in line)
+    return int(kilobytes["MemAvailable"].split()[0]) * 1024
+
+
+def _of_container() -> int | None:
+    try:
+        most = (_CGROUP / "memory.max").read_text(encoding="ascii").strip()
+        taken = int((_CGROUP / "memory.current").read_text(encoding="ascii"))
+        cached = dict(
+            line.split() for line in (_CGROUP / "memory.stat").read_text("ascii").splitlines()
+        )
+    except (OSError, ValueError):
+        return None
+    if most == "max":
+        return None
+    return max(int(most) - taken + int(cached.get("inactive_file", 0)), 0)
+
+
+def free_disk(folder: str | os.PathLike) -> int | None:
+    """Return the free bytes on the disk of a folder, which may not exist yet; None if unknown."""
+    path = Path(folder).absolute()
+    # A name that is too long for the disk does not exist; the disk of a parent is measured.
+    existing = next((each for each in [path, *path.parents] if os.path.exists(each)), Path.cwd())
+    disk = shutil.disk_usage(existing)
+    return disk.free if disk.total else None  # some of the system's own folders have no disk
+
+
+def shown(size: float) -> str:
+    """A number of bytes, to read."""
+    for unit in ("B", "kB", "MB", "GB"):
+        if size < 1e3:
+            return f"{size:.3g} {unit}"
+        size /= 1e3
+    return f"{size:.3g} TB"
+
+
+def resident_memory() -> int | None:
+    """Bytes that this process holds in memory now, or None where the system does not tell."""
+    try:
+        pages = Path("/proc/self/statm").read_text(encoding="ascii").split()[1]
+    except OSError:
+        return None
+    return int(pages) * os.sysconf("SC_PAGE_SIZE")
+
+
+_VECTORS = ("avx512f", "avx2", "avx", "sve2", "sve", "asimd")  # the widest first
+
+
+def usable_cores() -> int:
+    """Cores that this process may use, which can be fewer than the machine has."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+@functools.cache  # what the environment says later, JAX does not hear
+def threads_of_a_computation() -> int:
+    """Threads that XLA has for one computation on a CPU; on some CPUs their number decides digits.
+
+    As PJRT_NPROC or NPROC says when JAX begins, or else one for each usable core. To be asked for
+    once JAX has begun, or when it is about to.
+    """
+    told = os.environ.get("PJRT_NPROC") or os.environ.get("NPROC", "")
+    return max(int(told), 1) if told.isdecimal() else usable_cores()
+
+
+@functools.cache
+def processor() -> str:
+    """The processor's name, with the widest vectors that it computes in, as the system tells them.
+
+    By both NumPy and XLA choose how they compute, and with it the last digits.
+    """
+    entries: dict[str, str] = {}
+    try:
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
+        for line in text.splitlines():
+            name, _, value = line.partition(":")
+            entries.setdefault(name.strip().lower(), value.strip())
+    except OSError:  # another system than Linux
+        pass
+    name = entries.get("model name") or platform.processor() or platform.machine()
+    known = (entries.get("flags") or entries.get("features") or "").split()
+    widest = next((vectors for vectors in _VECTORS if vectors in known), None)
+    return f"{name} ({widest})" if widest else name
+
+
+def as_here(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """Return a function that another thread computes in the type of numbers of this thread.
+
+    `jax.enable_x64(True)` holds only for the thread that calls it.
+    """
+    import jax  # the command line measures memory without it
+
+    here = jax.config.jax_enable_x64  # type: ignore[attr-defined]
+
+    def call(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
+        # To enable what is enabled would have programs compiled anew.
+        is_so = jax.config.jax_enable_x64 == here  # type: ignore[attr-defined]
+        with contextlib.nullcontext() if is_so else jax.enable_x64(here):
+            return function(*args, **kwargs)
+
+    return call
