@@ -75,7 +75,7 @@ def follow(
     """
     flight = flight_of(case)
     poses = end_poses(case, flight, planner.points, planner.pieces)
-    place = planner.rank_poses(poses, LATER_RANKS)[rank]
+    place = online.rank_poses(poses, LATER_RANKS, 1.0 - planner.slack)[rank]
     start = planner.encode_straight(case, poses, place)
     start = start.at[:-1].add(bump_steps(bump, planner.pieces).reshape(-1))
     solver = dataclasses.replace(planner.attempts[0].solver, max_steps=steps, hope=None)

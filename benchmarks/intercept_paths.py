@@ -1,4 +1,4 @@
-"""Paths among standing walls: Hybrid A* with every heuristic, a published one, and smoothing.
+"""Paths among standing walls: Hybrid A* and a published search, and smoothing.
 
     python -m benchmarks.intercept_paths [--num 50] [--seed 0] [--out DIR]
 
@@ -25,12 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from planner_jax.baselines.intercept.hybrid_astar import (
-    HEURISTICS,
-    HybridAstar,
-    HybridPath,
-    hybrid_astar,
-)
+from planner_jax.baselines.intercept.hybrid_astar import HybridPath, hybrid_astar
 from planner_jax.baselines.intercept.path_smoothing import smooth_path
 from planner_jax.benchmarks.path_peers import CELL, INSTALL, PAD, installed, searched
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
@@ -107,20 +102,14 @@ def row_of(cases: list, paths: list[HybridPath], ms: np.ndarray) -> Row:
     return Row(found, np.array(clear), length, ms, f"{median:.0f} expansions, median")
 
 
-def searches_of(cases: list, meetings: np.ndarray, headings: list[float | None]) -> dict[str, Row]:
-    """Rows of every heuristic; None leaves the heading free."""
-    rows = {}
-    for heuristic in HEURISTICS:
-        settings = HybridAstar(heuristic=heuristic)
-        results = [
-            fastest(
-                functools.partial(search, case, meeting, end_heading=heading, settings=settings)
-            )
-            for case, meeting, heading in zip(cases, meetings, headings, strict=True)
-        ]
-        paths, ms = zip(*results, strict=True)
-        rows[f"this library, {heuristic}"] = row_of(cases, list(paths), np.array(ms))
-    return rows
+def searched_row(cases: list, meetings: np.ndarray, headings: list[float | None]) -> Row:
+    """Return the row of this library's search; None leaves the heading free."""
+    results = [
+        fastest(functools.partial(search, case, meeting, end_heading=heading))
+        for case, meeting, heading in zip(cases, meetings, headings, strict=True)
+    ]
+    paths, ms = zip(*results, strict=True)
+    return row_of(cases, list(paths), np.array(ms))
 
 
 def peer_row(cases: list, meetings: np.ndarray, headings: list[float]) -> Row:
@@ -225,12 +214,12 @@ def main() -> None:
             cases = [jax.tree.map(lambda leaf, k=k: leaf[k], host) for k in range(options.num)]
             drawn[suite] = (batch, cases, meetings)
             paths = [search(case, meeting) for case, meeting in zip(cases, meetings, strict=True)]
-            rows = searches_of(cases, meetings, [None] * options.num)
-            say_rows(bench, suite, "free", rows)
-            bench.count(rows[f"this library, {HybridAstar().heuristic}"].clear)
+            row = searched_row(cases, meetings, [None] * options.num)
+            say_rows(bench, suite, "free", {"this library": row})
+            bench.count(row.clear)
             # Where no path was found, any heading is as good.
             headings = [float(path.poses[-1, 2]) if path.found else 0.0 for path in paths]
-            rows = searches_of(cases, meetings, list(headings))
+            rows = {"this library": searched_row(cases, meetings, list(headings))}
             if installed():
                 rows["fastsim-navigation"] = peer_row(cases, meetings, headings)
             say_rows(bench, suite, "given", rows)

@@ -75,7 +75,7 @@ class _Sweep:
 
     def look(self) -> bool:
         """Count the chunks that are there; whether the process still runs."""
-        there = len(list(self._out.glob("parts/part-*.parquet")))
+        there = len(list(self._out.glob("plans/part-*.parquet")))
         self._times += [time.perf_counter()] * (there - len(self._times))
         return self._process.poll() is None
 

@@ -175,7 +175,7 @@ def test_a_chunk_in_which_every_worker_dies_leaves_a_run_that_can_be_finished(
     ray.deaths, out = {2: 99}, tmp_path / "run"
     assert main([*COMMAND, "--workers", "ray", "--out", str(out)]) == 1
     said = capsys.readouterr().err.splitlines()[-1]
-    assert "workers must live" in said and "chunk 2 in 4 tries (a worker died)" in said
+    assert "--workers must live" in said and "chunk 2 in 4 tries (a worker died)" in said
     assert f"finish with: planner-jax sweep hit --resume --out {out}" in said
     assert RunFolder(out).read_manifest()["state"] == "interrupted" and ray.ended == 1
     resume_sweep(TASK, out, progress=False)
@@ -306,7 +306,7 @@ def test_a_worker_whose_jax_has_no_device_ends_a_run_that_can_be_finished(
     monkeypatch.setattr(cluster, "require_backend", backend)
     assert main([*COMMAND, "--workers", "ray", "--out", str(out)]) == 1
     said = capsys.readouterr().err.splitlines()[-1]
-    assert "workers must be able to start the run, got: JAX_PLATFORMS" in said
+    assert "--workers must be able to start the run, got: JAX_PLATFORMS" in said
     assert "finish with" in said
     assert RunFolder(out).read_manifest()["state"] == "interrupted"
 

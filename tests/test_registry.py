@@ -1,5 +1,6 @@
 """Names of tasks, planners and suites, the library's own and those of other packages."""
 
+import pickle
 import subprocess
 import sys
 import warnings
@@ -11,6 +12,7 @@ import planner_jax as pj
 from planner_jax.core import errors
 from planner_jax.core.errors import UnknownName
 from planner_jax.core.registry import Task, all_tasks, task_named
+from planner_jax.runs.settings import WorkersFailed
 from planner_jax.task.catch.suites import draw as draw_catches
 
 METADATA = "Metadata-Version: 2.1\nName: planner-jax-others\nVersion: 1.0\n"
@@ -224,3 +226,33 @@ def test_a_missing_extra_is_installed_from_the_checkout_or_else_from_the_index(
     assert errors.install_line("view") == "pip install -c constraints.txt -e '.[view]'"
     monkeypatch.setattr(errors, "__file__", str(tmp_path / "planner_jax" / "core" / "errors.py"))
     assert errors.install_line("view") == "pip install 'planner-jax[view]'"
+
+
+ERRORS = [
+    errors.PlannerJaxError("one line"),
+    errors.ArgumentError("limits.speed", "> 0", np.array([1.0, -1.0]), 1, other="0", more=2),
+    errors.ArgumentError("out", "a new folder", verb="name", shown="'x' (exists)"),
+    errors.ArgumentTypeError("num", "a whole number", "x"),
+    errors.CaseError("speed", "finite", np.float32(np.nan), (2, 0)),
+    errors.UnknownName("task", "one of hit, catch", "hot"),
+    errors.MissingExtra("paper", "numba", "baselines"),
+    errors.NoEnding("no recovery trajectory keeps the limits"),
+    WorkersFailed("be able to start the run"),
+]
+
+
+def test_errors_of_every_class_are_listed():
+    classes = {value for value in vars(errors).values() if isinstance(value, type)}
+    defined = {each for each in classes if issubclass(each, errors.PlannerJaxError)}
+    assert defined <= {type(error) for error in ERRORS}
+
+
+@pytest.mark.parametrize("error", ERRORS, ids=lambda error: type(error).__name__)
+def test_an_error_is_the_same_in_another_process(error):
+    """A worker process sends its exception to the process that started it."""
+    copied = pickle.loads(pickle.dumps(error))
+    assert type(copied) is type(error) and str(copied) == str(error)
+    assert vars(copied).keys() == vars(error).keys()
+    if isinstance(error, (errors.ArgumentError, errors.MissingExtra)):
+        name = {getattr(error, "feature", error.name): "--other"}
+        assert str(copied.renamed(name)) == str(error.renamed(name))

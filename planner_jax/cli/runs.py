@@ -229,7 +229,7 @@ def _tell_how_to_continue(
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"interrupted; {rest()}") from None
     except WorkersFailed as error:
-        raise Unfinished(f"{error}; {rest()}") from None
+        raise Unfinished(f"--workers must {error.rule}; {rest()}") from None
     except OSError as error:
         shown = f"{error.filename!r} ({error.strerror or error})"
         raise Unfinished(f"{rule}, got {shown}; {rest()}") from None

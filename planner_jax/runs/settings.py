@@ -26,7 +26,14 @@ KnownSettings = TypeVar("KnownSettings")
 
 
 class WorkersFailed(PlannerJaxError, RuntimeError):
-    """Workers could not make a chunk of a run, which can be resumed; one line."""
+    """Workers could not make a chunk of a run, which can be resumed: "workers must RULE"."""
+
+    def __init__(self, rule: str):
+        super().__init__(rule)
+        self.rule = rule
+
+    def __str__(self) -> str:
+        return f"workers must {self.rule}"
 
 
 def option(default: Any, metavar: str, words: str) -> Any:

@@ -13,7 +13,6 @@ headings counter-clockwise from the x axis.
 import dataclasses
 import importlib
 from types import ModuleType
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,20 +21,17 @@ from planner_jax.core.errors import MissingExtra
 from planner_jax.plane.obstacles import Obstacles
 
 _DISCS = 3  # that cover the body
-HEURISTICS = ("dubins", "grid", "both")
 
 
 @dataclasses.dataclass(frozen=True)
 class HybridAstar:
-    """How a way is sought.
+    """Settings of the search.
 
-    A way costs its length, and turns cost more by `turn_price`. The heuristic is the length of the
-    shortest way without obstacles, "dubins", that in the plane among obstacles on the grid without
-    the curvature's limit, "grid", or the greater one, "both". Paper 003 takes the greater one of
-    Dubins's length and the straight line, which is "dubins": the straight line is never longer.
+    A path costs its length, and turns cost more by `turn_price`. The heuristic is the length of the
+    shortest path without obstacles. Paper 003 takes the greater one of this length and the straight
+    line, which is the same: the straight line is never longer.
     """
 
-    heuristic: Literal["dubins", "grid", "both"] = "both"
     cell: float = 0.1  # [m], side of a cell
     headings: int = 72  # bins of a turn
     turn_price: float = 0.05  # of a metre at the tightest curvature, in metres
@@ -128,8 +124,6 @@ def hybrid_astar(
         headings=settings.headings,
         price=float(settings.turn_price),
         slack=float(settings.slack),
-        with_dubins=settings.heuristic != "grid",
-        with_grid=settings.heuristic != "dubins",
         max_expansions=settings.max_expansions,
     )
     goal = kernels.Goal(np.append(place, heading), has_heading)
@@ -188,9 +182,6 @@ def _require(start, meeting, lower, upper, curvature, body, end_heading, setting
     for name, least in (("headings", 8), ("poses", 2)):
         if chosen[name] < least:
             raise ValueError(f"{name} must be >= {least}, got {chosen[name]}")
-    if settings.heuristic not in HEURISTICS:
-        known = ", ".join(HEURISTICS)
-        raise ValueError(f"heuristic must be one of {known}, got {settings.heuristic!r}")
 
 
 def _sampled(

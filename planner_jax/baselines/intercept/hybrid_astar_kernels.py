@@ -1,8 +1,7 @@
 """The loops of `hybrid_astar`, compiled by numba, which this module needs.
 
-Everything here is scalar code on the host, in float64. Poses are those of the rear axle, x [m],
-y [m] and heading [rad] in the world frame. Inside of the closed forms of Dubins the tightest radius
-is the unit of length, and the start is the origin of the frame.
+All code is scalar and runs on the host in float64. A pose is x [m], y [m] and heading [rad] of the
+rear axle in the world frame.
 """
 
 import heapq
@@ -12,7 +11,15 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-TURN = 2.0 * math.pi
+from planner_jax.baselines.intercept.dubins_kernels import (
+    SENSES,
+    TURN,
+    in_frame,
+    least_length,
+    words_to_point,
+    words_to_pose,
+)
+
 FOUND, NOT_FOUND, BLOCKED = 0, 1, 2
 PRIMITIVES = 5  # full and half curvature to the left, straight, and likewise to the right
 
@@ -46,8 +53,6 @@ class Rules(NamedTuple):
     headings: int  # bins of a turn
     price: float  # what a metre at the tightest curvature costs more than a straight one [m]
     slack: float  # by how much, relative, the heuristic is stretched
-    with_dubins: bool  # whether the heuristic knows lengths without obstacles
-    with_grid: bool  # whether it knows lengths among obstacles, without the curvature
     max_expansions: int
 
 
@@ -76,98 +81,6 @@ class _Tree(NamedTuple):
     parent: np.ndarray  # (nodes,) int32, -1 of the start
     primitive: np.ndarray  # (nodes,) int32, that led here
     node: np.ndarray  # (cells,) int32, n + 1 of the node n in a cell, -n - 1 once it is expanded
-
-
-@njit(cache=True)
-def _positive(angle):
-    """An angle in one turn from 0; a whole turn but for rounding is none."""
-    turned = angle % TURN
-    return 0.0 if turned > TURN - 1e-9 else turned
-
-
-@njit(cache=True)
-def words_to_pose(x, y, heading, lengths):
-    """Lengths (6, 3) of the parts of Dubins's words to a pose, infinite for those without a way.
-
-    Rows are LSL, LSR, LRL and their mirror images RSR, RSL, RLR; senses are those of `SENSES`.
-    """
-    lengths[:, :] = np.inf
-    sin, cos = math.sin(heading), math.cos(heading)
-    for side in range(2):
-        if side == 1:
-            y, sin, heading = -y, -sin, -heading
-        row = 3 * side
-        # From the centre of the first circle to that of the last one, which turns the same way.
-        across, up = x - sin, y + cos - 1.0
-        far = math.sqrt(across**2 + up**2)
-        if far < 1e-9:
-            lengths[row, 0], lengths[row, 1], lengths[row, 2] = _positive(heading), 0.0, 0.0
-        else:
-            angle = math.atan2(up, across)
-            lengths[row, 0], lengths[row, 1] = _positive(angle), far
-            lengths[row, 2] = _positive(heading - angle)
-            if far < 4.0:
-                middle = TURN - math.acos(1.0 - far**2 / 8.0)
-                first = _positive(angle + 0.5 * middle)
-                lengths[row + 2, 0], lengths[row + 2, 1] = first, middle
-                lengths[row + 2, 2] = _positive(heading - first + middle)
-        across, up = x + sin, y - cos - 1.0
-        square = across**2 + up**2 - 4.0
-        if square >= 0.0:
-            straight = math.sqrt(square)
-            angle = math.atan2(up, across) + math.atan2(2.0, straight)
-            lengths[row + 1, 0], lengths[row + 1, 1] = _positive(angle), straight
-            lengths[row + 1, 2] = _positive(angle - heading)
-
-
-# Of the parts of every word: 1 to the left, -1 to the right, 0 straight.
-SENSES = np.array(
-    [[1, 0, 1], [1, 0, -1], [1, -1, 1], [-1, 0, -1], [-1, 0, 1], [-1, 1, -1]], np.float64
-)
-
-
-@njit(cache=True)
-def words_to_point(x, y, lengths):
-    """Lengths (6, 3) of an arc and a straight line that leads to a point, for either side.
-
-    Rows are those of LSL and RSR in `SENSES`, the others infinite.
-    """
-    lengths[:] = np.inf
-    for side in range(2):
-        up = (y if side == 0 else -y) - 1.0
-        square = x**2 + up**2 - 1.0
-        if square >= 0.0:
-            straight = math.sqrt(square)
-            angle = math.atan2(up, x) + math.atan2(1.0, straight)
-            row = 3 * side
-            lengths[row, 0], lengths[row, 1], lengths[row, 2] = _positive(angle), straight, 0.0
-
-
-@njit(cache=True)
-def length_to_point(x, y):
-    """Least length to a point, arriving with any heading: CS or, inside of a circle, CC.
-
-    The shortest ways to a point are of these kinds (X.-N. Bui, J.-D. Boissonnat, P. Soueres and
-    J.-P. Laumond, Shortest path synthesis for Dubins non-holonomic robot, ICRA 1994).
-    """
-    y = abs(y)
-    best = np.inf
-    for side in (1.0, -1.0):
-        up = side * y - 1.0
-        square = x**2 + up**2 - 1.0
-        if square >= 0.0:
-            straight = math.sqrt(square)
-            angle = math.atan2(up, x) + math.atan2(1.0, straight)
-            best = min(best, _positive(angle) + straight)
-        else:  # inside of this circle: turn away first, and then this way
-            far = math.sqrt(x**2 + (y + 1.0) ** 2)
-            half = math.acos(min(max((far**2 + 3.0) / (4.0 * far), -1.0), 1.0))
-            for sign in (1.0, -1.0):
-                touch = math.atan2(y + 1.0, x) + sign * half
-                end_x, end_y = x - 2.0 * math.cos(touch), y + 1.0 - 2.0 * math.sin(touch)
-                first = _positive(0.5 * math.pi - touch)
-                best = min(best, first + _positive(math.atan2(end_y, end_x) - touch - math.pi))
-    return best
 
 
 @njit(cache=True)
@@ -253,87 +166,12 @@ def _free_at(pose, scene, field):
 
 
 @njit(cache=True)
-def wavefront(is_open, sources, cell):
-    """Length [m] of the shortest way in the plane from every cell to the nearest source.
-
-    The eikonal equation by sweeps in four directions in turns (H. Zhao, A fast sweeping method
-    for eikonal equations, 2005): unlike sums of steps between neighbours it is nearly the same in
-    all directions. It is of first order, a few hundredths too long beyond the end of a wall.
-
-    Args:
-        is_open: (X, Y) bool, cells that may be entered; sources may be closed.
-        sources: (X, Y) bool.
-        cell: [m].
-
-    Returns:
-        (X * Y,) [m], row by row; infinite where there is no way.
-    """
-    num_x, num_y = is_open.shape
-    far = np.full((num_x + 2, num_y + 2), np.inf)  # with a border
-    for i in range(num_x):
-        for j in range(num_y):
-            if sources[i, j]:
-                far[i + 1, j + 1] = 0.0
-    quiet, sweep = 0, 0
-    while quiet < 4:
-        quiet += 1
-        for a in range(num_x):
-            i = a if sweep % 2 == 0 else num_x - 1 - a
-            for b in range(num_y):
-                j = b if sweep // 2 % 2 == 0 else num_y - 1 - b
-                if not is_open[i, j]:
-                    continue
-                beside = min(far[i, j + 1], far[i + 2, j + 1])
-                above = min(far[i + 1, j], far[i + 1, j + 2])
-                less = min(beside, above)
-                if less + cell * 0.7 >= far[i + 1, j + 1]:
-                    continue
-                gap = max(beside, above) - less
-                if gap >= cell:
-                    new = less + cell
-                else:
-                    new = less + 0.5 * (gap + math.sqrt(2.0 * cell**2 - gap**2))
-                if new < far[i + 1, j + 1] - 1e-9:
-                    far[i + 1, j + 1] = new
-                    quiet = 0
-        sweep += 1
-    lengths = np.empty(num_x * num_y)
-    for i in range(num_x):
-        for j in range(num_y):
-            lengths[i * num_y + j] = far[i + 1, j + 1]
-    return lengths
-
-
-@njit(cache=True)
 def _field_around(scene, cell):
     """The field of a scene; two of its steps are a cell."""
     shape = (2 * scene.shape[0] + 1, 2 * scene.shape[1] + 1)
     cap = scene.clear + cell
     far = distance_field(scene.polygons, scene.present, scene.corner, 0.5 * cell, shape, cap)
     return _Field(far, scene.corner, 0.5 * cell)
-
-
-@njit(cache=True)
-def _lengths_in_plane(scene, field, goal, cell):
-    """Length (X * Y,) [m] from every cell to the goal for the rear axle as a disc."""
-    num_x, num_y = field.far.shape[0] // 2, field.far.shape[1] // 2
-    # No cell is closed in which the rear axle may be: it is near the middle of a disc.
-    near = np.inf
-    for k in range(scene.places.shape[0]):
-        near = min(near, abs(scene.places[k]))
-    least = scene.clear - near - 0.5 * math.sqrt(2.0) * cell
-    is_open = np.ones((num_x, num_y), np.bool_)
-    for i in range(num_x):
-        for j in range(num_y):
-            is_open[i, j] = field.far[2 * i + 1, 2 * j + 1] > least
-    sources = np.zeros((num_x, num_y), np.bool_)
-    poses = _goal_poses(goal, scene, 72)
-    for k in range(poses.shape[0]):
-        i = int((poses[k, 0] - field.corner[0]) / cell)
-        j = int((poses[k, 1] - field.corner[1]) / cell)
-        if 0 <= i < num_x and 0 <= j < num_y:
-            sources[i, j] = True
-    return wavefront(is_open, sources, cell)
 
 
 @njit(cache=True)
@@ -394,36 +232,6 @@ def _sinc(x):
 
 
 @njit(cache=True)
-def _in_frame(pose, goal, curvature):
-    """The goal's place ahead and to the left of a pose, in tightest radii."""
-    cos, sin = math.cos(pose[2]), math.sin(pose[2])
-    east, north = goal.pose[0] - pose[0], goal.pose[1] - pose[1]
-    return (cos * east + sin * north) * curvature, (cos * north - sin * east) * curvature
-
-
-@njit(cache=True)
-def least_length(pose, goal, middle, curvature, lengths):
-    """Least length [m] of a way without obstacles from a pose to a goal, of a free one a bound.
-
-    Args:
-        pose: (3,).
-        goal: a `Goal`.
-        middle: [m], how far the body's middle is ahead of the rear axle.
-        curvature: [1/m], the tightest.
-        lengths: (6, 3), to work with.
-    """
-    x, y = _in_frame(pose, goal, curvature)
-    if goal.has_heading:
-        words_to_pose(x, y, goal.pose[2] - pose[2], lengths)
-        best = np.inf
-        for row in range(6):
-            best = min(best, lengths[row, 0] + lengths[row, 1] + lengths[row, 2])
-        return best / curvature
-    # Once its middle is on the goal, a car comes to it by driving so far straight on.
-    return max(length_to_point(x, y) / curvature - middle, 0.0)
-
-
-@njit(cache=True)
 def _is_free_along(pose, parts, senses, curvature, scene, field):
     """Whether a way of three parts [m] from a pose is free all along."""
     x, y, heading = pose[0], pose[1], pose[2]
@@ -447,7 +255,7 @@ def _shot(pose, goal, bound, rules, scene, field, lengths):
 
     Returns its row of `lengths` [m], -1 if there is none, and its cost [m].
     """
-    x, y = _in_frame(pose, goal, rules.curvature)
+    x, y = in_frame(pose, goal, rules.curvature)
     if goal.has_heading:
         words_to_pose(x, y, goal.pose[2] - pose[2], lengths)
     else:
@@ -537,9 +345,7 @@ def _enter(tree, node, parent, primitive, x, y, cost, heading_bin):
 
 
 @njit(cache=True)
-def _expand(
-    node, num, best_cost, start, goal, scene, rules, field, in_plane, primitives, tree, heap
-):
+def _expand(node, num, best_cost, start, goal, scene, rules, field, primitives, tree, heap):
     """Reach the neighbours of a node; how many of the tree's nodes are then in use."""
     x, y, cost, k = tree.place[node, 0], tree.place[node, 1], tree.place[node, 2], tree.bin[node]
     cos, sin = primitives.directions[k, PRIMITIVES // 2, 0]
@@ -557,14 +363,12 @@ def _expand(
         known = tree.node[cell] - 1
         if known >= 0 and tree.place[known, 2] <= new_cost:
             continue
-        rest = in_plane[cell // rules.headings] if rules.with_grid else 0.0
-        if new_cost + rest >= best_cost:
+        if new_cost >= best_cost:
             continue
         if not _is_free_primitive(tree, node, p, primitives, scene, field):
             continue
-        if rules.with_dubins:
-            pose[2] = start[2] + TURN / rules.headings * heading_bin
-            rest = max(rest, least_length(pose, goal, scene.middle, rules.curvature, lengths))
+        pose[2] = start[2] + TURN / rules.headings * heading_bin
+        rest = max(0.0, least_length(pose, goal, scene.middle, rules.curvature, lengths))
         if known < 0:
             known = num
             num += 1
@@ -594,9 +398,6 @@ def search(start, goal, scene, rules, node_of):
     field = _field_around(scene, rules.cell)
     if _is_blocked(start, goal, scene, field):
         return BLOCKED, none, none, np.inf, 0
-    in_plane = np.zeros(1)
-    if rules.with_grid:
-        in_plane = _lengths_in_plane(scene, field, goal, rules.cell)
     primitives = _primitives(start[2], rules)
     tree = _empty_tree(node_of, rules.max_expansions)
     _enter(tree, 0, -1, 0, start[0], start[1], 0.0, 0)
@@ -625,7 +426,7 @@ def search(start, goal, scene, rules, node_of):
                     best_lengths[k] = lengths[row, k]
             wait = int((bound - cost) / (4.0 * primitives.reach))
         num = _expand(
-            node, num, best_cost, start, goal, scene, rules, field, in_plane, primitives, tree, heap
+            node, num, best_cost, start, goal, scene, rules, field, primitives, tree, heap
         )
     if best_node < 0:
         return NOT_FOUND, none, none, np.inf, expansions

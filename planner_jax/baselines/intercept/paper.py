@@ -45,7 +45,7 @@ class PaperIntercept(Planner):
     """Meets the target at the case's time along one searched path."""
 
     case_type: ClassVar[type] = InterceptCase
-    search: HybridAstar = HybridAstar(heuristic="dubins")
+    search: HybridAstar = HybridAstar()
     smoothing: Smoothing = Smoothing()
     follow: FollowConfig = FollowConfig()
     step: SpeedStep = printed_speed()

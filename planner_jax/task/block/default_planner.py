@@ -120,6 +120,20 @@ def _trial_cost(tried: LevenbergState, solver: LevenbergConfig) -> Array:
     return jnp.where(tried.stalled >= solver.settled, -1.0, tried.model.cost)
 
 
+def rank_poses(poses: EndPoses, num: int, most: float) -> Array:
+    """Return the indices (num,) of poses of little effort, mixed so that they differ.
+
+    Args:
+        poses: of the end of a motion.
+        num: number of indices.
+        most: greatest effort of a pose that is reached in time.
+    """
+    rng = np.random.default_rng(0)
+    mixed = jnp.asarray(rng.random(poses.effort.shape[0]), poses.effort.dtype)
+    late = jnp.where(poses.effort > most, 10.0 * poses.effort, 0.0)
+    return lax.top_k(-(poses.effort + mixed + late), num)[1]
+
+
 def _lift_to_unknowns(
     lift: Array, drift: Array, grams: Array, pushes: Array, joints: JointTerms
 ) -> tuple[Array, Array]:
@@ -222,7 +236,9 @@ class OnlineBlock(Planner):
         ranks, bumps = (
             each[attempt.first : attempt.first + attempt.tries] for each in read_learned_starts()
         )
-        order = self.rank_poses(poses, max(attempt.straight, 1 + max(ranks, default=0)))
+        order = rank_poses(
+            poses, max(attempt.straight, 1 + max(ranks, default=0)), 1.0 - self.slack
+        )
         in_time = jnp.sum(poses.effort <= 1.0 - self.slack)
         straight = jnp.where(flight.comes, jnp.minimum(in_time, attempt.straight), 0)
 
@@ -308,13 +324,6 @@ class OnlineBlock(Planner):
         least = jnp.argmin(jnp.where(jnp.isnan(plans.violation), jnp.inf, plans.violation))
         plan = jax.tree.map(lambda leaf: leaf[least], plans)
         return select(plan, best, ~is_solved(best.status))
-
-    def rank_poses(self, poses: EndPoses, num: int) -> Array:
-        """Return the indices (num,) of poses of little effort, mixed so that they differ."""
-        rng = np.random.default_rng(0)
-        mixed = jnp.asarray(rng.random(poses.effort.shape[0]), poses.effort.dtype)
-        late = jnp.where(poses.effort > 1.0 - self.slack, 10.0 * poses.effort, 0.0)
-        return lax.top_k(-(poses.effort + mixed + late), num)[1]
 
     def encode_straight(self, case: BlockCase, poses: EndPoses, place: Array) -> Array:
         """Return the unknowns (n,) of the straight motion to a pose."""

@@ -1,0 +1,136 @@
+"""Closed forms of Dubins's paths, compiled by numba, which this module needs.
+
+Inside the closed forms the tightest radius is the unit of length, and the start is the origin of
+the frame. All code is scalar and runs on the host in float64.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+TURN = 2.0 * math.pi
+
+
+@njit(cache=True)
+def _positive(angle):
+    """Return an angle in [0, 2 pi); a whole turn within rounding becomes 0."""
+    turned = angle % TURN
+    return 0.0 if turned > TURN - 1e-9 else turned
+
+
+@njit(cache=True)
+def words_to_pose(x, y, heading, lengths):
+    """Write the lengths (6, 3) of the parts of Dubins's words to a pose, infinite without a path.
+
+    Rows are LSL, LSR, LRL and their mirror images RSR, RSL, RLR, as in `SENSES`.
+    """
+    lengths[:, :] = np.inf
+    sin, cos = math.sin(heading), math.cos(heading)
+    for side in range(2):
+        if side == 1:
+            y, sin, heading = -y, -sin, -heading
+        row = 3 * side
+        # From the centre of the first circle to that of the last one, which turns the same way.
+        across, up = x - sin, y + cos - 1.0
+        far = math.sqrt(across**2 + up**2)
+        if far < 1e-9:
+            lengths[row, 0], lengths[row, 1], lengths[row, 2] = _positive(heading), 0.0, 0.0
+        else:
+            angle = math.atan2(up, across)
+            lengths[row, 0], lengths[row, 1] = _positive(angle), far
+            lengths[row, 2] = _positive(heading - angle)
+            if far < 4.0:
+                middle = TURN - math.acos(1.0 - far**2 / 8.0)
+                first = _positive(angle + 0.5 * middle)
+                lengths[row + 2, 0], lengths[row + 2, 1] = first, middle
+                lengths[row + 2, 2] = _positive(heading - first + middle)
+        across, up = x + sin, y - cos - 1.0
+        square = across**2 + up**2 - 4.0
+        if square >= 0.0:
+            straight = math.sqrt(square)
+            angle = math.atan2(up, across) + math.atan2(2.0, straight)
+            lengths[row + 1, 0], lengths[row + 1, 1] = _positive(angle), straight
+            lengths[row + 1, 2] = _positive(angle - heading)
+
+
+# Senses of the parts of every word: 1 to the left, -1 to the right, 0 straight.
+SENSES = np.array(
+    [[1, 0, 1], [1, 0, -1], [1, -1, 1], [-1, 0, -1], [-1, 0, 1], [-1, 1, -1]], np.float64
+)
+
+
+@njit(cache=True)
+def words_to_point(x, y, lengths):
+    """Write the lengths (6, 3) of an arc and a straight line to a point, for either side.
+
+    They stand in the rows of LSL and RSR in `SENSES`; the other rows are infinite.
+    """
+    lengths[:] = np.inf
+    for side in range(2):
+        up = (y if side == 0 else -y) - 1.0
+        square = x**2 + up**2 - 1.0
+        if square >= 0.0:
+            straight = math.sqrt(square)
+            angle = math.atan2(up, x) + math.atan2(1.0, straight)
+            row = 3 * side
+            lengths[row, 0], lengths[row, 1], lengths[row, 2] = _positive(angle), straight, 0.0
+
+
+@njit(cache=True)
+def length_to_point(x, y):
+    """Return the least length to a point with any heading: CS or, inside of a circle, CC.
+
+    The shortest paths to a point are of these kinds (X.-N. Bui, J.-D. Boissonnat, P. Soueres and
+    J.-P. Laumond, Shortest path synthesis for Dubins non-holonomic robot, ICRA 1994).
+    """
+    y = abs(y)
+    best = np.inf
+    for side in (1.0, -1.0):
+        up = side * y - 1.0
+        square = x**2 + up**2 - 1.0
+        if square >= 0.0:
+            straight = math.sqrt(square)
+            angle = math.atan2(up, x) + math.atan2(1.0, straight)
+            best = min(best, _positive(angle) + straight)
+        else:  # inside of this circle: turn away first, and then this way
+            far = math.sqrt(x**2 + (y + 1.0) ** 2)
+            half = math.acos(min(max((far**2 + 3.0) / (4.0 * far), -1.0), 1.0))
+            for sign in (1.0, -1.0):
+                touch = math.atan2(y + 1.0, x) + sign * half
+                end_x, end_y = x - 2.0 * math.cos(touch), y + 1.0 - 2.0 * math.sin(touch)
+                first = _positive(0.5 * math.pi - touch)
+                best = min(best, first + _positive(math.atan2(end_y, end_x) - touch - math.pi))
+    return best
+
+
+@njit(cache=True)
+def in_frame(pose, goal, curvature):
+    """Return the goal's position ahead and to the left of a pose, in tightest radii."""
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    east, north = goal.pose[0] - pose[0], goal.pose[1] - pose[1]
+    return (cos * east + sin * north) * curvature, (cos * north - sin * east) * curvature
+
+
+@njit(cache=True)
+def least_length(pose, goal, middle, curvature, lengths):
+    """Return the least length [m] from a pose to a goal without obstacles.
+
+    Where the heading at the goal is free, it is a lower bound.
+
+    Args:
+        pose: (3,).
+        goal: a `Goal`.
+        middle: [m], how far the body's middle is ahead of the rear axle.
+        curvature: [1/m], the tightest.
+        lengths: (6, 3), to work with.
+    """
+    x, y = in_frame(pose, goal, curvature)
+    if goal.has_heading:
+        words_to_pose(x, y, goal.pose[2] - pose[2], lengths)
+        best = np.inf
+        for row in range(6):
+            best = min(best, lengths[row, 0] + lengths[row, 1] + lengths[row, 2])
+        return best / curvature
+    # Once its middle is on the goal, a car comes to it by driving so far straight on.
+    return max(length_to_point(x, y) / curvature - middle, 0.0)
