@@ -1,1 +1,1 @@
-"""The simulated robots, a folder each; what is asked of one is said in `sims/robot.py`."""
+"""The simulated robots, a folder each; `sims/robot.py` declares their protocols."""

@@ -1,1 +1,1 @@
-"""The block sweep: how the arm is driven, and how exactly it has to meet a ball."""
+"""The block sweep: settings, columns and figures of an arm that blocks balls."""

@@ -1,1 +1,1 @@
-"""The catch sweep: suites, columns, table and figures of catches with a net."""
+"""The catch sweep: settings, columns, table and figures of catches with a net."""

@@ -1,1 +1,1 @@
-"""The intercept sweep: suites, columns, table and figures of a car that meets a moving target."""
+"""The sweeps of interceptions and of groups: settings, columns, table and figures."""
