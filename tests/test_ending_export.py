@@ -6,13 +6,13 @@ import jax
 import numpy as np
 import pytest
 from flown_plans import SOLVED, quadrotor, table
+from rest_referee import referee_rests, referee_stands, referee_stops
 
 import planner_jax as pj
 from planner_jax.cli.main import main
 from planner_jax.core.errors import ArgumentError, NoEnding
 from planner_jax.plane.target import TurningPath
 from planner_jax.recovery.after_plan import is_rested, with_ending
-from planner_jax.referee.rest import referee_rests, referee_stands, referee_stops
 from planner_jax.robot.arm import ArmPlan
 from planner_jax.robot.car import CarPlan
 from planner_jax.sweep import run

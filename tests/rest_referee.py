@@ -45,23 +45,14 @@ class RestVerdict(Verdict):
     worst_extra: np.ndarray  # (B,) int, place of the extra that is kept worst; -1 without any
 
 
-def referee_rests(
-    cases, plans, *, tolerance: float = 1e-3, continuity_tolerance: float = 1e-4
-) -> RestVerdict:
-    """Return the verdict on the way to rest of every plan of a batch, whatever is true of the plan.
+def referee_rests(cases, plans) -> RestVerdict:
+    """Return the verdict on the recovery trajectory of every plan of a batch.
 
     Args:
         cases: object with `gravity`, `limits` and `extras`, leaves with leading axis B.
         plans: object with the fields of `QuadrotorPlan`, with `ending`; leaves with leading axis B.
-        tolerance: relative, of every limit of the case.
-        continuity_tolerance: as of `referee_hits`.
-
-    Raises:
-        ValueError: a leaf has the wrong shape.
     """
-    judge = functools.partial(
-        _judge, extras=cases.extras, relative=tolerance, continuity=continuity_tolerance
-    )
+    judge = functools.partial(_judge, extras=cases.extras, relative=1e-3, continuity=1e-4)
     return RestVerdict(**judge_in_chunks(judge, read_flight(cases, plans), _CHUNK))
 
 
