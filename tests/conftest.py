@@ -64,7 +64,7 @@ SLOW = (
     *("b_spline", "baselines", "bezier", "block_adapt", "block_library", "block_peers"),
     *("catch_peer", "hybrid_astar", "minimum_jerk", "mpp", "paper_catch", "path_smoothing"),
     *("path_then_speed", "qp", "speed", "station_time"),
-    *("block_eye", "block_receding", "live"),
+    *("block_eye", "block_receding"),
     *("policy", "training", "learned_start"),
     "cluster",
     *("bench", "benchmark_ipopt", "intercept_oracle"),
