@@ -25,17 +25,21 @@ import os
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from flax import struct
+from jax import Array
 
 import planner_jax as pj
 from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
 from planner_jax.referee.block import BlockVerdict
-from planner_jax.robot.arm_dynamics import Torques, motion_torques
+from planner_jax.robot.arm import Arm
 from planner_jax.runs.timing import timed_plans
+from planner_jax.sims.robots.arm.dynamics import inverse_dynamics
 from planner_jax.sweep.block.settings import REGIMES
 from planner_jax.task.block.plan import BlockPlan
 from planner_jax.task.block.spec import SUITES
-from planner_jax.trajectory.polynomial import PiecewisePolynomial
+from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, total_duration
 
 PEERS = "ompl and toppra not installed: pip install 'planner-jax[arm-peers]' for rrt-connect, epase"
 # By name: the planner and its options. `direct-soonest` looks at one motion; plain ones take
@@ -67,6 +71,41 @@ TABLE_II = {
     "paper: RRT-Connect": (102.0, 130.2, 43.6, 0.35, 0.13, 0.015),
     "paper: ePA*SE": (61.4, 131.0, 39.5, 0.34, 0.11, 0.012),
 }
+
+
+@struct.dataclass
+class Torques:
+    """What the joints exert during a motion."""
+
+    rms: Array  # (6,) [N m], root of the mean square over the time
+    peak: Array  # (6,) [N m], greatest magnitude
+
+
+def motion_torques(
+    arm: Arm, motion: PiecewisePolynomial, gravity: float | Array = 9.81, samples: int = 256
+) -> Torques:
+    """Return joint torques over a motion: sqrt(1/T int tau^2 dt) as in Table II of paper 004.
+
+    The integral is that of the midpoint rule, as accelerations may jump at the ends. The paper
+    does not say whether gravity counts, nor how it samples; without gravity ask for 0.
+
+    Args:
+        arm: one arm.
+        motion: of its joints, longer than 0 s.
+        gravity: () [m/s^2], magnitude, along -z of the base frame.
+        samples: equal steps of the motion; 256 are below 4 ms up to a second.
+    """
+    shares = (np.arange(samples) + 0.5) / samples
+    duration = total_duration(motion)
+
+    def at(share: Array) -> Array:
+        angles, rates, accelerations = (evaluate(motion, share * duration, k) for k in range(3))
+        return inverse_dynamics(arm, angles, rates, accelerations, gravity)
+
+    torques = jax.vmap(at)(jnp.asarray(shares, duration.dtype))
+    return Torques(
+        rms=jnp.sqrt(jnp.mean(torques**2, axis=0)), peak=jnp.max(jnp.abs(torques), axis=0)
+    )
 
 
 @dataclasses.dataclass(frozen=True)

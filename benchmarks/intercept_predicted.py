@@ -30,11 +30,11 @@ import jax
 import numpy as np
 
 import planner_jax as pj
+from planner_jax.benchmarks.prediction_bounds import cramer_rao, share_within
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
 from planner_jax.core.protocol import is_solved
 from planner_jax.plane.prediction import select
 from planner_jax.plane.target import TurningPath
-from planner_jax.plane.turn_fit import cramer_rao, share_within
 from planner_jax.referee.intercept import InterceptVerdict
 from planner_jax.runs.summary import percent, wilson_interval
 from planner_jax.task.intercept.api import positions

@@ -13,10 +13,11 @@ import planner_jax as pj
 from planner_jax.baselines.block.free_space import FreeSpace
 from planner_jax.baselines.block.path_timing import PIECES, timed_way
 from planner_jax.baselines.parts.bang_bang import bang_bang, least_times
+from planner_jax.benchmarks.block_peers import motion_torques
 from planner_jax.core.errors import MissingExtra, install_line
 from planner_jax.robot.arm import REGIMES
-from planner_jax.robot.arm_dynamics import inverse_dynamics, motion_torques
 from planner_jax.robot.arm_mjcf import irb1600
+from planner_jax.sims.robots.arm.dynamics import inverse_dynamics
 from planner_jax.sweep.block.settings import BlockSettings
 from planner_jax.sweep.block.sweep import BlockSweep
 from planner_jax.task.block.spec import TASK
@@ -191,7 +192,7 @@ def test_without_the_extra_the_error_says_what_to_install(name, package, monkeyp
         pytest.importorskip("toppra", reason="the extra `arm-peers` is not installed")
     monkeypatch.setitem(sys.modules, package, None)
     how = re.escape(install_line("arm-peers"))
-    message = rf"^rrt-connect and epase need {package}: {how}$"
+    message = rf"^rrt-connect or epase needs {package}: {how}$"
     with pytest.raises(MissingExtra, match=message):
         pj.block.planner(name)
     others = BlockSweep(TASK).other_planners(BlockSettings(planner="online"))

@@ -11,9 +11,8 @@ from scipy.optimize import least_squares
 from scipy.special import ellipe
 from scipy.stats import ncx2
 
-from planner_jax.plane.polynomial_fit import (
-    fit_polynomial,
-)
+from planner_jax.benchmarks.prediction_bounds import cramer_rao, mean_distance, share_within
+from planner_jax.plane.polynomial_fit import fit_polynomial
 from planner_jax.plane.prediction import (
     Alternatives,
     Prediction,
@@ -24,7 +23,7 @@ from planner_jax.plane.prediction import (
     select,
 )
 from planner_jax.plane.target import PolynomialPath, TurningPath
-from planner_jax.plane.turn_fit import cramer_rao, fit_turn, mean_distance, share_within
+from planner_jax.plane.turn_fit import fit_turn
 
 TIMES = np.arange(-14.0, 1.0)
 NOISE, AHEAD = 0.1, 10.0

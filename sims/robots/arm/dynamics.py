@@ -1,21 +1,9 @@
 """Inverse dynamics of an arm: recursive Newton-Euler, its recursions written as running sums."""
 
-import jax
 import jax.numpy as jnp
-import numpy as np
-from flax import struct
 from jax import Array, lax
 
 from planner_jax.robot.arm import Arm, joint_axes, link_frames, product
-from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, total_duration
-
-
-@struct.dataclass
-class Torques:
-    """What the joints exert during a motion."""
-
-    rms: Array  # (6,) [N m], root of the mean square over the time
-    peak: Array  # (6,) [N m], greatest magnitude
 
 
 def inverse_dynamics(
@@ -57,30 +45,3 @@ def inverse_dynamics(
     moment = rate + jnp.cross(spin, momentum) + jnp.cross(positions + lever, force)
     force, moment = (lax.cumsum(each, axis=0, reverse=True) for each in (force, moment))
     return jnp.sum(axes * (moment - jnp.cross(positions, force)), axis=1)
-
-
-def motion_torques(
-    arm: Arm, motion: PiecewisePolynomial, gravity: float | Array = 9.81, samples: int = 256
-) -> Torques:
-    """Return joint torques over a motion: sqrt(1/T int tau^2 dt) as in Table II of paper 004.
-
-    The integral is that of the midpoint rule, as accelerations may jump at the ends. The paper
-    does not say whether gravity counts, nor how it samples; without gravity ask for 0.
-
-    Args:
-        arm: one arm.
-        motion: of its joints, longer than 0 s.
-        gravity: () [m/s^2], magnitude, along -z of the base frame.
-        samples: equal steps of the motion; 256 are below 4 ms up to a second.
-    """
-    shares = (np.arange(samples) + 0.5) / samples
-    duration = total_duration(motion)
-
-    def at(share: Array) -> Array:
-        angles, rates, accelerations = (evaluate(motion, share * duration, k) for k in range(3))
-        return inverse_dynamics(arm, angles, rates, accelerations, gravity)
-
-    torques = jax.vmap(at)(jnp.asarray(shares, duration.dtype))
-    return Torques(
-        rms=jnp.sqrt(jnp.mean(torques**2, axis=0)), peak=jnp.max(jnp.abs(torques), axis=0)
-    )

@@ -1,0 +1,62 @@
+"""Cramer-Rao bounds of predicted targets: the least error of an unbiased prediction."""
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.typing import ArrayLike
+
+from planner_jax.plane.observed import centre, safe_sqrt
+from planner_jax.plane.target import TurningPath, arc
+from planner_jax.plane.turn_fit import given_rate, tangent
+
+
+def cramer_rao(
+    path: TurningPath, times: ArrayLike, noise: ArrayLike, time: ArrayLike, *, turning: bool = True
+) -> Array:
+    """Return the least covariance (2, 2) [m^2] of an unbiased prediction of a position at one time.
+
+    The inverse of the exact Fisher information of place, velocity and turn rate, taken to the
+    position by its derivatives.
+
+    Args:
+        path: of the target.
+        times: (L,) [s], of the observations.
+        noise: () [m], standard deviation of a coordinate.
+        time: () [s], of the prediction.
+        turning: whether the turn rate is unknown too; False for one who knows that it is zero.
+
+    Raises:
+        ValueError: there is no room for two observations, or for three of a turn.
+    """
+    times = jnp.asarray(times)
+    seen = centre(times, jnp.zeros((*times.shape, 2)), None, 3 if turning else 2)
+    velocity = path.at(seen.middle).vel
+    fit = given_rate(seen, path.turn_rate)._replace(velocity=(velocity[0], velocity[1]))
+    variance = jnp.square(jnp.asarray(noise, seen.after.dtype))
+    after = time - seen.middle
+    moves = zip(arc(path.turn_rate, after), fit.lever, strict=True)
+    ahead, aside = (to - lever for to, lever in moves)
+    shared = variance * (1.0 / seen.total + (ahead**2 + aside**2) / fit.power)
+    bound = shared * jnp.eye(2, dtype=shared.dtype)
+    if turning:
+        slope, information = tangent(seen, fit)
+        moved = jnp.stack(slope(after))
+        bound += variance / information * moved[:, None] * moved
+    return bound
+
+
+def mean_distance(bound: Array) -> Array:
+    """Return the mean length () [m] of a Gaussian error of a covariance (2, 2) [m^2]."""
+    return np.sqrt(0.5 * np.pi) * jnp.mean(safe_sqrt(_around(bound)))
+
+
+def share_within(bound: Array, radius: ArrayLike) -> Array:
+    """Return the probability () that a Gaussian error of a covariance is within a radius [m]."""
+    return 1.0 - jnp.mean(jnp.exp(-0.5 * radius**2 / _around(bound)))
+
+
+def _around(bound: Array) -> Array:
+    """Return squares (64,) of the standard ellipse's radius at equal steps of its parameter."""
+    mean = 0.5 * (bound[0, 0] + bound[1, 1])
+    apart = safe_sqrt((0.5 * (bound[0, 0] - bound[1, 1])) ** 2 + bound[0, 1] ** 2)
+    return mean + apart * jnp.asarray(np.cos(np.arange(64) * (np.pi / 32.0)), bound.dtype)
