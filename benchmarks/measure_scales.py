@@ -30,8 +30,12 @@ from planner_jax.optimise.chain import ChainPlanner
 from planner_jax.optimise.multistart import minimise
 from planner_jax.optimise.settings import LbfgsConfig
 from planner_jax.planning.decided import first_choice
-from planner_jax.trajectory.chain import Chain, chain_motion, chain_rows
-from planner_jax.trajectory.proportional_minco import trajectory_energy
+from planner_jax.trajectory.proportional_minco import (
+    Chain,
+    chain_motion,
+    chain_rows,
+    trajectory_energy,
+)
 
 HIT_PIECES, CATCH_PIECES = (6, 12), (6,)
 

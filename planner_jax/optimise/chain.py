@@ -25,11 +25,13 @@ from planner_jax.cost.quadrotor import QuadrotorCase, flight_along, greatest_exc
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.settings import Curvature, Evaluation
 from planner_jax.optimise.shipped import StartNetwork, cheaper_start, shipped_scale
-from planner_jax.trajectory.chain import Chain, chain_rows, chain_trajectory
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 from planner_jax.trajectory.proportional_minco import (
+    Chain,
     ProportionalMinco,
     boundary_energy,
+    chain_rows,
+    chain_trajectory,
     offset_energy,
     proportional_minco,
 )

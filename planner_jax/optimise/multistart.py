@@ -20,6 +20,7 @@ from planner_jax.optimise.settings import (
     Curvature,
     Curved,
     Evaluation,
+    LbfgsConfig,
     NewtonConfig,
     Objective,
     Round,
@@ -134,7 +135,7 @@ def _given(
 
 def _method(config: Solver) -> ModuleType:
     """Return the module of a method."""
-    if not isinstance(config, NewtonConfig):
+    if isinstance(config, LbfgsConfig):
         return lbfgs
     from planner_jax.optimise import newton  # only planners that search for low costs take it
 
@@ -142,10 +143,10 @@ def _method(config: Solver) -> ModuleType:
 
 
 def _step(objective: Objective, curved: Curved | None, state: PyTree, config: Solver) -> PyTree:
-    method = _method(config)
-    if method is lbfgs:
+    if isinstance(config, LbfgsConfig):
         return lbfgs.step(objective, state, config)
-    return method.step(objective, curved or method.by_products(objective), state, config)
+    newton = _method(config)
+    return newton.step(objective, curved or newton.by_products(objective), state, config)
 
 
 def _with_stragglers(config: NewtonConfig) -> NewtonConfig:

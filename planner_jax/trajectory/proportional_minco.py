@@ -18,6 +18,10 @@ The velocities at the waypoints may be variables as well: offsets z, whitened in
 those of least energy for boundary and waypoints. z = 0 leaves the trajectory as it is without
 them, and the energy of z is another multiple of |z|^2, the same one. Such a trajectory is
 2s - 3 times differentiable.
+
+A `Chain` is N minimum-snap segments of M pieces each. The state at the end of a segment, position
+to jerk, is where the next one starts. Absent segments are computed like the others, so that one
+compiled shape serves any number of them, and count nothing.
 """
 
 import dataclasses
@@ -28,8 +32,9 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import struct
 from jax import Array, lax
-from jaxtyping import PyTree
+from jaxtyping import Bool, Float, PyTree
 
 from planner_jax.core.arithmetic import reciprocal
 from planner_jax.trajectory.polynomial import (
@@ -314,4 +319,62 @@ def proportional_trajectory(
     return PiecewisePolynomial(
         coeffs=unit / powers[None, :, None],
         durations=piece_duration * jnp.asarray(maps.proportions, rows.dtype),
+    )
+
+
+@struct.dataclass
+class Chain:
+    """Boundary rows, offsets and mean piece durations of N segments."""
+
+    rows: Float[Array, "N rows 3"]
+    offsets: Float[Array, "N offsets 3"]  # whitened
+    piece_durations: Float[Array, " N"]  # [s]
+
+    @property
+    def columns(self) -> Float[Array, "N columns 3"]:
+        """Rows and offsets together."""
+        return jnp.concatenate([self.rows, self.offsets], axis=1)
+
+
+def chain_rows(
+    head_state: Float[Array, "4 3"],
+    tail_states: Float[Array, "N 4 3"],
+    piece_durations: Float[Array, " N"],
+) -> Float[Array, "N 8 3"]:
+    """Return the boundary rows of every segment.
+
+    Args:
+        head_state: of the whole trajectory.
+        tail_states: at the end of each segment.
+        piece_durations: [s], mean of the pieces of a segment.
+    """
+    heads = jnp.concatenate([head_state[None], tail_states[:-1]])
+    return jax.vmap(boundary_rows)(heads, tail_states, piece_durations)
+
+
+def chain_motion(maps: ProportionalMinco, nodes: int, chain: Chain, orders: int = 4) -> Motion:
+    """Return samples of every segment, with the snap at 5 orders; leaves with a leading axis N."""
+    sample = functools.partial(sample_motion, maps, nodes, orders=orders)
+    return jax.vmap(sample)(chain.columns, chain.piece_durations)
+
+
+def chain_energy(maps: ProportionalMinco, chain: Chain) -> Float[Array, " N"]:
+    """Return the integral of |snap|^2 over every segment."""
+    energy = functools.partial(trajectory_energy, maps)
+    return jax.vmap(energy)(chain.rows, chain.offsets, chain.piece_durations)
+
+
+def chain_trajectory(
+    maps: ProportionalMinco, chain: Chain, active: Bool[Array, " N"]
+) -> PiecewisePolynomial:
+    """Return the trajectory of N * M pieces; pieces of absent segments stand still for no time."""
+    build = functools.partial(proportional_trajectory, maps)
+    pieces = jax.vmap(build)(chain.rows, chain.offsets, chain.piece_durations)
+    ends = chain.rows[:, maps.order, :]  # positions at the ends of the segments
+    last = ends[jnp.maximum(jnp.sum(active) - 1, 0)]
+    still = jnp.zeros_like(pieces.coeffs).at[:, :, 0].set(last)
+    coeffs = jnp.where(active[:, None, None, None], pieces.coeffs, still)
+    durations = jnp.where(active[:, None], pieces.durations, 0.0)
+    return PiecewisePolynomial(
+        coeffs=coeffs.reshape(-1, *coeffs.shape[2:]), durations=durations.ravel()
     )

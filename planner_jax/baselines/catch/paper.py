@@ -25,16 +25,14 @@ from planner_jax.task.catch.context import (
     targets_at,
 )
 from planner_jax.task.catch.plan import CatchPlan
-from planner_jax.trajectory.chain import (
+from planner_jax.trajectory.polynomial import Motion, evaluate
+from planner_jax.trajectory.proportional_minco import (
     Chain,
+    ProportionalMinco,
     chain_energy,
     chain_motion,
     chain_rows,
     chain_trajectory,
-)
-from planner_jax.trajectory.polynomial import Motion, evaluate
-from planner_jax.trajectory.proportional_minco import (
-    ProportionalMinco,
     equal_pieces,
     proportional_minco,
 )
