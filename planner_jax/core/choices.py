@@ -102,6 +102,6 @@ def require_disk(name: str, num: int, bytes_each: int, folder: str | os.PathLike
 def _require_space(name: str, num: int, bytes_each: int, free: int | None, what: str) -> None:
     """Raise `ArgumentError` unless `num` elements fit into the free bytes; None is unknown."""
     if free is not None and num * bytes_each > free:
-        sizes = f"{machine.shown(bytes_each)} each, {machine.shown(free)} free"
+        sizes = f"{machine.format_size(bytes_each)} each, {machine.format_size(free)} free"
         most = max(free // bytes_each, 1)
         raise ArgumentError(name, f"at most {most:,}, for {what} ({sizes})", num)

@@ -19,12 +19,13 @@ _CGROUP = Path("/sys/fs/cgroup")  # of a container, version 2
 
 
 def available_memory() -> int | None:
-    """Bytes that a process may still take, or None where the system does not tell."""
+    """Return the bytes that a process may still allocate; None if unknown."""
     found = [each for each in (_of_system(), _of_container()) if each is not None]
     return min(found, default=None)
 
 
 def _of_system() -> int | None:
+    """Return the free memory of the system."""
     try:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
     except OSError:
@@ -37,6 +38,7 @@ def _of_system() -> int | None:
 
 
 def _of_container() -> int | None:
+    """Return the free memory of the container; None outside of one."""
     try:
         most = (_CGROUP / "memory.max").read_text(encoding="ascii").strip()
         taken = int((_CGROUP / "memory.current").read_text(encoding="ascii"))
@@ -59,8 +61,8 @@ def free_disk(folder: str | os.PathLike) -> int | None:
     return disk.free if disk.total else None  # some of the system's own folders have no disk
 
 
-def shown(size: float) -> str:
-    """A number of bytes, to read."""
+def format_size(size: float) -> str:
+    """Return a number of bytes as text with a unit."""
     for unit in ("B", "kB", "MB", "GB"):
         if size < 1e3:
             return f"{size:.3g} {unit}"
@@ -69,7 +71,7 @@ def shown(size: float) -> str:
 
 
 def resident_memory() -> int | None:
-    """Bytes that this process holds in memory now, or None where the system does not tell."""
+    """Return the bytes that this process holds in memory; None if unknown."""
     try:
         pages = Path("/proc/self/statm").read_text(encoding="ascii").split()[1]
     except OSError:
@@ -81,28 +83,30 @@ _VECTORS = ("avx512f", "avx2", "avx", "sve2", "sve", "asimd")  # the widest firs
 
 
 def usable_cores() -> int:
-    """Cores that this process may use, which can be fewer than the machine has."""
-    if hasattr(os, "sched_getaffinity"):
+    """Return the number of cores that this process may use; the machine may have more."""
+    try:
         return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    except AttributeError:  # another system than Linux
+        return os.cpu_count() or 1
 
 
-@functools.cache  # what the environment says later, JAX does not hear
+@functools.cache  # JAX reads the environment once
 def threads_of_a_computation() -> int:
-    """Threads that XLA has for one computation on a CPU; on some CPUs their number decides digits.
+    """Return the number of threads that XLA has for one computation on a CPU.
 
-    As PJRT_NPROC or NPROC says when JAX begins, or else one for each usable core. To be asked for
-    once JAX has begun, or when it is about to.
+    The environment variable PJRT_NPROC or NPROC sets it; by default it is one for each usable core.
+    On some CPUs it decides the last digits. Call this function when JAX has started, or is about
+    to start.
     """
-    told = os.environ.get("PJRT_NPROC") or os.environ.get("NPROC", "")
-    return max(int(told), 1) if told.isdecimal() else usable_cores()
+    number = os.environ.get("PJRT_NPROC") or os.environ.get("NPROC", "")
+    return max(int(number), 1) if number.isdecimal() else usable_cores()
 
 
 @functools.cache
 def processor() -> str:
-    """The processor's name, with the widest vectors that it computes in, as the system tells them.
+    """Return the name of the processor and its widest vectors.
 
-    By both NumPy and XLA choose how they compute, and with it the last digits.
+    NumPy and XLA choose by both how they compute, and so the last digits.
     """
     entries: dict[str, str] = {}
     try:

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import jax
 import numpy as np
 
-from planner_jax.host.machine import resident_memory, shown
+from planner_jax.host.machine import format_size, resident_memory
 from planner_jax.live.packets import Fault
 
 _SHORTEST = 1e-6  # [s]
@@ -107,7 +107,7 @@ class Report:
             lines.append(f"{words:<32} {stage.num:>9,}{shown_times if stage.num else ''}")
         before, now = self._memory, resident_memory()
         if before is not None and now is not None:
-            lines += ["", f"memory {shown(before)} at the start, {shown(now)} now"]
+            lines += ["", f"memory {format_size(before)} at the start, {format_size(now)} now"]
         lines.append(f"farthest off course {self.tracking:.3f} m")
         lines.append(f"compiled after the start: {self.compiled}")
         return lines

@@ -75,7 +75,7 @@ def minimise_lanes(
     config: Solver,
     curved: Callable[[Array, PyTree], Curvature] | None = None,
 ) -> Optimum:
-    """`minimise` on many lanes, each with its own start and context.
+    """Minimise on many lanes, each with its own start and context.
 
     Args:
         objective: of one point (n,) and one context.
@@ -150,7 +150,7 @@ def _step(objective: Objective, curved: Curved | None, state: PyTree, config: So
 
 
 def _with_stragglers(config: NewtonConfig) -> NewtonConfig:
-    """The iterations of a lane that goes on as long as it may."""
+    """Return the settings with the iterations of a straggler."""
     if config.stragglers is None:
         return config
     _, steps, groups = config.stragglers
@@ -167,7 +167,7 @@ def _optimum_of(state: PyTree, config: Solver) -> Optimum:
 
 
 def _optimum_at(point: Array, evaluation: Evaluation, config: Solver) -> Optimum:
-    """The start itself."""
+    """Return the start itself as the optimum."""
     stationary = jnp.full((), config.patience == 0)
     return Optimum(point, evaluation, jnp.zeros((), jnp.int32), stationary)
 
@@ -214,7 +214,7 @@ def solve_round(planner: "OptimisedPlanner", attempt: Round, case: PyTree) -> Py
 
 
 def solve_batch(planner: "OptimisedPlanner", attempt: Round, cases: PyTree) -> PyTree:
-    """`solve_round` on a batch, the lanes of which end at their own times.
+    """Plan a batch of cases with one round's starts and iterations; pure.
 
     Args:
         planner: the problem; what it has of arrays is shared by all lanes.
@@ -222,7 +222,7 @@ def solve_batch(planner: "OptimisedPlanner", attempt: Round, cases: PyTree) -> P
         cases: B of them, a leading axis on every leaf.
 
     Returns:
-        Their plans, a leading axis on every leaf.
+        The plans, with a leading axis on every leaf.
     """
     last, num = planner.changed(attempt.settings), attempt.starts
     lanes = jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), cases)
@@ -255,31 +255,31 @@ def solve_batch(planner: "OptimisedPlanner", attempt: Round, cases: PyTree) -> P
 
 
 def _stages(attempt: Round) -> tuple[Stage, ...]:
-    """The searches, one after another, the round's own last."""
+    """Return the searches in their order; the last is the search of the round itself."""
     return (*attempt.stages, Stage(attempt.solver, attempt.settings))
 
 
 def _of_each(function: Callable, starts: PyTree) -> PyTree:
-    """`function` of every start, without a batch where there is one alone."""
+    """Return a function of every start, without a batch where there is only one."""
     if len(jax.tree.leaves(starts)[0]) > 1:
         return jax.vmap(function)(starts)
     return jax.tree.map(lambda leaf: leaf[None], function(jax.tree.map(lambda x: x[0], starts)))
 
 
 def _repeated(contexts: PyTree, num: int) -> PyTree:
-    """The context of every start, that of each case `num` times."""
+    """Return the context of every start: the context of each case `num` times."""
     if num == 1:
         return contexts
     return jax.tree.map(lambda x: jnp.repeat(x, num, axis=-1), contexts)
 
 
 def _cheapest(costs: Array, num: int) -> Array:
-    """Which starts of a case cost least, (num,) of costs (S,); a cost that is not finite, most."""
+    """Return the indices (num,) of the least of costs (S,); costs that are not finite come last."""
     return jnp.argsort(jnp.where(jnp.isfinite(costs), costs, jnp.inf))[:num]
 
 
 def _plan_at(planner: "OptimisedPlanner", optimum: Optimum, context: PyTree) -> PyTree:
-    """The plan of one optimum."""
+    """Return the plan of one optimum."""
     plan = planner.decode(optimum.point, context)
     cost = optimum.evaluation.cost
     status = status_of(cost, plan.violation, optimum.stationary)
@@ -289,6 +289,6 @@ def _plan_at(planner: "OptimisedPlanner", optimum: Optimum, context: PyTree) -> 
 
 
 def _best(plans: PyTree) -> PyTree:
-    """Return the plan that is selected of those of several starts."""
+    """Return the plan that is selected from the plans of several starts."""
     best = index_of_best(plans)
     return jax.tree.map(lambda leaf: leaf[best], plans)

@@ -1,4 +1,4 @@
-"""The planner that minimises: what it is to write, and what it gets for that."""
+"""Planners that minimise: the functions that a subclass defines, and those that it inherits."""
 
 import abc
 import dataclasses
@@ -45,7 +45,7 @@ _EFFORTS = {
 
 
 def pending(violation: Array) -> dict[str, PyTree]:
-    """The fields that every `Plan` has, before the solver fills in all but the violation."""
+    """Return the fields of a `Plan` before the solver sets all of them but the violation."""
     zero = jnp.zeros((), jnp.int32)
     return {
         "cost": jnp.zeros_like(violation),
@@ -70,21 +70,21 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
 
     @abc.abstractmethod
     def prepare(self, case: PyTree) -> PyTree:
-        """What every evaluation needs and none changes, such as the ball's path table."""
+        """Return what every evaluation reads, such as the table of the ball's path."""
 
     @abc.abstractmethod
     def guesses(self, context: PyTree, num: int) -> Array:
-        """The first `num` starting points, (num, n), best first."""
+        """Return the first `num` starting points, (num, n), best first."""
 
     @abc.abstractmethod
     def objective(self, point: Array, context: PyTree) -> Evaluation:
-        """Cost and largest violation at a point (n,)."""
+        """Return cost and largest violation at a point (n,)."""
 
     def curved(self, point: Array, context: PyTree) -> Curvature:
-        """Evaluation at a point (n,), gradient (n,), and products with the Hessian.
+        """Return what Newton's method takes at a point (n,).
 
-        What Newton's method takes. By default each product is a derivative of the gradient, and
-        nothing is known for a preconditioner.
+        By default each product with the Hessian is a derivative of the gradient, and nothing is
+        known for a preconditioner.
         """
         from planner_jax.optimise.newton import by_products  # only planners that polish need it
 
@@ -92,20 +92,22 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
 
     @abc.abstractmethod
     def decode(self, point: Array, context: PyTree) -> PyTree:
-        """The plan at a point (n,), its violation looked at more closely.
+        """Return the plan at a point (n,), with its violation computed more exactly.
 
         The solver fills in `cost`, `iterations` and `status`; until then they are `pending`.
         """
 
     def rules_out(self, context: PyTree) -> Array:
-        """Whether no plan can exist, by a bound that none can beat, () bool; never, by default."""
+        """Return whether a bound proves that no plan exists, () bool; never by default.
+
+        Such a case has the status `TOO_FAR` unless it is solved, and no further attempt is made.
+        """
         return jnp.zeros((), bool)
 
     def carried(self, point: Array, before: Self) -> Array:
-        """A point (n,) of `before`, this planner with other settings, as one of this planner.
+        """Return a point (n,) of `before`, this planner with other settings, in own variables.
 
-        Where the settings leave the variables what they are it is the same; only a planner whose
-        settings change its variables has anything to do.
+        The point is the same unless the settings change the variables of the planner.
         """
         return point
 
@@ -115,11 +117,11 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         return self.rounds
 
     def solve(self, case: PyTree, attempt: Round) -> PyTree:
-        """The plan of one case by one round."""
+        """Return the plan of one case by one round."""
         return solve_round(self, attempt, case)
 
     def solve_lanes(self, cases: PyTree, attempt: Round) -> PyTree:
-        """The plans of a batch by one round."""
+        """Return the plans of a batch by one round."""
         return solve_batch(self, attempt, cases)
 
     def settle(
@@ -129,7 +131,7 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         return self, cases
 
     def plan_shapes(self, cases: PyTree) -> PyTree:
-        """What plans (B, ...) of cases (B, ...) look like, leaves `jax.ShapeDtypeStruct`.
+        """Return the shapes of plans (B, ...) of cases (B, ...); leaves are `jax.ShapeDtypeStruct`.
 
         Args:
             cases: leaves may be `jax.ShapeDtypeStruct`, too.
@@ -142,15 +144,19 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         return jax.eval_shape(jax.vmap(plan), cases)
 
     def changed(self, settings: Settings) -> Self:
-        """The planner with some of its fields set anew; its plans keep their shape."""
+        """Return the planner with other values of some fields; its plans keep their shape."""
         return dataclasses.replace(self, **dict(settings))  # type: ignore[type-var]
 
     def with_solver(self, solver: Solver = _LONG) -> Self:
-        """The planner with one search from the first guess instead of its rounds, a long one."""
+        """Return the planner with one long search from the first guess in place of its rounds."""
         return self.changed((("rounds", (Round(solver=solver),)),))
 
     def polished(self, solver: NewtonConfig | None = None) -> Self:
-        """The planner whose first round goes on by Newton's method, to the optimum by default."""
+        """Return the planner whose first round continues by Newton's method.
+
+        Args:
+            solver: settings of the method; by default it continues to the optimum.
+        """
         if solver is None:
             solver = self._suited(_POLISH)
         first, *others = self.rounds
@@ -159,7 +165,7 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         return self.changed((("rounds", (first, *others)),))
 
     def with_effort(self, effort: str) -> Self:
-        """The planner with another first round, which searches on after every limit holds.
+        """Return the planner with a first round that searches on after every limit holds.
 
         Args:
             effort: "good" for an iteration of Newton's method, "best" for 8, and more of the cases
@@ -169,5 +175,5 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         return self.polished(self._suited(_EFFORTS[effort]))
 
     def _suited(self, solver: NewtonConfig) -> NewtonConfig:
-        """With as many vectors as the planner's preconditioner leaves to be searched."""
+        """Return the settings with the number of vectors that the preconditioner needs."""
         return dataclasses.replace(solver, subspace=self.subspace)
