@@ -12,6 +12,7 @@ from flax import struct
 from planner_jax.core.checks import require_number
 from planner_jax.core.choices import require_size
 from planner_jax.core.errors import ArgumentTypeError
+from planner_jax.core.rules import NOT_NEGATIVE, POSITIVE
 from planner_jax.policies.checkpoint import checkpoint_of
 from planner_jax.policies.networks import LEAST_STD
 from planner_jax.policies.observation import PER_TARGET, STRETCH, choice_of, observe
@@ -41,8 +42,8 @@ class Policy(CatchDecision):
 
     def __post_init__(self) -> None:
         require_size("proposals", self.proposals)
-        require_number("spread", self.spread, "finite and >= 0", lambda x: x >= 0.0)
-        require_number("stretch", self.stretch, "finite and > 0", lambda x: x > 0.0)
+        require_number("spread", self.spread, NOT_NEGATIVE)
+        require_number("stretch", self.stretch, POSITIVE)
         if not callable(getattr(self.network, "apply", None)):
             raise ArgumentTypeError("network", "a Flax module", self.network)
 

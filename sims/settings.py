@@ -348,7 +348,7 @@ class BlockFly(FlySettings):
             from planner_jax.task.block import draw
 
             planner = BLOCK.make_planner(self.planner, {})
-            planner.check(draw(1, self.suite, regime=self.regime))
+            planner.check(draw(1, self.suite, regime=self.regime))  # type: ignore[attr-defined]
         return super().flight()
 
     def check_rate(self) -> None:

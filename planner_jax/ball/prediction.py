@@ -18,7 +18,7 @@ from planner_jax.ball.flight import BallState, require_ball, rk4_step
 from planner_jax.core.arithmetic import reciprocal
 from planner_jax.core.checks import require_kind, require_number, require_scalar
 from planner_jax.core.choices import require_size
-from planner_jax.core.rules import POSITIVE, Field, Table
+from planner_jax.core.rules import NOT_NEGATIVE, POSITIVE, Field, Table
 from planner_jax.lanes import with_kernel
 
 LEAST_NODES = 5  # of a table
@@ -58,8 +58,8 @@ def predict_path(
     """
     require_size("num_nodes", num_nodes, LEAST_NODES)
     require_ball(ball)
-    require_number("horizon", horizon, "finite and > 0", lambda x: x > 0.0)
-    require_number("drag", drag, "finite and >= 0", lambda x: x >= 0.0)
+    require_number("horizon", horizon, POSITIVE)
+    require_number("drag", drag, NOT_NEGATIVE)
     require_number("gravity", gravity)
     resolution = horizon / (num_nodes - 3)
     pos, vel = _integrated(num_nodes)(ball.pos, ball.vel, resolution, drag, gravity)

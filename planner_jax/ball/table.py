@@ -14,6 +14,7 @@ from planner_jax.core.arithmetic import Numbers
 from planner_jax.core.checks import floating, require_number, shape_of
 from planner_jax.core.choices import require_size
 from planner_jax.core.errors import ArgumentError
+from planner_jax.core.rules import POSITIVE
 
 MOST_NODES = 4096  # that are chosen for a path
 _CHECKED = (0.2, 0.5, 0.8)  # shares of the way between two nodes, where errors are looked for
@@ -122,7 +123,7 @@ def _fewest_nodes(times: np.ndarray, values: list[PyTree], error: float) -> int:
     """A power of two of nodes with which the table is as near to the spline as it has to be."""
     if any(isinstance(value, Tracer) for value in values):
         raise ArgumentError("nodes", "given where positions are traced", shown="none")
-    require_number("error", error, "finite and > 0", lambda value: value > 0.0)
+    require_number("error", error, POSITIVE)
     nodes, worst = 16, np.inf
     while nodes <= MOST_NODES:
         resolution = times[-1] / (nodes - 3)

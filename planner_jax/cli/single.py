@@ -21,7 +21,8 @@ from planner_jax.runs.environment import require_backend
 from planner_jax.runs.settings import ending_options, require_ending
 
 if TYPE_CHECKING:
-    from planner_jax.core.protocol import Case, Plan
+    from planner_jax.core.protocol import Plan
+    from planner_jax.core.rules import Case
     from planner_jax.sweep.single import Answer
 
 

@@ -4,6 +4,8 @@ XLA compiles a division, a root or a sum into a loop of its own, and one small p
 for the number of loops, not for what they compute.
 """
 
+from types import ModuleType
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,6 +22,11 @@ def host_leaf(value: object, dtype: DTypeLike | None = None) -> Array:
 
 
 Numbers = Array | np.ndarray
+
+
+def numpy_of(*arrays: object) -> ModuleType:
+    """Return `jax.numpy` if one of the arrays is a jax array, otherwise `numpy`."""
+    return jnp if any(isinstance(each, jax.Array) for each in arrays) else np
 
 
 @jax.custom_jvp

@@ -60,8 +60,8 @@ def require_size(name: str, value: object, least: int = 1) -> None:
     """Raise unless an argument is a whole number that is neither too small nor beyond 64 bits."""
     if isinstance(value, bool) or not isinstance(value, Integral):
         raise ArgumentTypeError(name, "a whole number", value)
-    require(value >= least, name, f">= {least}", value)
-    require(value < 2**63, name, "< 2**63", value)
+    require(int(value) >= least, name, f">= {least}", value)
+    require(int(value) < 2**63, name, "< 2**63", value)
 
 
 def require_seed(value: object) -> None:

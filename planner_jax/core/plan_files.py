@@ -9,16 +9,18 @@ import typing
 import zipfile
 import zlib
 from collections.abc import Sequence
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
+from jaxtyping import PyTree
 
 from planner_jax.core.checks import require_path_name
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
+from planner_jax.core.rules import nodes_of
 from planner_jax.host.files import open_plain, replacing
 
 VERSION = 1
-# What NumPy and the archive that it reads may raise of a damaged file.
+# Exceptions of NumPy and of the archive's reader on a damaged file.
 UNREADABLE = (
     *(OSError, ValueError, KeyError, TypeError, EOFError, RuntimeError, MemoryError),
     *(zipfile.BadZipFile, zlib.error, struct.error),
@@ -31,32 +33,32 @@ class PlanFileError(ArgumentError):
     """A file cannot be read as plans; one line that names the file."""
 
 
-def save_arrays(path: str | os.PathLike, tree: Any) -> None:
-    """Write a dataclass, the leaves of which are arrays or such dataclasses, whole or not at all.
+def save_arrays(path: str | os.PathLike, tree: PyTree) -> None:
+    """Write a dataclass, whose leaves are arrays or such dataclasses, whole or not at all.
 
     Args:
         path: of the file; its name is taken as it is.
         tree: the dataclass.
 
     Raises:
-        TypeError: a leaf is not an array of numbers, or the path is none.
+        ArgumentTypeError: a leaf is not an array of numbers, or `path` is not a path.
     """
     require_path_name("path", path)
     header = json.dumps({"version": VERSION, "class": type(tree).__name__})
-    arrays: dict[str, Any] = {name: np.asarray(leaf) for name, leaf in named_leaves(tree).items()}
+    arrays = {name: np.asarray(leaf) for name, leaf in named_leaves(tree).items()}
     for name, array in arrays.items():
         if array.dtype.kind in "OSU":  # objects NumPy would pickle
             raise ArgumentTypeError(name, "an array of numbers", shown=str(array.dtype))
     with replacing(path) as scratch, open(scratch, "wb") as file:
-        np.savez(file, **{_HEADER: np.array(header), **arrays})
+        np.savez(file, **{_HEADER: np.array(header), **arrays})  # type: ignore[arg-type]
 
 
 def load_arrays(path: str | os.PathLike, kind: type[Kind]) -> Kind:
-    """The dataclass that `save_arrays` wrote, NumPy leaves.
+    """Return the dataclass that `save_arrays` wrote, with NumPy leaves.
 
     Raises:
         PlanFileError: the file is something else, of another class or of another version.
-        TypeError: the path is none.
+        ArgumentTypeError: `path` is not a path.
     """
     require_path_name("path", path)
     version, name, arrays = _read(path)
@@ -76,9 +78,9 @@ def load_arrays(path: str | os.PathLike, kind: type[Kind]) -> Kind:
 
 
 def load_fitting(path: str | os.PathLike, kinds: Sequence[type[Kind]]) -> Kind:
-    """What `save_arrays` wrote, as the first of some classes all of whose fields the file has.
+    """Return the first of some classes whose fields are all in a file of `save_arrays`.
 
-    A class that was derived from one of them is read as that one, without its own fields.
+    A file of a derived class is read as its base class, without the fields of the derived class.
 
     Raises:
         PlanFileError: the file is something else, of none of the classes or of another version.
@@ -96,8 +98,8 @@ def load_fitting(path: str | os.PathLike, kinds: Sequence[type[Kind]]) -> Kind:
     )
 
 
-def _read(path: str | os.PathLike) -> tuple[Any, Any, dict[str, np.ndarray]]:
-    """Version and name of the class in a file, and its arrays.
+def _read(path: str | os.PathLike) -> tuple[object, object, dict[str, np.ndarray]]:
+    """Return version and name of the class in a file, and its arrays.
 
     Raises:
         PlanFileError: the file is something else.
@@ -117,25 +119,24 @@ def _read(path: str | os.PathLike) -> tuple[Any, Any, dict[str, np.ndarray]]:
     return version, name, arrays
 
 
-def named_leaves(tree: Any, prefix: str = "") -> dict[str, Any]:
-    """The arrays of a dataclass by their names, joined by dots; without what is static or None."""
-    named = {}
-    for field in dataclasses.fields(tree):
-        if field.metadata.get("pytree_node", True):
-            value = getattr(tree, field.name)
-            place = prefix + field.name
-            if value is None and field.default is None:
-                continue
-            inner = dataclasses.is_dataclass(value)
-            named |= named_leaves(value, f"{place}.") if inner else {place: value}
-    return named
+def named_leaves(tree: PyTree, prefix: str = "") -> dict[str, PyTree]:
+    """Return the arrays of a dataclass by names joined by dots, without static fields and None."""
+    leaves = {}
+    defaults = {field.name: field.default for field in dataclasses.fields(tree)}
+    for name, value in nodes_of(tree).items():
+        place = prefix + name
+        if value is None and defaults[name] is None:
+            continue
+        inner = dataclasses.is_dataclass(value)
+        leaves |= named_leaves(value, f"{place}.") if inner else {place: value}
+    return leaves
 
 
-def build_tree(kind: Any, prefix: str, arrays: dict[str, Any]) -> Any:
+def build_tree(kind: type[Kind], prefix: str, arrays: dict[str, PyTree]) -> Kind:
     """Build a dataclass from the arrays named as its fields, which are removed from `arrays`."""
     types = typing.get_type_hints(kind)
     values = {}
-    for field in dataclasses.fields(kind):
+    for field in dataclasses.fields(kind):  # type: ignore[arg-type]
         inner, place = types[field.name], prefix + field.name
         if type(None) in typing.get_args(inner):
             inner = next(each for each in typing.get_args(inner) if each is not type(None))

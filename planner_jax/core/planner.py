@@ -8,7 +8,7 @@ frozen dataclass of sizes and switches alone becomes a pytree by `jax.tree_util.
 import enum
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, Generic, Protocol, TypeVar
+from typing import ClassVar, Generic, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,8 @@ from jax.extend.backend import backends
 from jaxtyping import PyTree
 
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
-from planner_jax.core.protocol import Attempt, Case, Plan
+from planner_jax.core.protocol import Attempt, Plan
+from planner_jax.core.rules import Case
 
 CaseT = TypeVar("CaseT", bound=Case)
 PlanT = TypeVar("PlanT", bound=Plan)
@@ -82,7 +83,7 @@ class Planner(Generic[CaseT, PlanT]):
     # long as another: in step, all cases would wait for the slowest one.
     is_sequential: ClassVar[bool] = False
 
-    def __init_subclass__(cls, **options: Any) -> None:
+    def __init_subclass__(cls, **options: object) -> None:
         super().__init_subclass__(**options)
         if cls.plan_by is not Planner.plan_by:
             cls.kind = Kind.COMPOSITE
@@ -101,11 +102,11 @@ class Planner(Generic[CaseT, PlanT]):
         """The planner that a planner around another one calls; otherwise the planner itself."""
         return self
 
-    def solve(self, case: CaseT, attempt: Any, /) -> PlanT:
+    def solve(self, case: CaseT, attempt: PyTree, /) -> PlanT:
         """Return the plan that one attempt makes of one case; pure."""
         raise NotImplementedError
 
-    def solve_lanes(self, cases: CaseT, attempt: Any, /) -> PlanT:
+    def solve_lanes(self, cases: CaseT, attempt: PyTree, /) -> PlanT:
         """Return the plans that one attempt makes of a batch; pure."""
         if not self.is_sequential:
             return self.solve_at_once(cases, attempt)
@@ -116,11 +117,11 @@ class Planner(Generic[CaseT, PlanT]):
             cases, cpu=in_turn, default=lambda cases: self.solve_at_once(cases, attempt)
         )
 
-    def solve_at_once(self, cases: CaseT, attempt: Any, /) -> PlanT:
+    def solve_at_once(self, cases: CaseT, attempt: PyTree, /) -> PlanT:
         """Return the plans that one attempt makes of a batch, all cases in step; pure."""
         return jax.vmap(lambda case: self.solve(case, attempt))(cases)
 
-    def solve_on_host(self, cases: CaseT, attempt: Any, /) -> PlanT:
+    def solve_on_host(self, cases: CaseT, attempt: PyTree, /) -> PlanT:
         """Return the plans that one attempt makes of a batch; NumPy leaves in and out."""
         raise NotImplementedError
 
@@ -136,7 +137,7 @@ class Planner(Generic[CaseT, PlanT]):
         """Return the planner that continues from plans of this one; see `pj.replan`."""
         return self
 
-    def begin(self, *args: Any, **news: Any) -> Case:
+    def begin(self, *args: PyTree, **news: PyTree) -> Case:
         """Return what is left of cases some time into their plans; see `pj.replan`.
 
         A re-planner takes the cases, the previous plans, the time since these began, and by name

@@ -1,10 +1,10 @@
-"""What comes back for every case, which plan is selected, and what planners are made of."""
+"""Plans, the rule that selects one of them, and attempts and decisions of planners."""
 
 import dataclasses
 import enum
 import os
 from collections.abc import Callable
-from typing import Any, Protocol, Self, TypeVar, runtime_checkable
+from typing import Protocol, Self, TypeVar, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -13,14 +13,21 @@ from flax import struct
 from jax import Array, lax
 from jaxtyping import PyTree
 
+from planner_jax.core.arithmetic import Numbers, numpy_of
 from planner_jax.core.checks import numeric, require_kind, require_number, require_switch
 from planner_jax.core.choices import require_size
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError, format_value
-from planner_jax.core.rules import has_rules, is_sound
+from planner_jax.core.rules import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    fields_of,
+    has_rules,
+    is_sound,
+)
 
 
 class Status(enum.IntEnum):
-    """What became of one case; `message` says what it means and what to do about it."""
+    """Outcome of one case; `message` explains it and names a remedy."""
 
     CONVERGED = 0
     FEASIBLE = 1
@@ -40,8 +47,8 @@ class Status(enum.IntEnum):
         return _MESSAGES[self]
 
     @classmethod
-    def _missing_(cls, value: Any) -> "Status | None":
-        """The status that a jax array of one number holds; arrays are no keys of the lookup."""
+    def _missing_(cls, value: object) -> "Status | None":
+        """Return the status in a jax array of one number, which cannot be a key of the lookup."""
         return next((status for status in cls if status == value), None)
 
 
@@ -61,15 +68,15 @@ _MESSAGES = {
 }
 
 
-def is_solved(status: Any) -> Any:
-    """Which statuses are those of a plan that meets every limit the planner looked at."""
-    return (status == Status.CONVERGED) | (status == Status.FEASIBLE)
+def is_solved(status: Numbers | int) -> Array:
+    """Return which statuses belong to plans that keep every limit of their planner, bool."""
+    return (status == Status.CONVERGED) | (status == Status.FEASIBLE)  # type: ignore[return-value]
 
 
-def is_unsolved(status: Any) -> Any:
-    """Which statuses are worth another attempt: not solved, but neither broken nor hopeless."""
+def is_unsolved(status: Numbers | int) -> Array:
+    """Return which statuses are worth another attempt: not solved, not broken, not hopeless."""
     worth = (status == Status.INFEASIBLE) | (status == Status.MAX_STEPS)
-    return worth | (status == Status.OUT_OF_REACH)
+    return worth | (status == Status.OUT_OF_REACH)  # type: ignore[return-value]
 
 
 # Plans are refereed to 1e-3 of a limit; half of that is left for peaks between samples.
@@ -77,7 +84,7 @@ FEASIBILITY_TOLERANCE = 5e-4
 
 
 def status_of(cost: Array, violation: Array, stationary: Array | bool) -> Array:
-    """The `Status` of a finished case, () int32."""
+    """Return the `Status` of a finished case, () int32."""
     feasible = violation <= FEASIBILITY_TOLERANCE
     status = jnp.where(
         feasible,
@@ -88,8 +95,8 @@ def status_of(cost: Array, violation: Array, stationary: Array | bool) -> Array:
     return jnp.where(finite, status, Status.NON_FINITE).astype(jnp.int32)
 
 
-def outcome(cost: Array, violation: Array, *, stationary: Array | bool = True) -> dict[str, Any]:
-    """The fields that every `Plan` has, of a planner that does not iterate.
+def outcome(cost: Array, violation: Array, *, stationary: Array | bool = True) -> dict[str, PyTree]:
+    """Return the fields that every `Plan` has, of a planner that does not iterate.
 
     Args:
         cost: (), the planner's own objective.
@@ -106,7 +113,7 @@ def outcome(cost: Array, violation: Array, *, stationary: Array | bool = True) -
 
 @struct.dataclass
 class Plan:
-    """What every planner gives back: the outcome; a task's own plan adds the motion.
+    """The outcome of planning; the plans of tasks add the motion.
 
     One plan, or a batch of them with a leading axis on every leaf.
     """
@@ -124,44 +131,35 @@ class Plan:
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> Self:
-        """The plan or batch that `save` wrote, NumPy leaves.
+        """Return the plan or batch that `save` wrote, with NumPy leaves.
 
         Raises:
-            PlanFileError: the file is not one of plans, or of another class or version; one line.
+            PlanFileError: the file does not hold plans, or plans of another class or version.
         """
         from planner_jax.core.plan_files import load_arrays
 
         return load_arrays(path, cls)
 
 
-@runtime_checkable
-class Case(Protocol):
-    """A pytree of arrays for one case, or for a batch with a leading axis on every leaf."""
-
-    @property
-    def batch_shape(self) -> tuple[int, ...]:
-        """() for one case, (B,) for a batch."""
-        ...
-
-
-def require_settings(planner: Any) -> None:
-    """Raise unless every field of a planner, a dataclass, is of the kind that its default is.
+def require_settings(planner: PyTree) -> None:
+    """Raise unless every field of a planner, a dataclass, is of the kind of its default.
 
     Sizes are whole numbers of 1 or more, 0 only where that is the default; weights and times are
     finite, and not negative where the default is not; attempts are one or more.
 
     Raises:
-        TypeError: a field is of another kind.
-        ValueError: a field is too small, not finite, or has no attempt.
+        ArgumentTypeError: a field is of another kind.
+        ArgumentError: a field is too small, not finite, or has no attempt.
     """
-    for field in dataclasses.fields(planner):
-        name, value, usual = field.name, getattr(planner, field.name), field.default
+    defaults = {field.name: field.default for field in dataclasses.fields(planner)}
+    for name, value in fields_of(planner).items():
+        usual = defaults[name]
         if isinstance(usual, bool):
             require_switch(name, value)
         elif isinstance(usual, int):
             require_size(name, value, min(usual, 1))
         elif isinstance(usual, float) and usual >= 0.0:
-            require_number(name, value, "finite and >= 0", lambda x: x >= 0.0)
+            require_number(name, value, NOT_NEGATIVE)
         elif isinstance(usual, float):
             require_number(name, value)
         elif isinstance(usual, tuple) and usual and isinstance(usual[0], Attempt):
@@ -173,12 +171,12 @@ def require_settings(planner: Any) -> None:
             require_kind(name, value, type(usual))
 
 
-def require_attempts(name: str, value: Any, kind: type) -> None:
-    """Raise unless a setting is a tuple of attempts of a class, one or more.
+def require_attempts(name: str, value: object, kind: type) -> None:
+    """Raise unless a setting is a tuple of one or more attempts of a class.
 
     Raises:
-        TypeError: it is something else.
-        ValueError: it has none.
+        ArgumentTypeError: it is something else.
+        ArgumentError: it is empty.
     """
     if not isinstance(value, tuple) or not all(isinstance(each, kind) for each in value):
         raise ArgumentTypeError(name, f"a tuple of {kind.__name__}", format_value(value))
@@ -190,17 +188,17 @@ def require_attempts(name: str, value: Any, kind: type) -> None:
 class Attempt:
     """One try at the cases that earlier tries left unsolved; static under jit."""
 
-    starts: int = 1  # places that one case takes in a batch
+    starts: int = 1  # lanes that one case takes in a batch
     # Cases that earlier attempts left with a greater violation are not tried; None: all are.
     within: float | None = dataclasses.field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         require_size("starts", self.starts)
         if self.within is not None:
-            require_number("within", self.within, "finite and > 0", lambda x: x > 0.0)
+            require_number("within", self.within, POSITIVE)
 
-    def is_due(self, plans: "Plan") -> Any:
-        """Which of the plans so far it is to try and better."""
+    def is_due(self, plans: "Plan") -> Array:
+        """Return which of the plans so far this attempt may improve."""
         unsolved = is_unsolved(plans.status)
         return unsolved if self.within is None else unsolved & (plans.violation <= self.within)
 
@@ -210,80 +208,79 @@ PlanT = TypeVar("PlanT", bound=Plan)
 
 @runtime_checkable
 class Decision(Protocol):
-    """Settles what a case leaves open, such as an order; a pytree, as planners are.
+    """A rule that decides what a case leaves open, such as an order; a pytree, as planners are.
 
-    Best of all orders, a network's answer and what was given are all of this kind.
+    Examples are the best of all orders, the output of a network, and a fixed order.
     """
 
-    def check(self, cases: Any, /) -> None:
-        """Raise `ValueError` for a batch about which this cannot decide; on the host."""
+    def check(self, cases: PyTree, /) -> None:
+        """Raise `ArgumentError` for a batch about which this cannot decide; on the host."""
         ...
 
-    def propose(self, case: Any, /) -> Any:
-        """Choices for one case, best first, that `case.decided` takes; leaves (F, ...); pure."""
+    def propose(self, case: PyTree, /) -> PyTree:
+        """Return choices for one case, best first, for `case.decided`; leaves (F, ...); pure."""
         ...
 
-    def rank(self, plans: Any, /) -> Array:
-        """What is least for the choice whose plan is to be kept, one number a plan; pure.
+    def rank(self, plans: PyTree, /) -> Array:
+        """Return one number a plan, which is least for the plan that is selected; pure.
 
-        It takes plans of any batch shape, in NumPy or jax arrays.
+        The plans have any batch shape, in NumPy or jax arrays.
         """
         ...
 
-    def explain(self, case: Any, status: Array, /) -> Array:
-        """The status () of an unsolved case, or one that says more; pure."""
+    def explain(self, case: PyTree, status: Array, /) -> Array:
+        """Return the status () of an unsolved case, or a status that explains more; pure."""
         ...
 
 
 Tree = TypeVar("Tree")
 
 
-def out_of_time(plans: PlanT, left: Any) -> PlanT:
-    """The plans, with the status `OUT_OF_TIME` where one is left unsolved."""
-    xp: Any = jnp if isinstance(plans.status, jax.Array) else np
-    status = xp.where(left, Status.OUT_OF_TIME, plans.status).astype(np.int32)
+def out_of_time(plans: PlanT, left: Numbers | bool) -> PlanT:
+    """Return the plans, with the status `OUT_OF_TIME` where one is left unsolved."""
+    status = numpy_of(plans.status).where(left, Status.OUT_OF_TIME, plans.status).astype(np.int32)
     return dataclasses.replace(plans, status=status)  # type: ignore[type-var]
 
 
-def is_resident(tree: Any) -> bool:
+def is_resident(tree: PyTree) -> bool:
     """Return whether all leaves are jax arrays, which may lie on other devices than the host."""
     return all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(tree))
 
 
-def lane(tree: Tree, k: Any) -> Tree:
-    """One case, plan or verdict of a batch, or some of them: entry `k` of every leaf.
+def lane(tree: Tree, k: int | np.integer | slice | Numbers) -> Tree:
+    """Return one case, plan or verdict of a batch, or some of them: entry `k` of every leaf.
 
     Args:
         tree: a pytree, or a dataclass of arrays such as a verdict, with a leading axis.
-        k: a place, a slice, or an array of places.
+        k: an index, a slice, or an array of indices or of bool.
     """
     if dataclasses.is_dataclass(tree) and jax.tree_util.all_leaves([tree]):
-        fields = {f.name: getattr(tree, f.name)[k] for f in dataclasses.fields(tree)}
+        fields = {name: leaf[k] for name, leaf in fields_of(tree).items()}
         return dataclasses.replace(tree, **fields)  # type: ignore[type-var]
     return jax.tree.map(lambda leaf: leaf[k], tree)
 
 
 def solved(plans: Plan) -> np.ndarray:
-    """Whether each plan meets every limit that its planner looked at, bool; see `Status`.
+    """Return whether each plan keeps every limit of its planner, bool; see `Status`.
 
     Raises:
-        TypeError: these are no plans.
+        ArgumentTypeError: the argument is not a plan or a batch of plans.
     """
     require_kind("plans", plans, Plan)
     return np.asarray(is_solved(plans.status))
 
 
-def marked(plans: PlanT, cases: Any) -> PlanT:
-    """The plans, with the status `BAD_INPUT` where a number of the case breaks its rule; pure.
+def marked(plans: PlanT, cases: PyTree) -> PlanT:
+    """Return the plans, with the status `BAD_INPUT` where a number of the case breaks a rule; pure.
 
     Args:
-        plans: one plan, or a batch.
-        cases: of them; those of a class without `rules` are left as they are.
+        plans: one plan, or a batch; the same plans are returned if the cases have no `rules`.
+        cases: of the plans.
     """
     if not has_rules(cases):
         return plans
-    xp: Any = jnp if isinstance(plans.status, jax.Array) else np
-    status = xp.where(is_sound(cases), plans.status, Status.BAD_INPUT).astype(np.int32)
+    status = numpy_of(plans.status).where(is_sound(cases), plans.status, Status.BAD_INPUT)
+    status = status.astype(np.int32)
     return dataclasses.replace(plans, status=status)  # type: ignore[type-var]
 
 
@@ -307,7 +304,7 @@ def is_better(
         is_good, was_good = is_solved(later.status), is_solved(before.status)
     else:
         is_good, was_good = later.violation <= tolerance, before.violation <= tolerance
-    xp: Any = jnp if isinstance(was_good, jax.Array) else np
+    xp = numpy_of(was_good)
     is_cheaper = is_good & (later.cost < share * before.cost)
     is_farther = before.violation <= later.violation  # false, too, where either is NaN
     is_nearer = xp.isfinite(later.violation) & xp.logical_not(is_farther)
@@ -355,7 +352,7 @@ def index_of_best(plans: PyTree, cost: PyTree = None) -> PyTree:
         plans: the plans of a case one after another, (K, ...).
         cost: (K, ...), in the place of the planner's own.
     """
-    xp: Any = jnp if isinstance(plans.status, jax.Array) else np
+    xp = numpy_of(plans.status)
     good = is_solved(plans.status)
     finite = xp.isfinite(plans.cost) & xp.isfinite(plans.violation)
     by_cost = xp.where(good, plans.cost if cost is None else cost, xp.inf)

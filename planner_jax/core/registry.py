@@ -1,6 +1,6 @@
-"""Tasks, planners and suites by name: the library's own, and those of other packages.
+"""Tasks, planners and suites by name, of the library and of other packages.
 
-Another package offers its own by entry points, without an edit of this one:
+Another package registers its objects by entry points:
 
     [project.entry-points."planner_jax.tasks"]
     meet = "my_package.meet:TASK"
@@ -18,9 +18,14 @@ import pkgutil
 import warnings
 from collections.abc import Callable, Collection, Mapping
 from importlib import metadata
-from typing import Any
+from typing import TYPE_CHECKING
 
 from planner_jax.core.errors import ArgumentTypeError, UnknownName
+
+if TYPE_CHECKING:
+    from jaxtyping import PyTree
+
+    from planner_jax.core.planner import Planner
 
 _GROUP = "planner_jax"
 _OWN = {
@@ -31,7 +36,7 @@ _OWN = {
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """What makes a task: its four words, planners, suites, and what runs of it need.
+    """A task: its four functions, planners, suites, and settings of its runs.
 
     Objects are named as "module:attribute" and imported when they are needed.
     """
@@ -39,55 +44,55 @@ class Task:
     name: str  # on the command line
     summary: str  # one line, without a full stop
     home: str  # module with the functions `case`, `draw`, `planner` and `judge`
-    planners: Mapping[str, str]  # name -> what makes the planner of given options; default first
-    suites: Mapping[str, str]  # name -> what it draws, a sentence; default first
-    # Planners that are read from a file, such as "library:motions.bin" -> what makes the file.
+    planners: Mapping[str, str]  # name -> class or function that makes the planner; default first
+    suites: Mapping[str, str]  # name -> a sentence about its cases; default first
+    # Planners that are read from a file, as in "library:motions.bin" -> the command that makes it.
     from_file: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    # Classes of the settings of its sweeps, and of its flights in `sims`; they name what runs them.
+    # Classes of the settings of its sweeps, and of its flights in `sims`.
     sweep: str = "planner_jax.runs.settings:SweepSettings"
     flight: str | None = None
-    # Class of the settings of one case that is asked for in a few numbers; they name what answers.
+    # Class of the settings of one case that is specified by a few numbers.
     single: str | None = None
     # Options of `planner` where its speed is measured.
-    bench: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    contact: str | None = None  # place in a plan of its times of contact, such as "stroke.time"
-    # The planner with whose costs those of planners are compared that have no longer search.
+    bench: Mapping[str, object] = dataclasses.field(default_factory=dict)
+    contact: str | None = None  # name in a plan of its times of contact, such as "stroke.time"
+    # The planner whose costs are the reference for planners that have no longer search.
     yardstick: str | None = None
 
     @property
-    def case(self) -> Callable[..., Any]:
-        """Makes one case, or a batch, of physical quantities."""
-        return self._word("case")
+    def case(self) -> "Callable[..., PyTree]":
+        """Function that makes one case, or a batch, of physical quantities."""
+        return self._function("case")
 
     @property
-    def draw(self) -> Callable[..., Any]:
+    def draw(self) -> "Callable[..., PyTree]":
         """`draw(num, suite=None, seed=0, *, first=0)`: a batch of a suite.
 
-        Case k of a seed is always the same one: `first` is the place of the first.
+        Case k of a seed is always the same one: `first` is the k of the first case.
         """
-        return self._word("draw")
+        return self._function("draw")
 
     @property
-    def planner(self) -> Callable[..., Any]:
-        """`planner(name, **options)`."""
-        return self._word("planner")
+    def planner(self) -> "Callable[..., Planner]":
+        """`planner(name, **options)`: the planner of a name."""
+        return self._function("planner")
 
     @property
-    def judge(self) -> Callable[..., Any]:
+    def judge(self) -> "Callable[..., PyTree]":
         """`judge(cases, plans)`: the referee's verdict."""
-        return self._word("judge")
+        return self._function("judge")
 
     def all_planners(self) -> dict[str, str | metadata.EntryPoint]:
-        """Planners by name, those of other packages behind the task's own."""
+        """Return planners by name, the task's own before the planners of other packages."""
         return {**self.planners, **_offered("planners", self.name, self.planners)}
 
     def all_suites(self) -> dict[str, str]:
-        """Suites and what they draw, those of other packages behind the task's own."""
+        """Return sentences on suites by name, the task's own before suites of other packages."""
         others = _offered("suites", self.name, self.suites)
         return {**self.suites, **{name: f"{entry.value}." for name, entry in others.items()}}
 
     def split_planner(self, name: object) -> tuple[str, str]:
-        """The key of `all_planners` in a planner's name, and its file, or nothing.
+        """Return the key of `all_planners` in a planner's name, and its file or "".
 
         Raises:
             UnknownName: there is no planner of that name, or it needs a file or takes none.
@@ -102,50 +107,56 @@ class Task:
             )
         return planner, file
 
-    def make_planner(self, name: object, options: Mapping[str, Any]) -> Any:
-        """The planner of a name.
+    def make_planner(self, name: object, options: Mapping[str, object]) -> "Planner":
+        """Return the planner of a name.
 
         Args:
-            name: a key of `all_planners`; of those in `from_file` with ":" and the file behind it.
-            options: keyword arguments of what makes it, which also takes the file first.
+            name: a key of `all_planners`; keys in `from_file` with ":" and the file behind them.
+            options: keyword arguments of the planner's class or function, behind the file.
 
         Raises:
             UnknownName: there is no planner of that name, or it needs a file or takes none.
-            TypeError: the planner has no such option.
+            ArgumentTypeError: the planner has no such option.
         """
         planner, file = self.split_planner(name)
         maker = _resolved(self.all_planners()[planner])
-        if isinstance(maker, type) and dataclasses.is_dataclass(maker):
-            known = [field.name for field in dataclasses.fields(maker) if field.init]
-            for option in options:
-                if option not in known:
-                    rule = f"one of {', '.join(known)}" if known else "left out"
-                    raise ArgumentTypeError(f"option of planner {planner}", rule, option)
+        _require_options(planner, maker, options)
         return maker(*filter(None, [file]), **options)
 
-    def other_suite(self, name: object) -> Callable[..., Any]:
-        """What draws a suite of another package: `draw(num, seed, first)`.
+    def other_suite(self, name: object) -> "Callable[..., PyTree]":
+        """Return the function `draw(num, seed, first)` of a suite of another package.
 
         Raises:
             UnknownName: there is no suite of that name.
         """
-        require_name(self.all_suites(), "suite", name)
-        return _resolved(_offered("suites", self.name, self.suites)[name])
+        suite = require_name(self.all_suites(), "suite", name)
+        return _resolved(_offered("suites", self.name, self.suites)[suite])
 
-    def _word(self, word: str) -> Callable[..., Any]:
-        return pkgutil.resolve_name(f"{self.home}:{word}")
+    def _function(self, name: str) -> "Callable[..., PyTree]":
+        return pkgutil.resolve_name(f"{self.home}:{name}")
 
 
-def require_name(known: Mapping[str, Any], kind: str, name: object) -> None:
-    """Raise `UnknownName` unless a name is known."""
+def require_name(known: Collection[str], kind: str, name: object) -> str:
+    """Return a name; raise `UnknownName` unless it is known."""
     if not isinstance(name, str):
         raise UnknownName(kind, "a name", name)
     if name not in known:
         raise UnknownName(kind, f"one of {', '.join(known)}", name)
+    return name
+
+
+def _require_options(planner: str, maker: object, options: Collection[str]) -> None:
+    """Raise `ArgumentTypeError` unless a planner's class, if it is a dataclass, has the fields."""
+    if isinstance(maker, type) and dataclasses.is_dataclass(maker):
+        known = [field.name for field in dataclasses.fields(maker) if field.init]
+        for option in options:
+            if option not in known:
+                rule = f"one of {', '.join(known)}" if known else "left out"
+                raise ArgumentTypeError(f"option of planner {planner}", rule, option)
 
 
 def suite_named(name: object, default: str) -> str:
-    """The name of a suite, or the default where none is given.
+    """Return the name of a suite, the default instead of None.
 
     Raises:
         UnknownName: it is no name.
@@ -156,21 +167,21 @@ def suite_named(name: object, default: str) -> str:
 
 
 def split_name(
-    known: Mapping[str, Any], kind: str, name: object, from_file: Collection[str] = ()
+    known: Collection[str], kind: str, name: object, from_file: Collection[str] = ()
 ) -> tuple[str, str]:
-    """A known name and the file behind it, as in "policy:FILE", or nothing.
+    """Return a known name and the file behind it, as in "policy:FILE", or "".
 
     Args:
         known: names.
-        kind: what they are names of, for the message.
-        name: one of them, with ":" and a file behind it or without.
-        from_file: those that may have one.
+        kind: noun for the named objects, for the message.
+        name: one of the names, with or without ":" and a file behind it.
+        from_file: names that may have a file.
 
     Raises:
         UnknownName: it is not known, or takes no file.
     """
     own, _, file = name.partition(":") if isinstance(name, str) else (name, "", "")
-    require_name(known, kind, own)
+    own = require_name(known, kind, own)
     if own != name and own not in from_file:
         raise UnknownName(kind, f"{own} without a file", name)
     if own != name and not file:
@@ -179,23 +190,22 @@ def split_name(
 
 
 def task_named(name: object) -> Task:
-    """The task of a name, of the library or of another package.
+    """Return the task of a name, of the library or of another package.
 
     Raises:
         UnknownName: there is none; one line.
     """
     tasks = all_tasks()
-    require_name(tasks, "task", name)
-    return tasks[name]
+    return tasks[require_name(tasks, "task", name)]
 
 
 @functools.cache
 def all_tasks() -> dict[str, Task]:
-    """Tasks by name; one of another package that does not work is left out with a warning."""
+    """Return tasks by name, without tasks of other packages that fail, with a warning."""
     tasks = {name: pkgutil.resolve_name(path) for name, path in _OWN.items()}
     for entry in metadata.entry_points(group=f"{_GROUP}.tasks"):
         problem = f"the name is taken by {tasks[entry.name].home}" if entry.name in tasks else ""
-        found: Any = None
+        found: object = None
         if not problem:
             try:
                 found = entry.load()
@@ -204,17 +214,17 @@ def all_tasks() -> dict[str, Task]:
             else:
                 if not isinstance(found, Task) or found.name != entry.name:
                     problem = f"it is not a Task of that name, got {found!r:.60}"
-        if problem:
+        if isinstance(found, Task) and not problem:
+            tasks[entry.name] = found
+        else:
             warnings.warn(
                 f"task {entry.name!r} of {entry.value} is left out: {problem}", stacklevel=2
             )
-        else:
-            tasks[entry.name] = found
     return tasks
 
 
-def _offered(kind: str, task: str, own: Mapping[str, Any]) -> dict[str, metadata.EntryPoint]:
-    """What other packages offer for a task, by name; a name that is taken is left out."""
+def _offered(kind: str, task: str, own: Collection[str]) -> dict[str, metadata.EntryPoint]:
+    """Return other packages' entry points for a task by name, without names that are taken."""
     found = {}
     for entry in metadata.entry_points(group=f"{_GROUP}.{kind}"):
         of, _, name = entry.name.partition(".")
@@ -228,7 +238,7 @@ def _offered(kind: str, task: str, own: Mapping[str, Any]) -> dict[str, metadata
     return found
 
 
-def _resolved(place: str | metadata.EntryPoint) -> Any:
+def _resolved(place: str | metadata.EntryPoint) -> "Callable[..., PyTree]":
     if isinstance(place, str):
         return pkgutil.resolve_name(place)
     try:

@@ -1,32 +1,34 @@
-"""What the numbers of a case must be: one table that serves the host and compiled programs.
+"""Rules on the numbers of cases: one table serves the host and compiled programs.
 
-A class of cases, or of parts of them such as a target's path, has its table as `rules`. Every
-number of a case that has one must be finite, and keep what the table says besides. On the host
-`require_sound` names the first that does not; inside of compiled programs `is_sound` says it lane
-by lane, of which `planner_jax.planning` makes the status `BAD_INPUT`.
+A class of cases, or of parts of cases such as a target's path, has its table as `rules`. Every
+number of such a case must be finite and keep the rule that the table has for it. On the host
+`require_sound` names the first number that breaks its rule. Inside compiled programs `is_sound`
+evaluates every lane, and `planner_jax.planning` gives unsound lanes the status `BAD_INPUT`.
 """
 
 import dataclasses
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jaxtyping import PyTree
 
+from planner_jax.core.arithmetic import Numbers, numpy_of
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError, CaseError
 
 
 @dataclasses.dataclass(frozen=True)
 class Rule:
-    """What a number must be."""
+    """A condition on every number of an array."""
 
     words: str  # as in "limits.speed must be WORDS, got -1"
-    # Where it holds, number by number: of an array with any leading axes, NumPy's or jax's, and of
-    # the case, or part of it, whose table has the rule.
-    holds: Callable[[Any, Any], Any]
+    # Returns where the condition holds, number by number, of an array with any leading axes and
+    # of the case, or part of it, whose table has the rule.
+    holds: Callable[[Numbers, PyTree], Numbers]
     infinite: bool = False  # whether the number may be infinite
     other: str = ""  # the array of the same part that the number is compared with
 
@@ -42,32 +44,33 @@ POSITIVE_OR_NONE = Rule("> 0", lambda value, part: value > 0.0, infinite=True)  
 
 
 def within(low: float, high: float, words: str) -> Rule:
-    """The rule of a closed interval."""
+    """Return the rule of a closed interval."""
     return Rule(words, lambda value, part: (value >= low) & (value <= high))
 
 
 def below(other: str) -> Rule:
-    """The rule of what must be less than another array of the same part and shape."""
+    """Return the rule that an array is less than another array of the same part and shape."""
     return Rule("<", lambda value, part: value < named(part, other), other=other)
 
 
-def _is_own_place(value: Any, part: Any) -> Any:
+def _is_permutation(value: Numbers, part: PyTree) -> Numbers:
+    """Return where an entry along the last axis is an index of it that no other entry has."""
     alike = (value[..., :, None] == value[..., None, :]).sum(axis=-1)
     return (alike == 1) & (value >= 0) & (value < value.shape[-1])
 
 
-PERMUTATION = Rule("a permutation", _is_own_place)
+PERMUTATION = Rule("a permutation", _is_permutation)
 
 
 @dataclasses.dataclass(frozen=True)
 class Field:
     """One array of a case: its name, its shape in one case, its rule, and its kind of numbers.
 
-    Where the case has None for it, or for what it is part of, nothing is asked.
+    An array that is None, or that belongs to a part that is None, is not checked.
     """
 
     name: str  # joined by dots, as in "limits.speed"
-    shape: tuple[int | str, ...] | None = ()  # a letter is one size wherever it is; None: any shape
+    shape: tuple[int | str, ...] | None = ()  # equal letters are equal sizes; None: any shape
     rule: Rule = FINITE
     kind: type = np.floating
 
@@ -80,34 +83,56 @@ class Ruled:
     """One array of a case, and one rule that it has to keep."""
 
     name: str
-    value: Any
+    value: Numbers
     rule: Rule
-    part: Any
+    part: PyTree
 
-    def holds(self) -> Any:
-        """Where it does."""
+    def holds(self) -> Numbers:
+        """Return where the array keeps the rule, bool of its shape."""
         return self.rule.holds(self.value, self.part)
 
 
-def named(tree: Any, name: str) -> Any:
-    """What stands at a place that is named with dots, such as "limits.speed"."""
+@runtime_checkable
+class Case(Protocol):
+    """A pytree of arrays for one case, or for a batch with a leading axis on every leaf."""
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """() for one case, (B,) for a batch."""
+        ...
+
+
+def fields_of(tree: PyTree) -> dict[str, PyTree]:
+    """Return the fields of a dataclass by name, without copies."""
+    return {field.name: getattr(tree, field.name) for field in dataclasses.fields(tree)}
+
+
+def nodes_of(tree: PyTree) -> dict[str, PyTree]:
+    """Return the fields of a dataclass by name, without its static fields."""
+    values = fields_of(tree)
+    fields = dataclasses.fields(tree)
+    return {f.name: values[f.name] for f in fields if f.metadata.get("pytree_node", True)}
+
+
+def named(tree: PyTree, name: str) -> PyTree:
+    """Return the part of a tree under a name with dots, such as "limits.speed"."""
     for each in name.split("."):
         tree = None if tree is None else getattr(tree, each)
     return tree
 
 
-def has_rules(cases: Any) -> bool:
-    """Whether the class of the cases, or of a part of them, has a table."""
+def has_rules(cases: PyTree) -> bool:
+    """Return whether the class of the cases, or of a part of them, has a table."""
     return any(True for _ in _parts(cases))
 
 
-def require_sound(cases: Any, names: Mapping[str, str] | None = None) -> None:
+def require_sound(cases: object, names: Mapping[str, str] | None = None) -> None:
     """Raise for the first rule that a case breaks, in one line.
 
     Args:
-        cases: one case, or a batch, in arrays of any kind. Classes without `rules` pass; of traced
+        cases: one case, or a batch, in arrays of any kind. Classes without `rules` pass. Of traced
             arrays, which have no values yet, only shape and kind are checked.
-        names: arguments of the caller by the fields that they become, for the message.
+        names: the caller's arguments by the fields that they become, for the message.
 
     Raises:
         CaseError: a number breaks its rule; the line has the field, the rule, the value and the
@@ -121,9 +146,9 @@ def require_sound(cases: Any, names: Mapping[str, str] | None = None) -> None:
         raise error.renamed(names or {}) from None
 
 
-def _require_sound(cases: Any) -> None:
+def _require_sound(cases: object) -> None:
     """Raise for the first rule that a case breaks, with the names of fields."""
-    if isinstance(cases, type) or not hasattr(cases, "batch_shape"):
+    if isinstance(cases, type) or not isinstance(cases, Case):
         raise ArgumentTypeError("cases", "a case or a batch", shown=f"a {type(cases).__name__}")
     require_shapes(cases)
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(cases)):
@@ -134,7 +159,7 @@ def _require_sound(cases: Any) -> None:
 
 
 def require_rule(
-    name: str, value: Any, holds: Any, words: str, batch: tuple[int, ...], other: str = ""
+    name: str, value: Numbers, holds: Numbers, words: str, batch: tuple[int, ...], other: str = ""
 ) -> None:
     """Raise `CaseError` for the first case where a rule does not hold.
 
@@ -157,10 +182,8 @@ def require_rule(
     raise CaseError(name, words, first, index, other=other, more=len(cases) - 1)
 
 
-def require_shapes(cases: Any) -> None:
-    """Raise unless every array has the shape and the kind of numbers of its field.
-
-    These are known of traced arrays, too.
+def require_shapes(cases: PyTree) -> None:
+    """Raise unless every array, traced or not, has the shape and kind of numbers of its field.
 
     Raises:
         ValueError: another shape; one line with the field and both shapes.
@@ -169,8 +192,9 @@ def require_shapes(cases: Any) -> None:
     for place, part in _parts(cases):
         sizes: dict[str, int] = {}
         batch = _usual_batch(part)
+        values = fields_of(part)
         for each in dataclasses.fields(part):
-            if getattr(part, each.name) is None and each.default is not None:
+            if values[each.name] is None and each.default is not None:
                 raise ArgumentTypeError(f"{place}{each.name}", "given", shown="None")
         for field in type(part).rules:
             value, name = named(part, field.name), place + field.name
@@ -199,11 +223,8 @@ def require_shapes(cases: Any) -> None:
                 raise ArgumentError(name, f"the shape ({wanted}{comma})", shape, verb="have")
 
 
-def _usual_batch(part: Any) -> tuple[int, ...]:
-    """The axes that most arrays of a part have in front of those of one case.
-
-    So the one array that is of another batch is named, whichever it is.
-    """
+def _usual_batch(part: PyTree) -> tuple[int, ...]:
+    """Return the axes that most arrays of a part have in front of the axes of one case."""
     fronts: Counter[tuple[int, ...]] = Counter()
     for name, size in {field.name: field.shape for field in type(part).rules}.items():
         if size is not None and (value := named(part, name)) is not None:
@@ -219,26 +240,27 @@ _KINDS = {
 }
 
 
-def is_sound(cases: Any) -> Any:
-    """Whether every number of each case keeps its rules, bool of the batch shape; pure.
+def is_sound(cases: PyTree) -> PyTree:
+    """Return whether every number of each case keeps its rules; pure.
 
-    NumPy arrays give NumPy's, jax arrays jax's.
+    Returns:
+        Bool of the batch shape, a jax array if the cases hold one.
     """
     batch = cases.batch_shape
     held = [ruled.holds() for ruled in all_ruled(cases)]
     # Joined before they are reduced: one loop of a compiled program, not one for every array.
-    xp: Any = jnp if any(isinstance(each, jax.Array) for each in held) else np
+    xp = numpy_of(*held)
     return xp.concatenate([each.reshape(*batch, -1) for each in held], axis=-1).all(axis=-1)
 
 
-def all_ruled(cases: Any) -> Iterator[Ruled]:
-    """All rules of the arrays of a case, that of being finite first."""
+def all_ruled(cases: PyTree) -> Iterator[Ruled]:
+    """Yield the rules of all arrays of a case, first the rule that they are finite."""
     parts = list(_parts(cases))
     tables = [
         (place + field.name, field, part) for place, part in parts for field in type(part).rules
     ]
     free = {name for name, field, _ in tables if field.rule.infinite}
-    whole: list[str] = []  # places of parts whose numbers have been gone through
+    whole: list[str] = []  # places of parts whose numbers have been yielded
     for place, part in parts:
         if any(place.startswith(outer) for outer in whole):
             continue
@@ -253,15 +275,14 @@ def all_ruled(cases: Any) -> Iterator[Ruled]:
             yield Ruled(name, value, field.rule, part)
 
 
-def _parts(tree: Any, place: str = "") -> Iterator[tuple[str, Any]]:
-    """The parts of a case whose class has a table, outer ones first, and where they stand."""
+def _parts(tree: PyTree, place: str = "") -> Iterator[tuple[str, PyTree]]:
+    """Yield the places and parts of a case whose class has a table, outer ones first."""
     if getattr(type(tree), "rules", None):
         yield place, tree
-    children: Any = ()
+    children: Mapping[str, PyTree] = {}
     if dataclasses.is_dataclass(tree):
-        fields = [f for f in dataclasses.fields(tree) if f.metadata.get("pytree_node", True)]
-        children = [(field.name, getattr(tree, field.name)) for field in fields]
+        children = nodes_of(tree)
     elif isinstance(tree, tuple | list):
-        children = enumerate(tree)
-    for name, child in children:
+        children = {str(k): child for k, child in enumerate(tree)}
+    for name, child in children.items():
         yield from _parts(child, f"{place}{name}.")

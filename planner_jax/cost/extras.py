@@ -19,7 +19,7 @@ from jax.typing import DTypeLike
 from jaxtyping import PyTree
 
 from planner_jax.core.arithmetic import Numbers
-from planner_jax.core.checks import shapes_told
+from planner_jax.core.checks import format_shapes
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.rules import NOT_NEGATIVE, NOT_ZERO, POSITIVE, Field, Table, below
 from planner_jax.cost.penalty import greatest_by_tangents
@@ -181,7 +181,7 @@ def for_batch(extras: object, batch: tuple[int, ...], dtype: DTypeLike) -> tuple
             alike = False
         if not alike and (not batch or any(shape[: len(batch)] != batch for shape in shapes)):
             rule = f"for one case, or have the axes {batch} in front" if batch else "for one case"
-            found = f"a {type(extra).__name__} with {shapes_told(extra)}"
+            found = f"a {type(extra).__name__} with {format_shapes(extra)}"
             raise ArgumentError(f"extras.{place}", rule, shown=found)
         lead = batch if alike else ()
         return jax.tree.map(lambda x: jnp.asarray(np.broadcast_to(x, lead + x.shape), dtype), extra)

@@ -19,7 +19,8 @@ from planner_jax.core.errors import (
     UnknownName,
     format_value,
 )
-from planner_jax.core.protocol import Case, Plan
+from planner_jax.core.protocol import Plan
+from planner_jax.core.rules import Case
 from planner_jax.export.setpoints import DEFAULT_RATE, robot_of
 from planner_jax.host.files import new_file_problem, replacing
 from planner_jax.recovery.after_plan import is_rested, with_ending

@@ -12,6 +12,7 @@ from planner_jax.core.checks import numeric, require_kind, require_number
 from planner_jax.core.choices import require_size
 from planner_jax.core.errors import format_value
 from planner_jax.core.protocol import Attempt
+from planner_jax.core.rules import NOT_NEGATIVE, Rule
 
 MOST_DAMPING = 1e4  # of a lane of Newton's method
 
@@ -61,12 +62,15 @@ class LbfgsConfig:
         for name, least in (("max_steps", 0), ("memory", 1), ("patience", 0)):
             require_size(name, vars(self)[name], least)
         for name in ("step_cap", "tolerance"):
-            require_number(name, vars(self)[name], "finite and >= 0", lambda x: x >= 0.0)
+            require_number(name, vars(self)[name], NOT_NEGATIVE)
         steps = self.trial_steps
         if not isinstance(steps, tuple) or any(numeric(each) is None for each in steps):
             raise TypeError(f"trial_steps must be a tuple of numbers, got {format_value(steps)}")
         if not steps or not all(0.0 < each < jnp.inf for each in steps):
             raise ValueError(f"trial_steps must be finite and > 0, one or more, got {steps}")
+
+
+_SHARE = Rule("in (0, 1]", lambda value, part: (value > 0.0) & (value <= 1.0))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,7 +100,7 @@ class NewtonConfig:
         for name, least in (("max_steps", 0), ("subspace", 0), ("patience", 0)):
             require_size(name, vars(self)[name], least)
         for name in ("damping", "ease", "tighten", "step_cap", "tolerance", "trusted", "slack"):
-            require_number(name, vars(self)[name], "finite and >= 0", lambda x: x >= 0.0)
+            require_number(name, vars(self)[name], NOT_NEGATIVE)
         trials = self.trial_dampings
         if not isinstance(trials, tuple) or any(numeric(each) is None for each in trials):
             raise TypeError(
@@ -112,7 +116,7 @@ class NewtonConfig:
                 f"stragglers must be a tuple of three numbers, got {format_value(later)}"
             )
         share, *counts = later
-        require_number("stragglers", share, "a share > 0 and <= 1", lambda x: 0.0 < x <= 1.0)
+        require_number("stragglers", share, _SHARE)
         for count in counts:
             require_size("stragglers", count, 1)
 

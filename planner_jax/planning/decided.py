@@ -1,7 +1,6 @@
 """A planner behind a decision: in what order, when, which of several."""
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -84,7 +83,7 @@ class DecidedPlanner(Planner[CaseT, PlanT]):
 
     def _plan_all(self, drive: Drive, cases: PyTree, choices: PyTree) -> tuple[PyTree, PyTree]:
         """Plan all choices together, and return the decided cases (B,) with the best plans."""
-        xp: Any = jnp if drive.is_pure else np
+        xp = jnp if drive.is_pure else np
         num = len(choices)
         if not drive.is_pure:
             cases, choices = jax.tree.map(np.asarray, (cases, choices))

@@ -1,6 +1,5 @@
 """`gradient`: plans, and how one of their numbers changes with the case."""
 
-import dataclasses
 import functools
 from collections.abc import Sequence
 from typing import Any, Generic, TypeVar
@@ -13,6 +12,7 @@ from jaxtyping import PyTree
 from planner_jax.core.checks import require_kind, require_switch
 from planner_jax.core.errors import format_value
 from planner_jax.core.protocol import Plan
+from planner_jax.core.rules import fields_of
 from planner_jax.optimise.sensitivity import Differentiated, Quantity, part_of
 from planner_jax.optimise.settings import LbfgsConfig, NewtonConfig, Solver
 from planner_jax.planning.plan import plan, require_fit
@@ -97,8 +97,4 @@ def gradient(
         minimiser = minimiser.polished()
     differentiated = Differentiated(minimiser, of, by, steps, curvature or minimiser.adjoint)
     plans = plan(differentiated, cases, chunk=chunk, devices=devices)
-    return PlanGradient(plans=plans.whole_plan(), **_fields(plans.gradient))
-
-
-def _fields(tree: PyTree) -> dict[str, PyTree]:
-    return {field.name: getattr(tree, field.name) for field in dataclasses.fields(tree)}
+    return PlanGradient(plans=plans.whole_plan(), **fields_of(plans.gradient))

@@ -9,8 +9,8 @@ from jaxtyping import PyTree
 
 from planner_jax.core.choices import require_size
 from planner_jax.core.planner import CaseT, Kind, Planner, PlanT, require_fit
-from planner_jax.core.protocol import Case, Status, is_resident
-from planner_jax.core.rules import has_rules, require_shapes, require_sound
+from planner_jax.core.protocol import Status, is_resident
+from planner_jax.core.rules import Case, has_rules, require_shapes, require_sound
 from planner_jax.planning.batch import Progress, Watch
 from planner_jax.planning.drive import Driver, require_pure
 

@@ -11,7 +11,8 @@ from jaxtyping import PyTree
 from planner_jax.core.checks import numbers_of, require_kind
 from planner_jax.core.errors import format_value
 from planner_jax.core.planner import require_planner
-from planner_jax.core.protocol import Case, Plan
+from planner_jax.core.protocol import Plan
+from planner_jax.core.rules import Case
 from planner_jax.planning.plan import plan
 
 CaseT = TypeVar("CaseT", bound=Case)

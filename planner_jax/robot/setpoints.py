@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from planner_jax.core.checks import require_number
 from planner_jax.core.errors import ArgumentError
+from planner_jax.core.rules import POSITIVE
 
 _MOST = 10**8  # setpoints of a batch
 TreeT = TypeVar("TreeT")
@@ -39,7 +40,7 @@ def sample_at_rate(
         TypeError: the rate is no number.
         ValueError: the rate is not positive, or there would be more than 1e8 setpoints.
     """
-    require_number("rate", rate, "finite and > 0", lambda x: x > 0.0)
+    require_number("rate", rate, POSITIVE)
     ends, leaves = np.asarray(ends), jax.tree.map(np.asarray, leaves)
     is_one = ends.ndim == 0
     if is_one:

@@ -15,8 +15,9 @@ from jax.typing import DTypeLike
 from planner_jax.core.checks import numbers_of, numeric, require_number, require_switch, shape_of
 from planner_jax.core.choices import require_memory, require_size
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
-from planner_jax.core.protocol import Case, Decision, Plan, lane
+from planner_jax.core.protocol import Decision, Plan, lane
 from planner_jax.core.registry import split_name
+from planner_jax.core.rules import NOT_NEGATIVE, Case
 
 _DRAWN_BYTES = 1_000  # of a case, as estimated
 
@@ -150,4 +151,4 @@ def require_settings(referee: Callable[..., object], settings: dict[str, object]
         elif isinstance(usual, int):
             require_size(name, value)
         elif isinstance(usual, float):
-            require_number(name, value, "finite and >= 0", lambda x: x >= 0.0)
+            require_number(name, value, NOT_NEGATIVE)

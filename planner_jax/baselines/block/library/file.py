@@ -11,9 +11,9 @@ Arrays are little-endian, in C order, and begin at multiples of 64 bytes.
 import dataclasses
 import json
 import os
-from typing import Any
 
 import numpy as np
+from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
 from planner_jax.baselines.block.library.cells import Face, Layout
@@ -109,9 +109,9 @@ def load_library(path: str | os.PathLike) -> Library:
     return library
 
 
-def _map_library(path: str | os.PathLike, header: dict[str, Any]) -> Library:
+def _map_library(path: str | os.PathLike, header: dict[str, PyTree]) -> Library:
     """Return the library that a header describes, its rows mapped."""
-    arrays: dict[str, Any] = {}
+    arrays: dict[str, PyTree] = {}
     for name, (kind, shape, place) in header["arrays"].items():
         mapped = np.memmap(path, kind, "r", place, tuple(shape) or (1,))
         mapped = mapped if shape else mapped[0]
