@@ -33,10 +33,10 @@ import planner_jax as pj
 from planner_jax.benchmarks.prediction_bounds import cramer_rao, share_within
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
 from planner_jax.core.protocol import is_solved
-from planner_jax.plane.prediction import select
 from planner_jax.plane.target import TurningPath
 from planner_jax.referee.intercept import InterceptVerdict
 from planner_jax.runs.summary import percent, wilson_interval
+from planner_jax.sims.prediction.select_path import select
 from planner_jax.task.intercept.api import positions
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.default_planner import SpacetimeIntercept

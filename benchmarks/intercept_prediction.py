@@ -25,10 +25,10 @@ import numpy as np
 
 from planner_jax.benchmarks.prediction_bounds import cramer_rao, mean_distance, share_within
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
-from planner_jax.plane.polynomial_fit import fit_polynomial
-from planner_jax.plane.prediction import chance_within, mean_position, select
 from planner_jax.plane.target import PolynomialPath, TurningPath
-from planner_jax.plane.turn_fit import fit_turn
+from planner_jax.sims.prediction.polynomial_fit import fit_polynomial
+from planner_jax.sims.prediction.select_path import chance_within, mean_position, select
+from planner_jax.sims.prediction.turn_fit import fit_turn
 
 TIMES = np.arange(-14.0, 1.0, dtype=np.float32)  # [s], of the observations
 AHEAD = np.array([0.0, 5.0, 10.0, 15.0], np.float32)  # [s]

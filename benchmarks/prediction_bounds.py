@@ -5,9 +5,9 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
-from planner_jax.plane.observed import centre, safe_sqrt
 from planner_jax.plane.target import TurningPath, arc
-from planner_jax.plane.turn_fit import given_rate, tangent
+from planner_jax.sims.prediction.observed import centre, safe_sqrt
+from planner_jax.sims.prediction.turn_fit import given_rate, tangent
 
 
 def cramer_rao(

@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from planner_jax.ball.estimation import EkfModel, ekf_init, ekf_predict, ekf_update
 from planner_jax.ball.flight import BallState, drag_free_flight
 from planner_jax.perception.camera import back_project, in_view, looking_at, project
-from planner_jax.perception.fit import Sight, across_std, believed_at, error_across, fit_flight
 from planner_jax.perception.noise import (
     RoundNoise,
     depth_std,
@@ -26,6 +25,13 @@ from planner_jax.sims.segment import (
     hue_saturation_value,
     noisy_depth,
     sighting,
+)
+from planner_jax.studies.block.flight_fit import (
+    Sight,
+    across_std,
+    believed_at,
+    error_across,
+    fit_flight,
 )
 
 GRAVITY = 9.81

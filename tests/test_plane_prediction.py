@@ -12,8 +12,9 @@ from scipy.special import ellipe
 from scipy.stats import ncx2
 
 from planner_jax.benchmarks.prediction_bounds import cramer_rao, mean_distance, share_within
-from planner_jax.plane.polynomial_fit import fit_polynomial
-from planner_jax.plane.prediction import (
+from planner_jax.plane.target import PolynomialPath, TurningPath
+from planner_jax.sims.prediction.polynomial_fit import fit_polynomial
+from planner_jax.sims.prediction.select_path import (
     Alternatives,
     Prediction,
     TurnPrior,
@@ -22,8 +23,7 @@ from planner_jax.plane.prediction import (
     mean_position,
     select,
 )
-from planner_jax.plane.target import PolynomialPath, TurningPath
-from planner_jax.plane.turn_fit import fit_turn
+from planner_jax.sims.prediction.turn_fit import fit_turn
 
 TIMES = np.arange(-14.0, 1.0)
 NOISE, AHEAD = 0.1, 10.0

@@ -20,8 +20,6 @@ from jax import Array
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import is_solved
 from planner_jax.plane.obstacles import Obstacles
-from planner_jax.plane.polynomial_fit import fit_polynomial
-from planner_jax.plane.prediction import select
 from planner_jax.plane.target import PointState, TurningPath
 from planner_jax.planning.plan import plan as plan_all
 from planner_jax.referee.clearance import clearances
@@ -36,6 +34,8 @@ from planner_jax.sims.drive import (
 from planner_jax.sims.launch import flight_keys
 from planner_jax.sims.model import World
 from planner_jax.sims.noise import CONTROL_RATE, FRAME_RATE
+from planner_jax.sims.prediction.polynomial_fit import fit_polynomial
+from planner_jax.sims.prediction.select_path import select
 from planner_jax.sims.robots.car.robot import Car
 from planner_jax.sims.robots.car.vehicle import GRAVITY, Vehicle
 from planner_jax.sims.task import FlightCases, Flights

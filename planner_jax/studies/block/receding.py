@@ -21,10 +21,10 @@ from planner_jax.ball.flight import BallState
 from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Status, is_solved, lane, select_into
-from planner_jax.perception.fit import FlightFit, Sight, believed_at
 from planner_jax.planning.plan import plan
 from planner_jax.planning.replan import Replanning
 from planner_jax.studies.block.contact_check import end_at_contact
+from planner_jax.studies.block.flight_fit import FlightFit, Sight, believed_at
 from planner_jax.studies.block.observation import (
     Eye,
     cautious,

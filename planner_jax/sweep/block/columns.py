@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from planner_jax.perception.fit import Sight
 from planner_jax.runs import columns as known
 from planner_jax.runs.columns import LIST, VECTOR, Column, RefereedBatch, leaves_of
+from planner_jax.studies.block.flight_fit import Sight
 
 FRAME = "base of the robot, z up; times from the moment at which the ball is first seen"
 

@@ -1,15 +1,15 @@
 """Polynomials through observations of a target (paper 003, eqs 9-11).
 
 Each additional degree multiplies the noise of a prediction, and a straight line misses targets
-that turn: `planner_jax.plane.prediction.select` usually does better than any of them.
+that turn: `planner_jax.sims.prediction.select_path.select` usually does better than any of them.
 """
 
 import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
 
-from planner_jax.plane.observed import centre
 from planner_jax.plane.target import PolynomialPath
+from planner_jax.sims.prediction.observed import centre
 
 
 def fit_polynomial(

@@ -13,9 +13,9 @@ from flax import struct
 from jax import Array, lax
 from jax.typing import ArrayLike
 
-from planner_jax.plane.observed import centre, safe_sqrt
 from planner_jax.plane.target import TurningPath, arc
-from planner_jax.plane.turn_fit import best_turn, given_rate, path_of, tangent
+from planner_jax.sims.prediction.observed import centre, safe_sqrt
+from planner_jax.sims.prediction.turn_fit import best_turn, given_rate, path_of, tangent
 
 _REACH = 5.0  # standard deviations of the turn rate that are looked at, to either side
 _OFFSETS = np.linspace(-1.0, 1.0, 49)  # where, in reaches

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jax.typing import ArrayLike
 
-from planner_jax.plane.observed import Centred, Pair, centre
 from planner_jax.plane.target import TurningPath, arc
+from planner_jax.sims.prediction.observed import Centred, Pair, centre
 
 _RATES = 33  # turn rates from which the best one is refined
 _STEPS = 8  # of Gauss-Newton, in the turn rate alone

@@ -1,0 +1,1 @@
+"""Predictions of targets in the plane from noisy observations."""
