@@ -2,11 +2,14 @@
 
 from collections.abc import Callable
 
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.core import Tracer
+from jax.typing import DTypeLike
 from jaxtyping import PyTree
 
+from planner_jax.core.checks import numbers_of
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.rules import (
     NOT_NEGATIVE,
@@ -61,6 +64,13 @@ def require_tool(robot: object, kind: str) -> Tool:
             "robot", f"a {kind}", verb="carry", shown=f"{robot.name!r} with a {robot.tool.kind}"
         )
     return robot.tool
+
+
+def hover_at(start: object, batch: tuple[int, ...], dtype: DTypeLike) -> Array:
+    """Return the states (..., 4, 3) of quadrotors in hover at positions (3,) or (..., 3) [m]."""
+    head = np.zeros(batch + (4, 3))
+    head[..., 0, :] = numbers_of("start", start, batch, (3,))
+    return jnp.asarray(head, dtype)
 
 
 def require_start(cases: PyTree) -> None:

@@ -1,4 +1,4 @@
-"""The words of the task: `pj.block.draw`, `planner` and `judge`; `case` stands beside."""
+"""The functions `pj.block.draw`, `planner` and `judge`; `case` is in a module of its own."""
 
 import jax.numpy as jnp
 from jax.typing import DTypeLike
@@ -27,19 +27,9 @@ def draw(
 ) -> BlockCase:
     """Draw throws as a batch of cases.
 
-    Args:
-        num: how many, >= 1.
-        suite: "pole", the default, "open" or "short"; or one that another package offers.
-        seed: >= 0. Throw k of a suite and seed is always the same one.
-        first: place of the first one, >= 0.
-        regime: "R1", "R2" or "R3"; see `case`.
-        wide: whether balls may be met off the shield's middle and aslant; see `case`.
-        anywhere: whether any place on the shield will do, at any angle.
-        delay: [s], until the arm may start.
-        dtype: of every floating leaf.
-
-    Raises:
-        ValueError: an argument is out of its range, or there is no such suite.
+    The suite is "pole" by default, "open", "short", or one that another package offers. `regime`,
+    `wide`, `anywhere` and `delay` [s] are those of `case`; the other arguments and the errors are
+    those of `pj.hit.draw`.
     """
     suite = suite_named(suite, "pole")
     if suite not in SUITES:
@@ -91,19 +81,11 @@ def planner(name: str = "online", **options: object) -> Planner[BlockCase, Block
 
 
 def judge(cases: BlockCase, plans: BlockPlan, **settings: object) -> BlockVerdict:
-    """Judge one plan, or a batch: kinematics and geometry alone decide.
+    """Judge one plan, or a batch, by kinematics and geometry alone, as `pj.hit.judge` does.
 
     Args:
         cases: one case, or a batch.
-        plans: of them.
+        plans: of the cases.
         **settings: such as `tolerance`; see `referee_blocks`.
-
-    Returns:
-        A verdict with the batch shape of the cases: `success`, `sentence(k)`, and what was
-        measured.
-
-    Raises:
-        TypeError: the cases or plans are not blocks.
-        ValueError: shapes that do not fit, or a setting out of its range.
     """
     return judge_by(referee_blocks, cases, plans, (BlockCase, BlockPlan), settings)

@@ -116,9 +116,9 @@ def case(
 
     Args:
         ball_pos: (3,) or (B, 3) [m], where the ball is first seen.
-        ball_vel: likewise [m/s].
-        delay: () or (B,) [s], until the arm may start, >= 0. So may be the angles, rates and
-            gravity: one value, or one a case.
+        ball_vel: (3,) or (B, 3) [m/s].
+        delay: () or (B,) [s], until the arm may start, >= 0. Delay, angles, rates and gravity are
+            one value, or one value a case.
         regime: a key of `planner_jax.robot.arm.REGIMES`: "R1", the limits that the paper's
             authors plan with, end velocity free; "R2", the data sheet's speeds and 30 rad/s^2,
             from rest to rest; "R3", R1's limits from rest to rest.
@@ -126,17 +126,15 @@ def case(
             on, and not 2 mm and half a degree.
         anywhere: whether any place on the shield will do, at any angle, as with motions that were
             not planned for the very ball.
-        scene: without the batch's axes; that of the paper if not given.
-        arm: likewise; an IRB 1600 with a shield if not given.
-        angles: (6,) [rad], at the start; the arm's home if not given.
+        scene: without the batch's axes; by default the paper's scene.
+        arm: without the batch's axes; by default an IRB 1600 with a shield.
+        angles: (6,) [rad], at the start; by default the arm's home.
         rates: (6,) [rad/s], at the start.
         gravity: [m/s^2], > 0.
         dtype: of every floating leaf.
 
     Raises:
-        CaseError: a number breaks a rule, such as a gravity that is not positive; one line.
-        ValueError: an argument has another shape, or there is no such regime.
-        TypeError: an argument holds no numbers, or `dtype` is not that of floating ones.
+        ValueError: there is no such regime; or as of `pj.hit.case`, as all other errors.
     """
     require_name(REGIMES, "regime", regime)
     require_switch("wide", wide)

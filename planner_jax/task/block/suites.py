@@ -52,21 +52,9 @@ def draw_cases(
     delay: float = 0.0,
     dtype: DTypeLike = jnp.float32,
 ) -> BlockCase:
-    """Return a batch of cases of a suite, drawn in float64 and then cast.
+    """Draw a batch of cases of a suite in float64, and cast it.
 
-    Args:
-        suite: a key of `SUITES`.
-        num: B, how many, >= 1.
-        seed: >= 0. Throw k of a suite and seed is always the same one.
-        first: place of the first one, >= 0.
-        regime: see `planner_jax.task.block.case.case`, as for the next one.
-        wide: likewise.
-        anywhere: likewise.
-        delay: [s].
-        dtype: of every floating leaf.
-
-    Raises:
-        ValueError: an argument is out of its range; one line.
+    Arguments and errors are those of `pj.block.draw`; `suite` is a key of `SUITES`.
     """
     require_name(SUITES, "suite", suite)
     own, randoms = SUITES[suite], make_generators(suite, num, seed, first)

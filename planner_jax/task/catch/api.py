@@ -1,4 +1,4 @@
-"""The words of the task: `pj.catch.planner` and `judge`; `case` and `draw` stand beside."""
+"""The functions `pj.catch.planner` and `judge`; `case` and `draw` are in modules of their own."""
 
 import jax
 import numpy as np
@@ -28,7 +28,7 @@ def planner(
     ending: str | None = None,
     **options: object,
 ) -> Planner[CatchCase, CatchPlan]:
-    """The catch planner of a name, behind a decision about order and times.
+    """Return the catch planner of a name, behind a decision about order and times.
 
     * `exact`: the ball is in the net by construction; the one to use.
     * `catch`: the published planner of paper 000, which meets the ball by penalties.
@@ -41,11 +41,8 @@ def planner(
             cases, "policy" asks a network that was trained by reinforcement; "policy:rush6"
             asks one that was trained on that suite alone, and "policy:FILE" one of your own; or
             a decision with settings, such as `Best(finalists=3)`.
-        ending: what is flown behind the last contact, within all limits: "brake" to rest where that
-            is cheapest, "home" for the way back to where the case begins; by default the plan ends
-            at the contact.
-        effort: "feasible" is done with a case as soon as every limit holds; "good" and "best"
-            search on for less cost. Of 1,000 `throws` it is above that of a very long search by
+        ending: as of `pj.hit.planner`.
+        effort: as of `pj.hit.planner`. Of 1,000 `throws` it is above that of a very long search by
             38, 0.06 and 0.00 % (median), 76, 1.5 and 0.00 % (90 % quantile); of two balls,
             `parabola2`, by 95, 11 and 0.00 %, and 182, 17 and 0.02 %.
         **options: fields of that planner's dataclass, for example `rounds`.
@@ -71,36 +68,21 @@ def planner(
 
 
 def judge(cases: CatchCase, plans: CatchPlan, **settings: object) -> CatchVerdict:
-    """What the referee says of one plan or of a batch: the physics alone decides.
+    """Judge one plan, or a batch, by the physics alone, as `pj.hit.judge` does.
 
-    Targets of the library's classes are followed by the referee itself. Those of a class of one's
-    own are where its `at` says in float64; their velocity is the central difference over 2e-4 s.
+    The referee computes the positions of targets of the library's classes itself. It calls the
+    method `at` of a target of any other class, in float64; the target's velocity is the central
+    difference over 2e-4 s.
 
     Args:
         cases: one case, or a batch.
-        plans: of them.
+        plans: of the cases.
         **settings: such as `tolerance` and `net_test`; see `referee_catches`.
-
-    Returns:
-        A verdict with the batch shape of the cases: `success`, `sentence(k)`, and what was
-        measured.
-
-    Raises:
-        TypeError: the cases or plans are not catches.
-        ValueError: shapes that do not fit, or a setting out of its range.
     """
-    if isinstance(cases, CatchCase) and _is_own(cases.targets):
+    known = (BallPath, HarmonicPath, PathTable)  # classes that the referee follows by itself
+    if isinstance(cases, CatchCase) and type(cases.targets) not in known:
         settings = {"target_states": _states_by_class, **settings}
     return judge_by(referee_catches, cases, plans, (CatchCase, CatchPlan), settings)
-
-
-def _is_own(targets: object) -> bool:
-    """Return whether targets are paths of a class that the referee does not follow by itself."""
-    return isinstance(targets, TargetPath) and type(targets) not in (
-        BallPath,
-        HarmonicPath,
-        PathTable,
-    )
 
 
 def _states_by_class(
@@ -108,12 +90,7 @@ def _states_by_class(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return positions and velocities (B, N, 3) of the targets `order` at `times`, both (B, N).
 
-    A velocity that the class itself may give is not asked for: it is what the planner has used.
-
-    Args:
-        targets: leaves (B, N, ...).
-        order: places of the targets.
-        times: [s].
+    The velocity of the class itself is not used, because the planner has used it.
     """
     lanes = np.arange(len(order))[:, None]
     with jax.enable_x64(True):

@@ -13,7 +13,7 @@ from jaxtyping import PyTree
 
 from planner_jax.ball.target import TargetPath
 from planner_jax.core.arithmetic import Numbers
-from planner_jax.core.checks import floating, numbers_of, require_path, require_switch, shape_of
+from planner_jax.core.checks import floating, require_path, require_switch, shape_of
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.rules import (
     PERMUTATION,
@@ -31,6 +31,7 @@ from planner_jax.task.arguments import array_of
 from planner_jax.task.quadrotor import (
     ARGUMENTS,
     FLIGHT_RULES,
+    hover_at,
     limits_of,
     require_start,
     require_tool,
@@ -142,37 +143,22 @@ def case(
     optional: bool = False,
     dtype=jnp.float32,
 ) -> CatchCase:
-    """A catch, or a batch of them, with the setting of paper 000.
+    """Return a catch, or a batch of catches, with the setting of paper 000.
 
-    Net and flight are paper 000's; it does not give limits, which are those of the shared
-    protocol: |v| <= 5 m/s, |omega| <= 5 rad/s, thrust 0.3 g to 2.5 g, height >= 0.25 m,
-    theta_safe = 30 degrees. Order and times are placeholders until `decide` sets them: the
-    targets as they come, at equal shares of the first horizon.
+    The paper gives no limits. The limits here are those of the shared protocol: |v| <= 5 m/s,
+    |omega| <= 5 rad/s, thrust 0.3 g to 2.5 g, height >= 0.25 m, theta_safe = 30 degrees. Order and
+    times are placeholders until `decide` sets them: the targets as they come, at equal shares of
+    the first horizon.
 
-    Args:
-        targets: a path pytree whose leaves have leading axes (..., N).
-        horizon: (..., N) [s], until when each target may be caught.
-        present: (..., N) bool.
-        robot: with a net; what is not given below is the robot's.
-        start: (3,) or (..., 3) [m], hover position of the quadrotor.
-        gravity: [m/s^2]. This and all that follow may be one value or one a case.
-        net_height: l [m].
-        net_radius: [m].
-        max_angle: theta_safe [rad].
-        speed: [m/s].
-        min_thrust: [m/s^2].
-        max_thrust: [m/s^2].
-        body_rate: [rad/s].
-        min_height: [m].
-        extras: such as `pj.KeepOut`, each for one case, which all of them get, or with the
-            batch's axes on every leaf.
-        optional: whether targets may be left: as many as can be are to be caught, not all.
-        dtype: of every floating leaf.
+    The arguments that are not in this list, and the errors, are those of `pj.hit.case`.
 
-    Raises:
-        CaseError: a number breaks a rule, such as a limit that is not positive; one line.
-        ValueError: an argument has another shape.
-        TypeError: an argument holds no numbers, or `dtype` is not that of floating ones.
+    * `targets`: a path pytree whose leaves have leading axes (..., N).
+    * `horizon`: (..., N) [s], until when each target may be caught.
+    * `present`: (..., N) bool.
+    * `robot`: with a net. The net's and the quadrotor's numbers are the robot's by default.
+    * `net_height`, `net_radius`: l and radius of the net [m].
+    * `max_angle`: theta_safe [rad].
+    * `optional`: whether targets may be left: as many as possible are to be caught, not all.
     """
     dtype, shape = floating(dtype), shape_of("horizon", horizon)
     if not shape or not shape[-1]:
@@ -186,8 +172,6 @@ def case(
 
     require_path("targets", targets, shape, 3, "horizon")
     tool = require_tool(robot, NET)
-    head = np.zeros(batch + (4, 3))
-    head[..., 0, :] = numbers_of("start", start, batch, (3,))
     shares = np.arange(1, num + 1) / (num + 1.0)
     made = CatchCase(
         targets=targets,
@@ -195,7 +179,7 @@ def case(
         horizon=leaf("horizon", horizon, num),
         order=jnp.asarray(np.broadcast_to(np.arange(num), shape), jnp.int32),
         times=leaf("horizon", shares * np.asarray(horizon)[..., :1], num),
-        head_state=jnp.asarray(head, dtype),
+        head_state=hover_at(start, batch, dtype),
         gravity=leaf("gravity", gravity),
         net=Net(
             height=leaf("net_height", tool.height if net_height is None else net_height),

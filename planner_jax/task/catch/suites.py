@@ -128,24 +128,17 @@ def draw(
     num_targets: int | None = None,
     dtype: DTypeLike = jnp.float32,
 ) -> CatchCase:
-    """A batch of cases of a suite, drawn in float64 and then cast.
+    """Draw a batch of cases of a suite in float64, and cast it.
 
-    Order and times are placeholders until a decision sets them.
+    Order and times are placeholders until a decision sets them. The arguments that are not in this
+    list, and the errors, are those of `pj.hit.draw`.
 
-    Args:
-        num: B, how many, >= 1.
-        suite: a key of `SUITES`, "throws" by default, or one that another package offers.
-        seed: >= 0. Case k of a suite and seed is always the same one.
-        first: place of the first one, >= 0.
-        limit_scale: factor on the limits of speed and body rate, and on how far the thrust may
-            be from that of hover.
-        robot: with a net; suites of other packages have their own.
-        num_targets: N, how many targets the shape holds, at least the suite's own; those
-            beyond these are absent, and copies of the first.
-        dtype: of every floating leaf.
-
-    Raises:
-        ValueError: an argument is out of its range.
+    * `suite`: a key of `SUITES`, "throws" by default, or a suite that another package offers.
+    * `limit_scale`: factor on the limits of speed and body rate, and on the difference between
+      the limits of the thrust and the thrust of hover.
+    * `robot`: with a net; suites of other packages have their own.
+    * `num_targets`: N, number of targets in the shape, at least the suite's own; further targets
+      are absent copies of the first.
     """
     suite = suite_named(suite, "throws")
     require_draw(num, seed, first)

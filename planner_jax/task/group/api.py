@@ -24,17 +24,9 @@ def draw(
     first: int = 0,
     dtype: DTypeLike = jnp.float32,
 ) -> InterceptGroup:
-    """Draw a batch of groups of a suite.
+    """Draw a batch of groups of a suite; arguments and errors are those of `pj.hit.draw`.
 
-    Args:
-        num: number of groups, >= 1.
-        suite: "group", the default, or a suite that another package offers.
-        seed: >= 0. Group k of a suite and seed is always the same group.
-        first: index of the first group, >= 0.
-        dtype: of every floating leaf.
-
-    Raises:
-        ValueError: an argument is out of its range, or there is no such suite.
+    The suite is "group" by default, or one that another package offers.
     """
     suite = suite_named(suite, "group")
     if suite not in SUITES:
@@ -68,7 +60,7 @@ def planner(
 
 
 def judge(cases: InterceptGroup, plans: GroupPlan, **settings: object) -> InterceptVerdict:
-    """Judge every leg of one plan, or of a batch of plans, by the referee.
+    """Judge every leg of one plan, or of a batch of plans, as `pj.hit.judge` does.
 
     Args:
         cases: one group, or a batch.
@@ -77,10 +69,6 @@ def judge(cases: InterceptGroup, plans: GroupPlan, **settings: object) -> Interc
 
     Returns:
         A verdict with the batch shape of the groups; see `referee_groups`.
-
-    Raises:
-        TypeError: the cases or plans are no groups.
-        ValueError: shapes that do not fit, or a setting out of its range.
     """
     require_settings(referee_intercepts, settings)
     if isinstance(cases, InterceptGroup):

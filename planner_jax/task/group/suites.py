@@ -34,17 +34,9 @@ _TARGET = ("pos", "angle", "speed", "rate")
 def draw_groups(
     suite: str, num: int, seed: int, first: int = 0, *, dtype: DTypeLike = jnp.float32
 ) -> InterceptGroup:
-    """A batch of groups of a suite, drawn in float64 and then cast.
+    """Draw a batch of groups of a suite in float64, and cast it.
 
-    Args:
-        suite: a key of `SUITES`.
-        num: B, how many, >= 1.
-        seed: >= 0. Group k of a suite and seed is always the same one.
-        first: place of the first one, >= 0.
-        dtype: of every floating leaf.
-
-    Raises:
-        ValueError: an argument is out of its range; one line.
+    Arguments and errors are those of `pj.hit.draw`; `suite` is a key of `SUITES`.
     """
     require_name(SUITES, "suite", suite)
     own, randoms, dtype = SUITES[suite], make_generators(suite, num, seed, first), floating(dtype)

@@ -1,4 +1,4 @@
-"""The words of the task: `pj.hit.draw`, `planner` and `judge`; `case` stands in `case.py`."""
+"""The functions `pj.hit.draw`, `planner` and `judge`; `case` is in a module of its own."""
 
 from collections.abc import Sequence
 
@@ -30,19 +30,19 @@ def draw(
     robot: QuadrotorModel = PAPER_HITTER,
     dtype: DTypeLike = jnp.float32,
 ) -> HitCase:
-    """Drawn serves as a batch of cases; see `generate_serves` and `to_cases`.
+    """Draw serves as a batch of cases; see `generate_serves` and `to_cases`.
 
     Args:
-        num: how many, >= 1.
+        num: number of cases, >= 1.
         suite: "court", the default, or one of the six real scenarios of paper 002, "S.1" to
-            "S.6", or one that another package offers.
-        seed: >= 0. Case k of a suite and seed is always the same one.
-        first: place of the first one, >= 0.
+            "S.6", or a suite that another package offers.
+        seed: >= 0. Case k of a suite and seed is always the same case.
+        first: index of the first case, >= 0.
         start: (3,) [m], hover position of the quadrotor; or "uniform" over the half court.
-        delay: [s] from the serve to the moment at which planning begins.
+        delay: [s] from the serve to the moment at which planning starts.
         limit_scale: factor on the speed, acceleration and body-rate limits.
         robot: with a racket; suites of other packages have their own.
-        dtype: of every leaf.
+        dtype: of every floating leaf.
 
     Raises:
         ValueError: an argument is out of its range, or there is no such suite.
@@ -66,7 +66,7 @@ def draw(
 def planner(
     name: str = "exact", *, effort: str = "feasible", ending: str | None = None, **options: object
 ) -> Planner[HitCase, HitPlan]:
-    """The hit planner of a name, with some of its fields set.
+    """Return the hit planner of a name, with some of its fields set.
 
     * `exact`: contact, impact and landing hold by construction; the one to use.
     * `bat`: the published planner of paper 002, impact and trajectory optimised together.
@@ -101,11 +101,11 @@ def planner(
 
 
 def judge(cases: HitCase, plans: HitPlan, **settings: object) -> HitVerdict:
-    """What the referee says of one plan or of a batch: the physics alone decides.
+    """Judge one plan, or a batch of plans, by the physics alone.
 
     Args:
         cases: one case, or a batch.
-        plans: of them.
+        plans: of the cases.
         **settings: such as `drag_after_impact` and `tolerance`; see `referee_hits`.
 
     Returns:
@@ -113,7 +113,7 @@ def judge(cases: HitCase, plans: HitPlan, **settings: object) -> HitVerdict:
         measured.
 
     Raises:
-        TypeError: the cases or plans are not hits.
+        TypeError: the cases or plans are of another task.
         ValueError: shapes that do not fit, or a setting out of its range.
     """
     return judge_by(referee_hits, cases, plans, (HitCase, HitPlan), settings)

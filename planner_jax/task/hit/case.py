@@ -9,7 +9,7 @@ from flax import struct
 from jax import Array
 
 from planner_jax.ball.flight import BallState
-from planner_jax.core.checks import floating, numbers_of
+from planner_jax.core.checks import floating
 from planner_jax.core.rules import (
     NOT_NEGATIVE,
     POSITIVE,
@@ -28,6 +28,7 @@ from planner_jax.task.hit.spec import DRAG, START
 from planner_jax.task.quadrotor import (
     ARGUMENTS,
     FLIGHT_RULES,
+    hover_at,
     limits_of,
     require_start,
     require_tool,
@@ -121,15 +122,15 @@ def case(
     extras: Sequence[Extra] = (),
     dtype=jnp.float32,
 ) -> HitCase:
-    """A hit, or a batch of them, with the setting of paper 002, Section VI-A.
+    """Return a hit, or a batch of hits, with the setting of paper 002, Section VI-A.
 
     Args:
         serve_pos: (..., 3) [m], ball when planning begins, above the ground at z = 0.
         serve_vel: (..., 3) [m/s].
         target: (..., 3) [m].
-        robot: with a racket; what is not given below is the robot's.
+        robot: with a racket. The racket's and the quadrotor's numbers are the robot's by default.
         start: (3,) or (..., 3) [m], hover position of the quadrotor.
-        drag: K_D [1/m]. This and all that follow may be one value or one a case.
+        drag: K_D [1/m]. The drag and all later numbers are one value, or one value a case.
         gravity: [m/s^2].
         restitution: beta of the racket.
         racket_height: [m].
@@ -143,9 +144,9 @@ def case(
         hitting_speed: (3,) [m/s], per axis.
         min_apex: [m].
         max_apex: [m].
-        extras: such as `pj.KeepOut`, each for one case, which all of them get, or with the
+        extras: such as `pj.KeepOut`, each for one case and shared by all cases, or with the
             batch's axes on every leaf.
-        dtype: of every leaf.
+        dtype: of every floating leaf.
 
     Returns:
         A `HitCase` whose leaves carry the batch shape of `serve_pos`.
@@ -161,11 +162,9 @@ def case(
     def leaf(name: str, value: object, *shape: int) -> Array:
         return array_of(name, value, batch, shape, dtype)
 
-    head = np.zeros(batch + (4, 3))
-    head[..., 0, :] = numbers_of("start", start, batch, (3,))
     made = HitCase(
         ball=BallState(pos=leaf("serve_pos", serve_pos, 3), vel=leaf("serve_vel", serve_vel, 3)),
-        head_state=jnp.asarray(head, dtype),
+        head_state=hover_at(start, batch, dtype),
         target=leaf("target", target, 3),
         drag=leaf("drag", drag),
         gravity=leaf("gravity", gravity),

@@ -277,20 +277,9 @@ def to_cases(
     robot: QuadrotorModel = PAPER_HITTER,
     dtype=jnp.float32,
 ) -> HitCase:
-    """One batch of cases, with the setting of paper 002, from serves.
+    """Return a batch of cases, with the setting of paper 002, from N serves.
 
-    Args:
-        serves: N of them.
-        start: (3,) [m], hover position of the quadrotor; or "uniform" for `uniform_starts`.
-        seed: of the uniform starts.
-        delay: [s] from the serve to the moment at which planning begins.
-        limit_scale: factor on the speed, acceleration and body-rate limits; those of the
-            stroke stay.
-        robot: with a racket.
-        dtype: of every leaf.
-
-    Raises:
-        ArgumentError: an argument is out of its range.
+    The other arguments and the errors are those of `pj.hit.draw`; `seed` is for `uniform_starts`.
     """
     require_scalar("limit_scale", limit_scale)
     require_scalar("delay", delay)

@@ -29,18 +29,10 @@ def draw(
     first: int = 0,
     dtype: DTypeLike = jnp.float32,
 ) -> InterceptCase:
-    """Draw a batch of interceptions of a suite; `drawn` also reports how many draws it rejected.
+    """Draw a batch of interceptions of a suite; arguments and errors are those of `pj.hit.draw`.
 
-    Args:
-        num: number of cases, >= 1.
-        suite: "easy", the default, "medium", "hard", "storm", "gale", "maze" or "rush"; or a suite
-            that another package offers.
-        seed: >= 0. Case k of a suite and seed is always the same case.
-        first: index of the first case, >= 0.
-        dtype: of every floating leaf.
-
-    Raises:
-        ValueError: an argument is out of its range, or there is no such suite.
+    The suite is "easy" by default, "medium", "hard", "storm", "gale", "maze", "rush", or one that
+    another package offers. `drawn` also reports how many draws it rejected.
     """
     suite = suite_named(suite, "easy")
     if suite not in SUITES:
@@ -125,7 +117,7 @@ def planner(name: str = "spacetime", **options: object) -> Planner[InterceptCase
 
 
 def judge(cases: InterceptCase, plans: InterceptPlan, **settings: object) -> InterceptVerdict:
-    """Judge one plan, or a batch of plans, by the referee.
+    """Judge one plan, or a batch of plans, as `pj.hit.judge` does.
 
     The referee computes the positions of `TurningPath`, `PolynomialPath` and `LaterPath` itself.
     It calls the method `at` of a target of any other class, in float64.
@@ -135,14 +127,6 @@ def judge(cases: InterceptCase, plans: InterceptPlan, **settings: object) -> Int
         plans: of the cases.
         **settings: such as `tolerance`, and `truth`: the path, or a batch of paths, that the target
             really takes, where the case holds a predicted one; see `referee_intercepts`.
-
-    Returns:
-        A verdict with the batch shape of the cases: `success`, `sentence(k)`, and what was
-        measured.
-
-    Raises:
-        TypeError: the cases or plans are not interceptions.
-        ValueError: shapes that do not fit, or a setting out of its range.
     """
     require_kind("cases", cases, InterceptCase)
     target = cases.target

@@ -130,7 +130,7 @@ def case(
     steering_rate: ArrayLike = 2.0,
     dtype: DTypeLike = jnp.float32,
 ) -> InterceptCase:
-    """An interception, or a batch of them, by default with the setting of paper 003.
+    """Return an interception, or a batch, by default with the setting of paper 003.
 
     The paper gives a map of 80 x 80 pixels, T = 10 s and 0.5 m/s at the start (Section V); sizes
     and limits of the car are those of a model car of scale 1:10 on a map of 8 m x 8 m: an
@@ -138,14 +138,14 @@ def case(
 
     Args:
         target: a path pytree such as `TurningPath`, leaves with the batch's axes first.
-        time: () or (B,) [s], when to meet it, > 0. This and all that follow may be one value, or
-            one a case.
+        time: () or (B,) [s], when to meet it, > 0. The time and all later numbers are one value,
+            or one value a case.
         start: (3,) x, y of the rear axle's middle [m], and heading [rad].
         initial_speed: [m/s].
         initial_curvature: [1/m].
         walls: polygons (V, 2) [m] each, convex, the same for all cases; or `Obstacles` with the
             batch's axes on every leaf.
-        movers: likewise, where they are at time 0.
+        movers: like the walls, at time 0.
         mover_velocities: (2,) or (N, 2) [m/s], of polygons in `movers`.
         tolerance: [m], how far from the target the body's middle may be at the end.
         end_heading: [rad]; left free if not given.
@@ -164,9 +164,7 @@ def case(
         dtype: of every floating leaf.
 
     Raises:
-        CaseError: a number breaks a rule, such as a limit that is not positive; one line.
-        ValueError: a polygon is not convex, or an argument or the target's path has another shape.
-        TypeError: an argument holds no numbers, or `dtype` is not that of floating ones.
+        ValueError: a polygon is not convex; or as of `pj.hit.case`, as all other errors.
     """
     dtype, shapes = floating(dtype), [batch_of("start", start, 3)]
     own = {"time": time, "initial_speed": initial_speed, "tolerance": tolerance}

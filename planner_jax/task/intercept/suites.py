@@ -86,15 +86,7 @@ def drawn(
 ) -> Drawn:
     """Draw a batch of cases of a suite in float64, cast it, and count the rejected draws.
 
-    Args:
-        suite: a key of `SUITES`.
-        num: B, number of cases, >= 1.
-        seed: >= 0. Case k of a suite and seed is always the same case.
-        first: index of the first case, >= 0.
-        dtype: of every floating leaf.
-
-    Raises:
-        ValueError: an argument is out of its range; one line.
+    Arguments and errors are those of `pj.hit.draw`; `suite` is a key of `SUITES`.
     """
     require_name(SUITES, "suite", suite)
     own, randoms, dtype = SUITES[suite], make_generators(suite, num, seed, first), floating(dtype)
