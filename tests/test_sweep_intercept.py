@@ -1,5 +1,6 @@
 """The intercept sweep: rows that hold a case and its drive, figures, counts."""
 
+import dataclasses
 import json
 from types import SimpleNamespace
 
@@ -9,21 +10,28 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from flax import struct
+from jax import Array
+from jax.typing import ArrayLike
 from sweeps import columns
 
 import planner_jax as pj
+from planner_jax.plane.obstacles import Obstacles
 from planner_jax.plane.reach import Lattice
-from planner_jax.plane.target import PolynomialPath
+from planner_jax.plane.target import PointState, PolynomialPath
 from planner_jax.referee.intercept import referee_intercepts
+from planner_jax.robot.car import CarBody, CarLimits
 from planner_jax.runs.columns import RefereedBatch
+from planner_jax.runs.manifest import Entries, Row
 from planner_jax.runs.run_folder import RunFolder
 from planner_jax.runs.source import Chunk
 from planner_jax.sweep.intercept.columns import COLUMNS, WAY_POINTS
-from planner_jax.sweep.intercept.drive import case_of, sampled_drive
-from planner_jax.sweep.intercept.figures.scene import instants
+from planner_jax.sweep.intercept.drive import sampled_drive
+from planner_jax.sweep.intercept.figures.plane import instants
 from planner_jax.sweep.intercept.settings import InterceptSettings
 from planner_jax.sweep.intercept.sweep import InterceptSweep
 from planner_jax.sweep.report import write_report
+from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.searches import Search
 
 TASK = pj.task_named("intercept")
@@ -35,6 +43,62 @@ FIGURES = ("plane.png", "motion.png", "outcomes.png")
 def one_search():
     """The planner with one search, so that one program is compiled: that of test_intercept."""
     return pj.intercept.planner(searches=(Search(12, lattice=Lattice(layers=22)),))
+
+
+BODY = [field.name for field in dataclasses.fields(CarBody)]
+LIMITS = [field.name for field in dataclasses.fields(CarLimits)]
+
+
+@struct.dataclass
+class SampledTarget:
+    """A target of any class, straight between the places where it is at even times."""
+
+    places: Array  # (M, 2) [m], the first at time 0
+    end: Array  # () [s], the time of the last
+
+    def at(self, time: Array) -> PointState:
+        """Position [m] and velocity [m/s] at one time () [s]."""
+        num = self.places.shape[0] - 1
+        share = jnp.clip(time / self.end * num, 0.0, num)
+        k = jnp.clip(share.astype(jnp.int32), 0, num - 1)
+        step = self.places[k + 1] - self.places[k]
+        return PointState(pos=self.places[k] + (share - k) * step, vel=step * (num / self.end))
+
+
+def case_of(row: Row, setting: Entries) -> InterceptCase:
+    """Return the case of a row, with the manifest's `setting`; its target is a `SampledTarget`."""
+
+    def leaf(value: ArrayLike, *shape: int) -> Array:
+        return jnp.asarray(np.reshape(value, shape), jnp.float32)
+
+    due = leaf(row["due_time"])
+    still = 0.0 * np.array(row["wall_present"], float)
+    return InterceptCase(
+        start=leaf(row["start"], 3),
+        speed=leaf(row["initial_speed"]),
+        curvature=leaf(row["initial_curvature"]),
+        target=SampledTarget(places=leaf(row["target_way"], -1, 2), end=due),
+        time=due,
+        walls=_obstacles(row, "wall", np.repeat(still, 2)),
+        movers=_obstacles(row, "mover", row["mover_velocity"]),
+        lower=leaf(setting["lower"], 2),
+        upper=leaf(setting["upper"], 2),
+        body=CarBody(**{name: leaf(setting[f"body_{name}"]) for name in BODY}),
+        limits=CarLimits(**{name: leaf(setting[name]) for name in LIMITS}),
+        **{n: leaf(row[n]) for n in ("tolerance", "end_heading", "heading_tolerance")},
+    )
+
+
+def _obstacles(row: Row, kind: str, velocity: ArrayLike) -> Obstacles:
+    present = np.array(row[f"{kind}_present"], bool)
+    corners = np.reshape(row[f"{kind}_corners"], (len(present), -1, 2))
+    centre = corners.mean(axis=1, keepdims=True)
+    return Obstacles(
+        centre=jnp.asarray(centre[:, 0], jnp.float32),
+        corners=jnp.asarray(corners - centre, jnp.float32),
+        velocity=jnp.asarray(np.reshape(velocity, (-1, 2)), jnp.float32),
+        present=jnp.asarray(present),
+    )
 
 
 @pytest.fixture(autouse=True, scope="module")

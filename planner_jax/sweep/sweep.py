@@ -48,7 +48,7 @@ class Sweep:
     frame: ClassVar[str] = ""  # axes and times of the columns, in words
     own_columns: ClassVar[Sequence[Column]] = ()
     single_columns: ClassVar[Sequence[Column]] = ()  # of one case that was asked for alone
-    figures: ClassVar[Sequence[RunFigure]] = (
+    figures: ClassVar[tuple[RunFigure, ...]] = (
         RunFigure(
             "outcomes.png",
             "Success with its 95 % Wilson interval, failures by name, and iterations.",

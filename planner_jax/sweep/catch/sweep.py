@@ -10,7 +10,7 @@ from planner_jax.runs.summary import COUNTED, Tally
 from planner_jax.runs.table import RateTable, own_cells
 from planner_jax.sweep.catch.columns import COLUMNS, FRAME
 from planner_jax.sweep.catch.figures.flight import flight_figure
-from planner_jax.sweep.catch.figures.motion import motion_figure, plan_figure
+from planner_jax.sweep.catch.figures.motion import motion_figure
 from planner_jax.sweep.catch.figures.outcomes import outcomes_figure
 from planner_jax.sweep.catch.settings import CatchSettings
 from planner_jax.sweep.figures.motion import CAPTION as MOTION
@@ -97,7 +97,7 @@ class CatchSweep(Sweep):
             "motion.png",
             "The plan along its time against the limits.",
             (13.0, 6.8),
-            lambda figure, run: plan_figure(figure, run, "as asked for"),
+            motion_figure,
         ),
     )
 

@@ -64,7 +64,6 @@ def quadrotor_figure(
     panels: Sequence[str],
     first: Callable[[Axes, Entries, list[Drawn]], None],
     word: Callable[[Row], str],
-    which: str,
 ) -> None:
     """Draw a quadrotor's plans for the same case along their time against the limits.
 
@@ -75,7 +74,6 @@ def quadrotor_figure(
         first: draws the panel before these, from its axes, the run's setting and the plans, the
             run's own last.
         word: what the referee says of a row that succeeds.
-        which: what the case is of, behind its index.
     """
     plans, setting = run.same_case(), run.manifest["setting"]
     axes = figure.subplots(2, 3, sharex=True)
@@ -104,7 +102,7 @@ def quadrotor_figure(
     axes[0, 2].tick_params(labelbottom=True)
     for panel in (*axes[1, :2], axes[0, 2]):
         panel.set_xlabel("time since planning began [s]")
-    write_verdicts(axes[1, 2], f"Case {plans[0][1]['index']}, {which}", plans, word)
+    write_verdicts(axes[1, 2], run, plans, word)
 
 
 def look_of(place: int, name: str, row: Row) -> Entries:
@@ -146,14 +144,22 @@ def _draw_thrust_limits(axes: Axes, setting: Entries) -> None:
 
 def write_verdicts(
     axes: Axes,
-    case: str,
+    run: RunRows,
     plans: Sequence[tuple[str, Row]],
     word: Callable[[Row], str],
 ) -> None:
     """Write the legend, each planner with the referee's word."""
     axes.axis("off")
     look: Look = {"va": "top", "transform": axes.transAxes}
-    axes.text(0.0, 1.0, f"{case}\nlimits: red; curves of failed plans: dashed", **look)
+    row, suite = plans[0][1], run.manifest["parameters"].get("suite")
+    origin = "as asked for" if suite is None else f"suite {suite}"
+    origin = f"scenario {row['scenario']}" if "scenario" in row else origin
+    axes.text(
+        0.0,
+        1.0,
+        f"Case {row['index']}, {origin}\nlimits: red; curves of failed plans: dashed",
+        **look,
+    )
     step = min(0.22, 0.9 / len(plans))
     for place, (name, row) in enumerate(plans):
         top = 0.78 - step * place

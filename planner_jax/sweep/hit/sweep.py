@@ -13,7 +13,7 @@ from planner_jax.runs.table import RateTable, own_cells
 from planner_jax.sweep.figures.motion import CAPTION as MOTION
 from planner_jax.sweep.hit.columns import COLUMNS, FRAME, SINGLE_COLUMNS, published_column
 from planner_jax.sweep.hit.figures.court import court_figure, path_figure
-from planner_jax.sweep.hit.figures.motion import motion_figure, plan_figure
+from planner_jax.sweep.hit.figures.motion import motion_figure
 from planner_jax.sweep.hit.figures.rates import compared_with, rates_figure
 from planner_jax.sweep.hit.settings import HitSettings
 from planner_jax.sweep.hit.source import ServeSource, open_source
@@ -103,7 +103,7 @@ class HitSweep(Sweep):
             "motion.png",
             "The plan along its time against the limits.",
             (13.0, 6.8),
-            lambda figure, run: plan_figure(figure, run, "as asked for"),
+            motion_figure,
         ),
     )
     failure_words = {"case": "index", "scenario": "scenario", **Sweep.failure_words}

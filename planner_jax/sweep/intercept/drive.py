@@ -1,38 +1,14 @@
-"""The case and the drive of one row of the run."""
+"""The drive of one row of the run."""
 
 import dataclasses
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 from jax import Array
-from jax.typing import ArrayLike
 
-from planner_jax.plane.obstacles import Obstacles
-from planner_jax.plane.target import PointState
-from planner_jax.robot.car import CarBody, CarLimits, knots_at, pose_at
+from planner_jax.robot.car import knots_at, pose_at
 from planner_jax.runs.manifest import Entries, Row
-from planner_jax.task.intercept.case import InterceptCase
-
-_BODY = tuple(field.name for field in dataclasses.fields(CarBody))
-_LIMITS = tuple(field.name for field in dataclasses.fields(CarLimits))
-
-
-@struct.dataclass
-class SampledTarget:
-    """A target of any class, straight between the places where it is at even times."""
-
-    places: Array  # (M, 2) [m], the first at time 0
-    end: Array  # () [s], the time of the last
-
-    def at(self, time: Array) -> PointState:
-        """Position [m] and velocity [m/s] at one time () [s]."""
-        num = self.places.shape[0] - 1
-        share = jnp.clip(time / self.end * num, 0.0, num)
-        k = jnp.clip(share.astype(jnp.int32), 0, num - 1)
-        step = self.places[k + 1] - self.places[k]
-        return PointState(pos=self.places[k] + (share - k) * step, vel=step * (num / self.end))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,39 +91,3 @@ def _sampled(
 
     pose, v, c, acceleration = jax.vmap(at)(time)
     return {"time": time, "pose": pose, "speed": v, "curvature": c, "acceleration": acceleration}
-
-
-def case_of(row: Row, setting: Entries) -> InterceptCase:
-    """Return the case of a row, with the manifest's `setting`; its target is a `SampledTarget`."""
-
-    def leaf(value: ArrayLike, *shape: int) -> Array:
-        return jnp.asarray(np.reshape(value, shape), jnp.float32)
-
-    due = leaf(row["due_time"])
-    still = 0.0 * np.array(row["wall_present"], float)
-    return InterceptCase(
-        start=leaf(row["start"], 3),
-        speed=leaf(row["initial_speed"]),
-        curvature=leaf(row["initial_curvature"]),
-        target=SampledTarget(places=leaf(row["target_way"], -1, 2), end=due),
-        time=due,
-        walls=_obstacles(row, "wall", np.repeat(still, 2)),
-        movers=_obstacles(row, "mover", row["mover_velocity"]),
-        lower=leaf(setting["lower"], 2),
-        upper=leaf(setting["upper"], 2),
-        body=CarBody(**{name: leaf(setting[f"body_{name}"]) for name in _BODY}),
-        limits=CarLimits(**{name: leaf(setting[name]) for name in _LIMITS}),
-        **{n: leaf(row[n]) for n in ("tolerance", "end_heading", "heading_tolerance")},
-    )
-
-
-def _obstacles(row: Row, kind: str, velocity: ArrayLike) -> Obstacles:
-    present = np.array(row[f"{kind}_present"], bool)
-    corners = np.reshape(row[f"{kind}_corners"], (len(present), -1, 2))
-    centre = corners.mean(axis=1, keepdims=True)
-    return Obstacles(
-        centre=jnp.asarray(centre[:, 0], jnp.float32),
-        corners=jnp.asarray(corners - centre, jnp.float32),
-        velocity=jnp.asarray(np.reshape(velocity, (-1, 2)), jnp.float32),
-        present=jnp.asarray(present),
-    )

@@ -8,7 +8,6 @@ from planner_jax.robot.car import CarPlan
 from planner_jax.runs.manifest import Entries, Row
 from planner_jax.runs.summary import COUNTED, Tally
 from planner_jax.sweep.figures.motion import CAPTION as MOTION
-from planner_jax.sweep.figures.outcomes import outcomes_figure
 from planner_jax.sweep.intercept.columns import COLUMNS, FRAME
 from planner_jax.sweep.intercept.figures.motion import motion_figure
 from planner_jax.sweep.intercept.figures.plane import plane_figure
@@ -48,12 +47,7 @@ class InterceptSweep(Sweep):
             plane_figure,
         ),
         RunFigure("motion.png", MOTION, (13.0, 6.8), motion_figure),
-        RunFigure(
-            "outcomes.png",
-            "Success with its 95 % Wilson interval, failures by name, and iterations.",
-            (13.0, 4.4),
-            outcomes_figure,
-        ),
+        *Sweep.figures,
     )
 
     def other_planners(self, settings: InterceptSettings) -> Entries:

@@ -16,12 +16,7 @@ _LEAST_DISTANCE = 1e-3  # [m], of the logarithmic axis
 
 def motion_figure(figure: Figure, run: RunRows) -> None:
     """Draw net distance, speed, body rate, thrust and jerk of plans for the same case."""
-    plan_figure(figure, run, f"suite {run.manifest['parameters']['suite']}")
-
-
-def plan_figure(figure: Figure, run: RunRows, which: str) -> None:
-    """Draw the same, with words of what the case is of."""
-    quadrotor_figure(figure, run, _PANELS, _draw_distances, _word, which)
+    quadrotor_figure(figure, run, _PANELS, _draw_distances, _word)
 
 
 def _draw_distances(axes: Axes, setting: Entries, plans: list[Drawn]) -> None:

@@ -17,12 +17,7 @@ _PANELS = ("speed", "acceleration", "body_rate", "thrust")
 
 def motion_figure(figure: Figure, run: RunRows) -> None:
     """Draw height, speed, acceleration, body rate and thrust of plans for the same serve."""
-    plan_figure(figure, run, f"scenario {run.same_case()[0][1]['scenario']}")
-
-
-def plan_figure(figure: Figure, run: RunRows, which: str) -> None:
-    """Draw the same, with words of what the case is of."""
-    quadrotor_figure(figure, run, _PANELS, _draw_heights, _word, which)
+    quadrotor_figure(figure, run, _PANELS, _draw_heights, _word)
 
 
 def _word(row: Row) -> str:

@@ -50,8 +50,7 @@ def motion_figure(figure: Figure, run: RunRows) -> None:
     panels[0, 2].tick_params(labelbottom=True)
     for axes in (*panels[1, :2], panels[0, 2]):
         axes.set_xlabel("time since the car sets out [s]")
-    suite = run.manifest["parameters"]["suite"]
-    write_verdicts(panels[1, 2], f"Case {plans[0][1]['index']}, suite {suite}", plans, _word)
+    write_verdicts(panels[1, 2], run, plans, _word)
 
 
 def _word(row: Row) -> str:
