@@ -9,6 +9,7 @@ from closed_forms import region_of
 
 import planner_jax as pj
 from planner_jax.ball import flight
+from planner_jax.baselines.hit.published import published_rates
 from planner_jax.core.errors import ArgumentError, CaseError
 from planner_jax.task.hit import court
 from planner_jax.task.hit.case import GRAVITY
@@ -17,7 +18,6 @@ from planner_jax.task.hit.court import (
     fly,
     landing,
 )
-from planner_jax.task.hit.published import published_rates
 from planner_jax.task.hit.spec import DRAG
 from planner_jax.task.hit.suites import (
     DEPTH,

@@ -14,6 +14,7 @@ from scipy.stats import binomtest
 from sweeps import columns, rows_of, stop_after
 
 import planner_jax as pj
+from planner_jax.baselines.hit.published import published_rates
 from planner_jax.core.errors import ArgumentError
 from planner_jax.planning.plan import plan
 from planner_jax.planning.programs import solve_on_devices
@@ -32,7 +33,6 @@ from planner_jax.sweep.report import RunRows, write_report
 from planner_jax.sweep.run import SweepInterrupted, resume_sweep, start_sweep
 from planner_jax.task.hit import court
 from planner_jax.task.hit.default_planner import ExactHit
-from planner_jax.task.hit.published import published_rates
 from planner_jax.task.hit.spec import REAL_SCENARIOS
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 

@@ -6,6 +6,7 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import PyTree
 
+from planner_jax.baselines.hit.published import published_rates
 from planner_jax.robot.quadrotor import QuadrotorPlan
 from planner_jax.runs.manifest import Entries, Row
 from planner_jax.runs.summary import COUNTED, Tally
@@ -22,7 +23,6 @@ from planner_jax.sweep.quadrotor_settings import robot_remark
 from planner_jax.sweep.rows import quadrotor_plan
 from planner_jax.sweep.sweep import RunFigure, Sweep, first_values
 from planner_jax.task.hit import court
-from planner_jax.task.hit.published import published_rates
 
 
 class HitTally(Tally):

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import math
 import os
+import pkgutil
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -80,9 +81,7 @@ def read_serves(folder: str | os.PathLike) -> Serves:
             not finite, does not land in the hitting half, or differs between the files of a
             scenario; `value` has all of these rows.
     """
-    from planner_jax.task.hit.published import read_trials
-
-    trials = read_trials(folder)
+    trials = pkgutil.resolve_name("planner_jax.baselines.hit.published:read_trials")(folder)
     numbers = np.array([trial.numbers for trial in trials])
     return Serves(
         position=numbers[:, 0:3],

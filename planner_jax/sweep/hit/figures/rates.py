@@ -4,13 +4,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from planner_jax.baselines.hit.published import published_rates
 from planner_jax.runs import style
 from planner_jax.runs.manifest import Entries
 from planner_jax.runs.style import Look
 from planner_jax.runs.summary import wilson_interval
 from planner_jax.sweep.report import RunRows
 from planner_jax.task.hit import court
-from planner_jax.task.hit.published import published_rates
 
 _WIDTH = 0.26
 

@@ -188,7 +188,7 @@ class PublishedRates:
 
 def published_rates() -> PublishedRates:
     """The rates that came with paper 002, columns in the order of court.PLANNERS."""
-    text = (resources.files("planner_jax.task.hit") / "published_rates.csv").read_text(
+    text = (resources.files("planner_jax.baselines.hit") / "published_rates.csv").read_text(
         encoding="utf-8"
     )
     table = csv.DictReader(line for line in text.splitlines() if not line.startswith("#"))
