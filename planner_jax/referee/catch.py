@@ -106,12 +106,7 @@ def referee_catches(
     that belongs to an absent target; with a duration they are flown, and judged like the rest.
     Where targets are optional a plan catches as many as it has pieces for: each of these catches
     is judged, and `num_caught` says how many hold.
-    Speed, thrust, body rate and height are sampled at both ends and inside of every piece and
-    their peaks searched on the polynomial itself. Errors at time 0 and between pieces count as
-    displacement (`referee.quadrotor.joint_errors`). A lane without targets has nothing to fail.
-
-    The case's extra limits are asked for their excess at the samples, in float64, and searched
-    between those where they may be greatest.
+    The flight is judged as `referee_hits` judges it. A lane without targets has nothing to fail.
 
     The target's place is worked out here, in float64, for a path with the fields of `BallPath`
     (known by `ball`), of `HarmonicPath` (`amplitude`) or of `PathTable` (`resolution`; between

@@ -16,6 +16,7 @@ import functools
 import numpy as np
 
 from planner_jax.referee.judging import (
+    ABOVE_LIMIT,
     CONTACT_TIME_TOLERANCE,
     FlightVerdict,
     above,
@@ -40,9 +41,7 @@ _SENTENCES = {
     "contact time": "off by {excess:.3g} s; it must be positive, the end of the trajectory "
     "({time:.3f} s), and before the ball lands",
     **MOTION_SENTENCES,
-    "hitting speed x": "{excess:.2%} above its limit at {time:.3f} s",
-    "hitting speed y": "{excess:.2%} above its limit at {time:.3f} s",
-    "hitting speed z": "{excess:.2%} above its limit at {time:.3f} s",
+    **{f"hitting speed {axis}": ABOVE_LIMIT for axis in "xyz"},
     "contact": "the racket centre is {excess:.3g} m from the ball at {time:.3f} s",
     "wrong face": "the ball leaves the racket's face at {excess:.3g} m/s at {time:.3f} s",
     "apex low": "{excess:.2%} below the least apex at {time:.3f} s",
@@ -98,16 +97,11 @@ def referee_hits(
 ) -> HitVerdict:
     """Judge every plan of a batch.
 
-    Speed, acceleration, body rate and height are sampled at both ends and inside of every
-    piece; the likeliest peak by parabolas through three samples is then searched on the
-    polynomial itself, so that what is reported is reached. The impact is the end of the
-    trajectory. Errors e_n of the n-th derivative (n = 0..3) at time 0 and between pieces
-    count as the displacement |e_n| h^n / n! that they make over one mean piece h (at least
-    `SHORTEST_PIECE`). Eight minimum-snap pieces computed in float32 with coordinates up to
-    4.5 m have at most 1.3e-4 m of it, under a third of the default tolerance.
-
-    The case's extra limits are asked for their excess at the samples, in float64, and searched
-    between those where they may be greatest.
+    `referee.quadrotor` measures the flight: `peaks` its speed, acceleration, thrust, body rate and
+    height, `joint_errors` its errors at time 0 and between pieces as displacement, and
+    `referee.extras` the excess over the case's extra limits. Eight minimum-snap pieces computed in
+    float32 with coordinates up to 4.5 m have at most 1.3e-4 m of displacement, under a third of the
+    default tolerance. The impact is the end of the trajectory.
 
     Args:
         cases: object with the fields of `HitCase`, leaves with leading axis B.

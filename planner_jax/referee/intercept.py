@@ -15,6 +15,7 @@ import numpy as np
 
 from planner_jax.referee.clearance import clearances
 from planner_jax.referee.judging import (
+    ABOVE_LIMIT,
     CONTACT_TIME_TOLERANCE,
     SMALLEST_LIMIT,
     Verdict,
@@ -26,8 +27,6 @@ from planner_jax.referee.judging import (
     read_leaves,
 )
 
-# Limit -> what is said when it fails. In the order in which they are tested: a failed plan is
-# named after its first failure.
 _SENTENCES = {
     "not finite": "the plan or its case is not finite",
     "time": "the plan ends at {time:.3f} s, off by {excess:.3g} s; it must end after time 0, and "
@@ -35,10 +34,9 @@ _SENTENCES = {
     "start": "the plan starts {excess:.3g} off the case in position [m], heading [rad], speed "
     "[m/s] or curvature [1/m]",
     "speed": "{excess:.2%} of its limit above it or below zero at {time:.3f} s",
-    "acceleration": "{excess:.2%} above its limit at {time:.3f} s",
-    "curvature": "{excess:.2%} above its limit at {time:.3f} s",
-    "steering rate": "{excess:.2%} above its limit at {time:.3f} s",
-    "lateral acceleration": "{excess:.2%} above its limit at {time:.3f} s",
+    **dict.fromkeys(
+        ("acceleration", "curvature", "steering rate", "lateral acceleration"), ABOVE_LIMIT
+    ),
     "map": "the body's middle is {excess:.3g} m off the map at {time:.3f} s",
     "wall": "the body is {excess:.3g} m inside walls[{nearest_wall}] at {time:.3f} s",
     "mover": "the body is {excess:.3g} m inside movers[{nearest_mover}] at {time:.3f} s",
@@ -144,8 +142,6 @@ def referee_intercepts(
     """
     if not 0.0 < step <= LONGEST_STEP:
         raise ValueError(f"step must be > 0 and <= {LONGEST_STEP}, got {step}")
-    if chunk < 1:
-        raise ValueError(f"chunk must be >= 1, got {chunk}")
     leaves = _leaves(cases, plans)
     times = leaves["plan.time"].astype(np.float64)
     target = cases.target if truth is None else truth
@@ -159,15 +155,8 @@ def referee_intercepts(
 
 # Leaves of a case -> shape in one lane.
 _SHAPES: dict[str, tuple[int, ...]] = {
-    "start": (3,),
-    "speed": (),
-    "curvature": (),
-    "time": (),
-    "tolerance": (),
-    "end_heading": (),
-    "heading_tolerance": (),
-    "lower": (2,),
-    "upper": (2,),
+    **{"start": (3,), "lower": (2,), "upper": (2,), "speed": (), "curvature": (), "time": ()},
+    **{"tolerance": (), "end_heading": (), "heading_tolerance": ()},
     **{f"body.{name}": () for name in ("length", "width", "wheelbase", "rear_overhang")},
     **{f"limits.{name}": () for name in ("speed", "acceleration", "lateral_acceleration")},
     **{f"limits.{name}": () for name in ("curvature", "steering_rate")},

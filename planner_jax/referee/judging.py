@@ -13,6 +13,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+ABOVE_LIMIT = "{excess:.2%} above its limit at {time:.3f} s"  # sentence for a failed limit
+
 
 @dataclasses.dataclass(frozen=True)
 class Verdict:

@@ -11,7 +11,15 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from planner_jax.referee.judging import above, checked_leaf, cut, derivative, flat, read_leaves
+from planner_jax.referee.judging import (
+    ABOVE_LIMIT,
+    above,
+    checked_leaf,
+    cut,
+    derivative,
+    flat,
+    read_leaves,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,9 +88,7 @@ def with_ending(pieces: Pieces, case: dict) -> Pieces:
 MOTION_SENTENCES = {
     "head state": "the trajectory starts {excess:.3g} m off the head state",
     "continuity": "the trajectory jumps by {excess:.3g} m at {time:.3f} s",
-    "speed": "{excess:.2%} above its limit at {time:.3f} s",
-    "acceleration": "{excess:.2%} above its limit at {time:.3f} s",
-    "body rate": "{excess:.2%} above its limit at {time:.3f} s",
+    **dict.fromkeys(("speed", "acceleration", "body rate"), ABOVE_LIMIT),
     "thrust low": "{excess:.2%} below the least thrust at {time:.3f} s",
     "thrust high": "{excess:.2%} above the greatest thrust at {time:.3f} s",
     "rotor low": "a rotor's thrust is {excess:.2%} of the greatest below the least at {time:.3f} s",

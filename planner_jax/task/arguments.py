@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.typing import DTypeLike
+from jax.typing import ArrayLike, DTypeLike
 
 from planner_jax.core.checks import numbers_of, numeric, require_number, require_switch, shape_of
 from planner_jax.core.choices import require_memory, require_size
@@ -88,6 +88,15 @@ def find_decision(
         return decide
     name, file = split_name(names, "decide", decide, from_file)
     return pkgutil.resolve_name(names[name])(*filter(None, [file]))
+
+
+def require_orders(orders: ArrayLike) -> None:
+    """Raise `ValueError` unless every order (..., N) of a batch is a permutation."""
+    flat = np.asarray(orders).reshape(-1, np.shape(orders)[-1])
+    wrong = np.flatnonzero((np.sort(flat, axis=1) != np.arange(flat.shape[1])).any(axis=1))
+    if wrong.size:
+        shown = f"{flat[wrong[0]].tolist()} in case {wrong[0]}"
+        raise ArgumentError("order", f"a permutation of 0..{flat.shape[1] - 1}", shown=shown)
 
 
 VerdictT = TypeVar("VerdictT")

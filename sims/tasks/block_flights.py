@@ -30,12 +30,12 @@ from planner_jax.sims.robots.arm.drives import IDEAL, Drives
 from planner_jax.sims.robots.arm.robot import ShieldArm
 from planner_jax.sims.task import FlightCases, Flights
 from planner_jax.studies.block.receding import Decided
-from planner_jax.task.block.api import draw as draw_throws
 from planner_jax.task.block.api import planner as block_planner
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.plan import BlockPlan
 from planner_jax.task.block.scene import FLOOR
 from planner_jax.task.block.suites import BALL_RADIUS, GRAVITY
+from planner_jax.task.block.suites import draw as draw_throws
 
 BLOCK_ARM = ShieldArm(base_height=-FLOOR)
 BLOCK_WORLD = World(BLOCK_ARM, GRAVITY, num_balls=0, timestep=TIMESTEP)

@@ -1,4 +1,3 @@
-from .api import draw as draw
 from .api import judge as judge
 from .api import planner as planner
 from .case import BlockCase as BlockCase
@@ -7,3 +6,4 @@ from .default_planner import OnlineBlock as OnlineBlock
 from .plan import BlockPlan as BlockPlan
 from .scene import Scene as Scene
 from .scene import paper_scene as paper_scene
+from .suites import draw as draw

@@ -1,50 +1,11 @@
-"""The functions `pj.block.draw`, `planner` and `judge`; `case` is in a module of its own."""
-
-import jax.numpy as jnp
-from jax.typing import DTypeLike
+"""The functions `pj.block.planner` and `judge`; `case` and `draw` are in modules of their own."""
 
 from planner_jax.core.planner import Planner
-from planner_jax.core.registry import suite_named
 from planner_jax.referee.block import BlockVerdict, referee_blocks
 from planner_jax.task.arguments import judge_by
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.plan import BlockPlan
-from planner_jax.task.block.spec import SUITES, TASK
-from planner_jax.task.block.suites import draw_cases
-
-
-def draw(
-    num: int,
-    suite: str | None = None,
-    seed: int = 0,
-    *,
-    first: int = 0,
-    regime: str = "R2",
-    wide: bool = False,
-    anywhere: bool = False,
-    delay: float = 0.0,
-    dtype: DTypeLike = jnp.float32,
-) -> BlockCase:
-    """Draw throws as a batch of cases.
-
-    The suite is "pole" by default, "open", "short", or one that another package offers. `regime`,
-    `wide`, `anywhere` and `delay` [s] are those of `case`; the other arguments and the errors are
-    those of `pj.hit.draw`.
-    """
-    suite = suite_named(suite, "pole")
-    if suite not in SUITES:
-        return TASK.other_suite(suite)(num, seed, first)
-    return draw_cases(
-        suite,
-        num,
-        seed,
-        first,
-        regime=regime,
-        wide=wide,
-        anywhere=anywhere,
-        delay=delay,
-        dtype=dtype,
-    )
+from planner_jax.task.block.spec import TASK
 
 
 def planner(name: str = "online", **options: object) -> Planner[BlockCase, BlockPlan]:

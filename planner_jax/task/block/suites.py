@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
 
-from planner_jax.core.registry import require_name
+from planner_jax.core.registry import suite_named
 from planner_jax.task.arguments import make_generators
 from planner_jax.task.block.case import BlockCase, case
 from planner_jax.task.block.scene import (
@@ -30,7 +30,7 @@ from planner_jax.task.block.scene import (
     POLE_RADIUS,
     paper_scene,
 )
-from planner_jax.task.block.spec import SUITES, Suite
+from planner_jax.task.block.spec import SUITES, TASK, Suite
 
 GRAVITY = 9.81  # [m/s^2]
 BALL_RADIUS = 0.05  # [m]
@@ -40,23 +40,27 @@ SPEED = (7.0, 10.0)  # [m/s], distance over flight time
 _LOOK = 0.002  # [s], between two places of a ball that are looked at
 
 
-def draw_cases(
-    suite: str,
+def draw(
     num: int,
-    seed: int,
-    first: int = 0,
+    suite: str | None = None,
+    seed: int = 0,
     *,
+    first: int = 0,
     regime: str = "R2",
     wide: bool = False,
     anywhere: bool = False,
     delay: float = 0.0,
     dtype: DTypeLike = jnp.float32,
 ) -> BlockCase:
-    """Draw a batch of cases of a suite in float64, and cast it.
+    """Draw throws as a batch of cases in float64, and cast it.
 
-    Arguments and errors are those of `pj.block.draw`; `suite` is a key of `SUITES`.
+    The suite is "pole" by default, "open", "short", or one that another package offers. `regime`,
+    `wide`, `anywhere` and `delay` [s] are those of `case`; the other arguments and the errors are
+    those of `pj.hit.draw`.
     """
-    require_name(SUITES, "suite", suite)
+    suite = suite_named(suite, "pole")
+    if suite not in SUITES:
+        return TASK.other_suite(suite)(num, seed, first)
     own, randoms = SUITES[suite], make_generators(suite, num, seed, first)
     thrown = np.array([_throw(own, random) for random in randoms])
     return case(

@@ -16,6 +16,7 @@ from jax import Array, lax
 
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import Status, is_unsolved, require_settings
+from planner_jax.task.arguments import require_orders
 from planner_jax.task.catch.case import CatchCase, CatchChoice
 from planner_jax.task.catch.estimate import (
     GRID,
@@ -278,14 +279,7 @@ class Given(CatchDecision):
 
     def check(self, cases: CatchCase) -> None:
         """Raise `ValueError` unless every order is a permutation."""
-        order = np.asarray(cases.order)
-        wrong = np.flatnonzero((np.sort(order, axis=-1) != np.arange(order.shape[-1])).any(axis=-1))
-        if wrong.size:
-            raise ArgumentError(
-                "order",
-                f"a permutation of 0..{order.shape[-1] - 1}",
-                shown=f"{order[wrong[0]].tolist()} in case {wrong[0]}",
-            )
+        require_orders(cases.order)
 
     def propose(self, case: CatchCase) -> CatchChoice:
         """The one choice of one case, leaves (1, N)."""

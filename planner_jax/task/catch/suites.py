@@ -154,9 +154,9 @@ def draw(
         raise ArgumentError("num_targets", f">= {own} for suite {suite!r}", size)
     random = np.random.default_rng([seed, zlib.crc32(suite.encode())])
     # One row a case: what stands in front is passed over.
-    columns = _columns(suite)
+    columns, make_targets = _PATHS[suite]
     random.bit_generator.advance(first * columns)  # type: ignore[attr-defined]
-    targets, horizon = _targets(suite, random.random((num, columns)))
+    targets, horizon = make_targets(random.random((num, columns)))
     # Which of the suite's targets has each place.
     place = np.where(np.arange(size) < own, np.arange(size), 0)
     cases = case(
@@ -172,39 +172,14 @@ def draw(
 
 
 def draw_by_key(key: Array, num: int, suite: str) -> CatchCase:
-    """A batch of cases as `draw` draws them, by a key of `jax.random`: pure, in float32.
-
-    Args:
-        key: of `jax.random`.
-        num: B, how many, >= 1.
-        suite: a key of `SUITES`.
-    """
-    uniform = jax.random.uniform(key, (num, _columns(suite)))
-    targets, horizon = _targets(suite, uniform)
-    targets, horizon = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), (targets, horizon))
+    """Draw `num` cases of a suite of `SUITES` by a key of `jax.random`: pure, in float32."""
+    columns, make_targets = _PATHS[suite]
+    found = make_targets(jax.random.uniform(key, (num, columns)))
+    targets, horizon = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), found)
     one = draw(1, suite)
     cases = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (num, *leaf.shape[1:])), one)
     times = one.times / one.horizon[:, :1] * horizon[:, :1]
     return dataclasses.replace(cases, targets=targets, horizon=horizon, times=times)
-
-
-def _columns(suite: str) -> int:
-    """How many numbers a case of a suite takes."""
-    throws = _THROWS.get(suite)
-    return 3 * len(throws) if throws else _PATHS[suite][0]
-
-
-def _targets(suite: str, uniform: PyTree) -> tuple[TargetPath, PyTree]:
-    """Targets, leaves (num, N, ...), and horizons (num, N) [s] from numbers of [0, 1).
-
-    Args:
-        suite: a key of `SUITES`.
-        uniform: (num, C), NumPy or JAX, and so are the targets.
-    """
-    throws = _THROWS.get(suite)
-    if throws:
-        return _throws(uniform, throws)
-    return _PATHS[suite][1](uniform)
 
 
 def _module(array: PyTree) -> ModuleType:
@@ -232,12 +207,8 @@ def _throws(uniform: PyTree, throws: tuple[_Throw, ...]) -> tuple[BallPath, PyTr
     drawn = [_throw(u, t) for u, t in zip(xp.split(uniform, len(throws), 1), throws, strict=True)]
     pos, vel, horizon = (xp.stack(column, axis=1) for column in zip(*drawn, strict=True))
     drag = np.broadcast_to([[t.drag] * 3 for t in throws], pos.shape)
-    return _balls(pos, vel, drag, np.full(horizon.shape, GRAVITY)), horizon
-
-
-def _balls(pos: PyTree, vel: PyTree, drag: PyTree, gravity: PyTree) -> BallPath:
-    """Paths with NumPy leaves."""
-    return BallPath(ball=BallState(pos=pos, vel=vel), drag=drag, gravity=gravity)
+    gravity = np.full(horizon.shape, GRAVITY)
+    return BallPath(BallState(pos=pos, vel=vel), drag, gravity), horizon
 
 
 def _throw(uniform: PyTree, throw: _Throw) -> tuple[PyTree, PyTree, PyTree]:
@@ -295,7 +266,8 @@ def _fly(pos, vel, time, drag: float, gravity: float = GRAVITY) -> tuple[PyTree,
 
 def _lines(pos: PyTree, vel: PyTree) -> BallPath:
     """Targets that fly straight on from `pos` (B, N, 3) at `vel`."""
-    return _balls(pos, vel, np.zeros(pos.shape), np.zeros(pos.shape[:2]))
+    ball = BallState(pos=pos, vel=vel)
+    return BallPath(ball, drag=np.zeros(pos.shape), gravity=np.zeros(pos.shape[:2]))
 
 
 def _harmonic(uniform: PyTree) -> tuple[HarmonicPath, PyTree]:
@@ -357,8 +329,13 @@ def _swarm(uniform: PyTree, *, num: int) -> tuple[BallPath, PyTree]:
 
 _hexagon = functools.partial(_polygon, num=6)
 
-# Suite -> how many numbers a case takes, and what makes targets and horizons of them.
-_PATHS: dict[str, tuple[int, Callable]] = {
+# Suite -> the number C of random numbers a case, and the function that makes of numbers (B, C) of
+# [0, 1), NumPy or JAX, the targets, leaves (B, N, ...), and the horizons (B, N) [s].
+_PATHS: dict[str, tuple[int, Callable[[PyTree], tuple[TargetPath, PyTree]]]] = {
+    **{
+        name: (3 * len(throws), functools.partial(_throws, throws=throws))
+        for name, throws in _THROWS.items()
+    },
     "harmonic2": (18, _harmonic),
     "triangle3": (7, _triangle),
     "hexagon6": (8, _hexagon),

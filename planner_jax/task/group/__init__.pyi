@@ -1,4 +1,3 @@
-from .api import draw as draw
 from .api import judge as judge
 from .api import planner as planner
 from .case import InterceptGroup as InterceptGroup
@@ -8,3 +7,4 @@ from .decide import Given as Given
 from .decide import Greedy as Greedy
 from .default_planner import GroupIntercept as GroupIntercept
 from .plan import GroupPlan as GroupPlan
+from .suites import draw as draw

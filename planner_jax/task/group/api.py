@@ -1,37 +1,14 @@
-"""The functions `pj.group.draw`, `planner` and `judge`; `case` is in a module of its own."""
-
-import jax.numpy as jnp
-from jax.typing import DTypeLike
+"""The functions `pj.group.planner` and `judge`; `case` and `draw` are in modules of their own."""
 
 from planner_jax.core.protocol import Decision
-from planner_jax.core.registry import suite_named
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.referee.intercept import InterceptVerdict, referee_intercepts
 from planner_jax.referee.intercept_group import referee_groups
 from planner_jax.task.arguments import find_decision, judge_by, require_settings
 from planner_jax.task.group.case import InterceptGroup
 from planner_jax.task.group.plan import GroupPlan
-from planner_jax.task.group.spec import DECISIONS, SUITES, TASK
-from planner_jax.task.group.suites import draw_groups
+from planner_jax.task.group.spec import DECISIONS, TASK
 from planner_jax.task.intercept.api import by_own_class
-
-
-def draw(
-    num: int,
-    suite: str | None = None,
-    seed: int = 0,
-    *,
-    first: int = 0,
-    dtype: DTypeLike = jnp.float32,
-) -> InterceptGroup:
-    """Draw a batch of groups of a suite; arguments and errors are those of `pj.hit.draw`.
-
-    The suite is "group" by default, or one that another package offers.
-    """
-    suite = suite_named(suite, "group")
-    if suite not in SUITES:
-        return TASK.other_suite(suite)(num, seed, first)
-    return draw_groups(suite, num, seed, first, dtype=dtype)
 
 
 def planner(

@@ -16,6 +16,7 @@ from jax import Array
 
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import require_settings
+from planner_jax.task.arguments import require_orders
 from planner_jax.task.group.case import GroupChoice, InterceptGroup
 from planner_jax.task.group.plan import GroupPlan
 
@@ -75,11 +76,6 @@ def _next(
 
 def _where(condition: Array, yes: _Meeting, no: _Meeting) -> _Meeting:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
-
-
-def _present_first(group: InterceptGroup, order: Array) -> Array:
-    """An order (N,) with absent targets behind all others."""
-    return order[jnp.argsort(~group.present[order], stable=True)]
 
 
 def _rank(group: InterceptGroup, table: tuple[Array, Array], order: Array) -> Array:
@@ -175,15 +171,9 @@ class Given(GroupDecision):
 
     def check(self, cases: InterceptGroup) -> None:
         """Raise `ValueError` unless every order is a permutation."""
-        order = np.asarray(cases.order).reshape(-1, cases.num_targets)
-        wrong = np.flatnonzero((np.sort(order, axis=1) != np.arange(order.shape[1])).any(axis=1))
-        if wrong.size:
-            raise ArgumentError(
-                "order",
-                f"a permutation of 0..{order.shape[1] - 1}",
-                shown=f"{order[wrong[0]].tolist()} in case {wrong[0]}",
-            )
+        require_orders(cases.order)
 
     def propose(self, case: InterceptGroup) -> GroupChoice:
         """The one choice of one group, leaves (1, N)."""
-        return GroupChoice(order=_present_first(case, case.order)[None])
+        present_first = jnp.argsort(~case.present[case.order], stable=True)
+        return GroupChoice(order=case.order[present_first][None])

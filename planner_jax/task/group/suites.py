@@ -14,10 +14,10 @@ import numpy as np
 from jax.typing import DTypeLike
 
 from planner_jax.core.checks import floating
-from planner_jax.core.registry import require_name
+from planner_jax.core.registry import suite_named
 from planner_jax.task.arguments import make_generators
 from planner_jax.task.group.case import InterceptGroup
-from planner_jax.task.group.spec import SUITES
+from planner_jax.task.group.spec import SUITES, TASK
 from planner_jax.task.intercept.suites import (
     CAUSES,
     accepted_draws,
@@ -31,14 +31,22 @@ from planner_jax.task.intercept.suites import (
 _TARGET = ("pos", "angle", "speed", "rate")
 
 
-def draw_groups(
-    suite: str, num: int, seed: int, first: int = 0, *, dtype: DTypeLike = jnp.float32
+def draw(
+    num: int,
+    suite: str | None = None,
+    seed: int = 0,
+    *,
+    first: int = 0,
+    dtype: DTypeLike = jnp.float32,
 ) -> InterceptGroup:
     """Draw a batch of groups of a suite in float64, and cast it.
 
-    Arguments and errors are those of `pj.hit.draw`; `suite` is a key of `SUITES`.
+    Arguments and errors are those of `pj.hit.draw`. The suite is "group" by default, or one that
+    another package offers.
     """
-    require_name(SUITES, "suite", suite)
+    suite = suite_named(suite, "group")
+    if suite not in SUITES:
+        return TASK.other_suite(suite)(num, seed, first)
     own, randoms, dtype = SUITES[suite], make_generators(suite, num, seed, first), floating(dtype)
     drawn, _, _ = accepted_draws(own, randoms)
     fewest, most = own.num_targets
