@@ -114,12 +114,7 @@ def _packed(cells: Array) -> Array:
 
 
 def _along_y(rows: Array, move: Array) -> Array:
-    """Move rows by at most `_FARTHEST` cells; cells that leave the grid are dropped.
-
-    Args:
-        rows: (words, ..., cells) uint32.
-        move: (...) int32.
-    """
+    """Move rows (words, ..., cells) uint32 by up to `_FARTHEST` cells; drop cells off the grid."""
     words, cells = rows.shape[0], rows.shape[-1]
     padded = jnp.pad(rows.reshape(words, -1, cells), ((0, 0), (0, 0), (_FARTHEST, _FARTHEST)))
     moved = jax.vmap(

@@ -323,12 +323,7 @@ def _clearances(
 ) -> dict[str, tuple]:
     """Return least distances (B,) [m] by kind, their times (B,) [s], and the parts (B,) str.
 
-    Args:
-        case: leaves of B lanes.
-        links: of the capsules.
-        motion: of the lanes.
-        turning: (B, M) [rad/s], that all joints together are not faster than.
-        step: [s], longest time between two samples.
+    No piece turns all joints together faster than `turning` (B, M) [rad/s].
     """
     turning = np.fmin(np.fmax(turning, np.finfo(float).tiny), _FASTEST)
     longest = np.minimum(step, LARGEST_TURN / turning)
@@ -357,15 +352,9 @@ def _clearances(
 def _sample(
     motion: _Motion, lanes: np.ndarray, count: np.ndarray, sample: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return times (B, S) [s] and angles (6, B, S) [rad] of some lanes at their samples.
+    """Return times (B, S) [s] and angles (6, B, S) [rad] of some lanes at samples numbered (S,).
 
-    Lanes with fewer samples than others stay at their end.
-
-    Args:
-        motion: of all lanes.
-        lanes: (B,) int.
-        count: (B, M), steps in each piece of these lanes.
-        sample: (S,), numbers of the samples.
+    Lanes with fewer samples, by `count` (B, M) in each piece, stay at their end.
     """
     behind = np.cumsum(count, axis=1)
     piece = (sample >= behind[..., None]).sum(axis=1).clip(max=count.shape[1] - 1)  # (B, S)
@@ -378,14 +367,7 @@ def _sample(
 
 
 def _judge_contact(case: dict, angles: np.ndarray, relative: float, contact: float) -> tuple:
-    """Measure how the ball meets the shield, and test ball, tilt and tunnel.
-
-    Args:
-        case: leaves of B lanes.
-        angles: (6, B) [rad], at the contact.
-        relative: tolerance of the offset and the tilt.
-        contact: tolerance [m].
-    """
+    """Measure how the ball meets the shield at angles (6, B), and test ball, tilt and tunnel."""
     time, fall = case["plan.contact_time"], np.array([[0.0], [0.0], [1.0]]) * case["gravity"]
     place = case["ball.pos"].T + case["ball.vel"].T * time - 0.5 * fall * time**2
     turns, places = links_of(case, angles[..., None])

@@ -240,19 +240,12 @@ def _known_states(targets, order: np.ndarray, times: np.ndarray) -> tuple[np.nda
 
 
 def _ball_states(start, vel, drag, gravity, times) -> tuple[np.ndarray, np.ndarray]:
-    """Return position and velocity (B, N, 3) of balls with linear drag on each axis.
+    """Return position and velocity (B, N, 3) of balls with linear drag K [1/s] on each axis.
 
     Paper 000, eq. 9 with its constant: s_0 + (v_0 - g / K) (1 - e^-x) / K + g t / K, x = K t,
     which is s_0 + v_0 t f(x) + g t^2 h(x) with f = (1 - e^-x) / x and h = (1 - f) / x. Both are
     smooth at x = 0, where they are 1 and 1/2: the parabola. For small x, h is summed as
     1/2! - x/3! + x^2/4! - ..., to rounding.
-
-    Args:
-        start: (B, N, 3) [m].
-        vel: (B, N, 3) [m/s] at time 0.
-        drag: (B, N, 3) K [1/s].
-        gravity: (B, N) [m/s^2], magnitude, downwards.
-        times: (B, N) [s].
     """
     times = times[..., None]
     x = drag * times
@@ -273,12 +266,6 @@ def _table_states(pos, vel, resolution, times) -> tuple[np.ndarray, np.ndarray]:
 
     Keys' cubic convolution with a = -1/2 is the cubic between two nodes whose slopes there are
     the central differences. Beyond the table the target goes on at its last velocity.
-
-    Args:
-        pos: (B, N, T, 3) [m].
-        vel: (B, N, T, 3) [m/s].
-        resolution: (B, N) [s].
-        times: (B, N) [s].
     """
     last = pos.shape[2] - 3
     inside = np.minimum(np.maximum(times, 0.0), last * resolution)

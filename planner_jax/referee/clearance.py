@@ -97,15 +97,9 @@ def _edges(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _separation(corners, normals, pose, half) -> np.ndarray:
     """Return distances (P,) [m] of rectangles from polygons; minus the depth where they overlap.
 
-    By separating axes: the greatest gap along the normal of an edge of either. If it is
-    negative the two overlap, and it is the shortest way out. If not, the distance is that of a
-    corner of one of them from the other.
-
-    Args:
-        corners: (P, V, 2) [m], of the polygons.
-        normals: (P, V, 2), of their edges, outwards; zero for an edge without length.
-        pose: (P, 3), of the rectangles' middles.
-        half: (P, 2) [m], half sides of the rectangles.
+    The greatest gap along the normal of an edge is negative where the two overlap, and is the
+    shortest way out. Elsewhere the distance is from a corner of one of them to the other. An edge
+    without length has a zero normal; `half` (P, 2) [m] are half sides.
     """
     cos, sin = np.cos(pose[:, 2, None]), np.sin(pose[:, 2, None])
 

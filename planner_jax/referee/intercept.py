@@ -304,13 +304,7 @@ def _greatest(values: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _judge_limits(case: dict, span: np.ndarray, relative: float) -> tuple[dict, dict]:
-    """What the car's motion asks of it, and the tests of that: name -> failed, excess, time.
-
-    Args:
-        case: leaves of B lanes.
-        span: (B,) [s], of every piece.
-        relative: tolerance.
-    """
+    """Measure the car's motion in pieces of (B,) [s], and test it: name -> failed, excess, time."""
     v, k, h = case["plan.speed"], case["plan.curvature"], span[:, None]
     knots = h * np.arange(v.shape[1])
     v0, k0, k1, starts = v[:, :-1], k[:, :-1], k[:, 1:], knots[:, :-1]
@@ -350,14 +344,9 @@ def _judge_limits(case: dict, span: np.ndarray, relative: float) -> tuple[dict, 
 
 
 def _driven(case: dict, span: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
-    """Where the car drives: times (B, S) [s] and poses (B, S, 3) of its body's middle.
+    """Return times (B, S) [s] and poses (B, S, 3) of the body's middle, for pieces of (B,) [s].
 
-    Lanes of fewer samples than others stay at the end of each piece until all have theirs.
-
-    Args:
-        case: leaves of B lanes.
-        span: (B,) [s], of each of the K pieces.
-        step: [s], longest time between two samples.
+    Lanes with fewer samples than others stay at the end of each piece until all have theirs.
     """
     v, k = case["plan.speed"][..., None], case["plan.curvature"][..., None]
     num, h = v.shape[1] - 1, span[:, None, None]
@@ -394,14 +383,7 @@ def _driven(case: dict, span: np.ndarray, step: float) -> tuple[np.ndarray, np.n
 
 
 def _judge_way(case: dict, times: np.ndarray, poses: np.ndarray, contact: float) -> tuple:
-    """Clearances along the way, and the tests of map, walls and movers.
-
-    Args:
-        case: leaves of B lanes.
-        times: (B, S) [s].
-        poses: (B, S, 3), of the body's middle.
-        contact: tolerance [m].
-    """
+    """Measure clearances at poses (B, S, 3) of the body's middle; test map, walls and movers."""
     middle = poses[..., :2]
     outside = np.maximum(case["lower"][:, None] - middle, middle - case["upper"][:, None])
     off, when = _greatest(outside.max(axis=2), times)

@@ -38,7 +38,7 @@ class GroupVerdict(InterceptVerdict):
     num_met: np.ndarray  # (B,) int, targets that are met before that leg, with it if it succeeds
 
     def praise(self, k: int | tuple) -> str:
-        """What is said of a success."""
+        """Return the end of the sentence for a success."""
         num, time = np.asarray(self.num_met)[k], np.asarray(self.meeting_time)[k]
         return f"{num} targets are met, the last after {time:.3g} s"
 
@@ -46,20 +46,11 @@ class GroupVerdict(InterceptVerdict):
 def referee_groups(
     cases: Any, plans: Any, *, target_positions: Callable | None = None, **settings: Any
 ) -> GroupVerdict:
-    """The verdict on every plan of a batch.
+    """Judge every plan of a batch; arguments and errors are those of `referee_intercepts`.
 
     Leg k has to begin where leg k - 1 ends: pose, speed and curvature, within the tolerance that
-    the first one has for the car's own. Its time is what is left of the case's.
-
-    Args:
-        cases: object with the fields of `InterceptGroup`, leaves with leading axis B.
-        plans: object with the fields of `GroupPlan`, leaves with leading axis B. Of legs to
-            absent targets nothing is read.
-        target_positions: as for `referee_intercepts`.
-        **settings: such as `tolerance`; see `referee_intercepts`.
-
-    Raises:
-        ValueError: as for `referee_intercepts`.
+    the first one has for the car's own. Its time is what is left of the case's. Nothing is read of
+    legs to absent targets.
     """
     present = np.asarray(cases.present, bool)
     batch, num = present.shape

@@ -55,15 +55,10 @@ def rotor_thrusts(
     inertia: np.ndarray,
     mixer: np.ndarray,
 ) -> np.ndarray:
-    """Return thrust of each rotor [N] (B, M, S, 4); not finite where there is no attitude.
+    """Return the thrust of each rotor [N] (B, M, S, 4); not finite where there is no attitude.
 
-    Args:
-        coeffs: (3, B, M, D + 1), rising powers of the time [s] since each piece's start.
-        times: (B, M, S) [s] since that.
-        gravity: (B,) [m/s^2].
-        mass: (B,) [kg].
-        inertia: (B, 3) [kg m^2], principal, about the body's axes.
-        mixer: (B, 4, 4), from thrust [N] and torque [N m] to the rotors' thrusts [N].
+    Coefficients (3, B, M, D + 1) are of rising powers of the times (B, M, S) [s] since each piece's
+    start; gravity, mass, inertia and mixer are those of the case, with leading axis B.
     """
     pull, rate = _pull_and_rate(coeffs, times, gravity)
     before, after = (

@@ -140,12 +140,10 @@ def approach(distance: Callable, *bodies: Array) -> Approach:
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _shortest(nearest: Callable, gap: Callable, bodies: tuple[Array, ...]) -> Array:
-    """The distance () [m] of bodies.
+    """Return the distance () [m] of bodies.
 
-    Args:
-        nearest: from the bodies to what names their nearest points, such as shares of segments.
-        gap: from that and the bodies to the vector between those points, to the first body's.
-        bodies: the arrays that both take.
+    `nearest` returns what names the nearest points, such as shares of segments, and `gap` the
+    vector between these points, to the first body's.
     """
     return _length(gap(nearest(*bodies), *bodies))
 

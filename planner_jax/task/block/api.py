@@ -25,28 +25,15 @@ def planner(name: str = "online", **options: object) -> Planner[BlockCase, Block
       `arm-peers`.
     * `insat`: that A* interleaved with B-splines, Algorithm 2 of paper 004; on the host.
 
-    Args:
-        name: one of these, or one that another package offers.
-        **options: fields of that planner's dataclass, for example `points` of `online`.
-
-    Returns:
-        A planner for `pj.plan`: `OnlineBlock`, `LibraryBlock`, `AdaptBlock`, `DirectBlock`,
-        `RrtConnectBlock`, `EpaseBlock` or `InsatBlock`.
-
-    Raises:
-        ValueError: there is no planner of that name.
-        TypeError: the planner has no such field.
-        ModuleNotFoundError: the planner needs an extra that is not installed.
+    Arguments and errors are those of `pj.hit.planner`; the options are fields of `OnlineBlock`,
+    `LibraryBlock`, `AdaptBlock`, `DirectBlock`, `RrtConnectBlock`, `EpaseBlock` or `InsatBlock`.
     """
     return TASK.make_planner(name, options)
 
 
 def judge(cases: BlockCase, plans: BlockPlan, **settings: object) -> BlockVerdict:
-    """Judge one plan, or a batch, by kinematics and geometry alone, as `pj.hit.judge` does.
+    """Judge one plan, or a batch, by kinematics and geometry alone.
 
-    Args:
-        cases: one case, or a batch.
-        plans: of the cases.
-        **settings: such as `tolerance`; see `referee_blocks`.
+    Arguments, result and errors are those of `pj.hit.judge`; `referee_blocks` has the settings.
     """
     return judge_by(referee_blocks, cases, plans, (BlockCase, BlockPlan), settings)

@@ -105,13 +105,7 @@ def read_learned_starts() -> tuple[np.ndarray, np.ndarray]:
 
 
 def _combine_excess(joints: Array, contact: Array, too_near: Array) -> Array:
-    """Return the largest excess over a limit; a centimetre too near counts as a whole limit.
-
-    Args:
-        joints: (), relative, of angles, rates and accelerations.
-        contact: (), relative, of the places and angles of the contact.
-        too_near: () [m].
-    """
+    """Return the largest excess over a limit; a centimetre too near counts as a whole limit."""
     return jnp.maximum(jnp.maximum(joints, contact), 100.0 * too_near)
 
 
@@ -139,13 +133,8 @@ def _lift_to_unknowns(
 ) -> tuple[Array, Array]:
     """Return the gradient (n,) and the curvature (n, n) by the unknowns.
 
-    Args:
-        lift: (W, K), angles at W samples by the steps.
-        drift: (W, 6) [rad/s], angles at samples by the time of contact: a later contact carries
-            them on at the rates of the beginning.
-        grams: (W, 7, 7), of the residuals of each sample by its angles and the time.
-        pushes: (W, 7), their gradients.
-        joints: terms of the joints, by steps and time.
+    `lift` (W, K) and `drift` (W, 6) are the slopes of the angles at W samples by the steps and by
+    the time of contact; `grams` (W, 7, 7) and `pushes` (W, 7) belong to angles and time.
     """
     grams_q, grams_t = grams[:, :6, :6], grams[:, :6, 6]
     carried = jnp.einsum("wij,wj->wi", grams_q, drift, precision=_HIGHEST) + grams_t

@@ -104,19 +104,12 @@ class ReplanBlock(Planner):
         angles: ArrayLike | None = None,
         rates: ArrayLike | None = None,
     ) -> Replanning:
-        """Return the rest of a case, or of a batch, some time into its motion; see `pj.replan`.
+        """Return the remainder of a case, or of a batch, some time into its motion.
 
-        Args:
-            cases: what `previous` was planned for.
-            previous: the plan that is carried out.
-            elapsed: () or (B,) [s], since its motion began, >= 0: when a new one may begin.
-            ball: as it is known now, at the time 0 of the cases; theirs if not given.
-            angles: (6,) or (B, 6) [rad], of the arm when the new motion begins.
-            rates: likewise [rad/s]. What of these is not given is the previous plan's own, which
-                brakes where it has ended.
-
-        Raises:
-            ValueError: a negative time.
+        `pj.replan` describes cases, the previous plan, the elapsed time and the errors. `ball` is
+        the estimated ball at the time 0 of the cases, by default the cases' own. `angles` [rad] and
+        `rates` [rad/s] of the arm at the start of the new motion are (6,) or (B, 6), by default the
+        previous plan's, which brakes after its end.
         """
         elapsed, batch = moment_of(cases, elapsed), cases.batch_shape
         if ball is not None:

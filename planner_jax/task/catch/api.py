@@ -68,16 +68,12 @@ def planner(
 
 
 def judge(cases: CatchCase, plans: CatchPlan, **settings: object) -> CatchVerdict:
-    """Judge one plan, or a batch, by the physics alone, as `pj.hit.judge` does.
+    """Judge one plan, or a batch, by the physics alone.
 
     The referee computes the positions of targets of the library's classes itself. It calls the
     method `at` of a target of any other class, in float64; the target's velocity is the central
     difference over 2e-4 s.
-
-    Args:
-        cases: one case, or a batch.
-        plans: of the cases.
-        **settings: such as `tolerance` and `net_test`; see `referee_catches`.
+    Arguments, result and errors are those of `pj.hit.judge`; `referee_catches` has the settings.
     """
     known = (BallPath, HarmonicPath, PathTable)  # classes that the referee follows by itself
     if isinstance(cases, CatchCase) and type(cases.targets) not in known:

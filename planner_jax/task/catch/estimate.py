@@ -58,13 +58,7 @@ def timetable(case: CatchCase) -> Timetable:
 
 
 def _to_catch(case: CatchCase, states: BallState, speed: Array) -> tuple[Array, Array]:
-    """Where the quadrotor catches N targets, and the penalty (N, K) [m] there.
-
-    Args:
-        case: one case.
-        states: of the targets, (N, 3, K).
-        speed: (N, K) [m/s], theirs.
-    """
+    """Return where the quadrotor catches N targets (N, 3, K), and the penalty (N, K) [m] there."""
     net, limits = case.net, case.limits
     from_below = jnp.maximum(states.vel[:, 2] / speed + _STEEPEST, 0.0)
     places = states.pos - net.height * jnp.asarray([[0.0], [0.0], [1.0]], states.pos.dtype)

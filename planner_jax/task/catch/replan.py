@@ -94,20 +94,12 @@ class ReplanCatch(OptimisedPlanner):
         targets: TargetPath,
         head_state: ArrayLike | None = None,
     ) -> Replanning:
-        """What is left of a case, or of a batch, some time into its plan; see `pj.replan`.
+        """Return the remainder of a case, or of a batch, some time into its plan.
 
-        Catches that have been made are no longer present; the others keep their order.
-
-        Args:
-            cases: what `previous` was planned for.
-            previous: the plan that is being flown; see that it is solved.
-            elapsed: () or (B,) [s], since it began, >= 0.
-            targets: as estimated now, with times that count from now; shapes as in `cases`.
-            head_state: (4, 3) or (B, 4, 3), where the quadrotor is. The plan's own state if not
-                given: it flies what was planned.
-
-        Raises:
-            ValueError: a negative time.
+        Caught targets are absent from it; the others keep their order. `pj.replan` describes
+        cases, the previous plan, the elapsed time and the errors. The estimated `targets` have the
+        shapes of the cases' and times that count from now. `head_state` is (4, 3) or (B, 4, 3), by
+        default the plan's.
         """
         elapsed = moment_of(cases, elapsed)
         require_path("targets", targets, np.shape(cases.present), 3)

@@ -37,15 +37,9 @@ def planner(
 
 
 def judge(cases: InterceptGroup, plans: GroupPlan, **settings: object) -> InterceptVerdict:
-    """Judge every leg of one plan, or of a batch of plans, as `pj.hit.judge` does.
+    """Judge every leg of one plan, or of a batch of plans; see `referee_groups`.
 
-    Args:
-        cases: one group, or a batch.
-        plans: of the groups.
-        **settings: such as `tolerance`; see `referee_intercepts`.
-
-    Returns:
-        A verdict with the batch shape of the groups; see `referee_groups`.
+    Arguments, result and errors are those of `pj.hit.judge`; `referee_intercepts` has the settings.
     """
     require_settings(referee_intercepts, settings)
     if isinstance(cases, InterceptGroup):

@@ -97,14 +97,10 @@ def _is_left(status: Array) -> Array:
 def _leg(
     cases: InterceptGroup, k: Array | int, begin: Array, car: CarState, fine: Array
 ) -> tuple[InterceptCase, Array]:
-    """The legs to the targets at a place of the order, and which of them are to be planned.
+    """Return the legs to the k-th targets of the orders, and which of the legs are to be planned.
 
-    Args:
-        cases: leaves with leading axis B.
-        k: that place.
-        begin: (B,) [s], when these legs begin.
-        car: leaves (B, ...), where the cars then are.
-        fine: (B,) bool, whether all legs before are solved.
+    They start at times (B,) [s] where the cars are then; `fine` (B,) bool says whether all legs
+    before are solved.
     """
 
     def of_one(case: InterceptGroup, begin: Array, car: CarState) -> tuple[InterceptCase, Array]:

@@ -91,6 +91,7 @@ def planner(
     Raises:
         ValueError: there is no planner of that name, or it has no such effort.
         TypeError: the planner has no such field.
+        ModuleNotFoundError: the planner needs an extra that is not installed.
     """
     made = with_effort(TASK.make_planner(name, options), effort)
     if ending is None:

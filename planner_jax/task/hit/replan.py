@@ -69,19 +69,11 @@ class ReplanHit(OptimisedPlanner):
         drag: ArrayLike | None = None,
         head_state: ArrayLike | None = None,
     ) -> Replanning:
-        """What is left of a case, or of a batch, some time into its plan; see `pj.replan`.
+        """Return the remainder of a case, or of a batch, some time into its plan.
 
-        Args:
-            cases: what `previous` was planned for.
-            previous: the plan that is being flown; see that it is solved.
-            elapsed: () or (B,) [s], since it began, >= 0.
-            ball: as estimated now, leaves (3,) or (B, 3).
-            drag: () or (B,) K_D [1/m], as believed now; by default as before.
-            head_state: (4, 3) or (B, 4, 3), where the quadrotor is. The plan's own state if not
-                given: it flies what was planned.
-
-        Raises:
-            ValueError: a negative time.
+        `pj.replan` describes cases, the previous plan, the elapsed time and the errors. The
+        estimated `ball` has leaves (3,) or (B, 3), and its `drag` is () or (B,) K_D [1/m], by
+        default the drag of the cases. `head_state` is (4, 3) or (B, 4, 3), by default the plan's.
         """
         elapsed = moment_of(cases, elapsed)
         own = states_at(previous.trajectory, elapsed)
@@ -122,9 +114,9 @@ class ReplanHit(OptimisedPlanner):
         return jnp.concatenate([first, self.planner.guesses(context.hit, num - 1)])
 
     def objective(self, point: Array, context: ReplanHitContext) -> Evaluation:
-        """Of the planner."""
+        """Return the value of the planner's objective."""
         return self.planner.objective(point, context.hit)
 
     def decode(self, point: Array, context: ReplanHitContext) -> HitPlan:
-        """The plan at a point."""
+        """Return the plan at a point."""
         return self.planner.decode(point, context.hit)

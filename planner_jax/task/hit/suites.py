@@ -210,13 +210,7 @@ def _aim_table() -> _AimTable:
 
 
 def _aim(distance: np.ndarray, rise: np.ndarray):
-    """Horizontal speed that carries a serve over `distance`, by Newton's method.
-
-    Returns:
-        speed: (...) [m/s].
-        slope: (...) [1/s], d speed / d distance.
-        time: (...) [s], from the serve to the floor.
-    """
+    """Return speed [m/s] that carries a serve over a distance, its slope [1/s] and the time [s]."""
     drag_free_time = (rise + np.sqrt(rise**2 + 2.0 * GRAVITY * SERVE_HEIGHT)) / GRAVITY
     speed = distance / drag_free_time * (1.0 + 0.5 * DRAG * distance)
     position = np.array([0.0, 0.0, SERVE_HEIGHT])

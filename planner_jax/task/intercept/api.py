@@ -102,31 +102,20 @@ def planner(name: str = "spacetime", **options: object) -> Planner[InterceptCase
     * `em`: the best path of `lattice` with the speed step of the EM planner.
     * `constant`: the best path of `lattice` at constant speed, whatever moves.
 
-    Args:
-        name: one of these, or a name that another package offers.
-        **options: fields of that planner's dataclass, for example `pieces` of `spacetime`.
-
-    Returns:
-        A planner for `pj.plan`: `SpacetimeIntercept`, `PathThenSpeed` or `PaperIntercept`.
-
-    Raises:
-        ValueError: there is no planner of that name.
-        TypeError: the planner has no such field.
+    Arguments and errors are those of `pj.hit.planner`; the options are fields of
+    `SpacetimeIntercept`, `PathThenSpeed` or `PaperIntercept`.
     """
     return TASK.make_planner(name, options)
 
 
 def judge(cases: InterceptCase, plans: InterceptPlan, **settings: object) -> InterceptVerdict:
-    """Judge one plan, or a batch of plans, as `pj.hit.judge` does.
+    """Judge one plan, or a batch of plans, by the referee.
 
     The referee computes the positions of `TurningPath`, `PolynomialPath` and `LaterPath` itself.
     It calls the method `at` of a target of any other class, in float64.
-
-    Args:
-        cases: one case, or a batch.
-        plans: of the cases.
-        **settings: such as `tolerance`, and `truth`: the path, or a batch of paths, that the target
-            really takes, where the case holds a predicted one; see `referee_intercepts`.
+    Arguments, result and errors are those of `pj.hit.judge`. `referee_intercepts` has the settings,
+    such as `truth`: the path, or a batch of paths, that the target really takes, where the case
+    holds a predicted one.
     """
     require_kind("cases", cases, InterceptCase)
     target = cases.target

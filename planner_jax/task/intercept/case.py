@@ -215,12 +215,7 @@ def _for_batch(
     batch: tuple[int, ...],
     dtype: DTypeLike,
 ) -> Obstacles:
-    """Obstacles with the batch's axes on every leaf.
-
-    Raises:
-        TypeError, ValueError: the polygons or their velocities break a rule; with the name of the
-            argument that holds them.
-    """
+    """Return obstacles with the batch's axes on every leaf; errors name the argument."""
     if isinstance(given, Obstacles):
         return given
     try:

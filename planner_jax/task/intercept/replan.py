@@ -67,21 +67,13 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
         speed: ArrayLike | None = None,
         curvature: ArrayLike | None = None,
     ) -> Replanning:
-        """Return the rest of a case, or of a batch, some time into its plan; see `pj.replan`.
+        """Return the remainder of a case, or of a batch, some time into its plan.
 
-        Args:
-            cases: the cases that `previous` was planned for.
-            previous: the plan that is being driven.
-            elapsed: () or (B,) [s], time since the plan began, >= 0.
-            target: the expected path of the target, with times that count from now.
-            movers: the moving obstacles as they are now; moved on evenly by default.
-            start: (3,) or (B, 3), pose of the rear axle: x, y [m] and heading [rad]; by default
-                the plan's own, as for `speed` and `curvature`.
-            speed: () or (B,) [m/s]; clipped to the car's limits.
-            curvature: () or (B,) [1/m]; clipped to the car's limits.
-
-        Raises:
-            ValueError: a negative time.
+        `pj.replan` describes cases, the previous plan, the elapsed time and the errors. `target` is
+        the expected path, with times that count from now, and `movers` are the moving obstacles at
+        this moment, by default moved on evenly. The car's `start` (3,) or (B, 3), x, y [m] and
+        heading [rad] of the rear axle, `speed` [m/s] and `curvature` [1/m], () or (B,), are by
+        default the plan's; speed and curvature are clipped to the car's limits.
         """
         elapsed, batch = moment_of(cases, elapsed), cases.batch_shape
         require_path("target", target, batch, 2)

@@ -149,12 +149,9 @@ def _unit(angle: np.ndarray) -> np.ndarray:
 
 
 def _candidates(suite: Suite, kinds: np.ndarray, uniform: np.ndarray) -> Draws:
-    """Make one draw for each of B cases.
+    """Make one draw for each of B cases, from numbers of [0, 1).
 
-    Args:
-        suite: ranges.
-        kinds: (B, 3), numbers of [0, 1) that hold for all draws of a case.
-        uniform: (B, `_columns(suite)`), numbers of this draw.
+    `kinds` (B, 3) holds for all draws of a case, `uniform` (B, `_columns(suite)`) for this draw.
     """
     turning, count_walls = kinds[:, 0] < 0.5, _whole(kinds[:, 1], *suite.num_walls)
     count_movers = _whole(kinds[:, 2], *suite.num_movers)
@@ -255,12 +252,8 @@ def _maze(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return corners (B, 12, 6, 2) [m] of a maze's polygons, and which are present, (B, 12).
 
-    Args:
-        uniform: (B, 12, M), of which the first three rows are used.
-        across: (B, 3) [m], positions of the walls.
-        count: (B,), number of walls.
-        start: (B, 2) [m].
-        end: (B, 2) [m]; the straight line from the start to it runs into dead ends.
+    The `count` walls stand at `across` (B, 3) [m]; straight lines from start to end run into dead
+    ends. Of `uniform` (B, 12, M) the first three rows are used.
     """
     u = np.moveaxis(uniform[:, :3], 2, 0)
     gap, half = _between(u[1], 0.8, SIZE - 0.8), 0.5 * _between(u[2], 0.7, 1.1)
