@@ -15,12 +15,9 @@ from jax import Array
 from planner_jax.ball.estimation import (
     EkfModel,
     EkfState,
-    RlsState,
     ekf_init,
     ekf_predict,
     ekf_update,
-    rls_update,
-    specific_energy,
 )
 from planner_jax.ball.flight import BallState, fly, rk4_step
 from planner_jax.sims.noise import Sensing
@@ -29,6 +26,40 @@ _LEAST_STD = 1e-3  # [m], that the filter believes of a sensor without noise
 _ACCELERATION_DENSITY = 0.01  # [m^2/s^3], of what the filter's flight leaves out
 _FLIGHT_STEPS = 4  # of a prediction over latency and planning
 _DRAG_SPREAD = 0.2  # relative standard deviation of the drag believed at first
+
+
+def specific_energy(ball: BallState, gravity: Array) -> Array:
+    """Return the mechanical energy per unit mass  |v|^2 / 2 + g z  [m^2/s^2], g > 0 the magnitude.
+
+    Paper 002 prints  + g' s  above eq. 6; with its own g, which points down, that sum would
+    not be conserved in free flight.
+    """
+    return 0.5 * jnp.sum(ball.vel**2) + gravity * ball.pos[2]
+
+
+@struct.dataclass
+class RlsState:
+    """Recursive least squares for one unknown x in  y = h x + noise of unit variance."""
+
+    estimate: Array  # () x
+    variance: Array  # () of the estimate; 1/variance of the start counts as that many y, h = 1
+
+
+def rls_update(state: RlsState, regressor: Array, measurement: Array) -> RlsState:
+    """Return the estimate after one more measurement.
+
+    Args:
+        state: the estimate so far.
+        regressor: () h.
+        measurement: () y; where it is not finite the estimate stays as it is.
+    """
+    usable = jnp.isfinite(measurement)
+    y = jnp.where(usable, measurement, 0.0)
+    # P / (1 + h^2 P) is the textbook's (1 - K h) P without its cancellation.
+    variance = state.variance / (1.0 + regressor**2 * state.variance)
+    error = y - regressor * state.estimate
+    after = RlsState(estimate=state.estimate + variance * regressor * error, variance=variance)
+    return jax.tree.map(lambda new, old: jnp.where(usable, new, old), after, state)
 
 
 @struct.dataclass

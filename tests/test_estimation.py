@@ -10,12 +10,9 @@ import pytest
 from planner_jax.ball.estimation import (
     EkfModel,
     EkfState,
-    RlsState,
     ekf_init,
     ekf_predict,
     ekf_update,
-    rls_update,
-    specific_energy,
 )
 from planner_jax.ball.flight import (
     BallState,
@@ -23,6 +20,7 @@ from planner_jax.ball.flight import (
     linear_drag_flight,
     rk4_step,
 )
+from planner_jax.sims.sensing import RlsState, rls_update, specific_energy
 
 GRAVITY = 9.8
 LINEAR_DRAG = (0.4, 0.3, 0.2)  # [1/s]

@@ -1,9 +1,7 @@
-"""What a ball does, from where it was seen: its state by a Kalman filter, its drag by energy.
+"""The state of a ball from its observations, by an extended Kalman filter.
 
-Paper 002, Section III (and paper 000, Section V-A, from which it comes): the extended Kalman
-filter of eq. 5, and what K_D of the quadratic model takes from the loss of energy, eqs 6 and 7:
-the energy and recursive least squares. World frame, z up, SI units, one ball; `jax.vmap` makes
-many. Something not seen is NaN here, and passes without a trace.
+The filter is that of paper 002, eq. 5 (from paper 000, Section V-A). World frame, z up, SI units,
+one ball; `jax.vmap` makes many. An observation with a NaN leaves the state unchanged.
 """
 
 from collections.abc import Callable
@@ -128,38 +126,3 @@ def ekf_update(state: EkfState, observation: Float[Array, "3"], model: EkfModel)
         mean=state.mean + jnp.matmul(K, residual, precision=lax.Precision.HIGHEST),
         covariance=jnp.where(observed, _congruence(kept, P) + _congruence(K, R), P),
     )
-
-
-# Parameters (3, axis), with rows position, velocity and drag, to residuals (N, axis).
-def specific_energy(ball: BallState, gravity: Array) -> Array:
-    """Mechanical energy per unit mass  |v|^2 / 2 + g z  [m^2/s^2], g > 0 the magnitude.
-
-    Paper 002 prints  + g' s  above eq. 6; with its own g, which points down, that sum would
-    not be conserved in free flight.
-    """
-    return 0.5 * jnp.sum(ball.vel**2) + gravity * ball.pos[2]
-
-
-@struct.dataclass
-class RlsState:
-    """Recursive least squares for one unknown x in  y = h x + noise of unit variance."""
-
-    estimate: Array  # () x
-    variance: Array  # () of the estimate; 1/variance of the start counts as that many y, h = 1
-
-
-def rls_update(state: RlsState, regressor: Array, measurement: Array) -> RlsState:
-    """The estimate with one measurement more.
-
-    Args:
-        state: the estimate so far.
-        regressor: () h.
-        measurement: () y; where it is not finite the estimate stays as it is.
-    """
-    usable = jnp.isfinite(measurement)
-    y = jnp.where(usable, measurement, 0.0)
-    # P / (1 + h^2 P) is the textbook's (1 - K h) P without its cancellation.
-    variance = state.variance / (1.0 + regressor**2 * state.variance)
-    error = y - regressor * state.estimate
-    after = RlsState(estimate=state.estimate + variance * regressor * error, variance=variance)
-    return jax.tree.map(lambda new, old: jnp.where(usable, new, old), after, state)
