@@ -41,7 +41,7 @@ NUM, BATCH = 84, 13  # chunks and single cases are planned by one program, for u
 # Half of these fail: late, and with one short round.
 SETTINGS = HitSettings(num=NUM, batch=BATCH, delay=0.8, seed=3)
 FAILED = "failed,failed,failed"
-FIGURES = ("court.png", "motion.png", "rates.png")
+FIGURES = ("court.png", "motion.png", "outcomes.png")
 
 
 def one_round(**options):

@@ -16,6 +16,8 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import pyarrow as pa
+
 from planner_jax.core.errors import ArgumentError
 from planner_jax.host.files import is_scratch, replacing
 from planner_jax.runs.dataset import Dataset
@@ -167,6 +169,16 @@ class RunFolder:
         """Write a file of the folder whole."""
         with replacing(self.path / name) as scratch:
             scratch.write_text(text, encoding="utf-8")
+
+    @contextlib.contextmanager
+    def reading_rows(self) -> Iterator[None]:
+        """Raise `ArgumentError` if the block cannot read the rows of the run."""
+        errors = (pa.ArrowException, LookupError, OSError, TypeError, ValueError, ZeroDivisionError)
+        try:
+            yield
+        except errors as error:
+            rule, why = "a run whose rows can be read", " ".join(str(error).split())
+            raise ArgumentError(self.name, rule, shown=why) from None
 
     def require_whole(self, rows: Dataset, remedy: str, num: int | None = None) -> None:
         """Raise `ArgumentError` if a part of some rows is missing or damaged.

@@ -10,7 +10,6 @@ from typing import Any, ClassVar, Self, TypeVar
 
 from planner_jax.core.choices import (
     CHOICES,
-    EFFORTS,
     NONE,
     require,
     require_disk,
@@ -142,19 +141,6 @@ class SweepSettings:
     def judge_options(self) -> dict[str, Any]:
         """Options of the task's `judge` that these settings decide."""
         return {name: getattr(self, name) for name in self.JUDGE}
-
-
-def require_effort(value: str, planner: str | None, without: str) -> None:
-    """Raise `ArgumentError` unless the argument `effort` is one, and of a planner that has it.
-
-    Args:
-        value: of the argument.
-        planner: the sweep's.
-        without: the task's planner that minimises nothing.
-    """
-    require_one_of(EFFORTS, "effort", value)
-    rule = f"left out for the planner {without}, which minimises nothing"
-    require(value == EFFORTS[0] or planner != without, "effort", rule, value)
 
 
 def settings_to_resume(

@@ -27,6 +27,14 @@ def own_cells(successes: int, num: int) -> list[str]:
     ]
 
 
+def align(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return cells as lines, the first column to the left and the others to the right."""
+    first, *widths = (max(map(len, column)) for column in zip(*rows, strict=True))
+    return [
+        "  ".join([row[0].ljust(first), *map(str.rjust, row[1:], widths)]).rstrip() for row in rows
+    ]
+
+
 def headline(manifest: Entries, findings: Sequence[str] = ()) -> list[str]:
     """Return success, speed and failures of a run, a sentence each.
 

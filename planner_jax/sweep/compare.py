@@ -9,13 +9,13 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import pyarrow as pa
 from scipy.stats import binomtest
 
 from planner_jax.core.errors import ArgumentError
 from planner_jax.runs.manifest import Entries
 from planner_jax.runs.run_folder import RunFolder
 from planner_jax.runs.summary import percent, wilson_interval
+from planner_jax.runs.table import align
 from planner_jax.sweep.report import finished_sweep
 from planner_jax.sweep.sweep import settings_of
 
@@ -73,11 +73,8 @@ def read_run(path: str | os.PathLike) -> ComparedRun:
     """
     folder = RunFolder(path, name="RUN")
     manifest, sweep = finished_sweep(folder)
-    try:
+    with folder.reading_rows():
         rows = folder.plans.read(_READ)
-    except (pa.ArrowException, KeyError, OSError) as error:
-        rule, why = "a run whose rows can be read", " ".join(str(error).split())
-        raise ArgumentError(folder.name, rule, shown=why) from None
     kinds = {"index": int, "success": bool, "failed_limit": str, "cost": float, "iterations": float}
     columns = {name: rows[name].to_numpy().astype(kind) for name, kind in kinds.items()}
     deciding = ("num", "serves", *settings_of(sweep.task).DRAW)
@@ -197,7 +194,7 @@ def described(runs: Sequence[ComparedRun], most: int | None = 10) -> list[str]:
     own, rows = first.settings, table_of(runs)
     lines = [f"{first.manifest['kind']}, suite {own['suite']}, seed {own['seed']}", ""]
     lines += [f"[{k}] {run.name}" for k, run in enumerate(runs, 1)]
-    lines += ["", *_aligned(_cells(rows)), ""]
+    lines += ["", *align(_cells(rows)), ""]
     for k, (run, row) in enumerate(zip(others, rows[1:], strict=True), 2):
         lines += _sentences(first, run, row, k)
     same = [(k, run) for k, run in enumerate(runs, 1) if not other_cases(first, run)]
@@ -210,7 +207,7 @@ def described(runs: Sequence[ComparedRun], most: int | None = 10) -> list[str]:
     lines.append(f"Cases that tell them apart: {len(apart):,}.")
     header = ["case", *(f"[{k}]" for k, _ in same)]
     listed = [[str(at), *(failed or "success" for failed in fails)] for at, fails in shown]
-    lines += _aligned([header, *listed])
+    lines += align([header, *listed])
     if len(shown) < len(apart):
         lines.append(f"... and {len(apart) - len(shown):,} more; --all lists them.")
     return lines
@@ -260,14 +257,6 @@ def _cells(rows: Sequence[Entries]) -> list[list[str]]:
         numbers = ("-" if row[name] is None else format(row[name], form) for row in rows)
         cells.append([words, *numbers])
     return cells
-
-
-def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return cells as lines, the first column to the left and the others to the right."""
-    first, *widths = (max(map(len, column)) for column in zip(*rows, strict=True))
-    return [
-        "  ".join([row[0].ljust(first), *map(str.rjust, row[1:], widths)]).rstrip() for row in rows
-    ]
 
 
 def as_csv(runs: Sequence[ComparedRun]) -> str:

@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from planner_jax.core.choices import EFFORTS, require, require_scale
+from planner_jax.core.choices import EFFORTS, require, require_one_of, require_scale
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.registry import Task
 from planner_jax.runs.manifest import Entries, Row
@@ -18,7 +18,6 @@ from planner_jax.runs.settings import (
     ending_option,
     ending_options,
     option,
-    require_effort,
     require_ending,
 )
 
@@ -91,7 +90,10 @@ class QuadrotorSettings(SweepSettings):
         super().__post_init__()
         require_scale(self.limit_scale)
         object.__setattr__(self, "robot", checked_robot(self.robot, self.TOOL))
-        require_effort(self.effort, self.planner, self.WITHOUT_EFFORT)
+        require_one_of(EFFORTS, "effort", self.effort)
+        rule = f"left out for the planner {self.WITHOUT_EFFORT}, which minimises nothing"
+        has_effort = self.effort == EFFORTS[0] or self.planner != self.WITHOUT_EFFORT
+        require(has_effort, "effort", rule, self.effort)
         require_ending(self.ending)
 
     def planner_options(self) -> Entries:

@@ -3,7 +3,6 @@
 from typing import NamedTuple
 
 import numpy as np
-import pyarrow as pa
 from jaxtyping import PyTree
 
 from planner_jax.core.errors import ArgumentError
@@ -61,12 +60,9 @@ def planned_row(folder: RunFolder, row: int | None) -> PlannedRow:
     if row is None or not 0 <= row <= last:
         shown = "nothing" if row is None else row
         raise ArgumentError("row", f"from 0 to {last}", shown=shown)
-    try:
+    with folder.reading_rows():
         (found,) = folder.plans.pick([row])
         plan = sweep.plan_of_row(found, manifest.get("setting", {}))
-    except (pa.ArrowException, KeyError, TypeError, ValueError) as error:
-        rule, why = "a run whose rows can be read", " ".join(str(error).split())
-        raise ArgumentError(folder.name, rule, shown=why) from None
     if plan is None:
         rule = "a sweep of a task whose rows are read back as plans"
         raise ArgumentError(folder.name, rule, shown=f"a {sweep.kind}")

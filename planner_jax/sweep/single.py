@@ -23,6 +23,7 @@ from planner_jax.runs.run_folder import RunFolder
 from planner_jax.runs.settings import SweepSettings
 from planner_jax.runs.source import Chunk
 from planner_jax.runs.style import draw
+from planner_jax.runs.table import align
 from planner_jax.sweep.quadrotor import SampledMotion, body_rate, net_thrust, sample_motion
 from planner_jax.sweep.report import RunRows
 from planner_jax.sweep.sweep import sweep_of
@@ -203,10 +204,7 @@ def _table(margins: Sequence[Margin]) -> list[str]:
         share = f"{100.0 * margin.share:.1f} %" if np.isfinite(margin.share) else "exceeded"
         numbers = (f"{margin.reached:.4g}", f"{margin.allowed:.4g}", share, f"{margin.time:.3f}")
         rows.append((margin.limit, *numbers))
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return [
-        "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows
-    ]
+    return align(rows)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,7 +11,6 @@ from planner_jax.runs.table import RateTable, own_cells
 from planner_jax.sweep.catch.columns import COLUMNS, FRAME
 from planner_jax.sweep.catch.figures.flight import flight_figure
 from planner_jax.sweep.catch.figures.motion import motion_figure
-from planner_jax.sweep.catch.figures.outcomes import outcomes_figure
 from planner_jax.sweep.catch.settings import CatchSettings
 from planner_jax.sweep.figures.motion import CAPTION as MOTION
 from planner_jax.sweep.quadrotor import ending_remark
@@ -82,24 +81,9 @@ class CatchSweep(Sweep):
             flight_figure,
         ),
         RunFigure("motion.png", MOTION, (13.0, 6.8), motion_figure),
-        RunFigure(
-            "outcomes.png",
-            "Success with its 95 % Wilson interval beside the published rates, failures by "
-            "name, and the times of the catches that hold.",
-            (13.0, 4.4),
-            outcomes_figure,
-        ),
+        *Sweep.figures,
     )
-
-    single_figures = (
-        figures[0],
-        RunFigure(
-            "motion.png",
-            "The plan along its time against the limits.",
-            (13.0, 6.8),
-            motion_figure,
-        ),
-    )
+    single_figures = figures[:2]
 
     def setting(self, cases: PyTree) -> Entries:
         """Return physics and limits that all cases have in common, for the manifest."""

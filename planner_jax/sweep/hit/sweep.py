@@ -15,7 +15,6 @@ from planner_jax.sweep.figures.motion import CAPTION as MOTION
 from planner_jax.sweep.hit.columns import COLUMNS, FRAME, SINGLE_COLUMNS, published_column
 from planner_jax.sweep.hit.figures.court import court_figure, path_figure
 from planner_jax.sweep.hit.figures.motion import motion_figure
-from planner_jax.sweep.hit.figures.rates import compared_with, rates_figure
 from planner_jax.sweep.hit.settings import HitSettings
 from planner_jax.sweep.hit.source import ServeSource, open_source
 from planner_jax.sweep.quadrotor import ending_remark
@@ -23,6 +22,11 @@ from planner_jax.sweep.quadrotor_settings import robot_remark
 from planner_jax.sweep.rows import quadrotor_plan
 from planner_jax.sweep.sweep import RunFigure, Sweep, first_values
 from planner_jax.task.hit import court
+
+
+def compared_with(planner: str) -> str:
+    """Return the published planner that a planner's rates stand beside: itself, or else bat."""
+    return planner if planner in court.PLANNERS else "bat"
 
 
 class HitTally(Tally):
@@ -89,22 +93,12 @@ class HitSweep(Sweep):
             court_figure,
         ),
         RunFigure("motion.png", MOTION, (13.0, 6.8), motion_figure),
-        RunFigure(
-            "rates.png",
-            "Success per scenario with 95 % Wilson intervals, beside the published rates.",
-            (13.0, 6.6),
-            rates_figure,
-        ),
+        *Sweep.figures,
     )
     single_columns = SINGLE_COLUMNS
     single_figures = (
         RunFigure("path.png", "Ball and quadrotor in space.", (11.0, 8.0), path_figure),
-        RunFigure(
-            "motion.png",
-            "The plan along its time against the limits.",
-            (13.0, 6.8),
-            motion_figure,
-        ),
+        figures[1],
     )
     failure_words = {"case": "index", "scenario": "scenario", **Sweep.failure_words}
 
