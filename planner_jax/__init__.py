@@ -25,6 +25,9 @@ What a trajectory does: `PiecewisePolynomial`, `evaluate`. For planners and task
 `Planner`, `Plan`, `Attempt`, `outcome`, `OptimisedPlanner`, `pending`, `Round`, `LbfgsConfig`,
 `NewtonConfig`, `Evaluation`, `Verdict`, `Task`.
 
+Errors are `PlannerJaxError`s. A wrong argument raises an `ArgumentError`, which is a `ValueError`
+or, for a wrong type, a `TypeError`; a wrong number of a case raises its subclass `CaseError`.
+
 Everything is imported on first use, so that `import planner_jax` itself is quick.
 """
 

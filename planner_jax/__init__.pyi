@@ -6,7 +6,9 @@ from .ball.prediction import target_at as target_at
 from .ball.table import table_path as table_path
 from .ball.target import BallPath as BallPath
 from .ball.target import HarmonicPath as HarmonicPath
+from .core.errors import ArgumentError as ArgumentError
 from .core.errors import CaseError as CaseError
+from .core.errors import PlannerJaxError as PlannerJaxError
 from .core.planner import Planner as Planner
 from .core.protocol import Attempt as Attempt
 from .core.protocol import Plan as Plan

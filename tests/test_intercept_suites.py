@@ -350,9 +350,9 @@ def test_bad_arguments_are_named_in_one_line(arguments, options, says):
     [
         ({"count": 0}, "count must be >= 1, got 0"),
         ({"noise": -0.1}, "noise must be >= 0, got -0.1"),
-        ({"interval": 0.0}, "interval must be > 0, got 0.0"),
+        ({"interval": 0.0}, "interval must be > 0, got 0"),
         ({"first": -2}, "first must be >= 0, got -2"),
-        ({"until": -1.0}, "until must be >= 0, got -1.0"),
+        ({"until": -1.0}, "until must be >= 0, got -1"),
     ],
 )
 def test_bad_observations_are_named_in_one_line(options, says):

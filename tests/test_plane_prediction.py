@@ -351,5 +351,5 @@ def test_what_cannot_be_fitted_is_refused_in_one_line():
         select(TIMES, np.zeros((15, 3)), NOISE)
     with pytest.raises(ValueError, match=r"weights must be \(L,\) as times \(15,\), got \(3,\)"):
         select(TIMES, np.zeros((15, 2)), NOISE, np.ones(3))
-    with pytest.raises(ValueError, match="noise must be > 0, got 0.0"):
+    with pytest.raises(ValueError, match="noise must be > 0, got 0"):
         select(TIMES, np.zeros((15, 2)), 0.0)

@@ -140,7 +140,7 @@ def test_all_attempts_are_reported_and_a_report_is_a_line(clock):
 @pytest.mark.parametrize(
     "options, error, words",
     [
-        (dict(time_limit=-1.0), ValueError, "time_limit must be >= 0 s, got -1.0"),
+        (dict(time_limit=-1.0), ValueError, "time_limit must be >= 0 s, got -1"),
         (dict(time_limit=float("nan")), ValueError, "time_limit must be >= 0 s, got nan"),
         (dict(time_limit="1"), TypeError, "time_limit must be a number, got '1'"),
         (dict(progress=3), TypeError, "progress must be callable, such as print, got 3"),

@@ -16,7 +16,7 @@ from jaxtyping import PyTree
 from planner_jax.core.arithmetic import Numbers, numpy_of
 from planner_jax.core.checks import numeric, require_kind, require_number, require_switch
 from planner_jax.core.choices import require_size
-from planner_jax.core.errors import ArgumentError, ArgumentTypeError, format_value
+from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.rules import (
     NOT_NEGATIVE,
     POSITIVE,
@@ -166,7 +166,7 @@ def require_settings(planner: PyTree) -> None:
             require_attempts(name, value, type(usual[0]))
         elif isinstance(usual, tuple):
             if not isinstance(value, tuple) or any(numeric(x) is None for x in value):
-                raise ArgumentTypeError(name, "a tuple of numbers", format_value(value))
+                raise ArgumentTypeError(name, "a tuple of numbers", value)
         elif dataclasses.is_dataclass(usual):
             require_kind(name, value, type(usual))
 
@@ -179,7 +179,7 @@ def require_attempts(name: str, value: object, kind: type) -> None:
         ArgumentError: it is empty.
     """
     if not isinstance(value, tuple) or not all(isinstance(each, kind) for each in value):
-        raise ArgumentTypeError(name, f"a tuple of {kind.__name__}", format_value(value))
+        raise ArgumentTypeError(name, f"a tuple of {kind.__name__}", value)
     if not value:
         raise ArgumentError(name, "an entry", verb="have", shown="none")
 

@@ -16,6 +16,7 @@ from jaxtyping import PyTree
 
 from planner_jax.core.checks import require_kind
 from planner_jax.core.choices import require_size
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import require_fit
 from planner_jax.core.protocol import marked, status_of
 from planner_jax.optimise.multistart import minimise
@@ -133,10 +134,8 @@ def optimal_plan(
     if solver is not None:
         require_kind("solver", solver, LbfgsConfig)
     if case.batch_shape != ():
-        raise ValueError(
-            f"case must be one case, got batch shape {case.batch_shape}; for batches "
-            "there is pj.gradient, or jax.vmap of this"
-        )
+        shown = f"batch shape {case.batch_shape}; for batches there is pj.gradient, or jax.vmap "
+        raise ArgumentError("case", "one case", shown=f"{shown}of this")
     planner, case = planner.settle(case)
     solver = solver or LbfgsConfig(max_steps=200, tolerance=1e-7, patience=6)
     context = planner.prepare(case)

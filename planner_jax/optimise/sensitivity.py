@@ -24,7 +24,7 @@ from jaxtyping import PyTree
 
 from planner_jax.core.checks import numeric
 from planner_jax.core.choices import require_size
-from planner_jax.core.errors import format_value
+from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.protocol import Plan
 from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.preconditioner import positive_inverse
@@ -87,15 +87,13 @@ class Differentiated(OptimisedPlanner):
     def __post_init__(self) -> None:
         if not isinstance(self.curvature, str) or self.curvature not in _CURVATURES:
             known = ", ".join(_CURVATURES)
-            raise ValueError(f"curvature must be one of {known}, got {self.curvature!r}")
+            raise ArgumentError("curvature", f"one of {known}", self.curvature)
         if self.steps is not None:
             require_size("steps", self.steps, 0)
         if not callable(self.quantity) and not isinstance(self.quantity, str):
-            raise TypeError(
-                f"of must be a name or a function of a plan, got {format_value(self.quantity)}"
-            )
+            raise ArgumentTypeError("of", "a name or a function of a plan", self.quantity)
         if not self.by:
-            raise ValueError("by must name something in the case, got nothing")
+            raise ArgumentError("by", "something in the case", verb="name", shown="nothing")
 
     @property
     def rounds(self) -> tuple[Round, ...]:
@@ -200,9 +198,9 @@ def gradient_at(
         plan = planner.decode(x, context_of(smooth))
         value = number(plan.replace(cost=cost(x, smooth)))
         if numeric(value) is None:
-            raise TypeError(f"of must be one number, got {format_value(value)}")
+            raise ArgumentTypeError("of", "one number", value)
         if value.shape:
-            raise ValueError(f"of must be one number, got shape {value.shape}")
+            raise ArgumentError("of", "one number", shown=f"shape {value.shape}")
         return value
 
     value, (along_point, by_context) = jax.value_and_grad(value_of, argnums=(0, 1))(point, smooth)
@@ -283,20 +281,22 @@ def part_of(tree: PyTree, name: str) -> PyTree:
     part = _found(tree, name, "by")
     for leaf in jax.tree.leaves(part):
         if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
-            raise ValueError(f"by must name floating numbers, got {name!r}")
+            raise ArgumentError("by", "floating numbers", name, verb="name")
     return jax.tree.map(jnp.asarray, part)
 
 
 def _found(tree: PyTree, name: str, argument: str) -> PyTree:
     if not isinstance(name, str):
-        raise TypeError(f"{argument} must be a name or some, got {format_value(name)}")
+        raise ArgumentTypeError(argument, "a name or some", name)
     part = tree
     for field in name.split("."):
         known = _members(part)
         if field not in known:
-            raise ValueError(
-                f"{argument} must name a place in {type(tree).__name__}, got {name!r}: "
-                f"{type(part).__name__} has {', '.join(known) or 'no fields'}"
+            raise ArgumentError(
+                argument,
+                f"a place in {type(tree).__name__}",
+                verb="name",
+                shown=f"{name!r}: {type(part).__name__} has {', '.join(known) or 'no fields'}",
             )
         part = known[field]
     return part

@@ -10,7 +10,7 @@ from jax import Array
 
 from planner_jax.core.checks import numeric, require_kind, require_number
 from planner_jax.core.choices import require_size
-from planner_jax.core.errors import format_value
+from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.protocol import Attempt
 from planner_jax.core.rules import NOT_NEGATIVE, Rule
 
@@ -65,9 +65,9 @@ class LbfgsConfig:
             require_number(name, vars(self)[name], NOT_NEGATIVE)
         steps = self.trial_steps
         if not isinstance(steps, tuple) or any(numeric(each) is None for each in steps):
-            raise TypeError(f"trial_steps must be a tuple of numbers, got {format_value(steps)}")
+            raise ArgumentTypeError("trial_steps", "a tuple of numbers", steps)
         if not steps or not all(0.0 < each < jnp.inf for each in steps):
-            raise ValueError(f"trial_steps must be finite and > 0, one or more, got {steps}")
+            raise ArgumentError("trial_steps", "finite and > 0, one or more", steps)
 
 
 _SHARE = Rule("in (0, 1]", lambda value, part: (value > 0.0) & (value <= 1.0))
@@ -103,18 +103,14 @@ class NewtonConfig:
             require_number(name, vars(self)[name], NOT_NEGATIVE)
         trials = self.trial_dampings
         if not isinstance(trials, tuple) or any(numeric(each) is None for each in trials):
-            raise TypeError(
-                f"trial_dampings must be a tuple of numbers, got {format_value(trials)}"
-            )
+            raise ArgumentTypeError("trial_dampings", "a tuple of numbers", trials)
         if not trials or not all(0.0 <= each < jnp.inf for each in trials):
-            raise ValueError(f"trial_dampings must be finite and >= 0, one or more, got {trials}")
+            raise ArgumentError("trial_dampings", "finite and >= 0, one or more", trials)
         later = self.stragglers
         if later is None:
             return
         if not isinstance(later, tuple) or len(later) != 3:
-            raise TypeError(
-                f"stragglers must be a tuple of three numbers, got {format_value(later)}"
-            )
+            raise ArgumentTypeError("stragglers", "a tuple of three numbers", later)
         share, *counts = later
         require_number("stragglers", share, _SHARE)
         for count in counts:

@@ -15,6 +15,8 @@ from flax import struct
 from jax import Array, lax
 from jax.typing import ArrayLike
 
+from planner_jax.core.errors import ArgumentError
+
 Kind = TypeVar("Kind")
 
 
@@ -55,11 +57,11 @@ def looking_at(
     position, target = np.asarray(position, float), np.asarray(target, float)
     ahead = target - position
     if not np.hypot(*ahead[:2]) > 1e-6:
-        raise ValueError("target must be beside the camera, not above, below or within it")
+        raise ArgumentError("target", "beside the camera, not above, below or within it", shown="")
     if not 0.0 < field_of_view < np.pi:
-        raise ValueError(f"field_of_view must be between 0 and pi, got {field_of_view:g}")
+        raise ArgumentError("field_of_view", "between 0 and pi", field_of_view)
     if not min(size) >= 1:
-        raise ValueError(f"size must be >= 1 each way, got {size}")
+        raise ArgumentError("size", ">= 1 each way", size)
     z = ahead / np.linalg.norm(ahead)
     x = np.cross(z, [0.0, 0.0, 1.0])
     x /= np.linalg.norm(x)

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array, lax
 
+from planner_jax.core.errors import ArgumentError
 from planner_jax.perception.camera import (
     Camera,
     back_project,
@@ -64,12 +65,12 @@ def stereo_noise(
     given = locals()
     for name, value in given.items():
         if not value >= 0.0:
-            raise ValueError(f"{name} must be >= 0, got {value:g}")
+            raise ArgumentError(name, ">= 0", value)
     if not baseline > 0.0:
-        raise ValueError(f"baseline must be > 0, got {baseline:g}")
+        raise ArgumentError("baseline", "> 0", baseline)
     for name in ("dropout", "mismatch"):
         if not given[name] < 1.0:
-            raise ValueError(f"{name} must be < 1, got {given[name]:g}")
+            raise ArgumentError(name, "< 1", given[name])
     return from_numbers(StereoNoise, **given)
 
 

@@ -18,6 +18,7 @@ from jax import Array
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import PyTree
 
+from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import (
     Attempt,
@@ -85,11 +86,11 @@ class Watch:
     ) -> None:
         if time_limit is not None:
             if isinstance(time_limit, str | bool) or np.ndim(time_limit) != 0:
-                raise TypeError(f"time_limit must be a number, got {time_limit!r:.60}")
+                raise ArgumentTypeError("time_limit", "a number", time_limit)
             if not time_limit >= 0.0:
-                raise ValueError(f"time_limit must be >= 0 s, got {time_limit}")
+                raise ArgumentError("time_limit", ">= 0 s", time_limit)
         if progress is not None and not callable(progress):
-            raise TypeError(f"progress must be callable, such as print, got {progress!r:.60}")
+            raise ArgumentTypeError("progress", "callable, such as print", progress)
         self._began, self._limit, self._progress = time.monotonic(), time_limit, progress
         self._told = (0, 0.0)  # round and time of the last report
 

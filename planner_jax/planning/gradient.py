@@ -10,7 +10,7 @@ from jax import Array
 from jaxtyping import PyTree
 
 from planner_jax.core.checks import require_kind, require_switch
-from planner_jax.core.errors import format_value
+from planner_jax.core.errors import ArgumentTypeError
 from planner_jax.core.protocol import Plan
 from planner_jax.core.rules import fields_of
 from planner_jax.optimise.sensitivity import Differentiated, Quantity, part_of
@@ -82,7 +82,7 @@ def gradient(
     """
     require_fit(planner, cases)
     if not isinstance(by, str | Sequence):
-        raise TypeError(f"by must be a name or some, got {format_value(by)}")
+        raise ArgumentTypeError("by", "a name or some", by)
     if solver is not None:
         require_kind("solver", solver, LbfgsConfig, NewtonConfig)
     require_switch("polish", polish)

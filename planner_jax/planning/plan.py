@@ -8,6 +8,7 @@ from jax.core import Tracer
 from jaxtyping import PyTree
 
 from planner_jax.core.choices import require_size
+from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.planner import CaseT, Kind, Planner, PlanT, require_fit
 from planner_jax.core.protocol import Status, is_resident
 from planner_jax.core.rules import Case, has_rules, require_shapes, require_sound
@@ -64,7 +65,9 @@ def plan(
     kinds = {type(leaf) for leaf in (*leaves, *jax.tree.leaves(planner))}
     if any(issubclass(kind, Tracer) for kind in kinds):
         if watch.waits:
-            raise TypeError("time_limit and progress must be left out inside of compiled functions")
+            raise ArgumentTypeError(
+                "time_limit and progress", "left out inside of compiled functions", shown=""
+            )
         return solve(planner, cases)
     require_fit(planner, cases)
     if chunk is not None or devices is not None:
@@ -92,9 +95,9 @@ def _require_layout(chunk: object, devices: object) -> None:
         if not isinstance(devices, Sequence | np.ndarray) or not all(
             isinstance(device, jax.Device) for device in devices
         ):
-            raise TypeError(f"devices must be a sequence of jax.Device, got {devices!r:.60}")
+            raise ArgumentTypeError("devices", "a sequence of jax.Device", devices)
         if not len(devices):
-            raise ValueError("devices must be at least one, got none")
+            raise ArgumentError("devices", "at least one", shown="none")
         if len(set(devices)) < len(devices):
             raise ValueError(f"devices must differ, got {', '.join(map(str, devices))}")
 
@@ -108,20 +111,22 @@ def _require_own_precision(leaves: list[PyTree]) -> None:
         return
     kinds = (leaf.dtype if isinstance(leaf, _ARRAYS) else None for leaf in leaves)
     if all(kind == np.float64 for kind in kinds if kind is None or kind.kind == "f"):
-        raise TypeError("cases must be in float32 unless jax_enable_x64 is set, got float64")
+        raise ArgumentTypeError("cases", "in float32 unless jax_enable_x64 is set", shown="float64")
 
 
 def require_batch(cases: Case) -> int:
     """Return the length of a batch; raise `ValueError` unless all leaves have it."""
     batch = cases.batch_shape
     if len(batch) != 1 or batch[0] == 0:
-        raise ValueError(f"cases must be a batch of at least one, got batch shape {batch}")
+        raise ArgumentError("cases", "a batch of at least one", shown=f"batch shape {batch}")
     for path, leaf in jax.tree_util.tree_leaves_with_path(cases):
         if np.shape(leaf)[:1] != batch:
             if has_rules(cases):
                 require_shapes(cases)  # which names the one array that is of another batch
             name = jax.tree_util.keystr(path)
-            raise ValueError(f"cases{name} must have {batch[0]} lanes, got shape {np.shape(leaf)}")
+            raise ArgumentError(
+                f"cases{name}", f"{batch[0]} lanes", verb="have", shown=f"shape {np.shape(leaf)}"
+            )
     return batch[0]
 
 

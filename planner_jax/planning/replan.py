@@ -9,7 +9,7 @@ from jax import Array
 from jaxtyping import PyTree
 
 from planner_jax.core.checks import numbers_of, require_kind
-from planner_jax.core.errors import format_value
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import require_planner
 from planner_jax.core.protocol import Plan
 from planner_jax.core.rules import Case
@@ -51,9 +51,9 @@ def moment_of(cases: Case, elapsed: PyTree) -> np.ndarray:
     least = np.minimum.reduce(elapsed, axis=None, initial=np.inf)
     most = np.maximum.reduce(elapsed, axis=None, initial=0.0)
     if not least >= 0.0:
-        raise ValueError(f"elapsed must be >= 0, got {least}")
+        raise ArgumentError("elapsed", ">= 0", least)
     if not most < np.inf:
-        raise ValueError(f"elapsed must be finite, got {most}")
+        raise ArgumentError("elapsed", "finite", most)
     return elapsed
 
 
@@ -75,7 +75,7 @@ def given_or_own(name: str, given: PyTree, own: PyTree, elapsed: np.ndarray) -> 
     batch = elapsed.shape
     found = numbers_of(name, given, batch, np.shape(own)[len(batch) :]).astype(elapsed.dtype)
     if not np.isfinite(found).all():
-        raise ValueError(f"{name} must be finite, got {format_value(given)}")
+        raise ArgumentError(name, "finite", given)
     return found
 
 
@@ -105,8 +105,10 @@ def replan(planner: PyTree, cases: PyTree, previous: PlanT, elapsed: PyTree, **n
     require_kind("cases", cases, again.inner.case_type)
     require_kind("previous", previous, again.plan_type)
     if np.shape(previous.status) != cases.batch_shape:
-        raise ValueError(
-            f"previous must have the batch shape of the cases, {cases.batch_shape}, got "
-            f"{np.shape(previous.status)}"
+        raise ArgumentError(
+            "previous",
+            f"the batch shape of the cases, {cases.batch_shape}",
+            np.shape(previous.status),
+            verb="have",
         )
     return plan(again, again.begin(cases, previous, elapsed, **news))

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from planner_jax.core.errors import NoEnding
+from planner_jax.core.errors import ArgumentError, ArgumentTypeError, NoEnding
 from planner_jax.core.protocol import Plan, is_solved, lane
 from planner_jax.cost.quadrotor import flight_excess, flight_names, relative_excess
 from planner_jax.planning.plan import plan
@@ -50,12 +50,12 @@ def with_ending(case: PyTree, found: Plan, to: str) -> Plan:
     if isinstance(found, QuadrotorPlan):
         return _end_flight(case, found, to)
     if to != "brake":
-        raise ValueError(f"to must be brake, as only quadrotors go home, got {to!r}")
+        raise ArgumentError("to", "brake, as only quadrotors go home", to)
     if isinstance(found, CarPlan):
         return brake_car(case, found)
     if isinstance(found, ArmPlan):
         return brake_arm(case, found)
-    raise TypeError(f"found must be the plan of a robot, got a {type(found).__name__}")
+    raise ArgumentTypeError("found", "the plan of a robot", shown=f"a {type(found).__name__}")
 
 
 def _end_flight(case: PyTree, found: QuadrotorPlan, to: str) -> QuadrotorPlan:

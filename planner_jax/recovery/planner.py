@@ -9,6 +9,7 @@ from flax import struct
 from jax import Array
 
 from planner_jax.core.choices import ENDINGS
+from planner_jax.core.errors import ArgumentError
 from planner_jax.optimise.chain import ChainEnds, ChainPlanner
 from planner_jax.optimise.planner import pending
 from planner_jax.optimise.settings import LbfgsConfig, Round
@@ -63,7 +64,7 @@ class RestPlanner(ChainPlanner[EndingCase, EndingPlan]):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.to not in ENDINGS:
-            raise ValueError(f"to must be one of {', '.join(ENDINGS)}, got {self.to!r}")
+            raise ArgumentError("to", f"one of {', '.join(ENDINGS)}", self.to)
 
     def prepare(self, case: EndingCase) -> RestContext:
         """Return the case as it is."""

@@ -37,6 +37,7 @@ from jax import Array, lax
 from jaxtyping import Bool, Float, PyTree
 
 from planner_jax.core.arithmetic import reciprocal
+from planner_jax.core.errors import ArgumentError
 from planner_jax.trajectory.polynomial import (
     Motion,
     PiecewisePolynomial,
@@ -139,7 +140,7 @@ def proportional_minco(
             of M - 1.
     """
     if not proportions or min(proportions) <= 0.0:
-        raise ValueError(f"proportions must be some numbers > 0, got {proportions}")
+        raise ArgumentError("proportions", "some numbers > 0", proportions)
     s, m = order, len(proportions)
     shares = np.array(proportions) * m / np.sum(proportions)
     # Derivative d of a node in the unit time of piece i is r_i^d of that in time over h.

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
 
+from planner_jax.core.errors import ArgumentError
+
 Pair = tuple[Array, Array]  # x and y of points of the plane, each (...)
 
 
@@ -36,15 +38,15 @@ def centre(
     """
     times, positions = jnp.asarray(times), jnp.asarray(positions)
     if times.ndim != 1 or positions.shape != (*times.shape, 2):
-        raise ValueError(
-            f"times must be (L,) and positions (L, 2), got {times.shape} and {positions.shape}"
+        raise ArgumentError(
+            "times", "(L,) and positions (L, 2)", shown=f"{times.shape} and {positions.shape}"
         )
     if times.shape[0] < least:
-        raise ValueError(f"times must be of at least {least} observations, got {times.shape[0]}")
+        raise ArgumentError("times", f"of at least {least} observations", times.shape[0])
     dtype = jnp.promote_types(jnp.result_type(times, positions), jnp.float32)
     given = jnp.ones(times.shape, dtype) if weights is None else jnp.asarray(weights, dtype)
     if given.shape != times.shape:
-        raise ValueError(f"weights must be (L,) as times {times.shape}, got {given.shape}")
+        raise ArgumentError("weights", f"(L,) as times {times.shape}", given.shape)
     times, positions = times.astype(dtype), positions.astype(dtype)
     present = jnp.isfinite(times) & jnp.all(jnp.isfinite(positions), axis=-1) & (given > 0.0)
     weight = jnp.where(present, given, 0.0)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
 
+from planner_jax.core.errors import ArgumentError
 from planner_jax.plane.target import PolynomialPath
 from planner_jax.sims.prediction.observed import centre
 
@@ -33,7 +34,7 @@ def fit_polynomial(
             the shapes do not match; one line.
     """
     if degree not in (1, 2, 3):
-        raise ValueError(f"degree must be 1, 2 or 3, got {degree}")
+        raise ArgumentError("degree", "1, 2 or 3", degree)
     seen = centre(times, positions, weights, degree + 1)
     span = jnp.max(jnp.abs(seen.after))
     span = jnp.where(span > 0.0, span, 1.0)

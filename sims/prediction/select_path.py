@@ -13,6 +13,7 @@ from flax import struct
 from jax import Array, lax
 from jax.typing import ArrayLike
 
+from planner_jax.core.errors import ArgumentError
 from planner_jax.plane.target import TurningPath, arc
 from planner_jax.sims.prediction.observed import centre, safe_sqrt
 from planner_jax.sims.prediction.turn_fit import best_turn, given_rate, path_of, tangent
@@ -131,7 +132,7 @@ def select(
             noise is a number that is not positive; one line.
     """
     if isinstance(noise, int | float) and not noise > 0.0:
-        raise ValueError(f"noise must be > 0, got {noise}")
+        raise ArgumentError("noise", "> 0", noise)
     least = 4 if noise is None else 3
     seen = centre(times, positions, weights, least)
     dtype = seen.after.dtype

@@ -28,6 +28,7 @@ import numpy as np
 from jax import lax
 from jax.typing import ArrayLike
 
+from planner_jax.core.errors import ArgumentError
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 
@@ -45,7 +46,7 @@ def basis(degree: int, num: int, shares: ArrayLike) -> np.ndarray:
     shares = np.asarray(shares, float)
     if not ((shares >= 0.0) & (shares <= 1.0)).all():
         outside = np.ravel(shares)[np.argmax(np.abs(np.ravel(shares) - 0.5))]
-        raise ValueError(f"shares must be from 0 to 1, got {outside:g}")
+        raise ArgumentError("shares", "from 0 to 1", outside)
     return _basis(degree, num, shares * _spans(degree, num))
 
 
@@ -108,7 +109,7 @@ def b_spline(degree: int, points: ArrayLike, duration: ArrayLike) -> PiecewisePo
 
 def _spans(degree: int, num: int) -> int:
     if num <= degree:
-        raise ValueError(f"control points must be more than the degree {degree}, got {num}")
+        raise ArgumentError("control points", f"more than the degree {degree}", num)
     return num - degree
 
 

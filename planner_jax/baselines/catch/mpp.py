@@ -13,6 +13,7 @@ from jaxtyping import PyTree
 from planner_jax.ball.flight import BallState, gravity_vector
 from planner_jax.ball.target import state_at
 from planner_jax.baselines.parts.minimum_jerk import eased_minimum_jerk
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt, outcome, require_settings
 from planner_jax.cost.quadrotor import (
@@ -122,9 +123,9 @@ class MppCatch(Planner):
     def __post_init__(self) -> None:
         require_settings(self)
         if not 0.0 < self.height < 2.0:
-            raise ValueError(f"height must be > 0 and < 2, got {self.height}")
+            raise ArgumentError("height", "> 0 and < 2", self.height)
         if not self.speeds or not self.thrusts:
-            raise ValueError("speeds and thrusts must have an entry, got none")
+            raise ArgumentError("speeds and thrusts", "an entry", verb="have", shown="none")
 
     def solve(self, case: CatchCase, attempt: Attempt) -> CatchPlan:
         """The cheapest primitives one after another; no variable is left to decide on.

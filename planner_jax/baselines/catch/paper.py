@@ -9,6 +9,7 @@ from flax import struct
 from jax import Array
 
 from planner_jax.baselines.parts.minimum_jerk import minimum_jerk
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import require_settings
 from planner_jax.cost.along import Along, integrate_along
 from planner_jax.cost.penalty import steep_hinge
@@ -129,7 +130,7 @@ class PaperCatch(OptimisedPlanner):
     def __post_init__(self) -> None:
         require_settings(self)
         if self.num_pieces < 2:
-            raise ValueError(f"num_pieces must be >= 2, got {self.num_pieces}")
+            raise ArgumentError("num_pieces", ">= 2", self.num_pieces)
         if not self.scale:
             object.__setattr__(self, "scale", (_OFFSET_SCALE,) * self.num_offsets + _CATCH_SCALE)
 
@@ -150,7 +151,7 @@ class PaperCatch(OptimisedPlanner):
     def guesses(self, context: CatchContext, num: int) -> Array:
         """From rest to rest below every ball, on minimum-jerk primitives, (1, n)."""
         if num != 1:
-            raise ValueError(f"starts must be 1, got {num}")
+            raise ArgumentError("starts", "1", num)
         case, dtype = context.case, context.times.dtype
         durations = jnp.maximum(jnp.diff(context.times, prepend=jnp.zeros((1,), dtype)), 0.05)
         ball = targets_at(context.targets, context.times)

@@ -14,6 +14,7 @@ from planner_jax.ball.prediction import target_at
 from planner_jax.baselines.hit.common import largest_violation, make_impact
 from planner_jax.baselines.hit.decoupled import aim_at_angle, decoupled_hit
 from planner_jax.baselines.parts.minimum_jerk import minimum_jerk
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import require_settings
 from planner_jax.cost.penalty import joined_trapezoid_weights, smoothed_hinge
 from planner_jax.cost.quadrotor import motion_excess
@@ -161,14 +162,14 @@ class BatHit(OptimisedPlanner):
     def __post_init__(self) -> None:
         require_settings(self)
         if self.num_pieces < 2:
-            raise ValueError(f"num_pieces must be >= 2, got {self.num_pieces}")
+            raise ArgumentError("num_pieces", ">= 2", self.num_pieces)
         if not self.scale:
             place, time, speed, thrust = _UNITS
             terminal = (time, speed, speed, thrust, thrust)
             object.__setattr__(self, "scale", (place,) * self.num_offsets + terminal)
         if len(self.scale) != self.num_offsets + 5:
             rule = f"of {self.num_offsets + 5} numbers"
-            raise ValueError(f"scale must be {rule}, got {len(self.scale)}")
+            raise ArgumentError("scale", rule, len(self.scale))
 
     @property
     def maps(self) -> ProportionalMinco:
@@ -204,7 +205,7 @@ class BatHit(OptimisedPlanner):
     def guesses(self, context: HitContext, num: int) -> Array:
         """The initial values of Section VI-A with the waypoints of the primitives, (1, n)."""
         if num != 1:
-            raise ValueError(f"starts must be 1, got {num}")
+            raise ArgumentError("starts", "1", num)
         case, dtype = context.case, context.landing_time.dtype
         stages = self.stage_times if self.transition else self.stage_times[:1]
         # A ball that lands sooner, because planning began late, is met before it lands.

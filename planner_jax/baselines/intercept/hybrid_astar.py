@@ -17,7 +17,7 @@ from types import ModuleType
 import numpy as np
 from numpy.typing import ArrayLike
 
-from planner_jax.core.errors import MissingExtra
+from planner_jax.core.errors import ArgumentError, MissingExtra
 from planner_jax.plane.obstacles import Obstacles
 
 _DISCS = 3  # that cover the body
@@ -164,24 +164,24 @@ def _require(start, meeting, lower, upper, curvature, body, end_heading, setting
     }
     for name, (value, size) in shapes.items():
         if value.shape != (size,) or not np.isfinite(value).all():
-            raise ValueError(f"{name} must be ({size},) and finite, got {value}")
+            raise ArgumentError(name, f"({size},) and finite", value)
     if not (upper > lower).all():
-        raise ValueError(f"upper must be > lower, got {upper} and {lower}")
+        raise ArgumentError("upper", "> lower", shown=f"{upper} and {lower}")
     if not (body[0] < body[1] and body[2] > 0.0):
-        raise ValueError(f"body must be (behind, ahead > behind, half width > 0), got {body}")
+        raise ArgumentError("body", "(behind, ahead > behind, half width > 0)", body)
     if end_heading is not None and not np.isfinite(end_heading):
-        raise ValueError(f"end_heading must be finite, got {end_heading}")
+        raise ArgumentError("end_heading", "finite", end_heading)
     positive = {"curvature": curvature, "cell": settings.cell}
     for name, value in (positive | {"max_expansions": settings.max_expansions}).items():
         if not (np.isfinite(value) and value > 0):
-            raise ValueError(f"{name} must be > 0 and finite, got {value}")
+            raise ArgumentError(name, "> 0 and finite", value)
     chosen = vars(settings)
     for name in ("turn_price", "slack", "margin"):
         if not 0.0 <= chosen[name] < np.inf:
-            raise ValueError(f"{name} must be >= 0 and finite, got {chosen[name]}")
+            raise ArgumentError(name, ">= 0 and finite", chosen[name])
     for name, least in (("headings", 8), ("poses", 2)):
         if chosen[name] < least:
-            raise ValueError(f"{name} must be >= {least}, got {chosen[name]}")
+            raise ArgumentError(name, f">= {least}", chosen[name])
 
 
 def _sampled(

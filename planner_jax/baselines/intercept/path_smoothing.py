@@ -32,6 +32,7 @@ import numpy as np
 from flax import struct
 from jax import Array, lax
 
+from planner_jax.core.errors import ArgumentError
 from planner_jax.plane.obstacles import Obstacles, distances, separation
 
 _FINE = 8  # samples of a piece of the spline, for its length
@@ -98,8 +99,8 @@ def smooth_path(
     """
     pieces, rest = divmod(poses.shape[0] - 1, settings.stride)
     if rest or pieces < 4:
-        raise ValueError(
-            f"poses must be {settings.stride} k + 1, k >= 4, for this stride, got {poses.shape[0]}"
+        raise ArgumentError(
+            "poses", f"{settings.stride} k + 1, k >= 4, for this stride", poses.shape[0]
         )
     given = control_points(poses[:: settings.stride], bends[:: settings.stride])
     smooth = smooth_points(given, walls, curvature, settings)

@@ -20,6 +20,7 @@ from flax import struct
 from jax import Array, lax
 from numpy.typing import ArrayLike
 
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import Status
 
 
@@ -80,12 +81,16 @@ def qp_template(
         e = np.concatenate([e, np.asarray(zeros, np.float64)])
     _, singular, axes = np.linalg.svd(e)
     if e.shape[0] > e.shape[1] or not singular.min() > 1e-12 * singular.max():
-        raise ValueError(f"equalities must be independent, got singular values from {singular[-1]}")
+        raise ArgumentError(
+            "equalities", "independent", shown=f"singular values from {singular[-1]}"
+        )
     free = axes[len(singular) :].T
     try:
         factor = np.linalg.cholesky(free.T @ q @ free)
     except np.linalg.LinAlgError:
-        raise ValueError("hessian must be positive definite where the equalities hold") from None
+        raise ArgumentError(
+            "hessian", "positive definite where the equalities hold", shown=""
+        ) from None
     directions = np.linalg.solve(factor, free.T).T
     base = np.linalg.pinv(e)[:, :given]
     base = base - directions @ (directions.T @ q @ base)

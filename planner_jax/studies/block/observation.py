@@ -15,6 +15,7 @@ from jax import Array
 
 from planner_jax.ball.flight import BallState, drag_free_flight
 from planner_jax.core.arithmetic import host_leaf
+from planner_jax.core.errors import ArgumentError
 from planner_jax.perception.camera import Camera, looking_at
 from planner_jax.perception.noise import Noise, RoundNoise, information, sightings, stereo_noise
 from planner_jax.studies.block.flight_fit import (
@@ -63,9 +64,9 @@ def eye(*, rate: float = 60.0, std: float | None = None, camera: Camera | None =
         ValueError: a number is not positive; one line.
     """
     if not rate > 0.0:
-        raise ValueError(f"rate must be > 0, got {rate:g}")
+        raise ArgumentError("rate", "> 0", rate)
     if std is not None and not std > 0.0:
-        raise ValueError(f"std must be > 0, got {std:g}")
+        raise ArgumentError("std", "> 0", std)
     return Eye(
         camera=mast_camera() if camera is None else camera,
         noise=stereo_noise() if std is None else RoundNoise(std=host_leaf(std, np.float32)),
@@ -143,7 +144,7 @@ def see(
     """
     for name, value in (("seconds", seconds), ("overhead", overhead)):
         if not value >= 0.0:
-            raise ValueError(f"{name} must be >= 0, got {value:g}")
+            raise ArgumentError(name, ">= 0", value)
     times = jnp.asarray(frame_times(eye, seconds), cases.gravity.dtype)
     balls, fits = _seen(cases, eye, times, jax.random.key(seed))
     delay = jnp.full_like(cases.delay, seconds + overhead)

@@ -19,6 +19,7 @@ from jax import Array
 
 from planner_jax.ball.flight import BallState
 from planner_jax.core.arithmetic import host_leaf
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Status, is_solved, lane, select_into
 from planner_jax.planning.plan import plan
@@ -143,9 +144,9 @@ def decide(
     """
     moments = [float(moment) for moment in moments]
     if len(moments) == 0 or moments[0] < 0.0 or not np.all(np.diff(moments) > 0.0):
-        raise ValueError(f"moments must rise from 0 or later, got {moments}")
+        raise ArgumentError("moments", "from 0 or later", moments, verb="rise")
     if not overhead >= 0.0:
-        raise ValueError(f"overhead must be >= 0, got {overhead:g}")
+        raise ArgumentError("overhead", ">= 0", overhead)
     if len(moments) > 1 and not isinstance(planner, OnlineBlock):
         raise TypeError(f"{type(planner).__name__} decides once: give it one moment")
     cases = jax.tree.map(np.asarray, cases)

@@ -14,7 +14,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from planner_jax.core.checks import require_path
-from planner_jax.core.errors import ArgumentError, format_value
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.rules import PERMUTATION, Field, Table
 from planner_jax.plane.target import LaterPath, PlanePath
 from planner_jax.task.intercept.case import InterceptCase
@@ -117,16 +117,14 @@ def case(
     shapes = [np.shape(time), np.shape(settings.get("start", 0.0))[:-1], *map(np.shape, given)]
     axis, leaves = len(max(shapes, key=len)), jax.tree.leaves(targets)
     if not leaves or any(np.ndim(leaf) <= axis for leaf in leaves):
-        raise ArgumentError(
-            "targets", f"paths with {axis + 1} axes in front", format_value(targets)
-        )
+        raise ArgumentError("targets", f"paths with {axis + 1} axes in front", targets)
     one = jax.tree.map(lambda leaf: np.asarray(leaf).take(0, axis), targets)
     shared = single_case(one, time, **settings)
     batch, num = shared.batch_shape, np.shape(leaves[0])[axis]
     require_path("targets", targets, (*batch, num), 2)
     there = np.asarray(present)
     if there.dtype != np.bool_ or there.shape not in ((), (num,), (*batch, num)):
-        raise ArgumentError("present", f"True or False of {num} targets", format_value(present))
+        raise ArgumentError("present", f"True or False of {num} targets", present)
     return InterceptGroup(
         shared=dataclasses.replace(shared, target=targets),
         present=jnp.asarray(np.broadcast_to(there, (*batch, num))),

@@ -10,6 +10,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Float
 
 from planner_jax.core.checks import require_kind, require_path
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import Planner
 from planner_jax.core.registry import suite_named
 from planner_jax.plane.target import LaterPath, PlanePath, PolynomialPath, TurningPath
@@ -70,9 +71,9 @@ def observe(
     given = {"count": (count, 1), "noise": (noise, 0), "first": (first, 0), "until": (until, 0)}
     for name, (value, least) in given.items():
         if not value >= least:
-            raise ValueError(f"{name} must be >= {least}, got {value}")
+            raise ArgumentError(name, f">= {least}", value)
     if not interval > 0.0:
-        raise ValueError(f"interval must be > 0, got {interval}")
+        raise ArgumentError("interval", "> 0", interval)
     times = interval * np.arange(1.0 - count, 1.0 + np.floor(until / interval + 1e-9))
     positions = np.asarray(_positions_at(cases.target, times.astype(cases.time.dtype)))
     tag = zlib.crc32(b"observations")

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import (
     Status,
@@ -76,7 +77,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         if self.searches is not None:
             require_attempts("searches", self.searches, Search)
         if self.meet not in ("given", "early", "least"):
-            raise ValueError(f"meet must be given, early or least, got {self.meet!r}")
+            raise ArgumentError("meet", "given, early or least", self.meet)
 
     @property
     def attempts(self) -> tuple[Search, ...]:

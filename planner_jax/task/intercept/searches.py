@@ -8,6 +8,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import Attempt
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.plane import cell_paths, reach
@@ -41,7 +42,7 @@ class Search(Attempt):
 
     def __post_init__(self) -> None:
         if self.ways < 1:
-            raise ValueError(f"ways must be >= 1, got {self.ways}")
+            raise ArgumentError("ways", ">= 1", self.ways)
         lattice = self.lattice
         words = lattice.cells**2 // 32 * lattice.levels * lattice.headings * lattice.layers
         starts = max(_ROOM * self.ways, round(_ROOM_OF_WORD * words))
