@@ -59,7 +59,7 @@ def build_library(
     finite = home is None or all(map(math.isfinite, home))
     require(finite, "home", "finite angles", shown=" ".join(map(str, home or ())))
     if Path(path).exists():
-        _loaded(path)  # lest a file of another kind be lost
+        load_library(path)  # lest a file of another kind be lost
     require_backend()
     try:
         body = irb1600() if arm is None else read_arm(arm)
@@ -79,13 +79,8 @@ def build_library(
 
 
 def show_library(path: str, *, map: str | None = None) -> None:
-    """Print what a library covers, and draw a map of it if asked.
-
-    Args:
-        path: of its file.
-        map: path of a picture, PNG.
-    """
-    library = _loaded(path)
+    """Print what a library covers, and draw a map of it as PNG if a path is passed."""
+    library = load_library(path)
     covered = coverage(library)
     _print(path, library, covered)
     if map is not None:
@@ -94,17 +89,11 @@ def show_library(path: str, *, map: str | None = None) -> None:
 
 
 def check_library(path: str, *, num: int = 2000, seed: int = 0) -> None:
-    """Have the referee judge the stored motions as answers to random balls.
-
-    Args:
-        path: of its file.
-        num: balls for each home.
-        seed: of the balls.
-    """
+    """Let the referee judge the motions for random balls, so many for each home."""
     require_count("num", num, 1)
     require_seed(seed)
     require_memory("num", num, BlockSettings.CASE_BYTES)
-    library = _loaded(path)
+    library = load_library(path)
     require_backend()
     for home in range(len(library.table.homes)):
         found = check(library, num, seed, home)
@@ -120,15 +109,8 @@ def check_library(path: str, *, num: int = 2000, seed: int = 0) -> None:
 
 
 def repair_library(path: str, *, pole: Sequence[float], out: str, retry: bool = False) -> None:
-    """Plan anew what touches a pole that has moved.
-
-    Args:
-        path: of the library's file.
-        pole: where it stands now, (2,) [m].
-        out: path of the new file.
-        retry: whether to try pairs without a motion again.
-    """
-    library = _loaded(path)
+    """Plan anew what touches a pole that has moved to (2,) [m]; write a new file."""
+    library = load_library(path)
     require(len(pole) == 2, "pole", "two numbers [m]", shown=f"{len(pole)} numbers")
     require(bool(np.isfinite(pole).all()), "pole", "finite", list(pole))
     require_backend()
@@ -143,10 +125,6 @@ def repair_library(path: str, *, pole: Sequence[float], out: str, retry: bool = 
         f"{time.perf_counter() - began:.1f} s, compilation included."
     )
     _print(out, repaired, coverage(repaired))
-
-
-def _loaded(path: str) -> Library:
-    return load_library(path)
 
 
 def _print(path: str, library: Library, covered: Coverage) -> None:
@@ -185,13 +163,7 @@ def _print(path: str, library: Library, covered: Coverage) -> None:
 
 
 def coverage_map(figure: Figure, library: Library, covered: Coverage) -> None:
-    """Draw each face with cells, coloured by the share of a cell's feasible pairs with a motion.
-
-    Args:
-        figure: empty.
-        library: that is shown.
-        covered: what it covers.
-    """
+    """Draw each face with cells, coloured by the share of feasible pairs with a motion."""
     layout, scene = library.table.layout, library.setting.scene
     shape = (layout.num_outer, layout.num_inner)
     found = covered.found.any(axis=0).reshape(shape)

@@ -32,12 +32,9 @@ class Unfinished(PlannerJaxError):
 def fail(
     error: str | PlannerJaxError, flags: Mapping[str, str] | None = None, code: int = BAD_ARGUMENT
 ) -> int:
-    """Print one line about an error and return an exit code.
+    """Print an error in one line and return its exit code.
 
-    Args:
-        error: text, or error that names an argument or a feature.
-        flags: options of the command by their names in Python, which take the place of the names.
-        code: exit code.
+    `flags` are the options of the command by the names of their arguments.
     """
     if isinstance(error, ArgumentError | MissingExtra):
         error = error.renamed(flags or {})
@@ -135,12 +132,7 @@ def _type_of(hint: Any) -> type:
 
 
 def pop_out(given: Options, kind: str = "folder") -> str | None:
-    """Take the option `--out` out of the options that were given, and return it.
-
-    Args:
-        given: options.
-        kind: "folder" or "file".
-    """
+    """Remove the option `--out`, a folder or file, from the options and return it."""
     out = given.pop("out", None)
     if out == "":
         raise ArgumentError("out", f"a {kind}", out, verb="name")

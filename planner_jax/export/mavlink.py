@@ -56,12 +56,7 @@ def write_tlog(plan: QuadrotorPlan, rate: float, file: BinaryIO) -> None:
 
 
 def stream(plan: QuadrotorPlan, port: int, rate: float = DEFAULT_RATE) -> int:
-    """Send the packets to a UDP port of this machine, each when it is due; returns how many.
-
-    Args:
-        plan: one, solved.
-        port: on which the autopilot, or its simulation, listens.
-        rate: [Hz].
+    """Send the packets to a UDP port of this machine, each when it is due; return their number.
 
     Raises:
         ArgumentError: the plan cannot be exported, the rate is absurd, or nobody listens on the

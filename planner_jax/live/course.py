@@ -38,16 +38,9 @@ def without_recovery(path: PiecewisePolynomial, gravity: Array) -> Course:
 def with_recovery(
     path: PiecewisePolynomial, gravity: Array, limits: QuadrotorLimits
 ) -> tuple[Course, bool]:
-    """Plan the recovery trajectory from the end of a trajectory of M pieces.
+    """Plan the recovery trajectory from the end of a trajectory of M pieces, NumPy leaves.
 
-    Args:
-        path: NumPy leaves.
-        gravity: () [m/s^2].
-        limits: of the robot.
-
-    Returns:
-        course: of both.
-        is_within: whether the recovery trajectory keeps the limits.
+    Returns the course of both, and whether the recovery trajectory keeps the limits.
     """
     state: Any = state_on(path, np.sum(path.durations))
     case = EndingCase(state, state[0], gravity, limits)

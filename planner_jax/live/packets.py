@@ -137,14 +137,9 @@ def answer(
     times: tuple[float, float, float],
     setpoints: np.ndarray,
 ) -> bytes:
-    """The packet of an answer.
+    """Return the packet of an answer with setpoints (K, 20) float32.
 
-    Args:
-        packet: that is answered.
-        fault: of it.
-        motion: what the setpoints belong to.
-        times: [s], of the first setpoint, from one to the next, and of the contact.
-        setpoints: (K, 20) float32.
+    `times` [s] are of the first setpoint, from one to the next, and of the contact.
     """
     head = _HEADER.pack(MAGIC, VERSION, ANSWER, packet.ball, packet.sequence, packet.sent)
     return head + _ANSWERED.pack(motion, fault, len(setpoints), *times) + setpoints.tobytes()

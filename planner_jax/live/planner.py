@@ -133,13 +133,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
         self.report.begin()
 
     def answer(self, data: bytes, sender: Hashable, received: float) -> bytes | None:
-        """Return the answer to a packet, or None if it gets none.
-
-        Args:
-            data: of the packet.
-            sender: its address.
-            received: `time.perf_counter()` at its arrival [s].
-        """
+        """Return the answer to a packet, or None; `received` [s] is by `time.perf_counter()`."""
         self._complete()
         report = self.report
         report.counts["packets"] += 1
@@ -168,12 +162,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
             return self._pack(packet, fault, due)
 
     def sent(self, data: bytes, received: float) -> None:
-        """Note that the answer to a packet has been sent, and do what could wait for that.
-
-        Args:
-            data: the packet.
-            received: `time.perf_counter()` at its arrival [s].
-        """
+        """Count the answer to a packet, and do what was left until it was sent."""
         taken = time.perf_counter() - received
         self.report.counts["answered"] += 1
         self.report.counts["missed"] += taken > self.deadline

@@ -138,13 +138,7 @@ def _columns_of(tree: PyTree, name: str, part: str, words: Mapping[str, str]) ->
 
 
 def rows_of(columns: Sequence[Column], batch: RefereedBatch, frame: str) -> pa.Table:
-    """Return the rows of a batch.
-
-    Args:
-        columns: of the task.
-        batch: the cases.
-        frame: axes and times of the columns, in words, for the metadata.
-    """
+    """Return the rows of a batch; the metadata hold the frame, in words."""
     num = len(batch.chunk)
     fields = [
         pa.field(c.name, c.type, metadata={"unit": c.unit, "meaning": c.meaning}) for c in columns

@@ -95,11 +95,7 @@ class Dataset:
         return sorted(path for path in there if not path.name.startswith("."))
 
     def write(self, number: int, content: bytes) -> None:
-        """Write a part in the place of another one of this number.
-
-        Args:
-            number: of the part.
-            content: as `encode` returns it.
+        """Write a part, as `encode` returns it, and remove another one of this number.
 
         Raises:
             OSError: the file cannot be written.
@@ -117,11 +113,7 @@ class Dataset:
         self.write(0, encode(rows, {}))
 
     def damages(self, num: int | None = None) -> dict[Path, str]:
-        """Return what is wrong, in words, by file; for missing rows by folder.
-
-        Args:
-            num: rows of all parts; None for any number.
-        """
+        """Return what is wrong, in words, by file; for another number of rows by folder."""
         found, counted = {}, 0
         for place, path in enumerate(self.files()):
             try:

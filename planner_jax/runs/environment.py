@@ -63,11 +63,7 @@ def environment() -> Entries:
 
 
 def makers_of(found: Entries) -> Entries:
-    """Return what decides rows besides settings and cases, in words.
-
-    Args:
-        found: as `environment` returns it.
-    """
+    """Return what decides rows besides settings and cases, out of `environment()`."""
     device = found["device"]
     return {
         **{name: found["versions"][name] for name in _PACKAGES},

@@ -75,12 +75,7 @@ def parse_written(text: bytes | str) -> Entries:
 
 
 def read_written(path: Path, name: str, what: str) -> Entries:
-    """Return the entries of a file of a folder, as `to_write` returned them.
-
-    Args:
-        path: of the file.
-        name: of the caller's argument that holds the folder, for messages.
-        what: the folder is of, in words.
+    """Return the entries of a file that `to_write` returned; `name` and `what` are for messages.
 
     Raises:
         ArgumentError: there is none, it is of another format, or it is not as it was written.

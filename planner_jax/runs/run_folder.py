@@ -181,13 +181,7 @@ class RunFolder:
             raise ArgumentError(self.name, rule, shown=why) from None
 
     def require_whole(self, rows: Dataset, remedy: str, num: int | None = None) -> None:
-        """Raise `ArgumentError` if a part of some rows is missing or damaged.
-
-        Args:
-            rows: of the run.
-            remedy: what to do then, in words.
-            num: how many rows there are; None for any number.
-        """
+        """Raise `ArgumentError`, with a remedy, if a part of some rows is missing or damaged."""
         for path, why in rows.damages(num).items():
             place = path.relative_to(self.path)
             rule = f"a run whose {place} is whole"

@@ -36,18 +36,18 @@ class WorkersFailed(PlannerJaxError, RuntimeError):
 
 
 def option(default: Any, metavar: str, words: str) -> Any:
-    """A field of settings with what the command line says of it; no `metavar` for a switch."""
+    """Return a field of settings with its help text; a switch has no `metavar`."""
     return dataclasses.field(default=default, metadata={"metavar": metavar, "help": words})
 
 
 def ending_option(usual: str = NONE) -> Any:
-    """The field of settings `ending`, of a task of quadrotors."""
+    """Return the field of settings `ending` of a task of quadrotors."""
     words = f"flown behind the last contact, within all limits: {', '.join(CHOICES)}"
     return option(usual, "NAME", words)
 
 
 def ending_options(value: str) -> dict[str, str]:
-    """What a planner is told of the argument `ending`."""
+    """Return the options of a planner for the argument `ending`."""
     return {} if value == NONE else {"ending": value}
 
 
@@ -98,7 +98,7 @@ class SweepSettings:
         require_seed(self.seed)
 
     def of(self, task: Task) -> Self:
-        """The same with the names of the task's planner and suite filled in, or checked.
+        """Return the same with the names of the task's planner and suite filled in, or checked.
 
         Raises:
             ArgumentError: the task has no planner or suite of the name.
@@ -119,39 +119,30 @@ class SweepSettings:
         return self.CASE_BYTES
 
     def require_room(self, out: str | os.PathLike) -> None:
-        """Raise `ArgumentError` if the rows that are asked for do not fit on the disk of a folder.
-
-        Args:
-            out: of the run.
-        """
+        """Raise `ArgumentError` if the rows of the run do not fit on the disk of its folder."""
         require_disk("num", self.num or self.DEFAULT_NUM, self.ROW_BYTES, out)
 
     def parameters(self) -> dict[str, Any]:
-        """The settings as plain values for `manifest.json`; the class brings them back."""
+        """Return the settings as plain values for `manifest.json`; the class brings them back."""
         return dataclasses.asdict(self)
 
     def planner_options(self) -> dict[str, Any]:
-        """Options of the planner that these settings decide."""
+        """Return options of the planner that these settings decide."""
         return {name: getattr(self, name) for name in self.PLANNER}
 
     def draw_options(self) -> dict[str, Any]:
-        """Options of the task's `draw` that these settings decide; None is left to it."""
+        """Return options of the task's `draw` that these settings decide; None is left to it."""
         return {name: value for name in self.DRAW if (value := getattr(self, name)) is not None}
 
     def judge_options(self) -> dict[str, Any]:
-        """Options of the task's `judge` that these settings decide."""
+        """Return options of the task's `judge` that these settings decide."""
         return {name: getattr(self, name) for name in self.JUDGE}
 
 
 def settings_to_resume(
     kind: type[AnySettings], parameters: dict[str, Any], given: dict[str, Any]
 ) -> AnySettings:
-    """The settings of the run that is resumed, after a check of those given again.
-
-    Args:
-        kind: class of the settings.
-        parameters: of the run's manifest.
-        given: settings that the caller named; they must be the run's.
+    """Return the settings of a run that is resumed, after a check of those passed again.
 
     Raises:
         ArgumentError: a given value is not the run's, or the run's are not such settings.
@@ -167,12 +158,7 @@ def settings_to_resume(
 def settings_of_manifest(
     kind: type[KnownSettings], parameters: dict[str, Any], name: str
 ) -> KnownSettings:
-    """The settings of a run.
-
-    Args:
-        kind: class of the settings.
-        parameters: of the run's manifest.
-        name: of the caller's argument that holds the run's folder, for messages.
+    """Return the settings of a run; `name` is the argument that holds its folder.
 
     Raises:
         ArgumentError: they are not such settings, as where another version wrote them.
@@ -185,7 +171,7 @@ def settings_of_manifest(
 
 
 def _difference(name: str, old: Any, new: Any) -> tuple[str, Any, Any]:
-    """Where two settings of a name differ: the name of the first part that does, and its values."""
+    """Return the name of the first part in which two settings differ, and its values."""
     if dataclasses.is_dataclass(old) and type(old) is type(new):
         for field in dataclasses.fields(old):
             mine, other = getattr(old, field.name), getattr(new, field.name)

@@ -93,12 +93,7 @@ class DrawnSource(Source):
 
 
 def filled_in(settings: SweepSettings, num: int, batch: int) -> Entries:
-    """Return fields of a `Source`: settings without gaps, `num` and `batch`.
-
-    Args:
-        settings: of the sweep.
-        num: cases, where the settings name no number.
-        batch: cases a chunk, likewise.
+    """Return fields of a `Source`; `num` and `batch` are used where the settings name none.
 
     Raises:
         ArgumentError: the cases of a chunk do not fit into memory, or there are too many chunks.

@@ -36,12 +36,7 @@ def align(rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def headline(manifest: Entries, findings: Sequence[str] = ()) -> list[str]:
-    """Return success, speed and failures of a run, a sentence each.
-
-    Args:
-        manifest: of the run.
-        findings: what its task says in between.
-    """
+    """Return success, findings of the task, speed and failures of a run, a sentence each."""
     summary, times = manifest["summary"], manifest["times"]
     settings, device = manifest["parameters"], manifest["device"]
     low, high = summary["wilson_95"]
@@ -62,14 +57,7 @@ def headline(manifest: Entries, findings: Sequence[str] = ()) -> list[str]:
 
 
 def to_markdown(title: str, lines: Sequence[str], table: RateTable, remarks: Sequence[str]) -> str:
-    """Return the contents of `table.md`.
-
-    Args:
-        title: of the run.
-        lines: of its headline.
-        table: of its rates.
-        remarks: where the numbers come from.
-    """
+    """Return the contents of `table.md`."""
     text = [f"# {title}", "", *(line + "  " for line in lines), ""]
     text += [_bars(table.header), _bars(["---"] + ["---:"] * (len(table.header) - 1))]
     for place, row in enumerate(table.rows):

@@ -76,11 +76,6 @@ class Maker:
     def of(cls, sweep: Sweep, settings: SweepSettings, batch: int) -> "Maker":
         """Open the source and the planner of a sweep.
 
-        Args:
-            sweep: of the task.
-            settings: of the sweep.
-            batch: cases a chunk, where the settings name no number.
-
         Raises:
             ArgumentError: the settings ask for what is not there.
         """
@@ -139,19 +134,9 @@ def _files_of(parameters: Entries) -> dict[str, int]:
 def make_parts(
     maker: Maker, rows: Dataset, there: dict[int, Record], workers: Workers | None, progress: bool
 ) -> dict[int, Record]:
-    """Plan, referee and write every chunk that has no part yet.
+    """Make every chunk that has no part yet, and return the records of all parts by number.
 
     While one chunk is planned, the next is drawn, and the last ones are judged and written.
-
-    Args:
-        maker: of the sweep.
-        rows: of the run.
-        there: records of the parts that there are, by number.
-        workers: that make the chunks; None for this process.
-        progress: show a bar on the standard error stream.
-
-    Returns:
-        The records of all parts by number.
     """
     source, records = maker.source, dict(there)
     done, successes = (sum(each[name] for each in there.values()) for name in ("num", "successes"))

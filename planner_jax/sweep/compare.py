@@ -172,11 +172,7 @@ def _of(measure: Callable[[np.ndarray], np.floating], values: np.ndarray) -> flo
 
 
 def differing(runs: Sequence[ComparedRun]) -> list[tuple[int, list[str]]]:
-    """Return the cases that some runs solve and others do not: index, and what fails in each run.
-
-    Args:
-        runs: of the same cases.
-    """
+    """Return the cases that only some runs solve: index, and what fails in each run."""
     solved = np.stack([run.success for run in runs])
     places = np.flatnonzero(solved.any(axis=0) & ~solved.all(axis=0))
     index = runs[0].index
@@ -184,12 +180,7 @@ def differing(runs: Sequence[ComparedRun]) -> list[tuple[int, list[str]]]:
 
 
 def described(runs: Sequence[ComparedRun], most: int | None = 10) -> list[str]:
-    """Return the comparison as lines of text.
-
-    Args:
-        runs: that `require_comparable` accepts.
-        most: cases that are listed; None for all.
-    """
+    """Return the comparison as lines of text; list at most `most` cases that differ."""
     first, *others = runs
     own, rows = first.settings, table_of(runs)
     lines = [f"{first.manifest['kind']}, suite {own['suite']}, seed {own['seed']}", ""]

@@ -34,14 +34,7 @@ def robot_option(usual: str) -> Any:
 
 
 def checked_robot(given: object, tool: str) -> "QuadrotorModel | None":
-    """Return the robot that a setting names.
-
-    Args:
-        given: a name or a file, a robot, its fields as a manifest has them, or None.
-        tool: the kind that it has to carry, "net" or "racket".
-
-    Returns:
-        The `QuadrotorModel`, or None.
+    """Return the `QuadrotorModel` that a setting names, or None without one.
 
     Raises:
         ArgumentError: there is no such robot, its file is not sound, or it carries something else.

@@ -96,13 +96,7 @@ def require_sound(folder: RunFolder) -> None:
 
 
 def require_counted(folder: RunFolder, told: Mapping[str, object], counted: Entries) -> None:
-    """Raise `ArgumentError` unless a manifest's summary says what its rows do.
-
-    Args:
-        folder: of the run.
-        told: the summary.
-        counted: the same of the rows; entries that are not of rows are missing.
-    """
+    """Raise `ArgumentError` unless a manifest's summary agrees with the counts of the rows."""
     for name, value in counted.items():
         if not _agree(told.get(name), value):
             rule = f"a run whose {name} is that of its rows, {value}"
@@ -123,11 +117,7 @@ def _agree(one: object, other: object) -> bool:
 
 
 def write_report(folder: RunFolder) -> None:
-    """Write `table.md`, `figures/` and `index.html` of a run anew.
-
-    Args:
-        folder: with a manifest that has its summary, and rows.
-    """
+    """Write `table.md`, `figures/` and `index.html` of a finished run anew."""
     manifest = folder.read_manifest()
     sweep = sweep_of_run(manifest, folder.name)
     folder.figures.mkdir(exist_ok=True)

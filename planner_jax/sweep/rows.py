@@ -26,11 +26,7 @@ class PlannedRow(NamedTuple):
 
 
 def case_of_row(folder: RunFolder, row: int) -> PyTree:
-    """Return the case of a row, read or drawn again.
-
-    Args:
-        folder: of the run.
-        row: its place, from 0, one that there is.
+    """Return the case of a row of a run, read or drawn again.
 
     Raises:
         ArgumentError: the folder is not that of a whole, finished sweep, or the case that is read
@@ -46,11 +42,7 @@ def case_of_row(folder: RunFolder, row: int) -> PyTree:
 
 
 def planned_row(folder: RunFolder, row: int | None) -> PlannedRow:
-    """Return the plan of a row, whatever became of it.
-
-    Args:
-        folder: of the run.
-        row: its place, from 0.
+    """Return the plan of a row of a run, and what the referee says against it.
 
     Raises:
         ArgumentError: the folder is not that of a whole, finished sweep, or there is no such row.

@@ -236,17 +236,7 @@ def _finish(
 def plan_baselines(
     sweep: Sweep, source: Source, planners: Mapping[str, Planner], index: int
 ) -> pa.Table:
-    """Return refereed plans of other planners for one case, solved or not.
-
-    Args:
-        sweep: of the run.
-        source: of its cases.
-        planners: by name, one or more.
-        index: place of the case in the run.
-
-    Returns:
-        The columns of the run's rows behind a column `planner`.
-    """
+    """Return the rows of other planners' plans for one case, with a column `planner`."""
     chunk, tables = source.cases(index, index + 1), []
     for name, planner in planners.items():
         stopping.check()

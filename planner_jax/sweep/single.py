@@ -219,14 +219,7 @@ class OneRow(RunRows):
 
 
 def write_pictures(task: Task, planner: str, answer: Answer, out: Path) -> list[Path]:
-    """Draw a case, and write the pictures into a folder; their paths.
-
-    Args:
-        task: of the case.
-        planner: its name.
-        answer: the case, its plan and verdict.
-        out: folder.
-    """
+    """Draw a case into a folder, and return the paths of the pictures."""
     sweep = sweep_of(task)
     case, plan = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (answer.case, answer.plan))
     verdict = dataclasses.replace(

@@ -121,12 +121,7 @@ class Sweep:
         return {}
 
     def plan_of_row(self, row: Row, setting: Entries) -> Plan | None:
-        """Return the plan of a row; None where rows of the task are not read back.
-
-        Args:
-            row: of the run.
-            setting: of its manifest.
-        """
+        """Return the plan of a row; None where rows of the task are not read back."""
         return None
 
     def tally(self, settings: SweepSettings) -> Tally:
@@ -171,11 +166,7 @@ def sweep_of(task: Task) -> Sweep:
 
 
 def sweep_of_run(manifest: Entries, name: str = "out") -> Sweep:
-    """Return the sweep that a run is of.
-
-    Args:
-        manifest: of the run.
-        name: of the caller's argument that holds the run's path, for the message.
+    """Return the sweep of a run; `name` is the argument that holds its path.
 
     Raises:
         ArgumentError: the run is of another kind, or of a task that is not installed.

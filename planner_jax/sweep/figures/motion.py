@@ -67,13 +67,8 @@ def quadrotor_figure(
 ) -> None:
     """Draw a quadrotor's plans for the same case along their time against the limits.
 
-    Args:
-        figure: empty.
-        run: its example and the other planners' plans for the same case are shown.
-        panels: four names of `PANELS`.
-        first: draws the panel before these, from its axes, the run's setting and the plans, the
-            run's own last.
-        word: what the referee says of a row that succeeds.
+    `first` draws the first panel, `panels` names the other four in `PANELS`, and `word` describes a
+    plan that succeeds.
     """
     plans, setting = run.same_case(), run.manifest["setting"]
     axes = figure.subplots(2, 3, sharex=True)
