@@ -139,11 +139,10 @@ def referee_blocks(
             face and outside of its square, the arm inside of an obstacle, and the ball outside of
             the outer box or inside of the inner one.
         step: [s], longest time between two samples, at most `LONGEST_STEP`.
-        chunk: most lanes that a thread judges at once; it bounds the memory.
+        chunk: as of `referee_hits`.
 
     Returns:
-        A `BlockVerdict` of float64 arrays. A lane that is not finite fails as "not finite" and
-        leaves the others alone. Limits, the offset and the tilt may be infinite.
+        A `BlockVerdict` as of `referee_hits`; the offset and the tilt may be infinite too.
 
     Raises:
         ValueError: a leaf has the wrong shape, `step` is not in (0, LONGEST_STEP] or `chunk` < 1.

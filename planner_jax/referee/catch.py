@@ -122,27 +122,24 @@ def referee_catches(
             (B, N * M, D + 1, 3), durations (B, N * M).
         target_states: for targets of any other class:
             `(targets, order (B, N) int, times (B, N) [s]) -> pos (B, N, 3), vel (B, N, 3)`,
-            [m] and [m/s], of target `order[b, i]` of case b at `times[b, i]`. It is asked for
-            the absent targets too; what it says of them is not read. If given, it answers for
-            the known classes as well.
+            [m] and [m/s], of target `order[b, i]` of case b at `times[b, i]`, also of absent
+            targets, whose values are not read. It then serves the known classes as well.
         net_test: "plane": the target is in the hoop's plane to `contact_tolerance`, and there
             within the net's radius of its centre. "ball": it is within that radius of the
             centre in any direction.
         tolerance: relative, of every limit of the case, the net's radius and angle included.
         contact_tolerance: [m], distance of the target from the hoop's plane at the catch.
-        continuity_tolerance: times the largest coordinate [m] at the piece ends (at least
-            1 m), allowed displacement of head state and joints.
+        continuity_tolerance: as of `referee_hits`.
         samples: fewest samples between one catch and the next, >= 200.
-        chunk: most lanes that a thread judges at once; it bounds the memory.
+        chunk: as of `referee_hits`.
 
     Returns:
-        A `CatchVerdict` of float64 arrays. A lane that is not finite fails as "not finite" and
-        leaves the others alone. A limit, the net's radius and angle and a horizon may be
-        infinite.
+        A `CatchVerdict` as of `referee_hits`; the net's radius and angle and a horizon may be
+        infinite too.
 
     Raises:
-        ValueError: a leaf has the wrong shape, the class of the targets is not known,
-            `net_test` is another word, `samples` < 200 or `chunk` < 1.
+        ValueError: as of `referee_hits`, the class of the targets is not known, or `net_test` is
+            another word.
     """
     if net_test not in ("plane", "ball"):
         raise ValueError(f'net_test must be "plane" or "ball", got {net_test!r}')

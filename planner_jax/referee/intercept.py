@@ -80,7 +80,7 @@ class InterceptVerdict(Verdict):
     meeting_time: np.ndarray  # (B,) [s], when the plan ends
 
     def praise(self, k: int | tuple) -> str:
-        """What is said of a success."""
+        """Return the end of the sentence for a success."""
         miss, time = np.asarray(self.miss)[k], np.asarray(self.meeting_time)[k]
         return f"the body's middle is {miss:.2g} m from the target after {time:.3g} s"
 
@@ -96,16 +96,16 @@ def referee_intercepts(
     step: float = LONGEST_STEP,
     chunk: int = 128,
 ) -> InterceptVerdict:
-    """The verdict on every plan of a batch.
+    """Judge every plan of a batch.
 
     Between two knots speed and curvature are lines, so that the heading is a cubic; the position
     is integrated between every two samples by Gauss-Legendre quadrature, to rounding. Speed,
     acceleration, curvature, steering rate and lateral acceleration are held against their limits
     at their extrema inside of each piece, not at samples.
 
-    The map, the walls and the movers are looked at in samples: the knots, and between them at
-    most `step` apart. There the test of rectangle against convex polygon is exact. In between,
-    nothing is looked at: at 1.5 m/s the car drives 3 cm in a step of 20 ms.
+    The map, the walls and the movers are tested at samples alone: the knots, and between them at
+    most `step` apart. There the test of rectangle against convex polygon is exact. At 1.5 m/s the
+    car drives 3 cm in a step of 20 ms.
 
     The position of the target is computed here, in float64, for a path with the fields of
     `TurningPath` (known by `turn_rate`), of `PolynomialPath` (`coeffs`), or of a `LaterPath`
@@ -130,11 +130,10 @@ def referee_intercepts(
         contact_tolerance: [m], how far the body may be inside an obstacle, and its middle off
             the map.
         step: [s], longest time between two samples, at most `LONGEST_STEP`.
-        chunk: most lanes that a thread judges at once; it bounds the memory.
+        chunk: as of `referee_hits`.
 
     Returns:
-        An `InterceptVerdict` of float64 arrays. A lane that is not finite fails as "not finite"
-        and leaves the others alone. Limits, tolerances and the map's bounds may be infinite.
+        An `InterceptVerdict` as of `referee_hits`; tolerances and the map's bounds may be infinite.
 
     Raises:
         ValueError: a leaf has the wrong shape, the class of the target is not known, `step` is

@@ -40,11 +40,6 @@ def irb1600() -> Arm:
     return read_arm((models / "irb1600.xml").read_text("utf-8"))
 
 
-def _text_of(path: str) -> str:
-    with open_plain(path) as file:
-        return file.read().decode("utf-8-sig")
-
-
 def read_arm(path_or_xml: str, *, dtype: DTypeLike = np.float32) -> Arm:
     """Return the arm of an MJCF file, or of MJCF text, with NumPy leaves.
 
@@ -60,9 +55,12 @@ def read_arm(path_or_xml: str, *, dtype: DTypeLike = np.float32) -> Arm:
             the element.
         OSError: the file cannot be read.
     """
-    is_text = path_or_xml.lstrip().startswith("<")
+    text = path_or_xml
     try:
-        root = ET.fromstring(path_or_xml if is_text else _text_of(path_or_xml))
+        if not text.lstrip().startswith("<"):
+            with open_plain(text) as file:
+                text = file.read().decode("utf-8-sig")
+        root = ET.fromstring(text)
     except (ET.ParseError, UnicodeDecodeError) as error:
         raise ArgumentError("MJCF", f"well-formed XML: {error}", shown="") from None
     _only(root, {"model"}, {"compiler", "worldbody", "keyframe", *_AROUND})

@@ -116,10 +116,7 @@ def body_rate_squared(acc: Components, jerk: Components, gravity: Array) -> Arra
 def body_rate(acc: Components, jerk: Components, gravity: Array) -> tuple[Array, Array, Array]:
     """Return components (...) of the body rate [rad/s] of the Hopf fibration, body frame.
 
-    Args:
-        acc: (..., 3) [m/s^2].
-        jerk: (..., 3) [m/s^3].
-        gravity: () [m/s^2].
+    The arguments are those of `body_rate_squared`.
     """
     tx, ty, az = components(acc)
     tz = az + gravity
@@ -139,12 +136,8 @@ def rotor_thrusts(
 ) -> tuple[Array, ...]:
     """Return thrust of each of the four rotors that a motion at zero heading takes [N], (...) each.
 
-    Args:
-        acc: (..., 3) [m/s^2].
-        jerk: (..., 3) [m/s^3].
-        snap: (..., 3) [m/s^4].
-        gravity: () [m/s^2].
-        rotors: and the body that they carry.
+    The arguments are those of `body_rate_squared`, the snap (..., 3) [m/s^4], and the rotors with
+    the body that they carry.
     """
     a, j, s = (tuple(components(each)) for each in (acc, jerk, snap))
     rate, turning = jax.jvp(lambda acc, jerk: body_rate(acc, jerk, gravity), (a, j), (j, s))
@@ -162,13 +155,9 @@ def rotor_thrusts(
 
 
 def tangent_basis(normal: Array) -> tuple[Array, Array]:
-    """Return the body x and y axes of the Hopf fibration at zero heading.
+    """Return the body x and y axes (3,) of the Hopf fibration at zero heading for a z axis (3,).
 
-    Args:
-        normal: (3,) body z axis, unit length.
-
-    Returns:
-        Two (3,) unit vectors across `normal`, smooth except at straight down.
+    They are smooth except at straight down.
     """
     x, y, z = components(normal)
     k = reciprocal(at_least(1.0 + z, 1e-6))
@@ -179,15 +168,9 @@ def tangent_basis(normal: Array) -> tuple[Array, Array]:
 
 
 def flat_attitude(acc: Array, jerk: Array, gravity: Array) -> tuple[Array, Array]:
-    """Return attitude and body rate of a motion, at zero heading of the Hopf fibration.
+    """Return rotation (3, 3), body to world, and body rate (3,) [rad/s] at zero heading.
 
-    Args:
-        acc: (3,) [m/s^2].
-        jerk: (3,) [m/s^3].
-        gravity: () [m/s^2], magnitude.
-
-    Returns:
-        (3, 3) rotation, body to world, and (3,) [rad/s] in the body frame.
+    Acceleration (3,) [m/s^2] and jerk (3,) [m/s^3] determine them by the Hopf fibration.
     """
     z = body_z(acc, gravity)
     size = jnp.sqrt(jnp.maximum(jnp.sum(net_thrust(acc, gravity) ** 2), 1e-2))
@@ -317,16 +300,12 @@ class QuadrotorPlan(Plan):
 
         path = jax.tree.map(np.asarray, self.whole)
         ends = np.sum(path.durations, axis=-1)
-        return QuadrotorSetpoints(**sample_at_rate(rate, ends, (path, self.gravity), _setpoint_at))
+        return QuadrotorSetpoints(**sample_at_rate(rate, ends, (path, self.gravity), setpoint_at))
 
 
-def _setpoint_at(leaves: tuple[PiecewisePolynomial, Array], time: Array) -> dict[str, Array]:
-    """Return one setpoint of a trajectory and the gravity it was planned for."""
-    return setpoint_at(*leaves, time)
-
-
-def setpoint_at(path: PiecewisePolynomial, gravity: Array, time: Array) -> dict[str, Array]:
-    """Return the fields of `QuadrotorSetpoints` but the time, at a time () [s] of a trajectory."""
+def setpoint_at(leaves: tuple[PiecewisePolynomial, Array], time: Array) -> dict[str, Array]:
+    """Return `QuadrotorSetpoints` but times, of a trajectory and its gravity at a time () [s]."""
+    path, gravity = leaves
     pos, vel, acc, jerk = (evaluate(path, time, order) for order in range(4))
     return {
         "pos": pos,

@@ -146,16 +146,10 @@ def read_robot(path: str | os.PathLike, **given: Value) -> QuadrotorModel:
 
 
 def model_of(described: Mapping[str, Value], place: str = "robot") -> QuadrotorModel:
-    """Return the quadrotor of a description with the fields of a YAML file.
-
-    `dataclasses.asdict` of a model is such a description as well.
-
-    Args:
-        described: the fields by name.
-        place: where they come from, for messages.
+    """Return the quadrotor of a description: the fields of a YAML file, or `dataclasses.asdict`.
 
     Raises:
-        RobotError: a field breaks a rule, is not known or is missing; one line.
+        RobotError: a field breaks a rule, is not known or is missing; one line that names `place`.
     """
     _only(described, [*_FIELDS[""], *_PARTS], "", place)
     parts: dict[str, Value] = {}

@@ -25,7 +25,7 @@ _DRAWN_BYTES = 1_000  # of a case, as estimated
 def array_of(
     name: str, value: object, batch: tuple[int, ...], shape: tuple[int, ...], dtype: DTypeLike
 ) -> Array:
-    """`numbers_of`, as a jax array of a type."""
+    """Return `numbers_of` as a JAX array of a type."""
     with np.errstate(over="ignore"):  # what is too large is infinite, and refused as that
         return jnp.asarray(numbers_of(name, value, batch, shape), dtype)
 
@@ -70,13 +70,9 @@ def make_generators(suite: str, num: int, seed: int, first: int) -> list[np.rand
 def find_decision(
     names: Mapping[str, str], decide: str | Decision, from_file: Collection[str] = ()
 ) -> Decision:
-    """Return the decision of a name, or the decision itself.
+    """Return the decision of a name out of "name -> module:class", or the decision itself.
 
-    Args:
-        names: name -> "module:class", those of a task.
-        decide: one of these names, with ":" and a file behind it if it may be read from one; or a
-            decision.
-        from_file: the names that may have a file behind them.
+    The names in `from_file` may have ":" and a file behind them.
 
     Raises:
         ValueError: there is no decision of that name, or it takes no file.
@@ -109,19 +105,12 @@ def judge_by(
     kinds: tuple[type[Case], type[Plan]],
     settings: dict[str, object],
 ) -> VerdictT:
-    """Return the verdict on one plan, or on a batch.
-
-    Args:
-        referee: of batches.
-        cases: one case or a batch.
-        plans: of them.
-        kinds: the classes that cases and plans must be of.
-        settings: keyword arguments of the referee.
+    """Return the verdict of a referee of batches on one plan, or on a batch.
 
     Raises:
-        TypeError: cases or plans are of another class, or a setting is none of the referee's or
-            of another kind.
-        ValueError: shapes that do not fit, or as the referee says.
+        TypeError: cases or plans are not of the two `kinds`, or a setting is none of the referee's
+            keyword arguments or of another kind.
+        ValueError: shapes that do not fit, or an error of the referee.
     """
     for name, tree, kind in zip(("cases", "plans"), (cases, plans), kinds, strict=True):
         if not isinstance(tree, kind):

@@ -50,7 +50,7 @@ ARGUMENTS = {
 
 
 def require_tool(robot: object, kind: str) -> Tool:
-    """The tool of a robot.
+    """Return the tool of a robot.
 
     Raises:
         TypeError: the robot is no `QuadrotorModel`.
@@ -94,14 +94,9 @@ def require_own_robot(robot: object, usual: QuadrotorModel, suite: str) -> None:
 def limits_of(
     robot: QuadrotorModel, leaf: Callable[..., Array], **given: object
 ) -> QuadrotorLimits:
-    """The limits of a case, a robot's where they are not given.
+    """Return the limits of a case, by default the robot's; `leaf(name, value)` makes an array.
 
-    A robot with a net has a least and a greatest thrust, those of its rotors if it says no other.
-
-    Args:
-        robot: whose limits.
-        leaf: of a name, a value and its shape in one case the array of the case.
-        **given: values by their names in `QuadrotorLimits`; None for the robot's.
+    A robot with a net has a least and a greatest thrust, by default of its rotors.
     """
     own = robot.limits
     least, most = own.thrust or (None, None)

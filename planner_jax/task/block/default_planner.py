@@ -115,12 +115,9 @@ def _trial_cost(tried: LevenbergState, solver: LevenbergConfig) -> Array:
 
 
 def rank_poses(poses: EndPoses, num: int, most: float) -> Array:
-    """Return the indices (num,) of poses of little effort, mixed so that they differ.
+    """Return the indices (num,) of end poses of little effort, mixed so that they differ.
 
-    Args:
-        poses: of the end of a motion.
-        num: number of indices.
-        most: greatest effort of a pose that is reached in time.
+    A pose with an effort above `most` is not reached in time.
     """
     rng = np.random.default_rng(0)
     mixed = jnp.asarray(rng.random(poses.effort.shape[0]), poses.effort.dtype)
@@ -374,14 +371,7 @@ class OnlineBlock(Planner):
         )
 
     def finish(self, case: BlockCase, flight: Flight, point: Array, steps: Array) -> BlockPlan:
-        """Return the plan of a point (n,), checked at more samples.
-
-        Args:
-            case: one case.
-            flight: of its ball.
-            point: unknowns.
-            steps: () int32, of least squares that led there.
-        """
+        """Return the plan of a point (n,) after steps of least squares, checked at more samples."""
         moves, first, duration = self.decode(case, point)
         joints = joint_terms(case, moves, first, duration, self.weights, 1.0 - self.slack).excess
         shares = tuple(np.arange(1, self.checked + 1) / self.checked)
@@ -412,9 +402,5 @@ class OnlineBlock(Planner):
 
 
 def brisk(**fields: object) -> OnlineBlock:
-    """Return the default planner with motions that end as early as possible; the arm then waits.
-
-    Args:
-        **fields: of `OnlineBlock`.
-    """
+    """Return an `OnlineBlock` with motions that end as early as possible; the arm then waits."""
     return OnlineBlock(**{"searches": _BRISK, "brisk": True, **fields})

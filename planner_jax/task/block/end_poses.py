@@ -63,15 +63,9 @@ def end_poses(
 ) -> EndPoses:
     """Return eight poses at each of some points of the ball's path between the boxes.
 
-    The joint at the flange, whose turns leave the ball on the shield, stays as it is.
-
-    Args:
-        case: one case.
-        flight: of its ball.
-        points: P, of the ball's path.
-        pieces: of the straight motions.
-        quickest: whether motions from rest to rest have the profile that could be made in the
-            least time, not that of the least effort.
+    The joint at the flange, whose turns leave the ball on the shield, stays as it is. Straight
+    motions of so many pieces have the profile of the least effort, or, from rest to rest, of the
+    least time if `quickest`.
     """
     share = (np.arange(points) + 0.5) / points
     time = flight.earliest + share * (flight.latest - flight.earliest)
@@ -130,14 +124,7 @@ def frame_of(normal: Array) -> Array:
 def contact_terms(
     case: BlockCase, flight: Flight, angles: Array, time: Array, weights: Weights
 ) -> tuple[Array, Array, Array]:
-    """Return the residuals of how the shield meets the ball.
-
-    Args:
-        case: one case.
-        flight: of its ball.
-        angles: (6,) [rad], at the contact.
-        time: () [s], of the contact.
-        weights: of the residuals.
+    """Return the residuals of a contact at angles (6,) [rad] and a time () [s].
 
     Returns:
         rows: (7,): off the plane, off the middle, tilted, too early or late.

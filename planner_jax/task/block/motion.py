@@ -47,13 +47,9 @@ def sums(pieces: int, shares: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray
 
 
 def angles_at(start: Array, first: Array, steps: Array, shares: tuple[float, ...]) -> Array:
-    """Return the angles (N, 6) [rad] at shares of the duration.
+    """Return the angles (N, 6) [rad] at N shares of the duration, in [0, 1].
 
-    Args:
-        start: (6,) [rad].
-        first: (6,) [rad], the rates at the beginning times the duration.
-        steps: (K, 6) [rad].
-        shares: N of them, in [0, 1].
+    The motion has steps (K, 6) [rad]; `first` (6,) [rad] are the first rates times the duration.
     """
     of_first, of_steps = sums(steps.shape[0], shares)
     turned = jnp.matmul(jnp.asarray(of_steps, steps.dtype), steps, precision=lax.Precision.HIGHEST)
@@ -74,13 +70,7 @@ def joint_terms(
 ) -> JointTerms:
     """Return the terms of limits and effort of the joints.
 
-    Args:
-        case: one case.
-        steps: (K, 6) [rad].
-        first: (6,) [rad], the rates at the beginning times the duration.
-        duration: () [s].
-        weights: of the residuals.
-        most: share of every limit that may be used.
+    Steps and first rates are as of `angles_at`; `most` is the usable share of every limit.
     """
     pieces, dtype = steps.shape[0], steps.dtype
     knots = tuple(np.arange(1, pieces + 1) / pieces)
@@ -156,16 +146,9 @@ def polynomial(start: Array, first: Array, steps: Array, duration: Array) -> Pie
 def speed_up(
     motion: PiecewisePolynomial, velocity: Array, acceleration: Array
 ) -> tuple[PiecewisePolynomial, Array]:
-    """Return a motion from rest to rest along the same path, as quick as limits allow.
+    """Return a motion of degree 2 from rest to rest along its path as quick as limits (6,) allow.
 
-    Args:
-        motion: of degree 2.
-        velocity: (6,) [rad/s], the most.
-        acceleration: (6,) [rad/s^2], the most.
-
-    Returns:
-        motion: along the same path, never slower.
-        pace: () in (0, 1], the new duration over the old one.
+    It is never slower. Also return the new duration over the old one, () in (0, 1].
     """
     rates = motion.coeffs[:, 1] / velocity
     rises = 2.0 * motion.coeffs[:, 2] / acceleration

@@ -107,11 +107,6 @@ def beam(case: CatchCase, table: Timetable, width: int) -> CatchChoice:
     last one: a bounded search, which may miss the best order. Where fewer than W are found, the
     first one is repeated.
 
-    Args:
-        case: one case.
-        table: its timetable.
-        width: W.
-
     Raises:
         ValueError: there are more than `MOST_SEARCHED` targets.
     """

@@ -265,13 +265,8 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         """Return the point (n,) that describes given catches: the inverse of `decode`.
 
         A place in the net cannot hold what is outside of the hoop or off its plane; the catch
-        is then the nearest across the net's axis.
-
-        Args:
-            context: the targets.
-            durations: (N,) [s], of the segments.
-            tail_states: (N, 4, 3) of the quadrotor at the catches.
-            offsets: (N, M - 1, 3) whitened waypoint offsets.
+        is then the nearest across the net's axis. Segments have durations (N,) [s], states of the
+        quadrotor at the catches (N, 4, 3), and whitened waypoint offsets (N, M - 1, 3).
         """
         case, net = context.case, context.case.net
         times = jnp.cumsum(jnp.where(context.active, durations, 0.0))

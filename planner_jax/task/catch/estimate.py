@@ -75,13 +75,9 @@ def length(vectors: Array) -> Array:
 def arrival(
     table: Timetable, begin: Array, place: Array, speed: Array
 ) -> tuple[Array, Array, Array]:
-    """Earliest time () [s], place (3,) and shortfall () [m] of the catch of one target.
+    """Return the earliest time () [s], place (3,) and shortfall () [m] of the catch of one target.
 
-    Args:
-        table: of this target.
-        begin: () [s], when the quadrotor leaves.
-        place: (3,) [m], from where.
-        speed: () [m/s], its greatest.
+    The quadrotor leaves a place (3,) [m] at `begin` () [s], with a greatest speed () [m/s].
     """
     times, places, penalty = table.times, table.places, table.penalty
     late = jnp.where(times > begin, 0.0, 100.0)

@@ -74,12 +74,9 @@ class InterceptGroup:
         return dataclasses.replace(self, order=choice.order)
 
     def leg(self, target: Array, begin: Array, car: CarState) -> InterceptCase:
-        """The interception of one target, with times that count from the leg's own beginning.
+        """Return the interception of a target, by its index () int, from a time () [s] on.
 
-        Args:
-            target: () int, its place among the N.
-            begin: () [s], when the leg begins.
-            car: where the car then is.
+        Its times count from then; the car is where it is then.
         """
         shared = self.shared
         path = jax.tree.map(lambda leaf: leaf[target], shared.target)
@@ -99,19 +96,12 @@ class InterceptGroup:
 def case(
     targets: PlanePath, time: ArrayLike = 15.0, *, present: ArrayLike = True, **settings: object
 ) -> InterceptGroup:
-    """A group, or a batch of them, by default with the car and the map of `case`.
+    """Return a group, or a batch, by default with the car and the map of `pj.intercept.case`.
 
-    The order is a placeholder until a decision sets it: the targets as they come.
-
-    Args:
-        targets: a path pytree such as `TurningPath`, leaves with axes (..., N) first.
-        time: () or (B,) [s], until when all are to be met, > 0.
-        present: (N,) or (B, N) bool.
-        **settings: such as `start` and `walls`; see `case`.
-
-    Raises:
-        ValueError: as for `case`.
-        TypeError: likewise.
+    The order is a placeholder until a decision sets it: the targets as they come. `targets` is a
+    path pytree such as `TurningPath`, leaves with axes (..., N) first, `present` is (N,) or (B, N)
+    bool, and all targets are to be met until `time`. `pj.intercept.case` describes the settings,
+    such as `start` and `walls`, and the errors.
     """
     given = [settings.get(name, 0.0) for name in ("initial_speed", "tolerance")]
     shapes = [np.shape(time), np.shape(settings.get("start", 0.0))[:-1], *map(np.shape, given)]

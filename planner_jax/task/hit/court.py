@@ -52,11 +52,7 @@ SCENARIOS = _scenario_names()
 
 
 def region_bounds(depth: float = HALF_LENGTH) -> np.ndarray:
-    """Edges of the regions as (4, 2, 2) [m]: region; |x| or y; lower or upper.
-
-    Args:
-        depth: [m], where the far and the side regions end.
-    """
+    """Return edges (4, 2, 2) [m] of regions: region; |x| up to a depth, or y; lower or upper."""
     near, far = (DEAD_ZONE, NEAR_LINE), (NEAR_LINE, depth)
     whole, middle = (DEAD_ZONE, depth), (-LANE_LINE, LANE_LINE)
     left, right = (LANE_LINE, HALF_WIDTH), (-HALF_WIDTH, -LANE_LINE)
@@ -64,14 +60,7 @@ def region_bounds(depth: float = HALF_LENGTH) -> np.ndarray:
 
 
 def scenario_regions(scenario) -> np.ndarray:
-    """Region codes, 1 to 4, of scenarios given by their place in SCENARIOS.
-
-    Args:
-        scenario: (...) int.
-
-    Returns:
-        (..., 3) int: serve, landing and target region.
-    """
+    """Return region codes (..., 3), 1 to 4, of serve, landing and target of scenarios (...) int."""
     codes = np.array([[1 + REGIONS.index(letter) for letter in name] for name in SCENARIOS])
     return codes[np.asarray(scenario)]
 
@@ -110,19 +99,10 @@ def _components_first(vectors: ArrayLike) -> np.ndarray:
 
 
 def fly(position, velocity, duration, drag, gravity, *, num_steps: int = _FLIGHT_STEPS):
-    """Position and velocity of balls after a flight with quadratic drag.
+    """Return position and velocity (..., 3) of balls after a flight with quadratic drag.
 
-    Args:
-        position: (..., 3) [m].
-        velocity: (..., 3) [m/s].
-        duration: (...) [s].
-        drag: (...) K_D [1/m].
-        gravity: (...) [m/s^2], magnitude.
-        num_steps: how many equal Runge-Kutta steps.
-
-    Returns:
-        position: (..., 3) [m].
-        velocity: (..., 3) [m/s].
+    Position (..., 3) [m], velocity (..., 3) [m/s], duration [s], drag K_D [1/m] and gravity
+    [m/s^2] (...) broadcast; the flight takes a number of equal Runge-Kutta steps.
     """
     step = np.asarray(duration, float) / num_steps
     drag, gravity = np.asarray(drag, float), np.asarray(gravity, float)
@@ -137,7 +117,7 @@ def fly(position, velocity, duration, drag, gravity, *, num_steps: int = _FLIGHT
 
 
 def landing(position, velocity, drag, gravity):
-    """When and where balls come down to the floor z = 0 if nobody hits them.
+    """Return when and where balls come down to the floor z = 0 if nobody hits them.
 
     Flies in equal steps until the ball is below the floor, then back to it by Newton's method on
     the height, each of its steps a Runge-Kutta step.

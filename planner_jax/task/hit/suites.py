@@ -63,7 +63,7 @@ class Serves:
 
 
 def read_serves(folder: str | os.PathLike) -> Serves:
-    """The serves of published trial files  S_L_T_M.csv.
+    """Read the serves of published trial files  S_L_T_M.csv.
 
     S, L, T are serve, landing and target region (1 N, 2 F, 3 L, 4 R), M the planner (p Bat,
     l Bat-Lite, b Juggle). The files of one S_L_T hold the same serves in the same order; any of
@@ -98,11 +98,10 @@ def read_serves(folder: str | os.PathLike) -> Serves:
 def generate_serves(
     num: int, seed: int, scenarios: Sequence[str] | None = None, *, first: int = 0
 ) -> Serves:
-    """Serves drawn from the law of the published ones, the scenarios in equal shares.
+    """Draw serves from the law of the published ones, the scenarios in equal shares.
 
     Each run of as many serves as there are scenarios has every scenario once, in random order.
-    Serve k of a seed (and list of scenarios) is always the same one, so the first n of more are
-    the n of fewer, and chunks that are drawn apart join without a seam.
+    Serve k of a seed (and list of scenarios) is always the same serve.
 
     Position and velocity are uniform under the conditions at the head of this module. Drawing
     them so would waste 97 of 100 draws on other landing regions. Instead the landing point and
@@ -110,10 +109,10 @@ def generate_serves(
     is kept with a probability proportional to |d horizontal velocity / d landing point|.
 
     Args:
-        num: how many, >= 1.
+        num: number of serves, >= 1.
         seed: >= 0.
         scenarios: names out of court.SCENARIOS; all of them by default.
-        first: place of the first one in the sequence, >= 0.
+        first: index of the first serve in the sequence, >= 0.
 
     Raises:
         ArgumentError: an argument is out of its range.
@@ -139,10 +138,9 @@ def generate_serves(
 
 
 def _random(seed: int, stream: int, block: int) -> np.random.Generator:
-    """The random numbers of one block: the same ones whatever was drawn before."""
-    return np.random.Generator(
-        np.random.Philox(np.random.SeedSequence(seed, spawn_key=(stream, block)))
-    )
+    """Return the generator of one block, which does not depend on earlier draws."""
+    sequence = np.random.SeedSequence(seed, spawn_key=(stream, block))
+    return np.random.Generator(np.random.Philox(sequence))
 
 
 def _draw_block(places: np.ndarray, seed: int, block: int):

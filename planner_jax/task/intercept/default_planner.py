@@ -201,18 +201,10 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
 
 
 def quick(**fields: object) -> SpacetimeIntercept:
-    """Make the default planner with fewer paths and steps, for meetings at the case's time.
-
-    Args:
-        **fields: of `SpacetimeIntercept`.
-    """
+    """Make a `SpacetimeIntercept` with fewer paths and steps, for meetings at the case's time."""
     return SpacetimeIntercept(**{"searches": QUICK, **fields})
 
 
 def best(**fields: object) -> SpacetimeIntercept:
-    """Make the default planner with more paths and steps; the plan of least effort is selected.
-
-    Args:
-        **fields: of `SpacetimeIntercept`.
-    """
+    """Make a `SpacetimeIntercept` with more paths and steps that selects the least effort."""
     return SpacetimeIntercept(**{"searches": BEST, "tries_all": True, **fields})

@@ -42,15 +42,9 @@ def make_plan(
     """Make the plan of knots and check it against every limit of its case.
 
     The cost of the plan is the integral of the squared acceleration [m^2/s^3] (paper 003, eq. 8a).
-
-    Args:
-        case: one case.
-        time: () [s], when the plan ends, at the target.
-        speed: (K + 1,) [m/s], at equal knots, the first as the case has it.
-        curvature: (K + 1,) [1/m], at the same knots.
-        samples: of every piece, at which obstacles are checked, static.
-        places: of every piece, at which the lateral acceleration is checked, static.
-        steps: () int32, iterations of the plan.
+    Speed [m/s] and curvature [1/m] (K + 1,) are at equal knots up to the time () [s] of the end.
+    Obstacles are checked at `samples` of every piece, the lateral acceleration at `places`; both
+    are static. The plan took () int32 steps.
     """
     drive = motion(case.start, time, speed, curvature, samples)
     _, violation = limit_terms(case, time, speed, curvature, Weights(), places)

@@ -158,15 +158,10 @@ class MotionProblem:
         places: Array,
         discs: int = 3,
     ) -> Model:
-        """Return the sum of squares at a point (n,), and its quadratic model.
+        """Return the sum of squares at a point (n,) of unknowns, and its quadratic model.
 
-        Args:
-            point: (n,) unknowns.
-            case: one case.
-            field: of the walls.
-            weights: of the terms.
-            places: (K, 2) [m], positions that `weights.follow` draws the car to.
-            discs: static number of discs that stand for the body.
+        `weights.follow` draws the car to places (K, 2) [m]; a static number of discs stands for
+        the body.
         """
         speed, curvature, time = self.unpack(case, point)
         drive = motion(case.start, time, speed, curvature, self.samples)
