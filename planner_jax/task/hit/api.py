@@ -40,7 +40,7 @@ def draw(
         first: index of the first case, >= 0.
         start: (3,) [m], hover position of the quadrotor; or "uniform" over the half court.
         delay: [s] from the serve to the moment at which planning starts.
-        limit_scale: factor on the speed, acceleration and body-rate limits.
+        limit_scale: factor on the speed, acceleration and body-rate limits; not on the stroke's.
         robot: with a racket; suites of other packages have their own.
         dtype: of every floating leaf.
 
