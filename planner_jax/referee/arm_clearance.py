@@ -126,12 +126,7 @@ class _Pair:
 
 
 def links_of(case: dict, angles: np.ndarray) -> tuple[list, list]:
-    """Return rotations (3, 3, B, S) of links 1 to 6 and the places (3, B, S) [m] of their joints.
-
-    Args:
-        case: leaves of B lanes.
-        angles: (6, B, S) [rad].
-    """
+    """Return rotations (3, 3, B, S) of links 1 to 6 and positions (3, B, S) [m] of their joints."""
     turn, place = np.eye(3)[..., None, None], np.zeros((3, 1, 1))
     turns, places = [], []
     for k in range(6):

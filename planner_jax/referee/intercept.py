@@ -252,12 +252,7 @@ def _judge(case: dict, step: float, relative: float, contact: float) -> dict:
 
 
 def final_poses(plans, body) -> np.ndarray:
-    """Where the rear axle and the heading are at the end of plans, (B, 3).
-
-    Args:
-        plans: object with the fields of `CarPlan`, leaves with leading axis B.
-        body: of the cars, object with the fields of `CarBody`.
-    """
+    """Return the final poses (B, 3) of the rear axles of plans, with the fields of `CarPlan`."""
     case = {
         "plan.start": plans.start,
         "plan.speed": plans.speed,

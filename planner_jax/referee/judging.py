@@ -194,11 +194,9 @@ def finite_lanes(case: dict, unbounded: tuple[str, ...] = ()) -> np.ndarray:
 def first_failures(tests: dict, limits: tuple[str, ...], finite: np.ndarray) -> dict:
     """Return success, failed limit, its time and its excess of every lane.
 
-    Args:
-        tests: name -> failed, excess, time, each (B,).
-        limits: "not finite", then the names in the order of the tests; names without a test are
-            skipped.
-        finite: (B,) bool, lanes whose inputs are finite.
+    Tests are name -> failed, excess, time, each (B,), and `finite` (B,) bool says whether inputs
+    are finite. `limits` are "not finite", then the names in the order of the tests; names without a
+    test are skipped.
     """
     limits = (limits[0], *(name for name in limits[1:] if name in tests))
     failed = np.stack([tests[name][0] for name in limits[1:]], axis=1)

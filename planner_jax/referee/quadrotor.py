@@ -41,13 +41,9 @@ class Pieces:
 
 
 def pieces_of(coeffs: np.ndarray, durations: np.ndarray, flown: np.ndarray | None = None) -> Pieces:
-    """Return the pieces of a batch of trajectories.
+    """Return the pieces of trajectories of coefficients (B, M, D + 1, 3) and durations (B, M) [s].
 
-    Args:
-        coeffs: (B, M, D + 1, 3), rising powers of the time [s] since the piece's start.
-        durations: (B, M) [s].
-        flown: (B, M) bool, which pieces are part of the trajectory; all of them if not given.
-            The others must have no duration.
+    Pieces that are not `flown` (B, M) bool must have no duration; by default all are flown.
     """
     coeffs = np.moveaxis(coeffs, -1, 0)
     starts = np.cumsum(durations, axis=1) - durations
@@ -327,11 +323,7 @@ def joint_errors(pieces: Pieces, head_state: np.ndarray) -> tuple:
 
     An error e_n of the n-th derivative (n = 0..3) counts as the displacement |e_n| h^n / n!
     that it makes over one mean piece h, at least `SHORTEST_PIECE`. The scale is the largest
-    coordinate at the pieces' ends, at least 1 m.
-
-    Args:
-        pieces: of B lanes.
-        head_state: (B, 4, 3) position to jerk at time 0.
+    coordinate at the pieces' ends, at least 1 m. The head state is (B, 4, 3), position to jerk.
     """
     durations, flown = pieces.durations, pieces.flown
     coeffs = np.moveaxis(pieces.coeffs, -1, 0)
@@ -358,13 +350,8 @@ def judge_motion(
 ) -> tuple[dict, dict]:
     """Return the measurements of `FlightVerdict`, and tests: name -> failed, excess, time.
 
-    Args:
-        pieces: of B lanes.
-        case: leaves with leading axis B: "head_state", and those of `read_flight`.
-        extras: of all cases.
-        intervals: between the samples of one piece.
-        relative: tolerance of every limit.
-        continuity: tolerance of head state and joints, times the scale of the coordinates.
+    A case has "head_state" and the leaves of `read_flight`. `continuity` is the tolerance of head
+    state and joints, times the scale of the coordinates.
     """
     found = peaks(pieces, case["gravity"], intervals)
     head, jump, jump_time, scale = joint_errors(pieces, case["head_state"])

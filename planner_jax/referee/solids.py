@@ -62,12 +62,7 @@ def segment_to_box(first: np.ndarray, second: np.ndarray, half: np.ndarray) -> n
 
     The squared distance is convex along the segment, and its slope is a line between the places
     where the segment crosses the planes of the box's sides: the root lies between the last of
-    them with a slope below zero and the first with one above.
-
-    Args:
-        first: (3, ...), one end in the box's frame.
-        second: (3, ...), the other one.
-        half: (3, ...), half edges of the box.
+    them with a slope below zero and the first with one above. Ends and half edges are (3, ...).
     """
     way = second - first
 

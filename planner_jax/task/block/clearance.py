@@ -61,14 +61,9 @@ class _Pairs(NamedTuple):
 
 
 def clearances(arm: Arm, scene: Scene, angles: Array) -> Array:
-    """Return distances (R, N) [m] of all pairs; capsules that overlap have negative ones.
+    """Return distances (R, N) [m] of all pairs in N poses; overlapping capsules have negative ones.
 
-    The first `num_of_pole(arm)` are those from the pole.
-
-    Args:
-        arm: the arm.
-        scene: what stands around.
-        angles: (N, 6) [rad], poses.
+    The first `num_of_pole(arm)` are distances from the pole.
     """
     every = _pairs(arm, scene, _poses(arm, angles))
     return jnp.concatenate([pairs.measure(*pairs.bodies) - pairs.thick for pairs in every])

@@ -49,12 +49,9 @@ def has_nan(case: BlockCase) -> Array:
 def explain_status(case: BlockCase, poses: EndPoses, status: Array) -> Array:
     """Return the status () int32 of a plan, or the status that explains why there is none.
 
-    Args:
-        case: one case. Without a plan the status is NON_FINITE if it has a NaN; OUT_OF_REACH if
-            the ball does not get into both boxes, or the shield nowhere to it; and BLOCKED if the
-            arm touches something where it starts.
-        poses: of the case, in which the shield meets the ball.
-        status: () int32, of the plan.
+    Without a plan the status is NON_FINITE if the case has a NaN; OUT_OF_REACH if the ball does not
+    get into both boxes, or the shield nowhere to it; and BLOCKED if the arm touches something where
+    it starts.
     """
 
     def reason() -> Array:

@@ -44,11 +44,9 @@ def targets_at(targets: TargetPath, times: Array) -> BallState:
 
 
 def facing_cosine(axis: Array, vel: Array) -> tuple[Array, Array]:
-    """Return cosines (N,) between net axes and the targets' way back, and which targets have one.
+    """Return cosines (N,) between unit net axes and the ways back of targets of velocities (N, 3).
 
-    Args:
-        axis: (N, 3) unit vectors.
-        vel: (N, 3) [m/s], of the targets.
+    Also return which targets have one.
     """
     speed_squared = jnp.sum(vel**2, axis=1)
     moving = speed_squared > 1e-12
@@ -59,11 +57,8 @@ def facing_cosine(axis: Array, vel: Array) -> tuple[Array, Array]:
 def nearest_upright(vel: Array, lean: Array) -> Array:
     """Return the net's axes (N, 3) nearest to upright that lean so far from the targets' way back.
 
-    Targets that rise are taken to fly level, and of those at rest the axis is upright.
-
-    Args:
-        vel: (N, 3) [m/s], of the targets.
-        lean: () [rad], from 0 to a quarter turn.
+    Targets that rise are taken to fly level, and of those at rest the axis is upright. The lean
+    () [rad] is from 0 to a quarter turn.
     """
     back = jnp.concatenate([-vel[:, :2], jnp.maximum(-vel[:, 2:], 0.0) + _RESTING], axis=1)
     back /= jnp.sqrt(jnp.maximum(jnp.sum(back**2, axis=1, keepdims=True), 1e-6))

@@ -41,13 +41,10 @@ _WORD = 24  # bits of a number that says which targets are taken
 
 
 def closest_approach(cases: CatchCase) -> Array:
-    """How near each target comes to where the net could be, (N,) [m]; zero is within reach.
+    """Return the distance (N,) or (B, N) [m] of targets from the net's reach; zero is within reach.
 
     A bound that no plan can beat, at 64 times up to the horizon: the quadrotor leaves with its
     velocity and flies at its greatest speed in any direction, above the least height.
-
-    Args:
-        cases: one case, or a batch, for which it is (B, N).
     """
     return _closest_approach(cases) if cases.batch_shape == () else _closest_approaches(cases)
 
@@ -177,11 +174,9 @@ def _choice(position: Array, times: Array) -> CatchChoice:
 
 
 def optimal_time_ratio(cases: CatchCase, plans: CatchPlan) -> np.ndarray:
-    """Mean of |T_o - T_p| / T_o over the targets that are caught, (B,) (paper 000, eq. 29).
+    """Return the mean of |T_o - T_p| / T_o over the caught targets, (B,) (paper 000, eq. 29).
 
-    Args:
-        cases: a batch.
-        plans: of them, with the times T_p that were decided and the optimised ones T_o.
+    The times T_p were decided, and the times T_o are optimised.
     """
     decided_times, optimised = np.asarray(plans.decided_times), np.asarray(plans.times)
     present = np.asarray(cases.present & plans.choice.taken)

@@ -136,14 +136,10 @@ def follow(case: CatchCase, table: Timetable, order: Array) -> tuple[CatchChoice
 
 
 def earliest_next(case: CatchCase, table: Timetable, handicap: Array) -> CatchChoice:
-    """Next is caught whatever can be caught earliest; absent targets come last, in any order.
+    """Return the choice that next catches the target that can be caught earliest; absent ones last.
 
-    Where targets are optional those that can no longer be reached are left, and come last too.
-
-    Args:
-        case: one case.
-        table: its timetable.
-        handicap: (N,) [s], by how much later than it can be caught each target is taken to be.
+    Optional targets that can no longer be reached are left, and come last too. Each target is taken
+    to be caught later by a handicap (N,) [s].
     """
     speed = top_speed(case)
 

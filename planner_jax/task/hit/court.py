@@ -163,10 +163,7 @@ def check_cases(cases: HitCase) -> None:
     """Raise `CaseError` for the first rule that some lane of a batch breaks.
 
     Every number keeps the rules of `HitCase`; the ball is above the floor, and comes down in the
-    hitting half, x < 0.
-
-    Args:
-        cases: one case, or a batch with leading axes. Its leaves must be concrete.
+    hitting half, x < 0. The leaves must be concrete.
     """
     require_sound(cases)
     batch, ball = cases.batch_shape, cases.ball

@@ -69,14 +69,9 @@ def _weights(samples: int) -> tuple[np.ndarray, ...]:
 
 
 def motion(start: Array, time: Array, speed: Array, curvature: Array, samples: int) -> Motion:
-    """The way of K pieces and its slopes.
+    """Return the motion of K pieces and its slopes, with a static number of samples a piece.
 
-    Args:
-        start: (3,) x, y [m], heading [rad].
-        time: () [s], the end.
-        speed: (K + 1,) [m/s], at the knots.
-        curvature: (K + 1,) [1/m], at the knots.
-        samples: S, of every piece, static.
+    Speed [m/s] and curvature [1/m] (K + 1,) are at knots up to a time () [s].
     """
     num, dtype = speed.shape[0] - 1, speed.dtype
     turned, weights = (jnp.asarray(each, dtype) for each in _weights(samples))

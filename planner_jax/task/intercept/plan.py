@@ -85,11 +85,8 @@ def explain(
 ) -> InterceptPlan:
     """Set the status of an unsolved plan to the reason why the case has no plan.
 
-    Args:
-        case: one case.
-        reason: () int32, the status if nothing is wrong with the case itself.
-        plan: of the case.
-        is_time_free: whether the target may be met before the case's time, static.
+    The status is `reason` () int32 if nothing is wrong with the case itself. `is_time_free` says
+    whether the target may be met before the case's time.
     """
     is_start_blocked, is_goal_blocked = is_blocked(case)
     blocked = is_start_blocked if is_time_free else is_start_blocked | is_goal_blocked

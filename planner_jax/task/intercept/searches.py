@@ -125,13 +125,9 @@ def make_field(case: InterceptCase, grid: reach.Grid) -> DistanceField:
 def search_reach(
     case: InterceptCase, search: Search, *, is_time_free: bool, layers: Array | None = None
 ) -> Found:
-    """Compute the reach set of a case.
+    """Compute the reach set of a case, by default for the layers up to the case's time.
 
-    Args:
-        case: one case.
-        search: sizes.
-        is_time_free: whether layers before the case's time may meet the target, static.
-        layers: () int32, number of layers to compute; by default those up to the case's time.
+    `is_time_free` says whether earlier layers may meet the target.
     """
     grid = make_grid(case, search.lattice)
     field = make_field(case, grid)

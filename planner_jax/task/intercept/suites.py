@@ -196,13 +196,9 @@ def anywhere(uniform: np.ndarray) -> np.ndarray:
 
 
 def target_to(meeting: np.ndarray, time: float, turning: np.ndarray, uniform: np.ndarray) -> Draws:
-    """Return the parts of draws for targets that are at a position at a time.
+    """Return the parts of draws for targets at positions (B, 2) [m] at a time [s].
 
-    Args:
-        meeting: (B, 2) [m], that position.
-        time: [s].
-        turning: (B,) bool, whether they turn.
-        uniform: (B, 4), numbers of [0, 1).
+    They are drawn by numbers (B, 4) of [0, 1); `turning` (B,) bool says whether they turn.
     """
     side = np.where(uniform[:, 3] < 0.5, 1.0, -1.0)
     rate = np.where(turning, side * _between(uniform[:, 2], 0.03, 0.1), 0.0)
