@@ -1,13 +1,13 @@
 """What the runs of every quadrotor task share: columns, and trajectories sampled from rows."""
 
 import dataclasses
-import math
 from collections.abc import Sequence
 
 import numpy as np
 
 from planner_jax.runs.columns import LIST, VECTOR, Column, RefereedBatch, leaves_of
 from planner_jax.runs.manifest import Row
+from planner_jax.trajectory.polynomial import PiecewisePolynomial, states_at
 
 
 def _starts(batch: RefereedBatch) -> np.ndarray:
@@ -78,25 +78,19 @@ class SampledMotion:
 def sample_motion(
     coeffs: Sequence[float] | np.ndarray, durations: Sequence[float] | np.ndarray, num: int
 ) -> SampledMotion:
-    """Sample a trajectory as the rows hold it, at even times, in float64.
+    """Sample a trajectory at even times in float64.
 
     Args:
         coeffs: flat, M pieces x ascending powers of the piece's own time x 3 axes.
         durations: (M,) [s].
-        num: how many samples.
+        num: number of samples.
     """
-    ends = np.cumsum(np.asarray(durations, float))
-    pieces = np.asarray(coeffs, float).reshape(len(ends), -1, 3)
-    time = np.linspace(0.0, ends[-1], num)
-    piece = np.minimum(np.searchsorted(ends, time, side="right"), len(ends) - 1)
-    local = time - np.concatenate([[0.0], ends[:-1]])[piece]
-    powers = local[:, None] ** np.arange(pieces.shape[1])
-    derivatives = []
-    for order in range(4):
-        factors = [math.perm(k, order) for k in range(order, pieces.shape[1])]
-        scaled = pieces[piece, order:] * np.array(factors, float)[:, None]
-        derivatives.append(np.einsum("nk,nki->ni", powers[:, : scaled.shape[1]], scaled))
-    return SampledMotion(time, *derivatives)
+    lengths = np.asarray(durations, float)
+    pieces = np.asarray(coeffs, float).reshape(len(lengths), -1, 3)
+    time = np.linspace(0.0, lengths.sum(), num)
+    leaves = (np.broadcast_to(leaf, (num, *leaf.shape)) for leaf in (pieces, lengths))
+    states = states_at(PiecewisePolynomial(*leaves), time)
+    return SampledMotion(time, *np.moveaxis(states, 1, 0))
 
 
 def sample_rest(row: Row, num: int) -> SampledMotion | None:

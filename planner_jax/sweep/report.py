@@ -31,11 +31,6 @@ class RunRows:
     manifest: Entries
     failures: list[Row]  # the first few rows that failed
 
-    @property
-    def setting(self) -> Entries:
-        """Physics and limits that all cases have in common."""
-        return self.manifest["setting"]
-
     def sample(self) -> list[Row]:
         """Return rows taken evenly from the run; where nearly all succeed, failures are added."""
         last = self.manifest["summary"]["num"] - 1
