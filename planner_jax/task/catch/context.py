@@ -80,9 +80,6 @@ def is_too_far(context: CatchContext) -> Array:
 
     False does not say that there is a plan. It is false for targets that may be left, for those of
     a class that does not say how it accelerates, and where a number is not finite.
-
-    Args:
-        context: of one case.
     """
     case, targets = context.case, context.targets
     if case.optional or not isinstance(targets, BallPath | HarmonicPath):

@@ -57,9 +57,6 @@ def is_too_far(context: HitContext) -> Array:
     by what is added to the distance.
 
     False does not say that there is a plan. A number that is not finite makes it false.
-
-    Args:
-        context: of one case.
     """
     case, path = context.case, context.path
     limits, ball = case.limits, case.ball

@@ -297,12 +297,9 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         return jnp.concatenate([excess[:2], Measure.ABOVE.relative(excess[2:])])
 
     def impact(self, natural: Array, context: HitContext) -> Impact:
-        """Return the impact that the end variables describe.
+        """Return the impact that the end variables (8,) describe.
 
-        Args:
-            natural: (8,) log T, log t_post, log thrust, two tangential speeds [m/s], jerk
-                [m/s^3].
-            context: of the case.
+        These are log T, log t_post, log thrust, two tangential speeds [m/s] and jerk [m/s^3].
         """
         case = context.case
         time, flight_time, thrust = jnp.exp(natural[0]), jnp.exp(natural[1]), jnp.exp(natural[2])

@@ -69,9 +69,6 @@ def read_serves(folder: str | os.PathLike) -> Serves:
     l Bat-Lite, b Juggle). The files of one S_L_T hold the same serves in the same order; any of
     them may be missing. Other files of the folder are passed over.
 
-    Args:
-        folder: where the files are.
-
     Returns:
         Row 1 of every scenario, then row 2 and so on, so that the first rows of the whole are a
         fair sample of the court. `published` has NaN for the files that are missing.
@@ -108,14 +105,8 @@ def generate_serves(
     the vertical speed are drawn uniformly, the horizontal velocity follows from them, and a draw
     is kept with a probability proportional to |d horizontal velocity / d landing point|.
 
-    Args:
-        num: number of serves, >= 1.
-        seed: >= 0.
-        scenarios: names out of court.SCENARIOS; all of them by default.
-        first: index of the first serve in the sequence, >= 0.
-
-    Raises:
-        ArgumentError: an argument is out of its range.
+    The scenarios are names out of court.SCENARIOS, by default all. The other arguments and the
+    errors are those of `pj.hit.draw`.
     """
     names = court.SCENARIOS if scenarios is None else tuple(scenarios)
     require_draw(num, seed, first)
