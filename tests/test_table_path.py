@@ -88,7 +88,7 @@ def test_the_path_is_differentiated_by_its_positions(float64):
         (dict(positions=np.full((4, 3), np.nan)), "positions must be finite, got nan"),
         (dict(velocities=np.zeros((2, 4, 3))), r"velocities must have .* got \(2, 4, 3\)"),
         (dict(nodes=4), "nodes must be >= 5, got 4"),
-        (dict(error=0.0), "error must be finite and > 0, got 0.0"),
+        (dict(error=0.0), "error must be finite and > 0, got 0"),
         (dict(positions=1e9 * np.eye(4)[:, :3]), "error must be >= .* got 0.001"),
     ],
 )

@@ -22,6 +22,7 @@ from planner_jax.core.registry import Task, require_name
 
 AnySettings = TypeVar("AnySettings", bound="SweepSettings")
 KnownSettings = TypeVar("KnownSettings")
+Options = dict[str, Any]  # values by their names in Python
 
 
 class WorkersFailed(PlannerJaxError, RuntimeError):
@@ -35,12 +36,12 @@ class WorkersFailed(PlannerJaxError, RuntimeError):
         return f"workers must {self.rule}"
 
 
-def option(default: Any, metavar: str, words: str) -> Any:
+def option(default: object, metavar: str, words: str) -> Any:
     """Return a field of settings with its help text; a switch has no `metavar`."""
     return dataclasses.field(default=default, metadata={"metavar": metavar, "help": words})
 
 
-def ending_option(usual: str = NONE) -> Any:
+def ending_option(usual: str = NONE) -> str:
     """Return the field of settings `ending` of a task of quadrotors."""
     words = f"flown behind the last contact, within all limits: {', '.join(CHOICES)}"
     return option(usual, "NAME", words)
@@ -93,8 +94,8 @@ class SweepSettings:
     JUDGE: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
-        for name in ("num", "batch"):
-            require_count(name, getattr(self, name), 1, none=True)
+        for name, value in (("num", self.num), ("batch", self.batch)):
+            require_count(name, value, 1, none=True)
         require_seed(self.seed)
 
     def of(self, task: Task) -> Self:
@@ -122,26 +123,28 @@ class SweepSettings:
         """Raise `ArgumentError` if the rows of the run do not fit on the disk of its folder."""
         require_disk("num", self.num or self.DEFAULT_NUM, self.ROW_BYTES, out)
 
-    def parameters(self) -> dict[str, Any]:
+    def parameters(self) -> Options:
         """Return the settings as plain values for `manifest.json`; the class brings them back."""
         return dataclasses.asdict(self)
 
-    def planner_options(self) -> dict[str, Any]:
+    def planner_options(self) -> Options:
         """Return options of the planner that these settings decide."""
-        return {name: getattr(self, name) for name in self.PLANNER}
+        return self._values(self.PLANNER)
 
-    def draw_options(self) -> dict[str, Any]:
+    def draw_options(self) -> Options:
         """Return options of the task's `draw` that these settings decide; None is left to it."""
-        return {name: value for name in self.DRAW if (value := getattr(self, name)) is not None}
+        return {k: value for k, value in self._values(self.DRAW).items() if value is not None}
 
-    def judge_options(self) -> dict[str, Any]:
+    def judge_options(self) -> Options:
         """Return options of the task's `judge` that these settings decide."""
-        return {name: getattr(self, name) for name in self.JUDGE}
+        return self._values(self.JUDGE)
+
+    def _values(self, names: tuple[str, ...]) -> Options:
+        """Return the settings of some names."""
+        return {name: getattr(self, name) for name in names}
 
 
-def settings_to_resume(
-    kind: type[AnySettings], parameters: dict[str, Any], given: dict[str, Any]
-) -> AnySettings:
+def settings_to_resume(kind: type[AnySettings], parameters: Options, given: Options) -> AnySettings:
     """Return the settings of a run that is resumed, after a check of those passed again.
 
     Raises:
@@ -156,7 +159,7 @@ def settings_to_resume(
 
 
 def settings_of_manifest(
-    kind: type[KnownSettings], parameters: dict[str, Any], name: str
+    kind: type[KnownSettings], parameters: Options, name: str
 ) -> KnownSettings:
     """Return the settings of a run; `name` is the argument that holds its folder.
 
@@ -170,9 +173,9 @@ def settings_of_manifest(
         raise ArgumentError(name, rule, shown=f"others: {error}") from None
 
 
-def _difference(name: str, old: Any, new: Any) -> tuple[str, Any, Any]:
+def _difference(name: str, old: object, new: object) -> tuple[str, object, object]:
     """Return the name of the first part in which two settings differ, and its values."""
-    if dataclasses.is_dataclass(old) and type(old) is type(new):
+    if dataclasses.is_dataclass(old) and dataclasses.is_dataclass(new) and type(old) is type(new):
         for field in dataclasses.fields(old):
             mine, other = getattr(old, field.name), getattr(new, field.name)
             if mine != other:
