@@ -340,8 +340,8 @@ def test_a_lost_look_shows_nothing():
     ("build", "message"),
     [
         (lambda: Sensing(position_std=-0.1), "position_std must be >= 0, got -0.1"),
-        (lambda: Sensing(dropout=1.0), "dropout must be < 1, got 1.0"),
-        (lambda: Loop(CATCH_WORLD, replan=-1.0), "replan must be >= 0, got -1.0"),
+        (lambda: Sensing(dropout=1.0), "dropout must be < 1, got 1"),
+        (lambda: Loop(CATCH_WORLD, replan=-1.0), "replan must be >= 0, got -1"),
         (
             lambda: Loop(CATCH_WORLD, replan=30.0),
             "replan must be a divisor of the looks' 100 Hz, got 30",
@@ -355,7 +355,7 @@ def test_a_lost_look_shows_nothing():
             "latency must be a multiple of the looks' 0.01 s, got 0.015",
         ),
         (lambda: dataclasses.replace(CATCH_WORLD, num_balls=-1), "num_balls must be >= 0, got -1"),
-        (lambda: dataclasses.replace(CATCH_WORLD, timestep=0.0), "timestep must be > 0, got 0.0"),
+        (lambda: dataclasses.replace(CATCH_WORLD, timestep=0.0), "timestep must be > 0, got 0"),
     ],
 )
 def test_what_cannot_be_flown_is_refused_in_one_line(build, message):
