@@ -173,7 +173,7 @@ def _serve(settings: ServeSettings) -> None:
     require_backend()
     keep_compiled_programs()
     names = ("rate", "horizon", "deadline", "noise")
-    options = {name: getattr(settings, name) for name in names}
+    options = {name: vars(settings)[name] for name in names}
     planner = LivePlanner(settings.stroke(), **options)
     server = Server(planner, settings.port)
     server.warm_up()

@@ -141,7 +141,7 @@ class SweepSettings:
 
     def _values(self, names: tuple[str, ...]) -> Options:
         """Return the settings of some names."""
-        return {name: getattr(self, name) for name in names}
+        return {name: vars(self)[name] for name in names}
 
 
 def settings_to_resume(kind: type[AnySettings], parameters: Options, given: Options) -> AnySettings:
@@ -153,7 +153,7 @@ def settings_to_resume(kind: type[AnySettings], parameters: Options, given: Opti
     settings = settings_of_manifest(kind, parameters, "out")
     asked = dataclasses.replace(settings, **given)
     for name in given:
-        part, old, new = _difference(name, getattr(settings, name), getattr(asked, name))
+        part, old, new = _difference(name, vars(settings)[name], vars(asked)[name])
         require(new == old, part, f"{old} as in the run that is resumed", new, shown=str(new))
     return settings
 
@@ -177,7 +177,7 @@ def _difference(name: str, old: object, new: object) -> tuple[str, object, objec
     """Return the name of the first part in which two settings differ, and its values."""
     if dataclasses.is_dataclass(old) and dataclasses.is_dataclass(new) and type(old) is type(new):
         for field in dataclasses.fields(old):
-            mine, other = getattr(old, field.name), getattr(new, field.name)
+            mine, other = vars(old)[field.name], vars(new)[field.name]
             if mine != other:
                 return _difference(f"{name}.{field.name}", mine, other)
     return name, old, new
