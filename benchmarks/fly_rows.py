@@ -75,15 +75,15 @@ def limited(name: str, seconds: int) -> Iterator[None]:
 
 def twice(fly: Callable[[], Any]) -> tuple[Any, str]:
     """What a flight gives, and the seconds of the second time and of the first."""
-    spent = []
-    for _ in range(2):
-        began = time.perf_counter()
-        flights = fly()
-        spent.append(time.perf_counter() - began)
+    began = time.perf_counter()
+    fly()
+    between = time.perf_counter()
+    flights = fly()
+    first, second = between - began, time.perf_counter() - between
     planning = flights.planning_seconds
     return flights, (
-        f"warm {spent[1] - planning:.2f} s to fly and re-plan and {planning:.2f} s to plan from "
-        f"scratch; first time, with compilation, {spent[0]:.0f} s"
+        f"warm {second - planning:.2f} s to fly and re-plan and {planning:.2f} s to plan from "
+        f"scratch; first time, with compilation, {first:.0f} s"
     )
 
 

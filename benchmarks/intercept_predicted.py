@@ -166,7 +166,7 @@ class Drives:
             plans,
             cases,
             began=np.zeros(cases.batch_shape),
-            had_plan=is_solved(plans.status),
+            had_plan=np.asarray(is_solved(plans.status)),
             speed=setpoints.speed,
             curvature=setpoints.curvature,
         )
@@ -178,7 +178,7 @@ class Drives:
         plans = pj.plan(again, task)
         lanes = np.flatnonzero(~is_solved(plans.status))
         if lanes.size:
-            is_lost = ~is_solved(self.plans.status[lanes])
+            is_lost = np.asarray(~is_solved(self.plans.status[lanes]))
             plans = put(plans, lanes, planned(taken(task.case, lanes), is_lost))
         # One that exceeds a limit is driven only instead of another such.
         lanes = np.flatnonzero(is_solved(plans.status) | ~is_solved(self.plans.status))

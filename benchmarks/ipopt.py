@@ -39,6 +39,8 @@ from planner_jax.core.errors import install_line
 from planner_jax.core.protocol import FEASIBILITY_TOLERANCE
 from planner_jax.cost.along import BETWEEN_NODES
 from planner_jax.planning.decided import DecidedPlanner
+from planner_jax.task.catch.default_planner import ExactCatch
+from planner_jax.task.hit.default_planner import ExactHit
 from planner_jax.trajectory.polynomial import snap_energy
 
 # By task: the suite, and the module that writes its problem down.
@@ -77,7 +79,9 @@ class Setup:
         self.card = pj.task_named(name)
         self.cases: Any = jax.tree.map(np.asarray, self.card.draw(num, suite, seed))
         made = self.card.planner("exact", **self.card.bench)
-        self.planner = made.planner if isinstance(made, DecidedPlanner) else made
+        planner = made.planner if isinstance(made, DecidedPlanner) else made
+        assert isinstance(planner, ExactHit | ExactCatch)
+        self.planner = planner
         self.module = importlib.import_module(f"planner_jax.benchmarks.ipopt_peer.{module}")
         decided = self.cases
         if isinstance(made, DecidedPlanner):
@@ -116,7 +120,7 @@ class Setup:
         with jax.enable_x64(True):
             path = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), float), plans.trajectory)
             cost = self.planner.energy_weight * np.asarray(jax.vmap(snap_energy)(path))
-        if hasattr(self.planner, "time_weight"):
+        if isinstance(self.planner, ExactCatch):
             cost = cost + self.planner.time_weight * np.asarray(plans.times, float)[:, -1]
         return cost
 

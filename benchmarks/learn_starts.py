@@ -266,7 +266,7 @@ def train(learnt: _Learnt, minutes: float, seed: int, say: Callable[[str], None]
         (params, state), values = jax.lax.scan(one, (params, state), jax.random.split(key, _STEPS))
         return params, state, jnp.mean(values)
 
-    key, began, share, calls = jax.random.key(seed), None, 0.0, 0
+    key, began, share, calls, value = jax.random.key(seed), None, 0.0, 0, np.nan
     while share < 1.0:
         key, own = jax.random.split(key)
         rate = _RATE * 0.5 * (1.0 + np.cos(np.pi * share))
@@ -297,6 +297,7 @@ def compare(bench: Bench, task: str, num: int) -> None:
         "| guess | iterations | limits hold | cost above the least found (median, p90, p99) |",
         "|---|---:|---:|---|",
     )
+    holds = np.zeros(0, bool)
     for iterations in learnt.iterations:
         for name, planner in planners.items():
             plans = pj.plan(planner.with_solver(pj.LbfgsConfig(max_steps=iterations)), cases)

@@ -72,7 +72,7 @@ def figures_of(
     bench.count(good)
     return {
         "success": 100.0 * good.mean(),
-        "last": plans.times[good, -1].mean() if good.any() else np.nan,
+        "last": float(plans.times[good, -1].mean()) if good.any() else np.nan,
         "ratio": pj.catch.optimal_time_ratio(cases, plans)[good].mean() if good.any() else np.nan,
     }
 

@@ -33,7 +33,7 @@ def cramer_rao(
     velocity = path.at(seen.middle).vel
     fit = given_rate(seen, path.turn_rate)._replace(velocity=(velocity[0], velocity[1]))
     variance = jnp.square(jnp.asarray(noise, seen.after.dtype))
-    after = time - seen.middle
+    after = jnp.asarray(time) - seen.middle
     moves = zip(arc(path.turn_rate, after), fit.lever, strict=True)
     ahead, aside = (to - lever for to, lever in moves)
     shared = variance * (1.0 / seen.total + (ahead**2 + aside**2) / fit.power)

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array, lax
-from jax.typing import ArrayLike
 
 from planner_jax.perception.camera import Camera, back_project, from_numbers
 from planner_jax.perception.noise import StereoNoise
@@ -35,8 +34,8 @@ class BallLook:
 
 
 def ball_look(
-    lower: ArrayLike = (0.02, 0.5, 0.25),
-    upper: ArrayLike = (0.13, 1.0, 1.0),
+    lower: np.ndarray | tuple[float, ...] = (0.02, 0.5, 0.25),
+    upper: np.ndarray | tuple[float, ...] = (0.13, 1.0, 1.0),
     *,
     radius: float = 0.05,
     confidence: float = 0.5,
@@ -56,8 +55,8 @@ def ball_look(
         raise ValueError(f"radius must be > 0, got {radius:g}")
     return from_numbers(
         BallLook,
-        lower=lower,
-        upper=upper,
+        lower=np.asarray(lower),
+        upper=np.asarray(upper),
         radius=radius,
         confidence=confidence,
         pixels=pixels,

@@ -63,7 +63,7 @@ def case_parameters(case: HitCase) -> dict[str, np.ndarray]:
     def height(_, state):
         return state[2] - floor
 
-    height.terminal, height.direction = True, -1.0
+    height.terminal, height.direction = True, -1.0  # pyright: ignore[reportFunctionMemberAccess]
     begin = np.r_[np.asarray(case.ball.pos, float), np.asarray(case.ball.vel, float)]
     accuracy = {"rtol": 1e-11, "atol": 1e-11, "dense_output": True}
     flight = solve_ivp(rate, (0.0, 30.0), begin, "DOP853", events=height, **accuracy)

@@ -108,7 +108,7 @@ def _plans() -> Iterator[Finding]:
     hit = task_named("hit")
     planner, batch = hit.planner(), jax.tree.map(np.asarray, hit.draw(_BATCH))
     for name, cases in (("one plan", lane(batch, 0)), (f"{_BATCH} plans", batch)):
-        seconds = []
+        seconds, plans = [], None
         for _ in range(6):
             began = time.perf_counter()
             plans = plan(planner, cases)

@@ -145,7 +145,7 @@ def _plan_of(source: str, row: int | None) -> "tuple[Plan, str]":
 
 def _case_of(source: str, row: int | None, ending: str) -> "Case":
     """Return the case of a row of a sweep, whose limits a recovery trajectory has to keep."""
-    if not os.path.isdir(source):
+    if row is None or not os.path.isdir(source):
         rule = "none for plans of a file that do not come to rest, as it does not hold their limits"
         raise ArgumentError("ending", rule, ending)
     from planner_jax.runs.run_folder import RunFolder

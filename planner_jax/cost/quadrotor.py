@@ -191,6 +191,12 @@ class Measure(enum.Enum):
         return excess
 
 
+def _rotor_excess(motion: Motion, gravity: Array, own: QuadrotorLimits) -> tuple[Array, ...]:
+    """Return `rotor_excess` by limits that have rotors."""
+    assert own.rotors is not None
+    return rotor_excess(motion, gravity, own.rotors)
+
+
 @dataclasses.dataclass(frozen=True)
 class _Kind:
     """Limits that are there together, or not."""
@@ -237,7 +243,7 @@ _KINDS = (
     _Kind(
         "rotors",
         (Measure.PLAIN,) * 8,
-        lambda motion, gravity, own: rotor_excess(motion, gravity, own.rotors),
+        _rotor_excess,
         (2, 3, 4),
     ),
 )

@@ -123,6 +123,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
         """Compile all programs, and start the report."""
         state = np.asarray(self.stroke.case.head_state)
         self._setpoints(self._recover(state, 0.0), 0.0)
+        ball = None
         for k in range(3):  # towards the robot
             pos = tuple(state[0] + (4.0 - 0.1 * k, 0.0, 0.1 * k))
             ball, _ = self._sight.see(0, pos, 0.01 * k, 0.01 * k)

@@ -96,8 +96,8 @@ class Stroke(abc.ABC, Generic[CaseT, PlanT]):
 
 def _state_in(task: Replanning) -> Array:
     """Return position to jerk (4, 3) of a robot that flies its plan."""
-    path = task.previous.trajectory
-    return jnp.stack([evaluate(path, task.elapsed, order) for order in range(4)])
+    path, elapsed = task.previous.trajectory, jnp.asarray(task.elapsed)
+    return jnp.stack([evaluate(path, elapsed, order) for order in range(4)])
 
 
 def _hit_first(attempt: Round, planner: ExactHit, case: HitCase) -> HitPlan:

@@ -199,6 +199,7 @@ def solve_round(planner: "OptimisedPlanner", attempt: Round, case: PyTree) -> Py
     before = planner.changed(_stages(attempt)[0].settings)
     points = before.guesses(context, attempt.starts)
     spent = jnp.zeros(len(points), jnp.int32)
+    optimum = None
     for stage in _stages(attempt):
         problem = planner.changed(stage.settings)
         points = _of_each(functools.partial(problem.carried, before=before), points)
@@ -208,6 +209,7 @@ def solve_round(planner: "OptimisedPlanner", attempt: Round, case: PyTree) -> Py
         if stage.keep is not None:
             kept = _cheapest(optimum.evaluation.cost, stage.keep)
             points, spent = points[kept], spent[kept]
+    assert optimum is not None  # a round has a stage
     optimum = dataclasses.replace(optimum, iterations=spent)
     plans = _of_each(lambda found: _plan_at(last, found, context), optimum)
     return jax.tree.map(lambda leaf: leaf[0], plans) if len(points) == 1 else _best(plans)
@@ -233,6 +235,7 @@ def solve_batch(planner: "OptimisedPlanner", attempt: Round, cases: PyTree) -> P
     points = jnp.moveaxis(starts, 0, -1).reshape(starts.shape[1], -1)
     of_starts = _repeated(contexts, num)
     spent = jnp.zeros(points.shape[1:], jnp.int32)
+    optimum = None
     for stage in _stages(attempt):
         problem = planner.changed(stage.settings)
         points = over_lanes(functools.partial(problem.carried, before=before))(points)
@@ -245,6 +248,7 @@ def solve_batch(planner: "OptimisedPlanner", attempt: Round, cases: PyTree) -> P
             kept = (kept + num * jnp.arange(len(costs))[:, None]).ravel()
             points, spent, num = points[:, kept], spent[kept], min(stage.keep, num)
             of_starts = _repeated(contexts, num)
+    assert optimum is not None  # a round has a stage
     optimum = dataclasses.replace(optimum, iterations=spent)
     plans = over_lanes(functools.partial(_plan_at, last))(optimum, of_starts)
     plans = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), plans)

@@ -13,7 +13,7 @@ along lambda then holds lambda^T cost_utheta.
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Self
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -96,8 +96,8 @@ class Differentiated(OptimisedPlanner):
             raise ArgumentError("by", "something in the case", verb="name", shown="nothing")
 
     @property
-    def rounds(self) -> tuple[Round, ...]:
-        """Those of the planner."""
+    def attempts(self) -> tuple[Round, ...]:
+        """The rounds of the planner."""
         return self.planner.rounds
 
     def changed(self, settings: Settings) -> "Differentiated":
@@ -112,9 +112,9 @@ class Differentiated(OptimisedPlanner):
         """Those of the planner."""
         return self.planner.guesses(context.inner, num)
 
-    def carried(self, point: Array, before: Self) -> Array:
+    def carried(self, point: Array, before: OptimisedPlanner) -> Array:
         """As the planner does."""
-        return self.planner.carried(point, before.planner)
+        return self.planner.carried(point, cast(Differentiated, before).planner)
 
     def objective(self, point: Array, context: _Context) -> Evaluation:
         """That of the planner."""

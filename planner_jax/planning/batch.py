@@ -125,7 +125,7 @@ def plan_batch(
     attempts: Sequence[Attempt],
     cases: PyTree,
     chunk: int | None,
-    devices: Sequence[jax.Device] | None,
+    devices: Sequence[jax.Device] | None,  # pyright: ignore[reportInvalidTypeForm]
     watch: Watch,
 ) -> tuple[PyTree, PyTree]:
     """Return plans of a batch by attempts, each at the lanes that are still unsolved.

@@ -27,7 +27,7 @@ class Driver:
     """The `Drive` of `plan`; or that of `solve`, which is pure."""
 
     chunk: int | None = None
-    devices: Sequence[jax.Device] | None = None
+    devices: Sequence[jax.Device] | None = None  # pyright: ignore[reportInvalidTypeForm]
     watch: Watch = dataclasses.field(default_factory=Watch)
     is_pure: bool = False  # inside a compiled program
 

@@ -43,7 +43,7 @@ def gradient(
     solver: Solver | None = None,
     polish: bool = True,
     chunk: int | None = None,
-    devices: Sequence[jax.Device] | None = None,
+    devices: Sequence[jax.Device] | None = None,  # pyright: ignore[reportInvalidTypeForm]
 ) -> PlanGradient:
     """`plan`, and the gradient of one number of every plan by parts of its case.
 

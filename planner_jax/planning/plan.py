@@ -23,7 +23,7 @@ def plan(
     cases: CaseT,
     *,
     chunk: int | None = None,
-    devices: Sequence[jax.Device] | None = None,
+    devices: Sequence[jax.Device] | None = None,  # pyright: ignore[reportInvalidTypeForm]
     time_limit: float | None = None,
     progress: Callable[[Progress], PyTree] | None = None,
 ) -> PlanT:

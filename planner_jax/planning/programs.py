@@ -81,7 +81,7 @@ def sizes_of(planner: Planner, attempt: Attempt, chunk: int | None, mesh: Mesh) 
     return Sizes(max(BUCKETS[0], _CPU_CHUNK // starts), busy)
 
 
-def on_devices(planner: Planner, devices: Sequence[jax.Device] | None) -> tuple[Planner, Mesh]:
+def on_devices(planner: Planner, devices: Sequence[jax.Device] | None) -> tuple[Planner, Mesh]:  # pyright: ignore[reportInvalidTypeForm]
     """Return the planner with its arrays on devices, by default all local ones, and their mesh."""
     mesh = Mesh(np.array(jax.local_devices() if devices is None else devices), ("lanes",))
     if jax.tree.leaves(planner):

@@ -14,6 +14,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import PyTree
 
+from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.errors import NoEnding
 from planner_jax.plane.obstacles import separation
 from planner_jax.robot.arm import ArmPlan
@@ -114,9 +115,8 @@ def _car_problem(
             continue
         moved = each.centre[:, None] + each.velocity[:, None] * (since + times)[:, None]
         apart = (poses[:, :2] - np.asarray(moved)).astype(np.float32)
-        gaps = np.asarray(
-            separation(each.corners, each.present, apart[..., 0], apart[..., 1], poses[:, 2], ends)
-        ).min(axis=1)
+        x, y, heading = (host_leaf(part) for part in (apart[..., 0], apart[..., 1], poses[:, 2]))
+        gaps = np.asarray(separation(each.corners, each.present, x, y, heading, ends)).min(axis=1)
         k = int(gaps.argmin())
         if gaps[k] < _GAP:
             return f"{name}: the body is {max(-gaps[k], 0.0):.3g} m inside {name}s[{k}]"
@@ -147,8 +147,8 @@ def brake_arm(case: PyTree, plan: ArmPlan) -> ArmPlan:
             size = max(coeffs.shape[1], 3)
             wide = [np.pad(x, [(0, 0), (0, size - x.shape[1]), (0, 0)]) for x in (coeffs, pieces)]
             motion = PiecewisePolynomial(
-                coeffs=np.concatenate(wide).astype(np.float32),
-                durations=np.append(durations, times).astype(np.float32),
+                coeffs=host_leaf(np.concatenate(wide), np.float32),
+                durations=host_leaf(np.append(durations, times), np.float32),
             )
             return _change(ArmPlan, plan, motion=motion)
         why = why or problem

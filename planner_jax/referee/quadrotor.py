@@ -281,13 +281,13 @@ def _search(name: str, pieces: Pieces, gravity, likeliest, u: np.ndarray) -> tup
     lanes = np.arange(len(piece))
     coeffs = np.ascontiguousarray(pieces.coeffs[:, lanes, piece].transpose(2, 0, 1))[:, :, None]
     span = pieces.durations[lanes, piece]
-    centre, half = u[sample], u[1]
+    value, centre, half = np.empty(len(piece)), u[sample], u[1]
     for _ in range(3):
         near = np.clip(centre + half * np.linspace(-1.0, 1.0, 9)[:, None], 0.0, 1.0)
         found = measure(gravity, *[derivative(coeffs, near * span, order) for order in orders])
         best = found.argmax(axis=0)
-        centre, half = near[best, lanes], half / 4.0
-    return found[best, lanes], pieces.starts[lanes, piece] + centre * span
+        value, centre, half = found[best, lanes], near[best, lanes], half / 4.0
+    return value, pieces.starts[lanes, piece] + centre * span
 
 
 def _greater(first: tuple, second: tuple) -> tuple[np.ndarray, np.ndarray]:

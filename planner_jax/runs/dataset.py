@@ -41,9 +41,9 @@ def encode(rows: pa.Table, record: Mapping[str, object]) -> bytes:
         rows.replace_schema_metadata(metadata),
         file,
         row_group_size=ROW_GROUP,
-        compression=dict.fromkeys(others, "snappy"),
-        use_dictionary=text,
-        write_statistics=others,
+        compression=dict.fromkeys(others, "snappy"),  # pyright: ignore[reportArgumentType]
+        use_dictionary=text,  # pyright: ignore[reportArgumentType]
+        write_statistics=others,  # pyright: ignore[reportArgumentType]
     )
     return file.getvalue()
 

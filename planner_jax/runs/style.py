@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import matplotlib
 from matplotlib.axes import Axes
@@ -10,6 +10,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from planner_jax.host.files import replacing
+
+if TYPE_CHECKING:
+    from matplotlib.typing import RcKeyType  # from Matplotlib 3.11 on
 
 BLUE, ORANGE, GREEN, RED = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 PURPLE, SKY, GREY, INK = "#CC79A7", "#56B4E9", "#8A8F98", "#24292F"
@@ -31,7 +34,7 @@ PLANNER_COLOURS = {
 
 Look: TypeAlias = dict[str, Any]  # named arguments of Matplotlib
 
-_LOOK: Look = {
+_LOOK: "dict[RcKeyType, object]" = {
     "font.size": 10.0,
     "axes.titlesize": 11.0,
     "axes.titlelocation": "left",

@@ -3,8 +3,10 @@
 from typing import NamedTuple
 
 import numpy as np
+from jax import Array
 from jaxtyping import PyTree
 
+from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import Plan, Status, lane
 from planner_jax.robot.arm import ArmPlan
@@ -51,7 +53,7 @@ def planned_row(folder: RunFolder, row: int | None) -> PlannedRow:
     last = manifest["summary"]["num"] - 1
     if row is None or not 0 <= row <= last:
         shown = "nothing" if row is None else row
-        raise ArgumentError("row", f"from 0 to {last}", shown=shown)
+        raise ArgumentError("row", f"from 0 to {last}", shown=str(shown))
     with folder.reading_rows():
         (found,) = folder.plans.pick([row])
         plan = sweep.plan_of_row(found, manifest.get("setting", {}))
@@ -90,7 +92,7 @@ def _outcome(row: Row) -> Entries:
     counts = {"iterations": row["iterations"], "status": Status[row["status"]]}
     return {
         **{name: _numbers(row[name]) for name in ("cost", "violation")},
-        **{name: np.asarray(count, np.int32) for name, count in counts.items()},
+        **{name: host_leaf(count, np.int32) for name, count in counts.items()},
     }
 
 
@@ -99,5 +101,5 @@ def _polynomial(coeffs: list, durations: list, axes: int) -> PiecewisePolynomial
     return PiecewisePolynomial(coeffs=pieces, durations=_numbers(durations))
 
 
-def _numbers(values: float | list) -> np.ndarray:
-    return np.asarray(values, np.float32)
+def _numbers(values: float | list) -> Array:
+    return host_leaf(values, np.float32)

@@ -4,11 +4,10 @@ import abc
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, Generic, SupportsFloat, TypeVar
 
 import jax
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
 from planner_jax.core.errors import CaseError
@@ -20,13 +19,15 @@ from planner_jax.robot.quadrotor import QuadrotorPlan
 from planner_jax.runs.columns import RefereedBatch, rows_of
 from planner_jax.runs.manifest import Row
 from planner_jax.runs.run_folder import RunFolder
-from planner_jax.runs.settings import SweepSettings
 from planner_jax.runs.source import Chunk
 from planner_jax.runs.style import draw
 from planner_jax.runs.table import align
 from planner_jax.sweep.quadrotor import SampledMotion, body_rate, net_thrust, sample_motion
+from planner_jax.sweep.quadrotor_settings import SingleSettings
 from planner_jax.sweep.report import RunRows
 from planner_jax.sweep.sweep import sweep_of
+
+SingleT = TypeVar("SingleT", bound=SingleSettings)
 
 _SAMPLES = 4001  # of a plan
 
@@ -71,7 +72,7 @@ class Answer:
         return bool(self.verdict.success)
 
 
-class Single(abc.ABC):
+class Single(abc.ABC, Generic[SingleT]):
     """The single cases of one task.
 
     Args:
@@ -82,7 +83,7 @@ class Single(abc.ABC):
     # Names of a case's fields, where they are not those of the settings behind their last dot.
     NAMES: ClassVar[dict[str, str]] = {"head_state": "start"}
 
-    def __init__(self, task: Task, settings: SweepSettings):
+    def __init__(self, task: Task, settings: SingleT):
         self.task, self.settings = task, settings
 
     @abc.abstractmethod
@@ -148,7 +149,12 @@ def _pieces(found: QuadrotorPlan) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _closest(
-    words: str, times: np.ndarray, values: np.ndarray, allowed: ArrayLike, *, least: bool = False
+    words: str,
+    times: np.ndarray,
+    values: np.ndarray,
+    allowed: SupportsFloat,
+    *,
+    least: bool = False,
 ) -> Margin:
     """Return the margin at the time at which a plan is closest to a limit, or beyond it most."""
     values = np.nan_to_num(values, nan=-np.inf if least else np.inf)  # no attitude: no limit kept
@@ -160,7 +166,7 @@ def _of_flight(answer: Answer, motion: SampledMotion) -> list[Margin]:
     limits, gravity = answer.case.limits, float(answer.case.gravity)
 
     def closest(
-        words: str, values: np.ndarray, allowed: ArrayLike, *, least: bool = False
+        words: str, values: np.ndarray, allowed: SupportsFloat, *, least: bool = False
     ) -> Margin:
         return _closest(words, motion.time, values, allowed, least=least)
 

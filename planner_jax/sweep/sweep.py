@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 import pkgutil
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, Generic
 
 import numpy as np
 from jaxtyping import PyTree
@@ -18,7 +18,7 @@ from planner_jax.core.registry import Task, task_named
 from planner_jax.planning.plan import plan
 from planner_jax.runs.columns import Column, RefereedBatch, leaf_columns
 from planner_jax.runs.manifest import Entries, Row
-from planner_jax.runs.settings import SweepSettings
+from planner_jax.runs.settings import AnySettings, SweepSettings
 from planner_jax.runs.source import DrawnSource, Source, filled_in
 from planner_jax.runs.summary import Tally
 from planner_jax.runs.table import RateTable, own_cells
@@ -38,7 +38,7 @@ class RunFigure:
     draw: Callable[[Figure, "RunRows"], None]  # takes an empty figure and a `report.RunRows`
 
 
-class Sweep:
+class Sweep(Generic[AnySettings]):
     """The sweep of a task: sources, planning, judging, columns, table and figures.
 
     What stands here serves any task; a task's own class, named by `SweepSettings.RUN`, replaces
@@ -76,11 +76,11 @@ class Sweep:
         """Return the columns of the run: the task's own, or every leaf of case, plan, verdict."""
         return self.own_columns or leaf_columns(batch)
 
-    def planner(self, settings: SweepSettings) -> Planner:
+    def planner(self, settings: AnySettings) -> Planner:
         """Return the planner of a run."""
         return self.task.planner(settings.planner, **settings.planner_options())
 
-    def other_planners(self, settings: SweepSettings) -> Entries:
+    def other_planners(self, settings: AnySettings) -> Entries:
         """Return the task's other planners of such cases by name, as far as they are installed."""
         own, _ = self.task.split_planner(settings.planner)
         made = {}
@@ -91,7 +91,7 @@ class Sweep:
         kind = self.planner(settings).case_type
         return {name: one for name, one in made.items() if one.case_type is kind}
 
-    def require_fit(self, settings: SweepSettings, planner: Planner, cases: PyTree) -> None:
+    def require_fit(self, settings: AnySettings, planner: Planner, cases: PyTree) -> None:
         """Raise `ArgumentError` unless the planner is one of such cases."""
         require(
             isinstance(cases, planner.case_type),
@@ -100,7 +100,7 @@ class Sweep:
             settings.planner,
         )
 
-    def open_source(self, settings: SweepSettings, batch: int) -> Source:
+    def open_source(self, settings: AnySettings, batch: int) -> Source:
         """Return the source of a sweep's cases; `batch` where the settings name none.
 
         Raises:
@@ -112,7 +112,7 @@ class Sweep:
         """Return the plans of a batch."""
         return plan(planner, cases)
 
-    def judge(self, cases: PyTree, plans: PyTree, settings: SweepSettings) -> PyTree:
+    def judge(self, cases: PyTree, plans: PyTree, settings: AnySettings) -> PyTree:
         """Return the referee's verdict on plans."""
         return self.task.judge(cases, plans, **settings.judge_options())
 
@@ -124,7 +124,7 @@ class Sweep:
         """Return the plan of a row; None where rows of the task are not read back."""
         return None
 
-    def tally(self, settings: SweepSettings) -> Tally:
+    def tally(self, settings: AnySettings) -> Tally:
         """Return an empty count of rows."""
         return self.counts()
 

@@ -205,7 +205,7 @@ def mean_position(prediction: Prediction, time: ArrayLike) -> Array:
     """Return the mean (2,) [m] of all alternatives at a time () [s]."""
     offset, _ = _errors(prediction, time)
     mean = jnp.sum(prediction.alternatives.chance[:, None] * offset, axis=0)
-    return prediction.path.at(time).pos + mean
+    return prediction.path.at(jnp.asarray(time)).pos + mean
 
 
 def covariance(prediction: Prediction, time: ArrayLike) -> Array:

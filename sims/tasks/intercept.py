@@ -10,7 +10,7 @@ import dataclasses
 import functools
 import time
 import zlib
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -306,7 +306,9 @@ def planned_anew(
     if isinstance(planner, SpacetimeIntercept):
         again = planner.replanner()
         now = {"start": pose, "speed": speed, "curvature": curvature}
-        task = again.begin(begun, drive.plan, elapsed, target=target, movers=movers, **now)
+        task = again.begin(
+            begun, cast(InterceptPlan, drive.plan), elapsed, target=target, movers=movers, **now
+        )
         left, found = task.case, plan_all(again, task)
     else:
         left = remaining(begun, elapsed, target, movers, pose, speed, curvature)

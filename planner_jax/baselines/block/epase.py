@@ -76,7 +76,7 @@ class OpenStates:
     def push(self, state: State) -> None:
         """Add a state."""
         self._lengths[_cell_of(state.angles)] = state.length
-        ahead = np.linalg.norm(state.angles - self._goal)
+        ahead = float(np.linalg.norm(state.angles - self._goal))
         entry = state.length + self._weight * ahead, next(self._number), state
         heapq.heappush(self._states, entry)
 

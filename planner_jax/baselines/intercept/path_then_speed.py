@@ -172,7 +172,7 @@ def lattice(**fields: object) -> PathThenSpeed:
     Args:
         **fields: of `PathThenSpeed`.
     """
-    return PathThenSpeed(**fields)
+    return dataclasses.replace(PathThenSpeed(), **fields)
 
 
 def em(kind: Literal["em", "em-exact"] = "em", **fields: object) -> PathThenSpeed:

@@ -20,6 +20,7 @@ from flax import struct
 from jax import Array, lax
 from numpy.typing import ArrayLike
 
+from planner_jax.core.arithmetic import Numbers
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import Status
 
@@ -193,7 +194,7 @@ def solve_qp(
 
 
 def _searched(
-    normals: Array, is_free: Array, low: Array, high: Array, slack: Array, config: QpConfig
+    normals: Numbers, is_free: Array, low: Array, high: Array, slack: Array, config: QpConfig
 ) -> _Search:
     """The dual method, from the empty working set to the optimum."""
     num, size = normals.shape
@@ -279,5 +280,5 @@ def _searched(
     return lax.while_loop(is_running, step, start)
 
 
-def _product(a: Array, b: Array) -> Array:
+def _product(a: Numbers, b: Numbers) -> Array:
     return jnp.matmul(a, b, precision=lax.Precision.HIGHEST)

@@ -2,13 +2,14 @@
 
 import dataclasses
 import zlib
+from typing import ClassVar
 
 import jax
 import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.core.planner import Planner
+from planner_jax.core.planner import Drive, Planner
 from planner_jax.core.protocol import lane
 from planner_jax.studies.block.contact_check import end_at_contact
 from planner_jax.studies.block.observation import eye
@@ -30,10 +31,12 @@ class SeenPlan(BlockPlan):
     motions: Array  # () int32, that were begun
 
 
+@jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class SeeingArms:
+class SeeingArms(Planner[BlockCase, SeenPlan]):
     """Arms that plan with what a camera has seen, once or again and again."""
 
+    case_type: ClassVar[type] = BlockCase
     planner: Planner
     sense: float  # [s], until the first fit
     overhead: float  # [s]
@@ -43,7 +46,7 @@ class SeeingArms:
     frame_rate: float  # [Hz]
     seed: int
 
-    def plans(self, cases: BlockCase) -> SeenPlan:
+    def plan_by(self, drive: Drive, cases: BlockCase) -> SeenPlan:
         """Return what the arms of a batch do, up to where they meet the true balls."""
         done = self.decided(cases)
         (error, std), (last, _) = (done.fit_errors(place) for place in (0, -1))

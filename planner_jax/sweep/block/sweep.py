@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from typing import ClassVar
 
 import jax
 import numpy as np
@@ -12,8 +13,9 @@ from jaxtyping import PyTree
 
 from planner_jax.baselines.block.library.adapt import AdaptBlock
 from planner_jax.baselines.block.library.planner import LibraryBlock
+from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.choices import require
-from planner_jax.core.planner import Planner
+from planner_jax.core.planner import Drive, Planner
 from planner_jax.robot.arm import ArmPlan
 from planner_jax.runs.columns import Column, RefereedBatch
 from planner_jax.runs.manifest import Entries, Row
@@ -39,19 +41,21 @@ class TimedPlan(BlockPlan):
     planning_time: Array  # () [s]
 
 
+@jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class CountedPlanner:
+class CountedPlanner(Planner[BlockCase, TimedPlan]):
     """Plans one after another by the clock; a plan that comes too late begins so much later."""
 
+    case_type: ClassVar[type] = BlockCase
     planner: Planner
     allowed: float  # [s], that planning may take; in the delay already
 
-    def plans(self, cases: BlockCase) -> TimedPlan:
+    def plan_by(self, drive: Drive, cases: BlockCase) -> TimedPlan:
         """Return the plans of a batch, up to where they meet the balls."""
         plans, spent = timed_plans(self.planner, cases)
         late = np.maximum(spent - self.allowed, 0.0).astype(cases.delay.dtype)
         met = delay_motion(cases, plans, late)
-        return jax.tree.map(np.asarray, TimedPlan(**vars(met), planning_time=spent))
+        return jax.tree.map(np.asarray, TimedPlan(**vars(met), planning_time=host_leaf(spent)))
 
 
 class BlockTally(Tally):
@@ -85,7 +89,7 @@ class BlockTally(Tally):
         return found
 
 
-class BlockSweep(Sweep):
+class BlockSweep(Sweep[BlockSettings]):
     """Arms that block thrown balls."""
 
     frame, counts = FRAME, BlockTally
@@ -95,7 +99,7 @@ class BlockSweep(Sweep):
         more = {SeenPlan: SEEN_COLUMNS, TimedPlan: TIMED_COLUMNS}.get(type(batch.plans), [])
         return [*COLUMNS, *more]
 
-    def planner(self, settings: BlockSettings) -> Planner | SeeingArms | CountedPlanner:
+    def planner(self, settings: BlockSettings) -> Planner:
         """Return the planner of a run; `ArgumentError` where its file is no library."""
         planner = super().planner(settings)
         if settings.perception:
@@ -124,12 +128,6 @@ class BlockSweep(Sweep):
         super().require_fit(settings, planner, cases)
         if isinstance(planner, LibraryBlock | AdaptBlock):
             planner.check(cases)
-
-    def plan(self, planner: Planner, cases: PyTree) -> PyTree:
-        """Return the plans of a batch; of arms that see or wait, what they do."""
-        if isinstance(planner, SeeingArms | CountedPlanner):
-            return planner.plans(cases)
-        return super().plan(planner, cases)
 
     def plan_of_row(self, row: Row, setting: Entries) -> ArmPlan:
         """Return the plan of a row; it begins when the arm may start, at the row's `delay`."""

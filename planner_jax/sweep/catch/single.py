@@ -6,11 +6,12 @@ from jaxtyping import PyTree
 
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath
+from planner_jax.sweep.catch.settings import SingleCatchSettings
 from planner_jax.sweep.single import Answer, Margin, Single
 from planner_jax.task.catch.case import GRAVITY
 
 
-class SingleCatch(Single):
+class SingleCatch(Single[SingleCatchSettings]):
     """A quadrotor that catches one ball, or several one after another."""
 
     NAMES = {

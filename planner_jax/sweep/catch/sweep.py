@@ -68,7 +68,7 @@ class CatchTally(Tally):
         }
 
 
-class CatchSweep(Sweep):
+class CatchSweep(Sweep[CatchSettings]):
     """Quadrotors that catch flying targets with a net."""
 
     frame, own_columns, single_columns = FRAME, COLUMNS, COLUMNS

@@ -1,5 +1,7 @@
 """The columns of a hit run: what was served, planned and judged."""
 
+from typing import cast
+
 import numpy as np
 import pyarrow as pa
 
@@ -7,6 +9,7 @@ from planner_jax.runs import columns as known
 from planner_jax.runs.columns import BOOL, COUNT, TEXT, VECTOR, Column, leaves_of, list_of
 from planner_jax.sweep.quadrotor import MOTION, START, TRAJECTORY
 from planner_jax.task.hit import court
+from planner_jax.task.hit.suites import Serves
 
 FRAME = "world, z up, net at x = 0; times from the start of planning"
 _POINT = list_of(pa.float64(), 3)
@@ -20,7 +23,7 @@ def published_column(planner: str) -> str:
 
 def _published(place: int, planner: str) -> Column:
     def values(batch: known.RefereedBatch) -> pa.Array | None:
-        if (found := batch.chunk.origin.published) is None:
+        if (found := cast(Serves, batch.chunk.origin).published) is None:
             return None
         outcome = found[:, place]
         return pa.array(outcome == 1.0, pa.bool_(), mask=np.isnan(outcome))

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import os
+from collections.abc import Iterable
 from typing import ClassVar
 
 from planner_jax.core.choices import require
@@ -57,7 +58,7 @@ class HitSettings(QuadrotorSettings):
         return super().planner_options() | truer
 
 
-def _checked_start(start: object) -> tuple[float, ...] | str:
+def _checked_start(start: str | Iterable[float]) -> tuple[float, ...] | str:
     rule = f"three finite numbers with z > 0, none beyond {_FARTHEST:g}, or 'uniform'"
     if start in ("uniform", ["uniform"]):
         return "uniform"

@@ -3,10 +3,11 @@
 import numpy as np
 from jaxtyping import PyTree
 
+from planner_jax.sweep.hit.settings import SingleHitSettings
 from planner_jax.sweep.single import Answer, Margin, Single
 
 
-class SingleHit(Single):
+class SingleHit(Single[SingleHitSettings]):
     """A quadrotor that returns one ball."""
 
     NAMES = {

@@ -21,11 +21,12 @@ from planner_jax.task.hit.suites import Serves, generate_serves, read_serves, to
 class ServeSource(Source):
     """Where the serves of a sweep come from; they are the origin of its cases."""
 
+    settings: HitSettings
     folder: Serves | None  # the serves of the published files, if these were asked for
 
     def cases(self, first: int, last: int) -> Chunk:
         """As `Source.cases`; a ball that is down before planning begins breaks a rule, too."""
-        settings: HitSettings = self.settings
+        settings = self.settings
         if self.folder is not None:
             serves = self.folder[first:last]
         else:

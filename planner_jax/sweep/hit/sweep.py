@@ -79,7 +79,7 @@ class HitTally(Tally):
         return {**super().summary(), "per_scenario": per_scenario}
 
 
-class HitSweep(Sweep):
+class HitSweep(Sweep[HitSettings]):
     """Quadrotors that return served balls with a racket."""
 
     frame, own_columns, counts = FRAME, COLUMNS, HitTally

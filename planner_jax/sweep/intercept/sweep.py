@@ -34,7 +34,7 @@ class InterceptTally(Tally):
         return [success & is_near, *super().examples(rows, success)]
 
 
-class InterceptSweep(Sweep):
+class InterceptSweep(Sweep[InterceptSettings]):
     """Cars that meet moving targets among obstacles."""
 
     frame, own_columns, counts = FRAME, COLUMNS, InterceptTally

@@ -171,9 +171,9 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         """Return the plans of a batch by one round."""
         return super().solve_lanes(cases, self._for_start(attempt, cases))
 
-    def starts_long(self, case: CatchCase) -> bool:
+    def starts_long(self, cases: CatchCase) -> bool:
         """Return whether the first search is a long one: many targets that must all be caught."""
-        return self.rounds == _ROUNDS and case.num_targets > _FEW and not case.optional
+        return self.rounds == _ROUNDS and cases.num_targets > _FEW and not cases.optional
 
     def _for_start(self, attempt: Round, case: CatchCase) -> Round:
         """Return a shorter first round where it starts near its end, longer searches elsewhere."""

@@ -190,7 +190,7 @@ class ReplanCatch(OptimisedPlanner):
         return jax.lax.cond(context.keep, rest, lambda: plan)
 
 
-def _states(coeffs: Array, time: Array) -> Array:
+def _states(coeffs: Array, time: Numbers) -> Array:
     """States (K, 4, 3) on K pieces (K, D + 1, 3), each at its own time (K,) since it began."""
     factors, powers = state_basis(coeffs.shape[1])
     basis = time[:, None, None] ** jnp.asarray(powers, time.dtype)

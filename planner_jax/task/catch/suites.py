@@ -80,6 +80,7 @@ from jaxtyping import PyTree
 
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath, HarmonicPath, TargetPath
+from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.checks import floating, require_scalar
 from planner_jax.core.choices import require_scale
 from planner_jax.core.errors import ArgumentError
@@ -208,7 +209,8 @@ def _throws(uniform: PyTree, throws: tuple[_Throw, ...]) -> tuple[BallPath, PyTr
     pos, vel, horizon = (xp.stack(column, axis=1) for column in zip(*drawn, strict=True))
     drag = np.broadcast_to([[t.drag] * 3 for t in throws], pos.shape)
     gravity = np.full(horizon.shape, GRAVITY)
-    return BallPath(BallState(pos=pos, vel=vel), drag, gravity), horizon
+    ball = BallState(pos=pos, vel=vel)
+    return BallPath(ball, host_leaf(drag), host_leaf(gravity)), horizon
 
 
 def _throw(uniform: PyTree, throw: _Throw) -> tuple[PyTree, PyTree, PyTree]:
@@ -267,7 +269,8 @@ def _fly(pos, vel, time, drag: float, gravity: float = GRAVITY) -> tuple[PyTree,
 def _lines(pos: PyTree, vel: PyTree) -> BallPath:
     """Targets that fly straight on from `pos` (B, N, 3) at `vel`."""
     ball = BallState(pos=pos, vel=vel)
-    return BallPath(ball, drag=np.zeros(pos.shape), gravity=np.zeros(pos.shape[:2]))
+    drag, gravity = host_leaf(np.zeros(pos.shape)), host_leaf(np.zeros(pos.shape[:2]))
+    return BallPath(ball, drag=drag, gravity=gravity)
 
 
 def _harmonic(uniform: PyTree) -> tuple[HarmonicPath, PyTree]:

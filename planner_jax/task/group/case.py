@@ -4,7 +4,7 @@ Paper 003 meets one target and names groups as future work; what is here is this
 """
 
 import dataclasses
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -94,7 +94,7 @@ class InterceptGroup:
 
 
 def case(
-    targets: PlanePath, time: ArrayLike = 15.0, *, present: ArrayLike = True, **settings: object
+    targets: PlanePath, time: ArrayLike = 15.0, *, present: ArrayLike = True, **settings: Any
 ) -> InterceptGroup:
     """Return a group, or a batch, by default with the car and the map of `pj.intercept.case`.
 

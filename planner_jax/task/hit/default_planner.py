@@ -6,7 +6,7 @@ choice of variables, which needs none of the singular divisions of its eqs 13-14
 """
 
 import dataclasses
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, cast
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ from planner_jax.ball.prediction import LEAST_NODES, target_at
 from planner_jax.core.choices import require_size
 from planner_jax.cost.quadrotor import Measure
 from planner_jax.optimise.chain import ChainEnds, ChainPlanner
-from planner_jax.optimise.planner import pending
+from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.settings import LbfgsConfig, Round, Settings, Stage
 from planner_jax.optimise.shipped import StartNetwork, shipped_network
 from planner_jax.robot.quadrotor import tangent_basis
@@ -269,9 +269,9 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         across = tangent_basis(impact.stroke.normal)
         return natural.at[3:5].set(jnp.stack([jnp.sum(vel * each) for each in across]))
 
-    def carried(self, point: Array, before: Self) -> Array:
+    def carried(self, point: Array, before: OptimisedPlanner) -> Array:
         """Return a point (n,) without velocities as one with the smoothest velocities."""
-        if self.velocities == before.velocities:
+        if self.velocities == cast(ExactHit, before).velocities:
             return point
         places, own = point[: self._num_places], point[self._num_places :]
         return jnp.concatenate([places, jnp.zeros_like(places), own])

@@ -203,6 +203,7 @@ def _aim(distance: np.ndarray, rise: np.ndarray):
     drag_free_time = (rise + np.sqrt(rise**2 + 2.0 * GRAVITY * SERVE_HEIGHT)) / GRAVITY
     speed = distance / drag_free_time * (1.0 + 0.5 * DRAG * distance)
     position = np.array([0.0, 0.0, SERVE_HEIGHT])
+    slope, time = np.zeros_like(speed), np.zeros((2, *speed.shape))
     for _ in range(_AIM_STEPS):
         # The second ball is a little faster: its lead gives the slope.
         pair = np.stack([speed, speed * (1.0 + 1e-5)])

@@ -1,6 +1,7 @@
 """The functions `pj.intercept.draw`, `observe`, `planner` and `judge`."""
 
 import zlib
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -122,7 +123,7 @@ def judge(cases: InterceptCase, plans: InterceptPlan, **settings: object) -> Int
     target = cases.target
     if (truth := settings.get("truth")) is not None:
         require_path("truth", truth, cases.batch_shape, 2)
-        target = truth
+        target = cast(PlanePath, truth)
         if cases.batch_shape == ():
             one = jax.tree.map(lambda leaf: np.asarray(leaf)[None], truth)
             settings = {**settings, "truth": one}

@@ -42,7 +42,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
-from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from planner_jax.core.checks import floating
@@ -133,7 +132,7 @@ def _columns(suite: Suite) -> int:
     return 7 + suite.wall_room[0] * (2 + _SHAPE) + suite.mover_room[0] * (3 + _SHAPE)
 
 
-def _between(uniform: np.ndarray, low: ArrayLike, high: ArrayLike) -> np.ndarray:
+def _between(uniform: np.ndarray, low: float | np.ndarray, high: float) -> np.ndarray:
     """Spread numbers of [0, 1) over an interval."""
     return low + uniform * (high - low)
 
@@ -351,7 +350,9 @@ def _is_too_far(_: Suite, drawn: Draws) -> np.ndarray:
     return np.linalg.norm(distance, axis=1) > TOP_SPEED * drawn["time"]
 
 
-def _room(drawn: Draws, kind: str, points: np.ndarray, times: ArrayLike = 0.0) -> np.ndarray:
+def _room(
+    drawn: Draws, kind: str, points: np.ndarray, times: float | np.ndarray = 0.0
+) -> np.ndarray:
     """Return the least distance (B,) [m] of points (B, [M,] 2) from obstacles at times (B,)."""
     corners, points = drawn[kind], points if points.ndim == 3 else points[:, None]
     if kind == "movers":

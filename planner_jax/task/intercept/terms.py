@@ -1,6 +1,7 @@
 """What an interception costs: hinges on limits, obstacles and the miss, with their slopes."""
 
 import dataclasses
+from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
@@ -81,7 +82,7 @@ def limit_terms(
     steering = gain * (c - curvature[:-1])
     excesses, squares = [], SumOfSquares(6)
 
-    def hinge(value: Array, limit: Array, by: dict[int, Array | float]) -> None:
+    def hinge(value: Array, limit: Array, by: Mapping[int, Array | float]) -> None:
         excess = jnp.abs(value) / limit - 1.0
         inside = jnp.maximum(excess + weights.slack, 0.0)
         sign = jnp.where(inside > 0.0, jnp.sign(value), 0.0) / limit
@@ -120,7 +121,7 @@ class SumOfSquares:
         """Of so many numbers that a residual has: its slopes, and itself."""
         self._size, self._sums = size, {}
 
-    def add(self, row: dict[int, Array | float], weight: Array | float) -> None:
+    def add(self, row: Mapping[int, Array | float], weight: Array | float) -> None:
         """Add the products of one residual's numbers, those that are not zero."""
         for a, left in row.items():
             for b, right in row.items():

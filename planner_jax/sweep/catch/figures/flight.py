@@ -22,7 +22,7 @@ def flight_figure(figure: Figure, run: RunRows) -> None:
     setting, (_, row) = run.manifest["setting"], run.same_case()[0]
     motion = sample_motion(row["coeffs"], row["durations"], _SAMPLES)
     plan = sampled_catch(row, motion, setting)
-    left, right = figure.subfigures(1, 2, width_ratios=[3.0, 1.6])
+    ((left, right),) = figure.subfigures(1, 2, squeeze=False, width_ratios=[3.0, 1.6])
     low, high = _window(plan)
     views = left.subplots(2, 1, sharex=True, height_ratios=(high - low)[[2, 1]])
     for axes, second in zip(views, (2, 1), strict=True):

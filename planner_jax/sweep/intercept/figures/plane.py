@@ -136,10 +136,15 @@ def draw_map(axes: Axes, setting: Entries, walls: list[np.ndarray]) -> None:
 
 
 def draw_polygons(
-    axes: Axes, polygons: list[np.ndarray], colour: ColorType, **look: object
+    axes: Axes,
+    polygons: list[np.ndarray],
+    colour: ColorType | np.ndarray,
+    *,
+    alpha: float = 0.25,
+    zorder: float = 2,
 ) -> None:
     """Draw polygons (V, 2) [m] in a colour, pale inside."""
-    look = {"alpha": 0.25, "linewidth": 0.0, "zorder": 2, **look}
-    axes.add_collection(PolyCollection(polygons, facecolor=colour, **look))
-    edge = {"facecolor": "none", "edgecolor": colour, "linewidth": 1.0, "zorder": look["zorder"]}
+    look: Look = {"facecolor": colour, "alpha": alpha, "linewidth": 0.0, "zorder": zorder}
+    axes.add_collection(PolyCollection(polygons, **look))
+    edge: Look = {"facecolor": "none", "edgecolor": colour, "linewidth": 1.0, "zorder": zorder}
     axes.add_collection(PolyCollection(polygons, **edge))
