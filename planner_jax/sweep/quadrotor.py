@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from planner_jax.core.arithmetic import host_leaf
 from planner_jax.runs.columns import LIST, VECTOR, Column, RefereedBatch, leaves_of
 from planner_jax.runs.manifest import Row
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, states_at
@@ -88,7 +89,7 @@ def sample_motion(
     lengths = np.asarray(durations, float)
     pieces = np.asarray(coeffs, float).reshape(len(lengths), -1, 3)
     time = np.linspace(0.0, lengths.sum(), num)
-    leaves = (np.broadcast_to(leaf, (num, *leaf.shape)) for leaf in (pieces, lengths))
+    leaves = (host_leaf(np.broadcast_to(x, (num, *x.shape))) for x in (pieces, lengths))
     states = states_at(PiecewisePolynomial(*leaves), time)
     return SampledMotion(time, *np.moveaxis(states, 1, 0))
 
