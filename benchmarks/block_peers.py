@@ -1,4 +1,4 @@
-"""All block planners on the same throws: Tables I and II of paper 004 beside our figures.
+"""All block planners on the same throws: Tables I and II of [Natarajan2024] beside our figures.
 
     python -m benchmarks.block_peers [--suite pole] [--regime R1] [--num 100] [--out DIR]
 
@@ -84,7 +84,7 @@ class Torques:
 def motion_torques(
     arm: Arm, motion: PiecewisePolynomial, gravity: float | Array = 9.81, samples: int = 256
 ) -> Torques:
-    """Return joint torques over a motion: sqrt(1/T int tau^2 dt) as in Table II of paper 004.
+    """Return joint torques over a motion: sqrt(1/T int tau^2 dt) as in Table II of [Natarajan2024].
 
     The integral is that of the midpoint rule, as accelerations may jump at the ends. The paper
     does not say whether gravity counts, nor how it samples; without gravity ask for 0.

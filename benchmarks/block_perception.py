@@ -5,11 +5,12 @@
                                           [--parts errors,images,pipeline,planning]
 
 Balls are watched from the first frame, at time 0, until some moment, and their flight is fitted
-once, with gravity known (paper 004, eqs 5 to 8). The error is that of the ball's position across
-its flight in the middle of its way between the two boxes; a shield that may meet the ball 0.1 m off
-its middle has so much room. Round noise is as large in every direction; the stereo camera has the
-noise of `stereo_noise`, and its observations are weighted by it, or all alike as in the paper's
-eq. 8. The summary's success is that of the suite `short`, 60 Hz, 2 cm, 0.25 s: within 0.1 m.
+once, with gravity known [Natarajan2024, eqs 5 to 8]. The error is that of the ball's position
+across its flight in the middle of its way between the two boxes; a shield that may meet the ball
+0.1 m off its middle has so much room. Round noise is as large in every direction; the stereo camera
+has the noise of `stereo_noise`, and its observations are weighted by it, or all alike as in the
+paper's eq. 8. The summary's success is that of the suite `short`, 60 Hz, 2 cm, 0.25 s: within 0.1
+m.
 
 Then images: throws of `short` are rendered at 60 Hz, and go through depth noise, colour mask,
 outlier rejection, centroid, the frame of a simulated calibration and the fit, beside the stereo
@@ -21,9 +22,9 @@ Then the whole pipeline: throws of `short` with the limits R1, wide (0.1 m off t
 degrees), seen, fitted, planned for and judged against the true ball. An arm decides once at a fixed
 moment; or once, at the first frame after which it could not wait for another; or again and again.
 Its motion begins 50 ms after the frame, and what is behind `on it` are balls that meet the shield
-anywhere on its face. Beside it is paper 004's eq. 1: sensing, overhead and motion have to be over
-when the ball is there. The planning in between is timed one throw at a time, and is to be shorter
-than the overhead.
+anywhere on its face. Beside it is [Natarajan2024, eq. 1]: sensing, overhead and motion have to be
+over when the ball is there. The planning in between is timed one throw at a time, and is to be
+shorter than the overhead.
 """
 
 import dataclasses

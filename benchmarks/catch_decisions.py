@@ -1,4 +1,4 @@
-"""Table III of paper 000 by decision: what order and times are worth, and what they cost.
+"""Table III of [Yu2023catch] by decision: what order and times are worth, and what they cost.
 
     python -m benchmarks.catch_decisions [--suites triangle3,hexagon6] [--num 1000] [--seed 777]
         [--policy FILE] [--timed 200] [--out DIR]

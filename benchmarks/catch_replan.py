@@ -11,7 +11,7 @@ missed deadline, and dropped. The filter knows the drag. A plan that breaks a li
 too; the last 0.05 s are flown as they were planned.
 
 What was flown, from the first plan to the catch, is refereed against the ball's true path, by
-the shared protocol of paper 000 (5 %, net test "ball"). Beside it stands what the first plan
+the shared protocol of [Yu2023catch] (5 %, net test "ball"). Beside it stands what the first plan
 alone would have caught. With --alone re-plans are only timed, beside plans from scratch of the
 same throws. The summary of the run folder is of what was flown, or of the re-plans alone; its cost
 gap is that of the first re-plans. Everything is computed in the thread that calls, as in the live

@@ -6,9 +6,9 @@
 Plans are made once for each regime, one at a time, and carried out in every row; a ball is blocked
 when it comes down on the face of the shield before its centre is in the inner box, and a block
 counts if the arm touched nothing until then. The arm may start 163 ms after a ball is first seen:
-83 ms of perception and 50 ms of overheads (paper 004, Section VI-B), and 30 ms for planning. A plan
-that took longer counts as there in time, since the clock is that of the machine at hand, unless
-`--count` is given. The share of plans that the referee accepts is what an ideal arm reaches.
+83 ms of perception and 50 ms of overheads [Natarajan2024, Section VI-B], and 30 ms for planning. A
+plan that took longer counts as there in time, since the clock is that of the machine at hand,
+unless `--count` is given. The share of plans that the referee accepts is what an ideal arm reaches.
 """
 
 import dataclasses

@@ -4,7 +4,7 @@
                                   [--limit 300]
 
 Noise `lab` with a latency of 20 ms; the drag is believed 15 % wrong, either way. Catches are
-planned anew at 100 Hz, hits at 50 Hz and, as in paper 002, not at all. A flight of several balls
+planned anew at 100 Hz, hits at 50 Hz and, as in [Yu2023bat], not at all. A flight of several balls
 counts if all are caught. Every line has its share with the 95 % Wilson interval, where there is
 one the share that it must reach, and the seconds of a second run in which nothing is compiled,
 planning from scratch apart. A line that takes longer than the limit is given up as soon as the

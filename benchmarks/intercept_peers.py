@@ -1,4 +1,4 @@
-"""All intercept planners on the same cases: Tables II and III of paper 003 beside our figures.
+"""All intercept planners on the same cases: Tables II and III of [Qu2022] beside our figures.
 
     python -m benchmarks.intercept_peers [--suite hard] [--num 200] [--timed 50] [--out DIR]
 

@@ -3,7 +3,7 @@
     python -m benchmarks.intercept_predicted [--suite hard] [--num 40] [--seed 0] [--out DIR]
 
 A target is seen 15 times, once a second up to the start, with noise of 0.1 m on each coordinate
-(paper 003, Section V-A), and `select` says where it will go; the planner knows walls and movers,
+[Qu2022, Section V-A], and `select` says where it will go; the planner knows walls and movers,
 but of the target the prediction alone. Rows, for targets that go straight and for those that turn:
 
 * `one shot`: one plan, driven to its end.

@@ -1,4 +1,4 @@
-"""Where targets will be: Table I of paper 003 and its polynomials beside ours and the bound.
+"""Where targets will be: Table I of [Qu2022] and its polynomials beside ours and the bound.
 
     python -m benchmarks.intercept_prediction [--num 20000] [--seed 0] [--out DIR]
 
@@ -130,9 +130,9 @@ def report(bench: Bench, mode: str, num: int, seed: int) -> None:
         row("Cramer-Rao", *(np.asarray(each).mean(axis=0) for each in bounds(paths)))
     if mode in PUBLISHED:
         cells = [f"{value} %" for value in PUBLISHED[mode]] + [""] * len(RADII)
-        lines.append(f"| paper 003 | {' | '.join(cells)} |")
+        lines.append(f"| [Qu2022] | {' | '.join(cells)} |")
         grown = {
-            "paper 003": np.array(PUBLISHED[mode]),
+            "[Qu2022]": np.array(PUBLISHED[mode]),
             **{name: off[:, METHODS.index(name)].mean(axis=0) for name in ("degree 2", "selected")},
         }
         ratios = {name: " : ".join(f"{g:.1f}" for g in e / e[0]) for name, e in grown.items()}
@@ -178,7 +178,7 @@ def latency(bench: Bench, num: int, seed: int) -> None:
     bench.say(
         "",
         f"one prediction and its chance of being within {RADII[0]} m, one core, warm: p50 "
-        f"{p50:.3f} ms, p99 {p99:.3f} ms; load average {os.getloadavg()[0]:.1f}; paper 003: "
+        f"{p50:.3f} ms, p99 {p99:.3f} ms; load average {os.getloadavg()[0]:.1f}; [Qu2022]: "
         "<= 1 ms",
     )
     bench.note(p50_ms=p50, p99_ms=p99)

@@ -1,4 +1,4 @@
-"""Speed along a known way: the planners of paper 003's Table II, and more, on seeded problems.
+"""Speed along a known way: the planners of [Qu2022, Table II], and more, on seeded problems.
 
     python -m benchmarks.intercept_speed [--num 500] [--seed 0] [--batch 65536] [--out DIR]
 

@@ -1,4 +1,4 @@
-"""Seeded problems of speed planning, for a comparison like Table II of paper 003."""
+"""Seeded problems of speed planning, for a comparison like Table II of [Qu2022]."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ _MOST = 3  # polygons of one problem
 
 
 def speed_problems(num: int, seed: int = 0, *, dtype: Any = np.float32) -> StationTimeProblem:
-    """Problems with the setting of paper 003, Section V-C, and one to three random parallelograms.
+    """Problems with the setting of [Qu2022, Section V-C], and one to three random parallelograms.
 
     6 m in 10 s, beginning with 0.5 m/s and no acceleration. The limits, 1.5 m/s and 2 m/s^2, and
     the parallelograms are assumptions: centres at 1 to 5 m and 1.5 to 8.5 s, 0.6 to 1.5 m high and

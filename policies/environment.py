@@ -2,8 +2,8 @@
 
 It is batched itself: `reset` takes a batch of keys and `step` a batch of actions, so that the
 planner in it solves all cases together, by the kernels of a GPU too. The lanes are shared among
-the suites evenly, each planned at its own number of targets. As in paper 000, IV-B, an episode is
-one step: the next cases are drawn in it, and never the same again.
+the suites evenly, each planned at its own number of targets. As in [Yu2023catch, IV-B], an episode
+is one step: the next cases are drawn in it, and never the same again.
 """
 
 import functools
@@ -159,7 +159,7 @@ def judged(cases: CatchCase, actions: Array, iterations: int) -> dict[str, Array
         last: how much earlier the last catch is than the estimate of `Greedy`, relative; zero
             where targets are optional.
         caught: how many more targets are taken than by `Greedy`, relative; zero but there.
-        ratio: the optimal time ratio (paper 000, eq. 29); zero by the estimate.
+        ratio: the optimal time ratio [Yu2023catch, eq. 29]; zero by the estimate.
         violation: of the plan, 2 at most; by the estimate log(1 + metres out of reach).
     """
     tables = jax.vmap(timetable)(cases)

@@ -1,7 +1,7 @@
 """What a policy sees of a catch, and what its actions mean: order and times.
 
-A policy sees each target by itself (paper 000, eq. 6, with where the target will be beside where it
-is), so that a network may treat any number of them alike. Its action gives each target a
+A policy sees each target by itself ([Yu2023catch, eq. 6], with where the target will be beside
+where it is), so that a network may treat any number of them alike. Its action gives each target a
 handicap, by how much later than it can be caught it is taken to be, and a stretch of its estimated
 time. Without either the decision is that of `Greedy`; every action is a valid one: an order, and
 times that rise.

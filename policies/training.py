@@ -1,4 +1,4 @@
-"""Training by Brax's PPO (paper 000, eqs 5 and 7): in parts, so that it can go on.
+"""Training by Brax's PPO [Yu2023catch, eqs 5 and 7]: in parts, so that it can go on.
 
 A run is a row of parts, each one call of `brax.training.agents.ppo.train` from the weights of the
 last, with rewards by the planner or by the estimate. What a part leaves is kept by Orbax before

@@ -4,7 +4,7 @@
 
 World frame, z up, SI units. `qpos` holds the robot's joint positions and then the balls'
 positions; `qvel` the robot's joint velocities and then the balls' velocities. A ball does not
-spin (paper 002, Section II), so three slides are its joint. Ball drag is a force in
+spin [Yu2023bat, Section II], so three slides are its joint. Ball drag is a force in
 `qfrc_applied`.
 
 In flight nothing touches: the racket's impact is the library's map and a caught ball has

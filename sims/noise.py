@@ -123,7 +123,7 @@ class PlaneSensing:
 
 PLANE_NOISES = {
     "none": PlaneSensing(),
-    # Paper 003, Section V-A, sees targets once a second with a variance of 0.01 m^2 a coordinate,
+    # [Qu2022, Section V-A], sees targets once a second with a variance of 0.01 m^2 a coordinate,
     # and says nothing of the car's own pose, of which 1 cm and 0.01 rad are assumptions.
     "paper": PlaneSensing(target_std=0.1, pose_stds=(0.01, 0.01)),
 }

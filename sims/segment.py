@@ -1,8 +1,8 @@
 """A ball in an image by its colour, and where it is by the depth of its pixels.
 
-Paper 004, Section IV-F.1 and 2: thresholds of hue, saturation and value make a mask; pixels of
-little confidence and depths that do not belong to the ball are dropped, and what is left, if there
-is enough of it, has a centroid.
+[Natarajan2024, Section IV-F]: thresholds of hue, saturation and value make a mask; pixels
+of little confidence and depths that do not belong to the ball are dropped, and what is left, if
+there is enough of it, has a centroid.
 """
 
 import jax

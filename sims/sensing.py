@@ -2,7 +2,7 @@
 
 A look at a ball shows where it was a latency ago, with noise, or nothing at all. The library's
 Kalman filter turns looks into position and velocity; the energy that the ball has lost since it
-was first seen well says what its drag is (paper 002, eqs 6 and 7). World frame, SI units.
+was first seen well says what its drag is [Yu2023bat, eqs 6 and 7]. World frame, SI units.
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ _DRAG_SPREAD = 0.2  # relative standard deviation of the drag believed at first
 def specific_energy(ball: BallState, gravity: Array) -> Array:
     """Return the mechanical energy per unit mass  |v|^2 / 2 + g z  [m^2/s^2], g > 0 the magnitude.
 
-    Paper 002 prints  + g' s  above eq. 6; with its own g, which points down, that sum would
+    [Yu2023bat] prints  + g' s  above eq. 6; with its own g, which points down, that sum would
     not be conserved in free flight.
     """
     return 0.5 * jnp.sum(ball.vel**2) + gravity * ball.pos[2]
@@ -140,7 +140,7 @@ def _energy(belief: EkfState, gravity: Array) -> tuple[Array, Array]:
 
 
 def with_drag(estimate: Estimate, gravity: Array) -> Estimate:
-    """The estimate with K_D from the energy lost since the anchor (paper 002, eq. 7).
+    """The estimate with K_D from the energy lost since the anchor [Yu2023bat, eq. 7].
 
     The one loss over all that time is weighed against what was believed at first; the paper's
     running mean of losses between looks would count the same noise again and again.

@@ -29,7 +29,7 @@ _AT_ONCE = 4096  # flights, by default
 _FLIGHT_BYTES, _FLOWN_BYTES = 1_000_000, 4_000
 _FASTEST = 10_000.0  # [Hz]
 _MOST_BALLS = 12  # of one flight, as of the largest suite: every one makes the program longer
-INTERVAL = 0.8  # [s], from throw to throw (paper 000, Fig. 1)
+INTERVAL = 0.8  # [s], from throw to throw [Yu2023catch, Fig. 1]
 
 
 def fly_settings(task: str) -> type["FlySettings"]:
@@ -311,7 +311,8 @@ class BlockFly(FlySettings):
     @property
     def until_known(self) -> float:
         """[s], from when the ball is first seen until its flight is known, or first fitted."""
-        # Paper 004, Section VI-B: 82.9 ms for perception and 50 ms for the rest of the system.
+        # [Natarajan2024, Section VI-B]: 82.9 ms for perception and 50 ms for the rest of the
+        # system.
         usual = 0.25 if self.perception else 0.133
         return usual if self.sense is None else self.sense
 

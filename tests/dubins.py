@@ -4,7 +4,7 @@ Of Dubins's six words (three arcs, or an arc, a straight line and an arc, at the
 curvature) the shortest is the shortest way of all (L. E. Dubins, 1957). Their lengths are closed
 forms (A. M. Shkel and V. Lumelsky, Classification of the Dubins set, 2001), all six at once here,
 so that a batch takes no branches. World frame in the plane, SI units, headings counter-clockwise
-from the x axis. Paper 003 uses them as the heuristic and the last part of its search for a path
+from the x axis. [Qu2022] uses them as the heuristic and the last part of its search for a path
 (Section III-B).
 """
 

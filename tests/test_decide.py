@@ -279,7 +279,7 @@ def test_fewer_finalists_are_the_first_of_more_and_one_is_needed(triangles):
 
 
 def test_the_time_ratio_is_that_of_the_present_targets(pairs):
-    """Paper 000, eq. 29, by hand: of the last case the second target is absent."""
+    """[Yu2023catch, eq. 29], by hand: of the last case the second target is absent."""
     present = np.ones((5, 2), bool)
     present[4, 1] = False
     order = np.array([[0, 1], [1, 0], [0, 1], [1, 0], [0, 1]])

@@ -1,4 +1,4 @@
-"""Paper 000's planner against the published C++ protocol: 240 throws, guess and optimum of each.
+"""The planner of [Yu2023catch] against the published C++ protocol: 240 throws, guess and optimum.
 
 `data/catch_paper.csv` and `data/catch_hard.csv` hold the ball at the time of planning, the time
 T_p of the guess, its cost with 4 and with 8 pieces, and the optimum that a C++ implementation

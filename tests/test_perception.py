@@ -114,7 +114,7 @@ def test_the_covariance_is_that_of_many_fits():
 
 
 def test_the_estimate_is_that_of_polynomials():
-    """With equal weights each axis is a line, z after the fall is taken off (paper 004, eq. 8)."""
+    """With equal weights each axis is a line, z without the fall [Natarajan2024, eq. 8]."""
     places = seen(1, np.random.default_rng(1))[0]
     there = believed(fit_one(TIMES, places, 1.0, GRAVITY), 0.0, GRAVITY)
     fallen = places.astype(float)

@@ -50,7 +50,7 @@ def hover(place, pieces):
 
 
 def drop(time):
-    """How far a ball with linear drag falls from rest: paper 000, eq. 9, with its constant."""
+    """How far a ball with linear drag falls from rest: [Yu2023catch, eq. 9], with its constant."""
     return GRAVITY * time / DRAG - GRAVITY * (1.0 - math.exp(-DRAG * time)) / DRAG**2
 
 

@@ -1,4 +1,4 @@
-"""The problem of `ExactCatch` with one ball in CasADi's symbols, from paper 000 and docstrings."""
+"""The problem of `ExactCatch` with one ball in CasADi's symbols, after [Yu2023catch]."""
 
 import math
 from typing import Any
@@ -52,7 +52,7 @@ def problem(planner: Any) -> Problem:
 
 
 def ball_at(time: Any, told: dict) -> tuple[Any, Any]:
-    """Position and velocity of a ball with linear drag on each axis (paper 000, eq. 9)."""
+    """Position and velocity of a ball with linear drag on each axis [Yu2023catch, eq. 9]."""
     x = told["ball_drag"] * time
     small = ca.fabs(x) < 0.5
     near, far = ca.if_else(small, x, 0.0), ca.if_else(small, 1.0, x)

@@ -1,4 +1,4 @@
-"""The problem of `ExactHit` in CasADi's symbols, from paper 002 and the planner's docstrings."""
+"""The problem of `ExactHit` in CasADi's symbols, from [Yu2023bat] and the planner's docstrings."""
 
 from typing import Any
 
@@ -48,7 +48,7 @@ def problem(planner: Any) -> Problem:
 
 
 def keys(distance: Any) -> Any:
-    """Keys' kernel with a = -1/2 at a distance in nodes (paper 002, eq. 10b)."""
+    """Keys' kernel with a = -1/2 at a distance in nodes [Yu2023bat, eq. 10b]."""
     u = ca.fabs(distance)
     near = (1.5 * u - 2.5) * u * u + 1.0
     far = ((-0.5 * u + 2.5) * u - 4.0) * u + 2.0
@@ -56,7 +56,7 @@ def keys(distance: Any) -> Any:
 
 
 def ball_at(time: Any, told: dict, nodes: int) -> tuple[Any, Any]:
-    """Position and velocity of the incoming ball, read from its table (paper 002, eqs 8 to 10)."""
+    """Position and velocity of the incoming ball, read from its table [Yu2023bat, eqs 8 to 10]."""
     inside = ca.fmin(ca.fmax(time, 0.0), told["resolution"] * (nodes - 3))
     place = inside / told["resolution"] + 1.0
     weights = keys(place - ca.DM(np.arange(nodes)))

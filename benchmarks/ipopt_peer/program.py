@@ -49,7 +49,7 @@ class Problem:
 
 
 def hinge(x: Any, width: float) -> Any:
-    """The smoothed hinge of paper 000, eq. 27b."""
+    """The smoothed hinge of [Yu2023catch, eq. 27b]."""
     blend = (width - 0.5 * x) * (x / width) ** 3
     return ca.if_else(x <= 0.0, 0.0, ca.if_else(x < width, blend, x - 0.5 * width))
 

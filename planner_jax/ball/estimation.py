@@ -1,7 +1,7 @@
 """The state of a ball from its observations, by an extended Kalman filter.
 
-The filter is that of paper 002, eq. 5 (from paper 000, Section V-A). World frame, z up, SI units,
-one ball; `jax.vmap` makes many. An observation with a NaN leaves the state unchanged.
+The filter is that of [Yu2023bat, eq. 5] (from [Yu2023catch, Section V-A]). World frame, z up, SI
+units, one ball; `jax.vmap` makes many. An observation with a NaN leaves the state unchanged.
 """
 
 from collections.abc import Callable
@@ -87,7 +87,7 @@ def ekf_predict(
     """The belief after `duration` [s] >= 0 of flight with nothing observed.
 
     The mean flies, and the covariance becomes F P F' + Q, F the Jacobian of the flight. With
-    `linear_drag_flight` this is paper 000, eq. 10, but exact in the duration (the print moves
+    `linear_drag_flight` this is [Yu2023catch, eq. 10], but exact in the duration (the print moves
     the position by v dt alone). With `rk4_step` the duration is one Runge-Kutta step. Q is the
     integral of a white acceleration over the duration.
     """
@@ -105,7 +105,7 @@ def ekf_predict(
 
 
 def ekf_update(state: EkfState, observation: Float[Array, "3"], model: EkfModel) -> EkfState:
-    """The belief after one observed position, s + K_a (Z - H s)  (paper 002, eq. 5).
+    """The belief after one observed position, s + K_a (Z - H s)  [Yu2023bat, eq. 5].
 
     H = [I 0]. The covariance takes Joseph's form, which stays positive definite in float32
     also when a wide prior meets a sharp observation.

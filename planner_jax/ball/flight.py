@@ -1,4 +1,4 @@
-"""Ball flight with quadratic drag (paper 002, eq. 2) or linear drag, and impacts on a racket.
+"""Ball flight with quadratic drag [Yu2023bat, eq. 2] or linear drag, and impacts on a racket.
 
 World frame, z up, SI units. Everything here is written for one ball; `jax.vmap` makes many.
 """
@@ -49,7 +49,7 @@ def gravity_vector(gravity: Array) -> Array:
 
 
 def ball_acceleration(vel: Vector, drag: Array, gravity: Array) -> Vector:
-    """Acceleration  g - K_D |v| v  of a ball in flight (paper 002, eq. 2).
+    """Acceleration  g - K_D |v| v  of a ball in flight [Yu2023bat, eq. 2].
 
     Args:
         vel: (3,) [m/s], or a tuple of its components.
@@ -126,7 +126,7 @@ def fly(
 def linear_drag_flight(ball: BallState, duration: Array, drag: Array, gravity: Array) -> BallState:
     """The ball after `duration` [s] with drag  -K_i v_i  on each axis (closed form).
 
-    Paper 002, eq. 4a with the constant that the print lacks:
+    [Yu2023bat, eq. 4a] with the constant that the print lacks:
     s(t) = s_0 + (v_0 - g/K)(1 - exp(-K t))/K + g t/K  on each axis, g signed.
 
     Args:
@@ -159,7 +159,7 @@ def _phi(x: Array) -> tuple[Array, Array]:
 
 
 def drag_free_flight(ball: BallState, duration: Array, gravity: Array) -> BallState:
-    """The ball after `duration` [s] of free fall (paper 004, eqs 5 to 7).
+    """The ball after `duration` [s] of free fall [Natarajan2024, eqs 5 to 7].
 
     Args:
         ball: one ball.
@@ -175,8 +175,8 @@ def drag_free_flight(ball: BallState, duration: Array, gravity: Array) -> BallSt
 def drag_free_apex(ball: BallState, gravity: Array) -> Array:
     """Greatest height [m] that a drag-free ball reaches from now on.
 
-    v_z^2 / (2 g) + z  for a rising ball (paper 002, eq. 22, with the z component that the
-    print lacks), z itself for a falling one.
+    v_z^2 / (2 g) + z  for a rising ball, z itself for a falling one
+    [Yu2023bat, eq. 22]; the printed equation lacks the z component.
     """
     return ball.pos[2] + jnp.maximum(ball.vel[2], 0.0) ** 2 / (2.0 * gravity)
 
@@ -206,7 +206,7 @@ def drag_free_fall_time(ball: BallState, height: Array, gravity: Array) -> tuple
 def racket_impact(ball_vel: Array, racket_vel: Array, normal: Array, restitution: Array) -> Array:
     """Ball velocity after the bounce.
 
-    v+ = v- - (1 + beta) ((v- - u) . z) z . Paper 002, eq. 3 prints (1 - beta); its own
+    v+ = v- - (1 + beta) ((v- - u) . z) z . [Yu2023bat, eq. 3] prints (1 - beta); its own
     definition of beta and its eq. 12 need the plus sign. The tangential velocity is kept.
 
     Args:
@@ -226,7 +226,7 @@ def required_impact(
 ) -> tuple[Array, Array]:
     """Racket normal and normal speed that turn one ball velocity into another.
 
-    Paper 002, eq. 11 (the normal points along v+ - v-; the print has it reversed) and eq. 12.
+    [Yu2023bat, eq. 11] (the normal points along v+ - v-; the print has it reversed) and eq. 12.
 
     Args:
         ball_vel: (3,) v- [m/s].

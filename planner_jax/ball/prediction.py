@@ -1,6 +1,6 @@
 """Where the ball will be: an integrated state table, smoothed by cubic convolution.
 
-Paper 002, Section III-C (eqs 8-10): the flight is integrated once into a table of states,
+[Yu2023bat, Section III-C] (eqs 8-10): the flight is integrated once into a table of states,
 and Keys' kernel (a = -1/2) reads it at any time with a continuous gradient.
 """
 
@@ -123,7 +123,7 @@ def horizon_of(table: PathTable) -> Array:
 
 
 def convolution_weights(u: Array) -> Array:
-    """Keys' weights of the four nodes around a point (paper 002, eqs 8 and 10b).
+    """Keys' weights of the four nodes around a point [Yu2023bat, eqs 8 and 10b].
 
     Args:
         u: () fraction of the way from the second to the third node, 0 to 1.
@@ -139,7 +139,7 @@ def convolution_weights(u: Array) -> Array:
 def target_at(table: PathTable, time: Array) -> BallState:
     """State of the target at one time, with a gradient in time that is continuous.
 
-    Inside the table both position and velocity are cubic convolutions (paper 002, eq. 9).
+    Inside the table both position and velocity are cubic convolutions [Yu2023bat, eq. 9].
     Outside [0, horizon] the target goes on from the end of the table at the velocity it has
     there: defined and differentiable.
 

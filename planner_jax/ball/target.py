@@ -39,10 +39,10 @@ def state_at(path: TargetPath, time: Array) -> BallState:
 
 @struct.dataclass
 class BallPath:
-    """A ball with linear drag on each axis (paper 000, eq. 9, with its constant).
+    """A ball with linear drag on each axis ([Yu2023catch, eq. 9], with its constant).
 
     Without drag it is a parabola, without drag and gravity a straight line: the targets of
-    paper 000, Section VII-B a, c and d.
+    [Yu2023catch, Section VII-B a, c, d].
     """
 
     rules: ClassVar[Table] = (
@@ -63,7 +63,7 @@ class BallPath:
 
 @struct.dataclass
 class HarmonicPath:
-    """A target that drifts and swings: p_0 + v t + A sin(w t + phi) (paper 000, VII-B b)."""
+    """A target that drifts and swings: p_0 + v t + A sin(w t + phi) [Yu2023catch, VII-B b]."""
 
     rules: ClassVar[Table] = (
         *(Field(name, (3,)) for name in ("pos", "vel", "amplitude")),

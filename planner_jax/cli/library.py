@@ -35,7 +35,7 @@ def build_library(
     arm: str | None = None,
     home: Sequence[float] | None = None,
 ) -> None:
-    """Build a library in the scene of paper 004, or go on with one that was interrupted.
+    """Build a library in the scene of [Natarajan2024], or go on with one that was interrupted.
 
     Args:
         path: of its file.

@@ -1,4 +1,4 @@
-"""Penalties integrated along a trajectory of pieces in fixed proportion (paper 000, eq. 26).
+"""Penalties integrated along a trajectory of pieces in fixed proportion [Yu2023catch, eq. 26].
 
 The innermost part of every solve. On a GPU it is one kernel (`along_kernel`), in which the
 samples of a trajectory never leave the registers; its slopes are another kernel, and so are their

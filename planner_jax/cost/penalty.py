@@ -10,7 +10,7 @@ from planner_jax.core.arithmetic import reciprocal
 
 
 def smoothed_hinge(x: Array, width: float | Array | Array) -> Array:
-    """L_mu: zero below 0, linear above mu, a quartic blend between (paper 000, eq. 27b).
+    """L_mu: zero below 0, linear above mu, a quartic blend between [Yu2023catch, eq. 27b].
 
     Twice continuously differentiable. x - mu/2 above the blend.
 
@@ -26,7 +26,7 @@ def smoothed_hinge(x: Array, width: float | Array | Array) -> Array:
 
 
 def steep_hinge(x: Array, width: float | Array | Array) -> Array:
-    """L_eps: cubic up to eps, then a far steeper cubic (paper 000, eq. 23).
+    """L_eps: cubic up to eps, then a far steeper cubic [Yu2023catch, eq. 23].
 
     eps^3 + (x - eps)^2 x / eps^4 above eps, as printed: the value is continuous there, but
     the slope drops from 3 eps^2 to 0 and grows again.
@@ -41,7 +41,7 @@ def steep_hinge(x: Array, width: float | Array | Array) -> Array:
 
 
 def trapezoid_weights(num_intervals: int) -> np.ndarray:
-    """Weights (1/2, 1, ..., 1, 1/2) / n of the trapezoid rule on [0, 1] (paper 000, eq. 26a).
+    """Weights (1/2, 1, ..., 1, 1/2) / n of the trapezoid rule on [0, 1] [Yu2023catch, eq. 26a].
 
     Returns:
         (num_intervals + 1,) float64, which sum to one.

@@ -37,12 +37,12 @@ def _size_squared(vector: Components) -> Array:
 
 
 def speed_excess(vel: Components, limits: QuadrotorLimits) -> Array:
-    """|v|^2 / v_max^2 - 1 for velocities (..., 3) [m/s] (paper 002, eq. 18a)."""
+    """|v|^2 / v_max^2 - 1 for velocities (..., 3) [m/s] [Yu2023bat, eq. 18a]."""
     return _size_squared(vel) * reciprocal(limits.speed) ** 2 - 1.0
 
 
 def acceleration_excess(acc: Components, limits: QuadrotorLimits) -> Array:
-    """|a|^2 / a_max^2 - 1 for accelerations (..., 3) [m/s^2] (paper 002, eq. 18a).
+    """|a|^2 / a_max^2 - 1 for accelerations (..., 3) [m/s^2] [Yu2023bat, eq. 18a].
 
     Without such a limit it is -1.
     """
@@ -54,13 +54,13 @@ def acceleration_excess(acc: Components, limits: QuadrotorLimits) -> Array:
 def body_rate_excess(
     acc: Components, jerk: Components, gravity: Array, limits: QuadrotorLimits
 ) -> Array:
-    """|omega|^2 / omega_max^2 - 1 by flatness (paper 002, eq. 18a)."""
+    """|omega|^2 / omega_max^2 - 1 by flatness [Yu2023bat, eq. 18a]."""
     rate_squared = body_rate_squared(acc, jerk, gravity)
     return rate_squared * reciprocal(limits.body_rate) ** 2 - 1.0
 
 
 def ground_excess(height: Array, limits: QuadrotorLimits) -> Array:
-    """z_min - z [m] for heights (...) [m] (paper 000, eq. 28, without its squares).
+    """z_min - z [m] for heights (...) [m] ([Yu2023catch, eq. 28], without its squares).
 
     The squares of the print change sign below ground.
     """
@@ -70,7 +70,7 @@ def ground_excess(height: Array, limits: QuadrotorLimits) -> Array:
 def motion_excess(
     motion: Motion, gravity: Array, limits: QuadrotorLimits
 ) -> tuple[Array, Array, Array, Array]:
-    """Paper 002's limits, each (N,): speed, acceleration, body rate, ground (eq. 18a)."""
+    """[Yu2023bat]'s limits, each (N,): speed, acceleration, body rate, ground (eq. 18a)."""
     return (
         speed_excess(motion.vel, limits),
         acceleration_excess(motion.acc, limits),
@@ -125,7 +125,7 @@ def thrust_excess(
 
 
 def thrust_band_excess(acc: Components, gravity: Array, least: Array, most: Array) -> Array:
-    """(f - middle)^2 - half^2 [m^2/s^4] of the bounds of the thrust f (paper 000's C++ protocol).
+    """Return (f - middle)^2 - half^2 [m^2/s^4] for the thrust f, as the code of [Yu2023catch] does.
 
     Args:
         acc: (..., 3) [m/s^2].

@@ -55,7 +55,7 @@ def stereo_noise(
 ) -> StereoNoise:
     """Errors of a stereo camera as NumPy float32 leaves.
 
-    The baseline of 0.12 m is that of the ZED 2i with which paper 004 sees, by its maker's
+    The baseline of 0.12 m is that of the ZED 2i with which [Natarajan2024] sees, by its maker's
     documentation. A fifth of a pixel is the usual estimate for the matching of one pixel; that
     half of it is left in the mean over a ball, and the other numbers, are assumptions.
 

@@ -17,8 +17,8 @@ from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 class Obstacles:
     """Up to N convex polygons of up to V corners; those that stand have no velocity.
 
-    World frame in the plane, SI units. An obstacle moves evenly and does not turn (paper 003,
-    eq. 5, with constant speeds as in its Section IV-A).
+    World frame in the plane, SI units. An obstacle moves evenly and does not turn ([Qu2022,
+    eq. 5], with constant speeds as in its Section IV-A).
     """
 
     centre: Array  # (N, 2) [m], at time 0

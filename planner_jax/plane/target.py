@@ -1,7 +1,7 @@
 """Paths of targets in the plane: any class with position and velocity at a time.
 
 A path is a pytree with a method `at(time) -> PointState`, differentiable in time and in every
-leaf. The ones here cover paper 003's targets and what is fitted to observations of them; a class
+leaf. The ones here cover [Qu2022]'s targets and what is fitted to observations of them; a class
 of a user's own serves as well. World frame in the plane, SI units.
 """
 
@@ -32,7 +32,7 @@ class PlanePath(Protocol):
 class TurningPath:
     """A target of constant speed whose direction turns evenly; without turning, a straight line.
 
-    The two modes of paper 003, Section V-A, as something that stays on its map.
+    The two modes of [Qu2022, Section V-A], as something that stays on its map.
     """
 
     pos: Array  # (2,) [m], at time 0
@@ -51,7 +51,7 @@ class TurningPath:
 
 @struct.dataclass
 class PolynomialPath:
-    """A polynomial in time on each axis (paper 003, eq. 9)."""
+    """A polynomial in time on each axis [Qu2022, eq. 9]."""
 
     coeffs: Array  # (n + 1, 2) [m/s^k], the power of the time rising
     origin: Array  # () [s], the time at which the powers are zero

@@ -2,9 +2,9 @@
 
 It shares no code with the planners. The joints' polynomials are compared with their limits at
 their extrema, the arm and its shield with their obstacles at every sample, and the ball falls
-along its parabola (paper 004, eqs 5 to 7). A plan's own claims (status, cost) are not trusted; only
-its time of contact is read. Robot base frame, z up, SI units. Times count from the moment at which
-the ball is first seen.
+along its parabola [Natarajan2024, eqs 5 to 7]. A plan's own claims (status, cost) are not trusted;
+only its time of contact is read. Robot base frame, z up, SI units. Times count from the moment at
+which the ball is first seen.
 """
 
 import dataclasses

@@ -6,7 +6,7 @@ flatness; here the targets are followed along their paths and compared with the 
 claims (status, cost) are not trusted; its order is checked, and its times of the catches are
 compared with those at which its pieces end. World frame, z up, SI units.
 
-Paper 000 is "Catch Planner": eq. 9 ball with linear drag (with its constant), eq. 22 net centre
+[Yu2023catch] is "Catch Planner": eq. 9 ball with linear drag (with its constant), eq. 22 net centre
 p + l z_d, eq. 25 angle between z_d and minus the ball's velocity; z_d is the thrust direction.
 """
 
@@ -112,7 +112,7 @@ def referee_catches(
     (known by `ball`), of `HarmonicPath` (`amplitude`) or of `PathTable` (`resolution`; between
     the nodes a cubic convolution, beyond the table on at its last velocity).
 
-    The shared protocol of paper 000 is `tolerance=0.05, net_test="ball"`.
+    The shared protocol of [Yu2023catch] is `tolerance=0.05, net_test="ball"`.
 
     Args:
         cases: object with the fields of `CatchCase`, leaves with leading axis B; those
@@ -239,7 +239,7 @@ def _known_states(targets, order: np.ndarray, times: np.ndarray) -> tuple[np.nda
 def _ball_states(start, vel, drag, gravity, times) -> tuple[np.ndarray, np.ndarray]:
     """Return position and velocity (B, N, 3) of balls with linear drag K [1/s] on each axis.
 
-    Paper 000, eq. 9 with its constant: s_0 + (v_0 - g / K) (1 - e^-x) / K + g t / K, x = K t,
+    [Yu2023catch, eq. 9] with its constant: s_0 + (v_0 - g / K) (1 - e^-x) / K + g t / K, x = K t,
     which is s_0 + v_0 t f(x) + g t^2 h(x) with f = (1 - e^-x) / x and h = (1 - f) / x. Both are
     smooth at x = 0, where they are 1 and 1/2: the parabola. For small x, h is summed as
     1/2! - x/3! + x^2/4! - ..., to rounding.

@@ -6,7 +6,7 @@ flatness; here the ball is integrated, the impact applied and the ball followed 
 plan's own claims (status, cost, stroke) are not trusted; only its impact time is compared. World
 frame, z up, ground at z = 0, SI units.
 
-Paper 002 is "Bat Planner": eq. 2 drag, eq. 3 impact (with 1 + beta), eq. 18 limits. Body
+[Yu2023bat] is "Bat Planner": eq. 2 drag, eq. 3 impact (with 1 + beta), eq. 18 limits. Body
 rates are those of the Hopf fibration at zero heading (Watterson and Kumar).
 """
 

@@ -1,7 +1,7 @@
 """Float64 NumPy referee of interceptions: the kinematics alone decides whether a plan succeeds.
 
 It shares no code with the planners, except for targets of a user's own class: the car's equations
-of motion (paper 003, eq. 1) are integrated here from the plan's start along its speed and
+of motion [Qu2022, eq. 1] are integrated here from the plan's start along its speed and
 curvature, the rectangle of its body is held against every obstacle at every sample by separating
 axes, and the target is followed along its path. A plan's own claims (status, cost, meeting point)
 are not trusted. World frame in the plane, SI units, headings counter-clockwise from the x axis.

@@ -64,7 +64,7 @@ def _regime(factor: float, acceleration: float, ends_at_rest: bool) -> Regime:
     return Regime(limits=limits, ends_at_rest=ends_at_rest)
 
 
-# Of the IRB 1600-6/1.2: what the code of paper 004 allows, the datasheet's speeds with an
+# Of the IRB 1600-6/1.2: what the code of [Natarajan2024] allows, the datasheet's speeds with an
 # acceleration as it is usual (the sheet has none), and the former with an end at rest.
 REGIMES = {
     "R1": _regime(2.0, 60.0, ends_at_rest=False),

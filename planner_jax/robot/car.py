@@ -1,6 +1,6 @@
 """A car with front steering: kinematics, limits, body, and plans that it drives.
 
-Its state is that of paper 003, eq. 1: the middle of the rear axle, the heading, the speed, and
+Its state is that of [Qu2022, eq. 1]: the middle of the rear axle, the heading, the speed, and
 for the steering angle delta the curvature kappa = tan(delta) / wheelbase of the way that the rear
 axle takes. World frame in the plane, SI units, headings counter-clockwise from the x axis.
 """

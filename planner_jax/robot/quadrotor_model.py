@@ -203,11 +203,11 @@ def _require_not_negative(name: str, value: object) -> None:
     _require(name, value, ">= 0", lambda x: x >= 0.0)
 
 
-# Paper 000: l and radius of the net (Fig. 6). It gives no limits; these are the shared protocol's.
-# The papers give neither mass, inertia nor rotors. Those here are assumptions: 0.9 kg of computer,
-# battery and frame within 5 cm of the centre and 75 g of motor and propeller at the end of each
-# arm, whose diagonal is the papers'. The greatest thrust is 4 g, so that a plan of 2.5 g leaves
-# room for control. As in the papers, plans are not asked what the rotors do.
+# [Yu2023catch]: l and radius of the net (Fig. 6). It gives no limits; these are the shared
+# protocol's. The papers give neither mass, inertia nor rotors. Those here are assumptions: 0.9 kg
+# of computer, battery and frame within 5 cm of the centre and 75 g of motor and propeller at the
+# end of each arm, whose diagonal is the papers'. The greatest thrust is 4 g, so that a plan of 2.5
+# g leaves room for control. As in the papers, plans are not asked what the rotors do.
 PAPER_CATCHER = QuadrotorModel(
     name="paper-catcher",
     mass=1.2,
@@ -217,13 +217,13 @@ PAPER_CATCHER = QuadrotorModel(
     limits=FlightLimits(
         speed=5.0, body_rate=5.0, thrust=(0.3 * GRAVITY, 2.5 * GRAVITY), rotor_share=None
     ),
-    source="paper 000 (Catch Planner); body and rotors assumed",
+    source="[Yu2023catch] (Catch Planner); body and rotors assumed",
 )
-# Paper 002: Fig. 2 and Section VI-A.
+# [Yu2023bat]: Fig. 2 and Section VI-A.
 PAPER_HITTER = dataclasses.replace(
     PAPER_CATCHER,
     name="paper-hitter",
     tool=Tool(RACKET, height=0.06, radius=0.11),
     limits=FlightLimits(speed=5.0, body_rate=5.0, acceleration=15.0, rotor_share=None),
-    source="paper 002 (Bat Planner); body and rotors assumed",
+    source="[Yu2023bat] (Bat Planner); body and rotors assumed",
 )

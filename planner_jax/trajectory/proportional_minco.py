@@ -1,7 +1,7 @@
 """MINCO with durations in fixed proportion: constant matrices in normalised time.
 
-MINCO is the piecewise polynomial of least integral |p^(s)|^2 through given waypoints (paper 002,
-eq. 19; Wang, Zhou, Xu, Gao, "Geometrically Constrained Trajectory Optimization for
+MINCO is the piecewise polynomial of least integral |p^(s)|^2 through given waypoints ([Yu2023bat,
+eq. 19]; Wang, Zhou, Xu, Gao, "Geometrically Constrained Trajectory Optimization for
 Multicopters"): 2s - 2 times differentiable, of degree 2s - 1 on every piece.
 
 When the M pieces last r_i h seconds with constant r_i of mean one, so that h = T / M, the map

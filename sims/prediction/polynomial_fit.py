@@ -1,4 +1,4 @@
-"""Polynomials through observations of a target (paper 003, eqs 9-11).
+"""Polynomials through observations of a target [Qu2022, eqs 9-11].
 
 Each additional degree multiplies the noise of a prediction, and a straight line misses targets
 that turn: `planner_jax.sims.prediction.select_path.select` usually does better than any of them.
@@ -16,7 +16,7 @@ from planner_jax.sims.prediction.observed import centre
 def fit_polynomial(
     times: ArrayLike, positions: ArrayLike, degree: int, weights: ArrayLike | None = None
 ) -> PolynomialPath:
-    """Fit a polynomial to observations by least squares (paper 003, eqs 9 and 10).
+    """Fit a polynomial to observations by least squares [Qu2022, eqs 9 and 10].
 
     Orthogonal columns in normalised time stand for the normal equations of eq. 11, whose H is
     printed as the sum T'T, and would there be squared once too often. With fewer observations

@@ -1,6 +1,6 @@
 """Prediction of a target's position in the plane, and of its error, from noisy observations.
 
-Paper 003, Section III-A, fits a polynomial (`polynomial_fit.py`) of a degree that it does not
+[Qu2022, Section III-A], fits a polynomial (`polynomial_fit.py`) of a degree that it does not
 give. `select` weighs a straight line against an even turn instead, and its prediction says how
 far it can be trusted: `covariance`, `chance_within`. World frame in the plane, SI units, one
 target; `jax.vmap` makes many. Noise is Gaussian, equal on both axes.

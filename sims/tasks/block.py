@@ -57,7 +57,7 @@ class BlockFlight(FlightTask):
     THING_RADIUS = BALL_RADIUS
     CONTACT = "blocked"
     SUCCESS = "blocked the ball and touched nothing else before"
-    PUBLISHED = "paper 004: 78 % of 50 throws from 6 to 8 m, on hardware"
+    PUBLISHED = "[Natarajan2024]: 78 % of 50 throws from 6 to 8 m, on hardware"
     VIEW = (20.0, -50.0)
     EYE = ((2.6, -2.6, 1.9), (0.3, 0.0, 0.9))
     BOUNDS = ((-1.1, -1.5, 0.0), (2.8, 1.5, 2.6))

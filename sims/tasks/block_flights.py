@@ -1,4 +1,4 @@
-"""Blocks in closed loop: an arm with a shield carries out plans against thrown balls (paper 004).
+"""Blocks in closed loop: an arm with a shield executes plans against thrown balls [Natarajan2024].
 
 The ball's flight is known once it has been seen for a while; then a plan is made, by a clock on the
 wall, and the arm sets out when the time that plans are allowed is over, or later if its plan is
@@ -54,7 +54,7 @@ class Throws(FlightCases):
 
 @dataclasses.dataclass(frozen=True)
 class Budget:
-    """Where the time until the contact goes, (B,) [s] each: eq. (1) of paper 004.
+    """Where the time until the contact goes, (B,) [s] each: eq. (1) of [Natarajan2024].
 
     The ball is blocked if the time of its flight is at least that of the others; what is planned
     after the time that it is allowed makes the arm late.

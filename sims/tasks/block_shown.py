@@ -53,7 +53,7 @@ def scenery(arm: Arm, has_pole: bool) -> tuple[Part, ...]:
 
 
 def budget_table(rows: Any) -> RateTable:
-    """Return where the time of flight goes: eq. (1) of paper 004, from the rows of a run."""
+    """Return where the time of flight goes: eq. (1) of [Natarajan2024], from the rows of a run."""
     planned = np.asarray(rows["planned"])
     parts = {name: 1e3 * np.asarray(rows[f"time_{name}"])[planned] for name in BUDGET}
     parts["flight, the sum"] = np.sum(list(parts.values()), axis=0)

@@ -1,4 +1,4 @@
-"""Catches in flight: one to three balls, thrown a service interval apart (paper 000).
+"""Catches in flight: one to three balls, thrown a service interval apart [Yu2023catch].
 
 When a ball comes into sight the one before it is about to be caught, and the state in which that
 leaves the quadrotor decides whether the next catch is possible. So every plan has one more catch
@@ -49,10 +49,10 @@ from planner_jax.task.catch.case import GRAVITY, START, CatchCase
 from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.task.catch.suites import LAUNCH, draw, earliest_throw
-from planner_jax.task.hit.spec import DRAG  # of the published serves; paper 000 gives none
+from planner_jax.task.hit.spec import DRAG  # of the published serves; [Yu2023catch] gives none
 
 CATCH_WORLD = World(Quadrotor(PAPER_CATCHER), GRAVITY, mouth=LAUNCH)
-SEEN = 0.3  # [s], a throw's flight before it is planned for: 2 m and more (paper 000, VII-A)
+SEEN = 0.3  # [s], a throw's flight before it is planned for: 2 m and more [Yu2023catch, VII-A]
 _AFTER = 0.05  # [s] flown after the last ball has come down to where it may be caught
 
 
@@ -224,7 +224,7 @@ class CatchFlight(BallFlightTask):
 
     CONTACT = "caught"
     SUCCESS = "caught all balls"
-    PUBLISHED = "Catch Planner, 50 real throws: 64 % caught"  # paper 000, Table I
+    PUBLISHED = "Catch Planner, 50 real throws: 64 % caught"  # [Yu2023catch, Table I]
     COLUMNS = (Column("caught", "", "each ball", list_of(BOOL), lambda b: b.verdict.caught),)
 
     def world(self) -> World:

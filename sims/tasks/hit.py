@@ -1,4 +1,4 @@
-"""Hits in flight: one served ball, volleyed to a target with a racket (paper 002)."""
+"""Hits in flight: one served ball, volleyed to a target with a racket [Yu2023bat]."""
 
 import dataclasses
 import functools
@@ -40,17 +40,17 @@ from planner_jax.task.hit.replan import ReplanHit
 from planner_jax.task.hit.spec import REAL_SCENARIOS
 from planner_jax.task.hit.suites import DEPTH, SERVE_HEIGHT, generate_serves, to_cases
 
-SEEN = 0.25  # [s], a serve's flight before it is planned for: 2 m and more (paper 000, VII-A)
+SEEN = 0.25  # [s], a serve's flight before it is planned for: 2 m and more [Yu2023catch, VII-A]
 _AFTER = 0.1  # [s] flown after the last impact planned
 _LONGEST = 1.9  # [s], the longest flight
-_NEAR, _FAR = 0.5, 1.0  # [m] from the target: the two rates of paper 002
+_NEAR, _FAR = 0.5, 1.0  # [m] from the target: the two rates of [Yu2023bat]
 
 _LINE_COLOUR, _MIDDLE_COLOUR, _DEAD_COLOUR = "#FFFFFF", "#24292F", "#D98880"
 _LINE, _THIN = 0.03, 0.002  # [m], width and height of the court's lines
 
 
 def court_parts() -> list[Part]:
-    """The court of paper 002 as flat boxes: the dead zone, and the lines of both ends over it."""
+    """The court of [Yu2023bat] as flat boxes: the dead zone, and the lines of both ends over it."""
     length, width = court.HALF_LENGTH, court.HALF_WIDTH
     lines = [((0.0, -width), (0.0, width))]  # first that at the net
     for side in (-1.0, 1.0):
@@ -188,7 +188,7 @@ class HitFlights(Flights):
 
 
 def returned(contact: Contact, restitution: Array) -> BallState:
-    """One ball just after the racket's impact, by the library's map (paper 002, eq. 3)."""
+    """One ball just after the racket's impact, by the library's map [Yu2023bat, eq. 3]."""
     vel = racket_impact(contact.ball_vel, contact.tool_vel, contact.normal, restitution)
     return BallState(pos=contact.ball_pos, vel=vel)
 
@@ -271,7 +271,7 @@ class HitFlight(BallFlightTask):
 
     CONTACT = "hit"
     SUCCESS = f"landed within {_NEAR:g} m of the target"
-    # Paper 002 shows its rates as a figure.
+    # [Yu2023bat] shows its rates as a figure.
     PUBLISHED = "Bat, 600 real serves: within 0.5 m and 1 m, in a figure without numbers"
     COLUMNS = (
         Column("met", "", "by the racket", BOOL, lambda b: b.verdict.flown.contact.met[:, 0]),

@@ -1,4 +1,4 @@
-"""Interceptions in closed loop: a car meets a moving target among obstacles (paper 003).
+"""Interceptions in closed loop: a car meets a moving target among obstacles [Qu2022].
 
 Before it sets out the car has seen its target 15 times, a second apart; on the way it looks on. At
 every planning it predicts where the target will be from what it has been shown until then, and

@@ -48,7 +48,7 @@ class InterceptFlight(FlightTask):
     THING_RADIUS = 0.06
     CONTACT = "met"
     SUCCESS = f"met the target within {SUCCESS:g} m and touched nothing"
-    PUBLISHED = "paper 003 shows single drives, without rates"
+    PUBLISHED = "[Qu2022] shows single drives, without rates"
     HAS_REACH = True
     VIEW = (58.0, -90.0)
     EYE = ((4.0, -5.0, 9.0), (4.0, 3.8, 0.0))

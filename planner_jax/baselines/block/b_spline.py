@@ -2,7 +2,7 @@
 
 With m control points p_i and a degree k, over shares s from 0 to 1 of the duration,
 
-    q(s) = sum_i  p_i N_{i,k}(s),    i = 0 .. m - 1    (paper 004, eq. 3),
+    q(s) = sum_i  p_i N_{i,k}(s),    i = 0 .. m - 1    [Natarajan2024, eq. 3],
 
 and the basis N by the recursion of Cox and de Boor (eq. 2) over knots s_0 .. s_{m+k},
 

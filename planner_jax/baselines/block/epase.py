@@ -1,4 +1,4 @@
-"""The baseline `epase` of paper 004: a weighted A* over steps of the joints, timed by TOPP-RA.
+"""The baseline `epase` of [Natarajan2024]: weighted A* over joint steps, timed by TOPP-RA.
 
 The steps are those of the code behind the paper: 7 degrees of joints 1 to 4 and 4 degrees of each
 joint, either way, and straight to the goal, which is tried first. States within a cell of 0.05 rad

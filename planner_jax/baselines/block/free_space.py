@@ -19,7 +19,7 @@ from planner_jax.task.block.scene import Scene
 RESOLUTION = 0.05 / 3.0  # [rad], of all joints together: between samples of an edge, as in [1]
 _BATCHES = (1, 64, 256, 1024)  # angles of a program
 
-# [1] The planners' code behind paper 004, github.com/sbpl/parallel_search.
+# [1] The planners' code behind [Natarajan2024], github.com/sbpl/parallel_search.
 
 
 @jax.jit

@@ -1,4 +1,4 @@
-"""The planner `insat` of paper 004: a search over steps of the joints, interleaved with splines.
+"""The planner `insat` of [Natarajan2024]: a search over joint steps, interleaved with splines.
 
 Algorithm 2 of the paper. The search is that of `epase`. A state that it comes to is lifted: the
 spline of each of its ancestors goes on straight to the state, control points are fitted to that,

@@ -1,4 +1,4 @@
-"""Planners on the host that try one end pose after another, as paper 004 has it (Section IV-C).
+"""Planners on the host that try one end pose after another [Natarajan2024, Section IV-C].
 
 Its goals are poses at equidistant points of a tunnel, "sequentially until it succeeds". Here they
 are at points of the ball's own way, each with the eight branches of inverse kinematics; poses at

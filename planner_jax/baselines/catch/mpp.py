@@ -84,11 +84,11 @@ def falling_time(target, height: Array, horizon: Array, nodes: int) -> tuple[Arr
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class MppCatch(Planner):
-    """The motion primitive planner that paper 000 compares with; nothing is optimised.
+    """The motion primitive planner that [Yu2023catch] compares with; nothing is optimised.
 
     What is taken from where:
 
-    - Paper 000, Sections V-B and VII-A: the primitive of least jerk of Mueller, Hehn, D'Andrea
+    - [Yu2023catch, Sections V-B and VII-A]: the primitive of least jerk of Mueller, Hehn, D'Andrea
       2015 (its ref. [1]) to a catch whose height is fixed by hand, below 2 m, so that the
       target's fall gives time and place; velocity and acceleration there are sampled and the
       primitive of least mean squared jerk is kept; limits are only looked at afterwards.

@@ -1,4 +1,4 @@
-"""The `catch` planner of paper 000: contact and attitude by penalties (its eqs 18-28)."""
+"""The `catch` planner of [Yu2023catch]: contact and attitude by penalties (its eqs 18-28)."""
 
 import dataclasses
 
@@ -83,7 +83,7 @@ class Catch:
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class PaperCatch(OptimisedPlanner):
-    """The joint optimisation of catching time and state of paper 000.
+    """The joint optimisation of catching time and state of [Yu2023catch].
 
     Cost (eqs 18-28): integral |snap|^2 + rho T + the smoothed penalties of speed, body rate,
     thrust and ground by the trapezoid rule + the penalties of the net's distance (eqs 22-24)

@@ -1,4 +1,4 @@
-"""The `bat` and `bat-lite` baselines: the planner of paper 002, with and without its front end."""
+"""The baselines `bat` and `bat-lite`: the planner of [Yu2023bat] with and without its front end."""
 
 import dataclasses
 import math
@@ -38,7 +38,7 @@ _ORDER = 4  # minimum snap
 _COST_UNIT = 1e4  # the solver wants curvatures of moderate size
 _DECODE_NODES = 24
 
-# Paper 002, Section VI-A. phi is in its list of parameters and nowhere in its text; it is read
+# [Yu2023bat, Section VI-A]. phi is in its list of parameters and nowhere in its text; it is read
 # as the share of the way from s_0 to s_t.
 _ALPHA, _ETA, _PHI = 0.5, 2.0 / 3.0, 0.5
 _SLOWING = np.array([0.5, 0.5, 1.0 / 3.0])  # varpi, velocity at the transition over the last one
@@ -68,7 +68,7 @@ def serve_origin(case: HitCase) -> Array:
 
 
 def transition_point(start: Array, hit: Array, origin: Array, target: Array) -> Array:
-    """Where the quadrotor stops hurrying and starts swinging: p_t of paper 002, Section IV-A.
+    """Where the quadrotor stops hurrying and starts swinging: p_t of [Yu2023bat, Section IV-A].
 
     The ray of Fig. 4 is read as the one from s_mid through p_h, the way along which the
     racket swings: p_alpha, halfway from p_0 to p_h, is projected on it to p_perp, and p_t is
@@ -99,7 +99,7 @@ _UNITS = (0.1, 0.05, 0.3, 0.5)
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class BatHit(OptimisedPlanner):
-    """The planner of paper 002; with `transition=False` its "Bat-Lite".
+    """The planner of [Yu2023bat]; with `transition=False` its "Bat-Lite".
 
     Decision variables, n = 3 (M - 1) + 5, each in units of `scale`: the waypoints' positions
     [m], log T, p_y_dot, p_z_dot, tau_x, tau_z. Taken from the paper as it stands:

@@ -1,4 +1,4 @@
-"""What the published baselines of paper 002 share: the stroke, and how far a plan is off."""
+"""What the published baselines of [Yu2023bat] share: the stroke, and how far a plan is off."""
 
 import jax.numpy as jnp
 from jax import Array

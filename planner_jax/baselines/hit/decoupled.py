@@ -1,4 +1,4 @@
-"""The impact with uncoupled components of paper 002, Section IV-B (eqs 11-14).
+"""The impact with uncoupled components of [Yu2023bat, Section IV-B] (eqs 11-14).
 
 Two components of the racket's velocity and two of its thrust are given; the others follow
 from the ball and the target.

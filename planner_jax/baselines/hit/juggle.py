@@ -58,20 +58,20 @@ def falling_time(path: PathTable, height: Array, earliest: Array, latest: Array)
 class JuggleHit(Planner):
     """A minimum-jerk primitive to a stroke that is fixed beforehand; nothing is optimised.
 
-    The "Juggle" of paper 002. What is taken from where:
+    The "Juggle" of [Yu2023bat]. What is taken from where:
 
     - Mueller, Lupashin, D'Andrea 2011 (its ref. [7]) and Dong et al. 2015 ([8]): the ball is
       met where it falls through a fixed height; the returned ball rises to a fixed apex;
       two components of the racket's velocity are fixed and the third follows from the impact.
     - Mueller, Hehn, D'Andrea 2015 ([9]): the primitive of least jerk to that state.
-    - Paper 002: eqs 11-12 (the impact solved for normal and normal speed), 15-17 (the
+    - [Yu2023bat]: eqs 11-12 (the impact solved for normal and normal speed), 15-17 (the
       primitive), and its tau_z = 1.1 g at the impact.
     - The published trials: v_x = v_y = 0 in every recorded hit; the quadrotor at 1.43 to
       1.50 m, never above, which is the first 10 ms sample below 1.5 m; an apex of 2.3 m
       (median; quartiles 2.2 and 2.4) that attitude and target imply, if gravity alone acts.
     - Assumed: the ramp of `eased_minimum_jerk`. Without it the body rate jumps at time 0.
 
-    With the restitution 0.7 of paper 002 this planner succeeds on two serves of three, and
+    With the restitution 0.7 of [Yu2023bat] this planner succeeds on two serves of three, and
     not on the one in ten of the published trials. Their recorded hits have a restitution near
     0.32: a racket that must rise at 3 m/s at the impact instead of nearly resting. With that
     restitution in the cases it succeeds on one in ten, and mostly in those of the 36
@@ -96,7 +96,7 @@ class JuggleHit(Planner):
     def solve(self, case: HitCase, attempt: Attempt) -> HitPlan:
         """The primitive to the stroke; no variable is left to decide on.
 
-        Its cost is the mean squared jerk (paper 002, eq. 15).
+        Its cost is the mean squared jerk [Yu2023bat, eq. 15].
         """
         impact = self.impact(prepare_hit(case, self.num_table_nodes))
         trajectory = eased_minimum_jerk(

@@ -1,4 +1,4 @@
-"""What was published with paper 002: trial files (serves and outcomes), and success rates."""
+"""What was published with [Yu2023bat]: trial files (serves and outcomes), and success rates."""
 
 import csv
 import dataclasses
@@ -187,7 +187,7 @@ class PublishedRates:
 
 
 def published_rates() -> PublishedRates:
-    """The rates that came with paper 002, columns in the order of court.PLANNERS."""
+    """The rates that came with [Yu2023bat], columns in the order of court.PLANNERS."""
     text = (resources.files("planner_jax.baselines.hit") / "published_rates.csv").read_text(
         encoding="utf-8"
     )

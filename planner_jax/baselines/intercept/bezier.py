@@ -1,7 +1,7 @@
 """Curves of one number over time, of Bezier pieces that all last equally long.
 
 Piece j of K runs from j T / K to (j + 1) T / K and is sum_i points[j, i] b_i(u), with Bernstein's
-polynomials b_i of degree n and u from 0 to 1 (paper 003, eq. 18). A point here is the paper's
+polynomials b_i of degree n and u from 0 to 1 [Qu2022, eq. 18]. A point here is the paper's
 control point times the duration of its piece, h_j c_j^i, so that the curve lies between its points
 and a bound on the curve is the same bound on the points; eqs 22 and 23 as printed bound c_j^i,
 which is right for pieces of 1 s only.
@@ -47,7 +47,7 @@ class BezierCurve:
 def hodograph(degree: int, order: int, pieces: int) -> np.ndarray:
     """From the points of a piece to those of its derivative, (degree + 1 - order, degree + 1).
 
-    For a horizon of 1 that is cut into `pieces` (paper 003's third property).
+    For a horizon of 1 that is cut into `pieces` ([Qu2022]'s third property).
     """
     points = np.eye(degree + 1)
     for k in range(order):
@@ -79,7 +79,7 @@ def energy_of_pieces(degree: int, order: int, pieces: int) -> np.ndarray:
 
 
 def joints(degree: int, orders: int, pieces: int) -> np.ndarray:
-    """What is 0 where neighbours agree up to `orders` derivatives (paper 003, eq. 21).
+    """What is 0 where neighbours agree up to `orders` derivatives [Qu2022, eq. 21].
 
     Returns:
         ((K - 1) (orders + 1), K (n + 1)).

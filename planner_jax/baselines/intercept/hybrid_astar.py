@@ -2,7 +2,7 @@
 
 A search over cells of place and heading, with one continuous state a cell, along arcs that the car
 can drive (D. Dolgov, S. Thrun, M. Montemerlo and J. Diebel, Practical search techniques in path
-planning for autonomous driving, 2008). It is the first half of paper 003's path planning (Section
+planning for autonomous driving, 2008). It is the first half of [Qu2022]'s path planning (Section
 III-B). Shots, free Dubins ways from a node to the goal, are tried the more often, the nearer the
 goal is; the cheapest one ends the search once nothing that is left can be cheaper, where the paper
 takes the first. Unlike the rest of `plane` it runs on the host, one search at a time; its loops are
@@ -28,7 +28,7 @@ class HybridAstar:
     """Settings of the search.
 
     A path costs its length, and turns cost more by `turn_price`. The heuristic is the length of the
-    shortest path without obstacles. Paper 003 takes the greater one of this length and the straight
+    shortest path without obstacles. [Qu2022] takes the greater one of this length and the straight
     line, which is the same: the straight line is never longer.
     """
 

@@ -1,4 +1,4 @@
-"""The planner of paper 003: Hybrid A*, gradient descent, dynamic programming, Bezier pieces.
+"""The planner of [Qu2022]: Hybrid A*, gradient descent, dynamic programming, Bezier pieces.
 
 The search runs on the host, one case after another; all that follows is a compiled program. What
 the paper leaves open: sizes and limits are those of the case, and the car drives beside the
@@ -30,7 +30,7 @@ _PACE = 1.2  # times those speeds, at which the steering angle can still follow 
 
 
 def printed_speed(end_weight: float | None = None) -> SpeedStep:
-    """The speed step as paper 003 has it: edges of polygons continued, pieces of a tenth.
+    """The speed step as [Qu2022] has it: edges of polygons continued, pieces of a tenth.
 
     Args:
         end_weight: of a soft end, w_2 T^3 / w_1: 300 for the paper's weights and T = 10 s. By

@@ -1,4 +1,4 @@
-"""Paths that a search has found, made smooth by gradient descent (paper 003, Section III-C).
+"""Paths that a search has found, made smooth by gradient descent [Qu2022, Section III-C].
 
 Points of the path move, its ends stay. The cost (eq. 12) keeps them away from obstacles (eq. 13),
 within the curvature's limit (eq. 14) and evenly spaced on a line as straight as may be (eq. 15).
@@ -44,7 +44,7 @@ _CURVATURE_ROOM = 1e-3
 
 @dataclasses.dataclass(frozen=True)
 class Smoothing:
-    """Weights and step of paper 003, Section V-C, and what else shapes the program."""
+    """Weights and step of [Qu2022, Section V-C], and what else shapes the program."""
 
     obstacle: float = 0.1
     curvature: float = 0.1
@@ -138,7 +138,7 @@ def smooth_path(
 def smooth_points(
     points: Array, walls: Obstacles, curvature: Array, settings: Smoothing = Smoothing()
 ) -> Array:
-    """Points (n + 1, 2) [m] after gradient descent (paper 003, eq. 16); the ends stay.
+    """Points (n + 1, 2) [m] after gradient descent [Qu2022, eq. 16]; the ends stay.
 
     Args:
         points: (n + 1, 2) [m], about equally far apart, such as `control_points`.
@@ -175,7 +175,7 @@ def smoothing_cost(
     curvature: Array,
     settings: Smoothing = Smoothing(),
 ) -> Array:
-    """J_G of paper 003, eq. 12, () without unit; see the top of the module for its terms.
+    """J_G of [Qu2022, eq. 12], () without unit; see the top of the module for its terms.
 
     Args:
         points: (n + 1, 2) [m].

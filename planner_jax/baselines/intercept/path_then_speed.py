@@ -1,4 +1,4 @@
-"""Planners that split path and speed (paper 003): a path among what stands, then a speed along it.
+"""Planners that split path and speed [Qu2022]: a path among what stands, then a speed along it.
 
 Where a path crosses something that stays on it no speed helps, which is what the split loses. So
 several paths are tried, each another way round what stands.
@@ -79,7 +79,7 @@ def ramp_and_cruise(problem: StationTimeProblem, times: Array) -> tuple[Array, A
     """Station [m] and speed [m/s] at times (M,) with the shortest ramp to a constant speed.
 
     The ramp has the greatest acceleration, and the car is at the end of the way in time if it can
-    be: with a change of speed d the way is v0 T + d T - d |d| / (2 a). Paper 003 compares with
+    be: with a change of speed d the way is v0 T + d T - d |d| / (2 a). [Qu2022] compares with
     constant speed (its Fig. 4), and leaves out how the car comes by it.
     """
     limit, horizon = problem.acceleration_limit, problem.horizon

@@ -4,7 +4,7 @@ The body at a point of the path and a polygon that moves evenly overlap in one i
 on every axis that may part them (their edges' normals) both cover intervals, one of which moves
 evenly, and what is left when every axis has had its say is exact. Along the path these intervals
 make up a region, which on a bent path can come in several runs. Each run is cut into slabs of
-equal duration, and each slab covered by a quadrangle (paper 003, Section IV-A: parallelograms,
+equal duration, and each slab covered by a quadrangle ([Qu2022, Section IV-A]: parallelograms,
 which is what a straight path has).
 """
 
@@ -45,7 +45,7 @@ def station_time_problem(
 ) -> StationTimeProblem:
     """The problem of driving along a path among moving obstacles, to be at its end in time.
 
-    The car begins without acceleration (paper 003, Section V-C).
+    The car begins without acceleration [Qu2022, Section V-C].
 
     Args:
         path: of the rear axle, N points.
@@ -71,7 +71,7 @@ def station_time_problem(
 def speed_limits(path: Path, body: CarBody, limits: CarLimits) -> Array:
     """The greatest speed between every two neighbours of a path, (N - 1,) [m/s].
 
-    That of the car, that of its lateral acceleration, sqrt(a / |kappa|) (paper 003, eq. 23), and
+    That of the car, that of its lateral acceleration, sqrt(a / |kappa|) [Qu2022, eq. 23], and
     that at which the steering angle changes at its greatest rate.
     """
     step = path.length / (path.curvature.shape[0] - 1)

@@ -1,4 +1,4 @@
-"""Speed along a known way: the second half of paper 003 (Section IV), and what it is compared with.
+"""Speed along a known way: the second half of [Qu2022] (Section IV), and what it is compared with.
 
 Dynamic programming finds a line through the graph of station and time; a quadratic program finds
 the curve of least acceleration beside the polygons on the same sides. The planners differ in how
@@ -41,7 +41,7 @@ from planner_jax.core.protocol import Plan, Status
 class SpeedPlan(Plan):
     """One plan, or a batch of them with a leading axis on every leaf.
 
-    Its cost is that of paper 003, eq. 19, by w_1: the integral of the squared acceleration
+    Its cost is that of [Qu2022, eq. 19], by w_1: the integral of the squared acceleration
     [m^2/s^3] and, of a soft end, its share. It is violated relative to length and horizon.
     """
 
@@ -86,7 +86,7 @@ SPEED_PLANNERS = {
 
 
 def plan_speed(problem: StationTimeProblem, planner: SpeedPlanner = SpeedPlanner()) -> SpeedPlan:
-    """Station over time of least acceleration (paper 003, eqs 17-24); pure, for one problem.
+    """Station over time of least acceleration [Qu2022, eqs 17-24]; pure, for one problem.
 
     Status NO_PATH where the graph has no free line on the grid, INFEASIBLE where no curve fits
     the bounds around it.

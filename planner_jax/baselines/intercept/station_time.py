@@ -1,8 +1,8 @@
 """The graph of station against time: what blocks a known way when, and lines through it.
 
 A car follows a way whose length is known; the station is how far it has come. Obstacles that move
-across the way block stations for some time: polygons in the plane of time and station (paper 003,
-Section IV-A). Here are the problem, dynamic programming on a grid (eq. 17), and what lies beside
+across the way block stations for some time: polygons in the plane of time and station [Qu2022,
+Section IV-A]. Here are the problem, dynamic programming on a grid (eq. 17), and what lies beside
 the line that it finds: free intervals at given times, and corridors of trapezoids (eq. 22).
 """
 
@@ -19,7 +19,7 @@ from jax import Array, lax
 class Blocked:
     """Up to P quadrangles in the plane of time and station, each between two upright sides.
 
-    Parallel edges make them paper 003's parallelograms. An obstacle that blocks a bent way takes
+    Parallel edges make them [Qu2022]'s parallelograms. An obstacle that blocks a bent way takes
     several.
     """
 
@@ -81,7 +81,7 @@ class ReferenceLine:
 def reference_line(
     problem: StationTimeProblem, grid: StationTimeGrid = StationTimeGrid()
 ) -> ReferenceLine:
-    """The line of least acceleration through the free part of the graph (paper 003, eq. 17).
+    """The line of least acceleration through the free part of the graph [Qu2022, eq. 17].
 
     A node is a station at a time together with the edge that leads there, so that cost_edge can
     charge the squared change of speed from edge to edge. Nodes cost nothing. An edge that meets
@@ -249,7 +249,7 @@ def corridor(
     lines: Literal["tilted", "edges", "flat"] = "tilted",
     slope: Array | None = None,
 ) -> Corridor:
-    """The corridor around a line that meets no polygon (paper 003, Section IV-C; its ref. [17]).
+    """The corridor around a line that meets no polygon ([Qu2022, Section IV-C]; its ref. [17]).
 
     A piece that a polygon covers from begin to end is bounded by the polygon's edge. Of a polygon
     that begins or ends within the piece any line through its corner would do. The continued edge,

@@ -1,4 +1,4 @@
-"""The minimum-jerk primitive between two full states (paper 002, eqs 15-17; its ref. [9])."""
+"""The minimum-jerk primitive between two full states ([Yu2023bat, eqs 15-17]; its ref. [9])."""
 
 import jax.numpy as jnp
 from jax import Array
@@ -9,7 +9,7 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial
 def minimum_jerk(head_state: Array, tail_state: Array, duration: Array) -> PiecewisePolynomial:
     """The quintic of least integral |jerk|^2 between two states.
 
-    Paper 002, eqs 16-17; the differences of eq. 17 must be taken from the coasting state,
+    [Yu2023bat, eqs 16-17]; the differences of eq. 17 must be taken from the coasting state,
     Delta p = p_T - p_0 - v_0 T - a_0 T^2 / 2 and so on (the print holds only from hover).
 
     Args:

@@ -1,4 +1,4 @@
-"""The flight of a ball by least squares through where it was seen (paper 004, eqs 5 to 8).
+"""The flight of a ball by least squares through where it was seen [Natarajan2024, eqs 5 to 8].
 
 Without drag a flight is linear in where the ball is and how fast at any one time, once the known
 fall is taken off: the least squares are six linear equations. They are set up around the
@@ -61,8 +61,8 @@ def fit_flight(times: Array, places: Array, information: ArrayLike, gravity: Arr
     """The free flight of least squares through observations; pure, so jit and vmap it.
 
     Minimises  sum_k e_k' W_k e_k,  e_k = p + v t_k - (0, 0, g t_k^2 / 2) - x_k.  With equal weights
-    this is paper 004, eq. 8. The covariance is that of the estimate if every W_k is the inverse of
-    its observation's.
+    this is [Natarajan2024, eq. 8]. The covariance is that of the estimate if every W_k is the
+    inverse of its observation's.
 
     Args:
         times: (N,) [s], in no order.

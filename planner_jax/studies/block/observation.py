@@ -42,10 +42,10 @@ class Eye:
 def mast_camera(size: tuple[int, int] = (1280, 720)) -> Camera:
     """Return a camera 1.6 m above the base, on a mast on the rig's beam behind the arm.
 
-    Paper 004 mounts its camera on the rig's beams, its authors' model in front of the arm, where
-    110 degrees do not take in what is thrown from 60 degrees on either side. From here a width of
-    120 degrees sees the throws of the suites until shortly before the outer box, over the arm and,
-    0.3 m to the left, aslant past the pole. Place and width are assumptions.
+    [Natarajan2024] mounts its camera on the rig's beams, its authors' model in front of the arm,
+    where 110 degrees do not take in what is thrown from 60 degrees on either side. From here a
+    width of 120 degrees sees the throws of the suites until shortly before the outer box, over the
+    arm and, 0.3 m to the left, aslant past the pole. Place and width are assumptions.
     """
     place = np.array([-RIG_HALF, 0.3, 1.6])
     ahead = np.array([1.0, np.tan(np.deg2rad(-1.0)), np.tan(np.deg2rad(-8.0))])

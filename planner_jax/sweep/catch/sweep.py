@@ -99,7 +99,7 @@ class CatchSweep(Sweep[CatchSettings]):
         return CatchTally(decides=settings.planner != "mpp")
 
     def table(self, manifest: Entries) -> RateTable:
-        """Success and optimal time ratio, beside Tables I and III of paper 000, every suite."""
+        """Success and optimal time ratio, beside Tables I and III of [Yu2023catch], every suite."""
         summary, settings = manifest["summary"], manifest["parameters"]
         planner, names = settings["planner"], list({**SUITES, settings["suite"]: None})
         header = ["suite", "cases", f"{planner} %", "95 % interval", f"{planner} OTR"]

@@ -23,7 +23,7 @@ def planner(name: str = "online", **options: object) -> Planner[BlockCase, Block
     * `rrt-connect`, `epase`: ways by OMPL's RRT-Connect, or by a weighted A* over steps of the
       joints, to one end pose after another, timed by TOPP-RA; on the host, with the extra
       `arm-peers`.
-    * `insat`: that A* interleaved with B-splines, Algorithm 2 of paper 004; on the host.
+    * `insat`: that A* interleaved with B-splines, Algorithm 2 of [Natarajan2024]; on the host.
 
     Arguments and errors are those of `pj.hit.planner`; the options are fields of `OnlineBlock`,
     `LibraryBlock`, `AdaptBlock`, `DirectBlock`, `RrtConnectBlock`, `EpaseBlock` or `InsatBlock`.

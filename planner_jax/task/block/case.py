@@ -112,7 +112,7 @@ def case(
     gravity: ArrayLike = 9.81,
     dtype: DTypeLike = jnp.float32,
 ) -> BlockCase:
-    """Return a case of a ball to block, or a batch, by default in the scene of paper 004.
+    """Return a case of a ball to block, or a batch, by default in the scene of [Natarajan2024].
 
     Args:
         ball_pos: (3,) or (B, 3) [m], where the ball is first seen.

@@ -4,8 +4,8 @@ The shield may meet a ball anywhere between the boxes, with the wrist and the el
 A straight motion of the joints, all of them in step, leads to each of these end poses. The planner
 takes the first straight motion that is in time and touches nothing. Where there is none, it
 optimises end pose, time of contact and motion together by Levenberg-Marquardt, from straight
-motions with a bump to one side, until one keeps every limit. Paper 004 looks its motions up in a
-library instead; here only the bumps are stored.
+motions with a bump to one side, until one keeps every limit. [Natarajan2024] looks its motions up
+in a library instead; here only the bumps are stored.
 """
 
 import dataclasses

@@ -1,4 +1,4 @@
-"""What an arm protects, and what stands in its way (paper 004, Sections IV-C and V-A).
+"""What an arm protects, and what stands in its way [Natarajan2024, Sections IV-C and V-A].
 
 Robot base frame, z up, SI units.
 """

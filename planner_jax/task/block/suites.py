@@ -1,8 +1,8 @@
 """Named, seeded suites of thrown balls.
 
-Paper 004 throws from 6 to 12 m and says that its 200 projectiles cross both boxes (Section V-A); it
-gives no other range. Those here and in `planner_jax.task.block.spec` are this library's, and part
-of each suite's name: a change of a range is another suite. All draws are uniform.
+[Natarajan2024] throws from 6 to 12 m and says that its 200 projectiles cross both boxes (Section
+V-A); it gives no other range. Those here and in `planner_jax.task.block.spec` are this library's,
+and part of each suite's name: a change of a range is another suite. All draws are uniform.
 
 | what | drawn from |
 |---|---|

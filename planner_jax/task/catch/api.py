@@ -31,8 +31,8 @@ def planner(
     """Return the catch planner of a name, behind a decision about order and times.
 
     * `exact`: the ball is in the net by construction; the one to use.
-    * `catch`: the published planner of paper 000, which meets the ball by penalties.
-    * `mpp`: the motion primitives that paper 000 compares with; nothing is optimised.
+    * `catch`: the published planner of [Yu2023catch], which meets the ball by penalties.
+    * `mpp`: the motion primitives that [Yu2023catch] compares with; nothing is optimised.
 
     Args:
         name: one of these, or one that another package offers.

@@ -69,7 +69,7 @@ _ARGUMENTS = {
 
 @struct.dataclass
 class Net:
-    """A hoop above the propellers, across the thrust direction (paper 000, eqs 22 and 25)."""
+    """A hoop above the propellers, across the thrust direction [Yu2023catch, eqs 22 and 25]."""
 
     height: Array  # () l [m], of the hoop's centre above the propeller plane
     radius: Array  # () [m]
@@ -103,7 +103,7 @@ class CatchCase:
     head_state: Array  # (4, 3) position, velocity, acceleration, jerk of the quadrotor at time 0
     gravity: Array  # () [m/s^2], magnitude
     net: Net
-    limits: QuadrotorLimits  # with a least and a greatest thrust (paper 000, eq. 3d-e)
+    limits: QuadrotorLimits  # with a least and a greatest thrust [Yu2023catch, eqs 3d, 3e]
     extras: tuple[Extra, ...] = ()  # limits and costs of the user's own, see `cost.extras`
     optional: bool = struct.field(pytree_node=False, default=False)  # targets may be left
 
@@ -143,7 +143,7 @@ def case(
     optional: bool = False,
     dtype=jnp.float32,
 ) -> CatchCase:
-    """Return a catch, or a batch of catches, with the setting of paper 000.
+    """Return a catch, or a batch of catches, with the setting of [Yu2023catch].
 
     The paper gives no limits. The limits here are those of the shared protocol: |v| <= 5 m/s,
     |omega| <= 5 rad/s, thrust 0.3 g to 2.5 g, height >= 0.25 m, theta_safe = 30 degrees. Order and

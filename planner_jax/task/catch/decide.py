@@ -174,7 +174,7 @@ def _choice(position: Array, times: Array) -> CatchChoice:
 
 
 def optimal_time_ratio(cases: CatchCase, plans: CatchPlan) -> np.ndarray:
-    """Return the mean of |T_o - T_p| / T_o over the caught targets, (B,) (paper 000, eq. 29).
+    """Return the mean of |T_o - T_p| / T_o over the caught targets, (B,) [Yu2023catch, eq. 29].
 
     The times T_p were decided, and the times T_o are optimised.
     """

@@ -1,6 +1,6 @@
 """The `exact` catch planner: every catch is built into the decision variables.
 
-Paper 000 brings the net to the ball by a penalty (eqs 22-24), and its plans miss by what the
+[Yu2023catch] brings the net to the ball by a penalty (eqs 22-24), and its plans miss by what the
 penalty accepts. Here the net's centre is the ball's position less an offset inside the
 hoop, so that no plan misses; attitude and limits stay inequalities.
 """
@@ -111,7 +111,7 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
     catch less the net's height along z_d and a place inside the hoop is the quadrotor's.
 
     Cost: time_weight * total time + energy_weight * integral |snap|^2 + integral of the
-    smoothed hinges of the limits (paper 000, eqs 26-28), and of the case's extras + hinges of the
+    smoothed hinges of the limits [Yu2023catch, eqs 26-28], and of the case's extras + hinges of the
     angle (eq. 25) and of the horizon.
     """
 

@@ -12,9 +12,9 @@ class Suite:
     num_targets: int
     horizon: float  # [s], until when a target may be caught at the latest
     description: str
-    # Planning success [%], optimal time ratio, and success of its MPP [%] in paper 000, Tables I
-    # and III. Those of `throws` are of 50 real throws, planned; the others of 1,000 simulated ones
-    # each. The paper gives no ranges: a suite of the same name is of the same kind, no more.
+    # Planning success [%], optimal time ratio, and success of its MPP [%] in [Yu2023catch], Tables
+    # I and III. Those of `throws` are of 50 real throws, planned; the others of 1,000 simulated
+    # ones each. The paper gives no ranges: a suite of the same name is of the same kind, no more.
     success: float | None = None
     time_ratio: float | None = None
     mpp_success: float | None = None

@@ -1,4 +1,4 @@
-"""Named, seeded suites of catch cases: the throws and the simulations of paper 000.
+"""Named, seeded suites of catch cases: the throws and the simulations of [Yu2023catch].
 
 The paper names its cases (Sections VII-A and VII-B, Table III) and gives none of the ranges
 from which it draws them. Those below are this library's, chosen to be no easier than what the
@@ -253,7 +253,7 @@ def earliest_throw(name: str) -> tuple[BallState, float]:
 
 
 def _fly(pos, vel, time, drag: float, gravity: float = GRAVITY) -> tuple[PyTree, PyTree]:
-    """Balls (B, 3) after `time` (B,) [s] with linear drag [1/s] (paper 000, eq. 9)."""
+    """Balls (B, 3) after `time` (B,) [s] with linear drag [1/s] [Yu2023catch, eq. 9]."""
     xp, t = _module(vel), time[:, None]
     pull = np.array([0.0, 0.0, -gravity])
     if drag == 0.0:

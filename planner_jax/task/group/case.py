@@ -1,6 +1,6 @@
 """Several targets for one car, met one after another in an order to be decided.
 
-Paper 003 meets one target and names groups as future work; what is here is this library's.
+[Qu2022] meets one target and names groups as future work; what is here is this library's.
 """
 
 import dataclasses

@@ -34,7 +34,7 @@ def draw(
 
     Args:
         num: number of cases, >= 1.
-        suite: "court", the default, or one of the six real scenarios of paper 002, "S.1" to
+        suite: "court", the default, or one of the six real scenarios of [Yu2023bat], "S.1" to
             "S.6", or a suite that another package offers.
         seed: >= 0. Case k of a suite and seed is always the same case.
         first: index of the first case, >= 0.
@@ -69,7 +69,7 @@ def planner(
     """Return the hit planner of a name, with some of its fields set.
 
     * `exact`: contact, impact and landing hold by construction; the one to use.
-    * `bat`: the published planner of paper 002, impact and trajectory optimised together.
+    * `bat`: the published planner of [Yu2023bat], impact and trajectory optimised together.
     * `bat-lite`: `bat` without the transition point before the impact.
     * `juggle`: a primitive to a stroke that is fixed beforehand; nothing is optimised.
 

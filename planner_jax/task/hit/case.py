@@ -64,7 +64,7 @@ _ARGUMENTS = {
 
 @struct.dataclass
 class HitLimits:
-    """What the stroke itself may not exceed (paper 002, eqs 18f and 18g)."""
+    """What the stroke itself may not exceed [Yu2023bat, eqs 18f and 18g]."""
 
     hitting_speed: Array  # (3,) [m/s], per world axis, of the quadrotor at impact
     min_apex: Array  # () [m], of the ball after the impact
@@ -122,7 +122,7 @@ def case(
     extras: Sequence[Extra] = (),
     dtype=jnp.float32,
 ) -> HitCase:
-    """Return a hit, or a batch of hits, with the setting of paper 002, Section VI-A.
+    """Return a hit, or a batch of hits, with the setting of [Yu2023bat, Section VI-A].
 
     Args:
         serve_pos: (..., 3) [m], ball when planning begins, above the ground at z = 0.

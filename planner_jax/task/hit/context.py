@@ -80,7 +80,7 @@ def is_too_far(context: HitContext) -> Array:
 
 
 def apex_excess(apex: Array, min_apex: Array, max_apex: Array) -> Array:
-    """Return the relative excess over the floor and roof of the returned ball (paper 002, eq. 21).
+    """Return the relative excess over the floor and roof of the returned ball [Yu2023bat, eq. 21].
 
     Returns:
         (2,) (H_min - H) / H_min and (H - H_max) / H_max.
@@ -89,5 +89,5 @@ def apex_excess(apex: Array, min_apex: Array, max_apex: Array) -> Array:
 
 
 def hitting_speed_excess(vel: Array, limit: Array) -> Array:
-    """Return v_j^2 / v_max,j^2 - 1 on each world axis (paper 002, eq. 24), shape (3,)."""
+    """Return v_j^2 / v_max,j^2 - 1 on each world axis [Yu2023bat, eq. 24], shape (3,)."""
     return (vel * reciprocal(limit)) ** 2 - 1.0

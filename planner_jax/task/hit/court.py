@@ -1,4 +1,4 @@
-"""The court of paper 002, Section VI-B: regions, targets, 36 scenarios, and flights of serves.
+"""The court of [Yu2023bat, Section VI-B]: regions, targets, 36 scenarios, and flights of serves.
 
 World frame, z up, x towards the opponent, net at x = 0, y to the left. The opponent's half
 has x > 0, the hitting half x < 0; the same lines, mirrored in x, divide both.
@@ -74,7 +74,7 @@ def target_of(scenario) -> np.ndarray:
 
 
 def _acceleration(velocity: np.ndarray, drag: np.ndarray, gravity: np.ndarray) -> np.ndarray:
-    """Acceleration  g - K_D |v| v  (3, ...) (paper 002, eq. 2)."""
+    """Acceleration  g - K_D |v| v  (3, ...) [Yu2023bat, eq. 2]."""
     x, y, z = velocity
     acceleration = -drag * np.sqrt(x * x + y * y + z * z) * velocity
     acceleration[2] -= gravity

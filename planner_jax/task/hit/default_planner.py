@@ -1,7 +1,7 @@
 """The `exact` hit planner: contact, impact and landing are built into the decision variables.
 
 No plan it returns can miss; only inequalities are left to penalties. The idea of solving the
-impact for the racket's normal and normal speed is paper 002's (eqs 11-12); what is new is the
+impact for the racket's normal and normal speed is [Yu2023bat]'s (eqs 11-12); what is new is the
 choice of variables, which needs none of the singular divisions of its eqs 13-14.
 """
 
@@ -125,12 +125,12 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
     Decision variables, n = 3 (M - 1) + 8, each in units of `scale`: whitened waypoint offsets
     y, log impact time, log flight time after it, log thrust, two racket velocities across the
     normal, jerk at the impact. From the two times follow the ball's velocities before and
-    after (target reached exactly), from these normal and normal speed of the racket (paper
-    002, eqs 11-12), and so position, velocity and acceleration at the impact. With `velocities`
-    the velocities at the waypoints are 3 (M - 1) variables more, behind the offsets.
+    after (target reached exactly), from these normal and normal speed of the racket
+    [Yu2023bat, eqs 11-12], and so position, velocity and acceleration at the impact. With
+    `velocities` the velocities at the waypoints are 3 (M - 1) variables more, behind the offsets.
 
     Cost: energy_weight * integral |snap|^2 + integral of the smoothed hinges of the limits
-    (paper 002, eq. 18a), and of the case's extras + hinges of apex (eq. 21) and hitting speed
+    [Yu2023bat, eq. 18a], and of the case's extras + hinges of apex (eq. 21) and hitting speed
     (eq. 24).
     """
 

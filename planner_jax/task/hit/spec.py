@@ -9,7 +9,7 @@ DRAG = 0.0616  # K_D [1/m]
 START = (-3.0, 0.0, 1.5)  # [m]
 
 # Serve, landing and target region of the simulated court (`court.SCENARIOS`) for the six real
-# scenarios of paper 002, Section VI-C, which it names in words alone: an assumption.
+# scenarios of [Yu2023bat, Section VI-C], which it names in words alone: an assumption.
 REAL_SCENARIOS = {
     "S.1": ("FNN", "FFN"),  # from different distances
     "S.2": ("FFF", "LFF"),  # serves from different directions

@@ -260,7 +260,7 @@ def to_cases(
     robot: QuadrotorModel = PAPER_HITTER,
     dtype=jnp.float32,
 ) -> HitCase:
-    """Return a batch of cases, with the setting of paper 002, from N serves.
+    """Return a batch of cases, with the setting of [Yu2023bat], from N serves.
 
     The other arguments and the errors are those of `pj.hit.draw`; `seed` is for `uniform_starts`.
     """

@@ -51,7 +51,7 @@ def observe(
     first: int = 0,
     until: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw noisy observations of the targets until the cars set out (paper 003, eq. 4), or longer.
+    """Draw noisy observations of the targets until the cars set out [Qu2022, eq. 4], or longer.
 
     Args:
         cases: leaves with leading axis B.
@@ -99,7 +99,7 @@ def planner(name: str = "spacetime", **options: object) -> Planner[InterceptCase
     * `best`: `spacetime` with more paths and steps; the plan of least effort is selected.
     * `lattice`: a path among the walls, then a speed along it among the movers, on eight paths
       from a reach set; the best one is selected.
-    * `paper`: one path by Hybrid A*, smoothed, then a speed along it, as paper 003 has it; on the
+    * `paper`: one path by Hybrid A*, smoothed, then a speed along it, as [Qu2022] has it; on the
       host, with the extra `baselines`.
     * `em`: the best path of `lattice` with the speed step of the EM planner.
     * `constant`: the best path of `lattice` at constant speed, whatever moves.

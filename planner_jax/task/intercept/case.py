@@ -130,7 +130,7 @@ def case(
     steering_rate: ArrayLike = 2.0,
     dtype: DTypeLike = jnp.float32,
 ) -> InterceptCase:
-    """Return an interception, or a batch, by default with the setting of paper 003.
+    """Return an interception, or a batch, by default with the setting of [Qu2022].
 
     The paper gives a map of 80 x 80 pixels, T = 10 s and 0.5 m/s at the start (Section V); sizes
     and limits of the car are those of a model car of scale 1:10 on a map of 8 m x 8 m: an

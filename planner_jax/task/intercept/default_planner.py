@@ -1,6 +1,6 @@
 """The default planner: a reach set in space and time, random paths through it, least squares.
 
-Paper 003 plans a path among the walls and then a speed along it among the movers; where the path
+[Qu2022] plans a path among the walls and then a speed along it among the movers; where the path
 crosses a mover that stays on it, no speed helps. Here path and speed are planned together. A reach
 set of cells (`plane.reach`) says what the car can reach and when. Levenberg-Marquardt on speed and
 curvature at knots (`problem`) starts from random paths through the set. It runs in stages: a motion

@@ -41,7 +41,7 @@ def make_plan(
 ) -> InterceptPlan:
     """Make the plan of knots and check it against every limit of its case.
 
-    The cost of the plan is the integral of the squared acceleration [m^2/s^3] (paper 003, eq. 8a).
+    The cost of the plan is the integral of the squared acceleration [m^2/s^3] [Qu2022, eq. 8a].
     Speed [m/s] and curvature [1/m] (K + 1,) are at equal knots up to the time () [s] of the end.
     Obstacles are checked at `samples` of every piece, the lateral acceleration at `places`; both
     are static. The plan took () int32 steps.

@@ -1,6 +1,6 @@
 """Named, seeded suites of interceptions on a map of 8 m x 8 m.
 
-Paper 003 shows one map of its own (Section V) and gives no ranges. The ranges here and in
+[Qu2022] shows one map of its own (Section V) and gives no ranges. The ranges here and in
 `planner_jax.task.intercept.spec` are this library's, and part of each suite's name: a change of a
 range is another suite. All draws are uniform; the car is the default of `case`; SI units.
 

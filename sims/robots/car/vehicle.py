@@ -1,6 +1,6 @@
 """Sizes and limits of the simulated car, and its tyres.
 
-A model car of scale 1:10, as `planner_jax.task.intercept.case` has it; paper 003 gives none of
+A model car of scale 1:10, as `planner_jax.task.intercept.case` has it; [Qu2022] gives none of
 these numbers. Drive and steering can do half as much again as plans ask for, which is what
 control works with.
 """

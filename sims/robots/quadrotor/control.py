@@ -1,6 +1,6 @@
 """Cascade SE(3) control by differential flatness and the Hopf fibration.
 
-Paper 002, Section VI-C, and paper 000, Section VII-A: position and velocity feedback with the
+[Yu2023bat, Section VI-C], and [Yu2023catch, Section VII-A]: position and velocity feedback with the
 plan's acceleration and jerk gives the wanted thrust and, at zero heading, attitude and body
 rate (Watterson and Kumar, "Control of quadrotors using the Hopf fibration on SO(3)"); the
 attitude's error corrects the body rate, and the body rate's error asks for a torque. What the

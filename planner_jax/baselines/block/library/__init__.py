@@ -1,1 +1,1 @@
-"""Blocks looked up: motions for every pair of cells of both boxes (paper 004, Algorithm 1)."""
+"""Blocks looked up: motions for every pair of cells of both boxes [Natarajan2024, Algorithm 1]."""

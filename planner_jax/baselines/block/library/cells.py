@@ -1,9 +1,9 @@
 """Cells on the faces of both boxes, the tunnels between them, and what a shield covers of these.
 
-Paper 004 calls the boxes domes (Section IV-C). It gives neither the number of cells nor the faces
-that have any; `LAYOUTS` has those that are used here. A pair is a cell of the outer box and one of
-the inner box: pair `outer * num_inner + inner`. Cells are numbered face by face; on a face by its
-axes in the order x, y, z, the last one fastest. Robot base frame, z up, SI units.
+[Natarajan2024] calls the boxes domes (Section IV-C). It gives neither the number of cells nor the
+faces that have any; `LAYOUTS` has those that are used here. A pair is a cell of the outer box and
+one of the inner box: pair `outer * num_inner + inner`. Cells are numbered face by face; on a face
+by its axes in the order x, y, z, the last one fastest. Robot base frame, z up, SI units.
 """
 
 import dataclasses

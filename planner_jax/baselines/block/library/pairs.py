@@ -1,4 +1,4 @@
-"""Least-time motions to the shield poses of one pair of cells (paper 004, Algorithm 1).
+"""Least-time motions to the shield poses of one pair of cells [Natarajan2024, Algorithm 1].
 
 The paper plans to equidistant points of the centreline and stores the plan of least time. A nominal
 ball flies here from the middle of the one cell to that of the other. Of two motions the better one

@@ -1,7 +1,7 @@
 """The library: a stored motion for every pair of cells, and how a ball's is looked up.
 
 A lookup is two intersections of the ball's parabola with the boxes, two cells, and one row of a
-table (paper 004, Section IV-D2). It takes as long for every ball and searches nothing. What is
+table [Natarajan2024, Section IV-D2]. It takes as long for every ball and searches nothing. What is
 added to the paper's is the moment at which this very ball crosses the plane of the shield that
 waits for it, and where on the shield.
 """

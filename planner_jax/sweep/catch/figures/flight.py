@@ -1,4 +1,4 @@
-"""One plan in space: targets, quadrotor, and the net at every catch (paper 000, Figs 6 and 8)."""
+"""One plan in space: targets, quadrotor, and the net at every catch [Yu2023catch, Figs 6, 8]."""
 
 import numpy as np
 from matplotlib.axes import Axes

@@ -1,4 +1,4 @@
-"""One plan along its time against the limits, beside the others' (paper 000, Figs 6e-h and 7)."""
+"""One plan along its time against the limits, beside others [Yu2023catch, Figs 6e-h, 7]."""
 
 import numpy as np
 from matplotlib.axes import Axes

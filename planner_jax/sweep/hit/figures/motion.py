@@ -1,4 +1,4 @@
-"""One plan along its time against the limits, beside the other planners' (paper 002, Fig. 7)."""
+"""One plan along its time against the limits, beside the other planners' [Yu2023bat, Fig. 7]."""
 
 import numpy as np
 from matplotlib.axes import Axes

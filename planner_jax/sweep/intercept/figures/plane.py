@@ -1,6 +1,6 @@
 """Cases from above: what stands, and where car, target and movers are at some times.
 
-After paper 003, Fig. 3, where one case is shown at four times.
+After [Qu2022, Fig. 3], where one case is shown at four times.
 """
 
 import numpy as np

@@ -1,0 +1,43 @@
+"""Citations by key, in code and pages, against the list in docs/references.md."""
+
+import re
+import subprocess
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+REFERENCES = ROOT / "docs" / "references.md"
+KEY = r"[A-Z][A-Za-z]+(?:19|20)\d\d[a-z]*"
+
+
+def cited_keys() -> dict[str, str]:
+    """Return each key that a tracked text cites in brackets, with one file that cites it."""
+    names = subprocess.run(
+        ["git", "ls-files", "*.py", "*.pyi", "*.md", "*.ipynb", "*.cff"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout.split()
+    return {
+        key: name
+        for name in names
+        for key in re.findall(rf"\[({KEY})(?=[\],;])", (ROOT / name).read_text())
+    }
+
+
+def test_every_cited_key_has_an_entry_in_the_list_of_references() -> None:
+    entries = set(re.findall(rf"^({KEY})$", REFERENCES.read_text(), re.MULTILINE))
+    cited = cited_keys()
+    assert {"Yu2023catch", "Yu2023bat", "Qu2022", "Natarajan2024"} <= cited.keys()
+    assert not {key: name for key, name in cited.items() if key not in entries}
+
+
+def test_no_text_cites_a_paper_by_a_private_number() -> None:
+    found = subprocess.run(
+        ["git", "grep", "-nE", r"[Pp]aper 0[0-9]{2}\b", "--", ":!tests/test_references.py"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert not found.stdout
