@@ -41,14 +41,14 @@ from jax import Array
 import planner_jax as pj
 from planner_jax.ball.flight import BallState, drag_free_flight
 from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
-from planner_jax.perception.camera import project
-from planner_jax.perception.noise import StereoNoise, depth_std, information
 from planner_jax.robot.arm_mjcf import irb1600
 from planner_jax.runs.summary import percent, wilson_interval
 from planner_jax.runs.timing import timed_warm
 from planner_jax.sims.segment import ball_look, noisy_depth, sighting
+from planner_jax.studies.block.camera import project
 from planner_jax.studies.block.contact_check import end_at_contact
 from planner_jax.studies.block.flight_fit import across_std, believed_at, error_across, fit_flight
+from planner_jax.studies.block.noise import StereoNoise, depth_std, information
 from planner_jax.studies.block.observation import (
     Eye,
     cautious,

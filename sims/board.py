@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from planner_jax.perception.camera import Camera, in_view, placed, to_camera
-from planner_jax.perception.noise import StereoNoise, depth_std
 from planner_jax.robot.arm import Arm, link_frames
 from planner_jax.sims.calibrate import Calibration, calibrate, pose
+from planner_jax.studies.block.camera import Camera, in_view, placed, to_camera
+from planner_jax.studies.block.noise import StereoNoise, depth_std
 
 _CORNERS = 6  # each way
 _FACING = 0.5  # least cosine between the board's normal and the way to the camera

@@ -11,8 +11,8 @@ import numpy as np
 from flax import struct
 from jax import Array, lax
 
-from planner_jax.perception.camera import Camera, back_project, from_numbers
-from planner_jax.perception.noise import StereoNoise
+from planner_jax.studies.block.camera import Camera, back_project, from_numbers
+from planner_jax.studies.block.noise import StereoNoise
 
 WINDOW = 64  # [px], edge of the square around the mask's middle that is looked at closely
 # Of a sphere's visible half, seen from afar: mean height above the plane through its middle, in

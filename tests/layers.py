@@ -21,7 +21,7 @@ OUTSIDE = ("sims", "policies", "benchmarks")
 # A module imports its own package and packages that stand before it.
 LAYERS = (
     *("host", "core", "lanes", "referee"),
-    *("ball", "perception", "trajectory", "robot", "space", "plane"),
+    *("ball", "trajectory", "robot", "space", "plane"),
     *("cost", "optimise", "planning", "recovery"),
     *("task", "baselines", "studies"),
     *("export", "runs", "sweep", "live", "__init__"),

@@ -11,7 +11,7 @@ import planner_jax as pj
 from planner_jax.ball.flight import drag_free_flight
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import Status, lane
-from planner_jax.perception.camera import looking_at
+from planner_jax.studies.block.camera import looking_at
 from planner_jax.studies.block.contact_check import delay_motion, end_at_contact
 from planner_jax.studies.block.flight_fit import Sight
 from planner_jax.studies.block.observation import cautious, eye

@@ -10,14 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from planner_jax.ball.estimation import EkfModel, ekf_init, ekf_predict, ekf_update
 from planner_jax.ball.flight import BallState, drag_free_flight
-from planner_jax.perception.camera import back_project, in_view, looking_at, project
-from planner_jax.perception.noise import (
-    RoundNoise,
-    depth_std,
-    information,
-    sightings,
-    stereo_noise,
-)
 from planner_jax.sims.calibrate import calibrate, hand_eye, pose, rigid_motion
 from planner_jax.sims.segment import (
     ball_look,
@@ -26,12 +18,20 @@ from planner_jax.sims.segment import (
     noisy_depth,
     sighting,
 )
+from planner_jax.studies.block.camera import back_project, in_view, looking_at, project
 from planner_jax.studies.block.flight_fit import (
     Sight,
     across_std,
     believed_at,
     error_across,
     fit_flight,
+)
+from planner_jax.studies.block.noise import (
+    RoundNoise,
+    depth_std,
+    information,
+    sightings,
+    stereo_noise,
 )
 
 GRAVITY = 9.81

@@ -10,14 +10,14 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.ball.flight import drag_free_flight
-from planner_jax.perception.camera import project
-from planner_jax.perception.noise import information, stereo_noise
 from planner_jax.robot.arm_mjcf import irb1600
 from planner_jax.sims import camera as scene_camera
 from planner_jax.sims.board import calibrated, show_board
 from planner_jax.sims.camera import RenderError, SceneCamera, sightings_of
 from planner_jax.sims.segment import ball_look, sighting
+from planner_jax.studies.block.camera import project
 from planner_jax.studies.block.flight_fit import believed_at, error_across, fit_flight
+from planner_jax.studies.block.noise import information, stereo_noise
 from planner_jax.studies.block.observation import mast_camera
 from planner_jax.task.block.scene import paper_scene
 

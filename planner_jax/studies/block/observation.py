@@ -16,8 +16,7 @@ from jax import Array
 from planner_jax.ball.flight import BallState, drag_free_flight
 from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.errors import ArgumentError
-from planner_jax.perception.camera import Camera, looking_at
-from planner_jax.perception.noise import Noise, RoundNoise, information, sightings, stereo_noise
+from planner_jax.studies.block.camera import Camera, looking_at
 from planner_jax.studies.block.flight_fit import (
     FlightFit,
     across_std,
@@ -25,6 +24,7 @@ from planner_jax.studies.block.flight_fit import (
     error_across,
     fit_flight,
 )
+from planner_jax.studies.block.noise import Noise, RoundNoise, information, sightings, stereo_noise
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.end_poses import flight_of
 from planner_jax.task.block.scene import RIG_HALF, Box

@@ -12,7 +12,7 @@ from flax import struct
 from jax import Array, lax
 
 from planner_jax.core.errors import ArgumentError
-from planner_jax.perception.camera import (
+from planner_jax.studies.block.camera import (
     Camera,
     back_project,
     from_numbers,
