@@ -34,7 +34,7 @@ WARM = 50  # balls before the clock counts
 def measured(bench: Bench, name: str, planner: Any, cases: Any) -> None:
     """One planner on all throws."""
     cases = jax.tree.map(np.asarray, cases)
-    lanes = [pj.lane(cases, k) for k in range(cases.batch_shape[0])]
+    lanes = [pj.take(cases, k) for k in range(cases.batch_shape[0])]
     began = time.perf_counter()
     pj.plan(planner, lanes[0])
     compiling = time.perf_counter() - began

@@ -33,7 +33,7 @@ def main() -> None:
         if not hard.size:
             bench.say("A straight motion blocks every throw.")
             return
-        some = jax.tree.map(np.asarray, pj.lane(cases, hard))
+        some = jax.tree.map(np.asarray, pj.take(cases, hard))
         calls = [timed_warm(lambda: pj.plan(planner, some)) for _ in range(options.repeat)]
         (plans, _), seconds = calls[0], [each for _, each in calls]
         success = pj.block.judge(some, plans).success

@@ -140,7 +140,7 @@ def outcome_of(planner: Any, cases: Any, warm: Any, *, lasts: bool) -> Outcome:
     """Plan throws one by one and have them judged; `lasts`: whether motions end at the contact."""
     # Once each: RRT-Connect draws on where it left off, so that further calls change its ways.
     for k in range(WARM):
-        pj.plan(planner, pj.lane(warm, k))
+        pj.plan(planner, pj.take(warm, k))
     plans, query = timed_plans(planner, cases)
     verdict = pj.block.judge(cases, plans)
     motion = moving(plans.motion)

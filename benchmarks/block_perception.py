@@ -297,7 +297,7 @@ def pipeline(bench: Bench, num: int, seed: int) -> None:
             tilt=np.full_like(done.cases.tilt, ANYWHERE[1]),
         )
         good, on_it = verdict.success & some, pj.block.judge(anywhere, met).success & some
-        errors, _ = fit_errors(done.cases, pj.lane(done.fits, 0))
+        errors, _ = fit_errors(done.cases, pj.take(done.fits, 0))
         start = np.median(np.asarray(done.begun)[good])
         contact = np.median(np.asarray(met.contact_time)[good])
         low, high = (100.0 * end for end in wilson_interval(int(good.sum()), num))
@@ -333,7 +333,7 @@ def planning(bench: Bench, num: int, seed: int) -> None:
     first, later = (jax.tree.map(np.asarray, each) for each in known)
     plans, seconds = timed_with_aims(planner, first)
     tasks = ReplanBlock().begin(first, plans, later.delay - first.delay, ball=later.ball)
-    moving = pj.lane(tasks, np.flatnonzero(pj.solved(plans)))
+    moving = pj.take(tasks, np.flatnonzero(pj.solved(plans)))
     again, more = timed_with_aims(ReplanBlock(), moving)
     rows = (("first", seconds, plans), ("next", more, again))
     for name, spent, found in rows:
@@ -362,7 +362,7 @@ def timed_with_aims(planner: Any, entries: Any) -> tuple[Any, np.ndarray]:
     for k in range(num):
         plan: Any = None
         for each in aimed:
-            entry = pj.lane(each, k)
+            entry = pj.take(each, k)
             plan, spent = timed_warm(lambda entry=entry: pj.plan(planner, entry))
             seconds[k] += spent
             if pj.solved(plan):

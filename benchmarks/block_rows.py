@@ -89,7 +89,7 @@ def blocked_long(cases: pj.block.BlockCase, index: np.ndarray, starts: int, lane
     size, found = max(1, lanes // starts), []
     for first in range(0, len(index), size):
         here = index[first : first + size]
-        some = pj.lane(cases, np.resize(here, size))
+        some = pj.take(cases, np.resize(here, size))
         plans = jax.device_get(long_search(some, *given))
         good = pj.block.judge(some, plans).success & pj.solved(plans)
         found.append(good[: len(here)])

@@ -121,7 +121,7 @@ def tried_in_parts(
             here = np.arange(first, min(first + lanes, len(index)))
             full = np.resize(here, lanes)
             given = (jnp.asarray(bumps[full], jnp.float32), jnp.asarray(ranks[full]))
-            some = pj.lane(cases, index[full])
+            some = pj.take(cases, index[full])
             good, beside = tried(online.OnlineBlock(), some, *given, jnp.asarray(steps))
             yield np.asarray(good)[: len(here)], np.asarray(beside)[: len(here)]
 

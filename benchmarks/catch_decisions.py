@@ -39,7 +39,7 @@ SHORT = ExactCatch(rounds=(Round(starts=1, solver=LbfgsConfig(max_steps=25)),))
 def decision_time(decision: Any, cases: Any, num: int) -> float:
     """Median seconds of a decision about one case, from one vector to one."""
     cpu = jax.local_devices(backend="cpu")[0]
-    lanes = [pj.lane(cases, k % cases.batch_shape[0]) for k in range(num)]
+    lanes = [pj.take(cases, k % cases.batch_shape[0]) for k in range(num)]
     with jax.default_device(cpu):
         _, case_of = ravel_pytree(lanes[0])
         decide = jax.jit(lambda vector: ravel_pytree(decision.propose(case_of(vector)))[0])

@@ -69,7 +69,7 @@ def latencies(planner, cases: pj.catch.CatchCase, repeats: int) -> str:
     """Percentiles of one plan at a time."""
     host = jax.tree.map(np.asarray, cases)
     num = host.batch_shape[0]
-    lanes = [pj.lane(host, k) for k in range(num)]
+    lanes = [pj.take(host, k) for k in range(num)]
     for lane in lanes:
         pj.plan(planner, lane)
     seconds = []

@@ -202,7 +202,7 @@ def judged(cases: CatchCase, plans: list[CatchPlan]) -> dict[str, np.ndarray]:
     for length in np.unique(lengths):  # he judges plans of as many pieces together
         lanes = np.flatnonzero(lengths == length)
         verdict = pj.catch.judge(
-            pj.lane(cases, lanes),
+            pj.take(cases, lanes),
             stacked([plans[k] for k in lanes]),
             tolerance=0.05,
             net_test="ball",
@@ -304,7 +304,7 @@ def main() -> None:
     compute_in_place()
     with begin(parser, options) as bench:
         cases, looks = throws(options.num, period, options.noise)
-        lanes = [pj.lane(cases, k) for k in range(options.num)]
+        lanes = [pj.take(cases, k) for k in range(options.num)]
         began = time.perf_counter()
         warm_up(lanes[0])
         bench.say(
@@ -320,7 +320,7 @@ def main() -> None:
 
 def fly_all(bench: Bench, cases: CatchCase, looks: np.ndarray, period: float, noise: float) -> None:
     """Fly every throw, warm, and report."""
-    lanes = [pj.lane(cases, k) for k in range(len(looks))]
+    lanes = [pj.take(cases, k) for k in range(len(looks))]
     path = balls_of(lanes[0])
     estimator = Estimator(period, noise, path.drag[0], path.gravity[0])
     for lane, seen in zip(lanes[:WARM_UP], looks, strict=False):

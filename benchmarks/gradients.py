@@ -136,7 +136,7 @@ def _measure(
     success = task_named(options.task).judge(cases, plans).success
     bench.count(success, cost_gaps(planner, cases, plans))
     if options.accuracy:
-        _compare(bench, options, differentiated, pj.lane(cases, slice(options.accuracy)))
+        _compare(bench, options, differentiated, pj.take(cases, slice(options.accuracy)))
 
 
 def _compare(bench: Bench, options: argparse.Namespace, differentiated: Any, few: Any) -> None:

@@ -229,7 +229,7 @@ def main() -> None:
         searched = drawn[~solved] if options.failed else drawn
         index = options.first + searched
         began = time.perf_counter()
-        left = scenes(pj.lane(cases, searched)) if searched.size else []
+        left = scenes(pj.take(cases, searched)) if searched.size else []
         at_end, earliest = search_all(left, options.workers)
         seconds = time.perf_counter() - began
         bench.say(

@@ -230,7 +230,7 @@ def main() -> None:
         table_of_outcomes(bench, outcomes)
         table_of_accelerations(bench, outcomes)
         num = min(options.timed, options.num)
-        lanes = [jax.tree.map(jnp.asarray, pj.lane(on_host, k)) for k in range(num)]
+        lanes = [jax.tree.map(jnp.asarray, pj.take(on_host, k)) for k in range(num)]
         table_of_times(bench, named, lanes)
         bench.count(outcomes["lattice"].verdict.success)
 

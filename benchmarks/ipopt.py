@@ -129,7 +129,7 @@ def ours(setup: Setup, effort: str, repeat: int, batch: int, seed: int) -> tuple
     """The planner with an effort, and how long the first call of one case took, with compiling."""
     planner = setup.card.planner("exact", effort=effort, **setup.card.bench)
     num, host = len(setup.batches["learned"].starts), jax.devices("cpu")[:1]
-    lanes = [pj.lane(setup.cases, k) for k in range(num)]
+    lanes = [pj.take(setup.cases, k) for k in range(num)]
     began = time.perf_counter()
     pj.plan(planner, lanes[0], devices=host)
     first = time.perf_counter() - began

@@ -29,7 +29,7 @@ def planned_again(planner: Any, cases: Any, elapsed: float) -> tuple[Any, Any]:
     """The re-planner, and what it gets some seconds into the solved plans of a batch."""
     plans = pj.plan(planner, cases)
     lanes = np.flatnonzero(pj.solved(plans) & (np.asarray(plans.time) > elapsed))
-    cases, plans = jax.tree.map(np.asarray, pj.lane((cases, plans), lanes))
+    cases, plans = jax.tree.map(np.asarray, pj.take((cases, plans), lanes))
     since: Any = np.full(len(lanes), elapsed, cases.time.dtype)
     again = planner.replanner()
     return again, again.begin(cases, plans, since, target=LaterPath(cases.target, since))
@@ -59,7 +59,7 @@ def main() -> None:
             judged = batch.case
         num = jax.tree.leaves(batch)[0].shape[0]
         began = time.perf_counter()
-        pj.plan(planner, pj.lane(batch, 0))
+        pj.plan(planner, pj.take(batch, 0))
         first = time.perf_counter() - began
         plans, seconds = timed_plans(planner, batch)
         success = np.asarray(card.judge(judged, plans).success)

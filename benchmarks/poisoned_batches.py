@@ -51,7 +51,7 @@ def poisoned(cases: Any, lanes: np.ndarray, spared: Collection[str] = ()) -> Any
         jax.tree_util.keystr(path, simple=True, separator="."): np.array(leaf)
         for path, leaf in paths
     }
-    bad = [(name, value) for name, value in poisons(pj.lane(cases, 0)) if name not in spared]
+    bad = [(name, value) for name, value in poisons(pj.take(cases, 0)) if name not in spared]
     for k, lane in enumerate(lanes):
         name, value = bad[k % len(bad)]
         leaves[name][lane] = value

@@ -230,10 +230,10 @@ def main() -> None:
     with begin(parser, options) as bench:
         balls = paths(options.task, options.rate)
         if options.task == "hit":
-            case = pj.lane(pj.hit.draw(1), 0)
+            case = pj.take(pj.hit.draw(1), 0)
             tool = float(case.racket_height), float(np.asarray(case.racket_radius))
         else:
-            case = pj.lane(pj.catch.draw(1), 0)
+            case = pj.take(pj.catch.draw(1), 0)
             tool = float(case.net.height), float(case.net.radius)
         start = np.asarray(case.head_state[0], float)
         process, port, seconds = started(options)

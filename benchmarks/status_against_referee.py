@@ -128,8 +128,8 @@ def _hits() -> dict[str, Row]:
         "planes": Row("hit", "court", changed=planes),
         "late-boxes": Row("hit", "court", {"delay": 0.3}, changed=boxes),
         **{name: Row("hit", "court", {"robot": MODELS[name]}) for name in ("racer", "x500")},
-        "brake": Row("hit", "court", options={"ending": "brake"}),
-        "home": Row("hit", "court", options={"ending": "home"}),
+        "brake": Row("hit", "court", options={"recovery": "brake"}),
+        "home": Row("hit", "court", options={"recovery": "home"}),
     }
 
 
@@ -147,7 +147,7 @@ def _catches() -> dict[str, Row]:
         "parabola2-boxes": Row("catch", "parabola2", changed=boxes),
         "parabola2-planes": Row("catch", "parabola2", changed=planes),
         **{name: Row("catch", "parabola2", {"robot": MODELS[name]}) for name in robots},
-        "parabola2-brake": Row("catch", "parabola2", options={"ending": "brake"}),
+        "parabola2-brake": Row("catch", "parabola2", options={"recovery": "brake"}),
     }
 
 

@@ -14,7 +14,7 @@ all tasks:
   `keep_compiled_programs`
 * `replan`: from the plan that is being carried out
 * `gradient`: of a number of every plan by parts of its case; `optimal_plan` inside a loss
-* `lane`, `solved`, `Status`: reading plans; a plan has `sample`, `save` and `load`
+* `take`, `solved`, `Status`: reading plans; a plan has `sample`, `save` and `load`
 * `export`: one plan into a file for a controller
 
 Limits and costs of one's own along the way, a case's `extras`: `KeepOut`, `KeepOutBox`, `Plane`,

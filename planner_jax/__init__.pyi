@@ -13,9 +13,9 @@ from .core.planner import Planner as Planner
 from .core.protocol import Attempt as Attempt
 from .core.protocol import Plan as Plan
 from .core.protocol import Status as Status
-from .core.protocol import lane as lane
 from .core.protocol import outcome as outcome
 from .core.protocol import solved as solved
+from .core.protocol import take as take
 from .core.registry import Task as Task
 from .core.registry import task_named as task_named
 from .core.rules import require_sound as require_sound
@@ -43,8 +43,8 @@ from .planning.gradient import gradient as gradient
 from .planning.plan import plan as plan
 from .planning.plan import solve as solve
 from .planning.replan import replan as replan
-from .recovery.planner import RestPlanner as RestPlanner
-from .recovery.with_recovery import EndedPlanner as EndedPlanner
+from .recovery.planner import RecoveryPlanner as RecoveryPlanner
+from .recovery.with_recovery import RecoveringPlanner as RecoveringPlanner
 from .referee.judging import Verdict as Verdict
 from .robot.quadrotor import QuadrotorLimits as QuadrotorLimits
 from .robot.quadrotor import RotorLimits as RotorLimits

@@ -54,7 +54,7 @@ PLANS = {"quadrotor": quadrotor(), "car": car(), "arm": arm()}
 
 def as_it_is(plan, **how):
     """A plan in a file without a way to rest: that of plans which nobody made keeps no limits."""
-    return pj.export(plan, ending=None, **how)
+    return pj.export(plan, recovery=None, **how)
 
 
 def table(path):

@@ -117,17 +117,17 @@ def rows() -> Iterator[tuple[str, Callable[[], dict[str, np.ndarray]]]]:
             pj.hit, pj.hit.planner(), pj.hit.draw(NUM, seed=SEED, delay=0.8, limit_scale=0.5)
         ),
     )
-    for ending in ("brake", "home"):
+    for recovery in ("brake", "home"):
         yield (
-            f"catch-exact-{ending}",
-            lambda ending=ending: plan_and_judge(
-                pj.catch, pj.catch.planner(ending=ending), pj.catch.draw(NUM, seed=SEED)
+            f"catch-exact-{recovery}",
+            lambda recovery=recovery: plan_and_judge(
+                pj.catch, pj.catch.planner(recovery=recovery), pj.catch.draw(NUM, seed=SEED)
             ),
         )
         yield (
-            f"hit-exact-{ending}",
-            lambda ending=ending: plan_and_judge(
-                pj.hit, pj.hit.planner(ending=ending), pj.hit.draw(NUM, seed=SEED)
+            f"hit-exact-{recovery}",
+            lambda recovery=recovery: plan_and_judge(
+                pj.hit, pj.hit.planner(recovery=recovery), pj.hit.draw(NUM, seed=SEED)
             ),
         )
     for decide in ("greedy", "random", "given", "policy"):

@@ -50,7 +50,7 @@ def referee_rests(cases, plans) -> RestVerdict:
 
     Args:
         cases: object with `gravity`, `limits` and `extras`, leaves with leading axis B.
-        plans: object with the fields of `QuadrotorPlan`, with `ending`; leaves with leading axis B.
+        plans: object with the fields of `QuadrotorPlan`, with `recovery`; leaves have axis B first.
     """
     judge = functools.partial(_judge, extras=cases.extras, relative=1e-3, continuity=1e-4)
     return RestVerdict(**judge_in_chunks(judge, read_flight(cases, plans), _CHUNK))
@@ -59,7 +59,7 @@ def referee_rests(cases, plans) -> RestVerdict:
 def _judge(case: dict, extras: tuple, relative: float, continuity: float) -> dict:
     """Return the fields of `RestVerdict` for one chunk of lanes."""
     case = {**case, "head_state": _end_states(case["coeffs"], case["durations"])}
-    pieces = pieces_of(case["ending.coeffs"], case["ending.durations"])
+    pieces = pieces_of(case["recovery.coeffs"], case["recovery.durations"])
     intervals = intervals_of(_SAMPLES, pieces.durations.shape[1])
     measured, tests = judge_motion(pieces, case, extras, intervals, relative, continuity)
     found = first_failures(tests, LIMITS, finite_lanes(case))

@@ -41,7 +41,7 @@ def double(tree):
 @pytest.mark.parametrize("name", CASES)
 def test_all_derivatives_are_those_of_the_integrated_penalties(name, given):
     with jax.enable_x64(True):
-        case = double(pj.lane(CASES[name](), 0))
+        case = double(pj.take(CASES[name](), 0))
         along = flight_along(MAPS, 2, case, 0.03, 0.1)
         columns = jnp.asarray(np.random.default_rng(0).normal(size=(10, 3)))
         theta, parameters = jnp.log(0.2), (case.gravity, case.limits, case.extras)
@@ -78,7 +78,7 @@ def test_all_derivatives_are_those_of_the_integrated_penalties(name, given):
 
 
 def a_hit():
-    case = pj.lane(pj.hit.draw(1, seed=1), 0)
+    case = pj.take(pj.hit.draw(1, seed=1), 0)
     return ExactHit(proportions=(0.2, 0.5, 1.0, 1.0, 1.0, 1.0)), case, 8
 
 
@@ -97,7 +97,7 @@ def a_throw_and_a_place_for_another():
 def decided(suite, num_targets):
     """One case in the greedy order, with places for so many targets."""
     cases = pj.catch.draw(1, suite, 3, num_targets=num_targets)
-    return pj.lane(first_choice(Greedy(), cases), 0)
+    return pj.take(first_choice(Greedy(), cases), 0)
 
 
 @pytest.mark.parametrize("make", [a_hit, a_throw, a_pair, a_throw_and_a_place_for_another])

@@ -214,7 +214,7 @@ def test_claims_are_confirmed_by_the_referee():
         verdict: Any = pj.block.judge(cases, plans)
         assert verdict.success.mean() >= least
         np.testing.assert_array_equal(verdict.success, pj.solved(plans))
-    one = pj.plan(planner, pj.lane(cases, 3))
+    one = pj.plan(planner, pj.take(cases, 3))
     assert one.status == plans.status[3]
     np.testing.assert_allclose(one.contact_time, plans.contact_time[3], atol=1e-4)
 

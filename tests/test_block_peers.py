@@ -118,7 +118,7 @@ def test_direct_is_confirmed_by_the_referee_and_says_what_became_of_each_ball():
 
 @pytest.mark.slow
 def test_edges_are_free_where_all_of_their_samples_are():
-    case = pj.lane(jax.tree.map(np.asarray, pj.block.draw(1, seed=8)), 0)
+    case = pj.take(jax.tree.map(np.asarray, pj.block.draw(1, seed=8)), 0)
     free = FreeSpace(case, 0.003)
     ends = case.angles + np.random.default_rng(0).uniform(-1.0, 1.0, (30, 6))
     ends[0] = case.angles
@@ -180,7 +180,7 @@ def test_planners_on_the_host_say_why_there_is_no_plan():
     assert [pj.Status(status).name for status in plans.status] == list(wanted)
     assert np.isinf(plans.violation).all()
     hurried = pj.block.planner("insat", points=6, budget=1e-9)
-    plan = pj.plan(hurried, pj.lane(pj.block.draw(5, "open", seed=8), 4))
+    plan = pj.plan(hurried, pj.take(pj.block.draw(5, "open", seed=8), 4))
     assert plan.status == pj.Status.NO_PATH and plan.iterations == 0
     with pytest.raises(ValueError, match="^budget and longest must be > 0, got 0 and 0.05$"):
         pj.block.planner("insat", budget=0.0)

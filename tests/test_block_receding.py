@@ -10,7 +10,7 @@ from test_block import SMALL
 import planner_jax as pj
 from planner_jax.ball.flight import drag_free_flight
 from planner_jax.core.errors import ArgumentError
-from planner_jax.core.protocol import Status, lane
+from planner_jax.core.protocol import Status, take
 from planner_jax.studies.block.camera import looking_at
 from planner_jax.studies.block.contact_check import delay_motion, end_at_contact
 from planner_jax.studies.block.flight_fit import Sight
@@ -93,7 +93,7 @@ def test_replanning_goes_on_from_the_motion_for_the_ball_as_it_is_now_known(case
     warm = pj.plan(AGAIN.warm, tasks)
     both = solved & pj.solved(warm)
     assert both.sum() >= 3
-    assert pj.block.judge(lane(tasks.case, both), lane(warm, both)).success.all()
+    assert pj.block.judge(take(tasks.case, both), take(warm, both)).success.all()
     again = pj.replan(AGAIN, cases, plans, 0.1, ball=ball)
     np.testing.assert_array_equal(again.contact_time[both], warm.contact_time[both])
 
@@ -114,7 +114,7 @@ def test_a_motion_that_begins_late_is_met_later_or_not_in_time(cases):
 def test_the_noise_of_a_throw_can_be_its_own_in_any_batch(cases):
     seeds = np.arange(6, dtype=np.uint32)
     every = decide(SMALL, cases, eye(std=0.02), [0.2], seed=seeds, aims=AIMS[:1])
-    some = decide(SMALL, lane(cases, slice(2, 5)), eye(std=0.02), [0.2], seed=seeds[2:5], aims=AIMS)
+    some = decide(SMALL, take(cases, slice(2, 5)), eye(std=0.02), [0.2], seed=seeds[2:5], aims=AIMS)
     np.testing.assert_allclose(
         every.fits.belief.mean[:, 2:5], some.fits.belief.mean, rtol=1e-4, atol=1e-4
     )

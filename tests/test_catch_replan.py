@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from planner_jax.ball.flight import BallState
-from planner_jax.core.protocol import Status, is_solved, lane
+from planner_jax.core.protocol import Status, is_solved, take
 from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.planning.plan import plan
 from planner_jax.referee.catch import referee_catches
@@ -79,7 +79,7 @@ def test_an_unchanged_target_and_no_time_give_the_plan_back(throws):
     np.testing.assert_allclose(again.times, plans.times, atol=2e-6)
     np.testing.assert_allclose(again.cost, plans.cost, rtol=2e-3)
     for k in range(6):
-        old, new = lane(plans.trajectory, k), lane(again.trajectory, k)
+        old, new = take(plans.trajectory, k), take(again.trajectory, k)
         assert_same_way(old, new, 0.0, plans.times[k, 0], 1e-3)
 
 
@@ -88,7 +88,7 @@ def test_a_later_plan_begins_where_the_quadrotor_is_and_catches_the_target_that_
     elapsed = np.linspace(0.01, 0.5, 6)
     task = AGAIN.begin(cases, plans, elapsed, targets=ahead(cases, elapsed, 0.01))
     for k in range(6):
-        expected = states(lane(plans.trajectory, k), elapsed[k])
+        expected = states(take(plans.trajectory, k), elapsed[k])
         np.testing.assert_allclose(task.case.head_state[k, :3], expected, atol=1e-3)
     np.testing.assert_allclose(task.case.horizon, cases.horizon - elapsed[:, None])
     again = plan(AGAIN, task)
@@ -105,10 +105,10 @@ def test_a_batch_is_its_cases(throws):
     together = plan(AGAIN, task)
     for k in range(6):
         alone_task = AGAIN.begin(
-            lane(cases, k), lane(plans, k), elapsed[k], targets=lane(task.case.targets, k)
+            take(cases, k), take(plans, k), elapsed[k], targets=take(task.case.targets, k)
         )
         for one, many in zip(
-            jax.tree.leaves(alone_task), jax.tree.leaves(lane(task, k)), strict=True
+            jax.tree.leaves(alone_task), jax.tree.leaves(take(task, k)), strict=True
         ):
             np.testing.assert_allclose(one, many, rtol=1e-4, atol=1e-4)
         alone = plan(AGAIN, alone_task)
@@ -128,7 +128,7 @@ def test_with_too_little_time_left_the_previous_plan_is_kept(throws):
     assert is_solved(again.status[kept]).all()
     assert (again.trajectory.durations > 0.0).all()
     for k in np.flatnonzero(kept):
-        old, new = lane(plans.trajectory, k), lane(again.trajectory, k)
+        old, new = take(plans.trajectory, k), take(again.trajectory, k)
         assert_same_way(old, new, elapsed[k], left[k], 1e-3)
 
 
@@ -140,7 +140,7 @@ def test_what_is_left_of_a_plan_can_be_cut_anywhere(throws):
     rest = plan(keeping, keeping.begin(cases, plans, elapsed, targets=ahead(cases, elapsed)))
     assert (rest.trajectory.durations > 0.0).all()
     for k in range(6):
-        old, new = lane(plans.trajectory, k), lane(rest.trajectory, k)
+        old, new = take(plans.trajectory, k), take(rest.trajectory, k)
         assert_same_way(old, new, elapsed[k], rest.times[k, 0], 1e-3)
 
 
@@ -153,7 +153,7 @@ def test_after_the_catch_the_plan_is_empty(throws):
     assert not again.trajectory.durations.any() and np.isfinite(again.cost).all()
     assert (again.status != Status.NON_FINITE).all()
     for k in range(6):
-        caught = states(lane(plans.trajectory, k), plans.times[k, 0])[0]
+        caught = states(take(plans.trajectory, k), plans.times[k, 0])[0]
         np.testing.assert_allclose(again.trajectory.coeffs[k, 0, 0], caught, atol=1e-4)
 
 
@@ -179,4 +179,4 @@ def test_of_several_targets_those_not_caught_yet_are_planned_on():
 def test_a_negative_time_is_refused_in_one_line(throws):
     cases, plans = throws
     with pytest.raises(ValueError, match="elapsed must be >= 0, got -0.1"):
-        AGAIN.begin(lane(cases, 0), lane(plans, 0), -0.1, targets=lane(cases.targets, 0))
+        AGAIN.begin(take(cases, 0), take(plans, 0), -0.1, targets=take(cases.targets, 0))

@@ -293,9 +293,9 @@ def test_a_nan_lane_on_the_host_is_named(entry):
 @entries(slow=(*LIKE_OTHERS, *OF_THEIR_OWN))
 def test_a_batch_is_a_loop_over_its_cases(entry):
     for k in (0, NUM - 1):
-        alone = pj.plan(entry.planner, pj.lane(entry.batch, k))
+        alone = pj.plan(entry.planner, pj.take(entry.batch, k))
         assert alone.status.shape == ()
-        assert_close(alone, pj.lane(entry.plans, k))
+        assert_close(alone, pj.take(entry.plans, k))
 
 
 @every
@@ -307,7 +307,7 @@ def test_every_status_is_a_status_and_solved_says_which_are_good(entry):
     assert good.dtype == bool and good.shape == (NUM,)
     for k in range(NUM):
         status = pj.Status(plans.status[k])
-        assert good[k] == is_solved(status) == pj.solved(pj.lane(plans, k))
+        assert good[k] == is_solved(status) == pj.solved(pj.take(plans, k))
         assert good[k] == (status in (pj.Status.CONVERGED, pj.Status.FEASIBLE))
         assert not good[k] or plans.violation[k] <= 5e-4
 
@@ -315,7 +315,7 @@ def test_every_status_is_a_status_and_solved_says_which_are_good(entry):
 @entries(on_host=False, slow=(*LIKE_OTHERS, "intercept spacetime"))
 def test_every_matrix_product_asks_for_full_precision(entry, monkeypatch):
     monkeypatch.setattr(planner_module, "has_only_cpu", lambda: False)  # also in what is for a GPU
-    planner, case = inside(entry.planner), pj.lane(entry.batch, 0)
+    planner, case = inside(entry.planner), pj.take(entry.batch, 0)
     for attempt in planner.attempts:
         assert_full_precision(lambda p, case, a=attempt: p.solve(case, a), planner, case)
         solve = lambda p, cases, a=attempt: p.solve_lanes(cases, a)  # noqa: E731
@@ -355,7 +355,7 @@ def test_a_second_batch_of_the_same_bucket_is_not_traced_again(entry, traces):
     found.clear()
     pj.plan(entry.planner, entry.cases(NUM + 3))
     pj.plan(entry.planner, jax.tree.map(np.asarray, entry.cases(NUM + 2)))
-    pj.plan(entry.planner, pj.lane(entry.batch, slice(0, 4)))
+    pj.plan(entry.planner, pj.take(entry.batch, slice(0, 4)))
     assert found == []
 
 
@@ -363,11 +363,11 @@ def test_other_arrays_of_the_same_shapes_in_a_planner_are_not_traced_again(trace
     cases = places(NUM)
     first = LibraryPlanner(library(1))
     mine = pj.plan(first, cases)
-    pj.plan(first, pj.lane(cases, 0))
+    pj.plan(first, pj.take(cases, 0))
     found = traces(first)
     other = LibraryPlanner(library(2))
     theirs = pj.plan(other, cases)
-    pj.plan(other, pj.lane(cases, 0))
+    pj.plan(other, pj.take(cases, 0))
     assert found == []
     assert (mine.point != theirs.point).any()
     for plans, planner in ((mine, first), (theirs, other)):
@@ -397,7 +397,7 @@ def test_solve_inside_a_compiled_function_is_plan(entry):
 def test_solve_takes_one_case_and_any_transformation_but_a_derivative(name):
     entry = ENTRIES[name]
     solve = functools.partial(pj.solve, entry.planner)
-    assert_close(jax.jit(solve)(pj.lane(entry.batch, 2)), pj.lane(entry.plans, 2))
+    assert_close(jax.jit(solve)(pj.take(entry.batch, 2)), pj.take(entry.plans, 2))
     assert_close(jax.jit(jax.vmap(solve))(entry.batch), entry.plans)
     assert_close(jax.jit(functools.partial(pj.plan, entry.planner))(entry.batch), entry.plans)
 
@@ -455,7 +455,7 @@ def test_a_gradient_is_there_where_it_is_promised_and_refused_elsewhere(entry):
 
 @every
 def test_plans_are_read_from_a_file_as_they_were_written(entry, tmp_path):
-    for plans in (entry.plans, pj.lane(entry.plans, 2)):
+    for plans in (entry.plans, pj.take(entry.plans, 2)):
         path = tmp_path / "plans.npz"
         plans.save(path)
         again = type(plans).load(path)

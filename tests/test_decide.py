@@ -205,7 +205,7 @@ def test_what_comes_back_is_of_the_kind_that_was_given(decide, array, kind, pair
     "decide", [Best(), pytest.param(Greedy(), marks=pytest.mark.slow)], ids=["best", "greedy"]
 )
 def test_one_case_alone_is_decided_on_and_planned_as_in_its_batch(decide, pairs):
-    alone, together = plan(by(decide), pj.lane(pairs, 1)), plan(by(decide), pairs)
+    alone, together = plan(by(decide), pj.take(pairs, 1)), plan(by(decide), pairs)
     assert alone.order.tolist() == together.order[1].tolist()
     assert alone.status == together.status[1]
     np.testing.assert_allclose(alone.decided_times, together.decided_times[1], rtol=1e-6)
@@ -266,7 +266,7 @@ def test_a_decision_sets_order_and_times_alone(triangles):
     first = first_choice(Greedy(), triangles)
     np.testing.assert_array_equal(first.order, choice.order)
     np.testing.assert_array_equal(first.times, choice.times)
-    one = first_choice(Greedy(), pj.lane(triangles, 3))
+    one = first_choice(Greedy(), pj.take(triangles, 3))
     assert orders(one) == orders(choice)[3]
 
 
@@ -314,7 +314,7 @@ def test_closest_approach_is_what_the_greatest_speed_leaves(pairs):
     gap = np.array(jax.jit(closest_approach)(pairs))
     left = np.hypot(100.0, 0.2) - 5.0 * 4.0 - (0.2 + 0.125) - 5.0 * 4.0 / 64.0
     assert gap[2, 0] == pytest.approx(left, rel=1e-4)
-    alone = jax.jit(closest_approach)(pj.lane(pairs, 2))
+    alone = jax.jit(closest_approach)(pj.take(pairs, 2))
     np.testing.assert_allclose(alone, gap[2], rtol=1e-6)
     gap[2, 0] = 0.0
     assert not gap.any()

@@ -87,7 +87,7 @@ def after_the_end(trajectory, stroke):
 
 def test_stroke_obeys_the_impact_map(plans):
     for lane in range(NUM):
-        one = pj.lane(plans, lane)
+        one = pj.take(plans, lane)
         after = after_the_end(one.trajectory, one.stroke)
         np.testing.assert_allclose(after, one.stroke.ball_vel_after, atol=2e-3)
 
@@ -209,7 +209,7 @@ SUPPLE = dataclasses.replace(PLANNER, velocities=True)
 
 
 def test_a_point_that_is_carried_to_velocities_as_variables_is_the_same_plan(cases):
-    lane = pj.lane(cases, 1)
+    lane = pj.take(cases, 1)
     context, guess = begun(lane)
     point = guess + 0.1 * np.random.default_rng(1).normal(size=guess.size).astype(np.float32)
 
@@ -229,7 +229,7 @@ def test_a_point_that_is_carried_to_velocities_as_variables_is_the_same_plan(cas
 
 
 def test_velocities_as_variables_have_exact_derivatives(float64, cases):
-    lane = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), pj.lane(cases, 2))
+    lane = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), pj.take(cases, 2))
     context = SUPPLE.prepare(lane)
     guess = SUPPLE.guesses(context, 1)[0]
     random = np.random.default_rng(2)
@@ -244,7 +244,7 @@ def test_velocities_as_variables_have_exact_derivatives(float64, cases):
 
 
 def test_all_guesses_but_the_first_pass_the_ball_as_fast_as_the_way_there_asks(cases):
-    lane = pj.lane(cases, 3)
+    lane = pj.take(cases, 3)
 
     @jax.jit
     def impacts(case):
@@ -282,7 +282,7 @@ def test_sizes_that_make_no_sense_are_refused(cases):
         ExactHit(proportions=(1.0,))
     with pytest.raises(ValueError, match="no measured scale for 'exact-5'"):
         ExactHit(proportions=(1.0,) * 5)
-    context, _ = begun(pj.lane(cases, 0))
+    context, _ = begun(pj.take(cases, 0))
     with pytest.raises(ValueError, match="starts must be <= 12, got 13"):
         PLANNER.guesses(context, 13)
 

@@ -213,7 +213,7 @@ def test_a_plan_that_is_not_solved_is_refused_by_its_status(tmp_path, status):
 def test_a_batch_another_class_and_a_plan_that_is_not_whole_are_refused(tmp_path):
     batch = jax.tree.map(lambda leaf: np.stack([leaf] * 3), quadrotor())
     with pytest.raises(
-        ArgumentError, match=r"^plan must be one, as pj.lane\(plans, k\) gives, got"
+        ArgumentError, match=r"^plan must be one, as pj.take\(plans, k\) gives, got"
     ):
         exported(tmp_path, batch)
     with pytest.raises(
@@ -251,7 +251,7 @@ def test_the_bounds_of_a_rate_are_two_setpoints_and_very_many():
     assert len(setpoints_of(quadrotor(), 1.0 / end).time) == 2
     assert len(setpoints_of(quadrotor(), (MOST - 2) / end).time) <= MOST
     with pytest.raises(ArgumentError, match="^rate must be at most 1000 for MAVLink, got 1001$"):
-        stream(quadrotor(), ending=None, to="px4", udp=9, rate=1001)
+        stream(quadrotor(), recovery=None, to="px4", udp=9, rate=1001)
 
 
 @pytest.mark.parametrize(("robot", "to"), [("car", "px4"), ("arm", "px4"), ("arm", "crazyflie")])

@@ -100,7 +100,7 @@ def test_a_row_is_read_back_bit_for_bit_with_what_the_referee_says(tmp_path, tas
     run, plans = written_run(tmp_path / "run", task), batch(TASKS[task][0])
     for row in range(NUM):
         plan, sentence = planned_row(run, row)
-        assert_same(plan, pj.lane(plans, row))
+        assert_same(plan, pj.take(plans, row))
         assert sentence == ("" if row == 0 else f"plan {row} is too fast")
 
 
@@ -139,7 +139,7 @@ def test_a_saved_batch_is_read_as_what_its_robot_knows(tmp_path, robot):
     for row in range(NUM):
         plan = load_plan(tmp_path / "a.npz", row)
         assert type(plan) is type(plans)
-        assert_same(plan, pj.lane(plans, row))
+        assert_same(plan, pj.take(plans, row))
 
 
 def test_what_a_task_adds_to_a_saved_plan_is_left_out(tmp_path):
@@ -180,10 +180,10 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-def said(capsys, words, ending="none"):
+def said(capsys, words, recovery="none"):
     """Exit code and what went to the two streams; by default of plans as they are."""
     try:
-        code = main(["export", *words.split(), *(["--ending", ending] if ending else [])])
+        code = main(["export", *words.split(), *(["--recovery", recovery] if recovery else [])])
     except SystemExit as stop:
         code = stop.code
     return code, *capsys.readouterr()
@@ -209,7 +209,7 @@ def test_a_plan_is_written_and_its_file_is_told(capsys, here, words, name):
 
 def test_a_row_is_written_as_pj_export_writes_its_plan(capsys, here):
     assert said(capsys, "run --row 0 --to px4 --out a.csv --rate 25")[0] == 0
-    as_it_is(pj.lane(batch("quadrotor"), 0), to="px4", out="b.csv", rate=25.0)
+    as_it_is(pj.take(batch("quadrotor"), 0), to="px4", out="b.csv", rate=25.0)
     assert (here / "a.csv").read_bytes() == (here / "b.csv").read_bytes()
 
 

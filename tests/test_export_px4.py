@@ -154,7 +154,7 @@ def test_a_stream_arrives_in_real_time_and_is_decoded():
         sent = []
         sender = threading.Thread(
             target=lambda: sent.append(
-                stream(quadrotor(), ending=None, to="px4", udp=port, rate=RATE)
+                stream(quadrotor(), recovery=None, to="px4", udp=port, rate=RATE)
             )
         )
         fields = trajectory_setpoints(quadrotor(), RATE)
@@ -174,7 +174,7 @@ def test_a_stream_arrives_in_real_time_and_is_decoded():
 @pytest.mark.parametrize("port", [0, -1, 65536, "14540", True, None])
 def test_a_port_is_one_that_there_is(port):
     with pytest.raises(ArgumentError, match="^udp must be a port from 1 to 65535, got"):
-        stream(quadrotor(), ending=None, to="px4", udp=port)
+        stream(quadrotor(), recovery=None, to="px4", udp=port)
 
 
 def test_a_port_on_which_nobody_listens_is_refused():
@@ -182,9 +182,9 @@ def test_a_port_on_which_nobody_listens_is_refused():
         taken.bind(("127.0.0.1", 0))
         port = taken.getsockname()[1]
     with pytest.raises(ArgumentError, match=f"^udp must be .* listens, got {port}$"):
-        stream(quadrotor(), ending=None, to="px4", udp=port)
+        stream(quadrotor(), recovery=None, to="px4", udp=port)
 
 
 def test_only_px4_is_streamed():
     with pytest.raises(ArgumentError, match="^udp must not be given for csv, only for px4, got 9$"):
-        stream(quadrotor(), ending=None, to="csv", udp=9)
+        stream(quadrotor(), recovery=None, to="csv", udp=9)

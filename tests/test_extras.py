@@ -66,7 +66,7 @@ def having(
 
 def way(plans, k, num=200):
     """Positions (num, 3) of plan k at equal steps, the ends included."""
-    path = pj.lane(plans.trajectory, k)
+    path = pj.take(plans.trajectory, k)
     many = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf)[None], num, axis=0), path)
     return states_at(many, np.linspace(0.0, path.durations.sum(), num))[:, 0]
 
@@ -191,9 +191,9 @@ def test_the_referee_finds_the_depth_its_time_and_the_extra(hits, free):
     """A straight way at 2 m/s through two spheres, the second of them deeper."""
     head = np.zeros((1, 4, 3), np.float32)
     head[0, 1, 0] = 2.0
-    plan = pj.lane(free, slice(0, 1)).replace(trajectory=straight(free.trajectory, head[0, 1]))
+    plan = pj.take(free, slice(0, 1)).replace(trajectory=straight(free.trajectory, head[0, 1]))
     limits = dataclasses.replace(hits.limits, min_height=hits.limits.min_height - 9.0)
-    case = pj.lane(hits.replace(limits=limits), slice(0, 1)).replace(head_state=head)
+    case = pj.take(hits.replace(limits=limits), slice(0, 1)).replace(head_state=head)
     zones = (
         pj.KeepOut(np.array([[0.3, 0.4, 0.0]]), np.array([0.5])),
         pj.Dislike(np.zeros((1, 3)), np.ones(1), np.ones(1)),
@@ -214,9 +214,9 @@ def test_the_tip_of_a_way_past_an_edge_is_found_between_samples(hits, free):
     limits = dataclasses.replace(hits.limits, min_height=hits.limits.min_height - 9.0)
     head = np.zeros((1, 4, 3), np.float32)
     head[0, 1] = (2.0, 2.0, 0.0)
-    case = pj.lane(hits.replace(limits=limits), one).replace(head_state=head)
+    case = pj.take(hits.replace(limits=limits), one).replace(head_state=head)
     path = straight(free.trajectory, head[0, 1])
-    plan = pj.lane(free, one).replace(trajectory=path)
+    plan = pj.take(free, one).replace(trajectory=path)
     maps, still = FREE.maps, np.zeros((FREE.num_pieces - 1, 3))
     tail = np.stack([head[0, 1] * span, head[0, 1], *np.zeros((2, 3))])
     rows = boundary_rows(head[0], tail, span[0] / FREE.num_pieces)
@@ -237,7 +237,7 @@ def test_the_tip_of_a_way_past_an_edge_is_found_between_samples(hits, free):
 
 def test_lanes_of_a_batch_are_those_planned_alone(blocked, around):
     for k in (0, 2):
-        alone = pj.plan(HIT, pj.lane(blocked, slice(k, k + 1)))
+        alone = pj.plan(HIT, pj.take(blocked, slice(k, k + 1)))
         np.testing.assert_allclose(
             alone.trajectory.coeffs[0, :, 0], around.trajectory.coeffs[k, :, 0], atol=2e-3
         )
@@ -298,7 +298,7 @@ def test_a_box_inside_out_and_a_plane_without_a_direction_are_refused(hits):
 
 
 def test_a_class_of_ones_own_is_planned_with_and_judged(hits, free):
-    samples = pj.lane(free, 0).sample(200.0)
+    samples = pj.take(free, 0).sample(200.0)
     taken = np.linalg.norm(samples.acc[:, :2], axis=1).max()
     gentle = having(hits, acceleration=np.r_[0.8 * taken, [99.0] * (NUM - 1)])
     verdict = pj.hit.judge(gentle, free)

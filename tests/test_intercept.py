@@ -146,7 +146,7 @@ def test_what_the_planner_claims_the_referee_confirms(planned):
 
 @pytest.mark.slow
 def test_best_also_solves_starts_beside_walls_that_leave_no_room_for_margins():
-    cases = pj.lane(pj.intercept.draw(600, "hard", 1), np.array([20, 176, 291, 506]))
+    cases = pj.take(pj.intercept.draw(600, "hard", 1), np.array([20, 176, 291, 506]))
     usual, best = (pj.plan(pj.intercept.planner(name), cases) for name in ("spacetime", "best"))
     success = pj.intercept.judge(cases, best).success
     assert success.sum() > pj.solved(usual).sum() and (success | ~pj.solved(best)).all()
@@ -155,7 +155,7 @@ def test_best_also_solves_starts_beside_walls_that_leave_no_room_for_margins():
 def test_a_plan_is_sampled_at_a_rate_up_to_its_end(planned):
     cases, plans = planned
     k = int(np.argmax(pj.solved(plans)))
-    one = pj.lane(plans, k).sample(50.0)
+    one = pj.take(plans, k).sample(50.0)
     assert one.time.shape == (501,) and one.pos.shape == (501, 2)
     np.testing.assert_allclose(one.pos[0], cases.start[k, :2], atol=1e-5)
     np.testing.assert_allclose(
@@ -212,7 +212,7 @@ def scenes():
 @pytest.mark.parametrize("name", SCENES)
 def test_a_case_that_cannot_be_solved_says_why_and_others_are_solved(scenes, name):
     k, status = list(SCENES).index(name), SCENES[name][1]
-    case, plan = pj.lane(scenes, k)
+    case, plan = pj.take(scenes, k)
     assert plan.status == status
     assert pj.Status(plan.status).message
     verdict = pj.intercept.judge(case, plan)
@@ -221,7 +221,7 @@ def test_a_case_that_cannot_be_solved_says_why_and_others_are_solved(scenes, nam
 
 @pytest.mark.parametrize("name, heading", [("north", 0.5 * np.pi), ("west", np.pi)])
 def test_a_given_heading_is_kept_at_the_meeting(scenes, name, heading):
-    plan = pj.lane(scenes[1], list(SCENES).index(name))
+    plan = pj.take(scenes[1], list(SCENES).index(name))
     off = plan.sample(10.0).heading[-1] - heading
     assert abs(np.angle(np.exp(1j * off))) <= 0.051
 
@@ -260,7 +260,7 @@ def test_an_early_meeting_is_at_most_as_late_as_the_straight_line_takes(early):
 def test_a_plan_goes_on_as_it_was_for_a_target_as_before(planned):
     cases, plans = planned
     good = np.flatnonzero(pj.solved(plans))
-    cases, plans = pj.lane((cases, plans), good)
+    cases, plans = pj.take((cases, plans), good)
     elapsed = 2.0
     target = jax.vmap(lambda path: path.at(elapsed))(cases.target)
     turned = pj.TurningPath(target.pos, target.vel, cases.target.turn_rate)

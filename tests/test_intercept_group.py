@@ -77,7 +77,7 @@ def test_groups_have_two_to_four_targets_that_stay_on_the_map():
 
 
 def test_a_leg_has_targets_and_movers_moved_on():
-    group = pj.lane(draw(1, 2, 4), 0)
+    group = pj.take(draw(1, 2, 4), 0)
     car = CarState(jnp.array([1.0, 2.0, 0.3]), jnp.array(1.2), jnp.array(-0.5))
     leg = group.leg(2, 4.0, car)
     path = jax.tree.map(lambda leaf: leaf[2], group.shared.target)
@@ -162,16 +162,16 @@ def test_the_best_order_is_no_later_than_the_greedy_one(planned):
 @pytest.mark.parametrize("decide", ["best", "greedy"])
 def test_one_group_is_planned_as_in_a_batch(planned, decide):
     k = int(np.argmax(pj.solved(planned[1][decide])))
-    one, batch = pj.plan(planner(decide), pj.lane(planned[0], k)), pj.lane(planned[1][decide], k)
+    one, batch = pj.plan(planner(decide), pj.take(planned[0], k)), pj.take(planned[1][decide], k)
     assert one.status == batch.status and one.order.tolist() == batch.order.tolist()
     np.testing.assert_allclose(one.cost, batch.cost, atol=1e-3)
-    assert pj.group.judge(pj.lane(planned[0], k), one).success
+    assert pj.group.judge(pj.take(planned[0], k), one).success
 
 
 def test_legs_join(planned):
     plans = planned[1]["best"]
-    plan = pj.lane(plans, int(np.argmax(pj.solved(plans))))
-    first, second = (pj.lane(plan.legs, k) for k in (0, 1))
+    plan = pj.take(plans, int(np.argmax(pj.solved(plans))))
+    first, second = (pj.take(plan.legs, k) for k in (0, 1))
     end = pose_at(first.start, first.time, first.speed, first.curvature, first.time)
     np.testing.assert_allclose(second.start, end, atol=1e-5)
     assert second.speed[0] == first.speed[-1] and second.curvature[0] == first.curvature[-1]
@@ -202,7 +202,7 @@ def cut(plans, **changes):
 def test_the_referee_refuses_a_plan_with_a_wrong_leg(planned):
     groups, plans = planned[0], planned[1]["best"]
     good = np.flatnonzero(pj.solved(plans))
-    groups, plans = pj.lane((groups, plans), good)
+    groups, plans = pj.take((groups, plans), good)
     legs = plans.legs
     shorter = np.array([1.0, 0.9, 1.0, 1.0], np.float32)
     aside = np.zeros((4, 3), np.float32)
@@ -222,7 +222,7 @@ def test_the_referee_refuses_a_plan_with_a_wrong_leg(planned):
         assert set(verdict.failed_limit) <= limits, name
         if limits != {"order"}:
             np.testing.assert_array_equal(verdict.leg, leg)
-    one = pj.group.judge(*pj.lane((groups, wrong["a leg that begins aside"][0]), 0))
+    one = pj.group.judge(*pj.take((groups, wrong["a leg that begins aside"][0]), 0))
     assert one.sentence().startswith("start: leg 1: the plan starts 0.01 off")
 
 

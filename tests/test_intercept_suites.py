@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from planner_jax.core.protocol import lane
+from planner_jax.core.protocol import take
 from planner_jax.referee.clearance import clearances
 from planner_jax.referee.intercept import referee_intercepts
 from planner_jax.task.intercept.api import draw, observe
@@ -189,7 +189,7 @@ def test_a_rush_ends_half_a_second_after_the_first_layer_that_meets_its_target(b
     with jax.enable_x64(True):
         full = replace(cases, time=np.full(NUM, suite.time))
         first = jax.jit(earliest_arrival)
-        arrivals = np.array([first(lane(full, k)) for k in range(3)])
+        arrivals = np.array([first(take(full, k)) for k in range(3)])
     np.testing.assert_allclose(cases.time[:3], arrivals + 0.5)
     end = places(cases.target, cases.time[:, None])
     assert end.min() >= 0.0 and end.max() <= SIZE

@@ -188,7 +188,7 @@ def end_of(objective, start, **options):
     )
 
 
-def test_each_ending_has_its_status():
+def test_each_recovery_has_its_status():
     start = np.full(4, -0.5, np.float32)
     infeasible = lambda x: Evaluation(stretched(x), jnp.full((), 0.2, x.dtype))  # noqa: E731
     assert end_of(unlimited(stretched), start, max_steps=200) is Status.CONVERGED

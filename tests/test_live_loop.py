@@ -323,7 +323,7 @@ def test_a_signal_ends_it_with_the_report(number):
 def test_hits_are_planned_too():
     cases = pj.hit.draw(1)
     of_one = jax.jit(lambda ball: pj.fly(ball, 1.5, 0.0616, 9.8, num_steps=150)[1].pos)
-    served = np.asarray(of_one(pj.lane(cases.ball, 0)), float)
+    served = np.asarray(of_one(pj.take(cases.ball, 0)), float)
     home = np.asarray(cases.head_state[0, 0], float)
     planner = LivePlanner(HitStroke(), deadline=30.0)
     planner.warm_up()

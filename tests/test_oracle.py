@@ -19,7 +19,7 @@ from planner_jax.benchmarks.hit_oracle.search import (
 def serve(limit_scale):
     with jax.enable_x64(True):
         batch = pj.hit.draw(1, seed=5, limit_scale=limit_scale, dtype=jnp.float64)
-        return pj.lane(jax.tree.map(np.asarray, batch), 0)
+        return pj.take(jax.tree.map(np.asarray, batch), 0)
 
 
 def test_an_easy_serve_is_proven_feasible_by_a_trajectory_that_the_referee_passes():

@@ -218,7 +218,7 @@ def test_a_batch_has_the_plans_of_its_cases_one_by_one(meet, float64):
     plans = pj.plan(planner, cases)
     assert len(set(plans.iterations.tolist())) > 1  # unequal lanes
     for k in range(6):
-        alone = pj.plan(planner, pj.lane(cases, k))
+        alone = pj.plan(planner, pj.take(cases, k))
         np.testing.assert_allclose(alone.time, plans.time[k], rtol=1e-8)
         np.testing.assert_allclose(alone.acc, plans.acc[k], atol=1e-6)
 

@@ -294,7 +294,7 @@ def scenes():
 @pytest.mark.parametrize("name", SCENES)
 def test_a_case_is_solved_or_says_why_not_and_the_referee_agrees(scenes, name):
     k, status = list(SCENES).index(name), SCENES[name][1]
-    case, plan = pj.lane(scenes, k)
+    case, plan = pj.take(scenes, k)
     assert plan.status == status
     verdict = pj.intercept.judge(case, plan)
     assert verdict.success == (status == pj.Status.CONVERGED), verdict.sentence()

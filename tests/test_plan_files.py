@@ -80,7 +80,7 @@ def test_numpy_alone_reads_the_arrays_by_the_names_of_their_places(plans, path):
 
 
 def test_jax_arrays_and_single_plans_are_written_too(plans, tmp_path):
-    one = pj.lane(jax.tree.map(jax.numpy.asarray, plans), 1)
+    one = pj.take(jax.tree.map(jax.numpy.asarray, plans), 1)
     one.save(tmp_path / "one.npz")
     again = HitPlan.load(tmp_path / "one.npz")
     assert again.cost.shape == () and again.status == 1

@@ -103,7 +103,7 @@ def test_one_plan_is_its_lane():
     plans = batch(curve(0, 0.8), curve(1, 0.35))
     together = plans.sample(20.0)
     for k, num in enumerate((17, 8)):
-        alone = pj.lane(plans, k).sample(20.0)
+        alone = pj.take(plans, k).sample(20.0)
         np.testing.assert_array_equal(alone.time, together.time[:num])
         for name in FIELDS:
             np.testing.assert_allclose(
@@ -133,7 +133,7 @@ def test_a_rate_must_be_positive(rate):
 
 
 def test_setpoints_of_a_planned_hit_begin_at_the_head_and_end_at_the_impact():
-    case = pj.lane(pj.hit.draw(1), 0)
+    case = pj.take(pj.hit.draw(1), 0)
     plan = pj.plan(pj.hit.planner("juggle", nodes=6), case)
     found = plan.sample(1000.0)
     assert {f.name for f in dataclasses.fields(found)} == {"time", *FIELDS}

@@ -1,4 +1,4 @@
-"""Reading batches: `pj.lane` and `pj.solved`, verdicts of one case, draws that go on."""
+"""Reading batches: `pj.take` and `pj.solved`, verdicts of one case, draws that go on."""
 
 import jax
 import jax.numpy as jnp
@@ -34,9 +34,9 @@ def assert_same(ours, theirs):
 def test_a_lane_is_an_entry_of_every_leaf(array):
     cases = jax.tree.map(array, pj.hit.draw(5))
     one, some, picked = (
-        pj.lane(cases, 3),
-        pj.lane(cases, slice(1, 3)),
-        pj.lane(cases, np.array([4, 0])),
+        pj.take(cases, 3),
+        pj.take(cases, slice(1, 3)),
+        pj.take(cases, np.array([4, 0])),
     )
     assert type(one) is type(cases)
     assert (one.batch_shape, some.batch_shape, picked.batch_shape) == ((), (2,), (2,))
@@ -49,7 +49,7 @@ def test_a_lane_is_an_entry_of_every_leaf(array):
 def test_a_lane_that_is_not_there_is_an_error():
     cases = jax.tree.map(np.asarray, pj.hit.draw(2))
     with pytest.raises(IndexError):
-        pj.lane(cases, 2)
+        pj.take(cases, 2)
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -59,11 +59,11 @@ def test_a_lane_of_a_verdict_is_a_verdict(task):
     verdict = task.judge(cases, pj.plan(CHEAP[task.name](), cases))
     assert isinstance(verdict, pj.Verdict)
     for k in range(4):
-        one = pj.lane(verdict, k)
+        one = pj.take(verdict, k)
         assert type(one) is type(verdict)
         assert np.shape(one.success) == () and one.success == verdict.success[k]
         assert one.sentence() == verdict.sentence(k)
-    some = pj.lane(verdict, verdict.success)
+    some = pj.take(verdict, verdict.success)
     assert some.success.all() and some.success.shape == (verdict.success.sum(),)
 
 
@@ -76,7 +76,7 @@ def test_solved_is_read_from_the_status():
     assert isinstance(good, np.ndarray) and good.dtype == bool
     resident = pj.solved(jax.tree.map(jnp.asarray, plans))
     assert isinstance(resident, np.ndarray) and resident.tolist() == good.tolist()
-    assert pj.solved(pj.lane(plans, 1)) and not pj.solved(pj.lane(plans, 4))
+    assert pj.solved(pj.take(plans, 1)) and not pj.solved(pj.take(plans, 4))
     # What is broken, blocked, without a way or too far is neither solved nor worth another attempt.
     assert is_unsolved(status).tolist() == [False, False, True, True, False, True, *5 * [False]]
 
@@ -93,7 +93,7 @@ def test_a_verdict_on_one_plan_is_that_of_its_lane(task, array):
     together = task.judge(cases, plans)
     assert together.success.shape == (4,)
     for k in range(4):
-        alone = task.judge(pj.lane(cases, k), pj.lane(plans, k))
+        alone = task.judge(pj.take(cases, k), pj.take(plans, k))
         assert np.shape(alone.success) == ()
         assert alone.sentence() == together.sentence(k)
         for name in vars(alone):
@@ -141,7 +141,7 @@ def test_a_draw_from_further_on_is_the_tail_of_one_from_the_beginning(task, suit
     draw = pj.task_named(task).draw
     whole = draw(12, suite, 3)
     for first, num in ((1, 11), (5, 3), (11, 1)):
-        assert_same(draw(num, suite, 3, first=first), pj.lane(whole, slice(first, first + num)))
+        assert_same(draw(num, suite, 3, first=first), pj.take(whole, slice(first, first + num)))
 
 
 @pytest.mark.parametrize(("task", "suite"), SUITES)

@@ -117,7 +117,7 @@ def objects(leaves):
     )
     trajectory = SimpleNamespace(coeffs=leaves["coeffs"], durations=leaves["durations"])
     plan = SimpleNamespace(
-        trajectory=trajectory, order=leaves["order"], times=leaves["times"], ending=None
+        trajectory=trajectory, order=leaves["order"], times=leaves["times"], recovery=None
     )
     return case, plan
 

@@ -121,7 +121,7 @@ def objects(leaves):
         **optional | {name: leaf for name, leaf in leaves.items() if "." not in name},
     )
     trajectory = SimpleNamespace(coeffs=leaves["coeffs"], durations=leaves["durations"])
-    return case, SimpleNamespace(trajectory=trajectory, stroke=part("stroke."), ending=None)
+    return case, SimpleNamespace(trajectory=trajectory, stroke=part("stroke."), recovery=None)
 
 
 def judge(leaves, **options) -> HitVerdict:

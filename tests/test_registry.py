@@ -236,7 +236,7 @@ ERRORS = [
     errors.CaseError("speed", "finite", np.float32(np.nan), (2, 0)),
     errors.UnknownName("task", "one of hit, catch", "hot"),
     errors.MissingExtra("paper", "numba", "baselines"),
-    errors.NoEnding("no recovery trajectory keeps the limits"),
+    errors.NoRecovery("no recovery trajectory keeps the limits"),
     WorkersFailed("be able to start the run"),
 ]
 

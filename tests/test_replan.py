@@ -85,9 +85,9 @@ def test_one_case_is_its_lane(task, request):
     planner = dataclasses.replace(planner, rounds=NONE)
     elapsed = np.float32(0.1)
     together = pj.replan(planner, cases, plans, np.full(NUM, elapsed), **news)
-    alone = pj.replan(planner, *pj.lane((cases, plans), 1), elapsed, **pj.lane(news, 1))
+    alone = pj.replan(planner, *pj.take((cases, plans), 1), elapsed, **pj.take(news, 1))
     assert alone.status.shape == () and alone.status == together.status[1]
-    found, expected = (np.asarray(x.trajectory.durations) for x in (alone, pj.lane(together, 1)))
+    found, expected = (np.asarray(x.trajectory.durations) for x in (alone, pj.take(together, 1)))
     np.testing.assert_allclose(found, expected, rtol=1e-4)
 
 

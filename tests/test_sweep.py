@@ -155,7 +155,7 @@ def test_the_rows_alone_lead_the_referee_to_the_same_verdict(finished):
         durations=rows["durations"], coeffs=rows["coeffs"].reshape(NUM, pieces, -1, 3)
     )
     plans = SimpleNamespace(
-        trajectory=trajectory, stroke=SimpleNamespace(time=rows["contact_time"]), ending=None
+        trajectory=trajectory, stroke=SimpleNamespace(time=rows["contact_time"]), recovery=None
     )
     verdict = referee_hits(cases, plans)
     np.testing.assert_array_equal(verdict.success, rows["success"])

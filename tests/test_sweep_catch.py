@@ -128,7 +128,7 @@ def test_the_rows_alone_lead_the_referee_to_the_same_verdict(finished):
         trajectory=SimpleNamespace(coeffs=coeffs, durations=rows["durations"]),
         order=rows["order"],
         times=rows["catch_times"],
-        ending=None,
+        recovery=None,
     )
     verdict = referee_catches(cases, plans)
     np.testing.assert_array_equal(verdict.success, rows["success"])

@@ -176,7 +176,7 @@ def test_a_row_s_drive_ends_where_the_referee_sees_it(finished, rows):
 
 
 def test_a_case_comes_back_from_its_row(finished, rows):
-    drawn = pj.lane(pj.intercept.draw(1, "hard", 0, first=7), 0)
+    drawn = pj.take(pj.intercept.draw(1, "hard", 0, first=7), 0)
     back = case_of(rows[7], finished[1]["setting"])
     for name in ("walls", "movers"):
         own, other = getattr(drawn, name), getattr(back, name)

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from planner_jax.benchmarks.ipopt_peer.program import COMPILER, Program, ca
-from planner_jax.core.protocol import lane
+from planner_jax.core.protocol import take
 from planner_jax.cost.along import BETWEEN_NODES
 
 # How MUMPS orders and scales: what it does by default, and the least of it, as matrices are small.
@@ -72,7 +72,7 @@ def told_of(module: ModuleType, planner: Any, contexts: Any) -> np.ndarray:
     contexts = jax.tree.map(np.asarray, contexts)
     sizes = module.problem(planner).sizes
     num = jax.tree.leaves(contexts)[0].shape[0]
-    each = (module.told(lane(contexts, k)) for k in range(num))
+    each = (module.told(take(contexts, k)) for k in range(num))
     return np.stack([np.concatenate([np.ravel(one[name]) for name in sizes]) for one in each])
 
 

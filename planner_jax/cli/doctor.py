@@ -101,13 +101,13 @@ def _plans() -> Iterator[Finding]:
     import jax
     import numpy as np
 
-    from planner_jax.core.protocol import lane
+    from planner_jax.core.protocol import take
     from planner_jax.core.registry import task_named
     from planner_jax.planning.plan import plan
 
     hit = task_named("hit")
     planner, batch = hit.planner(), jax.tree.map(np.asarray, hit.draw(_BATCH))
-    for name, cases in (("one plan", lane(batch, 0)), (f"{_BATCH} plans", batch)):
+    for name, cases in (("one plan", take(batch, 0)), (f"{_BATCH} plans", batch)):
         seconds, plans = [], None
         for _ in range(6):
             began = time.perf_counter()

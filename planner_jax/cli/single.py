@@ -18,7 +18,7 @@ from planner_jax.host.compile_cache import keep_compiled_programs
 from planner_jax.host.files import new_file_problem
 from planner_jax.live.settings import ServeSettings
 from planner_jax.runs.environment import require_backend
-from planner_jax.runs.settings import ending_options, require_ending
+from planner_jax.runs.settings import recovery_options, require_recovery
 
 if TYPE_CHECKING:
     from planner_jax.core.protocol import Plan
@@ -70,8 +70,8 @@ def _write_answer(
     written = [out / "plan.npz"]
     answer.plan.save(written[0])
     if answer.success:
-        ending = None if answer.plan.ending is None else "brake"  # one of its own stays
-        how = {"rate": rate, "ending": ending}
+        recovery = None if answer.plan.recovery is None else "brake"  # one of its own stays
+        how = {"rate": rate, "recovery": recovery}
         written.append(export(answer.plan, to="csv", out=out / "setpoints.csv", **how))
     written += write_pictures(task, planner, answer, out)
     print("\n" + "\n".join(map(str, written)))
@@ -96,7 +96,7 @@ def add_export(parser: Parser) -> None:
     port = "of this machine, to which px4 is sent in real time over UDP in the place of a file"
     parser.add("--udp", type=int, metavar="PORT", help=port)
     rest = "how a plan comes to rest behind its end, where it does not do so itself"
-    parser.add("--ending", metavar="NAME", help=f"{rest}: {', '.join(CHOICES)} (default: brake)")
+    parser.add("--recovery", metavar="NAME", help=f"{rest}: {', '.join(CHOICES)} (default: brake)")
     parser.set_defaults(command=_export)
 
 
@@ -106,15 +106,15 @@ def _export(given: Options) -> None:
 
     source, row = given.pop("plans"), given.pop("row", None)
     out, udp = pop_out(given, "file"), given.pop("udp", None)
-    require_ending(name := given.pop("ending", "brake"))
-    ending = ending_options(name).get("ending")
+    require_recovery(name := given.pop("recovery", "brake"))
+    recovery = recovery_options(name).get("recovery")
     if out is not None and udp is not None:
         raise ArgumentError("udp", "given with --out", udp, verb="not be")
     try:
         out = out or api.default_name(source, row, given["to"])
         plan, against = _plan_of(source, row)
-        lacks = ending is not None and api.lacks_ending(plan)
-        given |= {"ending": ending, "case": _case_of(source, row, name) if lacks else None}
+        lacks = recovery is not None and api.lacks_recovery(plan)
+        given |= {"recovery": recovery, "case": _case_of(source, row, name) if lacks else None}
         if udp is None:
             told = str(api.export(plan, out=out, **given))
         else:
@@ -125,7 +125,7 @@ def _export(given: Options) -> None:
         print(f"planner-jax: warning: row {row} fails the referee: {against}", file=sys.stderr)
     if lacks:
         rest = f"row {row} goes on to rest behind its end ({name}), within the limits of its case"
-        print(f"planner-jax: {rest}; --ending none leaves that out", file=sys.stderr)
+        print(f"planner-jax: {rest}; --recovery none leaves that out", file=sys.stderr)
     print(told)
 
 
@@ -143,11 +143,11 @@ def _plan_of(source: str, row: int | None) -> "tuple[Plan, str]":
     return load_plan(source, row), ""
 
 
-def _case_of(source: str, row: int | None, ending: str) -> "Case":
+def _case_of(source: str, row: int | None, recovery: str) -> "Case":
     """Return the case of a row of a sweep, whose limits a recovery trajectory has to keep."""
     if row is None or not os.path.isdir(source):
         rule = "none for plans of a file that do not come to rest, as it does not hold their limits"
-        raise ArgumentError("ending", rule, ending)
+        raise ArgumentError("recovery", rule, recovery)
     from planner_jax.runs.run_folder import RunFolder
     from planner_jax.sweep.rows import case_of_row
 

@@ -12,9 +12,9 @@ from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.host import machine
 
 EFFORTS = ("feasible", "good", "best")  # default first
-ENDINGS = ("brake", "home")  # to a standstill where that is cheapest, or where the case begins
+RECOVERIES = ("brake", "home")  # to a standstill where that is cheapest, or where the case begins
 NONE = "none"  # as a setting has it: a plan that ends at its last contact
-CHOICES = (NONE, *ENDINGS)
+CHOICES = (NONE, *RECOVERIES)
 SCALES = (1e-3, 1e3)  # factors on limits; beyond these, limits are not those of a machine
 
 

@@ -108,7 +108,7 @@ class MissingExtra(PlannerJaxError, ModuleNotFoundError):
         return error
 
 
-class NoEnding(PlannerJaxError, ValueError):
+class NoRecovery(PlannerJaxError, ValueError):
     """No trajectory to a standstill behind a plan keeps every limit; the text says which fails."""
 
 

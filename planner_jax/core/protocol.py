@@ -247,7 +247,7 @@ def is_resident(tree: PyTree) -> bool:
     return all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(tree))
 
 
-def lane(tree: Tree, k: int | np.integer | slice | Numbers) -> Tree:
+def take(tree: Tree, k: int | np.integer | slice | Numbers) -> Tree:
     """Return one case, plan or verdict of a batch, or some of them: entry `k` of every leaf.
 
     Args:

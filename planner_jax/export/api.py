@@ -11,11 +11,11 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import BinaryIO
 
-from planner_jax.core.choices import ENDINGS, require_one_of
+from planner_jax.core.choices import RECOVERIES, require_one_of
 from planner_jax.core.errors import (
     ArgumentError,
     MissingExtra,
-    NoEnding,
+    NoRecovery,
     UnknownName,
     format_value,
 )
@@ -23,7 +23,7 @@ from planner_jax.core.protocol import Plan
 from planner_jax.core.rules import Case
 from planner_jax.export.setpoints import DEFAULT_RATE, robot_of
 from planner_jax.host.files import new_file_problem, replacing
-from planner_jax.recovery.after_plan import is_rested, with_ending
+from planner_jax.recovery.after_plan import append_recovery, is_rested
 from planner_jax.robot.quadrotor import QuadrotorPlan
 
 Writer = Callable[[Plan, float | None, BinaryIO], None]
@@ -76,7 +76,7 @@ def export(
     to: str,
     out: str | os.PathLike,
     rate: float | None = None,
-    ending: str | None = "brake",
+    recovery: str | None = "brake",
     case: Case | None = None,
 ) -> Path:
     """Write one plan for a controller, into a new file that appears whole or not at all.
@@ -92,11 +92,11 @@ def export(
     `csv` and `ros2` take quadrotors, cars and arms, the others quadrotors. All units are SI.
 
     Args:
-        plan: one that is solved; of a batch `pj.lane(plans, k)`.
+        plan: one that is solved; of a batch `pj.take(plans, k)`.
         to: the format.
         out: the file, whose extension selects the kind of the format. It must not exist.
         rate: setpoints a second [Hz], 100 by default; none for `crazyflie`.
-        ending: how the plan comes to rest behind its last contact, unless it does so already:
+        recovery: how the plan comes to rest behind its last contact, unless it does so already:
             "brake" where that is cheapest, "home" where the case begins; None leaves that out.
         case: of the plan, whose limits the recovery trajectory keeps.
 
@@ -121,7 +121,7 @@ def export(
         rate = DEFAULT_RATE if rate is None else rate
     elif rate is not None:
         raise ArgumentError("rate", f"given for {to}, which takes polynomials", rate, verb="not be")
-    plan = bring_to_rest(plan, ending, case)
+    plan = bring_to_rest(plan, recovery, case)
     with replacing(path) as scratch, open(scratch, "wb") as file:
         write(plan, rate, file)
     return path
@@ -133,7 +133,7 @@ def stream(
     to: str,
     udp: int,
     rate: float | None = None,
-    ending: str | None = "brake",
+    recovery: str | None = "brake",
     case: Case | None = None,
 ) -> int:
     """Send one plan to a UDP port of this machine, in real time; return the number of messages.
@@ -143,7 +143,7 @@ def stream(
         to: "px4", the only format for this.
         udp: the port.
         rate: messages a second [Hz], 100 by default.
-        ending: as for `export`.
+        recovery: as for `export`.
         case: as for `export`.
 
     Raises:
@@ -155,7 +155,7 @@ def stream(
         raise ArgumentError("udp", f"given for {to}, only for px4", udp, verb="not be")
     _require_format(to, plan)
     send = _require("planner_jax.export.mavlink:stream", "export over UDP")
-    return send(bring_to_rest(plan, ending, case), udp, DEFAULT_RATE if rate is None else rate)
+    return send(bring_to_rest(plan, recovery, case), udp, DEFAULT_RATE if rate is None else rate)
 
 
 def default_name(source: str | os.PathLike, row: int | None, to: str) -> str:
@@ -165,44 +165,44 @@ def default_name(source: str | os.PathLike, row: int | None, to: str) -> str:
     return f"{Path(os.path.abspath(source)).stem}{index}-{to}{extension}"
 
 
-def bring_to_rest(plan: Plan, ending: str | None, case: Case | None = None) -> Plan:
+def bring_to_rest(plan: Plan, recovery: str | None, case: Case | None = None) -> Plan:
     """Return one plan with the recovery trajectory with which it is exported.
 
     Args:
         plan: of a robot of `ROBOTS`, solved.
-        ending: "brake" or "home"; a plan that comes to rest already stays as it is. None: the
+        recovery: "brake" or "home"; a plan that comes to rest already stays as it is. None: the
             plan up to its last contact, whatever it has behind it.
         case: of the plan, which a plan that does not come to rest needs.
 
     Raises:
-        ArgumentError: the plan cannot be exported, there is no such ending, the case is missing or
+        ArgumentError: the plan cannot be exported, `recovery` is unknown, the case is missing or
             of another robot, or no recovery trajectory keeps every limit.
     """
     robot = robot_of(plan)
-    if ending is None:
-        return dataclasses.replace(plan, ending=None) if isinstance(plan, QuadrotorPlan) else plan
-    require_one_of(ENDINGS, "ending", ending)
+    if recovery is None:
+        return dataclasses.replace(plan, recovery=None) if isinstance(plan, QuadrotorPlan) else plan
+    require_one_of(RECOVERIES, "recovery", recovery)
     if is_rested(plan):
         return plan
-    if robot.name != "quadrotor" and ending != "brake":
-        raise ArgumentError("ending", "brake, as only quadrotors go home", ending)
+    if robot.name != "quadrotor" and recovery != "brake":
+        raise ArgumentError("recovery", "brake, as only quadrotors go home", recovery)
     if case is None:
         rule = "given, whose limits the way to rest behind the plan keeps"
-        rule += ", or ending=None to leave that out"
+        rule += ", or recovery=None to leave that out"
         raise ArgumentError("case", rule, shown="neither")
     if robot.case_field not in vars(case):
         raise ArgumentError("case", "that of the plan", shown=type(case).__name__)
     if case.batch_shape != ():
         shown = f"a batch of shape {case.batch_shape}"
-        raise ArgumentError("case", "one, as pj.lane(cases, k) gives", shown=shown)
+        raise ArgumentError("case", "one, as pj.take(cases, k) gives", shown=shown)
     try:
-        return with_ending(case, plan, ending)
-    except NoEnding as error:
+        return append_recovery(case, plan, recovery)
+    except NoRecovery as error:
         rule = "none for a plan behind which no way to rest keeps every limit"
-        raise ArgumentError("ending", rule, shown=f"{ending!r} ({error})") from None
+        raise ArgumentError("recovery", rule, shown=f"{recovery!r} ({error})") from None
 
 
-def lacks_ending(plan: Plan) -> bool:
+def lacks_recovery(plan: Plan) -> bool:
     """Return whether one plan does not come to rest; raise `ArgumentError` as `robot_of`."""
     robot_of(plan)
     return not is_rested(plan)

@@ -12,7 +12,7 @@ import numpy as np
 
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.plan_files import PlanFileError, load_fitting, named_leaves
-from planner_jax.core.protocol import Plan, Status, is_solved, lane
+from planner_jax.core.protocol import Plan, Status, is_solved, take
 from planner_jax.robot.arm import ArmPlan, ArmSetpoints
 from planner_jax.robot.car import CarPlan, CarSetpoints
 from planner_jax.robot.quadrotor import QuadrotorPlan, QuadrotorSetpoints
@@ -72,7 +72,7 @@ def robot_of(plan: Plan) -> Robot:
         raise ArgumentError("plan", f"that of a robot ({names})", shown=f"a {type(plan).__name__}")
     if np.ndim(plan.status) != 0:
         shown = f"a batch of shape {np.shape(plan.status)}"
-        raise ArgumentError("plan", "one, as pj.lane(plans, k) gives", shown=shown)
+        raise ArgumentError("plan", "one, as pj.take(plans, k) gives", shown=shown)
     if not is_solved(plan.status):
         shown = [f"{each.name}: {each.message}" for each in Status if each == plan.status]
         raise ArgumentError("plan", "solved", shown=f"the status {(*shown, plan.status)[0]}")
@@ -161,4 +161,4 @@ def load_plan(path: str | os.PathLike, row: int | None = None) -> Plan:
     sizes = {np.shape(leaf)[:1] for leaf in named_leaves(plans).values()}
     if len(shape) != 1 or len(sizes) != 1:
         raise PlanFileError("path", "as much of every plan", str(path), verb="hold")
-    return lane(plans, row)
+    return take(plans, row)

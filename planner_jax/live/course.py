@@ -13,12 +13,12 @@ from planner_jax.core.protocol import is_solved
 from planner_jax.live.packets import FIELDS
 from planner_jax.optimise.settings import Round
 from planner_jax.planning.programs import call_packed, solve_cases
-from planner_jax.recovery.case import EndingCase, EndingPlan
-from planner_jax.recovery.planner import RestPlanner
+from planner_jax.recovery.case import RecoveryCase, RecoveryPlan
+from planner_jax.recovery.planner import RecoveryPlanner
 from planner_jax.robot.quadrotor import QuadrotorLimits, setpoint_at
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, states_at, total_duration
 
-_REST = RestPlanner()
+_REST = RecoveryPlanner()
 
 
 @struct.dataclass
@@ -43,8 +43,8 @@ def with_recovery(
     Returns the course of both, and whether the recovery trajectory keeps the limits.
     """
     state: Any = state_on(path, np.sum(path.durations))
-    case = EndingCase(state, state[0], gravity, limits)
-    rest: EndingPlan = call_packed(_recover, _REST.rounds[0], _REST, case)
+    case = RecoveryCase(state, state[0], gravity, limits)
+    rest: RecoveryPlan = call_packed(_recover, _REST.rounds[0], _REST, case)
     return Course(_join(path, rest.trajectory), gravity), bool(is_solved(rest.status))
 
 
@@ -70,7 +70,7 @@ def _join(path: PiecewisePolynomial, other: PiecewisePolynomial) -> PiecewisePol
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), path, other)
 
 
-def _recover(attempt: Round, planner: RestPlanner, case: EndingCase) -> EndingPlan:
+def _recover(attempt: Round, planner: RecoveryPlanner, case: RecoveryCase) -> RecoveryPlan:
     return solve_cases(planner, case, attempt)
 
 

@@ -6,13 +6,13 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from planner_jax.core.errors import ArgumentError, ArgumentTypeError, NoEnding
-from planner_jax.core.protocol import Plan, is_solved, lane
+from planner_jax.core.errors import ArgumentError, ArgumentTypeError, NoRecovery
+from planner_jax.core.protocol import Plan, is_solved, take
 from planner_jax.cost.quadrotor import flight_excess, flight_names, relative_excess
 from planner_jax.planning.plan import plan
 from planner_jax.recovery.braking import brake_arm, brake_car
-from planner_jax.recovery.planner import RestPlanner
-from planner_jax.recovery.with_recovery import ending_cases
+from planner_jax.recovery.planner import RecoveryPlanner
+from planner_jax.recovery.with_recovery import recovery_cases
 from planner_jax.robot.arm import ArmPlan
 from planner_jax.robot.car import CarPlan
 from planner_jax.robot.quadrotor import QuadrotorPlan
@@ -25,14 +25,14 @@ _NODES = 40  # intervals of a piece, at which the exceeded limit is looked for
 def is_rested(found: Plan) -> bool:
     """Return whether one plan ends at standstill, by itself or by its recovery trajectory."""
     if isinstance(found, QuadrotorPlan):
-        return found.ending is not None
+        return found.recovery is not None
     if isinstance(found, ArmPlan):
         end = np.asarray(np.sum(found.motion.durations))
         return bool(np.abs(states_at(found.motion, end)[1]).max() <= _ARM_AT_REST)
     return isinstance(found, CarPlan) and not float(np.asarray(found.speed)[-1]) > 0.0
 
 
-def with_ending(case: PyTree, found: Plan, to: str) -> Plan:
+def append_recovery(case: PyTree, found: Plan, to: str) -> Plan:
     """Return one plan that ends at standstill.
 
     Args:
@@ -41,10 +41,10 @@ def with_ending(case: PyTree, found: Plan, to: str) -> Plan:
         to: "brake", or of a quadrotor "home"; see `with_recovery.add_recovery`.
 
     Returns:
-        The plan with its `ending`; of a car or an arm one `CarPlan` or `ArmPlan` to standstill.
+        The plan with its `recovery`; of a car or an arm one `CarPlan` or `ArmPlan` to standstill.
 
     Raises:
-        NoEnding: no recovery trajectory keeps every limit; one line that names the limit.
+        NoRecovery: no recovery trajectory keeps every limit; one line that names the limit.
         ValueError: only quadrotors go home.
     """
     if isinstance(found, QuadrotorPlan):
@@ -59,15 +59,15 @@ def with_ending(case: PyTree, found: Plan, to: str) -> Plan:
 
 
 def _end_flight(case: PyTree, found: QuadrotorPlan, to: str) -> QuadrotorPlan:
-    """Return the plan of a quadrotor with its recovery trajectory; see `with_ending`."""
+    """Return the plan of a quadrotor with its recovery trajectory; see `append_recovery`."""
     cases, plans = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (case, found))
-    rest = plan(RestPlanner(to=to), ending_cases(cases, plans))
+    rest = plan(RecoveryPlanner(to=to), recovery_cases(cases, plans))
     if is_solved(rest.status[0]):
-        return lane(dataclasses.replace(plans, ending=rest.trajectory), 0)
-    motion = sample_pieces(lane(rest.trajectory, 0), _NODES)
+        return take(dataclasses.replace(plans, recovery=rest.trajectory), 0)
+    motion = sample_pieces(take(rest.trajectory, 0), _NODES)
     flown = relative_excess(case.limits, flight_excess(motion, case.gravity, case.limits))
     worst = [float(np.max(excess)) for excess in flown]
     k = int(np.argmax(worst))
     if worst[k] > 0.0:
-        raise NoEnding(f"{flight_names(case.limits)[k]}: {worst[k]:.2%} above its limit")
-    raise NoEnding(f"a limit is exceeded by {float(rest.violation[0]):.2%}")
+        raise NoRecovery(f"{flight_names(case.limits)[k]}: {worst[k]:.2%} above its limit")
+    raise NoRecovery(f"a limit is exceeded by {float(rest.violation[0]):.2%}")

@@ -15,7 +15,7 @@ from jax import Array
 from jaxtyping import PyTree
 
 from planner_jax.core.arithmetic import host_leaf
-from planner_jax.core.errors import NoEnding
+from planner_jax.core.errors import NoRecovery
 from planner_jax.plane.obstacles import separation
 from planner_jax.robot.arm import ArmPlan
 from planner_jax.robot.car import CarPlan, pose_at
@@ -42,7 +42,7 @@ def brake_car(case: PyTree, plan: CarPlan) -> CarPlan:
         plan: of the case.
 
     Raises:
-        NoEnding: every way to brake touches something.
+        NoRecovery: every way to brake touches something.
     """
     why = ""
     knots = (jnp.asarray(plan.speed), jnp.asarray(plan.curvature))
@@ -59,7 +59,7 @@ def brake_car(case: PyTree, plan: CarPlan) -> CarPlan:
                 curvature=np.append(plan.curvature, curvature[1:]).astype(np.float32),
             )
         why = why or problem
-    raise NoEnding(why)
+    raise NoRecovery(why)
 
 
 def _car_ways(case: PyTree, plan: CarPlan) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -136,7 +136,7 @@ def brake_arm(case: PyTree, plan: ArmPlan) -> ArmPlan:
         plan: of the case.
 
     Raises:
-        NoEnding: with every way to brake a joint leaves its range, or the arm touches something.
+        NoRecovery: with every way to brake a joint leaves its range, or the arm touches something.
     """
     coeffs, durations = (np.asarray(x, np.float64) for x in vars(plan.motion).values())
     state = states_at(plan.motion, np.asarray(durations.sum()))
@@ -152,7 +152,7 @@ def brake_arm(case: PyTree, plan: ArmPlan) -> ArmPlan:
             )
             return _change(ArmPlan, plan, motion=motion)
         why = why or problem
-    raise NoEnding(why)
+    raise NoRecovery(why)
 
 
 def _arm_ways(

@@ -1,4 +1,4 @@
-"""One ending to plan: the state at the end of a plan, and where the quadrotor may come to rest."""
+"""A recovery to plan: the state at the end of a plan, and where the quadrotor may rest."""
 
 from typing import ClassVar
 
@@ -14,7 +14,7 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 
 @struct.dataclass
-class EndingCase:
+class RecoveryCase:
     """One case. Every number is a leaf."""
 
     rules: ClassVar[Table] = (
@@ -36,7 +36,7 @@ class EndingCase:
 
 
 @struct.dataclass
-class EndingPlan(QuadrotorPlan):
+class RecoveryPlan(QuadrotorPlan):
     """One way to rest, or a batch of them with a leading axis on every leaf."""
 
 

@@ -8,12 +8,12 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.core.choices import ENDINGS
+from planner_jax.core.choices import RECOVERIES
 from planner_jax.core.errors import ArgumentError
 from planner_jax.optimise.chain import ChainEnds, ChainPlanner
 from planner_jax.optimise.planner import pending
 from planner_jax.optimise.settings import LbfgsConfig, Round
-from planner_jax.recovery.case import EndingCase, EndingPlan
+from planner_jax.recovery.case import RecoveryCase, RecoveryPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 _ABOVE_GROUND = 0.2  # [m], of a guessed place of standstill
@@ -26,12 +26,12 @@ _GUESSES = np.array([(1.0, 1.0), (1.6, 1.0), (0.7, 0.7), (2.5, 1.5), (1.2, 0.3),
 class RestContext:
     """One case."""
 
-    case: EndingCase
+    case: RecoveryCase
 
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class RestPlanner(ChainPlanner[EndingCase, EndingPlan]):
+class RecoveryPlanner(ChainPlanner[RecoveryCase, RecoveryPlan]):
     """Minimum-snap trajectories to standstill, of free duration.
 
     Decision variables, n = 3 (M - 1) + 4, in units of `scale`: whitened waypoint offsets, log
@@ -42,7 +42,7 @@ class RestPlanner(ChainPlanner[EndingCase, EndingPlan]):
     hinges of the limits, and of the case's extras.
     """
 
-    case_type = EndingCase
+    case_type = RecoveryCase
     package = "planner_jax.recovery"
     shipped_name = "rest"
     num_end_variables = 4
@@ -63,10 +63,10 @@ class RestPlanner(ChainPlanner[EndingCase, EndingPlan]):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.to not in ENDINGS:
-            raise ArgumentError("to", f"one of {', '.join(ENDINGS)}", self.to)
+        if self.to not in RECOVERIES:
+            raise ArgumentError("to", f"one of {', '.join(RECOVERIES)}", self.to)
 
-    def prepare(self, case: EndingCase) -> RestContext:
+    def prepare(self, case: RecoveryCase) -> RestContext:
         """Return the case as it is."""
         return RestContext(case)
 
@@ -101,6 +101,8 @@ class RestPlanner(ChainPlanner[EndingCase, EndingPlan]):
         ends: ChainEnds,
         violation: Array,
         context: RestContext,
-    ) -> EndingPlan:
+    ) -> RecoveryPlan:
         """Return the plan of a trajectory."""
-        return EndingPlan(trajectory=trajectory, gravity=context.case.gravity, **pending(violation))
+        return RecoveryPlan(
+            trajectory=trajectory, gravity=context.case.gravity, **pending(violation)
+        )

@@ -10,11 +10,11 @@ import numpy as np
 from flax import struct
 from jaxtyping import PyTree
 
-from planner_jax.core.choices import ENDINGS, require_one_of
+from planner_jax.core.choices import RECOVERIES, require_one_of
 from planner_jax.core.planner import CaseT, Drive, Planner, PlanT
 from planner_jax.core.protocol import Status, is_solved
-from planner_jax.recovery.case import EndingCase, end_state
-from planner_jax.recovery.planner import RestPlanner
+from planner_jax.recovery.case import RecoveryCase, end_state
+from planner_jax.recovery.planner import RecoveryPlanner
 
 # Where a plan ends so fast that nothing keeps the speed limit behind it, the plan is made again
 # for these shares of the limit.
@@ -22,14 +22,14 @@ _SLOWER = (0.8, 0.65, 0.5)
 
 
 @struct.dataclass
-class EndedPlanner(Planner[CaseT, PlanT]):
+class RecoveringPlanner(Planner[CaseT, PlanT]):
     """A composite planner: a quadrotor's planner, and one that goes on from its plans to rest.
 
-    A plan whose ending breaks a limit is not solved. It is then made again with less speed.
+    A plan whose recovery breaks a limit is not solved. It is then made again with less speed.
     """
 
     planner: Planner[CaseT, PlanT]
-    rest: RestPlanner
+    rest: RecoveryPlanner
 
     @property
     def case_type(self) -> type:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -38,24 +38,24 @@ class EndedPlanner(Planner[CaseT, PlanT]):
 
     @property
     def inner(self) -> Planner:
-        """The planner of plans without an ending."""
+        """The planner of plans without a recovery."""
         return self.planner
 
     def replanner(self) -> Planner:
-        """Return the planner's: what is planned anew has no ending."""
+        """Return the planner's: what is planned anew has no recovery."""
         return self.planner.replanner()
 
     def settle(
         self, cases: PyTree, plan_of: Callable[[Planner, PyTree], PyTree] | None = None
     ) -> tuple[PyTree, PyTree]:
-        """Raise `TypeError`: an ending follows from its plan, and minimises for itself."""
+        """Raise `TypeError`: a recovery follows from its plan, and minimises for itself."""
         raise TypeError(
-            "plans with an ending have no gradient, as plan and ending are minimised one after "
-            "the other: leave `ending` out"
+            "plans with a recovery have no gradient, as plan and recovery are minimised one after "
+            "the other: leave `recovery` out"
         )
 
     def plan_by(self, drive: Drive, cases: PyTree) -> PyTree:
-        """The plans of one case or of a batch, with their endings."""
+        """The plans of one case or of a batch, with their recoveries."""
         if cases.batch_shape == ():
             one = self.plan_by(drive, jax.tree.map(lambda leaf: np.asarray(leaf)[None], cases))
             return jax.tree.map(lambda leaf: leaf[0], one)
@@ -71,34 +71,34 @@ class EndedPlanner(Planner[CaseT, PlanT]):
         return plans
 
     def _ended(self, drive: Drive, cases: PyTree, factor: float) -> tuple[PyTree, PyTree]:
-        """Plans (B,) for a share of the speed limit, and which of them only lack an ending."""
+        """Plans (B,) for a share of the speed limit, and which of them only lack a recovery."""
         limits = cases.limits
         slower = dataclasses.replace(
             limits, speed=(factor * limits.speed).astype(limits.speed.dtype)
         )
         plans, _ = drive(self.planner, dataclasses.replace(cases, limits=slower))
-        endings, _ = drive(self.rest, ending_cases(cases, plans))
+        recoveries, _ = drive(self.rest, recovery_cases(cases, plans))
         xp: ModuleType = jnp if drive.is_pure else np
-        whole, rests = is_solved(plans.status), is_solved(endings.status)
+        whole, rests = is_solved(plans.status), is_solved(recoveries.status)
         lacking = whole & ~rests
         ended = dataclasses.replace(
             plans,
-            ending=endings.trajectory,
+            recovery=recoveries.trajectory,
             violation=xp.where(
-                whole, xp.maximum(plans.violation, endings.violation), plans.violation
+                whole, xp.maximum(plans.violation, recoveries.violation), plans.violation
             ),
-            iterations=plans.iterations + endings.iterations,
+            iterations=plans.iterations + recoveries.iterations,
             status=xp.where(lacking, Status.INFEASIBLE, plans.status).astype(np.int32),
         )
         return ended, lacking
 
 
-def ending_cases(cases: PyTree, plans: PyTree) -> EndingCase:
+def recovery_cases(cases: PyTree, plans: PyTree) -> RecoveryCase:
     """What is left to plan behind plans (B,) of a quadrotor's cases (B,): leaves of their kind."""
     states: PyTree = _end_states(plans.trajectory)
     if isinstance(plans.status, np.ndarray):
         states = np.asarray(states)
-    return EndingCase(
+    return RecoveryCase(
         head_state=states,
         home=cases.head_state[:, 0],
         gravity=cases.gravity,
@@ -110,16 +110,16 @@ def ending_cases(cases: PyTree, plans: PyTree) -> EndingCase:
 _end_states = jax.jit(jax.vmap(end_state))
 
 
-def add_recovery(planner: Planner[CaseT, PlanT], ending: str) -> EndedPlanner[CaseT, PlanT]:
+def add_recovery(planner: Planner[CaseT, PlanT], recovery: str) -> RecoveringPlanner[CaseT, PlanT]:
     """Return a quadrotor's planner whose plans continue to standstill behind their last contact.
 
     Args:
         planner: of plans with the trajectory of a quadrotor.
-        ending: "brake" for the cheapest trajectory to standstill, wherever that is; "home" for the
+        recovery: "brake" for the cheapest trajectory to standstill anywhere; "home" for the
             trajectory back to where the case begins.
 
     Raises:
-        ValueError: `ending` is something else.
+        ValueError: `recovery` is something else.
     """
-    require_one_of(ENDINGS, "ending", ending)
-    return EndedPlanner(planner, RestPlanner(to=ending))
+    require_one_of(RECOVERIES, "recovery", recovery)
+    return RecoveringPlanner(planner, RecoveryPlanner(to=recovery))

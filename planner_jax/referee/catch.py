@@ -31,17 +31,17 @@ from planner_jax.referee.judging import (
 from planner_jax.referee.quadrotor import (
     MOTION_SENTENCES,
     MOTION_UNBOUNDED,
+    append_recovery,
     checked_coeffs,
     intervals_of,
     judge_motion,
     pieces_of,
     read_flight,
-    with_ending,
 )
 
 _ORDER_OF_MOTION = (
     *("head state", "continuity", "speed", "thrust low", "thrust high", "body rate"),
-    *("acceleration", "rotor low", "rotor high", "ground", "extra", "ending"),
+    *("acceleration", "rotor low", "rotor high", "ground", "extra", "recovery"),
 )
 _SENTENCES = {
     "not finite": "the plan or its case is not finite",
@@ -310,7 +310,7 @@ def _judge(
         "target pos": np.where(held[..., None], case["target pos"], 0.0),
         "target vel": np.where(held[..., None], case["target vel"], 0.0),
     }
-    whole = with_ending(pieces, case)
+    whole = append_recovery(pieces, case)
     motion, tests = judge_motion(
         whole, case, extras, intervals, tolerances["relative"], tolerances["continuity"]
     )

@@ -29,11 +29,11 @@ from planner_jax.referee.judging import (
 from planner_jax.referee.quadrotor import (
     MOTION_SENTENCES,
     MOTION_UNBOUNDED,
+    append_recovery,
     intervals_of,
     judge_motion,
     pieces_of,
     read_flight,
-    with_ending,
 )
 
 _SENTENCES = {
@@ -147,7 +147,7 @@ def _judge(
     case: dict, extras: tuple, intervals: int, drag_after_impact: bool, tolerances: dict
 ) -> dict:
     """Return the fields of `HitVerdict` for one chunk of lanes."""
-    pieces = with_ending(pieces_of(case["coeffs"], case["durations"]), case)
+    pieces = append_recovery(pieces_of(case["coeffs"], case["durations"]), case)
     measured, tests = judge_motion(
         pieces, case, extras, intervals, tolerances["relative"], tolerances["continuity"]
     )

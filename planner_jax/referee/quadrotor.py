@@ -58,12 +58,12 @@ def pieces_of(coeffs: np.ndarray, durations: np.ndarray, flown: np.ndarray | Non
     return Pieces(np.ascontiguousarray(coeffs), durations, starts, flown)
 
 
-def with_ending(pieces: Pieces, case: dict) -> Pieces:
-    """Return the pieces of trajectories and of their endings, if there are any."""
-    if "ending.coeffs" not in case:
+def append_recovery(pieces: Pieces, case: dict) -> Pieces:
+    """Return the pieces of trajectories and of their recoveries, if there are any."""
+    if "recovery.coeffs" not in case:
         return pieces
-    durations = case["ending.durations"]
-    size = max(pieces.coeffs.shape[-1], case["ending.coeffs"].shape[2])
+    durations = case["recovery.durations"]
+    size = max(pieces.coeffs.shape[-1], case["recovery.coeffs"].shape[2])
 
     def wide(coeffs: np.ndarray) -> np.ndarray:
         return np.pad(coeffs, [(0, 0)] * 3 + [(0, size - coeffs.shape[-1])])
@@ -72,7 +72,7 @@ def with_ending(pieces: Pieces, case: dict) -> Pieces:
     starts = begin[:, None] + durations.cumsum(axis=1) - durations
     return Pieces(
         np.concatenate(
-            [wide(pieces.coeffs), wide(np.moveaxis(case["ending.coeffs"], -1, 0))], axis=2
+            [wide(pieces.coeffs), wide(np.moveaxis(case["recovery.coeffs"], -1, 0))], axis=2
         ),
         np.concatenate([pieces.durations, durations], axis=1),
         np.concatenate([pieces.starts, starts], axis=1),
@@ -91,7 +91,7 @@ MOTION_SENTENCES = {
     "rotor high": "{excess:.2%} above the greatest thrust of a rotor at {time:.3f} s",
     "ground": "{excess:.2%} below the least height at {time:.3f} s",
     "extra": "{excess:.2%} beyond extras[{worst_extra}] of the case at {time:.3f} s",
-    "ending": "the way to rest ends with what makes {excess:.3g} m of displacement",
+    "recovery": "the way to rest ends with what makes {excess:.3g} m of displacement",
 }
 MOTION_UNBOUNDED = {"body rate": "no thrust or upside down, so without attitude, at {time:.3f} s"}
 _ROTOR_SHAPES = {"mass": (), "inertia": (3,), "mixer": (4, 4), "min_thrust": (), "max_thrust": ()}
@@ -129,7 +129,7 @@ def read_flight(cases, plans) -> dict[str, np.ndarray]:
     """Read the arrays of cases and plans that `judge_motion` needs but the head state.
 
     The optional limits are those that are not None: acceleration, thrust, rotors. So is the
-    trajectory to rest behind the plan, `ending`.
+    trajectory to rest behind the plan, `recovery`.
     """
     coeffs = checked_coeffs(plans.trajectory.coeffs)
     num_lanes, num_pieces = coeffs.shape[:2]
@@ -141,10 +141,10 @@ def read_flight(cases, plans) -> dict[str, np.ndarray]:
     leaves |= read_leaves(cases, shapes, num_lanes)
     if cases.limits.rotors is not None:
         leaves |= read_leaves(cases.limits.rotors, _ROTOR_SHAPES, num_lanes, "limits.rotors.")
-    if plans.ending is not None:
-        coeffs = checked_coeffs(plans.ending.coeffs)
+    if plans.recovery is not None:
+        coeffs = checked_coeffs(plans.recovery.coeffs)
         shapes = {"coeffs": coeffs.shape[1:], "durations": coeffs.shape[1:2]}
-        leaves |= read_leaves(plans.ending, shapes, num_lanes, "ending.")
+        leaves |= read_leaves(plans.recovery, shapes, num_lanes, "recovery.")
     return leaves
 
 
@@ -408,10 +408,10 @@ def _judge_rest(case: dict, pieces: Pieces, continuity: float) -> dict:
 
     Velocity, acceleration and jerk at the end count as displacement, as jumps between pieces do.
     """
-    if "ending.coeffs" not in case:
+    if "recovery.coeffs" not in case:
         return {}
-    durations = case["ending.durations"]
-    last = np.moveaxis(case["ending.coeffs"][:, -1], 0, -1)
+    durations = case["recovery.durations"]
+    last = np.moveaxis(case["recovery.coeffs"][:, -1], 0, -1)
     period = np.maximum(durations.mean(axis=1), SHORTEST_PIECE)
     moved = np.stack(
         [
@@ -423,4 +423,4 @@ def _judge_rest(case: dict, pieces: Pieces, continuity: float) -> dict:
     scale = np.maximum(np.abs(pieces.coeffs[..., 0]).max(axis=(0, 2)), 1.0)
     late = (durations <= 0.0).any(axis=1)
     failed = ~(moved <= continuity * scale) | late
-    return {"ending": (failed, moved, pieces.starts[:, -1] + pieces.durations[:, -1])}
+    return {"recovery": (failed, moved, pieces.starts[:, -1] + pieces.durations[:, -1])}

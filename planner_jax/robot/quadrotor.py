@@ -283,15 +283,15 @@ class QuadrotorPlan(Plan):
     trajectory: PiecewisePolynomial  # up to the last contact
     gravity: Array  # () [m/s^2], magnitude, for which it was planned
     # From there on to rest, where it was asked for.
-    ending: PiecewisePolynomial | None = struct.field(default=None, kw_only=True)
+    recovery: PiecewisePolynomial | None = struct.field(default=None, kw_only=True)
 
     @property
     def whole(self) -> PiecewisePolynomial:
-        """The trajectory and the ending in one, of a plan or of a batch."""
-        return self.trajectory if self.ending is None else joined(self.trajectory, self.ending)
+        """The trajectory and the recovery in one, of a plan or of a batch."""
+        return self.trajectory if self.recovery is None else joined(self.trajectory, self.recovery)
 
     def sample(self, rate: float) -> QuadrotorSetpoints:
-        """Sample the plan, or the batch, at a rate [Hz] up to its end, `ending` included.
+        """Sample the plan, or the batch, at a rate [Hz] up to its end, `recovery` included.
 
         Raises:
             ValueError: the rate is not positive.

@@ -41,15 +41,15 @@ def option(default: object, metavar: str, words: str) -> Any:
     return dataclasses.field(default=default, metadata={"metavar": metavar, "help": words})
 
 
-def ending_option(usual: str = NONE) -> str:
-    """Return the field of settings `ending` of a task of quadrotors."""
+def recovery_option(usual: str = NONE) -> str:
+    """Return the field of settings `recovery` of a task of quadrotors."""
     words = f"flown behind the last contact, within all limits: {', '.join(CHOICES)}"
     return option(usual, "NAME", words)
 
 
-def ending_options(value: str) -> dict[str, str]:
-    """Return the options of a planner for the argument `ending`."""
-    return {} if value == NONE else {"ending": value}
+def recovery_options(value: str) -> dict[str, str]:
+    """Return the options of a planner for the argument `recovery`."""
+    return {} if value == NONE else {"recovery": value}
 
 
 def require_count(name: str, value: int | None, least: int, *, none: bool = False) -> None:
@@ -58,9 +58,9 @@ def require_count(name: str, value: int | None, least: int, *, none: bool = Fals
         require_size(name, value, least)  # type: ignore[arg-type]
 
 
-def require_ending(value: str) -> None:
-    """Raise `ArgumentError` unless the argument `ending` is one, or none."""
-    require_one_of(CHOICES, "ending", value)
+def require_recovery(value: str) -> None:
+    """Raise `ArgumentError` unless the argument `recovery` is one, or none."""
+    require_one_of(CHOICES, "recovery", value)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,7 +9,7 @@ import jax.monitoring
 import numpy as np
 
 from planner_jax.core.planner import Planner
-from planner_jax.core.protocol import lane
+from planner_jax.core.protocol import take
 from planner_jax.planning.plan import CaseT, PlanT, plan
 
 # Tracing, lowering and the backend's compilation, which includes reading the compile cache.
@@ -93,6 +93,6 @@ def timed_warm(call: Callable[[], FoundT]) -> tuple[FoundT, float]:
 def timed_plans(planner: Planner[CaseT, PlanT], cases: CaseT) -> tuple[PlanT, np.ndarray]:
     """Return plans of cases (B,), made one after another, and their warm seconds (B,)."""
     num = jax.tree.leaves(cases)[0].shape[0]
-    timed_each = [timed_warm(lambda k=k: plan(planner, lane(cases, k))) for k in range(num)]
+    timed_each = [timed_warm(lambda k=k: plan(planner, take(cases, k))) for k in range(num)]
     plans, seconds = zip(*timed_each, strict=True)
     return jax.tree.map(lambda *leaves: np.stack(leaves), *plans), np.array(seconds)

@@ -31,14 +31,14 @@ MOTION = leaves_of(
 )
 
 
-def _of_ending(name: str, unit: str, meaning: str) -> Column:
+def _of_recovery(name: str, unit: str, meaning: str) -> Column:
     """Return a leaf of the ways to rest; null where plans have none."""
 
     def values(batch: RefereedBatch) -> np.ndarray | None:
-        ending = batch.plans.ending
-        return None if ending is None else vars(ending)[name]
+        recovery = batch.plans.recovery
+        return None if recovery is None else vars(recovery)[name]
 
-    return Column(f"ending_{name}", unit, meaning, LIST, values)
+    return Column(f"recovery_{name}", unit, meaning, LIST, values)
 
 
 TRAJECTORY = [
@@ -47,8 +47,8 @@ TRAJECTORY = [
         ("durations", "s", "of the pieces", LIST),
         ("coeffs", "m/s^k", "pieces x powers k = 0..D x 3 axes, flat", LIST),
     ),
-    _of_ending("durations", "s", "of the pieces behind the last contact, to rest; null if none"),
-    _of_ending("coeffs", "m/s^k", "likewise, as `coeffs`"),
+    _of_recovery("durations", "s", "of the pieces behind the last contact, to rest; null if none"),
+    _of_recovery("coeffs", "m/s^k", "likewise, as `coeffs`"),
 ]
 
 _RESTS = {
@@ -57,9 +57,9 @@ _RESTS = {
 }
 
 
-def ending_remark(parameters: Row) -> list[str]:
+def recovery_remark(parameters: Row) -> list[str]:
     """Return a sentence on what plans do behind their last contact, if they do anything."""
-    words = _RESTS.get(parameters.get("ending", ""))
+    words = _RESTS.get(parameters.get("recovery", ""))
     if words is None:
         return []
     return [f"Behind the last contact: {words}; a plan is a success with that or not at all."]
@@ -96,9 +96,9 @@ def sample_motion(
 
 def sample_rest(row: Row, num: int) -> SampledMotion | None:
     """Sample the recovery trajectory of a row, at the plan's times; None where there is none."""
-    if row["ending_durations"] is None:
+    if row["recovery_durations"] is None:
         return None
-    rest = sample_motion(row["ending_coeffs"], row["ending_durations"], num)
+    rest = sample_motion(row["recovery_coeffs"], row["recovery_durations"], num)
     return dataclasses.replace(rest, time=rest.time + np.sum(row["durations"]))
 
 

@@ -15,10 +15,10 @@ from planner_jax.core.registry import Task
 from planner_jax.runs.manifest import Entries, Row
 from planner_jax.runs.settings import (
     SweepSettings,
-    ending_option,
-    ending_options,
     option,
-    require_ending,
+    recovery_option,
+    recovery_options,
+    require_recovery,
 )
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ class QuadrotorSettings(SweepSettings):
     limit_scale: float = option(1.0, "F", "factor on the limits of speed, body rate and thrust")
     robot: object = robot_option("the task's")
     effort: str = option(EFFORTS[0], "NAME", f"of the planner: {', '.join(EFFORTS)}")
-    ending: str = ending_option()
+    recovery: str = recovery_option()
 
     TOOL: ClassVar[str]  # that the robot has to carry, "net" or "racket"
     WITHOUT_EFFORT: ClassVar[str]  # the planner that minimises nothing
@@ -87,12 +87,12 @@ class QuadrotorSettings(SweepSettings):
         rule = f"left out for the planner {self.WITHOUT_EFFORT}, which minimises nothing"
         has_effort = self.effort == EFFORTS[0] or self.planner != self.WITHOUT_EFFORT
         require(has_effort, "effort", rule, self.effort)
-        require_ending(self.ending)
+        require_recovery(self.recovery)
 
     def planner_options(self) -> Entries:
         """Return the options of the planner that these settings decide."""
         more = {} if self.effort == EFFORTS[0] else {"effort": self.effort}
-        return super().planner_options() | more | ending_options(self.ending)
+        return super().planner_options() | more | recovery_options(self.recovery)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -114,7 +114,7 @@ class SingleSettings:
     min_height: float | None = option(None, "Z", f"least height [m] {_OWN}")
     gravity: float | None = option(None, "G", "magnitude [m/s^2] (default: the task's)")
     robot: object = robot_option("the task's")
-    ending: str = ending_option("brake")  # its setpoints leave for a controller
+    recovery: str = recovery_option("brake")  # its setpoints leave for a controller
 
     RUN: ClassVar[str]  # what answers, "module:Class"
     PLANNER: ClassVar[tuple[str, ...]] = ()  # names of the settings that are the planner's options
@@ -123,7 +123,7 @@ class SingleSettings:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "robot", checked_robot(self.robot, self.TOOL))
-        require_ending(self.ending)
+        require_recovery(self.recovery)
         for field in dataclasses.fields(self):
             value = vars(self)[field.name]
             if isinstance(value, list):  # as a parser has it
@@ -147,11 +147,11 @@ class SingleSettings:
     def planner_options(self) -> Entries:
         """Return options of the planner that these settings decide."""
         own = {name: vars(self)[name] for name in self.PLANNER}
-        return own | ending_options(self.ending)
+        return own | recovery_options(self.recovery)
 
     def case_options(self) -> Entries:
         """Named arguments of the task's `case` that are given."""
-        apart = {"planner", "ending", *self.PLANNER, *self.ELSEWHERE}
+        apart = {"planner", "recovery", *self.PLANNER, *self.ELSEWHERE}
         given = vars(self).items()
         return {name: value for name, value in given if value is not None and name not in apart}
 

@@ -8,7 +8,7 @@ from jaxtyping import PyTree
 
 from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.errors import ArgumentError
-from planner_jax.core.protocol import Plan, Status, lane
+from planner_jax.core.protocol import Plan, Status, take
 from planner_jax.robot.arm import ArmPlan
 from planner_jax.robot.car import CarPlan
 from planner_jax.robot.quadrotor import QuadrotorPlan
@@ -40,7 +40,7 @@ def case_of_row(folder: RunFolder, row: int) -> PyTree:
     if sweep.setting(cases) != manifest["setting"]:
         rule = "a run whose cases are drawn or read as they were"
         raise ArgumentError(folder.name, rule, shown=f"others for row {row}")
-    return lane(cases, 0)
+    return take(cases, 0)
 
 
 def planned_row(folder: RunFolder, row: int | None) -> PlannedRow:
@@ -65,12 +65,12 @@ def planned_row(folder: RunFolder, row: int | None) -> PlannedRow:
 
 def quadrotor_plan(row: Row, setting: Row) -> QuadrotorPlan:
     """Return the plan of a row of a quadrotor; gravity is that of the run's setting."""
-    rest = row.get("ending_durations")
+    rest = row.get("recovery_durations")
     return QuadrotorPlan(
         **_outcome(row),
         trajectory=_polynomial(row["coeffs"], row["durations"], 3),
         gravity=_numbers(setting["gravity"]),
-        ending=None if rest is None else _polynomial(row["ending_coeffs"], rest, 3),
+        recovery=None if rest is None else _polynomial(row["recovery_coeffs"], rest, 3),
     )
 
 

@@ -15,7 +15,7 @@ from jax.typing import ArrayLike, DTypeLike
 from planner_jax.core.checks import numbers_of, numeric, require_number, require_switch, shape_of
 from planner_jax.core.choices import require_memory, require_size
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
-from planner_jax.core.protocol import Decision, Plan, lane
+from planner_jax.core.protocol import Decision, Plan, take
 from planner_jax.core.registry import split_name
 from planner_jax.core.rules import NOT_NEGATIVE, Case
 
@@ -128,7 +128,7 @@ def judge_by(
     if alone:
         cases, plans = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (cases, plans))
     verdict = referee(cases, plans, **settings)
-    return lane(verdict, 0) if alone else verdict
+    return take(verdict, 0) if alone else verdict
 
 
 def require_settings(referee: Callable[..., object], settings: dict[str, object]) -> None:

@@ -105,7 +105,7 @@ pj.plan(exact, filled(hits, 'hit_limits.min_apex', 9.0)) | hit_limits.min_apex m
 pj.plan(catcher, filled(catches, 'order', 1)) | order must be a permutation
 pj.plan(catcher, having(catches, 'targets', None)) | targets must be given, got None
 pj.plan(exact, jax.tree.map(np.float16, hits)) | ball.pos must be in float32 or float64
-pj.plan(exact, pj.lane(hits, slice(0, 0))) | cases must be a batch of at least one
+pj.plan(exact, pj.take(hits, slice(0, 0))) | cases must be a batch of at least one
 pj.plan(exact, hits, devices=[0]) | devices must be a sequence of jax.Device
 pj.replan(exact, hits, hit_plans, -0.1, ball=hits.ball) | elapsed must
 pj.replan(exact, hits, catch_plans, 0.1, ball=hits.ball) | previous must

@@ -29,7 +29,7 @@ sweep hit stray                              | unrecognized stray
 sweep hit --limit-scale 1e-300               | --limit-scale must be from 0.001 to 1000
 sweep catch --limit-scale nan                | --limit-scale must be from 0.001 to 1000
 sweep hit --effort more                      | --effort must be one of feasible
-sweep catch --ending land                    | --ending must be one of none
+sweep catch --recovery land                    | --recovery must be one of none
 sweep hit --delay inf                        | --delay must be finite and >= 0
 sweep hit --start nan 0 1                    | --start must be
 sweep hit --start 1 2                        | --start must be
@@ -55,7 +55,7 @@ plan catch --horizon 1 --ball 1 2 3          | --ball
 plan block                                   | block
 compare junk junk --out x.txt                | --out must end in .csv
 export junk --row 0 --to cvs                 | --to must be one of csv did you mean 'csv'?
-export junk --row 0 --to csv --ending land   | --ending must be one of none
+export junk --row 0 --to csv --recovery land   | --recovery must be one of none
 serve hit --port 65536                       | --port must
 serve catch --deadline 0                     | --deadline must
 serve hit --robot nobody                     | --robot must be
@@ -122,10 +122,10 @@ NUMBERS = (
 )
 WORDS = (
     *((f"sweep {task}", option) for task in TASKS for option in ("--planner", "--suite")),
-    *(("sweep hit", "--effort"), ("sweep hit", "--ending"), ("sweep catch", "--decide")),
+    *(("sweep hit", "--effort"), ("sweep hit", "--recovery"), ("sweep catch", "--decide")),
     *(("sweep catch", "--net-test"), ("sweep block", "--regime"), ("fly hit", "--noise")),
     *((f"fly {task}", "--planner") for task in TASKS),
-    *((f"{HIT} --pos 4 0 1", option) for option in ("--planner", "--ending")),
+    *((f"{HIT} --pos 4 0 1", option) for option in ("--planner", "--recovery")),
     *(("export junk --row 0", "--to"), ("bench throughput", "--task"), ("serve hit", "--robot")),
     *(("library build new", "--layout"), ("train", "--suite"), ("bench throughput", "--planner")),
 )

@@ -72,7 +72,7 @@ def first(num, plans):
 
 def lane0(tree):
     """One of a batch."""
-    return pj.lane(tree, 0)
+    return pj.take(tree, 0)
 
 
 def ball_path(num):
@@ -100,7 +100,7 @@ def given(tmp_path_factory):
         host(task.draw(2)) for task in (pj.hit, pj.catch, pj.intercept, pj.block)
     )
     square = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
-    ball = pj.lane(hits.ball, 0)
+    ball = pj.take(hits.ball, 0)
 
     def saved(plans):
         plans.save(folder / "saved.npz")
@@ -115,14 +115,14 @@ def given(tmp_path_factory):
         **{"ball_path": ball_path, "turning": turning, "SQUARE": square},
         **{"exact": exact, "catcher": catcher, "driver": driver, "blocker": blocker},
         **{"hits": hits, "catches": catches, "drives": drives, "blocks": blocks},
-        "hit": pj.lane(hits, 0),
+        "hit": pj.take(hits, 0),
         **made_up_plans(),
         "two_walls": jax.tree.map(lambda leaf: np.stack([leaf] * 2), host(pj.obstacles([square]))),
         "HIT": {"serve_pos": (0, 5, 1), "serve_vel": (0, -5, 4), "target": (0, 4, 0)},
         "HITS": {name: np.ones((2, 3)) for name in ("serve_pos", "serve_vel", "target")},
         "CATCH": {"targets": ball_path(2), "horizon": (2.0, 2.0)},
         "TABLE": {"times": (0.0, 0.5, 1.0), "positions": np.eye(3)},
-        "DRIVE": {"target": pj.lane(turning(1), 0)},
+        "DRIVE": {"target": pj.take(turning(1), 0)},
         "BLOCK": {"ball_pos": (4, 0, 1), "ball_vel": (-8, 0, 2)},
         "PATH": {"ball": ball, "horizon": 1.0, "drag": 0.06, "gravity": 9.8, "num_nodes": 8},
         "FLY": {"ball": ball, "duration": 1.0, "drag": 0.06, "gravity": 9.8, "num_steps": 8},

@@ -28,7 +28,7 @@ def test_a_table_names_arrays_of_its_case_and_every_rule_can_be_broken(name):
     robots = {"hit": "x500", "catch": "x500-net"}
     options = {"robot": with_all_limits(pj.robot_named(robots[name]))} if name in robots else {}
     drawn = pj.task_named(name).draw(1, **options) if options else CASES[name]
-    case = pj.lane(jax.tree.map(np.asarray, drawn), 0)
+    case = pj.take(jax.tree.map(np.asarray, drawn), 0)
     fields = [field.name for field in type(case).rules]
     for field in fields:
         named(case, field)
@@ -40,7 +40,7 @@ def test_a_table_names_arrays_of_its_case_and_every_rule_can_be_broken(name):
 @pytest.mark.parametrize("name", TASKS)
 def test_every_broken_rule_marks_its_lane_alone_in_both_forms(name):
     cases = CASES[name]
-    bad = poisons(pj.lane(cases, 0))
+    bad = poisons(pj.take(cases, 0))
     whole = jax.tree.map(lambda leaf: np.repeat(leaf[:1], 2 * len(bad), axis=0), cases)
     lanes = np.arange(0, 2 * len(bad), 2)
     broken = poisoned(whole, lanes)
@@ -53,7 +53,7 @@ def test_every_broken_rule_marks_its_lane_alone_in_both_forms(name):
 @pytest.mark.parametrize("name", TASKS)
 def test_the_host_names_field_rule_value_and_lane(name):
     cases = CASES[name]
-    for place, value in poisons(pj.lane(cases, 0))[::5]:
+    for place, value in poisons(pj.take(cases, 0))[::5]:
         broken = jax.tree.map(np.array, cases)
         leaf = named(broken, place.replace("extras.", "extras."))
         leaf[1] = value

@@ -86,7 +86,7 @@ class ScipyMeet(pj.Planner):
     case_type = MeetCase
 
     def solve_on_host(self, cases: MeetCase, attempt: pj.Attempt) -> MeetPlan:
-        plans = [self._solve(pj.lane(cases, k)) for k in range(cases.batch_shape[0])]
+        plans = [self._solve(pj.take(cases, k)) for k in range(cases.batch_shape[0])]
         return jax.tree.map(lambda *leaves: np.stack(leaves), *plans)
 
     def _solve(self, case: MeetCase) -> MeetPlan:

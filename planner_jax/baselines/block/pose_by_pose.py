@@ -27,7 +27,7 @@ from planner_jax.baselines.block.path_timing import DEGREE, PIECES, required, ti
 from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import Planner
-from planner_jax.core.protocol import Attempt, Status, lane, require_settings
+from planner_jax.core.protocol import Attempt, Status, require_settings, take
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.plan import BlockPlan, explain_status
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
@@ -86,7 +86,7 @@ class PoseByPose(Planner, abc.ABC):
 
     def solve_on_host(self, cases: BlockCase, attempt: Attempt) -> BlockPlan:
         """Return the plans of a batch, one case after another."""
-        plans = [self.plan_of(lane(cases, k)) for k in range(cases.batch_shape[0])]
+        plans = [self.plan_of(take(cases, k)) for k in range(cases.batch_shape[0])]
         return jax.tree.map(lambda *leaves: np.stack(leaves), *plans)
 
     def plan_of(self, case: BlockCase) -> BlockPlan:

@@ -20,7 +20,7 @@ from planner_jax.baselines.intercept.path_smoothing import Smoothing, smooth_pat
 from planner_jax.baselines.intercept.path_then_speed import SpeedStep
 from planner_jax.baselines.intercept.speed import SPEED_PLANNERS
 from planner_jax.core.planner import Planner
-from planner_jax.core.protocol import Status, lane
+from planner_jax.core.protocol import Status, take
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.plan import InterceptPlan, explain
 from planner_jax.task.intercept.searches import Search
@@ -54,7 +54,7 @@ class PaperIntercept(Planner):
     def solve_on_host(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:
         """The plans of a batch."""
         num = len(np.asarray(cases.time))
-        found = [self.searched(lane(cases, k)) for k in range(num)]
+        found = [self.searched(take(cases, k)) for k in range(num)]
         poses, bends, length, is_found = (np.stack(each) for each in zip(*found, strict=True))
         plans = _driven(self, cases, poses, bends, length, is_found)
         return jax.tree.map(np.array, plans)

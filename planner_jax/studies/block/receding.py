@@ -21,7 +21,7 @@ from planner_jax.ball.flight import BallState
 from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import Planner
-from planner_jax.core.protocol import Status, is_solved, lane, select_into
+from planner_jax.core.protocol import Status, is_solved, select_into, take
 from planner_jax.planning.plan import plan
 from planner_jax.planning.replan import Replanning
 from planner_jax.studies.block.contact_check import end_at_contact
@@ -78,7 +78,7 @@ class Decided:
 
     def fit_errors(self, place: int) -> tuple[Array, Array]:
         """Return errors (B,) [m] of the fits of a moment, and what they are believed to be."""
-        return fit_errors(self.cases, lane(self.fits, place))
+        return fit_errors(self.cases, take(self.fits, place))
 
 
 def plan_with_aims(
@@ -94,7 +94,7 @@ def plan_with_aims(
     cases, plans = jax.tree.map(np.asarray, cases), None
     lanes = np.arange(cases.batch_shape[0])
     for aim in aims:
-        some = lane(cases, lanes)
+        some = take(cases, lanes)
         is_again = isinstance(some, Replanning)
         aimed = cautious(some.case if is_again else some, **dataclasses.asdict(aim))
         # NumPy arrays, for which there are programs already.
@@ -171,7 +171,7 @@ def decide(
             later = np.full(num, following + overhead, dtype)
             lanes = np.flatnonzero(open_ & stands)
             if lanes.size:
-                some = lane(dataclasses.replace(known, delay=later), lanes)
+                some = take(dataclasses.replace(known, delay=later), lanes)
                 open_[lanes] = ~is_solved(plan_with_aims(planner, some, aims[:1]).status)
         arms.decide(planner, known, np.where(open_, useful, 0), aims)
     plans = arms.composed()
@@ -234,21 +234,21 @@ class _Arms:
         for num in np.unique(useful[moves & (useful > 0)]):
             lanes = np.flatnonzero(moves & (useful == num))
             assert isinstance(planner, OnlineBlock)
-            warm, some = WarmBlock(planner=planner), lane(tasks, lanes)
+            warm, some = WarmBlock(planner=planner), take(tasks, lanes)
             found = plan_with_aims(warm, some, aims[:num])
             self._begin(begin, lanes, found)
             useful[lanes[is_solved(found.status)]] = 0
         # A search from scratch takes long: only for a ball that is missed else.
         lanes = np.flatnonzero(useful == len(aims))
         if lanes.size:
-            self._begin(begin, lanes, plan_with_aims(planner, lane(tasks.case, lanes), aims))
+            self._begin(begin, lanes, plan_with_aims(planner, take(tasks.case, lanes), aims))
 
     def _begin(self, begin: np.ndarray, lanes: np.ndarray, found: BlockPlan) -> None:
         """Go over to the plans found for some lanes (N,) that are solved."""
         good = is_solved(found.status)
         if not good.any():
             return
-        lanes, found = lanes[good], lane(found, good)
+        lanes, found = lanes[good], take(found, good)
         if not self.motions.any():  # from now on motions are of this shape
             still = _still(self.cases, found.motion.coeffs.shape[1:3])
             self.plans = dataclasses.replace(self.plans, motion=still)

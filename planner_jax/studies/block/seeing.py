@@ -10,7 +10,7 @@ from flax import struct
 from jax import Array
 
 from planner_jax.core.planner import Drive, Planner
-from planner_jax.core.protocol import lane
+from planner_jax.core.protocol import take
 from planner_jax.studies.block.contact_check import end_at_contact
 from planner_jax.studies.block.observation import eye
 from planner_jax.studies.block.receding import Decided, decide
@@ -50,7 +50,7 @@ class SeeingArms(Planner[BlockCase, SeenPlan]):
         """Return what the arms of a batch do, up to where they meet the true balls."""
         done = self.decided(cases)
         (error, std), (last, _) = (done.fit_errors(place) for place in (0, -1))
-        first = lane(done.fits, 0)
+        first = take(done.fits, 0)
         met = end_at_contact(done.cases, done.plans)
         return jax.tree.map(
             np.asarray,

@@ -13,7 +13,7 @@ from planner_jax.sweep.catch.figures.flight import flight_figure
 from planner_jax.sweep.catch.figures.motion import motion_figure
 from planner_jax.sweep.catch.settings import CatchSettings
 from planner_jax.sweep.figures.motion import CAPTION as MOTION
-from planner_jax.sweep.quadrotor import ending_remark
+from planner_jax.sweep.quadrotor import recovery_remark
 from planner_jax.sweep.quadrotor_settings import robot_remark
 from planner_jax.sweep.rows import quadrotor_plan
 from planner_jax.sweep.sweep import RunFigure, Sweep, first_values
@@ -132,7 +132,7 @@ class CatchSweep(Sweep[CatchSettings]):
         gravity = limits["gravity"]
         return [
             *robot_remark(settings),
-            *ending_remark(settings),
+            *recovery_remark(settings),
             f"Cases: {settings['num']:,} of suite {settings['suite']}, seed {settings['seed']}. "
             "Suites of a name are of the paper's kind; the paper gives no ranges of its own.",
             f"Order and first times, decision {settings['decide']}: "

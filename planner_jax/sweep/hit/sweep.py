@@ -17,7 +17,7 @@ from planner_jax.sweep.hit.figures.court import court_figure, path_figure
 from planner_jax.sweep.hit.figures.motion import motion_figure
 from planner_jax.sweep.hit.settings import HitSettings
 from planner_jax.sweep.hit.source import ServeSource, open_source
-from planner_jax.sweep.quadrotor import ending_remark
+from planner_jax.sweep.quadrotor import recovery_remark
 from planner_jax.sweep.quadrotor_settings import robot_remark
 from planner_jax.sweep.rows import quadrotor_plan
 from planner_jax.sweep.sweep import RunFigure, Sweep, first_values
@@ -155,7 +155,7 @@ class HitSweep(Sweep[HitSettings]):
             same = '"Same serves" are the published outcomes of this run\'s cases, where known. '
         return [
             *robot_remark(settings),
-            *ending_remark(settings),
+            *recovery_remark(settings),
             f"Serves: {summary['num']:,} {origin}; {manifest['serves']['distinct']:,} distinct "
             "balls (cases may share a ball and differ in the target).",
             f"Hover start {start}; planning begins {settings['delay']:g} s after the serve; speed, "

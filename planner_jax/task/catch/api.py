@@ -25,7 +25,7 @@ def planner(
     *,
     decide: str | Decision = "best",
     effort: str = "feasible",
-    ending: str | None = None,
+    recovery: str | None = None,
     **options: object,
 ) -> Planner[CatchCase, CatchPlan]:
     """Return the catch planner of a name, behind a decision about order and times.
@@ -41,7 +41,7 @@ def planner(
             cases, "policy" asks a network that was trained by reinforcement; "policy:rush6"
             asks one that was trained on that suite alone, and "policy:FILE" one of your own; or
             a decision with settings, such as `Best(finalists=3)`.
-        ending: as of `pj.hit.planner`.
+        recovery: as of `pj.hit.planner`.
         effort: as of `pj.hit.planner`. Of 1,000 `throws` it is above that of a very long search by
             38, 0.06 and 0.00 % (median), 76, 1.5 and 0.00 % (90 % quantile); of two balls,
             `parabola2`, by 95, 11 and 0.00 %, and 182, 17 and 0.02 %.
@@ -49,7 +49,7 @@ def planner(
 
     Returns:
         A planner for `pj.plan`; its `planner` is an `ExactCatch`, `PaperCatch` or `MppCatch`, or
-        with an ending a planner that has such a one. The plans hold the order and the times that
+        with a recovery a planner that has such a one. The plans hold the order and the times that
         were decided.
 
     Raises:
@@ -60,11 +60,11 @@ def planner(
     decision = find_decision(DECISIONS, decide, TRAINED)
     own = with_effort(TASK.make_planner(name, options), effort)
     decided = DecidedPlanner(own, decision)
-    if ending is None:
+    if recovery is None:
         return decided
     from planner_jax.recovery.with_recovery import add_recovery  # few catches need it
 
-    return add_recovery(decided, ending)
+    return add_recovery(decided, recovery)
 
 
 def judge(cases: CatchCase, plans: CatchPlan, **settings: object) -> CatchVerdict:

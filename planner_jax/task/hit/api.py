@@ -64,7 +64,7 @@ def draw(
 
 
 def planner(
-    name: str = "exact", *, effort: str = "feasible", ending: str | None = None, **options: object
+    name: str = "exact", *, effort: str = "feasible", recovery: str | None = None, **options: object
 ) -> Planner[HitCase, HitPlan]:
     """Return the hit planner of a name, with some of its fields set.
 
@@ -75,7 +75,7 @@ def planner(
 
     Args:
         name: one of these, or one that another package offers.
-        ending: what is flown behind the last contact, within all limits: "brake" to rest where that
+        recovery: the motion behind the last contact, within all limits: "brake" to rest where it
             is cheapest, "home" for the way back to where the case begins; by default the plan ends
             at the contact.
         effort: "feasible" is done with a case as soon as every limit holds; "good" and "best"
@@ -85,7 +85,7 @@ def planner(
         **options: fields of that planner's dataclass, for example `rounds`.
 
     Returns:
-        `ExactHit`, `BatHit` (`bat` and `bat-lite`) or `JuggleHit`, for `pj.plan`; with an ending a
+        `ExactHit`, `BatHit` (`bat` and `bat-lite`) or `JuggleHit`, for `pj.plan`; with a recovery a
         planner whose `planner` is one of these.
 
     Raises:
@@ -94,11 +94,11 @@ def planner(
         ModuleNotFoundError: the planner needs an extra that is not installed.
     """
     made = with_effort(TASK.make_planner(name, options), effort)
-    if ending is None:
+    if recovery is None:
         return made
     from planner_jax.recovery.with_recovery import add_recovery  # few hits need it
 
-    return add_recovery(made, ending)
+    return add_recovery(made, recovery)
 
 
 def judge(cases: HitCase, plans: HitPlan, **settings: object) -> HitVerdict:

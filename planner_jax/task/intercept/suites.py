@@ -45,7 +45,7 @@ from jax.typing import DTypeLike
 from scipy import ndimage
 
 from planner_jax.core.checks import floating
-from planner_jax.core.protocol import lane
+from planner_jax.core.protocol import take
 from planner_jax.core.registry import require_name
 from planner_jax.plane.obstacles import Obstacles
 from planner_jax.plane.target import TurningPath
@@ -211,7 +211,7 @@ def _hurried(suite: Suite, drawn: Draws) -> Draws:
     with jax.enable_x64(True):
         cases = jax.tree.map(np.asarray, cases_of(drawn, jnp.float64))
         num = len(drawn["time"])
-        arrivals = np.array([float(_earliest(lane(cases, k))) for k in range(num)])
+        arrivals = np.array([float(_earliest(take(cases, k))) for k in range(num)])
     reached = np.isfinite(arrivals)
     time = np.where(reached, arrivals + suite.spare, drawn["time"])
     way = _moved(drawn["angle"], drawn["speed"], drawn["rate"], time)

@@ -1,6 +1,6 @@
 """Ways to rest behind plans that do not come to rest, as `export` makes them: how many are found.
 
-    python -m benchmarks.endings [--rows ROW,...] [--num 1000] [--seed 1] [--out DIR]
+    python -m benchmarks.recoveries [--rows ROW,...] [--num 1000] [--seed 1] [--out DIR]
 
 Cases of each row are drawn and planned; of the plans that the referee lets pass each one is asked
 for its way to rest by itself. What is left without one has the limit that fails beside it.
@@ -15,8 +15,8 @@ import numpy as np
 
 import planner_jax as pj
 from planner_jax.benchmarks.run import argument_parser, begin, chosen
-from planner_jax.core.errors import NoEnding
-from planner_jax.recovery.after_plan import is_rested, with_ending
+from planner_jax.core.errors import NoRecovery
+from planner_jax.recovery.after_plan import append_recovery, is_rested
 
 # Row -> words of the task, options of `draw` and of `planner`, and the way to rest.
 ROWS: dict[str, tuple[Any, dict[str, Any], dict[str, Any], str]] = {
@@ -34,22 +34,22 @@ def found_behind(cases: Any, plans: Any, passed: np.ndarray, to: str) -> tuple[C
     counts: Counter[str] = Counter()
     seconds = []
     for place in np.flatnonzero(passed).tolist():
-        case, plan = pj.lane(cases, place), pj.lane(plans, place)
+        case, plan = pj.take(cases, place), pj.take(plans, place)
         if is_rested(plan):
             counts["rests"] += 1
             continue
         begin = time.perf_counter()
         try:
-            with_ending(case, plan, to)
+            append_recovery(case, plan, to)
             counts["found"] += 1
-        except NoEnding as error:
+        except NoRecovery as error:
             counts[str(error).partition(":")[0]] += 1
         seconds.append(time.perf_counter() - begin)
     return counts, float(np.median(seconds)) if seconds else 0.0
 
 
 def main() -> None:
-    parser = argument_parser("endings", __doc__, num=1000, seed=1)
+    parser = argument_parser("recoveries", __doc__, num=1000, seed=1)
     parser.add_argument("--rows", metavar="ROW,...", default=",".join(ROWS))
     options = parser.parse_args()
     rows = chosen(parser, "--rows", options.rows, ROWS)
